@@ -1,0 +1,38 @@
+"""Errors, named by what failed.
+
+A message says what was wrong, what was got, what was expected and what to do, on one line. A mask that merely is not
+found on the map is no error: it is a `Location` with a reason.
+"""
+
+__all__ = [
+    "CrsError",
+    "IndexFormatError",
+    "MaskError",
+    "OutputError",
+    "RoadSourceError",
+    "RoadgeoError",
+]
+
+
+class RoadgeoError(Exception):
+    """Base of every error that roadgeo raises on purpose."""
+
+
+class RoadSourceError(RoadgeoError):
+    """Roads could not be read, fetched, or are of no use (no lines, empty, unknown place, no network)."""
+
+
+class CrsError(RoadgeoError):
+    """A coordinate reference system is missing or cannot serve."""
+
+
+class MaskError(RoadgeoError):
+    """A query raster could not be read, or is not a road mask."""
+
+
+class IndexFormatError(RoadgeoError):
+    """A reference's files are missing, damaged, hostile, stale or of another format version."""
+
+
+class OutputError(RoadgeoError):
+    """A result could not be written."""

@@ -1,0 +1,177 @@
+"""The answer: where a mask lies on the map, how sure that is, or why there is no answer (schema `roadgeo.location/1`)."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, field
+from typing import Any, Literal
+
+from roadgeo.graph import RoadGraph
+from roadgeo.typing import FloatArray
+
+__all__ = ["SCHEMA", "Evidence", "Location", "Place", "Seconds", "Stats", "Status"]
+
+SCHEMA = "roadgeo.location/1"
+
+Status = Literal["located", "ambiguous", "not_located"]
+
+
+@dataclass(frozen=True)
+class Place:
+    """A point on the map with its odds: the centre of a footprint."""
+
+    x: float
+    y: float
+    lon: float
+    lat: float
+    log10_odds: float
+
+
+@dataclass(frozen=True)
+class Seconds:
+    """Wall time of each step, seconds."""
+
+    open: float = 0.0
+    read: float = 0.0
+    vectorize: float = 0.0
+    match: float = 0.0
+    refine: float = 0.0
+    write: float = 0.0
+
+    @property
+    def total(self) -> float:
+        """Sum of all steps."""
+        return self.open + self.read + self.vectorize + self.match + self.refine + self.write
+
+
+@dataclass(frozen=True)
+class Stats:
+    """How much work the search did."""
+
+    tuples_sampled: int = 0
+    candidates: int = 0
+    hypotheses: int = 0
+    verified: int = 0
+
+
+@dataclass(frozen=True)
+class Evidence:
+    """What the answer rests on, for drawing it. Dimensions: M matched intersections.
+
+    Attributes
+    ----------
+    query_graph : RoadGraph
+        The mask's roads in the query plane, pixels (see `roadgeo.grid`).
+    query_xy : (M, 2) float64
+        Matched intersections, query plane.
+    reference_xy : (M, 2) float64
+        Their counterparts on the map, in the location's CRS.
+    residual_m : (M,) float64
+        Distances between the mapped query intersections and their counterparts.
+    """
+
+    query_graph: RoadGraph
+    query_xy: FloatArray
+    reference_xy: FloatArray
+    residual_m: FloatArray
+
+
+@dataclass(frozen=True)
+class Location:
+    """Result of locating one mask. Everything that needs a place is None unless `status` is "located" or "ambiguous".
+
+    Attributes
+    ----------
+    homography : (3, 3) float64
+        Query pixel (column, row; GDAL corner convention) to CRS.
+    footprint, footprint_lonlat : (4, 2) float64
+        Corners TL, TR, BR, BL of the frame in the CRS, and as longitude, latitude.
+    corner_sigma_m : (4,) float64
+        Standard deviations of those corners' positions.
+    rotation_deg : float
+        Direction of the image's up at its centre, clockwise from north.
+    tilt_deg : float or None
+        Of the camera from the vertical; None where neither given nor well determined. `tilt_source` says which.
+    """
+
+    query: str
+    status: Status
+    reason: str
+    reference: str = ""
+    crs: str | None = None
+    size: tuple[int, int] | None = None  # (width, height) of the mask in pixels
+    homography: FloatArray | None = None
+    footprint: FloatArray | None = None
+    footprint_lonlat: FloatArray | None = None
+    center: Place | None = None
+    gsd_m: float | None = None
+    rotation_deg: float | None = None
+    tilt_deg: float | None = None
+    tilt_source: str | None = None
+    corner_sigma_m: FloatArray | None = None
+    n_intersections: int = 0
+    n_matched: int = 0
+    inlier_ratio: float = 0.0
+    log10_odds: float | None = None
+    runner_up: Place | None = None
+    seconds: Seconds = field(default_factory=Seconds)
+    stats: Stats = field(default_factory=Stats)
+    evidence: Evidence | None = None
+
+    @property
+    def located(self) -> bool:
+        """Whether one place was found."""
+        return self.status == "located"
+
+    def to_dict(self) -> dict[str, Any]:
+        """Plain values in the order of the schema, ready for `json.dumps`; the evidence is left out."""
+
+        def rows(array: FloatArray | None) -> list[Any] | None:
+            return None if array is None else array.tolist()
+
+        center = self.center
+        runner_up = self.runner_up
+        return {
+            "schema": SCHEMA,
+            "query": self.query,
+            "status": self.status,
+            "reason": self.reason,
+            "reference": self.reference,
+            "crs": self.crs,
+            "size": None if self.size is None else list(self.size),
+            "homography": rows(self.homography),
+            "footprint": rows(self.footprint),
+            "footprint_lonlat": rows(self.footprint_lonlat),
+            "center": None
+            if center is None
+            else {"x": center.x, "y": center.y, "lon": center.lon, "lat": center.lat},
+            "gsd_m": self.gsd_m,
+            "rotation_deg": self.rotation_deg,
+            "tilt_deg": self.tilt_deg,
+            "tilt_source": self.tilt_source,
+            "corner_sigma_m": rows(self.corner_sigma_m),
+            "n_intersections": self.n_intersections,
+            "n_matched": self.n_matched,
+            "inlier_ratio": self.inlier_ratio,
+            "log10_odds": self.log10_odds,
+            "runner_up": None
+            if runner_up is None
+            else {
+                "center": {"x": runner_up.x, "y": runner_up.y, "lon": runner_up.lon, "lat": runner_up.lat},
+                "log10_odds": runner_up.log10_odds,
+            },
+            "seconds": {
+                "open": self.seconds.open,
+                "read": self.seconds.read,
+                "vectorize": self.seconds.vectorize,
+                "match": self.seconds.match,
+                "refine": self.seconds.refine,
+                "write": self.seconds.write,
+                "total": self.seconds.total,
+            },
+            "stats": {
+                "tuples_sampled": self.stats.tuples_sampled,
+                "candidates": self.stats.candidates,
+                "hypotheses": self.stats.hypotheses,
+                "verified": self.stats.verified,
+            },
+        }
