@@ -5,7 +5,7 @@ import numpy as np
 
 
 def join_chains(edges, lengths):
-    """Sorted list of (ends, length) of the maximal chains between nodes that are not of degree two; rings by length."""
+    """Sorted list of (ends, length) of the maximal chains between nodes that are not of degree two; rings have no ends."""
     graph = nx.MultiGraph()
     for (a, b), length in zip(edges, lengths, strict=True):
         graph.add_edge(int(a), int(b), length=length)
@@ -19,7 +19,7 @@ def join_chains(edges, lengths):
                 break
         else:
             ends = [((a, b) if a <= b else (b, a), d) for a, b, d in graph.edges(data="length")]
-            return sorted((("ring", d) if graph.degree(e[0]) == 2 and e[0] == e[1] else (e, d)) for e, d in ends)
+            return sorted((((), d) if graph.degree(e[0]) == 2 and e[0] == e[1] else (e, d)) for e, d in ends)
 
 
 def close_pairs(xy, radius):
