@@ -13,11 +13,11 @@ __all__ = ["replacing", "write_bytes", "write_text"]
 
 
 @contextmanager
-def replacing(path: str | os.PathLike[str]) -> Iterator[Path]:
+def replacing(path: str | os.PathLike[str], sync: bool = True) -> Iterator[Path]:
     """Yield a temporary name beside `path`; on success the file there takes the name `path`, else it is deleted.
 
-    The temporary name keeps the suffix, so that drivers that go by it work. The content is synced to disk first: after
-    a power cut the name stands for the old content or the new, not for an empty file.
+    The temporary name keeps the suffix, so that drivers that go by it work. With `sync` the content is on the disk
+    first: after a power cut the name stands for the old content or the new, not for an empty file.
 
     Raises
     ------
@@ -29,7 +29,8 @@ def replacing(path: str | os.PathLike[str]) -> Iterator[Path]:
     try:
         try:
             yield temporary
-            _sync(temporary)
+            if sync:
+                _sync(temporary)
             temporary.replace(target)
         finally:
             temporary.unlink(missing_ok=True)
