@@ -1,0 +1,127 @@
+"""Files that appear whole or not at all: written in a staging folder beside the target, synced, then renamed over it.
+
+Readers that hold the previous file open keep reading it; a writer killed at any moment leaves the previous file as it
+was, and at worst a staging folder that the next writer in the same place removes.
+"""
+
+from __future__ import annotations
+
+import contextlib
+import errno
+import os
+import secrets
+import shutil
+from collections.abc import Iterator
+from pathlib import Path
+from typing import BinaryIO
+
+from roadgeo.errors import OutputError
+
+try:
+    import fcntl
+except ImportError:  # Windows: there an open file cannot be deleted, which serves as the lock
+    fcntl = None  # type: ignore[assignment]
+
+__all__ = ["publish", "staging", "writing"]
+
+_PREFIX, _SUFFIX, _LOCK = ".roadgeo-", ".tmp", "lock"
+
+_REMEDIES = {
+    errno.ENOSPC: "free some space or choose another disk",
+    errno.EDQUOT: "free some space or choose another disk",
+    errno.EFBIG: "raise the file size limit or choose another disk",
+    errno.EACCES: "choose a folder you may write to",
+    errno.EPERM: "choose a folder you may write to",
+    errno.EROFS: "choose a folder you may write to",
+    errno.ENOENT: "create the folder first",
+    errno.ENOTDIR: "choose a folder, not a file",
+    errno.EISDIR: "choose a file name, not a folder",
+}
+
+
+@contextlib.contextmanager
+def writing(target: str | os.PathLike[str]) -> Iterator[None]:
+    """Turn an `OSError` of the block into an `OutputError` that names `target`, the cause and the remedy."""
+    try:
+        yield
+    except OSError as error:
+        remedy = _REMEDIES.get(error.errno or 0, "check the disk and the permissions")
+        cause = error.strerror or str(error)
+        raise OutputError(f"cannot write {os.fspath(target)}: {cause.lower()}; {remedy}") from error
+
+
+@contextlib.contextmanager
+def staging(target: str | os.PathLike[str]) -> Iterator[Path]:
+    """Give a folder on the target's disk for unfinished files; it is gone at the end, whatever happens.
+
+    Leftovers of writers that died are removed on the way.
+
+    Parameters
+    ----------
+    target : path
+        The file to be written. Its folder must exist.
+
+    Raises
+    ------
+    OutputError
+        When the disk is full, the folder is missing or not writable.
+    """
+    parent = Path(target).parent
+    with writing(target):
+        _remove_leftovers(parent)
+        folder, lock = _locked_folder(parent)
+        try:
+            yield folder
+        finally:
+            lock.close()
+            shutil.rmtree(folder, ignore_errors=True)
+
+
+def publish(staged: Path, target: str | os.PathLike[str]) -> None:
+    """Sync a finished file of a staging folder to disk and rename it over `target`."""
+    with staged.open("rb+") as file:
+        os.fsync(file.fileno())
+    staged.replace(target)
+    _sync_folder(Path(target).parent)
+
+
+def _sync_folder(folder: Path) -> None:
+    """Make a rename in `folder` survive a power cut, where the platform can."""
+    if os.name == "posix":
+        descriptor = os.open(folder, os.O_RDONLY)
+        try:
+            os.fsync(descriptor)
+        finally:
+            os.close(descriptor)
+
+
+def _locked_folder(parent: Path) -> tuple[Path, BinaryIO]:
+    """Create a staging folder and lock it, so that other writers see that it is in use."""
+    while True:
+        folder = parent / f"{_PREFIX}{secrets.token_hex(6)}{_SUFFIX}"
+        folder.mkdir()
+        try:
+            lock = (folder / _LOCK).open("xb")
+        except FileNotFoundError:  # another writer took the empty folder for a leftover
+            continue
+        if fcntl is not None:
+            fcntl.flock(lock, fcntl.LOCK_EX)
+        if (folder / _LOCK).exists():
+            return folder, lock
+        lock.close()
+
+
+def _remove_leftovers(parent: Path) -> None:
+    """Remove staging folders whose writer lives no more: nobody holds their lock."""
+    for folder in parent.glob(f"{_PREFIX}*{_SUFFIX}"):
+        with contextlib.suppress(OSError):  # in use, or being removed by somebody else
+            if not (folder / _LOCK).exists():
+                folder.rmdir()  # only ever empty: the lock is the first file and the last
+                continue
+            if fcntl is None:
+                (folder / _LOCK).unlink()
+                shutil.rmtree(folder, ignore_errors=True)
+                continue
+            with (folder / _LOCK).open("rb+") as lock:
+                fcntl.flock(lock, fcntl.LOCK_EX | fcntl.LOCK_NB)
+                shutil.rmtree(folder, ignore_errors=True)
