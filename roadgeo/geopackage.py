@@ -9,8 +9,8 @@ from __future__ import annotations
 import os
 import sqlite3
 import struct
-from collections.abc import Mapping, Sequence
-from contextlib import closing
+from collections.abc import Iterator, Mapping, Sequence
+from contextlib import closing, contextmanager
 from dataclasses import dataclass, field
 from functools import lru_cache
 from pathlib import Path
@@ -22,7 +22,16 @@ from roadgeo.errors import CrsError, IndexFormatError, OutputError
 from roadgeo.files import replacing
 from roadgeo.typing import AnyArray, FloatArray
 
-__all__ = ["PIXELS", "GeometryType", "Layer", "layer_names", "read_layer", "write_layers"]
+__all__ = [
+    "PIXELS",
+    "GeometryType",
+    "Layer",
+    "add_layers",
+    "layer_names",
+    "open_read_only",
+    "read_layer",
+    "write_layers",
+]
 
 GeometryType = Literal["POINT", "LINESTRING", "POLYGON"]
 
@@ -77,9 +86,37 @@ def write_layers(path: str | os.PathLike[str], layers: Sequence[Layer]) -> None:
         temporary.unlink(missing_ok=True)
         try:
             with closing(sqlite3.connect(temporary)) as database:
-                _write(database, layers)
+                add_layers(database, layers)
         except sqlite3.Error as error:
             raise OutputError(f"cannot write {path}: {error}; choose a folder that you may write to") from error
+
+
+def add_layers(database: sqlite3.Connection, layers: Sequence[Layer]) -> None:
+    """Make a GeoPackage of an empty database: for writers that add tables of their own to it.
+
+    Raises
+    ------
+    CrsError
+        A layer's CRS is unknown.
+    sqlite3.Error
+        The file cannot be written.
+    """
+    database.executescript("PRAGMA journal_mode = OFF; PRAGMA synchronous = OFF;")
+    database.executescript(_SCHEMA)
+    srs_ids: dict[str, int] = {}
+    for crs in dict.fromkeys(["EPSG:4326", *(layer.crs for layer in layers if layer.geometry_type)]):
+        srs_ids[crs] = _add_srs(database, crs, _CUSTOM_SRS_ID + len(srs_ids))
+    for layer in layers:
+        _add_layer(database, layer, srs_ids.get(layer.crs, 0))
+    styled = [layer for layer in layers if layer.style]
+    if styled:
+        database.executescript(_STYLES_SCHEMA)
+        database.executemany(
+            "INSERT INTO layer_styles (f_table_catalog, f_table_schema, f_table_name, f_geometry_column, styleName,"
+            " styleQML, styleSLD, useAsDefault, description, owner) VALUES ('', '', ?, 'geom', ?, ?, '', 1, '', '')",
+            [(layer.name, layer.name, layer.style) for layer in styled],
+        )
+    database.commit()
 
 
 def layer_names(path: str | os.PathLike[str]) -> list[str]:
@@ -116,6 +153,28 @@ def read_layer(path: str | os.PathLike[str], name: str) -> tuple[list[FloatArray
     if not found:
         return [], table
     return [_decode(blob, path, name) for blob in table.pop(found[0][0])], table
+
+
+@contextmanager
+def open_read_only(path: str | os.PathLike[str]) -> Iterator[sqlite3.Connection]:
+    """Open a GeoPackage for queries; whatever SQLite finds wrong in the block is an `IndexFormatError`.
+
+    Raises
+    ------
+    IndexFormatError
+        No such file, or no GeoPackage.
+    """
+    source = Path(path)
+    if not source.is_file():
+        raise IndexFormatError(f"no such file: {source}; give the path of a .gpkg file")
+    # Immutable: no lock or journal file appears beside a reference that lies in a read-only folder. But while QGIS
+    # edits the file, the latest state lies in the journal beside it, which an immutable file would not have.
+    state = "" if source.with_name(f"{source.name}-wal").exists() else "&immutable=1"
+    try:
+        with closing(sqlite3.connect(f"{source.absolute().as_uri()}?mode=ro{state}", uri=True)) as database:
+            yield database
+    except sqlite3.Error as error:
+        raise IndexFormatError(f"{source} is no readable GeoPackage ({error}); make it again") from error
 
 
 # --- writing ----------------------------------------------------------------------------------------------------------
@@ -191,25 +250,6 @@ BEGIN
   DELETE FROM "rtree_{t}_geom" WHERE id = OLD."fid";
 END;
 """
-
-
-def _write(database: sqlite3.Connection, layers: Sequence[Layer]) -> None:
-    database.executescript("PRAGMA journal_mode = OFF; PRAGMA synchronous = OFF;")
-    database.executescript(_SCHEMA)
-    srs_ids: dict[str, int] = {}
-    for crs in dict.fromkeys(["EPSG:4326", *(layer.crs for layer in layers if layer.geometry_type)]):
-        srs_ids[crs] = _add_srs(database, crs, _CUSTOM_SRS_ID + len(srs_ids))
-    for layer in layers:
-        _add_layer(database, layer, srs_ids.get(layer.crs, 0))
-    styled = [layer for layer in layers if layer.style]
-    if styled:
-        database.executescript(_STYLES_SCHEMA)
-        database.executemany(
-            "INSERT INTO layer_styles (f_table_catalog, f_table_schema, f_table_name, f_geometry_column, styleName,"
-            " styleQML, styleSLD, useAsDefault, description, owner) VALUES ('', '', ?, 'geom', ?, ?, '', 1, '', '')",
-            [(layer.name, layer.name, layer.style) for layer in styled],
-        )
-    database.commit()
 
 
 def _add_srs(database: sqlite3.Connection, crs: str, custom_id: int) -> int:
@@ -346,15 +386,8 @@ def _encode(
 
 
 def _query(path: str | os.PathLike[str], sql: str) -> list[Any]:
-    source = Path(path)
-    if not source.is_file():
-        raise IndexFormatError(f"no such file: {source}; give the path of a .gpkg file")
-    try:
-        # Immutable: no lock or journal file appears beside a reference that lies in a read-only folder.
-        with closing(sqlite3.connect(f"{source.absolute().as_uri()}?mode=ro&immutable=1", uri=True)) as database:
-            return database.execute(sql).fetchall()
-    except sqlite3.Error as error:
-        raise IndexFormatError(f"{source} is no readable GeoPackage ({error}); make it again") from error
+    with open_read_only(path) as database:
+        return database.execute(sql).fetchall()
 
 
 def _decode(blob: bytes, path: str | os.PathLike[str], layer: str) -> FloatArray:
