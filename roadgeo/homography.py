@@ -29,9 +29,8 @@ class Homography:
             return np.where(w > 0, mapped[..., :2] / w, np.nan)
 
     def inverse(self) -> Homography:
-        """Return the map back, scaled so that w stays positive where it was."""
-        inverse = np.linalg.inv(self.matrix)
-        return Homography(inverse * np.sign(np.linalg.det(self.matrix)))
+        """Return the map back; where w was positive it is so again, as H^-1 (H x) = x has the third element 1."""
+        return Homography(np.linalg.inv(self.matrix))
 
     def __matmul__(self, other: Homography) -> Homography:
         """Compose: (A @ B)(x) = A(B(x))."""
