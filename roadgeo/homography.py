@@ -30,7 +30,7 @@ class Homography:
 
     def inverse(self) -> Homography:
         """Return the map back; where w was positive it is so again, as H^-1 (H x) = x has the third element 1."""
-        return Homography(np.linalg.inv(self.matrix))
+        return Homography(np.asarray(np.linalg.inv(self.matrix), np.float64))
 
     def __matmul__(self, other: Homography) -> Homography:
         """Compose: (A @ B)(x) = A(B(x))."""

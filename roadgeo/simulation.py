@@ -1,0 +1,163 @@
+"""Query masks whose place is known: views of a road map by a pinhole camera, drawn with what goes wrong in real masks.
+
+Everything is drawn from seeds, query by query: the k-th mask does not depend on how many are drawn, nor by whom.
+"""
+
+from __future__ import annotations
+
+import zlib
+from collections.abc import Iterator
+from dataclasses import dataclass, field
+
+import numpy as np
+
+from roadgeo.drawing import NoiseModel, Range, draw_mask
+from roadgeo.errors import RoadSourceError
+from roadgeo.landscape import Landscape, visible_intersections
+from roadgeo.truth import Truth
+from roadgeo.typing import AnyArray
+from roadgeo.view import View, make_view, sees_ground
+
+__all__ = ["SimulatedQuery", "SimulationOptions", "ViewOptions", "draw_view", "simulate", "simulate_query"]
+
+#: Draws of a view before a query is given up.
+MAX_TRIES = 4000
+
+
+@dataclass(frozen=True)
+class ViewOptions:
+    """Which views are drawn. A range (low, high) is drawn from anew for each query.
+
+    Attributes
+    ----------
+    size_px : (int, int)
+        Width and height of the frame.
+    window_m : float or None
+        Where given, the frame is a square of this side on the ground (at the sampling of its centre) instead.
+    gsd_m : range
+        Metres per pixel across the optical axis at the frame's centre; drawn log-uniformly.
+    tilt_deg : range
+        Of the optical axis from the vertical, towards any direction.
+    heading_deg : range
+        Direction of the image's up at its centre, clockwise from north.
+    focal_px : float or None
+        Focal length in pixels. None: the frame's longer side, a field of view of 53 degrees.
+    intersections : (int, int)
+        Least and greatest number of intersections that the frame must show with three branches or more.
+    road_width_m : range
+        Width of a street as drawn.
+    """
+
+    size_px: tuple[int, int] = (1500, 1500)
+    window_m: float | None = None
+    gsd_m: Range = (1.0, 1.0)
+    tilt_deg: Range = (0.0, 0.0)
+    heading_deg: Range = (0.0, 0.0)
+    focal_px: float | None = None
+    intersections: tuple[int, int] = (30, 1_000_000)
+    road_width_m: Range = (8.0, 11.0)
+
+
+@dataclass(frozen=True)
+class SimulationOptions:
+    """A query set.
+
+    Attributes
+    ----------
+    kind : str
+        What the queries are called in tables and files.
+    mirrored : bool
+        Turn each mask over. A camera above the ground never shows that, so such a mask has no place on any map, and yet
+        looks like one that has: locating it is an error.
+    """
+
+    view: ViewOptions = field(default_factory=ViewOptions)
+    noise: NoiseModel = field(default_factory=NoiseModel)
+    kind: str = "clean"
+    seed: int = 0
+    mirrored: bool = False
+
+
+@dataclass(frozen=True)
+class SimulatedQuery:
+    """A mask ((H, W) uint8, roads 255) and where it was taken."""
+
+    mask: AnyArray
+    truth: Truth
+
+
+def simulate(landscape: Landscape, options: SimulationOptions, count: int) -> Iterator[SimulatedQuery]:
+    """Draw queries 0 to `count` - 1 of a set."""
+    for k in range(count):
+        yield simulate_query(landscape, options, k)
+
+
+def simulate_query(landscape: Landscape, options: SimulationOptions, k: int) -> SimulatedQuery:
+    """Draw the k-th query of a set: always the same one for the same landscape and options.
+
+    Raises
+    ------
+    RoadSourceError
+        The map has no place for such a view.
+    """
+    rng = np.random.default_rng([options.seed, zlib.crc32(options.kind.encode()), k])
+    least, most = options.view.intersections
+    for _ in range(MAX_TRIES):
+        view = draw_view(landscape, options.view, rng)
+        mask, drawn = draw_mask(landscape, view, options.noise, options.view.road_width_m, rng)
+        if least <= drawn["n_intersections"] <= most:
+            break
+    else:
+        raise RoadSourceError(
+            f"no mask with {least} to {most} intersections left could be drawn; ask for fewer or for less noise"
+        )
+    if options.mirrored:
+        mask = np.ascontiguousarray(mask[:, ::-1])
+    matrix = landscape.plane.to_crs_matrix() @ view.homography.matrix
+    truth = Truth(
+        file=f"{options.kind}/q_{k:04d}.png",
+        kind=options.kind,
+        homography=matrix / matrix[2, 2],
+        crs=landscape.plane.crs,
+        size=view.size_px,
+        on_map=not options.mirrored,
+        properties={
+            "gsd_m": view.gsd_m,
+            "tilt_deg": view.tilt_deg,
+            "tilt_azimuth_deg": view.tilt_azimuth_deg,
+            "heading_deg": view.heading_deg,
+            "focal_px": view.focal_px,
+            **drawn,
+        },
+    )
+    return SimulatedQuery(mask, truth)
+
+
+def draw_view(landscape: Landscape, options: ViewOptions, rng: np.random.Generator) -> View:
+    """Draw a view that lies on covered ground and holds enough intersections of the map.
+
+    Raises
+    ------
+    RoadSourceError
+        The map has no such place.
+    """
+    low, high = landscape.bounds
+    for _ in range(MAX_TRIES):
+        gsd = float(np.exp(rng.uniform(*np.log(options.gsd_m))))
+        view = make_view(
+            tuple(rng.uniform(low, high)),
+            options.size_px if options.window_m is None else (round(options.window_m / gsd),) * 2,
+            gsd,
+            rng.uniform(*options.tilt_deg),
+            rng.uniform(0.0, 360.0),
+            rng.uniform(*options.heading_deg),
+            options.focal_px,
+        )
+        if not sees_ground(view) or not landscape.covers(view.footprint):
+            continue
+        if options.intersections[0] <= len(visible_intersections(landscape, view)):
+            return view
+    raise RoadSourceError(
+        f"no view with {options.intersections[0]} to {options.intersections[1]} intersections was found on the map in"
+        f" {MAX_TRIES} draws; ask for fewer, for a wider window, or give a larger map"
+    )
