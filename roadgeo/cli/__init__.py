@@ -1,0 +1,111 @@
+"""The command line: options, one call, printing. Each command is a module, imported only when it is used.
+
+Exit status: 0 all well (and every mask located), 3 at least one mask not located, 1 error, 2 usage, 130 interrupted.
+"""
+
+from __future__ import annotations
+
+import importlib
+import os
+import sys
+from collections.abc import Sequence
+
+import click
+
+from roadgeo._version import __version__
+from roadgeo.errors import RoadgeoError
+
+__all__ = ["COMMANDS", "ERROR", "INTERRUPTED", "NOT_LOCATED", "cli", "main"]
+
+ERROR, USAGE, NOT_LOCATED, INTERRUPTED = 1, 2, 3, 130
+
+#: Name of each command: the module whose `command` it is, and its summary, which stands here so that `--help` need not
+#: import the module.
+COMMANDS = {
+    "index": ("roadgeo.cli.index", "Build a reference: the searchable roads of a place."),
+    "locate": ("roadgeo.cli.locate", "Find road masks on a reference and draw them there."),
+    "vectorize": ("roadgeo.cli.vectorize", "Show what roads are seen in a mask."),
+    "info": ("roadgeo.cli.references", "Describe a reference."),
+    "check": ("roadgeo.cli.references", "Verify every byte and number of a reference."),
+    "list": ("roadgeo.cli.references", "List the references in the library."),
+    "remove": ("roadgeo.cli.references", "Remove references from the library."),
+    "demo": ("roadgeo.cli.demo", "Locate five masks in Porto: needs no network and no data."),
+}
+
+
+class LazyGroup(click.Group):
+    """A group that imports a command's module when the command runs or its own help is asked for."""
+
+    def list_commands(self, ctx: click.Context) -> list[str]:  # noqa: ARG002 (click's signature)
+        """Name all commands in the order of their use."""
+        return list(COMMANDS)
+
+    def get_command(self, ctx: click.Context, cmd_name: str) -> click.Command | None:  # noqa: ARG002
+        """Import one command."""
+        if cmd_name not in COMMANDS:
+            return None
+        module = importlib.import_module(COMMANDS[cmd_name][0])
+        return getattr(module, f"{cmd_name}_command")  # type: ignore[no-any-return]
+
+    def format_commands(self, ctx: click.Context, formatter: click.HelpFormatter) -> None:  # noqa: ARG002
+        """List the summaries without importing anything."""
+        with formatter.section("Commands"):
+            formatter.write_dl([(name, summary) for name, (_, summary) in COMMANDS.items()])
+
+
+@click.group(
+    cls=LazyGroup,
+    invoke_without_command=True,
+    context_settings={"help_option_names": ["-h", "--help"], "max_content_width": 100},
+    epilog="Exit status: 0 every mask located, 3 at least one not located, 1 error, 2 usage.",
+)
+@click.version_option(__version__, prog_name="roadgeo")
+@click.pass_context
+def cli(ctx: click.Context) -> None:
+    r"""Locate aerial images from their roads alone.
+
+    \b
+      roadgeo index --osm "Boston, MA"      once: fetch and index the roads of a place
+      roadgeo locate image_mask.tif         find the mask there; image_mask_footprint.tif opens in QGIS
+      roadgeo demo                          see it work, offline, in a minute
+
+    `roadgeo COMMAND --help` explains each command, with examples.
+    """
+    if os.environ.get("NO_COLOR"):
+        ctx.color = False
+    if ctx.invoked_subcommand is None:
+        click.echo(ctx.get_help())
+        ctx.exit(USAGE)
+
+
+def main(arguments: Sequence[str] | None = None) -> int:
+    """Run the command line and return its exit status; every error is one line on standard error."""
+    try:
+        status = cli.main(
+            args=None if arguments is None else list(arguments), prog_name="roadgeo", standalone_mode=False
+        )
+    except click.UsageError as error:
+        asked = error.ctx.command_path if error.ctx else "roadgeo"
+        return _fail(f"{error.format_message()} Try '{asked} --help'.", error.exit_code)
+    except click.ClickException as error:
+        return _fail(error.format_message(), error.exit_code)
+    except (click.Abort, KeyboardInterrupt):
+        click.echo("Interrupted.", err=True)
+        return INTERRUPTED
+    except RoadgeoError as error:
+        return _fail(str(error), ERROR)
+    except BrokenPipeError:
+        # Whoever read our output has gone; what Python still holds for it must not raise at exit.
+        os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
+        return ERROR
+    except Exception as error:
+        if os.environ.get("ROADGEO_TRACEBACK"):
+            raise
+        what = f"{type(error).__name__}: {error}"
+        return _fail(f"{what}. This is a fault of roadgeo; ROADGEO_TRACEBACK=1 shows where, please report it", ERROR)
+    return status if isinstance(status, int) else 0
+
+
+def _fail(message: str, status: int) -> int:
+    click.echo("Error: " + " ".join(message.split()), err=True)
+    return status

@@ -1,0 +1,85 @@
+"""Parameter types and options that several commands share."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+from typing import Any, TypeVar
+
+import click
+
+__all__ = ["BOX", "NEAR", "RANGE", "Numbers", "verbosity_options"]
+
+Command = TypeVar("Command", bound=Callable[..., Any])
+
+
+class Numbers(click.ParamType):  # type: ignore[type-arg]  # generic only in late versions of click
+    """A fixed number of numbers with a separator between them, checked together.
+
+    Parameters
+    ----------
+    names : sequence of str
+        What the numbers are, for messages; their count is the count asked for.
+    wrong : callable
+        Takes the numbers; returns what is wrong with them, or "".
+    """
+
+    def __init__(self, name: str, names: Sequence[str], separator: str, wrong: Callable[..., str]) -> None:
+        self.name = name
+        self.names = tuple(names)
+        self.separator = separator
+        self.wrong = wrong
+
+    def convert(self, value: Any, param: click.Parameter | None, ctx: click.Context | None) -> tuple[float, ...]:
+        """Parse the text.
+
+        Raises
+        ------
+        click.BadParameter
+            Another count, no numbers, or numbers that make no sense together.
+        """
+        if isinstance(value, tuple):
+            return value
+        expected = self.separator.join(self.names)
+        try:
+            numbers = tuple(float(part) for part in value.split(self.separator))
+        except ValueError:
+            numbers = ()
+        if len(numbers) != len(self.names):
+            self.fail(f"got {value!r}, expected {expected}", param, ctx)
+        problem = self.wrong(*numbers)
+        if problem:
+            self.fail(f"got {value!r}: {problem}; expected {expected}", param, ctx)
+        return numbers
+
+
+def _wrong_range(low: float, high: float) -> str:
+    return "" if 0 < low <= high < float("inf") else "LO must be above 0 and not above HI"
+
+
+def _wrong_place(lon: float, lat: float, radius: float) -> str:
+    if not (-180 <= lon <= 180 and -90 <= lat <= 90):
+        return "longitude must lie within ±180, latitude within ±90 (longitude comes first)"
+    return "" if 0 < radius < 2e7 else "the radius must be above 0 metres"
+
+
+def _wrong_box(west: float, south: float, east: float, north: float) -> str:
+    if not (-90 <= south < north <= 90):
+        return "south must lie below north, both within ±90"
+    if not (-180 <= west <= 180 and -180 <= east <= 180 and west != east):
+        return "west and east must differ and lie within ±180"
+    return ""
+
+
+#: Metres per pixel, least and greatest.
+RANGE = Numbers("range", ("LO", "HI"), ":", _wrong_range)
+#: A place in degrees and a distance in metres.
+NEAR = Numbers("place", ("LON", "LAT", "RADIUS"), ",", _wrong_place)
+#: A box in degrees; west may exceed east, across the 180th meridian.
+BOX = Numbers("box", ("W", "S", "E", "N"), ",", _wrong_box)
+
+
+def verbosity_options(command: Command) -> Command:
+    """Add --quiet and --verbose."""
+    verbose = click.option("-v", "--verbose", is_flag=True, help="Say more: times, counts, files read.")
+    quiet = click.option("-q", "--quiet", is_flag=True, help="Say nothing but errors, and what --json prints.")
+    return verbose(quiet(command))
