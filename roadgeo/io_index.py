@@ -36,7 +36,7 @@ from roadgeo.errors import IndexFormatError
 from roadgeo.io_atomic import publish, staging
 from roadgeo.typing import AnyArray
 
-__all__ = ["FORMAT_VERSION", "check_index", "read_index", "read_manifest", "write_index"]
+__all__ = ["FORMAT_VERSION", "check_index", "dump_index", "read_index", "read_manifest", "write_index"]
 
 #: Goes up whenever an older roadgeo could misread the file. A reader refuses every version but its own, and says so.
 FORMAT_VERSION = 1
@@ -60,9 +60,9 @@ _MAX_DEPTH = 16
 
 def write_index(
     path: str | os.PathLike[str],
-    meta: dict[str, Any],
+    meta: Mapping[str, Any],
     arrays: Mapping[str, AnyArray],
-    about: dict[str, Any] | None = None,
+    about: Mapping[str, Any] | None = None,
 ) -> None:
     """Write an index file; whole or not at all.
 
@@ -84,7 +84,17 @@ def write_index(
     TypeError
         When a value or array is of a kind that the format does not store.
     """
-    chunks = [_dump_plain(meta)]
+    with staging(path) as folder:
+        staged = folder / Path(path).name
+        dump_index(staged, meta, arrays, about)
+        publish(staged, path)
+
+
+def dump_index(
+    path: Path, meta: Mapping[str, Any], arrays: Mapping[str, AnyArray], about: Mapping[str, Any] | None = None
+) -> None:
+    """Write an index to a new file, in place; for callers that stage it. A disk error is an `OSError`."""
+    chunks = [_dump_plain(dict(meta))]
     entries = []
     offset = _aligned(len(chunks[0]))
     for name, array in arrays.items():
@@ -105,20 +115,17 @@ def write_index(
     manifest = {
         "format": FORMAT_VERSION,
         "roadgeo": __version__,
-        "about": about or {},
+        "about": dict(about or {}),
         "size": offset,
         "pickle": {"size": len(chunks[0]), "digest": _digest(chunks[0])},
         "arrays": entries,
     }
     _require_plain(manifest)
     header = _header(json.dumps(manifest, allow_nan=False).encode())
-    with staging(path) as folder:
-        staged = folder / Path(path).name
-        with staged.open("xb") as file:
-            for chunk in (header, *chunks):
-                file.write(chunk)
-                file.write(bytes(-len(chunk) % _ALIGNMENT))
-        publish(staged, path)
+    with path.open("xb") as file:
+        for chunk in (header, *chunks):
+            file.write(chunk)
+            file.write(bytes(-len(chunk) % _ALIGNMENT))
 
 
 def read_manifest(path: str | os.PathLike[str]) -> dict[str, Any]:

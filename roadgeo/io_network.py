@@ -31,7 +31,17 @@ from roadgeo.projection import LocalPlane
 from roadgeo.styles import draw_fill, draw_line, draw_marker
 from roadgeo.typing import AnyArray, Float32Array, FloatArray
 
-__all__ = ["as_stored", "dump_network", "network_digest", "read_network", "stored_digest", "write_network"]
+__all__ = [
+    "as_stored",
+    "computed_digest",
+    "dump_network",
+    "network_digest",
+    "read_meta",
+    "read_network",
+    "ring_area",
+    "stored_digest",
+    "write_network",
+]
 
 SCHEMA = "roadgeo.reference/1"
 
@@ -146,7 +156,7 @@ def read_network(path: str | os.PathLike[str]) -> RoadNetwork:
     IndexFormatError
         When the file is missing, is no reference, or its layers contradict each other.
     """
-    meta = _read_meta(path)
+    meta = read_meta(path)
     plane = _plane(path, meta)
     rings, _ = read_layer(path, "coverage")
     return RoadNetwork(
@@ -156,6 +166,29 @@ def read_network(path: str | os.PathLike[str]) -> RoadNetwork:
         coverage=tuple(plane.from_crs(ring) for ring in rings),
         meta={key: value for key, value in meta.items() if not key.startswith("roadgeo.")},
     )
+
+
+def read_meta(path: str | os.PathLike[str]) -> dict[str, Any]:
+    """Read the table `roadgeo_meta`: values by key, the program's own under `roadgeo.`.
+
+    Raises
+    ------
+    IndexFormatError
+        When the file is missing or is no reference.
+    """
+    with open_read_only(path) as database:
+        rows = database.execute("SELECT key, value FROM roadgeo_meta").fetchall()
+    try:
+        meta = {str(key): json.loads(value) for key, value in rows}
+    except (TypeError, ValueError, RecursionError) as error:
+        raise IndexFormatError(
+            f"{path}: its table roadgeo_meta holds a value that is no JSON; make the file again"
+        ) from error
+    if meta.get("roadgeo.schema") != SCHEMA:
+        raise IndexFormatError(
+            f"{path} has schema {meta.get('roadgeo.schema')!r}, expected {SCHEMA!r}: make it again with `roadgeo index`"
+        )
+    return meta
 
 
 def network_digest(network: RoadNetwork) -> str:
@@ -178,17 +211,30 @@ def stored_digest(path: str | os.PathLike[str]) -> str:
     """
     with open_read_only(path) as database:
         guards = database.execute("SELECT name FROM sqlite_master WHERE type = 'trigger'").fetchall()
-    meta = _read_meta(path)
+    meta = read_meta(path)
     digest = meta.get("roadgeo.digest")
     if isinstance(digest, str) and {name for (name,) in guards} >= _TRIGGERS.keys():
         return digest
-    return _computed_digest(path, meta)
+    return computed_digest(path)
 
 
-def _computed_digest(path: str | os.PathLike[str], meta: Mapping[str, Any]) -> str:
-    plane = _plane(path, meta)
+def computed_digest(path: str | os.PathLike[str]) -> str:
+    """Digest of a GeoPackage's intersections as they are now.
+
+    Raises
+    ------
+    IndexFormatError
+        When the file is missing or is no reference.
+    """
+    plane = _plane(path, read_meta(path))
     empty = RoadGraph.from_polylines(np.empty((0, 2)), np.empty((0, 2), np.int32), [])
     return network_digest(RoadNetwork(empty, _read_intersections(path, plane), plane))
+
+
+def ring_area(ring: FloatArray) -> float:
+    """Area of a simple ring (V, 2), square units."""
+    x, y = (ring - ring.mean(axis=0)).T
+    return float(abs(np.dot(x, np.roll(y, 1)) - np.dot(y, np.roll(x, 1))) / 2)
 
 
 # --- writing ----------------------------------------------------------------------------------------------------------
@@ -202,7 +248,7 @@ def _map_layers(network: RoadNetwork) -> list[Layer]:
             "coverage",
             "POLYGON",
             [plane.to_crs(ring) for ring in network.coverage],
-            {"area_km2": [_ring_area(ring) / 1e6 for ring in network.coverage]},
+            {"area_km2": [ring_area(ring) / 1e6 for ring in network.coverage]},
             plane.crs,
             draw_fill("120,144,156,18", "120,144,156", 0.4),
             "Where the map knows roads at all",
@@ -253,12 +299,6 @@ def _tangent_layer(found: Intersections, plane: LocalPlane) -> Layer:
     )
 
 
-def _ring_area(ring: FloatArray) -> float:
-    """Area of a simple ring, square units."""
-    x, y = (ring - ring.mean(axis=0)).T
-    return float(abs(np.dot(x, np.roll(y, 1)) - np.dot(y, np.roll(x, 1))) / 2)
-
-
 def _stored_meta(network: RoadNetwork) -> dict[str, Any]:
     return {
         **network.meta,
@@ -299,22 +339,6 @@ def _with_aliases(style: str, aliases: Mapping[str, str]) -> str:
 
 
 # --- reading ----------------------------------------------------------------------------------------------------------
-
-
-def _read_meta(path: str | os.PathLike[str]) -> dict[str, Any]:
-    with open_read_only(path) as database:
-        rows = database.execute("SELECT key, value FROM roadgeo_meta").fetchall()
-    try:
-        meta = {str(key): json.loads(value) for key, value in rows}
-    except (TypeError, ValueError, RecursionError) as error:
-        raise IndexFormatError(
-            f"{path}: its table roadgeo_meta holds a value that is no JSON; make the file again"
-        ) from error
-    if meta.get("roadgeo.schema") != SCHEMA:
-        raise IndexFormatError(
-            f"{path} has schema {meta.get('roadgeo.schema')!r}, expected {SCHEMA!r}: make it again with `roadgeo index`"
-        )
-    return meta
 
 
 def _plane(path: str | os.PathLike[str], meta: Mapping[str, Any]) -> LocalPlane:

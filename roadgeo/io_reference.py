@@ -1,0 +1,314 @@
+"""A reference on disk: `REF.gpkg` for people and `REF.index` for the search, which are kept together."""
+
+from __future__ import annotations
+
+import math
+import os
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any, Literal, TypeAlias
+
+import numpy as np
+
+from roadgeo.errors import IndexFormatError, OutputError
+from roadgeo.geopackage import open_read_only
+from roadgeo.intersections import Intersections
+from roadgeo.io_atomic import publish, staging
+from roadgeo.io_index import check_index, dump_index, read_index, read_manifest, write_index
+from roadgeo.io_network import (
+    computed_digest,
+    dump_network,
+    network_digest,
+    read_meta,
+    read_network,
+    ring_area,
+    stored_digest,
+)
+from roadgeo.network import RoadNetwork
+from roadgeo.typing import AnyArray
+
+__all__ = [
+    "Freshness",
+    "IndexParts",
+    "ReferencePaths",
+    "check_reference",
+    "describe_reference",
+    "open_reference",
+    "reference_freshness",
+    "reference_paths",
+    "write_reference",
+]
+
+#: What an index file holds: plain values, and arrays by name.
+IndexParts: TypeAlias = tuple[Mapping[str, Any], Mapping[str, AnyArray]]
+
+Freshness: TypeAlias = Literal["fresh", "stale", "no index", "no GeoPackage"]
+
+#: Largest distance between the intersections of a tuple whose types are counted, as in the paper's Figure 7 (eq. 8).
+TUPLE_DISTANCE_M = 500.0
+
+
+@dataclass(frozen=True)
+class ReferencePaths:
+    """The two files of a reference."""
+
+    geopackage: Path
+    index: Path
+
+
+def reference_paths(path: str | os.PathLike[str]) -> ReferencePaths:
+    """Name the two files of a reference, given either of them or what they have in common."""
+    given = Path(path)
+    stem = given.with_suffix("") if given.suffix.lower() in {".gpkg", ".index"} else given
+    return ReferencePaths(stem.with_name(f"{stem.name}.gpkg"), stem.with_name(f"{stem.name}.index"))
+
+
+def write_reference(path: str | os.PathLike[str], network: RoadNetwork, parts: IndexParts) -> ReferencePaths:
+    """Write both files of a reference; a previous one stays usable at every moment.
+
+    Parameters
+    ----------
+    path : path
+        Either file, or what they have in common.
+    network : RoadNetwork
+        As `io_network.as_stored` gives it, so that the index is the one that the GeoPackage would give.
+    parts : (meta, arrays)
+        The index of that network.
+
+    Raises
+    ------
+    OutputError
+        When the disk is full, the folder is missing or not writable.
+    CrsError
+        When the plane's CRS is unknown.
+    """
+    paths = reference_paths(path)
+    meta, arrays = parts
+    with staging(paths.geopackage) as folder:
+        staged = reference_paths(folder / paths.geopackage.name)
+        dump_network(staged.geopackage, network)
+        dump_index(staged.index, meta, arrays, _about(network, meta))
+        # Without its index a GeoPackage is still a whole reference, with an index of another one it is not.
+        paths.index.unlink(missing_ok=True)
+        publish(staged.geopackage, paths.geopackage)
+        publish(staged.index, paths.index)
+    return paths
+
+
+def open_reference(
+    path: str | os.PathLike[str], rebuild: Callable[[RoadNetwork], IndexParts] | None = None
+) -> IndexParts:
+    """Open a reference's index.
+
+    Parameters
+    ----------
+    path : path
+        Either file, or what they have in common.
+    rebuild : callable, optional
+        Builds the index of a network, where the file is missing; the result is stored when the folder allows it.
+
+    Returns
+    -------
+    meta, arrays
+        Plain values, and read-only views of the memory-mapped file.
+
+    Raises
+    ------
+    IndexFormatError
+        When there is no such reference, or its index is missing (without `rebuild`), damaged, hostile or stale.
+    """
+    paths = reference_paths(path)
+    freshness = reference_freshness(path)
+    if freshness == "stale":
+        raise IndexFormatError(
+            f"{paths.index} is stale: the intersections of {paths.geopackage.name} were changed after it was built; "
+            "delete it and it will be built again from the GeoPackage"
+        )
+    if freshness != "no index":
+        return read_index(paths.index)
+    if rebuild is None:
+        raise IndexFormatError(f"{paths.index} is missing; build it again from {paths.geopackage.name}")
+    return _rebuild(paths, rebuild)
+
+
+def reference_freshness(path: str | os.PathLike[str]) -> Freshness:
+    """Tell whether the index is that of the GeoPackage beside it.
+
+    Raises
+    ------
+    IndexFormatError
+        When neither file is there, or either is damaged.
+    """
+    paths = reference_paths(path)
+    if not paths.index.is_file():
+        if not paths.geopackage.is_file():
+            raise IndexFormatError(f"no reference {path}: expected {paths.geopackage}; make it with `roadgeo index`")
+        read_meta(paths.geopackage)
+        return "no index"
+    digest = read_manifest(paths.index)["about"].get("network")
+    if not paths.geopackage.is_file():
+        return "no GeoPackage"
+    return "fresh" if digest == stored_digest(paths.geopackage) else "stale"
+
+
+def describe_reference(path: str | os.PathLike[str]) -> dict[str, Any]:
+    """Describe a reference in plain values; nothing is unpickled.
+
+    Returns
+    -------
+    dict
+        `name`, `freshness`, `files` and their sizes in bytes; with an index also `format`, `roadgeo` (the version that
+        built it), `memory_bytes` (of the mapped arrays) and what `about` held: `crs`, `extent`, `counts`, `road_km`,
+        `area_km2`, `intersections_per_km2`, `tuple_types`, `index`; and `meta`, the network's own.
+
+    Raises
+    ------
+    IndexFormatError
+        As `reference_freshness`.
+    """
+    paths = reference_paths(path)
+    freshness = reference_freshness(path)
+    files = [file for file in (paths.geopackage, paths.index) if file.is_file()]
+    description: dict[str, Any] = {
+        "name": paths.geopackage.stem,
+        "freshness": freshness,
+        "files": {str(file): file.stat().st_size for file in files},
+    }
+    if freshness == "no index":
+        stored = read_meta(paths.geopackage)
+        own = {key: value for key, value in stored.items() if not key.startswith("roadgeo.")}
+        return description | {"crs": stored.get("roadgeo.crs"), "counts": _row_counts(paths.geopackage), "meta": own}
+    manifest = read_manifest(paths.index)
+    memory = sum(math.prod(entry["shape"]) * np.dtype(entry["dtype"]).itemsize for entry in manifest["arrays"])
+    written = {"format": manifest["format"], "roadgeo": manifest["roadgeo"], "memory_bytes": memory}
+    about = {key: value for key, value in manifest["about"].items() if key not in {"name", "network"}}
+    return description | {"name": manifest["about"].get("name") or description["name"]} | written | about
+
+
+def check_reference(path: str | os.PathLike[str]) -> list[str]:
+    """Verify a reference thoroughly: all digests, all ranges, and that both files agree.
+
+    Returns
+    -------
+    list of str
+        Problems, one sentence each; empty when the reference is sound.
+    """
+    paths = reference_paths(path)
+    if not paths.geopackage.is_file() and not paths.index.is_file():
+        return [f"no reference {path}: expected {paths.geopackage}"]
+    network, problems = None, []
+    if paths.geopackage.is_file():
+        network, found = _check_geopackage(paths.geopackage)
+        problems += found
+    if paths.index.is_file():
+        found = check_index(paths.index)
+        problems += found or _check_content(paths.index, network)
+    return problems
+
+
+# --- building ---------------------------------------------------------------------------------------------------------
+
+
+def _rebuild(paths: ReferencePaths, rebuild: Callable[[RoadNetwork], IndexParts]) -> IndexParts:
+    """Build a missing index, and keep it where that is possible and nobody has written another meanwhile."""
+    network = read_network(paths.geopackage)
+    meta, arrays = rebuild(network)
+    about = _about(network, meta)
+    try:
+        if not paths.index.exists() and stored_digest(paths.geopackage) == about["network"]:
+            write_index(paths.index, dict(meta), arrays, about)
+    except OutputError:  # a reference in a read-only folder serves as well, it only costs this time at every opening
+        pass
+    return meta, arrays
+
+
+def _about(network: RoadNetwork, meta: Mapping[str, Any]) -> dict[str, Any]:
+    """Describe a network and its index for people, in plain values."""
+    found, graph = network.intersections, network.graph
+    area_km2 = sum(map(ring_area, network.coverage)) / 1e6
+    low, high = (graph.coords.min(axis=0), graph.coords.max(axis=0)) if graph.n_edges else (np.zeros(2), np.zeros(2))
+    return {
+        "name": str(network.meta.get("name", "")),
+        "network": network_digest(network),
+        "crs": network.plane.crs,
+        "extent": network.plane.to_crs(np.concatenate([[low], [high]])).ravel().tolist(),
+        "counts": {"intersections": len(found), "roads": graph.n_edges, "nodes": graph.n_nodes},
+        "road_km": float(graph.edge_lengths().sum()) / 1e3,
+        "area_km2": area_km2,
+        "intersections_per_km2": len(found) / area_km2 if area_km2 else None,
+        "tuple_types": _count_tuple_types(found, TUPLE_DISTANCE_M),
+        "index": {key: value for key, value in meta.items() if key not in network.meta},
+        "meta": network.meta,
+    }
+
+
+def _count_tuple_types(found: Intersections, d_max: float) -> dict[str, Any]:
+    """Count pairs of intersections within `d_max` (eq. 8) by branch descriptor d_b, the commonest first (Figure 7)."""
+    from scipy.spatial import KDTree
+
+    types, member = np.unique(np.column_stack([found.n_branches, found.n_tangents]), axis=0, return_inverse=True)
+    trees = [KDTree(found.xy[member.ravel() == i]) for i in range(len(types))]
+    counts = []
+    for i, (b1, q1) in enumerate(types.tolist()):
+        for j, (b2, q2) in enumerate(types[: i + 1].tolist()):
+            n = int(trees[i].count_neighbors(trees[j], d_max))
+            pairs = (n - trees[i].n) // 2 if i == j else n
+            if pairs:
+                counts.append({"d_b": [b1, b2, q1, q2], "tuples": pairs})
+    return {"d_max_m": d_max, "types": sorted(counts, key=lambda entry: -entry["tuples"])}
+
+
+def _row_counts(path: Path) -> dict[str, int]:
+    with open_read_only(path) as database:
+        return {
+            layer: int(database.execute(f"SELECT count(*) FROM {layer}").fetchone()[0])  # noqa: S608 - our own names
+            for layer in ("intersections", "roads")
+        }
+
+
+# --- checking ---------------------------------------------------------------------------------------------------------
+
+
+def _check_geopackage(path: Path) -> tuple[RoadNetwork | None, list[str]]:
+    """Read all of a GeoPackage; the network, if it is one, and what is wrong with it."""
+    try:
+        with open_read_only(path) as database:
+            notes = [note for (note,) in database.execute("PRAGMA integrity_check")]
+            orphans = database.execute("PRAGMA foreign_key_check").fetchall()
+        network = read_network(path)
+        digest = computed_digest(path)
+        stale = stored_digest(path) != digest
+    except IndexFormatError as error:
+        return None, [str(error)]
+    problems = [f"{path}: SQLite finds: {note}" for note in notes if note != "ok"]
+    if orphans:
+        problems.append(f"{path}: {len(orphans)} rows refer to tables or metadata that do not exist")
+    if stale:
+        problems.append(f"{path}: its intersections differ from their stored digest")
+    return network, problems
+
+
+def _check_content(path: Path, network: RoadNetwork | None) -> list[str]:
+    """Check that an undamaged index is one that the search can use, and that of its GeoPackage."""
+    from roadgeo.index import ReferenceIndex, check_table
+
+    about = read_manifest(path)["about"]
+    try:
+        index = ReferenceIndex.from_parts(*read_index(path), path=str(path))
+        check_table(index)
+    except IndexFormatError as error:
+        return [str(error)]
+    if network is None:
+        return []
+    if about.get("network") != network_digest(network):
+        return [f"{path} is stale: it was built from other intersections; delete it and it will be built again"]
+    found = network.intersections
+    source = np.asarray(index.source)
+    if not np.array_equal(np.sort(source), np.arange(len(found))):
+        return [f"{path}: its intersections are not those of the GeoPackage; delete it and it will be built again"]
+    same = np.array_equal(found.xy[source], index.xy)
+    same = same and np.array_equal(found.tangents[source], index.tangents, equal_nan=True)
+    return (
+        [] if same else [f"{path}: its intersections lie elsewhere than the GeoPackage's; delete it to build it again"]
+    )
