@@ -62,7 +62,7 @@ class LazyGroup(click.Group):
 @click.version_option(__version__, prog_name="roadgeo")
 @click.pass_context
 def cli(ctx: click.Context) -> None:
-    r"""Locate aerial images from their roads alone.
+    """Locate aerial images from their roads alone.
 
     \b
       roadgeo index --osm "Boston, MA"      once: fetch and index the roads of a place

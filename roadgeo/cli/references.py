@@ -1,0 +1,169 @@
+"""`roadgeo info`, `check`, `list` and `remove`: what is known of references, and keeping the library tidy."""
+
+from __future__ import annotations
+
+import json
+from typing import Any
+
+import click
+
+from roadgeo.cli import ERROR
+
+__all__ = ["check_command", "info_command", "list_command", "remove_command"]
+
+
+@click.command("info", short_help="Describe a reference.")
+@click.argument("reference", metavar="REF")
+@click.option("--json", "as_json", is_flag=True, help="Print everything that is known as one JSON object.")
+def info_command(reference: str, as_json: bool) -> None:
+    """Describe a reference: a file (REF.gpkg or REF.index) or a name in the library.
+
+    Reads a few kilobytes, whatever the size of the reference, and runs nothing that a file may carry.
+
+    \b
+    Examples:
+      roadgeo info boston-ma
+      roadgeo info maps/porto.gpkg --json
+    """
+    from roadgeo.io_reference import describe_reference
+    from roadgeo.library import resolve_reference
+
+    described = describe_reference(resolve_reference(reference))
+    if as_json:
+        click.echo(json.dumps(described, indent=2))
+        return
+    width = max(len(label) for label, _ in _lines(described))
+    for label, value in _lines(described):
+        click.echo(f"{label:<{width}}  {value}")
+
+
+@click.command("check", short_help="Verify every byte and number of a reference.")
+@click.argument("references", metavar="REF...", nargs=-1, required=True)
+def check_command(references: tuple[str, ...]) -> int:
+    """Verify references thoroughly: all digests, all ranges, and that index and GeoPackage agree.
+
+    `roadgeo locate` checks enough to be safe each time it opens a reference; this checks all, and takes longer.
+    Status 1 if anything is wrong.
+
+    \b
+    Examples:
+      roadgeo check boston-ma
+      roadgeo check maps/*.gpkg
+    """
+    from roadgeo.errors import RoadgeoError
+    from roadgeo.io_reference import check_reference
+    from roadgeo.library import resolve_reference
+
+    status = 0
+    for reference in references:
+        try:
+            problems = check_reference(resolve_reference(reference))
+        except RoadgeoError as error:
+            problems = [str(error)]
+        for problem in problems:
+            click.echo(f"Error: {problem}", err=True)
+        if problems:
+            status = ERROR
+        else:
+            click.echo(f"{reference}: sound")
+    return status
+
+
+@click.command("list", short_help="List the references in the library.")
+@click.option("--json", "as_json", is_flag=True, help="Print one JSON object per reference and line.")
+def list_command(as_json: bool) -> int:
+    """List the references in the library: what `roadgeo locate` searches when it is given no --reference.
+
+    The library is a folder of the user's data; the environment variable ROADGEO_LIBRARY names another.
+
+    \b
+    Examples:
+      roadgeo list
+      roadgeo list --json
+    """
+    from roadgeo.errors import RoadgeoError
+    from roadgeo.io_reference import describe_reference
+    from roadgeo.library import library_dir, list_references
+
+    paths = list_references()
+    if not paths:
+        click.echo(f"The library in {library_dir()} is empty; `roadgeo index` adds to it.", err=True)
+    width = max((len(path.stem) for path in paths), default=0)
+    status = 0
+    for path in paths:
+        try:
+            described = describe_reference(path)
+        except RoadgeoError as error:
+            click.echo(f"Error: {error}", err=True)
+            status = ERROR
+            continue
+        click.echo(json.dumps(described) if as_json else f"{path.stem:<{width}}  {_summary(described)}")
+    return status
+
+
+@click.command("remove", short_help="Remove references from the library.")
+@click.argument("names", metavar="NAME...", nargs=-1, required=True)
+@click.option("-y", "--yes", is_flag=True, help="Do not ask.")
+def remove_command(names: tuple[str, ...], yes: bool) -> None:
+    """Delete references from the library, both files of each.
+
+    \b
+    Examples:
+      roadgeo remove boston-ma
+      roadgeo remove boston-ma porto --yes
+    """
+    from roadgeo.library import library_dir, remove_reference
+
+    if not yes:
+        click.confirm(f"Delete {', '.join(names)} from {library_dir()}?", abort=True, err=True)
+    for name in names:
+        for path in remove_reference(name):
+            click.echo(f"removed {path}")
+
+
+def _lines(described: dict[str, Any]) -> list[tuple[str, str]]:
+    """Label and value of what a person wants to know."""
+    meta, counts = described.get("meta", {}), described.get("counts", {})
+    size = sum(described["files"].values())
+    lines = [
+        ("name", str(described["name"])),
+        ("files", ", ".join(described["files"])),
+        ("size", f"{size / 1e6:.1f} MB"),
+        ("state", _STATES[described["freshness"]]),
+        ("CRS", str(described.get("crs"))),
+        ("intersections", f"{counts.get('intersections', 0):,}"),
+        ("roads", _road_text(described)),
+    ]
+    if described.get("area_km2"):
+        lines.append(("area", f"{described['area_km2']:,.0f} km²"))
+        lines.append(("density", f"{described['intersections_per_km2']:.0f} intersections per km²"))
+    if described.get("memory_bytes"):
+        lines.append(("memory", f"{described['memory_bytes'] / 1e6:.1f} MB, mapped"))
+    types = described.get("tuple_types", {}).get("types", [])
+    if types:
+        commonest = ", ".join(f"{entry['d_b']} {entry['tuples']:,}" for entry in types[:4])
+        lines.append(("tuple types", f"{len(types)}, the commonest: {commonest}"))
+    return lines + [(key, str(value)) for key, value in meta.items() if isinstance(value, str) and key != "name"]
+
+
+_STATES = {
+    "fresh": "ready",
+    "stale": "stale: the GeoPackage was edited; delete the index and it is built again",
+    "no index": "no index: it is built when the reference is first used",
+    "no GeoPackage": "ready; the GeoPackage is missing",
+}
+
+
+def _road_text(described: dict[str, Any]) -> str:
+    count = f"{described.get('counts', {}).get('roads', 0):,}"
+    return f"{count}, {described['road_km']:,.0f} km" if "road_km" in described else count
+
+
+def _summary(described: dict[str, Any]) -> str:
+    counts = described.get("counts", {})
+    parts = [f"{counts.get('intersections', 0):>9,} intersections"]
+    if described.get("area_km2"):
+        parts.append(f"{described['area_km2']:>9,.0f} km²")
+    parts.append(f"{sum(described['files'].values()) / 1e6:>8.1f} MB")
+    state = described["freshness"]
+    return "  ".join(parts) + ("" if state == "fresh" else f"  {state}")
