@@ -37,7 +37,7 @@ from roadgeo.geopackage import Layer, write_layers
 from roadgeo.homography import Homography
 from roadgeo.typing import FloatArray
 
-__all__ = ["SCHEMA", "Truth", "read_truth", "write_truth"]
+__all__ = ["SCHEMA", "Truth", "read_truth", "truth_from_record", "truth_to_record", "write_truth"]
 
 SCHEMA = "roadgeo.truth/1"
 
@@ -120,7 +120,7 @@ def read_truth(path: str | os.PathLike[str], crs: str | None = None) -> list[Tru
         raise RoadSourceError(f"cannot read {source}: {error}; expected a table of truths, CSV or JSON") from error
     try:
         if text.lstrip().startswith("{"):
-            return [_from_record(record, crs) for record in json.loads(text)["queries"]]
+            return [truth_from_record(record, crs) for record in json.loads(text)["queries"]]
         rows = list(csv.DictReader(io.StringIO(text)))
         columns = set(rows[0]) if rows else set()
         if "tile" in columns:
@@ -138,8 +138,8 @@ def read_truth(path: str | os.PathLike[str], crs: str | None = None) -> list[Tru
 # --- ours -------------------------------------------------------------------------------------------------------------
 
 
-def _to_record(truth: Truth) -> dict[str, Any]:
-    """Plain values, the homography as lists."""
+def truth_to_record(truth: Truth) -> dict[str, Any]:
+    """Give a truth as plain values, ready for `json.dumps`, as `truth.json` holds it."""
     center = truth.center
     return {
         "file": truth.file,
@@ -155,7 +155,8 @@ def _to_record(truth: Truth) -> dict[str, Any]:
     }
 
 
-def _from_record(record: dict[str, Any], crs: str | None) -> Truth:
+def truth_from_record(record: dict[str, Any], crs: str | None = None) -> Truth:
+    """Read what `truth_to_record` wrote; `crs` stands in where the record names none."""
     return Truth(
         str(record["file"]),
         str(record["kind"]),
@@ -168,7 +169,7 @@ def _from_record(record: dict[str, Any], crs: str | None) -> Truth:
 
 
 def _to_json(truths: Sequence[Truth]) -> str:
-    return json.dumps({"schema": SCHEMA, "queries": [_to_record(truth) for truth in truths]}, indent=1) + "\n"
+    return json.dumps({"schema": SCHEMA, "queries": [truth_to_record(truth) for truth in truths]}, indent=1) + "\n"
 
 
 def _to_csv(truths: Sequence[Truth]) -> str:
@@ -177,7 +178,7 @@ def _to_csv(truths: Sequence[Truth]) -> str:
     table = csv.writer(text, lineterminator="\n")
     table.writerow([*_OWN_COLUMNS, *names])
     for truth in truths:
-        record = _to_record(truth)
+        record = truth_to_record(truth)
         # repr keeps every digit of a float, so that reading gives the same numbers.
         matrix = [repr(value) for row in record["homography"] for value in row]
         table.writerow(

@@ -1,0 +1,213 @@
+"""Running a locator over a query set: in this process or in several, and on where an interrupted run left off."""
+
+from __future__ import annotations
+
+import json
+import multiprocessing
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from concurrent.futures import ProcessPoolExecutor
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any, Protocol, TypeAlias
+
+import cv2
+
+from roadgeo.errors import OutputError
+from roadgeo.files import write_text
+from roadgeo.io_network import read_network
+from roadgeo.landscape import Landscape
+from roadgeo.simulation import SimulationOptions, simulate_query
+from roadgeo.truth import Truth, truth_from_record, truth_to_record
+from roadgeo.typing import AnyArray
+
+__all__ = ["DrawnMasks", "Locator", "Mask", "MaskFiles", "QuerySet", "Trial", "run_trials"]
+
+SCHEMA = "roadgeo.trials/1"
+
+#: A mask, or the path of one.
+Mask: TypeAlias = AnyArray | str
+
+#: Result of a trial: `Location.to_dict`.
+Answer: TypeAlias = dict[str, Any]
+
+
+class QuerySet(Protocol):
+    """Masks with truth. It is sent to other processes, so it holds paths and options; each process opens it once."""
+
+    def __len__(self) -> int:
+        """How many queries there are."""
+
+    def open(self) -> Callable[[int], tuple[Truth, Mask]]:
+        """Read what is needed and return the function that gives the k-th query."""
+
+
+class Locator(Protocol):
+    """A way of locating masks, sent to other processes like a `QuerySet`."""
+
+    def open(self) -> Callable[[Mask], Answer]:
+        """Open the references and return the function that locates a mask."""
+
+
+@dataclass(frozen=True)
+class MaskFiles:
+    """Masks in a folder."""
+
+    folder: Path
+    truths: tuple[Truth, ...]
+
+    def __len__(self) -> int:
+        """How many masks there are."""
+        return len(self.truths)
+
+    def open(self) -> Callable[[int], tuple[Truth, Mask]]:
+        """Return the function that names the k-th file."""
+        return lambda k: (self.truths[k], str(self.folder / self.truths[k].file))
+
+
+@dataclass(frozen=True)
+class DrawnMasks:
+    """Masks drawn when they are needed, from the roads of a reference.
+
+    Attributes
+    ----------
+    geopackage : Path
+        `REF.gpkg`.
+    sets : tuple of (SimulationOptions, int)
+        Options and number of queries, set by set.
+    """
+
+    geopackage: Path
+    sets: tuple[tuple[SimulationOptions, int], ...]
+
+    def __len__(self) -> int:
+        """How many queries there are."""
+        return sum(count for _, count in self.sets)
+
+    def open(self) -> Callable[[int], tuple[Truth, Mask]]:
+        """Read the roads and return the function that draws the k-th query."""
+        landscape = Landscape.from_network(read_network(self.geopackage))
+        numbered = [(options, k) for options, count in self.sets for k in range(count)]
+
+        def draw(k: int) -> tuple[Truth, Mask]:
+            query = simulate_query(landscape, *numbered[k])
+            return query.truth, query.mask
+
+        return draw
+
+
+@dataclass(frozen=True)
+class Trial:
+    """One query's truth and what the locator answered."""
+
+    truth: Truth
+    answer: Answer
+
+
+def run_trials(
+    queries: QuerySet,
+    locator: Locator,
+    jobs: int = 1,
+    record: Path | None = None,
+    settings: Mapping[str, Any] | None = None,
+    progress: Callable[[Trial], None] | None = None,
+) -> list[Trial]:
+    """Locate every query.
+
+    Parameters
+    ----------
+    jobs : int
+        Processes. The answers do not depend on it, but for the times in them.
+    record : Path, optional
+        JSON lines file that gets every trial as it ends. Trials that it holds already, from a run with the same
+        settings, are not repeated.
+    settings : mapping, optional
+        Plain values that tell this run from others.
+    progress : callable, optional
+        Called with every trial, the recorded ones too, in order.
+
+    Raises
+    ------
+    OutputError
+        The record cannot be written, or belongs to a run with other settings.
+    """
+    done = [] if record is None else _read_record(record, dict(settings or {}))
+    for trial in done:
+        if progress:
+            progress(trial)
+    pending = range(len(done), len(queries))
+    for trial in _results(queries, locator, pending, jobs):
+        if record is not None:
+            _append(record, trial)
+        done.append(trial)
+        if progress:
+            progress(trial)
+    return done
+
+
+# --- running ----------------------------------------------------------------------------------------------------------
+
+_draw: Callable[[int], tuple[Truth, Mask]]
+_locate: Callable[[Mask], Answer]
+
+
+def _results(queries: QuerySet, locator: Locator, pending: Sequence[int], jobs: int) -> Iterator[Trial]:
+    if not pending:
+        return
+    if jobs == 1:
+        draw, locate = queries.open(), locator.open()
+        for k in pending:
+            truth, mask = draw(k)
+            yield Trial(truth, locate(mask))
+        return
+    # Spawned, not forked: the same on every system, and no thread of ours is lost in the child.
+    with ProcessPoolExecutor(
+        min(jobs, len(pending)), multiprocessing.get_context("spawn"), _prepare, (queries, locator)
+    ) as pool:
+        try:
+            yield from pool.map(_run, pending)
+        finally:
+            pool.shutdown(wait=False, cancel_futures=True)
+
+
+def _prepare(queries: QuerySet, locator: Locator) -> None:
+    """Open what a worker process needs, once."""
+    global _draw, _locate
+    cv2.setNumThreads(1)
+    _draw, _locate = queries.open(), locator.open()
+
+
+def _run(k: int) -> Trial:
+    truth, mask = _draw(k)
+    return Trial(truth, _locate(mask))
+
+
+# --- the record -------------------------------------------------------------------------------------------------------
+
+
+def _read_record(path: Path, settings: dict[str, Any]) -> list[Trial]:
+    """Read the trials of an earlier run, or start a record; a line that was cut off is dropped."""
+    head = json.dumps({"schema": SCHEMA, "settings": settings}, sort_keys=True)
+    lines = path.read_text(encoding="utf-8").splitlines() if path.is_file() else []
+    if lines and lines[0] != head:
+        raise OutputError(
+            f"{path} holds trials of another run; choose another folder, or delete the file to begin anew"
+        )
+    trials, kept = [], [head]
+    for line in lines[1:]:
+        try:
+            entry = json.loads(line)
+        except ValueError:
+            break
+        trials.append(Trial(truth_from_record(entry["truth"]), entry["answer"]))
+        kept.append(line)
+    write_text(path, "\n".join(kept) + "\n")
+    return trials
+
+
+def _append(path: Path, trial: Trial) -> None:
+    line = json.dumps({"truth": truth_to_record(trial.truth), "answer": trial.answer})
+    try:
+        with path.open("a", encoding="utf-8") as file:
+            file.write(line + "\n")
+    except OSError as error:
+        raise OutputError(f"cannot write {path}: {error.strerror}; make room or choose another folder") from error
