@@ -1,0 +1,123 @@
+import subprocess
+import sys
+from pathlib import Path
+
+import click
+import pytest
+
+from roadgeo.cli import COMMANDS, LazyGroup, cli, main
+from roadgeo.cli.parameters import BOX, NEAR, RANGE, Numbers
+from roadgeo.errors import RoadgeoError
+
+
+def test_help_imports_click_and_nothing_heavy() -> None:
+    program = "import sys; from roadgeo.cli import main; main(['--help']); print(*sys.modules, file=sys.stderr)"
+    done = subprocess.run([sys.executable, "-c", program], capture_output=True, text=True, check=True)
+    assert "locate" in done.stdout
+    heavy = {"numpy", "cv2", "numba", "rasterio", "pyproj", "rich", "scipy", "pandas", "geopandas", "osmnx"}
+    assert not heavy & set(done.stderr.split())
+
+
+@pytest.mark.parametrize("name", COMMANDS)
+def test_every_command_has_the_name_and_summary_of_the_table_and_examples(name: str) -> None:
+    command = cli.get_command(click.Context(cli), name)
+    assert command is not None
+    assert command.name == name
+    assert command.short_help == COMMANDS[name][1]
+    assert f"roadgeo {name}" in (command.help or "")
+
+
+def test_no_command_shows_help(capfd: pytest.CaptureFixture[str]) -> None:
+    assert main([]) == 2
+    assert "Commands:" in capfd.readouterr().out
+
+
+@pytest.mark.parametrize(
+    ("arguments", "message"),
+    [
+        (["nonesuch"], "Error: No such command 'nonesuch'. Try 'roadgeo --help'.\n"),
+        (["info"], "Error: Missing argument 'REF'. Try 'roadgeo info --help'.\n"),
+    ],
+)
+def test_usage_is_one_line_and_status_2(arguments: list[str], message: str, capfd: pytest.CaptureFixture[str]) -> None:
+    assert main(arguments) == 2
+    assert capfd.readouterr() == ("", message)
+
+
+@pytest.mark.parametrize(
+    ("error", "status", "message"),
+    [
+        (RoadgeoError("no such\nthing"), 1, "Error: no such thing\n"),
+        (KeyboardInterrupt(), 130, "Interrupted.\n"),
+        (ZeroDivisionError("x"), 1, "Error: ZeroDivisionError: x. This is a fault of roadgeo; "),
+    ],
+)
+def test_errors_are_one_line(
+    error: BaseException, status: int, message: str, monkeypatch: pytest.MonkeyPatch, capfd: pytest.CaptureFixture[str]
+) -> None:
+    def fail() -> None:
+        raise error
+
+    monkeypatch.setattr(LazyGroup, "get_command", lambda *_: click.Command("x", callback=fail))
+    assert main(["x"]) == status
+    out, err = capfd.readouterr()
+    assert out == ""
+    assert err.lstrip("\n").startswith(message)  # click ends the line that shows ^C
+    assert err.strip().count("\n") == 0
+
+
+def test_a_traceback_is_there_for_those_who_ask(monkeypatch: pytest.MonkeyPatch) -> None:
+    def fail() -> None:
+        raise ZeroDivisionError
+
+    monkeypatch.setenv("ROADGEO_TRACEBACK", "1")
+    monkeypatch.setattr(LazyGroup, "get_command", lambda *_: click.Command("x", callback=fail))
+    with pytest.raises(ZeroDivisionError):
+        main(["x"])
+
+
+def test_a_reader_that_leaves_is_no_error_with_traceback() -> None:
+    program = "import sys; from roadgeo.cli import main; sys.exit(main(['--help']))"
+    with subprocess.Popen([sys.executable, "-c", program], stdout=subprocess.PIPE, stderr=subprocess.PIPE) as process:
+        process.stdout.close()
+        assert process.stderr.read() == b""
+
+
+@pytest.mark.parametrize(
+    ("kind", "text", "numbers"),
+    [
+        (RANGE, "0.5:2", (0.5, 2.0)),
+        (RANGE, "2:2", (2.0, 2.0)),
+        (NEAR, "-71.1,42.3,5000", (-71.1, 42.3, 5000.0)),
+        (BOX, "179,-19,-179,-16", (179.0, -19.0, -179.0, -16.0)),
+    ],
+)
+def test_numbers_are_read(kind: Numbers, text: str, numbers: tuple[float, ...]) -> None:
+    assert kind.convert(text, None, None) == numbers
+    assert kind.convert(numbers, None, None) == numbers
+
+
+@pytest.mark.parametrize(
+    ("kind", "text"),
+    [
+        (RANGE, "2:1"),
+        (RANGE, "0:1"),
+        (RANGE, "1"),
+        (RANGE, "a:b"),
+        (RANGE, "1:nan"),
+        (NEAR, "42.3,-171.1,10"),
+        (NEAR, "1,1,0"),
+        (NEAR, "1,1"),
+        (BOX, "1,2,3,2"),
+        (BOX, "1,2,1,4"),
+        (BOX, "1,2,190,4"),
+    ],
+)
+def test_numbers_that_make_no_sense_are_refused(kind: Numbers, text: str) -> None:
+    with pytest.raises(click.BadParameter, match="expected"):
+        kind.convert(text, None, None)
+
+
+def test_python_m_roadgeo_is_roadgeo(tmp_path: Path) -> None:
+    done = subprocess.run([sys.executable, "-m", "roadgeo", "--version"], capture_output=True, text=True, check=True)
+    assert done.stdout.startswith("roadgeo")
