@@ -9,7 +9,6 @@ from __future__ import annotations
 import contextlib
 import errno
 import os
-import secrets
 import shutil
 from collections.abc import Iterator
 from pathlib import Path
@@ -98,7 +97,7 @@ def _sync_folder(folder: Path) -> None:
 def _locked_folder(parent: Path) -> tuple[Path, BinaryIO]:
     """Create a staging folder and lock it, so that other writers see that it is in use."""
     while True:
-        folder = parent / f"{_PREFIX}{secrets.token_hex(6)}{_SUFFIX}"
+        folder = parent / f"{_PREFIX}{os.urandom(6).hex()}{_SUFFIX}"
         folder.mkdir()
         try:
             lock = (folder / _LOCK).open("xb")
