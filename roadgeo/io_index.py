@@ -99,19 +99,10 @@ def dump_index(
     offset = _aligned(len(chunks[0]))
     for name, array in arrays.items():
         data = _stored_array(name, array)
-        buffer = data.reshape(-1).view(np.uint8)
-        entries.append(
-            {
-                "name": name,
-                "dtype": _code(data.dtype),
-                "shape": list(data.shape),
-                "offset": offset,
-                "checksum": _checksum(buffer),
-                "digest": _digest(buffer),
-            }
-        )
-        chunks.append(buffer.data)  # type: ignore[arg-type]
-        offset = _aligned(offset + buffer.nbytes)
+        entry = {"name": name, "dtype": _code(data.dtype), "shape": list(data.shape), "offset": offset}
+        entries.append(entry | {"checksum": _checksum(entry, data), "digest": _digest(_bytes(data))})
+        chunks.append(_bytes(data))
+        offset = _aligned(offset + data.nbytes)
     manifest = {
         "format": FORMAT_VERSION,
         "roadgeo": __version__,
@@ -174,7 +165,7 @@ def read_index(path: str | os.PathLike[str]) -> tuple[dict[str, Any], dict[str, 
     arrays = {}
     for entry in manifest["arrays"]:
         array = _view(data, start, entry)
-        if _checksum(array.reshape(-1).view(np.uint8)) != entry["checksum"]:
+        if _checksum(entry, array) != entry["checksum"]:
             _refuse(path, f"its array {entry['name']!r} is damaged (checksum differs)")
         if array.dtype == bool and array.size and array.view(np.uint8).max() > 1:
             _refuse(path, f"its boolean array {entry['name']!r} holds values that are neither true nor false")
@@ -199,7 +190,7 @@ def check_index(path: str | os.PathLike[str]) -> list[str]:
     return [
         f"array {entry['name']!r} differs from its digest"
         for entry in manifest["arrays"]
-        if _digest(_view(data, start, entry).reshape(-1).view(np.uint8)) != entry["digest"]
+        if _digest(_bytes(_view(data, start, entry))) != entry["digest"]
     ]
 
 
@@ -218,14 +209,21 @@ def _digest(data: Any) -> str:
     return blake2b(data, digest_size=16).hexdigest()
 
 
-def _checksum(data: AnyArray) -> str:
-    """Checksum of a contiguous uint8 array at the speed of memory: row and column sums of every MiB, hashed.
+def _bytes(array: AnyArray) -> memoryview:
+    """Bytes of a contiguous array."""
+    return array.reshape(-1).view(np.uint8).data
 
-    The bytes are laid out as 64-bit words in rows of 512. A changed word changes its column's sum and its row's, a
-    moved word or page at least one of them, and the hash keeps the order of everything else.
+
+def _checksum(entry: Mapping[str, Any], array: AnyArray) -> str:
+    """Checksum of an array with its name, type and shape, nearly at the speed of memory.
+
+    Row and column sums of every MiB are hashed. The bytes are laid out as 64-bit words in rows of 512: a changed word
+    changes its column's sum and its row's, a moved word or page at least one of them, and the hash keeps the order of
+    everything else.
     """
     width, height = 512, 256
-    hasher = blake2b(digest_size=16)
+    hasher = blake2b(json.dumps([entry["name"], entry["dtype"], entry["shape"]]).encode(), digest_size=16)
+    data = array.reshape(-1).view(np.uint8)
     n_rows = data.size // (8 * width)
     words = data[: n_rows * 8 * width].view("<u8").reshape(n_rows, width)
     for first in range(0, n_rows, height):

@@ -9,6 +9,7 @@ from __future__ import annotations
 
 import errno
 import json
+import math
 import os
 import sqlite3
 from collections.abc import Mapping, Sequence
@@ -344,7 +345,9 @@ def _with_aliases(style: str, aliases: Mapping[str, str]) -> str:
 def _plane(path: str | os.PathLike[str], meta: Mapping[str, Any]) -> LocalPlane:
     crs, origin = meta.get("roadgeo.crs"), meta.get("roadgeo.origin")
     if isinstance(crs, str) and isinstance(origin, list) and [type(o) for o in origin] == [float, float]:
-        return LocalPlane(crs, (origin[0], origin[1]))
+        x, y = origin
+        if math.isfinite(x) and math.isfinite(y):
+            return LocalPlane(crs, (x, y))
     raise IndexFormatError(f"{path}: its table roadgeo_meta lacks the CRS or the origin; make the file again")
 
 
