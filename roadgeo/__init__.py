@@ -1,5 +1,57 @@
-"""roadgeo: locate an aerial image from its roads alone."""
+"""roadgeo: locate an aerial image from its roads alone.
+
+>>> import roadgeo
+>>> ref = roadgeo.build_reference(roads_gdf)  # or roadgeo.open_reference("boston.gpkg")
+>>> loc = roadgeo.locate("image_mask.tif", ref)
+>>> loc.status, loc.center, loc.log10_odds
+
+Names are imported when they are first used, so that `import roadgeo` costs nothing.
+"""
+
+from __future__ import annotations
+
+import importlib
+from typing import TYPE_CHECKING, Any
 
 from roadgeo._version import __version__
 
-__all__ = ["__version__"]
+if TYPE_CHECKING:
+    from roadgeo.errors import RoadgeoError
+    from roadgeo.grid import RoadMask
+    from roadgeo.location import Location
+    from roadgeo.workflows import BuildOptions, LocateOptions, Reference, build_reference, locate, open_reference
+
+__all__ = [
+    "BuildOptions",
+    "LocateOptions",
+    "Location",
+    "Reference",
+    "RoadMask",
+    "RoadgeoError",
+    "__version__",
+    "build_reference",
+    "locate",
+    "open_reference",
+]
+
+_HOMES = {
+    "BuildOptions": "workflows",
+    "LocateOptions": "workflows",
+    "Location": "location",
+    "Reference": "workflows",
+    "RoadMask": "grid",
+    "RoadgeoError": "errors",
+    "build_reference": "workflows",
+    "locate": "workflows",
+    "open_reference": "workflows",
+}
+
+
+def __getattr__(name: str) -> Any:
+    if name not in _HOMES:
+        raise AttributeError(f"module 'roadgeo' has no attribute {name!r}")
+    return getattr(importlib.import_module(f"roadgeo.{_HOMES[name]}"), name)
+
+
+def __dir__() -> list[str]:
+    return sorted(__all__)

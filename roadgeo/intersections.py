@@ -33,14 +33,14 @@ class IntersectionOptions:
     min_branch_length
         Shorter branches do not count.
     max_shift
-        A centre that its branch lines would move further stays at its node.
+        Centres move no further than this from their node.
     """
 
-    tangent_length: float = 25.0
-    skip_length: float = 5.0
+    tangent_length: float = 45.0
+    skip_length: float = 8.0
     merge_angle_deg: float = 20.0
     min_branch_length: float = 6.0
-    max_shift: float = 6.0
+    max_shift: float = 10.0
 
 
 @dataclass(frozen=True)

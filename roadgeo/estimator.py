@@ -1,0 +1,217 @@
+"""From a query scene to a place on the map: propose, grow, verify and refine, as one problem for the robust loop."""
+
+from __future__ import annotations
+
+import time
+from collections.abc import Iterator
+from dataclasses import dataclass, field, replace
+
+import numpy as np
+
+from roadgeo.camera import CameraOptions, judge, pose
+from roadgeo.index import ReferenceIndex
+from roadgeo.kernels.growth import grow
+from roadgeo.kernels.roads import screen
+from roadgeo.refinement import Refined, RefineOptions, refine
+from roadgeo.scene import Scene
+from roadgeo.triples import Proposals, TripleOptions, propose
+from roadgeo.typing import FloatArray, IntArray
+from roadgeo.verification import Agreement, VerifyOptions, agreement, chance_agreement, log10_odds
+
+__all__ = ["GrowOptions", "Hypothesis", "MatchOptions", "TripleEstimator"]
+
+
+@dataclass(frozen=True)
+class GrowOptions:
+    """How hypotheses grow and when they are given up (see `kernels.growth.grow`)."""
+
+    sigma_m: float = 4.0
+    radius_m: float = 25.0
+    ray_tolerance_deg: float = 25.0
+    perspective_sigma: float = 0.4
+    hit_rate: float = 0.45
+    chance_rate: float = 0.08
+    patience: float = 4.0
+    screen_points: int = 40
+    screen_radius_m: float = 12.0
+    screen_share: float = 0.6
+    min_matched: int = 4
+    max_per_round: int = 150
+    max_verified_per_round: int = 6
+
+
+@dataclass(frozen=True)
+class MatchOptions:
+    """Options of all stages of matching, nested."""
+
+    triples: TripleOptions = field(default_factory=TripleOptions)
+    grow: GrowOptions = field(default_factory=GrowOptions)
+    verify: VerifyOptions = field(default_factory=VerifyOptions)
+    refine: RefineOptions = field(default_factory=RefineOptions)
+    camera: CameraOptions = field(default_factory=CameraOptions)
+    sweeps: tuple[tuple[float, int], ...] = ((8.0, 40), (12.0, 60))
+
+
+@dataclass
+class Hypothesis:
+    """A grown hypothesis and what came of it."""
+
+    matrix: FloatArray
+    seeds: IntArray
+    support: float
+    matched: IntArray
+    refined: Refined | None = None
+    found: Agreement | None = None
+    chance: tuple[float, float, float] = (1.0, 1.0, 1.0)
+    distance: FloatArray | None = None
+    log10_odds: float = -np.inf
+
+
+class TripleEstimator:
+    """Locates a scene by triples of neighbouring intersections; see `robust.Estimator`."""
+
+    def __init__(
+        self,
+        scene: Scene,
+        index: ReferenceIndex,
+        options: MatchOptions | None = None,
+        near: tuple[float, float, float] | None = None,
+    ) -> None:
+        """`near` = (x, y, radius) in plane metres restricts where the middle of the frame may lie."""
+        self.near = near
+        self.refine_s = 0.0
+        self.scene = scene
+        self.index = index
+        self.options = options or MatchOptions()
+        self.n_tuples = self.n_candidates = self.n_hypotheses = self.n_verified = 0
+
+    def rounds(self) -> Iterator[list[Hypothesis]]:
+        """Yield, for one anchor after another, the hypotheses that grew."""
+        options = self.options
+        gsd = options.camera.gsd_m
+        scale = (gsd[0] * 0.5, gsd[1] * 2.0)
+        for tolerance, most in options.sweeps:
+            triples = replace(options.triples, angle_tolerance_deg=tolerance)
+            for n, proposals in enumerate(
+                propose(self.scene.intersections, self.scene.neighbours, self.index, scale, 0.33, triples)
+            ):
+                if n >= most:
+                    break
+                self.n_tuples += proposals.n_tuples
+                self.n_candidates += proposals.n_hits
+                yield self._grow_all(proposals)
+
+    def _screen(self, proposals: Proposals) -> IntArray:
+        """Return the proposals under which the roads around the anchor lie on roads of the map, the best placed first."""
+        options, scene, index = self.options.grow, self.scene, self.index
+        anchor = scene.intersections.xy[proposals.anchor]
+        away = np.hypot(*(scene.points - anchor).T)
+        last = scene.neighbours[proposals.anchor]
+        reach = np.hypot(*(scene.intersections.xy[last[last >= 0]] - anchor).T).max()
+        near = np.argsort(away, kind="stable")[: options.screen_points]
+        near = near[away[near] < reach]
+        shares = np.empty(len(proposals.reference))
+        screen(
+            proposals.reference, proposals.affine, anchor, index.xy, scene.points[near], scene.directions[near],
+            options.screen_radius_m, np.cos(np.radians(options.ray_tolerance_deg)), options.screen_share,
+            index.segments, index.segment_starts, index.segment_ids, index.grid, index.shape, shares,
+        )  # fmt: skip
+        good = shares >= options.screen_share
+        if self.near is not None:
+            det = proposals.affine[:, 0] * proposals.affine[:, 3] - proposals.affine[:, 1] * proposals.affine[:, 2]
+            frame = 2.0 * scene.half_size * np.sqrt(np.maximum(det, 0.0))
+            away_m = np.hypot(*(index.xy[proposals.reference] - self.near[:2]).T)
+            good &= away_m < self.near[2] + frame
+        kept = np.flatnonzero(good)
+        return kept[np.argsort(-(proposals.placed[kept] + shares[kept]), kind="stable")]
+
+    def _grow_all(self, proposals: Proposals) -> list[Hypothesis]:
+        options = self.options.grow
+        scene, index = self.scene, self.index
+        found = scene.intersections
+        anchor = proposals.anchor
+        order = np.argsort(np.hypot(*(found.xy - found.xy[anchor]).T), kind="stable")
+        matched = np.empty(len(found), np.int64)
+        distance = np.empty(len(found))
+        matrix = np.empty((3, 3))
+        grown = []
+        for m in self._screen(proposals)[: options.max_per_round]:
+            self.n_hypotheses += 1
+            n_matched, _, ratio = grow(
+                found.xy, found.rays, order, scene.half_size, anchor, proposals.reference[m], proposals.affine[m],
+                scene.neighbours, proposals.partners[m],
+                index.xy, index.rays, index.point_starts, index.grid, index.shape,
+                options.sigma_m, options.radius_m, np.radians(options.ray_tolerance_deg), options.perspective_sigma,
+                options.hit_rate, options.chance_rate, options.patience, matched, distance, matrix,
+            )  # fmt: skip
+            if n_matched < options.min_matched or not np.isfinite(ratio):
+                continue
+            if judge(matrix, scene.size, self.options.camera):
+                continue
+            slots = proposals.partners[m] >= 0
+            seeds = np.append(scene.neighbours[anchor][slots], anchor)
+            grown.append(Hypothesis(matrix / matrix[2, 2], seeds, ratio, matched.copy()))
+        grown.sort(key=lambda h: -h.support)
+        distinct: list[Hypothesis] = []
+        for h in grown:
+            if len(distinct) == options.max_verified_per_round:
+                break
+            if not any(self.same(h, other) for other in distinct):
+                distinct.append(h)
+        return distinct
+
+    def score(self, model: Hypothesis) -> float:
+        """Refine a hypothesis and return its log10 odds."""
+        started = time.perf_counter()
+        try:
+            return self._verify(model)
+        finally:
+            self.refine_s += time.perf_counter() - started
+
+    def _verify(self, model: Hypothesis) -> float:
+        self.n_verified += 1
+        scene, index, options = self.scene, self.index, self.options
+        matrix, forward = model.matrix, -1.0
+        for _ in range(5):  # more matches make a better fit, and that finds more matches
+            refined = refine(matrix, scene, index, model.matched, options.refine)
+            matrix = refined.matrix
+            if judge(matrix, scene.size, options.camera) or self._is_far(matrix):
+                return -np.inf
+            gsd = pose(matrix, scene.size).gsd_m
+            model.refined = refined
+            model.found, model.matched, model.distance = agreement(
+                matrix, scene, index, gsd, model.seeds, options.verify
+            )
+            if model.found.forward < forward + 0.005:
+                break
+            forward = model.found.forward
+        optimistic = log10_odds(model.found, (0.05, 0.2, 0.25), scene.n_edges, self.n_candidates)
+        if optimistic < 2.0:
+            model.log10_odds = optimistic
+            return optimistic
+        model.chance = chance_agreement(matrix, scene, index, gsd, options.verify)
+        model.log10_odds = log10_odds(model.found, model.chance, scene.n_edges, self.n_candidates)
+        return model.log10_odds
+
+    def _is_far(self, matrix: FloatArray) -> bool:
+        """Whether the middle of the frame lies outside the circle that the user gave."""
+        if self.near is None:
+            return False
+        mapped = matrix @ np.append(self.scene.center, 1.0)
+        return bool(np.hypot(*(mapped[:2] / mapped[2] - self.near[:2])) > self.near[2])
+
+    def settled(self, model: Hypothesis) -> bool:
+        """Whether a hypothesis fits the whole frame, so that no better fit of the same place is to be expected."""
+        return model.found is not None and model.found.forward >= 0.65
+
+    def center(self, model: Hypothesis) -> FloatArray:
+        """Where the middle of the frame lies, in plane metres."""
+        matrix = model.refined.matrix if model.refined is not None else model.matrix
+        mapped = matrix @ np.append(self.scene.center, 1.0)
+        return np.asarray(mapped[:2] / mapped[2])
+
+    def same(self, a: Hypothesis, b: Hypothesis) -> bool:
+        """Whether two hypotheses put the middle of the frame within 50 m, or a twentieth of its size, of each other."""
+        gsd = pose(a.matrix, self.scene.size).gsd_m
+        limit = max(50.0, 0.05 * gsd * self.scene.half_size)
+        return bool(np.hypot(*(self.center(a) - self.center(b))) < limit)

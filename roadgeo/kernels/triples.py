@@ -1,0 +1,390 @@
+"""Triples of neighbouring intersections: their affine-invariant codes, the table of codes, and its look-up.
+
+A triple (X, Y, Z), counterclockwise, is sent by an affine map to an equilateral triangle; two tangent lines at each vertex then
+give six angles that hardly change from map to image. At a vertex with edge vectors e1, e2 to the next two vertices, a
+direction d = alpha e1 + beta e2 has, against the axis towards the triangle's middle, the angle
+atan2((beta - alpha) sin 30, (alpha + beta) cos 30). Angles are measured in units of pi / 192, in cells of 16 units (15 degrees).
+
+Two sorted cells at a vertex make one of 78 pairs, three vertices one of 78^3 table cells. An entry is a uint64:
+`anchor << 32 | slot of Y << 28 | slot of Z << 24 | six 4-bit positions within the cells`, slots being columns of `neighbours`.
+"""
+
+import math
+
+import numpy as np
+from numba import njit
+
+from roadgeo.kernels.rays import rays_agree
+
+UNITS = 192  # per half turn
+CELL_UNITS = 16
+CELLS = UNITS // CELL_UNITS
+PAIRS = CELLS * (CELLS + 1) // 2
+TABLE = PAIRS**3
+
+
+@njit(cache=True)
+def pair_id(low, high):
+    """Number the sorted pair of cells low <= high from 0 to PAIRS - 1."""
+    return low * CELLS - (low * (low - 1)) // 2 + (high - low)
+
+
+@njit(cache=True)
+def vertex_angle(e1x, e1y, e2x, e2y, tangent):
+    """Return a tangent's angle in the equilateral frame, in units, 0 <= angle < UNITS (float)."""
+    dx, dy = math.cos(tangent), math.sin(tangent)
+    alpha = dx * e2y - dy * e2x
+    beta = e1x * dy - e1y * dx
+    angle = math.atan2((beta - alpha) * 0.5, (alpha + beta) * 0.8660254037844386)
+    angle = angle * (UNITS / math.pi)
+    return angle % UNITS
+
+
+@njit(cache=True)
+def vertex_codes(xy, tangents, i, j, k, limit, out):
+    """Write the sorted unit pairs (u1 <= u2) of vertex i of the triangle i, j, k; return how many.
+
+    One pair for every two of the vertex's tangents, at most `limit`, the most distinct directions first.
+    """
+    e1x, e1y = xy[j, 0] - xy[i, 0], xy[j, 1] - xy[i, 1]
+    e2x, e2y = xy[k, 0] - xy[i, 0], xy[k, 1] - xy[i, 1]
+    n = 0
+    m = 0
+    while m < tangents.shape[1] and not np.isnan(tangents[i, m]):
+        m += 1
+    for p in range(m):
+        up = int(vertex_angle(e1x, e1y, e2x, e2y, tangents[i, p])) % UNITS
+        for q in range(p + 1, m):
+            uq = int(vertex_angle(e1x, e1y, e2x, e2y, tangents[i, q])) % UNITS
+            if n < limit:
+                out[n, 0] = min(up, uq)
+                out[n, 1] = max(up, uq)
+                n += 1
+    return n
+
+
+@njit(cache=True)
+def orient(xy, a, b, c, min_shape):
+    """Return +1 if a, b, c run counterclockwise, -1 if clockwise, 0 if the triangle is too thin.
+
+    The shape is twice the area over the square of the longest side: 0.87 for an equilateral triangle, 0 for a line.
+    """
+    abx, aby = xy[b, 0] - xy[a, 0], xy[b, 1] - xy[a, 1]
+    acx, acy = xy[c, 0] - xy[a, 0], xy[c, 1] - xy[a, 1]
+    bcx, bcy = acx - abx, acy - aby
+    cross = abx * acy - aby * acx
+    longest = max(abx * abx + aby * aby, acx * acx + acy * acy, bcx * bcx + bcy * bcy)
+    if abs(cross) < min_shape * longest:
+        return 0
+    return 1 if cross > 0 else -1
+
+
+@njit(cache=True)
+def has_both(neighbours, i, j, k):
+    """Whether j and k both stand among the neighbours of i."""
+    found = 0
+    for s in range(neighbours.shape[1]):
+        if neighbours[i, s] == j or neighbours[i, s] == k:
+            found += 1
+    return found == 2
+
+
+@njit(cache=True)
+def fill_table(xy, tangents, neighbours, min_shape, limit, starts, entries):
+    """Count codes per table cell, or write the entries.
+
+    With an empty `entries`, `starts[cell + 1]` is incremented for every code. Otherwise `starts` holds each cell's first free
+    place, and is moved on as entries are written. A triple that several vertices could anchor is stored once, by the lowest
+    of them.
+    """
+    write = entries.shape[0] > 0
+    codes = np.empty((3, limit, 2), np.int64)
+    n = np.empty(3, np.int64)
+    total = 0
+    for a in range(xy.shape[0]):
+        for s in range(neighbours.shape[1]):
+            b0 = neighbours[a, s]
+            if b0 < 0:
+                break
+            for t in range(s + 1, neighbours.shape[1]):
+                c0 = neighbours[a, t]
+                if c0 < 0:
+                    break
+                turn = orient(xy, a, b0, c0, min_shape)
+                if turn == 0:
+                    continue
+                if (b0 < a and has_both(neighbours, b0, a, c0)) or (c0 < a and has_both(neighbours, c0, a, b0)):
+                    continue
+                b, c, sb, sc = (b0, c0, s, t) if turn > 0 else (c0, b0, t, s)
+                n[0] = vertex_codes(xy, tangents, a, b, c, limit, codes[0])
+                n[1] = vertex_codes(xy, tangents, b, c, a, limit, codes[1])
+                n[2] = vertex_codes(xy, tangents, c, a, b, limit, codes[2])
+                for p in range(n[0]):
+                    for q in range(n[1]):
+                        for r in range(n[2]):
+                            cell = 0
+                            fine = np.uint64(0)
+                            for v in range(3):
+                                w = p if v == 0 else (q if v == 1 else r)
+                                u1, u2 = codes[v, w, 0], codes[v, w, 1]
+                                cell = cell * PAIRS + pair_id(u1 // CELL_UNITS, u2 // CELL_UNITS)
+                                fine = (fine << np.uint64(8)) | np.uint64((u1 % CELL_UNITS) * 16 + u2 % CELL_UNITS)
+                            if write:
+                                head = (np.uint64(a) << np.uint64(32)) | np.uint64((sb << 28) | (sc << 24))
+                                entries[starts[cell]] = head | fine
+                                starts[cell] += 1
+                            else:
+                                starts[cell + 1] += 1
+                            total += 1
+    return total
+
+
+@njit(cache=True)
+def vertex_probes(u1, u2, tolerance, probes):
+    """Write (pair, low1, high1, low2, high2) for every pair of cells that may hold (u1, u2) +- tolerance; return how many.
+
+    The bounds are positions within the cells of the entry's first and second angle.
+    """
+    n = 0
+    first = (u1 - tolerance) // CELL_UNITS
+    last = (u1 + tolerance) // CELL_UNITS
+    for c1 in range(first, last + 1):
+        low1 = max(u1 - tolerance - c1 * CELL_UNITS, 0)
+        high1 = min(u1 + tolerance - c1 * CELL_UNITS, CELL_UNITS - 1)
+        s1 = c1 % CELLS
+        for c2 in range((u2 - tolerance) // CELL_UNITS, (u2 + tolerance) // CELL_UNITS + 1):
+            low2 = max(u2 - tolerance - c2 * CELL_UNITS, 0)
+            high2 = min(u2 + tolerance - c2 * CELL_UNITS, CELL_UNITS - 1)
+            s2 = c2 % CELLS
+            if s1 <= s2:
+                probes[n, 0] = pair_id(s1, s2)
+                probes[n, 1], probes[n, 2], probes[n, 3], probes[n, 4] = low1, high1, low2, high2
+                n += 1
+            if s2 <= s1:
+                if s1 == s2 and low1 == low2 and high1 == high2:
+                    continue
+                probes[n, 0] = pair_id(s2, s1)
+                probes[n, 1], probes[n, 2], probes[n, 3], probes[n, 4] = low2, high2, low1, high1
+                n += 1
+    return n
+
+
+@njit(cache=True)
+def triple_codes(xy, tangents, a, b, c, limit, codes, n):
+    """Fill `codes[v, :n[v]]` for the three vertices of the counterclockwise triangle a, b, c."""
+    n[0] = vertex_codes(xy, tangents, a, b, c, limit, codes[0])
+    n[1] = vertex_codes(xy, tangents, b, c, a, limit, codes[1])
+    n[2] = vertex_codes(xy, tangents, c, a, b, limit, codes[2])
+
+
+@njit(cache=True)
+def count_alike(xy, tangents, neighbours, min_shape, limit, starts, costs):
+    """Fill `costs[a, s, t]` with the number of table entries in the very cells of the triple (a, slot s, slot t).
+
+    -1 where there is no such triple. It says how common a triple is on the map: cheap ones are looked up first.
+    """
+    codes = np.empty((3, limit, 2), np.int64)
+    n = np.empty(3, np.int64)
+    costs[:] = -1
+    for a in range(xy.shape[0]):
+        for s in range(neighbours.shape[1]):
+            b0 = neighbours[a, s]
+            if b0 < 0:
+                break
+            for t in range(s + 1, neighbours.shape[1]):
+                c0 = neighbours[a, t]
+                if c0 < 0:
+                    break
+                turn = orient(xy, a, b0, c0, min_shape)
+                if turn == 0:
+                    continue
+                b, c = (b0, c0) if turn > 0 else (c0, b0)
+                triple_codes(xy, tangents, a, b, c, limit, codes, n)
+                total = 0
+                for p in range(n[0]):
+                    for q in range(n[1]):
+                        for r in range(n[2]):
+                            k0 = pair_id(codes[0, p, 0] // CELL_UNITS, codes[0, p, 1] // CELL_UNITS)
+                            k1 = pair_id(codes[1, q, 0] // CELL_UNITS, codes[1, q, 1] // CELL_UNITS)
+                            k2 = pair_id(codes[2, r, 0] // CELL_UNITS, codes[2, r, 1] // CELL_UNITS)
+                            for cell in (
+                                (k0 * PAIRS + k1) * PAIRS + k2,
+                                (k2 * PAIRS + k0) * PAIRS + k1,
+                                (k1 * PAIRS + k2) * PAIRS + k0,
+                            ):
+                                total += starts[cell + 1] - starts[cell]
+                costs[a, s, t] = total if n[0] * n[1] * n[2] > 0 else -1
+
+
+@njit(cache=True)
+def look_up(
+    xy, rays, tangents, a, s, t, neighbours, limit, tolerance, ray_tolerance,
+    ref_xy, ref_rays, ref_neighbours, starts, entries, scale, min_ratio, hit_ids, hit_affine, n_hits,
+):  # fmt: skip
+    """Append the map's triples whose codes agree with those of the query triple (a, slot s, slot t) within `tolerance` units.
+
+    A hit is `hit_ids` = (A, slot of b, B, slot of c, C), b and c counterclockwise after a, and `hit_affine` = the 2 x 2 matrix
+    (row-major) that takes the query triangle to the reference triangle. Gates: `scale` = (least, greatest) root of its determinant,
+    and `min_ratio`, the least ratio of its singular values. Returns (hits so far, entries compared).
+    """
+    b, c = neighbours[a, s], neighbours[a, t]
+    abx, aby = xy[b, 0] - xy[a, 0], xy[b, 1] - xy[a, 1]
+    acx, acy = xy[c, 0] - xy[a, 0], xy[c, 1] - xy[a, 1]
+    if abx * acy - aby * acx < 0:
+        b, c, s, t = c, b, t, s
+        abx, aby, acx, acy = acx, acy, abx, aby
+    cross = abx * acy - aby * acx
+    codes = np.empty((3, limit, 2), np.int64)
+    n = np.empty(3, np.int64)
+    triple_codes(xy, tangents, a, b, c, limit, codes, n)
+    probes = np.empty((3, 64, 5), np.int64)
+    n_probes = np.empty(3, np.int64)
+    compared = 0
+    for p in range(n[0]):
+        n_probes[0] = vertex_probes(codes[0, p, 0], codes[0, p, 1], tolerance, probes[0])
+        for q in range(n[1]):
+            n_probes[1] = vertex_probes(codes[1, q, 0], codes[1, q, 1], tolerance, probes[1])
+            for r in range(n[2]):
+                n_probes[2] = vertex_probes(codes[2, r, 0], codes[2, r, 1], tolerance, probes[2])
+                for turn in range(3):
+                    # The stored triple may start at another vertex: X, Y, Z = a, b, c or c, a, b or b, c, a.
+                    vx, vy, vz = (0, 1, 2) if turn == 0 else ((2, 0, 1) if turn == 1 else (1, 2, 0))
+                    for i in range(n_probes[vx]):
+                        ki = probes[vx, i, 0] * PAIRS
+                        for j in range(n_probes[vy]):
+                            kj = (ki + probes[vy, j, 0]) * PAIRS
+                            for k in range(n_probes[vz]):
+                                cell = kj + probes[vz, k, 0]
+                                for e in range(starts[cell], starts[cell + 1]):
+                                    compared += 1
+                                    entry = entries[e]
+                                    fine = np.int64(entry & np.uint64(0xFFFFFF))
+                                    f = fine >> 20
+                                    if f < probes[vx, i, 1] or f > probes[vx, i, 2]:
+                                        continue
+                                    f = (fine >> 16) & 15
+                                    if f < probes[vx, i, 3] or f > probes[vx, i, 4]:
+                                        continue
+                                    f = (fine >> 12) & 15
+                                    if f < probes[vy, j, 1] or f > probes[vy, j, 2]:
+                                        continue
+                                    f = (fine >> 8) & 15
+                                    if f < probes[vy, j, 3] or f > probes[vy, j, 4]:
+                                        continue
+                                    f = (fine >> 4) & 15
+                                    if f < probes[vz, k, 1] or f > probes[vz, k, 2]:
+                                        continue
+                                    f = fine & 15
+                                    if f < probes[vz, k, 3] or f > probes[vz, k, 4]:
+                                        continue
+                                    x = np.int64(entry >> np.uint64(32))
+                                    y = np.int64((entry >> np.uint64(28)) & np.uint64(15))
+                                    z = np.int64((entry >> np.uint64(24)) & np.uint64(15))
+                                    # A file's bits may have been flipped: no entry is believed.
+                                    if x >= ref_xy.shape[0] or max(y, z) >= ref_neighbours.shape[1]:
+                                        continue
+                                    y, z = np.int64(ref_neighbours[x, y]), np.int64(ref_neighbours[x, z])
+                                    if min(y, z) < 0:
+                                        continue
+                                    if turn == 1:
+                                        x, y, z = y, z, x
+                                    elif turn == 2:
+                                        x, y, z = z, x, y
+                                    bx, by = ref_xy[y, 0] - ref_xy[x, 0], ref_xy[y, 1] - ref_xy[x, 1]
+                                    cx, cy = ref_xy[z, 0] - ref_xy[x, 0], ref_xy[z, 1] - ref_xy[x, 1]
+                                    det = (bx * cy - by * cx) / cross
+                                    if det < scale[0] * scale[0] or det > scale[1] * scale[1]:
+                                        continue
+                                    j00 = (bx * acy - cx * aby) / cross
+                                    j01 = (cx * abx - bx * acx) / cross
+                                    j10 = (by * acy - cy * aby) / cross
+                                    j11 = (cy * abx - by * acx) / cross
+                                    # singular values s1 >= s2: s1 s2 = det, s1^2 + s2^2 = |J|^2
+                                    square = j00 * j00 + j01 * j01 + j10 * j10 + j11 * j11
+                                    if square * min_ratio > det * (1.0 + min_ratio * min_ratio):
+                                        continue
+                                    if not (
+                                        rays_agree(rays, a, ref_rays, x, j00, j01, j10, j11, ray_tolerance)
+                                        and rays_agree(rays, b, ref_rays, y, j00, j01, j10, j11, ray_tolerance)
+                                        and rays_agree(rays, c, ref_rays, z, j00, j01, j10, j11, ray_tolerance)
+                                    ):
+                                        continue
+                                    if n_hits >= hit_ids.shape[0]:
+                                        return n_hits, compared
+                                    hit_ids[n_hits, 0] = x
+                                    hit_ids[n_hits, 1] = s
+                                    hit_ids[n_hits, 2] = y
+                                    hit_ids[n_hits, 3] = t
+                                    hit_ids[n_hits, 4] = z
+                                    hit_affine[n_hits, 0] = j00
+                                    hit_affine[n_hits, 1] = j01
+                                    hit_affine[n_hits, 2] = j10
+                                    hit_affine[n_hits, 3] = j11
+                                    n_hits += 1
+    return n_hits, compared
+
+
+@njit(cache=True)
+def gather(hit_ids, hit_affine, order, n_slots, tolerance, out_ids, out_affine, out_score):
+    """Find map intersections A on which hits from different triples of one anchor agree; return how many.
+
+    `order` sorts the hits by A. Two hits agree when they send the neighbours they share to the same places and their affine maps
+    differ by less than `tolerance` of their size. For each A the hit with most agreement becomes a proposal: `out_ids` =
+    (A, then for each neighbour slot its partner or -1), `out_affine` the mean map, `out_score` the number of neighbours placed.
+    """
+    n = 0
+    partner = np.empty(n_slots, np.int64)
+    start = 0
+    while start < order.shape[0]:
+        stop = start + 1
+        a = hit_ids[order[start], 0]
+        while stop < order.shape[0] and hit_ids[order[stop], 0] == a:
+            stop += 1
+        if stop - start >= 2 and n < out_score.shape[0]:
+            best = 2
+            size = min(stop - start, 200)
+            for i in range(start, start + size):
+                u = order[i]
+                det = hit_affine[u, 0] * hit_affine[u, 3] - hit_affine[u, 1] * hit_affine[u, 2]
+                limit = tolerance * tolerance * det * 2.0
+                partner[:] = -1
+                partner[hit_ids[u, 1]] = hit_ids[u, 2]
+                partner[hit_ids[u, 3]] = hit_ids[u, 4]
+                placed = 2
+                m00, m01, m10, m11, m = 0.0, 0.0, 0.0, 0.0, 0
+                for j in range(start, start + size):
+                    v = order[j]
+                    d00 = hit_affine[v, 0] - hit_affine[u, 0]
+                    d01 = hit_affine[v, 1] - hit_affine[u, 1]
+                    d10 = hit_affine[v, 2] - hit_affine[u, 2]
+                    d11 = hit_affine[v, 3] - hit_affine[u, 3]
+                    if d00 * d00 + d01 * d01 + d10 * d10 + d11 * d11 > limit:
+                        continue
+                    sb, sc = hit_ids[v, 1], hit_ids[v, 3]
+                    pb, pc = hit_ids[v, 2], hit_ids[v, 4]
+                    if (partner[sb] >= 0 and partner[sb] != pb) or (partner[sc] >= 0 and partner[sc] != pc):
+                        continue
+                    if partner[sb] < 0:
+                        partner[sb] = pb
+                        placed += 1
+                    if partner[sc] < 0:
+                        partner[sc] = pc
+                        placed += 1
+                    m00 += hit_affine[v, 0]
+                    m01 += hit_affine[v, 1]
+                    m10 += hit_affine[v, 2]
+                    m11 += hit_affine[v, 3]
+                    m += 1
+                if placed > best:
+                    best = placed
+                    out_ids[n, 0] = a
+                    out_ids[n, 1 : 1 + n_slots] = partner
+                    out_affine[n, 0] = m00 / m
+                    out_affine[n, 1] = m01 / m
+                    out_affine[n, 2] = m10 / m
+                    out_affine[n, 3] = m11 / m
+                    out_score[n] = placed
+            if best > 2:
+                n += 1
+        start = stop
+    return n

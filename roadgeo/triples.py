@@ -1,0 +1,108 @@
+"""Hypotheses from triples of neighbouring intersections.
+
+For one query intersection (the anchor) all triples with two of its nearest neighbours are looked up in the reference's table.
+Hits of different triples that put the anchor on the same map intersection, with nearly the same affine map, make a proposal:
+one triple alone may agree by chance with thousands of others, two or three that share an anchor hardly ever.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from dataclasses import dataclass
+
+import numpy as np
+
+from roadgeo.index import ReferenceIndex
+from roadgeo.intersections import Intersections
+from roadgeo.kernels.triples import count_alike, gather, look_up
+from roadgeo.typing import FloatArray, Int32Array, IntArray
+
+__all__ = ["Proposals", "TripleOptions", "propose"]
+
+
+@dataclass(frozen=True)
+class TripleOptions:
+    """How triples are looked up and gathered."""
+
+    n_neighbours: int = 8
+    min_shape: float = 0.12
+    codes_per_vertex: int = 3
+    angle_tolerance_deg: float = 10.0
+    ray_tolerance_deg: float = 25.0
+    affine_tolerance: float = 0.3
+    max_hits: int = 200_000
+
+
+@dataclass(frozen=True)
+class Proposals:
+    """What one anchor proposes. Dimensions: M proposals, K neighbour slots.
+
+    Attributes
+    ----------
+    anchor : int
+        The query intersection.
+    reference : (M,) int
+        Map intersections it may be.
+    partners : (M, K) int
+        Map intersections of the anchor's neighbours, -1 where not placed.
+    affine : (M, 4) float64
+        The 2 x 2 map (row-major) from query to reference around the anchor.
+    placed : (M,) int
+        Neighbours placed; proposals stand in descending order of it.
+    """
+
+    anchor: int
+    reference: IntArray
+    partners: IntArray
+    affine: FloatArray
+    placed: IntArray
+    n_tuples: int
+    n_candidates: int
+    n_hits: int
+
+
+def propose(
+    query: Intersections,
+    neighbours: Int32Array,
+    index: ReferenceIndex,
+    scale: tuple[float, float],
+    min_ratio: float,
+    options: TripleOptions,
+) -> Iterator[Proposals]:
+    """Yield the proposals of one anchor after another, those anchors first whose triples are rare on the map."""
+    k = neighbours.shape[1]
+    costs = np.empty((len(query), k, k), np.int64)
+    count_alike(
+        query.xy, query.tangents, neighbours, options.min_shape, options.codes_per_vertex, index.table_starts, costs
+    )
+    tolerance = round(options.angle_tolerance_deg * 192 / 180)
+    ids = np.empty((options.max_hits, 5), np.int64)
+    affine = np.empty((options.max_hits, 4))
+    usable = costs >= 0
+    total = np.where(usable, costs, 0).sum(axis=(1, 2))
+    n_usable = usable.sum(axis=(1, 2))
+    anchors = np.argsort(np.where(n_usable >= 3, total / np.maximum(n_usable, 1), np.inf), kind="stable")
+    for a in anchors:
+        if n_usable[a] < 3:
+            break
+        slots = np.argwhere(usable[a])
+        slots = slots[np.argsort(costs[a][usable[a]], kind="stable")]
+        n_hits = n_compared = 0
+        for s, t in slots:
+            n_hits, compared = look_up(
+                query.xy, query.rays, query.tangents, a, s, t, neighbours, options.codes_per_vertex, tolerance,
+                np.radians(options.ray_tolerance_deg),
+                index.xy, index.rays, index.neighbours, index.table_starts, index.table_entries, scale, min_ratio,
+                ids, affine, n_hits,
+            )  # fmt: skip
+            n_compared += compared
+        out_ids = np.empty((max(n_hits // 2, 1), k + 1), np.int64)
+        out_affine = np.empty((len(out_ids), 4))
+        out_placed = np.empty(len(out_ids), np.int64)
+        order = np.argsort(ids[:n_hits, 0], kind="stable")
+        n = gather(ids, affine, order, k, options.affine_tolerance, out_ids, out_affine, out_placed)
+        best = np.argsort(-out_placed[:n], kind="stable")
+        yield Proposals(
+            int(a), out_ids[best, 0], out_ids[best, 1:], out_affine[best], out_placed[best],
+            len(slots), n_compared, n_hits,
+        )  # fmt: skip

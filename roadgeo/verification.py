@@ -1,0 +1,171 @@
+"""How strongly a place is supported, against chance on this very map.
+
+Three kinds of evidence are counted, each once: intersections of the query that meet one of the map with agreeing branches (those
+that made the hypothesis left out), road points of the query that lie on a road of the map, and roads of the map inside the
+footprint that the query shows. What chance would give is measured at hand: the same query is laid over the same map at many
+shifted positions, and the best of those is the null. In a city of equal blocks a shift by one block fits almost as well, and then
+even a good fit is weak evidence.
+"""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass
+
+import numpy as np
+
+from roadgeo.index import ReferenceIndex
+from roadgeo.kernels.growth import match_all
+from roadgeo.kernels.roads import backward_agreement, forward_distances
+from roadgeo.scene import Scene
+from roadgeo.typing import FloatArray, IntArray
+
+__all__ = ["Agreement", "VerifyOptions", "agreement", "chance_agreement", "log10_odds", "tolerance_m"]
+
+
+@dataclass(frozen=True)
+class VerifyOptions:
+    """Tolerances and the null model.
+
+    Attributes
+    ----------
+    map_sigma_m : float
+        Usual distance between a mapped road and the road.
+    pixel_sigma_px : float
+        Usual error of a traced road in pixels.
+    n_shifts : int
+        Shifted positions of the null model.
+    """
+
+    map_sigma_m: float = 1.8
+    pixel_sigma_px: float = 1.0
+    max_turn_deg: float = 25.0
+    ray_tolerance_deg: float = 25.0
+    backward_step_m: float = 12.0
+    shift_m: tuple[float, float] = (30.0, 320.0)
+    n_shifts: int = 150
+    n_null_points: int = 150
+
+
+@dataclass(frozen=True)
+class Agreement:
+    """Hits and trials of the three kinds of evidence."""
+
+    matched: int
+    tested: int
+    forward: float
+    backward: float
+    n_seen: int
+
+    @property
+    def rate(self) -> float:
+        """Share of intersections matched."""
+        return self.matched / max(self.tested, 1)
+
+
+def tolerance_m(gsd_m: float, options: VerifyOptions) -> float:
+    """Three standard deviations of a road's place, map and mask together, in metres."""
+    return 3.0 * math.hypot(options.map_sigma_m, options.pixel_sigma_px * gsd_m)
+
+
+def _bounds(matrix: FloatArray, scene: Scene) -> FloatArray:
+    corners = np.c_[scene.corners, np.ones(4)] @ matrix.T
+    ground = corners[:, :2] / corners[:, 2:]
+    return np.concatenate([ground.min(axis=0), ground.max(axis=0)])
+
+
+def agreement(
+    matrix: FloatArray,
+    scene: Scene,
+    index: ReferenceIndex,
+    gsd_m: float,
+    seeds: IntArray,
+    options: VerifyOptions,
+) -> tuple[Agreement, IntArray, FloatArray]:
+    """Compare query and map under `matrix`; return the agreement, the matches (N,) or -1, and their distances in metres.
+
+    `seeds` are query intersections that made the hypothesis: they are matched but not counted.
+    """
+    tolerance = tolerance_m(gsd_m, options)
+    found = scene.intersections
+    matched = np.empty(len(found), np.int64)
+    distance = np.empty(len(found))
+    match_all(
+        matrix, found.xy, found.rays, 1.5 * tolerance, np.radians(options.ray_tolerance_deg), 0.0, 0.0, True,
+        index.xy, index.rays, index.point_starts, index.grid, index.shape, matched, distance,
+    )  # fmt: skip
+    counted = np.ones(len(found), bool)
+    counted[seeds] = False
+    out = np.empty(len(scene.points))
+    min_cos = math.cos(math.radians(options.max_turn_deg))
+    roads = (index.segments, index.segment_starts, index.segment_ids, index.grid, index.shape)
+    near = forward_distances(
+        matrix, scene.points, scene.directions, tolerance, min_cos, 0.0, 0.0, *roads, out
+    )
+    seen, shown = backward_agreement(
+        np.linalg.inv(matrix), _bounds(matrix, scene), options.backward_step_m, tolerance, 0.0, 0.0, *roads,
+        scene.field, scene.field_scale, scene.observed,
+    )  # fmt: skip
+    result = Agreement(
+        int((matched[counted] >= 0).sum()), int(counted.sum()),
+        near / max(len(out), 1), shown / max(seen, 1), seen,
+    )  # fmt: skip
+    return result, matched, distance
+
+
+def chance_agreement(
+    matrix: FloatArray, scene: Scene, index: ReferenceIndex, gsd_m: float, options: VerifyOptions
+) -> tuple[float, float, float]:
+    """Return the rates (intersections, forward, backward) that the best shifted positions reach.
+
+    Shifts lie on a sunflower spiral between the two radii of `shift_m`, so that all directions and distances are met evenly.
+    """
+    tolerance = tolerance_m(gsd_m, options)
+    found = scene.intersections
+    matched = np.empty(len(found), np.int64)
+    distance = np.empty(len(found))
+    thin = max(1, len(scene.points) // options.n_null_points)
+    points, directions = scene.points[::thin], scene.directions[::thin]
+    out = np.empty(len(points))
+    min_cos = math.cos(math.radians(options.max_turn_deg))
+    roads = (index.segments, index.segment_starts, index.segment_ids, index.grid, index.shape)
+    inverse, bounds = np.linalg.inv(matrix), _bounds(matrix, scene)
+    k = np.arange(options.n_shifts)
+    low, high = options.shift_m
+    radius = np.sqrt(low**2 + (high**2 - low**2) * (k + 0.5) / options.n_shifts)
+    angle = k * math.pi * (3.0 - math.sqrt(5.0))
+    rates = np.empty((options.n_shifts, 3))
+    for i, (dx, dy) in enumerate(zip(radius * np.cos(angle), radius * np.sin(angle), strict=True)):
+        n = match_all(
+            matrix, found.xy, found.rays, 1.5 * tolerance, np.radians(options.ray_tolerance_deg), dx, dy, False,
+            index.xy, index.rays, index.point_starts, index.grid, index.shape, matched, distance,
+        )  # fmt: skip
+        near = forward_distances(matrix, points, directions, tolerance, min_cos, dx, dy, *roads, out)
+        rates[i, 0] = n / max(len(found), 1)
+        rates[i, 1] = near / max(len(out), 1)
+    best = np.argsort(-rates[:, 1])[:12]
+    for i in best:
+        dx, dy = radius[i] * math.cos(angle[i]), radius[i] * math.sin(angle[i])
+        seen, shown = backward_agreement(
+            inverse, bounds, 2 * options.backward_step_m, tolerance, dx, dy, *roads,
+            scene.field, scene.field_scale, scene.observed,
+        )  # fmt: skip
+        rates[i, 2] = shown / max(seen, 1)
+    return float(rates[:, 0].max()), float(rates[:, 1].max()), float(rates[best, 2].max())
+
+
+def _information(rate: float, chance: float) -> float:
+    """Log-likelihood ratio in nats per trial: a rate against the chance rate, negative where the rate is the lower."""
+    rate = min(max(rate, 1e-3), 1.0 - 1e-3)
+    chance = min(max(chance, 0.02), 0.98)
+    nats = rate * math.log(rate / chance) + (1.0 - rate) * math.log((1.0 - rate) / (1.0 - chance))
+    return nats if rate > chance else -nats
+
+
+def log10_odds(
+    found: Agreement, chance: tuple[float, float, float], n_roads: float, n_candidates: int
+) -> float:
+    """Log10 odds of a place against chance, corrected for the candidates tried."""
+    nats = found.tested * _information(found.rate, chance[0])
+    nats += 0.5 * n_roads * (_information(found.forward, chance[1]) + _information(found.backward, chance[2]))
+    return (nats - math.log(max(n_candidates, 1))) / math.log(10.0)

@@ -1,0 +1,431 @@
+"""The two straight lines: roads to a reference, and a mask to a place on it."""
+
+from __future__ import annotations
+
+import math
+import time
+from collections.abc import Sequence
+from dataclasses import dataclass, field, replace
+from functools import lru_cache
+from pathlib import Path
+from typing import TYPE_CHECKING, Any, Literal
+
+import numpy as np
+
+from roadgeo.camera import pose
+from roadgeo.errors import RoadSourceError
+from roadgeo.estimator import Hypothesis, MatchOptions, TripleEstimator
+from roadgeo.graph import RoadGraph
+from roadgeo.grid import PIXEL_TO_PLANE, RoadMask
+from roadgeo.homography import Homography
+from roadgeo.index import IndexOptions, ReferenceIndex, build_index
+from roadgeo.intersections import IntersectionOptions, Intersections, find_intersections
+from roadgeo.location import Evidence, Location, Place, Seconds, Stats
+from roadgeo.network import RoadNetwork
+from roadgeo.pairs import PairIndex, PairOptions, build_pair_index, match_pairs
+from roadgeo.projection import LocalPlane
+from roadgeo.robust import SearchOptions, SearchResult, search
+from roadgeo.scene import Scene, SceneOptions, prepare_scene
+from roadgeo.simplification import SimplifyOptions, planarize, simplify
+from roadgeo.typing import AnyArray, FloatArray, IntArray
+from roadgeo.vectorization import VectorizeOptions, vectorize
+
+if TYPE_CHECKING:
+    import geopandas as gpd
+
+__all__ = [
+    "BuildOptions",
+    "LocateOptions",
+    "QueryOptions",
+    "Reference",
+    "build_network",
+    "build_reference",
+    "locate",
+    "open_reference",
+    "trace_query",
+]
+
+
+# --- roads to a reference ---------------------------------------------------------------------------------------------
+
+
+@dataclass(frozen=True)
+class BuildOptions:
+    """Options of all stages of building a reference; lengths in metres."""
+
+    simplify: SimplifyOptions = field(default_factory=SimplifyOptions)
+    intersections: IntersectionOptions = field(default_factory=IntersectionOptions)
+    index: IndexOptions = field(default_factory=IndexOptions)
+
+
+@dataclass(frozen=True)
+class Reference:
+    """A searchable road map: its index, and the network it was built from where that is at hand."""
+
+    index: ReferenceIndex
+    network: RoadNetwork | None = None
+
+    @property
+    def name(self) -> str:
+        """What the user calls it."""
+        return self.index.name
+
+    def save(self, path: str | Path) -> None:
+        """Write `path`.gpkg and `path`.index (see `io_reference.write_reference`)."""
+        from roadgeo.io_reference import write_reference
+
+        if self.network is None:
+            raise RoadSourceError(f"{self.name}: opened from a file, there is nothing new to save")
+        write_reference(path, self.network, (self.index.meta, self.index.arrays()))
+
+
+def build_network(
+    lines: Sequence[Any] | AnyArray, plane: LocalPlane, meta: dict[str, Any], options: BuildOptions | None = None
+) -> RoadNetwork:
+    """Draw road lines (shapely, in plane metres) as a mask sees them, and find their intersections."""
+    from roadgeo.simplification import coverage
+
+    options = options or BuildOptions()
+    graph = simplify(planarize(lines), options.simplify)
+    found = find_intersections(graph, options.intersections)
+    return RoadNetwork(graph, found, plane, tuple(coverage(graph)), meta)
+
+
+def build_reference(
+    roads: gpd.GeoDataFrame, name: str = "", options: BuildOptions | None = None, meta: dict[str, Any] | None = None
+) -> Reference:
+    """Build a reference from road lines.
+
+    Parameters
+    ----------
+    roads : GeoDataFrame
+        Lines in any CRS.
+
+    Raises
+    ------
+    CrsError, RoadSourceError
+        No CRS; no lines; fewer than three intersections.
+    """
+    from roadgeo.io_network import as_stored
+    from roadgeo.io_roads import project_lines
+
+    options = options or BuildOptions()
+    lines, plane = project_lines(roads.geometry, roads.crs)
+    network = as_stored(build_network(lines, plane, {"name": name, **(meta or {})}, options))
+    return Reference(build_index(network, options.index), network)
+
+
+def open_reference(path: str | Path) -> Reference:
+    """Open REF.gpkg with its REF.index; a missing index is built again from the GeoPackage.
+
+    Raises
+    ------
+    IndexFormatError
+        If there is no such reference, or it is damaged, hostile, stale or of another version.
+    """
+    from roadgeo.io_reference import open_reference as open_parts
+    from roadgeo.io_reference import reference_paths
+
+    def rebuild(network: RoadNetwork) -> tuple[dict[str, Any], dict[str, AnyArray]]:
+        index = build_index(network)
+        return dict(index.meta), index.arrays()
+
+    meta, arrays = open_parts(path, rebuild)
+    return Reference(ReferenceIndex.from_parts(meta, arrays, str(reference_paths(path).geopackage)))
+
+
+# --- a mask to a place ------------------------------------------------------------------------------------------------
+
+
+@dataclass(frozen=True)
+class QueryOptions:
+    """How a mask becomes intersections. Names ending in `_widths` count road widths."""
+
+    vectorize: VectorizeOptions = field(default_factory=VectorizeOptions)
+    merge_widths: float = 1.4
+    fuse_widths: float = 1.0
+    stub_widths: float = 1.5
+    tangent_widths: float = 4.5
+    skip_widths: float = 0.6
+    branch_widths: float = 0.8
+    scene: SceneOptions = field(default_factory=SceneOptions)
+
+
+@dataclass(frozen=True)
+class LocateOptions:
+    """Options of all stages of locating a mask.
+
+    Attributes
+    ----------
+    method : "auto" or "pair"
+        Triples of intersections, or the paper's pairs.
+    near : (lon, lat, radius in metres) or None
+        The middle of the frame is known to lie there.
+    min_log10_odds : float
+        Places with less are not reported as located.
+    min_margin : float
+        Log10 odds by which the best place must lead any other; otherwise the answer is "ambiguous".
+    min_intersections : int
+        Masks with fewer are not searched.
+    """
+
+    method: Literal["auto", "pair"] = "auto"
+    near: tuple[float, float, float] | None = None
+    min_log10_odds: float = 6.0
+    min_margin: float = 3.0
+    min_intersections: int = 6
+    query: QueryOptions = field(default_factory=QueryOptions)
+    match: MatchOptions = field(default_factory=MatchOptions)
+    search: SearchOptions = field(default_factory=SearchOptions)
+    pair: PairOptions = field(default_factory=PairOptions)
+
+
+def trace_query(mask: RoadMask, options: QueryOptions | None = None) -> tuple[Scene, RoadGraph]:
+    """Vectorize a mask and prepare it for matching; the same calls as for a reference, in units of its road width."""
+    options = options or QueryOptions()
+    traced = vectorize(mask, options.vectorize)
+    width = traced.road_width_px
+    graph = simplify(
+        traced.graph,
+        SimplifyOptions(
+            merge_radius=options.merge_widths * width,
+            fuse_distance=options.fuse_widths * width,
+            stub_length=options.stub_widths * width,
+        ),
+    )
+    found = find_intersections(
+        graph,
+        IntersectionOptions(
+            tangent_length=options.tangent_widths * width,
+            skip_length=options.skip_widths * width,
+            min_branch_length=options.branch_widths * width,
+        ),
+    )
+    height, wide = mask.shape
+    return prepare_scene(graph, found, (wide, height), mask.observed, options.scene), graph
+
+
+def locate(
+    mask: RoadMask | AnyArray | str | Path,
+    reference: Reference | Sequence[Reference],
+    options: LocateOptions | None = None,
+) -> Location:
+    """Find where a road mask lies on one of the references.
+
+    Pure: no file is written. A mask that is not found is a `Location` with a reason, not an error.
+
+    Raises
+    ------
+    MaskError
+        The mask cannot be read or shows no roads.
+    """
+    options = options or LocateOptions()
+    started = time.perf_counter()
+    road_mask = _as_mask(mask)
+    read = time.perf_counter()
+    scene, graph = trace_query(road_mask, options.query)
+    seconds = Seconds(read=read - started, vectorize=time.perf_counter() - read)
+    references = [reference] if isinstance(reference, Reference) else list(reference)
+    if not references:
+        raise RoadSourceError("no reference to search: build one with `roadgeo index`")
+    found = [_locate_on(road_mask.name, scene, graph, one.index, options, seconds) for one in references]
+    return _best_of(found)
+
+
+def _as_mask(mask: RoadMask | AnyArray | str | Path) -> RoadMask:
+    if isinstance(mask, RoadMask):
+        return mask
+    from roadgeo.io_raster import read_mask
+
+    return read_mask(mask)
+
+
+def _locate_on(
+    name: str, scene: Scene, graph: RoadGraph, index: ReferenceIndex, options: LocateOptions, seconds: Seconds
+) -> Location:
+    """Match, judge and describe one query on one reference."""
+    n = len(scene.intersections)
+    location = Location(
+        name, "not_located", "", reference=index.name, size=scene.size, n_intersections=n, seconds=seconds
+    )
+    if n < options.min_intersections:
+        needed = options.min_intersections
+        return replace(location, reason=f"only {n} intersections are seen, at least {needed} are needed")
+    if options.method == "pair":
+        return _locate_by_pairs(location, scene, graph, index, options)
+    started = time.perf_counter()
+    estimator = TripleEstimator(scene, index, options.match, _near(index, options.near))
+    result = search(estimator, options.search)
+    stats = Stats(estimator.n_tuples, estimator.n_candidates, estimator.n_hypotheses, estimator.n_verified)
+    seconds = replace(
+        seconds, match=time.perf_counter() - started - estimator.refine_s, refine=estimator.refine_s
+    )
+    location = replace(location, seconds=seconds, stats=stats)
+    return _describe(location, scene, graph, index, result, estimator, options)
+
+
+@lru_cache(maxsize=4)
+def _pair_index(reference: _Same, options: PairOptions) -> tuple[Intersections, PairIndex]:
+    """Build the paper's tables for a reference: they are large, so they are not stored with it, but kept for a batch."""
+    index = reference.index
+    n = len(index)
+    found = Intersections(index.xy, index.rays, index.tangents, np.zeros(n, np.float32), np.arange(n))
+    return found, build_pair_index(found, options)
+
+
+@dataclass(frozen=True)
+class _Same:
+    """A reference as a key of a cache: equal to itself only."""
+
+    index: ReferenceIndex
+
+    def __hash__(self) -> int:
+        return id(self.index)
+
+    def __eq__(self, other: object) -> bool:
+        return isinstance(other, _Same) and other.index is self.index
+
+
+def _locate_by_pairs(
+    location: Location, scene: Scene, graph: RoadGraph, index: ReferenceIndex, options: LocateOptions
+) -> Location:
+    """Run the paper's method: what it finds is reported as found, with no odds, for it knows none."""
+    pair = replace(options.pair, time_limit_s=options.search.time_limit_s)
+    reference, table = _pair_index(_Same(index), pair)
+    match = match_pairs(scene.intersections, reference, table, scene.corners, pair)
+    location = replace(
+        location,
+        reason=match.reason,
+        seconds=replace(location.seconds, match=match.seconds),
+        stats=Stats(match.n_samples, match.candidates, match.hypotheses, match.hypotheses),
+    )
+    if match.homography is None:
+        return location
+    matched = np.full(len(scene.intersections), -1, np.int64)
+    matched[match.matches[:, 0]] = match.matches[:, 1]
+    chosen = matched >= 0
+    gap = Homography(match.homography)(scene.intersections.xy[chosen]) - index.xy[matched[chosen]]
+    distance = np.zeros(len(matched))
+    distance[chosen] = np.hypot(*gap.T)
+    placed = place_scene(location, scene, graph, index, match.homography, matched, distance)
+    center = replace(placed.center, log10_odds=0.0) if placed.center else None
+    return replace(placed, status="located", center=center, inlier_ratio=match.inlier_ratio)
+
+
+def _near(index: ReferenceIndex, near: tuple[float, float, float] | None) -> tuple[float, float, float] | None:
+    """Take (lon, lat, radius) to the plane."""
+    if near is None:
+        return None
+    from roadgeo.projection import from_lonlat
+
+    x, y = from_lonlat(index.plane, np.array([near[:2]]))[0]
+    return float(x), float(y), near[2]
+
+
+def _describe(
+    location: Location,
+    scene: Scene,
+    graph: RoadGraph,
+    index: ReferenceIndex,
+    result: SearchResult[Hypothesis],
+    estimator: TripleEstimator,
+    options: LocateOptions,
+) -> Location:
+    """Turn the search's result into a `Location`: located, ambiguous, or refused with a reason."""
+    best = result.best
+    if best is None or best.refined is None or best.found is None or result.score < options.min_log10_odds:
+        return replace(location, reason=_refusal(result, options))
+    lead = result.score - max(result.runner_up_score, -99.0)
+    runner_up = None
+    if result.runner_up is not None and math.isfinite(result.runner_up_score):
+        runner_up = _place(index.plane, estimator.center(result.runner_up), result.runner_up_score)
+    placed = place_scene(location, scene, graph, index, best.refined.matrix, best.matched, best.distance)
+    placed = replace(
+        placed,
+        center=replace(placed.center, log10_odds=result.score) if placed.center else None,
+        corner_sigma_m=best.refined.corner_sigma_m,
+        log10_odds=result.score,
+        runner_up=runner_up,
+    )
+    if lead < options.min_margin:
+        reason = f"two places fit almost equally: log10 odds {result.score:.1f} and {result.runner_up_score:.1f}"
+        return replace(placed, status="ambiguous", reason=reason)
+    reason = (
+        f"{placed.n_matched} of {placed.n_intersections} intersections and {best.found.forward:.0%} of the roads agree; "
+        f"odds 10^{result.score:.1f} against chance"
+    )
+    return replace(placed, status="located", reason=reason)
+
+
+def _refusal(result: SearchResult[Hypothesis], options: LocateOptions) -> str:
+    best = f"the best had log10 odds {result.score:.1f}" if math.isfinite(result.score) else "none survived the tests"
+    if result.stopped == "time":
+        return f"stopped after the time limit of {options.search.time_limit_s:g} s; of the places tried, {best}"
+    needed = options.min_log10_odds
+    return f"no place on this map stands out: {best}, {needed:g} are needed; more roads in view or another map may help"
+
+
+def place_scene(
+    location: Location,
+    scene: Scene,
+    graph: RoadGraph,
+    index: ReferenceIndex,
+    matrix: FloatArray,
+    matched: IntArray,
+    distance: FloatArray | None,
+) -> Location:
+    """Fill in everything that follows from a homography (query plane to reference plane) and its matches."""
+    from roadgeo.projection import to_lonlat
+
+    plane = index.plane
+    homography = plane.to_crs_matrix() @ matrix @ PIXEL_TO_PLANE
+    width, height = scene.size
+    pixels = np.array([[0, 0, 1], [width, 0, 1], [width, height, 1], [0, height, 1], [width / 2, height / 2, 1]], float)
+    ground = pixels @ homography.T
+    ground = ground[:, :2] / ground[:, 2:]
+    lonlat = to_lonlat(plane.crs, ground)
+    camera = pose(matrix, scene.size)
+    chosen = matched >= 0
+    residual = np.zeros(int(chosen.sum())) if distance is None else distance[chosen]
+    return replace(
+        location,
+        crs=plane.crs,
+        homography=homography / homography[2, 2],
+        footprint=ground[:4],
+        footprint_lonlat=lonlat[:4],
+        center=Place(*(float(v) for v in (*ground[4], *lonlat[4])), math.nan),
+        gsd_m=camera.gsd_m,
+        rotation_deg=camera.rotation_deg,
+        tilt_deg=camera.tilt_deg,
+        tilt_source="homography",
+        n_matched=int(chosen.sum()),
+        inlier_ratio=float(chosen.mean()),
+        evidence=Evidence(graph, scene.intersections.xy[chosen], plane.to_crs(index.xy[matched[chosen]]), residual),
+    )
+
+
+def _place(plane: LocalPlane, xy: FloatArray, log10_odds: float) -> Place:
+    from roadgeo.projection import to_lonlat
+
+    ground = plane.to_crs(xy[None])
+    lonlat = to_lonlat(plane.crs, ground)
+    return Place(float(ground[0, 0]), float(ground[0, 1]), float(lonlat[0, 0]), float(lonlat[0, 1]), log10_odds)
+
+
+def _best_of(found: Sequence[Location]) -> Location:
+    """Return the best answer of several references; two different places that are equally sure are ambiguous."""
+    rank = {"located": 2, "ambiguous": 1, "not_located": 0}
+    ranked = sorted(found, key=lambda one: (-rank[one.status], -(one.log10_odds or -math.inf)))
+    best = ranked[0]
+    total = Seconds(
+        read=best.seconds.read,
+        vectorize=best.seconds.vectorize,
+        match=sum(one.seconds.match for one in found),
+        refine=sum(one.seconds.refine for one in found),
+    )
+    if best.status == "not_located" and len(found) > 1:
+        names = ", ".join(one.reference for one in found)
+        return replace(best, seconds=total, reference=names)
+    return replace(best, seconds=total)
+
+
