@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 import multiprocessing
+import signal
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from concurrent.futures import ProcessPoolExecutor
 from dataclasses import dataclass
@@ -172,6 +173,7 @@ def _results(queries: QuerySet, locator: Locator, pending: Sequence[int], jobs: 
 def _prepare(queries: QuerySet, locator: Locator) -> None:
     """Open what a worker process needs, once."""
     global _draw, _locate
+    signal.signal(signal.SIGINT, signal.SIG_IGN)  # Ctrl-C is the parent's to handle
     cv2.setNumThreads(1)
     _draw, _locate = queries.open(), locator.open()
 

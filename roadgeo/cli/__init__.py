@@ -29,6 +29,8 @@ COMMANDS = {
     "check": ("roadgeo.cli.references", "Verify every byte and number of a reference."),
     "list": ("roadgeo.cli.references", "List the references in the library."),
     "remove": ("roadgeo.cli.references", "Remove references from the library."),
+    "simulate": ("roadgeo.cli.simulate", "Draw road masks whose place is known."),
+    "evaluate": ("roadgeo.cli.evaluate", "Measure how well masks are located, and where they would be."),
     "demo": ("roadgeo.cli.demo", "Locate five masks in Porto: needs no network and no data."),
 }
 

@@ -1,0 +1,107 @@
+"""Options that say which query masks are drawn, for `simulate` and `evaluate`."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from typing import TYPE_CHECKING, Any, TypeVar
+
+import click
+
+from roadgeo.cli.parameters import RANGE, Numbers
+
+if TYPE_CHECKING:
+    from roadgeo.simulation import SimulationOptions
+
+__all__ = ["query_options", "query_sets"]
+
+Command = TypeVar("Command", bound=Callable[..., Any])
+
+
+def _wrong_angles(low: float, high: float) -> str:
+    return "" if -360 <= low <= high <= 360 else "LO must not be above HI, both within ±360"
+
+
+#: Degrees, least and greatest.
+ANGLES = Numbers("angles", ("LO", "HI"), ":", _wrong_angles)
+
+_OPTIONS = [
+    click.option("-n", "--count", type=click.IntRange(1), default=40, show_default=True, help="Masks per noise model."),
+    click.option(
+        "--noise",
+        type=click.Choice(["clean", "segmented", "poor"]),
+        multiple=True,
+        default=["clean", "segmented", "poor"],
+        show_default=True,
+        help="What goes wrong in the masks; may be given several times.",
+    ),
+    click.option("--gsd", type=RANGE, default="0.7:1.4", show_default=True, help="Metres per pixel at the centre."),
+    click.option(
+        "--tilt", type=ANGLES, default="0:30", show_default=True, help="Degrees of the axis from the vertical."
+    ),
+    click.option("--heading", type=ANGLES, default="0:360", show_default=True, help="Where up points, from north."),
+    click.option(
+        "--size", type=click.IntRange(64, 20_000), default=1500, show_default=True, help="Side of a mask, pixels."
+    ),
+    click.option(
+        "--window", type=click.FloatRange(10), metavar="METRES", help="Side on the ground, in place of --size."
+    ),
+    click.option(
+        "--focal", type=click.FloatRange(1), metavar="PX", help="Focal length in pixels.  [default: the side]"
+    ),
+    click.option(
+        "--intersections",
+        metavar="LO:HI",
+        type=RANGE,
+        default="30:1000000",
+        show_default=True,
+        help="How many to show.",
+    ),
+    click.option("--road-width", type=RANGE, default="8:11", show_default=True, help="Metres, as drawn."),
+    click.option(
+        "--mirrored", type=click.IntRange(0), default=0, help="Also so many masks turned over, which have no place."
+    ),
+    click.option("--seed", type=click.IntRange(0), default=0, show_default=True, help="Other seeds draw other masks."),
+]
+
+
+def query_options(command: Command) -> Command:
+    """Add the options that `query_sets` takes."""
+    for option in reversed(_OPTIONS):
+        command = option(command)
+    return command
+
+
+def query_sets(
+    *,
+    count: int,
+    noise: tuple[str, ...],
+    gsd: tuple[float, float],
+    tilt: tuple[float, float],
+    heading: tuple[float, float],
+    size: int,
+    window: float | None,
+    focal: float | None,
+    intersections: tuple[float, float],
+    road_width: tuple[float, float],
+    mirrored: int,
+    seed: int,
+) -> tuple[tuple[SimulationOptions, int], ...]:
+    """Turn the options into sets of queries, one per noise model, and one of mirrored masks where some are wanted."""
+    from roadgeo.drawing import NOISE_MODELS
+    from roadgeo.simulation import SimulationOptions, ViewOptions
+
+    view = ViewOptions(
+        size_px=(size, size),
+        window_m=window,
+        gsd_m=gsd,
+        tilt_deg=tilt,
+        heading_deg=heading,
+        focal_px=focal,
+        intersections=(int(intersections[0]), int(intersections[1])),
+        road_width_m=road_width,
+    )
+    sets = [(SimulationOptions(view, NOISE_MODELS[name], name, seed), count) for name in dict.fromkeys(noise)]
+    if mirrored:
+        turned = SimulationOptions(view, NOISE_MODELS[noise[0]], "mirrored", seed, mirrored=True)
+        sets.append((turned, mirrored))
+    return tuple(sets)

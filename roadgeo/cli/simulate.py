@@ -1,0 +1,62 @@
+"""`roadgeo simulate`: query masks whose place is known."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Any
+
+import click
+
+from roadgeo.cli.queries import query_options, query_sets
+
+__all__ = ["simulate_command"]
+
+
+@click.command("simulate", short_help="Draw road masks whose place is known.")
+@click.argument("reference", metavar="REF")
+@click.option(
+    "-o", "--out-dir", type=click.Path(file_okay=False, path_type=Path), required=True, help="Where to write."
+)
+@query_options
+@click.option("-q", "--quiet", is_flag=True, help="Say nothing but errors.")
+def simulate_command(reference: str, out_dir: Path, quiet: bool, **options: Any) -> None:
+    """Draw road masks from a reference's own roads, as a camera would see them and a segmenter get them wrong.
+
+    Writes NOISE/q_NNNN.png, truth.csv, truth.json (columns: see roadgeo/truth.py) and footprints.gpkg. The same options
+    draw the same masks.
+
+    \b
+    Examples:
+      roadgeo simulate boston-ma -o queries
+      roadgeo simulate boston-ma -o drone --noise segmented --gsd 0.3:0.6 --tilt 30:50 --intersections 12:30
+      roadgeo simulate boston-ma -o plan --window 1500 --gsd 1:1 --tilt 0:0 --heading 0:0 -n 100
+    """
+    import cv2
+
+    from roadgeo.cli.progress import progress_bar
+    from roadgeo.files import write_bytes
+    from roadgeo.io_atomic import writing
+    from roadgeo.io_network import read_network
+    from roadgeo.landscape import Landscape
+    from roadgeo.library import resolve_reference
+    from roadgeo.simulation import simulate_query
+    from roadgeo.truth import write_truth
+
+    sets = query_sets(**options)
+    landscape = Landscape.from_network(read_network(resolve_reference(reference)))
+    truths = []
+    with progress_bar("Drawing", sum(count for _, count in sets), quiet) as advance:
+        for simulation, count in sets:
+            folder = out_dir / simulation.kind
+            with writing(folder):
+                folder.mkdir(parents=True, exist_ok=True)
+            for k in range(count):
+                query = simulate_query(landscape, simulation, k)
+                write_bytes(out_dir / query.truth.file, cv2.imencode(".png", query.mask)[1].tobytes())
+                truths.append(query.truth)
+                advance()
+    write_truth(out_dir, truths)
+    if not quiet:
+        click.echo(
+            f"{len(truths)} masks in {out_dir}; next: roadgeo evaluate {reference} --queries {out_dir}", err=True
+        )
