@@ -17,7 +17,7 @@ from roadgeo.io_outputs import Placement
 from roadgeo.location import Location
 from roadgeo.typing import AnyArray, FloatArray
 
-__all__ = ["PlotOptions", "draw_overlay", "write_overlay"]
+__all__ = ["PlotOptions", "draw_overlay", "format_lonlat", "write_overlay"]
 
 Color = tuple[int, int, int]
 
@@ -137,6 +137,11 @@ def draw_overlay(
     return picture
 
 
+def format_lonlat(lon: float, lat: float) -> str:
+    """Write a position as people do: 41.15253° N, 8.60801° W."""
+    return f"{abs(lat):.5f}° {'N' if lat >= 0 else 'S'}, {abs(lon):.5f}° {'E' if lon >= 0 else 'W'}"
+
+
 # --- the map ----------------------------------------------------------------------------------------------------------
 
 
@@ -243,9 +248,7 @@ def _title(location: Location) -> str:
     name = os.path.basename(location.query)  # noqa: PTH119 (a name, not a file)
     if location.center is None:
         return name
-    lat, lon = location.center.lat, location.center.lon
-    where = f"{abs(lat):.5f}° {'N' if lat >= 0 else 'S'}, {abs(lon):.5f}° {'E' if lon >= 0 else 'W'}"
-    return f"{name}: {where}"
+    return f"{name}: {format_lonlat(location.center.lon, location.center.lat)}"
 
 
 def _summary(location: Location) -> str:

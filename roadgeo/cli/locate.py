@@ -1,0 +1,327 @@
+"""`roadgeo locate`: options, one call per mask, printing."""
+
+from __future__ import annotations
+
+import json
+from collections import Counter
+from collections.abc import Callable, Iterable
+from contextlib import AbstractContextManager, nullcontext
+from dataclasses import dataclass
+from pathlib import Path
+from typing import TYPE_CHECKING, Any, Literal
+
+import click
+
+from roadgeo.cli import ERROR, NOT_LOCATED
+from roadgeo.cli.batch import Task, find_masks, name_tasks, run
+from roadgeo.cli.parameters import NEAR, RANGE, verbosity_options
+
+if TYPE_CHECKING:
+    from roadgeo.location import Location
+    from roadgeo.workflows import LocateOptions, Reference
+
+__all__ = ["Job", "Outcome", "locate_command"]
+
+Status = Literal["located", "ambiguous", "not_located", "error"]
+
+
+@dataclass(frozen=True)
+class Outcome:
+    """What became of one mask: its JSON object, a text for people, the files written."""
+
+    status: Status
+    document: dict[str, Any]
+    text: str
+    files: tuple[str, ...] = ()
+
+
+@dataclass(frozen=True)
+class Job:
+    """What is done with every mask; travels to other processes."""
+
+    references: tuple[str, ...]
+    options: LocateOptions
+    out_dir: str
+    threshold: float | None = None
+    band: int | None = None
+    plot: bool = False
+
+    def prepare(self) -> Callable[[Task], Outcome]:
+        """Open the references."""
+        from time import perf_counter
+
+        started = perf_counter()
+        references = open_references(self.references)
+        seconds = perf_counter() - started
+        return lambda task: self.locate(task, references, seconds)
+
+    def give_up(self, task: Task, reason: str) -> Outcome:
+        """Make the outcome of a mask that could not be worked on."""
+        return _failed(task, reason)
+
+    def locate(self, task: Task, references: list[Reference], open_seconds: float) -> Outcome:
+        """Locate one mask and write its results. What is wrong with one mask never stops the others."""
+        from roadgeo.errors import RoadgeoError
+
+        try:
+            return self._locate(task, references, open_seconds)
+        except RoadgeoError as error:
+            return _failed(task, str(error))
+        except (MemoryError, OSError, ValueError, ArithmeticError, LookupError, TypeError) as error:
+            return _failed(
+                task, f"{task.mask}: {type(error).__name__}: {error}; this is a fault of roadgeo, please report it"
+            )
+
+    def _locate(self, task: Task, references: list[Reference], open_seconds: float) -> Outcome:
+        from dataclasses import replace
+
+        from roadgeo.io_outputs import output_paths, write_location
+        from roadgeo.io_raster import read_mask
+        from roadgeo.workflows import locate
+
+        mask = read_mask(task.mask, threshold=self.threshold, band=self.band)
+        location = locate(mask, references, self.options)
+        location = replace(location, seconds=replace(location.seconds, open=open_seconds))
+        paths = output_paths(self.out_dir, task.stem)
+        location = write_location(location, mask, paths)
+        files = [paths.json]
+        if location.located:
+            files = [paths.footprint, paths.style, paths.geopackage, paths.json]
+            if self.plot:
+                reference = next(one for one in references if one.name == location.reference)
+                _draw(location, mask, reference, paths.overlay)
+                files.append(paths.overlay)
+        return Outcome(location.status, location.to_dict(), describe(location), tuple(map(str, files)))
+
+
+def open_references(names: Iterable[str]) -> list[Reference]:
+    """Open references by path or name; none named: all of the library.
+
+    Raises
+    ------
+    IndexFormatError
+        A reference is missing or unusable, or the library is empty.
+    """
+    from roadgeo.errors import IndexFormatError
+    from roadgeo.library import library_dir, list_references, resolve_reference
+    from roadgeo.workflows import open_reference
+
+    paths = [resolve_reference(name) for name in names] or list_references()
+    if not paths:
+        raise IndexFormatError(
+            f"the library in {library_dir()} is empty and no --reference was given; build one with `roadgeo index`"
+        )
+    return [open_reference(path) for path in paths]
+
+
+@click.command("locate", short_help="Find road masks on a reference and draw them there.")
+@click.argument("masks", metavar="MASK...", nargs=-1, required=True)
+@click.option(
+    "-r",
+    "--reference",
+    "references",
+    metavar="REF",
+    multiple=True,
+    help="Reference to search: REF.gpkg, or a name in the library. Repeatable. Default: all of the library.",
+)
+@click.option(
+    "-o",
+    "--out-dir",
+    metavar="DIR",
+    default=".",
+    type=click.Path(file_okay=False),
+    help="Where the results go; made if missing. Default: here.",
+)
+@click.option("--json", "as_json", is_flag=True, help="Print one JSON object per mask and line, in input order.")
+@click.option("--plot", is_flag=True, help="Also write MASK_overlay.png: the mask and its place, to look at.")
+@click.option("--threshold", metavar="T", type=float, help="Values above T are road. Default: told by the values.")
+@click.option(
+    "--band", metavar="N", type=click.IntRange(1), help="Band that holds the mask. Default: told by the bands."
+)
+@click.option("--gsd", metavar="LO:HI", type=RANGE, help="Metres per pixel at the middle. Default: 0.2:5.")
+@click.option(
+    "--max-tilt", metavar="DEG", type=click.FloatRange(0, 80), help="Greatest angle of the camera from the vertical."
+)
+@click.option("--near", metavar="LON,LAT,RADIUS", type=NEAR, help="The middle lies within RADIUS metres of this place.")
+@click.option("--north-up", is_flag=True, help="The image's up is north.")
+@click.option(
+    "--method",
+    type=click.Choice(["auto", "pair"]),
+    default="auto",
+    show_default=True,
+    help="auto: the best there is. pair: exactly the paper's matcher.",
+)
+@click.option(
+    "--time-limit",
+    metavar="SECONDS",
+    type=click.FloatRange(min=0, min_open=True),
+    default=10.0,
+    show_default=True,
+    help="Stop searching for a mask after this time.",
+)
+@click.option("-j", "--jobs", metavar="N", type=click.IntRange(1), default=1, show_default=True, help="Processes.")
+@verbosity_options
+def locate_command(
+    masks: tuple[str, ...],
+    references: tuple[str, ...],
+    out_dir: str,
+    as_json: bool,
+    plot: bool,
+    threshold: float | None,
+    band: int | None,
+    gsd: tuple[float, float] | None,
+    max_tilt: float | None,
+    near: tuple[float, float, float] | None,
+    north_up: bool,
+    method: Literal["auto", "pair"],
+    time_limit: float,
+    jobs: int,
+    quiet: bool,
+    verbose: bool,
+) -> int:
+    """Find where road MASKs lie on a map, and draw them there.
+
+    A mask is an image of the roads that an aerial picture shows: bright or 1 where there is road. Its size, heading,
+    scale and camera need not be known; what is known narrows the search and makes it surer. Give files, folders or
+    patterns.
+
+    \b
+    For each located photo_mask.tif:
+      photo_mask_footprint.tif   the mask on the map (Cloud Optimized GeoTIFF)
+      photo_mask_location.gpkg   footprint, matched intersections, roads: opens styled in QGIS
+      photo_mask_location.json   place, homography, odds; also written, with a reason, where nothing was found
+      photo_mask_overlay.png     with --plot
+
+    \b
+    Examples:
+      roadgeo locate photo_mask.tif
+      roadgeo locate masks/ --reference boston-ma --out-dir found --plot
+      roadgeo locate *.png --json --jobs 4 > found.jsonl
+      roadgeo locate mask.png --gsd 0.3:0.6 --near -71.06,42.36,5000
+
+    Exit status: 0 every mask located, 3 at least one not located, 1 error, 2 usage.
+    """
+    options = make_options(method, gsd, max_tilt, near, north_up, time_limit)
+    tasks = name_tasks(find_masks(masks))
+    if not tasks:
+        raise click.UsageError(f"No images in {', '.join(masks)}.")
+    _make_folder(out_dir)
+    job = Job(references, options, out_dir, threshold, band, plot)
+    if jobs > 1:
+        open_references(references)  # so that what is wrong with them is said once, before the processes start
+    counts: Counter[Status] = Counter()
+    with _progress(len(tasks), as_json, quiet) as advance:
+        for outcome in run(tasks, job, jobs):
+            counts[outcome.status] += 1
+            advance(counts)
+            _report(outcome, as_json, quiet, verbose, single=len(tasks) == 1)
+    if len(tasks) > 1 and not quiet:
+        click.echo(summarize(counts), err=True)
+    return ERROR if counts["error"] else 0 if counts["located"] == len(tasks) else NOT_LOCATED
+
+
+def make_options(
+    method: Literal["auto", "pair"],
+    gsd: tuple[float, float] | None,
+    max_tilt: float | None,
+    near: tuple[float, float, float] | None,
+    north_up: bool,
+    time_limit: float,
+) -> LocateOptions:
+    """Put what was given in its place among the options of all stages; the rest stays as it is."""
+    from dataclasses import replace
+
+    from roadgeo.workflows import LocateOptions
+
+    default = LocateOptions()
+    camera = replace(
+        default.match.camera,
+        gsd_m=gsd or default.match.camera.gsd_m,
+        max_tilt_deg=default.match.camera.max_tilt_deg if max_tilt is None else max_tilt,
+        north_up=north_up,
+    )
+    match = replace(default.match, camera=camera)
+    return replace(
+        default, method=method, near=near, match=match, search=replace(default.search, time_limit_s=time_limit)
+    )
+
+
+# --- one mask ---------------------------------------------------------------------------------------------------------
+
+
+def describe(location: Location) -> str:
+    """Say what was found, in a line or two."""
+    if not location.located or location.center is None:
+        return f"{location.query}: {location.status.replace('_', ' ')}: {location.reason}"
+    from roadgeo.plot import format_lonlat
+
+    where = format_lonlat(location.center.lon, location.center.lat)
+    return f"{location.query}: located at {where} on {location.reference}: {location.reason}"
+
+
+def _failed(task: Task, reason: str) -> Outcome:
+    from roadgeo.location import SCHEMA
+
+    document = {"schema": SCHEMA, "query": task.mask, "status": "error", "reason": reason}
+    return Outcome("error", document, f"Error: {reason}")
+
+
+def _draw(location: Location, mask: Any, reference: Reference, path: Path) -> None:
+    from roadgeo.plot import write_overlay
+
+    index = reference.index
+    roads = index.plane.to_crs(index.segments.reshape(-1, 2).astype(float)).reshape(-1, 4)
+    write_overlay(path, location, mask, roads, str(index.meta.get("attribution", "")))
+
+
+def _make_folder(folder: str) -> None:
+    from roadgeo.io_atomic import writing
+
+    with writing(folder):
+        Path(folder).mkdir(parents=True, exist_ok=True)
+
+
+# --- printing ---------------------------------------------------------------------------------------------------------
+
+
+def summarize(counts: Counter[Status]) -> str:
+    """Say how many masks came to what."""
+    parts = [f"{counts['located']} located"]
+    if counts["ambiguous"]:
+        parts.append(f"{counts['ambiguous']} ambiguous")
+    parts.append(f"{counts['not_located']} not located")
+    if counts["error"]:
+        parts.append(f"{counts['error']} failed")
+    return ", ".join(parts)
+
+
+def _report(outcome: Outcome, as_json: bool, quiet: bool, verbose: bool, single: bool) -> None:
+    if as_json:
+        click.echo(json.dumps(outcome.document))
+    if outcome.status == "error":
+        click.echo(" ".join(outcome.text.split()), err=True)
+        return
+    if quiet:
+        return
+    click.echo(outcome.text, err=as_json)
+    if verbose:
+        click.echo(_details(outcome.document), err=as_json)
+    if (single or verbose) and outcome.status == "located":
+        click.echo("  wrote " + ", ".join(outcome.files), err=as_json)
+
+
+def _details(document: dict[str, Any]) -> str:
+    seconds = ", ".join(f"{step} {value:.3f}" for step, value in document["seconds"].items())
+    stats = ", ".join(f"{value} {name.replace('_', ' ')}" for name, value in document["stats"].items())
+    return f"  seconds: {seconds}\n  {stats}"
+
+
+def _progress(total: int, as_json: bool, quiet: bool) -> AbstractContextManager[Callable[[Counter[Status]], None]]:
+    """Show a bar on standard error, where that is a terminal that JSON does not fill and there are several masks."""
+    import sys
+
+    if quiet or total < 2 or not sys.stderr.isatty() or (as_json and sys.stdout.isatty()):
+        return nullcontext(lambda _: None)
+    from roadgeo.cli.progress import show_progress
+
+    return show_progress(total, summarize)
