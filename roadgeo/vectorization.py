@@ -14,7 +14,7 @@ import numpy as np
 from roadgeo.errors import MaskError
 from roadgeo.graph import RoadGraph
 from roadgeo.grid import RoadMask, pixel_to_plane
-from roadgeo.kernels.thinning import GROUND, ROAD, SIMPLE, SOLID, rethin, thin
+from roadgeo.kernels.thinning import GROUND, ROAD, SOLID, rethin, thin
 from roadgeo.kernels.tracing import smooth_chains, trace
 from roadgeo.typing import AnyArray, BoolArray, Float32Array, FloatArray, Int32Array, IntArray
 
@@ -23,18 +23,49 @@ __all__ = ["Vectorization", "VectorizeOptions", "road_width", "vectorize"]
 #: Bands of rows that `road_width` looks at first, and how many road pixels they must hold.
 _BAND_ROWS, _BAND_STEP, _BAND_MIN_ROAD = 64, 256, 2000
 
+#: Rays in the fan before a free end (an odd number), and how many of their pixels may touch the end itself.
+_BENDS, _NEAR = 11, 2
+
 
 @dataclass(frozen=True)
 class VectorizeOptions:
-    """How a mask is cleaned and traced. Names ending in `_widths` count road widths, `_areas` squared road widths."""
+    """How a mask is cleaned and traced. Names in `_widths` count road widths, `_areas` squared road widths.
 
-    working_width_px: float = 6.0  # wide roads are reduced to about this before thinning
-    closing_widths: float = 0.35  # gaps up to this are closed
-    opening_widths: float = 0.3  # threads up to this are cut
-    hole_areas: float = 1.2  # smaller holes are filled
-    speck_areas: float = 4.0  # smaller pieces are dropped
-    spur_widths: float = 1.0  # free ends that reach less than this beyond the road's edge are dropped
-    smoothing_widths: float = 0.4  # standard deviation of the smoothing along a road
+    Attributes
+    ----------
+    working_width_px
+        Wide roads are reduced to about this width before thinning.
+    closing_widths, opening_widths
+        Gaps up to this are closed; threads up to this are cut.
+    hole_areas, speck_areas
+        Smaller holes are filled; smaller pieces are dropped.
+    spur_widths
+        Free ends that reach less than this beyond the edge of the road they leave are dropped.
+    piece_widths
+        Roads that touch no other are dropped when they are shorter.
+    bridge_widths
+        A road that ends, and points at another across a gap up to this, is joined to it.
+    bridge_angle_deg
+        How far from its own direction it may bend to get there.
+    bent_widths
+        So far from a junction a skeleton is bent: the road is drawn straight there.
+    smoothing_widths
+        Standard deviation of the smoothing along a road.
+    vertex_spacing_px
+        Distance between the vertices of a road.
+    """
+
+    working_width_px: float = 5.7
+    closing_widths: float = 0.35
+    opening_widths: float = 0.3
+    hole_areas: float = 1.2
+    speck_areas: float = 1.0
+    spur_widths: float = 1.3
+    piece_widths: float = 2.0
+    bridge_widths: float = 1.0
+    bridge_angle_deg: float = 35.0
+    bent_widths: float = 0.4
+    smoothing_widths: float = 0.4
     vertex_spacing_px: float = 2.0
 
 
@@ -75,24 +106,20 @@ def vectorize(mask: RoadMask, options: VectorizeOptions | None = None) -> Vector
         When the mask shows no road.
     """
     options = options or VectorizeOptions()
-    width = road_width(mask)
-    factor = max(1, round(width / options.working_width_px))
-    states = _clean(_reduce(mask, factor), width / factor, options)
+    width_px = road_width(mask)
+    factor = max(1, round(width_px / options.working_width_px))
+    width = width_px / factor
+    states = _clean(_reduce(mask, factor), width, options)
     distance = cv2.distanceTransform((states != GROUND).view(np.uint8), cv2.DIST_L2, 5)
-    depth = 0.25 * width / factor  # half of a road half as wide as most
-    pixels = thin(states, distance, max(depth, 1.0), SIMPLE)
-    if len(pixels) == 0:
-        raise MaskError(
-            f"{mask.name or 'mask'}: no road is left after cleaning; is it a road mask with roads as non-zero?"
-        )
-    width_px = max(2.0 * float(np.median(distance.ravel()[pixels])) - 0.5, 1.0)
-    skeleton = _prune(states, distance, pixels, options.spur_widths * width_px)
-    graph, is_open = _to_graph(skeleton, distance, factor, width_px, options)
-    return Vectorization(graph, width_px * factor, is_open)
+    skeleton = _skeletonize(states, distance, width, options)
+    if len(skeleton.edges) == 0:
+        raise MaskError(f"{mask.name or 'mask'}: no road is left after cleaning; expected roads as non-zero pixels")
+    graph, is_open = _to_graph(skeleton, distance, factor, width, options)
+    return Vectorization(graph, width_px, is_open)
 
 
 def road_width(mask: RoadMask) -> float:
-    """Estimate the usual road width of a mask in pixels: four times the median depth of a road pixel.
+    """Estimate the usual road width of a mask in pixels: four times the mean depth of a road pixel.
 
     Depths within a straight road are spread evenly between 0 and half its width.
 
@@ -106,10 +133,11 @@ def road_width(mask: RoadMask) -> float:
     if sum(int(cv2.countNonZero(band)) for band in bands) < _BAND_MIN_ROAD:
         bands = [roads]
     depths = [cv2.distanceTransform(np.ascontiguousarray(band), cv2.DIST_L2, 3)[band > 0] for band in bands]
-    depth = np.concatenate(depths)
+    depth = np.concatenate(depths) - 0.5  # from the road's edge, not from the next pixel's centre
     if len(depth) == 0:
         raise MaskError(f"{mask.name or 'mask'}: no road pixel; expected a mask with roads as non-zero pixels")
-    return float(max(4.0 * (np.median(depth) - 0.5), 1.0))
+    ceiling = 2.5 * np.median(depth)  # blobs and squares are deeper than roads
+    return float(max(4.0 * np.minimum(depth, ceiling).mean(), 1.0))
 
 
 def _reduce(mask: RoadMask, factor: int) -> AnyArray:
@@ -137,14 +165,19 @@ def _shrink(flags: AnyArray, factor: int) -> AnyArray:
 
 
 def _clean(states: AnyArray, width: float, options: VectorizeOptions) -> AnyArray:
-    """Close gaps, fill holes, cut threads and drop specks."""
-    filled = (states != GROUND).view(np.uint8)
-    filled = _morph(filled, cv2.MORPH_CLOSE, options.closing_widths * width)
-    _fill_holes(filled, options.hole_areas * width**2)
-    filled = _morph(filled, cv2.MORPH_OPEN, options.opening_widths * width)
-    _drop_specks(filled, options.speck_areas * width**2)
-    filled[states == SOLID] = SOLID
-    return filled
+    """Close gaps, fill holes, drop specks and cut threads."""
+    cleaned = (states != GROUND).view(np.uint8)
+    cleaned = _morph(cleaned, cv2.MORPH_CLOSE, options.closing_widths * width)
+    contours, hierarchy = cv2.findContours(cleaned, cv2.RETR_CCOMP, cv2.CHAIN_APPROX_SIMPLE)
+    areas = np.array([cv2.contourArea(contour) for contour in contours])
+    is_hole = hierarchy[0, :, 3] >= 0 if hierarchy is not None else np.zeros(0, bool)
+    small = np.where(is_hole, areas < options.hole_areas * width**2, areas < options.speck_areas * width**2)
+    for inside, value in ((is_hole, ROAD), (~is_hole, GROUND)):
+        chosen = [contours[i] for i in np.flatnonzero(small & inside).tolist()]
+        cv2.drawContours(cleaned, chosen, -1, value, cv2.FILLED)
+    cleaned = _morph(cleaned, cv2.MORPH_OPEN, options.opening_widths * width)
+    cleaned[states == SOLID] = SOLID
+    return cleaned
 
 
 def _morph(flags: AnyArray, operation: int, diameter: float) -> AnyArray:
@@ -156,66 +189,69 @@ def _morph(flags: AnyArray, operation: int, diameter: float) -> AnyArray:
     return np.asarray(cv2.morphologyEx(flags, operation, disc))
 
 
-def _fill_holes(filled: AnyArray, area: float) -> None:
-    """Fill holes smaller than `area` in place."""
-    contours, hierarchy = cv2.findContours(filled, cv2.RETR_CCOMP, cv2.CHAIN_APPROX_SIMPLE)
-    if hierarchy is None:
-        return
-    holes = [
-        contours[i] for i in np.flatnonzero(hierarchy[0, :, 3] >= 0).tolist() if cv2.contourArea(contours[i]) < area
-    ]
-    cv2.drawContours(filled, holes, -1, ROAD, cv2.FILLED)
-
-
-def _drop_specks(filled: AnyArray, area: float) -> None:
-    """Clear pieces whose outline encloses less than `area`, in place."""
-    contours, _ = cv2.findContours(filled, cv2.RETR_EXTERNAL, cv2.CHAIN_APPROX_SIMPLE)
-    specks = [contour for contour in contours if cv2.contourArea(contour) < area]
-    cv2.drawContours(filled, specks, -1, GROUND, cv2.FILLED)
-
-
 @dataclass(frozen=True)
 class _Skeleton:
-    """What `trace` returns: see there."""
+    """What `trace` returns; see there."""
 
     xy: FloatArray
     is_open: BoolArray
     edges: Int32Array
-    chain: IntArray
+    chain: Int32Array
     offsets: IntArray
 
+    @property
+    def degree(self) -> IntArray:
+        """(N,) chain ends at each node."""
+        return np.bincount(self.edges.ravel(), minlength=len(self.xy)).astype(np.int64)
+
+    @property
+    def pixel(self) -> tuple[IntArray, IntArray]:
+        """(N,) row and column of the pixel nearest to each node."""
+        columns, rows = np.rint(self.xy).astype(np.int64).T
+        return rows, columns
+
+    @property
+    def tips(self) -> BoolArray:
+        """(E, 2) whether an end of a chain is a free end."""
+        return np.asarray(((self.degree == 1) & ~self.is_open)[self.edges])
+
+    @property
     def lengths(self) -> FloatArray:
         """(E,) straight distance between the nodes or pixels on the way, whichever is longer."""
         a, b = self.xy[self.edges[:, 0]], self.xy[self.edges[:, 1]]
         return np.maximum(np.diff(self.offsets) + 1.0, np.hypot(*(a - b).T))
 
 
-def _prune(states: AnyArray, distance: Float32Array, pixels: IntArray, reach: float) -> _Skeleton:
-    """Drop free ends that reach less than `reach` beyond the road they leave, shortest first; two stay at a node."""
-    no_end = np.zeros(states.shape, np.bool_)
+def _skeletonize(states: AnyArray, distance: Float32Array, width: float, options: VectorizeOptions) -> _Skeleton:
+    """Thin, then prune and bridge until nothing is left to do. `states` is changed; lengths in its pixels."""
     flat = states.ravel()
+    room = np.empty(len(flat), np.int32)
+    pixels = thin(states, distance, max(0.25 * width, 1.0))  # ends of roads half as wide as most are kept
+    bridged = False
     while True:
-        skeleton = _Skeleton(*trace(states, pixels))
-        spurs = _spurs(skeleton, distance, reach)
-        if len(spurs) == 0:
+        skeleton = _Skeleton(*trace(states, pixels, room))
+        drop = np.concatenate(
+            (_spurs(skeleton, distance, options.spur_widths * width), _pieces(skeleton, options.piece_widths * width))
+        )
+        if len(drop) > 0:
+            _erase(states, skeleton, drop)
+        elif bridged:
             return skeleton
-        for e in spurs:
-            flat[skeleton.chain[skeleton.offsets[e] : skeleton.offsets[e + 1]]] = GROUND
-        degree = np.bincount(skeleton.edges.ravel(), minlength=len(skeleton.xy))
-        tips = skeleton.xy[skeleton.edges[spurs]][degree[skeleton.edges[spurs]] == 1]
-        columns, rows = np.rint(tips).astype(int).T
-        states[rows, columns] = GROUND
-        pixels = rethin(states, pixels, ~no_end, SIMPLE)
+        else:
+            bridged = True
+            bridges = _bridges(states, distance, skeleton, width, options)
+            if len(bridges) == 0:
+                return skeleton
+            flat[bridges] = ROAD
+            pixels = np.concatenate((pixels, bridges))
+        pixels = rethin(states, distance, pixels, 0.0)
 
 
 def _spurs(skeleton: _Skeleton, distance: Float32Array, reach: float) -> IntArray:
-    """Return the edges to drop in one round."""
-    degree = np.bincount(skeleton.edges.ravel(), minlength=len(skeleton.xy))
-    is_tip = (degree == 1) & ~skeleton.is_open
-    tips = is_tip[skeleton.edges]
-    columns, rows = np.rint(skeleton.xy).astype(int).T
+    """Return free ends that reach less than `reach` beyond the road they leave, shortest first; two stay at a node."""
+    tips, degree = skeleton.tips, skeleton.degree
     foot = np.where(tips[:, 0], skeleton.edges[:, 1], skeleton.edges[:, 0])
-    excess = skeleton.lengths() - distance[rows, columns][foot]
+    excess = skeleton.lengths - distance[skeleton.pixel][foot]
     short = np.flatnonzero((tips[:, 0] != tips[:, 1]) & (degree[foot] >= 3) & (excess < reach))
     budget = degree - 2
     drop = []
@@ -226,31 +262,108 @@ def _spurs(skeleton: _Skeleton, distance: Float32Array, reach: float) -> IntArra
     return np.array(drop, np.int64)
 
 
+def _pieces(skeleton: _Skeleton, least: float) -> IntArray:
+    """Return roads that touch nothing and are shorter than `least`."""
+    return np.flatnonzero(skeleton.tips.all(axis=1) & (skeleton.lengths < least))
+
+
+def _erase(states: AnyArray, skeleton: _Skeleton, drop: IntArray) -> None:
+    """Clear the pixels of some chains and of their free ends."""
+    flat = states.ravel()
+    for e in drop:
+        flat[skeleton.chain[skeleton.offsets[e] : skeleton.offsets[e + 1]]] = GROUND
+    rows, columns = skeleton.pixel
+    ends = skeleton.edges[drop][skeleton.tips[drop]]
+    states[rows[ends], columns[ends]] = GROUND
+
+
+def _bridges(
+    states: AnyArray, distance: Float32Array, skeleton: _Skeleton, width: float, options: VectorizeOptions
+) -> Int32Array:
+    """Return pixels that join free ends to the roads they point at.
+
+    From every free end rays fan out; the shortest (weighed by its bend) that meets another line is taken, if the road
+    is not interrupted for longer than allowed on the way.
+    """
+    flat, stride = states.ravel(), states.shape[1]
+    edge, side = np.nonzero(skeleton.tips & (skeleton.lengths >= width)[:, None])
+    tip = skeleton.xy[skeleton.edges[edge, side]]
+    at = _fans(states.shape, tip, _headings(skeleton, edge, side, tip, 2.0 * width, stride), width, options)
+    met = cv2.dilate((states == ROAD).view(np.uint8), np.ones((3, 3), np.uint8)).ravel()[at]
+    met[flat[at] == SOLID] = SOLID
+    met[..., :_NEAR] = GROUND  # the road's own end
+    first = np.argmax(met != GROUND, axis=2)[..., None]
+    missing = np.take_along_axis(np.cumsum(distance.ravel()[at] == 0, axis=2), first, axis=2)
+    good = (np.take_along_axis(met, first, axis=2) == ROAD) & (missing <= options.bridge_widths * width)
+    bend = np.linspace(-1, 1, _BENDS)[:, None]
+    cost = np.where(good, (first + 1) * (1 + bend**2), np.inf)[..., 0]
+    best = np.argmin(cost, axis=1)
+    least = cost[np.arange(len(cost)), best]
+    bridges: list[Int32Array] = []
+    for i in np.argsort(least)[: np.isfinite(least).sum()]:
+        column, row = np.rint(tip[i]).astype(int)
+        if np.count_nonzero(states[row - 1 : row + 2, column - 1 : column + 2]) > 2:
+            continue  # a bridge from the other side has come
+        path = at[i, best[i], : first[i, best[i], 0] + 1]
+        path = path[flat[path] == GROUND]
+        flat[path] = ROAD
+        bridges.append(path)
+    return np.concatenate(bridges).astype(np.int32) if bridges else np.empty(0, np.int32)
+
+
+def _headings(
+    skeleton: _Skeleton, edge: IntArray, side: IntArray, tip: FloatArray, length: float, stride: int
+) -> FloatArray:
+    """Return the directions in which chains run over the last `length` pixels before their free ends."""
+    back = np.minimum(np.diff(skeleton.offsets)[edge] - 1, round(length))
+    behind = np.where(side == 0, skeleton.offsets[edge] + back, skeleton.offsets[edge + 1] - 1 - back)
+    rows, columns = np.divmod(skeleton.chain[behind], stride)
+    return np.asarray(np.arctan2(tip[:, 1] - rows, tip[:, 0] - columns))
+
+
+def _fans(
+    shape: tuple[int, int], tip: FloatArray, heading: FloatArray, width: float, options: VectorizeOptions
+) -> IntArray:
+    """Return flat indices (tips, bends, steps) of the pixels on rays that fan out from free ends."""
+    limit = np.radians(options.bridge_angle_deg)
+    steps = np.arange(1, int((options.bridge_widths + 1.5) * width) + 3)  # the gap, and half a road at either side
+    angle = (heading[:, None] + np.linspace(-limit, limit, _BENDS))[..., None]
+    columns = np.rint(tip[:, 0, None, None] + steps * np.cos(angle)).astype(np.int64).clip(0, shape[1] - 1)
+    rows = np.rint(tip[:, 1, None, None] + steps * np.sin(angle)).astype(np.int64).clip(0, shape[0] - 1)
+    return np.asarray(rows * shape[1] + columns)
+
+
 def _to_graph(
     skeleton: _Skeleton, distance: Float32Array, factor: int, width: float, options: VectorizeOptions
 ) -> tuple[RoadGraph, BoolArray]:
     """Smooth the chains and take them to the query plane; `width` in reduced pixels."""
-    edges, xy, is_open = skeleton.edges, skeleton.xy, skeleton.is_open
-    passes = max(1, round(2.0 * (options.smoothing_widths * width) ** 2))  # each pass adds a variance of 1/2
+    skeleton = _part_open_ends(skeleton)
+    keep = skeleton.lengths > width  # loops, and links along the frame, that are shorter than a road is wide
+    keep |= ~skeleton.is_open[skeleton.edges].any(axis=1) & (skeleton.edges[:, 0] != skeleton.edges[:, 1])
+    edges, xy = skeleton.edges, skeleton.xy
+    passes = max(1, round(2.0 * (options.smoothing_widths * width) ** 2))  # each adds a variance of 1/2
     spacing = max(1, round(options.vertex_spacing_px / factor))
-    coords, offsets = smooth_chains(
-        distance, skeleton.chain, skeleton.offsets, xy[edges[:, 0]], xy[edges[:, 1]], passes, spacing
-    )
+    ends = np.concatenate((xy[edges[:, 0]], xy[edges[:, 1]]), axis=1)
+    bent = np.where(skeleton.degree >= 3, round(options.bent_widths * width), 0)
+    coords, offsets = smooth_chains(distance, skeleton.chain, skeleton.offsets, ends, bent[edges], passes, spacing)
     coords, xy = _to_plane(coords, factor), _to_plane(xy, factor)
-    keep = skeleton.lengths() > width  # loops and links shorter than a road is wide are no roads
-    keep |= ~is_open[edges].any(axis=1) & (edges[:, 0] != edges[:, 1])
     polylines = [coords[offsets[e] : offsets[e + 1]] for e in np.flatnonzero(keep)]
-    return _compact(RoadGraph.from_polylines(xy, edges[keep], polylines), is_open)
+    used = np.bincount(edges[keep].ravel(), minlength=len(xy)) > 0
+    number = np.cumsum(used, dtype=np.int32) - 1
+    return RoadGraph.from_polylines(xy[used], number[edges[keep]], polylines), skeleton.is_open[used]
+
+
+def _part_open_ends(skeleton: _Skeleton) -> _Skeleton:
+    """Give every chain that ends at the frame its own node there: roads do not meet at a frame."""
+    half_edges = skeleton.edges.ravel()
+    at_frame = np.flatnonzero(skeleton.is_open[half_edges])
+    apart = half_edges.copy()
+    apart[at_frame] = len(skeleton.xy) + np.arange(len(at_frame))
+    xy = np.concatenate((skeleton.xy, skeleton.xy[half_edges[at_frame]]))
+    is_open = np.concatenate((np.zeros(len(skeleton.xy), bool), np.ones(len(at_frame), bool)))
+    return _Skeleton(xy, is_open, apart.reshape(-1, 2), skeleton.chain, skeleton.offsets)
 
 
 def _to_plane(reduced: FloatArray, factor: int) -> FloatArray:
     """Take (column, row) of reduced, ringed pixel centres to the query plane."""
     return np.asarray(pixel_to_plane((reduced - 0.5) * factor))
-
-
-def _compact(graph: RoadGraph, is_open: BoolArray) -> tuple[RoadGraph, BoolArray]:
-    """Drop nodes without edges."""
-    used = graph.degree() > 0
-    number = np.cumsum(used) - 1
-    edges = number[graph.edges].astype(np.int32).reshape(-1, 2)
-    return RoadGraph(graph.xy[used], edges, graph.coords, graph.offsets), is_open[used]

@@ -9,88 +9,82 @@ import numpy as np
 from numba import njit
 from numpy.typing import NDArray
 
-__all__ = ["GROUND", "ROAD", "SIMPLE", "SOLID", "neighbour_steps", "rethin", "thin"]
+__all__ = ["GROUND", "ROAD", "SOLID", "neighbour_steps", "neighbours", "rethin", "thin"]
 
 GROUND = 0  # observed, no road
 ROAD = 1
 SOLID = 2  # beyond the frame or unobserved: road for all we know, never deleted
 
+KEEP, DELETE, TIP = 0, 1, 2  # a tip is a free end of a line
+
 LEVELS_PER_PIXEL = 8  # distances are told apart to 1/8 px
 
 
-def _simple_table() -> NDArray[np.bool_]:
-    """Return (256,): whether a pixel with these neighbours (bit k: number k, counterclockwise from east) is simple."""
-    table = np.zeros(256, np.bool_)
+def _roles() -> NDArray[np.uint8]:
+    """Return (256,): KEEP, DELETE or TIP for a pixel with these neighbours.
+
+    Bit k of the index is neighbour k, counterclockwise from east. A pixel is simple where its neighbours form one
+    8-connected piece and one of the four next to it is ground (crossing number 1, Yokoi et al. 1975).
+    """
+    roles = np.full(256, KEEP, np.uint8)
     for code in range(256):
-        n = [(code >> k) & 1 for k in range(8)]
-        # Hilditch's crossing number for an 8-connected foreground; 0 means interior or isolated
-        crossings = sum((1 - n[k]) & (n[k + 1] | n[(k + 2) % 8]) for k in (0, 2, 4, 6))
-        table[code] = crossings == 1
-    return table
+        n = [code >> k & 1 for k in range(8)]
+        if sum((1 - n[k]) & (n[k + 1] | n[(k + 2) % 8]) for k in (0, 2, 4, 6)) == 1:
+            roles[code] = TIP if sum(n) == 1 else DELETE
+    return roles
 
 
-SIMPLE = _simple_table()
+ROLES = _roles()
+
+
+@njit(cache=True)
+def neighbours(flat: NDArray[np.uint8], p: np.uint64, stride: np.uint64) -> np.uint8:
+    """Return one bit for each neighbour that is not GROUND, counterclockwise from east."""
+    return np.uint8(
+        (flat[p + np.uint64(1)] != GROUND)
+        | (flat[p - stride + np.uint64(1)] != GROUND) << 1
+        | (flat[p - stride] != GROUND) << 2
+        | (flat[p - stride - np.uint64(1)] != GROUND) << 3
+        | (flat[p - np.uint64(1)] != GROUND) << 4
+        | (flat[p + stride - np.uint64(1)] != GROUND) << 5
+        | (flat[p + stride] != GROUND) << 6
+        | (flat[p + stride + np.uint64(1)] != GROUND) << 7
+    )
 
 
 @njit(cache=True)
 def neighbour_steps(stride: int) -> NDArray[np.int64]:
-    """Flat offsets of the 8 neighbours, counterclockwise from east."""
-    return np.array([1, 1 - stride, -stride, -1 - stride, -1, stride - 1, stride, stride + 1], np.int64)
-
-
-@njit(cache=True)
-def _delete_from(
-    flat: NDArray[np.uint8], p: int, steps: NDArray[np.int64], table: NDArray[np.bool_], ends_at: NDArray[np.bool_]
-) -> bool:
-    """Delete pixel `p` where that is allowed, then walk on while a free end of the line can be deleted too."""
-    deleted = False
-    while True:
-        code = 0
-        n_road = 0
-        n_solid = 0
-        last = p
-        for k in range(8):
-            q = p + steps[k]
-            state = flat[q]
-            if state != GROUND:
-                code |= 1 << k
-                if state == ROAD:
-                    n_road += 1
-                    last = q
-                else:
-                    n_solid += 1
-        if not table[code] or (n_road == 1 and n_solid == 0 and ends_at[p]):
-            return deleted
-        flat[p] = GROUND
-        deleted = True
-        if n_road != 1 or n_solid > 0:
-            return deleted
-        p = last
+    """Return the (8,) steps to the neighbours in flat indices, counterclockwise from east."""
+    return np.array([1, 1 - stride, -stride, -1 - stride, -1, stride - 1, stride, stride + 1])
 
 
 @njit(cache=True)
 def rethin(
-    states: NDArray[np.uint8], pixels: NDArray[np.int64], is_end: NDArray[np.bool_], table: NDArray[np.bool_]
-) -> NDArray[np.int64]:
+    states: NDArray[np.uint8],
+    distance: NDArray[np.float32],
+    pixels: NDArray[np.int32],
+    min_end_depth: float,
+) -> NDArray[np.int32]:
     """Delete what is simple among `pixels` until nothing is, in place; return the pixels left.
 
     Parameters
     ----------
     states : (H, W) uint8, C-contiguous
         GROUND, ROAD or SOLID; its outermost rows and columns are not ROAD. Changed in place.
-    pixels : (P,) int64
-        Flat indices of all ROAD pixels, in the order in which to try them.
-    is_end : (H, W) bool
-        Where a free end of a line is kept.
-    table : (256,) bool
-        `SIMPLE`.
+    distance : (H, W) float32, C-contiguous
+        Distance to the nearest GROUND pixel, before thinning.
+    pixels : (P,) int32
+        Flat indices that hold all ROAD pixels, in the order in which to try them; others are left out.
+    min_end_depth : float
+        A free end of a line is kept where the road is at least this deep: bumps on its edge leave no hairs.
 
     Returns
     -------
-    (Q,) int64
+    (Q,) int32
     """
     flat = states.ravel()
-    ends_at = is_end.ravel()
+    depth = distance.ravel()
+    stride = np.uint64(states.shape[1])  # unsigned: numba then leaves out the check for negative indices
     steps = neighbour_steps(states.shape[1])
     left = pixels.copy()
     n = len(left)
@@ -99,53 +93,52 @@ def rethin(
         changed = False
         kept = 0
         for i in range(n):
-            p = left[i]
-            if flat[p] == ROAD and _delete_from(flat, p, steps, table, ends_at):
-                changed = True
-            if flat[p] == ROAD:
-                left[kept] = p
+            p = np.uint64(left[i])
+            if flat[p] != ROAD:
+                continue
+            role = ROLES[neighbours(flat, p, stride)]
+            if role == KEEP or (role == TIP and depth[p] >= min_end_depth):
+                left[kept] = left[i]
                 kept += 1
+                continue
+            changed = True
+            flat[p] = GROUND
+            while role == TIP:  # follow a line that is eaten from its end
+                for k in range(8):
+                    if flat[p + np.uint64(steps[k])] != GROUND:
+                        p += np.uint64(steps[k])
+                        break
+                role = ROLES[neighbours(flat, p, stride)]
+                if flat[p] != ROAD or role != TIP or depth[p] >= min_end_depth:
+                    break
+                flat[p] = GROUND
         n = kept
-    return left[:n]
+    return left[:n].copy()
 
 
 @njit(cache=True)
-def thin(
-    states: NDArray[np.uint8], distance: NDArray[np.float32], min_end_distance: float, table: NDArray[np.bool_]
-) -> NDArray[np.int64]:
-    """Thin the ROAD pixels to lines, in place; return the pixels left.
+def thin(states: NDArray[np.uint8], distance: NDArray[np.float32], min_end_depth: float) -> NDArray[np.int32]:
+    """Thin the ROAD pixels to lines, in place, the shallow ones first; return the pixels left.
 
-    Parameters
-    ----------
-    states : (H, W) uint8, C-contiguous
-        As in `rethin`.
-    distance : (H, W) float32
-        Distance to the nearest GROUND pixel.
-    min_end_distance : float
-        A free end is kept where the road is at least this deep: bumps on its edge leave no hairs.
-    table : (256,) bool
-        `SIMPLE`.
-
-    Returns
-    -------
-    (Q,) int64
-        Flat indices of the pixels still ROAD.
+    Parameters and result are those of `rethin`.
     """
     flat = states.ravel()
     depth = distance.ravel()
+    found = np.empty(len(flat), np.int32)
+    n = 0
     deepest = np.float32(0.0)
     for p in range(len(flat)):
-        if flat[p] == ROAD and depth[p] > deepest:
-            deepest = depth[p]
+        if flat[p] == ROAD:
+            found[n] = p
+            n += 1
+            deepest = max(deepest, depth[p])
     start = np.zeros(int(deepest * LEVELS_PER_PIXEL) + 2, np.int64)
-    for p in range(len(flat)):
-        if flat[p] == ROAD:
-            start[int(depth[p] * LEVELS_PER_PIXEL) + 1] += 1
+    for i in range(n):
+        start[int(depth[found[i]] * LEVELS_PER_PIXEL) + 1] += 1
     start = np.cumsum(start)
-    order = np.empty(start[-1], np.int64)
-    for p in range(len(flat)):
-        if flat[p] == ROAD:
-            level = int(depth[p] * LEVELS_PER_PIXEL)
-            order[start[level]] = p
-            start[level] += 1
-    return rethin(states, order, distance >= min_end_distance, table)
+    order = np.empty(n, np.int32)
+    for i in range(n):
+        level = int(depth[found[i]] * LEVELS_PER_PIXEL)
+        order[start[level]] = found[i]
+        start[level] += 1
+    return rethin(states, distance, order, min_end_depth)

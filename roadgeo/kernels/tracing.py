@@ -4,15 +4,20 @@ import numpy as np
 from numba import njit
 from numpy.typing import NDArray
 
-from roadgeo.kernels.thinning import ROAD, SOLID, neighbour_steps
+from roadgeo.kernels.thinning import ROAD, SOLID, neighbour_steps, neighbours
 
 __all__ = ["smooth_chains", "trace"]
+
+PATH, WALKED, FREE_END, OPEN_END, JUNCTION = -1, -2, -3, -4, -5  # a pixel's label before its node is numbered
+
+#: (256,) number of the lowest bit set; of 0 it is 0.
+LOWEST_BIT = np.array([max((code & -code).bit_length() - 1, 0) for code in range(256)], np.int64)
 
 
 @njit(cache=True)
 def trace(
-    states: NDArray[np.uint8], pixels: NDArray[np.int64]
-) -> tuple[NDArray[np.float64], NDArray[np.bool_], NDArray[np.int32], NDArray[np.int64], NDArray[np.int64]]:
+    states: NDArray[np.uint8], pixels: NDArray[np.int32], node_of: NDArray[np.int32]
+) -> tuple[NDArray[np.float64], NDArray[np.bool_], NDArray[np.int32], NDArray[np.int32], NDArray[np.int64]]:
     """Split a skeleton into nodes and chains.
 
     A node is a cluster of touching pixels with three ROAD neighbours or more, a pixel with one, a pixel that touches
@@ -22,8 +27,10 @@ def trace(
     ----------
     states : (H, W) uint8, C-contiguous
         As left by `thin`.
-    pixels : (P,) int64
+    pixels : (P,) int32
         Flat indices of its ROAD pixels.
+    node_of : (H * W,) int32
+        Room to work in; need not be set.
 
     Returns
     -------
@@ -32,53 +39,55 @@ def trace(
     is_open : (N,) bool
     edges : (E, 2) int32
         Nodes at the two ends of each chain.
-    chain : (C,) int64
+    chain : (C,) int32
         Flat indices of the pixels strictly between the nodes, chain after chain.
     offsets : (E + 1,) int64
     """
     flat = states.ravel()
     width = states.shape[1]
+    stride = np.uint64(width)
     steps = neighbour_steps(width)
     n = len(pixels)
-    node_of = np.empty(len(flat), np.int32)  # defined at ROAD pixels: node, -1 path, -2 path already walked
     slots = 0
     for i in range(n):
         p = pixels[i]
+        around = neighbours(flat, np.uint64(p), stride)
         n_road = 0
         solid = False
-        for k in range(8):
-            state = flat[p + steps[k]]
-            n_road += state == ROAD
-            solid |= state == SOLID
+        while around:
+            if flat[p + steps[LOWEST_BIT[around]]] == SOLID:
+                solid = True
+            else:
+                n_road += 1
+            around &= around - 1
         if n_road == 2 and not solid:
-            node_of[p] = -1
+            node_of[p] = PATH
         else:
-            node_of[p] = -3 if n_road < 2 or solid else -4
+            node_of[p] = OPEN_END if solid else JUNCTION if n_road > 2 else FREE_END
             slots += n_road
 
-    members = np.empty(n, np.int64)  # pixels of the nodes, node after node
+    members = np.empty(n, np.int32)  # pixels of the nodes, node after node
     first = np.empty(n + 1, np.int64)
     is_open = np.zeros(n, np.bool_)
     n_nodes = 0
     n_members = 0
     for i in range(n):
         seed = pixels[i]
-        if node_of[seed] > -3:
+        kind = node_of[seed]
+        if kind > FREE_END:
             continue
         first[n_nodes] = n_members
-        spread = node_of[seed] == -4
+        is_open[n_nodes] = kind == OPEN_END
         members[n_members] = seed
         n_members += 1
         node_of[seed] = n_nodes
         head = first[n_nodes]
-        while head < n_members:
+        while kind == JUNCTION and head < n_members:
             p = members[head]
             head += 1
             for k in range(8):
                 q = p + steps[k]
-                if flat[q] == SOLID:
-                    is_open[n_nodes] = True
-                elif spread and flat[q] == ROAD and node_of[q] == -4:
+                if flat[q] == ROAD and node_of[q] == JUNCTION:
                     node_of[q] = n_nodes
                     members[n_members] = q
                     n_members += 1
@@ -87,14 +96,14 @@ def trace(
 
     edges = np.empty((slots + n // 2 + 1, 2), np.int32)
     offsets = np.zeros(len(edges) + 1, np.int64)
-    chain = np.empty(n, np.int64)
+    chain = np.empty(n, np.int32)
     n_edges = 0
     n_chain = 0
     m = 0
     next_ring = 0
     while True:
         if m == n_members:  # all nodes done: is there a ring left?
-            while next_ring < n and node_of[pixels[next_ring]] != -1:
+            while next_ring < n and node_of[pixels[next_ring]] != PATH:
                 next_ring += 1
             if next_ring == n:
                 break
@@ -107,27 +116,20 @@ def trace(
         m += 1
         for k in range(8):
             q = p + steps[k]
-            if flat[q] != ROAD or node_of[q] == -2 or node_of[q] == node_of[p]:
+            if flat[q] != ROAD or node_of[q] == WALKED or node_of[q] == node_of[p]:
                 continue
-            if node_of[q] >= 0:
-                if node_of[p] > node_of[q]:
-                    continue  # seen from the other node
-                edges[n_edges, 0] = node_of[p]
-                edges[n_edges, 1] = node_of[q]
-            else:
-                edges[n_edges, 0] = node_of[p]
-                came_from = p
-                while node_of[q] == -1:
-                    node_of[q] = -2
-                    chain[n_chain] = q
-                    n_chain += 1
-                    for j in range(8):
-                        onward = q + steps[j]
-                        if flat[onward] == ROAD and onward != came_from:
-                            break
-                    came_from = q
-                    q = onward
-                edges[n_edges, 1] = node_of[q]
+            if node_of[q] >= 0 and node_of[p] > node_of[q]:
+                continue  # seen from the other node
+            edges[n_edges, 0] = node_of[p]
+            came_along = k
+            while node_of[q] == PATH:
+                node_of[q] = WALKED
+                chain[n_chain] = q
+                n_chain += 1
+                onward = neighbours(flat, np.uint64(q), stride) & ~(1 << ((came_along + 4) & 7))
+                came_along = LOWEST_BIT[onward]
+                q += steps[came_along]
+            edges[n_edges, 1] = node_of[q]
             n_edges += 1
             offsets[n_edges] = n_chain
 
@@ -143,10 +145,10 @@ def trace(
 @njit(cache=True)
 def smooth_chains(
     distance: NDArray[np.float32],
-    chain: NDArray[np.int64],
+    chain: NDArray[np.int32],
     chain_offsets: NDArray[np.int64],
-    starts: NDArray[np.float64],
     ends: NDArray[np.float64],
+    trims: NDArray[np.int64],
     passes: int,
     spacing: int,
 ) -> tuple[NDArray[np.float64], NDArray[np.int64]]:
@@ -158,17 +160,20 @@ def smooth_chains(
     Parameters
     ----------
     distance : (H, W) float32, C-contiguous
-    chain : (C,) int64
+    chain : (C,) int32
+        Flat indices of pixels, none in the outermost rows and columns.
     chain_offsets : (E + 1,) int64
         Chain e owns `chain[chain_offsets[e]:chain_offsets[e + 1]]`, possibly nothing.
-    starts, ends : (E, 2) float64
-        (column, row) of the nodes at the two ends.
+    ends : (E, 4) float64
+        Column, row of the nodes at the two ends.
+    trims : (E, 2) int64
+        How many pixels to leave out at either end: near a junction a skeleton is bent. One pixel is always kept.
     passes, spacing : int
 
     Returns
     -------
     coords : (V, 2) float64
-        Column, row (pixel centres at whole numbers); at least two vertices per chain.
+        Column, row (pixel centres at whole numbers), from node to node; at least two vertices per chain.
     offsets : (E + 1,) int64
     """
     depth = distance.ravel()
@@ -176,51 +181,57 @@ def smooth_chains(
     n_edges = len(chain_offsets) - 1
     coords = np.empty((len(chain) + 2 * n_edges, 2))
     offsets = np.zeros(n_edges + 1, np.int64)
-    longest = 0
-    for e in range(n_edges):
-        longest = max(longest, chain_offsets[e + 1] - chain_offsets[e])
-    line = np.empty((longest + 2, 2))
     n_out = 0
     for e in range(n_edges):
-        n = chain_offsets[e + 1] - chain_offsets[e] + 2
-        line[0] = starts[e]
-        line[n - 1] = ends[e]
-        for i in range(1, n - 1):
-            p = chain[chain_offsets[e] + i - 1]
+        lo = chain_offsets[e] + trims[e, 0]
+        hi = chain_offsets[e + 1] - trims[e, 1]
+        if lo >= hi and chain_offsets[e] < chain_offsets[e + 1]:
+            lo = (chain_offsets[e] + chain_offsets[e + 1]) // 2
+            hi = lo + 1
+        coords[n_out, 0] = ends[e, 0]
+        coords[n_out, 1] = ends[e, 1]
+        n_out += 1
+        n = max(hi - lo, 0)
+        line = coords[n_out : n_out + n]  # worked on in place, then thinned out
+        for i in range(n):
+            p = chain[lo + i]
             lowest = depth[p]
-            for dy in range(-1, 2):
+            for dy in range(-width, width + 1, width):
                 for dx in range(-1, 2):
-                    lowest = min(lowest, depth[p + dy * width + dx])
+                    lowest = min(lowest, depth[p + dy + dx])
             total = 0.0
             sum_x = 0.0
             sum_y = 0.0
-            for dy in range(-1, 2):
+            for row in range(-1, 2):
                 for dx in range(-1, 2):
-                    weight = depth[p + dy * width + dx] - lowest
+                    weight = depth[p + row * width + dx] - lowest
                     total += weight
                     sum_x += weight * dx
-                    sum_y += weight * dy
+                    sum_y += weight * row
             line[i, 0] = p % width
             line[i, 1] = p // width
             if total > 0.0:
                 line[i, 0] += sum_x / total
                 line[i, 1] += sum_y / total
         for _ in range(passes):
-            before_x = line[0, 0]
-            before_y = line[0, 1]
-            for i in range(1, n - 1):
+            before_x = 0.0
+            before_y = 0.0
+            for i in range(n):
                 here_x = line[i, 0]
                 here_y = line[i, 1]
-                line[i, 0] = 0.25 * (before_x + line[i + 1, 0]) + 0.5 * here_x
-                line[i, 1] = 0.25 * (before_y + line[i + 1, 1]) + 0.5 * here_y
+                if 0 < i < n - 1:
+                    line[i, 0] = 0.25 * (before_x + line[i + 1, 0]) + 0.5 * here_x
+                    line[i, 1] = 0.25 * (before_y + line[i + 1, 1]) + 0.5 * here_y
                 before_x = here_x
                 before_y = here_y
-        coords[n_out] = line[0]
-        n_out += 1
-        for i in range(spacing, n - 1 - spacing // 2, spacing):
-            coords[n_out] = line[i]
-            n_out += 1
-        coords[n_out] = line[n - 1]
+        kept = 0
+        for i in range(n):
+            if i % spacing == 0 or i == n - 1:
+                line[kept] = line[i]
+                kept += 1
+        n_out += kept
+        coords[n_out, 0] = ends[e, 2]
+        coords[n_out, 1] = ends[e, 3]
         n_out += 1
         offsets[e + 1] = n_out
     return coords[:n_out].copy(), offsets
