@@ -129,11 +129,12 @@ def draw_overlay(
     _draw_matches(canvas, location)
     _draw_scale_bar(canvas)
     _draw_north(canvas)
-    _draw_legend(canvas, attribution)
+    _draw_legend(canvas)
     left = _draw_mask(location, mask, canvas.image.shape[0], round(options.map_px * options.mask_share))
     gap = np.full((canvas.image.shape[0], _GAP, 3), LIT, np.uint8)
     picture = np.hstack([left, gap, canvas.image])
     _draw_title(picture, location, canvas.top)
+    _write(picture, attribution, (_GAP, len(picture) - round(canvas.top * 0.15)), round(canvas.top * 0.2), FAINT_INK)
     return picture
 
 
@@ -181,7 +182,7 @@ def _draw_query(canvas: _Canvas, location: Location, place: Placement) -> None:
 
 def _draw_matches(canvas: _Canvas, location: Location) -> None:
     if location.evidence is not None:
-        _dot(canvas.image, canvas.pixels(location.evidence.reference_xy), 4.4)
+        _dot(canvas.image, canvas.pixels(location.evidence.reference_xy), 4.4 if location.n_matched < 200 else 3.4)
 
 
 def _dot(image: AnyArray, centers: AnyArray, radius: float) -> None:
@@ -264,7 +265,7 @@ def _summary(location: Location) -> str:
     return "   ·   ".join(parts)
 
 
-def _draw_legend(canvas: _Canvas, attribution: str) -> None:
+def _draw_legend(canvas: _Canvas) -> None:
     image, top = canvas.image, canvas.top
     height = image.shape[0]
     image[:top] = LIT
@@ -276,8 +277,7 @@ def _draw_legend(canvas: _Canvas, attribution: str) -> None:
         cv2.line(image, (x + 4, middle), (x + 2 * size, middle), color, width, cv2.LINE_AA)
         x = _write(image, label, (x + round(2.5 * size), baseline), size, INK) + round(1.4 * size)
     cv2.circle(image, (x, middle), 6, MATCH, -1, cv2.LINE_AA)
-    x = _write(image, "matched intersections", (x + size, baseline), size, INK) + round(1.4 * size)
-    _write(image, attribution, (x, baseline), size, FAINT_INK)
+    _write(image, "matched intersections", (x + size, baseline), size, INK)
 
 
 # --- the mask ---------------------------------------------------------------------------------------------------------
@@ -300,7 +300,7 @@ def _draw_mask(location: Location, mask: RoadMask, height: int, width: int) -> A
     _outline(panel, np.rint(corners).astype(np.int32))
     if location.evidence is not None:
         at = plane_to_pixel(location.evidence.query_xy) * scale + (left - 0.5, top - 0.5)
-        _dot(panel, np.rint(at * (1 << _SHIFT)).astype(int), 3.6)
+        _dot(panel, np.rint(at * (1 << _SHIFT)).astype(int), 3.6 if location.n_matched < 200 else 2.4)
     return panel
 
 
