@@ -15,12 +15,15 @@ import numpy as np
 
 from roadgeo.graph import RoadGraph
 from roadgeo.kernels import simplification as kernels
-from roadgeo.typing import BoolArray, Int32Array
+from roadgeo.typing import BoolArray, FloatArray, Int32Array, IntArray
 
 if TYPE_CHECKING:
     from shapely.geometry import LineString
 
-__all__ = ["SimplifyOptions", "planarize", "simplify"]
+__all__ = ["SimplifyOptions", "coverage", "planarize", "simplify"]
+
+#: Roads at a smaller angle than this run side by side.
+_PARALLEL_COS = float(np.cos(np.radians(25.0)))
 
 
 @dataclass(frozen=True)
@@ -40,7 +43,7 @@ class SimplifyOptions:
     """
 
     merge_radius: float = 14.0
-    fuse_distance: float = 10.0
+    fuse_distance: float = 12.0
     stub_length: float = 15.0
     max_passes: int = 6
 
@@ -73,6 +76,37 @@ def planarize(lines: Sequence[LineString] | Any, grid_m: float = 0.1) -> RoadGra
     return RoadGraph(ends[first], inverse.reshape(-1, 2).astype(np.int32), coords, offsets)
 
 
+def coverage(graph: RoadGraph, cell_m: float = 300.0) -> list[FloatArray]:
+    """Outline the ground where the map knows its roads: every cell with a road, those around it, and what they enclose.
+
+    Parameters
+    ----------
+    graph : RoadGraph
+        In metres.
+    cell_m : float
+
+    Returns
+    -------
+    list of (V, 2) float64
+        Closed rings, plane metres, counterclockwise, disjoint.
+    """
+    import shapely
+
+    if graph.n_edges == 0:
+        return []
+    lines = shapely.linestrings(graph.coords, indices=np.repeat(np.arange(graph.n_edges), np.diff(graph.offsets)))
+    dense = shapely.get_coordinates(shapely.segmentize(lines, cell_m))
+    around = np.stack(np.meshgrid((-1, 0, 1), (-1, 0, 1)), axis=-1).reshape(-1, 2)
+    cells = np.unique(np.floor(dense / cell_m).astype(np.int64), axis=0)
+    cells = np.unique((cells[:, None] + around).reshape(-1, 2), axis=0)
+    boxes = shapely.box(*(cells.T * cell_m), *((cells.T + 1) * cell_m))
+    shells = shapely.get_exterior_ring(shapely.get_parts(shapely.coverage_union_all(boxes)))
+    whole = shapely.union_all(shapely.polygons(shells))  # an island inside another's hole is part of it
+    rings = shapely.get_exterior_ring(shapely.get_parts(whole))
+    rings = np.where(shapely.is_ccw(rings), rings, shapely.reverse(rings))
+    return [shapely.get_coordinates(ring) for ring in rings]
+
+
 def simplify(graph: RoadGraph, options: SimplifyOptions | None = None) -> RoadGraph:
     """Join chains, merge intersections, fuse parallel roads and drop stubs until nothing changes.
 
@@ -90,6 +124,7 @@ def simplify(graph: RoadGraph, options: SimplifyOptions | None = None) -> RoadGr
     graph = _join_chains(graph)
     for _ in range(options.max_passes):
         before = graph.n_nodes, graph.n_edges
+        graph = _join_chains(_close_narrow_faces(graph, options))
         graph = _join_chains(_merge_intersections(graph, options))
         graph = _join_chains(_fuse_parallels(graph, options))
         graph = _join_chains(_drop_stubs(graph, options))
@@ -115,38 +150,167 @@ def _merge_intersections(graph: RoadGraph, options: SimplifyOptions) -> RoadGrap
     number = np.full(graph.n_nodes, -1)
     number[joint] = np.arange(len(joint))
     xy = graph.xy[joint]
-    near = kernels.close_pairs(xy, np.argsort(xy[:, 0], kind="stable"), options.fuse_distance)
-    short = number[graph.edges[graph.edge_lengths() < options.merge_radius]]
-    joined = short[(short >= 0).all(axis=1) & (short[:, 0] != short[:, 1])]
+    near: IntArray = joint[kernels.close_pairs(xy, np.argsort(xy[:, 0], kind="stable"), options.fuse_distance)]
+    short = graph.edges[_lengths(graph) < options.merge_radius]
+    joined = short[(number[short] >= 0).all(axis=1) & (short[:, 0] != short[:, 1])]
     pairs = np.concatenate((near, joined))
     radius = np.repeat((options.fuse_distance, options.merge_radius), (len(near), len(joined)))
-    order = np.argsort(np.hypot(*(xy[pairs[:, 0]] - xy[pairs[:, 1]]).T), kind="stable")
-    cluster, centre = kernels.draw_together(xy, pairs[order], radius[order])
+    return _merge(graph, pairs, radius, 4 * options.merge_radius)
 
-    place = graph.xy.copy()
-    place[joint] = centre
-    target = np.arange(graph.n_nodes)
-    target[joint] = joint[cluster]
-    edges = target[graph.edges].astype(np.int32)
-    coords, offsets = kernels.reattach(place, graph.edges, graph.offsets, graph.coords)
-    merged = RoadGraph(place, edges, coords, offsets)
-    inside = (edges[:, 0] == edges[:, 1]) & (merged.edge_lengths() < 4 * options.merge_radius)
-    return _keep_edges(merged, ~inside)
+
+def _close_narrow_faces(graph: RoadGraph, options: SimplifyOptions) -> RoadGraph:
+    """Make one intersection of the nodes around a face that the roads around it fill: a roundabout, a slip road."""
+    if graph.n_edges == 0:
+        return graph
+    first, last = graph.offsets[:-1], graph.offsets[1:] - 1
+    out = np.stack((graph.coords[first + 1] - graph.coords[first], graph.coords[last - 1] - graph.coords[last]), axis=1)
+    node = graph.edges.ravel()
+    around = np.lexsort((np.arctan2(out[..., 1], out[..., 0]).ravel(), node))  # half-edges, counterclockwise
+    start = np.concatenate(([0], np.cumsum(graph.degree())))
+    place = np.empty(len(node), np.int64)
+    place[around] = np.arange(len(node))
+    twin = np.arange(len(node)) ^ 1
+    before = place[twin] - 1
+    before = np.where(before < start[node[twin]], start[node[twin] + 1] - 1, before)
+    x, y = graph.coords.T
+    sweep = np.zeros(len(x))
+    sweep[:-1] = x[:-1] * y[1:] - x[1:] * y[:-1]
+    sweep[last] = 0.0
+    area = 0.5 * np.add.reduceat(sweep, first)
+    face = kernels.narrow_faces(
+        around[before],
+        np.stack((area, -area), axis=1).ravel(),
+        _lengths(graph),
+        options.fuse_distance,
+        6.0 * options.merge_radius,
+    )
+    inner = np.flatnonzero(face >= 0)
+    pairs = np.stack((node[inner], node[face[inner]]), axis=1).astype(np.int64)
+    return _merge(
+        graph, pairs, np.full(len(pairs), np.inf), 0.0, drop=np.asarray((face >= 0).reshape(-1, 2).any(axis=1))
+    )
 
 
 def _fuse_parallels(graph: RoadGraph, options: SimplifyOptions) -> RoadGraph:
-    """Keep one of several edges that run side by side between the same two nodes."""
+    """Make one road of roads that run side by side, nearer than a mask shows apart."""
+    graph = _halve_loops(graph)
+    graph = _tie(graph, _find_ties(graph, options), options)
     graph = _turned(graph)
     by_ends = np.lexsort((graph.edges[:, 1], graph.edges[:, 0]))
-    lengths = graph.edge_lengths()
-    stands = kernels.parallel_twins(graph.edges, graph.offsets, graph.coords, lengths, by_ends, options.fuse_distance)
-    return _keep_edges(graph, stands == np.arange(graph.n_edges))
+    edges, coords, offsets = kernels.fuse_twins(
+        graph.edges,
+        graph.offsets,
+        graph.coords,
+        _lengths(graph),
+        by_ends,
+        1.5 * options.fuse_distance,
+        0.5 * options.fuse_distance,
+    )
+    return RoadGraph(graph.xy, edges, coords, offsets)
+
+
+def _find_ties(graph: RoadGraph, options: SimplifyOptions) -> FloatArray:
+    """Find where roads begin and cease to run side by side, or end at the side of another: see `kernels.tie_runs`."""
+    lengths = _lengths(graph)
+    count = np.ceil(lengths / (0.4 * options.fuse_distance)).astype(np.int64) + 1
+    count = np.maximum(count, 2)
+    starts = np.concatenate(([0], np.cumsum(count)))
+    xy = np.empty((starts[-1], 2))
+    direction = np.empty((starts[-1], 2))
+    kernels.sample_edges(graph.offsets, graph.coords, lengths, starts, xy, direction)
+    edge = np.repeat(np.arange(graph.n_edges), count)
+    cell = np.floor((xy - xy.min(axis=0, initial=np.inf)) / options.fuse_distance).astype(np.int64) + 1
+    n_columns = int(cell[:, 0].max(initial=0)) + 2
+    key = cell[:, 1] * n_columns + cell[:, 0]
+    order = np.argsort(key, kind="stable")
+    mate, apart, touch = kernels.find_mates(
+        xy,
+        direction,
+        edge,
+        graph.edges,
+        starts,
+        order,
+        key[order],
+        n_columns,
+        options.fuse_distance,
+        _PARALLEL_COS,
+    )
+    runs = kernels.tie_runs(starts, lengths, edge, mate, apart, 0.7 * options.fuse_distance, options.merge_radius)
+    end = np.flatnonzero(touch >= 0)
+    there = touch[end]
+    share = (there - starts[edge[there]]) / (count[edge[there]] - 1)
+    touches = np.stack((end // 2, (end % 2) * lengths[end // 2], edge[there], share * lengths[edge[there]]), axis=1)
+    return np.concatenate((runs, touches))
+
+
+def _tie(graph: RoadGraph, ties: FloatArray, options: SimplifyOptions) -> RoadGraph:
+    """Cut edges where they are tied together, and merge what is tied."""
+    if len(ties) == 0:
+        return graph
+    edge = ties[:, [0, 2]].ravel().astype(np.int64)
+    along = ties[:, [1, 3]].ravel()
+    lengths = _lengths(graph)[edge]
+    snap = options.fuse_distance
+    node = np.where(along < lengths / 2, graph.edges[edge, 0], graph.edges[edge, 1]).astype(np.int64)
+    inner = np.flatnonzero((along > snap) & (along < lengths - snap))
+    inner = inner[np.lexsort((along[inner], edge[inner]))]
+    fresh = np.ones(len(inner), bool)  # cuts closer than `snap` to the one before are the same
+    fresh[1:] = (np.diff(edge[inner]) != 0) | (np.diff(along[inner]) > snap)
+    node[inner] = graph.n_nodes + np.cumsum(fresh) - 1
+    cuts = inner[fresh]
+    places, edges, coords, offsets = kernels.cut_edges(
+        graph.edges,
+        graph.offsets,
+        graph.coords,
+        along[cuts],
+        np.concatenate(([0], np.cumsum(np.bincount(edge[cuts], minlength=graph.n_edges)))),
+        graph.n_nodes,
+    )
+    cut = RoadGraph(np.concatenate((graph.xy, places)), edges, coords, offsets)
+    pairs = node.reshape(-1, 2)
+    return _merge(cut, pairs, np.full(len(pairs), 2.0 * options.fuse_distance), 4 * options.merge_radius)
+
+
+def _halve_loops(graph: RoadGraph) -> RoadGraph:
+    """Cut loops in their middle, so that the two halves of a long narrow one run side by side."""
+    loop = graph.edges[:, 0] == graph.edges[:, 1]
+    places, edges, coords, offsets = kernels.cut_edges(
+        graph.edges,
+        graph.offsets,
+        graph.coords,
+        _lengths(graph)[loop] / 2,
+        np.concatenate(([0], np.cumsum(loop))),
+        graph.n_nodes,
+    )
+    return RoadGraph(np.concatenate((graph.xy, places)), edges, coords, offsets)
 
 
 def _drop_stubs(graph: RoadGraph, options: SimplifyOptions) -> RoadGraph:
     """Leave out dead ends that are too short to be seen."""
     dead = (graph.degree() == 1)[graph.edges].any(axis=1)
-    return _keep_edges(graph, ~(dead & (graph.edge_lengths() < options.stub_length)))
+    return _keep_edges(graph, ~(dead & (_lengths(graph) < options.stub_length)))
+
+
+def _merge(
+    graph: RoadGraph, pairs: IntArray, radius: FloatArray, shortest_loop: float, drop: BoolArray | None = None
+) -> RoadGraph:
+    """Merge pairs of nodes, nearest first, while the centres of what is merged are nearer than `radius`.
+
+    Loops shorter than `shortest_loop` vanish, and so do loops among the edges to `drop`.
+    """
+    order = np.argsort(np.hypot(*(graph.xy[pairs[:, 0]] - graph.xy[pairs[:, 1]]).T), kind="stable")
+    cluster, centre = kernels.draw_together(graph.xy, pairs[order], radius[order])
+    coords, offsets = kernels.reattach(centre, graph.edges, graph.offsets, graph.coords)
+    edges = cluster[graph.edges].astype(np.int32)
+    merged = RoadGraph(centre, edges, coords, offsets)
+    loop = edges[:, 0] == edges[:, 1]
+    short = _lengths(merged) < shortest_loop
+    return _keep_edges(merged, ~(loop & (short if drop is None else short | drop)))
+
+
+def _lengths(graph: RoadGraph) -> FloatArray:
+    """(E,) lengths; `RoadGraph.edge_lengths`, ten times as fast on small graphs."""
+    return np.asarray(kernels.measure_edges(graph.offsets, graph.coords))
 
 
 def _keep_edges(graph: RoadGraph, keep: BoolArray) -> RoadGraph:

@@ -129,7 +129,7 @@ def describe_intersections(
     stiffness : float
         Weight of the node against one line: decides where the lines do not.
     max_shift : float
-        Centres that would move further stay at their node.
+        Centres move no further than this from their node.
     xy, rays, tangents, residual
         Written: (N, 2) float64, (N, R) float32 filled with NaN, the same, (N,) float32.
     """
@@ -156,8 +156,10 @@ def describe_intersections(
         det = a11 * a22 - a12 * a12
         dx = (a22 * b1 - a12 * b2) / det
         dy = (a11 * b2 - a12 * b1) / det
-        if dx * dx + dy * dy > max_shift * max_shift:
-            dx = dy = 0.0
+        shift = np.sqrt(dx * dx + dy * dy)
+        if shift > max_shift:
+            dx *= max_shift / shift
+            dy *= max_shift / shift
         xy[n, 0] = node_xy[n, 0] + dx
         xy[n, 1] = node_xy[n, 1] + dy
         residual[n] = np.sqrt(square / max(count, 1))

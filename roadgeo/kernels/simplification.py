@@ -7,7 +7,19 @@ import numpy as np
 from numba import njit
 from numpy.typing import NDArray
 
-__all__ = ["close_pairs", "draw_together", "join_chains", "parallel_twins", "reattach"]
+__all__ = [
+    "close_pairs",
+    "cut_edges",
+    "draw_together",
+    "find_mates",
+    "fuse_twins",
+    "join_chains",
+    "measure_edges",
+    "narrow_faces",
+    "reattach",
+    "sample_edges",
+    "tie_runs",
+]
 
 
 @njit(cache=True)
@@ -79,6 +91,18 @@ def join_chains(
             n_out += 1
             out_offsets[n_out] = size
     return out_edges[:n_out].copy(), out_coords[:size].copy(), out_offsets[: n_out + 1].copy()
+
+
+@njit(cache=True)
+def measure_edges(offsets: NDArray[np.int64], coords: NDArray[np.float64]) -> NDArray[np.float64]:
+    """Return the (E,) lengths of edges; `offsets` (E + 1,), `coords` (C, 2)."""
+    lengths = np.zeros(len(offsets) - 1)
+    for e in range(len(lengths)):
+        for c in range(offsets[e], offsets[e + 1] - 1):
+            dx = coords[c + 1, 0] - coords[c, 0]
+            dy = coords[c + 1, 1] - coords[c, 1]
+            lengths[e] += np.sqrt(dx * dx + dy * dy)
+    return lengths
 
 
 @njit(cache=True)
@@ -236,15 +260,16 @@ def _point_at(coords: NDArray[np.float64], lo: int, hi: int, along: float) -> tu
 
 
 @njit(cache=True)
-def parallel_twins(
+def fuse_twins(
     edges: NDArray[np.int32],
     offsets: NDArray[np.int64],
     coords: NDArray[np.float64],
     lengths: NDArray[np.float64],
     by_ends: NDArray[np.int64],
     distance: float,
-) -> NDArray[np.int64]:
-    """Find edges that run beside another one between the same two nodes.
+    spacing: float,
+) -> tuple[NDArray[np.int32], NDArray[np.float64], NDArray[np.int64]]:
+    """Make one edge, halfway, of edges that run beside each other between the same two nodes.
 
     Parameters
     ----------
@@ -257,14 +282,16 @@ def parallel_twins(
         Order of the edges by their two ends.
     distance : float
         Twins are everywhere nearer to each other than this, compared at equal shares of their lengths.
+    spacing : float
+        Of the vertices of an edge made of twins.
 
     Returns
     -------
-    (E,) int64
-        The edge that stands for this one: itself, or the twin that it is dropped for.
+    edges, coords, offsets
     """
     n_edges = len(edges)
-    stands = np.arange(n_edges)
+    stands = np.arange(n_edges)  # the edge that each one goes into
+    members = np.ones(n_edges, np.int64)
     for a in range(n_edges):
         e = by_ends[a]
         if stands[e] != e or edges[e, 0] == edges[e, 1]:
@@ -284,4 +311,343 @@ def parallel_twins(
                     break
             if near:
                 stands[f] = e
-    return stands
+                members[e] += 1
+
+    size = 0
+    n_out = 0
+    for e in range(n_edges):
+        if stands[e] == e:
+            n_out += 1
+            size += offsets[e + 1] - offsets[e] if members[e] == 1 else int(lengths[e] / spacing) + 2
+    out_edges = np.empty((n_out, 2), np.int32)
+    out_offsets = np.zeros(n_out + 1, np.int64)
+    out = np.zeros((size, 2))
+    place = np.empty(n_edges, np.int64)
+    size = 0
+    n_out = 0
+    for e in range(n_edges):
+        if stands[e] == e:
+            place[e] = n_out
+            out_edges[n_out] = edges[e]
+            if members[e] == 1:
+                for c in range(offsets[e], offsets[e + 1]):
+                    out[size, 0] = coords[c, 0]
+                    out[size, 1] = coords[c, 1]
+                    size += 1
+            else:
+                size += int(lengths[e] / spacing) + 2
+            n_out += 1
+            out_offsets[n_out] = size
+    for e in range(n_edges):
+        head = stands[e]
+        if members[head] > 1:
+            lo = out_offsets[place[head]]
+            n = out_offsets[place[head] + 1] - lo
+            for k in range(n):
+                x, y = _point_at(coords, offsets[e], offsets[e + 1], lengths[e] * k / (n - 1))
+                out[lo + k, 0] += x / members[head]
+                out[lo + k, 1] += y / members[head]
+    return out_edges, out, out_offsets
+
+
+@njit(cache=True)
+def sample_edges(
+    offsets: NDArray[np.int64],
+    coords: NDArray[np.float64],
+    lengths: NDArray[np.float64],
+    starts: NDArray[np.int64],
+    xy: NDArray[np.float64],
+    direction: NDArray[np.float64],
+) -> None:
+    """Write points evenly spaced along every edge, both ends included, and the road's direction there.
+
+    Parameters
+    ----------
+    offsets : (E + 1,) int64
+    coords : (C, 2) float64
+    lengths : (E,) float64
+    starts : (E + 1,) int64
+        Edge e gets samples `starts[e]` to `starts[e + 1]`, two or more.
+    xy, direction : (S, 2) float64
+        Written; directions are unit vectors.
+    """
+    for e in range(len(lengths)):
+        n = starts[e + 1] - starts[e]
+        c = offsets[e]
+        done = 0.0
+        for k in range(n):
+            along = lengths[e] * k / (n - 1)
+            while True:
+                dx = coords[c + 1, 0] - coords[c, 0]
+                dy = coords[c + 1, 1] - coords[c, 1]
+                step = np.sqrt(dx * dx + dy * dy)
+                if (done + step >= along and step > 0.0) or c + 2 >= offsets[e + 1]:
+                    break
+                done += step
+                c += 1
+            i = starts[e] + k
+            t = min((along - done) / step, 1.0) if step > 0.0 else 0.0
+            xy[i, 0] = coords[c, 0] + t * dx
+            xy[i, 1] = coords[c, 1] + t * dy
+            direction[i, 0] = dx / step if step > 0.0 else 1.0
+            direction[i, 1] = dy / step if step > 0.0 else 0.0
+
+
+@njit(cache=True)
+def find_mates(
+    xy: NDArray[np.float64],
+    direction: NDArray[np.float64],
+    edge: NDArray[np.int64],
+    edges: NDArray[np.int32],
+    starts: NDArray[np.int64],
+    order: NDArray[np.int64],
+    key: NDArray[np.int64],
+    n_columns: int,
+    distance: float,
+    min_cos: float,
+) -> tuple[NDArray[np.int64], NDArray[np.float64], NDArray[np.int64]]:
+    """Find the nearest sample of another edge beside each sample, in the same or the opposite direction.
+
+    Parameters
+    ----------
+    xy, direction : (S, 2) float64
+    edge : (S,) int64
+        The edge of each sample.
+    edges : (E, 2) int32
+    starts : (E + 1,) int64
+        Edge e has the samples `starts[e]` to `starts[e + 1]`.
+    order, key : (S,) int64
+        Samples sorted by the cell (row * n_columns + column, with empty cells around) that they lie in, and those
+        cells, ascending; cells are `distance` wide.
+    n_columns : int
+    distance : float
+    min_cos : float
+        Least |cosine| of the angle between the two roads.
+
+    Returns
+    -------
+    mate : (S,) int64
+        -1 where there is none.
+    apart : (S,) float64
+        Distance to the mate, `distance` where there is none.
+    touch : (2 E,) int64
+        The sample nearest to each end of each edge, in any direction, of edges that do not meet it there, or -1.
+    """
+    n = len(xy)
+    mate = np.full(n, -1)
+    apart = np.full(n, distance * distance)
+    touch = np.full(2 * len(edges), -1)
+    nearest = np.full(2 * len(edges), distance * distance)
+    for row in range(-1, 2):
+        lo = 0
+        hi = 0
+        for a in range(n):
+            while lo < n and key[lo] < key[a] + row * n_columns - 1:
+                lo += 1
+            while hi < n and key[hi] <= key[a] + row * n_columns + 1:
+                hi += 1
+            i = order[a]
+            e = edge[i]
+            end = -1
+            if i == starts[e]:
+                end = 2 * e
+            elif i == starts[e + 1] - 1:
+                end = 2 * e + 1
+            for b in range(lo, hi):
+                j = order[b]
+                if e == edge[j]:
+                    continue
+                dx = xy[j, 0] - xy[i, 0]
+                dy = xy[j, 1] - xy[i, 1]
+                d = dx * dx + dy * dy
+                if d < apart[i]:
+                    cos = direction[i, 0] * direction[j, 0] + direction[i, 1] * direction[j, 1]
+                    if abs(cos) >= min_cos:
+                        apart[i] = d
+                        mate[i] = j
+                if end >= 0 and d < nearest[end]:
+                    node = edges[e, end % 2]
+                    if edges[edge[j], 0] != node and edges[edge[j], 1] != node:
+                        nearest[end] = d
+                        touch[end] = j
+    return mate, np.sqrt(apart), touch
+
+
+@njit(cache=True)
+def tie_runs(
+    starts: NDArray[np.int64],
+    lengths: NDArray[np.float64],
+    edge: NDArray[np.int64],
+    mate: NDArray[np.int64],
+    apart: NDArray[np.float64],
+    split_distance: float,
+    least: float,
+) -> NDArray[np.float64]:
+    """Tie two edges together where they begin and where they cease to run side by side.
+
+    Parameters
+    ----------
+    starts : (E + 1,) int64
+    lengths : (E,) float64
+    edge, mate : (S,) int64
+    apart : (S,) float64
+    split_distance : float
+        Where two roads part, they are one until they are this far apart.
+    least : float
+        Shorter runs are left alone.
+
+    Returns
+    -------
+    (T, 4) float64
+        Edge, arc length along it, other edge, arc length along that.
+    """
+    ties = np.empty((64, 4))
+    size = 0
+    for e in range(len(lengths)):
+        step = lengths[e] / (starts[e + 1] - starts[e] - 1)
+        i = starts[e]
+        while i < starts[e + 1]:
+            if mate[i] < 0:
+                i += 1
+                continue
+            f = edge[mate[i]]
+            j = i
+            while j + 1 < starts[e + 1] and mate[j + 1] >= 0 and edge[mate[j + 1]] == f:
+                j += 1
+            first = i
+            last = j
+            i = j + 1
+            if first > starts[e] and mate[first - 1] < 0:  # the roads draw near here
+                while first < last and apart[first] > split_distance and apart[first + 1] < apart[first]:
+                    first += 1
+            if last + 1 < starts[e + 1] and mate[last + 1] < 0:  # they part here
+                while last > first and apart[last] > split_distance and apart[last - 1] < apart[last]:
+                    last -= 1
+            if (last - first) * step < least:
+                continue
+            if size + 2 > len(ties):
+                grown = np.empty((2 * size, 4))
+                grown[:size] = ties[:size]
+                ties = grown
+            other = lengths[f] / (starts[f + 1] - starts[f] - 1)
+            for k in (first, last):
+                ties[size, 0] = e
+                ties[size, 1] = (k - starts[e]) * step
+                ties[size, 2] = f
+                ties[size, 3] = (mate[k] - starts[f]) * other
+                size += 1
+    return ties[:size].copy()
+
+
+@njit(cache=True)
+def cut_edges(
+    edges: NDArray[np.int32],
+    offsets: NDArray[np.int64],
+    coords: NDArray[np.float64],
+    cuts: NDArray[np.float64],
+    cut_starts: NDArray[np.int64],
+    n_nodes: int,
+) -> tuple[NDArray[np.float64], NDArray[np.int32], NDArray[np.float64], NDArray[np.int64]]:
+    """Cut edges at given arc lengths; cut k becomes node `n_nodes + k`.
+
+    Parameters
+    ----------
+    edges : (E, 2) int32
+    offsets : (E + 1,) int64
+    coords : (C, 2) float64
+    cuts : (K,) float64
+        Arc lengths, ascending within each edge, inside it.
+    cut_starts : (E + 1,) int64
+        Edge e is cut at `cuts[cut_starts[e]:cut_starts[e + 1]]`.
+    n_nodes : int
+
+    Returns
+    -------
+    places : (K, 2) float64
+        Of the new nodes.
+    edges, coords, offsets
+    """
+    n_edges = len(edges)
+    n_cuts = len(cuts)
+    places = np.empty((n_cuts, 2))
+    out_edges = np.empty((n_edges + n_cuts, 2), np.int32)
+    out_offsets = np.zeros(n_edges + n_cuts + 1, np.int64)
+    out = np.empty((len(coords) + 2 * n_cuts, 2))
+    size = 0
+    n_out = 0
+    for e in range(n_edges):
+        k = cut_starts[e]
+        done = 0.0
+        node = edges[e, 0]
+        for c in range(offsets[e], offsets[e + 1]):
+            if c > offsets[e]:
+                dx = coords[c, 0] - coords[c - 1, 0]
+                dy = coords[c, 1] - coords[c - 1, 1]
+                step = np.sqrt(dx * dx + dy * dy)
+                while k < cut_starts[e + 1] and cuts[k] <= done + step:
+                    t = (cuts[k] - done) / step if step > 0.0 else 0.0
+                    places[k, 0] = coords[c - 1, 0] + t * dx
+                    places[k, 1] = coords[c - 1, 1] + t * dy
+                    out[size] = places[k]
+                    out[size + 1] = places[k]
+                    out_edges[n_out, 0] = node
+                    node = n_nodes + k
+                    out_edges[n_out, 1] = node
+                    n_out += 1
+                    out_offsets[n_out] = size + 1
+                    size += 2
+                    k += 1
+                done += step
+            out[size, 0] = coords[c, 0]
+            out[size, 1] = coords[c, 1]
+            size += 1
+        out_edges[n_out, 0] = node
+        out_edges[n_out, 1] = edges[e, 1]
+        n_out += 1
+        out_offsets[n_out] = size
+    return places, out_edges, out, out_offsets
+
+
+@njit(cache=True)
+def narrow_faces(
+    follow: NDArray[np.int64], area: NDArray[np.float64], lengths: NDArray[np.float64], width: float, longest: float
+) -> NDArray[np.int64]:
+    """Find the faces of a plane graph that are small and narrow: a roundabout, the triangle of a slip road.
+
+    Parameters
+    ----------
+    follow : (2 E,) int64
+        The half-edge that comes after each half-edge around the face on its left.
+    area : (2 E,) float64
+        Area swept by each half-edge as seen from the origin, counterclockwise positive.
+    lengths : (E,) float64
+    width : float
+        A face is narrow when twice its area is less than this times its perimeter.
+    longest : float
+        Largest perimeter.
+
+    Returns
+    -------
+    (2 E,) int64
+        The first half-edge of the narrow face on the left of each half-edge, -1 for other faces.
+    """
+    n = len(follow)
+    face = np.full(n, -2)
+    for first in range(n):
+        if face[first] != -2:
+            continue
+        perimeter = 0.0
+        total = 0.0
+        half = first
+        while True:
+            perimeter += lengths[half // 2]
+            total += area[half]
+            face[half] = -1
+            half = follow[half]
+            if half == first:
+                break
+        if perimeter < longest and 0.0 < 2 * total < width * perimeter:
+            while face[half] == -1:
+                face[half] = first
+                half = follow[half]
+    return face
