@@ -7,21 +7,23 @@ import multiprocessing
 import signal
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from concurrent.futures import ProcessPoolExecutor
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any, Protocol, TypeAlias
 
 import cv2
 
-from roadgeo.errors import OutputError
+from roadgeo.errors import MaskError, OutputError
 from roadgeo.files import write_text
+from roadgeo.grid import RoadMask
 from roadgeo.io_network import read_network
 from roadgeo.landscape import Landscape
 from roadgeo.simulation import SimulationOptions, simulate_query
 from roadgeo.truth import Truth, truth_from_record, truth_to_record
 from roadgeo.typing import AnyArray
+from roadgeo.workflows import LocateOptions, locate, open_reference
 
-__all__ = ["DrawnMasks", "Locator", "Mask", "MaskFiles", "QuerySet", "Trial", "run_trials"]
+__all__ = ["DrawnMasks", "Locator", "Mask", "MaskFiles", "QuerySet", "ReferenceLocator", "Trial", "run_trials"]
 
 SCHEMA = "roadgeo.trials/1"
 
@@ -94,6 +96,27 @@ class DrawnMasks:
             return query.truth, query.mask
 
         return draw
+
+
+@dataclass(frozen=True)
+class ReferenceLocator:
+    """`roadgeo.locate` on one or more references; a mask that it cannot use counts as not located."""
+
+    references: tuple[Path, ...]
+    options: LocateOptions = field(default_factory=LocateOptions)
+
+    def open(self) -> Callable[[Mask], Answer]:
+        """Open the references."""
+        references = [open_reference(path) for path in self.references]
+
+        def answer(mask: Mask) -> Answer:
+            try:
+                query = mask if isinstance(mask, str) else RoadMask(mask > 0)
+                return locate(query, references, self.options).to_dict()
+            except MaskError as error:
+                return {"status": "not_located", "reason": str(error)}
+
+        return answer
 
 
 @dataclass(frozen=True)

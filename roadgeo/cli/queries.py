@@ -2,7 +2,10 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
+import sys
+from collections import Counter
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
 from typing import TYPE_CHECKING, Any, TypeVar
 
 import click
@@ -12,7 +15,7 @@ from roadgeo.cli.parameters import RANGE, Numbers
 if TYPE_CHECKING:
     from roadgeo.simulation import SimulationOptions
 
-__all__ = ["query_options", "query_sets"]
+__all__ = ["count_up", "query_options", "query_sets"]
 
 Command = TypeVar("Command", bound=Callable[..., Any])
 
@@ -25,7 +28,15 @@ def _wrong_angles(low: float, high: float) -> str:
 ANGLES = Numbers("angles", ("LO", "HI"), ":", _wrong_angles)
 
 _OPTIONS = [
-    click.option("-n", "--count", type=click.IntRange(1), default=40, show_default=True, help="Masks per noise model."),
+    click.option(
+        "-n",
+        "--count",
+        metavar="N",
+        type=click.IntRange(1),
+        default=40,
+        show_default=True,
+        help="Masks per noise model.",
+    ),
     click.option(
         "--noise",
         type=click.Choice(["clean", "segmented", "poor"]),
@@ -34,13 +45,32 @@ _OPTIONS = [
         show_default=True,
         help="What goes wrong in the masks; may be given several times.",
     ),
-    click.option("--gsd", type=RANGE, default="0.7:1.4", show_default=True, help="Metres per pixel at the centre."),
+    click.option(
+        "--gsd",
+        metavar="LO:HI",
+        type=RANGE,
+        default="0.7:1.4",
+        show_default=True,
+        help="Metres per pixel at the centre.",
+    ),
     click.option(
         "--tilt", type=ANGLES, default="0:30", show_default=True, help="Degrees of the axis from the vertical."
     ),
-    click.option("--heading", type=ANGLES, default="0:360", show_default=True, help="Where up points, from north."),
     click.option(
-        "--size", type=click.IntRange(64, 20_000), default=1500, show_default=True, help="Side of a mask, pixels."
+        "--heading",
+        metavar="LO:HI",
+        type=ANGLES,
+        default="0:360",
+        show_default=True,
+        help="Where up points, from north.",
+    ),
+    click.option(
+        "--size",
+        metavar="PX",
+        type=click.IntRange(64, 20_000),
+        default=1500,
+        show_default=True,
+        help="Side of a mask, pixels.",
     ),
     click.option(
         "--window", type=click.FloatRange(10), metavar="METRES", help="Side on the ground, in place of --size."
@@ -56,11 +86,24 @@ _OPTIONS = [
         show_default=True,
         help="How many to show.",
     ),
-    click.option("--road-width", type=RANGE, default="8:11", show_default=True, help="Metres, as drawn."),
     click.option(
-        "--mirrored", type=click.IntRange(0), default=0, help="Also so many masks turned over, which have no place."
+        "--road-width", metavar="LO:HI", type=RANGE, default="8:11", show_default=True, help="Metres, as drawn."
     ),
-    click.option("--seed", type=click.IntRange(0), default=0, show_default=True, help="Other seeds draw other masks."),
+    click.option(
+        "--mirrored",
+        metavar="N",
+        type=click.IntRange(0),
+        default=0,
+        help="Also so many masks turned over, which have no place.",
+    ),
+    click.option(
+        "--seed",
+        metavar="N",
+        type=click.IntRange(0),
+        default=0,
+        show_default=True,
+        help="Other seeds draw other masks.",
+    ),
 ]
 
 
@@ -69,6 +112,25 @@ def query_options(command: Command) -> Command:
     for option in reversed(_OPTIONS):
         command = option(command)
     return command
+
+
+@contextmanager
+def count_up(total: int, quiet: bool) -> Iterator[Callable[[str], None]]:
+    """Show a bar on standard error, where that is a terminal; yields what counts one more of a sort."""
+    if quiet or not sys.stderr.isatty():
+        yield lambda _: None
+        return
+    from roadgeo.cli.progress import show_progress
+
+    counts: Counter[str] = Counter()
+
+    with show_progress(total, lambda counts: ", ".join(f"{n} {sort}" for sort, n in counts.items())) as advance:
+
+        def count(sort: str) -> None:
+            counts[sort] += 1
+            advance(counts)
+
+        yield count
 
 
 def query_sets(

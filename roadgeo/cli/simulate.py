@@ -7,7 +7,7 @@ from typing import Any
 
 import click
 
-from roadgeo.cli.queries import query_options, query_sets
+from roadgeo.cli.queries import count_up, query_options, query_sets
 
 __all__ = ["simulate_command"]
 
@@ -33,7 +33,6 @@ def simulate_command(reference: str, out_dir: Path, quiet: bool, **options: Any)
     """
     import cv2
 
-    from roadgeo.cli.progress import progress_bar
     from roadgeo.files import write_bytes
     from roadgeo.io_atomic import writing
     from roadgeo.io_network import read_network
@@ -45,7 +44,7 @@ def simulate_command(reference: str, out_dir: Path, quiet: bool, **options: Any)
     sets = query_sets(**options)
     landscape = Landscape.from_network(read_network(resolve_reference(reference)))
     truths = []
-    with progress_bar("Drawing", sum(count for _, count in sets), quiet) as advance:
+    with count_up(sum(count for _, count in sets), quiet) as advance:
         for simulation, count in sets:
             folder = out_dir / simulation.kind
             with writing(folder):
@@ -54,7 +53,7 @@ def simulate_command(reference: str, out_dir: Path, quiet: bool, **options: Any)
                 query = simulate_query(landscape, simulation, k)
                 write_bytes(out_dir / query.truth.file, cv2.imencode(".png", query.mask)[1].tobytes())
                 truths.append(query.truth)
-                advance()
+                advance(simulation.kind)
     write_truth(out_dir, truths)
     if not quiet:
         click.echo(

@@ -1,0 +1,177 @@
+"""`roadgeo evaluate`: how well masks are located on a reference."""
+
+from __future__ import annotations
+
+import json
+import time
+from collections.abc import Iterator, Sequence
+from pathlib import Path
+from typing import TYPE_CHECKING, Any, Literal
+
+import click
+
+from roadgeo.cli.parameters import RANGE
+from roadgeo.cli.queries import count_up, query_options, query_sets
+
+if TYPE_CHECKING:
+    from rich.table import Table
+
+    from roadgeo.evaluation import Evaluation, Share, Summary
+    from roadgeo.trials import QuerySet
+
+__all__ = ["evaluate_command"]
+
+
+@click.command("evaluate", short_help="Measure how well masks are located.")
+@click.argument("reference", metavar="REF")
+@click.option("--queries", type=click.Path(exists=True, path_type=Path), help="A query set: its folder, or its table.")
+@query_options
+@click.option("--method", type=click.Choice(["auto", "pair"]), default="auto", show_default=True, help="As in locate.")
+@click.option("--known-gsd", metavar="LO:HI", type=RANGE, help="Tell the locator, as --gsd of locate does.")
+@click.option("--max-tilt", metavar="DEG", type=click.FloatRange(0, 80), help="Tell the locator.")
+@click.option("--north-up", is_flag=True, help="Tell the locator.")
+@click.option(
+    "--time-limit", type=click.FloatRange(0.01), metavar="S", default=10.0, show_default=True, help="Per mask."
+)
+@click.option(
+    "--radius", metavar="METRES", type=click.FloatRange(0.01), default=20.0, show_default=True, help="Right if nearer."
+)
+@click.option("-j", "--jobs", metavar="N", type=click.IntRange(1), default=1, show_default=True, help="Processes.")
+@click.option("-o", "--out-dir", type=click.Path(file_okay=False, path_type=Path), help="Where to keep all there is.")
+@click.option("--json", "as_json", is_flag=True, help="Print the figures as one JSON object.")
+@click.option("-q", "--quiet", is_flag=True, help="Say nothing but errors, and what --json prints.")
+def evaluate_command(
+    reference: str,
+    queries: Path | None,
+    method: Literal["auto", "pair"],
+    known_gsd: tuple[float, float] | None,
+    max_tilt: float | None,
+    north_up: bool,
+    time_limit: float,
+    radius: float,
+    jobs: int,
+    out_dir: Path | None,
+    as_json: bool,
+    quiet: bool,
+    **options: Any,
+) -> None:
+    """Locate masks whose place is known, and count.
+
+    Without --queries the masks are drawn as `roadgeo simulate` draws them. With --out-dir the folder gets
+    evaluation.json, report.html and trials.jsonl, from which an interrupted run goes on. Other tables of truths than
+    those of `simulate` are understood too; see roadgeo/truth.py.
+
+    \b
+    Examples:
+      roadgeo evaluate boston-ma -j 2
+      roadgeo evaluate boston-ma --noise poor --tilt 30:50 --mirrored 100 -o evaluation
+      roadgeo evaluate boston-ma --queries queries/truth.csv --method pair
+    """
+    from roadgeo.cli.locate import make_options
+    from roadgeo.evaluation import evaluate
+    from roadgeo.io_atomic import writing
+    from roadgeo.library import resolve_reference
+    from roadgeo.trials import ReferenceLocator, run_trials
+
+    path = resolve_reference(reference)
+    query_set, settings = _query_set(path, queries, options)
+    told = {"known_gsd": known_gsd, "max_tilt": max_tilt, "north_up": north_up or None, "time_limit_s": time_limit}
+    settings |= {"reference": path.stem, "method": method, **{k: v for k, v in told.items() if v is not None}}
+    if out_dir is not None:
+        with writing(out_dir):
+            out_dir.mkdir(parents=True, exist_ok=True)
+    record = None if out_dir is None else out_dir / "trials.jsonl"
+    locator = ReferenceLocator((path,), make_options(method, known_gsd, max_tilt, None, north_up, time_limit))
+
+    started = time.perf_counter()
+    with count_up(len(query_set), quiet or as_json) as count:
+        trials = run_trials(
+            query_set, locator, jobs, record, settings, lambda trial: count(trial.answer["status"].replace("_", " "))
+        )
+    elapsed = time.perf_counter() - started
+
+    truths = [trial.truth for trial in trials]
+    evaluation = evaluate(truths, [trial.answer for trial in trials], settings, radius)
+    if out_dir is not None:
+        from roadgeo.evaluation_report import render_report
+        from roadgeo.files import write_text
+
+        write_text(out_dir / "evaluation.json", json.dumps(evaluation.to_dict(), indent=1) + "\n")
+        write_text(out_dir / "report.html", render_report(evaluation, truths, f"{path.stem}: {len(trials)} masks"))
+    if as_json:
+        click.echo(json.dumps({name: part for name, part in evaluation.to_dict().items() if name != "scores"}))
+    elif not quiet:
+        _print(evaluation)
+        click.echo(f"{len(trials)} masks in {elapsed:.1f} s" + (f"; see {out_dir}" if out_dir else ""), err=True)
+
+
+def _query_set(reference: Path, queries: Path | None, options: dict[str, Any]) -> tuple[QuerySet, dict[str, Any]]:
+    """Choose between a query set on disk and one to draw, and say which."""
+    from roadgeo.trials import DrawnMasks, MaskFiles
+    from roadgeo.truth import read_truth
+
+    if queries is None:
+        plain = {name: value for name, value in options.items() if value is not None}
+        return DrawnMasks(reference, query_sets(**options)), plain
+    table = queries / "truth.csv" if queries.is_dir() else queries
+    return MaskFiles(table.parent, tuple(read_truth(table))), {"queries": str(queries)}
+
+
+# --- printing ---------------------------------------------------------------------------------------------------------
+
+
+def _print(evaluation: Evaluation) -> None:
+    from rich.console import Console
+
+    from roadgeo.evaluation_report import TITLES
+
+    console = Console()
+    for by, groups in evaluation.breakdowns.items():
+        console.print(_table(TITLES[by], [*groups, evaluation.total] if by == "kind" else groups))
+    for line in _verdicts(evaluation):
+        console.print(line, highlight=False)
+
+
+def _table(title: str, groups: Sequence[Summary]) -> Table:
+    from rich.table import Table
+
+    table = Table(title=title, title_justify="left")
+    absent = any(group.refused.of for group in groups)
+    heads = ["", "masks", "precision %", "recall %", *(["refused %"] if absent else []), "centre m", "corners m", "ms"]
+    for head in heads:
+        table.add_column(head, justify="right" if head else "left", no_wrap=True)
+    for group in groups:
+        errors = (group.center_m, group.corners_rms_m)
+        table.add_row(
+            group.name,
+            str(group.queries),
+            _percent(group.precision),
+            _percent(group.recall),
+            *([_percent(group.refused)] if absent else []),
+            *(f"{spread.median:.1f}/{spread.p95:.1f}" for spread in errors),
+            f"{1000 * group.compute_s.median:.0f}/{1000 * group.compute_s.p95:.0f}",
+        )
+    return table
+
+
+def _percent(estimate: Share) -> str:
+    if not estimate.of:
+        return "-"
+    return f"{100 * estimate.value:.1f} ({100 * estimate.low:.0f}-{100 * estimate.high:.0f})"
+
+
+def _verdicts(evaluation: Evaluation) -> Iterator[str]:
+    """Say what the numbers in the tables are, and whether odds and standard deviations hold."""
+    yield "In brackets: 95 % confidence. Metres, ms: median/95 %."
+    broken = [step for step in evaluation.odds if not step.holds]
+    surest = next((step for step in reversed(evaluation.odds) if step.wrong.of), None)
+    if broken:
+        step = broken[0]
+        wrong = f"{step.wrong.hits} of {step.wrong.of}"
+        yield f"Odds promise too much: {wrong} located at 10^{step.at_least:g} or more are wrong."
+    elif surest is not None:
+        located = evaluation.odds[0].wrong
+        yield f"Odds hold: {located.hits} of {located.of} located masks are wrong, no count contradicts them."
+    if evaluation.sigma.within_1.of:
+        robust = f"robustly {evaluation.sigma.robust:.2f}"
+        yield f"Corner errors are {evaluation.sigma.rms:.2f} times what is claimed ({robust})."
