@@ -36,9 +36,18 @@ from roadgeo.errors import IndexFormatError
 from roadgeo.io_atomic import publish, staging
 from roadgeo.typing import AnyArray
 
-__all__ = ["FORMAT_VERSION", "check_index", "dump_index", "read_index", "read_manifest", "write_index"]
+__all__ = [
+    "FORMAT_VERSION",
+    "check_index",
+    "dump_index",
+    "read_format_version",
+    "read_index",
+    "read_manifest",
+    "write_index",
+]
 
-#: Goes up whenever an older roadgeo could misread the file. A reader refuses every version but its own, and says so.
+#: Goes up whenever the file or the arrays in it change. A reader refuses every version but its own; an older index is
+#: built again from its GeoPackage, whose schema is the one that lasts.
 FORMAT_VERSION = 1
 
 _MAGIC = b"\x89roadgeo index\r\n"
@@ -94,7 +103,7 @@ def dump_index(
     path: Path, meta: Mapping[str, Any], arrays: Mapping[str, AnyArray], about: Mapping[str, Any] | None = None
 ) -> None:
     """Write an index to a new file, in place; for callers that stage it. A disk error is an `OSError`."""
-    chunks = [_dump_plain(dict(meta))]
+    chunks: list[bytes | memoryview] = [_dump_plain(dict(meta))]
     entries = []
     offset = _aligned(len(chunks[0]))
     for name, array in arrays.items():
@@ -117,6 +126,17 @@ def dump_index(
         for chunk in (header, *chunks):
             file.write(chunk)
             file.write(bytes(-len(chunk) % _ALIGNMENT))
+
+
+def read_format_version(path: str | os.PathLike[str]) -> int:
+    """Format version of an index file, which every version stores at the same place.
+
+    Raises
+    ------
+    IndexFormatError
+        When the file is missing or is no index.
+    """
+    return _parse_version(_map(path), path)
 
 
 def read_manifest(path: str | os.PathLike[str]) -> dict[str, Any]:
@@ -238,7 +258,8 @@ def _map(path: str | os.PathLike[str]) -> mmap.mmap:
     """Map a regular file of at least one preamble, read-only."""
     try:
         if not Path(path).is_file():
-            _refuse(path, "it is not a file" if Path(path).exists() else "there is no such file")
+            kind = "it is not a file" if Path(path).exists() else "no such file"
+            raise IndexFormatError(f"no index at {os.fspath(path)}: {kind}; make it with `roadgeo index`")
         with Path(path).open("rb") as file:
             if os.fstat(file.fileno()).st_size < _PREAMBLE.size:
                 _refuse(path, f"it is not an index, or truncated: shorter than {_PREAMBLE.size} bytes")
@@ -257,11 +278,17 @@ def _header(manifest: bytes) -> bytes:
     return _PREAMBLE.pack(_MAGIC, FORMAT_VERSION, len(manifest), digest) + manifest
 
 
-def _parse_manifest(data: mmap.mmap, path: str | os.PathLike[str]) -> tuple[dict[str, Any], int]:
-    """Validate everything the file says of itself; the manifest and where the data section starts."""
-    magic, version, size, digest = _PREAMBLE.unpack_from(data)
+def _parse_version(data: mmap.mmap, path: str | os.PathLike[str]) -> int:
+    magic, version, _, _ = _PREAMBLE.unpack_from(data)
     if magic != _MAGIC:
         _refuse(path, "it is not a roadgeo index")
+    return int(version)
+
+
+def _parse_manifest(data: mmap.mmap, path: str | os.PathLike[str]) -> tuple[dict[str, Any], int]:
+    """Validate everything the file says of itself; the manifest and where the data section starts."""
+    version = _parse_version(data, path)
+    _, _, size, digest = _PREAMBLE.unpack_from(data)
     if version != FORMAT_VERSION:
         _refuse(path, f"it has format version {version}, and this roadgeo {__version__} reads version {FORMAT_VERSION}")
     if size > _MAX_MANIFEST or _PREAMBLE.size + size > len(data):

@@ -15,7 +15,15 @@ from roadgeo.errors import IndexFormatError, OutputError
 from roadgeo.geopackage import open_read_only
 from roadgeo.intersections import Intersections
 from roadgeo.io_atomic import publish, staging
-from roadgeo.io_index import check_index, dump_index, read_index, read_manifest, write_index
+from roadgeo.io_index import (
+    FORMAT_VERSION,
+    check_index,
+    dump_index,
+    read_format_version,
+    read_index,
+    read_manifest,
+    write_index,
+)
 from roadgeo.io_network import (
     computed_digest,
     dump_network,
@@ -43,7 +51,9 @@ __all__ = [
 #: What an index file holds: plain values, and arrays by name.
 IndexParts: TypeAlias = tuple[Mapping[str, Any], Mapping[str, AnyArray]]
 
-Freshness: TypeAlias = Literal["fresh", "stale", "no index", "no GeoPackage"]
+#: "no GeoPackage": an index alone, which serves as well. "old format": an index of an earlier roadgeo, and a GeoPackage
+#: from which to build it again.
+Freshness: TypeAlias = Literal["fresh", "stale", "no index", "old format", "no GeoPackage"]
 
 #: Largest distance between the intersections of a tuple whose types are counted, as in the paper's Figure 7 (eq. 8).
 TUPLE_DISTANCE_M = 500.0
@@ -106,7 +116,8 @@ def open_reference(
     path : path
         Either file, or what they have in common.
     rebuild : callable, optional
-        Builds the index of a network, where the file is missing; the result is stored when the folder allows it.
+        Builds the index of a network, where the file is missing or of an earlier format; the result is stored when the
+        folder allows it.
 
     Returns
     -------
@@ -125,11 +136,9 @@ def open_reference(
             f"{paths.index} is stale: the intersections of {paths.geopackage.name} were changed after it was built; "
             "delete it and it will be built again from the GeoPackage"
         )
-    if freshness != "no index":
-        return read_index(paths.index)
-    if rebuild is None:
-        raise IndexFormatError(f"{paths.index} is missing; build it again from {paths.geopackage.name}")
-    return _rebuild(paths, rebuild)
+    if freshness in {"no index", "old format"} and rebuild is not None:
+        return _rebuild(paths, rebuild)
+    return read_index(paths.index)
 
 
 def reference_freshness(path: str | os.PathLike[str]) -> Freshness:
@@ -146,6 +155,8 @@ def reference_freshness(path: str | os.PathLike[str]) -> Freshness:
             raise IndexFormatError(f"no reference {path}: expected {paths.geopackage}; make it with `roadgeo index`")
         read_meta(paths.geopackage)
         return "no index"
+    if paths.geopackage.is_file() and read_format_version(paths.index) < FORMAT_VERSION:
+        return "old format"
     digest = read_manifest(paths.index)["about"].get("network")
     if not paths.geopackage.is_file():
         return "no GeoPackage"
@@ -158,9 +169,10 @@ def describe_reference(path: str | os.PathLike[str]) -> dict[str, Any]:
     Returns
     -------
     dict
-        `name`, `freshness`, `files` and their sizes in bytes; with an index also `format`, `roadgeo` (the version that
-        built it), `memory_bytes` (of the mapped arrays) and what `about` held: `crs`, `extent`, `counts`, `road_km`,
-        `area_km2`, `intersections_per_km2`, `tuple_types`, `index`; and `meta`, the network's own.
+        `name`, `freshness`, `files` (sizes in bytes by path), `crs`, `counts`, `meta` (the network's own); with an
+        index also its `format`, `roadgeo` (the version that built it), `memory_bytes` (of the mapped arrays), `extent`
+        (min easting, min northing, max easting, max northing), `road_km`, `area_km2`, `intersections_per_km2`,
+        `tuple_types` (the paper's Figure 7) and `index` (its options and grid).
 
     Raises
     ------
@@ -175,7 +187,7 @@ def describe_reference(path: str | os.PathLike[str]) -> dict[str, Any]:
         "freshness": freshness,
         "files": {str(file): file.stat().st_size for file in files},
     }
-    if freshness == "no index":
+    if freshness in {"no index", "old format"}:
         stored = read_meta(paths.geopackage)
         own = {key: value for key, value in stored.items() if not key.startswith("roadgeo.")}
         return description | {"crs": stored.get("roadgeo.crs"), "counts": _row_counts(paths.geopackage), "meta": own}
@@ -212,15 +224,24 @@ def check_reference(path: str | os.PathLike[str]) -> list[str]:
 
 def _rebuild(paths: ReferencePaths, rebuild: Callable[[RoadNetwork], IndexParts]) -> IndexParts:
     """Build a missing index, and keep it where that is possible and nobody has written another meanwhile."""
+    before = _identity(paths.index)
     network = read_network(paths.geopackage)
     meta, arrays = rebuild(network)
     about = _about(network, meta)
     try:
-        if not paths.index.exists() and stored_digest(paths.geopackage) == about["network"]:
+        if _identity(paths.index) == before and stored_digest(paths.geopackage) == about["network"]:
             write_index(paths.index, dict(meta), arrays, about)
     except OutputError:  # a reference in a read-only folder serves as well, it only costs this time at every opening
         pass
     return meta, arrays
+
+
+def _identity(path: Path) -> tuple[int, int] | None:
+    """Return what tells a file from one that replaces it; None where there is none."""
+    if not path.exists():
+        return None
+    status = path.stat()
+    return status.st_ino, status.st_mtime_ns
 
 
 def _about(network: RoadNetwork, meta: Mapping[str, Any]) -> dict[str, Any]:

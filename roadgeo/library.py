@@ -11,7 +11,7 @@ from pathlib import Path
 
 from roadgeo.errors import IndexFormatError
 from roadgeo.io_atomic import writing
-from roadgeo.io_reference import reference_paths
+from roadgeo.io_reference import ReferencePaths, reference_paths
 
 __all__ = ["library_dir", "list_references", "make_slug", "new_reference", "remove_reference", "resolve_reference"]
 
@@ -70,12 +70,12 @@ def resolve_reference(name_or_path: str | os.PathLike[str]) -> Path:
     IndexFormatError
         When there is neither.
     """
-    for candidate in (Path(name_or_path), library_dir() / make_slug(os.fspath(name_or_path))):
-        paths = reference_paths(candidate)
+    given = reference_paths(name_or_path)
+    for paths in (given, _shelved(given.geopackage.stem)):
         if paths.geopackage.is_file() or paths.index.is_file():
             return paths.geopackage
     known = [path.stem for path in list_references()]
-    near = difflib.get_close_matches(make_slug(os.fspath(name_or_path)), known, n=1)
+    near = difflib.get_close_matches(make_slug(given.geopackage.stem), known, n=1)
     hint = f"did you mean {near[0]}?" if near else "`roadgeo list` shows the library, `roadgeo index` adds to it"
     raise IndexFormatError(
         f"no reference {os.fspath(name_or_path)!r}, neither as a file nor in {library_dir()}: {hint}"
@@ -97,7 +97,7 @@ def remove_reference(name: str) -> list[Path]:
     OutputError
         When a file cannot be deleted.
     """
-    paths = reference_paths(library_dir() / make_slug(name))
+    paths = _shelved(name)
     files = [file for file in (paths.index, paths.geopackage) if file.is_file()]
     if not files:
         raise IndexFormatError(f"no reference {name!r} in {library_dir()}; `roadgeo list` shows what there is")
@@ -105,3 +105,8 @@ def remove_reference(name: str) -> list[Path]:
         with writing(file):
             file.unlink()
     return files
+
+
+def _shelved(name: str) -> ReferencePaths:
+    """Return where the library keeps a reference of that name."""
+    return reference_paths(library_dir() / make_slug(name))

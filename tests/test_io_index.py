@@ -5,6 +5,8 @@ import json
 import os
 import pickle
 import struct
+import subprocess
+import sys
 from hashlib import blake2b
 from pathlib import Path
 from typing import Any
@@ -428,3 +430,16 @@ def test_header_digest_covers_version_and_size() -> None:
 def test_a_missing_folder_is_named(tmp_path: Path) -> None:
     with pytest.raises(OutputError, match=r"nowhere.*create the folder"):
         write_index(tmp_path / "nowhere" / "town.index", {}, {})
+
+
+# --- five thousand mutants --------------------------------------------------------------------------------------------
+
+
+def test_mutants_are_refused_or_equal_and_cost_little_memory() -> None:
+    """In a process of its own, whose crash or memory would show."""
+    script = Path(__file__).with_name("fuzz_index.py")
+    done = subprocess.run([sys.executable, script, "--count", "5040"], capture_output=True, text=True, check=True)
+    result = json.loads(done.stdout)
+    assert result["mutants"] == 5040
+    assert result["refused"] > 4800
+    assert result["peak_above_start_mb"] < 150
