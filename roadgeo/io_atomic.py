@@ -21,7 +21,7 @@ try:
 except ImportError:  # Windows: there an open file cannot be deleted, which serves as the lock
     fcntl = None  # type: ignore[assignment]
 
-__all__ = ["publish", "staging", "writing"]
+__all__ = ["publish", "staging", "sync_file", "writing"]
 
 _PREFIX, _SUFFIX, _LOCK = ".roadgeo-", ".tmp", "lock"
 
@@ -78,10 +78,15 @@ def staging(target: str | os.PathLike[str]) -> Iterator[Path]:
 
 def publish(staged: Path, target: str | os.PathLike[str]) -> None:
     """Sync a finished file of a staging folder to disk and rename it over `target`."""
-    with staged.open("rb+") as file:
-        os.fsync(file.fileno())
+    sync_file(staged)
     staged.replace(target)
     _sync_folder(Path(target).parent)
+
+
+def sync_file(path: Path) -> None:
+    """Wait until a file's content is on the disk."""
+    with path.open("rb+") as file:
+        os.fsync(file.fileno())
 
 
 def _sync_folder(folder: Path) -> None:

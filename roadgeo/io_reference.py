@@ -14,7 +14,7 @@ import numpy as np
 from roadgeo.errors import IndexFormatError, OutputError
 from roadgeo.geopackage import open_read_only
 from roadgeo.intersections import Intersections
-from roadgeo.io_atomic import publish, staging
+from roadgeo.io_atomic import publish, staging, sync_file
 from roadgeo.io_index import (
     FORMAT_VERSION,
     check_index,
@@ -99,7 +99,9 @@ def write_reference(path: str | os.PathLike[str], network: RoadNetwork, parts: I
         staged = reference_paths(folder / paths.geopackage.name)
         dump_network(staged.geopackage, network)
         dump_index(staged.index, meta, arrays, _about(network, meta))
-        # Without its index a GeoPackage is still a whole reference, with an index of another one it is not.
+        sync_file(staged.geopackage)
+        sync_file(staged.index)
+        # Without its index a GeoPackage is still a whole reference, with the index of another one it is not.
         paths.index.unlink(missing_ok=True)
         publish(staged.geopackage, paths.geopackage)
         publish(staged.index, paths.index)

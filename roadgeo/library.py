@@ -70,16 +70,14 @@ def resolve_reference(name_or_path: str | os.PathLike[str]) -> Path:
     IndexFormatError
         When there is neither.
     """
-    given = reference_paths(name_or_path)
-    for paths in (given, _shelved(given.geopackage.stem)):
+    name = os.fspath(name_or_path)
+    for paths in (reference_paths(name), _shelved(name)):
         if paths.geopackage.is_file() or paths.index.is_file():
             return paths.geopackage
     known = [path.stem for path in list_references()]
-    near = difflib.get_close_matches(make_slug(given.geopackage.stem), known, n=1)
+    near = difflib.get_close_matches(make_slug(name), known, n=1)
     hint = f"did you mean {near[0]}?" if near else "`roadgeo list` shows the library, `roadgeo index` adds to it"
-    raise IndexFormatError(
-        f"no reference {os.fspath(name_or_path)!r}, neither as a file nor in {library_dir()}: {hint}"
-    )
+    raise IndexFormatError(f"no reference {name!r}, neither as a file nor in {library_dir()}: {hint}")
 
 
 def remove_reference(name: str) -> list[Path]:
@@ -108,5 +106,5 @@ def remove_reference(name: str) -> list[Path]:
 
 
 def _shelved(name: str) -> ReferencePaths:
-    """Return where the library keeps a reference of that name."""
-    return reference_paths(library_dir() / make_slug(name))
+    """Return where the library keeps a reference of that name; a file's suffix may stand behind it."""
+    return reference_paths(library_dir() / make_slug(name.removesuffix(".gpkg").removesuffix(".index")))

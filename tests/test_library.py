@@ -54,12 +54,13 @@ def test_an_empty_library_has_no_folder(shelf: Path) -> None:
 
 
 def test_references_are_shelved_listed_found_and_removed(shelf: Path, tmp_path: Path) -> None:
-    salem, boston = add("Salem, MA"), add("Boston, MA")
+    salem, boston = add("Salem / MA"), add("Boston, MA")
     assert (salem, boston) == (shelf / "salem-ma.gpkg", shelf / "boston-ma.gpkg")
     (shelf / ".roadgeo-0.tmp").mkdir()
     assert list_references() == [boston, salem]
     for name in ("Boston, MA", "boston-ma", "boston-ma.gpkg", str(boston), str(shelf / "boston-ma.index")):
         assert resolve_reference(name) == boston
+    assert resolve_reference("Salem / MA") == salem
     boston.unlink()
     assert list_references() == [boston, salem]
     assert remove_reference("Boston, MA") == [shelf / "boston-ma.index"]
