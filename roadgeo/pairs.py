@@ -5,6 +5,8 @@ paper leaves a choice open or a step costs nothing but time, this module decides
 
 - Equal types at both ends leave open which end is which: such a tuple is looked up both ways.
 - Candidates are drawn without repetition, so k_i draws (eq. 15) need at most N_match tests.
+- The matching pairs of eq. 10 are one to one. Read literally, any number of query intersections may match the same
+  one, and an H that shrinks the image to a few streets passes for a place.
 - The paper's "gold standard" is the Sampson error of all tangents for each hypothesis, and after the search the
   geometric error of all matched intersections, with guided matching (Hartley & Zisserman, algorithm 4.6).
 - Query tuples of a type that the reference does not hold are not drawn.
@@ -64,7 +66,7 @@ class PairOptions:
     inlier_distance_m : float
         How close to an intersection of the same type a mapped one must come (eq. 10).
     one_to_one : bool
-        Let each reference intersection match once. The paper does not ask for it.
+        Let each reference intersection match once only. False: eq. 10 to the letter.
     min_intersections : int
         Queries with fewer are not searched.
     max_tuple_intersections : int
@@ -73,17 +75,17 @@ class PairOptions:
         The search stops after this many seconds.
     """
 
-    d_max_m: float = 500.0
+    d_max_m: float = 1000.0
     d_max_px: float | None = None
-    min_line_angle_deg: float = 10.0
+    min_line_angle_deg: float = 15.0
     delta_cross_ratio: float = 0.3
     tangent_orders: Literal["++", "all"] = "++"
     lambda_: float = 0.01
     lambda_1: float = 0.05
-    p_query: float = 0.1
+    p_query: float = 0.01
     delta_inlier: float = 0.5
     inlier_distance_m: float = 20.0
-    one_to_one: bool = False
+    one_to_one: bool = True
     min_intersections: int = 30
     max_tuple_intersections: int = 1000
     time_limit_s: float = 10.0
@@ -320,8 +322,8 @@ def match_pairs(
             return search.located()
         if search.is_late:
             return search.not_located(
-                f"stopped after {options.time_limit_s:g} s and {search.n_samples} query tuples: no place matched more "
-                f"than {options.delta_inlier:.0%} of the intersections"
+                f"stopped after {options.time_limit_s:g} s and {search.n_samples} query tuples (confidence "
+                f"{search.confidence:.3g}): none matched more than {options.delta_inlier:.0%} of the intersections"
             )
     return search.not_located(
         f"no such place (confidence {search.confidence:.3g}): none matched more than {options.delta_inlier:.0%} of the "
@@ -365,7 +367,7 @@ class _Search:
         self.begin = time.perf_counter()
         self.query, self.index, self.frame, self.options, self.rng = query, index, frame, options, rng
         self.codes = _codes(query)
-        self.tangents = _fixed(reference.tangents, np.float32)
+        self.xy, self.tangents = _fixed(reference.xy, np.float64), _fixed(reference.tangents, np.float32)
         self.buckets = kernels.Buckets(
             index.grid[:2],
             float(index.grid[2]),
@@ -373,8 +375,8 @@ class _Search:
             int(index.shape[1]),
             index.starts,
             index.items,
-            _fixed(reference.xy, np.float64),
-            index.codes,
+            _fixed(reference.xy[index.items], np.float64),
+            _fixed(index.codes[index.items], np.uint8),
         )
         # Rare types miss most often where a hypothesis is wrong: they judge first.
         frequency = np.bincount(index.codes, minlength=256)
@@ -434,6 +436,7 @@ class _Search:
                 self.index.tuples(t),
                 correspondence.rows,
                 np.array([done, until, start, stride]),
+                self.xy,
                 self.tangents,
                 self.buckets,
                 self.options.inlier_distance_m,
@@ -457,6 +460,10 @@ class _Search:
         nearest = np.empty(len(xy), np.int32)
         kernels.nearest_of_type(xy, self.codes, self.buckets, self.options.inlier_distance_m, nearest)
         found = np.flatnonzero(nearest >= 0)
+        if self.options.one_to_one:
+            distance = np.hypot(*(xy[found] - self.xy[nearest[found]]).T)
+            closest_first = found[np.argsort(distance, kind="stable")]
+            found = np.sort(closest_first[np.unique(nearest[closest_first], return_index=True)[1]])
         return np.column_stack([found, nearest[found]])
 
     def located(self) -> PairMatch:
@@ -476,15 +483,20 @@ class _Search:
         """Alternate between the gold-standard fit and matching, as long as that matches more."""
         matches = self.matches(homography)
         for _ in range(5):
-            refined = _fit_points(homography, self.query.xy[matches[:, 0]], self.buckets.xy[matches[:, 1]])
+            refined = _fit_points(homography, self.query.xy[matches[:, 0]], self.xy[matches[:, 1]])
             rematched = self.matches(refined)
-            if len(rematched) < len(matches):
+            if len(rematched) < len(matches) or not self._is_allowed(refined):
                 break
             is_stable = np.array_equal(rematched, matches)
             homography, matches = refined, rematched
             if is_stable:
                 break
         return homography, matches
+
+    def _is_allowed(self, homography: FloatArray) -> bool:
+        """Say whether the horizon stays out of the frame, where that is asked for."""
+        w = self.frame @ homography[2, :2] + homography[2, 2]
+        return self.options.tangent_orders == "all" or bool(np.all(w * w[0] > 0))
 
     def not_located(self, reason: str) -> PairMatch:
         """Report that no place was found."""

@@ -28,7 +28,7 @@ _LEAF_SIZE = 8
 
 
 class Buckets(NamedTuple):
-    """Reference intersections in square cells: cell c = W row + column owns `items[starts[c]:starts[c + 1]]`.
+    """Reference intersections sorted by square cells: cell c = W row + column owns places `starts[c]:starts[c + 1]`.
 
     Dimensions: N intersections, H rows, W columns.
     """
@@ -38,9 +38,9 @@ class Buckets(NamedTuple):
     n_rows: int
     n_cols: int
     starts: np.ndarray  # (H W + 1,) int32
-    items: np.ndarray  # (N,) int32
-    xy: np.ndarray  # (N, 2) float64
-    codes: np.ndarray  # (N,) uint8
+    items: np.ndarray  # (N,) int32, the intersection at each place
+    xy: np.ndarray  # (N, 2) float64, its position
+    codes: np.ndarray  # (N,) uint8, its type
 
 
 @njit(cache=True, error_model="numpy")
@@ -258,7 +258,7 @@ def search_tree(values, low, high, out):  # type: ignore[no-untyped-def]
 
 @njit(cache=True, error_model="numpy")
 def _nearest(buckets, x, y, code, radius):  # type: ignore[no-untyped-def]
-    """Return the reference intersection of type `code` nearest to (x, y) within `radius`, or -1."""
+    """Return the place of the reference intersection of type `code` nearest to (x, y) within `radius`, or -1."""
     inverse = 1.0 / buckets.cell
     left = (x - radius - buckets.origin[0]) * inverse
     right = (x + radius - buckets.origin[0]) * inverse
@@ -273,15 +273,14 @@ def _nearest(buckets, x, y, code, radius):  # type: ignore[no-untyped-def]
     for row in range(row_0, row_1 + 1):
         first = row * buckets.n_cols
         for slot in range(buckets.starts[first + col_0], buckets.starts[first + col_1 + 1]):
-            i = buckets.items[slot]
-            if buckets.codes[i] != code:
+            if buckets.codes[slot] != code:
                 continue
-            dx = buckets.xy[i, 0] - x
-            dy = buckets.xy[i, 1] - y
+            dx = buckets.xy[slot, 0] - x
+            dy = buckets.xy[slot, 1] - y
             squared = dx * dx + dy * dy
             if squared < best:
                 best = squared
-                found = i
+                found = slot
     return found
 
 
@@ -301,7 +300,8 @@ def nearest_of_type(xy, codes, buckets, radius, out):  # type: ignore[no-untyped
         Receives its number, or -1.
     """
     for q in range(len(xy)):
-        out[q] = _nearest(buckets, xy[q, 0], xy[q, 1], codes[q], radius)
+        place = _nearest(buckets, xy[q, 0], xy[q, 1], codes[q], radius)
+        out[q] = buckets.items[place] if place >= 0 else -1
 
 
 @njit(cache=True, error_model="numpy")
@@ -340,10 +340,10 @@ def _count_inliers(uv, codes, buckets, model, radius, least, stamps, stamp):  # 
         w = 1.0 / ((alpha_1 - alpha_2) * u + (beta_1 - beta_2) * v + alpha_2)
         along = (alpha_1 * u + beta_1 * v) * w
         across = v * w
-        i = _nearest(buckets, x + dx * along - dy * across, y + dy * along + dx * across, codes[q], radius)
-        if i >= 0 and (len(stamps) == 0 or stamps[i] != stamp):
+        place = _nearest(buckets, x + dx * along - dy * across, y + dy * along + dx * across, codes[q], radius)
+        if place >= 0 and (len(stamps) == 0 or stamps[place] != stamp):
             if len(stamps) > 0:
-                stamps[i] = stamp
+                stamps[place] = stamp
             inliers += 1
         else:
             misses_left -= 1
@@ -354,7 +354,22 @@ def _count_inliers(uv, codes, buckets, model, radius, least, stamps, stamp):  # 
 
 @njit(cache=True, error_model="numpy")
 def evaluate_pairs(  # type: ignore[no-untyped-def]
-    uv, codes, corners, cot_1, cot_2, pairs, rows, draws, tangents, buckets, radius, is_physical, best, model, stamps
+    uv,
+    codes,
+    corners,
+    cot_1,
+    cot_2,
+    pairs,
+    rows,
+    draws,
+    xy,
+    tangents,
+    buckets,
+    radius,
+    is_physical,
+    best,
+    model,
+    stamps,
 ):
     """Test a query tuple against candidates: H from all lines in closed form (eq. 9), inlier count (eq. 10), the best.
 
@@ -380,6 +395,8 @@ def evaluate_pairs(  # type: ignore[no-untyped-def]
     draws : (4,) int64
         Draws number `draws[0]` up to `draws[1]`; draw j takes candidate (draws[2] + j draws[3]) mod C, which repeats
         none where draws[3] and C have no common divisor.
+    xy : (M, 2) float64
+        Of the reference.
     tangents : (M, R) float32
         Of the reference.
     buckets : Buckets
@@ -409,8 +426,8 @@ def evaluate_pairs(  # type: ignore[no-untyped-def]
         chosen = (draws[2] + draw * draws[3]) % n_candidates
         row = rows[chosen] if len(rows) > 0 else chosen
         i, j = pairs[row, 0], pairs[row, 1]
-        x, y = buckets.xy[i, 0], buckets.xy[i, 1]
-        dx, dy = buckets.xy[j, 0] - x, buckets.xy[j, 1] - y
+        x, y = xy[i, 0], xy[i, 1]
+        dx, dy = xy[j, 0] - x, xy[j, 1] - y
         phi = math.atan2(dy, dx)
         _cotangents(tangents, i, len(cot_1), phi, found_1)
         _cotangents(tangents, j, len(cot_2), phi, found_2)
