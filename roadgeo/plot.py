@@ -16,8 +16,9 @@ from roadgeo.homography import Homography
 from roadgeo.io_outputs import Placement
 from roadgeo.location import Location
 from roadgeo.typing import AnyArray, FloatArray
+from roadgeo.wording import format_lonlat
 
-__all__ = ["PlotOptions", "draw_overlay", "format_lonlat", "write_overlay"]
+__all__ = ["PlotOptions", "draw_overlay", "write_overlay"]
 
 Color = tuple[int, int, int]
 
@@ -136,11 +137,6 @@ def draw_overlay(
     _draw_title(picture, location, canvas.top)
     _write(picture, attribution, (_GAP, len(picture) - round(canvas.top * 0.15)), round(canvas.top * 0.2), FAINT_INK)
     return picture
-
-
-def format_lonlat(lon: float, lat: float) -> str:
-    """Write a position as people do: 41.15253° N, 8.60801° W."""
-    return f"{abs(lat):.5f}° {'N' if lat >= 0 else 'S'}, {abs(lon):.5f}° {'E' if lon >= 0 else 'W'}"
 
 
 # --- the map ----------------------------------------------------------------------------------------------------------

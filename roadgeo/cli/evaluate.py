@@ -133,9 +133,10 @@ def _print(evaluation: Evaluation) -> None:
 
 
 def _table(title: str, groups: Sequence[Summary]) -> Table:
+    from rich.box import SIMPLE_HEAD
     from rich.table import Table
 
-    table = Table(title=title, title_justify="left")
+    table = Table(title=title, title_justify="left", box=SIMPLE_HEAD, pad_edge=False, padding=(0, 1, 0, 0))
     absent = any(group.refused.of for group in groups)
     heads = ["", "masks", "precision %", "recall %", *(["refused %"] if absent else []), "centre m", "corners m", "ms"]
     for head in heads:

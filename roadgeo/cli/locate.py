@@ -15,12 +15,13 @@ import click
 from roadgeo.cli import ERROR, NOT_LOCATED
 from roadgeo.cli.batch import Task, find_masks, name_tasks, run
 from roadgeo.cli.parameters import NEAR, RANGE, verbosity_options
+from roadgeo.wording import format_lonlat
 
 if TYPE_CHECKING:
     from roadgeo.location import Location
     from roadgeo.workflows import LocateOptions, Reference
 
-__all__ = ["Job", "Outcome", "locate_command"]
+__all__ = ["Job", "Outcome", "locate_command", "make_folder", "open_references"]
 
 Status = Literal["located", "ambiguous", "not_located", "error"]
 
@@ -205,7 +206,7 @@ def locate_command(
     tasks = name_tasks(find_masks(masks))
     if not tasks:
         raise click.UsageError(f"No images in {', '.join(masks)}.")
-    _make_folder(out_dir)
+    make_folder(out_dir)
     job = Job(references, options, out_dir, threshold, band, plot)
     if jobs > 1:
         open_references(references)  # so that what is wrong with them is said once, before the processes start
@@ -253,8 +254,6 @@ def describe(location: Location) -> str:
     """Say what was found, in a line or two."""
     if not location.located or location.center is None:
         return f"{location.query}: {location.status.replace('_', ' ')}: {location.reason}"
-    from roadgeo.plot import format_lonlat
-
     where = format_lonlat(location.center.lon, location.center.lat)
     return f"{location.query}: located at {where} on {location.reference}: {location.reason}"
 
@@ -274,7 +273,8 @@ def _draw(location: Location, mask: Any, reference: Reference, path: Path) -> No
     write_overlay(path, location, mask, roads, str(index.meta.get("attribution", "")))
 
 
-def _make_folder(folder: str) -> None:
+def make_folder(folder: str) -> None:
+    """Make the folder for the results, unless it is there."""
     from roadgeo.io_atomic import writing
 
     with writing(folder):

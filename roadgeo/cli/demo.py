@@ -1,0 +1,107 @@
+"""`roadgeo demo`: the whole way, on data that ships with the package."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from time import perf_counter
+from typing import TYPE_CHECKING, Any
+
+import click
+
+from roadgeo.cli import ERROR
+from roadgeo.wording import format_lonlat
+
+if TYPE_CHECKING:
+    from roadgeo.cli.locate import Outcome
+    from roadgeo.demo import DemoMask
+
+__all__ = ["demo_command"]
+
+#: A middle farther off than this is wrong.
+MAX_ERROR_M = 5.0
+
+
+@click.command("demo", short_help="Locate five masks in Porto: needs no network and no data.")
+@click.option(
+    "-o",
+    "--out-dir",
+    metavar="DIR",
+    default="roadgeo_demo",
+    show_default=True,
+    type=click.Path(file_okay=False),
+    help="Where everything is written; made if missing.",
+)
+def demo_command(out_dir: str) -> int:
+    """Show the whole way on real data: build a reference, locate masks, write every output, compare with the truth.
+
+    The map is a piece of Porto from OpenStreetMap. Four masks show parts of it as cameras and a road segmenter would;
+    the fifth shows another city and has to be refused.
+
+    \b
+    Examples:
+      roadgeo demo
+      roadgeo demo --out-dir porto
+    """
+    from roadgeo.cli.batch import Task
+    from roadgeo.cli.compilation import compile_once
+    from roadgeo.cli.index import build
+    from roadgeo.cli.locate import Job, make_folder
+    from roadgeo.demo import ATTRIBUTION, ROADS, demo_masks
+    from roadgeo.workflows import LocateOptions
+
+    folder = Path(out_dir)
+    make_folder(out_dir)
+    started = perf_counter()
+    reference = build(ROADS, folder / "porto.gpkg", "porto")
+    seconds = perf_counter() - started
+    click.echo(f"Porto, {ATTRIBUTION}: {len(reference.index):,} intersections, indexed in {seconds:.1f} s")
+    compile_once(reference, quiet=False)
+    job = Job((str(folder / "porto.gpkg"),), LocateOptions(), out_dir, plot=True)
+    locate = job.prepare()
+    wrong = 0
+    for mask in demo_masks():
+        outcome = locate(Task(str(mask.path), mask.path.stem))
+        right, text = _judge(outcome, mask)
+        wrong += not right
+        click.echo(f"\n{mask.path.name}: {mask.title}\n  {text}")
+    click.echo(
+        f"\nLook at {folder / 'drone_overlay.png'}. In QGIS, open {folder / 'drone_footprint.tif'} and "
+        f"{folder / 'drone_location.gpkg'} over {folder / 'porto.gpkg'}."
+    )
+    if wrong:
+        click.echo(f"Error: {wrong} masks came out wrong; please report it", err=True)
+    return ERROR if wrong else 0
+
+
+def _judge(outcome: Outcome, mask: DemoMask) -> tuple[bool, str]:
+    """Compare with the truth: whether it is right, and what to say."""
+    found = outcome.document
+    if outcome.status == "error":
+        return False, outcome.text
+    if outcome.status != "located":
+        right = not mask.in_map
+        return right, f"{'refused, as it should be' if right else 'not found, although it is there'}: {found['reason']}"
+    if not mask.in_map:
+        return False, f"located, although it is not on this map: {found['reason']}"
+    center_m, corners_m = _errors(found, mask)
+    where = format_lonlat(found["center"]["lon"], found["center"]["lat"])
+    seconds = found["seconds"]
+    return center_m < MAX_ERROR_M, (
+        f"found at {where}: the middle is {center_m:.1f} m off, the corners {corners_m:.1f} m; "
+        f"{found['n_matched']} intersections matched, {seconds['total'] - seconds['open'] - seconds['write']:.2f} s"
+    )
+
+
+def _errors(found: dict[str, Any], mask: DemoMask) -> tuple[float, float]:
+    """Distance of the middle, and rms distance of the corners, between result and truth, metres."""
+    import numpy as np
+    import pyproj
+
+    from roadgeo.homography import Homography
+
+    width, height = found["size"]
+    pixels = np.array([[width / 2, height / 2], [0, 0], [width, 0], [width, height], [0, height]], float)
+    x, y = Homography(mask.homography)(pixels).T
+    truth = np.stack(pyproj.Transformer.from_crs(mask.crs, found["crs"], always_xy=True).transform(x, y), axis=1)
+    distances = np.hypot(*(Homography(np.array(found["homography"]))(pixels) - truth).T)
+    return float(distances[0]), float(np.sqrt((distances[1:] ** 2).mean()))
