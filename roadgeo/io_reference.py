@@ -103,7 +103,7 @@ def write_reference(path: str | os.PathLike[str], network: RoadNetwork, parts: I
         sync_file(staged.index)
         # Without its index a GeoPackage is still a whole reference, with the index of another one it is not.
         paths.index.unlink(missing_ok=True)
-        publish(staged.geopackage, paths.geopackage)
+        staged.geopackage.replace(paths.geopackage)
         publish(staged.index, paths.index)
     return paths
 

@@ -15,7 +15,7 @@ import pytest
 from networks import grid_network
 from test_io_network import editing
 
-from roadgeo import io_index, io_reference
+from roadgeo import io_index
 from roadgeo.errors import IndexFormatError, OutputError
 from roadgeo.io_index import read_manifest
 from roadgeo.io_network import as_stored, network_digest, read_network, write_network
@@ -188,15 +188,15 @@ def test_the_reference_is_whole_at_every_moment(
 ) -> None:
     """A writer that dies before, between and after its two renames."""
     newer = as_stored(grid_network(seed=7))
-    publish, calls = io_reference.publish, []
+    rename, calls = Path.replace, []
 
     def die(staged: Path, target: Path) -> None:
         if len(calls) == moment:
             raise KeyboardInterrupt
         calls.append(target)
-        publish(staged, target)
+        rename(staged, target)
 
-    monkeypatch.setattr(io_reference, "publish", die)
+    monkeypatch.setattr(Path, "replace", die)
     if moment < 2:
         with pytest.raises(KeyboardInterrupt):
             write_reference(path, newer, parts(newer))
