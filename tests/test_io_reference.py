@@ -202,6 +202,7 @@ def test_the_reference_is_whole_at_every_moment(
             write_reference(path, newer, parts(newer))
     else:
         write_reference(path, newer, parts(newer))
+    monkeypatch.undo()
     expected = network if moment == 0 else newer
     np.testing.assert_array_equal(open_reference(path, parts)[1]["xy"], expected.intersections.xy)
     assert sorted(file.name for file in path.parent.iterdir()) == ["grid.gpkg", "grid.index"]
