@@ -150,6 +150,7 @@ _STATES = {
     "fresh": "ready",
     "stale": "stale: the GeoPackage was edited; delete the index and it is built again",
     "no index": "no index: it is built when the reference is first used",
+    "old format": "index of an earlier roadgeo: it is built again when the reference is next used",
     "no GeoPackage": "ready; the GeoPackage is missing",
 }
 
