@@ -36,6 +36,7 @@ class GrowOptions:
     screen_radius_m: float = 12.0
     screen_share: float = 0.6
     min_matched: int = 4
+    max_screened: int = 600
     max_per_round: int = 150
     max_verified_per_round: int = 6
 
@@ -64,6 +65,7 @@ class Hypothesis:
     found: Agreement | None = None
     chance: tuple[float, float, float] = (1.0, 1.0, 1.0)
     distance: FloatArray | None = None
+    gsd_m: float = np.nan
     log10_odds: float = -np.inf
 
 
@@ -110,9 +112,10 @@ class TripleEstimator:
         reach = np.hypot(*(scene.intersections.xy[last[last >= 0]] - anchor).T).max()
         near = np.argsort(away, kind="stable")[: options.screen_points]
         near = near[away[near] < reach]
-        shares = np.empty(len(proposals.reference))
+        most = options.max_screened
+        shares = np.zeros(len(proposals.reference))
         screen(
-            proposals.reference, proposals.affine, anchor, index.xy, scene.points[near], scene.directions[near],
+            proposals.reference[:most], proposals.affine, anchor, index.xy, scene.points[near], scene.directions[near],
             options.screen_radius_m, np.cos(np.radians(options.ray_tolerance_deg)), options.screen_share,
             index.segments, index.segment_starts, index.segment_ids, index.grid, index.shape, shares,
         )  # fmt: skip
@@ -171,27 +174,42 @@ class TripleEstimator:
     def _verify(self, model: Hypothesis) -> float:
         self.n_verified += 1
         scene, index, options = self.scene, self.index, self.options
-        matrix, forward = model.matrix, -1.0
-        for _ in range(5):  # more matches make a better fit, and that finds more matches
-            refined = refine(matrix, scene, index, model.matched, options.refine)
-            matrix = refined.matrix
-            if judge(matrix, scene.size, options.camera) or self._is_far(matrix):
+        for n_points in (150, 300, None):
+            if not self._converge(model, n_points):
                 return -np.inf
-            gsd = pose(matrix, scene.size).gsd_m
-            model.refined = refined
-            model.found, model.matched, model.distance = agreement(
-                matrix, scene, index, gsd, model.seeds, options.verify
-            )
-            if model.found.forward < forward + 0.005:
+            assert model.found is not None  # noqa: S101 - for the type checker
+            # What a wrong place reaches is soon seen; only promising ones are worth all points.
+            if log10_odds(model.found, (0.05, 0.2, 0.25), scene.n_edges, self.n_candidates) < 0.0:
                 break
-            forward = model.found.forward
         optimistic = log10_odds(model.found, (0.05, 0.2, 0.25), scene.n_edges, self.n_candidates)
         if optimistic < 2.0:
             model.log10_odds = optimistic
             return optimistic
-        model.chance = chance_agreement(matrix, scene, index, gsd, options.verify)
+        model.chance = chance_agreement(model.matrix, scene, index, model.gsd_m, options.verify)
         model.log10_odds = log10_odds(model.found, model.chance, scene.n_edges, self.n_candidates)
         return model.log10_odds
+
+    def _converge(self, model: Hypothesis, n_points: int | None) -> bool:
+        """Refine until nothing more agrees: more matches make a better fit, and that finds more matches."""
+        scene, options = self.scene, self.options
+        best = -1.0
+        for _ in range(5):
+            refined = refine(model.matrix, scene, self.index, model.matched, options.refine, n_points)
+            if refined is None or judge(refined.matrix, scene.size, options.camera) or self._is_far(refined.matrix):
+                return model.refined is not None and best >= 0.0
+            gsd = pose(refined.matrix, scene.size).gsd_m
+            found, matched, distance = agreement(
+                refined.matrix, scene, self.index, gsd, model.seeds, options.verify
+            )
+            if found.forward < best:
+                break
+            improved = found.forward > best + 0.01
+            best = found.forward
+            model.matrix, model.refined, model.found = refined.matrix, refined, found
+            model.matched, model.distance, model.gsd_m = matched, distance, gsd
+            if not improved:
+                break
+        return True
 
     def _is_far(self, matrix: FloatArray) -> bool:
         """Whether the middle of the frame lies outside the circle that the user gave."""

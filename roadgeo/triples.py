@@ -26,11 +26,12 @@ class TripleOptions:
 
     n_neighbours: int = 8
     min_shape: float = 0.12
-    codes_per_vertex: int = 3
+    codes_per_vertex: int = 1
     angle_tolerance_deg: float = 10.0
     ray_tolerance_deg: float = 25.0
     affine_tolerance: float = 0.3
-    max_hits: int = 200_000
+    max_hits: int = 12_000
+    max_compared: int = 400_000
 
 
 @dataclass(frozen=True)
@@ -89,6 +90,8 @@ def propose(
         slots = slots[np.argsort(costs[a][usable[a]], kind="stable")]
         n_hits = n_compared = 0
         for s, t in slots:
+            if n_hits == options.max_hits or n_compared > options.max_compared:
+                break
             n_hits, compared = look_up(
                 query.xy, query.rays, query.tangents, a, s, t, neighbours, options.codes_per_vertex, tolerance,
                 np.radians(options.ray_tolerance_deg),

@@ -44,7 +44,7 @@ def vertex_angle(e1x, e1y, e2x, e2y, tangent):
 def vertex_codes(xy, tangents, i, j, k, limit, out):
     """Write the sorted unit pairs (u1 <= u2) of vertex i of the triangle i, j, k; return how many.
 
-    One pair for every two of the vertex's tangents, at most `limit`, the most distinct directions first.
+    One pair for every two of the vertex's tangents, at most `limit`; with a limit of 1, the two that cross most openly.
     """
     e1x, e1y = xy[j, 0] - xy[i, 0], xy[j, 1] - xy[i, 1]
     e2x, e2y = xy[k, 0] - xy[i, 0], xy[k, 1] - xy[i, 1]
@@ -52,11 +52,20 @@ def vertex_codes(xy, tangents, i, j, k, limit, out):
     m = 0
     while m < tangents.shape[1] and not np.isnan(tangents[i, m]):
         m += 1
+    widest = -1
     for p in range(m):
         up = int(vertex_angle(e1x, e1y, e2x, e2y, tangents[i, p])) % UNITS
         for q in range(p + 1, m):
             uq = int(vertex_angle(e1x, e1y, e2x, e2y, tangents[i, q])) % UNITS
-            if n < limit:
+            if limit == 1:
+                between = abs(up - uq)
+                between = min(between, UNITS - between)
+                if between > widest:
+                    widest = between
+                    out[0, 0] = min(up, uq)
+                    out[0, 1] = max(up, uq)
+                    n = 1
+            elif n < limit:
                 out[n, 0] = min(up, uq)
                 out[n, 1] = max(up, uq)
                 n += 1

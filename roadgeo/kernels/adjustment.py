@@ -1,0 +1,132 @@
+"""Least-squares adjustment of a homography to matched intersections and to the roads of the map.
+
+The parameters are those of `kernels.growth`: p = (h00 h01 h02 h10 h11 h12 h20 h21), h22 = 1, between normalised coordinates,
+query (x - x0) / half_size and reference (X - X0) / unit.
+"""
+
+import math
+
+import numpy as np
+from numba import njit
+
+from roadgeo.kernels.growth import cholesky, solve_cholesky
+from roadgeo.kernels.roads import nearest_road
+
+
+@njit(cache=True)
+def point_row(p, u, v, axis_x, axis_y, row):
+    """Fill `row` (8) with the derivative of the predicted point's component along (axis_x, axis_y); return (X, Y, w)."""
+    w = 1.0 + p[6] * u + p[7] * v
+    x, y = (p[0] * u + p[1] * v + p[2]) / w, (p[3] * u + p[4] * v + p[5]) / w
+    row[0], row[1], row[2] = axis_x * u / w, axis_x * v / w, axis_x / w
+    row[3], row[4], row[5] = axis_y * u / w, axis_y * v / w, axis_y / w
+    along = axis_x * x + axis_y * y
+    row[6], row[7] = -along * u / w, -along * v / w
+    return x, y, w
+
+
+@njit(cache=True)
+def add_row(normal, right, row, weight, residual):
+    """Add one weighted equation to the lower triangle of the system."""
+    for r in range(8):
+        scaled = weight * row[r]
+        for c in range(r + 1):
+            normal[r, c] += scaled * row[c]
+        right[r] += scaled * residual
+
+
+@njit(cache=True)
+def adjust(
+    p, unit, origin_x, origin_y, points, directions, point_weight, pairs, targets, pair_weight,
+    max_radius, min_cos, sigma_m, prior, n_iterations, tolerance_m,
+    segments, starts, ids, grid, shape, normal,
+):  # fmt: skip
+    """Adjust `p` in place by Gauss-Newton with Cauchy weights; return (road points used, robust rms in metres), or (-1, inf).
+
+    `points` (S, 2) with unit `directions` (S, 2) are road points, `pairs` (M, 2) matched intersections with their `targets` (M, 2), all
+    normalised. A road point's residual is its distance across the nearest road of the map that runs its way. How far off it may be
+    is predicted from the system so far: it is searched as far as three times that, and not at all beyond `max_radius`, so that the fit
+    grows outwards from where it is sure. `prior` is the weight that holds the perspective parameters near zero; `point_weight` and
+    `pair_weight` are those of an observation of standard deviation `sigma_m`. On return `normal` (8, 8) holds the last system.
+    """
+    right = np.empty(8)
+    row = np.empty(8)
+    work = np.empty(8)
+    factor = np.zeros((8, 8))
+    previous = -1
+    rms = np.inf
+    for iteration in range(n_iterations + 1):
+        normal[:] = 0.0
+        right[:] = 0.0
+        for r in range(8):
+            normal[r, r] = 1e-9
+        for r in range(6, 8):
+            normal[r, r] += prior
+            right[r] -= prior * p[r]
+        for i in range(pairs.shape[0]):
+            for axis in range(2):
+                x, y, w = point_row(p, pairs[i, 0], pairs[i, 1], 1.0 - axis, 1.0 * axis, row)
+                if w < 0.02:
+                    return -1, np.inf
+                dx, dy = targets[i, 0] - x, targets[i, 1] - y
+                far = math.sqrt(dx * dx + dy * dy) * unit
+                if far > max_radius:
+                    continue
+                weight = pair_weight / (1.0 + (far / (2.0 * sigma_m)) ** 2)
+                add_row(normal, right, row, weight, dx if axis == 0 else dy)
+        used, weights, squares = 0, 0.0, 0.0
+        if iteration > 0:
+            for i in range(points.shape[0]):
+                u, v = points[i, 0], points[i, 1]
+                w = 1.0 + p[6] * u + p[7] * v
+                if w < 0.02:
+                    return -1, np.inf
+                x, y = (p[0] * u + p[1] * v + p[2]) / w, (p[3] * u + p[4] * v + p[5]) / w
+                dw = p[6] * directions[i, 0] + p[7] * directions[i, 1]
+                dx = p[0] * directions[i, 0] + p[1] * directions[i, 1] - x * dw
+                dy = p[3] * directions[i, 0] + p[4] * directions[i, 1] - y * dw
+                length = math.sqrt(dx * dx + dy * dy)
+                if length == 0.0:
+                    continue
+                dx /= length
+                dy /= length
+                point_row(p, u, v, -dy, dx, row)
+                spread = 0.0
+                for r in range(8):  # |L^-1 row|^2
+                    value = row[r]
+                    for c in range(r):
+                        value -= factor[r, c] * work[c]
+                    work[r] = value / factor[r, r]
+                    spread += work[r] * work[r]
+                sigma = sigma_m * math.sqrt(1.0 + spread)
+                if 3.0 * sigma > max_radius:
+                    continue
+                gx, gy = origin_x + unit * x, origin_y + unit * y
+                d, fx, fy, rx, ry = nearest_road(
+                    gx, gy, dx, dy, 3.0 * sigma, min_cos, segments, starts, ids, grid, shape
+                )
+                if d == np.inf:
+                    continue
+                residual = (fx - gx) * -ry + (fy - gy) * rx
+                point_row(p, u, v, -ry, rx, row)
+                weight = 1.0 / (1.0 + (residual / sigma) ** 2)
+                add_row(normal, right, row, point_weight * weight, residual / unit)
+                used += 1
+                weights += weight
+                squares += weight * residual * residual
+            if weights > 0.0:
+                rms = math.sqrt(squares / weights)
+        for r in range(8):
+            for c in range(r):
+                normal[c, r] = normal[r, c]
+        if not cholesky(normal, factor):
+            return -1, np.inf
+        solve_cholesky(factor, right)
+        largest = 0.0
+        for r in range(8):
+            p[r] += right[r]
+            largest = max(largest, abs(right[r]))
+        if iteration > 1 and largest * unit < tolerance_m and used <= previous:
+            break
+        previous = used
+    return previous, rms
