@@ -47,12 +47,13 @@ def demo_command(out_dir: str) -> int:
     from roadgeo.cli.index import build
     from roadgeo.cli.locate import Job, make_folder
     from roadgeo.demo import ATTRIBUTION, ROADS, demo_masks
+    from roadgeo.io_roads import read_roads
     from roadgeo.workflows import LocateOptions
 
     folder = Path(out_dir)
     make_folder(out_dir)
     started = perf_counter()
-    reference = build(ROADS, folder / "porto.gpkg", "porto")
+    reference = build(read_roads(ROADS, attribution=ATTRIBUTION), folder / "porto.gpkg", "porto")
     seconds = perf_counter() - started
     click.echo(f"Porto, {ATTRIBUTION}: {len(reference.index):,} intersections, indexed in {seconds:.1f} s")
     compile_once(reference, quiet=False)

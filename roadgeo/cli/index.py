@@ -1,0 +1,159 @@
+"""`roadgeo index`: roads in, a reference out."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from pathlib import Path
+from time import perf_counter
+from typing import TYPE_CHECKING, Any
+
+import click
+
+from roadgeo.cli.parameters import BOX, NEAR, verbosity_options
+
+if TYPE_CHECKING:
+    from roadgeo.io_roads import Roads
+    from roadgeo.workflows import Reference
+
+__all__ = ["build", "index_command"]
+
+
+@click.command("index", short_help="Build a reference: the searchable roads of a place.")
+@click.option("--osm", "place", metavar="PLACE", help="Fetch a place's roads from OpenStreetMap, by its name.")
+@click.option("--bbox", metavar="W,S,E,N", type=BOX, help="Fetch the roads in a box, degrees; or cut --roads to it.")
+@click.option("--around", metavar="LON,LAT,METRES", type=NEAR, help="Fetch the roads within a distance of a point.")
+@click.option("--polygon", metavar="FILE", help="Fetch the roads inside a polygon of a file (GeoJSON, GeoPackage ...).")
+@click.option("--roads", metavar="FILE", multiple=True, help="Take roads from a file or a folder of files. Repeatable.")
+@click.option("--layer", metavar="NAME", help="Layer of --roads, where there are several.")
+@click.option("--crs", metavar="CRS", help="CRS of --roads, where the file does not say, such as EPSG:26986.")
+@click.option(
+    "--kinds",
+    type=click.Choice(["main", "drivable", "vehicles", "all"]),
+    default="drivable",
+    show_default=True,
+    help="Which roads: those that the masks show.",
+)
+@click.option("--tunnels", is_flag=True, help="Take tunnels too, which a camera does not see.")
+@click.option("--attribution", metavar="TEXT", help="Whom to name beside the map, where --roads does not say.")
+@click.option("--date", metavar="YYYY-MM-DD", help="Fetch the roads as they were on that day.")
+@click.option("--overpass-url", metavar="URL", help="Overpass server to fetch from.")
+@click.option("--nominatim-url", metavar="URL", help="Nominatim server that finds --osm places.")
+@click.option("--no-cache", is_flag=True, help="Fetch anew what was fetched before.")
+@click.option("--name", metavar="NAME", help="Name of the reference. Default: after the place or file.")
+@click.option("-o", "--out", metavar="REF.gpkg", help="Where it goes. Default: into the library, under its name.")
+@verbosity_options
+def index_command(out: str | None, name: str | None, quiet: bool, verbose: bool, **source: Any) -> None:
+    """Build a reference: draw the roads of a place as a mask shows them, and index their intersections.
+
+    Done once per place; `roadgeo locate` then searches it. The result is REF.gpkg, which opens styled in QGIS, and
+    REF.index beside it. Without --out it goes into the library, which `roadgeo locate` searches by default.
+
+    \b
+    Examples:
+      roadgeo index --osm "Boston, MA"
+      roadgeo index --bbox=-71.19,42.23,-70.95,42.44 --name boston
+      roadgeo index --roads streets.shp --crs EPSG:26986 --out maps/streets.gpkg
+      roadgeo index --roads massachusetts.osm.pbf --bbox=-71.19,42.23,-70.95,42.44
+    """
+    from roadgeo.cli.compilation import compile_once
+    from roadgeo.library import make_slug, new_reference
+
+    say = _sayer(quiet)
+    started = perf_counter()
+    given = _one_source(source)
+    roads = _read(source, say) if given == "roads" else _fetch(source, given, say)
+    name = name or _name(source, given)
+    path = Path(out) if out else new_reference(name)
+    say(f"drawing {len(roads):,} lines as a mask shows them")
+    reference = build(roads, path, make_slug(name))
+    compile_once(reference, quiet)
+    if verbose:
+        for key, value in roads.meta.items():
+            click.echo(f"  {key}: {value}", err=True)
+    if not quiet:
+        seconds = perf_counter() - started
+        click.echo(
+            f"{path}: {len(reference.index):,} intersections in {seconds:.1f} s; search it with `roadgeo locate`"
+        )
+
+
+def build(roads: Roads, path: Path, name: str) -> Reference:
+    """Build a reference from roads on their plane and write it.
+
+    Raises
+    ------
+    RoadSourceError
+        There are too few intersections.
+    OutputError
+        It cannot be written.
+    """
+    from roadgeo.index import build_index
+    from roadgeo.io_network import as_stored
+    from roadgeo.workflows import Reference, build_network
+
+    network = as_stored(build_network(roads.lines, roads.plane, {"name": name, **roads.meta}))
+    reference = Reference(build_index(network), network)
+    reference.save(path)
+    return reference
+
+
+# --- where the roads come from ----------------------------------------------------------------------------------------
+
+_FETCHED = {"place": "--osm PLACE", "around": "--around LON,LAT,METRES", "polygon": "--polygon FILE"}
+
+
+def _one_source(source: dict[str, Any]) -> str:
+    """Name the option that says where the roads come from; a box alone is a source, with --roads it cuts them."""
+    given = [option for option in (*_FETCHED, "roads") if source[option]]
+    if source["bbox"] and given != ["roads"]:
+        given.append("bbox")
+    if len(given) != 1:
+        known = ", ".join(_FETCHED.values())
+        raise click.UsageError(f"Give one source of roads: {known}, --bbox W,S,E,N or --roads FILE.")
+    if given == ["roads"] and (source["date"] or source["no_cache"]):
+        raise click.UsageError("--date and --no-cache go with roads that are fetched, not with --roads.")
+    if given != ["roads"] and (source["layer"] or source["crs"] or source["attribution"]):
+        raise click.UsageError("--layer, --crs and --attribution go with --roads.")
+    return given[0]
+
+
+def _read(source: dict[str, Any], say: Callable[[str], None]) -> Roads:
+    from roadgeo.io_roads import read_roads
+
+    return read_roads(
+        source["roads"],
+        source["layer"],
+        source["crs"],
+        source["kinds"],
+        tunnels=source["tunnels"],
+        bbox=source["bbox"],
+        attribution=source["attribution"],
+        say=say,
+    )
+
+
+def _fetch(source: dict[str, Any], given: str, say: Callable[[str], None]) -> Roads:
+    from dataclasses import replace
+
+    from roadgeo.io_overpass import FetchOptions
+    from roadgeo.io_roads import fetch_roads
+
+    options = replace(FetchOptions(), date=source["date"], cache=not source["no_cache"])
+    servers = {key: source[key] for key in ("overpass_url", "nominatim_url") if source[key]}
+    options = replace(options, **servers)
+    where = {given: source[given]}
+    return fetch_roads(**where, which=source["kinds"], tunnels=source["tunnels"], options=options, say=say)
+
+
+def _name(source: dict[str, Any], given: str) -> str:
+    if given == "place":
+        return str(source["place"])
+    if given in {"roads", "polygon"}:
+        first = source["roads"][0] if given == "roads" else source["polygon"]
+        return Path(first).name.split(".")[0]
+    return given + " " + " ".join(f"{number:g}" for number in source[given])
+
+
+def _sayer(quiet: bool) -> Callable[[str], None]:
+    """Return what tells the user what is going on, on standard error."""
+    return (lambda _: None) if quiet else (lambda text: click.echo(f"{text} ...", err=True))
