@@ -30,6 +30,10 @@ class RefineOptions:
         Roads count as partners when their directions differ by less.
     perspective_sigma : float
         Prior standard deviation of the two perspective parameters.
+    least_support : float
+        Matches take part when at least this share of their neighbours are matched.
+    n_cells, least_share : int, float
+        The frame is divided into so many cells a side; a cell takes part when at least this share of its road points meet roads.
     correlation_m : float
         Errors of the map and of the mask keep their sign over about this length of road: points closer than that are no
         independent observations.
@@ -42,6 +46,9 @@ class RefineOptions:
     intersection_weight: float = 0.3
     max_turn_deg: float = 25.0
     perspective_sigma: float = 0.5
+    least_support: float = 0.3
+    n_cells: int = 8
+    least_share: float = 0.5
     correlation_m: float = 60.0
     sigma_floor_m: float = 0.1
     n_iterations: int = 15
@@ -83,6 +90,13 @@ def _spacing(scene: Scene, unit: float) -> float:
     return scene.road_length_px * unit / scene.half_size / max(len(scene.points), 1)
 
 
+def _cells(uv: FloatArray, options: RefineOptions) -> IntArray:
+    """Number the cell of the frame that each normalised point lies in."""
+    n = options.n_cells
+    columns = np.clip(((uv + 1.0) * (n / 2.0)).astype(np.int64), 0, n - 1)
+    return np.asarray(columns[:, 1] * n + columns[:, 0])
+
+
 def _corner_rows(p: FloatArray, uv: FloatArray) -> FloatArray:
     """Return the derivatives (M, 2, 8) of predicted points at normalised query points (M, 2)."""
     rows = np.empty((len(uv), 2, 8))
@@ -117,12 +131,17 @@ def refine(
     chosen = matched >= 0
     step = 1 if n_points is None else max(1, len(scene.points) // n_points)
     points = (scene.points[::step] - center) / half_size
+    # A match whose neighbours found none is more likely chance than luck.
+    around = scene.neighbours[chosen]
+    support = ((matched[around] >= 0) & (around >= 0)).sum(axis=1) / np.maximum((around >= 0).sum(axis=1), 1)
+    chosen[chosen] = support >= options.least_support
+    pairs = (scene.intersections.xy[chosen] - center) / half_size
     normal = np.empty((8, 8))
     _, rms = adjust(
-        p, unit, origin[0], origin[1], points, scene.directions[::step],
+        p, unit, origin[0], origin[1], points, scene.directions[::step], _cells(points, options),
         min(1.0, _spacing(scene, unit) * step / options.correlation_m),
-        (scene.intersections.xy[chosen] - center) / half_size, (index.xy[matched[chosen]] - origin) / unit,
-        options.intersection_weight, options.max_radius_m, np.cos(np.radians(options.max_turn_deg)), options.sigma_m,
+        pairs, (index.xy[matched[chosen]] - origin) / unit, _cells(pairs, options), options.intersection_weight,
+        options.n_cells**2, options.least_share, options.max_radius_m, np.cos(np.radians(options.max_turn_deg)), options.sigma_m,
         (options.sigma_m / unit / options.perspective_sigma) ** 2, options.n_iterations, options.tolerance_m,
         index.segments, index.segment_starts, index.segment_ids, index.grid, index.shape, normal,
     )  # fmt: skip

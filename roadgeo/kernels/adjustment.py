@@ -37,8 +37,8 @@ def add_row(normal, right, row, weight, residual):
 
 @njit(cache=True)
 def adjust(
-    p, unit, origin_x, origin_y, points, directions, point_weight, pairs, targets, pair_weight,
-    max_radius, min_cos, sigma_m, prior, n_iterations, tolerance_m,
+    p, unit, origin_x, origin_y, points, directions, point_cells, point_weight, pairs, targets, pair_cells, pair_weight,
+    n_cells, least_share, max_radius, min_cos, sigma_m, prior, n_iterations, tolerance_m,
     segments, starts, ids, grid, shape, normal,
 ):  # fmt: skip
     """Adjust `p` in place by Gauss-Newton with Cauchy weights; return (road points used, robust rms in metres), or (-1, inf).
@@ -46,13 +46,22 @@ def adjust(
     `points` (S, 2) with unit `directions` (S, 2) are road points, `pairs` (M, 2) matched intersections with their `targets` (M, 2), all
     normalised. A road point's residual is its distance across the nearest road of the map that runs its way. How far off it may be
     is predicted from the system so far: it is searched as far as three times that, and not at all beyond `max_radius`, so that the fit
-    grows outwards from where it is sure. `prior` is the weight that holds the perspective parameters near zero; `point_weight` and
+    grows outwards from where it is sure. The frame is divided into `n_cells` cells (`point_cells`, `pair_cells`: each observation's own):
+    where less than `least_share` of a cell's searched points meet a road, what does meet one is chance, and the cell waits. `prior` is the weight that holds the perspective parameters near zero; `point_weight` and
     `pair_weight` are those of an observation of standard deviation `sigma_m`. On return `normal` (8, 8) holds the last system.
     """
     right = np.empty(8)
     row = np.empty(8)
     work = np.empty(8)
     factor = np.zeros((8, 8))
+    n = points.shape[0]
+    met = np.empty(n, np.bool_)
+    normals = np.empty((n, 2))
+    residuals = np.empty(n)
+    sigmas = np.empty(n)
+    searched = np.empty(n_cells)
+    hits = np.empty(n_cells)
+    shares = np.ones(n_cells)
     previous = -1
     rms = np.inf
     for iteration in range(n_iterations + 1):
@@ -64,6 +73,8 @@ def adjust(
             normal[r, r] += prior
             right[r] -= prior * p[r]
         for i in range(pairs.shape[0]):
+            if shares[pair_cells[i]] < least_share:
+                continue
             for axis in range(2):
                 x, y, w = point_row(p, pairs[i, 0], pairs[i, 1], 1.0 - axis, 1.0 * axis, row)
                 if w < 0.02:
@@ -76,7 +87,10 @@ def adjust(
                 add_row(normal, right, row, weight, dx if axis == 0 else dy)
         used, weights, squares = 0, 0.0, 0.0
         if iteration > 0:
-            for i in range(points.shape[0]):
+            searched[:] = 0.0
+            hits[:] = 0.0
+            for i in range(n):
+                met[i] = False
                 u, v = points[i, 0], points[i, 1]
                 w = 1.0 + p[6] * u + p[7] * v
                 if w < 0.02:
@@ -101,19 +115,29 @@ def adjust(
                 sigma = sigma_m * math.sqrt(1.0 + spread)
                 if 3.0 * sigma > max_radius:
                     continue
+                searched[point_cells[i]] += 1.0
                 gx, gy = origin_x + unit * x, origin_y + unit * y
                 d, fx, fy, rx, ry = nearest_road(
                     gx, gy, dx, dy, 3.0 * sigma, min_cos, segments, starts, ids, grid, shape
                 )
                 if d == np.inf:
                     continue
-                residual = (fx - gx) * -ry + (fy - gy) * rx
-                point_row(p, u, v, -ry, rx, row)
-                weight = 1.0 / (1.0 + (residual / sigma) ** 2)
-                add_row(normal, right, row, point_weight * weight, residual / unit)
+                met[i] = True
+                hits[point_cells[i]] += 1.0
+                normals[i, 0], normals[i, 1] = -ry, rx
+                residuals[i] = (fx - gx) * -ry + (fy - gy) * rx
+                sigmas[i] = sigma
+            for c in range(n_cells):
+                shares[c] = hits[c] / searched[c] if searched[c] > 0.0 else 1.0
+            for i in range(n):
+                if not met[i] or shares[point_cells[i]] < least_share:
+                    continue
+                point_row(p, points[i, 0], points[i, 1], normals[i, 0], normals[i, 1], row)
+                weight = 1.0 / (1.0 + (residuals[i] / sigmas[i]) ** 2)
+                add_row(normal, right, row, point_weight * weight, residuals[i] / unit)
                 used += 1
                 weights += weight
-                squares += weight * residual * residual
+                squares += weight * residuals[i] * residuals[i]
             if weights > 0.0:
                 rms = math.sqrt(squares / weights)
         for r in range(8):
