@@ -19,11 +19,10 @@ def test_help_imports_click_and_nothing_heavy() -> None:
 
 
 @pytest.mark.parametrize("name", COMMANDS)
-def test_every_command_has_the_name_and_summary_of_the_table_and_examples(name: str) -> None:
+def test_every_command_has_the_name_of_the_table_and_examples(name: str) -> None:
     command = cli.get_command(click.Context(cli), name)
     assert command is not None
     assert command.name == name
-    assert command.short_help == COMMANDS[name][1]
     assert f"roadgeo {name}" in (command.help or "")
 
 

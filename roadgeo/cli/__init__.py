@@ -88,7 +88,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
         )
     except click.UsageError as error:
         asked = error.ctx.command_path if error.ctx else "roadgeo"
-        return _fail(f"{error.format_message()} Try '{asked} --help'.", error.exit_code)
+        return _fail(f"{error.format_message().rstrip('.')}. Try '{asked} --help'.", error.exit_code)
     except click.ClickException as error:
         return _fail(error.format_message(), error.exit_code)
     except (click.Abort, KeyboardInterrupt):

@@ -44,8 +44,9 @@ def demo_command(out_dir: str) -> int:
     """
     from roadgeo.cli.batch import Task
     from roadgeo.cli.compilation import compile_once
+    from roadgeo.cli.folders import make_folder
     from roadgeo.cli.index import build
-    from roadgeo.cli.locate import Job, make_folder
+    from roadgeo.cli.locate import Job
     from roadgeo.demo import ATTRIBUTION, ROADS, demo_masks
     from roadgeo.io_roads import read_roads
     from roadgeo.workflows import LocateOptions

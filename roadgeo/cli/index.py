@@ -56,14 +56,16 @@ def index_command(out: str | None, name: str | None, quiet: bool, verbose: bool,
       roadgeo index --roads massachusetts.osm.pbf --bbox=-71.19,42.23,-70.95,42.44
     """
     from roadgeo.cli.compilation import compile_once
+    from roadgeo.cli.folders import make_folder
     from roadgeo.library import make_slug, new_reference
 
     say = _sayer(quiet)
     started = perf_counter()
     given = _one_source(source)
-    roads = _read(source, say) if given == "roads" else _fetch(source, given, say)
     name = name or _name(source, given)
     path = Path(out) if out else new_reference(name)
+    make_folder(path.parent)  # before the long part
+    roads = _read(source, say) if given == "roads" else _fetch(source, given, say)
     say(f"drawing {len(roads):,} lines as a mask shows them")
     reference = build(roads, path, make_slug(name))
     compile_once(reference, quiet)

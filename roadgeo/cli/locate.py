@@ -14,6 +14,7 @@ import click
 
 from roadgeo.cli import ERROR, NOT_LOCATED
 from roadgeo.cli.batch import Task, find_masks, name_tasks, run
+from roadgeo.cli.folders import make_folder
 from roadgeo.cli.parameters import NEAR, RANGE, verbosity_options
 from roadgeo.wording import format_lonlat
 
@@ -21,7 +22,7 @@ if TYPE_CHECKING:
     from roadgeo.location import Location
     from roadgeo.workflows import LocateOptions, Reference
 
-__all__ = ["Job", "Outcome", "locate_command", "make_folder", "open_references"]
+__all__ = ["Job", "Outcome", "locate_command", "open_references"]
 
 Status = Literal["located", "ambiguous", "not_located", "error"]
 
@@ -202,14 +203,16 @@ def locate_command(
 
     Exit status: 0 every mask located, 3 at least one not located, 1 error, 2 usage.
     """
+    from roadgeo.cli.compilation import compile_once
+
     options = make_options(method, gsd, max_tilt, near, north_up, time_limit)
     tasks = name_tasks(find_masks(masks))
     if not tasks:
         raise click.UsageError(f"No images in {', '.join(masks)}.")
     make_folder(out_dir)
     job = Job(references, options, out_dir, threshold, band, plot)
-    if jobs > 1:
-        open_references(references)  # so that what is wrong with them is said once, before the processes start
+    # Opened here too: what is wrong with them is said once, and the search is compiled before processes start.
+    compile_once(open_references(references)[0], quiet)
     counts: Counter[Status] = Counter()
     with _progress(len(tasks), as_json, quiet) as advance:
         for outcome in run(tasks, job, jobs):
@@ -271,14 +274,6 @@ def _draw(location: Location, mask: Any, reference: Reference, path: Path) -> No
     index = reference.index
     roads = index.plane.to_crs(index.segments.reshape(-1, 2).astype(float)).reshape(-1, 4)
     write_overlay(path, location, mask, roads, str(index.meta.get("attribution", "")))
-
-
-def make_folder(folder: str) -> None:
-    """Make the folder for the results, unless it is there."""
-    from roadgeo.io_atomic import writing
-
-    with writing(folder):
-        Path(folder).mkdir(parents=True, exist_ok=True)
 
 
 # --- printing ---------------------------------------------------------------------------------------------------------
