@@ -698,11 +698,11 @@ def _normalising(xy: FloatArray) -> FloatArray:
 
 
 def _bucket(xy: FloatArray) -> tuple[FloatArray, IntArray, Int32Array, Int32Array]:
-    """Sort intersections into square buckets, at most about four for each: `grid`, `shape`, `starts`, `items`."""
+    """Sort intersections into square buckets, about sixteen for each: `grid`, `shape`, `starts`, `items`."""
     if len(xy) == 0:
         return np.array([0.0, 0.0, 1.0]), np.array([1, 1]), np.zeros(2, np.int32), np.empty(0, np.int32)
     low, extent = xy.min(axis=0), np.ptp(xy, axis=0)
-    cell = max(math.sqrt(extent[0] * extent[1] / (4 * len(xy))), float(extent.max()) / (4 * len(xy)), 1.0)
+    cell = max(math.sqrt(extent[0] * extent[1] / (16 * len(xy))), float(extent.max()) / (16 * len(xy)), 1.0)
     n_cols, n_rows = (extent // cell).astype(np.int64) + 1
     cols, rows = ((xy - low) // cell).astype(np.int64).T
     buckets = rows * n_cols + cols

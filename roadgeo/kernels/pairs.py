@@ -103,7 +103,7 @@ def _near_line(directions, i, n_tangents, dx, dy, limit):  # type: ignore[no-unt
 def _cotangents(tangents, i, n_tangents, phi, out):  # type: ignore[no-untyped-def]
     """Write the cotangents of intersection i's tangents relative to a line of direction `phi`, falling."""
     for k in range(n_tangents):
-        r = tangents[i, k] - phi
+        r = np.float64(tangents[i, k]) - phi
         value = math.cos(r) / math.sin(r)
         slot = k
         while slot > 0 and out[slot - 1] < value:
