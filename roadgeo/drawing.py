@@ -10,7 +10,7 @@ import numpy as np
 
 from roadgeo.landscape import Landscape, Strokes, visible_intersections, visible_strokes
 from roadgeo.typing import AnyArray, BoolArray, Float32Array, FloatArray, IntArray
-from roadgeo.view import View
+from roadgeo.view import View, polygon_area
 
 __all__ = ["NOISE_MODELS", "NoiseModel", "draw_mask"]
 
@@ -107,7 +107,7 @@ def draw_mask(
     mask = _wear(canvas.mask, noise, rng)
     drawn = {
         "n_intersections": n_intersections,
-        "density_km2": n_intersections / (_area(view.footprint) / 1e6),
+        "density_km2": n_intersections / (polygon_area(view.footprint) / 1e6),
         "missing": float(strokes.length[missing].sum()) / total,
         "false_roads": false / total,
         "outdated": (float(strokes.length[gone].sum()) + new) / total,
@@ -249,8 +249,3 @@ def _smooth_noise(shape: tuple[int, int], scale_px: int, rng: np.random.Generato
     coarse = rng.standard_normal((shape[0] // scale_px + 2, shape[1] // scale_px + 2)).astype(np.float32)
     smooth = cv2.resize(coarse, shape[::-1], interpolation=cv2.INTER_CUBIC)
     return np.asarray((smooth - smooth.mean()) / max(float(smooth.std()), 1e-6), np.float32)
-
-
-def _area(polygon: FloatArray) -> float:
-    x, y = polygon.T
-    return abs(float(x @ np.roll(y, -1) - y @ np.roll(x, -1))) / 2

@@ -16,9 +16,17 @@ from roadgeo.errors import RoadSourceError
 from roadgeo.landscape import Landscape, visible_intersections
 from roadgeo.truth import Truth
 from roadgeo.typing import AnyArray
-from roadgeo.view import View, make_view, sees_ground
+from roadgeo.view import View, make_view, polygon_area, sees_ground
 
-__all__ = ["SimulatedQuery", "SimulationOptions", "ViewOptions", "draw_view", "simulate", "simulate_query"]
+__all__ = [
+    "SimulatedQuery",
+    "SimulationOptions",
+    "ViewOptions",
+    "draw_view",
+    "simulate",
+    "simulate_query",
+    "simulate_query_at",
+]
 
 #: Draws of a view before a query is given up.
 MAX_TRIES = 4000
@@ -100,19 +108,94 @@ def simulate_query(landscape: Landscape, options: SimulationOptions, k: int) -> 
     RoadSourceError
         The map has no place for such a view.
     """
-    rng = np.random.default_rng([options.seed, zlib.crc32(options.kind.encode()), k])
+    rng = _generator(options, k)
     least, most = options.view.intersections
     for _ in range(MAX_TRIES):
-        view = draw_view(landscape, options.view, rng)
-        mask, drawn = draw_mask(landscape, view, options.noise, options.view.road_width_m, rng)
-        if least <= drawn["n_intersections"] <= most:
-            break
-    else:
-        raise RoadSourceError(
-            f"no mask with {least} to {most} intersections left could be drawn; ask for fewer or for less noise"
-        )
-    if options.mirrored:
-        mask = np.ascontiguousarray(mask[:, ::-1])
+        query = _draw_query(landscape, draw_view(landscape, options.view, rng), options, k, rng)
+        if least <= query.truth.properties["n_intersections"] <= most:
+            return query
+    raise RoadSourceError(
+        f"no mask with {least} to {most} intersections left could be drawn; ask for fewer or for less noise"
+    )
+
+
+def simulate_query_at(
+    landscape: Landscape, options: SimulationOptions, k: int, center: tuple[float, float]
+) -> SimulatedQuery:
+    """Draw a query whose frame's middle lies at a plane position, however few intersections it shows.
+
+    Raises
+    ------
+    RoadSourceError
+        Every view that the options allow holds the horizon.
+    """
+    rng = _generator(options, k)
+    for _ in range(MAX_TRIES):
+        view = _view_at(center, options.view, rng)
+        if sees_ground(view):
+            return _draw_query(landscape, view, options, k, rng)
+    raise RoadSourceError("every view that was drawn holds the horizon; allow less tilt or a longer focal length")
+
+
+def draw_view(landscape: Landscape, options: ViewOptions, rng: np.random.Generator) -> View:
+    """Draw a view that lies on covered ground and holds enough intersections of the map.
+
+    Raises
+    ------
+    RoadSourceError
+        The map has no such place.
+    """
+    low, high = landscape.bounds
+    for _ in range(MAX_TRIES):
+        x, y = rng.uniform(low, high)
+        view = _view_at((x, y), options, rng)
+        if not sees_ground(view) or not landscape.covers(view.footprint):
+            continue
+        if options.intersections[0] <= len(visible_intersections(landscape, view)):
+            return view
+    raise RoadSourceError(
+        f"no view with {options.intersections[0]} to {options.intersections[1]} intersections was found on the map in"
+        f" {MAX_TRIES} draws; ask for fewer, for a wider window, or give a larger map"
+    )
+
+
+def footprint_area(options: ViewOptions, draws: int = 200) -> float:
+    """Average the ground that views show, square metres, over those that the options allow.
+
+    Raises
+    ------
+    RoadSourceError
+        Every view that the options allow holds the horizon.
+    """
+    rng = np.random.default_rng(0)
+    views = [view for view in (_view_at((0.0, 0.0), options, rng) for _ in range(draws)) if sees_ground(view)]
+    if not views:
+        raise RoadSourceError("every view that was drawn holds the horizon; allow less tilt or a longer focal length")
+    return float(np.mean([polygon_area(view.footprint) for view in views]))
+
+
+def _generator(options: SimulationOptions, k: int) -> np.random.Generator:
+    return np.random.default_rng([options.seed, zlib.crc32(options.kind.encode()), k])
+
+
+def _view_at(center: tuple[float, float], options: ViewOptions, rng: np.random.Generator) -> View:
+    """Draw sampling, tilt and heading of a view of `center`."""
+    gsd = float(np.exp(rng.uniform(*np.log(options.gsd_m))))
+    return make_view(
+        center,
+        options.size_px if options.window_m is None else (round(options.window_m / gsd),) * 2,
+        gsd,
+        rng.uniform(*options.tilt_deg),
+        rng.uniform(0.0, 360.0),
+        rng.uniform(*options.heading_deg),
+        options.focal_px,
+    )
+
+
+def _draw_query(
+    landscape: Landscape, view: View, options: SimulationOptions, k: int, rng: np.random.Generator
+) -> SimulatedQuery:
+    mask, drawn = draw_mask(landscape, view, options.noise, options.view.road_width_m, rng)
     matrix = landscape.plane.to_crs_matrix() @ view.homography.matrix
     truth = Truth(
         file=f"{options.kind}/q_{k:04d}.png",
@@ -130,34 +213,4 @@ def simulate_query(landscape: Landscape, options: SimulationOptions, k: int) -> 
             **drawn,
         },
     )
-    return SimulatedQuery(mask, truth)
-
-
-def draw_view(landscape: Landscape, options: ViewOptions, rng: np.random.Generator) -> View:
-    """Draw a view that lies on covered ground and holds enough intersections of the map.
-
-    Raises
-    ------
-    RoadSourceError
-        The map has no such place.
-    """
-    low, high = landscape.bounds
-    for _ in range(MAX_TRIES):
-        gsd = float(np.exp(rng.uniform(*np.log(options.gsd_m))))
-        view = make_view(
-            tuple(rng.uniform(low, high)),
-            options.size_px if options.window_m is None else (round(options.window_m / gsd),) * 2,
-            gsd,
-            rng.uniform(*options.tilt_deg),
-            rng.uniform(0.0, 360.0),
-            rng.uniform(*options.heading_deg),
-            options.focal_px,
-        )
-        if not sees_ground(view) or not landscape.covers(view.footprint):
-            continue
-        if options.intersections[0] <= len(visible_intersections(landscape, view)):
-            return view
-    raise RoadSourceError(
-        f"no view with {options.intersections[0]} to {options.intersections[1]} intersections was found on the map in"
-        f" {MAX_TRIES} draws; ask for fewer, for a wider window, or give a larger map"
-    )
+    return SimulatedQuery(np.ascontiguousarray(mask[:, ::-1]) if options.mirrored else mask, truth)

@@ -18,12 +18,22 @@ from roadgeo.files import write_text
 from roadgeo.grid import RoadMask
 from roadgeo.io_network import read_network
 from roadgeo.landscape import Landscape
-from roadgeo.simulation import SimulationOptions, simulate_query
+from roadgeo.simulation import SimulationOptions, simulate_query, simulate_query_at
 from roadgeo.truth import Truth, truth_from_record, truth_to_record
 from roadgeo.typing import AnyArray
 from roadgeo.workflows import LocateOptions, locate, open_reference
 
-__all__ = ["DrawnMasks", "Locator", "Mask", "MaskFiles", "QuerySet", "ReferenceLocator", "Trial", "run_trials"]
+__all__ = [
+    "DrawnMasks",
+    "Locator",
+    "Mask",
+    "MaskFiles",
+    "PlacedMasks",
+    "QuerySet",
+    "ReferenceLocator",
+    "Trial",
+    "run_trials",
+]
 
 SCHEMA = "roadgeo.trials/1"
 
@@ -93,6 +103,38 @@ class DrawnMasks:
 
         def draw(k: int) -> tuple[Truth, Mask]:
             query = simulate_query(landscape, *numbered[k])
+            return query.truth, query.mask
+
+        return draw
+
+
+@dataclass(frozen=True)
+class PlacedMasks:
+    """Masks drawn at given places of a reference.
+
+    Attributes
+    ----------
+    centers : tuple of (float, float)
+        Middles of the frames, metres on the reference's plane.
+    first : int
+        Number of the first query: others draw other noise.
+    """
+
+    geopackage: Path
+    options: SimulationOptions
+    centers: tuple[tuple[float, float], ...]
+    first: int = 0
+
+    def __len__(self) -> int:
+        """How many queries there are."""
+        return len(self.centers)
+
+    def open(self) -> Callable[[int], tuple[Truth, Mask]]:
+        """Read the roads and return the function that draws the k-th query."""
+        landscape = Landscape.from_network(read_network(self.geopackage))
+
+        def draw(k: int) -> tuple[Truth, Mask]:
+            query = simulate_query_at(landscape, self.options, self.first + k, self.centers[k])
             return query.truth, query.mask
 
         return draw

@@ -9,7 +9,7 @@ from towns import lattice_town
 from roadgeo.drawing import NOISE_MODELS
 from roadgeo.errors import RoadSourceError
 from roadgeo.homography import Homography
-from roadgeo.simulation import SimulationOptions, ViewOptions, simulate, simulate_query
+from roadgeo.simulation import SimulationOptions, ViewOptions, simulate, simulate_query, simulate_query_at
 
 TOWN = lattice_town()
 VIEW = ViewOptions(
@@ -57,6 +57,15 @@ def test_a_window_fixes_the_side_on_the_ground():
     for query in simulate(TOWN, replace(OPTIONS, view=view), 3):
         side = np.hypot(*(query.truth.footprint[1] - query.truth.footprint[0]))
         assert side == pytest.approx(300.0, abs=1.0)
+
+
+def test_queries_can_be_placed():
+    center = (330.0, 440.0)
+    query = simulate_query_at(TOWN, OPTIONS, 5, center)
+    assert query.truth.center == pytest.approx(TOWN.plane.to_crs(np.array(center)))
+    assert np.array_equal(query.mask, simulate_query_at(TOWN, OPTIONS, 5, center).mask)
+    off_the_map = simulate_query_at(TOWN, replace(OPTIONS, noise=NOISE_MODELS["clean"]), 5, (1e5, 1e5))
+    assert not off_the_map.mask.any()
 
 
 def test_mirrored_masks_have_no_place():

@@ -17,7 +17,7 @@ if TYPE_CHECKING:
     from rich.table import Table
 
     from roadgeo.evaluation import Evaluation, Share, Summary
-    from roadgeo.trials import QuerySet
+    from roadgeo.trials import QuerySet, ReferenceLocator
 
 __all__ = ["evaluate_command"]
 
@@ -37,6 +37,9 @@ __all__ = ["evaluate_command"]
     "--radius", metavar="METRES", type=click.FloatRange(0.01), default=20.0, show_default=True, help="Right if nearer."
 )
 @click.option("-j", "--jobs", metavar="N", type=click.IntRange(1), default=1, show_default=True, help="Processes.")
+@click.option("--map", "as_map", is_flag=True, help="Map where such masks (of the first --noise) are located.")
+@click.option("--height", metavar="METRES", type=click.FloatRange(1), help="Above ground, in place of --gsd.")
+@click.option("--check", metavar="N", type=click.IntRange(0), default=0, help="Hold the map against N other masks.")
 @click.option("-o", "--out-dir", type=click.Path(file_okay=False, path_type=Path), help="Where to keep all there is.")
 @click.option("--json", "as_json", is_flag=True, help="Print the figures as one JSON object.")
 @click.option("-q", "--quiet", is_flag=True, help="Say nothing but errors, and what --json prints.")
@@ -50,6 +53,9 @@ def evaluate_command(
     time_limit: float,
     radius: float,
     jobs: int,
+    as_map: bool,
+    height: float | None,
+    check: int,
     out_dir: Path | None,
     as_json: bool,
     quiet: bool,
@@ -61,32 +67,60 @@ def evaluate_command(
     evaluation.json, report.html and trials.jsonl, from which an interrupted run goes on. Other tables of truths than
     those of `simulate` are understood too; see roadgeo/truth.py.
 
+    With --map masks are tried all over the map (-n of them, 400 if not said), and REF_localizability.tif (styled in
+    QGIS), .png and .json say where they would be located, may be ambiguous, or show too few intersections.
+
     \b
     Examples:
       roadgeo evaluate boston-ma -j 2
       roadgeo evaluate boston-ma --noise poor --tilt 30:50 --mirrored 100 -o evaluation
       roadgeo evaluate boston-ma --queries queries/truth.csv --method pair
+      roadgeo evaluate boston-ma --map --height 400 --focal 2000 --size 1200 --noise segmented --check 300
     """
     from roadgeo.cli.locate import make_options
-    from roadgeo.evaluation import evaluate
     from roadgeo.io_atomic import writing
     from roadgeo.library import resolve_reference
-    from roadgeo.trials import ReferenceLocator, run_trials
+    from roadgeo.trials import ReferenceLocator
 
     path = resolve_reference(reference)
-    query_set, settings = _query_set(path, queries, options)
-    told = {"known_gsd": known_gsd, "max_tilt": max_tilt, "north_up": north_up or None, "time_limit_s": time_limit}
-    settings |= {"reference": path.stem, "method": method, **{k: v for k, v in told.items() if v is not None}}
     if out_dir is not None:
         with writing(out_dir):
             out_dir.mkdir(parents=True, exist_ok=True)
-    record = None if out_dir is None else out_dir / "trials.jsonl"
+    if height is not None:
+        options["gsd"] = (height / (options["focal"] or options["size"]),) * 2
     locator = ReferenceLocator((path,), make_options(method, known_gsd, max_tilt, None, north_up, time_limit))
+    if as_map:
+        from roadgeo.cli.localizability import ANY, Survey
 
+        trials = options["count"] or 400
+        ((simulation, _), *_) = query_sets(**options | {"intersections": ANY})
+        Survey(path, simulation, locator, trials, check, jobs, quiet).run(out_dir or Path(), as_json)
+        return
+    query_set, settings = _query_set(path, queries, options)
+    told = {"known_gsd": known_gsd, "max_tilt": max_tilt, "north_up": north_up or None, "time_limit_s": time_limit}
+    settings |= {"reference": path.stem, "method": method, **{k: v for k, v in told.items() if v is not None}}
+    _evaluate(query_set, locator, settings, radius, jobs, out_dir, as_json, quiet)
+
+
+def _evaluate(
+    queries: QuerySet,
+    locator: ReferenceLocator,
+    settings: dict[str, Any],
+    radius: float,
+    jobs: int,
+    out_dir: Path | None,
+    as_json: bool,
+    quiet: bool,
+) -> None:
+    """Locate all queries; write and print what that shows."""
+    from roadgeo.evaluation import evaluate
+    from roadgeo.trials import run_trials
+
+    record = None if out_dir is None else out_dir / "trials.jsonl"
     started = time.perf_counter()
-    with count_up(len(query_set), quiet or as_json) as count:
+    with count_up(len(queries), quiet) as count:
         trials = run_trials(
-            query_set, locator, jobs, record, settings, lambda trial: count(trial.answer["status"].replace("_", " "))
+            queries, locator, jobs, record, settings, lambda trial: count(trial.answer["status"].replace("_", " "))
         )
     elapsed = time.perf_counter() - started
 
@@ -96,8 +130,9 @@ def evaluate_command(
         from roadgeo.evaluation_report import render_report
         from roadgeo.files import write_text
 
+        title = f"{settings['reference']}: {len(trials)} masks"
         write_text(out_dir / "evaluation.json", json.dumps(evaluation.to_dict(), indent=1) + "\n")
-        write_text(out_dir / "report.html", render_report(evaluation, truths, f"{path.stem}: {len(trials)} masks"))
+        write_text(out_dir / "report.html", render_report(evaluation, truths, title))
     if as_json:
         click.echo(json.dumps({name: part for name, part in evaluation.to_dict().items() if name != "scores"}))
     elif not quiet:

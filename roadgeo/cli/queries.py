@@ -33,9 +33,7 @@ _OPTIONS = [
         "--count",
         metavar="N",
         type=click.IntRange(1),
-        default=40,
-        show_default=True,
-        help="Masks per noise model.",
+        help="Masks per noise model.  [default: 40]",
     ),
     click.option(
         "--noise",
@@ -135,7 +133,7 @@ def count_up(total: int, quiet: bool) -> Iterator[Callable[[str], None]]:
 
 def query_sets(
     *,
-    count: int,
+    count: int | None,
     noise: tuple[str, ...],
     gsd: tuple[float, float],
     tilt: tuple[float, float],
@@ -162,7 +160,7 @@ def query_sets(
         intersections=(int(intersections[0]), int(intersections[1])),
         road_width_m=road_width,
     )
-    sets = [(SimulationOptions(view, NOISE_MODELS[name], name, seed), count) for name in dict.fromkeys(noise)]
+    sets = [(SimulationOptions(view, NOISE_MODELS[name], name, seed), count or 40) for name in dict.fromkeys(noise)]
     if mirrored:
         turned = SimulationOptions(view, NOISE_MODELS[noise[0]], "mirrored", seed, mirrored=True)
         sets.append((turned, mirrored))

@@ -1,0 +1,134 @@
+"""`roadgeo evaluate --map`: where on a reference masks would be located."""
+
+from __future__ import annotations
+
+import json
+from dataclasses import dataclass, replace
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+import click
+import numpy as np
+
+from roadgeo.cli.queries import count_up
+
+if TYPE_CHECKING:
+    from roadgeo.localizability import LocalizabilityMap
+    from roadgeo.simulation import SimulationOptions
+    from roadgeo.trials import QuerySet, ReferenceLocator, Trial
+
+__all__ = ["Survey"]
+
+#: No number of intersections is asked for: how many a place shows is what matters.
+ANY = (0, 1_000_000)
+
+
+@dataclass(frozen=True)
+class Survey:
+    """What a map of localizability is made with.
+
+    Attributes
+    ----------
+    trials : int
+        Masks to learn from: half of them anywhere, half where the first half leaves hope.
+    check : int
+        Other masks that the map is held against.
+    """
+
+    reference: Path
+    simulation: SimulationOptions
+    locator: ReferenceLocator
+    trials: int
+    check: int
+    jobs: int
+    quiet: bool
+
+    def run(self, out_dir: Path, as_json: bool) -> None:
+        """Make the map, and write and print it."""
+        from roadgeo.files import write_bytes, write_text
+        from roadgeo.io_network import read_network
+        from roadgeo.localizability import draw_localizability, to_geotiff, to_qml
+
+        network = read_network(self.reference)
+        found = self._learn(network)
+        stem = f"{self.reference.stem}_localizability"
+        window = round(found.grid.footprint_m2**0.5)
+        title = f"{self.reference.stem}: masks of {window} x {window} m, {self.simulation.kind}"
+        write_bytes(out_dir / f"{stem}.tif", to_geotiff(found))
+        write_text(out_dir / f"{stem}.qml", to_qml())
+        write_bytes(out_dir / f"{stem}.png", draw_localizability(network, found, title))
+        summary = self._summary(found)
+        write_text(out_dir / f"{stem}.json", json.dumps(summary, indent=1) + "\n")
+        if as_json:
+            click.echo(json.dumps(summary))
+        elif not self.quiet:
+            _print(summary)
+            click.echo(f"wrote {out_dir / stem}.tif, .qml, .png, .json", err=True)
+
+    def _learn(self, network: Any) -> LocalizabilityMap:
+        from roadgeo.localizability import lay_grid, map_localizability
+        from roadgeo.simulation import footprint_area
+        from roadgeo.trials import PlacedMasks
+
+        grid = lay_grid(network, footprint_area(self.simulation.view))
+        rng = np.random.default_rng(self.simulation.seed)
+        hope = np.ones(grid.covered.shape, bool)
+        places, located = np.empty((0, 2)), np.empty(0, bool)
+        for count in (self.trials - self.trials // 2, self.trials // 2):
+            centers = grid.draw(count, hope, rng)
+            masks = PlacedMasks(self.reference, self.simulation, tuple(map(tuple, centers.tolist())), len(places))
+            places = np.vstack([places, centers])
+            located = np.concatenate([located, _located(self._try(masks))])
+            found = map_localizability(grid, places, located)
+            hope = np.nan_to_num(found.probability) >= 0.3
+        return found
+
+    def _try(self, masks: QuerySet) -> list[Trial]:
+        from roadgeo.trials import run_trials
+
+        with count_up(len(masks), self.quiet) as count:
+            return run_trials(
+                masks, self.locator, self.jobs, progress=lambda trial: count(trial.answer["status"].replace("_", " "))
+            )
+
+    def _summary(self, found: LocalizabilityMap) -> dict[str, Any]:
+        """Say how much ground is in each class, and how many of the masks held against it were located there."""
+        from dataclasses import asdict
+
+        from roadgeo.evaluation import share
+        from roadgeo.localizability import PALETTE
+        from roadgeo.trials import DrawnMasks
+
+        summary: dict[str, Any] = {"schema": "roadgeo.localizability/1", "trials": self.trials, "classes": []}
+        checked, located = np.empty(0, np.uint8), np.empty(0, bool)
+        if self.check:
+            held_out = replace(self.simulation, kind=f"{self.simulation.kind}-check")
+            trials = self._try(DrawnMasks(self.reference, ((held_out, self.check),)))
+            checked = found.at(found.grid.plane.from_crs(np.array([trial.truth.center for trial in trials])))
+            located = _located(trials)
+        known = max(int((found.classes > 0).sum()), 1)
+        for value, (_, _, label) in list(PALETTE.items())[1:]:
+            hits = located[checked == value]
+            summary["classes"].append(
+                {
+                    "value": value,
+                    "label": label,
+                    "area_share": float((found.classes == value).sum() / known),
+                    "located": asdict(share(int(hits.sum()), len(hits))) if len(hits) else None,
+                }
+            )
+        return summary
+
+
+def _located(trials: list[Trial]) -> Any:
+    from roadgeo.evaluation import score
+
+    return np.array([score(trial.truth, trial.answer).right for trial in trials], bool)
+
+
+def _print(summary: dict[str, Any]) -> None:
+    for entry in summary["classes"]:
+        line = f"{entry['label']:<28} {100 * entry['area_share']:5.1f} % of the map"
+        if entry["located"]:
+            line += f"; located there: {entry['located']['hits']} of {entry['located']['of']}"
+        click.echo(line)
