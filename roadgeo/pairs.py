@@ -331,6 +331,22 @@ def match_pairs(
     )
 
 
+class Buckets(NamedTuple):
+    """Reference intersections sorted by square cells: cell c = W row + column owns places `starts[c]:starts[c + 1]`.
+
+    Dimensions: N intersections, H rows, W columns.
+    """
+
+    origin: FloatArray  # (2,) lower left corner, metres
+    cell: float  # side of a cell, metres
+    n_rows: int
+    n_cols: int
+    starts: Int32Array  # (H W + 1,)
+    items: Int32Array  # (N,) the intersection at each place
+    xy: FloatArray  # (N, 2) its position
+    codes: AnyArray  # (N,) uint8, its type
+
+
 class _Correspondence(NamedTuple):
     """One way in which a query tuple may correspond to reference tuples of its type: which end, which tangent orders.
 
@@ -368,7 +384,7 @@ class _Search:
         self.query, self.index, self.frame, self.options, self.rng = query, index, frame, options, rng
         self.codes = _codes(query)
         self.xy, self.tangents = _fixed(reference.xy, np.float64), _fixed(reference.tangents, np.float32)
-        self.buckets = kernels.Buckets(
+        self.buckets = Buckets(
             index.grid[:2],
             float(index.grid[2]),
             int(index.shape[0]),

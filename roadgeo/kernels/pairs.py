@@ -2,18 +2,16 @@
 
 Notation. At each end of a pair (P1, P2) every tangent has an angle r in (0, pi), counterclockwise from the connecting
 line l; its cotangent falls as r grows, so "sorted in one rotational sense, starting from l" is "falling cotangents".
-`codes` are intersection types, 16 N_B + N_q. Arrays of the reference are read-only, so that one compiled version serves
-built and memory-mapped indices alike.
+`codes` are intersection types, 16 N_B + N_q; `buckets` is a `roadgeo.pairs.Buckets`. Arrays of the reference are
+read-only, so that one compiled version serves built and memory-mapped indices alike.
 """
 
 import math
-from typing import NamedTuple
 
 import numpy as np
 from numba import njit
 
 __all__ = [
-    "Buckets",
     "cross_ratios",
     "describe_pairs",
     "evaluate_pairs",
@@ -25,22 +23,6 @@ __all__ = [
 
 _MAX_TANGENTS = 8
 _LEAF_SIZE = 8
-
-
-class Buckets(NamedTuple):
-    """Reference intersections sorted by square cells: cell c = W row + column owns places `starts[c]:starts[c + 1]`.
-
-    Dimensions: N intersections, H rows, W columns.
-    """
-
-    origin: np.ndarray  # (2,) float64, lower left corner, metres
-    cell: float  # side of a cell, metres
-    n_rows: int
-    n_cols: int
-    starts: np.ndarray  # (H W + 1,) int32
-    items: np.ndarray  # (N,) int32, the intersection at each place
-    xy: np.ndarray  # (N, 2) float64, its position
-    codes: np.ndarray  # (N,) uint8, its type
 
 
 @njit(cache=True, error_model="numpy")
@@ -293,7 +275,7 @@ def nearest_of_type(xy, codes, buckets, radius, out):  # type: ignore[no-untyped
     xy : (N, 2) float64
         Reference plane, metres; NaN has no neighbour.
     codes : (N,) uint8
-    buckets : Buckets
+    buckets : roadgeo.pairs.Buckets
     radius : float
         Metres; a neighbour lies strictly nearer.
     out : (N,) int32
@@ -399,7 +381,7 @@ def evaluate_pairs(  # type: ignore[no-untyped-def]
         Of the reference.
     tangents : (M, R) float32
         Of the reference.
-    buckets : Buckets
+    buckets : roadgeo.pairs.Buckets
     radius : float
         Inlier distance, metres.
     is_physical : bool
