@@ -1,0 +1,57 @@
+"""`roadgeo vectorize`: what the program sees in a mask, for a person to look at."""
+
+from __future__ import annotations
+
+import click
+
+from roadgeo.cli import ERROR
+from roadgeo.cli.batch import find_masks, name_tasks
+from roadgeo.cli.folders import make_folder
+
+__all__ = ["vectorize_command"]
+
+
+@click.command("vectorize", short_help="Show what roads are seen in a mask.")
+@click.argument("masks", metavar="MASK...", nargs=-1, required=True)
+@click.option(
+    "-o",
+    "--out-dir",
+    metavar="DIR",
+    default=".",
+    type=click.Path(file_okay=False),
+    help="Where the results go; made if missing. Default: here.",
+)
+@click.option("--threshold", metavar="T", type=float, help="Values above T are road. Default: told by the values.")
+@click.option(
+    "--band", metavar="N", type=click.IntRange(1), help="Band that holds the mask. Default: told by the bands."
+)
+def vectorize_command(masks: tuple[str, ...], out_dir: str, threshold: float | None, band: int | None) -> int:
+    """Show what roads and intersections the program sees in MASKs: the first thing to look at when one was not located.
+
+    For photo_mask.tif it writes photo_mask_vectorized.gpkg, in pixel coordinates, which lies on the mask when both are
+    opened in QGIS, and photo_mask_vectorized.png.
+
+    \b
+    Examples:
+      roadgeo vectorize photo_mask.tif
+      roadgeo vectorize probability.tif --band 2 --threshold 0.4 --out-dir seen
+    """
+    from roadgeo.errors import RoadgeoError
+    from roadgeo.io_raster import read_mask
+    from roadgeo.io_vectorized import write_vectorized
+    from roadgeo.workflows import trace_query
+
+    make_folder(out_dir)
+    status = 0
+    for task in name_tasks(find_masks(masks)):
+        try:
+            mask = read_mask(task.mask, band=band, threshold=threshold)
+            scene, graph = trace_query(mask)
+            files = write_vectorized(out_dir, task.stem, mask, graph, scene.intersections)
+        except RoadgeoError as error:
+            click.echo(f"Error: {error}", err=True)
+            status = ERROR
+            continue
+        seen = f"{len(scene.intersections)} intersections, {graph.n_edges} roads between them"
+        click.echo(f"{task.mask}: {seen}; wrote {', '.join(map(str, files))}")
+    return status
