@@ -2,9 +2,11 @@
 
 from __future__ import annotations
 
+import math
 import time
 from collections.abc import Iterator
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, field
+from itertools import islice
 
 import numpy as np
 
@@ -23,34 +25,53 @@ __all__ = ["GrowOptions", "Hypothesis", "MatchOptions", "TripleEstimator"]
 
 @dataclass(frozen=True)
 class GrowOptions:
-    """How hypotheses grow and when they are given up (see `kernels.growth.grow`)."""
+    """How proposals are screened and grown (see `kernels.roads.screen`, `kernels.growth.grow`). Lengths have a part in metres, the
+    map's, and one in pixels, the mask's."""
 
-    sigma_m: float = 4.0
-    radius_m: float = 25.0
+    screen_points: int = 40
+    screen_radius_m: float = 8.0
+    screen_radius_px: float = 4.0
+    screen_share: float = 0.6
+    max_screened: int = 600
+    sigma_m: float = 3.5
+    sigma_px: float = 1.5
+    radius_m: float = 20.0
+    radius_px: float = 5.0
     ray_tolerance_deg: float = 25.0
     perspective_sigma: float = 0.4
     hit_rate: float = 0.45
     chance_rate: float = 0.08
     patience: float = 4.0
-    screen_points: int = 40
-    screen_radius_m: float = 12.0
-    screen_share: float = 0.6
     min_matched: int = 4
-    max_screened: int = 600
-    max_per_round: int = 150
-    max_verified_per_round: int = 6
+    max_grown: int = 150
+    max_verified: int = 6
+
+
+@dataclass(frozen=True)
+class Sweep:
+    """One pass over the query's anchors: how many, and how widely their triples are looked up."""
+
+    triples: TripleOptions
+    max_anchors: int
 
 
 @dataclass(frozen=True)
 class MatchOptions:
     """Options of all stages of matching, nested."""
 
-    triples: TripleOptions = field(default_factory=TripleOptions)
+    sweeps: tuple[Sweep, ...] = (
+        Sweep(TripleOptions(), 40),
+        Sweep(
+            TripleOptions(
+                n_neighbours=12, codes_per_vertex=3, angle_tolerance_deg=10.0, max_hits=50_000, max_compared=4_000_000
+            ),
+            150,
+        ),
+    )
     grow: GrowOptions = field(default_factory=GrowOptions)
     verify: VerifyOptions = field(default_factory=VerifyOptions)
     refine: RefineOptions = field(default_factory=RefineOptions)
     camera: CameraOptions = field(default_factory=CameraOptions)
-    sweeps: tuple[tuple[float, int], ...] = ((8.0, 40), (12.0, 60))
 
 
 @dataclass
@@ -82,6 +103,9 @@ class TripleEstimator:
         """`near` = (x, y, radius) in plane metres restricts where the middle of the frame may lie."""
         self.near = near
         self.refine_s = 0.0
+        # The least that chance reached at the places verified so far: a place that is not promising against it is none.
+        self.least_chance = np.array([0.05, 0.2, 0.05])
+        self.n_nulls = 0
         self.scene = scene
         self.index = index
         self.options = options or MatchOptions()
@@ -92,13 +116,9 @@ class TripleEstimator:
         options = self.options
         gsd = options.camera.gsd_m
         scale = (gsd[0] * 0.5, gsd[1] * 2.0)
-        for tolerance, most in options.sweeps:
-            triples = replace(options.triples, angle_tolerance_deg=tolerance)
-            for n, proposals in enumerate(
-                propose(self.scene.intersections, self.scene.neighbours, self.index, scale, 0.33, triples)
-            ):
-                if n >= most:
-                    break
+        for sweep in options.sweeps:
+            anchors = propose(self.scene.intersections, self.scene.neighbours, self.index, scale, 0.33, sweep.triples)
+            for proposals in islice(anchors, sweep.max_anchors):
                 self.n_tuples += proposals.n_tuples
                 self.n_candidates += proposals.n_hits
                 yield self._grow_all(proposals)
@@ -116,7 +136,7 @@ class TripleEstimator:
         shares = np.zeros(len(proposals.reference))
         screen(
             proposals.reference[:most], proposals.affine, anchor, index.xy, scene.points[near], scene.directions[near],
-            options.screen_radius_m, np.cos(np.radians(options.ray_tolerance_deg)), options.screen_share,
+            options.screen_radius_m, options.screen_radius_px, np.cos(np.radians(options.ray_tolerance_deg)), options.screen_share,
             index.segments, index.segment_starts, index.segment_ids, index.grid, index.shape, shares,
         )  # fmt: skip
         good = shares >= options.screen_share
@@ -133,18 +153,20 @@ class TripleEstimator:
         scene, index = self.scene, self.index
         found = scene.intersections
         anchor = proposals.anchor
+        neighbours = np.ascontiguousarray(scene.neighbours[:, : proposals.partners.shape[1]])
         order = np.argsort(np.hypot(*(found.xy - found.xy[anchor]).T), kind="stable")
         matched = np.empty(len(found), np.int64)
         distance = np.empty(len(found))
         matrix = np.empty((3, 3))
         grown = []
-        for m in self._screen(proposals)[: options.max_per_round]:
+        gsd = np.sqrt(proposals.affine[:, 0] * proposals.affine[:, 3] - proposals.affine[:, 1] * proposals.affine[:, 2])
+        for m in self._screen(proposals)[: options.max_grown]:
             self.n_hypotheses += 1
             n_matched, _, ratio = grow(
                 found.xy, found.rays, order, scene.half_size, anchor, proposals.reference[m], proposals.affine[m],
-                scene.neighbours, proposals.partners[m],
+                neighbours, proposals.partners[m],
                 index.xy, index.rays, index.point_starts, index.grid, index.shape,
-                options.sigma_m, options.radius_m, np.radians(options.ray_tolerance_deg), options.perspective_sigma,
+                math.hypot(options.sigma_m, options.sigma_px * gsd[m]), options.radius_m + options.radius_px * gsd[m], np.radians(options.ray_tolerance_deg), options.perspective_sigma,
                 options.hit_rate, options.chance_rate, options.patience, matched, distance, matrix,
             )  # fmt: skip
             if n_matched < options.min_matched or not np.isfinite(ratio):
@@ -152,12 +174,12 @@ class TripleEstimator:
             if judge(matrix, scene.size, self.options.camera):
                 continue
             slots = proposals.partners[m] >= 0
-            seeds = np.append(scene.neighbours[anchor][slots], anchor)
+            seeds = np.append(neighbours[anchor][slots], anchor)
             grown.append(Hypothesis(matrix / matrix[2, 2], seeds, ratio, matched.copy()))
         grown.sort(key=lambda h: -h.support)
         distinct: list[Hypothesis] = []
         for h in grown:
-            if len(distinct) == options.max_verified_per_round:
+            if len(distinct) == options.max_verified:
                 break
             if not any(self.same(h, other) for other in distinct):
                 distinct.append(h)
@@ -178,14 +200,13 @@ class TripleEstimator:
             if not self._converge(model, n_points):
                 return -np.inf
             assert model.found is not None  # noqa: S101 - for the type checker
-            # What a wrong place reaches is soon seen; only promising ones are worth all points.
-            if log10_odds(model.found, (0.05, 0.2, 0.25), scene.n_edges, self.n_candidates) < 0.0:
-                break
-        optimistic = log10_odds(model.found, (0.05, 0.2, 0.25), scene.n_edges, self.n_candidates)
-        if optimistic < 2.0:
-            model.log10_odds = optimistic
-            return optimistic
+            # What a wrong place reaches is soon seen; only promising ones are worth all points and a null of their own.
+            model.log10_odds = log10_odds(model.found, self.least_chance, scene.n_edges, self.n_candidates)
+            if model.log10_odds < options.verify.promising:
+                return model.log10_odds
         model.chance = chance_agreement(model.matrix, scene, index, model.gsd_m, options.verify)
+        self.least_chance = np.minimum(self.least_chance, model.chance) if self.n_nulls else np.array(model.chance)
+        self.n_nulls += 1
         model.log10_odds = log10_odds(model.found, model.chance, scene.n_edges, self.n_candidates)
         return model.log10_odds
 

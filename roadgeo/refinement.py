@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from dataclasses import dataclass
 
 import numpy as np
@@ -20,10 +21,10 @@ class RefineOptions:
 
     Attributes
     ----------
-    max_radius_m : float
-        Points whose place is less sure than a third of this do not take part yet.
-    sigma_m : float
-        Standard deviation of a road point across the road, and scale of the Cauchy weights.
+    max_radius_m, max_radius_px : float
+        Points whose place is less sure than a third of their sum do not take part yet.
+    sigma_m, sigma_px : float
+        Standard deviation of a road point across the road, the map's and the mask's, and scale of the Cauchy weights.
     intersection_weight : float
         Weight of a matched intersection against an independent road point: its centre is less certain.
     max_turn_deg : float
@@ -41,8 +42,10 @@ class RefineOptions:
         Accuracy of the map as a whole, which no number of points improves.
     """
 
-    max_radius_m: float = 30.0
-    sigma_m: float = 1.5
+    max_radius_m: float = 20.0
+    max_radius_px: float = 10.0
+    sigma_m: float = 1.2
+    sigma_px: float = 0.9
     intersection_weight: float = 0.3
     max_turn_deg: float = 25.0
     perspective_sigma: float = 0.5
@@ -128,6 +131,8 @@ def refine(
     options = options or RefineOptions()
     center, half_size = scene.center, scene.half_size
     p, origin, unit = _parameters(matrix, center, half_size)
+    gsd = unit / half_size
+    sigma_m = math.hypot(options.sigma_m, options.sigma_px * gsd)
     chosen = matched >= 0
     step = 1 if n_points is None else max(1, len(scene.points) // n_points)
     points = (scene.points[::step] - center) / half_size
@@ -141,8 +146,9 @@ def refine(
         p, unit, origin[0], origin[1], points, scene.directions[::step], _cells(points, options),
         min(1.0, _spacing(scene, unit) * step / options.correlation_m),
         pairs, (index.xy[matched[chosen]] - origin) / unit, _cells(pairs, options), options.intersection_weight,
-        options.n_cells**2, options.least_share, options.max_radius_m, np.cos(np.radians(options.max_turn_deg)), options.sigma_m,
-        (options.sigma_m / unit / options.perspective_sigma) ** 2, options.n_iterations, options.tolerance_m,
+        options.n_cells**2, options.least_share, options.max_radius_m + options.max_radius_px * gsd,
+        np.cos(np.radians(options.max_turn_deg)), sigma_m,
+        (sigma_m / unit / options.perspective_sigma) ** 2, options.n_iterations, options.tolerance_m,
         index.segments, index.segment_starts, index.segment_ids, index.grid, index.shape, normal,
     )  # fmt: skip
     if not np.isfinite(rms):

@@ -20,7 +20,7 @@ __all__ = ["Scene", "SceneOptions", "prepare_scene", "query_neighbours", "sample
 class SceneOptions:
     """Sizes of the scene's tables."""
 
-    n_neighbours: int = 8
+    n_neighbours: int = 12
     max_road_points: int = 600
     min_point_spacing_px: float = 6.0
     field_cells: int = 400

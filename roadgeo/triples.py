@@ -27,7 +27,7 @@ class TripleOptions:
     n_neighbours: int = 8
     min_shape: float = 0.12
     codes_per_vertex: int = 1
-    angle_tolerance_deg: float = 10.0
+    angle_tolerance_deg: float = 8.0
     ray_tolerance_deg: float = 25.0
     affine_tolerance: float = 0.3
     max_hits: int = 12_000
@@ -71,6 +71,7 @@ def propose(
     options: TripleOptions,
 ) -> Iterator[Proposals]:
     """Yield the proposals of one anchor after another, those anchors first whose triples are rare on the map."""
+    neighbours = np.ascontiguousarray(neighbours[:, : options.n_neighbours])
     k = neighbours.shape[1]
     costs = np.empty((len(query), k, k), np.int64)
     count_alike(

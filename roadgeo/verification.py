@@ -10,6 +10,7 @@ even a good fit is weak evidence.
 from __future__ import annotations
 
 import math
+from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -35,6 +36,8 @@ class VerifyOptions:
         Usual error of a traced road in pixels.
     n_shifts : int
         Shifted positions of the null model.
+    promising : float
+        Log10 odds that a place must reach against the least chance seen so far before a null of its own is measured for it.
     """
 
     map_sigma_m: float = 1.8
@@ -45,6 +48,7 @@ class VerifyOptions:
     shift_m: tuple[float, float] = (30.0, 320.0)
     n_shifts: int = 150
     n_null_points: int = 150
+    promising: float = 2.0
 
 
 @dataclass(frozen=True)
@@ -163,7 +167,7 @@ def _information(rate: float, chance: float) -> float:
 
 
 def log10_odds(
-    found: Agreement, chance: tuple[float, float, float], n_roads: float, n_candidates: int
+    found: Agreement, chance: Sequence[float] | FloatArray, n_roads: float, n_candidates: int
 ) -> float:
     """Log10 odds of a place against chance, corrected for the candidates tried."""
     nats = found.tested * _information(found.rate, chance[0])

@@ -1,21 +1,44 @@
 """Roads as short straight segments in buckets: the nearest one to a point, and how well two networks cover each other.
 
-`segments` (S, 4) are x1, y1, x2, y2; bucket `c` lists the ids `ids[starts[c]:starts[c + 1]]` of all segments that touch it.
-`grid` = (x0, y0, cell size), `shape` = (columns, rows), as in `kernels.buckets`.
+`segments` (S, 4) are x1, y1, x2, y2; bucket c lists the segments that touch it, `ids[starts[c]:starts[c + 1]]`. `grid` and
+`shape` are those of `kernels.buckets`.
 """
 
 import math
 
 import numpy as np
 from numba import njit
+from numpy.typing import NDArray
+
+__all__ = ["backward_agreement", "bin_segments", "forward_distances", "nearest_road", "screen"]
 
 
 @njit(cache=True)
-def bin_segments(segments, grid, shape, starts, ids):
-    """Count the buckets of every segment (empty `ids`), or write the ids; `starts` as in `kernels.triples.fill_table`.
+def bin_segments(
+    segments: NDArray[np.float32],
+    grid: tuple[float, float, float],
+    shape: tuple[int, int],
+    starts: NDArray[np.int64],
+    ids: NDArray[np.int32],
+) -> int:
+    """Count the segments of every bucket, or list them.
 
     A segment is listed in every bucket of its bounding box that it crosses or comes near: segments are short, and a few
-    entries too many cost less than an exact clip.
+    entries too many cost less than an exact clip. What lies outside the grid belongs to the buckets of its rim.
+
+    Parameters
+    ----------
+    segments : (S, 4) float32
+    starts : (B + 1,) int64
+        To count: zeros; `starts[c + 1]` then grows by one for every segment of bucket c. To list: each bucket's first
+        free place, which moves on.
+    ids : (L,) int32
+        Empty to count; otherwise filled with the segments' numbers.
+
+    Returns
+    -------
+    int
+        L, the number of entries.
     """
     write = ids.shape[0] > 0
     total = 0
@@ -31,7 +54,7 @@ def bin_segments(segments, grid, shape, starts, ids):
                 if r1 > r0 and c1 > c0:
                     mx = grid[0] + (c + 0.5) * grid[2] - x1
                     my = grid[1] + (r + 0.5) * grid[2] - y1
-                    if abs(mx * (y2 - y1) - my * (x2 - x1)) > 0.7072 * grid[2] * length:
+                    if abs(mx * (y2 - y1) - my * (x2 - x1)) > 0.7072 * grid[2] * length:  # half a bucket's diagonal
                         continue
                 bucket = r * shape[0] + c
                 if write:
@@ -44,10 +67,34 @@ def bin_segments(segments, grid, shape, starts, ids):
 
 
 @njit(cache=True)
-def nearest_road(x, y, dx, dy, radius, min_cos, segments, starts, ids, grid, shape):
-    """Return (distance, foot x, foot y, direction x, direction y) of the nearest road within `radius`.
+def nearest_road(
+    x: float,
+    y: float,
+    dx: float,
+    dy: float,
+    radius: float,
+    min_cos: float,
+    segments: NDArray[np.float32],
+    starts: NDArray[np.int32],
+    ids: NDArray[np.int32],
+    grid: tuple[float, float, float],
+    shape: tuple[int, int],
+) -> tuple[float, float, float, float, float]:
+    """Return the distance of the nearest road that runs along (dx, dy), its foot point and its own direction.
 
-    Only roads whose direction agrees with the unit vector (dx, dy) count: |cos| >= `min_cos`. Nothing found: distance = inf.
+    Parameters
+    ----------
+    x, y : float
+        Metres on the reference plane.
+    dx, dy : float
+        Unit vector; roads count whose direction has |cos| >= `min_cos` with it.
+    radius : float
+        Roads nearer than this count, metres.
+
+    Returns
+    -------
+    distance, foot x, foot y, direction x, direction y
+        Distance inf where there is none.
     """
     best = radius * radius
     fx, fy, ux, uy = 0.0, 0.0, 0.0, 0.0
@@ -81,11 +128,38 @@ def nearest_road(x, y, dx, dy, radius, min_cos, segments, starts, ids, grid, sha
 
 
 @njit(cache=True)
-def forward_distances(matrix, points, directions, radius, min_cos, shift_x, shift_y, segments, starts, ids, grid, shape, out):
-    """Fill `out` (S,) with the distance, in metres, from each query road point to the nearest road of the map alike in direction.
+def forward_distances(
+    matrix: NDArray[np.float64],
+    points: NDArray[np.float64],
+    directions: NDArray[np.float64],
+    radius: float,
+    min_cos: float,
+    shift_x: float,
+    shift_y: float,
+    segments: NDArray[np.float32],
+    starts: NDArray[np.int32],
+    ids: NDArray[np.int32],
+    grid: tuple[float, float, float],
+    shape: tuple[int, int],
+    out: NDArray[np.float64],
+) -> int:
+    """Find how far each road point of the query lies from a road of the map that runs its way.
 
-    The points (S, 2) and unit directions (S, 2) of the query plane are mapped by `matrix`, then shifted. inf: no road within
-    `radius`. Returns the number of finite distances.
+    Parameters
+    ----------
+    matrix : (3, 3) float64
+        Query plane to reference plane; the shift, in metres, is added.
+    points, directions : (S, 2) float64
+        Points on the query's roads, in its plane, and unit vectors along the road.
+    radius, min_cos
+        As in `nearest_road`.
+    out : (S,) float64
+        Filled with metres; inf where no road is near or the point lies beyond the horizon.
+
+    Returns
+    -------
+    int
+        How many are finite.
     """
     n = 0
     for i in range(points.shape[0]):
@@ -113,12 +187,43 @@ def forward_distances(matrix, points, directions, radius, min_cos, shift_x, shif
 
 
 @njit(cache=True)
-def backward_agreement(inverse, bounds, step, tolerance_m, shift_x, shift_y, segments, starts, ids, grid, shape, field, field_scale, observed):
-    """Count the map's roads inside the footprint: return (samples on observed ground, samples near a query road).
+def backward_agreement(
+    inverse: NDArray[np.float64],
+    bounds: NDArray[np.float64],
+    step: float,
+    tolerance_m: float,
+    shift_x: float,
+    shift_y: float,
+    segments: NDArray[np.float32],
+    starts: NDArray[np.int32],
+    ids: NDArray[np.int32],
+    grid: tuple[float, float, float],
+    shape: tuple[int, int],
+    field: NDArray[np.float32],
+    field_scale: float,
+    observed: NDArray[np.bool_],
+) -> tuple[int, int]:
+    """Count the map's roads inside the footprint that the query could show, and those that it shows.
 
-    The map is sampled every `step` metres along its segments within `bounds` (x0, y0, x1, y1), shifted by minus the shift and
-    taken to the query plane by `inverse`. `field` is the distance to the nearest query road in field cells, one cell being `field_scale` pixels;
-    `observed` (same shape) tells where the query saw the ground. `tolerance_m` is turned into pixels by the local scale.
+    Parameters
+    ----------
+    inverse : (3, 3) float64
+        Reference plane, after minus the shift (metres), to query plane.
+    bounds : (4,) float64
+        x0, y0, x1, y1 of the footprint before the shift: only buckets that meet it are looked at.
+    step : float
+        The map is sampled once in so many metres of road.
+    tolerance_m : float
+        A sample nearer than this to a road of the query counts as shown; pixels by the scale at its place.
+    field : (h, w) float32
+        Distance from each cell of the frame to the query's nearest road, in cells of `field_scale` pixels, rows downwards.
+    observed : (h, w) bool
+        Where the query saw the ground.
+
+    Returns
+    -------
+    seen, shown : int
+        Samples on observed ground, and how many of them lie near a road of the query.
     """
     n_seen, n_near = 0, 0
     c0 = max(int(np.floor((bounds[0] + shift_x - grid[0]) / grid[2])), 0)
@@ -143,6 +248,7 @@ def backward_agreement(inverse, bounds, step, tolerance_m, shift_x, shift_y, seg
                 for k in range(count):
                     t = (k + 0.5) / count
                     x, y = ax + t * sx, ay + t * sy
+                    # A segment may be listed in several buckets: each sample counts in its own.
                     if int(np.floor((x - grid[0]) / grid[2])) != c or int(np.floor((y - grid[1]) / grid[2])) != r:
                         continue
                     x -= shift_x
@@ -150,11 +256,11 @@ def backward_agreement(inverse, bounds, step, tolerance_m, shift_x, shift_y, seg
                     w = inverse[2, 0] * x + inverse[2, 1] * y + inverse[2, 2]
                     if w <= 0.0:
                         continue
-                    u = (inverse[0, 0] * x + inverse[0, 1] * y + inverse[0, 2]) / w
-                    v = -(inverse[1, 0] * x + inverse[1, 1] * y + inverse[1, 2]) / w
-                    column, row = int(np.floor(u / field_scale)), int(np.floor(v / field_scale))
-                    if u < 0.0 or v < 0.0 or column >= field.shape[1] or row >= field.shape[0]:
+                    across = (inverse[0, 0] * x + inverse[0, 1] * y + inverse[0, 2]) / w / field_scale
+                    down = -(inverse[1, 0] * x + inverse[1, 1] * y + inverse[1, 2]) / w / field_scale
+                    if not (0.0 <= across < field.shape[1] and 0.0 <= down < field.shape[0]):
                         continue
+                    column, row = int(across), int(down)
                     if not observed[row, column]:
                         continue
                     n_seen += 1
@@ -166,13 +272,40 @@ def backward_agreement(inverse, bounds, step, tolerance_m, shift_x, shift_y, seg
 
 @njit(cache=True)
 def screen(
-    references, affines, anchor_xy, ref_xy, points, directions, radius, min_cos, least,
-    segments, starts, ids, grid, shape, shares,
-):  # fmt: skip
-    """Fill `shares` (M,) with the part of the query's road points that lie on roads of the map under each proposal.
+    references: NDArray[np.int64],
+    affines: NDArray[np.float64],
+    anchor_xy: NDArray[np.float64],
+    ref_xy: NDArray[np.float64],
+    points: NDArray[np.float64],
+    directions: NDArray[np.float64],
+    radius: float,
+    min_cos: float,
+    least: float,
+    segments: NDArray[np.float32],
+    starts: NDArray[np.int32],
+    ids: NDArray[np.int32],
+    grid: tuple[float, float, float],
+    shape: tuple[int, int],
+    shares: NDArray[np.float64],
+) -> None:
+    """Find which part of the query's roads around an anchor lies on roads of the map, under each proposal.
 
-    A proposal puts `anchor_xy` on intersection `references[m]`, with the 2 x 2 map `affines[m]` around it; the points are those
-    near the anchor. A proposal is given up, with share 0, once it cannot reach the share `least`.
+    Parameters
+    ----------
+    references : (M,) int64
+        The map intersection that each proposal puts the anchor on.
+    affines : (M, 4) float64
+        The 2 x 2 map, row-major, from query to reference around the anchor; regular.
+    anchor_xy : (2,) float64
+        The anchor in the query plane.
+    points, directions : (S, 2) float64
+        Road points near it, and unit vectors along the road.
+    radius, min_cos
+        As in `nearest_road`.
+    least : float
+        A proposal is given up, with share 0, once it cannot reach this share.
+    shares : (M,) float64
+        Filled; 1 where there are no points, for then nothing speaks against a proposal.
     """
     n = points.shape[0]
     for m in range(references.shape[0]):
@@ -194,4 +327,4 @@ def screen(
                 misses += 1
                 if misses > (1.0 - least) * n:
                     break
-        shares[m] = hits / n if misses <= (1.0 - least) * n else 0.0
+        shares[m] = 0.0 if misses > (1.0 - least) * n else hits / n if n > 0 else 1.0
