@@ -105,9 +105,10 @@ def read_mask(
 def _separate(raster: _Raster, threshold: float | None) -> tuple[BoolArray, BoolArray | None]:
     """Return where values lie above the threshold, and where they are valid."""
     height, width = raster.shape
-    step = max(1, int(np.sqrt(height * width / _SAMPLE_PIXELS)))
+    step = int(np.ceil(np.sqrt(height * width / _SAMPLE_PIXELS)))
     sample, valid = raster.read(0, height, step)
-    seen = sample[_finite(sample, valid)]
+    finite = _finite(sample, valid)
+    seen = sample.reshape(-1, raster.n_bands) if finite.all() else sample[finite]
     if len(seen) == 0:
         raise MaskError(f"{raster.name}: holds no observed pixel, only nodata, NaN or alpha 0; give a mask with roads")
     channel = int(np.argmax(seen.std(axis=0))) if raster.n_bands > 1 else 0
@@ -120,7 +121,7 @@ def _separate(raster: _Raster, threshold: float | None) -> tuple[BoolArray, Bool
     for top in range(0, height, rows):
         strip = slice(top, min(top + rows, height))
         values, valid = raster.read(strip.start, strip.stop, 1)
-        np.greater(values[..., channel], threshold, out=roads[strip])
+        _compare(values[..., channel], threshold, roads[strip])
         finite = _finite(values, valid)
         if not finite.all():
             observed = np.ones(raster.shape, np.bool_) if observed is None else observed
@@ -132,6 +133,16 @@ def _separate(raster: _Raster, threshold: float | None) -> tuple[BoolArray, Bool
             f"{seen[:, channel].max():g}; expected roads as light pixels (or give a lower threshold)"
         )
     return roads, observed
+
+
+def _compare(values: AnyArray, threshold: float, above: BoolArray) -> None:
+    """Set `above` where values exceed the threshold, in the values' own type: many times faster for whole numbers."""
+    if values.dtype.kind == "f":
+        np.greater(values, threshold, out=above)
+        return
+    limits = np.iinfo(values.dtype)
+    if threshold < limits.max:
+        np.greater_equal(values, max(int(np.floor(threshold)) + 1, limits.min), out=above)
 
 
 def _finite(values: AnyArray, valid: BoolArray | None) -> BoolArray:
@@ -249,7 +260,7 @@ def _of_array(array: AnyArray, band: int | None, name: str, *, alpha: bool) -> _
         )
     whole = array if array.ndim == 3 else array[..., None]
     data = np.ma.getdata(whole)
-    valid = ~np.ma.getmaskarray(whole).any(axis=2) if np.ma.is_masked(whole) else None
+    valid: BoolArray | None = ~np.ma.getmaskarray(whole).any(axis=2) if np.ma.is_masked(whole) else None
     if alpha:
         data, valid = data[..., :-1], data[..., -1] > 0
     data = data[..., _bands(name, band, data.shape[2])]

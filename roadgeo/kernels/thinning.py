@@ -18,6 +18,7 @@ SOLID = 2  # beyond the frame or unobserved: road for all we know, never deleted
 KEEP, DELETE, TIP = 0, 1, 2  # a tip is a free end of a line
 
 LEVELS_PER_PIXEL = 8  # distances are told apart to 1/8 px
+DEEPEST = np.float32(4096.0)  # and not beyond this: without any GROUND they are infinite
 
 
 def _roles() -> NDArray[np.uint8]:
@@ -131,14 +132,14 @@ def thin(states: NDArray[np.uint8], distance: NDArray[np.float32], min_end_depth
         if flat[p] == ROAD:
             found[n] = p
             n += 1
-            deepest = max(deepest, depth[p])
+            deepest = max(deepest, min(depth[p], DEEPEST))
     start = np.zeros(int(deepest * LEVELS_PER_PIXEL) + 2, np.int64)
     for i in range(n):
-        start[int(depth[found[i]] * LEVELS_PER_PIXEL) + 1] += 1
+        start[int(min(depth[found[i]], DEEPEST) * LEVELS_PER_PIXEL) + 1] += 1
     start = np.cumsum(start)
     order = np.empty(n, np.int32)
     for i in range(n):
-        level = int(depth[found[i]] * LEVELS_PER_PIXEL)
+        level = int(min(depth[found[i]], DEEPEST) * LEVELS_PER_PIXEL)
         order[start[level]] = found[i]
         start[level] += 1
     return rethin(states, distance, order, min_end_depth)
