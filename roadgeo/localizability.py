@@ -59,6 +59,8 @@ class LocalizabilityOptions:
         Places are marked as located where, of the trials at places that promise as much or more, surely (at the lower
         end of the interval of `z` standard errors) this share was located.
     z : float
+    min_probability : float
+        Places that promise less are not marked as located, however well others do.
     cells_per_window : float
         Cells along the side of a window.
     max_cells : int
@@ -66,7 +68,8 @@ class LocalizabilityOptions:
     """
 
     located_share: float = 0.95
-    z: float = 1.0
+    z: float = 1.5
+    min_probability: float = 0.85
     cells_per_window: float = 10.0
     max_cells: int = 2000
 
@@ -239,7 +242,7 @@ def _threshold(probability: FloatArray, located: BoolArray, options: Localizabil
     hits = np.cumsum(located[order])
     sure = [share(int(hits[k]), k + 1, options.z).low >= options.located_share for k in range(len(order))]
     last = np.flatnonzero(sure)
-    return float(probability[order[last[-1]]]) if len(last) else math.inf
+    return max(float(probability[order[last[-1]]]), options.min_probability) if len(last) else math.inf
 
 
 def _fewest(counts: AnyArray, probability: FloatArray) -> float:
