@@ -69,6 +69,8 @@ class PairOptions:
         Let each reference intersection match once only. False: eq. 10 to the letter.
     min_intersections : int
         Queries with fewer are not searched.
+    rarest_first : bool
+        Draw query tuples of types rare in the reference first (section 3.3). False: all types alike.
     max_tuple_intersections : int
         Of larger queries, this many intersections at random form the tuples; all of them still judge.
     time_limit_s : float
@@ -87,6 +89,7 @@ class PairOptions:
     inlier_distance_m: float = 20.0
     one_to_one: bool = True
     min_intersections: int = 30
+    rarest_first: bool = True
     max_tuple_intersections: int = 1000
     time_limit_s: float = 10.0
 
@@ -552,7 +555,7 @@ def _draw_query_tuples(search: _Search) -> tuple[Int32Array, IntArray]:
     known = rng.permutation(np.flatnonzero(types >= 0))
     frequency = np.diff(search.index.offsets)[types[known]]
     n = query_draws(options.lambda_, options.lambda_1, options.p_query)
-    drawn = known[np.argsort(frequency, kind="stable")][:n]
+    drawn = (known[np.argsort(frequency, kind="stable")] if options.rarest_first else known)[:n]
     return pairs[drawn], types[drawn]
 
 
