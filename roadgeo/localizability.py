@@ -322,6 +322,10 @@ def draw_localizability(network: RoadNetwork, found: LocalizabilityMap, title: s
         cv2.rectangle(picture, (at, 34), (at + 14, 48), _blend((255, 255, 255), color, alpha), -1)
         cv2.putText(picture, label, (at + 20, 46), cv2.FONT_HERSHEY_SIMPLEX, 0.42, (40, 40, 40), 1, cv2.LINE_AA)
     _draw_scale(picture, to_pixel, len(picture) - 18)
+    attribution = str(network.meta.get("attribution") or "").encode("ascii", "ignore").decode().strip()
+    cv2.putText(
+        picture, attribution, (360, len(picture) - 13), cv2.FONT_HERSHEY_SIMPLEX, 0.42, (90, 90, 90), 1, cv2.LINE_AA
+    )
     return bytes(cv2.imencode(".png", picture)[1].tobytes())
 
 
