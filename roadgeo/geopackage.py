@@ -20,6 +20,7 @@ import numpy as np
 
 from roadgeo.errors import CrsError, IndexFormatError, OutputError
 from roadgeo.files import replacing
+from roadgeo.rtree import pack_rtree
 from roadgeo.typing import AnyArray, FloatArray
 
 __all__ = [
@@ -322,16 +323,26 @@ def _add_spatial_index(database: sqlite3.Connection, name: str, bounds: FloatArr
         database.execute(f'CREATE VIRTUAL TABLE "rtree_{name}_geom" USING rtree(id, minx, maxx, miny, maxy)')
     except sqlite3.OperationalError:
         return
-    database.executemany(
-        f'INSERT INTO "rtree_{name}_geom" VALUES (?, ?, ?, ?, ?)',
-        zip(range(1, len(bounds) + 1), *bounds.T.tolist(), strict=True),
-    )
+    if len(bounds):
+        _fill_spatial_index(database, f"rtree_{name}_geom", bounds)
     database.executescript(_RTREE_TRIGGERS.format(t=name))
     database.execute(
         "INSERT INTO gpkg_extensions VALUES (?, 'geom', 'gpkg_rtree_index',"
         " 'http://www.geopackage.org/spec120/#extension_rtree', 'write-only')",
         (name,),
     )
+
+
+def _fill_spatial_index(database: sqlite3.Connection, table: str, bounds: FloatArray) -> None:
+    """Fill the tables behind an empty R-tree; inserting into it would take as long as all else."""
+    (node_size,) = database.execute(f'SELECT length(data) FROM "{table}_node" WHERE nodeno = 1').fetchone()
+    tree = pack_rtree(bounds, node_size)
+    raw = tree.nodes.tobytes()
+    blobs = (raw[i : i + node_size] for i in range(0, len(raw), node_size))
+    database.executemany(f'REPLACE INTO "{table}_node" VALUES (?, ?)', enumerate(blobs, 1))
+    parents = list(enumerate(tree.parents.tolist(), 1))[1:]
+    database.executemany(f'INSERT INTO "{table}_parent" VALUES (?, ?)', parents)
+    database.executemany(f'INSERT INTO "{table}_rowid" VALUES (?, ?)', enumerate(tree.leaves.tolist(), 1))
 
 
 def _sql_values(values: Sequence[Any] | AnyArray) -> tuple[str, list[Any]]:
