@@ -45,7 +45,7 @@ class SimplifyOptions:
     merge_radius: float = 14.0
     fuse_distance: float = 12.0
     stub_length: float = 15.0
-    max_passes: int = 6
+    max_passes: int = 3
 
 
 def planarize(lines: Sequence[LineString] | Any, grid_m: float = 0.1) -> RoadGraph:
@@ -162,6 +162,17 @@ def _close_narrow_faces(graph: RoadGraph, options: SimplifyOptions) -> RoadGraph
     """Make one intersection of the nodes around a face that the roads around it fill: a roundabout, a slip road."""
     if graph.n_edges == 0:
         return graph
+    follow, area = _walk_faces(graph)
+    face = kernels.narrow_faces(follow, area, _lengths(graph), options.fuse_distance, 6.0 * options.merge_radius)
+    node = graph.edges.ravel()
+    inner = np.flatnonzero(face >= 0)
+    pairs = np.stack((node[inner], node[face[inner]]), axis=1).astype(np.int64)
+    filled = np.asarray((face >= 0).reshape(-1, 2).any(axis=1))
+    return _merge(graph, pairs, np.full(len(pairs), np.inf), 0.0, drop=filled)
+
+
+def _walk_faces(graph: RoadGraph) -> tuple[IntArray, FloatArray]:
+    """Return, for each half-edge, the one after it around the face on its left, and the area that it sweeps."""
     first, last = graph.offsets[:-1], graph.offsets[1:] - 1
     out = np.stack((graph.coords[first + 1] - graph.coords[first], graph.coords[last - 1] - graph.coords[last]), axis=1)
     node = graph.edges.ravel()
@@ -170,25 +181,14 @@ def _close_narrow_faces(graph: RoadGraph, options: SimplifyOptions) -> RoadGraph
     place = np.empty(len(node), np.int64)
     place[around] = np.arange(len(node))
     twin = np.arange(len(node)) ^ 1
-    before = place[twin] - 1
-    before = np.where(before < start[node[twin]], start[node[twin] + 1] - 1, before)
+    clockwise = place[twin] - 1
+    clockwise = np.where(clockwise < start[node[twin]], start[node[twin] + 1] - 1, clockwise)
     x, y = graph.coords.T
     sweep = np.zeros(len(x))
     sweep[:-1] = x[:-1] * y[1:] - x[1:] * y[:-1]
     sweep[last] = 0.0
     area = 0.5 * np.add.reduceat(sweep, first)
-    face = kernels.narrow_faces(
-        around[before],
-        np.stack((area, -area), axis=1).ravel(),
-        _lengths(graph),
-        options.fuse_distance,
-        6.0 * options.merge_radius,
-    )
-    inner = np.flatnonzero(face >= 0)
-    pairs = np.stack((node[inner], node[face[inner]]), axis=1).astype(np.int64)
-    return _merge(
-        graph, pairs, np.full(len(pairs), np.inf), 0.0, drop=np.asarray((face >= 0).reshape(-1, 2).any(axis=1))
-    )
+    return around[clockwise], np.stack((area, -area), axis=1).ravel()
 
 
 def _fuse_parallels(graph: RoadGraph, options: SimplifyOptions) -> RoadGraph:

@@ -1,11 +1,15 @@
 """Slow, obvious twins of the kernels of `roadgeo.simplification`."""
 
+from itertools import groupby, pairwise
+
 import networkx as nx
 import numpy as np
+from shapely import LineString, Polygon, get_parts, polygonize
+from shapely.ops import substring
 
 
 def join_chains(edges, lengths):
-    """Sorted list of (ends, length) of the maximal chains between nodes that are not of degree two; rings have no ends."""
+    """Sorted (ends, length) of the maximal chains between nodes that are not of degree two; rings have no ends."""
     graph = nx.MultiGraph()
     for (a, b), length in zip(edges, lengths, strict=True):
         graph.add_edge(int(a), int(b), length=length)
@@ -36,3 +40,67 @@ def draw_together(xy, pairs, radius):
             a |= b
             clusters.remove(b)
     return clusters
+
+
+def reattach(centre, ends, lines):
+    """Polylines from the new place of one end to that of the other, without repeated points there."""
+    result = []
+    for (a, b), line in zip(ends, lines, strict=True):
+        points = [tuple(p) for p in line]
+        points = points if points[0] == tuple(centre[a]) else [tuple(centre[a]), *points]
+        result.append(points if points[-1] == tuple(centre[b]) else [*points, tuple(centre[b])])
+    return result
+
+
+def cut_edge(line, cuts):
+    """The pieces of a polyline between arc lengths."""
+    whole = LineString(line)
+    return [substring(whole, a, b) for a, b in pairwise([0.0, *cuts, whole.length])]
+
+
+def halfway(lines, n):
+    """Mean of polylines, at n points at equal shares of their lengths."""
+    shares = np.linspace(0, 1, n)
+    return np.mean(
+        [[LineString(line).interpolate(s, normalized=True).coords[0] for s in shares] for line in lines], axis=0
+    )
+
+
+def are_twins(one, other, distance):
+    """Whether two polylines are near at equal shares of their lengths."""
+    shares = np.arange(1, 12) / 12
+    a, b = (np.array([LineString(x).interpolate(s, normalized=True).coords[0] for s in shares]) for x in (one, other))
+    return bool((np.hypot(*(a - b).T) <= distance).all())
+
+
+def find_mates(xy, direction, edge, edges, ends, distance, min_cos):
+    """Distances: of each sample to the nearest beside it, of each edge end to the nearest edge not meeting it."""
+    mate = []
+    for i in range(len(xy)):
+        d = np.hypot(*(xy - xy[i]).T)
+        ok = (edge != edge[i]) & (np.abs(direction @ direction[i]) >= min_cos) & (d < distance)
+        mate.append(d[ok].min() if ok.any() else None)
+    touch = []
+    for half, i in enumerate(ends):
+        d = np.hypot(*(xy - xy[i]).T)
+        node = edges[half // 2, half % 2]
+        ok = (edge != half // 2) & (edges[edge] != node).all(axis=1) & (d < distance)
+        touch.append(d[ok].min() if ok.any() else None)
+    return mate, touch
+
+
+def runs(mates):
+    """First and last place of each stretch with one and the same mate that is not None."""
+    found = []
+    start = 0
+    for mate, group in groupby(mates):
+        n = len(list(group))
+        found += [] if mate is None else [(start, start + n - 1)]
+        start += n
+    return found
+
+
+def narrow_faces(lines, width, longest):
+    """Area and perimeter of the inner faces of noded lines that are small and narrow."""
+    faces = [(Polygon(f.exterior).area, f.exterior.length) for f in get_parts(polygonize(lines))]
+    return sorted(f for f in faces if f[1] < longest and 2 * f[0] < width * f[1])

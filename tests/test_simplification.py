@@ -1,13 +1,14 @@
 import naive_simplification as naive
 import numpy as np
 import pytest
+import shapely
 from hypothesis import given, settings
 from hypothesis import strategies as st
 from shapely.geometry import LineString, MultiLineString
 
 from roadgeo.graph import RoadGraph
 from roadgeo.kernels import simplification as kernels
-from roadgeo.simplification import SimplifyOptions, coverage, planarize, simplify
+from roadgeo.simplification import SimplifyOptions, _walk_faces, coverage, planarize, simplify
 
 
 def network(*lines):
@@ -248,3 +249,143 @@ def test_noded_lines_simplify_to_a_whole_graph(drawn):
     assert result.edge_lengths().sum() <= graph.edge_lengths().sum() * 1.5 + 50
     dead = (result.degree() == 1)[result.edges].any(axis=1)
     assert (result.edge_lengths()[dead] >= SimplifyOptions().stub_length).all()
+
+
+@settings(max_examples=60, deadline=None)
+@given(small_graphs())
+def test_edges_measure_and_reattach_as_their_twins(graph):
+    measured = kernels.measure_edges(graph.offsets, graph.coords)
+    np.testing.assert_allclose(measured, [LineString(line).length for line in graph.polylines()])
+    np.testing.assert_allclose(measured, graph.edge_lengths())
+    centre = np.round(graph.xy / 20) * 20
+    coords, offsets = kernels.reattach(centre, graph.edges, graph.offsets, graph.coords)
+    moved = RoadGraph(centre, graph.edges, coords, offsets)
+    expected = naive.reattach(centre, graph.edges, graph.polylines())
+    assert [list(map(tuple, line.tolist())) for line in moved.polylines()] == expected
+
+
+@settings(max_examples=60, deadline=None)
+@given(small_graphs(), st.lists(st.floats(0.05, 0.95), min_size=28, max_size=28))
+def test_edges_are_cut_as_by_the_twin(graph, shares):
+    lengths = graph.edge_lengths()
+    cuts = [sorted({lengths[e] * shares[2 * e], lengths[e] * shares[2 * e + 1]}) for e in range(graph.n_edges)]
+    starts = np.concatenate(([0], np.cumsum([len(c) for c in cuts])))
+    places, edges, coords, offsets = kernels.cut_edges(
+        graph.edges, graph.offsets, graph.coords, np.concatenate(cuts), starts, graph.n_nodes
+    )
+    pieces = RoadGraph(np.concatenate((graph.xy, places)), edges, coords, offsets)
+    assert valid(pieces) or graph.degree().min() == 0 or lengths.min() == 0
+    expected = [piece for line, c in zip(graph.polylines(), cuts, strict=True) for piece in naive.cut_edge(line, c)]
+    if lengths.min() > 0:
+        assert pieces.n_edges == len(expected)
+        np.testing.assert_allclose(pieces.edge_lengths(), [piece.length for piece in expected], atol=1e-9)
+        np.testing.assert_allclose(coords[offsets[:-1]], [piece.coords[0] for piece in expected], atol=1e-9)
+
+
+@settings(max_examples=60, deadline=None)
+@given(small_graphs(), st.floats(5, 30))
+def test_twins_are_fused_as_by_the_twin(graph, distance):
+    back = graph.edges[:, 0] > graph.edges[:, 1]
+    lines = [line[::-1] if turned else line for line, turned in zip(graph.polylines(), back, strict=True)]
+    graph = RoadGraph.from_polylines(graph.xy, np.sort(graph.edges, axis=1), lines)
+    by_ends = np.lexsort((graph.edges[:, 1], graph.edges[:, 0]))
+    edges, coords, offsets = kernels.fuse_twins(
+        graph.edges, graph.offsets, graph.coords, graph.edge_lengths(), by_ends, distance, 3.0
+    )
+    fused = RoadGraph(graph.xy, edges, coords, offsets)
+    heads: list[list[int]] = []
+    for e in by_ends:
+        for group in heads:
+            same = (graph.edges[group[0]] == graph.edges[e]).all() and graph.edges[e, 0] != graph.edges[e, 1]
+            if same and naive.are_twins(lines[group[0]], lines[e], distance):
+                group.append(e)
+                break
+        else:
+            heads.append([e])
+    heads.sort(key=lambda group: group[0])
+    assert edges.tolist() == [graph.edges[group[0]].tolist() for group in heads]
+    for line, group in zip(fused.polylines(), heads, strict=True):
+        if len(group) == 1:
+            np.testing.assert_array_equal(line, lines[group[0]])
+        else:
+            np.testing.assert_allclose(line, naive.halfway([lines[e] for e in group], len(line)), atol=1e-9)
+
+
+@settings(max_examples=60, deadline=None)
+@given(small_graphs(), st.floats(2, 25))
+def test_mates_and_touches_agree_with_their_twin(graph, distance):
+    lengths = graph.edge_lengths()
+    count = np.ceil(lengths / 6.0).astype(int) + 2
+    starts = np.concatenate(([0], np.cumsum(count)))
+    xy, direction = np.empty((2, starts[-1], 2))
+    kernels.sample_edges(graph.offsets, graph.coords, lengths, starts, xy, direction)
+    for e, line in enumerate(graph.polylines()):
+        shares = np.linspace(0, 1, count[e])
+        expected = [LineString(line).interpolate(s, normalized=True).coords[0] for s in shares]
+        np.testing.assert_allclose(xy[starts[e] : starts[e + 1]], expected, atol=1e-9)
+    np.testing.assert_allclose(np.hypot(*direction.T), 1)
+
+    edge = np.repeat(np.arange(graph.n_edges), count)
+    cell = np.floor((xy - xy.min(axis=0)) / distance).astype(int) + 1
+    columns = int(cell[:, 0].max()) + 2
+    key = cell[:, 1] * columns + cell[:, 0]
+    order = np.argsort(key, kind="stable")
+    mate, apart, touch = kernels.find_mates(
+        xy, direction, edge, graph.edges, starts, order, key[order], columns, distance, 0.9
+    )
+    ends = np.stack((starts[:-1], starts[1:] - 1), axis=1).ravel()
+    mates, touches = naive.find_mates(xy, direction, edge, graph.edges, ends, distance, 0.9)
+    assert [None if m < 0 else d for m, d in zip(mate, apart, strict=True)] == pytest.approx(mates)
+    gaps = [None if t < 0 else np.hypot(*(xy[t] - xy[i])) for t, i in zip(touch, ends, strict=True)]
+    assert gaps == pytest.approx(touches)
+
+
+@settings(max_examples=60, deadline=None)
+@given(st.lists(st.sampled_from([None, 1, 2]), min_size=2, max_size=14), st.floats(0, 40))
+def test_runs_are_tied_at_their_ends(mates, least):
+    """One edge of three is sampled every 10 units; its mates are the samples abreast on the other two."""
+    n = len(mates)
+    starts = np.array([0, n, 2 * n, 3 * n])
+    lengths = np.full(3, 10.0 * (n - 1))
+    edge = np.repeat(np.arange(3), n)
+    mate = np.full(3 * n, -1)
+    mate[:n] = [-1 if m is None else m * n + k for k, m in enumerate(mates)]
+    ties = kernels.tie_runs(starts, lengths, edge, mate, np.full(3 * n, 5.0), 7.0, least)
+    expected = [
+        [0, 10.0 * k, mates[k], 10.0 * k]
+        for first, last in naive.runs(mates)
+        if 10.0 * (last - first) >= least
+        for k in (first, last)
+    ]
+    np.testing.assert_allclose(ties, np.array(expected).reshape(-1, 4))
+
+
+def test_a_run_ends_where_a_gap_opens():
+    """Roads that part are tied where they are `split_distance` apart, not where they are out of sight."""
+    apart = np.array([5.0, 5.0, 5.0, 6.0, 8.0, 9.5, 10.0])
+    mate = np.array([7, 8, 9, 10, 11, 12, -1] + [-1] * 7)
+    edge = np.repeat([0, 1], 7)
+    ties = kernels.tie_runs(
+        np.array([0, 7, 14]), np.full(2, 60.0), edge, mate, np.concatenate((apart, apart)), 7.0, 10.0
+    )
+    assert ties.tolist() == [[0, 0, 1, 0], [0, 30, 1, 30]]
+
+
+@settings(max_examples=100, deadline=None)
+@given(lines, st.floats(5, 40))
+def test_narrow_faces_agree_with_their_twin(drawn, width):
+    whole = network(*drawn).polylines()
+    _, cuts, dangles, _ = shapely.polygonize_full([LineString(line) for line in whole])
+    loose = shapely.get_parts(shapely.union(cuts, dangles))
+    closed = [line for line in whole if not any(LineString(line).equals(part) for part in loose)]
+    graph = planarize([LineString(line) for line in closed])
+    if graph.n_edges == 0:
+        return
+    follow, area = _walk_faces(graph)
+    face = kernels.narrow_faces(follow, area, graph.edge_lengths(), width, 200.0)
+    found = [
+        (area[face == first].sum(), graph.edge_lengths()[np.flatnonzero(face == first) // 2].sum())
+        for first in np.unique(face[face >= 0])
+    ]
+    expected = naive.narrow_faces([LineString(line) for line in graph.polylines()], width, 200.0)
+    np.testing.assert_allclose(np.array(sorted(found)).reshape(-1, 2), np.array(expected).reshape(-1, 2), rtol=1e-6)
