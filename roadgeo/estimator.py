@@ -26,7 +26,8 @@ __all__ = ["GrowOptions", "Hypothesis", "MatchOptions", "TripleEstimator"]
 @dataclass(frozen=True)
 class GrowOptions:
     """How proposals are screened and grown (see `kernels.roads.screen`, `kernels.growth.grow`). Lengths have a part in metres, the
-    map's, and one in pixels, the mask's."""
+    map's, and one in pixels, the mask's.
+    """
 
     screen_points: int = 40
     screen_radius_m: float = 8.0
@@ -117,7 +118,8 @@ class TripleEstimator:
         gsd = options.camera.gsd_m
         scale = (gsd[0] * 0.5, gsd[1] * 2.0)
         for sweep in options.sweeps:
-            anchors = propose(self.scene.intersections, self.scene.neighbours, self.index, scale, 0.33, sweep.triples)
+            anchors = propose(
+                self.scene.intersections, self.scene.branches, self.scene.neighbours, self.index, scale, 0.33, sweep.triples)
             for proposals in islice(anchors, sweep.max_anchors):
                 self.n_tuples += proposals.n_tuples
                 self.n_candidates += proposals.n_hits
@@ -163,10 +165,10 @@ class TripleEstimator:
         for m in self._screen(proposals)[: options.max_grown]:
             self.n_hypotheses += 1
             n_matched, _, ratio = grow(
-                found.xy, found.rays, order, scene.half_size, anchor, proposals.reference[m], proposals.affine[m],
+                found.xy, scene.branches, order, scene.half_size, anchor, proposals.reference[m], proposals.affine[m],
                 neighbours, proposals.partners[m],
-                index.xy, index.rays, index.point_starts, index.grid, index.shape,
-                math.hypot(options.sigma_m, options.sigma_px * gsd[m]), options.radius_m + options.radius_px * gsd[m], np.radians(options.ray_tolerance_deg), options.perspective_sigma,
+                index.xy, index.branches, index.point_starts, index.grid, index.shape,
+                math.hypot(options.sigma_m, options.sigma_px * gsd[m]), options.radius_m + options.radius_px * gsd[m], np.cos(np.radians(options.ray_tolerance_deg)), options.perspective_sigma,
                 options.hit_rate, options.chance_rate, options.patience, matched, distance, matrix,
             )  # fmt: skip
             if n_matched < options.min_matched or not np.isfinite(ratio):

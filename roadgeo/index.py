@@ -22,7 +22,7 @@ from roadgeo.network import RoadNetwork
 from roadgeo.projection import LocalPlane
 from roadgeo.typing import AnyArray, Float32Array, FloatArray, Int32Array
 
-__all__ = ["IndexOptions", "ReferenceIndex", "build_index", "neighbour_grid", "sort_by_bucket"]
+__all__ = ["IndexOptions", "ReferenceIndex", "build_index", "neighbour_grid", "pack_tangents", "sort_by_bucket"]
 
 #: Slots of `neighbours` are stored in 4 bits.
 MAX_NEIGHBOURS = 16
@@ -65,8 +65,10 @@ class ReferenceIndex:
         Plain values: name, crs, origin, grid, shape, options, counts and what the network's own `meta` holds.
     xy : (N, 2) float64
         Intersections in plane metres, sorted by bucket.
-    rays, tangents : (N, R) float32
-        As in `Intersections`.
+    branches : (N, R, 2) int8
+        As `Intersections.branches` gives them.
+    tangents : (N, R) int16
+        Directions of the tangent lines in units of pi / 32767, -1 behind the last.
     neighbours : (N, K) int32
         Nearest intersections, -1 where there are fewer.
     point_starts : (B + 1,) int32
@@ -83,8 +85,8 @@ class ReferenceIndex:
 
     meta: Mapping[str, Any]
     xy: FloatArray
-    rays: Float32Array
-    tangents: Float32Array
+    branches: AnyArray
+    tangents: AnyArray
     neighbours: Int32Array
     point_starts: Int32Array
     segments: Float32Array
@@ -146,8 +148,8 @@ class ReferenceIndex:
 
 _SCHEMA: dict[str, tuple[str, int]] = {  # name: (dtype, dimensions)
     "xy": ("<f8", 2),
-    "rays": ("<f4", 2),
-    "tangents": ("<f4", 2),
+    "branches": ("|i1", 3),
+    "tangents": ("<i2", 2),
     "neighbours": ("<i4", 2),
     "point_starts": ("<i4", 1),
     "segments": ("<f4", 2),
@@ -176,13 +178,15 @@ def _check_parts(meta: Mapping[str, Any], arrays: Mapping[str, AnyArray], path: 
     require(isinstance(origin, (list, tuple)) and len(origin) == 2 and all(map(is_number, origin)), "bad origin")
     require(isinstance(shape, (list, tuple)) and len(shape) == 2 and all(type(s) is int for s in shape), "bad shape")
     require(isinstance(meta.get("crs"), str), "no CRS")
-    assert grid is not None and shape is not None  # noqa: S101 - for the type checker; `require` has raised
+    assert grid is not None  # noqa: S101 - for the type checker; `require` has raised
+    assert shape is not None  # noqa: S101
     require(grid[2] > 0 and min(shape) > 0 and shape[0] * shape[1] < 2**31, "bad grid")
     n = len(arrays["xy"])
     n_buckets = shape[0] * shape[1]
     require(arrays["xy"].shape == (n, 2) and n < 2**31, "bad positions")
-    columns = arrays["rays"].shape[1]
-    require(2 <= columns <= 32 and arrays["rays"].shape == arrays["tangents"].shape == (n, columns), "bad rays")
+    columns = arrays["tangents"].shape[1]
+    require(2 <= columns <= 32 and arrays["tangents"].shape == (n, columns), "bad tangents")
+    require(arrays["branches"].shape == (n, columns, 2), "bad branches")
     k = arrays["neighbours"].shape[1]
     require(1 <= k <= MAX_NEIGHBOURS and arrays["neighbours"].shape == (n, k), "bad neighbours")
     require(arrays["segments"].shape[1] == 4 and arrays["source"].shape == (n,), "bad segments")
@@ -206,7 +210,10 @@ def _check_parts(meta: Mapping[str, Any], arrays: Mapping[str, AnyArray], path: 
 
 
 def check_table(index: ReferenceIndex) -> None:
-    """Check that every table entry points to intersections that exist; `from_parts` leaves that to the kernels' guard."""
+    """Check that every table entry points to intersections that exist.
+
+    `from_parts` leaves that to the kernels, which believe no entry: it would read the whole table.
+    """
     entries = index.table_entries
     anchors = (entries >> np.uint64(32)).astype(np.int64)
     if len(anchors) == 0:
@@ -219,19 +226,23 @@ def check_table(index: ReferenceIndex) -> None:
             raise IndexFormatError("a table entry is out of range; rebuild the index with `roadgeo index`")
 
 
-def neighbour_grid(xy: FloatArray, min_bucket: float) -> tuple[FloatArray, tuple[int, int]]:
-    """Return a grid (x0, y0, bucket size) over the points' bounding box and its (columns, rows): at most 8 N + 1 buckets."""
+def neighbour_grid(xy: FloatArray, min_bucket: float) -> tuple[tuple[float, float, float], tuple[int, int]]:
+    """Return a grid (x0, y0, bucket size) over the box around (N, 2) points, and its (columns, rows).
+
+    It has at most 16 N + 1 buckets.
+    """
     low, high = xy.min(axis=0), xy.max(axis=0)
-    width, height = np.maximum(high - low, 1e-9)
-    size = max(min_bucket, math.sqrt(width * height / (8 * len(xy))), max(width, height) / (4 * len(xy)) / 1000)
-    shape = (int(width // size) + 1, int(height // size) + 1)
-    return np.array([low[0], low[1], size]), shape
+    width, height = (float(side) for side in high - low)
+    size = max(min_bucket, math.sqrt(width * height / (8 * len(xy))), max(width, height) / (4 * len(xy)))
+    return (float(low[0]), float(low[1]), size), (int(width / size) + 1, int(height / size) + 1)
 
 
-def sort_by_bucket(xy: FloatArray, grid: FloatArray, shape: tuple[int, int]) -> tuple[Int32Array, Int32Array]:
+def sort_by_bucket(
+    xy: FloatArray, grid: tuple[float, float, float], shape: tuple[int, int]
+) -> tuple[Int32Array, Int32Array]:
     """Return the order that sorts points by bucket, and the (B + 1,) starts of the buckets in that order."""
-    columns = np.clip(((xy[:, 0] - grid[0]) // grid[2]).astype(np.int64), 0, shape[0] - 1)
-    rows = np.clip(((xy[:, 1] - grid[1]) // grid[2]).astype(np.int64), 0, shape[1] - 1)
+    columns = np.clip(np.floor((xy[:, 0] - grid[0]) / grid[2]).astype(np.int64), 0, shape[0] - 1)
+    rows = np.clip(np.floor((xy[:, 1] - grid[1]) / grid[2]).astype(np.int64), 0, shape[1] - 1)
     bucket = rows * shape[0] + columns
     counts = np.bincount(bucket, minlength=shape[0] * shape[1])
     starts = np.concatenate(([0], np.cumsum(counts))).astype(np.int32)
@@ -249,7 +260,12 @@ def _cut_segments(graph: RoadGraph, tolerance_m: float) -> Float32Array:
     coords, owner = shapely.get_coordinates(lines, return_index=True)
     inside = owner[1:] == owner[:-1]
     segments = np.hstack([coords[:-1], coords[1:]])[inside]
-    return segments.astype(np.float32)
+    return np.asarray(segments, np.float32)
+
+
+def pack_tangents(tangents: Float32Array) -> AnyArray:
+    """Return tangent directions as stored: (N, R) int16, units of pi / 32767, -1 for NaN."""
+    return np.where(np.isnan(tangents), -1, np.round(np.nan_to_num(tangents) * (32767 / math.pi))).astype(np.int16)
 
 
 def build_index(network: RoadNetwork, options: IndexOptions | None = None) -> ReferenceIndex:
@@ -290,7 +306,7 @@ def build_index(network: RoadNetwork, options: IndexOptions | None = None) -> Re
         **network.meta,
         "crs": network.plane.crs,
         "origin": list(network.plane.origin),
-        "grid": grid.tolist(),
+        "grid": list(grid),
         "shape": list(shape),
         "index_options": asdict(options),
         "n_intersections": len(xy),
@@ -299,8 +315,8 @@ def build_index(network: RoadNetwork, options: IndexOptions | None = None) -> Re
     return ReferenceIndex(
         meta=meta,
         xy=xy,
-        rays=np.ascontiguousarray(found.rays[order]),
-        tangents=tangents,
+        branches=found.branches()[order],
+        tangents=pack_tangents(tangents),
         neighbours=neighbours,
         point_starts=point_starts,
         segments=segments,
@@ -310,5 +326,3 @@ def build_index(network: RoadNetwork, options: IndexOptions | None = None) -> Re
         table_entries=entries,
         source=order,
     )
-
-

@@ -8,7 +8,7 @@ import numpy as np
 
 from roadgeo.graph import RoadGraph
 from roadgeo.kernels import intersections as kernels
-from roadgeo.typing import Float32Array, FloatArray, IntArray
+from roadgeo.typing import AnyArray, Float32Array, FloatArray, IntArray
 
 __all__ = ["IntersectionOptions", "Intersections", "find_intersections"]
 
@@ -73,6 +73,11 @@ class Intersections:
     def __len__(self) -> int:
         """N."""
         return len(self.xy)
+
+    def branches(self) -> AnyArray:
+        """(N, R, 2) int8: the rays as unit vectors scaled to 127, zeros behind the last (see `kernels.rays`)."""
+        vectors = np.stack([np.cos(self.rays), np.sin(self.rays)], axis=-1) * 127.0
+        return np.round(np.nan_to_num(vectors)).astype(np.int8)
 
     @property
     def n_branches(self) -> IntArray:

@@ -314,7 +314,7 @@ def _check_geopackage(path: Path) -> tuple[RoadNetwork | None, list[str]]:
 
 def _check_content(path: Path, network: RoadNetwork | None) -> list[str]:
     """Check that an undamaged index is one that the search can use, and that of its GeoPackage."""
-    from roadgeo.index import ReferenceIndex, check_table
+    from roadgeo.index import ReferenceIndex, check_table, pack_tangents
 
     about = read_manifest(path)["about"]
     try:
@@ -331,7 +331,7 @@ def _check_content(path: Path, network: RoadNetwork | None) -> list[str]:
     if not np.array_equal(np.sort(source), np.arange(len(found))):
         return [f"{path}: its intersections are not those of the GeoPackage; delete it and it will be built again"]
     same = np.array_equal(found.xy[source], index.xy)
-    same = same and np.array_equal(found.tangents[source], index.tangents, equal_nan=True)
+    same = same and np.array_equal(pack_tangents(found.tangents[source]), index.tangents)
     return (
         [] if same else [f"{path}: its intersections lie elsewhere than the GeoPackage's; delete it to build it again"]
     )

@@ -11,7 +11,7 @@ from roadgeo.graph import RoadGraph
 from roadgeo.index import neighbour_grid, sort_by_bucket
 from roadgeo.intersections import Intersections
 from roadgeo.kernels.buckets import nearest_neighbours
-from roadgeo.typing import BoolArray, Float32Array, FloatArray, Int32Array
+from roadgeo.typing import AnyArray, BoolArray, Float32Array, FloatArray, Int32Array
 
 __all__ = ["Scene", "SceneOptions", "prepare_scene", "query_neighbours", "sample_roads"]
 
@@ -36,6 +36,8 @@ class Scene:
     ----------
     size : (width, height) in pixels.
     intersections : Intersections
+    branches : (N, R, 2) int8
+        As in `Intersections.branches`.
     neighbours : (N, K) int32
     points, directions : (S, 2) float64
         Points spread evenly along the roads, and unit vectors along the road.
@@ -52,6 +54,7 @@ class Scene:
 
     size: tuple[int, int]
     intersections: Intersections
+    branches: AnyArray
     neighbours: Int32Array
     points: FloatArray
     directions: FloatArray
@@ -129,5 +132,5 @@ def prepare_scene(
     k = options.n_neighbours
     neighbours = query_neighbours(intersections.xy, k) if len(intersections) else np.empty((0, k), np.int32)
     return Scene(
-        size, intersections, neighbours, points, directions, length, graph.n_edges, field, scale, seen
+        size, intersections, intersections.branches(), neighbours, points, directions, length, graph.n_edges, field, scale, seen
     )  # fmt: skip

@@ -14,8 +14,8 @@ import numpy as np
 
 from roadgeo.index import ReferenceIndex
 from roadgeo.intersections import Intersections
-from roadgeo.kernels.triples import count_alike, gather, look_up
-from roadgeo.typing import FloatArray, Int32Array, IntArray
+from roadgeo.kernels.triples import UNITS, count_alike, gather, look_up
+from roadgeo.typing import AnyArray, FloatArray, Int32Array, IntArray
 
 __all__ = ["Proposals", "TripleOptions", "propose"]
 
@@ -64,6 +64,7 @@ class Proposals:
 
 def propose(
     query: Intersections,
+    branches: AnyArray,
     neighbours: Int32Array,
     index: ReferenceIndex,
     scale: tuple[float, float],
@@ -77,7 +78,7 @@ def propose(
     count_alike(
         query.xy, query.tangents, neighbours, options.min_shape, options.codes_per_vertex, index.table_starts, costs
     )
-    tolerance = round(options.angle_tolerance_deg * 192 / 180)
+    tolerance = round(options.angle_tolerance_deg * UNITS / 180.0)
     ids = np.empty((options.max_hits, 5), np.int64)
     affine = np.empty((options.max_hits, 4))
     usable = costs >= 0
@@ -94,9 +95,9 @@ def propose(
             if n_hits == options.max_hits or n_compared > options.max_compared:
                 break
             n_hits, compared = look_up(
-                query.xy, query.rays, query.tangents, a, s, t, neighbours, options.codes_per_vertex, tolerance,
-                np.radians(options.ray_tolerance_deg),
-                index.xy, index.rays, index.neighbours, index.table_starts, index.table_entries, scale, min_ratio,
+                query.xy, branches, query.tangents, a, s, t, neighbours, options.codes_per_vertex, tolerance,
+                np.cos(np.radians(options.ray_tolerance_deg)),
+                index.xy, index.branches, index.neighbours, index.table_starts, index.table_entries, scale, min_ratio,
                 ids, affine, n_hits,
             )  # fmt: skip
             n_compared += compared

@@ -95,8 +95,8 @@ def agreement(
     matched = np.empty(len(found), np.int64)
     distance = np.empty(len(found))
     match_all(
-        matrix, found.xy, found.rays, 1.5 * tolerance, np.radians(options.ray_tolerance_deg), 0.0, 0.0, True,
-        index.xy, index.rays, index.point_starts, index.grid, index.shape, matched, distance,
+        matrix, found.xy, scene.branches, 1.5 * tolerance, np.cos(np.radians(options.ray_tolerance_deg)), 0.0, 0.0, True,
+        index.xy, index.branches, index.point_starts, index.grid, index.shape, matched, distance,
     )  # fmt: skip
     counted = np.ones(len(found), bool)
     counted[seeds] = False
@@ -141,8 +141,8 @@ def chance_agreement(
     rates = np.empty((options.n_shifts, 3))
     for i, (dx, dy) in enumerate(zip(radius * np.cos(angle), radius * np.sin(angle), strict=True)):
         n = match_all(
-            matrix, found.xy, found.rays, 1.5 * tolerance, np.radians(options.ray_tolerance_deg), dx, dy, False,
-            index.xy, index.rays, index.point_starts, index.grid, index.shape, matched, distance,
+            matrix, found.xy, scene.branches, 1.5 * tolerance, np.cos(np.radians(options.ray_tolerance_deg)), dx, dy, False,
+            index.xy, index.branches, index.point_starts, index.grid, index.shape, matched, distance,
         )  # fmt: skip
         near = forward_distances(matrix, points, directions, tolerance, min_cos, dx, dy, *roads, out)
         rates[i, 0] = n / max(len(found), 1)

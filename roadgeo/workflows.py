@@ -269,7 +269,10 @@ def _pair_index(reference: _Same, options: PairOptions) -> tuple[Intersections, 
     """Build the paper's tables for a reference: they are large, so they are not stored with it, but kept for a batch."""
     index = reference.index
     n = len(index)
-    found = Intersections(index.xy, index.rays, index.tangents, np.zeros(n, np.float32), np.arange(n))
+    vectors = index.branches.astype(np.float32)
+    rays = np.where(vectors.any(axis=2), np.arctan2(vectors[..., 1], vectors[..., 0]), np.nan)
+    tangents = np.where(index.tangents >= 0, index.tangents * np.float32(math.pi / 32767), np.nan).astype(np.float32)
+    found = Intersections(index.xy, rays, tangents, np.zeros(n, np.float32), np.arange(n))
     return found, build_pair_index(found, options)
 
 

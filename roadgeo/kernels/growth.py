@@ -119,7 +119,7 @@ def prediction_variance(factor, p, u, v, work):
 
 
 @njit(cache=True)
-def nearest_alike(x, y, radius, rays, i, ref_xy, ref_rays, starts, grid, shape, j00, j01, j10, j11, tolerance):
+def nearest_alike(x, y, radius, branches, i, ref_xy, ref_branches, starts, grid, shape, j00, j01, j10, j11, min_cos):
     """Return (reference id, distance) of the nearest intersection within `radius` whose rays agree, or (-1, radius)."""
     best, where = radius, -1
     c0 = int(np.floor((x - radius - grid[0]) / grid[2]))
@@ -134,16 +134,16 @@ def nearest_alike(x, y, radius, rays, i, ref_xy, ref_rays, starts, grid, shape, 
         for j in range(starts[low], starts[high + 1]):
             dx, dy = ref_xy[j, 0] - x, ref_xy[j, 1] - y
             d = math.sqrt(dx * dx + dy * dy)
-            if d < best and rays_agree(rays, i, ref_rays, j, j00, j01, j10, j11, tolerance):
+            if d < best and rays_agree(branches, i, ref_branches, j, j00, j01, j10, j11, min_cos):
                 best, where = d, j
     return where, best
 
 
 @njit(cache=True)
 def grow(
-    xy, rays, order, half_size, anchor, ref_anchor, affine, neighbours, partners,
-    ref_xy, ref_rays, starts, grid, shape,
-    sigma_m, radius_m, ray_tolerance, perspective_sigma, hit_rate, chance_rate, patience,
+    xy, branches, order, half_size, anchor, ref_anchor, affine, neighbours, partners,
+    ref_xy, ref_branches, starts, grid, shape,
+    sigma_m, radius_m, min_cos, perspective_sigma, hit_rate, chance_rate, patience,
     matched, distance, matrix,
 ):  # fmt: skip
     """Grow a hypothesis; return (matches besides the seeds, points tested besides the seeds, log-likelihood ratio).
@@ -210,8 +210,8 @@ def grow(
             j10 = (p[3] - py * p[6]) / w
             j11 = (p[4] - py * p[7]) / w
             j, d = nearest_alike(
-                x0 + unit * px, y0 + unit * py, radius, rays, i, ref_xy, ref_rays, starts, grid, shape,
-                j00, j01, j10, j11, ray_tolerance,
+                x0 + unit * px, y0 + unit * py, radius, branches, i, ref_xy, ref_branches, starts, grid, shape,
+                j00, j01, j10, j11, min_cos,
             )  # fmt: skip
             tested[i] = True
             n_tested += 1
@@ -250,8 +250,8 @@ def grow(
             j10 = (p[3] - py * p[6]) / w
             j11 = (p[4] - py * p[7]) / w
             j, d = nearest_alike(
-                x0 + unit * px, y0 + unit * py, radius, rays, i, ref_xy, ref_rays, starts, grid, shape,
-                j00, j01, j10, j11, ray_tolerance,
+                x0 + unit * px, y0 + unit * py, radius, branches, i, ref_xy, ref_branches, starts, grid, shape,
+                j00, j01, j10, j11, min_cos,
             )  # fmt: skip
             distance[i] = d
             matched[i] = j
@@ -291,8 +291,8 @@ def grow(
 
 @njit(cache=True)
 def match_all(
-    matrix, xy, rays, radius, ray_tolerance, shift_x, shift_y, one_to_one,
-    ref_xy, ref_rays, starts, grid, shape, matched, distance,
+    matrix, xy, branches, radius, min_cos, shift_x, shift_y, one_to_one,
+    ref_xy, ref_branches, starts, grid, shape, matched, distance,
 ):  # fmt: skip
     """Match every query intersection to the nearest one of the map with agreeing rays; return the number of matches.
 
@@ -311,10 +311,10 @@ def match_all(
         x = (matrix[0, 0] * u + matrix[0, 1] * v + matrix[0, 2]) / w
         y = (matrix[1, 0] * u + matrix[1, 1] * v + matrix[1, 2]) / w
         matched[i], distance[i] = nearest_alike(
-            x + shift_x, y + shift_y, radius, rays, i, ref_xy, ref_rays, starts, grid, shape,
+            x + shift_x, y + shift_y, radius, branches, i, ref_xy, ref_branches, starts, grid, shape,
             (matrix[0, 0] - x * matrix[2, 0]) / w, (matrix[0, 1] - x * matrix[2, 1]) / w,
             (matrix[1, 0] - y * matrix[2, 0]) / w, (matrix[1, 1] - y * matrix[2, 1]) / w,
-            ray_tolerance,
+            min_cos,
         )  # fmt: skip
         if matched[i] >= 0:
             count += 1

@@ -3,10 +3,11 @@
 A triple (X, Y, Z), counterclockwise, is sent by an affine map to an equilateral triangle; two tangent lines at each vertex then
 give six angles that hardly change from map to image. At a vertex with edge vectors e1, e2 to the next two vertices, a
 direction d = alpha e1 + beta e2 has, against the axis towards the triangle's middle, the angle
-atan2((beta - alpha) sin 30, (alpha + beta) cos 30). Angles are measured in units of pi / 192, in cells of 16 units (15 degrees).
+atan2((beta - alpha) sin 30, (alpha + beta) cos 30). Angles are measured in units of pi / 96, in cells of 8 units (15 degrees).
 
 Two sorted cells at a vertex make one of 78 pairs, three vertices one of 78^3 table cells. An entry is a uint64:
-`anchor << 32 | slot of Y << 28 | slot of Z << 24 | six 4-bit positions within the cells`, slots being columns of `neighbours`.
+`anchor << 32 | slot of Y << 28 | slot of Z << 24 | six positions within the cells`, slots being columns of `neighbours`. Each
+position takes 4 bits of which the highest is 0: with that bit set as a guard, one subtraction compares all six at once.
 """
 
 import math
@@ -16,8 +17,9 @@ from numba import njit
 
 from roadgeo.kernels.rays import rays_agree
 
-UNITS = 192  # per half turn
-CELL_UNITS = 16
+UNITS = 96  # per half turn
+CELL_UNITS = 8
+GUARDS = 0x888888
 CELLS = UNITS // CELL_UNITS
 PAIRS = CELLS * (CELLS + 1) // 2
 TABLE = PAIRS**3
@@ -150,14 +152,12 @@ def fill_table(xy, tangents, neighbours, min_shape, limit, starts, entries):
 
 @njit(cache=True)
 def vertex_probes(u1, u2, tolerance, probes):
-    """Write (pair, low1, high1, low2, high2) for every pair of cells that may hold (u1, u2) +- tolerance; return how many.
+    """Write (pair, lows, highs) for every pair of cells that may hold (u1, u2) +- tolerance; return how many.
 
-    The bounds are positions within the cells of the entry's first and second angle.
+    Lows and highs are the bounds of the entry's two positions within their cells, packed like them: first << 4 | second.
     """
     n = 0
-    first = (u1 - tolerance) // CELL_UNITS
-    last = (u1 + tolerance) // CELL_UNITS
-    for c1 in range(first, last + 1):
+    for c1 in range((u1 - tolerance) // CELL_UNITS, (u1 + tolerance) // CELL_UNITS + 1):
         low1 = max(u1 - tolerance - c1 * CELL_UNITS, 0)
         high1 = min(u1 + tolerance - c1 * CELL_UNITS, CELL_UNITS - 1)
         s1 = c1 % CELLS
@@ -167,13 +167,13 @@ def vertex_probes(u1, u2, tolerance, probes):
             s2 = c2 % CELLS
             if s1 <= s2:
                 probes[n, 0] = pair_id(s1, s2)
-                probes[n, 1], probes[n, 2], probes[n, 3], probes[n, 4] = low1, high1, low2, high2
+                probes[n, 1] = low1 << 4 | low2
+                probes[n, 2] = high1 << 4 | high2
                 n += 1
-            if s2 <= s1:
-                if s1 == s2 and low1 == low2 and high1 == high2:
-                    continue
+            if s2 <= s1 and not (s1 == s2 and low1 == low2 and high1 == high2):
                 probes[n, 0] = pair_id(s2, s1)
-                probes[n, 1], probes[n, 2], probes[n, 3], probes[n, 4] = low2, high2, low1, high1
+                probes[n, 1] = low2 << 4 | low1
+                probes[n, 2] = high2 << 4 | high1
                 n += 1
     return n
 
@@ -227,8 +227,8 @@ def count_alike(xy, tangents, neighbours, min_shape, limit, starts, costs):
 
 @njit(cache=True)
 def look_up(
-    xy, rays, tangents, a, s, t, neighbours, limit, tolerance, ray_tolerance,
-    ref_xy, ref_rays, ref_neighbours, starts, entries, scale, min_ratio, hit_ids, hit_affine, n_hits,
+    xy, branches, tangents, a, s, t, neighbours, limit, tolerance, min_cos,
+    ref_xy, ref_branches, ref_neighbours, starts, entries, scale, min_ratio, hit_ids, hit_affine, n_hits,
 ):  # fmt: skip
     """Append the map's triples whose codes agree with those of the query triple (a, slot s, slot t) within `tolerance` units.
 
@@ -246,7 +246,7 @@ def look_up(
     codes = np.empty((3, limit, 2), np.int64)
     n = np.empty(3, np.int64)
     triple_codes(xy, tangents, a, b, c, limit, codes, n)
-    probes = np.empty((3, 64, 5), np.int64)
+    probes = np.empty((3, 64, 3), np.int64)
     n_probes = np.empty(3, np.int64)
     compared = 0
     for p in range(n[0]):
@@ -260,31 +260,19 @@ def look_up(
                     vx, vy, vz = (0, 1, 2) if turn == 0 else ((2, 0, 1) if turn == 1 else (1, 2, 0))
                     for i in range(n_probes[vx]):
                         ki = probes[vx, i, 0] * PAIRS
+                        li, hi = probes[vx, i, 1] << 16, probes[vx, i, 2] << 16 | GUARDS
                         for j in range(n_probes[vy]):
                             kj = (ki + probes[vy, j, 0]) * PAIRS
+                            lj, hj = li | probes[vy, j, 1] << 8, hi | probes[vy, j, 2] << 8
                             for k in range(n_probes[vz]):
                                 cell = kj + probes[vz, k, 0]
+                                lows = lj | probes[vz, k, 1]
+                                highs = hj | probes[vz, k, 2]
                                 for e in range(starts[cell], starts[cell + 1]):
                                     compared += 1
                                     entry = entries[e]
                                     fine = np.int64(entry & np.uint64(0xFFFFFF))
-                                    f = fine >> 20
-                                    if f < probes[vx, i, 1] or f > probes[vx, i, 2]:
-                                        continue
-                                    f = (fine >> 16) & 15
-                                    if f < probes[vx, i, 3] or f > probes[vx, i, 4]:
-                                        continue
-                                    f = (fine >> 12) & 15
-                                    if f < probes[vy, j, 1] or f > probes[vy, j, 2]:
-                                        continue
-                                    f = (fine >> 8) & 15
-                                    if f < probes[vy, j, 3] or f > probes[vy, j, 4]:
-                                        continue
-                                    f = (fine >> 4) & 15
-                                    if f < probes[vz, k, 1] or f > probes[vz, k, 2]:
-                                        continue
-                                    f = fine & 15
-                                    if f < probes[vz, k, 3] or f > probes[vz, k, 4]:
+                                    if ((fine | GUARDS) - lows) & (highs - fine) & GUARDS != GUARDS:
                                         continue
                                     x = np.int64(entry >> np.uint64(32))
                                     y = np.int64((entry >> np.uint64(28)) & np.uint64(15))
@@ -313,9 +301,9 @@ def look_up(
                                     if square * min_ratio > det * (1.0 + min_ratio * min_ratio):
                                         continue
                                     if not (
-                                        rays_agree(rays, a, ref_rays, x, j00, j01, j10, j11, ray_tolerance)
-                                        and rays_agree(rays, b, ref_rays, y, j00, j01, j10, j11, ray_tolerance)
-                                        and rays_agree(rays, c, ref_rays, z, j00, j01, j10, j11, ray_tolerance)
+                                        rays_agree(branches, a, ref_branches, x, j00, j01, j10, j11, min_cos)
+                                        and rays_agree(branches, b, ref_branches, y, j00, j01, j10, j11, min_cos)
+                                        and rays_agree(branches, c, ref_branches, z, j00, j01, j10, j11, min_cos)
                                     ):
                                         continue
                                     if n_hits >= hit_ids.shape[0]:
