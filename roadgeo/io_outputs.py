@@ -1,33 +1,39 @@
-"""Where a result leaves: the warped mask, the GeoPackage and the JSON of a location, all of them or none."""
+"""Where a result leaves: the warped picture or mask, the GeoPackage, the JSON, what else is asked for; all or none."""
 
 from __future__ import annotations
 
 import json
 import os
+from collections.abc import Iterable
 from contextlib import ExitStack
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 from pathlib import Path
 from time import perf_counter
-from typing import Any
 
 import numpy as np
 
 from roadgeo._version import __version__
-from roadgeo.errors import OutputError
+from roadgeo.errors import CrsError, OutputError
 from roadgeo.files import replacing
 from roadgeo.geopackage import Layer, write_layers
 from roadgeo.grid import PIXEL_TO_PLANE, RoadMask, plane_to_pixel
 from roadgeo.homography import Homography
+from roadgeo.io_image import ImageOptions, choose_target, image_homography, warp_image
+from roadgeo.io_products import PRODUCTS, Subject
 from roadgeo.location import Evidence, Location
+from roadgeo.outputs import OutputPaths, Placement, attributes
 from roadgeo.styles import draw_fill, draw_line, draw_marker, draw_palette
-from roadgeo.typing import AnyArray, FloatArray
-from roadgeo.warping import choose_grid, warp
+from roadgeo.typing import AnyArray
+from roadgeo.warping import MapGrid, cover, warp
 
-__all__ = ["OutputOptions", "OutputPaths", "Placement", "output_paths", "write_location"]
+__all__ = ["OutputOptions", "write_location"]
 
 #: Values of the warped mask, and how they are drawn: colour, alpha, label. Outside the footprint is nodata.
 OUTSIDE, GROUND, ROAD = 0, 1, 2
 PALETTE = {GROUND: ("#fdf6ec", 0, "no road"), ROAD: ("#e4572e", 255, "road")}
+
+#: A warped mask is drawn in memory, so it is made coarser beyond this.
+_MASK_MAX_PIXELS = 100_000_000
 
 _FOOTPRINT_STYLE = draw_fill("31,111,180,20", "31,111,180", 0.7)
 _ROADS_STYLE = draw_line("228,87,46", 0.5)
@@ -36,103 +42,86 @@ _MATCHES_STYLE = draw_marker("27,38,59", 2.2)
 
 @dataclass(frozen=True)
 class OutputOptions:
-    """How the warped mask is drawn.
+    """What is written for a located mask.
 
     Attributes
     ----------
-    resolution_m : float or None
-        Pixel size of the warped mask, metres; None: the mask's own at its centre.
-    max_pixels : int
-        Coarsen the warped mask beyond this size: a camera that looks far ahead sees much ground.
+    image : ImageOptions
+        How the picture, or without one the mask, is drawn on the map; masks always with the nearest value.
+    products : tuple of str
+        Further forms, by their names in `io_products.PRODUCTS`.
     """
 
-    resolution_m: float | None = None
-    max_pixels: int = 100_000_000
-
-
-@dataclass(frozen=True)
-class Placement:
-    """What a located `Location` surely has; see there for shapes and frames."""
-
-    crs: str
-    homography: FloatArray
-    footprint: FloatArray
-    gsd_m: float
-
-    @classmethod
-    def of(cls, location: Location) -> Placement:
-        """Take it from a location that has a place.
-
-        Raises
-        ------
-        OutputError
-            It has none.
-        """
-        crs, homography, footprint, gsd_m = location.crs, location.homography, location.footprint, location.gsd_m
-        if crs is None or homography is None or footprint is None or gsd_m is None:
-            raise OutputError(f"{location.query} has no place on the map to draw: it is {location.status}")
-        return cls(crs, homography, footprint, gsd_m)
-
-
-@dataclass(frozen=True)
-class OutputPaths:
-    """Names of the files that one mask's result may have."""
-
-    footprint: Path
-    style: Path
-    geopackage: Path
-    overlay: Path
-    json: Path
-
-    @property
-    def georeferenced(self) -> tuple[Path, ...]:
-        """Those that exist only for a located mask."""
-        return self.footprint, self.style, self.geopackage, self.overlay
-
-
-def output_paths(folder: str | os.PathLike[str], stem: str) -> OutputPaths:
-    """Name the outputs of the mask `stem` in a folder."""
-    base = Path(folder)
-    return OutputPaths(
-        base / f"{stem}_footprint.tif",
-        base / f"{stem}_footprint.qml",
-        base / f"{stem}_location.gpkg",
-        base / f"{stem}_overlay.png",
-        base / f"{stem}_location.json",
-    )
+    image: ImageOptions = field(default_factory=ImageOptions)
+    products: tuple[str, ...] = ()
 
 
 def write_location(
-    location: Location, mask: RoadMask, paths: OutputPaths, options: OutputOptions | None = None
-) -> Location:
-    """Write what a location asks for and return it with `seconds.write` set.
+    location: Location,
+    mask: RoadMask,
+    paths: OutputPaths,
+    options: OutputOptions | None = None,
+    picture: str | os.PathLike[str] | None = None,
+    attribution: str = "",
+) -> tuple[Location, list[Path]]:
+    """Write what a location asks for; return it with `seconds.write` set, and the files.
 
     A located mask gets every file but the overlay (see `roadgeo.plot`); any other gets its JSON only, and files that an
     earlier run left under these names are removed, lest a place that no longer holds be taken for the result.
+
+    Parameters
+    ----------
+    picture : path, optional
+        The photograph that the mask was made of: drawn on the map instead of the mask.
+    attribution : str
+        Whom the map's licence asks to name.
 
     Raises
     ------
     OutputError
         A file cannot be written; then none is.
+    MaskError
+        The picture cannot be read or shows another frame than the mask.
+    CrsError
+        The target CRS is unknown or not made for this place.
     """
     started = perf_counter()
+    options = options or OutputOptions()
+    source = Path(picture if picture is not None else mask.name or f"{paths.stem}.png")
+    written = [paths.json]
     if not location.located:
-        _remove(paths.georeferenced)
+        products = (product.path(paths.folder, paths.stem, source.name) for product in PRODUCTS.values())
+        _remove([paths.footprint, paths.style, paths.geopackage, paths.overlay, *products])
     with ExitStack() as files:
+
+        def stage(path: Path) -> Path:
+            written.append(path)
+            return files.enter_context(replacing(path, sync=False))
+
         # Entered first, renamed last: whoever sees the JSON finds the other files whole.
         report = files.enter_context(replacing(paths.json, sync=False))
         if location.located:
-            footprint = files.enter_context(replacing(paths.footprint, sync=False))
-            footprint.write_bytes(_draw_raster(location, mask, options or OutputOptions()))
-            style = files.enter_context(replacing(paths.style, sync=False))
-            style.write_text(draw_palette(PALETTE), encoding="utf-8")
-            write_layers(files.enter_context(replacing(paths.geopackage, sync=False)), _layers(location))
+            place = Placement.of(location)
+            if picture is None:
+                homography, size = place.homography, mask.shape[::-1]
+                grid = _write_mask(stage(paths.footprint), location, mask, options.image, attribution)
+                stage(paths.style).write_text(draw_palette(PALETTE), encoding="utf-8")
+            else:
+                homography, size = image_homography(place, mask.shape[::-1], picture)
+                tags = _tags(location, attribution)
+                grid = warp_image(picture, stage(paths.footprint), place, homography, tags, options.image)
+            write_layers(stage(paths.geopackage), _layers(location))
+            subject = Subject(location, place, source, size, homography, grid, options.image.crs or place.crs, paths)
+            subject = replace(subject, attribution=attribution, mask=mask if picture is None else None)
+            for name in options.products:
+                product = PRODUCTS[name]
+                product.write(stage(product.path(paths.folder, paths.stem, source.name)), subject)
         location = replace(location, seconds=replace(location.seconds, write=perf_counter() - started))
         report.write_text(json.dumps(location.to_dict(), indent=2, allow_nan=False) + "\n", encoding="utf-8")
-    return location
+    return location, written
 
 
-def _remove(paths: tuple[Path, ...]) -> None:
+def _remove(paths: Iterable[Path]) -> None:
     for path in paths:
         try:
             path.unlink(missing_ok=True)
@@ -145,14 +134,17 @@ def _remove(paths: tuple[Path, ...]) -> None:
 # --- the warped mask --------------------------------------------------------------------------------------------------
 
 
-def _draw_raster(location: Location, mask: RoadMask, options: OutputOptions) -> bytes:
+def _write_mask(path: Path, location: Location, mask: RoadMask, options: ImageOptions, attribution: str) -> MapGrid:
     """Draw the mask on the map: a Cloud Optimized GeoTIFF with a colour table, nodata outside the footprint."""
     import rasterio
     import rasterio.shutil
 
     place = Placement.of(location)
-    grid = choose_grid(place.footprint, options.resolution_m or place.gsd_m, options.max_pixels)
-    labels = warp(_labels(mask), place.homography, grid)
+    crs, to_target, to_place = choose_target(place, options)
+    max_pixels = min(options.max_pixels, _MASK_MAX_PIXELS)
+    grid = cover(mask.shape[::-1], place.homography, options.resolution, max_pixels, to_target)
+    if grid.width == 0:
+        raise CrsError(f"the footprint lies outside what {crs} is made for; choose another --crs")
     size = grid.resolution
     profile = {
         "driver": "GTiff",
@@ -161,24 +153,18 @@ def _draw_raster(location: Location, mask: RoadMask, options: OutputOptions) -> 
         "count": 1,
         "dtype": "uint8",
         "nodata": OUTSIDE,
-        "crs": place.crs,
+        "crs": crs,
         "transform": rasterio.Affine(size, 0.0, grid.west, 0.0, -size, grid.north),
     }
     with rasterio.MemoryFile() as memory, rasterio.MemoryFile(ext="tif") as optimized:
         with memory.open(**profile) as plain:
-            plain.write(labels, 1)
+            plain.write(warp(_labels(mask), place.homography, grid, to_place), 1)
             plain.write_colormap(1, {value: _rgba(color) for value, (color, _, _) in PALETTE.items()})
-            plain.update_tags(**_tags(location))
-            rasterio.shutil.copy(
-                plain,
-                optimized.name,
-                driver="COG",
-                compress="DEFLATE",
-                level=1,
-                overview_resampling="mode",
-                blocksize=512,
-            )
-        return bytes(optimized.read())
+            plain.update_tags(**_tags(location, attribution))
+            layout = {"compress": "DEFLATE", "level": 1, "overview_resampling": "mode", "blocksize": 512}
+            rasterio.shutil.copy(plain, optimized.name, driver="COG", **layout)
+        path.write_bytes(optimized.read())
+    return grid
 
 
 def _labels(mask: RoadMask) -> AnyArray:
@@ -194,8 +180,8 @@ def _rgba(color: str) -> tuple[int, int, int, int]:
     return red, green, blue, 255
 
 
-def _tags(location: Location) -> dict[str, str]:
-    """Provenance, for `gdalinfo`."""
+def _tags(location: Location, attribution: str = "") -> dict[str, str]:
+    """Say where it comes from, for `gdalinfo`."""
     homography = [] if location.homography is None else location.homography.tolist()
     return {
         "TIFFTAG_SOFTWARE": f"roadgeo {__version__}",
@@ -203,6 +189,7 @@ def _tags(location: Location) -> dict[str, str]:
         "ROADGEO_REFERENCE": location.reference,
         "ROADGEO_HOMOGRAPHY": json.dumps(homography),
         "ROADGEO_LOG10_ODDS": f"{location.log10_odds}",
+        "ROADGEO_ATTRIBUTION": attribution,
     }
 
 
@@ -216,7 +203,7 @@ def _layers(location: Location) -> list[Layer]:
             "footprint",
             "POLYGON",
             [place.footprint],
-            _attributes(location),
+            {name: [value] for name, value in attributes(location).items()},
             place.crs,
             _FOOTPRINT_STYLE,
             "Ground that the image shows",
@@ -225,14 +212,6 @@ def _layers(location: Location) -> list[Layer]:
     if location.evidence is not None:
         layers += [_road_layer(place, location.evidence), _match_layer(place, location.evidence)]
     return layers
-
-
-def _attributes(location: Location) -> dict[str, list[Any]]:
-    names = ["query", "status", "reason", "reference", "gsd_m", "rotation_deg", "tilt_deg", "n_intersections"]
-    names += ["n_matched", "inlier_ratio", "log10_odds"]
-    sigma = location.corner_sigma_m
-    worst = None if sigma is None else float(sigma.max())
-    return {**{name: [getattr(location, name)] for name in names}, "max_corner_sigma_m": [worst]}
 
 
 def _road_layer(place: Placement, evidence: Evidence) -> Layer:

@@ -13,8 +13,8 @@ from roadgeo.errors import OutputError
 from roadgeo.files import write_bytes
 from roadgeo.grid import PIXEL_TO_PLANE, RoadMask, plane_to_pixel
 from roadgeo.homography import Homography
-from roadgeo.io_outputs import Placement
 from roadgeo.location import Location
+from roadgeo.outputs import Placement
 from roadgeo.typing import AnyArray, FloatArray
 from roadgeo.wording import format_lonlat
 

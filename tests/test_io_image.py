@@ -12,7 +12,7 @@ from roadgeo import io_image
 from roadgeo.errors import CrsError, MaskError
 from roadgeo.homography import Homography
 from roadgeo.io_image import ImageOptions, image_homography, warp_image
-from roadgeo.io_outputs import Placement
+from roadgeo.outputs import Placement
 
 PLACE = Placement.of(located())
 MASK_SIZE = (400, 300)
@@ -51,7 +51,7 @@ def test_every_pixel_shows_the_ground_where_it_lies(
     monkeypatch.setattr(io_image, "_BLOCK", 150)
     source = write(tmp_path / "a.tif", positions(300 * scale, 400 * scale))
     homography, size = image_homography(PLACE, MASK_SIZE, source)
-    assert size.scale == scale
+    assert size == (400 * scale, 300 * scale)
     warp_image(source, tmp_path / "b.tif", PLACE, homography, {}, ImageOptions(crs=crs, resampling=resampling))
     with rasterio.open(tmp_path / "b.tif") as raster:
         column, row, alpha = raster.read().astype(float)
@@ -150,5 +150,5 @@ def test_what_cannot_be_drawn_is_named(tmp_path: Path) -> None:
     source = write(tmp_path / "a.tif", np.zeros((1, 300, 300), "uint8"))
     with pytest.raises(MaskError, match="300 x 300 pixels, its mask 400 x 300"):
         image_homography(PLACE, MASK_SIZE, source)
-    with pytest.raises(CrsError, match="unknown CRS"):
+    with pytest.raises(CrsError, match="banana"):
         warp_image(source, tmp_path / "b.tif", PLACE, PLACE.homography, {}, ImageOptions(crs="EPSG:banana"))

@@ -11,8 +11,10 @@ from roadgeo.geopackage import layer_names, read_layer
 from roadgeo.graph import RoadGraph
 from roadgeo.grid import RoadMask, pixel_to_plane
 from roadgeo.homography import Homography
-from roadgeo.io_outputs import GROUND, OUTSIDE, ROAD, OutputOptions, Placement, output_paths, write_location
+from roadgeo.io_image import ImageOptions
+from roadgeo.io_outputs import GROUND, OUTSIDE, ROAD, OutputOptions, write_location
 from roadgeo.location import Evidence, Location, Place
+from roadgeo.outputs import Placement, output_paths
 
 CRS = "EPSG:32629"
 SHAPE = (300, 400)
@@ -71,7 +73,7 @@ def test_the_warped_mask_agrees_with_the_homography(
         observed[:80, :80] = False
         mask = RoadMask(mask.roads & observed, observed)
     paths = output_paths(tmp_path, "photo_mask")
-    write_location(location, mask, paths, OutputOptions(resolution_m))
+    write_location(location, mask, paths, OutputOptions(ImageOptions(resolution=resolution_m)))
     with rasterio.open(paths.footprint) as raster:
         labels, transform = raster.read(1), raster.transform
         rows, columns = np.indices(labels.shape)
@@ -108,7 +110,7 @@ def test_the_warped_mask_is_a_cloud_optimized_geotiff_with_colours(tmp_path: Pat
 
 def test_a_far_view_is_coarsened(tmp_path: Path) -> None:
     paths = output_paths(tmp_path, "a")
-    write_location(located(), road_mask(), paths, OutputOptions(max_pixels=10_000))
+    write_location(located(), road_mask(), paths, OutputOptions(ImageOptions(max_pixels=10_000)))
     with rasterio.open(paths.footprint) as raster:
         assert raster.width * raster.height < 11_000
 
@@ -132,7 +134,8 @@ def test_the_geopackage_holds_footprint_roads_and_residuals(tmp_path: Path) -> N
 
 def test_the_json_is_the_location(tmp_path: Path) -> None:
     paths = output_paths(tmp_path, "a")
-    written = write_location(located(), road_mask(), paths)
+    written, files = write_location(located(), road_mask(), paths)
+    assert all(path.exists() for path in files)
     assert json.loads(paths.json.read_text()) == json.loads(json.dumps(written.to_dict()))
     assert written.seconds.write > 0
 

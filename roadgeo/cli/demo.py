@@ -48,6 +48,7 @@ def demo_command(out_dir: str) -> int:
     from roadgeo.cli.index import build
     from roadgeo.cli.locate import Job
     from roadgeo.demo import ATTRIBUTION, ROADS, demo_masks
+    from roadgeo.io_outputs import OutputOptions
     from roadgeo.io_roads import read_roads
     from roadgeo.workflows import LocateOptions
 
@@ -58,7 +59,7 @@ def demo_command(out_dir: str) -> int:
     seconds = perf_counter() - started
     click.echo(f"Porto, {ATTRIBUTION}: {len(reference.index):,} intersections, indexed in {seconds:.1f} s")
     compile_once(reference, quiet=False)
-    job = Job((str(folder / "porto.gpkg"),), LocateOptions(), out_dir, plot=True)
+    job = Job((str(folder / "porto.gpkg"),), LocateOptions(), OutputOptions(), out_dir, plot=True)
     locate = job.prepare()
     wrong = 0
     for mask in demo_masks():

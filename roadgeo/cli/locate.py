@@ -4,9 +4,9 @@ from __future__ import annotations
 
 import json
 from collections import Counter
-from collections.abc import Callable, Iterable
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from contextlib import AbstractContextManager, nullcontext
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Literal
 
@@ -19,10 +19,14 @@ from roadgeo.cli.parameters import NEAR, RANGE, verbosity_options
 from roadgeo.wording import format_lonlat
 
 if TYPE_CHECKING:
+    from roadgeo.io_outputs import OutputOptions
     from roadgeo.location import Location
     from roadgeo.workflows import LocateOptions, Reference
 
-__all__ = ["Job", "Outcome", "locate_command", "open_references"]
+__all__ = ["Job", "Outcome", "locate_command", "make_options", "open_references", "pair_images"]
+
+#: Names in `io_products.PRODUCTS`, known here without importing it.
+PRODUCTS = ("gcps", "vrt", "points", "odm", "worldfile", "geojson", "stac", "kmz")
 
 Status = Literal["located", "ambiguous", "not_located", "error"]
 
@@ -43,7 +47,9 @@ class Job:
 
     references: tuple[str, ...]
     options: LocateOptions
+    outputs: OutputOptions
     out_dir: str
+    images: Mapping[str, str] = field(default_factory=dict)
     threshold: float | None = None
     band: int | None = None
     plot: bool = False
@@ -77,22 +83,22 @@ class Job:
     def _locate(self, task: Task, references: list[Reference], open_seconds: float) -> Outcome:
         from dataclasses import replace
 
-        from roadgeo.io_outputs import output_paths, write_location
+        from roadgeo.io_outputs import write_location
         from roadgeo.io_raster import read_mask
+        from roadgeo.outputs import output_paths
         from roadgeo.workflows import locate
 
         mask = read_mask(task.mask, threshold=self.threshold, band=self.band)
         location = locate(mask, references, self.options)
         location = replace(location, seconds=replace(location.seconds, open=open_seconds))
+        reference = next((one for one in references if one.name == location.reference), references[0])
+        attribution = str(reference.index.meta.get("attribution", ""))
         paths = output_paths(self.out_dir, task.stem)
-        location = write_location(location, mask, paths)
-        files = [paths.json]
-        if location.located:
-            files = [paths.footprint, paths.style, paths.geopackage, paths.json]
-            if self.plot:
-                reference = next(one for one in references if one.name == location.reference)
-                _draw(location, mask, reference, paths.overlay)
-                files.append(paths.overlay)
+        picture = self.images.get(task.mask)
+        location, files = write_location(location, mask, paths, self.outputs, picture, attribution)
+        if self.plot and location.located:
+            _draw(location, mask, reference, paths.overlay, attribution)
+            files.append(paths.overlay)
         return Outcome(location.status, location.to_dict(), describe(location), tuple(map(str, files)))
 
 
@@ -136,6 +142,43 @@ def open_references(names: Iterable[str]) -> list[Reference]:
 )
 @click.option("--json", "as_json", is_flag=True, help="Print one JSON object per mask and line, in input order.")
 @click.option("--plot", is_flag=True, help="Also write MASK_overlay.png: the mask and its place, to look at.")
+@click.option(
+    "--image",
+    "images",
+    metavar="PHOTO",
+    multiple=True,
+    help="Draw this photograph on the map instead of its mask. One per mask, in order, or a folder of them.",
+)
+@click.option(
+    "--also",
+    "products",
+    type=click.Choice(PRODUCTS),
+    multiple=True,
+    help="Write a further form of the result. Repeatable.",
+)
+@click.option("--gcps", is_flag=True, help="The same as --also gcps: the picture's own pixels with control points.")
+@click.option("--crs", metavar="CRS", help="CRS of what is drawn, such as EPSG:3857. Default: the reference's, metric.")
+@click.option(
+    "--resolution",
+    metavar="SIZE",
+    type=click.FloatRange(min=0, min_open=True),
+    help="Pixel size of what is drawn, in units of its CRS. Default: the picture's own.",
+)
+@click.option(
+    "--resampling",
+    type=click.Choice(["nearest", "bilinear", "cubic", "lanczos"]),
+    default="cubic",
+    show_default=True,
+    help="How a photograph's values between its pixels are found.",
+)
+@click.option(
+    "--max-pixels",
+    metavar="N",
+    type=click.IntRange(1),
+    default=400_000_000,
+    show_default=True,
+    help="Draw coarser rather than more than this.",
+)
 @click.option("--threshold", metavar="T", type=float, help="Values above T are road. Default: told by the values.")
 @click.option(
     "--band", metavar="N", type=click.IntRange(1), help="Band that holds the mask. Default: told by the bands."
@@ -169,6 +212,13 @@ def locate_command(
     out_dir: str,
     as_json: bool,
     plot: bool,
+    images: tuple[str, ...],
+    products: tuple[str, ...],
+    gcps: bool,
+    crs: str | None,
+    resolution: float | None,
+    resampling: Literal["nearest", "bilinear", "cubic", "lanczos"],
+    max_pixels: int,
     threshold: float | None,
     band: int | None,
     gsd: tuple[float, float] | None,
@@ -189,17 +239,29 @@ def locate_command(
 
     \b
     For each located photo_mask.tif:
-      photo_mask_footprint.tif   the mask on the map (Cloud Optimized GeoTIFF)
+      photo_mask_footprint.tif   the mask, or its --image, on the map (Cloud Optimized GeoTIFF)
       photo_mask_location.gpkg   footprint, matched intersections, roads: opens styled in QGIS
       photo_mask_location.json   place, homography, odds; also written, with a reason, where nothing was found
       photo_mask_overlay.png     with --plot
+
+    \b
+    With --also:
+      gcps       the picture's own pixels with 25 control points (GeoTIFF)
+      vrt        the same without copying pixels (GDAL virtual raster)
+      points     control points for the QGIS Georeferencer
+      odm        control points for OpenDroneMap
+      worldfile  world file of the drawn raster
+      geojson    footprint as of RFC 7946
+      stac       STAC Item of the drawn raster
+      kmz        ground overlay for Google Earth
 
     \b
     Examples:
       roadgeo locate photo_mask.tif
       roadgeo locate masks/ --reference boston-ma --out-dir found --plot
       roadgeo locate *.png --json --jobs 4 > found.jsonl
-      roadgeo locate mask.png --gsd 0.3:0.6 --near -71.06,42.36,5000
+      roadgeo locate photo_mask.png --image photo.tif --crs EPSG:3857 --also geojson --also points
+      roadgeo locate mask.png --gsd 0.3:0.6 --near=-71.06,42.36,5000
 
     Exit status: 0 every mask located, 3 at least one not located, 1 error, 2 usage.
     """
@@ -210,7 +272,9 @@ def locate_command(
     if not tasks:
         raise click.UsageError(f"No images in {', '.join(masks)}.")
     make_folder(out_dir)
-    job = Job(references, options, out_dir, threshold, band, plot)
+    outputs = _make_outputs(crs, resolution, resampling, max_pixels, (*products, *(["gcps"] if gcps else [])))
+    pictures = pair_images([task.mask for task in tasks], images)
+    job = Job(references, options, outputs, out_dir, pictures, threshold, band, plot)
     # Opened here too: what is wrong with them is said once, and the search is compiled before processes start.
     compile_once(open_references(references)[0], quiet)
     counts: Counter[Status] = Counter()
@@ -250,6 +314,42 @@ def make_options(
     )
 
 
+def _make_outputs(
+    crs: str | None,
+    resolution: float | None,
+    resampling: Literal["nearest", "bilinear", "cubic", "lanczos"],
+    max_pixels: int,
+    products: Sequence[str],
+) -> OutputOptions:
+    from roadgeo.io_image import ImageOptions
+    from roadgeo.io_outputs import OutputOptions
+
+    return OutputOptions(ImageOptions(crs, resolution, resampling, max_pixels), tuple(dict.fromkeys(products)))
+
+
+def pair_images(masks: Sequence[str], images: Sequence[str]) -> dict[str, str]:
+    """Say which photograph belongs to which mask.
+
+    One photograph per mask in the same order, or a folder in which it has the mask's name, less a final "_mask".
+
+    Raises
+    ------
+    click.UsageError
+        Another number of photographs than of masks, or none in the folder.
+    """
+    if len(images) == 1 and Path(images[0]).is_dir():
+        by_stem = {path.stem: str(path) for path in sorted(Path(images[0]).iterdir()) if path.suffix}
+        stems = {mask: Path(mask).stem for mask in masks}
+        found = {mask: by_stem.get(stem.removesuffix("_mask"), by_stem.get(stem)) for mask, stem in stems.items()}
+        missing = [mask for mask, image in found.items() if image is None]
+        if missing:
+            raise click.UsageError(f"No photograph in {images[0]} has the name of {missing[0]}.")
+        return {mask: image for mask, image in found.items() if image is not None}
+    if images and len(images) != len(masks):
+        raise click.UsageError(f"Got {len(masks)} masks and {len(images)} times --image, expected as many.")
+    return dict(zip(masks, images, strict=False))
+
+
 # --- one mask ---------------------------------------------------------------------------------------------------------
 
 
@@ -268,12 +368,12 @@ def _failed(task: Task, reason: str) -> Outcome:
     return Outcome("error", document, f"Error: {reason}")
 
 
-def _draw(location: Location, mask: Any, reference: Reference, path: Path) -> None:
+def _draw(location: Location, mask: Any, reference: Reference, path: Path, attribution: str) -> None:
     from roadgeo.plot import write_overlay
 
     index = reference.index
     roads = index.plane.to_crs(index.segments.reshape(-1, 2).astype(float)).reshape(-1, 4)
-    write_overlay(path, location, mask, roads, str(index.meta.get("attribution", "")))
+    write_overlay(path, location, mask, roads, attribution)
 
 
 # --- printing ---------------------------------------------------------------------------------------------------------
