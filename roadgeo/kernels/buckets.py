@@ -1,46 +1,54 @@
-"""Bucket grids over points: the nearest neighbours of every point, and points near a place.
+"""Bucket grids over points: the nearest neighbours of every point.
 
-Points are stored sorted by bucket (row-major), so that bucket `c` owns the points `starts[c]:starts[c + 1]` and no list of
-ids is needed. `grid` = (x0, y0, cell size) and `shape` = (columns, rows).
+Points are stored sorted by bucket, row by row, so that bucket c owns the points `starts[c]:starts[c + 1]` and no list
+of ids is needed. `grid` is (x0, y0, bucket size), `shape` is (columns, rows), and bucket c = row * columns + column.
 """
 
 import numpy as np
 from numba import njit
+from numpy.typing import NDArray
+
+__all__ = ["nearest_neighbours"]
 
 
 @njit(cache=True)
-def bucket_of(x, y, grid, shape):
-    """Return the bucket of a point; points outside fall into the nearest bucket of the rim."""
-    column = int(np.floor((x - grid[0]) / grid[2]))
-    row = int(np.floor((y - grid[1]) / grid[2]))
-    column = min(max(column, 0), shape[0] - 1)
-    row = min(max(row, 0), shape[1] - 1)
-    return row * shape[0] + column
+def nearest_neighbours(
+    xy: NDArray[np.float64],
+    starts: NDArray[np.int32],
+    grid: tuple[float, float, float],
+    shape: tuple[int, int],
+    k: int,
+) -> NDArray[np.int32]:
+    """Return each point's k nearest others, nearest first.
 
+    Rings of buckets are searched outwards until the k-th distance lies inside the square searched.
 
-@njit(cache=True)
-def nearest_neighbours(xy, starts, grid, shape, k):
-    """Return (N, k) int32: each point's k nearest others, nearest first, -1 where there are fewer.
+    Parameters
+    ----------
+    xy : (N, 2) float64
+        Points, sorted by bucket, none outside the grid.
+    starts : (B + 1,) int32
 
-    Rings of buckets are searched outwards until the k-th distance lies inside the searched square.
+    Returns
+    -------
+    (N, k) int32
+        -1 where there are fewer than k others.
     """
     n = xy.shape[0]
     neighbours = np.full((n, k), -1, np.int32)
     best = np.empty(k)
-    reach = max(shape[0], shape[1])
     for i in range(n):
         x, y = xy[i, 0], xy[i, 1]
         column = min(max(int(np.floor((x - grid[0]) / grid[2])), 0), shape[0] - 1)
         row = min(max(int(np.floor((y - grid[1]) / grid[2])), 0), shape[1] - 1)
         found = 0
         best[:] = np.inf
-        for ring in range(reach + 1):
+        for ring in range(max(shape[0], shape[1]) + 1):
             safe = (ring - 1) * grid[2]
             if found == k and ring > 0 and best[k - 1] <= safe * safe:
                 break
             for r in range(max(row - ring, 0), min(row + ring, shape[1] - 1) + 1):
-                inner = abs(r - row) < ring
-                step = 2 * ring if inner and ring > 0 else 1
+                step = 2 * ring if abs(r - row) < ring else 1  # between its first and last row a ring has two buckets
                 c = column - ring
                 while c <= column + ring:
                     if 0 <= c < shape[0]:

@@ -1,22 +1,44 @@
 """Growth of a hypothesis: from a few matched intersections outwards over the whole query.
 
-The model is a homography in normalised coordinates, query (x - xa) / s to reference (X - XA) / (s g), s being the query's half
-size in pixels and g the ground sampling at the anchor, so that it is near a rotation. Its eight parameters
-p = (h00 h01 h02 h10 h11 h12 h20 h21), h22 = 1, come from linear least squares with a prior on the two perspective ones: with few
-matches it is an affine map, with many a homography. The same normal matrix predicts how far off a new point may be.
+The model is a homography in normalised coordinates, query (x - xa) / s to reference (X - XA) / (s g), s being the
+query's half size in pixels and g the ground sampling at the anchor, so that it is near a rotation. Its eight parameters
+p = (h00 h01 h02 h10 h11 h12 h20 h21), h22 = 1, come from linear least squares with a prior on the two perspective ones:
+with few matches it is an affine map, with many a homography. The same normal matrix predicts how far off a new point
+may be.
 """
 
 import math
 
 import numpy as np
 from numba import njit
+from numpy.typing import NDArray
 
 from roadgeo.kernels.rays import rays_agree
 
+__all__ = [
+    "cholesky",
+    "fit_homography",
+    "grow",
+    "keep_nearest",
+    "match_all",
+    "nearest_alike",
+    "predict",
+    "prediction_variance",
+    "solve_cholesky",
+]
+
 
 @njit(cache=True)
-def cholesky(matrix, factor):
-    """Fill `factor` with the lower Cholesky factor of a positive definite (n, n) matrix; return whether that worked."""
+def cholesky(matrix: NDArray[np.float64], factor: NDArray[np.float64]) -> bool:
+    """Factorise a symmetric matrix; return whether it is positive definite.
+
+    Parameters
+    ----------
+    matrix : (n, n) float64
+        Only its lower triangle is read.
+    factor : (n, n) float64
+        Its lower triangle is filled with L, L L^T = matrix.
+    """
     n = matrix.shape[0]
     for i in range(n):
         for j in range(i + 1):
@@ -33,8 +55,8 @@ def cholesky(matrix, factor):
 
 
 @njit(cache=True)
-def solve_cholesky(factor, right):
-    """Solve L L^T x = right in place."""
+def solve_cholesky(factor: NDArray[np.float64], right: NDArray[np.float64]) -> None:
+    """Solve L L^T x = right, L (n, n) as left by `cholesky`; x replaces `right` (n,)."""
     n = factor.shape[0]
     for i in range(n):
         for k in range(i):
@@ -47,11 +69,30 @@ def solve_cholesky(factor, right):
 
 
 @njit(cache=True)
-def fit_homography(query, image, matched, prior, p, normal, factor):
-    """Fit the eight parameters `p` to the pairs query[i] -> image[i] with matched[i] >= 0; return whether that worked.
+def fit_homography(
+    query: NDArray[np.float64],
+    image: NDArray[np.float64],
+    matched: NDArray[np.int64],
+    prior: float,
+    p: NDArray[np.float64],
+    normal: NDArray[np.float64],
+    factor: NDArray[np.float64],
+) -> bool:
+    """Fit a homography to matched points by one step of linear least squares; return whether that worked.
 
-    Both are normalised coordinates; `prior` is the weight (1 / variance, in units of the residuals' variance) that holds the two
-    perspective parameters near zero. The equations are divided by the previous w, so that residuals are distances.
+    x' (1 + p6 u + p7 v) = p0 u + p1 v + p2 is linear in p. The equations are divided by the w of the `p` given, so that
+    residuals are distances on the reference plane.
+
+    Parameters
+    ----------
+    query, image : (N, 2) float64
+        Normalised points u, v and their images; those with `matched` >= 0 count.
+    prior : float
+        Weight that holds the two perspective parameters near zero: variance of a residual over theirs.
+    p : (8,) float64
+        Parameters so far; replaced.
+    normal, factor : (8, 8) float64
+        Their lower triangles are filled with the normal matrix and its Cholesky factor.
     """
     right = np.zeros(8)
     row = np.zeros(8)
@@ -91,15 +132,27 @@ def fit_homography(query, image, matched, prior, p, normal, factor):
 
 
 @njit(cache=True)
-def predict(p, u, v):
-    """Return (X, Y, w) of a normalised query point."""
+def predict(p: NDArray[np.float64], u: float, v: float) -> tuple[float, float, float]:
+    """Return (x', y', w) of a normalised query point under the parameters `p` (8,)."""
     w = 1.0 + p[6] * u + p[7] * v
     return (p[0] * u + p[1] * v + p[2]) / w, (p[3] * u + p[4] * v + p[5]) / w, w
 
 
 @njit(cache=True)
-def prediction_variance(factor, p, u, v, work):
-    """Return the variance of a predicted point, summed over x and y, in units of the residuals' variance."""
+def prediction_variance(
+    factor: NDArray[np.float64], p: NDArray[np.float64], u: float, v: float, work: NDArray[np.float64]
+) -> float:
+    """Return the variance of a predicted point, summed over x and y, in units of the residuals' variance.
+
+    With J (2, 8) the derivative of the point by p, it is the trace of J (L L^T)^-1 J^T, the squared norm of L^-1 J^T.
+
+    Parameters
+    ----------
+    factor : (8, 8) float64
+        L, as left by `fit_homography`.
+    work : (8,) float64
+        Room to work in.
+    """
     x, y, w = predict(p, u, v)
     total = 0.0
     for axis in range(2):
@@ -119,19 +172,43 @@ def prediction_variance(factor, p, u, v, work):
 
 
 @njit(cache=True)
-def nearest_alike(x, y, radius, branches, i, ref_xy, ref_branches, starts, grid, shape, j00, j01, j10, j11, min_cos):
-    """Return (reference id, distance) of the nearest intersection within `radius` whose rays agree, or (-1, radius)."""
+def nearest_alike(
+    x: float,
+    y: float,
+    radius: float,
+    branches: NDArray[np.int8],
+    i: int,
+    ref_xy: NDArray[np.float64],
+    ref_branches: NDArray[np.int8],
+    starts: NDArray[np.int32],
+    grid: tuple[float, float, float],
+    shape: tuple[int, int],
+    j00: float,
+    j01: float,
+    j10: float,
+    j11: float,
+    min_cos: float,
+) -> tuple[int, float]:
+    """Return the number and distance of the nearest intersection of the map with agreeing branches, or (-1, `radius`).
+
+    Parameters
+    ----------
+    x, y, radius : float
+        Metres on the reference plane; intersections nearer than this count.
+    branches, i, ref_branches, j00, j01, j10, j11, min_cos
+        As in `rays_agree`.
+    ref_xy : (N, 2) float64, starts : (B + 1,) int32
+        The map's intersections, sorted by bucket (see `kernels.buckets`).
+    """
     best, where = radius, -1
-    c0 = int(np.floor((x - radius - grid[0]) / grid[2]))
-    c1 = int(np.floor((x + radius - grid[0]) / grid[2]))
-    r0 = int(np.floor((y - radius - grid[1]) / grid[2]))
-    r1 = int(np.floor((y + radius - grid[1]) / grid[2]))
-    for r in range(max(r0, 0), min(r1, shape[1] - 1) + 1):
-        low = r * shape[0] + max(c0, 0)
-        high = r * shape[0] + min(c1, shape[0] - 1)
-        if high < low:
-            continue
-        for j in range(starts[low], starts[high + 1]):
+    c0 = max(int(np.floor((x - radius - grid[0]) / grid[2])), 0)
+    c1 = min(int(np.floor((x + radius - grid[0]) / grid[2])), shape[0] - 1)
+    r0 = max(int(np.floor((y - radius - grid[1]) / grid[2])), 0)
+    r1 = min(int(np.floor((y + radius - grid[1]) / grid[2])), shape[1] - 1)
+    if c1 < c0:
+        return where, best
+    for r in range(r0, r1 + 1):
+        for j in range(starts[r * shape[0] + c0], starts[r * shape[0] + c1 + 1]):
             dx, dy = ref_xy[j, 0] - x, ref_xy[j, 1] - y
             d = math.sqrt(dx * dx + dy * dy)
             if d < best and rays_agree(branches, i, ref_branches, j, j00, j01, j10, j11, min_cos):
@@ -140,24 +217,117 @@ def nearest_alike(x, y, radius, branches, i, ref_xy, ref_branches, starts, grid,
 
 
 @njit(cache=True)
-def grow(
-    xy, branches, order, half_size, anchor, ref_anchor, affine, neighbours, partners,
-    ref_xy, ref_branches, starts, grid, shape,
-    sigma_m, radius_m, min_cos, perspective_sigma, hit_rate, chance_rate, patience,
-    matched, distance, matrix,
-):  # fmt: skip
-    """Grow a hypothesis; return (matches besides the seeds, points tested besides the seeds, log-likelihood ratio).
+def keep_nearest(matched: NDArray[np.int64], distance: NDArray[np.float64]) -> int:
+    """Let the nearest of several claimants keep a partner, the first of equals; return the number of matches left.
 
-    `order` lists the query points by distance from the anchor. Seeds are the anchor and its placed neighbours
-    (`partners[s]` >= 0 for column s of `neighbours[anchor]`). Each further point is predicted; its search radius grows with the
-    prediction's own standard deviation up to `radius_m`. A sequential probability ratio test (`hit_rate` if true, `chance_rate` if not) gives up
-    below -`patience` nats. On return `matched` (N) holds reference ids or -1, `distance` (N) metres, and `matrix` the 3 x 3
-    homography from the query plane to the reference plane. A ratio of -inf: given up.
+    Parameters
+    ----------
+    matched : (N,) int64
+        Partners or -1; the losers' are set to -1.
+    distance : (N,) float64
+        Of each to its partner.
+    """
+    n = matched.shape[0]
+    size = 4
+    while size < 2 * n:
+        size *= 2
+    keeper = np.full(size, -1, np.int64)  # a hash table by partner, probed linearly
+    count = 0
+    for i in range(n):
+        if matched[i] < 0:
+            continue
+        slot = (matched[i] * 40503) & (size - 1)
+        while keeper[slot] >= 0 and matched[keeper[slot]] != matched[i]:
+            slot = (slot + 1) & (size - 1)
+        k = keeper[slot]
+        if k < 0:
+            keeper[slot] = i
+            count += 1
+        elif distance[i] < distance[k]:
+            keeper[slot] = i
+            matched[k] = -1
+        else:
+            matched[i] = -1
+    return count
+
+
+@njit(cache=True)
+def grow(
+    xy: NDArray[np.float64],
+    branches: NDArray[np.int8],
+    order: NDArray[np.int64],
+    half_size: float,
+    anchor: int,
+    ref_anchor: int,
+    affine: NDArray[np.float64],
+    neighbours: NDArray[np.int32],
+    partners: NDArray[np.int64],
+    ref_xy: NDArray[np.float64],
+    ref_branches: NDArray[np.int8],
+    starts: NDArray[np.int32],
+    grid: tuple[float, float, float],
+    shape: tuple[int, int],
+    sigma_m: float,
+    radius_m: float,
+    min_cos: float,
+    perspective_sigma: float,
+    hit_rate: float,
+    chance_rate: float,
+    patience: float,
+    matched: NDArray[np.int64],
+    distance: NDArray[np.float64],
+    matrix: NDArray[np.float64],
+) -> tuple[int, int, float]:
+    """Grow a hypothesis from its seeds, give up early or match the whole query.
+
+    Seeds are the anchor and its placed neighbours. Each further point is predicted, the nearest ones first, once its
+    search radius, 2.5 of the prediction's own standard deviations, has come down to `radius_m`; matches refit the
+    model. A sequential probability ratio test (Wald 1945) counts hits and misses and gives up below -`patience`. In the
+    end all points are matched anew, one to one, twice.
+
+    Parameters
+    ----------
+    xy : (N, 2) float64, branches : (N, R, 2) int8
+        The query's intersections.
+    order : (N,) int64
+        Query points by distance from the anchor.
+    half_size : float
+        Of the frame, pixels.
+    anchor, ref_anchor : int
+        The anchor in the query, and the map intersection that it may be.
+    affine : (4,) float64
+        The 2 x 2 map, row-major, around them; not mirrored.
+    neighbours : (N, K) int32, partners : (K,) int64
+        `partners[s]` is the map intersection of query point `neighbours[anchor, s]`, or -1.
+    ref_xy, ref_branches, starts
+        As in `nearest_alike`.
+    sigma_m, radius_m : float
+        Standard deviation of a matched intersection, and the greatest search radius, metres.
+    min_cos : float
+        As in `rays_agree`.
+    perspective_sigma : float
+        Standard deviation of the two perspective parameters, a priori.
+    hit_rate, chance_rate : float
+        Share of points that meet a partner in the right place, and by chance.
+    patience : float
+        Nats.
+    matched : (N,) int64
+        Filled with map intersections or -1.
+    distance : (N,) float64
+        Filled with metres where matched.
+    matrix : (3, 3) float64
+        Filled with the homography from the query plane to the reference plane, unless given up.
+
+    Returns
+    -------
+    matches, tests : int
+        Besides the seeds.
+    ratio : float
+        Log-likelihood ratio in nats; -inf: given up.
     """
     n = xy.shape[0]
     det = affine[0] * affine[3] - affine[1] * affine[2]
-    gsd = math.sqrt(det)
-    unit = half_size * gsd
+    unit = half_size * math.sqrt(det)
     query = np.empty((n, 2))
     image = np.zeros((n, 2))
     for i in range(n):
@@ -259,11 +429,7 @@ def grow(
                 continue
             image[i, 0] = (ref_xy[j, 0] - x0) / unit
             image[i, 1] = (ref_xy[j, 1] - y0) / unit
-        for i in range(n):
-            for k in range(i):
-                if matched[k] >= 0 and matched[k] == matched[i]:
-                    loser = k if distance[i] < distance[k] else i
-                    matched[loser] = -1
+        keep_nearest(matched, distance)
         for i in range(n):
             if seed[i]:
                 continue
@@ -291,13 +457,47 @@ def grow(
 
 @njit(cache=True)
 def match_all(
-    matrix, xy, branches, radius, min_cos, shift_x, shift_y, one_to_one,
-    ref_xy, ref_branches, starts, grid, shape, matched, distance,
-):  # fmt: skip
-    """Match every query intersection to the nearest one of the map with agreeing rays; return the number of matches.
+    matrix: NDArray[np.float64],
+    xy: NDArray[np.float64],
+    branches: NDArray[np.int8],
+    radius: float,
+    min_cos: float,
+    shift_x: float,
+    shift_y: float,
+    one_to_one: bool,
+    ref_xy: NDArray[np.float64],
+    ref_branches: NDArray[np.int8],
+    starts: NDArray[np.int32],
+    grid: tuple[float, float, float],
+    shape: tuple[int, int],
+    matched: NDArray[np.int64],
+    distance: NDArray[np.float64],
+) -> int:
+    """Match every intersection of the query to the nearest one of the map with agreeing branches.
 
-    The query is mapped by `matrix` and shifted. `matched` (N) holds reference ids or -1, `distance` (N) metres. With `one_to_one` the nearer of two
-    claimants keeps an intersection.
+    Parameters
+    ----------
+    matrix : (3, 3) float64
+        Query plane to reference plane; the shift, in metres, is added.
+    xy : (N, 2) float64, branches : (N, R, 2) int8
+        The query's intersections.
+    radius : float
+        Metres.
+    min_cos : float
+        As in `rays_agree`.
+    one_to_one : bool
+        Whether only the nearest of several claimants keeps an intersection.
+    ref_xy, ref_branches, starts
+        As in `nearest_alike`.
+    matched : (N,) int64
+        Filled with map intersections or -1.
+    distance : (N,) float64
+        Filled with metres, `radius` where there is none.
+
+    Returns
+    -------
+    int
+        Number of matches.
     """
     n = xy.shape[0]
     count = 0
@@ -318,12 +518,4 @@ def match_all(
         )  # fmt: skip
         if matched[i] >= 0:
             count += 1
-    if not one_to_one:
-        return count
-    for i in range(n):
-        for k in range(i):
-            if matched[k] >= 0 and matched[k] == matched[i]:
-                loser = k if distance[i] < distance[k] else i
-                matched[loser] = -1
-                count -= 1
-    return count
+    return keep_nearest(matched, distance) if one_to_one else count

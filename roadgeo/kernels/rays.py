@@ -1,7 +1,7 @@
 """Branches of two intersections compared.
 
-Branches are unit vectors scaled to 127 and rounded, (N, R, 2) int8 with zeros behind the last: comparing two takes a few
-products and no trigonometry, and a map's fit into 2 R bytes each; rounding turns them by less than 0.4 degrees.
+Branches are unit vectors scaled to 127 and rounded, (N, R, 2) int8 with zeros behind the last: comparing two takes
+some products and no trigonometry, an intersection takes 2 R bytes, and rounding turns one by less than 0.4 degrees.
 """
 
 import math
@@ -25,7 +25,7 @@ def rays_agree(
     j11: float,
     min_cos: float,
 ) -> bool:
-    """Return whether the branches of query intersection i, as the map would show them, agree with those of its intersection j.
+    """Return whether the branches of query intersection i, as a map would show them, agree with those of j on the map.
 
     Each branch takes the nearest partner that is still free; all branches of the poorer of the two must have found one.
 

@@ -1,7 +1,7 @@
 """Roads as short straight segments in buckets: the nearest one to a point, and how well two networks cover each other.
 
-`segments` (S, 4) are x1, y1, x2, y2; bucket c lists the segments that touch it, `ids[starts[c]:starts[c + 1]]`. `grid` and
-`shape` are those of `kernels.buckets`.
+`segments` (S, 4) are x1, y1, x2, y2; bucket c lists the segments that touch it, `ids[starts[c]:starts[c + 1]]`. `grid`
+and `shape` are those of `kernels.buckets`.
 """
 
 import math
@@ -216,7 +216,8 @@ def backward_agreement(
     tolerance_m : float
         A sample nearer than this to a road of the query counts as shown; pixels by the scale at its place.
     field : (h, w) float32
-        Distance from each cell of the frame to the query's nearest road, in cells of `field_scale` pixels, rows downwards.
+        Distance from each cell of the frame to the nearest road of the query, in cells of `field_scale` pixels; rows
+        run downwards.
     observed : (h, w) bool
         Where the query saw the ground.
 
@@ -279,6 +280,7 @@ def screen(
     points: NDArray[np.float64],
     directions: NDArray[np.float64],
     radius: float,
+    radius_px: float,
     min_cos: float,
     least: float,
     segments: NDArray[np.float32],
@@ -295,12 +297,14 @@ def screen(
     references : (M,) int64
         The map intersection that each proposal puts the anchor on.
     affines : (M, 4) float64
-        The 2 x 2 map, row-major, from query to reference around the anchor; regular.
+        The 2 x 2 map, row-major, from query to reference around the anchor; not mirrored.
     anchor_xy : (2,) float64
         The anchor in the query plane.
     points, directions : (S, 2) float64
         Road points near it, and unit vectors along the road.
-    radius, min_cos
+    radius, radius_px : float
+        Roads count within `radius` metres and so many pixels more.
+    min_cos
         As in `nearest_road`.
     least : float
         A proposal is given up, with share 0, once it cannot reach this share.
@@ -311,6 +315,7 @@ def screen(
     for m in range(references.shape[0]):
         x0, y0 = ref_xy[references[m], 0], ref_xy[references[m], 1]
         j00, j01, j10, j11 = affines[m, 0], affines[m, 1], affines[m, 2], affines[m, 3]
+        reach = radius + radius_px * math.sqrt(j00 * j11 - j01 * j10)
         hits, misses = 0, 0
         for i in range(n):
             u, v = points[i, 0] - anchor_xy[0], points[i, 1] - anchor_xy[1]
@@ -318,7 +323,7 @@ def screen(
             dy = j10 * directions[i, 0] + j11 * directions[i, 1]
             length = math.sqrt(dx * dx + dy * dy)
             d = nearest_road(
-                x0 + j00 * u + j01 * v, y0 + j10 * u + j11 * v, dx / length, dy / length, radius, min_cos,
+                x0 + j00 * u + j01 * v, y0 + j10 * u + j11 * v, dx / length, dy / length, reach, min_cos,
                 segments, starts, ids, grid, shape,
             )[0]  # fmt: skip
             if d < np.inf:
