@@ -76,11 +76,32 @@ def staging(target: str | os.PathLike[str]) -> Iterator[Path]:
             shutil.rmtree(folder, ignore_errors=True)
 
 
-def publish(staged: Path, target: str | os.PathLike[str]) -> None:
-    """Sync a finished file of a staging folder to disk and rename it over `target`."""
+def publish(staged: Path, target: str | os.PathLike[str], *, replace: bool = True) -> None:
+    """Sync a finished file of a staging folder to disk and rename it over `target`.
+
+    Raises
+    ------
+    FileExistsError
+        There is a target and `replace` is False.
+    """
     sync_file(staged)
-    staged.replace(target)
+    if replace:
+        staged.replace(target)
+    else:
+        _rename_to_new(staged, Path(target))
     _sync_folder(Path(target).parent)
+
+
+def _rename_to_new(staged: Path, target: Path) -> None:
+    """Give a file a name that must be free; a hard link is what tells so and takes it in one step."""
+    try:
+        os.link(staged, target)
+    except FileExistsError:
+        raise
+    except OSError:  # no hard links on this disk: look first, and hope that nobody comes between
+        if target.exists():
+            raise
+        staged.replace(target)
 
 
 def sync_file(path: Path) -> None:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import contextlib
 import math
 import os
 from collections.abc import Callable, Mapping
@@ -22,7 +23,6 @@ from roadgeo.io_index import (
     read_format_version,
     read_index,
     read_manifest,
-    write_index,
 )
 from roadgeo.io_network import (
     computed_digest,
@@ -132,7 +132,18 @@ def open_reference(
         When there is no such reference, or its index is missing (without `rebuild`), damaged, hostile or stale.
     """
     paths = reference_paths(path)
-    freshness = reference_freshness(path)
+    while True:
+        before = _identities(paths)
+        try:
+            return _open(paths, rebuild)
+        except IndexFormatError:
+            if _identities(paths) == before:
+                raise
+            # Another process has replaced the reference meanwhile: what we saw was half the old one, half the new.
+
+
+def _open(paths: ReferencePaths, rebuild: Callable[[RoadNetwork], IndexParts] | None) -> IndexParts:
+    freshness = reference_freshness(paths.geopackage)
     if freshness == "stale":
         raise IndexFormatError(
             f"{paths.index} is stale: the intersections of {paths.geopackage.name} were changed after it was built; "
@@ -226,24 +237,31 @@ def check_reference(path: str | os.PathLike[str]) -> list[str]:
 
 def _rebuild(paths: ReferencePaths, rebuild: Callable[[RoadNetwork], IndexParts]) -> IndexParts:
     """Build a missing index, and keep it where that is possible and nobody has written another meanwhile."""
-    before = _identity(paths.index)
+    before = _identities(paths)
     network = read_network(paths.geopackage)
+    if _identities(paths) != before:
+        raise IndexFormatError(f"{paths.geopackage} was replaced while it was read; try again")
     meta, arrays = rebuild(network)
-    about = _about(network, meta)
-    try:
-        if _identity(paths.index) == before and stored_digest(paths.geopackage) == about["network"]:
-            write_index(paths.index, dict(meta), arrays, about)
-    except OutputError:  # a reference in a read-only folder serves as well, it only costs this time at every opening
-        pass
+    # A reference in a read-only folder serves as well; it only costs this time at every opening.
+    with contextlib.suppress(OutputError), staging(paths.index) as folder:
+        staged = folder / paths.index.name
+        dump_index(staged, meta, arrays, _about(network, meta))
+        if _identities(paths) == before:
+            paths.index.unlink(missing_ok=True)
+            publish(staged, paths.index, replace=False)
     return meta, arrays
 
 
-def _identity(path: Path) -> tuple[int, int] | None:
-    """Return what tells a file from one that replaces it; None where there is none."""
-    if not path.exists():
-        return None
-    status = path.stat()
-    return status.st_ino, status.st_mtime_ns
+def _identities(paths: ReferencePaths) -> list[tuple[int, int] | None]:
+    """Return what tells each file from one that replaces it; None where there is none."""
+    found: list[tuple[int, int] | None] = []
+    for path in (paths.geopackage, paths.index):
+        try:
+            status = path.stat()
+            found.append((status.st_ino, status.st_mtime_ns))
+        except FileNotFoundError:
+            found.append(None)
+    return found
 
 
 def _about(network: RoadNetwork, meta: Mapping[str, Any]) -> dict[str, Any]:

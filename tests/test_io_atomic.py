@@ -4,6 +4,7 @@ import signal
 import subprocess
 import sys
 import time
+from contextlib import nullcontext
 from pathlib import Path
 
 import pytest
@@ -21,6 +22,29 @@ def test_a_file_appears_when_published(tmp_path: Path) -> None:
         publish(folder / "a.txt", target)
     assert target.read_text() == "new"
     assert list(tmp_path.iterdir()) == [target]
+
+
+def test_a_file_that_must_not_replace_another(tmp_path: Path) -> None:
+    write_twice(tmp_path, "exists")
+
+
+def write_twice(tmp_path: Path, message: str) -> None:
+    target = tmp_path / "a.txt"
+    for content in ("first", "second"):
+        with pytest.raises(OutputError, match=message) if target.exists() else nullcontext():  # noqa: SIM117
+            with staging(target) as folder:
+                (folder / "a.txt").write_text(content)
+                publish(folder / "a.txt", target, replace=False)
+    assert target.read_text() == "first"
+    assert list(tmp_path.iterdir()) == [target]
+
+
+def test_a_disk_without_hard_links(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    def refuse(*_: object) -> None:
+        raise PermissionError(errno.EPERM, "no hard links")
+
+    monkeypatch.setattr(os, "link", refuse)
+    write_twice(tmp_path, "may write to")
 
 
 @pytest.mark.parametrize("error", [ValueError, KeyboardInterrupt, OSError])

@@ -4,6 +4,7 @@ import os
 import struct
 import subprocess
 import sys
+import time
 from collections.abc import Iterator
 from dataclasses import replace
 from pathlib import Path
@@ -214,6 +215,24 @@ def test_readers_keep_the_reference_they_opened(path: Path, network: RoadNetwork
     write_reference(path, newer, parts(newer))
     np.testing.assert_array_equal(arrays["xy"], network.intersections.xy)
     np.testing.assert_array_equal(open_reference(path)[1]["xy"], newer.intersections.xy)
+
+
+def test_readers_are_not_disturbed_by_a_writer(tmp_path: Path) -> None:
+    """Every opening gives one whole reference, while another process replaces it again and again."""
+    path = tmp_path / "REF.gpkg"
+    command = [sys.executable, kill_writers.__file__, "--write", str(path)]
+    known = [as_stored(grid_network(size, size, seed=size)).intersections.xy for size in kill_writers.SIZES]
+    n_opened = {len(xy): 0 for xy in known}
+    with subprocess.Popen(command, stdout=subprocess.PIPE) as writer:
+        assert writer.stdout is not None
+        writer.stdout.readline()
+        end = time.monotonic() + 2
+        while time.monotonic() < end:
+            meta, arrays = open_reference(path, kill_writers.parts)
+            assert any(np.array_equal(arrays["xy"], xy) for xy in known)
+            n_opened[meta["n"]] += 1
+        writer.kill()
+    assert min(n_opened.values()) > 0
 
 
 def test_a_name_is_needed_by_nobody(tmp_path: Path, network: RoadNetwork) -> None:
