@@ -138,7 +138,7 @@ def fetch_lines(
         if not pieces:
             shutil.rmtree(folder, ignore_errors=True)
             raise RoadSourceError(
-                f"OpenStreetMap has no {which} roads there; check the area or try another --roads-kind"
+                f"OpenStreetMap has no {which} roads there; check the area or try another --kinds"
             )
         timestamp = _timestamp(folder)
     ends, highway, tunnel = (np.concatenate(column) for column in zip(*pieces, strict=True))

@@ -204,7 +204,7 @@ def _join(sources: Sequence[RoadLines], meta: dict[str, Any], attribution: str |
     """Take the lines of all sources to one plane."""
     filled = [source for source in sources if len(source.lines)]
     if not filled:
-        raise RoadSourceError(f"{_names(sources)}: no roads of the kind asked for; try another --roads-kind or area")
+        raise RoadSourceError(f"{_names(sources)}: no roads of the kind asked for; try another --kinds or area")
     plane = choose_plane(np.concatenate([_spread(source) for source in filled]))
     lines = np.concatenate([_to_plane(source, plane) for source in filled])
     calls = dict.fromkeys(source.meta["attribution"] for source in filled if source.meta.get("attribution"))

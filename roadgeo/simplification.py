@@ -124,10 +124,9 @@ def simplify(graph: RoadGraph, options: SimplifyOptions | None = None) -> RoadGr
     graph = _join_chains(graph)
     for _ in range(options.max_passes):
         before = graph.n_nodes, graph.n_edges
-        graph = _join_chains(_close_narrow_faces(graph, options))
-        graph = _join_chains(_merge_intersections(graph, options))
-        graph = _join_chains(_fuse_parallels(graph, options))
-        graph = _join_chains(_drop_stubs(graph, options))
+        for step in (_close_narrow_faces, _merge_intersections, _fuse_parallels, _drop_stubs):
+            changed = step(graph, options)
+            graph = graph if changed is graph else _join_chains(changed)
         if (graph.n_nodes, graph.n_edges) == before:
             break
     return graph
@@ -167,6 +166,7 @@ def _close_narrow_faces(graph: RoadGraph, options: SimplifyOptions) -> RoadGraph
     node = graph.edges.ravel()
     inner = np.flatnonzero(face >= 0)
     pairs = np.stack((node[inner], node[face[inner]]), axis=1).astype(np.int64)
+    pairs = pairs[pairs[:, 0] != pairs[:, 1]]
     filled = np.asarray((face >= 0).reshape(-1, 2).any(axis=1))
     return _merge(graph, pairs, np.full(len(pairs), np.inf), 0.0, drop=filled)
 
@@ -193,20 +193,24 @@ def _walk_faces(graph: RoadGraph) -> tuple[IntArray, FloatArray]:
 
 def _fuse_parallels(graph: RoadGraph, options: SimplifyOptions) -> RoadGraph:
     """Make one road of roads that run side by side, nearer than a mask shows apart."""
-    graph = _halve_loops(graph)
-    graph = _tie(graph, _find_ties(graph, options), options)
-    graph = _turned(graph)
-    by_ends = np.lexsort((graph.edges[:, 1], graph.edges[:, 0]))
+    halved = _halve_loops(graph)
+    tied = _tie(halved, _find_ties(halved, options), options)
+    ends = np.sort(tied.edges, axis=1)
+    by_ends = np.lexsort((ends[:, 1], ends[:, 0]))
+    ends = ends[by_ends]
+    if not ((ends[1:] == ends[:-1]).all(axis=1) & (ends[1:, 0] != ends[1:, 1])).any():
+        return graph if tied is halved else tied
+    turned = _turned(tied)
     edges, coords, offsets = kernels.fuse_twins(
-        graph.edges,
-        graph.offsets,
-        graph.coords,
-        _lengths(graph),
+        turned.edges,
+        turned.offsets,
+        turned.coords,
+        _lengths(turned),
         by_ends,
         1.5 * options.fuse_distance,
         0.5 * options.fuse_distance,
     )
-    return RoadGraph(graph.xy, edges, coords, offsets)
+    return RoadGraph(tied.xy, edges, coords, offsets)
 
 
 def _find_ties(graph: RoadGraph, options: SimplifyOptions) -> FloatArray:
@@ -257,6 +261,10 @@ def _tie(graph: RoadGraph, ties: FloatArray, options: SimplifyOptions) -> RoadGr
     fresh = np.ones(len(inner), bool)  # cuts closer than `snap` to the one before are the same
     fresh[1:] = (np.diff(edge[inner]) != 0) | (np.diff(along[inner]) > snap)
     node[inner] = graph.n_nodes + np.cumsum(fresh) - 1
+    pairs = node.reshape(-1, 2)
+    pairs = pairs[pairs[:, 0] != pairs[:, 1]]
+    if len(pairs) == 0:
+        return graph
     cuts = inner[fresh]
     places, edges, coords, offsets = kernels.cut_edges(
         graph.edges,
@@ -267,13 +275,14 @@ def _tie(graph: RoadGraph, ties: FloatArray, options: SimplifyOptions) -> RoadGr
         graph.n_nodes,
     )
     cut = RoadGraph(np.concatenate((graph.xy, places)), edges, coords, offsets)
-    pairs = node.reshape(-1, 2)
     return _merge(cut, pairs, np.full(len(pairs), 2.0 * options.fuse_distance), 4 * options.merge_radius)
 
 
 def _halve_loops(graph: RoadGraph) -> RoadGraph:
     """Cut loops in their middle, so that the two halves of a long narrow one run side by side."""
     loop = graph.edges[:, 0] == graph.edges[:, 1]
+    if not loop.any():
+        return graph
     places, edges, coords, offsets = kernels.cut_edges(
         graph.edges,
         graph.offsets,
@@ -298,12 +307,15 @@ def _merge(
 
     Loops shorter than `shortest_loop` vanish, and so do loops among the edges to `drop`.
     """
-    order = np.argsort(np.hypot(*(graph.xy[pairs[:, 0]] - graph.xy[pairs[:, 1]]).T), kind="stable")
-    cluster, centre = kernels.draw_together(graph.xy, pairs[order], radius[order])
-    coords, offsets = kernels.reattach(centre, graph.edges, graph.offsets, graph.coords)
-    edges = cluster[graph.edges].astype(np.int32)
-    merged = RoadGraph(centre, edges, coords, offsets)
-    loop = edges[:, 0] == edges[:, 1]
+    merged = graph
+    if len(pairs):
+        order = np.argsort(np.hypot(*(graph.xy[pairs[:, 0]] - graph.xy[pairs[:, 1]]).T), kind="stable")
+        cluster, centre = kernels.draw_together(graph.xy, pairs[order], radius[order])
+        coords, offsets = kernels.reattach(centre, graph.edges, graph.offsets, graph.coords)
+        merged = RoadGraph(centre, cluster[graph.edges].astype(np.int32), coords, offsets)
+    loop = merged.edges[:, 0] == merged.edges[:, 1]
+    if not loop.any():
+        return merged
     short = _lengths(merged) < shortest_loop
     return _keep_edges(merged, ~(loop & (short if drop is None else short | drop)))
 

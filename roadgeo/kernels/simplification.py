@@ -434,6 +434,11 @@ def find_mates(
         The sample nearest to each end of each edge, in any direction, of edges that do not meet it there, or -1.
     """
     n = len(xy)
+    x = xy[order, 0]  # neighbours side by side in memory
+    y = xy[order, 1]
+    east = direction[order, 0]
+    north = direction[order, 1]
+    owner = edge[order]
     mate = np.full(n, -1)
     apart = np.full(n, distance * distance)
     touch = np.full(2 * len(edges), -1)
@@ -447,29 +452,26 @@ def find_mates(
             while hi < n and key[hi] <= key[a] + row * n_columns + 1:
                 hi += 1
             i = order[a]
-            e = edge[i]
+            e = owner[a]
             end = -1
             if i == starts[e]:
                 end = 2 * e
             elif i == starts[e + 1] - 1:
                 end = 2 * e + 1
+            best = apart[i]
             for b in range(lo, hi):
-                j = order[b]
-                if e == edge[j]:
+                if owner[b] == e:
                     continue
-                dx = xy[j, 0] - xy[i, 0]
-                dy = xy[j, 1] - xy[i, 1]
-                d = dx * dx + dy * dy
-                if d < apart[i]:
-                    cos = direction[i, 0] * direction[j, 0] + direction[i, 1] * direction[j, 1]
-                    if abs(cos) >= min_cos:
-                        apart[i] = d
-                        mate[i] = j
+                d = (x[b] - x[a]) ** 2 + (y[b] - y[a]) ** 2
+                if d < best and abs(east[a] * east[b] + north[a] * north[b]) >= min_cos:
+                    best = d
+                    mate[i] = order[b]
                 if end >= 0 and d < nearest[end]:
                     node = edges[e, end % 2]
-                    if edges[edge[j], 0] != node and edges[edge[j], 1] != node:
+                    if edges[owner[b], 0] != node and edges[owner[b], 1] != node:
                         nearest[end] = d
-                        touch[end] = j
+                        touch[end] = order[b]
+            apart[i] = best
     return mate, np.sqrt(apart), touch
 
 
