@@ -64,9 +64,9 @@ class MatchOptions:
         Sweep(TripleOptions(), 40),
         Sweep(
             TripleOptions(
-                n_neighbours=12, codes_per_vertex=3, angle_tolerance_deg=10.0, max_hits=50_000, max_compared=4_000_000
+                n_neighbours=12, codes_per_vertex=3, angle_tolerance_deg=10.0, max_hits=20_000, max_compared=2_000_000
             ),
-            150,
+            60,
         ),
     )
     grow: GrowOptions = field(default_factory=GrowOptions)
