@@ -1,4 +1,4 @@
-"""Is a homography what a camera could have seen? Tilt, focal length and ground sampling of a plane seen by a pinhole."""
+"""Is a homography what a camera could have seen? Tilt, focal length and ground sampling of a plane under a pinhole."""
 
 from __future__ import annotations
 
@@ -27,9 +27,9 @@ class CameraOptions:
     focal_px : float or None
         Focal length, where it is known.
     max_skew : float
-        How far the homography may be from that of any pinhole with square pixels whose axis meets the middle of the frame: the
-        greater of |cos| of the angle between the images of two perpendicular unit vectors and the log of their lengths' ratio.
-        A crop or a lens's distortion moves it from 0.
+        How far the homography may be from that of any pinhole with square pixels whose axis meets the middle of the
+        frame: the greater of |cos| of the angle between the images of two perpendicular unit vectors and the log of
+        their lengths' ratio. A crop or a lens's distortion moves it from 0.
     north_up : bool
         The image's up is north, within 5 degrees.
     """
@@ -43,8 +43,19 @@ class CameraOptions:
 
 @dataclass(frozen=True)
 class CameraPose:
-    """What a homography says of the camera: ground sampling at the frame's middle, its up's direction clockwise from north, and
-    the pinhole that fits best. `focal_px` and `tilt_deg` are ill determined near the nadir."""
+    """What a homography says of the camera.
+
+    Attributes
+    ----------
+    gsd_m : float
+        Ground sampling at the middle of the frame, metres per pixel.
+    rotation_deg : float
+        Direction of the image's up there, clockwise from north.
+    tilt_deg, focal_px : float
+        Of the pinhole that fits best: the angle of its axis from the vertical. Ill determined near the nadir.
+    skew : float
+        How badly even that one fits (see `CameraOptions.max_skew`).
+    """
 
     gsd_m: float
     rotation_deg: float
@@ -62,8 +73,8 @@ def _jacobian(matrix: FloatArray, xy: FloatArray) -> FloatArray:
 def pose(matrix: FloatArray, size: tuple[int, int], focal_px: float | None = None) -> CameraPose:
     """Describe the camera behind a homography from the query plane (pixels, y up) to a metric plane.
 
-    For each focal length f the columns of diag(1/f, 1/f, 1) G, G the inverse map with the frame's middle as origin, should be
-    perpendicular and equally long (Hartley & Zisserman, 8.1.1); the f that comes nearest is taken.
+    For each focal length f the columns of diag(1/f, 1/f, 1) G, G the inverse map with the frame's middle as origin,
+    should be perpendicular and equally long (Hartley & Zisserman, 8.1.1); the f that comes nearest is taken.
     """
     center = np.array([size[0] / 2.0, -size[1] / 2.0])
     jacobian = _jacobian(matrix, center)

@@ -18,7 +18,8 @@ class Estimator(Protocol[Model]):
     def rounds(self) -> Iterator[Iterable[Model]]:
         """Yield hypotheses, a round at a time, the most promising rounds first.
 
-        All hypotheses that one sample of the query admits belong to one round, so that twins of a place are met together.
+        All hypotheses that one sample of the query admits belong to one round, so that twins of a place are met
+        together.
         """
 
     def score(self, model: Model) -> float:
@@ -55,7 +56,7 @@ class SearchOptions:
 
 @dataclass(frozen=True)
 class SearchResult(Generic[Model]):
-    """Best model, the best that means something else, their scores (-inf where there is none), and why the search ended."""
+    """Best model, the best that means something else, their scores (-inf where there is none), and what ended it."""
 
     best: Model | None
     score: float

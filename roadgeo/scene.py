@@ -124,7 +124,7 @@ def prepare_scene(
     pixels = np.round((graph.coords * (1.0, -1.0) / scale - 0.5) * 16).astype(np.int32)
     lines = [pixels[graph.offsets[e] : graph.offsets[e + 1]] for e in range(graph.n_edges)]
     cv2.polylines(canvas, lines, False, 0, 1, cv2.LINE_8, 4)
-    field = cv2.distanceTransform(canvas, cv2.DIST_L2, 3)
+    field = np.asarray(cv2.distanceTransform(canvas, cv2.DIST_L2, 3), np.float32)
     if observed is None:
         seen = np.ones(cells, bool)
     else:
@@ -132,5 +132,15 @@ def prepare_scene(
     k = options.n_neighbours
     neighbours = query_neighbours(intersections.xy, k) if len(intersections) else np.empty((0, k), np.int32)
     return Scene(
-        size, intersections, intersections.branches(), neighbours, points, directions, length, graph.n_edges, field, scale, seen
-    )  # fmt: skip
+        size=size,
+        intersections=intersections,
+        branches=intersections.branches(),
+        neighbours=neighbours,
+        points=points,
+        directions=directions,
+        road_length_px=length,
+        n_edges=graph.n_edges,
+        field=field,
+        field_scale=scale,
+        observed=seen,
+    )

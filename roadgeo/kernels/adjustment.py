@@ -1,21 +1,39 @@
 """Least-squares adjustment of a homography to matched intersections and to the roads of the map.
 
-The parameters are those of `kernels.growth`: p = (h00 h01 h02 h10 h11 h12 h20 h21), h22 = 1, between normalised coordinates,
-query (x - x0) / half_size and reference (X - X0) / unit.
+The parameters are those of `kernels.growth`: p = (h00 h01 h02 h10 h11 h12 h20 h21), h22 = 1, between normalised
+coordinates, query (x - x0) / half_size and reference (X - X0) / unit.
 """
 
 import math
 
 import numpy as np
 from numba import njit
+from numpy.typing import NDArray
 
 from roadgeo.kernels.growth import cholesky, solve_cholesky
 from roadgeo.kernels.roads import nearest_road
 
+__all__ = ["add_row", "adjust", "point_row"]
+
 
 @njit(cache=True)
-def point_row(p, u, v, axis_x, axis_y, row):
-    """Fill `row` (8) with the derivative of the predicted point's component along (axis_x, axis_y); return (X, Y, w)."""
+def point_row(
+    p: NDArray[np.float64], u: float, v: float, axis_x: float, axis_y: float, row: NDArray[np.float64]
+) -> tuple[float, float, float]:
+    """Differentiate a predicted point's component along (axis_x, axis_y) by the parameters `p` (8,).
+
+    Parameters
+    ----------
+    u, v : float
+        Normalised query point.
+    row : (8,) float64
+        Filled with the derivative.
+
+    Returns
+    -------
+    x', y', w : float
+        The point, normalised, and its denominator.
+    """
     w = 1.0 + p[6] * u + p[7] * v
     x, y = (p[0] * u + p[1] * v + p[2]) / w, (p[3] * u + p[4] * v + p[5]) / w
     row[0], row[1], row[2] = axis_x * u / w, axis_x * v / w, axis_x / w
@@ -26,8 +44,14 @@ def point_row(p, u, v, axis_x, axis_y, row):
 
 
 @njit(cache=True)
-def add_row(normal, right, row, weight, residual):
-    """Add one weighted equation to the lower triangle of the system."""
+def add_row(
+    normal: NDArray[np.float64],
+    right: NDArray[np.float64],
+    row: NDArray[np.float64],
+    weight: float,
+    residual: float,
+) -> None:
+    """Add the equation row . dp = residual to the lower triangle of the normal equations `normal` dp = `right`."""
     for r in range(8):
         scaled = weight * row[r]
         for c in range(r + 1):
@@ -37,18 +61,69 @@ def add_row(normal, right, row, weight, residual):
 
 @njit(cache=True)
 def adjust(
-    p, unit, origin_x, origin_y, points, directions, point_cells, point_weight, pairs, targets, pair_cells, pair_weight,
-    n_cells, least_share, max_radius, min_cos, sigma_m, prior, n_iterations, tolerance_m,
-    segments, starts, ids, grid, shape, normal,
-):  # fmt: skip
-    """Adjust `p` in place by Gauss-Newton with Cauchy weights; return (road points used, robust rms in metres), or (-1, inf).
+    p: NDArray[np.float64],
+    unit: float,
+    origin_x: float,
+    origin_y: float,
+    points: NDArray[np.float64],
+    directions: NDArray[np.float64],
+    point_cells: NDArray[np.int64],
+    point_weight: float,
+    pairs: NDArray[np.float64],
+    targets: NDArray[np.float64],
+    pair_cells: NDArray[np.int64],
+    pair_weight: float,
+    n_cells: int,
+    least_share: float,
+    max_radius: float,
+    min_cos: float,
+    sigma_m: float,
+    prior: float,
+    n_iterations: int,
+    tolerance_m: float,
+    segments: NDArray[np.float32],
+    starts: NDArray[np.int32],
+    ids: NDArray[np.int32],
+    grid: tuple[float, float, float],
+    shape: tuple[int, int],
+    normal: NDArray[np.float64],
+) -> tuple[int, float]:
+    """Adjust a homography by Gauss-Newton with Cauchy weights.
 
-    `points` (S, 2) with unit `directions` (S, 2) are road points, `pairs` (M, 2) matched intersections with their `targets` (M, 2), all
-    normalised. A road point's residual is its distance across the nearest road of the map that runs its way. How far off it may be
-    is predicted from the system so far: it is searched as far as three times that, and not at all beyond `max_radius`, so that the fit
-    grows outwards from where it is sure. The frame is divided into `n_cells` cells (`point_cells`, `pair_cells`: each observation's own):
-    where less than `least_share` of a cell's searched points meet a road, what does meet one is chance, and the cell waits. `prior` is the weight that holds the perspective parameters near zero; `point_weight` and
-    `pair_weight` are those of an observation of standard deviation `sigma_m`. On return `normal` (8, 8) holds the last system.
+    The first step takes matched intersections only. Then a road point's residual is its distance across the nearest
+    road of the map that runs its way. How far off it may be is predicted from the system so far: it is searched as far
+    as three times that, and not at all beyond `max_radius`, so that the fit grows outwards from where it is sure. Where
+    fewer than `least_share` of a cell's searched points meet a road, what does meet one is chance, and the cell waits.
+
+    Parameters
+    ----------
+    p : (8,) float64
+        Adjusted in place.
+    unit, origin_x, origin_y : float
+        Metres per normalised unit, and the reference point of the normalised (0, 0).
+    points, directions : (S, 2) float64
+        The query's road points, normalised, and unit vectors along the road.
+    pairs, targets : (M, 2) float64
+        Matched intersections in query and reference, normalised.
+    point_cells : (S,) int64, pair_cells : (M,) int64
+        The one of `n_cells` cells of the frame that each lies in.
+    point_weight, pair_weight : float
+        Of an observation, against one of standard deviation `sigma_m`.
+    max_radius, sigma_m, tolerance_m : float
+        Metres. The iteration ends when no parameter moves by more than the tolerance.
+    min_cos, segments, starts, ids, grid, shape
+        As in `nearest_road`.
+    prior : float
+        Weight that holds the two perspective parameters near zero.
+    normal : (8, 8) float64
+        Filled with the last normal matrix.
+
+    Returns
+    -------
+    n : int
+        Road points that took part; -1 where the adjustment failed.
+    rms : float
+        Weighted rms of their residuals, metres; inf where it failed or there are none.
     """
     right = np.empty(8)
     row = np.empty(8)
