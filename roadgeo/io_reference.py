@@ -6,12 +6,13 @@ import contextlib
 import math
 import os
 from collections.abc import Callable, Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, fields
 from pathlib import Path
 from typing import Any, Literal, TypeAlias
 
 import numpy as np
 
+from roadgeo._version import __version__
 from roadgeo.errors import IndexFormatError, OutputError
 from roadgeo.geopackage import open_read_only
 from roadgeo.intersections import Intersections
@@ -331,10 +332,19 @@ def _check_geopackage(path: Path) -> tuple[RoadNetwork | None, list[str]]:
 
 
 def _check_content(path: Path, network: RoadNetwork | None) -> list[str]:
-    """Check that an undamaged index is one that the search can use, and that of its GeoPackage."""
-    from roadgeo.index import ReferenceIndex, check_table, pack_tangents
+    """Check that an undamaged index is one that the search can use, and what its GeoPackage gives."""
+    from roadgeo.index import IndexOptions, ReferenceIndex, build_index, check_table
 
-    about = read_manifest(path)["about"]
+    def are_options(stored: Any) -> bool:
+        """Whether stored options are whole, and no larger than the arrays that they made."""
+        return (
+            type(stored) is dict
+            and stored.keys() == {field.name for field in fields(IndexOptions)}
+            and all(type(value) in (int, float) and math.isfinite(value) for value in stored.values())
+            and stored["n_neighbours"] == index.neighbours.shape[1]
+        )
+
+    manifest = read_manifest(path)
     try:
         index = ReferenceIndex.from_parts(*read_index(path), path=str(path))
         check_table(index)
@@ -342,14 +352,17 @@ def _check_content(path: Path, network: RoadNetwork | None) -> list[str]:
         return [str(error)]
     if network is None:
         return []
-    if about.get("network") != network_digest(network):
-        return [f"{path} is stale: it was built from other intersections; delete it and it will be built again"]
-    found = network.intersections
-    source = np.asarray(index.source)
-    if not np.array_equal(np.sort(source), np.arange(len(found))):
-        return [f"{path}: its intersections are not those of the GeoPackage; delete it and it will be built again"]
-    same = np.array_equal(found.xy[source], index.xy)
-    same = same and np.array_equal(pack_tangents(found.tangents[source]), index.tangents)
-    return (
-        [] if same else [f"{path}: its intersections lie elsewhere than the GeoPackage's; delete it to build it again"]
-    )
+    remedy = "delete it and it will be built again"
+    if manifest["about"].get("network") != network_digest(network):
+        return [f"{path} is stale: it was built from other intersections; {remedy}"]
+    if manifest["roadgeo"] != __version__:  # which may well have built another index
+        return []
+    stored = index.meta.get("index_options")
+    if not are_options(stored):
+        return [f"{path}: its options are none that `roadgeo index` writes; {remedy}"]
+    expected = build_index(network, IndexOptions(**stored)).arrays()
+    return [
+        f"{path}: its array {name!r} is not what the GeoPackage gives; {remedy}"
+        for name, array in index.arrays().items()
+        if not np.array_equal(array, expected[name], equal_nan=array.dtype.kind == "f")
+    ]

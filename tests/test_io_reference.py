@@ -362,9 +362,9 @@ def test_damage_of_either_file_is_found(checked: Path) -> None:
     [
         ("neighbours", lambda a: a + 1000, "out of range"),
         ("table_entries", lambda a: a | np.uint64(0xFFFF << 32), "out of range"),
-        ("source", lambda a: a * 0, "not those of the GeoPackage"),
-        ("xy", lambda a: a + 0.25, "elsewhere"),
-        ("tangents", lambda a: a[:, ::-1].copy(), "elsewhere"),
+        ("source", lambda a: a * 0, "array 'source' is not what the GeoPackage gives"),
+        ("xy", lambda a: a + 0.25, "array 'xy' is not what the GeoPackage gives"),
+        ("segments", lambda a: a + 0.25, "array 'segments' is not what the GeoPackage gives"),
     ],
 )
 def test_an_index_that_cannot_be_used_is_found(
@@ -375,6 +375,17 @@ def test_an_index_that_cannot_be_used_is_found(
     problems = check_reference(paths.geopackage)
     assert len(problems) == 1
     assert message in problems[0]
+
+
+@pytest.mark.parametrize("options", [None, {}, {"n_neighbours": 10**9}, {"simplify_m": "x"}, {"else": 1}])
+def test_options_that_nobody_wrote_are_found(
+    tmp_path: Path, sound: tuple[RoadNetwork, IndexParts], options: dict[str, Any] | None
+) -> None:
+    network, (meta, arrays) = sound
+    stored = meta["index_options"] | options if options else options
+    paths = write_reference(tmp_path / "grid", network, (meta | {"index_options": stored}, arrays))
+    (problem,) = check_reference(paths.geopackage)
+    assert "its options are none that" in problem
 
 
 def test_a_stale_index_and_an_unnoticed_edit_are_found(checked: Path) -> None:
