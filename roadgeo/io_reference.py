@@ -357,7 +357,7 @@ def _check_content(path: Path, network: RoadNetwork | None) -> list[str]:
         return [f"{path} is stale: it was built from other intersections; {remedy}"]
     if manifest["roadgeo"] != __version__:  # which may well have built another index
         return []
-    stored = index.meta.get("index_options")
+    stored: Any = index.meta.get("index_options")
     if not are_options(stored):
         return [f"{path}: its options are none that `roadgeo index` writes; {remedy}"]
     expected = build_index(network, IndexOptions(**stored)).arrays()
