@@ -1,0 +1,68 @@
+"""Figure 7: how many tuples of two intersections there are of each type; and whether to draw the rarest first pays.
+
+    python examples/paper/figure7.py boston-ma --out results
+
+A type is d_b = [N_B(P1), N_B(P2), N_q(P1), N_q(P2)]: branches and tangents of both ends.
+"""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import experiments as paper
+import numpy as np
+
+from roadgeo.pairs import build_pair_index
+from roadgeo.trials import DrawnMasks
+from roadgeo.workflows import open_reference
+
+
+def main() -> None:
+    """Run the experiment."""
+    parser = paper.arguments(__doc__, queries=50)
+    options = parser.parse_args()
+    area = paper.search_area(options.reference, options.out)
+    table = build_pair_index(paper.reference_intersections(open_reference(area).index), paper.PAIR)
+    counts = np.diff(table.offsets)
+    order = np.argsort(-counts)
+    shares = np.cumsum(counts[order]) / counts.sum()
+    print(f"{len(table):,} tuples of {len(counts)} types; the commonest:")
+    for t in order[:8]:
+        print(f"  {table.types[t].tolist()}  {counts[t]:>9,}  {100 * counts[t] / counts.sum():.1f} %")
+    print(
+        f"{np.searchsorted(shares, 0.9) + 1} types hold 90 % of them; {np.sum(counts < 100)} types have fewer than 100"
+    )
+
+    results = []
+    for noise in ("clean", "segmented", "poor"):
+        queries = DrawnMasks(area, ((paper.masks(1500.0, noise, options.seed), options.queries),))
+        for rarest in (True, False):
+            pair = replace(paper.PAIR, rarest_first=rarest, time_limit_s=options.time_limit)
+            name = f"{noise}, {'rarest type first' if rarest else 'any type'}"
+            done, found = paper.trials(queries, paper.PairLocator(area, pair), options, name)
+            tested = [t.answer["stats"]["hypotheses"] for t in done if t.answer["status"] == "located"]
+            results.append(
+                {
+                    "noise": noise,
+                    "rarest_first": rarest,
+                    "median_hypotheses_of_located": float(np.median(tested)) if tested else None,
+                    **paper.point(found),
+                }
+            )
+    types = [{"type": table.types[t].tolist(), "tuples": int(counts[t])} for t in order]
+    paper.save(options.out, "figure7", {"reference": area.stem, "types": types, "rarest_first": results})
+
+    figure, (bars, orders) = paper.axes()
+    bars.bar(np.arange(len(counts)), counts[order], width=1.0)
+    bars.set(yscale="log", xlabel="types, by frequency", ylabel="tuples", title=f"{area.stem}: {len(table):,} tuples")
+    at = np.arange(3)
+    for rarest, shift in ((True, -0.2), (False, 0.2)):
+        chosen = [r["recall"]["value"] for r in results if r["rarest_first"] is rarest]
+        orders.bar(at + shift, chosen, 0.4, label="rarest type first" if rarest else "any type")
+    orders.set(xticks=at, xticklabels=["clean", "segmented", "poor"], ylim=(0, 1.03), ylabel="recall of pair")
+    orders.legend()
+    figure.savefig(options.out / "figure7.png", dpi=110)
+
+
+if __name__ == "__main__":
+    main()
