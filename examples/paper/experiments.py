@@ -19,7 +19,7 @@ from roadgeo.drawing import NOISE_MODELS
 from roadgeo.evaluation import Evaluation, evaluate
 from roadgeo.graph import RoadGraph
 from roadgeo.grid import PIXEL_TO_PLANE, RoadMask
-from roadgeo.index import ReferenceIndex, build_index
+from roadgeo.index import build_index
 from roadgeo.intersections import Intersections, find_intersections
 from roadgeo.io_network import as_stored, read_network
 from roadgeo.library import resolve_reference
@@ -107,12 +107,11 @@ class PairLocator:
 
     def open(self) -> Callable[[Any], dict[str, Any]]:
         """Build the paper's tables."""
-        index = open_reference(self.reference).index
-        found = reference_intersections(index)
-        table = build_pair_index(found, self.options)
-        return lambda mask: self._locate(mask, index, found, table)
+        network = read_network(self.reference)
+        table = build_pair_index(network.intersections, self.options)
+        return lambda mask: self._locate(mask, network, table)
 
-    def _locate(self, mask: Any, index: ReferenceIndex, found: Intersections, table: PairIndex) -> dict[str, Any]:
+    def _locate(self, mask: Any, network: RoadNetwork, table: PairIndex) -> dict[str, Any]:
         from time import perf_counter
 
         started = perf_counter()
@@ -121,11 +120,11 @@ class PairLocator:
         query, options = scene.intersections, self.options
         if self.n_r is not None:
             query, options = subset(query, self.n_r), replace(options, min_intersections=min(self.n_r, len(query)))
-        match = match_pairs(query, found, table, scene.corners, options)
+        match = match_pairs(query, network.intersections, table, scene.corners, options)
         answer = {
             "status": "not_located" if match.homography is None else "located",
             "reason": match.reason,
-            "crs": index.plane.crs,
+            "crs": network.plane.crs,
             "size": list(scene.size),
             "n_intersections": len(query),
             "inlier_ratio": match.inlier_ratio,
@@ -133,7 +132,7 @@ class PairLocator:
             "stats": {"tuples_sampled": match.n_samples, "hypotheses": match.hypotheses},
         }
         if match.homography is not None:
-            matrix = index.plane.to_crs_matrix() @ match.homography @ PIXEL_TO_PLANE
+            matrix = network.plane.to_crs_matrix() @ match.homography @ PIXEL_TO_PLANE
             answer["homography"] = (matrix / matrix[2, 2]).tolist()
         return answer
 
@@ -169,12 +168,6 @@ def as_mask(mask: Any) -> RoadMask:
     return read_mask(mask)
 
 
-def reference_intersections(index: ReferenceIndex) -> Intersections:
-    """Intersections of a reference as the matcher wants them."""
-    n = len(index)
-    return Intersections(index.xy, index.rays, index.tangents, np.zeros(n, np.float32), np.arange(n))
-
-
 def subset(found: Intersections, n_r: int) -> Intersections:
     """Choose N_r intersections at random, always the same for the same mask (section 4.3)."""
     rng = np.random.default_rng(zlib.crc32(found.xy.tobytes()))
@@ -183,16 +176,18 @@ def subset(found: Intersections, n_r: int) -> Intersections:
 
 
 def middle(mask: RoadMask, n_r: int) -> RoadMask:
-    """Keep the square around the middle that holds N_r intersections; the rest was not observed."""
+    """Keep the smallest square around the middle that shows N_r intersections; the rest was not observed."""
     scene, _ = trace_query(mask)
     height, width = mask.shape
-    row = np.abs(-scene.intersections.xy[:, 1] - height / 2)
-    column = np.abs(scene.intersections.xy[:, 0] - width / 2)
-    reach = np.sort(np.maximum(row, column))[: n_r + 1]
-    half = float(reach[-1]) - 1.0 if len(reach) > n_r else float(max(height, width))
-    rows, columns = np.abs(np.arange(height) + 0.5 - height / 2), np.abs(np.arange(width) + 0.5 - width / 2)
-    observed = (rows[:, None] < half) & (columns[None, :] < half)
-    return RoadMask(mask.roads & observed, observed, mask.name)
+    rows, columns = (np.abs(np.arange(n) + 0.5 - n / 2) for n in (height, width))
+    away = np.abs(scene.intersections.xy * (1, -1) - (width / 2, height / 2)).max(axis=1)
+    # Those near its border lose a branch, so a square around N_r of them does not show as many.
+    for half in np.sort(away)[n_r :: max(n_r // 5, 1)]:
+        observed = (rows[:, None] < half) & (columns[None, :] < half)
+        part = RoadMask(mask.roads & observed, observed, mask.name)
+        if len(trace_query(part)[0].intersections) >= n_r:
+            return part
+    return mask
 
 
 def trials(queries: QuerySet, locator: Any, options: argparse.Namespace, what: str) -> tuple[list[Trial], Evaluation]:

@@ -14,7 +14,6 @@ import numpy as np
 
 from roadgeo.pairs import build_pair_index
 from roadgeo.trials import DrawnMasks
-from roadgeo.workflows import open_reference
 
 
 def main() -> None:
@@ -22,7 +21,7 @@ def main() -> None:
     parser = paper.arguments(__doc__, queries=50)
     options = parser.parse_args()
     area = paper.search_area(options.reference, options.out)
-    table = build_pair_index(paper.reference_intersections(open_reference(area).index), paper.PAIR)
+    table = build_pair_index(paper.read_network(area).intersections, paper.PAIR)
     counts = np.diff(table.offsets)
     order = np.argsort(-counts)
     shares = np.cumsum(counts[order]) / counts.sum()

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import math
 import time
 from collections.abc import Iterator, Sequence
 from pathlib import Path
@@ -16,7 +17,7 @@ from roadgeo.cli.queries import count_up, query_options, query_sets
 if TYPE_CHECKING:
     from rich.table import Table
 
-    from roadgeo.evaluation import Evaluation, Share, Summary
+    from roadgeo.evaluation import Evaluation, Share, Spread, Summary
     from roadgeo.trials import QuerySet, ReferenceLocator
 
 __all__ = ["evaluate_command"]
@@ -173,19 +174,19 @@ def _table(title: str, groups: Sequence[Summary]) -> Table:
 
     table = Table(title=title, title_justify="left", box=SIMPLE_HEAD, pad_edge=False, padding=(0, 1, 0, 0))
     absent = any(group.refused.of for group in groups)
-    heads = ["", "masks", "precision %", "recall %", *(["refused %"] if absent else []), "centre m", "corners m", "ms"]
+    heads = ["", "masks", "precision %", "recall %", *(["refused"] if absent else []), "centre m", "corners m", "ms"]
     for head in heads:
         table.add_column(head, justify="right" if head else "left", no_wrap=True)
     for group in groups:
-        errors = (group.center_m, group.corners_rms_m)
         table.add_row(
             group.name,
             str(group.queries),
             _percent(group.precision),
             _percent(group.recall),
-            *([_percent(group.refused)] if absent else []),
-            *(f"{spread.median:.1f}/{spread.p95:.1f}" for spread in errors),
-            f"{1000 * group.compute_s.median:.0f}/{1000 * group.compute_s.p95:.0f}",
+            *([f"{group.refused.hits}/{group.refused.of}" if group.refused.of else "-"] if absent else []),
+            _pair(group.center_m, 1),
+            _pair(group.corners_rms_m, 1),
+            _pair(group.compute_s, 0, 1000),
         )
     return table
 
@@ -194,6 +195,13 @@ def _percent(estimate: Share) -> str:
     if not estimate.of:
         return "-"
     return f"{100 * estimate.value:.1f} ({100 * estimate.low:.0f}-{100 * estimate.high:.0f})"
+
+
+def _pair(spread: Spread, digits: int, scale: float = 1.0) -> str:
+    """Median and 95th percentile."""
+    if math.isnan(spread.median):
+        return "-"
+    return f"{scale * spread.median:.{digits}f}/{scale * spread.p95:.{digits}f}"
 
 
 def _verdicts(evaluation: Evaluation) -> Iterator[str]:
