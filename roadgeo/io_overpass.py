@@ -137,9 +137,7 @@ def fetch_lines(
         pieces = [_edges(graph) for graph in graphs if graph is not None]
         if not pieces:
             shutil.rmtree(folder, ignore_errors=True)
-            raise RoadSourceError(
-                f"OpenStreetMap has no {which} roads there; check the area or try another --kinds"
-            )
+            raise RoadSourceError(f"OpenStreetMap has no {which} roads there; check the area or try another --kinds")
         timestamp = _timestamp(folder)
     ends, highway, tunnel = (np.concatenate(column) for column in zip(*pieces, strict=True))
     meta = {"format": "OpenStreetMap", "features": len(ends), "attribution": OSM_ATTRIBUTION}
