@@ -1,0 +1,383 @@
+"""Slow, obvious twins of the matching engine's kernels: of the same names, without buckets and without early exits."""
+
+from itertools import combinations, permutations, product
+
+import numpy as np
+
+# buckets
+
+
+def nearest_neighbours(xy, k):
+    """Distances (N, k) of each point's nearest others, NaN where there are fewer."""
+    far = np.hypot(*(xy[:, None] - xy[None]).transpose(2, 0, 1))
+    found = np.full((len(xy), k), np.nan)
+    for i in range(len(xy)):
+        others = np.sort(np.delete(far[i], i))[:k]
+        found[i, : len(others)] = others
+    return found
+
+
+# rays
+
+
+def vectors(branches):
+    """Branches of one intersection without the padding, (n, 2) float."""
+    return branches[(branches != 0).any(axis=1)].astype(float)
+
+
+def rays_agree(branches, i, ref_branches, j, J, tolerance):
+    """Each branch in turn takes the nearest free partner within `tolerance` radians; the poorer side must be served."""
+    turned = [np.arctan2(*(J @ b)[::-1]) for b in vectors(branches[i])]
+    free = [np.arctan2(*b[::-1]) for b in vectors(ref_branches[j])]
+    needed = min(len(turned), len(free))
+    taken = 0
+    for angle in turned:
+        gaps = [abs((angle - other + np.pi) % (2 * np.pi) - np.pi) for other in free]
+        if gaps and min(gaps) < tolerance:
+            free.pop(int(np.argmin(gaps)))
+            taken += 1
+    return taken >= needed
+
+
+# roads
+
+
+def bin_segments(segments, grid, shape):
+    """For every bucket the segments that pass through its square, sampled finely."""
+    listed = [set() for _ in range(shape[0] * shape[1])]
+    for s, (x1, y1, x2, y2) in enumerate(segments.astype(float)):
+        for t in np.linspace(0, 1, 400):
+            c = int(np.floor((x1 + t * (x2 - x1) - grid[0]) / grid[2]))
+            r = int(np.floor((y1 + t * (y2 - y1) - grid[1]) / grid[2]))
+            if 0 <= c < shape[0] and 0 <= r < shape[1]:
+                listed[r * shape[0] + c].add(s)
+    return listed
+
+
+def nearest_road(x, y, dx, dy, radius, min_cos, segments):
+    """(distance, foot, direction) of the nearest road alike in direction, among all."""
+    best = (np.inf, np.zeros(2), np.zeros(2))
+    for x1, y1, x2, y2 in segments.astype(float):
+        start, step = np.array([x1, y1]), np.array([x2 - x1, y2 - y1])
+        length = np.hypot(*step)
+        if length == 0 or abs(step @ (dx, dy)) < min_cos * length:
+            continue
+        t = np.clip((np.array([x, y]) - start) @ step / length**2, 0, 1)
+        foot = start + t * step
+        distance = np.hypot(*(foot - (x, y)))
+        if distance < min(best[0], radius):
+            best = (distance, foot, step / length)
+    return best
+
+
+def transform(matrix, xy):
+    """A point under a homography, or None beyond the horizon."""
+    x, y, w = matrix @ (*xy, 1.0)
+    return np.array([x, y]) / w if w > 0 else None
+
+
+def jacobian(matrix, xy, step=1e-4):
+    """By central differences."""
+    columns = [(transform(matrix, xy + move) - transform(matrix, xy - move)) / (2 * step) for move in step * np.eye(2)]
+    return np.stack(columns, axis=1)
+
+
+def forward_distances(matrix, points, directions, radius, min_cos, shift, segments):
+    found = np.full(len(points), np.inf)
+    for i, (point, direction) in enumerate(zip(points, directions, strict=True)):
+        place = transform(matrix, point)
+        if place is None:
+            continue
+        along = jacobian(matrix, point) @ direction
+        found[i] = nearest_road(*(place + shift), *(along / np.hypot(*along)), radius, min_cos, segments)[0]
+    return found
+
+
+def backward_agreement(inverse, step, tolerance_m, shift, segments, inside, field, field_scale, observed):
+    """Samples of all segments for which `inside(x, y)`, seen and shown."""
+    seen = shown = 0
+    for s, (x1, y1, x2, y2) in enumerate(segments.astype(float)):
+        count = int(np.hypot(x2 - x1, y2 - y1) / step + (s * 0.6180339887) % 1.0)
+        for k in range(count):
+            t = (k + 0.5) / count
+            place = np.array([x1 + t * (x2 - x1), y1 + t * (y2 - y1)])
+            pixel = transform(inverse, place - shift)
+            if not inside(*place) or pixel is None:
+                continue
+            column, row = np.floor(pixel * (1, -1) / field_scale).astype(int)
+            if not (0 <= row < field.shape[0] and 0 <= column < field.shape[1]) or not observed[row, column]:
+                continue
+            seen += 1
+            scale = np.sqrt(abs(np.linalg.det(jacobian(inverse, place - shift))))
+            shown += field[row, column] * field_scale <= tolerance_m * scale + 0.7 * field_scale
+    return seen, shown
+
+
+def screen(references, affines, anchor_xy, ref_xy, points, directions, radius, radius_px, min_cos, least, segments):
+    shares = []
+    for reference, affine in zip(references, affines, strict=True):
+        J = affine.reshape(2, 2)
+        reach = radius + radius_px * np.sqrt(np.linalg.det(J))
+        hits = 0
+        for point, direction in zip(points, directions, strict=True):
+            place = ref_xy[reference] + J @ (point - anchor_xy)
+            along = J @ direction / np.hypot(*(J @ direction))
+            hits += nearest_road(*place, *along, reach, min_cos, segments)[0] < np.inf
+        share = hits / len(points) if len(points) else 1.0
+        shares.append(share if len(points) - hits <= (1.0 - least) * len(points) else 0.0)
+    return np.array(shares)
+
+
+# growth
+
+
+def predict(p, u, v):
+    x, y, w = np.append(p, 1.0).reshape(3, 3) @ (u, v, 1.0)
+    return np.array([x / w, y / w])
+
+
+def predict_rows(p, u, v, step=1e-6):
+    """(2, 8) derivative of a predicted point by the parameters, by central differences."""
+    return np.stack([(predict(p + move, u, v) - predict(p - move, u, v)) / (2 * step) for move in step * np.eye(8)], 1)
+
+
+def fit_homography(query, image, matched, prior, p):
+    """One weighted linear least-squares step: x' w = h . (u, v, 1), over the old w. Returns p and the normal matrix."""
+    rows, right = [], []
+    for (u, v), target, m in zip(query, image, matched, strict=True):
+        if m < 0:
+            continue
+        w = 1.0 + p[6] * u + p[7] * v
+        x, y = target
+        rows.append(np.array([u, v, 1, 0, 0, 0, -x * u, -x * v]) / w)
+        rows.append(np.array([0, 0, 0, u, v, 1, -y * u, -y * v]) / w)
+        right += [x / w, y / w]
+    rows += [np.sqrt(prior) * np.eye(8)[k] for k in (6, 7)]
+    rows += list(np.sqrt(1e-9) * np.eye(8))
+    right += [0.0] * 10
+    A = np.array(rows)
+    return np.linalg.lstsq(A, np.array(right), rcond=None)[0], A.T @ A
+
+
+def prediction_variance(normal, p, u, v):
+    rows = predict_rows(p, u, v)
+    return np.trace(rows @ np.linalg.inv(normal) @ rows.T)
+
+
+def nearest_alike(x, y, radius, branches, i, ref_xy, ref_branches, J, tolerance):
+    best, where = radius, -1
+    for j in range(len(ref_xy)):
+        distance = np.hypot(*(ref_xy[j] - (x, y)))
+        if distance < best and rays_agree(branches, i, ref_branches, j, J, tolerance):
+            best, where = distance, j
+    return where, best
+
+
+def keep_nearest(matched, distance):
+    """Every partner's nearest claimant keeps it, the first of equals."""
+    kept = np.full(len(matched), -1)
+    for partner in set(matched[matched >= 0].tolist()):
+        claimants = np.flatnonzero(matched == partner)
+        kept[claimants[np.argmin(distance[claimants])]] = partner
+    return kept
+
+
+def match_all(matrix, xy, branches, radius, tolerance, shift, one_to_one, ref_xy, ref_branches):
+    matched, distance = np.full(len(xy), -1), np.full(len(xy), float(radius))
+    for i, point in enumerate(xy):
+        place = transform(matrix, point)
+        if place is not None:
+            matched[i], distance[i] = nearest_alike(
+                *(place + shift), radius, branches, i, ref_xy, ref_branches, jacobian(matrix, point), tolerance
+            )
+    return keep_nearest(matched, distance) if one_to_one else matched, distance
+
+
+def grow(
+    xy, branches, order, half_size, anchor, ref_anchor, affine, neighbours, partners, ref_xy, ref_branches,
+    sigma_m, radius_m, tolerance, perspective_sigma, hit_rate, chance_rate, patience,
+):  # fmt: skip
+    """(matches, tests, ratio, matched, matrix) of a hypothesis that grows from its seeds; matrix None: given up."""
+    unit = half_size * np.sqrt(np.linalg.det(affine.reshape(2, 2)))
+    query = (xy - xy[anchor]) / half_size
+    seeds = {anchor: ref_anchor, **{int(neighbours[anchor, s]): int(b) for s, b in enumerate(partners) if b >= 0}}
+    matched = np.full(len(xy), -1)
+    matched[list(seeds)] = list(seeds.values())
+    prior = (sigma_m / unit) ** 2 / perspective_sigma**2
+    hit, miss = np.log(hit_rate / chance_rate), np.log((1 - hit_rate) / (1 - chance_rate))
+
+    def fit(p):
+        return fit_homography(query, (ref_xy[matched] - ref_xy[ref_anchor]) / unit, matched, prior, p)
+
+    def search(i, p, normal):
+        """(map intersection or -1, distance, radius) at the predicted place of a query point."""
+        u, v = query[i]
+        spread = np.sqrt(0.5 * prediction_variance(normal, p, u, v))
+        radius = 2.5 * sigma_m * np.hypot(spread, 1.0)
+        model = np.append(p, 1.0).reshape(3, 3)
+        place = ref_xy[ref_anchor] + unit * predict(p, u, v)
+        J = jacobian(model, query[i])
+        return place, radius, J
+
+    p, normal = fit(np.zeros(8))
+    p, normal = fit(p)
+    ratio, fitted, tested = 0.0, len(seeds), set(seeds)
+    for _ in range(8):
+        before = len(tested)
+        found = 0
+        for i in order:
+            if i in tested:
+                continue
+            place, radius, J = search(i, p, normal)
+            if radius > radius_m:
+                continue
+            tested.add(i)
+            j, _ = nearest_alike(*place, radius, branches, i, ref_xy, ref_branches, J, tolerance)
+            ratio += hit if j >= 0 else miss
+            if j < 0 and ratio < -patience:
+                return (matched >= 0).sum() - len(seeds), len(tested) - len(seeds), -np.inf, matched, None
+            if j >= 0:
+                found += 1
+                matched[i] = j
+                if (matched >= 0).sum() >= 1.2 * fitted:
+                    p, normal = fit(p)
+                    fitted = (matched >= 0).sum()
+        assert len(tested) >= before
+        p, normal = fit(p)
+        if found == 0:
+            break
+    for _ in range(2):
+        distance = np.full(len(xy), np.inf)
+        for i in range(len(xy)):
+            place, radius, J = search(i, p, normal)
+            matched[i], distance[i] = nearest_alike(
+                *place, min(radius, radius_m), branches, i, ref_xy, ref_branches, J, tolerance
+            )
+        matched = keep_nearest(matched, distance)
+        others = [i for i in range(len(xy)) if i not in seeds]
+        hits = sum(matched[i] >= 0 for i in others)
+        ratio = hits * hit + (len(others) - hits) * miss
+        p, normal = fit(p)
+    to_query = np.array(
+        [[1 / half_size, 0, -xy[anchor, 0] / half_size], [0, 1 / half_size, -xy[anchor, 1] / half_size]]
+    )
+    to_ground = np.array([[unit, 0, ref_xy[ref_anchor, 0]], [0, unit, ref_xy[ref_anchor, 1]], [0, 0, 1]])
+    matrix = to_ground @ np.append(p, 1.0).reshape(3, 3) @ np.vstack([to_query, [0, 0, 1]])
+    return hits, len(others), ratio, matched, matrix
+
+
+# adjustment
+
+
+def adjust(
+    p, unit, origin, points, directions, point_cells, point_weight, pairs, targets, pair_cells, pair_weight,
+    n_cells, least_share, max_radius, min_cos, sigma_m, prior, n_iterations, tolerance_m, segments,
+):  # fmt: skip
+    """(p, road points used, rms, normal matrix) of Gauss-Newton steps with Cauchy weights."""
+    shares = np.ones(n_cells)
+    previous, rms = -1, np.inf
+    normal = None
+    for iteration in range(n_iterations + 1):
+        rows, weights, residuals = [], [], []
+        for pair, target, cell in zip(pairs, targets, pair_cells, strict=True):
+            gap = target - predict(p, *pair)
+            if shares[cell] >= least_share and np.hypot(*gap) * unit <= max_radius:
+                weight = pair_weight / (1 + (np.hypot(*gap) * unit / (2 * sigma_m)) ** 2)
+                rows += list(predict_rows(p, *pair))
+                weights += [weight, weight]
+                residuals += list(gap)
+        met = []
+        if iteration > 0:
+            searched, hits = np.zeros(n_cells), np.zeros(n_cells)
+            for i, (point, direction) in enumerate(zip(points, directions, strict=True)):
+                along = jacobian(np.append(p, 1.0).reshape(3, 3), point) @ direction
+                along /= np.hypot(*along)
+                row = np.array([-along[1], along[0]]) @ predict_rows(p, *point)
+                sigma = sigma_m * np.sqrt(1 + row @ np.linalg.inv(normal) @ row)
+                if 3 * sigma > max_radius:
+                    continue
+                searched[point_cells[i]] += 1
+                place = origin + unit * predict(p, *point)
+                distance, foot, road = nearest_road(*place, *along, 3 * sigma, min_cos, segments)
+                if distance < np.inf:
+                    hits[point_cells[i]] += 1
+                    across = np.array([-road[1], road[0]])
+                    met.append((point_cells[i], across @ predict_rows(p, *point), across @ (foot - place), sigma))
+            shares = np.where(searched > 0, hits / np.maximum(searched, 1), 1.0)
+            met = [m[1:] for m in met if shares[m[0]] >= least_share]
+            for row, residual, sigma in met:
+                rows.append(row)
+                weights.append(point_weight / (1 + (residual / sigma) ** 2))
+                residuals.append(residual / unit)
+            if met:
+                cauchy = np.array([1 / (1 + (r / s) ** 2) for _, r, s in met])
+                rms = np.sqrt(cauchy @ [r**2 for _, r, _ in met] / cauchy.sum())
+        A, W = np.array(rows).reshape(-1, 8), np.array(weights)
+        hold = np.diag([0.0] * 6 + [prior] * 2)
+        normal = A.T @ (W[:, None] * A) + hold + 1e-9 * np.eye(8)
+        step = np.linalg.solve(normal, A.T @ (W * np.array(residuals)) - hold @ p)
+        p = p + step
+        if iteration > 1 and np.abs(step).max() * unit < tolerance_m and len(met) <= previous:
+            break
+        previous = len(met)
+    return p, previous, rms, normal
+
+
+# triples
+
+UNITS, CELL_UNITS = 96, 8
+
+
+def vertex_angle(e1, e2, tangent):
+    """The tangent's angle after the affine map that sends e1, e2 to +-30 degrees about the axis, in units."""
+    equilateral = np.array([[np.cos(np.pi / 6), np.cos(np.pi / 6)], [-0.5, 0.5]])
+    direction = equilateral @ np.linalg.inv(np.stack([e1, e2], axis=1)) @ (np.cos(tangent), np.sin(tangent))
+    return np.arctan2(*direction[::-1]) * UNITS / np.pi % UNITS
+
+
+def vertex_codes(xy, tangents, i, j, k):
+    """All sorted pairs of whole units at vertex i."""
+    lines = tangents[i][np.isfinite(tangents[i])]
+    units = [int(vertex_angle(xy[j] - xy[i], xy[k] - xy[i], t)) % UNITS for t in lines]
+    return [tuple(sorted(pair)) for pair in combinations(units, 2)]
+
+
+def shape_of(xy, a, b, c):
+    """Twice the area over the longest side squared, positive where a, b, c run counterclockwise."""
+    sides = [xy[b] - xy[a], xy[c] - xy[a], xy[c] - xy[b]]
+    return (sides[0][0] * sides[1][1] - sides[0][1] * sides[1][0]) / max(side @ side for side in sides)
+
+
+def fill_table(xy, tangents, neighbours, min_shape, limit):
+    """The multiset of (anchor, b, c, codes) of all triples, each anchored once."""
+    near = [set(row[row >= 0].tolist()) for row in neighbours]
+    rows = []
+    for triple in combinations(range(len(xy)), 3):
+        anchors = [a for a in triple if set(triple) - {a} <= near[a]]
+        if not anchors or abs(shape_of(xy, *triple)) < min_shape:
+            continue
+        a = min(anchors)
+        b, c = set(triple) - {a}
+        b, c = (b, c) if shape_of(xy, a, b, c) > 0 else (c, b)
+        vertices = [(a, b, c), (b, c, a), (c, a, b)]
+        rows += [(a, b, c, code) for code in product(*(vertex_codes(xy, tangents, *v)[:limit] for v in vertices))]
+    return rows
+
+
+def alike(code, other, tolerance):
+    """Whether two pairs of units, unordered, agree modulo a half turn."""
+    return any(
+        all(abs((u - v + UNITS // 2) % UNITS - UNITS // 2) <= tolerance for u, v in zip(code, order, strict=True))
+        for order in permutations(other)
+    )
+
+
+def look_up(code, table, tolerance):
+    """(A, B, C) of all table rows that some turn of which has this code."""
+    hits = []
+    for *corners, other in table:
+        for turn in range(3):
+            turned = [other[(v + turn) % 3] for v in range(3)]
+            if all(alike(u, v, tolerance) for u, v in zip(code, turned, strict=True)):
+                hits.append(tuple(corners[(v + turn) % 3] for v in range(3)))
+    return hits
