@@ -68,7 +68,7 @@ def test_evaluate_reads_query_sets(town, tmp_path, capsys):
     assert run("evaluate", town, "--queries", tmp_path) == 0
     printed = capsys.readouterr().out
     assert "Kind of mask" in printed
-    assert "100.0 (34-100)" in printed
+    assert "100 (34-100)" in printed
 
 
 def test_a_map_is_written_styled(town, tmp_path, capsys):

@@ -194,7 +194,7 @@ def _table(title: str, groups: Sequence[Summary]) -> Table:
 def _percent(estimate: Share) -> str:
     if not estimate.of:
         return "-"
-    return f"{100 * estimate.value:.1f} ({100 * estimate.low:.0f}-{100 * estimate.high:.0f})"
+    return f"{100 * estimate.value:.3g} ({100 * estimate.low:.0f}-{100 * estimate.high:.0f})"
 
 
 def _pair(spread: Spread, digits: int, scale: float = 1.0) -> str:
