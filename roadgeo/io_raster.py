@@ -35,7 +35,8 @@ _MAX_ROAD_SHARE = 0.35  # of a frame
 _MAX_CLASS = 32  # whole numbers up to this, three or more of them, are the classes of a map
 
 #: First bytes of the files that OpenCV reads; importing rasterio would take longer than reading the mask.
-_OPENCV_MAGIC = (b"\x89PNG\r\n", b"\xff\xd8\xff", b"BM")
+_PNG_MAGIC, _PNG_END = b"\x89PNG\r\n", b"IEND"
+_OPENCV_MAGIC = (_PNG_MAGIC, b"\xff\xd8\xff", b"BM")
 
 
 @dataclass(frozen=True)
@@ -234,7 +235,7 @@ def _open(source: str | os.PathLike[str] | AnyArray, band: int | None, name: str
             raise MaskError(f"{name}: no such file; check the path")
         if Path(path).is_dir():
             raise MaskError(f"{name}: is a folder; give a raster file")
-        image = _read_with_opencv(path)
+        image = _read_with_opencv(path, name)
         if image is not None:
             yield _of_array(image, band, name, alpha=image.ndim == 3 and image.shape[2] == 4)
             return
@@ -242,13 +243,20 @@ def _open(source: str | os.PathLike[str] | AnyArray, band: int | None, name: str
         yield _of_dataset(dataset, band, name)
 
 
-def _read_with_opencv(path: str) -> AnyArray | None:
+def _read_with_opencv(path: str, name: str) -> AnyArray | None:
     """Decode a PNG, JPEG or BMP without side files as it is stored; None where GDAL has to."""
     with Path(path).open("rb") as file:
         head = file.read(8)
     if not head.startswith(_OPENCV_MAGIC) or Path(path + ".aux.xml").exists():
         return None
-    return cv2.imdecode(np.fromfile(path, np.uint8), cv2.IMREAD_UNCHANGED)
+    content = np.fromfile(path, np.uint8)
+    is_png = head.startswith(_PNG_MAGIC)
+    image = (
+        None if is_png and _PNG_END not in content[-1024:].tobytes() else cv2.imdecode(content, cv2.IMREAD_UNCHANGED)
+    )
+    if is_png and image is None:  # GDAL would read the rest as black
+        raise MaskError(f"{name}: a PNG that is damaged or cut short; copy or export it again")
+    return image
 
 
 def _of_array(array: AnyArray, band: int | None, name: str, *, alpha: bool) -> _Raster:
@@ -260,7 +268,7 @@ def _of_array(array: AnyArray, band: int | None, name: str, *, alpha: bool) -> _
         )
     whole = array if array.ndim == 3 else array[..., None]
     data = np.ma.getdata(whole)
-    valid: BoolArray | None = ~np.ma.getmaskarray(whole).any(axis=2) if np.ma.is_masked(whole) else None
+    valid = np.asarray(~np.ma.getmaskarray(whole).any(axis=2)) if np.ma.is_masked(whole) else None
     if alpha:
         data, valid = data[..., :-1], data[..., -1] > 0
     data = data[..., _bands(name, band, data.shape[2])]

@@ -121,9 +121,10 @@ def draw_vectorized(mask: RoadMask, graph: RoadGraph, intersections: Intersectio
     cv2.polylines(picture, [_fixed(ray, scale) for ray in rays], False, _RAY, 1, cv2.LINE_AA, 4)
     for column, row in _fixed(intersections.xy, scale)[:, 0].tolist():
         cv2.circle(picture, (column, row), 3 * 16, _CENTRE, cv2.FILLED, cv2.LINE_AA, 4)
-    return picture
+    return np.asarray(picture)
 
 
 def _fixed(xy: FloatArray, scale: float) -> AnyArray:
     """Take (V, 2) points of the query plane to OpenCV's (V, 1, 2) pixels from pixel centres, in sixteenths."""
-    return np.asarray(np.rint((plane_to_pixel(xy) * scale - 0.5) * 16), np.int32).reshape(-1, 1, 2)
+    sixteenths = np.rint((plane_to_pixel(xy) * scale - 0.5) * 16)
+    return np.asarray(sixteenths, np.int32)[:, None]

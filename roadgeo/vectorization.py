@@ -21,7 +21,10 @@ from roadgeo.typing import AnyArray, BoolArray, Float32Array, FloatArray, Int32A
 __all__ = ["Vectorization", "VectorizeOptions", "road_width", "vectorize"]
 
 #: Bands of rows that `road_width` looks at first, and how many road pixels they must hold.
-_BAND_ROWS, _BAND_STEP, _BAND_MIN_ROAD = 64, 256, 2000
+_BAND_ROWS, _BAND_STEP, _BAND_MIN_ROAD, _MAX_BAND_PIXELS = 48, 192, 2000, 1 << 24
+
+_MAX_DEPTH = 1000  # of a road, pixels; deeper ones are not told apart
+_STRIP_PIXELS = 1 << 24  # large masks are gone through so many pixels at a time
 
 #: Rays in the fan before a free end (an odd number), and how many of their pixels may touch the end itself.
 _BENDS, _NEAR = 11, 2
@@ -35,6 +38,8 @@ class VectorizeOptions:
     ----------
     working_width_px
         Wide roads are reduced to about this width before thinning.
+    max_working_pixels
+        Larger masks are reduced further, at some loss, so that memory is bounded.
     closing_widths, opening_widths
         Gaps up to this are closed; threads up to this are cut.
     hole_areas, speck_areas
@@ -55,7 +60,8 @@ class VectorizeOptions:
         Distance between the vertices of a road.
     """
 
-    working_width_px: float = 5.7
+    working_width_px: float = 6.0
+    max_working_pixels: int = 64_000_000
     closing_widths: float = 0.35
     opening_widths: float = 0.3
     hole_areas: float = 1.2
@@ -107,9 +113,10 @@ def vectorize(mask: RoadMask, options: VectorizeOptions | None = None) -> Vector
     """
     options = options or VectorizeOptions()
     width_px = road_width(mask)
-    factor = max(1, round(width_px / options.working_width_px))
-    width = width_px / factor
-    states = _clean(_reduce(mask, factor), width, options)
+    crowded = np.ceil(np.sqrt(mask.roads.size / options.max_working_pixels))
+    factor = int(max(round(width_px / options.working_width_px), crowded, 1))
+    width = max(width_px / factor, 1.0)
+    states = _clean(_reduce(mask, factor, min(0.5, 0.45 * width_px / factor)), width, options)
     distance = cv2.distanceTransform((states != GROUND).view(np.uint8), cv2.DIST_L2, 5)
     skeleton = _skeletonize(states, distance, width, options)
     if len(skeleton.edges) == 0:
@@ -121,7 +128,8 @@ def vectorize(mask: RoadMask, options: VectorizeOptions | None = None) -> Vector
 def road_width(mask: RoadMask) -> float:
     """Estimate the usual road width of a mask in pixels: four times the mean depth of a road pixel.
 
-    Depths within a straight road are spread evenly between 0 and half its width.
+    Depths within a straight road are spread evenly between 0 and half its width. What is much deeper than the median
+    is no road and counts as little as a road can.
 
     Raises
     ------
@@ -129,24 +137,48 @@ def road_width(mask: RoadMask) -> float:
         When the mask shows no road.
     """
     roads = mask.roads.view(np.uint8)
-    bands = [roads[top : top + _BAND_ROWS] for top in range(0, len(roads), _BAND_STEP)]
-    if sum(int(cv2.countNonZero(band)) for band in bands) < _BAND_MIN_ROAD:
-        bands = [roads]
-    depths = [cv2.distanceTransform(np.ascontiguousarray(band), cv2.DIST_L2, 3)[band > 0] for band in bands]
-    depth = np.concatenate(depths) - 0.5  # from the road's edge, not from the next pixel's centre
-    if len(depth) == 0:
+    step = max(_BAND_STEP, _BAND_ROWS * roads.size // _MAX_BAND_PIXELS)
+    counts = _count_depths(roads, _BAND_ROWS, step)
+    if counts.sum() < _BAND_MIN_ROAD:
+        rows = max(_STRIP_PIXELS // roads.shape[1], _BAND_ROWS)
+        counts = _count_depths(roads, rows, rows)
+    if counts.sum() == 0:
         raise MaskError(f"{mask.name or 'mask'}: no road pixel; expected a mask with roads as non-zero pixels")
-    ceiling = 2.5 * np.median(depth)  # blobs and squares are deeper than roads
-    return float(max(4.0 * np.minimum(depth, ceiling).mean(), 1.0))
+    width = _width(counts)
+    factor = min(int(width / 8), min(roads.shape) // 16)
+    if width <= _BAND_ROWS / 3 or factor < 2:
+        return max(width, 1.0)
+    return factor * road_width(RoadMask(_shrink(roads, factor, 0.5).view(np.bool_), name=mask.name))
 
 
-def _reduce(mask: RoadMask, factor: int) -> AnyArray:
-    """Return the mask's states (GROUND, ROAD, SOLID) on a grid `factor` times coarser, with a ring of SOLID around."""
+def _count_depths(roads: AnyArray, rows: int, step: int) -> IntArray:
+    """Return how many road pixels lie how many eighths of a pixel from their road's edge, in bands of rows."""
+    counts = np.zeros(8 * _MAX_DEPTH + 1, np.int64)
+    for top in range(0, len(roads), step):
+        band = np.ascontiguousarray(roads[top : top + rows])
+        # A road's edge lies half a pixel before the centre of the next pixel, or less where it slants.
+        depth = cv2.distanceTransform(band, cv2.DIST_L2, 3)[band > 0] - 0.4
+        counts += np.bincount((8 * np.minimum(depth, _MAX_DEPTH)).astype(np.int64), minlength=len(counts))
+    return counts
+
+
+def _width(counts: IntArray) -> float:
+    """Return the road width that such counts of depths belong to."""
+    depth = (np.arange(len(counts)) + 0.25) / 8
+    median = depth[np.searchsorted(np.cumsum(counts), counts.sum() / 2)]
+    return float(4.0 * (counts @ np.minimum(depth, 2.0 * median + 1.0)) / max(counts.sum(), 1))
+
+
+def _reduce(mask: RoadMask, factor: int, share: float) -> AnyArray:
+    """Return the mask's states (GROUND, ROAD, SOLID) on a grid `factor` times coarser, with a ring of SOLID around.
+
+    A pixel is ROAD where at least `share` of the pixels it stands for are.
+    """
     roads = mask.roads.view(np.uint8)
     observed = None if mask.observed is None else mask.observed.view(np.uint8)
     if factor > 1:
-        roads = _shrink(roads, factor)
-        observed = None if observed is None else _shrink(observed, factor)
+        roads = _shrink(roads, factor, share)
+        observed = None if observed is None else _shrink(observed, factor, 0.5)
     states = np.full((roads.shape[0] + 2, roads.shape[1] + 2), SOLID, np.uint8)
     states[1:-1, 1:-1] = roads
     if observed is not None:
@@ -154,14 +186,19 @@ def _reduce(mask: RoadMask, factor: int) -> AnyArray:
     return states
 
 
-def _shrink(flags: AnyArray, factor: int) -> AnyArray:
-    """Reduce 0/1 flags: 1 where at least half of the factor x factor pixels are."""
+def _shrink(flags: AnyArray, factor: int, share: float) -> AnyArray:
+    """Reduce 0/1 flags: 1 where at least `share` of factor x factor pixels are. Strip by strip, to save memory."""
     height, width = flags.shape
     rows, columns = -(-height // factor), -(-width // factor)
-    fill = (0, rows * factor - height, 0, columns * factor - width)
-    padded = cv2.copyMakeBorder(flags, *fill, cv2.BORDER_REPLICATE) * np.uint8(254)
-    mean = cv2.resize(padded, (columns, rows), interpolation=cv2.INTER_AREA)
-    return (mean >= 127).view(np.uint8)
+    reduced = np.empty((rows, columns), np.uint8)
+    step = max(_STRIP_PIXELS // (width * factor), 1)
+    for top in range(0, rows, step):
+        strip = flags[top * factor : (top + step) * factor] * np.uint8(254)
+        fill = (-len(strip) % factor, columns * factor - width)
+        filled = cv2.copyMakeBorder(strip, 0, fill[0], 0, fill[1], cv2.BORDER_REPLICATE)
+        mean = cv2.resize(filled, (columns, len(filled) // factor), interpolation=cv2.INTER_AREA)
+        reduced[top : top + step] = mean >= max(int(254 * share), 1)
+    return reduced
 
 
 def _clean(states: AnyArray, width: float, options: VectorizeOptions) -> AnyArray:
@@ -244,7 +281,7 @@ def _skeletonize(states: AnyArray, distance: Float32Array, width: float, options
                 return skeleton
             flat[bridges] = ROAD
             pixels = np.concatenate((pixels, bridges))
-        pixels = rethin(states, distance, pixels, 0.0)
+        pixels = rethin(states, distance, pixels, 0.0, False)
 
 
 def _spurs(skeleton: _Skeleton, distance: Float32Array, reach: float) -> IntArray:
@@ -294,7 +331,7 @@ def _bridges(
     met[..., :_NEAR] = GROUND  # the road's own end
     first = np.argmax(met != GROUND, axis=2)[..., None]
     missing = np.take_along_axis(np.cumsum(distance.ravel()[at] == 0, axis=2), first, axis=2)
-    good = (np.take_along_axis(met, first, axis=2) == ROAD) & (missing <= options.bridge_widths * width)
+    good = (np.take_along_axis(met, first, axis=2) == ROAD) & (missing <= options.bridge_widths * width + 0.5)
     bend = np.linspace(-1, 1, _BENDS)[:, None]
     cost = np.where(good, (first + 1) * (1 + bend**2), np.inf)[..., 0]
     best = np.argmin(cost, axis=1)

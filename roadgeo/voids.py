@@ -72,23 +72,31 @@ def find_voids(roads: BoolArray, road_width_px: float, options: VoidOptions | No
         return None
     observed = np.ones(roads.shape, np.bool_)
     for side, n in zip(sides, ends, strict=True):
-        if n < options.least_ends:
-            continue
-        inside = _inside(side, roads.shape)
-        if inside.mean() > 1.0 - options.max_cut:
-            observed &= inside
+        if n >= options.least_ends:
+            _cut(observed, side, options.max_cut)
     return observed
 
 
-def _inside(side: _Side, shape: tuple[int, ...]) -> BoolArray:
-    """Return (H, W) where pixel centres do not lie beyond a side."""
-    rows, columns = np.arange(shape[0]) + 0.5, np.arange(shape[1]) + 0.5
+def _cut(observed: BoolArray, side: _Side, max_cut: float) -> None:
+    """Clear (H, W) the pixels whose centres lie beyond a side, unless they are too many."""
+    height, width = observed.shape
     slope_x, slope_y = side.outwards
-    room = -(rows - side.start[1]) * slope_y  # a column x is inside where (x - start) * slope_x <= room
-    if abs(slope_x) < 1e-6:
-        return np.broadcast_to((room >= 0)[:, None], shape)
-    limit = (side.start[0] + room / slope_x)[:, None]
-    return np.asarray(columns <= limit if slope_x > 0 else columns >= limit)
+    room = (
+        -(np.arange(height) + 0.5 - side.start[1]) * slope_y
+    )  # column x lies beyond where (x - start) * slope_x > room
+    if abs(slope_x) > 1e-6:
+        edge = np.clip(np.rint(side.start[0] + room / slope_x), 0, width).astype(np.int64)
+    else:
+        edge = np.where(room >= 0, width, 0)
+    from_right = slope_x >= 0 or abs(slope_x) <= 1e-6
+    beyond = (width - edge if from_right else edge) / width
+    if beyond.mean() > max_cut:
+        return
+    for row in np.flatnonzero(beyond):
+        if from_right:
+            observed[row, edge[row] :] = False
+        else:
+            observed[row, : edge[row]] = False
 
 
 def _hull(roads: BoolArray) -> FloatArray:

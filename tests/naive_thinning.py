@@ -19,8 +19,8 @@ def is_simple(states, row, column):
     return pieces == 1 and len(beside) == 1
 
 
-def is_tip(states, row, column):
-    return np.count_nonzero(states[row - 1 : row + 2, column - 1 : column + 2]) == 2
+def n_neighbours(states, row, column):
+    return np.count_nonzero(states[row - 1 : row + 2, column - 1 : column + 2]) - 1
 
 
 def thin(states, distance, min_end_depth):
@@ -28,21 +28,23 @@ def thin(states, distance, min_end_depth):
     rows, columns = np.nonzero(states == ROAD)
     order = np.argsort((np.minimum(distance[rows, columns], 4096) * 8).astype(int), kind="stable")
     pixels = [(int(rows[i]), int(columns[i])) for i in order]
-    changed = True
+    first = changed = True
     while changed:
-        changed = False
+        changed = first
         for row, column in pixels:
             while states[row, column] == ROAD and is_simple(states, row, column):
-                tip = is_tip(states, row, column)
-                if tip and distance[row, column] >= min_end_depth:
+                n = n_neighbours(states, row, column)
+                near = (slice(row - 1, row + 2), slice(column - 1, column + 2))
+                is_pair = first and n == 2 and distance[row, column] == distance[near][states[near] != GROUND].max()
+                if distance[row, column] >= min_end_depth and (n == 1 or is_pair):
                     break
                 states[row, column] = GROUND
                 changed = True
-                if not tip:
+                if n > 1:
                     break
-                near = states[row - 1 : row + 2, column - 1 : column + 2]
-                step = np.argwhere(near != GROUND)[0] - 1
+                step = np.argwhere(states[near] != GROUND)[0] - 1
                 row, column = row + int(step[0]), column + int(step[1])
-                if not is_tip(states, row, column):
+                if n_neighbours(states, row, column) > 1:
                     break
+        first = False
     return [r * states.shape[1] + c for r, c in pixels if states[r, c] == ROAD]

@@ -70,7 +70,7 @@ def test_thinning_joins_and_parts_nothing(states: np.ndarray) -> None:
 def test_what_is_left_is_one_pixel_wide(states: np.ndarray) -> None:
     left = thinned(states, 0.0)
     for row, column in np.argwhere(left == ROAD):
-        assert not naive.is_simple(left, row, column) or naive.is_tip(left, row, column)
+        assert not naive.is_simple(left, row, column) or naive.n_neighbours(left, row, column) == 1
 
 
 @pytest.mark.parametrize(
@@ -104,9 +104,19 @@ def test_a_bump_leaves_no_hair_but_a_road_keeps_its_end() -> None:
     assert columns.max() >= 50
 
 
+@pytest.mark.parametrize("width", range(2, 10))
+@pytest.mark.parametrize("turns", range(4))
+def test_a_road_of_even_width_is_not_eaten_from_its_end(width: int, turns: int) -> None:
+    states = np.full((42, 42), SOLID, np.uint8)
+    states[1:-1, 1:-1] = GROUND
+    states[20 : 20 + width, 10:41] = ROAD  # from the frame to a free end
+    left = thinned(np.ascontiguousarray(np.rot90(states, turns)), 0.25 * width)
+    assert 31 - width / 2 - 1 <= np.count_nonzero(left == ROAD) <= 31
+
+
 def test_rethin_takes_stale_and_repeated_pixels() -> None:
     states = framed("..... .###. ..#.. .....")
     pixels = np.flatnonzero(states == ROAD).astype(np.int32)
     states.ravel()[pixels[0]] = GROUND
-    left = rethin(states, depth(states), np.concatenate((pixels, pixels)), 0.0)
+    left = rethin(states, depth(states), np.concatenate((pixels, pixels)), 0.0, False)
     assert set(left) == set(np.flatnonzero(states == ROAD))

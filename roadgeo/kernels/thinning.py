@@ -9,20 +9,21 @@ import numpy as np
 from numba import njit
 from numpy.typing import NDArray
 
-__all__ = ["GROUND", "ROAD", "SOLID", "neighbour_steps", "neighbours", "rethin", "thin"]
+__all__ = ["GROUND", "ROAD", "SOLID", "neighbour_steps", "neighbours", "rethin", "thin", "touches_solid"]
 
 GROUND = 0  # observed, no road
 ROAD = 1
 SOLID = 2  # beyond the frame or unobserved: road for all we know, never deleted
 
-KEEP, DELETE, TIP = 0, 1, 2  # a tip is a free end of a line
+#: Roles of a pixel by its neighbours: not simple; simple; a free end of a line; simple with two neighbours that touch.
+KEEP, DELETE, TIP, CORNER = 0, 1, 2, 3
 
 LEVELS_PER_PIXEL = 8  # distances are told apart to 1/8 px
 DEEPEST = np.float32(4096.0)  # and not beyond this: without any GROUND they are infinite
 
 
 def _roles() -> NDArray[np.uint8]:
-    """Return (256,): KEEP, DELETE or TIP for a pixel with these neighbours.
+    """Return (256,): the role of a pixel with these neighbours.
 
     Bit k of the index is neighbour k, counterclockwise from east. A pixel is simple where its neighbours form one
     8-connected piece and one of the four next to it is ground (crossing number 1, Yokoi et al. 1975).
@@ -31,7 +32,7 @@ def _roles() -> NDArray[np.uint8]:
     for code in range(256):
         n = [code >> k & 1 for k in range(8)]
         if sum((1 - n[k]) & (n[k + 1] | n[(k + 2) % 8]) for k in (0, 2, 4, 6)) == 1:
-            roles[code] = TIP if sum(n) == 1 else DELETE
+            roles[code] = {1: TIP, 2: CORNER}.get(sum(n), DELETE)
     return roles
 
 
@@ -54,9 +55,27 @@ def neighbours(flat: NDArray[np.uint8], p: np.uint64, stride: np.uint64) -> np.u
 
 
 @njit(cache=True)
+def touches_solid(flat: NDArray[np.uint8], p: np.uint64, stride: np.uint64) -> bool:
+    """Tell whether a neighbour of pixel `p` is SOLID."""
+    above = flat[p - stride] | flat[p - stride - np.uint64(1)] | flat[p - stride + np.uint64(1)]
+    below = flat[p + stride] | flat[p + stride - np.uint64(1)] | flat[p + stride + np.uint64(1)]
+    return bool((above | below | flat[p - np.uint64(1)] | flat[p + np.uint64(1)]) & SOLID)
+
+
+@njit(cache=True)
 def neighbour_steps(stride: int) -> NDArray[np.int64]:
     """Return the (8,) steps to the neighbours in flat indices, counterclockwise from east."""
     return np.array([1, 1 - stride, -stride, -1 - stride, -1, stride - 1, stride, stride + 1])
+
+
+@njit(cache=True)
+def _is_ridge(flat: NDArray[np.uint8], depth: NDArray[np.float32], p: np.uint64, steps: NDArray[np.int64]) -> bool:
+    """Tell whether no neighbour that is left lies deeper than pixel `p`."""
+    for k in range(8):
+        q = p + np.uint64(steps[k])
+        if flat[q] != GROUND and depth[q] > depth[p]:
+            return False
+    return True
 
 
 @njit(cache=True)
@@ -65,6 +84,7 @@ def rethin(
     distance: NDArray[np.float32],
     pixels: NDArray[np.int32],
     min_end_depth: float,
+    keep_pairs: bool,
 ) -> NDArray[np.int32]:
     """Delete what is simple among `pixels` until nothing is, in place; return the pixels left.
 
@@ -78,6 +98,8 @@ def rethin(
         Flat indices that hold all ROAD pixels, in the order in which to try them; others are left out.
     min_end_depth : float
         A free end of a line is kept where the road is at least this deep: bumps on its edge leave no hairs.
+    keep_pairs : bool
+        In the first round, keep free ends of lines two pixels wide, too: else those would be eaten from end to end.
 
     Returns
     -------
@@ -91,14 +113,18 @@ def rethin(
     n = len(left)
     changed = True
     while changed:
-        changed = False
+        changed = keep_pairs
         kept = 0
         for i in range(n):
             p = np.uint64(left[i])
             if flat[p] != ROAD:
                 continue
             role = ROLES[neighbours(flat, p, stride)]
-            if role == KEEP or (role == TIP and depth[p] >= min_end_depth):
+            if (
+                role == KEEP
+                or (role == TIP and depth[p] >= min_end_depth)
+                or (keep_pairs and role == CORNER and depth[p] >= min_end_depth and _is_ridge(flat, depth, p, steps))
+            ):
                 left[kept] = left[i]
                 kept += 1
                 continue
@@ -113,6 +139,7 @@ def rethin(
                 if flat[p] != ROAD or role != TIP or depth[p] >= min_end_depth:
                     break
                 flat[p] = GROUND
+        keep_pairs = False
         n = kept
     return left[:n].copy()
 
@@ -121,25 +148,23 @@ def rethin(
 def thin(states: NDArray[np.uint8], distance: NDArray[np.float32], min_end_depth: float) -> NDArray[np.int32]:
     """Thin the ROAD pixels to lines, in place, the shallow ones first; return the pixels left.
 
-    Parameters and result are those of `rethin`.
+    Parameters and result as in `rethin`.
     """
     flat = states.ravel()
     depth = distance.ravel()
     found = np.empty(len(flat), np.int32)
+    level = np.empty(len(flat), np.uint16)
+    start = np.zeros(int(DEEPEST * LEVELS_PER_PIXEL) + 2, np.int64)
     n = 0
-    deepest = np.float32(0.0)
     for p in range(len(flat)):
         if flat[p] == ROAD:
             found[n] = p
+            level[n] = np.uint16(min(depth[p], DEEPEST) * LEVELS_PER_PIXEL)
+            start[level[n] + 1] += 1
             n += 1
-            deepest = max(deepest, min(depth[p], DEEPEST))
-    start = np.zeros(int(deepest * LEVELS_PER_PIXEL) + 2, np.int64)
-    for i in range(n):
-        start[int(min(depth[found[i]], DEEPEST) * LEVELS_PER_PIXEL) + 1] += 1
     start = np.cumsum(start)
     order = np.empty(n, np.int32)
     for i in range(n):
-        level = int(min(depth[found[i]], DEEPEST) * LEVELS_PER_PIXEL)
-        order[start[level]] = found[i]
-        start[level] += 1
-    return rethin(states, distance, order, min_end_depth)
+        order[start[level[i]]] = found[i]
+        start[level[i]] += 1
+    return rethin(states, distance, order, min_end_depth, True)

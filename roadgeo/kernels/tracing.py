@@ -4,13 +4,14 @@ import numpy as np
 from numba import njit
 from numpy.typing import NDArray
 
-from roadgeo.kernels.thinning import ROAD, SOLID, neighbour_steps, neighbours
+from roadgeo.kernels.thinning import ROAD, neighbour_steps, neighbours, touches_solid
 
 __all__ = ["smooth_chains", "trace"]
 
 PATH, WALKED, FREE_END, OPEN_END, JUNCTION = -1, -2, -3, -4, -5  # a pixel's label before its node is numbered
 
-#: (256,) number of the lowest bit set; of 0 it is 0.
+#: (256,) how many bits are set, and the number of the lowest (of 0 it is 0).
+COUNT = np.array([code.bit_count() for code in range(256)], np.int64)
 LOWEST_BIT = np.array([max((code & -code).bit_length() - 1, 0) for code in range(256)], np.int64)
 
 
@@ -50,21 +51,14 @@ def trace(
     n = len(pixels)
     slots = 0
     for i in range(n):
-        p = pixels[i]
-        around = neighbours(flat, np.uint64(p), stride)
-        n_road = 0
-        solid = False
-        while around:
-            if flat[p + steps[LOWEST_BIT[around]]] == SOLID:
-                solid = True
-            else:
-                n_road += 1
-            around &= around - 1
-        if n_road == 2 and not solid:
+        p = np.uint64(pixels[i])
+        around = neighbours(flat, p, stride)
+        solid = touches_solid(flat, p, stride)
+        if COUNT[around] == 2 and not solid:
             node_of[p] = PATH
         else:
-            node_of[p] = OPEN_END if solid else JUNCTION if n_road > 2 else FREE_END
-            slots += n_road
+            node_of[p] = OPEN_END if solid else JUNCTION if COUNT[around] > 2 else FREE_END
+            slots += COUNT[around]
 
     members = np.empty(n, np.int32)  # pixels of the nodes, node after node
     first = np.empty(n + 1, np.int64)
