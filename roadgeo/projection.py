@@ -150,7 +150,7 @@ def _stereographic(lon: float, lat: float) -> str:
     parts = crs.to_json_dict()
     parts["name"] = f"Oblique stereographic, {abs(lat):g} {'NS'[lat < 0]}, {abs(lon):g} {'EW'[lon < 0]}"
     parts["conversion"]["name"] = parts["name"]
-    parts["base_crs"] = CRS("EPSG:4326").to_json_dict()
+    parts["base_crs"]["name"] = "WGS 84"
     return CRS.from_json_dict(parts).to_wkt("WKT2_2019")
 
 
