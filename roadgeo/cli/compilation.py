@@ -33,12 +33,12 @@ def compile_once(reference: Reference, quiet: bool) -> None:
 
 
 def _is_cold() -> bool:
-    """Whether numba has stored nothing beside the kernels; where it stores elsewhere, nobody can tell."""
+    """Whether numba has stored no kernel of the search beside it; where it stores elsewhere, nobody can tell."""
     import roadgeo.kernels
 
     folder = Path(roadgeo.kernels.__path__[0])
     stored_here = "NUMBA_CACHE_DIR" not in os.environ and os.access(folder, os.W_OK)
-    return stored_here and not any((folder / "__pycache__").glob("*.nbi"))
+    return stored_here and not any((folder / "__pycache__").glob("growth.*.nbi"))
 
 
 def _practice_mask(reference: Reference) -> BoolArray:
