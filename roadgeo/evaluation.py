@@ -10,12 +10,12 @@ from __future__ import annotations
 import math
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import asdict, dataclass, field, replace
-from functools import lru_cache
 from typing import Any
 
 import numpy as np
 
 from roadgeo.homography import Homography
+from roadgeo.projection import transformer
 from roadgeo.truth import Truth
 from roadgeo.typing import FloatArray
 
@@ -132,14 +132,7 @@ def _true_points(truth: Truth, pixels: FloatArray, crs: str | None) -> FloatArra
     points = Homography(truth.homography).facing(pixels[0])(pixels)
     if truth.crs is None or crs is None or truth.crs == crs:
         return points
-    return np.column_stack(_transformer(truth.crs, crs).transform(*points.T))
-
-
-@lru_cache(maxsize=16)
-def _transformer(source: str, target: str) -> Any:
-    import pyproj
-
-    return pyproj.Transformer.from_crs(source, target, always_xy=True)
+    return np.column_stack(transformer(truth.crs, crs).transform(*points.T))
 
 
 # --- shares and spreads -----------------------------------------------------------------------------------------------

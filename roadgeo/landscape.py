@@ -10,7 +10,8 @@ import numpy as np
 from roadgeo.graph import RoadGraph
 from roadgeo.network import RoadNetwork
 from roadgeo.projection import LocalPlane
-from roadgeo.typing import FloatArray, IntArray
+from roadgeo.simplification import planarize
+from roadgeo.typing import AnyArray, FloatArray, IntArray
 from roadgeo.view import View
 
 __all__ = ["Landscape", "Strokes", "visible_intersections", "visible_strokes"]
@@ -40,6 +41,12 @@ class Landscape:
     def from_network(cls, network: RoadNetwork) -> Landscape:
         """Look at a reference's own roads."""
         return cls(network.graph, network.intersections.xy, network.plane, network.coverage)
+
+    @classmethod
+    def from_lines(cls, lines: AnyArray, plane: LocalPlane, coverage: tuple[FloatArray, ...] = ()) -> Landscape:
+        """Look at lines (shapely, plane metres) as they are: two carriageways stay two."""
+        graph = planarize(lines)
+        return cls(graph, graph.xy[graph.degree() >= 3], plane, coverage)
 
     @cached_property
     def bounds(self) -> FloatArray:

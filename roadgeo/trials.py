@@ -12,12 +12,14 @@ from pathlib import Path
 from typing import Any, Protocol, TypeAlias
 
 import cv2
+import numpy as np
 
 from roadgeo.errors import MaskError, OutputError
 from roadgeo.files import write_text
 from roadgeo.grid import RoadMask
 from roadgeo.io_network import read_network
 from roadgeo.landscape import Landscape
+from roadgeo.projection import transformer
 from roadgeo.simulation import SimulationOptions, simulate_query, simulate_query_at
 from roadgeo.truth import Truth, truth_from_record, truth_to_record
 from roadgeo.typing import AnyArray
@@ -32,6 +34,7 @@ __all__ = [
     "QuerySet",
     "ReferenceLocator",
     "Trial",
+    "read_landscape",
     "run_trials",
 ]
 
@@ -77,9 +80,29 @@ class MaskFiles:
         return lambda k: (self.truths[k], str(self.folder / self.truths[k].file))
 
 
+def read_landscape(geopackage: Path, roads: Path | None = None) -> Landscape:
+    """Read the roads to draw masks from: a reference's own, or those of a file, where the reference covers them.
+
+    Raises
+    ------
+    IndexFormatError, RoadSourceError, CrsError
+        The reference or the file cannot be read.
+    """
+    network = read_network(geopackage)
+    if roads is None:
+        return Landscape.from_network(network)
+    from roadgeo.io_roads import read_roads
+
+    found = read_roads(roads)
+    there = transformer(network.plane.crs, found.plane.crs)
+    coverage = [network.plane.to_crs(ring) for ring in network.coverage]
+    rings = [found.plane.from_crs(np.column_stack(there.transform(*ring.T))) for ring in coverage]
+    return Landscape.from_lines(found.lines, found.plane, tuple(rings))
+
+
 @dataclass(frozen=True)
 class DrawnMasks:
-    """Masks drawn when they are needed, from the roads of a reference.
+    """Masks drawn when they are needed.
 
     Attributes
     ----------
@@ -87,10 +110,13 @@ class DrawnMasks:
         `REF.gpkg`.
     sets : tuple of (SimulationOptions, int)
         Options and number of queries, set by set.
+    roads : Path, optional
+        Roads to draw instead of the reference's own.
     """
 
     geopackage: Path
     sets: tuple[tuple[SimulationOptions, int], ...]
+    roads: Path | None = None
 
     def __len__(self) -> int:
         """How many queries there are."""
@@ -98,7 +124,7 @@ class DrawnMasks:
 
     def open(self) -> Callable[[int], tuple[Truth, Mask]]:
         """Read the roads and return the function that draws the k-th query."""
-        landscape = Landscape.from_network(read_network(self.geopackage))
+        landscape = read_landscape(self.geopackage, self.roads)
         numbered = [(options, k) for options, count in self.sets for k in range(count)]
 
         def draw(k: int) -> tuple[Truth, Mask]:
@@ -131,7 +157,7 @@ class PlacedMasks:
 
     def open(self) -> Callable[[int], tuple[Truth, Mask]]:
         """Read the roads and return the function that draws the k-th query."""
-        landscape = Landscape.from_network(read_network(self.geopackage))
+        landscape = read_landscape(self.geopackage)
 
         def draw(k: int) -> tuple[Truth, Mask]:
             query = simulate_query_at(landscape, self.options, self.first + k, self.centers[k])

@@ -107,3 +107,19 @@ def test_seeds_matter(town, tmp_path):
     masks = [(tmp_path / str(seed) / "clean" / "q_0000.png").read_bytes() for seed in (0, 1)]
     assert masks[0] != masks[1]
     assert not np.array_equal(*(read_truth(tmp_path / str(seed) / "truth.csv")[0].homography for seed in (0, 1)))
+
+
+def test_another_map_of_the_place_can_be_drawn(town, tmp_path, capsys):
+    import geopandas as gpd
+    from shapely.geometry import LineString
+
+    landscape = lattice_town(16)
+    lines = [LineString(landscape.plane.to_crs(line)) for line in landscape.graph.polylines()]
+    roads = gpd.GeoDataFrame(geometry=lines, crs=landscape.plane.crs).to_crs("EPSG:4326")
+    roads.to_file(tmp_path / "other.geojson")
+    options = ["-n", 2, "--noise", "clean", *SMALL, "--json"]
+    assert run("evaluate", town, "--roads", tmp_path / "other.geojson", *options) == 0
+    table = json.loads(capsys.readouterr().out)
+    assert table["total"]["recall"]["hits"] == 2
+    assert table["total"]["center_m"]["max"] < 2.0
+    assert run("evaluate", town, "--map", "--roads", tmp_path / "other.geojson") == 2

@@ -106,8 +106,7 @@ def test_masks_are_drawn_set_by_set(monkeypatch):
     from roadgeo import trials
 
     town = lattice_town()
-    monkeypatch.setattr(trials, "read_network", lambda _: town)
-    monkeypatch.setattr(trials.Landscape, "from_network", staticmethod(lambda network: network))
+    monkeypatch.setattr(trials, "read_landscape", lambda *_: town)
     clean = SimulationOptions(ViewOptions(size_px=(300, 300), intersections=(3, 99)), NOISE_MODELS["clean"], "clean")
     queries = DrawnMasks(Path("ref.gpkg"), ((clean, 2), (replace(clean, kind="again"), 1)))
     assert len(queries) == 3

@@ -47,6 +47,7 @@ __all__ = ["evaluate_command"]
 def evaluate_command(
     reference: str,
     queries: Path | None,
+    roads: Path | None,
     method: Literal["auto", "pair"],
     known_gsd: tuple[float, float] | None,
     max_tilt: float | None,
@@ -75,6 +76,7 @@ def evaluate_command(
     Examples:
       roadgeo evaluate boston-ma -j 2
       roadgeo evaluate boston-ma --noise poor --tilt 30:50 --mirrored 100 -o evaluation
+      roadgeo evaluate boston-ma --roads city_centerlines.geojson --noise clean
       roadgeo evaluate boston-ma --queries queries/truth.csv --method pair
       roadgeo evaluate boston-ma --map --height 400 --focal 2000 --size 1200 --noise segmented --check 300
     """
@@ -93,11 +95,13 @@ def evaluate_command(
     if as_map:
         from roadgeo.cli.localizability import ANY, Survey
 
+        if roads is not None or queries is not None:
+            raise click.UsageError("--map draws the reference's own roads: leave --roads and --queries out.")
         trials = options["count"] or 400
         ((simulation, _), *_) = query_sets(**options | {"intersections": ANY})
         Survey(path, simulation, locator, trials, check, jobs, quiet).run(out_dir or Path(), as_json)
         return
-    query_set, settings = _query_set(path, queries, options)
+    query_set, settings = _query_set(path, queries, roads, options)
     told = {"known_gsd": known_gsd, "max_tilt": max_tilt, "north_up": north_up or None, "time_limit_s": time_limit}
     settings |= {"reference": path.stem, "method": method, **{k: v for k, v in told.items() if v is not None}}
     _evaluate(query_set, locator, settings, radius, jobs, out_dir, as_json, quiet)
@@ -141,14 +145,17 @@ def _evaluate(
         click.echo(f"{len(trials)} masks in {elapsed:.1f} s" + (f"; see {out_dir}" if out_dir else ""), err=True)
 
 
-def _query_set(reference: Path, queries: Path | None, options: dict[str, Any]) -> tuple[QuerySet, dict[str, Any]]:
+def _query_set(
+    reference: Path, queries: Path | None, roads: Path | None, options: dict[str, Any]
+) -> tuple[QuerySet, dict[str, Any]]:
     """Choose between a query set on disk and one to draw, and say which."""
     from roadgeo.trials import DrawnMasks, MaskFiles
     from roadgeo.truth import read_truth
 
     if queries is None:
         plain = {name: value for name, value in options.items() if value is not None}
-        return DrawnMasks(reference, query_sets(**options)), plain
+        drawn_from = {} if roads is None else {"roads": roads.name}
+        return DrawnMasks(reference, query_sets(**options), roads), plain | drawn_from
     table = queries / "truth.csv" if queries.is_dir() else queries
     return MaskFiles(table.parent, tuple(read_truth(table))), {"queries": str(queries)}
 

@@ -6,6 +6,7 @@ import sys
 from collections import Counter
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
+from pathlib import Path
 from typing import TYPE_CHECKING, Any, TypeVar
 
 import click
@@ -44,6 +45,12 @@ _OPTIONS = [
         help="What goes wrong in the masks; may be given several times.",
     ),
     click.option(
+        "--roads",
+        metavar="FILE",
+        type=click.Path(exists=True, path_type=Path),
+        help="Draw the roads of this file, another map of the place, in place of the reference's own.",
+    ),
+    click.option(
         "--gsd",
         metavar="LO:HI",
         type=RANGE,
@@ -52,7 +59,12 @@ _OPTIONS = [
         help="Metres per pixel at the centre.",
     ),
     click.option(
-        "--tilt", type=ANGLES, default="0:30", show_default=True, help="Degrees of the axis from the vertical."
+        "--tilt",
+        metavar="LO:HI",
+        type=ANGLES,
+        default="0:30",
+        show_default=True,
+        help="Degrees of the axis from the vertical.",
     ),
     click.option(
         "--heading",

@@ -19,7 +19,7 @@ __all__ = ["simulate_command"]
 )
 @query_options
 @click.option("-q", "--quiet", is_flag=True, help="Say nothing but errors.")
-def simulate_command(reference: str, out_dir: Path, quiet: bool, **options: Any) -> None:
+def simulate_command(reference: str, out_dir: Path, roads: Path | None, quiet: bool, **options: Any) -> None:
     """Draw road masks from a reference's own roads, as a camera would see them and a segmenter get them wrong.
 
     Writes NOISE/q_NNNN.png, truth.csv, truth.json (columns: see roadgeo/truth.py) and footprints.gpkg. The same options
@@ -35,14 +35,13 @@ def simulate_command(reference: str, out_dir: Path, quiet: bool, **options: Any)
 
     from roadgeo.files import write_bytes
     from roadgeo.io_atomic import writing
-    from roadgeo.io_network import read_network
-    from roadgeo.landscape import Landscape
     from roadgeo.library import resolve_reference
     from roadgeo.simulation import simulate_query
+    from roadgeo.trials import read_landscape
     from roadgeo.truth import write_truth
 
     sets = query_sets(**options)
-    landscape = Landscape.from_network(read_network(resolve_reference(reference)))
+    landscape = read_landscape(resolve_reference(reference), roads)
     truths = []
     with count_up(sum(count for _, count in sets), quiet) as advance:
         for simulation, count in sets:
