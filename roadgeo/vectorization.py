@@ -29,6 +29,8 @@ _STRIP_PIXELS = 1 << 24  # large masks are gone through so many pixels at a time
 #: Rays in the fan before a free end (an odd number), and how many of their pixels may touch the end itself.
 _BENDS, _NEAR = 11, 2
 
+_MAX_ROUNDS = 3  # of pruning; what later ones would still find is not worth their time
+
 
 @dataclass(frozen=True)
 class VectorizeOptions:
@@ -148,7 +150,7 @@ def road_width(mask: RoadMask) -> float:
     factor = min(int(width / 8), min(roads.shape) // 16)
     if width <= _BAND_ROWS / 3 or factor < 2:
         return max(width, 1.0)
-    return factor * road_width(RoadMask(_shrink(roads, factor, 0.5).view(np.bool_), name=mask.name))
+    return float(factor) * road_width(RoadMask(_shrink(roads, factor, 0.5).view(np.bool_), name=mask.name))
 
 
 def _count_depths(roads: AnyArray, rows: int, step: int) -> IntArray:
@@ -265,65 +267,61 @@ def _skeletonize(states: AnyArray, distance: Float32Array, width: float, options
     room = np.empty(len(flat), np.int32)
     pixels = thin(states, distance, max(0.25 * width, 1.0))  # ends of roads half as wide as most are kept
     bridged = False
-    while True:
+    for round_ in range(_MAX_ROUNDS):
         skeleton = _Skeleton(*trace(states, pixels, room))
-        drop = np.concatenate(
-            (_spurs(skeleton, distance, options.spur_widths * width), _pieces(skeleton, options.piece_widths * width))
-        )
-        if len(drop) > 0:
-            _erase(states, skeleton, drop)
-        elif bridged:
-            return skeleton
-        else:
+        drop = _spurs(skeleton, distance, options.spur_widths * width) | _pieces(skeleton, options.piece_widths * width)
+        _erase(states, skeleton, drop)
+        bridges = np.empty(0, np.int32)
+        if not bridged and (round_ > 0 or not drop.any()):
+            bridges = _bridges(states, distance, skeleton, ~drop, width, options)
             bridged = True
-            bridges = _bridges(states, distance, skeleton, width, options)
-            if len(bridges) == 0:
-                return skeleton
-            flat[bridges] = ROAD
-            pixels = np.concatenate((pixels, bridges))
-        pixels = rethin(states, distance, pixels, 0.0, False)
+        if bridged and not drop.any() and len(bridges) == 0:
+            return skeleton
+        pixels = rethin(states, distance, np.concatenate((pixels, bridges)), 0.0, False)
+    return _Skeleton(*trace(states, pixels, room))
 
 
-def _spurs(skeleton: _Skeleton, distance: Float32Array, reach: float) -> IntArray:
-    """Return free ends that reach less than `reach` beyond the road they leave, shortest first; two stay at a node."""
+def _spurs(skeleton: _Skeleton, distance: Float32Array, reach: float) -> BoolArray:
+    """Return (E,) which chains end free less than `reach` beyond the road they leave; two chains stay at a node."""
     tips, degree = skeleton.tips, skeleton.degree
     foot = np.where(tips[:, 0], skeleton.edges[:, 1], skeleton.edges[:, 0])
     excess = skeleton.lengths - distance[skeleton.pixel][foot]
     short = np.flatnonzero((tips[:, 0] != tips[:, 1]) & (degree[foot] >= 3) & (excess < reach))
-    budget = degree - 2
-    drop = []
-    for e in short[np.argsort(excess[short], kind="stable")]:
-        if budget[foot[e]] > 0:
-            budget[foot[e]] -= 1
-            drop.append(e)
-    return np.array(drop, np.int64)
+    short = short[np.lexsort((excess[short], foot[short]))]  # node by node, the shortest first
+    rank = np.arange(len(short)) - np.searchsorted(foot[short], foot[short])
+    drop = np.zeros(len(tips), np.bool_)
+    drop[short[rank < degree[foot[short]] - 2]] = True
+    return drop
 
 
-def _pieces(skeleton: _Skeleton, least: float) -> IntArray:
-    """Return roads that touch nothing and are shorter than `least`."""
-    return np.flatnonzero(skeleton.tips.all(axis=1) & (skeleton.lengths < least))
+def _pieces(skeleton: _Skeleton, least: float) -> BoolArray:
+    """Return (E,) which chains touch nothing and are shorter than `least`."""
+    return np.asarray(skeleton.tips.all(axis=1) & (skeleton.lengths < least))
 
 
-def _erase(states: AnyArray, skeleton: _Skeleton, drop: IntArray) -> None:
-    """Clear the pixels of some chains and of their free ends."""
-    flat = states.ravel()
-    for e in drop:
-        flat[skeleton.chain[skeleton.offsets[e] : skeleton.offsets[e + 1]]] = GROUND
+def _erase(states: AnyArray, skeleton: _Skeleton, drop: BoolArray) -> None:
+    """Clear the pixels of (E,) some chains and of their free ends."""
+    states.ravel()[skeleton.chain[np.repeat(drop, np.diff(skeleton.offsets))]] = GROUND
     rows, columns = skeleton.pixel
     ends = skeleton.edges[drop][skeleton.tips[drop]]
     states[rows[ends], columns[ends]] = GROUND
 
 
 def _bridges(
-    states: AnyArray, distance: Float32Array, skeleton: _Skeleton, width: float, options: VectorizeOptions
+    states: AnyArray,
+    distance: Float32Array,
+    skeleton: _Skeleton,
+    stands: BoolArray,
+    width: float,
+    options: VectorizeOptions,
 ) -> Int32Array:
-    """Return pixels that join free ends to the roads they point at.
+    """Return pixels that join free ends of the chains that stand, (E,), to the roads they point at; mark them as ROAD.
 
     From every free end rays fan out; the shortest (weighed by its bend) that meets another line is taken, if the road
     is not interrupted for longer than allowed on the way.
     """
     flat, stride = states.ravel(), states.shape[1]
-    edge, side = np.nonzero(skeleton.tips & (skeleton.lengths >= width)[:, None])
+    edge, side = np.nonzero(skeleton.tips & (stands & (skeleton.lengths >= width))[:, None])
     tip = skeleton.xy[skeleton.edges[edge, side]]
     at = _fans(states.shape, tip, _headings(skeleton, edge, side, tip, 2.0 * width, stride), width, options)
     met = cv2.dilate((states == ROAD).view(np.uint8), np.ones((3, 3), np.uint8)).ravel()[at]

@@ -63,16 +63,19 @@ def touches_solid(flat: NDArray[np.uint8], p: np.uint64, stride: np.uint64) -> b
 
 
 @njit(cache=True)
-def neighbour_steps(stride: int) -> NDArray[np.int64]:
-    """Return the (8,) steps to the neighbours in flat indices, counterclockwise from east."""
-    return np.array([1, 1 - stride, -stride, -1 - stride, -1, stride - 1, stride, stride + 1])
+def neighbour_steps(stride: int) -> NDArray[np.uint64]:
+    """Return the (8,) steps to the neighbours in flat indices, counterclockwise from east, modulo 2**64.
+
+    Unsigned like all indices here: numba then leaves out the check for negative ones.
+    """
+    return np.array([1, 1 - stride, -stride, -1 - stride, -1, stride - 1, stride, stride + 1]).astype(np.uint64)
 
 
 @njit(cache=True)
-def _is_ridge(flat: NDArray[np.uint8], depth: NDArray[np.float32], p: np.uint64, steps: NDArray[np.int64]) -> bool:
+def _is_ridge(flat: NDArray[np.uint8], depth: NDArray[np.float32], p: np.uint64, steps: NDArray[np.uint64]) -> bool:
     """Tell whether no neighbour that is left lies deeper than pixel `p`."""
     for k in range(8):
-        q = p + np.uint64(steps[k])
+        q = p + steps[k]
         if flat[q] != GROUND and depth[q] > depth[p]:
             return False
     return True
@@ -107,7 +110,7 @@ def rethin(
     """
     flat = states.ravel()
     depth = distance.ravel()
-    stride = np.uint64(states.shape[1])  # unsigned: numba then leaves out the check for negative indices
+    stride = np.uint64(states.shape[1])
     steps = neighbour_steps(states.shape[1])
     left = pixels.copy()
     n = len(left)
@@ -132,8 +135,8 @@ def rethin(
             flat[p] = GROUND
             while role == TIP:  # follow a line that is eaten from its end
                 for k in range(8):
-                    if flat[p + np.uint64(steps[k])] != GROUND:
-                        p += np.uint64(steps[k])
+                    if flat[p + steps[k]] != GROUND:
+                        p += steps[k]
                         break
                 role = ROLES[neighbours(flat, p, stride)]
                 if flat[p] != ROAD or role != TIP or depth[p] >= min_end_depth:

@@ -66,7 +66,7 @@ def trace(
     n_nodes = 0
     n_members = 0
     for i in range(n):
-        seed = pixels[i]
+        seed = np.uint64(pixels[i])
         kind = node_of[seed]
         if kind > FREE_END:
             continue
@@ -77,7 +77,7 @@ def trace(
         node_of[seed] = n_nodes
         head = first[n_nodes]
         while kind == JUNCTION and head < n_members:
-            p = members[head]
+            p = np.uint64(members[head])
             head += 1
             for k in range(8):
                 q = p + steps[k]
@@ -106,7 +106,7 @@ def trace(
             n_members += 1
             n_nodes += 1
             first[n_nodes] = n_members
-        p = members[m]
+        p = np.uint64(members[m])
         m += 1
         for k in range(8):
             q = p + steps[k]
