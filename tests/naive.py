@@ -4,6 +4,8 @@ from itertools import combinations, permutations, product
 
 import numpy as np
 
+from roadgeo.kernels.triples import UNITS
+
 # buckets
 
 
@@ -131,6 +133,10 @@ def screen(references, affines, anchor_xy, ref_xy, points, directions, radius, r
 # growth
 
 
+class GivenUpError(Exception):
+    """A fit has too few points, or one of them at the horizon."""
+
+
 def predict(p, u, v):
     x, y, w = np.append(p, 1.0).reshape(3, 3) @ (u, v, 1.0)
     return np.array([x / w, y / w])
@@ -197,7 +203,7 @@ def grow(
     xy, branches, order, half_size, anchor, ref_anchor, affine, neighbours, partners, ref_xy, ref_branches,
     sigma_m, radius_m, tolerance, perspective_sigma, hit_rate, chance_rate, patience,
 ):  # fmt: skip
-    """(matches, tests, ratio, matched, matrix) of a hypothesis that grows from its seeds; matrix None: given up."""
+    """(ratio, matches, tests, matched, matrix) of a hypothesis that grows from its seeds, or GivenUpError."""
     unit = half_size * np.sqrt(np.linalg.det(affine.reshape(2, 2)))
     query = (xy - xy[anchor]) / half_size
     seeds = {anchor: ref_anchor, **{int(neighbours[anchor, s]): int(b) for s, b in enumerate(partners) if b >= 0}}
@@ -207,52 +213,54 @@ def grow(
     hit, miss = np.log(hit_rate / chance_rate), np.log((1 - hit_rate) / (1 - chance_rate))
 
     def fit(p):
+        if (matched >= 0).sum() < 3 or (1.0 + query[matched >= 0] @ p[6:] < 0.05).any():
+            raise GivenUpError
         return fit_homography(query, (ref_xy[matched] - ref_xy[ref_anchor]) / unit, matched, prior, p)
 
     def search(i, p, normal):
-        """(map intersection or -1, distance, radius) at the predicted place of a query point."""
-        u, v = query[i]
-        spread = np.sqrt(0.5 * prediction_variance(normal, p, u, v))
-        radius = 2.5 * sigma_m * np.hypot(spread, 1.0)
+        """(place, search radius, Jacobian) of a query point, or None near the horizon."""
         model = np.append(p, 1.0).reshape(3, 3)
-        place = ref_xy[ref_anchor] + unit * predict(p, u, v)
-        J = jacobian(model, query[i])
-        return place, radius, J
+        if model[2] @ (*query[i], 1.0) < 0.1:
+            return None
+        spread = np.sqrt(0.5 * prediction_variance(normal, p, *query[i]))
+        place = ref_xy[ref_anchor] + unit * predict(p, *query[i])
+        return place, 2.5 * sigma_m * np.hypot(spread, 1.0), jacobian(model, query[i])
 
     p, normal = fit(np.zeros(8))
     p, normal = fit(p)
     ratio, fitted, tested = 0.0, len(seeds), set(seeds)
     for _ in range(8):
-        before = len(tested)
-        found = 0
+        news = 0
         for i in order:
             if i in tested:
                 continue
-            place, radius, J = search(i, p, normal)
-            if radius > radius_m:
+            found = search(i, p, normal)
+            if found is None or found[1] > radius_m:
                 continue
+            place, radius, J = found
             tested.add(i)
             j, _ = nearest_alike(*place, radius, branches, i, ref_xy, ref_branches, J, tolerance)
             ratio += hit if j >= 0 else miss
             if j < 0 and ratio < -patience:
-                return (matched >= 0).sum() - len(seeds), len(tested) - len(seeds), -np.inf, matched, None
+                raise GivenUpError
             if j >= 0:
-                found += 1
+                news += 1
                 matched[i] = j
                 if (matched >= 0).sum() >= 1.2 * fitted:
                     p, normal = fit(p)
                     fitted = (matched >= 0).sum()
-        assert len(tested) >= before
         p, normal = fit(p)
-        if found == 0:
+        if news == 0:
             break
     for _ in range(2):
         distance = np.full(len(xy), np.inf)
+        matched = np.full(len(xy), -1)
         for i in range(len(xy)):
-            place, radius, J = search(i, p, normal)
-            matched[i], distance[i] = nearest_alike(
-                *place, min(radius, radius_m), branches, i, ref_xy, ref_branches, J, tolerance
-            )
+            found = search(i, p, normal)
+            if found is not None:
+                place, radius, J = found
+                reach = min(radius, radius_m)
+                matched[i], distance[i] = nearest_alike(*place, reach, branches, i, ref_xy, ref_branches, J, tolerance)
         matched = keep_nearest(matched, distance)
         others = [i for i in range(len(xy)) if i not in seeds]
         hits = sum(matched[i] >= 0 for i in others)
@@ -263,7 +271,7 @@ def grow(
     )
     to_ground = np.array([[unit, 0, ref_xy[ref_anchor, 0]], [0, unit, ref_xy[ref_anchor, 1]], [0, 0, 1]])
     matrix = to_ground @ np.append(p, 1.0).reshape(3, 3) @ np.vstack([to_query, [0, 0, 1]])
-    return hits, len(others), ratio, matched, matrix
+    return ratio, hits, len(others), matched, matrix
 
 
 # adjustment
@@ -325,8 +333,6 @@ def adjust(
 
 # triples
 
-UNITS, CELL_UNITS = 96, 8
-
 
 def vertex_angle(e1, e2, tangent):
     """The tangent's angle after the affine map that sends e1, e2 to +-30 degrees about the axis, in units."""
@@ -335,11 +341,12 @@ def vertex_angle(e1, e2, tangent):
     return np.arctan2(*direction[::-1]) * UNITS / np.pi % UNITS
 
 
-def vertex_codes(xy, tangents, i, j, k):
-    """All sorted pairs of whole units at vertex i."""
+def vertex_codes(xy, tangents, i, j, k, limit):
+    """Sorted pairs of whole units at vertex i, those first that cross most openly."""
     lines = tangents[i][np.isfinite(tangents[i])]
     units = [int(vertex_angle(xy[j] - xy[i], xy[k] - xy[i], t)) % UNITS for t in lines]
-    return [tuple(sorted(pair)) for pair in combinations(units, 2)]
+    pairs = [tuple(sorted(pair)) for pair in combinations(units, 2)]
+    return sorted(pairs, key=lambda pair: -min(pair[1] - pair[0], UNITS - pair[1] + pair[0]))[:limit]
 
 
 def shape_of(xy, a, b, c):
@@ -360,7 +367,7 @@ def fill_table(xy, tangents, neighbours, min_shape, limit):
         b, c = set(triple) - {a}
         b, c = (b, c) if shape_of(xy, a, b, c) > 0 else (c, b)
         vertices = [(a, b, c), (b, c, a), (c, a, b)]
-        rows += [(a, b, c, code) for code in product(*(vertex_codes(xy, tangents, *v)[:limit] for v in vertices))]
+        rows += [(a, b, c, code) for code in product(*(vertex_codes(xy, tangents, *v, limit) for v in vertices))]
     return rows
 
 

@@ -46,7 +46,7 @@ def cholesky(matrix: NDArray[np.float64], factor: NDArray[np.float64]) -> bool:
             for k in range(j):
                 total -= factor[i, k] * factor[j, k]
             if i == j:
-                if total <= 1e-300:
+                if not total > 1e-300:  # NaN neither
                     return False
                 factor[i, i] = math.sqrt(total)
             else:
