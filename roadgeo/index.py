@@ -26,6 +26,8 @@ __all__ = ["IndexOptions", "ReferenceIndex", "build_index", "neighbour_grid", "p
 
 #: Slots of `neighbours` are stored in 4 bits.
 MAX_NEIGHBOURS = 16
+#: Branches and tangents beyond these, which hardly an intersection has, serve its codes but are not compared.
+INDEXED_BRANCHES = 6
 
 
 @dataclass(frozen=True)
@@ -48,9 +50,9 @@ class IndexOptions:
 
     n_neighbours: int = 8
     min_shape: float = 0.06
-    codes_per_vertex: int = 3
+    codes_per_vertex: int = 2
     min_bucket_m: float = 150.0
-    simplify_m: float = 0.5
+    simplify_m: float = 0.8
 
 
 @dataclass(frozen=True)
@@ -233,7 +235,7 @@ def neighbour_grid(xy: FloatArray, min_bucket: float) -> tuple[tuple[float, floa
     """
     low, high = xy.min(axis=0), xy.max(axis=0)
     width, height = (float(side) for side in high - low)
-    size = max(min_bucket, math.sqrt(width * height / (8 * len(xy))), max(width, height) / (4 * len(xy)))
+    size = max(min_bucket, math.sqrt(width * height / (4 * len(xy))), max(width, height) / (4 * len(xy)))
     return (float(low[0]), float(low[1]), size), (int(width / size) + 1, int(height / size) + 1)
 
 
@@ -315,8 +317,8 @@ def build_index(network: RoadNetwork, options: IndexOptions | None = None) -> Re
     return ReferenceIndex(
         meta=meta,
         xy=xy,
-        branches=found.branches()[order],
-        tangents=pack_tangents(tangents),
+        branches=np.ascontiguousarray(found.branches()[order, :INDEXED_BRANCHES]),
+        tangents=pack_tangents(tangents[:, :INDEXED_BRANCHES]),
         neighbours=neighbours,
         point_starts=point_starts,
         segments=segments,

@@ -3,9 +3,9 @@
 A triple (X, Y, Z), counterclockwise, is sent by an affine map to an equilateral triangle; two tangent lines at each vertex then
 give six angles that hardly change from map to image. At a vertex with edge vectors e1, e2 to the next two vertices, a
 direction d = alpha e1 + beta e2 has, against the axis towards the triangle's middle, the angle
-atan2((beta - alpha) sin 30, (alpha + beta) cos 30). Angles are measured in units of pi / 96, in cells of 8 units (15 degrees).
+atan2((beta - alpha) sin 30, (alpha + beta) cos 30). Angles are measured in units of pi / 72, in cells of 8 units (20 degrees).
 
-Two sorted cells at a vertex make one of 78 pairs, three vertices one of 78^3 table cells. An entry is a uint64:
+Two sorted cells at a vertex make one of 45 pairs, three vertices one of 45^3 table cells. An entry is a uint64:
 `anchor << 32 | slot of Y << 28 | slot of Z << 24 | six positions within the cells`, slots being columns of `neighbours`. Each
 position takes 4 bits of which the highest is 0: with that bit set as a guard, one subtraction compares all six at once.
 """
@@ -17,7 +17,7 @@ from numba import njit
 
 from roadgeo.kernels.rays import rays_agree
 
-UNITS = 96  # per half turn
+UNITS = 72  # per half turn
 CELL_UNITS = 8
 GUARDS = 0x888888
 CELLS = UNITS // CELL_UNITS
@@ -46,7 +46,7 @@ def vertex_angle(e1x, e1y, e2x, e2y, tangent):
 def vertex_codes(xy, tangents, i, j, k, limit, out):
     """Write the sorted unit pairs (u1 <= u2) of vertex i of the triangle i, j, k; return how many.
 
-    One pair for every two of the vertex's tangents, at most `limit`; with a limit of 1, the two that cross most openly.
+    One pair for every two of the vertex's tangents; of more than `limit`, those that cross most openly.
     """
     e1x, e1y = xy[j, 0] - xy[i, 0], xy[j, 1] - xy[i, 1]
     e2x, e2y = xy[k, 0] - xy[i, 0], xy[k, 1] - xy[i, 1]
@@ -54,23 +54,22 @@ def vertex_codes(xy, tangents, i, j, k, limit, out):
     m = 0
     while m < tangents.shape[1] and not np.isnan(tangents[i, m]):
         m += 1
-    widest = -1
+    openness = np.empty(limit, np.int64)
     for p in range(m):
         up = int(vertex_angle(e1x, e1y, e2x, e2y, tangents[i, p])) % UNITS
         for q in range(p + 1, m):
             uq = int(vertex_angle(e1x, e1y, e2x, e2y, tangents[i, q])) % UNITS
-            if limit == 1:
-                between = abs(up - uq)
-                between = min(between, UNITS - between)
-                if between > widest:
-                    widest = between
-                    out[0, 0] = min(up, uq)
-                    out[0, 1] = max(up, uq)
-                    n = 1
-            elif n < limit:
-                out[n, 0] = min(up, uq)
-                out[n, 1] = max(up, uq)
-                n += 1
+            between = min(abs(up - uq), UNITS - abs(up - uq))
+            if n == limit and between <= openness[n - 1]:
+                continue
+            place = min(n, limit - 1)
+            while place > 0 and openness[place - 1] < between:
+                openness[place] = openness[place - 1]
+                out[place, 0], out[place, 1] = out[place - 1, 0], out[place - 1, 1]
+                place -= 1
+            openness[place] = between
+            out[place, 0], out[place, 1] = min(up, uq), max(up, uq)
+            n = min(n + 1, limit)
     return n
 
 
