@@ -97,10 +97,12 @@ def pose(matrix: FloatArray, size: tuple[int, int], focal_px: float | None = Non
 
 def judge(matrix: FloatArray, size: tuple[int, int], options: CameraOptions) -> str:
     """Return why a homography is not plausible, or "" if it is."""
+    if not np.isfinite(matrix).all():
+        return "degenerate"
     width, height = size
     corners = np.array([[0, 0, 1], [width, 0, 1], [width, -height, 1], [0, -height, 1]], float)
     middle = float(matrix[2] @ (width / 2.0, -height / 2.0, 1.0))
-    if not np.isfinite(matrix).all() or middle == 0.0:
+    if middle == 0.0:
         return "degenerate"
     if (corners @ matrix[2] / middle < 0.05).any():
         return "horizon in the frame"
