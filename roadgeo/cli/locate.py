@@ -53,6 +53,7 @@ class Job:
     threshold: float | None = None
     band: int | None = None
     plot: bool = False
+    skip_existing: bool = False
 
     def prepare(self) -> Callable[[Task], Outcome]:
         """Open the references."""
@@ -71,6 +72,9 @@ class Job:
         """Locate one mask and write its results. What is wrong with one mask never stops the others."""
         from roadgeo.errors import RoadgeoError
 
+        earlier = self._earlier(task) if self.skip_existing else None
+        if earlier is not None:
+            return earlier
         try:
             return self._locate(task, references, open_seconds)
         except RoadgeoError as error:
@@ -79,6 +83,22 @@ class Job:
             return _failed(
                 task, f"{task.mask}: {type(error).__name__}: {error}; this is a fault of roadgeo, please report it"
             )
+
+    def _earlier(self, task: Task) -> Outcome | None:
+        """Return what an earlier run found, if its result is whole, of this mask and younger than it."""
+        from roadgeo.location import SCHEMA
+        from roadgeo.outputs import output_paths
+
+        path = output_paths(self.out_dir, task.stem).json
+        try:
+            document = json.loads(path.read_text(encoding="utf-8"))
+            if path.stat().st_mtime < Path(task.mask).stat().st_mtime:
+                return None
+        except (OSError, ValueError):
+            return None
+        if not isinstance(document, dict) or (document.get("schema"), document.get("query")) != (SCHEMA, task.mask):
+            return None
+        return Outcome(document["status"], document, f"{task.mask}: {document['status'].replace('_', ' ')} before")
 
     def _locate(self, task: Task, references: list[Reference], open_seconds: float) -> Outcome:
         from dataclasses import replace
@@ -204,6 +224,11 @@ def open_references(names: Iterable[str]) -> list[Reference]:
     show_default=True,
     help="Stop searching for a mask after this time.",
 )
+@click.option(
+    "--skip-existing/--overwrite",
+    default=False,
+    help="Keep results that are there and younger than their masks, or make them anew, the default.",
+)
 @click.option("-j", "--jobs", metavar="N", type=click.IntRange(1), default=1, show_default=True, help="Processes.")
 @verbosity_options
 def locate_command(
@@ -227,6 +252,7 @@ def locate_command(
     north_up: bool,
     method: Literal["auto", "pair"],
     time_limit: float,
+    skip_existing: bool,
     jobs: int,
     quiet: bool,
     verbose: bool,
@@ -243,6 +269,9 @@ def locate_command(
       photo_mask_location.gpkg   footprint, matched intersections, roads: opens styled in QGIS
       photo_mask_location.json   place, homography, odds; also written, with a reason, where nothing was found
       photo_mask_overlay.png     with --plot
+
+    For several masks also roadgeo_summary.gpkg and roadgeo_summary.csv, all footprints in one. What Ctrl-C cut short
+    goes on with --skip-existing.
 
     \b
     With --also:
@@ -266,6 +295,7 @@ def locate_command(
     Exit status: 0 every mask located, 3 at least one not located, 1 error, 2 usage.
     """
     from roadgeo.cli.compilation import compile_once
+    from roadgeo.io_summary import write_summary
 
     options = make_options(method, gsd, max_tilt, near, north_up, time_limit)
     tasks = name_tasks(find_masks(masks))
@@ -274,17 +304,21 @@ def locate_command(
     make_folder(out_dir)
     outputs = _make_outputs(crs, resolution, resampling, max_pixels, (*products, *(["gcps"] if gcps else [])))
     pictures = pair_images([task.mask for task in tasks], images)
-    job = Job(references, options, outputs, out_dir, pictures, threshold, band, plot)
+    job = Job(references, options, outputs, out_dir, pictures, threshold, band, plot, skip_existing)
     # Opened here too: what is wrong with them is said once, and the search is compiled before processes start.
     compile_once(open_references(references)[0], quiet)
     counts: Counter[Status] = Counter()
+    documents = []
     with _progress(len(tasks), as_json, quiet) as advance:
         for outcome in run(tasks, job, jobs):
             counts[outcome.status] += 1
+            documents.append(outcome.document)
             advance(counts)
             _report(outcome, as_json, quiet, verbose, single=len(tasks) == 1)
-    if len(tasks) > 1 and not quiet:
-        click.echo(summarize(counts), err=True)
+    if len(tasks) > 1:
+        files = write_summary(Path(out_dir), documents)
+        if not quiet:
+            click.echo(f"{summarize(counts)}; all footprints: {', '.join(map(str, files))}", err=True)
     return ERROR if counts["error"] else 0 if counts["located"] == len(tasks) else NOT_LOCATED
 
 
