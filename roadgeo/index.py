@@ -169,7 +169,7 @@ def _check_parts(meta: Mapping[str, Any], arrays: Mapping[str, AnyArray], path: 
             raise IndexFormatError(f"{path or 'index'}: {what}; rebuild it with `roadgeo index`")
 
     def is_number(value: object) -> bool:
-        return isinstance(value, (int, float)) and math.isfinite(value)
+        return isinstance(value, (int, float)) and -1e15 < value < 1e15
 
     for name, (dtype, ndim) in _SCHEMA.items():
         require(name in arrays, f"array {name!r} is missing")

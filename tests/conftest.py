@@ -2,8 +2,13 @@
 
 import os
 from pathlib import Path
+from typing import TYPE_CHECKING
 
 import pytest
+
+if TYPE_CHECKING:
+    from roadgeo.index import ReferenceIndex
+    from roadgeo.network import RoadNetwork
 
 
 @pytest.fixture(scope="session")
@@ -13,3 +18,14 @@ def data_dir() -> Path:
     if not folder or not Path(folder).is_dir():
         pytest.skip("ROADGEO_DATA is not set: no development data here")
     return Path(folder)
+
+
+@pytest.fixture(scope="session")
+def town() -> "tuple[RoadNetwork, ReferenceIndex]":
+    """A made-up town of 4 x 4 km, 730 intersections, and its index; see `scenes`."""
+    from scenes import random_network
+
+    from roadgeo.index import build_index
+
+    network = random_network(1, 4000.0)
+    return network, build_index(network)

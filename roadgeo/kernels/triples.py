@@ -84,7 +84,7 @@ def orient(xy, a, b, c, min_shape):
     bcx, bcy = acx - abx, acy - aby
     cross = abx * acy - aby * acx
     longest = max(abx * abx + aby * aby, acx * acx + acy * acy, bcx * bcx + bcy * bcy)
-    if abs(cross) < min_shape * longest:
+    if not abs(cross) > min_shape * longest:  # three points in one place are thin too
         return 0
     return 1 if cross > 0 else -1
 
