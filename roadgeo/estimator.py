@@ -23,6 +23,10 @@ from roadgeo.verification import Agreement, VerifyOptions, agreement, chance_agr
 __all__ = ["GrowOptions", "Hypothesis", "MatchOptions", "TripleEstimator"]
 
 
+#: Matches that fix a homography: so many of a hypothesis' own are no evidence for it.
+MINIMAL = 4
+
+
 @dataclass(frozen=True)
 class GrowOptions:
     """How proposals are screened and grown (see `kernels.roads.screen`, `kernels.growth.grow`). Lengths have a part in metres, the
@@ -110,7 +114,7 @@ class TripleEstimator:
         self.scene = scene
         self.index = index
         self.options = options or MatchOptions()
-        self.n_tuples = self.n_candidates = self.n_hypotheses = self.n_verified = 0
+        self.n_tuples = self.n_candidates = self.n_screened = self.n_hypotheses = self.n_verified = 0
 
     def rounds(self) -> Iterator[list[Hypothesis]]:
         """Yield, for one anchor after another, the hypotheses that grew."""
@@ -119,7 +123,14 @@ class TripleEstimator:
         scale = (gsd[0] * 0.5, gsd[1] * 2.0)
         for sweep in options.sweeps:
             anchors = propose(
-                self.scene.intersections, self.scene.branches, self.scene.neighbours, self.index, scale, 0.33, sweep.triples)
+                self.scene.intersections,
+                self.scene.branches,
+                self.scene.neighbours,
+                self.index,
+                scale,
+                0.33,
+                sweep.triples,
+            )
             for proposals in islice(anchors, sweep.max_anchors):
                 self.n_tuples += proposals.n_tuples
                 self.n_candidates += proposals.n_hits
@@ -135,6 +146,7 @@ class TripleEstimator:
         near = np.argsort(away, kind="stable")[: options.screen_points]
         near = near[away[near] < reach]
         most = options.max_screened
+        self.n_screened += min(most, len(proposals.reference))
         shares = np.zeros(len(proposals.reference))
         screen(
             proposals.reference[:most], proposals.affine, anchor, index.xy, scene.points[near], scene.directions[near],
@@ -203,13 +215,15 @@ class TripleEstimator:
                 return -np.inf
             assert model.found is not None  # noqa: S101 - for the type checker
             # What a wrong place reaches is soon seen; only promising ones are worth all points and a null of their own.
-            model.log10_odds = log10_odds(model.found, self.least_chance, scene.n_edges, self.n_candidates)
+            model.log10_odds = log10_odds(
+                model.found, self.least_chance, scene.n_edges, self.n_screened, options.verify
+            )
             if model.log10_odds < options.verify.promising:
                 return model.log10_odds
         model.chance = chance_agreement(model.matrix, scene, index, model.gsd_m, options.verify)
         self.least_chance = np.minimum(self.least_chance, model.chance) if self.n_nulls else np.array(model.chance)
         self.n_nulls += 1
-        model.log10_odds = log10_odds(model.found, model.chance, scene.n_edges, self.n_candidates)
+        model.log10_odds = log10_odds(model.found, model.chance, scene.n_edges, self.n_screened, options.verify)
         return model.log10_odds
 
     def _converge(self, model: Hypothesis, n_points: int | None) -> bool:
@@ -222,7 +236,7 @@ class TripleEstimator:
                 return model.refined is not None and best >= 0.0
             gsd = pose(refined.matrix, scene.size).gsd_m
             found, matched, distance = agreement(
-                refined.matrix, scene, self.index, gsd, model.seeds, options.verify
+                refined.matrix, scene, self.index, gsd, model.seeds[-MINIMAL:], options.verify
             )
             if found.forward < best:
                 break

@@ -12,7 +12,7 @@ from roadgeo.kernels.adjustment import adjust, point_row
 from roadgeo.scene import Scene
 from roadgeo.typing import FloatArray, IntArray
 
-__all__ = ["Refined", "RefineOptions", "refine"]
+__all__ = ["RefineOptions", "Refined", "refine"]
 
 
 @dataclass(frozen=True)
@@ -60,8 +60,9 @@ class RefineOptions:
 
 @dataclass(frozen=True)
 class Refined:
-    """A refined homography (3, 3), query plane to reference plane, the (4,) standard deviations of the frame's corners in metres,
-    and the robust rms distance of road points from the map's roads."""
+    """A refined homography (3, 3), query plane to reference plane, the (4,) standard deviations of the frame's corners (root mean square of their distances) in metres,
+    and the robust rms distance of road points from the map's roads.
+    """
 
     matrix: FloatArray
     corner_sigma_m: FloatArray
@@ -155,6 +156,6 @@ def refine(
         return None
     covariance = np.linalg.inv(normal) * (rms / unit) ** 2
     rows = _corner_rows(p, (scene.corners - center) / half_size)
-    variance = np.einsum("nai,ij,naj->n", rows, covariance, rows) / 2.0 * unit**2
+    variance = np.einsum("nai,ij,naj->n", rows, covariance, rows) * unit**2
     result = _matrix(p, center, half_size, origin, unit)
     return Refined(result / result[2, 2], np.sqrt(variance + options.sigma_floor_m**2), rms)

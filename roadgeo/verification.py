@@ -36,6 +36,10 @@ class VerifyOptions:
         Usual error of a traced road in pixels.
     n_shifts : int
         Shifted positions of the null model.
+    saturation : float
+        However many intersections or roads agree, they count as fewer than so many independent trials: chance varies from
+        place to place by more than a binomial law allows, and no number of trials helps against that. Fitted to the best
+        wrong places of training queries whose true place was forbidden.
     promising : float
         Log10 odds that a place must reach against the least chance seen so far before a null of its own is measured for it.
     """
@@ -48,7 +52,8 @@ class VerifyOptions:
     shift_m: tuple[float, float] = (30.0, 320.0)
     n_shifts: int = 150
     n_null_points: int = 150
-    promising: float = 2.0
+    saturation: float = 30.0
+    promising: float = 0.0
 
 
 @dataclass(frozen=True)
@@ -103,9 +108,7 @@ def agreement(
     out = np.empty(len(scene.points))
     min_cos = math.cos(math.radians(options.max_turn_deg))
     roads = (index.segments, index.segment_starts, index.segment_ids, index.grid, index.shape)
-    near = forward_distances(
-        matrix, scene.points, scene.directions, tolerance, min_cos, 0.0, 0.0, *roads, out
-    )
+    near = forward_distances(matrix, scene.points, scene.directions, tolerance, min_cos, 0.0, 0.0, *roads, out)
     seen, shown = backward_agreement(
         np.linalg.inv(matrix), _bounds(matrix, scene), options.backward_step_m, tolerance, 0.0, 0.0, *roads,
         scene.field, scene.field_scale, scene.observed,
@@ -167,9 +170,19 @@ def _information(rate: float, chance: float) -> float:
 
 
 def log10_odds(
-    found: Agreement, chance: Sequence[float] | FloatArray, n_roads: float, n_candidates: int
+    found: Agreement, chance: Sequence[float] | FloatArray, n_roads: float, n_candidates: int, options: VerifyOptions
 ) -> float:
-    """Log10 odds of a place against chance, corrected for the candidates tried."""
-    nats = found.tested * _information(found.rate, chance[0])
-    nats += 0.5 * n_roads * (_information(found.forward, chance[1]) + _information(found.backward, chance[2]))
+    """Log10 odds of a place against chance, corrected for the candidates tried.
+
+    Log-likelihood ratios of the three rates against the rates by chance, times the number of independent trials, less the
+    logarithm of the number of places tried.
+    """
+
+    def independent(trials: float) -> float:
+        return trials / (1.0 + trials / options.saturation)
+
+    nats = independent(found.tested) * _information(found.rate, chance[0])
+    # Forward and backward agreement are two views of the same roads: each counts half.
+    both = _information(found.forward, chance[1]) + _information(found.backward, chance[2])
+    nats += independent(0.5 * n_roads) * both
     return (nats - math.log(max(n_candidates, 1))) / math.log(10.0)

@@ -171,8 +171,8 @@ class LocateOptions:
 
     method: Literal["auto", "pair"] = "auto"
     near: tuple[float, float, float] | None = None
-    min_log10_odds: float = 6.0
-    min_margin: float = 3.0
+    min_log10_odds: float = 3.0
+    min_margin: float = 1.5
     min_intersections: int = 6
     query: QueryOptions = field(default_factory=QueryOptions)
     match: MatchOptions = field(default_factory=MatchOptions)
@@ -257,9 +257,7 @@ def _locate_on(
     estimator = TripleEstimator(scene, index, options.match, _near(index, options.near))
     result = search(estimator, options.search)
     stats = Stats(estimator.n_tuples, estimator.n_candidates, estimator.n_hypotheses, estimator.n_verified)
-    seconds = replace(
-        seconds, match=time.perf_counter() - started - estimator.refine_s, refine=estimator.refine_s
-    )
+    seconds = replace(seconds, match=time.perf_counter() - started - estimator.refine_s, refine=estimator.refine_s)
     location = replace(location, seconds=seconds, stats=stats)
     return _describe(location, scene, graph, index, result, estimator, options)
 
@@ -430,5 +428,3 @@ def _best_of(found: Sequence[Location]) -> Location:
         names = ", ".join(one.reference for one in found)
         return replace(best, seconds=total, reference=names)
     return replace(best, seconds=total)
-
-
