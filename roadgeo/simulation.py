@@ -23,6 +23,7 @@ __all__ = [
     "SimulationOptions",
     "ViewOptions",
     "draw_view",
+    "footprint_area",
     "simulate",
     "simulate_query",
     "simulate_query_at",

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 import math
+import sys
 import time
 from collections.abc import Iterator, Sequence
 from pathlib import Path
@@ -168,7 +169,7 @@ def _print(evaluation: Evaluation) -> None:
 
     from roadgeo.evaluation_report import TITLES
 
-    console = Console()
+    console = Console(width=None if sys.stdout.isatty() else 100)
     for by, groups in evaluation.breakdowns.items():
         console.print(_table(TITLES[by], [*groups, evaluation.total] if by == "kind" else groups))
     for line in _verdicts(evaluation):
