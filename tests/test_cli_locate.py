@@ -7,6 +7,7 @@ import subprocess
 import sys
 from pathlib import Path
 
+import click
 import cv2
 import numpy as np
 import pyproj
@@ -15,6 +16,7 @@ import rasterio
 
 from roadgeo.cli import main
 from roadgeo.cli.index import build
+from roadgeo.cli.locate import pair_images
 from roadgeo.demo import ROADS, DemoMask, demo_masks
 from roadgeo.homography import Homography
 from roadgeo.io_roads import read_roads
@@ -93,6 +95,53 @@ def test_processes_give_the_same_results(porto: Path, tmp_path: Path, capfd: pyt
     for found, mask in zip(alone, MASKS.values(), strict=True):
         if mask.in_map:
             assert center_error(found, mask) < 2
+
+
+def test_what_was_cut_short_goes_on_where_it_was(
+    porto: Path, tmp_path: Path, capfd: pytest.CaptureFixture[str]
+) -> None:
+    for name in ("drone", "elsewhere", "map_sheet"):
+        shutil.copy(MASKS[name].path, f"{name}.png")
+    locate = ["locate", "drone.png", "elsewhere.png", "map_sheet.png", "-r", str(porto), "-o", "out", "--json", "-q"]
+    assert main([*locate[:3], *locate[4:]]) == 3  # as if it had been interrupted
+    first = capfd.readouterr().out.splitlines()
+    marked = {**json.loads(first[0]), "reason": "found before"}
+    Path("out/drone_location.json").write_text(json.dumps(marked))
+    Path("out/elsewhere_location.json").write_text("half a fi")
+    assert main([*locate, "--skip-existing"]) == 3
+    again = [json.loads(line) for line in capfd.readouterr().out.splitlines()]
+    assert [one["status"] for one in again] == ["located", "not_located", "located"]
+    assert again[0] == marked
+    assert Path("out/roadgeo_summary.csv").read_text().count("\n") == 4
+    os.utime("drone.png", (2e9, 2e9))  # the mask was made anew
+    assert main([*locate, "--skip-existing"]) == 3
+    assert json.loads(capfd.readouterr().out.splitlines()[0])["reason"] != "found before"
+
+
+def test_the_photograph_is_drawn_in_the_crs_asked_for(porto: Path, tmp_path: Path) -> None:
+    shutil.copy(MASKS["drone"].path, "drone_mask.png")
+    Path("photos").mkdir()
+    photo = cv2.cvtColor(cv2.resize(cv2.imread("drone_mask.png", 0), None, fx=2, fy=2), cv2.COLOR_GRAY2BGR)
+    cv2.imwrite("photos/drone.png", photo)
+    arguments = ["--crs", "EPSG:3857", "--resolution", "2", "--gcps", "--also", "geojson", "-r", str(porto), "-q"]
+    assert main(["locate", "drone_mask.png", "--image", "photos", *arguments]) == 0
+    with rasterio.open("drone_mask_footprint.tif") as raster:
+        assert (raster.crs.to_epsg(), raster.res, raster.count) == (3857, (2.0, 2.0), 4)
+    assert Path("drone_mask_gcps.tif").exists()
+    assert Path("drone_mask_footprint.geojson").exists()
+
+
+def test_photographs_go_with_their_masks(tmp_path: Path) -> None:
+    for name in ("a.jpg", "b_mask.tif"):
+        (tmp_path / name).touch()
+    found = pair_images(["x/a_mask.png", "x/b_mask.png"], [str(tmp_path)])
+    assert found == {"x/a_mask.png": str(tmp_path / "a.jpg"), "x/b_mask.png": str(tmp_path / "b_mask.tif")}
+    assert pair_images(["a.png", "b.png"], ["1.tif", "2.tif"]) == {"a.png": "1.tif", "b.png": "2.tif"}
+    assert pair_images(["a.png"], []) == {}
+    with pytest.raises(click.UsageError, match="2 masks and 1 times --image"):
+        pair_images(["a.png", "b.png"], ["1.tif"])
+    with pytest.raises(click.UsageError, match=r"the name of c\.png"):
+        pair_images(["c.png"], [str(tmp_path)])
 
 
 def test_options_narrow_the_search(porto: Path, capfd: pytest.CaptureFixture[str]) -> None:
