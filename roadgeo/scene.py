@@ -100,6 +100,7 @@ def sample_roads(graph: RoadGraph, spacing: float) -> tuple[FloatArray, FloatArr
     lengths[graph.offsets[1:-1] - 1] = 0.0  # the jump from one edge to the next is no road
     along = np.concatenate(([0.0], np.cumsum(lengths)))
     at = np.arange(spacing / 2, along[-1], spacing)
+    at = at[at < along[-1]]  # `arange` may round up to its end
     segment = np.searchsorted(along, at, side="right") - 1
     fraction = (at - along[segment]) / lengths[segment]
     return graph.coords[segment] + fraction[:, None] * steps[segment], steps[segment] / lengths[segment][:, None]
