@@ -29,10 +29,35 @@ MINIMAL = 4
 
 @dataclass(frozen=True)
 class GrowOptions:
-    """How proposals are screened and grown (see `kernels.roads.screen`, `kernels.growth.grow`). Lengths have a part in metres, the
-    map's, and one in pixels, the mask's.
+    """How proposals are screened and grown (see `kernels.roads.screen`, `kernels.growth.grow`).
+
+    Lengths have a part in metres, the map's, and one in pixels, the mask's.
+
+    Attributes
+    ----------
+    max_scale_ratio : float
+        Away from the middle of a tilted frame the ground sampling may differ from that at the middle by this factor.
+    min_shape_ratio : float
+        Least ratio of the singular values of the map around an anchor: a camera tilted by 60 degrees sees 1 : 2, the
+        rays at
+        its frame's edge still less.
+    screen_points, screen_radius_m, screen_radius_px, screen_share
+        Of so many road points near the anchor, this share must lie within these radii of roads of the map.
+    max_screened, max_grown, max_verified : int
+        Bounds of one anchor's work: proposals screened, grown, and grown ones scored.
+    sigma_m, sigma_px, radius_m, radius_px
+        Standard deviation of an intersection's place, and the greatest search radius.
+    perspective_sigma : float
+        Prior standard deviation of the two perspective parameters.
+    hit_rate, chance_rate, patience : float
+        Of the sequential test: share of intersections that match if true and if not, and the nats lost before giving
+        up.
+    min_matched : int
+        Least matches besides the seeds.
     """
 
+    max_scale_ratio: float = 2.0
+    min_shape_ratio: float = 0.33
     screen_points: int = 40
     screen_radius_m: float = 8.0
     screen_radius_px: float = 4.0
@@ -118,26 +143,46 @@ class TripleEstimator:
 
     def rounds(self) -> Iterator[list[Hypothesis]]:
         """Yield, for one anchor after another, the hypotheses that grew."""
-        options = self.options
-        gsd = options.camera.gsd_m
-        scale = (gsd[0] * 0.5, gsd[1] * 2.0)
+        scene, options = self.scene, self.options
+        low, high = options.camera.gsd_m
+        scale = (low / options.grow.max_scale_ratio, high * options.grow.max_scale_ratio)
         for sweep in options.sweeps:
             anchors = propose(
-                self.scene.intersections,
-                self.scene.branches,
-                self.scene.neighbours,
-                self.index,
-                scale,
-                0.33,
-                sweep.triples,
-            )
+                scene.intersections, scene.branches, scene.neighbours, self.index,
+                scale, options.grow.min_shape_ratio, sweep.triples,
+            )  # fmt: skip
             for proposals in islice(anchors, sweep.max_anchors):
                 self.n_tuples += proposals.n_tuples
                 self.n_candidates += proposals.n_hits
                 yield self._grow_all(proposals)
 
+    def rehearse(self) -> None:
+        """Call every kernel once, on places of no meaning: they are compiled or loaded then, and no clock need know."""
+        n = len(self.scene.intersections)
+        if n == 0 or len(self.index) < MINIMAL:
+            return
+        other = TripleEstimator(self.scene, self.index, self.options)
+        next(other.rounds(), None)
+        proposals = Proposals(
+            0,
+            np.zeros(1, np.int64),
+            np.full((1, 8), -1),
+            np.array([[1.0, 0.0, 0.0, 1.0]]),
+            np.zeros(1, np.int64),
+            0,
+            0,
+            0,
+        )
+        other._screen(proposals)
+        other._grow(proposals, 0, np.arange(n))
+        x, y = self.index.xy[0] - self.scene.center
+        matrix = np.array([[1.0, 0.0, x], [0.0, 1.0, y], [0.0, 0.0, 1.0]])
+        hypothesis = Hypothesis(matrix, np.empty(0, np.int64), 0.0, np.full(n, -1))
+        other.score(hypothesis)
+        chance_agreement(matrix, self.scene, self.index, 1.0, self.options.verify)
+
     def _screen(self, proposals: Proposals) -> IntArray:
-        """Return the proposals under which the roads around the anchor lie on roads of the map, the best placed first."""
+        """Return the proposals that put roads around the anchor on roads of the map, the best placed first."""
         options, scene, index = self.options.grow, self.scene, self.index
         anchor = scene.intersections.xy[proposals.anchor]
         away = np.hypot(*(scene.points - anchor).T)
@@ -150,7 +195,8 @@ class TripleEstimator:
         shares = np.zeros(len(proposals.reference))
         screen(
             proposals.reference[:most], proposals.affine, anchor, index.xy, scene.points[near], scene.directions[near],
-            options.screen_radius_m, options.screen_radius_px, np.cos(np.radians(options.ray_tolerance_deg)), options.screen_share,
+            options.screen_radius_m, options.screen_radius_px, math.cos(math.radians(options.ray_tolerance_deg)),
+            options.screen_share,
             index.segments, index.segment_starts, index.segment_ids, index.grid, index.shape, shares,
         )  # fmt: skip
         good = shares >= options.screen_share
@@ -162,37 +208,39 @@ class TripleEstimator:
         kept = np.flatnonzero(good)
         return kept[np.argsort(-(proposals.placed[kept] + shares[kept]), kind="stable")]
 
-    def _grow_all(self, proposals: Proposals) -> list[Hypothesis]:
-        options = self.options.grow
-        scene, index = self.scene, self.index
-        found = scene.intersections
-        anchor = proposals.anchor
-        neighbours = np.ascontiguousarray(scene.neighbours[:, : proposals.partners.shape[1]])
-        order = np.argsort(np.hypot(*(found.xy - found.xy[anchor]).T), kind="stable")
-        matched = np.empty(len(found), np.int64)
-        distance = np.empty(len(found))
+    def _grow(self, proposals: Proposals, m: int, order: IntArray) -> Hypothesis | None:
+        """Grow one proposal; None if it withers. `order` sorts the query by distance from the anchor."""
+        options, scene, index = self.options.grow, self.scene, self.index
+        anchor, partners, affine = proposals.anchor, proposals.partners[m], proposals.affine[m]
+        neighbours = np.ascontiguousarray(scene.neighbours[:, : len(partners)])
+        gsd = math.sqrt(affine[0] * affine[3] - affine[1] * affine[2])
+        matched = np.empty(len(order), np.int64)
+        distance = np.empty(len(order))
         matrix = np.empty((3, 3))
-        grown = []
-        gsd = np.sqrt(proposals.affine[:, 0] * proposals.affine[:, 3] - proposals.affine[:, 1] * proposals.affine[:, 2])
-        for m in self._screen(proposals)[: options.max_grown]:
-            self.n_hypotheses += 1
-            n_matched, _, ratio = grow(
-                found.xy, scene.branches, order, scene.half_size, anchor, proposals.reference[m], proposals.affine[m],
-                neighbours, proposals.partners[m],
-                index.xy, index.branches, index.point_starts, index.grid, index.shape,
-                math.hypot(options.sigma_m, options.sigma_px * gsd[m]), options.radius_m + options.radius_px * gsd[m], np.cos(np.radians(options.ray_tolerance_deg)), options.perspective_sigma,
-                options.hit_rate, options.chance_rate, options.patience, matched, distance, matrix,
-            )  # fmt: skip
-            if n_matched < options.min_matched or not np.isfinite(ratio):
-                continue
-            if judge(matrix, scene.size, self.options.camera):
-                continue
-            slots = proposals.partners[m] >= 0
-            seeds = np.append(neighbours[anchor][slots], anchor)
-            grown.append(Hypothesis(matrix / matrix[2, 2], seeds, ratio, matched.copy()))
-        grown.sort(key=lambda h: -h.support)
+        n_matched, _, ratio = grow(
+            scene.intersections.xy, scene.branches, order, scene.half_size, anchor, proposals.reference[m], affine,
+            neighbours, partners, index.xy, index.branches, index.point_starts, index.grid, index.shape,
+            math.hypot(options.sigma_m, options.sigma_px * gsd), options.radius_m + options.radius_px * gsd,
+            math.cos(math.radians(options.ray_tolerance_deg)), options.perspective_sigma,
+            options.hit_rate, options.chance_rate, options.patience, matched, distance, matrix,
+        )  # fmt: skip
+        if n_matched < options.min_matched or not math.isfinite(ratio):
+            return None
+        if judge(matrix, scene.size, self.options.camera):
+            return None
+        seeds = np.append(neighbours[anchor][partners >= 0], anchor)
+        return Hypothesis(matrix / matrix[2, 2], seeds, ratio, matched)
+
+    def _grow_all(self, proposals: Proposals) -> list[Hypothesis]:
+        """Return the best grown proposals of one anchor that mean different places."""
+        options = self.options.grow
+        xy = self.scene.intersections.xy
+        order = np.argsort(np.hypot(*(xy - xy[proposals.anchor]).T), kind="stable")
+        chosen = self._screen(proposals)[: options.max_grown]
+        self.n_hypotheses += len(chosen)
+        grown = [h for m in chosen if (h := self._grow(proposals, m, order)) is not None]
         distinct: list[Hypothesis] = []
-        for h in grown:
+        for h in sorted(grown, key=lambda h: -h.support):
             if len(distinct) == options.max_verified:
                 break
             if not any(self.same(h, other) for other in distinct):
@@ -213,18 +261,21 @@ class TripleEstimator:
         for n_points in (150, 300, None):
             if not self._converge(model, n_points):
                 return -np.inf
-            assert model.found is not None  # noqa: S101 - for the type checker
             # What a wrong place reaches is soon seen; only promising ones are worth all points and a null of their own.
-            model.log10_odds = log10_odds(
-                model.found, self.least_chance, scene.n_edges, self.n_screened, options.verify
-            )
+            model.log10_odds = self._odds(model, self.least_chance)
             if model.log10_odds < options.verify.promising:
                 return model.log10_odds
         model.chance = chance_agreement(model.matrix, scene, index, model.gsd_m, options.verify)
         self.least_chance = np.minimum(self.least_chance, model.chance) if self.n_nulls else np.array(model.chance)
         self.n_nulls += 1
-        model.log10_odds = log10_odds(model.found, model.chance, scene.n_edges, self.n_screened, options.verify)
+        model.log10_odds = self._odds(model, np.array(model.chance))
         return model.log10_odds
+
+    def _odds(self, model: Hypothesis, chance: FloatArray) -> float:
+        found = model.found
+        if found is None:
+            return -math.inf
+        return log10_odds(found, chance, self.scene.n_edges, self.n_screened, self.options.verify)
 
     def _converge(self, model: Hypothesis, n_points: int | None) -> bool:
         """Refine until nothing more agrees: more matches make a better fit, and that finds more matches."""

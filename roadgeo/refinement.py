@@ -34,7 +34,8 @@ class RefineOptions:
     least_support : float
         Matches take part when at least this share of their neighbours are matched.
     n_cells, least_share : int, float
-        The frame is divided into so many cells a side; a cell takes part when at least this share of its road points meet roads.
+        The frame is divided into so many cells a side; a cell takes part when at least this share of its road points
+        meet roads.
     correlation_m : float
         Errors of the map and of the mask keep their sign over about this length of road: points closer than that are no
         independent observations.
@@ -60,8 +61,16 @@ class RefineOptions:
 
 @dataclass(frozen=True)
 class Refined:
-    """A refined homography (3, 3), query plane to reference plane, the (4,) standard deviations of the frame's corners (root mean square of their distances) in metres,
-    and the robust rms distance of road points from the map's roads.
+    """A refined homography and its accuracy.
+
+    Attributes
+    ----------
+    matrix : (3, 3) float64
+        Query plane to reference plane.
+    corner_sigma_m : (4,) float64
+        Standard deviations of the frame's corners: root mean squares of their distances from the truth.
+    rms_m : float
+        Of the road points' distances from the map's roads, robustly.
     """
 
     matrix: FloatArray
@@ -70,7 +79,10 @@ class Refined:
 
 
 def _parameters(matrix: FloatArray, center: FloatArray, half_size: float) -> tuple[FloatArray, FloatArray, float]:
-    """Normalise: return the eight parameters of `kernels.growth`, the reference point under the middle, and the unit in metres."""
+    """Normalise a homography.
+
+    Return the eight parameters of `kernels.growth`, the reference point under the middle, and the unit in metres.
+    """
     mapped = matrix @ (center[0], center[1], 1.0)
     origin = mapped[:2] / mapped[2]
     linear = (matrix[:2, :2] - np.outer(origin, matrix[2, :2])) / mapped[2]
@@ -95,7 +107,7 @@ def _spacing(scene: Scene, unit: float) -> float:
 
 
 def _cells(uv: FloatArray, options: RefineOptions) -> IntArray:
-    """Number the cell of the frame that each normalised point lies in."""
+    """Return the number of the frame's cell that each normalised point lies in."""
     n = options.n_cells
     columns = np.clip(((uv + 1.0) * (n / 2.0)).astype(np.int64), 0, n - 1)
     return np.asarray(columns[:, 1] * n + columns[:, 0])

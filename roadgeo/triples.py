@@ -1,8 +1,9 @@
 """Hypotheses from triples of neighbouring intersections.
 
-For one query intersection (the anchor) all triples with two of its nearest neighbours are looked up in the reference's table.
-Hits of different triples that put the anchor on the same map intersection, with nearly the same affine map, make a proposal:
-one triple alone may agree by chance with thousands of others, two or three that share an anchor hardly ever.
+For one query intersection (the anchor) all triples with two of its nearest neighbours are looked up in the reference's
+table. Hits of different triples that put the anchor on the same map intersection, with nearly the same affine map,
+make a proposal: one triple alone may agree by chance with thousands of others, two or three that share an anchor hardly
+ever.
 """
 
 from __future__ import annotations

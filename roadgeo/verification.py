@@ -1,10 +1,10 @@
 """How strongly a place is supported, against chance on this very map.
 
-Three kinds of evidence are counted, each once: intersections of the query that meet one of the map with agreeing branches (those
-that made the hypothesis left out), road points of the query that lie on a road of the map, and roads of the map inside the
-footprint that the query shows. What chance would give is measured at hand: the same query is laid over the same map at many
-shifted positions, and the best of those is the null. In a city of equal blocks a shift by one block fits almost as well, and then
-even a good fit is weak evidence.
+Three kinds of evidence are counted, each once: intersections of the query that meet one of the map with agreeing
+branches (those that made the hypothesis left out), road points of the query that lie on a road of the map, and roads of
+the map inside the footprint that the query shows. What chance would give is measured at hand: the same query is laid
+over the same map at many shifted positions, and the best of those is the null. In a city of equal blocks a shift by one
+block fits almost as well, and then even a good fit is weak evidence.
 """
 
 from __future__ import annotations
@@ -37,11 +37,14 @@ class VerifyOptions:
     n_shifts : int
         Shifted positions of the null model.
     saturation : float
-        However many intersections or roads agree, they count as fewer than so many independent trials: chance varies from
-        place to place by more than a binomial law allows, and no number of trials helps against that. Fitted to the best
+        However many intersections or roads agree, they count as fewer than so many independent trials: chance varies
+        from
+        place to place by more than a binomial law allows, and no number of trials helps against that. Fitted to the
+        best
         wrong places of training queries whose true place was forbidden.
     promising : float
-        Log10 odds that a place must reach against the least chance seen so far before a null of its own is measured for it.
+        Log10 odds that a place must reach against the least chance seen so far before a null of its own is measured for
+        it.
     """
 
     map_sigma_m: float = 1.8
@@ -54,6 +57,11 @@ class VerifyOptions:
     n_null_points: int = 150
     saturation: float = 30.0
     promising: float = 0.0
+
+    @property
+    def ray_cos(self) -> float:
+        """Cosine of the angle within which branches agree."""
+        return math.cos(math.radians(self.ray_tolerance_deg))
 
 
 @dataclass(frozen=True)
@@ -91,16 +99,24 @@ def agreement(
     seeds: IntArray,
     options: VerifyOptions,
 ) -> tuple[Agreement, IntArray, FloatArray]:
-    """Compare query and map under `matrix`; return the agreement, the matches (N,) or -1, and their distances in metres.
+    """Compare query and map under `matrix`.
 
     `seeds` are query intersections that made the hypothesis: they are matched but not counted.
+
+    Returns
+    -------
+    Agreement
+    matched : (N,) int64
+        Map intersection of each query intersection, or -1.
+    distance : (N,) float64
+        Metres between them.
     """
     tolerance = tolerance_m(gsd_m, options)
     found = scene.intersections
     matched = np.empty(len(found), np.int64)
     distance = np.empty(len(found))
     match_all(
-        matrix, found.xy, scene.branches, 1.5 * tolerance, np.cos(np.radians(options.ray_tolerance_deg)), 0.0, 0.0, True,
+        matrix, found.xy, scene.branches, 1.5 * tolerance, options.ray_cos, 0.0, 0.0, True,
         index.xy, index.branches, index.point_starts, index.grid, index.shape, matched, distance,
     )  # fmt: skip
     counted = np.ones(len(found), bool)
@@ -110,7 +126,8 @@ def agreement(
     roads = (index.segments, index.segment_starts, index.segment_ids, index.grid, index.shape)
     near = forward_distances(matrix, scene.points, scene.directions, tolerance, min_cos, 0.0, 0.0, *roads, out)
     seen, shown = backward_agreement(
-        np.linalg.inv(matrix), _bounds(matrix, scene), options.backward_step_m, tolerance, 0.0, 0.0, *roads,
+        np.asarray(np.linalg.inv(matrix), float), _bounds(matrix, scene), options.backward_step_m, tolerance, 0.0, 0.0,
+        *roads,
         scene.field, scene.field_scale, scene.observed,
     )  # fmt: skip
     result = Agreement(
@@ -125,7 +142,8 @@ def chance_agreement(
 ) -> tuple[float, float, float]:
     """Return the rates (intersections, forward, backward) that the best shifted positions reach.
 
-    Shifts lie on a sunflower spiral between the two radii of `shift_m`, so that all directions and distances are met evenly.
+    Shifts lie on a sunflower spiral between the two radii of `shift_m`, so that all directions and distances are met
+    evenly.
     """
     tolerance = tolerance_m(gsd_m, options)
     found = scene.intersections
@@ -136,7 +154,7 @@ def chance_agreement(
     out = np.empty(len(points))
     min_cos = math.cos(math.radians(options.max_turn_deg))
     roads = (index.segments, index.segment_starts, index.segment_ids, index.grid, index.shape)
-    inverse, bounds = np.linalg.inv(matrix), _bounds(matrix, scene)
+    inverse, bounds = np.asarray(np.linalg.inv(matrix), float), _bounds(matrix, scene)
     k = np.arange(options.n_shifts)
     low, high = options.shift_m
     radius = np.sqrt(low**2 + (high**2 - low**2) * (k + 0.5) / options.n_shifts)
@@ -144,7 +162,7 @@ def chance_agreement(
     rates = np.empty((options.n_shifts, 3))
     for i, (dx, dy) in enumerate(zip(radius * np.cos(angle), radius * np.sin(angle), strict=True)):
         n = match_all(
-            matrix, found.xy, scene.branches, 1.5 * tolerance, np.cos(np.radians(options.ray_tolerance_deg)), dx, dy, False,
+            matrix, found.xy, scene.branches, 1.5 * tolerance, options.ray_cos, dx, dy, False,
             index.xy, index.branches, index.point_starts, index.grid, index.shape, matched, distance,
         )  # fmt: skip
         near = forward_distances(matrix, points, directions, tolerance, min_cos, dx, dy, *roads, out)
@@ -174,7 +192,8 @@ def log10_odds(
 ) -> float:
     """Log10 odds of a place against chance, corrected for the candidates tried.
 
-    Log-likelihood ratios of the three rates against the rates by chance, times the number of independent trials, less the
+    Log-likelihood ratios of the three rates against the rates by chance, times the number of independent trials, less
+    the
     logarithm of the number of places tried.
     """
 

@@ -1,19 +1,23 @@
 """Triples of neighbouring intersections: their affine-invariant codes, the table of codes, and its look-up.
 
-A triple (X, Y, Z), counterclockwise, is sent by an affine map to an equilateral triangle; two tangent lines at each vertex then
-give six angles that hardly change from map to image. At a vertex with edge vectors e1, e2 to the next two vertices, a
-direction d = alpha e1 + beta e2 has, against the axis towards the triangle's middle, the angle
-atan2((beta - alpha) sin 30, (alpha + beta) cos 30). Angles are measured in units of pi / 72, in cells of 8 units (20 degrees).
+A triple (X, Y, Z), counterclockwise, is sent by an affine map to an equilateral triangle; two tangent lines at each
+vertex then give six angles that hardly change from map to image. At a vertex with edge vectors e1, e2 to the next two
+vertices, a direction d = alpha e1 + beta e2 has, against the axis towards the triangle's middle, the angle
+atan2((beta - alpha) sin 30, (alpha + beta) cos 30). Angles are measured in units of pi / 72, in cells of 8 units (20
+degrees).
 
 Two sorted cells at a vertex make one of 45 pairs, three vertices one of 45^3 table cells. An entry is a uint64:
-`anchor << 32 | slot of Y << 28 | slot of Z << 24 | six positions within the cells`, slots being columns of `neighbours`. Each
-position takes 4 bits of which the highest is 0: with that bit set as a guard, one subtraction compares all six at once.
+`anchor << 32 | slot of Y << 28 | slot of Z << 24 | six positions within the cells`, slots being columns of
+`neighbours`. Each position takes 4 bits of which the highest is 0: with that bit set as a guard, one subtraction
+compares all six.
 """
 
 import math
+from typing import Any
 
 import numpy as np
 from numba import njit
+from numpy.typing import NDArray
 
 from roadgeo.kernels.rays import rays_agree
 
@@ -26,13 +30,13 @@ TABLE = PAIRS**3
 
 
 @njit(cache=True)
-def pair_id(low, high):
-    """Number the sorted pair of cells low <= high from 0 to PAIRS - 1."""
+def pair_id(low: int, high: int) -> int:
+    """Return the number of the sorted pair of cells low <= high, from 0 to PAIRS - 1."""
     return low * CELLS - (low * (low - 1)) // 2 + (high - low)
 
 
 @njit(cache=True)
-def vertex_angle(e1x, e1y, e2x, e2y, tangent):
+def vertex_angle(e1x: float, e1y: float, e2x: float, e2y: float, tangent: float) -> float:
     """Return a tangent's angle in the equilateral frame, in units, 0 <= angle < UNITS (float)."""
     dx, dy = math.cos(tangent), math.sin(tangent)
     alpha = dx * e2y - dy * e2x
@@ -43,7 +47,9 @@ def vertex_angle(e1x, e1y, e2x, e2y, tangent):
 
 
 @njit(cache=True)
-def vertex_codes(xy, tangents, i, j, k, limit, out):
+def vertex_codes(
+    xy: NDArray[np.float64], tangents: NDArray[np.float32], i: int, j: int, k: int, limit: int, out: NDArray[np.int64]
+) -> int:
     """Write the sorted unit pairs (u1 <= u2) of vertex i of the triangle i, j, k; return how many.
 
     One pair for every two of the vertex's tangents; of more than `limit`, those that cross most openly.
@@ -74,7 +80,7 @@ def vertex_codes(xy, tangents, i, j, k, limit, out):
 
 
 @njit(cache=True)
-def orient(xy, a, b, c, min_shape):
+def orient(xy: NDArray[np.float64], a: int, b: int, c: int, min_shape: float) -> int:
     """Return +1 if a, b, c run counterclockwise, -1 if clockwise, 0 if the triangle is too thin.
 
     The shape is twice the area over the square of the longest side: 0.87 for an equilateral triangle, 0 for a line.
@@ -90,7 +96,7 @@ def orient(xy, a, b, c, min_shape):
 
 
 @njit(cache=True)
-def has_both(neighbours, i, j, k):
+def has_both(neighbours: NDArray[np.int32], i: int, j: int, k: int) -> bool:
     """Whether j and k both stand among the neighbours of i."""
     found = 0
     for s in range(neighbours.shape[1]):
@@ -100,12 +106,20 @@ def has_both(neighbours, i, j, k):
 
 
 @njit(cache=True)
-def fill_table(xy, tangents, neighbours, min_shape, limit, starts, entries):
+def fill_table(
+    xy: NDArray[np.float64],
+    tangents: NDArray[np.float32],
+    neighbours: NDArray[np.int32],
+    min_shape: float,
+    limit: int,
+    starts: NDArray[Any],
+    entries: NDArray[np.uint64],
+) -> int:
     """Count codes per table cell, or write the entries.
 
-    With an empty `entries`, `starts[cell + 1]` is incremented for every code. Otherwise `starts` holds each cell's first free
-    place, and is moved on as entries are written. A triple that several vertices could anchor is stored once, by the lowest
-    of them.
+    With an empty `entries`, `starts[cell + 1]` is incremented for every code. Otherwise `starts` holds each cell's
+    first free place, and is moved on as entries are written. A triple that several vertices could anchor is stored
+    once, by the lowest of them.
     """
     write = entries.shape[0] > 0
     codes = np.empty((3, limit, 2), np.int64)
@@ -150,10 +164,11 @@ def fill_table(xy, tangents, neighbours, min_shape, limit, starts, entries):
 
 
 @njit(cache=True)
-def vertex_probes(u1, u2, tolerance, probes):
+def vertex_probes(u1: int, u2: int, tolerance: int, probes: NDArray[np.int64]) -> int:
     """Write (pair, lows, highs) for every pair of cells that may hold (u1, u2) +- tolerance; return how many.
 
-    Lows and highs are the bounds of the entry's two positions within their cells, packed like them: first << 4 | second.
+    Lows and highs are the bounds of the entry's two positions within their cells, packed like them: first << 4 |
+    second.
     """
     n = 0
     for c1 in range((u1 - tolerance) // CELL_UNITS, (u1 + tolerance) // CELL_UNITS + 1):
@@ -178,7 +193,16 @@ def vertex_probes(u1, u2, tolerance, probes):
 
 
 @njit(cache=True)
-def triple_codes(xy, tangents, a, b, c, limit, codes, n):
+def triple_codes(
+    xy: NDArray[np.float64],
+    tangents: NDArray[np.float32],
+    a: int,
+    b: int,
+    c: int,
+    limit: int,
+    codes: NDArray[np.int64],
+    n: NDArray[np.int64],
+) -> None:
     """Fill `codes[v, :n[v]]` for the three vertices of the counterclockwise triangle a, b, c."""
     n[0] = vertex_codes(xy, tangents, a, b, c, limit, codes[0])
     n[1] = vertex_codes(xy, tangents, b, c, a, limit, codes[1])
@@ -186,7 +210,15 @@ def triple_codes(xy, tangents, a, b, c, limit, codes, n):
 
 
 @njit(cache=True)
-def count_alike(xy, tangents, neighbours, min_shape, limit, starts, costs):
+def count_alike(
+    xy: NDArray[np.float64],
+    tangents: NDArray[np.float32],
+    neighbours: NDArray[np.int32],
+    min_shape: float,
+    limit: int,
+    starts: NDArray[Any],
+    costs: NDArray[np.int64],
+) -> None:
     """Fill `costs[a, s, t]` with the number of table entries in the very cells of the triple (a, slot s, slot t).
 
     -1 where there is no such triple. It says how common a triple is on the map: cheap ones are looked up first.
@@ -226,14 +258,33 @@ def count_alike(xy, tangents, neighbours, min_shape, limit, starts, costs):
 
 @njit(cache=True)
 def look_up(
-    xy, branches, tangents, a, s, t, neighbours, limit, tolerance, min_cos,
-    ref_xy, ref_branches, ref_neighbours, starts, entries, scale, min_ratio, hit_ids, hit_affine, n_hits,
-):  # fmt: skip
-    """Append the map's triples whose codes agree with those of the query triple (a, slot s, slot t) within `tolerance` units.
+    xy: NDArray[np.float64],
+    branches: NDArray[np.int8],
+    tangents: NDArray[np.float32],
+    a: int,
+    s: int,
+    t: int,
+    neighbours: NDArray[np.int32],
+    limit: int,
+    tolerance: int,
+    min_cos: float,
+    ref_xy: NDArray[np.float64],
+    ref_branches: NDArray[np.int8],
+    ref_neighbours: NDArray[np.int32],
+    starts: NDArray[Any],
+    entries: NDArray[np.uint64],
+    scale: tuple[float, float],
+    min_ratio: float,
+    hit_ids: NDArray[np.int64],
+    hit_affine: NDArray[np.float64],
+    n_hits: int,
+) -> tuple[int, int]:
+    """Append the map's triples whose codes agree with those of the query triple (a, slot s, slot t).
 
-    A hit is `hit_ids` = (A, slot of b, B, slot of c, C), b and c counterclockwise after a, and `hit_affine` = the 2 x 2 matrix
-    (row-major) that takes the query triangle to the reference triangle. Gates: `scale` = (least, greatest) root of its determinant,
-    and `min_ratio`, the least ratio of its singular values. Returns (hits so far, entries compared).
+    Angles may differ by `tolerance` units, branches by an angle of cosine `min_cos`. A hit is `hit_ids` = (A, slot of
+    b, B, slot of c, C), b and c counterclockwise after a, and `hit_affine` = the 2 x 2 matrix (row-major) that takes
+    the query triangle to the reference triangle. Gates: `scale` = (least, greatest) root of its determinant, and
+    `min_ratio`, the least ratio of its singular values. Returns (hits so far, entries compared).
     """
     b, c = neighbours[a, s], neighbours[a, t]
     abx, aby = xy[b, 0] - xy[a, 0], xy[b, 1] - xy[a, 1]
@@ -300,9 +351,13 @@ def look_up(
                                     if square * min_ratio > det * (1.0 + min_ratio * min_ratio):
                                         continue
                                     if not (
-                                        rays_agree(branches, a, ref_branches, x, j00, j01, j10, j11, min_cos)
-                                        and rays_agree(branches, b, ref_branches, y, j00, j01, j10, j11, min_cos)
-                                        and rays_agree(branches, c, ref_branches, z, j00, j01, j10, j11, min_cos)
+                                        rays_agree(branches, a, ref_branches, int(x), j00, j01, j10, j11, min_cos)
+                                        and rays_agree(
+                                            branches, int(b), ref_branches, int(y), j00, j01, j10, j11, min_cos
+                                        )
+                                        and rays_agree(
+                                            branches, int(c), ref_branches, int(z), j00, j01, j10, j11, min_cos
+                                        )
                                     ):
                                         continue
                                     if n_hits >= hit_ids.shape[0]:
@@ -321,12 +376,22 @@ def look_up(
 
 
 @njit(cache=True)
-def gather(hit_ids, hit_affine, order, n_slots, tolerance, out_ids, out_affine, out_score):
+def gather(
+    hit_ids: NDArray[np.int64],
+    hit_affine: NDArray[np.float64],
+    order: NDArray[np.int64],
+    n_slots: int,
+    tolerance: float,
+    out_ids: NDArray[np.int64],
+    out_affine: NDArray[np.float64],
+    out_score: NDArray[np.int64],
+) -> int:
     """Find map intersections A on which hits from different triples of one anchor agree; return how many.
 
-    `order` sorts the hits by A. Two hits agree when they send the neighbours they share to the same places and their affine maps
-    differ by less than `tolerance` of their size. For each A the hit with most agreement becomes a proposal: `out_ids` =
-    (A, then for each neighbour slot its partner or -1), `out_affine` the mean map, `out_score` the number of neighbours placed.
+    `order` sorts the hits by A. Two hits agree when they send the neighbours they share to the same places and their
+    affine maps differ by less than `tolerance` of their size. For each A the hit with most agreement becomes a
+    proposal: `out_ids` = (A, then for each neighbour slot its partner or -1), `out_affine` the mean map, `out_score`
+    the number of neighbours placed.
     """
     n = 0
     partner = np.empty(n_slots, np.int64)
