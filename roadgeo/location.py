@@ -1,4 +1,4 @@
-"""The answer: where a mask lies on the map, how sure that is, or why there is no answer (schema `roadgeo.location/1`)."""
+"""The answer: where a mask lies on the map, how sure that is, or why there is none (schema `roadgeo.location/1`)."""
 
 from __future__ import annotations
 

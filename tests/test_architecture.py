@@ -60,4 +60,4 @@ def test_kernels_import_numpy_and_numba_only(path: Path) -> None:
         elif isinstance(node, ast.ImportFrom):
             names = [node.module or ""]
         for name in names:
-            assert name.split(".")[0] in {"numpy", "numba", "math", "__future__"} or name.startswith("roadgeo.kernels")
+            assert name.split(".")[0] in {"numpy", "numba", "math", "typing", "__future__"} or name.startswith("roadgeo.kernels")

@@ -62,7 +62,7 @@ def test_a_score_without_a_margin_is_not_enough():
 
 
 def test_a_better_version_of_the_same_answer_is_no_runner_up():
-    result = search(Toy([[(1, 10.0)], [(2, 11.0)], [(3, 9.0)], [(50, 2.0)]]))
+    result = search(Toy([[(1, 10.0)], [(2, 11.0)], [(3, 9.0)], [(50, 2.0)]]), SearchOptions(accept=12.0))
     assert answers(result) == (2, 50)
 
 
