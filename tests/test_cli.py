@@ -1,3 +1,4 @@
+import os
 import subprocess
 import sys
 from pathlib import Path
@@ -120,3 +121,39 @@ def test_numbers_that_make_no_sense_are_refused(kind: Numbers, text: str) -> Non
 def test_python_m_roadgeo_is_roadgeo(tmp_path: Path) -> None:
     done = subprocess.run([sys.executable, "-m", "roadgeo", "--version"], capture_output=True, text=True, check=True)
     assert done.stdout.startswith("roadgeo")
+
+
+def test_the_shell_completes_commands(monkeypatch: pytest.MonkeyPatch, capfd: pytest.CaptureFixture[str]) -> None:
+    assert main(["completion", "bash"]) == 0
+    assert "_ROADGEO_COMPLETE=bash_complete" in capfd.readouterr().out
+    environment = {"_ROADGEO_COMPLETE": "bash_complete", "COMP_WORDS": "roadgeo locate --gc", "COMP_CWORD": "2"}
+    for name, value in environment.items():
+        monkeypatch.setenv(name, value)
+    with pytest.raises(SystemExit):
+        main([])
+    assert capfd.readouterr().out == "plain,--gcps\n"
+
+
+def run_on_a_terminal(arguments: list[str], environment: dict[str, str]) -> str:
+    """Run the command line with a pseudo-terminal as standard output and error."""
+    pty = pytest.importorskip("pty")
+    leader, follower = pty.openpty()
+    command = [sys.executable, "-m", "roadgeo", *arguments]
+    with subprocess.Popen(command, stdout=follower, stderr=follower, env={**os.environ, **environment}) as process:
+        os.close(follower)
+        text = b""
+        try:
+            while part := os.read(leader, 4096):
+                text += part
+        except OSError:  # the other end is closed
+            pass
+        process.wait()
+    os.close(leader)
+    return text.decode()
+
+
+def test_colours_appear_on_terminals_that_want_them() -> None:
+    assert "\x1b[31mError:" in run_on_a_terminal(["info", "nonesuch"], {"NO_COLOR": ""})
+    plain = run_on_a_terminal(["info", "nonesuch"], {"NO_COLOR": "1"})
+    assert plain.startswith("Error: no reference 'nonesuch'")
+    assert "\x1b" not in plain

@@ -32,6 +32,7 @@ COMMANDS = {
     "simulate": ("roadgeo.cli.simulate", "Draw road masks whose place is known."),
     "evaluate": ("roadgeo.cli.evaluate", "Measure how well masks are located, and where they would be."),
     "demo": ("roadgeo.cli.demo", "Locate five masks in Porto: needs no network and no data."),
+    "completion": ("roadgeo.cli.completion", "Complete commands and options in your shell."),
 }
 
 
@@ -109,5 +110,6 @@ def main(arguments: Sequence[str] | None = None) -> int:
 
 
 def _fail(message: str, status: int) -> int:
-    click.echo("Error: " + " ".join(message.split()), err=True)
+    error = click.style("Error:", fg="red") + " " + " ".join(message.split())
+    click.echo(error, err=True, color=False if os.environ.get("NO_COLOR") else None)
     return status

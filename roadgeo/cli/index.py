@@ -22,8 +22,19 @@ __all__ = ["build", "index_command"]
 @click.option("--osm", "place", metavar="PLACE", help="Fetch a place's roads from OpenStreetMap, by its name.")
 @click.option("--bbox", metavar="W,S,E,N", type=BOX, help="Fetch the roads in a box, degrees; or cut --roads to it.")
 @click.option("--around", metavar="LON,LAT,METRES", type=NEAR, help="Fetch the roads within a distance of a point.")
-@click.option("--polygon", metavar="FILE", help="Fetch the roads inside a polygon of a file (GeoJSON, GeoPackage ...).")
-@click.option("--roads", metavar="FILE", multiple=True, help="Take roads from a file or a folder of files. Repeatable.")
+@click.option(
+    "--polygon",
+    metavar="FILE",
+    type=click.Path(),
+    help="Fetch the roads inside a polygon of a file (GeoJSON, GeoPackage ...).",
+)
+@click.option(
+    "--roads",
+    metavar="FILE",
+    type=click.Path(),
+    multiple=True,
+    help="Take roads from a file or a folder of files. Repeatable.",
+)
 @click.option("--layer", metavar="NAME", help="Layer of --roads, where there are several.")
 @click.option("--crs", metavar="CRS", help="CRS of --roads, where the file does not say, such as EPSG:26986.")
 @click.option(
@@ -40,7 +51,13 @@ __all__ = ["build", "index_command"]
 @click.option("--nominatim-url", metavar="URL", help="Nominatim server that finds --osm places.")
 @click.option("--no-cache", is_flag=True, help="Fetch anew what was fetched before.")
 @click.option("--name", metavar="NAME", help="Name of the reference. Default: after the place or file.")
-@click.option("-o", "--out", metavar="REF.gpkg", help="Where it goes. Default: into the library, under its name.")
+@click.option(
+    "-o",
+    "--out",
+    metavar="REF.gpkg",
+    type=click.Path(),
+    help="Where it goes. Default: into the library, under its name.",
+)
 @verbosity_options
 def index_command(out: str | None, name: str | None, quiet: bool, verbose: bool, **source: Any) -> None:
     """Build a reference: draw the roads of a place as a mask shows them, and index their intersections.

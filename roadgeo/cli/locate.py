@@ -8,6 +8,7 @@ from collections.abc import Callable, Iterable, Mapping, Sequence
 from contextlib import AbstractContextManager, nullcontext
 from dataclasses import dataclass, field
 from pathlib import Path
+from time import perf_counter
 from typing import TYPE_CHECKING, Any, Literal
 
 import click
@@ -57,8 +58,6 @@ class Job:
 
     def prepare(self) -> Callable[[Task], Outcome]:
         """Open the references."""
-        from time import perf_counter
-
         started = perf_counter()
         references = open_references(self.references)
         seconds = perf_counter() - started
@@ -108,9 +107,11 @@ class Job:
         from roadgeo.outputs import output_paths
         from roadgeo.workflows import locate
 
+        started = perf_counter()
         mask = read_mask(task.mask, threshold=self.threshold, band=self.band)
+        read_seconds = perf_counter() - started
         location = locate(mask, references, self.options)
-        location = replace(location, seconds=replace(location.seconds, open=open_seconds))
+        location = replace(location, seconds=replace(location.seconds, open=open_seconds, read=read_seconds))
         reference = next((one for one in references if one.name == location.reference), references[0])
         attribution = str(reference.index.meta.get("attribution", ""))
         paths = output_paths(self.out_dir, task.stem)
@@ -143,12 +144,13 @@ def open_references(names: Iterable[str]) -> list[Reference]:
 
 
 @click.command("locate", short_help="Find road masks on a reference and draw them there.")
-@click.argument("masks", metavar="MASK...", nargs=-1, required=True)
+@click.argument("masks", metavar="MASK...", nargs=-1, required=True, type=click.Path())
 @click.option(
     "-r",
     "--reference",
     "references",
     metavar="REF",
+    type=click.Path(),
     multiple=True,
     help="Reference to search: REF.gpkg, or a name in the library. Repeatable. Default: all of the library.",
 )
@@ -166,6 +168,7 @@ def open_references(names: Iterable[str]) -> list[Reference]:
     "--image",
     "images",
     metavar="PHOTO",
+    type=click.Path(),
     multiple=True,
     help="Draw this photograph on the map instead of its mask. One per mask, in order, or a folder of them.",
 )
@@ -295,7 +298,6 @@ def locate_command(
     Exit status: 0 every mask located, 3 at least one not located, 1 error, 2 usage.
     """
     from roadgeo.cli.compilation import compile_once
-    from roadgeo.io_summary import write_summary
 
     options = make_options(method, gsd, max_tilt, near, north_up, time_limit)
     tasks = name_tasks(find_masks(masks))
@@ -316,6 +318,8 @@ def locate_command(
             advance(counts)
             _report(outcome, as_json, quiet, verbose, single=len(tasks) == 1)
     if len(tasks) > 1:
+        from roadgeo.io_summary import write_summary
+
         files = write_summary(Path(out_dir), documents)
         if not quiet:
             click.echo(f"{summarize(counts)}; all footprints: {', '.join(map(str, files))}", err=True)
@@ -389,17 +393,18 @@ def pair_images(masks: Sequence[str], images: Sequence[str]) -> dict[str, str]:
 
 def describe(location: Location) -> str:
     """Say what was found, in a line or two."""
+    status = click.style(location.status.replace("_", " "), fg="green" if location.located else "yellow")
     if not location.located or location.center is None:
-        return f"{location.query}: {location.status.replace('_', ' ')}: {location.reason}"
+        return f"{location.query}: {status}: {location.reason}"
     where = format_lonlat(location.center.lon, location.center.lat)
-    return f"{location.query}: located at {where} on {location.reference}: {location.reason}"
+    return f"{location.query}: {status} at {where} on {location.reference}: {location.reason}"
 
 
 def _failed(task: Task, reason: str) -> Outcome:
     from roadgeo.location import SCHEMA
 
     document = {"schema": SCHEMA, "query": task.mask, "status": "error", "reason": reason}
-    return Outcome("error", document, f"Error: {reason}")
+    return Outcome("error", document, f"{click.style('Error:', fg='red')} {reason}")
 
 
 def _draw(location: Location, mask: Any, reference: Reference, path: Path, attribution: str) -> None:

@@ -13,7 +13,7 @@ __all__ = ["check_command", "info_command", "list_command", "remove_command"]
 
 
 @click.command("info", short_help="Describe a reference.")
-@click.argument("reference", metavar="REF")
+@click.argument("reference", metavar="REF", type=click.Path())
 @click.option("--json", "as_json", is_flag=True, help="Print everything that is known as one JSON object.")
 def info_command(reference: str, as_json: bool) -> None:
     """Describe a reference: a file (REF.gpkg or REF.index) or a name in the library.
@@ -38,7 +38,7 @@ def info_command(reference: str, as_json: bool) -> None:
 
 
 @click.command("check", short_help="Verify every byte and number of a reference.")
-@click.argument("references", metavar="REF...", nargs=-1, required=True)
+@click.argument("references", metavar="REF...", nargs=-1, required=True, type=click.Path())
 def check_command(references: tuple[str, ...]) -> int:
     """Verify references thoroughly: all digests, all ranges, and that index and GeoPackage agree.
 

@@ -12,7 +12,7 @@ __all__ = ["vectorize_command"]
 
 
 @click.command("vectorize", short_help="Show what roads are seen in a mask.")
-@click.argument("masks", metavar="MASK...", nargs=-1, required=True)
+@click.argument("masks", metavar="MASK...", nargs=-1, required=True, type=click.Path())
 @click.option(
     "-o",
     "--out-dir",
