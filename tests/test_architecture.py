@@ -16,7 +16,7 @@ STOREYS = {
     "projection": 3, "simplification": 3, "vectorization": 3, "voids": 3, "intersections": 3, "network": 3, "updating": 3, "warping": 3, "view": 3, "landscape": 3,
     "tuples": 4, "index": 4,
     "estimator": 5, "verification": 5, "refinement": 5, "location": 5, "pairs": 5, "triples": 5, "camera": 5, "scene": 5,
-    "io_roads": 6, "io_lines": 6, "io_overpass": 6, "io_raster": 6, "io_vectorized": 6, "io_index": 6, "io_atomic": 6, "io_network": 6, "io_reference": 6, "io_outputs": 6, "io_products": 6, "io_summary": 6, "outputs": 5, "io_image": 6, "files": 6, "geopackage": 6, "rtree": 6, "truth": 6, "styles": 6, "library": 6,
+    "io_roads": 6, "io_lines": 6, "io_overpass": 6, "io_raster": 6, "io_exif": 6, "io_vectorized": 6, "io_index": 6, "io_atomic": 6, "io_network": 6, "io_reference": 6, "io_outputs": 6, "io_products": 6, "io_summary": 6, "outputs": 5, "io_image": 6, "files": 6, "geopackage": 6, "rtree": 6, "truth": 6, "styles": 6, "library": 6,
     "workflows": 7,
     "cli": 8, "report": 8, "plot": 8, "qgis": 8, "demo": 8, "drawing": 8, "trials": 8, "localizability": 8, "evaluation_report": 8, "simulation": 8, "evaluation": 8, "__main__": 8,
     "__init__": 9,

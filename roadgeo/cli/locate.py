@@ -16,10 +16,11 @@ import click
 from roadgeo.cli import ERROR, NOT_LOCATED
 from roadgeo.cli.batch import Task, find_masks, name_tasks, run
 from roadgeo.cli.folders import make_folder
-from roadgeo.cli.parameters import NEAR, RANGE, verbosity_options
+from roadgeo.cli.parameters import CAMERA, NEAR, RANGE, verbosity_options
 from roadgeo.wording import format_lonlat
 
 if TYPE_CHECKING:
+    from roadgeo.grid import RoadMask
     from roadgeo.io_outputs import OutputOptions
     from roadgeo.location import Location
     from roadgeo.workflows import LocateOptions, Reference
@@ -54,6 +55,7 @@ class Job:
     threshold: float | None = None
     band: int | None = None
     plot: bool = False
+    exif: bool = False
     skip_existing: bool = False
 
     def prepare(self) -> Callable[[Task], Outcome]:
@@ -110,7 +112,7 @@ class Job:
         started = perf_counter()
         mask = read_mask(task.mask, threshold=self.threshold, band=self.band)
         read_seconds = perf_counter() - started
-        location = locate(mask, references, self.options)
+        location = locate(mask, references, self._options(task, max(mask.shape)))
         location = replace(location, seconds=replace(location.seconds, open=open_seconds, read=read_seconds))
         reference = next((one for one in references if one.name == location.reference), references[0])
         attribution = str(reference.index.meta.get("attribution", ""))
@@ -121,6 +123,18 @@ class Job:
             _draw(location, mask, reference, paths.overlay, attribution)
             files.append(paths.overlay)
         return Outcome(location.status, location.to_dict(), describe(location), tuple(map(str, files)))
+
+    def _options(self, task: Task, longer_side: int) -> LocateOptions:
+        """Return the options, with the focal length that the photograph's EXIF states where that was asked for."""
+        if not self.exif:
+            return self.options
+        from dataclasses import replace
+
+        from roadgeo.io_exif import read_focal_length
+
+        focal_px = read_focal_length(self.images.get(task.mask, task.mask)) * longer_side
+        match = self.options.match
+        return replace(self.options, match=replace(match, camera=replace(match.camera, focal_px=focal_px)))
 
 
 def open_references(names: Iterable[str]) -> list[Reference]:
@@ -210,6 +224,12 @@ def open_references(names: Iterable[str]) -> list[Reference]:
 @click.option(
     "--max-tilt", metavar="DEG", type=click.FloatRange(0, 80), help="Greatest angle of the camera from the vertical."
 )
+@click.option(
+    "--camera",
+    metavar="PIXELS|exif",
+    type=CAMERA,
+    help="Focal length in pixels of the mask, or exif: as the photograph given by --image (else the mask) says.",
+)
 @click.option("--near", metavar="LON,LAT,RADIUS", type=NEAR, help="The middle lies within RADIUS metres of this place.")
 @click.option("--north-up", is_flag=True, help="The image's up is north.")
 @click.option(
@@ -253,6 +273,7 @@ def locate_command(
     max_tilt: float | None,
     near: tuple[float, float, float] | None,
     north_up: bool,
+    camera: float | str | None,
     method: Literal["auto", "pair"],
     time_limit: float,
     skip_existing: bool,
@@ -299,14 +320,16 @@ def locate_command(
     """
     from roadgeo.cli.compilation import compile_once
 
-    options = make_options(method, gsd, max_tilt, near, north_up, time_limit)
+    focal_px = camera if isinstance(camera, float) else None
+    options = make_options(method, gsd, max_tilt, near, north_up, time_limit, focal_px)
     tasks = name_tasks(find_masks(masks))
     if not tasks:
         raise click.UsageError(f"No images in {', '.join(masks)}.")
     make_folder(out_dir)
     outputs = _make_outputs(crs, resolution, resampling, max_pixels, (*products, *(["gcps"] if gcps else [])))
     pictures = pair_images([task.mask for task in tasks], images)
-    job = Job(references, options, outputs, out_dir, pictures, threshold, band, plot, skip_existing)
+    from_exif = camera == "exif"
+    job = Job(references, options, outputs, out_dir, pictures, threshold, band, plot, from_exif, skip_existing)
     # Opened here too: what is wrong with them is said once, and the search is compiled before processes start.
     compile_once(open_references(references)[0], quiet)
     counts: Counter[Status] = Counter()
@@ -333,6 +356,7 @@ def make_options(
     near: tuple[float, float, float] | None,
     north_up: bool,
     time_limit: float,
+    focal_px: float | None = None,
 ) -> LocateOptions:
     """Put what was given in its place among the options of all stages; the rest stays as it is."""
     from dataclasses import replace
@@ -340,13 +364,14 @@ def make_options(
     from roadgeo.workflows import LocateOptions
 
     default = LocateOptions()
-    camera = replace(
+    known = replace(
         default.match.camera,
         gsd_m=gsd or default.match.camera.gsd_m,
         max_tilt_deg=default.match.camera.max_tilt_deg if max_tilt is None else max_tilt,
         north_up=north_up,
+        focal_px=focal_px,
     )
-    match = replace(default.match, camera=camera)
+    match = replace(default.match, camera=known)
     return replace(
         default, method=method, near=near, match=match, search=replace(default.search, time_limit_s=time_limit)
     )
@@ -407,7 +432,16 @@ def _failed(task: Task, reason: str) -> Outcome:
     return Outcome("error", document, f"{click.style('Error:', fg='red')} {reason}")
 
 
-def _draw(location: Location, mask: Any, reference: Reference, path: Path, attribution: str) -> None:
+def _scale(picture: str, mask: RoadMask) -> float:
+    """How many times the mask's width a picture's is."""
+    from roadgeo.io_image import open_picture
+
+    with open_picture(picture) as source:
+        width: int = source.width
+    return round(width / mask.shape[1], 3)
+
+
+def _draw(location: Location, mask: RoadMask, reference: Reference, path: Path, attribution: str) -> None:
     from roadgeo.plot import write_overlay
 
     index = reference.index

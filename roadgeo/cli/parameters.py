@@ -7,7 +7,7 @@ from typing import Any, TypeVar
 
 import click
 
-__all__ = ["BOX", "NEAR", "RANGE", "Numbers", "verbosity_options"]
+__all__ = ["BOX", "CAMERA", "NEAR", "RANGE", "Numbers", "verbosity_options"]
 
 Command = TypeVar("Command", bound=Callable[..., Any])
 
@@ -52,6 +52,30 @@ class Numbers(click.ParamType):  # type: ignore[type-arg]  # generic only in lat
         return numbers
 
 
+class Focal(click.ParamType):  # type: ignore[type-arg]
+    """A focal length in pixels, or the word "exif"."""
+
+    name = "focal length"
+
+    def convert(self, value: Any, param: click.Parameter | None, ctx: click.Context | None) -> float | str:
+        """Parse the text.
+
+        Raises
+        ------
+        click.BadParameter
+            Neither "exif" nor a positive number.
+        """
+        if isinstance(value, float) or str(value).lower() == "exif":
+            return value if isinstance(value, float) else "exif"
+        try:
+            focal = float(value)
+        except ValueError:
+            focal = 0.0
+        if not 0 < focal < float("inf"):
+            self.fail(f"got {value!r}, expected a number of pixels above 0, or exif", param, ctx)
+        return focal
+
+
 def _wrong_range(low: float, high: float) -> str:
     return "" if 0 < low <= high < float("inf") else "LO must be above 0 and not above HI"
 
@@ -74,6 +98,8 @@ def _wrong_box(west: float, south: float, east: float, north: float) -> str:
 RANGE = Numbers("range", ("LO", "HI"), ":", _wrong_range)
 #: A place in degrees and a distance in metres.
 NEAR = Numbers("place", ("LON", "LAT", "RADIUS"), ",", _wrong_place)
+#: A focal length in pixels, or where to find it.
+CAMERA = Focal()
 #: A box in degrees; west may exceed east, across the 180th meridian.
 BOX = Numbers("box", ("W", "S", "E", "N"), ",", _wrong_box)
 
