@@ -29,7 +29,7 @@ def test_a_photograph_without_exif_says_so(tmp_path):
 
 
 def test_a_missing_file_is_named(tmp_path):
-    with pytest.raises(MaskError, match="gone.jpg"):
+    with pytest.raises(MaskError, match=r"gone\.jpg"):
         read_focal_length(tmp_path / "gone.jpg")
 
 
