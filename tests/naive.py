@@ -318,8 +318,10 @@ def adjust(
                 weights.append(point_weight / (1 + (residual / sigma) ** 2))
                 residuals.append(residual / unit)
             if met:
-                cauchy = np.array([1 / (1 + (r / s) ** 2) for _, r, s in met])
-                rms = np.sqrt(cauchy @ [r**2 for _, r, _ in met] / cauchy.sum())
+                r, s = np.array([m[1:] for m in met]).T
+                cauchy = 1 / (1 + (r / s) ** 2)
+                slope = (1 - (r / s) ** 2) * cauchy**2  # of the influence r * cauchy
+                rms = np.sqrt(np.mean((cauchy * r) ** 2) * cauchy.mean()) / max(slope.mean(), 0.1 * cauchy.mean())
         A, W = np.array(rows).reshape(-1, 8), np.array(weights)
         hold = np.diag([0.0] * 6 + [prior] * 2)
         normal = A.T @ (W[:, None] * A) + hold + 1e-9 * np.eye(8)

@@ -123,7 +123,8 @@ def adjust(
     n : int
         Road points that took part; -1 where the adjustment failed.
     rms : float
-        Weighted rms of their residuals, metres; inf where it failed or there are none.
+        Scale of their residuals, metres: its square times the inverse of `normal` is the covariance of an M-estimate
+        (Huber 1981, 7.6), which a merely weighted rms would claim too small. inf where it failed or there are none.
     """
     right = np.empty(8)
     row = np.empty(8)
@@ -160,7 +161,7 @@ def adjust(
                     continue
                 weight = pair_weight / (1.0 + (far / (2.0 * sigma_m)) ** 2)
                 add_row(normal, right, row, weight, dx if axis == 0 else dy)
-        used, weights, squares = 0, 0.0, 0.0
+        used, weights, slopes, squares = 0, 0.0, 0.0, 0.0
         if iteration > 0:
             searched[:] = 0.0
             hits[:] = 0.0
@@ -212,9 +213,10 @@ def adjust(
                 add_row(normal, right, row, point_weight * weight, residuals[i] / unit)
                 used += 1
                 weights += weight
-                squares += weight * residuals[i] * residuals[i]
+                slopes += weight * (2.0 * weight - 1.0)  # of the influence, by the residual
+                squares += (weight * residuals[i]) ** 2
             if weights > 0.0:
-                rms = math.sqrt(squares / weights)
+                rms = math.sqrt(squares * weights) / max(slopes, 0.1 * weights)
         for r in range(8):
             for c in range(r):
                 normal[c, r] = normal[r, c]
