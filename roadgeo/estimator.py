@@ -187,7 +187,7 @@ class TripleEstimator:
         anchor = scene.intersections.xy[proposals.anchor]
         away = np.hypot(*(scene.points - anchor).T)
         last = scene.neighbours[proposals.anchor]
-        reach = np.hypot(*(scene.intersections.xy[last[last >= 0]] - anchor).T).max()
+        reach = np.hypot(*(scene.intersections.xy[last[last >= 0]] - anchor).T).max(initial=0.0)
         near = np.argsort(away, kind="stable")[: options.screen_points]
         near = near[away[near] < reach]
         most = options.max_screened
