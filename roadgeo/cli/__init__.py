@@ -31,6 +31,7 @@ COMMANDS = {
     "remove": ("roadgeo.cli.references", "Remove references from the library."),
     "simulate": ("roadgeo.cli.simulate", "Draw road masks whose place is known."),
     "evaluate": ("roadgeo.cli.evaluate", "Measure how well masks are located, and where they would be."),
+    "qgis": ("roadgeo.cli.qgis", "Install the QGIS plugin."),
     "demo": ("roadgeo.cli.demo", "Locate five masks in Porto: needs no network and no data."),
     "completion": ("roadgeo.cli.completion", "Complete commands and options in your shell."),
 }

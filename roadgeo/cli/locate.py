@@ -485,9 +485,17 @@ def _details(document: dict[str, Any]) -> str:
 
 
 def _progress(total: int, as_json: bool, quiet: bool) -> AbstractContextManager[Callable[[Counter[Status]], None]]:
-    """Show a bar on standard error, where that is a terminal that JSON does not fill and there are several masks."""
+    """Show a bar on standard error, where that is a terminal that JSON does not fill and there are several masks.
+
+    Programs that set ROADGEO_PROGRESS=json, as the QGIS plugin does, get lines of JSON instead.
+    """
+    import os
     import sys
 
+    if os.environ.get("ROADGEO_PROGRESS") == "json":
+        from roadgeo.cli.progress import print_progress
+
+        return print_progress(total, summarize)
     if quiet or total < 2 or not sys.stderr.isatty() or (as_json and sys.stdout.isatty()):
         return nullcontext(lambda _: None)
     from roadgeo.cli.progress import show_progress

@@ -1,17 +1,17 @@
-"""A progress bar on standard error."""
+"""Progress on standard error: a bar for people, JSON lines for programs."""
 
 from __future__ import annotations
 
+import json
 import sys
 from collections import Counter
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from typing import Any
 
-from rich.console import Console
-from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeRemainingColumn
+import click
 
-__all__ = ["show_progress"]
+__all__ = ["print_progress", "show_progress"]
 
 
 @contextmanager
@@ -20,6 +20,9 @@ def show_progress(total: int, summarize: Callable[[Counter[Any]], str]) -> Itera
 
     Lines printed to a terminal meanwhile appear above it; standard output that goes elsewhere is left alone.
     """
+    from rich.console import Console
+    from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeRemainingColumn
+
     columns = (BarColumn(), MofNCompleteColumn(), TextColumn("{task.description}"), TimeRemainingColumn())
     console = Console(stderr=True)
     with Progress(*columns, console=console, transient=True, redirect_stdout=sys.stdout.isatty()) as progress:
@@ -29,3 +32,14 @@ def show_progress(total: int, summarize: Callable[[Counter[Any]], str]) -> Itera
             progress.update(task, advance=1, description=summarize(counts))
 
         yield advance
+
+
+@contextmanager
+def print_progress(total: int, summarize: Callable[[Counter[Any]], str]) -> Iterator[Callable[[Counter[Any]], None]]:
+    """Do as `show_progress`, in lines such as {"progress": {"done": 3, "total": 10, "text": "2 located, 1 failed"}}."""
+
+    def advance(counts: Counter[Any]) -> None:
+        progress = {"done": counts.total(), "total": total, "text": summarize(counts)}
+        click.echo(json.dumps({"progress": progress}), err=True)
+
+    yield advance

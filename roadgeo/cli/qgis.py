@@ -1,0 +1,75 @@
+"""`roadgeo qgis`: the QGIS plugin into a profile, or into a package."""
+
+from __future__ import annotations
+
+import click
+
+__all__ = ["qgis_command"]
+
+
+@click.group("qgis", short_help="Install the QGIS plugin.")
+def qgis_command() -> None:
+    """Put roadgeo into QGIS: a plugin that adds its commands to the Processing toolbox.
+
+    \b
+    Examples:
+      roadgeo qgis install
+      roadgeo qgis install --profile surveys
+      roadgeo qgis zip --out roadgeo_qgis.zip
+    """
+
+
+@qgis_command.command("install", short_help="Put the plugin into a QGIS profile.")
+@click.option(
+    "--profile",
+    metavar="PROFILE",
+    default="default",
+    show_default=True,
+    help="A profile's name, as QGIS shows it in Settings > User Profiles, or its folder.",
+)
+def install_command(profile: str) -> None:
+    """Put the plugin into a QGIS profile, in place of an earlier version, and enable it there.
+
+    It calls the roadgeo that installed it; another one is set in QGIS, under Settings > Options > Processing >
+    Providers > roadgeo.
+
+    \b
+    Examples:
+      roadgeo qgis install
+      roadgeo qgis install --profile surveys
+    """
+    from roadgeo.qgis.installation import find_profiles, install_plugin
+
+    for folder in find_profiles(profile):
+        click.echo(f"installed {install_plugin(folder)}")
+    click.echo("Start QGIS anew: the Processing toolbox has a group roadgeo.", err=True)
+
+
+@qgis_command.command("zip", short_help="Make the plugin's package.")
+@click.option(
+    "-o",
+    "--out",
+    metavar="FILE",
+    help="The package. Default: roadgeo_qgis-VERSION.zip.",
+    type=click.Path(dir_okay=False),
+)
+@click.option("--email", metavar="ADDRESS", help="The publisher's, which the plugin repository asks for.")
+@click.option("--repository", metavar="URL", help="Where the source code is, which it asks for too.")
+@click.option("--tracker", metavar="URL", help="Where to report problems, which it asks for too.")
+@click.option("--homepage", metavar="URL", help="Where the documentation is.")
+def zip_command(out: str | None, **publisher: str | None) -> None:
+    """Make the package that QGIS installs (Plugins > Manage and Install Plugins > Install from ZIP).
+
+    QGIS's plugin repository takes the same package, with the publisher's --email, --repository and --tracker.
+
+    \b
+    Examples:
+      roadgeo qgis zip
+      roadgeo qgis zip --out roadgeo_qgis.zip
+    """
+    from roadgeo import _version
+    from roadgeo.qgis.installation import NAME, write_package
+
+    path = out or f"{NAME}-{_version.__version__}.zip"
+    write_package(path, {key: value for key, value in publisher.items() if value})
+    click.echo(f"wrote {path}")

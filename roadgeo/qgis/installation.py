@@ -1,0 +1,150 @@
+"""Putting the plugin into a QGIS profile, or into a package for QGIS's plugin repository."""
+
+from __future__ import annotations
+
+import os
+import re
+import shutil
+import sys
+import zipfile
+from collections.abc import Mapping
+from pathlib import Path
+
+from roadgeo.errors import OutputError
+from roadgeo.files import replacing, write_bytes
+from roadgeo.io_atomic import writing
+from roadgeo.qgis.plugin.runner import REMEMBERED
+
+__all__ = ["NAME", "find_profiles", "install_plugin", "write_package"]
+
+#: Name of the plugin's folder: not `roadgeo`, which would stand before the library of that name in QGIS's Python.
+NAME = "roadgeo_qgis"
+
+_PLUGIN = Path(__file__).parent / "plugin"
+
+
+def install_plugin(profile: Path) -> Path:
+    """Copy the plugin into a profile, in place of an earlier one, and enable it.
+
+    The copy remembers the executable that runs now, so it needs no search.
+
+    Returns
+    -------
+    Path
+        The plugin's folder.
+
+    Raises
+    ------
+    OutputError
+        The profile cannot be written to.
+    """
+    target = profile / "python" / "plugins" / NAME
+    with writing(target):
+        if target.exists():
+            shutil.rmtree(target)
+        for file in _files():
+            (target / file).parent.mkdir(parents=True, exist_ok=True)
+            shutil.copyfile(_PLUGIN / file, target / file)
+        executable = _this_executable()
+        if executable is not None:
+            (target / REMEMBERED).write_text(f"{executable}\n", encoding="utf-8")
+        _enable(profile)
+    return target
+
+
+def write_package(path: str | os.PathLike[str], publisher: Mapping[str, str] | None = None) -> None:
+    """Write the plugin as the ZIP that QGIS installs, and that its plugin repository takes.
+
+    Parameters
+    ----------
+    publisher : mapping, optional
+        What the repository also asks for and only the publisher knows: `email`, `repository`, `tracker`, `homepage`.
+
+    Raises
+    ------
+    OutputError
+        It cannot be written.
+    """
+    with replacing(path) as temporary, zipfile.ZipFile(temporary, "w", zipfile.ZIP_DEFLATED) as archive:
+        for file in _files():
+            content = (_PLUGIN / file).read_bytes()
+            if file.name == "metadata.txt":
+                content += "".join(f"{key}={value}\n" for key, value in (publisher or {}).items()).encode()
+            # A date of its own would make the same plugin another file each time.
+            archive.writestr(zipfile.ZipInfo(f"{NAME}/{file.as_posix()}"), content, zipfile.ZIP_DEFLATED)
+
+
+def _files() -> list[Path]:
+    """List the plugin's files, relative to its folder."""
+    files = (file.relative_to(_PLUGIN) for file in _PLUGIN.rglob("*") if file.is_file())
+    return sorted(file for file in files if "__pycache__" not in file.parts)
+
+
+def _this_executable() -> Path | None:
+    """Return the program that runs now, or the one beside the running Python."""
+    name = "roadgeo.exe" if sys.platform == "win32" else "roadgeo"
+    for folder in (Path(sys.argv[0]).absolute().parent, Path(sys.executable).absolute().parent):
+        if (folder / name).is_file():
+            return folder / name
+    return None
+
+
+# --- profiles ---------------------------------------------------------------------------------------------------------
+
+
+def find_profiles(name_or_folder: str) -> list[Path]:
+    """Find the profiles of that name, one in each QGIS of this user (3 and 4, from Flatpak too); or take a folder.
+
+    The profile `default` of a QGIS that was never started is one as well: QGIS completes it when it starts.
+
+    Raises
+    ------
+    OutputError
+        There is no such profile.
+    """
+    if Path(name_or_folder).is_dir() or Path(name_or_folder).name != name_or_folder:
+        return [Path(name_or_folder)]
+    roots = _profile_roots()
+    found = [root / name_or_folder for root in roots if (root / name_or_folder).is_dir()]
+    if found or name_or_folder == "default":
+        return found or [roots[0] / name_or_folder]
+    known = sorted({profile.name for root in roots if root.is_dir() for profile in root.iterdir() if profile.is_dir()})
+    raise OutputError(
+        f"QGIS has no profile {name_or_folder!r}; it has {', '.join(known) or 'none'}; or give its folder"
+    )
+
+
+def _profile_roots() -> list[Path]:
+    """List where this user's QGIS may keep profiles, first the one of QGIS 3."""
+    given = os.environ.get("QGIS_CUSTOM_CONFIG_PATH")
+    if given:
+        return [Path(given) / "profiles"]
+    home = Path.home()
+    if sys.platform == "win32":
+        bases = [Path(os.environ.get("APPDATA") or home / "AppData" / "Roaming")]
+    elif sys.platform == "darwin":
+        bases = [home / "Library" / "Application Support"]
+    else:
+        data = Path(os.environ.get("XDG_DATA_HOME") or home / ".local" / "share")
+        bases = [data, home / ".var" / "app" / "org.qgis.qgis" / "data"]
+    return [base / "QGIS" / version / "profiles" for base in bases for version in ("QGIS3", "QGIS4")]
+
+
+def _enable(profile: Path) -> None:
+    """Tick the plugin in QGIS's settings: a line in the section of Python plugins."""
+    organization = "qgis.org" if sys.platform == "darwin" else "QGIS"
+    for settings in sorted(profile.glob("*/QGIS?.ini")) or [profile / organization / "QGIS3.ini"]:
+        settings.parent.mkdir(parents=True, exist_ok=True)
+        content = settings.read_bytes() if settings.exists() else b""
+        write_bytes(settings, _with_line(content, b"PythonPlugins", NAME.encode()))
+
+
+def _with_line(content: bytes, section: bytes, key: bytes) -> bytes:
+    """Return an INI file's content with `key=true` in a section; all else stays, byte for byte."""
+    content = re.sub(rb"(?m)^%s=.*(\r?\n|$)" % re.escape(key), b"", content)
+    header = re.search(rb"(?m)^\[%s\][ \t]*(\r?\n|$)" % re.escape(section), content)
+    if header is None:
+        gap = b"\n" if content and not content.endswith(b"\n") else b""
+        return content + gap + b"[%s]\n%s=true\n" % (section, key)
+    before, after = content[: header.end()], content[header.end() :]
+    return before + (b"" if before.endswith(b"\n") else b"\n") + b"%s=true\n" % key + after

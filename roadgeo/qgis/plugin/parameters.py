@@ -1,0 +1,411 @@
+"""Parameters of the algorithms, and what each of them says on roadgeo's command line."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass, field, replace
+from pathlib import Path
+from typing import Any
+
+from qgis.core import (
+    QgsCoordinateReferenceSystem,
+    QgsProcessing,
+    QgsProcessingException,
+    QgsProcessingParameterBand,
+    QgsProcessingParameterBoolean,
+    QgsProcessingParameterCrs,
+    QgsProcessingParameterDefinition,
+    QgsProcessingParameterEnum,
+    QgsProcessingParameterExtent,
+    QgsProcessingParameterFeatureSource,
+    QgsProcessingParameterFile,
+    QgsProcessingParameterFileDestination,
+    QgsProcessingParameterFolderDestination,
+    QgsProcessingParameterNumber,
+    QgsProcessingParameterPoint,
+    QgsProcessingParameterRasterLayer,
+    QgsProcessingParameterString,
+    QgsProviderRegistry,
+)
+
+__all__ = [
+    "BATCH",
+    "CAMERA",
+    "MASK",
+    "MASK_VALUES",
+    "OUTPUT_FOLDER",
+    "PICTURE",
+    "REFERENCE",
+    "ROADS",
+    "Option",
+    "Values",
+]
+
+
+class Values:
+    """What the user set."""
+
+    def __init__(self, algorithm: Any, parameters: dict[str, Any], context: Any, feedback: Any) -> None:
+        self.algorithm, self.parameters, self.context, self.feedback = algorithm, parameters, context, feedback
+
+    def given(self, name: str) -> bool:
+        """Whether a parameter has a value, be it its default."""
+        default = self.algorithm.parameterDefinition(name).defaultValue()
+        return self.parameters.get(name, default) not in (None, "")
+
+    def get(self, kind: str, name: str, *more: Any) -> Any:
+        """Return a value as `QgsProcessingAlgorithm.parameterAs<kind>` reads it."""
+        return getattr(self.algorithm, f"parameterAs{kind}")(self.parameters, name, self.context, *more)
+
+    def in_degrees(self, kind: str, name: str) -> Any:
+        """Return a point or an extent as longitudes and latitudes."""
+        return self.get(kind, name, QgsCoordinateReferenceSystem("EPSG:4326"))
+
+    def raster(self, name: str) -> str:
+        """Return the file of a raster layer.
+
+        Raises
+        ------
+        QgsProcessingException
+            It cannot be opened, or is not a file.
+        """
+        layer = self.get("RasterLayer", name)
+        if layer is None:
+            raise QgsProcessingException(self.algorithm.invalidRasterError(self.parameters, name))
+        path = QgsProviderRegistry.instance().decodeUri(layer.providerType(), layer.source()).get("path", "")
+        if not Path(path).is_file():
+            raise QgsProcessingException(f"{layer.name()} is not a file on this computer; save it as GeoTIFF first")
+        return str(path)
+
+    def lines(self, name: str) -> tuple[str, str, str]:
+        """Return file, layer and CRS of a layer of lines; what is no file that roadgeo reads is saved as one."""
+        formats = ["gpkg", "shp", "geojson", "json", "fgb"]
+        path, layer = self.get("CompatibleSourceLayerPathAndLayerName", name, formats, formats[0], self.feedback)
+        return path, layer, name_crs(self.get("Source", name).sourceCrs())
+
+
+def name_crs(crs: Any) -> str:
+    """Name a CRS so that others know it: those that users define are known to QGIS only."""
+    known = crs.authid() and not crs.authid().startswith("USER:")
+    return str(crs.authid() if known else crs.toWkt())
+
+
+@dataclass(frozen=True)
+class Option:
+    """A parameter.
+
+    Attributes
+    ----------
+    kind : type
+        Class of its definition, one of `QgsProcessingParameter...`.
+    hint : str
+        What it is for.
+    say : callable
+        What its value says on the command line; asked only where it has one.
+    settings : dict
+        What else its definition takes.
+    folded : bool
+        Below "Advanced parameters".
+    """
+
+    kind: Any
+    name: str
+    label: str
+    hint: str
+    say: Callable[[Values, str], list[str]] = lambda *_: []
+    settings: dict[str, Any] = field(default_factory=dict)
+    folded: bool = False
+
+    def define(self) -> Any:
+        """Make its definition, which QGIS then owns."""
+        definition = self.kind(self.name, self.label, **self.settings)
+        definition.setHelp(self.hint)
+        if self.folded:
+            definition.setFlags(definition.flags() | QgsProcessingParameterDefinition.Flag.FlagAdvanced)
+        return definition
+
+    def arguments(self, values: Values) -> list[str]:
+        """Return what it says on the command line."""
+        return self.say(values, self.name) if values.given(self.name) else []
+
+
+# --- ways to say a value ----------------------------------------------------------------------------------------------
+
+
+def _said(flag: str, kind: str, form: str = "{}") -> Callable[[Values, str], list[str]]:
+    return lambda values, name: [f"{flag}={form.format(values.get(kind, name))}"]
+
+
+def _switched(flag: str) -> Callable[[Values, str], list[str]]:
+    return lambda values, name: [flag] if values.get("Boolean", name) else []
+
+
+def _chosen(flag: str, words: list[str]) -> Callable[[Values, str], list[str]]:
+    return lambda values, name: [f"{flag}={words[i]}" for i in values.get("Enums", name)]
+
+
+def _crs(values: Values, name: str) -> list[str]:
+    return [f"--crs={name_crs(values.get('Crs', name))}"]
+
+
+def _scales(values: Values, name: str) -> list[str]:
+    return [f"--gsd={values.get('Double', name):.9g}:{values.get('Double', 'GSD_MAX'):.9g}"]
+
+
+def _near(values: Values, name: str) -> list[str]:
+    point = values.in_degrees("Point", name)
+    return [f"--near={point.x():.9g},{point.y():.9g},{values.get('Double', 'NEAR_RADIUS'):.9g}"]
+
+
+def _box(values: Values, name: str) -> list[str]:
+    box = values.in_degrees("Extent", name)
+    return [f"--bbox={box.xMinimum():.9g},{box.yMinimum():.9g},{box.xMaximum():.9g},{box.yMaximum():.9g}"]
+
+
+def _lines(values: Values, name: str) -> list[str]:
+    path, layer, crs = values.lines(name)
+    return [f"--roads={path}", *([f"--layer={layer}"] if layer else []), f"--crs={crs}"]
+
+
+# --- kinds of parameters ----------------------------------------------------------------------------------------------
+
+
+def _number(flag: str, name: str, label: str, hint: str, **settings: Any) -> Option:
+    settings = {"type": QgsProcessingParameterNumber.Type.Double, "optional": True, **settings}
+    return Option(QgsProcessingParameterNumber, name, label, hint, _said(flag, "Double", "{:.12g}"), settings)
+
+
+def _integer(flag: str, name: str, label: str, hint: str, **settings: Any) -> Option:
+    settings = {"type": QgsProcessingParameterNumber.Type.Integer, "optional": True, **settings}
+    return Option(QgsProcessingParameterNumber, name, label, hint, _said(flag, "Int"), settings)
+
+
+def _text(flag: str, name: str, label: str, hint: str) -> Option:
+    return Option(QgsProcessingParameterString, name, label, hint, _said(flag, "String"), {"optional": True})
+
+
+def _switch(flag: str, name: str, label: str, hint: str) -> Option:
+    return Option(QgsProcessingParameterBoolean, name, label, hint, _switched(flag), {"defaultValue": False})
+
+
+def _choice(flag: str, name: str, label: str, hint: str, words: dict[str, str], **settings: Any) -> Option:
+    """Make a choice among words of the command line, each with what the user reads."""
+    settings = {"options": list(words.values()), "optional": True, **settings}
+    return Option(QgsProcessingParameterEnum, name, label, hint, _chosen(flag, list(words)), settings)
+
+
+def _raster(name: str, label: str, hint: str) -> Option:
+    return Option(QgsProcessingParameterRasterLayer, name, label, hint)
+
+
+def _folder(name: str, label: str, hint: str, **settings: Any) -> Option:
+    behavior = QgsProcessingParameterFile.Behavior.Folder
+    return Option(QgsProcessingParameterFile, name, label, hint, settings={"behavior": behavior, **settings})
+
+
+def _fold(*options: Option) -> tuple[Option, ...]:
+    return tuple(replace(option, folded=True) for option in options)
+
+
+# --- the parameters ---------------------------------------------------------------------------------------------------
+
+MASK = _raster(
+    "MASK",
+    "Road mask",
+    "An image of the roads that the aerial picture shows: bright, or 1, where there is road. It needs no georeference.",
+)
+_THRESHOLD = _number("--threshold", "THRESHOLD", "Threshold", "Values above it are road. Empty: told by the values.")
+_BAND_HINT = "Band that holds the mask. Empty: told by the bands."
+MASK_VALUES = _fold(
+    Option(
+        QgsProcessingParameterBand,
+        "BAND",
+        "Band",
+        _BAND_HINT,
+        _said("--band", "Int"),
+        {"parentLayerParameterName": "MASK", "optional": True},
+    ),
+    _THRESHOLD,
+)
+
+REFERENCE = Option(
+    QgsProcessingParameterFile,
+    "REFERENCE",
+    "Road reference",
+    "What Build road reference made. Empty: all references of roadgeo's library are searched.",
+    _said("--reference", "File"),
+    {"extension": "gpkg", "optional": True},
+)
+
+CAMERA = _fold(
+    Option(
+        QgsProcessingParameterNumber,
+        "GSD_MIN",
+        "Least pixel size, metres",
+        "How much ground a pixel at the middle of the mask covers, at least and at most: the search is narrowed.",
+        _scales,
+        {"type": QgsProcessingParameterNumber.Type.Double, "defaultValue": 0.2, "minValue": 1e-3},
+    ),
+    Option(
+        QgsProcessingParameterNumber,
+        "GSD_MAX",
+        "Greatest pixel size, metres",
+        "See above.",
+        settings={"type": QgsProcessingParameterNumber.Type.Double, "defaultValue": 5.0, "minValue": 1e-3},
+    ),
+    _number(
+        "--max-tilt",
+        "MAX_TILT",
+        "Greatest tilt, degrees",
+        "Greatest angle of the camera from the vertical.",
+        minValue=0.0,
+        maxValue=80.0,
+    ),
+    _text(
+        "--camera",
+        "FOCAL_LENGTH",
+        "Focal length",
+        "In pixels of the mask; or the word exif: as the image, or else the mask, says. Empty: not known.",
+    ),
+    _switch("--north-up", "NORTH_UP", "North is up", "The top of the mask is north."),
+    Option(
+        QgsProcessingParameterPoint,
+        "NEAR",
+        "Near",
+        "The middle of the mask lies near this place.",
+        _near,
+        {"optional": True},
+    ),
+    Option(
+        QgsProcessingParameterNumber,
+        "NEAR_RADIUS",
+        "Within, metres",
+        "How near.",
+        settings={"type": QgsProcessingParameterNumber.Type.Double, "defaultValue": 10_000.0, "minValue": 1.0},
+    ),
+    _number(
+        "--time-limit",
+        "TIME_LIMIT",
+        "Time limit, seconds",
+        "Stop searching for a mask after this time.",
+        defaultValue=10.0,
+        minValue=0.1,
+    ),
+)
+
+PICTURE = (
+    _raster(
+        "IMAGE",
+        "Image",
+        "The picture that the mask shows the roads of, of the same frame. Its size may differ from the mask's.",
+    ),
+    Option(
+        QgsProcessingParameterCrs,
+        "CRS",
+        "CRS of the result",
+        "Empty: the reference's own, which is metric.",
+        _crs,
+        {"optional": True},
+    ),
+    *_fold(
+        _number(
+            "--resolution",
+            "RESOLUTION",
+            "Pixel size of the result",
+            "In units of its CRS. Empty: the image's own.",
+            minValue=0.0,
+        ),
+        _choice(
+            "--resampling",
+            "RESAMPLING",
+            "Resampling",
+            "How values between the image's pixels are found.",
+            {"nearest": "Nearest", "bilinear": "Bilinear", "cubic": "Cubic", "lanczos": "Lanczos"},
+            defaultValue=2,
+        ),
+        _choice(
+            "--also",
+            "PRODUCTS",
+            "Also write",
+            "Further forms of the result.",
+            {
+                "points": "Control points for the QGIS Georeferencer (.points)",
+                "gcps": "The image's own pixels with control points (GeoTIFF)",
+                "vrt": "The same without copying pixels (GDAL virtual raster)",
+                "odm": "Control points for OpenDroneMap",
+                "worldfile": "World file of the result",
+                "geojson": "Footprint as GeoJSON",
+                "stac": "STAC Item",
+                "kmz": "Ground overlay for Google Earth (KMZ)",
+            },
+            allowMultiple=True,
+        ),
+    ),
+)
+
+BATCH = (
+    _folder("MASKS", "Folder of road masks", "Every image in it is located."),
+    REFERENCE,
+    _integer(
+        "--jobs",
+        "JOBS",
+        "Processes",
+        "How many masks are located at the same time.",
+        defaultValue=1,
+        minValue=1,
+    ),
+    *_fold(
+        _switch(
+            "--skip-existing",
+            "SKIP_EXISTING",
+            "Keep earlier results",
+            "Masks that have a result in the folder, younger than they are, are not located again.",
+        ),
+        _integer("--band", "BAND", "Band", _BAND_HINT, minValue=1),
+        _THRESHOLD,
+    ),
+)
+
+ROADS = (
+    Option(
+        QgsProcessingParameterFeatureSource,
+        "ROADS",
+        "Road lines",
+        "A layer of roads. Or leave it empty, and name a place or an extent: its roads come from OpenStreetMap.",
+        _lines,
+        {"types": [QgsProcessing.SourceType.TypeVectorLine], "optional": True},
+    ),
+    _text("--osm", "PLACE", "Place", "The name of a place in OpenStreetMap, such as Boston, MA."),
+    Option(
+        QgsProcessingParameterExtent,
+        "EXTENT",
+        "Extent",
+        "Roads in it come from OpenStreetMap; or the road lines are cut to it.",
+        _box,
+        {"optional": True},
+    ),
+    _choice(
+        "--kinds",
+        "KINDS",
+        "Which roads",
+        "Those that the masks show, where the data tell kinds apart.",
+        {"main": "Main roads", "drivable": "Public roads for cars", "vehicles": "All for vehicles", "all": "All"},
+        defaultValue=1,
+    ),
+    *_fold(
+        _switch("--tunnels", "TUNNELS", "Tunnels too", "A camera does not see them."),
+        _text("--name", "NAME", "Name", "Name of the reference. Empty: after the place or file."),
+        _text("--attribution", "ATTRIBUTION", "Attribution", "Whom to name beside the map; goes with road lines."),
+    ),
+    Option(
+        QgsProcessingParameterFileDestination,
+        "OUTPUT",
+        "Road reference",
+        "A GeoPackage; its search index, of the same name, lies beside it.",
+        settings={"fileFilter": "GeoPackage (*.gpkg)"},
+    ),
+)
+
+OUTPUT_FOLDER = Option(
+    QgsProcessingParameterFolderDestination, "OUTPUT_FOLDER", "Folder for the results", "Made if it is missing."
+)

@@ -1,0 +1,150 @@
+"""The roadgeo executable as a child process: where it is, what it inherits, what it says, how it is stopped.
+
+Knows nothing of QGIS, whose Python carries other versions of the libraries that roadgeo uses: nothing of roadgeo is
+imported here, nor anything of QGIS there.
+"""
+
+from __future__ import annotations
+
+import contextlib
+import os
+import queue
+import shutil
+import signal
+import subprocess
+import sys
+import threading
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from pathlib import Path
+from typing import IO, Any
+
+__all__ = ["REMEMBERED", "child_environment", "find_executable", "run"]
+
+#: File beside this one in which `roadgeo qgis install` leaves the path of the executable that ran it.
+REMEMBERED = "executable.txt"
+
+_NAME, _SCRIPTS = ("roadgeo.exe", "Scripts") if sys.platform == "win32" else ("roadgeo", "bin")
+
+#: Where programs and environments are put below the home folder; QGIS often starts with a shorter PATH than a terminal.
+_PLACES = (
+    ".local/bin",
+    f".local/share/uv/tools/roadgeo/{_SCRIPTS}",
+    f".local/share/pipx/venvs/roadgeo/{_SCRIPTS}",
+    f"pipx/venvs/roadgeo/{_SCRIPTS}",
+    f".venv/{_SCRIPTS}",
+    f"*/.venv/{_SCRIPTS}",
+    f".virtualenvs/*/{_SCRIPTS}",
+    f"*conda*/envs/*/{_SCRIPTS}",
+    f"*forge*/envs/*/{_SCRIPTS}",
+    "Library/Python/3*/bin",
+    "AppData/Roaming/Python/Python3*/Scripts",
+    "AppData/Local/Programs/Python/Python3*/Scripts",
+)
+
+#: What QGIS sets for its own Python, PROJ and GDAL would break another's.
+_NOT_INHERITED = ("PYTHON", "__PYVENV", "PROJ_", "GDAL_")
+
+#: How long a child may take to clean up after it was asked to stop, and how often we look whether it should.
+_GRACE_S, _LOOK_S = 3.0, 0.1
+
+
+def find_executable(configured: str, environ: Mapping[str, str], home: Path, beside: Path) -> str | None:
+    """Find the roadgeo executable, or return None.
+
+    Parameters
+    ----------
+    configured : str
+        Path from the settings; "" searches: ROADGEO_EXECUTABLE, what the installer left in the folder `beside`, PATH,
+        and the usual places below `home`.
+    """
+    if configured:
+        return _executable(Path(configured).expanduser())
+    remembered = beside / REMEMBERED
+    told = [environ.get("ROADGEO_EXECUTABLE", ""), remembered.read_text("utf-8") if remembered.is_file() else ""]
+    told.append(shutil.which(_NAME, path=environ.get("PATH", "")) or "")
+    places = (place / _NAME for pattern in _PLACES for place in sorted(home.glob(pattern)))
+    candidates = [*(Path(path.strip()) for path in told if path.strip()), *places]
+    return next(filter(None, map(_executable, candidates)), None)
+
+
+def _executable(path: Path) -> str | None:
+    return str(path) if path.is_file() and os.access(path, os.X_OK) else None
+
+
+def child_environment(environ: Mapping[str, str]) -> dict[str, str]:
+    """Return the child's environment: nothing of QGIS's own Python, PROJ and GDAL; UTF-8, and progress as JSON."""
+    kept = {name: value for name, value in environ.items() if not name.startswith(_NOT_INHERITED)}
+    return {**kept, "PYTHONIOENCODING": "utf-8", "ROADGEO_PROGRESS": "json", "NO_COLOR": "1"}
+
+
+def run(command: Sequence[str], handle: Callable[[str, str], None], is_cancelled: Callable[[], bool]) -> int:
+    """Run a command to its end and return its exit status.
+
+    Parameters
+    ----------
+    handle : callable
+        Takes "stdout" or "stderr" and a line, in the calling thread.
+    is_cancelled : callable
+        Asked ten times a second; once true the child and its own children are stopped.
+    """
+    options: dict[str, Any] = {"encoding": "utf-8", "errors": "replace", "env": child_environment(os.environ)}
+    if sys.platform == "win32":
+        options["creationflags"] = subprocess.CREATE_NO_WINDOW
+    else:
+        options["start_new_session"] = True
+    pipe = subprocess.PIPE
+    with subprocess.Popen(command, stdin=subprocess.DEVNULL, stdout=pipe, stderr=pipe, **options) as process:  # noqa: S603 (ours)
+        stopping = None
+        try:
+            for line in _lines(process):
+                if line is not None:
+                    handle(*line)
+                elif stopping is None and is_cancelled():
+                    stopping = threading.Thread(target=_stop, args=(process,))
+                    stopping.start()
+        except BaseException:
+            _kill(process)
+            raise
+        if stopping is not None:
+            stopping.join()
+    return process.returncode
+
+
+def _lines(process: subprocess.Popen[str]) -> Iterator[tuple[str, str] | None]:
+    """Yield lines of both streams with the stream's name as they come, and None whenever it is time to look around."""
+    lines: queue.Queue[tuple[str, str]] = queue.Queue()
+    readers = [
+        threading.Thread(target=_read, args=(name, stream, lines), daemon=True)
+        for name, stream in (("stdout", process.stdout), ("stderr", process.stderr))
+    ]
+    for reader in readers:
+        reader.start()
+    while any(reader.is_alive() for reader in readers) or not lines.empty():
+        with contextlib.suppress(queue.Empty):
+            yield lines.get(timeout=_LOOK_S)
+        yield None
+
+
+def _read(name: str, stream: IO[str], lines: queue.Queue[tuple[str, str]]) -> None:
+    for line in stream:
+        lines.put((name, line.rstrip("\n")))
+
+
+def _stop(process: subprocess.Popen[str]) -> None:
+    """Interrupt the child as Ctrl-C does, so that it ends its workers and removes half-written files; else kill it."""
+    if sys.platform != "win32":
+        process.send_signal(signal.SIGINT)
+        with contextlib.suppress(subprocess.TimeoutExpired):
+            process.wait(_GRACE_S)
+            return
+    _kill(process)
+
+
+def _kill(process: subprocess.Popen[str]) -> None:
+    """End the child and all that it started."""
+    if sys.platform == "win32":
+        command = ["taskkill", "/F", "/T", "/PID", str(process.pid)]
+        subprocess.run(command, capture_output=True, check=False)  # noqa: S603
+    else:
+        with contextlib.suppress(ProcessLookupError):
+            os.killpg(process.pid, signal.SIGKILL)

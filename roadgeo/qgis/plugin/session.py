@@ -1,0 +1,101 @@
+"""One run: calling roadgeo, passing on what it says, and loading its results, styled."""
+
+from __future__ import annotations
+
+import json
+from pathlib import Path
+from typing import Any
+
+from qgis.core import QgsProcessingContext, QgsProcessingException, QgsProcessingLayerPostProcessorInterface
+
+from .runner import run
+from .settings import NOT_FOUND, locate_executable
+
+__all__ = ["Session"]
+
+#: Exit statuses of roadgeo that are no errors: all well, and something was not located.
+_WELL = (0, 3)
+
+
+class _Styler(QgsProcessingLayerPostProcessorInterface):
+    """Gives a layer the style that roadgeo wrote with it; Processing would pick one at random."""
+
+    def postProcessLayer(self, layer: Any, context: Any, feedback: Any) -> None:  # noqa: ARG002 (QGIS's signature)
+        layer.loadDefaultStyle()
+        layer.triggerRepaint()
+
+
+#: QGIS keeps no reference of its own.
+_STYLER = _Styler()
+
+
+class Session:
+    """Calls of the executable on behalf of an algorithm.
+
+    Attributes
+    ----------
+    documents : list of dict
+        The JSON objects that it printed.
+    """
+
+    def __init__(self, context: Any, feedback: Any) -> None:
+        self.context, self.feedback = context, feedback
+        self.documents: list[dict[str, Any]] = []
+        self.errors: list[str] = []
+
+    def call(self, *arguments: str, some_may_fail: bool = False) -> list[dict[str, Any]]:
+        """Run roadgeo with some arguments and return the JSON objects that it printed; none once cancelled.
+
+        Raises
+        ------
+        QgsProcessingException
+            It is not there, or it failed; with `some_may_fail` only if it printed nothing.
+        """
+        executable = locate_executable()
+        if executable is None:
+            raise QgsProcessingException(NOT_FOUND)
+        self.feedback.pushCommandInfo(" ".join([executable, *arguments]))
+        status = run([executable, *arguments], self._hear, self.feedback.isCanceled)
+        if self.feedback.isCanceled():
+            return []
+        if status not in _WELL and not (some_may_fail and self.documents):
+            raise QgsProcessingException("\n".join(self.errors) or f"roadgeo ended with status {status}")
+        for error in self.errors:
+            self.feedback.reportError(error)
+        return self.documents
+
+    def _hear(self, stream: str, line: str) -> None:
+        """Take one line: results and progress are JSON objects, all else is said to people."""
+        document = _parse(line)
+        if document is not None and "progress" in document:
+            progress = document["progress"]
+            self.feedback.setProgress(100.0 * progress["done"] / progress["total"])
+            self.feedback.setProgressText(progress["text"])
+        elif document is not None and stream == "stdout":
+            self.documents.append(document)
+        elif line.startswith("Error: "):
+            self.errors.append(line[len("Error: ") :])
+        elif line.endswith(" ..."):
+            self.feedback.setProgressText(line)
+        elif line.strip():
+            self.feedback.pushInfo(line)
+
+    def show(self, path: Path, title: str, layer: str = "") -> str:
+        """Have a result loaded, with its style, when all is done; return what QGIS opens it by."""
+        source = f"{path}|layername={layer}" if layer else str(path)
+        project = self.context.project()
+        if project is not None:
+            details = QgsProcessingContext.LayerDetails(title, project, title)
+            details.setPostProcessor(_STYLER)
+            self.context.addLayerToLoadOnCompletion(source, details)
+        return source
+
+
+def _parse(line: str) -> dict[str, Any] | None:
+    if not line.startswith("{"):
+        return None
+    try:
+        document = json.loads(line)
+    except ValueError:
+        return None
+    return document if isinstance(document, dict) else None
