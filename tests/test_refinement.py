@@ -76,13 +76,13 @@ def calibration(town, seeds, **view):
     [
         {"sight": Sight(0.6)},
         {"sight": Sight(1.2), "tilt": 25},
-        {"sight": Sight(2.0), "tilt": 10},
+        {"sight": Sight(1.8), "tilt": 10},
         {"sight": Sight(1.2, missing=0.15, false=0.1), "tilt": 35},
     ],
     ids=["sharp", "tilted", "blurred", "gaps"],
 )
 def test_claimed_accuracy_is_honest(town, view):
-    errors, sigmas = calibration(town, range(24), **view)
+    errors, sigmas = calibration(town, range(30), **view)
     assert 0.7 < np.sqrt(np.mean((errors / sigmas) ** 2)) < 1.3
     assert np.median(errors) < 1.5
 
