@@ -23,7 +23,7 @@ from roadgeo.io_products import PRODUCTS, Subject
 from roadgeo.location import Evidence, Location
 from roadgeo.outputs import OutputPaths, Placement, attributes
 from roadgeo.styles import draw_fill, draw_line, draw_marker, draw_palette
-from roadgeo.typing import AnyArray
+from roadgeo.typing import AnyArray, FloatArray
 from roadgeo.warping import MapGrid, cover, warp
 
 __all__ = ["OutputOptions", "write_location"]
@@ -108,7 +108,7 @@ def write_location(
                 stage(paths.style).write_text(draw_palette(PALETTE), encoding="utf-8")
             else:
                 homography, size = image_homography(place, mask.shape[::-1], picture)
-                tags = _tags(location, attribution)
+                tags = _tags(location, homography, attribution)
                 grid = warp_image(picture, stage(paths.footprint), place, homography, tags, options.image)
             write_layers(stage(paths.geopackage), _layers(location))
             subject = Subject(location, place, source, size, homography, grid, options.image.crs or place.crs, paths)
@@ -160,7 +160,7 @@ def _write_mask(path: Path, location: Location, mask: RoadMask, options: ImageOp
         with memory.open(**profile) as plain:
             plain.write(warp(_labels(mask), place.homography, grid, to_place), 1)
             plain.write_colormap(1, {value: _rgba(color) for value, (color, _, _) in PALETTE.items()})
-            plain.update_tags(**_tags(location, attribution))
+            plain.update_tags(**_tags(location, place.homography, attribution))
             layout = {"compress": "DEFLATE", "level": 1, "overview_resampling": "mode", "blocksize": 512}
             rasterio.shutil.copy(plain, optimized.name, driver="COG", **layout)
         path.write_bytes(optimized.read())
@@ -180,14 +180,13 @@ def _rgba(color: str) -> tuple[int, int, int, int]:
     return red, green, blue, 255
 
 
-def _tags(location: Location, attribution: str = "") -> dict[str, str]:
-    """Say where it comes from, for `gdalinfo`."""
-    homography = [] if location.homography is None else location.homography.tolist()
+def _tags(location: Location, homography: FloatArray, attribution: str) -> dict[str, str]:
+    """Say where it comes from, for `gdalinfo`; the homography is that of what is drawn."""
     return {
         "TIFFTAG_SOFTWARE": f"roadgeo {__version__}",
         "ROADGEO_QUERY": location.query,
         "ROADGEO_REFERENCE": location.reference,
-        "ROADGEO_HOMOGRAPHY": json.dumps(homography),
+        "ROADGEO_HOMOGRAPHY": json.dumps(homography.tolist()),
         "ROADGEO_LOG10_ODDS": f"{location.log10_odds}",
         "ROADGEO_ATTRIBUTION": attribution,
     }

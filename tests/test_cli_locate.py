@@ -118,13 +118,16 @@ def test_what_was_cut_short_goes_on_where_it_was(
     assert json.loads(capfd.readouterr().out.splitlines()[0])["reason"] != "found before"
 
 
-def test_the_photograph_is_drawn_in_the_crs_asked_for(porto: Path, tmp_path: Path) -> None:
+def test_the_photograph_is_drawn_in_the_crs_asked_for(
+    porto: Path, tmp_path: Path, capfd: pytest.CaptureFixture[str]
+) -> None:
     shutil.copy(MASKS["drone"].path, "drone_mask.png")
     Path("photos").mkdir()
     photo = cv2.cvtColor(cv2.resize(cv2.imread("drone_mask.png", 0), None, fx=2, fy=2), cv2.COLOR_GRAY2BGR)
     cv2.imwrite("photos/drone.png", photo)
-    arguments = ["--crs", "EPSG:3857", "--resolution", "2", "--gcps", "--also", "geojson", "-r", str(porto), "-q"]
+    arguments = ["--crs", "EPSG:3857", "--resolution", "2", "--gcps", "--also", "geojson", "-r", str(porto)]
     assert main(["locate", "drone_mask.png", "--image", "photos", *arguments]) == 0
+    assert f"drew {Path('photos', 'drone.png')}, 2 times the mask's size" in capfd.readouterr().out
     with rasterio.open("drone_mask_footprint.tif") as raster:
         assert (raster.crs.to_epsg(), raster.res, raster.count) == (3857, (2.0, 2.0), 4)
     assert Path("drone_mask_gcps.tif").exists()

@@ -122,7 +122,10 @@ class Job:
         if self.plot and location.located:
             _draw(location, mask, reference, paths.overlay, attribution)
             files.append(paths.overlay)
-        return Outcome(location.status, location.to_dict(), describe(location), tuple(map(str, files)))
+        text = describe(location)
+        if picture and location.located:
+            text += f"\n  drew {picture}, {_scale(picture, mask):g} times the mask's size"
+        return Outcome(location.status, location.to_dict(), text, tuple(map(str, files)))
 
     def _options(self, task: Task, longer_side: int) -> LocateOptions:
         """Return the options, with the focal length that the photograph's EXIF states where that was asked for."""
