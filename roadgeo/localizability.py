@@ -69,7 +69,7 @@ class LocalizabilityOptions:
 
     located_share: float = 0.95
     z: float = 1.5
-    min_probability: float = 0.85
+    min_probability: float = 0.9
     cells_per_window: float = 10.0
     max_cells: int = 2000
 
@@ -88,8 +88,8 @@ class PlaceGrid:
         Ground that a mask shows.
     counts : (R, C) float32
         Intersections within the footprint of a mask (a disc of its area).
-    features : (R, C, 3) float64
-        1, log(1 + count), and the entropy of the directions of the streets there.
+    features : (R, C, 2) float64
+        log(1 + count), and the entropy of the directions of the streets there.
     """
 
     plane: LocalPlane
@@ -214,26 +214,42 @@ def _features(
     layers = np.stack([spread(found.xy[owner[direction == d]]) for d in range(_DIRECTIONS)], axis=-1)
     shares = layers / np.maximum(layers.sum(axis=-1, keepdims=True), 1.0)
     entropy = -(shares * np.log(np.maximum(shares, 1e-9))).sum(axis=-1)
-    return counts, np.stack([np.ones(shape), np.log1p(counts), entropy], axis=-1)
+    return counts, np.stack([np.log1p(counts), entropy], axis=-1)
 
 
-def _fit(features: FloatArray, located: BoolArray, ridge: float = 0.1) -> FloatArray:
-    """Fit a logistic regression, (T, F) features to (T,) outcomes, by Newton's method; (F,) weights."""
-    weights = np.zeros(features.shape[1])
-    penalty = ridge * np.diag([0.0] + [1.0] * (features.shape[1] - 1))
-    for _ in range(50):
-        p = _predict(features, weights)
-        curvature = (features.T * (p * (1 - p) + 1e-9)) @ features + penalty
-        step = np.linalg.solve(curvature, features.T @ (located - p) - penalty @ weights)
-        # Trials that all went the same way have no finite optimum: bounded steps and weights.
-        weights = np.clip(weights + np.clip(step, -2.0, 2.0), -50.0, 50.0)
+def _fit(features: FloatArray, located: BoolArray, ridge: float = 0.01) -> FloatArray:
+    """Fit a logistic regression with an intercept, (T, F) features to (T,) outcomes; (1 + F,) weights.
+
+    Newton's method on standardized features, whose weights are drawn to 0 by `ridge`: without that, trials that all
+    went the same way would have no finite optimum.
+    """
+    mean, scale = features.mean(axis=0), features.std(axis=0) + 1e-9
+    design = np.column_stack([np.ones(len(features)), (features - mean) / scale])
+    penalty = ridge * np.ones(design.shape[1])
+
+    def loss(weights: FloatArray) -> float:
+        signs = np.where(located, 1.0, -1.0)
+        return float(np.logaddexp(0.0, -signs * (design @ weights)).sum() + (penalty * weights**2).sum() / 2)
+
+    weights = np.zeros(design.shape[1])
+    for _ in range(100):
+        p = _logistic(design @ weights)
+        curvature = (design.T * (p * (1 - p))) @ design + np.diag(penalty)
+        step = np.linalg.solve(curvature, design.T @ (located - p) - penalty * weights)
+        while loss(weights + step) > loss(weights) and np.abs(step).max() > 1e-9:
+            step = step / 2
+        weights = weights + step
         if np.abs(step).max() < 1e-6:
             break
-    return weights
+    return np.concatenate(([weights[0] - (weights[1:] * mean / scale).sum()], weights[1:] / scale))
 
 
 def _predict(features: FloatArray, weights: FloatArray) -> FloatArray:
-    return np.asarray(1.0 / (1.0 + np.exp(-np.clip(features @ weights, -50.0, 50.0))))
+    return _logistic(features @ weights[1:] + weights[0])
+
+
+def _logistic(x: FloatArray) -> FloatArray:
+    return np.asarray(1.0 / (1.0 + np.exp(-np.clip(x, -500.0, 500.0))))
 
 
 def _threshold(probability: FloatArray, located: BoolArray, options: LocalizabilityOptions) -> float:

@@ -257,8 +257,9 @@ def _results(queries: QuerySet, locator: Locator, pending: Sequence[int], jobs: 
     ) as pool:
         try:
             yield from pool.map(_run, pending)
-        finally:
+        except BaseException:
             pool.shutdown(wait=False, cancel_futures=True)
+            raise
 
 
 def _prepare(queries: QuerySet, locator: Locator) -> None:

@@ -65,12 +65,12 @@ def test_cells_count_the_intersections_around_them():
 def test_the_map_tells_where_masks_are_located():
     rng = np.random.default_rng(0)
     grid = lay_grid(network(), 400.0**2)
-    found = map_localizability(grid, *trials(grid, rng))
+    found = map_localizability(grid, *trials(grid, rng, 1000))
     places, located = trials(grid, rng, 2000)
     classes = found.at(places)
     assert located[classes == LOCATED].mean() >= 0.93
     assert located[classes != LOCATED].mean() <= 0.3
-    assert not located[classes == TOO_FEW].any()
+    assert located[classes == TOO_FEW].mean() < 0.05
     assert (found.classes == LOCATED).mean() > 0.3
 
 

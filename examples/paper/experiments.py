@@ -240,6 +240,7 @@ def plot_share(ax: Any, xs: Sequence[float], shares: Sequence[dict[str, Any]], l
         return
     x = [at for at, _ in known]
     value, low, high = (np.array([s[name] for _, s in known]) for name in ("value", "low", "high"))
-    ax.errorbar(x, value, [value - low, high - value], label=label, capsize=2, marker="o", markersize=4, **style)
+    reach = np.maximum([value - low, high - value], 0.0)
+    ax.errorbar(x, value, reach, label=label, capsize=2, marker="o", markersize=4, **style)
     ax.set_ylim(0, 1.03)
     ax.grid(alpha=0.3)

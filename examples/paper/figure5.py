@@ -9,6 +9,7 @@ gets the middle of the mask that holds N_r of them.
 from __future__ import annotations
 
 from dataclasses import replace
+from typing import Any
 
 import experiments as paper
 
@@ -36,10 +37,14 @@ def main() -> None:
                 _, found = paper.trials(queries, locator(method, area, n_r, options.time_limit), options, name)
                 results.append({"method": method, "scene_m": scene, "n_r": n_r, **paper.point(found)})
     paper.save(options.out, "figure5", {"reference": area.stem, "noise": options.noise, "points": results})
+    draw(area.stem, results, options.out)
 
+
+def draw(area: str, results: list[dict[str, Any]], out: paper.Path) -> None:
+    """Plot precision and recall over N_r."""
     figure, panels = paper.axes(1, 2, sharey=True)
     for ax, share in zip(panels, ("precision", "recall"), strict=True):
-        for method in options.methods:
+        for method in dict.fromkeys(p["method"] for p in results):
             for scene in SCENES_M:
                 points = [p for p in results if p["method"] == method and p["scene_m"] == scene]
                 color, line = ("C1" if method == "pair" else "C0"), ("--" if scene == SCENES_M[0] else "-")
@@ -47,11 +52,11 @@ def main() -> None:
                 paper.plot_share(
                     ax, [p["n_r"] for p in points], [p[share] for p in points], label, color=color, ls=line
                 )
-        ax.set(xlabel="number of intersections $N_r$", ylabel=share, title=f"{area.stem}: {share}")
+        ax.set(xlabel="number of intersections $N_r$", ylabel=share, title=f"{area}: {share}")
     panels[0].axhline(0.9, color="grey", lw=1, ls=":")
     panels[0].axvline(30, color="grey", lw=1, ls=":")
     panels[1].legend()
-    figure.savefig(options.out / "figure5.png", dpi=110)
+    figure.savefig(out / "figure5.png", dpi=110)
 
 
 def locator(method: str, area: paper.Path, n_r: int, time_limit: float) -> object:

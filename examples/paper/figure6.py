@@ -9,6 +9,7 @@ threshold, so `pair` runs anew for each; `auto` runs once, and its answers are c
 from __future__ import annotations
 
 from dataclasses import replace
+from typing import Any
 
 import experiments as paper
 
@@ -27,7 +28,7 @@ def main() -> None:
     options = parser.parse_args()
     area = paper.search_area(options.reference, options.out)
     queries = DrawnMasks(area, ((paper.masks(1500.0, options.noise, options.seed), options.queries),))
-    results: dict[str, list[dict[str, object]]] = {method: [] for method in options.methods}
+    results: dict[str, list[dict[str, Any]]] = {method: [] for method in options.methods}
     if "pair" in options.methods:
         for ratio in RATIOS:
             pair = replace(paper.PAIR, delta_inlier=ratio, time_limit_s=options.time_limit)
@@ -46,16 +47,20 @@ def main() -> None:
             found = evaluate([t.truth for t in done], cut)
             results["auto"].append({"threshold": odds, **paper.point(found)})
     paper.save(options.out, "figure6", {"reference": area.stem, "noise": options.noise, "points": results})
+    draw(area.stem, results, options.out)
 
-    figure, panels = paper.axes(1, len(options.methods), squeeze=False)
+
+def draw(area: str, results: dict[str, list[dict[str, Any]]], out: paper.Path) -> None:
+    """Plot precision and recall over the thresholds."""
+    figure, panels = paper.axes(1, len(results), squeeze=False)
     labels = {"pair": "inlier-ratio threshold", "auto": "threshold of log10 odds"}
-    for ax, method in zip(panels[0], options.methods, strict=True):
+    for ax, method in zip(panels[0], results, strict=True):
         for share, color in (("precision", "C0"), ("recall", "C1")):
             points = results[method]
             paper.plot_share(ax, [p["threshold"] for p in points], [p[share] for p in points], share, color=color)
-        ax.set(xlabel=labels[method], title=f"{area.stem}, {method}")
+        ax.set(xlabel=labels[method], title=f"{area}, {method}")
         ax.legend()
-    figure.savefig(options.out / "figure6.png", dpi=110)
+    figure.savefig(out / "figure6.png", dpi=110)
 
 
 if __name__ == "__main__":

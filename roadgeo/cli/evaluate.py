@@ -70,7 +70,7 @@ def evaluate_command(
     evaluation.json, report.html and trials.jsonl, from which an interrupted run goes on. Other tables of truths than
     those of `simulate` are understood too; see roadgeo/truth.py.
 
-    With --map masks are tried all over the map (-n of them, 400 if not said), and REF_localizability.tif (styled in
+    With --map masks are tried all over the map (-n of them, 600 if not said), and REF_localizability.tif (styled in
     QGIS), .png and .json say where they would be located, may be ambiguous, or show too few intersections.
 
     \b
@@ -98,7 +98,7 @@ def evaluate_command(
 
         if roads is not None or queries is not None:
             raise click.UsageError("--map draws the reference's own roads: leave --roads and --queries out.")
-        trials = options["count"] or 400
+        trials = options["count"] or 600
         ((simulation, _), *_) = query_sets(**options | {"intersections": ANY})
         Survey(path, simulation, locator, trials, check, jobs, quiet).run(out_dir or Path(), as_json)
         return

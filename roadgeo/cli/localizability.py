@@ -30,7 +30,7 @@ class Survey:
     Attributes
     ----------
     trials : int
-        Masks to learn from: half of them anywhere, half where the first half leaves hope.
+        Masks to learn from: a quarter of them anywhere, the others where the first leave hope.
     check : int
         Other masks that the map is held against.
     """
@@ -72,15 +72,16 @@ class Survey:
 
         grid = lay_grid(network, footprint_area(self.simulation.view))
         rng = np.random.default_rng(self.simulation.seed)
-        hope = np.ones(grid.covered.shape, bool)
+        hope = grid.counts >= 3
         places, located = np.empty((0, 2)), np.empty(0, bool)
-        for count in (self.trials - self.trials // 2, self.trials // 2):
+        first = -(-self.trials // 4)
+        for count in (first, self.trials - first):
             centers = grid.draw(count, hope, rng)
             masks = PlacedMasks(self.reference, self.simulation, tuple(map(tuple, centers.tolist())), len(places))
             places = np.vstack([places, centers])
             located = np.concatenate([located, _located(self._try(masks))])
             found = map_localizability(grid, places, located)
-            hope = np.nan_to_num(found.probability) >= 0.3
+            hope = np.nan_to_num(found.probability) >= 0.5
         return found
 
     def _try(self, masks: QuerySet) -> list[Trial]:
@@ -132,3 +133,7 @@ def _print(summary: dict[str, Any]) -> None:
         if entry["located"]:
             line += f"; located there: {entry['located']['hits']} of {entry['located']['of']}"
         click.echo(line)
+    if not summary["classes"][0]["area_share"]:
+        click.echo(
+            "Too few of the masks tried were located for any promise: wider windows, better masks or a larger -n may."
+        )
