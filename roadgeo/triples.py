@@ -8,6 +8,7 @@ ever.
 
 from __future__ import annotations
 
+import math
 from collections.abc import Iterator
 from dataclasses import dataclass
 
@@ -23,7 +24,24 @@ __all__ = ["Proposals", "TripleOptions", "propose"]
 
 @dataclass(frozen=True)
 class TripleOptions:
-    """How triples are looked up and gathered."""
+    """How triples are looked up and gathered.
+
+    Attributes
+    ----------
+    n_neighbours : int
+        Triples are formed with pairs of so many nearest neighbours of the anchor.
+    min_shape : float
+        Thinner triangles are left out (see `kernels.triples.orient`); the map's may be thinner still.
+    codes_per_vertex : int
+        Of an intersection with three tangents or more, so many pairs of tangents are looked up.
+    angle_tolerance_deg, ray_tolerance_deg : float
+        How far tangents may turn in the equilateral frame, and branches in the map's.
+    affine_tolerance : float
+        Hits of one proposal may differ by this part of their affine maps' size.
+    max_hits, max_compared : int
+        An anchor's triples are looked up, the rarest first, until so many were found or compared: on a map of
+        `usual_size` intersections, and on a larger one more by the root of the ratio.
+    """
 
     n_neighbours: int = 8
     min_shape: float = 0.12
@@ -33,6 +51,12 @@ class TripleOptions:
     affine_tolerance: float = 0.3
     max_hits: int = 12_000
     max_compared: int = 400_000
+    usual_size: int = 15_000
+
+    def bounds(self, n_reference: int) -> tuple[int, int]:
+        """Return `max_hits` and `max_compared` for a map of so many intersections."""
+        factor = math.sqrt(max(1.0, n_reference / self.usual_size))
+        return int(self.max_hits * factor), int(self.max_compared * factor)
 
 
 @dataclass(frozen=True)
@@ -80,8 +104,9 @@ def propose(
         query.xy, query.tangents, neighbours, options.min_shape, options.codes_per_vertex, index.table_starts, costs
     )
     tolerance = round(options.angle_tolerance_deg * UNITS / 180.0)
-    ids = np.empty((options.max_hits, 5), np.int64)
-    affine = np.empty((options.max_hits, 4))
+    max_hits, max_compared = options.bounds(len(index))
+    ids = np.empty((max_hits, 5), np.int64)
+    affine = np.empty((max_hits, 4))
     usable = costs >= 0
     total = np.where(usable, costs, 0).sum(axis=(1, 2))
     n_usable = usable.sum(axis=(1, 2))
@@ -93,7 +118,7 @@ def propose(
         slots = slots[np.argsort(costs[a][usable[a]], kind="stable")]
         n_hits = n_compared = 0
         for s, t in slots:
-            if n_hits == options.max_hits or n_compared > options.max_compared:
+            if n_hits == max_hits or n_compared > max_compared:
                 break
             n_hits, compared = look_up(
                 query.xy, branches, query.tangents, a, s, t, neighbours, options.codes_per_vertex, tolerance,

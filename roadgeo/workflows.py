@@ -229,7 +229,7 @@ def locate(
     if not references:
         raise RoadSourceError("no reference to search: build one with `roadgeo index`")
     found = [_locate_on(road_mask.name, scene, graph, one.index, options, seconds) for one in references]
-    return _best_of(found)
+    return _best_of(found, options)
 
 
 def _as_mask(mask: RoadMask | AnyArray | str | Path) -> RoadMask:
@@ -425,18 +425,37 @@ def _place(plane: LocalPlane, xy: FloatArray, log10_odds: float) -> Place:
     return Place(float(ground[0, 0]), float(ground[0, 1]), float(lonlat[0, 0]), float(lonlat[0, 1]), log10_odds)
 
 
-def _best_of(found: Sequence[Location]) -> Location:
-    """Return the best answer of several references; two different places that are equally sure are ambiguous."""
+def _best_of(found: Sequence[Location], options: LocateOptions) -> Location:
+    """Return the best answer of several references; two places far apart that are almost equally sure are ambiguous."""
     rank = {"located": 2, "ambiguous": 1, "not_located": 0}
     ranked = sorted(found, key=lambda one: (-rank[one.status], -(one.log10_odds or -math.inf)))
     best = ranked[0]
-    total = Seconds(
-        read=best.seconds.read,
-        vectorize=best.seconds.vectorize,
+    seconds = replace(
+        best.seconds,
         match=sum(one.seconds.match for one in found),
         refine=sum(one.seconds.refine for one in found),
     )
     if best.status == "not_located" and len(found) > 1:
-        names = ", ".join(one.reference for one in found)
-        return replace(best, seconds=total, reference=names)
-    return replace(best, seconds=total)
+        return replace(best, seconds=seconds, reference=", ".join(one.reference for one in found))
+    rivals = [one for one in ranked[1:] if one.status == "located" and _far_apart(one, best)]
+    if (
+        rivals
+        and best.status == "located"
+        and (best.log10_odds or 0.0) - (rivals[0].log10_odds or 0.0) < options.min_margin
+    ):
+        rival = rivals[0]
+        reason = (
+            f"two places fit almost equally: log10 odds {best.log10_odds:.1f} on {best.reference} and "
+            f"{rival.log10_odds:.1f} on {rival.reference}"
+        )
+        return replace(best, status="ambiguous", reason=reason, runner_up=rival.center, seconds=seconds)
+    return replace(best, seconds=seconds)
+
+
+def _far_apart(a: Location, b: Location) -> bool:
+    """Whether two locations on different maps mean different places: their middles are more than half a frame apart."""
+    if a.center is None or b.center is None or b.gsd_m is None or b.size is None:
+        return False
+    east = math.radians(a.center.lon - b.center.lon) * math.cos(math.radians(b.center.lat))
+    north = math.radians(a.center.lat - b.center.lat)
+    return 6.371e6 * math.hypot(east, north) > 0.5 * b.gsd_m * max(b.size)

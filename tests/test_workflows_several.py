@@ -1,0 +1,45 @@
+"""Answers of several references become one answer."""
+
+from dataclasses import replace
+
+import pytest
+
+from roadgeo.location import Location, Place, Seconds
+from roadgeo.workflows import LocateOptions, _best_of
+
+HERE = Place(0.0, 0.0, 8.60, 41.15, 20.0)
+
+
+def located(reference: str, odds: float, lon: float = 8.60) -> Location:
+    center = replace(HERE, lon=lon, log10_odds=odds)
+    return Location(
+        "q", "located", "fits", reference=reference, size=(1000, 1000), center=center, gsd_m=1.0, log10_odds=odds,
+        seconds=Seconds(match=1.0, refine=0.5),
+    )  # fmt: skip
+
+
+def refused(reference: str) -> Location:
+    return Location("q", "not_located", "no place stands out", reference=reference, seconds=Seconds(match=2.0))
+
+
+def test_the_surest_place_wins_and_all_work_counts():
+    best = _best_of([refused("a"), located("b", 20.0), located("c", 9.0, lon=9.0)], LocateOptions())
+    assert (best.status, best.reference, best.log10_odds) == ("located", "b", 20.0)
+    assert (best.seconds.match, best.seconds.refine) == (4.0, 1.0)
+
+
+def test_two_places_far_apart_that_are_equally_sure_are_ambiguous():
+    best = _best_of([located("b", 20.0), located("c", 19.0, lon=9.0)], LocateOptions())
+    assert best.status == "ambiguous"
+    assert "on b and 19.0 on c" in best.reason
+    assert best.runner_up is not None
+    assert best.runner_up.lon == 9.0
+
+
+def test_overlapping_maps_may_agree():
+    assert _best_of([located("b", 20.0), located("c", 19.9, lon=8.6001)], LocateOptions()).status == "located"
+
+
+@pytest.mark.parametrize("names", [["a"], ["a", "b"]])
+def test_a_refusal_says_where_it_looked(names):
+    assert _best_of([refused(name) for name in names], LocateOptions()).reference == ", ".join(names)
