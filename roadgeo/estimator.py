@@ -54,6 +54,8 @@ class GrowOptions:
         up.
     min_matched : int
         Least matches besides the seeds.
+    max_points : int
+        Of more intersections, those nearest to the anchor decide how well a hypothesis grows.
     """
 
     max_scale_ratio: float = 2.0
@@ -73,6 +75,7 @@ class GrowOptions:
     chance_rate: float = 0.08
     patience: float = 4.0
     min_matched: int = 4
+    max_points: int = 1000
     max_grown: int = 150
     max_verified: int = 6
 
@@ -214,8 +217,8 @@ class TripleEstimator:
         anchor, partners, affine = proposals.anchor, proposals.partners[m], proposals.affine[m]
         neighbours = np.ascontiguousarray(scene.neighbours[:, : len(partners)])
         gsd = math.sqrt(affine[0] * affine[3] - affine[1] * affine[2])
-        matched = np.empty(len(order), np.int64)
-        distance = np.empty(len(order))
+        matched = np.empty(len(scene.intersections), np.int64)
+        distance = np.empty(len(matched))
         matrix = np.empty((3, 3))
         n_matched, _, ratio = grow(
             scene.intersections.xy, scene.branches, order, scene.half_size, anchor, proposals.reference[m], affine,
@@ -235,7 +238,7 @@ class TripleEstimator:
         """Return the best grown proposals of one anchor that mean different places."""
         options = self.options.grow
         xy = self.scene.intersections.xy
-        order = np.argsort(np.hypot(*(xy - xy[proposals.anchor]).T), kind="stable")
+        order = np.argsort(np.hypot(*(xy - xy[proposals.anchor]).T), kind="stable")[: options.max_points]
         chosen = self._screen(proposals)[: options.max_grown]
         self.n_hypotheses += len(chosen)
         grown = [h for m in chosen if (h := self._grow(proposals, m, order)) is not None]

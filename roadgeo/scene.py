@@ -18,8 +18,16 @@ __all__ = ["Scene", "SceneOptions", "prepare_scene", "query_neighbours", "sample
 
 @dataclass(frozen=True)
 class SceneOptions:
-    """Sizes of the scene's tables."""
+    """Sizes of the scene's tables.
 
+    Attributes
+    ----------
+    max_intersections : int
+        Of more, those nearest to the middle of the frame are kept: they place a mask as surely, and time and memory
+        are bounded.
+    """
+
+    max_intersections: int = 5000
     n_neighbours: int = 12
     max_road_points: int = 600
     min_point_spacing_px: float = 6.0
@@ -106,6 +114,14 @@ def sample_roads(graph: RoadGraph, spacing: float) -> tuple[FloatArray, FloatArr
     return graph.coords[segment] + fraction[:, None] * steps[segment], steps[segment] / lengths[segment][:, None]
 
 
+def _nearest(found: Intersections, center: FloatArray, most: int) -> Intersections:
+    """Return the `most` intersections nearest to a point (2,), in their own order."""
+    if len(found) <= most:
+        return found
+    kept = np.sort(np.argsort(np.hypot(*(found.xy - center).T), kind="stable")[:most])
+    return Intersections(found.xy[kept], found.rays[kept], found.tangents[kept], found.residual[kept], found.node[kept])
+
+
 def prepare_scene(
     graph: RoadGraph,
     intersections: Intersections,
@@ -130,6 +146,7 @@ def prepare_scene(
         seen = np.ones(cells, bool)
     else:
         seen = cv2.resize(observed.astype(np.uint8), cells[::-1], interpolation=cv2.INTER_AREA) > 0
+    intersections = _nearest(intersections, np.array([width / 2.0, -height / 2.0]), options.max_intersections)
     k = options.n_neighbours
     neighbours = query_neighbours(intersections.xy, k) if len(intersections) else np.empty((0, k), np.int32)
     return Scene(

@@ -42,6 +42,8 @@ class VectorizeOptions:
         Wide roads are reduced to about this width before thinning.
     max_working_pixels
         Larger masks are reduced further, at some loss, so that memory is bounded.
+    max_pieces
+        A mask that falls into more pieces of road is noise and is refused, so that time and memory are bounded.
     closing_widths, opening_widths
         Gaps up to this are closed; threads up to this are cut.
     hole_areas, speck_areas
@@ -64,6 +66,7 @@ class VectorizeOptions:
 
     working_width_px: float = 6.0
     max_working_pixels: int = 64_000_000
+    max_pieces: int = 300_000
     closing_widths: float = 0.35
     opening_widths: float = 0.3
     hole_areas: float = 1.2
@@ -121,6 +124,11 @@ def vectorize(mask: RoadMask, options: VectorizeOptions | None = None) -> Vector
     states = _clean(_reduce(mask, factor, min(0.5, 0.45 * width_px / factor)), width, options)
     distance = cv2.distanceTransform((states != GROUND).view(np.uint8), cv2.DIST_L2, 5)
     skeleton = _skeletonize(states, distance, width, options)
+    if len(skeleton.edges) > options.max_pieces:
+        raise MaskError(
+            f"{mask.name or 'mask'}: falls into {len(skeleton.edges):,} pieces of road, expected at most "
+            f"{options.max_pieces:,}: this looks like noise; smooth it before it is thresholded, or reduce it"
+        )
     if len(skeleton.edges) == 0:
         raise MaskError(f"{mask.name or 'mask'}: no road is left after cleaning; expected roads as non-zero pixels")
     graph, is_open = _to_graph(skeleton, distance, factor, width, options)
@@ -270,6 +278,8 @@ def _skeletonize(states: AnyArray, distance: Float32Array, width: float, options
     bridged = False
     for round_ in range(_MAX_ROUNDS):
         skeleton = _Skeleton(*trace(states, pixels, room))
+        if len(skeleton.edges) > options.max_pieces:
+            return skeleton
         drop = _spurs(skeleton, distance, options.spur_widths * width) | _pieces(skeleton, options.piece_widths * width)
         _erase(states, skeleton, drop)
         bridges = np.empty(0, np.int32)

@@ -255,14 +255,14 @@ def grow(
     for _ in range(2):
         distance = np.full(len(xy), np.inf)
         matched = np.full(len(xy), -1)
-        for i in range(len(xy)):
+        for i in order:
             found = search(i, p, normal)
             if found is not None:
                 place, radius, J = found
                 reach = min(radius, radius_m)
                 matched[i], distance[i] = nearest_alike(*place, reach, branches, i, ref_xy, ref_branches, J, tolerance)
         matched = keep_nearest(matched, distance)
-        others = [i for i in range(len(xy)) if i not in seeds]
+        others = [i for i in order if i not in seeds]
         hits = sum(matched[i] >= 0 for i in others)
         ratio = hits * hit + (len(others) - hits) * miss
         p, normal = fit(p)

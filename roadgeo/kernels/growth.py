@@ -283,14 +283,14 @@ def grow(
     Seeds are the anchor and its placed neighbours. Each further point is predicted, the nearest ones first, once its
     search radius, 2.5 of the prediction's own standard deviations, has come down to `radius_m`; matches refit the
     model. A sequential probability ratio test (Wald 1945) counts hits and misses and gives up below -`patience`. In the
-    end all points are matched anew, one to one, twice.
+    end all in `order` are matched anew, one to one, twice.
 
     Parameters
     ----------
     xy : (N, 2) float64, branches : (N, R, 2) int8
         The query's intersections.
-    order : (N,) int64
-        Query points by distance from the anchor.
+    order : (M,) int64
+        Query points by distance from the anchor: all of them or the nearest, the others are left out.
     half_size : float
         Of the frame, pixels.
     anchor, ref_anchor : int
@@ -363,7 +363,7 @@ def grow(
     fitted = n_seeds
     for _ in range(8):
         news = 0
-        for index in range(n):
+        for index in range(order.shape[0]):
             i = order[index]
             if seed[i] or matched[i] >= 0 or tested[i]:
                 continue
@@ -407,8 +407,9 @@ def grow(
     # The model now stands on all: match everything anew, one to one, and fit once more.
     for _ in range(2):
         n_matched, n_tested, ratio = 0, 0, 0.0
-        for i in range(n):
-            matched[i] = -1
+        matched[:] = -1
+        for index in range(order.shape[0]):
+            i = order[index]
             u, v = query[i, 0], query[i, 1]
             px, py, w = predict(p, u, v)
             if w < 0.1:
@@ -430,7 +431,8 @@ def grow(
             image[i, 0] = (ref_xy[j, 0] - x0) / unit
             image[i, 1] = (ref_xy[j, 1] - y0) / unit
         keep_nearest(matched, distance)
-        for i in range(n):
+        for index in range(order.shape[0]):
+            i = order[index]
             if seed[i]:
                 continue
             n_tested += 1
