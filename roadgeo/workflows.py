@@ -371,11 +371,15 @@ def _describe(
 
 
 def _refusal(result: SearchResult[Hypothesis], options: LocateOptions) -> str:
-    best = f"the best had log10 odds {result.score:.1f}" if math.isfinite(result.score) else "none survived the tests"
-    if result.stopped == "time":
-        return f"stopped after the time limit of {options.search.time_limit_s:g} s; of the places tried, {best}"
+    """Say why nothing is reported, and what may help."""
     needed = options.min_log10_odds
-    return f"no place on this map stands out: {best}, {needed:g} are needed; more roads in view or another map may help"
+    if math.isfinite(result.score):
+        best = f"the best has log10 odds {result.score:.1f}, {needed:g} are needed"
+    else:
+        best = "none passed the tests"
+    if result.stopped == "time":
+        return f"stopped at the time limit of {options.search.time_limit_s:g} s; of the places tried, {best}"
+    return f"no place on this map stands out: {best}; more roads in view or another map may help"
 
 
 def place_scene(
