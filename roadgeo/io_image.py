@@ -25,7 +25,7 @@ from roadgeo.outputs import Placement
 from roadgeo.typing import AnyArray, FloatArray
 from roadgeo.warping import MapGrid, Transform, cover, source_pixels
 
-__all__ = ["ImageOptions", "choose_target", "image_homography", "open_picture", "warp_image"]
+__all__ = ["ImageOptions", "choose_target", "image_homography", "open_picture", "read_preview", "warp_image"]
 
 ResamplingName = Literal["nearest", "bilinear", "cubic", "lanczos"]
 
@@ -77,6 +77,33 @@ def open_picture(path: str | os.PathLike[str]) -> Any:
             return rasterio.open(path)
     except RasterioError as error:
         raise MaskError(f"cannot read the picture {path}: {error}; give a raster that GDAL reads") from error
+
+
+def read_preview(path: str | os.PathLike[str], side: int) -> AnyArray:
+    """Read a picture to look at: (h, w, 4) uint8, red, green, blue, alpha, neither side longer than `side` pixels.
+
+    Values deeper than 8 bit are stretched between the darkest and the brightest hundredth.
+
+    Raises
+    ------
+    MaskError
+        GDAL cannot read it.
+    """
+    with open_picture(path) as picture:
+        factor = min(1.0, side / max(picture.width, picture.height))
+        width, height = (max(round(length * factor), 1) for length in (picture.width, picture.height))
+        bands, palette = _value_bands(picture), _palette(picture)
+        bands = bands[:3] if len(bands) >= 3 else bands[:1]
+        averaged = Resampling.average if palette is None else Resampling.nearest
+        values = picture.read(bands, out_shape=(len(bands), height, width), resampling=averaged)
+        known = picture.dataset_mask(out_shape=(height, width))
+    colors = np.moveaxis(values, 0, 2) if palette is None else palette[values[0]]
+    if colors.dtype != np.uint8:
+        low, high = np.nanpercentile(colors[known > 0], (1, 99)) if known.any() else (0.0, 1.0)
+        colors = np.clip((np.nan_to_num(colors.astype(float)) - low) * (255.0 / max(high - low, 1e-9)), 0, 255)
+    preview = np.empty((height, width, 4), np.uint8)
+    preview[..., :3], preview[..., 3] = colors, known
+    return preview
 
 
 def image_homography(
@@ -190,6 +217,19 @@ def _tile(path: str | os.PathLike[str], folder: Path) -> str | os.PathLike[str]:
         return copy
 
 
+def _value_bands(picture: Any) -> list[int]:
+    return [
+        band for band, color in zip(picture.indexes, picture.colorinterp, strict=True) if color != ColorInterp.alpha
+    ]
+
+
+def _palette(picture: Any) -> AnyArray | None:
+    if picture.colorinterp[0] != ColorInterp.palette:
+        return None
+    colors = picture.colormap(1)
+    return np.array([colors.get(i, (0, 0, 0))[:3] for i in range(256)], np.uint8)
+
+
 @dataclass(frozen=True)
 class _Plan:
     """What is drawn, on what."""
@@ -208,16 +248,12 @@ class _Plan:
     @property
     def bands(self) -> list[int]:
         """Bands that are read: all but alpha, which is drawn anew."""
-        colors = zip(self.picture.indexes, self.picture.colorinterp, strict=True)
-        return [band for band, color in colors if color != ColorInterp.alpha]
+        return _value_bands(self.picture)
 
     @property
     def palette(self) -> AnyArray | None:
         """(256, 3) uint8 colours, where the picture has a palette."""
-        if self.picture.colorinterp[0] != ColorInterp.palette:
-            return None
-        colors = self.picture.colormap(1)
-        return np.array([colors.get(i, (0, 0, 0))[:3] for i in range(256)], np.uint8)
+        return _palette(self.picture)
 
     @property
     def colors(self) -> list[ColorInterp]:

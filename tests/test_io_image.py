@@ -11,7 +11,7 @@ from test_io_outputs import located
 from roadgeo import io_image
 from roadgeo.errors import CrsError, MaskError
 from roadgeo.homography import Homography
-from roadgeo.io_image import ImageOptions, image_homography, warp_image
+from roadgeo.io_image import ImageOptions, image_homography, read_preview, warp_image
 from roadgeo.outputs import Placement
 
 PLACE = Placement.of(located())
@@ -152,3 +152,37 @@ def test_what_cannot_be_drawn_is_named(tmp_path: Path) -> None:
         image_homography(PLACE, MASK_SIZE, source)
     with pytest.raises(CrsError, match="banana"):
         warp_image(source, tmp_path / "b.tif", PLACE, PLACE.homography, {}, ImageOptions(crs="EPSG:banana"))
+
+
+@pytest.mark.parametrize("dtype", ["uint8", "uint16", "float32"])
+@pytest.mark.parametrize("n_bands", [1, 3, 4])
+def test_a_preview_is_small_and_shows_what_is_known(tmp_path: Path, dtype: str, n_bands: int) -> None:
+    scale = {"uint8": 1, "uint16": 200, "float32": 0.01}[dtype]
+    ramp = np.tile(np.linspace(10, 240, 600), (400, 1)) * scale
+    bands = np.repeat(ramp[None], min(n_bands, 3), axis=0).astype(dtype)
+    bands[:, :, -100:] = 0
+    profile = {"nodata": 0}
+    if n_bands == 4:
+        opaque = np.iinfo(dtype).max if dtype != "float32" else 255
+        alpha = np.where(np.arange(600) < 500, opaque, 0).astype(dtype)
+        bands = np.concatenate([bands, np.tile(alpha, (400, 1))[None]])
+        profile = {"photometric": "RGB", "alpha": "yes"}
+    preview = read_preview(write(tmp_path / "a.tif", bands, **profile), 300)
+    assert preview.shape == (200, 300, 4)
+    assert preview.dtype == np.uint8
+    assert (preview[:, :248, 3] == 255).all()
+    assert (preview[:, 252:, 3] == 0).all()
+    row = preview[100, :248].astype(int)
+    assert (np.diff(row[:, 0]) >= 0).all()
+    assert row[-1, 0] - row[0, 0] > 180
+    assert np.array_equal(row[:, 0], row[:, 2])
+
+
+def test_a_preview_of_a_palette_shows_its_colours(tmp_path: Path) -> None:
+    labels = np.repeat(np.array([[0, 1]], np.uint8), 40, axis=0).repeat(20, axis=1)[None]
+    path = write(tmp_path / "a.tif", labels, photometric="palette")
+    with warnings.catch_warnings(action="ignore"), rasterio.open(path, "r+") as sink:
+        sink.write_colormap(1, {0: (10, 20, 30, 255), 1: (200, 100, 50, 255)})
+    preview = read_preview(path, 1000)
+    assert preview[5, 5].tolist() == [10, 20, 30, 255]
+    assert preview[5, 35].tolist() == [200, 100, 50, 255]
