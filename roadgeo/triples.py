@@ -38,6 +38,8 @@ class TripleOptions:
         How far tangents may turn in the equilateral frame, and branches in the map's.
     affine_tolerance : float
         Hits of one proposal may differ by this part of their affine maps' size.
+    max_weighed : int
+        Of more intersections, evenly chosen ones may become anchors: to weigh all would take longer than to use some.
     max_hits, max_compared : int
         An anchor's triples are looked up, the rarest first, until so many were found or compared: on a map of
         `usual_size` intersections, and on a larger one more by the root of the ratio.
@@ -49,6 +51,7 @@ class TripleOptions:
     angle_tolerance_deg: float = 8.0
     ray_tolerance_deg: float = 25.0
     affine_tolerance: float = 0.3
+    max_weighed: int = 1000
     max_hits: int = 12_000
     max_compared: int = 400_000
     usual_size: int = 15_000
@@ -99,10 +102,12 @@ def propose(
     """Yield the proposals of one anchor after another, those anchors first whose triples are rare on the map."""
     neighbours = np.ascontiguousarray(neighbours[:, : options.n_neighbours])
     k = neighbours.shape[1]
-    costs = np.empty((len(query), k, k), np.int64)
+    weighed = np.arange(0, len(query), max(1, math.ceil(len(query) / options.max_weighed)))
+    costs = np.empty((len(weighed), k, k), np.int64)
     count_alike(
-        query.xy, query.tangents, neighbours, options.min_shape, options.codes_per_vertex, index.table_starts, costs
-    )
+        query.xy, query.tangents, neighbours, weighed, options.min_shape, options.codes_per_vertex,
+        index.table_starts, costs,
+    )  # fmt: skip
     tolerance = round(options.angle_tolerance_deg * UNITS / 180.0)
     max_hits, max_compared = options.bounds(len(index))
     ids = np.empty((max_hits, 5), np.int64)
@@ -110,12 +115,12 @@ def propose(
     usable = costs >= 0
     total = np.where(usable, costs, 0).sum(axis=(1, 2))
     n_usable = usable.sum(axis=(1, 2))
-    anchors = np.argsort(np.where(n_usable >= 3, total / np.maximum(n_usable, 1), np.inf), kind="stable")
-    for a in anchors:
-        if n_usable[a] < 3:
+    for i in np.argsort(np.where(n_usable >= 3, total / np.maximum(n_usable, 1), np.inf), kind="stable"):
+        if n_usable[i] < 3:
             break
-        slots = np.argwhere(usable[a])
-        slots = slots[np.argsort(costs[a][usable[a]], kind="stable")]
+        a = weighed[i]
+        slots = np.argwhere(usable[i])
+        slots = slots[np.argsort(costs[i][usable[i]], kind="stable")]
         n_hits = n_compared = 0
         for s, t in slots:
             if n_hits == max_hits or n_compared > max_compared:

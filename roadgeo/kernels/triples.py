@@ -127,11 +127,11 @@ def fill_table(
     total = 0
     for a in range(xy.shape[0]):
         for s in range(neighbours.shape[1]):
-            b0 = neighbours[a, s]
+            b0 = np.int64(neighbours[a, s])  # one type of number, one compilation
             if b0 < 0:
                 break
             for t in range(s + 1, neighbours.shape[1]):
-                c0 = neighbours[a, t]
+                c0 = np.int64(neighbours[a, t])
                 if c0 < 0:
                     break
                 turn = orient(xy, a, b0, c0, min_shape)
@@ -214,25 +214,27 @@ def count_alike(
     xy: NDArray[np.float64],
     tangents: NDArray[np.float32],
     neighbours: NDArray[np.int32],
+    anchors: NDArray[np.int64],
     min_shape: float,
     limit: int,
     starts: NDArray[Any],
     costs: NDArray[np.int64],
 ) -> None:
-    """Fill `costs[a, s, t]` with the number of table entries in the very cells of the triple (a, slot s, slot t).
+    """Fill `costs[i, s, t]` with the number of table entries in the cells of a triple (anchors[i], slot s, slot t).
 
     -1 where there is no such triple. It says how common a triple is on the map: cheap ones are looked up first.
     """
     codes = np.empty((3, limit, 2), np.int64)
     n = np.empty(3, np.int64)
     costs[:] = -1
-    for a in range(xy.shape[0]):
+    for i in range(anchors.shape[0]):
+        a = anchors[i]
         for s in range(neighbours.shape[1]):
-            b0 = neighbours[a, s]
+            b0 = np.int64(neighbours[a, s])  # one type of number, one compilation
             if b0 < 0:
                 break
             for t in range(s + 1, neighbours.shape[1]):
-                c0 = neighbours[a, t]
+                c0 = np.int64(neighbours[a, t])
                 if c0 < 0:
                     break
                 turn = orient(xy, a, b0, c0, min_shape)
@@ -253,7 +255,7 @@ def count_alike(
                                 (k1 * PAIRS + k2) * PAIRS + k0,
                             ):
                                 total += starts[cell + 1] - starts[cell]
-                costs[a, s, t] = total if n[0] * n[1] * n[2] > 0 else -1
+                costs[i, s, t] = total if n[0] * n[1] * n[2] > 0 else -1
 
 
 @njit(cache=True)
@@ -286,7 +288,7 @@ def look_up(
     the query triangle to the reference triangle. Gates: `scale` = (least, greatest) root of its determinant, and
     `min_ratio`, the least ratio of its singular values. Returns (hits so far, entries compared).
     """
-    b, c = neighbours[a, s], neighbours[a, t]
+    b, c = np.int64(neighbours[a, s]), np.int64(neighbours[a, t])
     abx, aby = xy[b, 0] - xy[a, 0], xy[b, 1] - xy[a, 1]
     acx, acy = xy[c, 0] - xy[a, 0], xy[c, 1] - xy[a, 1]
     if abx * acy - aby * acx < 0:
