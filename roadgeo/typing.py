@@ -5,7 +5,7 @@ from typing import Any, TypeAlias
 import numpy as np
 from numpy.typing import NDArray
 
-__all__ = ["BoolArray", "FloatArray", "Float32Array", "Int32Array", "IntArray", "AnyArray"]
+__all__ = ["AnyArray", "BoolArray", "Float32Array", "FloatArray", "Int32Array", "IntArray"]
 
 FloatArray: TypeAlias = NDArray[np.float64]
 Float32Array: TypeAlias = NDArray[np.float32]
