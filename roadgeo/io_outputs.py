@@ -91,7 +91,7 @@ def write_location(
     written = [paths.json]
     if not location.located:
         products = (product.path(paths.folder, paths.stem, source.name) for product in PRODUCTS.values())
-        _remove([paths.footprint, paths.style, paths.geopackage, paths.overlay, *products])
+        _remove([paths.footprint, paths.style, paths.geopackage, paths.overlay, paths.report, *products])
     with ExitStack() as files:
 
         def stage(path: Path) -> Path:

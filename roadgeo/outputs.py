@@ -69,6 +69,11 @@ class OutputPaths:
         return self._named("_overlay.png")
 
     @property
+    def report(self) -> Path:
+        """The page that shows and explains the result."""
+        return self._named("_report.html")
+
+    @property
     def json(self) -> Path:
         """The `Location`."""
         return self._named("_location.json")

@@ -182,6 +182,13 @@ class Page:
         self.mouse("mouseReleased", x + dx, y + dy, button="left", clickCount=1)
         self.settle()
 
+    def click_through(self, x: float, y: float) -> None:
+        """Click a link and wait for the page that it leads to."""
+        self._browser.events.clear()
+        self.mouse("mousePressed", x, y, button="left", buttons=1, clickCount=1)
+        self.mouse("mouseReleased", x, y, button="left", clickCount=1)
+        self._browser.wait_for("Page.loadEventFired")
+
     def touch(self, kind: str, *points: tuple[float, float]) -> None:
         """Send one touch event: touchStart, touchMove, touchEnd."""
         fingers = [{"x": x, "y": y, "id": i} for i, (x, y) in enumerate(points)]

@@ -14,6 +14,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 from hypothesis.extra.numpy import arrays
 
+from roadgeo.cli import main
 from roadgeo.demo import ATTRIBUTION, ROADS, demo_masks
 from roadgeo.errors import MaskError, OutputError
 from roadgeo.grid import RoadMask, pixel_to_plane, plane_to_pixel
@@ -22,7 +23,7 @@ from roadgeo.index import build_index
 from roadgeo.io_raster import read_mask
 from roadgeo.io_roads import read_roads
 from roadgeo.location import Evidence, Location, Place
-from roadgeo.report import ReportOptions, render_report, write_report
+from roadgeo.report import Entry, ReportOptions, render_batch, render_report, write_batch, write_report
 from roadgeo.report.svg import draw_dots, draw_image, draw_lines, join_segments, thin_lines
 from roadgeo.workflows import Reference, build_network, locate
 
@@ -194,6 +195,52 @@ def test_the_report_is_written_in_one_step(porto: Reference, drone: RoadMask, fo
     assert [path.name for path in tmp_path.iterdir()] == ["drone_report.html"]
     with pytest.raises(OutputError, match="cannot write"):
         write_report(tmp_path / "none" / "drone_report.html", found, drone, porto.index)
+
+
+# --- many masks -------------------------------------------------------------------------------------------------------
+
+
+def test_many_masks_are_listed_with_their_reports(porto: Reference, found: Location) -> None:
+    elsewhere = replace(found, query="b/else&where.png", status="not_located", reason="no <place>", footprint=None)
+    documents = [
+        found.to_dict(),
+        elsewhere.to_dict(),
+        {"query": "c.png", "status": "error", "reason": "c.png: missing"},
+    ]
+    links = ["drone_report.html", "else & where_report.html", ""]
+    entries = list(map(Entry, documents, links))
+    other = replace(porto.index, meta={**porto.index.meta, "name": "lisbon", "attribution": "© Lisbon"})
+    read = Reader(render_batch(entries, [other, porto.index]))
+    assert read.open == []
+    for said in ("3 masks", "1 located, 1 not located, 1 failed", "else&where.png", "no <place>", "c.png: missing"):
+        assert said in read.text
+    assert "On porto" in read.text  # nothing lies on the first, which is shown because it was searched
+    addresses = [attrs["href"] for tag, attrs in read.tags if tag == "a"]
+    assert addresses == ["drone_report.html", "else%20%26%20where_report.html", "drone_report.html"]
+    assert "© Lisbon; © OpenStreetMap" in read.text
+    assert len(render_batch(entries[:1] * 9000, [porto.index]).encode()) < MAX_BYTES
+
+
+def test_the_command_line_writes_reports(
+    porto: Reference, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    monkeypatch.chdir(tmp_path)
+    porto.save("porto.gpkg")
+    for name in ("drone", "elsewhere"):
+        (tmp_path / f"{name}.png").write_bytes(DEMO[name].path.read_bytes())
+    (tmp_path / "broken.png").write_bytes(b"no picture")
+    (tmp_path / "broken_report.html").touch()  # of an earlier run, when it was not broken
+    arguments = ["locate", "drone.png", "elsewhere.png", "broken.png", "-r", "porto.gpkg", "--report", "--jobs", "2"]
+    assert main(arguments) == 1
+    assert "roadgeo_report.html" in capsys.readouterr().err
+    assert "✓ located" in (tmp_path / "drone_report.html").read_text(encoding="utf-8")
+    assert "✕ not located" in (tmp_path / "elsewhere_report.html").read_text(encoding="utf-8")
+    page = (tmp_path / "roadgeo_report.html").read_text(encoding="utf-8")
+    assert "1 located, 1 not located, 1 failed" in page
+    assert ATTRIBUTION in page
+    assert "broken_report.html" not in page
+    assert main(["locate", "elsewhere.png", "-r", "porto.gpkg", "--quiet"]) == 3
+    assert not (tmp_path / "elsewhere_report.html").exists()  # nothing that no longer holds is left
 
 
 # --- how large it gets ------------------------------------------------------------------------------------------------
@@ -473,3 +520,16 @@ def test_a_mask_without_a_place_opens_too(browser: Browser, porto: Reference, tm
         page.settle()
         assert view(page)[2] < start[2]
         assert page.complaints() == []
+
+
+def test_the_list_leads_to_the_reports(browser: Browser, report: Path, porto: Reference, found: Location) -> None:
+    path = report.with_name("roadgeo_report.html")
+    write_batch(path, [Entry(found.to_dict(), report.name)], [porto.index])
+    for link in ("svg.view a path", ".list a"):
+        with browser.open(path, 1360, 860) as page:
+            assert page.complaints() == []
+            page.drag(*page.middle("svg.view a path"), 60, 40)  # moves the map, follows no link
+            assert page.run("location.href") == path.as_uri()
+            page.click_through(*page.middle(link))
+            assert page.run("location.href") == report.as_uri()
+            assert page.complaints() == []

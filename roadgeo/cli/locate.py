@@ -55,6 +55,7 @@ class Job:
     threshold: float | None = None
     band: int | None = None
     plot: bool = False
+    report: bool = False
     exif: bool = False
     skip_existing: bool = False
 
@@ -122,6 +123,11 @@ class Job:
         if self.plot and location.located:
             _draw(location, mask, reference, paths.overlay, attribution)
             files.append(paths.overlay)
+        if self.report:
+            from roadgeo.report import write_report
+
+            write_report(paths.report, location, mask, reference.index, attribution, picture)
+            files.append(paths.report)
         text = describe(location)
         if picture and location.located:
             text += f"\n  drew {picture}, {_scale(picture, mask):g} times the mask's size"
@@ -181,6 +187,11 @@ def open_references(names: Iterable[str]) -> list[Reference]:
 )
 @click.option("--json", "as_json", is_flag=True, help="Print one JSON object per mask and line, in input order.")
 @click.option("--plot", is_flag=True, help="Also write MASK_overlay.png: the mask and its place, to look at.")
+@click.option(
+    "--report",
+    is_flag=True,
+    help="Also write MASK_report.html, to look at in a browser, located or not; needs no network.",
+)
 @click.option(
     "--image",
     "images",
@@ -263,6 +274,7 @@ def locate_command(
     out_dir: str,
     as_json: bool,
     plot: bool,
+    report: bool,
     images: tuple[str, ...],
     products: tuple[str, ...],
     gcps: bool,
@@ -296,9 +308,10 @@ def locate_command(
       photo_mask_location.gpkg   footprint, matched intersections, roads: opens styled in QGIS
       photo_mask_location.json   place, homography, odds; also written, with a reason, where nothing was found
       photo_mask_overlay.png     with --plot
+      photo_mask_report.html     with --report: map, mask, residuals and numbers; also where nothing was found
 
-    For several masks also roadgeo_summary.gpkg and roadgeo_summary.csv, all footprints in one. What Ctrl-C cut short
-    goes on with --skip-existing.
+    For several masks also roadgeo_summary.gpkg and roadgeo_summary.csv, all footprints in one, and with --report
+    roadgeo_report.html, which lists them. What Ctrl-C cut short goes on with --skip-existing.
 
     \b
     With --also:
@@ -332,9 +345,10 @@ def locate_command(
     outputs = _make_outputs(crs, resolution, resampling, max_pixels, (*products, *(["gcps"] if gcps else [])))
     pictures = pair_images([task.mask for task in tasks], images)
     from_exif = camera == "exif"
-    job = Job(references, options, outputs, out_dir, pictures, threshold, band, plot, from_exif, skip_existing)
+    job = Job(references, options, outputs, out_dir, pictures, threshold, band, plot, report, from_exif, skip_existing)
     # Opened here too: what is wrong with them is said once, and the search is compiled before processes start.
-    compile_once(open_references(references)[0], quiet)
+    opened = open_references(references)
+    compile_once(opened[0], quiet)
     counts: Counter[Status] = Counter()
     documents = []
     with _progress(len(tasks), as_json, quiet) as advance:
@@ -347,6 +361,8 @@ def locate_command(
         from roadgeo.io_summary import write_summary
 
         files = write_summary(Path(out_dir), documents)
+        if report:
+            files.append(_list_reports(Path(out_dir), tasks, documents, opened))
         if not quiet:
             click.echo(f"{summarize(counts)}; all footprints: {', '.join(map(str, files))}", err=True)
     return ERROR if counts["error"] else 0 if counts["located"] == len(tasks) else NOT_LOCATED
@@ -450,6 +466,21 @@ def _draw(location: Location, mask: RoadMask, reference: Reference, path: Path, 
     index = reference.index
     roads = index.plane.to_crs(index.segments.reshape(-1, 2).astype(float)).reshape(-1, 4)
     write_overlay(path, location, mask, roads, attribution)
+
+
+def _list_reports(
+    folder: Path, tasks: Sequence[Task], documents: Sequence[dict[str, Any]], references: Sequence[Reference]
+) -> Path:
+    """Write the page that links to the reports of all masks."""
+    from roadgeo.outputs import output_paths
+    from roadgeo.report import Entry, write_batch
+
+    paths = [output_paths(folder, task.stem).report for task in tasks]
+    there = [path.exists() and document["status"] != "error" for path, document in zip(paths, documents, strict=True)]
+    links = [path.name if here else "" for path, here in zip(paths, there, strict=True)]
+    page = folder / "roadgeo_report.html"
+    write_batch(page, list(map(Entry, documents, links)), [one.index for one in references])
+    return page
 
 
 # --- printing ---------------------------------------------------------------------------------------------------------

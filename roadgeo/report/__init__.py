@@ -2,7 +2,8 @@
 
 from __future__ import annotations
 
+from roadgeo.report.batch import Entry, render_batch, write_batch
 from roadgeo.report.page import render_report, write_report
 from roadgeo.report.views import ReportOptions
 
-__all__ = ["ReportOptions", "render_report", "write_report"]
+__all__ = ["Entry", "ReportOptions", "render_batch", "render_report", "write_batch", "write_report"]

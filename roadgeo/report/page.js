@@ -106,6 +106,7 @@ class Viewer {
     stage.addEventListener("pointermove", (event) => this.drag(event));
     stage.addEventListener("pointerleave", () => pointAt(null));
     for (const name of ["pointerup", "pointercancel"]) stage.addEventListener(name, (event) => this.release(event));
+    stage.addEventListener("dragstart", (event) => event.preventDefault());
     stage.addEventListener("dblclick", (event) => this.zoom(event.shiftKey ? 0.5 : 2, this.point(event)));
     stage.addEventListener("keydown", (event) => this.key(event));
     const acts = { in: () => this.zoom(ZOOM), out: () => this.zoom(1 / ZOOM), fit: () => this.fit() };
@@ -128,13 +129,13 @@ class Viewer {
 
   press(event) {
     if (event.button !== 0 || event.target.closest("button")) return;
-    this.stage.setPointerCapture(event.pointerId);
     this.pointers.set(event.pointerId, event);
     if (this.pointers.size === 1) this.start = event;
     else this.start = null;
   }
 
   drag(event) {
+    if (event.buttons === 0) this.pointers.delete(event.pointerId); // it was released elsewhere
     if (!this.pointers.has(event.pointerId)) {
       if (event.pointerType === "mouse") pointAt(this, this.point(event));
       return;
@@ -142,8 +143,9 @@ class Viewer {
     const before = gauge(this.pointers);
     this.pointers.set(event.pointerId, event);
     const after = gauge(this.pointers);
-    if (this.start && far(this.start, event)) this.start = null;
-    if (this.start) return;
+    if (this.start && !far(this.start, event)) return;
+    this.start = null;
+    this.stage.setPointerCapture(event.pointerId); // only now, so that links in the picture can be clicked
     const at = this.point({ clientX: before.x, clientY: before.y });
     if (before.spread && after.spread) this.zoom(after.spread / before.spread, at);
     const moved = this.point({ clientX: after.x, clientY: after.y });

@@ -24,7 +24,7 @@ from roadgeo.report.views import ReportOptions, Subject, Window, draw_mask, draw
 from roadgeo.view import polygon_area
 from roadgeo.wording import format_lonlat
 
-__all__ = ["STATUS", "render_page", "render_report", "section", "write_report"]
+__all__ = ["STATUS", "footer", "render_page", "render_report", "section", "write_report"]
 
 #: How each status is shown: by a sign and a word, not by colour alone.
 STATUS = {"located": "✓ located", "ambiguous": "≈ ambiguous", "not_located": "✕ not located", "error": "! failed"}
@@ -96,7 +96,7 @@ def render_report(
         f'<h1>{html.escape(name)}</h1><span class="status {location.status}">{STATUS[location.status]}</span>'
         f"<p>{html.escape(_sentence(location.reason))}</p>"
     )
-    return render_page(name, header, f"<main>{views[0]}<aside>{''.join(parts)}{_footer(attribution)}</aside></main>")
+    return render_page(name, header, f"<main>{views[0]}<aside>{''.join(parts)}{footer(attribution)}</aside></main>")
 
 
 def render_page(title: str, header: str, body: str) -> str:
@@ -131,7 +131,8 @@ def section(title: str, content: str) -> str:
     return f"<section><h2>{html.escape(title)}</h2>{content}</section>" if content else ""
 
 
-def _footer(attribution: str) -> str:
+def footer(attribution: str) -> str:
+    """Name whom the map's licence asks to name, and the program."""
     credit = f"Map: {html.escape(attribution)}. " if attribution else ""
     return f"<footer>{credit}Made by roadgeo {__version__}. This file needs no network.</footer>"
 

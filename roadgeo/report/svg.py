@@ -103,6 +103,8 @@ def _straighten(line: FloatArray, tolerance: float) -> FloatArray:
         return line
     if (line[0] == line[-1]).all():  # Douglas and Peucker start from a line between two different ends
         k = int(np.argmax(np.hypot(*(line - line[0]).T)))
+        if k == 0:
+            return line[:2]
         return np.concatenate([_straighten(line[: k + 1], tolerance), _straighten(line[k:], tolerance)[1:]])
     origin = line[0]  # 32-bit numbers are fine near it
     kept = cv2.approxPolyDP((line - origin).astype(np.float32), tolerance, False)[:, 0]

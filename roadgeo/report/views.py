@@ -22,7 +22,18 @@ from roadgeo.typing import AnyArray, BoolArray, FloatArray
 from roadgeo.warping import cover, warp
 from roadgeo.workflows import QueryOptions, trace_query
 
-__all__ = ["ReportOptions", "Subject", "Window", "draw_mask", "draw_overview", "draw_place", "draw_whole_map"]
+__all__ = [
+    "Layer",
+    "ReportOptions",
+    "Subject",
+    "Window",
+    "draw_mask",
+    "draw_overview",
+    "draw_place",
+    "draw_viewer",
+    "draw_whole_map",
+    "ring_data",
+]
 
 #: A circle that holds a corner's true position with 95 %, in standard deviations of each coordinate.
 _SIGMAS = 2.45
@@ -202,7 +213,7 @@ class Window:
 
 
 @dataclass(frozen=True)
-class _Layer:
+class Layer:
     """Something that can be shown or not: `name` is its class in the style sheet, `sign` stands in the legend."""
 
     name: str
@@ -215,8 +226,6 @@ class _Layer:
 _DOT_SIGN = '<path class="halo" d="M13 7h.1"/><path d="M13 7h.1"/>'
 _RING_SIGN = '<path d="M13 7h.1"/><path class="core" d="M13 7h.1"/>'
 _PICTURE_SIGN = '<rect x="3" y="2" width="20" height="10"/>'
-_SCALE = '<span class="scale"></span>'
-_TIMES = '<span>residuals, corners <span class="times">enlarged</span></span>'
 
 
 def draw_place(subject: Subject, place: Placement) -> str:
@@ -232,25 +241,25 @@ def draw_place(subject: Subject, place: Placement) -> str:
     query = [line for line in map(to_svg, subject.lines) if np.isfinite(line).all()]
     layers = [
         _picture_on_map(subject, place, window),
-        _Layer("map-roads", "roads of the map", draw_lines(thin_lines(roads, subject.options.max_map_vertices))),
-        _Layer("unmatched", "intersections of the map", _draw_rings(crossings), _RING_SIGN, shown=False),
-        _Layer("query-roads", "roads of the mask", draw_lines(query)),
-        _Layer("footprint", "footprint", _draw_footprint(corners), '<path d="M3 2h20v10h-20z"/>'),
+        Layer("map-roads", "roads of the map", draw_lines(thin_lines(roads, subject.options.max_map_vertices))),
+        Layer("unmatched", "intersections of the map", _draw_rings(crossings), _RING_SIGN, shown=False),
+        Layer("query-roads", "roads of the mask", draw_lines(query)),
+        Layer("footprint", "footprint", _draw_footprint(corners), '<path d="M3 2h20v10h-20z"/>'),
     ]
     matches = subject.matches()
     if matches is not None:
         at, found = window.to_svg(matches.reference_xy), to_svg(plane_to_pixel(matches.query_xy))
         layers += [
-            _Layer("residuals", "residuals", _draw_arrows(at, found - at), '<path d="M3 7h18m-5-4l5 4l-5 4"/>'),
-            _Layer("matches", "matched intersections", draw_dots(at, ("halo", "")), _DOT_SIGN),
+            Layer("residuals", "residuals", _draw_arrows(at, found - at), '<path d="M3 7h18m-5-4l5 4l-5 4"/>'),
+            Layer("matches", "matched intersections", draw_dots(at, ("halo", "")), _DOT_SIGN),
         ]
     if location.corner_sigma_m is not None:
         circles = _draw_circles(corners, location.corner_sigma_m)
-        layers.append(_Layer("sigma", "corners, 95 %", circles, '<circle cx="13" cy="7" r="5"/>'))
+        layers.append(Layer("sigma", "corners, 95 %", circles, '<circle cx="13" cy="7" r="5"/>'))
     other = subject.runner_up()
     if other is not None and window.holds(other):
         cross = pin(window.to_svg(other), '<path d="M-9-9L9 9M-9 9L9-9"/>', "runner-up")
-        layers.append(_Layer("runner-up", "runner-up", cross, '<path d="M8 2l10 10m0-10l-10 10"/>'))
+        layers.append(Layer("runner-up", "runner-up", cross, '<path d="M8 2l10 10m0-10l-10 10"/>'))
     arrows, per_px = _arrow_scale(location), window.width / _PLACE_PX
     attributes = {
         "data-frame": "map",
@@ -261,23 +270,22 @@ def draw_place(subject: Subject, place: Placement) -> str:
         "style": f"--u:{per_px:.4g};--k:{max(1.0, arrows * per_px):.4g}",
     }
     said = f"Map, north up: the footprint of {location.query} over the roads of {location.reference}"
-    credit = f'<span class="credit">{html.escape(subject.attribution)}</span>' if subject.attribution else ""
-    return draw_viewer(said, window.box, layers, attributes, _TIMES + _SCALE, credit)
+    return draw_viewer(said, window.box, layers, attributes, scale=True, enlarged=True, credit=subject.attribution)
 
 
-def _picture_on_map(subject: Subject, place: Placement, window: Window) -> _Layer:
+def _picture_on_map(subject: Subject, place: Placement, window: Window) -> Layer:
     image = subject.draw_picture(_QUERY_COLOR)
     size = image.shape[1], image.shape[0]
     to_crs = place.homography @ np.diag([subject.size[0] / size[0], subject.size[1] / size[1], 1.0])
     grid = cover(size, to_crs, None, subject.options.picture_px**2)
     is_photograph = subject.photograph is not None
     if grid.width == 0:
-        return _Layer("picture", "", "")
+        return Layer("picture", "", "")
     warped = warp(image, to_crs, grid, interpolation=cv2.INTER_LINEAR if is_photograph else cv2.INTER_NEAREST)
     x, y = window.to_svg(np.array([grid.west, grid.north]))
     box = (x, y, grid.width * grid.resolution, grid.height * grid.resolution)
     picture = draw_image(warped, box, subject.options.picture_bytes, lossless=not is_photograph)
-    return _Layer("picture", "photograph" if is_photograph else "mask", picture, _PICTURE_SIGN, shown=is_photograph)
+    return Layer("picture", "photograph" if is_photograph else "mask", picture, _PICTURE_SIGN, shown=is_photograph)
 
 
 def _draw_footprint(corners: FloatArray) -> str:
@@ -341,13 +349,13 @@ def draw_mask(subject: Subject) -> str:
     others = np.array([xy for xy in subject.seen.tolist() if tuple(xy) not in taken]).reshape(-1, 2)
     others = others[: subject.options.max_query_vertices // 4]
     layers = [
-        _Layer("picture", "photograph" if is_photograph else "mask", picture, _PICTURE_SIGN),
-        _Layer("query-roads", "its roads", draw_lines(subject.lines)),
-        _Layer(
+        Layer("picture", "photograph" if is_photograph else "mask", picture, _PICTURE_SIGN),
+        Layer("query-roads", "its roads", draw_lines(subject.lines)),
+        Layer(
             "unmatched", "other intersections" if len(matched) else "its intersections", _draw_rings(others), _RING_SIGN
         ),
-        _Layer("matches", "matched", draw_dots(matched, ("halo", "")), _DOT_SIGN),
-        _Layer("edge", "", f'<path d="{ring_data(subject.mask.corners)}"/>'),
+        Layer("matches", "matched", draw_dots(matched, ("halo", "")), _DOT_SIGN),
+        Layer("edge", "", f'<path d="{ring_data(subject.mask.corners)}"/>'),
     ]
     said = f"The mask {subject.location.query}, with the roads and intersections seen in it"
     attributes = {"data-frame": "mask", "style": f"--u:{max(width, height) / _MASK_PX:.4g}"}
@@ -362,11 +370,11 @@ def draw_overview(subject: Subject) -> str:
     index, location = subject.index, subject.location
     if index.name != location.reference:  # several were searched
         return f"<p>Searched: {html.escape(location.reference)}.</p>"
-    picture, window = draw_whole_map(index, subject.options.overview_bytes)
+    picture, window = draw_whole_map(index, subject.options.overview_bytes, 2 * _OVERVIEW_PX)
     marks = []
     if subject.place is not None:
         d = ring_data(window.to_svg(subject.place.footprint))
-        marks.append(f'<g class="outline {location.status}"><path d="{d}"/></g>')
+        marks.append(f'<g class="{location.status}"><path d="{d}"/></g>')
     other = subject.runner_up()
     if other is not None:
         cross = pin(window.to_svg(other), '<path d="M-6-6L6 6M-6 6L6-6"/>', "runner-up")
@@ -381,17 +389,16 @@ def draw_overview(subject: Subject) -> str:
     )
 
 
-def draw_whole_map(index: ReferenceIndex, limit: int) -> tuple[str, Window]:
+def draw_whole_map(index: ReferenceIndex, limit: int, width_px: int) -> tuple[str, Window]:
     """Draw all roads of a reference as an SVG image of at most `limit` bytes, and say which window it fills."""
     x0, y0, size = index.grid
     columns, rows = index.shape
     west, south = index.plane.to_crs(np.array([x0, y0])).tolist()
     window = Window(west, south + rows * size, columns * size, rows * size)
-    scale = 2 * _OVERVIEW_PX / window.width
-    scale = min(scale, 4 * _OVERVIEW_PX / window.height)
+    scale = min(width_px / window.width, 2 * width_px / window.height)
     alpha = np.zeros((max(round(window.height * scale), 1), max(round(window.width * scale), 1)), np.uint8)
     ends = (index.segments.reshape(-1, 2, 2) - (x0, y0 + rows * size)) * (scale, -scale)
-    cv2.polylines(alpha, list(np.rint(ends * 16).astype(np.int32)), False, 112, 1, cv2.LINE_AA, 4)
+    cv2.polylines(alpha, list(np.rint(ends * 16).astype(np.int32)), False, 160, 1, cv2.LINE_AA, 4)
     image = np.empty((*alpha.shape, 4), np.uint8)
     image[..., :3], image[..., 3] = _GREY, alpha & 0xF0
     return draw_image(image, window.box, limit, lossless=True), window
@@ -413,12 +420,27 @@ _MARKS = (
 def draw_viewer(
     said: str,
     box: tuple[float, float, float, float],
-    layers: Sequence[_Layer],
+    layers: Sequence[Layer],
     attributes: dict[str, str],
-    notes: str = "",
+    *,
+    scale: bool = False,
+    enlarged: bool = False,
     credit: str = "",
 ) -> str:
-    """Draw layers that can be zoomed into, notes and a credit in the corners, and a legend that switches layers."""
+    """Draw layers that can be zoomed into, with a legend that switches those that have a label: an HTML figure.
+
+    Parameters
+    ----------
+    scale : bool
+        Show a scale bar: the units are metres.
+    enlarged : bool
+        Say how much residuals and circles are enlarged.
+    credit : str
+        Stands in a corner.
+    """
+    notes = '<span>residuals, corners <span class="times">enlarged</span></span>' if enlarged else ""
+    notes += '<span class="scale"></span>' if scale else ""
+    named = f'<span class="credit">{html.escape(credit)}</span>' if credit else ""
     pad = 0.02 * max(box[2:])
     view = f"{box[0] - pad:.1f} {box[1] - pad:.1f} {box[2] + 2 * pad:.1f} {box[3] + 2 * pad:.1f}"
     given = "".join(f' {name}="{html.escape(value)}"' for name, value in attributes.items())
@@ -434,7 +456,7 @@ def draw_viewer(
         '<figure class="viewer"><div class="stage" tabindex="0" role="group" '
         'aria-label="Zoom with + and −, move with the arrow keys, 0 shows all">'
         f'<svg class="view" viewBox="{view}" role="img" aria-label="{html.escape(said)}"{given}>{groups}{_MARKS}</svg>'
-        f'{_BUTTONS}<div class="notes">{notes}<span class="position"></span></div>{credit}</div>'
+        f'{_BUTTONS}<div class="notes">{notes}<span class="position"></span></div>{named}</div>'
         f'<fieldset class="legend" aria-label="Layers">{legend}</fieldset></figure>'
     )
 
