@@ -24,12 +24,9 @@ def compile_once(reference: Reference, quiet: bool) -> None:
         return
     if not quiet:
         click.echo("Compiling the search for this machine, once; it takes a few seconds ...", err=True)
-    from dataclasses import replace
+    from roadgeo.workflows import locate
 
-    from roadgeo.workflows import LocateOptions, locate
-
-    options = LocateOptions()
-    locate(_practice_mask(reference), reference, replace(options, search=replace(options.search, time_limit_s=600.0)))
+    locate(_practice_mask(reference), reference)
 
 
 def _is_cold() -> bool:

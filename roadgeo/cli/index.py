@@ -13,9 +13,11 @@ from roadgeo.cli.parameters import BOX, NEAR, verbosity_options
 
 if TYPE_CHECKING:
     from roadgeo.io_roads import Roads
+    from roadgeo.network import RoadNetwork
+    from roadgeo.projection import LocalPlane
     from roadgeo.workflows import Reference
 
-__all__ = ["build", "index_command"]
+__all__ = ["build", "index_command", "replace_ground"]
 
 
 @click.command("index", short_help="Build a reference: the searchable roads of a place.")
@@ -50,6 +52,9 @@ __all__ = ["build", "index_command"]
 @click.option("--overpass-url", metavar="URL", help="Overpass server to fetch from.")
 @click.option("--nominatim-url", metavar="URL", help="Nominatim server that finds --osm places.")
 @click.option("--no-cache", is_flag=True, help="Fetch anew what was fetched before.")
+@click.option(
+    "--update", is_flag=True, help="Replace or add this ground in the reference that is there; keep the rest."
+)
 @click.option("--name", metavar="NAME", help="Name of the reference. Default: after the place or file.")
 @click.option(
     "-o",
@@ -59,7 +64,7 @@ __all__ = ["build", "index_command"]
     help="Where it goes. Default: into the library, under its name.",
 )
 @verbosity_options
-def index_command(out: str | None, name: str | None, quiet: bool, verbose: bool, **source: Any) -> None:
+def index_command(out: str | None, name: str | None, update: bool, quiet: bool, verbose: bool, **source: Any) -> None:
     """Build a reference: draw the roads of a place as a mask shows them, and index their intersections.
 
     Done once per place; `roadgeo locate` then searches it. The result is REF.gpkg, which opens styled in QGIS, and
@@ -71,6 +76,7 @@ def index_command(out: str | None, name: str | None, quiet: bool, verbose: bool,
       roadgeo index --bbox=-71.19,42.23,-70.95,42.44 --name boston
       roadgeo index --roads streets.shp --crs EPSG:26986 --out maps/streets.gpkg
       roadgeo index --roads massachusetts.osm.pbf --bbox=-71.19,42.23,-70.95,42.44
+      roadgeo index --update --osm "Cambridge, MA" --name boston-ma
     """
     from roadgeo.cli.compilation import compile_once
     from roadgeo.cli.folders import make_folder
@@ -84,7 +90,7 @@ def index_command(out: str | None, name: str | None, quiet: bool, verbose: bool,
     make_folder(path.parent)  # before the long part
     roads = _read(source, say) if given == "roads" else _fetch(source, given, say)
     say(f"drawing {len(roads):,} lines as a mask shows them")
-    reference = build(roads, path, make_slug(name))
+    reference = replace_ground(roads, path, source["bbox"]) if update else build(roads, path, make_slug(name))
     compile_once(reference, quiet)
     if verbose:
         for key, value in roads.meta.items():
@@ -97,7 +103,7 @@ def index_command(out: str | None, name: str | None, quiet: bool, verbose: bool,
 
 
 def build(roads: Roads, path: Path, name: str) -> Reference:
-    """Build a reference from roads on their plane and write it.
+    """Build a reference from roads on their plane, write it and open it.
 
     Raises
     ------
@@ -106,14 +112,56 @@ def build(roads: Roads, path: Path, name: str) -> Reference:
     OutputError
         It cannot be written.
     """
+    from roadgeo.workflows import build_network
+
+    return _write(build_network(roads.lines, roads.plane, {"name": name, **roads.meta}), path)
+
+
+def replace_ground(roads: Roads, path: Path, box: tuple[float, float, float, float] | None) -> Reference:
+    """Replace the roads of a reference by others where those lie, or in a box of degrees, and write it.
+
+    Raises
+    ------
+    IndexFormatError
+        There is no such reference.
+    OutputError
+        It cannot be written.
+    """
+    from roadgeo.io_network import read_network
+    from roadgeo.updating import ground_of, move_lines, replace_area
+
+    network = read_network(path)
+    lines = move_lines(roads.lines, roads.plane, network.plane)
+    area = ground_of(lines) if box is None else _ground(box, network.plane)
+    owed = dict.fromkeys([network.meta.get("attribution", ""), roads.meta["attribution"]])
+    meta = {
+        **network.meta,
+        "sources": [*network.meta.get("sources", []), *roads.meta["sources"]],
+        "attribution": "; ".join(filter(None, owed)),
+    }
+    return _write(replace_area(network, lines, area, meta), path)
+
+
+def _ground(box: tuple[float, float, float, float], plane: LocalPlane) -> Any:
+    """Outline a box of degrees, whose east may lie beyond 180, on a plane."""
+    import numpy as np
+    import shapely
+
+    from roadgeo.projection import from_lonlat
+
+    west, south, east, north = box
+    ring = shapely.segmentize(shapely.box(west, south, east + 360.0 * (east < west), north), 0.01)
+    return shapely.transform(ring, lambda lonlat: np.asarray(from_lonlat(plane, lonlat)))
+
+
+def _write(network: RoadNetwork, path: Path) -> Reference:
     from roadgeo.index import build_index
     from roadgeo.io_network import as_stored
-    from roadgeo.workflows import Reference, build_network
+    from roadgeo.workflows import Reference, open_reference
 
-    network = as_stored(build_network(roads.lines, roads.plane, {"name": name, **roads.meta}))
-    reference = Reference(build_index(network), network)
-    reference.save(path)
-    return reference
+    stored = as_stored(network)
+    Reference(build_index(stored), stored).save(path)
+    return open_reference(path)  # as `locate` has it: memory-mapped arrays are another type to compiled code
 
 
 # --- where the roads come from ----------------------------------------------------------------------------------------
