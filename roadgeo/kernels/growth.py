@@ -127,7 +127,8 @@ def fit_homography(
     if not cholesky(normal, factor):
         return False
     solve_cholesky(factor, right)
-    p[:] = right
+    for r in range(8):
+        p[r] = right[r]
     return True
 
 

@@ -4,7 +4,7 @@ import numpy as np
 from numba import njit
 from numpy.typing import NDArray
 
-__all__ = ["describe_intersections", "fit_branches"]
+__all__ = ["describe_intersections", "fit_branches", "sort_few"]
 
 
 @njit(cache=True)
@@ -103,6 +103,18 @@ def fit_branches(
 
 
 @njit(cache=True)
+def sort_few(values: NDArray[np.floating], n: int) -> None:
+    """Sort the first n values in place, by insertion: a general sort would cost two seconds to compile."""
+    for i in range(1, n):
+        value = values[i]
+        k = i
+        while k > 0 and values[k - 1] > value:
+            values[k] = values[k - 1]
+            k -= 1
+        values[k] = value
+
+
+@njit(cache=True)
 def describe_intersections(
     node_xy: NDArray[np.float64],
     starts: NDArray[np.int64],
@@ -166,12 +178,12 @@ def describe_intersections(
         if count == 0:
             continue
 
-        angle[:count].sort()
+        sort_few(angle, count)
         for k in range(count):
             rays[n, k] = angle[k]
         for k in range(count):
             angle[k] = angle[k] % np.pi
-        angle[:count].sort()
+        sort_few(angle, count)
         first = 0  # start after the widest gap, so that no line is cut in two at 0 = pi
         widest = angle[0] + np.pi - angle[count - 1]
         for k in range(1, count):
@@ -193,4 +205,4 @@ def describe_intersections(
             members += 1
         tangents[n, n_lines] = (total / members) % np.pi
         n_lines += 1
-        tangents[n, :n_lines].sort()
+        sort_few(tangents[n], n_lines)

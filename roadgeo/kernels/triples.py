@@ -441,7 +441,8 @@ def gather(
                 if placed > best:
                     best = placed
                     out_ids[n, 0] = a
-                    out_ids[n, 1 : 1 + n_slots] = partner
+                    for slot in range(n_slots):
+                        out_ids[n, 1 + slot] = partner[slot]
                     out_affine[n, 0] = m00 / m
                     out_affine[n, 1] = m01 / m
                     out_affine[n, 2] = m10 / m
