@@ -325,7 +325,7 @@ def match_pairs(
             return search.located()
         if search.is_late:
             return search.not_located(
-                f"stopped after {options.time_limit_s:g} s and {search.n_samples} query tuples (confidence "
+                f"stopped after {options.time_limit_s:.3g} s and {search.n_samples} query tuples (confidence "
                 f"{search.confidence:.3g}): none matched more than {options.delta_inlier:.0%} of the intersections"
             )
     return search.not_located(

@@ -10,6 +10,7 @@ from functools import lru_cache
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Literal
 
+import cv2
 import numpy as np
 
 from roadgeo.camera import pose
@@ -220,15 +221,21 @@ def locate(
         The mask cannot be read or shows no roads.
     """
     options = options or LocateOptions()
+    references = [reference] if isinstance(reference, Reference) else list(reference)
+    if not references:
+        raise RoadSourceError("no reference to search: build one with `roadgeo index`")
+    _rehearse_tracing()
     started = time.perf_counter()
     road_mask = _as_mask(mask)
     read = time.perf_counter()
     scene, graph = trace_query(road_mask, options.query)
     seconds = Seconds(read=read - started, vectorize=time.perf_counter() - read)
-    references = [reference] if isinstance(reference, Reference) else list(reference)
-    if not references:
-        raise RoadSourceError("no reference to search: build one with `roadgeo index`")
-    found = [_locate_on(road_mask.name, scene, graph, one.index, options, seconds) for one in references]
+    left = options.search.time_limit_s - seconds.vectorize
+    found: list[Location] = []
+    for one in references:
+        share = max(left, 0.0) / (len(references) - len(found))
+        found.append(_locate_on(road_mask.name, scene, graph, one.index, options, share, seconds))
+        left -= found[-1].seconds.match + found[-1].seconds.refine
     return _best_of(found, options)
 
 
@@ -238,6 +245,15 @@ def _as_mask(mask: RoadMask | AnyArray | str | Path) -> RoadMask:
     from roadgeo.io_raster import read_mask
 
     return read_mask(mask)
+
+
+@lru_cache(maxsize=1)
+def _rehearse_tracing() -> None:
+    """Compile or load the kernels that trace a mask, once a process, before a time limit counts."""
+    canvas = np.zeros((160, 160), np.uint8)
+    for k in range(11):  # crossings, forks, near parallels: each kernel has its turn
+        cv2.line(canvas, (7, 3 + 15 * k), (150, 97 * k % 160), 1, 3)
+    trace_query(RoadMask(canvas > 0))
 
 
 _rehearsed = False
@@ -252,9 +268,15 @@ def _rehearse_once(estimator: TripleEstimator) -> None:
 
 
 def _locate_on(
-    name: str, scene: Scene, graph: RoadGraph, index: ReferenceIndex, options: LocateOptions, seconds: Seconds
+    name: str,
+    scene: Scene,
+    graph: RoadGraph,
+    index: ReferenceIndex,
+    options: LocateOptions,
+    time_limit_s: float,
+    seconds: Seconds,
 ) -> Location:
-    """Match, judge and describe one query on one reference."""
+    """Match, judge and describe one query on one reference; `time_limit_s` is what is left for that."""
     n = len(scene.intersections)
     location = Location(
         name, "not_located", "", reference=index.name, size=scene.size, n_intersections=n, seconds=seconds
@@ -263,11 +285,11 @@ def _locate_on(
         needed = options.min_intersections
         return replace(location, reason=f"only {n} intersections are seen, at least {needed} are needed")
     if options.method == "pair":
-        return _locate_by_pairs(location, scene, graph, index, options)
+        return _locate_by_pairs(location, scene, graph, index, options, time_limit_s)
     estimator = TripleEstimator(scene, index, options.match, _near(index, options.near))
     _rehearse_once(estimator)
     started = time.perf_counter()
-    result = search(estimator, options.search)
+    result = search(estimator, replace(options.search, time_limit_s=time_limit_s))
     stats = Stats(estimator.n_tuples, estimator.n_candidates, estimator.n_hypotheses, estimator.n_verified)
     seconds = replace(seconds, match=time.perf_counter() - started - estimator.refine_s, refine=estimator.refine_s)
     location = replace(location, seconds=seconds, stats=stats)
@@ -300,11 +322,16 @@ class _Same:
 
 
 def _locate_by_pairs(
-    location: Location, scene: Scene, graph: RoadGraph, index: ReferenceIndex, options: LocateOptions
+    location: Location,
+    scene: Scene,
+    graph: RoadGraph,
+    index: ReferenceIndex,
+    options: LocateOptions,
+    time_limit_s: float,
 ) -> Location:
     """Run the paper's method: what it finds is reported as found, with no odds, for it knows none."""
-    pair = replace(options.pair, time_limit_s=options.search.time_limit_s)
-    reference, table = _pair_index(_Same(index), pair)
+    reference, table = _pair_index(_Same(index), options.pair)
+    pair = replace(options.pair, time_limit_s=time_limit_s)
     match = match_pairs(scene.intersections, reference, table, scene.corners, pair)
     location = replace(
         location,
@@ -347,7 +374,7 @@ def _describe(
     """Turn the search's result into a `Location`: located, ambiguous, or refused with a reason."""
     best = result.best
     if best is None or best.refined is None or best.found is None or result.score < options.min_log10_odds:
-        return replace(location, reason=_refusal(result, options))
+        return replace(location, reason=_refusal(result, options, location.seconds.vectorize))
     lead = result.score - max(result.runner_up_score, -99.0)
     runner_up = None
     if result.runner_up is not None and math.isfinite(result.runner_up_score):
@@ -370,7 +397,7 @@ def _describe(
     return replace(placed, status="located", reason=reason)
 
 
-def _refusal(result: SearchResult[Hypothesis], options: LocateOptions) -> str:
+def _refusal(result: SearchResult[Hypothesis], options: LocateOptions, tracing_s: float) -> str:
     """Say why nothing is reported, and what may help."""
     needed = options.min_log10_odds
     if math.isfinite(result.score):
@@ -378,7 +405,9 @@ def _refusal(result: SearchResult[Hypothesis], options: LocateOptions) -> str:
     else:
         best = "none passed the tests"
     if result.stopped == "time":
-        return f"stopped at the time limit of {options.search.time_limit_s:g} s; of the places tried, {best}"
+        limit = options.search.time_limit_s
+        tracing = f", of which tracing the mask took {tracing_s:.1f} s" if tracing_s > limit / 4 else ""
+        return f"stopped at the time limit of {limit:g} s{tracing}; of the places tried, {best}"
     return f"no place on this map stands out: {best}; more roads in view or another map may help"
 
 
