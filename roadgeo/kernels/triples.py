@@ -127,11 +127,11 @@ def fill_table(
     total = 0
     for a in range(xy.shape[0]):
         for s in range(neighbours.shape[1]):
-            b0 = np.int64(neighbours[a, s])  # one type of number, one compilation
+            b0 = int(np.int64(neighbours[a, s]))  # of one type everywhere, vertex_codes is compiled once
             if b0 < 0:
                 break
             for t in range(s + 1, neighbours.shape[1]):
-                c0 = np.int64(neighbours[a, t])
+                c0 = int(np.int64(neighbours[a, t]))
                 if c0 < 0:
                     break
                 turn = orient(xy, a, b0, c0, min_shape)
@@ -230,11 +230,11 @@ def count_alike(
     for i in range(anchors.shape[0]):
         a = anchors[i]
         for s in range(neighbours.shape[1]):
-            b0 = np.int64(neighbours[a, s])  # one type of number, one compilation
+            b0 = int(np.int64(neighbours[a, s]))  # of one type everywhere, vertex_codes is compiled once
             if b0 < 0:
                 break
             for t in range(s + 1, neighbours.shape[1]):
-                c0 = np.int64(neighbours[a, t])
+                c0 = int(np.int64(neighbours[a, t]))
                 if c0 < 0:
                     break
                 turn = orient(xy, a, b0, c0, min_shape)
@@ -288,7 +288,7 @@ def look_up(
     the query triangle to the reference triangle. Gates: `scale` = (least, greatest) root of its determinant, and
     `min_ratio`, the least ratio of its singular values. Returns (hits so far, entries compared).
     """
-    b, c = np.int64(neighbours[a, s]), np.int64(neighbours[a, t])
+    b, c = int(np.int64(neighbours[a, s])), int(np.int64(neighbours[a, t]))
     abx, aby = xy[b, 0] - xy[a, 0], xy[b, 1] - xy[a, 1]
     acx, acy = xy[c, 0] - xy[a, 0], xy[c, 1] - xy[a, 1]
     if abx * acy - aby * acx < 0:
