@@ -161,7 +161,7 @@ def _write_mask(path: Path, location: Location, mask: RoadMask, options: ImageOp
             plain.write(warp(_labels(mask), place.homography, grid, to_place), 1)
             plain.write_colormap(1, {value: _rgba(color) for value, (color, _, _) in PALETTE.items()})
             plain.update_tags(**_tags(location, place.homography, attribution))
-            layout = {"compress": "DEFLATE", "level": 1, "overview_resampling": "mode", "blocksize": 512}
+            layout = {"compress": "DEFLATE", "level": 1, "overview_resampling": "nearest", "blocksize": 512}
             rasterio.shutil.copy(plain, optimized.name, driver="COG", **layout)
         path.write_bytes(optimized.read())
     return grid
