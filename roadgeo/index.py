@@ -314,7 +314,7 @@ def build_index(network: RoadNetwork, options: IndexOptions | None = None) -> Re
         "n_intersections": len(xy),
         "n_segments": len(segments),
     }
-    return ReferenceIndex(
+    index = ReferenceIndex(
         meta=meta,
         xy=xy,
         branches=np.ascontiguousarray(found.branches()[order, :INDEXED_BRANCHES]),
@@ -328,3 +328,6 @@ def build_index(network: RoadNetwork, options: IndexOptions | None = None) -> Re
         table_entries=entries,
         source=order,
     )
+    for array in index.arrays().values():
+        array.setflags(write=False)  # as in one opened from a file, so that kernels are compiled once for both
+    return index

@@ -116,6 +116,9 @@ class TestBuildIndex:
         table = index.table_starts.nbytes
         assert (index.nbytes - table) / len(index) < 3000
 
+    def test_arrays_cannot_be_written(self, town):
+        assert not any(array.flags.writeable for array in town[1].arrays().values())
+
     def test_meta_is_plain(self, town):
         network, index = town
         assert index.name == network.meta["name"]
