@@ -202,6 +202,8 @@ def nearest_alike(
         The map's intersections, sorted by bucket (see `kernels.buckets`).
     """
     best, where = radius, -1
+    if not abs(x) + abs(y) < 1e15:  # infinite or NaN: no bucket has such a number
+        return where, best
     c0 = max(int(np.floor((x - radius - grid[0]) / grid[2])), 0)
     c1 = min(int(np.floor((x + radius - grid[0]) / grid[2])), shape[0] - 1)
     r0 = max(int(np.floor((y - radius - grid[1]) / grid[2])), 0)

@@ -99,6 +99,8 @@ def nearest_road(
     best = radius * radius
     fx, fy, ux, uy = 0.0, 0.0, 0.0, 0.0
     found = False
+    if not abs(x) + abs(y) < 1e15:  # infinite or NaN: no bucket has such a number
+        return np.inf, fx, fy, ux, uy
     c0 = max(int(np.floor((x - radius - grid[0]) / grid[2])), 0)
     c1 = min(int(np.floor((x + radius - grid[0]) / grid[2])), shape[0] - 1)
     r0 = max(int(np.floor((y - radius - grid[1]) / grid[2])), 0)
