@@ -9,8 +9,23 @@ from dataclasses import dataclass
 import cv2
 import numpy as np
 
-from roadgeo.errors import OutputError
-from roadgeo.files import write_bytes
+from roadgeo.canvas import (
+    FAINT_INK,
+    FRAME,
+    INK,
+    LIT,
+    MAP_ROAD,
+    MATCH,
+    PAPER,
+    QUERY_ROAD,
+    SHIFT,
+    Color,
+    draw_dots,
+    draw_outline,
+    draw_plate,
+    write_png,
+    write_text,
+)
 from roadgeo.grid import PIXEL_TO_PLANE, RoadMask, plane_to_pixel
 from roadgeo.homography import Homography
 from roadgeo.location import Location
@@ -20,19 +35,6 @@ from roadgeo.wording import format_lonlat
 
 __all__ = ["PlotOptions", "draw_overlay", "write_overlay"]
 
-Color = tuple[int, int, int]
-
-# Red, green, blue; drawn in this order and turned for OpenCV at the end.
-PAPER: Color = (243, 241, 236)
-LIT: Color = (255, 255, 255)
-MAP_ROAD: Color = (186, 188, 190)
-QUERY_ROAD: Color = (228, 87, 46)
-MATCH: Color = (27, 38, 59)
-FRAME: Color = (31, 111, 180)
-INK: Color = (38, 42, 48)
-FAINT_INK: Color = (110, 114, 120)
-
-_SHIFT = 4  # fractional bits of the coordinates that OpenCV draws at
 _GAP = 24  # pixels between the two panels
 
 
@@ -68,11 +70,11 @@ class _Canvas:
     def pixels(self, xy: FloatArray) -> AnyArray:
         """Take CRS positions (..., 2) to the fixed-point pixels that OpenCV draws at."""
         at = (xy - (self.west, self.north)) * (self.scale, -self.scale) + (-0.5, self.top - 0.5)
-        return np.rint(np.clip(at, -20_000, 20_000) * (1 << _SHIFT)).astype(np.int32)
+        return np.rint(np.clip(at, -20_000, 20_000) * (1 << SHIFT)).astype(np.int32)
 
     def draw_lines(self, lines: list[AnyArray], color: Color, width: int) -> None:
         """Draw polylines given in fixed-point pixels."""
-        cv2.polylines(self.image, lines, False, color, width, cv2.LINE_AA, _SHIFT)
+        cv2.polylines(self.image, lines, False, color, width, cv2.LINE_AA, SHIFT)
 
 
 def write_overlay(
@@ -90,11 +92,7 @@ def write_overlay(
     OutputError
         The file cannot be written, or the location has no place.
     """
-    image = draw_overlay(location, mask, roads, attribution, options)
-    done, encoded = cv2.imencode(".png", image[:, :, ::-1], [cv2.IMWRITE_PNG_COMPRESSION, 9])
-    if not done:
-        raise OutputError(f"cannot write {path}: OpenCV did not encode the picture; use a smaller one")
-    write_bytes(path, encoded.tobytes())
+    write_png(path, draw_overlay(location, mask, roads, attribution, options))
 
 
 def draw_overlay(
@@ -123,10 +121,10 @@ def draw_overlay(
     place = Placement.of(location)
     canvas = _lay_canvas(place, options)
     frame = canvas.pixels(place.footprint)
-    cv2.fillPoly(canvas.image, [frame], LIT, cv2.LINE_AA, _SHIFT)
+    cv2.fillPoly(canvas.image, [frame], LIT, cv2.LINE_AA, SHIFT)
     _draw_map(canvas, roads)
     _draw_query(canvas, location, place)
-    _outline(canvas.image, frame)
+    draw_outline(canvas.image, frame)
     _draw_matches(canvas, location)
     _draw_scale_bar(canvas)
     _draw_north(canvas)
@@ -135,7 +133,9 @@ def draw_overlay(
     gap = np.full((canvas.image.shape[0], _GAP, 3), LIT, np.uint8)
     picture = np.hstack([left, gap, canvas.image])
     _draw_title(picture, location, canvas.top)
-    _write(picture, attribution, (_GAP, len(picture) - round(canvas.top * 0.15)), round(canvas.top * 0.2), FAINT_INK)
+    write_text(
+        picture, attribution, (_GAP, len(picture) - round(canvas.top * 0.15)), round(canvas.top * 0.2), FAINT_INK
+    )
     return picture
 
 
@@ -178,25 +178,7 @@ def _draw_query(canvas: _Canvas, location: Location, place: Placement) -> None:
 
 def _draw_matches(canvas: _Canvas, location: Location) -> None:
     if location.evidence is not None:
-        _dot(canvas.image, canvas.pixels(location.evidence.reference_xy), 4.4 if location.n_matched < 200 else 3.4)
-
-
-def _dot(image: AnyArray, centers: AnyArray, radius: float) -> None:
-    for x, y in centers.tolist():
-        cv2.circle(image, (x, y), round((radius + 1.6) * (1 << _SHIFT)), LIT, -1, cv2.LINE_AA, _SHIFT)
-        cv2.circle(image, (x, y), round(radius * (1 << _SHIFT)), MATCH, -1, cv2.LINE_AA, _SHIFT)
-
-
-def _outline(image: AnyArray, frame: AnyArray) -> None:
-    """Outline a footprint, (4, 2) from its top left; a triangle outside it shows which way is up in the image."""
-    cv2.polylines(image, [frame], True, LIT, 7, cv2.LINE_AA, _SHIFT)
-    cv2.polylines(image, [frame], True, FRAME, 4, cv2.LINE_AA, _SHIFT)
-    left, right = frame[0].astype(float), frame[1].astype(float)
-    along = (right - left) / max(float(np.hypot(*(right - left))), 1.0)
-    out = np.array([along[1], -along[0]])
-    middle, size = (left + right) / 2, 16 * (1 << _SHIFT)
-    tip = np.array([middle - along * size, middle + along * size, middle + out * 1.3 * size])
-    cv2.fillPoly(image, [np.rint(tip).astype(np.int32)], FRAME, cv2.LINE_AA, _SHIFT)
+        draw_dots(canvas.image, canvas.pixels(location.evidence.reference_xy), 4.4 if location.n_matched < 200 else 3.4)
 
 
 # --- what stands around it --------------------------------------------------------------------------------------------
@@ -211,34 +193,26 @@ def _draw_scale_bar(canvas: _Canvas) -> None:
     size = canvas.top // 4
     left, bar = round(width * 0.025), round(length * canvas.scale)
     y = height - canvas.top // 2 - round(canvas.top * 0.3)
-    _draw_plate(canvas.image, (left - 14, y - 2 * size - 6), (left + bar + 14, y + 16))
+    draw_plate(canvas.image, (left - 14, y - 2 * size - 6), (left + bar + 14, y + 16))
     cv2.rectangle(canvas.image, (left, y), (left + bar, y + 5), INK, -1)
     cv2.rectangle(canvas.image, (left + bar // 2, y + 1), (left + bar - 1, y + 4), LIT, -1)
-    _write(canvas.image, text, (left, y - size // 2), size, INK)
+    write_text(canvas.image, text, (left, y - size // 2), size, INK)
 
 
 def _draw_north(canvas: _Canvas) -> None:
     width = canvas.image.shape[1]
     size = canvas.top // 4
     x, y = width - 2 * size, canvas.top + round(2.2 * size)
-    _draw_plate(
-        canvas.image, (x - round(1.3 * size), y - round(1.8 * size)), (width - size // 2, y + round(2.6 * size))
-    )
+    draw_plate(canvas.image, (x - round(1.3 * size), y - round(1.8 * size)), (width - size // 2, y + round(2.6 * size)))
     arrow = np.array([[x, y - 1.4 * size], [x + 0.8 * size, y + size], [x, y + 0.5 * size], [x - 0.8 * size, y + size]])
-    cv2.fillPoly(canvas.image, [np.rint(arrow * (1 << _SHIFT)).astype(np.int32)], INK, cv2.LINE_AA, _SHIFT)
-    _write(canvas.image, "N", (x - round(0.36 * size), y + round(2.2 * size)), size, INK, bold=True)
-
-
-def _draw_plate(image: AnyArray, first: tuple[int, int], last: tuple[int, int]) -> None:
-    """Lighten a rectangle, so that what is written there stands out from the roads."""
-    part = image[max(first[1], 0) : last[1], max(first[0], 0) : last[0]]
-    part[...] = (part * 0.15 + np.array(LIT) * 0.85).astype(np.uint8)
+    cv2.fillPoly(canvas.image, [np.rint(arrow * (1 << SHIFT)).astype(np.int32)], INK, cv2.LINE_AA, SHIFT)
+    write_text(canvas.image, "N", (x - round(0.36 * size), y + round(2.2 * size)), size, INK, bold=True)
 
 
 def _draw_title(image: AnyArray, location: Location, top: int) -> None:
     left = _GAP
-    _write(image, _title(location), (left, round(top * 0.44)), round(top * 0.32), INK, bold=True)
-    _write(image, _summary(location), (left, round(top * 0.82)), round(top * 0.23), FAINT_INK)
+    write_text(image, _title(location), (left, round(top * 0.44)), round(top * 0.32), INK, bold=True)
+    write_text(image, _summary(location), (left, round(top * 0.82)), round(top * 0.23), FAINT_INK)
 
 
 def _title(location: Location) -> str:
@@ -271,9 +245,9 @@ def _draw_legend(canvas: _Canvas) -> None:
     lines = (("roads of the map", MAP_ROAD, 6), ("roads of the mask", QUERY_ROAD, 3), ("footprint", FRAME, 4))
     for label, color, width in lines:
         cv2.line(image, (x + 4, middle), (x + 2 * size, middle), color, width, cv2.LINE_AA)
-        x = _write(image, label, (x + round(2.5 * size), baseline), size, INK) + round(1.4 * size)
+        x = write_text(image, label, (x + round(2.5 * size), baseline), size, INK) + round(1.4 * size)
     cv2.circle(image, (x, middle), 6, MATCH, -1, cv2.LINE_AA)
-    _write(image, "matched intersections", (x + size, baseline), size, INK)
+    write_text(image, "matched intersections", (x + size, baseline), size, INK)
 
 
 # --- the mask ---------------------------------------------------------------------------------------------------------
@@ -292,26 +266,9 @@ def _draw_mask(location: Location, mask: RoadMask, height: int, width: int) -> A
     small = cv2.resize(gray, size, interpolation=cv2.INTER_AREA if scale < 1 else cv2.INTER_NEAREST)
     left, top = (width - size[0]) // 2 + _GAP // 4, (height - size[1]) // 2
     panel[top : top + size[1], left : left + size[0]] = small[..., None]
-    corners = (np.array([[0, 0], [1, 0], [1, 1], [0, 1]]) * size + (left, top)) * (1 << _SHIFT)
-    _outline(panel, np.rint(corners).astype(np.int32))
+    corners = (np.array([[0, 0], [1, 0], [1, 1], [0, 1]]) * size + (left, top)) * (1 << SHIFT)
+    draw_outline(panel, np.rint(corners).astype(np.int32))
     if location.evidence is not None:
         at = plane_to_pixel(location.evidence.query_xy) * scale + (left - 0.5, top - 0.5)
-        _dot(panel, np.rint(at * (1 << _SHIFT)).astype(int), 3.6 if location.n_matched < 200 else 2.4)
+        draw_dots(panel, np.rint(at * (1 << SHIFT)).astype(int), 3.6 if location.n_matched < 200 else 2.4)
     return panel
-
-
-# --- text -------------------------------------------------------------------------------------------------------------
-
-
-def _write(image: AnyArray, text: str, origin: tuple[int, int], size: int, color: Color, bold: bool = False) -> int:
-    """Write text with its baseline's left end at `origin`; return the x where it ends."""
-    if hasattr(cv2, "FontFace"):
-        (end, _), _ = cv2.putText(image, text, origin, color, cv2.FontFace("sans"), size, 700 if bold else 400)
-        return int(end)
-    # OpenCV 4 brings only stroked letters, and only ASCII ones.
-    for sign, plain in (("°", " deg"), ("±", "+-"), ("·", "|"), ("©", "(c)")):
-        text = text.replace(sign, plain)
-    scale, thickness = size / 26, 2 if bold else 1
-    cv2.putText(image, text, origin, cv2.FONT_HERSHEY_DUPLEX, scale, color, thickness, cv2.LINE_AA)
-    (width, _), _ = cv2.getTextSize(text, cv2.FONT_HERSHEY_DUPLEX, scale, thickness)
-    return origin[0] + int(width)

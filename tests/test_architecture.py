@@ -11,18 +11,20 @@ ROOT = Path(roadgeo.__file__).parent
 
 #: Modules (or packages) of each storey.
 NAMES = {
-    0: "errors wording typing _version",
+    0: "errors wording typing plugins _version",
     1: "kernels",
     2: "grid road_kinds graph homography robust",
     3: "projection simplification vectorization voids intersections network updating warping view landscape",
     4: "tuples index",
-    5: "estimator verification refinement location pairs triples camera scene outputs",
+    5: "estimator verification refinement location pairs triples camera scene outputs explanation",
     6: (
         "io_roads io_lines io_overpass io_raster io_exif io_vectorized io_index io_atomic io_network "
         "io_reference io_outputs io_products io_summary io_image files geopackage rtree truth styles library"
     ),
     7: "workflows",
-    8: ("cli report plot qgis demo drawing trials localizability evaluation_report simulation evaluation __main__"),
+    8: (
+        "cli report plot canvas explanation_plot qgis demo drawing trials localizability evaluation_report simulation evaluation __main__"
+    ),
     9: "__init__",
 }
 STOREYS = {name: storey for storey, names in NAMES.items() for name in names.split()}
