@@ -1,8 +1,9 @@
 """Where on a map would masks be located? A map of the odds, learnt from masks tried at random places of it.
 
-What decides is how many intersections a mask shows and how much their streets differ in direction (a lattice has few
-directions and looks alike everywhere), and how well this reference, this camera and this quality of masks go together.
-The first two are known at every place of the map; how they decide is fitted to the trials by logistic regression.
+What decides is how many intersections a mask shows, how many of them stand clear of others (those of interchanges melt
+into one another), how much their streets differ in direction (a lattice has few directions and looks alike everywhere),
+and how well this reference, this camera and this quality of masks go together. All but the last is known at every place
+of the map; how it decides is fitted to the trials by logistic regression.
 """
 
 from __future__ import annotations
@@ -48,6 +49,9 @@ PALETTE = {
 
 _DIRECTIONS = 12
 
+#: Intersections with no other nearer than this are clear.
+CLEAR_M = 40.0
+
 
 @dataclass(frozen=True)
 class LocalizabilityOptions:
@@ -88,8 +92,8 @@ class PlaceGrid:
         Ground that a mask shows.
     counts : (R, C) float32
         Intersections within the footprint of a mask (a disc of its area).
-    features : (R, C, 2) float64
-        log(1 + count), and the entropy of the directions of the streets there.
+    features : (R, C, 3) float64
+        log(1 + count), the entropy of the directions of the streets there, and log(1 + count of clear intersections).
     """
 
     plane: LocalPlane
@@ -208,13 +212,22 @@ def _features(
         return np.maximum(cv2.filter2D(layer, -1, disc, borderType=cv2.BORDER_CONSTANT), 0.0)
 
     counts = np.round(spread(found.xy))
+    clear = np.round(spread(found.xy[_clear(found.xy)]))
     known = np.isfinite(found.tangents)
     owner, _ = np.nonzero(known)
     direction = np.floor(found.tangents[known] / math.pi * _DIRECTIONS).astype(int) % _DIRECTIONS
     layers = np.stack([spread(found.xy[owner[direction == d]]) for d in range(_DIRECTIONS)], axis=-1)
     shares = layers / np.maximum(layers.sum(axis=-1, keepdims=True), 1.0)
     entropy = -(shares * np.log(np.maximum(shares, 1e-9))).sum(axis=-1)
-    return counts, np.stack([np.log1p(counts), entropy], axis=-1)
+    return counts, np.stack([np.log1p(counts), entropy, np.log1p(clear)], axis=-1)
+
+
+def _clear(xy: FloatArray) -> BoolArray:
+    """(N,) whether points have no other within `CLEAR_M`."""
+    from scipy.spatial import cKDTree
+
+    distance, _ = cKDTree(xy).query(xy, k=2)
+    return np.asarray(distance[:, 1] > CLEAR_M)
 
 
 def _fit(features: FloatArray, located: BoolArray, ridge: float = 0.01) -> FloatArray:

@@ -30,7 +30,7 @@ class Survey:
     Attributes
     ----------
     trials : int
-        Masks to learn from: a quarter of them anywhere, the others where the first leave hope.
+        Masks to learn from: a quarter of them anywhere, a quarter where those leave hope, half where these leave much.
     check : int
         Other masks that the map is held against.
     """
@@ -73,15 +73,16 @@ class Survey:
         grid = lay_grid(network, footprint_area(self.simulation.view))
         rng = np.random.default_rng(self.simulation.seed)
         hope = grid.counts >= 3
+        quarter = self.trials // 4
         places, located = np.empty((0, 2)), np.empty(0, bool)
-        first = -(-self.trials // 4)
-        for count in (first, self.trials - first):
+        # The surer a class of places is to be, the more trials it takes to tell.
+        for count, least in ((quarter, 0.5), (quarter, 0.85), (self.trials - 2 * quarter, 1.0)):
             centers = grid.draw(count, hope, rng)
             masks = PlacedMasks(self.reference, self.simulation, tuple(map(tuple, centers.tolist())), len(places))
             places = np.vstack([places, centers])
             located = np.concatenate([located, _located(self._try(masks))])
             found = map_localizability(grid, places, located)
-            hope = np.nan_to_num(found.probability) >= 0.5
+            hope = np.nan_to_num(found.probability) >= least
         return found
 
     def _try(self, masks: QuerySet) -> list[Trial]:
