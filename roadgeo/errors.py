@@ -9,6 +9,7 @@ __all__ = [
     "IndexFormatError",
     "MaskError",
     "OutputError",
+    "PluginError",
     "RoadSourceError",
     "RoadgeoError",
 ]
@@ -36,3 +37,7 @@ class IndexFormatError(RoadgeoError):
 
 class OutputError(RoadgeoError):
     """A result could not be written."""
+
+
+class PluginError(RoadgeoError):
+    """A plugin is missing, cannot be loaded, or does not do what is asked of its kind."""

@@ -13,15 +13,16 @@ from time import perf_counter
 import numpy as np
 
 from roadgeo._version import __version__
-from roadgeo.errors import CrsError, OutputError
+from roadgeo.errors import CrsError, OutputError, PluginError
 from roadgeo.files import replacing
 from roadgeo.geopackage import Layer, write_layers
 from roadgeo.grid import PIXEL_TO_PLANE, RoadMask, plane_to_pixel
 from roadgeo.homography import Homography
 from roadgeo.io_image import ImageOptions, choose_target, image_homography, warp_image
-from roadgeo.io_products import PRODUCTS, Subject
+from roadgeo.io_products import PRODUCTS, Product, Subject
 from roadgeo.location import Evidence, Location
 from roadgeo.outputs import OutputPaths, Placement, attributes
+from roadgeo.plugins import OUTPUTS, load_plugin
 from roadgeo.styles import draw_fill, draw_line, draw_marker, draw_palette
 from roadgeo.typing import AnyArray, FloatArray
 from roadgeo.warping import MapGrid, cover, warp
@@ -49,7 +50,7 @@ class OutputOptions:
     image : ImageOptions
         How the picture, or without one the mask, is drawn on the map; masks always with the nearest value.
     products : tuple of str
-        Further forms, by their names in `io_products.PRODUCTS`.
+        Further forms, by the names of plugins: our own are those in `io_products.PRODUCTS`.
     """
 
     image: ImageOptions = field(default_factory=ImageOptions)
@@ -84,13 +85,17 @@ def write_location(
         The picture cannot be read or shows another frame than the mask.
     CrsError
         The target CRS is unknown or not made for this place.
+    PluginError
+        There is no such product.
     """
     started = perf_counter()
     options = options or OutputOptions()
     source = Path(picture if picture is not None else mask.name or f"{paths.stem}.png")
     written = [paths.json]
+    chosen = [_product(name) for name in options.products]
     if not location.located:
-        products = (product.path(paths.folder, paths.stem, source.name) for product in PRODUCTS.values())
+        ours = PRODUCTS.values()
+        products = (product.path(paths.folder, paths.stem, source.name) for product in (*ours, *chosen))
         _remove([paths.footprint, paths.style, paths.geopackage, paths.overlay, paths.report, *products])
     with ExitStack() as files:
 
@@ -113,12 +118,18 @@ def write_location(
             write_layers(stage(paths.geopackage), _layers(location))
             subject = Subject(location, place, source, size, homography, grid, options.image.crs or place.crs, paths)
             subject = replace(subject, attribution=attribution, mask=mask if picture is None else None)
-            for name in options.products:
-                product = PRODUCTS[name]
+            for product in chosen:
                 product.write(stage(product.path(paths.folder, paths.stem, source.name)), subject)
         location = replace(location, seconds=replace(location.seconds, write=perf_counter() - started))
         report.write_text(json.dumps(location.to_dict(), indent=2, allow_nan=False) + "\n", encoding="utf-8")
     return location, written
+
+
+def _product(name: str) -> Product:
+    product = load_plugin(OUTPUTS, name)
+    if not isinstance(product, Product):
+        raise PluginError(f"the output {name!r} is a {type(product).__name__}, expected a roadgeo.io_products.Product")
+    return product
 
 
 def _remove(paths: Iterable[Path]) -> None:

@@ -341,14 +341,23 @@ def _kml(subject: Subject, grid: MapGrid) -> str:
 """
 
 
-#: What `roadgeo locate --also NAME` can write.
+GCPS = Product("_gcps.tif", write_gcps, "the picture's own pixels with 25 control points, GeoTIFF")
+VRT = Product("_gcps.vrt", write_vrt, "the same as a GDAL virtual raster: no pixels are copied")
+POINTS = Product("{picture}.points", write_points, "control points for the QGIS Georeferencer")
+ODM = Product("_gcp_list.txt", write_odm, "control points for OpenDroneMap")
+WORLD_FILE = Product("_footprint.tfw", write_world_file, "world file of the warped raster")
+GEOJSON = Product("_footprint.geojson", write_geojson, "footprint as GeoJSON (RFC 7946)")
+STAC = Product("_stac.json", write_stac, "STAC Item of the warped raster")
+KMZ = Product("_overlay.kmz", write_kmz, "ground overlay for Google Earth")
+
+#: Our own outputs by the names under which pyproject.toml registers them (see `roadgeo.plugins`).
 PRODUCTS = {
-    "gcps": Product("_gcps.tif", write_gcps, "the picture's own pixels with 25 control points, GeoTIFF"),
-    "vrt": Product("_gcps.vrt", write_vrt, "the same as a GDAL virtual raster: no pixels are copied"),
-    "points": Product("{picture}.points", write_points, "control points for the QGIS Georeferencer"),
-    "odm": Product("_gcp_list.txt", write_odm, "control points for OpenDroneMap"),
-    "worldfile": Product("_footprint.tfw", write_world_file, "world file of the warped raster"),
-    "geojson": Product("_footprint.geojson", write_geojson, "footprint as GeoJSON (RFC 7946)"),
-    "stac": Product("_stac.json", write_stac, "STAC Item of the warped raster"),
-    "kmz": Product("_overlay.kmz", write_kmz, "ground overlay for Google Earth"),
+    "gcps": GCPS,
+    "vrt": VRT,
+    "points": POINTS,
+    "odm": ODM,
+    "worldfile": WORLD_FILE,
+    "geojson": GEOJSON,
+    "stac": STAC,
+    "kmz": KMZ,
 }

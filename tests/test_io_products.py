@@ -12,7 +12,6 @@ import pytest
 import rasterio
 from test_io_outputs import located, road_mask
 
-from roadgeo.cli.locate import PRODUCTS as KNOWN
 from roadgeo.homography import Homography
 from roadgeo.io_image import open_picture
 from roadgeo.io_outputs import OutputOptions, write_location
@@ -38,10 +37,6 @@ def written(tmp_path_factory: pytest.TempPathFactory) -> OutputPaths:
 
 def photo_homography() -> Homography:
     return Homography(located().homography @ np.diag([0.5, 0.5, 1.0]))
-
-
-def test_the_command_line_knows_all_products() -> None:
-    assert tuple(PRODUCTS) == KNOWN
 
 
 @pytest.mark.parametrize("name", ["mask_gcps.tif", "mask_gcps.vrt"])

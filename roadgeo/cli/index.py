@@ -9,15 +9,13 @@ from typing import TYPE_CHECKING, Any
 
 import click
 
-from roadgeo.cli.parameters import BOX, NEAR, verbosity_options
+from roadgeo.cli.parameters import BOX, NEAR, Plugin, verbosity_options
 
 if TYPE_CHECKING:
     from roadgeo.io_roads import Roads
-    from roadgeo.network import RoadNetwork
-    from roadgeo.projection import LocalPlane
     from roadgeo.workflows import Reference
 
-__all__ = ["build", "index_command", "replace_ground"]
+__all__ = ["build", "index_command"]
 
 
 @click.command("index", short_help="Build a reference: the searchable roads of a place.")
@@ -36,6 +34,13 @@ __all__ = ["build", "index_command", "replace_ground"]
     type=click.Path(),
     multiple=True,
     help="Take roads from a file or a folder of files. Repeatable.",
+)
+@click.option(
+    "--source",
+    "plugin",
+    metavar="NAME:WHERE",
+    type=Plugin("roadgeo.sources", has_argument=True),
+    help="Take roads from a plugin; `roadgeo info --plugins` lists them.",
 )
 @click.option("--layer", metavar="NAME", help="Layer of --roads, where there are several.")
 @click.option("--crs", metavar="CRS", help="CRS of --roads, where the file does not say, such as EPSG:26986.")
@@ -70,6 +75,9 @@ def index_command(out: str | None, name: str | None, update: bool, quiet: bool, 
     Done once per place; `roadgeo locate` then searches it. The result is REF.gpkg, which opens styled in QGIS, and
     REF.index beside it. Without --out it goes into the library, which `roadgeo locate` searches by default.
 
+    With --update the reference of that --name or --out is kept, but for the ground asked for (the place, the box, the
+    polygon, or where the roads of --roads lie): there its roads are replaced.
+
     \b
     Examples:
       roadgeo index --osm "Boston, MA"
@@ -80,7 +88,9 @@ def index_command(out: str | None, name: str | None, update: bool, quiet: bool, 
     """
     from roadgeo.cli.compilation import compile_once
     from roadgeo.cli.folders import make_folder
+    from roadgeo.io_reference import reference_freshness
     from roadgeo.library import make_slug, new_reference
+    from roadgeo.workflows import update_reference
 
     say = _sayer(quiet)
     started = perf_counter()
@@ -88,9 +98,12 @@ def index_command(out: str | None, name: str | None, update: bool, quiet: bool, 
     name = name or _name(source, given)
     path = Path(out) if out else new_reference(name)
     make_folder(path.parent)  # before the long part
-    roads = _read(source, say) if given == "roads" else _fetch(source, given, say)
+    if update:
+        reference_freshness(path)
+    read = {"roads": _read, "plugin": _read_plugin}.get(given, _fetch)
+    roads = read(source, given, say)
     say(f"drawing {len(roads):,} lines as a mask shows them")
-    reference = replace_ground(roads, path, source["bbox"]) if update else build(roads, path, make_slug(name))
+    reference = update_reference(path, roads) if update else build(roads, path, make_slug(name))
     compile_once(reference, quiet)
     if verbose:
         for key, value in roads.meta.items():
@@ -112,55 +125,12 @@ def build(roads: Roads, path: Path, name: str) -> Reference:
     OutputError
         It cannot be written.
     """
-    from roadgeo.workflows import build_network
-
-    return _write(build_network(roads.lines, roads.plane, {"name": name, **roads.meta}), path)
-
-
-def replace_ground(roads: Roads, path: Path, box: tuple[float, float, float, float] | None) -> Reference:
-    """Replace the roads of a reference by others where those lie, or in a box of degrees, and write it.
-
-    Raises
-    ------
-    IndexFormatError
-        There is no such reference.
-    OutputError
-        It cannot be written.
-    """
-    from roadgeo.io_network import read_network
-    from roadgeo.updating import ground_of, move_lines, replace_area
-
-    network = read_network(path)
-    lines = move_lines(roads.lines, roads.plane, network.plane)
-    area = ground_of(lines) if box is None else _ground(box, network.plane)
-    owed = dict.fromkeys([network.meta.get("attribution", ""), roads.meta["attribution"]])
-    meta = {
-        **network.meta,
-        "sources": [*network.meta.get("sources", []), *roads.meta["sources"]],
-        "attribution": "; ".join(filter(None, owed)),
-    }
-    return _write(replace_area(network, lines, area, meta), path)
-
-
-def _ground(box: tuple[float, float, float, float], plane: LocalPlane) -> Any:
-    """Outline a box of degrees, whose east may lie beyond 180, on a plane."""
-    import numpy as np
-    import shapely
-
-    from roadgeo.projection import from_lonlat
-
-    west, south, east, north = box
-    ring = shapely.segmentize(shapely.box(west, south, east + 360.0 * (east < west), north), 0.01)
-    return shapely.transform(ring, lambda lonlat: np.asarray(from_lonlat(plane, lonlat)))
-
-
-def _write(network: RoadNetwork, path: Path) -> Reference:
     from roadgeo.index import build_index
     from roadgeo.io_network import as_stored
-    from roadgeo.workflows import Reference, open_reference
+    from roadgeo.workflows import Reference, build_network, open_reference
 
-    stored = as_stored(network)
-    Reference(build_index(stored), stored).save(path)
+    network = as_stored(build_network(roads.lines, roads.plane, {"name": name, **roads.meta}))
+    Reference(build_index(network), network).save(path)
     return open_reference(path)  # as `locate` has it: memory-mapped arrays are another type to compiled code
 
 
@@ -171,24 +141,26 @@ _FETCHED = {"place": "--osm PLACE", "around": "--around LON,LAT,METRES", "polygo
 
 def _one_source(source: dict[str, Any]) -> str:
     """Name the option that says where the roads come from; a box alone is a source, with --roads it cuts them."""
-    given = [option for option in (*_FETCHED, "roads") if source[option]]
+    given = [option for option in (*_FETCHED, "roads", "plugin") if source[option]]
     if source["bbox"] and given != ["roads"]:
         given.append("bbox")
     if len(given) != 1:
         known = ", ".join(_FETCHED.values())
-        raise click.UsageError(f"Give one source of roads: {known}, --bbox W,S,E,N or --roads FILE.")
-    if given == ["roads"] and (source["date"] or source["no_cache"]):
-        raise click.UsageError("--date and --no-cache go with roads that are fetched, not with --roads.")
+        raise click.UsageError(
+            f"Give one source of roads: {known}, --bbox W,S,E,N, --roads FILE or --source NAME:WHERE."
+        )
+    if given in (["roads"], ["plugin"]) and (source["date"] or source["no_cache"]):
+        raise click.UsageError("--date and --no-cache go with roads that are fetched from OpenStreetMap.")
     if given != ["roads"] and (source["layer"] or source["crs"] or source["attribution"]):
         raise click.UsageError("--layer, --crs and --attribution go with --roads.")
     return given[0]
 
 
-def _read(source: dict[str, Any], say: Callable[[str], None]) -> Roads:
+def _read(source: dict[str, Any], given: str, say: Callable[[str], None]) -> Roads:
     from roadgeo.io_roads import read_roads
 
     return read_roads(
-        source["roads"],
+        source[given],
         source["layer"],
         source["crs"],
         source["kinds"],
@@ -212,9 +184,25 @@ def _fetch(source: dict[str, Any], given: str, say: Callable[[str], None]) -> Ro
     return fetch_roads(**where, which=source["kinds"], tunnels=source["tunnels"], options=options, say=say)
 
 
+def _read_plugin(source: dict[str, Any], given: str, say: Callable[[str], None]) -> Roads:
+    from dataclasses import replace
+
+    from roadgeo.errors import PluginError
+    from roadgeo.io_roads import Roads
+    from roadgeo.plugins import SOURCES, call_plugin
+
+    name, _, where = source[given].partition(":")
+    roads = call_plugin(SOURCES, name, where, say=say)
+    if not isinstance(roads, Roads):
+        raise PluginError(f"the source {name!r} returned a {type(roads).__name__}, expected roadgeo.io_roads.Roads")
+    return replace(roads, meta={"sources": [{"name": source[given]}], "attribution": "", **roads.meta})
+
+
 def _name(source: dict[str, Any], given: str) -> str:
     if given == "place":
         return str(source["place"])
+    if given == "plugin":
+        return Path(source["plugin"].partition(":")[2]).stem or "roads"
     if given in {"roads", "polygon"}:
         first = source["roads"][0] if given == "roads" else source["polygon"]
         return Path(first).name.split(".")[0]

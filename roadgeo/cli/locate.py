@@ -16,7 +16,7 @@ import click
 from roadgeo.cli import ERROR, NOT_LOCATED
 from roadgeo.cli.batch import Task, find_masks, name_tasks, run
 from roadgeo.cli.folders import make_folder
-from roadgeo.cli.parameters import CAMERA, NEAR, RANGE, verbosity_options
+from roadgeo.cli.parameters import CAMERA, NEAR, RANGE, Plugin, verbosity_options
 from roadgeo.wording import format_lonlat
 
 if TYPE_CHECKING:
@@ -26,9 +26,6 @@ if TYPE_CHECKING:
     from roadgeo.workflows import LocateOptions, Reference
 
 __all__ = ["Job", "Outcome", "locate_command", "make_options", "open_references", "pair_images"]
-
-#: Names in `io_products.PRODUCTS`, known here without importing it.
-PRODUCTS = ("gcps", "vrt", "points", "odm", "worldfile", "geojson", "stac", "kmz")
 
 Status = Literal["located", "ambiguous", "not_located", "error"]
 
@@ -56,6 +53,7 @@ class Job:
     band: int | None = None
     plot: bool = False
     report: bool = False
+    segmenter: str | None = None
     exif: bool = False
     skip_existing: bool = False
 
@@ -106,19 +104,18 @@ class Job:
         from dataclasses import replace
 
         from roadgeo.io_outputs import write_location
-        from roadgeo.io_raster import read_mask
         from roadgeo.outputs import output_paths
         from roadgeo.workflows import locate
 
         started = perf_counter()
-        mask = read_mask(task.mask, threshold=self.threshold, band=self.band)
+        mask = self._read(task)
         read_seconds = perf_counter() - started
         location = locate(mask, references, self._options(task, max(mask.shape)))
         location = replace(location, seconds=replace(location.seconds, open=open_seconds, read=read_seconds))
         reference = next((one for one in references if one.name == location.reference), references[0])
         attribution = str(reference.index.meta.get("attribution", ""))
         paths = output_paths(self.out_dir, task.stem)
-        picture = self.images.get(task.mask)
+        picture = self.images.get(task.mask, task.mask if self.segmenter else None)
         location, files = write_location(location, mask, paths, self.outputs, picture, attribution)
         if self.plot and location.located:
             _draw(location, mask, reference, paths.overlay, attribution)
@@ -132,6 +129,27 @@ class Job:
         if picture and location.located:
             text += f"\n  drew {picture}, {_scale(picture, mask):g} times the mask's size"
         return Outcome(location.status, location.to_dict(), text, tuple(map(str, files)))
+
+    def _read(self, task: Task) -> RoadMask:
+        """Read the mask, or have a plugin see the roads in a photograph."""
+        from dataclasses import replace
+
+        import numpy as np
+
+        from roadgeo.errors import PluginError
+        from roadgeo.grid import RoadMask
+        from roadgeo.io_raster import read_mask
+        from roadgeo.plugins import SEGMENTERS, call_plugin
+
+        if self.segmenter is None:
+            return read_mask(task.mask, threshold=self.threshold, band=self.band)
+        seen = call_plugin(SEGMENTERS, self.segmenter, task.mask)
+        if isinstance(seen, RoadMask):
+            return replace(seen, name=task.mask)
+        if not isinstance(seen, np.ndarray):
+            kind = type(seen).__name__
+            raise PluginError(f"the segmenter {self.segmenter!r} returned a {kind}, expected a RoadMask or an array")
+        return read_mask(seen, threshold=self.threshold, name=task.mask)
 
     def _options(self, task: Task, longer_side: int) -> LocateOptions:
         """Return the options, with the focal length that the photograph's EXIF states where that was asked for."""
@@ -203,9 +221,10 @@ def open_references(names: Iterable[str]) -> list[Reference]:
 @click.option(
     "--also",
     "products",
-    type=click.Choice(PRODUCTS),
+    metavar="NAME",
+    type=Plugin("roadgeo.outputs"),
     multiple=True,
-    help="Write a further form of the result. Repeatable.",
+    help="Write a further form of the result: see below. Repeatable.",
 )
 @click.option("--gcps", is_flag=True, help="The same as --also gcps: the picture's own pixels with control points.")
 @click.option("--crs", metavar="CRS", help="CRS of what is drawn, such as EPSG:3857. Default: the reference's, metric.")
@@ -229,6 +248,12 @@ def open_references(names: Iterable[str]) -> list[Reference]:
     default=400_000_000,
     show_default=True,
     help="Draw coarser rather than more than this.",
+)
+@click.option(
+    "--segmenter",
+    metavar="NAME",
+    type=Plugin("roadgeo.segmenters"),
+    help="The MASKs are photographs: have this plugin find their roads. `roadgeo info --plugins` lists them.",
 )
 @click.option("--threshold", metavar="T", type=float, help="Values above T are road. Default: told by the values.")
 @click.option(
@@ -282,6 +307,7 @@ def locate_command(
     resolution: float | None,
     resampling: Literal["nearest", "bilinear", "cubic", "lanczos"],
     max_pixels: int,
+    segmenter: str | None,
     threshold: float | None,
     band: int | None,
     gsd: tuple[float, float] | None,
@@ -323,6 +349,7 @@ def locate_command(
       geojson    footprint as of RFC 7946
       stac       STAC Item of the drawn raster
       kmz        ground overlay for Google Earth
+      and what plugins offer (roadgeo info --plugins)
 
     \b
     Examples:
@@ -345,7 +372,20 @@ def locate_command(
     outputs = _make_outputs(crs, resolution, resampling, max_pixels, (*products, *(["gcps"] if gcps else [])))
     pictures = pair_images([task.mask for task in tasks], images)
     from_exif = camera == "exif"
-    job = Job(references, options, outputs, out_dir, pictures, threshold, band, plot, report, from_exif, skip_existing)
+    job = Job(
+        references,
+        options,
+        outputs,
+        out_dir,
+        pictures,
+        threshold,
+        band,
+        plot,
+        report,
+        segmenter,
+        from_exif,
+        skip_existing,
+    )
     # Opened here too: what is wrong with them is said once, and the search is compiled before processes start.
     opened = open_references(references)
     compile_once(opened[0], quiet)

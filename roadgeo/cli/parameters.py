@@ -7,7 +7,7 @@ from typing import Any, TypeVar
 
 import click
 
-__all__ = ["BOX", "CAMERA", "NEAR", "RANGE", "Numbers", "verbosity_options"]
+__all__ = ["BOX", "CAMERA", "NEAR", "RANGE", "Numbers", "Plugin", "verbosity_options"]
 
 Command = TypeVar("Command", bound=Callable[..., Any])
 
@@ -50,6 +50,41 @@ class Numbers(click.ParamType):  # type: ignore[type-arg]  # generic only in lat
         if problem:
             self.fail(f"got {value!r}: {problem}; expected {expected}", param, ctx)
         return numbers
+
+
+class Plugin(click.ParamType):  # type: ignore[type-arg]
+    """The name of a plugin, and with `has_argument` a colon and what it is to look at: "osm:Boston, MA"."""
+
+    name = "plugin"
+
+    def __init__(self, group: str, *, has_argument: bool = False) -> None:
+        self.group = group
+        self.has_argument = has_argument
+
+    def convert(self, value: Any, param: click.Parameter | None, ctx: click.Context | None) -> str:
+        """Check that it is installed; nothing of it is imported.
+
+        Raises
+        ------
+        click.BadParameter
+            It is not, or the colon is missing.
+        """
+        from roadgeo.plugins import find_plugins
+
+        name, colon, _ = str(value).partition(":")
+        known = sorted(find_plugins(self.group))
+        if name not in known or bool(colon) != self.has_argument:
+            expected = ", ".join(f"{one}:WHERE" if self.has_argument else one for one in known)
+            self.fail(f"got {value!r}, expected one of {expected}", param, ctx)
+        return str(value)
+
+    def shell_complete(self, ctx: click.Context, param: click.Parameter, incomplete: str) -> list[Any]:  # noqa: ARG002
+        """Offer the names that begin so."""
+        from click.shell_completion import CompletionItem
+
+        from roadgeo.plugins import find_plugins
+
+        return [CompletionItem(name) for name in sorted(find_plugins(self.group)) if name.startswith(incomplete)]
 
 
 class Focal(click.ParamType):  # type: ignore[type-arg]

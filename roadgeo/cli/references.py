@@ -13,9 +13,12 @@ __all__ = ["check_command", "info_command", "list_command", "remove_command"]
 
 
 @click.command("info", short_help="Describe a reference.")
-@click.argument("reference", metavar="REF", type=click.Path())
+@click.argument("reference", metavar="REF", type=click.Path(), required=False)
+@click.option(
+    "--plugins", is_flag=True, help="Instead, list the road sources, segmenters and outputs that are installed."
+)
 @click.option("--json", "as_json", is_flag=True, help="Print everything that is known as one JSON object.")
-def info_command(reference: str, as_json: bool) -> None:
+def info_command(reference: str | None, plugins: bool, as_json: bool) -> None:
     """Describe a reference: a file (REF.gpkg or REF.index) or a name in the library.
 
     Reads a few kilobytes, whatever the size of the reference, and runs nothing that a file may carry.
@@ -24,7 +27,13 @@ def info_command(reference: str, as_json: bool) -> None:
     Examples:
       roadgeo info boston-ma
       roadgeo info maps/porto.gpkg --json
+      roadgeo info --plugins
     """
+    if plugins:
+        _list_plugins(as_json)
+        return
+    if reference is None:
+        raise click.UsageError("Missing argument 'REF'.")
     from roadgeo.io_reference import describe_reference
     from roadgeo.library import resolve_reference
 
@@ -35,6 +44,21 @@ def info_command(reference: str, as_json: bool) -> None:
     width = max(len(label) for label, _ in _lines(described))
     for label, value in _lines(described):
         click.echo(f"{label:<{width}}  {value}")
+
+
+def _list_plugins(as_json: bool) -> None:
+    from roadgeo.plugins import GROUPS, find_plugins
+
+    found = [plugin for group in GROUPS for _, plugin in sorted(find_plugins(group).items())]
+    rows = [
+        (one.group, one.name, f"{one.dist.name} {one.dist.version}" if one.dist else "", one.value) for one in found
+    ]
+    if as_json:
+        click.echo(json.dumps([dict(zip(("group", "name", "package", "object"), row, strict=True)) for row in rows]))
+        return
+    widths = [max((len(row[i]) for row in rows), default=0) for i in range(3)]
+    for row in rows:
+        click.echo("  ".join([*(text.ljust(width) for text, width in zip(row, widths, strict=False)), row[3]]))
 
 
 @click.command("check", short_help="Verify every byte and number of a reference.")

@@ -1,0 +1,69 @@
+"""Road sources, segmenters and outputs that installed packages offer as entry points; roadgeo's own are found so too.
+
+A source takes where to look and `say`, which it may tell what it waits for, and returns `roadgeo.io_roads.Roads`. A
+segmenter takes the path of a photograph and returns a `roadgeo.grid.RoadMask`, or an array that `roadgeo.io_raster.
+read_mask` takes. An output is a `roadgeo.io_products.Product`. `examples/plugin` has one of each.
+"""
+
+from __future__ import annotations
+
+from importlib.metadata import EntryPoint, entry_points
+from typing import Any
+
+from roadgeo.errors import PluginError, RoadgeoError
+
+__all__ = ["GROUPS", "OUTPUTS", "SEGMENTERS", "SOURCES", "call_plugin", "find_plugins", "load_plugin"]
+
+GROUPS = SOURCES, SEGMENTERS, OUTPUTS = "roadgeo.sources", "roadgeo.segmenters", "roadgeo.outputs"
+
+
+def find_plugins(group: str) -> dict[str, EntryPoint]:
+    """Find what is offered in a group, by name; nothing is imported. Where names clash, our own comes first."""
+    offered = sorted(entry_points(group=group), key=lambda one: (package_of(one) != "roadgeo", package_of(one)))
+    return {one.name: one for one in reversed(offered)}
+
+
+def package_of(plugin: EntryPoint) -> str:
+    """Name the package that offers a plugin."""
+    return plugin.dist.name if plugin.dist else ""
+
+
+def load_plugin(group: str, name: str) -> Any:
+    """Import what a name stands for.
+
+    Raises
+    ------
+    PluginError
+        There is none of that name, or it cannot be imported.
+    """
+    found = find_plugins(group)
+    if name not in found:
+        raise PluginError(
+            f"no {name!r} among the {group}, expected one of {', '.join(sorted(found))}; is it installed?"
+        )
+    try:
+        return found[name].load()
+    except Exception as error:
+        raise PluginError(f"{_describe(found[name])} cannot be loaded: {type(error).__name__}: {error}") from error
+
+
+def call_plugin(group: str, name: str, *arguments: Any, **options: Any) -> Any:
+    """Call what a name stands for.
+
+    Raises
+    ------
+    PluginError
+        As for `load_plugin`, or it fails with an error of its own.
+    """
+    plugin = load_plugin(group, name)
+    try:
+        return plugin(*arguments, **options)
+    except RoadgeoError:
+        raise
+    except Exception as error:
+        said = _describe(find_plugins(group)[name])
+        raise PluginError(f"{said} failed: {type(error).__name__}: {error}; tell its makers") from error
+
+
+def _describe(plugin: EntryPoint) -> str:
+    return f"{plugin.name!r} of {plugin.group} from {package_of(plugin) or 'an unknown package'}"

@@ -1,0 +1,237 @@
+"""Plugins: found by entry points like our own; the example is installed and used as a user would."""
+
+import json
+import os
+import shutil
+import subprocess
+import sys
+import tomllib
+from importlib.metadata import EntryPoint
+from pathlib import Path
+
+import cv2
+import numpy as np
+import pytest
+import shapely
+
+from roadgeo import plugins
+from roadgeo.cli import main
+from roadgeo.cli.locate import Job
+from roadgeo.demo import ROADS, demo_masks
+from roadgeo.errors import MaskError, PluginError
+from roadgeo.grid import RoadMask
+from roadgeo.io_products import PRODUCTS
+from roadgeo.io_raster import read_mask
+from roadgeo.io_roads import fetch_roads, read_roads
+from roadgeo.plugins import GROUPS, OUTPUTS, SEGMENTERS, SOURCES, call_plugin, find_plugins, load_plugin
+from roadgeo.projection import to_lonlat
+
+ROOT = Path(__file__).parent.parent
+SHEET = next(mask.path for mask in demo_masks() if mask.path.stem == "map_sheet")
+
+
+@pytest.fixture
+def offer(monkeypatch: pytest.MonkeyPatch):
+    """Offer objects of this module as if packages were installed that do."""
+
+    def offered(**objects: str) -> None:
+        points = {group: [] for group in GROUPS}
+        for name, value in objects.items():
+            kind, _, short = name.partition("_")
+            group = next(group for group in GROUPS if group.startswith(f"roadgeo.{kind}"))
+            points[group].append(EntryPoint(short, value, group))
+        monkeypatch.setattr(plugins, "entry_points", lambda group: points[group])
+
+    return offered
+
+
+def see_nothing(picture: str) -> RoadMask:
+    raise MaskError(f"{picture}: clouds")
+
+
+def stumble(*_: object, **__: object) -> None:
+    raise ZeroDivisionError("by zero")
+
+
+def give_nothing(*_: object, **__: object) -> None:
+    return None
+
+
+def see_mask(picture: str) -> RoadMask:
+    return read_mask(picture, name="something else")
+
+
+def see_array(picture: str) -> np.ndarray:
+    return cv2.imread(picture, cv2.IMREAD_GRAYSCALE)
+
+
+NOT_CALLABLE = 7
+
+
+def test_our_own_are_registered_like_all_others() -> None:
+    assert {name: load_plugin(OUTPUTS, name) for name in find_plugins(OUTPUTS)} == PRODUCTS
+    assert {load_plugin(SOURCES, name) for name in find_plugins(SOURCES)} == {read_roads, fetch_roads}
+    assert load_plugin(SEGMENTERS, "mask") is read_mask
+    declared = tomllib.loads((ROOT / "pyproject.toml").read_text(encoding="utf-8"))["project"]["entry-points"]
+    for group in GROUPS:
+        assert declared[group] == {name: point.value for name, point in find_plugins(group).items()}
+
+
+def test_ours_come_first_where_names_clash(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(plugins, "package_of", lambda point: point.value.split(":")[0])
+    points = [EntryPoint("x", f"{package}:x", SOURCES) for package in ("zebra", "roadgeo", "aardvark")]
+    monkeypatch.setattr(plugins, "entry_points", lambda group: points)
+    assert find_plugins(SOURCES)["x"].value == "roadgeo:x"
+    points.pop(1)
+    assert find_plugins(SOURCES)["x"].value == "aardvark:x"
+
+
+@pytest.mark.parametrize(
+    ("value", "message"),
+    [
+        (
+            f"{__name__}:stumble",
+            "'broken' of roadgeo.segmenters from an unknown package failed: ZeroDivisionError: by zero",
+        ),
+        (f"{__name__}:absent", "'broken' of .* cannot be loaded: AttributeError"),
+        ("no_such_module_at_all:x", "'broken' of .* cannot be loaded: ModuleNotFoundError"),
+        (f"{__name__}:NOT_CALLABLE", "failed: TypeError: 'int' object is not callable"),
+    ],
+)
+def test_what_a_plugin_does_wrong_is_said_to_be_its_own(offer, value: str, message: str) -> None:
+    offer(segmenters_broken=value)
+    with pytest.raises(PluginError, match=message):
+        call_plugin(SEGMENTERS, "broken", "a.png")
+
+
+def test_what_a_plugin_refuses_is_said_as_it_says_it(offer) -> None:
+    offer(segmenters_clouds=f"{__name__}:see_nothing")
+    with pytest.raises(MaskError, match=r"a\.png: clouds"):
+        call_plugin(SEGMENTERS, "clouds", "a.png")
+    with pytest.raises(PluginError, match=r"no 'sun' among the roadgeo\.segmenters, expected one of clouds"):
+        load_plugin(SEGMENTERS, "sun")
+
+
+@pytest.mark.parametrize("kind", ["mask", "array"])
+def test_a_segmenter_may_return_a_mask_or_an_array(offer, kind: str) -> None:
+    from roadgeo.cli.batch import Task
+
+    offer(segmenters_mask=f"{__name__}:see_mask", segmenters_array=f"{__name__}:see_array")
+    job = Job((), None, None, ".", segmenter=kind)  # type: ignore[arg-type]  # only reading is asked of it
+    mask = job._read(Task(str(SHEET), "map_sheet"))
+    assert mask.name == str(SHEET)
+    assert np.array_equal(mask.roads, read_mask(SHEET).roads)
+
+
+@pytest.mark.parametrize(
+    ("arguments", "status", "message"),
+    [
+        (["index", "--source", "osm"], 2, "got 'osm', expected one of files:WHERE, osm:WHERE"),
+        (["index", "--source", "moon:Tycho"], 2, "got 'moon:Tycho', expected one of"),
+        (["index", "--source", "files:a.gpkg", "--roads", "a.gpkg"], 2, "Give one source of roads"),
+        (["index", "--source", "files:missing.gpkg"], 1, "missing.gpkg"),
+        (["locate", "a.png", "--segmenter", "eyes"], 2, "got 'eyes', expected one of mask"),
+        (["locate", "a.png", "--also", "bread"], 2, "got 'bread', expected one of gcps, geojson, kmz"),
+        (["info"], 2, "Missing argument 'REF'"),
+    ],
+)
+def test_the_command_line_knows_what_is_installed(
+    arguments: list[str],
+    status: int,
+    message: str,
+    tmp_path: Path,
+    monkeypatch: pytest.MonkeyPatch,
+    capsys: pytest.CaptureFixture[str],
+) -> None:
+    monkeypatch.chdir(tmp_path)
+    monkeypatch.setenv("ROADGEO_LIBRARY", str(tmp_path))
+    assert main(arguments) == status
+    assert message in capsys.readouterr().err
+
+
+@pytest.mark.parametrize(
+    ("kind", "message"),
+    [
+        ("sources", "the source 'odd' returned a NoneType, expected roadgeo.io_roads.Roads"),
+        ("outputs", "the output 'odd' is a function, expected a roadgeo.io_products.Product"),
+        ("segmenters", "the segmenter 'odd' returned a NoneType, expected a RoadMask or an array"),
+    ],
+)
+def test_what_is_of_the_wrong_kind_is_refused(
+    offer, kind: str, message: str, tmp_path: Path, capsys: pytest.CaptureFixture[str], demo_reference: Path
+) -> None:
+    offer(**{f"{kind}_odd": f"{__name__}:give_nothing"})
+    locate = ["locate", str(SHEET), "-r", str(demo_reference), "-o", str(tmp_path)]
+    arguments = {
+        "sources": ["index", "--source", "odd:there", "--out", str(tmp_path / "odd.gpkg")],
+        "outputs": [*locate, "--also", "odd"],
+        "segmenters": [*locate, "--segmenter", "odd"],
+    }
+    assert main(arguments[kind]) == 1
+    assert message in " ".join(capsys.readouterr().err.split())
+
+
+@pytest.fixture(scope="module")
+def demo_reference(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    path = tmp_path_factory.mktemp("reference") / "porto.gpkg"
+    assert main(["index", "--source", f"files:{ROADS}", "--out", str(path), "--quiet"]) == 0
+    return path
+
+
+@pytest.fixture(scope="module")
+def installed(tmp_path_factory: pytest.TempPathFactory) -> dict[str, str]:
+    """The example, installed beside everything else: the environment that has it."""
+    folder = tmp_path_factory.mktemp("plugin")
+    shutil.copytree(
+        ROOT / "examples" / "plugin", folder / "plugin", ignore=shutil.ignore_patterns("build", "*.egg-info")
+    )
+    pip = [sys.executable, "-m", "pip", "install", "--quiet", "--disable-pip-version-check"]
+    options = ["--no-deps", "--no-build-isolation", "--target", str(folder / "site")]
+    subprocess.run([*pip, *options, str(folder / "plugin")], check=True, capture_output=True)
+    path = os.pathsep.join(filter(None, [str(folder / "site"), os.environ.get("PYTHONPATH")]))
+    return {**os.environ, "PYTHONPATH": path}
+
+
+def test_the_example_is_twenty_lines() -> None:
+    lines = (ROOT / "examples" / "plugin" / "roadgeo_wkt.py").read_text(encoding="utf-8").splitlines()
+    assert sum(bool(line.strip()) for line in lines) <= 21
+
+
+def test_the_example_is_installed_and_used(installed: dict[str, str], tmp_path: Path) -> None:
+    def roadgeo(*arguments: str) -> str:
+        command = [sys.executable, "-m", "roadgeo", *arguments]
+        done = subprocess.run(command, cwd=tmp_path, env=installed, capture_output=True, text=True, encoding="utf-8")
+        assert done.returncode == 0, done.stderr
+        return done.stdout
+
+    listed = json.loads(roadgeo("info", "--plugins", "--json"))
+    assert {one["group"] for one in listed if one["package"] == "roadgeo-wkt 1.0"} == set(GROUPS)
+    assert "roadgeo.segmenters  yellow" in roadgeo("info", "--plugins")
+
+    roads = read_roads(ROADS)
+    degrees = [
+        shapely.transform(line, lambda xy: to_lonlat(roads.plane.crs, roads.plane.to_crs(xy))) for line in roads.lines
+    ]
+    (tmp_path / "roads.txt").write_text("\n".join(line.wkt for line in degrees), encoding="utf-8")
+    roadgeo("index", "--source", "wkt:roads.txt", "--out", "porto.gpkg")
+
+    mask = cv2.imread(str(SHEET), cv2.IMREAD_GRAYSCALE)
+    sheet = np.full((*mask.shape, 3), 255, np.uint8)
+    sheet[mask > 127] = (60, 210, 250)
+    cv2.imwrite(str(tmp_path / "sheet.png"), sheet)
+    found = json.loads(
+        roadgeo(
+            "locate", "sheet.png", "-r", "porto.gpkg", "--segmenter", "yellow", "--also", "wkt", "--json", "--quiet"
+        )
+    )
+    assert found["status"] == "located"
+    polygon = shapely.from_wkt((tmp_path / "sheet_footprint.wkt").read_text(encoding="utf-8"))
+    assert shapely.get_coordinates(polygon)[:4] == pytest.approx(np.array(found["footprint"]))
+
+
+def test_nothing_is_looked_up_before_a_plugin_is_named() -> None:
+    script = (
+        "import sys, roadgeo, roadgeo.cli; roadgeo.cli.main(['--help']); print('importlib.metadata' in sys.modules)"
+    )
+    done = subprocess.run([sys.executable, "-c", script], capture_output=True, text=True, check=True)
+    assert done.stdout.splitlines()[-1] == "False"
