@@ -141,9 +141,7 @@ class Location:
             "homography": rows(self.homography),
             "footprint": rows(self.footprint),
             "footprint_lonlat": rows(self.footprint_lonlat),
-            "center": None
-            if center is None
-            else {"x": center.x, "y": center.y, "lon": center.lon, "lat": center.lat},
+            "center": None if center is None else {"x": center.x, "y": center.y, "lon": center.lon, "lat": center.lat},
             "gsd_m": self.gsd_m,
             "rotation_deg": self.rotation_deg,
             "tilt_deg": self.tilt_deg,
