@@ -229,7 +229,7 @@ class TripleEstimator:
         )  # fmt: skip
         if n_matched < options.min_matched or not math.isfinite(ratio):
             return None
-        if judge(matrix, scene.size, self.options.camera):
+        if self._judge(matrix):
             return None
         seeds = np.append(neighbours[anchor][partners >= 0], anchor)
         return Hypothesis(matrix / matrix[2, 2], seeds, ratio, matched)
@@ -286,7 +286,7 @@ class TripleEstimator:
         best = -1.0
         for _ in range(5):
             refined = refine(model.matrix, scene, self.index, model.matched, options.refine, n_points)
-            if refined is None or judge(refined.matrix, scene.size, options.camera) or self._is_far(refined.matrix):
+            if refined is None or self._judge(refined.matrix) or self._is_far(refined.matrix):
                 return model.refined is not None and best >= 0.0
             gsd = pose(refined.matrix, scene.size).gsd_m
             found, matched, distance = agreement(
@@ -301,6 +301,10 @@ class TripleEstimator:
             if not improved:
                 break
         return True
+
+    def _judge(self, matrix: FloatArray) -> str:
+        """Return why a homography is not plausible for the camera, or "" if it is."""
+        return judge(matrix, self.scene.size, self.options.camera)
 
     def _is_far(self, matrix: FloatArray) -> bool:
         """Whether the middle of the frame lies outside the circle that the user gave."""
