@@ -16,7 +16,6 @@ import numpy as np
 
 from roadgeo.errors import MaskError, OutputError
 from roadgeo.files import write_text
-from roadgeo.grid import RoadMask
 from roadgeo.io_network import read_network
 from roadgeo.landscape import Landscape
 from roadgeo.projection import transformer
@@ -179,8 +178,7 @@ class ReferenceLocator:
 
         def answer(mask: Mask) -> Answer:
             try:
-                query = mask if isinstance(mask, str) else RoadMask(mask > 0)
-                return locate(query, references, self.options).to_dict()
+                return locate(mask, references, self.options).to_dict()
             except MaskError as error:
                 return {"status": "not_located", "reason": str(error)}
 

@@ -160,9 +160,7 @@ class AutoLocator:
 
 
 def as_mask(mask: Any) -> RoadMask:
-    """A drawn mask, or the file of one."""
-    if isinstance(mask, np.ndarray):
-        return RoadMask(mask > 0)
+    """Take a drawn mask, or the file of one, as `roadgeo.locate` does: the void corners of a warped one are told."""
     from roadgeo.io_raster import read_mask
 
     return read_mask(mask)
