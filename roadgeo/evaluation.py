@@ -266,7 +266,7 @@ def calibrate_odds(
 
 @dataclass(frozen=True)
 class Calibration:
-    """Errors of corners in units of what was claimed: error / (sqrt(2) sigma), sigma being of each coordinate.
+    """Errors of corners in units of what was claimed: error / sigma, sigma being the rms distance from the truth.
 
     Attributes
     ----------
@@ -275,7 +275,7 @@ class Calibration:
     robust : float
         The same from the median, which for Gaussian errors is sqrt(ln 2): outliers do not count.
     within_1, within_2, within_3 : Share
-        Errors of at most 1, 2, 3 sqrt(2) sigma; of Gaussian ones 63.2, 98.2 and 99.99 %.
+        Errors of at most 1, 2, 3 sigma; of Gaussian ones 63.2, 98.2 and 99.99 %.
     """
 
     rms: float
@@ -290,7 +290,7 @@ def calibrate_sigma(scores: Sequence[Score]) -> Calibration:
     errors = np.array([s.corners_m for s in scores if s.right]).reshape(-1, 4)
     sigmas = np.array([s.sigma_m for s in scores if s.right]).reshape(-1, 4)
     known = np.isfinite(errors) & (sigmas > 0)
-    ratio = errors[known] / (math.sqrt(2) * sigmas[known])
+    ratio = errors[known] / sigmas[known]
     if len(ratio) == 0:
         return Calibration(math.nan, math.nan, *(share(0, 0),) * 3)
     within = [share(int((ratio <= k).sum()), len(ratio)) for k in (1, 2, 3)]

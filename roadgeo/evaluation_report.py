@@ -258,7 +258,7 @@ def _odds_chart(steps: Sequence[OddsStep]) -> str:
 
 def _sigma_chart(scores: Sequence[Score], calibration: Calibration) -> str:
     ratios = [
-        error / (math.sqrt(2) * sigma)
+        error / sigma
         for s in scores
         if s.right
         for error, sigma in zip(s.corners_m, s.sigma_m, strict=True)
@@ -273,7 +273,7 @@ def _sigma_chart(scores: Sequence[Score], calibration: Calibration) -> str:
         + plane.line(fine, [1 - math.exp(-x * x) for x in fine], _GREY, "5 4")
         + _cumulative(plane, ratios, _BLUE)
     )
-    caption = f"Corner errors in units of sqrt(2) sigma: rms {_number(calibration.rms, 2)}, 1 is honest."
+    caption = f"Corner errors in units of sigma: rms {_number(calibration.rms, 2)}, 1 is honest."
     return _figure("Do the standard deviations mean what they say?", svg, caption)
 
 

@@ -86,7 +86,7 @@ class Location:
     footprint, footprint_lonlat : (4, 2) float64
         Corners TL, TR, BR, BL of the frame in the CRS, and as longitude, latitude.
     corner_sigma_m : (4,) float64
-        Standard deviations of those corners' positions.
+        Standard deviations of those corners' positions: root mean squares of their distances from the truth.
     rotation_deg : float
         Direction of the image's up at its centre, clockwise from north.
     tilt_deg : float or None

@@ -134,7 +134,7 @@ def test_odds_that_promise_too_much_are_told():
 @pytest.mark.parametrize("scale", [0.5, 1.0, 2.0])
 def test_sigmas_are_measured_by_the_errors(scale):
     rng = np.random.default_rng(5)
-    errors = np.hypot(*rng.normal(0.0, scale * 1.5, (2, 4000, 4)))
+    errors = np.hypot(*rng.normal(0.0, scale * 1.5 / math.sqrt(2), (2, 4000, 4)))
     scores = [Score("", "k", True, "located", True, 1.0, tuple(row), (1.5,) * 4) for row in errors.tolist()]
     got = calibrate_sigma(scores)
     assert got.rms == pytest.approx(scale, rel=0.02)

@@ -35,8 +35,8 @@ __all__ = [
     "ring_data",
 ]
 
-#: A circle that holds a corner's true position with 95 %, in standard deviations of each coordinate.
-_SIGMAS = 2.45
+#: A circle that holds a corner's true position with 95 %, in rms distances.
+_SIGMAS = 1.73
 
 #: Screen pixels that a large residual's arrow (the 90th percentile) and a corner's circle get at most.
 _ARROW_PX, _CIRCLE_PX = 26.0, 60.0
