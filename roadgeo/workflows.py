@@ -16,6 +16,7 @@ import numpy as np
 from roadgeo.camera import pose
 from roadgeo.errors import RoadSourceError
 from roadgeo.estimator import Hypothesis, MatchOptions, TripleEstimator
+from roadgeo.explanation import Explanation, Needed, Story, WatchedEstimator, tell
 from roadgeo.graph import RoadGraph
 from roadgeo.grid import PIXEL_TO_PLANE, RoadMask
 from roadgeo.homography import Homography
@@ -41,6 +42,7 @@ __all__ = [
     "Reference",
     "build_network",
     "build_reference",
+    "explain",
     "locate",
     "open_reference",
     "trace_query",
@@ -221,20 +223,62 @@ def locate(
         The mask cannot be read or shows no roads.
     """
     options = options or LocateOptions()
-    references = [reference] if isinstance(reference, Reference) else list(reference)
-    if not references:
-        raise RoadSourceError("no reference to search: build one with `roadgeo index`")
+    return _search_all(_read_query(mask, options), reference, options)
+
+
+def explain(
+    mask: RoadMask | AnyArray | str | Path,
+    reference: Reference | Sequence[Reference],
+    options: LocateOptions | None = None,
+) -> Explanation:
+    """Locate a mask as `locate` does, and tell how far the search got, what it rejected and what was missing.
+
+    Raises
+    ------
+    MaskError
+        The mask cannot be read or shows no roads.
+    """
+    options = options or LocateOptions()
+    query = _read_query(mask, options)
+    stories: list[Story] = []
+    location = _search_all(query, reference, options, stories)
+    return Explanation(location, query.scene, query.graph, tuple(stories))
+
+
+@dataclass(frozen=True)
+class _Query:
+    """A mask that was read and traced."""
+
+    name: str
+    scene: Scene
+    graph: RoadGraph
+    seconds: Seconds
+
+
+def _read_query(mask: RoadMask | AnyArray | str | Path, options: LocateOptions) -> _Query:
     _rehearse_tracing()
     started = time.perf_counter()
     road_mask = _as_mask(mask)
     read = time.perf_counter()
     scene, graph = trace_query(road_mask, options.query)
-    seconds = Seconds(read=read - started, vectorize=time.perf_counter() - read)
-    left = options.search.time_limit_s - seconds.vectorize
+    return _Query(road_mask.name, scene, graph, Seconds(read=read - started, vectorize=time.perf_counter() - read))
+
+
+def _search_all(
+    query: _Query,
+    reference: Reference | Sequence[Reference],
+    options: LocateOptions,
+    stories: list[Story] | None = None,
+) -> Location:
+    """Search one reference after another within the time limit, and return the best answer."""
+    references = [reference] if isinstance(reference, Reference) else list(reference)
+    if not references:
+        raise RoadSourceError("no reference to search: build one with `roadgeo index`")
+    left = options.search.time_limit_s - query.seconds.vectorize
     found: list[Location] = []
     for one in references:
         share = max(left, 0.0) / (len(references) - len(found))
-        found.append(_locate_on(road_mask.name, scene, graph, one.index, options, share, seconds))
+        found.append(_locate_on(query, one.index, options, share, stories))
         left -= found[-1].seconds.match + found[-1].seconds.refine
     return _best_of(found, options)
 
@@ -268,32 +312,36 @@ def _rehearse_once(estimator: TripleEstimator) -> None:
 
 
 def _locate_on(
-    name: str,
-    scene: Scene,
-    graph: RoadGraph,
-    index: ReferenceIndex,
-    options: LocateOptions,
-    time_limit_s: float,
-    seconds: Seconds,
+    query: _Query, index: ReferenceIndex, options: LocateOptions, time_limit_s: float, stories: list[Story] | None
 ) -> Location:
     """Match, judge and describe one query on one reference; `time_limit_s` is what is left for that."""
+    scene, graph, seconds = query.scene, query.graph, query.seconds
     n = len(scene.intersections)
     location = Location(
-        name, "not_located", "", reference=index.name, size=scene.size, n_intersections=n, seconds=seconds
+        query.name, "not_located", "", reference=index.name, size=scene.size, n_intersections=n, seconds=seconds
     )
-    if n < options.min_intersections:
-        needed = options.min_intersections
-        return replace(location, reason=f"only {n} intersections are seen, at least {needed} are needed")
-    if options.method == "pair":
-        return _locate_by_pairs(location, scene, graph, index, options, time_limit_s)
-    estimator = TripleEstimator(scene, index, options.match, _near(index, options.near))
+    needed = Needed(options.min_log10_odds, options.min_margin, options.min_intersections)
+    if n < needed.intersections or options.method == "pair":
+        if n < needed.intersections:
+            reason = f"only {n} intersections are seen, at least {needed.intersections} are needed"
+            location = replace(location, reason=reason)
+        else:
+            location = _locate_by_pairs(location, scene, graph, index, options, time_limit_s)
+        if stories is not None:
+            stories.append(tell(location, scene, index, needed))
+        return location
+    watch = TripleEstimator if stories is None else WatchedEstimator
+    estimator = watch(scene, index, options.match, _near(index, options.near))
     _rehearse_once(estimator)
     started = time.perf_counter()
     result = search(estimator, replace(options.search, time_limit_s=time_limit_s))
     stats = Stats(estimator.n_tuples, estimator.n_candidates, estimator.n_hypotheses, estimator.n_verified)
     seconds = replace(seconds, match=time.perf_counter() - started - estimator.refine_s, refine=estimator.refine_s)
     location = replace(location, seconds=seconds, stats=stats)
-    return _describe(location, scene, graph, index, result, estimator, options)
+    location = _describe(location, scene, graph, index, result, estimator, options)
+    if stories is not None and isinstance(estimator, WatchedEstimator):
+        stories.append(tell(location, scene, index, needed, estimator, result))
+    return location
 
 
 @lru_cache(maxsize=4)
