@@ -23,7 +23,7 @@ pytest.importorskip("matplotlib")
 @pytest.fixture(scope="module")
 def town(tmp_path_factory):
     path = tmp_path_factory.mktemp("town") / "town.gpkg"
-    landscape = lattice_town(36)
+    landscape = lattice_town(28)
     found = find_intersections(landscape.graph)
     network = RoadNetwork(landscape.graph, found, landscape.plane, (), {"name": "town"})
     write_network(path, as_stored(network))
@@ -100,8 +100,8 @@ def test_the_middle_of_a_mask_holds_the_intersections_asked_for(experiments):
     from roadgeo.view import make_view
     from roadgeo.workflows import trace_query
 
-    view = make_view((1700.0, 1700.0), (900, 900), 1.0)
-    mask, _ = draw_mask(lattice_town(36), view, NoiseModel(), (8.0, 9.0), np.random.default_rng(0))
+    view = make_view((1350.0, 1350.0), (900, 900), 1.0)
+    mask, _ = draw_mask(lattice_town(28), view, NoiseModel(), (8.0, 9.0), np.random.default_rng(0))
     part = experiments.middle(experiments.as_mask(mask), 20)
     scene, _ = trace_query(part)
     assert 20 <= len(scene.intersections) <= 26
