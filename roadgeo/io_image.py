@@ -184,7 +184,7 @@ def warp_image(
     options = options or ImageOptions()
     crs, to_target, to_place = choose_target(place, options)
     with ExitStack() as stack:
-        stack.enter_context(rasterio.Env(GDAL_CACHEMAX=256))
+        stack.enter_context(rasterio.Env(GDAL_CACHEMAX=256 << 20))  # bytes
         folder = Path(stack.enter_context(TemporaryDirectory(dir=Path(target).parent, prefix=".roadgeo-")))
         picture = stack.enter_context(open_picture(_tile(source, folder)))
         size = (picture.width, picture.height)
