@@ -40,11 +40,14 @@ class Roads:
     meta : dict
         Plain values: `sources` (one dict each: where from, features read, lines kept and left out, OSM timestamp),
         `attribution`, `roads` (which kinds), `tunnels`, `bbox`.
+    area : shapely Polygon or MultiPolygon, or None
+        The ground whose roads were asked for, in degrees; None where it was all that there are.
     """
 
     lines: AnyArray
     plane: LocalPlane
     meta: dict[str, Any] = field(default_factory=dict)
+    area: Any = None
 
     def __len__(self) -> int:
         """L."""
@@ -91,6 +94,8 @@ def read_roads(
     CrsError
         A file has no CRS and none was given, or its coordinates do not fit.
     """
+    from roadgeo.io_overpass import box_area
+
     given = [path] if isinstance(path, str | os.PathLike) else list(path)
     files = [file for one in given for file in list_sources(Path(one))]
     sources = []
@@ -103,7 +108,8 @@ def read_roads(
         if source.crs is None:
             raise CrsError(f"{file}: says nothing of its CRS; name it, for example --crs EPSG:26986")
         sources.append(_choose(source, file.name, which, tunnels, bbox))
-    return _join(sources, {"roads": which, "tunnels": tunnels, "bbox": _plain(bbox)}, attribution)
+    roads = _join(sources, {"roads": which, "tunnels": tunnels, "bbox": _plain(bbox)}, attribution)
+    return roads if bbox is None else replace(roads, area=box_area(bbox))
 
 
 def fetch_roads(
@@ -159,7 +165,7 @@ def fetch_roads(
         area, name = read_area(polygon)
     source = fetch_lines(area, which, tunnels, options, say)
     chosen = _choose(source, name, which, tunnels, None)
-    return _join([chosen], {"roads": which, "tunnels": tunnels, "bbox": _plain(bbox)}, None)
+    return replace(_join([chosen], {"roads": which, "tunnels": tunnels, "bbox": _plain(bbox)}, None), area=area)
 
 
 def project_lines(shapes: Iterable[Any], crs: Any) -> tuple[AnyArray, LocalPlane]:

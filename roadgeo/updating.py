@@ -19,7 +19,7 @@ from roadgeo.projection import LocalPlane, from_lonlat, to_lonlat
 from roadgeo.simplification import SimplifyOptions, coverage, planarize, simplify
 from roadgeo.typing import AnyArray, BoolArray, FloatArray, IntArray
 
-__all__ = ["UpdateOptions", "ground_of", "move_lines", "replace_area", "replace_roads"]
+__all__ = ["UpdateOptions", "ground_of", "move_area", "move_lines", "replace_area", "replace_roads"]
 
 
 @dataclass(frozen=True)
@@ -105,6 +105,15 @@ def move_lines(lines: Sequence[Any] | AnyArray, source: LocalPlane, target: Loca
         return from_lonlat(target, to_lonlat(source.crs, source.to_crs(xy)))
 
     return np.asarray(shapely.transform(np.asarray(lines, object), move))
+
+
+def move_area(area: Any, plane: LocalPlane) -> Any:
+    """Take a shapely Polygon or MultiPolygon from degrees to a plane; parts that meet at 180 degrees become one."""
+    import shapely
+
+    dense = shapely.segmentize(area, 0.01)  # the sides of a box of degrees are no straight lines on the plane
+    parts = shapely.get_parts(shapely.transform(dense, lambda lonlat: from_lonlat(plane, lonlat)))
+    return shapely.union_all(shapely.make_valid(parts), grid_size=0.01)
 
 
 def replace_roads(

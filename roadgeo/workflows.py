@@ -5,22 +5,22 @@ from __future__ import annotations
 import math
 import time
 from collections.abc import Sequence
-from dataclasses import dataclass, field, replace
+from dataclasses import asdict, dataclass, field, fields, replace
 from functools import lru_cache
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, Literal
+from typing import TYPE_CHECKING, Any, Literal, TypeVar
 
 import cv2
 import numpy as np
 
 from roadgeo.camera import pose
-from roadgeo.errors import RoadSourceError
+from roadgeo.errors import IndexFormatError, RoadSourceError
 from roadgeo.estimator import Hypothesis, MatchOptions, TripleEstimator
 from roadgeo.explanation import Explanation, Needed, Story, WatchedEstimator, tell
 from roadgeo.graph import RoadGraph
 from roadgeo.grid import PIXEL_TO_PLANE, RoadMask
 from roadgeo.homography import Homography
-from roadgeo.index import IndexOptions, ReferenceIndex, build_index
+from roadgeo.index import MAX_NEIGHBOURS, IndexOptions, ReferenceIndex, build_index
 from roadgeo.intersections import IntersectionOptions, Intersections, find_intersections
 from roadgeo.location import Evidence, Location, Place, Seconds, Stats
 from roadgeo.network import RoadNetwork
@@ -35,6 +35,8 @@ from roadgeo.vectorization import VectorizeOptions, vectorize
 if TYPE_CHECKING:
     import geopandas as gpd
 
+    from roadgeo.io_roads import Roads
+
 __all__ = [
     "BuildOptions",
     "LocateOptions",
@@ -45,7 +47,9 @@ __all__ = [
     "explain",
     "locate",
     "open_reference",
+    "stored_options",
     "trace_query",
+    "update_reference",
 ]
 
 
@@ -85,13 +89,16 @@ class Reference:
 def build_network(
     lines: Sequence[Any] | AnyArray, plane: LocalPlane, meta: dict[str, Any], options: BuildOptions | None = None
 ) -> RoadNetwork:
-    """Draw road lines (shapely, in plane metres) as a mask sees them, and find their intersections."""
+    """Draw road lines (shapely, in plane metres) as a mask sees them, and find their intersections.
+
+    The network's `meta` is the one given and the options, for whoever builds its index again or updates it.
+    """
     from roadgeo.simplification import coverage
 
     options = options or BuildOptions()
     graph = simplify(planarize(lines), options.simplify)
     found = find_intersections(graph, options.intersections)
-    return RoadNetwork(graph, found, plane, tuple(coverage(graph)), meta)
+    return RoadNetwork(graph, found, plane, tuple(coverage(graph)), {**meta, "options": asdict(options)})
 
 
 def build_reference(
@@ -118,6 +125,87 @@ def build_reference(
     return Reference(build_index(network, options.index), network)
 
 
+def update_reference(path: str | Path, roads: Roads) -> Reference:
+    """Replace the roads of a reference by others on the ground that those were asked for, or add them, and write it.
+
+    The rest of the network is not drawn again. Where the roads do not say what ground they were asked for, it is the
+    ground they lie on. The options are those that the reference was built with.
+
+    Raises
+    ------
+    IndexFormatError
+        There is no such reference, or it is damaged.
+    OutputError
+        It cannot be written; the old one stays as it was.
+    """
+    from roadgeo.io_network import as_stored, read_network
+    from roadgeo.io_reference import reference_paths
+    from roadgeo.updating import UpdateOptions, ground_of, move_area, move_lines, replace_area
+
+    old = read_network(reference_paths(path).geopackage)
+    options = stored_options(old)
+    lines = move_lines(roads.lines, roads.plane, old.plane)
+    _require_same_scale(roads.lines, lines)
+    area = ground_of(lines) if roads.area is None else move_area(roads.area, old.plane)
+    owed = dict.fromkeys([old.meta.get("attribution", ""), roads.meta.get("attribution", "")])
+    meta = {
+        **old.meta,
+        "sources": [*old.meta.get("sources", []), *roads.meta.get("sources", [])],
+        "attribution": "; ".join(filter(None, owed)),
+    }
+    drawn_alike = UpdateOptions(simplify=options.simplify, intersections=options.intersections)
+    network = as_stored(replace_area(old, lines, area, meta, drawn_alike))
+    Reference(build_index(network, options.index), network).save(path)
+    return open_reference(path)
+
+
+def _require_same_scale(lines: AnyArray, moved: AnyArray) -> None:
+    """Refuse roads that lie so far from a reference that its plane has another scale there, or knows no place there."""
+    import shapely
+
+    scale = float(shapely.length(moved).sum() / shapely.length(lines).sum())
+    if not 0.95 < scale < 1.05:
+        raise RoadSourceError(
+            "the roads lie too far from the reference to be drawn on its plane; build one reference from both sources"
+        )
+
+
+def stored_options(network: RoadNetwork) -> BuildOptions:
+    """Return the options that a network was built with; the defaults for those that it does not tell.
+
+    Raises
+    ------
+    IndexFormatError
+        It tells what cannot be: its file was made elsewhere, or changed.
+    """
+    stored = network.meta.get("options", {})
+    return BuildOptions(
+        simplify=_read_options(SimplifyOptions, stored, "simplify"),
+        intersections=_read_options(IntersectionOptions, stored, "intersections"),
+        index=_read_options(IndexOptions, stored, "index"),
+    )
+
+
+#: Least and most of options that could break or flood a kernel; the others are at least 0.
+_RANGES = {"n_neighbours": (2, MAX_NEIGHBOURS), "codes_per_vertex": (1, 8), "min_bucket_m": (1.0, 1e5)}
+
+_Options = TypeVar("_Options", SimplifyOptions, IntersectionOptions, IndexOptions)
+
+
+def _read_options(kind: type[_Options], stored: Any, stage: str) -> _Options:
+    """Read the options of one stage out of JSON values, which may hold anything."""
+    told = stored.get(stage, {}) if isinstance(stored, dict) else None
+    values: dict[str, Any] = {}
+    for option in fields(kind):
+        value: Any = told.get(option.name, option.default) if isinstance(told, dict) else None
+        low, high = _RANGES.get(option.name, (0, 1000))
+        if type(value) not in {int, type(option.default)} or not low <= value <= high:
+            what = f"the stored option {stage}.{option.name} is {value!r}, expected {low:g} to {high:g}"
+            raise IndexFormatError(f"{what}; make the reference again with `roadgeo index`")
+        values[option.name] = value
+    return kind(**values)
+
+
 def open_reference(path: str | Path) -> Reference:
     """Open REF.gpkg with its REF.index; a missing index is built again from the GeoPackage.
 
@@ -130,7 +218,7 @@ def open_reference(path: str | Path) -> Reference:
     from roadgeo.io_reference import reference_paths
 
     def rebuild(network: RoadNetwork) -> tuple[dict[str, Any], dict[str, AnyArray]]:
-        index = build_index(network)
+        index = build_index(network, stored_options(network).index)
         return dict(index.meta), index.arrays()
 
     meta, arrays = open_parts(path, rebuild)

@@ -4,8 +4,9 @@ import json
 import time
 
 import pytest
+import shapely
 from fake_osm import EMPTY, fake_osm
-from fenway import write_streets
+from fenway import write_streets, write_vector
 
 from roadgeo.cli import main
 
@@ -81,3 +82,96 @@ def test_roads_without_a_crs_are_an_error(tmp_path, capsys):
     assert index("--roads", file, "--out", tmp_path / "a.gpkg") == 1
     assert "name it, for example --crs EPSG:26986" in capsys.readouterr().err
     assert index("--roads", file, "--crs", "EPSG:4326", "--out", tmp_path / "a.gpkg") == 0
+
+
+WEST, EAST = "--bbox=-71.11,42.34,-71.0865,42.36", "--bbox=-71.0870,42.34,-71.07,42.36"
+INNER = "--bbox=-71.09,42.345,-71.084,42.35"
+
+
+def counts(reference, capsys):
+    capsys.readouterr()
+    assert main(["check", str(reference)]) == 0
+    assert main(["info", str(reference), "--json"]) == 0
+    told = json.loads(capsys.readouterr().out.partition("\n")[2])
+    return told["counts"]["intersections"], told["road_km"], told["meta"]
+
+
+def test_a_part_is_added_and_replaced_and_the_rest_stays(tmp_path, capsys):
+    streets, whole, grown = write_streets(tmp_path / "a.geojson"), tmp_path / "whole.gpkg", tmp_path / "grown.gpkg"
+    assert index("--roads", streets, "--out", whole) == 0
+    assert index("--roads", streets, WEST, "--out", grown) == 0
+    n, length, _ = counts(whole, capsys)
+    n_west, length_west, meta = counts(grown, capsys)
+    assert n_west < n
+    assert index("--update", "--roads", streets, EAST, "--out", grown) == 0
+    n_grown, length_grown, told = counts(grown, capsys)
+    assert n_grown == pytest.approx(n, abs=2)
+    assert length_grown == pytest.approx(length, rel=0.02)
+    assert length_grown > length_west
+    assert (told["name"], told["options"], len(told["sources"])) == ("a", meta["options"], 2)
+    assert index("--update", "--roads", streets, EAST, "--out", grown) == 0
+    assert counts(grown, capsys)[:2] == pytest.approx((n_grown, length_grown), rel=0.01)
+
+
+def test_roads_of_a_file_replace_those_where_they_lie(tmp_path, capsys):
+    streets, reference = write_streets(tmp_path / "a.geojson"), tmp_path / "a.gpkg"
+    assert index("--roads", streets, "--out", reference) == 0
+    n, length, _ = counts(reference, capsys)
+    assert index("--update", "--roads", streets, "--out", reference) == 0
+    assert counts(reference, capsys)[:2] == pytest.approx((n, length), rel=0.02)
+
+
+def test_a_fetched_area_replaces_that_of_the_reference(osm, tmp_path, capsys):
+    assert index("--osm", "Fenway, Boston", osm=osm) == 0
+    n, length, _ = counts("fenway-boston", capsys)
+    assert index("--update", INNER, "--name", "fenway-boston", osm=osm) == 0
+    n_new, length_new, meta = counts("fenway-boston", capsys)
+    assert (n_new, length_new) == pytest.approx((n, length), rel=0.03)
+    assert meta["attribution"].count("OpenStreetMap") == 1
+    assert len(meta["sources"]) == 2
+
+
+def test_an_update_of_nothing_is_refused_before_anything_is_fetched(osm, tmp_path, capsys):
+    assert index("--update", "--osm", "Fenway, Boston", "--out", tmp_path / "none.gpkg", osm=osm, quiet=True) == 1
+    told = capsys.readouterr().err
+    assert "no reference" in told
+    assert told.count("\n") == 1
+    assert not osm.searches
+
+
+def test_an_update_from_far_away_is_refused(tmp_path, capsys):
+    reference, far = tmp_path / "a.gpkg", tmp_path / "far.geojson"
+    streets = write_streets(tmp_path / "a.geojson")
+    assert index("--roads", streets, "--out", reference) == 0
+    lines = [shapely.LineString([(10.0, 0.001 * k), (10.01, 0.001 * k)]) for k in range(5)]
+    write_vector(far, lines)
+    before = reference.read_bytes()
+    capsys.readouterr()
+    assert index("--update", "--roads", far, "--out", reference, quiet=True) == 1
+    assert "too far from the reference" in capsys.readouterr().err
+    assert reference.read_bytes() == before
+
+
+def test_ctrl_c_leaves_nothing_behind(tmp_path, monkeypatch, capsys):
+    def interrupt(*_):
+        raise KeyboardInterrupt
+
+    streets = write_streets(tmp_path / "a.geojson")
+    out = tmp_path / "out"
+    monkeypatch.setattr("roadgeo.io_reference.sync_file", interrupt)  # both files are written, but not in place
+    assert index("--roads", streets, "--out", out / "a.gpkg", quiet=True) == 130
+    assert capsys.readouterr().err.strip() == "Interrupted."
+    assert not list(out.iterdir())
+
+
+def test_the_library_from_filling_to_removing(tmp_path, monkeypatch, capsys):
+    monkeypatch.setenv("ROADGEO_LIBRARY", str(tmp_path / "library"))
+    streets = write_streets(tmp_path / "Fenway Streets.geojson")
+    for name in ("one", "two"):
+        assert index("--roads", streets, "--name", name, quiet=True) == 0
+    assert index("--roads", streets, quiet=True) == 0
+    assert main(["list"]) == 0
+    told = capsys.readouterr().out
+    assert [line.split()[0] for line in told.splitlines()] == ["fenway-streets", "one", "two"]
+    assert main(["remove", "one", "fenway-streets", "--yes"]) == 0
+    assert sorted(file.name for file in (tmp_path / "library").iterdir()) == ["two.gpkg", "two.index"]

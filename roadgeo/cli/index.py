@@ -90,7 +90,6 @@ def index_command(out: str | None, name: str | None, update: bool, quiet: bool, 
     from roadgeo.cli.folders import make_folder
     from roadgeo.io_reference import reference_freshness
     from roadgeo.library import make_slug, new_reference
-    from roadgeo.workflows import update_reference
 
     say = _sayer(quiet)
     started = perf_counter()
@@ -99,11 +98,11 @@ def index_command(out: str | None, name: str | None, update: bool, quiet: bool, 
     path = Path(out) if out else new_reference(name)
     make_folder(path.parent)  # before the long part
     if update:
-        reference_freshness(path)
+        reference_freshness(path)  # there must be one
     read = {"roads": _read, "plugin": _read_plugin}.get(given, _fetch)
     roads = read(source, given, say)
     say(f"drawing {len(roads):,} lines as a mask shows them")
-    reference = update_reference(path, roads) if update else build(roads, path, make_slug(name))
+    reference = renew(roads, path) if update else build(roads, path, make_slug(name))
     compile_once(reference, quiet)
     if verbose:
         for key, value in roads.meta.items():
@@ -132,6 +131,13 @@ def build(roads: Roads, path: Path, name: str) -> Reference:
     network = as_stored(build_network(roads.lines, roads.plane, {"name": name, **roads.meta}))
     Reference(build_index(network), network).save(path)
     return open_reference(path)  # as `locate` has it: memory-mapped arrays are another type to compiled code
+
+
+def renew(roads: Roads, path: Path) -> Reference:
+    """Replace a reference's roads by others on their ground, write and open it; see `workflows.update_reference`."""
+    from roadgeo.workflows import update_reference
+
+    return update_reference(path, roads)
 
 
 # --- where the roads come from ----------------------------------------------------------------------------------------
