@@ -124,7 +124,7 @@ def test_a_mask_that_was_not_located_is_shown_with_the_reason(porto: Reference) 
     location = locate(mask, porto)
     text = Reader(page := render_report(location, mask, porto.index)).text
     assert location.status == "not_located"
-    for said in ("✕ not located", location.reason[1:], "Nothing was georeferenced", "hold the place at all", "--near"):
+    for said in ("✕ not located", location.reason[1:], "Nothing was georeferenced", "It was porto.", "--near"):
         assert said in text
     assert 'data-frame="map"' not in page
     assert 'class="overview"' in page
@@ -218,6 +218,9 @@ def test_many_masks_are_listed_with_their_reports(porto: Reference, found: Locat
     addresses = [attrs["href"] for tag, attrs in read.tags if tag == "a"]
     assert addresses == ["drone_report.html", "else%20%26%20where_report.html", "drone_report.html"]
     assert "© Lisbon; © OpenStreetMap" in read.text
+    assert "a/drone.png" not in read.text
+    twice = [Entry({**entries[0].document, "query": f"{folder}/drone.png"}) for folder in ("x/a", "x/b")]
+    assert "a/drone.png ✓ located" in Reader(render_batch(twice, [porto.index])).text
     assert len(render_batch(entries[:1] * 9000, [porto.index]).encode()) < MAX_BYTES
 
 

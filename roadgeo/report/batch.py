@@ -43,9 +43,9 @@ class Entry:
     link: str = ""
 
     @property
-    def name(self) -> str:
-        """What people call the mask."""
-        return PurePath(str(self.document["query"])).name or "mask"
+    def path(self) -> PurePath:
+        """Of the mask, as it was given."""
+        return PurePath(str(self.document["query"]))
 
     @property
     def status(self) -> str:
@@ -85,7 +85,8 @@ def render_batch(entries: Sequence[Entry], indexes: Sequence[ReferenceIndex]) ->
     views = [_draw_map(index, found) for index, found in maps]
     others = [section(f"On {index.name}", view) for (index, _), view in zip(maps[1:], views[1:], strict=True)]
     note = f'<p class="faint">{left_out} more are not listed; all are in the tables beside this page.</p>'
-    items = "".join(map(_item, shown))
+    shared = Counter(entry.path.name for entry in shown)
+    items = "".join(_item(entry, shared[entry.path.name] > 1) for entry in shown)
     listed = f'<ol class="list">{items}</ol>{note if left_out else ""}'
     named = dict.fromkeys(_credit(index) for index, _ in maps)
     parts = [section("Masks", listed), *others, footer("; ".join(filter(None, named)))]
@@ -119,10 +120,11 @@ def _outline(window: Window, entry: Entry) -> str:
     corners = window.to_svg(np.array(entry.document["footprint"], float))
     if not np.isfinite(corners).all():
         return ""
-    return entry.wrap(f'<path d="{ring_data(corners)}"><title>{html.escape(entry.name)}</title></path>')
+    return entry.wrap(f'<path d="{ring_data(corners)}"><title>{html.escape(entry.path.name)}</title></path>')
 
 
-def _item(entry: Entry) -> str:
+def _item(entry: Entry, with_folder: bool) -> str:
+    name = "/".join(entry.path.parts[-2:]) if with_folder else entry.path.name
     document = entry.document
     center, sigma, odds = document.get("center"), document.get("corner_sigma_m"), document.get("log10_odds")
     parts = []
@@ -134,4 +136,4 @@ def _item(entry: Entry) -> str:
             parts.append(f"odds 10<sup>{odds:.1f}</sup>")
     said = " · ".join(parts) or html.escape(str(document.get("reason", "")))
     status = f'<span class="status {entry.status}">{STATUS[entry.status]}</span>'
-    return f"<li>{entry.wrap(html.escape(entry.name))} {status}<br><small>{said}</small></li>"
+    return f"<li>{entry.wrap(html.escape(name or 'mask'))} {status}<br><small>{said}</small></li>"
