@@ -133,14 +133,17 @@ def open_reference(
         When there is no such reference, or its index is missing (without `rebuild`), damaged, hostile or stale.
     """
     paths = reference_paths(path)
+    failed = None
     while True:
         before = _identities(paths)
         try:
             return _open(paths, rebuild)
         except IndexFormatError:
-            if _identities(paths) == before:
+            # Another process may have replaced the reference meanwhile: what we saw was half the old one, half the new.
+            # Equal files before and after are no proof, for an index may have come and gone between; twice is.
+            if _identities(paths) == before == failed:
                 raise
-            # Another process has replaced the reference meanwhile: what we saw was half the old one, half the new.
+            failed = before
 
 
 def _open(paths: ReferencePaths, rebuild: Callable[[RoadNetwork], IndexParts] | None) -> IndexParts:

@@ -235,6 +235,21 @@ def test_readers_are_not_disturbed_by_a_writer(tmp_path: Path) -> None:
     assert min(n_opened.values()) > 0
 
 
+def test_an_index_that_comes_and_goes_while_it_is_opened(
+    tmp_path: Path, network: RoadNetwork, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """A writer publishes the index of one reference and takes it away for the next: the files look untouched."""
+    path = tmp_path / "grid.gpkg"
+    write_network(path, network)
+
+    def read_and_lose(file: Path) -> RoadNetwork:
+        monkeypatch.undo()
+        raise IndexFormatError(f"{file} was replaced while it was read; try again")
+
+    monkeypatch.setattr("roadgeo.io_reference.read_network", read_and_lose)
+    np.testing.assert_array_equal(open_reference(path, kill_writers.parts)[1]["xy"], network.intersections.xy)
+
+
 def test_a_name_is_needed_by_nobody(tmp_path: Path, network: RoadNetwork) -> None:
     bare = replace(network, meta={})
     write_reference(tmp_path / "bare", bare, ({}, {}))
