@@ -156,7 +156,7 @@ def refine(
     pairs = (scene.intersections.xy[chosen] - center) / half_size
     normal = np.empty((8, 8))
     _, rms = adjust(
-        p, unit, origin[0], origin[1], points, scene.directions[::step], _cells(points, options),
+        p, unit, origin[0], origin[1], points, np.ascontiguousarray(scene.directions[::step]), _cells(points, options),
         min(1.0, _spacing(scene, unit) * step / options.correlation_m),
         pairs, (index.xy[matched[chosen]] - origin) / unit, _cells(pairs, options), options.intersection_weight,
         options.n_cells**2, options.least_share, options.max_radius_m + options.max_radius_px * gsd,

@@ -150,7 +150,7 @@ def chance_agreement(
     matched = np.empty(len(found), np.int64)
     distance = np.empty(len(found))
     thin = max(1, len(scene.points) // options.n_null_points)
-    points, directions = scene.points[::thin], scene.directions[::thin]
+    points, directions = (np.ascontiguousarray(array[::thin]) for array in (scene.points, scene.directions))
     out = np.empty(len(points))
     min_cos = math.cos(math.radians(options.max_turn_deg))
     roads = (index.segments, index.segment_starts, index.segment_ids, index.grid, index.shape)
