@@ -268,6 +268,16 @@ class Explanation:
     graph: RoadGraph
     stories: tuple[Story, ...]
 
+    @property
+    def nearest(self) -> Story:
+        """The story of the reference that the mask was located on, or else came nearest to it."""
+
+        def rank(story: Story) -> tuple[bool, float]:
+            best = max((place.log10_odds for place in story.places), default=-math.inf)
+            return self.location.located and story.reference == self.location.reference, best
+
+        return max(self.stories, key=rank)
+
     def to_dict(self) -> dict[str, Any]:
         """Plain values, ready for `json.dumps`; see the module's text."""
         location, scene = self.location, self.scene
@@ -325,7 +335,7 @@ def tell(
     )
     located = location.located
     entries = [*watched.scored, *([] if located else watched.without_limits())]
-    ranked = _distinct(watched, sorted(entries, key=lambda entry: -entry.log10_odds))[:_MAX_PLACES]
+    ranked = _distinct(watched, sorted(entries, key=lambda entry: _rank(entry, needed)))
     places = tuple(_describe(watched, entry, result, location, needed) for entry in ranked)
     starved = None if located else _starved(funnel, watched.refusals, result, needed)
     missing = () if located else tuple(_missing(scene, funnel, watched, result, places, needed))
@@ -333,10 +343,17 @@ def tell(
     return Story(index.name, result.stopped, needed, funnel, refusals, starved, missing, places)
 
 
+def _rank(entry: _Scored, needed: Needed) -> tuple[bool, float]:
+    """Sort by odds; what the camera refused comes last, unless nothing else kept it from being the answer."""
+    return bool(entry.fault) and entry.log10_odds < needed.log10_odds, -entry.log10_odds
+
+
 def _distinct(watched: WatchedEstimator, entries: Sequence[_Scored]) -> list[_Scored]:
     """Return the best entry of each place."""
     kept: list[_Scored] = []
     for entry in entries:
+        if kept and not math.isfinite(entry.log10_odds):
+            break
         if not any(watched.same(entry.model, other.model) for other in kept):
             kept.append(entry)
         if len(kept) == _MAX_PLACES:
@@ -392,7 +409,9 @@ def _why(
 ) -> str:
     """Say why a place is not the answer."""
     if entry.fault:
-        odds = f"; without that its log10 odds were {entry.log10_odds:.1f}" if math.isfinite(entry.log10_odds) else ""
+        odds = (
+            f"; without that its log10 odds were {_number(entry.log10_odds)}" if math.isfinite(entry.log10_odds) else ""
+        )
         return f"the camera: {entry.fault}{_limits(place, entry.fault)}{odds}"
     if not math.isfinite(entry.log10_odds):
         return "the fit does not converge to a place within the limits"
@@ -401,8 +420,13 @@ def _why(
     if entry.log10_odds >= needed.log10_odds:
         if result.score - entry.log10_odds < needed.margin:
             return f"fits as well as another place: the margin is below {needed.margin:g}"
-        return f"another place has log10 odds {result.score:.1f}"
-    return f"log10 odds {entry.log10_odds:.1f} of {needed.log10_odds:g} needed: {_weakest(place)}"
+        return f"another place has log10 odds {_number(result.score)}"
+    return f"log10 odds {_number(entry.log10_odds)} of {needed.log10_odds:g} needed: {_weakest(place)}"
+
+
+def _number(value: float) -> str:
+    """Write a number to one digit, and never -0.0."""
+    return f"{round(value, 1) + 0.0:.1f}"
 
 
 def _limits(place: RejectedPlace, fault: str) -> str:
@@ -448,7 +472,6 @@ _NOTHING = {
     "proposals": "nowhere on the map do two triples that share an intersection agree",
     "on_roads": "wherever triples agree, the roads around them do not",
     "survived": "whatever was followed outwards met too few intersections where they should be",
-    "verified": "no place was verified",
 }
 
 
@@ -467,12 +490,13 @@ def _missing(
     starved = _starved(funnel, watched.refusals, result, needed)
     if starved in _NOTHING:
         told.append(_NOTHING[starved])
-    if watched.refusals and starved != "margin":
+    if starved == "camera":
         reasons = ", ".join(f"{reason} ({times})" for reason, times in watched.refusals.most_common())
-        told.append(f"places that had grown were refused by the camera: {reasons}")
+        told.append(f"a camera: all places that grew are such as none sees, or none within the limits: {reasons}")
     best = places[0] if places else None
     if best is not None and best.why.startswith("the camera") and best.log10_odds >= needed.log10_odds:
-        told.append(f"the limits on the camera may be too narrow: the best place fails by them alone: {best.why}")
+        fault = best.why.removeprefix("the camera: ")
+        told.append(f"the limits on the camera may be too narrow: the best place fails by them alone: {fault}")
     elif best is not None and starved == "odds":
         told.append(f"evidence: at the best place {_weakest(best)}")
     if starved == "margin":

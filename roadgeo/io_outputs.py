@@ -96,7 +96,8 @@ def write_location(
     if not location.located:
         ours = PRODUCTS.values()
         products = (product.path(paths.folder, paths.stem, source.name) for product in (*ours, *chosen))
-        _remove([paths.footprint, paths.style, paths.geopackage, paths.overlay, paths.report, *products])
+        pages = [paths.report, paths.explanation, paths.explanation_picture]
+        _remove([paths.footprint, paths.style, paths.geopackage, paths.overlay, *pages, *products])
     with ExitStack() as files:
 
         def stage(path: Path) -> Path:

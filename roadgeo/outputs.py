@@ -74,6 +74,16 @@ class OutputPaths:
         return self._named("_report.html")
 
     @property
+    def explanation(self) -> Path:
+        """Why it was or was not located."""
+        return self._named("_explain.json")
+
+    @property
+    def explanation_picture(self) -> Path:
+        """The same to look at."""
+        return self._named("_explain.png")
+
+    @property
     def json(self) -> Path:
         """The `Location`."""
         return self._named("_location.json")

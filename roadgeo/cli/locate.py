@@ -20,9 +20,11 @@ from roadgeo.cli.parameters import CAMERA, NEAR, RANGE, Plugin, verbosity_option
 from roadgeo.wording import format_lonlat
 
 if TYPE_CHECKING:
+    from roadgeo.explanation import Explanation
     from roadgeo.grid import RoadMask
     from roadgeo.io_outputs import OutputOptions
     from roadgeo.location import Location
+    from roadgeo.outputs import OutputPaths
     from roadgeo.workflows import LocateOptions, Reference
 
 __all__ = ["Job", "Outcome", "locate_command", "make_options", "open_references", "pair_images"]
@@ -53,6 +55,7 @@ class Job:
     band: int | None = None
     plot: bool = False
     report: bool = False
+    explain: bool = False
     segmenter: str | None = None
     exif: bool = False
     skip_existing: bool = False
@@ -105,12 +108,14 @@ class Job:
 
         from roadgeo.io_outputs import write_location
         from roadgeo.outputs import output_paths
-        from roadgeo.workflows import locate
+        from roadgeo.workflows import explain, locate
 
         started = perf_counter()
         mask = self._read(task)
         read_seconds = perf_counter() - started
-        location = locate(mask, references, self._options(task, max(mask.shape)))
+        options = self._options(task, max(mask.shape))
+        explanation = explain(mask, references, options) if self.explain else None
+        location = locate(mask, references, options) if explanation is None else explanation.location
         location = replace(location, seconds=replace(location.seconds, open=open_seconds, read=read_seconds))
         reference = next((one for one in references if one.name == location.reference), references[0])
         attribution = str(reference.index.meta.get("attribution", ""))
@@ -125,6 +130,8 @@ class Job:
 
             write_report(paths.report, location, mask, reference.index, attribution, picture)
             files.append(paths.report)
+        if explanation is not None:
+            files += _write_explanation(explanation, mask, references, paths)
         text = describe(location)
         if picture and location.located:
             text += f"\n  drew {picture}, {_scale(picture, mask):g} times the mask's size"
@@ -209,6 +216,11 @@ def open_references(names: Iterable[str]) -> list[Reference]:
     "--report",
     is_flag=True,
     help="Also write MASK_report.html, to look at in a browser, located or not; needs no network.",
+)
+@click.option(
+    "--explain",
+    is_flag=True,
+    help="Also write MASK_explain.png and .json: how far the search got, the best rejected places, what was missing.",
 )
 @click.option(
     "--image",
@@ -300,6 +312,7 @@ def locate_command(
     as_json: bool,
     plot: bool,
     report: bool,
+    explain: bool,
     images: tuple[str, ...],
     products: tuple[str, ...],
     gcps: bool,
@@ -335,6 +348,7 @@ def locate_command(
       photo_mask_location.json   place, homography, odds; also written, with a reason, where nothing was found
       photo_mask_overlay.png     with --plot
       photo_mask_report.html     with --report: map, mask, residuals and numbers; also where nothing was found
+      photo_mask_explain.png     with --explain, and .json: why it was found there, or nowhere
 
     For several masks also roadgeo_summary.gpkg and roadgeo_summary.csv, all footprints in one, and with --report
     roadgeo_report.html, which lists them. What Ctrl-C cut short goes on with --skip-existing.
@@ -382,6 +396,7 @@ def locate_command(
         band,
         plot,
         report,
+        explain,
         segmenter,
         from_exif,
         skip_existing,
@@ -506,6 +521,19 @@ def _draw(location: Location, mask: RoadMask, reference: Reference, path: Path, 
     index = reference.index
     roads = index.plane.to_crs(index.segments.reshape(-1, 2).astype(float)).reshape(-1, 4)
     write_overlay(path, location, mask, roads, attribution)
+
+
+def _write_explanation(
+    explanation: Explanation, mask: RoadMask, references: Sequence[Reference], paths: OutputPaths
+) -> list[Path]:
+    from roadgeo.explanation_plot import write_explanation_picture
+    from roadgeo.files import write_text
+
+    told = explanation.nearest
+    reference = next((one for one in references if one.name == told.reference), references[0])
+    write_text(paths.explanation, json.dumps(explanation.to_dict(), indent=2, allow_nan=False) + "\n")
+    write_explanation_picture(paths.explanation_picture, explanation, mask, reference.index)
+    return [paths.explanation, paths.explanation_picture]
 
 
 def _list_reports(
