@@ -140,8 +140,8 @@ def _switched(flag: str) -> Callable[[Values, str], list[str]]:
     return lambda values, name: [flag] if values.get("Boolean", name) else []
 
 
-def _chosen(flag: str, words: list[str]) -> Callable[[Values, str], list[str]]:
-    return lambda values, name: [f"{flag}={words[i]}" for i in values.get("Enums", name)]
+def _chosen(flag: str) -> Callable[[Values, str], list[str]]:
+    return lambda values, name: [f"{flag}={word}" for word in values.get("EnumStrings", name)]
 
 
 def _crs(values: Values, name: str) -> list[str]:
@@ -170,13 +170,18 @@ def _lines(values: Values, name: str) -> list[str]:
 # --- kinds of parameters ----------------------------------------------------------------------------------------------
 
 
+def _maybe_unset(settings: dict[str, Any]) -> dict[str, Any]:
+    """Let a parameter that has no default be left out."""
+    return {"optional": "defaultValue" not in settings, **settings}
+
+
 def _number(flag: str, name: str, label: str, hint: str, **settings: Any) -> Option:
-    settings = {"type": QgsProcessingParameterNumber.Type.Double, "optional": True, **settings}
+    settings = {"type": QgsProcessingParameterNumber.Type.Double, **_maybe_unset(settings)}
     return Option(QgsProcessingParameterNumber, name, label, hint, _said(flag, "Double", "{:.12g}"), settings)
 
 
 def _integer(flag: str, name: str, label: str, hint: str, **settings: Any) -> Option:
-    settings = {"type": QgsProcessingParameterNumber.Type.Integer, "optional": True, **settings}
+    settings = {"type": QgsProcessingParameterNumber.Type.Integer, **_maybe_unset(settings)}
     return Option(QgsProcessingParameterNumber, name, label, hint, _said(flag, "Int"), settings)
 
 
@@ -188,10 +193,10 @@ def _switch(flag: str, name: str, label: str, hint: str) -> Option:
     return Option(QgsProcessingParameterBoolean, name, label, hint, _switched(flag), {"defaultValue": False})
 
 
-def _choice(flag: str, name: str, label: str, hint: str, words: dict[str, str], **settings: Any) -> Option:
-    """Make a choice among words of the command line, each with what the user reads."""
-    settings = {"options": list(words.values()), "optional": True, **settings}
-    return Option(QgsProcessingParameterEnum, name, label, hint, _chosen(flag, list(words)), settings)
+def _choice(flag: str, name: str, label: str, hint: str, words: list[str], **settings: Any) -> Option:
+    """Make a choice among words of the command line."""
+    settings = {"options": words, "usesStaticStrings": True, **_maybe_unset(settings)}
+    return Option(QgsProcessingParameterEnum, name, label, hint, _chosen(flag), settings)
 
 
 def _raster(name: str, label: str, hint: str) -> Option:
@@ -320,24 +325,17 @@ PICTURE = (
             "RESAMPLING",
             "Resampling",
             "How values between the image's pixels are found.",
-            {"nearest": "Nearest", "bilinear": "Bilinear", "cubic": "Cubic", "lanczos": "Lanczos"},
-            defaultValue=2,
+            ["nearest", "bilinear", "cubic", "lanczos"],
+            defaultValue="cubic",
         ),
         _choice(
             "--also",
             "PRODUCTS",
             "Also write",
-            "Further forms of the result.",
-            {
-                "points": "Control points for the QGIS Georeferencer (.points)",
-                "gcps": "The image's own pixels with control points (GeoTIFF)",
-                "vrt": "The same without copying pixels (GDAL virtual raster)",
-                "odm": "Control points for OpenDroneMap",
-                "worldfile": "World file of the result",
-                "geojson": "Footprint as GeoJSON",
-                "stac": "STAC Item",
-                "kmz": "Ground overlay for Google Earth (KMZ)",
-            },
+            "Further forms of the result: points, for the QGIS Georeferencer; gcps, the image's own pixels with "
+            "control points (GeoTIFF); vrt, the same without copying pixels; odm, for OpenDroneMap; worldfile; geojson, the "
+            "footprint; stac, an Item; kmz, for Google Earth.",
+            ["points", "gcps", "vrt", "odm", "worldfile", "geojson", "stac", "kmz"],
             allowMultiple=True,
         ),
     ),
@@ -388,9 +386,10 @@ ROADS = (
         "--kinds",
         "KINDS",
         "Which roads",
-        "Those that the masks show, where the data tell kinds apart.",
-        {"main": "Main roads", "drivable": "Public roads for cars", "vehicles": "All for vehicles", "all": "All"},
-        defaultValue=1,
+        "Those that the masks show, where the data tell kinds apart: main roads, public ones for cars (drivable), all "
+        "for vehicles, or all.",
+        ["main", "drivable", "vehicles", "all"],
+        defaultValue="drivable",
     ),
     *_fold(
         _switch("--tunnels", "TUNNELS", "Tunnels too", "A camera does not see them."),

@@ -6,7 +6,13 @@ import json
 from pathlib import Path
 from typing import Any
 
-from qgis.core import QgsProcessingContext, QgsProcessingException, QgsProcessingLayerPostProcessorInterface
+from qgis.core import (
+    QgsProcessingContext,
+    QgsProcessingException,
+    QgsProcessingLayerPostProcessorInterface,
+    QgsProcessingUtils,
+)
+from qgis.PyQt import sip
 
 from .runner import run
 from .settings import NOT_FOUND, locate_executable
@@ -25,8 +31,14 @@ class _Styler(QgsProcessingLayerPostProcessorInterface):
         layer.triggerRepaint()
 
 
-#: QGIS keeps no reference of its own.
-_STYLER = _Styler()
+#: QGIS deletes a styler with its context, but keeps no reference to what Python knows of it.
+_STYLERS: list[_Styler] = []
+
+
+def _new_styler() -> _Styler:
+    _STYLERS[:] = [styler for styler in _STYLERS if not sip.isdeleted(styler)]
+    _STYLERS.append(_Styler())
+    return _STYLERS[-1]
 
 
 class Session:
@@ -85,8 +97,9 @@ class Session:
         source = f"{path}|layername={layer}" if layer else str(path)
         project = self.context.project()
         if project is not None:
-            details = QgsProcessingContext.LayerDetails(title, project, title)
-            details.setPostProcessor(_STYLER)
+            hint = QgsProcessingUtils.LayerHint.Vector if layer else QgsProcessingUtils.LayerHint.Raster
+            details = QgsProcessingContext.LayerDetails(title, project, title, hint)
+            details.setPostProcessor(_new_styler())
             self.context.addLayerToLoadOnCompletion(source, details)
         return source
 
