@@ -19,7 +19,15 @@ if TYPE_CHECKING:
     from roadgeo.errors import RoadgeoError
     from roadgeo.grid import RoadMask
     from roadgeo.location import Location
-    from roadgeo.workflows import BuildOptions, LocateOptions, Reference, build_reference, locate, open_reference
+    from roadgeo.workflows import (
+        BuildOptions,
+        LocateOptions,
+        Reference,
+        build_reference,
+        explain,
+        locate,
+        open_reference,
+    )
 
 __all__ = [
     "BuildOptions",
@@ -30,6 +38,7 @@ __all__ = [
     "RoadgeoError",
     "__version__",
     "build_reference",
+    "explain",
     "locate",
     "open_reference",
 ]
@@ -42,6 +51,7 @@ _HOMES = {
     "RoadMask": "grid",
     "RoadgeoError": "errors",
     "build_reference": "workflows",
+    "explain": "workflows",
     "locate": "workflows",
     "open_reference": "workflows",
 }

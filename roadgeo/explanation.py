@@ -320,7 +320,8 @@ def tell(
         few = n < needed.intersections
         stats = location.stats
         funnel = Funnel(n, stats.tuples_sampled, 0, stats.candidates, 0, 0, stats.hypotheses, 0, stats.verified)
-        return Story(index.name, "", needed, funnel, {}, "intersections" if few else None, (location.reason,))
+        reasons = () if location.located else (location.reason,)
+        return Story(index.name, "", needed, funnel, {}, "intersections" if few else None, reasons)
     funnel = Funnel(
         n,
         len(set(watched.anchors)),
@@ -508,7 +509,7 @@ def _missing(
             f"intersections: {len(scene.intersections)} are seen; masks with fewer than {_USUAL_INTERSECTIONS} are"
             " seldom located"
         )
-    if best is not None and best.chance_measured and best.chance[1] > 0.5:
+    if best is not None and best.chance[1] > 0.5:
         told.append(f"variety: streets here are so alike that shifted copies meet {best.chance[1]:.0%} of the roads")
     if watched.near is not None and not places:
         told.append("perhaps the circle given is wrong: nothing outside it was tried")
