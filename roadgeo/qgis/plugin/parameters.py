@@ -333,8 +333,8 @@ PICTURE = (
             "PRODUCTS",
             "Also write",
             "Further forms of the result: points, for the QGIS Georeferencer; gcps, the image's own pixels with "
-            "control points (GeoTIFF); vrt, the same without copying pixels; odm, for OpenDroneMap; worldfile; geojson, the "
-            "footprint; stac, an Item; kmz, for Google Earth.",
+            "control points (GeoTIFF); vrt, the same without copying pixels; odm, for OpenDroneMap; worldfile; "
+            "geojson, the footprint; stac, an Item; kmz, for Google Earth.",
             ["points", "gcps", "vrt", "odm", "worldfile", "geojson", "stac", "kmz"],
             allowMultiple=True,
         ),
