@@ -7,6 +7,7 @@ import time
 from collections.abc import Iterator
 from dataclasses import dataclass, field
 from itertools import islice
+from typing import Protocol
 
 import numpy as np
 
@@ -20,7 +21,7 @@ from roadgeo.triples import Proposals, TripleOptions, propose
 from roadgeo.typing import FloatArray, IntArray
 from roadgeo.verification import Agreement, VerifyOptions, agreement, chance_agreement, log10_odds
 
-__all__ = ["GrowOptions", "Hypothesis", "MatchOptions", "TripleEstimator"]
+__all__ = ["GrowOptions", "Hypothesis", "MatchOptions", "Source", "Sweep", "TripleEstimator"]
 
 
 #: Matches that fix a homography: so many of a hypothesis' own are no evidence for it.
@@ -80,6 +81,19 @@ class GrowOptions:
     max_verified: int = 6
 
 
+class Source(Protocol):
+    """Where hypotheses come from: `Sweep` makes them of triples, `sources.PairSweep` of pairs."""
+
+    def proposals(
+        self, scene: Scene, index: ReferenceIndex, scale: tuple[float, float], min_ratio: float
+    ) -> Iterator[Proposals]:
+        """Yield what one query intersection after another may be, with the work it took, the most promising first.
+
+        `scale` = (least, greatest) root of the determinant of a proposed map, metres per pixel; `min_ratio` is the
+        least ratio of its singular values.
+        """
+
+
 @dataclass(frozen=True)
 class Sweep:
     """One pass over the query's anchors: how many, and how widely their triples are looked up."""
@@ -87,18 +101,25 @@ class Sweep:
     triples: TripleOptions
     max_anchors: int
 
+    def proposals(
+        self, scene: Scene, index: ReferenceIndex, scale: tuple[float, float], min_ratio: float
+    ) -> Iterator[Proposals]:
+        """Yield the proposals of the anchors (see `Source`)."""
+        anchors = propose(scene.intersections, scene.branches, scene.neighbours, index, scale, min_ratio, self.triples)
+        return islice(anchors, self.max_anchors)
+
 
 @dataclass(frozen=True)
 class MatchOptions:
     """Options of all stages of matching, nested."""
 
-    sweeps: tuple[Sweep, ...] = (
+    sweeps: tuple[Source, ...] = (
         Sweep(TripleOptions(), 40),
         Sweep(
             TripleOptions(
                 n_neighbours=12, codes_per_vertex=3, angle_tolerance_deg=10.0, max_hits=20_000, max_compared=2_000_000
             ),
-            50,
+            70,
         ),
     )
     grow: GrowOptions = field(default_factory=GrowOptions)
@@ -149,12 +170,8 @@ class TripleEstimator:
         scene, options = self.scene, self.options
         low, high = options.camera.gsd_m
         scale = (low / options.grow.max_scale_ratio, high * options.grow.max_scale_ratio)
-        for sweep in options.sweeps:
-            anchors = propose(
-                scene.intersections, scene.branches, scene.neighbours, self.index,
-                scale, options.grow.min_shape_ratio, sweep.triples,
-            )  # fmt: skip
-            for proposals in islice(anchors, sweep.max_anchors):
+        for source in options.sweeps:
+            for proposals in source.proposals(scene, self.index, scale, options.grow.min_shape_ratio):
                 self.n_tuples += proposals.n_tuples
                 self.n_candidates += proposals.n_hits
                 yield self._grow_all(proposals)

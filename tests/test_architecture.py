@@ -16,7 +16,7 @@ NAMES = {
     2: "grid road_kinds graph homography robust",
     3: "projection simplification vectorization voids intersections network updating warping view landscape",
     4: "tuples index",
-    5: "estimator verification refinement location pairs triples camera scene outputs explanation",
+    5: "estimator verification refinement location pairs sources triples camera scene outputs explanation",
     6: (
         "io_roads io_lines io_overpass io_raster io_exif io_vectorized io_index io_atomic io_network "
         "io_reference io_outputs io_products io_summary io_image files geopackage rtree truth styles library"
