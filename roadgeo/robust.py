@@ -48,8 +48,8 @@ class SearchOptions:
         No further round is begun, and no further model scored, after this time.
     """
 
-    accept: float = 6.0
-    margin: float = 3.0
+    accept: float = 8.0
+    margin: float = 4.0
     more_rounds: int = 25
     time_limit_s: float = 10.0
 

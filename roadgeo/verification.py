@@ -55,7 +55,7 @@ class VerifyOptions:
     shift_m: tuple[float, float] = (30.0, 320.0)
     n_shifts: int = 150
     n_null_points: int = 150
-    saturation: float = 30.0
+    saturation: float = 60.0
     promising: float = 0.0
 
     @property

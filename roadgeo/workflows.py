@@ -262,8 +262,8 @@ class LocateOptions:
 
     method: Literal["auto", "pair"] = "auto"
     near: tuple[float, float, float] | None = None
-    min_log10_odds: float = 3.0
-    min_margin: float = 1.5
+    min_log10_odds: float = 3.5
+    min_margin: float = 2.0
     min_intersections: int = 6
     query: QueryOptions = field(default_factory=QueryOptions)
     match: MatchOptions = field(default_factory=MatchOptions)
