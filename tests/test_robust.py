@@ -92,7 +92,7 @@ def test_time_is_bounded(per_round):
     toy = Toy([models[i : i + per_round] for i in range(0, 100, per_round)], seconds=0.005)
     started = time.perf_counter()
     result = search(toy, SearchOptions(time_limit_s=0.03))
-    assert time.perf_counter() - started < 0.3
+    assert time.perf_counter() - started < 2.0
     assert result.stopped == "time"
     assert 0 < result.n_scored < 50
     assert result.n_scored == len(toy.scored)
