@@ -5,6 +5,7 @@ import configparser
 import json
 import os
 import re
+import shlex
 import shutil
 import signal
 import subprocess
@@ -247,9 +248,9 @@ class Qgis:
     folder: Path
     environ: dict[str, str]
 
-    def tool(self, *arguments: str) -> subprocess.CompletedProcess[str]:
+    def tool(self, *arguments: str, folder: Path | None = None) -> subprocess.CompletedProcess[str]:
         """Run `qgis_process`."""
-        return self._run([self.process, *arguments])
+        return self._run([self.process, *arguments], folder)
 
     def ask(self, *tasks: tuple[str, dict]) -> tuple[list, list[str], str]:
         """Do tasks of `qgis_child`: what they return, QGIS's warnings, and what was printed as an error."""
@@ -262,11 +263,9 @@ class Qgis:
         printed = "".join(line for line in done.stderr.splitlines(True) if "setapi() is deprecated" not in line)
         return document["answers"], document["warnings"], printed
 
-    def _run(self, command: list[str]) -> subprocess.CompletedProcess[str]:
-        environ = {**self.environ, "QT_QPA_PLATFORM": "offscreen"}
-        return subprocess.run(
-            command, capture_output=True, text=True, env=environ, cwd=self.folder, timeout=240, check=False
-        )
+    def _run(self, command: list[str], folder: Path | None = None) -> subprocess.CompletedProcess[str]:
+        settings = {"env": self.environ, "cwd": folder or self.folder, "timeout": 240}
+        return subprocess.run(command, capture_output=True, text=True, check=False, **settings)
 
 
 def find_qgis() -> tuple[str, str] | None:
@@ -296,6 +295,7 @@ def qgis(tmp_path_factory: pytest.TempPathFactory) -> Qgis:
     }
     own = {
         "QGIS_CUSTOM_CONFIG_PATH": str(folder / "config"),
+        "QT_QPA_PLATFORM": "offscreen",
         "XDG_RUNTIME_DIR": str(runtime),
         "ROADGEO_LIBRARY": str(folder / "library"),
         "LANG": "C.UTF-8",
@@ -470,6 +470,34 @@ def test_every_output_opens_without_a_word(qgis: Qgis, porto: Path, located: Pat
     assert warnings == []
     assert printed == ""
     assert main(["check", str(porto)]) == 0  # QGIS changes a GeoPackage's bytes; the reference is sound all the same
+
+
+def test_the_page_about_it_runs_as_it_stands(qgis: Qgis, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.chdir(tmp_path)
+    monkeypatch.setenv("QGIS_CUSTOM_CONFIG_PATH", str(tmp_path / "config"))
+    (tmp_path / "config" / "profiles" / "surveys").mkdir(parents=True)
+    shutil.copy(ROADS, "streets.gpkg")
+    shutil.copy(MASKS["drone"].path, "photo_mask.png")
+    page = (Path(__file__).parent.parent / "docs" / "qgis.md").read_text("utf-8")
+    lines = [
+        line
+        for block in re.findall(r"^```bash\n(.*?)^```$", page, re.DOTALL | re.MULTILINE)
+        for line in block.splitlines()
+    ]
+    for program, *arguments in map(shlex.split, lines):
+        if program == "roadgeo":
+            assert main(arguments) == 0
+        else:
+            done = qgis.tool(*arguments, folder=tmp_path)
+            assert done.returncode == 0, done.stderr
+    assert {path.name for path in tmp_path.iterdir()} >= {
+        "roadgeo_qgis.zip",
+        "city.gpkg",
+        "city.index",
+        "found",
+        "seen",
+    }
+    assert (tmp_path / "found" / "photo_mask_footprint.tif").exists()
 
 
 # --- what QGIS makes of it --------------------------------------------------------------------------------------------

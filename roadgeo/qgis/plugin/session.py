@@ -99,6 +99,7 @@ class Session:
         if project is not None:
             hint = QgsProcessingUtils.LayerHint.Vector if layer else QgsProcessingUtils.LayerHint.Raster
             details = QgsProcessingContext.LayerDetails(title, project, title, hint)
+            details.forceName = True
             details.setPostProcessor(_new_styler())
             self.context.addLayerToLoadOnCompletion(source, details)
         return source
