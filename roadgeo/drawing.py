@@ -81,9 +81,19 @@ NOISE_MODELS = {
 
 
 def draw_mask(
-    landscape: Landscape, view: View, noise: NoiseModel, road_width_m: Range, rng: np.random.Generator
+    landscape: Landscape,
+    view: View,
+    noise: NoiseModel,
+    road_width: Range,
+    rng: np.random.Generator,
+    in_pixels: bool = False,
 ) -> tuple[AnyArray, dict[str, Any]]:
     """Draw what a camera sees, and what a segmenter makes of it.
+
+    Parameters
+    ----------
+    road_width : range
+        Of a street, in metres, so that it looks narrower farther off; or in pixels, the same everywhere in the frame.
 
     Returns
     -------
@@ -98,8 +108,8 @@ def draw_mask(
     gone = _pick(strokes.street, strokes.length, rng.uniform(*noise.outdated), rng)
     missing = _pick(strokes.piece, np.where(gone, 0.0, strokes.length), rng.uniform(*noise.missing), rng)
 
-    canvas = _Canvas(np.zeros(view.size_px[::-1], np.uint8), view, strokes, road_width_m, rng)
-    _draw_streets(canvas, ~gone & ~missing, rng.uniform(*road_width_m, landscape.graph.n_edges))
+    canvas = _Canvas(np.zeros(view.size_px[::-1], np.uint8), view, strokes, road_width, in_pixels, rng)
+    _draw_streets(canvas, ~gone & ~missing, rng.uniform(*road_width, landscape.graph.n_edges))
     n_intersections = _count_intact(canvas, visible_intersections(landscape, view))
     new = _draw_new_streets(canvas, rng.uniform(*noise.outdated) * total)
     false = _draw_false_roads(canvas, rng.uniform(*noise.false_roads) * total)
@@ -123,7 +133,8 @@ class _Canvas:
     mask: AnyArray
     view: View
     strokes: Strokes
-    road_width_m: Range
+    road_width: Range
+    in_pixels: bool
     rng: np.random.Generator
 
     def line(self, pixels: FloatArray, width_px: float) -> None:
@@ -132,9 +143,13 @@ class _Canvas:
         points = np.round((pixels - 0.5) * 16).astype(np.int32).reshape(-1, 1, 2)
         cv2.polylines(self.mask, [points], False, 255, max(round(width_px), 3), cv2.LINE_8, 4)
 
+    def metres_per_unit(self, pixels: FloatArray) -> FloatArray:
+        """(...,) what a road's width at (..., 2) pixels is divided by to have it in pixels."""
+        return np.ones(pixels.shape[:-1]) if self.in_pixels else self.view.sampling(pixels)
+
     def some_width(self) -> float:
         """Width of a street, pixels, at the frame's sampling."""
-        return self.rng.uniform(*self.road_width_m) / self.view.gsd_m
+        return self.rng.uniform(*self.road_width) / (1.0 if self.in_pixels else self.view.gsd_m)
 
     def some_pixel(self, on_road: float) -> FloatArray:
         """(2,) a pixel of a road with probability `on_road`, else from anywhere in the frame."""
@@ -156,7 +171,7 @@ def _pick(group: IntArray, length: FloatArray, share: float, rng: np.random.Gene
     return picked[member] & (length > 0)
 
 
-def _draw_streets(canvas: _Canvas, kept: BoolArray, widths_m: FloatArray) -> None:
+def _draw_streets(canvas: _Canvas, kept: BoolArray, widths: FloatArray) -> None:
     """Draw each unbroken run of kept strokes of a piece as one line, as wide as its street at its middle."""
     strokes = canvas.strokes
     chosen = np.flatnonzero(kept)
@@ -165,14 +180,14 @@ def _draw_streets(canvas: _Canvas, kept: BoolArray, widths_m: FloatArray) -> Non
     broken = np.not_equal(np.diff(chosen), 1) | np.not_equal(np.diff(strokes.piece[chosen]), 0)
     for run in np.split(chosen, np.flatnonzero(broken) + 1):
         middle = run[len(run) // 2]
-        width = widths_m[strokes.street[middle]] / float(canvas.view.sampling(strokes.start[middle]))
+        width = widths[strokes.street[middle]] / float(canvas.metres_per_unit(strokes.start[middle]))
         canvas.line(np.vstack([strokes.start[run], strokes.end[run[-1:]]]), width)
 
 
 def _count_intact(canvas: _Canvas, pixels: FloatArray) -> int:
     """How many of the intersections at (K, 2) pixels show three branches: road runs on a circle around each."""
     view = canvas.view
-    radius = 1.5 * np.maximum(np.mean(canvas.road_width_m) / view.sampling(pixels), 3.0) + 5.0
+    radius = 1.5 * np.maximum(np.mean(canvas.road_width) / canvas.metres_per_unit(pixels), 3.0) + 5.0
     angle = np.linspace(0.0, 2 * np.pi, 180, endpoint=False)
     ring = pixels[:, None] + radius[:, None, None] * np.stack([np.cos(angle), np.sin(angle)], axis=-1)
     column, row = np.clip(ring.astype(int), 0, np.array(view.size_px) - 1).transpose(2, 0, 1)

@@ -11,8 +11,8 @@ searches      one for each reference, in the order in which they were searched:
               `reference`, `stopped` ("accepted", "exhausted", "time", or "" where there was nothing to search for),
               `needed` (the least log10 odds and margin)
 
-              `funnel`, what went into and came out of each stage: `anchors` (intersections tried), `triples` of the
-              mask looked up, `alike` (triples of the map like them), `proposals` (places on which several agree),
+              `funnel`, what went into and came out of each stage: `anchors` (intersections tried), `tuples` of the
+              mask looked up, `candidates` (tuples of the map like them), `proposals` (places on which several agree),
               `on_roads` (those that put the roads around the anchor on roads), `grown` (followed outwards), `survived`
               (not given up on the way), `verified` (different ones, refined and compared with the map), `measured`
               (promising ones for which chance was measured on the spot)
@@ -163,8 +163,8 @@ class Funnel:
 
     intersections: int = 0
     anchors: int = 0
-    triples: int = 0
-    alike: int = 0
+    tuples: int = 0
+    candidates: int = 0
     proposals: int = 0
     on_roads: int = 0
     grown: int = 0
@@ -455,7 +455,7 @@ def _weakest(place: RejectedPlace) -> str:
 
 def _starved(funnel: Funnel, refusals: Counter[str], result: SearchResult[Hypothesis], needed: Needed) -> str:
     """Return the first stage that nothing came out of."""
-    stages = ("intersections", "anchors", "triples", "alike", "proposals", "on_roads", "survived", "verified")
+    stages = ("intersections", "anchors", "tuples", "candidates", "proposals", "on_roads", "survived", "verified")
     empty = next((stage for stage in stages if getattr(funnel, stage) == 0), None)
     if empty == "verified" and refusals:
         return "camera"
@@ -467,11 +467,11 @@ def _starved(funnel: Funnel, refusals: Counter[str], result: SearchResult[Hypoth
 
 
 _NOTHING = {
-    "anchors": "no intersection has three neighbours and tangents that make usable triples",
-    "triples": "no intersection has three neighbours and tangents that make usable triples",
-    "alike": "no triple of the mask's intersections is like one of the map's",
-    "proposals": "nowhere on the map do two triples that share an intersection agree",
-    "on_roads": "wherever triples agree, the roads around them do not",
+    "anchors": "no intersection has three neighbours and tangents that make usable tuples",
+    "tuples": "no intersection has three neighbours and tangents that make usable tuples",
+    "candidates": "no tuple of the mask's intersections is like one of the map's",
+    "proposals": "nowhere on the map do two tuples that share an intersection agree",
+    "on_roads": "wherever tuples agree, the roads around them do not",
     "survived": "whatever was followed outwards met too few intersections where they should be",
 }
 

@@ -50,8 +50,8 @@ _CAPTION = 132  # height of what is written below a place
 _STAGES = {
     "intersections": "intersections seen",
     "anchors": "tried as anchors",
-    "triples": "triples looked up",
-    "alike": "like them on the map",
+    "tuples": "tuples looked up",
+    "candidates": "like them on the map",
     "proposals": "places where several agree",
     "on_roads": "with roads around them",
     "grown": "followed outwards",

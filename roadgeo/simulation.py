@@ -55,6 +55,8 @@ class ViewOptions:
         Least and greatest number of intersections that the frame must show with three branches or more.
     road_width_m : range
         Width of a street as drawn.
+    road_width_px : range or None
+        Where given, streets are drawn so wide instead, near and far alike.
     """
 
     size_px: tuple[int, int] = (1500, 1500)
@@ -65,6 +67,7 @@ class ViewOptions:
     focal_px: float | None = None
     intersections: tuple[int, int] = (30, 1_000_000)
     road_width_m: Range = (8.0, 11.0)
+    road_width_px: Range | None = None
 
 
 @dataclass(frozen=True)
@@ -196,7 +199,9 @@ def _view_at(center: tuple[float, float], options: ViewOptions, rng: np.random.G
 def _draw_query(
     landscape: Landscape, view: View, options: SimulationOptions, k: int, rng: np.random.Generator
 ) -> SimulatedQuery:
-    mask, drawn = draw_mask(landscape, view, options.noise, options.view.road_width_m, rng)
+    in_pixels = options.view.road_width_px is not None
+    width = options.view.road_width_px or options.view.road_width_m
+    mask, drawn = draw_mask(landscape, view, options.noise, width, rng, in_pixels)
     matrix = landscape.plane.to_crs_matrix() @ view.homography.matrix
     truth = Truth(
         file=f"{options.kind}/q_{k:04d}.png",

@@ -2,6 +2,7 @@
 
 from dataclasses import replace
 
+import cv2
 import numpy as np
 import pytest
 from towns import lattice_town
@@ -84,3 +85,12 @@ def test_a_view_without_roads_is_black():
     assert mask.shape == (60, 50)
     assert not mask.any()
     assert drawn["n_intersections"] == 0
+
+
+@pytest.mark.parametrize(("in_pixels", "low", "high"), [(False, 1.3, 3.0), (True, 0.9, 1.1)])
+def test_roads_grow_narrower_farther_off_unless_asked_otherwise(in_pixels, low, high):
+    steep = make_view((550.0, 550.0), (600, 600), 1.0, 40.0)
+    mask, _ = draw_mask(TOWN, steep, NoiseModel(), (10.0, 10.0), np.random.default_rng(0), in_pixels)
+    depth = cv2.distanceTransform(mask, cv2.DIST_L2, 5)
+    far, near = (float(np.mean(half[half > 0])) for half in (depth[:250], depth[350:]))
+    assert low < near / far < high
