@@ -605,7 +605,8 @@ def _best_of(found: Sequence[Location], options: LocateOptions) -> Location:
         refine=sum(one.seconds.refine for one in found),
     )
     if best.status == "not_located" and len(found) > 1:
-        return replace(best, seconds=seconds, reference=", ".join(one.reference for one in found))
+        names = ", ".join(one.reference for one in found)
+        return replace(best, seconds=seconds, reference=names, reason=f"{best.reason} (looked on {names})")
     rivals = [one for one in ranked[1:] if one.status == "located" and _far_apart(one, best)]
     if (
         rivals
