@@ -75,7 +75,7 @@ def test_an_interrupt_ends_the_workers(tmp_path: Path) -> None:
         "    def give_up(self, task, reason): pass\n"
         "if __name__ == '__main__':\n"
         "    try:\n"
-        "        for _ in run(name_tasks(['a', 'b', 'c']), Slow(), 2): print('one', flush=True)\n"
+        "        for _ in run(name_tasks('abcdef'), Slow(), 2): print('one', flush=True)\n"
         "    except KeyboardInterrupt:\n"
         "        sys.exit(130)\n"
     )
@@ -94,6 +94,7 @@ def test_an_interrupt_ends_the_workers(tmp_path: Path) -> None:
     assert process.returncode == 130
     assert err == ""
     assert (tmp_path / "b").exists()  # the worker was told, and cleaned up
+    assert not (tmp_path / "f").exists()  # and did not go on with what waited
     assert is_gone(process.pid)
 
 

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import glob
 import multiprocessing
+import os
 import signal
 import sys
 from collections import Counter
@@ -114,9 +115,9 @@ def _run_together(tasks: Sequence[Task], work: Work[Result], jobs: int) -> Itera
             for future in futures:
                 yield future.result()
         except BaseException:
-            pool.shutdown(wait=False, cancel_futures=True)
             for process in multiprocessing.active_children():
                 process.terminate()
+            pool.shutdown(cancel_futures=True)
             raise
 
 
@@ -131,4 +132,7 @@ def _start_worker(work: Work[object]) -> None:
 
 
 def _do(task: Task) -> Any:
-    return _prepared[0](task)
+    try:
+        return _prepared[0](task)
+    except SystemExit as end:  # the task has cleaned up; the pool would take this for its result, and go on
+        os._exit(int(end.code or 0))
