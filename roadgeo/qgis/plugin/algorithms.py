@@ -101,7 +101,8 @@ class BuildReference(RoadgeoAlgorithm):
     def work(self, values: Values, session: Session) -> dict[str, Any]:
         """Build it; load its roads and intersections."""
         path = values.get("FileOutput", "OUTPUT")
-        session.call("index", f"--out={path}", *self.arguments(values))
+        name = [f"--name={Path(path).stem}"] if values.given("ROADS") and not values.given("NAME") else []
+        session.call("index", f"--out={path}", *name, *self.arguments(values))
         for layer in ("coverage", "roads", "intersections"):
             session.show(Path(path), f"{Path(path).stem} {layer}", layer)
         return {"OUTPUT": path}

@@ -393,7 +393,7 @@ ROADS = (
     ),
     *_fold(
         _switch("--tunnels", "TUNNELS", "Tunnels too", "A camera does not see them."),
-        _text("--name", "NAME", "Name", "Name of the reference. Empty: after the place or file."),
+        _text("--name", "NAME", "Name", "Name of the reference. Empty: after the place, or else the result's file."),
         _text("--attribution", "ATTRIBUTION", "Attribution", "Whom to name beside the map; goes with road lines."),
     ),
     Option(

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import shlex
 from pathlib import Path
 from typing import Any
 
@@ -66,7 +67,7 @@ class Session:
         executable = locate_executable()
         if executable is None:
             raise QgsProcessingException(NOT_FOUND)
-        self.feedback.pushCommandInfo(" ".join([executable, *arguments]))
+        self.feedback.pushCommandInfo(shlex.join([executable, *arguments]))
         status = run([executable, *arguments], self._hear, self.feedback.isCanceled)
         if self.feedback.isCanceled():
             return []
