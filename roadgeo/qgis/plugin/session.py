@@ -20,8 +20,8 @@ from .settings import NOT_FOUND, locate_executable
 
 __all__ = ["Session"]
 
-#: Exit statuses of roadgeo that are no errors: all well, and something was not located.
-_WELL = (0, 3)
+#: Exit statuses of roadgeo: all well, and something was not located, which are no errors; an error.
+_WELL, _ERROR = (0, 3), 1
 
 
 class _Styler(QgsProcessingLayerPostProcessorInterface):
@@ -62,7 +62,7 @@ class Session:
         Raises
         ------
         QgsProcessingException
-            It is not there, or it failed; with `some_may_fail` only if it printed nothing.
+            It is not there, or it failed; with `some_may_fail` an error beside results is only shown.
         """
         executable = locate_executable()
         if executable is None:
@@ -71,7 +71,8 @@ class Session:
         status = run([executable, *arguments], self._hear, self.feedback.isCanceled)
         if self.feedback.isCanceled():
             return []
-        if status not in _WELL and not (some_may_fail and self.documents):
+        in_part = some_may_fail and status == _ERROR and self.documents
+        if status not in _WELL and not in_part:
             raise QgsProcessingException("\n".join(self.errors) or f"roadgeo ended with status {status}")
         for error in self.errors:
             self.feedback.reportError(error)
@@ -97,7 +98,7 @@ class Session:
         """Have a result loaded, with its style, when all is done; return what QGIS opens it by."""
         source = f"{path}|layername={layer}" if layer else str(path)
         project = self.context.project()
-        if project is not None:
+        if project is not None and not self.feedback.isCanceled():
             hint = QgsProcessingUtils.LayerHint.Vector if layer else QgsProcessingUtils.LayerHint.Raster
             details = QgsProcessingContext.LayerDetails(title, project, title, hint)
             details.forceName = True
