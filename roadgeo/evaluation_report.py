@@ -91,6 +91,8 @@ def render_report(evaluation: Evaluation, truths: Sequence[Truth], title: str) -
 
 
 def _text(value: object) -> str:
+    if isinstance(value, list | tuple):
+        return " ".join(_text(part) for part in value)
     return f"{value:g}" if isinstance(value, float) else str(value)
 
 
@@ -141,7 +143,7 @@ def _summary_table(table: Sequence[Summary]) -> str:
             _spread(group.compute_s, 1000, 0),
         ]
         if absent:
-            cells.append(_percent(group.refused))
+            cells.append(f"{group.refused.hits}/{group.refused.of}" if group.refused.of else "–")
         rows.append("<tr>" + "".join(f"<td>{cell}</td>" for cell in cells) + "</tr>")
     head = "".join(f"<th>{name}</th>" for name in heads)
     return f'<div class="scroll"><table><thead><tr>{head}</tr></thead><tbody>{"".join(rows)}</tbody></table></div>'
