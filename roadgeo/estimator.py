@@ -119,7 +119,7 @@ class MatchOptions:
             TripleOptions(
                 n_neighbours=12, codes_per_vertex=3, angle_tolerance_deg=10.0, max_hits=20_000, max_compared=2_000_000
             ),
-            50,
+            70,
         ),
     )
     grow: GrowOptions = field(default_factory=GrowOptions)
