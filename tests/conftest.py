@@ -1,14 +1,22 @@
 """Fixtures shared by all tests."""
 
 import os
+import signal
 from pathlib import Path
 from typing import TYPE_CHECKING
 
 import pytest
+from hypothesis import settings
 
 if TYPE_CHECKING:
     from roadgeo.index import ReferenceIndex
     from roadgeo.network import RoadNetwork
+
+# Whoever starts the tests in the background hands down an ignored SIGINT, and with it children that Ctrl-C cannot stop.
+signal.signal(signal.SIGINT, signal.default_int_handler)
+# The same examples in every run: what a random one finds once is no reason for another change to fail.
+settings.register_profile("steady", derandomize=True, deadline=None)
+settings.load_profile("steady")
 
 
 @pytest.fixture(scope="session")
