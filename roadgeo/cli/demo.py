@@ -35,7 +35,8 @@ def demo_command(out_dir: str) -> int:
     """Show the whole way on real data: build a reference, locate masks, write every output, compare with the truth.
 
     The map is a piece of Porto from OpenStreetMap. Four masks show parts of it as cameras and a road segmenter would;
-    the fifth shows another city and has to be refused.
+    the fifth shows another city and has to be refused. Roads, masks and a photograph are put beside the results, to go
+    on with: docs/tutorial.md does.
 
     \b
     Examples:
@@ -47,13 +48,16 @@ def demo_command(out_dir: str) -> int:
     from roadgeo.cli.folders import make_folder
     from roadgeo.cli.index import build
     from roadgeo.cli.locate import Job
-    from roadgeo.demo import ATTRIBUTION, ROADS, demo_masks
+    from roadgeo.demo import ATTRIBUTION, PHOTO, ROADS, demo_masks
+    from roadgeo.files import write_bytes
     from roadgeo.io_outputs import OutputOptions
     from roadgeo.io_roads import read_roads
     from roadgeo.workflows import LocateOptions
 
-    folder = Path(out_dir)
-    make_folder(out_dir)
+    folder, masks = Path(out_dir), demo_masks()
+    make_folder(folder / "masks")
+    for source, name in [(ROADS, ROADS.name), (PHOTO, PHOTO.name), *((m.path, f"masks/{m.path.name}") for m in masks)]:
+        write_bytes(folder / name, source.read_bytes())
     started = perf_counter()
     reference = build(read_roads(ROADS, attribution=ATTRIBUTION), folder / "porto.gpkg", "porto")
     seconds = perf_counter() - started
@@ -62,14 +66,14 @@ def demo_command(out_dir: str) -> int:
     job = Job((str(folder / "porto.gpkg"),), LocateOptions(), OutputOptions(), out_dir, plot=True)
     locate = job.prepare()
     wrong = 0
-    for mask in demo_masks():
+    for mask in masks:
         outcome = locate(Task(str(mask.path), mask.path.stem))
         right, text = _judge(outcome, mask)
         wrong += not right
         click.echo(f"\n{mask.path.name}: {mask.title}\n  {text}")
     click.echo(
         f"\nLook at {folder / 'drone_overlay.png'}. In QGIS, open {folder / 'drone_footprint.tif'} and "
-        f"{folder / 'drone_location.gpkg'} over {folder / 'porto.gpkg'}."
+        f"{folder / 'drone_location.gpkg'} over {folder / 'porto.gpkg'}. The masks are in {folder / 'masks'}."
     )
     if wrong:
         click.echo(f"Error: {wrong} masks came out wrong; please report it", err=True)

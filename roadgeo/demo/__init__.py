@@ -10,12 +10,14 @@ import numpy as np
 
 from roadgeo.typing import FloatArray
 
-__all__ = ["ATTRIBUTION", "ROADS", "DemoMask", "demo_masks"]
+__all__ = ["ATTRIBUTION", "PHOTO", "ROADS", "DemoMask", "demo_masks"]
 
 _DATA = Path(__file__).parent / "data"
 
 #: Roads around the centre of Porto, as OpenStreetMap has them.
 ROADS = _DATA / "porto_roads.gpkg"
+#: What the mask `drone.png` was made of: painted, see `paint_photo`.
+PHOTO = _DATA / "drone_photo.jpg"
 ATTRIBUTION = "© OpenStreetMap contributors, ODbL 1.0"
 
 
