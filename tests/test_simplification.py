@@ -2,13 +2,13 @@ import naive_simplification as naive
 import numpy as np
 import pytest
 import shapely
-from hypothesis import given, settings
+from hypothesis import assume, example, given, settings
 from hypothesis import strategies as st
 from shapely.geometry import LineString, MultiLineString
 
 from roadgeo.graph import RoadGraph
 from roadgeo.kernels import simplification as kernels
-from roadgeo.simplification import SimplifyOptions, _walk_faces, coverage, planarize, simplify
+from roadgeo.simplification import SimplifyOptions, _keep_edges, _walk_faces, coverage, planarize, simplify
 
 
 def network(*lines):
@@ -381,22 +381,26 @@ def test_a_run_ends_where_a_gap_opens():
 
 @settings(max_examples=100, deadline=None)
 @given(lines, st.floats(5, 40))
+@example([[(0, 95), (139, 118), (0, 75)], [(125, 52), (142, 150)]], 5.0)  # half a square metre, but for rounding
 def test_narrow_faces_agree_with_their_twin(drawn, width):
-    whole = network(*drawn).polylines()
-    _, cuts, dangles, _ = shapely.polygonize_full([LineString(line) for line in whole])
-    loose = shapely.get_parts(shapely.union(cuts, dangles))
-    closed = [line for line in whole if not any(LineString(line).equals(part) for part in loose)]
-    graph = planarize([LineString(line) for line in closed])
-    if graph.n_edges == 0:
+    whole = network(*drawn)
+    lines = np.array([LineString(line) for line in whole.polylines()], object)
+    _, cuts, dangles, _ = shapely.polygonize_full(lines)
+    loose = shapely.get_parts(shapely.get_parts([cuts, dangles]))  # the twin knows no dead ends in a face
+    closed = np.array([not line.equals(loose).any() for line in lines], bool)
+    if not closed.any():
         return
+    graph, lines = _keep_edges(whole, closed), lines[closed]
     follow, area = _walk_faces(graph)
     face = kernels.narrow_faces(follow, area, graph.edge_lengths(), width, 200.0)
     found = [
         (area[face == first].sum(), graph.edge_lengths()[np.flatnonzero(face == first) // 2].sum())
         for first in np.unique(face[face >= 0])
     ]
-    expected = naive.narrow_faces([LineString(line) for line in graph.polylines()], width, 200.0)
-    seen, wanted = (
-        np.sort([f for f in faces if f[0] > 0.5] or np.empty((0, 2)), axis=0) for faces in (found, expected)
+    for size, perimeter in naive.narrow_faces(lines, np.inf, np.inf):  # at a limit, rounding decides
+        assume(abs(2 * size - width * perimeter) > 1e-6 and abs(perimeter - 200.0) > 1e-6)
+    seen, wanted = (  # slivers of rounding aside; on a grid of 0.1 m, areas are multiples of 0.005
+        np.sort([face for face in faces if face[0] > 0.4975] or np.empty((0, 2)), axis=0)
+        for faces in (found, naive.narrow_faces(lines, width, 200.0))
     )
-    np.testing.assert_allclose(seen, wanted, rtol=1e-6)  # slivers of rounding aside
+    np.testing.assert_allclose(seen, wanted, rtol=1e-6)
