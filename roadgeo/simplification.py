@@ -7,7 +7,7 @@ the skeleton of a mask, what the width of the roads does to both.
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from typing import TYPE_CHECKING, Any
 
@@ -76,7 +76,16 @@ def planarize(lines: Sequence[LineString] | Any, grid_m: float = 0.1) -> RoadGra
     edges = inverse.reshape(-1, 2).astype(np.int32)
     coords[at_ends] = ends[first][edges.ravel()]
     specks = (edges[:, 0] == edges[:, 1]) & (shapely.length(parts) < 2 * grid_m)
-    return _keep_edges(RoadGraph(ends[first], edges, coords, offsets), ~specks)
+    return _keep_edges(RoadGraph(ends[first], edges, coords, offsets), ~(specks | _repeated(edges, offsets)))
+
+
+def _repeated(edges: Int32Array, offsets: IntArray) -> BoolArray:
+    """Tell which straight edges join the same two nodes as one before them: they differed by rounding only."""
+    straight = np.flatnonzero(np.diff(offsets) == 2)
+    _, first = np.unique(np.sort(edges[straight], axis=1), axis=0, return_index=True)
+    repeated = np.zeros(len(edges), bool)
+    repeated[np.delete(straight, first)] = True
+    return repeated
 
 
 def _rounded(lines: Sequence[LineString] | Any, grid: float) -> AnyArray:
@@ -137,13 +146,17 @@ def coverage(graph: RoadGraph, cell_m: float = 300.0) -> list[FloatArray]:
     return [shapely.get_coordinates(ring) for ring in rings]
 
 
-def simplify(graph: RoadGraph, options: SimplifyOptions | None = None) -> RoadGraph:
+def simplify(
+    graph: RoadGraph, options: SimplifyOptions | None = None, advance: Callable[[float], None] = lambda _: None
+) -> RoadGraph:
     """Join chains, merge intersections, fuse parallel roads and drop stubs until nothing changes.
 
     Parameters
     ----------
     graph : RoadGraph
         Noded: roads meet only at nodes.
+    advance : callable, optional
+        Told the share that is done, at most.
 
     Returns
     -------
@@ -152,9 +165,11 @@ def simplify(graph: RoadGraph, options: SimplifyOptions | None = None) -> RoadGr
     """
     options = options or SimplifyOptions()
     graph = _join_chains(graph)
-    for _ in range(options.max_passes):
+    steps = _close_narrow_faces, _merge_intersections, _fuse_parallels, _drop_stubs
+    for n_passes in range(options.max_passes):
         before = graph.n_nodes, graph.n_edges
-        for step in (_close_narrow_faces, _merge_intersections, _fuse_parallels, _drop_stubs):
+        for n_steps, step in enumerate(steps):
+            advance((n_passes + n_steps / len(steps)) / options.max_passes)
             changed = step(graph, options)
             graph = graph if changed is graph else _join_chains(changed)
         if (graph.n_nodes, graph.n_edges) == before:

@@ -100,7 +100,17 @@ def runs(mates):
     return found
 
 
+def outer_rings(face):
+    """The outer ring of a face, then the holes that hang on it by a node: one walks around them too."""
+    rings, holes = [face.exterior], list(face.interiors)
+    while hanging := [hole for hole in holes if any(hole.intersects(ring) for ring in rings)]:
+        rings += hanging
+        holes = [hole for hole in holes if hole not in hanging]
+    return rings
+
+
 def narrow_faces(lines, width, longest):
     """Area and perimeter of the inner faces of noded lines that are small and narrow."""
-    faces = [(Polygon(f.exterior).area, f.exterior.length) for f in get_parts(polygonize(lines))]
+    rings = [outer_rings(face) for face in get_parts(polygonize(lines))]
+    faces = [(2 * Polygon(r[0]).area - sum(Polygon(ring).area for ring in r), sum(x.length for x in r)) for r in rings]
     return sorted(f for f in faces if f[1] < longest and 2 * f[0] < width * f[1])
