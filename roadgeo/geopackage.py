@@ -9,7 +9,7 @@ from __future__ import annotations
 import os
 import sqlite3
 import struct
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import closing, contextmanager
 from dataclasses import dataclass, field
 from functools import lru_cache
@@ -92,8 +92,12 @@ def write_layers(path: str | os.PathLike[str], layers: Sequence[Layer]) -> None:
             raise OutputError(f"cannot write {path}: {error}; choose a folder that you may write to") from error
 
 
-def add_layers(database: sqlite3.Connection, layers: Sequence[Layer]) -> None:
+def add_layers(
+    database: sqlite3.Connection, layers: Sequence[Layer], advance: Callable[[float], None] = lambda _: None
+) -> None:
     """Make a GeoPackage of an empty database: for writers that add tables of their own to it.
+
+    `advance` is told which share of the rows is written.
 
     Raises
     ------
@@ -107,7 +111,9 @@ def add_layers(database: sqlite3.Connection, layers: Sequence[Layer]) -> None:
     srs_ids: dict[str, int] = {}
     for crs in dict.fromkeys(["EPSG:4326", *(layer.crs for layer in layers if layer.geometry_type)]):
         srs_ids[crs] = _add_srs(database, crs, _CUSTOM_SRS_ID + len(srs_ids))
-    for layer in layers:
+    n_rows = [max((len(column) for column in layer.columns.values()), default=0) for layer in layers]
+    for n, layer in enumerate(layers):
+        advance(sum(n_rows[:n]) / max(sum(n_rows), 1))
         _add_layer(database, layer, srs_ids.get(layer.crs, 0))
     styled = [layer for layer in layers if layer.style]
     if styled:

@@ -19,6 +19,7 @@ from roadgeo.kernels.buckets import nearest_neighbours
 from roadgeo.kernels.roads import bin_segments
 from roadgeo.kernels.triples import TABLE, fill_table
 from roadgeo.network import RoadNetwork
+from roadgeo.progress import Say, say_nothing
 from roadgeo.projection import LocalPlane
 from roadgeo.typing import AnyArray, Float32Array, FloatArray, Int32Array
 
@@ -270,7 +271,7 @@ def pack_tangents(tangents: Float32Array) -> AnyArray:
     return np.where(np.isnan(tangents), -1, np.round(np.nan_to_num(tangents) * (32767 / math.pi))).astype(np.int16)
 
 
-def build_index(network: RoadNetwork, options: IndexOptions | None = None) -> ReferenceIndex:
+def build_index(network: RoadNetwork, options: IndexOptions | None = None, say: Say = say_nothing) -> ReferenceIndex:
     """Index a road network.
 
     Raises
@@ -284,6 +285,8 @@ def build_index(network: RoadNetwork, options: IndexOptions | None = None) -> Re
     found = network.intersections
     if len(found) < 3:
         raise RoadSourceError(f"the roads have {len(found)} intersections, at least 3 are needed: take a larger area")
+    what = f"indexing {len(found):,} intersections"
+    say(what, 0.0)
     segments = _cut_segments(network.graph, options.simplify_m)
     grid, shape = neighbour_grid(found.xy, options.min_bucket_m)
     order, point_starts = sort_by_bucket(found.xy, grid, shape)
@@ -291,17 +294,20 @@ def build_index(network: RoadNetwork, options: IndexOptions | None = None) -> Re
     tangents = np.ascontiguousarray(found.tangents[order])
     neighbours = nearest_neighbours(xy, point_starts, grid, shape, options.n_neighbours)
 
+    say(what, 0.2)
     counts = np.zeros(shape[0] * shape[1] + 1, np.int64)
     total = bin_segments(segments, grid, shape, counts, np.empty(0, np.int32))
     segment_starts = np.cumsum(counts).astype(np.int32)
     segment_ids = np.empty(total, np.int32)
     bin_segments(segments, grid, shape, segment_starts.astype(np.int64), segment_ids)
 
+    say(what, 0.4)
     counts = np.zeros(TABLE + 1, np.int64)
     shape_limit = (options.min_shape, options.codes_per_vertex)
     total = fill_table(xy, tangents, neighbours, *shape_limit, counts, np.empty(0, np.uint64))
     table_starts = np.cumsum(counts)
     entries = np.empty(total, np.uint64)
+    say(what, 0.7)
     fill_table(xy, tangents, neighbours, *shape_limit, table_starts.copy(), entries)
 
     meta = {

@@ -7,10 +7,10 @@ osmnx's `.graphml`, GeoParquet, and everything else that GDAL reads (GeoPackage,
 from __future__ import annotations
 
 import warnings
-from collections.abc import Sequence
+from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import Any
+from typing import Any, BinaryIO
 
 import numpy as np
 
@@ -26,6 +26,9 @@ _OSM = (".osm.pbf", ".pbf", ".osm", ".osm.gz", ".osm.bz2", ".osm.xml")
 _PARQUET = (".parquet", ".geoparquet")
 _GRAPH = (".graphml",)
 _OTHER = (".gpkg", ".shp", ".geojson", ".geojsonl", ".fgb", ".gml", ".kml", ".sqlite", ".tab", ".mif", ".shz")
+
+#: PBF files are read in parts of about this size; what may stand in them at most, as their specification says.
+_PART, _MAX_BLOB, _MAX_BLOB_HEADER = 1 << 20, 32 << 20, 64 << 10
 
 #: Columns that may say what kind of road a line is: OpenStreetMap's, Geofabrik's, Overture's.
 _KIND_COLUMNS = ("highway", "fclass", "class")
@@ -78,7 +81,7 @@ def list_sources(path: Path) -> list[Path]:
     return found
 
 
-def read_lines(path: Path, layer: str | None = None) -> RoadLines:
+def read_lines(path: Path, layer: str | None = None, advance: Callable[[float], None] = lambda _: None) -> RoadLines:
     """Read all lines of a road file.
 
     Parameters
@@ -86,6 +89,8 @@ def read_lines(path: Path, layer: str | None = None) -> RoadLines:
     path : Path
     layer : str, optional
         Of a file with several; the one with lines by default.
+    advance : callable, optional
+        Told which share of a PBF file is read.
 
     Raises
     ------
@@ -96,7 +101,7 @@ def read_lines(path: Path, layer: str | None = None) -> RoadLines:
         raise RoadSourceError(f"{path}: no such file")
     name = path.name.lower()
     if name.endswith(_OSM):
-        read = _read_osm(path)
+        read = _read_osm(path, advance)
     elif name.endswith(_GRAPH):
         read = _read_graphml(path)
     elif name.endswith(_PARQUET):
@@ -108,7 +113,7 @@ def read_lines(path: Path, layer: str | None = None) -> RoadLines:
     return read
 
 
-def _read_osm(path: Path) -> RoadLines:
+def _read_osm(path: Path, advance: Callable[[float], None]) -> RoadLines:
     """Stream the ways with a `highway` tag out of an OpenStreetMap file."""
     import osmium
     import shapely
@@ -119,13 +124,10 @@ def _read_osm(path: Path) -> RoadLines:
     tunnel: list[str | None] = []
     broken = 0
     try:
-        with osmium.io.Reader(str(path)) as reader:
+        with osmium.io.Reader(str(path), osmium.osm.NOTHING) as reader:
             header = reader.header()
             timestamp = header.get("osmosis_replication_timestamp") or header.get("timestamp") or None
-        entities = osmium.osm.NODE | osmium.osm.WAY
-        ways = osmium.FileProcessor(str(path), entities).with_locations()
-        ways.with_filter(osmium.filter.EntityFilter(osmium.osm.WAY)).with_filter(osmium.filter.KeyFilter("highway"))
-        for way in ways:
+        for way in _highways(path, advance):
             tags = way.tags
             if tags.get("area") == "yes":
                 continue
@@ -145,6 +147,82 @@ def _read_osm(path: Path) -> RoadLines:
     return RoadLines(
         lines, "EPSG:4326", np.array(highway, object)[place], in_tunnel(np.array(tunnel, object))[place], meta
     )
+
+
+def _highways(path: Path, advance: Callable[[float], None]) -> Iterator[Any]:
+    """Yield the ways with a `highway` tag, which know where their nodes are."""
+    import osmium
+
+    pool = osmium.io.ThreadPool()
+    places = osmium.NodeLocationsForWays(osmium.index.create_map("flex_mem"))
+    places.ignore_errors()
+    wanted = osmium.filter.EntityFilter(osmium.osm.WAY), osmium.filter.KeyFilter("highway")
+    for part, share in _osm_parts(path):
+        with osmium.io.Reader(part, osmium.osm.NODE | osmium.osm.WAY, thread_pool=pool) as reader:
+            yield from osmium.OsmFileIterator(reader, places, *wanted)
+        advance(share)
+
+
+def _osm_parts(path: Path) -> Iterator[tuple[Any, float]]:
+    """Yield what osmium is to read one after another, and the share of the file that is read then.
+
+    A PBF file is a row of blobs, the first of them a header, each with a header of its own. It is cut between them,
+    for osmium does not tell how far it is. Other files are left whole.
+    """
+    import osmium
+
+    if not path.name.lower().endswith(".pbf"):
+        yield str(path), 1.0
+        return
+    size = path.stat().st_size
+    with path.open("rb") as file:
+        header = _read_blob(file)
+        while file.tell() < size:
+            part = bytearray()
+            while len(part) < _PART and file.tell() < size:
+                part += _read_blob(file)
+            yield osmium.io.FileBuffer(header + part, "pbf"), file.tell() / size
+
+
+def _read_blob(file: BinaryIO) -> bytes:
+    """Read one blob of a PBF file, the header before it, and the size of that before both.
+
+    Raises
+    ------
+    RuntimeError
+        As osmium does: it is cut off, or there is none.
+    """
+    prefix = file.read(4)
+    header = file.read(min(int.from_bytes(prefix, "big"), _MAX_BLOB_HEADER))
+    size = _blob_size(header)
+    blob = file.read(min(size, _MAX_BLOB))
+    if len(prefix) < 4 or len(header) != int.from_bytes(prefix, "big") or len(blob) != size:
+        raise RuntimeError("it is cut off, damaged or no PBF file")
+    return prefix + header + blob
+
+
+def _blob_size(header: bytes) -> int:
+    """Find the size of a blob in its header: field 3, a number, of a Protocol Buffers message; -1 where it is not."""
+    at = 0
+
+    def number() -> int:
+        nonlocal at
+        value = shift = 0
+        while at < len(header):
+            byte = header[at]
+            value |= (byte & 127) << shift
+            at, shift = at + 1, shift + 7
+            if byte < 128:
+                break
+        return value
+
+    while at < len(header):
+        field, kind = divmod(number(), 8)
+        value = number()
+        if field == 3 and kind == 0:
+            return value
+        at += value if kind == 2 else 0  # text, or an index that nobody needs
+    return -1
 
 
 def _way_shape(way: Any, factory: Any) -> str | None:

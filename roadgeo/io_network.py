@@ -28,6 +28,7 @@ from roadgeo.graph import RoadGraph
 from roadgeo.intersections import MAX_BRANCHES, Intersections
 from roadgeo.io_atomic import publish, staging
 from roadgeo.network import RoadNetwork
+from roadgeo.progress import Say, say_nothing
 from roadgeo.projection import LocalPlane
 from roadgeo.styles import draw_fill, draw_line, draw_marker
 from roadgeo.typing import AnyArray, Float32Array, FloatArray
@@ -125,7 +126,7 @@ def write_network(path: str | os.PathLike[str], network: RoadNetwork) -> None:
         publish(staged, path)
 
 
-def dump_network(path: Path, network: RoadNetwork) -> None:
+def dump_network(path: Path, network: RoadNetwork, say: Say = say_nothing) -> None:
     """Write a network to a new file, in place; for callers that stage it. A disk error is an `OSError`."""
     meta = _stored_meta(network)
     layers = [replace(layer, style=_with_aliases(layer.style, _ALIASES[layer.name])) for layer in _map_layers(network)]
@@ -138,7 +139,7 @@ def dump_network(path: Path, network: RoadNetwork) -> None:
     )
     try:
         with closing(sqlite3.connect(path)) as database:
-            add_layers(database, layers)
+            add_layers(database, layers, lambda share: say(f"writing {path.name}", share))
             database.executescript(
                 "".join(_TRIGGER.format(name=name, event=event) for name, event in _TRIGGERS.items())
             )

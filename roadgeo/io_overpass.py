@@ -16,7 +16,7 @@ import socket
 import sys
 import tempfile
 import time
-from collections.abc import Callable, Iterator
+from collections.abc import Iterator
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -27,6 +27,7 @@ import numpy as np
 from roadgeo._version import __version__
 from roadgeo.errors import RoadSourceError
 from roadgeo.io_lines import OSM_ATTRIBUTION, RoadLines, first_line
+from roadgeo.progress import Say, say_nothing
 from roadgeo.road_kinds import RoadKind, highways, in_tunnel
 from roadgeo.typing import AnyArray
 
@@ -80,7 +81,7 @@ def cache_dir() -> Path:
     return Path(os.environ.get("XDG_CACHE_HOME") or Path.home() / ".cache") / "roadgeo"
 
 
-def find_place(place: str, options: FetchOptions, say: Callable[[str], None] | None = None) -> tuple[Any, str]:
+def find_place(place: str, options: FetchOptions, say: Say = say_nothing) -> tuple[Any, str]:
     """Ask Nominatim for the outline of a place.
 
     Returns
@@ -117,9 +118,11 @@ def fetch_lines(
     which: RoadKind,
     tunnels: bool,
     options: FetchOptions,
-    say: Callable[[str], None] | None = None,
+    say: Say = say_nothing,
 ) -> RoadLines:
     """Ask Overpass for the roads of an area in degrees; ways are given in pieces between two of their nodes.
+
+    A large area is asked for in parts, each of which is kept as it comes: a later call fetches only what is missing.
 
     Raises
     ------
@@ -132,8 +135,10 @@ def fetch_lines(
     tags = '["highway"]' if kinds is None else f'["highway"~"^({"|".join(kinds)})$"]'
     tags += '["area"!~"yes"]' + ("" if tunnels else '["tunnel"!~"^(yes|avalanche_protector)$"]')
     query = json.dumps([area.wkt, tags, options.date, options.overpass_url])
-    with _asking(options, f"overpass-{hashlib.sha256(query.encode()).hexdigest()[:20]}", say) as folder:
-        graphs = [_network(part, tags) for part in _hemispheres(area)]
+    sides = _hemispheres(area)
+    asked, n_parts = hashlib.sha256(query.encode()).hexdigest()[:20], sum(map(_count_parts, sides))
+    with _asking(options, f"overpass-{asked}", say, n_parts) as folder:
+        graphs = [_network(side, tags) for side in sides]
         pieces = [_edges(graph) for graph in graphs if graph is not None]
         if not pieces:
             shutil.rmtree(folder, ignore_errors=True)
@@ -216,6 +221,18 @@ def _network(area: Any, tags: str) -> Any:
     return None
 
 
+def _count_parts(area: Any) -> int:
+    """Count the requests in which osmnx asks for the network of an area; 1 should it no longer tell."""
+    import osmnx as ox
+
+    plane, crs = ox.projection.project_geometry(area)
+    around, _ = ox.projection.project_geometry(plane.buffer(500.0), crs=crs, to_latlong=True)  # as osmnx does
+    try:
+        return len(ox._overpass._make_overpass_polygon_coord_strs(around))
+    except AttributeError:
+        return 1
+
+
 def _edges(graph: Any) -> tuple[AnyArray, AnyArray, AnyArray]:
     """Return the pieces of ways in an osmnx graph, each once: ends (P, 2, 2), highway (P,), tunnel (P,)."""
     place = {node: (data["x"], data["y"]) for node, data in graph.nodes(data=True)}
@@ -252,7 +269,7 @@ def _timestamp(folder: Path) -> str | None:
 
 
 @contextlib.contextmanager
-def _asking(options: FetchOptions, query: str, say: Callable[[str], None] | None) -> Iterator[Path]:
+def _asking(options: FetchOptions, query: str, say: Say, n_parts: int = 1) -> Iterator[Path]:
     """Set osmnx up for one query and yield the folder of its answers; what goes wrong becomes a `RoadSourceError`."""
     import osmnx as ox
     import requests
@@ -264,7 +281,6 @@ def _asking(options: FetchOptions, query: str, say: Callable[[str], None] | None
         "overpass_rate_limit": options.overpass_url == OVERPASS_URL,  # others have no slots to ask about
         "overpass_settings": "[out:json][timeout:{timeout}]{maxsize}" + _date_setting(options.date),
         "requests_timeout": options.timeout_s,
-        "requests_kwargs": {"hooks": {"response": _Patience(options, say)}},
         "doh_url_template": None,
         "http_user_agent": f"roadgeo/{__version__}",
         "http_referer": "roadgeo",
@@ -274,12 +290,13 @@ def _asking(options: FetchOptions, query: str, say: Callable[[str], None] | None
     lookup = socket.getaddrinfo
     with _answers(options, query) as folder:
         settings["cache_folder"] = str(folder)
-        before = {name: getattr(ox.settings, name) for name in settings}
+        before = {name: getattr(ox.settings, name) for name in (*settings, "requests_kwargs")}
         try:
+            counted = _Parts(host, n_parts, sum(1 for _ in folder.glob("*.json")), say)
+            settings["requests_kwargs"] = {"hooks": {"response": _Patience(options, say, counted)}}
             for name, value in settings.items():
                 setattr(ox.settings, name, value)
-            if say is not None and not any(folder.iterdir()):
-                say(f"asking {host}")
+            counted.tell()
             yield folder
         except requests.exceptions.Timeout as error:
             raise RoadSourceError(f"{host} did not answer within {options.timeout_s:g} s; try again later") from error
@@ -320,7 +337,11 @@ def _answers(options: FetchOptions, query: str) -> Iterator[Path]:
     except OSError:
         kept = False
     if kept:
-        yield folder
+        try:
+            yield folder
+        finally:
+            with contextlib.suppress(OSError):  # there are answers in it
+                folder.rmdir()
         return
     with tempfile.TemporaryDirectory(prefix="roadgeo-") as passing:
         yield Path(passing)
@@ -333,12 +354,29 @@ def _is_whole(answer: Path) -> bool:
         return file.read(1) in (b"}", b"]")
 
 
+@dataclass
+class _Parts:
+    """Which part of a query is asked for."""
+
+    host: str
+    total: int
+    done: int
+    say: Say
+
+    def tell(self) -> None:
+        """Say what is asked for next, if anything is."""
+        if self.done < self.total:
+            part = f" for part {self.done + 1} of {self.total}" if self.total > 1 else ""
+            self.say(f"asking {self.host}{part}", self.done / self.total if part else None)
+
+
 class _Patience:
     """A hook of `requests` that asks a busy server again, says so, and notices an Overpass that gave up."""
 
-    def __init__(self, options: FetchOptions, say: Callable[[str], None] | None) -> None:
+    def __init__(self, options: FetchOptions, say: Say, parts: _Parts) -> None:
         self.options = options
         self.say = say
+        self.parts = parts
 
     def __call__(self, response: Any, **kwargs: Any) -> Any:
         """Return the response, or a better one."""
@@ -350,8 +388,7 @@ class _Patience:
             if response.status_code not in _BUSY:
                 break
             wait = _retry_after(response.headers.get("Retry-After"), pause)
-            if self.say is not None:
-                self.say(f"{host} is busy ({response.status_code}), trying again in {wait:.0f} s")
+            self.say(f"{host} is busy ({response.status_code}), trying again in {wait:.0f} s")
             time.sleep(wait)
             pause *= 2
             again = response.request.copy()
@@ -367,6 +404,9 @@ class _Patience:
         if remark:
             reason = remark[1].decode("utf-8", "replace")[:200]
             raise RoadSourceError(f"{host} gave up: {reason}; ask for a smaller area")
+        if response.request.method == "POST":  # an answer, not the server's status
+            self.parts.done += 1
+            self.parts.tell()
         return response
 
 

@@ -35,6 +35,7 @@ from roadgeo.io_network import (
     stored_digest,
 )
 from roadgeo.network import RoadNetwork
+from roadgeo.progress import Say, say_nothing
 from roadgeo.typing import AnyArray
 
 __all__ = [
@@ -75,7 +76,9 @@ def reference_paths(path: str | os.PathLike[str]) -> ReferencePaths:
     return ReferencePaths(stem.with_name(f"{stem.name}.gpkg"), stem.with_name(f"{stem.name}.index"))
 
 
-def write_reference(path: str | os.PathLike[str], network: RoadNetwork, parts: IndexParts) -> ReferencePaths:
+def write_reference(
+    path: str | os.PathLike[str], network: RoadNetwork, parts: IndexParts, say: Say = say_nothing
+) -> ReferencePaths:
     """Write both files of a reference; a previous one stays usable at every moment.
 
     Parameters
@@ -86,6 +89,8 @@ def write_reference(path: str | os.PathLike[str], network: RoadNetwork, parts: I
         As `io_network.as_stored` gives it, so that the index is the one that the GeoPackage would give.
     parts : (meta, arrays)
         The index of that network.
+    say : Say
+        Told how much of the GeoPackage is written.
 
     Raises
     ------
@@ -98,7 +103,7 @@ def write_reference(path: str | os.PathLike[str], network: RoadNetwork, parts: I
     meta, arrays = parts
     with staging(paths.geopackage) as folder:
         staged = reference_paths(folder / paths.geopackage.name)
-        dump_network(staged.geopackage, network)
+        dump_network(staged.geopackage, network, say)
         dump_index(staged.index, meta, arrays, _about(network, meta))
         sync_file(staged.geopackage)
         sync_file(staged.index)

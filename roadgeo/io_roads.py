@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import os
-from collections.abc import Callable, Iterable, Sequence
+from collections.abc import Iterable, Sequence
 from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -12,6 +12,7 @@ import numpy as np
 
 from roadgeo.errors import CrsError, RoadSourceError
 from roadgeo.io_lines import RoadLines, crs_name, list_sources, read_lines, simple_lines
+from roadgeo.progress import Say, say_nothing
 from roadgeo.projection import LocalPlane, choose_plane, transformer
 from roadgeo.road_kinds import RoadKind, drives
 from roadgeo.typing import AnyArray, FloatArray
@@ -63,7 +64,7 @@ def read_roads(
     tunnels: bool = False,
     bbox: Box | None = None,
     attribution: str | None = None,
-    say: Callable[[str], None] | None = None,
+    say: Say = say_nothing,
 ) -> Roads:
     """Read roads from one or more files or folders of files, of any formats and CRS, onto one plane.
 
@@ -84,8 +85,8 @@ def read_roads(
         Degrees; roads are cut at its border. West > east: astride 180 degrees.
     attribution : str, optional
         Overrides what the sources call for.
-    say : callable, optional
-        Told what is being read.
+    say : Say
+        Told what is being read and, of PBF files, how much of it.
 
     Raises
     ------
@@ -99,10 +100,10 @@ def read_roads(
     given = [path] if isinstance(path, str | os.PathLike) else list(path)
     files = [file for one in given for file in list_sources(Path(one))]
     sources = []
-    for file in files:
-        if say is not None:
-            say(f"reading {file.name}")
-        source = read_lines(file, layer)
+    for n, file in enumerate(files, 1):
+        what = f"reading {file.name}" + (f", {n} of {len(files)}" if len(files) > 1 else "")
+        say(what)
+        source = read_lines(file, layer, lambda share, what=what: say(what, share))  # type: ignore[misc]
         if crs is not None and source.meta["format"] != "OpenStreetMap":
             source = replace(source, crs=_known_crs(crs))
         if source.crs is None:
@@ -121,7 +122,7 @@ def fetch_roads(
     which: RoadKind = "drivable",
     tunnels: bool = False,
     options: FetchOptions | None = None,
-    say: Callable[[str], None] | None = None,
+    say: Say = say_nothing,
 ) -> Roads:
     """Fetch the roads of an area from OpenStreetMap.
 
@@ -139,8 +140,8 @@ def fetch_roads(
         As for `read_roads`.
     options : FetchOptions, optional
         Servers, cache, patience, date.
-    say : callable, optional
-        Told what is being waited for.
+    say : Say
+        Told what is being waited for, and how much of it has come.
 
     Raises
     ------

@@ -25,6 +25,7 @@ from roadgeo.intersections import IntersectionOptions, Intersections, find_inter
 from roadgeo.location import Evidence, Location, Place, Seconds, Stats
 from roadgeo.network import RoadNetwork
 from roadgeo.pairs import PairIndex, PairOptions, build_pair_index, match_pairs
+from roadgeo.progress import Say, say_nothing
 from roadgeo.projection import LocalPlane
 from roadgeo.robust import SearchOptions, SearchResult, search
 from roadgeo.scene import Scene, SceneOptions, prepare_scene
@@ -77,17 +78,21 @@ class Reference:
         """What the user calls it."""
         return self.index.name
 
-    def save(self, path: str | Path) -> None:
+    def save(self, path: str | Path, say: Say = say_nothing) -> None:
         """Write `path`.gpkg and `path`.index (see `io_reference.write_reference`)."""
         from roadgeo.io_reference import write_reference
 
         if self.network is None:
             raise RoadSourceError(f"{self.name}: opened from a file, there is nothing new to save")
-        write_reference(path, self.network, (self.index.meta, self.index.arrays()))
+        write_reference(path, self.network, (self.index.meta, self.index.arrays()), say)
 
 
 def build_network(
-    lines: Sequence[Any] | AnyArray, plane: LocalPlane, meta: dict[str, Any], options: BuildOptions | None = None
+    lines: Sequence[Any] | AnyArray,
+    plane: LocalPlane,
+    meta: dict[str, Any],
+    options: BuildOptions | None = None,
+    say: Say = say_nothing,
 ) -> RoadNetwork:
     """Draw road lines (shapely, in plane metres) as a mask sees them, and find their intersections.
 
@@ -96,7 +101,10 @@ def build_network(
     from roadgeo.simplification import coverage
 
     options = options or BuildOptions()
-    graph = simplify(planarize(lines), options.simplify)
+    say(f"cutting {len(lines):,} lines where they cross")
+    graph = planarize(lines)
+    drawing = "drawing them as a mask shows them"
+    graph = simplify(graph, options.simplify, lambda share: say(drawing, share))
     found = find_intersections(graph, options.intersections)
     return RoadNetwork(graph, found, plane, tuple(coverage(graph)), {**meta, "options": asdict(options)})
 
@@ -125,7 +133,7 @@ def build_reference(
     return Reference(build_index(network, options.index), network)
 
 
-def update_reference(path: str | Path, roads: Roads) -> Reference:
+def update_reference(path: str | Path, roads: Roads, say: Say = say_nothing) -> Reference:
     """Replace the roads of a reference by others on the ground that those were asked for, or add them, and write it.
 
     The rest of the network is not drawn again. Where the roads do not say what ground they were asked for, it is the
@@ -153,9 +161,10 @@ def update_reference(path: str | Path, roads: Roads) -> Reference:
         "sources": [*old.meta.get("sources", []), *roads.meta.get("sources", [])],
         "attribution": "; ".join(filter(None, owed)),
     }
+    say(f"drawing {len(lines):,} lines among the others as a mask shows them")
     drawn_alike = UpdateOptions(simplify=options.simplify, intersections=options.intersections)
     network = as_stored(replace_area(old, lines, area, meta, drawn_alike))
-    Reference(build_index(network, options.index), network).save(path)
+    Reference(build_index(network, options.index, say), network).save(path, say)
     return open_reference(path)
 
 
@@ -206,8 +215,8 @@ def _read_options(kind: type[_Options], stored: Any, stage: str) -> _Options:
     return kind(**values)
 
 
-def open_reference(path: str | Path) -> Reference:
-    """Open REF.gpkg with its REF.index; a missing index is built again from the GeoPackage.
+def open_reference(path: str | Path, say: Say = say_nothing) -> Reference:
+    """Open REF.gpkg with its REF.index; a missing index, or one of an earlier format, is built from the GeoPackage.
 
     Raises
     ------
@@ -218,7 +227,8 @@ def open_reference(path: str | Path) -> Reference:
     from roadgeo.io_reference import reference_paths
 
     def rebuild(network: RoadNetwork) -> tuple[dict[str, Any], dict[str, AnyArray]]:
-        index = build_index(network, stored_options(network).index)
+        say(f"building the index of {reference_paths(path).geopackage.name} again")
+        index = build_index(network, stored_options(network).index, say)
         return dict(index.meta), index.arrays()
 
     meta, arrays = open_parts(path, rebuild)

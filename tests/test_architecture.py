@@ -11,7 +11,7 @@ ROOT = Path(roadgeo.__file__).parent
 
 #: Modules (or packages) of each storey.
 NAMES = {
-    0: "errors wording typing plugins _version",
+    0: "errors wording progress typing plugins _version",
     1: "kernels",
     2: "grid road_kinds graph homography robust",
     3: "projection simplification vectorization voids intersections network updating warping view landscape",

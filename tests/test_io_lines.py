@@ -13,6 +13,7 @@ from shapely.geometry import (
     box,
 )
 
+from roadgeo import io_lines
 from roadgeo.errors import RoadSourceError
 from roadgeo.io_lines import OSM_ATTRIBUTION, list_sources, read_lines, simple_lines
 
@@ -186,6 +187,28 @@ def test_nonsense_is_refused_on_one_line(tmp_path, name):
     with pytest.raises(RoadSourceError, match=r"x\.") as caught:
         read_lines(broken(tmp_path, name))
     assert "\n" not in str(caught.value)
+
+
+@pytest.mark.parametrize("part_size", [1, 1 << 20])
+def test_pbf_files_are_read_in_parts_and_progress_is_told(tmp_path, monkeypatch, part_size):
+    file = write_streets(tmp_path / "a.osm.pbf")
+    whole = read_lines(file)
+    monkeypatch.setattr(io_lines, "_PART", part_size)
+    told = []
+    read = read_lines(file, advance=told.append)
+    assert shapely.equals(read.lines, whole.lines).all()
+    assert read.highway.tolist() == whole.highway.tolist()
+    assert told == sorted(told)
+    assert told[-1] == 1.0
+    assert len(told) == 1 if part_size > file.stat().st_size else len(told) > 1
+
+
+@pytest.mark.parametrize("at", [300, -500, -1])
+def test_a_pbf_file_that_is_cut_off_says_so(tmp_path, at):
+    file = write_streets(tmp_path / "a.osm.pbf")
+    file.write_bytes(file.read_bytes()[:at])
+    with pytest.raises(RoadSourceError, match="cut off, damaged or no PBF file"):
+        read_lines(file)
 
 
 @pytest.mark.parametrize("name", FORMATS)

@@ -33,7 +33,7 @@ def ask(osm, **changes):
 
 def test_the_roads_of_a_place(osm, pauses):
     said = []
-    roads = fetch_roads("Fenway, Boston", options=ask(osm), say=said.append)
+    roads = fetch_roads("Fenway, Boston", options=ask(osm), say=lambda text, share=None: said.append(text))
     (source,) = roads.meta["sources"]
     assert source["name"] == "Fenway, Boston, Massachusetts, United States"
     assert source["osm_timestamp"] == "2022-05-04T19:30:42Z"
@@ -52,7 +52,7 @@ def test_the_roads_of_a_place(osm, pauses):
 def test_answers_are_kept_and_grow_old(osm, pauses):
     first = fetch_roads("Fenway, Boston", options=ask(osm))
     said = []
-    again = fetch_roads("Fenway, Boston", options=ask(osm), say=said.append)
+    again = fetch_roads("Fenway, Boston", options=ask(osm), say=lambda text, share=None: said.append(text))
     assert (len(osm.queries), len(osm.searches), said) == (1, 1, [])
     assert again.meta == first.meta
     assert shapely.equals(first.lines, again.lines).all()
@@ -119,6 +119,30 @@ def test_an_area_astride_180_degrees_is_asked_for_in_two(osm, pauses):
     assert len(shapely.get_parts(square(180, -17, 1000))) == 2
 
 
+def test_a_large_area_is_asked_for_in_parts_and_resumed(osm, pauses, monkeypatch):
+    import osmnx as ox
+
+    monkeypatch.setattr(ox.settings, "max_query_area_size", 1_000_000)
+    said = []
+    osm.overpass += [(200, {}, osm.roads), (500, {}, b"<html>")]
+    with pytest.raises(RoadSourceError, match="makes no sense"):
+        fetch_roads("Fenway, Boston", options=ask(osm), say=lambda *step: said.append(step))
+    host = osm.url[7:]
+    n_parts = int(said[1][0].rpartition(" ")[2])
+    assert n_parts > 2
+    assert said[1:] == [(f"asking {host} for part {k + 1} of {n_parts}", k / n_parts) for k in range(len(said) - 1)]
+    assert not list(cache_dir().glob("overpass-*"))  # an answer that makes no sense spoils the others
+
+    osm.overpass += [(200, {}, osm.roads), "cut"]
+    with pytest.raises(RoadSourceError, match="broke off"):
+        fetch_roads("Fenway, Boston", options=ask(osm))
+    n_asked = len(osm.queries)
+    said.clear()
+    fetch_roads("Fenway, Boston", options=ask(osm), say=lambda *step: said.append(step))
+    assert len(osm.queries) == n_asked + n_parts - 1
+    assert said == [(f"asking {host} for part {k + 1} of {n_parts}", k / n_parts) for k in range(1, n_parts)]
+
+
 @pytest.mark.parametrize(
     ("name", "message"),
     [
@@ -135,7 +159,7 @@ def test_a_busy_server_is_asked_again(osm, pauses):
     osm.overpass.extend([(429, {"Retry-After": "7"}, b"busy"), (504, {}, b"<html>timeout</html>")])
     said = []
     host = osm.url[7:]
-    assert len(fetch_roads(bbox=OUTLINE.bounds, options=ask(osm), say=said.append)) > 0
+    assert len(fetch_roads(bbox=OUTLINE.bounds, options=ask(osm), say=lambda text, share=None: said.append(text))) > 0
     assert said[1:] == [
         f"{host} is busy (429), trying again in 7 s",
         f"{host} is busy (504), trying again in 30 s",

@@ -157,8 +157,11 @@ def test_odd_lines_do_no_harm(tmp_path):
 
 def test_progress_is_told(tmp_path):
     said = []
-    read_roads([write_streets(tmp_path / "a.gpkg"), write_streets(tmp_path / "b.osm.pbf")], say=said.append)
-    assert said == ["reading a.gpkg", "reading b.osm.pbf"]
+    files = write_streets(tmp_path / "a.gpkg"), write_streets(tmp_path / "b.osm.pbf")
+    read_roads(files, say=lambda *step: said.append(step))
+    assert said == [("reading a.gpkg, 1 of 2",), ("reading b.osm.pbf, 2 of 2",), ("reading b.osm.pbf, 2 of 2", 1.0)]
+    read_roads(files[0], say=lambda *step: said.append(step))
+    assert said[3:] == [("reading a.gpkg",)]
 
 
 def test_lines_from_memory():

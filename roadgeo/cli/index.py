@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
 from pathlib import Path
 from time import perf_counter
 from typing import TYPE_CHECKING, Any
@@ -10,6 +9,7 @@ from typing import TYPE_CHECKING, Any
 import click
 
 from roadgeo.cli.parameters import BOX, NEAR, Plugin, verbosity_options
+from roadgeo.progress import Say, say_nothing
 
 if TYPE_CHECKING:
     from roadgeo.io_roads import Roads
@@ -88,10 +88,10 @@ def index_command(out: str | None, name: str | None, update: bool, quiet: bool, 
     """
     from roadgeo.cli.compilation import compile_once
     from roadgeo.cli.folders import make_folder
+    from roadgeo.cli.progress import show_steps
     from roadgeo.io_reference import reference_freshness
     from roadgeo.library import make_slug, new_reference
 
-    say = _sayer(quiet)
     started = perf_counter()
     given = _one_source(source)
     name = name or _name(source, given)
@@ -100,9 +100,9 @@ def index_command(out: str | None, name: str | None, update: bool, quiet: bool, 
     if update:
         reference_freshness(path)  # there must be one
     read = {"roads": _read, "plugin": _read_plugin}.get(given, _fetch)
-    roads = read(source, given, say)
-    say(f"drawing {len(roads):,} lines as a mask shows them")
-    reference = renew(roads, path) if update else build(roads, path, make_slug(name))
+    with show_steps(quiet) as say:
+        roads = read(source, given, say)
+        reference = renew(roads, path, say) if update else build(roads, path, make_slug(name), say)
     compile_once(reference, quiet)
     if verbose:
         for key, value in roads.meta.items():
@@ -114,7 +114,7 @@ def index_command(out: str | None, name: str | None, update: bool, quiet: bool, 
         )
 
 
-def build(roads: Roads, path: Path, name: str) -> Reference:
+def build(roads: Roads, path: Path, name: str, say: Say = say_nothing) -> Reference:
     """Build a reference from roads on their plane, write it and open it.
 
     Raises
@@ -128,16 +128,16 @@ def build(roads: Roads, path: Path, name: str) -> Reference:
     from roadgeo.io_network import as_stored
     from roadgeo.workflows import Reference, build_network, open_reference
 
-    network = as_stored(build_network(roads.lines, roads.plane, {"name": name, **roads.meta}))
-    Reference(build_index(network), network).save(path)
+    network = as_stored(build_network(roads.lines, roads.plane, {"name": name, **roads.meta}, say=say))
+    Reference(build_index(network, say=say), network).save(path, say)
     return open_reference(path)  # as `locate` has it: memory-mapped arrays are another type to compiled code
 
 
-def renew(roads: Roads, path: Path) -> Reference:
+def renew(roads: Roads, path: Path, say: Say = say_nothing) -> Reference:
     """Replace a reference's roads by others on their ground, write and open it; see `workflows.update_reference`."""
     from roadgeo.workflows import update_reference
 
-    return update_reference(path, roads)
+    return update_reference(path, roads, say)
 
 
 # --- where the roads come from ----------------------------------------------------------------------------------------
@@ -162,7 +162,7 @@ def _one_source(source: dict[str, Any]) -> str:
     return given[0]
 
 
-def _read(source: dict[str, Any], given: str, say: Callable[[str], None]) -> Roads:
+def _read(source: dict[str, Any], given: str, say: Say) -> Roads:
     from roadgeo.io_roads import read_roads
 
     return read_roads(
@@ -177,7 +177,7 @@ def _read(source: dict[str, Any], given: str, say: Callable[[str], None]) -> Roa
     )
 
 
-def _fetch(source: dict[str, Any], given: str, say: Callable[[str], None]) -> Roads:
+def _fetch(source: dict[str, Any], given: str, say: Say) -> Roads:
     from dataclasses import replace
 
     from roadgeo.io_overpass import FetchOptions
@@ -190,7 +190,7 @@ def _fetch(source: dict[str, Any], given: str, say: Callable[[str], None]) -> Ro
     return fetch_roads(**where, which=source["kinds"], tunnels=source["tunnels"], options=options, say=say)
 
 
-def _read_plugin(source: dict[str, Any], given: str, say: Callable[[str], None]) -> Roads:
+def _read_plugin(source: dict[str, Any], given: str, say: Say) -> Roads:
     from dataclasses import replace
 
     from roadgeo.errors import PluginError
@@ -213,8 +213,3 @@ def _name(source: dict[str, Any], given: str) -> str:
         first = source["roads"][0] if given == "roads" else source["polygon"]
         return Path(first).name.split(".")[0]
     return given + " " + " ".join(f"{number:g}" for number in source[given])
-
-
-def _sayer(quiet: bool) -> Callable[[str], None]:
-    """Return what tells the user what is going on, on standard error."""
-    return (lambda _: None) if quiet else (lambda text: click.echo(f"{text} ...", err=True))

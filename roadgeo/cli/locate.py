@@ -17,6 +17,7 @@ from roadgeo.cli import ERROR, NOT_LOCATED
 from roadgeo.cli.batch import Task, find_masks, name_tasks, run
 from roadgeo.cli.folders import make_folder
 from roadgeo.cli.parameters import CAMERA, NEAR, RANGE, Plugin, verbosity_options
+from roadgeo.progress import Say, say_nothing
 from roadgeo.wording import format_lonlat
 
 if TYPE_CHECKING:
@@ -171,8 +172,8 @@ class Job:
         return replace(self.options, match=replace(match, camera=replace(match.camera, focal_px=focal_px)))
 
 
-def open_references(names: Iterable[str]) -> list[Reference]:
-    """Open references by path or name; none named: all of the library.
+def open_references(names: Iterable[str], say: Say = say_nothing) -> list[Reference]:
+    """Open references by path or name; none named: all of the library. `say` is told of an index that has to be built.
 
     Raises
     ------
@@ -188,7 +189,7 @@ def open_references(names: Iterable[str]) -> list[Reference]:
         raise IndexFormatError(
             f"the library in {library_dir()} is empty and no --reference was given; build one with `roadgeo index`"
         )
-    return [open_reference(path) for path in paths]
+    return [open_reference(path, say) for path in paths]
 
 
 @click.command("locate", short_help="Find road masks on a reference and draw them there.")
@@ -376,6 +377,7 @@ def locate_command(
     Exit status: 0 every mask located, 3 at least one not located, 1 error, 2 usage.
     """
     from roadgeo.cli.compilation import compile_once
+    from roadgeo.cli.progress import print_steps
 
     focal_px = camera if isinstance(camera, float) else None
     options = make_options(method, gsd, max_tilt, near, north_up, time_limit, focal_px)
@@ -402,7 +404,7 @@ def locate_command(
         skip_existing,
     )
     # Opened here too: what is wrong with them is said once, and the search is compiled before processes start.
-    opened = open_references(references)
+    opened = open_references(references, print_steps(quiet))
     compile_once(opened[0], quiet)
     counts: Counter[Status] = Counter()
     documents = []
