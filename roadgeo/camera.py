@@ -9,7 +9,7 @@ import numpy as np
 
 from roadgeo.typing import FloatArray
 
-__all__ = ["CameraOptions", "CameraPose", "judge", "pose"]
+__all__ = ["CameraOptions", "CameraPose", "judge", "pose", "sampling"]
 
 _FOCAL_STEPS = np.geomspace(0.35, 8.0, 25)
 
@@ -70,6 +70,12 @@ def _jacobian(matrix: FloatArray, xy: FloatArray) -> FloatArray:
     return np.asarray((matrix[:2, :2] - np.outer(image, matrix[2, :2])) / mapped[2])
 
 
+def sampling(matrix: FloatArray, size: tuple[int, int]) -> float:
+    """Return the ground sampling at the middle of the frame, metres per pixel."""
+    jacobian = _jacobian(matrix, np.array([size[0] / 2.0, -size[1] / 2.0]))
+    return math.sqrt(abs(jacobian[0, 0] * jacobian[1, 1] - jacobian[0, 1] * jacobian[1, 0]))
+
+
 def pose(matrix: FloatArray, size: tuple[int, int], focal_px: float | None = None) -> CameraPose:
     """Describe the camera behind a homography from the query plane (pixels, y up) to a metric plane.
 
@@ -78,7 +84,7 @@ def pose(matrix: FloatArray, size: tuple[int, int], focal_px: float | None = Non
     """
     center = np.array([size[0] / 2.0, -size[1] / 2.0])
     jacobian = _jacobian(matrix, center)
-    gsd = math.sqrt(abs(np.linalg.det(jacobian)))
+    gsd = sampling(matrix, size)
     rotation = math.degrees(math.atan2(jacobian[0, 1], jacobian[1, 1]))
     shift = np.array([[1.0, 0.0, -center[0]], [0.0, 1.0, -center[1]], [0.0, 0.0, 1.0]])
     g = shift @ np.linalg.inv(matrix)

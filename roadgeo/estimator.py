@@ -11,9 +11,9 @@ from typing import Protocol
 
 import numpy as np
 
-from roadgeo.camera import CameraOptions, judge, pose
+from roadgeo.camera import CameraOptions, judge, sampling
 from roadgeo.index import ReferenceIndex
-from roadgeo.kernels.growth import grow
+from roadgeo.kernels.growth import grow_each
 from roadgeo.kernels.roads import screen
 from roadgeo.refinement import Refined, RefineOptions, refine
 from roadgeo.scene import Scene
@@ -40,8 +40,7 @@ class GrowOptions:
         Away from the middle of a tilted frame the ground sampling may differ from that at the middle by this factor.
     min_shape_ratio : float
         Least ratio of the singular values of the map around an anchor: a camera tilted by 60 degrees sees 1 : 2, the
-        rays at
-        its frame's edge still less.
+        rays at its frame's edge still less.
     screen_points, screen_radius_m, screen_radius_px, screen_share
         Of so many road points near the anchor, this share must lie within these radii of roads of the map.
     max_screened, max_grown, max_verified : int
@@ -51,8 +50,8 @@ class GrowOptions:
     perspective_sigma : float
         Prior standard deviation of the two perspective parameters.
     hit_rate, chance_rate, patience : float
-        Of the sequential test: share of intersections that match if true and if not, and the nats lost before giving
-        up.
+        Of the sequential test: share of intersections that match if true and if not, and the nats lost before it
+        gives up.
     min_matched : int
         Least matches besides the seeds.
     max_points : int
@@ -117,9 +116,9 @@ class MatchOptions:
         Sweep(TripleOptions(), 40),
         Sweep(
             TripleOptions(
-                n_neighbours=12, codes_per_vertex=3, angle_tolerance_deg=10.0, max_hits=20_000, max_compared=2_000_000
+                n_neighbours=12, angle_tolerance_deg=10.0, max_hits=20_000, max_compared=500_000, spread=True
             ),
-            70,
+            40,
         ),
     )
     grow: GrowOptions = field(default_factory=GrowOptions)
@@ -194,7 +193,7 @@ class TripleEstimator:
             0,
         )
         other._screen(proposals)
-        other._grow(proposals, 0, np.arange(n))
+        other._grow(proposals, np.arange(1))
         x, y = self.index.xy[0] - self.scene.center
         matrix = np.array([[1.0, 0.0, x], [0.0, 1.0, y], [0.0, 0.0, 1.0]])
         hypothesis = Hypothesis(matrix, np.empty(0, np.int64), 0.0, np.full(n, -1))
@@ -228,44 +227,48 @@ class TripleEstimator:
         kept = np.flatnonzero(good)
         return kept[np.argsort(-(proposals.placed[kept] + shares[kept]), kind="stable")]
 
-    def _grow(self, proposals: Proposals, m: int, order: IntArray) -> Hypothesis | None:
-        """Grow one proposal; None if it withers. `order` sorts the query by distance from the anchor."""
+    def _grow(self, proposals: Proposals, chosen: IntArray) -> list[Hypothesis]:
+        """Grow the chosen proposals of one anchor; return those that did not wither, the best supported first."""
         options, scene, index = self.options.grow, self.scene, self.index
-        anchor, partners, affine = proposals.anchor, proposals.partners[m], proposals.affine[m]
-        neighbours = np.ascontiguousarray(scene.neighbours[:, : len(partners)])
-        gsd = math.sqrt(affine[0] * affine[3] - affine[1] * affine[2])
-        matched = np.empty(len(scene.intersections), np.int64)
-        distance = np.empty(len(matched))
-        matrix = np.empty((3, 3))
-        n_matched, _, ratio = grow(
-            scene.intersections.xy, scene.branches, order, scene.half_size, anchor, proposals.reference[m], affine,
-            neighbours, partners, index.xy, index.branches, index.point_starts, index.grid, index.shape,
-            math.hypot(options.sigma_m, options.sigma_px * gsd), options.radius_m + options.radius_px * gsd,
+        xy, anchor = scene.intersections.xy, proposals.anchor
+        order = np.argsort(np.hypot(*(xy - xy[anchor]).T), kind="stable")[: options.max_points]
+        partners = np.ascontiguousarray(proposals.partners[chosen])
+        neighbours = np.ascontiguousarray(scene.neighbours[:, : partners.shape[1]])
+        matched = np.empty((len(chosen), len(xy)), np.int64)
+        matrices = np.empty((len(chosen), 3, 3))
+        ratios = np.empty(len(chosen))
+        grow_each(
+            xy, scene.branches, order, scene.half_size, anchor,
+            proposals.reference[chosen], proposals.affine[chosen], neighbours, partners,
+            index.xy, index.branches, index.point_starts, index.grid, index.shape,
+            (options.sigma_m, options.sigma_px), (options.radius_m, options.radius_px),
             math.cos(math.radians(options.ray_tolerance_deg)), options.perspective_sigma,
-            options.hit_rate, options.chance_rate, options.patience, matched, distance, matrix,
+            options.hit_rate, options.chance_rate, options.patience, options.min_matched, matched, matrices, ratios,
         )  # fmt: skip
-        if n_matched < options.min_matched or not math.isfinite(ratio):
-            return None
-        if self._judge(matrix):
-            return None
-        seeds = np.append(neighbours[anchor][partners >= 0], anchor)
-        return Hypothesis(matrix / matrix[2, 2], seeds, ratio, matched)
+        best = np.argsort(-ratios, kind="stable")
+        seeds = [np.append(neighbours[anchor][partners[m] >= 0], anchor) for m in best]
+        return [
+            Hypothesis(matrices[m] / matrices[m, 2, 2], made_of, float(ratios[m]), matched[m])
+            for m, made_of in zip(best, seeds, strict=True)
+            if np.isfinite(ratios[m])
+        ]
 
     def _grow_all(self, proposals: Proposals) -> list[Hypothesis]:
-        """Return the best grown proposals of one anchor that mean different places."""
+        """Return the best grown proposals of one anchor that mean different places and that a camera can have seen."""
         options = self.options.grow
-        xy = self.scene.intersections.xy
-        order = np.argsort(np.hypot(*(xy - xy[proposals.anchor]).T), kind="stable")[: options.max_points]
         chosen = self._screen(proposals)[: options.max_grown]
         self.n_hypotheses += len(chosen)
-        grown = [h for m in chosen if (h := self._grow(proposals, m, order)) is not None]
         distinct: list[Hypothesis] = []
-        for h in sorted(grown, key=lambda h: -h.support):
-            if len(distinct) == options.max_verified:
-                break
-            if not any(self.same(h, other) for other in distinct):
+        for h in self._grow(proposals, chosen):
+            if self._is_plausible(h) and not any(self.same(h, other) for other in distinct):
                 distinct.append(h)
+                if len(distinct) == options.max_verified:
+                    break
         return distinct
+
+    def _is_plausible(self, hypothesis: Hypothesis) -> bool:
+        """Whether a camera can have seen a grown hypothesis."""
+        return not self._judge(hypothesis.matrix)
 
     def score(self, model: Hypothesis) -> float:
         """Refine a hypothesis and return its log10 odds."""
@@ -278,17 +281,19 @@ class TripleEstimator:
     def _verify(self, model: Hypothesis) -> float:
         self.n_verified += 1
         scene, index, options = self.scene, self.index, self.options
-        for n_points in (150, 300, None):
+        # What a wrong place reaches is soon seen; only promising ones are worth all points and all of a null model.
+        chance = self.least_chance
+        for n_points, every in ((150, 0), (300, 6), (None, 1)):
             if not self._converge(model, n_points):
                 return -np.inf
-            # What a wrong place reaches is soon seen; only promising ones are worth all points and a null of their own.
-            model.log10_odds = self._odds(model, self.least_chance)
+            if every:
+                model.chance = chance_agreement(model.matrix, scene, index, model.gsd_m, options.verify, every)
+                chance = np.array(model.chance)
+            model.log10_odds = self._odds(model, chance)
             if model.log10_odds < options.verify.promising:
                 return model.log10_odds
-        model.chance = chance_agreement(model.matrix, scene, index, model.gsd_m, options.verify)
-        self.least_chance = np.minimum(self.least_chance, model.chance) if self.n_nulls else np.array(model.chance)
+        self.least_chance = np.minimum(self.least_chance, chance) if self.n_nulls else chance
         self.n_nulls += 1
-        model.log10_odds = self._odds(model, np.array(model.chance))
         return model.log10_odds
 
     def _odds(self, model: Hypothesis, chance: FloatArray) -> float:
@@ -305,7 +310,7 @@ class TripleEstimator:
             refined = refine(model.matrix, scene, self.index, model.matched, options.refine, n_points)
             if refined is None or self._judge(refined.matrix) or self._is_far(refined.matrix):
                 return model.refined is not None and best >= 0.0
-            gsd = pose(refined.matrix, scene.size).gsd_m
+            gsd = sampling(refined.matrix, scene.size)
             found, matched, distance = agreement(
                 refined.matrix, scene, self.index, gsd, model.seeds[-MINIMAL:], options.verify
             )
@@ -342,6 +347,6 @@ class TripleEstimator:
 
     def same(self, a: Hypothesis, b: Hypothesis) -> bool:
         """Whether two hypotheses put the middle of the frame within 50 m, or a twentieth of its size, of each other."""
-        gsd = pose(a.matrix, self.scene.size).gsd_m
+        gsd = sampling(a.matrix, self.scene.size)
         limit = max(50.0, 0.05 * gsd * self.scene.half_size)
         return bool(np.hypot(*(self.center(a) - self.center(b))) < limit)

@@ -37,7 +37,7 @@ from typing import Any
 
 import numpy as np
 
-from roadgeo.camera import CameraOptions, pose
+from roadgeo.camera import CameraOptions, pose, sampling
 from roadgeo.estimator import Hypothesis, MatchOptions, TripleEstimator
 from roadgeo.graph import RoadGraph
 from roadgeo.index import ReferenceIndex
@@ -107,17 +107,20 @@ class WatchedEstimator(TripleEstimator):
         self._objection = (fault, matrix) if fault else None
         return fault
 
-    def _grow(self, proposals: Proposals, m: int, order: IntArray) -> Hypothesis | None:
+    def _grow(self, proposals: Proposals, chosen: IntArray) -> list[Hypothesis]:
+        grown = super()._grow(proposals, chosen)
+        self.n_survived += len(grown)
+        return grown
+
+    def _is_plausible(self, hypothesis: Hypothesis) -> bool:
         self._objection = None
-        hypothesis = super()._grow(proposals, m, order)
-        if hypothesis is not None:
-            self.n_survived += 1
-        elif self._objection is not None:
-            self.n_survived += 1
-            self.refusals[self._objection[0]] += 1
-            if self._objection[0] in _NEGOTIABLE and len(self.refused) < _MAX_REFUSED:
-                self.refused.append(self._objection)
-        return hypothesis
+        if super()._is_plausible(hypothesis) or self._objection is None:
+            return True
+        fault = self._objection[0]
+        self.refusals[fault] += 1
+        if fault in _NEGOTIABLE and len(self.refused) < _MAX_REFUSED:
+            self.refused.append(self._objection)
+        return False
 
     def score(self, model: Hypothesis) -> float:
         """Refine a hypothesis and return its log10 odds."""
@@ -138,7 +141,7 @@ class WatchedEstimator(TripleEstimator):
         compared = []
         for fault, unscaled in self.refused:
             matrix = unscaled / unscaled[2, 2]
-            gsd = pose(matrix, self.scene.size).gsd_m
+            gsd = sampling(matrix, self.scene.size)
             found, matched, _ = agreement(matrix, self.scene, self.index, gsd, nobody, self.options.verify)
             compared.append((found.rate + found.forward, fault, Hypothesis(matrix, nobody, 0.0, matched)))
         compared.sort(key=lambda entry: -entry[0])

@@ -34,12 +34,12 @@ __all__ = [
     "write_layers",
 ]
 
-GeometryType = Literal["POINT", "LINESTRING", "POLYGON"]
+GeometryType = Literal["POINT", "LINESTRING", "POLYGON", "MULTIPOLYGON"]
 
 #: The `crs` of layers that lie nowhere on Earth: pixel coordinates. GeoPackage calls it undefined Cartesian, srs_id -1.
 PIXELS = ""
 
-_WKB_TYPES = {"POINT": 1, "LINESTRING": 2, "POLYGON": 3}
+_WKB_TYPES = {"POINT": 1, "LINESTRING": 2, "POLYGON": 3, "MULTIPOLYGON": 6}
 _CUSTOM_SRS_ID = 100_000  # for a CRS without an EPSG code; one such CRS per layer is numbered upwards from here
 _POINT = np.dtype([("header", "S4"), ("srs_id", "<i4"), ("order", "u1"), ("type", "<u4"), ("xy", "<f8", 2)])
 _HEADER = struct.Struct("<4si4d")  # magic, version and flags; srs_id; envelope min x, max x, min y, max y
@@ -52,10 +52,11 @@ class Layer:
 
     Attributes
     ----------
-    geometry_type : {"POINT", "LINESTRING", "POLYGON"} or None
+    geometry_type : {"POINT", "LINESTRING", "POLYGON", "MULTIPOLYGON"} or None
         None: a table without geometry.
     geometries : sequence of N float64 arrays
         POINT: (N, 2) array. LINESTRING: (V, 2) vertices each. POLYGON: one ring (V, 2) each, closed here if it is open.
+        MULTIPOLYGON: a sequence of such rings each.
     columns : mapping of name to N values
         Numpy arrays or lists; integers, floats (NaN becomes NULL), booleans, or text (None becomes NULL).
     crs : str
@@ -66,7 +67,7 @@ class Layer:
 
     name: str
     geometry_type: GeometryType | None = None
-    geometries: Sequence[FloatArray] | FloatArray = ()
+    geometries: Sequence[Any] | FloatArray = ()
     columns: Mapping[str, Sequence[Any] | AnyArray] = field(default_factory=dict)
     crs: str = PIXELS
     style: str = ""
@@ -367,9 +368,7 @@ def _sql_values(values: Sequence[Any] | AnyArray) -> tuple[str, list[Any]]:
     return "TEXT", plain
 
 
-def _encode(
-    kind: GeometryType, geometries: Sequence[FloatArray] | FloatArray, srs_id: int
-) -> tuple[list[bytes], FloatArray]:
+def _encode(kind: GeometryType, geometries: Sequence[Any] | FloatArray, srs_id: int) -> tuple[list[bytes], FloatArray]:
     """GeoPackage blobs, and (N, 4) bounds min x, max x, min y, max y."""
     if kind == "POINT":
         xy = np.asarray(geometries, float).reshape(-1, 2)
@@ -381,6 +380,8 @@ def _encode(
         return [raw[i : i + size] for i in range(0, len(raw), size)], xy[:, [0, 0, 1, 1]]
     if not len(geometries):
         return [], np.empty((0, 4))
+    if kind == "MULTIPOLYGON":
+        return _encode_multipolygons(geometries, srs_id)
     arrays = [np.asarray(vertices, "<f8") for vertices in geometries]
     if kind == "POLYGON":
         arrays = [xy if np.array_equal(xy[0], xy[-1]) else np.vstack([xy, xy[:1]]) for xy in arrays]
@@ -398,6 +399,19 @@ def _encode(
         for start, stop, box in zip(starts, stops, bounds.tolist(), strict=True)
     ]
     return blobs, bounds
+
+
+def _encode_multipolygons(geometries: Sequence[Any] | FloatArray, srs_id: int) -> tuple[list[bytes], FloatArray]:
+    """Do as `_encode`; a geometry is a sequence of outer rings."""
+    header = _HEADER.size
+    blobs, bounds = [], []
+    for rings in geometries:
+        parts, boxes = _encode("POLYGON", rings, srs_id)
+        box = [*boxes[:, [0, 2]].min(axis=0), *boxes[:, [1, 3]].max(axis=0)]
+        bounds.append([box[0], box[2], box[1], box[3]])
+        count = struct.pack("<BII", 1, _WKB_TYPES["MULTIPOLYGON"], len(parts))
+        blobs.append(b"".join([_HEADER.pack(b"GP\0\3", srs_id, *bounds[-1]), count, *(one[header:] for one in parts)]))
+    return blobs, np.array(bounds)
 
 
 # --- reading ----------------------------------------------------------------------------------------------------------

@@ -4,13 +4,11 @@ from __future__ import annotations
 
 import html
 import json
-import math
 import xml.etree.ElementTree as ET
 import zipfile
 from collections.abc import Callable
 from dataclasses import dataclass
 from datetime import UTC, datetime
-from itertools import pairwise
 from pathlib import Path
 from tempfile import TemporaryDirectory
 from typing import Any
@@ -18,6 +16,8 @@ from typing import Any
 import cv2
 import numpy as np
 
+from roadgeo.degrees import bounds_of, cut_ring, holds_pole, unwrap_ring
+from roadgeo.errors import OutputError
 from roadgeo.grid import RoadMask
 from roadgeo.homography import Homography
 from roadgeo.location import Location
@@ -75,16 +75,14 @@ class Subject:
         return points
 
     def outline(self) -> FloatArray:
-        """Ring (33, 2) of longitude and latitude around the footprint, closed, counterclockwise, not cut at 180."""
+        """Ring (32, 2) of longitude and latitude around the footprint, counterclockwise; see `roadgeo.degrees`."""
         from roadgeo.projection import to_lonlat
 
         width, height = self.size
         corners = np.array([[0, 0], [0, height], [width, height], [width, 0]], float)
         sides = zip(corners, np.roll(corners, -1, axis=0), strict=True)
         pixels = np.concatenate([np.linspace(a, b, 8, endpoint=False) for a, b in sides])
-        ring = to_lonlat(self.place.crs, Homography(self.homography)(pixels))
-        ring[:, 0] = ring[0, 0] + (ring[:, 0] - ring[0, 0] + 180.0) % 360.0 - 180.0
-        return np.vstack([ring, ring[:1]])
+        return to_lonlat(self.place.crs, Homography(self.homography)(pixels))
 
 
 @dataclass(frozen=True)
@@ -166,11 +164,22 @@ def write_points(path: Path, subject: Subject) -> None:
 
 def write_odm(path: Path, subject: Subject) -> None:
     """Write control points as OpenDroneMap's gcp_list.txt; the map knows no heights, so all are 0."""
-    lines = [subject.place.crs]
+    lines = [_odm_crs(subject.place.crs)]
     lines += [
         f"{x!r} {y!r} 0 {column!r} {row!r} {subject.picture.name}" for column, row, x, y in subject.control_points()
     ]
     path.write_text("\n".join(lines) + "\n", encoding="utf-8")
+
+
+def _odm_crs(crs: str) -> str:
+    """Return a CRS as OpenDroneMap reads it: an EPSG code, else a PROJ string, for it knows no WKT."""
+    import warnings
+
+    import pyproj
+
+    with warnings.catch_warnings():
+        warnings.simplefilter("ignore")  # a PROJ string lacks names; of our own planes nothing else
+        return crs if crs.upper().startswith("EPSG:") else str(pyproj.CRS.from_user_input(crs).to_proj4())
 
 
 def write_world_file(path: Path, subject: Subject) -> None:
@@ -231,6 +240,8 @@ def write_stac(path: Path, subject: Subject) -> None:
 
 def write_kmz(path: Path, subject: Subject) -> None:
     """Write a ground overlay for Google Earth: the picture in degrees, or the mask's roads, and the footprint."""
+    if holds_pole(subject.outline()):
+        raise OutputError(f"cannot write {path}: a frame that holds a pole is no picture in degrees; leave out kmz")
     with TemporaryDirectory(dir=path.parent, prefix=".roadgeo-") as folder:
         overlay, grid = _draw_in_degrees(subject, Path(folder))
     with zipfile.ZipFile(path, "w", zipfile.ZIP_DEFLATED) as archive:
@@ -241,38 +252,17 @@ def write_kmz(path: Path, subject: Subject) -> None:
 # --- their parts ------------------------------------------------------------------------------------------------------
 
 
-def _cut(ring: FloatArray) -> list[FloatArray]:
-    """Cut a closed ring that lies astride 180 degrees there, so that all longitudes lie within -180..180."""
-    ring = ring - (360.0 * math.floor((ring[:, 0].min() + 180.0) / 360.0), 0.0)
-    if ring[:, 0].max() <= 180.0:
-        return [ring]
-    return [_clip(ring, 1.0), _clip(ring, -1.0) - (360.0, 0.0)]
-
-
-def _clip(ring: FloatArray, side: float) -> FloatArray:
-    """Clip a closed ring at 180 degrees: the part west of it (side 1) or east (-1), after Sutherland and Hodgman."""
-    kept: list[FloatArray] = []
-    for a, b in pairwise(ring):
-        if side * (180.0 - a[0]) >= 0:
-            kept.append(a)
-        if (180.0 - a[0]) * (180.0 - b[0]) < 0:
-            kept.append(a + (b - a) * (180.0 - a[0]) / (b[0] - a[0]))
-    return np.array([*kept, kept[0]])
-
-
 def _geometry(ring: FloatArray) -> dict[str, Any]:
     """Return a GeoJSON polygon, or where the ring lies astride 180 degrees two."""
-    polygons = [[np.round(part, 7).tolist()] for part in _cut(ring)]
+    polygons = [[np.round(part, 7).tolist()] for part in cut_ring(ring)]
     if len(polygons) == 1:
         return {"type": "Polygon", "coordinates": polygons[0]}
     return {"type": "MultiPolygon", "coordinates": polygons}
 
 
 def _bounds(ring: FloatArray) -> list[float]:
-    """West, south, east, north; west exceeds east astride 180 degrees."""
-    parts = _cut(ring)
-    bounds = (parts[0][:, 0].min(), ring[:, 1].min(), parts[-1][:, 0].max(), ring[:, 1].max())
-    return [round(float(value), 7) for value in bounds]
+    """Return west, south, east, north as RFC 7946 wants them."""
+    return [round(value, 7) for value in bounds_of(ring)]
 
 
 def _asset(path: Path, media_type: str, role: str) -> dict[str, Any]:
@@ -291,7 +281,7 @@ def _draw_in_degrees(subject: Subject, folder: Path) -> tuple[bytes, MapGrid]:
         drawn = np.zeros((*subject.mask.shape, 4), np.uint8)
         drawn[subject.mask.roads] = (*_KMZ_ROAD[::-1], 255)
         cv2.imwrite(str(source), drawn)
-    middle = float(subject.outline()[:, 0].mean())
+    middle = float(unwrap_ring(subject.outline())[:-1, 0].mean())
     crs = f"+proj=longlat +datum=WGS84 +lon_wrap={middle:.6f} +no_defs"
     warped = folder / "degrees.tif"
     options = ImageOptions(crs, resampling="bilinear", max_pixels=_KMZ_PIXELS)
@@ -313,11 +303,17 @@ def _to_bytes(colors: AnyArray, known: AnyArray) -> AnyArray:
     return np.asarray(np.clip(stretched, 0, 255), np.uint8)
 
 
+_KML_POLYGON = """<Polygon><tessellate>1</tessellate>
+<outerBoundaryIs><LinearRing><coordinates>{}</coordinates></LinearRing></outerBoundaryIs>
+</Polygon>"""
+
+
 def _kml(subject: Subject, grid: MapGrid) -> str:
     west = (grid.west + 180.0) % 360.0 - 180.0
-    east = (grid.west + grid.width * grid.resolution + 180.0) % 360.0 - 180.0
+    east = west + grid.width * grid.resolution  # beyond 180, as KML wants it of what lies astride
     south = grid.north - grid.height * grid.resolution
-    ring = " ".join(f"{lon:.7f},{lat:.7f},0" for lon, lat in _cut(subject.outline())[0])
+    rings = [" ".join(f"{lon:.7f},{lat:.7f},0" for lon, lat in ring) for ring in cut_ring(subject.outline())]
+    polygons = "\n".join(map(_KML_POLYGON.format, rings))
     name = html.escape(subject.paths.stem)
     said = html.escape(f"{subject.location.reason}. {subject.attribution}".strip())
     return f"""<?xml version="1.0" encoding="UTF-8"?>
@@ -332,9 +328,9 @@ def _kml(subject: Subject, grid: MapGrid) -> str:
 </LatLonBox>
 </GroundOverlay>
 <Placemark><name>footprint</name><styleUrl>#footprint</styleUrl>
-<Polygon><tessellate>1</tessellate>
-<outerBoundaryIs><LinearRing><coordinates>{ring}</coordinates></LinearRing></outerBoundaryIs>
-</Polygon>
+<MultiGeometry>
+{polygons}
+</MultiGeometry>
 </Placemark>
 </Document>
 </kml>

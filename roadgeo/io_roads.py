@@ -264,12 +264,17 @@ def _to_degrees(lines: AnyArray, crs: str | None, name: str) -> AnyArray:
 
 
 def _clip(lines: AnyArray, bbox: Box) -> AnyArray:
-    """Cut lines in degrees at the border of a box."""
+    """Cut lines in degrees at the border of a box; a line or a box may lie astride 180 degrees."""
     import shapely
 
     west, south, east, north = bbox
-    boxes = [(west, east)] if west <= east else [(west, 180.0), (-180.0, east)]
-    pieces = [shapely.clip_by_rect(lines, lo, south, hi, north) for lo, hi in boxes]
+    east += 360.0 * (east < west)
+    coords, line = shapely.get_coordinates(lines, return_index=True)
+    jumps = (np.abs(np.diff(coords[:, 0])) > 180.0) & (np.diff(line) == 0)
+    astride = np.isin(line, line[1:][jumps])
+    coords[astride, 0] %= 360.0
+    lines = shapely.set_coordinates(lines.copy(), coords)
+    pieces = [shapely.clip_by_rect(lines, west + turn, south, east + turn, north) for turn in (-360.0, 0.0, 360.0)]
     return simple_lines(np.concatenate(pieces))[0]
 
 

@@ -10,8 +10,9 @@ from typing import Any
 
 import numpy as np
 
+from roadgeo.degrees import cut_ring
 from roadgeo.files import write_text
-from roadgeo.geopackage import Layer, write_layers
+from roadgeo.geopackage import GeometryType, Layer, write_layers
 from roadgeo.styles import draw_fill
 
 __all__ = ["write_summary"]
@@ -25,8 +26,8 @@ def write_summary(folder: Path, documents: Sequence[Mapping[str, Any]]) -> list[
     """Write `roadgeo_summary.gpkg` and `roadgeo_summary.csv`; return their paths.
 
     The GeoPackage has a layer `footprints` of the located masks, in degrees as their references may lie in different
-    zones, and a table `others` of all that were not located, with the reasons. The CSV has all masks in their order,
-    the footprints as well-known text.
+    zones, cut at 180 degrees where one lies astride (then all are multipolygons); and a table `others` of all that were
+    not located, with the reasons. The CSV has all masks in their order, the footprints as well-known text.
 
     Parameters
     ----------
@@ -40,11 +41,14 @@ def write_summary(folder: Path, documents: Sequence[Mapping[str, Any]]) -> list[
     """
     located = [document for document in documents if document["status"] == "located"]
     others = [document for document in documents if document["status"] != "located"]
-    rings = [np.array(document["footprint_lonlat"], float) for document in located]
+    parts = [cut_ring(np.array(document["footprint_lonlat"], float)) for document in located]
+    shapes: tuple[GeometryType, list[Any]] = ("POLYGON", [rings[0] for rings in parts])
+    if any(len(rings) > 1 for rings in parts):
+        shapes = ("MULTIPOLYGON", parts)
     footprints = {name: [document[name] for document in located] for name in (*_SHARED, *_NUMBERS)}
     geopackage, table = folder / "roadgeo_summary.gpkg", folder / "roadgeo_summary.csv"
     layers = [
-        Layer("footprints", "POLYGON", rings, footprints, "EPSG:4326", _STYLE, "Ground that the located masks show"),
+        Layer("footprints", *shapes, footprints, "EPSG:4326", _STYLE, "Ground that the located masks show"),
         Layer("others", columns={name: [document.get(name) for document in others] for name in _SHARED}),
     ]
     write_layers(geopackage, layers)
@@ -69,4 +73,5 @@ def _to_csv(documents: Sequence[Mapping[str, Any]]) -> str:
 def _to_wkt(corners: Sequence[Sequence[float]] | None) -> str:
     if corners is None:
         return ""
-    return "POLYGON ((" + ", ".join(f"{lon:.7f} {lat:.7f}" for lon, lat in [*corners, corners[0]]) + "))"
+    rings = [", ".join(f"{lon:.7f} {lat:.7f}" for lon, lat in ring) for ring in cut_ring(np.array(corners, float))]
+    return f"POLYGON (({rings[0]}))" if len(rings) == 1 else f"MULTIPOLYGON ((({')), (('.join(rings)})))"

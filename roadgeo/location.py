@@ -88,7 +88,7 @@ class Location:
     corner_sigma_m : (4,) float64
         Standard deviations of those corners' positions: root mean squares of their distances from the truth.
     rotation_deg : float
-        Direction of the image's up at its centre, clockwise from north.
+        Direction of the image's up at its centre, clockwise from true north.
     tilt_deg : float or None
         Of the camera from the vertical; None where neither given nor well determined. `tilt_source` says which.
     """

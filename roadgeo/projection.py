@@ -17,7 +17,7 @@ from roadgeo.typing import FloatArray
 if TYPE_CHECKING:
     from pyproj import Transformer
 
-__all__ = ["LocalPlane", "choose_plane", "from_lonlat", "to_lonlat", "transformer"]
+__all__ = ["LocalPlane", "choose_plane", "from_lonlat", "grid_north", "to_lonlat", "transformer"]
 
 #: UTM reaches from 80 S to 84 N; the polar stereographic planes (UPS) lie beyond.
 _UPS_NORTH, _UPS_SOUTH = 84.0, -80.0
@@ -112,6 +112,17 @@ def from_lonlat(plane: LocalPlane, lonlat: FloatArray) -> FloatArray:
     points = np.asarray(lonlat, float)
     en = transformer("EPSG:4326", plane.crs).transform(points[:, 0], points[:, 1])
     return plane.from_crs(np.stack(en, axis=1))
+
+
+def grid_north(plane: LocalPlane, en: FloatArray) -> float:
+    """Return the direction of a plane's y axis at a place (2,) of its CRS, degrees clockwise from true north.
+
+    A few degrees on a UTM zone, anything on a polar plane.
+    """
+    from pyproj import Geod
+
+    (lon, lat), (lon_up, lat_up) = to_lonlat(plane.crs, np.add(en, [[0.0, 0.0], [0.0, 10.0]])).tolist()
+    return float(Geod(ellps="WGS84").inv(lon, lat, lon_up, lat_up)[0])
 
 
 @lru_cache(maxsize=16)

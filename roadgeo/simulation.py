@@ -150,8 +150,11 @@ def draw_view(landscape: Landscape, options: ViewOptions, rng: np.random.Generat
         The map has no such place.
     """
     low, high = landscape.bounds
-    for _ in range(MAX_TRIES):
-        x, y = rng.uniform(low, high)
+    for tries in range(2 * MAX_TRIES):
+        if tries < MAX_TRIES or not len(landscape.intersections):
+            x, y = rng.uniform(low, high)
+        else:  # towns far apart: hardly any ground between their bounds is covered
+            x, y = landscape.intersections[rng.integers(len(landscape.intersections))]
         view = _view_at((x, y), options, rng)
         if not sees_ground(view) or not landscape.covers(view.footprint):
             continue
@@ -159,7 +162,7 @@ def draw_view(landscape: Landscape, options: ViewOptions, rng: np.random.Generat
             return view
     raise RoadSourceError(
         f"no view with {options.intersections[0]} to {options.intersections[1]} intersections was found on the map in"
-        f" {MAX_TRIES} draws; ask for fewer, for a wider window, or give a larger map"
+        f" {2 * MAX_TRIES} draws; ask for fewer, for a wider window, or give a larger map"
     )
 
 

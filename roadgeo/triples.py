@@ -38,6 +38,10 @@ class TripleOptions:
         How far tangents may turn in the equilateral frame, and branches in the map's.
     affine_tolerance : float
         Hits of one proposal may differ by this part of their affine maps' size.
+    spread : bool
+        Whether anchors come spread over the frame, from its middle outwards, or those first whose triples are rare.
+        Rare triples are soon looked up, but often rare because they are wrong: on `noisy` and `hard` training masks 9 %
+        of the rarest sixth of the anchors lead to the place, and 44 % of the commonest.
     max_weighed : int
         Of more intersections, evenly chosen ones may become anchors: to weigh all would take longer than to use some.
     max_hits, max_compared : int
@@ -51,6 +55,7 @@ class TripleOptions:
     angle_tolerance_deg: float = 8.0
     ray_tolerance_deg: float = 25.0
     affine_tolerance: float = 0.3
+    spread: bool = False
     max_weighed: int = 1000
     max_hits: int = 12_000
     max_compared: int = 400_000
@@ -99,7 +104,7 @@ def propose(
     min_ratio: float,
     options: TripleOptions,
 ) -> Iterator[Proposals]:
-    """Yield the proposals of one anchor after another, those anchors first whose triples are rare on the map."""
+    """Yield the proposals of one anchor after another (see `TripleOptions.spread`)."""
     neighbours = np.ascontiguousarray(neighbours[:, : options.n_neighbours])
     k = neighbours.shape[1]
     weighed = np.arange(0, len(query), max(1, math.ceil(len(query) / options.max_weighed)))
@@ -115,9 +120,9 @@ def propose(
     usable = costs >= 0
     total = np.where(usable, costs, 0).sum(axis=(1, 2))
     n_usable = usable.sum(axis=(1, 2))
-    for i in np.argsort(np.where(n_usable >= 3, total / np.maximum(n_usable, 1), np.inf), kind="stable"):
-        if n_usable[i] < 3:
-            break
+    able = np.flatnonzero(n_usable >= 3)
+    rarest = able[np.argsort(total[able] / n_usable[able], kind="stable")]
+    for i in _farthest_first(query.xy[weighed[able]], able) if options.spread else rarest:
         a = weighed[i]
         slots = np.argwhere(usable[i])
         slots = slots[np.argsort(costs[i][usable[i]], kind="stable")]
@@ -142,3 +147,17 @@ def propose(
             int(a), out_ids[best, 0], out_ids[best, 1:], out_affine[best], out_placed[best],
             len(slots), n_compared, n_hits,
         )  # fmt: skip
+
+
+def _farthest_first(xy: FloatArray, names: IntArray) -> Iterator[int]:
+    """Yield the name of the point nearest to the middle of all, then always of the one farthest from those before."""
+    if len(xy) == 0:
+        return
+    away = -np.hypot(*(xy - (xy.min(axis=0) + xy.max(axis=0)) / 2.0).T)
+    nearest = np.full(len(xy), np.inf)
+    for _ in range(len(xy)):
+        i = int(np.argmax(away))
+        yield int(names[i])
+        nearest = np.minimum(nearest, np.hypot(*(xy - xy[i]).T))
+        nearest[i] = -1.0
+        away = nearest

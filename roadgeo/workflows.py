@@ -567,7 +567,7 @@ def place_scene(
     distance: FloatArray | None,
 ) -> Location:
     """Fill in everything that follows from a homography (query plane to reference plane) and its matches."""
-    from roadgeo.projection import to_lonlat
+    from roadgeo.projection import grid_north, to_lonlat
 
     plane = index.plane
     homography = plane.to_crs_matrix() @ matrix @ PIXEL_TO_PLANE
@@ -577,6 +577,7 @@ def place_scene(
     ground = ground[:, :2] / ground[:, 2:]
     lonlat = to_lonlat(plane.crs, ground)
     camera = pose(matrix, scene.size)
+    north = grid_north(plane, ground[4])
     chosen = matched >= 0
     residual = np.zeros(int(chosen.sum())) if distance is None else distance[chosen]
     return replace(
@@ -587,7 +588,7 @@ def place_scene(
         footprint_lonlat=lonlat[:4],
         center=Place(float(ground[4, 0]), float(ground[4, 1]), float(lonlat[4, 0]), float(lonlat[4, 1]), math.nan),
         gsd_m=camera.gsd_m,
-        rotation_deg=camera.rotation_deg,
+        rotation_deg=(camera.rotation_deg + north + 180.0) % 360.0 - 180.0,
         tilt_deg=camera.tilt_deg,
         tilt_source="homography",
         n_matched=int(chosen.sum()),

@@ -154,7 +154,7 @@ def _lines(described: dict[str, Any]) -> list[tuple[str, str]]:
         ("files", ", ".join(described["files"])),
         ("size", f"{size / 1e6:.1f} MB"),
         ("state", _STATES[described["freshness"]]),
-        ("CRS", str(described.get("crs"))),
+        ("CRS", _crs_text(str(described.get("crs")))),
         ("intersections", f"{counts.get('intersections', 0):,}"),
         ("roads", _road_text(described)),
     ]
@@ -177,6 +177,11 @@ _STATES = {
     "old format": "index of an earlier roadgeo: it is built again when the reference is next used",
     "no GeoPackage": "ready; the GeoPackage is missing",
 }
+
+
+def _crs_text(crs: str) -> str:
+    """Return a code as it is, and of a plane of our own the name that stands first in its WKT2."""
+    return crs.split('"')[1] if '"' in crs else crs
 
 
 def _road_text(described: dict[str, Any]) -> str:

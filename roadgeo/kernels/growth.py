@@ -19,6 +19,7 @@ __all__ = [
     "cholesky",
     "fit_homography",
     "grow",
+    "grow_each",
     "keep_nearest",
     "match_all",
     "nearest_alike",
@@ -458,6 +459,60 @@ def grow(
         matrix[axis, 2] = unit * h2 + origin * c
     matrix[2, 0], matrix[2, 1], matrix[2, 2] = a, b, c
     return n_matched, n_tested, ratio
+
+
+@njit(cache=True)
+def grow_each(
+    xy: NDArray[np.float64],
+    branches: NDArray[np.int8],
+    order: NDArray[np.int64],
+    half_size: float,
+    anchor: int,
+    references: NDArray[np.int64],
+    affines: NDArray[np.float64],
+    neighbours: NDArray[np.int32],
+    partners: NDArray[np.int64],
+    ref_xy: NDArray[np.float64],
+    ref_branches: NDArray[np.int8],
+    starts: NDArray[np.int32],
+    grid: tuple[float, float, float],
+    shape: tuple[int, int],
+    sigma: tuple[float, float],
+    radius: tuple[float, float],
+    min_cos: float,
+    perspective_sigma: float,
+    hit_rate: float,
+    chance_rate: float,
+    patience: float,
+    min_matched: int,
+    matched: NDArray[np.int64],
+    matrices: NDArray[np.float64],
+    ratios: NDArray[np.float64],
+) -> None:
+    """Grow the M proposals of one anchor (see `grow`).
+
+    Parameters
+    ----------
+    references : (M,) int64, affines : (M, 4) float64, partners : (M, K) int64
+        `ref_anchor`, `affine` and `partners` of each.
+    sigma, radius : (metres, pixels)
+        Both have a part in metres of the map and one in pixels of the query.
+    min_matched : int
+        Least matches besides the seeds.
+    matched : (M, N) int64, matrices : (M, 3, 3) float64, ratios : (M,) float64
+        Filled; a ratio of -inf: given up.
+    """
+    distance = np.empty(xy.shape[0])
+    for m in range(references.shape[0]):
+        affine = affines[m]
+        gsd = math.sqrt(affine[0] * affine[3] - affine[1] * affine[2])
+        n, _, ratio = grow(
+            xy, branches, order, half_size, anchor, references[m], affine, neighbours, partners[m],
+            ref_xy, ref_branches, starts, grid, shape,
+            math.sqrt(sigma[0] ** 2 + (sigma[1] * gsd) ** 2), radius[0] + radius[1] * gsd, min_cos,
+            perspective_sigma, hit_rate, chance_rate, patience, matched[m], distance, matrices[m],
+        )  # fmt: skip
+        ratios[m] = ratio if n >= min_matched else -np.inf
 
 
 @njit(cache=True)
