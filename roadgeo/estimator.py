@@ -73,11 +73,11 @@ class GrowOptions:
     perspective_sigma: float = 0.4
     hit_rate: float = 0.45
     chance_rate: float = 0.08
-    patience: float = 4.0
-    min_matched: int = 4
+    patience: float = 6.0
+    min_matched: int = 2
     max_points: int = 1000
     max_grown: int = 150
-    max_verified: int = 6
+    max_verified: int = 3
 
 
 class Source(Protocol):

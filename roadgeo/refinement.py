@@ -39,8 +39,9 @@ class RefineOptions:
     correlation_m : float
         Errors of the map and of the mask keep their sign over about this length of road: points closer than that are no
         independent observations.
-    sigma_floor_m : float
-        Accuracy of the map as a whole, which no number of points improves.
+    sigma_floor_m, sigma_floor_px : float
+        Accuracy of the map and of the mask as a whole, which no number of points improves: lines are drawn and thinned
+        to whole pixels. Fitted to the corners of training masks.
     """
 
     max_radius_m: float = 20.0
@@ -55,6 +56,7 @@ class RefineOptions:
     least_share: float = 0.5
     correlation_m: float = 60.0
     sigma_floor_m: float = 0.1
+    sigma_floor_px: float = 0.15
     n_iterations: int = 15
     tolerance_m: float = 0.02
 
@@ -170,4 +172,5 @@ def refine(
     rows = _corner_rows(p, (scene.corners - center) / half_size)
     variance = np.einsum("nai,ij,naj->n", rows, covariance, rows) * unit**2
     result = _matrix(p, center, half_size, origin, unit)
-    return Refined(result / result[2, 2], np.sqrt(variance + options.sigma_floor_m**2), rms)
+    floor = options.sigma_floor_m**2 + (options.sigma_floor_px * gsd) ** 2
+    return Refined(result / result[2, 2], np.sqrt(variance + floor), rms)
