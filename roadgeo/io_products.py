@@ -16,7 +16,7 @@ from typing import Any
 import cv2
 import numpy as np
 
-from roadgeo.degrees import bounds_of, cut_ring, holds_pole, unwrap_ring
+from roadgeo.degrees import bounds_of, cut_ring, unwrap_ring
 from roadgeo.errors import OutputError
 from roadgeo.grid import RoadMask
 from roadgeo.homography import Homography
@@ -31,6 +31,8 @@ __all__ = ["PRODUCTS", "Product", "Subject"]
 _GRID = 5
 #: Pixels of a picture for Google Earth, and the colour (red, green, blue) of a mask's roads there.
 _KMZ_PIXELS, _KMZ_ROAD = 4_000_000, (228, 87, 46)
+#: 11 km from a pole a picture in degrees is as wide as it is deformed.
+_KMZ_LATITUDE = 89.9
 #: No photograph from the air is older: what stands for an unknown date.
 _FIRST_AERIAL_PHOTOGRAPH = "1858-01-01T00:00:00Z"
 
@@ -240,8 +242,8 @@ def write_stac(path: Path, subject: Subject) -> None:
 
 def write_kmz(path: Path, subject: Subject) -> None:
     """Write a ground overlay for Google Earth: the picture in degrees, or the mask's roads, and the footprint."""
-    if holds_pole(subject.outline()):
-        raise OutputError(f"cannot write {path}: a frame that holds a pole is no picture in degrees; leave out kmz")
+    if np.abs(subject.outline()[:, 1]).max() > _KMZ_LATITUDE:
+        raise OutputError(f"cannot write {path}: so near a pole there is no picture in degrees; leave out kmz")
     with TemporaryDirectory(dir=path.parent, prefix=".roadgeo-") as folder:
         overlay, grid = _draw_in_degrees(subject, Path(folder))
     with zipfile.ZipFile(path, "w", zipfile.ZIP_DEFLATED) as archive:

@@ -13,7 +13,7 @@ ROOT = Path(roadgeo.__file__).parent
 NAMES = {
     0: "errors wording progress typing plugins _version",
     1: "kernels",
-    2: "grid road_kinds graph homography robust",
+    2: "grid degrees road_kinds graph homography robust",
     3: "projection simplification vectorization voids intersections network updating warping view landscape",
     4: "tuples index",
     5: "estimator verification refinement location pairs sources triples camera scene outputs explanation",

@@ -111,6 +111,16 @@ def test_a_box_astride_180_degrees(tmp_path):
     )
 
 
+def test_lines_that_run_across_180_degrees(tmp_path):
+    """As a program writes them that knows nothing of that meridian."""
+    lines = [LineString([(179.99, -17), (-179.99, -17)]), LineString([(179.999, -17.01), (179.999, -16.99)])]
+    file = write_vector(tmp_path / "fiji.gpkg", lines)
+    assert shapely.length(read_roads(file).lines).tolist() == pytest.approx([2129, 2213], rel=0.01)
+    for west, east, length in ((179.995, -179.995, 1064), (179.998, 180, 213), (-180, -179.998, 213)):
+        roads = read_roads(file, bbox=(west, -17.005, east, -16.995))
+        assert shapely.length(roads.lines)[0] == pytest.approx(length, rel=0.01)
+
+
 def test_a_shapefile_without_prj_asks_for_a_crs(tmp_path):
     file = write(tmp_path / "a.shp", HERE, crs="EPSG:2249")
     expected = read_roads(file)
