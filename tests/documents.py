@@ -1,7 +1,6 @@
 """Pages of documentation as programs: their blocks, what running them gives, what they link to and name."""
 
 import contextlib
-import glob
 import io
 import os
 import re
@@ -67,9 +66,15 @@ def run_page(text, servers=(), left_out=frozenset()):
         if block.language == "bash":
             printed = "".join(run_command(*command, servers, block.line) for command in block.commands())
         elif block.language == "python":
-            printed, _ = captured(lambda: exec(compile(block.text, f"<line {block.line}>", "exec"), names))
+            printed = run_program(block, names)
         elif block.language == "text":
             compare(block, printed)
+
+
+def run_program(block, names):
+    """Run a python block in the names that those before it left, and return what it printed."""
+    program = compile(block.text, f"<line {block.line}>", "exec")
+    return captured(lambda: exec(program, names))[0]
 
 
 def run_command(command, expected, servers=(), line=0):
@@ -107,15 +112,24 @@ def parse(command):
         name, _, value = words.pop(0).partition("=")
         assignments[name] = value
     at = next((i for i, word in enumerate(words) if word in {"|", ">", ">>"}), len(words))
-    rest = f"cat {shlex.join(words[at + 1 :]).join([f'{words[at]} ', ''])}" if words[at:] else ""
-    if words[at:] and words[at] == "|":
-        rest = command.split("|", 1)[1]
-    expanded = [name for word in words[:at] for name in (sorted(glob.glob(word)) or [word])]
+    rest = ""
+    if words[at:]:
+        after = command.split(f" {words[at]} ", 1)[1]
+        rest = after if words[at] == "|" else f"cat {words[at]} {after}"
+    expanded = [
+        name
+        for word in words[:at]
+        for name in (sorted(map(str, Path().glob(word))) or [word] if "*" in word else [word])
+    ]
     return assignments, expanded, rest
 
 
 def run_roadgeo(words):
     """Return what a command printed on both streams, its status, and what it printed on standard output."""
+    if {"--jobs", "-j"} & set(words):  # a server of processes would outlive this page, and keep its environment
+        command = [sys.executable, "-m", "roadgeo", *words]
+        done = subprocess.run(command, capture_output=True, text=True, check=False)
+        return done.stdout + done.stderr, done.returncode, done.stdout
     status = 0
 
     def call():

@@ -1,8 +1,10 @@
 """README.md and docs say what is true: every command and program in them runs, offline, and gives what they show."""
 
 import json
+import os
 import re
 import shutil
+import subprocess
 import time
 from collections import UserDict
 from pathlib import Path
@@ -13,6 +15,7 @@ import pytest
 from documents import ROOT, blocks, run_page
 from fake_osm import OUTLINE, fake_osm, place
 from fenway import streets, write_streets, write_vector
+from test_qgis import find_qgis
 
 from roadgeo.cli import main
 
@@ -23,8 +26,8 @@ PAGES = {
 }
 LINKING = [path for path in sorted(ROOT.rglob("*.md")) if not {".venv", "build", ".pytest_cache"} & set(path.parts)]
 
-#: Blocks that run elsewhere, by how they begin: .ci/run takes the first two from README.md and runs them on clean copies
-#: of this repository; what runs inside QGIS is run there by test_qgis.
+#: Blocks that are not run with their page, by how they begin: .ci/run takes the first two from README.md and runs them
+#: on clean copies of this repository; for what runs inside QGIS see `test_the_commands_for_qgis_run_there`.
 ELSEWHERE = ("python3 -m venv .venv", "qgis_process run roadgeo:", "processing.run(")
 
 
@@ -52,15 +55,13 @@ def shelf(tmp_path_factory):
         shutil.copy(folder / "massachusetts.osm.pbf", folder / "more")
         write_vector(folder / "outline.geojson", [OUTLINE])
         # Masks of the same streets stand for those that readers draw.
-        index = ["index", "--roads", "massachusetts.osm.pbf", "--out", "fenway.gpkg", "--quiet"]
+        index = ["index", "--roads", "massachusetts.osm.pbf", "--out", "city.gpkg", "--quiet"]
         view = ["--noise", "clean", "--size", "600", "--gsd", "1:1", "--intersections", "15:1000", "--count", "3"]
         assert main(index) == 0
-        assert main(["simulate", "fenway.gpkg", "--out-dir", "drawn", "--quiet", *view]) == 0
+        assert main(["simulate", "city.gpkg", "--out-dir", "drawn", "--quiet", *view]) == 0
         (folder / "drawn" / "clean").rename(folder / "masks")
         for name in ("photo_mask.tif", "photo_mask.png", "photo.tif", "photo.jpg"):
             shutil.copy(folder / "masks" / "q_0000.png", folder / name)
-        for left in ("fenway.gpkg", "fenway.index"):
-            (folder / left).unlink()
         shutil.rmtree("drawn")
     return folder
 
@@ -72,6 +73,7 @@ def desk(shelf, tmp_path, monkeypatch):
     shutil.copytree(shelf, folder)
     for name in ("HOME", "XDG_DATA_HOME", "ROADGEO_CACHE", "ROADGEO_LIBRARY"):
         monkeypatch.setenv(name, str(tmp_path / name.lower()))
+    (tmp_path / "home").mkdir()
     (tmp_path / "xdg_data_home/QGIS/QGIS3/profiles/surveys").mkdir(parents=True)
     monkeypatch.delenv("QGIS_CUSTOM_CONFIG_PATH", raising=False)
     monkeypatch.setattr(time, "sleep", lambda _: None)
@@ -119,14 +121,38 @@ def test_every_command_has_a_page() -> None:
     assert set(re.findall(r"\w+", titles)) >= set(COMMANDS)
 
 
+def elsewhere() -> list[tuple[str, str]]:
+    """Page and text of the blocks that `test_a_page_does_what_it_says` leaves out."""
+    found = [(page, block.text) for page, text in PAGES.items() for block in blocks(text)]
+    return [(page, text) for page, text in found if text.startswith(ELSEWHERE)]
+
+
 def test_only_what_is_said_to_runs_elsewhere() -> None:
-    found = [
-        (page, block.text.split("\n")[0])
-        for page, text in PAGES.items()
-        for block in blocks(text)
-        if block.text.startswith(ELSEWHERE)
-    ]
-    assert [page for page, _ in found] == ["README.md"] * 2 + ["docs/qgis.md"] * 2
+    assert [page for page, _ in elsewhere()] == ["README.md"] * 2 + ["docs/qgis.md"] * 2
+    commands = {text for page, text in elsewhere() if page == "README.md"}
+    first = [block.text for block in blocks(README)][:2]
+    assert commands == set(first)  # the first two blocks: those that .ci/run takes
+
+
+def test_the_commands_for_qgis_run_there(desk: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    found = find_qgis()
+    if found is None:
+        if os.environ.get("ROADGEO_REQUIRE_QGIS"):
+            pytest.fail("ROADGEO_REQUIRE_QGIS is set, and QGIS is not installed")
+        pytest.skip("QGIS is not installed")
+    monkeypatch.setenv("QGIS_CUSTOM_CONFIG_PATH", str(desk / "config"))
+    monkeypatch.setenv("QT_QPA_PLATFORM", "offscreen")
+    assert main(["qgis", "install"]) == 0
+    shell, script = (text for page, text in elsewhere() if page == "docs/qgis.md")
+    functions = f'qgis_process() {{ "{found[0]}" "$@"; }}; set -e\n'
+    done = subprocess.run(["bash", "-c", functions + shell], capture_output=True, text=True, check=False)
+    assert done.returncode == 0, done.stdout + done.stderr
+    assert "STATUS:\tlocated" in done.stdout
+    assert (desk / "found" / "photo_mask_location.gpkg").exists()
+    assert (desk / "seen" / "photo_mask_vectorized.gpkg").exists()
+    # The call from Python asks for the same.
+    for name, value in re.findall(r'"([A-Z_]+)": "([^"]+)"', script):
+        assert f"{name}={value}" in shell
 
 
 def test_the_first_screen_holds_a_picture_and_two_commands() -> None:
