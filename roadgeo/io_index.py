@@ -13,6 +13,15 @@ nothing overlaps, types are known, and the digests of header and pickle and the 
 finds damage. A forger can make digests agree, so against hostility the unpickler knows no names and is shown only
 opcodes that can neither call nor refer back, and the owner of the arrays checks their integer references before a
 kernel follows them.
+
+How it is upgraded: never. The GeoPackage beside an index is what lasts: its schema ("roadgeo.reference/1") is read by
+every later roadgeo, and holds the roads, the intersections and the options that the index is built from, in seconds. So
+`FORMAT_VERSION` goes up whenever the file or the arrays in it change, and a reader refuses every version but its own:
+
+- an older index beside its GeoPackage is built again, unasked, when the reference is next opened;
+- an older index alone is refused: the reference has to be made again from its roads, or by whoever handed it on;
+- a newer index is refused and left alone, for a newer roadgeo may be in use beside this one: either that is used, or
+  `roadgeo index --rebuild REF.gpkg` replaces the index by one of this version.
 """
 
 from __future__ import annotations
@@ -23,6 +32,7 @@ import math
 import mmap
 import os
 import pickle
+import shlex
 import struct
 from collections.abc import Mapping
 from hashlib import blake2b
@@ -43,17 +53,16 @@ __all__ = [
     "read_format_version",
     "read_index",
     "read_manifest",
+    "remedy",
     "write_index",
 ]
 
-#: Goes up whenever the file or the arrays in it change. A reader refuses every version but its own; an older index is
-#: built again from its GeoPackage, whose schema is the one that lasts.
+#: See the module's docstring for when it goes up, and what becomes of other versions.
 FORMAT_VERSION = 1
 
 _MAGIC = b"\x89roadgeo index\r\n"
 _PREAMBLE = struct.Struct("<16sII32s8x")
 _ALIGNMENT = 64
-_REMEDY = "rebuild it with `roadgeo index`, or delete it if its GeoPackage lies beside it"
 
 _DTYPES = {
     code: np.dtype(code) for code in ("<f8", "<f4", "<i8", "<i4", "<i2", "|i1", "<u8", "<u4", "<u2", "|u1", "|b1")
@@ -218,7 +227,15 @@ def check_index(path: str | os.PathLike[str]) -> list[str]:
 
 
 def _refuse(path: str | os.PathLike[str], what: str, cause: Exception | None = None) -> NoReturn:
-    raise IndexFormatError(f"{os.fspath(path)} cannot be used: {what}; {_REMEDY}") from cause
+    raise IndexFormatError(f"{os.fspath(path)} cannot be used: {what}; {remedy(path)}") from cause
+
+
+def remedy(path: str | os.PathLike[str]) -> str:
+    """Say how an index that cannot be used is had again: what to type where its GeoPackage lies beside it."""
+    geopackage = Path(path).with_suffix(".gpkg")
+    if geopackage.is_file():
+        return f"build it again from its GeoPackage: roadgeo index --rebuild {shlex.quote(os.fspath(geopackage))}"
+    return f"put {geopackage.name} beside it, from which it is built again, or make both again with `roadgeo index`"
 
 
 def _aligned(n: int) -> int:
@@ -290,7 +307,8 @@ def _parse_manifest(data: mmap.mmap, path: str | os.PathLike[str]) -> tuple[dict
     version = _parse_version(data, path)
     _, _, size, digest = _PREAMBLE.unpack_from(data)
     if version != FORMAT_VERSION:
-        _refuse(path, f"it has format version {version}, and this roadgeo {__version__} reads version {FORMAT_VERSION}")
+        told = f"it has format version {version}, and this roadgeo {__version__} reads version {FORMAT_VERSION}"
+        _refuse(path, told + ("; use a later roadgeo, or else" if version > FORMAT_VERSION else ""))
     if size > _MAX_MANIFEST or _PREAMBLE.size + size > len(data):
         _refuse(path, "it is truncated, or its manifest's size is wrong")
     raw = data[_PREAMBLE.size : _PREAMBLE.size + size]

@@ -24,6 +24,7 @@ from roadgeo.io_index import (
     read_format_version,
     read_index,
     read_manifest,
+    remedy,
 )
 from roadgeo.io_network import (
     computed_digest,
@@ -45,6 +46,7 @@ __all__ = [
     "check_reference",
     "describe_reference",
     "open_reference",
+    "rebuild_index",
     "reference_freshness",
     "reference_paths",
     "write_reference",
@@ -156,11 +158,33 @@ def _open(paths: ReferencePaths, rebuild: Callable[[RoadNetwork], IndexParts] | 
     if freshness == "stale":
         raise IndexFormatError(
             f"{paths.index} is stale: the intersections of {paths.geopackage.name} were changed after it was built; "
-            "delete it and it will be built again from the GeoPackage"
+            + remedy(paths.index)
         )
     if freshness in {"no index", "old format"} and rebuild is not None:
         return _rebuild(paths, rebuild)
     return read_index(paths.index)
+
+
+def rebuild_index(path: str | os.PathLike[str], build: Callable[[RoadNetwork], IndexParts]) -> None:
+    """Build a reference's index again from its GeoPackage alone, whatever index there is.
+
+    Raises
+    ------
+    IndexFormatError
+        There is no such GeoPackage, it is damaged, or it is replaced meanwhile.
+    OutputError
+        The index cannot be written.
+    """
+    paths = reference_paths(path)
+    before = _identities(paths)
+    network = read_network(paths.geopackage)
+    meta, arrays = build(network)
+    with staging(paths.index) as folder:
+        staged = folder / paths.index.name
+        dump_index(staged, meta, arrays, _about(network, meta))
+        if _identities(paths) != before:
+            raise IndexFormatError(f"{paths.geopackage} or its index was replaced meanwhile; try again")
+        publish(staged, paths.index)
 
 
 def reference_freshness(path: str | os.PathLike[str]) -> Freshness:
@@ -360,17 +384,16 @@ def _check_content(path: Path, network: RoadNetwork | None) -> list[str]:
         return [str(error)]
     if network is None:
         return []
-    remedy = "delete it and it will be built again"
     if manifest["about"].get("network") != network_digest(network):
-        return [f"{path} is stale: it was built from other intersections; {remedy}"]
+        return [f"{path} is stale: it was built from other intersections; {remedy(path)}"]
     if manifest["roadgeo"] != __version__:  # which may well have built another index
         return []
     stored: Any = index.meta.get("index_options")
     if not are_options(stored):
-        return [f"{path}: its options are none that `roadgeo index` writes; {remedy}"]
+        return [f"{path}: its options are none that `roadgeo index` writes; {remedy(path)}"]
     expected = build_index(network, IndexOptions(**stored)).arrays()
     return [
-        f"{path}: its array {name!r} is not what the GeoPackage gives; {remedy}"
+        f"{path}: its array {name!r} is not what the GeoPackage gives; {remedy(path)}"
         for name, array in index.arrays().items()
         if not np.array_equal(array, expected[name], equal_nan=array.dtype.kind == "f")
     ]

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 import time
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import asdict, dataclass, field, fields, replace
 from functools import lru_cache
 from pathlib import Path
@@ -48,6 +48,7 @@ __all__ = [
     "explain",
     "locate",
     "open_reference",
+    "rebuild_reference",
     "stored_options",
     "trace_query",
     "update_reference",
@@ -226,13 +227,35 @@ def open_reference(path: str | Path, say: Say = say_nothing) -> Reference:
     from roadgeo.io_reference import open_reference as open_parts
     from roadgeo.io_reference import reference_paths
 
-    def rebuild(network: RoadNetwork) -> tuple[dict[str, Any], dict[str, AnyArray]]:
-        say(f"building the index of {reference_paths(path).geopackage.name} again")
-        index = build_index(network, stored_options(network).index, say)
+    meta, arrays = open_parts(path, _index_builder(path, say))
+    return Reference(ReferenceIndex.from_parts(meta, arrays, str(reference_paths(path).geopackage)))
+
+
+def rebuild_reference(path: str | Path, say: Say = say_nothing) -> Reference:
+    """Build a reference's index again from its GeoPackage alone, after an edit of that, or in place of a damaged one.
+
+    Raises
+    ------
+    IndexFormatError
+        There is no such GeoPackage, or it is damaged.
+    OutputError
+        The index cannot be written.
+    """
+    from roadgeo.io_reference import rebuild_index
+
+    rebuild_index(path, _index_builder(path, say))
+    return open_reference(path)
+
+
+def _index_builder(path: str | Path, say: Say) -> Callable[[RoadNetwork], tuple[dict[str, Any], dict[str, AnyArray]]]:
+    """Return what builds the index of a reference's network with the options that are stored in that."""
+
+    def build(network: RoadNetwork) -> tuple[dict[str, Any], dict[str, AnyArray]]:
+        what = f"building the index of {Path(path).stem} again"
+        index = build_index(network, stored_options(network).index, lambda _, share=None: say(what, share))
         return dict(index.meta), index.arrays()
 
-    meta, arrays = open_parts(path, rebuild)
-    return Reference(ReferenceIndex.from_parts(meta, arrays, str(reference_paths(path).geopackage)))
+    return build
 
 
 # --- a mask to a place ------------------------------------------------------------------------------------------------

@@ -1,8 +1,15 @@
 """`roadgeo index` from its command line to its files, on loopback servers that give real answers."""
 
 import json
+import os
+import shlex
+import sqlite3
 import time
+from contextlib import closing
+from pathlib import Path
 
+import cv2
+import numpy as np
 import pytest
 import shapely
 from fake_osm import EMPTY, fake_osm
@@ -150,6 +157,36 @@ def test_an_update_from_far_away_is_refused(tmp_path, capsys):
     assert index("--update", "--roads", far, "--out", reference, quiet=True) == 1
     assert "too far from the reference" in capsys.readouterr().err
     assert reference.read_bytes() == before
+
+
+def test_an_index_is_built_again_from_the_geopackage_alone(tmp_path, monkeypatch, capsys):
+    """After an edit, as in QGIS, every command says what to type, and that helps."""
+    monkeypatch.chdir(tmp_path)
+    assert index("--roads", write_streets(tmp_path / "a.geojson"), "--out", "my map.gpkg", quiet=True) == 0
+    n, *_ = counts("my map.gpkg", capsys)
+    with closing(sqlite3.connect("my map.gpkg")) as database:
+        database.execute("DELETE FROM intersections WHERE fid = 1")
+        database.commit()
+    cv2.imwrite("mask.png", np.zeros((200, 200), np.uint8))
+    assert main(["locate", "mask.png", "-r", "my map.gpkg"]) == 1
+    advice = capsys.readouterr().err.strip().rpartition(": ")[2]
+    assert advice == "roadgeo index --rebuild 'my map.gpkg'"
+    assert main(shlex.split(advice)[1:]) == 0
+    assert "building the index of my map again ..." in capsys.readouterr().err
+    assert counts("my map.gpkg", capsys)[0] == n - 1
+    assert index("--rebuild", "my map.gpkg", "--osm", "Fenway, Boston") == 2
+    assert index("--rebuild", "none.gpkg", quiet=True) == 1
+    Path("my map.index").unlink()
+    assert main(["locate", "mask.png", "-r", "my map.gpkg"]) == 1  # it shows no roads
+    assert "building the index of my map again ..." in capsys.readouterr().err
+
+
+def test_a_folder_one_may_not_write_to_is_named_before_the_long_part(tmp_path, monkeypatch, capsys):
+    monkeypatch.setattr(os, "access", lambda _, mode: not mode & os.W_OK)  # root may write everywhere
+    assert index("--roads", write_streets(tmp_path / "a.geojson"), "--out", tmp_path / "shelf" / "a.gpkg") == 1
+    told = capsys.readouterr().err
+    assert told.endswith("permission denied; choose a folder you may write to\n")
+    assert told.count("\n") == 1
 
 
 def test_ctrl_c_leaves_nothing_behind(tmp_path, monkeypatch, capsys):

@@ -170,7 +170,10 @@ def test_other_versions_are_named(path: Path) -> None:
     raw = bytearray(path.read_bytes())
     raw[16:20] = struct.pack("<I", 7)
     path.write_bytes(raw)
-    with pytest.raises(IndexFormatError, match=r"format version 7.*reads version 1.*rebuild"):
+    with pytest.raises(
+        IndexFormatError,
+        match=r"format version 7.*reads version 1; use a later roadgeo.*make both again with `roadgeo index`",
+    ):
         read_index(path)
 
 

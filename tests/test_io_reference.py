@@ -24,6 +24,7 @@ from roadgeo.io_reference import (
     check_reference,
     describe_reference,
     open_reference,
+    rebuild_index,
     reference_freshness,
     reference_paths,
     write_reference,
@@ -108,15 +109,44 @@ def test_an_index_of_a_later_format_is_refused(path: Path) -> None:
     index = path.with_suffix(".index")
     raw = index.read_bytes()
     index.write_bytes(raw[:16] + struct.pack("<I", 99) + raw[20:])
-    with pytest.raises(IndexFormatError, match=r"format version 99.*reads version 1"):
+    with pytest.raises(
+        IndexFormatError, match=r"format version 99.*reads version 1; use a later .*--rebuild \S*grid\.gpkg$"
+    ):
         open_reference(path, never)
+    assert index.read_bytes()[16:20] == struct.pack("<I", 99)  # that roadgeo may want it
+
+
+def test_an_old_index_alone_says_what_is_missing(path: Path) -> None:
+    index = path.with_suffix(".index")
+    raw = index.read_bytes()
+    index.write_bytes(raw[:16] + struct.pack("<I", 0) + raw[20:])
+    path.unlink()
+    with pytest.raises(IndexFormatError, match=r"format version 0.*put grid\.gpkg beside it"):
+        open_reference(path, parts)
+
+
+@pytest.mark.parametrize("damage", [b"", b"nonsense", struct.pack("<I", 99)], ids=["empty", "damaged", "later"])
+def test_an_index_is_built_again_on_request_whatever_there_was(path: Path, network: RoadNetwork, damage: bytes) -> None:
+    index = path.with_suffix(".index")
+    raw = index.read_bytes()
+    index.write_bytes(raw[:16] + damage + raw[16 + len(damage) :] if damage else b"")
+    with pytest.raises(IndexFormatError):
+        open_reference(path, never)
+    rebuild_index(path, parts)
+    assert index.read_bytes() == raw
+    assert open_reference(path, never)[0] == parts(network)[0]
+    path.unlink()
+    with pytest.raises(IndexFormatError, match=r"no such file: .*grid\.gpkg"):
+        rebuild_index(path, parts)
 
 
 def test_an_edited_geopackage_makes_the_index_stale(path: Path) -> None:
     with editing(path) as database:
         database.execute("DELETE FROM intersections WHERE fid = 1")
     assert reference_freshness(path) == "stale"
-    with pytest.raises(IndexFormatError, match=r"grid\.index is stale: .* grid\.gpkg .*; delete it"):
+    with pytest.raises(
+        IndexFormatError, match=r"grid\.index is stale: .* grid\.gpkg .*: roadgeo index --rebuild \S*grid\.gpkg$"
+    ):
         open_reference(path, never)
     path.with_suffix(".index").unlink()
     assert (

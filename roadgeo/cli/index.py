@@ -58,7 +58,14 @@ __all__ = ["build", "index_command"]
 @click.option("--nominatim-url", metavar="URL", help="Nominatim server that finds --osm places.")
 @click.option("--no-cache", is_flag=True, help="Fetch anew what was fetched before.")
 @click.option(
-    "--update", is_flag=True, help="Replace or add this ground in the reference that is there; keep the rest."
+    "--update",
+    is_flag=True,
+    help="Bring a reference up to date: replace its roads on the ground asked for, or add that; keep the rest.",
+)
+@click.option(
+    "--rebuild",
+    metavar="REF",
+    help="Build the index of REF again from its GeoPackage alone, after an edit in QGIS for example.",
 )
 @click.option("--name", metavar="NAME", help="Name of the reference. Default: after the place or file.")
 @click.option(
@@ -69,14 +76,17 @@ __all__ = ["build", "index_command"]
     help="Where it goes. Default: into the library, under its name.",
 )
 @verbosity_options
-def index_command(out: str | None, name: str | None, update: bool, quiet: bool, verbose: bool, **source: Any) -> None:
+def index_command(
+    out: str | None, name: str | None, update: bool, rebuild: str | None, quiet: bool, verbose: bool, **source: Any
+) -> None:
     """Build a reference: draw the roads of a place as a mask shows them, and index their intersections.
 
     Done once per place; `roadgeo locate` then searches it. The result is REF.gpkg, which opens styled in QGIS, and
     REF.index beside it. Without --out it goes into the library, which `roadgeo locate` searches by default.
 
-    With --update the reference of that --name or --out is kept, but for the ground asked for (the place, the box, the
-    polygon, or where the roads of --roads lie): there its roads are replaced.
+    With --update the reference named by --name (in the library) or --out is changed: on the ground asked for (the
+    place, the box, the polygon, or where the roads of --roads lie) its roads are replaced, or added where it has none.
+    The rest stays as it is, and so do the options it was built with.
 
     \b
     Examples:
@@ -85,6 +95,8 @@ def index_command(out: str | None, name: str | None, update: bool, quiet: bool, 
       roadgeo index --roads streets.shp --crs EPSG:26986 --out maps/streets.gpkg
       roadgeo index --roads massachusetts.osm.pbf --bbox=-71.19,42.23,-70.95,42.44
       roadgeo index --update --osm "Cambridge, MA" --name boston-ma
+      roadgeo index --update --roads new_estate.geojson --out maps/streets.gpkg
+      roadgeo index --rebuild maps/streets.gpkg
     """
     from roadgeo.cli.compilation import compile_once
     from roadgeo.cli.folders import make_folder
@@ -93,6 +105,11 @@ def index_command(out: str | None, name: str | None, update: bool, quiet: bool, 
     from roadgeo.library import make_slug, new_reference
 
     started = perf_counter()
+    if rebuild is not None:
+        if update or name or out or any(source[option] for option in (*_FETCHED, "bbox", "roads", "plugin")):
+            raise click.UsageError("--rebuild takes nothing but the reference: its roads are in its GeoPackage.")
+        _rebuild(rebuild, quiet)
+        return
     given = _one_source(source)
     name = name or _name(source, given)
     path = Path(out) if out else new_reference(name)
@@ -138,6 +155,20 @@ def renew(roads: Roads, path: Path, say: Say = say_nothing) -> Reference:
     from roadgeo.workflows import update_reference
 
     return update_reference(path, roads, say)
+
+
+def _rebuild(name: str, quiet: bool) -> None:
+    from roadgeo.cli.compilation import compile_once
+    from roadgeo.cli.progress import show_steps
+    from roadgeo.library import resolve_reference
+    from roadgeo.workflows import rebuild_reference
+
+    path = resolve_reference(name)
+    with show_steps(quiet) as say:
+        reference = rebuild_reference(path, say)
+    compile_once(reference, quiet)
+    if not quiet:
+        click.echo(f"{path}: {len(reference.index):,} intersections indexed again")
 
 
 # --- where the roads come from ----------------------------------------------------------------------------------------

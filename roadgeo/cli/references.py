@@ -172,7 +172,7 @@ def _lines(described: dict[str, Any]) -> list[tuple[str, str]]:
 
 _STATES = {
     "fresh": "ready",
-    "stale": "stale: the GeoPackage was edited; delete the index and it is built again",
+    "stale": "stale: the GeoPackage was edited; `roadgeo index --rebuild` builds the index again",
     "no index": "no index: it is built when the reference is first used",
     "old format": "index of an earlier roadgeo: it is built again when the reference is next used",
     "no GeoPackage": "ready; the GeoPackage is missing",
