@@ -8,7 +8,7 @@ from typing import Any, Literal
 from roadgeo.graph import RoadGraph
 from roadgeo.typing import FloatArray
 
-__all__ = ["SCHEMA", "Evidence", "Location", "Place", "Seconds", "Stats", "Status"]
+__all__ = ["SCHEMA", "Evidence", "Location", "Place", "Seconds", "Seen", "Stats", "Status"]
 
 SCHEMA = "roadgeo.location/1"
 
@@ -51,6 +51,14 @@ class Stats:
     candidates: int = 0
     hypotheses: int = 0
     verified: int = 0
+
+
+@dataclass(frozen=True)
+class Seen:
+    """What the mask shows, in the query plane, pixels (see `roadgeo.grid`): roads, and (N, 2) intersections."""
+
+    graph: RoadGraph
+    xy: FloatArray
 
 
 @dataclass(frozen=True)
@@ -116,6 +124,7 @@ class Location:
     seconds: Seconds = field(default_factory=Seconds)
     stats: Stats = field(default_factory=Stats)
     evidence: Evidence | None = None
+    seen: Seen | None = field(default=None, repr=False)
 
     @property
     def located(self) -> bool:
@@ -123,7 +132,7 @@ class Location:
         return self.status == "located"
 
     def to_dict(self) -> dict[str, Any]:
-        """Plain values in the order of the schema, ready for `json.dumps`; the evidence is left out."""
+        """Plain values in the order of the schema, ready for `json.dumps`; evidence and what was seen are left out."""
 
         def rows(array: FloatArray | None) -> list[Any] | None:
             return None if array is None else array.tolist()

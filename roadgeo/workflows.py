@@ -22,7 +22,7 @@ from roadgeo.grid import PIXEL_TO_PLANE, RoadMask
 from roadgeo.homography import Homography
 from roadgeo.index import MAX_NEIGHBOURS, IndexOptions, ReferenceIndex, build_index
 from roadgeo.intersections import IntersectionOptions, Intersections, find_intersections
-from roadgeo.location import Evidence, Location, Place, Seconds, Stats
+from roadgeo.location import Evidence, Location, Place, Seconds, Seen, Stats
 from roadgeo.network import RoadNetwork
 from roadgeo.pairs import PairIndex, PairOptions, build_pair_index, match_pairs
 from roadgeo.progress import Say, say_nothing
@@ -438,8 +438,9 @@ def _locate_on(
     """Match, judge and describe one query on one reference; `time_limit_s` is what is left for that."""
     scene, graph, seconds = query.scene, query.graph, query.seconds
     n = len(scene.intersections)
+    seen = Seen(graph, scene.intersections.xy)
     location = Location(
-        query.name, "not_located", "", reference=index.name, size=scene.size, n_intersections=n, seconds=seconds
+        query.name, "not_located", "", index.name, size=scene.size, n_intersections=n, seconds=seconds, seen=seen
     )
     needed = Needed(options.min_log10_odds, options.min_margin, options.min_intersections)
     if n < needed.intersections or options.method == "pair":

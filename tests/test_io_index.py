@@ -19,7 +19,7 @@ from hypothesis.extra import numpy as hnp
 
 from roadgeo import io_index
 from roadgeo.errors import IndexFormatError, OutputError
-from roadgeo.io_index import check_index, read_index, read_manifest, write_index
+from roadgeo.io_index import FORMAT_VERSION, check_index, read_index, read_manifest, write_index
 
 META = {"name": "Böston", "origin": [330000.0, 4690000], "flags": [True, None, -1, 2**40], "options": {"n": 8}}
 ARRAYS = {
@@ -172,7 +172,7 @@ def test_other_versions_are_named(path: Path) -> None:
     path.write_bytes(raw)
     with pytest.raises(
         IndexFormatError,
-        match=r"format version 7.*reads version 1; use a later roadgeo.*make both again with `roadgeo index`",
+        match=rf"format version 7.*reads version {FORMAT_VERSION}; use a later .*make both again with `roadgeo index`",
     ):
         read_index(path)
 
@@ -250,7 +250,7 @@ def test_checksum_sees_a_changed_name_type_or_shape(change: dict[str, Any]) -> N
 @pytest.mark.parametrize(
     "change",
     [
-        {"format": 2},
+        {"format": FORMAT_VERSION + 1},
         {"format": "1"},
         {"format": True},
         {"arrays": None},
@@ -424,7 +424,7 @@ def test_random_pickles_are_refused_or_plain(path: Path, pickled: bytes) -> None
 
 def test_header_digest_covers_version_and_size() -> None:
     header = io_index._header(b"{}")
-    assert header[24:56] == blake2b(struct.pack("<II", 1, 2) + b"{}", digest_size=32).digest()
+    assert header[24:56] == blake2b(struct.pack("<II", FORMAT_VERSION, 2) + b"{}", digest_size=32).digest()
 
 
 # --- the disk ---------------------------------------------------------------------------------------------------------

@@ -18,7 +18,7 @@ from test_io_network import editing
 
 from roadgeo import io_index
 from roadgeo.errors import IndexFormatError, OutputError
-from roadgeo.io_index import read_manifest
+from roadgeo.io_index import FORMAT_VERSION, read_manifest
 from roadgeo.io_network import as_stored, network_digest, read_network, write_network
 from roadgeo.io_reference import (
     check_reference,
@@ -110,7 +110,8 @@ def test_an_index_of_a_later_format_is_refused(path: Path) -> None:
     raw = index.read_bytes()
     index.write_bytes(raw[:16] + struct.pack("<I", 99) + raw[20:])
     with pytest.raises(
-        IndexFormatError, match=r"format version 99.*reads version 1; use a later .*--rebuild \S*grid\.gpkg$"
+        IndexFormatError,
+        match=rf"format version 99.*reads version {FORMAT_VERSION}; use a later .*--rebuild \S*grid\.gpkg$",
     ):
         open_reference(path, never)
     assert index.read_bytes()[16:20] == struct.pack("<I", 99)  # that roadgeo may want it
@@ -406,7 +407,7 @@ def test_damage_of_either_file_is_found(checked: Path) -> None:
     ("name", "change", "message"),
     [
         ("neighbours", lambda a: a + 1000, "out of range"),
-        ("table_entries", lambda a: a | np.uint64(0xFFFF << 32), "out of range"),
+        ("table_entries", lambda a: a | np.uint64(0xFFFF << 48), "out of range"),
         ("source", lambda a: a * 0, "array 'source' is not what the GeoPackage gives"),
         ("xy", lambda a: a + 0.25, "array 'xy' is not what the GeoPackage gives"),
         ("segments", lambda a: a + 0.25, "array 'segments' is not what the GeoPackage gives"),

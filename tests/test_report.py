@@ -190,6 +190,14 @@ def test_a_photograph_is_shown_in_place_of_the_mask(
         render_report(found, drone, porto.index, picture=tmp_path / "missing.png")
 
 
+def test_a_mask_is_traced_once(
+    porto: Reference, drone: RoadMask, found: Location, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    anew = render_report(replace(found, seen=None), drone, porto.index)
+    monkeypatch.setattr("roadgeo.report.views.trace_query", None)
+    assert render_report(found, drone, porto.index) == anew
+
+
 def test_the_report_is_written_in_one_step(porto: Reference, drone: RoadMask, found: Location, tmp_path: Path) -> None:
     write_report(tmp_path / "drone_report.html", found, drone, porto.index, ATTRIBUTION)
     assert [path.name for path in tmp_path.iterdir()] == ["drone_report.html"]

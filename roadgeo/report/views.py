@@ -7,7 +7,7 @@ import json
 import math
 import os
 from collections.abc import Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass
 
 import cv2
 import numpy as np
@@ -15,12 +15,12 @@ import numpy as np
 from roadgeo.grid import RoadMask, plane_to_pixel
 from roadgeo.homography import Homography
 from roadgeo.index import ReferenceIndex
-from roadgeo.location import Evidence, Location
+from roadgeo.location import Evidence, Location, Seen
 from roadgeo.outputs import Placement
 from roadgeo.report.svg import draw_dots, draw_image, draw_lines, join_segments, thin_lines
 from roadgeo.typing import AnyArray, BoolArray, FloatArray
 from roadgeo.warping import cover, warp
-from roadgeo.workflows import QueryOptions, trace_query
+from roadgeo.workflows import trace_query
 
 __all__ = [
     "Layer",
@@ -64,8 +64,6 @@ class ReportOptions:
         Longer side of the photograph or mask, and size of each of its two copies: in its frame and on the map.
     overview_bytes : int
         Size of the picture of the whole map.
-    query : QueryOptions
-        How the mask's roads were found.
     """
 
     margin: float = 0.12
@@ -76,7 +74,6 @@ class ReportOptions:
     picture_px: int = 1400
     picture_bytes: int = 300_000
     overview_bytes: int = 150_000
-    query: QueryOptions = field(default_factory=QueryOptions)
 
 
 @dataclass(frozen=True)
@@ -115,17 +112,20 @@ class Subject:
         options: ReportOptions,
         attribution: str,
     ) -> Subject:
-        """See what is in the mask, and read the picture."""
-        scene, graph = trace_query(mask, options.query)
-        lines = thin_lines([plane_to_pixel(line) for line in graph.polylines()], options.max_query_vertices, 0.4)
+        """Take what was seen in the mask, or look at it anew, and read the picture."""
+        seen = location.seen
+        if seen is None:
+            scene, graph = trace_query(mask)
+            seen = Seen(graph, scene.intersections.xy)
+        lines = thin_lines([plane_to_pixel(line) for line in seen.graph.polylines()], options.max_query_vertices, 0.4)
         photograph = None
         if picture is not None:
             from roadgeo.io_image import read_preview
 
             photograph = read_preview(picture, options.picture_px)
         place = None if location.homography is None else Placement.of(location)
-        seen = plane_to_pixel(scene.intersections.xy)
-        return cls(location, mask, index, options, place, lines, seen, photograph, attribution)
+        crossings = plane_to_pixel(seen.xy)
+        return cls(location, mask, index, options, place, lines, crossings, photograph, attribution)
 
     @property
     def size(self) -> tuple[int, int]:
