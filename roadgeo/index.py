@@ -17,7 +17,7 @@ from roadgeo.errors import IndexFormatError
 from roadgeo.graph import RoadGraph
 from roadgeo.kernels.buckets import nearest_neighbours
 from roadgeo.kernels.roads import bin_segments
-from roadgeo.kernels.triples import TABLE, fill_table
+from roadgeo.kernels.triples import MAX_ANCHORS, MAX_NEIGHBOURS, TABLE, fill_table, find_sides
 from roadgeo.network import RoadNetwork
 from roadgeo.progress import Say, say_nothing
 from roadgeo.projection import LocalPlane
@@ -25,8 +25,6 @@ from roadgeo.typing import AnyArray, Float32Array, FloatArray, Int32Array
 
 __all__ = ["IndexOptions", "ReferenceIndex", "build_index", "neighbour_grid", "pack_tangents", "sort_by_bucket"]
 
-#: Slots of `neighbours` are stored in 4 bits.
-MAX_NEIGHBOURS = 16
 #: Branches and tangents beyond these, which hardly an intersection has, serve its codes but are not compared.
 INDEXED_BRANCHES = 6
 
@@ -38,7 +36,7 @@ class IndexOptions:
     Attributes
     ----------
     n_neighbours : int
-        Triples are formed with pairs of an intersection's nearest neighbours; at most 16.
+        Triples are formed with pairs of an intersection's nearest neighbours; at most 8.
     min_shape : float
         Triangles thinner than this (twice the area over the longest side squared) carry no stable code.
     codes_per_vertex : int
@@ -218,13 +216,13 @@ def check_table(index: ReferenceIndex) -> None:
     `from_parts` leaves that to the kernels, which believe no entry: it would read the whole table.
     """
     entries = index.table_entries
-    anchors = (entries >> np.uint64(32)).astype(np.int64)
+    anchors = (entries >> np.uint64(40)).astype(np.int64)
     if len(anchors) == 0:
         return
     if int(anchors.max()) >= len(index):
         raise IndexFormatError("a table entry is out of range; rebuild the index with `roadgeo index`")
-    for shift in (28, 24):
-        slots = ((entries >> np.uint64(shift)) & np.uint64(15)).astype(np.int64)
+    for shift in (37, 34):
+        slots = ((entries >> np.uint64(shift)) & np.uint64(7)).astype(np.int64)
         if int(slots.max()) >= index.neighbours.shape[1] or (index.neighbours[anchors, slots] < 0).any():
             raise IndexFormatError("a table entry is out of range; rebuild the index with `roadgeo index`")
 
@@ -285,6 +283,10 @@ def build_index(network: RoadNetwork, options: IndexOptions | None = None, say: 
     found = network.intersections
     if len(found) < 3:
         raise RoadSourceError(f"the roads have {len(found)} intersections, at least 3 are needed: take a larger area")
+    if len(found) > MAX_ANCHORS:
+        raise RoadSourceError(
+            f"the roads have {len(found):,} intersections, at most {MAX_ANCHORS:,} can be indexed: split the area"
+        )
     what = f"indexing {len(found):,} intersections"
     say(what, 0.0)
     segments = _cut_segments(network.graph, options.simplify_m)
@@ -302,13 +304,16 @@ def build_index(network: RoadNetwork, options: IndexOptions | None = None, say: 
     bin_segments(segments, grid, shape, segment_starts.astype(np.int64), segment_ids)
 
     say(what, 0.4)
+    branches = np.ascontiguousarray(found.branches()[order])
+    sides = np.empty(tangents.shape, np.int8)
+    find_sides(tangents, branches, sides)
     counts = np.zeros(TABLE + 1, np.int64)
     shape_limit = (options.min_shape, options.codes_per_vertex)
-    total = fill_table(xy, tangents, neighbours, *shape_limit, counts, np.empty(0, np.uint64))
+    total = fill_table(xy, tangents, sides, neighbours, *shape_limit, counts, np.empty(0, np.uint64))
     table_starts = np.cumsum(counts)
     entries = np.empty(total, np.uint64)
     say(what, 0.7)
-    fill_table(xy, tangents, neighbours, *shape_limit, table_starts.copy(), entries)
+    fill_table(xy, tangents, sides, neighbours, *shape_limit, table_starts.copy(), entries)
 
     meta = {
         **network.meta,
@@ -323,7 +328,7 @@ def build_index(network: RoadNetwork, options: IndexOptions | None = None, say: 
     index = ReferenceIndex(
         meta=meta,
         xy=xy,
-        branches=np.ascontiguousarray(found.branches()[order, :INDEXED_BRANCHES]),
+        branches=np.ascontiguousarray(branches[:, :INDEXED_BRANCHES]),
         tangents=pack_tangents(tangents[:, :INDEXED_BRANCHES]),
         neighbours=neighbours,
         point_starts=point_starts,

@@ -16,7 +16,7 @@ import numpy as np
 
 from roadgeo.index import ReferenceIndex
 from roadgeo.intersections import Intersections
-from roadgeo.kernels.triples import UNITS, count_alike, gather, look_up
+from roadgeo.kernels.triples import UNITS, count_alike, find_sides, gather, look_up
 from roadgeo.typing import AnyArray, FloatArray, Int32Array, IntArray
 
 __all__ = ["Proposals", "TripleOptions", "propose"]
@@ -108,9 +108,11 @@ def propose(
     neighbours = np.ascontiguousarray(neighbours[:, : options.n_neighbours])
     k = neighbours.shape[1]
     weighed = np.arange(0, len(query), max(1, math.ceil(len(query) / options.max_weighed)))
+    sides = np.empty(query.tangents.shape, np.int8)
+    find_sides(query.tangents, branches, sides)
     costs = np.empty((len(weighed), k, k), np.int64)
     count_alike(
-        query.xy, query.tangents, neighbours, weighed, options.min_shape, options.codes_per_vertex,
+        query.xy, query.tangents, sides, neighbours, weighed, options.min_shape, options.codes_per_vertex,
         index.table_starts, costs,
     )  # fmt: skip
     tolerance = round(options.angle_tolerance_deg * UNITS / 180.0)
@@ -131,7 +133,7 @@ def propose(
             if n_hits == max_hits or n_compared > max_compared:
                 break
             n_hits, compared = look_up(
-                query.xy, branches, query.tangents, a, s, t, neighbours, options.codes_per_vertex, tolerance,
+                query.xy, branches, query.tangents, sides, a, s, t, neighbours, options.codes_per_vertex, tolerance,
                 np.cos(np.radians(options.ray_tolerance_deg)),
                 index.xy, index.branches, index.neighbours, index.table_starts, index.table_entries, scale, min_ratio,
                 ids, affine, n_hits,

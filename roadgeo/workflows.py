@@ -20,8 +20,9 @@ from roadgeo.explanation import Explanation, Needed, Story, WatchedEstimator, te
 from roadgeo.graph import RoadGraph
 from roadgeo.grid import PIXEL_TO_PLANE, RoadMask
 from roadgeo.homography import Homography
-from roadgeo.index import MAX_NEIGHBOURS, IndexOptions, ReferenceIndex, build_index
+from roadgeo.index import IndexOptions, ReferenceIndex, build_index
 from roadgeo.intersections import IntersectionOptions, Intersections, find_intersections
+from roadgeo.kernels.triples import MAX_NEIGHBOURS
 from roadgeo.location import Evidence, Location, Place, Seconds, Seen, Stats
 from roadgeo.network import RoadNetwork
 from roadgeo.pairs import PairIndex, PairOptions, build_pair_index, match_pairs

@@ -340,15 +340,30 @@ def vertex_angle(e1, e2, tangent):
     """The tangent's angle after the affine map that sends e1, e2 to +-30 degrees about the axis, in units."""
     equilateral = np.array([[np.cos(np.pi / 6), np.cos(np.pi / 6)], [-0.5, 0.5]])
     direction = equilateral @ np.linalg.inv(np.stack([e1, e2], axis=1)) @ (np.cos(tangent), np.sin(tangent))
-    return np.arctan2(*direction[::-1]) * UNITS / np.pi % UNITS
+    return np.arctan2(*direction[::-1]) * UNITS / np.pi % (2 * UNITS)
 
 
-def vertex_codes(xy, tangents, i, j, k, limit):
-    """Sorted pairs of whole units at vertex i, those first that cross most openly."""
-    lines = tangents[i][np.isfinite(tangents[i])]
-    units = [int(vertex_angle(xy[j] - xy[i], xy[k] - xy[i], t)) % UNITS for t in lines]
-    pairs = [tuple(sorted(pair)) for pair in combinations(units, 2)]
-    return sorted(pairs, key=lambda pair: -min(pair[1] - pair[0], UNITS - pair[1] + pair[0]))[:limit]
+def sides_of(tangent, branches):
+    """Whether branches run along a tangent forwards, backwards ("both" if neither)."""
+    along = branches.astype(float) @ (np.cos(tangent), np.sin(tangent)) / 127
+    ways = (bool((along > 0.87).any()), bool((along < -0.87).any()))
+    return ways if any(ways) else (True, True)
+
+
+def vertex_codes(xy, tangents, branches, i, j, k, limit):
+    """((u1, sides), (u2, sides)), u1 <= u2 whole units, of vertex i, those first that cross most openly."""
+    seen = []
+    for t in tangents[i][np.isfinite(tangents[i])]:
+        unit = int(vertex_angle(xy[j] - xy[i], xy[k] - xy[i], t)) % (2 * UNITS)
+        ways = sides_of(t, branches[i])
+        seen.append((unit % UNITS, ways if unit < UNITS else ways[::-1]))
+    pairs = [tuple(sorted(pair, key=lambda one: one[0])) for pair in combinations(seen, 2)]
+
+    def openness(pair):
+        between = pair[1][0] - pair[0][0]
+        return min(between, UNITS - between)
+
+    return sorted(pairs, key=lambda pair: -openness(pair))[:limit]
 
 
 def shape_of(xy, a, b, c):
@@ -357,7 +372,7 @@ def shape_of(xy, a, b, c):
     return (sides[0][0] * sides[1][1] - sides[0][1] * sides[1][0]) / max(side @ side for side in sides)
 
 
-def fill_table(xy, tangents, neighbours, min_shape, limit):
+def fill_table(xy, tangents, branches, neighbours, min_shape, limit):
     """The multiset of (anchor, b, c, codes) of all triples, each anchored once."""
     near = [set(row[row >= 0].tolist()) for row in neighbours]
     rows = []
@@ -369,16 +384,28 @@ def fill_table(xy, tangents, neighbours, min_shape, limit):
         b, c = set(triple) - {a}
         b, c = (b, c) if shape_of(xy, a, b, c) > 0 else (c, b)
         vertices = [(a, b, c), (b, c, a), (c, a, b)]
-        rows += [(a, b, c, code) for code in product(*(vertex_codes(xy, tangents, *v, limit) for v in vertices))]
+        rows += [
+            (a, b, c, code) for code in product(*(vertex_codes(xy, tangents, branches, *v, limit) for v in vertices))
+        ]
     return rows
 
 
 def alike(code, other, tolerance):
-    """Whether two pairs of units, unordered, agree modulo a half turn."""
-    return any(
-        all(abs((u - v + UNITS // 2) % UNITS - UNITS // 2) <= tolerance for u, v in zip(code, order, strict=True))
-        for order in permutations(other)
-    )
+    """Whether two pairs of (unit, sides), unordered, agree: within a tolerance, and no side missing in both."""
+
+    def ways(one, turned):
+        return {(way + turned) % 2 for way in (0, 1) if one[1][way]}
+
+    for order in permutations(other):
+        ours, theirs, near = set(), set(), True
+        for n, (one, two) in enumerate(zip(code, order, strict=True)):
+            gap = (one[0] - two[0] + UNITS // 2) % UNITS - UNITS // 2
+            near &= abs(gap) <= tolerance
+            ours |= {(n, way) for way in ways(one, 0)}
+            theirs |= {(n, way) for way in ways(two, int(one[0] - gap != two[0]))}
+        if near and (ours <= theirs or theirs <= ours):
+            return True
+    return False
 
 
 def look_up(code, table, tolerance):

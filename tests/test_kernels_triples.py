@@ -13,13 +13,17 @@ from test_kernels_growth import branches_of
 
 from roadgeo.kernels.buckets import nearest_neighbours
 from roadgeo.kernels.triples import (
+    BACKWARDS,
+    BOTH,
     CELL_UNITS,
     CELLS,
+    FORWARDS,
     PAIRS,
     TABLE,
     UNITS,
     count_alike,
     fill_table,
+    find_sides,
     gather,
     has_both,
     look_up,
@@ -32,6 +36,13 @@ from roadgeo.kernels.triples import (
 
 MIN_SHAPE = 0.08
 MIN_COS = np.cos(np.radians(25))
+WAYS = {FORWARDS: (True, False), BACKWARDS: (False, True), BOTH: (True, True)}
+
+
+def sides_of(tangents, branches):
+    sides = np.empty(tangents.shape, np.int8)
+    find_sides(tangents, branches, sides)
+    return sides
 
 
 class World:
@@ -48,7 +59,7 @@ class World:
         self.branches = branches_of(np.hstack([self.tangents, self.tangents[:, :1] + np.pi]).astype(float))
         self.neighbours = nearest_neighbours(xy, starts, grid, shape, k)
         counts = np.zeros(TABLE + 1, np.int64)
-        arguments = (xy, self.tangents, self.neighbours, MIN_SHAPE, limit)
+        arguments = (xy, self.tangents, self.sides, self.neighbours, MIN_SHAPE, limit)
         total = fill_table(*arguments, counts, np.empty(0, np.uint64))
         self.starts = np.cumsum(counts)
         self.entries = np.empty(total, np.uint64)
@@ -57,18 +68,24 @@ class World:
         assert np.array_equal(free[:-1], self.starts[1:])
         self.starts = self.starts.astype(np.int32)
 
+    @property
+    def sides(self):
+        return sides_of(self.tangents, self.branches)
+
     def decoded(self):
-        """(a, b, c, three pairs of units) of every entry."""
+        """(a, b, c, three codes like those of the twin) of every entry."""
         ids = {pair_id(low, high): (low, high) for low in range(CELLS) for high in range(low, CELLS)}
         cells = np.repeat(np.arange(TABLE), np.diff(self.starts))
         for cell, entry in zip(cells.tolist(), self.entries.tolist(), strict=True):
-            a = entry >> 32
-            b, c = (int(self.neighbours[a, entry >> shift & 15]) for shift in (28, 24))
+            a = entry >> 40
+            b, c = (int(self.neighbours[a, entry >> shift & 7]) for shift in (37, 34))
             pairs = (cell // PAIRS**2, cell // PAIRS % PAIRS, cell % PAIRS)
             code = []
             for v, pair in enumerate(pairs):
                 fine = entry >> (16 - 8 * v) & 255
-                code.append((ids[pair][0] * CELL_UNITS + (fine >> 4), ids[pair][1] * CELL_UNITS + (fine & 15)))
+                sides = (entry >> 24 & 1023) // 9 ** (2 - v) % 9
+                units = ids[pair][0] * CELL_UNITS + (fine >> 4), ids[pair][1] * CELL_UNITS + (fine & 15)
+                code.append(tuple((u, WAYS[s]) for u, s in zip(units, divmod(sides, 3), strict=True)))
             yield a, b, c, tuple(code)
 
 
@@ -103,9 +120,9 @@ def test_vertex_angle_like_the_twin(phi, wide, one, two, tangent):
     e1 = one * np.array([np.cos(phi), np.sin(phi)])
     e2 = two * np.array([np.cos(phi + wide), np.sin(phi + wide)])
     found = vertex_angle(*e1, *e2, tangent)
-    assert 0 <= found < UNITS + 1e-9
-    gap = (found - naive.vertex_angle(e1, e2, tangent)) % UNITS
-    assert min(gap, UNITS - gap) < 1e-6
+    assert 0 <= found < 2 * UNITS + 1e-9
+    gap = (found - naive.vertex_angle(e1, e2, tangent)) % (2 * UNITS)
+    assert min(gap, 2 * UNITS - gap) < 1e-6
 
 
 @given(st.lists(st.floats(-3, 3), min_size=4, max_size=4), angles)
@@ -142,15 +159,18 @@ def test_has_both():
 
 class TestVertexCodes:
     def codes(self, world, i, j, k, limit):
-        out = np.full((limit, 2), -1)
-        return [tuple(pair) for pair in out[: vertex_codes(world.xy, world.tangents, i, j, k, limit, out)].tolist()]
+        out = np.full((limit, 3), -1)
+        n = vertex_codes(world.xy, world.tangents, world.sides, i, j, k, limit, out)
+        return [((u, WAYS[sides // 3]), (v, WAYS[sides % 3])) for u, v, sides in out[:n].tolist()]
 
     @pytest.mark.parametrize("limit", [1, 2, 3])
     def test_like_the_twin(self, world, limit):
         rng = np.random.default_rng(1)
         for _ in range(60):
             i, j, k = rng.choice(len(world.xy), 3, replace=False)
-            expected = naive.vertex_codes(world.xy, world.tangents, i, j, k, limit)
+            if naive.shape_of(world.xy, i, j, k) < 0:
+                j, k = k, j
+            expected = naive.vertex_codes(world.xy, world.tangents, world.branches, i, j, k, limit)
             assert self.codes(world, i, j, k, limit) == expected
 
     def test_a_single_tangent_gives_none(self, world):
@@ -162,7 +182,7 @@ class TestFillTable:
     @pytest.mark.parametrize("limit", [2, 3])
     def test_like_the_twin(self, limit):
         world = World(2, limit=limit)
-        expected = naive.fill_table(world.xy, world.tangents, world.neighbours, MIN_SHAPE, limit)
+        expected = naive.fill_table(world.xy, world.tangents, world.branches, world.neighbours, MIN_SHAPE, limit)
         assert len(expected) > 100
         assert Counter(world.decoded()) == Counter(expected)
 
@@ -174,28 +194,53 @@ class TestFillTable:
 
     def test_no_point(self):
         counts = np.zeros(TABLE + 1, np.int64)
-        nothing = np.empty((0, 2)), np.empty((0, 4), np.float32), np.empty((0, 6), np.int32)
+        nothing = np.empty((0, 2)), np.empty((0, 4), np.float32), np.empty((0, 4), np.int8), np.empty((0, 6), np.int32)
         assert fill_table(*nothing, MIN_SHAPE, 3, counts, np.empty(0, np.uint64)) == 0
+
+
+class TestSides:
+    def test_branches_along_a_tangent(self):
+        tangents = np.array([[0.0, np.pi / 2, np.nan], [0.3, np.nan, np.nan]], np.float32)
+        branches = branches_of(np.array([[0.1, np.pi, -np.pi / 2], [2.0, np.nan, np.nan]]))
+        assert sides_of(tangents, branches)[0, :2].tolist() == [BOTH, BACKWARDS]
+        assert sides_of(tangents, branches[:, :1])[0, :2].tolist() == [FORWARDS, BOTH]
+        assert sides_of(tangents, branches)[1, 0] == BOTH  # nothing is known
+
+    def test_like_the_twin(self, world):
+        for i, row in enumerate(world.sides.tolist()):
+            for tangent, side in zip(world.tangents[i], row, strict=True):
+                if np.isfinite(tangent):
+                    assert WAYS[side] == naive.sides_of(tangent, world.branches[i])
 
 
 class TestVertexProbes:
     @pytest.mark.parametrize("tolerance", [0, 2, 5])
     def test_probe_exactly_what_is_alike(self, tolerance):
         rng = np.random.default_rng(3)
-        every = [(u, v) for u in range(UNITS) for v in range(u, UNITS)]
+        every = [(u, v, sides) for u in range(UNITS) for v in range(u, UNITS) for sides in range(9)]
         for u1, u2 in np.sort(rng.integers(0, UNITS, (12, 2)), axis=1).tolist():
-            probes = np.empty((64, 3), np.int64)
-            n = vertex_probes(u1, u2, tolerance, probes)
-            found = Counter()
-            for pair, lows, highs in probes[:n].tolist():
-                found.update(
-                    (u, v)
-                    for u, v in every
-                    if pair_id(u // CELL_UNITS, v // CELL_UNITS) == pair
-                    and lows >> 4 <= u % CELL_UNITS <= highs >> 4
-                    and lows & 15 <= v % CELL_UNITS <= highs & 15
-                )
-            assert set(found) == {other for other in every if naive.alike((u1, u2), other, tolerance)}
+            own = int(rng.integers(9))
+            probes = np.empty((64, 4), np.int64)
+            n = vertex_probes(np.array([u1, u2, own]), tolerance, probes)
+            found = {
+                (u, v, sides)
+                for pair, lows, highs, alike in probes[:n].tolist()
+                for u, v, sides in every
+                if pair_id(u // CELL_UNITS, v // CELL_UNITS) == pair
+                and lows >> 4 <= u % CELL_UNITS <= highs >> 4
+                and lows & 15 <= v % CELL_UNITS <= highs & 15
+                and alike >> sides & 1
+            }
+
+            def code(u, v, sides):
+                return (u, WAYS[sides // 3]), (v, WAYS[sides % 3])
+
+            assert found == {other for other in every if naive.alike(code(u1, u2, own), code(*other), tolerance)}
+
+
+def cell_of(code):
+    """The cells of three codes."""
+    return tuple((u // CELL_UNITS, v // CELL_UNITS) for (u, _), (v, _) in code)
 
 
 class TestCountAlike:
@@ -203,10 +248,10 @@ class TestCountAlike:
         k = world.neighbours.shape[1]
         anchors = np.arange(len(world.xy))[::2]
         costs = np.empty((len(anchors), k, k), np.int64)
-        count_alike(world.xy, world.tangents, world.neighbours, anchors, MIN_SHAPE, 3, world.starts, costs)
+        count_alike(world.xy, world.tangents, world.sides, world.neighbours, anchors, MIN_SHAPE, 3, world.starts, costs)
         cells = Counter()
         for *_, code in world.decoded():
-            cells.update(tuple((u // CELL_UNITS, v // CELL_UNITS) for u, v in code[t:] + code[:t]) for t in range(3))
+            cells.update(cell_of(code[t:] + code[:t]) for t in range(3))
         for i, a in enumerate(anchors):
             for s in range(k):
                 for t in range(k):
@@ -217,10 +262,8 @@ class TestCountAlike:
                         continue
                     b, c = (b, c) if shape > 0 else (c, b)
                     corners = [(a, b, c), (b, c, a), (c, a, b)]
-                    codes = [naive.vertex_codes(world.xy, world.tangents, *v, 3) for v in corners]
-                    expected = sum(
-                        cells[tuple((u // CELL_UNITS, v // CELL_UNITS) for u, v in code)] for code in product(*codes)
-                    )
+                    codes = [naive.vertex_codes(world.xy, world.tangents, world.branches, *v, 3) for v in corners]
+                    expected = sum(cells[cell_of(code)] for code in product(*codes))
                     assert costs[i, s, t] == (expected if all(codes) else -1)
 
 
@@ -230,7 +273,7 @@ class TestLookUp:
     def run(self, world, query, a, s, t, tolerance, room=5000):
         ids, affine = np.empty((room, 5), np.int64), np.empty((room, 4))
         n, compared = look_up(
-            query.xy, query.branches, query.tangents, a, s, t, query.neighbours, 3, tolerance, MIN_COS,
+            query.xy, query.branches, query.tangents, query.sides, a, s, t, query.neighbours, 3, tolerance, MIN_COS,
             world.xy, world.branches, world.neighbours, world.starts, world.entries, self.SCALE, self.MIN_RATIO,
             ids, affine, 0,
         )  # fmt: skip
@@ -250,7 +293,10 @@ class TestLookUp:
             ids, _, compared = self.run(world, query, a, s, t, tolerance)
             found.update((a, b, c, *hit) for hit in ids[:, [0, 2, 4]].tolist())
             edges = np.stack([query.xy[b] - query.xy[a], query.xy[c] - query.xy[a]], axis=1)
-            codes = (naive.vertex_codes(query.xy, query.tangents, *v, 3) for v in [(a, b, c), (b, c, a), (c, a, b)])
+            codes = (
+                naive.vertex_codes(query.xy, query.tangents, query.branches, *v, 3)
+                for v in [(a, b, c), (b, c, a), (c, a, b)]
+            )
             hits = [hit for code in product(*codes) for hit in naive.look_up(code, table, tolerance)]
             assert compared >= len(hits)
             for x, y, z in hits:
@@ -282,7 +328,7 @@ class TestLookUp:
 
     def slots(self, world):
         for entry in world.entries.tolist():
-            yield entry >> 32, entry >> 28 & 15, entry >> 24 & 15
+            yield entry >> 40, entry >> 37 & 7, entry >> 34 & 7
 
     def test_stops_where_the_room_ends(self, world):
         a, s, t = next(self.slots(world))

@@ -7,9 +7,10 @@ atan2((beta - alpha) sin 30, (alpha + beta) cos 30). Angles are measured in unit
 degrees).
 
 Two sorted cells at a vertex make one of 45 pairs, three vertices one of 45^3 table cells. An entry is a uint64:
-`anchor << 32 | slot of Y << 28 | slot of Z << 24 | six positions within the cells`, slots being columns of
-`neighbours`. Each position takes 4 bits of which the highest is 0: with that bit set as a guard, one subtraction
-compares all six.
+`anchor << 40 | slot of Y << 37 | slot of Z << 34 | sides << 24 | six positions within the cells`, slots being columns
+of `neighbours`. Each position takes 4 bits of which the highest is 0: with that bit set as a guard, one subtraction
+compares all six. `sides` says on which sides of each vertex the road along a tangent leaves it: most entries whose
+angles agree are told apart by them, before anything else of the map is read.
 """
 
 import math
@@ -27,6 +28,23 @@ GUARDS = 0x888888
 CELLS = UNITS // CELL_UNITS
 PAIRS = CELLS * (CELLS + 1) // 2
 TABLE = PAIRS**3
+MAX_NEIGHBOURS = 8  # slots take 3 bits
+MAX_ANCHORS = 1 << 24
+FORWARDS, BACKWARDS, BOTH = 0, 1, 2
+
+#: Bit r of `ALIKE[q]`: whether sides r of a vertex of the map are those of q or more, or fewer, on both tangents.
+ALIKE = np.array(
+    [
+        sum(
+            1 << r
+            for r in range(9)
+            if (q // 3 in (r // 3, BOTH) and q % 3 in (r % 3, BOTH))
+            or (r // 3 in (q // 3, BOTH) and r % 3 in (q % 3, BOTH))
+        )
+        for q in range(9)
+    ],
+    np.int64,
+)
 
 
 @njit(cache=True)
@@ -37,22 +55,65 @@ def pair_id(low: int, high: int) -> int:
 
 @njit(cache=True)
 def vertex_angle(e1x: float, e1y: float, e2x: float, e2y: float, tangent: float) -> float:
-    """Return a tangent's angle in the equilateral frame, in units, 0 <= angle < UNITS (float)."""
+    """Return a direction's angle in the equilateral frame, in units, 0 <= angle < 2 UNITS (float)."""
     dx, dy = math.cos(tangent), math.sin(tangent)
     alpha = dx * e2y - dy * e2x
     beta = e1x * dy - e1y * dx
     angle = math.atan2((beta - alpha) * 0.5, (alpha + beta) * 0.8660254037844386)
     angle = angle * (UNITS / math.pi)
-    return angle % UNITS
+    return angle % (2 * UNITS)
+
+
+@njit(cache=True)
+def find_sides(tangents: NDArray[np.float32], branches: NDArray[np.int8], sides: NDArray[np.int8]) -> None:
+    """Find on which sides branches run along each tangent.
+
+    Parameters
+    ----------
+    tangents : (N, T) float32
+        Directions in radians, NaN behind the last.
+    branches : (N, R, 2) int8
+        As in `rays_agree`.
+    sides : (N, T) int8
+        Filled with FORWARDS, BACKWARDS or BOTH; BOTH too where no branch is found.
+    """
+    for i in range(tangents.shape[0]):
+        for t in range(tangents.shape[1]):
+            sides[i, t] = BOTH
+            if np.isnan(tangents[i, t]):
+                continue
+            dx, dy = math.cos(tangents[i, t]), math.sin(tangents[i, t])
+            forwards, backwards = False, False
+            for r in range(branches.shape[1]):
+                along = dx * branches[i, r, 0] + dy * branches[i, r, 1]
+                forwards |= along > 0.87 * 127.0
+                backwards |= along < -0.87 * 127.0
+            if forwards != backwards:
+                sides[i, t] = FORWARDS if forwards else BACKWARDS
+
+
+@njit(cache=True)
+def turned(side: int) -> int:
+    """Return a side as seen from the other end."""
+    return BOTH if side == BOTH else 1 - side
 
 
 @njit(cache=True)
 def vertex_codes(
-    xy: NDArray[np.float64], tangents: NDArray[np.float32], i: int, j: int, k: int, limit: int, out: NDArray[np.int64]
+    xy: NDArray[np.float64],
+    tangents: NDArray[np.float32],
+    sides: NDArray[np.int8],
+    i: int,
+    j: int,
+    k: int,
+    limit: int,
+    out: NDArray[np.int64],
 ) -> int:
-    """Write the sorted unit pairs (u1 <= u2) of vertex i of the triangle i, j, k; return how many.
+    """Write the codes of vertex i of the triangle i, j, k; return how many.
 
-    One pair for every two of the vertex's tangents; of more than `limit`, those that cross most openly.
+    A code is a sorted pair of units u1 <= u2, and 3 s1 + s2, the sides of the two (see `find_sides`) as the equilateral
+    frame sees them. There is one for every two of the vertex's tangents; of more than `limit`, those that cross most
+    openly.
     """
     e1x, e1y = xy[j, 0] - xy[i, 0], xy[j, 1] - xy[i, 1]
     e2x, e2y = xy[k, 0] - xy[i, 0], xy[k, 1] - xy[i, 1]
@@ -61,20 +122,26 @@ def vertex_codes(
     while m < tangents.shape[1] and not np.isnan(tangents[i, m]):
         m += 1
     openness = np.empty(limit, np.int64)
+    units = np.empty(m, np.int64)
+    seen = np.empty(m, np.int64)
     for p in range(m):
-        up = int(vertex_angle(e1x, e1y, e2x, e2y, tangents[i, p])) % UNITS
+        units[p] = int(vertex_angle(e1x, e1y, e2x, e2y, tangents[i, p])) % (2 * UNITS)
+        side = int(np.int64(sides[i, p]))
+        seen[p] = side if units[p] < UNITS else turned(side)
+        units[p] %= UNITS
+    for p in range(m):
         for q in range(p + 1, m):
-            uq = int(vertex_angle(e1x, e1y, e2x, e2y, tangents[i, q])) % UNITS
-            between = min(abs(up - uq), UNITS - abs(up - uq))
+            between = min(abs(units[p] - units[q]), UNITS - abs(units[p] - units[q]))
             if n == limit and between <= openness[n - 1]:
                 continue
             place = min(n, limit - 1)
             while place > 0 and openness[place - 1] < between:
                 openness[place] = openness[place - 1]
-                out[place, 0], out[place, 1] = out[place - 1, 0], out[place - 1, 1]
+                out[place] = out[place - 1]
                 place -= 1
             openness[place] = between
-            out[place, 0], out[place, 1] = min(up, uq), max(up, uq)
+            first, second = (p, q) if units[p] <= units[q] else (q, p)
+            out[place, 0], out[place, 1], out[place, 2] = units[first], units[second], 3 * seen[first] + seen[second]
             n = min(n + 1, limit)
     return n
 
@@ -106,9 +173,28 @@ def has_both(neighbours: NDArray[np.int32], i: int, j: int, k: int) -> bool:
 
 
 @njit(cache=True)
+def triple_codes(
+    xy: NDArray[np.float64],
+    tangents: NDArray[np.float32],
+    sides: NDArray[np.int8],
+    a: int,
+    b: int,
+    c: int,
+    limit: int,
+    codes: NDArray[np.int64],
+    n: NDArray[np.int64],
+) -> None:
+    """Fill `codes[v, :n[v]]` for the three vertices of the counterclockwise triangle a, b, c."""
+    n[0] = vertex_codes(xy, tangents, sides, a, b, c, limit, codes[0])
+    n[1] = vertex_codes(xy, tangents, sides, b, c, a, limit, codes[1])
+    n[2] = vertex_codes(xy, tangents, sides, c, a, b, limit, codes[2])
+
+
+@njit(cache=True)
 def fill_table(
     xy: NDArray[np.float64],
     tangents: NDArray[np.float32],
+    sides: NDArray[np.int8],
     neighbours: NDArray[np.int32],
     min_shape: float,
     limit: int,
@@ -122,7 +208,7 @@ def fill_table(
     once, by the lowest of them.
     """
     write = entries.shape[0] > 0
-    codes = np.empty((3, limit, 2), np.int64)
+    codes = np.empty((3, limit, 3), np.int64)
     n = np.empty(3, np.int64)
     total = 0
     for a in range(xy.shape[0]):
@@ -140,22 +226,21 @@ def fill_table(
                 if (b0 < a and has_both(neighbours, b0, a, c0)) or (c0 < a and has_both(neighbours, c0, a, b0)):
                     continue
                 b, c, sb, sc = (b0, c0, s, t) if turn > 0 else (c0, b0, t, s)
-                n[0] = vertex_codes(xy, tangents, a, b, c, limit, codes[0])
-                n[1] = vertex_codes(xy, tangents, b, c, a, limit, codes[1])
-                n[2] = vertex_codes(xy, tangents, c, a, b, limit, codes[2])
+                triple_codes(xy, tangents, sides, a, b, c, limit, codes, n)
                 for p in range(n[0]):
                     for q in range(n[1]):
                         for r in range(n[2]):
                             cell = 0
-                            fine = np.uint64(0)
+                            fine, around = np.uint64(0), np.uint64(0)
                             for v in range(3):
                                 w = p if v == 0 else (q if v == 1 else r)
                                 u1, u2 = codes[v, w, 0], codes[v, w, 1]
                                 cell = cell * PAIRS + pair_id(u1 // CELL_UNITS, u2 // CELL_UNITS)
                                 fine = (fine << np.uint64(8)) | np.uint64((u1 % CELL_UNITS) * 16 + u2 % CELL_UNITS)
+                                around = around * np.uint64(9) + np.uint64(codes[v, w, 2])
                             if write:
-                                head = (np.uint64(a) << np.uint64(32)) | np.uint64((sb << 28) | (sc << 24))
-                                entries[starts[cell]] = head | fine
+                                head = (np.uint64(a) << np.uint64(40)) | (np.uint64((sb << 3) | sc) << np.uint64(34))
+                                entries[starts[cell]] = head | (around << np.uint64(24)) | fine
                                 starts[cell] += 1
                             else:
                                 starts[cell + 1] += 1
@@ -164,55 +249,45 @@ def fill_table(
 
 
 @njit(cache=True)
-def vertex_probes(u1: int, u2: int, tolerance: int, probes: NDArray[np.int64]) -> int:
-    """Write (pair, lows, highs) for every pair of cells that may hold (u1, u2) +- tolerance; return how many.
+def vertex_probes(code: NDArray[np.int64], tolerance: int, probes: NDArray[np.int64]) -> int:
+    """Write (pair, lows, highs, alike) for every pair of cells that may hold a vertex's `code`; return how many.
 
-    Lows and highs are the bounds of the entry's two positions within their cells, packed like them: first << 4 |
-    second.
+    Units may differ by `tolerance`. Lows and highs are the bounds of the entry's two positions within their cells,
+    packed like them: first << 4 | second. Bit r of `alike` is set where the entry's sides may be r. A tangent that is
+    found across the half turn is seen from its other end.
     """
     n = 0
+    u1, u2 = code[0], code[1]
     for c1 in range((u1 - tolerance) // CELL_UNITS, (u1 + tolerance) // CELL_UNITS + 1):
         low1 = max(u1 - tolerance - c1 * CELL_UNITS, 0)
         high1 = min(u1 + tolerance - c1 * CELL_UNITS, CELL_UNITS - 1)
         s1 = c1 % CELLS
+        side1 = code[2] // 3 if 0 <= c1 < CELLS else turned(code[2] // 3)
         for c2 in range((u2 - tolerance) // CELL_UNITS, (u2 + tolerance) // CELL_UNITS + 1):
             low2 = max(u2 - tolerance - c2 * CELL_UNITS, 0)
             high2 = min(u2 + tolerance - c2 * CELL_UNITS, CELL_UNITS - 1)
             s2 = c2 % CELLS
+            side2 = code[2] % 3 if 0 <= c2 < CELLS else turned(code[2] % 3)
             if s1 <= s2:
                 probes[n, 0] = pair_id(s1, s2)
                 probes[n, 1] = low1 << 4 | low2
                 probes[n, 2] = high1 << 4 | high2
+                probes[n, 3] = ALIKE[3 * side1 + side2]
                 n += 1
-            if s2 <= s1 and not (s1 == s2 and low1 == low2 and high1 == high2):
+            if s2 <= s1 and not (s1 == s2 and low1 == low2 and high1 == high2 and side1 == side2):
                 probes[n, 0] = pair_id(s2, s1)
                 probes[n, 1] = low2 << 4 | low1
                 probes[n, 2] = high2 << 4 | high1
+                probes[n, 3] = ALIKE[3 * side2 + side1]
                 n += 1
     return n
-
-
-@njit(cache=True)
-def triple_codes(
-    xy: NDArray[np.float64],
-    tangents: NDArray[np.float32],
-    a: int,
-    b: int,
-    c: int,
-    limit: int,
-    codes: NDArray[np.int64],
-    n: NDArray[np.int64],
-) -> None:
-    """Fill `codes[v, :n[v]]` for the three vertices of the counterclockwise triangle a, b, c."""
-    n[0] = vertex_codes(xy, tangents, a, b, c, limit, codes[0])
-    n[1] = vertex_codes(xy, tangents, b, c, a, limit, codes[1])
-    n[2] = vertex_codes(xy, tangents, c, a, b, limit, codes[2])
 
 
 @njit(cache=True)
 def count_alike(
     xy: NDArray[np.float64],
     tangents: NDArray[np.float32],
+    sides: NDArray[np.int8],
     neighbours: NDArray[np.int32],
     anchors: NDArray[np.int64],
     min_shape: float,
@@ -224,7 +299,7 @@ def count_alike(
 
     -1 where there is no such triple. It says how common a triple is on the map: cheap ones are looked up first.
     """
-    codes = np.empty((3, limit, 2), np.int64)
+    codes = np.empty((3, limit, 3), np.int64)
     n = np.empty(3, np.int64)
     costs[:] = -1
     for i in range(anchors.shape[0]):
@@ -241,7 +316,7 @@ def count_alike(
                 if turn == 0:
                     continue
                 b, c = (b0, c0) if turn > 0 else (c0, b0)
-                triple_codes(xy, tangents, a, b, c, limit, codes, n)
+                triple_codes(xy, tangents, sides, a, b, c, limit, codes, n)
                 total = 0
                 for p in range(n[0]):
                     for q in range(n[1]):
@@ -263,6 +338,7 @@ def look_up(
     xy: NDArray[np.float64],
     branches: NDArray[np.int8],
     tangents: NDArray[np.float32],
+    sides: NDArray[np.int8],
     a: int,
     s: int,
     t: int,
@@ -295,18 +371,18 @@ def look_up(
         b, c, s, t = c, b, t, s
         abx, aby, acx, acy = acx, acy, abx, aby
     cross = abx * acy - aby * acx
-    codes = np.empty((3, limit, 2), np.int64)
+    codes = np.empty((3, limit, 3), np.int64)
     n = np.empty(3, np.int64)
-    triple_codes(xy, tangents, a, b, c, limit, codes, n)
-    probes = np.empty((3, 64, 3), np.int64)
+    triple_codes(xy, tangents, sides, a, b, c, limit, codes, n)
+    probes = np.empty((3, 64, 4), np.int64)
     n_probes = np.empty(3, np.int64)
     compared = 0
     for p in range(n[0]):
-        n_probes[0] = vertex_probes(codes[0, p, 0], codes[0, p, 1], tolerance, probes[0])
+        n_probes[0] = vertex_probes(codes[0, p], tolerance, probes[0])
         for q in range(n[1]):
-            n_probes[1] = vertex_probes(codes[1, q, 0], codes[1, q, 1], tolerance, probes[1])
+            n_probes[1] = vertex_probes(codes[1, q], tolerance, probes[1])
             for r in range(n[2]):
-                n_probes[2] = vertex_probes(codes[2, r, 0], codes[2, r, 1], tolerance, probes[2])
+                n_probes[2] = vertex_probes(codes[2, r], tolerance, probes[2])
                 for turn in range(3):
                     # The stored triple may start at another vertex: X, Y, Z = a, b, c or c, a, b or b, c, a.
                     vx, vy, vz = (0, 1, 2) if turn == 0 else ((2, 0, 1) if turn == 1 else (1, 2, 0))
@@ -320,15 +396,21 @@ def look_up(
                                 cell = kj + probes[vz, k, 0]
                                 lows = lj | probes[vz, k, 1]
                                 highs = hj | probes[vz, k, 2]
+                                alike_x, alike_y, alike_z = probes[vx, i, 3], probes[vy, j, 3], probes[vz, k, 3]
                                 for e in range(starts[cell], starts[cell + 1]):
                                     compared += 1
                                     entry = entries[e]
                                     fine = np.int64(entry & np.uint64(0xFFFFFF))
                                     if ((fine | GUARDS) - lows) & (highs - fine) & GUARDS != GUARDS:
                                         continue
-                                    x = np.int64(entry >> np.uint64(32))
-                                    y = np.int64((entry >> np.uint64(28)) & np.uint64(15))
-                                    z = np.int64((entry >> np.uint64(24)) & np.uint64(15))
+                                    around = np.int64((entry >> np.uint64(24)) & np.uint64(1023))
+                                    if (alike_x >> (around // 81)) & (alike_y >> (around // 9 % 9)) & (
+                                        alike_z >> (around % 9)
+                                    ) & 1 == 0:
+                                        continue
+                                    x = np.int64(entry >> np.uint64(40))
+                                    y = np.int64((entry >> np.uint64(37)) & np.uint64(7))
+                                    z = np.int64((entry >> np.uint64(34)) & np.uint64(7))
                                     # A file's bits may have been flipped: no entry is believed.
                                     if x >= ref_xy.shape[0] or max(y, z) >= ref_neighbours.shape[1]:
                                         continue
