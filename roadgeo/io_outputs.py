@@ -21,7 +21,7 @@ from roadgeo.homography import Homography
 from roadgeo.io_image import ImageOptions, choose_target, image_homography, warp_image
 from roadgeo.io_products import PRODUCTS, Product, Subject
 from roadgeo.location import Evidence, Location
-from roadgeo.outputs import OutputPaths, Placement, attributes
+from roadgeo.outputs import FIGURES, OutputPaths, Placement, attributes
 from roadgeo.plugins import OUTPUTS, load_plugin
 from roadgeo.styles import draw_fill, draw_line, draw_marker, draw_palette
 from roadgeo.typing import AnyArray, FloatArray
@@ -97,7 +97,8 @@ def write_location(
         ours = PRODUCTS.values()
         products = (product.path(paths.folder, paths.stem, source.name) for product in (*ours, *chosen))
         pages = [paths.report, paths.explanation, paths.explanation_picture]
-        _remove([paths.footprint, paths.style, paths.geopackage, paths.overlay, *pages, *products])
+        pictures = [paths.overlay, *map(paths.figure, FIGURES)]
+        _remove([paths.footprint, paths.style, paths.geopackage, *pictures, *pages, *products])
     with ExitStack() as files:
 
         def stage(path: Path) -> Path:

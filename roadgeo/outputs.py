@@ -11,7 +11,11 @@ from roadgeo.errors import OutputError
 from roadgeo.location import Location
 from roadgeo.typing import FloatArray
 
-__all__ = ["OutputPaths", "Placement", "attributes", "output_paths"]
+__all__ = ["FIGURES", "OutputPaths", "Placement", "attributes", "output_paths"]
+
+
+#: Formats of `OutputPaths.figure`.
+FIGURES = ("pdf", "svg", "png")
 
 
 @dataclass(frozen=True)
@@ -67,6 +71,10 @@ class OutputPaths:
     def overlay(self) -> Path:
         """The picture of the result."""
         return self._named("_overlay.png")
+
+    def figure(self, kind: str) -> Path:
+        """Name the same for papers, in one of the `FIGURES`."""
+        return self._named(f"_figure.{kind}")
 
     @property
     def report(self) -> Path:

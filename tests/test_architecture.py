@@ -23,7 +23,7 @@ NAMES = {
     ),
     7: "workflows",
     8: (
-        "cli report plot canvas explanation_plot qgis demo drawing trials localizability evaluation_report "
+        "cli report plot figure canvas explanation_plot qgis demo drawing trials localizability evaluation_report "
         "simulation evaluation __main__"
     ),
     9: "__init__",

@@ -19,7 +19,7 @@ __all__ = ["Task", "Work", "find_masks", "name_tasks", "run"]
 
 #: What a folder is searched for, and what in it are our own results.
 SUFFIXES = (".tif", ".tiff", ".png", ".jpg", ".jpeg", ".jp2", ".bmp", ".pgm", ".webp", ".vrt", ".img", ".npy")
-RESULTS = ("_footprint", "_overlay", "_explain", "_image", "_vectorized")
+RESULTS = ("_footprint", "_overlay", "_figure", "_explain", "_image", "_vectorized")
 
 Result = TypeVar("Result", covariant=True)
 

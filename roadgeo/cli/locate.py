@@ -55,6 +55,7 @@ class Job:
     threshold: float | None = None
     band: int | None = None
     plot: bool = False
+    figure: str | None = None
     report: bool = False
     explain: bool = False
     segmenter: str | None = None
@@ -123,9 +124,11 @@ class Job:
         paths = output_paths(self.out_dir, task.stem)
         picture = self.images.get(task.mask, task.mask if self.segmenter else None)
         location, files = write_location(location, mask, paths, self.outputs, picture, attribution)
-        if self.plot and location.located:
-            _draw(location, mask, reference, paths.overlay, attribution)
-            files.append(paths.overlay)
+        if location.located and (self.plot or self.figure):
+            pictures = [paths.overlay] if self.plot else []
+            pictures += [paths.figure(self.figure)] if self.figure else []
+            _draw(location, mask, reference, pictures, attribution)
+            files += pictures
         if self.report:
             from roadgeo.report import write_report
 
@@ -213,6 +216,11 @@ def open_references(names: Iterable[str], say: Say = say_nothing) -> list[Refere
 )
 @click.option("--json", "as_json", is_flag=True, help="Print one JSON object per mask and line, in input order.")
 @click.option("--plot", is_flag=True, help="Also write MASK_overlay.png: the mask and its place, to look at.")
+@click.option(
+    "--figure",
+    type=click.Choice(["pdf", "svg", "png"]),
+    help="Also write MASK_figure, the same with axes, for papers. Needs matplotlib: pip install 'roadgeo[plot]'.",
+)
 @click.option(
     "--report",
     is_flag=True,
@@ -312,6 +320,7 @@ def locate_command(
     out_dir: str,
     as_json: bool,
     plot: bool,
+    figure: str | None,
     report: bool,
     explain: bool,
     images: tuple[str, ...],
@@ -348,6 +357,7 @@ def locate_command(
       photo_mask_location.gpkg   footprint, matched intersections, roads: opens styled in QGIS
       photo_mask_location.json   place, homography, odds; also written, with a reason, where nothing was found
       photo_mask_overlay.png     with --plot
+      photo_mask_figure.pdf      with --figure pdf (or svg, png)
       photo_mask_report.html     with --report: map, mask, residuals and numbers; also where nothing was found
       photo_mask_explain.png     with --explain, and .json: why it was found there, or nowhere
 
@@ -379,6 +389,11 @@ def locate_command(
     from roadgeo.cli.compilation import compile_once
     from roadgeo.cli.progress import print_steps
 
+    if figure is not None:
+        from roadgeo.figure import has_matplotlib
+
+        if not has_matplotlib():
+            raise click.UsageError("--figure needs matplotlib: pip install 'roadgeo[plot]'.")
     focal_px = camera if isinstance(camera, float) else None
     options = make_options(method, gsd, max_tilt, near, north_up, time_limit, focal_px)
     tasks = name_tasks(find_masks(masks))
@@ -397,6 +412,7 @@ def locate_command(
         threshold,
         band,
         plot,
+        figure,
         report,
         explain,
         segmenter,
@@ -517,12 +533,16 @@ def _scale(picture: str, mask: RoadMask) -> float:
     return round(width / mask.shape[1], 3)
 
 
-def _draw(location: Location, mask: RoadMask, reference: Reference, path: Path, attribution: str) -> None:
+def _draw(location: Location, mask: RoadMask, reference: Reference, pictures: Sequence[Path], attribution: str) -> None:
+    """Draw the overlay and the figure, as their names tell."""
+    from roadgeo.figure import write_figure
     from roadgeo.plot import write_overlay
 
     index = reference.index
     roads = index.plane.to_crs(index.segments.reshape(-1, 2).astype(float)).reshape(-1, 4)
-    write_overlay(path, location, mask, roads, attribution)
+    for path in pictures:
+        write = write_overlay if path.stem.endswith("_overlay") else write_figure
+        write(path, location, mask, roads, attribution)
 
 
 def _write_explanation(
