@@ -5,12 +5,15 @@ import os
 import re
 import shutil
 import subprocess
+import sys
 import time
 from collections import UserDict
 from pathlib import Path
 
+import cv2
 import documents
 import geopandas as gpd
+import numpy as np
 import pytest
 from documents import ROOT, blocks, run_page
 from fake_osm import OUTLINE, fake_osm, place
@@ -119,6 +122,16 @@ def test_every_command_has_a_page() -> None:
 
     titles = " ".join(text.splitlines()[0] for page, text in PAGES.items() if page.startswith("docs/commands/"))
     assert set(re.findall(r"\w+", titles)) >= set(COMMANDS)
+
+
+def test_the_figure_is_what_its_program_draws(tmp_path: Path) -> None:
+    """But for the type faces and the rasterizer of this machine."""
+    pytest.importorskip("matplotlib")
+    shutil.copy(ROOT / "docs" / "draw_how_it_works.py", tmp_path)
+    subprocess.run([sys.executable, "-W", "error", "draw_how_it_works.py"], cwd=tmp_path, check=True)
+    drawn, kept = (cv2.imread(str(folder / "how-it-works.png")) for folder in (tmp_path, ROOT / "docs"))
+    assert drawn.shape == kept.shape
+    assert np.abs(cv2.blur(drawn, (25, 25)).astype(int) - cv2.blur(kept, (25, 25))).mean() < 3
 
 
 def elsewhere() -> list[tuple[str, str]]:

@@ -167,7 +167,8 @@ def _lines(described: dict[str, Any]) -> list[tuple[str, str]]:
     if types:
         commonest = ", ".join(f"{entry['d_b']} {entry['tuples']:,}" for entry in types[:4])
         lines.append(("tuple types", f"{len(types)}, the commonest: {commonest}"))
-    return lines + [(key, str(value)) for key, value in meta.items() if isinstance(value, str) and key != "name"]
+    told = [(key, value) for key, value in meta.items() if isinstance(value, str) and key != "name"]
+    return lines + [("kinds" if key == "roads" else key, value) for key, value in told]
 
 
 _STATES = {
