@@ -115,10 +115,8 @@ class MatchOptions:
     sweeps: tuple[Source, ...] = (
         Sweep(TripleOptions(), 40),
         Sweep(
-            TripleOptions(
-                n_neighbours=12, angle_tolerance_deg=10.0, max_hits=20_000, max_compared=500_000, spread=True
-            ),
-            40,
+            TripleOptions(n_neighbours=12, angle_tolerance_deg=7.5, max_hits=20_000, max_compared=500_000, spread=True),
+            50,
         ),
     )
     grow: GrowOptions = field(default_factory=GrowOptions)
