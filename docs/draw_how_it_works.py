@@ -16,7 +16,7 @@ from roadgeo.demo import ATTRIBUTION, ROADS, demo_masks
 from roadgeo.index import ReferenceIndex, build_index
 from roadgeo.io_raster import read_mask
 from roadgeo.io_roads import read_roads
-from roadgeo.kernels.triples import UNITS, look_up, triple_codes
+from roadgeo.kernels.triples import UNITS, find_sides, look_up
 from roadgeo.scene import Scene
 from roadgeo.triples import TripleOptions, propose
 from roadgeo.workflows import Reference, build_network, trace_query
@@ -110,6 +110,8 @@ def find_triple(scene: Scene, index: ReferenceIndex, to_map: np.ndarray) -> tupl
     options = TripleOptions()
     xy, tangents = scene.intersections.xy, scene.intersections.tangents
     neighbours = np.ascontiguousarray(scene.neighbours[:, : options.n_neighbours])
+    sides = np.empty(tangents.shape, np.int8)
+    find_sides(tangents, scene.branches, sides)
     good = []
     for proposals in propose(scene.intersections, scene.branches, neighbours, index, (0.1, 10.0), 0.33, options):
         a = proposals.anchor
@@ -118,19 +120,19 @@ def find_triple(scene: Scene, index: ReferenceIndex, to_map: np.ndarray) -> tupl
                 b, c = neighbours[a, s], neighbours[a, t]
                 ids, affine = np.empty((12_000, 5), np.int64), np.empty((12_000, 4))
                 n, _ = look_up(
-                    xy, scene.branches, tangents, a, s, t, neighbours, 1,
+                    xy, scene.branches, tangents, sides, a, s, t, neighbours, 1,
                     round(options.angle_tolerance_deg * UNITS / 180), np.cos(np.radians(options.ray_tolerance_deg)),
                     index.xy, index.branches, index.neighbours, index.table_starts, index.table_entries,
                     (0.1, 10.0), 0.33, ids, affine, 0,
                 )  # fmt: skip
                 hits = ids[:n][:, [0, 2, 4]]
                 triple = np.array([a, b, c])
-                sides = xy[triple] - xy[np.roll(triple, 1)]
-                turn = sides[1][0] * sides[2][1] - sides[1][1] * sides[2][0]
+                edges = xy[triple] - xy[np.roll(triple, 1)]
+                turn = edges[1][0] * edges[2][1] - edges[1][1] * edges[2][0]
                 triple = triple if turn > 0 else triple[[0, 2, 1]]
                 apart = np.hypot(*(index.xy[hits] - apply(to_map, xy[triple])).transpose(2, 0, 1)).max(axis=1)
                 two = (~np.isnan(tangents[triple])).sum(axis=1) == 2
-                lengths = np.hypot(*sides.T)
+                lengths = np.hypot(*edges.T)
                 inside = (np.abs(xy[triple].mean(axis=0) - scene.center) < np.array(scene.size) * 0.33).all()
                 if 4 <= n <= 12 and apart.min(initial=99) < 8 and two.all() and inside and lengths.min() > 60:
                     shape = abs(turn) / lengths.max() ** 2
@@ -195,8 +197,7 @@ def draw_codes(
 
 def draw_equilateral(ax: Axes, xy: np.ndarray, directions: np.ndarray, ids: np.ndarray) -> None:
     """Draw the triangle as the affine map makes it, with its tangents."""
-    edges = np.stack([xy[ids[1]] - xy[ids[0]], xy[ids[2]] - xy[ids[0]]], axis=1)
-    affine = CORNERS[1:].T @ np.linalg.inv(edges)
+    affine = to_equilateral(xy[ids])
     for corner, i, color in zip(CORNERS, ids, COLORS, strict=True):
         for angle in directions[i][~np.isnan(directions[i])]:
             step = affine @ (np.cos(angle), np.sin(angle))
@@ -211,10 +212,23 @@ def draw_equilateral(ax: Axes, xy: np.ndarray, directions: np.ndarray, ids: np.n
 
 
 def code(xy: np.ndarray, directions: np.ndarray, ids: np.ndarray) -> np.ndarray:
-    """(3, 2) tangents' directions in the equilateral frame as the index stores them, degrees."""
-    codes, n = np.empty((3, 1, 2), np.int64), np.empty(3, np.int64)
-    triple_codes(xy, directions, *ids.tolist(), 1, codes, n)
-    return np.rint(codes[:, 0] * (180 / UNITS)).astype(int)
+    """(3, 2) degrees of two tangents in the equilateral frame, from the axis towards its middle, as fine as stored."""
+    affine = to_equilateral(xy[ids])
+    pairs = []
+    for corner, i in zip(CORNERS, ids, strict=True):
+        angles = directions[i][~np.isnan(directions[i])]
+        x, y = affine @ (np.cos(angles), np.sin(angles))
+        to_middle = np.arctan2(*(CORNERS.mean(axis=0) - corner)[::-1])
+        units = np.floor((np.arctan2(y, x) - to_middle) % np.pi * (UNITS / np.pi))
+        apart = np.abs(units[:, None] - units)
+        openly = np.unravel_index(np.argmax(np.minimum(apart, UNITS - apart)), apart.shape)
+        pairs.append(np.sort(units[list(openly)]))
+    return np.rint(np.array(pairs) * (180 / UNITS)).astype(int)
+
+
+def to_equilateral(triangle: np.ndarray) -> np.ndarray:
+    """Linear part of the affine map that makes a triangle equilateral."""
+    return CORNERS[1:].T @ np.linalg.inv(np.stack([triangle[1] - triangle[0], triangle[2] - triangle[0]], axis=1))
 
 
 def draw_map(ax: Axes, index: ReferenceIndex, center: np.ndarray, reach: tuple[float, float], width: float) -> None:
