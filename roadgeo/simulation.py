@@ -32,6 +32,8 @@ __all__ = [
 #: Draws of a view before a query is given up.
 MAX_TRIES = 4000
 
+_HORIZON = "every view that was drawn holds the horizon; allow less tilt or a longer focal length"
+
 
 @dataclass(frozen=True)
 class ViewOptions:
@@ -119,7 +121,7 @@ def simulate_query(landscape: Landscape, options: SimulationOptions, k: int) -> 
         if least <= query.truth.properties["n_intersections"] <= most:
             return query
     raise RoadSourceError(
-        f"no mask with {least} to {most} intersections left could be drawn; ask for fewer or for less noise"
+        f"no mask with {_range_text(least, most)} intersections left could be drawn; ask for fewer or for less noise"
     )
 
 
@@ -138,7 +140,7 @@ def simulate_query_at(
         view = _view_at(center, options.view, rng)
         if sees_ground(view):
             return _draw_query(landscape, view, options, k, rng)
-    raise RoadSourceError("every view that was drawn holds the horizon; allow less tilt or a longer focal length")
+    raise RoadSourceError(_HORIZON)
 
 
 def draw_view(landscape: Landscape, options: ViewOptions, rng: np.random.Generator) -> View:
@@ -150,20 +152,30 @@ def draw_view(landscape: Landscape, options: ViewOptions, rng: np.random.Generat
         The map has no such place.
     """
     low, high = landscape.bounds
+    holds_horizon = True
     for tries in range(2 * MAX_TRIES):
         if tries < MAX_TRIES or not len(landscape.intersections):
             x, y = rng.uniform(low, high)
         else:  # towns far apart: hardly any ground between their bounds is covered
             x, y = landscape.intersections[rng.integers(len(landscape.intersections))]
         view = _view_at((x, y), options, rng)
-        if not sees_ground(view) or not landscape.covers(view.footprint):
+        if not sees_ground(view):
+            continue
+        holds_horizon = False
+        if not landscape.covers(view.footprint):
             continue
         if options.intersections[0] <= len(visible_intersections(landscape, view)):
             return view
+    if holds_horizon:
+        raise RoadSourceError(_HORIZON)
     raise RoadSourceError(
-        f"no view with {options.intersections[0]} to {options.intersections[1]} intersections was found on the map in"
-        f" {2 * MAX_TRIES} draws; ask for fewer, for a wider window, or give a larger map"
+        f"no view that lies on the map and shows {_range_text(*options.intersections)} intersections was found in"
+        f" {2 * MAX_TRIES} draws; ask for fewer, for another window, or give a larger map"
     )
+
+
+def _range_text(least: int, most: int) -> str:
+    return f"{least} or more" if most >= 1_000_000 else f"{least} to {most}"
 
 
 def footprint_area(options: ViewOptions, draws: int = 200) -> float:
@@ -177,7 +189,7 @@ def footprint_area(options: ViewOptions, draws: int = 200) -> float:
     rng = np.random.default_rng(0)
     views = [view for view in (_view_at((0.0, 0.0), options, rng) for _ in range(draws)) if sees_ground(view)]
     if not views:
-        raise RoadSourceError("every view that was drawn holds the horizon; allow less tilt or a longer focal length")
+        raise RoadSourceError(_HORIZON)
     return float(np.mean([polygon_area(view.footprint) for view in views]))
 
 

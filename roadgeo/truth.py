@@ -4,11 +4,11 @@
 
 =================  ===================================================================================================
 file               path of the mask, relative to the table
-kind               what sort of query it is ("clean", "poor", ...)
-on_map             True, or False where the mask must be refused
+kind               what sort of query it is ("clean", "poor", ...); may be missing
+on_map             True, or False where the mask must be refused; may be missing
 crs                "EPSG:n" or WKT2, of everything below
 width, height      of the mask, pixels
-center_x/_y        CRS position of the middle of the frame
+center_x/_y        CRS position of the middle of the frame; to look at, it is not read
 h00 ... h22        homography, pixel (column, row) to CRS, row by row; the centre of the top-left pixel is (0.5, 0.5)
 others             properties: numbers such as gsd_m, tilt_deg, heading_deg, n_intersections, density_km2
 =================  ===================================================================================================
@@ -42,6 +42,7 @@ __all__ = ["SCHEMA", "Truth", "read_truth", "truth_from_record", "truth_to_recor
 SCHEMA = "roadgeo.truth/1"
 
 _MATRIX_COLUMNS = [f"h{i}{j}" for i in range(3) for j in range(3)]
+_REQUIRED = ["file", "crs", "width", "height"]
 _OWN_COLUMNS = ["file", "kind", "on_map", "crs", "width", "height", "center_x", "center_y", *_MATRIX_COLUMNS]
 
 
@@ -117,7 +118,10 @@ def read_truth(path: str | os.PathLike[str], crs: str | None = None) -> list[Tru
     try:
         text = source.read_text(encoding="utf-8-sig")
     except (OSError, UnicodeDecodeError) as error:
-        raise RoadSourceError(f"cannot read {source}: {error}; expected a table of truths, CSV or JSON") from error
+        cause = error.strerror if isinstance(error, OSError) else error
+        raise RoadSourceError(
+            f"cannot read {source}: {cause}; expected a table of truths, CSV or JSON, as `roadgeo simulate` writes it"
+        ) from error
     try:
         if text.lstrip().startswith("{"):
             return [truth_from_record(record, crs) for record in json.loads(text)["queries"]]
@@ -131,7 +135,7 @@ def read_truth(path: str | os.PathLike[str], crs: str | None = None) -> list[Tru
     except (KeyError, ValueError, TypeError, AttributeError) as error:
         raise RoadSourceError(
             f"{source} is no table of truths ({type(error).__name__}: {error}); expected the columns"
-            f" {', '.join(_OWN_COLUMNS[:6])}, h00 ... h22, or schema {SCHEMA}"
+            f" {', '.join(_REQUIRED)}, h00 ... h22, or schema {SCHEMA}"
         ) from error
 
 
@@ -191,11 +195,11 @@ def _from_row(row: dict[str, str], crs: str | None) -> Truth:
     properties = {name: float(value) for name, value in row.items() if name not in _OWN_COLUMNS and value != ""}
     return Truth(
         row["file"],
-        row["kind"],
+        row.get("kind") or "mask",
         _matrix(row),
         row["crs"] or crs,
         (int(row["width"]), int(row["height"])),
-        row["on_map"] == "True",
+        row.get("on_map", "True").strip().lower() not in ("false", "0", "no"),
         properties,
     )
 

@@ -2,6 +2,7 @@
 
 import json
 
+import cv2
 import numpy as np
 import pytest
 from towns import lattice_town
@@ -40,27 +41,62 @@ def test_simulate_writes_masks_and_truth(town, tmp_path):
     assert (tmp_path / "a" / "footprints.gpkg").is_file()
 
 
-def figures(text):
-    """The figures but for times."""
-    table = json.loads(text)
-    for group in [table["total"], *(g for groups in table["breakdowns"].values() for g in groups)]:
-        del group["compute_s"]
-    return table
+def figures(value):
+    """All figures but times, mask by mask too."""
+    if isinstance(value, dict):
+        return {name: figures(part) for name, part in value.items() if name not in ("compute_s", "seconds")}
+    return [figures(part) for part in value] if isinstance(value, list) else value
+
+
+def answers(folder):
+    """What was recorded of each mask, but for times."""
+    return [figures(json.loads(line)) for line in (folder / "trials.jsonl").read_text().splitlines()]
 
 
 def test_evaluate_gives_the_same_figures_however_it_is_run(town, tmp_path, capsys):
-    options = ["-n", 4, "--noise", "clean", "--mirrored", 2, *SMALL, "--json"]
-    assert run("evaluate", town, *options, "-o", tmp_path / "out") == 0
-    once = figures(capsys.readouterr().out)
-    assert once["total"]["queries"] == 6
-    assert once["total"]["recall"]["hits"] == 4
+    options = ["-n", 4, "--noise", "clean", "--noise", "poor", "--mirrored", 2, *SMALL, "-q"]
+    runs = {"once": [], "again": [], "by two": ["-j", 2]}
+    for name, jobs in runs.items():
+        assert run("evaluate", town, *options, *jobs, "-o", tmp_path / name) == 0
+    once = json.loads((tmp_path / "once" / "evaluation.json").read_text())
+    assert once["total"]["queries"] == len(once["scores"]) == 10
+    assert once["breakdowns"]["kind"][0]["recall"]["hits"] == 4
     assert once["total"]["refused"]["hits"] == 2
-    assert (tmp_path / "out" / "report.html").is_file()
-    assert len((tmp_path / "out" / "trials.jsonl").read_text().splitlines()) == 7
-    assert run("evaluate", town, *options, "-j", 2) == 0
-    assert figures(capsys.readouterr().out) == once
-    assert run("evaluate", town, *options, "-o", tmp_path / "out") == 0  # from the record
-    assert figures(capsys.readouterr().out) == once
+    assert once["total"]["compute_s"]["median"] > 0
+    assert len(answers(tmp_path / "once")) == 11
+    for name in ("again", "by two"):
+        assert figures(json.loads((tmp_path / name / "evaluation.json").read_text())) == figures(once)
+        assert answers(tmp_path / name) == answers(tmp_path / "once")
+    assert (tmp_path / "once" / "report.html").is_file()
+
+    assert run("evaluate", town, *options, "--json", "-o", tmp_path / "once") == 0  # from the record
+    printed = json.loads(capsys.readouterr().out)
+    assert printed == {name: part for name, part in once.items() if name != "scores"}
+
+
+def test_an_interrupted_run_says_that_it_can_go_on(town, tmp_path, capsys, monkeypatch):
+    from roadgeo import trials
+
+    options = ["evaluate", town, "-n", 3, "--noise", "clean", *SMALL, "-o", tmp_path]
+    draw = trials.simulate_query
+
+    def interrupted(landscape, options, k):
+        if k == 2:
+            raise KeyboardInterrupt
+        return draw(landscape, options, k)
+
+    monkeypatch.setattr(trials, "simulate_query", interrupted)
+    assert run(*options) == 130
+    assert "2 of 3 masks are kept; the same command goes on" in capsys.readouterr().err
+    monkeypatch.undo()
+    assert run(*options) == 0
+    assert "3 masks (2 of them recorded before) in" in capsys.readouterr().err
+
+
+def test_programs_are_told_how_far_it_is(town, monkeypatch, capsys):
+    monkeypatch.setenv("ROADGEO_PROGRESS", "json")
+    assert run("evaluate", town, "-n", 1, "--noise", "clean", *SMALL, "-q") == 0
+    assert json.loads(capsys.readouterr().err) == {"progress": {"done": 1, "total": 1, "text": "1 located"}}
 
 
 def test_evaluate_reads_query_sets(town, tmp_path, capsys):
@@ -87,6 +123,10 @@ def test_a_map_is_written_styled(town, tmp_path, capsys):
         (["--noise", "awful"], 2, "segmented"),
         (["--intersections", "5000:6000"], 1, "ask for fewer"),
         (["--queries", "nowhere"], 2, "does not exist"),
+        (["--check", "9"], 2, "--check needs --map"),
+        (["--queries", ".", "--gsd", "1:1"], 2, "--count, --gsd does nothing with --queries"),
+        (["--map", "--radius", "9"], 2, "--radius does nothing with --map"),
+        (["--tilt", "80:85"], 1, "allow less tilt"),
     ],
 )
 def test_what_is_wrong_is_said(town, arguments, status, words, capsys, monkeypatch):
@@ -99,6 +139,15 @@ def test_an_unknown_table_is_refused(town, tmp_path, capsys):
     (tmp_path / "truth.csv").write_text("a,b\n1,2\n")
     assert run("evaluate", town, "--queries", tmp_path / "truth.csv") == 1
     assert "no table of truths" in capsys.readouterr().err
+
+
+def test_masks_of_another_place_are_told(town, tmp_path, capsys):
+    matrix = "1,0,9e5,0,-1,9e6,0,0,1"
+    names = "file,crs,width,height," + ",".join(f"h{i}{j}" for i in range(3) for j in range(3))
+    (tmp_path / "truth.csv").write_text(f"{names}\nq.png,EPSG:32619,64,64,{matrix}\n")
+    cv2.imwrite(str(tmp_path / "q.png"), np.zeros((64, 64), np.uint8))
+    assert run("evaluate", town, "--queries", tmp_path) == 0
+    assert "the places of 1 of 1 masks are not on town" in capsys.readouterr().err
 
 
 def test_seeds_matter(town, tmp_path):

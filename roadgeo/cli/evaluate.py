@@ -11,15 +11,17 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any, Literal
 
 import click
+from click.core import ParameterSource
 
 from roadgeo.cli.parameters import RANGE
-from roadgeo.cli.queries import count_up, query_options, query_sets
+from roadgeo.cli.queries import QUERY_OPTIONS, count_up, query_options, query_sets
 
 if TYPE_CHECKING:
     from rich.table import Table
 
     from roadgeo.evaluation import Evaluation, Share, Spread, Summary
     from roadgeo.trials import QuerySet, ReferenceLocator
+    from roadgeo.truth import Truth
 
 __all__ = ["evaluate_command"]
 
@@ -29,9 +31,9 @@ __all__ = ["evaluate_command"]
 @click.option("--queries", type=click.Path(exists=True, path_type=Path), help="A query set: its folder, or its table.")
 @query_options
 @click.option("--method", type=click.Choice(["auto", "pair"]), default="auto", show_default=True, help="As in locate.")
-@click.option("--known-gsd", metavar="LO:HI", type=RANGE, help="Tell the locator, as --gsd of locate does.")
-@click.option("--max-tilt", metavar="DEG", type=click.FloatRange(0, 80), help="Tell the locator.")
-@click.option("--north-up", is_flag=True, help="Tell the locator.")
+@click.option("--known-gsd", metavar="LO:HI", type=RANGE, help="Tell the locator, as --gsd of `roadgeo locate` does.")
+@click.option("--max-tilt", metavar="DEG", type=click.FloatRange(0, 80), help="Tell the locator, as that of locate.")
+@click.option("--north-up", is_flag=True, help="Tell the locator, as that of locate.")
 @click.option(
     "--time-limit", type=click.FloatRange(0.01), metavar="S", default=10.0, show_default=True, help="Per mask."
 )
@@ -40,9 +42,22 @@ __all__ = ["evaluate_command"]
 )
 @click.option("-j", "--jobs", metavar="N", type=click.IntRange(1), default=1, show_default=True, help="Processes.")
 @click.option("--map", "as_map", is_flag=True, help="Map where such masks (of the first --noise) are located.")
-@click.option("--height", metavar="METRES", type=click.FloatRange(1), help="Above ground, in place of --gsd.")
-@click.option("--check", metavar="N", type=click.IntRange(0), default=0, help="Hold the map against N other masks.")
-@click.option("-o", "--out-dir", type=click.Path(file_okay=False, path_type=Path), help="Where to keep all there is.")
+@click.option(
+    "--height",
+    metavar="METRES",
+    type=click.FloatRange(1),
+    help="Above ground, in place of --gsd: height/focal.",
+)
+@click.option(
+    "--check",
+    metavar="N",
+    type=click.IntRange(0),
+    default=0,
+    help="With --map: try N other masks and count those located in each class.",
+)
+@click.option(
+    "-o", "--out-dir", type=click.Path(file_okay=False, path_type=Path), help="Write here, and go on from here."
+)
 @click.option("--json", "as_json", is_flag=True, help="Print the figures as one JSON object.")
 @click.option("-q", "--quiet", is_flag=True, help="Say nothing but errors, and what --json prints.")
 def evaluate_command(
@@ -67,8 +82,8 @@ def evaluate_command(
     """Locate masks whose place is known, and count.
 
     Without --queries the masks are drawn as `roadgeo simulate` draws them. With --out-dir the folder gets
-    evaluation.json, report.html and trials.jsonl, from which an interrupted run goes on. Other tables of truths than
-    those of `simulate` are understood too; see roadgeo/truth.py.
+    evaluation.json, report.html and trials.jsonl, from which the same command goes on when it was interrupted. A table
+    of your own needs the columns file, crs, width, height and h00 to h22, the homography from pixels to the CRS.
 
     With --map masks are tried all over the map (-n of them, 600 if not said), and REF_localizability.tif (styled in
     QGIS), .png and .json say where they would be located, may be ambiguous, or show too few intersections.
@@ -86,6 +101,7 @@ def evaluate_command(
     from roadgeo.library import resolve_reference
     from roadgeo.trials import ReferenceLocator
 
+    _refuse_idle("--map" if as_map else "" if queries is None else "--queries")
     path = resolve_reference(reference)
     if out_dir is not None:
         with writing(out_dir):
@@ -96,8 +112,6 @@ def evaluate_command(
     if as_map:
         from roadgeo.cli.localizability import ANY, Survey
 
-        if roads is not None or queries is not None:
-            raise click.UsageError("--map draws the reference's own roads: leave --roads and --queries out.")
         trials = options["count"] or 600
         ((simulation, _), *_) = query_sets(**options | {"intersections": ANY})
         Survey(path, simulation, locator, trials, check, jobs, quiet).run(out_dir or Path(), as_json)
@@ -106,6 +120,27 @@ def evaluate_command(
     told = {"known_gsd": known_gsd, "max_tilt": max_tilt, "north_up": north_up or None, "time_limit_s": time_limit}
     settings |= {"reference": path.stem, "method": method, **{k: v for k, v in told.items() if v is not None}}
     _evaluate(query_set, locator, settings, radius, jobs, out_dir, as_json, quiet)
+
+
+#: Parameters that say nothing beside an option, or without --map.
+_IDLE = {
+    "": {"check"},
+    "--queries": {*QUERY_OPTIONS, "check", "height"},
+    "--map": {"intersections", "mirrored", "queries", "radius", "roads"},
+}
+
+
+def _refuse_idle(beside: str) -> None:
+    """Refuse options that would silently do nothing."""
+    context = click.get_current_context()
+    idle = [
+        parameter.opts[-1]
+        for parameter in context.command.params
+        if parameter.name in _IDLE[beside]
+        and context.get_parameter_source(parameter.name) is ParameterSource.COMMANDLINE
+    ]
+    if idle:
+        raise click.UsageError(f"{', '.join(idle)} {'does nothing with ' + beside if beside else 'needs --map'}.")
 
 
 def _evaluate(
@@ -123,11 +158,17 @@ def _evaluate(
     from roadgeo.trials import run_trials
 
     record = None if out_dir is None else out_dir / "trials.jsonl"
+    before = _recorded(record)
     started = time.perf_counter()
-    with count_up(len(queries), quiet) as count:
-        trials = run_trials(
-            queries, locator, jobs, record, settings, lambda trial: count(trial.answer["status"].replace("_", " "))
-        )
+    try:
+        with count_up(len(queries), quiet) as count:
+            trials = run_trials(
+                queries, locator, jobs, record, settings, lambda trial: count(trial.answer["status"].replace("_", " "))
+            )
+    except KeyboardInterrupt:
+        if record is not None:
+            click.echo(f"{_recorded(record)} of {len(queries)} masks are kept; the same command goes on.", err=True)
+        raise
     elapsed = time.perf_counter() - started
 
     truths = [trial.truth for trial in trials]
@@ -143,7 +184,16 @@ def _evaluate(
         click.echo(json.dumps({name: part for name, part in evaluation.to_dict().items() if name != "scores"}))
     elif not quiet:
         _print(evaluation)
-        click.echo(f"{len(trials)} masks in {elapsed:.1f} s" + (f"; see {out_dir}" if out_dir else ""), err=True)
+        earlier = f" ({before} of them recorded before)" if before else ""
+        where = f"; see {out_dir}" if out_dir else ""
+        click.echo(f"{len(trials)} masks{earlier} in {elapsed:.1f} s{where}", err=True)
+
+
+def _recorded(record: Path | None) -> int:
+    """Count the trials in a record."""
+    if record is None or not record.is_file():
+        return 0
+    return max(len(record.read_text(encoding="utf-8").splitlines()) - 1, 0)
 
 
 def _query_set(
@@ -158,7 +208,32 @@ def _query_set(
         drawn_from = {} if roads is None else {"roads": roads.name}
         return DrawnMasks(reference, query_sets(**options), roads), plain | drawn_from
     table = queries / "truth.csv" if queries.is_dir() else queries
-    return MaskFiles(table.parent, tuple(read_truth(table))), {"queries": str(queries)}
+    truths = read_truth(table)
+    elsewhere = _count_elsewhere(truths, reference)
+    if elsewhere:
+        click.echo(
+            f"Warning: the places of {elsewhere} of {len(truths)} masks are not on {reference.stem}; they count against"
+            " recall. In a table of truths, on_map False says that a mask has no place there.",
+            err=True,
+        )
+    return MaskFiles(table.parent, tuple(truths)), {"queries": str(queries)}
+
+
+def _count_elsewhere(truths: Sequence[Truth], reference: Path) -> int:
+    """Count masks whose place lies beyond the bounds of a reference."""
+    import numpy as np
+
+    from roadgeo.io_network import read_network
+    from roadgeo.projection import transformer
+
+    network = read_network(reference)
+    low, high = network.graph.coords.min(axis=0), network.graph.coords.max(axis=0)
+    count = 0
+    for truth in truths:
+        center = transformer(truth.crs or network.plane.crs, network.plane.crs).transform(*truth.center)
+        xy = network.plane.from_crs(np.array([center], float))
+        count += truth.on_map and not ((xy >= low) & (xy <= high)).all()
+    return count
 
 
 # --- printing ---------------------------------------------------------------------------------------------------------

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import os
 import sys
 from collections import Counter
 from collections.abc import Callable, Iterator
@@ -16,7 +17,7 @@ from roadgeo.cli.parameters import RANGE, Numbers
 if TYPE_CHECKING:
     from roadgeo.simulation import SimulationOptions
 
-__all__ = ["count_up", "query_options", "query_sets"]
+__all__ = ["QUERY_OPTIONS", "count_up", "query_options", "query_sets"]
 
 Command = TypeVar("Command", bound=Callable[..., Any])
 
@@ -42,7 +43,7 @@ _OPTIONS = [
         multiple=True,
         default=["clean", "segmented", "poor"],
         show_default=True,
-        help="What goes wrong in the masks; may be given several times.",
+        help="What goes wrong in the masks; repeat it for several.",
     ),
     click.option(
         "--roads",
@@ -64,7 +65,7 @@ _OPTIONS = [
         type=ANGLES,
         default="0:30",
         show_default=True,
-        help="Degrees of the axis from the vertical.",
+        help="Of the optical axis from the vertical, degrees.",
     ),
     click.option(
         "--heading",
@@ -72,7 +73,7 @@ _OPTIONS = [
         type=ANGLES,
         default="0:360",
         show_default=True,
-        help="Where up points, from north.",
+        help="Where the image's up points, degrees from north.",
     ),
     click.option(
         "--size",
@@ -83,7 +84,10 @@ _OPTIONS = [
         help="Side of a mask, pixels.",
     ),
     click.option(
-        "--window", type=click.FloatRange(10), metavar="METRES", help="Side on the ground, in place of --size."
+        "--window",
+        type=click.FloatRange(10),
+        metavar="METRES",
+        help="Side on the ground, in place of --size.",
     ),
     click.option(
         "--focal", type=click.FloatRange(1), metavar="PX", help="Focal length in pixels.  [default: the side]"
@@ -94,17 +98,22 @@ _OPTIONS = [
         type=RANGE,
         default="30:1000000",
         show_default=True,
-        help="How many to show.",
+        help="How many a mask must show.",
     ),
     click.option(
-        "--road-width", metavar="LO:HI", type=RANGE, default="8:11", show_default=True, help="Metres, as drawn."
+        "--road-width",
+        metavar="LO:HI",
+        type=RANGE,
+        default="8:11",
+        show_default=True,
+        help="Of a street, metres.",
     ),
     click.option(
         "--mirrored",
         metavar="N",
         type=click.IntRange(0),
         default=0,
-        help="Also so many masks turned over, which have no place.",
+        help="Draw so many masks turned over besides, which have no place and must be refused.",
     ),
     click.option(
         "--seed",
@@ -117,6 +126,13 @@ _OPTIONS = [
 ]
 
 
+#: Names of the parameters of `query_sets`, and of `--roads`.
+QUERY_OPTIONS = {
+    *("count", "noise", "roads", "gsd", "tilt", "heading", "size", "window", "focal"),
+    *("intersections", "road_width", "mirrored", "seed"),
+}
+
+
 def query_options(command: Command) -> Command:
     """Add the options that `query_sets` takes."""
     for option in reversed(_OPTIONS):
@@ -126,15 +142,20 @@ def query_options(command: Command) -> Command:
 
 @contextmanager
 def count_up(total: int, quiet: bool) -> Iterator[Callable[[str], None]]:
-    """Show a bar on standard error, where that is a terminal; yields what counts one more of a sort."""
-    if quiet or not sys.stderr.isatty():
+    """Show a bar on standard error, where that is a terminal; yields what counts one more of a sort.
+
+    Programs that set ROADGEO_PROGRESS=json get lines of JSON instead.
+    """
+    as_json = os.environ.get("ROADGEO_PROGRESS") == "json"
+    if not as_json and (quiet or not sys.stderr.isatty()):
         yield lambda _: None
         return
-    from roadgeo.cli.progress import show_progress
+    from roadgeo.cli.progress import print_progress, show_progress
 
     counts: Counter[str] = Counter()
+    show = print_progress if as_json else show_progress
 
-    with show_progress(total, lambda counts: ", ".join(f"{n} {sort}" for sort, n in counts.items())) as advance:
+    with show(total, lambda counts: ", ".join(f"{n} {sort}" for sort, n in counts.items())) as advance:
 
         def count(sort: str) -> None:
             counts[sort] += 1

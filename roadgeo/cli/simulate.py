@@ -22,8 +22,9 @@ __all__ = ["simulate_command"]
 def simulate_command(reference: str, out_dir: Path, roads: Path | None, quiet: bool, **options: Any) -> None:
     """Draw road masks from a reference's own roads, as a camera would see them and a segmenter get them wrong.
 
-    Writes NOISE/q_NNNN.png, truth.csv, truth.json (columns: see roadgeo/truth.py) and footprints.gpkg. The same options
-    draw the same masks.
+    Writes NOISE/q_NNNN.png, footprints.gpkg, and truth.csv and truth.json, which hold for each mask the homography from
+    its pixels to the CRS (h00 to h22; the centre of the top-left pixel is (0.5, 0.5)), the camera, and what was done to
+    the roads. The same options draw the same masks.
 
     \b
     Examples:
