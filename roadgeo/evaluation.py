@@ -65,7 +65,7 @@ class Score:
         Errors of the corners TL, TR, BR, BL, and the standard deviations (of each coordinate) reported for them.
     log10_odds : float
         As reported; NaN where none are.
-    seconds : dict
+    seconds, reason
         As reported.
     """
 
@@ -80,6 +80,7 @@ class Score:
     log10_odds: float = math.nan
     seconds: dict[str, float] = field(default_factory=dict)
     properties: dict[str, float] = field(default_factory=dict)
+    reason: str = ""
 
     @property
     def located(self) -> bool:
@@ -107,6 +108,7 @@ def score(truth: Truth, location: Mapping[str, Any] | None, radius_m: float = RA
         status=str(location["status"]),
         log10_odds=_number(location.get("log10_odds")),
         seconds={step: _number(value) for step, value in (location.get("seconds") or {}).items()},
+        reason=str(location.get("reason") or ""),
     )
     if location.get("homography") is None or not truth.on_map:
         return answered

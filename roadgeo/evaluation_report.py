@@ -30,6 +30,10 @@ _NOTE = (
 _BLUE, _ORANGE, _GREEN, _RED, _GREY = "#1f6fb4", "#e4572e", "#2e8b57", "#c62828", "#9aa0a6"
 _OUTCOMES = {"right": _GREEN, "wrong": _RED, "ambiguous": _ORANGE, "not located": _GREY}
 
+#: Order of the masks that were lost, and how many of them are named.
+_LOST = ["wrong", "ambiguous", "not located"]
+_MOST_LOST = 200
+
 _PAGE = """<!DOCTYPE html>
 <html lang="en">
 <head>
@@ -49,6 +53,7 @@ p, figcaption {{ max-width: 46rem; }} figcaption, .faint {{ color: #5f666e; font
 table {{ border-collapse: collapse; background: #fff; font-size: .88rem; font-variant-numeric: tabular-nums; }}
 th, td {{ border: 1px solid #e2e0da; padding: .25rem .55rem; text-align: right; white-space: nowrap; }}
 th:first-child, td:first-child {{ text-align: left; }} thead th {{ background: #efede7; }}
+td.words {{ text-align: left; white-space: normal; min-width: 20rem; }}
 .charts {{ display: grid; grid-template-columns: repeat(auto-fit, minmax(min(100%, 430px), 1fr)); gap: 1rem; }}
 figure {{ margin: 0; background: #fff; border: 1px solid #e2e0da; border-radius: 8px; padding: .6rem; }}
 svg {{ width: 100%; height: auto; display: block; }} svg text {{ font: 12px system-ui, sans-serif; fill: #40464d; }}
@@ -75,6 +80,7 @@ def render_report(evaluation: Evaluation, truths: Sequence[Truth], title: str) -
     for by, table in evaluation.breakdowns.items():
         parts.append(f"<h2>{TITLES[by]}</h2>{_summary_table([*table, evaluation.total] if by == 'kind' else table)}")
     parts.append(f'<p class="faint">{_NOTE}</p>')
+    parts.append(_lost_table(evaluation.scores))
     charts = [
         *(_share_chart(by, table) for by, table in evaluation.breakdowns.items() if len(table) > 1),
         _odds_chart(evaluation.odds),
@@ -92,6 +98,8 @@ def render_report(evaluation: Evaluation, truths: Sequence[Truth], title: str) -
 
 def _text(value: object) -> str:
     if isinstance(value, list | tuple):
+        if len(value) == 2 and all(isinstance(part, int | float) for part in value):
+            return f"{value[0]:g} or more" if value[1] >= 1e6 else f"{value[0]:g} to {value[1]:g}"
         return " ".join(_text(part) for part in value)
     return f"{value:g}" if isinstance(value, float) else str(value)
 
@@ -147,6 +155,33 @@ def _summary_table(table: Sequence[Summary]) -> str:
         rows.append("<tr>" + "".join(f"<td>{cell}</td>" for cell in cells) + "</tr>")
     head = "".join(f"<th>{name}</th>" for name in heads)
     return f'<div class="scroll"><table><thead><tr>{head}</tr></thead><tbody>{"".join(rows)}</tbody></table></div>'
+
+
+def _lost_table(scores: Sequence[Score]) -> str:
+    """Name the masks that were not located rightly, wrong ones first, and why not."""
+    lost = sorted((s for s in scores if _outcome(s) != "right"), key=lambda s: _LOST.index(_outcome(s)))
+    if not lost:
+        return "<h2>Masks that were lost</h2><p>None.</p>"
+    rows = []
+    for entry in lost[:_MOST_LOST]:
+        cells = [
+            html.escape(entry.file),
+            _outcome(entry),
+            _number(entry.center_m),
+            _number(entry.log10_odds),
+            _number(entry.properties.get("n_intersections", math.nan), 0),
+            _number(entry.properties.get("tilt_deg", math.nan), 0),
+            _number(1000 * entry.compute_s, 0),
+        ]
+        reason = f'<td class="words">{html.escape(entry.reason)}</td>'
+        rows.append("<tr>" + "".join(f"<td>{cell}</td>" for cell in cells) + reason + "</tr>")
+    heads = ["", "outcome", "centre, m", "log10 odds", "intersections", "tilt, °", "time, ms", "reason given"]
+    head = "".join(f"<th>{name}</th>" for name in heads)
+    more = f"<p>And {len(lost) - _MOST_LOST} more; see evaluation.json.</p>" if len(lost) > _MOST_LOST else ""
+    return (
+        f'<h2>Masks that were lost</h2><div class="scroll"><table><thead><tr>{head}</tr></thead>'
+        f"<tbody>{''.join(rows)}</tbody></table></div>{more}"
+    )
 
 
 # --- charts -----------------------------------------------------------------------------------------------------------
@@ -348,7 +383,9 @@ def _map(scores: Sequence[Score], truths: Sequence[Truth]) -> str:
                 points = (truth.footprint - low) * (scale, -scale) + (10, height - 10)
                 path = " ".join(f"{x:.1f},{y:.1f}" for x, y in points)
                 color = _OUTCOMES[name]
-                parts.append(f'<polygon points="{path}" fill="{color}" fill-opacity=".12" stroke="{color}"/>')
+                style = f'fill="{color}" fill-opacity=".12" stroke="{color}"'
+                name_of = html.escape(f"{entry.file}: {name}")
+                parts.append(f'<polygon points="{path}" {style}><title>{name_of}</title></polygon>')
     at = 10.0
     for name, color in _OUTCOMES.items():
         parts.append(

@@ -48,3 +48,18 @@ def test_charts_show_what_tables_say():
     assert page.count("<figure>") == 3 + 5
     assert "No count contradicts the odds." in page
     assert "Tilt of the camera, degrees" in page
+
+
+def test_masks_that_were_lost_are_named():
+    truths = [truth(k, on_map=k != 3) for k in range(5)]
+    answers = [answer(0), None, {**answer(2), "status": "ambiguous", "reason": "two <places>"}, answer(3), answer(4)]
+    page = render_report(evaluate(truths, answers, {"gsd": (0.7, 1.4), "intersections": (30, 1_000_000)}), truths, "t")
+    table = page[page.index("Masks that were lost") : page.index("Charts")]
+    assert re.findall(r"<td>(q_\d.png)</td><td>([a-z ]+)</td>", table) == [
+        ("q_3.png", "wrong"),
+        ("q_2.png", "ambiguous"),
+        ("q_1.png", "not located"),
+    ]
+    assert "two &lt;places&gt;" in table
+    assert "gsd 0.7 to 1.4, intersections 30 or more" in page
+    assert "<title>q_2.png: ambiguous</title>" in page
