@@ -107,13 +107,21 @@ def test_evaluate_reads_query_sets(town, tmp_path, capsys):
     assert "100 (34-100)" in printed
 
 
-def test_a_map_is_written_styled(town, tmp_path, capsys):
+def test_a_map_is_written_styled(town, tmp_path, capsys, monkeypatch):
     options = ["--map", "-n", 6, "--check", 2, "--noise", "clean", "--height", 400, "--size", 400]
     assert run("evaluate", town, *options, "-o", tmp_path) == 0
     assert {path.suffix for path in tmp_path.glob("town_localizability.*")} == {".tif", ".qml", ".png", ".json"}
     summary = json.loads((tmp_path / "town_localizability.json").read_text())
     assert sum(entry["area_share"] for entry in summary["classes"]) == pytest.approx(1.0)
     assert "would be located" in capsys.readouterr().out
+    pictures = [(tmp_path / f"town_localizability.{kind}").read_bytes() for kind in ("tif", "png", "json")]
+    monkeypatch.setattr("roadgeo.trials.simulate_query_at", None)  # from the record
+    monkeypatch.setattr("roadgeo.trials.simulate_query", None)
+    assert run("evaluate", town, *options, "-j", 2, "-o", tmp_path) == 0
+    assert [(tmp_path / f"town_localizability.{kind}").read_bytes() for kind in ("tif", "png", "json")] == pictures
+    capsys.readouterr()
+    assert run("evaluate", town, *options, "--seed", 1, "-o", tmp_path) == 1
+    assert "another run" in capsys.readouterr().err
 
 
 @pytest.mark.parametrize(

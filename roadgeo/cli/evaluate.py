@@ -109,17 +109,24 @@ def evaluate_command(
     if height is not None:
         options["gsd"] = (height / (options["focal"] or options["size"]),) * 2
     locator = ReferenceLocator((path,), make_options(method, known_gsd, max_tilt, None, north_up, time_limit))
+    hints = {"known_gsd": known_gsd, "max_tilt": max_tilt, "north_up": north_up or None, "time_limit_s": time_limit}
+    told = {"reference": path.stem, "method": method, **_known(hints)}
     if as_map:
         from roadgeo.cli.localizability import ANY, Survey
 
         trials = options["count"] or 600
         ((simulation, _), *_) = query_sets(**options | {"intersections": ANY})
-        Survey(path, simulation, locator, trials, check, jobs, quiet).run(out_dir or Path(), as_json)
+        settings = {name: value for name, value in options.items() if name not in ("intersections", "mirrored")}
+        settings = _known(settings | {"count": trials, "noise": simulation.kind}) | told
+        Survey(path, simulation, locator, trials, check, jobs, quiet, settings, out_dir).run(as_json)
         return
     query_set, settings = _query_set(path, queries, roads, options)
-    told = {"known_gsd": known_gsd, "max_tilt": max_tilt, "north_up": north_up or None, "time_limit_s": time_limit}
-    settings |= {"reference": path.stem, "method": method, **{k: v for k, v in told.items() if v is not None}}
+    settings |= told
     _evaluate(query_set, locator, settings, radius, jobs, out_dir, as_json, quiet)
+
+
+def _known(settings: dict[str, Any]) -> dict[str, Any]:
+    return {name: value for name, value in settings.items() if value is not None}
 
 
 #: Parameters that say nothing beside an option, or without --map.
@@ -204,9 +211,8 @@ def _query_set(
     from roadgeo.truth import read_truth
 
     if queries is None:
-        plain = {name: value for name, value in options.items() if value is not None}
         drawn_from = {} if roads is None else {"roads": roads.name}
-        return DrawnMasks(reference, query_sets(**options), roads), plain | drawn_from
+        return DrawnMasks(reference, query_sets(**options), roads), _known(options) | drawn_from
     table = queries / "truth.csv" if queries.is_dir() else queries
     truths = read_truth(table)
     elsewhere = _count_elsewhere(truths, reference)

@@ -33,6 +33,10 @@ class Survey:
         Masks to learn from: a quarter of them anywhere, a quarter where those leave hope, half where these leave much.
     check : int
         Other masks that the map is held against.
+    settings : dict
+        Plain values that tell these masks and this locator from others.
+    out_dir : Path or None
+        Where every trial is kept, so that the same command goes on from there. None: nowhere.
     """
 
     reference: Path
@@ -42,8 +46,10 @@ class Survey:
     check: int
     jobs: int
     quiet: bool
+    settings: dict[str, Any]
+    out_dir: Path | None
 
-    def run(self, out_dir: Path, as_json: bool) -> None:
+    def run(self, as_json: bool) -> None:
         """Make the map, and write and print it."""
         from roadgeo.files import write_bytes, write_text
         from roadgeo.io_network import read_network
@@ -51,6 +57,7 @@ class Survey:
 
         network = read_network(self.reference)
         found = self._learn(network)
+        out_dir = self.out_dir or Path()
         stem = f"{self.reference.stem}_localizability"
         window = round(found.grid.footprint_m2**0.5)
         title = f"{self.reference.stem}: masks of {window} x {window} m, {self.simulation.kind}"
@@ -76,21 +83,30 @@ class Survey:
         quarter = self.trials // 4
         places, located = np.empty((0, 2)), np.empty(0, bool)
         # The surer a class of places is to be, the more trials it takes to tell.
-        for count, least in ((quarter, 0.5), (quarter, 0.85), (self.trials - 2 * quarter, 1.0)):
+        rounds = (quarter, 0.5), (quarter, 0.85), (self.trials - 2 * quarter, 1.0)
+        for number, (count, least) in enumerate(rounds, 1):
             centers = grid.draw(count, hope, rng)
             masks = PlacedMasks(self.reference, self.simulation, tuple(map(tuple, centers.tolist())), len(places))
             places = np.vstack([places, centers])
-            located = np.concatenate([located, _located(self._try(masks))])
+            located = np.concatenate([located, _located(self._try(masks, f"{number}"))])
             found = map_localizability(grid, places, located)
             hope = np.nan_to_num(found.probability) >= least
         return found
 
-    def _try(self, masks: QuerySet) -> list[Trial]:
+    def _try(self, masks: QuerySet, part: str) -> list[Trial]:
         from roadgeo.trials import run_trials
 
+        record = None
+        if self.out_dir is not None:
+            record = self.out_dir / f"{self.reference.stem}_localizability_trials_{part}.jsonl"
         with count_up(len(masks), self.quiet) as count:
             return run_trials(
-                masks, self.locator, self.jobs, progress=lambda trial: count(trial.answer["status"].replace("_", " "))
+                masks,
+                self.locator,
+                self.jobs,
+                record,
+                self.settings,
+                lambda trial: count(trial.answer["status"].replace("_", " ")),
             )
 
     def _summary(self, found: LocalizabilityMap) -> dict[str, Any]:
@@ -105,7 +121,7 @@ class Survey:
         checked, located = np.empty(0, np.uint8), np.empty(0, bool)
         if self.check:
             held_out = replace(self.simulation, kind=f"{self.simulation.kind}-check")
-            trials = self._try(DrawnMasks(self.reference, ((held_out, self.check),)))
+            trials = self._try(DrawnMasks(self.reference, ((held_out, self.check),)), "check")
             checked = found.at(found.grid.plane.from_crs(np.array([trial.truth.center for trial in trials])))
             located = _located(trials)
         known = max(int((found.classes > 0).sum()), 1)
