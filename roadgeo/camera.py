@@ -12,6 +12,10 @@ from roadgeo.typing import FloatArray
 __all__ = ["CameraOptions", "CameraPose", "judge", "pose", "sampling"]
 
 _FOCAL_STEPS = np.geomspace(0.35, 8.0, 25)
+#: Focal length that is taken where none fits better: in halves of the frame's diagonal, that of a usual lens.
+_USUAL_FOCAL = 1.5
+#: How much more skew a usual focal length may leave than one e times as long.
+_FOCAL_PRIOR = 0.01
 
 
 @dataclass(frozen=True)
@@ -39,6 +43,21 @@ class CameraOptions:
     focal_px: float | None = None
     max_skew: float = 0.35
     north_up: bool = False
+
+    @property
+    def min_shape_ratio(self) -> float:
+        """Least ratio of the singular values of a map around an intersection that three crossings may propose.
+
+        A camera tilted by a sees 1 : 1 / cos a, the rays at its frame's edge still less; triangles are not exact.
+        """
+        return max(0.33, 0.85 * math.cos(math.radians(min(self.max_tilt_deg + 25.0, 85.0))))
+
+    def perspective_sigma(self, usual: float) -> float:
+        """Return the prior standard deviation of the perspective parameters, in units of 1 / half the frame's diagonal.
+
+        It is `usual` unless so little tilt is allowed that they must be less.
+        """
+        return min(usual, 0.03 + 0.7 * math.tan(math.radians(min(self.max_tilt_deg, 80.0))))
 
 
 @dataclass(frozen=True)
@@ -76,33 +95,55 @@ def sampling(matrix: FloatArray, size: tuple[int, int]) -> float:
     return math.sqrt(abs(jacobian[0, 0] * jacobian[1, 1] - jacobian[0, 1] * jacobian[1, 0]))
 
 
-def pose(matrix: FloatArray, size: tuple[int, int], focal_px: float | None = None) -> CameraPose:
-    """Describe the camera behind a homography from the query plane (pixels, y up) to a metric plane.
+@dataclass(frozen=True)
+class _Pinholes:
+    """How well pinholes of several focal lengths fit a homography: focal lengths in pixels, skew and tilt of each."""
+
+    focal_px: FloatArray
+    skew: FloatArray
+    tilt_deg: FloatArray
+
+
+def _pinholes(matrix: FloatArray, size: tuple[int, int], focal_px: float | None) -> _Pinholes:
+    """Fit pinholes to a homography from the query plane to a metric plane.
 
     For each focal length f the columns of diag(1/f, 1/f, 1) G, G the inverse map with the frame's middle as origin,
-    should be perpendicular and equally long (Hartley & Zisserman, 8.1.1); the f that comes nearest is taken.
+    should be perpendicular and equally long (Hartley & Zisserman, 8.1.1).
     """
-    center = np.array([size[0] / 2.0, -size[1] / 2.0])
-    jacobian = _jacobian(matrix, center)
-    gsd = sampling(matrix, size)
-    rotation = math.degrees(math.atan2(jacobian[0, 1], jacobian[1, 1]))
+    center = (size[0] / 2.0, -size[1] / 2.0)
     shift = np.array([[1.0, 0.0, -center[0]], [0.0, 1.0, -center[1]], [0.0, 0.0, 1.0]])
     g = shift @ np.linalg.inv(matrix)
-    focal = np.array([focal_px]) if focal_px else _FOCAL_STEPS * np.hypot(*size) / 2.0
+    focal = np.array([focal_px]) if focal_px else _FOCAL_STEPS * math.hypot(*size) / 2.0
     # columns of diag(1/f, 1/f, 1) G, up to the factor 1/f
     aa = g[0, 0] ** 2 + g[1, 0] ** 2 + (focal * g[2, 0]) ** 2
     bb = g[0, 1] ** 2 + g[1, 1] ** 2 + (focal * g[2, 1]) ** 2
     ab = g[0, 0] * g[0, 1] + g[1, 0] * g[1, 1] + focal**2 * g[2, 0] * g[2, 1]
     skew = np.maximum(np.abs(ab) / np.sqrt(aa * bb), 0.5 * np.abs(np.log(aa / bb)))
-    best = int(np.argmin(skew))
     vertical = g[0, 0] * g[1, 1] - g[1, 0] * g[0, 1]  # z of their cross product, whose length is sqrt(aa bb - ab^2)
-    cos_tilt = abs(vertical) / math.sqrt(max(aa[best] * bb[best] - ab[best] ** 2, 1e-300))
-    tilt = math.degrees(math.acos(min(1.0, cos_tilt)))
-    return CameraPose(gsd, rotation, tilt, float(focal[best]), float(skew[best]))
+    cosine = abs(vertical) / np.sqrt(np.maximum(aa * bb - ab**2, 1e-300))
+    return _Pinholes(focal, skew, np.degrees(np.arccos(np.minimum(1.0, cosine))))
 
 
-def judge(matrix: FloatArray, size: tuple[int, int], options: CameraOptions) -> str:
-    """Return why a homography is not plausible, or "" if it is."""
+def pose(matrix: FloatArray, size: tuple[int, int], focal_px: float | None = None) -> CameraPose:
+    """Describe the camera behind a homography from the query plane (pixels, y up) to a metric plane.
+
+    The focal length is that of the pinhole that fits best, and of a usual lens where all fit alike, as near the nadir.
+    """
+    jacobian = _jacobian(matrix, np.array([size[0] / 2.0, -size[1] / 2.0]))
+    gsd = sampling(matrix, size)
+    rotation = math.degrees(math.atan2(jacobian[0, 1], jacobian[1, 1]))
+    fits = _pinholes(matrix, size, focal_px)
+    usual = _USUAL_FOCAL * math.hypot(*size) / 2.0
+    best = int(np.argmin(fits.skew + _FOCAL_PRIOR * np.abs(np.log(fits.focal_px / usual))))
+    return CameraPose(gsd, rotation, float(fits.tilt_deg[best]), float(fits.focal_px[best]), float(fits.skew[best]))
+
+
+def judge(matrix: FloatArray, size: tuple[int, int], options: CameraOptions, rough: bool = False) -> str:
+    """Return why a homography is not plausible, or "" if it is.
+
+    Some camera within the options must fit about as well as any. A `rough` homography, of a few matches only, may still
+    become plausible: its bounds are wider.
+    """
     if not np.isfinite(matrix).all():
         return "degenerate"
     width, height = size
@@ -114,13 +155,16 @@ def judge(matrix: FloatArray, size: tuple[int, int], options: CameraOptions) -> 
         return "horizon in the frame"
     if np.linalg.det(matrix) / middle**3 <= 0:
         return "mirrored"
-    camera = pose(matrix, size, options.focal_px)
-    if not options.gsd_m[0] <= camera.gsd_m <= options.gsd_m[1]:
+    slack_deg, slack, further = (15.0, 1.25, 0.2) if rough else (5.0, 1.0, 0.1)
+    if not options.gsd_m[0] / slack <= sampling(matrix, size) <= options.gsd_m[1] * slack:
         return "ground sampling out of range"
-    if camera.skew > options.max_skew:
+    fits = _pinholes(matrix, size, options.focal_px)
+    if fits.skew.min() > options.max_skew * slack:
         return "no camera sees a plane so"
-    if camera.tilt_deg > options.max_tilt_deg + 5.0:
+    if fits.tilt_deg[fits.skew <= fits.skew.min() + further].min() > options.max_tilt_deg + slack_deg:
         return "tilt out of range"
-    if options.north_up and abs(camera.rotation_deg) > 5.0:
-        return "not north up"
+    if options.north_up:
+        jacobian = _jacobian(matrix, np.array([width / 2.0, -height / 2.0]))
+        if abs(math.degrees(math.atan2(jacobian[0, 1], jacobian[1, 1]))) > slack_deg:
+            return "not north up"
     return ""

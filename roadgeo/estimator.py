@@ -18,7 +18,7 @@ from roadgeo.kernels.roads import screen
 from roadgeo.refinement import Refined, RefineOptions, refine
 from roadgeo.scene import Scene
 from roadgeo.triples import Proposals, TripleOptions, propose
-from roadgeo.typing import FloatArray, IntArray
+from roadgeo.typing import BoolArray, FloatArray, IntArray
 from roadgeo.verification import Agreement, VerifyOptions, agreement, chance_agreement, log10_odds
 
 __all__ = ["GrowOptions", "Hypothesis", "MatchOptions", "Source", "Sweep", "TripleEstimator"]
@@ -26,6 +26,8 @@ __all__ = ["GrowOptions", "Hypothesis", "MatchOptions", "Source", "Sweep", "Trip
 
 #: Matches that fix a homography: so many of a hypothesis' own are no evidence for it.
 MINIMAL = 4
+#: How far a proposal, made of three intersections, may turn the image's up from where it points.
+_ROUGHLY_DEG = 25.0
 
 
 @dataclass(frozen=True)
@@ -38,9 +40,6 @@ class GrowOptions:
     ----------
     max_scale_ratio : float
         Away from the middle of a tilted frame the ground sampling may differ from that at the middle by this factor.
-    min_shape_ratio : float
-        Least ratio of the singular values of the map around an anchor: a camera tilted by 60 degrees sees 1 : 2, the
-        rays at its frame's edge still less.
     screen_points, screen_radius_m, screen_radius_px, screen_share
         Of so many road points near the anchor, this share must lie within these radii of roads of the map.
     max_screened, max_grown, max_verified : int
@@ -59,7 +58,6 @@ class GrowOptions:
     """
 
     max_scale_ratio: float = 2.0
-    min_shape_ratio: float = 0.33
     screen_points: int = 40
     screen_radius_m: float = 8.0
     screen_radius_px: float = 4.0
@@ -95,17 +93,28 @@ class Source(Protocol):
 
 @dataclass(frozen=True)
 class Sweep:
-    """One pass over the query's anchors: how many, and how widely their triples are looked up."""
+    """One pass over the query's anchors: how many, and how widely their triples are looked up.
+
+    Attributes
+    ----------
+    triples : TripleOptions
+    max_anchors : int
+        On a map of `usual_size` intersections or more; on a smaller one, where each takes less time, more.
+    most_more : float
+        At most by this factor.
+    """
 
     triples: TripleOptions
     max_anchors: int
+    most_more: float = 3.0
 
     def proposals(
         self, scene: Scene, index: ReferenceIndex, scale: tuple[float, float], min_ratio: float
     ) -> Iterator[Proposals]:
         """Yield the proposals of the anchors (see `Source`)."""
         anchors = propose(scene.intersections, scene.branches, scene.neighbours, index, scale, min_ratio, self.triples)
-        return islice(anchors, self.max_anchors)
+        more = min(max(1.0, math.sqrt(self.triples.usual_size / max(len(index), 1))), self.most_more)
+        return islice(anchors, int(more * self.max_anchors))
 
 
 #: Where the rarest triples lead nowhere, more neighbours are taken, all over the frame.
@@ -166,6 +175,8 @@ class TripleEstimator:
         self.scene = scene
         self.index = index
         self.options = options or MatchOptions()
+        camera, usual = self.options.camera, self.options.refine
+        self.refine_options = replace(usual, perspective_sigma=camera.perspective_sigma(usual.perspective_sigma))
         self.n_tuples = self.n_candidates = self.n_screened = self.n_hypotheses = self.n_verified = 0
 
     def rounds(self) -> Iterator[list[Hypothesis]]:
@@ -174,7 +185,7 @@ class TripleEstimator:
         low, high = options.camera.gsd_m
         scale = (low / options.grow.max_scale_ratio, high * options.grow.max_scale_ratio)
         for source in options.sweeps:
-            for proposals in source.proposals(scene, self.index, scale, options.grow.min_shape_ratio):
+            for proposals in source.proposals(scene, self.index, scale, options.camera.min_shape_ratio):
                 self.n_tuples += proposals.n_tuples
                 self.n_candidates += proposals.n_hits
                 yield self._grow_all(proposals)
@@ -213,23 +224,31 @@ class TripleEstimator:
         reach = np.hypot(*(scene.intersections.xy[last[last >= 0]] - anchor).T).max(initial=0.0)
         near = np.argsort(away, kind="stable")[: options.screen_points]
         near = near[away[near] < reach]
-        most = options.max_screened
-        self.n_screened += min(most, len(proposals.reference))
-        shares = np.zeros(len(proposals.reference))
+        looked_at = np.flatnonzero(self._is_allowed(proposals))[: options.max_screened]
+        self.n_screened += len(looked_at)
+        shares = np.zeros(len(looked_at))
         screen(
-            proposals.reference[:most], proposals.affine, anchor, index.xy, scene.points[near], scene.directions[near],
+            proposals.reference[looked_at], proposals.affine[looked_at], anchor,
+            index.xy, scene.points[near], scene.directions[near],
             options.screen_radius_m, options.screen_radius_px, math.cos(math.radians(options.ray_tolerance_deg)),
             options.screen_share,
             index.segments, index.segment_starts, index.segment_ids, index.grid, index.shape, shares,
         )  # fmt: skip
         good = shares >= options.screen_share
+        kept, shares = looked_at[good], shares[good]
+        return kept[np.argsort(-(proposals.placed[kept] + shares), kind="stable")]
+
+    def _is_allowed(self, proposals: Proposals) -> BoolArray:
+        """Tell which proposals put the frame's middle where it may be, and its up where it may point."""
+        j00, j01, j10, j11 = proposals.affine.T
+        allowed = np.ones(len(j00), bool)
         if self.near is not None:
-            det = proposals.affine[:, 0] * proposals.affine[:, 3] - proposals.affine[:, 1] * proposals.affine[:, 2]
-            frame = 2.0 * scene.half_size * np.sqrt(np.maximum(det, 0.0))
-            away_m = np.hypot(*(index.xy[proposals.reference] - self.near[:2]).T)
-            good &= away_m < self.near[2] + frame
-        kept = np.flatnonzero(good)
-        return kept[np.argsort(-(proposals.placed[kept] + shares[kept]), kind="stable")]
+            frame = 2.0 * self.scene.half_size * np.sqrt(np.maximum(j00 * j11 - j01 * j10, 0.0))
+            away_m = np.hypot(*(self.index.xy[proposals.reference] - self.near[:2]).T)
+            allowed &= away_m < self.near[2] + frame
+        if self.options.camera.north_up:
+            allowed &= np.abs(np.arctan2(j01, j11)) < math.radians(_ROUGHLY_DEG)
+        return allowed
 
     def _grow(self, proposals: Proposals, chosen: IntArray) -> list[Hypothesis]:
         """Grow the chosen proposals of one anchor; return those that did not wither, the best supported first."""
@@ -246,7 +265,8 @@ class TripleEstimator:
             proposals.reference[chosen], proposals.affine[chosen], neighbours, partners,
             index.xy, index.branches, index.point_starts, index.grid, index.shape,
             (options.sigma_m, options.sigma_px), (options.radius_m, options.radius_px),
-            math.cos(math.radians(options.ray_tolerance_deg)), options.perspective_sigma,
+            math.cos(math.radians(options.ray_tolerance_deg)),
+            self.options.camera.perspective_sigma(options.perspective_sigma),
             options.hit_rate, options.chance_rate, options.patience, options.min_matched, matched, matrices, ratios,
         )  # fmt: skip
         best = np.argsort(-ratios, kind="stable")
@@ -272,7 +292,7 @@ class TripleEstimator:
 
     def _is_plausible(self, hypothesis: Hypothesis) -> bool:
         """Whether a camera can have seen a grown hypothesis."""
-        return not self._judge(hypothesis.matrix)
+        return not self._judge(hypothesis.matrix, rough=True)
 
     def score(self, model: Hypothesis) -> float:
         """Refine a hypothesis and return its log10 odds."""
@@ -311,7 +331,7 @@ class TripleEstimator:
         scene, options = self.scene, self.options
         best = -1.0
         for _ in range(5):
-            refined = refine(model.matrix, scene, self.index, model.matched, options.refine, n_points)
+            refined = refine(model.matrix, scene, self.index, model.matched, self.refine_options, n_points)
             if refined is None or self._judge(refined.matrix) or self._is_far(refined.matrix):
                 return model.refined is not None and best >= 0.0
             gsd = sampling(refined.matrix, scene.size)
@@ -328,9 +348,9 @@ class TripleEstimator:
                 break
         return True
 
-    def _judge(self, matrix: FloatArray) -> str:
+    def _judge(self, matrix: FloatArray, rough: bool = False) -> str:
         """Return why a homography is not plausible for the camera, or "" if it is."""
-        return judge(matrix, self.scene.size, self.options.camera)
+        return judge(matrix, self.scene.size, self.options.camera, rough)
 
     def _is_far(self, matrix: FloatArray) -> bool:
         """Whether the middle of the frame lies outside the circle that the user gave."""
@@ -341,7 +361,10 @@ class TripleEstimator:
 
     def settled(self, model: Hypothesis) -> bool:
         """Whether a hypothesis fits the whole frame, so that no better fit of the same place is to be expected."""
-        return model.found is not None and model.found.forward >= 0.65
+        if model.found is None or model.refined is None:
+            return False
+        frame_m = 2.0 * self.scene.half_size * model.gsd_m
+        return model.found.forward >= 0.65 and bool(model.refined.corner_sigma_m.max() <= 0.005 * frame_m)
 
     def center(self, model: Hypothesis) -> FloatArray:
         """Where the middle of the frame lies, in plane metres."""

@@ -55,7 +55,7 @@ __all__ = ["SCHEMA", "Explanation", "Funnel", "Needed", "RejectedPlace", "Story"
 SCHEMA = "roadgeo.explanation/1"
 
 #: Places that are shown, places that a camera refused which are looked at again, and how many of those are kept.
-_MAX_PLACES, _MAX_RETRIED, _MAX_REFUSED = 6, 6, 200
+_MAX_PLACES, _MAX_RETRIED, _MAX_REFUSED, _MAX_ELSEWHERE = 6, 6, 200, 20
 
 #: Limits that a user may have set too narrow; other refusals hold for every camera.
 _NEGOTIABLE = ("ground sampling out of range", "no camera sees a plane so", "tilt out of range", "not north up")
@@ -102,8 +102,8 @@ class WatchedEstimator(TripleEstimator):
         self.n_on_roads += len(kept)
         return kept
 
-    def _judge(self, matrix: FloatArray) -> str:
-        fault = super()._judge(matrix)
+    def _judge(self, matrix: FloatArray, rough: bool = False) -> str:
+        fault = super()._judge(matrix, rough)
         self._objection = (fault, matrix) if fault else None
         return fault
 
@@ -111,6 +111,14 @@ class WatchedEstimator(TripleEstimator):
         grown = super()._grow(proposals, chosen)
         self.n_survived += len(grown)
         return grown
+
+    def _grow_all(self, proposals: Proposals) -> list[Hypothesis]:
+        found = super()._grow_all(proposals)
+        # What points elsewhere than a camera may is not grown: some of it is here, to tell that it would fit.
+        elsewhere = np.flatnonzero(~self._is_allowed(proposals))[:_MAX_ELSEWHERE]
+        for hypothesis in super()._grow(proposals, elsewhere)[:_MAX_RETRIED]:
+            self._is_plausible(hypothesis)
+        return found
 
     def _is_plausible(self, hypothesis: Hypothesis) -> bool:
         self._objection = None

@@ -8,7 +8,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Mapping
-from dataclasses import asdict, dataclass, field, fields
+from dataclasses import asdict, dataclass, field, fields, replace
 from typing import Any
 
 import numpy as np
@@ -23,7 +23,7 @@ from roadgeo.progress import Say, say_nothing
 from roadgeo.projection import LocalPlane
 from roadgeo.typing import AnyArray, Float32Array, FloatArray, Int32Array
 
-__all__ = ["IndexOptions", "ReferenceIndex", "build_index", "neighbour_grid", "pack_tangents", "sort_by_bucket"]
+__all__ = ["IndexOptions", "ReferenceIndex", "build_index", "crop", "neighbour_grid", "pack_tangents", "sort_by_bucket"]
 
 #: Branches and tangents beyond these, which hardly an intersection has, serve its codes but are not compared.
 INDEXED_BRANCHES = 6
@@ -269,6 +269,51 @@ def pack_tangents(tangents: Float32Array) -> AnyArray:
     return np.where(np.isnan(tangents), -1, np.round(np.nan_to_num(tangents) * (32767 / math.pi))).astype(np.int16)
 
 
+def _tabulate(
+    xy: FloatArray, tangents: Float32Array, branches: AnyArray, neighbours: Int32Array, options: IndexOptions
+) -> tuple[Int32Array, AnyArray]:
+    """Return starts and entries of the table of triples (see `kernels.triples`)."""
+    sides = np.empty(tangents.shape, np.int8)
+    find_sides(tangents, branches, sides)
+    counts = np.zeros(TABLE + 1, np.int64)
+    shape_limit = (options.min_shape, options.codes_per_vertex)
+    total = fill_table(xy, tangents, sides, neighbours, *shape_limit, counts, np.empty(0, np.uint64))
+    starts = np.cumsum(counts)
+    entries = np.empty(total, np.uint64)
+    fill_table(xy, tangents, sides, neighbours, *shape_limit, starts.copy(), entries)
+    return starts.astype(np.int32), entries
+
+
+def crop(index: ReferenceIndex, center: tuple[float, float], radius_m: float) -> ReferenceIndex:
+    """Return a reference with the intersections within a circle only; all roads stay.
+
+    Neighbours and triples are those of the intersections left, so that a small part of a large map is searched as
+    quickly and as thoroughly as a small map.
+    """
+    inside = np.hypot(*(index.xy - center).T) <= radius_m
+    (kept,) = np.nonzero(inside)
+    buckets = np.repeat(np.arange(len(index.point_starts) - 1), np.diff(index.point_starts))
+    point_starts = np.concatenate(([0], np.cumsum(np.bincount(buckets[kept], minlength=len(index.point_starts) - 1))))
+    point_starts = point_starts.astype(np.int32)
+    xy, branches = np.ascontiguousarray(index.xy[kept]), np.ascontiguousarray(index.branches[kept])
+    packed = np.ascontiguousarray(index.tangents[kept])
+    tangents = np.where(packed >= 0, packed * np.float32(math.pi / 32767), np.nan).astype(np.float32)
+    options = IndexOptions(n_neighbours=index.neighbours.shape[1])
+    neighbours = nearest_neighbours(xy, point_starts, index.grid, index.shape, options.n_neighbours)
+    table_starts, entries = _tabulate(xy, tangents, branches, neighbours, options)
+    return replace(
+        index,
+        xy=xy,
+        branches=branches,
+        tangents=packed,
+        neighbours=neighbours,
+        point_starts=point_starts,
+        table_starts=table_starts,
+        table_entries=entries,
+        source=index.source[kept],
+    )
+
+
 def build_index(network: RoadNetwork, options: IndexOptions | None = None, say: Say = say_nothing) -> ReferenceIndex:
     """Index a road network.
 
@@ -305,15 +350,7 @@ def build_index(network: RoadNetwork, options: IndexOptions | None = None, say: 
 
     say(what, 0.4)
     branches = np.ascontiguousarray(found.branches()[order])
-    sides = np.empty(tangents.shape, np.int8)
-    find_sides(tangents, branches, sides)
-    counts = np.zeros(TABLE + 1, np.int64)
-    shape_limit = (options.min_shape, options.codes_per_vertex)
-    total = fill_table(xy, tangents, sides, neighbours, *shape_limit, counts, np.empty(0, np.uint64))
-    table_starts = np.cumsum(counts)
-    entries = np.empty(total, np.uint64)
-    say(what, 0.7)
-    fill_table(xy, tangents, sides, neighbours, *shape_limit, table_starts.copy(), entries)
+    table_starts, entries = _tabulate(xy, tangents, branches, neighbours, options)
 
     meta = {
         **network.meta,
@@ -335,7 +372,7 @@ def build_index(network: RoadNetwork, options: IndexOptions | None = None, say: 
         segments=segments,
         segment_starts=segment_starts,
         segment_ids=segment_ids,
-        table_starts=table_starts.astype(np.int32),
+        table_starts=table_starts,
         table_entries=entries,
         source=order,
     )

@@ -20,7 +20,7 @@ from roadgeo.explanation import Explanation, Needed, Story, WatchedEstimator, te
 from roadgeo.graph import RoadGraph
 from roadgeo.grid import PIXEL_TO_PLANE, RoadMask
 from roadgeo.homography import Homography
-from roadgeo.index import IndexOptions, ReferenceIndex, build_index
+from roadgeo.index import IndexOptions, ReferenceIndex, build_index, crop
 from roadgeo.intersections import IntersectionOptions, Intersections, find_intersections
 from roadgeo.kernels.triples import MAX_NEIGHBOURS
 from roadgeo.location import Evidence, Location, Place, Seconds, Seen, Stats
@@ -453,8 +453,13 @@ def _locate_on(
         if stories is not None:
             stories.append(tell(location, scene, index, needed))
         return location
+    near = _near(index, options.near)
+    if near is not None:
+        index = _part(_Same(index), near[:2], near[2] + 2.0 * scene.half_size * options.match.camera.gsd_m[1])
+        if len(index) < needed.intersections:
+            return replace(location, reason=f"the map has {len(index)} intersections around the place given by near")
     watch = TripleEstimator if stories is None else WatchedEstimator
-    estimator = watch(scene, index, options.match, _near(index, options.near))
+    estimator = watch(scene, index, options.match, near)
     _rehearse_once(estimator)
     started = time.perf_counter()
     result = search(estimator, replace(options.search, time_limit_s=time_limit_s))
@@ -465,6 +470,14 @@ def _locate_on(
     if stories is not None and isinstance(estimator, WatchedEstimator):
         stories.append(tell(location, scene, index, needed, estimator, result))
     return location
+
+
+@lru_cache(maxsize=4)
+def _part(reference: _Same, center: tuple[float, float], radius_m: float) -> ReferenceIndex:
+    """Crop a reference to a circle, unless it hardly reaches beyond: made once for a batch."""
+    index = reference.index
+    inside = np.hypot(*(index.xy - center).T) <= radius_m
+    return crop(index, center, radius_m) if inside.mean() < 0.7 else index
 
 
 @lru_cache(maxsize=4)

@@ -113,3 +113,31 @@ def test_a_known_focal_length_refuses_what_another_lens_saw():
     matrix = camera((0, 0), SIZE, 1.0, 45.0, 0.0, 0.0, 900.0)
     assert judge(matrix, SIZE, replace(OPTIONS, focal_px=900.0)) == ""
     assert judge(matrix, SIZE, replace(OPTIONS, focal_px=9000.0)) == "no camera sees a plane so"
+
+
+@pytest.mark.parametrize("focal", [600.0, 1500.0, 6000.0])
+def test_a_vertical_view_is_within_any_tilt_whatever_the_lens(focal):
+    """Near the nadir every focal length fits, and a long one makes tilt of any error: no bound may hang on it."""
+    rng = np.random.default_rng(int(focal))
+    for _ in range(20):
+        matrix = camera((0, 0), SIZE, 1.0, 2.0, rng.uniform(0, 360), rng.uniform(0, 360), focal)
+        matrix = matrix / matrix[2, 2]
+        matrix[2, :2] += rng.normal(0.0, 2e-5, 2)  # corners off by some metres
+        assert judge(matrix, SIZE, CameraOptions(max_tilt_deg=5.0)) == ""
+
+
+def test_a_rough_homography_has_wider_bounds():
+    beyond = camera((0, 0), SIZE, 1.0, 42.0, 0.0, 0.0, 1200.0)
+    options = CameraOptions(gsd_m=(0.5, 1.0), max_tilt_deg=30.0, focal_px=1200.0)
+    assert judge(beyond, SIZE, options) != ""
+    assert judge(beyond, SIZE, options, rough=True) == ""
+
+
+def test_what_is_known_of_the_tilt_narrows_what_is_looked_for():
+    ratios = [CameraOptions(max_tilt_deg=tilt).min_shape_ratio for tilt in (0, 15, 30, 60)]
+    assert ratios == sorted(ratios, reverse=True)
+    assert ratios[-1] == 0.33
+    sigmas = [CameraOptions(max_tilt_deg=tilt).perspective_sigma(0.4) for tilt in (0, 5, 15, 60)]
+    assert sigmas == sorted(sigmas)
+    assert sigmas[0] < 0.05
+    assert sigmas[-1] == 0.4

@@ -18,6 +18,7 @@ from roadgeo.index import (
     ReferenceIndex,
     build_index,
     check_table,
+    crop,
     neighbour_grid,
     pack_tangents,
     sort_by_bucket,
@@ -279,3 +280,28 @@ class TestCheckTable:
 
     def test_no_entries(self, town):
         check_table(replace(town[1], table_entries=town[1].table_entries[:0]))
+
+
+class TestCrop:
+    def test_what_lies_within_and_how_it_is_found(self, town):
+        index = town[1]
+        center = index.xy.mean(axis=0)
+        away = np.hypot(*(index.xy - center).T)
+        radius = float(np.median(away))
+        part = crop(index, tuple(center), radius)
+        assert len(part) == int((away <= radius).sum())
+        assert np.array_equal(part.xy, index.xy[away <= radius])
+        assert np.array_equal(part.source, index.source[away <= radius])
+        assert part.segments is index.segments
+        check_table(part)
+        ReferenceIndex.from_parts(part.meta, part.arrays())
+        # Far from the circle's rim neighbours are what they were.
+        deep = np.flatnonzero(away[away <= radius] < 0.5 * radius)[0]
+        was = np.flatnonzero(away <= radius)[deep]
+        assert np.array_equal(part.xy[part.neighbours[deep]], index.xy[index.neighbours[was]])
+
+    def test_the_whole_and_nothing(self, town):
+        index = town[1]
+        whole = crop(index, tuple(index.xy[0]), 1e6)
+        assert len(whole.table_entries) == len(index.table_entries)
+        assert len(crop(index, (1e7, 1e7), 1.0)) == 0
