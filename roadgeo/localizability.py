@@ -71,7 +71,7 @@ class LocalizabilityOptions:
         Cells are made larger where the map would have more along a side.
     """
 
-    located_share: float = 0.95
+    located_share: float = 0.97
     z: float = 1.5
     min_probability: float = 0.9
     cells_per_window: float = 10.0
