@@ -152,6 +152,6 @@ def _print(summary: dict[str, Any]) -> None:
         click.echo(line)
     if not summary["classes"][0]["area_share"]:
         click.echo(
-            "No promise can be made anywhere: too few of the masks tried were located, or too few were tried; a larger -n,"
-            " wider windows or better masks may help."
+            "No promise can be made anywhere: too few masks were located, or tried; a larger -n, wider windows or"
+            " better masks may help."
         )
