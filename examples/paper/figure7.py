@@ -8,6 +8,7 @@ A type is d_b = [N_B(P1), N_B(P2), N_q(P1), N_q(P2)]: branches and tangents of b
 from __future__ import annotations
 
 from dataclasses import replace
+from typing import Any
 
 import experiments as paper
 import numpy as np
@@ -51,16 +52,24 @@ def main() -> None:
     types = [{"type": table.types[t].tolist(), "tuples": int(counts[t])} for t in order]
     paper.save(options.out, "figure7", {"reference": area.stem, "types": types, "rarest_first": results})
 
+    draw(area.stem, counts[order], results, options.out)
+
+
+def draw(area: str, counts: np.ndarray, results: list[dict[str, Any]], out: paper.Path) -> None:
+    """Plot how many tuples each type has, commonest first, and recall in either order of drawing."""
     figure, (bars, orders) = paper.axes()
-    bars.bar(np.arange(len(counts)), counts[order], width=1.0)
-    bars.set(yscale="log", xlabel="types, by frequency", ylabel="tuples", title=f"{area.stem}: {len(table):,} tuples")
-    at = np.arange(3)
+    bars.bar(np.arange(len(counts)), counts, width=1.0)
+    bars.set(yscale="log", xlabel="types, by frequency", ylabel="tuples", title=f"{area}: {counts.sum():,} tuples")
     for rarest, shift in ((True, -0.2), (False, 0.2)):
-        chosen = [r["recall"]["value"] for r in results if r["rarest_first"] is rarest]
-        orders.bar(at + shift, chosen, 0.4, label="rarest type first" if rarest else "any type")
-    orders.set(xticks=at, xticklabels=["clean", "segmented", "poor"], ylim=(0, 1.03), ylabel="recall of pair")
+        chosen = [r["recall"] for r in results if r["rarest_first"] is rarest]
+        value, low, high = (np.array([share[name] for share in chosen]) for name in ("value", "low", "high"))
+        at = np.arange(len(chosen)) + shift
+        label = "rarest type first" if rarest else "any type"
+        orders.bar(at, value, 0.4, yerr=np.maximum([value - low, high - value], 0.0), capsize=3, label=label)
+    kinds = list(dict.fromkeys(r["noise"] for r in results))
+    orders.set(xticks=np.arange(len(kinds)), xticklabels=kinds, ylim=(0, 1.03), ylabel="recall of pair")
     orders.legend()
-    figure.savefig(options.out / "figure7.png", dpi=110)
+    figure.savefig(out / "figure7.png", dpi=110)
 
 
 if __name__ == "__main__":

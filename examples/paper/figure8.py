@@ -8,6 +8,7 @@ One core. The paper's figure counts the time of its search; so do these (vectori
 from __future__ import annotations
 
 from dataclasses import replace
+from typing import Any
 
 import experiments as paper
 import numpy as np
@@ -35,7 +36,6 @@ def main() -> None:
         search = replace(default.search, time_limit_s=options.time_limit)
         locators["auto"] = paper.AutoLocator(area, replace(default, search=search))
 
-    figure, ax = paper.axes(1, 1)
     results = []
     for name, locator in locators.items():
         done, found = paper.trials(queries, locator, options, name)
@@ -43,14 +43,23 @@ def main() -> None:
         within = float(np.mean(seconds <= 1.0))
         print(f"  {100 * within:.0f} % within 1 s")
         results.append({"name": name, "within_1_s": within, "seconds": seconds.round(4).tolist(), **paper.point(found)})
-        label = f"{name}: {100 * within:.0f} % in 1 s, recall {100 * found.total.recall.value:.0f} %"
-        ax.step(np.maximum(seconds, 1e-3), np.arange(1, len(seconds) + 1) / len(seconds), label=label, where="post")
     paper.save(options.out, "figure8", {"reference": area.stem, "noise": options.noise, "points": results})
-    ax.set(xscale="log", xlabel="seconds", ylabel="share of masks", title=f"{area.stem}: time of the search")
+    draw(area.stem, results, options.out)
+
+
+def draw(area: str, results: list[dict[str, Any]], out: paper.Path) -> None:
+    """Plot the share of masks that were answered within a time."""
+    figure, ax = paper.axes(1, 1)
+    for point in results:
+        seconds = np.array(point["seconds"])
+        within, recall = 100 * point["within_1_s"], 100 * point["recall"]["value"]
+        label = f"{point['name']}: {within:.0f} % in 1 s, recall {recall:.0f} %"
+        ax.step(np.maximum(seconds, 1e-3), np.arange(1, len(seconds) + 1) / len(seconds), label=label, where="post")
+    ax.set(xscale="log", xlabel="seconds", ylabel="share of masks", title=f"{area}: time of the search")
     ax.axvline(1.0, color="grey", lw=1, ls=":")
     ax.grid(alpha=0.3)
     ax.legend(fontsize=8)
-    figure.savefig(options.out / "figure8.png", dpi=110)
+    figure.savefig(out / "figure8.png", dpi=110)
 
 
 def search_seconds(trial: Trial) -> float:
