@@ -19,7 +19,21 @@ from roadgeo.intersections import Intersections
 from roadgeo.kernels.triples import UNITS, count_alike, find_sides, gather, look_up
 from roadgeo.typing import AnyArray, FloatArray, Int32Array, IntArray
 
-__all__ = ["Proposals", "TripleOptions", "propose"]
+__all__ = ["Proposals", "TripleOptions", "larger", "propose", "smaller"]
+
+
+#: Intersections of the maps that bounds are made for: a city's.
+_USUAL_SIZE = 15_000
+
+
+def larger(n_reference: int) -> float:
+    """Return the root of how many times a map of so many intersections is larger than a usual one, at least 1."""
+    return math.sqrt(max(1.0, n_reference / _USUAL_SIZE))
+
+
+def smaller(n_reference: int) -> float:
+    """Return the root of how many times it is smaller, at least 1."""
+    return math.sqrt(max(1.0, _USUAL_SIZE / max(n_reference, 1)))
 
 
 @dataclass(frozen=True)
@@ -45,8 +59,8 @@ class TripleOptions:
     max_weighed : int
         Of more intersections, evenly chosen ones may become anchors: to weigh all would take longer than to use some.
     max_hits, max_compared : int
-        An anchor's triples are looked up, the rarest first, until so many were found or compared: on a map of
-        `usual_size` intersections, and on a larger one more by the root of the ratio.
+        An anchor's triples are looked up, the rarest first, until so many were found or compared: on a map of 15,000
+        intersections, and on a larger one more by the root of the ratio.
     """
 
     n_neighbours: int = 8
@@ -59,12 +73,10 @@ class TripleOptions:
     max_weighed: int = 1000
     max_hits: int = 12_000
     max_compared: int = 400_000
-    usual_size: int = 15_000
 
     def bounds(self, n_reference: int) -> tuple[int, int]:
         """Return `max_hits` and `max_compared` for a map of so many intersections."""
-        factor = math.sqrt(max(1.0, n_reference / self.usual_size))
-        return int(self.max_hits * factor), int(self.max_compared * factor)
+        return int(self.max_hits * larger(n_reference)), int(self.max_compared * larger(n_reference))
 
 
 @dataclass(frozen=True)

@@ -8,10 +8,11 @@ import shapely
 from scenes import PLANE, Sight, camera, look, mapped, random_lines, random_network, scene_of
 
 from roadgeo.camera import CameraOptions
-from roadgeo.estimator import MatchOptions, TripleEstimator
+from roadgeo.estimator import MatchOptions, Sweep, TripleEstimator
 from roadgeo.index import build_index
 from roadgeo.robust import SearchOptions, search
 from roadgeo.scene import query_neighbours
+from roadgeo.triples import TripleOptions
 from roadgeo.workflows import build_network
 
 ACCEPT = SearchOptions().accept
@@ -130,6 +131,26 @@ def test_little_to_see(town, scene, n):
 def test_road_points_far_from_the_anchor(town, scene):
     sparse = replace(scene, points=scene.points[:0], directions=scene.directions[:0])
     locate(sparse, town[1], limits=SearchOptions(time_limit_s=0.5))
+
+
+@pytest.mark.parametrize("most", [0, 300])
+def test_places_are_bounded(town, most):
+    stranger = scene_of(look(random_network(3, 2000.0), camera((1000, 1000)), sight=Sight(0.5)))
+    options = MatchOptions(max_places=most)
+    result, estimator = locate(stranger, town[1], options)
+    assert result.stopped == "exhausted"
+    assert estimator.n_screened <= most + options.grow.max_screened
+
+
+def test_more_anchors_are_tried_on_a_small_map(town, scene):
+    index = town[1]
+
+    def n_anchors(most_more):
+        sweep = Sweep(TripleOptions(), 5, most_more)
+        return len(list(sweep.proposals(scene, index, (0.1, 10.0), 0.33)))
+
+    assert n_anchors(1.0) == 5
+    assert n_anchors(1.0) < n_anchors(3.0) <= 15
 
 
 def test_time_is_bounded(town):
