@@ -52,6 +52,8 @@ def run(script, town, out, *arguments):
     ("script", "arguments", "result"),
     [
         ("figure5.py", ["--n-r", "20", "--methods", "pair"], "figure5"),
+        ("figure6.py", ["--methods", "auto"], "figure6"),
+        ("figure7.py", [], "figure7"),
         ("figure8.py", [], "figure8"),
         ("tables.py", [], "table2"),
     ],
