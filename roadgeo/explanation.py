@@ -328,11 +328,12 @@ def tell(
     """
     n = len(scene.intersections)
     if watched is None or result is None:
-        few = n < needed.intersections
         stats = location.stats
+        ended = "intersections" if n < needed.intersections else "verified" if stats.tuples_sampled else "anchors"
         funnel = Funnel(n, stats.tuples_sampled, 0, stats.candidates, 0, 0, stats.hypotheses, 0, stats.verified)
-        reasons = () if location.located else (location.reason,)
-        return Story(index.name, "", needed, funnel, {}, "intersections" if few else None, reasons)
+        if location.located:
+            return Story(index.name, "", needed, funnel, {}, None, ())
+        return Story(index.name, "", needed, funnel, {}, ended, (location.reason,))
     funnel = Funnel(
         n,
         len(set(watched.anchors)),

@@ -491,7 +491,7 @@ class _Search:
         homography, matches = self._refine(self.homography)
         ratio = len(matches) / len(self.query)
         reason = (
-            f"located: {len(matches)} of {len(self.query)} intersections ({ratio:.0%}) match, after {self.n_samples} "
+            f"{len(matches)} of {len(self.query)} intersections ({ratio:.0%}) match, after {self.n_samples} "
             f"query tuples and {self.hypotheses} hypotheses"
         )
         facing = Homography(homography).facing(self.frame.mean(axis=0)).matrix

@@ -13,7 +13,7 @@ from typing import TYPE_CHECKING, Any, Literal, TypeVar
 import cv2
 import numpy as np
 
-from roadgeo.camera import pose
+from roadgeo.camera import CameraOptions, pose
 from roadgeo.errors import IndexFormatError, RoadSourceError
 from roadgeo.estimator import Hypothesis, MatchOptions, TripleEstimator
 from roadgeo.explanation import Explanation, Needed, Story, WatchedEstimator, tell
@@ -444,20 +444,23 @@ def _locate_on(
         query.name, "not_located", "", index.name, size=scene.size, n_intersections=n, seconds=seconds, seen=seen
     )
     needed = Needed(options.min_log10_odds, options.min_margin, options.min_intersections)
-    if n < needed.intersections or options.method == "pair":
-        if n < needed.intersections:
-            reason = f"only {n} intersections are seen, at least {needed.intersections} are needed"
-            location = replace(location, reason=reason)
-        else:
-            location = _locate_by_pairs(location, scene, graph, index, options, time_limit_s)
+
+    def tell_at_once(location: Location) -> Location:
         if stories is not None:
             stories.append(tell(location, scene, index, needed))
         return location
+
+    if n < needed.intersections:
+        reason = f"only {n} intersections are seen, at least {needed.intersections} are needed"
+        return tell_at_once(replace(location, reason=reason))
+    if options.method == "pair":
+        return tell_at_once(_locate_by_pairs(location, scene, graph, index, options, time_limit_s))
     near = _near(index, options.near)
     if near is not None:
         index = _part(_Same(index), near[:2], near[2] + 2.0 * scene.half_size * options.match.camera.gsd_m[1])
         if len(index) < needed.intersections:
-            return replace(location, reason=f"the map has {len(index)} intersections around the place given by near")
+            few = f"the map has {len(index)} intersections around the place given by near{_searched(options)}"
+            return tell_at_once(replace(location, reason=few))
     watch = TripleEstimator if stories is None else WatchedEstimator
     estimator = watch(scene, index, options.match, near)
     _rehearse_once(estimator)
@@ -583,7 +586,7 @@ def _describe(
 
 def _refusal(result: SearchResult[Hypothesis], options: LocateOptions, tracing_s: float) -> str:
     """Say why nothing is reported, and what may help."""
-    needed = options.min_log10_odds
+    needed, searched = options.min_log10_odds, _searched(options)
     if math.isfinite(result.score):
         best = f"the best has log10 odds {result.score:.1f}, {needed:g} are needed"
     else:
@@ -591,8 +594,30 @@ def _refusal(result: SearchResult[Hypothesis], options: LocateOptions, tracing_s
     if result.stopped == "time":
         limit = options.search.time_limit_s
         tracing = f", of which tracing the mask took {tracing_s:.1f} s" if tracing_s > limit / 4 else ""
-        return f"stopped at the time limit of {limit:g} s{tracing}; of the places tried, {best}"
-    return f"no place on this map stands out: {best}; more roads in view or another map may help"
+        return f"stopped at the time limit of {limit:g} s{tracing}; of the places tried, {best}{searched}"
+    nothing = f"no place on this map stands out: {best}{searched}"
+    if searched:
+        return f"{nothing}: more roads in view or a wider search may help"
+    return f"{nothing}; more roads in view or another map may help"
+
+
+def _searched(options: LocateOptions) -> str:
+    """Name the limits that the search was given, to end a sentence; "" for none."""
+    camera, usual = options.match.camera, CameraOptions()
+    limits = []
+    if options.near is not None:
+        lon, lat, radius = options.near
+        reach = f"{radius:g} m" if radius < 1000 else f"{radius / 1000:g} km"
+        limits.append(f"within {reach} of {lon:.9g},{lat:.9g}")
+    if camera.gsd_m != usual.gsd_m:
+        limits.append(f"at {camera.gsd_m[0]:g} to {camera.gsd_m[1]:g} m per pixel")
+    if camera.max_tilt_deg != usual.max_tilt_deg:
+        limits.append(f"tilted by up to {camera.max_tilt_deg:g} degrees")
+    if camera.north_up:
+        limits.append("north up")
+    if camera.focal_px is not None:
+        limits.append(f"with a focal length of {camera.focal_px:.5g} pixels")
+    return f"; searched {', '.join(limits)}" if limits else ""
 
 
 def place_scene(

@@ -2,6 +2,7 @@
 
 import json
 import os
+import re
 import shutil
 import subprocess
 import sys
@@ -168,6 +169,22 @@ def test_options_narrow_the_search(porto: Path, capfd: pytest.CaptureFixture[str
     assert main(["locate", mask, *reference, "--gsd", "2:3"]) == 3
     assert main(["locate", mask, *reference, "--near=-8.60,41.15,500"]) == 3
     assert capfd.readouterr().out == ""
+    for limits, told in [
+        (["--near=-8.60,41.15,500"], "searched within 500 m of -8.6,41.15: "),
+        (
+            ["--near=2.35,48.85,2000", "--gsd", "0.8:1.2"],
+            "searched within 2 km of 2.35,48.85, at 0.8 to 1.2 m per pixel",
+        ),
+    ]:
+        assert main(["locate", mask, "-r", str(porto), *limits]) == 3
+        assert told in capfd.readouterr().out
+
+
+def test_the_papers_matcher_says_once_what_it_found(porto: Path, capfd: pytest.CaptureFixture[str]) -> None:
+    assert main(["locate", str(MASKS["drone"].path), "-r", str(porto), "--method", "pair"]) == 0
+    out = capfd.readouterr().out
+    assert re.search(r"located at 41\.152.* on porto: \d+ of \d+ intersections", out)
+    assert out.count("located") == 1
 
 
 def test_the_library_is_searched_by_default(tmp_path: Path, capfd: pytest.CaptureFixture[str]) -> None:

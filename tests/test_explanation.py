@@ -115,6 +115,15 @@ def test_limits_that_are_too_narrow_are_named(town, mask, limits, fault, value):
     assert any("limits on the camera may be too narrow" in sentence for sentence in search["missing"])
 
 
+def test_a_place_off_the_map_is_told(town, mask):
+    explanation = explain(mask, town, LocateOptions(near=(0.0, 80.0, 500.0)))
+    search = check(explanation)
+    assert explanation.location.reason == (
+        "the map has 0 intersections around the place given by near; searched within 500 m of 0,80"
+    )
+    assert search["missing"] == [explanation.location.reason]
+
+
 def test_a_mask_of_elsewhere(town):
     search = check(explain(mask_of(random_network(77)), town))
     assert search["starved_at"] in {"odds", "survived", "on_roads", "camera"}

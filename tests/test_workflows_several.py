@@ -1,11 +1,14 @@
 """Answers of several references become one answer."""
 
+import math
 from dataclasses import replace
 
 import pytest
 
+from roadgeo.camera import CameraOptions
 from roadgeo.location import Location, Place, Seconds
-from roadgeo.workflows import LocateOptions, _best_of
+from roadgeo.robust import SearchResult
+from roadgeo.workflows import LocateOptions, _best_of, _refusal
 
 HERE = Place(0.0, 0.0, 8.60, 41.15, 20.0)
 
@@ -43,3 +46,31 @@ def test_overlapping_maps_may_agree():
 @pytest.mark.parametrize("names", [["a"], ["a", "b"]])
 def test_a_refusal_says_where_it_looked(names):
     assert _best_of([refused(name) for name in names], LocateOptions()).reference == ", ".join(names)
+
+
+NEAR, CAMERA = (-71.06, 42.36, 500.0), CameraOptions()
+
+
+@pytest.mark.parametrize(
+    ("near", "camera", "told"),
+    [
+        (None, {}, "; more roads in view or another map may help"),
+        (NEAR, {}, "; searched within 500 m of -71.06,42.36: more roads in view or a wider search may help"),
+        ((8.123456, -1.0, 1234567.0), {}, "; searched within 1234.57 km of 8.123456,-1: "),
+        (None, {"gsd_m": (0.5, 1.0)}, "; searched at 0.5 to 1 m per pixel: "),
+        (None, {"max_tilt_deg": 20.0}, "; searched tilted by up to 20 degrees: "),
+        (None, {"focal_px": 1280.0}, "; searched with a focal length of 1280 pixels: "),
+        (NEAR, {"gsd_m": (0.5, 1.0), "north_up": True}, "of -71.06,42.36, at 0.5 to 1 m per pixel, north up: "),
+    ],
+)
+@pytest.mark.parametrize("stopped", ["exhausted", "time"])
+def test_a_refusal_names_the_limits_that_were_given(near, camera, told, stopped):
+    match = replace(LocateOptions().match, camera=replace(CAMERA, **camera))
+    nothing = SearchResult(None, -math.inf, None, -math.inf, 1, 0, stopped)
+    reason = _refusal(nothing, LocateOptions(near=near, match=match), 0.1)
+    if stopped == "time":
+        assert reason.startswith("stopped at the time limit of 10 s")
+        assert reason.endswith(told.partition(": ")[0] if near or camera else "none passed the tests")
+    else:
+        assert told in reason
+        assert reason.endswith(" may help")

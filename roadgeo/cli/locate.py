@@ -348,8 +348,8 @@ def locate_command(
     """Find where road MASKs lie on a map, and draw them there.
 
     A mask is an image of the roads that an aerial picture shows: bright or 1 where there is road. Its size, heading,
-    scale and camera need not be known; what is known narrows the search and makes it surer. Give files, folders or
-    patterns.
+    scale and camera need not be known; what is known shortens the search, and tells places apart that look alike. Give
+    files, folders or patterns.
 
     \b
     For each located photo_mask.tif:

@@ -159,7 +159,7 @@ def _explain(location: Location) -> str:
             f"{location.n_intersections} intersections are seen in the mask{few}.",
             "Do the coloured lines follow the mask's roads? If not, a cleaner mask, --threshold or --band may help.",
             f"Was the right map searched? It was {location.reference}.",
-            "Whatever is known narrows the search and makes it surer: --gsd, --near, --north-up, --max-tilt.",
+            "Whatever is known shortens the search and may save a mask: --near, --gsd, --north-up, --max-tilt.",
         ]
     return "".join(f"<p>{html.escape(text)}</p>" for text in texts if text)
 
