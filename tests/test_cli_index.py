@@ -83,6 +83,20 @@ def test_files_become_a_reference(tmp_path, capsys):
     assert (tmp_path / "fenway.index").exists()
 
 
+@pytest.mark.parametrize(
+    ("given", "name"),
+    [(["--out", "My b.gpkg"], "my-b"), (["--out", "b.index"], "b"), (["--name", "C", "--out", "b"], "c")],
+)
+def test_a_reference_is_called_after_its_own_file(tmp_path, monkeypatch, capsys, given, name):
+    monkeypatch.chdir(tmp_path)
+    assert index("--roads", write_streets(tmp_path / "a.geojson"), *given, quiet=True) == 0
+    (reference,) = tmp_path.glob("*.index")
+    assert main(["info", str(reference)]) == 0
+    assert capsys.readouterr().out.splitlines()[0].split() == ["name", name]
+    assert main(["info", str(reference), "--json"]) == 0
+    assert "a.geojson" in json.dumps(json.loads(capsys.readouterr().out)["meta"]["sources"])
+
+
 def test_roads_without_a_crs_are_an_error(tmp_path, capsys):
     file = write_streets(tmp_path / "a.shp")
     file.with_suffix(".prj").unlink()
@@ -115,7 +129,7 @@ def test_a_part_is_added_and_replaced_and_the_rest_stays(tmp_path, capsys):
     assert n_grown == pytest.approx(n, abs=2)
     assert length_grown == pytest.approx(length, rel=0.02)
     assert length_grown > length_west
-    assert (told["name"], told["options"], len(told["sources"])) == ("a", meta["options"], 2)
+    assert (told["name"], told["options"], len(told["sources"])) == ("grown", meta["options"], 2)
     assert index("--update", "--roads", streets, EAST, "--out", grown) == 0
     assert counts(grown, capsys)[:2] == pytest.approx((n_grown, length_grown), rel=0.01)
 

@@ -67,7 +67,9 @@ __all__ = ["build", "index_command"]
     metavar="REF",
     help="Build the index of REF again from its GeoPackage alone, after an edit in QGIS for example.",
 )
-@click.option("--name", metavar="NAME", help="Name of the reference. Default: after the place or file.")
+@click.option(
+    "--name", metavar="NAME", help="Name of the reference. Default: after the place, else after REF.gpkg or the file."
+)
 @click.option(
     "-o",
     "--out",
@@ -111,7 +113,7 @@ def index_command(
         _rebuild(rebuild, quiet)
         return
     given = _one_source(source)
-    name = name or _name(source, given)
+    name = name or _name(source, given, out)
     path = Path(out) if out else new_reference(name)
     make_folder(path.parent)  # before the long part
     if update:
@@ -235,9 +237,13 @@ def _read_plugin(source: dict[str, Any], given: str, say: Say) -> Roads:
     return replace(roads, meta={"sources": [{"name": source[given]}], "attribution": "", **roads.meta})
 
 
-def _name(source: dict[str, Any], given: str) -> str:
+def _name(source: dict[str, Any], given: str, out: str | None) -> str:
     if given == "place":
         return str(source["place"])
+    if out:
+        from roadgeo.io_reference import reference_paths
+
+        return reference_paths(out).geopackage.stem
     if given == "plugin":
         return Path(source["plugin"].partition(":")[2]).stem or "roads"
     if given in {"roads", "polygon"}:
