@@ -71,9 +71,9 @@ class LocalizabilityOptions:
         Cells are made larger where the map would have more along a side.
     """
 
-    located_share: float = 0.97
+    located_share: float = 0.95
     z: float = 1.5
-    min_probability: float = 0.9
+    min_probability: float = 0.95
     cells_per_window: float = 10.0
     max_cells: int = 2000
 
