@@ -63,7 +63,6 @@ def write_location(
     paths: OutputPaths,
     options: OutputOptions | None = None,
     picture: str | os.PathLike[str] | None = None,
-    attribution: str = "",
 ) -> tuple[Location, list[Path]]:
     """Write what a location asks for; return it with `seconds.write` set, and the files.
 
@@ -74,8 +73,6 @@ def write_location(
     ----------
     picture : path, optional
         The photograph that the mask was made of: drawn on the map instead of the mask.
-    attribution : str
-        Whom the map's licence asks to name.
 
     Raises
     ------
@@ -111,15 +108,15 @@ def write_location(
             place = Placement.of(location)
             if picture is None:
                 homography, size = place.homography, mask.shape[::-1]
-                grid = _write_mask(stage(paths.footprint), location, mask, options.image, attribution)
+                grid = _write_mask(stage(paths.footprint), location, mask, options.image)
                 stage(paths.style).write_text(draw_palette(PALETTE), encoding="utf-8")
             else:
                 homography, size = image_homography(place, mask.shape[::-1], picture)
-                tags = _tags(location, homography, attribution)
+                tags = _tags(location, homography)
                 grid = warp_image(picture, stage(paths.footprint), place, homography, tags, options.image)
             write_layers(stage(paths.geopackage), _layers(location))
             subject = Subject(location, place, source, size, homography, grid, options.image.crs or place.crs, paths)
-            subject = replace(subject, attribution=attribution, mask=mask if picture is None else None)
+            subject = replace(subject, mask=mask if picture is None else None)
             for product in chosen:
                 product.write(stage(product.path(paths.folder, paths.stem, source.name)), subject)
         location = replace(location, seconds=replace(location.seconds, write=perf_counter() - started))
@@ -147,7 +144,7 @@ def _remove(paths: Iterable[Path]) -> None:
 # --- the warped mask --------------------------------------------------------------------------------------------------
 
 
-def _write_mask(path: Path, location: Location, mask: RoadMask, options: ImageOptions, attribution: str) -> MapGrid:
+def _write_mask(path: Path, location: Location, mask: RoadMask, options: ImageOptions) -> MapGrid:
     """Draw the mask on the map: a Cloud Optimized GeoTIFF with a colour table, nodata outside the footprint."""
     import rasterio
     import rasterio.shutil
@@ -173,7 +170,7 @@ def _write_mask(path: Path, location: Location, mask: RoadMask, options: ImageOp
         with memory.open(**profile) as plain:
             plain.write(warp(_labels(mask), place.homography, grid, to_place), 1)
             plain.write_colormap(1, {value: _rgba(color) for value, (color, _, _) in PALETTE.items()})
-            plain.update_tags(**_tags(location, place.homography, attribution))
+            plain.update_tags(**_tags(location, place.homography))
             layout = {"compress": "DEFLATE", "level": 1, "overview_resampling": "nearest", "blocksize": 512}
             rasterio.shutil.copy(plain, optimized.name, driver="COG", **layout)
         path.write_bytes(optimized.read())
@@ -193,7 +190,7 @@ def _rgba(color: str) -> tuple[int, int, int, int]:
     return red, green, blue, 255
 
 
-def _tags(location: Location, homography: FloatArray, attribution: str) -> dict[str, str]:
+def _tags(location: Location, homography: FloatArray) -> dict[str, str]:
     """Say where it comes from, for `gdalinfo`; the homography is that of what is drawn."""
     return {
         "TIFFTAG_SOFTWARE": f"roadgeo {__version__}",
@@ -201,7 +198,7 @@ def _tags(location: Location, homography: FloatArray, attribution: str) -> dict[
         "ROADGEO_REFERENCE": location.reference,
         "ROADGEO_HOMOGRAPHY": json.dumps(homography.tolist()),
         "ROADGEO_LOG10_ODDS": f"{location.log10_odds}",
-        "ROADGEO_ATTRIBUTION": attribution,
+        "ROADGEO_ATTRIBUTION": location.attribution,
     }
 
 

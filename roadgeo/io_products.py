@@ -53,8 +53,6 @@ class Subject:
         Of the warped raster.
     mask : RoadMask or None
         Given where `picture` is the mask itself.
-    attribution : str
-        Whom the map's licence asks to name.
     """
 
     location: Location
@@ -66,7 +64,6 @@ class Subject:
     crs: str
     paths: OutputPaths
     mask: RoadMask | None = None
-    attribution: str = ""
 
     def control_points(self) -> list[tuple[float, float, float, float]]:
         """Column, row, x, y of 25 points on a grid over the picture."""
@@ -317,7 +314,7 @@ def _kml(subject: Subject, grid: MapGrid) -> str:
     rings = [" ".join(f"{lon:.7f},{lat:.7f},0" for lon, lat in ring) for ring in cut_ring(subject.outline())]
     polygons = "\n".join(map(_KML_POLYGON.format, rings))
     name = html.escape(subject.paths.stem)
-    said = html.escape(f"{subject.location.reason}. {subject.attribution}".strip())
+    said = html.escape(f"{subject.location.reason}. {subject.location.attribution}".strip())
     return f"""<?xml version="1.0" encoding="UTF-8"?>
 <kml xmlns="http://www.opengis.net/kml/2.2">
 <Document><name>{name}</name><description>{said}</description>

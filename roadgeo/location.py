@@ -89,6 +89,8 @@ class Location:
 
     Attributes
     ----------
+    attribution : str
+        Whom the licence of the reference asks to name.
     homography : (3, 3) float64
         Query pixel (column, row; GDAL corner convention) to CRS.
     footprint, footprint_lonlat : (4, 2) float64
@@ -105,6 +107,7 @@ class Location:
     status: Status
     reason: str
     reference: str = ""
+    attribution: str = ""
     crs: str | None = None
     size: tuple[int, int] | None = None  # (width, height) of the mask in pixels
     homography: FloatArray | None = None
@@ -145,6 +148,7 @@ class Location:
             "status": self.status,
             "reason": self.reason,
             "reference": self.reference,
+            "attribution": self.attribution,
             "crs": self.crs,
             "size": None if self.size is None else list(self.size),
             "homography": rows(self.homography),

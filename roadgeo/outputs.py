@@ -104,7 +104,7 @@ def output_paths(folder: str | os.PathLike[str], stem: str) -> OutputPaths:
 
 def attributes(location: Location) -> dict[str, Any]:
     """Return what a footprint carries in every format: plain values."""
-    names = ["query", "status", "reason", "reference", "gsd_m", "rotation_deg", "tilt_deg"]
+    names = ["query", "status", "reason", "reference", "attribution", "gsd_m", "rotation_deg", "tilt_deg"]
     names += ["n_intersections", "n_matched", "inlier_ratio", "log10_odds"]
     sigma = location.corner_sigma_m
     worst = None if sigma is None else float(sigma.max())

@@ -441,7 +441,15 @@ def _locate_on(
     n = len(scene.intersections)
     seen = Seen(graph, scene.intersections.xy)
     location = Location(
-        query.name, "not_located", "", index.name, size=scene.size, n_intersections=n, seconds=seconds, seen=seen
+        query.name,
+        "not_located",
+        "",
+        index.name,
+        str(index.meta.get("attribution") or ""),
+        size=scene.size,
+        n_intersections=n,
+        seconds=seconds,
+        seen=seen,
     )
     needed = Needed(options.min_log10_odds, options.min_margin, options.min_intersections)
 
@@ -680,7 +688,9 @@ def _best_of(found: Sequence[Location], options: LocateOptions) -> Location:
     )
     if best.status == "not_located" and len(found) > 1:
         names = ", ".join(one.reference for one in found)
-        return replace(best, seconds=seconds, reference=names, reason=f"{best.reason} (looked on {names})")
+        owed = "; ".join(dict.fromkeys(one.attribution for one in found if one.attribution))
+        reason = f"{best.reason} (looked on {names})"
+        return replace(best, seconds=seconds, reference=names, attribution=owed, reason=reason)
     rivals = [one for one in ranked[1:] if one.status == "located" and _far_apart(one, best)]
     if (
         rivals

@@ -18,7 +18,7 @@ import rasterio
 from roadgeo.cli import main
 from roadgeo.cli.index import build
 from roadgeo.cli.locate import pair_images
-from roadgeo.demo import ROADS, DemoMask, demo_masks
+from roadgeo.demo import ATTRIBUTION, ROADS, DemoMask, demo_masks
 from roadgeo.homography import Homography
 from roadgeo.io_roads import read_roads
 
@@ -28,7 +28,7 @@ MASKS = {mask.path.stem: mask for mask in demo_masks()}
 @pytest.fixture(scope="module")
 def porto(tmp_path_factory: pytest.TempPathFactory) -> Path:
     path = tmp_path_factory.mktemp("reference") / "porto.gpkg"
-    build(read_roads(ROADS), path, "porto")
+    build(read_roads(ROADS, attribution=ATTRIBUTION), path, "porto")
     return path
 
 
@@ -90,6 +90,7 @@ def test_json_lines_stand_in_input_order_and_alone_on_standard_output(
     assert [one["query"] for one in found] == ["a.png", "missing.png", "b.png", "c.png"]
     assert [one["status"] for one in found] == ["not_located", "error", "error", "located"]
     assert all(one["schema"] == "roadgeo.location/1" and one["reason"] for one in found)
+    assert [one.get("attribution") for one in found] == [ATTRIBUTION, None, None, ATTRIBUTION]
     assert status == 1
     assert err.count("Error: ") == 2
     assert "1 located, 1 not located, 2 failed" in err

@@ -37,6 +37,7 @@ def located(H: np.ndarray = TURN @ TILT) -> Location:
         status="located",
         reason="found",
         reference="porto",
+        attribution="© somebody",
         crs=CRS,
         size=(400, 300),
         homography=H,
@@ -122,6 +123,7 @@ def test_the_geopackage_holds_footprint_roads_and_residuals(tmp_path: Path) -> N
     rings, attributes = read_layer(paths.geopackage, "footprint")
     np.testing.assert_allclose(rings[0][:4], location.footprint)
     assert attributes["query"] == ["photo_mask.png"]
+    assert attributes["attribution"] == ["© somebody"]
     assert attributes["max_corner_sigma_m"] == [0.8]
     points, matches = read_layer(paths.geopackage, "matches")
     np.testing.assert_allclose(points, location.evidence.reference_xy)
@@ -137,6 +139,7 @@ def test_the_json_is_the_location(tmp_path: Path) -> None:
     written, files = write_location(located(), road_mask(), paths)
     assert all(path.exists() for path in files)
     assert json.loads(paths.json.read_text()) == json.loads(json.dumps(written.to_dict()))
+    assert json.loads(paths.json.read_text())["attribution"] == "© somebody"
     assert written.seconds.write > 0
 
 

@@ -30,7 +30,7 @@ def written(tmp_path_factory: pytest.TempPathFactory) -> OutputPaths:
     paths = output_paths(tmp_path / "out", "mask")
     paths.folder.mkdir()
     options = OutputOptions(products=tuple(PRODUCTS))
-    _, files = write_location(located(), road_mask(), paths, options, tmp_path / "photo.png", "© somebody")
+    _, files = write_location(located(), road_mask(), paths, options, tmp_path / "photo.png")
     assert sorted(files) == sorted(paths.folder.iterdir())
     return paths
 
@@ -104,6 +104,7 @@ def test_geojson_is_the_footprint(written: OutputPaths) -> None:
     feature = json.loads((written.folder / "mask_footprint.geojson").read_text())
     check_rfc7946(feature)
     assert feature["properties"]["query"] == "photo_mask.png"
+    assert feature["properties"]["attribution"] == "© somebody"
     ring = np.array(feature["geometry"]["coordinates"][0])
     to_crs = pyproj.Transformer.from_crs(4326, 32629, always_xy=True)
     corners = np.stack(to_crs.transform(*ring[[0, 24, 16, 8]].T), 1)

@@ -22,7 +22,9 @@ def located(reference: str, odds: float, lon: float = 8.60) -> Location:
 
 
 def refused(reference: str) -> Location:
-    return Location("q", "not_located", "no place stands out", reference=reference, seconds=Seconds(match=2.0))
+    return Location(
+        "q", "not_located", "no place stands out", reference=reference, attribution="© all", seconds=Seconds(match=2.0)
+    )
 
 
 def test_the_surest_place_wins_and_all_work_counts():
@@ -45,7 +47,8 @@ def test_overlapping_maps_may_agree():
 
 @pytest.mark.parametrize("names", [["a"], ["a", "b"]])
 def test_a_refusal_says_where_it_looked(names):
-    assert _best_of([refused(name) for name in names], LocateOptions()).reference == ", ".join(names)
+    best = _best_of([refused(name) for name in names], LocateOptions())
+    assert (best.reference, best.attribution) == (", ".join(names), "© all")
 
 
 NEAR, CAMERA = (-71.06, 42.36, 500.0), CameraOptions()

@@ -123,7 +123,7 @@ class Job:
         attribution = str(reference.index.meta.get("attribution", ""))
         paths = output_paths(self.out_dir, task.stem)
         picture = self.images.get(task.mask, task.mask if self.segmenter else None)
-        location, files = write_location(location, mask, paths, self.outputs, picture, attribution)
+        location, files = write_location(location, mask, paths, self.outputs, picture)
         if location.located and (self.plot or self.figure):
             pictures = [paths.overlay] if self.plot else []
             pictures += [paths.figure(self.figure)] if self.figure else []
