@@ -267,11 +267,16 @@ def _find_ties(graph: RoadGraph, options: SimplifyOptions) -> FloatArray:
     xy = np.empty((starts[-1], 2))
     direction = np.empty((starts[-1], 2))
     kernels.sample_edges(graph.offsets, graph.coords, lengths, starts, xy, direction)
-    edge = np.repeat(np.arange(graph.n_edges), count)
-    cell = np.floor((xy - xy.min(axis=0, initial=np.inf)) / options.fuse_distance).astype(np.int64) + 1
-    n_columns = int(cell[:, 0].max(initial=0)) + 2
-    key = cell[:, 1] * n_columns + cell[:, 0]
+    edge = np.repeat(np.arange(graph.n_edges, dtype=np.int32), count)
+    # On a map of many cities these arrays are the largest: none is kept longer than it is needed.
+    column = _cells(xy[:, 0], options.fuse_distance)
+    n_columns = int(column.max(initial=0)) + 2
+    key = _cells(xy[:, 1], options.fuse_distance)
+    key *= n_columns
+    key += column
+    del column
     order = np.argsort(key, kind="stable")
+    key = key[order]
     mate, apart, touch = kernels.find_mates(
         xy,
         direction,
@@ -279,17 +284,23 @@ def _find_ties(graph: RoadGraph, options: SimplifyOptions) -> FloatArray:
         graph.edges,
         starts,
         order,
-        key[order],
+        key,
         n_columns,
         options.fuse_distance,
         _PARALLEL_COS,
     )
+    del xy, direction, order, key
     runs = kernels.tie_runs(starts, lengths, edge, mate, apart, 0.7 * options.fuse_distance, options.merge_radius)
     end = np.flatnonzero(touch >= 0)
     there = touch[end]
     share = (there - starts[edge[there]]) / (count[edge[there]] - 1)
     touches = np.stack((end // 2, (end % 2) * lengths[end // 2], edge[there], share * lengths[edge[there]]), axis=1)
     return np.concatenate((runs, touches))
+
+
+def _cells(along: FloatArray, size: float) -> IntArray:
+    """Return the numbers, from 1, of the cells of a grid that coordinates (N,) lie in."""
+    return np.asarray((along - along.min(initial=np.inf)) / size + 1.0).astype(np.int64)
 
 
 def _tie(graph: RoadGraph, ties: FloatArray, options: SimplifyOptions) -> RoadGraph:

@@ -399,7 +399,7 @@ def sample_edges(
 def find_mates(
     xy: NDArray[np.float64],
     direction: NDArray[np.float64],
-    edge: NDArray[np.int64],
+    edge: NDArray[np.int32],
     edges: NDArray[np.int32],
     starts: NDArray[np.int64],
     order: NDArray[np.int64],
@@ -481,7 +481,7 @@ def find_mates(
 def tie_runs(
     starts: NDArray[np.int64],
     lengths: NDArray[np.float64],
-    edge: NDArray[np.int64],
+    edge: NDArray[np.int32],
     mate: NDArray[np.int64],
     apart: NDArray[np.float64],
     split_distance: float,
