@@ -413,7 +413,7 @@ def find_mates(
     Parameters
     ----------
     xy, direction : (S, 2) float64
-    edge : (S,) int64
+    edge : (S,) int32
         The edge of each sample.
     edges : (E, 2) int32
     starts : (E + 1,) int64
