@@ -291,7 +291,9 @@ def open_references(names: Iterable[str], say: Say = say_nothing) -> list[Refere
     help="Focal length in pixels of the mask, or exif: as the photograph given by --image (else the mask) says.",
 )
 @click.option("--near", metavar="LON,LAT,RADIUS", type=NEAR, help="The middle lies within RADIUS metres of this place.")
-@click.option("--north-up", is_flag=True, help="The image's up is north.")
+@click.option(
+    "--north-up", is_flag=True, help="The image's up is north: grid north of the reference, within 5 degrees."
+)
 @click.option(
     "--method",
     type=click.Choice(["auto", "pair"]),
