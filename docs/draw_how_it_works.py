@@ -17,9 +17,10 @@ from roadgeo.index import ReferenceIndex, build_index
 from roadgeo.io_raster import read_mask
 from roadgeo.io_roads import read_roads
 from roadgeo.kernels.triples import UNITS, find_sides, look_up
+from roadgeo.references import Reference, build_network
 from roadgeo.scene import Scene
 from roadgeo.triples import TripleOptions, propose
-from roadgeo.workflows import Reference, build_network, trace_query
+from roadgeo.workflows import trace_query
 
 mpl.use("Agg")
 import matplotlib.pyplot as plt

@@ -46,12 +46,13 @@ from roadgeo.errors import MaskError, RoadgeoError, RoadSourceError  # noqa: E40
 from roadgeo.evaluation import Score, Share, calibrate_odds, calibrate_sigma, score, share  # noqa: E402
 from roadgeo.io_raster import read_mask  # noqa: E402
 from roadgeo.landscape import Landscape, visible_intersections  # noqa: E402
+from roadgeo.references import build_reference, open_reference  # noqa: E402
 from roadgeo.simplification import planarize  # noqa: E402
 from roadgeo.simulation import SimulationOptions, ViewOptions, simulate_query  # noqa: E402
 from roadgeo.trials import Mask, MaskFiles, QuerySet, Trial, run_trials  # noqa: E402
 from roadgeo.truth import Truth, read_truth  # noqa: E402
 from roadgeo.view import make_view, sees_ground  # noqa: E402
-from roadgeo.workflows import LocateOptions, build_reference, locate, open_reference  # noqa: E402
+from roadgeo.workflows import LocateOptions, locate  # noqa: E402
 
 TILTED = ViewOptions(
     gsd_m=(0.7, 1.4), tilt_deg=(0.0, 30.0), heading_deg=(0.0, 360.0), focal_px=1500.0, road_width_px=(9.0, 10.0)

@@ -19,15 +19,8 @@ if TYPE_CHECKING:
     from roadgeo.errors import RoadgeoError
     from roadgeo.grid import RoadMask
     from roadgeo.location import Location
-    from roadgeo.workflows import (
-        BuildOptions,
-        LocateOptions,
-        Reference,
-        build_reference,
-        explain,
-        locate,
-        open_reference,
-    )
+    from roadgeo.references import BuildOptions, Reference, build_reference, open_reference
+    from roadgeo.workflows import LocateOptions, explain, locate
 
 __all__ = [
     "BuildOptions",
@@ -44,16 +37,16 @@ __all__ = [
 ]
 
 _HOMES = {
-    "BuildOptions": "workflows",
+    "BuildOptions": "references",
     "LocateOptions": "workflows",
     "Location": "location",
-    "Reference": "workflows",
+    "Reference": "references",
     "RoadMask": "grid",
     "RoadgeoError": "errors",
-    "build_reference": "workflows",
+    "build_reference": "references",
     "explain": "workflows",
     "locate": "workflows",
-    "open_reference": "workflows",
+    "open_reference": "references",
 }
 
 

@@ -19,10 +19,11 @@ from roadgeo.files import write_text
 from roadgeo.io_network import read_network
 from roadgeo.landscape import Landscape
 from roadgeo.projection import transformer
+from roadgeo.references import open_reference
 from roadgeo.simulation import SimulationOptions, simulate_query, simulate_query_at
 from roadgeo.truth import Truth, truth_from_record, truth_to_record
 from roadgeo.typing import AnyArray
-from roadgeo.workflows import LocateOptions, locate, open_reference
+from roadgeo.workflows import LocateOptions, locate
 
 __all__ = [
     "DrawnMasks",

@@ -10,8 +10,8 @@ from roadgeo.graph import RoadGraph
 from roadgeo.intersections import IntersectionOptions, find_intersections
 from roadgeo.network import RoadNetwork
 from roadgeo.projection import LocalPlane
+from roadgeo.references import build_network
 from roadgeo.scene import Scene, prepare_scene
-from roadgeo.workflows import build_network
 
 __all__ = ["PLANE", "Sight", "camera", "look", "mapped", "random_lines", "random_network", "scene_of"]
 

@@ -21,7 +21,7 @@ NAMES = {
         "io_roads io_lines io_overpass io_raster io_exif io_vectorized io_index io_atomic io_network "
         "io_reference io_outputs io_products io_summary io_image files geopackage rtree truth styles library"
     ),
-    7: "workflows",
+    7: "references workflows",
     8: (
         "cli report plot figure canvas explanation_plot qgis demo drawing trials localizability evaluation_report "
         "simulation evaluation __main__"

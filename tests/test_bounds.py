@@ -16,9 +16,10 @@ from roadgeo.errors import MaskError
 from roadgeo.grid import RoadMask
 from roadgeo.index import build_index
 from roadgeo.io_raster import read_mask
+from roadgeo.references import Reference, build_network
 from roadgeo.robust import SearchOptions
 from roadgeo.scene import SceneOptions
-from roadgeo.workflows import LocateOptions, Reference, build_network, locate
+from roadgeo.workflows import LocateOptions, locate
 
 
 def grid_mask(side, step, width, jitter=0.0):

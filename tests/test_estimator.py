@@ -10,10 +10,10 @@ from scenes import PLANE, Sight, camera, look, mapped, random_lines, random_netw
 from roadgeo.camera import CameraOptions
 from roadgeo.estimator import MatchOptions, Sweep, TripleEstimator
 from roadgeo.index import build_index
+from roadgeo.references import build_network
 from roadgeo.robust import SearchOptions, search
 from roadgeo.scene import query_neighbours
 from roadgeo.triples import TripleOptions
-from roadgeo.workflows import build_network
 
 ACCEPT = SearchOptions().accept
 

@@ -16,8 +16,9 @@ from roadgeo.explanation import SCHEMA, Explanation
 from roadgeo.explanation_plot import AGREES, STARVED, draw_explanation, write_explanation_picture
 from roadgeo.grid import RoadMask, plane_to_pixel
 from roadgeo.index import build_index
+from roadgeo.references import Reference, build_network
 from roadgeo.robust import SearchOptions
-from roadgeo.workflows import LocateOptions, Reference, build_network, explain, locate
+from roadgeo.workflows import LocateOptions, explain, locate
 
 SIZE = (900, 900)
 TRUTH = camera((1500.0, 1400.0), SIZE, 1.0, tilt_deg=15.0, azimuth_deg=50.0, heading_deg=200.0, focal_px=900.0)

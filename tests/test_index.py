@@ -26,7 +26,7 @@ from roadgeo.index import (
 from roadgeo.intersections import Intersections
 from roadgeo.kernels.triples import TABLE
 from roadgeo.network import RoadNetwork
-from roadgeo.workflows import build_network
+from roadgeo.references import build_network
 
 coordinates = st.floats(-1e6, 1e6)
 points = st.lists(st.tuples(coordinates, coordinates), min_size=1, max_size=30).map(lambda p: np.array(p, float))

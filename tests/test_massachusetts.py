@@ -11,9 +11,10 @@ import pytest
 
 from roadgeo.homography import Homography
 from roadgeo.io_raster import read_mask
+from roadgeo.references import Reference, build_reference
 from roadgeo.truth import Truth, read_truth
 from roadgeo.view import warp_mask
-from roadgeo.workflows import Reference, build_reference, locate
+from roadgeo.workflows import locate
 
 pytestmark = pytest.mark.realdata
 

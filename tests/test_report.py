@@ -23,9 +23,10 @@ from roadgeo.index import build_index
 from roadgeo.io_raster import read_mask
 from roadgeo.io_roads import read_roads
 from roadgeo.location import Evidence, Location, Place
+from roadgeo.references import Reference, build_network
 from roadgeo.report import Entry, ReportOptions, render_batch, render_report, write_batch, write_report
 from roadgeo.report.svg import draw_dots, draw_image, draw_lines, join_segments, thin_lines
-from roadgeo.workflows import Reference, build_network, locate
+from roadgeo.workflows import locate
 
 __all__ = ["browser"]
 

@@ -10,6 +10,7 @@ from hypothesis import strategies as st
 from scenes import PLANE, Sight, camera, look, mapped, scene_of
 
 from roadgeo.index import build_index
+from roadgeo.references import build_network
 from roadgeo.verification import (
     Agreement,
     VerifyOptions,
@@ -18,7 +19,6 @@ from roadgeo.verification import (
     log10_odds,
     tolerance_m,
 )
-from roadgeo.workflows import build_network
 
 OPTIONS = VerifyOptions()
 NO_SEEDS = np.array([], int)

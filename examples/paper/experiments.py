@@ -25,9 +25,10 @@ from roadgeo.io_network import as_stored, read_network
 from roadgeo.library import resolve_reference
 from roadgeo.network import RoadNetwork
 from roadgeo.pairs import PairIndex, PairOptions, build_pair_index, match_pairs
+from roadgeo.references import Reference, open_reference
 from roadgeo.simulation import SimulationOptions, ViewOptions
 from roadgeo.trials import QuerySet, Trial, run_trials
-from roadgeo.workflows import LocateOptions, Reference, locate, open_reference, trace_query
+from roadgeo.workflows import LocateOptions, locate, trace_query
 
 #: Section 4.3: "an area of 10 x 10 km2"; section 4.4: cross-ratio error 0.3, inlier ratio 0.5, 30 intersections.
 AREA_M = 10_000.0

@@ -13,7 +13,7 @@ from roadgeo.progress import Say, say_nothing
 
 if TYPE_CHECKING:
     from roadgeo.io_roads import Roads
-    from roadgeo.workflows import Reference
+    from roadgeo.references import Reference
 
 __all__ = ["build", "index_command"]
 
@@ -145,7 +145,7 @@ def build(roads: Roads, path: Path, name: str, say: Say = say_nothing) -> Refere
     """
     from roadgeo.index import build_index
     from roadgeo.io_network import as_stored
-    from roadgeo.workflows import Reference, build_network, open_reference
+    from roadgeo.references import Reference, build_network, open_reference
 
     network = as_stored(build_network(roads.lines, roads.plane, {"name": name, **roads.meta}, say=say))
     Reference(build_index(network, say=say), network).save(path, say)
@@ -154,7 +154,7 @@ def build(roads: Roads, path: Path, name: str, say: Say = say_nothing) -> Refere
 
 def renew(roads: Roads, path: Path, say: Say = say_nothing) -> Reference:
     """Replace a reference's roads by others on their ground, write and open it; see `workflows.update_reference`."""
-    from roadgeo.workflows import update_reference
+    from roadgeo.references import update_reference
 
     return update_reference(path, roads, say)
 
@@ -163,7 +163,7 @@ def _rebuild(name: str, quiet: bool) -> None:
     from roadgeo.cli.compilation import compile_once
     from roadgeo.cli.progress import show_steps
     from roadgeo.library import resolve_reference
-    from roadgeo.workflows import rebuild_reference
+    from roadgeo.references import rebuild_reference
 
     path = resolve_reference(name)
     with show_steps(quiet) as say:

@@ -26,7 +26,8 @@ if TYPE_CHECKING:
     from roadgeo.io_outputs import OutputOptions
     from roadgeo.location import Location
     from roadgeo.outputs import OutputPaths
-    from roadgeo.workflows import LocateOptions, Reference
+    from roadgeo.references import Reference
+    from roadgeo.workflows import LocateOptions
 
 __all__ = ["Job", "Outcome", "locate_command", "make_options", "open_references", "pair_images"]
 
@@ -185,7 +186,7 @@ def open_references(names: Iterable[str], say: Say = say_nothing) -> list[Refere
     """
     from roadgeo.errors import IndexFormatError
     from roadgeo.library import library_dir, list_references, resolve_reference
-    from roadgeo.workflows import open_reference
+    from roadgeo.references import open_reference
 
     paths = [resolve_reference(name) for name in names] or list_references()
     if not paths:

@@ -11,8 +11,8 @@ from roadgeo.errors import IndexFormatError
 from roadgeo.index import IndexOptions
 from roadgeo.intersections import IntersectionOptions
 from roadgeo.io_network import read_network
+from roadgeo.references import BuildOptions, build_reference, open_reference, stored_options
 from roadgeo.simplification import SimplifyOptions
-from roadgeo.workflows import BuildOptions, build_reference, open_reference, stored_options
 
 OPTIONS = BuildOptions(
     SimplifyOptions(merge_radius=10.0, max_passes=2),
