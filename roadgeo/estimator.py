@@ -370,8 +370,11 @@ class TripleEstimator:
         return bool(np.hypot(*(mapped[:2] / mapped[2] - self.near[:2])) > self.near[2])
 
     def settled(self, model: Hypothesis) -> bool:
-        """Whether a hypothesis fits the whole frame, so that no better fit of the same place is to be expected."""
-        if model.found is None or model.refined is None:
+        """Whether a hypothesis fits the whole frame, so that no better one is to be expected, of its place or another.
+
+        Where half of the roads would agree after a shift, streets form a lattice: it may have twins that fit as well.
+        """
+        if model.found is None or model.refined is None or model.chance[1] >= 0.5:
             return False
         frame_m = 2.0 * self.scene.half_size * model.gsd_m
         return model.found.forward >= 0.65 and bool(model.refined.corner_sigma_m.max() <= 0.005 * frame_m)
