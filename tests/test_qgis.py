@@ -5,7 +5,6 @@ import configparser
 import json
 import os
 import re
-import shlex
 import shutil
 import signal
 import subprocess
@@ -470,34 +469,6 @@ def test_every_output_opens_without_a_word(qgis: Qgis, porto: Path, located: Pat
     assert warnings == []
     assert printed == ""
     assert main(["check", str(porto)]) == 0  # QGIS changes a GeoPackage's bytes; the reference is sound all the same
-
-
-def test_the_page_about_it_runs_as_it_stands(qgis: Qgis, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.chdir(tmp_path)
-    monkeypatch.setenv("QGIS_CUSTOM_CONFIG_PATH", str(tmp_path / "config"))
-    (tmp_path / "config" / "profiles" / "surveys").mkdir(parents=True)
-    shutil.copy(ROADS, "streets.gpkg")
-    shutil.copy(MASKS["drone"].path, "photo_mask.png")
-    page = (Path(__file__).parent.parent / "docs" / "qgis.md").read_text("utf-8")
-    lines = [
-        line
-        for block in re.findall(r"^```bash\n(.*?)^```$", page, re.DOTALL | re.MULTILINE)
-        for line in block.splitlines()
-    ]
-    for program, *arguments in map(shlex.split, lines):
-        if program == "roadgeo":
-            assert main(arguments) == 0
-        else:
-            done = qgis.tool(*arguments, folder=tmp_path)
-            assert done.returncode == 0, done.stderr
-    assert {path.name for path in tmp_path.iterdir()} >= {
-        "roadgeo_qgis.zip",
-        "city.gpkg",
-        "city.index",
-        "found",
-        "seen",
-    }
-    assert (tmp_path / "found" / "photo_mask_footprint.tif").exists()
 
 
 # --- what QGIS makes of it --------------------------------------------------------------------------------------------
