@@ -65,6 +65,8 @@ class LocalizabilityOptions:
     z : float
     min_probability : float
         Places that promise less are not marked as located, however well others do.
+    min_intersections : int
+        Places with fewer around them hold too few, whatever the trials were: `locate` refuses such masks.
     cells_per_window : float
         Cells along the side of a window.
     max_cells : int
@@ -74,6 +76,7 @@ class LocalizabilityOptions:
     located_share: float = 0.95
     z: float = 1.5
     min_probability: float = 0.95
+    min_intersections: int = 6
     cells_per_window: float = 10.0
     max_cells: int = 2000
 
@@ -170,8 +173,9 @@ def map_localizability(
     row, column = (np.clip(at, 0, n - 1) for at, n in zip(_cells(places, grid), shape, strict=True))
     probability = _predict(grid.features, _fit(grid.features[row, column], located))
     threshold = _threshold(probability[row, column], located, options)
-    few = grid.counts < _fewest(grid.counts, probability)
-    classes = np.where(probability >= threshold, LOCATED, np.where(few, TOO_FEW, AMBIGUOUS))
+    none = grid.counts < options.min_intersections
+    few = none | (grid.counts < _fewest(grid.counts, probability))
+    classes = np.where((probability >= threshold) & ~none, LOCATED, np.where(few, TOO_FEW, AMBIGUOUS))
     return LocalizabilityMap(
         grid,
         np.where(grid.covered, classes, UNKNOWN).astype(np.uint8),

@@ -257,6 +257,12 @@ def test_a_bad_mask_is_one_line_and_status_1(
     assert err.count("\n") == 1
 
 
+@pytest.mark.parametrize("known", [["--north-up"], ["--gsd", "0.5:1"], ["--near=-8.6,41.1,500"], ["--max-tilt", "0"]])
+def test_the_papers_method_knows_no_hints(known: list[str], porto: Path, capfd: pytest.CaptureFixture[str]) -> None:
+    assert main(["locate", str(MASKS["drone"].path), "-r", str(porto), "--method", "pair", *known]) == 2
+    assert "--method pair knows no --camera" in capfd.readouterr().err
+
+
 def last_line(capfd: pytest.CaptureFixture[str]) -> str:
     out, err = capfd.readouterr()
     assert out == ""

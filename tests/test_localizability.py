@@ -91,6 +91,17 @@ def test_few_trials_support_no_promise():
     assert set(np.unique(found.classes)) <= {AMBIGUOUS, TOO_FEW}
 
 
+def test_ground_with_hardly_a_crossing_is_promised_nothing():
+    """Trials lie where there are crossings: what they tell does not hold where there are none."""
+    grid = lay_grid(network(), 400.0**2)
+    places = grid.draw(100, grid.counts > 8, np.random.default_rng(0))
+    found = map_localizability(grid, places, np.full(100, True))
+    bare = grid.covered & (grid.counts < 6)
+    assert bare.any()
+    assert (found.classes[bare] == TOO_FEW).all()
+    assert (found.classes[grid.counts > 8] == LOCATED).all()
+
+
 def test_ground_without_known_roads_is_left_out():
     ring = np.array([[0, 0], [1000, 0], [1000, 1000], [0, 1000], [0, 0]], float)
     hole = np.array([[400, 400], [600, 400], [600, 600], [400, 600], [400, 400]], float)

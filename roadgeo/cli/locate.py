@@ -397,6 +397,10 @@ def locate_command(
 
         if not has_matplotlib():
             raise click.UsageError("--figure needs matplotlib: pip install 'roadgeo[plot]'.")
+    if method == "pair" and (camera or gsd or near or north_up or max_tilt is not None):
+        raise click.UsageError(
+            "--method pair knows no --camera, --gsd, --max-tilt, --near or --north-up: leave them out."
+        )
     focal_px = camera if isinstance(camera, float) else None
     options = make_options(method, gsd, max_tilt, near, north_up, time_limit, focal_px)
     tasks = name_tasks(find_masks(masks))
