@@ -8,7 +8,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Mapping
-from dataclasses import asdict, dataclass, field, fields, replace
+from dataclasses import asdict, dataclass, fields, replace
 from typing import Any
 
 import numpy as np
@@ -23,7 +23,16 @@ from roadgeo.progress import Say, say_nothing
 from roadgeo.projection import LocalPlane
 from roadgeo.typing import AnyArray, Float32Array, FloatArray, Int32Array
 
-__all__ = ["IndexOptions", "ReferenceIndex", "build_index", "crop", "neighbour_grid", "pack_tangents", "sort_by_bucket"]
+__all__ = [
+    "IndexOptions",
+    "ReferenceIndex",
+    "build_index",
+    "crop",
+    "neighbour_grid",
+    "pack_tangents",
+    "sort_by_bucket",
+    "unpack_tangents",
+]
 
 #: Branches and tangents beyond these, which hardly an intersection has, serve its codes but are not compared.
 INDEXED_BRANCHES = 6
@@ -54,9 +63,9 @@ class IndexOptions:
     simplify_m: float = 0.8
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, eq=False)
 class ReferenceIndex:
-    """A searchable reference.
+    """A searchable reference; equal to itself only, so that what is made of it can be cached.
 
     Dimensions: N intersections, R ray columns, K neighbours, S segments, B buckets, T table entries.
 
@@ -96,7 +105,7 @@ class ReferenceIndex:
     table_starts: Int32Array
     table_entries: AnyArray
     source: Int32Array
-    path: str = field(default="", compare=False)
+    path: str = ""
 
     def __len__(self) -> int:
         """N."""
@@ -269,6 +278,11 @@ def pack_tangents(tangents: Float32Array) -> AnyArray:
     return np.where(np.isnan(tangents), -1, np.round(np.nan_to_num(tangents) * (32767 / math.pi))).astype(np.int16)
 
 
+def unpack_tangents(packed: AnyArray) -> Float32Array:
+    """Undo `pack_tangents`: (N, R) float32 radians, NaN for -1."""
+    return np.asarray(np.where(packed >= 0, packed * np.float32(math.pi / 32767), np.nan), np.float32)
+
+
 def _tabulate(
     xy: FloatArray, tangents: Float32Array, branches: AnyArray, neighbours: Int32Array, options: IndexOptions
 ) -> tuple[Int32Array, AnyArray]:
@@ -297,10 +311,9 @@ def crop(index: ReferenceIndex, center: tuple[float, float], radius_m: float) ->
     point_starts = point_starts.astype(np.int32)
     xy, branches = np.ascontiguousarray(index.xy[kept]), np.ascontiguousarray(index.branches[kept])
     packed = np.ascontiguousarray(index.tangents[kept])
-    tangents = np.where(packed >= 0, packed * np.float32(math.pi / 32767), np.nan).astype(np.float32)
     options = IndexOptions(n_neighbours=index.neighbours.shape[1])
     neighbours = nearest_neighbours(xy, point_starts, index.grid, index.shape, options.n_neighbours)
-    table_starts, entries = _tabulate(xy, tangents, branches, neighbours, options)
+    table_starts, entries = _tabulate(xy, unpack_tangents(packed), branches, neighbours, options)
     return replace(
         index,
         xy=xy,

@@ -19,7 +19,7 @@ from functools import lru_cache
 
 import numpy as np
 
-from roadgeo.index import ReferenceIndex
+from roadgeo.index import ReferenceIndex, unpack_tangents
 from roadgeo.kernels.neighbour_pairs import count_pairs, find_pairs, list_neighbour_pairs
 from roadgeo.scene import Scene
 from roadgeo.triples import Proposals
@@ -81,7 +81,7 @@ class PairSweep:
         tangents = np.asarray(found.tangents, np.float64)
         min_sine = math.sin(math.radians(self.min_line_angle_deg))
         ends, pairs = _list_pairs(found.xy, tangents, scene.neighbours[:, : self.n_neighbours], min_sine)
-        reference, table = _reference_pairs(_Same(index), min_sine)
+        reference, table = _reference_pairs(index, min_sine)
         spread = self._spread(pairs)
         max_error = math.radians(self.max_angle_deg) ** 2
         step = max(1, len(table) // self.n_sampled)
@@ -131,22 +131,8 @@ def _list_pairs(
     return ends[:n], pairs[:n]
 
 
-@dataclass(frozen=True)
-class _Same:
-    """A reference as a key of a cache: equal to itself only."""
-
-    index: ReferenceIndex
-
-    def __hash__(self) -> int:
-        return id(self.index)
-
-    def __eq__(self, other: object) -> bool:
-        return isinstance(other, _Same) and other.index is self.index
-
-
 @lru_cache(maxsize=2)
-def _reference_pairs(reference: _Same, min_sine: float) -> tuple[Int32Array, FloatArray]:
+def _reference_pairs(index: ReferenceIndex, min_sine: float) -> tuple[Int32Array, FloatArray]:
     """Describe the map's pairs of neighbours: built when first needed, kept for a batch."""
-    index = reference.index
-    tangents = np.where(index.tangents >= 0, index.tangents * (math.pi / 32767), np.nan)
+    tangents = unpack_tangents(index.tangents).astype(np.float64)
     return _list_pairs(index.xy, tangents, index.neighbours, min_sine)

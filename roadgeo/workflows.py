@@ -20,7 +20,7 @@ from roadgeo.explanation import Explanation, Needed, Story, WatchedEstimator, te
 from roadgeo.graph import RoadGraph
 from roadgeo.grid import PIXEL_TO_PLANE, RoadMask
 from roadgeo.homography import Homography
-from roadgeo.index import ReferenceIndex, crop
+from roadgeo.index import ReferenceIndex, crop, unpack_tangents
 from roadgeo.intersections import IntersectionOptions, Intersections, find_intersections
 from roadgeo.location import Evidence, Location, Place, Seconds, Seen, Stats
 from roadgeo.pairs import PairIndex, PairOptions, build_pair_index, match_pairs
@@ -238,12 +238,12 @@ def _locate_on(
         return tell_at_once(_locate_by_pairs(location, scene, graph, index, options, time_limit_s))
     near = _near(index, options.near)
     if near is not None:
-        index = _part(_Same(index), near[:2], near[2] + 2.0 * scene.half_size * options.match.camera.gsd_m[1])
+        index = _part(index, near[:2], near[2] + 2.0 * scene.half_size * options.match.camera.gsd_m[1])
         if len(index) < needed.intersections:
             few = f"the map has {len(index)} intersections around the place given by near{_searched(options)}"
             return tell_at_once(replace(location, reason=few))
     watch = TripleEstimator if stories is None else WatchedEstimator
-    estimator = watch(scene, index, options.match, near)
+    estimator = watch(scene, index, _match_options(options), near)
     _rehearse_once(estimator)
     started = time.perf_counter()
     result = search(estimator, replace(options.search, time_limit_s=time_limit_s))
@@ -256,37 +256,28 @@ def _locate_on(
     return location
 
 
+def _match_options(options: LocateOptions) -> MatchOptions:
+    """Call every place promising that may be reported, or come within the margin of one that is."""
+    least = options.min_log10_odds - options.min_margin
+    verify = replace(options.match.verify, promising=min(options.match.verify.promising, least))
+    return replace(options.match, verify=verify)
+
+
 @lru_cache(maxsize=4)
-def _part(reference: _Same, center: tuple[float, float], radius_m: float) -> ReferenceIndex:
+def _part(index: ReferenceIndex, center: tuple[float, float], radius_m: float) -> ReferenceIndex:
     """Crop a reference to a circle, unless it hardly reaches beyond: made once for a batch."""
-    index = reference.index
     inside = np.hypot(*(index.xy - center).T) <= radius_m
     return crop(index, center, radius_m) if inside.mean() < 0.7 else index
 
 
 @lru_cache(maxsize=4)
-def _pair_index(reference: _Same, options: PairOptions) -> tuple[Intersections, PairIndex]:
+def _pair_index(index: ReferenceIndex, options: PairOptions) -> tuple[Intersections, PairIndex]:
     """Build the paper's tables for a reference: too large to store with it, kept for a batch."""
-    index = reference.index
     n = len(index)
     vectors = index.branches.astype(np.float32)
     rays = np.where(vectors.any(axis=2), np.arctan2(vectors[..., 1], vectors[..., 0]), np.nan)
-    tangents = np.where(index.tangents >= 0, index.tangents * np.float32(math.pi / 32767), np.nan).astype(np.float32)
-    found = Intersections(index.xy, rays, tangents, np.zeros(n, np.float32), np.arange(n))
+    found = Intersections(index.xy, rays, unpack_tangents(index.tangents), np.zeros(n, np.float32), np.arange(n))
     return found, build_pair_index(found, options)
-
-
-@dataclass(frozen=True)
-class _Same:
-    """A reference as a key of a cache: equal to itself only."""
-
-    index: ReferenceIndex
-
-    def __hash__(self) -> int:
-        return id(self.index)
-
-    def __eq__(self, other: object) -> bool:
-        return isinstance(other, _Same) and other.index is self.index
 
 
 def _locate_by_pairs(
@@ -298,7 +289,7 @@ def _locate_by_pairs(
     time_limit_s: float,
 ) -> Location:
     """Run the paper's method: what it finds is reported as found, with no odds, for it knows none."""
-    reference, table = _pair_index(_Same(index), options.pair)
+    reference, table = _pair_index(index, options.pair)
     pair = replace(options.pair, time_limit_s=time_limit_s)
     match = match_pairs(scene.intersections, reference, table, scene.corners, pair)
     location = replace(
