@@ -236,17 +236,18 @@ def _locate_on(
         return tell_at_once(replace(location, reason=reason))
     if options.method == "pair":
         return tell_at_once(_locate_by_pairs(location, scene, graph, index, options, time_limit_s))
-    near = _near(index, options.near)
+    near, started = _near(index, options.near), time.perf_counter()
     if near is not None:
         index = _part(index, near[:2], near[2] + 2.0 * scene.half_size * options.match.camera.gsd_m[1])
         if len(index) < needed.intersections:
             few = f"the map has {len(index)} intersections around the place given by near{_searched(options)}"
             return tell_at_once(replace(location, reason=few))
+    cropping_s = time.perf_counter() - started
     watch = TripleEstimator if stories is None else WatchedEstimator
     estimator = watch(scene, index, _match_options(options), near)
     _rehearse_once(estimator)
-    started = time.perf_counter()
-    result = search(estimator, replace(options.search, time_limit_s=time_limit_s))
+    started = time.perf_counter() - cropping_s
+    result = search(estimator, replace(options.search, time_limit_s=time_limit_s - cropping_s))
     stats = Stats(estimator.n_tuples, estimator.n_candidates, estimator.n_hypotheses, estimator.n_verified)
     seconds = replace(seconds, match=time.perf_counter() - started - estimator.refine_s, refine=estimator.refine_s)
     location = replace(location, seconds=seconds, stats=stats)
