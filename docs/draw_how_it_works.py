@@ -13,14 +13,14 @@ import numpy as np
 
 import roadgeo
 from roadgeo.demo import ATTRIBUTION, ROADS, demo_masks
-from roadgeo.index import ReferenceIndex, build_index
-from roadgeo.io_raster import read_mask
-from roadgeo.io_roads import read_roads
 from roadgeo.kernels.triples import UNITS, find_sides, look_up
-from roadgeo.references import Reference, build_network
-from roadgeo.scene import Scene
-from roadgeo.triples import TripleOptions, propose
-from roadgeo.workflows import trace_query
+from roadgeo.matching.index import ReferenceIndex, build_index
+from roadgeo.matching.query import trace_query
+from roadgeo.matching.scene import Scene
+from roadgeo.matching.triples import TripleOptions, propose
+from roadgeo.reference.reference import Reference, build_network
+from roadgeo.sources.masks import read_mask
+from roadgeo.sources.roads import read_roads
 
 mpl.use("Agg")
 import matplotlib.pyplot as plt

@@ -41,17 +41,17 @@ import cv2  # noqa: E402
 import numpy as np  # noqa: E402
 
 from roadgeo.demo import demo_masks  # noqa: E402
-from roadgeo.drawing import NoiseModel, draw_mask  # noqa: E402
 from roadgeo.errors import MaskError, RoadgeoError, RoadSourceError  # noqa: E402
-from roadgeo.evaluation import Score, Share, calibrate_odds, calibrate_sigma, score, share  # noqa: E402
-from roadgeo.io_raster import read_mask  # noqa: E402
-from roadgeo.landscape import Landscape, visible_intersections  # noqa: E402
-from roadgeo.references import build_reference, open_reference  # noqa: E402
-from roadgeo.simplification import planarize  # noqa: E402
-from roadgeo.simulation import SimulationOptions, ViewOptions, simulate_query  # noqa: E402
-from roadgeo.trials import Mask, MaskFiles, QuerySet, Trial, run_trials  # noqa: E402
-from roadgeo.truth import Truth, read_truth  # noqa: E402
-from roadgeo.view import make_view, sees_ground  # noqa: E402
+from roadgeo.evaluation.landscape import Landscape, visible_intersections  # noqa: E402
+from roadgeo.evaluation.noise import NoiseModel, draw_mask  # noqa: E402
+from roadgeo.evaluation.scoring import Score, Share, calibrate_odds, calibrate_sigma, score, share  # noqa: E402
+from roadgeo.evaluation.simulation import SimulationOptions, ViewOptions, simulate_query  # noqa: E402
+from roadgeo.evaluation.trials import Mask, MaskFiles, QuerySet, Trial, run_trials  # noqa: E402
+from roadgeo.evaluation.truth import Truth, read_truth  # noqa: E402
+from roadgeo.geometry.pinhole import make_view, sees_ground  # noqa: E402
+from roadgeo.reference.reference import build_reference, open_reference  # noqa: E402
+from roadgeo.roads.simplification import planarize  # noqa: E402
+from roadgeo.sources.masks import read_mask  # noqa: E402
 from roadgeo.workflows import LocateOptions, locate  # noqa: E402
 
 TILTED = ViewOptions(
@@ -137,7 +137,7 @@ def read_lines(path: Path) -> Any:
 
 
 def read_landscape(path: Path) -> Landscape:
-    from roadgeo.io_roads import project_lines
+    from roadgeo.sources.roads import project_lines
 
     roads = read_lines(path)
     lines, plane = project_lines(roads.geometry, roads.crs)

@@ -9,9 +9,9 @@ import geopandas as gpd
 
 import roadgeo
 from roadgeo.demo import ROADS, demo_masks
-from roadgeo.grid import RoadMask
-from roadgeo.io_outputs import write_location
-from roadgeo.outputs import output_paths
+from roadgeo.geometry.mask import RoadMask
+from roadgeo.outputs.location_files import write_location
+from roadgeo.outputs.paths import output_paths
 from roadgeo.workflows import LocateOptions
 
 reference = roadgeo.build_reference(gpd.read_file(ROADS), name="porto")

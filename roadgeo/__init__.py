@@ -17,9 +17,9 @@ from roadgeo._version import __version__
 
 if TYPE_CHECKING:
     from roadgeo.errors import RoadgeoError
-    from roadgeo.grid import RoadMask
+    from roadgeo.geometry.mask import RoadMask
     from roadgeo.location import Location
-    from roadgeo.references import BuildOptions, Reference, build_reference, open_reference
+    from roadgeo.reference.reference import BuildOptions, Reference, build_reference, open_reference
     from roadgeo.workflows import LocateOptions, explain, locate
 
 __all__ = [
@@ -37,16 +37,16 @@ __all__ = [
 ]
 
 _HOMES = {
-    "BuildOptions": "references",
+    "BuildOptions": "reference.reference",
     "LocateOptions": "workflows",
     "Location": "location",
-    "Reference": "references",
-    "RoadMask": "grid",
+    "Reference": "reference.reference",
+    "RoadMask": "geometry.mask",
     "RoadgeoError": "errors",
-    "build_reference": "references",
+    "build_reference": "reference.reference",
     "explain": "workflows",
     "locate": "workflows",
-    "open_reference": "references",
+    "open_reference": "reference.reference",
 }
 
 

@@ -5,8 +5,8 @@ from __future__ import annotations
 from dataclasses import dataclass, field
 from typing import Any, Literal
 
-from roadgeo.graph import RoadGraph
-from roadgeo.typing import FloatArray
+from roadgeo._arrays import FloatArray
+from roadgeo.roads.graph import RoadGraph
 
 __all__ = ["SCHEMA", "Evidence", "Location", "Place", "Seconds", "Seen", "Stats", "Status"]
 

@@ -1,8 +1,9 @@
 """Road sources, segmenters and outputs that installed packages offer as entry points; roadgeo's own are found so too.
 
-A source takes where to look and `say`, which it may tell what it waits for, and returns `roadgeo.io_roads.Roads`. A
-segmenter takes the path of a photograph and returns a `roadgeo.grid.RoadMask`, or an array that `roadgeo.io_raster.
-read_mask` takes. An output is a `roadgeo.io_products.Product`. `examples/plugin` has one of each.
+A source takes where to look and `say`, which it may tell what it waits for, and returns `roadgeo.sources.roads.Roads`.
+A segmenter takes the path of a photograph and returns a `roadgeo.RoadMask`, or an array that
+`roadgeo.sources.masks.read_mask` takes. An output is a `roadgeo.outputs.products.Product`. `examples/plugin` has one of
+each.
 """
 
 from __future__ import annotations

@@ -13,40 +13,25 @@ from typing import Literal
 import cv2
 import numpy as np
 
-from roadgeo.camera import CameraOptions, pose
+from roadgeo._arrays import AnyArray, FloatArray, IntArray
 from roadgeo.errors import RoadSourceError
-from roadgeo.estimator import Hypothesis, MatchOptions, TripleEstimator
-from roadgeo.explanation import Explanation, Needed, Story, WatchedEstimator, tell
-from roadgeo.graph import RoadGraph
-from roadgeo.grid import PIXEL_TO_PLANE, RoadMask
-from roadgeo.homography import Homography
-from roadgeo.index import ReferenceIndex, crop, unpack_tangents
-from roadgeo.intersections import IntersectionOptions, Intersections, find_intersections
+from roadgeo.geometry.camera import CameraOptions, pose
+from roadgeo.geometry.homography import Homography
+from roadgeo.geometry.mask import PIXEL_TO_PLANE, RoadMask
+from roadgeo.geometry.projection import LocalPlane
 from roadgeo.location import Evidence, Location, Place, Seconds, Seen, Stats
-from roadgeo.pairs import PairIndex, PairOptions, build_pair_index, match_pairs
-from roadgeo.projection import LocalPlane
-from roadgeo.references import Reference
-from roadgeo.robust import SearchOptions, SearchResult, search
-from roadgeo.scene import Scene, SceneOptions, prepare_scene
-from roadgeo.simplification import SimplifyOptions, simplify
-from roadgeo.typing import AnyArray, FloatArray, IntArray
-from roadgeo.vectorization import VectorizeOptions, vectorize
+from roadgeo.matching.estimator import Hypothesis, MatchOptions, TripleEstimator
+from roadgeo.matching.explanation import Explanation, Needed, Story, WatchedEstimator, tell
+from roadgeo.matching.index import ReferenceIndex, crop, unpack_tangents
+from roadgeo.matching.paper import PairIndex, PairOptions, build_pair_index, match_pairs
+from roadgeo.matching.query import QueryOptions, trace_query
+from roadgeo.matching.scene import Scene
+from roadgeo.matching.search import SearchOptions, SearchResult, search
+from roadgeo.reference.reference import Reference
+from roadgeo.roads.graph import RoadGraph
+from roadgeo.roads.intersections import Intersections
 
-__all__ = ["LocateOptions", "QueryOptions", "explain", "locate", "trace_query"]
-
-
-@dataclass(frozen=True)
-class QueryOptions:
-    """How a mask becomes intersections. Names ending in `_widths` count road widths."""
-
-    vectorize: VectorizeOptions = field(default_factory=VectorizeOptions)
-    merge_widths: float = 1.4
-    fuse_widths: float = 1.0
-    stub_widths: float = 1.5
-    tangent_widths: float = 4.5
-    skip_widths: float = 0.6
-    branch_widths: float = 0.8
-    scene: SceneOptions = field(default_factory=SceneOptions)
+__all__ = ["LocateOptions", "explain", "locate"]
 
 
 @dataclass(frozen=True)
@@ -76,31 +61,6 @@ class LocateOptions:
     match: MatchOptions = field(default_factory=MatchOptions)
     search: SearchOptions = field(default_factory=SearchOptions)
     pair: PairOptions = field(default_factory=PairOptions)
-
-
-def trace_query(mask: RoadMask, options: QueryOptions | None = None) -> tuple[Scene, RoadGraph]:
-    """Vectorize a mask and prepare it for matching; the same calls as for a reference, in units of its road width."""
-    options = options or QueryOptions()
-    traced = vectorize(mask, options.vectorize)
-    width = traced.road_width_px
-    graph = simplify(
-        traced.graph,
-        SimplifyOptions(
-            merge_radius=options.merge_widths * width,
-            fuse_distance=options.fuse_widths * width,
-            stub_length=options.stub_widths * width,
-        ),
-    )
-    found = find_intersections(
-        graph,
-        IntersectionOptions(
-            tangent_length=options.tangent_widths * width,
-            skip_length=options.skip_widths * width,
-            min_branch_length=options.branch_widths * width,
-        ),
-    )
-    height, wide = mask.shape
-    return prepare_scene(graph, found, (wide, height), mask.observed, options.scene), graph
 
 
 def locate(
@@ -181,7 +141,7 @@ def _search_all(
 def _as_mask(mask: RoadMask | AnyArray | str | Path) -> RoadMask:
     if isinstance(mask, RoadMask):
         return mask
-    from roadgeo.io_raster import read_mask
+    from roadgeo.sources.masks import read_mask
 
     return read_mask(mask)
 
@@ -316,7 +276,7 @@ def _near(index: ReferenceIndex, near: tuple[float, float, float] | None) -> tup
     """Take (lon, lat, radius) to the plane."""
     if near is None:
         return None
-    from roadgeo.projection import from_lonlat
+    from roadgeo.geometry.projection import from_lonlat
 
     x, y = from_lonlat(index.plane, np.array([near[:2]]))[0]
     return float(x), float(y), near[2]
@@ -403,7 +363,7 @@ def place_scene(
     distance: FloatArray | None,
 ) -> Location:
     """Fill in everything that follows from a homography (query plane to reference plane) and its matches."""
-    from roadgeo.projection import grid_north, to_lonlat
+    from roadgeo.geometry.projection import grid_north, to_lonlat
 
     plane = index.plane
     homography = plane.to_crs_matrix() @ matrix @ PIXEL_TO_PLANE
@@ -434,7 +394,7 @@ def place_scene(
 
 
 def _place(plane: LocalPlane, xy: FloatArray, log10_odds: float) -> Place:
-    from roadgeo.projection import to_lonlat
+    from roadgeo.geometry.projection import to_lonlat
 
     ground = plane.to_crs(xy[None])
     lonlat = to_lonlat(plane.crs, ground)

@@ -9,8 +9,8 @@ import pytest
 from hypothesis import settings
 
 if TYPE_CHECKING:
-    from roadgeo.index import ReferenceIndex
-    from roadgeo.network import RoadNetwork
+    from roadgeo.matching.index import ReferenceIndex
+    from roadgeo.roads.network import RoadNetwork
 
 # Whoever starts the tests in the background hands down an ignored SIGINT, and with it children that Ctrl-C cannot stop.
 signal.signal(signal.SIGINT, signal.default_int_handler)
@@ -30,10 +30,10 @@ def data_dir() -> Path:
 
 @pytest.fixture(scope="session")
 def town() -> "tuple[RoadNetwork, ReferenceIndex]":
-    """A made-up town of 4 x 4 km, 730 intersections, and its index; see `scenes`."""
-    from scenes import random_network
+    """A made-up town of 4 x 4 km, 730 intersections, and its index; see `worlds.scenes`."""
+    from worlds.scenes import random_network
 
-    from roadgeo.index import build_index
+    from roadgeo.matching.index import build_index
 
     network = random_network(1, 4000.0)
     return network, build_index(network)

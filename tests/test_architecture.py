@@ -9,26 +9,21 @@ import roadgeo
 
 ROOT = Path(roadgeo.__file__).parent
 
-#: Modules (or packages) of each storey.
-NAMES = {
-    0: "errors wording progress typing plugins _version",
-    1: "kernels",
-    2: "grid degrees road_kinds graph homography robust",
-    3: "projection simplification vectorization voids intersections network updating warping view landscape",
-    4: "tuples index",
-    5: "estimator verification refinement location pairs sources triples camera scene outputs explanation",
-    6: (
-        "io_roads io_lines io_overpass io_raster io_exif io_vectorized io_index io_atomic io_network "
-        "io_reference io_outputs io_products io_summary io_image files geopackage rtree truth styles library"
-    ),
-    7: "references workflows",
-    8: (
-        "cli report plot figure canvas explanation_plot qgis demo drawing trials localizability evaluation_report "
-        "simulation evaluation __main__"
-    ),
-    9: "__init__",
-}
-STOREYS = {name: storey for storey, names in NAMES.items() for name in names.split()}
+#: What each storey holds: folders and modules at the top of the package. One imports from storeys below, and its own.
+STOREYS_TEXT = """
+    words       _version _arrays _progress errors plugins
+    kernels     kernels
+    planes      geometry storage
+    roads       roads
+    entrances   sources location
+    matching    matching
+    references  reference
+    exits       outputs
+    workflows   workflows
+    evaluation  evaluation
+    faces       cli qgis demo __main__ __init__
+"""
+STOREYS = {name: storey for storey, line in enumerate(STOREYS_TEXT.split("\n")) for name in line.split()[1:]}
 
 
 def modules() -> list[Path]:

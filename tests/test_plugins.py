@@ -19,12 +19,12 @@ from roadgeo.cli import main
 from roadgeo.cli.locate import Job
 from roadgeo.demo import ROADS, demo_masks
 from roadgeo.errors import MaskError, PluginError
-from roadgeo.grid import RoadMask
-from roadgeo.io_products import PRODUCTS
-from roadgeo.io_raster import read_mask
-from roadgeo.io_roads import fetch_roads, read_roads
+from roadgeo.geometry.mask import RoadMask
+from roadgeo.geometry.projection import to_lonlat
+from roadgeo.outputs.products import PRODUCTS
 from roadgeo.plugins import GROUPS, OUTPUTS, SEGMENTERS, SOURCES, call_plugin, find_plugins, load_plugin
-from roadgeo.projection import to_lonlat
+from roadgeo.sources.masks import read_mask
+from roadgeo.sources.roads import fetch_roads, read_roads
 
 ROOT = Path(__file__).parent.parent
 SHEET = next(mask.path for mask in demo_masks() if mask.path.stem == "map_sheet")
@@ -152,8 +152,8 @@ def test_the_command_line_knows_what_is_installed(
 @pytest.mark.parametrize(
     ("kind", "message"),
     [
-        ("sources", "the source 'odd' returned a NoneType, expected roadgeo.io_roads.Roads"),
-        ("outputs", "the output 'odd' is a function, expected a roadgeo.io_products.Product"),
+        ("sources", "the source 'odd' returned a NoneType, expected roadgeo.sources.roads.Roads"),
+        ("outputs", "the output 'odd' is a function, expected a roadgeo.outputs.products.Product"),
         ("segmenters", "the segmenter 'odd' returned a NoneType, expected a RoadMask or an array"),
     ],
 )

@@ -15,20 +15,21 @@ from typing import Any
 
 import numpy as np
 
-from roadgeo.drawing import NOISE_MODELS
-from roadgeo.evaluation import Evaluation, evaluate
-from roadgeo.graph import RoadGraph
-from roadgeo.grid import PIXEL_TO_PLANE, RoadMask
-from roadgeo.index import build_index
-from roadgeo.intersections import Intersections, find_intersections
-from roadgeo.io_network import as_stored, read_network
-from roadgeo.library import resolve_reference
-from roadgeo.network import RoadNetwork
-from roadgeo.pairs import PairIndex, PairOptions, build_pair_index, match_pairs
-from roadgeo.references import Reference, open_reference
-from roadgeo.simulation import SimulationOptions, ViewOptions
-from roadgeo.trials import QuerySet, Trial, run_trials
-from roadgeo.workflows import LocateOptions, locate, trace_query
+from roadgeo.evaluation.noise import NOISE_MODELS
+from roadgeo.evaluation.scoring import Evaluation, evaluate
+from roadgeo.evaluation.simulation import SimulationOptions, ViewOptions
+from roadgeo.evaluation.trials import QuerySet, Trial, run_trials
+from roadgeo.geometry.mask import PIXEL_TO_PLANE, RoadMask
+from roadgeo.matching.index import build_index
+from roadgeo.matching.paper import PairIndex, PairOptions, build_pair_index, match_pairs
+from roadgeo.matching.query import trace_query
+from roadgeo.reference.library import resolve_reference
+from roadgeo.reference.network_file import as_stored, read_network
+from roadgeo.reference.reference import Reference, open_reference
+from roadgeo.roads.graph import RoadGraph
+from roadgeo.roads.intersections import Intersections, find_intersections
+from roadgeo.roads.network import RoadNetwork
+from roadgeo.workflows import LocateOptions, locate
 
 #: Section 4.3: "an area of 10 x 10 km2"; section 4.4: cross-ratio error 0.3, inlier ratio 0.5, 30 intersections.
 AREA_M = 10_000.0
@@ -162,7 +163,7 @@ class AutoLocator:
 
 def as_mask(mask: Any) -> RoadMask:
     """Take a drawn mask, or the file of one, as `roadgeo.locate` does: the void corners of a warped one are told."""
-    from roadgeo.io_raster import read_mask
+    from roadgeo.sources.masks import read_mask
 
     return read_mask(mask)
 

@@ -13,7 +13,7 @@ from typing import Any
 
 import experiments as paper
 
-from roadgeo.trials import DrawnMasks
+from roadgeo.evaluation.trials import DrawnMasks
 from roadgeo.workflows import LocateOptions
 
 SCENES_M = (1000.0, 1500.0)

@@ -13,8 +13,8 @@ from typing import Any
 
 import experiments as paper
 
-from roadgeo.evaluation import evaluate
-from roadgeo.trials import DrawnMasks
+from roadgeo.evaluation.scoring import evaluate
+from roadgeo.evaluation.trials import DrawnMasks
 from roadgeo.workflows import LocateOptions
 
 RATIOS = (0.2, 0.3, 0.4, 0.5, 0.6, 0.7, 0.8, 0.9)

@@ -13,8 +13,8 @@ from typing import Any
 import experiments as paper
 import numpy as np
 
-from roadgeo.pairs import build_pair_index
-from roadgeo.trials import DrawnMasks
+from roadgeo.evaluation.trials import DrawnMasks
+from roadgeo.matching.paper import build_pair_index
 
 
 def main() -> None:

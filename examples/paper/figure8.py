@@ -13,7 +13,7 @@ from typing import Any
 import experiments as paper
 import numpy as np
 
-from roadgeo.trials import DrawnMasks, Trial
+from roadgeo.evaluation.trials import DrawnMasks, Trial
 from roadgeo.workflows import LocateOptions
 
 ERRORS = (0.1, 0.2, 0.3, 0.4)

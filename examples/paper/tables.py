@@ -19,12 +19,12 @@ import cv2
 import experiments as paper
 import numpy as np
 
-from roadgeo.evaluation import evaluate, summarize
-from roadgeo.library import resolve_reference
-from roadgeo.simulation import SimulationOptions, ViewOptions
-from roadgeo.trials import DrawnMasks, MaskFiles, QuerySet, Trial
-from roadgeo.truth import Truth, read_truth
-from roadgeo.view import warp_mask
+from roadgeo.evaluation.scoring import evaluate, summarize
+from roadgeo.evaluation.simulation import SimulationOptions, ViewOptions
+from roadgeo.evaluation.trials import DrawnMasks, MaskFiles, QuerySet, Trial
+from roadgeo.evaluation.truth import Truth, read_truth
+from roadgeo.geometry.pinhole import warp_mask
+from roadgeo.reference.library import resolve_reference
 from roadgeo.workflows import LocateOptions
 
 #: Tables 1 to 3: area, its centre in EPSG:26986, and precision and recall in percent, aligned and under perspective.

@@ -5,8 +5,8 @@ from pathlib import Path
 import cv2
 import shapely
 
-from roadgeo.io_products import Product
-from roadgeo.io_roads import Roads, project_lines
+from roadgeo.outputs.products import Product
+from roadgeo.sources.roads import Roads, project_lines
 
 
 def read_wkt(where, say=print):

@@ -107,7 +107,7 @@ def _run_together(tasks: Sequence[Task], work: Work[Result], jobs: int) -> Itera
     method = "forkserver" if "forkserver" in multiprocessing.get_all_start_methods() else "spawn"
     context = multiprocessing.get_context(method)
     if method == "forkserver":
-        context.set_forkserver_preload(["roadgeo.workflows", "roadgeo.io_outputs", "roadgeo.io_raster"])
+        context.set_forkserver_preload(["roadgeo.workflows", "roadgeo.outputs.location_files", "roadgeo.sources.masks"])
     workers = min(jobs, len(tasks))
     with ProcessPoolExecutor(workers, context, initializer=_start_worker, initargs=(work,)) as pool:
         futures = [pool.submit(_do, task) for task in tasks]

@@ -9,8 +9,8 @@ from typing import TYPE_CHECKING
 import click
 
 if TYPE_CHECKING:
-    from roadgeo.references import Reference
-    from roadgeo.typing import BoolArray
+    from roadgeo._arrays import BoolArray
+    from roadgeo.reference.reference import Reference
 
 __all__ = ["compile_once"]
 

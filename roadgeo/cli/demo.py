@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING, Any
 import click
 
 from roadgeo.cli import ERROR
-from roadgeo.wording import format_lonlat
+from roadgeo.outputs.wording import format_lonlat
 
 if TYPE_CHECKING:
     from roadgeo.cli.locate import Outcome
@@ -49,9 +49,9 @@ def demo_command(out_dir: str) -> int:
     from roadgeo.cli.index import build
     from roadgeo.cli.locate import Job
     from roadgeo.demo import ATTRIBUTION, PHOTO, ROADS, demo_masks
-    from roadgeo.files import write_bytes
-    from roadgeo.io_outputs import OutputOptions
-    from roadgeo.io_roads import read_roads
+    from roadgeo.outputs.location_files import OutputOptions
+    from roadgeo.sources.roads import read_roads
+    from roadgeo.storage.files import write_bytes
     from roadgeo.workflows import LocateOptions
 
     folder, masks = Path(out_dir), demo_masks()
@@ -104,7 +104,7 @@ def _errors(found: dict[str, Any], mask: DemoMask) -> tuple[float, float]:
     import numpy as np
     import pyproj
 
-    from roadgeo.homography import Homography
+    from roadgeo.geometry.homography import Homography
 
     width, height = found["size"]
     pixels = np.array([[width / 2, height / 2], [0, 0], [width, 0], [width, height], [0, height]], float)

@@ -19,9 +19,9 @@ from roadgeo.cli.queries import QUERY_OPTIONS, count_up, query_options, query_se
 if TYPE_CHECKING:
     from rich.table import Table
 
-    from roadgeo.evaluation import Evaluation, Share, Spread, Summary
-    from roadgeo.trials import QuerySet, ReferenceLocator
-    from roadgeo.truth import Truth
+    from roadgeo.evaluation.scoring import Evaluation, Share, Spread, Summary
+    from roadgeo.evaluation.trials import QuerySet, ReferenceLocator
+    from roadgeo.evaluation.truth import Truth
 
 __all__ = ["evaluate_command"]
 
@@ -97,9 +97,9 @@ def evaluate_command(
       roadgeo evaluate boston-ma --map --height 400 --focal 2000 --size 1200 --noise segmented --check 300
     """
     from roadgeo.cli.locate import make_options
-    from roadgeo.io_atomic import writing
-    from roadgeo.library import resolve_reference
-    from roadgeo.trials import ReferenceLocator
+    from roadgeo.evaluation.trials import ReferenceLocator
+    from roadgeo.reference.library import resolve_reference
+    from roadgeo.storage.atomic import writing
 
     _refuse_idle("--map" if as_map else "" if queries is None else "--queries")
     path = resolve_reference(reference)
@@ -161,8 +161,8 @@ def _evaluate(
     quiet: bool,
 ) -> None:
     """Locate all queries; write and print what that shows."""
-    from roadgeo.evaluation import evaluate
-    from roadgeo.trials import run_trials
+    from roadgeo.evaluation.scoring import evaluate
+    from roadgeo.evaluation.trials import run_trials
 
     record = None if out_dir is None else out_dir / "trials.jsonl"
     before = _recorded(record)
@@ -181,8 +181,8 @@ def _evaluate(
     truths = [trial.truth for trial in trials]
     evaluation = evaluate(truths, [trial.answer for trial in trials], settings, radius)
     if out_dir is not None:
-        from roadgeo.evaluation_report import render_report
-        from roadgeo.files import write_text
+        from roadgeo.evaluation.report import render_report
+        from roadgeo.storage.files import write_text
 
         title = f"{settings['reference']}: {len(trials)} masks"
         write_text(out_dir / "evaluation.json", json.dumps(evaluation.to_dict(), indent=1) + "\n")
@@ -207,8 +207,8 @@ def _query_set(
     reference: Path, queries: Path | None, roads: Path | None, options: dict[str, Any]
 ) -> tuple[QuerySet, dict[str, Any]]:
     """Choose between a query set on disk and one to draw, and say which."""
-    from roadgeo.trials import DrawnMasks, MaskFiles
-    from roadgeo.truth import read_truth
+    from roadgeo.evaluation.trials import DrawnMasks, MaskFiles
+    from roadgeo.evaluation.truth import read_truth
 
     if queries is None:
         drawn_from = {} if roads is None else {"roads": roads.name}
@@ -229,8 +229,8 @@ def _count_elsewhere(truths: Sequence[Truth], reference: Path) -> int:
     """Count masks whose place lies beyond the bounds of a reference."""
     import numpy as np
 
-    from roadgeo.io_network import read_network
-    from roadgeo.projection import transformer
+    from roadgeo.geometry.projection import transformer
+    from roadgeo.reference.network_file import read_network
 
     network = read_network(reference)
     low, high = network.graph.coords.min(axis=0), network.graph.coords.max(axis=0)
@@ -248,7 +248,7 @@ def _count_elsewhere(truths: Sequence[Truth], reference: Path) -> int:
 def _print(evaluation: Evaluation) -> None:
     from rich.console import Console
 
-    from roadgeo.evaluation_report import TITLES
+    from roadgeo.evaluation.report import TITLES
 
     console = Console(width=None if sys.stdout.isatty() else 100)
     for by, groups in evaluation.breakdowns.items():

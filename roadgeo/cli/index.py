@@ -8,12 +8,12 @@ from typing import TYPE_CHECKING, Any
 
 import click
 
+from roadgeo._progress import Say, say_nothing
 from roadgeo.cli.parameters import BOX, NEAR, Plugin, verbosity_options
-from roadgeo.progress import Say, say_nothing
 
 if TYPE_CHECKING:
-    from roadgeo.io_roads import Roads
-    from roadgeo.references import Reference
+    from roadgeo.reference.reference import Reference
+    from roadgeo.sources.roads import Roads
 
 __all__ = ["build", "index_command"]
 
@@ -103,8 +103,8 @@ def index_command(
     from roadgeo.cli.compilation import compile_once
     from roadgeo.cli.folders import make_folder
     from roadgeo.cli.progress import show_steps
-    from roadgeo.io_reference import reference_freshness
-    from roadgeo.library import make_slug, new_reference
+    from roadgeo.reference.files import reference_freshness
+    from roadgeo.reference.library import make_slug, new_reference
 
     started = perf_counter()
     if rebuild is not None:
@@ -143,9 +143,9 @@ def build(roads: Roads, path: Path, name: str, say: Say = say_nothing) -> Refere
     OutputError
         It cannot be written.
     """
-    from roadgeo.index import build_index
-    from roadgeo.io_network import as_stored
-    from roadgeo.references import Reference, build_network, open_reference
+    from roadgeo.matching.index import build_index
+    from roadgeo.reference.network_file import as_stored
+    from roadgeo.reference.reference import Reference, build_network, open_reference
 
     network = as_stored(build_network(roads.lines, roads.plane, {"name": name, **roads.meta}, say=say))
     Reference(build_index(network, say=say), network).save(path, say)
@@ -154,7 +154,7 @@ def build(roads: Roads, path: Path, name: str, say: Say = say_nothing) -> Refere
 
 def renew(roads: Roads, path: Path, say: Say = say_nothing) -> Reference:
     """Replace a reference's roads by others on their ground, write and open it; see `workflows.update_reference`."""
-    from roadgeo.references import update_reference
+    from roadgeo.reference.reference import update_reference
 
     return update_reference(path, roads, say)
 
@@ -162,8 +162,8 @@ def renew(roads: Roads, path: Path, say: Say = say_nothing) -> Reference:
 def _rebuild(name: str, quiet: bool) -> None:
     from roadgeo.cli.compilation import compile_once
     from roadgeo.cli.progress import show_steps
-    from roadgeo.library import resolve_reference
-    from roadgeo.references import rebuild_reference
+    from roadgeo.reference.library import resolve_reference
+    from roadgeo.reference.reference import rebuild_reference
 
     path = resolve_reference(name)
     with show_steps(quiet) as say:
@@ -196,7 +196,7 @@ def _one_source(source: dict[str, Any]) -> str:
 
 
 def _read(source: dict[str, Any], given: str, say: Say) -> Roads:
-    from roadgeo.io_roads import read_roads
+    from roadgeo.sources.roads import read_roads
 
     return read_roads(
         source[given],
@@ -213,8 +213,8 @@ def _read(source: dict[str, Any], given: str, say: Say) -> Roads:
 def _fetch(source: dict[str, Any], given: str, say: Say) -> Roads:
     from dataclasses import replace
 
-    from roadgeo.io_overpass import FetchOptions
-    from roadgeo.io_roads import fetch_roads
+    from roadgeo.sources.overpass import FetchOptions
+    from roadgeo.sources.roads import fetch_roads
 
     options = replace(FetchOptions(), date=source["date"], cache=not source["no_cache"])
     servers = {key: source[key] for key in ("overpass_url", "nominatim_url") if source[key]}
@@ -227,13 +227,15 @@ def _read_plugin(source: dict[str, Any], given: str, say: Say) -> Roads:
     from dataclasses import replace
 
     from roadgeo.errors import PluginError
-    from roadgeo.io_roads import Roads
     from roadgeo.plugins import SOURCES, call_plugin
+    from roadgeo.sources.roads import Roads
 
     name, _, where = source[given].partition(":")
     roads = call_plugin(SOURCES, name, where, say=say)
     if not isinstance(roads, Roads):
-        raise PluginError(f"the source {name!r} returned a {type(roads).__name__}, expected roadgeo.io_roads.Roads")
+        raise PluginError(
+            f"the source {name!r} returned a {type(roads).__name__}, expected roadgeo.sources.roads.Roads"
+        )
     return replace(roads, meta={"sources": [{"name": source[given]}], "attribution": "", **roads.meta})
 
 
@@ -241,7 +243,7 @@ def _name(source: dict[str, Any], given: str, out: str | None) -> str:
     if given == "place":
         return str(source["place"])
     if out:
-        from roadgeo.io_reference import reference_paths
+        from roadgeo.reference.files import reference_paths
 
         return reference_paths(out).geopackage.stem
     if given == "plugin":

@@ -13,9 +13,9 @@ import numpy as np
 from roadgeo.cli.queries import count_up
 
 if TYPE_CHECKING:
-    from roadgeo.localizability import LocalizabilityMap
-    from roadgeo.simulation import SimulationOptions
-    from roadgeo.trials import QuerySet, ReferenceLocator, Trial
+    from roadgeo.evaluation.localizability import LocalizabilityMap
+    from roadgeo.evaluation.simulation import SimulationOptions
+    from roadgeo.evaluation.trials import QuerySet, ReferenceLocator, Trial
 
 __all__ = ["Survey"]
 
@@ -51,9 +51,9 @@ class Survey:
 
     def run(self, as_json: bool) -> None:
         """Make the map, and write and print it."""
-        from roadgeo.files import write_bytes, write_text
-        from roadgeo.io_network import read_network
-        from roadgeo.localizability import draw_localizability, to_geotiff, to_qml
+        from roadgeo.evaluation.localizability import draw_localizability, to_geotiff, to_qml
+        from roadgeo.reference.network_file import read_network
+        from roadgeo.storage.files import write_bytes, write_text
 
         network = read_network(self.reference)
         found = self._learn(network)
@@ -73,9 +73,9 @@ class Survey:
             click.echo(f"wrote {out_dir / stem}.tif, .qml, .png, .json", err=True)
 
     def _learn(self, network: Any) -> LocalizabilityMap:
-        from roadgeo.localizability import lay_grid, map_localizability
-        from roadgeo.simulation import footprint_area
-        from roadgeo.trials import PlacedMasks
+        from roadgeo.evaluation.localizability import lay_grid, map_localizability
+        from roadgeo.evaluation.simulation import footprint_area
+        from roadgeo.evaluation.trials import PlacedMasks
 
         grid = lay_grid(network, footprint_area(self.simulation.view))
         rng = np.random.default_rng(self.simulation.seed)
@@ -94,7 +94,7 @@ class Survey:
         return found
 
     def _try(self, masks: QuerySet, part: str) -> list[Trial]:
-        from roadgeo.trials import run_trials
+        from roadgeo.evaluation.trials import run_trials
 
         record = None
         if self.out_dir is not None:
@@ -113,9 +113,9 @@ class Survey:
         """Say how much ground is in each class, and how many of the masks held against it were located there."""
         from dataclasses import asdict
 
-        from roadgeo.evaluation import share
-        from roadgeo.localizability import PALETTE
-        from roadgeo.trials import DrawnMasks
+        from roadgeo.evaluation.localizability import PALETTE
+        from roadgeo.evaluation.scoring import share
+        from roadgeo.evaluation.trials import DrawnMasks
 
         summary: dict[str, Any] = {"schema": "roadgeo.localizability/1", "trials": self.trials, "classes": []}
         checked, located = np.empty(0, np.uint8), np.empty(0, bool)
@@ -139,7 +139,7 @@ class Survey:
 
 
 def _located(trials: list[Trial]) -> Any:
-    from roadgeo.evaluation import score
+    from roadgeo.evaluation.scoring import score
 
     return np.array([score(trial.truth, trial.answer).right for trial in trials], bool)
 

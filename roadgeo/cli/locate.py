@@ -13,20 +13,20 @@ from typing import TYPE_CHECKING, Any, Literal
 
 import click
 
+from roadgeo._progress import Say, say_nothing
 from roadgeo.cli import ERROR, NOT_LOCATED
 from roadgeo.cli.batch import Task, find_masks, name_tasks, run
 from roadgeo.cli.folders import make_folder
 from roadgeo.cli.parameters import CAMERA, NEAR, RANGE, Plugin, verbosity_options
-from roadgeo.progress import Say, say_nothing
-from roadgeo.wording import format_lonlat
+from roadgeo.outputs.wording import format_lonlat
 
 if TYPE_CHECKING:
-    from roadgeo.explanation import Explanation
-    from roadgeo.grid import RoadMask
-    from roadgeo.io_outputs import OutputOptions
+    from roadgeo.geometry.mask import RoadMask
     from roadgeo.location import Location
-    from roadgeo.outputs import OutputPaths
-    from roadgeo.references import Reference
+    from roadgeo.matching.explanation import Explanation
+    from roadgeo.outputs.location_files import OutputOptions
+    from roadgeo.outputs.paths import OutputPaths
+    from roadgeo.reference.reference import Reference
     from roadgeo.workflows import LocateOptions
 
 __all__ = ["Job", "Outcome", "locate_command", "make_options", "open_references", "pair_images"]
@@ -93,7 +93,7 @@ class Job:
     def _earlier(self, task: Task) -> Outcome | None:
         """Return what an earlier run found, if its result is whole, of this mask and younger than it."""
         from roadgeo.location import SCHEMA
-        from roadgeo.outputs import output_paths
+        from roadgeo.outputs.paths import output_paths
 
         path = output_paths(self.out_dir, task.stem).json
         try:
@@ -109,8 +109,8 @@ class Job:
     def _locate(self, task: Task, references: list[Reference], open_seconds: float) -> Outcome:
         from dataclasses import replace
 
-        from roadgeo.io_outputs import write_location
-        from roadgeo.outputs import output_paths
+        from roadgeo.outputs.location_files import write_location
+        from roadgeo.outputs.paths import output_paths
         from roadgeo.workflows import explain, locate
 
         started = perf_counter()
@@ -131,7 +131,7 @@ class Job:
             _draw(location, mask, reference, pictures, attribution)
             files += pictures
         if self.report:
-            from roadgeo.report import write_report
+            from roadgeo.outputs.report import write_report
 
             write_report(paths.report, location, mask, reference.index, attribution, picture)
             files.append(paths.report)
@@ -149,9 +149,9 @@ class Job:
         import numpy as np
 
         from roadgeo.errors import PluginError
-        from roadgeo.grid import RoadMask
-        from roadgeo.io_raster import read_mask
+        from roadgeo.geometry.mask import RoadMask
         from roadgeo.plugins import SEGMENTERS, call_plugin
+        from roadgeo.sources.masks import read_mask
 
         if self.segmenter is None:
             return read_mask(task.mask, threshold=self.threshold, band=self.band)
@@ -169,7 +169,7 @@ class Job:
             return self.options
         from dataclasses import replace
 
-        from roadgeo.io_exif import read_focal_length
+        from roadgeo.sources.exif import read_focal_length
 
         focal_px = read_focal_length(self.images.get(task.mask, task.mask)) * longer_side
         match = self.options.match
@@ -185,8 +185,8 @@ def open_references(names: Iterable[str], say: Say = say_nothing) -> list[Refere
         A reference is missing or unusable, or the library is empty.
     """
     from roadgeo.errors import IndexFormatError
-    from roadgeo.library import library_dir, list_references, resolve_reference
-    from roadgeo.references import open_reference
+    from roadgeo.reference.library import library_dir, list_references, resolve_reference
+    from roadgeo.reference.reference import open_reference
 
     paths = [resolve_reference(name) for name in names] or list_references()
     if not paths:
@@ -393,7 +393,7 @@ def locate_command(
     from roadgeo.cli.progress import print_steps
 
     if figure is not None:
-        from roadgeo.figure import has_matplotlib
+        from roadgeo.outputs.figure import has_matplotlib
 
         if not has_matplotlib():
             raise click.UsageError("--figure needs matplotlib: pip install 'roadgeo[plot]'.")
@@ -438,7 +438,7 @@ def locate_command(
             advance(counts)
             _report(outcome, as_json, quiet, verbose, single=len(tasks) == 1)
     if len(tasks) > 1:
-        from roadgeo.io_summary import write_summary
+        from roadgeo.outputs.summary import write_summary
 
         files = write_summary(Path(out_dir), documents)
         if report:
@@ -483,8 +483,8 @@ def _make_outputs(
     max_pixels: int,
     products: Sequence[str],
 ) -> OutputOptions:
-    from roadgeo.io_image import ImageOptions
-    from roadgeo.io_outputs import OutputOptions
+    from roadgeo.outputs.location_files import OutputOptions
+    from roadgeo.outputs.orthophoto import ImageOptions
 
     return OutputOptions(ImageOptions(crs, resolution, resampling, max_pixels), tuple(dict.fromkeys(products)))
 
@@ -533,7 +533,7 @@ def _failed(task: Task, reason: str) -> Outcome:
 
 def _scale(picture: str, mask: RoadMask) -> float:
     """How many times the mask's width a picture's is."""
-    from roadgeo.io_image import open_picture
+    from roadgeo.outputs.orthophoto import open_picture
 
     with open_picture(picture) as source:
         width: int = source.width
@@ -542,8 +542,8 @@ def _scale(picture: str, mask: RoadMask) -> float:
 
 def _draw(location: Location, mask: RoadMask, reference: Reference, pictures: Sequence[Path], attribution: str) -> None:
     """Draw the overlay and the figure, as their names tell."""
-    from roadgeo.figure import write_figure
-    from roadgeo.plot import write_overlay
+    from roadgeo.outputs.figure import write_figure
+    from roadgeo.outputs.overlay import write_overlay
 
     index = reference.index
     roads = index.plane.to_crs(index.segments.reshape(-1, 2).astype(float)).reshape(-1, 4)
@@ -555,8 +555,8 @@ def _draw(location: Location, mask: RoadMask, reference: Reference, pictures: Se
 def _write_explanation(
     explanation: Explanation, mask: RoadMask, references: Sequence[Reference], paths: OutputPaths
 ) -> list[Path]:
-    from roadgeo.explanation_plot import write_explanation_picture
-    from roadgeo.files import write_text
+    from roadgeo.outputs.explanation_sheet import write_explanation_picture
+    from roadgeo.storage.files import write_text
 
     told = explanation.nearest
     reference = next((one for one in references if one.name == told.reference), references[0])
@@ -569,8 +569,8 @@ def _list_reports(
     folder: Path, tasks: Sequence[Task], documents: Sequence[dict[str, Any]], references: Sequence[Reference]
 ) -> Path:
     """Write the page that links to the reports of all masks."""
-    from roadgeo.outputs import output_paths
-    from roadgeo.report import Entry, write_batch
+    from roadgeo.outputs.paths import output_paths
+    from roadgeo.outputs.report import Entry, write_batch
 
     paths = [output_paths(folder, task.stem).report for task in tasks]
     there = [path.exists() and document["status"] != "error" for path, document in zip(paths, documents, strict=True)]

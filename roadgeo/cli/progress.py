@@ -12,7 +12,7 @@ from typing import Any
 
 import click
 
-from roadgeo.progress import Say, say_nothing
+from roadgeo._progress import Say, say_nothing
 
 __all__ = ["print_progress", "print_steps", "show_progress", "show_steps"]
 

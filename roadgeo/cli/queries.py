@@ -15,7 +15,7 @@ import click
 from roadgeo.cli.parameters import RANGE, Numbers
 
 if TYPE_CHECKING:
-    from roadgeo.simulation import SimulationOptions
+    from roadgeo.evaluation.simulation import SimulationOptions
 
 __all__ = ["QUERY_OPTIONS", "count_up", "query_options", "query_sets"]
 
@@ -180,8 +180,8 @@ def query_sets(
     seed: int,
 ) -> tuple[tuple[SimulationOptions, int], ...]:
     """Turn the options into sets of queries, one per noise model, and one of mirrored masks where some are wanted."""
-    from roadgeo.drawing import NOISE_MODELS
-    from roadgeo.simulation import SimulationOptions, ViewOptions
+    from roadgeo.evaluation.noise import NOISE_MODELS
+    from roadgeo.evaluation.simulation import SimulationOptions, ViewOptions
 
     view = ViewOptions(
         size_px=(size, size),

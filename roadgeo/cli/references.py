@@ -34,8 +34,8 @@ def info_command(reference: str | None, plugins: bool, as_json: bool) -> None:
         return
     if reference is None:
         raise click.UsageError("Missing argument 'REF'.")
-    from roadgeo.io_reference import describe_reference
-    from roadgeo.library import resolve_reference
+    from roadgeo.reference.files import describe_reference
+    from roadgeo.reference.library import resolve_reference
 
     described = describe_reference(resolve_reference(reference))
     if as_json:
@@ -75,8 +75,8 @@ def check_command(references: tuple[str, ...]) -> int:
       roadgeo check maps/*.gpkg
     """
     from roadgeo.errors import RoadgeoError
-    from roadgeo.io_reference import check_reference
-    from roadgeo.library import resolve_reference
+    from roadgeo.reference.files import check_reference
+    from roadgeo.reference.library import resolve_reference
 
     status = 0
     for reference in references:
@@ -106,8 +106,8 @@ def list_command(as_json: bool) -> int:
       roadgeo list --json
     """
     from roadgeo.errors import RoadgeoError
-    from roadgeo.io_reference import describe_reference
-    from roadgeo.library import library_dir, list_references
+    from roadgeo.reference.files import describe_reference
+    from roadgeo.reference.library import library_dir, list_references
 
     paths = list_references()
     if not paths:
@@ -136,7 +136,7 @@ def remove_command(names: tuple[str, ...], yes: bool) -> None:
       roadgeo remove boston-ma
       roadgeo remove boston-ma porto --yes
     """
-    from roadgeo.library import library_dir, remove_reference
+    from roadgeo.reference.library import library_dir, remove_reference
 
     if not yes:
         click.confirm(f"Delete {', '.join(names)} from {library_dir()}?", abort=True, err=True)

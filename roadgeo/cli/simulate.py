@@ -34,12 +34,12 @@ def simulate_command(reference: str, out_dir: Path, roads: Path | None, quiet: b
     """
     import cv2
 
-    from roadgeo.files import write_bytes
-    from roadgeo.io_atomic import writing
-    from roadgeo.library import resolve_reference
-    from roadgeo.simulation import simulate_query
-    from roadgeo.trials import read_landscape
-    from roadgeo.truth import write_truth
+    from roadgeo.evaluation.simulation import simulate_query
+    from roadgeo.evaluation.trials import read_landscape
+    from roadgeo.evaluation.truth import write_truth
+    from roadgeo.reference.library import resolve_reference
+    from roadgeo.storage.atomic import writing
+    from roadgeo.storage.files import write_bytes
 
     sets = query_sets(**options)
     landscape = read_landscape(resolve_reference(reference), roads)

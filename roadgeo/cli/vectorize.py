@@ -37,9 +37,9 @@ def vectorize_command(masks: tuple[str, ...], out_dir: str, threshold: float | N
       roadgeo vectorize probability.tif --band 2 --threshold 0.4 --out-dir seen
     """
     from roadgeo.errors import RoadgeoError
-    from roadgeo.io_raster import read_mask
-    from roadgeo.io_vectorized import write_vectorized
-    from roadgeo.workflows import trace_query
+    from roadgeo.matching.query import trace_query
+    from roadgeo.outputs.vectorized import write_vectorized
+    from roadgeo.sources.masks import read_mask
 
     make_folder(out_dir)
     status = 0

@@ -1,4 +1,7 @@
-"""A demonstration that needs neither network nor data: a piece of Porto, five masks and the truth (see `make_demo`)."""
+"""A demonstration that needs neither network nor data: a piece of Porto, five masks and the truth.
+
+They were made by the programs in `examples/demo`.
+"""
 
 from __future__ import annotations
 
@@ -8,7 +11,7 @@ from pathlib import Path
 
 import numpy as np
 
-from roadgeo.typing import FloatArray
+from roadgeo._arrays import FloatArray
 
 __all__ = ["ATTRIBUTION", "PHOTO", "ROADS", "DemoMask", "demo_masks"]
 
@@ -16,7 +19,7 @@ _DATA = Path(__file__).parent / "data"
 
 #: Roads around the centre of Porto, as OpenStreetMap has them.
 ROADS = _DATA / "porto_roads.gpkg"
-#: What the mask `drone.png` was made of: painted, see `paint_photo`.
+#: What the mask `drone.png` was made of: painted, see `examples/demo`.
 PHOTO = _DATA / "drone_photo.jpg"
 ATTRIBUTION = "© OpenStreetMap contributors, ODbL 1.0"
 

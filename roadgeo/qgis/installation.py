@@ -11,9 +11,9 @@ from collections.abc import Mapping
 from pathlib import Path
 
 from roadgeo.errors import OutputError
-from roadgeo.files import replacing, write_bytes
-from roadgeo.io_atomic import writing
 from roadgeo.qgis.plugin.runner import REMEMBERED
+from roadgeo.storage.atomic import writing
+from roadgeo.storage.files import replacing, write_bytes
 
 __all__ = ["NAME", "find_profiles", "install_plugin", "write_package"]
 

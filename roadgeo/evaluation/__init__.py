@@ -1,0 +1,1 @@
+"""Masks whose place is known, and how well masks are located."""

@@ -1,0 +1,161 @@
+"""Roads to look at: a map as the camera of a simulation meets it."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from functools import cached_property
+
+import numpy as np
+
+from roadgeo._arrays import AnyArray, FloatArray, IntArray
+from roadgeo.geometry.pinhole import View
+from roadgeo.geometry.projection import LocalPlane
+from roadgeo.roads.graph import RoadGraph
+from roadgeo.roads.network import RoadNetwork
+from roadgeo.roads.simplification import planarize
+
+__all__ = ["Landscape", "Strokes", "visible_intersections", "visible_strokes"]
+
+#: Pixels around the frame that are drawn too, so that roads do not end at its border.
+PAD_PX = 40
+
+
+@dataclass(frozen=True)
+class Landscape:
+    """Roads to look at, in metres on a plane.
+
+    Attributes
+    ----------
+    intersections : (N, 2) float64
+        Where three branches or more meet.
+    coverage : tuple of (V, 2) float64
+        Closed rings around the ground where roads are known; views stay inside. Empty: the box around the roads.
+    """
+
+    graph: RoadGraph
+    intersections: FloatArray
+    plane: LocalPlane
+    coverage: tuple[FloatArray, ...] = ()
+
+    @classmethod
+    def from_network(cls, network: RoadNetwork) -> Landscape:
+        """Look at a reference's own roads."""
+        return cls(network.graph, network.intersections.xy, network.plane, network.coverage)
+
+    @classmethod
+    def from_lines(cls, lines: AnyArray, plane: LocalPlane, coverage: tuple[FloatArray, ...] = ()) -> Landscape:
+        """Look at lines (shapely, plane metres) as they are: two carriageways stay two."""
+        graph = planarize(lines)
+        return cls(graph, graph.xy[graph.degree() >= 3], plane, coverage)
+
+    @cached_property
+    def bounds(self) -> FloatArray:
+        """(2, 2) lower left and upper right corner of all roads."""
+        return np.array([self.graph.coords.min(axis=0), self.graph.coords.max(axis=0)])
+
+    @cached_property
+    def edge_boxes(self) -> FloatArray:
+        """(E, 4) west, south, east, north of every edge."""
+        starts = self.graph.offsets[:-1]
+        coords = self.graph.coords
+        return np.hstack([np.minimum.reduceat(coords, starts), np.maximum.reduceat(coords, starts)])
+
+    def covers(self, points: FloatArray) -> bool:
+        """Whether all (K, 2) points lie on ground whose roads are known."""
+        low, high = self.bounds
+        if ((points < low) | (points > high)).any():
+            return False
+        # Rings may be holes of one another: inside is where an odd number of them goes around.
+        inside = sum((_in_ring(points, ring) for ring in self.coverage), np.zeros(len(points), int))
+        return not self.coverage or bool((inside % 2 == 1).all())
+
+
+@dataclass(frozen=True)
+class Strokes:
+    """Short straight strokes of the visible roads. Dimension: S strokes, in the order of the roads.
+
+    Attributes
+    ----------
+    start, end : (S, 2) float64
+        Pixels, corner convention.
+    length : (S,) float64
+        Pixels.
+    street, piece : (S,) int64
+        Numbers of the edge of the graph, and of the stretch of 60 to 200 m of it, that the stroke belongs to.
+    """
+
+    start: FloatArray
+    end: FloatArray
+    length: FloatArray
+    street: IntArray
+    piece: IntArray
+
+
+def visible_strokes(landscape: Landscape, view: View, rng: np.random.Generator) -> Strokes:
+    """Sample the roads around the footprint every few pixels and see them through the camera."""
+    low, high = view.footprint.min(axis=0), view.footprint.max(axis=0)
+    pad = PAD_PX * float(view.sampling(view.corners).max())
+    boxes = landscape.edge_boxes
+    near = np.flatnonzero(((boxes[:, :2] <= high + pad) & (boxes[:, 2:] >= low - pad)).all(axis=1))
+    step = 8.0 * float(view.sampling(view.corners).min())
+    points, street, along = _sample_edges(landscape.graph, near, step)
+
+    pixels = view.homography.inverse()(points)
+    frame = np.array(view.size_px)
+    inside = np.asarray(((pixels > -PAD_PX) & (pixels < frame + PAD_PX)).all(axis=1))
+    drawn = np.flatnonzero(np.equal(street[:-1], street[1:]) & inside[:-1] & inside[1:])
+    cuts = np.cumsum(rng.uniform(60.0, 200.0, int(along[-1] / 60.0) + 1 if len(along) else 0))
+    stretch = np.searchsorted(cuts, along)
+    # A stretch that goes on in the next street is another piece there.
+    changes = np.not_equal(np.diff(stretch), 0) | np.not_equal(np.diff(street), 0)
+    piece = np.concatenate(([0], np.cumsum(changes)))[: len(along)]
+    start, end = pixels[drawn], pixels[drawn + 1]
+    return Strokes(start, end, np.hypot(*(end - start).T), street[drawn], piece[drawn])
+
+
+def _sample_edges(graph: RoadGraph, edges: IntArray, step: float) -> tuple[FloatArray, IntArray, FloatArray]:
+    """Sample edges at their vertices and at least every `step` between them.
+
+    Returns
+    -------
+    points : (P, 2) float64
+    edge : (P,) int64
+    along : (P,) float64
+        Distance from the first sample along all edges, one after another.
+    """
+    sizes = (graph.offsets[1:] - graph.offsets[:-1])[edges]
+    if len(edges) == 0:
+        return np.empty((0, 2)), np.empty(0, np.int64), np.empty(0)
+    packed = np.cumsum(sizes) - sizes  # where each edge starts once they are taken one after another
+    vertex = np.repeat(graph.offsets[edges] - packed, sizes) + np.arange(sizes.sum())
+    coords, owner = graph.coords[vertex], np.repeat(edges, sizes)
+    steps = np.hypot(*np.diff(coords, axis=0).T)
+    steps[owner[1:] != owner[:-1]] = 0.0  # the jump from one edge to the next is no road
+    parts = np.concatenate((np.maximum(np.ceil(steps / step), 1).astype(np.int64), [1]))
+    index = np.repeat(np.arange(len(coords)), parts)
+    share = (np.arange(len(index)) - np.repeat(np.cumsum(parts) - parts, parts)) / parts[index]
+    ahead = np.minimum(index + 1, len(coords) - 1)
+    share[owner[ahead] != owner[index]] = 0.0
+    points = coords[index] + share[:, None] * (coords[ahead] - coords[index])
+    along = np.concatenate(([0.0], np.cumsum(steps)))[index] + share * np.concatenate((steps, [0.0]))[index]
+    return points, owner[index], along
+
+
+def visible_intersections(landscape: Landscape, view: View, margin_px: float = 15.0) -> FloatArray:
+    """(K, 2) pixels of the intersections in the frame; of those within 14 px of one another one is kept."""
+    low, high = view.footprint.min(axis=0), view.footprint.max(axis=0)
+    near = landscape.intersections[((landscape.intersections >= low) & (landscape.intersections <= high)).all(axis=1)]
+    pixels = view.homography.inverse()(near)
+    inside = ((pixels > margin_px) & (pixels < np.array(view.size_px) - margin_px)).all(axis=1)
+    pixels = pixels[inside]
+    _, first = np.unique(np.floor(pixels / 14.0), axis=0, return_index=True)
+    return pixels[np.sort(first)]
+
+
+def _in_ring(points: FloatArray, ring: FloatArray) -> IntArray:
+    """(K,) 1 for points inside a closed ring, by counting the sides that a ray to the east crosses."""
+    x, y = points[:, 0, None], points[:, 1, None]
+    (x0, y0), (x1, y1) = ring.T, np.roll(ring, -1, axis=0).T
+    with np.errstate(divide="ignore", invalid="ignore"):
+        crossed = ((y0 > y) != (y1 > y)) & (x < x0 + (y - y0) / (y1 - y0) * (x1 - x0))
+    return np.asarray(crossed.sum(axis=1) % 2)

@@ -1,0 +1,384 @@
+"""Where on a map would masks be located? A map of the odds, learnt from masks tried at random places of it.
+
+What decides is how many intersections a mask shows, how many of them stand clear of others (those of interchanges melt
+into one another), how much their streets differ in direction (a lattice has few directions and looks alike everywhere),
+and how well this reference, this camera and this quality of masks go together. All but the last is known at every place
+of the map; how it decides is fitted to the trials by logistic regression.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Iterator
+from dataclasses import dataclass
+
+import cv2
+import numpy as np
+
+from roadgeo._arrays import AnyArray, BoolArray, FloatArray
+from roadgeo.evaluation.scoring import share
+from roadgeo.geometry.projection import LocalPlane
+from roadgeo.roads.network import RoadNetwork
+from roadgeo.storage.qml import draw_palette
+
+__all__ = [
+    "AMBIGUOUS",
+    "LOCATED",
+    "PALETTE",
+    "TOO_FEW",
+    "UNKNOWN",
+    "LocalizabilityMap",
+    "LocalizabilityOptions",
+    "PlaceGrid",
+    "draw_localizability",
+    "lay_grid",
+    "map_localizability",
+    "to_geotiff",
+    "to_qml",
+]
+
+UNKNOWN, LOCATED, AMBIGUOUS, TOO_FEW = 0, 1, 2, 3
+
+#: Value: colour, alpha and meaning.
+PALETTE = {
+    UNKNOWN: ("#000000", 0, "off the map"),
+    LOCATED: ("#2e8b57", 150, "would be located"),
+    AMBIGUOUS: ("#e08a1e", 150, "may be ambiguous or refused"),
+    TOO_FEW: ("#a9324a", 150, "too few intersections"),
+}
+
+_DIRECTIONS = 12
+
+#: Intersections with no other nearer than this are clear.
+CLEAR_M = 40.0
+
+
+@dataclass(frozen=True)
+class LocalizabilityOptions:
+    """How surely, and how finely.
+
+    Attributes
+    ----------
+    located_share : float
+        Places are marked as located where, of the trials at places that promise as much or more, surely (at the lower
+        end of the interval of `z` standard errors) this share was located.
+    z : float
+    min_probability : float
+        Places that promise less are not marked as located, however well others do.
+    min_intersections : int
+        Places with fewer around them hold too few, whatever the trials were: `locate` refuses such masks.
+    cells_per_window : float
+        Cells along the side of a window.
+    max_cells : int
+        Cells are made larger where the map would have more along a side.
+    """
+
+    located_share: float = 0.95
+    z: float = 1.5
+    min_probability: float = 0.95
+    min_intersections: int = 6
+    cells_per_window: float = 10.0
+    max_cells: int = 2000
+
+
+@dataclass(frozen=True)
+class PlaceGrid:
+    """Places of a map and what is known of them without trying. Dimensions: R rows from north, C columns from west.
+
+    Attributes
+    ----------
+    west, north, cell_m : float
+        As in `LocalizabilityMap`.
+    covered : (R, C) bool
+        Where the map knows the roads.
+    footprint_m2 : float
+        Ground that a mask shows.
+    counts : (R, C) float32
+        Intersections within the footprint of a mask (a disc of its area).
+    features : (R, C, 3) float64
+        log(1 + count), the entropy of the directions of the streets there, and log(1 + count of clear intersections).
+    """
+
+    plane: LocalPlane
+    west: float
+    north: float
+    cell_m: float
+    footprint_m2: float
+    covered: BoolArray
+    counts: AnyArray
+    features: FloatArray
+
+    def draw(self, count: int, where: BoolArray, rng: np.random.Generator) -> FloatArray:
+        """Draw (count, 2) positions, uniform over the covered cells that `where` (R, C) allows, or over all if none."""
+        cells = np.argwhere(self.covered & where)
+        cells = cells if len(cells) else np.argwhere(self.covered)
+        row, column = (cells[rng.integers(len(cells), size=count)] + rng.random((count, 2))).T
+        return np.column_stack([self.west + column * self.cell_m, self.north - row * self.cell_m])
+
+
+@dataclass(frozen=True)
+class LocalizabilityMap:
+    """What masks centred in the cells of a grid (R, C) would come to.
+
+    Attributes
+    ----------
+    classes : (R, C) uint8
+        `LOCATED`, `AMBIGUOUS`, `TOO_FEW`, or `UNKNOWN` off the map.
+    probability : (R, C) float32
+        Of being located, as fitted; NaN off the map.
+    threshold : float
+        Probability from which cells are marked as located; infinite where the trials support none.
+    """
+
+    grid: PlaceGrid
+    classes: AnyArray
+    probability: AnyArray
+    threshold: float
+
+    def at(self, xy: FloatArray) -> AnyArray:
+        """Classes at (K, 2) plane positions."""
+        row, column = _cells(xy, self.grid)
+        inside = (row >= 0) & (row < self.classes.shape[0]) & (column >= 0) & (column < self.classes.shape[1])
+        found = np.full(len(xy), UNKNOWN, np.uint8)
+        found[inside] = self.classes[row[inside], column[inside]]
+        return found
+
+
+def lay_grid(network: RoadNetwork, footprint_m2: float, options: LocalizabilityOptions | None = None) -> PlaceGrid:
+    """Describe every place of a map for masks that show so much ground."""
+    options = options or LocalizabilityOptions()
+    coords = network.graph.coords
+    (west, south), (east, north) = coords.min(axis=0), coords.max(axis=0)
+    cell = max(math.sqrt(footprint_m2) / options.cells_per_window, max(east - west, north - south) / options.max_cells)
+    shape = math.ceil((north - south) / cell), math.ceil((east - west) / cell)
+    counts, features = _features(network, west, north, cell, shape, math.sqrt(footprint_m2 / math.pi))
+    covered = _covered(network, west, north, cell, shape)
+    return PlaceGrid(network.plane, float(west), float(north), cell, footprint_m2, covered, counts, features)
+
+
+def map_localizability(
+    grid: PlaceGrid, places: FloatArray, located: BoolArray, options: LocalizabilityOptions | None = None
+) -> LocalizabilityMap:
+    """Learn from trials where masks are located, and tell it for the whole map.
+
+    Parameters
+    ----------
+    places : (T, 2) float64
+        Where masks were tried: the middles of their frames, plane metres.
+    located : (T,) bool
+        Which of them were located.
+    """
+    options = options or LocalizabilityOptions()
+    shape = grid.counts.shape
+    row, column = (np.clip(at, 0, n - 1) for at, n in zip(_cells(places, grid), shape, strict=True))
+    probability = _predict(grid.features, _fit(grid.features[row, column], located))
+    threshold = _threshold(probability[row, column], located, options)
+    none = grid.counts < options.min_intersections
+    few = none | (grid.counts < _fewest(grid.counts, probability))
+    classes = np.where((probability >= threshold) & ~none, LOCATED, np.where(few, TOO_FEW, AMBIGUOUS))
+    return LocalizabilityMap(
+        grid,
+        np.where(grid.covered, classes, UNKNOWN).astype(np.uint8),
+        np.where(grid.covered, probability, np.nan).astype(np.float32),
+        threshold,
+    )
+
+
+# --- learning ---------------------------------------------------------------------------------------------------------
+
+
+def _cells(xy: FloatArray, grid: PlaceGrid) -> tuple[AnyArray, AnyArray]:
+    """Rows and columns of the cells that (K, 2) positions lie in."""
+    return _rows(xy, grid.north, grid.cell_m), _columns(xy, grid.west, grid.cell_m)
+
+
+def _rows(xy: FloatArray, north: float, cell: float) -> AnyArray:
+    return np.floor((north - xy[:, 1]) / cell).astype(int)
+
+
+def _columns(xy: FloatArray, west: float, cell: float) -> AnyArray:
+    return np.floor((xy[:, 0] - west) / cell).astype(int)
+
+
+def _features(
+    network: RoadNetwork, west: float, north: float, cell: float, shape: tuple[int, int], radius: float
+) -> tuple[AnyArray, FloatArray]:
+    """Count intersections within `radius` of every cell, and make the features of a `PlaceGrid`."""
+    found = network.intersections
+    reach = round(radius / cell)
+    y, x = np.mgrid[-reach : reach + 1, -reach : reach + 1]
+    disc = (np.hypot(x, y) * cell <= radius).astype(np.float32)
+
+    def spread(xy: FloatArray) -> AnyArray:
+        layer = np.zeros(shape, np.float32)
+        row, column = _rows(xy, north, cell), _columns(xy, west, cell)
+        np.add.at(layer, (np.clip(row, 0, shape[0] - 1), np.clip(column, 0, shape[1] - 1)), 1.0)
+        return np.maximum(cv2.filter2D(layer, -1, disc, borderType=cv2.BORDER_CONSTANT), 0.0)
+
+    counts = np.round(spread(found.xy))
+    clear = np.round(spread(found.xy[_clear(found.xy)]))
+    known = np.isfinite(found.tangents)
+    owner, _ = np.nonzero(known)
+    direction = np.floor(found.tangents[known] / math.pi * _DIRECTIONS).astype(int) % _DIRECTIONS
+    layers = np.stack([spread(found.xy[owner[direction == d]]) for d in range(_DIRECTIONS)], axis=-1)
+    shares = layers / np.maximum(layers.sum(axis=-1, keepdims=True), 1.0)
+    entropy = -(shares * np.log(np.maximum(shares, 1e-9))).sum(axis=-1)
+    return counts, np.stack([np.log1p(counts), entropy, np.log1p(clear)], axis=-1)
+
+
+def _clear(xy: FloatArray) -> BoolArray:
+    """(N,) whether points have no other within `CLEAR_M`."""
+    from scipy.spatial import cKDTree
+
+    distance, _ = cKDTree(xy).query(xy, k=2)
+    return np.asarray(distance[:, 1] > CLEAR_M)
+
+
+def _fit(features: FloatArray, located: BoolArray, ridge: float = 0.01) -> FloatArray:
+    """Fit a logistic regression with an intercept, (T, F) features to (T,) outcomes; (1 + F,) weights.
+
+    Newton's method on standardized features, whose weights are drawn to 0 by `ridge`: without that, trials that all
+    went the same way would have no finite optimum.
+    """
+    mean, scale = features.mean(axis=0), features.std(axis=0) + 1e-9
+    design = np.column_stack([np.ones(len(features)), (features - mean) / scale])
+    penalty = ridge * np.ones(design.shape[1])
+
+    def loss(weights: FloatArray) -> float:
+        signs = np.where(located, 1.0, -1.0)
+        return float(np.logaddexp(0.0, -signs * (design @ weights)).sum() + (penalty * weights**2).sum() / 2)
+
+    weights = np.zeros(design.shape[1])
+    for _ in range(100):
+        p = _logistic(design @ weights)
+        curvature = (design.T * (p * (1 - p))) @ design + np.diag(penalty)
+        step = np.linalg.solve(curvature, design.T @ (located - p) - penalty * weights)
+        while loss(weights + step) > loss(weights) and np.abs(step).max() > 1e-9:
+            step = step / 2
+        weights = weights + step
+        if np.abs(step).max() < 1e-6:
+            break
+    return np.concatenate(([weights[0] - (weights[1:] * mean / scale).sum()], weights[1:] / scale))
+
+
+def _predict(features: FloatArray, weights: FloatArray) -> FloatArray:
+    return _logistic(features @ weights[1:] + weights[0])
+
+
+def _logistic(x: FloatArray) -> FloatArray:
+    return np.asarray(1.0 / (1.0 + np.exp(-np.clip(x, -500.0, 500.0))))
+
+
+def _threshold(probability: FloatArray, located: BoolArray, options: LocalizabilityOptions) -> float:
+    """Lowest probability above which the trials were surely located as often as asked."""
+    order = np.argsort(-probability, kind="stable")
+    hits = np.cumsum(located[order])
+    sure = [share(int(hits[k]), k + 1, options.z).low >= options.located_share for k in range(len(order))]
+    last = np.flatnonzero(sure)
+    return max(float(probability[order[last[-1]]]), options.min_probability) if len(last) else math.inf
+
+
+def _fewest(counts: AnyArray, probability: FloatArray) -> float:
+    """Give the least number of intersections with which any mask is rather located than not."""
+    likely = counts[probability >= 0.5]
+    return float(likely.min()) if len(likely) else math.inf
+
+
+def _covered(network: RoadNetwork, west: float, north: float, cell: float, shape: tuple[int, int]) -> BoolArray:
+    """(R, C) whether the map knows the roads of a cell."""
+    if not network.coverage:
+        return np.ones(shape, bool)
+    inside = np.zeros(shape, np.uint8)
+    rings = [np.rint((ring - (west, north)) * (16 / cell, -16 / cell)).astype(np.int32) for ring in network.coverage]
+    cv2.fillPoly(inside, rings, 1, cv2.LINE_8, 4)  # rings within rings are holes
+    return inside.astype(bool)
+
+
+# --- outputs ----------------------------------------------------------------------------------------------------------
+
+
+def to_geotiff(found: LocalizabilityMap) -> bytes:
+    """Write the classes (band 1, with a colour table) and the probability in percent (band 2) as a GeoTIFF."""
+    import rasterio
+
+    grid = found.grid
+    x, y = grid.plane.to_crs(np.array([grid.west, grid.north]))
+    profile = {
+        "driver": "GTiff",
+        "width": found.classes.shape[1],
+        "height": found.classes.shape[0],
+        "count": 2,
+        "dtype": "uint8",
+        "crs": grid.plane.crs,
+        "transform": rasterio.Affine(grid.cell_m, 0.0, x, 0.0, -grid.cell_m, y),
+        "compress": "deflate",
+        "interleave": "band",
+        "photometric": "minisblack",
+    }
+    percent = np.where(np.isnan(found.probability), 255, np.nan_to_num(found.probability) * 100).round()
+    with rasterio.MemoryFile() as memory:
+        with memory.open(**profile) as raster:
+            raster.write(found.classes, 1)
+            raster.write(percent.astype(np.uint8), 2)
+            raster.set_band_description(
+                1, "class: " + ", ".join(f"{v} {label}" for v, (_, _, label) in PALETTE.items())
+            )
+            raster.set_band_description(2, "probability of being located, percent (255: off the map)")
+        return bytes(memory.read())
+
+
+def to_qml() -> str:
+    """Style the GeoTIFF for QGIS: to be stored beside it under the same name."""
+    return draw_palette(PALETTE)
+
+
+def draw_localizability(network: RoadNetwork, found: LocalizabilityMap, title: str, longer_px: int = 1400) -> bytes:
+    """Draw the map over its roads, with legend and scale, as PNG."""
+    rows, columns = found.classes.shape
+    scale = longer_px / max(rows, columns)
+    size = round(columns * scale), round(rows * scale)
+    top, bottom = 56, 44
+    picture = np.full((size[1] + top + bottom, max(size[0], 640), 3), 255, np.uint8)
+    ground = picture[top : top + size[1], : size[0]]
+    ground[:] = (236, 241, 243)
+    classes = cv2.resize(found.classes, size, interpolation=cv2.INTER_NEAREST)
+    for value, (color, alpha, _) in PALETTE.items():
+        ground[classes == value] = _blend((236, 241, 243), color, alpha)
+    to_pixel = scale / found.grid.cell_m
+    lines = [
+        np.rint((line - (found.grid.west, found.grid.north)) * (16 * to_pixel, -16 * to_pixel)).astype(np.int32)
+        for line in network.graph.polylines()
+    ]
+    cv2.polylines(ground, lines, False, (70, 66, 62), 1, cv2.LINE_AA, 4)
+    cv2.putText(picture, title, (10, 24), cv2.FONT_HERSHEY_DUPLEX, 0.6, (40, 40, 40), 1, cv2.LINE_AA)
+    for at, (color, alpha, label) in zip(_legend_steps(), list(PALETTE.values())[1:], strict=False):
+        cv2.rectangle(picture, (at, 34), (at + 14, 48), _blend((255, 255, 255), color, alpha), -1)
+        cv2.putText(picture, label, (at + 20, 46), cv2.FONT_HERSHEY_SIMPLEX, 0.42, (40, 40, 40), 1, cv2.LINE_AA)
+    _draw_scale(picture, to_pixel, len(picture) - 18)
+    attribution = str(network.meta.get("attribution") or "").encode("ascii", "ignore").decode().strip()
+    cv2.putText(
+        picture, attribution, (360, len(picture) - 13), cv2.FONT_HERSHEY_SIMPLEX, 0.42, (90, 90, 90), 1, cv2.LINE_AA
+    )
+    return bytes(cv2.imencode(".png", picture)[1].tobytes())
+
+
+def _legend_steps() -> Iterator[int]:
+    yield from (10, 170, 400)
+
+
+def _blend(paper: tuple[int, int, int], color: str, alpha: int) -> tuple[int, int, int]:
+    """Blue, green, red of a "#rrggbb" laid over paper."""
+    bgr = [int(color[i : i + 2], 16) for i in (5, 3, 1)]
+    mixed = [round((alpha * c + (255 - alpha) * p) / 255) for c, p in zip(bgr, paper, strict=True)]
+    return mixed[0], mixed[1], mixed[2]
+
+
+def _draw_scale(picture: AnyArray, pixels_per_m: float, y: int) -> None:
+    """Draw a bar of a round length, at most 300 pixels long."""
+    limit = 300 / pixels_per_m
+    step = 10.0 ** math.floor(math.log10(limit))
+    length = max(k * step for k in (1, 2, 5) if k * step <= limit)
+    end = 10 + round(length * pixels_per_m)
+    cv2.line(picture, (10, y), (end, y), (40, 40, 40), 3)
+    words = f"{length / 1000:g} km" if length >= 1000 else f"{length:g} m"
+    cv2.putText(picture, words, (end + 8, y + 5), cv2.FONT_HERSHEY_SIMPLEX, 0.45, (40, 40, 40), 1, cv2.LINE_AA)

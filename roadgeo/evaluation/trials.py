@@ -1,0 +1,306 @@
+"""Running a locator over a query set: in this process or in several, and on where an interrupted run left off."""
+
+from __future__ import annotations
+
+import json
+import multiprocessing
+import signal
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from concurrent.futures import ProcessPoolExecutor
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Any, Protocol, TypeAlias
+
+import cv2
+import numpy as np
+
+from roadgeo._arrays import AnyArray
+from roadgeo.errors import MaskError, OutputError
+from roadgeo.evaluation.landscape import Landscape
+from roadgeo.evaluation.simulation import SimulationOptions, simulate_query, simulate_query_at
+from roadgeo.evaluation.truth import Truth, truth_from_record, truth_to_record
+from roadgeo.geometry.projection import transformer
+from roadgeo.reference.network_file import read_network
+from roadgeo.reference.reference import open_reference
+from roadgeo.storage.files import write_text
+from roadgeo.workflows import LocateOptions, locate
+
+__all__ = [
+    "DrawnMasks",
+    "Locator",
+    "Mask",
+    "MaskFiles",
+    "PlacedMasks",
+    "QuerySet",
+    "ReferenceLocator",
+    "Trial",
+    "read_landscape",
+    "run_trials",
+]
+
+SCHEMA = "roadgeo.trials/1"
+
+#: A mask, or the path of one.
+Mask: TypeAlias = AnyArray | str
+
+#: Result of a trial: `Location.to_dict`.
+Answer: TypeAlias = dict[str, Any]
+
+
+class QuerySet(Protocol):
+    """Masks with truth. It is sent to other processes, so it holds paths and options; each process opens it once."""
+
+    def __len__(self) -> int:
+        """How many queries there are."""
+
+    def open(self) -> Callable[[int], tuple[Truth, Mask]]:
+        """Read what is needed and return the function that gives the k-th query."""
+
+
+class Locator(Protocol):
+    """A way of locating masks, sent to other processes like a `QuerySet`."""
+
+    def open(self) -> Callable[[Mask], Answer]:
+        """Open the references and return the function that locates a mask."""
+
+
+@dataclass(frozen=True)
+class MaskFiles:
+    """Masks in a folder."""
+
+    folder: Path
+    truths: tuple[Truth, ...]
+
+    def __len__(self) -> int:
+        """How many masks there are."""
+        return len(self.truths)
+
+    def open(self) -> Callable[[int], tuple[Truth, Mask]]:
+        """Return the function that names the k-th file."""
+        return lambda k: (self.truths[k], str(self.folder / self.truths[k].file))
+
+
+def read_landscape(geopackage: Path, roads: Path | None = None) -> Landscape:
+    """Read the roads to draw masks from: a reference's own, or those of a file, where the reference covers them.
+
+    Raises
+    ------
+    IndexFormatError, RoadSourceError, CrsError
+        The reference or the file cannot be read.
+    """
+    network = read_network(geopackage)
+    if roads is None:
+        return Landscape.from_network(network)
+    from roadgeo.sources.roads import read_roads
+
+    found = read_roads(roads)
+    there = transformer(network.plane.crs, found.plane.crs)
+    coverage = [network.plane.to_crs(ring) for ring in network.coverage]
+    rings = [found.plane.from_crs(np.column_stack(there.transform(*ring.T))) for ring in coverage]
+    return Landscape.from_lines(found.lines, found.plane, tuple(rings))
+
+
+@dataclass(frozen=True)
+class DrawnMasks:
+    """Masks drawn when they are needed.
+
+    Attributes
+    ----------
+    geopackage : Path
+        `REF.gpkg`.
+    sets : tuple of (SimulationOptions, int)
+        Options and number of queries, set by set.
+    roads : Path, optional
+        Roads to draw instead of the reference's own.
+    """
+
+    geopackage: Path
+    sets: tuple[tuple[SimulationOptions, int], ...]
+    roads: Path | None = None
+
+    def __len__(self) -> int:
+        """How many queries there are."""
+        return sum(count for _, count in self.sets)
+
+    def open(self) -> Callable[[int], tuple[Truth, Mask]]:
+        """Read the roads and return the function that draws the k-th query."""
+        landscape = read_landscape(self.geopackage, self.roads)
+        numbered = [(options, k) for options, count in self.sets for k in range(count)]
+
+        def draw(k: int) -> tuple[Truth, Mask]:
+            query = simulate_query(landscape, *numbered[k])
+            return query.truth, query.mask
+
+        return draw
+
+
+@dataclass(frozen=True)
+class PlacedMasks:
+    """Masks drawn at given places of a reference.
+
+    Attributes
+    ----------
+    centers : tuple of (float, float)
+        Middles of the frames, metres on the reference's plane.
+    first : int
+        Number of the first query: others draw other noise.
+    """
+
+    geopackage: Path
+    options: SimulationOptions
+    centers: tuple[tuple[float, float], ...]
+    first: int = 0
+
+    def __len__(self) -> int:
+        """How many queries there are."""
+        return len(self.centers)
+
+    def open(self) -> Callable[[int], tuple[Truth, Mask]]:
+        """Read the roads and return the function that draws the k-th query."""
+        landscape = read_landscape(self.geopackage)
+
+        def draw(k: int) -> tuple[Truth, Mask]:
+            query = simulate_query_at(landscape, self.options, self.first + k, self.centers[k])
+            return query.truth, query.mask
+
+        return draw
+
+
+@dataclass(frozen=True)
+class ReferenceLocator:
+    """`roadgeo.locate` on one or more references; a mask that it cannot use counts as not located."""
+
+    references: tuple[Path, ...]
+    options: LocateOptions = field(default_factory=LocateOptions)
+
+    def open(self) -> Callable[[Mask], Answer]:
+        """Open the references."""
+        references = [open_reference(path) for path in self.references]
+
+        def answer(mask: Mask) -> Answer:
+            try:
+                return locate(mask, references, self.options).to_dict()
+            except MaskError as error:
+                return {"status": "not_located", "reason": str(error)}
+
+        return answer
+
+
+@dataclass(frozen=True)
+class Trial:
+    """One query's truth and what the locator answered."""
+
+    truth: Truth
+    answer: Answer
+
+
+def run_trials(
+    queries: QuerySet,
+    locator: Locator,
+    jobs: int = 1,
+    record: Path | None = None,
+    settings: Mapping[str, Any] | None = None,
+    progress: Callable[[Trial], None] | None = None,
+) -> list[Trial]:
+    """Locate every query.
+
+    Parameters
+    ----------
+    jobs : int
+        Processes. The answers do not depend on it, but for the times in them.
+    record : Path, optional
+        JSON lines file that gets every trial as it ends. Trials that it holds already, from a run with the same
+        settings, are not repeated.
+    settings : mapping, optional
+        Plain values that tell this run from others.
+    progress : callable, optional
+        Called with every trial, the recorded ones too, in order.
+
+    Raises
+    ------
+    OutputError
+        The record cannot be written, or belongs to a run with other settings.
+    """
+    done = [] if record is None else _read_record(record, dict(settings or {}))
+    for trial in done:
+        if progress:
+            progress(trial)
+    pending = range(len(done), len(queries))
+    for trial in _results(queries, locator, pending, jobs):
+        if record is not None:
+            _append(record, trial)
+        done.append(trial)
+        if progress:
+            progress(trial)
+    return done
+
+
+# --- running ----------------------------------------------------------------------------------------------------------
+
+_draw: Callable[[int], tuple[Truth, Mask]]
+_locate: Callable[[Mask], Answer]
+
+
+def _results(queries: QuerySet, locator: Locator, pending: Sequence[int], jobs: int) -> Iterator[Trial]:
+    if not pending:
+        return
+    if jobs == 1:
+        draw, locate = queries.open(), locator.open()
+        for k in pending:
+            truth, mask = draw(k)
+            yield Trial(truth, locate(mask))
+        return
+    # Spawned, not forked: the same on every system, and no thread of ours is lost in the child.
+    with ProcessPoolExecutor(
+        min(jobs, len(pending)), multiprocessing.get_context("spawn"), _prepare, (queries, locator)
+    ) as pool:
+        try:
+            yield from pool.map(_run, pending)
+        except BaseException:
+            pool.shutdown(wait=False, cancel_futures=True)
+            raise
+
+
+def _prepare(queries: QuerySet, locator: Locator) -> None:
+    """Open what a worker process needs, once."""
+    global _draw, _locate
+    signal.signal(signal.SIGINT, signal.SIG_IGN)  # Ctrl-C is the parent's to handle
+    cv2.setNumThreads(1)
+    _draw, _locate = queries.open(), locator.open()
+
+
+def _run(k: int) -> Trial:
+    truth, mask = _draw(k)
+    return Trial(truth, _locate(mask))
+
+
+# --- the record -------------------------------------------------------------------------------------------------------
+
+
+def _read_record(path: Path, settings: dict[str, Any]) -> list[Trial]:
+    """Read the trials of an earlier run, or start a record; a line that was cut off is dropped."""
+    head = json.dumps({"schema": SCHEMA, "settings": settings}, sort_keys=True)
+    lines = path.read_text(encoding="utf-8").splitlines() if path.is_file() else []
+    if lines and lines[0] != head:
+        raise OutputError(
+            f"{path} holds trials of another run; choose another folder, or delete the file to begin anew"
+        )
+    trials, kept = [], [head]
+    for line in lines[1:]:
+        try:
+            entry = json.loads(line)
+        except ValueError:
+            break
+        trials.append(Trial(truth_from_record(entry["truth"]), entry["answer"]))
+        kept.append(line)
+    write_text(path, "\n".join(kept) + "\n")
+    return trials
+
+
+def _append(path: Path, trial: Trial) -> None:
+    line = json.dumps({"truth": truth_to_record(trial.truth), "answer": trial.answer})
+    try:
+        with path.open("a", encoding="utf-8") as file:
+            file.write(line + "\n")
+    except OSError as error:
+        raise OutputError(f"cannot write {path}: {error.strerror}; make room or choose another folder") from error

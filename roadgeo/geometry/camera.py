@@ -1,0 +1,170 @@
+"""Is a homography what a camera could have seen? Tilt, focal length and ground sampling of a plane under a pinhole."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass
+
+import numpy as np
+
+from roadgeo._arrays import FloatArray
+
+__all__ = ["CameraOptions", "CameraPose", "judge", "pose", "sampling"]
+
+_FOCAL_STEPS = np.geomspace(0.35, 8.0, 25)
+#: Focal length that is taken where none fits better: in halves of the frame's diagonal, that of a usual lens.
+_USUAL_FOCAL = 1.5
+#: How much more skew a usual focal length may leave than one e times as long.
+_FOCAL_PRIOR = 0.01
+
+
+@dataclass(frozen=True)
+class CameraOptions:
+    """What is known of the camera.
+
+    Attributes
+    ----------
+    gsd_m : (low, high)
+        Ground sampling at the middle of the frame, metres per pixel.
+    max_tilt_deg : float
+        Greatest angle between the optical axis and the vertical.
+    focal_px : float or None
+        Focal length, where it is known.
+    max_skew : float
+        How far the homography may be from that of any pinhole with square pixels whose axis meets the middle of the
+        frame: the greater of |cos| of the angle between the images of two perpendicular unit vectors and the log of
+        their lengths' ratio. A crop or a lens's distortion moves it from 0.
+    north_up : bool
+        The image's up is north, within 5 degrees.
+    """
+
+    gsd_m: tuple[float, float] = (0.2, 5.0)
+    max_tilt_deg: float = 60.0
+    focal_px: float | None = None
+    max_skew: float = 0.35
+    north_up: bool = False
+
+    @property
+    def min_shape_ratio(self) -> float:
+        """Least ratio of the singular values of a map around an intersection that three crossings may propose.
+
+        A camera tilted by a sees 1 : 1 / cos a, the rays at its frame's edge still less; triangles are not exact.
+        """
+        return max(0.33, 0.85 * math.cos(math.radians(min(self.max_tilt_deg + 25.0, 85.0))))
+
+    def perspective_sigma(self, usual: float) -> float:
+        """Return the prior standard deviation of the perspective parameters, in units of 1 / half the frame's diagonal.
+
+        It is `usual` unless so little tilt is allowed that they must be less.
+        """
+        return min(usual, 0.03 + 0.7 * math.tan(math.radians(min(self.max_tilt_deg, 80.0))))
+
+
+@dataclass(frozen=True)
+class CameraPose:
+    """What a homography says of the camera.
+
+    Attributes
+    ----------
+    gsd_m : float
+        Ground sampling at the middle of the frame, metres per pixel.
+    rotation_deg : float
+        Direction of the image's up there, clockwise from north.
+    tilt_deg, focal_px : float
+        Of the pinhole that fits best: the angle of its axis from the vertical. Ill determined near the nadir.
+    skew : float
+        How badly even that one fits (see `CameraOptions.max_skew`).
+    """
+
+    gsd_m: float
+    rotation_deg: float
+    tilt_deg: float
+    focal_px: float
+    skew: float
+
+
+def _jacobian(matrix: FloatArray, xy: FloatArray) -> FloatArray:
+    mapped = matrix @ (xy[0], xy[1], 1.0)
+    image = mapped[:2] / mapped[2]
+    return np.asarray((matrix[:2, :2] - np.outer(image, matrix[2, :2])) / mapped[2])
+
+
+def sampling(matrix: FloatArray, size: tuple[int, int]) -> float:
+    """Return the ground sampling at the middle of the frame, metres per pixel."""
+    jacobian = _jacobian(matrix, np.array([size[0] / 2.0, -size[1] / 2.0]))
+    return math.sqrt(abs(jacobian[0, 0] * jacobian[1, 1] - jacobian[0, 1] * jacobian[1, 0]))
+
+
+@dataclass(frozen=True)
+class _Pinholes:
+    """How well pinholes of several focal lengths fit a homography: focal lengths in pixels, skew and tilt of each."""
+
+    focal_px: FloatArray
+    skew: FloatArray
+    tilt_deg: FloatArray
+
+
+def _pinholes(matrix: FloatArray, size: tuple[int, int], focal_px: float | None) -> _Pinholes:
+    """Fit pinholes to a homography from the query plane to a metric plane.
+
+    For each focal length f the columns of diag(1/f, 1/f, 1) G, G the inverse map with the frame's middle as origin,
+    should be perpendicular and equally long (Hartley & Zisserman, 8.1.1).
+    """
+    center = (size[0] / 2.0, -size[1] / 2.0)
+    shift = np.array([[1.0, 0.0, -center[0]], [0.0, 1.0, -center[1]], [0.0, 0.0, 1.0]])
+    g = shift @ np.linalg.inv(matrix)
+    focal = np.array([focal_px]) if focal_px else _FOCAL_STEPS * math.hypot(*size) / 2.0
+    # columns of diag(1/f, 1/f, 1) G, up to the factor 1/f
+    aa = g[0, 0] ** 2 + g[1, 0] ** 2 + (focal * g[2, 0]) ** 2
+    bb = g[0, 1] ** 2 + g[1, 1] ** 2 + (focal * g[2, 1]) ** 2
+    ab = g[0, 0] * g[0, 1] + g[1, 0] * g[1, 1] + focal**2 * g[2, 0] * g[2, 1]
+    skew = np.maximum(np.abs(ab) / np.sqrt(aa * bb), 0.5 * np.abs(np.log(aa / bb)))
+    vertical = g[0, 0] * g[1, 1] - g[1, 0] * g[0, 1]  # z of their cross product, whose length is sqrt(aa bb - ab^2)
+    cosine = abs(vertical) / np.sqrt(np.maximum(aa * bb - ab**2, 1e-300))
+    return _Pinholes(focal, skew, np.degrees(np.arccos(np.minimum(1.0, cosine))))
+
+
+def pose(matrix: FloatArray, size: tuple[int, int], focal_px: float | None = None) -> CameraPose:
+    """Describe the camera behind a homography from the query plane (pixels, y up) to a metric plane.
+
+    The focal length is that of the pinhole that fits best, and of a usual lens where all fit alike, as near the nadir.
+    """
+    jacobian = _jacobian(matrix, np.array([size[0] / 2.0, -size[1] / 2.0]))
+    gsd = sampling(matrix, size)
+    rotation = math.degrees(math.atan2(jacobian[0, 1], jacobian[1, 1]))
+    fits = _pinholes(matrix, size, focal_px)
+    usual = _USUAL_FOCAL * math.hypot(*size) / 2.0
+    best = int(np.argmin(fits.skew + _FOCAL_PRIOR * np.abs(np.log(fits.focal_px / usual))))
+    return CameraPose(gsd, rotation, float(fits.tilt_deg[best]), float(fits.focal_px[best]), float(fits.skew[best]))
+
+
+def judge(matrix: FloatArray, size: tuple[int, int], options: CameraOptions, rough: bool = False) -> str:
+    """Return why a homography is not plausible, or "" if it is.
+
+    Some camera within the options must fit about as well as any. A `rough` homography, of a few matches only, may still
+    become plausible: its bounds are wider.
+    """
+    if not np.isfinite(matrix).all():
+        return "degenerate"
+    width, height = size
+    corners = np.array([[0, 0, 1], [width, 0, 1], [width, -height, 1], [0, -height, 1]], float)
+    middle = float(matrix[2] @ (width / 2.0, -height / 2.0, 1.0))
+    if middle == 0.0:
+        return "degenerate"
+    if (corners @ matrix[2] / middle < 0.05).any():
+        return "horizon in the frame"
+    if np.linalg.det(matrix) / middle**3 <= 0:
+        return "mirrored"
+    slack_deg, slack, further = (15.0, 1.25, 0.2) if rough else (5.0, 1.0, 0.1)
+    if not options.gsd_m[0] / slack <= sampling(matrix, size) <= options.gsd_m[1] * slack:
+        return "ground sampling out of range"
+    fits = _pinholes(matrix, size, options.focal_px)
+    if fits.skew.min() > options.max_skew * slack:
+        return "no camera sees a plane so"
+    if fits.tilt_deg[fits.skew <= fits.skew.min() + further].min() > options.max_tilt_deg + slack_deg:
+        return "tilt out of range"
+    if options.north_up:
+        jacobian = _jacobian(matrix, np.array([width / 2.0, -height / 2.0]))
+        if abs(math.degrees(math.atan2(jacobian[0, 1], jacobian[1, 1]))) > slack_deg:
+            return "not north up"
+    return ""

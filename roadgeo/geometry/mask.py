@@ -1,0 +1,62 @@
+"""A query mask on its pixel grid: which pixels are road, and which were observed at all.
+
+Frames. A pixel position is (column, row) in GDAL's corner convention: the centre of the top-left pixel is (0.5, 0.5).
+The *query plane* is (x, y) = (column, -row), y up, in pixels: rows are flipped once, here and nowhere else, so that
+"counterclockwise" means the same on query and reference and an image taken from above is never mirrored.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+
+from roadgeo._arrays import BoolArray, FloatArray
+
+__all__ = ["PIXEL_TO_PLANE", "RoadMask", "pixel_to_plane", "plane_to_pixel"]
+
+#: 3 x 3 homography that takes pixels (column, row) to the query plane (x, y). It is its own inverse.
+PIXEL_TO_PLANE: FloatArray = np.diag([1.0, -1.0, 1.0])
+PIXEL_TO_PLANE.setflags(write=False)
+
+
+def pixel_to_plane(pixels: FloatArray) -> FloatArray:
+    """Take (..., 2) pixel positions (column, row) to the query plane (x, y), y up."""
+    return np.asarray(pixels, float) * (1.0, -1.0)
+
+
+def plane_to_pixel(xy: FloatArray) -> FloatArray:
+    """Take (..., 2) positions of the query plane to pixels (column, row)."""
+    return np.asarray(xy, float) * (1.0, -1.0)
+
+
+@dataclass(frozen=True)
+class RoadMask:
+    """Road pixels of an image, and the pixels that were observed.
+
+    Dimensions: H rows, W columns.
+
+    Attributes
+    ----------
+    roads : (H, W) bool
+        True where the image shows road. False wherever `observed` is False.
+    observed : (H, W) bool or None
+        False where nothing is known (nodata, alpha 0, the black corners of a warped image). None: all observed.
+    name : str
+        What the user calls it (the path as given).
+    """
+
+    roads: BoolArray
+    observed: BoolArray | None = None
+    name: str = ""
+
+    @property
+    def shape(self) -> tuple[int, int]:
+        """(H, W)."""
+        return self.roads.shape[0], self.roads.shape[1]
+
+    @property
+    def corners(self) -> FloatArray:
+        """(4, 2) pixel positions of the frame's corners TL, TR, BR, BL."""
+        height, width = self.shape
+        return np.array([[0, 0], [width, 0], [width, height], [0, height]], float)

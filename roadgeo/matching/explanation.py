@@ -1,0 +1,528 @@
+"""Why a mask was or was not located: how far the search got, the best rejected places, and what was missing.
+
+`Explanation.to_dict` gives schema `roadgeo.explanation/1`:
+
+============  ==========================================================================================================
+query         as in `Location`, and so are `status` and `reason`
+seen          `intersections` (all of them usable up to `SceneOptions.max_intersections`), how many of them have two
+              tangents or more, `roads`, their length and the frame's size in pixels, the share of it that was observed
+searches      one for each reference, in the order in which they were searched:
+
+              `reference`, `stopped` ("accepted", "exhausted", "time", or "" where there was nothing to search for),
+              `needed` (the least log10 odds and margin)
+
+              `funnel`, what went into and came out of each stage: `anchors` (intersections tried), `tuples` of the
+              mask looked up, `candidates` (tuples of the map like them), `proposals` (places on which several agree),
+              `on_roads` (those that put the roads around the anchor on roads), `grown` (followed outwards), `survived`
+              (not given up on the way), `verified` (different ones, refined and compared with the map), `measured`
+              (promising ones for which chance was measured on the spot)
+
+              `camera_refusals`: how often which reason kept a place that had grown from being verified
+
+              `starved_at`: the first stage that nothing came out of, "odds" or "margin"; null where it was located
+
+              `missing`: sentences
+
+              `places`: the best ones, best first; see `RejectedPlace`
+============  ==========================================================================================================
+"""
+
+from __future__ import annotations
+
+import math
+from collections import Counter
+from collections.abc import Sequence
+from dataclasses import asdict, dataclass, replace
+from typing import Any
+
+import numpy as np
+
+from roadgeo._arrays import BoolArray, FloatArray, IntArray
+from roadgeo.geometry.camera import CameraOptions, pose, sampling
+from roadgeo.geometry.projection import to_lonlat
+from roadgeo.kernels.roads import forward_distances
+from roadgeo.location import Location, Place
+from roadgeo.matching.estimator import Hypothesis, MatchOptions, TripleEstimator
+from roadgeo.matching.index import ReferenceIndex
+from roadgeo.matching.scene import Scene
+from roadgeo.matching.search import SearchResult
+from roadgeo.matching.triples import Proposals
+from roadgeo.matching.verification import Agreement, agreement, tolerance_m
+from roadgeo.roads.graph import RoadGraph
+
+__all__ = ["SCHEMA", "Explanation", "Funnel", "Needed", "RejectedPlace", "Story", "WatchedEstimator", "tell"]
+
+SCHEMA = "roadgeo.explanation/1"
+
+#: Places that are shown, places that a camera refused which are looked at again, and how many of those are kept.
+_MAX_PLACES, _MAX_RETRIED, _MAX_REFUSED, _MAX_ELSEWHERE = 6, 6, 200, 20
+
+#: Limits that a user may have set too narrow; other refusals hold for every camera.
+_NEGOTIABLE = ("ground sampling out of range", "no camera sees a plane so", "tilt out of range", "not north up")
+
+#: Masks with fewer intersections are seldom located.
+_USUAL_INTERSECTIONS = 12
+
+
+# --- what is watched --------------------------------------------------------------------------------------------------
+
+
+@dataclass(frozen=True)
+class _Scored:
+    """A hypothesis that was verified, its odds, and the camera's objection if that ended it."""
+
+    model: Hypothesis
+    log10_odds: float
+    fault: str = ""
+
+
+class WatchedEstimator(TripleEstimator):
+    """A `TripleEstimator` that remembers what became of everything it tried. It finds the same."""
+
+    def __init__(
+        self,
+        scene: Scene,
+        index: ReferenceIndex,
+        options: MatchOptions | None = None,
+        near: tuple[float, float, float] | None = None,
+    ) -> None:
+        """As of `TripleEstimator`."""
+        super().__init__(scene, index, options, near)
+        self.anchors: list[int] = []
+        self.n_proposals = self.n_on_roads = self.n_survived = 0
+        self.refusals: Counter[str] = Counter()
+        self.refused: list[tuple[str, FloatArray]] = []
+        self.scored: list[_Scored] = []
+        self._objection: tuple[str, FloatArray] | None = None
+
+    def _screen(self, proposals: Proposals) -> IntArray:
+        kept = super()._screen(proposals)
+        self.anchors.append(proposals.anchor)
+        self.n_proposals += len(proposals.reference)
+        self.n_on_roads += len(kept)
+        return kept
+
+    def _judge(self, matrix: FloatArray, rough: bool = False) -> str:
+        fault = super()._judge(matrix, rough)
+        self._objection = (fault, matrix) if fault else None
+        return fault
+
+    def _grow(self, proposals: Proposals, chosen: IntArray) -> list[Hypothesis]:
+        grown = super()._grow(proposals, chosen)
+        self.n_survived += len(grown)
+        return grown
+
+    def _grow_all(self, proposals: Proposals) -> list[Hypothesis]:
+        found = super()._grow_all(proposals)
+        # What points elsewhere than a camera may is not grown: some of it is here, to tell that it would fit.
+        elsewhere = np.flatnonzero(~self._is_allowed(proposals))[:_MAX_ELSEWHERE]
+        for hypothesis in super()._grow(proposals, elsewhere)[:_MAX_RETRIED]:
+            self._is_plausible(hypothesis)
+        return found
+
+    def _is_plausible(self, hypothesis: Hypothesis) -> bool:
+        self._objection = None
+        if super()._is_plausible(hypothesis) or self._objection is None:
+            return True
+        fault = self._objection[0]
+        self.refusals[fault] += 1
+        if fault in _NEGOTIABLE and len(self.refused) < _MAX_REFUSED:
+            self.refused.append(self._objection)
+        return False
+
+    def score(self, model: Hypothesis) -> float:
+        """Refine a hypothesis and return its log10 odds."""
+        self._objection = None
+        odds = super().score(model)
+        fault = self._objection[0] if self._objection is not None and not math.isfinite(odds) else ""
+        if fault:
+            self.refusals[fault] += 1
+        self.scored.append(_Scored(model, odds, fault))
+        return odds
+
+    def without_limits(self) -> list[_Scored]:
+        """Verify the best of the places that the camera refused as if it had not."""
+        camera = CameraOptions(gsd_m=(0.0, math.inf), max_tilt_deg=180.0, max_skew=math.inf)
+        free = TripleEstimator(self.scene, self.index, replace(self.options, camera=camera))
+        free.least_chance, free.n_screened = self.least_chance, self.n_screened
+        nobody = np.empty(0, np.int64)
+        compared = []
+        for fault, unscaled in self.refused:
+            matrix = unscaled / unscaled[2, 2]
+            gsd = sampling(matrix, self.scene.size)
+            found, matched, _ = agreement(matrix, self.scene, self.index, gsd, nobody, self.options.verify)
+            compared.append((found.rate + found.forward, fault, Hypothesis(matrix, nobody, 0.0, matched)))
+        compared.sort(key=lambda entry: -entry[0])
+        return [_Scored(model, free.score(model), fault) for _, fault, model in compared[:_MAX_RETRIED]]
+
+
+# --- what is told -----------------------------------------------------------------------------------------------------
+
+
+@dataclass(frozen=True)
+class Needed:
+    """What an answer must reach; see `workflows.LocateOptions`."""
+
+    log10_odds: float
+    margin: float
+    intersections: int
+
+
+@dataclass(frozen=True)
+class Funnel:
+    """What came out of each stage, in order; see the module's text."""
+
+    intersections: int = 0
+    anchors: int = 0
+    tuples: int = 0
+    candidates: int = 0
+    proposals: int = 0
+    on_roads: int = 0
+    grown: int = 0
+    survived: int = 0
+    verified: int = 0
+    measured: int = 0
+
+
+@dataclass(frozen=True)
+class RejectedPlace:
+    """A place that was verified, and why it is not the answer; the answer itself is the first, `why` says so.
+
+    Attributes
+    ----------
+    matrix : (3, 3) float64
+        Query plane to reference plane.
+    footprint, footprint_lonlat : (4, 2) float64
+        Corners TL, TR, BR, BL, plane metres and longitude, latitude.
+    agreement : Agreement or None
+        None where the fit failed before anything could be compared.
+    chance : tuple of 3 floats
+        Shares that the best shifted copies reach: of intersections, of the mask's roads, of the map's roads.
+    chance_measured : bool
+        At this place; otherwise the least of the places where it was.
+    agrees : (S,) bool
+        Which of the scene's road points lie on roads of the map that run their way.
+    """
+
+    matrix: FloatArray
+    center: Place
+    footprint: FloatArray
+    footprint_lonlat: FloatArray
+    log10_odds: float
+    gsd_m: float
+    rotation_deg: float
+    tilt_deg: float
+    agreement: Agreement | None
+    chance: tuple[float, float, float]
+    chance_measured: bool
+    agrees: BoolArray
+    why: str
+
+    def to_dict(self) -> dict[str, Any]:
+        """Plain values, ready for `json.dumps`."""
+        found = self.agreement
+        by_chance = dict(zip(("intersections", "roads_of_mask", "roads_of_map"), self.chance, strict=True))
+        return {
+            "why": self.why,
+            "log10_odds": self.log10_odds if math.isfinite(self.log10_odds) else None,
+            "center": {"x": self.center.x, "y": self.center.y, "lon": self.center.lon, "lat": self.center.lat},
+            "footprint_lonlat": self.footprint_lonlat.tolist(),
+            "gsd_m": self.gsd_m,
+            "rotation_deg": self.rotation_deg,
+            "tilt_deg": self.tilt_deg,
+            "agreement": found
+            and {
+                "intersections": found.rate,
+                "intersections_matched": found.matched,
+                "intersections_tested": found.tested,
+                "roads_of_mask": found.forward,
+                "roads_of_map": found.backward,
+            },
+            "chance": by_chance,
+            "chance_measured": self.chance_measured,
+        }
+
+
+@dataclass(frozen=True)
+class Story:
+    """How the search on one reference went; see the module's text."""
+
+    reference: str
+    stopped: str
+    needed: Needed
+    funnel: Funnel
+    camera_refusals: dict[str, int]
+    starved_at: str | None
+    missing: tuple[str, ...]
+    places: tuple[RejectedPlace, ...] = ()
+
+    def to_dict(self) -> dict[str, Any]:
+        """Plain values, ready for `json.dumps`."""
+        return {
+            "reference": self.reference,
+            "stopped": self.stopped,
+            "needed": asdict(self.needed),
+            "funnel": asdict(self.funnel),
+            "camera_refusals": self.camera_refusals,
+            "starved_at": self.starved_at,
+            "missing": list(self.missing),
+            "places": [place.to_dict() for place in self.places],
+        }
+
+
+@dataclass(frozen=True)
+class Explanation:
+    """A location and how it came about: what was seen in the mask, and a story for each reference."""
+
+    location: Location
+    scene: Scene
+    graph: RoadGraph
+    stories: tuple[Story, ...]
+
+    @property
+    def nearest(self) -> Story:
+        """The story of the reference that the mask was located on, or else came nearest to it."""
+
+        def rank(story: Story) -> tuple[bool, float]:
+            best = max((place.log10_odds for place in story.places), default=-math.inf)
+            return self.location.located and story.reference == self.location.reference, best
+
+        return max(self.stories, key=rank)
+
+    def to_dict(self) -> dict[str, Any]:
+        """Plain values, ready for `json.dumps`; see the module's text."""
+        location, scene = self.location, self.scene
+        return {
+            "schema": SCHEMA,
+            "query": location.query,
+            "status": location.status,
+            "reason": location.reason,
+            "seen": {
+                "size": list(scene.size),
+                "intersections": len(scene.intersections),
+                "with_two_tangents": int((scene.intersections.n_tangents >= 2).sum()),
+                "roads": scene.n_edges,
+                "road_length_px": scene.road_length_px,
+                "observed": float(scene.observed.mean()),
+            },
+            "searches": [story.to_dict() for story in self.stories],
+        }
+
+
+def tell(
+    location: Location,
+    scene: Scene,
+    index: ReferenceIndex,
+    needed: Needed,
+    watched: WatchedEstimator | None = None,
+    result: SearchResult[Hypothesis] | None = None,
+) -> Story:
+    """Tell how the search on one reference went.
+
+    Parameters
+    ----------
+    location : Location
+        What it came to.
+    watched, result : optional
+        None where there was nothing to search for, or another method searched.
+    """
+    n = len(scene.intersections)
+    if watched is None or result is None:
+        stats = location.stats
+        ended = "intersections" if n < needed.intersections else "verified" if stats.tuples_sampled else "anchors"
+        funnel = Funnel(n, stats.tuples_sampled, 0, stats.candidates, 0, 0, stats.hypotheses, 0, stats.verified)
+        if location.located:
+            return Story(index.name, "", needed, funnel, {}, None, ())
+        return Story(index.name, "", needed, funnel, {}, ended, (location.reason,))
+    funnel = Funnel(
+        n,
+        len(set(watched.anchors)),
+        watched.n_tuples,
+        watched.n_candidates,
+        watched.n_proposals,
+        watched.n_on_roads,
+        watched.n_hypotheses,
+        watched.n_survived,
+        watched.n_verified,
+        watched.n_nulls,
+    )
+    located = location.located
+    entries = [*watched.scored, *([] if located else watched.without_limits())]
+    ranked = _distinct(watched, sorted(entries, key=lambda entry: _rank(entry, needed)))
+    places = tuple(_describe(watched, entry, result, location, needed) for entry in ranked)
+    starved = None if located else _starved(funnel, watched.refusals, result, needed)
+    missing = () if located else tuple(_missing(scene, funnel, watched, result, places, needed))
+    refusals = dict(watched.refusals.most_common())
+    return Story(index.name, result.stopped, needed, funnel, refusals, starved, missing, places)
+
+
+def _rank(entry: _Scored, needed: Needed) -> tuple[bool, float]:
+    """Sort by odds; what the camera refused comes last, unless nothing else kept it from being the answer."""
+    return bool(entry.fault) and entry.log10_odds < needed.log10_odds, -entry.log10_odds
+
+
+def _distinct(watched: WatchedEstimator, entries: Sequence[_Scored]) -> list[_Scored]:
+    """Return the best entry of each place."""
+    kept: list[_Scored] = []
+    for entry in entries:
+        if kept and not math.isfinite(entry.log10_odds):
+            break
+        if not any(watched.same(entry.model, other.model) for other in kept):
+            kept.append(entry)
+        if len(kept) == _MAX_PLACES:
+            break
+    return kept
+
+
+def _describe(
+    watched: WatchedEstimator,
+    entry: _Scored,
+    result: SearchResult[Hypothesis],
+    location: Location,
+    needed: Needed,
+) -> RejectedPlace:
+    model, scene, index = entry.model, watched.scene, watched.index
+    verify = watched.options.verify
+    camera = pose(model.matrix, scene.size)
+    measured = model.chance != (1.0, 1.0, 1.0)
+    chance = model.chance if measured else tuple(float(share) for share in watched.least_chance)
+    corners = np.vstack([scene.corners, scene.center])
+    ground = np.c_[corners, np.ones(5)] @ model.matrix.T
+    ground = ground[:, :2] / ground[:, 2:]
+    in_crs = index.plane.to_crs(ground)
+    lonlat = to_lonlat(index.plane.crs, in_crs)
+    distance = np.empty(len(scene.points))
+    forward_distances(
+        model.matrix, scene.points, scene.directions, tolerance_m(camera.gsd_m, verify),
+        math.cos(math.radians(verify.max_turn_deg)), 0.0, 0.0,
+        index.segments, index.segment_starts, index.segment_ids, index.grid, index.shape, distance,
+    )  # fmt: skip
+    place = RejectedPlace(
+        matrix=model.matrix,
+        center=Place(
+            float(in_crs[4, 0]), float(in_crs[4, 1]), float(lonlat[4, 0]), float(lonlat[4, 1]), entry.log10_odds
+        ),
+        footprint=ground[:4],
+        footprint_lonlat=lonlat[:4],
+        log10_odds=entry.log10_odds,
+        gsd_m=camera.gsd_m,
+        rotation_deg=camera.rotation_deg,
+        tilt_deg=camera.tilt_deg,
+        agreement=model.found,
+        chance=(chance[0], chance[1], chance[2]),
+        chance_measured=measured,
+        agrees=np.isfinite(distance),
+        why="",
+    )
+    return replace(place, why=_why(place, entry, result, location, needed))
+
+
+def _why(
+    place: RejectedPlace, entry: _Scored, result: SearchResult[Hypothesis], location: Location, needed: Needed
+) -> str:
+    """Say why a place is not the answer."""
+    if entry.fault:
+        odds = (
+            f"; without that its log10 odds were {_number(entry.log10_odds)}" if math.isfinite(entry.log10_odds) else ""
+        )
+        return f"the camera: {entry.fault}{_limits(place, entry.fault)}{odds}"
+    if not math.isfinite(entry.log10_odds):
+        return "the fit does not converge to a place within the limits"
+    if entry.model is result.best and location.located:
+        return "located"
+    if entry.log10_odds >= needed.log10_odds:
+        if result.score - entry.log10_odds < needed.margin:
+            return f"fits as well as another place: the margin is below {needed.margin:g}"
+        return f"another place has log10 odds {_number(result.score)}"
+    return f"log10 odds {_number(entry.log10_odds)} of {needed.log10_odds:g} needed: {_weakest(place)}"
+
+
+def _number(value: float) -> str:
+    """Write a number to one digit, and never -0.0."""
+    return f"{round(value, 1) + 0.0:.1f}"
+
+
+def _limits(place: RejectedPlace, fault: str) -> str:
+    values = {
+        "ground sampling out of range": f" ({place.gsd_m:.2f} m per pixel)",
+        "tilt out of range": f" ({place.tilt_deg:.0f} degrees)",
+        "not north up": f" (up is {place.rotation_deg % 360:.0f} degrees)",
+    }
+    return values.get(fault, "")
+
+
+def _weakest(place: RejectedPlace) -> str:
+    """Say which of the three kinds of evidence exceeds chance the least."""
+    found = place.agreement
+    if found is None:
+        return "nothing could be compared"
+    kinds = [
+        (found.rate, place.chance[0], "of the intersections"),
+        (found.forward, place.chance[1], "of the mask's roads"),
+        (found.backward, place.chance[2], "of the map's roads"),
+    ]
+    rate, chance, name = min(kinds, key=lambda kind: kind[0] - kind[1])
+    return f"{rate:.0%} {name} agree, by chance {chance:.0%}"
+
+
+def _starved(funnel: Funnel, refusals: Counter[str], result: SearchResult[Hypothesis], needed: Needed) -> str:
+    """Return the first stage that nothing came out of."""
+    stages = ("intersections", "anchors", "tuples", "candidates", "proposals", "on_roads", "survived", "verified")
+    empty = next((stage for stage in stages if getattr(funnel, stage) == 0), None)
+    if empty == "verified" and refusals:
+        return "camera"
+    if empty is not None:
+        return empty
+    if result.score < needed.log10_odds:
+        return "odds"
+    return "margin"
+
+
+_NOTHING = {
+    "anchors": "no intersection has three neighbours and tangents that make usable tuples",
+    "tuples": "no intersection has three neighbours and tangents that make usable tuples",
+    "candidates": "no tuple of the mask's intersections is like one of the map's",
+    "proposals": "nowhere on the map do two tuples that share an intersection agree",
+    "on_roads": "wherever tuples agree, the roads around them do not",
+    "survived": "whatever was followed outwards met too few intersections where they should be",
+}
+
+
+def _missing(
+    scene: Scene,
+    funnel: Funnel,
+    watched: WatchedEstimator,
+    result: SearchResult[Hypothesis],
+    places: Sequence[RejectedPlace],
+    needed: Needed,
+) -> list[str]:
+    """Say what was missing, the surest first."""
+    told = []
+    if result.stopped == "time":
+        told.append("time: the search was stopped by its limit, places may be left untried")
+    starved = _starved(funnel, watched.refusals, result, needed)
+    if starved in _NOTHING:
+        told.append(_NOTHING[starved])
+    if starved == "camera":
+        reasons = ", ".join(f"{reason} ({times})" for reason, times in watched.refusals.most_common())
+        told.append(f"a camera: all places that grew are such as none sees, or none within the limits: {reasons}")
+    best = places[0] if places else None
+    if best is not None and best.why.startswith("the camera") and best.log10_odds >= needed.log10_odds:
+        fault = best.why.removeprefix("the camera: ")
+        told.append(f"the limits on the camera may be too narrow: the best place fails by them alone: {fault}")
+    elif best is not None and starved == "odds":
+        told.append(f"evidence: at the best place {_weakest(best)}")
+    if starved == "margin":
+        told.append(
+            "difference: another place fits almost as well; more of the surroundings in view would tell them apart"
+        )
+    if len(scene.intersections) < _USUAL_INTERSECTIONS:
+        told.append(
+            f"intersections: {len(scene.intersections)} are seen; masks with fewer than {_USUAL_INTERSECTIONS} are"
+            " seldom located"
+        )
+    if best is not None and best.chance[1] > 0.5:
+        told.append(f"variety: streets here are so alike that shifted copies meet {best.chance[1]:.0%} of the roads")
+    if watched.near is not None and not places:
+        told.append("perhaps the circle given is wrong: nothing outside it was tried")
+    return told or ["agreement: nothing on this map is like the mask; another map may be needed"]

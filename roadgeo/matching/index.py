@@ -1,0 +1,394 @@
+"""The reference index: everything `locate` needs of a road network, in flat arrays that can be memory-mapped.
+
+Intersections are stored sorted by bucket of one grid, which also lists the road segments; the table of triple codes
+(`kernels.triples`) points into them. Positions are metres from the plane's origin.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Mapping
+from dataclasses import asdict, dataclass, fields, replace
+from typing import Any
+
+import numpy as np
+
+from roadgeo._arrays import AnyArray, Float32Array, FloatArray, Int32Array
+from roadgeo._progress import Say, say_nothing
+from roadgeo.errors import IndexFormatError
+from roadgeo.geometry.projection import LocalPlane
+from roadgeo.kernels.buckets import nearest_neighbours
+from roadgeo.kernels.roads import bin_segments
+from roadgeo.kernels.triples import MAX_ANCHORS, MAX_NEIGHBOURS, TABLE, fill_table, find_sides
+from roadgeo.roads.graph import RoadGraph
+from roadgeo.roads.network import RoadNetwork
+
+__all__ = [
+    "IndexOptions",
+    "ReferenceIndex",
+    "build_index",
+    "crop",
+    "neighbour_grid",
+    "pack_tangents",
+    "sort_by_bucket",
+    "unpack_tangents",
+]
+
+#: Branches and tangents beyond these, which hardly an intersection has, serve its codes but are not compared.
+INDEXED_BRANCHES = 6
+
+
+@dataclass(frozen=True)
+class IndexOptions:
+    """How many triples an intersection anchors, and the grid.
+
+    Attributes
+    ----------
+    n_neighbours : int
+        Triples are formed with pairs of an intersection's nearest neighbours; at most 8.
+    min_shape : float
+        Triangles thinner than this (twice the area over the longest side squared) carry no stable code.
+    codes_per_vertex : int
+        At most so many pairs of tangents are coded at a vertex with three tangents or more.
+    min_bucket_m : float
+        Least size of the grid's buckets.
+    simplify_m : float
+        Roads are straightened to this accuracy before they are cut into segments.
+    """
+
+    n_neighbours: int = 8
+    min_shape: float = 0.06
+    codes_per_vertex: int = 2
+    min_bucket_m: float = 150.0
+    simplify_m: float = 0.8
+
+
+@dataclass(frozen=True, eq=False)
+class ReferenceIndex:
+    """A searchable reference; equal to itself only, so that what is made of it can be cached.
+
+    Dimensions: N intersections, R ray columns, K neighbours, S segments, B buckets, T table entries.
+
+    Attributes
+    ----------
+    meta : mapping
+        Plain values: name, crs, origin, grid, shape, options, counts and what the network's own `meta` holds.
+    xy : (N, 2) float64
+        Intersections in plane metres, sorted by bucket.
+    branches : (N, R, 2) int8
+        As `Intersections.branches` gives them.
+    tangents : (N, R) int16
+        Directions of the tangent lines in units of pi / 32767, -1 behind the last.
+    neighbours : (N, K) int32
+        Nearest intersections, -1 where there are fewer.
+    point_starts : (B + 1,) int32
+        Bucket c owns the intersections `point_starts[c]:point_starts[c + 1]`.
+    segments : (S, 4) float32
+        Road segments x1, y1, x2, y2.
+    segment_starts : (B + 1,) int32, segment_ids : int32
+        Segments that touch each bucket.
+    table_starts : (TABLE + 1,) int32, table_entries : (T,) uint64
+        Codes of triples, see `kernels.triples`.
+    source : (N,) int32
+        Row of each intersection in the network's `intersections`.
+    """
+
+    meta: Mapping[str, Any]
+    xy: FloatArray
+    branches: AnyArray
+    tangents: AnyArray
+    neighbours: Int32Array
+    point_starts: Int32Array
+    segments: Float32Array
+    segment_starts: Int32Array
+    segment_ids: Int32Array
+    table_starts: Int32Array
+    table_entries: AnyArray
+    source: Int32Array
+    path: str = ""
+
+    def __len__(self) -> int:
+        """N."""
+        return len(self.xy)
+
+    @property
+    def name(self) -> str:
+        """What the user calls the reference."""
+        return str(self.meta.get("name", ""))
+
+    @property
+    def plane(self) -> LocalPlane:
+        """Where the index's plane lies on Earth."""
+        x, y = self.meta["origin"]
+        return LocalPlane(str(self.meta["crs"]), (float(x), float(y)))
+
+    @property
+    def grid(self) -> tuple[float, float, float]:
+        """(x0, y0, bucket size) in metres."""
+        x0, y0, size = self.meta["grid"]
+        return float(x0), float(y0), float(size)
+
+    @property
+    def shape(self) -> tuple[int, int]:
+        """(columns, rows) of buckets."""
+        columns, rows = self.meta["shape"]
+        return int(columns), int(rows)
+
+    @property
+    def nbytes(self) -> int:
+        """Size of all arrays."""
+        return sum(array.nbytes for array in self.arrays().values())
+
+    def arrays(self) -> dict[str, AnyArray]:
+        """All arrays by name, for writing."""
+        return {f.name: getattr(self, f.name) for f in fields(self) if f.name not in {"meta", "path"}}
+
+    @classmethod
+    def from_parts(cls, meta: Mapping[str, Any], arrays: Mapping[str, AnyArray], path: str = "") -> ReferenceIndex:
+        """Rebuild from what a file held, after checking every shape, type and integer reference.
+
+        Raises
+        ------
+        IndexFormatError
+            If anything could make a kernel read outside its arrays.
+        """
+        _check_parts(meta, arrays, path)
+        return cls(meta=meta, path=path, **{name: arrays[name] for name in _SCHEMA})
+
+
+_SCHEMA: dict[str, tuple[str, int]] = {  # name: (dtype, dimensions)
+    "xy": ("<f8", 2),
+    "branches": ("|i1", 3),
+    "tangents": ("<i2", 2),
+    "neighbours": ("<i4", 2),
+    "point_starts": ("<i4", 1),
+    "segments": ("<f4", 2),
+    "segment_starts": ("<i4", 1),
+    "segment_ids": ("<i4", 1),
+    "table_starts": ("<i4", 1),
+    "table_entries": ("<u8", 1),
+    "source": ("<i4", 1),
+}
+
+
+def _check_parts(meta: Mapping[str, Any], arrays: Mapping[str, AnyArray], path: str) -> None:
+    def require(condition: bool, what: str) -> None:
+        if not condition:
+            raise IndexFormatError(f"{path or 'index'}: {what}; rebuild it with `roadgeo index`")
+
+    def is_number(value: object) -> bool:
+        return isinstance(value, (int, float)) and -1e15 < value < 1e15
+
+    for name, (dtype, ndim) in _SCHEMA.items():
+        require(name in arrays, f"array {name!r} is missing")
+        array = arrays[name]
+        require(array.dtype == np.dtype(dtype) and array.ndim == ndim, f"array {name!r} has the wrong type or shape")
+    grid, shape, origin = meta.get("grid"), meta.get("shape"), meta.get("origin")
+    require(isinstance(grid, (list, tuple)) and len(grid) == 3 and all(map(is_number, grid)), "bad grid")
+    require(isinstance(origin, (list, tuple)) and len(origin) == 2 and all(map(is_number, origin)), "bad origin")
+    require(isinstance(shape, (list, tuple)) and len(shape) == 2 and all(type(s) is int for s in shape), "bad shape")
+    require(isinstance(meta.get("crs"), str), "no CRS")
+    assert grid is not None  # noqa: S101 - for the type checker; `require` has raised
+    assert shape is not None  # noqa: S101
+    require(grid[2] > 0 and min(shape) > 0 and shape[0] * shape[1] < 2**31, "bad grid")
+    n = len(arrays["xy"])
+    n_buckets = shape[0] * shape[1]
+    require(arrays["xy"].shape == (n, 2) and n < 2**31, "bad positions")
+    columns = arrays["tangents"].shape[1]
+    require(2 <= columns <= 32 and arrays["tangents"].shape == (n, columns), "bad tangents")
+    require(arrays["branches"].shape == (n, columns, 2), "bad branches")
+    k = arrays["neighbours"].shape[1]
+    require(1 <= k <= MAX_NEIGHBOURS and arrays["neighbours"].shape == (n, k), "bad neighbours")
+    require(arrays["segments"].shape[1] == 4 and arrays["source"].shape == (n,), "bad segments")
+    for starts, total, size in (
+        ("point_starts", n, n_buckets),
+        ("segment_starts", len(arrays["segment_ids"]), n_buckets),
+        ("table_starts", len(arrays["table_entries"]), TABLE),
+    ):
+        array = arrays[starts]
+        require(array.shape == (size + 1,), f"{starts} has the wrong length")
+        require(int(array[0]) == 0 and int(array[-1]) == total, f"{starts} does not cover its array")
+        require(bool((array[1:] >= array[:-1]).all()), f"{starts} is not ascending")
+    if n:
+        neighbours = arrays["neighbours"]
+        require(int(neighbours.min()) >= -1 and int(neighbours.max()) < n, "a neighbour is out of range")
+    ids = arrays["segment_ids"]
+    require(
+        len(ids) == 0 or (int(ids.min()) >= 0 and int(ids.max()) < len(arrays["segments"])),
+        "a segment id is out of range",
+    )
+
+
+def check_table(index: ReferenceIndex) -> None:
+    """Check that every table entry points to intersections that exist.
+
+    `from_parts` leaves that to the kernels, which believe no entry: it would read the whole table.
+    """
+    entries = index.table_entries
+    anchors = (entries >> np.uint64(40)).astype(np.int64)
+    if len(anchors) == 0:
+        return
+    if int(anchors.max()) >= len(index):
+        raise IndexFormatError("a table entry is out of range; rebuild the index with `roadgeo index`")
+    for shift in (37, 34):
+        slots = ((entries >> np.uint64(shift)) & np.uint64(7)).astype(np.int64)
+        if int(slots.max()) >= index.neighbours.shape[1] or (index.neighbours[anchors, slots] < 0).any():
+            raise IndexFormatError("a table entry is out of range; rebuild the index with `roadgeo index`")
+
+
+def neighbour_grid(xy: FloatArray, min_bucket: float) -> tuple[tuple[float, float, float], tuple[int, int]]:
+    """Return a grid (x0, y0, bucket size) over the box around (N, 2) points, and its (columns, rows).
+
+    It has at most 16 N + 1 buckets.
+    """
+    low, high = xy.min(axis=0), xy.max(axis=0)
+    width, height = (float(side) for side in high - low)
+    size = max(min_bucket, math.sqrt(width * height / (4 * len(xy))), max(width, height) / (4 * len(xy)))
+    return (float(low[0]), float(low[1]), size), (int(width / size) + 1, int(height / size) + 1)
+
+
+def sort_by_bucket(
+    xy: FloatArray, grid: tuple[float, float, float], shape: tuple[int, int]
+) -> tuple[Int32Array, Int32Array]:
+    """Return the order that sorts points by bucket, and the (B + 1,) starts of the buckets in that order."""
+    columns = np.clip(np.floor((xy[:, 0] - grid[0]) / grid[2]).astype(np.int64), 0, shape[0] - 1)
+    rows = np.clip(np.floor((xy[:, 1] - grid[1]) / grid[2]).astype(np.int64), 0, shape[1] - 1)
+    bucket = rows * shape[0] + columns
+    counts = np.bincount(bucket, minlength=shape[0] * shape[1])
+    starts = np.concatenate(([0], np.cumsum(counts))).astype(np.int32)
+    return np.argsort(bucket, kind="stable").astype(np.int32), starts
+
+
+def _cut_segments(graph: RoadGraph, tolerance_m: float) -> Float32Array:
+    """Straighten the edges and cut them into (S, 4) segments."""
+    import shapely
+
+    if graph.n_edges == 0:
+        return np.empty((0, 4), np.float32)
+    owner = np.repeat(np.arange(graph.n_edges), np.diff(graph.offsets))
+    lines = shapely.simplify(shapely.linestrings(graph.coords, indices=owner), tolerance_m, preserve_topology=False)
+    coords, owner = shapely.get_coordinates(lines, return_index=True)
+    inside = owner[1:] == owner[:-1]
+    segments = np.hstack([coords[:-1], coords[1:]])[inside]
+    return np.asarray(segments, np.float32)
+
+
+def pack_tangents(tangents: Float32Array) -> AnyArray:
+    """Return tangent directions as stored: (N, R) int16, units of pi / 32767, -1 for NaN."""
+    return np.where(np.isnan(tangents), -1, np.round(np.nan_to_num(tangents) * (32767 / math.pi))).astype(np.int16)
+
+
+def unpack_tangents(packed: AnyArray) -> Float32Array:
+    """Undo `pack_tangents`: (N, R) float32 radians, NaN for -1."""
+    return np.asarray(np.where(packed >= 0, packed * np.float32(math.pi / 32767), np.nan), np.float32)
+
+
+def _tabulate(
+    xy: FloatArray, tangents: Float32Array, branches: AnyArray, neighbours: Int32Array, options: IndexOptions
+) -> tuple[Int32Array, AnyArray]:
+    """Return starts and entries of the table of triples (see `kernels.triples`)."""
+    sides = np.empty(tangents.shape, np.int8)
+    find_sides(tangents, branches, sides)
+    counts = np.zeros(TABLE + 1, np.int64)
+    shape_limit = (options.min_shape, options.codes_per_vertex)
+    total = fill_table(xy, tangents, sides, neighbours, *shape_limit, counts, np.empty(0, np.uint64))
+    starts = np.cumsum(counts)
+    entries = np.empty(total, np.uint64)
+    fill_table(xy, tangents, sides, neighbours, *shape_limit, starts.copy(), entries)
+    return starts.astype(np.int32), entries
+
+
+def crop(index: ReferenceIndex, center: tuple[float, float], radius_m: float) -> ReferenceIndex:
+    """Return a reference with the intersections within a circle only; all roads stay.
+
+    Neighbours and triples are those of the intersections left, so that a small part of a large map is searched as
+    quickly and as thoroughly as a small map.
+    """
+    inside = np.hypot(*(index.xy - center).T) <= radius_m
+    (kept,) = np.nonzero(inside)
+    buckets = np.repeat(np.arange(len(index.point_starts) - 1), np.diff(index.point_starts))
+    point_starts = np.concatenate(([0], np.cumsum(np.bincount(buckets[kept], minlength=len(index.point_starts) - 1))))
+    point_starts = point_starts.astype(np.int32)
+    xy, branches = np.ascontiguousarray(index.xy[kept]), np.ascontiguousarray(index.branches[kept])
+    packed = np.ascontiguousarray(index.tangents[kept])
+    options = IndexOptions(n_neighbours=index.neighbours.shape[1])
+    neighbours = nearest_neighbours(xy, point_starts, index.grid, index.shape, options.n_neighbours)
+    table_starts, entries = _tabulate(xy, unpack_tangents(packed), branches, neighbours, options)
+    return replace(
+        index,
+        xy=xy,
+        branches=branches,
+        tangents=packed,
+        neighbours=neighbours,
+        point_starts=point_starts,
+        table_starts=table_starts,
+        table_entries=entries,
+        source=index.source[kept],
+    )
+
+
+def build_index(network: RoadNetwork, options: IndexOptions | None = None, say: Say = say_nothing) -> ReferenceIndex:
+    """Index a road network.
+
+    Raises
+    ------
+    RoadSourceError
+        If there are fewer than three intersections.
+    """
+    from roadgeo.errors import RoadSourceError
+
+    options = options or IndexOptions()
+    found = network.intersections
+    if len(found) < 3:
+        raise RoadSourceError(f"the roads have {len(found)} intersections, at least 3 are needed: take a larger area")
+    if len(found) > MAX_ANCHORS:
+        raise RoadSourceError(
+            f"the roads have {len(found):,} intersections, at most {MAX_ANCHORS:,} can be indexed: split the area"
+        )
+    what = f"indexing {len(found):,} intersections"
+    say(what, 0.0)
+    segments = _cut_segments(network.graph, options.simplify_m)
+    grid, shape = neighbour_grid(found.xy, options.min_bucket_m)
+    order, point_starts = sort_by_bucket(found.xy, grid, shape)
+    xy = np.ascontiguousarray(found.xy[order])
+    tangents = np.ascontiguousarray(found.tangents[order])
+    neighbours = nearest_neighbours(xy, point_starts, grid, shape, options.n_neighbours)
+
+    say(what, 0.2)
+    counts = np.zeros(shape[0] * shape[1] + 1, np.int64)
+    total = bin_segments(segments, grid, shape, counts, np.empty(0, np.int32))
+    segment_starts = np.cumsum(counts).astype(np.int32)
+    segment_ids = np.empty(total, np.int32)
+    bin_segments(segments, grid, shape, segment_starts.astype(np.int64), segment_ids)
+
+    say(what, 0.4)
+    branches = np.ascontiguousarray(found.branches()[order])
+    table_starts, entries = _tabulate(xy, tangents, branches, neighbours, options)
+
+    meta = {
+        **network.meta,
+        "crs": network.plane.crs,
+        "origin": list(network.plane.origin),
+        "grid": list(grid),
+        "shape": list(shape),
+        "index_options": asdict(options),
+        "n_intersections": len(xy),
+        "n_segments": len(segments),
+    }
+    index = ReferenceIndex(
+        meta=meta,
+        xy=xy,
+        branches=np.ascontiguousarray(branches[:, :INDEXED_BRANCHES]),
+        tangents=pack_tangents(tangents[:, :INDEXED_BRANCHES]),
+        neighbours=neighbours,
+        point_starts=point_starts,
+        segments=segments,
+        segment_starts=segment_starts,
+        segment_ids=segment_ids,
+        table_starts=table_starts,
+        table_entries=entries,
+        source=order,
+    )
+    for array in index.arrays().values():
+        array.setflags(write=False)  # as in one opened from a file, so that kernels are compiled once for both
+    return index

@@ -1,0 +1,53 @@
+"""A road mask becomes a query: traced, simplified, and its intersections found, by the calls that draw a reference."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, field
+
+from roadgeo.geometry.mask import RoadMask
+from roadgeo.matching.scene import Scene, SceneOptions, prepare_scene
+from roadgeo.roads.graph import RoadGraph
+from roadgeo.roads.intersections import IntersectionOptions, find_intersections
+from roadgeo.roads.simplification import SimplifyOptions, simplify
+from roadgeo.roads.vectorization import VectorizeOptions, vectorize
+
+__all__ = ["QueryOptions", "trace_query"]
+
+
+@dataclass(frozen=True)
+class QueryOptions:
+    """How a mask becomes intersections. Names ending in `_widths` count road widths."""
+
+    vectorize: VectorizeOptions = field(default_factory=VectorizeOptions)
+    merge_widths: float = 1.4
+    fuse_widths: float = 1.0
+    stub_widths: float = 1.5
+    tangent_widths: float = 4.5
+    skip_widths: float = 0.6
+    branch_widths: float = 0.8
+    scene: SceneOptions = field(default_factory=SceneOptions)
+
+
+def trace_query(mask: RoadMask, options: QueryOptions | None = None) -> tuple[Scene, RoadGraph]:
+    """Vectorize a mask and prepare it for matching; the same calls as for a reference, in units of its road width."""
+    options = options or QueryOptions()
+    traced = vectorize(mask, options.vectorize)
+    width = traced.road_width_px
+    graph = simplify(
+        traced.graph,
+        SimplifyOptions(
+            merge_radius=options.merge_widths * width,
+            fuse_distance=options.fuse_widths * width,
+            stub_length=options.stub_widths * width,
+        ),
+    )
+    found = find_intersections(
+        graph,
+        IntersectionOptions(
+            tangent_length=options.tangent_widths * width,
+            skip_length=options.skip_widths * width,
+            min_branch_length=options.branch_widths * width,
+        ),
+    )
+    height, wide = mask.shape
+    return prepare_scene(graph, found, (wide, height), mask.observed, options.scene), graph

@@ -1,0 +1,176 @@
+"""Refinement of a homography to the map's accuracy: road points and matched intersections against the reference."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass
+
+import numpy as np
+
+from roadgeo._arrays import FloatArray, IntArray
+from roadgeo.kernels.adjustment import adjust, point_row
+from roadgeo.matching.index import ReferenceIndex
+from roadgeo.matching.scene import Scene
+
+__all__ = ["RefineOptions", "Refined", "refine"]
+
+
+@dataclass(frozen=True)
+class RefineOptions:
+    """How points are weighted.
+
+    Attributes
+    ----------
+    max_radius_m, max_radius_px : float
+        Points whose place is less sure than a third of their sum do not take part yet.
+    sigma_m, sigma_px : float
+        Standard deviation of a road point across the road, the map's and the mask's, and scale of the Cauchy weights.
+    intersection_weight : float
+        Weight of a matched intersection against an independent road point: its centre is less certain.
+    max_turn_deg : float
+        Roads count as partners when their directions differ by less.
+    perspective_sigma : float
+        Prior standard deviation of the two perspective parameters.
+    least_support : float
+        Matches take part when at least this share of their neighbours are matched.
+    n_cells, least_share : int, float
+        The frame is divided into so many cells a side; a cell takes part when at least this share of its road points
+        meet roads.
+    correlation_m : float
+        Errors of the map and of the mask keep their sign over about this length of road: points closer than that are no
+        independent observations.
+    sigma_floor_m, sigma_floor_px : float
+        Accuracy of the map and of the mask as a whole, which no number of points improves: lines are drawn and thinned
+        to whole pixels. Fitted to the corners of training masks.
+    """
+
+    max_radius_m: float = 20.0
+    max_radius_px: float = 10.0
+    sigma_m: float = 1.2
+    sigma_px: float = 0.9
+    intersection_weight: float = 0.3
+    max_turn_deg: float = 25.0
+    perspective_sigma: float = 0.5
+    least_support: float = 0.3
+    n_cells: int = 8
+    least_share: float = 0.5
+    correlation_m: float = 60.0
+    sigma_floor_m: float = 0.1
+    sigma_floor_px: float = 0.15
+    n_iterations: int = 15
+    tolerance_m: float = 0.02
+
+
+@dataclass(frozen=True)
+class Refined:
+    """A refined homography and its accuracy.
+
+    Attributes
+    ----------
+    matrix : (3, 3) float64
+        Query plane to reference plane.
+    corner_sigma_m : (4,) float64
+        Standard deviations of the frame's corners: root mean squares of their distances from the truth.
+    rms_m : float
+        Of the road points' distances from the map's roads, robustly.
+    """
+
+    matrix: FloatArray
+    corner_sigma_m: FloatArray
+    rms_m: float
+
+
+def _parameters(matrix: FloatArray, center: FloatArray, half_size: float) -> tuple[FloatArray, FloatArray, float]:
+    """Normalise a homography.
+
+    Return the eight parameters of `kernels.growth`, the reference point under the middle, and the unit in metres.
+    """
+    mapped = matrix @ (center[0], center[1], 1.0)
+    origin = mapped[:2] / mapped[2]
+    linear = (matrix[:2, :2] - np.outer(origin, matrix[2, :2])) / mapped[2]
+    unit = half_size * float(np.sqrt(abs(np.linalg.det(linear))))
+    to_query = np.array([[half_size, 0.0, center[0]], [0.0, half_size, center[1]], [0.0, 0.0, 1.0]])
+    from_reference = np.array([[1.0, 0.0, -origin[0]], [0.0, 1.0, -origin[1]], [0.0, 0.0, unit]])
+    p = from_reference @ matrix @ to_query
+    return (p / p[2, 2]).ravel()[:8], origin, unit
+
+
+def _matrix(p: FloatArray, center: FloatArray, half_size: float, origin: FloatArray, unit: float) -> FloatArray:
+    """Undo `_parameters`."""
+    from_query = np.array([[1.0, 0.0, -center[0]], [0.0, 1.0, -center[1]], [0.0, 0.0, half_size]])
+    to_reference = np.array([[unit, 0.0, origin[0]], [0.0, unit, origin[1]], [0.0, 0.0, 1.0]])
+    matrix = to_reference @ np.append(p, 1.0).reshape(3, 3) @ from_query
+    return np.asarray(matrix / half_size)
+
+
+def _spacing(scene: Scene, unit: float) -> float:
+    """Return the distance between neighbouring road points in metres."""
+    return scene.road_length_px * unit / scene.half_size / max(len(scene.points), 1)
+
+
+def _cells(uv: FloatArray, options: RefineOptions) -> IntArray:
+    """Return the number of the frame's cell that each normalised point lies in."""
+    n = options.n_cells
+    columns = np.clip(((uv + 1.0) * (n / 2.0)).astype(np.int64), 0, n - 1)
+    return np.asarray(columns[:, 1] * n + columns[:, 0])
+
+
+def _corner_rows(p: FloatArray, uv: FloatArray) -> FloatArray:
+    """Return the derivatives (M, 2, 8) of predicted points at normalised query points (M, 2)."""
+    rows = np.empty((len(uv), 2, 8))
+    for i, (u, v) in enumerate(uv):
+        point_row(p, u, v, 1.0, 0.0, rows[i, 0])
+        point_row(p, u, v, 0.0, 1.0, rows[i, 1])
+    return rows
+
+
+def refine(
+    matrix: FloatArray,
+    scene: Scene,
+    index: ReferenceIndex,
+    matched: IntArray,
+    options: RefineOptions | None = None,
+    n_points: int | None = None,
+) -> Refined | None:
+    """Adjust a homography by Gauss-Newton with Cauchy weights; None where that fails.
+
+    Parameters
+    ----------
+    matrix : (3, 3)
+        Query plane to reference plane, right to some metres over part of the frame.
+    matched : (N,) int
+        Map intersection of each query intersection, or -1.
+    n_points : int, optional
+        Use about so many of the scene's road points.
+    """
+    options = options or RefineOptions()
+    center, half_size = scene.center, scene.half_size
+    p, origin, unit = _parameters(matrix, center, half_size)
+    gsd = unit / half_size
+    sigma_m = math.hypot(options.sigma_m, options.sigma_px * gsd)
+    chosen = matched >= 0
+    step = 1 if n_points is None else max(1, len(scene.points) // n_points)
+    points = (scene.points[::step] - center) / half_size
+    # A match whose neighbours found none is more likely chance than luck.
+    around = scene.neighbours[chosen]
+    support = ((matched[around] >= 0) & (around >= 0)).sum(axis=1) / np.maximum((around >= 0).sum(axis=1), 1)
+    chosen[chosen] = support >= options.least_support
+    pairs = (scene.intersections.xy[chosen] - center) / half_size
+    normal = np.empty((8, 8))
+    _, rms = adjust(
+        p, unit, origin[0], origin[1], points, np.ascontiguousarray(scene.directions[::step]), _cells(points, options),
+        min(1.0, _spacing(scene, unit) * step / options.correlation_m),
+        pairs, (index.xy[matched[chosen]] - origin) / unit, _cells(pairs, options), options.intersection_weight,
+        options.n_cells**2, options.least_share, options.max_radius_m + options.max_radius_px * gsd,
+        np.cos(np.radians(options.max_turn_deg)), sigma_m,
+        (sigma_m / unit / options.perspective_sigma) ** 2, options.n_iterations, options.tolerance_m,
+        index.segments, index.segment_starts, index.segment_ids, index.grid, index.shape, normal,
+    )  # fmt: skip
+    if not np.isfinite(rms):
+        return None
+    covariance = np.linalg.inv(normal) * (rms / unit) ** 2
+    rows = _corner_rows(p, (scene.corners - center) / half_size)
+    variance = np.einsum("nai,ij,naj->n", rows, covariance, rows) * unit**2
+    result = _matrix(p, center, half_size, origin, unit)
+    floor = options.sigma_floor_m**2 + (options.sigma_floor_px * gsd) ** 2
+    return Refined(result / result[2, 2], np.sqrt(variance + floor), rms)

@@ -1,0 +1,164 @@
+"""The query as search, verification and refinement see it: intersections, road points, and what was observed."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import cv2
+import numpy as np
+
+from roadgeo._arrays import AnyArray, BoolArray, Float32Array, FloatArray, Int32Array
+from roadgeo.kernels.buckets import nearest_neighbours
+from roadgeo.matching.index import neighbour_grid, sort_by_bucket
+from roadgeo.roads.graph import RoadGraph
+from roadgeo.roads.intersections import Intersections
+
+__all__ = ["Scene", "SceneOptions", "prepare_scene", "query_neighbours", "sample_roads"]
+
+
+@dataclass(frozen=True)
+class SceneOptions:
+    """Sizes of the scene's tables.
+
+    Attributes
+    ----------
+    max_intersections : int
+        Of more, those nearest to the middle of the frame are kept: they place a mask as surely, and time and memory
+        are bounded.
+    """
+
+    max_intersections: int = 5000
+    n_neighbours: int = 12
+    max_road_points: int = 600
+    min_point_spacing_px: float = 6.0
+    field_cells: int = 400
+
+
+@dataclass(frozen=True)
+class Scene:
+    """One query, in the query plane (pixels, y up).
+
+    Dimensions: N intersections, K neighbours, S road points, (h, w) cells of the reduced frame.
+
+    Attributes
+    ----------
+    size : (width, height) in pixels.
+    intersections : Intersections
+    branches : (N, R, 2) int8
+        As in `Intersections.branches`.
+    neighbours : (N, K) int32
+    points, directions : (S, 2) float64
+        Points spread evenly along the roads, and unit vectors along the road.
+    road_length_px : float
+        Length of all roads.
+    n_edges : int
+        Edges of the road graph: about the number of independent statements that the roads make.
+    field : (h, w) float32
+        Distance from each cell to the nearest road, in cells; rows downwards as in the image.
+    field_scale : float
+        Pixels per cell.
+    observed : (h, w) bool
+    """
+
+    size: tuple[int, int]
+    intersections: Intersections
+    branches: AnyArray
+    neighbours: Int32Array
+    points: FloatArray
+    directions: FloatArray
+    road_length_px: float
+    n_edges: int
+    field: Float32Array
+    field_scale: float
+    observed: BoolArray
+
+    @property
+    def center(self) -> FloatArray:
+        """(2,) middle of the frame."""
+        return np.array([self.size[0] / 2.0, -self.size[1] / 2.0])
+
+    @property
+    def corners(self) -> FloatArray:
+        """(4, 2) corners TL, TR, BR, BL of the frame."""
+        width, height = self.size
+        return np.array([[0, 0], [width, 0], [width, -height], [0, -height]], float)
+
+    @property
+    def half_size(self) -> float:
+        """Half the frame's diagonal in pixels."""
+        return float(np.hypot(*self.size)) / 2.0
+
+
+def query_neighbours(xy: FloatArray, k: int) -> Int32Array:
+    """(N, k) nearest neighbours of each point, in the points' own order."""
+    grid, shape = neighbour_grid(xy, 1.0)
+    order, starts = sort_by_bucket(xy, grid, shape)
+    inside = nearest_neighbours(np.ascontiguousarray(xy[order]), starts, grid, shape, k)
+    neighbours = np.empty_like(inside)
+    neighbours[order] = np.where(inside >= 0, order[inside], -1)
+    return neighbours
+
+
+def sample_roads(graph: RoadGraph, spacing: float) -> tuple[FloatArray, FloatArray]:
+    """Return points every `spacing` along all edges, (S, 2), and the unit directions of the roads there, (S, 2)."""
+    if graph.n_edges == 0:
+        return np.empty((0, 2)), np.empty((0, 2))
+    steps = np.diff(graph.coords, axis=0)
+    lengths = np.hypot(*steps.T)
+    lengths[graph.offsets[1:-1] - 1] = 0.0  # the jump from one edge to the next is no road
+    along = np.concatenate(([0.0], np.cumsum(lengths)))
+    at = np.arange(spacing / 2, along[-1], spacing)
+    at = at[at < along[-1]]  # `arange` may round up to its end
+    segment = np.searchsorted(along, at, side="right") - 1
+    fraction = (at - along[segment]) / lengths[segment]
+    return graph.coords[segment] + fraction[:, None] * steps[segment], steps[segment] / lengths[segment][:, None]
+
+
+def _nearest(found: Intersections, center: FloatArray, most: int) -> Intersections:
+    """Return the `most` intersections nearest to a point (2,), in their own order."""
+    if len(found) <= most:
+        return found
+    kept = np.sort(np.argsort(np.hypot(*(found.xy - center).T), kind="stable")[:most])
+    return Intersections(found.xy[kept], found.rays[kept], found.tangents[kept], found.residual[kept], found.node[kept])
+
+
+def prepare_scene(
+    graph: RoadGraph,
+    intersections: Intersections,
+    size: tuple[int, int],
+    observed: BoolArray | None = None,
+    options: SceneOptions | None = None,
+) -> Scene:
+    """Prepare a vectorized mask for matching; `size` is (width, height), `observed` (height, width)."""
+    options = options or SceneOptions()
+    width, height = size
+    length = float(graph.edge_lengths().sum())
+    spacing = max(options.min_point_spacing_px, length / options.max_road_points)
+    points, directions = sample_roads(graph, spacing)
+    scale = max(1.0, max(size) / options.field_cells)
+    cells = (int(np.ceil(height / scale)), int(np.ceil(width / scale)))
+    canvas = np.full(cells, 255, np.uint8)
+    pixels = np.round((graph.coords * (1.0, -1.0) / scale - 0.5) * 16).astype(np.int32)
+    lines = [pixels[graph.offsets[e] : graph.offsets[e + 1]] for e in range(graph.n_edges)]
+    cv2.polylines(canvas, lines, False, 0, 1, cv2.LINE_8, 4)
+    field = np.asarray(cv2.distanceTransform(canvas, cv2.DIST_L2, 3), np.float32)
+    if observed is None:
+        seen = np.ones(cells, bool)
+    else:
+        seen = cv2.resize(observed.astype(np.uint8), cells[::-1], interpolation=cv2.INTER_AREA) > 0
+    intersections = _nearest(intersections, np.array([width / 2.0, -height / 2.0]), options.max_intersections)
+    k = options.n_neighbours
+    neighbours = query_neighbours(intersections.xy, k) if len(intersections) else np.empty((0, k), np.int32)
+    return Scene(
+        size=size,
+        intersections=intersections,
+        branches=intersections.branches(),
+        neighbours=neighbours,
+        points=points,
+        directions=directions,
+        road_length_px=length,
+        n_edges=graph.n_edges,
+        field=field,
+        field_scale=scale,
+        observed=seen,
+    )

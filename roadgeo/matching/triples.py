@@ -1,0 +1,177 @@
+"""Hypotheses from triples of neighbouring intersections.
+
+For one query intersection (the anchor) all triples with two of its nearest neighbours are looked up in the reference's
+table. Hits of different triples that put the anchor on the same map intersection, with nearly the same affine map,
+make a proposal: one triple alone may agree by chance with thousands of others, two or three that share an anchor hardly
+ever.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Iterator
+from dataclasses import dataclass
+
+import numpy as np
+
+from roadgeo._arrays import AnyArray, FloatArray, Int32Array, IntArray
+from roadgeo.kernels.triples import UNITS, count_alike, find_sides, gather, look_up
+from roadgeo.matching.index import ReferenceIndex
+from roadgeo.roads.intersections import Intersections
+
+__all__ = ["Proposals", "TripleOptions", "larger", "propose", "smaller"]
+
+
+#: Intersections of the maps that bounds are made for: a city's.
+_USUAL_SIZE = 15_000
+
+
+def larger(n_reference: int) -> float:
+    """Return the root of how many times a map of so many intersections is larger than a usual one, at least 1."""
+    return math.sqrt(max(1.0, n_reference / _USUAL_SIZE))
+
+
+def smaller(n_reference: int) -> float:
+    """Return the root of how many times it is smaller, at least 1."""
+    return math.sqrt(max(1.0, _USUAL_SIZE / max(n_reference, 1)))
+
+
+@dataclass(frozen=True)
+class TripleOptions:
+    """How triples are looked up and gathered.
+
+    Attributes
+    ----------
+    n_neighbours : int
+        Triples are formed with pairs of so many nearest neighbours of the anchor.
+    min_shape : float
+        Thinner triangles are left out (see `kernels.triples.orient`); the map's may be thinner still.
+    codes_per_vertex : int
+        Of an intersection with three tangents or more, so many pairs of tangents are looked up.
+    angle_tolerance_deg, ray_tolerance_deg : float
+        How far tangents may turn in the equilateral frame, and branches in the map's.
+    affine_tolerance : float
+        Hits of one proposal may differ by this part of their affine maps' size.
+    spread : bool
+        Whether anchors come spread over the frame, from its middle outwards, or those first whose triples are rare.
+        Rare triples are soon looked up, but often rare because they are wrong: on `noisy` and `hard` training masks 9 %
+        of the rarest sixth of the anchors lead to the place, and 44 % of the commonest.
+    max_weighed : int
+        Of more intersections, evenly chosen ones may become anchors: to weigh all would take longer than to use some.
+    max_hits, max_compared : int
+        An anchor's triples are looked up, the rarest first, until so many were found or compared: on a map of 15,000
+        intersections, and on a larger one more by the root of the ratio.
+    """
+
+    n_neighbours: int = 8
+    min_shape: float = 0.12
+    codes_per_vertex: int = 1
+    angle_tolerance_deg: float = 8.0
+    ray_tolerance_deg: float = 25.0
+    affine_tolerance: float = 0.3
+    spread: bool = False
+    max_weighed: int = 1000
+    max_hits: int = 12_000
+    max_compared: int = 400_000
+
+    def bounds(self, n_reference: int) -> tuple[int, int]:
+        """Return `max_hits` and `max_compared` for a map of so many intersections."""
+        return int(self.max_hits * larger(n_reference)), int(self.max_compared * larger(n_reference))
+
+
+@dataclass(frozen=True)
+class Proposals:
+    """What one anchor proposes. Dimensions: M proposals, K neighbour slots.
+
+    Attributes
+    ----------
+    anchor : int
+        The query intersection.
+    reference : (M,) int
+        Map intersections it may be.
+    partners : (M, K) int
+        Map intersections of the anchor's neighbours, -1 where not placed.
+    affine : (M, 4) float64
+        The 2 x 2 map (row-major) from query to reference around the anchor.
+    placed : (M,) int
+        Neighbours placed; proposals stand in descending order of it.
+    """
+
+    anchor: int
+    reference: IntArray
+    partners: IntArray
+    affine: FloatArray
+    placed: IntArray
+    n_tuples: int
+    n_candidates: int
+    n_hits: int
+
+
+def propose(
+    query: Intersections,
+    branches: AnyArray,
+    neighbours: Int32Array,
+    index: ReferenceIndex,
+    scale: tuple[float, float],
+    min_ratio: float,
+    options: TripleOptions,
+) -> Iterator[Proposals]:
+    """Yield the proposals of one anchor after another (see `TripleOptions.spread`)."""
+    neighbours = np.ascontiguousarray(neighbours[:, : options.n_neighbours])
+    k = neighbours.shape[1]
+    weighed = np.arange(0, len(query), max(1, math.ceil(len(query) / options.max_weighed)))
+    sides = np.empty(query.tangents.shape, np.int8)
+    find_sides(query.tangents, branches, sides)
+    costs = np.empty((len(weighed), k, k), np.int64)
+    count_alike(
+        query.xy, query.tangents, sides, neighbours, weighed, options.min_shape, options.codes_per_vertex,
+        index.table_starts, costs,
+    )  # fmt: skip
+    tolerance = round(options.angle_tolerance_deg * UNITS / 180.0)
+    max_hits, max_compared = options.bounds(len(index))
+    ids = np.empty((max_hits, 5), np.int64)
+    affine = np.empty((max_hits, 4))
+    usable = costs >= 0
+    total = np.where(usable, costs, 0).sum(axis=(1, 2))
+    n_usable = usable.sum(axis=(1, 2))
+    able = np.flatnonzero(n_usable >= 3)
+    rarest = able[np.argsort(total[able] / n_usable[able], kind="stable")]
+    for i in _farthest_first(query.xy[weighed[able]], able) if options.spread else rarest:
+        a = weighed[i]
+        slots = np.argwhere(usable[i])
+        slots = slots[np.argsort(costs[i][usable[i]], kind="stable")]
+        n_hits = n_compared = 0
+        for s, t in slots:
+            if n_hits == max_hits or n_compared > max_compared:
+                break
+            n_hits, compared = look_up(
+                query.xy, branches, query.tangents, sides, a, s, t, neighbours, options.codes_per_vertex, tolerance,
+                np.cos(np.radians(options.ray_tolerance_deg)),
+                index.xy, index.branches, index.neighbours, index.table_starts, index.table_entries, scale, min_ratio,
+                ids, affine, n_hits,
+            )  # fmt: skip
+            n_compared += compared
+        out_ids = np.empty((max(n_hits // 2, 1), k + 1), np.int64)
+        out_affine = np.empty((len(out_ids), 4))
+        out_placed = np.empty(len(out_ids), np.int64)
+        order = np.argsort(ids[:n_hits, 0], kind="stable")
+        n = gather(ids, affine, order, k, options.affine_tolerance, out_ids, out_affine, out_placed)
+        best = np.argsort(-out_placed[:n], kind="stable")
+        yield Proposals(
+            int(a), out_ids[best, 0], out_ids[best, 1:], out_affine[best], out_placed[best],
+            len(slots), n_compared, n_hits,
+        )  # fmt: skip
+
+
+def _farthest_first(xy: FloatArray, names: IntArray) -> Iterator[int]:
+    """Yield the name of the point nearest to the middle of all, then always of the one farthest from those before."""
+    if len(xy) == 0:
+        return
+    away = -np.hypot(*(xy - (xy.min(axis=0) + xy.max(axis=0)) / 2.0).T)
+    nearest = np.full(len(xy), np.inf)
+    for _ in range(len(xy)):
+        i = int(np.argmax(away))
+        yield int(names[i])
+        nearest = np.minimum(nearest, np.hypot(*(xy - xy[i]).T))
+        nearest[i] = -1.0
+        away = nearest

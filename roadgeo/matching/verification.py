@@ -1,0 +1,204 @@
+"""How strongly a place is supported, against chance on this very map.
+
+Three kinds of evidence are counted, each once: intersections of the query that meet one of the map with agreeing
+branches (those that made the hypothesis left out), road points of the query that lie on a road of the map, and roads of
+the map inside the footprint that the query shows. What chance would give is measured at hand: the same query is laid
+over the same map at many shifted positions, and the best of those is the null. In a city of equal blocks a shift by one
+block fits almost as well, and then even a good fit is weak evidence.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+
+from roadgeo._arrays import FloatArray, IntArray
+from roadgeo.kernels.growth import match_all
+from roadgeo.kernels.roads import backward_agreement, forward_distances
+from roadgeo.matching.index import ReferenceIndex
+from roadgeo.matching.scene import Scene
+
+__all__ = ["Agreement", "VerifyOptions", "agreement", "chance_agreement", "log10_odds", "tolerance_m"]
+
+
+@dataclass(frozen=True)
+class VerifyOptions:
+    """Tolerances and the null model.
+
+    Attributes
+    ----------
+    map_sigma_m : float
+        Usual distance between a mapped road and the road.
+    pixel_sigma_px : float
+        Usual error of a traced road in pixels.
+    n_shifts : int
+        Shifted positions of the null model.
+    saturation : float
+        However many intersections or roads agree, they count as fewer than so many independent trials: chance varies
+        from place to place by more than a binomial law allows, and no number of trials helps against that. Fitted to
+        the best wrong places of training queries whose true place was forbidden.
+    promising : float
+        Log10 odds that a place must reach against the least chance seen so far before a null of its own is measured.
+        They are an upper bound: below 1.5 a place is neither located (3.5) nor within the margin (2.0) of one that is.
+    """
+
+    map_sigma_m: float = 1.8
+    pixel_sigma_px: float = 1.0
+    max_turn_deg: float = 25.0
+    ray_tolerance_deg: float = 25.0
+    backward_step_m: float = 12.0
+    shift_m: tuple[float, float] = (30.0, 320.0)
+    n_shifts: int = 150
+    n_null_points: int = 150
+    saturation: float = 60.0
+    promising: float = 1.5
+
+    @property
+    def ray_cos(self) -> float:
+        """Cosine of the angle within which branches agree."""
+        return math.cos(math.radians(self.ray_tolerance_deg))
+
+
+@dataclass(frozen=True)
+class Agreement:
+    """Hits and trials of the three kinds of evidence."""
+
+    matched: int
+    tested: int
+    forward: float
+    backward: float
+    n_seen: int
+
+    @property
+    def rate(self) -> float:
+        """Share of intersections matched."""
+        return self.matched / max(self.tested, 1)
+
+
+def tolerance_m(gsd_m: float, options: VerifyOptions) -> float:
+    """Three standard deviations of a road's place, map and mask together, in metres."""
+    return 3.0 * math.hypot(options.map_sigma_m, options.pixel_sigma_px * gsd_m)
+
+
+def _bounds(matrix: FloatArray, scene: Scene) -> FloatArray:
+    corners = np.c_[scene.corners, np.ones(4)] @ matrix.T
+    ground = corners[:, :2] / corners[:, 2:]
+    return np.concatenate([ground.min(axis=0), ground.max(axis=0)])
+
+
+def agreement(
+    matrix: FloatArray,
+    scene: Scene,
+    index: ReferenceIndex,
+    gsd_m: float,
+    seeds: IntArray,
+    options: VerifyOptions,
+) -> tuple[Agreement, IntArray, FloatArray]:
+    """Compare query and map under `matrix`.
+
+    `seeds` are query intersections that made the hypothesis: they are matched but not counted.
+
+    Returns
+    -------
+    Agreement
+    matched : (N,) int64
+        Map intersection of each query intersection, or -1.
+    distance : (N,) float64
+        Metres between them.
+    """
+    tolerance = tolerance_m(gsd_m, options)
+    found = scene.intersections
+    matched = np.empty(len(found), np.int64)
+    distance = np.empty(len(found))
+    match_all(
+        matrix, found.xy, scene.branches, 1.5 * tolerance, options.ray_cos, 0.0, 0.0, True,
+        index.xy, index.branches, index.point_starts, index.grid, index.shape, matched, distance,
+    )  # fmt: skip
+    counted = np.ones(len(found), bool)
+    counted[seeds] = False
+    out = np.empty(len(scene.points))
+    min_cos = math.cos(math.radians(options.max_turn_deg))
+    roads = (index.segments, index.segment_starts, index.segment_ids, index.grid, index.shape)
+    near = forward_distances(matrix, scene.points, scene.directions, tolerance, min_cos, 0.0, 0.0, *roads, out)
+    seen, shown = backward_agreement(
+        np.asarray(np.linalg.inv(matrix), float), _bounds(matrix, scene), options.backward_step_m, tolerance, 0.0, 0.0,
+        *roads,
+        scene.field, scene.field_scale, scene.observed,
+    )  # fmt: skip
+    result = Agreement(
+        int((matched[counted] >= 0).sum()), int(counted.sum()),
+        near / max(len(out), 1), shown / max(seen, 1), seen,
+    )  # fmt: skip
+    return result, matched, distance
+
+
+def chance_agreement(
+    matrix: FloatArray, scene: Scene, index: ReferenceIndex, gsd_m: float, options: VerifyOptions, every: int = 1
+) -> tuple[float, float, float]:
+    """Return the rates (intersections, forward, backward) that the best shifted positions reach.
+
+    Shifts lie on a sunflower spiral between the two radii of `shift_m`, so that all directions and distances are met
+    evenly. Of only `every` n-th of them the best cannot be better than of all: that is a quick lower bound.
+    """
+    tolerance = tolerance_m(gsd_m, options)
+    found = scene.intersections
+    matched = np.empty(len(found), np.int64)
+    distance = np.empty(len(found))
+    thin = max(1, len(scene.points) // options.n_null_points)
+    points, directions = (np.ascontiguousarray(array[::thin]) for array in (scene.points, scene.directions))
+    out = np.empty(len(points))
+    min_cos = math.cos(math.radians(options.max_turn_deg))
+    roads = (index.segments, index.segment_starts, index.segment_ids, index.grid, index.shape)
+    inverse, bounds = np.asarray(np.linalg.inv(matrix), float), _bounds(matrix, scene)
+    k = np.arange(0, options.n_shifts, every)
+    low, high = options.shift_m
+    radius = np.sqrt(low**2 + (high**2 - low**2) * (k + 0.5) / options.n_shifts)
+    angle = k * math.pi * (3.0 - math.sqrt(5.0))
+    rates = np.empty((len(k), 3))
+    for i, (dx, dy) in enumerate(zip(radius * np.cos(angle), radius * np.sin(angle), strict=True)):
+        n = match_all(
+            matrix, found.xy, scene.branches, 1.5 * tolerance, options.ray_cos, dx, dy, False,
+            index.xy, index.branches, index.point_starts, index.grid, index.shape, matched, distance,
+        )  # fmt: skip
+        near = forward_distances(matrix, points, directions, tolerance, min_cos, dx, dy, *roads, out)
+        rates[i, 0] = n / max(len(found), 1)
+        rates[i, 1] = near / max(len(out), 1)
+    best = np.argsort(-rates[:, 1])[:12]
+    for i in best:
+        dx, dy = radius[i] * math.cos(angle[i]), radius[i] * math.sin(angle[i])
+        seen, shown = backward_agreement(
+            inverse, bounds, 2 * options.backward_step_m, tolerance, dx, dy, *roads,
+            scene.field, scene.field_scale, scene.observed,
+        )  # fmt: skip
+        rates[i, 2] = shown / max(seen, 1)
+    return float(rates[:, 0].max()), float(rates[:, 1].max()), float(rates[best, 2].max())
+
+
+def _information(rate: float, chance: float) -> float:
+    """Log-likelihood ratio in nats per trial: a rate against the chance rate, negative where the rate is the lower."""
+    rate = min(max(rate, 1e-3), 1.0 - 1e-3)
+    chance = min(max(chance, 0.02), 0.98)
+    nats = rate * math.log(rate / chance) + (1.0 - rate) * math.log((1.0 - rate) / (1.0 - chance))
+    return nats if rate > chance else -nats
+
+
+def log10_odds(
+    found: Agreement, chance: Sequence[float] | FloatArray, n_roads: float, n_candidates: int, options: VerifyOptions
+) -> float:
+    """Log10 odds of a place against chance, corrected for the candidates tried.
+
+    Log-likelihood ratios of the three rates against the rates by chance, times the number of independent trials, less
+    the logarithm of the number of places tried.
+    """
+
+    def independent(trials: float) -> float:
+        return trials / (1.0 + trials / options.saturation)
+
+    nats = independent(found.tested) * _information(found.rate, chance[0])
+    # Forward and backward agreement are two views of the same roads: each counts half.
+    both = _information(found.forward, chance[1]) + _information(found.backward, chance[2])
+    nats += independent(0.5 * n_roads) * both
+    return (nats - math.log(max(n_candidates, 1))) / math.log(10.0)

@@ -1,0 +1,1 @@
+"""Where a result leaves: files, pictures, reports."""

@@ -1,0 +1,139 @@
+"""One page for many masks: their footprints on the whole map, and a list with links to the report of each."""
+
+from __future__ import annotations
+
+import html
+import os
+from collections import Counter
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from pathlib import PurePath
+from typing import Any
+from urllib.parse import quote
+
+import numpy as np
+
+from roadgeo.matching.index import ReferenceIndex
+from roadgeo.outputs.report.page import STATUS, footer, render_page, section
+from roadgeo.outputs.report.views import Layer, Window, draw_viewer, draw_whole_map, ring_data
+from roadgeo.outputs.wording import format_lonlat
+from roadgeo.storage.files import write_text
+
+__all__ = ["Entry", "render_batch", "write_batch"]
+
+#: More masks are only counted: the page stays below 3 MB.
+_MAX_LISTED = 3000
+
+_OVERVIEW_BYTES, _VIEW_PX = 200_000, 900
+
+
+@dataclass(frozen=True)
+class Entry:
+    """One mask of a batch.
+
+    Attributes
+    ----------
+    document : mapping
+        `Location.to_dict`, or what the command line prints of a mask that failed.
+    link : str
+        File name of its report beside the page; "" where it has none.
+    """
+
+    document: Mapping[str, Any]
+    link: str = ""
+
+    @property
+    def path(self) -> PurePath:
+        """Of the mask, as it was given."""
+        return PurePath(str(self.document["query"]))
+
+    @property
+    def status(self) -> str:
+        """As in the document."""
+        return str(self.document["status"])
+
+    def wrap(self, content: str) -> str:
+        """Make HTML or SVG a link to the report."""
+        return f'<a href="{html.escape(quote(self.link))}">{content}</a>' if self.link else content
+
+
+def write_batch(path: str | os.PathLike[str], entries: Sequence[Entry], indexes: Sequence[ReferenceIndex]) -> None:
+    """Write `render_batch`, in one step.
+
+    Raises
+    ------
+    OutputError
+        The file cannot be written.
+    """
+    write_text(path, render_batch(entries, indexes))
+
+
+def render_batch(entries: Sequence[Entry], indexes: Sequence[ReferenceIndex]) -> str:
+    """Render what became of many masks as a whole HTML page.
+
+    Parameters
+    ----------
+    indexes : sequence of ReferenceIndex
+        The maps that were searched; those on which nothing was found are left out, but for the first.
+    """
+    counts = Counter(entry.status for entry in entries)
+    said = ", ".join(f"{counts[status]} {words[2:]}" for status, words in STATUS.items() if counts[status])
+    shown = entries[:_MAX_LISTED]
+    left_out = len(entries) - len(shown)
+    maps = [(index, [entry for entry in shown if entry.document.get("reference") == index.name]) for index in indexes]
+    maps = [(index, found) for i, (index, found) in enumerate(maps) if i == 0 or any(map(_has_place, found))]
+    views = [_draw_map(index, found) for index, found in maps]
+    others = [section(f"On {index.name}", view) for (index, _), view in zip(maps[1:], views[1:], strict=True)]
+    note = f'<p class="faint">{left_out} more are not listed; all are in the tables beside this page.</p>'
+    shared = Counter(entry.path.name for entry in shown)
+    items = "".join(_item(entry, shared[entry.path.name] > 1) for entry in shown)
+    listed = f'<ol class="list">{items}</ol>{note if left_out else ""}'
+    named = dict.fromkeys(_credit(index) for index, _ in maps)
+    parts = [section("Masks", listed), *others, footer("; ".join(filter(None, named)))]
+    header = f"<h1>{len(entries)} masks</h1><p>{said}</p>"
+    return render_page(f"{len(entries)} masks", header, f"<main>{views[0]}<aside>{''.join(parts)}</aside></main>")
+
+
+def _credit(index: ReferenceIndex) -> str:
+    return str(index.meta.get("attribution") or "")
+
+
+def _has_place(entry: Entry) -> bool:
+    return bool(entry.document.get("footprint"))
+
+
+def _draw_map(index: ReferenceIndex, entries: Sequence[Entry]) -> str:
+    """Draw a whole map with the footprints that lie on it, each a link."""
+    picture, window = draw_whole_map(index, _OVERVIEW_BYTES, 2 * _VIEW_PX)
+    layers = [Layer("picture", "", picture)]
+    for status in ("ambiguous", "located"):
+        outlines = "".join(_outline(window, entry) for entry in entries if _has_place(entry) and entry.status == status)
+        layers.append(Layer(status, STATUS[status][2:], outlines, '<path d="M3 2h20v10h-20z"/>'))
+    attributes = {"data-frame": "map", "data-west": f"{window.west:.3f}", "data-north": f"{window.north:.3f}"}
+    attributes["style"] = f"--u:{window.width / _VIEW_PX:.4g}"
+    return draw_viewer(
+        f"The footprints on the map {index.name}", window.box, layers, attributes, scale=True, credit=_credit(index)
+    )
+
+
+def _outline(window: Window, entry: Entry) -> str:
+    corners = window.to_svg(np.array(entry.document["footprint"], float))
+    if not np.isfinite(corners).all():
+        return ""
+    return entry.wrap(f'<path d="{ring_data(corners)}"><title>{html.escape(entry.path.name)}</title></path>')
+
+
+def _item(entry: Entry, with_folder: bool) -> str:
+    name = "/".join(entry.path.parts[-2:]) if with_folder else entry.path.name
+    document = entry.document
+    center, sigma, odds = document.get("center"), document.get("corner_sigma_m"), document.get("log10_odds")
+    parts = []
+    if entry.status == "located" and center:
+        parts.append(format_lonlat(center["lon"], center["lat"]))
+        if sigma:
+            parts.append(f"corners ± {max(sigma):.1f} m")
+        if odds is not None:
+            parts.append(f"odds 10<sup>{odds:.1f}</sup>")
+    said = " · ".join(parts) or html.escape(str(document.get("reason", "")))
+    status = f'<span class="status {entry.status}">{STATUS[entry.status]}</span>'
+    return f"<li>{entry.wrap(html.escape(name or 'mask'))} {status}<br><small>{said}</small></li>"

@@ -1,0 +1,77 @@
+"""All footprints of many masks in one GeoPackage and one table (CSV)."""
+
+from __future__ import annotations
+
+import csv
+import io
+from collections.abc import Mapping, Sequence
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from roadgeo.geometry.antimeridian import cut_ring
+from roadgeo.storage.files import write_text
+from roadgeo.storage.geopackage import GeometryType, Layer, write_layers
+from roadgeo.storage.qml import draw_fill
+
+__all__ = ["write_summary"]
+
+_STYLE = draw_fill("31,111,180,40", "31,111,180", 0.5)
+_SHARED = ("query", "status", "reason", "reference")
+_NUMBERS = ("gsd_m", "rotation_deg", "tilt_deg", "n_intersections", "n_matched", "inlier_ratio", "log10_odds")
+
+
+def write_summary(folder: Path, documents: Sequence[Mapping[str, Any]]) -> list[Path]:
+    """Write `roadgeo_summary.gpkg` and `roadgeo_summary.csv`; return their paths.
+
+    The GeoPackage has a layer `footprints` of the located masks, in degrees as their references may lie in different
+    zones, cut at 180 degrees where one lies astride (then all are multipolygons); and a table `others` of all that were
+    not located, with the reasons. The CSV has all masks in their order, the footprints as well-known text.
+
+    Parameters
+    ----------
+    documents : sequence of dict
+        `Location.to_dict` of each mask; for a mask that failed what the command line prints.
+
+    Raises
+    ------
+    OutputError
+        A file cannot be written.
+    """
+    located = [document for document in documents if document["status"] == "located"]
+    others = [document for document in documents if document["status"] != "located"]
+    parts = [cut_ring(np.array(document["footprint_lonlat"], float)) for document in located]
+    shapes: tuple[GeometryType, list[Any]] = ("POLYGON", [rings[0] for rings in parts])
+    if any(len(rings) > 1 for rings in parts):
+        shapes = ("MULTIPOLYGON", parts)
+    footprints = {name: [document[name] for document in located] for name in (*_SHARED, *_NUMBERS)}
+    geopackage, table = folder / "roadgeo_summary.gpkg", folder / "roadgeo_summary.csv"
+    layers = [
+        Layer("footprints", *shapes, footprints, "EPSG:4326", _STYLE, "Ground that the located masks show"),
+        Layer("others", columns={name: [document.get(name) for document in others] for name in _SHARED}),
+    ]
+    write_layers(geopackage, layers)
+    write_text(table, _to_csv(documents))
+    return [geopackage, table]
+
+
+def _to_csv(documents: Sequence[Mapping[str, Any]]) -> str:
+    text = io.StringIO()
+    writer = csv.writer(text, lineterminator="\n")
+    writer.writerow([*_SHARED, "lon", "lat", "crs", "x", "y", *_NUMBERS, "footprint_wkt"])
+    for document in documents:
+        here = document if document["status"] == "located" else {}
+        center = here.get("center") or {}
+        position = [center.get("lon"), center.get("lat"), here.get("crs"), center.get("x"), center.get("y")]
+        numbers = [document.get(name) for name in _NUMBERS]
+        shared = [document.get(name, "") for name in _SHARED]
+        writer.writerow([*shared, *position, *numbers, _to_wkt(here.get("footprint_lonlat"))])
+    return text.getvalue()
+
+
+def _to_wkt(corners: Sequence[Sequence[float]] | None) -> str:
+    if corners is None:
+        return ""
+    rings = [", ".join(f"{lon:.7f} {lat:.7f}" for lon, lat in ring) for ring in cut_ring(np.array(corners, float))]
+    return f"POLYGON (({rings[0]}))" if len(rings) == 1 else f"MULTIPOLYGON ((({')), (('.join(rings)})))"

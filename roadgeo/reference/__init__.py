@@ -1,0 +1,1 @@
+"""A searchable road map: how it is built, stored, opened and listed."""

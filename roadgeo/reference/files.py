@@ -1,0 +1,399 @@
+"""A reference on disk: `REF.gpkg` for people and `REF.index` for the search, which are kept together."""
+
+from __future__ import annotations
+
+import contextlib
+import math
+import os
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass, fields
+from pathlib import Path
+from typing import Any, Literal, TypeAlias
+
+import numpy as np
+
+from roadgeo._arrays import AnyArray
+from roadgeo._progress import Say, say_nothing
+from roadgeo._version import __version__
+from roadgeo.errors import IndexFormatError, OutputError
+from roadgeo.reference.index_file import (
+    FORMAT_VERSION,
+    check_index,
+    dump_index,
+    read_format_version,
+    read_index,
+    read_manifest,
+    remedy,
+)
+from roadgeo.reference.network_file import (
+    computed_digest,
+    dump_network,
+    network_digest,
+    read_meta,
+    read_network,
+    ring_area,
+    stored_digest,
+)
+from roadgeo.roads.intersections import Intersections
+from roadgeo.roads.network import RoadNetwork
+from roadgeo.storage.atomic import publish, staging, sync_file
+from roadgeo.storage.geopackage import open_read_only
+
+__all__ = [
+    "Freshness",
+    "IndexParts",
+    "ReferencePaths",
+    "check_reference",
+    "describe_reference",
+    "open_reference",
+    "rebuild_index",
+    "reference_freshness",
+    "reference_paths",
+    "write_reference",
+]
+
+#: What an index file holds: plain values, and arrays by name.
+IndexParts: TypeAlias = tuple[Mapping[str, Any], Mapping[str, AnyArray]]
+
+#: "no GeoPackage": an index alone, which serves as well. "old format": an index of an earlier roadgeo, and a GeoPackage
+#: from which to build it again.
+Freshness: TypeAlias = Literal["fresh", "stale", "no index", "old format", "no GeoPackage"]
+
+#: Largest distance between the intersections of a tuple whose types are counted, as in the paper's Figure 7 (eq. 8).
+TUPLE_DISTANCE_M = 500.0
+
+
+@dataclass(frozen=True)
+class ReferencePaths:
+    """The two files of a reference."""
+
+    geopackage: Path
+    index: Path
+
+
+def reference_paths(path: str | os.PathLike[str]) -> ReferencePaths:
+    """Name the two files of a reference, given either of them or what they have in common."""
+    given = Path(path)
+    stem = given.with_suffix("") if given.suffix.lower() in {".gpkg", ".index"} else given
+    return ReferencePaths(stem.with_name(f"{stem.name}.gpkg"), stem.with_name(f"{stem.name}.index"))
+
+
+def write_reference(
+    path: str | os.PathLike[str], network: RoadNetwork, parts: IndexParts, say: Say = say_nothing
+) -> ReferencePaths:
+    """Write both files of a reference; a previous one stays usable at every moment.
+
+    Parameters
+    ----------
+    path : path
+        Either file, or what they have in common.
+    network : RoadNetwork
+        As `network_file.as_stored` gives it, so that the index is the one that the GeoPackage would give.
+    parts : (meta, arrays)
+        The index of that network.
+    say : Say
+        Told how much of the GeoPackage is written.
+
+    Raises
+    ------
+    OutputError
+        When the disk is full, the folder is missing or not writable.
+    CrsError
+        When the plane's CRS is unknown.
+    """
+    paths = reference_paths(path)
+    meta, arrays = parts
+    with staging(paths.geopackage) as folder:
+        staged = reference_paths(folder / paths.geopackage.name)
+        dump_network(staged.geopackage, network, say)
+        dump_index(staged.index, meta, arrays, _about(network, meta))
+        sync_file(staged.geopackage)
+        sync_file(staged.index)
+        # Without its index a GeoPackage is still a whole reference, with the index of another one it is not.
+        paths.index.unlink(missing_ok=True)
+        staged.geopackage.replace(paths.geopackage)
+        publish(staged.index, paths.index)
+    return paths
+
+
+def open_reference(
+    path: str | os.PathLike[str], rebuild: Callable[[RoadNetwork], IndexParts] | None = None
+) -> IndexParts:
+    """Open a reference's index.
+
+    Parameters
+    ----------
+    path : path
+        Either file, or what they have in common.
+    rebuild : callable, optional
+        Builds the index of a network, where the file is missing or of an earlier format; the result is stored when the
+        folder allows it.
+
+    Returns
+    -------
+    meta, arrays
+        Plain values, and read-only views of the memory-mapped file.
+
+    Raises
+    ------
+    IndexFormatError
+        When there is no such reference, or its index is missing (without `rebuild`), damaged, hostile or stale.
+    """
+    paths = reference_paths(path)
+    failed = None
+    while True:
+        before = _identities(paths)
+        try:
+            return _open(paths, rebuild)
+        except IndexFormatError:
+            # Another process may have replaced the reference meanwhile: what we saw was half the old one, half the new.
+            # Equal files before and after are no proof, for an index may have come and gone between; twice is.
+            if _identities(paths) == before == failed:
+                raise
+            failed = before
+
+
+def _open(paths: ReferencePaths, rebuild: Callable[[RoadNetwork], IndexParts] | None) -> IndexParts:
+    freshness = reference_freshness(paths.geopackage)
+    if freshness == "stale":
+        raise IndexFormatError(
+            f"{paths.index} is stale: the intersections of {paths.geopackage.name} were changed after it was built; "
+            + remedy(paths.index)
+        )
+    if freshness in {"no index", "old format"} and rebuild is not None:
+        return _rebuild(paths, rebuild)
+    return read_index(paths.index)
+
+
+def rebuild_index(path: str | os.PathLike[str], build: Callable[[RoadNetwork], IndexParts]) -> None:
+    """Build a reference's index again from its GeoPackage alone, whatever index there is.
+
+    Raises
+    ------
+    IndexFormatError
+        There is no such GeoPackage, it is damaged, or it is replaced meanwhile.
+    OutputError
+        The index cannot be written.
+    """
+    paths = reference_paths(path)
+    before = _identities(paths)
+    network = read_network(paths.geopackage)
+    meta, arrays = build(network)
+    with staging(paths.index) as folder:
+        staged = folder / paths.index.name
+        dump_index(staged, meta, arrays, _about(network, meta))
+        if _identities(paths) != before:
+            raise IndexFormatError(f"{paths.geopackage} or its index was replaced meanwhile; try again")
+        publish(staged, paths.index)
+
+
+def reference_freshness(path: str | os.PathLike[str]) -> Freshness:
+    """Tell whether the index is that of the GeoPackage beside it.
+
+    Raises
+    ------
+    IndexFormatError
+        When neither file is there, or either is damaged.
+    """
+    paths = reference_paths(path)
+    if not paths.index.is_file():
+        if not paths.geopackage.is_file():
+            raise IndexFormatError(f"no reference {path}: expected {paths.geopackage}; make it with `roadgeo index`")
+        read_meta(paths.geopackage)
+        return "no index"
+    if paths.geopackage.is_file() and read_format_version(paths.index) < FORMAT_VERSION:
+        return "old format"
+    digest = read_manifest(paths.index)["about"].get("network")
+    if not paths.geopackage.is_file():
+        return "no GeoPackage"
+    return "fresh" if digest == stored_digest(paths.geopackage) else "stale"
+
+
+def describe_reference(path: str | os.PathLike[str]) -> dict[str, Any]:
+    """Describe a reference in plain values; nothing is unpickled.
+
+    Returns
+    -------
+    dict
+        `name`, `freshness`, `files` (sizes in bytes by path), `crs`, `counts`, `meta` (the network's own); with an
+        index also its `format`, `roadgeo` (the version that built it), `memory_bytes` (of the mapped arrays), `extent`
+        (min easting, min northing, max easting, max northing), `road_km`, `area_km2`, `intersections_per_km2`,
+        `tuple_types` (the paper's Figure 7) and `index` (its options and grid).
+
+    Raises
+    ------
+    IndexFormatError
+        As `reference_freshness`.
+    """
+    paths = reference_paths(path)
+    freshness = reference_freshness(path)
+    files = [file for file in (paths.geopackage, paths.index) if file.is_file()]
+    description: dict[str, Any] = {
+        "name": paths.geopackage.stem,
+        "freshness": freshness,
+        "files": {str(file): file.stat().st_size for file in files},
+    }
+    if freshness in {"no index", "old format"}:
+        stored = read_meta(paths.geopackage)
+        own = {key: value for key, value in stored.items() if not key.startswith("roadgeo.")}
+        return description | {"crs": stored.get("roadgeo.crs"), "counts": _row_counts(paths.geopackage), "meta": own}
+    manifest = read_manifest(paths.index)
+    memory = sum(math.prod(entry["shape"]) * np.dtype(entry["dtype"]).itemsize for entry in manifest["arrays"])
+    written = {"format": manifest["format"], "roadgeo": manifest["roadgeo"], "memory_bytes": memory}
+    about = {key: value for key, value in manifest["about"].items() if key not in {"name", "network"}}
+    return description | {"name": manifest["about"].get("name") or description["name"]} | written | about
+
+
+def check_reference(path: str | os.PathLike[str]) -> list[str]:
+    """Verify a reference thoroughly: all digests, all ranges, and that both files agree.
+
+    Returns
+    -------
+    list of str
+        Problems, one sentence each; empty when the reference is sound.
+    """
+    paths = reference_paths(path)
+    if not paths.geopackage.is_file() and not paths.index.is_file():
+        return [f"no reference {path}: expected {paths.geopackage}"]
+    network, problems = None, []
+    if paths.geopackage.is_file():
+        network, found = _check_geopackage(paths.geopackage)
+        problems += found
+    if paths.index.is_file():
+        found = check_index(paths.index)
+        problems += found or _check_content(paths.index, network)
+    return problems
+
+
+# --- building ---------------------------------------------------------------------------------------------------------
+
+
+def _rebuild(paths: ReferencePaths, rebuild: Callable[[RoadNetwork], IndexParts]) -> IndexParts:
+    """Build a missing index, and keep it where that is possible and nobody has written another meanwhile."""
+    before = _identities(paths)
+    network = read_network(paths.geopackage)
+    if _identities(paths) != before:
+        raise IndexFormatError(f"{paths.geopackage} was replaced while it was read; try again")
+    meta, arrays = rebuild(network)
+    # A reference in a read-only folder serves as well; it only costs this time at every opening.
+    with contextlib.suppress(OutputError), staging(paths.index) as folder:
+        staged = folder / paths.index.name
+        dump_index(staged, meta, arrays, _about(network, meta))
+        if _identities(paths) == before:
+            paths.index.unlink(missing_ok=True)
+            publish(staged, paths.index, replace=False)
+    return meta, arrays
+
+
+def _identities(paths: ReferencePaths) -> list[tuple[int, int] | None]:
+    """Return what tells each file from one that replaces it; None where there is none."""
+    found: list[tuple[int, int] | None] = []
+    for path in (paths.geopackage, paths.index):
+        try:
+            status = path.stat()
+            found.append((status.st_ino, status.st_mtime_ns))
+        except FileNotFoundError:
+            found.append(None)
+    return found
+
+
+def _about(network: RoadNetwork, meta: Mapping[str, Any]) -> dict[str, Any]:
+    """Describe a network and its index for people, in plain values."""
+    found, graph = network.intersections, network.graph
+    area_km2 = sum(map(ring_area, network.coverage)) / 1e6
+    low, high = (graph.coords.min(axis=0), graph.coords.max(axis=0)) if graph.n_edges else (np.zeros(2), np.zeros(2))
+    return {
+        "name": str(network.meta.get("name", "")),
+        "network": network_digest(network),
+        "crs": network.plane.crs,
+        "extent": network.plane.to_crs(np.concatenate([[low], [high]])).ravel().tolist(),
+        "counts": {"intersections": len(found), "roads": graph.n_edges, "nodes": graph.n_nodes},
+        "road_km": float(graph.edge_lengths().sum()) / 1e3,
+        "area_km2": area_km2,
+        "intersections_per_km2": len(found) / area_km2 if area_km2 else None,
+        "tuple_types": _count_tuple_types(found, TUPLE_DISTANCE_M),
+        "index": {key: value for key, value in meta.items() if key not in network.meta},
+        "meta": network.meta,
+    }
+
+
+def _count_tuple_types(found: Intersections, d_max: float) -> dict[str, Any]:
+    """Count pairs of intersections within `d_max` (eq. 8) by branch descriptor d_b, the commonest first (Figure 7)."""
+    from scipy.spatial import KDTree
+
+    types, member = np.unique(np.column_stack([found.n_branches, found.n_tangents]), axis=0, return_inverse=True)
+    trees = [KDTree(found.xy[member.ravel() == i]) for i in range(len(types))]
+    counts = []
+    for i, (b1, q1) in enumerate(types.tolist()):
+        for j, (b2, q2) in enumerate(types[: i + 1].tolist()):
+            n = int(trees[i].count_neighbors(trees[j], d_max))
+            pairs = (n - trees[i].n) // 2 if i == j else n
+            if pairs:
+                counts.append({"d_b": [b1, b2, q1, q2], "tuples": pairs})
+    return {"d_max_m": d_max, "types": sorted(counts, key=lambda entry: -entry["tuples"])}
+
+
+def _row_counts(path: Path) -> dict[str, int]:
+    with open_read_only(path) as database:
+        return {
+            layer: int(database.execute(f"SELECT count(*) FROM {layer}").fetchone()[0])  # noqa: S608 - our own names
+            for layer in ("intersections", "roads")
+        }
+
+
+# --- checking ---------------------------------------------------------------------------------------------------------
+
+
+def _check_geopackage(path: Path) -> tuple[RoadNetwork | None, list[str]]:
+    """Read all of a GeoPackage; the network, if it is one, and what is wrong with it."""
+    try:
+        with open_read_only(path) as database:
+            notes = [note for (note,) in database.execute("PRAGMA integrity_check")]
+            orphans = database.execute("PRAGMA foreign_key_check").fetchall()
+        network = read_network(path)
+        digest = computed_digest(path)
+        stale = stored_digest(path) != digest
+    except IndexFormatError as error:
+        return None, [str(error)]
+    problems = [f"{path}: SQLite finds: {note}" for note in notes if note != "ok"]
+    if orphans:
+        problems.append(f"{path}: {len(orphans)} rows refer to tables or metadata that do not exist")
+    if stale:
+        problems.append(f"{path}: its intersections differ from their stored digest")
+    return network, problems
+
+
+def _check_content(path: Path, network: RoadNetwork | None) -> list[str]:
+    """Check that an undamaged index is one that the search can use, and what its GeoPackage gives."""
+    from roadgeo.matching.index import IndexOptions, ReferenceIndex, build_index, check_table
+
+    def are_options(stored: Any) -> bool:
+        """Whether stored options are whole, and no larger than the arrays that they made."""
+        return (
+            type(stored) is dict
+            and stored.keys() == {field.name for field in fields(IndexOptions)}
+            and all(type(value) in (int, float) and math.isfinite(value) for value in stored.values())
+            and stored["n_neighbours"] == index.neighbours.shape[1]
+        )
+
+    manifest = read_manifest(path)
+    try:
+        index = ReferenceIndex.from_parts(*read_index(path), path=str(path))
+        check_table(index)
+    except IndexFormatError as error:
+        return [str(error)]
+    if network is None:
+        return []
+    if manifest["about"].get("network") != network_digest(network):
+        return [f"{path} is stale: it was built from other intersections; {remedy(path)}"]
+    if manifest["roadgeo"] != __version__:  # which may well have built another index
+        return []
+    stored: Any = index.meta.get("index_options")
+    if not are_options(stored):
+        return [f"{path}: its options are none that `roadgeo index` writes; {remedy(path)}"]
+    expected = build_index(network, IndexOptions(**stored)).arrays()
+    return [
+        f"{path}: its array {name!r} is not what the GeoPackage gives; {remedy(path)}"
+        for name, array in index.arrays().items()
+        if not np.array_equal(array, expected[name], equal_nan=array.dtype.kind == "f")
+    ]

@@ -1,0 +1,110 @@
+"""The reference library: references by name, in the user's data folder (or where `ROADGEO_LIBRARY` says)."""
+
+from __future__ import annotations
+
+import difflib
+import os
+import re
+import sys
+import unicodedata
+from pathlib import Path
+
+from roadgeo.errors import IndexFormatError
+from roadgeo.reference.files import ReferencePaths, reference_paths
+from roadgeo.storage.atomic import writing
+
+__all__ = ["library_dir", "list_references", "make_slug", "new_reference", "remove_reference", "resolve_reference"]
+
+
+def library_dir() -> Path:
+    """Folder of the library; it need not exist yet."""
+    given = os.environ.get("ROADGEO_LIBRARY")
+    if given:
+        return Path(given).expanduser()
+    if sys.platform == "win32":
+        base = Path(os.environ.get("LOCALAPPDATA") or Path.home() / "AppData" / "Local")
+    elif sys.platform == "darwin":
+        base = Path.home() / "Library" / "Application Support"
+    else:
+        base = Path(os.environ.get("XDG_DATA_HOME") or Path.home() / ".local" / "share")
+    return base / "roadgeo" / "references"
+
+
+def make_slug(name: str) -> str:
+    """Turn a place's name into a file name: "Boston, MA" is `boston-ma`, "São Paulo" is `sao-paulo`."""
+    letters = (c for c in unicodedata.normalize("NFKD", name.casefold()) if not unicodedata.combining(c))
+    return re.sub(r"[\W_]+", "-", "".join(letters)).strip("-")[:80] or "reference"
+
+
+def new_reference(name: str) -> Path:
+    """Path for a reference of that name in the library, whose folder is made.
+
+    Raises
+    ------
+    OutputError
+        When the folder cannot be made.
+    """
+    folder = library_dir()
+    with writing(folder):
+        folder.mkdir(parents=True, exist_ok=True)
+    return folder / f"{make_slug(name)}.gpkg"
+
+
+def list_references() -> list[Path]:
+    """Every reference in the library, by name; a file without its other half counts."""
+    folder = library_dir()
+    stems = {file.with_suffix("") for suffix in ("gpkg", "index") for file in folder.glob(f"[!.]*.{suffix}")}
+    return sorted(reference_paths(stem).geopackage for stem in stems)
+
+
+def resolve_reference(name_or_path: str | os.PathLike[str]) -> Path:
+    """Find a reference: a file as given, else one in the library by its name.
+
+    Returns
+    -------
+    Path
+        Of its GeoPackage, which may be absent where the index stands alone.
+
+    Raises
+    ------
+    IndexFormatError
+        When there is neither.
+    """
+    name = os.fspath(name_or_path)
+    for paths in (reference_paths(name), _shelved(name)):
+        if paths.geopackage.is_file() or paths.index.is_file():
+            return paths.geopackage
+    known = [path.stem for path in list_references()]
+    near = difflib.get_close_matches(make_slug(name), known, n=1)
+    hint = f"did you mean {near[0]}?" if near else "`roadgeo list` shows the library, `roadgeo index` adds to it"
+    raise IndexFormatError(f"no reference {name!r}, neither as a file nor in {library_dir()}: {hint}")
+
+
+def remove_reference(name: str) -> list[Path]:
+    """Delete a reference from the library.
+
+    Returns
+    -------
+    list of Path
+        The files that are gone.
+
+    Raises
+    ------
+    IndexFormatError
+        When the library has no reference of that name.
+    OutputError
+        When a file cannot be deleted.
+    """
+    paths = _shelved(name)
+    files = [file for file in (paths.index, paths.geopackage) if file.is_file()]
+    if not files:
+        raise IndexFormatError(f"no reference {name!r} in {library_dir()}; `roadgeo list` shows what there is")
+    for file in files:
+        with writing(file):
+            file.unlink()
+    return files
+
+
+def _shelved(name: str) -> ReferencePaths:
+    """Return where the library keeps a reference of that name; a file's suffix may stand behind it."""
+    return reference_paths(library_dir() / make_slug(name.removesuffix(".gpkg").removesuffix(".index")))

@@ -1,0 +1,234 @@
+"""The first straight line: roads to a reference, and how references are opened, updated and built again."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+from dataclasses import asdict, dataclass, field, fields
+from pathlib import Path
+from typing import TYPE_CHECKING, Any, TypeVar
+
+from roadgeo._arrays import AnyArray
+from roadgeo._progress import Say, say_nothing
+from roadgeo.errors import IndexFormatError, RoadSourceError
+from roadgeo.geometry.projection import LocalPlane
+from roadgeo.kernels.triples import MAX_NEIGHBOURS
+from roadgeo.matching.index import IndexOptions, ReferenceIndex, build_index
+from roadgeo.roads.intersections import IntersectionOptions, find_intersections
+from roadgeo.roads.network import RoadNetwork
+from roadgeo.roads.simplification import SimplifyOptions, planarize, simplify
+
+if TYPE_CHECKING:
+    import geopandas as gpd
+
+    from roadgeo.sources.roads import Roads
+
+__all__ = [
+    "BuildOptions",
+    "Reference",
+    "build_network",
+    "build_reference",
+    "open_reference",
+    "rebuild_reference",
+    "stored_options",
+    "update_reference",
+]
+
+
+@dataclass(frozen=True)
+class BuildOptions:
+    """Options of all stages of building a reference; lengths in metres."""
+
+    simplify: SimplifyOptions = field(default_factory=SimplifyOptions)
+    intersections: IntersectionOptions = field(default_factory=IntersectionOptions)
+    index: IndexOptions = field(default_factory=IndexOptions)
+
+
+@dataclass(frozen=True)
+class Reference:
+    """A searchable road map: its index, and the network it was built from where that is at hand."""
+
+    index: ReferenceIndex
+    network: RoadNetwork | None = None
+
+    @property
+    def name(self) -> str:
+        """What the user calls it."""
+        return self.index.name
+
+    def save(self, path: str | Path, say: Say = say_nothing) -> None:
+        """Write `path`.gpkg and `path`.index (see `files.write_reference`)."""
+        from roadgeo.reference.files import write_reference
+
+        if self.network is None:
+            raise RoadSourceError(f"{self.name}: opened from a file, there is nothing new to save")
+        write_reference(path, self.network, (self.index.meta, self.index.arrays()), say)
+
+
+def build_network(
+    lines: Sequence[Any] | AnyArray,
+    plane: LocalPlane,
+    meta: dict[str, Any],
+    options: BuildOptions | None = None,
+    say: Say = say_nothing,
+) -> RoadNetwork:
+    """Draw road lines (shapely, in plane metres) as a mask sees them, and find their intersections.
+
+    The network's `meta` is the one given and the options, for whoever builds its index again or updates it.
+    """
+    from roadgeo.roads.simplification import coverage
+
+    options = options or BuildOptions()
+    say(f"cutting {len(lines):,} lines where they cross")
+    graph = planarize(lines)
+    drawing = "drawing them as a mask shows them"
+    graph = simplify(graph, options.simplify, lambda share: say(drawing, share))
+    found = find_intersections(graph, options.intersections)
+    return RoadNetwork(graph, found, plane, tuple(coverage(graph)), {**meta, "options": asdict(options)})
+
+
+def build_reference(
+    roads: gpd.GeoDataFrame, name: str = "", options: BuildOptions | None = None, meta: dict[str, Any] | None = None
+) -> Reference:
+    """Build a reference from road lines.
+
+    Parameters
+    ----------
+    roads : GeoDataFrame
+        Lines in any CRS.
+
+    Raises
+    ------
+    CrsError, RoadSourceError
+        No CRS; no lines; fewer than three intersections.
+    """
+    from roadgeo.reference.network_file import as_stored
+    from roadgeo.sources.roads import project_lines
+
+    options = options or BuildOptions()
+    lines, plane = project_lines(roads.geometry, roads.crs)
+    network = as_stored(build_network(lines, plane, {"name": name, **(meta or {})}, options))
+    return Reference(build_index(network, options.index), network)
+
+
+def update_reference(path: str | Path, roads: Roads, say: Say = say_nothing) -> Reference:
+    """Replace the roads of a reference by others on the ground that those were asked for, or add them, and write it.
+
+    The rest of the network is not drawn again. Where the roads do not say what ground they were asked for, it is the
+    ground they lie on. The options are those that the reference was built with.
+
+    Raises
+    ------
+    IndexFormatError
+        There is no such reference, or it is damaged.
+    OutputError
+        It cannot be written; the old one stays as it was.
+    """
+    from roadgeo.reference.files import reference_paths
+    from roadgeo.reference.network_file import as_stored, read_network
+    from roadgeo.roads.updating import UpdateOptions, ground_of, move_area, move_lines, replace_area
+
+    old = read_network(reference_paths(path).geopackage)
+    options = stored_options(old)
+    lines = move_lines(roads.lines, roads.plane, old.plane)
+    _require_same_scale(roads.lines, lines)
+    area = ground_of(lines) if roads.area is None else move_area(roads.area, old.plane)
+    owed = dict.fromkeys([old.meta.get("attribution", ""), roads.meta.get("attribution", "")])
+    meta = {
+        **old.meta,
+        "sources": [*old.meta.get("sources", []), *roads.meta.get("sources", [])],
+        "attribution": "; ".join(filter(None, owed)),
+    }
+    say(f"drawing {len(lines):,} lines among the others as a mask shows them")
+    drawn_alike = UpdateOptions(simplify=options.simplify, intersections=options.intersections)
+    network = as_stored(replace_area(old, lines, area, meta, drawn_alike))
+    Reference(build_index(network, options.index, say), network).save(path, say)
+    return open_reference(path)
+
+
+def _require_same_scale(lines: AnyArray, moved: AnyArray) -> None:
+    """Refuse roads that lie so far from a reference that its plane has another scale there, or knows no place there."""
+    import shapely
+
+    scale = float(shapely.length(moved).sum() / shapely.length(lines).sum())
+    if not 0.95 < scale < 1.05:
+        raise RoadSourceError(
+            "the roads lie too far from the reference to be drawn on its plane; build one reference from both sources"
+        )
+
+
+def stored_options(network: RoadNetwork) -> BuildOptions:
+    """Return the options that a network was built with; the defaults for those that it does not tell.
+
+    Raises
+    ------
+    IndexFormatError
+        It tells what cannot be: its file was made elsewhere, or changed.
+    """
+    stored = network.meta.get("options", {})
+    return BuildOptions(
+        simplify=_read_options(SimplifyOptions, stored, "simplify"),
+        intersections=_read_options(IntersectionOptions, stored, "intersections"),
+        index=_read_options(IndexOptions, stored, "index"),
+    )
+
+
+#: Least and most of options that could break or flood a kernel; the others are at least 0.
+_RANGES = {"n_neighbours": (2, MAX_NEIGHBOURS), "codes_per_vertex": (1, 8), "min_bucket_m": (1.0, 1e5)}
+
+_Options = TypeVar("_Options", SimplifyOptions, IntersectionOptions, IndexOptions)
+
+
+def _read_options(kind: type[_Options], stored: Any, stage: str) -> _Options:
+    """Read the options of one stage out of JSON values, which may hold anything."""
+    told = stored.get(stage, {}) if isinstance(stored, dict) else None
+    values: dict[str, Any] = {}
+    for option in fields(kind):
+        value: Any = told.get(option.name, option.default) if isinstance(told, dict) else None
+        low, high = _RANGES.get(option.name, (0, 1000))
+        if type(value) not in {int, type(option.default)} or not low <= value <= high:
+            what = f"the stored option {stage}.{option.name} is {value!r}, expected {low:g} to {high:g}"
+            raise IndexFormatError(f"{what}; make the reference again with `roadgeo index`")
+        values[option.name] = value
+    return kind(**values)
+
+
+def open_reference(path: str | Path, say: Say = say_nothing) -> Reference:
+    """Open REF.gpkg with its REF.index; a missing index, or one of an earlier format, is built from the GeoPackage.
+
+    Raises
+    ------
+    IndexFormatError
+        If there is no such reference, or it is damaged, hostile, stale or of another version.
+    """
+    from roadgeo.reference.files import open_reference as open_parts
+    from roadgeo.reference.files import reference_paths
+
+    meta, arrays = open_parts(path, _index_builder(path, say))
+    return Reference(ReferenceIndex.from_parts(meta, arrays, str(reference_paths(path).geopackage)))
+
+
+def rebuild_reference(path: str | Path, say: Say = say_nothing) -> Reference:
+    """Build a reference's index again from its GeoPackage alone, after an edit of that, or in place of a damaged one.
+
+    Raises
+    ------
+    IndexFormatError
+        There is no such GeoPackage, or it is damaged.
+    OutputError
+        The index cannot be written.
+    """
+    from roadgeo.reference.files import rebuild_index
+
+    rebuild_index(path, _index_builder(path, say))
+    return open_reference(path)
+
+
+def _index_builder(path: str | Path, say: Say) -> Callable[[RoadNetwork], tuple[dict[str, Any], dict[str, AnyArray]]]:
+    """Return what builds the index of a reference's network with the options that are stored in that."""
+
+    def build(network: RoadNetwork) -> tuple[dict[str, Any], dict[str, AnyArray]]:
+        what = f"building the index of {Path(path).stem} again"
+        index = build_index(network, stored_options(network).index, lambda _, share=None: say(what, share))
+        return dict(index.meta), index.arrays()
+
+    return build

@@ -1,0 +1,91 @@
+"""Which roads a mask would show: kinds of road by OpenStreetMap's `highway` tag and what other maps make of it."""
+
+from __future__ import annotations
+
+import re
+from collections.abc import Iterable
+from typing import Any, Literal, get_args
+
+import numpy as np
+
+from roadgeo._arrays import AnyArray, BoolArray
+
+__all__ = ["ROAD_KINDS", "RoadKind", "drives", "highways", "in_tunnel", "names_highways"]
+
+#: From few roads to many. "main": motorways to tertiary roads. "drivable": with residential and other public streets.
+#: "vehicles": with service roads and tracks. "all": with footways, cycleways, steps; whatever is a line.
+RoadKind = Literal["main", "drivable", "vehicles", "all"]
+ROAD_KINDS: tuple[RoadKind, ...] = get_args(RoadKind)
+
+_MAIN = {name + link for name in ("motorway", "trunk", "primary", "secondary", "tertiary") for link in ("", "_link")}
+_DRIVABLE = _MAIN | {"residential", "unclassified", "living_street", "road", "residential_link"}
+_VEHICLES = _DRIVABLE | {"service", "track", "track_grade1", "track_grade2", "track_grade3", "track_grade4"}
+_VEHICLES |= {"track_grade5", "busway", "bus_guideway", "raceway", "escape"}
+_PATHS = {"pedestrian", "footway", "cycleway", "path", "bridleway", "steps", "crossing", "via_ferrata", "unknown"}
+_MEMBERS: dict[RoadKind, set[str]] = {"main": _MAIN, "drivable": _DRIVABLE, "vehicles": _VEHICLES}
+_KNOWN = _VEHICLES | _PATHS
+
+#: Lines that carry a `highway` tag and are no road, or none yet.
+_NO_ROADS = {
+    "abandoned", "bus_stop", "construction", "corridor", "demolished", "disused", "elevator", "no", "none", "planned",
+    "platform", "proposed", "razed", "rest_area", "services",
+}  # fmt: skip
+
+_TUNNELS = {"yes", "true", "t", "1", "tunnel", "avalanche_protector", "is_tunnel"}
+
+
+def highways(kind: RoadKind) -> list[str] | None:
+    """Return the values of `highway` that a kind is made of, sorted; None for "all", which has no list."""
+    return sorted(_MEMBERS[kind]) if kind != "all" else None
+
+
+def drives(values: AnyArray, kind: RoadKind) -> BoolArray:
+    """Say which lines are roads of a kind.
+
+    Parameters
+    ----------
+    values : (L,) object
+        Values of `highway`: text, several in a list or in text (`"['a', 'b']"`, `a;b`), or None. Of several, one is
+        enough. Lines without a value are roads of an unknown kind: all kinds but "main" take them.
+    kind : RoadKind
+
+    Returns
+    -------
+    (L,) bool
+    """
+    if kind == "all":
+        return _each(values, lambda names: not names or bool(names - _NO_ROADS))
+    members = _MEMBERS[kind]
+    return _each(values, lambda names: bool(names & members) if names else kind != "main")
+
+
+def names_highways(values: AnyArray) -> bool:
+    """Say whether a column holds `highway` values at all: most of what is filled in is known."""
+    filled = _each(values, bool)
+    known = _each(values, lambda names: bool(names & (_KNOWN | _NO_ROADS)))
+    return bool(filled.any()) and int(known.sum()) * 2 > int(filled.sum())
+
+
+def in_tunnel(values: AnyArray) -> BoolArray:
+    """Say which lines run in a tunnel all the way, by values of `tunnel`, as in `drives`; (L,) bool."""
+    return _each(values, lambda names: bool(names) and names <= _TUNNELS)
+
+
+def _each(values: AnyArray, test: Any) -> BoolArray:
+    """Apply a test of a set of names to every value; equal values are tested once."""
+    verdicts: dict[Any, bool] = {}
+    result = np.empty(len(values), bool)
+    for i, value in enumerate(values):
+        key = value if isinstance(value, str | float | int | bool | None) else tuple(map(str, value))
+        if key not in verdicts:
+            verdicts[key] = bool(test(_names(key)))
+        result[i] = verdicts[key]
+    return result
+
+
+def _names(value: str | float | bool | Iterable[str] | None) -> set[str]:
+    """Split one value into its names."""
+    if value is None or (isinstance(value, float) and value != value):
+        return set()
+    text = str(value) if isinstance(value, str | float | int) else ";".join(value)
+    return {name for name in re.split(r"[^a-z0-9_]+", text.lower()) if name}

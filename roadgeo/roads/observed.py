@@ -1,0 +1,171 @@
+"""Ground that a mask cannot show: the black corners that a warped image leaves in its frame.
+
+A mask is black where no road is, too. What gives a warped frame away is its straight sides: beyond them lies no road
+at all, and along them road after road ends on the same line.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import cv2
+import numpy as np
+
+from roadgeo._arrays import BoolArray, FloatArray
+
+__all__ = ["VoidOptions", "find_voids"]
+
+
+@dataclass(frozen=True)
+class VoidOptions:
+    """When a line is taken for the side of a warped frame.
+
+    Attributes
+    ----------
+    sure_ends
+        Roads that must end on one line before anything is cut at all.
+    least_ends
+        Roads that must end on every further line.
+    straightness_px
+        How far the ends may lie off their line.
+    min_length
+        Of the line between the outermost ends, as a share of the frame's shorter side.
+    max_cut
+        Largest share of the frame that may lie beyond one line.
+    """
+
+    sure_ends: int = 5
+    least_ends: int = 4
+    straightness_px: float = 1.5
+    min_length: float = 0.12
+    max_cut: float = 0.4
+
+
+@dataclass(frozen=True)
+class _Side:
+    """A line that has all roads on one side; pixels, corner convention."""
+
+    start: FloatArray
+    along: FloatArray  # unit vector
+    outwards: FloatArray  # unit vector
+    length: float
+    bulge: float  # how far roads reach beyond the line
+
+
+def find_voids(roads: BoolArray, road_width_px: float, options: VoidOptions | None = None) -> BoolArray | None:
+    """Return which pixels were observed, or None where nothing says that some were not.
+
+    Parameters
+    ----------
+    roads : (H, W) bool
+    road_width_px : float
+    options : VoidOptions, optional
+
+    Returns
+    -------
+    (H, W) bool or None
+    """
+    options = options or VoidOptions()
+    sides = _sides(_hull(roads), roads.shape, options)
+    ends = [_count_ends(roads, side, road_width_px) for side in sides]
+    if max(ends, default=0) < options.sure_ends:
+        return None
+    observed = np.ones(roads.shape, np.bool_)
+    for side, n in zip(sides, ends, strict=True):
+        if n >= options.least_ends:
+            _cut(observed, side, options.max_cut)
+    return observed
+
+
+def _cut(observed: BoolArray, side: _Side, max_cut: float) -> None:
+    """Clear (H, W) the pixels whose centres lie beyond a side, unless they are too many."""
+    height, width = observed.shape
+    slope_x, slope_y = side.outwards
+    room = (
+        -(np.arange(height) + 0.5 - side.start[1]) * slope_y
+    )  # column x lies beyond where (x - start) * slope_x > room
+    if abs(slope_x) > 1e-6:
+        edge = np.clip(np.rint(side.start[0] + room / slope_x), 0, width).astype(np.int64)
+    else:
+        edge = np.where(room >= 0, width, 0)
+    from_right = slope_x >= 0 or abs(slope_x) <= 1e-6
+    beyond = (width - edge if from_right else edge) / width
+    if beyond.mean() > max_cut:
+        return
+    for row in np.flatnonzero(beyond):
+        if from_right:
+            observed[row, edge[row] :] = False
+        else:
+            observed[row, : edge[row]] = False
+
+
+def _hull(roads: BoolArray) -> FloatArray:
+    """Return the convex hull (V, 2) around all road pixels, clockwise as seen in the image."""
+    rows = np.flatnonzero(roads.any(axis=1))
+    left = roads.argmax(axis=1)[rows]
+    right = roads.shape[1] - roads[:, ::-1].argmax(axis=1)[rows]
+    ends = [np.stack((x, y), axis=1) for x in (left, right) for y in (rows, rows + 1)]
+    hull = cv2.convexHull(np.concatenate(ends).astype(np.int32), clockwise=False)  # OpenCV thinks of y upwards
+    return np.asarray(hull[:, 0], np.float64)
+
+
+def _sides(hull: FloatArray, shape: tuple[int, ...], options: VoidOptions) -> list[_Side]:
+    """Return the straight stretches of a hull that are not the frame itself, longest first, apart from each other."""
+    n = len(hull)
+    stretches = []
+    for i in range(n):
+        longest = None
+        for k in range(1, n):
+            side = _side(hull[(i + np.arange(k + 1)) % n])
+            if side.bulge > options.straightness_px:
+                break
+            longest = (side.length, i, k, side)
+        if longest is not None:
+            stretches.append(longest)
+    stretches.sort(key=lambda stretch: -stretch[0])
+    taken = np.zeros(n, bool)
+    sides = []
+    for length, i, k, side in stretches:
+        steps = (i + np.arange(k)) % n
+        if length < options.min_length * min(shape):
+            break
+        if taken[steps].any():
+            continue
+        taken[steps] = True
+        if not _on_frame(side, shape):
+            sides.append(side)
+    return sides
+
+
+def _side(points: FloatArray) -> _Side:
+    """Return the line from the first to the last of some hull points."""
+    chord = points[-1] - points[0]
+    length = float(np.hypot(*chord))
+    along = chord / length
+    outwards = np.array([along[1], -along[0]])
+    return _Side(points[0], along, outwards, length, float(((points - points[0]) @ outwards).max()))
+
+
+def _on_frame(side: _Side, shape: tuple[int, ...]) -> bool:
+    """Tell whether a side lies along the frame, within 2 px."""
+    ends = np.stack((side.start, side.start + side.length * side.along))
+    gaps = np.concatenate((ends, np.array(shape[::-1]) - ends), axis=1)
+    return bool((gaps.max(axis=0) < 2.5).any())
+
+
+def _count_ends(roads: BoolArray, side: _Side, road_width_px: float) -> int:
+    """Count the roads that end at a side: seen just inside it and, still apart, most of a road width further in."""
+    along = np.arange(-30.0, side.length + 30.0, 0.5)
+    counts = []
+    for depth in 2.0 + road_width_px * np.array(
+        [0.0, 0.3, 0.6, 0.9]
+    ):  # a road along the side is one wide end somewhere
+        line = side.start + along[:, None] * side.along - (depth - side.bulge) * side.outwards
+        columns, rows = np.floor(line).astype(np.int64).T
+        inside = (columns >= 0) & (rows >= 0) & (columns < roads.shape[1]) & (rows < roads.shape[0])
+        on = np.zeros(len(along) + 2, np.int8)
+        on[1:-1][inside] = roads[rows[inside], columns[inside]]
+        starts, stops = np.flatnonzero(np.diff(on) > 0), np.flatnonzero(np.diff(on) < 0)
+        widths = 0.5 * (stops - starts) / road_width_px
+        counts.append(int(((widths > 0.5) & (widths < 5.0)).sum()))
+    return min(counts)

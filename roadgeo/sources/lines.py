@@ -1,0 +1,403 @@
+"""Lines out of road files of every kind, as they stand in the file.
+
+Formats are told by the file's name: OpenStreetMap data (`.osm.pbf`, `.osm`, `.osm.gz`, `.osm.bz2`) through osmium,
+osmnx's `.graphml`, GeoParquet, and everything else that GDAL reads (GeoPackage, Shapefile, GeoJSON, FlatGeobuf, ...).
+"""
+
+from __future__ import annotations
+
+import warnings
+from collections.abc import Callable, Iterator, Sequence
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Any, BinaryIO
+
+import numpy as np
+
+from roadgeo._arrays import AnyArray, BoolArray
+from roadgeo.errors import RoadSourceError
+from roadgeo.roads.kinds import in_tunnel, names_highways
+
+__all__ = ["OSM_ATTRIBUTION", "RoadLines", "crs_name", "first_line", "list_sources", "read_lines", "simple_lines"]
+
+OSM_ATTRIBUTION = "© OpenStreetMap contributors, ODbL 1.0"
+
+_OSM = (".osm.pbf", ".pbf", ".osm", ".osm.gz", ".osm.bz2", ".osm.xml")
+_PARQUET = (".parquet", ".geoparquet")
+_GRAPH = (".graphml",)
+_OTHER = (".gpkg", ".shp", ".geojson", ".geojsonl", ".fgb", ".gml", ".kml", ".sqlite", ".tab", ".mif", ".shz")
+
+#: PBF files are read in parts of about this size; what may stand in them at most, as their specification says.
+_PART, _MAX_BLOB, _MAX_BLOB_HEADER = 1 << 20, 32 << 20, 64 << 10
+
+#: Columns that may say what kind of road a line is: OpenStreetMap's, Geofabrik's, Overture's.
+_KIND_COLUMNS = ("highway", "fclass", "class")
+_TUNNEL_COLUMNS = ("tunnel", "road_flags")
+
+#: Layers to prefer where a file has several with lines.
+_LAYERS = ("roads", "edges", "lines")
+
+
+@dataclass(frozen=True)
+class RoadLines:
+    """Lines of one source. Dimension: L lines.
+
+    Attributes
+    ----------
+    lines : (L,) object
+        Shapely LineStrings, 2-D, finite, not empty, in the source's CRS.
+    crs : str or None
+        "EPSG:n" or WKT; None where the source does not say.
+    highway : (L,) object or None
+        Values of `highway` or the like; None where the source has no such column.
+    tunnel : (L,) bool or None
+        Runs in a tunnel.
+    meta : dict
+        Provenance: plain values.
+    """
+
+    lines: AnyArray
+    crs: str | None
+    highway: AnyArray | None = None
+    tunnel: BoolArray | None = None
+    meta: dict[str, Any] = field(default_factory=dict)
+
+
+def list_sources(path: Path) -> list[Path]:
+    """Return the road files of a folder (not of folders in it), by name, or the path itself.
+
+    Raises
+    ------
+    RoadSourceError
+        Nothing is there, or a folder holds no road file.
+    """
+    if not path.exists():
+        raise RoadSourceError(f"{path}: no such file or folder")
+    if not path.is_dir() or path.suffix.lower() == ".gdb":
+        return [path]
+    found = sorted(file for file in path.iterdir() if file.name.lower().endswith(_OSM + _PARQUET + _GRAPH + _OTHER))
+    if not found:
+        raise RoadSourceError(f"{path}: no road file in this folder; expected names like *.gpkg, *.shp or *.osm.pbf")
+    return found
+
+
+def read_lines(path: Path, layer: str | None = None, advance: Callable[[float], None] = lambda _: None) -> RoadLines:
+    """Read all lines of a road file.
+
+    Parameters
+    ----------
+    path : Path
+    layer : str, optional
+        Of a file with several; the one with lines by default.
+    advance : callable, optional
+        Told which share of a PBF file is read.
+
+    Raises
+    ------
+    RoadSourceError
+        The file is missing, unreadable, empty or holds no lines.
+    """
+    if not path.exists():
+        raise RoadSourceError(f"{path}: no such file")
+    name = path.name.lower()
+    if name.endswith(_OSM):
+        read = _read_osm(path, advance)
+    elif name.endswith(_GRAPH):
+        read = _read_graphml(path)
+    elif name.endswith(_PARQUET):
+        read = _read_parquet(path)
+    else:
+        read = _read_gdal(path, layer)
+    if len(read.lines) == 0:
+        raise RoadSourceError(f"{path}: no lines in it, expected the centre lines of roads")
+    return read
+
+
+def _read_osm(path: Path, advance: Callable[[float], None]) -> RoadLines:
+    """Stream the ways with a `highway` tag out of an OpenStreetMap file."""
+    import osmium
+    import shapely
+
+    factory = osmium.geom.WKBFactory()
+    shapes: list[str] = []
+    highway: list[str] = []
+    tunnel: list[str | None] = []
+    broken = 0
+    try:
+        with osmium.io.Reader(str(path), osmium.osm.NOTHING) as reader:
+            header = reader.header()
+            timestamp = header.get("osmosis_replication_timestamp") or header.get("timestamp") or None
+        for way in _highways(path, advance):
+            tags = way.tags
+            if tags.get("area") == "yes":
+                continue
+            shape = _way_shape(way, factory)
+            if shape is None:
+                broken += 1
+                continue
+            shapes.append(shape)
+            highway.append(tags["highway"])
+            tunnel.append(tags.get("tunnel"))
+    except RuntimeError as error:
+        raise RoadSourceError(f"{path}: not readable as OpenStreetMap data: {first_line(error)}") from error
+    lines, place = simple_lines(shapely.from_wkb(np.array(shapes, object)))
+    meta = {"format": "OpenStreetMap", "features": len(shapes) + broken, "attribution": OSM_ATTRIBUTION}
+    if timestamp:
+        meta["osm_timestamp"] = timestamp
+    return RoadLines(
+        lines, "EPSG:4326", np.array(highway, object)[place], in_tunnel(np.array(tunnel, object))[place], meta
+    )
+
+
+def _highways(path: Path, advance: Callable[[float], None]) -> Iterator[Any]:
+    """Yield the ways with a `highway` tag, which know where their nodes are."""
+    import osmium
+
+    pool = osmium.io.ThreadPool()
+    places = osmium.NodeLocationsForWays(osmium.index.create_map("flex_mem"))
+    places.ignore_errors()
+    wanted = osmium.filter.EntityFilter(osmium.osm.WAY), osmium.filter.KeyFilter("highway")
+    for part, share in _osm_parts(path):
+        with osmium.io.Reader(part, osmium.osm.NODE | osmium.osm.WAY, thread_pool=pool) as reader:
+            yield from osmium.OsmFileIterator(reader, places, *wanted)
+        advance(share)
+
+
+def _osm_parts(path: Path) -> Iterator[tuple[Any, float]]:
+    """Yield what osmium is to read one after another, and the share of the file that is read then.
+
+    A PBF file is a row of blobs, the first of them a header, each with a header of its own. It is cut between them,
+    for osmium does not tell how far it is. Other files are left whole.
+    """
+    import osmium
+
+    if not path.name.lower().endswith(".pbf"):
+        yield str(path), 1.0
+        return
+    size = path.stat().st_size
+    with path.open("rb") as file:
+        header = _read_blob(file)
+        while file.tell() < size:
+            part = bytearray()
+            while len(part) < _PART and file.tell() < size:
+                part += _read_blob(file)
+            yield osmium.io.FileBuffer(header + part, "pbf"), file.tell() / size
+
+
+def _read_blob(file: BinaryIO) -> bytes:
+    """Read one blob of a PBF file, the header before it, and the size of that before both.
+
+    Raises
+    ------
+    RuntimeError
+        As osmium does: it is cut off, or there is none.
+    """
+    prefix = file.read(4)
+    header = file.read(min(int.from_bytes(prefix, "big"), _MAX_BLOB_HEADER))
+    size = _blob_size(header)
+    blob = file.read(min(size, _MAX_BLOB))
+    if len(prefix) < 4 or len(header) != int.from_bytes(prefix, "big") or len(blob) != size:
+        raise RuntimeError("it is cut off, damaged or no PBF file")
+    return prefix + header + blob
+
+
+def _blob_size(header: bytes) -> int:
+    """Find the size of a blob in its header: field 3, a number, of a Protocol Buffers message; -1 where it is not."""
+    at = 0
+
+    def number() -> int:
+        nonlocal at
+        value = shift = 0
+        while at < len(header):
+            byte = header[at]
+            value |= (byte & 127) << shift
+            at, shift = at + 1, shift + 7
+            if byte < 128:
+                break
+        return value
+
+    while at < len(header):
+        field, kind = divmod(number(), 8)
+        value = number()
+        if field == 3 and kind == 0:
+            return value
+        at += value if kind == 2 else 0  # text, or an index that nobody needs
+    return -1
+
+
+def _way_shape(way: Any, factory: Any) -> str | None:
+    """Return a way as hexadecimal WKB; of a way cut off by an extract, the part whose nodes are there."""
+    import osmium
+    import shapely
+
+    try:
+        return str(factory.create_linestring(way))
+    except (RuntimeError, osmium.InvalidLocationError):  # fewer than two different nodes, or nodes outside
+        known = [(node.lon, node.lat) for node in way.nodes if node.location.valid()]
+        return shapely.to_wkb(shapely.LineString(known), hex=True) if len(set(known)) > 1 else None
+
+
+def _read_graphml(path: Path) -> RoadLines:
+    """Read a street network that osmnx saved."""
+    import xml.etree.ElementTree as ET
+
+    import networkx as nx
+    import osmnx as ox
+
+    try:
+        graph = ox.load_graphml(path)
+        edges = ox.graph_to_gdfs(graph, nodes=False, fill_edge_geometry=True)
+    except (ET.ParseError, nx.NetworkXError, KeyError, ValueError, AttributeError) as error:
+        raise RoadSourceError(f"{path}: not a street network saved by osmnx: {first_line(error)}") from error
+    columns = {name: edges[name].to_numpy(object) for name in edges.columns if name in _KIND_COLUMNS + _TUNNEL_COLUMNS}
+    meta = {"format": "GraphML", "attribution": OSM_ATTRIBUTION}
+    return _from_columns(edges.geometry.to_numpy(), crs_name(edges.crs), columns, meta)
+
+
+def _read_parquet(path: Path) -> RoadLines:
+    """Read GeoParquet, Overture's transportation segments included."""
+    import geopandas as gpd
+    import pyarrow as pa
+    import pyarrow.parquet as pq
+
+    try:
+        names = pq.read_schema(path).names
+        wanted = [name for name in _KIND_COLUMNS + _TUNNEL_COLUMNS + ("subtype",) if name in names]
+        geometry = _geometry_columns(path)
+        frame = gpd.read_parquet(path, columns=geometry[:1] + wanted)
+    except (ValueError, pa.ArrowException, OSError) as error:
+        raise RoadSourceError(f"{path}: not readable as GeoParquet: {first_line(error)}") from error
+    meta = {"format": "GeoParquet"}
+    if "subtype" in frame:  # Overture keeps railways and waterways among its segments
+        frame = frame[frame["subtype"] == "road"]
+        meta["attribution"] = "© OpenStreetMap contributors, Overture Maps Foundation, ODbL 1.0"
+    columns = {name: frame[name].to_numpy(object) for name in wanted if name != "subtype"}
+    if "road_flags" in columns:
+        columns["road_flags"] = _overture_flags(columns["road_flags"])
+    return _from_columns(frame.geometry.to_numpy(), crs_name(frame.crs), columns, meta)
+
+
+def _geometry_columns(path: Path) -> list[str]:
+    """Return the geometry columns of a GeoParquet file, the primary one first."""
+    import json
+
+    import pyarrow.parquet as pq
+
+    stored = pq.read_schema(path).metadata or {}
+    if b"geo" not in stored:
+        raise ValueError("it says nothing of a geometry column")
+    return [json.loads(stored[b"geo"])["primary_column"]]
+
+
+def _overture_flags(values: AnyArray) -> AnyArray:
+    """Keep the flags that hold for a whole segment, as text."""
+    flags = np.empty(len(values), object)
+    for i, rules in enumerate(values):
+        whole = [rule for rule in (rules if rules is not None else ()) if rule.get("between") is None]
+        flags[i] = ";".join(str(flag) for rule in whole for flag in rule.get("values") or ()) or None
+    return flags
+
+
+def _read_gdal(path: Path, layer: str | None) -> RoadLines:
+    """Read what GDAL reads as lines."""
+    import pyogrio
+    from pyogrio.errors import DataLayerError, DataSourceError, FieldError
+
+    try:
+        layer = _choose_layer(path, layer)
+        with warnings.catch_warnings():
+            warnings.simplefilter("ignore")
+            info = pyogrio.read_info(path, layer=layer)
+            wanted = [name for name in info["fields"] if name.lower() in _KIND_COLUMNS + _TUNNEL_COLUMNS]
+            meta, _, shapes, values = pyogrio.raw.read(path, layer=layer, columns=wanted, force_2d=True)
+    except (DataSourceError, DataLayerError, FieldError, UnicodeDecodeError) as error:
+        raise RoadSourceError(f"{path}: not readable as a map of roads: {first_line(error)}") from error
+    if shapes is None:
+        raise RoadSourceError(f"{path}: layer {layer!r} has no geometry, expected lines")
+    import shapely
+
+    columns = {name.lower(): column for name, column in zip(meta["fields"], values, strict=True)}
+    shapes = shapely.from_wkb(shapes, on_invalid="ignore")
+    return _from_columns(shapes, crs_name(meta["crs"]), columns, {"format": info["driver"], "layer": layer})
+
+
+def _choose_layer(path: Path, layer: str | None) -> str:
+    """Return the layer to read: the one asked for, or the one with lines."""
+    import pyogrio
+
+    layers = [(str(name), str(kind)) for name, kind in pyogrio.list_layers(path)]
+    names = [name for name, _ in layers]
+    if layer is not None:
+        if layer not in names:
+            raise RoadSourceError(f"{path}: no layer {layer!r}; it has {_listed(names)}: choose with --layer")
+        return layer
+    drawn = [name for name, kind in layers if kind in {"None", "Unknown"} or "Line" in kind or "Collection" in kind]
+    if not drawn:
+        kinds = sorted({kind for _, kind in layers}) or ["nothing"]
+        raise RoadSourceError(f"{path}: holds {_listed(kinds)}, expected lines: the centre lines of roads")
+    chosen = [name for name in _LAYERS if name in drawn] or drawn
+    if len(drawn) > 1 and chosen == drawn:
+        raise RoadSourceError(f"{path}: several layers hold lines, {_listed(drawn)}: choose one with --layer")
+    return chosen[0]
+
+
+def _from_columns(shapes: AnyArray, crs: str | None, columns: dict[str, AnyArray], meta: dict[str, Any]) -> RoadLines:
+    """Keep the lines and what is known about each."""
+    lines, place = simple_lines(shapes)
+    kinds = [columns[name] for name in _KIND_COLUMNS if name in columns and names_highways(columns[name])]
+    tunnels = [in_tunnel(columns[name])[place] for name in _TUNNEL_COLUMNS if name in columns]
+    return RoadLines(
+        lines,
+        crs,
+        kinds[0][place] if kinds else None,
+        np.logical_or.reduce(tunnels) if tunnels else None,
+        {"features": len(shapes), **meta},
+    )
+
+
+def simple_lines(shapes: AnyArray) -> tuple[AnyArray, AnyArray]:
+    """Return the 2-D LineStrings in any shapes, and the shape that each came from.
+
+    Missing, empty and infinite ones are left out, and so is what is no line.
+    """
+    import shapely
+
+    parts, place = shapely.get_parts(np.asarray(shapes, object), return_index=True)
+    while np.isin(shapely.get_type_id(parts), (5, 7)).any():  # collections may hold collections
+        parts, inner = shapely.get_parts(parts, return_index=True)
+        place = place[inner]
+    kept = np.isin(shapely.get_type_id(parts), (1, 2)) & ~shapely.is_empty(parts)
+    lines = shapely.force_2d(parts[kept])
+    bounds = shapely.bounds(lines)
+    finite = np.isfinite(bounds).all(axis=1)
+    return lines[finite], place[kept][finite]
+
+
+def crs_name(crs: Any) -> str | None:
+    """Return a CRS as "EPSG:n" or WKT2; None where there is none, or one that is bound to no place on Earth."""
+    if crs is None:
+        return None
+    from pyproj import CRS
+    from pyproj.exceptions import CRSError
+
+    try:
+        known = CRS.from_user_input(crs)
+    except CRSError:
+        return None
+    known = known.to_2d() if len(known.axis_info) == 3 else known
+    if not (known.is_geographic or known.is_projected):
+        return None
+    code = known.to_epsg(min_confidence=100)
+    return f"EPSG:{code}" if code else known.to_wkt("WKT2_2019")
+
+
+def _listed(names: Sequence[str]) -> str:
+    """Join names for a message, at most eight."""
+    shown = ", ".join(names[:8])
+    return shown if len(names) <= 8 else f"{shown} and {len(names) - 8} more"
+
+
+def first_line(error: BaseException) -> str:
+    """Return the first line of a foreign error's message, short."""
+    text = (str(error) or type(error).__name__).strip().splitlines()
+    return text[0][:200] if text else type(error).__name__

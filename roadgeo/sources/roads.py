@@ -1,0 +1,299 @@
+"""Road lines on a metric plane, from files or from OpenStreetMap: what a reference is built from."""
+
+from __future__ import annotations
+
+import os
+from collections.abc import Iterable, Sequence
+from dataclasses import dataclass, field, replace
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+
+from roadgeo._arrays import AnyArray, FloatArray
+from roadgeo._progress import Say, say_nothing
+from roadgeo.errors import CrsError, RoadSourceError
+from roadgeo.geometry.projection import LocalPlane, choose_plane, transformer
+from roadgeo.roads.kinds import RoadKind, drives
+from roadgeo.sources.lines import RoadLines, crs_name, list_sources, read_lines, simple_lines
+
+if TYPE_CHECKING:
+    from roadgeo.sources.overpass import FetchOptions
+
+__all__ = ["Box", "Roads", "fetch_roads", "project_lines", "read_roads"]
+
+#: West, south, east, north in degrees; west > east where it lies astride 180 degrees.
+Box = tuple[float, float, float, float]
+
+#: Vertices looked at to choose a plane; the ends of every line's bounding box are always among them.
+_SAMPLE = 100_000
+
+
+@dataclass(frozen=True)
+class Roads:
+    """Lines of roads on their plane. Dimension: L lines.
+
+    Attributes
+    ----------
+    lines : (L,) object
+        Shapely LineStrings in plane metres, not noded.
+    plane : LocalPlane
+    meta : dict
+        Plain values: `sources` (one dict each: where from, features read, lines kept and left out, OSM timestamp),
+        `attribution`, `roads` (which kinds), `tunnels`, `bbox`.
+    area : shapely Polygon or MultiPolygon, or None
+        The ground whose roads were asked for, in degrees; None where it was all that there are.
+    """
+
+    lines: AnyArray
+    plane: LocalPlane
+    meta: dict[str, Any] = field(default_factory=dict)
+    area: Any = None
+
+    def __len__(self) -> int:
+        """L."""
+        return len(self.lines)
+
+
+def read_roads(
+    path: str | os.PathLike[str] | Sequence[str | os.PathLike[str]],
+    layer: str | None = None,
+    crs: str | None = None,
+    which: RoadKind = "drivable",
+    *,
+    tunnels: bool = False,
+    bbox: Box | None = None,
+    attribution: str | None = None,
+    say: Say = say_nothing,
+) -> Roads:
+    """Read roads from one or more files or folders of files, of any formats and CRS, onto one plane.
+
+    Parameters
+    ----------
+    path : path or sequence of paths
+        A folder stands for every road file in it.
+    layer : str, optional
+        Layer of files that have several.
+    crs : str, optional
+        CRS of the coordinates, whatever the files say. Needed where a file says nothing, as a shapefile without its
+        .prj. OpenStreetMap files are always in degrees.
+    which : RoadKind
+        Kinds of road to take, where the file tells them apart (`highway`, `fclass` or `class`); otherwise all.
+    tunnels : bool
+        Take tunnels too: a mask does not show them.
+    bbox : (west, south, east, north), optional
+        Degrees; roads are cut at its border. West > east: astride 180 degrees.
+    attribution : str, optional
+        Overrides what the sources call for.
+    say : Say
+        Told what is being read and, of PBF files, how much of it.
+
+    Raises
+    ------
+    RoadSourceError
+        A file is missing, unreadable, or holds no lines; no road is left.
+    CrsError
+        A file has no CRS and none was given, or its coordinates do not fit.
+    """
+    from roadgeo.sources.overpass import box_area
+
+    given = [path] if isinstance(path, str | os.PathLike) else list(path)
+    files = [file for one in given for file in list_sources(Path(one))]
+    sources = []
+    for n, file in enumerate(files, 1):
+        what = f"reading {file.name}" + (f", {n} of {len(files)}" if len(files) > 1 else "")
+        say(what)
+        source = read_lines(file, layer, lambda share, what=what: say(what, share))  # type: ignore[misc]
+        if crs is not None and source.meta["format"] != "OpenStreetMap":
+            source = replace(source, crs=_known_crs(crs))
+        if source.crs is None:
+            raise CrsError(f"{file}: says nothing of its CRS; name it, for example --crs EPSG:26986")
+        sources.append(_choose(source, file.name, which, tunnels, bbox))
+    roads = _join(sources, {"roads": which, "tunnels": tunnels, "bbox": _plain(bbox)}, attribution)
+    return roads if bbox is None else replace(roads, area=box_area(bbox))
+
+
+def fetch_roads(
+    place: str | None = None,
+    *,
+    bbox: Box | None = None,
+    polygon: str | os.PathLike[str] | Any = None,
+    around: tuple[float, float, float] | None = None,
+    which: RoadKind = "drivable",
+    tunnels: bool = False,
+    options: FetchOptions | None = None,
+    say: Say = say_nothing,
+) -> Roads:
+    """Fetch the roads of an area from OpenStreetMap.
+
+    Parameters
+    ----------
+    place : str, optional
+        A name that Nominatim knows the outline of: "Boston, MA".
+    bbox : (west, south, east, north), optional
+        Degrees.
+    polygon : path or shapely geometry, optional
+        A file with polygons, or a geometry in degrees.
+    around : (lon, lat, metres), optional
+        A square around a point; the distance is half its side.
+    which, tunnels
+        As for `read_roads`.
+    options : FetchOptions, optional
+        Servers, cache, patience, date.
+    say : Say
+        Told what is being waited for, and how much of it has come.
+
+    Raises
+    ------
+    RoadSourceError
+        The place is unknown or has no area, there is no network, the server stays busy, or there are no roads.
+    ValueError
+        Not exactly one area.
+    """
+    from roadgeo.sources.overpass import FetchOptions, box_area, fetch_lines, find_place, read_area, square
+
+    given = [area is not None for area in (place, bbox, polygon, around)]
+    if sum(given) != 1:
+        raise ValueError("give exactly one of place, bbox, polygon and around")
+    options = options or FetchOptions()
+    if place is not None:
+        area, name = find_place(place, options, say)
+    elif bbox is not None:
+        area, name = box_area(bbox), ",".join(f"{degrees:g}" for degrees in bbox)
+    elif around is not None:
+        area, name = square(*around), "{:g},{:g} within {:g} m".format(*around)
+    else:
+        area, name = read_area(polygon)
+    source = fetch_lines(area, which, tunnels, options, say)
+    chosen = _choose(source, name, which, tunnels, None)
+    return replace(_join([chosen], {"roads": which, "tunnels": tunnels, "bbox": _plain(bbox)}, None), area=area)
+
+
+def project_lines(shapes: Iterable[Any], crs: Any) -> tuple[AnyArray, LocalPlane]:
+    """Take shapely lines from their CRS (anything pyproj understands) to a metric plane of our choice.
+
+    Raises
+    ------
+    CrsError
+        No CRS, or coordinates that do not fit it.
+    RoadSourceError
+        No lines.
+    """
+    lines, _ = simple_lines(np.fromiter(shapes, object))
+    name = crs_name(crs)
+    if name is None:
+        raise CrsError("the roads have no CRS; set one, for example roads.set_crs('EPSG:26986')")
+    roads = _join([RoadLines(lines, name, meta={"name": "the roads"})], {}, None)
+    return roads.lines, roads.plane
+
+
+def _choose(source: RoadLines, name: str, which: RoadKind, tunnels: bool, bbox: Box | None) -> RoadLines:
+    """Keep the lines that were asked for, and count what was left out."""
+    wanted = np.ones(len(source.lines), bool) if source.highway is None else drives(source.highway, which)
+    hidden = np.zeros(len(wanted), bool) if tunnels or source.tunnel is None else source.tunnel & wanted
+    lines = source.lines[wanted & ~hidden]
+    crs = source.crs
+    if bbox is not None:
+        lines, crs = _clip(_to_degrees(lines, source.crs, name), bbox), "EPSG:4326"
+    meta = {
+        "name": name,
+        **source.meta,
+        "lines": len(source.lines),
+        "kinds_known": source.highway is not None,
+        "other_kinds": int((~wanted).sum()),
+        "tunnels": int(hidden.sum()),
+        "kept": len(lines),
+    }
+    return RoadLines(lines, crs, meta=meta)
+
+
+def _join(sources: Sequence[RoadLines], meta: dict[str, Any], attribution: str | None) -> Roads:
+    """Take the lines of all sources to one plane."""
+    filled = [source for source in sources if len(source.lines)]
+    if not filled:
+        raise RoadSourceError(f"{_names(sources)}: no roads of the kind asked for; try another --kinds or area")
+    plane = choose_plane(np.concatenate([_spread(source) for source in filled]))
+    lines = np.concatenate([_to_plane(source, plane) for source in filled])
+    calls = dict.fromkeys(source.meta["attribution"] for source in filled if source.meta.get("attribution"))
+    return Roads(
+        lines,
+        plane,
+        {
+            **meta,
+            "sources": [source.meta for source in sources],
+            "attribution": "; ".join(calls) if attribution is None else attribution,
+        },
+    )
+
+
+def _spread(source: RoadLines) -> FloatArray:
+    """Return longitudes and latitudes of points spread over a source; (N, 2)."""
+    import shapely
+
+    coords = shapely.get_coordinates(source.lines)
+    sides = np.concatenate((coords.argmin(axis=0), coords.argmax(axis=0)))
+    points = np.concatenate((coords[:: max(len(coords) // _SAMPLE, 1)], coords[sides]))
+    degrees = transformer(_crs_of(source), "EPSG:4326").transform(points[:, 0], points[:, 1])
+    lonlat = np.stack(degrees, axis=1)
+    if not np.isfinite(lonlat).all() or np.abs(lonlat).max() > 360.0 or np.abs(lonlat[:, 1]).max() > 90.0:
+        raise CrsError(
+            f"{source.meta['name']}: coordinates reach {np.abs(points).max():.6g} and do not fit its CRS, "
+            f"{_crs_of(source)[:40]}; give the right one with --crs"
+        )
+    return lonlat
+
+
+def _to_plane(source: RoadLines, plane: LocalPlane) -> AnyArray:
+    """Return a source's lines in plane metres."""
+    import shapely
+
+    way = transformer(_crs_of(source), plane.crs)
+    coords = shapely.get_coordinates(source.lines)
+    xy = plane.from_crs(np.stack(way.transform(coords[:, 0], coords[:, 1]), axis=1))
+    return np.asarray(shapely.set_coordinates(source.lines.copy(), xy))
+
+
+def _to_degrees(lines: AnyArray, crs: str | None, name: str) -> AnyArray:
+    import shapely
+
+    if crs is None:
+        raise CrsError(f"{name}: says nothing of its CRS")
+    coords = shapely.get_coordinates(lines)
+    lonlat = np.stack(transformer(crs, "EPSG:4326").transform(coords[:, 0], coords[:, 1]), axis=1)
+    return np.asarray(shapely.set_coordinates(lines.copy(), lonlat))
+
+
+def _clip(lines: AnyArray, bbox: Box) -> AnyArray:
+    """Cut lines in degrees at the border of a box; a line or a box may lie astride 180 degrees."""
+    import shapely
+
+    west, south, east, north = bbox
+    east += 360.0 * (east < west)
+    coords, line = shapely.get_coordinates(lines, return_index=True)
+    jumps = (np.abs(np.diff(coords[:, 0])) > 180.0) & (np.diff(line) == 0)
+    astride = np.isin(line, line[1:][jumps])
+    coords[astride, 0] %= 360.0
+    lines = shapely.set_coordinates(lines.copy(), coords)
+    pieces = [shapely.clip_by_rect(lines, west + turn, south, east + turn, north) for turn in (-360.0, 0.0, 360.0)]
+    return simple_lines(np.concatenate(pieces))[0]
+
+
+def _known_crs(crs: str) -> str:
+    name = crs_name(crs)
+    if name is None:
+        raise CrsError(f"{crs!r} is no CRS of places on Earth; expected for example EPSG:26986")
+    return name
+
+
+def _crs_of(source: RoadLines) -> str:
+    if source.crs is None:
+        raise CrsError(f"{source.meta.get('name', 'the roads')}: no CRS")
+    return source.crs
+
+
+def _names(sources: Sequence[RoadLines]) -> str:
+    return ", ".join(str(source.meta["name"]) for source in sources) or "no source"
+
+
+def _plain(bbox: Box | None) -> list[float] | None:
+    return None if bbox is None else [float(degrees) for degrees in bbox]

@@ -1,0 +1,448 @@
+"""OGC GeoPackages, written and read with sqlite3 alone: no geopandas, no pyogrio, so that `locate` starts fast.
+
+Version 1.3 (QGIS 3.22 warns about newer ones), with spatial indexes and QGIS styles. A file appears
+whole or not at all.
+"""
+
+from __future__ import annotations
+
+import os
+import sqlite3
+import struct
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from contextlib import closing, contextmanager
+from dataclasses import dataclass, field
+from functools import lru_cache
+from pathlib import Path
+from typing import Any, Literal
+
+import numpy as np
+
+from roadgeo._arrays import AnyArray, FloatArray
+from roadgeo.errors import CrsError, IndexFormatError, OutputError
+from roadgeo.storage.files import replacing
+from roadgeo.storage.rtree import pack_rtree
+
+__all__ = [
+    "PIXELS",
+    "GeometryType",
+    "Layer",
+    "add_layers",
+    "layer_names",
+    "open_read_only",
+    "read_layer",
+    "write_layers",
+]
+
+GeometryType = Literal["POINT", "LINESTRING", "POLYGON", "MULTIPOLYGON"]
+
+#: The `crs` of layers that lie nowhere on Earth: pixel coordinates. GeoPackage calls it undefined Cartesian, srs_id -1.
+PIXELS = ""
+
+_WKB_TYPES = {"POINT": 1, "LINESTRING": 2, "POLYGON": 3, "MULTIPOLYGON": 6}
+_CUSTOM_SRS_ID = 100_000  # for a CRS without an EPSG code; one such CRS per layer is numbered upwards from here
+_POINT = np.dtype([("header", "S4"), ("srs_id", "<i4"), ("order", "u1"), ("type", "<u4"), ("xy", "<f8", 2)])
+_HEADER = struct.Struct("<4si4d")  # magic, version and flags; srs_id; envelope min x, max x, min y, max y
+_ENVELOPE_BYTES = {0: 0, 1: 32, 2: 48, 3: 48, 4: 64}
+
+
+@dataclass(frozen=True)
+class Layer:
+    """One table. Dimension: N features.
+
+    Attributes
+    ----------
+    geometry_type : {"POINT", "LINESTRING", "POLYGON", "MULTIPOLYGON"} or None
+        None: a table without geometry.
+    geometries : sequence of N float64 arrays
+        POINT: (N, 2) array. LINESTRING: (V, 2) vertices each. POLYGON: one ring (V, 2) each, closed here if it is open.
+        MULTIPOLYGON: a sequence of such rings each.
+    columns : mapping of name to N values
+        Numpy arrays or lists; integers, floats (NaN becomes NULL), booleans, or text (None becomes NULL).
+    crs : str
+        Anything pyproj understands ("EPSG:32619", WKT2), or `PIXELS`.
+    style : str
+        QML: how QGIS draws the layer when it opens it. Empty: QGIS chooses.
+    """
+
+    name: str
+    geometry_type: GeometryType | None = None
+    geometries: Sequence[Any] | FloatArray = ()
+    columns: Mapping[str, Sequence[Any] | AnyArray] = field(default_factory=dict)
+    crs: str = PIXELS
+    style: str = ""
+    description: str = ""
+
+
+def write_layers(path: str | os.PathLike[str], layers: Sequence[Layer]) -> None:
+    """Write a new GeoPackage, replacing what stood there in one step.
+
+    Raises
+    ------
+    CrsError
+        A layer's CRS is unknown.
+    OutputError
+        The file cannot be written.
+    """
+    with replacing(path) as temporary:
+        temporary.unlink(missing_ok=True)
+        try:
+            with closing(sqlite3.connect(temporary)) as database:
+                add_layers(database, layers)
+        except sqlite3.Error as error:
+            raise OutputError(f"cannot write {path}: {error}; choose a folder that you may write to") from error
+
+
+def add_layers(
+    database: sqlite3.Connection, layers: Sequence[Layer], advance: Callable[[float], None] = lambda _: None
+) -> None:
+    """Make a GeoPackage of an empty database: for writers that add tables of their own to it.
+
+    `advance` is told which share of the rows is written.
+
+    Raises
+    ------
+    CrsError
+        A layer's CRS is unknown.
+    sqlite3.Error
+        The file cannot be written.
+    """
+    database.executescript("PRAGMA journal_mode = OFF; PRAGMA synchronous = OFF;")
+    database.executescript(_SCHEMA)
+    srs_ids: dict[str, int] = {}
+    for crs in dict.fromkeys(["EPSG:4326", *(layer.crs for layer in layers if layer.geometry_type)]):
+        srs_ids[crs] = _add_srs(database, crs, _CUSTOM_SRS_ID + len(srs_ids))
+    n_rows = [max((len(column) for column in layer.columns.values()), default=0) for layer in layers]
+    for n, layer in enumerate(layers):
+        advance(sum(n_rows[:n]) / max(sum(n_rows), 1))
+        _add_layer(database, layer, srs_ids.get(layer.crs, 0))
+    styled = [layer for layer in layers if layer.style]
+    if styled:
+        database.executescript(_STYLES_SCHEMA)
+        database.executemany(
+            "INSERT INTO layer_styles (f_table_catalog, f_table_schema, f_table_name, f_geometry_column, styleName,"
+            " styleQML, styleSLD, useAsDefault, description, owner) VALUES ('', '', ?, 'geom', ?, ?, '', 1, '', '')",
+            [(layer.name, layer.name, layer.style) for layer in styled],
+        )
+    database.commit()
+
+
+def layer_names(path: str | os.PathLike[str]) -> list[str]:
+    """Names of the tables in a GeoPackage, features and attributes.
+
+    Raises
+    ------
+    IndexFormatError
+        No such file, or no GeoPackage.
+    """
+    return [name for (name,) in _query(path, "SELECT table_name FROM gpkg_contents ORDER BY rowid")]
+
+
+def read_layer(path: str | os.PathLike[str], name: str) -> tuple[list[FloatArray], dict[str, list[Any]]]:
+    """Read the geometries ((2,) points, (V, 2) lines or outer rings) and columns of one table, in the order of its ids.
+
+    The first column is the table's primary key. A table without geometry gives an empty list.
+
+    Raises
+    ------
+    IndexFormatError
+        No such file or table, or a geometry that `write_layers` would not write.
+    """
+    columns = _query(path, f"SELECT name, pk FROM pragma_table_info({_literal(name)})")
+    if not columns:
+        raise IndexFormatError(f"{path} has no layer '{name}': it is no complete file of roadgeo; make it again")
+    key = next((column for column, primary in columns if primary), "rowid")
+    rows = _query(path, f"SELECT * FROM {_quoted(name)} ORDER BY {_quoted(key)}")
+    table = {column: [row[i] for row in rows] for i, (column, _) in enumerate(columns)}
+    found = _query(
+        path,
+        f"SELECT column_name FROM gpkg_geometry_columns WHERE table_name = {_literal(name)}",
+    )
+    if not found:
+        return [], table
+    return [_decode(blob, path, name) for blob in table.pop(found[0][0])], table
+
+
+@contextmanager
+def open_read_only(path: str | os.PathLike[str]) -> Iterator[sqlite3.Connection]:
+    """Open a GeoPackage for queries; whatever SQLite finds wrong in the block is an `IndexFormatError`.
+
+    Raises
+    ------
+    IndexFormatError
+        No such file, or no GeoPackage.
+    """
+    source = Path(path)
+    if not source.is_file():
+        raise IndexFormatError(f"no such file: {source}; give the path of a .gpkg file")
+    # Immutable: no lock or journal file appears beside a reference that lies in a read-only folder. But while QGIS
+    # edits the file, the latest state lies in the journal beside it, which an immutable file would not have.
+    state = "" if source.with_name(f"{source.name}-wal").exists() else "&immutable=1"
+    try:
+        with closing(sqlite3.connect(f"{source.absolute().as_uri()}?mode=ro{state}", uri=True)) as database:
+            database.execute("PRAGMA trusted_schema = OFF")  # views of a file from anywhere call no unsafe function
+            yield database
+    except sqlite3.Error as error:
+        raise IndexFormatError(f"{source} is no readable GeoPackage ({error}); make it again") from error
+
+
+# --- writing ----------------------------------------------------------------------------------------------------------
+
+_SCHEMA = """
+PRAGMA application_id = 0x47504B47;
+PRAGMA user_version = 10300;
+CREATE TABLE gpkg_spatial_ref_sys (
+    srs_name TEXT NOT NULL, srs_id INTEGER NOT NULL PRIMARY KEY, organization TEXT NOT NULL,
+    organization_coordsys_id INTEGER NOT NULL, definition TEXT NOT NULL, description TEXT);
+CREATE TABLE gpkg_contents (
+    table_name TEXT NOT NULL PRIMARY KEY, data_type TEXT NOT NULL, identifier TEXT UNIQUE, description TEXT DEFAULT '',
+    last_change DATETIME NOT NULL DEFAULT (strftime('%Y-%m-%dT%H:%M:%fZ','now')),
+    min_x DOUBLE, min_y DOUBLE, max_x DOUBLE, max_y DOUBLE, srs_id INTEGER,
+    CONSTRAINT fk_gc_r_srs_id FOREIGN KEY (srs_id) REFERENCES gpkg_spatial_ref_sys(srs_id));
+CREATE TABLE gpkg_geometry_columns (
+    table_name TEXT NOT NULL, column_name TEXT NOT NULL, geometry_type_name TEXT NOT NULL, srs_id INTEGER NOT NULL,
+    z TINYINT NOT NULL, m TINYINT NOT NULL,
+    CONSTRAINT pk_geom_cols PRIMARY KEY (table_name, column_name), CONSTRAINT uk_gc_table_name UNIQUE (table_name),
+    CONSTRAINT fk_gc_tn FOREIGN KEY (table_name) REFERENCES gpkg_contents(table_name),
+    CONSTRAINT fk_gc_srs FOREIGN KEY (srs_id) REFERENCES gpkg_spatial_ref_sys(srs_id));
+CREATE TABLE gpkg_extensions (
+    table_name TEXT, column_name TEXT, extension_name TEXT NOT NULL, definition TEXT NOT NULL, scope TEXT NOT NULL,
+    CONSTRAINT ge_tce UNIQUE (table_name, column_name, extension_name));
+INSERT INTO gpkg_spatial_ref_sys VALUES
+    ('Undefined Cartesian SRS', -1, 'NONE', -1, 'undefined', 'undefined Cartesian coordinate reference system'),
+    ('Undefined geographic SRS', 0, 'NONE', 0, 'undefined', 'undefined geographic coordinate reference system');
+"""
+
+_STYLES_SCHEMA = """
+CREATE TABLE layer_styles (
+    id INTEGER PRIMARY KEY AUTOINCREMENT NOT NULL, f_table_catalog TEXT(256), f_table_schema TEXT(256),
+    f_table_name TEXT(256), f_geometry_column TEXT(256), styleName TEXT(30), styleQML TEXT, styleSLD TEXT,
+    useAsDefault BOOLEAN, description TEXT, owner TEXT(30), ui TEXT(30),
+    update_time DATETIME DEFAULT (strftime('%Y-%m-%dT%H:%M:%fZ','now')));
+INSERT INTO gpkg_contents (table_name, data_type, identifier) VALUES ('layer_styles', 'attributes', 'layer_styles');
+"""
+
+# As the GeoPackage standard spells them (annex F.3); a writer that edits the layer keeps the index true through them.
+_RTREE_TRIGGERS = """
+CREATE TRIGGER "rtree_{t}_geom_insert" AFTER INSERT ON "{t}"
+  WHEN (new."geom" NOT NULL AND NOT ST_IsEmpty(NEW."geom"))
+BEGIN
+  INSERT OR REPLACE INTO "rtree_{t}_geom" VALUES (
+    NEW."fid", ST_MinX(NEW."geom"), ST_MaxX(NEW."geom"), ST_MinY(NEW."geom"), ST_MaxY(NEW."geom"));
+END;
+CREATE TRIGGER "rtree_{t}_geom_update1" AFTER UPDATE OF "geom" ON "{t}"
+  WHEN OLD."fid" = NEW."fid" AND (NEW."geom" NOTNULL AND NOT ST_IsEmpty(NEW."geom"))
+BEGIN
+  INSERT OR REPLACE INTO "rtree_{t}_geom" VALUES (
+    NEW."fid", ST_MinX(NEW."geom"), ST_MaxX(NEW."geom"), ST_MinY(NEW."geom"), ST_MaxY(NEW."geom"));
+END;
+CREATE TRIGGER "rtree_{t}_geom_update2" AFTER UPDATE OF "geom" ON "{t}"
+  WHEN OLD."fid" = NEW."fid" AND (NEW."geom" ISNULL OR ST_IsEmpty(NEW."geom"))
+BEGIN
+  DELETE FROM "rtree_{t}_geom" WHERE id = OLD."fid";
+END;
+CREATE TRIGGER "rtree_{t}_geom_update3" AFTER UPDATE ON "{t}"
+  WHEN OLD."fid" != NEW."fid" AND (NEW."geom" NOTNULL AND NOT ST_IsEmpty(NEW."geom"))
+BEGIN
+  DELETE FROM "rtree_{t}_geom" WHERE id = OLD."fid";
+  INSERT OR REPLACE INTO "rtree_{t}_geom" VALUES (
+    NEW."fid", ST_MinX(NEW."geom"), ST_MaxX(NEW."geom"), ST_MinY(NEW."geom"), ST_MaxY(NEW."geom"));
+END;
+CREATE TRIGGER "rtree_{t}_geom_update4" AFTER UPDATE ON "{t}"
+  WHEN OLD."fid" != NEW."fid" AND (NEW."geom" ISNULL OR ST_IsEmpty(NEW."geom"))
+BEGIN
+  DELETE FROM "rtree_{t}_geom" WHERE id IN (OLD."fid", NEW."fid");
+END;
+CREATE TRIGGER "rtree_{t}_geom_delete" AFTER DELETE ON "{t}"
+  WHEN old."geom" NOT NULL
+BEGIN
+  DELETE FROM "rtree_{t}_geom" WHERE id = OLD."fid";
+END;
+"""
+
+
+def _add_srs(database: sqlite3.Connection, crs: str, custom_id: int) -> int:
+    """Register a CRS and return its srs_id."""
+    if crs == PIXELS:
+        return -1
+    name, code, definition = _describe_crs(crs)
+    srs_id = custom_id if code is None else code
+    organization = "NONE" if code is None else "EPSG"
+    database.execute(
+        "INSERT OR IGNORE INTO gpkg_spatial_ref_sys VALUES (?, ?, ?, ?, ?, '')",
+        (name, srs_id, organization, srs_id, definition),
+    )
+    return srs_id
+
+
+@lru_cache(maxsize=32)
+def _describe_crs(crs: str) -> tuple[str, int | None, str]:
+    """Name, EPSG code and WKT 1 (the dialect that the standard asks for)."""
+    import pyproj
+
+    try:
+        parsed = pyproj.CRS.from_user_input(crs)
+        return parsed.name, parsed.to_epsg(), parsed.to_wkt("WKT1_GDAL")
+    except pyproj.exceptions.CRSError as error:
+        raise CrsError(f"unknown CRS {crs[:60]!r}; give an EPSG code such as EPSG:32619") from error
+
+
+def _add_layer(database: sqlite3.Connection, layer: Layer, srs_id: int) -> None:
+    columns = {name: _sql_values(values) for name, values in layer.columns.items()}
+    declared = ["fid INTEGER PRIMARY KEY AUTOINCREMENT NOT NULL"]
+    declared += [f"geom {layer.geometry_type}"] if layer.geometry_type else []
+    declared += [f"{_quoted(name)} {sql_type}" for name, (sql_type, _) in columns.items()]
+    database.execute(f"CREATE TABLE {_quoted(layer.name)} ({', '.join(declared)})")
+
+    values: list[Sequence[Any]] = [column for _, column in columns.values()]
+    bounds = np.empty((0, 4))
+    if layer.geometry_type:
+        blobs, bounds = _encode(layer.geometry_type, layer.geometries, srs_id)
+        values.insert(0, blobs)
+    if values:
+        marks = ", ".join("?" * (len(values) + 1))
+        rows = zip(range(1, len(values[0]) + 1), *values, strict=True)
+        database.executemany(f"INSERT INTO {_quoted(layer.name)} VALUES ({marks})", rows)
+    _register(database, layer, srs_id, bounds)
+    if layer.geometry_type:
+        _add_spatial_index(database, layer.name, bounds)
+
+
+def _register(database: sqlite3.Connection, layer: Layer, srs_id: int, bounds: FloatArray) -> None:
+    extent: list[float | None] = [None] * 4
+    if len(bounds):
+        extent = [*bounds[:, [0, 2]].min(axis=0).tolist(), *bounds[:, [1, 3]].max(axis=0).tolist()]
+    kind = "features" if layer.geometry_type else "attributes"
+    database.execute(
+        "INSERT INTO gpkg_contents (table_name, data_type, identifier, description, min_x, min_y, max_x, max_y, srs_id)"
+        " VALUES (?, ?, ?, ?, ?, ?, ?, ?, ?)",
+        (layer.name, kind, layer.name, layer.description, *extent, srs_id),
+    )
+    if layer.geometry_type:
+        database.execute(
+            "INSERT INTO gpkg_geometry_columns VALUES (?, 'geom', ?, ?, 0, 0)",
+            (layer.name, layer.geometry_type, srs_id),
+        )
+
+
+def _add_spatial_index(database: sqlite3.Connection, name: str, bounds: FloatArray) -> None:
+    """Add the R-tree extension; without SQLite's rtree module the file is as valid, only slower to pan over."""
+    try:
+        database.execute(f'CREATE VIRTUAL TABLE "rtree_{name}_geom" USING rtree(id, minx, maxx, miny, maxy)')
+    except sqlite3.OperationalError:
+        return
+    if len(bounds):
+        _fill_spatial_index(database, f"rtree_{name}_geom", bounds)
+    database.executescript(_RTREE_TRIGGERS.format(t=name))
+    database.execute(
+        "INSERT INTO gpkg_extensions VALUES (?, 'geom', 'gpkg_rtree_index',"
+        " 'http://www.geopackage.org/spec120/#extension_rtree', 'write-only')",
+        (name,),
+    )
+
+
+def _fill_spatial_index(database: sqlite3.Connection, table: str, bounds: FloatArray) -> None:
+    """Fill the tables behind an empty R-tree; inserting into it would take as long as all else."""
+    (node_size,) = database.execute(f'SELECT length(data) FROM "{table}_node" WHERE nodeno = 1').fetchone()
+    tree = pack_rtree(bounds, node_size)
+    raw = tree.nodes.tobytes()
+    blobs = (raw[i : i + node_size] for i in range(0, len(raw), node_size))
+    database.executemany(f'REPLACE INTO "{table}_node" VALUES (?, ?)', enumerate(blobs, 1))
+    parents = list(enumerate(tree.parents.tolist(), 1))[1:]
+    database.executemany(f'INSERT INTO "{table}_parent" VALUES (?, ?)', parents)
+    database.executemany(f'INSERT INTO "{table}_rowid" VALUES (?, ?)', enumerate(tree.leaves.tolist(), 1))
+
+
+def _sql_values(values: Sequence[Any] | AnyArray) -> tuple[str, list[Any]]:
+    """Return the SQL type and the plain Python values of one column."""
+    plain = values.tolist() if isinstance(values, np.ndarray) else list(values)
+    kinds = {type(value) for value in plain if value is not None}
+    if isinstance(values, np.ndarray) and values.dtype.kind in "biuf":  # it knows its type even when empty
+        kinds = {{"b": bool, "f": float}.get(values.dtype.kind, int)}
+    if kinds <= {bool} and kinds:
+        return "BOOLEAN", plain
+    if kinds <= {bool, int} and kinds:
+        return "INTEGER", plain
+    if kinds <= {bool, int, float} and kinds:
+        return "REAL", [None if value != value else value for value in plain]  # NaN differs from itself
+    return "TEXT", plain
+
+
+def _encode(kind: GeometryType, geometries: Sequence[Any] | FloatArray, srs_id: int) -> tuple[list[bytes], FloatArray]:
+    """GeoPackage blobs, and (N, 4) bounds min x, max x, min y, max y."""
+    if kind == "POINT":
+        xy = np.asarray(geometries, float).reshape(-1, 2)
+        records = np.zeros(len(xy), _POINT)
+        records["header"], records["srs_id"], records["order"], records["type"] = b"GP\0\1", srs_id, 1, 1
+        records["xy"] = xy
+        raw = records.tobytes()
+        size = _POINT.itemsize
+        return [raw[i : i + size] for i in range(0, len(raw), size)], xy[:, [0, 0, 1, 1]]
+    if not len(geometries):
+        return [], np.empty((0, 4))
+    if kind == "MULTIPOLYGON":
+        return _encode_multipolygons(geometries, srs_id)
+    arrays = [np.asarray(vertices, "<f8") for vertices in geometries]
+    if kind == "POLYGON":
+        arrays = [xy if np.array_equal(xy[0], xy[-1]) else np.vstack([xy, xy[:1]]) for xy in arrays]
+    coords = np.concatenate(arrays)
+    stops = np.cumsum([len(xy) for xy in arrays]).tolist()
+    starts = [0, *stops[:-1]]
+    bounds = np.stack([np.minimum.reduceat(coords, starts), np.maximum.reduceat(coords, starts)], axis=2).reshape(-1, 4)
+    raw = coords.tobytes()
+    head = struct.Struct("<BII" if kind == "LINESTRING" else "<BIII")
+    rings = () if kind == "LINESTRING" else (1,)
+    blobs = [
+        _HEADER.pack(b"GP\0\3", srs_id, *box)
+        + head.pack(1, _WKB_TYPES[kind], *rings, stop - start)
+        + raw[16 * start : 16 * stop]
+        for start, stop, box in zip(starts, stops, bounds.tolist(), strict=True)
+    ]
+    return blobs, bounds
+
+
+def _encode_multipolygons(geometries: Sequence[Any] | FloatArray, srs_id: int) -> tuple[list[bytes], FloatArray]:
+    """Do as `_encode`; a geometry is a sequence of outer rings."""
+    header = _HEADER.size
+    blobs, bounds = [], []
+    for rings in geometries:
+        parts, boxes = _encode("POLYGON", rings, srs_id)
+        box = [*boxes[:, [0, 2]].min(axis=0), *boxes[:, [1, 3]].max(axis=0)]
+        bounds.append([box[0], box[2], box[1], box[3]])
+        count = struct.pack("<BII", 1, _WKB_TYPES["MULTIPOLYGON"], len(parts))
+        blobs.append(b"".join([_HEADER.pack(b"GP\0\3", srs_id, *bounds[-1]), count, *(one[header:] for one in parts)]))
+    return blobs, np.array(bounds)
+
+
+# --- reading ----------------------------------------------------------------------------------------------------------
+
+
+def _query(path: str | os.PathLike[str], sql: str) -> list[Any]:
+    with open_read_only(path) as database:
+        return database.execute(sql).fetchall()
+
+
+def _decode(blob: bytes, path: str | os.PathLike[str], layer: str) -> FloatArray:
+    """Vertices of a point, line or outer ring, little-endian or big-endian, with or without an envelope."""
+    try:
+        flags = blob[3]
+        start = 8 + _ENVELOPE_BYTES[(flags >> 1) & 7]
+        order = "<" if blob[start] else ">"
+        (kind,) = struct.unpack_from(f"{order}I", blob, start + 1)
+        if kind == 1:
+            return np.frombuffer(blob, f"{order}f8", 2, start + 5).astype(float)
+        at = start + {2: 5, 3: 9}[kind]
+        (count,) = struct.unpack_from(f"{order}I", blob, at)
+        return np.frombuffer(blob, f"{order}f8", 2 * count, at + 4).astype(float).reshape(-1, 2)
+    except (IndexError, KeyError, TypeError, ValueError, struct.error) as error:
+        raise IndexFormatError(
+            f"{path}: layer '{layer}' holds a geometry that is no point, line or polygon; make the file again"
+        ) from error
+
+
+def _quoted(name: str) -> str:
+    return '"' + name.replace('"', '""') + '"'
+
+
+def _literal(text: str) -> str:
+    return "'" + text.replace("'", "''") + "'"

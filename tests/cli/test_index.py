@@ -1,0 +1,228 @@
+"""`roadgeo index` from its command line to its files, on loopback servers that give real answers."""
+
+import json
+import os
+import shlex
+import sqlite3
+import time
+from contextlib import closing
+from pathlib import Path
+
+import cv2
+import numpy as np
+import pytest
+import shapely
+from worlds.fake_osm import EMPTY, fake_osm
+from worlds.fenway import write_streets, write_vector
+
+from roadgeo.cli import main
+
+
+@pytest.fixture
+def osm(tmp_path, monkeypatch):
+    monkeypatch.setenv("ROADGEO_CACHE", str(tmp_path / "cache"))
+    monkeypatch.setenv("ROADGEO_LIBRARY", str(tmp_path / "library"))
+    monkeypatch.setattr(time, "sleep", lambda _: None)
+    with fake_osm() as state:
+        yield state
+
+
+def index(*arguments, osm=None, quiet=False):
+    servers = [] if osm is None else ["--overpass-url", f"{osm.url}/api", "--nominatim-url", osm.url]
+    arguments += ("--quiet",) if quiet else ()
+    return main(["index", *map(str, arguments), *servers])
+
+
+def test_a_place_becomes_a_reference_in_the_library(osm, tmp_path, capsys):
+    assert index("--osm", "Fenway, Boston", osm=osm) == 0
+    capsys.readouterr()
+    assert {file.name for file in (tmp_path / "library").iterdir()} == {"fenway-boston.gpkg", "fenway-boston.index"}
+    assert main(["info", "fenway-boston", "--json"]) == 0
+    told = json.loads(capsys.readouterr().out)
+    assert "OpenStreetMap contributors" in json.dumps(told, ensure_ascii=False)
+    assert "2022-05-04T19:30:42Z" in json.dumps(told)
+
+
+@pytest.mark.parametrize(
+    ("arguments", "message"),
+    [
+        (("--osm", "Atlantis"), "OpenStreetMap knows no such place"),
+        (("--osm", "Gas Lamp"), "is a point on OpenStreetMap, not an area"),
+    ],
+)
+def test_places_that_cannot_be_indexed(osm, tmp_path, capsys, arguments, message):
+    assert index(*arguments, osm=osm) == 1
+    assert message in capsys.readouterr().err
+    assert not list(tmp_path.rglob("*.gpkg"))
+
+
+def test_a_busy_server_is_waited_for_and_said(osm, capsys):
+    osm.overpass.append((429, {"Retry-After": "3"}, b"busy"))
+    assert index("--bbox=-71.0925,42.3445,-71.08,42.3525", osm=osm) == 0
+    assert "is busy (429), trying again in 3 s" in capsys.readouterr().err
+
+
+@pytest.mark.parametrize("answer", ["cut", (200, {}, EMPTY), (500, {}, b"<html>")], ids=["cut", "empty", "broken"])
+def test_answers_of_no_use_are_an_error_on_one_line(osm, tmp_path, capsys, answer):
+    osm.overpass.append(answer)
+    assert index("--bbox=-71.0925,42.3445,-71.08,42.3525", osm=osm, quiet=True) == 1
+    told = capsys.readouterr().err
+    assert told.startswith("Error: ")
+    assert told.count("\n") == 1
+    assert "fault of roadgeo" not in told
+    assert not list(tmp_path.rglob("*.gpkg"))
+
+
+def test_files_become_a_reference(tmp_path, capsys):
+    folder = tmp_path / "maps"
+    folder.mkdir()
+    write_streets(folder / "a.osm.pbf")
+    write_streets(folder / "b.shp")
+    assert index("--roads", folder, "--out", tmp_path / "fenway.gpkg") == 0
+    assert "reading a.osm.pbf" in capsys.readouterr().err
+    assert (tmp_path / "fenway.index").exists()
+
+
+@pytest.mark.parametrize(
+    ("given", "name"),
+    [(["--out", "My b.gpkg"], "my-b"), (["--out", "b.index"], "b"), (["--name", "C", "--out", "b"], "c")],
+)
+def test_a_reference_is_called_after_its_own_file(tmp_path, monkeypatch, capsys, given, name):
+    monkeypatch.chdir(tmp_path)
+    assert index("--roads", write_streets(tmp_path / "a.geojson"), *given, quiet=True) == 0
+    (reference,) = tmp_path.glob("*.index")
+    assert main(["info", str(reference)]) == 0
+    assert capsys.readouterr().out.splitlines()[0].split() == ["name", name]
+    assert main(["info", str(reference), "--json"]) == 0
+    assert "a.geojson" in json.dumps(json.loads(capsys.readouterr().out)["meta"]["sources"])
+
+
+def test_roads_without_a_crs_are_an_error(tmp_path, capsys):
+    file = write_streets(tmp_path / "a.shp")
+    file.with_suffix(".prj").unlink()
+    assert index("--roads", file, "--out", tmp_path / "a.gpkg") == 1
+    assert "name it, for example --crs EPSG:26986" in capsys.readouterr().err
+    assert index("--roads", file, "--crs", "EPSG:4326", "--out", tmp_path / "a.gpkg") == 0
+
+
+WEST, EAST = "--bbox=-71.11,42.34,-71.0865,42.36", "--bbox=-71.0870,42.34,-71.07,42.36"
+INNER = "--bbox=-71.09,42.345,-71.084,42.35"
+
+
+def counts(reference, capsys):
+    capsys.readouterr()
+    assert main(["check", str(reference)]) == 0
+    assert main(["info", str(reference), "--json"]) == 0
+    told = json.loads(capsys.readouterr().out.partition("\n")[2])
+    return told["counts"]["intersections"], told["road_km"], told["meta"]
+
+
+def test_a_part_is_added_and_replaced_and_the_rest_stays(tmp_path, capsys):
+    streets, whole, grown = write_streets(tmp_path / "a.geojson"), tmp_path / "whole.gpkg", tmp_path / "grown.gpkg"
+    assert index("--roads", streets, "--out", whole) == 0
+    assert index("--roads", streets, WEST, "--out", grown) == 0
+    n, length, _ = counts(whole, capsys)
+    n_west, length_west, meta = counts(grown, capsys)
+    assert n_west < n
+    assert index("--update", "--roads", streets, EAST, "--out", grown) == 0
+    n_grown, length_grown, told = counts(grown, capsys)
+    assert n_grown == pytest.approx(n, abs=2)
+    assert length_grown == pytest.approx(length, rel=0.02)
+    assert length_grown > length_west
+    assert (told["name"], told["options"], len(told["sources"])) == ("grown", meta["options"], 2)
+    assert index("--update", "--roads", streets, EAST, "--out", grown) == 0
+    assert counts(grown, capsys)[:2] == pytest.approx((n_grown, length_grown), rel=0.01)
+
+
+def test_roads_of_a_file_replace_those_where_they_lie(tmp_path, capsys):
+    streets, reference = write_streets(tmp_path / "a.geojson"), tmp_path / "a.gpkg"
+    assert index("--roads", streets, "--out", reference) == 0
+    n, length, _ = counts(reference, capsys)
+    assert index("--update", "--roads", streets, "--out", reference) == 0
+    assert counts(reference, capsys)[:2] == pytest.approx((n, length), rel=0.02)
+
+
+def test_a_fetched_area_replaces_that_of_the_reference(osm, tmp_path, capsys):
+    assert index("--osm", "Fenway, Boston", osm=osm) == 0
+    n, length, _ = counts("fenway-boston", capsys)
+    assert index("--update", INNER, "--name", "fenway-boston", osm=osm) == 0
+    n_new, length_new, meta = counts("fenway-boston", capsys)
+    assert (n_new, length_new) == pytest.approx((n, length), rel=0.03)
+    assert meta["attribution"].count("OpenStreetMap") == 1
+    assert len(meta["sources"]) == 2
+
+
+def test_an_update_of_nothing_is_refused_before_anything_is_fetched(osm, tmp_path, capsys):
+    assert index("--update", "--osm", "Fenway, Boston", "--out", tmp_path / "none.gpkg", osm=osm, quiet=True) == 1
+    told = capsys.readouterr().err
+    assert "no reference" in told
+    assert told.count("\n") == 1
+    assert not osm.searches
+
+
+def test_an_update_from_far_away_is_refused(tmp_path, capsys):
+    reference, far = tmp_path / "a.gpkg", tmp_path / "far.geojson"
+    streets = write_streets(tmp_path / "a.geojson")
+    assert index("--roads", streets, "--out", reference) == 0
+    lines = [shapely.LineString([(10.0, 0.001 * k), (10.01, 0.001 * k)]) for k in range(5)]
+    write_vector(far, lines)
+    before = reference.read_bytes()
+    capsys.readouterr()
+    assert index("--update", "--roads", far, "--out", reference, quiet=True) == 1
+    assert "too far from the reference" in capsys.readouterr().err
+    assert reference.read_bytes() == before
+
+
+def test_an_index_is_built_again_from_the_geopackage_alone(tmp_path, monkeypatch, capsys):
+    """After an edit, as in QGIS, every command says what to type, and that helps."""
+    monkeypatch.chdir(tmp_path)
+    assert index("--roads", write_streets(tmp_path / "a.geojson"), "--out", "my map.gpkg", quiet=True) == 0
+    n, *_ = counts("my map.gpkg", capsys)
+    with closing(sqlite3.connect("my map.gpkg")) as database:
+        database.execute("DELETE FROM intersections WHERE fid = 1")
+        database.commit()
+    cv2.imwrite("mask.png", np.zeros((200, 200), np.uint8))
+    assert main(["locate", "mask.png", "-r", "my map.gpkg"]) == 1
+    advice = capsys.readouterr().err.strip().rpartition(": ")[2]
+    assert advice == "roadgeo index --rebuild 'my map.gpkg'"
+    assert main(shlex.split(advice)[1:]) == 0
+    assert "building the index of my map again ..." in capsys.readouterr().err
+    assert counts("my map.gpkg", capsys)[0] == n - 1
+    assert index("--rebuild", "my map.gpkg", "--osm", "Fenway, Boston") == 2
+    assert index("--rebuild", "none.gpkg", quiet=True) == 1
+    Path("my map.index").unlink()
+    assert main(["locate", "mask.png", "-r", "my map.gpkg"]) == 1  # it shows no roads
+    assert "building the index of my map again ..." in capsys.readouterr().err
+
+
+def test_a_folder_one_may_not_write_to_is_named_before_the_long_part(tmp_path, monkeypatch, capsys):
+    monkeypatch.setattr(os, "access", lambda _, mode: not mode & os.W_OK)  # root may write everywhere
+    assert index("--roads", write_streets(tmp_path / "a.geojson"), "--out", tmp_path / "shelf" / "a.gpkg") == 1
+    told = capsys.readouterr().err
+    assert told.endswith("permission denied; choose a folder you may write to\n")
+    assert told.count("\n") == 1
+
+
+def test_ctrl_c_leaves_nothing_behind(tmp_path, monkeypatch, capsys):
+    def interrupt(*_):
+        raise KeyboardInterrupt
+
+    streets = write_streets(tmp_path / "a.geojson")
+    out = tmp_path / "out"
+    monkeypatch.setattr("roadgeo.reference.files.sync_file", interrupt)  # both files are written, but not in place
+    assert index("--roads", streets, "--out", out / "a.gpkg", quiet=True) == 130
+    assert capsys.readouterr().err.strip() == "Interrupted."
+    assert not list(out.iterdir())
+
+
+def test_the_library_from_filling_to_removing(tmp_path, monkeypatch, capsys):
+    monkeypatch.setenv("ROADGEO_LIBRARY", str(tmp_path / "library"))
+    streets = write_streets(tmp_path / "Fenway Streets.geojson")
+    for name in ("one", "two"):
+        assert index("--roads", streets, "--name", name, quiet=True) == 0
+    assert index("--roads", streets, quiet=True) == 0
+    assert main(["list"]) == 0
+    told = capsys.readouterr().out
+    assert [line.split()[0] for line in told.splitlines()] == ["fenway-streets", "one", "two"]
+    assert main(["remove", "one", "fenway-streets", "--yes"]) == 0
+    assert sorted(file.name for file in (tmp_path / "library").iterdir()) == ["two.gpkg", "two.index"]

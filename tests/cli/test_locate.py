@@ -1,0 +1,397 @@
+"""The command line on real roads: the demonstration's map and masks."""
+
+import json
+import os
+import re
+import shutil
+import subprocess
+import sys
+from pathlib import Path
+
+import click
+import cv2
+import numpy as np
+import pyproj
+import pytest
+import rasterio
+
+from roadgeo.cli import main
+from roadgeo.cli.index import build
+from roadgeo.cli.locate import pair_images
+from roadgeo.demo import ATTRIBUTION, ROADS, DemoMask, demo_masks
+from roadgeo.geometry.homography import Homography
+from roadgeo.sources.roads import read_roads
+
+MASKS = {mask.path.stem: mask for mask in demo_masks()}
+
+
+@pytest.fixture(scope="module")
+def porto(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    path = tmp_path_factory.mktemp("reference") / "porto.gpkg"
+    build(read_roads(ROADS, attribution=ATTRIBUTION), path, "porto")
+    return path
+
+
+@pytest.fixture(autouse=True)
+def _library(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setenv("ROADGEO_LIBRARY", str(tmp_path / "library"))
+    monkeypatch.chdir(tmp_path)
+
+
+def center_error(found: dict, mask: DemoMask) -> float:
+    middle = np.array(found["size"]) / 2
+    x, y = pyproj.Transformer.from_crs(mask.crs, found["crs"], always_xy=True).transform(
+        *Homography(mask.homography)(middle)
+    )
+    return float(np.hypot(found["center"]["x"] - x, found["center"]["y"] - y))
+
+
+def test_a_mask_is_located_and_everything_is_written(
+    porto: Path, tmp_path: Path, capfd: pytest.CaptureFixture[str]
+) -> None:
+    assert main(["locate", str(MASKS["drone"].path), "-r", str(porto), "--plot"]) == 0
+    out, err = capfd.readouterr()
+    assert "drone.png: located at 41.1525" in out
+    assert err == ""
+    written = {path.name for path in tmp_path.iterdir()}
+    assert written == {
+        "drone_footprint.tif",
+        "drone_footprint.qml",
+        "drone_location.gpkg",
+        "drone_location.json",
+        "drone_overlay.png",
+    }
+    assert center_error(json.loads((tmp_path / "drone_location.json").read_text()), MASKS["drone"]) < 2
+
+
+def test_a_figure_is_written_and_goes_with_the_place(
+    porto: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capfd: pytest.CaptureFixture[str]
+) -> None:
+    pytest.importorskip("matplotlib")
+    shutil.copy(MASKS["drone"].path, "a.png")
+    assert main(["locate", "a.png", "-r", str(porto), "--figure", "pdf", "-q"]) == 0
+    assert (tmp_path / "a_figure.pdf").read_bytes().startswith(b"%PDF")
+    assert main(["locate", "a.png", "-r", str(porto), "--near", "0,0,10", "-q"]) == 3
+    assert not (tmp_path / "a_figure.pdf").exists()
+    monkeypatch.setattr("roadgeo.outputs.figure.has_matplotlib", lambda: False)
+    assert main(["locate", "a.png", "-r", str(porto), "--figure", "pdf", "-q"]) == 2
+    assert "pip install 'roadgeo[plot]'" in capfd.readouterr().err
+
+
+def test_json_lines_stand_in_input_order_and_alone_on_standard_output(
+    porto: Path, tmp_path: Path, capfd: pytest.CaptureFixture[str]
+) -> None:
+    shutil.copy(MASKS["elsewhere"].path, "a.png")
+    Path("b.png").write_text("no picture")
+    shutil.copy(MASKS["map_sheet"].path, "c.png")
+    status = main(["locate", "a.png", "missing.png", "b.png", "c.png", "-r", str(porto), "--json", "-o", "out"])
+    out, err = capfd.readouterr()
+    found = [json.loads(line) for line in out.splitlines()]
+    assert [one["query"] for one in found] == ["a.png", "missing.png", "b.png", "c.png"]
+    assert [one["status"] for one in found] == ["not_located", "error", "error", "located"]
+    assert all(one["schema"] == "roadgeo.location/1" and one["reason"] for one in found)
+    assert [one.get("attribution") for one in found] == [ATTRIBUTION, None, None, ATTRIBUTION]
+    assert status == 1
+    assert err.count("Error: ") == 2
+    assert "1 located, 1 not located, 2 failed" in err
+    assert not (tmp_path / "out" / "a_footprint.tif").exists()
+
+
+def test_processes_give_the_same_results(porto: Path, tmp_path: Path, capfd: pytest.CaptureFixture[str]) -> None:
+    masks = [str(mask.path) for mask in MASKS.values()]
+    results = []
+    for jobs in ("1", "2"):
+        assert main(["locate", *masks, "-r", str(porto), "--json", "-o", f"out{jobs}", "--jobs", jobs, "-q"]) == 3
+        out, err = capfd.readouterr()
+        assert err == ""
+        results.append([json.loads(line) for line in out.splitlines()])
+    alone, together = ([{**one, "seconds": None} for one in found] for found in results)
+    assert alone == together
+    assert [one["status"] == "located" for one in alone] == [mask.in_map for mask in MASKS.values()]
+    for found, mask in zip(alone, MASKS.values(), strict=True):
+        if mask.in_map:
+            assert center_error(found, mask) < 2
+
+
+def test_what_was_cut_short_goes_on_where_it_was(
+    porto: Path, tmp_path: Path, capfd: pytest.CaptureFixture[str]
+) -> None:
+    for name in ("drone", "elsewhere", "map_sheet"):
+        shutil.copy(MASKS[name].path, f"{name}.png")
+    locate = ["locate", "drone.png", "elsewhere.png", "map_sheet.png", "-r", str(porto), "-o", "out", "--json", "-q"]
+    assert main([*locate[:3], *locate[4:]]) == 3  # as if it had been interrupted
+    first = capfd.readouterr().out.splitlines()
+    marked = {**json.loads(first[0]), "reason": "found before"}
+    Path("out/drone_location.json").write_text(json.dumps(marked))
+    Path("out/elsewhere_location.json").write_text("half a fi")
+    assert main([*locate, "--skip-existing"]) == 3
+    again = [json.loads(line) for line in capfd.readouterr().out.splitlines()]
+    assert [one["status"] for one in again] == ["located", "not_located", "located"]
+    assert again[0] == marked
+    assert Path("out/roadgeo_summary.csv").read_text().count("\n") == 4
+    os.utime("drone.png", (2e9, 2e9))  # the mask was made anew
+    assert main([*locate, "--skip-existing"]) == 3
+    assert json.loads(capfd.readouterr().out.splitlines()[0])["reason"] != "found before"
+
+
+def test_the_photograph_is_drawn_in_the_crs_asked_for(
+    porto: Path, tmp_path: Path, capfd: pytest.CaptureFixture[str]
+) -> None:
+    shutil.copy(MASKS["drone"].path, "drone_mask.png")
+    Path("photos").mkdir()
+    photo = cv2.cvtColor(cv2.resize(cv2.imread("drone_mask.png", 0), None, fx=2, fy=2), cv2.COLOR_GRAY2BGR)
+    cv2.imwrite("photos/drone.png", photo)
+    arguments = ["--crs", "EPSG:3857", "--resolution", "2", "--gcps", "--also", "geojson", "-r", str(porto)]
+    assert main(["locate", "drone_mask.png", "--image", "photos", *arguments]) == 0
+    assert f"drew {Path('photos', 'drone.png')}, 2 times the mask's size" in capfd.readouterr().out
+    with rasterio.open("drone_mask_footprint.tif") as raster:
+        assert (raster.crs.to_epsg(), raster.res, raster.count) == (3857, (2.0, 2.0), 4)
+    assert Path("drone_mask_gcps.tif").exists()
+    assert Path("drone_mask_footprint.geojson").exists()
+
+
+def test_photographs_go_with_their_masks(tmp_path: Path) -> None:
+    for name in ("a.jpg", "b_mask.tif"):
+        (tmp_path / name).touch()
+    found = pair_images(["x/a_mask.png", "x/b_mask.png"], [str(tmp_path)])
+    assert found == {"x/a_mask.png": str(tmp_path / "a.jpg"), "x/b_mask.png": str(tmp_path / "b_mask.tif")}
+    assert pair_images(["a.png", "b.png"], ["1.tif", "2.tif"]) == {"a.png": "1.tif", "b.png": "2.tif"}
+    assert pair_images(["a.png"], []) == {}
+    with pytest.raises(click.UsageError, match="2 masks and 1 times --image"):
+        pair_images(["a.png", "b.png"], ["1.tif"])
+    with pytest.raises(click.UsageError, match=r"the name of c\.png"):
+        pair_images(["c.png"], [str(tmp_path)])
+
+
+def test_options_narrow_the_search(porto: Path, capfd: pytest.CaptureFixture[str]) -> None:
+    mask = str(MASKS["map_sheet"].path)
+    reference = ["-r", str(porto), "-q"]
+    assert main(["locate", mask, *reference, "--north-up", "--gsd", "0.8:1.2", "--near=-8.629,41.1625,500"]) == 0
+    assert main(["locate", mask, *reference, "--gsd", "2:3"]) == 3
+    assert main(["locate", mask, *reference, "--near=-8.60,41.15,500"]) == 3
+    assert capfd.readouterr().out == ""
+    for limits, told in [
+        (["--near=-8.60,41.15,500"], "searched within 500 m of -8.6,41.15: "),
+        (
+            ["--near=2.35,48.85,2000", "--gsd", "0.8:1.2"],
+            "searched within 2 km of 2.35,48.85, at 0.8 to 1.2 m per pixel",
+        ),
+    ]:
+        assert main(["locate", mask, "-r", str(porto), *limits]) == 3
+        assert told in capfd.readouterr().out
+
+
+def test_the_papers_matcher_says_once_what_it_found(porto: Path, capfd: pytest.CaptureFixture[str]) -> None:
+    assert main(["locate", str(MASKS["drone"].path), "-r", str(porto), "--method", "pair"]) == 0
+    out = capfd.readouterr().out
+    assert re.search(r"located at 41\.152.* on porto: \d+ of \d+ intersections", out)
+    assert out.count("located") == 1
+
+
+def test_the_library_is_searched_by_default(tmp_path: Path, capfd: pytest.CaptureFixture[str]) -> None:
+    assert main(["index", "--roads", str(ROADS), "--name", "Porto, Portugal", "-q"]) == 0
+    assert main(["list"]) == 0
+    assert "porto-portugal" in capfd.readouterr().out
+    assert main(["locate", str(MASKS["high_flight"].path)]) == 0
+    assert "on porto-portugal" in capfd.readouterr().out
+    assert main(["info", "porto-portugal"]) == 0
+    assert "intersections" in capfd.readouterr().out
+    assert main(["check", "porto-portugal"]) == 0
+    assert main(["remove", "porto-portugal", "--yes"]) == 0
+    capfd.readouterr()
+    assert main(["locate", str(MASKS["high_flight"].path)]) == 1
+    assert "is empty and no --reference was given" in capfd.readouterr().err
+
+
+def test_a_part_of_a_reference_is_replaced(tmp_path: Path, capfd: pytest.CaptureFixture[str]) -> None:
+    west, east = "-8.67,41.13,-8.62,41.19", "-8.63,41.13,-8.57,41.19"
+    roads = ["index", "--roads", str(ROADS), "-o", "porto.gpkg", "-q"]
+    assert main([*roads, "--bbox=" + west]) == 0
+    assert main(["locate", str(MASKS["drone"].path), "-r", "porto.gpkg", "-q"]) == 3
+    assert main([*roads, "--update", "--bbox=" + east]) == 0
+    assert main(["check", "porto.gpkg"]) == 0
+    assert main(["locate", str(MASKS["drone"].path), str(MASKS["segmenter"].path), "-r", "porto.gpkg", "-q"]) == 0
+    assert main(["index", "--update", "--roads", str(ROADS), "-o", "missing.gpkg", "-q"]) == 1
+    assert "missing.gpkg" in capfd.readouterr().err
+
+
+def test_vectorize_shows_what_the_program_saw(tmp_path: Path, capfd: pytest.CaptureFixture[str]) -> None:
+    assert main(["vectorize", str(MASKS["segmenter"].path), "-o", "out"]) == 0
+    assert sorted(path.name for path in Path("out").iterdir()) == [
+        "segmenter_vectorized.gpkg",
+        "segmenter_vectorized.png",
+    ]
+
+
+# --- input that is wrong ----------------------------------------------------------------------------------------------
+
+
+def bad_mask(name: str) -> Path:
+    path = Path(name)
+    photo = np.random.default_rng(1).integers(0, 256, (300, 300, 3)).astype(np.uint8)
+    content = {"black.png": np.zeros((300, 300), np.uint8), "photo.png": cv2.GaussianBlur(photo, (0, 0), 2)}
+    if name in content:
+        cv2.imwrite(name, content[name])
+    elif name == "empty.png":
+        path.touch()
+    return path
+
+
+@pytest.mark.parametrize(
+    ("name", "message"),
+    [
+        ("missing.png", "no such file"),
+        ("empty.png", "not a raster"),
+        ("black.png", "shows no road"),
+        ("photo.png", "looks like a photograph"),
+    ],
+)
+def test_a_bad_mask_is_one_line_and_status_1(
+    name: str, message: str, porto: Path, capfd: pytest.CaptureFixture[str]
+) -> None:
+    assert main(["locate", str(bad_mask(name)), "-r", str(porto)]) == 1
+    out, err = capfd.readouterr()
+    assert out == ""
+    assert err.startswith(f"Error: {name}")
+    assert message in err
+    assert err.count("\n") == 1
+
+
+@pytest.mark.parametrize("known", [["--north-up"], ["--gsd", "0.5:1"], ["--near=-8.6,41.1,500"], ["--max-tilt", "0"]])
+def test_the_papers_method_knows_no_hints(known: list[str], porto: Path, capfd: pytest.CaptureFixture[str]) -> None:
+    assert main(["locate", str(MASKS["drone"].path), "-r", str(porto), "--method", "pair", *known]) == 2
+    assert "--method pair knows no --camera" in capfd.readouterr().err
+
+
+def last_line(capfd: pytest.CaptureFixture[str]) -> str:
+    out, err = capfd.readouterr()
+    assert out == ""
+    assert "Traceback" not in err
+    assert err.count("Error: ") == 1
+    return err.splitlines()[-1]
+
+
+def test_roads_that_are_none_are_named(tmp_path: Path, capfd: pytest.CaptureFixture[str]) -> None:
+    import geopandas as gpd
+    import shapely
+
+    line = shapely.LineString([(0, 0), (900, 900)])
+    gpd.GeoDataFrame(geometry=[line], crs=32629).to_file("nocrs.shp")
+    Path("nocrs.prj").unlink()
+    gpd.GeoDataFrame(geometry=[shapely.Point(-71, 42)], crs=4326).to_file("points.geojson")
+    for name, message in [
+        ("nocrs.shp", "says nothing of its CRS"),
+        ("points.geojson", "holds Point, expected lines"),
+        ("missing.shp", "no such file"),
+    ]:
+        assert main(["index", "--roads", name, "--out", "x.gpkg"]) == 1
+        assert message in last_line(capfd)
+    assert not Path("x.gpkg").exists()
+
+
+def test_a_place_nobody_can_look_up_is_one_line(
+    capfd: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch, tmp_path: Path
+) -> None:
+    """Nothing listens on port 9 of this machine: as good as no network."""
+    monkeypatch.setenv("ROADGEO_CACHE", str(tmp_path / "cache"))
+    arguments = ["--overpass-url", "http://127.0.0.1:9/api", "--nominatim-url", "http://127.0.0.1:9"]
+    assert main(["index", "--osm", "Atlantis", "--out", "x.gpkg", *arguments]) == 1
+    assert "127.0.0.1" in last_line(capfd)
+    assert not Path("x.gpkg").exists()
+
+
+def test_a_truncated_index_is_refused(porto: Path, capfd: pytest.CaptureFixture[str]) -> None:
+    for path in porto.parent.iterdir():
+        shutil.copy(path, ".")
+    content = Path("porto.index").read_bytes()
+    Path("porto.index").write_bytes(content[: len(content) // 2])
+    assert main(["locate", str(MASKS["drone"].path), "-r", "porto.gpkg"]) == 1
+    assert "truncated" in last_line(capfd)
+    Path("porto.index").unlink()
+    assert main(["locate", str(MASKS["drone"].path), "-r", "porto.gpkg", "-q"]) == 0  # rebuilt from the GeoPackage
+
+
+class Malice:
+    def __reduce__(self) -> tuple:
+        return os.system, ("touch it_ran",)
+
+
+def test_a_pickle_that_would_run_code_does_not(porto: Path, capfd: pytest.CaptureFixture[str]) -> None:
+    """Wherever the index holds its pickle, a hostile one of the same length in its place is refused unread."""
+    import pickle
+
+    for path in porto.parent.iterdir():
+        shutil.copy(path, ".")
+    content = Path("porto.index").read_bytes()
+    start = content.index(b"\x80\x05")
+    evil = pickle.dumps(Malice(), 5)
+    Path("porto.index").write_bytes(content[:start] + evil + content[start + len(evil) :])
+    assert main(["locate", str(MASKS["drone"].path), "-r", "porto.gpkg"]) == 1
+    assert "porto.index" in last_line(capfd)
+    Path("porto.index").write_bytes(evil)
+    assert main(["locate", str(MASKS["drone"].path), "-r", "porto.gpkg"]) == 1
+    assert "porto.index" in last_line(capfd)
+    assert not Path("it_ran").exists()
+
+
+@pytest.mark.parametrize("command", ["locate", "index"])
+def test_a_folder_that_cannot_be_written_to_is_named(
+    command: str, porto: Path, capfd: pytest.CaptureFixture[str]
+) -> None:
+    Path("file").touch()  # a file where a folder should be stands in the way even of root
+    arguments = {
+        "locate": [str(MASKS["drone"].path), "-r", str(porto), "-o", "file/out"],
+        "index": ["--roads", str(ROADS), "-o", "file/porto.gpkg"],
+    }
+    assert main([command, *arguments[command]]) == 1
+    assert "cannot write file" in last_line(capfd)
+
+
+@pytest.mark.parametrize(
+    "arguments",
+    [
+        ["locate"],
+        ["locate", "a.png", "--gsd", "3"],
+        ["locate", "a.png", "--near", "1,2"],
+        ["locate", "a.png", "--jobs", "0"],
+        ["locate", "a.png", "--method", "magic"],
+        ["index"],
+        ["index", "--osm", "Porto", "--roads", "a.shp"],
+        ["index", "--osm", "Porto", "--crs", "EPSG:4326"],
+        ["index", "--roads", "a.shp", "--date", "2020-01-01"],
+    ],
+)
+def test_usage_is_one_line_and_status_2(arguments: list[str], capfd: pytest.CaptureFixture[str]) -> None:
+    assert main(arguments) == 2
+    out, err = capfd.readouterr()
+    assert out == ""
+    assert err.startswith("Error: ")
+    assert err.endswith(f"Try 'roadgeo {arguments[0]} --help'.\n")
+    assert err.count("\n") == 1
+
+
+# --- the whole --------------------------------------------------------------------------------------------------------
+
+
+def test_the_demonstration_shows_what_it_promises(tmp_path: Path, capfd: pytest.CaptureFixture[str]) -> None:
+    assert main(["demo"]) == 0
+    out = capfd.readouterr().out
+    assert out.count("found at") == 4
+    assert out.count("refused, as it should be") == 1
+    assert (tmp_path / "roadgeo_demo" / "drone_overlay.png").exists()
+    with rasterio.open(tmp_path / "roadgeo_demo" / "drone_footprint.tif") as raster:
+        assert raster.crs.to_epsg() == 32629
+
+
+def test_locate_needs_no_heavy_library(porto: Path, tmp_path: Path) -> None:
+    program = (
+        "import sys; from roadgeo.cli import main; status = main(sys.argv[1:]); print(*sys.modules); sys.exit(status)"
+    )
+    done = subprocess.run(
+        [sys.executable, "-c", program, "locate", str(MASKS["drone"].path), "-r", str(porto), "-q"],
+        capture_output=True,
+        text=True,
+        check=True,
+    )
+    heavy = {"geopandas", "pyogrio", "osmnx", "networkx", "pandas", "matplotlib", "shapely", "rich"}
+    assert not heavy & set(done.stdout.split())

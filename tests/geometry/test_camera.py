@@ -1,0 +1,143 @@
+"""Cameras whose pose is known."""
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+from worlds.scenes import camera
+
+from roadgeo.geometry.camera import CameraOptions, judge, pose
+
+SIZE = (1200, 900)
+OPTIONS = CameraOptions()
+
+tilts = st.floats(0, 50)
+turns = st.floats(0, 360)
+
+
+def angle_between(a, b):
+    return abs((a - b + 180) % 360 - 180)
+
+
+@given(gsd=st.floats(0.25, 4.5), heading=turns, focal=st.floats(600, 5000))
+def test_straight_down(gsd, heading, focal):
+    seen = pose(camera((500, 700), SIZE, gsd, 0.0, 0.0, heading, focal), SIZE)
+    assert seen.gsd_m == pytest.approx(gsd)
+    assert angle_between(seen.rotation_deg, heading) < 1e-6
+    assert seen.tilt_deg < 1e-3
+    assert seen.skew < 1e-9
+    assert judge(camera((500, 700), SIZE, gsd, 0.0, 0.0, heading, focal), SIZE, OPTIONS) == ""
+
+
+@given(tilt=st.floats(0.5, 60), azimuth=turns, heading=turns, focal=st.floats(700, 4000), gsd=st.floats(0.3, 4))
+def test_tilt_of_a_known_focal_length(tilt, azimuth, heading, focal, gsd):
+    seen = pose(camera((-3000, 90), SIZE, gsd, tilt, azimuth, heading, focal), SIZE, focal)
+    assert seen.tilt_deg == pytest.approx(tilt, abs=1e-3)
+    assert seen.focal_px == focal
+    assert seen.skew < 1e-6
+    # Across the axis a pixel covers `gsd`, along it 1 / cos(tilt) more: the root of the area lies between.
+    assert seen.gsd_m == pytest.approx(gsd / np.sqrt(np.cos(np.radians(tilt))), rel=1e-6)
+
+
+@pytest.mark.parametrize("focal", [700.0, 1200.0, 2500.0])
+@pytest.mark.parametrize("tilt", [20.0, 35.0, 50.0])
+def test_tilt_and_focal_length_where_neither_is_known(tilt, focal):
+    errors = []
+    for azimuth in (10, 130, 250):
+        matrix = camera((0, 0), SIZE, 1.0, tilt, azimuth, 77.0, focal)
+        seen = pose(matrix, SIZE)
+        errors.append(abs(seen.tilt_deg - tilt))
+        assert seen.focal_px == pytest.approx(focal, rel=0.12)
+        assert seen.skew < 0.05
+    assert max(errors) < 3
+
+
+@given(heading=turns)
+def test_up_is_where_the_image_points_when_the_camera_tilts_forwards(heading):
+    seen = pose(camera((0, 0), SIZE, 1.0, 40.0, heading, heading, 1000.0), SIZE, 1000.0)
+    assert angle_between(seen.rotation_deg, heading) < 1e-6
+
+
+@given(scale=st.floats(-50, 50).filter(lambda s: abs(s) > 1e-3), tilt=tilts, azimuth=turns)
+def test_a_homography_and_its_multiples_are_the_same(scale, tilt, azimuth):
+    matrix = camera((100, 50), SIZE, 1.2, tilt, azimuth, 30.0, 1500.0)
+    one, other = pose(matrix, SIZE), pose(scale * matrix, SIZE)
+    assert one.gsd_m == pytest.approx(other.gsd_m)
+    assert one.tilt_deg == pytest.approx(other.tilt_deg, abs=1e-3)
+    assert angle_between(one.rotation_deg, other.rotation_deg) < 1e-6
+    assert judge(scale * matrix, SIZE, OPTIONS) == judge(matrix, SIZE, OPTIONS) == ""
+
+
+@given(tilt=st.floats(0, 60), azimuth=turns, heading=turns, focal=st.floats(0.8, 6), gsd=st.floats(0.25, 3))
+def test_every_camera_within_the_options_is_plausible(tilt, azimuth, heading, focal, gsd):
+    half_angle = np.degrees(np.arctan(0.5 * np.hypot(*SIZE) / (focal * SIZE[0])))
+    if tilt + half_angle < 85:
+        matrix = camera((10, 20), SIZE, gsd, tilt, azimuth, heading, focal * SIZE[0])
+        assert judge(matrix, SIZE, OPTIONS) == ""
+        assert judge(matrix, SIZE, replace(OPTIONS, focal_px=focal * SIZE[0])) == ""
+
+
+def test_what_is_not_plausible():
+    matrix = camera((0, 0), SIZE, 1.0, 30.0, 40.0, 50.0, 1200.0)
+    mirror = np.array([[-1, 0, SIZE[0]], [0, 1, 0], [0, 0, 1.0]])
+    stretch = np.array([[1, 0, 0], [0, 2.2, 0], [0, 0, 1.0]])
+    assert judge(matrix @ mirror, SIZE, OPTIONS) == "mirrored"
+    assert judge(-matrix @ mirror, SIZE, OPTIONS) == "mirrored"
+    assert judge(camera((0, 0), SIZE, 1.0, 75.0, 0.0, 0.0, 1000.0), SIZE, OPTIONS) == "horizon in the frame"
+    assert judge(camera((0, 0), SIZE, 9.0), SIZE, OPTIONS) == "ground sampling out of range"
+    assert judge(camera((0, 0), SIZE, 0.1), SIZE, OPTIONS) == "ground sampling out of range"
+    assert judge(stretch @ camera((0, 0), SIZE, 0.7), SIZE, OPTIONS) == "no camera sees a plane so"
+    assert judge(camera((0, 0), SIZE, 1.0, 50.0, 0.0, 0.0, 4000.0), SIZE, CameraOptions(max_tilt_deg=30.0)) == (
+        "tilt out of range"
+    )
+
+
+@pytest.mark.parametrize("value", [0.0, np.nan, np.inf])
+def test_what_is_no_homography(value):
+    assert judge(np.full((3, 3), value), SIZE, OPTIONS) == "degenerate"
+    assert judge(np.array([[1.0, 0, 0], [1, 0, 0], [0, 0, 1]]), SIZE, OPTIONS) != ""
+
+
+@pytest.mark.parametrize(
+    ("heading", "reason"), [(0, ""), (4, ""), (-4, ""), (356, ""), (90, "not north up"), (180, "not north up")]
+)
+def test_north_up(heading, reason):
+    matrix = camera((0, 0), SIZE, 1.0, 0.0, 0.0, heading)
+    assert judge(matrix, SIZE, replace(OPTIONS, north_up=True)) == reason
+    assert judge(matrix, SIZE, OPTIONS) == ""
+
+
+def test_a_known_focal_length_refuses_what_another_lens_saw():
+    matrix = camera((0, 0), SIZE, 1.0, 45.0, 0.0, 0.0, 900.0)
+    assert judge(matrix, SIZE, replace(OPTIONS, focal_px=900.0)) == ""
+    assert judge(matrix, SIZE, replace(OPTIONS, focal_px=9000.0)) == "no camera sees a plane so"
+
+
+@pytest.mark.parametrize("focal", [600.0, 1500.0, 6000.0])
+def test_a_vertical_view_is_within_any_tilt_whatever_the_lens(focal):
+    """Near the nadir every focal length fits, and a long one makes tilt of any error: no bound may hang on it."""
+    rng = np.random.default_rng(int(focal))
+    for _ in range(20):
+        matrix = camera((0, 0), SIZE, 1.0, 2.0, rng.uniform(0, 360), rng.uniform(0, 360), focal)
+        matrix = matrix / matrix[2, 2]
+        matrix[2, :2] += rng.normal(0.0, 2e-5, 2)  # corners off by some metres
+        assert judge(matrix, SIZE, CameraOptions(max_tilt_deg=5.0)) == ""
+
+
+def test_a_rough_homography_has_wider_bounds():
+    beyond = camera((0, 0), SIZE, 1.0, 42.0, 0.0, 0.0, 1200.0)
+    options = CameraOptions(gsd_m=(0.5, 1.0), max_tilt_deg=30.0, focal_px=1200.0)
+    assert judge(beyond, SIZE, options) != ""
+    assert judge(beyond, SIZE, options, rough=True) == ""
+
+
+def test_what_is_known_of_the_tilt_narrows_what_is_looked_for():
+    ratios = [CameraOptions(max_tilt_deg=tilt).min_shape_ratio for tilt in (0, 15, 30, 60)]
+    assert ratios == sorted(ratios, reverse=True)
+    assert ratios[-1] == 0.33
+    sigmas = [CameraOptions(max_tilt_deg=tilt).perspective_sigma(0.4) for tilt in (0, 5, 15, 60)]
+    assert sigmas == sorted(sigmas)
+    assert sigmas[0] < 0.05
+    assert sigmas[-1] == 0.4

@@ -1,0 +1,71 @@
+"""Pinhole views: where rays meet the ground."""
+
+import numpy as np
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+
+from roadgeo.geometry.pinhole import make_view, sees_ground, warp_mask
+
+CENTER = (1000.0, 2000.0)
+
+
+def test_a_view_from_above_is_a_scaled_north_up_map():
+    view = make_view(CENTER, (200, 100), 0.5)
+    assert view.footprint == pytest.approx(np.array([[950, 2025], [1050, 2025], [1050, 1975], [950, 1975]]))
+    assert view.homography(np.array([0.5, 0.5])) == pytest.approx([950.25, 2024.75])
+
+
+@pytest.mark.parametrize(("heading", "up"), [(0, (0, 1)), (90, (1, 0)), (180, (0, -1)), (270, (-1, 0))])
+def test_the_image_up_points_to_the_heading(heading, up):
+    view = make_view(CENTER, (100, 100), 1.0, heading_deg=heading)
+    step = view.homography(np.array([50.0, 49.0])) - CENTER
+    assert step == pytest.approx(up, abs=1e-9)
+
+
+angles = st.floats(0, 360)
+
+
+@given(tilt=st.floats(0, 60), azimuth=angles, heading=angles, gsd=st.floats(0.1, 5), focal=st.floats(100, 1000))
+def test_a_view_is_the_projection_of_its_camera(tilt, azimuth, heading, gsd, focal):
+    view = make_view(CENTER, (120, 80), gsd, tilt, azimuth, heading, focal)
+    middle = np.array([60.0, 40.0])
+    assert view.homography(middle) == pytest.approx(CENTER)
+    jacobian = view.homography.jacobian(middle)
+    assert np.linalg.det(jacobian) < 0  # pixel rows run down
+    # Across the axis a pixel covers gsd metres, along the tilt gsd / cos(tilt).
+    assert np.linalg.svd(jacobian, compute_uv=False) == pytest.approx([gsd / np.cos(np.radians(tilt)), gsd])
+    ahead = jacobian @ [0, -1]
+    assert ahead / np.hypot(*ahead) == pytest.approx(
+        [np.sin(np.radians(heading)), np.cos(np.radians(heading))], abs=1e-9
+    )
+    assert float(view.sampling(middle)) == pytest.approx(gsd / np.sqrt(np.cos(np.radians(tilt))))
+
+
+def test_a_tilted_view_reaches_farther_where_it_leans():
+    view = make_view(CENTER, (100, 100), 1.0, tilt_deg=40, tilt_azimuth_deg=90)
+    east = view.footprint[:, 0] - CENTER[0]
+    assert east.max() > 1.5 * -east.min()
+
+
+@pytest.mark.parametrize(("tilt", "seen"), [(0, True), (45, True), (60, False), (80, False)])
+def test_frames_that_reach_to_the_horizon_are_told(tilt, seen):
+    assert sees_ground(make_view(CENTER, (100, 100), 1.0, tilt)) is seen
+
+
+def test_a_warped_mask_shows_what_its_matrix_says():
+    mask = np.zeros((200, 300), np.uint8)
+    mask[80:100, 180:200] = 255
+    warped, matrix = warp_mask(mask, 25.0, 70.0, 30.0)
+    rows, columns = np.nonzero(warped)
+    source = np.column_stack([columns + 0.5, rows + 0.5, np.ones(len(rows))]) @ matrix.T
+    source = source[:, :2] / source[:, 2:]
+    assert source.min(axis=0) == pytest.approx([180, 80], abs=1.5)
+    assert source.max(axis=0) == pytest.approx([200, 100], abs=1.5)
+
+
+def test_a_mask_warped_by_nothing_stays():
+    mask = np.where(np.arange(60 * 40).reshape(40, 60) % 7 == 0, 255, 0).astype(np.uint8)
+    warped, matrix = warp_mask(mask, 0.0, 0.0, 0.0)
+    assert np.array_equal(warped, mask)
+    assert matrix / matrix[2, 2] == pytest.approx(np.eye(3), abs=1e-12)

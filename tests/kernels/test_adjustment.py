@@ -1,0 +1,152 @@
+"""The adjustment against a slow twin and a known homography."""
+
+import numpy as np
+import pytest
+from kernels.test_roads import binned
+from naive import kernels as naive
+
+from roadgeo.kernels.adjustment import add_row, adjust, point_row
+
+P = np.array([0.9, -0.2, 0.05, 0.25, 1.1, -0.02, 0.12, -0.08])
+UNIT, ORIGIN = 400.0, np.array([350.0, 320.0])
+GRID, SHAPE = (-400.0, -400.0, 100.0), (15, 15)
+N_CELLS = 9
+
+
+def jittered(p, size, seed=0):
+    return p + np.random.default_rng(seed).normal(0, size, 8)
+
+
+class Town:
+    """Crooked streets on the reference plane, road points that a query saw of them, and matched intersections."""
+
+    def __init__(self, seed=0, noise=0.0, points=80, pairs=12):
+        rng = np.random.default_rng(seed)
+        lines = []
+        for k in range(9):
+            for flip in (False, True):
+                at = 100.0 * k - 50 + rng.uniform(-20, 20, 9)
+                line = np.c_[np.linspace(-50, 750, 9), at]
+                line = line[:, ::-1] if flip else line
+                lines.append(np.hstack([line[:-1], line[1:]]))
+        self.roads = binned(np.vstack(lines), GRID, SHAPE)
+        segments = self.roads[0].astype(float)
+        inverse = np.linalg.inv(np.append(P, 1.0).reshape(3, 3))
+        chosen = segments[rng.integers(0, len(segments), 600)]
+        t = rng.uniform(0, 1, (len(chosen), 1))
+        places = chosen[:, :2] + t * (chosen[:, 2:] - chosen[:, :2])
+        across = (chosen[:, 2:] - chosen[:, :2])[:, ::-1] * (-1, 1)
+        across /= np.hypot(*across.T)[:, None]
+        along = across[:, ::-1] * (1, -1)
+        normal = (places + noise * rng.normal(0, 1, (len(chosen), 1)) * across - ORIGIN) / UNIT
+        query = np.array([naive.transform(inverse, n) for n in normal])
+        ahead = np.array([naive.jacobian(inverse, n) @ d for n, d in zip(normal, along, strict=True)])
+        kept = np.flatnonzero((np.abs(query) < 0.7).all(axis=1))[:points]
+        self.points = query[kept]
+        self.directions = ahead[kept] / np.hypot(*ahead[kept].T)[:, None]
+        self.pairs = rng.uniform(-0.6, 0.6, (pairs, 2))
+        self.targets = np.array([naive.predict(P, *q) for q in self.pairs]).reshape(-1, 2)
+        self.targets += rng.normal(0, noise / UNIT, self.targets.shape)
+
+    def cells(self, xy):
+        return (np.clip((xy + 0.7) / 1.4 * 3, 0, 2).astype(np.int64) @ (1, 3)).astype(np.int64)
+
+    def arguments(self, **changes):
+        values = {
+            "point_weight": 0.8, "pair_weight": 0.3, "n_cells": N_CELLS, "least_share": 0.5, "max_radius": 30.0,
+            "min_cos": float(np.cos(np.radians(25))), "sigma_m": 2.0, "prior": 1e-4, "n_iterations": 12,
+            "tolerance_m": 1e-4, **changes,
+        }  # fmt: skip
+        scalars = list(values.values())
+        observations = (self.points, self.directions, self.cells(self.points), scalars[0])
+        matches = (self.pairs, self.targets, self.cells(self.pairs), scalars[1])
+        return (*observations, *matches, *scalars[2:])
+
+
+def run(town, p, **changes):
+    p, normal = p.copy(), np.empty((8, 8))
+    n, rms = adjust(p, UNIT, *ORIGIN, *town.arguments(**changes), *town.roads, normal)
+    return p, n, rms, normal
+
+
+def corner_gap(p, q):
+    corners = [(-0.7, -0.7), (0.7, -0.7), (0.7, 0.7), (-0.7, 0.7)]
+    return UNIT * max(np.hypot(*(naive.predict(p, *c) - naive.predict(q, *c))) for c in corners)
+
+
+@pytest.mark.parametrize("axis", [(1.0, 0.0), (0.0, 1.0), (0.6, -0.8)])
+def test_point_row_is_the_derivative(axis):
+    row = np.empty(8)
+    x, y, w = point_row(P, 0.3, -0.5, *axis, row)
+    assert (x, y) == pytest.approx(naive.predict(P, 0.3, -0.5))
+    assert w == pytest.approx(1 + P[6] * 0.3 - P[7] * 0.5)
+    assert np.allclose(row, axis @ naive.predict_rows(P, 0.3, -0.5), atol=1e-8)
+
+
+def test_add_row_sums_normal_equations():
+    rng = np.random.default_rng(0)
+    A, W, b = rng.normal(0, 1, (20, 8)), rng.uniform(0, 1, 20), rng.normal(0, 1, 20)
+    normal, right = np.zeros((8, 8)), np.zeros(8)
+    for row, weight, residual in zip(A, W, b, strict=True):
+        add_row(normal, right, row, weight, residual)
+    assert np.allclose(np.tril(normal), np.tril(A.T @ (W[:, None] * A)))
+    assert np.allclose(right, A.T @ (W * b))
+
+
+@pytest.mark.parametrize("seed", range(5))
+def test_exact_observations_give_the_homography(seed):
+    town = Town(seed)
+    start = jittered(P, 0.008, seed)
+    assert corner_gap(start, P) > 2
+    p, n, rms, _ = run(town, start, prior=0.0)
+    assert n > 60
+    assert rms < 1e-3
+    assert corner_gap(p, P) < 0.02
+
+
+@pytest.mark.parametrize("changes", [{}, {"max_radius": 12.0}, {"least_share": 0.8}, {"prior": 10.0}])
+@pytest.mark.parametrize("seed", range(3))
+def test_like_the_twin(seed, changes):
+    town = Town(seed, noise=1.5, points=50)
+    town.directions[:12] = town.directions[:12, ::-1]  # some roads run across
+    start = jittered(P, 0.006, seed)
+    p, n, rms, normal = run(town, start, n_iterations=4, **changes)
+    arguments = town.arguments(n_iterations=4, **changes)
+    expected, n_expected, rms_expected, system = naive.adjust(start, UNIT, ORIGIN, *arguments, town.roads[0])
+    assert n == n_expected
+    assert rms == pytest.approx(rms_expected, rel=1e-3)
+    assert corner_gap(p, expected) < 1e-3
+    assert np.allclose(normal, system, rtol=1e-2, atol=1e-3)
+
+
+def test_wrong_matches_are_outvoted():
+    town = Town(4, noise=0.5)
+    town.targets[:4] += (0.05, -0.05)  # 28 m off
+    p, *_ = run(town, jittered(P, 0.004))
+    assert corner_gap(p, P) < 2
+
+
+def test_cells_where_roads_do_not_meet_wait():
+    town = Town(6)
+    town.cells = lambda xy: (xy[:, 0] > 0).astype(np.int64)
+    right = town.points[:, 0] > 0
+    rng = np.random.default_rng(0)
+    town.points[right] += rng.uniform(-0.2, 0.2, (right.sum(), 2))  # what is there is not on the map
+    n = run(town, P, least_share=0.6, max_radius=8.0)[1]
+    assert n <= (~right).sum()
+    assert run(town, P, least_share=0.0, max_radius=8.0)[1] > n
+
+
+@pytest.mark.parametrize("pairs", [0, 1])
+def test_too_little_to_stand_on(pairs):
+    town = Town(0, points=0, pairs=pairs)
+    p, n, rms, _ = run(town, P)
+    assert rms == np.inf
+    assert n <= 0
+    assert np.isfinite(p).all()
+
+
+def test_the_horizon_is_refused():
+    town = Town(0)
+    town.pairs[0] = (-10.0, 10.0)
+    assert run(town, P)[1:3] == (-1, np.inf)

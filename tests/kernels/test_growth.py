@@ -1,0 +1,288 @@
+"""Growth of hypotheses against slow twins and known homographies."""
+
+import numpy as np
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+from naive import kernels as naive
+
+from roadgeo.kernels.growth import (
+    cholesky,
+    fit_homography,
+    grow,
+    keep_nearest,
+    match_all,
+    nearest_alike,
+    predict,
+    prediction_variance,
+    solve_cholesky,
+)
+from roadgeo.matching.index import neighbour_grid, sort_by_bucket
+
+TOLERANCE = np.radians(25)
+MIN_COS = np.cos(TOLERANCE)
+TRUTH = np.array([[0.8, -0.55, 700.0], [0.5, 0.75, 900.0], [1.5e-4, -1e-4, 1.0]])
+P = np.array([0.9, -0.2, 0.05, 0.25, 1.1, -0.02, 0.15, -0.1])
+
+
+def branches_of(angles):
+    """(N, 8, 2) int8 from (N, k) radians, NaN-padded."""
+    vectors = np.full((len(angles), 8, 2), np.nan)
+    vectors[:, : angles.shape[1]] = np.stack([np.cos(angles), np.sin(angles)], -1)
+    return np.round(127 * np.nan_to_num(vectors)).astype(np.int8)
+
+
+class World:
+    """Scattered intersections with three or four branches, in buckets, and a noisy view of some of them."""
+
+    def __init__(self, seed=0, n=150, noise=0.5, false=10, missing=0.1):
+        rng = np.random.default_rng(seed)
+        xy = rng.uniform(0, 1500, (n, 2))
+        angles = rng.uniform(0, 2 * np.pi, (n, 1)) + np.radians([0, 95, 185, 275]) + rng.uniform(-0.1, 0.1, (n, 4))
+        angles[rng.uniform(size=n) < 0.6, 3] = np.nan
+        self.grid, self.shape = neighbour_grid(xy, 100.0)
+        order, self.starts = sort_by_bucket(xy, self.grid, self.shape)
+        self.ref_xy, angles = np.ascontiguousarray(xy[order]), angles[order]
+        self.ref_branches = branches_of(angles)
+        back = np.linalg.inv(TRUTH)
+        places = [naive.transform(back, point) for point in self.ref_xy]
+        self.truth = np.array([i for i, q in enumerate(places) if (0 < q[0] < 700) and (-700 < q[1] < 0)])
+        self.truth = rng.permutation(self.truth[rng.uniform(size=len(self.truth)) > missing])
+        rays = np.full((len(self.truth), 4), np.nan)
+        for row, i in enumerate(self.truth):
+            J = naive.jacobian(back, self.ref_xy[i])
+            turned = J @ np.array([np.cos(angles[i]), np.sin(angles[i])])
+            rays[row] = np.arctan2(turned[1], turned[0])
+        invented = np.c_[rng.uniform(0, 7, (false, 3)), np.full((false, 1), np.nan)]
+        self.xy = np.vstack([[places[i] for i in self.truth], rng.uniform((0, -700), (700, 0), (false, 2))])
+        self.xy += rng.normal(0, noise, self.xy.shape)
+        self.branches = branches_of(np.vstack([rays, invented]))
+        self.truth = np.r_[self.truth, np.full(false, -1)]
+
+    @property
+    def reference(self):
+        return self.ref_xy, self.ref_branches, self.starts, self.grid, self.shape
+
+    def seeds(self, anchor, k=8, placed=3):
+        """(order, neighbours, partners, affine) around an anchor whose nearest neighbours are placed right."""
+        away = np.hypot(*(self.xy - self.xy[anchor]).T)
+        order = np.argsort(away, kind="stable")
+        neighbours = np.full((len(self.xy), k), -1, np.int32)
+        neighbours[anchor] = order[1 : k + 1]
+        partners = self.truth[neighbours[anchor]].copy()
+        partners[np.flatnonzero(partners >= 0)[placed:]] = -1
+        return order, neighbours, partners, naive.jacobian(TRUTH, self.xy[anchor]).ravel()
+
+
+@pytest.fixture(scope="module")
+def world():
+    return World()
+
+
+class TestCholesky:
+    @pytest.mark.parametrize("n", [1, 3, 8])
+    def test_factorises_and_solves(self, n):
+        rng = np.random.default_rng(n)
+        root = rng.normal(0, 1, (n, n + 2))
+        matrix = root @ root.T
+        factor, right = np.zeros((n, n)), rng.normal(0, 1, n)
+        expected = np.linalg.solve(matrix, right)
+        assert cholesky(np.tril(matrix), factor)
+        assert np.allclose(factor, np.linalg.cholesky(matrix))
+        solve_cholesky(factor, right)
+        assert np.allclose(right, expected)
+
+    @pytest.mark.parametrize("matrix", [np.zeros((2, 2)), -np.eye(3), np.ones((2, 2)), np.full((2, 2), np.nan)])
+    def test_refuses_what_is_not_positive_definite(self, matrix):
+        assert not cholesky(matrix, np.zeros(matrix.shape))
+
+
+class TestFitHomography:
+    @pytest.mark.parametrize("n", [3, 4, 12])
+    @pytest.mark.parametrize("start", [np.zeros(8), P])
+    def test_like_the_twin(self, n, start):
+        rng = np.random.default_rng(n)
+        query, matched = rng.uniform(-0.7, 0.7, (n + 2, 2)), np.r_[-1, np.arange(n), -1]
+        image = np.array([naive.predict(P, *q) for q in query]) + rng.normal(0, 0.01, query.shape)
+        p, normal, factor = start.copy(), np.empty((8, 8)), np.zeros((8, 8))
+        assert fit_homography(query, image, matched, 0.01, p, normal, factor)
+        expected, system = naive.fit_homography(query, image, matched, 0.01, start)
+        assert np.allclose(p, expected, atol=1e-6)
+        assert np.allclose(np.tril(normal), np.tril(system))
+
+    def test_exact_points_give_the_homography(self):
+        query = np.random.default_rng(0).uniform(-0.7, 0.7, (20, 2))
+        image = np.array([naive.predict(P, *q) for q in query])
+        p, normal, factor = np.zeros(8), np.empty((8, 8)), np.zeros((8, 8))
+        for _ in range(3):
+            assert fit_homography(query, image, np.arange(20), 0.0, p, normal, factor)
+        assert np.allclose(p, P, atol=1e-6)
+
+    @pytest.mark.parametrize("matched", [[], [-1, -1, -1, -1], [0, 1, -1, -1]])
+    def test_two_points_are_too_few(self, matched):
+        query = np.random.default_rng(0).uniform(-1, 1, (len(matched), 2))
+        room = np.empty((8, 8)), np.zeros((8, 8))
+        assert not fit_homography(query, query, np.array(matched, np.int64), 1.0, np.zeros(8), *room)
+
+    def test_points_beyond_the_horizon_cannot_be(self):
+        query = np.array([[0.0, 0], [1, 0], [0, 1], [1, 1]])
+        p = np.array([1.0, 0, 0, 0, 1, 0, -1, -1])  # w = -1 at (1, 1)
+        assert not fit_homography(query, query, np.arange(4), 1.0, p, np.empty((8, 8)), np.zeros((8, 8)))
+
+
+class TestPrediction:
+    @pytest.mark.parametrize("uv", [(0.0, 0.0), (0.4, -0.7), (1.0, 1.0)])
+    def test_like_the_twin(self, uv):
+        query = np.random.default_rng(1).uniform(-0.5, 0.5, (9, 2))
+        image = np.array([naive.predict(P, *q) for q in query])
+        p, normal, factor = P.copy(), np.empty((8, 8)), np.zeros((8, 8))
+        assert fit_homography(query, image, np.arange(9), 0.05, p, normal, factor)
+        x, y, w = predict(p, *uv)
+        assert (x, y) == pytest.approx(naive.predict(p, *uv))
+        assert w == pytest.approx(1 + p[6] * uv[0] + p[7] * uv[1])
+        symmetric = np.tril(normal) + np.tril(normal, -1).T
+        expected = naive.prediction_variance(symmetric, p, *uv)
+        assert prediction_variance(factor, p, *uv, np.empty(8)) == pytest.approx(expected, rel=1e-4)
+
+
+class TestNearestAlike:
+    @pytest.mark.parametrize("radius", [3.0, 80.0, 1e4])
+    def test_like_the_twin(self, world, radius):
+        rng = np.random.default_rng(3)
+        for i, (x, y) in enumerate(rng.uniform(-100, 1600, (len(world.xy), 2))):
+            J = rng.normal(0, 1, (2, 2))
+            found = nearest_alike(x, y, radius, world.branches, i, *world.reference, *J.ravel(), MIN_COS)
+            near = {
+                naive.nearest_alike(x, y, radius, world.branches, i, world.ref_xy, world.ref_branches, J, TOLERANCE + e)
+                for e in (-0.02, 0.0, 0.02)
+            }
+            if len(near) == 1:
+                assert found == pytest.approx(near.pop())
+
+    @pytest.mark.parametrize("place", [(np.nan, 0.0), (1e300, 100.0), (-1e300, -1e300), (700.0, np.inf)])
+    def test_places_that_are_none(self, world, place):
+        found = nearest_alike(*place, 50.0, world.branches, 0, *world.reference, 1.0, 0.0, 0.0, 1.0, MIN_COS)
+        assert found == (-1, 50.0)
+
+
+class TestKeepNearest:
+    @given(st.lists(st.tuples(st.integers(-1, 12), st.integers(0, 9)), max_size=60))
+    def test_like_the_twin(self, claims):
+        matched = np.array([partner for partner, _ in claims], np.int64)
+        distance = np.array([float(d) for _, d in claims])
+        expected = naive.keep_nearest(matched, distance)
+        n = keep_nearest(matched, distance)
+        assert np.array_equal(matched, expected)
+        assert n == (expected >= 0).sum()
+
+    def test_partners_with_large_numbers(self):
+        matched = np.array([2**31 - 1, 2**40, 2**31 - 1, 2**40, -1])
+        assert keep_nearest(matched, np.array([2.0, 1.0, 1.0, 1.0, 0.0])) == 2
+        assert matched.tolist() == [-1, 2**40, 2**31 - 1, -1, -1]
+
+
+class TestMatchAll:
+    @pytest.mark.parametrize("shift", [(0.0, 0.0), (60.0, -35.0)])
+    def test_like_the_twin(self, world, shift):
+        def run(one_to_one):
+            matched, distance = np.empty(len(world.xy), np.int64), np.empty(len(world.xy))
+            n = match_all(
+                TRUTH, world.xy, world.branches, 90.0, MIN_COS, *shift, one_to_one, *world.reference, matched, distance
+            )
+            assert n == (matched >= 0).sum() > 0
+            return matched, distance
+
+        matched, distance = run(one_to_one=False)
+        (strict, _), (expected, away), (lax, _) = (
+            naive.match_all(TRUTH, world.xy, world.branches, 90.0, t, shift, False, world.ref_xy, world.ref_branches)
+            for t in (TOLERANCE - 0.02, TOLERANCE, TOLERANCE + 0.02)
+        )
+        clear = (strict == expected) & (lax == expected)  # branches are compared to a degree
+        assert clear.mean() > 0.8
+        assert np.array_equal(matched[clear], expected[clear])
+        assert np.allclose(distance[clear], away[clear], atol=1e-3)
+        assert np.array_equal(run(one_to_one=True)[0], naive.keep_nearest(matched, distance))
+
+    def test_the_true_homography_matches_the_true_points(self, world):
+        matched, distance = np.empty(len(world.xy), np.int64), np.empty(len(world.xy))
+        match_all(TRUTH, world.xy, world.branches, 5.0, MIN_COS, 0.0, 0.0, True, *world.reference, matched, distance)
+        assert np.array_equal(matched[world.truth >= 0], world.truth[world.truth >= 0])
+        assert (distance[world.truth >= 0] < 3).all()
+
+    def test_no_query(self, world):
+        nothing = np.empty((0, 2)), np.empty((0, 8, 2), np.int8), 5.0, MIN_COS, 0.0, 0.0, True
+        assert match_all(TRUTH, *nothing, *world.reference, np.empty(0, np.int64), np.empty(0)) == 0
+
+
+class TestGrow:
+    NUMBERS = (2.0, 25.0)
+    RATES = (0.4, 0.45, 0.08, 4.0)
+
+    def run(self, world, anchor, ref_anchor, seeds):
+        order, neighbours, partners, affine = seeds
+        matched, distance = np.empty(len(world.xy), np.int64), np.empty(len(world.xy))
+        matrix = np.empty((3, 3))
+        result = grow(
+            world.xy, world.branches, order, 500.0, anchor, ref_anchor, affine, neighbours, partners,
+            *world.reference, *self.NUMBERS, MIN_COS, *self.RATES, matched, distance, matrix,
+        )  # fmt: skip
+        return result, matched, distance, matrix
+
+    @pytest.mark.parametrize("seed", range(6))
+    def test_a_true_hypothesis_grows_over_the_whole_query(self, seed):
+        world = World(seed)
+        anchor = int(np.argmin(np.where(world.truth >= 0, np.hypot(*(world.xy - (350, -350)).T), np.inf)))
+        (n, tested, ratio), matched, distance, matrix = self.run(
+            world, anchor, world.truth[anchor], world.seeds(anchor)
+        )
+        true = world.truth >= 0
+        assert (matched[true] == world.truth[true]).mean() > 0.9
+        assert n + 4 >= 0.9 * true.sum()
+        assert tested == len(world.xy) - 4
+        assert ratio > 10
+        assert (distance[matched >= 0] < 25).all()
+        corners = np.array([[0.0, 0], [700, 0], [700, -700], [0, -700]])
+        gap = [naive.transform(matrix, c) - naive.transform(TRUTH, c) for c in corners]
+        assert np.hypot(*np.transpose(gap)).max() < 4
+
+    @pytest.mark.parametrize(("seed", "most"), [(0, None), (1, None), (2, None), (3, None), (1, 40), (3, 25)])
+    def test_like_the_twin(self, seed, most):
+        world = World(seed, n=90, noise=1.0)
+        rng = np.random.default_rng(seed)
+        for anchor in rng.permutation(np.flatnonzero(world.truth >= 0))[:3]:
+            for ref_anchor in (world.truth[anchor], rng.integers(90)):
+                order, neighbours, partners, affine = world.seeds(anchor)
+                order = order[:most]
+                seeds = order, neighbours, partners, affine
+                result, matched, _, matrix = self.run(world, anchor, ref_anchor, seeds)
+                try:
+                    expected = naive.grow(
+                        world.xy, world.branches, order, 500.0, anchor, ref_anchor, affine, neighbours, partners,
+                        world.ref_xy, world.ref_branches, *self.NUMBERS, TOLERANCE, *self.RATES,
+                    )  # fmt: skip
+                except naive.GivenUpError:
+                    assert result[2] == -np.inf
+                    continue
+                ratio, *counts, matches, model = expected
+                assert result == pytest.approx((*counts, ratio))
+                assert np.array_equal(matched, matches)
+                assert np.allclose(matrix / matrix[2, 2], model / model[2, 2], rtol=1e-4, atol=1e-4)
+
+    def test_a_false_hypothesis_is_given_up_early(self, world):
+        anchor = int(np.flatnonzero(world.truth >= 0)[0])
+        order, neighbours, partners, affine = world.seeds(anchor)
+        elsewhere = (world.truth[anchor] + 70) % 150
+        offset = elsewhere - world.truth[anchor]
+        wrong = np.where(partners >= 0, (partners + offset) % 150, -1)
+        result, *_ = self.run(world, anchor, elsewhere, (order, neighbours, wrong, affine))
+        assert result[2] == -np.inf
+        assert result[1] < len(world.xy) / 2
+
+    def test_seeds_on_a_line_or_too_few_do_not_crash(self, world):
+        anchor = int(np.flatnonzero(world.truth >= 0)[0])
+        order, neighbours, partners, affine = world.seeds(anchor)
+        nothing = np.full_like(partners, -1)
+        assert self.run(world, anchor, 0, (order, neighbours, nothing, affine))[0] == (0, 0, -np.inf)
+        alone = nothing.copy()
+        alone[0] = 3
+        assert self.run(world, anchor, 0, (order, neighbours, alone, affine))[0] == (0, 0, -np.inf)

@@ -1,0 +1,180 @@
+"""Roads in buckets against roads searched one by one."""
+
+import numpy as np
+import pytest
+from naive import kernels as naive
+
+from roadgeo.kernels.roads import backward_agreement, bin_segments, forward_distances, nearest_road, screen
+
+GRID, SHAPE = (-50.0, 20.0, 100.0), (8, 6)
+MIN_COS = np.cos(np.radians(25))
+
+
+def binned(segments, grid=GRID, shape=SHAPE):
+    """(segments, starts, ids, grid, shape) as the kernels take them."""
+    segments = np.asarray(segments, np.float32).reshape(-1, 4)
+    counts = np.zeros(shape[0] * shape[1] + 1, np.int64)
+    total = bin_segments(segments, grid, shape, counts, np.empty(0, np.int32))
+    starts = np.cumsum(counts)
+    ids = np.empty(total, np.int32)
+    free = starts.copy()
+    assert bin_segments(segments, grid, shape, free, ids) == total
+    if total:
+        assert np.array_equal(free[:-1], starts[1:])
+    return segments, starts.astype(np.int32), ids, grid, shape
+
+
+def town(seed=0, n=120, longest=150.0):
+    rng = np.random.default_rng(seed)
+    start = rng.uniform((-40, 30), (740, 610), (n, 2))
+    return binned(np.hstack([start, start + rng.uniform(-longest, longest, (n, 2))]))
+
+
+def directions(rng, n):
+    angle = rng.uniform(0, 2 * np.pi, n)
+    return np.stack([np.cos(angle), np.sin(angle)], axis=1)
+
+
+class TestBinSegments:
+    @pytest.mark.parametrize("seed", range(3))
+    def test_lists_whatever_crosses_a_bucket(self, seed):
+        segments, starts, ids, grid, shape = town(seed)
+        expected = naive.bin_segments(segments, grid, shape)
+        for c, crossing in enumerate(expected):
+            listed = ids[starts[c] : starts[c + 1]].tolist()
+            assert len(set(listed)) == len(listed)
+            assert crossing <= set(listed)
+        assert len(ids) < 1.6 * sum(map(len, expected))
+
+    def test_keeps_what_lies_outside_in_the_rim(self):
+        _, starts, ids, *_ = binned([[-900, -900, -800, -950], [5000, 5000, 5100, 5000]])
+        assert ids[starts[0] : starts[1]].tolist() == [0]
+        assert ids[starts[-2] : starts[-1]].tolist() == [1]
+
+    def test_no_segments(self):
+        _, starts, ids, *_ = binned(np.empty((0, 4)))
+        assert len(ids) == 0
+        assert not starts.any()
+
+    def test_a_segment_of_no_length(self):
+        assert len(binned([[100, 100, 100, 100]])[2]) == 1
+
+
+class TestNearestRoad:
+    @pytest.mark.parametrize("radius", [5.0, 40.0, 260.0])
+    @pytest.mark.parametrize("min_cos", [0.0, MIN_COS, 0.9999])
+    def test_like_the_twin(self, radius, min_cos):
+        roads = town(1)
+        rng = np.random.default_rng(2)
+        for (x, y), (dx, dy) in zip(rng.uniform(-100, 800, (120, 2)), directions(rng, 120), strict=True):
+            d, *rest = nearest_road(x, y, dx, dy, radius, min_cos, *roads)
+            distance, foot, direction = naive.nearest_road(x, y, dx, dy, radius, min_cos, roads[0])
+            if not (roads[3][0] < x < 750 and roads[3][1] < y < 620):
+                continue  # outside the grid only its rim is known
+            assert d == pytest.approx(distance, abs=1e-3)
+            if np.isfinite(distance):
+                assert rest == pytest.approx([*foot, *direction], abs=2e-3)
+
+    def test_no_roads_and_roads_of_no_length(self):
+        assert nearest_road(0.0, 0.0, 1.0, 0.0, 50.0, 0.0, *binned(np.empty((0, 4))))[0] == np.inf
+        assert nearest_road(100.0, 100.0, 1.0, 0.0, 50.0, 0.0, *binned([[100, 100, 100, 100]]))[0] == np.inf
+
+    @pytest.mark.parametrize("place", [(np.nan, 0.0), (1e300, 0.0), (-1e300, 1e300), (np.inf, 100.0)])
+    def test_places_that_are_none(self, place):
+        assert nearest_road(*place, 1.0, 0.0, 50.0, 0.0, *town())[0] == np.inf
+
+
+TILTED = np.array([[0.9, -0.3, 260.0], [0.25, 1.1, 420.0], [2e-4, -3e-4, 1.0]])
+
+
+class TestForwardDistances:
+    @pytest.mark.parametrize("shift", [(0.0, 0.0), (31.0, -17.0)])
+    def test_like_the_twin(self, shift):
+        roads = town(3)
+        rng = np.random.default_rng(4)
+        points, along = rng.uniform((0, -250), (250, 0), (60, 2)), directions(rng, 60)
+        out = np.empty(60)
+        n = forward_distances(TILTED, points, along, 30.0, MIN_COS, *shift, *roads, out)
+        expected = naive.forward_distances(TILTED, points, along, 30.0, MIN_COS, shift, roads[0])
+        assert np.isfinite(expected).any()
+        assert np.allclose(out, expected, atol=2e-3)
+        assert n == np.isfinite(out).sum()
+
+    def test_beyond_the_horizon_there_is_nothing(self):
+        roads = town(3)
+        horizon = np.array([[1.0, 0, 300], [0, 1.0, 300], [0, -0.1, 1.0]])
+        out = np.empty(2)
+        points = np.array([[0.0, 20.0], [0.0, 10.0]])  # w = -1, 0
+        assert forward_distances(horizon, points, np.array([[1.0, 0], [0, 1]]), 1e3, 0.0, 0.0, 0.0, *roads, out) == 0
+        assert np.isinf(out).all()
+
+    def test_no_points(self):
+        assert (
+            forward_distances(TILTED, np.empty((0, 2)), np.empty((0, 2)), 9.0, 0.5, 0.0, 0.0, *town(), np.empty(0)) == 0
+        )
+
+
+class TestBackwardAgreement:
+    @pytest.mark.parametrize("shift", [(0.0, 0.0), (31.0, -17.0)])
+    @pytest.mark.parametrize("scale", [1.0, 2.5])
+    def test_like_the_twin(self, shift, scale):
+        roads = town(5)
+        rng = np.random.default_rng(6)
+        cells = (int(250 / scale), int(300 / scale))
+        field = rng.uniform(0, 12, cells).astype(np.float32)
+        observed = rng.uniform(size=cells) < 0.7
+        inverse = np.linalg.inv(TILTED)
+        corners = np.array([[0, 0, 1], [300, 0, 1], [300, -250, 1], [0, -250, 1]]) @ TILTED.T
+        corners = corners[:, :2] / corners[:, 2:]
+        bounds = np.concatenate([corners.min(axis=0), corners.max(axis=0)])
+        found = backward_agreement(inverse, bounds, 4.0, 6.0, *shift, *roads, field, scale, observed)
+
+        def inside(x, y):
+            return GRID[0] <= x < GRID[0] + 800 and GRID[1] <= y < GRID[1] + 600
+
+        expected = naive.backward_agreement(inverse, 4.0, 6.0, shift, roads[0], inside, field, scale, observed)
+        assert expected[0] > 100
+        assert found == pytest.approx(expected, abs=2)  # a sample may lie on the border of two cells
+
+    def test_nothing_seen_counts_for_nothing(self):
+        field = np.zeros((10, 10), np.float32)
+        blind = np.zeros((10, 10), bool)
+        everywhere = np.array([-1e4, -1e4, 1e4, 1e4])
+        move = np.array([[1.0, 0, -100], [0, 1, -400], [0, 0, 1]])
+        assert backward_agreement(move, everywhere, 1.0, 5.0, 0.0, 0.0, *town(), field, 20.0, blind) == (0, 0)
+
+    @pytest.mark.parametrize("w", [0.0, 1e-300, np.nan])
+    def test_pixels_at_infinity_are_outside(self, w):
+        inverse = np.array([[1.0, 0, 0], [0, -1.0, 0], [0, 0, w]])
+        field, observed = np.zeros((10, 10), np.float32), np.ones((10, 10), bool)
+        bounds = np.array([-1e4, -1e4, 1e4, 1e4])
+        assert backward_agreement(inverse, bounds, 1.0, 5.0, 0.0, 0.0, *town(), field, 20.0, observed) == (0, 0)
+
+
+class TestScreen:
+    def run(self, points, along, least, n=40):
+        roads = town(7)
+        rng = np.random.default_rng(8)
+        ref_xy = rng.uniform((100, 100), (600, 500), (20, 2))
+        references = rng.integers(0, 20, n)
+        turn = rng.uniform(0, 2 * np.pi, n)
+        affines = (
+            rng.uniform(0.5, 2, n) * np.array([np.cos(turn), -np.sin(turn), np.sin(turn), np.cos(turn)])
+        ).T.copy()
+        affines += rng.normal(0, 0.05, affines.shape)
+        shares = np.full(n, np.nan)
+        anchor = np.array([40.0, -30.0])
+        screen(references, affines, anchor, ref_xy, points, along, 8.0, 4.0, MIN_COS, least, *roads, shares)
+        expected = naive.screen(references, affines, anchor, ref_xy, points, along, 8.0, 4.0, MIN_COS, least, roads[0])
+        return shares, expected
+
+    @pytest.mark.parametrize("least", [0.0, 0.2, 0.4])
+    def test_like_the_twin(self, least):
+        rng = np.random.default_rng(9)
+        shares, expected = self.run(rng.uniform((0, -80), (80, 0), (25, 2)), directions(rng, 25), least)
+        assert (expected > 0).any()
+        assert np.allclose(shares, expected)
+
+    def test_without_points_nothing_speaks_against_a_proposal(self):
+        shares, _ = self.run(np.empty((0, 2)), np.empty((0, 2)), 0.6)
+        assert (shares == 1).all()

@@ -1,0 +1,384 @@
+"""Triples: codes that an affine map does not change, their table, and its look-up, against slow twins."""
+
+from collections import Counter
+from itertools import combinations, product
+
+import numpy as np
+import pytest
+from hypothesis import assume, given
+from hypothesis import strategies as st
+from kernels.test_buckets import sorted_points
+from kernels.test_growth import branches_of
+from naive import kernels as naive
+
+from roadgeo.kernels.buckets import nearest_neighbours
+from roadgeo.kernels.triples import (
+    BACKWARDS,
+    BOTH,
+    CELL_UNITS,
+    CELLS,
+    FORWARDS,
+    PAIRS,
+    TABLE,
+    UNITS,
+    count_alike,
+    fill_table,
+    find_sides,
+    gather,
+    has_both,
+    look_up,
+    orient,
+    pair_id,
+    vertex_angle,
+    vertex_codes,
+    vertex_probes,
+)
+
+MIN_SHAPE = 0.08
+MIN_COS = np.cos(np.radians(25))
+WAYS = {FORWARDS: (True, False), BACKWARDS: (False, True), BOTH: (True, True)}
+
+
+def sides_of(tangents, branches):
+    sides = np.empty(tangents.shape, np.int8)
+    find_sides(tangents, branches, sides)
+    return sides
+
+
+class World:
+    """Scattered intersections, their neighbours and the table of their triples."""
+
+    def __init__(self, seed=0, n=60, k=6, limit=3):
+        rng = np.random.default_rng(seed)
+        xy, starts, grid, shape = sorted_points(rng.uniform(0, 1000, (n, 2)))
+        self.xy, self.limit = xy, limit
+        self.tangents = np.full((n, 4), np.nan, np.float32)
+        for row in self.tangents:
+            m = rng.integers(1, 4)
+            row[:m] = np.sort(rng.uniform(0, np.pi, m))
+        self.branches = branches_of(np.hstack([self.tangents, self.tangents[:, :1] + np.pi]).astype(float))
+        self.neighbours = nearest_neighbours(xy, starts, grid, shape, k)
+        counts = np.zeros(TABLE + 1, np.int64)
+        arguments = (xy, self.tangents, self.sides, self.neighbours, MIN_SHAPE, limit)
+        total = fill_table(*arguments, counts, np.empty(0, np.uint64))
+        self.starts = np.cumsum(counts)
+        self.entries = np.empty(total, np.uint64)
+        free = self.starts.copy()
+        assert fill_table(*arguments, free, self.entries) == total
+        assert np.array_equal(free[:-1], self.starts[1:])
+        self.starts = self.starts.astype(np.int32)
+
+    @property
+    def sides(self):
+        return sides_of(self.tangents, self.branches)
+
+    def decoded(self):
+        """(a, b, c, three codes like those of the twin) of every entry."""
+        ids = {pair_id(low, high): (low, high) for low in range(CELLS) for high in range(low, CELLS)}
+        cells = np.repeat(np.arange(TABLE), np.diff(self.starts))
+        for cell, entry in zip(cells.tolist(), self.entries.tolist(), strict=True):
+            a = entry >> 40
+            b, c = (int(self.neighbours[a, entry >> shift & 7]) for shift in (37, 34))
+            pairs = (cell // PAIRS**2, cell // PAIRS % PAIRS, cell % PAIRS)
+            code = []
+            for v, pair in enumerate(pairs):
+                fine = entry >> (16 - 8 * v) & 255
+                sides = (entry >> 24 & 1023) // 9 ** (2 - v) % 9
+                units = ids[pair][0] * CELL_UNITS + (fine >> 4), ids[pair][1] * CELL_UNITS + (fine & 15)
+                code.append(tuple((u, WAYS[s]) for u, s in zip(units, divmod(sides, 3), strict=True)))
+            yield a, b, c, tuple(code)
+
+
+def seen_through(world, A, noise=0.0):
+    """The world under an affine map, its tangents turned by some noise besides."""
+    query = World()
+    query.xy = world.xy @ A.T
+    angles = world.tangents + np.random.default_rng(0).normal(0, noise, world.tangents.shape)
+    angles = np.hstack([angles, angles[:, :1] + np.pi])
+    turned = np.einsum("ij,njr->nir", A, np.stack([np.cos(angles), np.sin(angles)], axis=1))
+    angles = np.arctan2(turned[:, 1], turned[:, 0])
+    query.tangents = (angles[:, :-1] % np.pi).astype(np.float32)
+    query.branches = branches_of(angles)
+    return query
+
+
+@pytest.fixture(scope="module")
+def world():
+    return World()
+
+
+def test_pairs_of_cells_are_numbered_without_gap():
+    assert [pair_id(low, high) for low in range(CELLS) for high in range(low, CELLS)] == list(range(PAIRS))
+
+
+angles = st.floats(0, 3.14159)
+lengths = st.floats(0.1, 10)
+
+
+@given(angles, st.floats(0.2, 2.9), lengths, lengths, angles)
+def test_vertex_angle_like_the_twin(phi, wide, one, two, tangent):
+    e1 = one * np.array([np.cos(phi), np.sin(phi)])
+    e2 = two * np.array([np.cos(phi + wide), np.sin(phi + wide)])
+    found = vertex_angle(*e1, *e2, tangent)
+    assert 0 <= found < 2 * UNITS + 1e-9
+    gap = (found - naive.vertex_angle(e1, e2, tangent)) % (2 * UNITS)
+    assert min(gap, 2 * UNITS - gap) < 1e-6
+
+
+@given(st.lists(st.floats(-3, 3), min_size=4, max_size=4), angles)
+def test_vertex_angle_does_not_change_under_affine_maps(matrix, tangent):
+    A = np.array(matrix).reshape(2, 2)
+    assume(A[0, 0] * A[1, 1] - A[0, 1] * A[1, 0] > 0.1)
+    e1, e2, d = np.array([2.0, 0.3]), np.array([0.4, 1.7]), np.array([np.cos(tangent), np.sin(tangent)])
+    turned = np.arctan2(*(A @ d)[::-1]) % np.pi
+    gap = (vertex_angle(*e1, *e2, tangent) - vertex_angle(*(A @ e1), *(A @ e2), turned)) % UNITS
+    assert min(gap, UNITS - gap) < 1e-4
+
+
+@given(st.lists(st.tuples(st.floats(-9, 9), st.floats(-9, 9)), min_size=3, max_size=3), st.floats(0.01, 0.8))
+def test_orient_like_the_twin(points, min_shape):
+    xy = np.array(points)
+    if any(np.hypot(*(p - q)) < 1e-3 for p, q in combinations(xy, 2)):
+        return
+    shape = naive.shape_of(xy, 0, 1, 2)
+    if abs(abs(shape) - min_shape) > 1e-9:
+        assert orient(xy, 0, 1, 2, min_shape) == (0 if abs(shape) < min_shape else np.sign(shape))
+
+
+def test_points_in_one_place_make_no_triangle():
+    assert orient(np.zeros((3, 2)), 0, 1, 2, 0.06) == 0
+    assert orient(np.full((3, 2), np.nan), 0, 1, 2, 0.06) == 0
+    assert orient(np.array([[0.0, 0], [1, 1], [2, 2]]), 0, 1, 2, 0.06) == 0
+
+
+def test_has_both():
+    neighbours = np.array([[1, 2, -1]], np.int32)
+    assert has_both(neighbours, 0, 2, 1)
+    assert not has_both(neighbours, 0, 1, 3)
+
+
+class TestVertexCodes:
+    def codes(self, world, i, j, k, limit):
+        out = np.full((limit, 3), -1)
+        n = vertex_codes(world.xy, world.tangents, world.sides, i, j, k, limit, out)
+        return [((u, WAYS[sides // 3]), (v, WAYS[sides % 3])) for u, v, sides in out[:n].tolist()]
+
+    @pytest.mark.parametrize("limit", [1, 2, 3])
+    def test_like_the_twin(self, world, limit):
+        rng = np.random.default_rng(1)
+        for _ in range(60):
+            i, j, k = rng.choice(len(world.xy), 3, replace=False)
+            if naive.shape_of(world.xy, i, j, k) < 0:
+                j, k = k, j
+            expected = naive.vertex_codes(world.xy, world.tangents, world.branches, i, j, k, limit)
+            assert self.codes(world, i, j, k, limit) == expected
+
+    def test_a_single_tangent_gives_none(self, world):
+        i = int(np.argmin(np.isfinite(world.tangents).sum(axis=1)))
+        assert self.codes(world, i, 0, 1, 3) == []
+
+
+class TestFillTable:
+    @pytest.mark.parametrize("limit", [2, 3])
+    def test_like_the_twin(self, limit):
+        world = World(2, limit=limit)
+        expected = naive.fill_table(world.xy, world.tangents, world.branches, world.neighbours, MIN_SHAPE, limit)
+        assert len(expected) > 100
+        assert Counter(world.decoded()) == Counter(expected)
+
+    @pytest.mark.parametrize("n", [1, 2, 3])
+    def test_few_points(self, n):
+        world = World(0, n=n)
+        assert len(world.entries) <= 27
+        assert all(set(row[:3]) == {0, 1, 2} for row in world.decoded())
+
+    def test_no_point(self):
+        counts = np.zeros(TABLE + 1, np.int64)
+        nothing = np.empty((0, 2)), np.empty((0, 4), np.float32), np.empty((0, 4), np.int8), np.empty((0, 6), np.int32)
+        assert fill_table(*nothing, MIN_SHAPE, 3, counts, np.empty(0, np.uint64)) == 0
+
+
+class TestSides:
+    def test_branches_along_a_tangent(self):
+        tangents = np.array([[0.0, np.pi / 2, np.nan], [0.3, np.nan, np.nan]], np.float32)
+        branches = branches_of(np.array([[0.1, np.pi, -np.pi / 2], [2.0, np.nan, np.nan]]))
+        assert sides_of(tangents, branches)[0, :2].tolist() == [BOTH, BACKWARDS]
+        assert sides_of(tangents, branches[:, :1])[0, :2].tolist() == [FORWARDS, BOTH]
+        assert sides_of(tangents, branches)[1, 0] == BOTH  # nothing is known
+
+    def test_like_the_twin(self, world):
+        for i, row in enumerate(world.sides.tolist()):
+            for tangent, side in zip(world.tangents[i], row, strict=True):
+                if np.isfinite(tangent):
+                    assert WAYS[side] == naive.sides_of(tangent, world.branches[i])
+
+
+class TestVertexProbes:
+    @pytest.mark.parametrize("tolerance", [0, 2, 5])
+    def test_probe_exactly_what_is_alike(self, tolerance):
+        rng = np.random.default_rng(3)
+        every = [(u, v, sides) for u in range(UNITS) for v in range(u, UNITS) for sides in range(9)]
+        for u1, u2 in np.sort(rng.integers(0, UNITS, (12, 2)), axis=1).tolist():
+            own = int(rng.integers(9))
+            probes = np.empty((64, 4), np.int64)
+            n = vertex_probes(np.array([u1, u2, own]), tolerance, probes)
+            found = {
+                (u, v, sides)
+                for pair, lows, highs, alike in probes[:n].tolist()
+                for u, v, sides in every
+                if pair_id(u // CELL_UNITS, v // CELL_UNITS) == pair
+                and lows >> 4 <= u % CELL_UNITS <= highs >> 4
+                and lows & 15 <= v % CELL_UNITS <= highs & 15
+                and alike >> sides & 1
+            }
+
+            def code(u, v, sides):
+                return (u, WAYS[sides // 3]), (v, WAYS[sides % 3])
+
+            assert found == {other for other in every if naive.alike(code(u1, u2, own), code(*other), tolerance)}
+
+
+def cell_of(code):
+    """The cells of three codes."""
+    return tuple((u // CELL_UNITS, v // CELL_UNITS) for (u, _), (v, _) in code)
+
+
+class TestCountAlike:
+    def test_counts_the_cells_of_each_triple(self, world):
+        k = world.neighbours.shape[1]
+        anchors = np.arange(len(world.xy))[::2]
+        costs = np.empty((len(anchors), k, k), np.int64)
+        count_alike(world.xy, world.tangents, world.sides, world.neighbours, anchors, MIN_SHAPE, 3, world.starts, costs)
+        cells = Counter()
+        for *_, code in world.decoded():
+            cells.update(cell_of(code[t:] + code[:t]) for t in range(3))
+        for i, a in enumerate(anchors):
+            for s in range(k):
+                for t in range(k):
+                    b, c = world.neighbours[a, s], world.neighbours[a, t]
+                    shape = naive.shape_of(world.xy, a, b, c) if s < t else 0.0
+                    if abs(shape) < MIN_SHAPE:
+                        assert costs[i, s, t] == -1
+                        continue
+                    b, c = (b, c) if shape > 0 else (c, b)
+                    corners = [(a, b, c), (b, c, a), (c, a, b)]
+                    codes = [naive.vertex_codes(world.xy, world.tangents, world.branches, *v, 3) for v in corners]
+                    expected = sum(cells[cell_of(code)] for code in product(*codes))
+                    assert costs[i, s, t] == (expected if all(codes) else -1)
+
+
+class TestLookUp:
+    SCALE, MIN_RATIO = (0.2, 5.0), 0.3
+
+    def run(self, world, query, a, s, t, tolerance, room=5000):
+        ids, affine = np.empty((room, 5), np.int64), np.empty((room, 4))
+        n, compared = look_up(
+            query.xy, query.branches, query.tangents, query.sides, a, s, t, query.neighbours, 3, tolerance, MIN_COS,
+            world.xy, world.branches, world.neighbours, world.starts, world.entries, self.SCALE, self.MIN_RATIO,
+            ids, affine, 0,
+        )  # fmt: skip
+        return ids[:n], affine[:n], compared
+
+    @pytest.mark.parametrize("tolerance", [1, 5])
+    def test_like_the_twin(self, world, tolerance):
+        query = seen_through(world, np.array([[1.2, -0.4], [0.3, 0.9]]), noise=0.05)
+        table = list(world.decoded())
+        found, expected = set(), set()
+        for a, (s, t) in ((a, slots) for a in range(0, 60, 4) for slots in combinations(range(4), 2)):
+            b, c = query.neighbours[a, s], query.neighbours[a, t]
+            shape = naive.shape_of(query.xy, a, b, c)
+            if abs(shape) < MIN_SHAPE:
+                continue
+            b, c = (b, c) if shape > 0 else (c, b)
+            ids, _, compared = self.run(world, query, a, s, t, tolerance)
+            found.update((a, b, c, *hit) for hit in ids[:, [0, 2, 4]].tolist())
+            edges = np.stack([query.xy[b] - query.xy[a], query.xy[c] - query.xy[a]], axis=1)
+            codes = (
+                naive.vertex_codes(query.xy, query.tangents, query.branches, *v, 3)
+                for v in [(a, b, c), (b, c, a), (c, a, b)]
+            )
+            hits = [hit for code in product(*codes) for hit in naive.look_up(code, table, tolerance)]
+            assert compared >= len(hits)
+            for x, y, z in hits:
+                J = np.stack([world.xy[y] - world.xy[x], world.xy[z] - world.xy[x]], axis=1) @ np.linalg.inv(edges)
+                big, small = np.linalg.svd(J, compute_uv=False)
+                scale = np.sqrt(np.linalg.det(J))
+                if not self.SCALE[0] <= scale <= self.SCALE[1] or small / big < self.MIN_RATIO:
+                    continue
+                pairs = zip((a, b, c), (x, y, z), strict=True)
+                if all(naive.rays_agree(query.branches, i, world.branches, j, J, np.radians(25)) for i, j in pairs):
+                    expected.add((a, b, c, x, y, z))
+        assert len(expected) > 10
+        assert found == expected  # a hit may be reported more than once
+
+    def test_every_triple_finds_itself_through_its_affine_map(self, world):
+        A = np.array([[1.2, -0.4], [0.3, 0.9]])
+        query = seen_through(world, A)
+        n_found = 0
+        for a, s, t in {(a, *sorted(slots)) for a, *slots in self.slots(world)}:
+            ids, affine, _ = self.run(world, query, a, s, t, 2)
+            b, c = world.neighbours[a, s], world.neighbours[a, t]
+            hits = [row for row, hit in enumerate(ids[:, [0, 2, 4]].tolist()) if hit in ([a, b, c], [a, c, b])]
+            assert hits
+            assert np.allclose(affine[hits[0]].reshape(2, 2), np.linalg.inv(A), atol=1e-6)
+            assert set(ids[hits[0], [1, 3]].tolist()) == {s, t}
+            assert all(world.neighbours[a, ids[hits[0], slot]] == ids[hits[0], slot + 1] for slot in (1, 3))
+            n_found += 1
+        assert n_found > 50
+
+    def slots(self, world):
+        for entry in world.entries.tolist():
+            yield entry >> 40, entry >> 37 & 7, entry >> 34 & 7
+
+    def test_stops_where_the_room_ends(self, world):
+        a, s, t = next(self.slots(world))
+        everything = self.run(world, world, a, *sorted((s, t)), 5)[0]
+        assert len(everything) >= 1
+        assert len(self.run(world, world, a, *sorted((s, t)), 5, room=0)[0]) == 0
+
+    def test_believes_no_entry(self, world):
+        damaged = World()
+        rng = np.random.default_rng(0)
+        damaged.entries = (damaged.entries & np.uint64(0xFFFFFF)) | rng.integers(
+            0, 2**40, len(damaged.entries), dtype=np.uint64
+        ) << np.uint64(24)
+        for a, s, t in self.slots(world):
+            ids, *_ = self.run(damaged, world, a, *sorted((s, t)), 5)
+            assert ((ids[:, [0, 2, 4]] >= 0) & (ids[:, [0, 2, 4]] < 60)).all()
+
+
+class TestGather:
+    def run(self, hits, affines, n_slots=4, tolerance=0.3):
+        ids, affine = np.array(hits, np.int64).reshape(-1, 5), np.array(affines, float).reshape(-1, 4)
+        order = np.argsort(ids[:, 0], kind="stable")
+        room = max(len(ids) // 2, 1)
+        out = np.empty((room, n_slots + 1), np.int64), np.empty((room, 4)), np.empty(room, np.int64)
+        n = gather(ids, affine, order, n_slots, tolerance, *out)
+        return [array[:n] for array in out]
+
+    def test_hits_that_agree_make_a_proposal(self):
+        one, other = [1.0, 0, 0, 1], [1.1, 0, 0, 1.1]
+        ids, affine, placed = self.run([(7, 0, 70, 1, 71), (7, 1, 71, 2, 72)], [one, other])
+        assert ids.tolist() == [[7, 70, 71, 72, -1]]
+        assert affine[0] == pytest.approx([1.05, 0, 0, 1.05])
+        assert placed.tolist() == [3]
+
+    @pytest.mark.parametrize(
+        ("hits", "affines"),
+        [
+            ([], []),
+            ([(7, 0, 70, 1, 71)], [[1, 0, 0, 1]]),  # alone
+            ([(7, 0, 70, 1, 71), (8, 1, 71, 2, 72)], [[1, 0, 0, 1]] * 2),  # elsewhere
+            ([(7, 0, 70, 1, 71), (7, 0, 70, 1, 71)], [[1, 0, 0, 1]] * 2),  # the same triple twice
+            ([(7, 0, 70, 1, 71), (7, 1, 99, 2, 72)], [[1, 0, 0, 1]] * 2),  # a neighbour in two places
+            ([(7, 0, 70, 1, 71), (7, 1, 71, 2, 72)], [[1, 0, 0, 1], [0, -1, 1, 0]]),  # maps that differ
+        ],
+    )
+    def test_hits_that_do_not(self, hits, affines):
+        assert len(self.run(hits, affines)[0]) == 0
+
+    def test_every_map_intersection_proposes_once(self):
+        hits = [(a, s, 10 * a + s, s + 1, 10 * a + s + 1) for a in (3, 5, 4) for s in range(3)]
+        ids, _, placed = self.run(hits, [[1, 0, 0, 1]] * len(hits))
+        assert ids[:, 0].tolist() == [3, 4, 5]
+        assert placed.tolist() == [4, 4, 4]

@@ -1,0 +1,165 @@
+"""The search for a place, on made-up towns with known homographies."""
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+import shapely
+from worlds.scenes import PLANE, Sight, camera, look, mapped, random_lines, random_network, scene_of
+
+from roadgeo.geometry.camera import CameraOptions
+from roadgeo.matching.estimator import MatchOptions, Sweep, TripleEstimator
+from roadgeo.matching.index import build_index
+from roadgeo.matching.scene import query_neighbours
+from roadgeo.matching.search import SearchOptions, search
+from roadgeo.matching.triples import TripleOptions
+from roadgeo.reference.reference import build_network
+
+ACCEPT = SearchOptions().accept
+
+
+def locate(scene, index, options=None, near=None, limits=None):
+    estimator = TripleEstimator(scene, index, options, near)
+    return search(estimator, limits or SearchOptions(time_limit_s=60.0)), estimator
+
+
+def gap(result, truth, scene):
+    """Largest error of a corner, metres."""
+    return np.hypot(*(mapped(result.best.refined.matrix, scene.corners) - mapped(truth, scene.corners)).T).max()
+
+
+@pytest.mark.parametrize("tilt", [0, 15, 30, 45])
+@pytest.mark.parametrize(
+    "sight",
+    [Sight(0.5), Sight(1.5, missing=0.1, false=0.1), Sight(1.0, missing=0.2, false=0.2)],
+    ids=["sharp", "noisy", "gaps"],
+)
+def test_finds_where_a_camera_looked(town, tilt, sight):
+    network, index = town
+    for seed in range(2):
+        rng = np.random.default_rng([tilt, seed])
+        truth = camera(
+            tuple(rng.uniform(1300, 2700, 2)), (1000, 1000), rng.uniform(0.8, 1.4), tilt, *rng.uniform(0, 360, 2)
+        )
+        scene = scene_of(look(network, truth, sight=sight, seed=seed))
+        result, estimator = locate(scene, index)
+        assert result.score >= ACCEPT
+        assert result.score - result.runner_up_score > 6
+        assert result.stopped == "accepted"
+        assert gap(result, truth, scene) < 6
+        assert np.hypot(*(estimator.center(result.best) - mapped(truth, scene.center[None])[0])) < 2
+        assert estimator.n_tuples >= estimator.n_verified > 0
+
+
+TRUTH = camera((2100, 1900), (1000, 1000), 1.0, 10.0, 20.0, 70.0)
+
+
+@pytest.fixture(scope="module")
+def scene(town):
+    """A view of the town."""
+    return scene_of(look(town[0], TRUTH, sight=Sight(0.8, missing=0.05)))
+
+
+@pytest.mark.parametrize("seed", [2, 3])
+def test_another_town_is_refused(town, seed):
+    stranger = scene_of(look(random_network(seed, 2000.0), camera((1000, 1000)), sight=Sight(0.5)))
+    result, _ = locate(stranger, town[1], limits=SearchOptions(time_limit_s=3.0))
+    assert result.score < 6
+    assert result.stopped in {"exhausted", "time"}
+
+
+def test_a_mirrored_view_is_refused(town):
+    graph = look(town[0], TRUTH)
+    mirrored = replace(graph, xy=graph.xy * (-1, 1) + (1000, 0), coords=graph.coords * (-1, 1) + (1000, 0))
+    assert locate(scene_of(mirrored), town[1], limits=SearchOptions(time_limit_s=3.0))[0].score < 6
+
+
+def test_twins_leave_no_margin():
+    centre = random_lines(5, 1500.0)
+    lines = [shapely.affinity.translate(line, dx, dy) for dx, dy in [(0, 0), (4000, 700)] for line in centre]
+    lines += [shapely.affinity.translate(line, 2000, 2500) for line in random_lines(6, 1500.0)]
+    index = build_index(build_network(lines, PLANE, {}))
+    truth = camera((760, 740), (900, 900), 1.0, 5.0, 40.0, 200.0)
+    scene = scene_of(look(build_network(centre, PLANE, {}), truth, (900, 900), Sight(0.5)), (900, 900))
+    result, estimator = locate(scene, index)
+    assert result.score > 6
+    assert result.score - result.runner_up_score < 3
+    places = {tuple(np.round(estimator.center(model) / 100).astype(int)) for model in (result.best, result.runner_up)}
+    middle = mapped(truth, scene.center[None])[0]
+    assert places == {tuple(np.round((middle + move) / 100).astype(int)) for move in [(0, 0), (4000, 700)]}
+
+
+class TestNear:
+    def test_a_circle_around_the_place_changes_nothing(self, town, scene):
+        x, y = mapped(TRUTH, scene.center[None])[0]
+        result, _ = locate(scene, town[1], near=(x + 80, y, 150.0))
+        assert result.score >= ACCEPT
+        assert gap(result, TRUTH, scene) < 5
+
+    def test_the_place_is_not_reported_outside_the_circle(self, town, scene):
+        x, y = mapped(TRUTH, scene.center[None])[0]
+        result, _ = locate(scene, town[1], near=(x + 700, y, 500.0), limits=SearchOptions(time_limit_s=3.0))
+        assert result.score < 6
+
+
+class TestCamera:
+    @pytest.mark.parametrize(
+        "options",
+        [CameraOptions(gsd_m=(2.0, 4.0)), CameraOptions(gsd_m=(0.2, 0.6)), CameraOptions(north_up=True)],
+        ids=["coarser", "finer", "north up"],
+    )
+    def test_what_the_camera_cannot_be_is_not_found(self, town, scene, options):
+        result, _ = locate(scene, town[1], MatchOptions(camera=options), limits=SearchOptions(time_limit_s=3.0))
+        assert result.score < 6
+
+    def test_a_known_camera_is_found(self, town, scene):
+        known = MatchOptions(camera=CameraOptions(gsd_m=(0.9, 1.1), max_tilt_deg=15.0, focal_px=1000.0))
+        assert gap(locate(scene, town[1], known)[0], TRUTH, scene) < 5
+
+
+@pytest.mark.parametrize("n", [0, 1, 2, 3, 5])
+def test_little_to_see(town, scene, n):
+    found = scene.intersections
+    few = replace(found, xy=found.xy[:n], rays=found.rays[:n], tangents=found.tangents[:n])
+    neighbours = query_neighbours(few.xy, 8) if n else np.empty((0, 8), np.int32)
+    little = replace(scene, intersections=few, branches=scene.branches[:n], neighbours=neighbours)
+    result, estimator = locate(little, town[1])
+    assert result.score < 6
+    estimator.rehearse()
+
+
+def test_road_points_far_from_the_anchor(town, scene):
+    sparse = replace(scene, points=scene.points[:0], directions=scene.directions[:0])
+    locate(sparse, town[1], limits=SearchOptions(time_limit_s=0.5))
+
+
+@pytest.mark.parametrize("most", [0, 300])
+def test_places_are_bounded(town, most):
+    stranger = scene_of(look(random_network(3, 2000.0), camera((1000, 1000)), sight=Sight(0.5)))
+    options = MatchOptions(max_places=most)
+    result, estimator = locate(stranger, town[1], options)
+    assert result.stopped == "exhausted"
+    assert estimator.n_screened <= most + options.grow.max_screened
+
+
+def test_more_anchors_are_tried_on_a_small_map(town, scene):
+    index = town[1]
+
+    def n_anchors(most_more):
+        sweep = Sweep(TripleOptions(), 5, most_more)
+        return len(list(sweep.proposals(scene, index, (0.1, 10.0), 0.33)))
+
+    assert n_anchors(1.0) == 5
+    assert n_anchors(1.0) < n_anchors(3.0) <= 15
+
+
+def test_time_is_bounded(town):
+    rng = np.random.default_rng(0)
+    noise = look(random_network(9, 3000.0), camera((1500, 1500), (2600, 2600)), (2600, 2600), Sight(3.0), 1)
+    result, _ = locate(
+        scene_of(replace(noise, coords=noise.coords + rng.normal(0, 2, noise.coords.shape)), (2600, 2600)),
+        town[1],
+        limits=SearchOptions(time_limit_s=0.5),
+    )
+    assert result.stopped in {"time", "exhausted"}
+    assert result.score < 6

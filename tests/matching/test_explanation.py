@@ -1,0 +1,216 @@
+"""Explanations: of masks that are located, refused, cut short, and looked for with wrong limits."""
+
+import json
+from dataclasses import replace
+from pathlib import Path
+
+import cv2
+import numpy as np
+import pytest
+from shapely import LineString
+from worlds.scenes import PLANE, camera, look, mapped, random_network
+
+from roadgeo.cli import main
+from roadgeo.geometry.camera import CameraOptions
+from roadgeo.geometry.mask import RoadMask, plane_to_pixel
+from roadgeo.matching.explanation import SCHEMA, Explanation
+from roadgeo.matching.index import build_index
+from roadgeo.matching.search import SearchOptions
+from roadgeo.outputs.explanation_sheet import AGREES, STARVED, draw_explanation, write_explanation_picture
+from roadgeo.reference.reference import Reference, build_network
+from roadgeo.workflows import LocateOptions, explain, locate
+
+SIZE = (900, 900)
+TRUTH = camera((1500.0, 1400.0), SIZE, 1.0, tilt_deg=15.0, azimuth_deg=50.0, heading_deg=200.0, focal_px=900.0)
+
+
+def reference_of(network) -> Reference:
+    return Reference(build_index(network), network)
+
+
+def mask_of(network, matrix=TRUTH, size=SIZE) -> RoadMask:
+    canvas = np.zeros(size[::-1], np.uint8)
+    for line in look(network, matrix, size).polylines():
+        cv2.polylines(canvas, [np.rint(plane_to_pixel(line) * 16).astype(np.int32)], False, 1, 8, cv2.LINE_8, 4)
+    return RoadMask(canvas > 0, name="mask.png")
+
+
+@pytest.fixture(scope="module")
+def network():
+    return random_network(4)
+
+
+@pytest.fixture(scope="module")
+def town(network):
+    return reference_of(network)
+
+
+@pytest.fixture(scope="module")
+def mask(network):
+    return mask_of(network)
+
+
+@pytest.fixture(scope="module")
+def lattice():
+    at = np.arange(40) * 90.0
+    ways = [LineString([(x, 0), (x, at[-1])]) for x in at] + [LineString([(0, y), (at[-1], y)]) for y in at]
+    return reference_of(build_network(ways, PLANE, {"name": "lattice"}))
+
+
+def with_camera(**limits) -> LocateOptions:
+    options = LocateOptions()
+    return replace(options, match=replace(options.match, camera=CameraOptions(**limits)))
+
+
+def check(explanation: Explanation) -> dict:
+    """Return its one search as plain values, after checking what holds of all."""
+    document = json.loads(json.dumps(explanation.to_dict(), allow_nan=False))
+    assert document["schema"] == SCHEMA
+    (search,) = document["searches"]
+    funnel = search["funnel"]
+    assert funnel["proposals"] >= funnel["on_roads"] >= funnel["grown"] >= funnel["survived"] >= funnel["verified"]
+    assert funnel["verified"] >= funnel["measured"]
+    odds = [place["log10_odds"] for place in search["places"]]
+    assert all(place["why"] for place in search["places"])
+    assert None not in odds or len(odds) == 1
+    assert (search["starved_at"] is None) == (document["status"] == "located")
+    assert bool(search["missing"]) == (document["status"] != "located")
+    return search
+
+
+def test_a_located_mask_is_told_from_the_places_it_was_not_put(town, mask):
+    explanation = explain(mask, town)
+    search = check(explanation)
+    assert explanation.location.located
+    assert search["stopped"] == "accepted"
+    assert search["places"][0]["why"] == "located"
+    assert search["places"][0]["log10_odds"] == explanation.location.log10_odds
+    where = mapped(TRUTH, np.array([[450.0, -450.0]]))[0] + PLANE.origin
+    place = search["places"][0]["center"]
+    assert np.hypot(place["x"] - where[0], place["y"] - where[1]) < 3
+    assert explanation.stories[0].places[0].agrees.mean() > 0.8
+
+
+def test_watching_changes_nothing(town, mask):
+    seen, plain = explain(mask, town).location, locate(mask, town)
+    assert np.array_equal(seen.homography, plain.homography)
+    assert (seen.status, seen.reason, seen.log10_odds, seen.stats) == (
+        plain.status, plain.reason, plain.log10_odds, plain.stats,
+    )  # fmt: skip
+
+
+@pytest.mark.parametrize(
+    ("limits", "fault", "value"),
+    [
+        ({"gsd_m": (0.3, 0.7)}, "ground sampling out of range", "(1.0"),
+        ({"north_up": True}, "not north up", "(up is 2"),
+    ],
+)
+def test_limits_that_are_too_narrow_are_named(town, mask, limits, fault, value):
+    explanation = explain(mask, town, with_camera(**limits))
+    search = check(explanation)
+    assert explanation.location.status == "not_located"
+    assert search["camera_refusals"][fault] > 0
+    assert search["places"][0]["why"].startswith(f"the camera: {fault} {value}")
+    assert search["places"][0]["log10_odds"] > 6
+    assert any("limits on the camera may be too narrow" in sentence for sentence in search["missing"])
+
+
+def test_a_place_off_the_map_is_told(town, mask):
+    explanation = explain(mask, town, LocateOptions(near=(0.0, 80.0, 500.0)))
+    search = check(explanation)
+    assert explanation.location.reason == (
+        "the map has 0 intersections around the place given by near; searched within 500 m of 0,80"
+    )
+    assert search["missing"] == [explanation.location.reason]
+
+
+def test_a_mask_of_elsewhere(town):
+    search = check(explain(mask_of(random_network(77)), town))
+    assert search["starved_at"] in {"odds", "survived", "on_roads", "camera"}
+    assert search["stopped"] == "exhausted"
+    assert all(place["why"] != "located" for place in search["places"])
+
+
+def test_blocks_like_one_another(lattice):
+    mask = mask_of(lattice.network)
+    explanation = explain(mask, lattice)
+    search = check(explanation)
+    assert explanation.location.status != "located"
+    assert search["starved_at"] in {"odds", "margin"}
+    assert search["places"][0]["chance"]["roads_of_mask"] > 0.5
+    assert any(sentence.startswith(("variety", "difference")) for sentence in search["missing"])
+
+
+def test_time_that_ran_out_is_named(town, network):
+    options = LocateOptions(search=SearchOptions(time_limit_s=1e-6))
+    search = check(explain(mask_of(random_network(78)), town, options))
+    assert search["stopped"] == "time"
+    assert search["missing"][0].startswith("time: ")
+
+
+def test_too_few_intersections(town):
+    canvas = np.zeros((300, 300), np.uint8)
+    cv2.line(canvas, (0, 150), (299, 140), 1, 7)
+    cv2.line(canvas, (150, 0), (160, 299), 1, 7)
+    explanation = explain(RoadMask(canvas > 0), town)
+    search = check(explanation)
+    assert search["starved_at"] == "intersections"
+    assert search["funnel"]["intersections"] == 1
+    assert search["missing"] == ["only 1 intersections are seen, at least 6 are needed"]
+    assert draw_explanation(explanation, RoadMask(canvas > 0), town.index).shape[1] == 2000
+
+
+def test_the_papers_method_tells_what_it_counts(town, mask):
+    explanation = explain(mask, town, replace(LocateOptions(), method="pair"))
+    (search,) = explanation.to_dict()["searches"]
+    assert explanation.location.located
+    assert search["places"] == search["missing"] == []
+    assert search["funnel"]["intersections"] > 20
+    assert draw_explanation(explanation, mask, town.index).shape[1] == 2000
+
+
+def test_each_reference_has_its_story(town, mask, lattice):
+    explanation = explain(mask, [lattice, town])
+    assert [story.reference for story in explanation.stories] == ["lattice", "town 4"]
+    assert explanation.location.reference == explanation.nearest.reference == "town 4"
+
+
+class TestPicture:
+    def test_what_agrees_and_what_does_not(self, town, mask):
+        picture = draw_explanation(explain(mask, town), mask, town.index)
+        assert picture.dtype == np.uint8
+        assert picture.shape[1:] == (2000, 3)
+        assert (picture == AGREES).all(axis=2).sum() > 500
+        assert not (picture == STARVED).all(axis=2).any()
+
+    def test_the_stage_that_starved_is_marked(self, town, mask, tmp_path: Path):
+        explanation = explain(mask, town, with_camera(gsd_m=(0.3, 0.7)))
+        write_explanation_picture(tmp_path / "a.png", explanation, mask, town.index)
+        picture = cv2.imread(str(tmp_path / "a.png"))[..., ::-1]
+        assert (explanation.stories[0].starved_at == "camera") == bool((picture == STARVED).all(axis=2).any())
+
+    @pytest.mark.parametrize("size", [(1800, 60), (60, 1800)])
+    def test_frames_of_any_shape_with_ground_unseen(self, town, network, size):
+        mask = mask_of(network, camera((1500.0, 1500.0), size, 1.0), size)
+        observed = np.ones(mask.shape, bool)
+        observed[: size[1] // 2, : size[0] // 2] = False
+        mask = RoadMask(mask.roads & observed, observed, "long.png")
+        assert draw_explanation(explain(mask, town), mask, town.index).shape[1] == 2000
+
+
+def test_from_the_command_line(town, mask, tmp_path: Path, monkeypatch, capfd):
+    monkeypatch.chdir(tmp_path)
+    monkeypatch.setenv("ROADGEO_LIBRARY", str(tmp_path / "library"))
+    town.save("town.gpkg")
+    cv2.imwrite("a.png", mask.roads * np.uint8(255))
+    assert main(["locate", "a.png", "-r", "town.gpkg", "--explain", "-q"]) == 0
+    assert main(["locate", ".", "-r", "town.gpkg", "--explain", "-q", "--gsd", "0.3:0.7"]) == 3
+    document = json.loads(Path("a_explain.json").read_text())
+    assert document["status"] == "not_located"
+    assert "narrow" in " ".join(document["searches"][0]["missing"])
+    assert cv2.imread("a_explain.png") is not None
+    assert not Path("a_explain_explain.json").exists()
+    assert main(["locate", "a.png", "-r", "town.gpkg", "-q", "--gsd", "0.3:0.7"]) == 3
+    assert not Path("a_explain.json").exists()
+    assert capfd.readouterr().err == ""

@@ -1,0 +1,563 @@
+"""The paper's matcher: kernels against slow twins, counts against the paper's formulas, scenes with known H."""
+
+import math
+from dataclasses import replace
+
+import numpy as np
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+from naive import paper as naive
+
+from roadgeo.errors import IndexFormatError
+from roadgeo.geometry.homography import Homography
+from roadgeo.kernels import pairs as kernels
+from roadgeo.matching import paper as pairs_module
+from roadgeo.matching.paper import PairIndex, PairOptions, build_pair_index, match_pairs, query_draws, reference_draws
+from roadgeo.roads.intersections import MAX_BRANCHES, Intersections
+
+FRAME = np.array([[0, 0], [1000, 0], [1000, -1000], [0, -1000]], float)
+
+
+def intersections(xy, rays, tangents) -> Intersections:
+    def padded(rows):
+        return np.array([[*row, *[np.nan] * (MAX_BRANCHES - len(row))] for row in rows], np.float32)
+
+    n = len(xy)
+    return Intersections(
+        np.array(xy, float).reshape(n, 2),
+        padded(rays).reshape(n, MAX_BRANCHES),
+        padded(tangents).reshape(n, MAX_BRANCHES),
+        np.zeros(n, np.float32),
+        np.arange(n, dtype=np.int32),
+    )
+
+
+def random_network(rng, n=300, side=4000.0, gap_deg=25.0) -> Intersections:
+    """Intersections at random, 3 to 5 branches on 2 to 4 tangents at least `gap_deg` apart."""
+    rays, tangents = [], []
+    for _ in range(n):
+        n_tangents = rng.choice([2, 3, 4], p=[0.6, 0.3, 0.1])
+        free = math.pi - n_tangents * math.radians(gap_deg)
+        gaps = rng.dirichlet(np.ones(n_tangents)) * free + math.radians(gap_deg)
+        lines = np.sort((rng.uniform(0, math.pi) + np.cumsum(gaps)) % math.pi)
+        n_branches = max(3, n_tangents + rng.integers(2))
+        tangents.append(lines)
+        rays.append(np.sort([*lines, *(lines[: n_branches - n_tangents] - math.pi)]))
+    return intersections(rng.uniform(0, side, (n, 2)), rays, tangents)
+
+
+def camera(rng, center, tilt_deg=0.0, gsd=1.0) -> Homography:
+    """Query plane to reference plane for a pinhole camera of any heading over `center`; w > 0 over FRAME."""
+    tilt, azimuth, heading = math.radians(tilt_deg), rng.uniform(0, 2 * math.pi), rng.uniform(0, 2 * math.pi)
+
+    def turn(a):
+        return np.array([[math.cos(a), -math.sin(a), 0], [math.sin(a), math.cos(a), 0], [0, 0, 1]])
+
+    lean = np.array([[1, 0, 0], [0, math.cos(tilt), -math.sin(tilt)], [0, math.sin(tilt), math.cos(tilt)]])
+    rays = (
+        turn(heading) @ turn(azimuth) @ lean @ turn(-azimuth) @ np.array([[1, 0, -500], [0, 1, 500], [0, 0, -1000.0]])
+    )
+    H = np.diag([1000 * gsd, 1000 * gsd, -1.0]) @ rays
+    shift = np.array([[1, 0, center[0]], [0, 1, center[1]], [0, 0, 1]])
+    return Homography(shift @ H).facing(np.array([500.0, -500.0]))
+
+
+def view(reference, homography, rng=None) -> tuple[Intersections, np.ndarray]:
+    """What an image sees: the intersections inside FRAME, tangents by the Jacobian, shuffled; and their numbers."""
+    back = Homography(np.linalg.inv(homography.matrix))
+    mapped = np.column_stack([reference.xy, np.ones(len(reference))]) @ back.matrix.T
+    xy = mapped[:, :2] / mapped[:, 2:]
+    seen = np.flatnonzero((xy > [0, -1000]).all(axis=1) & (xy < [1000, 0]).all(axis=1))
+    if rng is not None:
+        seen = rng.permutation(seen)
+    J = back.jacobian(reference.xy[seen])
+    tangents = reference.tangents[seen].astype(float)
+    directions = np.einsum("nij,nrj->nri", J, np.stack([np.cos(tangents), np.sin(tangents)], axis=-1))
+    turned = np.sort(np.arctan2(directions[..., 1], directions[..., 0]) % math.pi, axis=1)
+    return replace(
+        reference,
+        xy=xy[seen],
+        rays=reference.rays[seen],
+        tangents=turned.astype(np.float32),
+        residual=reference.residual[seen],
+        node=seen.astype(np.int32),
+    ), seen
+
+
+@pytest.fixture(scope="module")
+def reference() -> Intersections:
+    return random_network(np.random.default_rng(1))
+
+
+@pytest.fixture(scope="module")
+def index(reference) -> PairIndex:
+    return build_pair_index(reference)
+
+
+def corner_error(match, homography) -> float:
+    assert match.homography is not None, match.reason
+    return float(np.abs(Homography(match.homography)(FRAME) - homography(FRAME)).max())
+
+
+# Sampling counts
+
+
+@pytest.mark.parametrize(
+    ("lambda_", "lambda_1", "p_query", "expected"),
+    [
+        (0.01, 0.05, 0.1, 47),  # log 0.01 / log 0.905 = 46.13
+        (0.01, 0.05, 0.01, 483),  # log 0.01 / log 0.9905 = 482.45
+        (0.1, 0.5, 0.5, 9),  # log 0.1 / log 0.75 = 8.004
+    ],
+)
+def test_query_draws_follow_equation_16(lambda_, lambda_1, p_query, expected):
+    assert query_draws(lambda_, lambda_1, p_query) == expected
+
+
+@pytest.mark.parametrize(
+    ("n_match", "lambda_1", "expected"),
+    [(0, 0.05, 0), (1, 0.05, 1), (2, 0.05, 5), (10, 0.05, 29), (10, 0.5, 7)],  # 4.32, 28.43, 6.58
+)
+def test_reference_draws_follow_equation_15(n_match, lambda_1, expected):
+    assert reference_draws(n_match, lambda_1) == expected
+
+
+@given(st.integers(2, 10**6), st.floats(1e-6, 0.9))
+def test_reference_draws_are_the_fewest_that_miss_seldom_enough(n_match, lambda_1):
+    k = reference_draws(n_match, lambda_1)
+    assert k * math.log1p(-1 / n_match) < math.log(lambda_1) * (1 - 1e-9) or k == 0
+    assert (k - 1) * math.log1p(-1 / n_match) >= math.log(lambda_1) * (1 + 1e-9)
+
+
+@given(st.integers(1, 500), st.integers(0, 2**32 - 1))
+def test_permutation_meets_every_candidate_once(n, seed):
+    start, stride = pairs_module._permutation(n, np.random.default_rng(seed))
+    assert sorted((start + j * stride) % n for j in range(n)) == list(range(n))
+
+
+# Tuples and their index
+
+
+def crossing(x, y, *tangents_deg):
+    lines = np.radians(sorted(tangents_deg))
+    return (x, y), np.sort([*(lines - math.pi), *lines]), lines
+
+
+@pytest.mark.parametrize(
+    ("second", "options", "expected"),
+    [
+        (crossing(100, 100, 0, 90), PairOptions(), 1),
+        (crossing(100, 0, 0, 90), PairOptions(), 0),  # along a street: eq. 7
+        (crossing(100, 26, 0, 90), PairOptions(), 0),  # 14.6 degrees off the street
+        (crossing(100, 28, 0, 90), PairOptions(), 1),  # 15.6 degrees
+        (crossing(100, 100, 45, 90), PairOptions(), 0),  # only the second end is degenerate
+        (crossing(100, 100, 90), PairOptions(), 0),  # one tangent cannot carry a homography
+        (crossing(100, 100, 0, 90), PairOptions(d_max_m=141), 0),  # eq. 8
+        (crossing(100, 100, 0, 90), PairOptions(d_max_m=142), 1),
+        (crossing(0, 0, 0, 90), PairOptions(), 0),  # the same place
+    ],
+)
+def test_tuples_pass_equations_7_and_8(second, options, expected):
+    index = build_pair_index(intersections(*zip(crossing(0, 0, 0, 90), second, strict=True)), options)
+    assert len(index) == expected
+
+
+def test_types_put_the_lesser_end_first():
+    found = intersections(*zip(crossing(0, 0, 0, 60, 120), crossing(100, 100, 0, 90), strict=True))
+    index = build_pair_index(found)
+    assert index.types.tolist() == [[4, 6, 2, 3]]
+    assert index.pairs.tolist() == [[1, 0]]
+
+
+def test_pairs_match_their_twin(reference, index):
+    expected = naive.list_pairs(reference.xy, reference.tangents, 1000.0, math.radians(15))
+    assert {frozenset(p) for p in index.pairs.tolist()} == expected
+    assert len(index) == len(expected)
+    ends = np.column_stack([reference.n_branches[index.pairs], reference.n_tangents[index.pairs]])
+    assert (ends == np.repeat(index.types, np.diff(index.offsets), axis=0)).all()
+
+
+def test_descriptors_match_their_twin(reference, index):
+    for t in range(len(index.types)):
+        if index.tree(t).shape[1]:
+            expected = naive.describe_pairs(index.tuples(t), reference.xy, reference.tangents)
+            np.testing.assert_allclose(index.tree(t), expected, rtol=1e-5)
+            assert (index.tree(t) > 1).all()
+
+
+def test_four_symmetric_lines_are_harmonic():
+    out = np.empty(1)
+    kernels.cross_ratios(np.array([1.0, 0.0, -1.0]), np.array([[0, 1, 2, 3]], np.uint8), out)
+    assert out[0] == 2.0
+
+
+@settings(max_examples=30, deadline=None)
+@given(st.integers(0, 2**32 - 1), st.floats(0, 50))
+def test_cross_ratios_are_invariant_under_homographies(seed, tilt_deg):
+    rng = np.random.default_rng(seed)
+    network = random_network(rng, n=40, side=1000.0)
+    query, seen = view(network, camera(rng, (500, 500), tilt_deg))
+    if len(seen) < 2:
+        return
+    options = PairOptions(d_max_m=1e6, min_line_angle_deg=5)
+    there, here = build_pair_index(network, options), build_pair_index(query, options)
+    known = {
+        (tuple(d_b), tuple(p)): row
+        for t, d_b in enumerate(there.types.tolist())
+        for p, row in zip(there.tuples(t).tolist(), there.tree(t), strict=True)
+    }
+    for t, d_b in enumerate(here.types.tolist()):
+        for p, row in zip(seen[here.tuples(t)].tolist(), here.tree(t), strict=True):
+            if (tuple(d_b), tuple(p)) in known:
+                np.testing.assert_allclose(row, known[tuple(d_b), tuple(p)], rtol=2e-4)
+
+
+@settings(max_examples=50, deadline=None)
+@given(st.integers(0, 400), st.integers(1, 4), st.booleans(), st.integers(0, 2**32 - 1))
+def test_tree_finds_what_its_twin_finds(n, n_dims, has_ties, seed):
+    rng = np.random.default_rng(seed)
+    values = rng.uniform(0, 1, (n, n_dims)).astype(np.float32)
+    if has_ties:
+        values = np.round(values * 4) / 4
+    order = rng.permutation(n).astype(np.int32)
+    kernels.order_tree(values, order)
+    assert sorted(order) == list(range(n))
+    tree = values[order]
+    tree.setflags(write=False)
+    low, high = np.sort(rng.uniform(-0.2, 1.2, (2, n_dims)), axis=0)
+    out = np.empty(n, np.int32)
+    found = out[: kernels.search_tree(tree, low, high, out)]
+    assert sorted(found) == naive.search_tree(tree, low, high).tolist()
+
+
+def test_index_survives_storage(index):
+    stored = {name: array.copy() for name, array in index.to_arrays().items()}
+    back = PairIndex.from_arrays(stored)
+    for name, array in index.to_arrays().items():
+        np.testing.assert_array_equal(array, back.to_arrays()[name])
+    assert back.n_bytes == index.n_bytes
+
+
+DAMAGE = {
+    "missing": lambda a: a.pop("pairs"),
+    "type": lambda a: a.update(pairs=a["pairs"].astype(np.int64)),
+    "dimensions": lambda a: a.update(pairs=a["pairs"].ravel()),
+    "columns": lambda a: a.update(types=a["types"][:, :3].copy()),
+    "intersection too great": lambda a: a["pairs"].__setitem__((0, 0), len(a["codes"])),
+    "intersection negative": lambda a: a["pairs"].__setitem__((0, 0), -1),
+    "offsets fall": lambda a: a["offsets"].__setitem__(1, a["offsets"][2] + 1),
+    "offsets end early": lambda a: a["offsets"].__setitem__(-1, 0),
+    "too many tangents": lambda a: a["types"].__setitem__((0, 2), 9),
+    "twice the same type": lambda a: a["types"].__setitem__(0, a["types"][1]),
+    "intersection of nine tangents": lambda a: a["codes"].__setitem__(0, 16 * 3 + 9),
+    "descriptors cut": lambda a: a.update(descriptors=a["descriptors"][:-1].copy()),
+    "grid not finite": lambda a: a["grid"].__setitem__(0, np.nan),
+    "no cell": lambda a: a["grid"].__setitem__(2, 0.0),
+    "shape": lambda a: a["shape"].__setitem__(0, a["shape"][0] + 1),
+    "shape negative": lambda a: a["shape"].__imul__(-1),
+    "bucket too great": lambda a: a["starts"].__setitem__(1, 10**6),
+    "item too great": lambda a: a["items"].__setitem__(0, len(a["codes"])),
+}
+
+
+@pytest.mark.parametrize("damage", DAMAGE.values(), ids=DAMAGE)
+def test_damaged_index_is_refused(index, damage):
+    arrays = {name: array.copy() for name, array in index.to_arrays().items()}
+    damage(arrays)
+    with pytest.raises(IndexFormatError, match="rebuild the index"):
+        PairIndex.from_arrays(arrays)
+
+
+@pytest.mark.parametrize("n", [0, 1])
+def test_hardly_any_reference_is_no_place(n):
+    few = intersections(*zip(*[crossing(0, 0, 0, 90)][:n], strict=True)) if n else intersections([], [], [])
+    query = random_network(np.random.default_rng(3), n=40, side=900.0)
+    match = match_pairs(replace(query, xy=query.xy - [0, 950]), few, build_pair_index(few), FRAME)
+    assert match.homography is None
+    assert match.n_samples == 0
+    assert "no such place" in match.reason
+
+
+# Hypotheses
+
+
+def buckets_of(reference, index):
+    return pairs_module._Search(reference, reference, index, FRAME, PairOptions(), np.random.default_rng(0)).buckets
+
+
+def test_neighbours_match_their_twin(reference, index):
+    rng = np.random.default_rng(2)
+    xy = np.concatenate([rng.uniform(-300, 4300, (500, 2)), reference.xy, [[np.nan, 0], [1e300, -1e300], [np.inf, 5]]])
+    codes = rng.choice(np.unique(index.codes), len(xy))
+    for radius in (5.0, 150.0, 1e5):
+        out = np.empty(len(xy), np.int32)
+        kernels.nearest_of_type(xy, codes, buckets_of(reference, index), radius, out)
+        expected = naive.nearest_of_type(
+            np.nan_to_num(xy, nan=1e300, posinf=1e300), codes, reference.xy, index.codes, radius
+        )
+        np.testing.assert_array_equal(out, expected)
+
+
+def evaluate(search, correspondence, t, row, least=-1):
+    """The inlier count and homography of one candidate."""
+    first, second = search.query.xy[list(correspondence.ends)]
+    model = np.empty(8)
+    count, _ = kernels.evaluate_pairs(
+        pairs_module._to_pair_frame(search.query.xy, first, second),
+        search.codes,
+        pairs_module._to_pair_frame(search.frame, first, second),
+        *correspondence.cotangents,
+        search.index.tuples(t),
+        np.array([row], np.int32),
+        np.array([0, 1, 0, 1]),
+        search.xy,
+        search.tangents,
+        search.buckets,
+        search.options.inlier_distance_m,
+        search.options.tangent_orders == "++",
+        least,
+        model,
+        np.empty(0, np.int64),
+    )
+    return count, pairs_module._pair_homography(model, first, second) if count >= 0 else None
+
+
+@pytest.mark.parametrize("orders", ["++", "all"])
+def test_hypotheses_match_their_twin(reference, index, orders):
+    """Tuples with two tangents at each end: the closed form is the direct linear transformation of all five lines."""
+    rng = np.random.default_rng(4)
+    query, _ = view(reference, camera(rng, (2000, 2000), 20), rng)
+    options = PairOptions(tangent_orders=orders, inlier_distance_m=60.0)
+    search = pairs_module._Search(query, reference, index, FRAME, options, rng)
+    t = index.types.tolist().index([3, 3, 2, 2])
+    codes = search.codes
+    a, b = np.flatnonzero(codes == 16 * 3 + 2)[:2]
+    candidates = index.tuples(t)[:150]
+    for correspondence in pairs_module._correspondences(query, a, b, t, index, options)[:: 1 if orders == "++" else 4]:
+        expected, models = naive.evaluate_pairs(
+            (query.xy, query.tangents, codes),
+            correspondence.ends,
+            (reference.xy, reference.tangents, index.codes),
+            candidates,
+            FRAME,
+            60.0,
+            orders == "++",
+        )
+        for row in range(len(candidates)):
+            count, model = evaluate(search, correspondence, t, row)
+            assert count == expected[row]
+            if model is not None:
+                model = model / (model[2] @ [*query.xy[correspondence.ends[0]], 1.0])
+                np.testing.assert_allclose(model, models[row], rtol=1e-4, atol=1e-6 * np.abs(models[row]).max())
+        assert (expected > 0).any()
+
+
+def test_four_tangent_orders_pair_the_lines_as_told(reference, index):
+    rng = np.random.default_rng(5)
+    query, _ = view(reference, camera(rng, (2000, 2000), 10), rng)
+    options = PairOptions(tangent_orders="all")
+    search = pairs_module._Search(query, reference, index, FRAME, options, rng)
+    t = index.types.tolist().index([3, 3, 2, 2])
+    a, b = np.flatnonzero(search.codes == 16 * 3 + 2)[:2]
+    found = pairs_module._correspondences(query, a, b, t, index, options)
+    assert len(found) == 8
+    for correspondence, signs in zip(found, [(1, 1), (1, -1), (-1, 1), (-1, -1)] * 2, strict=True):
+        _, model = evaluate(search, correspondence, t, 7)
+        expected = naive.homography_from_pair(
+            query.xy, query.tangents, correspondence.ends, reference.xy, reference.tangents, index.tuples(t)[7], signs
+        )
+        model = model / (model[2] @ [*query.xy[correspondence.ends[0]], 1.0])
+        np.testing.assert_allclose(model, expected, rtol=1e-4, atol=1e-6 * np.abs(expected).max())
+
+
+def test_best_count_is_beaten_or_kept(reference, index):
+    rng = np.random.default_rng(6)
+    query, _ = view(reference, camera(rng, (2000, 2000)), rng)
+    search = pairs_module._Search(query, reference, index, FRAME, PairOptions(inlier_distance_m=200.0), rng)
+    t = index.types.tolist().index([3, 3, 2, 2])
+    a, b = np.flatnonzero(search.codes == 16 * 3 + 2)[:2]
+    correspondence = pairs_module._correspondences(query, a, b, t, index, search.options)[0]
+    for row in range(60):
+        count, _ = evaluate(search, correspondence, t, row)
+        if count >= 0:
+            assert evaluate(search, correspondence, t, row, count - 1)[0] == count
+            assert evaluate(search, correspondence, t, row, count)[0] == count  # the bound itself, not beaten
+            assert evaluate(search, correspondence, t, row, count + 3)[0] == count + 3
+
+
+def test_more_tangents_give_the_least_geometric_error():
+    """The fit of a pencil of four lines is the minimum of the Sampson error over (alpha, beta)."""
+    from scipy.optimize import minimize
+
+    rng = np.random.default_rng(7)
+    r = np.radians([25, 60, 100, 150])
+    image = np.arctan2(1, 1.3 / np.tan(r) + 0.2) + rng.normal(0, 0.02, 4)
+    query, found = 1 / np.tan(r), 1 / np.tan(image)
+
+    def sampson(p):
+        error = found - p[0] * query - p[1]
+        return np.sum(error**2 / ((1 + found**2) ** 2 + (p[0] * (1 + query**2)) ** 2))
+
+    fitted = kernels._fit_pencil(query, found, 4)
+    best = minimize(sampson, (1.0, 0.0), method="Nelder-Mead", options={"xatol": 1e-9, "fatol": 1e-15})
+    assert sampson(fitted) <= best.fun * 1.01
+    np.testing.assert_allclose(fitted, best.x, atol=2e-3)
+
+
+# Scenes with known H
+
+
+@pytest.mark.parametrize("tilt_deg", [0, 15, 30])
+@pytest.mark.parametrize("seed", range(4))
+def test_known_homography_is_recovered(reference, index, tilt_deg, seed):
+    rng = np.random.default_rng([seed, tilt_deg])
+    truth = camera(rng, (2000, 2000), tilt_deg, gsd=rng.uniform(1.8, 2.5))
+    query, seen = view(reference, truth, rng)
+    match = match_pairs(query, reference, index, FRAME, seed=seed)
+    assert corner_error(match, truth) < 1e-6
+    np.testing.assert_array_equal(match.matches, np.column_stack([np.arange(len(seen)), seen]))
+    assert match.inlier_ratio == 1.0
+    assert np.linalg.det(match.homography) > 0
+    assert match.homography[2] @ [500, -500, 1] == pytest.approx(1.0)
+    assert match.reason.startswith(f"{len(seen)} of {len(seen)} intersections (100%) match")
+
+
+@pytest.mark.parametrize("seed", range(3))
+def test_noise_and_clutter_are_survived(reference, index, seed):
+    rng = np.random.default_rng([seed, 77])
+    truth = camera(rng, (2000, 2000), 20, gsd=2.2)
+    query, _ = view(reference, truth, rng)
+    clutter = random_network(rng, n=len(query) // 4, side=1000.0)
+    noisy = intersections(
+        np.concatenate([query.xy + rng.normal(0, 0.5, query.xy.shape), clutter.xy - [0, 1000]]),
+        [row[np.isfinite(row)] for row in np.concatenate([query.rays, clutter.rays])],
+        [
+            np.sort((row[np.isfinite(row)] + rng.normal(0, 0.01, np.isfinite(row).sum())) % math.pi)
+            for row in np.concatenate([query.tangents, clutter.tangents])
+        ],
+    )
+    match = match_pairs(noisy, reference, index, FRAME, seed=seed)
+    assert corner_error(match, truth) < 8.0
+    assert 0.5 < match.inlier_ratio < 0.95
+
+
+@pytest.mark.parametrize("kind", ["mirrored", "horizon", "mirrored horizon"])
+def test_unphysical_orders_are_found_on_request_only(kind):
+    network = random_network(np.random.default_rng(8), n=120, side=1400.0)
+    index = build_pair_index(network)
+    truth = np.diag([1.4, 1.4, 1.0]) @ np.array([[1, 0, 0], [0, 1, 1000], [0, 0, 1.0]])
+    if "horizon" in kind:  # between the left third of the frame and the rest
+        truth = np.array([[200.0, 0, 0], [0, 200, 100000], [1, 0, -300]])
+        network = random_network(np.random.default_rng(8), n=600, side=1400.0)
+        index = build_pair_index(replace(network, xy=network.xy - 700))
+        network = replace(network, xy=network.xy - 700)
+    if "mirrored" in kind:
+        truth = truth @ np.array([[1, 0, 0], [0, -1, -1000], [0, 0, 1.0]])
+    query, _ = view(network, Homography(truth), np.random.default_rng(0))
+    options = PairOptions(time_limit_s=60, inlier_distance_m=2.0)
+    match = match_pairs(query, network, index, FRAME, replace(options, p_query=0.2))
+    assert match.homography is None
+    match = match_pairs(query, network, index, FRAME, replace(options, tangent_orders="all"))
+    assert match.homography is not None
+    np.testing.assert_allclose(match.homography, truth / (truth[2] @ [500, -500, 1]), rtol=1e-5, atol=1e-5)
+
+
+def test_same_seed_same_answer(reference, index):
+    rng = np.random.default_rng(9)
+    query, _ = view(reference, camera(rng, (1500, 1500), 20, gsd=2.0), rng)
+    first, again = (match_pairs(query, reference, index, FRAME, seed=4) for _ in range(2))
+    np.testing.assert_array_equal(first.homography, again.homography)
+    assert replace(first, homography=None, matches=None, seconds=0) == replace(
+        again, homography=None, matches=None, seconds=0
+    )
+
+
+# No such place
+
+
+def test_elsewhere_is_no_such_place(reference, index):
+    rng = np.random.default_rng(10)
+    query, _ = view(random_network(rng), camera(rng, (2000, 2000), gsd=2.0), rng)
+    options = PairOptions(p_query=0.2)
+    match = match_pairs(query, reference, index, FRAME, options)
+    assert match.homography is None
+    assert len(match.matches) == match.inlier_ratio == 0
+    assert match.n_samples == query_draws(0.01, 0.05, 0.2)
+    assert match.n_sum >= match.candidates >= match.hypotheses > 0
+    assert match.confidence >= 1 - options.lambda_
+    assert match.reason.startswith("no such place (confidence 0.99")
+
+
+def test_sampled_subsets_claim_no_more_than_they_tested(reference, index):
+    rng = np.random.default_rng(11)
+    query, _ = view(random_network(rng), camera(rng, (2000, 2000), gsd=2.0), rng)
+    match = match_pairs(query, reference, index, FRAME, PairOptions(p_query=0.3, lambda_1=0.6, tangent_orders="all"))
+    assert match.hypotheses < 0.7 * match.candidates
+    assert 1 - 0.01 <= match.confidence < 1 - 0.7**match.n_samples
+
+
+def test_few_intersections_are_not_searched(reference, index):
+    few = random_network(np.random.default_rng(12), n=29)
+    match = match_pairs(few, reference, index, FRAME)
+    assert match.reason == "only 29 intersections, 30 are needed"
+    assert match.confidence == 0.0
+
+
+def test_time_limit_stops_the_search(reference, index):
+    rng = np.random.default_rng(13)
+    query, _ = view(reference, camera(rng, (2000, 2000), gsd=2.0), rng)
+    match = match_pairs(query, reference, index, FRAME, PairOptions(time_limit_s=0.0))
+    assert match.homography is None
+    assert match.n_samples == 1
+    assert match.hypotheses == 0
+    assert match.reason.startswith("stopped after 0 s")
+
+
+def test_large_queries_form_tuples_of_a_sample(reference, index):
+    rng = np.random.default_rng(14)
+    truth = camera(rng, (2000, 2000), gsd=2.5)
+    query, _ = view(reference, truth, rng)
+    match = match_pairs(query, reference, index, FRAME, PairOptions(max_tuple_intersections=40))
+    assert corner_error(match, truth) < 1e-6
+    assert match.inlier_ratio == 1.0
+
+
+def test_index_of_another_reference_is_misuse(reference, index):
+    with pytest.raises(ValueError, match="rebuild"):
+        match_pairs(reference, random_network(np.random.default_rng(0), n=5), index, FRAME)
+
+
+def test_query_shrunk_onto_a_few_places_is_no_match():
+    """Equation 10 to the letter counts any number of intersections at one place."""
+    rng = np.random.default_rng(15)
+    spots = random_network(rng, n=12, side=60.0, gap_deg=40.0)
+    query = random_network(rng, n=60, side=900.0, gap_deg=40.0)
+    query = replace(query, xy=query.xy - [0, 950])
+    index = build_pair_index(spots)
+    options = PairOptions(inlier_distance_m=40.0, p_query=0.05, tangent_orders="++")
+    assert match_pairs(query, spots, index, FRAME, options).homography is None
+    assert match_pairs(query, spots, index, FRAME, replace(options, one_to_one=False)).homography is not None
+
+
+# Real roads
+
+
+@pytest.mark.realdata
+def test_boston_is_found_in_itself(data_dir):
+    import geopandas as gpd
+
+    from roadgeo.roads.intersections import find_intersections
+    from roadgeo.roads.simplification import planarize, simplify
+
+    roads = gpd.read_file(data_dir / "boston" / "boston_osm_roads.gpkg", bbox=(-71.13, 42.33, -71.05, 42.38))
+    lines = roads.to_crs(26919).geometry.translate(-328000, -4690000)
+    boston = find_intersections(simplify(planarize(lines[lines.geom_type == "LineString"].values)))
+    index = build_pair_index(boston)
+    assert index.n_bytes / len(boston) < 800
+    rng = np.random.default_rng(0)
+    for _ in range(5):
+        truth = camera(rng, boston.xy[rng.integers(len(boston))], 25, gsd=1.2)
+        query, seen = view(boston, truth, rng)
+        if len(seen) >= 30:
+            assert corner_error(match_pairs(query, boston, index, FRAME), truth) < 1e-6

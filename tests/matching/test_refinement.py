@@ -1,0 +1,123 @@
+"""Refinement on made-up towns with known homographies."""
+
+import numpy as np
+import pytest
+from worlds.scenes import Sight, camera, look, mapped, scene_of
+
+from roadgeo.matching.index import IndexOptions, build_index
+from roadgeo.matching.refinement import RefineOptions, refine
+from roadgeo.matching.verification import VerifyOptions, agreement
+
+NO_SEEDS = np.array([], int)
+
+
+def shaken(matrix, scene, size_m, rng):
+    """The homography after its frame's corners have moved by some metres."""
+    import cv2
+
+    corners = mapped(matrix, scene.corners)
+    moved = (corners + rng.normal(0, size_m, (4, 2)) - corners[0]).astype(np.float32)
+    return np.array([[1, 0, corners[0, 0]], [0, 1, corners[0, 1]], [0, 0, 1]]) @ cv2.getPerspectiveTransform(
+        scene.corners.astype(np.float32), moved
+    )
+
+
+def refined(start, scene, index, gsd=1.0, rounds=3):
+    matrix, result = start, None
+    for _ in range(rounds):
+        _, matched, _ = agreement(matrix, scene, index, gsd, NO_SEEDS, VerifyOptions())
+        result = refine(matrix, scene, index, matched)
+        assert result is not None
+        matrix = result.matrix
+    return result
+
+
+def sight_of(network, seed, tilt=0.0, sight=None, gsd=1.0):
+    """(truth, scene) of a camera somewhere over the town."""
+    rng = np.random.default_rng(seed)
+    center = tuple(rng.uniform(1300, 2700, 2))
+    truth = camera(center, (1000, 1000), gsd, tilt, rng.uniform(0, 360), rng.uniform(0, 360))
+    return truth, scene_of(look(network, truth, sight=sight, seed=seed), px_per_m=1 / gsd)
+
+
+@pytest.fixture(scope="module")
+def exact(town):
+    """The town's index with its roads as they are."""
+    return build_index(town[0], IndexOptions(simplify_m=0.01))
+
+
+@pytest.mark.parametrize("tilt", [0, 15, 30, 45])
+@pytest.mark.parametrize("gsd", [0.7, 1.3])
+def test_the_homography_is_recovered_where_the_query_is_exact(town, exact, tilt, gsd):
+    truth, scene = sight_of(town[0], tilt, tilt, gsd=gsd)
+    start = shaken(truth, scene, 4.0, np.random.default_rng(tilt))
+    result = refined(start, scene, exact, gsd)
+    inner = scene.center + 0.8 * (scene.corners - scene.center)
+    gaps = np.hypot(*(mapped(result.matrix, inner) - mapped(truth, inner)).T)
+    assert np.sqrt(np.mean(gaps**2)) < 0.1
+    assert result.rms_m < 0.1
+    assert (result.corner_sigma_m < 0.15 + 0.15 * gsd).all()
+    assert result.matrix[2, 2] == 1.0
+
+
+def calibration(town, seeds, **view):
+    """(errors of corners, their claimed standard deviations)."""
+    errors, sigmas = [], []
+    for seed in seeds:
+        truth, scene = sight_of(town[0], seed, **view)
+        result = refined(shaken(truth, scene, 3.0, np.random.default_rng(seed)), scene, town[1])
+        errors.append(np.hypot(*(mapped(result.matrix, scene.corners) - mapped(truth, scene.corners)).T))
+        sigmas.append(result.corner_sigma_m)
+    return np.array(errors), np.array(sigmas)
+
+
+@pytest.mark.parametrize(
+    "view",
+    [
+        {"sight": Sight(0.6)},
+        {"sight": Sight(1.2), "tilt": 25},
+        {"sight": Sight(1.8), "tilt": 10},
+        {"sight": Sight(1.2, missing=0.15, false=0.1), "tilt": 35},
+    ],
+    ids=["sharp", "tilted", "blurred", "gaps"],
+)
+def test_claimed_accuracy_is_honest(town, view):
+    errors, sigmas = calibration(town, range(30), **view)
+    assert 0.7 < np.sqrt(np.mean((errors / sigmas) ** 2)) < 1.3
+    assert np.median(errors) < 1.5
+
+
+def test_more_noise_is_claimed_as_such(town):
+    claims = [calibration(town, range(4), sight=Sight(s))[1].mean() for s in (0.3, 1.0, 2.5)]
+    assert claims[0] < claims[1] < claims[2]
+
+
+def test_wrong_matches_do_no_harm(town):
+    truth, scene = sight_of(town[0], 5, 20.0, Sight(0.5))
+    index = town[1]
+    _, matched, _ = agreement(truth, scene, index, 1.0, NO_SEEDS, VerifyOptions())
+    swapped = matched.copy()
+    few = np.flatnonzero(matched >= 0)[::6]
+    swapped[few] = index.neighbours[matched[few], 0]
+    right, wrong = refine(truth, scene, index, matched), refine(truth, scene, index, swapped)
+    assert np.abs(mapped(right.matrix, scene.corners) - mapped(wrong.matrix, scene.corners)).max() < 0.3
+
+
+def test_fewer_points_do_nearly_as_well(town):
+    truth, scene = sight_of(town[0], 6, 20.0, Sight(0.5))
+    _, matched, _ = agreement(truth, scene, town[1], 1.0, NO_SEEDS, VerifyOptions())
+    result = refine(truth, scene, town[1], matched, n_points=150)
+    assert np.abs(mapped(result.matrix, scene.corners) - mapped(truth, scene.corners)).max() < 2
+
+
+def test_a_floor_under_every_claim(town):
+    truth, scene = sight_of(town[0], 7)
+    _, matched, _ = agreement(truth, scene, town[1], 1.0, NO_SEEDS, VerifyOptions())
+    floor = RefineOptions(sigma_floor_m=3.0)
+    assert (refine(truth, scene, town[1], matched, floor).corner_sigma_m >= 3.0).all()
+
+
+def test_nothing_to_stand_on_is_no_refinement(town):
+    truth, scene = sight_of(town[0], 8)
+    nowhere = np.array([[1, 0, 1e6], [0, 1, 1e6], [0, 0, 1]]) @ truth
+    assert refine(nowhere, scene, town[1], np.full(len(scene.intersections), -1)) is None

@@ -1,0 +1,104 @@
+"""The search loop, with a toy: guess a secret integer; models are (answer, score) pairs."""
+
+import time
+from dataclasses import dataclass, field
+
+import pytest
+
+from roadgeo.matching.search import SearchOptions, search
+
+
+@dataclass
+class Toy:
+    """Rounds of models; two models mean the same answer where their tens agree."""
+
+    plan: list[list[tuple[int, float]]]
+    settled_from: float = float("-inf")
+    seconds: float = 0.0
+    scored: list[int] = field(default_factory=list)
+
+    def rounds(self):
+        yield from self.plan
+
+    def score(self, model):
+        time.sleep(self.seconds)
+        self.scored.append(model[0])
+        return model[1]
+
+    def settled(self, model):
+        return model[1] >= self.settled_from
+
+    def same(self, a, b):
+        return a[0] // 10 == b[0] // 10
+
+
+def answers(result):
+    return (result.best and result.best[0], result.runner_up and result.runner_up[0])
+
+
+@pytest.mark.parametrize("plan", [[], [[]], [[], []]])
+def test_nothing_to_score(plan):
+    result = search(Toy(plan))
+    assert answers(result) == (None, None)
+    assert result.score == result.runner_up_score == float("-inf")
+    assert result.stopped == "exhausted"
+    assert (result.n_rounds, result.n_scored) == (len(plan), 0)
+
+
+def test_stops_after_the_round_in_which_one_stands_out():
+    toy = Toy([[(1, 3.0)], [(2, 30.0), (50, 4.0)], [(70, 99.0)]])
+    result = search(toy)
+    assert toy.scored == [1, 2, 50]
+    assert answers(result) == (2, 50)
+    assert (result.score, result.runner_up_score) == (30.0, 4.0)
+    assert (result.n_rounds, result.n_scored, result.stopped) == (2, 3, "accepted")
+
+
+def test_a_score_without_a_margin_is_not_enough():
+    result = search(Toy([[(1, 30.0), (50, 28.0)], [(52, 29.0)], [(90, 1.0)]]))
+    assert result.stopped == "exhausted"
+    assert answers(result) == (1, 52)
+    assert result.runner_up_score == 29.0
+
+
+def test_a_better_version_of_the_same_answer_is_no_runner_up():
+    result = search(Toy([[(1, 10.0)], [(2, 11.0)], [(3, 9.0)], [(50, 2.0)]]), SearchOptions(accept=12.0))
+    assert answers(result) == (2, 50)
+
+
+def test_a_runner_up_of_the_new_best_answer_falls_away():
+    result = search(Toy([[(1, 10.0), (50, 8.0)], [(51, 12.0)]]))
+    assert answers(result) == (51, 1)
+    result = search(Toy([[(1, 10.0), (50, 8.0)], [(90, 9.0)]]))
+    assert answers(result) == (1, 90)
+
+
+def test_models_that_are_not_settled_get_more_rounds():
+    plan = [[(1, 30.0)]] + [[(k, 1.0)] for k in range(2, 9)]
+    result = search(Toy(plan, settled_from=100.0), SearchOptions(more_rounds=3))
+    assert (result.n_rounds, result.stopped) == (4, "accepted")
+    better = search(Toy([[(1, 30.0)], [(2, 101.0)], [(3, 1.0)]], settled_from=100.0), SearchOptions(more_rounds=3))
+    assert (better.n_rounds, answers(better)) == (2, (2, None))
+
+
+def test_a_rival_that_comes_later_takes_the_margin_away():
+    toy = Toy([[(1, 30.0)], [(50, 29.0)], [], [], []], settled_from=100.0)
+    assert search(toy, SearchOptions(more_rounds=2)).stopped == "exhausted"
+
+
+@pytest.mark.parametrize("per_round", [1, 100])
+def test_time_is_bounded(per_round):
+    models = [(k, 1.0) for k in range(100)]
+    toy = Toy([models[i : i + per_round] for i in range(0, 100, per_round)], seconds=0.005)
+    started = time.perf_counter()
+    result = search(toy, SearchOptions(time_limit_s=0.03))
+    assert time.perf_counter() - started < 2.0
+    assert result.stopped == "time"
+    assert 0 < result.n_scored < 50
+    assert result.n_scored == len(toy.scored)
+
+
+def test_impossible_models_lose_to_any_other():
+    result = search(Toy([[(1, float("-inf")), (50, -3.0)]]))
+    assert answers(result) == (50, 1)
+    assert result.score == -3.0

@@ -1,0 +1,189 @@
+import warnings
+from pathlib import Path
+
+import numpy as np
+import pyproj
+import pytest
+import rasterio
+from outputs.test_location_files import located
+from rasterio.enums import ColorInterp
+
+from roadgeo.errors import CrsError, MaskError
+from roadgeo.geometry.homography import Homography
+from roadgeo.outputs import orthophoto
+from roadgeo.outputs.orthophoto import ImageOptions, image_homography, read_preview, warp_image
+from roadgeo.outputs.paths import Placement
+
+PLACE = Placement.of(located())
+MASK_SIZE = (400, 300)
+
+
+def write(path: Path, bands: np.ndarray, **profile: object) -> Path:
+    """Write (bands, rows, columns)."""
+    count, height, width = bands.shape
+    size = {"width": width, "height": height, "count": count, "dtype": bands.dtype.name}
+    with warnings.catch_warnings(action="ignore"), rasterio.open(path, "w", driver="GTiff", **size, **profile) as sink:
+        sink.write(bands)
+    return path
+
+
+def positions(height: int, width: int, dtype: str = "uint16") -> np.ndarray:
+    """Two bands: 100 + 10 times the column and the row of each pixel's centre; linear, so interpolation keeps them."""
+    rows, columns = np.indices((height, width)) + 0.5
+    return (100 + 10 * np.stack([columns, rows])).astype(dtype)
+
+
+@pytest.mark.parametrize(
+    ("crs", "scale", "resampling"),
+    [
+        (None, 1, "nearest"),
+        (None, 2, "bilinear"),
+        (None, 1, "cubic"),
+        (None, 1, "lanczos"),
+        ("EPSG:3857", 1, "cubic"),
+        ("EPSG:4326", 1, "bilinear"),
+        ("EPSG:4326", 2, "nearest"),
+    ],
+)
+def test_every_pixel_shows_the_ground_where_it_lies(
+    tmp_path: Path, crs: str | None, scale: int, resampling: str, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(orthophoto, "_BLOCK", 150)
+    source = write(tmp_path / "a.tif", positions(300 * scale, 400 * scale))
+    homography, size = image_homography(PLACE, MASK_SIZE, source)
+    assert size == (400 * scale, 300 * scale)
+    warp_image(source, tmp_path / "b.tif", PLACE, homography, {}, ImageOptions(crs=crs, resampling=resampling))
+    with rasterio.open(tmp_path / "b.tif") as raster:
+        column, row, alpha = raster.read().astype(float)
+        assert raster.tags(ns="IMAGE_STRUCTURE")["LAYOUT"] == "COG"
+        rows, columns = np.indices(alpha.shape) + 0.5
+        x, y = raster.transform.c + raster.transform.a * columns, raster.transform.f + raster.transform.e * rows
+        if crs:
+            assert raster.crs == rasterio.CRS.from_user_input(crs)
+            x, y = pyproj.Transformer.from_crs(crs, PLACE.crs, always_xy=True).transform(x, y)
+    shown = alpha == 65535
+    expected = Homography(homography).inverse()(np.stack([x, y], axis=-1))
+    inner = shown & (expected > 3).all(axis=-1) & (expected < np.array([400, 300]) * scale - 3).all(axis=-1)
+    assert inner.sum() > 0.9 * 400 * 300 * scale**2 * 0.5
+    error = np.stack([column, row], axis=-1)[inner] / 10 - 10 - expected[inner]
+    assert np.abs(error).max() < (0.56 if resampling == "nearest" else 0.12)
+    outside = ((expected < -0.01) | (expected > np.array([400, 300]) * scale + 0.01)).any(axis=-1)
+    assert not shown[outside].any()
+    assert shown[~outside & ((expected > 0.01) & (expected < np.array([400, 300]) * scale - 0.01)).all(axis=-1)].all()
+
+
+@pytest.mark.parametrize(
+    ("bands", "dtype", "colors"),
+    [
+        (1, "uint8", [ColorInterp.gray, ColorInterp.alpha]),
+        (3, "uint8", [ColorInterp.red, ColorInterp.green, ColorInterp.blue, ColorInterp.alpha]),
+        (3, "uint16", [ColorInterp.red, ColorInterp.green, ColorInterp.blue, ColorInterp.alpha]),
+    ],
+)
+def test_bands_and_depth_are_kept(tmp_path: Path, bands: int, dtype: str, colors: list[ColorInterp]) -> None:
+    photometric = {"photometric": "RGB"} if bands == 3 else {}
+    source = write(tmp_path / "a.tif", np.full((bands, 30, 40), 200, dtype), **photometric)
+    homography, _ = image_homography(PLACE, MASK_SIZE, source)
+    warp_image(source, tmp_path / "b.tif", PLACE, homography, {"ROADGEO_QUERY": "a"})
+    with rasterio.open(tmp_path / "b.tif") as raster:
+        assert list(raster.colorinterp) == colors
+        assert raster.dtypes[0] == dtype
+        assert raster.tags()["ROADGEO_QUERY"] == "a"
+        values = raster.read()
+    shown = values[-1] > 0
+    assert (values[:-1, shown] == 200).all()
+    assert (values[:, ~shown] == 0).all()
+
+
+def test_alpha_of_the_picture_is_kept(tmp_path: Path) -> None:
+    bands = np.full((4, 300, 400), 200, "uint8")
+    bands[:, :, 200:] = 0
+    source = write(tmp_path / "a.tif", bands, photometric="RGB", alpha="yes")
+    homography, _ = image_homography(PLACE, MASK_SIZE, source)
+    warp_image(source, tmp_path / "b.tif", PLACE, homography, {})
+    with rasterio.open(tmp_path / "b.tif") as raster:
+        values = raster.read()
+    assert len(values) == 4
+    assert (values[:3, values[3] > 0] == 200).all()  # nothing of the unknown black bled into the known
+    assert (values[3] > 0).sum() < 0.55 * 400 * 300
+
+
+@pytest.mark.parametrize(("dtype", "nodata"), [("float32", None), ("float32", -9999.0), ("int16", None), ("int16", 7)])
+def test_other_types_have_a_nodata_value(tmp_path: Path, dtype: str, nodata: float | None) -> None:
+    values = np.full((1, 300, 400), 50, dtype)
+    if nodata is not None:
+        values[:, :, 200:] = nodata
+    source = write(tmp_path / "a.tif", values, nodata=nodata)
+    homography, _ = image_homography(PLACE, MASK_SIZE, source)
+    warp_image(source, tmp_path / "b.tif", PLACE, homography, {})
+    with rasterio.open(tmp_path / "b.tif") as raster:
+        known = raster.dataset_mask() > 0
+        values = raster.read(1)
+        assert raster.count == 1
+    assert 0.2 * known.size < known.sum() < 0.8 * known.size
+    np.testing.assert_allclose(values[known], 50, rtol=1e-6)
+
+
+def test_a_large_picture_in_rows_is_tiled_first_and_read_coarser(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(orthophoto, "_TILED_BYTES", 1000)
+    monkeypatch.setattr(orthophoto, "_MAX_SOURCE", 100)
+    source = write(tmp_path / "a.tif", positions(300, 400))
+    homography, _ = image_homography(PLACE, MASK_SIZE, source)
+    grid = warp_image(source, tmp_path / "b.tif", PLACE, homography, {}, ImageOptions(max_pixels=2000))
+    assert grid.width * grid.height < 2300
+    with rasterio.open(tmp_path / "b.tif") as raster:
+        column, row, alpha = raster.read().astype(float)
+        rows, columns = np.indices(alpha.shape) + 0.5
+        x, y = raster.transform.c + raster.transform.a * columns, raster.transform.f + raster.transform.e * rows
+    expected = Homography(homography).inverse()(np.stack([x, y], axis=-1))
+    inner = (expected > 12).all(axis=-1) & (expected < (388, 288)).all(axis=-1)
+    assert np.abs(np.stack([column, row], axis=-1)[inner] / 10 - 10 - expected[inner]).max() < 4
+    assert [path.name for path in tmp_path.iterdir()] == ["a.tif", "b.tif"]
+
+
+def test_what_cannot_be_drawn_is_named(tmp_path: Path) -> None:
+    (tmp_path / "a.txt").write_text("no picture")
+    with pytest.raises(MaskError, match="cannot read the picture"):
+        image_homography(PLACE, MASK_SIZE, tmp_path / "a.txt")
+    source = write(tmp_path / "a.tif", np.zeros((1, 300, 300), "uint8"))
+    with pytest.raises(MaskError, match="300 x 300 pixels, its mask 400 x 300"):
+        image_homography(PLACE, MASK_SIZE, source)
+    with pytest.raises(CrsError, match="banana"):
+        warp_image(source, tmp_path / "b.tif", PLACE, PLACE.homography, {}, ImageOptions(crs="EPSG:banana"))
+
+
+@pytest.mark.parametrize(
+    ("dtype", "n_bands"),
+    [("uint8", 1), ("uint8", 3), ("uint8", 4), ("uint16", 1), ("uint16", 3), ("uint16", 4), ("float32", 1)],
+)
+def test_a_preview_is_small_and_shows_what_is_known(tmp_path: Path, dtype: str, n_bands: int) -> None:
+    scale = {"uint8": 1, "uint16": 200, "float32": 0.01}[dtype]
+    ramp = np.tile(np.linspace(10, 240, 600), (400, 1)) * scale
+    bands = np.repeat(ramp[None], min(n_bands, 3), axis=0).astype(dtype)
+    bands[:, :, -100:] = 0
+    profile = {"nodata": 0}
+    if n_bands == 4:
+        alpha = np.where(np.arange(600) < 500, np.iinfo(dtype).max, 0).astype(dtype)
+        bands = np.concatenate([bands, np.tile(alpha, (400, 1))[None]])
+        profile = {"photometric": "RGB", "alpha": "yes"}
+    preview = read_preview(write(tmp_path / "a.tif", bands, **profile), 300)
+    assert preview.shape == (200, 300, 4)
+    assert preview.dtype == np.uint8
+    assert (preview[:, :248, 3] == 255).all()
+    assert (preview[:, 252:, 3] == 0).all()
+    row = preview[100, :248].astype(int)
+    assert (np.diff(row[:, 0]) >= 0).all()
+    assert row[-1, 0] - row[0, 0] > 180
+    assert np.array_equal(row[:, 0], row[:, 2])
+
+
+def test_a_preview_of_a_palette_shows_its_colours(tmp_path: Path) -> None:
+    labels = np.repeat(np.array([[0, 1]], np.uint8), 40, axis=0).repeat(20, axis=1)[None]
+    path = write(tmp_path / "a.tif", labels, photometric="palette")
+    with warnings.catch_warnings(action="ignore"), rasterio.open(path, "r+") as sink:
+        sink.write_colormap(1, {0: (10, 20, 30, 255), 1: (200, 100, 50, 255)})
+    preview = read_preview(path, 1000)
+    assert preview[5, 5].tolist() == [10, 20, 30, 255]
+    assert preview[5, 35].tolist() == [200, 100, 50, 255]

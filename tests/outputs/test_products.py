@@ -1,0 +1,180 @@
+import json
+import shutil
+import xml.etree.ElementTree as ET
+import zipfile
+from dataclasses import replace
+from pathlib import Path
+
+import cv2
+import numpy as np
+import pyproj
+import pytest
+import rasterio
+from outputs.test_location_files import located, road_mask
+
+from roadgeo.geometry.homography import Homography
+from roadgeo.geometry.warping import MapGrid
+from roadgeo.location import Location
+from roadgeo.outputs.location_files import OutputOptions, write_location
+from roadgeo.outputs.orthophoto import open_picture
+from roadgeo.outputs.paths import OutputPaths, Placement, output_paths
+from roadgeo.outputs.products import PRODUCTS, Subject, write_geojson, write_kmz
+
+
+@pytest.fixture(scope="module")
+def written(tmp_path_factory: pytest.TempPathFactory) -> OutputPaths:
+    """All products of a photograph of twice the mask's size."""
+    tmp_path = tmp_path_factory.mktemp("products")
+    photo = np.random.default_rng(1).integers(0, 255, (600, 800, 3)).astype(np.uint8)
+    cv2.imwrite(str(tmp_path / "photo.png"), photo)
+    paths = output_paths(tmp_path / "out", "mask")
+    paths.folder.mkdir()
+    options = OutputOptions(products=tuple(PRODUCTS))
+    _, files = write_location(located(), road_mask(), paths, options, tmp_path / "photo.png")
+    assert sorted(files) == sorted(paths.folder.iterdir())
+    return paths
+
+
+def photo_homography() -> Homography:
+    return Homography(located().homography @ np.diag([0.5, 0.5, 1.0]))
+
+
+@pytest.mark.parametrize("name", ["mask_gcps.tif", "mask_gcps.vrt"])
+def test_control_points_lie_where_the_homography_says(written: OutputPaths, name: str) -> None:
+    with open_picture(written.folder / name) as raster:
+        points, crs = raster.gcps
+        assert crs.to_epsg() == 32629
+        assert (raster.width, raster.height, raster.count) == (800, 600, 3)
+        pixels = raster.read()
+    assert len(points) == 25
+    expected = photo_homography()(np.array([[point.col, point.row] for point in points]))
+    np.testing.assert_allclose([[point.x, point.y] for point in points], expected, atol=1e-6)
+    photo = cv2.imread(str(written.folder.parent / "photo.png"))[..., ::-1]
+    np.testing.assert_array_equal(pixels.transpose(1, 2, 0), photo)
+
+
+def test_points_for_the_qgis_georeferencer(written: OutputPaths) -> None:
+    first, header, *rows = (written.folder / "photo.png.points").read_text().splitlines()
+    assert pyproj.CRS.from_user_input(first.removeprefix("#CRS: ")).to_epsg() == 32629
+    assert header == "mapX,mapY,sourceX,sourceY,enable,dX,dY,residual"
+    x, y, column, row = np.array([line.split(",")[:4] for line in rows], float).T
+    np.testing.assert_allclose(np.stack([x, y], 1), photo_homography()(np.stack([column, -row], 1)), atol=1e-6)
+
+
+def test_control_points_for_opendronemap(written: OutputPaths) -> None:
+    first, *rows = (written.folder / "mask_gcp_list.txt").read_text().splitlines()
+    assert first == "EPSG:32629"
+    assert {row.split()[5] for row in rows} == {"photo.png"}
+    x, y, z, column, row = np.array([line.split()[:5] for line in rows], float).T
+    assert (z == 0).all()
+    np.testing.assert_allclose(np.stack([x, y], 1), photo_homography()(np.stack([column, row], 1)), atol=1e-6)
+
+
+def test_the_world_file_is_that_of_the_drawn_raster(written: OutputPaths) -> None:
+    a, d, b, e, c, f = map(float, (written.folder / "mask_footprint.tfw").read_text().split())
+    with rasterio.open(written.footprint) as raster:
+        transform = raster.transform
+    center = (transform.c + transform.a / 2, transform.f + transform.e / 2)
+    np.testing.assert_allclose((a, b, d, e, c, f), (transform.a, 0, 0, transform.e, *center))
+
+
+def signed_area(ring: list) -> float:
+    x, y = np.array(ring).T
+    return float((x[:-1] * y[1:] - x[1:] * y[:-1]).sum() / 2)
+
+
+def check_rfc7946(feature: dict) -> None:
+    """What section 3.1.6, 3.1.9, 4 and 5 of RFC 7946 ask of a polygon."""
+    assert feature["type"] == "Feature"
+    assert "crs" not in feature
+    geometry = feature["geometry"]
+    polygons = [geometry["coordinates"]] if geometry["type"] == "Polygon" else geometry["coordinates"]
+    for (ring,) in polygons:
+        assert ring[0] == ring[-1]
+        assert len(ring) >= 4
+        assert signed_area(ring) > 0  # counterclockwise
+        assert np.abs(np.array(ring)).max(axis=0)[0] <= 180
+        assert np.ptp(np.array(ring)[:, 0]) < 180
+    west, south, east, north = feature["bbox"]
+    assert south < north
+    assert (west < east) == (len(polygons) == 1)
+
+
+def test_geojson_is_the_footprint(written: OutputPaths) -> None:
+    feature = json.loads((written.folder / "mask_footprint.geojson").read_text())
+    check_rfc7946(feature)
+    assert feature["properties"]["query"] == "photo_mask.png"
+    assert feature["properties"]["attribution"] == "© somebody"
+    ring = np.array(feature["geometry"]["coordinates"][0])
+    to_crs = pyproj.Transformer.from_crs(4326, 32629, always_xy=True)
+    corners = np.stack(to_crs.transform(*ring[[0, 24, 16, 8]].T), 1)
+    np.testing.assert_allclose(corners, located().footprint, atol=0.02)
+
+
+def test_the_stac_item_describes_the_drawn_raster(written: OutputPaths) -> None:
+    item = json.loads((written.folder / "mask_stac.json").read_text())
+    check_rfc7946(item)
+    assert item["stac_version"] == "1.0.0"
+    assert {"id", "properties", "links", "assets"} <= set(item)
+    properties = item["properties"]
+    assert properties["datetime"] is None
+    assert properties["start_datetime"] < properties["end_datetime"]
+    with rasterio.open(written.footprint) as raster:
+        assert properties["proj:code"] == f"EPSG:{raster.crs.to_epsg()}"
+        assert properties["proj:shape"] == list(raster.shape)
+        np.testing.assert_allclose(properties["proj:transform"], list(raster.transform))
+    for asset in item["assets"].values():
+        assert (written.folder / asset["href"]).exists()
+
+
+def read_kmz(path: Path) -> tuple[list[float], np.ndarray]:
+    with zipfile.ZipFile(path) as archive:
+        root = ET.fromstring(archive.read("doc.kml"))
+        picture = cv2.imdecode(np.frombuffer(archive.read("overlay.png"), np.uint8), cv2.IMREAD_UNCHANGED)
+    space = {"k": "http://www.opengis.net/kml/2.2"}
+    box = root.find(".//k:LatLonBox", space)
+    return [float(box.find(f"k:{side}", space).text) for side in ("west", "south", "east", "north")], picture
+
+
+def test_the_kmz_lies_where_the_picture_does(written: OutputPaths) -> None:
+    (west, south, east, north), picture = read_kmz(written.folder / "mask_overlay.kmz")
+    assert picture.shape[2] == 4
+    rows, columns = np.nonzero(picture[..., 3])
+    lon = west + (columns.mean() + 0.5) / picture.shape[1] * (east - west)
+    lat = north - (rows.mean() + 0.5) / picture.shape[0] * (north - south)
+    middle = pyproj.Transformer.from_crs(32629, 4326, always_xy=True).transform(*located().footprint.mean(axis=0))
+    np.testing.assert_allclose((lon, lat), middle, atol=1e-4)
+
+
+def astride(tmp_path: Path) -> Subject:
+    """A mask on the 180th meridian, in Fiji."""
+    x, y = pyproj.Transformer.from_crs(4326, 32701, always_xy=True).transform(180.0, -16.8)
+    H = np.array([[1.0, 0.0, x - 200.0], [0.0, -1.0, y + 150.0], [0.0, 0.0, 1.0]])
+    location: Location = replace(located(H), crs="EPSG:32701")
+    place = Placement.of(location)
+    grid = MapGrid(x - 200, y + 150, 1.0, 400, 300)
+    paths = output_paths(tmp_path, "a")
+    return Subject(location, place, tmp_path / "a.png", (400, 300), H, grid, place.crs, paths, road_mask())
+
+
+def test_a_footprint_astride_180_degrees_is_cut_there(tmp_path: Path) -> None:
+    subject = astride(tmp_path)
+    write_geojson(tmp_path / "a.geojson", subject)
+    feature = json.loads((tmp_path / "a.geojson").read_text())
+    check_rfc7946(feature)
+    assert feature["geometry"]["type"] == "MultiPolygon"
+    areas = [signed_area(ring) for (ring,) in feature["geometry"]["coordinates"]]
+    np.testing.assert_allclose(areas[0], areas[1], rtol=0.02)
+    write_kmz(tmp_path / "a.kmz", subject)
+    (west, _, east, _), picture = read_kmz(tmp_path / "a.kmz")
+    assert 179.9 < west < 180
+    assert 180 < east < 180.1  # as KML wants it
+    assert picture[..., 3].max() == 255
+    assert max(picture.shape[:2]) < 1000
+
+
+def test_a_mask_that_was_not_located_loses_its_products(written: OutputPaths, tmp_path: Path) -> None:
+    shutil.copytree(written.folder, tmp_path / "out")
+    paths = output_paths(tmp_path / "out", "mask")
+    write_location(replace(located(), status="not_located"), road_mask(), paths, None, "photo.png")
+    assert [path.name for path in paths.folder.iterdir()] == ["mask_location.json"]

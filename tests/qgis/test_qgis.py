@@ -1,0 +1,606 @@
+"""The QGIS plugin: its parts without QGIS, then all of it in the real QGIS, in child processes with a time limit."""
+
+import ast
+import configparser
+import json
+import os
+import re
+import shutil
+import signal
+import subprocess
+import sys
+import time
+import zipfile
+from dataclasses import dataclass
+from pathlib import Path
+
+import cv2
+import numpy as np
+import pytest
+import rasterio
+
+import roadgeo
+from roadgeo.cli import main
+from roadgeo.demo import ROADS, demo_masks
+from roadgeo.errors import OutputError
+from roadgeo.geometry.homography import Homography
+from roadgeo.outputs.products import PRODUCTS
+from roadgeo.qgis import installation
+from roadgeo.qgis.installation import NAME, find_profiles, install_plugin, write_package
+from roadgeo.qgis.plugin import runner
+from roadgeo.workflows import LocateOptions
+
+PLUGIN = Path(installation.__file__).parent / "plugin"
+CHILD = Path(__file__).parents[1] / "support" / "qgis_child.py"
+MASKS = {mask.path.stem: mask for mask in demo_masks()}
+ROAD, FOOTPRINT, MAP_ROAD = "#e4572e", "#1f6fb4", "#546e7a"
+
+
+def make_program(path: Path, body: str) -> Path:
+    path.parent.mkdir(parents=True, exist_ok=True)
+    path.write_text(f"#!{sys.executable}\n{body}", encoding="utf-8")
+    path.chmod(0o755)
+    return path
+
+
+# --- finding the executable -------------------------------------------------------------------------------------------
+
+
+def test_the_executable_is_searched_from_the_surest_place_to_the_usual_ones(tmp_path: Path) -> None:
+    home, beside = tmp_path / "home", tmp_path / "plugin"
+    beside.mkdir()
+    places = [
+        home / "projects" / ".venv" / "bin" / "roadgeo",
+        home / ".local" / "bin" / "roadgeo",
+        tmp_path / "path" / "roadgeo",
+        tmp_path / "remembered" / "roadgeo",
+        tmp_path / "told" / "roadgeo",
+    ]
+    environ = {"PATH": str(places[2].parent), "ROADGEO_EXECUTABLE": str(places[4])}
+    (beside / runner.REMEMBERED).write_text(f"{places[3]}\n", "utf-8")
+    assert runner.find_executable("", environ, home, beside) is None
+    for place in places:  # each takes precedence over those before it
+        make_program(place, "")
+        assert runner.find_executable("", environ, home, beside) == str(place)
+    assert runner.find_executable(str(places[0]), environ, home, beside) == str(places[0])
+    assert runner.find_executable(str(tmp_path / "none"), environ, home, beside) is None
+
+
+def test_the_child_inherits_nothing_of_the_libraries_of_qgis() -> None:
+    environ = {"PYTHONHOME": "a", "PYTHONPATH": "b", "PROJ_LIB": "c", "PROJ_DATA": "d", "GDAL_DATA": "e", "PATH": "f"}
+    kept = runner.child_environment(environ)
+    assert kept == {"PATH": "f", "PYTHONIOENCODING": "utf-8", "ROADGEO_PROGRESS": "json", "NO_COLOR": "1"}
+
+
+# --- running it -------------------------------------------------------------------------------------------------------
+
+
+def never() -> bool:
+    return False
+
+
+def test_lines_of_both_streams_arrive_and_the_status(tmp_path: Path) -> None:
+    program = make_program(
+        tmp_path / "roadgeo",
+        "import sys\nprint('São João')\nprint('oops', file=sys.stderr)\nprint('x' * 300000)\nsys.exit(3)",
+    )
+    heard: list[tuple[str, str]] = []
+    assert runner.run([str(program)], lambda *line: heard.append(line), never) == 3
+    assert [line for stream, line in heard if stream == "stdout"] == ["São João", "x" * 300000]
+    assert [line for stream, line in heard if stream == "stderr"] == ["oops"]
+
+
+@pytest.mark.skipif(sys.platform == "win32", reason="signals")
+@pytest.mark.parametrize("stubborn", [False, True])
+def test_cancelling_stops_the_child_and_its_own_children(
+    stubborn: bool, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """One that heeds the interrupt may clean up; one that does not is killed with all that it started."""
+    monkeypatch.setattr(runner, "_GRACE_S", 0.5)
+    body = f"""
+import signal, subprocess, sys, time
+worker = subprocess.Popen([sys.executable, "-c", "import time; time.sleep(600)"])
+if {stubborn}:
+    signal.signal(signal.SIGINT, signal.SIG_IGN)
+print(worker.pid, flush=True)
+try:
+    time.sleep(600)
+except KeyboardInterrupt:
+    worker.kill()
+    worker.wait()
+    print("clean", flush=True)
+    sys.exit(130)
+"""
+    heard: list[str] = []
+    started = time.monotonic()
+    status = runner.run(
+        [str(make_program(tmp_path / "roadgeo", body))], lambda _, line: heard.append(line), lambda: bool(heard)
+    )
+    assert time.monotonic() - started < 10
+    assert (status, heard[1:]) == ((-signal.SIGKILL, []) if stubborn else (130, ["clean"]))
+    assert not is_running(int(heard[0]))
+
+
+def is_running(process: int) -> bool:
+    """Whether a process runs on; one that ended is not counted, even if nobody asked for its status yet."""
+    for _ in range(50):
+        try:
+            os.kill(process, 0)
+        except ProcessLookupError:
+            return False
+        status = Path(f"/proc/{process}/stat")
+        if status.exists() and status.read_text().rpartition(")")[2].split()[0] == "Z":
+            return False
+        time.sleep(0.1)
+    return True
+
+
+# --- installing -------------------------------------------------------------------------------------------------------
+
+
+def test_installing_replaces_enables_and_remembers(tmp_path: Path) -> None:
+    settings = tmp_path / "QGIS" / "QGIS3.ini"
+    settings.parent.mkdir()
+    settings.write_bytes(
+        b"[General]\r\nname=%C3%A9\r\n[PythonPlugins]\r\nother=true\r\nroadgeo_qgis=false\r\n[Z]\r\na=1"
+    )
+    (tmp_path / "python" / "plugins" / NAME).mkdir(parents=True)
+    (tmp_path / "python" / "plugins" / NAME / "outdated.py").touch()
+    for _ in range(2):
+        folder = install_plugin(tmp_path)
+        assert folder == tmp_path / "python" / "plugins" / NAME
+        installed = {path.name for path in folder.rglob("*")}
+        assert {"__init__.py", "metadata.txt", "icon.svg", "LICENSE", "algorithms.py"} <= installed
+        assert not {"outdated.py", "__pycache__"} & installed
+        assert settings.read_bytes() == (
+            b"[General]\r\nname=%C3%A9\r\n[PythonPlugins]\r\nroadgeo_qgis=true\nother=true\r\n[Z]\r\na=1"
+        )
+        executable = Path((folder / runner.REMEMBERED).read_text("utf-8").strip())
+        assert executable.is_file()
+        assert executable.stem == "roadgeo"
+
+
+def test_profiles_are_found_by_name_in_every_qgis_of_the_user(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.delenv("QGIS_CUSTOM_CONFIG_PATH", raising=False)
+    monkeypatch.setenv("HOME", str(tmp_path))
+    monkeypatch.setenv("XDG_DATA_HOME", str(tmp_path / "data"))
+    monkeypatch.setattr(sys, "platform", "linux")
+    three, four = (tmp_path / "data" / "QGIS" / version / "profiles" for version in ("QGIS3", "QGIS4"))
+    assert find_profiles("default") == [three / "default"]
+    for profile in (three / "default", four / "default", four / "work"):
+        profile.mkdir(parents=True)
+    assert find_profiles("default") == [three / "default", four / "default"]
+    assert find_profiles("work") == [four / "work"]
+    assert find_profiles(str(four / "work")) == [four / "work"]
+    with pytest.raises(OutputError, match="no profile 'works'; it has default, work"):
+        find_profiles("works")
+    monkeypatch.setenv("QGIS_CUSTOM_CONFIG_PATH", str(tmp_path / "own"))
+    assert find_profiles("default") == [tmp_path / "own" / "profiles" / "default"]
+
+
+def test_a_profile_that_cannot_be_written_is_one_line(tmp_path: Path, capfd: pytest.CaptureFixture[str]) -> None:
+    (tmp_path / "python").touch()
+    assert main(["qgis", "install", "--profile", str(tmp_path)]) == 1
+    assert capfd.readouterr().err.startswith("Error: cannot write ")
+
+
+def test_the_package_is_what_the_plugin_repository_takes(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.chdir(tmp_path)
+    publisher = [
+        "--email",
+        "a@example.org",
+        "--repository",
+        "https://example.org/r",
+        "--tracker",
+        "https://example.org/t",
+    ]
+    assert main(["qgis", "zip", *publisher]) == 0
+    with zipfile.ZipFile(f"roadgeo_qgis-{roadgeo.__version__}.zip") as archive:
+        names = archive.namelist()
+        metadata = archive.read(f"{NAME}/metadata.txt").decode()
+    assert all(name.startswith(f"{NAME}/") for name in names)
+    assert {f"{NAME}/{name}" for name in ("__init__.py", "metadata.txt", "LICENSE", "icon.svg")} <= set(names)
+    assert not [name for name in names if "__pycache__" in name or name.endswith(runner.REMEMBERED)]
+    parser = configparser.ConfigParser(interpolation=None)
+    parser.read_string(metadata)
+    general = parser["general"]
+    asked = {
+        "name",
+        "description",
+        "about",
+        "version",
+        "qgisMinimumVersion",
+        "author",
+        "email",
+        "repository",
+        "tracker",
+    }
+    assert all(general.get(key) for key in asked)
+    assert general["version"] == roadgeo.__version__
+    assert general["hasProcessingProvider"] == "yes"
+    assert (PLUGIN / general["icon"]).is_file()
+    assert (PLUGIN / "LICENSE").read_text() == (Path(__file__).parents[2] / "LICENSE").read_text()
+    for name in ("a.zip", "b.zip"):
+        write_package(name)
+    assert Path("a.zip").read_bytes() == Path("b.zip").read_bytes()
+
+
+@pytest.mark.parametrize("path", sorted(PLUGIN.glob("*.py")), ids=lambda path: path.name)
+def test_the_plugin_is_written_for_every_qgis_from_3_22_to_qt_6(path: Path) -> None:
+    """Python 3.9 is what QGIS 3.22 has on Windows; PyQt 6 knows enumerations by their scope only."""
+    source = path.read_text("utf-8")
+    tree = ast.parse(source, feature_version=(3, 9))
+    imported = {node.module for node in ast.walk(tree) if isinstance(node, ast.ImportFrom)}
+    imported |= {alias.name for node in ast.walk(tree) if isinstance(node, ast.Import) for alias in node.names}
+    assert not [name for name in imported if name and name.startswith(("PyQt", "PySide", "roadgeo", "numpy"))]
+    assert not re.findall(r"\b(?:Qt|Qgis|Qgs\w+)\.(?:Type|Flag|[A-Z]\w*)\b(?![.(])", source)
+
+
+# --- in QGIS ----------------------------------------------------------------------------------------------------------
+
+
+@dataclass(frozen=True)
+class Qgis:
+    """The real QGIS with a profile of its own, into which the plugin was installed."""
+
+    process: str
+    python: str
+    folder: Path
+    environ: dict[str, str]
+
+    def tool(self, *arguments: str, folder: Path | None = None) -> subprocess.CompletedProcess[str]:
+        """Run `qgis_process`."""
+        return self._run([self.process, *arguments], folder)
+
+    def ask(self, *tasks: tuple[str, dict]) -> tuple[list, list[str], str]:
+        """Do tasks of `qgis_child`: what they return, QGIS's warnings, and what was printed as an error."""
+        wanted, answers = self.folder / "tasks.json", self.folder / "answers.json"
+        wanted.write_text(json.dumps(tasks), "utf-8")
+        answers.unlink(missing_ok=True)
+        done = self._run([self.python, str(CHILD), str(wanted), str(answers)])
+        assert answers.exists(), done.stdout + done.stderr
+        document = json.loads(answers.read_text("utf-8"))
+        printed = "".join(line for line in done.stderr.splitlines(True) if "setapi() is deprecated" not in line)
+        return document["answers"], document["warnings"], printed
+
+    def _run(self, command: list[str], folder: Path | None = None) -> subprocess.CompletedProcess[str]:
+        settings = {"env": self.environ, "cwd": folder or self.folder, "timeout": 240}
+        return subprocess.run(command, capture_output=True, text=True, check=False, **settings)
+
+
+def find_qgis() -> tuple[str, str] | None:
+    """Return `qgis_process` and the Python that QGIS can be imported in."""
+    process = shutil.which("qgis_process.bin") or shutil.which("qgis_process")
+    pythons = [path for path in ("/usr/bin/python3", shutil.which("python3")) if path and Path(path).exists()]
+    for python in pythons if process else []:
+        if subprocess.run([python, "-c", "import qgis.core"], capture_output=True, check=False).returncode == 0:
+            return process, python
+    return None
+
+
+@pytest.fixture(scope="module")
+def qgis(tmp_path_factory: pytest.TempPathFactory) -> Qgis:
+    found = find_qgis()
+    if found is None:
+        if os.environ.get("ROADGEO_REQUIRE_QGIS"):
+            pytest.fail("ROADGEO_REQUIRE_QGIS is set, and QGIS is not installed")
+        pytest.skip("QGIS is not installed (Debian: qgis python3-qgis qgis-providers)")
+    folder = tmp_path_factory.mktemp("qgis")
+    runtime = folder / "runtime"
+    runtime.mkdir(mode=0o700)
+    kept = {
+        name: os.environ[name]
+        for name in ("PATH", "HOME", "NUMBA_CACHE_DIR", "NUMBA_NUM_THREADS")
+        if name in os.environ
+    }
+    own = {
+        "QGIS_CUSTOM_CONFIG_PATH": str(folder / "config"),
+        "QT_QPA_PLATFORM": "offscreen",
+        "XDG_RUNTIME_DIR": str(runtime),
+        "ROADGEO_LIBRARY": str(folder / "library"),
+        "LANG": "C.UTF-8",
+        "PYTHONPATH": "/nowhere",  # what QGIS may set and roadgeo must not see
+        "PROJ_LIB": "/usr/share/proj",
+    }
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setenv("QGIS_CUSTOM_CONFIG_PATH", own["QGIS_CUSTOM_CONFIG_PATH"])
+        assert main(["qgis", "install"]) == 0
+    return Qgis(*found, folder, {**kept, **own})
+
+
+@pytest.fixture(scope="module")
+def porto(qgis: Qgis) -> Path:
+    """The reference that *Build road reference* makes."""
+    path = qgis.folder / "porto.gpkg"
+    done = qgis.tool("run", "roadgeo:buildreference", "--", f"ROADS={ROADS}", "KINDS=all", f"OUTPUT={path}")
+    assert done.returncode == 0, done.stderr
+    assert f"OUTPUT:\t{path}" in done.stdout
+    assert path.with_suffix(".index").exists()
+    return path
+
+
+@pytest.fixture(scope="module")
+def located(qgis: Qgis, porto: Path) -> Path:
+    """The folder with what *Locate mask* makes of a mask."""
+    folder = qgis.folder / "located"
+    mask = MASKS["drone"].path
+    done = qgis.tool("run", "roadgeo:locatemask", "--", f"MASK={mask}", f"REFERENCE={porto}", f"OUTPUT_FOLDER={folder}")
+    assert done.returncode == 0, done.stderr
+    assert "STATUS:\tlocated" in done.stdout
+    assert f"LOCATION:\t{folder / 'drone_location.gpkg'}|layername=footprint" in done.stdout
+    return folder
+
+
+def read_location(path: Path) -> tuple[Homography, dict]:
+    document = json.loads(path.read_text("utf-8"))
+    return Homography(np.array(document["homography"])), document
+
+
+def test_the_provider_loads_and_explains_itself(qgis: Qgis) -> None:
+    listed = qgis.tool("list").stdout
+    names = ["buildreference", "locatemask", "locatemasks", "vectorizemask", "georeferenceimage"]
+    assert [name for name in names if f"roadgeo:{name}\t" in listed] == names
+    assert "* roadgeo_qgis" in qgis.tool("plugins").stdout
+    explained = qgis.tool("help", "roadgeo:georeferenceimage").stdout
+    assert "Cloud Optimized GeoTIFF" in explained
+
+
+def test_defaults_are_those_of_the_command_line() -> None:
+    source = (PLUGIN / "parameters.py").read_text("utf-8")
+    defaults = [float(text) for text in re.findall(r'"defaultValue": ([\d_.]+)', source)]
+    assert tuple(defaults[:2]) == LocateOptions().match.camera.gsd_m
+
+
+def test_a_located_mask_lies_where_the_truth_says(located: Path) -> None:
+    _, document = read_location(located / "drone_location.json")
+    middle = np.array(document["size"]) / 2
+    x, y = Homography(MASKS["drone"].homography)(middle)
+    assert np.hypot(document["center"]["x"] - x, document["center"]["y"] - y) < 2
+
+
+def test_a_refused_mask_is_a_warning_with_the_reason(qgis: Qgis, porto: Path) -> None:
+    arguments = {
+        "MASK": str(MASKS["elsewhere"].path),
+        "REFERENCE": str(porto),
+        "OUTPUT_FOLDER": str(qgis.folder / "no"),
+    }
+    (refused,), _, _ = qgis.ask(("run", {"algorithm": "roadgeo:locatemask", "parameters": arguments}))
+    assert refused["results"]["STATUS"] == "not_located"
+    assert refused["layers"] == {}
+    assert f"warning: elsewhere: {refused['results']['REASON']}" in refused["said"]
+
+
+def test_errors_are_shown_as_qgis_shows_errors(qgis: Qgis, porto: Path) -> None:
+    mask = f"MASK={MASKS['drone'].path}"
+    folder = f"OUTPUT_FOLDER={qgis.folder / 'errors'}"
+    done = qgis.tool("run", "roadgeo:locatemask", "--", mask, f"REFERENCE={qgis.folder / 'none.gpkg'}", folder)
+    assert done.returncode == 1
+    assert "ERROR:\tno reference '" in done.stderr
+    done = qgis.tool("run", "roadgeo:locatemask", "--", mask, f"REFERENCE={porto}", folder, "GSD_MIN=9")
+    assert done.returncode == 1
+    assert "LO must be above 0 and not above HI" in done.stderr
+    done = qgis.tool("run", "roadgeo:buildreference", "--", f"OUTPUT={qgis.folder / 'x.gpkg'}")
+    assert done.returncode == 1
+    assert "Give one source of roads" in done.stderr
+
+
+def test_without_the_executable_nothing_runs_and_the_advice_is_there(qgis: Qgis) -> None:
+    answers, _, _ = qgis.ask(("configure", {"executable": "/no/such/roadgeo"}), ("configure", {"executable": ""}))
+    assert not answers[0][0]
+    assert "pipx install roadgeo" in answers[0][1]
+    assert answers[1] == [True, ""]
+
+
+def test_cancelling_stops_the_executable(qgis: Qgis, porto: Path) -> None:
+    body = """
+import os, sys, time
+open("started", "w").write(str(os.getpid()))
+try:
+    time.sleep(600)
+except KeyboardInterrupt:
+    open("cleaned", "w").close()
+"""
+    program = make_program(qgis.folder / "slow" / "roadgeo", body)
+    arguments = {
+        "MASK": str(MASKS["drone"].path),
+        "REFERENCE": str(porto),
+        "OUTPUT_FOLDER": str(qgis.folder / "cancelled"),
+    }
+    task = {"algorithm": "roadgeo:locatemask", "parameters": arguments, "executable": str(program), "seconds": 1.5}
+    qgis.ask(("cancel", task))
+    assert not is_running(int((qgis.folder / "started").read_text()))
+    assert (qgis.folder / "cleaned").exists()
+
+
+def test_a_folder_of_masks_is_located_whatever_is_wrong_with_some(qgis: Qgis, porto: Path) -> None:
+    masks, folder = qgis.folder / "masks", qgis.folder / "batch"
+    masks.mkdir()
+    for name in ("map_sheet", "high_flight", "elsewhere"):
+        shutil.copy(MASKS[name].path, masks)
+    (masks / "broken.png").write_text("no picture")
+    arguments = {"MASKS": str(masks), "REFERENCE": str(porto), "OUTPUT_FOLDER": str(folder), "JOBS": 2}
+    (done,), _, _ = qgis.ask(("run", {"algorithm": "roadgeo:locatemasks", "parameters": arguments}))
+    results = done["results"]
+    assert [results[name] for name in ("LOCATED", "NOT_LOCATED", "FAILED")] == [2, 1, 1]
+    assert done["layers"]["Footprints"]["features"] == 2
+    assert done["layers"]["Footprints"]["colors"] == [FOOTPRINT]
+    assert "progress: 2 located, 1 not located, 1 failed" in done["said"]
+    assert any(line.startswith("error: ") and "broken.png" in line for line in done["said"])
+
+
+def test_a_mask_is_vectorized(qgis: Qgis) -> None:
+    arguments = {"MASK": str(MASKS["segmenter"].path), "OUTPUT_FOLDER": str(qgis.folder / "seen")}
+    (done,), _, _ = qgis.ask(("run", {"algorithm": "roadgeo:vectorizemask", "parameters": arguments}))
+    assert set(done["layers"]) == {"Roads as seen", "Intersections as seen"}
+    for layer in done["layers"].values():
+        assert layer["valid"]
+        assert layer["features"] > 50
+    assert done["layers"]["Roads as seen"]["colors"] == ["#ffbe28"]
+
+
+def test_results_are_loaded_with_their_styles(qgis: Qgis, porto: Path) -> None:
+    arguments = {
+        "MASK": str(MASKS["drone"].path),
+        "REFERENCE": str(porto),
+        "OUTPUT_FOLDER": str(qgis.folder / "loaded"),
+    }
+    roads = {"ROADS": str(ROADS), "KINDS": "all", "OUTPUT": str(qgis.folder / "again.gpkg")}
+    (built, done), _, _ = qgis.ask(
+        ("run", {"algorithm": "roadgeo:buildreference", "parameters": roads}),
+        ("run", {"algorithm": "roadgeo:locatemask", "parameters": arguments}),
+    )
+    assert built["layers"]["again roads"]["colors"] == [MAP_ROAD]
+    assert set(built["layers"]) == {"again roads", "again coverage", "again intersections"}
+    layers = done["layers"]
+    assert set(layers) == {"drone", "drone footprint", "drone matches", "drone roads"}
+    assert all(layer["valid"] and layer["crs"] == "EPSG:32629" for layer in layers.values())
+    assert layers["drone"]["renderer"] == "paletted"
+    assert layers["drone footprint"]["colors"] == [FOOTPRINT]
+    assert layers["drone roads"]["colors"] == [ROAD]
+
+
+def test_every_output_opens_without_a_word(qgis: Qgis, porto: Path, located: Path) -> None:
+    package = located / "drone_location.gpkg"
+    files = [(str(porto), layer) for layer in ("coverage", "roads", "tangents", "intersections")]
+    files += [(str(package), layer) for layer in ("footprint", "matches", "query_roads")]
+    files += [(str(located / "drone_footprint.tif"), "")]
+    layers, warnings, printed = qgis.ask(*(("load", {"path": path, "layer": layer}) for path, layer in files))
+    assert all(layer["valid"] for layer in layers)
+    assert all(layer["features"] for layer in layers[:-1])
+    assert warnings == []
+    assert printed == ""
+    assert main(["check", str(porto)]) == 0  # QGIS changes a GeoPackage's bytes; the reference is sound all the same
+
+
+# --- what QGIS makes of it --------------------------------------------------------------------------------------------
+
+
+def test_the_map_shows_the_mask_over_the_roads(qgis: Qgis, porto: Path, located: Path) -> None:
+    """Two metres to a pixel: the mask's roads have their area, lie on the map's roads, and would not elsewhere."""
+    with rasterio.open(located / "drone_footprint.tif") as raster:
+        bounds, road_area = raster.bounds, np.count_nonzero(raster.read(1) == 2) * raster.res[0] ** 2
+    west, south = bounds.left // 2 * 2, bounds.bottom // 2 * 2
+    size = [int((bounds.right - west) / 2) + 1, int((bounds.top - south) / 2) + 1]
+    extent = [west, south, west + 2 * size[0], south + 2 * size[1]]
+    mask, roads, outline = "drone_footprint.tif", "porto.gpkg roads", "drone_location.gpkg footprint"
+    loads = [(str(located / mask), ""), (str(porto), "roads"), (str(located / "drone_location.gpkg"), "footprint")]
+    pictures = {"all": [outline, mask, roads], "mask": [mask], "roads": [roads], "outline": [outline]}
+    shots = [
+        ("render", {"layers": layers, "extent": extent, "size": size, "path": str(qgis.folder / f"{name}.png")})
+        for name, layers in pictures.items()
+    ]
+    qgis.ask(*(("load", {"path": path, "layer": layer}) for path, layer in loads), *shots)
+    shown = {name: cv2.imread(str(qgis.folder / f"{name}.png")) for name in pictures}
+    drawn = has_color(shown["mask"], ROAD)
+    assert np.count_nonzero(drawn) * 4 == pytest.approx(road_area, rel=0.03)
+    on_map = cv2.dilate(has_color(shown["roads"], MAP_ROAD, 90).view(np.uint8), np.ones((13, 13), np.uint8)) > 0
+    aside = np.roll(on_map, (37, 23), axis=(0, 1))
+    assert on_map[drawn].mean() > 0.95
+    assert aside[drawn].mean() < 0.7
+    _, document = read_location(located / "drone_location.json")
+    corners = (np.array(document["footprint"]) - (west, south + 2 * size[1])) / (2, -2)
+    expected = cv2.polylines(np.zeros(drawn.shape, np.uint8), [np.rint(corners).astype(np.int32)], True, 1, 3) > 0
+    line = has_color(shown["outline"], FOOTPRINT, 40)
+    assert (expected & line).sum() > 0.9 * line.sum()
+    together = shown["all"]
+    assert has_color(together, ROAD)[drawn].mean() > 0.7  # under the footprint's light fill
+    assert has_color(together, MAP_ROAD, 90).sum() > 500
+
+
+def has_color(picture: np.ndarray, color: str, tolerance: int = 60) -> np.ndarray:
+    """(H, W) bool: pixels whose three values differ from a colour by less than the tolerance, together."""
+    wanted = np.array(list(bytes.fromhex(color[1:]))[::-1])
+    return np.abs(picture.astype(int) - wanted).sum(axis=2) < tolerance
+
+
+def coordinate_picture(path: Path, size: tuple[int, int]) -> Path:
+    """Write a picture whose red and green tell where its pixels are: sixteenths of column and row, at their centres."""
+    rows, columns = np.mgrid[: size[1], : size[0]] + 0.5
+    cv2.imwrite(str(path), np.dstack([np.ones(rows.shape), rows * 16, columns * 16]).astype(np.uint16))
+    return path
+
+
+@dataclass(frozen=True)
+class Warped:
+    """A coordinate picture on the map: the raster, its control points, and the homography that both are to follow."""
+
+    footprint: Path
+    points: Path
+    homography: Homography
+    size: tuple[int, int]
+
+    def pixels(self) -> np.ndarray:
+        """(N, 2) places all over the picture."""
+        columns, rows = (np.linspace(8, side - 8, 12) for side in self.size)
+        return np.stack(np.meshgrid(columns, rows), axis=-1).reshape(-1, 2)
+
+    def places(self) -> tuple[np.ndarray, float]:
+        """(N, 2) centres of the raster's pixels all over it, on the map, and how large those are."""
+        with rasterio.open(self.footprint) as raster:
+            resolution, corner = raster.res[0], (raster.bounds.left, raster.bounds.top)
+        steps = np.array((resolution, -resolution))
+        return corner + (np.floor((self.homography(self.pixels()) - corner) / steps) + 0.5) * steps, resolution
+
+
+def disagreements(qgis: Qgis, pictures: list[Warped]) -> tuple[float, float]:
+    """Say by how many pixels QGIS and the homographies differ at most, and by how many metres the control points."""
+    tasks = []
+    for one in pictures:
+        tasks.append(("sample", {"path": str(one.footprint), "points": one.places()[0].tolist(), "bands": [1, 2]}))
+        tasks.append(("project", {"points": str(one.points), "pixels": one.pixels().tolist()}))
+    answers, _, _ = qgis.ask(*tasks)
+    pixels, metres = [], []
+    for one, sampled, projected in zip(pictures, answers[::2], answers[1::2], strict=True):
+        places, resolution = one.places()
+        shown = one.homography(np.array(sampled, float) / 16)
+        pixels.append(np.hypot(*(shown - places).T).max() / resolution)
+        metres.append(np.hypot(*(np.array(projected) - one.homography(one.pixels())).T).max())
+    return max(pixels), max(metres)
+
+
+def test_a_georeferenced_image_agrees_with_the_homography_everywhere(qgis: Qgis, porto: Path) -> None:
+    """A tilted camera, and a picture of another size than its mask."""
+    mask, folder = MASKS["drone"].path, qgis.folder / "image"
+    height, width = cv2.imread(str(mask), cv2.IMREAD_GRAYSCALE).shape
+    size = (width // 2, height // 2)
+    picture = coordinate_picture(qgis.folder / "photo.tif", size)
+    inputs = [f"IMAGE={picture}", f"MASK={mask}", f"REFERENCE={porto}", f"OUTPUT_FOLDER={folder}"]
+    more = [*(f"PRODUCTS={product}" for product in PRODUCTS), "RESAMPLING=bilinear"]
+    done = qgis.tool("run", "roadgeo:georeferenceimage", "--", *inputs, *more)
+    assert done.returncode == 0, done.stderr
+    _, document = read_location(folder / "drone_location.json")
+    homography = Homography(np.array(document["homography"]) @ np.diag([2, 2, 1]))
+    warped = Warped(folder / "drone_footprint.tif", folder / "photo.tif.points", homography, size)
+    pixels, metres = disagreements(qgis, [warped])
+    assert pixels < 0.6
+    assert metres < 0.01
+    assert all(product.path(folder, "drone", "photo.tif").exists() for product in PRODUCTS.values())
+
+
+@pytest.mark.realdata
+def test_ten_real_masks_agree_with_their_homographies(qgis: Qgis, data_dir: Path) -> None:
+    reference, photos, folder = qgis.folder / "boston.gpkg", qgis.folder / "photos", qgis.folder / "ten"
+    roads = data_dir / "boston" / "boston_osm_roads.gpkg"
+    done = qgis.tool("run", "roadgeo:buildreference", "--", f"ROADS={roads}", f"OUTPUT={reference}")
+    assert done.returncode == 0, done.stderr
+    tiles = (data_dir / "massachusetts" / "tiles.csv").read_text("utf-8").splitlines()
+    stems = [row.partition(",")[0] for row in tiles if ",True," in row][:10]
+    photos.mkdir()
+    picture = coordinate_picture(photos / f"{stems[0]}.tif", (1500, 1500))
+    for stem in stems[1:]:
+        shutil.copy(picture, photos / f"{stem}.tif")
+    masks = [str(data_dir / "massachusetts" / "masks" / f"{stem}.png") for stem in stems]
+    options = ["--reference", str(reference), "--out-dir", str(folder), "--resampling", "bilinear", "--also", "points"]
+    assert main(["locate", *masks, "--image", str(photos), *options, "-q"]) == 0
+    warped = [
+        Warped(
+            folder / f"{stem}_footprint.tif",
+            folder / f"{stem}.tif.points",
+            read_location(folder / f"{stem}_location.json")[0],
+            (1500, 1500),
+        )
+        for stem in stems
+    ]
+    pixels, metres = disagreements(qgis, warped)
+    assert pixels < 0.6
+    assert metres < 0.01

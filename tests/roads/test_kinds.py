@@ -1,0 +1,78 @@
+import numpy as np
+import pytest
+
+from roadgeo.roads.kinds import ROAD_KINDS, drives, highways, in_tunnel, names_highways
+
+
+def column(*values):
+    array = np.empty(len(values), object)
+    array[:] = values
+    return array
+
+
+@pytest.mark.parametrize(
+    ("value", "least"),
+    [
+        ("motorway", "main"),
+        ("tertiary_link", "main"),
+        ("residential", "drivable"),
+        ("living_street", "drivable"),
+        ("['living_street', 'residential']", "drivable"),
+        (["footway", "residential"], "drivable"),
+        (np.array(["tertiary", "service"], object), "main"),
+        ("service;residential", "drivable"),
+        ("Residential", "drivable"),
+        ("service", "vehicles"),
+        ("track_grade2", "vehicles"),
+        ("footway", "all"),
+        ("something_new", "all"),
+        (None, "drivable"),
+        (float("nan"), "drivable"),
+        ("construction", None),
+        ("platform", None),
+    ],
+)
+def test_kinds_nest(value, least):
+    passed = [kind for kind in ROAD_KINDS if drives(column(value), kind)[0]]
+    assert passed == ([] if least is None else list(ROAD_KINDS[ROAD_KINDS.index(least) :]))
+
+
+def test_kinds_list_their_values():
+    assert "motorway_link" in highways("main")
+    assert set(highways("main")) < set(highways("drivable")) < set(highways("vehicles"))
+    assert highways("all") is None
+
+
+@pytest.mark.parametrize(
+    ("value", "tunnel"),
+    [
+        ("yes", True),
+        ("no", False),
+        (None, False),
+        ("building_passage", False),
+        ("T", True),
+        ("F", False),
+        (True, True),
+        (1, True),
+        ("['yes', 'no']", False),
+        (["yes", "yes"], True),
+        ("avalanche_protector", True),
+        ("", False),
+    ],
+)
+def test_tunnels(value, tunnel):
+    assert in_tunnel(column(value))[0] == tunnel
+
+
+@pytest.mark.parametrize(
+    ("values", "expected"),
+    [
+        (["residential", "service", None], True),
+        (["Main Street", "Elm Street", "residential"], False),
+        ([None, None], False),
+        ([], False),
+        ([1, 2, 3], False),
+    ],
+)
+def test_columns_of_highways_are_told_from_others(values, expected):
+    assert names_highways(column(*values)) == expected

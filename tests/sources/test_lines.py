@@ -1,0 +1,256 @@
+import numpy as np
+import pytest
+import shapely
+from shapely.geometry import (
+    GeometryCollection,
+    LinearRing,
+    LineString,
+    MultiLineString,
+    MultiPoint,
+    Point,
+    Polygon,
+    box,
+)
+from worlds.fenway import streets, write_streets, write_vector
+
+from roadgeo.errors import RoadSourceError
+from roadgeo.sources import lines as lines_module
+from roadgeo.sources.lines import OSM_ATTRIBUTION, list_sources, read_lines, simple_lines
+
+FORMATS = [
+    "streets.gpkg",
+    "streets.shp",
+    "streets.geojson",
+    "streets.fgb",
+    "streets.parquet",
+    "streets.osm",
+    "streets.osm.gz",
+    "streets.osm.bz2",
+    "streets.osm.pbf",
+]
+
+
+@pytest.mark.parametrize("name", FORMATS)
+def test_every_format_gives_the_same_lines(tmp_path, name):
+    lines, highway, tunnel = streets()
+    read = read_lines(write_streets(tmp_path / name))
+    assert read.crs == "EPSG:4326"
+    assert read.meta["features"] == len(read.lines) == len(lines)
+    here, there = np.argsort(shapely.length(lines)), np.argsort(shapely.length(read.lines))  # FlatGeobuf sorts by place
+    assert read.highway[there].tolist() == [highway[k] for k in here]
+    assert read.tunnel[there].tolist() == [tunnel[k] == "yes" for k in here]
+    assert shapely.equals_exact(read.lines[there], lines[here], 1e-7).all()
+    assert (read.meta.get("attribution") == OSM_ATTRIBUTION) == (".osm" in name)
+
+
+def test_graphml_of_osmnx(tmp_path):
+    import networkx as nx
+    import osmnx as ox
+
+    graph = nx.MultiDiGraph(crs="epsg:4326")
+    graph.add_node(1, x=-71.09, y=42.35)
+    graph.add_node(2, x=-71.08, y=42.35)
+    graph.add_edge(1, 2, key=0, osmid=5, highway=["residential", "tertiary"], length=800.0)
+    graph.add_edge(2, 1, key=0, osmid=6, highway="footway", tunnel="yes", length=800.0)
+    ox.save_graphml(graph, tmp_path / "streets.graphml")
+    read = read_lines(tmp_path / "streets.graphml")
+    assert read.crs == "EPSG:4326"
+    assert [line.coords[0] for line in read.lines] == [(-71.09, 42.35), (-71.08, 42.35)]
+    assert read.highway.tolist() == [["residential", "tertiary"], "footway"]
+    assert read.tunnel.tolist() == [False, True]
+
+
+def test_overture_segments(tmp_path):
+    import geopandas as gpd
+
+    flags = [
+        None,
+        [{"values": ["is_tunnel"], "between": None}],
+        [{"values": ["is_tunnel"], "between": [0.1, 0.2]}],
+        None,
+    ]
+    frame = gpd.GeoDataFrame(
+        {
+            "id": list("abcd"),
+            "subtype": ["road", "road", "road", "rail"],
+            "class": ["residential", "primary", "service", "unknown"],
+            "road_flags": flags,
+        },
+        geometry=[LineString([(k, 0), (k, 1)]) for k in range(4)],
+        crs="OGC:CRS84",
+    )
+    frame.to_parquet(tmp_path / "segments.parquet")
+    read = read_lines(tmp_path / "segments.parquet")
+    assert read.highway.tolist() == ["residential", "primary", "service"]
+    assert read.tunnel.tolist() == [False, True, False]
+    assert "Overture" in read.meta["attribution"]
+
+
+def test_an_extract_that_cuts_ways_keeps_what_is_there(tmp_path):
+    rows = [
+        '<osm version="0.6"><node id="1" version="1" lat="1" lon="1"/><node id="2" version="1" lat="1" lon="2"/>',
+        '<way id="1" version="1"><nd ref="1"/><nd ref="2"/><nd ref="3"/><tag k="highway" v="primary"/></way>',
+        '<way id="2" version="1"><nd ref="2"/><nd ref="3"/><tag k="highway" v="primary"/></way>',
+        '<way id="3" version="1"><nd ref="1"/><nd ref="1"/><tag k="highway" v="primary"/></way>',
+        '<way id="4" version="1"><nd ref="1"/><nd ref="2"/><tag k="building" v="yes"/></way>',
+        '<way id="5" version="1"><nd ref="1"/><nd ref="2"/><tag k="highway" v="footway"/><tag k="area" v="yes"/></way>',
+        "</osm>",
+    ]
+    (tmp_path / "cut.osm").write_text("\n".join(rows))
+    read = read_lines(tmp_path / "cut.osm")
+    assert [list(line.coords) for line in read.lines] == [[(1, 1), (2, 1)]]
+    assert read.meta["features"] == 3
+
+
+def test_shapes_of_all_kinds():
+    line = LineString([(0, 0), (1, 1)])
+    shapes = [
+        line,
+        None,
+        LineString(),
+        MultiLineString([[(0, 0), (1, 0)], [(5, 5), (6, 6)]]),
+        GeometryCollection([Point(0, 0), line, GeometryCollection([line, MultiLineString([[(2, 2), (3, 3)]])])]),
+        LineString([(0, 0, 5), (1, 1, 6)]),
+        LinearRing([(0, 0), (1, 0), (1, 1)]),
+        LineString([(0, 0), (np.inf, 1)]),
+        Point(1, 1),
+        MultiPoint([(0, 0)]),
+        box(0, 0, 1, 1),
+    ]
+    lines, place = simple_lines(np.array(shapes, object))
+    assert place.tolist() == [0, 3, 3, 4, 4, 4, 5, 6]
+    assert not shapely.has_z(lines).any()
+    empty, _ = simple_lines(np.array([], object))
+    assert len(empty) == 0
+
+
+def test_measured_and_raised_lines_lose_the_rest(tmp_path):
+    write_vector(tmp_path / "z.gpkg", [LineString([(0, 0, 1), (1, 1, 2)])])
+    assert not shapely.has_z(read_lines(tmp_path / "z.gpkg").lines).any()
+
+
+@pytest.mark.parametrize(
+    ("kinds", "expected"),
+    [
+        ({"highway": ["residential", None, "service"]}, ["residential", None, "service"]),
+        ({"fclass": ["residential", "primary", "service"]}, ["residential", "primary", "service"]),
+        ({"HIGHWAY": ["residential", "primary", "service"]}, ["residential", "primary", "service"]),
+        ({"class": ["A", "B", "C"]}, None),
+        ({"name": ["residential", "b", "c"]}, None),
+        ({"class": ["A", "B", "C"], "fclass": ["trunk", "trunk", "trunk"]}, ["trunk"] * 3),
+    ],
+)
+def test_columns_that_say_the_kind(tmp_path, kinds, expected):
+    lines = [LineString([(k, 0), (k, 1)]) for k in range(3)]
+    read = read_lines(write_vector(tmp_path / "roads.gpkg", lines, **kinds))
+    assert (None if read.highway is None else read.highway.tolist()) == expected
+
+
+def test_a_file_without_crs_says_so(tmp_path):
+    file = write_streets(tmp_path / "streets.shp")
+    file.with_suffix(".prj").unlink()
+    assert read_lines(file).crs is None
+
+
+def test_a_crs_that_is_nowhere_is_none(tmp_path):
+    engineering = 'ENGCRS["x",EDATUM["x"],CS[Cartesian,2],AXIS["x",east],AXIS["y",north],LENGTHUNIT["metre",1]]'
+    assert read_lines(write_vector(tmp_path / "x.gpkg", [LineString([(0, 0), (1, 1)])], crs=engineering)).crs is None
+
+
+def test_layers(tmp_path):
+    file = tmp_path / "map.gpkg"
+    line = [LineString([(0, 0), (1, 1)])]
+    write_vector(file, [Point(0, 0)], layer="places")
+    write_vector(file, line, layer="streets", append=True)
+    assert read_lines(file).meta["layer"] == "streets"
+    write_vector(file, line * 2, layer="rivers", append=True)
+    with pytest.raises(RoadSourceError, match="several layers hold lines, streets, rivers: choose one with --layer"):
+        read_lines(file)
+    assert len(read_lines(file, "rivers").lines) == 2
+    with pytest.raises(RoadSourceError, match="no layer 'roads'; it has places, streets, rivers"):
+        read_lines(file, "roads")
+    write_vector(file, line * 3, layer="roads", append=True)
+    assert read_lines(file).meta["layer"] == "roads"
+
+
+def broken(tmp_path, name):
+    """A file of that name with nonsense in it."""
+    (tmp_path / name).write_bytes(b"these are no roads\n" * 20)
+    return tmp_path / name
+
+
+@pytest.mark.parametrize(
+    "name",
+    ["x.gpkg", "x.shp", "x.geojson", "x.fgb", "x.parquet", "x.osm", "x.osm.pbf", "x.osm.gz", "x.graphml", "x.txt"],
+)
+def test_nonsense_is_refused_on_one_line(tmp_path, name):
+    with pytest.raises(RoadSourceError, match=r"x\.") as caught:
+        read_lines(broken(tmp_path, name))
+    assert "\n" not in str(caught.value)
+
+
+@pytest.mark.parametrize("part_size", [1, 1 << 20])
+def test_pbf_files_are_read_in_parts_and_progress_is_told(tmp_path, monkeypatch, part_size):
+    file = write_streets(tmp_path / "a.osm.pbf")
+    whole = read_lines(file)
+    monkeypatch.setattr(lines_module, "_PART", part_size)
+    told = []
+    read = read_lines(file, advance=told.append)
+    assert shapely.equals(read.lines, whole.lines).all()
+    assert read.highway.tolist() == whole.highway.tolist()
+    assert told == sorted(told)
+    assert told[-1] == 1.0
+    assert len(told) == 1 if part_size > file.stat().st_size else len(told) > 1
+
+
+@pytest.mark.parametrize("at", [300, -500, -1])
+def test_a_pbf_file_that_is_cut_off_says_so(tmp_path, at):
+    file = write_streets(tmp_path / "a.osm.pbf")
+    file.write_bytes(file.read_bytes()[:at])
+    with pytest.raises(RoadSourceError, match="cut off, damaged or no PBF file"):
+        read_lines(file)
+
+
+@pytest.mark.parametrize("name", FORMATS)
+def test_half_a_file_is_refused_or_read_in_part(tmp_path, name):
+    file = write_streets(tmp_path / name)
+    whole = file.read_bytes()
+    file.write_bytes(whole[: len(whole) // 2])
+    try:
+        assert len(read_lines(file).lines) > 0
+    except RoadSourceError as error:
+        assert name in str(error)  # noqa: PT017
+
+
+@pytest.mark.parametrize(
+    ("shapes", "message"),
+    [
+        ([Point(0, 0)], "holds Point, expected lines"),
+        ([Polygon([(0, 0), (1, 0), (1, 1)])], "holds Polygon, expected lines"),
+        ([LineString()], "no lines in it"),
+    ],
+)
+def test_what_is_no_line_is_refused(tmp_path, shapes, message):
+    with pytest.raises(RoadSourceError, match=message):
+        read_lines(write_vector(tmp_path / "x.gpkg", shapes))
+
+
+def test_a_plain_parquet_table_is_refused(tmp_path):
+    import pandas as pd
+
+    pd.DataFrame({"highway": ["primary"]}).to_parquet(tmp_path / "x.parquet")
+    with pytest.raises(RoadSourceError, match="says nothing of a geometry column"):
+        read_lines(tmp_path / "x.parquet")
+
+
+def test_folders(tmp_path):
+    with pytest.raises(RoadSourceError, match="no road file in this folder"):
+        list_sources(tmp_path)
+    for name in ("b.gpkg", "a.osm.pbf", "c.SHP", "c.dbf", "notes.txt"):
+        (tmp_path / name).touch()
+    assert [file.name for file in list_sources(tmp_path)] == ["a.osm.pbf", "b.gpkg", "c.SHP"]
+    assert list_sources(tmp_path / "b.gpkg") == [tmp_path / "b.gpkg"]
+    with pytest.raises(RoadSourceError, match="no such file or folder"):
+        list_sources(tmp_path / "d")
+    with pytest.raises(RoadSourceError, match="no such file"):
+        read_lines(tmp_path / "d.gpkg")

@@ -1,0 +1,268 @@
+"""Any raster becomes a road mask, or one line says why not."""
+
+import logging
+from pathlib import Path
+
+import cv2
+import numpy as np
+import pytest
+import rasterio
+from rasterio.errors import NotGeoreferencedWarning
+
+from roadgeo.errors import MaskError
+from roadgeo.sources.masks import read_mask
+
+pytestmark = pytest.mark.filterwarnings("ignore::rasterio.errors.NotGeoreferencedWarning")
+
+SHAPE = (80, 100)
+
+
+@pytest.fixture
+def roads() -> np.ndarray:
+    """Three streets across the frame."""
+    image = np.zeros(SHAPE, np.uint8)
+    for line in ([(0, 20), (100, 30)], [(40, 0), (30, 80)], [(70, 0), (80, 80)]):
+        cv2.line(image, *line, 1, 5)
+    return image.astype(bool)
+
+
+def tiff(path: Path, bands: np.ndarray, **options: object) -> Path:
+    """Write (B, H, W) bands."""
+    with rasterio.open(
+        path, "w", driver="GTiff", count=len(bands), height=SHAPE[0], width=SHAPE[1], dtype=bands.dtype, **options
+    ) as dataset:
+        dataset.write(bands)
+    return path
+
+
+LOSSY = {".jpg", ".webp", ".jp2"}
+
+
+@pytest.mark.parametrize(
+    ("suffix", "light"),
+    [(s, 1) for s in (".png", ".bmp", ".tif")] + [(s, 255) for s in (".png", ".tif", *sorted(LOSSY))],
+)
+def test_formats(tmp_path: Path, roads: np.ndarray, suffix: str, light: int) -> None:
+    path = tmp_path / f"mask{suffix}"
+    assert cv2.imwrite(str(path), roads * np.uint8(light))
+    mask = read_mask(path, voids=False)
+    assert mask.name == str(path)
+    assert mask.observed is None
+    assert np.mean(mask.roads != roads) < (0.02 if suffix in LOSSY else 1e-9)
+
+
+@pytest.mark.parametrize(
+    ("dtype", "dark", "light"),
+    [
+        ("bool", 0, 1),
+        ("uint8", 0, 1),
+        ("uint8", 3, 200),
+        ("uint16", 0, 65535),
+        ("uint16", 0, 7),
+        ("int16", -1, 1),
+        ("int32", 0, 100_000),
+        ("float32", 0, 1),
+        ("float64", -4.0, 4.0),
+    ],
+)
+def test_types_of_values(roads: np.ndarray, dtype: str, dark: float, light: float) -> None:
+    values = np.where(roads, light, dark).astype(dtype)
+    np.testing.assert_array_equal(read_mask(values).roads, roads)
+    np.testing.assert_array_equal(read_mask(values[..., None]).roads, roads)
+
+
+def test_probabilities_are_parted_at_a_half(roads: np.ndarray) -> None:
+    soft = np.clip(cv2.GaussianBlur(roads.astype(np.float32), (0, 0), 1.0), 0, 1)
+    np.testing.assert_array_equal(read_mask(soft).roads, soft > 0.5)
+    np.testing.assert_array_equal(read_mask(soft, threshold=0.2).roads, soft > 0.2)
+    bytes_ = np.rint(soft * 255).astype(np.uint8)
+    np.testing.assert_array_equal(read_mask(bytes_).roads, bytes_ > 127)
+    np.testing.assert_array_equal(read_mask(bytes_, threshold=100.5).roads, bytes_ > 100)
+
+
+def test_scores_are_parted_where_they_part(roads: np.ndarray) -> None:
+    rng = np.random.default_rng(0)
+    scores = np.where(roads, 5.0, -3.0) + rng.normal(0, 0.3, SHAPE)
+    np.testing.assert_array_equal(read_mask(scores).roads, roads)
+
+
+def test_a_band_is_chosen(tmp_path: Path, roads: np.ndarray) -> None:
+    rng = np.random.default_rng(0)
+    bands = rng.integers(0, 255, (5, *SHAPE)).astype(np.uint8)
+    bands[3] = roads * 255
+    path = tiff(tmp_path / "bands.tif", bands)
+    np.testing.assert_array_equal(read_mask(path, band=4).roads, roads)
+    np.testing.assert_array_equal(read_mask(np.moveaxis(bands, 0, 2), band=4).roads, roads)
+    with pytest.raises(MaskError, match="has 5 bands; choose"):
+        read_mask(path)
+    with pytest.raises(MaskError, match="no band 6; expected 1 to 5"):
+        read_mask(path, band=6)
+
+
+@pytest.mark.parametrize("colour", [(255, 255, 255), (0, 0, 255), (10, 200, 90)])
+def test_drawings_in_one_colour(tmp_path: Path, roads: np.ndarray, colour: tuple[int, int, int]) -> None:
+    path = tmp_path / "drawing.png"
+    cv2.imwrite(str(path), roads[..., None] * np.array(colour, np.uint8))
+    np.testing.assert_array_equal(read_mask(path).roads, roads)
+
+
+def test_a_palette(tmp_path: Path, roads: np.ndarray) -> None:
+    path = tmp_path / "palette.tif"
+    with rasterio.open(
+        path, "w", driver="GTiff", count=1, height=SHAPE[0], width=SHAPE[1], dtype="uint8", photometric="palette"
+    ) as dataset:
+        dataset.write(roads.astype(np.uint8), 1)
+        dataset.write_colormap(1, {0: (255, 255, 255, 255), 1: (200, 0, 0, 255)})
+    np.testing.assert_array_equal(read_mask(path).roads, roads)
+
+
+@pytest.mark.parametrize("kind", ["nodata", "nan", "alpha", "alpha png", "masked array", "mask band"])
+def test_what_was_not_observed(tmp_path: Path, roads: np.ndarray, kind: str) -> None:
+    seen = np.ones(SHAPE, bool)
+    seen[:, 60:] = False
+    values = roads * np.uint8(255)
+    path = tmp_path / "mask.tif"
+    source: object = path
+    if kind == "nodata":
+        tiff(path, np.where(seen, values, 7)[None], nodata=7)
+    elif kind == "nan":
+        tiff(path, np.where(seen, roads, np.nan).astype(np.float32)[None])
+    elif kind == "alpha":
+        tiff(path, np.stack([values] * 3 + [seen * np.uint8(255)]), photometric="RGB", alpha="yes")
+    elif kind == "alpha png":
+        source = tmp_path / "mask.png"
+        cv2.imwrite(str(source), np.dstack([values] * 3 + [seen * np.uint8(255)]))
+    elif kind == "mask band":
+        with rasterio.Env(GDAL_TIFF_INTERNAL_MASK=True):
+            tiff(path, values[None])
+            with rasterio.open(path, "r+") as dataset:
+                dataset.write_mask(seen)
+    else:
+        source = np.ma.masked_array(values, ~seen)
+    mask = read_mask(source)
+    assert mask.observed is not None
+    np.testing.assert_array_equal(mask.observed, seen)
+    np.testing.assert_array_equal(mask.roads, roads & seen)
+
+
+@pytest.mark.parametrize("kind", ["nodata", "alpha"])
+def test_ground_that_is_called_nodata_is_ground(tmp_path: Path, roads: np.ndarray, kind: str) -> None:
+    path = tmp_path / ("mask.tif" if kind == "nodata" else "mask.png")
+    if kind == "nodata":
+        tiff(path, roads[None] * np.uint8(255), nodata=0)
+    else:
+        cv2.imwrite(str(path), np.dstack([np.full(SHAPE, 40, np.uint8)] * 3 + [roads * np.uint8(255)]))
+    mask = read_mask(path)
+    assert mask.observed is None
+    np.testing.assert_array_equal(mask.roads, roads)
+
+
+def test_an_inverted_mask_is_read_and_said_so(roads: np.ndarray, caplog: pytest.LogCaptureFixture) -> None:
+    with caplog.at_level(logging.WARNING):
+        np.testing.assert_array_equal(read_mask(~roads).roads, roads)
+    assert "inverted" in caplog.text
+    values = np.ma.masked_array((~roads).astype(np.uint8), np.arange(SHAPE[1]) >= 60 + np.zeros(SHAPE))
+    np.testing.assert_array_equal(read_mask(values).roads, roads & ~values.mask)
+
+
+def test_strips_join(tmp_path: Path, roads: np.ndarray, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr("roadgeo.sources.masks._STRIP_PIXELS", 7 * SHAPE[1])
+    path = tiff(tmp_path / "mask.tif", np.where(roads, 200, 9)[None].astype(np.uint8), nodata=3)
+    np.testing.assert_array_equal(read_mask(path).roads, roads)
+    holed = np.where(roads, 1.0, 0.0)
+    holed[50:, 50:] = np.nan
+    mask = read_mask(holed)
+    np.testing.assert_array_equal(mask.observed, np.isfinite(holed))
+    np.testing.assert_array_equal(mask.roads, roads & np.isfinite(holed))
+
+
+def test_a_photograph_is_refused_by_name(tmp_path: Path) -> None:
+    rng = np.random.default_rng(0)
+    ground = cv2.GaussianBlur(rng.normal(0, 1, (*SHAPE, 3)), (0, 0), 3)
+    photo = np.clip(110 + 400 * ground + rng.normal(0, 8, ground.shape), 0, 255).astype(np.uint8)
+    path = tmp_path / "photo.jpg"
+    for picture in (photo, cv2.cvtColor(photo, cv2.COLOR_BGR2GRAY)):
+        cv2.imwrite(str(path), picture)
+        with pytest.raises(MaskError, match="looks like a photograph"):
+            read_mask(path)
+    assert read_mask(path, threshold=150).roads.any()
+
+
+@pytest.mark.parametrize(
+    ("values", "message"),
+    [
+        (np.zeros(SHAPE, np.uint8), "shows no road"),
+        (np.full(SHAPE, 255, np.uint8), "every pixel is light"),
+        (np.full(SHAPE, np.nan), "no observed pixel"),
+        (np.tile([0.1, 0.3, 0.2, 0.4], (80, 25)), "shows no road: no value above 0.5"),
+        (np.eye(10), "10 x 10 pixels; expected 32"),
+        (np.arange(8000).reshape(SHAPE) % 4, "holds the classes 0, 1, 2, 3"),
+        (np.zeros((3, 4, 5, 6)), r"shape \(3, 4, 5, 6\)"),
+        (np.array([["road"]]), "numbers or booleans"),
+    ],
+)
+def test_what_is_no_mask(values: np.ndarray, message: str) -> None:
+    with pytest.raises(MaskError, match=message) as raised:
+        read_mask(values)
+    assert "\n" not in str(raised.value)
+
+
+def test_a_land_cover_map_in_colours_is_refused(tmp_path: Path) -> None:
+    colours = np.array([(0, 0, 0), (0, 200, 0), (200, 0, 0), (255, 255, 255)], np.uint8)
+    picture = colours[(np.arange(SHAPE[0])[:, None] // 20 + np.zeros(SHAPE, int)) % 4]
+    cv2.imwrite(str(tmp_path / "classes.png"), picture)
+    with pytest.raises(MaskError, match="holds 4 colours"):
+        read_mask(tmp_path / "classes.png")
+
+
+def test_files_that_are_none(tmp_path: Path, roads: np.ndarray) -> None:
+    good = tmp_path / "good.png"
+    cv2.imwrite(str(good), roads * np.uint8(255))
+    (tmp_path / "text.tif").write_text("no raster")
+    (tmp_path / "empty.png").touch()
+    (tmp_path / "cut.png").write_bytes(good.read_bytes()[:60])
+    for name, message in (
+        ("none.png", "no such file"),
+        ("", "is a folder"),
+        ("text.tif", "not a raster"),
+        ("empty.png", "not a raster"),
+        ("cut.png", "damaged or cut short"),
+    ):
+        with pytest.raises(MaskError, match=message) as raised:
+            read_mask(tmp_path / name)
+        assert "\n" not in str(raised.value)
+
+
+def test_voids_are_told_on_request(tmp_path: Path) -> None:
+    image = np.zeros((400, 400), np.uint8)
+    for x in range(15, 400, 30):
+        cv2.line(image, (x, 0), (x + 8, 400), 255, 4)
+        cv2.line(image, (0, x), (400, x + 5), 255, 4)
+    cv2.fillConvexPoly(image, np.array([(0, 0), (400, 0), (400, 150)]), 0)
+    mask = read_mask(image)
+    assert mask.observed is not None
+    assert not mask.observed[5, 395]
+    assert not mask.roads[~mask.observed].any()
+    assert read_mask(image, voids=False).observed is None
+
+
+@pytest.mark.realdata
+def test_every_real_mask_is_read_and_every_photograph_refused(data_dir: Path) -> None:
+    masks = sorted((data_dir / "massachusetts").glob("**/masks/*.png"))
+    assert masks
+    for path in masks:
+        values = cv2.imread(str(path), cv2.IMREAD_GRAYSCALE)
+        if values.any():
+            mask = read_mask(path)
+            assert mask.observed is None
+            np.testing.assert_array_equal(mask.roads, values > 127)
+    for path in sorted((data_dir / "massachusetts" / "segmentation" / "images").glob("*.jpg")):
+        with pytest.raises(MaskError, match="photograph"):
+            read_mask(path)
+
+
+def test_reading_warns_of_nothing(tmp_path: Path, roads: np.ndarray, recwarn: pytest.WarningsRecorder) -> None:
+    path = tiff(tmp_path / "mask.tif", roads[None].astype(np.uint8))
+    recwarn.clear()
+    read_mask(path)
+    assert not [w for w in recwarn if issubclass(w.category, NotGeoreferencedWarning)]

@@ -1,0 +1,247 @@
+import socket
+import time
+
+import numpy as np
+import pytest
+import shapely
+from worlds.fake_osm import EMPTY, OUTLINE, fake_osm
+from worlds.fenway import streets, write_vector
+
+from roadgeo.errors import RoadSourceError
+from roadgeo.sources.overpass import FetchOptions, cache_dir, fetch_lines, find_place, read_area, square
+from roadgeo.sources.roads import fetch_roads
+
+
+@pytest.fixture
+def osm(tmp_path, monkeypatch):
+    monkeypatch.setenv("ROADGEO_CACHE", str(tmp_path / "cache"))
+    with fake_osm() as state:
+        yield state
+
+
+@pytest.fixture
+def pauses(monkeypatch):
+    """Waiting takes no time; how long it would have."""
+    waited = []
+    monkeypatch.setattr(time, "sleep", waited.append)
+    return waited
+
+
+def ask(osm, **changes):
+    return FetchOptions(overpass_url=f"{osm.url}/api", nominatim_url=osm.url, **changes)
+
+
+def test_the_roads_of_a_place(osm, pauses):
+    said = []
+    roads = fetch_roads("Fenway, Boston", options=ask(osm), say=lambda text, share=None: said.append(text))
+    (source,) = roads.meta["sources"]
+    assert source["name"] == "Fenway, Boston, Massachusetts, United States"
+    assert source["osm_timestamp"] == "2022-05-04T19:30:42Z"
+    assert roads.meta["attribution"] == "© OpenStreetMap contributors, ODbL 1.0"
+    assert roads.plane.crs == "EPSG:32619"
+    lines, *_ = streets()
+    inside = shapely.intersection(lines, OUTLINE)
+    ratio = shapely.length(roads.lines).sum() / (shapely.length(inside).sum() * 97_000)  # metres per degree, about
+    assert 0.85 < ratio < 1.2
+    assert said == [f"asking {osm.url[7:]}"] * 2
+    (query,) = osm.queries
+    assert '["highway"~"^(living_street|motorway|' in query
+    assert '["tunnel"!~"^(yes|avalanche_protector)$"]' in query
+
+
+def test_answers_are_kept_and_grow_old(osm, pauses):
+    first = fetch_roads("Fenway, Boston", options=ask(osm))
+    said = []
+    again = fetch_roads("Fenway, Boston", options=ask(osm), say=lambda text, share=None: said.append(text))
+    assert (len(osm.queries), len(osm.searches), said) == (1, 1, [])
+    assert again.meta == first.meta
+    assert shapely.equals(first.lines, again.lines).all()
+    fetch_roads("Fenway, Boston", options=ask(osm, max_age_days=-1))
+    assert (len(osm.queries), len(osm.searches)) == (2, 2)
+    fetch_roads("Fenway, Boston", options=ask(osm, cache=False))
+    assert len(osm.queries) == 3
+    fetch_roads("Fenway, Boston", which="main", options=ask(osm))
+    assert len(osm.queries) == 4
+
+
+def test_answers_cut_off_in_the_cache_are_fetched_anew(osm, pauses):
+    fetch_roads("Fenway, Boston", options=ask(osm))
+    for file in cache_dir().rglob("*.json"):
+        file.write_bytes(file.read_bytes()[:-200])
+    fetch_roads("Fenway, Boston", options=ask(osm))
+    assert len(osm.queries) == 2
+
+
+def test_a_cache_that_cannot_be_written_is_done_without(osm, pauses, tmp_path, monkeypatch):
+    (tmp_path / "file").touch()
+    monkeypatch.setenv("ROADGEO_CACHE", str(tmp_path / "file"))
+    assert len(fetch_roads("Fenway, Boston", options=ask(osm))) > 0
+
+
+def test_osmnx_is_left_as_it_was(osm, pauses):
+    import osmnx as ox
+
+    before = {name: value for name, value in vars(ox.settings).items() if not name.startswith("_")}
+    lookup = socket.getaddrinfo
+    fetch_roads("Fenway, Boston", options=ask(osm, date="2019-10-28"))
+    osm.roads = b"<html>"
+    with pytest.raises(RoadSourceError):
+        fetch_roads(bbox=(0, 0, 1, 1), options=ask(osm))
+    assert {name: value for name, value in vars(ox.settings).items() if not name.startswith("_")} == before
+    assert socket.getaddrinfo is lookup
+
+
+def test_roads_as_of_a_day(osm, pauses):
+    roads = fetch_roads(bbox=OUTLINE.bounds, options=ask(osm, date="2019-10-28"))
+    assert '[date:"2019-10-28T00:00:00Z"]' in osm.queries[0]
+    assert roads.meta["sources"][0]["date"] == "2019-10-28"
+    with pytest.raises(RoadSourceError, match="'last year' is no date"):
+        fetch_roads(bbox=OUTLINE.bounds, options=ask(osm, date="last year"))
+
+
+def test_boxes_polygons_and_surroundings(osm, pauses, tmp_path):
+    box = fetch_roads(bbox=OUTLINE.bounds, options=ask(osm))
+    outline = write_vector(tmp_path / "outline.gpkg", [OUTLINE])
+    polygon = fetch_roads(polygon=outline, options=ask(osm))
+    assert len(box) == len(polygon)
+    assert polygon.meta["sources"][0]["name"] == "outline"
+    around = fetch_roads(around=(-71.0862, 42.3485, 200.0), options=ask(osm))
+    assert 0 < len(around) < len(box)
+    with pytest.raises(ValueError, match="exactly one"):
+        fetch_roads("Boston", bbox=(0, 0, 1, 1))
+
+
+def test_an_area_astride_180_degrees_is_asked_for_in_two(osm, pauses):
+    osm.roads = EMPTY
+    with pytest.raises(RoadSourceError, match="no drivable roads there"):
+        fetch_roads(bbox=(179.9, -17, -179.9, -16), options=ask(osm))
+    assert len(osm.queries) == 2
+    assert len(shapely.get_parts(square(180, -17, 1000))) == 2
+
+
+def test_a_large_area_is_asked_for_in_parts_and_resumed(osm, pauses, monkeypatch):
+    import osmnx as ox
+
+    monkeypatch.setattr(ox.settings, "max_query_area_size", 1_000_000)
+    said = []
+    osm.overpass += [(200, {}, osm.roads), (500, {}, b"<html>")]
+    with pytest.raises(RoadSourceError, match="makes no sense"):
+        fetch_roads("Fenway, Boston", options=ask(osm), say=lambda *step: said.append(step))
+    host = osm.url[7:]
+    n_parts = int(said[1][0].rpartition(" ")[2])
+    assert n_parts > 2
+    assert said[1:] == [(f"asking {host} for part {k + 1} of {n_parts}", k / n_parts) for k in range(len(said) - 1)]
+    assert not list(cache_dir().glob("overpass-*"))  # an answer that makes no sense spoils the others
+
+    osm.overpass += [(200, {}, osm.roads), "cut"]
+    with pytest.raises(RoadSourceError, match="broke off"):
+        fetch_roads("Fenway, Boston", options=ask(osm))
+    n_asked = len(osm.queries)
+    said.clear()
+    fetch_roads("Fenway, Boston", options=ask(osm), say=lambda *step: said.append(step))
+    assert len(osm.queries) == n_asked + n_parts - 1
+    assert said == [(f"asking {host} for part {k + 1} of {n_parts}", k / n_parts) for k in range(1, n_parts)]
+
+
+@pytest.mark.parametrize(
+    ("name", "message"),
+    [
+        ("Atlantis", "'Atlantis': OpenStreetMap knows no such place"),
+        ("Gas Lamp", "'Gas Lamp' is a point on OpenStreetMap, not an area"),
+    ],
+)
+def test_places_without_an_area(osm, pauses, name, message):
+    with pytest.raises(RoadSourceError, match=message):
+        find_place(name, ask(osm))
+
+
+def test_a_busy_server_is_asked_again(osm, pauses):
+    osm.overpass.extend([(429, {"Retry-After": "7"}, b"busy"), (504, {}, b"<html>timeout</html>")])
+    said = []
+    host = osm.url[7:]
+    assert len(fetch_roads(bbox=OUTLINE.bounds, options=ask(osm), say=lambda text, share=None: said.append(text))) > 0
+    assert said[1:] == [
+        f"{host} is busy (429), trying again in 7 s",
+        f"{host} is busy (504), trying again in 30 s",
+    ]
+    assert pauses[-2:] == [7.0, 30.0]
+    assert len(osm.queries) == 3
+    assert len(set(osm.queries)) == 1
+
+
+def test_a_busy_nominatim_is_asked_again(osm, pauses):
+    osm.nominatim.append((429, {}, b"busy"))
+    assert find_place("Fenway, Boston", ask(osm))[1].startswith("Fenway")
+    assert len(osm.searches) == 2
+
+
+def test_a_server_that_stays_busy_is_given_up(osm, pauses):
+    osm.overpass.extend([(429, {}, b"busy")] * 9)
+    with pytest.raises(RoadSourceError, match=r"is still busy \(429\) after 2 more tries; try later"):
+        fetch_roads(bbox=OUTLINE.bounds, options=ask(osm, retries=2))
+
+
+@pytest.mark.parametrize(
+    ("answer", "message"),
+    [
+        ("cut", "cannot be reached or broke off"),
+        ((200, {}, EMPTY), "no drivable roads there"),
+        ((200, {}, b"<html>hello</html>"), "makes no sense"),
+        ((400, {}, b"<html>bad query</html>"), "makes no sense"),
+        (
+            (200, {}, EMPTY[:-1] + b', "remark": "runtime error: Query timed out in \\"query\\" at line 1"}'),
+            "gave up: runtime error: Query timed out",
+        ),
+    ],
+    ids=["cut", "empty", "html", "refused", "gave up"],
+)
+def test_answers_that_are_of_no_use(osm, pauses, answer, message):
+    osm.overpass.append(answer)
+    with pytest.raises(RoadSourceError, match=message) as caught:
+        fetch_roads(bbox=OUTLINE.bounds, options=ask(osm))
+    assert "\n" not in str(caught.value)
+    assert len(fetch_roads(bbox=OUTLINE.bounds, options=ask(osm))) > 0  # nothing of it is kept
+
+
+def test_no_network(pauses, tmp_path, monkeypatch):
+    monkeypatch.setenv("ROADGEO_CACHE", str(tmp_path))
+    with socket.socket() as held:
+        held.bind(("127.0.0.1", 0))
+        nowhere = f"http://127.0.0.1:{held.getsockname()[1]}"
+        options = FetchOptions(overpass_url=nowhere, nominatim_url=nowhere)
+        with pytest.raises(RoadSourceError, match="cannot be reached or broke off; is there a network connection"):
+            find_place("Boston", options)
+        with pytest.raises(RoadSourceError, match="cannot be reached or broke off"):
+            fetch_lines(OUTLINE, "drivable", False, options)
+
+
+def test_the_slots_of_the_public_server_are_asked_for(osm, pauses, monkeypatch):
+    monkeypatch.setattr("roadgeo.sources.overpass.OVERPASS_URL", f"{osm.url}/api")
+    assert len(fetch_roads(bbox=OUTLINE.bounds, options=ask(osm))) > 0
+
+
+@pytest.mark.parametrize(
+    ("shapes", "crs", "message"),
+    [
+        ([shapely.LineString([(0, 0), (1, 1)])], "EPSG:4326", "no polygon in it"),
+        ([OUTLINE], None, "says nothing of its CRS"),
+    ],
+)
+def test_outlines_that_are_of_no_use(tmp_path, shapes, crs, message):
+    file = tmp_path / "outline.shp"
+    write_vector(file, shapes, crs=crs or "EPSG:4326")
+    if crs is None:
+        file.with_suffix(".prj").unlink()
+    with pytest.raises(RoadSourceError, match=message):
+        read_area(file)
+    with pytest.raises(RoadSourceError, match="no such file"):
+        read_area(tmp_path / "nowhere.gpkg")
+    (tmp_path / "nonsense.gpkg").write_text("nonsense")
+    with pytest.raises(RoadSourceError, match="not readable as a map"):
+        read_area(tmp_path / "nonsense.gpkg")
+
+
+def test_outlines_in_any_crs(tmp_path):
+    file = write_vector(tmp_path / "outline.gpkg", [shapely.box(330_000, 4_690_000, 331_000, 4_691_000)], "EPSG:32619")
+    area, _ = read_area(file)
+    assert np.allclose(area.centroid.coords[0], (-71.06, 42.35), atol=0.02)

@@ -1,0 +1,1 @@
+"""Programs that tests drive: browser, QGIS, validators, killers."""

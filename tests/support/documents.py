@@ -1,0 +1,259 @@
+"""Pages of documentation as programs: their blocks, what running them gives, what they link to and name."""
+
+import contextlib
+import io
+import os
+import re
+import shlex
+import subprocess
+import sys
+from dataclasses import dataclass
+from pathlib import Path
+
+import click
+
+from roadgeo.cli import cli, main
+
+ROOT = Path(__file__).parents[2]
+FENCE = re.compile(r"^```(\w+)\n(.*?)^```$", re.DOTALL | re.MULTILINE)
+INLINE = re.compile(r"(?<!`)`([^`\n]+)`(?!`)")
+NUMBER = re.compile(r"\d[\d,]*(?:\.\d+)?")
+OPTION = re.compile(r"(?<![\w-])--?[a-z][\w-]*")
+FILE = re.compile(r"[a-z0-9_./-]+\.(?:tif|gpkg|index|json|jsonl|geojson|png|html|csv|zip|kmz|points|txt|vrt|qml|tfw)")
+
+
+@dataclass(frozen=True)
+class Block:
+    """What stands between fences: its language, its text, and the line of the page where it begins."""
+
+    language: str
+    text: str
+    line: int
+
+    def commands(self):
+        """Yield (command, exit status) of each line; a comment "# status 3" says that it is not 0."""
+        for line in self.text.replace("\\\n", " ").splitlines():
+            told = re.search(r"#.*\bstatus (\d+)", line)
+            command = re.sub(r"\s+#.*$|^#.*$", "", line).strip()
+            if command:
+                yield command, int(told[1]) if told else 0
+
+
+def blocks(text):
+    """All fenced blocks of a page."""
+    return [Block(found[1], found[2], text[: found.start()].count("\n") + 1) for found in FENCE.finditer(text)]
+
+
+def prose(text):
+    """The page without its fenced blocks."""
+    return FENCE.sub("", text)
+
+
+# --- running ----------------------------------------------------------------------------------------------------------
+
+
+def run_page(text, servers=(), left_out=frozenset()):
+    """Run a page's bash and python blocks in order, in this folder; hold its text blocks against what was printed.
+
+    Raises AssertionError at what does not come out as the page says. `servers` are options that lead what is fetched
+    to servers on loopback; `left_out` are the lines of blocks that are run elsewhere.
+    """
+    printed = ""
+    names = {"__name__": "__page__"}
+    for block in blocks(text):
+        if block.line in left_out:
+            continue
+        if block.language == "bash":
+            printed = "".join(run_command(*command, servers, block.line) for command in block.commands())
+        elif block.language == "python":
+            printed = run_program(block, names)
+        elif block.language == "text":
+            compare(block, printed)
+
+
+def run_program(block, names):
+    """Run a python block in the names that those before it left, and return what it printed."""
+    program = compile(block.text, f"<line {block.line}>", "exec")
+    return captured(lambda: exec(program, names))[0]
+
+
+def run_command(command, expected, servers=(), line=0):
+    """Run one line of bash and return all it printed; roadgeo itself runs in this process."""
+    assignments, words, rest = parse(command)
+    if words[:1] == ["roadgeo"]:
+        if words[1:2] == ["index"] and not {"--roads", "--source"} & set(words):
+            words += servers
+        before = {name: os.environ.get(name) for name in assignments}
+        os.environ.update(assignments)
+        try:
+            printed, status, out = run_roadgeo(words[1:])
+        finally:
+            for name, value in before.items():
+                os.environ.pop(name) if value is None else os.environ.update({name: value})
+        if rest:
+            done = subprocess.run(["bash", "-c", rest], input=out, capture_output=True, text=True, check=False)
+            printed += done.stdout + done.stderr
+            status = status or done.returncode
+    else:
+        done = subprocess.run(["bash", "-c", command], capture_output=True, text=True, check=False)
+        printed, status = done.stdout + done.stderr, done.returncode
+    assert status == expected, f"line {line}: status {status}, not {expected}: {command}\n{printed}"
+    return printed
+
+
+def parse(command):
+    """Split a line into assignments, the words of its first command, and a command that takes what that prints."""
+    lexer = shlex.shlex(command, posix=True, punctuation_chars="|>")
+    lexer.whitespace_split = True
+    lexer.commenters = ""
+    words = list(lexer)
+    assignments = {}
+    while words and re.fullmatch(r"[A-Z_]+=.*", words[0]):
+        name, _, value = words.pop(0).partition("=")
+        assignments[name] = value
+    at = next((i for i, word in enumerate(words) if word in {"|", ">", ">>"}), len(words))
+    rest = ""
+    if words[at:]:
+        after = command.split(f" {words[at]} ", 1)[1]
+        rest = after if words[at] == "|" else f"cat {words[at]} {after}"
+    expanded = [
+        name
+        for word in words[:at]
+        for name in (sorted(map(str, Path().glob(word))) or [word] if "*" in word else [word])
+    ]
+    return assignments, expanded, rest
+
+
+def run_roadgeo(words):
+    """Return what a command printed on both streams, its status, and what it printed on standard output."""
+    if {"--jobs", "-j"} & set(words):  # a server of processes would outlive this page, and keep its environment
+        command = [sys.executable, "-m", "roadgeo", *words]
+        done = subprocess.run(command, capture_output=True, text=True, check=False)
+        return done.stdout + done.stderr, done.returncode, done.stdout
+    status = 0
+
+    def call():
+        nonlocal status
+        status = main(words)
+
+    printed, out = captured(call)
+    return printed, status, out
+
+
+def captured(call):
+    """Return (all that was printed, what was printed on standard output)."""
+    both, out = io.StringIO(), io.StringIO()
+
+    class Both(io.StringIO):
+        def write(self, text):
+            both.write(text)
+            return out.write(text)
+
+    with contextlib.redirect_stdout(Both()), contextlib.redirect_stderr(both):
+        call()
+    return both.getvalue(), out.getvalue()
+
+
+def compare(block, printed):
+    """Hold a text block against what was printed: the same lines in the same order, but for numbers and gaps (...)."""
+    lines = iter(map(normalise, printed.splitlines()))
+    for line in block.text.splitlines():
+        wanted = normalise(line)
+        if wanted in {"", "..."}:
+            continue
+        assert any(wanted in got for got in lines), f"line {block.line}: not printed: {line}\nbut\n{printed}"
+
+
+def normalise(line):
+    """Leave out what differs from run to run: numbers, and spaces that fill up."""
+    return " ".join(re.sub(r"[─-]{2,}", "-", NUMBER.sub("#", line)).split())
+
+
+# --- what is named ----------------------------------------------------------------------------------------------------
+
+
+def context(words):
+    """The click command that words begin with, and the words after its name."""
+    command, rest = cli, list(words)
+    while isinstance(command, click.Group) and rest and not rest[0].startswith("-"):
+        found = command.get_command(click.Context(command), rest[0])
+        if found is None:
+            return None, rest
+        command, rest = found, rest[1:]
+    return command, rest
+
+
+def options_of(command):
+    """All options of a command."""
+    known = {"-h", "--help"}
+    for parameter in command.params:
+        if isinstance(parameter, click.Option):
+            known |= {*parameter.opts, *parameter.secondary_opts}
+    return known
+
+
+def all_options():
+    """All options of all commands."""
+    known, waiting = set(), [cli]
+    while waiting:
+        command = waiting.pop()
+        known |= options_of(command)
+        if isinstance(command, click.Group):
+            ctx = click.Context(command)
+            waiting += [command.get_command(ctx, name) for name in command.list_commands(ctx)]
+    return known
+
+
+def unknown_names(text):
+    """Commands and options that a page names, in blocks or inline, and that the command line does not have."""
+    wrong = []
+    known = all_options()
+    lines = [command for block in blocks(text) if block.language == "bash" for command, _ in block.commands()]
+    for code in [*INLINE.findall(prose(text)), *lines]:
+        words = code.split()
+        if words[:1] == ["roadgeo"] and len(words) > 1 and not words[1].isupper():
+            command, rest = context(words[1:])
+            has = options_of(command) if command else set()
+            wrong += [f"{code}: {one}" for one in OPTION.findall(" ".join(rest)) if one not in has]
+            wrong += [] if command else [code]
+        elif words and words[0].startswith("-"):
+            wrong += [one for one in OPTION.findall(code) if one not in known]
+    return wrong
+
+
+def broken_links(page, text):
+    """Relative links and pictures of a page that lead nowhere."""
+    broken = []
+    for target in re.findall(r"\]\(([^)\s]+)\)", prose(text)):
+        if target.startswith(("https://", "mailto:")):
+            continue
+        path, _, anchor = target.partition("#")
+        aim = (page.parent / path).resolve() if path else page
+        if not aim.exists() or (anchor and anchor not in anchors(aim.read_text(encoding="utf-8") if path else text)):
+            broken.append(target)
+    return broken
+
+
+def anchors(text):
+    """What the headings of a page are called in links, as GitHub makes them."""
+    titles = re.findall(r"^#+ (.*)$", prose(text), re.MULTILINE)
+    return {re.sub(r"[^\w\- ]", "", title.lower()).replace(" ", "-") for title in titles}
+
+
+def missing_files(text, folder):
+    """Files that a page names inline and that are neither in a folder nor in the repository."""
+    there = {str(path.relative_to(folder)) for path in folder.rglob("*")}
+    named = {code for code in INLINE.findall(prose(text)) if FILE.fullmatch(code)}
+    return sorted(
+        name
+        for name in named
+        if not (ROOT / name).exists() and not any(f"/{one}".endswith(f"/{name}") for one in there)
+    )
+
+
+# What the blocks of a page print: PYTHONPATH=tests python tests/support/documents.py PAGE, in a scratch folder.
+if __name__ == "__main__":
+    for part in blocks(Path(sys.argv[1]).read_text(encoding="utf-8")):
+        if part.language == "bash":
+            for line, wanted in part.commands():
+                print(f"$ {line}\n{run_command(line, wanted, line=part.line)}")

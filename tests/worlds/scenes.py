@@ -1,0 +1,170 @@
+"""Made-up road networks, and what a camera above them sees, with everything known; no mask is drawn."""
+
+from dataclasses import dataclass, replace
+
+import numpy as np
+import shapely
+from scipy.spatial import Delaunay
+
+from roadgeo.geometry.projection import LocalPlane
+from roadgeo.matching.scene import Scene, prepare_scene
+from roadgeo.reference.reference import build_network
+from roadgeo.roads.graph import RoadGraph
+from roadgeo.roads.intersections import IntersectionOptions, find_intersections
+from roadgeo.roads.network import RoadNetwork
+
+__all__ = ["PLANE", "Sight", "camera", "look", "mapped", "random_lines", "random_network", "scene_of"]
+
+PLANE = LocalPlane("EPSG:32619", (330000.0, 4690000.0))
+
+
+def random_lines(seed: int, side: float = 3000.0, spacing: float = 120.0) -> list[shapely.LineString]:
+    """Roads of a made-up town: a triangulation of scattered points, without what leaves a node too sharply."""
+    rng = np.random.default_rng(seed)
+    points = rng.uniform(0, side, (int(3 * (side / spacing) ** 2), 2))
+    kept: list[int] = []
+    for i, point in enumerate(points):
+        if not kept or (np.hypot(*(points[kept] - point).T) > 0.75 * spacing).all():
+            kept.append(i)
+    xy = points[kept]
+    triangles = Delaunay(xy).simplices
+    pairs = np.unique(np.sort(np.vstack([triangles[:, [0, 1]], triangles[:, [1, 2]], triangles[:, [0, 2]]])), axis=0)
+    length = np.hypot(*(xy[pairs[:, 0]] - xy[pairs[:, 1]]).T)
+    taken: dict[int, list[float]] = {i: [] for i in range(len(xy))}
+    lines = []
+    for a, b in pairs[np.argsort(length)]:
+        angle = float(np.arctan2(*(xy[b] - xy[a])[::-1]))
+        at = ((a, angle), (b, angle + np.pi))
+        sharp = any(np.cos(angle - other) > np.cos(np.radians(50)) for n, angle in at for other in taken[n])
+        if sharp or length.max() < np.hypot(*(xy[a] - xy[b])):
+            continue
+        for n, angle in at:
+            taken[n].append(angle)
+        if rng.uniform() < 0.12:  # a block of its own size and shape here and there
+            continue
+        middle = (xy[a] + xy[b]) / 2 + rng.normal(0, 4, 2)
+        lines.append(shapely.LineString([xy[a], middle, xy[b]]))
+    return lines
+
+
+def random_network(seed: int, side: float = 3000.0, spacing: float = 120.0) -> RoadNetwork:
+    """The same as a reference has it."""
+    return build_network(random_lines(seed, side, spacing), PLANE, {"name": f"town {seed}"})
+
+
+def camera(
+    center: tuple[float, float],
+    size: tuple[int, int] = (1000, 1000),
+    gsd_m: float = 1.0,
+    tilt_deg: float = 0.0,
+    azimuth_deg: float = 0.0,
+    heading_deg: float = 0.0,
+    focal_px: float = 1000.0,
+) -> np.ndarray:
+    """Homography from the query plane (pixels, y up) to metres, of a pinhole whose axis meets the ground at `center`.
+
+    The axis is tilted from the vertical towards `azimuth_deg`, clockwise from north; before tilting, the image's up
+    points to `heading_deg`. `gsd_m` is measured across the axis at the frame's middle.
+    """
+    heading, azimuth, tilt = np.radians([heading_deg, azimuth_deg, tilt_deg])
+
+    def turn(clockwise: float) -> np.ndarray:
+        c, s = np.cos(clockwise), np.sin(clockwise)
+        return np.array([[c, s, 0], [-s, c, 0], [0, 0, 1]])
+
+    lean = np.array([[1, 0, 0], [0, np.cos(tilt), np.sin(tilt)], [0, -np.sin(tilt), np.cos(tilt)]])
+    # Rays of the camera over the ground, z up: (x, y, -f) for a camera that looks straight down with up to the north.
+    rays = turn(azimuth) @ lean.T @ turn(heading - azimuth)
+    rays = rays @ np.array([[1, 0, -size[0] / 2], [0, 1, size[1] / 2], [0, 0, -focal_px]])
+    distance = gsd_m * focal_px
+    axis = rays @ (size[0] / 2, -size[1] / 2, 1) / focal_px
+    eye = -distance * axis
+    matrix = np.array([-eye[2] * rays[0] + eye[0] * rays[2], -eye[2] * rays[1] + eye[1] * rays[2], rays[2]])
+    matrix = np.array([[1, 0, center[0]], [0, 1, center[1]], [0, 0, 1]]) @ matrix
+    return matrix / (matrix[2] @ (size[0] / 2, -size[1] / 2, 1))
+
+
+def mapped(matrix: np.ndarray, xy: np.ndarray) -> np.ndarray:
+    """Points (N, 2) under a homography."""
+    homogeneous = np.c_[xy, np.ones(len(xy))] @ matrix.T
+    return homogeneous[:, :2] / homogeneous[:, 2:]
+
+
+@dataclass(frozen=True)
+class Sight:
+    """How well the query sees: standard deviation of its roads' places in metres, over stretches of 60 m, the share of
+    roads it misses, and the share that is not there."""
+
+    sigma_m: float = 0.0
+    missing: float = 0.0
+    false: float = 0.0
+
+
+def look(
+    network: RoadNetwork,
+    matrix: np.ndarray,
+    size: tuple[int, int] = (1000, 1000),
+    sight: Sight | None = None,
+    seed: int = 0,
+) -> RoadGraph:
+    """The network as a camera sees it, in the query plane; roads end at the frame."""
+    rng = np.random.default_rng(seed)
+    sight = sight or Sight()
+    graph = network.graph
+    back = np.linalg.inv(matrix)
+    low, high = np.array([0.0, -size[1]]), np.array([size[0], 0.0])
+    moved = graph.xy + rng.normal(0, sight.sigma_m, graph.xy.shape) if sight.sigma_m else graph.xy
+    width = float(np.ptp(graph.xy))
+    nodes: list[np.ndarray] = []
+    number: dict[int, int] = {}
+    edges, lines = [], []
+
+    def node(n: int, xy: np.ndarray) -> int:
+        if n < 0 or n not in number:
+            if n >= 0:
+                number[n] = len(nodes)
+            nodes.append(xy)
+        return number[n] if n >= 0 else len(nodes) - 1
+
+    for e, (a, b) in enumerate(graph.edges):
+        if rng.uniform() < sight.missing:
+            continue
+        line = np.array(shapely.segmentize(shapely.LineString(graph.polyline(e)), 60.0).coords)
+        if sight.sigma_m:
+            line[1:-1] += rng.normal(0, sight.sigma_m, (len(line) - 2, 2))
+        line[0], line[-1] = moved[a], moved[b]
+        line = np.array(shapely.segmentize(shapely.LineString(line), 10.0).coords)
+        ahead = np.c_[line, np.ones(len(line))] @ back[2] > 0
+        seen = mapped(back, line)
+        inside = ahead & (seen > low).all(axis=1) & (seen < high).all(axis=1)
+        runs = np.flatnonzero(np.diff(np.r_[0, inside.astype(int), 0]))
+        for start, stop in runs.reshape(-1, 2):
+            if stop - start < 2:
+                continue
+            piece = seen[start:stop]
+            ends = (a if start == 0 else -1, b if stop == len(line) else -1)
+            edges.append((node(ends[0], piece[0]), node(ends[1], piece[-1])))
+            lines.append(piece)
+    for _ in range(int(sight.false * len(edges))):
+        middle, angle = rng.uniform(low, high), rng.uniform(0, np.pi)
+        reach = 0.02 * width * np.array([np.cos(angle), np.sin(angle)])
+        piece = np.clip(np.array([middle - reach, middle, middle + reach]), low + 1, high - 1)
+        edges.append((node(-1, piece[0]), node(-1, piece[-1])))
+        lines.append(piece)
+    return RoadGraph.from_polylines(np.array(nodes).reshape(-1, 2), np.array(edges).reshape(-1, 2), lines)
+
+
+def scene_of(graph: RoadGraph, size: tuple[int, int] = (1000, 1000), px_per_m: float = 1.0, **changes: object) -> Scene:
+    """A scene from a graph in the query plane."""
+    metres = IntersectionOptions()
+    found = find_intersections(
+        graph,
+        replace(
+            metres,
+            tangent_length=metres.tangent_length * px_per_m,
+            skip_length=metres.skip_length * px_per_m,
+            min_branch_length=metres.min_branch_length * px_per_m,
+            max_shift=metres.max_shift * px_per_m,
+        ),
+    )
+    return prepare_scene(graph, found, size, **changes)
