@@ -55,7 +55,7 @@ class Stats:
 
 @dataclass(frozen=True)
 class Seen:
-    """What the mask shows, in the query plane, pixels (see `roadgeo.grid`): roads, and (N, 2) intersections."""
+    """What the mask shows, in the query plane, pixels (see `geometry.mask`): roads, and (N, 2) intersections."""
 
     graph: RoadGraph
     xy: FloatArray
@@ -68,7 +68,7 @@ class Evidence:
     Attributes
     ----------
     query_graph : RoadGraph
-        The mask's roads in the query plane, pixels (see `roadgeo.grid`).
+        The mask's roads in the query plane, pixels (see `geometry.mask`).
     query_xy : (M, 2) float64
         Matched intersections, query plane.
     reference_xy : (M, 2) float64

@@ -13,7 +13,7 @@ paper leaves a choice open or a step costs nothing but time, this module decides
 
 A fixed inlier ratio separates right from wrong poorly; this is the baseline that other methods are measured against.
 
-Frames: query plane in pixels and reference plane in metres, both y up (see `roadgeo.grid`); x_ref = H x_query.
+Frames: query plane in pixels and reference plane in metres, both y up (see `geometry.mask`); x_ref = H x_query.
 """
 
 from __future__ import annotations

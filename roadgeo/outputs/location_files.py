@@ -66,8 +66,8 @@ def write_location(
 ) -> tuple[Location, list[Path]]:
     """Write what a location asks for; return it with `seconds.write` set, and the files.
 
-    A located mask gets every file but the overlay (see `roadgeo.plot`); any other gets its JSON only, and files that an
-    earlier run left under these names are removed, lest a place that no longer holds be taken for the result.
+    A located mask gets every file but the overlay (see `outputs.overlay`); any other gets its JSON only. Files that
+    an earlier run left under these names are removed, so that stale results are not mistaken for this run's.
 
     Parameters
     ----------

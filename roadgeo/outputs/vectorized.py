@@ -41,7 +41,7 @@ def write_vectorized(
         What the names of the files begin with.
     mask : RoadMask
     graph : RoadGraph
-        In the query plane (see `roadgeo.grid`).
+        In the query plane (see `geometry.mask`).
     intersections : Intersections
         Found on `graph`.
 

@@ -17,7 +17,7 @@ class RoadGraph:
     """Road network of a mask or a map, y up.
 
     Dimensions: N nodes, E edges, C vertices of all edges together. The plane is the query plane in pixels (see
-    `roadgeo.grid`) or the reference plane in metres from its local origin.
+    `geometry.mask`) or the reference plane in metres from its local origin.
 
     Attributes
     ----------

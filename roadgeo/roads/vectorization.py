@@ -87,7 +87,7 @@ class Vectorization:
     Attributes
     ----------
     graph : RoadGraph
-        In the query plane (see `roadgeo.grid`), pixels, N nodes.
+        In the query plane (see `geometry.mask`), pixels, N nodes.
     road_width_px : float
         Median road width.
     is_open : (N,) bool

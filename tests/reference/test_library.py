@@ -117,7 +117,7 @@ def test_where_the_library_lies(
 
 
 def test_the_library_imports_nothing_heavy() -> None:
-    code = "import sys, roadgeo.library; print(*sys.modules)"
+    code = "import sys, roadgeo.reference.library; print(*sys.modules)"
     loaded = subprocess.run([sys.executable, "-c", code], check=True, capture_output=True, text=True).stdout.split()
     assert not {"geopandas", "pyogrio", "osmnx", "networkx", "pandas", "scipy.spatial"} & set(loaded)
     assert library.__name__ in loaded
