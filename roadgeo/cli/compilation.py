@@ -30,12 +30,11 @@ def compile_once(reference: Reference, quiet: bool) -> None:
 
 
 def _is_cold() -> bool:
-    """Whether numba has stored no kernel of the search beside it; where it stores elsewhere, nobody can tell."""
-    import roadgeo.kernels
+    """Whether no kernel of the search was compiled yet."""
+    from roadgeo.kernels.compilation import kernel_folder
 
-    folder = Path(roadgeo.kernels.__path__[0])
-    stored_here = "NUMBA_CACHE_DIR" not in os.environ and os.access(folder, os.W_OK)
-    return stored_here and not any((folder / "__pycache__").glob("growth.*.nbi"))
+    folder = os.environ.get("NUMBA_CACHE_DIR") or kernel_folder()
+    return not any(Path(folder).rglob("growth.*.nbi"))
 
 
 def _practice_mask(reference: Reference) -> BoolArray:

@@ -7,16 +7,16 @@ coordinates, query (x - x0) / half_size and reference (X - X0) / unit.
 import math
 
 import numpy as np
-from numba import njit
 from numpy.typing import NDArray
 
+from roadgeo.kernels.compilation import kernel
 from roadgeo.kernels.growth import cholesky, solve_cholesky
 from roadgeo.kernels.roads import nearest_road
 
 __all__ = ["add_row", "adjust", "point_row"]
 
 
-@njit(cache=True)
+@kernel()
 def point_row(
     p: NDArray[np.float64], u: float, v: float, axis_x: float, axis_y: float, row: NDArray[np.float64]
 ) -> tuple[float, float, float]:
@@ -43,7 +43,7 @@ def point_row(
     return x, y, w
 
 
-@njit(cache=True)
+@kernel()
 def add_row(
     normal: NDArray[np.float64],
     right: NDArray[np.float64],
@@ -59,7 +59,7 @@ def add_row(
         right[r] += scaled * residual
 
 
-@njit(cache=True)
+@kernel()
 def adjust(
     p: NDArray[np.float64],
     unit: float,

@@ -5,13 +5,14 @@ of ids is needed. `grid` is (x0, y0, bucket size), `shape` is (columns, rows), a
 """
 
 import numpy as np
-from numba import njit
 from numpy.typing import NDArray
+
+from roadgeo.kernels.compilation import kernel
 
 __all__ = ["nearest_neighbours"]
 
 
-@njit(cache=True)
+@kernel()
 def nearest_neighbours(
     xy: NDArray[np.float64],
     starts: NDArray[np.int32],

@@ -10,9 +10,9 @@ may be.
 import math
 
 import numpy as np
-from numba import njit
 from numpy.typing import NDArray
 
+from roadgeo.kernels.compilation import kernel
 from roadgeo.kernels.rays import rays_agree
 
 __all__ = [
@@ -29,7 +29,7 @@ __all__ = [
 ]
 
 
-@njit(cache=True)
+@kernel()
 def cholesky(matrix: NDArray[np.float64], factor: NDArray[np.float64]) -> bool:
     """Factorise a symmetric matrix; return whether it is positive definite.
 
@@ -55,7 +55,7 @@ def cholesky(matrix: NDArray[np.float64], factor: NDArray[np.float64]) -> bool:
     return True
 
 
-@njit(cache=True)
+@kernel()
 def solve_cholesky(factor: NDArray[np.float64], right: NDArray[np.float64]) -> None:
     """Solve L L^T x = right, L (n, n) as left by `cholesky`; x replaces `right` (n,)."""
     n = factor.shape[0]
@@ -69,7 +69,7 @@ def solve_cholesky(factor: NDArray[np.float64], right: NDArray[np.float64]) -> N
         right[i] /= factor[i, i]
 
 
-@njit(cache=True)
+@kernel()
 def fit_homography(
     query: NDArray[np.float64],
     image: NDArray[np.float64],
@@ -133,14 +133,14 @@ def fit_homography(
     return True
 
 
-@njit(cache=True)
+@kernel()
 def predict(p: NDArray[np.float64], u: float, v: float) -> tuple[float, float, float]:
     """Return (x', y', w) of a normalised query point under the parameters `p` (8,)."""
     w = 1.0 + p[6] * u + p[7] * v
     return (p[0] * u + p[1] * v + p[2]) / w, (p[3] * u + p[4] * v + p[5]) / w, w
 
 
-@njit(cache=True)
+@kernel()
 def prediction_variance(
     factor: NDArray[np.float64], p: NDArray[np.float64], u: float, v: float, work: NDArray[np.float64]
 ) -> float:
@@ -173,7 +173,7 @@ def prediction_variance(
     return total
 
 
-@njit(cache=True)
+@kernel()
 def nearest_alike(
     x: float,
     y: float,
@@ -220,7 +220,7 @@ def nearest_alike(
     return where, best
 
 
-@njit(cache=True)
+@kernel()
 def keep_nearest(matched: NDArray[np.int64], distance: NDArray[np.float64]) -> int:
     """Let the nearest of several claimants keep a partner, the first of equals; return the number of matches left.
 
@@ -255,7 +255,7 @@ def keep_nearest(matched: NDArray[np.int64], distance: NDArray[np.float64]) -> i
     return count
 
 
-@njit(cache=True)
+@kernel()
 def grow(
     xy: NDArray[np.float64],
     branches: NDArray[np.int8],
@@ -461,7 +461,7 @@ def grow(
     return n_matched, n_tested, ratio
 
 
-@njit(cache=True)
+@kernel()
 def grow_each(
     xy: NDArray[np.float64],
     branches: NDArray[np.int8],
@@ -515,7 +515,7 @@ def grow_each(
         ratios[m] = ratio if n >= min_matched else -np.inf
 
 
-@njit(cache=True)
+@kernel()
 def match_all(
     matrix: NDArray[np.float64],
     xy: NDArray[np.float64],

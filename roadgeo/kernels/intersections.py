@@ -1,13 +1,14 @@
 """Kernels of `roadgeo.intersections`: lines fitted to branches, and the centre and tangents of each intersection."""
 
 import numpy as np
-from numba import njit
 from numpy.typing import NDArray
+
+from roadgeo.kernels.compilation import kernel
 
 __all__ = ["describe_intersections", "fit_branches", "sort_few"]
 
 
-@njit(cache=True)
+@kernel()
 def fit_branches(
     half_edges: NDArray[np.int64],
     edges: NDArray[np.int32],
@@ -102,7 +103,7 @@ def fit_branches(
     return lines
 
 
-@njit(cache=True)
+@kernel()
 def sort_few(values: NDArray[np.floating], n: int) -> None:
     """Sort the first n values in place, by insertion: a general sort would cost two seconds to compile."""
     for i in range(1, n):
@@ -114,7 +115,7 @@ def sort_few(values: NDArray[np.floating], n: int) -> None:
         values[k] = value
 
 
-@njit(cache=True)
+@kernel()
 def describe_intersections(
     node_xy: NDArray[np.float64],
     starts: NDArray[np.int64],

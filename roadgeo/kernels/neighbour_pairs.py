@@ -11,9 +11,9 @@ the connecting line, and log (c1 - c2) - log (c3 - c4), which an affine map leav
 import math
 
 import numpy as np
-from numba import njit
 from numpy.typing import NDArray
 
+from roadgeo.kernels.compilation import kernel
 from roadgeo.kernels.growth import nearest_alike
 from roadgeo.kernels.rays import rays_agree
 
@@ -31,7 +31,7 @@ __all__ = [
 MISFIT = 1e9
 
 
-@njit(cache=True)
+@kernel()
 def describe_end(tangents: NDArray[np.float64], line: float, min_sine: float, out: NDArray[np.float64]) -> bool:
     """Fill `out` (2,) with the falling cotangents of the two tangents that cross most openly; False: too few.
 
@@ -53,7 +53,7 @@ def describe_end(tangents: NDArray[np.float64], line: float, min_sine: float, ou
     return widest > min_sine
 
 
-@njit(cache=True)
+@kernel()
 def describe_pair(
     xy: NDArray[np.float64],
     tangents: NDArray[np.float64],
@@ -78,7 +78,7 @@ def describe_pair(
     return True
 
 
-@njit(cache=True)
+@kernel()
 def list_neighbour_pairs(
     xy: NDArray[np.float64],
     tangents: NDArray[np.float64],
@@ -103,7 +103,7 @@ def list_neighbour_pairs(
     return n
 
 
-@njit(cache=True)
+@kernel()
 def fit_pencils(query: NDArray[np.float64], reference: NDArray[np.float64], model: NDArray[np.float64]) -> float:
     """Fit c' = alpha c + beta to the four cotangents of two pairs; return the sum of squared errors in rad^2.
 
@@ -136,7 +136,7 @@ def fit_pencils(query: NDArray[np.float64], reference: NDArray[np.float64], mode
     return error
 
 
-@njit(cache=True)
+@kernel()
 def count_pairs(
     pair: NDArray[np.float64], spread: float, max_error: float, pairs: NDArray[np.float64], step: int
 ) -> int:
@@ -149,7 +149,7 @@ def count_pairs(
     return n
 
 
-@njit(cache=True)
+@kernel()
 def find_pairs(
     xy: NDArray[np.float64],
     branches: NDArray[np.int8],

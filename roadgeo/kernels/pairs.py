@@ -9,7 +9,8 @@ read-only, so that one compiled version serves built and memory-mapped indices a
 import math
 
 import numpy as np
-from numba import njit
+
+from roadgeo.kernels.compilation import kernel
 
 __all__ = [
     "cross_ratios",
@@ -25,7 +26,7 @@ _MAX_TANGENTS = 8
 _LEAF_SIZE = 8
 
 
-@njit(cache=True, error_model="numpy")
+@kernel(error_model="numpy")
 def list_pairs(xy, directions, codes, by_x, d_max, min_sine, out):  # type: ignore[no-untyped-def]
     """List the pairs nearer than `d_max` (eq. 8) whose tangents all leave the connecting line (eq. 7).
 
@@ -72,7 +73,7 @@ def list_pairs(xy, directions, codes, by_x, d_max, min_sine, out):  # type: igno
     return n
 
 
-@njit(cache=True, error_model="numpy")
+@kernel(error_model="numpy")
 def _near_line(directions, i, n_tangents, dx, dy, limit):  # type: ignore[no-untyped-def]
     """Say whether any tangent of intersection i is nearly parallel to (dx, dy), or there are too few for eq. 9."""
     for k in range(n_tangents):
@@ -81,7 +82,7 @@ def _near_line(directions, i, n_tangents, dx, dy, limit):  # type: ignore[no-unt
     return n_tangents < 2
 
 
-@njit(cache=True, error_model="numpy")
+@kernel(error_model="numpy")
 def _cotangents(tangents, i, n_tangents, phi, out):  # type: ignore[no-untyped-def]
     """Write the cotangents of intersection i's tangents relative to a line of direction `phi`, falling."""
     for k in range(n_tangents):
@@ -94,7 +95,7 @@ def _cotangents(tangents, i, n_tangents, phi, out):  # type: ignore[no-untyped-d
         out[slot] = value
 
 
-@njit(cache=True, error_model="numpy")
+@kernel(error_model="numpy")
 def describe_pairs(pairs, xy, tangents, codes, subsets, n_first, out):  # type: ignore[no-untyped-def]
     """Compute the cross-ratio descriptors d_c of pairs of one type (eq. 4).
 
@@ -120,7 +121,7 @@ def describe_pairs(pairs, xy, tangents, codes, subsets, n_first, out):  # type: 
         cross_ratios(cot, subsets[n_first:], out[p, n_first:])
 
 
-@njit(cache=True, error_model="numpy")
+@kernel(error_model="numpy")
 def cross_ratios(cot, subsets, out):  # type: ignore[no-untyped-def]
     """Compute cross ratios of concurrent lines: (a, b; c, d) = sin(ac) sin(bd) / (sin(bc) sin(ad)).
 
@@ -144,7 +145,7 @@ def cross_ratios(cot, subsets, out):  # type: ignore[no-untyped-def]
             out[s] = (a - c) * (b - d) / ((b - c) * (a - d))
 
 
-@njit(cache=True)
+@kernel()
 def order_tree(values, order):  # type: ignore[no-untyped-def]
     """Reorder `order` into an implicit k-d tree over `values[order]`; nothing else is stored.
 
@@ -191,7 +192,7 @@ def order_tree(values, order):  # type: ignore[no-untyped-def]
         top += 2
 
 
-@njit(cache=True)
+@kernel()
 def search_tree(values, low, high, out):  # type: ignore[no-untyped-def]
     """Find the points of an implicit k-d tree (see `order_tree`) strictly inside a box.
 
@@ -238,7 +239,7 @@ def search_tree(values, low, high, out):  # type: ignore[no-untyped-def]
     return n
 
 
-@njit(cache=True, error_model="numpy")
+@kernel(error_model="numpy")
 def _nearest(buckets, x, y, code, radius):  # type: ignore[no-untyped-def]
     """Return the place of the reference intersection of type `code` nearest to (x, y) within `radius`, or -1."""
     inverse = 1.0 / buckets.cell
@@ -266,7 +267,7 @@ def _nearest(buckets, x, y, code, radius):  # type: ignore[no-untyped-def]
     return found
 
 
-@njit(cache=True, error_model="numpy")
+@kernel(error_model="numpy")
 def nearest_of_type(xy, codes, buckets, radius, out):  # type: ignore[no-untyped-def]
     """Find for each point the nearest reference intersection of its own type.
 
@@ -286,7 +287,7 @@ def nearest_of_type(xy, codes, buckets, radius, out):  # type: ignore[no-untyped
         out[q] = buckets.items[place] if place >= 0 else -1
 
 
-@njit(cache=True, error_model="numpy")
+@kernel(error_model="numpy")
 def _fit_pencil(query, reference, n):  # type: ignore[no-untyped-def]
     """Fit cot r' = alpha cot r + beta to n corresponding lines of two pencils: exact for two, gold standard for more.
 
@@ -311,7 +312,7 @@ def _fit_pencil(query, reference, n):  # type: ignore[no-untyped-def]
     return alpha, beta
 
 
-@njit(cache=True, error_model="numpy")
+@kernel(error_model="numpy")
 def _count_inliers(uv, codes, buckets, model, radius, least, stamps, stamp):  # type: ignore[no-untyped-def]
     """Count query intersections that land near a reference intersection of their type, while `least` can be beaten."""
     alpha_1, beta_1, alpha_2, beta_2, x, y, dx, dy = model
@@ -334,7 +335,7 @@ def _count_inliers(uv, codes, buckets, model, radius, least, stamps, stamp):  # 
     return inliers
 
 
-@njit(cache=True, error_model="numpy")
+@kernel(error_model="numpy")
 def evaluate_pairs(  # type: ignore[no-untyped-def]
     uv,
     codes,

@@ -7,13 +7,14 @@ some products and no trigonometry, an intersection takes 2 R bytes, and rounding
 import math
 
 import numpy as np
-from numba import njit
 from numpy.typing import NDArray
+
+from roadgeo.kernels.compilation import kernel
 
 __all__ = ["rays_agree"]
 
 
-@njit(cache=True)
+@kernel()
 def rays_agree(
     branches: NDArray[np.int8],
     i: int,

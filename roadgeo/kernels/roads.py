@@ -7,13 +7,14 @@ and `shape` are those of `kernels.buckets`.
 import math
 
 import numpy as np
-from numba import njit
 from numpy.typing import NDArray
+
+from roadgeo.kernels.compilation import kernel
 
 __all__ = ["backward_agreement", "bin_segments", "forward_distances", "nearest_road", "screen"]
 
 
-@njit(cache=True)
+@kernel()
 def bin_segments(
     segments: NDArray[np.float32],
     grid: tuple[float, float, float],
@@ -66,7 +67,7 @@ def bin_segments(
     return total
 
 
-@njit(cache=True)
+@kernel()
 def nearest_road(
     x: float,
     y: float,
@@ -129,7 +130,7 @@ def nearest_road(
     return math.sqrt(best), fx, fy, ux, uy
 
 
-@njit(cache=True)
+@kernel()
 def forward_distances(
     matrix: NDArray[np.float64],
     points: NDArray[np.float64],
@@ -188,7 +189,7 @@ def forward_distances(
     return n
 
 
-@njit(cache=True)
+@kernel()
 def backward_agreement(
     inverse: NDArray[np.float64],
     bounds: NDArray[np.float64],
@@ -273,7 +274,7 @@ def backward_agreement(
     return n_seen, n_near
 
 
-@njit(cache=True)
+@kernel()
 def screen(
     references: NDArray[np.int64],
     affines: NDArray[np.float64],

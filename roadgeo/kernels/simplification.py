@@ -5,8 +5,9 @@ element by element here: the first assignment of a whole row costs numba two sec
 """
 
 import numpy as np
-from numba import njit
 from numpy.typing import NDArray
+
+from roadgeo.kernels.compilation import kernel
 
 __all__ = [
     "close_pairs",
@@ -23,7 +24,7 @@ __all__ = [
 ]
 
 
-@njit(cache=True)
+@kernel()
 def join_chains(
     n_nodes: int, edges: NDArray[np.int32], offsets: NDArray[np.int64], coords: NDArray[np.float64]
 ) -> tuple[NDArray[np.int32], NDArray[np.float64], NDArray[np.int64]]:
@@ -94,7 +95,7 @@ def join_chains(
     return out_edges[:n_out].copy(), out_coords[:size].copy(), out_offsets[: n_out + 1].copy()
 
 
-@njit(cache=True)
+@kernel()
 def measure_edges(offsets: NDArray[np.int64], coords: NDArray[np.float64]) -> NDArray[np.float64]:
     """Return the (E,) lengths of edges; `offsets` (E + 1,), `coords` (C, 2)."""
     lengths = np.zeros(len(offsets) - 1)
@@ -106,7 +107,7 @@ def measure_edges(offsets: NDArray[np.int64], coords: NDArray[np.float64]) -> ND
     return lengths
 
 
-@njit(cache=True)
+@kernel()
 def close_pairs(xy: NDArray[np.float64], by_x: NDArray[np.int64], radius: float) -> NDArray[np.int64]:
     """Find all pairs of points nearer than `radius`, by a sweep along x.
 
@@ -144,7 +145,7 @@ def close_pairs(xy: NDArray[np.float64], by_x: NDArray[np.int64], radius: float)
     return pairs[:size].copy()
 
 
-@njit(cache=True)
+@kernel()
 def draw_together(
     xy: NDArray[np.float64], pairs: NDArray[np.int64], radius: NDArray[np.float64]
 ) -> tuple[NDArray[np.int64], NDArray[np.float64]]:
@@ -202,7 +203,7 @@ def draw_together(
     return cluster, centre
 
 
-@njit(cache=True)
+@kernel()
 def reattach(
     centre: NDArray[np.float64], ends: NDArray[np.int32], offsets: NDArray[np.int64], coords: NDArray[np.float64]
 ) -> tuple[NDArray[np.float64], NDArray[np.int64]]:
@@ -246,7 +247,7 @@ def reattach(
     return out[:size].copy(), out_offsets
 
 
-@njit(cache=True)
+@kernel()
 def _point_at(coords: NDArray[np.float64], lo: int, hi: int, along: float) -> tuple[float, float]:
     """Return the point at arc length `along` of a polyline."""
     done = 0.0
@@ -261,7 +262,7 @@ def _point_at(coords: NDArray[np.float64], lo: int, hi: int, along: float) -> tu
     return coords[hi - 1, 0], coords[hi - 1, 1]
 
 
-@njit(cache=True)
+@kernel()
 def fuse_twins(
     edges: NDArray[np.int32],
     offsets: NDArray[np.int64],
@@ -352,7 +353,7 @@ def fuse_twins(
     return out_edges, out, out_offsets
 
 
-@njit(cache=True)
+@kernel()
 def sample_edges(
     offsets: NDArray[np.int64],
     coords: NDArray[np.float64],
@@ -395,7 +396,7 @@ def sample_edges(
             direction[i, 1] = dy / step if step > 0.0 else 0.0
 
 
-@njit(cache=True)
+@kernel()
 def find_mates(
     xy: NDArray[np.float64],
     direction: NDArray[np.float64],
@@ -477,7 +478,7 @@ def find_mates(
     return mate, np.sqrt(apart), touch
 
 
-@njit(cache=True)
+@kernel()
 def tie_runs(
     starts: NDArray[np.int64],
     lengths: NDArray[np.float64],
@@ -545,7 +546,7 @@ def tie_runs(
     return ties[:size].copy()
 
 
-@njit(cache=True)
+@kernel()
 def cut_edges(
     edges: NDArray[np.int32],
     offsets: NDArray[np.int64],
@@ -615,7 +616,7 @@ def cut_edges(
     return places, out_edges, out, out_offsets
 
 
-@njit(cache=True)
+@kernel()
 def narrow_faces(
     follow: NDArray[np.int64], area: NDArray[np.float64], lengths: NDArray[np.float64], width: float, longest: float
 ) -> NDArray[np.int64]:

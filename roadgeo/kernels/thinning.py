@@ -6,8 +6,9 @@ road pixels only, so its cost grows with the roads, not with the image.
 """
 
 import numpy as np
-from numba import njit
 from numpy.typing import NDArray
+
+from roadgeo.kernels.compilation import kernel
 
 __all__ = ["GROUND", "ROAD", "SOLID", "neighbour_steps", "neighbours", "rethin", "thin", "touches_solid"]
 
@@ -39,7 +40,7 @@ def _roles() -> NDArray[np.uint8]:
 ROLES = _roles()
 
 
-@njit(cache=True)
+@kernel()
 def neighbours(flat: NDArray[np.uint8], p: np.uint64, stride: np.uint64) -> np.uint8:
     """Return one bit for each neighbour that is not GROUND, counterclockwise from east."""
     return np.uint8(
@@ -54,7 +55,7 @@ def neighbours(flat: NDArray[np.uint8], p: np.uint64, stride: np.uint64) -> np.u
     )
 
 
-@njit(cache=True)
+@kernel()
 def touches_solid(flat: NDArray[np.uint8], p: np.uint64, stride: np.uint64) -> bool:
     """Tell whether a neighbour of pixel `p` is SOLID."""
     above = flat[p - stride] | flat[p - stride - np.uint64(1)] | flat[p - stride + np.uint64(1)]
@@ -62,7 +63,7 @@ def touches_solid(flat: NDArray[np.uint8], p: np.uint64, stride: np.uint64) -> b
     return bool((above | below | flat[p - np.uint64(1)] | flat[p + np.uint64(1)]) & SOLID)
 
 
-@njit(cache=True)
+@kernel()
 def neighbour_steps(stride: int) -> NDArray[np.uint64]:
     """Return the (8,) steps to the neighbours in flat indices, counterclockwise from east, modulo 2**64.
 
@@ -71,7 +72,7 @@ def neighbour_steps(stride: int) -> NDArray[np.uint64]:
     return np.array([1, 1 - stride, -stride, -1 - stride, -1, stride - 1, stride, stride + 1]).astype(np.uint64)
 
 
-@njit(cache=True)
+@kernel()
 def _is_ridge(flat: NDArray[np.uint8], depth: NDArray[np.float32], p: np.uint64, steps: NDArray[np.uint64]) -> bool:
     """Tell whether no neighbour that is left lies deeper than pixel `p`."""
     for k in range(8):
@@ -81,7 +82,7 @@ def _is_ridge(flat: NDArray[np.uint8], depth: NDArray[np.float32], p: np.uint64,
     return True
 
 
-@njit(cache=True)
+@kernel()
 def rethin(
     states: NDArray[np.uint8],
     distance: NDArray[np.float32],
@@ -147,7 +148,7 @@ def rethin(
     return left[:n].copy()
 
 
-@njit(cache=True)
+@kernel()
 def thin(states: NDArray[np.uint8], distance: NDArray[np.float32], min_end_depth: float) -> NDArray[np.int32]:
     """Thin the ROAD pixels to lines, in place, the shallow ones first; return the pixels left.
 

@@ -4,9 +4,9 @@ Rows of arrays are copied element by element here: the first assignment of a who
 """
 
 import numpy as np
-from numba import njit
 from numpy.typing import NDArray
 
+from roadgeo.kernels.compilation import kernel
 from roadgeo.kernels.thinning import ROAD, neighbour_steps, neighbours, touches_solid
 
 __all__ = ["smooth_chains", "trace"]
@@ -18,7 +18,7 @@ COUNT = np.array([code.bit_count() for code in range(256)], np.int64)
 LOWEST_BIT = np.array([max((code & -code).bit_length() - 1, 0) for code in range(256)], np.int64)
 
 
-@njit(cache=True)
+@kernel()
 def trace(
     states: NDArray[np.uint8], pixels: NDArray[np.int32], node_of: NDArray[np.int32]
 ) -> tuple[NDArray[np.float64], NDArray[np.bool_], NDArray[np.int32], NDArray[np.int32], NDArray[np.int64]]:
@@ -140,7 +140,7 @@ def trace(
     return xy, is_open[:n_nodes].copy(), edges[:n_edges].copy(), chain[:n_chain].copy(), offsets[: n_edges + 1].copy()
 
 
-@njit(cache=True)
+@kernel()
 def smooth_chains(
     distance: NDArray[np.float32],
     chain: NDArray[np.int32],

@@ -17,9 +17,9 @@ import math
 from typing import Any
 
 import numpy as np
-from numba import njit
 from numpy.typing import NDArray
 
+from roadgeo.kernels.compilation import kernel
 from roadgeo.kernels.rays import rays_agree
 
 UNITS = 72  # per half turn
@@ -47,13 +47,13 @@ ALIKE = np.array(
 )
 
 
-@njit(cache=True)
+@kernel()
 def pair_id(low: int, high: int) -> int:
     """Return the number of the sorted pair of cells low <= high, from 0 to PAIRS - 1."""
     return low * CELLS - (low * (low - 1)) // 2 + (high - low)
 
 
-@njit(cache=True)
+@kernel()
 def vertex_angle(e1x: float, e1y: float, e2x: float, e2y: float, tangent: float) -> float:
     """Return a direction's angle in the equilateral frame, in units, 0 <= angle < 2 UNITS (float)."""
     dx, dy = math.cos(tangent), math.sin(tangent)
@@ -64,7 +64,7 @@ def vertex_angle(e1x: float, e1y: float, e2x: float, e2y: float, tangent: float)
     return angle % (2 * UNITS)
 
 
-@njit(cache=True)
+@kernel()
 def find_sides(tangents: NDArray[np.float32], branches: NDArray[np.int8], sides: NDArray[np.int8]) -> None:
     """Find on which sides branches run along each tangent.
 
@@ -92,13 +92,13 @@ def find_sides(tangents: NDArray[np.float32], branches: NDArray[np.int8], sides:
                 sides[i, t] = FORWARDS if forwards else BACKWARDS
 
 
-@njit(cache=True)
+@kernel()
 def turned(side: int) -> int:
     """Return a side as seen from the other end."""
     return BOTH if side == BOTH else 1 - side
 
 
-@njit(cache=True)
+@kernel()
 def vertex_codes(
     xy: NDArray[np.float64],
     tangents: NDArray[np.float32],
@@ -146,7 +146,7 @@ def vertex_codes(
     return n
 
 
-@njit(cache=True)
+@kernel()
 def orient(xy: NDArray[np.float64], a: int, b: int, c: int, min_shape: float) -> int:
     """Return +1 if a, b, c run counterclockwise, -1 if clockwise, 0 if the triangle is too thin.
 
@@ -162,7 +162,7 @@ def orient(xy: NDArray[np.float64], a: int, b: int, c: int, min_shape: float) ->
     return 1 if cross > 0 else -1
 
 
-@njit(cache=True)
+@kernel()
 def has_both(neighbours: NDArray[np.int32], i: int, j: int, k: int) -> bool:
     """Whether j and k both stand among the neighbours of i."""
     found = 0
@@ -172,7 +172,7 @@ def has_both(neighbours: NDArray[np.int32], i: int, j: int, k: int) -> bool:
     return found == 2
 
 
-@njit(cache=True)
+@kernel()
 def triple_codes(
     xy: NDArray[np.float64],
     tangents: NDArray[np.float32],
@@ -190,7 +190,7 @@ def triple_codes(
     n[2] = vertex_codes(xy, tangents, sides, c, a, b, limit, codes[2])
 
 
-@njit(cache=True)
+@kernel()
 def fill_table(
     xy: NDArray[np.float64],
     tangents: NDArray[np.float32],
@@ -248,7 +248,7 @@ def fill_table(
     return total
 
 
-@njit(cache=True)
+@kernel()
 def vertex_probes(code: NDArray[np.int64], tolerance: int, probes: NDArray[np.int64]) -> int:
     """Write (pair, lows, highs, alike) for every pair of cells that may hold a vertex's `code`; return how many.
 
@@ -283,7 +283,7 @@ def vertex_probes(code: NDArray[np.int64], tolerance: int, probes: NDArray[np.in
     return n
 
 
-@njit(cache=True)
+@kernel()
 def count_alike(
     xy: NDArray[np.float64],
     tangents: NDArray[np.float32],
@@ -333,7 +333,7 @@ def count_alike(
                 costs[i, s, t] = total if n[0] * n[1] * n[2] > 0 else -1
 
 
-@njit(cache=True)
+@kernel()
 def look_up(
     xy: NDArray[np.float64],
     branches: NDArray[np.int8],
@@ -459,7 +459,7 @@ def look_up(
     return n_hits, compared
 
 
-@njit(cache=True)
+@kernel()
 def gather(
     hit_ids: NDArray[np.int64],
     hit_affine: NDArray[np.float64],

@@ -13,7 +13,6 @@ import os
 import re
 import shutil
 import socket
-import sys
 import tempfile
 import time
 from collections.abc import Iterator
@@ -25,13 +24,14 @@ from urllib.parse import urlsplit
 import numpy as np
 
 from roadgeo._arrays import AnyArray
+from roadgeo._folders import cache_dir
 from roadgeo._progress import Say, say_nothing
 from roadgeo._version import __version__
 from roadgeo.errors import RoadSourceError
 from roadgeo.roads.kinds import RoadKind, highways, in_tunnel
 from roadgeo.sources.lines import OSM_ATTRIBUTION, RoadLines, first_line
 
-__all__ = ["FetchOptions", "box_area", "cache_dir", "fetch_lines", "find_place", "read_area", "square"]
+__all__ = ["FetchOptions", "box_area", "fetch_lines", "find_place", "read_area", "square"]
 
 OVERPASS_URL = "https://overpass-api.de/api"
 NOMINATIM_URL = "https://nominatim.openstreetmap.org"
@@ -67,18 +67,6 @@ class FetchOptions:
     timeout_s: float = 180.0
     retries: int = 5
     pause_s: float = 15.0
-
-
-def cache_dir() -> Path:
-    """Folder of fetched answers (`ROADGEO_CACHE` overrides); it need not exist yet."""
-    given = os.environ.get("ROADGEO_CACHE")
-    if given:
-        return Path(given).expanduser()
-    if sys.platform == "win32":
-        return Path(os.environ.get("LOCALAPPDATA") or Path.home() / "AppData" / "Local") / "roadgeo" / "cache"
-    if sys.platform == "darwin":
-        return Path.home() / "Library" / "Caches" / "roadgeo"
-    return Path(os.environ.get("XDG_CACHE_HOME") or Path.home() / ".cache") / "roadgeo"
 
 
 def find_place(place: str, options: FetchOptions, say: Say = say_nothing) -> tuple[Any, str]:
