@@ -8,16 +8,17 @@ import platform
 from collections.abc import Callable
 from functools import lru_cache
 from pathlib import Path
-from typing import Any
+from typing import Any, TypeVar
 
 import numba
 from numba import njit
-from numba.core import config
 
 from roadgeo._folders import cache_dir, private_temporary_dir, writable
 from roadgeo._version import __version__
 
 __all__ = ["kernel", "kernel_folder"]
+
+_Function = TypeVar("_Function", bound=Callable[..., Any])
 
 
 @lru_cache(maxsize=1)
@@ -38,15 +39,17 @@ def kernel_folder() -> Path:
     return folder if writable(folder) else private_temporary_dir() / name
 
 
-def kernel(**options: Any) -> Any:
+def kernel(**options: Any) -> Callable[[_Function], _Function]:
     """Compile a function on its first call, and keep its machine code in `kernel_folder`."""
 
-    def decorate(function: Callable[..., Any]) -> Any:
+    def decorate(function: _Function) -> _Function:
         # The setting is read when a function is decorated; it is put back, for it is everyone's.
+        config: Any = numba.config
         kept = config.CACHE_DIR
         config.CACHE_DIR = os.environ.get("NUMBA_CACHE_DIR") or str(kernel_folder())
         try:
-            return njit(cache=True, **options)(function)
+            compiled: _Function = njit(cache=True, **options)(function)
+            return compiled
         finally:
             config.CACHE_DIR = kept
 
