@@ -17,13 +17,17 @@ from roadgeo.errors import CrsError
 if TYPE_CHECKING:
     from pyproj import Transformer
 
-__all__ = ["LocalPlane", "choose_plane", "from_lonlat", "grid_north", "to_lonlat", "transformer"]
+__all__ = ["LocalPlane", "choose_plane", "from_lonlat", "grid_north", "serves_as_plane", "to_lonlat", "transformer"]
 
 #: UTM reaches from 80 S to 84 N; the polar stereographic planes (UPS) lie beyond.
 _UPS_NORTH, _UPS_SOUTH = 84.0, -80.0
 
 #: A UTM zone is used this far from its central meridian (its own half width is 3 degrees); scale is off by < 0.3 %.
 _UTM_HALF_WIDTH_DEG = 4.5
+
+#: A source's own CRS is kept up to these: UTM at 4.5 degrees reaches 0.27 %, national grids 0.1-0.4 %. A degree of
+#: angular distortion is what tangents measure at best; half of it is not noticed.
+_MOST_SCALE_ERROR, _MOST_ANGLE_DEG = 0.004, 0.5
 
 
 @dataclass(frozen=True)
@@ -54,16 +58,18 @@ class LocalPlane:
         return np.array([[1.0, 0.0, self.origin[0]], [0.0, 1.0, self.origin[1]], [0.0, 0.0, 1.0]])
 
 
-def choose_plane(lonlat: FloatArray) -> LocalPlane:
-    """Choose the metric plane of data by its own longitudes.
+def choose_plane(lonlat: FloatArray, own_crs: str | None = None) -> LocalPlane:
+    """Choose the metric plane of data: its own CRS where that serves, else one chosen by its longitudes.
 
-    UTM where the data fits a zone, UPS in the polar zones, else an oblique stereographic plane around the data's
-    middle: conformal like the others, so that angles between roads are those on the ground.
+    Else means UTM where the data fits a zone, UPS in the polar zones, and elsewhere an oblique stereographic plane
+    around the data's middle: conformal like the others, so that angles between roads are those on the ground.
 
     Parameters
     ----------
     lonlat : (N, 2) float64
         Points spread over the data, degrees; longitudes may lie on both sides of 180 degrees.
+    own_crs : str, optional
+        The CRS that the data came in, where it all came in one: people expect answers in it. See `serves_as_plane`.
 
     Raises
     ------
@@ -79,6 +85,45 @@ def choose_plane(lonlat: FloatArray) -> LocalPlane:
             f"coordinates reach {reach:.6g}, expected degrees of longitude and latitude; "
             "the data's CRS is not what it says: give the right one with --crs"
         )
+    crs = own_crs if own_crs and serves_as_plane(own_crs, points) else _conformal_crs(points)
+    en = np.stack(transformer("EPSG:4326", crs).transform(points[:, 0], points[:, 1]), axis=1)
+    if not np.isfinite(en).all():
+        west, east = _longitudes(points[:, 0])
+        raise CrsError(
+            f"the data spans {east - west:.0f} x {np.ptp(points[:, 1]):.0f} degrees, too much for one plane; "
+            "build one reference for each region"
+        )
+    center = (en.min(axis=0) + en.max(axis=0)) / 2
+    return LocalPlane(crs, (float(round(center[0], -3)), float(round(center[1], -3))))
+
+
+def serves_as_plane(crs: str, lonlat: FloatArray) -> bool:
+    """Whether a CRS measures metres east and north, true enough to scale and angle at all of (N, 2) degrees.
+
+    Web Mercator fails by its scale, an equal-area CRS away from its middle by its angles, a CRS in feet by its unit.
+    """
+    from pyproj import CRS, Geod
+
+    known = CRS.from_user_input(crs)
+    axes = {(axis.direction, axis.unit_name) for axis in known.axis_info[:2]}
+    if not known.is_projected or axes != {("east", "metre"), ("north", "metre")}:
+        return False
+    # Steps of 100 m on the ellipsoid, measured in the CRS: this needs no trust in what a projection says of itself.
+    some = lonlat[:: max(len(lonlat) // 200, 1)]
+    lon, lat = np.concatenate((some, lonlat[lonlat.argmin(axis=0)], lonlat[lonlat.argmax(axis=0)])).T
+    steps = []
+    for azimuth in (0.0, 90.0):
+        ahead = Geod(ellps="WGS84").fwd(lon, lat, np.full(len(lon), azimuth), np.full(len(lon), 100.0))[:2]
+        ends = [np.stack(transformer("EPSG:4326", crs).transform(*one), axis=1) for one in ((lon, lat), ahead)]
+        steps.append((ends[1] - ends[0]) / 100.0)
+    scales = np.hypot(*np.moveaxis(np.stack(steps), -1, 0))
+    skew = np.sum(steps[0] * steps[1], axis=1) / scales.prod(axis=0)
+    most_skew = np.sin(np.radians(_MOST_ANGLE_DEG))
+    return bool((np.abs(scales - 1.0) <= _MOST_SCALE_ERROR).all() and (np.abs(skew) <= most_skew).all())
+
+
+def _conformal_crs(points: FloatArray) -> str:
+    """Return the UTM, UPS or oblique stereographic CRS that fits (N, 2) degrees."""
     west, east = _longitudes(points[:, 0])
     south, north = points[:, 1].min(), points[:, 1].max()
     lon, lat = (west + east) / 2, float(south + north) / 2
@@ -86,19 +131,10 @@ def choose_plane(lonlat: FloatArray) -> LocalPlane:
     meridian = 6.0 * zone - 183.0
     middle = lon - meridian - 360.0 * np.round((lon - meridian) / 360.0)
     if lat > _UPS_NORTH or lat < _UPS_SOUTH:
-        crs = "EPSG:5041" if lat > 0 else "EPSG:5042"
-    elif abs(middle) + (east - west) / 2 <= _UTM_HALF_WIDTH_DEG:
-        crs = f"EPSG:{32600 + zone if lat >= 0 else 32700 + zone}"
-    else:
-        crs = _stereographic(round((lon + 180.0) % 360.0 - 180.0, 2), round(lat, 2))
-    en = np.stack(transformer("EPSG:4326", crs).transform(points[:, 0], points[:, 1]), axis=1)
-    if not np.isfinite(en).all():
-        raise CrsError(
-            f"the data spans {east - west:.0f} x {north - south:.0f} degrees, too much for one plane; "
-            "build one reference for each region"
-        )
-    center = (en.min(axis=0) + en.max(axis=0)) / 2
-    return LocalPlane(crs, (float(round(center[0], -3)), float(round(center[1], -3))))
+        return "EPSG:5041" if lat > 0 else "EPSG:5042"
+    if abs(middle) + (east - west) / 2 <= _UTM_HALF_WIDTH_DEG:
+        return f"EPSG:{32600 + zone if lat >= 0 else 32700 + zone}"
+    return _stereographic(round((lon + 180.0) % 360.0 - 180.0, 2), round(lat, 2))
 
 
 def to_lonlat(crs: str, en: FloatArray) -> FloatArray:

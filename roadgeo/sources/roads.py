@@ -212,7 +212,9 @@ def _join(sources: Sequence[RoadLines], meta: dict[str, Any], attribution: str |
     filled = [source for source in sources if len(source.lines)]
     if not filled:
         raise RoadSourceError(f"{_names(sources)}: no roads of the kind asked for; try another --kinds or area")
-    plane = choose_plane(np.concatenate([_spread(source) for source in filled]))
+    shared = {source.crs for source in filled}
+    own_crs = shared.pop() if len(shared) == 1 else None
+    plane = choose_plane(np.concatenate([_spread(source) for source in filled]), own_crs)
     lines = np.concatenate([_to_plane(source, plane) for source in filled])
     calls = dict.fromkeys(source.meta["attribution"] for source in filled if source.meta.get("attribution"))
     return Roads(
@@ -220,6 +222,7 @@ def _join(sources: Sequence[RoadLines], meta: dict[str, Any], attribution: str |
         plane,
         {
             **meta,
+            "plane": "the source's own CRS" if plane.crs == own_crs else "a metric CRS chosen for the place",
             "sources": [source.meta for source in sources],
             "attribution": "; ".join(calls) if attribution is None else attribution,
         },

@@ -5,7 +5,7 @@ from hypothesis import strategies as st
 from pyproj import CRS, Geod
 
 from roadgeo.errors import CrsError
-from roadgeo.geometry.projection import LocalPlane, choose_plane, from_lonlat, to_lonlat
+from roadgeo.geometry.projection import LocalPlane, choose_plane, from_lonlat, serves_as_plane, to_lonlat
 
 
 def spread(lon, lat, width=0.2, height=0.2):
@@ -102,3 +102,26 @@ def test_any_region_goes_there_and_back_with_true_angles(lon, lat, width, height
     assert abs(east @ north) / (np.hypot(*east) * np.hypot(*north)) < 1e-3
     assert np.hypot(*east) == pytest.approx(np.hypot(*north), rel=2e-3)
     assert np.hypot(*east) == pytest.approx(100.0, rel=0.03)
+
+
+@pytest.mark.parametrize(
+    ("crs", "lonlat", "kept"),
+    [
+        ("EPSG:26986", [[-71.2, 42.2], [-70.9, 42.4]], True),  # Massachusetts, metres
+        ("EPSG:2249", [[-71.2, 42.2], [-70.9, 42.4]], False),  # the same in feet
+        ("EPSG:26986", [[120.0, -20.0], [120.1, -20.1]], False),  # far from where it is meant for
+        ("EPSG:2154", [[2.0, 48.0], [8.0, 43.0]], True),  # France
+        ("EPSG:2056", [[7.0, 47.0], [8.0, 46.0]], True),  # Switzerland
+        ("EPSG:27700", [[-2.0, 52.0], [0.0, 51.0]], True),  # Great Britain
+        ("EPSG:3035", [[4.0, 50.0], [4.2, 50.1]], True),  # equal area, near enough to its middle
+        ("EPSG:3035", [[-8.6, 41.1], [-8.5, 41.2]], False),  # equal area: angles are off by a degree in Porto
+        ("EPSG:3857", [[-71.2, 42.2], [-70.9, 42.4]], False),
+        ("EPSG:3857", [[10.0, 0.0], [10.1, 0.1]], False),  # not conformal even at the equator
+        ("EPSG:4326", [[-71.2, 42.2], [-70.9, 42.4]], False),
+        ("EPSG:2053", [[29.0, -26.0], [29.1, -26.1]], False),  # axes west and south
+    ],
+)
+def test_a_projected_source_keeps_its_crs_where_that_is_true_enough(crs, lonlat, kept):
+    points = np.array(lonlat)
+    assert serves_as_plane(crs, points) is kept
+    assert (choose_plane(points, crs).crs == crs) is kept
