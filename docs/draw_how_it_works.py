@@ -29,7 +29,7 @@ from matplotlib.collections import LineCollection
 
 INK, FAINT, PAPER, MAP = "#262a30", "#6e7278", "#f3f1ec", "#babcbe"
 ROAD, CROSSING, FRAME, AGREES = "#e4572e", "#1b263b", "#1f6fb4", "#008080"
-COLORS = ("#d3128b", "#2f55d4", "#e07b00")  # the three crossings of the triple
+COLORS = ("#d3128b", "#2f55d4", "#e07b00")  # the three intersections of the triple
 CORNERS = np.array([[0.0, 0.0], [1.0, 0.0], [0.5, np.sqrt(0.75)]])
 STAGES = (3, 12, 40)  # matches after which a grown homography is drawn
 
@@ -55,8 +55,8 @@ def main() -> None:
     figure.get_layout_engine().set(w_pad=0.12, h_pad=0.1)
     titles = (
         "1  The mask: where there is road",
-        "2  Its roads, crossings and their directions",
-        "3  Three crossings, made equilateral",
+        "2  Its roads, intersections and their directions",
+        "3  Three intersections, made equilateral",
         f"4  The code looked up on the map: {len(hits)} fit",
         "5  The right one grows outwards",
         "6  All roads are compared: located",
@@ -151,7 +151,7 @@ def draw_lines(ax: Axes, lines: list[np.ndarray], color: str, width: float, **mo
 
 
 def draw_sticks(ax: Axes, xy: np.ndarray, directions: np.ndarray, half: float, color: str, width: float) -> None:
-    """Draw tangents as short lines through a crossing."""
+    """Draw tangents as short lines through an intersection."""
     for angle in directions[~np.isnan(directions)]:
         step = half * np.array([np.cos(angle), np.sin(angle)])
         ax.plot(*np.array([xy - step, xy + step]).T, color=color, lw=width, solid_capstyle="round")
@@ -271,7 +271,7 @@ def draw_growth(
     for stage, shade in zip((*STAGES, len(order)), shades, strict=True):
         matrix = fit(*(first if stage == 3 else (points[order[:stage]] for points in pairs)))
         outline = apply(matrix, np.vstack([scene.corners, scene.corners[:1]]))
-        ax.plot(*outline.T, color=shade, lw=2.4, label=f"{stage} crossings", zorder=4)
+        ax.plot(*outline.T, color=shade, lw=2.4, label=f"{stage} intersections", zorder=4)
     stage_of = np.searchsorted(STAGES, np.argsort(order), side="right")
     ax.scatter(*pairs[1].T, c=shades[stage_of], s=34, ec="white", lw=0.8, zorder=5)
     draw_triangle(ax, index.xy[hit], 6)
@@ -307,7 +307,7 @@ def draw_location(
     ax.plot(*outline.T, color=FRAME, lw=3, zorder=4)
     told = location.to_dict()
     text = (
-        f"{told['n_matched']} of {told['n_intersections']} crossings match\n"
+        f"{told['n_matched']} of {told['n_intersections']} intersections match\n"
         f"odds against chance $10^{{{told['log10_odds']:.0f}}}$\n"
         f"corners ± {max(told['corner_sigma_m']):.1f} m"
     )
