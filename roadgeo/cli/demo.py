@@ -104,10 +104,11 @@ def _errors(found: dict[str, Any], mask: DemoMask) -> tuple[float, float]:
     import numpy as np
     import pyproj
 
+    from roadgeo.geometry.frame import Frame
     from roadgeo.geometry.homography import Homography
 
-    width, height = found["size"]
-    pixels = np.array([[width / 2, height / 2], [0, 0], [width, 0], [width, height], [0, height]], float)
+    frame = Frame(*found["size"])
+    pixels = np.vstack((frame.center, frame.corners))
     x, y = Homography(mask.homography)(pixels).T
     truth = np.stack(pyproj.Transformer.from_crs(mask.crs, found["crs"], always_xy=True).transform(x, y), axis=1)
     distances = np.hypot(*(Homography(np.array(found["homography"]))(pixels) - truth).T)

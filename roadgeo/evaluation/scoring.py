@@ -16,6 +16,7 @@ import numpy as np
 
 from roadgeo._arrays import FloatArray
 from roadgeo.evaluation.truth import Truth
+from roadgeo.geometry.frame import Frame
 from roadgeo.geometry.homography import Homography
 from roadgeo.geometry.projection import transformer
 
@@ -112,10 +113,10 @@ def score(truth: Truth, location: Mapping[str, Any] | None, radius_m: float = RA
     )
     if location.get("homography") is None or not truth.on_map:
         return answered
-    width, height = location.get("size") or truth.size
-    frame = np.array([[width / 2, height / 2], [0, 0], [width, 0], [width, height], [0, height]], float)
-    found = Homography(np.array(location["homography"], float)).facing(frame[0])(frame)
-    errors = np.hypot(*(found - _true_points(truth, frame, location.get("crs"))).T)
+    frame = Frame(*(location.get("size") or truth.size))
+    points = np.vstack((frame.center, frame.corners))
+    found = Homography(np.array(location["homography"], float)).facing(frame.center)(points)
+    errors = np.hypot(*(found - _true_points(truth, points, location.get("crs"))).T)
     return replace(
         answered,
         right=answered.located and bool(errors[0] <= radius_m),

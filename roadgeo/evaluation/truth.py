@@ -33,6 +33,7 @@ import numpy as np
 
 from roadgeo._arrays import FloatArray
 from roadgeo.errors import RoadSourceError
+from roadgeo.geometry.frame import Frame
 from roadgeo.geometry.homography import Homography
 from roadgeo.storage.files import write_text
 from roadgeo.storage.geopackage import Layer, write_layers
@@ -77,8 +78,7 @@ class Truth:
     @property
     def footprint(self) -> FloatArray:
         """(4, 2) corners TL, TR, BR, BL in the CRS."""
-        width, height = self.size
-        return Homography(self.homography)(np.array([[0, 0], [width, 0], [width, height], [0, height]], float))
+        return Homography(self.homography)(Frame(*self.size).corners)
 
     @property
     def center(self) -> FloatArray:

@@ -12,6 +12,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from roadgeo._arrays import BoolArray, FloatArray
+from roadgeo.geometry.frame import Frame
 
 __all__ = ["PIXEL_TO_PLANE", "RoadMask", "pixel_to_plane", "plane_to_pixel"]
 
@@ -59,4 +60,4 @@ class RoadMask:
     def corners(self) -> FloatArray:
         """(4, 2) pixel positions of the frame's corners TL, TR, BR, BL."""
         height, width = self.shape
-        return np.array([[0, 0], [width, 0], [width, height], [0, height]], float)
+        return Frame(width, height).corners

@@ -8,6 +8,7 @@ import cv2
 import numpy as np
 
 from roadgeo._arrays import AnyArray, FloatArray
+from roadgeo.geometry.frame import Frame
 from roadgeo.geometry.homography import Homography
 
 __all__ = ["View", "make_view", "polygon_area", "sees_ground", "warp_mask"]
@@ -39,8 +40,7 @@ class View:
     @property
     def corners(self) -> FloatArray:
         """(4, 2) pixel positions of the frame's corners TL, TR, BR, BL."""
-        width, height = self.size_px
-        return np.array([[0, 0], [width, 0], [width, height], [0, height]], float)
+        return Frame(*self.size_px).corners
 
     @property
     def footprint(self) -> FloatArray:

@@ -10,6 +10,7 @@ import cv2
 import numpy as np
 
 from roadgeo._arrays import AnyArray, FloatArray
+from roadgeo.geometry.frame import Frame
 from roadgeo.geometry.homography import Homography
 
 __all__ = ["MapGrid", "Transform", "choose_grid", "cover", "source_pixels", "warp"]
@@ -74,7 +75,7 @@ def cover(
 
     The grid may have NaN bounds where the image lies outside what the target CRS is made for.
     """
-    corners = np.array([[0, 0], [size[0], 0], size, [0, size[1]]], float)
+    corners = Frame(*size).corners
     sides = zip(corners, np.roll(corners, -1, axis=0), strict=True)
     outline = np.concatenate([np.linspace(a, b, _PER_SIDE)[:-1] for a, b in sides])
     cross = corners.mean(axis=0) + np.array([[-0.5, 0], [0.5, 0], [0, -0.5], [0, 0.5]])

@@ -8,6 +8,7 @@ import cv2
 import numpy as np
 
 from roadgeo._arrays import AnyArray, BoolArray, Float32Array, FloatArray, Int32Array
+from roadgeo.geometry.frame import Frame
 from roadgeo.kernels.buckets import nearest_neighbours
 from roadgeo.matching.index import neighbour_grid, sort_by_bucket
 from roadgeo.roads.graph import RoadGraph
@@ -75,18 +76,17 @@ class Scene:
     @property
     def center(self) -> FloatArray:
         """(2,) middle of the frame."""
-        return np.array([self.size[0] / 2.0, -self.size[1] / 2.0])
+        return Frame(*self.size).plane_center
 
     @property
     def corners(self) -> FloatArray:
         """(4, 2) corners TL, TR, BR, BL of the frame."""
-        width, height = self.size
-        return np.array([[0, 0], [width, 0], [width, -height], [0, -height]], float)
+        return Frame(*self.size).plane_corners
 
     @property
     def half_size(self) -> float:
         """Half the frame's diagonal in pixels."""
-        return float(np.hypot(*self.size)) / 2.0
+        return Frame(*self.size).half_diagonal
 
 
 def query_neighbours(xy: FloatArray, k: int) -> Int32Array:

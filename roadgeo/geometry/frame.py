@@ -1,0 +1,45 @@
+"""The frame of an image: its size, and the points that everything asks of it."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass
+
+import numpy as np
+
+from roadgeo._arrays import FloatArray
+
+__all__ = ["Frame"]
+
+
+@dataclass(frozen=True)
+class Frame:
+    """Width and height of an image, pixels. Positions are (column, row) in GDAL's corner convention."""
+
+    width: float
+    height: float
+
+    @property
+    def corners(self) -> FloatArray:
+        """(4, 2) pixel positions of the corners TL, TR, BR, BL."""
+        return np.array([[0.0, 0.0], [self.width, 0.0], [self.width, self.height], [0.0, self.height]])
+
+    @property
+    def center(self) -> FloatArray:
+        """(2,) pixel position of the middle."""
+        return np.array([self.width / 2, self.height / 2])
+
+    @property
+    def half_diagonal(self) -> float:
+        """Distance from the middle to a corner, pixels."""
+        return math.hypot(self.width, self.height) / 2
+
+    @property
+    def plane_corners(self) -> FloatArray:
+        """(4, 2) corners TL, TR, BR, BL on the query plane: y up (see `geometry.mask`)."""
+        return self.corners * (1.0, -1.0)
+
+    @property
+    def plane_center(self) -> FloatArray:
+        """(2,) the middle on the query plane: y up."""
+        return self.center * (1.0, -1.0)
