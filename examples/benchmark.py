@@ -49,10 +49,10 @@ from roadgeo.evaluation.simulation import SimulationOptions, ViewOptions, simula
 from roadgeo.evaluation.trials import Mask, MaskFiles, QuerySet, Trial, run_trials  # noqa: E402
 from roadgeo.evaluation.truth import Truth, read_truth  # noqa: E402
 from roadgeo.geometry.pinhole import make_view, sees_ground  # noqa: E402
-from roadgeo.reference.reference import build_reference, open_reference  # noqa: E402
+from roadgeo.reference.reference import open_reference  # noqa: E402
 from roadgeo.roads.simplification import planarize  # noqa: E402
 from roadgeo.sources.masks import read_mask  # noqa: E402
-from roadgeo.workflows import LocateOptions, locate  # noqa: E402
+from roadgeo.workflows import LocateOptions, build_reference, locate  # noqa: E402
 
 TILTED = ViewOptions(
     gsd_m=(0.7, 1.4), tilt_deg=(0.0, 30.0), heading_deg=(0.0, 360.0), focal_px=1500.0, road_width_px=(9.0, 10.0)

@@ -19,8 +19,9 @@ if TYPE_CHECKING:
     from roadgeo.errors import RoadgeoError
     from roadgeo.geometry.mask import RoadMask
     from roadgeo.location import Location
-    from roadgeo.reference.reference import BuildOptions, Reference, build_reference, open_reference
-    from roadgeo.workflows import LocateOptions, explain, locate
+    from roadgeo.matching.options import LocateOptions
+    from roadgeo.reference.reference import BuildOptions, Reference, open_reference
+    from roadgeo.workflows import build_reference, explain, locate
 
 __all__ = [
     "BuildOptions",
@@ -38,12 +39,12 @@ __all__ = [
 
 _HOMES = {
     "BuildOptions": "reference.reference",
-    "LocateOptions": "workflows",
+    "LocateOptions": "matching.options",
     "Location": "location",
     "Reference": "reference.reference",
     "RoadMask": "geometry.mask",
     "RoadgeoError": "errors",
-    "build_reference": "reference.reference",
+    "build_reference": "workflows",
     "explain": "workflows",
     "locate": "workflows",
     "open_reference": "reference.reference",

@@ -46,20 +46,18 @@ def demo_command(out_dir: str) -> int:
     from roadgeo.cli.batch import Task
     from roadgeo.cli.compilation import compile_once
     from roadgeo.cli.folders import make_folder
-    from roadgeo.cli.index import build
     from roadgeo.cli.locate import Job
     from roadgeo.demo import ATTRIBUTION, PHOTO, ROADS, demo_masks
     from roadgeo.outputs.location_files import OutputOptions
-    from roadgeo.sources.roads import read_roads
     from roadgeo.storage.files import write_bytes
-    from roadgeo.workflows import LocateOptions
+    from roadgeo.workflows import LocateOptions, build_reference
 
     folder, masks = Path(out_dir), demo_masks()
     make_folder(folder / "masks")
     for source, name in [(ROADS, ROADS.name), (PHOTO, PHOTO.name), *((m.path, f"masks/{m.path.name}") for m in masks)]:
         write_bytes(folder / name, source.read_bytes())
     started = perf_counter()
-    reference = build(read_roads(ROADS, attribution=ATTRIBUTION), folder / "porto.gpkg", "porto")
+    reference = build_reference(ROADS, "porto", path=folder / "porto.gpkg", attribution=ATTRIBUTION)
     seconds = perf_counter() - started
     click.echo(f"Porto, {ATTRIBUTION}: {len(reference.index):,} intersections, indexed in {seconds:.1f} s")
     compile_once(reference, quiet=False)

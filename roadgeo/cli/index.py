@@ -8,14 +8,13 @@ from typing import TYPE_CHECKING, Any
 
 import click
 
-from roadgeo._progress import Say, say_nothing
+from roadgeo._progress import Say
 from roadgeo.cli.parameters import BOX, NEAR, Plugin, verbosity_options
 
 if TYPE_CHECKING:
-    from roadgeo.reference.reference import Reference
     from roadgeo.sources.roads import Roads
 
-__all__ = ["build", "index_command"]
+__all__ = ["index_command"]
 
 
 @click.command("index", short_help="Build a reference: the searchable roads of a place.")
@@ -105,6 +104,7 @@ def index_command(
     from roadgeo.cli.progress import show_steps
     from roadgeo.reference.files import reference_freshness
     from roadgeo.reference.library import make_slug, new_reference
+    from roadgeo.workflows import build_reference, update_reference
 
     started = perf_counter()
     if rebuild is not None:
@@ -121,7 +121,10 @@ def index_command(
     read = {"roads": _read, "plugin": _read_plugin}.get(given, _fetch)
     with show_steps(quiet) as say:
         roads = read(source, given, say)
-        reference = renew(roads, path, say) if update else build(roads, path, make_slug(name), say)
+        if update:
+            reference = update_reference(path, roads, say)
+        else:
+            reference = build_reference(roads, make_slug(name), path=path, say=say)
     compile_once(reference, quiet)
     if verbose:
         for key, value in roads.meta.items():
@@ -131,32 +134,6 @@ def index_command(
         click.echo(
             f"{path}: {len(reference.index):,} intersections in {seconds:.1f} s; search it with `roadgeo locate`"
         )
-
-
-def build(roads: Roads, path: Path, name: str, say: Say = say_nothing) -> Reference:
-    """Build a reference from roads on their plane, write it and open it.
-
-    Raises
-    ------
-    RoadSourceError
-        There are too few intersections.
-    OutputError
-        It cannot be written.
-    """
-    from roadgeo.matching.index import build_index
-    from roadgeo.reference.network_file import as_stored
-    from roadgeo.reference.reference import Reference, build_network, open_reference
-
-    network = as_stored(build_network(roads.lines, roads.plane, {"name": name, **roads.meta}, say=say))
-    Reference(build_index(network, say=say), network).save(path, say)
-    return open_reference(path)  # as `locate` has it: memory-mapped arrays are another type to compiled code
-
-
-def renew(roads: Roads, path: Path, say: Say = say_nothing) -> Reference:
-    """Replace a reference's roads by others on their ground, write and open it; see `workflows.update_reference`."""
-    from roadgeo.reference.reference import update_reference
-
-    return update_reference(path, roads, say)
 
 
 def _rebuild(name: str, quiet: bool) -> None:

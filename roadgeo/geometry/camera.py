@@ -4,18 +4,31 @@ from __future__ import annotations
 
 import math
 from dataclasses import dataclass
+from enum import Enum
 
 import numpy as np
 
 from roadgeo._arrays import FloatArray
 
-__all__ = ["CameraOptions", "CameraPose", "judge", "pose", "sampling"]
+__all__ = ["CameraFault", "CameraOptions", "CameraPose", "judge", "pose", "sampling"]
 
 _FOCAL_STEPS = np.geomspace(0.35, 8.0, 25)
 #: Focal length that is taken where none fits better: in halves of the frame's diagonal, that of a usual lens.
 _USUAL_FOCAL = 1.5
 #: How much more skew a usual focal length may leave than one e times as long.
 _FOCAL_PRIOR = 0.01
+
+
+class CameraFault(Enum):
+    """Why no camera within the options can have seen a homography; the value is the text for people."""
+
+    DEGENERATE = "degenerate"
+    HORIZON = "horizon in the frame"
+    MIRRORED = "mirrored"
+    SAMPLING = "ground sampling out of range"
+    SKEW = "no camera sees a plane so"
+    TILT = "tilt out of range"
+    NOT_NORTH_UP = "not north up"
 
 
 @dataclass(frozen=True)
@@ -138,33 +151,33 @@ def pose(matrix: FloatArray, size: tuple[int, int], focal_px: float | None = Non
     return CameraPose(gsd, rotation, float(fits.tilt_deg[best]), float(fits.focal_px[best]), float(fits.skew[best]))
 
 
-def judge(matrix: FloatArray, size: tuple[int, int], options: CameraOptions, rough: bool = False) -> str:
-    """Return why a homography is not plausible, or "" if it is.
+def judge(matrix: FloatArray, size: tuple[int, int], options: CameraOptions, rough: bool = False) -> CameraFault | None:
+    """Return why a homography is not plausible, or None if it is.
 
     Some camera within the options must fit about as well as any. A `rough` homography, of a few matches only, may still
     become plausible: its bounds are wider.
     """
     if not np.isfinite(matrix).all():
-        return "degenerate"
+        return CameraFault.DEGENERATE
     width, height = size
     corners = np.array([[0, 0, 1], [width, 0, 1], [width, -height, 1], [0, -height, 1]], float)
     middle = float(matrix[2] @ (width / 2.0, -height / 2.0, 1.0))
     if middle == 0.0:
-        return "degenerate"
+        return CameraFault.DEGENERATE
     if (corners @ matrix[2] / middle < 0.05).any():
-        return "horizon in the frame"
+        return CameraFault.HORIZON
     if np.linalg.det(matrix) / middle**3 <= 0:
-        return "mirrored"
+        return CameraFault.MIRRORED
     slack_deg, slack, further = (15.0, 1.25, 0.2) if rough else (5.0, 1.0, 0.1)
     if not options.gsd_m[0] / slack <= sampling(matrix, size) <= options.gsd_m[1] * slack:
-        return "ground sampling out of range"
+        return CameraFault.SAMPLING
     fits = _pinholes(matrix, size, options.focal_px)
     if fits.skew.min() > options.max_skew * slack:
-        return "no camera sees a plane so"
+        return CameraFault.SKEW
     if fits.tilt_deg[fits.skew <= fits.skew.min() + further].min() > options.max_tilt_deg + slack_deg:
-        return "tilt out of range"
+        return CameraFault.TILT
     if options.north_up:
         jacobian = _jacobian(matrix, np.array([width / 2.0, -height / 2.0]))
         if abs(math.degrees(math.atan2(jacobian[0, 1], jacobian[1, 1]))) > slack_deg:
-            return "not north up"
-    return ""
+            return CameraFault.NOT_NORTH_UP
+    return None

@@ -12,12 +12,13 @@ from typing import Protocol
 import numpy as np
 
 from roadgeo._arrays import BoolArray, FloatArray, IntArray
-from roadgeo.geometry.camera import CameraOptions, judge, sampling
+from roadgeo.geometry.camera import CameraFault, CameraOptions, judge, sampling
 from roadgeo.kernels.growth import grow_each
 from roadgeo.kernels.roads import screen
 from roadgeo.matching.index import ReferenceIndex
 from roadgeo.matching.refinement import Refined, RefineOptions, refine
 from roadgeo.matching.scene import Scene
+from roadgeo.matching.trace import NO_TRACE, Trace
 from roadgeo.matching.triples import Proposals, TripleOptions, larger, propose, smaller
 from roadgeo.matching.verification import Agreement, VerifyOptions, agreement, chance_agreement, log10_odds
 
@@ -149,7 +150,7 @@ class MatchOptions:
 
 @dataclass
 class Hypothesis:
-    """A grown hypothesis and what came of it."""
+    """A grown hypothesis and what came of it; `fault` is the camera's last objection, None where it had none."""
 
     matrix: FloatArray
     seeds: IntArray
@@ -161,6 +162,7 @@ class Hypothesis:
     distance: FloatArray | None = None
     gsd_m: float = np.nan
     log10_odds: float = -np.inf
+    fault: CameraFault | None = None
 
 
 class TripleEstimator:
@@ -172,9 +174,11 @@ class TripleEstimator:
         index: ReferenceIndex,
         options: MatchOptions | None = None,
         near: tuple[float, float, float] | None = None,
+        trace: Trace = NO_TRACE,
     ) -> None:
         """`near` = (x, y, radius) in plane metres restricts where the middle of the frame may lie."""
         self.near = near
+        self.trace = trace
         self.refine_s = 0.0
         # The least that chance reached at the places verified so far: a place that is not promising against it is none.
         self.least_chance = np.array([0.05, 0.2, 0.05])
@@ -218,7 +222,7 @@ class TripleEstimator:
             0,
         )
         other._screen(proposals)
-        other._grow(proposals, np.arange(1))
+        other.grow(proposals, np.arange(1))
         x, y = self.index.xy[0] - self.scene.center
         matrix = np.array([[1.0, 0.0, x], [0.0, 1.0, y], [0.0, 0.0, 1.0]])
         hypothesis = Hypothesis(matrix, np.empty(0, np.int64), 0.0, np.full(n, -1))
@@ -234,7 +238,8 @@ class TripleEstimator:
         reach = np.hypot(*(scene.intersections.xy[last[last >= 0]] - anchor).T).max(initial=0.0)
         near = np.argsort(away, kind="stable")[: options.screen_points]
         near = near[away[near] < reach]
-        looked_at = np.flatnonzero(self._is_allowed(proposals))[: options.max_screened]
+        allowed = self._is_allowed(proposals)
+        looked_at = np.flatnonzero(allowed)[: options.max_screened]
         self.n_screened += len(looked_at)
         shares = np.zeros(len(looked_at))
         screen(
@@ -246,7 +251,9 @@ class TripleEstimator:
         )  # fmt: skip
         good = shares >= options.screen_share
         kept, shares = looked_at[good], shares[good]
-        return kept[np.argsort(-(proposals.placed[kept] + shares), kind="stable")]
+        kept = kept[np.argsort(-(proposals.placed[kept] + shares), kind="stable")]
+        self.trace.screened(proposals, allowed, kept)
+        return kept
 
     def _is_allowed(self, proposals: Proposals) -> BoolArray:
         """Tell which proposals put the frame's middle where it may be, and its up where it may point."""
@@ -260,7 +267,7 @@ class TripleEstimator:
             allowed &= np.abs(np.arctan2(j01, j11)) < math.radians(_ROUGHLY_DEG)
         return allowed
 
-    def _grow(self, proposals: Proposals, chosen: IntArray) -> list[Hypothesis]:
+    def grow(self, proposals: Proposals, chosen: IntArray) -> list[Hypothesis]:
         """Grow the chosen proposals of one anchor; return those that did not wither, the best supported first."""
         options, scene, index = self.options.grow, self.scene, self.index
         xy, anchor = scene.intersections.xy, proposals.anchor
@@ -292,25 +299,26 @@ class TripleEstimator:
         options = self.options.grow
         chosen = self._screen(proposals)[: options.max_grown]
         self.n_hypotheses += len(chosen)
+        grown = self.grow(proposals, chosen)
+        self.trace.grown(grown)
         distinct: list[Hypothesis] = []
-        for h in self._grow(proposals, chosen):
-            if self._is_plausible(h) and not any(self.same(h, other) for other in distinct):
+        for h in grown:
+            h.fault = self.judge(h.matrix, rough=True)
+            if h.fault is not None:
+                self.trace.refused(h.fault, h.matrix)
+            elif not any(self.same(h, other) for other in distinct):
                 distinct.append(h)
                 if len(distinct) == options.max_verified:
                     break
         return distinct
 
-    def _is_plausible(self, hypothesis: Hypothesis) -> bool:
-        """Whether a camera can have seen a grown hypothesis."""
-        return not self._judge(hypothesis.matrix, rough=True)
-
     def score(self, model: Hypothesis) -> float:
         """Refine a hypothesis and return its log10 odds."""
         started = time.perf_counter()
-        try:
-            return self._verify(model)
-        finally:
-            self.refine_s += time.perf_counter() - started
+        model.log10_odds = self._verify(model)
+        self.refine_s += time.perf_counter() - started
+        self.trace.scored(model)
+        return model.log10_odds
 
     def _verify(self, model: Hypothesis) -> float:
         self.n_verified += 1
@@ -342,7 +350,8 @@ class TripleEstimator:
         best = -1.0
         for _ in range(5):
             refined = refine(model.matrix, scene, self.index, model.matched, self.refine_options, n_points)
-            if refined is None or self._judge(refined.matrix) or self._is_far(refined.matrix):
+            model.fault = None if refined is None else self.judge(refined.matrix)
+            if refined is None or model.fault is not None or self._is_far(refined.matrix):
                 return model.refined is not None and best >= 0.0
             gsd = sampling(refined.matrix, scene.size)
             found, matched, distance = agreement(
@@ -358,8 +367,8 @@ class TripleEstimator:
                 break
         return True
 
-    def _judge(self, matrix: FloatArray, rough: bool = False) -> str:
-        """Return why a homography is not plausible for the camera, or "" if it is."""
+    def judge(self, matrix: FloatArray, rough: bool = False) -> CameraFault | None:
+        """Return why a homography is not plausible for the camera, or None if it is."""
         return judge(matrix, self.scene.size, self.options.camera, rough)
 
     def _is_far(self, matrix: FloatArray) -> bool:

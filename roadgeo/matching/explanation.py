@@ -38,33 +38,35 @@ from typing import Any
 import numpy as np
 
 from roadgeo._arrays import BoolArray, FloatArray, IntArray
-from roadgeo.geometry.camera import CameraOptions, pose, sampling
+from roadgeo.geometry.camera import CameraFault, CameraOptions, pose, sampling
 from roadgeo.geometry.projection import to_lonlat
 from roadgeo.kernels.roads import forward_distances
 from roadgeo.location import Location, Place
-from roadgeo.matching.estimator import Hypothesis, MatchOptions, TripleEstimator
-from roadgeo.matching.index import ReferenceIndex
+from roadgeo.matching.estimator import Hypothesis, TripleEstimator
+from roadgeo.matching.methods import Found
+from roadgeo.matching.query import Query
 from roadgeo.matching.scene import Scene
 from roadgeo.matching.search import SearchResult
 from roadgeo.matching.triples import Proposals
+from roadgeo.matching.verdict import Needed
 from roadgeo.matching.verification import Agreement, agreement, tolerance_m
 from roadgeo.roads.graph import RoadGraph
 
-__all__ = ["SCHEMA", "Explanation", "Funnel", "Needed", "RejectedPlace", "Story", "WatchedEstimator", "tell"]
+__all__ = ["SCHEMA", "Explanation", "Funnel", "Record", "RejectedPlace", "Story", "tell"]
 
 SCHEMA = "roadgeo.explanation/1"
 
 #: Places that are shown, places that a camera refused which are looked at again, and how many of those are kept.
 _MAX_PLACES, _MAX_RETRIED, _MAX_REFUSED, _MAX_ELSEWHERE = 6, 6, 200, 20
 
-#: Limits that a user may have set too narrow; other refusals hold for every camera.
-_NEGOTIABLE = ("ground sampling out of range", "no camera sees a plane so", "tilt out of range", "not north up")
+#: Limits that a user may have set too narrow; other faults hold for every camera.
+_NEGOTIABLE = (CameraFault.SAMPLING, CameraFault.SKEW, CameraFault.TILT, CameraFault.NOT_NORTH_UP)
 
 #: Masks with fewer intersections are seldom located.
 _USUAL_INTERSECTIONS = 12
 
 
-# --- what is watched --------------------------------------------------------------------------------------------------
+# --- what is recorded -------------------------------------------------------------------------------------------------
 
 
 @dataclass(frozen=True)
@@ -73,99 +75,77 @@ class _Scored:
 
     model: Hypothesis
     log10_odds: float
-    fault: str = ""
+    fault: CameraFault | None = None
 
 
-class WatchedEstimator(TripleEstimator):
-    """A `TripleEstimator` that remembers what became of everything it tried. It finds the same."""
+class Record:
+    """A `Trace` that remembers what became of everything a search tried."""
 
-    def __init__(
-        self,
-        scene: Scene,
-        index: ReferenceIndex,
-        options: MatchOptions | None = None,
-        near: tuple[float, float, float] | None = None,
-    ) -> None:
-        """As of `TripleEstimator`."""
-        super().__init__(scene, index, options, near)
+    def __init__(self) -> None:
+        """Begin empty."""
         self.anchors: list[int] = []
         self.n_proposals = self.n_on_roads = self.n_survived = 0
-        self.refusals: Counter[str] = Counter()
-        self.refused: list[tuple[str, FloatArray]] = []
-        self.scored: list[_Scored] = []
-        self._objection: tuple[str, FloatArray] | None = None
+        self.refusals: Counter[CameraFault] = Counter()
+        self.unscaled: list[tuple[CameraFault, FloatArray]] = []
+        self.models: list[_Scored] = []
+        self.elsewhere: list[Proposals] = []
+        self.estimator: TripleEstimator | None = None
+        self.result: SearchResult[Hypothesis] | None = None
 
-    def _screen(self, proposals: Proposals) -> IntArray:
-        kept = super()._screen(proposals)
+    def screened(self, proposals: Proposals, allowed: BoolArray, kept: IntArray) -> None:
+        """Note one anchor's proposals (see `Trace`); some that point elsewhere than a camera may are kept for later."""
         self.anchors.append(proposals.anchor)
         self.n_proposals += len(proposals.reference)
         self.n_on_roads += len(kept)
-        return kept
+        barred = np.flatnonzero(~allowed)[:_MAX_ELSEWHERE]
+        if len(barred):
+            self.elsewhere.append(proposals.only(barred))
 
-    def _judge(self, matrix: FloatArray, rough: bool = False) -> str:
-        fault = super()._judge(matrix, rough)
-        self._objection = (fault, matrix) if fault else None
-        return fault
+    def grown(self, hypotheses: Sequence[Hypothesis]) -> None:
+        """Count what survived."""
+        self.n_survived += len(hypotheses)
 
-    def _grow(self, proposals: Proposals, chosen: IntArray) -> list[Hypothesis]:
-        grown = super()._grow(proposals, chosen)
-        self.n_survived += len(grown)
-        return grown
-
-    def _grow_all(self, proposals: Proposals) -> list[Hypothesis]:
-        found = super()._grow_all(proposals)
-        # What points elsewhere than a camera may is not grown: some of it is here, to tell that it would fit.
-        elsewhere = np.flatnonzero(~self._is_allowed(proposals))[:_MAX_ELSEWHERE]
-        for hypothesis in super()._grow(proposals, elsewhere)[:_MAX_RETRIED]:
-            self._is_plausible(hypothesis)
-        return found
-
-    def _is_plausible(self, hypothesis: Hypothesis) -> bool:
-        self._objection = None
-        if super()._is_plausible(hypothesis) or self._objection is None:
-            return True
-        fault = self._objection[0]
+    def refused(self, fault: CameraFault, matrix: FloatArray) -> None:
+        """Count a camera's refusal; those that other limits would allow are looked at again (see `without_limits`)."""
         self.refusals[fault] += 1
-        if fault in _NEGOTIABLE and len(self.refused) < _MAX_REFUSED:
-            self.refused.append(self._objection)
-        return False
+        if fault in _NEGOTIABLE and len(self.unscaled) < _MAX_REFUSED:
+            self.unscaled.append((fault, matrix))
 
-    def score(self, model: Hypothesis) -> float:
-        """Refine a hypothesis and return its log10 odds."""
-        self._objection = None
-        odds = super().score(model)
-        fault = self._objection[0] if self._objection is not None and not math.isfinite(odds) else ""
-        if fault:
+    def scored(self, model: Hypothesis) -> None:
+        """Keep what was verified."""
+        fault = None if math.isfinite(model.log10_odds) else model.fault
+        if fault is not None:
             self.refusals[fault] += 1
-        self.scored.append(_Scored(model, odds, fault))
-        return odds
+        self.models.append(_Scored(model, model.log10_odds, fault))
 
-    def without_limits(self) -> list[_Scored]:
-        """Verify the best of the places that the camera refused as if it had not."""
-        camera = CameraOptions(gsd_m=(0.0, math.inf), max_tilt_deg=180.0, max_skew=math.inf)
-        free = TripleEstimator(self.scene, self.index, replace(self.options, camera=camera))
-        free.least_chance, free.n_screened = self.least_chance, self.n_screened
-        nobody = np.empty(0, np.int64)
-        compared = []
-        for fault, unscaled in self.refused:
-            matrix = unscaled / unscaled[2, 2]
-            gsd = sampling(matrix, self.scene.size)
-            found, matched, _ = agreement(matrix, self.scene, self.index, gsd, nobody, self.options.verify)
-            compared.append((found.rate + found.forward, fault, Hypothesis(matrix, nobody, 0.0, matched)))
-        compared.sort(key=lambda entry: -entry[0])
-        return [_Scored(model, free.score(model), fault) for _, fault, model in compared[:_MAX_RETRIED]]
+    def finished(self, estimator: TripleEstimator, result: SearchResult[Hypothesis]) -> None:
+        """Keep the result, and grow what points elsewhere than a camera may: to tell that it would fit."""
+        self.estimator, self.result = estimator, result
+        for proposals in self.elsewhere:
+            for hypothesis in estimator.grow(proposals, np.arange(len(proposals.reference)))[:_MAX_RETRIED]:
+                fault = estimator.judge(hypothesis.matrix, rough=True)
+                if fault is not None:
+                    self.refused(fault, hypothesis.matrix)
+
+
+def _without_limits(record: Record, estimator: TripleEstimator) -> list[_Scored]:
+    """Verify the best of the places that the camera refused as if it had not."""
+    scene, index, options = estimator.scene, estimator.index, estimator.options
+    camera = CameraOptions(gsd_m=(0.0, math.inf), max_tilt_deg=180.0, max_skew=math.inf)
+    free = TripleEstimator(scene, index, replace(options, camera=camera))
+    free.least_chance, free.n_screened = estimator.least_chance, estimator.n_screened
+    nobody = np.empty(0, np.int64)
+    compared = []
+    for fault, unscaled in record.unscaled:
+        matrix = unscaled / unscaled[2, 2]
+        gsd = sampling(matrix, scene.size)
+        found, matched, _ = agreement(matrix, scene, index, gsd, nobody, options.verify)
+        compared.append((found.rate + found.forward, fault, Hypothesis(matrix, nobody, 0.0, matched)))
+    compared.sort(key=lambda entry: -entry[0])
+    return [_Scored(model, free.score(model), fault) for _, fault, model in compared[:_MAX_RETRIED]]
 
 
 # --- what is told -----------------------------------------------------------------------------------------------------
-
-
-@dataclass(frozen=True)
-class Needed:
-    """What an answer must reach; see `workflows.LocateOptions`."""
-
-    log10_odds: float
-    margin: float
-    intersections: int
 
 
 @dataclass(frozen=True)
@@ -202,6 +182,8 @@ class RejectedPlace:
         At this place; otherwise the least of the places where it was.
     agrees : (S,) bool
         Which of the scene's road points lie on roads of the map that run their way.
+    fault : CameraFault or None
+        The camera's objection, if that ended it.
     """
 
     matrix: FloatArray
@@ -217,6 +199,7 @@ class RejectedPlace:
     chance_measured: bool
     agrees: BoolArray
     why: str
+    fault: CameraFault | None = None
 
     def to_dict(self) -> dict[str, Any]:
         """Plain values, ready for `json.dumps`."""
@@ -309,65 +292,47 @@ class Explanation:
         }
 
 
-def tell(
-    location: Location,
-    scene: Scene,
-    index: ReferenceIndex,
-    needed: Needed,
-    watched: WatchedEstimator | None = None,
-    result: SearchResult[Hypothesis] | None = None,
-) -> Story:
-    """Tell how the search on one reference went.
-
-    Parameters
-    ----------
-    location : Location
-        What it came to.
-    watched, result : optional
-        None where there was nothing to search for, or another method searched.
-    """
-    n = len(scene.intersections)
-    if watched is None or result is None:
-        stats = location.stats
+def tell(query: Query, found: Found, location: Location, record: Record, needed: Needed) -> Story:
+    """Tell how the search on one reference went; `location` is what it came to on that reference alone."""
+    n, name, located = len(query.scene.intersections), found.index.name, location.located
+    search, result, stats = record.estimator, record.result, found.stats
+    if search is None or result is None:  # there was nothing to search for, or another method searched
         ended = "intersections" if n < needed.intersections else "verified" if stats.tuples_sampled else "anchors"
         funnel = Funnel(n, stats.tuples_sampled, 0, stats.candidates, 0, 0, stats.hypotheses, 0, stats.verified)
-        if location.located:
-            return Story(index.name, "", needed, funnel, {}, None, ())
-        return Story(index.name, "", needed, funnel, {}, ended, (location.reason,))
+        return Story(name, "", needed, funnel, {}, None if located else ended, () if located else (location.reason,))
     funnel = Funnel(
         n,
-        len(set(watched.anchors)),
-        watched.n_tuples,
-        watched.n_candidates,
-        watched.n_proposals,
-        watched.n_on_roads,
-        watched.n_hypotheses,
-        watched.n_survived,
-        watched.n_verified,
-        watched.n_nulls,
+        len(set(record.anchors)),
+        search.n_tuples,
+        search.n_candidates,
+        record.n_proposals,
+        record.n_on_roads,
+        search.n_hypotheses,
+        record.n_survived,
+        search.n_verified,
+        search.n_nulls,
     )
-    located = location.located
-    entries = [*watched.scored, *([] if located else watched.without_limits())]
-    ranked = _distinct(watched, sorted(entries, key=lambda entry: _rank(entry, needed)))
-    places = tuple(_describe(watched, entry, result, location, needed) for entry in ranked)
-    starved = None if located else _starved(funnel, watched.refusals, result, needed)
-    missing = () if located else tuple(_missing(scene, funnel, watched, result, places, needed))
-    refusals = dict(watched.refusals.most_common())
-    return Story(index.name, result.stopped, needed, funnel, refusals, starved, missing, places)
+    entries = [*record.models, *([] if located else _without_limits(record, search))]
+    ranked = _distinct(search, sorted(entries, key=lambda entry: _rank(entry, needed)))
+    places = tuple(_describe(search, entry, result, location, needed) for entry in ranked)
+    starved = None if located else _starved(funnel, record, result, needed)
+    missing = () if located else tuple(_missing(funnel, record, search, result, places, needed))
+    refusals = {fault.value: times for fault, times in record.refusals.most_common()}
+    return Story(name, result.stopped, needed, funnel, refusals, starved, missing, places)
 
 
 def _rank(entry: _Scored, needed: Needed) -> tuple[bool, float]:
     """Sort by odds; what the camera refused comes last, unless nothing else kept it from being the answer."""
-    return bool(entry.fault) and entry.log10_odds < needed.log10_odds, -entry.log10_odds
+    return entry.fault is not None and entry.log10_odds < needed.log10_odds, -entry.log10_odds
 
 
-def _distinct(watched: WatchedEstimator, entries: Sequence[_Scored]) -> list[_Scored]:
+def _distinct(search: TripleEstimator, entries: Sequence[_Scored]) -> list[_Scored]:
     """Return the best entry of each place."""
     kept: list[_Scored] = []
     for entry in entries:
         if kept and not math.isfinite(entry.log10_odds):
             break
-        if not any(watched.same(entry.model, other.model) for other in kept):
+        if not any(search.same(entry.model, other.model) for other in kept):
             kept.append(entry)
         if len(kept) == _MAX_PLACES:
             break
@@ -375,17 +340,17 @@ def _distinct(watched: WatchedEstimator, entries: Sequence[_Scored]) -> list[_Sc
 
 
 def _describe(
-    watched: WatchedEstimator,
+    search: TripleEstimator,
     entry: _Scored,
     result: SearchResult[Hypothesis],
     location: Location,
     needed: Needed,
 ) -> RejectedPlace:
-    model, scene, index = entry.model, watched.scene, watched.index
-    verify = watched.options.verify
+    model, scene, index = entry.model, search.scene, search.index
+    verify = search.options.verify
     camera = pose(model.matrix, scene.size)
     measured = model.chance != (1.0, 1.0, 1.0)
-    chance = model.chance if measured else tuple(float(share) for share in watched.least_chance)
+    chance = model.chance if measured else tuple(float(share) for share in search.least_chance)
     corners = np.vstack([scene.corners, scene.center])
     ground = np.c_[corners, np.ones(5)] @ model.matrix.T
     ground = ground[:, :2] / ground[:, 2:]
@@ -413,6 +378,7 @@ def _describe(
         chance_measured=measured,
         agrees=np.isfinite(distance),
         why="",
+        fault=entry.fault,
     )
     return replace(place, why=_why(place, entry, result, location, needed))
 
@@ -421,11 +387,8 @@ def _why(
     place: RejectedPlace, entry: _Scored, result: SearchResult[Hypothesis], location: Location, needed: Needed
 ) -> str:
     """Say why a place is not the answer."""
-    if entry.fault:
-        odds = (
-            f"; without that its log10 odds were {_number(entry.log10_odds)}" if math.isfinite(entry.log10_odds) else ""
-        )
-        return f"the camera: {entry.fault}{_limits(place, entry.fault)}{odds}"
+    if entry.fault is not None:
+        return f"the camera: {_objection(place, entry.fault)}"
     if not math.isfinite(entry.log10_odds):
         return "the fit does not converge to a place within the limits"
     if entry.model is result.best and location.located:
@@ -442,13 +405,16 @@ def _number(value: float) -> str:
     return f"{round(value, 1) + 0.0:.1f}"
 
 
-def _limits(place: RejectedPlace, fault: str) -> str:
+def _objection(place: RejectedPlace, fault: CameraFault) -> str:
+    """Say what the camera has against a place, and what its odds were otherwise."""
     values = {
-        "ground sampling out of range": f" ({place.gsd_m:.2f} m per pixel)",
-        "tilt out of range": f" ({place.tilt_deg:.0f} degrees)",
-        "not north up": f" (up is {place.rotation_deg % 360:.0f} degrees)",
+        CameraFault.SAMPLING: f" ({place.gsd_m:.2f} m per pixel)",
+        CameraFault.TILT: f" ({place.tilt_deg:.0f} degrees)",
+        CameraFault.NOT_NORTH_UP: f" (up is {place.rotation_deg % 360:.0f} degrees)",
     }
-    return values.get(fault, "")
+    known = math.isfinite(place.log10_odds)
+    odds = f"; without that its log10 odds were {_number(place.log10_odds)}" if known else ""
+    return f"{fault.value}{values.get(fault, '')}{odds}"
 
 
 def _weakest(place: RejectedPlace) -> str:
@@ -465,11 +431,11 @@ def _weakest(place: RejectedPlace) -> str:
     return f"{rate:.0%} {name} agree, by chance {chance:.0%}"
 
 
-def _starved(funnel: Funnel, refusals: Counter[str], result: SearchResult[Hypothesis], needed: Needed) -> str:
+def _starved(funnel: Funnel, record: Record, result: SearchResult[Hypothesis], needed: Needed) -> str:
     """Return the first stage that nothing came out of."""
     stages = ("intersections", "anchors", "tuples", "candidates", "proposals", "on_roads", "survived", "verified")
     empty = next((stage for stage in stages if getattr(funnel, stage) == 0), None)
-    if empty == "verified" and refusals:
+    if empty == "verified" and record.refusals:
         return "camera"
     if empty is not None:
         return empty
@@ -489,27 +455,27 @@ _NOTHING = {
 
 
 def _missing(
-    scene: Scene,
     funnel: Funnel,
-    watched: WatchedEstimator,
+    record: Record,
+    search: TripleEstimator,
     result: SearchResult[Hypothesis],
     places: Sequence[RejectedPlace],
     needed: Needed,
 ) -> list[str]:
     """Say what was missing, the surest first."""
-    told = []
+    told, scene = [], search.scene
     if result.stopped == "time":
         told.append("time: the search was stopped by its limit, places may be left untried")
-    starved = _starved(funnel, watched.refusals, result, needed)
+    starved = _starved(funnel, record, result, needed)
     if starved in _NOTHING:
         told.append(_NOTHING[starved])
     if starved == "camera":
-        reasons = ", ".join(f"{reason} ({times})" for reason, times in watched.refusals.most_common())
+        reasons = ", ".join(f"{fault.value} ({times})" for fault, times in record.refusals.most_common())
         told.append(f"a camera: all places that grew are such as none sees, or none within the limits: {reasons}")
     best = places[0] if places else None
-    if best is not None and best.why.startswith("the camera") and best.log10_odds >= needed.log10_odds:
-        fault = best.why.removeprefix("the camera: ")
-        told.append(f"the limits on the camera may be too narrow: the best place fails by them alone: {fault}")
+    if best is not None and best.fault is not None and best.log10_odds >= needed.log10_odds:
+        objection = _objection(best, best.fault)
+        told.append(f"the limits on the camera may be too narrow: the best place fails by them alone: {objection}")
     elif best is not None and starved == "odds":
         told.append(f"evidence: at the best place {_weakest(best)}")
     if starved == "margin":
@@ -523,6 +489,6 @@ def _missing(
         )
     if best is not None and best.chance[1] > 0.5:
         told.append(f"variety: streets here are so alike that shifted copies meet {best.chance[1]:.0%} of the roads")
-    if watched.near is not None and not places:
+    if search.near is not None and not places:
         told.append("perhaps the circle given is wrong: nothing outside it was tried")
     return told or ["agreement: nothing on this map is like the mask; another map may be needed"]

@@ -2,16 +2,20 @@
 
 from __future__ import annotations
 
+import time
 from dataclasses import dataclass, field
+from pathlib import Path
 
+from roadgeo._arrays import AnyArray
 from roadgeo.geometry.mask import RoadMask
+from roadgeo.location import Seconds
 from roadgeo.matching.scene import Scene, SceneOptions, prepare_scene
 from roadgeo.roads.graph import RoadGraph
 from roadgeo.roads.intersections import IntersectionOptions, find_intersections
 from roadgeo.roads.simplification import SimplifyOptions, simplify
 from roadgeo.roads.vectorization import VectorizeOptions, vectorize
 
-__all__ = ["QueryOptions", "trace_query"]
+__all__ = ["Query", "QueryOptions", "read_query", "trace_query"]
 
 
 @dataclass(frozen=True)
@@ -51,3 +55,31 @@ def trace_query(mask: RoadMask, options: QueryOptions | None = None) -> tuple[Sc
     )
     height, wide = mask.shape
     return prepare_scene(graph, found, (wide, height), mask.observed, options.scene), graph
+
+
+@dataclass(frozen=True)
+class Query:
+    """A mask that was read and traced."""
+
+    name: str
+    scene: Scene
+    graph: RoadGraph
+    seconds: Seconds
+
+
+def read_query(mask: RoadMask | AnyArray | str | Path, options: QueryOptions | None = None) -> Query:
+    """Read a mask, unless it is one already, and trace it.
+
+    Raises
+    ------
+    MaskError
+        The mask cannot be read or shows no roads.
+    """
+    started = time.perf_counter()
+    if not isinstance(mask, RoadMask):
+        from roadgeo.sources.masks import read_mask
+
+        mask = read_mask(mask)
+    read = time.perf_counter()
+    scene, graph = trace_query(mask, options)
+    return Query(mask.name, scene, graph, Seconds(read=read - started, vectorize=time.perf_counter() - read))

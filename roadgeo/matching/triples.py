@@ -10,7 +10,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Iterator
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 
@@ -105,6 +105,16 @@ class Proposals:
     n_tuples: int
     n_candidates: int
     n_hits: int
+
+    def only(self, rows: IntArray) -> Proposals:
+        """Return some of the proposals."""
+        return replace(
+            self,
+            reference=self.reference[rows],
+            partners=self.partners[rows],
+            affine=self.affine[rows],
+            placed=self.placed[rows],
+        )
 
 
 def propose(

@@ -1,11 +1,11 @@
-"""The first straight line: roads to a reference, and how references are opened, updated and built again."""
+"""References: what they are built of and with, and how they are opened and built again."""
 
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
 from dataclasses import asdict, dataclass, field, fields
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, TypeVar
+from typing import Any, TypeVar
 
 from roadgeo._arrays import AnyArray
 from roadgeo._progress import Say, say_nothing
@@ -17,20 +17,13 @@ from roadgeo.roads.intersections import IntersectionOptions, find_intersections
 from roadgeo.roads.network import RoadNetwork
 from roadgeo.roads.simplification import SimplifyOptions, planarize, simplify
 
-if TYPE_CHECKING:
-    import geopandas as gpd
-
-    from roadgeo.sources.roads import Roads
-
 __all__ = [
     "BuildOptions",
     "Reference",
     "build_network",
-    "build_reference",
     "open_reference",
     "rebuild_reference",
     "stored_options",
-    "update_reference",
 ]
 
 
@@ -84,76 +77,6 @@ def build_network(
     graph = simplify(graph, options.simplify, lambda share: say(drawing, share))
     found = find_intersections(graph, options.intersections)
     return RoadNetwork(graph, found, plane, tuple(coverage(graph)), {**meta, "options": asdict(options)})
-
-
-def build_reference(
-    roads: gpd.GeoDataFrame, name: str = "", options: BuildOptions | None = None, meta: dict[str, Any] | None = None
-) -> Reference:
-    """Build a reference from road lines.
-
-    Parameters
-    ----------
-    roads : GeoDataFrame
-        Lines in any CRS.
-
-    Raises
-    ------
-    CrsError, RoadSourceError
-        No CRS; no lines; fewer than three intersections.
-    """
-    from roadgeo.reference.network_file import as_stored
-    from roadgeo.sources.roads import project_lines
-
-    options = options or BuildOptions()
-    lines, plane = project_lines(roads.geometry, roads.crs)
-    network = as_stored(build_network(lines, plane, {"name": name, **(meta or {})}, options))
-    return Reference(build_index(network, options.index), network)
-
-
-def update_reference(path: str | Path, roads: Roads, say: Say = say_nothing) -> Reference:
-    """Replace the roads of a reference by others on the ground that those were asked for, or add them, and write it.
-
-    The rest of the network is not drawn again. Where the roads do not say what ground they were asked for, it is the
-    ground they lie on. The options are those that the reference was built with.
-
-    Raises
-    ------
-    IndexFormatError
-        There is no such reference, or it is damaged.
-    OutputError
-        It cannot be written; the old one stays as it was.
-    """
-    from roadgeo.reference.files import reference_paths
-    from roadgeo.reference.network_file import as_stored, read_network
-    from roadgeo.roads.updating import UpdateOptions, ground_of, move_area, move_lines, replace_area
-
-    old = read_network(reference_paths(path).geopackage)
-    options = stored_options(old)
-    lines = move_lines(roads.lines, roads.plane, old.plane)
-    _require_same_scale(roads.lines, lines)
-    area = ground_of(lines) if roads.area is None else move_area(roads.area, old.plane)
-    owed = dict.fromkeys([old.meta.get("attribution", ""), roads.meta.get("attribution", "")])
-    meta = {
-        **old.meta,
-        "sources": [*old.meta.get("sources", []), *roads.meta.get("sources", [])],
-        "attribution": "; ".join(filter(None, owed)),
-    }
-    say(f"drawing {len(lines):,} lines among the others as a mask shows them")
-    drawn_alike = UpdateOptions(simplify=options.simplify, intersections=options.intersections)
-    network = as_stored(replace_area(old, lines, area, meta, drawn_alike))
-    Reference(build_index(network, options.index, say), network).save(path, say)
-    return open_reference(path)
-
-
-def _require_same_scale(lines: AnyArray, moved: AnyArray) -> None:
-    """Refuse roads that lie so far from a reference that its plane has another scale there, or knows no place there."""
-    import shapely
-
-    scale = float(shapely.length(moved).sum() / shapely.length(lines).sum())
-    if not 0.95 < scale < 1.05:
-        raise RoadSourceError(
-            "the roads lie too far from the reference to be drawn on its plane; build one reference from both sources"
-        )
 
 
 def stored_options(network: RoadNetwork) -> BuildOptions:

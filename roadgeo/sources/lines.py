@@ -18,7 +18,16 @@ from roadgeo._arrays import AnyArray, BoolArray
 from roadgeo.errors import RoadSourceError
 from roadgeo.roads.kinds import in_tunnel, names_highways
 
-__all__ = ["OSM_ATTRIBUTION", "RoadLines", "crs_name", "first_line", "list_sources", "read_lines", "simple_lines"]
+__all__ = [
+    "OSM_ATTRIBUTION",
+    "RoadLines",
+    "crs_name",
+    "first_line",
+    "list_sources",
+    "read_lines",
+    "simple_lines",
+    "table_lines",
+]
 
 OSM_ATTRIBUTION = "© OpenStreetMap contributors, ODbL 1.0"
 
@@ -339,6 +348,13 @@ def _choose_layer(path: Path, layer: str | None) -> str:
     if len(drawn) > 1 and chosen == drawn:
         raise RoadSourceError(f"{path}: several layers hold lines, {_listed(drawn)}: choose one with --layer")
     return chosen[0]
+
+
+def table_lines(table: Any, name: str) -> RoadLines:
+    """Return the lines of a GeoDataFrame."""
+    known = [column for column in table.columns if str(column).lower() in _KIND_COLUMNS + _TUNNEL_COLUMNS]
+    columns = {str(column).lower(): table[column].to_numpy(object) for column in known}
+    return _from_columns(table.geometry.to_numpy(), crs_name(table.crs), columns, {"name": name})
 
 
 def _from_columns(shapes: AnyArray, crs: str | None, columns: dict[str, AnyArray], meta: dict[str, Any]) -> RoadLines:

@@ -15,12 +15,12 @@ from roadgeo._progress import Say, say_nothing
 from roadgeo.errors import CrsError, RoadSourceError
 from roadgeo.geometry.projection import LocalPlane, choose_plane, transformer
 from roadgeo.roads.kinds import RoadKind, drives
-from roadgeo.sources.lines import RoadLines, crs_name, list_sources, read_lines, simple_lines
+from roadgeo.sources.lines import RoadLines, crs_name, list_sources, read_lines, simple_lines, table_lines
 
 if TYPE_CHECKING:
     from roadgeo.sources.overpass import FetchOptions
 
-__all__ = ["Box", "Roads", "fetch_roads", "project_lines", "read_roads"]
+__all__ = ["Box", "Roads", "choose_roads", "fetch_roads", "project_lines", "read_roads"]
 
 #: West, south, east, north in degrees; west > east where it lies astride 180 degrees.
 Box = tuple[float, float, float, float]
@@ -111,6 +111,33 @@ def read_roads(
         sources.append(_choose(source, file.name, which, tunnels, bbox))
     roads = _join(sources, {"roads": which, "tunnels": tunnels, "bbox": _plain(bbox)}, attribution)
     return roads if bbox is None else replace(roads, area=box_area(bbox))
+
+
+def choose_roads(
+    roads: Roads | Any | str | os.PathLike[str],
+    which: RoadKind = "drivable",
+    tunnels: bool = False,
+    attribution: str | None = None,
+    say: Say = say_nothing,
+) -> Roads:
+    """Return the roads to build a reference from: as they are, or those of a GeoDataFrame or of files.
+
+    Raises
+    ------
+    CrsError
+        A table has no CRS, or coordinates that do not fit it.
+    RoadSourceError
+        There are no lines of the kind asked for.
+    """
+    if isinstance(roads, Roads):
+        return roads if attribution is None else replace(roads, meta={**roads.meta, "attribution": attribution})
+    if isinstance(roads, str | os.PathLike):
+        return read_roads(roads, which=which, tunnels=tunnels, attribution=attribution, say=say)
+    source = table_lines(roads, "the roads")
+    if source.crs is None:
+        raise CrsError("the roads have no CRS; set one, for example roads.set_crs('EPSG:26986')")
+    chosen = _choose(source, "the roads", which, tunnels, None)
+    return _join([chosen], {"roads": which, "tunnels": tunnels, "bbox": None}, attribution)
 
 
 def fetch_roads(

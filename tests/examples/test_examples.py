@@ -36,3 +36,21 @@ def test_the_benchmark_measures_everything_and_goes_on_where_it_stopped(tmp_path
     refused = subprocess.run([*command, "--seed", "5"], capture_output=True, text=True, cwd=tmp_path, check=False)
     assert refused.returncode == 1
     assert "holds trials of another run" in refused.stderr
+
+
+def test_results_are_compared_to_the_last_bit(tmp_path: Path) -> None:
+    line = '{"query": "a.png", "status": "located", "center": {"x": 1.5}, "seconds": {"total": %s}}\n'
+    for folder, seconds, x in (("before", 1, 1.5), ("same", 2, 1.5), ("after", 1, 1.5000001)):
+        (tmp_path / folder).mkdir()
+        (tmp_path / folder / "r.jsonl").write_text((line % seconds).replace("1.5}", f"{x}}}"))
+
+    def compare(*options: str) -> tuple[int, str]:
+        command = [sys.executable, str(EXAMPLES / "compare_results.py"), *options]
+        done = subprocess.run(command, capture_output=True, text=True, cwd=tmp_path, check=False)
+        return done.returncode, done.stdout
+
+    assert compare("before", "same")[0] == 0
+    status, told = compare("before", "after")
+    assert status == 1
+    assert "center.x: 1\n    a.png: 1.5 -> 1.5000001" in told
+    assert compare("before", "after", "--tolerance", "1e-6")[0] == 0

@@ -8,7 +8,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 from worlds.scenes import camera
 
-from roadgeo.geometry.camera import CameraOptions, judge, pose
+from roadgeo.geometry.camera import CameraFault, CameraOptions, judge, pose
 
 SIZE = (1200, 900)
 OPTIONS = CameraOptions()
@@ -28,7 +28,7 @@ def test_straight_down(gsd, heading, focal):
     assert angle_between(seen.rotation_deg, heading) < 1e-6
     assert seen.tilt_deg < 1e-3
     assert seen.skew < 1e-9
-    assert judge(camera((500, 700), SIZE, gsd, 0.0, 0.0, heading, focal), SIZE, OPTIONS) == ""
+    assert judge(camera((500, 700), SIZE, gsd, 0.0, 0.0, heading, focal), SIZE, OPTIONS) is None
 
 
 @given(tilt=st.floats(0.5, 60), azimuth=turns, heading=turns, focal=st.floats(700, 4000), gsd=st.floats(0.3, 4))
@@ -67,7 +67,7 @@ def test_a_homography_and_its_multiples_are_the_same(scale, tilt, azimuth):
     assert one.gsd_m == pytest.approx(other.gsd_m)
     assert one.tilt_deg == pytest.approx(other.tilt_deg, abs=1e-3)
     assert angle_between(one.rotation_deg, other.rotation_deg) < 1e-6
-    assert judge(scale * matrix, SIZE, OPTIONS) == judge(matrix, SIZE, OPTIONS) == ""
+    assert judge(scale * matrix, SIZE, OPTIONS) is judge(matrix, SIZE, OPTIONS) is None
 
 
 @given(tilt=st.floats(0, 60), azimuth=turns, heading=turns, focal=st.floats(0.8, 6), gsd=st.floats(0.25, 3))
@@ -75,44 +75,45 @@ def test_every_camera_within_the_options_is_plausible(tilt, azimuth, heading, fo
     half_angle = np.degrees(np.arctan(0.5 * np.hypot(*SIZE) / (focal * SIZE[0])))
     if tilt + half_angle < 85:
         matrix = camera((10, 20), SIZE, gsd, tilt, azimuth, heading, focal * SIZE[0])
-        assert judge(matrix, SIZE, OPTIONS) == ""
-        assert judge(matrix, SIZE, replace(OPTIONS, focal_px=focal * SIZE[0])) == ""
+        assert judge(matrix, SIZE, OPTIONS) is None
+        assert judge(matrix, SIZE, replace(OPTIONS, focal_px=focal * SIZE[0])) is None
 
 
 def test_what_is_not_plausible():
     matrix = camera((0, 0), SIZE, 1.0, 30.0, 40.0, 50.0, 1200.0)
     mirror = np.array([[-1, 0, SIZE[0]], [0, 1, 0], [0, 0, 1.0]])
     stretch = np.array([[1, 0, 0], [0, 2.2, 0], [0, 0, 1.0]])
-    assert judge(matrix @ mirror, SIZE, OPTIONS) == "mirrored"
-    assert judge(-matrix @ mirror, SIZE, OPTIONS) == "mirrored"
-    assert judge(camera((0, 0), SIZE, 1.0, 75.0, 0.0, 0.0, 1000.0), SIZE, OPTIONS) == "horizon in the frame"
-    assert judge(camera((0, 0), SIZE, 9.0), SIZE, OPTIONS) == "ground sampling out of range"
-    assert judge(camera((0, 0), SIZE, 0.1), SIZE, OPTIONS) == "ground sampling out of range"
-    assert judge(stretch @ camera((0, 0), SIZE, 0.7), SIZE, OPTIONS) == "no camera sees a plane so"
-    assert judge(camera((0, 0), SIZE, 1.0, 50.0, 0.0, 0.0, 4000.0), SIZE, CameraOptions(max_tilt_deg=30.0)) == (
-        "tilt out of range"
+    assert judge(matrix @ mirror, SIZE, OPTIONS) is CameraFault.MIRRORED
+    assert judge(-matrix @ mirror, SIZE, OPTIONS) is CameraFault.MIRRORED
+    assert judge(camera((0, 0), SIZE, 1.0, 75.0, 0.0, 0.0, 1000.0), SIZE, OPTIONS) is CameraFault.HORIZON
+    assert judge(camera((0, 0), SIZE, 9.0), SIZE, OPTIONS) is CameraFault.SAMPLING
+    assert judge(camera((0, 0), SIZE, 0.1), SIZE, OPTIONS) is CameraFault.SAMPLING
+    assert judge(stretch @ camera((0, 0), SIZE, 0.7), SIZE, OPTIONS) is CameraFault.SKEW
+    assert judge(camera((0, 0), SIZE, 1.0, 50.0, 0.0, 0.0, 4000.0), SIZE, CameraOptions(max_tilt_deg=30.0)) is (
+        CameraFault.TILT
     )
 
 
 @pytest.mark.parametrize("value", [0.0, np.nan, np.inf])
 def test_what_is_no_homography(value):
-    assert judge(np.full((3, 3), value), SIZE, OPTIONS) == "degenerate"
-    assert judge(np.array([[1.0, 0, 0], [1, 0, 0], [0, 0, 1]]), SIZE, OPTIONS) != ""
+    assert judge(np.full((3, 3), value), SIZE, OPTIONS) is CameraFault.DEGENERATE
+    assert judge(np.array([[1.0, 0, 0], [1, 0, 0], [0, 0, 1]]), SIZE, OPTIONS) is not None
 
 
 @pytest.mark.parametrize(
-    ("heading", "reason"), [(0, ""), (4, ""), (-4, ""), (356, ""), (90, "not north up"), (180, "not north up")]
+    ("heading", "reason"),
+    [(0, None), (4, None), (-4, None), (356, None), (90, CameraFault.NOT_NORTH_UP), (180, CameraFault.NOT_NORTH_UP)],
 )
 def test_north_up(heading, reason):
     matrix = camera((0, 0), SIZE, 1.0, 0.0, 0.0, heading)
-    assert judge(matrix, SIZE, replace(OPTIONS, north_up=True)) == reason
-    assert judge(matrix, SIZE, OPTIONS) == ""
+    assert judge(matrix, SIZE, replace(OPTIONS, north_up=True)) is reason
+    assert judge(matrix, SIZE, OPTIONS) is None
 
 
 def test_a_known_focal_length_refuses_what_another_lens_saw():
     matrix = camera((0, 0), SIZE, 1.0, 45.0, 0.0, 0.0, 900.0)
-    assert judge(matrix, SIZE, replace(OPTIONS, focal_px=900.0)) == ""
-    assert judge(matrix, SIZE, replace(OPTIONS, focal_px=9000.0)) == "no camera sees a plane so"
+    assert judge(matrix, SIZE, replace(OPTIONS, focal_px=900.0)) is None
+    assert judge(matrix, SIZE, replace(OPTIONS, focal_px=9000.0)) is CameraFault.SKEW
 
 
 @pytest.mark.parametrize("focal", [600.0, 1500.0, 6000.0])
@@ -123,14 +124,14 @@ def test_a_vertical_view_is_within_any_tilt_whatever_the_lens(focal):
         matrix = camera((0, 0), SIZE, 1.0, 2.0, rng.uniform(0, 360), rng.uniform(0, 360), focal)
         matrix = matrix / matrix[2, 2]
         matrix[2, :2] += rng.normal(0.0, 2e-5, 2)  # corners off by some metres
-        assert judge(matrix, SIZE, CameraOptions(max_tilt_deg=5.0)) == ""
+        assert judge(matrix, SIZE, CameraOptions(max_tilt_deg=5.0)) is None
 
 
 def test_a_rough_homography_has_wider_bounds():
     beyond = camera((0, 0), SIZE, 1.0, 42.0, 0.0, 0.0, 1200.0)
     options = CameraOptions(gsd_m=(0.5, 1.0), max_tilt_deg=30.0, focal_px=1200.0)
-    assert judge(beyond, SIZE, options) != ""
-    assert judge(beyond, SIZE, options, rough=True) == ""
+    assert judge(beyond, SIZE, options) is not None
+    assert judge(beyond, SIZE, options, rough=True) is None
 
 
 def test_what_is_known_of_the_tilt_narrows_what_is_looked_for():

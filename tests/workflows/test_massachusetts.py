@@ -12,9 +12,9 @@ import pytest
 from roadgeo.evaluation.truth import Truth, read_truth
 from roadgeo.geometry.homography import Homography
 from roadgeo.geometry.pinhole import warp_mask
-from roadgeo.reference.reference import Reference, build_reference
+from roadgeo.reference.reference import Reference
 from roadgeo.sources.masks import read_mask
-from roadgeo.workflows import locate
+from roadgeo.workflows import build_reference, locate
 
 pytestmark = pytest.mark.realdata
 

@@ -1,54 +1,103 @@
-"""Answers of several references become one answer."""
+"""Places found on one or more references are judged once, together."""
 
 import math
 from dataclasses import replace
 
+import numpy as np
 import pytest
+from worlds.scenes import PLANE, camera, look, random_network, scene_of
 
 from roadgeo.geometry.camera import CameraOptions
-from roadgeo.location import Location, Place, Seconds
-from roadgeo.matching.search import SearchResult
-from roadgeo.workflows import LocateOptions, _best_of, _refusal
+from roadgeo.location import Seconds
+from roadgeo.matching.index import build_index
+from roadgeo.matching.methods import Fit, Found
+from roadgeo.matching.options import LocateOptions
+from roadgeo.matching.query import Query
+from roadgeo.matching.verdict import decide
 
-HERE = Place(0.0, 0.0, 8.60, 41.15, 20.0)
-
-
-def located(reference: str, odds: float, lon: float = 8.60) -> Location:
-    center = replace(HERE, lon=lon, log10_odds=odds)
-    return Location(
-        "q", "located", "fits", reference=reference, size=(1000, 1000), center=center, gsd_m=1.0, log10_odds=odds,
-        seconds=Seconds(match=1.0, refine=0.5),
-    )  # fmt: skip
+SIZE = (1000, 1000)
 
 
-def refused(reference: str) -> Location:
-    return Location(
-        "q", "not_located", "no place stands out", reference=reference, attribution="© all", seconds=Seconds(match=2.0)
-    )
+@pytest.fixture(scope="module")
+def query():
+    graph = look(random_network(1, 2000.0), camera((1000, 1000)))
+    return Query("q", scene_of(graph), graph, Seconds(vectorize=0.1))
 
 
-def test_the_surest_place_wins_and_all_work_counts():
-    best = _best_of([refused("a"), located("b", 20.0), located("c", 9.0, lon=9.0)], LocateOptions())
-    assert (best.status, best.reference, best.log10_odds) == ("located", "b", 20.0)
-    assert (best.seconds.match, best.seconds.refine) == (4.0, 1.0)
+@pytest.fixture(scope="module")
+def town():
+    return build_index(random_network(1, 2000.0))
 
 
-def test_two_places_far_apart_that_are_equally_sure_are_ambiguous():
-    best = _best_of([located("b", 20.0), located("c", 19.0, lon=9.0)], LocateOptions())
-    assert best.status == "ambiguous"
-    assert "on b and 19.0 on c" in best.reason
+@pytest.fixture
+def searched(query, town):
+    """Return what a search of a reference of that name found, at these odds and eastings in metres."""
+
+    def found(name: str, *places: tuple[float, float], tried: int = 100, **told) -> Found:
+        index = replace(town, meta={**town.meta, "name": name, "attribution": "© all"})
+        nobody = np.full(len(query.scene.intersections), -1)
+        fits = [
+            Fit(index, camera((east, 0.0), SIZE), nobody, np.zeros(len(nobody)), 0.9, odds, np.ones(4))
+            for odds, east in places
+        ]
+        told = {"stopped": "exhausted", "match_s": 1.0, "refine_s": 0.5, **told}
+        return Found(index, tuple(fits), n_tried=tried, n_searched=len(index), **told)
+
+    return found
+
+
+def judge(query, *found, **options):
+    return decide(query, found, LocateOptions(**options))
+
+
+def test_the_surest_place_wins_and_all_work_counts(query, searched):
+    best = judge(query, searched("a"), searched("b", (20.0, 0.0)), searched("c", (9.0, 30_000.0)))
+    assert (best.status, best.reference) == ("located", "b")
+    assert best.log10_odds == pytest.approx(20.0 - math.log10(3))  # three times as many places were tried
     assert best.runner_up is not None
-    assert best.runner_up.lon == 9.0
+    assert (best.seconds.match, best.seconds.refine, best.seconds.vectorize) == (3.0, 1.5, 0.1)
 
 
-def test_overlapping_maps_may_agree():
-    assert _best_of([located("b", 20.0), located("c", 19.9, lon=8.6001)], LocateOptions()).status == "located"
+def test_one_reference_alone_keeps_its_odds(query, searched):
+    assert judge(query, searched("a", (8.0, 0.0), (3.0, 500.0))).log10_odds == 8.0
+
+
+def test_two_places_far_apart_that_are_equally_sure_are_ambiguous(query, searched):
+    best = judge(query, searched("b", (20.0, 0.0)), searched("c", (19.0, 30_000.0)))
+    assert (best.status, best.reference) == ("ambiguous", "b")
+    assert "on b and 18.7 on c" in best.reason
+    assert best.runner_up.x == pytest.approx(PLANE.origin[0] + 30_000.0, abs=1.0)
+
+
+def test_overlapping_maps_may_agree(query, searched):
+    best = judge(query, searched("b", (20.0, 0.0)), searched("c", (19.9, 100.0)))
+    assert best.status == "located"
+
+
+def test_a_weak_place_does_not_beat_a_pair_of_far_surer_ones(query, searched):
+    """Two places of one map at 10^30 are ambiguous, whatever another map holds at 10^4."""
+    best = judge(query, searched("a", (4.0, 0.0)), searched("b", (30.0, 0.0), (29.5, 5000.0)))
+    assert (best.status, best.reference) == ("ambiguous", "b")
+    assert best.log10_odds == pytest.approx(30.0 - math.log10(2))
+
+
+def test_a_place_that_is_refused_alone_is_a_rival_all_the_same(query, searched):
+    """At 3.4 a place is not reported; it is still too near to 4.0 for that to be the answer."""
+    best = judge(query, searched("a", (4.5, 0.0)), searched("b", (3.4, 30_000.0)))
+    assert best.status == "ambiguous"
+    assert best.runner_up.log10_odds == pytest.approx(3.4 - math.log10(2))
 
 
 @pytest.mark.parametrize("names", [["a"], ["a", "b"]])
-def test_a_refusal_says_where_it_looked(names):
-    best = _best_of([refused(name) for name in names], LocateOptions())
-    assert (best.reference, best.attribution) == (", ".join(names), "© all")
+def test_a_refusal_says_where_it_looked(query, searched, names):
+    best = judge(query, *map(searched, names))
+    assert (best.status, best.reference, best.attribution) == ("not_located", ", ".join(names), "© all")
+
+
+def test_a_refusal_gives_the_reason_of_what_came_nearest(query, searched):
+    near_miss = searched("b", (3.5, 0.0), stopped="time")
+    best = judge(query, searched("a", tried=9000), near_miss, searched("c", (1.0, 9000.0)))
+    assert "stopped at the time limit of 10 s; of the places tried, the best has log10 odds 1.5" in best.reason
 
 
 NEAR, CAMERA = (-71.06, 42.36, 500.0), CameraOptions()
@@ -67,10 +116,9 @@ NEAR, CAMERA = (-71.06, 42.36, 500.0), CameraOptions()
     ],
 )
 @pytest.mark.parametrize("stopped", ["exhausted", "time"])
-def test_a_refusal_names_the_limits_that_were_given(near, camera, told, stopped):
+def test_a_refusal_names_the_limits_that_were_given(query, searched, near, camera, told, stopped):
     match = replace(LocateOptions().match, camera=replace(CAMERA, **camera))
-    nothing = SearchResult(None, -math.inf, None, -math.inf, 1, 0, stopped)
-    reason = _refusal(nothing, LocateOptions(near=near, match=match), 0.1)
+    reason = judge(query, searched("a", stopped=stopped), near=near, match=match).reason
     if stopped == "time":
         assert reason.startswith("stopped at the time limit of 10 s")
         assert reason.endswith(told.partition(": ")[0] if near or camera else "none passed the tests")

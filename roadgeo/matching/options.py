@@ -1,0 +1,42 @@
+"""Options of all stages of locating a mask."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, field
+from typing import Literal
+
+from roadgeo.matching.estimator import MatchOptions
+from roadgeo.matching.paper import PairOptions
+from roadgeo.matching.query import QueryOptions
+from roadgeo.matching.search import SearchOptions
+
+__all__ = ["LocateOptions"]
+
+
+@dataclass(frozen=True)
+class LocateOptions:
+    """Options of all stages of locating a mask.
+
+    Attributes
+    ----------
+    method : "auto" or "pair"
+        Triples of intersections, or the paper's pairs.
+    near : (lon, lat, radius in metres) or None
+        The middle of the frame is known to lie there.
+    min_log10_odds : float
+        Places with less are not reported as located.
+    min_margin : float
+        Log10 odds by which the best place must lead any other; otherwise the answer is "ambiguous".
+    min_intersections : int
+        Masks with fewer are not searched.
+    """
+
+    method: Literal["auto", "pair"] = "auto"
+    near: tuple[float, float, float] | None = None
+    min_log10_odds: float = 3.5
+    min_margin: float = 2.0
+    min_intersections: int = 6
+    query: QueryOptions = field(default_factory=QueryOptions)
+    match: MatchOptions = field(default_factory=MatchOptions)
+    search: SearchOptions = field(default_factory=SearchOptions)
+    pair: PairOptions = field(default_factory=PairOptions)

@@ -1,0 +1,59 @@
+"""What follows from a fit: where the frame lies on Earth, and how it was seen."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import replace
+
+import numpy as np
+
+from roadgeo.geometry.camera import pose
+from roadgeo.geometry.mask import PIXEL_TO_PLANE
+from roadgeo.geometry.projection import grid_north, to_lonlat
+from roadgeo.location import Evidence, Location, Place
+from roadgeo.matching.methods import Fit
+from roadgeo.matching.query import Query
+
+__all__ = ["center_of", "place_frame"]
+
+
+def place_frame(location: Location, query: Query, fit: Fit) -> Location:
+    """Fill in everything that follows from a fit's homography and its matches."""
+    plane, scene = fit.index.plane, query.scene
+    homography = plane.to_crs_matrix() @ fit.matrix @ PIXEL_TO_PLANE
+    width, height = scene.size
+    pixels = np.array([[0, 0, 1], [width, 0, 1], [width, height, 1], [0, height, 1], [width / 2, height / 2, 1]], float)
+    ground = pixels @ homography.T
+    ground = ground[:, :2] / ground[:, 2:]
+    lonlat = to_lonlat(plane.crs, ground)
+    camera = pose(fit.matrix, scene.size)
+    north = grid_north(plane, ground[4])
+    chosen = fit.matched >= 0
+    reference_xy = plane.to_crs(fit.index.xy[fit.matched[chosen]])
+    odds = 0.0 if math.isnan(fit.log10_odds) else fit.log10_odds
+    return replace(
+        location,
+        crs=plane.crs,
+        homography=homography / homography[2, 2],
+        footprint=ground[:4],
+        footprint_lonlat=lonlat[:4],
+        center=Place(float(ground[4, 0]), float(ground[4, 1]), float(lonlat[4, 0]), float(lonlat[4, 1]), odds),
+        corner_sigma_m=fit.corner_sigma_m,
+        gsd_m=camera.gsd_m,
+        rotation_deg=(camera.rotation_deg + north + 180.0) % 360.0 - 180.0,
+        tilt_deg=camera.tilt_deg,
+        tilt_source="homography",
+        n_matched=int(chosen.sum()),
+        inlier_ratio=float(chosen.mean()),
+        log10_odds=None if math.isnan(fit.log10_odds) else fit.log10_odds,
+        evidence=Evidence(query.graph, scene.intersections.xy[chosen], reference_xy, fit.distance[chosen]),
+    )
+
+
+def center_of(query: Query, fit: Fit) -> Place:
+    """Return where the middle of the frame lies."""
+    plane = fit.index.plane
+    mapped = fit.matrix @ np.append(query.scene.center, 1.0)
+    ground = plane.to_crs((mapped[:2] / mapped[2])[None])
+    lonlat = to_lonlat(plane.crs, ground)
+    return Place(float(ground[0, 0]), float(ground[0, 1]), float(lonlat[0, 0]), float(lonlat[0, 1]), fit.log10_odds)

@@ -1,0 +1,197 @@
+"""Located, ambiguous or refused: the places found on all references are judged once, together."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+
+from roadgeo.geometry.camera import CameraOptions, sampling
+from roadgeo.location import Location, Place, Seen, Stats
+from roadgeo.matching.methods import Fit, Found
+from roadgeo.matching.options import LocateOptions
+from roadgeo.matching.placing import center_of, place_frame
+from roadgeo.matching.query import Query
+
+__all__ = ["Needed", "decide", "needed_of"]
+
+_EARTH_RADIUS_M = 6.371e6
+
+
+@dataclass(frozen=True)
+class Needed:
+    """What an answer must reach; see `LocateOptions`."""
+
+    log10_odds: float
+    margin: float
+    intersections: int
+
+
+def needed_of(options: LocateOptions) -> Needed:
+    """Return what an answer must reach."""
+    return Needed(options.min_log10_odds, options.min_margin, options.min_intersections)
+
+
+@dataclass(frozen=True)
+class _Candidate:
+    """A place, the reference it lies on, and its odds against all places that were tried on any reference."""
+
+    found: Found
+    fit: Fit
+    center: Place
+
+    @property
+    def score(self) -> float:
+        return self.fit.log10_odds
+
+
+def decide(query: Query, found: Sequence[Found], options: LocateOptions) -> Location:
+    """Judge the places found on one or more references, and describe the answer."""
+    location = _describe_work(query, found)
+    if options.method == "pair":
+        return _decide_pairs(location, query, found, options)
+    candidates = _pool(query, found)
+    best = candidates[0] if candidates else None
+    if best is None or best.score < options.min_log10_odds:
+        return _refuse(location, query, found, best, options)
+    placed = place_frame(_on(location, best.found), query, best.fit)
+    rival = next((one for one in candidates[1:] if _differ(query, best, one)), None)
+    placed = replace(placed, runner_up=None if rival is None else rival.center)
+    if rival is not None and best.score - rival.score < options.min_margin:
+        return replace(placed, status="ambiguous", reason=_twins(best, rival))
+    reason = (
+        f"{placed.n_matched} of {placed.n_intersections} intersections and {best.fit.agreeing:.0%} of the roads agree"
+        f"; odds 10^{best.score:.1f} against chance"
+    )
+    return replace(placed, status="located", reason=reason)
+
+
+def _describe_work(query: Query, found: Sequence[Found]) -> Location:
+    """Return what holds whatever the answer is."""
+    stats = [one.stats for one in found]
+    work = Stats(
+        sum(one.tuples_sampled for one in stats),
+        sum(one.candidates for one in stats),
+        sum(one.hypotheses for one in stats),
+        sum(one.verified for one in stats),
+    )
+    match_s, refine_s = sum(one.match_s for one in found), sum(one.refine_s for one in found)
+    xy = query.scene.intersections.xy
+    return Location(
+        query.name,
+        "not_located",
+        "",
+        size=query.scene.size,
+        n_intersections=len(xy),
+        seconds=replace(query.seconds, match=match_s, refine=refine_s),
+        stats=work,
+        seen=Seen(query.graph, xy),
+    )
+
+
+def _on(location: Location, found: Found) -> Location:
+    """Name the reference of an answer."""
+    return replace(location, reference=found.index.name, attribution=str(found.index.meta.get("attribution") or ""))
+
+
+def _pool(query: Query, found: Sequence[Found]) -> list[_Candidate]:
+    """Return the places of all references, the best first; their odds count the places tried on all of them."""
+    tried = sum(one.n_tried for one in found)
+    pool = []
+    for one in found:
+        for fit in one.fits:
+            odds = fit.log10_odds - math.log10(max(tried, 1) / max(one.n_tried, 1))
+            corrected = replace(fit, log10_odds=odds)
+            pool.append(_Candidate(one, corrected, center_of(query, corrected)))
+    return sorted(pool, key=lambda candidate: -candidate.score)
+
+
+def _differ(query: Query, a: _Candidate, b: _Candidate) -> bool:
+    """Whether two candidates are different places; on different maps if more than half a frame lies between them."""
+    if a.found is b.found:
+        return True
+    east = math.radians(a.center.lon - b.center.lon) * math.cos(math.radians(b.center.lat))
+    north = math.radians(a.center.lat - b.center.lat)
+    frame_m = sampling(b.fit.matrix, query.scene.size) * max(query.scene.size)
+    return _EARTH_RADIUS_M * math.hypot(east, north) > 0.5 * frame_m
+
+
+def _twins(best: _Candidate, rival: _Candidate) -> str:
+    on = ("", "")
+    if best.found is not rival.found:
+        on = (f" on {best.found.index.name}", f" on {rival.found.index.name}")
+    return f"two places fit almost equally: log10 odds {best.score:.1f}{on[0]} and {rival.score:.1f}{on[1]}"
+
+
+def _decide_pairs(location: Location, query: Query, found: Sequence[Found], options: LocateOptions) -> Location:
+    """Report what the paper's method found as found: it knows no odds."""
+    best = next((one for one in found if one.fits), None)
+    if best is None:
+        return _refuse(location, query, found, None, options)
+    placed = place_frame(_on(location, best), query, best.fits[0])
+    return replace(placed, status="located", reason=best.said)
+
+
+# --- refusals ---------------------------------------------------------------------------------------------------------
+
+
+def _refuse(
+    location: Location, query: Query, found: Sequence[Found], best: _Candidate | None, options: LocateOptions
+) -> Location:
+    """Say why nothing is reported: of several references, for the one that came nearest."""
+    nearest = best.found if best is not None else max(found, key=lambda one: one.n_tried)
+    score = best.score if best is not None else -math.inf
+    reason = _why_nothing(query, nearest, score, options)
+    if len(found) == 1:
+        return replace(_on(location, nearest), reason=reason)
+    names = ", ".join(one.index.name for one in found)
+    owed = dict.fromkeys(_on(location, one).attribution for one in found)
+    return replace(
+        location,
+        reference=names,
+        attribution="; ".join(filter(None, owed)),
+        reason=f"{reason} (looked on {names})",
+    )
+
+
+def _why_nothing(query: Query, found: Found, score: float, options: LocateOptions) -> str:
+    """Say why nothing is reported, and what may help."""
+    n, needed = len(query.scene.intersections), options.min_intersections
+    if n < needed:
+        return f"only {n} intersections are seen, at least {needed} are needed"
+    if found.said:
+        return found.said
+    searched = searched_within(options)
+    if options.near is not None and found.n_searched < needed:
+        return f"the map has {found.n_searched} intersections around the place given by near{searched}"
+    if math.isfinite(score):
+        best = f"the best has log10 odds {score:.1f}, {options.min_log10_odds:g} are needed"
+    else:
+        best = "none passed the tests"
+    if found.stopped == "time":
+        limit, tracing_s = options.search.time_limit_s, query.seconds.vectorize
+        tracing = f", of which tracing the mask took {tracing_s:.1f} s" if tracing_s > limit / 4 else ""
+        return f"stopped at the time limit of {limit:g} s{tracing}; of the places tried, {best}{searched}"
+    nothing = f"no place on this map stands out: {best}{searched}"
+    if searched:
+        return f"{nothing}: more roads in view or a wider search may help"
+    return f"{nothing}; more roads in view or another map may help"
+
+
+def searched_within(options: LocateOptions) -> str:
+    """Name the limits that the search was given, to end a sentence; "" for none."""
+    camera, usual = options.match.camera, CameraOptions()
+    limits = []
+    if options.near is not None:
+        lon, lat, radius = options.near
+        reach = f"{radius:g} m" if radius < 1000 else f"{radius / 1000:g} km"
+        limits.append(f"within {reach} of {lon:.9g},{lat:.9g}")
+    if camera.gsd_m != usual.gsd_m:
+        limits.append(f"at {camera.gsd_m[0]:g} to {camera.gsd_m[1]:g} m per pixel")
+    if camera.max_tilt_deg != usual.max_tilt_deg:
+        limits.append(f"tilted by up to {camera.max_tilt_deg:g} degrees")
+    if camera.north_up:
+        limits.append("north up")
+    if camera.focal_px is not None:
+        limits.append(f"with a focal length of {camera.focal_px:.5g} pixels")
+    return f"; searched {', '.join(limits)}" if limits else ""
