@@ -2,17 +2,20 @@
 
 Notation. At each end of a pair (P1, P2) every tangent has an angle r in (0, pi), counterclockwise from the connecting
 line l; its cotangent falls as r grows, so "sorted in one rotational sense, starting from l" is "falling cotangents".
-`codes` are intersection types, 16 N_B + N_q; `buckets` is a `roadgeo.pairs.Buckets`. Arrays of the reference are
+`codes` are intersection types, 16 N_B + N_q; `buckets` is a `PairBuckets`. Arrays of the reference are
 read-only, so that one compiled version serves built and memory-mapped indices alike.
 """
 
 import math
+from typing import Any, NamedTuple
 
 import numpy as np
+from numpy.typing import NDArray
 
 from roadgeo.kernels.compilation import kernel
 
 __all__ = [
+    "PairBuckets",
     "cross_ratios",
     "describe_pairs",
     "evaluate_pairs",
@@ -24,6 +27,22 @@ __all__ = [
 
 _MAX_TANGENTS = 8
 _LEAF_SIZE = 8
+
+
+class PairBuckets(NamedTuple):
+    """Reference intersections sorted by square cells: cell c = W row + column owns places `starts[c]:starts[c + 1]`.
+
+    Dimensions: N intersections, H rows, W columns.
+    """
+
+    origin: NDArray[Any]  # (2,) lower left corner, metres
+    cell: float  # side of a cell, metres
+    n_rows: int
+    n_cols: int
+    starts: NDArray[Any]  # (H W + 1,)
+    items: NDArray[Any]  # (N,) the intersection at each place
+    xy: NDArray[Any]  # (N, 2) its position
+    codes: NDArray[Any]  # (N,) uint8, its type
 
 
 @kernel(error_model="numpy")
@@ -276,7 +295,7 @@ def nearest_of_type(xy, codes, buckets, radius, out):  # type: ignore[no-untyped
     xy : (N, 2) float64
         Reference plane, metres; NaN has no neighbour.
     codes : (N,) uint8
-    buckets : roadgeo.pairs.Buckets
+    buckets : PairBuckets
     radius : float
         Metres; a neighbour lies strictly nearer.
     out : (N,) int32
@@ -382,7 +401,7 @@ def evaluate_pairs(  # type: ignore[no-untyped-def]
         Of the reference.
     tangents : (M, R) float32
         Of the reference.
-    buckets : roadgeo.pairs.Buckets
+    buckets : PairBuckets
     radius : float
         Inlier distance, metres.
     is_physical : bool

@@ -16,7 +16,8 @@ from roadgeo.location import Stats
 from roadgeo.matching.estimator import Hypothesis, MatchOptions, TripleEstimator
 from roadgeo.matching.index import ReferenceIndex, crop, unpack_tangents
 from roadgeo.matching.options import LocateOptions
-from roadgeo.matching.paper import PairIndex, PairOptions, build_pair_index, match_pairs
+from roadgeo.matching.paper.search import match_pairs
+from roadgeo.matching.paper.tuples import PairIndex, PairOptions, build_pair_index
 from roadgeo.matching.query import Query
 from roadgeo.matching.rehearsal import rehearse_search
 from roadgeo.matching.search import SearchResult, search
