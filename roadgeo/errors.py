@@ -8,6 +8,7 @@ __all__ = [
     "CrsError",
     "IndexFormatError",
     "MaskError",
+    "NotLocatedError",
     "OutputError",
     "PluginError",
     "RoadSourceError",
@@ -33,6 +34,10 @@ class MaskError(RoadgeoError):
 
 class IndexFormatError(RoadgeoError):
     """A reference's files are missing, damaged, hostile, stale or of another format version."""
+
+
+class NotLocatedError(RoadgeoError):
+    """A place was asked of a mask that was not located."""
 
 
 class OutputError(RoadgeoError):

@@ -3,10 +3,17 @@
 from __future__ import annotations
 
 from dataclasses import dataclass, field
-from typing import Any, Literal
+from html import escape
+from typing import TYPE_CHECKING, Any, Literal
 
 from roadgeo._arrays import FloatArray
+from roadgeo.errors import NotLocatedError
+from roadgeo.geometry.frame import Frame
+from roadgeo.geometry.homography import Homography
 from roadgeo.roads.graph import RoadGraph
+
+if TYPE_CHECKING:
+    import geopandas as gpd
 
 __all__ = ["SCHEMA", "Evidence", "Location", "Place", "Seconds", "Seen", "Stats", "Status"]
 
@@ -83,7 +90,7 @@ class Evidence:
     residual_m: FloatArray
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, repr=False)
 class Location:
     """Result of locating one mask. Everything that needs a place is None unless `status` is "located" or "ambiguous".
 
@@ -133,6 +140,73 @@ class Location:
     def located(self) -> bool:
         """Whether one place was found."""
         return self.status == "located"
+
+    def pixel_to_map(self, pixels: FloatArray) -> FloatArray:
+        """Take (..., 2) pixel positions (column, row; the top-left corner is 0, 0) to the location's CRS.
+
+        Raises
+        ------
+        NotLocatedError
+            There is no place: `status` is "not_located".
+        """
+        return self._placed()(pixels)
+
+    def map_to_pixel(self, xy: FloatArray) -> FloatArray:
+        """Take (..., 2) coordinates of the location's CRS to pixel positions (column, row).
+
+        Raises
+        ------
+        NotLocatedError
+            There is no place: `status` is "not_located".
+        """
+        return self._placed().inverse()(xy)
+
+    def _placed(self) -> Homography:
+        if self.homography is None or self.size is None:
+            raise NotLocatedError(f"{self.query or 'the mask'} has no place: {self.reason}")
+        return Homography(self.homography).facing(Frame(*self.size).center)
+
+    @property
+    def __geo_interface__(self) -> dict[str, Any]:
+        """The footprint as a GeoJSON Feature in longitude and latitude; no geometry where there is no place."""
+        ring = [] if self.footprint_lonlat is None else self.footprint_lonlat.tolist()
+        closed = {"type": "Polygon", "coordinates": [[*ring, ring[0]]]} if ring else None
+        told = {key: value for key, value in self.to_dict().items() if not isinstance(value, dict | list)}
+        return {"type": "Feature", "geometry": closed, "properties": told}
+
+    def to_geodataframe(self) -> gpd.GeoDataFrame:
+        """Return the footprint and its attributes as a table of one row, in the location's CRS (WGS 84 without one)."""
+        import geopandas as gpd
+
+        frame = gpd.GeoDataFrame.from_features([self.__geo_interface__], crs="EPSG:4326")
+        return frame if self.crs is None else frame.to_crs(self.crs)
+
+    def __repr__(self) -> str:
+        """Say the answer in one line."""
+        if self.center is None:
+            return f"<Location {self.query!r}: {self.status}, {self.reason}>"
+        place = f"{self.center.lat:.6f}, {self.center.lon:.6f} on {self.reference}"
+        score = "" if self.log10_odds is None else f", log10 odds {self.log10_odds:.1f}"
+        return f"<Location {self.query!r}: {self.status} at {place}{score}>"
+
+    def _repr_html_(self) -> str:
+        """Show the answer as a small table, for notebooks."""
+        rows = {"status": self.status, "reason": self.reason, "reference": self.reference, "crs": self.crs}
+        if self.center is not None:
+            rows["latitude, longitude"] = f"{self.center.lat:.6f}, {self.center.lon:.6f}"
+        if self.corner_sigma_m is not None:
+            rows["corners, standard deviation"] = f"{self.corner_sigma_m.max():.1f} m at most"
+        for label, value, unit in (
+            ("ground sampling", self.gsd_m, "m"),
+            ("rotation", self.rotation_deg, "°"),
+            ("tilt", self.tilt_deg, "°"),
+        ):
+            if value is not None:
+                rows[label] = f"{value:.3g} {unit}"
+        cells = "".join(
+            f"<tr><th>{escape(label)}</th><td>{escape(str(value))}</td></tr>" for label, value in rows.items() if value
+        )
+        return f"<table><caption>{escape(self.query)}</caption>{cells}</table>"
 
     def to_dict(self) -> dict[str, Any]:
         """Plain values in the order of the schema, ready for `json.dumps`; evidence and what was seen are left out."""

@@ -1,0 +1,65 @@
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+from roadgeo.errors import NotLocatedError
+from roadgeo.location import Location, Place
+
+REFUSED = Location("field.png", "not_located", "only 3 intersections are seen, at least 6 are needed", size=(400, 300))
+#: 0.5 m per pixel, north up, and with the sign of w turned about.
+H = -np.array([[0.5, 0.0, 331_000.0], [0.0, -0.5, 4_690_000.0], [0.0, 0.0, 1.0]])
+LOCATED = replace(
+    REFUSED,
+    status="located",
+    reason="40 of 50 intersections agree",
+    reference="boston <&>",
+    crs="EPSG:32619",
+    homography=H,
+    footprint=np.array([[331_000, 4_690_000], [331_200, 4_690_000], [331_200, 4_689_850], [331_000, 4_689_850]], float),
+    footprint_lonlat=np.array(
+        [[-71.048806, 42.342935], [-71.046379, 42.342980], [-71.046334, 42.341630], [-71.048761, 42.341585]]
+    ),
+    center=Place(331_100.0, 4_689_925.0, -71.04757, 42.342283, 12.5),
+    gsd_m=0.5,
+    log10_odds=12.5,
+    corner_sigma_m=np.full(4, 0.7),
+)
+
+
+def test_a_location_says_the_answer_in_one_line():
+    assert repr(REFUSED) == "<Location 'field.png': not_located, only 3 intersections are seen, at least 6 are needed>"
+    expected = "<Location 'field.png': located at 42.342283, -71.047570 on boston <&>, log10 odds 12.5>"
+    assert repr(LOCATED) == expected
+    shown = LOCATED._repr_html_()
+    assert "boston &lt;&amp;&gt;" in shown
+    assert "0.7 m at most" in shown
+    assert "<tr>" in REFUSED._repr_html_()
+
+
+def test_pixels_go_to_the_map_and_back():
+    pixels = np.array([[0.0, 0.0], [400.0, 300.0], [12.5, 7.25]])
+    there = LOCATED.pixel_to_map(pixels)
+    np.testing.assert_allclose(there[:2], LOCATED.footprint[[0, 2]])
+    np.testing.assert_allclose(LOCATED.map_to_pixel(there), pixels, atol=1e-6)
+    for way in (REFUSED.pixel_to_map, REFUSED.map_to_pixel):
+        with pytest.raises(NotLocatedError, match=r"field.png has no place: only 3 intersections"):
+            way(pixels)
+
+
+def test_a_location_is_a_feature_to_other_libraries():
+    import geopandas as gpd
+    import shapely
+
+    feature = LOCATED.__geo_interface__
+    ring = shapely.geometry.shape(feature["geometry"])
+    assert ring.is_valid
+    assert len(feature["geometry"]["coordinates"][0]) == 5
+    assert feature["properties"]["status"] == "located"
+    assert feature["properties"]["log10_odds"] == 12.5
+    assert REFUSED.__geo_interface__["geometry"] is None
+    table = LOCATED.to_geodataframe()
+    assert isinstance(table, gpd.GeoDataFrame)
+    assert table.crs == "EPSG:32619"
+    assert table.area[0] == pytest.approx(200 * 150, rel=1e-3)
+    assert len(REFUSED.to_geodataframe()) == 1
