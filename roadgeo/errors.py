@@ -10,6 +10,7 @@ __all__ = [
     "MaskError",
     "NotLocatedError",
     "OutputError",
+    "PhotographError",
     "PluginError",
     "RoadSourceError",
     "RoadgeoError",
@@ -30,6 +31,10 @@ class CrsError(RoadgeoError):
 
 class MaskError(RoadgeoError):
     """A query raster could not be read, or is not a road mask."""
+
+
+class PhotographError(MaskError):
+    """A query raster is a photograph: its roads have to be segmented first."""
 
 
 class IndexFormatError(RoadgeoError):

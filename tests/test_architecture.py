@@ -20,6 +20,7 @@ STOREYS_TEXT = """
     references  reference
     exits       outputs
     workflows   workflows
+    looks       looks
     evaluation  evaluation
     faces       cli qgis demo __main__ __init__
 """

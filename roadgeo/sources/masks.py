@@ -19,20 +19,21 @@ from roadgeo.errors import MaskError
 from roadgeo.geometry.mask import RoadMask
 from roadgeo.roads.observed import find_voids
 from roadgeo.roads.vectorization import road_width
+from roadgeo.sources.thresholds import Sample, find_thresholds
 
 if TYPE_CHECKING:
     from rasterio import DatasetReader
 
-__all__ = ["read_mask"]
+__all__ = ["MaskSource", "open_mask", "read_mask"]
 
 _LOG = logging.getLogger(__name__)
 
 MIN_SIDE, MAX_SIDE = 32, 20_000
 _STRIP_PIXELS = 1 << 25  # rows are read and thresholded so many pixels at a time
 _SAMPLE_PIXELS = 1 << 18  # what a mask's values mean is told from about so many
-_COLOURED_SHARE, _GREY_SHARE, _GREY_SHARE_ON_DARK = 0.05, 0.25, 0.3  # more than this: a photograph
+_MIDDLE_PIXELS = 1 << 22  # and, where neighbours matter, from so many in the middle rows
+_OPENCV_BYTES = 1 << 25  # larger files are read window by window, by GDAL
 _MAX_ROAD_SHARE = 0.35  # of a frame
-_MAX_CLASS = 32  # whole numbers up to this, three or more of them, are the classes of a map
 
 #: First bytes of the files that OpenCV reads; importing rasterio would take longer than reading the mask.
 _PNG_MAGIC, _PNG_END = b"\x89PNG\r\n", b"IEND"
@@ -84,27 +85,74 @@ def read_mask(
 
     Raises
     ------
+    PhotographError
+        It is a photograph.
     MaskError
-        The file is missing or no raster; or it is empty, too small, too large, a photograph, or of several classes.
+        The file is missing or no raster; or it is empty, too small, too large, or of several classes.
     """
+    with open_mask(source, band=band, threshold=threshold, name=name, voids=voids) as opened:
+        return opened.read(opened.thresholds[0])
+
+
+@dataclass(frozen=True)
+class MaskSource:
+    """An open mask, or a soft map of roads that can be read at several thresholds.
+
+    Attributes
+    ----------
+    thresholds : tuple of float
+        Those worth trying, the most promising first; one for a mask.
+    """
+
+    thresholds: tuple[float, ...]
+    _raster: _Raster
+    _channel: int
+    _voids: bool
+
+    def read(self, threshold: float) -> RoadMask:
+        """Read where values lie above a threshold as road.
+
+        Raises
+        ------
+        MaskError
+            There are none, or hardly others.
+        """
+        name = self._raster.name
+        roads, observed = _separate(self._raster, self._channel, threshold)
+        roads, observed = _told_apart(name, roads, observed)
+        if self._voids and observed is None:
+            observed = find_voids(roads, road_width(RoadMask(roads, name=name)))
+        if observed is not None:
+            roads &= observed
+        return RoadMask(roads, observed, name)
+
+
+@contextmanager
+def open_mask(
+    source: str | os.PathLike[str] | AnyArray,
+    *,
+    band: int | None = None,
+    threshold: float | None = None,
+    name: str | None = None,
+    voids: bool = True,
+) -> Iterator[MaskSource]:
+    """Open a road mask or a soft map of roads: parameters and errors as of `read_mask`."""
     with _open(source, band, name) as raster:
         height, width = raster.shape
+        seen = _sample(raster)
+        channel = int(np.argmax(seen.std(axis=0))) if raster.n_bands > 1 else 0
+        sample = Sample(raster.name, seen, channel, lambda: _middle_rows(raster, channel))
+        thresholds = find_thresholds(sample) if threshold is None else (threshold,)
         if min(raster.shape) < MIN_SIDE or max(raster.shape) > MAX_SIDE:
             raise MaskError(
                 f"{raster.name}: {width} x {height} pixels; expected {MIN_SIDE} to {MAX_SIDE} on each side: "
                 + ("give a larger mask" if min(raster.shape) < MIN_SIDE else "reduce it or cut it up")
             )
-        roads, observed = _separate(raster, threshold)
-    roads, observed = _told_apart(raster.name, roads, observed)
-    if voids and observed is None:
-        observed = find_voids(roads, road_width(RoadMask(roads, name=raster.name)))
-    if observed is not None:
-        roads &= observed
-    return RoadMask(roads, observed, raster.name)
+        yield MaskSource(thresholds, raster, channel, voids)
 
 
-def _separate(raster: _Raster, threshold: float | None) -> tuple[BoolArray, BoolArray | None]:
-    """Return where values lie above the threshold, and where they are valid."""
+def _sample(raster: _Raster) -> AnyArray:
+    """Return (n, B) observed values, from all over a raster."""
     height, width = raster.shape
     step = int(np.ceil(np.sqrt(height * width / _SAMPLE_PIXELS)))
     sample, valid = raster.read(0, height, step)
@@ -112,15 +160,28 @@ def _separate(raster: _Raster, threshold: float | None) -> tuple[BoolArray, Bool
     seen = sample.reshape(-1, raster.n_bands) if finite.all() else sample[finite]
     if len(seen) == 0:
         raise MaskError(f"{raster.name}: holds no observed pixel, only nodata, NaN or alpha 0; give a mask with roads")
-    channel = int(np.argmax(seen.std(axis=0))) if raster.n_bands > 1 else 0
-    if threshold is None:
-        threshold = _threshold(raster.name, seen, channel)
+    return seen
 
+
+def _middle_rows(raster: _Raster, channel: int) -> AnyArray:
+    """Return (rows, columns) values of a band in the middle of a raster; where they are no numbers, the smallest."""
+    height, width = raster.shape
+    rows = min(height, max(_MIDDLE_PIXELS // width, MIN_SIDE))
+    top = (height - rows) // 2
+    values, valid = raster.read(top, top + rows, 1)
+    finite = _finite(values, valid)
+    chosen = values[..., channel]
+    return chosen if finite.all() else np.where(finite, chosen, chosen[finite].min() if finite.any() else 0)
+
+
+def _separate(raster: _Raster, channel: int, threshold: float) -> tuple[BoolArray, BoolArray | None]:
+    """Return where values of a band lie above the threshold, and where they are valid."""
+    _, width = raster.shape
     roads = np.zeros(raster.shape, np.bool_)
     observed = None
     rows = max(1, _STRIP_PIXELS // (width * raster.n_bands))
-    for top in range(0, height, rows):
-        strip = slice(top, min(top + rows, height))
+    for top in range(0, raster.shape[0], rows):
+        strip = slice(top, min(top + rows, raster.shape[0]))
         values, valid = raster.read(strip.start, strip.stop, 1)
         _compare(values[..., channel], threshold, roads[strip])
         finite = _finite(values, valid)
@@ -131,7 +192,7 @@ def _separate(raster: _Raster, threshold: float | None) -> tuple[BoolArray, Bool
     if not roads.any():
         raise MaskError(
             f"{raster.name}: shows no road: no value above {threshold:g}, the largest of a sample is "
-            f"{seen[:, channel].max():g}; expected roads as light pixels (or give a lower threshold)"
+            f"{_sample(raster)[:, channel].max():g}; expected roads as light pixels (or give a lower threshold)"
         )
     return roads, observed
 
@@ -150,61 +211,6 @@ def _finite(values: AnyArray, valid: BoolArray | None) -> BoolArray:
     """Return (rows, columns) where values are valid numbers."""
     finite = np.ones(values.shape[:2], np.bool_) if valid is None else valid
     return finite & np.isfinite(values).all(axis=2) if values.dtype.kind == "f" else finite
-
-
-def _threshold(name: str, seen: AnyArray, channel: int) -> float:
-    """Tell from (n, B) values what is road; `channel` is the band to go by."""
-    values = seen[:, channel].astype(np.float64)
-    levels = np.unique(values)
-    low, high = levels[0], levels[-1]
-    if len(levels) <= 2:
-        return float(low + high) / 2 if high > low else float(np.nextafter(high, -np.inf) if high > 0 else high)
-    _refuse_classes(name, seen, levels)
-    if seen.dtype.kind == "f" and low >= 0 and high <= 1:
-        return 0.5  # probabilities
-    _refuse_photograph(name, seen, values)
-    if seen.dtype == np.uint8 and high > 127:
-        return 127.0
-    return _otsu(values)
-
-
-def _refuse_classes(name: str, seen: AnyArray, levels: AnyArray) -> None:
-    """Raise where (n, B) values are the classes of a land cover map: small whole numbers or a handful of colours."""
-    if seen.dtype.kind in "iu" and levels[-1] <= _MAX_CLASS:
-        listed = ", ".join(f"{level:g}" for level in levels)
-        raise MaskError(f"{name}: holds the classes {listed}; expected road and no road: give a threshold or a mask")
-    if seen.shape[1] == 1 or np.ptp(seen.astype(np.float64), axis=1).max() <= 0.1 * levels[-1]:
-        return
-    n_colours = len(np.unique(seen, axis=0)) if len(levels) <= _MAX_CLASS else 0
-    if 2 < n_colours <= _MAX_CLASS:
-        raise MaskError(f"{name}: holds {n_colours} colours; expected road and no road: choose a band or give a mask")
-
-
-def _refuse_photograph(name: str, seen: AnyArray, values: AnyArray) -> None:
-    """Raise where (n, B) values are coloured, or spread between the usual dark and the usual light (n,) value."""
-    span = np.ptp(values)
-    coloured = np.mean(np.ptp(seen.astype(np.float64), axis=1) > 0.05 * span) if seen.shape[1] > 1 else 0.0
-    counts, edges = np.histogram(values, bins=64)
-    dark, light = edges[np.argmax(counts[:32])], edges[32 + np.argmax(counts[32:])]
-    off_light = np.abs(values - light) > 0.08 * span
-    off = np.mean(off_light & (np.abs(values - dark) > 0.08 * span))
-    off_on_dark = off / np.mean(off_light) if np.mean(off_light) > 0.5 else 0.0
-    if coloured > _COLOURED_SHARE or off > _GREY_SHARE or off_on_dark > _GREY_SHARE_ON_DARK:
-        raise MaskError(
-            f"{name}: looks like a photograph, {coloured:.0%} of it coloured and {off:.0%} neither dark nor light; "
-            "expected a mask of its roads: segment it first (or give a threshold, if it is a mask)"
-        )
-
-
-def _otsu(values: AnyArray) -> float:
-    """Return the value that parts two groups best: largest variance between them (Otsu 1979)."""
-    counts, edges = np.histogram(values, bins=256)
-    centres = (edges[:-1] + edges[1:]) / 2
-    below = np.cumsum(counts)[:-1]
-    sums = np.cumsum(counts * centres)
-    above = len(values) - below
-    between = below * above * (sums[:-1] / below - (sums[-1] - sums[:-1]) / np.maximum(above, 1)) ** 2
-    return float(edges[1:-1][np.argmax(between)])
 
 
 def _told_apart(name: str, roads: BoolArray, observed: BoolArray | None) -> tuple[BoolArray, BoolArray | None]:
@@ -247,7 +253,7 @@ def _read_with_opencv(path: str, name: str) -> AnyArray | None:
     """Decode a PNG, JPEG or BMP without side files as it is stored; None where GDAL has to."""
     with Path(path).open("rb") as file:
         head = file.read(8)
-    if not head.startswith(_OPENCV_MAGIC) or Path(path + ".aux.xml").exists():
+    if not head.startswith(_OPENCV_MAGIC) or Path(path + ".aux.xml").exists() or _is_large(path):
         return None
     content = np.fromfile(path, np.uint8)
     is_png = head.startswith(_PNG_MAGIC)
@@ -257,6 +263,10 @@ def _read_with_opencv(path: str, name: str) -> AnyArray | None:
     if is_png and image is None:  # GDAL would read the rest as black
         raise MaskError(f"{name}: a PNG that is damaged or cut short; copy or export it again")
     return image
+
+
+def _is_large(path: str) -> bool:
+    return Path(path).stat().st_size > _OPENCV_BYTES
 
 
 def _of_array(array: AnyArray, band: int | None, name: str, *, alpha: bool) -> _Raster:

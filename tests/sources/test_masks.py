@@ -1,5 +1,6 @@
 """Any raster becomes a road mask, or one line says why not."""
 
+import itertools
 import logging
 from pathlib import Path
 
@@ -9,8 +10,8 @@ import pytest
 import rasterio
 from rasterio.errors import NotGeoreferencedWarning
 
-from roadgeo.errors import MaskError
-from roadgeo.sources.masks import read_mask
+from roadgeo.errors import MaskError, PhotographError
+from roadgeo.sources.masks import open_mask, read_mask
 
 pytestmark = pytest.mark.filterwarnings("ignore::rasterio.errors.NotGeoreferencedWarning")
 
@@ -194,7 +195,6 @@ def test_a_photograph_is_refused_by_name(tmp_path: Path) -> None:
         (np.zeros(SHAPE, np.uint8), "shows no road"),
         (np.full(SHAPE, 255, np.uint8), "every pixel is light"),
         (np.full(SHAPE, np.nan), "no observed pixel"),
-        (np.tile([0.1, 0.3, 0.2, 0.4], (80, 25)), "shows no road: no value above 0.5"),
         (np.eye(10), "10 x 10 pixels; expected 32"),
         (np.arange(8000).reshape(SHAPE) % 4, "holds the classes 0, 1, 2, 3"),
         (np.zeros((3, 4, 5, 6)), r"shape \(3, 4, 5, 6\)"),
@@ -205,6 +205,79 @@ def test_what_is_no_mask(values: np.ndarray, message: str) -> None:
     with pytest.raises(MaskError, match=message) as raised:
         read_mask(values)
     assert "\n" not in str(raised.value)
+
+
+def soft_map(roads: np.ndarray, seed: int = 0) -> np.ndarray:
+    """Roads blurred on uneven grey ground."""
+    rng = np.random.default_rng(seed)
+    uneven = cv2.resize(
+        rng.standard_normal((4, 5)).astype(np.float32), roads.shape[::-1], interpolation=cv2.INTER_CUBIC
+    )
+    soft = cv2.GaussianBlur(roads * np.float32(255), (0, 0), 4) * 0.8 + 18 + 10 * uneven
+    return np.clip(soft, 0, 255).astype(np.uint8)
+
+
+@pytest.fixture
+def town() -> np.ndarray:
+    image = np.zeros((400, 500), np.uint8)
+    for line in ([(0, 50), (500, 90)], [(120, 0), (100, 400)], [(300, 0), (360, 400)], [(0, 250), (500, 240)]):
+        cv2.line(image, *line, 1, 9)
+    return image.astype(bool)
+
+
+def test_a_soft_map_is_read_at_several_thresholds(town: np.ndarray) -> None:
+    soft = soft_map(town)
+    with open_mask(soft) as opened:
+        thresholds = opened.thresholds
+        masks = [opened.read(threshold) for threshold in thresholds]
+    assert len(thresholds) >= 2
+    overlap = np.mean(masks[0].roads & town) / np.mean(masks[0].roads | town)
+    assert overlap > 0.6
+    np.testing.assert_array_equal(read_mask(soft).roads, masks[0].roads)
+    areas = sorted(np.mean(mask.roads) for mask in masks)
+    assert all(larger > 1.1 * smaller for smaller, larger in itertools.pairwise(areas))
+
+
+def test_a_mask_has_one_threshold(town: np.ndarray) -> None:
+    for values in (town, town * np.uint8(255), np.where(town, 3.0, -3.0)):
+        with open_mask(values) as opened:
+            assert len(opened.thresholds) == 1
+    with open_mask(soft_map(town), threshold=60) as opened:
+        assert opened.thresholds == (60,)
+
+
+@pytest.mark.parametrize("sigma", [1, 2, 4])
+def test_a_faint_map_is_no_map_of_classes(tmp_path: Path, town: np.ndarray, sigma: float) -> None:
+    faint = np.rint(cv2.GaussianBlur(town * np.float32(12), (0, 0), sigma)).astype(np.uint8)
+    path = tmp_path / "faint.png"
+    cv2.imwrite(str(path), np.dstack([faint] * 3 + [np.full_like(faint, 255)]))
+    for source in (faint, path):
+        roads = read_mask(source).roads
+        assert np.mean(roads & town) / np.mean(roads | town) > 0.6
+
+
+def test_classes_are_no_faint_map() -> None:
+    rng = np.random.default_rng(0)
+    patches = rng.integers(0, 13, (8, 10)).astype(np.uint8)
+    classes = cv2.resize(patches, (500, 400), interpolation=cv2.INTER_NEAREST)
+    with pytest.raises(MaskError, match="holds the classes 0, 1, 2"):
+        read_mask(classes)
+
+
+def test_faint_probabilities_are_read(town: np.ndarray) -> None:
+    faint = 0.04 * cv2.GaussianBlur(town.astype(np.float32), (0, 0), 2)
+    roads = read_mask(faint).roads
+    assert np.mean(roads & town) / np.mean(roads | town) > 0.6
+
+
+def test_a_grey_photograph_with_a_white_void_is_no_mask() -> None:
+    rng = np.random.default_rng(0)
+    ground = cv2.GaussianBlur(rng.normal(0, 1, (400, 500)), (0, 0), 3)
+    photo = np.clip(110 + 400 * ground + rng.normal(0, 8, ground.shape), 0, 255).astype(np.uint8)
+    for void in (0.0, 0.4, 0.8):
+        photo[:, : int(500 * void)] = 255
+        with pytest.raises(PhotographError):
+            read_mask(photo)
 
 
 def test_a_land_cover_map_in_colours_is_refused(tmp_path: Path) -> None:

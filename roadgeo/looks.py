@@ -1,0 +1,184 @@
+"""Several looks at one scene: a soft map at several thresholds, a photograph at several scales.
+
+Each look is a mask of its own and is located by `workflows.locate`. All share one time limit. Who looks k times finds
+a chance resemblance k times as often, so log10(k) is taken off the odds.
+"""
+
+from __future__ import annotations
+
+import math
+import os
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass, replace
+
+import numpy as np
+
+from roadgeo._arrays import AnyArray
+from roadgeo.errors import MaskError
+from roadgeo.geometry.mask import RoadMask
+from roadgeo.location import Location
+from roadgeo.matching.explanation import Explanation
+from roadgeo.reference.reference import Reference
+from roadgeo.sources.masks import open_mask
+from roadgeo.workflows import LocateOptions, locate
+
+__all__ = ["Look", "Sighting", "locate_looks", "locate_soft"]
+
+#: Share of the time left that a look may take; the last one may take all.
+_SHARE = 0.6
+
+Locate = Callable[[RoadMask, Sequence[Reference], LocateOptions], "Location | Explanation"]
+
+
+@dataclass(frozen=True)
+class Look:
+    """A mask to locate, made when it is needed.
+
+    Attributes
+    ----------
+    what : str
+        What tells it from the others, for people: "threshold 63".
+    make : callable
+        Returns the mask; may raise MaskError.
+    """
+
+    what: str
+    make: Callable[[], RoadMask]
+
+
+@dataclass(frozen=True)
+class Sighting:
+    """The answer of the best look, and the mask that it rests on."""
+
+    location: Location
+    mask: RoadMask
+    explanation: Explanation | None = None
+
+
+def locate_soft(
+    source: str | os.PathLike[str] | AnyArray,
+    references: Sequence[Reference],
+    options: LocateOptions,
+    *,
+    band: int | None = None,
+    name: str | None = None,
+    how: Locate = locate,
+) -> Sighting:
+    """Locate a mask, or a soft map of roads at the thresholds that its values suggest.
+
+    Raises
+    ------
+    PhotographError
+        It is a photograph.
+    MaskError
+        It cannot be read or shows no roads at any threshold.
+    """
+    with open_mask(source, band=band, name=name) as opened:
+
+        def look(threshold: float) -> Look:
+            return Look(f"threshold {threshold:.3g}", lambda: opened.read(threshold))
+
+        return locate_looks([look(threshold) for threshold in opened.thresholds], references, options, how)
+
+
+def locate_looks(
+    looks: Sequence[Look], references: Sequence[Reference], options: LocateOptions, how: Locate = locate
+) -> Sighting:
+    """Take one look after another until one is located, within the time limit of the search.
+
+    Raises
+    ------
+    MaskError
+        No look shows roads that can be traced; the first one's reason.
+    """
+    sightings: list[Sighting] = []
+    failure: MaskError | None = None
+    left = options.search.time_limit_s
+    for tried, look in enumerate(looks, 1):
+        if tried > 1 and left <= 0.05 * options.search.time_limit_s:
+            break
+        limit = left if tried == len(looks) else _SHARE * left
+        try:
+            sighting = _take(look, references, _limited(options, limit), how)
+        except MaskError as error:
+            failure = failure or error
+            continue
+        seconds = sighting.location.seconds
+        left -= seconds.vectorize + seconds.match + seconds.refine
+        sightings.append(_discount(sighting, look, tried, options))
+        if sightings[-1].location.located:
+            break
+    if not sightings:
+        raise failure or MaskError("nothing to look at; give a mask or a photograph")
+    return _best_of(sightings, options)
+
+
+def _limited(options: LocateOptions, time_limit_s: float) -> LocateOptions:
+    return replace(options, search=replace(options.search, time_limit_s=time_limit_s))
+
+
+def _take(look: Look, references: Sequence[Reference], options: LocateOptions, how: Locate) -> Sighting:
+    mask = look.make()
+    found = how(mask, references, options)
+    if isinstance(found, Explanation):
+        return Sighting(found.location, mask, found)
+    return Sighting(found, mask)
+
+
+def _discount(sighting: Sighting, look: Look, tried: int, options: LocateOptions) -> Sighting:
+    """Take log10 of the number of looks off the odds; what is then too unlikely is not located."""
+    location, off = sighting.location, math.log10(tried)
+    if tried == 1 or location.log10_odds is None:
+        return sighting
+    odds = location.log10_odds - off
+    if odds < options.min_log10_odds:
+        few = f"at {look.what}, look {tried}, log10 odds {odds:.1f} are left, {options.min_log10_odds:g} are needed"
+        return replace(sighting, location=_refused(location, few))
+    reason = f"{location.reason}; at {look.what}, for which as look {tried} a factor of {tried} is off the odds"
+    center = None if location.center is None else replace(location.center, log10_odds=odds)
+    runner_up = location.runner_up
+    if runner_up is not None:
+        runner_up = replace(runner_up, log10_odds=runner_up.log10_odds - off)
+    location = replace(location, reason=reason, log10_odds=odds, center=center, runner_up=runner_up)
+    return replace(sighting, location=location)
+
+
+def _refused(location: Location, reason: str) -> Location:
+    """Return a location of which nothing is left but what was seen."""
+    bare = Location(location.query, "not_located", reason, location.reference, location.attribution)
+    seen = {name: getattr(location, name) for name in ("size", "n_intersections", "seconds", "stats", "seen")}
+    return replace(bare, **seen)
+
+
+def _best_of(sightings: Sequence[Sighting], options: LocateOptions) -> Sighting:
+    """Return the best answer, the first of equals; a rival elsewhere that is almost as sure makes it ambiguous."""
+    rank = {"located": 2, "ambiguous": 1, "not_located": 0}
+    best = max(sightings, key=lambda one: (rank[one.location.status], one.location.log10_odds or -math.inf))
+    locations = [one.location for one in sightings]
+    seconds = replace(
+        best.location.seconds,
+        vectorize=sum(one.seconds.vectorize for one in locations),
+        match=sum(one.seconds.match for one in locations),
+        refine=sum(one.seconds.refine for one in locations),
+    )
+    location = replace(best.location, seconds=seconds)
+    if len(sightings) > 1 and location.status == "not_located":
+        location = replace(location, reason=f"{location.reason} ({len(sightings)} looks taken)")
+    rivals = [one for one in locations if one is not best.location and _elsewhere(one, location)]
+    rival = max(rivals, key=lambda one: one.log10_odds or -math.inf, default=None)
+    if location.located and rival is not None:
+        lead = (location.log10_odds or 0.0) - (rival.log10_odds or 0.0)
+        if lead < options.min_margin:
+            reason = f"two looks find two places almost equally: they differ by {lead:.1f} in log10 odds"
+            location = replace(location, status="ambiguous", reason=reason, runner_up=rival.center)
+    return replace(best, location=location)
+
+
+def _elsewhere(one: Location, best: Location) -> bool:
+    """Whether a location, sure or ambiguous, lies more than half a frame from another."""
+    if one.center is None or best.center is None or best.footprint is None:
+        return False
+    east = math.radians(one.center.lon - best.center.lon) * math.cos(math.radians(best.center.lat))
+    north = math.radians(one.center.lat - best.center.lat)
+    side = float(np.hypot(*(best.footprint[1] - best.footprint[0])))
+    return 6.371e6 * math.hypot(east, north) > 0.5 * side

@@ -1,0 +1,185 @@
+"""What a raster's values mean: a mask, probabilities, classes or a photograph; and the thresholds worth trying.
+
+Values are judged from a sample of pixels spread over the raster and, where neighbours matter, from rows of it.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass
+
+import cv2
+import numpy as np
+
+from roadgeo._arrays import AnyArray, BoolArray
+from roadgeo.errors import MaskError, PhotographError
+from roadgeo.geometry.mask import RoadMask
+from roadgeo.roads.vectorization import road_width
+
+__all__ = ["Sample", "find_thresholds"]
+
+_COLOURED_SHARE = 0.05  # more than this: a photograph
+_GREY_SHARE = 0.25  # more than this is neither dark nor light: a soft map on uneven ground
+_CRISP_SHARE = 0.02  # less than this: a mask
+_MAX_CLASS = 32  # whole numbers up to this, three or more of them, are the classes of a map, unless they are faint
+
+#: Values that are not crisp show roads only where (measured on soft maps and on the photographs of the Massachusetts
+#: Roads Dataset in grey, plain and blurred) little of the frame is light, the dark ground is even, and what is light
+#: falls into few pieces of one width. In an inverted map dark and light change places.
+_MAX_LIGHT = 0.35  # share of the frame
+_MAX_SPREAD = 0.22  # standard deviation of the ground, of the difference between light and dark
+_MAX_PIECES = 0.3  # pieces times their squared width, of the light area
+_MAX_DEPTH = 2.3  # ninth decile of the depth of light pixels, of its mean: 1.8 in a stripe
+
+#: Neighbours in a faint map differ by one level, in a map of classes by any number of them.
+_MIN_STEPS_OF_ONE, _MIN_LEVELS_FILLED = 0.8, 0.7
+_MANY_LEVELS = 8  # more classes than this do not look like roads
+
+#: Further thresholds of a soft map, as shares of the way from the ground's value to the roads'.
+_FURTHER = (0.3, 0.7)
+
+
+@dataclass(frozen=True)
+class Sample:
+    """Values of a raster. Dimensions: n pixels, B bands.
+
+    Attributes
+    ----------
+    name : str
+        Of the raster, for messages.
+    seen : (n, B)
+        Observed pixels spread over the raster.
+    channel : int
+        The band to go by.
+    read_rows : callable
+        Returns (rows, columns) neighbouring values of that band, from the middle of the raster.
+    """
+
+    name: str
+    seen: AnyArray
+    channel: int
+    read_rows: Callable[[], AnyArray]
+
+
+def find_thresholds(sample: Sample) -> tuple[float, ...]:
+    """Find the thresholds above which values may be road: one for a mask, several for a soft map, the best first.
+
+    Raises
+    ------
+    PhotographError
+        It is a photograph.
+    MaskError
+        It is a map of several classes.
+    """
+    values = sample.seen[:, sample.channel].astype(np.float64)
+    levels = np.unique(values)
+    low, high = levels[0], levels[-1]
+    if len(levels) <= 2:
+        return (float(low + high) / 2 if high > low else float(np.nextafter(high, -np.inf) if high > 0 else high),)
+    if sample.seen.dtype.kind in "iu" and high <= _MAX_CLASS:
+        _refuse_classes(sample, levels)
+        return _spread(values, _otsu(values))
+    _refuse_colours(sample, levels)
+    if sample.seen.dtype.kind == "f" and low >= 0 and high <= 1:
+        return _spread(values, 0.5 if high > 0.5 else _otsu(values))  # probabilities
+    grey = _grey_share(sample, values)
+    usual = 127.0 if sample.seen.dtype == np.uint8 and high > 127 and grey <= _GREY_SHARE else _otsu(values)
+    return (usual,) if grey <= _CRISP_SHARE else _spread(values, usual)
+
+
+def _spread(values: AnyArray, first: float) -> tuple[float, ...]:
+    """Return the first threshold and those between ground and roads that part (n,) values otherwise."""
+    above = values > first
+    if not above.any() or above.all():
+        return (first,)
+    ground, road = float(np.median(values[~above])), float(np.median(values[above]))
+    chosen = [first]
+    areas = [float(above.mean())]
+    for share in _FURTHER:
+        threshold = ground + share * (road - ground)
+        area = float(np.mean(values > threshold))
+        if area > 0 and all(max(area, one) > 1.15 * min(area, one) for one in areas):
+            chosen.append(threshold)
+            areas.append(area)
+    return tuple(chosen)
+
+
+def _refuse_classes(sample: Sample, levels: AnyArray) -> None:
+    """Raise where small whole numbers are the classes of a map and not a faint map, whose neighbours differ by one."""
+    rows = sample.read_rows().astype(np.float64)
+    steps = np.abs(np.concatenate([np.diff(rows, axis=0).ravel(), np.diff(rows, axis=1).ravel()]))
+    steps = steps[steps > 0]
+    filled = len(levels) / (levels[-1] - levels[0] + 1)
+    if filled >= _MIN_LEVELS_FILLED:
+        if len(steps) and np.mean(steps == 1) >= _MIN_STEPS_OF_ONE:
+            return
+        if len(levels) >= _MANY_LEVELS and _shows_roads(rows, _otsu(rows.ravel())):
+            return
+    listed = ", ".join(f"{level:g}" for level in levels)
+    raise MaskError(f"{sample.name}: holds the classes {listed}; expected road and no road: give a threshold or a mask")
+
+
+def _refuse_colours(sample: Sample, levels: AnyArray) -> None:
+    """Raise where values are a handful of colours: a land cover map."""
+    seen = sample.seen
+    if seen.shape[1] == 1 or np.ptp(seen.astype(np.float64), axis=1).max() <= 0.1 * levels[-1]:
+        return
+    n_colours = len(np.unique(seen, axis=0)) if len(levels) <= _MAX_CLASS else 0
+    if 2 < n_colours <= _MAX_CLASS:
+        raise MaskError(
+            f"{sample.name}: holds {n_colours} colours; expected road and no road: choose a band or give a mask"
+        )
+
+
+def _grey_share(sample: Sample, values: AnyArray) -> float:
+    """Return the share of (n,) values that are neither dark nor light.
+
+    Raises
+    ------
+    PhotographError
+        They are coloured, or what is light does not look like roads.
+    """
+    span = np.ptp(values)
+    bands = sample.seen.astype(np.float64)
+    coloured = np.mean(np.ptp(bands, axis=1) > 0.05 * span) if bands.shape[1] > 1 else 0.0
+    counts, edges = np.histogram(values, bins=64)
+    dark, light = edges[np.argmax(counts[:32])], edges[32 + np.argmax(counts[32:])]
+    off_light = np.abs(values - light) > 0.08 * span
+    off = float(np.mean(off_light & (np.abs(values - dark) > 0.08 * span)))
+    if coloured <= _COLOURED_SHARE and (
+        off <= _CRISP_SHARE or _shows_roads(sample.read_rows().astype(np.float64), _otsu(values))
+    ):
+        return off
+    raise PhotographError(
+        f"{sample.name}: looks like a photograph, {coloured:.0%} of it coloured and {off:.0%} neither dark nor light; "
+        "expected a mask of its roads: segment it first (or give a threshold, if it is a mask)"
+    )
+
+
+def _shows_roads(rows: AnyArray, threshold: float) -> bool:
+    """Tell whether light (rows, columns) look like roads on even ground: see the constants above."""
+    light: BoolArray = rows > threshold
+    if np.count_nonzero(light) > 0.5 * light.size:
+        light, rows = ~light, -rows
+    n_light = int(np.count_nonzero(light))
+    if not 0 < n_light <= _MAX_LIGHT * light.size:
+        return False
+    ground, roads = rows[~light], rows[light]
+    if ground.std() > _MAX_SPREAD * (roads.mean() - ground.mean()):
+        return False
+    depth = cv2.distanceTransform(light.view(np.uint8), cv2.DIST_L2, 3)[light]
+    if np.quantile(depth, 0.9) > _MAX_DEPTH * depth.mean():
+        return False
+    n_pieces = cv2.connectedComponents(light.view(np.uint8))[0] - 1
+    return bool(n_pieces * road_width(RoadMask(light)) ** 2 <= _MAX_PIECES * n_light)
+
+
+def _otsu(values: AnyArray) -> float:
+    """Return the value that parts two groups best: largest variance between them (Otsu 1979)."""
+    counts, edges = np.histogram(values, bins=256)
+    centres = (edges[:-1] + edges[1:]) / 2
+    below = np.cumsum(counts)[:-1]
+    sums = np.cumsum(counts * centres)
+    above = len(values) - below
+    between = below * above * (sums[:-1] / below - (sums[-1] - sums[:-1]) / np.maximum(above, 1)) ** 2
+    return float(edges[1:-1][np.argmax(between)])
