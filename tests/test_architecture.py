@@ -19,8 +19,7 @@ STOREYS_TEXT = """
     matching    matching
     references  reference
     exits       outputs
-    workflows   workflows
-    looks       looks
+    workflows   workflows looks
     evaluation  evaluation
     faces       cli qgis demo __main__ __init__
 """

@@ -1,0 +1,85 @@
+"""Several looks share one time limit, and each costs its part of the odds."""
+
+import numpy as np
+import pytest
+
+from roadgeo.errors import MaskError
+from roadgeo.geometry.mask import RoadMask
+from roadgeo.location import Location, Place, Seconds
+from roadgeo.looks import Look, locate_looks
+from roadgeo.matching.options import LocateOptions
+
+OPTIONS = LocateOptions()
+MASK = RoadMask(np.eye(40, dtype=bool))
+SQUARE = np.array([[0, 1000], [1000, 1000], [1000, 0], [0, 0]], float)
+
+
+def found(status="located", odds=9.0, lon=10.0, seconds=1.0):
+    place = Place(500.0, 500.0, lon, 50.0, odds)
+    known = {"footprint": SQUARE, "center": place, "log10_odds": odds}
+    return Location("q", status, "why", seconds=Seconds(match=seconds), **(known if status != "not_located" else {}))
+
+
+def take(*answers, options=OPTIONS):
+    """Locate looks whose answers are given; return the sighting and the time limits that were set."""
+    limits, left = [], list(answers)
+
+    def how(mask, references, options):
+        limits.append(options.search.time_limit_s)
+        answer = left.pop(0)
+        if isinstance(answer, Exception):
+            raise answer
+        return answer
+
+    looks = [Look(f"look {i}", lambda: MASK) for i in range(len(answers))]
+    return locate_looks(looks, [], options, how).location, limits
+
+
+def test_the_first_look_that_is_located_is_the_answer():
+    location, limits = take(found(), found(odds=30.0))
+    assert location.log10_odds == 9.0
+    assert location.reason == "why"
+    assert limits == [6.0]
+
+
+def test_a_single_look_has_all_the_time():
+    assert take(found())[1] == [10.0]
+
+
+def test_each_look_costs_its_part_of_the_odds_and_of_the_time():
+    location, limits = take(found("not_located"), MaskError("no road"), found(odds=9.0))
+    assert location.status == "located"
+    assert location.log10_odds == pytest.approx(9 - np.log10(3))
+    assert location.center.log10_odds == location.log10_odds
+    assert "off the odds" in location.reason
+    np.testing.assert_allclose(limits, [6.0, 5.4, 9.0])
+    assert location.seconds.match == 2.0
+
+
+def test_what_is_too_unlikely_for_a_second_look_is_refused():
+    location, _ = take(MaskError("no road"), found(odds=OPTIONS.min_log10_odds + 0.2))
+    assert location.status == "not_located"
+    assert location.center is None
+    assert location.log10_odds is None
+    assert "are needed" in location.reason
+
+
+def test_no_look_is_taken_when_the_time_is_gone():
+    location, limits = take(found("not_located", seconds=9.8), found())
+    assert location.status == "not_located"
+    assert len(limits) == 1
+
+
+def test_two_looks_at_two_places_are_ambiguous():
+    location, _ = take(found("ambiguous", odds=10.0, lon=10.5), found(odds=9.0))
+    assert location.status == "ambiguous"
+    assert location.runner_up.lon == 10.5
+    same, _ = take(found("ambiguous", odds=10.0), found(odds=9.0))
+    assert same.status == "located"
+
+
+def test_looks_that_show_nothing_raise_the_first_reason():
+    with pytest.raises(MaskError, match="first"):
+        take(MaskError("first"), MaskError("second"))
+    with pytest.raises(MaskError, match="nothing to look at"):
+        take()
