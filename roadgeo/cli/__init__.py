@@ -14,6 +14,7 @@ import click
 
 from roadgeo._version import __version__
 from roadgeo.errors import RoadgeoError
+from roadgeo.storage.gdal import skip_drivers
 
 __all__ = ["COMMANDS", "ERROR", "INTERRUPTED", "NOT_LOCATED", "cli", "main"]
 
@@ -84,6 +85,7 @@ def cli(ctx: click.Context) -> None:
 
 def main(arguments: Sequence[str] | None = None) -> int:
     """Run the command line and return its exit status; every error is one line on standard error."""
+    skip_drivers()
     try:
         status = cli.main(
             args=None if arguments is None else list(arguments), prog_name="roadgeo", standalone_mode=False

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import os
 from collections import Counter
 from collections.abc import Callable, Iterable, Mapping, Sequence
 from contextlib import AbstractContextManager, nullcontext
@@ -85,10 +86,13 @@ class Job:
             return self._locate(task, references, open_seconds)
         except RoadgeoError as error:
             return _failed(task, str(error))
-        except (MemoryError, OSError, ValueError, ArithmeticError, LookupError, TypeError) as error:
-            return _failed(
-                task, f"{task.mask}: {type(error).__name__}: {error}; this is a fault of roadgeo, please report it"
-            )
+        except MemoryError:
+            return _failed(task, f"{task.mask}: more memory is needed than there is; reduce it or cut it up")
+        except Exception as error:  # whatever it is, the other masks go on
+            if os.environ.get("ROADGEO_TRACEBACK"):
+                raise
+            what = " ".join(f"{type(error).__name__}: {error}".split())
+            return _failed(task, f"{task.mask}: {what}; this is a fault of roadgeo, please report it")
 
     def _earlier(self, task: Task) -> Outcome | None:
         """Return what an earlier run found, if its result is whole, of this mask and younger than it."""
@@ -533,9 +537,9 @@ def _failed(task: Task, reason: str) -> Outcome:
 
 def _scale(picture: str, mask: RoadMask) -> float:
     """How many times the mask's width a picture's is."""
-    from roadgeo.outputs.orthophoto import open_picture
+    from roadgeo.storage.rasters import open_raster
 
-    with open_picture(picture) as source:
+    with open_raster(picture) as source:
         width: int = source.width
     return round(width / mask.shape[1], 3)
 
@@ -620,7 +624,6 @@ def _progress(total: int, as_json: bool, quiet: bool) -> AbstractContextManager[
 
     Programs that set ROADGEO_PROGRESS=json, as the QGIS plugin does, get lines of JSON instead.
     """
-    import os
     import sys
 
     if os.environ.get("ROADGEO_PROGRESS") == "json":

@@ -37,6 +37,10 @@ __all__ = [
 #: Branches and tangents beyond these, which hardly an intersection has, serve its codes but are not compared.
 INDEXED_BRANCHES = 6
 
+#: What an index from a stranger may hold: the kernels sample segments every few metres, in each bucket that lists them.
+_MAX_DISTANCE_M = 5e7
+_MAX_SEGMENT_M, _MAX_MEAN_SEGMENT_M = 1e6, 1e4
+
 
 @dataclass(frozen=True)
 class IndexOptions:
@@ -193,9 +197,9 @@ def _check_parts(meta: Mapping[str, Any], arrays: Mapping[str, AnyArray], path: 
     require(grid[2] > 0 and min(shape) > 0 and shape[0] * shape[1] < 2**31, "bad grid")
     n = len(arrays["xy"])
     n_buckets = shape[0] * shape[1]
-    require(arrays["xy"].shape == (n, 2) and n < 2**31, "bad positions")
+    require(arrays["xy"].shape == (n, 2) and n < 2**31 and _lie_on_earth(arrays["xy"]), "bad positions")
     columns = arrays["tangents"].shape[1]
-    require(2 <= columns <= 32 and arrays["tangents"].shape == (n, columns), "bad tangents")
+    require(2 <= columns <= INDEXED_BRANCHES and arrays["tangents"].shape == (n, columns), "bad tangents")
     require(arrays["branches"].shape == (n, columns, 2), "bad branches")
     k = arrays["neighbours"].shape[1]
     require(1 <= k <= MAX_NEIGHBOURS and arrays["neighbours"].shape == (n, k), "bad neighbours")
@@ -217,6 +221,22 @@ def _check_parts(meta: Mapping[str, Any], arrays: Mapping[str, AnyArray], path: 
         len(ids) == 0 or (int(ids.min()) >= 0 and int(ids.max()) < len(arrays["segments"])),
         "a segment id is out of range",
     )
+    require(_are_short(arrays["segments"], ids), "bad segments")
+
+
+def _lie_on_earth(metres: AnyArray) -> bool:
+    """Whether positions on a plane are finite, and not farther from its origin than it is around the Earth."""
+    return metres.size == 0 or bool(-_MAX_DISTANCE_M <= metres.min() <= metres.max() <= _MAX_DISTANCE_M)
+
+
+def _are_short(segments: AnyArray, ids: AnyArray) -> bool:
+    """Whether (S, 4) segments can be walked along in a bounded time, wherever they are listed."""
+    if not _lie_on_earth(segments):
+        return False
+    lengths = np.hypot(segments[:, 2] - segments[:, 0], segments[:, 3] - segments[:, 1])
+    listed = float(lengths[ids].sum(dtype=np.float64))
+    longest = float(lengths.max(initial=0.0))
+    return longest <= _MAX_SEGMENT_M and listed <= _MAX_SEGMENT_M * 10 + _MAX_MEAN_SEGMENT_M * len(ids)
 
 
 def check_table(index: ReferenceIndex) -> None:

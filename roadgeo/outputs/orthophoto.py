@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import math
 import os
-import warnings
 from collections.abc import Iterator, Mapping
 from contextlib import ExitStack
 from dataclasses import dataclass
@@ -17,15 +16,16 @@ import numpy as np
 import rasterio
 import rasterio.shutil
 from rasterio.enums import ColorInterp, Resampling
-from rasterio.errors import NotGeoreferencedWarning, RasterioError
+from rasterio.errors import RasterioError
 from rasterio.windows import Window
 
 from roadgeo._arrays import AnyArray, FloatArray
 from roadgeo.errors import CrsError, MaskError, OutputError
 from roadgeo.geometry.warping import MapGrid, Transform, cover, source_pixels
 from roadgeo.outputs.paths import Placement
+from roadgeo.storage.rasters import open_raster
 
-__all__ = ["ImageOptions", "choose_target", "image_homography", "open_picture", "read_preview", "warp_image"]
+__all__ = ["ImageOptions", "choose_target", "image_homography", "read_preview", "warp_image"]
 
 ResamplingName = Literal["nearest", "bilinear", "cubic", "lanczos"]
 
@@ -64,21 +64,6 @@ class ImageOptions:
     max_pixels: int = 400_000_000
 
 
-def open_picture(path: str | os.PathLike[str]) -> Any:
-    """Open a raster that may lie nowhere on Earth yet.
-
-    Raises
-    ------
-    MaskError
-        GDAL cannot read it.
-    """
-    try:
-        with warnings.catch_warnings(action="ignore", category=NotGeoreferencedWarning):  # that is why we are here
-            return rasterio.open(path)
-    except RasterioError as error:
-        raise MaskError(f"cannot read the picture {path}: {error}; give a raster that GDAL reads") from error
-
-
 def read_preview(path: str | os.PathLike[str], side: int) -> AnyArray:
     """Read a picture to look at: (h, w, 4) uint8, red, green, blue, alpha, neither side longer than `side` pixels.
 
@@ -89,7 +74,7 @@ def read_preview(path: str | os.PathLike[str], side: int) -> AnyArray:
     MaskError
         GDAL cannot read it.
     """
-    with open_picture(path) as picture:
+    with open_raster(path) as picture:
         factor = min(1.0, side / max(picture.width, picture.height))
         width, height = (max(round(length * factor), 1) for length in (picture.width, picture.height))
         bands, palette = _value_bands(picture), _palette(picture)
@@ -118,7 +103,7 @@ def image_homography(
     MaskError
         The picture cannot be read, or its sides are in another proportion than the mask's.
     """
-    with open_picture(path) as picture:
+    with open_raster(path) as picture:
         width, height = picture.width, picture.height
     factors = np.array([mask_size[0] / width, mask_size[1] / height])
     # The sides of a reduced picture are rounded, so a pixel's worth of difference is none.
@@ -186,7 +171,7 @@ def warp_image(
     with ExitStack() as stack:
         stack.enter_context(rasterio.Env(GDAL_CACHEMAX=256 << 20))  # bytes
         folder = Path(stack.enter_context(TemporaryDirectory(dir=Path(target).parent, prefix=".roadgeo-")))
-        picture = stack.enter_context(open_picture(_tile(source, folder)))
+        picture = stack.enter_context(open_raster(_tile(source, folder)))
         size = (picture.width, picture.height)
         grid = cover(size, homography, options.resolution, options.max_pixels, to_target)
         if grid.width == 0:
@@ -206,7 +191,7 @@ def warp_image(
 
 def _tile(path: str | os.PathLike[str], folder: Path) -> str | os.PathLike[str]:
     """Copy a large picture that can only be read from the top down into tiles; return what to read."""
-    with open_picture(path) as picture:
+    with open_raster(path) as picture:
         size = picture.width * picture.height * picture.count * np.dtype(picture.dtypes[0]).itemsize
         if size < _TILED_BYTES or picture.block_shapes[0][1] != picture.width:
             return path

@@ -118,12 +118,12 @@ def write_gcps(path: Path, subject: Subject) -> None:
     """
     import rasterio.shutil
 
-    from roadgeo.outputs.orthophoto import open_picture
+    from roadgeo.storage.rasters import open_raster
 
     with TemporaryDirectory(dir=path.parent, prefix=".roadgeo-") as folder:
         vrt = Path(folder) / "gcps.vrt"
         write_vrt(vrt, subject)
-        with open_picture(vrt) as source:
+        with open_raster(vrt, is_ours=True) as source:
             rasterio.shutil.copy(source, path, driver="GTiff", compress="DEFLATE", tiled=True, bigtiff="IF_SAFER")
 
 
@@ -132,9 +132,9 @@ def write_vrt(path: Path, subject: Subject) -> None:
     import pyproj
     import rasterio.shutil
 
-    from roadgeo.outputs.orthophoto import open_picture
+    from roadgeo.storage.rasters import open_raster
 
-    with open_picture(subject.picture.absolute()) as source:
+    with open_raster(subject.picture.absolute()) as source:
         rasterio.shutil.copy(source, path, driver="VRT")
     document = ET.parse(path)  # noqa: S314 (GDAL wrote it just now)
     root = document.getroot()

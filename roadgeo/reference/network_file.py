@@ -30,7 +30,7 @@ from roadgeo.roads.graph import RoadGraph
 from roadgeo.roads.intersections import MAX_BRANCHES, Intersections
 from roadgeo.roads.network import RoadNetwork
 from roadgeo.storage.atomic import publish, staging
-from roadgeo.storage.geopackage import Layer, add_layers, open_read_only, read_layer
+from roadgeo.storage.geopackage import Layer, add_layers, open_read_only, read_layer, require_tables
 from roadgeo.storage.qml import draw_fill, draw_line, draw_marker
 
 __all__ = [
@@ -179,6 +179,7 @@ def read_meta(path: str | os.PathLike[str]) -> dict[str, Any]:
         When the file is missing or is no reference.
     """
     with open_read_only(path) as database:
+        require_tables(database, path, "roadgeo_meta")
         rows = database.execute("SELECT key, value FROM roadgeo_meta").fetchall()
     try:
         meta = {str(key): json.loads(value) for key, value in rows}

@@ -3,9 +3,9 @@
 from __future__ import annotations
 
 import os
-import warnings
 
 from roadgeo.errors import MaskError
+from roadgeo.storage.rasters import open_raster
 
 __all__ = ["read_focal_length"]
 
@@ -21,16 +21,8 @@ def read_focal_length(path: str | os.PathLike[str]) -> float:
     MaskError
         The file cannot be read, or says nothing of its focal length.
     """
-    import rasterio
-    from rasterio.errors import NotGeoreferencedWarning, RasterioIOError
-
-    try:
-        with warnings.catch_warnings():
-            warnings.simplefilter("ignore", NotGeoreferencedWarning)
-            with rasterio.open(path) as source:
-                tags = {**source.tags(), **source.tags(ns="EXIF")}
-    except RasterioIOError as error:
-        raise MaskError(f"{path}: cannot be read as an image: {error}") from error
+    with open_raster(path) as source:
+        tags = {**source.tags(), **source.tags(ns="EXIF")}
     stated = tags.get("EXIF_FocalLengthIn35mmFilm", "").strip("() ")
     try:
         focal = float(stated)

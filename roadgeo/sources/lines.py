@@ -6,7 +6,6 @@ osmnx's `.graphml`, GeoParquet, and everything else that GDAL reads (GeoPackage,
 
 from __future__ import annotations
 
-import warnings
 from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
@@ -17,12 +16,12 @@ import numpy as np
 from roadgeo._arrays import AnyArray, BoolArray
 from roadgeo.errors import RoadSourceError
 from roadgeo.roads.kinds import in_tunnel, names_highways
+from roadgeo.sources.vectors import first_line, list_layers, read_layer, require_file
 
 __all__ = [
     "OSM_ATTRIBUTION",
     "RoadLines",
     "crs_name",
-    "first_line",
     "list_sources",
     "read_lines",
     "simple_lines",
@@ -38,6 +37,9 @@ _OTHER = (".gpkg", ".shp", ".geojson", ".geojsonl", ".fgb", ".gml", ".kml", ".sq
 
 #: PBF files are read in parts of about this size; what may stand in them at most, as their specification says.
 _PART, _MAX_BLOB, _MAX_BLOB_HEADER = 1 << 20, 32 << 20, 64 << 10
+
+#: A compressed file may unpack to so many bytes, and beyond them to so many times its size.
+_UNPACKED_FREE, _UNPACKED_TIMES = 64 << 20, 100
 
 #: Columns that may say what kind of road a line is: OpenStreetMap's, Geofabrik's, Overture's.
 _KIND_COLUMNS = ("highway", "fclass", "class")
@@ -106,20 +108,27 @@ def read_lines(path: Path, layer: str | None = None, advance: Callable[[float], 
     RoadSourceError
         The file is missing, unreadable, empty or holds no lines.
     """
-    if not path.exists():
-        raise RoadSourceError(f"{path}: no such file")
-    name = path.name.lower()
-    if name.endswith(_OSM):
-        read = _read_osm(path, advance)
-    elif name.endswith(_GRAPH):
-        read = _read_graphml(path)
-    elif name.endswith(_PARQUET):
-        read = _read_parquet(path)
-    else:
-        read = _read_gdal(path, layer)
+    from pyproj.exceptions import ProjError
+    from shapely.errors import ShapelyError
+
+    require_file(path)
+    try:
+        read = _read(path, layer, advance)
+    except (ProjError, ShapelyError, RuntimeError, ValueError, LookupError, ArithmeticError, OSError) as error:
+        # Many libraries read such files, and what a damaged one makes them raise is theirs to know.
+        raise RoadSourceError(f"{path}: damaged, or not what its name says: {first_line(error)}") from error
     if len(read.lines) == 0:
         raise RoadSourceError(f"{path}: no lines in it, expected the centre lines of roads")
     return read
+
+
+def _read(path: Path, layer: str | None, advance: Callable[[float], None]) -> RoadLines:
+    name = path.name.lower()
+    if name.endswith(_OSM):
+        return _read_osm(path, advance)
+    if name.endswith(_GRAPH):
+        return _read_graphml(path)
+    return _read_parquet(path) if name.endswith(_PARQUET) else _read_gdal(path, layer)
 
 
 def _read_osm(path: Path, advance: Callable[[float], None]) -> RoadLines:
@@ -133,6 +142,7 @@ def _read_osm(path: Path, advance: Callable[[float], None]) -> RoadLines:
     tunnel: list[str | None] = []
     broken = 0
     try:
+        _refuse_bomb(path)
         with osmium.io.Reader(str(path), osmium.osm.NOTHING) as reader:
             header = reader.header()
             timestamp = header.get("osmosis_replication_timestamp") or header.get("timestamp") or None
@@ -147,7 +157,7 @@ def _read_osm(path: Path, advance: Callable[[float], None]) -> RoadLines:
             shapes.append(shape)
             highway.append(tags["highway"])
             tunnel.append(tags.get("tunnel"))
-    except RuntimeError as error:
+    except (RuntimeError, OSError, ValueError) as error:
         raise RoadSourceError(f"{path}: not readable as OpenStreetMap data: {first_line(error)}") from error
     lines, place = simple_lines(shapely.from_wkb(np.array(shapes, object)))
     meta = {"format": "OpenStreetMap", "features": len(shapes) + broken, "attribution": OSM_ATTRIBUTION}
@@ -156,6 +166,28 @@ def _read_osm(path: Path, advance: Callable[[float], None]) -> RoadLines:
     return RoadLines(
         lines, "EPSG:4326", np.array(highway, object)[place], in_tunnel(np.array(tunnel, object))[place], meta
     )
+
+
+def _refuse_bomb(path: Path) -> None:
+    """Refuse a compressed file that unpacks to far more than any map: XML shrinks to a tenth, hardly to a fiftieth."""
+    import bz2
+    import gzip
+    import zlib
+
+    suffix = path.name.lower()[-4:]
+    opener: Any = gzip.open if suffix.endswith(".gz") else bz2.open if suffix == ".bz2" else None
+    if opener is None:
+        return
+    left = _UNPACKED_FREE + _UNPACKED_TIMES * path.stat().st_size
+    try:
+        with opener(path) as file:
+            while left >= 0 and (part := file.read(1 << 20)):
+                left -= len(part)
+    except (EOFError, zlib.error) as error:
+        raise RuntimeError("it is cut off or damaged") from error
+    if left < 0:
+        times = f"{_UNPACKED_TIMES} times its size"
+        raise RoadSourceError(f"{path}: unpacks to more than {times}; unpack it yourself if you trust it")
 
 
 def _highways(path: Path, advance: Callable[[float], None]) -> Iterator[Any]:
@@ -271,6 +303,7 @@ def _read_parquet(path: Path) -> RoadLines:
 
     try:
         names = pq.read_schema(path).names
+        _require_rows(path)
         wanted = [name for name in _KIND_COLUMNS + _TUNNEL_COLUMNS + ("subtype",) if name in names]
         geometry = _geometry_columns(path)
         frame = gpd.read_parquet(path, columns=geometry[:1] + wanted)
@@ -284,6 +317,17 @@ def _read_parquet(path: Path) -> RoadLines:
     if "road_flags" in columns:
         columns["road_flags"] = _overture_flags(columns["road_flags"])
     return _from_columns(frame.geometry.to_numpy(), crs_name(frame.crs), columns, meta)
+
+
+def _require_rows(path: Path) -> None:
+    """Refuse what says to hold more rows than bytes: a few bytes may stand for billions of equal rows."""
+    import pyarrow.parquet as pq
+
+    meta = pq.read_metadata(path)
+    unpacked = sum(meta.row_group(i).total_byte_size for i in range(meta.num_row_groups))
+    size = path.stat().st_size
+    if meta.num_rows > size or unpacked > _UNPACKED_FREE + _UNPACKED_TIMES * size:
+        raise ValueError(f"its {size:,} bytes say to hold {meta.num_rows:,} rows and {unpacked:,} bytes")
 
 
 def _geometry_columns(path: Path) -> list[str]:
@@ -309,32 +353,19 @@ def _overture_flags(values: AnyArray) -> AnyArray:
 
 def _read_gdal(path: Path, layer: str | None) -> RoadLines:
     """Read what GDAL reads as lines."""
-    import pyogrio
-    from pyogrio.errors import DataLayerError, DataSourceError, FieldError
-
-    try:
-        layer = _choose_layer(path, layer)
-        with warnings.catch_warnings():
-            warnings.simplefilter("ignore")
-            info = pyogrio.read_info(path, layer=layer)
-            wanted = [name for name in info["fields"] if name.lower() in _KIND_COLUMNS + _TUNNEL_COLUMNS]
-            meta, _, shapes, values = pyogrio.raw.read(path, layer=layer, columns=wanted, force_2d=True)
-    except (DataSourceError, DataLayerError, FieldError, UnicodeDecodeError) as error:
-        raise RoadSourceError(f"{path}: not readable as a map of roads: {first_line(error)}") from error
-    if shapes is None:
-        raise RoadSourceError(f"{path}: layer {layer!r} has no geometry, expected lines")
     import shapely
 
-    columns = {name.lower(): column for name, column in zip(meta["fields"], values, strict=True)}
-    shapes = shapely.from_wkb(shapes, on_invalid="ignore")
-    return _from_columns(shapes, crs_name(meta["crs"]), columns, {"format": info["driver"], "layer": layer})
+    layer = _choose_layer(path, layer)
+    found = read_layer(path, layer, _KIND_COLUMNS + _TUNNEL_COLUMNS)
+    if found.shapes is None:
+        raise RoadSourceError(f"{path}: layer {layer!r} has no geometry, expected lines")
+    shapes = shapely.from_wkb(found.shapes, on_invalid="ignore")
+    return _from_columns(shapes, crs_name(found.crs), found.columns, {"format": found.driver, "layer": layer})
 
 
 def _choose_layer(path: Path, layer: str | None) -> str:
     """Return the layer to read: the one asked for, or the one with lines."""
-    import pyogrio
-
-    layers = [(str(name), str(kind)) for name, kind in pyogrio.list_layers(path)]
+    layers = list_layers(path)
     names = [name for name, _ in layers]
     if layer is not None:
         if layer not in names:
@@ -411,9 +442,3 @@ def _listed(names: Sequence[str]) -> str:
     """Join names for a message, at most eight."""
     shown = ", ".join(names[:8])
     return shown if len(names) <= 8 else f"{shown} and {len(names) - 8} more"
-
-
-def first_line(error: BaseException) -> str:
-    """Return the first line of a foreign error's message, short."""
-    text = (str(error) or type(error).__name__).strip().splitlines()
-    return text[0][:200] if text else type(error).__name__

@@ -2,9 +2,9 @@
 
 from __future__ import annotations
 
+import contextlib
 import logging
 import os
-import warnings
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from dataclasses import dataclass
@@ -20,6 +20,8 @@ from roadgeo.geometry.mask import RoadMask
 from roadgeo.roads.observed import find_voids
 from roadgeo.roads.vectorization import road_width
 from roadgeo.sources.thresholds import Sample, find_thresholds
+from roadgeo.storage.gdal import is_named_remote
+from roadgeo.storage.rasters import image_size, open_raster, require_file, sidecar_nodata
 
 if TYPE_CHECKING:
     from rasterio import DatasetReader
@@ -35,9 +37,12 @@ _MIDDLE_PIXELS = 1 << 22  # and, where neighbours matter, from so many in the mi
 _OPENCV_BYTES = 1 << 25  # larger files are read window by window, by GDAL
 _MAX_ROAD_SHARE = 0.35  # of a frame
 
-#: First bytes of the files that OpenCV reads; importing rasterio would take longer than reading the mask.
+#: OpenCV reads what is no larger than this when decoded: importing rasterio would take longer than reading the mask.
+_MAX_DECODED_BYTES = 1 << 29
 _PNG_MAGIC, _PNG_END = b"\x89PNG\r\n", b"IEND"
-_OPENCV_MAGIC = (_PNG_MAGIC, b"\xff\xd8\xff", b"BM")
+
+#: What is larger, whatever its sign, stands for no value: the least number of a type is often written for nodata.
+_MAX_VALUE = 1e30
 
 
 @dataclass(frozen=True)
@@ -138,26 +143,19 @@ def open_mask(
 ) -> Iterator[MaskSource]:
     """Open a road mask or a soft map of roads: parameters and errors as of `read_mask`."""
     with _open(source, band, name) as raster:
-        height, width = raster.shape
+        _require_size(raster.name, *raster.shape)
         seen = _sample(raster)
         channel = int(np.argmax(seen.std(axis=0))) if raster.n_bands > 1 else 0
         sample = Sample(raster.name, seen, channel, lambda: _middle_rows(raster, channel))
         thresholds = find_thresholds(sample) if threshold is None else (threshold,)
-        if min(raster.shape) < MIN_SIDE or max(raster.shape) > MAX_SIDE:
-            raise MaskError(
-                f"{raster.name}: {width} x {height} pixels; expected {MIN_SIDE} to {MAX_SIDE} on each side: "
-                + ("give a larger mask" if min(raster.shape) < MIN_SIDE else "reduce it or cut it up")
-            )
         yield MaskSource(thresholds, raster, channel, voids)
 
 
 def _sample(raster: _Raster) -> AnyArray:
     """Return (n, B) observed values, from all over a raster."""
-    height, width = raster.shape
-    step = int(np.ceil(np.sqrt(height * width / _SAMPLE_PIXELS)))
-    sample, valid = raster.read(0, height, step)
-    finite = _finite(sample, valid)
-    seen = sample.reshape(-1, raster.n_bands) if finite.all() else sample[finite]
+    step = int(np.ceil(np.sqrt(raster.shape[0] * raster.shape[1] / _SAMPLE_PIXELS)))
+    parts = [raster.read(strip.start, strip.stop, step) for strip in _strips(raster, step)]
+    seen = np.concatenate([values[_finite(values, valid)] for values, valid in parts])
     if len(seen) == 0:
         raise MaskError(f"{raster.name}: holds no observed pixel, only nodata, NaN or alpha 0; give a mask with roads")
     return seen
@@ -176,12 +174,9 @@ def _middle_rows(raster: _Raster, channel: int) -> AnyArray:
 
 def _separate(raster: _Raster, channel: int, threshold: float) -> tuple[BoolArray, BoolArray | None]:
     """Return where values of a band lie above the threshold, and where they are valid."""
-    _, width = raster.shape
     roads = np.zeros(raster.shape, np.bool_)
     observed = None
-    rows = max(1, _STRIP_PIXELS // (width * raster.n_bands))
-    for top in range(0, raster.shape[0], rows):
-        strip = slice(top, min(top + rows, raster.shape[0]))
+    for strip in _strips(raster, 1):
         values, valid = raster.read(strip.start, strip.stop, 1)
         _compare(values[..., channel], threshold, roads[strip])
         finite = _finite(values, valid)
@@ -197,6 +192,14 @@ def _separate(raster: _Raster, channel: int, threshold: float) -> tuple[BoolArra
     return roads, observed
 
 
+def _strips(raster: _Raster, step: int) -> Iterator[slice]:
+    """Cut the rows into strips that are read at a time, each of a multiple of `step` rows."""
+    height, width = raster.shape
+    rows = step * max(1, _STRIP_PIXELS // (width * raster.n_bands * step))
+    for top in range(0, height, rows):
+        yield slice(top, min(top + rows, height))
+
+
 def _compare(values: AnyArray, threshold: float, above: BoolArray) -> None:
     """Set `above` where values exceed the threshold, in the values' own type: many times faster for whole numbers."""
     if values.dtype.kind == "f":
@@ -210,7 +213,10 @@ def _compare(values: AnyArray, threshold: float, above: BoolArray) -> None:
 def _finite(values: AnyArray, valid: BoolArray | None) -> BoolArray:
     """Return (rows, columns) where values are valid numbers."""
     finite = np.ones(values.shape[:2], np.bool_) if valid is None else valid
-    return finite & np.isfinite(values).all(axis=2) if values.dtype.kind == "f" else finite
+    if values.dtype.kind != "f":
+        return finite
+    limit = values.dtype.type(min(_MAX_VALUE, float(np.finfo(values.dtype).max)))
+    return np.asarray(finite & (np.abs(values) <= limit).all(axis=2), np.bool_)
 
 
 def _told_apart(name: str, roads: BoolArray, observed: BoolArray | None) -> tuple[BoolArray, BoolArray | None]:
@@ -236,33 +242,42 @@ def _open(source: str | os.PathLike[str] | AnyArray, band: int | None, name: str
         return
     path = os.fspath(source)
     name = name or path
-    if not path.startswith("/vsi"):
-        if not Path(path).exists():
-            raise MaskError(f"{name}: no such file; check the path")
-        if Path(path).is_dir():
-            raise MaskError(f"{name}: is a folder; give a raster file")
+    if not is_named_remote(path):
+        require_file(path, name)
         image = _read_with_opencv(path, name)
         if image is not None:
             yield _of_array(image, band, name, alpha=image.ndim == 3 and image.shape[2] == 4)
             return
-    with _open_dataset(path, name) as dataset:
-        yield _of_dataset(dataset, band, name)
+    with open_raster(path, name) as dataset:
+        yield _of_dataset(dataset, band, name, sidecar_nodata(path))
 
 
 def _read_with_opencv(path: str, name: str) -> AnyArray | None:
-    """Decode a PNG, JPEG or BMP without side files as it is stored; None where GDAL has to."""
-    with Path(path).open("rb") as file:
-        head = file.read(8)
-    if not head.startswith(_OPENCV_MAGIC) or Path(path + ".aux.xml").exists() or _is_large(path):
+    """Decode a PNG, JPEG or BMP without side files as it is stored; None where GDAL has to, or can in less memory."""
+    size = image_size(Path(path))
+    if size is not None:
+        _require_size(name, size[1], size[0])
+    if size is None or size[2] > _MAX_DECODED_BYTES or Path(path + ".aux.xml").exists() or _is_large(path):
         return None
     content = np.fromfile(path, np.uint8)
-    is_png = head.startswith(_PNG_MAGIC)
-    image = (
-        None if is_png and _PNG_END not in content[-1024:].tobytes() else cv2.imdecode(content, cv2.IMREAD_UNCHANGED)
-    )
+    is_png = content[: len(_PNG_MAGIC)].tobytes() == _PNG_MAGIC
+    image = None
+    if not is_png or _PNG_END in content[-1024:].tobytes():
+        with contextlib.suppress(cv2.error):
+            image = cv2.imdecode(content, cv2.IMREAD_UNCHANGED)
     if is_png and image is None:  # GDAL would read the rest as black
         raise MaskError(f"{name}: a PNG that is damaged or cut short; copy or export it again")
     return image
+
+
+def _require_size(name: str, height: int, width: int) -> None:
+    """Refuse by its header what is too small to show roads, or too large to decode."""
+    low, high = min(height, width), max(height, width)
+    if low < MIN_SIDE or high > MAX_SIDE:
+        raise MaskError(
+            f"{name}: {width} x {height} pixels; expected {MIN_SIDE} to {MAX_SIDE} on each side: "
+            + ("give a larger mask" if low < MIN_SIDE else "reduce it or cut it up")
+        )
 
 
 def _is_large(path: str) -> bool:
@@ -292,26 +307,8 @@ def _of_array(array: AnyArray, band: int | None, name: str, *, alpha: bool) -> _
     return _Raster(name, (data.shape[0], data.shape[1]), data.shape[2], read)
 
 
-@contextmanager
-def _open_dataset(path: str, name: str) -> Iterator[DatasetReader]:
-    """Open a raster with GDAL."""
-    import rasterio
-    from rasterio.errors import NotGeoreferencedWarning, RasterioError
-
-    with warnings.catch_warnings():
-        warnings.simplefilter("ignore", NotGeoreferencedWarning)
-        try:
-            with rasterio.open(path) as dataset:
-                yield dataset
-        except RasterioError as error:
-            reason = str(error).splitlines()[0]
-            raise MaskError(
-                f"{name}: not a raster that GDAL or OpenCV can read ({reason}); give an image or GeoTIFF"
-            ) from error
-
-
-def _of_dataset(dataset: DatasetReader, band: int | None, name: str) -> _Raster:
-    """Wrap an open GDAL dataset."""
+def _of_dataset(dataset: DatasetReader, band: int | None, name: str, nodata: float | None) -> _Raster:
+    """Wrap an open GDAL dataset; `nodata` is what is called so beside it."""
     from rasterio.enums import ColorInterp, MaskFlags
     from rasterio.windows import Window
 
@@ -321,14 +318,20 @@ def _of_dataset(dataset: DatasetReader, band: int | None, name: str) -> _Raster:
     if not colour:
         raise MaskError(f"{name}: holds no band of values; give an image or GeoTIFF")
     chosen = [colour[i] for i in _bands(name, band, len(colour))]
+    kinds = {str(dataset.dtypes[i - 1]) for i in chosen}
+    if not all(kind.startswith(("bool", "int", "uint", "float")) for kind in kinds):
+        raise MaskError(f"{name}: holds values of type {', '.join(sorted(kinds))}; expected real numbers")
     all_valid = MaskFlags.all_valid in list(dataset.mask_flag_enums)[chosen[0] - 1]
 
     def read(top: int, bottom: int, step: int) -> tuple[AnyArray, BoolArray | None]:
         window = Window(0, top, dataset.width, bottom - top)
-        size = (-(-(bottom - top) // step), -(-dataset.width // step))
-        values = dataset.read(chosen, window=window, out_shape=(len(chosen), *size))
-        valid = None if all_valid else dataset.read_masks(chosen[0], window=window, out_shape=size) > 0
-        return np.moveaxis(values, 0, 2), valid
+        # Every step-th value of all, for to read fewer GDAL would go to overviews: blurred, or of another file.
+        values = np.moveaxis(dataset.read(chosen, window=window)[:, ::step, ::step], 0, 2)
+        valid = None if all_valid else dataset.read_masks(chosen[0], window=window)[::step, ::step] > 0
+        if nodata is not None and dataset.nodata is None:
+            known = (values != nodata).all(axis=2)
+            valid = known if valid is None else valid & known
+        return values, valid
 
     return _Raster(name, (dataset.height, dataset.width), len(chosen), read)
 

@@ -29,7 +29,8 @@ from roadgeo._progress import Say, say_nothing
 from roadgeo._version import __version__
 from roadgeo.errors import RoadSourceError
 from roadgeo.roads.kinds import RoadKind, highways, in_tunnel
-from roadgeo.sources.lines import OSM_ATTRIBUTION, RoadLines, first_line
+from roadgeo.sources.lines import OSM_ATTRIBUTION, RoadLines
+from roadgeo.sources.vectors import first_line, read_layer
 
 __all__ = ["FetchOptions", "box_area", "fetch_lines", "find_place", "read_area", "square"]
 
@@ -166,9 +167,7 @@ def read_area(polygon: str | os.PathLike[str] | Any) -> tuple[Any, str]:
     RoadSourceError
         The file is missing, unreadable, or holds no polygons.
     """
-    import pyogrio
     import shapely
-    from pyogrio.errors import DataSourceError
 
     from roadgeo.geometry.projection import transformer
     from roadgeo.sources.lines import crs_name
@@ -176,17 +175,15 @@ def read_area(polygon: str | os.PathLike[str] | Any) -> tuple[Any, str]:
     if not isinstance(polygon, str | os.PathLike):
         return polygon, "the given area"
     path = Path(polygon)
-    if not path.exists():
-        raise RoadSourceError(f"{path}: no such file")
+    found = read_layer(path, None, ())
     try:
-        meta, _, shapes, _ = pyogrio.raw.read(path, columns=[], force_2d=True)
-    except DataSourceError as error:
-        raise RoadSourceError(f"{path}: not readable as a map: {first_line(error)}") from error
-    parts = shapely.get_parts(shapely.from_wkb(shapes if shapes is not None else []))
+        parts = shapely.get_parts(shapely.from_wkb(found.shapes if found.shapes is not None else []))
+    except shapely.errors.ShapelyError as error:
+        raise RoadSourceError(f"{path}: holds no shapes that can be read: {first_line(error)}") from error
     parts = parts[shapely.get_type_id(parts) == 3]
     if len(parts) == 0:
         raise RoadSourceError(f"{path}: no polygon in it, expected the outline of an area")
-    crs = crs_name(meta["crs"])
+    crs = crs_name(found.crs)
     if crs is None:
         raise RoadSourceError(f"{path}: says nothing of its CRS; save the outline in one, for example as GeoJSON")
     way = transformer(crs, "EPSG:4326")

@@ -22,6 +22,7 @@ from roadgeo._arrays import AnyArray, FloatArray
 from roadgeo.errors import CrsError, IndexFormatError, OutputError
 from roadgeo.storage.files import replacing
 from roadgeo.storage.rtree import pack_rtree
+from roadgeo.storage.sqlite import opened, table_problem
 
 __all__ = [
     "PIXELS",
@@ -31,6 +32,7 @@ __all__ = [
     "layer_names",
     "open_read_only",
     "read_layer",
+    "require_tables",
     "write_layers",
 ]
 
@@ -135,7 +137,9 @@ def layer_names(path: str | os.PathLike[str]) -> list[str]:
     IndexFormatError
         No such file, or no GeoPackage.
     """
-    return [name for (name,) in _query(path, "SELECT table_name FROM gpkg_contents ORDER BY rowid")]
+    with open_read_only(path) as database:
+        require_tables(database, path, "gpkg_contents")
+        return [name for (name,) in database.execute("SELECT table_name FROM gpkg_contents ORDER BY rowid")]
 
 
 def read_layer(path: str | os.PathLike[str], name: str) -> tuple[list[FloatArray], dict[str, list[Any]]]:
@@ -148,19 +152,30 @@ def read_layer(path: str | os.PathLike[str], name: str) -> tuple[list[FloatArray
     IndexFormatError
         No such file or table, or a geometry that `write_layers` would not write.
     """
-    columns = _query(path, f"SELECT name, pk FROM pragma_table_info({_literal(name)})")
-    if not columns:
-        raise IndexFormatError(f"{path} has no layer '{name}': it is no complete file of roadgeo; make it again")
-    key = next((column for column, primary in columns if primary), "rowid")
-    rows = _query(path, f"SELECT * FROM {_quoted(name)} ORDER BY {_quoted(key)}")
+    with open_read_only(path) as database:
+        require_tables(database, path, name, "gpkg_geometry_columns")
+        columns = database.execute("SELECT name, pk FROM pragma_table_info(?)", (name,)).fetchall()
+        key = next((column for column, primary in columns if primary), "rowid")
+        rows = database.execute(f"SELECT * FROM {_quoted(name)} ORDER BY {_quoted(key)}").fetchall()
+        found = database.execute(
+            "SELECT column_name FROM gpkg_geometry_columns WHERE table_name = ?", (name,)
+        ).fetchall()
     table = {column: [row[i] for row in rows] for i, (column, _) in enumerate(columns)}
-    found = _query(
-        path,
-        f"SELECT column_name FROM gpkg_geometry_columns WHERE table_name = {_literal(name)}",
-    )
     if not found:
         return [], table
+    if found[0][0] not in table:
+        raise IndexFormatError(f"{path}: layer '{name}' lacks its column of geometries; make the file again")
     return [_decode(blob, path, name) for blob in table.pop(found[0][0])], table
+
+
+def require_tables(database: sqlite3.Connection, path: str | os.PathLike[str], *names: str) -> None:
+    """Raise `IndexFormatError` unless all names are tables that hold what they give."""
+    for name in names:
+        problem = table_problem(database, name)
+        if problem:
+            raise IndexFormatError(
+                f"{path} cannot be used: {problem}; it is no complete file of roadgeo: make it again"
+            )
 
 
 @contextmanager
@@ -175,12 +190,8 @@ def open_read_only(path: str | os.PathLike[str]) -> Iterator[sqlite3.Connection]
     source = Path(path)
     if not source.is_file():
         raise IndexFormatError(f"no such file: {source}; give the path of a .gpkg file")
-    # Immutable: no lock or journal file appears beside a reference that lies in a read-only folder. But while QGIS
-    # edits the file, the latest state lies in the journal beside it, which an immutable file would not have.
-    state = "" if source.with_name(f"{source.name}-wal").exists() else "&immutable=1"
     try:
-        with closing(sqlite3.connect(f"{source.absolute().as_uri()}?mode=ro{state}", uri=True)) as database:
-            database.execute("PRAGMA trusted_schema = OFF")  # views of a file from anywhere call no unsafe function
+        with opened(source) as database:
             yield database
     except sqlite3.Error as error:
         raise IndexFormatError(f"{source} is no readable GeoPackage ({error}); make it again") from error
@@ -415,11 +426,6 @@ def _encode_multipolygons(geometries: Sequence[Any] | FloatArray, srs_id: int) -
 
 
 # --- reading ----------------------------------------------------------------------------------------------------------
-
-
-def _query(path: str | os.PathLike[str], sql: str) -> list[Any]:
-    with open_read_only(path) as database:
-        return database.execute(sql).fetchall()
 
 
 def _decode(blob: bytes, path: str | os.PathLike[str], layer: str) -> FloatArray:

@@ -212,6 +212,28 @@ class TestFromParts:
         branches = town[1].branches
         self.refuse(town[1], "bad branches", branches=np.concatenate([branches, branches[..., :1]], axis=2))
 
+    @pytest.mark.parametrize("columns", [1, *range(7, 33)])
+    def test_columns_that_no_index_has(self, town, columns):
+        """The paper's method copies them into arrays of eight: more of them were written beyond its end."""
+        n = len(town[1])
+        wide = {"tangents": np.zeros((n, columns), np.int16), "branches": np.zeros((n, columns, 2), np.int8)}
+        self.refuse(town[1], "bad tangents", **wide)
+
+    @pytest.mark.parametrize("value", [np.nan, np.inf, -np.inf, 1e9, -1e9])
+    @pytest.mark.parametrize("name", ["xy", "segments"])
+    def test_places_that_are_nowhere(self, town, name, value):
+        array = getattr(town[1], name).copy()
+        array.flat[array.size // 2] = value
+        self.refuse(town[1], "bad positions" if name == "xy" else "bad segments", **{name: array})
+
+    def test_segments_that_take_forever_to_walk_along(self, town):
+        """Each within bounds, but listed so often that a query would sample a million kilometres of them."""
+        segments = town[1].segments.copy()
+        segments[:, 2] = segments[:, 0] + 9e5
+        self.refuse(town[1], "bad segments", segments=segments)
+        segments[:, 2] = segments[:, 0] + 2e6
+        self.refuse(town[1], "bad segments", segments=segments[:1], segment_ids=town[1].segment_ids * 0)
+
     @pytest.mark.parametrize("columns", [0, 17])
     def test_too_few_or_too_many_neighbours(self, town, columns):
         self.refuse(town[1], "bad neighbours", neighbours=np.zeros((len(town[1]), columns), np.int32))

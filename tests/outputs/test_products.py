@@ -16,9 +16,9 @@ from roadgeo.geometry.homography import Homography
 from roadgeo.geometry.warping import MapGrid
 from roadgeo.location import Location
 from roadgeo.outputs.location_files import OutputOptions, write_location
-from roadgeo.outputs.orthophoto import open_picture
 from roadgeo.outputs.paths import OutputPaths, Placement, output_paths
 from roadgeo.outputs.products import PRODUCTS, Subject, write_geojson, write_kmz
+from roadgeo.storage.rasters import open_raster
 
 
 @pytest.fixture(scope="module")
@@ -41,7 +41,7 @@ def photo_homography() -> Homography:
 
 @pytest.mark.parametrize("name", ["mask_gcps.tif", "mask_gcps.vrt"])
 def test_control_points_lie_where_the_homography_says(written: OutputPaths, name: str) -> None:
-    with open_picture(written.folder / name) as raster:
+    with open_raster(written.folder / name, is_ours=True) as raster:
         points, crs = raster.gcps
         assert crs.to_epsg() == 32629
         assert (raster.width, raster.height, raster.count) == (800, 600, 3)

@@ -1,4 +1,5 @@
 import sqlite3
+import struct
 from collections.abc import Iterator
 from contextlib import closing, contextmanager
 from dataclasses import replace
@@ -14,6 +15,7 @@ from worlds.networks import grid_network, same_values
 
 from roadgeo.errors import CrsError, IndexFormatError, OutputError
 from roadgeo.geometry.projection import LocalPlane
+from roadgeo.reference.files import check_reference, describe_reference
 from roadgeo.reference.network_file import (
     as_stored,
     computed_digest,
@@ -274,3 +276,72 @@ def test_a_missing_folder_and_an_unknown_crs_leave_nothing(tmp_path: Path, netwo
 
 def test_ring_area() -> None:
     assert ring_area(np.array([[0, 0], [4, 0], [4, 3], [0, 3], [0, 0]]) + 1e6) == 12
+
+
+class TestHostileTables:
+    """What a GeoPackage of a stranger gives must lie in it: no rows without end, no computed values."""
+
+    ENDLESS = "WITH RECURSIVE n(i) AS (SELECT 1 UNION ALL SELECT i + 1 FROM n) SELECT i AS key, i AS value FROM n"
+
+    def forge(self, path, script):
+        with closing(sqlite3.connect(path)) as database:
+            database.executescript(f"PRAGMA writable_schema = ON; {script}")
+            database.commit()
+
+    @pytest.mark.parametrize("name", ["roadgeo_meta", "intersections", "roads", "coverage", "gpkg_geometry_columns"])
+    def test_a_view_in_place_of_a_table(self, path, name):
+        self.forge(path, f'DROP TABLE IF EXISTS "{name}"; CREATE VIEW "{name}" AS {self.ENDLESS};')
+        with pytest.raises(IndexFormatError, match="is a view, expected a table"):
+            read_network(path)
+
+    @pytest.mark.parametrize("name", ["roadgeo_meta", "intersections", "roads", "coverage"])
+    def test_columns_that_are_larger_than_the_file(self, path, name):
+        self.forge(path, f'ALTER TABLE "{name}" ADD COLUMN more AS (zeroblob(900000000));')
+        with pytest.raises(IndexFormatError, match="is computed"):
+            read_network(path)
+
+    def test_a_default_that_every_row_repeats(self, path):
+        self.forge(path, f"ALTER TABLE roads ADD COLUMN more TEXT DEFAULT '{'x' * 500_000}';")
+        with pytest.raises(IndexFormatError, match="is computed"):
+            read_network(path)
+
+    def test_a_tree_that_never_ends(self, path):
+        """Pages of a table that all lead to the same page: a few kilobytes hold 400 to the fourth power rows."""
+        deep_tree(path, "roads")
+        for read in (read_network, check_reference, describe_reference):
+            if read is check_reference:
+                assert read(path)
+            else:
+                with pytest.raises(IndexFormatError, match=r"cannot be used|no readable"):
+                    read(path)
+
+    def test_a_layer_without_its_geometry(self, path):
+        self.forge(path, "UPDATE gpkg_geometry_columns SET column_name = 'other' WHERE table_name = 'roads';")
+        with pytest.raises(IndexFormatError, match="lacks its column"):
+            read_network(path)
+
+
+def deep_tree(path, table, depth=4):
+    """Put a tree of interior pages above a table's root whose branches are all the same page below."""
+    with closing(sqlite3.connect(path)) as database:
+        (root,) = database.execute("SELECT rootpage FROM sqlite_master WHERE name = ?", (table,)).fetchone()
+        (size,) = database.execute("PRAGMA page_size").fetchone()
+    raw = bytearray(path.read_bytes())
+    page = raw[(root - 1) * size : root * size]
+    below = len(raw) // size + 1
+    raw += page  # what was the root now lies at the end, below everything else
+    for level in range(depth):
+        cells = (size - 12) // 7
+        new = bytearray(size)
+        new[:12] = struct.pack(">BHHHBI", 5, 0, cells, size - 5 * cells, 0, below)
+        for i in range(cells):
+            at = size - 5 * (i + 1)
+            new[12 + 2 * i : 14 + 2 * i] = at.to_bytes(2, "big")
+            new[at : at + 5] = struct.pack(">IB", below, 127)
+        if level < depth - 1:
+            raw += new
+            below += 1
+        else:
+            raw[(root - 1) * size : root * size] = new
+    raw[28:32] = (len(raw) // size).to_bytes(4, "big")
+    path.write_bytes(raw)

@@ -1,0 +1,203 @@
+"""The one place that opens vector files of strangers with GDAL: few drivers, no network, no views.
+
+GDAL chooses its driver by content, and some drivers fetch what a file names, run programs, or read any other file.
+While a file is read only those below are registered, and its network leads nowhere. Pyogrio's GDAL is its own; what is
+left out is registered again afterwards, for this may be part of a larger program.
+"""
+
+from __future__ import annotations
+
+import mmap
+import os
+import re
+import sqlite3
+import threading
+import warnings
+from collections.abc import Iterator, Sequence
+from contextlib import contextmanager
+from pathlib import Path
+from typing import NamedTuple
+
+from roadgeo._arrays import AnyArray
+from roadgeo.errors import RoadSourceError
+from roadgeo.storage.gdal import CONSENT, NETWORK, allowed_drivers
+from roadgeo.storage.sqlite import opened, table_problem
+
+__all__ = ["VectorLayer", "first_line", "list_layers", "read_layer", "require_file"]
+
+#: GDAL's names of the drivers that may read; they read the file, and those beside it that belong to it.
+_DRIVERS = {
+    *("CSV", "ESRI Shapefile", "ESRIJSON", "FlatGeobuf", "GML", "GPKG", "GPX", "GeoJSON", "GeoJSONSeq", "KML"),
+    *("LIBKML", "MapInfo File", "OpenFileGDB", "SQLite", "TopoJSON"),
+}
+
+#: Tables that GDAL reads to find out what a GeoPackage or SpatiaLite file holds.
+_OWN_TABLES = (
+    "SELECT name FROM sqlite_master WHERE type IN ('table', 'view') AND (name LIKE 'gpkg@_%' ESCAPE '@'"
+    " OR name LIKE '%geometry_columns' OR name = 'spatial_ref_sys')"
+)
+
+_LOCK = threading.RLock()
+_LINK = re.compile(rb'"crs"\s*:\s*\{[^\[\]]{0,2000}?"type"\s*:\s*"(link|url)"', re.IGNORECASE)
+
+
+class VectorLayer(NamedTuple):
+    """One layer as it stands in its file. Dimension: N features.
+
+    Attributes
+    ----------
+    shapes : (N,) object, WKB, or None where the layer has no geometry
+    columns : (N,) object each, by name
+    crs : str or None
+    driver : str
+    """
+
+    shapes: AnyArray | None
+    columns: dict[str, AnyArray]
+    crs: str | None
+    driver: str
+
+
+def list_layers(path: Path) -> list[tuple[str, str]]:
+    """Return the names and geometry types of a file's layers.
+
+    Raises
+    ------
+    RoadSourceError
+        The file cannot be read, or not without opening others.
+    """
+    import pyogrio
+
+    with _guarded(path):
+        return [(str(name), str(kind)) for name, kind in pyogrio.list_layers(path)]
+
+
+def read_layer(path: Path, layer: str | None, columns: Sequence[str]) -> VectorLayer:
+    """Read a layer (the first by default), with those of the named columns (in lower case) that it has.
+
+    Raises
+    ------
+    RoadSourceError
+        As `list_layers`.
+    """
+    import pyogrio
+
+    with _guarded(path):
+        layer = layer or str(pyogrio.list_layers(path)[0][0])
+        _require_stored(path, layer)
+        info = pyogrio.read_info(path, layer=layer)
+        wanted = [name for name in info["fields"] if name.lower() in columns]
+        meta, _, shapes, values = pyogrio.raw.read(path, layer=layer, columns=wanted, force_2d=True)
+    named = {name.lower(): column for name, column in zip(meta["fields"], values, strict=True)}
+    return VectorLayer(shapes, named, meta["crs"], info["driver"])
+
+
+def require_file(path: Path) -> None:
+    """Raise `RoadSourceError` unless a path is a regular file, or a folder that is a geodatabase."""
+    if not path.exists():
+        raise RoadSourceError(f"{path}: no such file")
+    if not path.is_file() and not (path.is_dir() and path.suffix.lower() == ".gdb"):
+        raise RoadSourceError(f"{path}: is no regular file; save the roads in one first")
+
+
+@contextmanager
+def _guarded(path: Path) -> Iterator[None]:
+    """Check what can be checked without GDAL, then read with as little of it as is needed."""
+    from pyogrio.errors import CRSError, DataLayerError, DataSourceError
+
+    require_file(path)
+    _refuse_links(path)
+    _require_stored(path)
+    try:
+        with _few_drivers(), _offline(), warnings.catch_warnings():
+            warnings.simplefilter("ignore")
+            yield
+    except CRSError as error:
+        raise RoadSourceError(f"{path}: names a CRS that is none: {first_line(error)}") from error
+    except (DataSourceError, DataLayerError, UnicodeDecodeError) as error:
+        told = "of a format that is not read here" if "not recognized" in str(error) else first_line(error)
+        hint = f"; save it as GeoPackage, or allow GDAL's driver with {CONSENT}" if told.startswith("of") else ""
+        raise RoadSourceError(f"{path}: not readable as a map of roads: {told}{hint}") from error
+
+
+@contextmanager
+def _few_drivers() -> Iterator[None]:
+    """Have pyogrio's GDAL know only the drivers above, and those that the user allows."""
+    import pyogrio
+    from pyogrio import core
+
+    with _LOCK:
+        kept = _DRIVERS | set(allowed_drivers())
+        given = pyogrio.get_gdal_config_option("GDAL_SKIP")
+        left_out = ",".join(sorted(set(pyogrio.list_drivers()) - kept))
+        pyogrio.set_gdal_config_options({"GDAL_SKIP": f"{left_out},"})
+        core._register_drivers()
+        try:
+            yield
+        finally:
+            pyogrio.set_gdal_config_options({"GDAL_SKIP": None if given == os.environ.get("GDAL_SKIP") else given})
+            core._register_drivers()
+
+
+@contextmanager
+def _offline() -> Iterator[None]:
+    """Let no request of pyogrio's GDAL reach anything."""
+    import pyogrio
+
+    options = {**NETWORK, "GML_DOWNLOAD_SCHEMA": "NO"}
+    before = {name: pyogrio.get_gdal_config_option(name) for name in options}
+    exempt = {name: os.environ.pop(name) for name in ("no_proxy", "NO_PROXY") if name in os.environ}
+    pyogrio.set_gdal_config_options(options)
+    try:
+        yield
+    finally:
+        pyogrio.set_gdal_config_options(before)
+        os.environ.update(exempt)
+
+
+def _refuse_links(path: Path) -> None:
+    """Refuse a GeoJSON whose CRS is said elsewhere: its coordinates would be taken for degrees."""
+    if not path.is_file() or path.stat().st_size == 0:
+        return
+    with path.open("rb") as file, mmap.mmap(file.fileno(), 0, access=mmap.ACCESS_READ) as content:
+        if content[:512].lstrip(b"\xef\xbb\xbf \t\r\n")[:1] not in (b"{", b"["):
+            return
+        at = content.find(b'"crs"')
+        while at >= 0:
+            if _LINK.match(content[at : at + 4096]):
+                raise RoadSourceError(f"{path}: says its CRS by a link, which is not followed; name it in the file")
+            at = content.find(b'"crs"', at + 5)
+
+
+def _require_stored(path: Path, layer: str | None = None) -> None:
+    """Refuse what an SQLite file computes in place of storing it: its GeoPackage tables, or the layer."""
+    if not path.is_file():
+        return
+    with path.open("rb") as file:
+        if file.read(16) != b"SQLite format 3\0":
+            return
+    try:
+        with opened(path) as database:
+            problems = _computed(database, layer)
+    except sqlite3.Error as error:
+        raise RoadSourceError(f"{path}: not readable as SQLite: {error}") from error
+    if problems:
+        raise RoadSourceError(f"{path}: {problems[0]}; save the roads as a table of their own")
+
+
+def _computed(database: sqlite3.Connection, layer: str | None) -> list[str]:
+    """Tell what is computed: of GeoPackage's own tables, which GDAL reads in any case, or of one layer."""
+    if layer is None:
+        names = [name for (name,) in database.execute(_OWN_TABLES)]
+        return [problem for problem in (table_problem(database, name) for name in names) if problem]
+    problem = table_problem(database, layer)
+    if not problem:
+        quoted = '"' + layer.replace('"', '""') + '"'
+        database.execute(f"SELECT sum(1) FROM {quoted}").fetchone()  # noqa: S608 - ends, within the work allowed
+    return [problem] if problem else []
+
+
+def first_line(error: BaseException) -> str:
+    """Return the first line of a foreign error's message, short."""
+    text = (str(error) or type(error).__name__).strip().splitlines()
+    return text[0][:200] if text else type(error).__name__

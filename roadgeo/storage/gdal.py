@@ -1,0 +1,50 @@
+"""What GDAL may do with files of strangers: which drivers, no network, no files beside the one that was named.
+
+GDAL chooses among some 150 drivers by a file's content, whatever its name. Several of them fetch what a file names from
+the network, and one (MRF) writes where a file tells it to. Rasterio and pyogrio each bring a GDAL of their own.
+"""
+
+from __future__ import annotations
+
+import os
+from pathlib import Path
+
+__all__ = ["CONSENT", "NETWORK", "SEALED", "allowed_drivers", "is_named_remote", "skip_drivers"]
+
+#: Environment variable that names further drivers to allow, for example "VRT" or "VRT,netCDF".
+CONSENT = "ROADGEO_GDAL_DRIVERS"
+
+#: Drivers that reach for the network or write while they read; never of use here.
+_SKIPPED = ("MRF", "WMS", "WCS", "WMTS", "HTTP", "STACIT", "STACTA", "GTI", "PLMOSAIC", "EEDAI", "DAAS")
+
+#: Settings that keep GDAL off the network: no remote file has the only name allowed, and nothing answers at port 0.
+NETWORK = {
+    "CPL_VSIL_CURL_ALLOWED_FILENAME": "none",
+    "GDAL_HTTP_PROXY": "127.0.0.1:0",
+    "GDAL_HTTPS_PROXY": "127.0.0.1:0",
+}
+
+#: Settings under which rasters are opened: no siblings (.ovr, .msk, .aux.xml, world files) and no network.
+SEALED = {"GDAL_DISABLE_READDIR_ON_OPEN": "EMPTY_DIR", **NETWORK}
+
+
+def skip_drivers() -> None:
+    """Have GDAL leave out its dangerous drivers, for programs that are roadgeo's alone: call it before GDAL is loaded.
+
+    Programs that merely use roadgeo keep their drivers; `storage.rasters` and `sources.vectors` guard each file.
+    """
+    given = os.environ.get("GDAL_SKIP", "")
+    before = (name.strip() for name in (given.split(",") if "," in given else given.split()))
+    kept = set(allowed_drivers())
+    names = dict.fromkeys(name for name in (*before, *_SKIPPED) if name and name not in kept)
+    os.environ["GDAL_SKIP"] = ",".join(names)
+
+
+def allowed_drivers() -> list[str]:
+    """Return the further drivers that the user allows."""
+    return [name.strip() for name in os.environ.get(CONSENT, "").split(",") if name.strip()]
+
+
+def is_named_remote(path: str | os.PathLike[str]) -> bool:
+    """Whether the user typed a GDAL file system (/vsicurl/, /vsizip/, ...): then its network is wanted."""
+    return os.fspath(path).startswith("/vsi") and not Path(path).exists()

@@ -1,0 +1,200 @@
+"""The one place that opens rasters of strangers.
+
+The driver follows from the file's first bytes and is the only one that GDAL may use. What lies beside the file, its
+overviews elsewhere, and the network are left alone (`storage.gdal`). A GDAL virtual raster names other files, and is
+opened only where the user allows it. Rasterio is imported only here and late: it takes longer than to read a mask.
+"""
+
+from __future__ import annotations
+
+import os
+import re
+import stat
+import struct
+import warnings
+from collections.abc import Iterator
+from contextlib import contextmanager
+from pathlib import Path
+from typing import TYPE_CHECKING, BinaryIO
+
+from roadgeo.errors import MaskError
+from roadgeo.storage.gdal import CONSENT, NETWORK, SEALED, allowed_drivers, is_named_remote
+
+if TYPE_CHECKING:
+    from rasterio import DatasetReader
+
+__all__ = ["image_size", "open_raster", "require_file", "sidecar_nodata"]
+
+#: First bytes of the formats that are read, and GDAL's names of their drivers.
+_DRIVERS = (
+    (rb"II[*+]\0|MM\0[*+]", "GTiff"),
+    (rb"\x89PNG\r\n\x1a\n", "PNG"),
+    (rb"\xff\xd8\xff", "JPEG"),
+    (rb"BM", "BMP"),
+    (rb"RIFF....WEBP", "WEBP"),
+    (rb"\0\0\0\x0cjP  |\xff\x4f\xff\x51", "JP2OpenJPEG"),
+    (rb"P[56]\s", "PNM"),
+    (rb"GIF8[79]a", "GIF"),
+    (rb"EHFA_HEADER_TAG", "HFA"),
+    (rb"\s*(<\?xml[^>]*>\s*)?<VRTDataset", "VRT"),
+)
+_NAMES = "GeoTIFF, PNG, JPEG, JPEG 2000, WebP, BMP, PNM, GIF, Erdas Imagine"
+
+#: A block is decoded whole: more than this for one is a bomb, or should be tiled.
+_MAX_BLOCK_BYTES = 2 << 30
+_MAX_SIDECAR = 1 << 20
+_HEAD_BYTES = 8192
+
+
+@contextmanager
+def open_raster(
+    path: str | os.PathLike[str], name: str | None = None, *, is_ours: bool = False
+) -> Iterator[DatasetReader]:
+    """Open a raster that may lack a georeference; what goes wrong while it is open is told in the same way.
+
+    Parameters
+    ----------
+    path : path
+        A regular file, or a name in a GDAL file system (/vsizip/, /vsicurl/, ...) that the user typed.
+    name : str, optional
+        What messages call it.
+    is_ours : bool
+        We wrote it just now: it may be a virtual raster.
+
+    Raises
+    ------
+    MaskError
+        It is missing, no regular file, of a format that is not read, damaged, or refers to other files.
+    """
+    from rasterio._err import CPLE_BaseError
+    from rasterio.errors import NotGeoreferencedWarning, RasterioError
+
+    name = name or os.fspath(path)
+    remote = is_named_remote(path)
+    if not remote:
+        require_file(path, name)
+    if remote:
+        drivers = allowed_drivers() + [driver for _, driver in _DRIVERS[:-1]]
+    else:
+        drivers = _drivers(Path(path), name, allowed_drivers() + ["VRT"] * is_ours)
+    with warnings.catch_warnings():
+        warnings.simplefilter("ignore", NotGeoreferencedWarning)
+        try:
+            # Absolute, for a name may look like the text of a virtual raster, which GDAL takes in place of a path.
+            with _opened(os.fspath(path) if remote else str(Path(path).absolute()), drivers, remote) as dataset:
+                _require_plain(dataset, name)
+                yield dataset
+        except (RasterioError, CPLE_BaseError) as error:
+            reason = " ".join(str(error).split())[:300]
+            raise MaskError(f"{name}: not a raster that can be read ({reason}); give an image or GeoTIFF") from error
+
+
+def require_file(path: str | os.PathLike[str], name: str) -> None:
+    """Raise `MaskError` unless there is a regular file: a pipe may never end, a device may do anything."""
+    try:
+        mode = os.stat(path).st_mode  # noqa: PTH116 (names may hold what Path refuses)
+    except (FileNotFoundError, NotADirectoryError) as error:
+        raise MaskError(f"{name}: no such file; check the path") from error
+    except (OSError, ValueError) as error:
+        raise MaskError(f"{name}: cannot be read ({error}); check the path and its permissions") from error
+    if stat.S_ISDIR(mode):
+        raise MaskError(f"{name}: is a folder; give a raster file")
+    if not stat.S_ISREG(mode):
+        raise MaskError(f"{name}: is a pipe or device; expected a regular file: save the raster first")
+
+
+def image_size(path: Path) -> tuple[int, int, int] | None:
+    """Read (width, height, bytes when decoded) of a PNG, JPEG or BMP from its header; None where it has none."""
+    with path.open("rb") as file:
+        head = file.read(30)
+        if head.startswith(b"\x89PNG") and len(head) >= 26:
+            width, height, depth, colour = struct.unpack(">IIBB", head[16:26])
+            samples = {0: 1, 2: 3, 3: 3, 4: 4, 6: 4}.get(colour, 4)
+            return width, height, width * height * samples * (2 if depth == 16 else 1)
+        if head.startswith(b"BM") and len(head) >= 26:
+            width, height = struct.unpack("<ii", head[18:26])
+            return abs(width), abs(height), abs(width * height) * 4
+        return _jpeg_size(file) if head.startswith(b"\xff\xd8") else None
+
+
+def _jpeg_size(file: BinaryIO) -> tuple[int, int, int] | None:
+    """Walk the segments of a JPEG to its frame header (ITU T.81, B.2)."""
+    file.seek(2)
+    while len(head := file.read(4)) == 4 and head[0] == 0xFF:
+        marker, size = head[1], int.from_bytes(head[2:], "big")
+        if 0xC0 <= marker <= 0xCF and marker not in (0xC4, 0xC8, 0xCC):
+            frame = file.read(6)
+            if len(frame) < 6:
+                return None
+            height, width = struct.unpack(">HH", frame[1:5])
+            return width, height, width * height * frame[5]
+        file.seek(size - 2, os.SEEK_CUR)
+    return None
+
+
+def sidecar_nodata(path: str | os.PathLike[str]) -> float | None:
+    """Return the nodata value in the `.aux.xml` beside a raster: all that is taken from such a file."""
+    beside = Path(os.fspath(path) + ".aux.xml")
+    if not beside.is_file() or beside.stat().st_size > _MAX_SIDECAR:
+        return None
+    found = re.search(rb"<NoDataValue[^>]*>\s*([-+.0-9eEnaif]{1,32})\s*</", beside.read_bytes())
+    try:
+        return float(found[1]) if found else None
+    except ValueError:
+        return None
+
+
+def _drivers(path: Path, name: str, more: list[str]) -> list[str]:
+    """Name the drivers that may read a file: the one of its first bytes, or those that the user allows besides."""
+    with path.open("rb") as file:
+        head = file.read(_HEAD_BYTES)
+    driver = next((driver for magic, driver in _DRIVERS if re.match(magic, head, re.DOTALL)), None)
+    if driver == "VRT" and "VRT" not in more:
+        raise MaskError(
+            f"{name}: a GDAL virtual raster, which names other files to read: give those, "
+            f"or set {CONSENT}=VRT if you trust it"
+        )
+    if driver != "VRT" and re.search(rb"<(VRTDataset|MRF_META|GDAL_WMS)", head):
+        raise MaskError(f"{name}: holds the text of a raster of another format; convert it to GeoTIFF if you trust it")
+    if driver is None and not more:
+        raise MaskError(
+            f"{name}: not a raster of a format that is read here ({_NAMES}); convert it to GeoTIFF, "
+            f"or name GDAL's driver for it, if you trust the file: {CONSENT}=netCDF"
+        )
+    return [driver] if driver else more
+
+
+@contextmanager
+def _opened(path: str, drivers: list[str], remote: bool) -> Iterator[DatasetReader]:
+    """Open a dataset with the first of some drivers that takes it."""
+    import rasterio
+    from rasterio.errors import RasterioIOError
+
+    may_fetch = remote or drivers == ["VRT"]
+    with rasterio.Env(**{key: value for key, value in SEALED.items() if not (may_fetch and key in NETWORK)}):
+        for last, driver in enumerate(drivers, 1 - len(drivers)):
+            try:
+                dataset = rasterio.open(path, driver=driver)
+            except RasterioIOError:
+                if last == 0:
+                    raise
+                continue
+            with dataset:
+                yield dataset
+            return
+
+
+def _require_plain(dataset: DatasetReader, name: str) -> None:
+    """Refuse rasters whose own metadata send GDAL to other files, or that cannot be decoded in parts."""
+    import numpy as np
+
+    if dataset.tags(ns="OVERVIEWS"):
+        raise MaskError(f"{name}: names a file elsewhere as its overviews; remove that (gdal_edit.py -unsetmd)")
+    block = max(
+        height * width * np.dtype(dtype.replace("complex_int16", "int32")).itemsize
+        for (height, width), dtype in zip(dataset.block_shapes, dataset.dtypes, strict=True)
+    )
+    if dataset.interleaving is not None and dataset.interleaving.value == "PIXEL":
+        block *= dataset.count
+    if block > _MAX_BLOCK_BYTES:
+        raise MaskError(f"{name}: its blocks are of {block / 1e9:.1f} GB each when decoded; save it in tiles")

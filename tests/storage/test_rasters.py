@@ -1,0 +1,326 @@
+"""Rasters of strangers: what they name is neither read, nor fetched, nor written."""
+
+import os
+import shutil
+import struct
+import subprocess
+import sys
+import zlib
+from collections.abc import Callable, Iterator
+from pathlib import Path
+
+import cv2
+import numpy as np
+import pytest
+import rasterio
+from support.loopback import counting_server
+
+from roadgeo.errors import MaskError
+from roadgeo.outputs.orthophoto import read_preview
+from roadgeo.sources.exif import read_focal_length
+from roadgeo.sources.masks import read_mask
+from roadgeo.storage.gdal import CONSENT, skip_drivers
+from roadgeo.storage.rasters import image_size, open_raster
+
+pytestmark = pytest.mark.filterwarnings("ignore::rasterio.errors.NotGeoreferencedWarning")
+
+SIZE = 1100  # large enough that only part of the values are looked at first
+
+
+@pytest.fixture
+def roads() -> np.ndarray:
+    image = np.zeros((SIZE, SIZE), np.uint8)
+    for k in range(6):
+        cv2.line(image, (0, 100 + 180 * k), (SIZE, 60 + 190 * k), 255, 9)
+        cv2.line(image, (80 + 190 * k, 0), (150 + 180 * k, SIZE), 255, 9)
+    return image
+
+
+@pytest.fixture
+def victim(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
+    """A file that no mask may touch; GDAL keeps all its drivers, as in a program that merely uses roadgeo."""
+    monkeypatch.delenv("GDAL_SKIP", raising=False)
+    path = tmp_path / "victim.sh"
+    path.write_text("safe")
+    return path
+
+
+def write_tiff(path: Path, values: np.ndarray, **options: object) -> Path:
+    height, width = values.shape
+    profile = {"driver": "GTiff", "width": width, "height": height, "count": 1, "dtype": values.dtype}
+    with rasterio.open(path, "w", **profile, **options) as sink:
+        sink.write(values[None])
+    return path
+
+
+def mrf(folder: Path, victim: Path) -> str:
+    """Return the text of an MRF whose cache is another file: whoever reads it writes there."""
+    source = write_tiff(folder / "source.tif", np.full((64, 64), ord("X"), np.uint8))
+    return (
+        f"<MRF_META><CachedSource><Source>{source}</Source></CachedSource><Raster>"
+        '<Size x="64" y="64" c="1"/><PageSize x="64" y="64" c="1"/><Compression>NONE</Compression>'
+        f"<DataType>Byte</DataType><DataFile>{victim}</DataFile><IndexFile>{folder}/i.idx</IndexFile></Raster></MRF_META>"
+    )
+
+
+def vrt(source: object) -> str:
+    return (
+        '<VRTDataset rasterXSize="64" rasterYSize="64"><VRTRasterBand dataType="Byte" band="1"><SimpleSource>'
+        f'<SourceFilename relativeToVRT="0">{source}</SourceFilename></SimpleSource></VRTRasterBand></VRTDataset>'
+    )
+
+
+READERS: list[Callable[[Path], object]] = [read_mask, lambda path: read_preview(path, 200), read_focal_length]
+
+
+@pytest.mark.parametrize("read", READERS, ids=["mask", "picture", "exif"])
+class TestNothingIsWritten:
+    def test_by_an_mrf_called_png(self, tmp_path, victim, read):
+        path = tmp_path / "mask.png"
+        path.write_text(mrf(tmp_path, victim))
+        with pytest.raises(MaskError, match="another format"):
+            read(path)
+        assert victim.read_text() == "safe"
+
+    def test_by_an_mrf_in_a_virtual_raster(self, tmp_path, victim, read):
+        (tmp_path / "inner.bin").write_text(mrf(tmp_path, victim))
+        path = tmp_path / "mask.tif"
+        path.write_text(vrt(tmp_path / "inner.bin"))
+        with pytest.raises(MaskError, match="virtual raster"):
+            read(path)
+        assert victim.read_text() == "safe"
+
+    @pytest.mark.parametrize("sibling", [".ovr", ".msk", ".aux.xml"])
+    def test_by_a_sibling(self, tmp_path, victim, roads, read, sibling):
+        path = write_tiff(tmp_path / "mask.tif", roads)
+        Path(f"{path}{sibling}").write_text(mrf(tmp_path, victim))
+        if read is read_focal_length:
+            with pytest.raises(MaskError, match="focal length"):
+                read(path)
+        else:
+            read(path)
+        assert victim.read_text() == "safe"
+
+    @pytest.mark.parametrize("inside", [True, False])
+    def test_by_overviews_that_metadata_name(self, tmp_path, victim, roads, read, inside):
+        path, evil = tmp_path / "mask.tif", tmp_path / "evil"
+        evil.write_text(mrf(tmp_path, victim))
+        write_tiff(path, roads)
+        if inside:
+            with rasterio.open(path, "r+") as sink:
+                sink.update_tags(ns="OVERVIEWS", OVERVIEW_FILE=str(evil))
+            with pytest.raises(MaskError, match="overviews"):
+                read(path)
+        else:
+            domain = f'<Metadata domain="OVERVIEWS"><MDI key="OVERVIEW_FILE">{evil}</MDI></Metadata>'
+            Path(f"{path}.aux.xml").write_text(f"<PAMDataset>{domain}</PAMDataset>")
+            if read is read_focal_length:
+                with pytest.raises(MaskError, match="focal length"):
+                    read(path)
+            else:
+                read(path)
+        assert victim.read_text() == "safe"
+
+    def test_by_an_image_with_a_second_format_in_its_header(self, tmp_path, victim, read):
+        (tmp_path / "inner.bin").write_text(mrf(tmp_path, victim))
+        path = tmp_path / "mask.pgm"
+        path.write_bytes(f"P5\n#{vrt(tmp_path / 'inner.bin')}\n64 64\n255\n".encode() + bytes(64 * 64))
+        with pytest.raises(MaskError, match="another format"):
+            read(path)
+        assert victim.read_text() == "safe"
+
+
+def test_the_exploit_works_where_gdal_is_free(tmp_path, victim):
+    """Else the tests above prove nothing."""
+    path = tmp_path / "mask.png"
+    path.write_text(mrf(tmp_path, victim))
+    with rasterio.open(path) as raster:
+        raster.read(1)
+    assert victim.stat().st_size > 4
+
+
+@pytest.fixture
+def server() -> Iterator[tuple[str, list[str]]]:
+    with counting_server() as served:
+        yield served
+
+
+@pytest.mark.parametrize("read", READERS, ids=["mask", "picture", "exif"])
+def test_nothing_is_fetched(tmp_path, server, victim, roads, read):
+    address, asked = server
+    texts = {
+        "vrt": vrt(f"/vsicurl/{address}/a.tif"),
+        "wms": f'<GDAL_WMS><Service name="TMS"><ServerUrl>{address}/${{z}}</ServerUrl></Service></GDAL_WMS>',
+        "wcs": f"<WCS_GDAL><ServiceURL>{address}/?</ServiceURL><CoverageName>a</CoverageName></WCS_GDAL>",
+        "wmts": f"<GDAL_WMTS><GetCapabilitiesUrl>{address}/?</GetCapabilitiesUrl></GDAL_WMTS>",
+        "gti": f"<GDALTileIndexDataset><IndexDataset>/vsicurl/{address}/i.gpkg</IndexDataset></GDALTileIndexDataset>",
+        "stac": f'{{"type": "FeatureCollection", "stac_version": "1", "features": [], "href": "{address}/s"}}',
+    }
+    for name, text in texts.items():
+        path = tmp_path / f"{name}.png"
+        path.write_text(text)
+        with pytest.raises(MaskError, match=CONSENT if name == "vrt" else "format"):
+            read(path)
+    path = write_tiff(tmp_path / "linked.tif", roads)
+    with rasterio.open(path, "r+") as sink:
+        sink.update_tags(ns="OVERVIEWS", OVERVIEW_FILE=f"/vsicurl/{address}/o.tif")
+    with pytest.raises(MaskError, match="overviews"):
+        read(path)
+    assert asked == []
+
+
+def test_a_virtual_raster_is_read_by_consent(tmp_path, roads, monkeypatch):
+    path = tmp_path / "mask.vrt"
+    text = vrt(write_tiff(tmp_path / "part.tif", roads)).replace('="64"', f'="{SIZE}"')
+    path.write_text(text)
+    with pytest.raises(MaskError, match=f"{CONSENT}=VRT"):
+        read_mask(path)
+    monkeypatch.setenv(CONSENT, "VRT")
+    assert np.array_equal(read_mask(path).roads, roads > 0)
+
+
+def test_other_drivers_are_used_by_consent(tmp_path, roads, monkeypatch):
+    path = tmp_path / "mask.asc"
+    header = f"ncols {SIZE}\nnrows {SIZE}\nxllcorner 0\nyllcorner 0\ncellsize 1\n"
+    path.write_text(header + "\n".join(" ".join(map(str, row)) for row in (roads // 255).tolist()))
+    with pytest.raises(MaskError, match=CONSENT):
+        read_mask(path)
+    monkeypatch.setenv(CONSENT, "HF2, AAIGrid")
+    assert np.array_equal(read_mask(path).roads, roads > 0)
+
+
+def test_a_command_line_leaves_out_dangerous_drivers(monkeypatch):
+    """A program of ours alone: the QGIS plugin strips GDAL_* of its child's environment, so the child sets it."""
+    code = (
+        "from roadgeo.cli import main; main(['--version']); import rasterio\n"
+        "with rasterio.Env() as env: print(*sorted(env.drivers()))"
+    )
+    environment = {name: value for name, value in os.environ.items() if not name.startswith("GDAL_")}
+    command = [sys.executable, "-c", code]
+    listed = subprocess.run(command, env=environment, capture_output=True, text=True, check=True).stdout.split()
+    assert "GTiff" in listed
+    assert not {"MRF", "WMS", "WCS", "WMTS", "HTTP", "STACIT", "STACTA", "PLMOSAIC", "EEDAI", "DAAS"} & set(listed)
+
+    monkeypatch.setenv("GDAL_SKIP", "JPEG MRF")
+    monkeypatch.setenv(CONSENT, "WMS")
+    skip_drivers()
+    skipped = os.environ["GDAL_SKIP"].split(",")
+    assert skipped[:2] == ["JPEG", "MRF"]
+    assert "WMS" not in skipped
+
+
+def test_internal_masks_count_and_nodata_beside_the_file(tmp_path, roads):
+    """What stays of what lies beside a file: the nodata value."""
+    path = tmp_path / "mask.png"
+    seen = np.where(np.arange(SIZE) < 700, roads, 7).astype(np.uint8)
+    cv2.imwrite(str(path), seen)
+    band = '<PAMRasterBand band="1"><NoDataValue>7.00000000000000E+00</NoDataValue></PAMRasterBand>'
+    Path(f"{path}.aux.xml").write_text(f"<PAMDataset>{band}</PAMDataset>")
+    observed = read_mask(path).observed
+    assert observed is not None
+    assert np.array_equal(observed, np.broadcast_to(np.arange(SIZE) < 700, roads.shape))
+
+
+@pytest.mark.parametrize("read", [*READERS[:2]], ids=["mask", "picture"])
+def test_what_is_no_regular_file(tmp_path, read):
+    os.mkfifo(tmp_path / "pipe.png")
+    for path, message in ((tmp_path / "pipe.png", "pipe"), (Path("/dev/zero"), "pipe or device"), (tmp_path, "folder")):
+        with pytest.raises(MaskError, match=message):
+            read(path)
+    with pytest.raises(MaskError, match="cannot be read"):
+        read(tmp_path / ("n" * 300 + ".png"))
+    with pytest.raises(MaskError, match="cannot be read"):
+        read(Path("a\0.png"))
+
+
+def png(width: int, height: int, depth: int = 8, colour: int = 0) -> bytes:
+    """Return a PNG of zeros, whole or merely said to be."""
+    rows = zlib.compress(bytes(1 << 16)) if width * height > 1 << 24 else zlib.compress(bytes((width + 1) * height))
+
+    def chunk(kind: bytes, data: bytes) -> bytes:
+        return struct.pack(">I", len(data)) + kind + data + struct.pack(">I", zlib.crc32(kind + data))
+
+    head = struct.pack(">IIBBBBB", width, height, depth, colour, 0, 0, 0)
+    return b"\x89PNG\r\n\x1a\n" + chunk(b"IHDR", head) + chunk(b"IDAT", rows) + chunk(b"IEND", b"")
+
+
+class TestSizes:
+    @pytest.mark.parametrize("side", [100_000, 2**31 - 1])
+    def test_a_header_says_too_much(self, tmp_path, side):
+        (tmp_path / "a.png").write_bytes(png(side, side))
+        (tmp_path / "a.bmp").write_bytes(b"BM" + bytes(16) + struct.pack("<ii", side, -side) + bytes(28))
+        for name in ("a.png", "a.bmp"):
+            with pytest.raises(MaskError, match=f"{side} x {side} pixels; expected 32 to 20000"):
+                read_mask(tmp_path / name)
+
+    @pytest.mark.parametrize("suffix", [".png", ".jpg", ".bmp"])
+    def test_like_the_image(self, tmp_path, suffix):
+        for shape in ((90, 70), (33, 400, 3)):
+            path = tmp_path / f"a{suffix}"
+            cv2.imwrite(str(path), np.zeros(shape, np.uint8))
+            size = image_size(path)
+            assert size is not None
+            assert size[:2] == (shape[1], shape[0])
+            assert size[2] >= np.prod(shape)
+            path.write_bytes(path.read_bytes()[:12])
+            assert image_size(path) is None
+
+    def test_what_opencv_refuses_is_refused_in_a_line(self, tmp_path, roads):
+        """More pixels than OpenCV decodes, in an image that is not too long."""
+        path = tmp_path / "a.bmp"
+        path.write_bytes(b"BM" + bytes(12) + struct.pack("<iiiHH", 40, 20_000, 20_000, 1, 24) + bytes(24))
+        with pytest.raises(MaskError, match="not a raster"):
+            read_mask(path)
+
+    def test_large_images_are_read_in_strips(self, tmp_path, roads, monkeypatch):
+        path = tmp_path / "mask.png"
+        cv2.imwrite(str(path), roads)
+        whole = read_mask(path)
+        monkeypatch.setattr("roadgeo.sources.masks._MAX_DECODED_BYTES", 1)
+        monkeypatch.setattr("roadgeo.sources.masks._STRIP_PIXELS", 1 << 16)
+        assert np.array_equal(read_mask(path).roads, whole.roads)
+
+    def test_a_raster_in_one_enormous_block(self, tmp_path):
+        path = tmp_path / "mask.tif"
+        profile = {"driver": "GTiff", "width": 20_000, "height": 20_000, "count": 1, "dtype": "float64"}
+        with rasterio.open(path, "w", **profile, blockysize=20_000, compress="deflate", sparse_ok=True):
+            pass
+        with pytest.raises(MaskError, match=r"3\.2 GB each.*tiles"):
+            read_mask(path)
+
+
+class TestValues:
+    def test_complex_numbers(self, tmp_path, roads):
+        path = write_tiff(tmp_path / "mask.tif", roads.astype(np.complex64))
+        with pytest.raises(MaskError, match="complex64; expected real numbers"):
+            read_mask(path)
+
+    @pytest.mark.filterwarnings("error")
+    @pytest.mark.parametrize(("dtype", "value"), [(np.float64, 1e308), (np.float64, -1.7e308), (np.float32, -3.4e38)])
+    def test_what_only_stands_for_no_value(self, tmp_path, roads, dtype, value):
+        values = np.where(np.arange(SIZE) < 700, roads / 255, value).astype(dtype)
+        mask = read_mask(write_tiff(tmp_path / "mask.tif", values))
+        assert np.array_equal(mask.roads[:, :690], roads[:, :690] > 0)
+        if dtype == np.float64:
+            assert mask.observed is not None
+            assert not mask.observed[:, 700:].any()
+
+
+def test_what_goes_wrong_inside_gdal_is_told_in_a_line(tmp_path, roads):
+    """A damaged block raises what rasterio has no error of its own for."""
+    path = write_tiff(tmp_path / "mask.tif", roads, compress="deflate")
+    content = bytearray(path.read_bytes())
+    content[len(content) // 2 : len(content) // 2 + 2000] = bytes(2000)
+    path.write_bytes(content)
+    with pytest.raises(MaskError, match="not a raster that can be read"):
+        read_mask(path)
+
+
+def test_names_are_no_text_for_gdal(tmp_path, roads, monkeypatch):
+    """A virtual raster may stand in for its own path."""
+    monkeypatch.chdir(tmp_path)
+    name = "<VRTDataset rasterXSize='64' rasterYSize='64'>.tif"
+    shutil.move(write_tiff(tmp_path / "a.tif", roads), name)
+    assert read_mask(name).shape == roads.shape
+    with open_raster(name) as raster:
+        assert raster.driver == "GTiff"
