@@ -1,0 +1,61 @@
+"""Nothing that is wrong with one mask stops the others of a batch."""
+
+import json
+import os
+import struct
+import zlib
+from pathlib import Path
+
+import numpy as np
+import pytest
+import rasterio
+
+from roadgeo.cli import main
+from roadgeo.demo import ROADS, demo_masks
+from roadgeo.workflows import build_reference
+
+
+@pytest.fixture(scope="module")
+def porto(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    path = tmp_path_factory.mktemp("reference") / "porto.gpkg"
+    build_reference(ROADS, "porto", path=path)
+    return path
+
+
+def write_hostile(folder: Path) -> int:
+    """Write masks that have each ended a run, and return how many."""
+    head = struct.pack(">IIBBBBB", 100_000, 100_000, 1, 0, 0, 0, 0)
+    chunk = struct.pack(">I", 13) + b"IHDR" + head + struct.pack(">I", zlib.crc32(b"IHDR" + head))
+    (folder / "a_header.png").write_bytes(b"\x89PNG\r\n\x1a\n" + chunk + bytes(23))
+    (folder / "b_bitmap.bmp").write_bytes(
+        b"BM" + bytes(12) + struct.pack("<iiiHH", 40, 20_000, 20_000, 1, 24) + bytes(9)
+    )
+    source = '<VRTDataset rasterXSize="64" rasterYSize="64"><SRS>nonsense</SRS></VRTDataset>'
+    (folder / "c_virtual.tif").write_text(source)
+    profile = {"driver": "GTiff", "width": 600, "height": 600, "count": 1, "crs": "EPSG:3857"}
+    with rasterio.open(folder / "d_complex.tif", "w", **profile, dtype="complex64") as sink:
+        sink.write(np.ones((1, 600, 600), np.complex64))
+    with rasterio.open(folder / "e_damaged.tif", "w", **profile, dtype="uint8", compress="deflate") as sink:
+        sink.write(np.random.default_rng(0).integers(0, 2, (1, 600, 600), np.uint8) * 255)
+    content = bytearray((folder / "e_damaged.tif").read_bytes())
+    content[3000:9000] = bytes(6000)
+    (folder / "e_damaged.tif").write_bytes(content)
+    os.mkfifo(folder / "f_pipe.png")
+    (folder / "g_empty.tif").write_bytes(b"")
+    return 7
+
+
+@pytest.mark.parametrize("jobs", ["1", "2"])
+@pytest.mark.filterwarnings("ignore::rasterio.errors.NotGeoreferencedWarning")
+def test_the_others_go_on(porto: Path, tmp_path: Path, capfd: pytest.CaptureFixture[str], jobs: str) -> None:
+    folder = tmp_path / "masks"
+    folder.mkdir()
+    n_hostile = write_hostile(folder)
+    (folder / "z_drone.png").write_bytes(demo_masks()[0].path.read_bytes())
+    assert main(["locate", str(folder), "-r", str(porto), "--json", "--jobs", jobs, "-o", str(tmp_path)]) == 1
+    out, err = capfd.readouterr()
+    documents = [json.loads(line) for line in out.splitlines()]
+    assert [document["status"] for document in documents] == ["error"] * n_hostile + ["located"]
+    reasons = [document["reason"] for document in documents[:-1]]
+    assert not [reason for reason in reasons if "\n" in reason or "fault of roadgeo" in reason]
+    assert f"1 located, 0 not located, {n_hostile} failed" in err
