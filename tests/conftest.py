@@ -19,6 +19,18 @@ settings.register_profile("steady", derandomize=True, deadline=None)
 settings.load_profile("steady")
 
 
+#: Folders whose tests start programs, draw masks or run whole commands: they take most of the time.
+SLOW = ("cli", "docs", "evaluation", "examples", "outputs", "qgis", "workflows")
+
+
+def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
+    """Mark what is slow by its folder, so that no new test there is forgotten."""
+    here = Path(__file__).parent
+    for item in items:
+        if item.path.relative_to(here).parts[0] in SLOW:
+            item.add_marker(pytest.mark.slow)
+
+
 @pytest.fixture(scope="session")
 def data_dir() -> Path:
     """The development data, for tests marked `realdata`; they skip where it is absent."""

@@ -16,11 +16,11 @@ import pytest
 import rasterio
 
 from roadgeo.cli import main
-from roadgeo.cli.index import build
 from roadgeo.cli.locate import pair_images
 from roadgeo.demo import ATTRIBUTION, ROADS, DemoMask, demo_masks
 from roadgeo.geometry.homography import Homography
 from roadgeo.sources.roads import read_roads
+from roadgeo.workflows import build_reference
 
 MASKS = {mask.path.stem: mask for mask in demo_masks()}
 
@@ -28,7 +28,7 @@ MASKS = {mask.path.stem: mask for mask in demo_masks()}
 @pytest.fixture(scope="module")
 def porto(tmp_path_factory: pytest.TempPathFactory) -> Path:
     path = tmp_path_factory.mktemp("reference") / "porto.gpkg"
-    build(read_roads(ROADS, attribution=ATTRIBUTION), path, "porto")
+    build_reference(read_roads(ROADS, attribution=ATTRIBUTION), "porto", path=path)
     return path
 
 
