@@ -92,7 +92,9 @@ class Evidence:
 
 @dataclass(frozen=True, repr=False)
 class Location:
-    """Result of locating one mask. Everything that needs a place is None unless `status` is "located" or "ambiguous".
+    """Result of locating one mask.
+
+    Everything that needs a place, but the odds, is None unless `status` is "located" or "ambiguous".
 
     Attributes
     ----------
@@ -107,7 +109,15 @@ class Location:
     rotation_deg : float
         Direction of the image's up at its centre, clockwise from true north.
     tilt_deg : float or None
-        Of the camera from the vertical; None where neither given nor well determined. `tilt_source` says which.
+        Of the camera from the vertical.
+    tilt_source : str or None
+        What the tilt rests on: the "camera" whose focal length was given, the "homography" where that tells the focal
+        length, or a usual lens that is "assumed".
+    log10_odds : float or None
+        Of the best place; also where that is not enough to report it. None where no place was verified, or the method
+        knows no odds.
+    runner_up : Place or None
+        The best other place, on any of the references.
     """
 
     query: str

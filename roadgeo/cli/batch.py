@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import glob
+import hashlib
 import multiprocessing
 import os
 import signal
@@ -50,19 +51,29 @@ def _is_mask(path: Path) -> bool:
 
 
 def name_tasks(masks: Sequence[str]) -> list[Task]:
-    """Give each mask the stem of its own name; those that share one get their folder's name too, then a number."""
-    stems = [Path(mask).stem for mask in masks]
-    shared = Counter(stems)
-    stems = [
-        f"{Path(mask).absolute().parent.name}_{stem}" if shared[stem] > 1 else stem
-        for mask, stem in zip(masks, stems, strict=True)
-    ]
-    taken: Counter[str] = Counter()
-    tasks = []
-    for mask, stem in zip(masks, stems, strict=True):
-        taken[stem] += 1
-        tasks.append(Task(mask, stem if taken[stem] == 1 else f"{stem}_{taken[stem]}"))
-    return tasks
+    """Give each mask the stem of its own name; those that would share one get more of their path, until none does.
+
+    So a stem depends on the other masks only where names meet, and then on the mask's path, not on the others' order.
+    """
+    known = [_stems(mask, n) for n, mask in enumerate(masks)]
+    used = [0] * len(masks)
+    while True:
+        stems = [stems[level] for stems, level in zip(known, used, strict=True)]
+        taken = Counter(stem.casefold() for stem in stems)  # one name to file systems that do not tell cases apart
+        shared = [n for n, stem in enumerate(stems) if taken[stem.casefold()] > 1 and used[n] < len(known[n]) - 1]
+        if not shared:
+            return [Task(mask, stem) for mask, stem in zip(masks, stems, strict=True)]
+        for n in shared:
+            used[n] += 1
+
+
+def _stems(mask: str, n: int) -> list[str]:
+    """Return longer and longer stems for the n-th mask: its name, its folder, its format, its path, its number."""
+    path = Path(mask).absolute()
+    folder = f"{path.parent.name}_{path.stem}"
+    format_ = f"{folder}_{path.suffix.lower().removeprefix('.')}"
+    whole = f"{format_}_{hashlib.blake2b(os.fsencode(path), digest_size=4).hexdigest()}"
+    return [path.stem, folder, format_, whole, f"{whole}_{n + 1}"]
 
 
 class Work(Protocol[Result]):

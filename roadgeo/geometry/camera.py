@@ -5,6 +5,7 @@ from __future__ import annotations
 import math
 from dataclasses import dataclass
 from enum import Enum
+from typing import Literal
 
 import numpy as np
 
@@ -17,6 +18,9 @@ _FOCAL_STEPS = np.geomspace(0.35, 8.0, 25)
 _USUAL_FOCAL = 1.5
 #: How much more skew a usual focal length may leave than one e times as long.
 _FOCAL_PRIOR = 0.01
+#: Focal lengths whose skews differ by less than the errors of homographies are not told apart; where the longest of
+#: them is so many times the shortest, the homography says nothing of the lens.
+_TOLD_APART, _ALIKE = 0.02, 4.0
 
 
 class CameraFault(Enum):
@@ -85,6 +89,9 @@ class CameraPose:
         Direction of the image's up there, clockwise from north.
     tilt_deg, focal_px : float
         Of the pinhole that fits best: the angle of its axis from the vertical. Ill determined near the nadir.
+    source : str
+        What says so: the "camera" whose focal length is given, the "homography", or a lens "assumed" where so many fit
+        about as well that the homography cannot tell them apart.
     skew : float
         How badly even that one fits (see `CameraOptions.max_skew`).
     """
@@ -94,6 +101,7 @@ class CameraPose:
     tilt_deg: float
     focal_px: float
     skew: float
+    source: Literal["camera", "homography", "assumed"] = "homography"
 
 
 def _jacobian(matrix: FloatArray, xy: FloatArray) -> FloatArray:
@@ -148,7 +156,12 @@ def pose(matrix: FloatArray, size: tuple[int, int], focal_px: float | None = Non
     fits = _pinholes(matrix, size, focal_px)
     usual = _USUAL_FOCAL * math.hypot(*size) / 2.0
     best = int(np.argmin(fits.skew + _FOCAL_PRIOR * np.abs(np.log(fits.focal_px / usual))))
-    return CameraPose(gsd, rotation, float(fits.tilt_deg[best]), float(fits.focal_px[best]), float(fits.skew[best]))
+    alike = fits.focal_px[fits.skew <= fits.skew.min() + _TOLD_APART]
+    source: Literal["camera", "homography", "assumed"] = "homography" if alike[-1] < _ALIKE * alike[0] else "assumed"
+    if focal_px:
+        source = "camera"
+    tilt, focal, skew = (float(values[best]) for values in (fits.tilt_deg, fits.focal_px, fits.skew))
+    return CameraPose(gsd, rotation, tilt, focal, skew, source)
 
 
 def judge(matrix: FloatArray, size: tuple[int, int], options: CameraOptions, rough: bool = False) -> CameraFault | None:

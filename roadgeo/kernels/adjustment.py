@@ -13,6 +13,9 @@ from roadgeo.kernels.compilation import kernel
 from roadgeo.kernels.growth import cholesky, solve_cholesky
 from roadgeo.kernels.roads import nearest_road
 
+#: Steps of an adjustment in which points are held near their start.
+_HELD_STEPS = 6
+
 __all__ = ["add_row", "adjust", "point_row"]
 
 
@@ -73,6 +76,9 @@ def adjust(
     targets: NDArray[np.float64],
     pair_cells: NDArray[np.int64],
     pair_weight: float,
+    held: NDArray[np.float64],
+    held_targets: NDArray[np.float64],
+    held_weight: float,
     n_cells: int,
     least_share: float,
     max_radius: float,
@@ -90,10 +96,11 @@ def adjust(
 ) -> tuple[int, float]:
     """Adjust a homography by Gauss-Newton with Cauchy weights.
 
-    The first step takes matched intersections only. Then a road point's residual is its distance across the nearest
-    road of the map that runs its way. How far off it may be is predicted from the system so far: it is searched as far
-    as three times that, and not at all beyond `max_radius`, so that the fit grows outwards from where it is sure. Where
-    fewer than `least_share` of a cell's searched points meet a road, what does meet one is chance, and the cell waits.
+    The first step takes matched intersections, and points held where the map to be adjusted put them. Then a road
+    point's residual is its distance across the nearest road of the map that runs its way. How far off it may be is
+    predicted from the system so far: it is searched as far as three times that, and not at all beyond `max_radius`, so
+    that the fit grows outwards from where it is sure. Where fewer than `least_share` of a cell's searched points meet a
+    road, what does meet one is chance, and the cell waits.
 
     Parameters
     ----------
@@ -109,6 +116,10 @@ def adjust(
         The one of `n_cells` cells of the frame that each lies in.
     point_weight, pair_weight : float
         Of an observation, against one of standard deviation `sigma_m`.
+    held, held_targets : (G, 2) float64
+        Points that hold the fit near its start while little else does, normalised.
+    held_weight : float
+        As `point_weight`, of each, in the first step; half of it in the next, and so on, and none after `_HELD_STEPS`.
     max_radius, sigma_m, tolerance_m : float
         Metres. The iteration ends when no parameter moves by more than the tolerance.
     min_cos, segments, starts, ids, grid, shape
@@ -161,6 +172,14 @@ def adjust(
                     continue
                 weight = pair_weight / (1.0 + (far / (2.0 * sigma_m)) ** 2)
                 add_row(normal, right, row, weight, dx if axis == 0 else dy)
+        if iteration < _HELD_STEPS:
+            for i in range(held.shape[0]):
+                for axis in range(2):
+                    x, y, w = point_row(p, held[i, 0], held[i, 1], 1.0 - axis, 1.0 * axis, row)
+                    if w < 0.02:
+                        return -1, np.inf
+                    residual = held_targets[i, 0] - x if axis == 0 else held_targets[i, 1] - y
+                    add_row(normal, right, row, held_weight * 0.5**iteration, residual)
         used, weights, slopes, squares = 0, 0.0, 0.0, 0.0
         if iteration > 0:
             searched[:] = 0.0
@@ -227,7 +246,7 @@ def adjust(
         for r in range(8):
             p[r] += right[r]
             largest = max(largest, abs(right[r]))
-        if iteration > 1 and largest * unit < tolerance_m and used <= previous:
+        if iteration > (1 if held.shape[0] == 0 else _HELD_STEPS) and largest * unit < tolerance_m and used <= previous:
             break
         previous = used
     return previous, rms

@@ -34,8 +34,8 @@ __all__ = [
     "unpack_tangents",
 ]
 
-#: Branches and tangents beyond these, which hardly an intersection has, serve its codes but are not compared.
-INDEXED_BRANCHES = 6
+#: Seed of the order of the table's entries within a cell.
+_SHUFFLE_SEED = 7
 
 #: What an index from a stranger may hold: the kernels sample segments every few metres, in each bucket that lists them.
 _MAX_DISTANCE_M = 5e7
@@ -306,7 +306,11 @@ def unpack_tangents(packed: AnyArray) -> Float32Array:
 def _tabulate(
     xy: FloatArray, tangents: Float32Array, branches: AnyArray, neighbours: Int32Array, options: IndexOptions
 ) -> tuple[Int32Array, AnyArray]:
-    """Return starts and entries of the table of triples (see `kernels.triples`)."""
+    """Return starts and entries of the table of triples (see `kernels.triples`).
+
+    Within a cell the entries stand in random order, always the same: where a look-up ends before the cell does, it has
+    seen all parts of the map alike.
+    """
     sides = np.empty(tangents.shape, np.int8)
     find_sides(tangents, branches, sides)
     counts = np.zeros(TABLE + 1, np.int64)
@@ -315,6 +319,9 @@ def _tabulate(
     starts = np.cumsum(counts)
     entries = np.empty(total, np.uint64)
     fill_table(xy, tangents, sides, neighbours, *shape_limit, starts.copy(), entries)
+    order = np.random.default_rng(_SHUFFLE_SEED).permutation(total)
+    cells = np.repeat(np.arange(TABLE, dtype=np.int32), np.diff(starts))
+    entries = entries[order[np.argsort(cells[order], kind="stable")]]
     return starts.astype(np.int32), entries
 
 
@@ -331,7 +338,8 @@ def crop(index: ReferenceIndex, center: tuple[float, float], radius_m: float) ->
     point_starts = point_starts.astype(np.int32)
     xy, branches = np.ascontiguousarray(index.xy[kept]), np.ascontiguousarray(index.branches[kept])
     packed = np.ascontiguousarray(index.tangents[kept])
-    options = IndexOptions(n_neighbours=index.neighbours.shape[1])
+    stored = {"n_neighbours": index.neighbours.shape[1], **index.meta.get("index_options", {})}
+    options = IndexOptions(**{f.name: stored[f.name] for f in fields(IndexOptions) if f.name in stored})
     neighbours = nearest_neighbours(xy, point_starts, index.grid, index.shape, options.n_neighbours)
     table_starts, entries = _tabulate(xy, unpack_tangents(packed), branches, neighbours, options)
     return replace(
@@ -398,8 +406,8 @@ def build_index(network: RoadNetwork, options: IndexOptions | None = None, say: 
     index = ReferenceIndex(
         meta=meta,
         xy=xy,
-        branches=np.ascontiguousarray(branches[:, :INDEXED_BRANCHES]),
-        tangents=pack_tangents(tangents[:, :INDEXED_BRANCHES]),
+        branches=branches,
+        tangents=pack_tangents(tangents),
         neighbours=neighbours,
         point_starts=point_starts,
         segments=segments,

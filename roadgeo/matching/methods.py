@@ -105,7 +105,9 @@ def _search_triples(
     started = time.perf_counter()
     part, near = index, _near(index, options.near)
     if near is not None:
-        part = _part(index, near[:2], near[2] + 2.0 * query.scene.half_size * options.match.camera.gsd_m[1])
+        part = _part(
+            index, near[:2], _rounded_up(near[2] + 2.0 * query.scene.half_size * options.match.camera.gsd_m[1])
+        )
         if len(part) < options.min_intersections:
             return Found(index, n_searched=len(part))
     cropping_s = time.perf_counter() - started
@@ -162,6 +164,11 @@ def _near(index: ReferenceIndex, near: tuple[float, float, float] | None) -> tup
         return None
     x, y = from_lonlat(index.plane, np.array([near[:2]]))[0]
     return float(x), float(y), near[2]
+
+
+def _rounded_up(radius_m: float) -> float:
+    """Return the next step of a ladder, so that masks of many sizes are looked for on a few parts of a map."""
+    return float(1.25 ** math.ceil(math.log(radius_m) / math.log(1.25)))
 
 
 @lru_cache(maxsize=4)

@@ -17,8 +17,8 @@ from roadgeo.matching.query import Query
 __all__ = ["center_of", "place_frame"]
 
 
-def place_frame(location: Location, query: Query, fit: Fit) -> Location:
-    """Fill in everything that follows from a fit's homography and its matches."""
+def place_frame(location: Location, query: Query, fit: Fit, focal_px: float | None = None) -> Location:
+    """Fill in everything that follows from a fit's homography and its matches; `focal_px` if it is known."""
     plane, scene = fit.index.plane, query.scene
     homography = plane.to_crs_matrix() @ fit.matrix @ PIXEL_TO_PLANE
     width, height = scene.size
@@ -26,7 +26,7 @@ def place_frame(location: Location, query: Query, fit: Fit) -> Location:
     ground = pixels @ homography.T
     ground = ground[:, :2] / ground[:, 2:]
     lonlat = to_lonlat(plane.crs, ground)
-    camera = pose(fit.matrix, scene.size)
+    camera = pose(fit.matrix, scene.size, focal_px)
     north = grid_north(plane, ground[4])
     chosen = fit.matched >= 0
     reference_xy = plane.to_crs(fit.index.xy[fit.matched[chosen]])
@@ -42,7 +42,7 @@ def place_frame(location: Location, query: Query, fit: Fit) -> Location:
         gsd_m=camera.gsd_m,
         rotation_deg=(camera.rotation_deg + north + 180.0) % 360.0 - 180.0,
         tilt_deg=camera.tilt_deg,
-        tilt_source="homography",
+        tilt_source=camera.source,
         n_matched=int(chosen.sum()),
         inlier_ratio=float(chosen.mean()),
         log10_odds=None if math.isnan(fit.log10_odds) else fit.log10_odds,

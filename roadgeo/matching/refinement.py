@@ -31,6 +31,10 @@ class RefineOptions:
         Roads count as partners when their directions differ by less.
     perspective_sigma : float
         Prior standard deviation of the two perspective parameters.
+    held_m, held_px : float
+        How far off a homography that is held near its start may be.
+    few_matches : int
+        With fewer matches the start is held: they alone would not determine a homography, and it would be forgotten.
     least_support : float
         Matches take part when at least this share of their neighbours are matched.
     n_cells, least_share : int, float
@@ -57,6 +61,9 @@ class RefineOptions:
     correlation_m: float = 60.0
     sigma_floor_m: float = 0.1
     sigma_floor_px: float = 0.15
+    held_m: float = 5.0
+    held_px: float = 3.0
+    few_matches: int = 8
     n_iterations: int = 15
     tolerance_m: float = 0.02
 
@@ -124,6 +131,14 @@ def _corner_rows(p: FloatArray, uv: FloatArray) -> FloatArray:
     return rows
 
 
+def _held_points(p: FloatArray, n: int) -> tuple[FloatArray, FloatArray]:
+    """Return an n x n grid of normalised points over the frame, (n * n, 2), and where `p` puts them."""
+    side = np.linspace(-0.7, 0.7, n)
+    uv = np.stack(np.meshgrid(side, side), axis=-1).reshape(-1, 2)
+    mapped = np.c_[uv, np.ones(len(uv))] @ np.append(p, 1.0).reshape(3, 3).T
+    return uv, mapped[:, :2] / mapped[:, 2:]
+
+
 def refine(
     matrix: FloatArray,
     scene: Scene,
@@ -131,6 +146,7 @@ def refine(
     matched: IntArray,
     options: RefineOptions | None = None,
     n_points: int | None = None,
+    held: bool = False,
 ) -> Refined | None:
     """Adjust a homography by Gauss-Newton with Cauchy weights; None where that fails.
 
@@ -142,6 +158,8 @@ def refine(
         Map intersection of each query intersection, or -1.
     n_points : int, optional
         Use about so many of the scene's road points.
+    held : bool
+        Hold the homography near its start also where there are matches enough: it is right all over the frame.
     """
     options = options or RefineOptions()
     center, half_size = scene.center, scene.half_size
@@ -156,11 +174,14 @@ def refine(
     support = ((matched[around] >= 0) & (around >= 0)).sum(axis=1) / np.maximum((around >= 0).sum(axis=1), 1)
     chosen[chosen] = support >= options.least_support
     pairs = (scene.intersections.xy[chosen] - center) / half_size
+    grid, targets = _held_points(p, 6 if held or len(pairs) < options.few_matches else 0)
+    held_weight = 8.0 / 36.0 * (sigma_m / max(options.held_m, options.held_px * gsd)) ** 2
     normal = np.empty((8, 8))
     _, rms = adjust(
         p, unit, origin[0], origin[1], points, np.ascontiguousarray(scene.directions[::step]), _cells(points, options),
         min(1.0, _spacing(scene, unit) * step / options.correlation_m),
         pairs, (index.xy[matched[chosen]] - origin) / unit, _cells(pairs, options), options.intersection_weight,
+        grid, targets, held_weight,
         options.n_cells**2, options.least_share, options.max_radius_m + options.max_radius_px * gsd,
         np.cos(np.radians(options.max_turn_deg)), sigma_m,
         (sigma_m / unit / options.perspective_sigma) ** 2, options.n_iterations, options.tolerance_m,

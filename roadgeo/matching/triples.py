@@ -166,11 +166,16 @@ def propose(
         out_placed = np.empty(len(out_ids), np.int64)
         order = np.argsort(ids[:n_hits, 0], kind="stable")
         n = gather(ids, affine, order, k, options.affine_tolerance, out_ids, out_affine, out_placed)
-        best = np.argsort(-out_placed[:n], kind="stable")
+        best = np.lexsort((_scattered(out_ids[:n, 0]), -out_placed[:n]))
         yield Proposals(
             int(a), out_ids[best, 0], out_ids[best, 1:], out_affine[best], out_placed[best],
             len(slots), n_compared, n_hits,
         )  # fmt: skip
+
+
+def _scattered(numbers: IntArray) -> IntArray:
+    """Return keys that put numbers in an order of no meaning, always the same: those of the map run from the south."""
+    return (numbers * 2654435761) % 2**32  # Knuth's multiplicative hash
 
 
 def _farthest_first(xy: FloatArray, names: IntArray) -> Iterator[int]:

@@ -6,7 +6,10 @@ import math
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 
+import numpy as np
+
 from roadgeo.geometry.camera import CameraOptions, sampling
+from roadgeo.geometry.projection import from_lonlat
 from roadgeo.location import Location, Place, Seen, Stats
 from roadgeo.matching.methods import Fit, Found
 from roadgeo.matching.options import LocateOptions
@@ -52,11 +55,15 @@ def decide(query: Query, found: Sequence[Found], options: LocateOptions) -> Loca
         return _decide_pairs(location, query, found, options)
     candidates = _pool(query, found)
     best = candidates[0] if candidates else None
+    rival = None if best is None else next((one for one in candidates[1:] if _differ(query, best, one)), None)
+    location = replace(
+        location,
+        log10_odds=None if best is None else best.score,
+        runner_up=None if best is None or rival is None else _seen_from(best, rival),
+    )
     if best is None or best.score < options.min_log10_odds:
         return _refuse(location, query, found, best, options)
-    placed = place_frame(_on(location, best.found), query, best.fit)
-    rival = next((one for one in candidates[1:] if _differ(query, best, one)), None)
-    placed = replace(placed, runner_up=None if rival is None else rival.center)
+    placed = place_frame(_on(location, best.found), query, best.fit, options.match.camera.focal_px)
     if rival is not None and best.score - rival.score < options.min_margin:
         return replace(placed, status="ambiguous", reason=_twins(best, rival))
     reason = (
@@ -114,6 +121,15 @@ def _differ(query: Query, a: _Candidate, b: _Candidate) -> bool:
     north = math.radians(a.center.lat - b.center.lat)
     frame_m = sampling(b.fit.matrix, query.scene.size) * max(query.scene.size)
     return _EARTH_RADIUS_M * math.hypot(east, north) > 0.5 * frame_m
+
+
+def _seen_from(best: _Candidate, rival: _Candidate) -> Place:
+    """Return the middle of a rival in the CRS of the best place."""
+    if best.found is rival.found:
+        return rival.center
+    plane = best.fit.index.plane
+    x, y = plane.to_crs(from_lonlat(plane, np.array([[rival.center.lon, rival.center.lat]])))[0]
+    return replace(rival.center, x=float(x), y=float(y))
 
 
 def _twins(best: _Candidate, rival: _Candidate) -> str:

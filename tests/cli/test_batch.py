@@ -53,7 +53,29 @@ def test_folders_and_patterns_are_expanded(tmp_path: Path, monkeypatch: pytest.M
 
 def test_results_never_share_a_name() -> None:
     tasks = name_tasks(["x/q.png", "y/q.png", "y/q.tif", "y/r.png"])
-    assert [task.stem for task in tasks] == ["x_q", "y_q", "y_q_2", "r"]
+    assert [task.stem for task in tasks] == ["x_q", "y_q_png", "y_q_tif", "r"]
+
+
+@pytest.mark.parametrize(
+    "masks",
+    [
+        ["p/x.png", "p/x.tif", "q/p_x_2.png"],
+        ["p/x.png", "p/x.tif", "q/p_x_tif.png"],
+        ["a/q.png", "a/Q.png", "b/Q.PNG"],
+        ["q.png", "q.png", "./q.png", "a/../q.png"],
+        ["1/a/x.png", "2/a/x.png"],
+    ],
+)
+def test_no_two_results_have_one_name(masks: list[str]) -> None:
+    for order in (masks, masks[::-1]):
+        stems = [task.stem.casefold() for task in name_tasks(order)]
+        assert len(set(stems)) == len(masks)
+
+
+def test_a_name_does_not_depend_on_the_order() -> None:
+    masks = ["p/x.png", "p/x.tif", "q/x.png", "r/x.png"]
+    names = {task.mask: task.stem for task in name_tasks(masks)}
+    assert {task.mask: task.stem for task in name_tasks(masks[::-1])} == names
 
 
 @pytest.mark.skipif(os.name == "nt", reason="signals of POSIX")

@@ -54,6 +54,12 @@ def test_tilt_and_focal_length_where_neither_is_known(tilt, focal):
     assert max(errors) < 3
 
 
+def test_near_the_nadir_a_lens_is_assumed():
+    assert pose(camera((0, 0), SIZE, 1.0, 3.0, 10.0, 20.0, 1000.0), SIZE).source == "assumed"
+    assert pose(camera((0, 0), SIZE, 1.0, 35.0, 10.0, 20.0, 1000.0), SIZE).source == "homography"
+    assert pose(camera((0, 0), SIZE, 1.0, 35.0, 10.0, 20.0, 1000.0), SIZE, 1000.0).source == "camera"
+
+
 @given(heading=turns)
 def test_up_is_where_the_image_points_when_the_camera_tilts_forwards(heading):
     seen = pose(camera((0, 0), SIZE, 1.0, 40.0, heading, heading, 1000.0), SIZE, 1000.0)

@@ -51,7 +51,12 @@ class Town:
     def cells(self, xy):
         return (np.clip((xy + 0.7) / 1.4 * 3, 0, 2).astype(np.int64) @ (1, 3)).astype(np.int64)
 
-    def arguments(self, **changes):
+    def held(self, p):
+        """A grid of points over the frame, and where `p` puts them."""
+        grid = np.stack(np.meshgrid([-0.6, 0.0, 0.6], [-0.6, 0.0, 0.6]), axis=-1).reshape(-1, 2)
+        return grid, np.array([naive.predict(p, *q) for q in grid])
+
+    def arguments(self, held_at=None, **changes):
         values = {
             "point_weight": 0.8, "pair_weight": 0.3, "n_cells": N_CELLS, "least_share": 0.5, "max_radius": 30.0,
             "min_cos": float(np.cos(np.radians(25))), "sigma_m": 2.0, "prior": 1e-4, "n_iterations": 12,
@@ -60,7 +65,8 @@ class Town:
         scalars = list(values.values())
         observations = (self.points, self.directions, self.cells(self.points), scalars[0])
         matches = (self.pairs, self.targets, self.cells(self.pairs), scalars[1])
-        return (*observations, *matches, *scalars[2:])
+        held = (np.empty((0, 2)), np.empty((0, 2))) if held_at is None else self.held(held_at)
+        return (*observations, *matches, *held, 0.05, *scalars[2:])
 
 
 def run(town, p, **changes):
@@ -117,6 +123,28 @@ def test_like_the_twin(seed, changes):
     assert rms == pytest.approx(rms_expected, rel=1e-3)
     assert corner_gap(p, expected) < 1e-3
     assert np.allclose(normal, system, rtol=1e-2, atol=1e-3)
+
+
+@pytest.mark.parametrize("seed", range(3))
+def test_like_the_twin_where_points_are_held(seed):
+    town, start = Town(seed, noise=1.5, pairs=3), jittered(P, 0.004, seed)
+    p, n, rms, normal = run(town, start, held_at=start)
+    expected = naive.adjust(start, UNIT, ORIGIN, *town.arguments(held_at=start), town.roads[0].astype(float))
+    assert np.allclose(p, expected[0], atol=1e-6)
+    assert n == expected[1]
+    assert rms == pytest.approx(expected[2], rel=1e-4)
+    assert np.allclose(np.tril(normal), np.tril(expected[3]), rtol=1e-4, atol=1e-6)
+
+
+@pytest.mark.parametrize("pairs", [0, 2])
+def test_held_near_its_start_roads_are_enough(pairs):
+    town, start = Town(pairs=pairs), jittered(P, 0.006, 4)
+    assert corner_gap(start, P) > 4
+    free, n_free, *_ = run(town, start)
+    assert n_free == -1 or corner_gap(free, P) > 4
+    p, n, *_ = run(town, start, held_at=start)
+    assert n > 50
+    assert corner_gap(p, P) < 0.5
 
 
 def test_wrong_matches_are_outvoted():

@@ -322,8 +322,25 @@ class TestCrop:
         was = np.flatnonzero(away <= radius)[deep]
         assert np.array_equal(part.xy[part.neighbours[deep]], index.xy[index.neighbours[was]])
 
+    def test_the_options_are_those_of_the_whole(self, town):
+        options = IndexOptions(n_neighbours=5, min_shape=0.15, codes_per_vertex=1)
+        index = build_index(town[0], options)
+        part = crop(index, tuple(index.xy[0]), 1e6)
+        assert len(part.table_entries) == len(index.table_entries)
+
     def test_the_whole_and_nothing(self, town):
         index = town[1]
         whole = crop(index, tuple(index.xy[0]), 1e6)
         assert len(whole.table_entries) == len(index.table_entries)
         assert len(crop(index, (1e7, 1e7), 1.0)) == 0
+
+
+def test_within_a_cell_entries_come_from_all_parts_of_the_map(town):
+    """Where a look-up is cut short it must not have seen the south only."""
+    index = town[1]
+    anchors = (index.table_entries >> np.uint64(40)).astype(np.int64)
+    northing = index.xy[anchors, 1]
+    cells = np.repeat(np.arange(len(index.table_starts) - 1), np.diff(index.table_starts))
+    inside = cells[1:] == cells[:-1]
+    later = northing[1:][inside] - northing[:-1][inside]
+    assert abs((later > 0).mean() - 0.5) < 0.05

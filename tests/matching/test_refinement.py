@@ -121,3 +121,17 @@ def test_nothing_to_stand_on_is_no_refinement(town):
     truth, scene = sight_of(town[0], 8)
     nowhere = np.array([[1, 0, 1e6], [0, 1, 1e6], [0, 0, 1]]) @ truth
     assert refine(nowhere, scene, town[1], np.full(len(scene.intersections), -1)) is None
+
+
+@pytest.mark.parametrize("n_matches", [0, 1, 3, 5])
+def test_few_true_matches_are_enough_where_roads_agree(town, n_matches):
+    """Of a few lone matches the filter leaves none: the fit used to forget where it began, and failed."""
+    truth, scene = sight_of(town[0], 8, 15.0, Sight(0.8))
+    _, matched, _ = agreement(truth, scene, town[1], 1.0, NO_SEEDS, VerifyOptions())
+    few = np.full(len(matched), -1)
+    chosen = np.flatnonzero(matched >= 0)[:: max(1, int((matched >= 0).sum()) // max(n_matches, 1))][:n_matches]
+    few[chosen] = matched[chosen]
+    result = refine(truth, scene, town[1], few)
+    assert result is not None
+    gaps = np.hypot(*(mapped(result.matrix, scene.corners) - mapped(truth, scene.corners)).T)
+    assert gaps.max() < 2.0

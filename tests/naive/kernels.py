@@ -279,7 +279,8 @@ def grow(
 
 def adjust(
     p, unit, origin, points, directions, point_cells, point_weight, pairs, targets, pair_cells, pair_weight,
-    n_cells, least_share, max_radius, min_cos, sigma_m, prior, n_iterations, tolerance_m, segments,
+    held, held_targets, held_weight, n_cells, least_share, max_radius, min_cos, sigma_m, prior, n_iterations,
+    tolerance_m, segments,
 ):  # fmt: skip
     """(p, road points used, rms, normal matrix) of Gauss-Newton steps with Cauchy weights."""
     shares = np.ones(n_cells)
@@ -294,6 +295,11 @@ def adjust(
                 rows += list(predict_rows(p, *pair))
                 weights += [weight, weight]
                 residuals += list(gap)
+        if iteration < 6:
+            for point, target in zip(held, held_targets, strict=True):
+                rows += list(predict_rows(p, *point))
+                weights += [held_weight * 0.5**iteration] * 2
+                residuals += list(target - predict(p, *point))
         met = []
         if iteration > 0:
             searched, hits = np.zeros(n_cells), np.zeros(n_cells)
@@ -327,7 +333,7 @@ def adjust(
         normal = A.T @ (W[:, None] * A) + hold + 1e-9 * np.eye(8)
         step = np.linalg.solve(normal, A.T @ (W * np.array(residuals)) - hold @ p)
         p = p + step
-        if iteration > 1 and np.abs(step).max() * unit < tolerance_m and len(met) <= previous:
+        if iteration > (6 if len(held) else 1) and np.abs(step).max() * unit < tolerance_m and len(met) <= previous:
             break
         previous = len(met)
     return p, previous, rms, normal

@@ -94,6 +94,29 @@ def test_a_refusal_says_where_it_looked(query, searched, names):
     assert (best.status, best.reference, best.attribution) == ("not_located", ", ".join(names), "© all")
 
 
+def test_a_refusal_tells_the_odds_of_the_best_and_of_the_next_place(query, searched):
+    best = judge(query, searched("a", (3.0, 0.0), (1.0, 2000.0)), searched("b", (2.0, 30_000.0)))
+    assert (best.status, best.center) == ("not_located", None)
+    assert best.log10_odds == pytest.approx(3.0 - math.log10(2))
+    assert best.runner_up.log10_odds == pytest.approx(2.0 - math.log10(2))
+    assert best.runner_up.x == pytest.approx(PLANE.origin[0] + 30_000.0, abs=1.0)
+
+
+def test_a_given_focal_length_is_used_for_the_tilt(query, town):
+    """A homography alone tells the tilt to a degree at best, with the focal length it tells it to hundredths."""
+    truth = camera((1000.0, 1000.0), SIZE, 1.0, tilt_deg=24.0, azimuth_deg=70.0, focal_px=900.0)
+    nobody = np.full(len(query.scene.intersections), -1)
+    found = Found(
+        town, (Fit(town, truth, nobody, np.zeros(len(nobody)), 0.9, 20.0, np.ones(4)),), "accepted", n_tried=1
+    )
+    match = LocateOptions().match
+    known = replace(match, camera=CameraOptions(focal_px=900.0))
+    seen = judge(query, found, match=known)
+    assert seen.tilt_deg == pytest.approx(24.0, abs=1e-3)
+    assert seen.tilt_source == "camera"
+    assert judge(query, found).tilt_source == "homography"
+
+
 def test_a_refusal_gives_the_reason_of_what_came_nearest(query, searched):
     near_miss = searched("b", (3.5, 0.0), stopped="time")
     best = judge(query, searched("a", tried=9000), near_miss, searched("c", (1.0, 9000.0)))

@@ -209,7 +209,7 @@ def _numbers(subject: Subject) -> list[tuple[str, str]]:
     if location.rotation_deg is not None:
         rows.append(("Image's up", f"{location.rotation_deg % 360:.1f}° clockwise from north"))
     if location.tilt_deg is not None:
-        source = f" <small>(from the {html.escape(location.tilt_source)})</small>" if location.tilt_source else ""
+        source = f" <small>({html.escape(location.tilt_source)})</small>" if location.tilt_source else ""
         rows.append(("Tilt", f"{location.tilt_deg:.1f}° from the vertical{source}"))
     sigma = location.corner_sigma_m
     if sigma is not None and np.isfinite(sigma).all():
