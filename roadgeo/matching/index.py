@@ -21,6 +21,7 @@ from roadgeo.kernels.buckets import nearest_neighbours
 from roadgeo.kernels.roads import bin_segments
 from roadgeo.kernels.triples import MAX_ANCHORS, MAX_NEIGHBOURS, TABLE, fill_table, find_sides
 from roadgeo.roads.graph import RoadGraph
+from roadgeo.roads.intersections import MAX_BRANCHES
 from roadgeo.roads.network import RoadNetwork
 
 __all__ = [
@@ -199,7 +200,7 @@ def _check_parts(meta: Mapping[str, Any], arrays: Mapping[str, AnyArray], path: 
     n_buckets = shape[0] * shape[1]
     require(arrays["xy"].shape == (n, 2) and n < 2**31 and _lie_on_earth(arrays["xy"]), "bad positions")
     columns = arrays["tangents"].shape[1]
-    require(2 <= columns <= INDEXED_BRANCHES and arrays["tangents"].shape == (n, columns), "bad tangents")
+    require(2 <= columns <= MAX_BRANCHES and arrays["tangents"].shape == (n, columns), "bad tangents")
     require(arrays["branches"].shape == (n, columns, 2), "bad branches")
     k = arrays["neighbours"].shape[1]
     require(1 <= k <= MAX_NEIGHBOURS and arrays["neighbours"].shape == (n, k), "bad neighbours")
