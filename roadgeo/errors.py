@@ -8,6 +8,7 @@ __all__ = [
     "CrsError",
     "IndexFormatError",
     "MaskError",
+    "ModelError",
     "NotLocatedError",
     "OutputError",
     "PhotographError",
@@ -35,6 +36,10 @@ class MaskError(RoadgeoError):
 
 class PhotographError(MaskError):
     """A query raster is a photograph: its roads have to be segmented first."""
+
+
+class ModelError(RoadgeoError):
+    """A segmentation model is missing, damaged, hostile, or not of a kind that can be run here."""
 
 
 class IndexFormatError(RoadgeoError):

@@ -7,22 +7,20 @@ a chance resemblance k times as often, so log10(k) is taken off the odds.
 from __future__ import annotations
 
 import math
-import os
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
 
-from roadgeo._arrays import AnyArray
 from roadgeo.errors import MaskError
 from roadgeo.geometry.mask import RoadMask
 from roadgeo.location import Location
 from roadgeo.matching.explanation import Explanation
+from roadgeo.matching.options import LocateOptions
 from roadgeo.reference.reference import Reference
-from roadgeo.sources.masks import open_mask
-from roadgeo.workflows import LocateOptions, locate
+from roadgeo.segmentation.probability import ProbabilityMap
 
-__all__ = ["Look", "Sighting", "locate_looks", "locate_soft"]
+__all__ = ["Locate", "Look", "Sighting", "locate_looks"]
 
 #: Share of the time left that a look may take; the last one may take all.
 _SHARE = 0.6
@@ -40,10 +38,13 @@ class Look:
         What tells it from the others, for people: "threshold 63".
     make : callable
         Returns the mask; may raise MaskError.
+    probability : callable, optional
+        Returns what a segmenter saw, where the mask is made of that.
     """
 
     what: str
     make: Callable[[], RoadMask]
+    probability: Callable[[], ProbabilityMap] | None = None
 
 
 @dataclass(frozen=True)
@@ -53,36 +54,11 @@ class Sighting:
     location: Location
     mask: RoadMask
     explanation: Explanation | None = None
-
-
-def locate_soft(
-    source: str | os.PathLike[str] | AnyArray,
-    references: Sequence[Reference],
-    options: LocateOptions,
-    *,
-    band: int | None = None,
-    name: str | None = None,
-    how: Locate = locate,
-) -> Sighting:
-    """Locate a mask, or a soft map of roads at the thresholds that its values suggest.
-
-    Raises
-    ------
-    PhotographError
-        It is a photograph.
-    MaskError
-        It cannot be read or shows no roads at any threshold.
-    """
-    with open_mask(source, band=band, name=name) as opened:
-
-        def look(threshold: float) -> Look:
-            return Look(f"threshold {threshold:.3g}", lambda: opened.read(threshold))
-
-        return locate_looks([look(threshold) for threshold in opened.thresholds], references, options, how)
+    probability: ProbabilityMap | None = None
 
 
 def locate_looks(
-    looks: Sequence[Look], references: Sequence[Reference], options: LocateOptions, how: Locate = locate
+    looks: Sequence[Look], references: Sequence[Reference], options: LocateOptions, how: Locate
 ) -> Sighting:
     """Take one look after another until one is located, within the time limit of the search.
 
@@ -120,9 +96,10 @@ def _limited(options: LocateOptions, time_limit_s: float) -> LocateOptions:
 def _take(look: Look, references: Sequence[Reference], options: LocateOptions, how: Locate) -> Sighting:
     mask = look.make()
     found = how(mask, references, options)
+    probability = look.probability() if look.probability else None
     if isinstance(found, Explanation):
-        return Sighting(found.location, mask, found)
-    return Sighting(found, mask)
+        return Sighting(found.location, mask, found, probability)
+    return Sighting(found, mask, probability=probability)
 
 
 def _discount(sighting: Sighting, look: Look, tried: int, options: LocateOptions) -> Sighting:

@@ -15,11 +15,11 @@ STOREYS_TEXT = """
     kernels     kernels
     planes      geometry storage
     roads       roads
-    entrances   sources location
+    entrances   sources location segmentation
     matching    matching
     references  reference
     exits       outputs
-    workflows   workflows looks
+    workflows   workflows looks queries
     evaluation  evaluation
     faces       cli qgis demo __main__ __init__
 """

@@ -3,11 +3,12 @@
 from __future__ import annotations
 
 import os
+import re
 
 from roadgeo.errors import MaskError
 from roadgeo.storage.rasters import open_raster
 
-__all__ = ["read_focal_length"]
+__all__ = ["estimate_gsd", "read_focal_length"]
 
 #: Width of a 35 mm film frame, which "FocalLengthIn35mmFilm" refers to.
 FILM_WIDTH_MM = 36.0
@@ -24,13 +25,36 @@ def read_focal_length(path: str | os.PathLike[str]) -> float:
     with open_raster(path) as source:
         tags = {**source.tags(), **source.tags(ns="EXIF")}
     stated = tags.get("EXIF_FocalLengthIn35mmFilm", "").strip("() ")
-    try:
-        focal = float(stated)
-    except ValueError:
-        focal = 0.0
+    focal = _number(stated)
     if not 1.0 <= focal <= 5000.0:
         raise MaskError(
             f"{path}: EXIF names no focal length (FocalLengthIn35mmFilm is {stated or 'missing'}); "
             "give it in pixels: --camera PIXELS"
         )
     return focal / FILM_WIDTH_MM
+
+
+def estimate_gsd(path: str | os.PathLike[str]) -> float | None:
+    """Estimate the size of a photograph's pixels on the ground in metres, from its camera's height and focal length.
+
+    The height above the place of take-off, which drones note (XMP "RelativeAltitude"), is better than EXIF
+    "GPSAltitude", which counts from the sea. None where either is missing.
+    """
+    with open_raster(path) as source:
+        tags = {**source.tags(), **source.tags(ns="EXIF")}
+        xmp = "".join(source.tags(ns="xml:XMP").values())
+        longer_side: int = max(source.shape)
+    focal = _number(tags.get("EXIF_FocalLengthIn35mmFilm", ""))
+    relative = re.search(r"RelativeAltitude\W{1,4}([-+]?\d+(\.\d+)?)", xmp)
+    height = _number(relative[1]) if relative else _number(tags.get("EXIF_GPSAltitude", ""))
+    if not (1.0 <= focal <= 5000.0 and 5.0 <= height <= 100_000.0):
+        return None
+    return height * FILM_WIDTH_MM / focal / longer_side
+
+
+def _number(text: str) -> float:
+    """Return the number in an EXIF value such as "(24)"; 0 where there is none."""
+    try:
+        return float(text.strip("() "))
+    except ValueError:
+        return 0.0

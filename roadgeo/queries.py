@@ -1,0 +1,225 @@
+"""What a user gives to be located: a mask, a soft map of roads, a photograph, or several looks at one scene.
+
+A photograph is recognised and its roads are segmented; the probability of road is kept, and looked at with several
+thresholds and, where nobody says how large a pixel is, at several scales (`looks`).
+"""
+
+from __future__ import annotations
+
+import os
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass, replace
+from functools import lru_cache, partial
+from pathlib import Path
+from typing import Literal
+
+import numpy as np
+
+from roadgeo._progress import Say, say_nothing
+from roadgeo.errors import MaskError, PhotographError, PluginError
+from roadgeo.geometry.mask import RoadMask
+from roadgeo.location import Location
+from roadgeo.looks import Locate, Look, Sighting, locate_looks
+from roadgeo.matching.options import LocateOptions
+from roadgeo.plugins import SEGMENTERS, call_plugin
+from roadgeo.reference.reference import Reference
+from roadgeo.segmentation.network import DEFAULT_MODEL, Network, load_network
+from roadgeo.segmentation.photograph import Photograph, open_photograph
+from roadgeo.segmentation.probability import ProbabilityMap, fuse
+from roadgeo.segmentation.scales import rank_scales, scale_of
+from roadgeo.segmentation.tiling import segment
+from roadgeo.sources.exif import estimate_gsd
+from roadgeo.sources.masks import open_mask, read_mask
+from roadgeo.workflows import locate
+
+__all__ = ["QueryOptions", "is_model", "locate_query"]
+
+#: The mask of a larger photograph is reduced, so that time and memory are bounded.
+_MAX_GRID_PIXELS = 64_000_000
+_MAX_SCALES = 3
+_KNOWN_SPAN = 1.7  # a range of pixel sizes narrower than this is one scale
+
+#: Further thresholds of a probability map, as shares of the way from the model's own to 0 (below 0) and to 1.
+_THRESHOLDS = (0.0, -0.5, 0.4)
+
+
+@dataclass(frozen=True)
+class QueryOptions:
+    """How what is given is read.
+
+    Attributes
+    ----------
+    threshold : float or None
+        Values of a mask, or probabilities, above it are road. Default: told by the values.
+    band : int or None
+        The band that holds a mask, counted from 1.
+    segment : "auto", "always" or "never"
+        Whether photographs are recognised, everything is taken for one, or nothing.
+    segmenters : tuple of str
+        Plugins, and files of models (.onnx); several are fused. None: the model that ships.
+    class_name : str or None
+        The class of a model that is road. Default: told by their names.
+    fused_with : tuple of str
+        Further looks at the same frame, fused with each query.
+    threads : int
+        Of a model; fixed, so that results are the same on every run.
+    """
+
+    threshold: float | None = None
+    band: int | None = None
+    segment: Literal["auto", "always", "never"] = "auto"
+    segmenters: tuple[str, ...] = ()
+    class_name: str | None = None
+    fused_with: tuple[str, ...] = ()
+    threads: int = 1
+
+
+def locate_query(
+    path: str,
+    references: Sequence[Reference],
+    options: LocateOptions | None = None,
+    query: QueryOptions | None = None,
+    *,
+    how: Locate = locate,
+    say: Say = say_nothing,
+) -> Sighting:
+    """Locate a mask or a photograph.
+
+    Raises
+    ------
+    MaskError
+        It cannot be read, or is a mask without roads.
+    ModelError
+        There is no model, or it cannot be run.
+    PluginError
+        A segmenter fails.
+    """
+    options, query = options or LocateOptions(), query or QueryOptions()
+    has_plugin = any(not is_model(name) for name in query.segmenters)
+    wants_mask = query.segment == "never" or (query.segment == "auto" and not has_plugin)
+    if wants_mask and not query.fused_with:
+        try:
+            return _locate_mask(path, references, options, query, how)
+        except PhotographError:
+            if query.segment == "never":
+                raise
+    return _locate_photograph((path, *query.fused_with), references, options, query, how, say)
+
+
+def is_model(segmenter: str) -> bool:
+    """Whether a segmenter is the file of a model, not the name of a plugin."""
+    return segmenter.lower().endswith(".onnx")
+
+
+def _locate_mask(
+    path: str, references: Sequence[Reference], options: LocateOptions, query: QueryOptions, how: Locate
+) -> Sighting:
+    """Locate a mask, or a soft map of roads at the thresholds that its values suggest."""
+    with open_mask(path, band=query.band, threshold=query.threshold) as opened:
+
+        def look(threshold: float) -> Look:
+            return Look(f"threshold {threshold:.3g}", lambda: opened.read(threshold))
+
+        return locate_looks([look(threshold) for threshold in opened.thresholds], references, options, how)
+
+
+def _locate_photograph(
+    paths: Sequence[str],
+    references: Sequence[Reference],
+    options: LocateOptions,
+    query: QueryOptions,
+    how: Locate,
+    say: Say,
+) -> Sighting:
+    """Segment a photograph, or several of one frame, and locate what is seen."""
+    plugins = [name for name in query.segmenters if not is_model(name)]
+    if plugins and len(query.segmenters) == 1 and len(paths) == 1:
+        mask = _call_segmenter(plugins[0], paths[0], query.threshold)
+        return locate_looks([Look("the segmenter's own threshold", lambda: mask)], references, options, how)
+    with open_photograph(paths[0]) as photograph:
+        k = max(1, int(np.ceil(np.sqrt(photograph.width * photograph.height / _MAX_GRID_PIXELS))))
+        grid = round(photograph.height / k), round(photograph.width / k)
+        scales = _choose_scales(photograph, query, options)
+
+    @lru_cache(1)
+    def see(scale: float) -> ProbabilityMap:
+        seen = [_see(path, name, scale, query, say) for path in paths for name in query.segmenters or ("",)]
+        maps = [one.resized(grid) for one in seen]
+        return maps[0] if len(maps) == 1 else fuse(maps)
+
+    looks = [look for scale in scales for look in _looks_at(partial(see, scale), scale, query)]
+    options = _on_grid(options, k)
+    try:
+        return locate_looks(looks, references, options, how)
+    except MaskError as error:
+        names = ", ".join(one.name for one in references)
+        reason = f"hardly a road is seen in the photograph ({error})"
+        location = Location(paths[0], "not_located", reason, names, size=(grid[1], grid[0]))
+        return Sighting(location, RoadMask(np.zeros(grid, np.bool_), name=paths[0]), probability=see(scales[0]))
+
+
+def _looks_at(see: Callable[[], ProbabilityMap], scale: float, query: QueryOptions) -> list[Look]:
+    """Return looks at one probability map, at the model's threshold and others."""
+
+    def threshold(share: float) -> float:
+        own = see().threshold if query.threshold is None else query.threshold
+        return own + share * (own if share < 0 else 1 - own)
+
+    def look(share: float) -> Look:
+        what = f"scale {scale:.3g}" + (f", threshold {share:+.0%}" if share else "")
+        return Look(what, lambda: see().mask(threshold(share)), see)
+
+    return [look(share) for share in (_THRESHOLDS if query.threshold is None else (0.0,))]
+
+
+def _choose_scales(photograph: Photograph, query: QueryOptions, options: LocateOptions) -> list[float]:
+    """Return the scales to try, the most promising first: one where the size of a pixel is known."""
+    models = [name for name in query.segmenters if is_model(name)] or ([] if query.segmenters else [""])
+    if not models:
+        return [1.0]
+    network = _network(models[0], query.class_name, query.threads)
+    low, high = options.match.camera.gsd_m
+    if high <= _KNOWN_SPAN * low:
+        return [scale_of(float(np.sqrt(low * high)), network)]
+    ranked = rank_scales(photograph, network)[:_MAX_SCALES]
+    stated = estimate_gsd(photograph.name)
+    if stated is None or not low <= stated <= high:
+        return ranked
+    return [scale_of(stated, network), *ranked][:_MAX_SCALES]
+
+
+def _see(path: str, segmenter: str, scale: float, query: QueryOptions, say: Say) -> ProbabilityMap:
+    """Return what one segmenter sees in one photograph; a mask is sure of itself."""
+    if segmenter and not is_model(segmenter):
+        mask = _call_segmenter(segmenter, path, query.threshold)
+        values = np.where(mask.roads, 229, 25).astype(np.uint8)  # 0.9 and 0.1: a mask says nothing of its doubts
+        if mask.observed is not None:
+            values[~mask.observed] = 255
+        return ProbabilityMap(values, 0.5, path, segmenter)
+    with open_photograph(path) as photograph:
+        return segment(photograph, _network(segmenter, query.class_name, query.threads), scale, say)
+
+
+@lru_cache(maxsize=4)
+def _network(path: str, class_name: str | None, threads: int) -> Network:
+    """Load a model, once for a batch."""
+    return load_network(Path(path) if path else DEFAULT_MODEL, class_name=class_name, threads=threads)
+
+
+def _call_segmenter(name: str, path: str, threshold: float | None) -> RoadMask:
+    """Have a plugin find the roads in a photograph."""
+    seen = call_plugin(SEGMENTERS, name, path)
+    if isinstance(seen, RoadMask):
+        return replace(seen, name=os.fspath(path))
+    if not isinstance(seen, np.ndarray):
+        kind = type(seen).__name__
+        raise PluginError(f"the segmenter {name!r} returned a {kind}, expected a RoadMask or an array")
+    return read_mask(seen, threshold=threshold, name=os.fspath(path))
+
+
+def _on_grid(options: LocateOptions, k: int) -> LocateOptions:
+    """Return what is known of the camera in pixels of a grid k times coarser than the photograph."""
+    camera = options.match.camera
+    focal = None if camera.focal_px is None else camera.focal_px / k
+    camera = replace(camera, gsd_m=(k * camera.gsd_m[0], k * camera.gsd_m[1]), focal_px=focal)
+    return replace(options, match=replace(options.match, camera=camera))

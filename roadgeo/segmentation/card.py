@@ -1,0 +1,285 @@
+"""What must be known of a model to run it, from its own metadata or the STAC item beside it.
+
+Conventions: QGIS Deepness and GeoDeep keep JSON strings in an ONNX file's `metadata_props`
+(https://qgis-plugin-deepness.readthedocs.io, "Adding metadata to ONNX model"; https://github.com/uav4geo/GeoDeep,
+`inference.py`); the STAC Machine Learning Model extension describes a model in MODEL.json beside MODEL.onnx
+(https://github.com/stac-extensions/mlm).
+"""
+
+from __future__ import annotations
+
+import ast
+import json
+import re
+from dataclasses import dataclass, replace
+from pathlib import Path
+from typing import Any
+
+from roadgeo.errors import ModelError
+from roadgeo.segmentation.onnx_file import OnnxFile, Port
+
+__all__ = ["ModelCard", "read_card"]
+
+_ROAD, _NOT = {"road", "roads", "street", "streets", "highway", "highways"}, {"not", "no", "non", "without"}
+_DEFAULT_TILE, _MAX_TILE = 512, 4096
+_TILE_STEP = 32  # free input sizes are made multiples of this, as encoders with five reductions ask for
+_MAX_SIDECAR = 4 << 20
+
+
+@dataclass(frozen=True)
+class ModelCard:
+    """How a model is run. Dimensions: C classes.
+
+    Attributes
+    ----------
+    resolution_m : float or None
+        Metres per pixel that it was made for.
+    tile : (height, width)
+        Of its input, pixels.
+    overlap : float
+        Share of a tile that it has in common with the next.
+    mean, std : (3,) tuple
+        Subtracted from, and divided out of RGB values between 0 and 1.
+    threshold : float
+        Probabilities above it are road.
+    output : str
+        The output that shows roads.
+    channels : tuple of int
+        Those that are road: their probabilities are added.
+    is_probability : bool or None
+        Whether the output is a probability already; None: told by its values.
+    """
+
+    resolution_m: float | None
+    tile: tuple[int, int]
+    overlap: float
+    mean: tuple[float, float, float]
+    std: tuple[float, float, float]
+    threshold: float
+    output: str
+    channels: tuple[int, ...]
+    is_probability: bool | None
+
+
+def read_card(model: OnnxFile, path: Path, class_name: str | None = None) -> ModelCard:
+    """Work out how a model is run.
+
+    Parameters
+    ----------
+    class_name : str, optional
+        The class that is road. Default: told by the names of the classes.
+
+    Raises
+    ------
+    ModelError
+        It takes or gives something else than expected, its metadata contradict it, or no class is a road.
+    """
+    try:
+        told = {**_read_metadata(model.metadata), **_read_sidecar(path.with_suffix(".json"))}
+        return _make_card(model, told, class_name)
+    except (TypeError, ValueError, KeyError, AttributeError, RecursionError) as error:
+        raise ModelError(f"{path}: its metadata make no sense ({error}); correct them") from error
+    except _WrongModelError as error:
+        raise ModelError(f"{path}: {error}") from error
+
+
+class _WrongModelError(Exception):
+    """Why a model cannot be run, and what to do."""
+
+
+def _make_card(model: OnnxFile, told: dict[str, Any], class_name: str | None) -> ModelCard:
+    kind = str(told.get("model_type", "Segmentor"))
+    if kind.lower() not in ("segmentor", "segmenter", "segmentation", "semantic-segmentation"):
+        raise _WrongModelError(f"is a model for {kind}; expected one for segmentation (Segmentor)")
+    tile = _tile_of(model, told)
+    names = told.get("classes", {})
+    output = _choose_output(model, class_name)
+    channels = _choose_channels(output, names, class_name)
+    resolution = told.get("resolution_m")
+    if resolution is not None and not 0.01 <= resolution <= 100:
+        raise ValueError(f"a resolution of {resolution:g} m per pixel")
+    card = ModelCard(
+        resolution_m=resolution,
+        tile=tile,
+        overlap=_within(told.get("overlap", 0.125), 0.0, 0.75, "overlap"),
+        mean=_triple(told.get("mean", 0.0), "mean"),
+        std=_triple(told.get("std", 1.0), "standard deviation"),
+        threshold=_within(told.get("threshold", 0.5), 0.0, 1.0, "threshold"),
+        output=output.name,
+        channels=channels,
+        is_probability=True if model.last.get(output.name) in ("Sigmoid", "HardSigmoid", "Softmax") else None,
+    )
+    if min(card.std) <= 0:
+        raise ValueError(f"standard deviations {card.std}")
+    return replace(card, overlap=max(card.overlap, 0.05))
+
+
+def _tile_of(model: OnnxFile, told: dict[str, Any]) -> tuple[int, int]:
+    """Return (height, width) of the input: its own where it is fixed, else as told."""
+    if len(model.inputs) != 1:
+        raise _WrongModelError(f"takes {len(model.inputs)} inputs; expected one, a picture")
+    port = model.inputs[0]
+    sizes = ", ".join("any" if side is None else str(side) for side in port.shape)
+    if not port.is_float or len(port.shape) != 4 or port.shape[0] not in (None, 1) or port.shape[1] not in (None, 3):
+        kind = "32-bit floats" if port.is_float else "other numbers"
+        raise _WrongModelError(f"takes {kind} of shape ({sizes}); expected 32-bit floats (1, 3, height, width), RGB")
+    wanted = int(told.get("tile", _DEFAULT_TILE))
+    free = max(_TILE_STEP, round(wanted / _TILE_STEP) * _TILE_STEP)
+    tile = port.shape[2] or free, port.shape[3] or free
+    if not all(_TILE_STEP <= side <= _MAX_TILE for side in tile):
+        raise _WrongModelError(f"takes tiles of {tile[1]} x {tile[0]} pixels; expected {_TILE_STEP} to {_MAX_TILE}")
+    return tile
+
+
+def _choose_output(model: OnnxFile, class_name: str | None) -> Port:
+    """Choose among heads: the one of the class's name, the one named after roads, or the first that is an image."""
+    images = [port for port in model.outputs if port.is_float and len(port.shape) in (0, 3, 4)]
+    if not images:
+        raise _WrongModelError("gives no image of 32-bit floats; expected (1, classes, height, width)")
+    named = [port for port in images if port.name == class_name]
+    return (named or [port for port in images if _is_road(port.name)] or images)[0]
+
+
+def _choose_channels(output: Port, names: dict[int, str], class_name: str | None) -> tuple[int, ...]:
+    """Tell which channels of an output are road."""
+    n = output.shape[1] if len(output.shape) == 4 else 1
+    if class_name is None:
+        wanted = [key for key, name in names.items() if _is_road(name)]
+    else:
+        wanted = [key for key, name in names.items() if class_name in (name, str(key))]
+    if n == 1:
+        # A single channel is by convention the last of the classes, told from the others by the threshold.
+        if max(names, default=0) in wanted or (not names and class_name in (None, output.name)):
+            return (0,)
+        raise _WrongModelError(_ask(names, class_name))
+    if not wanted or (n is not None and max(wanted) >= n):
+        raise _WrongModelError(_ask(names, class_name))
+    return tuple(wanted)
+
+
+def _ask(names: dict[int, str], class_name: str | None) -> str:
+    listed = ", ".join(f"{key} {name}" for key, name in sorted(names.items())) or "none"
+    if class_name is None:
+        return f"names no class after roads (its classes: {listed}); say which shows them: --class NAME"
+    return f"has no class {class_name!r} (its classes: {listed}); choose one of them: --class NAME"
+
+
+def _is_road(name: str) -> bool:
+    words = set(re.findall(r"[a-z]+", name.lower()))
+    return bool(words & _ROAD) and not words & _NOT
+
+
+def _read_metadata(props: dict[str, str]) -> dict[str, Any]:
+    """Read `metadata_props` as Deepness and GeoDeep write them."""
+    told: dict[str, Any] = {}
+    if "model_type" in props:
+        told["model_type"] = _value(props["model_type"])
+    names = props.get("class_names", props.get("names"))
+    if names is not None:
+        told["classes"] = _classes(_value(names))
+    if "resolution" in props:
+        told["resolution_m"] = float(_value(props["resolution"])) / 100.0
+    size = props.get("tiles_size", props.get("tile_size"))
+    if size is not None:
+        told["tile"] = int(_value(size))
+    for key, name in (("standardization_mean", "mean"), ("standardization_std", "std")):
+        if key in props:
+            told[name] = _value(props[key])
+    if "tiles_overlap" in props:
+        told["overlap"] = float(_value(props["tiles_overlap"])) / 100.0
+    if "seg_thresh" in props:
+        told["threshold"] = float(_value(props["seg_thresh"]))
+    return told
+
+
+def _value(text: str) -> Any:
+    """Parse JSON or, as old models have it, a Python literal; anything else is text."""
+    try:
+        return json.loads(text)
+    except ValueError:
+        pass
+    try:
+        return ast.literal_eval(text) if len(text) < 10_000 else text
+    except (ValueError, SyntaxError, MemoryError):
+        return text
+
+
+def _classes(names: Any) -> dict[int, str]:
+    pairs = names.items() if isinstance(names, dict) else enumerate(names)
+    found = {int(key): str(name) for key, name in pairs}
+    if len(found) > 1000:
+        raise ValueError(f"{len(found)} classes")
+    return found
+
+
+def _read_sidecar(path: Path) -> dict[str, Any]:
+    """Read the STAC item beside a model, if there is one and it describes a model."""
+    if not path.is_file() or path.stat().st_size > _MAX_SIDECAR:
+        return {}
+    document = json.loads(path.read_text(encoding="utf-8"))
+    properties = document.get("properties", {}) if isinstance(document, dict) else {}
+    inputs, outputs = properties.get("mlm:input"), properties.get("mlm:output")
+    if not inputs or not outputs:
+        return {}
+    told = _read_scaling(inputs[0])
+    tasks = outputs[0].get("tasks") or properties.get("mlm:tasks") or []
+    if tasks:
+        told["model_type"] = next((one for one in tasks if "segmentation" in one), tasks[0])
+        told["model_type"] = "Segmentor" if "segmentation" in told["model_type"] else told["model_type"]
+    classes = outputs[0].get("classification:classes", outputs[0].get("classification_classes"))
+    if classes:
+        told["classes"] = {int(one.get("value", i)): str(one["name"]) for i, one in enumerate(classes)}
+    if "gsd" in properties:
+        told["resolution_m"] = float(properties["gsd"])
+    shape = inputs[0].get("input", {}).get("shape", [])
+    if len(shape) == 4 and shape[-1] > 0:
+        told["tile"] = int(shape[-1])
+    return told
+
+
+def _read_scaling(one: dict[str, Any]) -> dict[str, Any]:
+    """Turn MLM's scaling of 8-bit values, a chain of affine maps, into mean and deviation of values up to 1."""
+    scaling = one.get("value_scaling")
+    if not scaling:
+        statistics = one.get("statistics") or []
+        if one.get("norm_type") != "z-score" or not statistics:
+            return {}
+        scaling = [{"type": "z-score", **each} for each in statistics]
+    steps = scaling if isinstance(scaling, list) else [scaling]
+    low, high = [], []  # what 0 and 1 (that is, 255) become
+    for each in steps if len(steps) == 3 else steps[:1] * 3:
+        shift, divisor = _affine(each)
+        unit = 1.0 if abs(shift) <= 1.5 and divisor <= 1.5 else 255.0
+        low.append(shift / unit)
+        high.append(divisor / unit)
+    return {"mean": low, "std": high}
+
+
+def _affine(step: dict[str, Any]) -> tuple[float, float]:
+    """Return what is subtracted, and what is divided by then."""
+    kind = step.get("type")
+    if kind is None:
+        return 0.0, 1.0
+    if kind == "z-score":
+        return float(step["mean"]), float(step.get("stddev", step.get("std", 1.0)))
+    if kind == "min-max":
+        return float(step["minimum"]), float(step["maximum"]) - float(step["minimum"])
+    if kind == "scale":
+        return 0.0, float(step["value"])
+    raise _WrongModelError(f"asks for values scaled by {kind!r}; expected z-score, min-max or scale")
+
+
+def _triple(value: Any, what: str) -> tuple[float, float, float]:
+    """Return three finite numbers; one is repeated."""
+    numbers = [float(one) for one in (value if isinstance(value, list | tuple) else [value])]
+    numbers = numbers * 3 if len(numbers) == 1 else numbers
+    if len(numbers) != 3 or not all(-1e4 < number < 1e4 for number in numbers):
+        raise ValueError(f"{what} {value}")
+    return numbers[0], numbers[1], numbers[2]
+
+
+def _within(value: Any, low: float, high: float, what: str) -> float:
+    number = float(value)
+    if not low <= number <= high:
+        raise ValueError(f"{what} {number:g}, expected {low:g} to {high:g}")
+    return number

@@ -1,0 +1,163 @@
+"""A photograph, read strip by strip at any scale: RGB of 8 bits, and where it shows ground at all."""
+
+from __future__ import annotations
+
+import os
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
+from dataclasses import dataclass
+from typing import TYPE_CHECKING
+
+import cv2
+import numpy as np
+
+from roadgeo._arrays import AnyArray, BoolArray
+from roadgeo.errors import MaskError
+from roadgeo.storage.rasters import open_raster
+
+if TYPE_CHECKING:
+    from rasterio import DatasetReader
+
+__all__ = ["MAX_SIDE", "Photograph", "find_voids", "open_photograph"]
+
+MIN_SIDE, MAX_SIDE = 64, 60_000
+_SAMPLE_SIDE = 1024  # deep values are stretched by what a sample of this size holds
+
+#: A void is a plain white or black area (JPEG smears its values and its edge), larger than any white roof.
+_WHITE, _BLACK = 250, 3
+_DARKEST, _LIGHTEST = 8, 245  # of stretched values
+_VOID_CORE_PX, _VOID_AREA_PX, _VOID_EDGE_PX = 15, 20_000, 9
+
+
+@dataclass(frozen=True)
+class Photograph:
+    """An open photograph.
+
+    Attributes
+    ----------
+    name : str
+    width, height : int
+        Pixels.
+    read : callable
+        `read(left, top, width, height, shape)` returns this part of it, in its own pixels, as (H, W, 3) uint8 RGB of
+        the given shape (H, W), and as (H, W) bool where it is not nodata.
+    """
+
+    name: str
+    width: int
+    height: int
+    read: Callable[[float, float, float, float, tuple[int, int]], tuple[AnyArray, BoolArray]]
+
+
+@contextmanager
+def open_photograph(path: str | os.PathLike[str]) -> Iterator[Photograph]:
+    """Open a photograph.
+
+    Raises
+    ------
+    MaskError
+        It is missing, no raster, too small or too large, or has no bands of colour or grey.
+    """
+    name = os.fspath(path)
+    with open_raster(path) as dataset:
+        if min(dataset.shape) < MIN_SIDE or max(dataset.shape) > MAX_SIDE:
+            raise MaskError(
+                f"{name}: {dataset.width} x {dataset.height} pixels; expected {MIN_SIDE} to {MAX_SIDE} on each side"
+            )
+        bands = _choose_bands(dataset, name)
+        stretch = _find_stretch(dataset, bands, name)
+
+        def read(
+            left: float, top: float, width: float, height: float, shape: tuple[int, int]
+        ) -> tuple[AnyArray, BoolArray]:
+            values, valid = _read(dataset, bands, (left, top, width, height), shape)
+            return stretch(values), valid
+
+        yield Photograph(name, dataset.width, dataset.height, read)
+
+
+def _choose_bands(dataset: DatasetReader, name: str) -> list[int]:
+    """Return the numbers of the red, green and blue band, or one of grey."""
+    from rasterio.enums import ColorInterp
+
+    meaning = dict(zip(dataset.colorinterp, dataset.indexes, strict=True))
+    rgb = [meaning.get(colour) for colour in (ColorInterp.red, ColorInterp.green, ColorInterp.blue)]
+    if all(rgb):
+        return [index for index in rgb if index]
+    shown = [i for i, m in zip(dataset.indexes, dataset.colorinterp, strict=True) if m != ColorInterp.alpha]
+    if not shown:
+        raise MaskError(f"{name}: holds no band of values; give a photograph")
+    return shown[:3] if len(shown) >= 3 else shown[:1]
+
+
+def _read(
+    dataset: DatasetReader, bands: list[int], part: tuple[float, float, float, float], shape: tuple[int, int]
+) -> tuple[AnyArray, BoolArray]:
+    """Read a part as (H, W, B) values and (H, W) validity; averaged where it is reduced."""
+    from rasterio.enums import Resampling
+    from rasterio.windows import Window
+
+    window = Window(*part)
+    reduced = part[3] > shape[0]
+    resampling = Resampling.average if reduced else Resampling.bilinear
+    values = dataset.read(bands, window=window, out_shape=(len(bands), *shape), resampling=resampling)
+    valid = dataset.dataset_mask(window=window, out_shape=shape) > 0
+    return np.moveaxis(values, 0, 2), valid
+
+
+def _find_stretch(dataset: DatasetReader, bands: list[int], name: str) -> Callable[[AnyArray], AnyArray]:
+    """Return what makes (H, W, 3) 8-bit RGB of (H, W, B) values."""
+    palette = None
+    if dataset.count == 1 and dataset.dtypes[0] == "uint8" and dataset.colorinterp[0].name == "palette":
+        palette = np.zeros((256, 3), np.uint8)
+        for index, colour in dataset.colormap(1).items():
+            palette[index] = colour[:3]
+    if palette is not None:
+        table = palette
+        return lambda values: table[values[..., 0]]
+    if dataset.dtypes[bands[0] - 1] == "uint8":
+        return _as_rgb
+    scale = max(dataset.shape) / _SAMPLE_SIDE
+    shape = tuple(max(1, round(side / max(scale, 1))) for side in dataset.shape)
+    sample, valid = _read(dataset, bands, (0, 0, dataset.width, dataset.height), (shape[0], shape[1]))
+    seen = sample[valid & np.isfinite(sample.astype(np.float64)).all(axis=2)].astype(np.float64)
+    if len(seen) == 0:
+        raise MaskError(f"{name}: holds no observed pixel; give a photograph that shows ground")
+    low, high = np.percentile(seen, [1, 99])
+
+    def stretch(values: AnyArray) -> AnyArray:
+        scaled = (np.nan_to_num(values.astype(np.float32)) - low) / max(high - low, 1e-9)
+        # Neither black nor white, which would mean that there is no photograph.
+        return _as_rgb(np.clip(_DARKEST + (_LIGHTEST - _DARKEST) * scaled, _DARKEST, _LIGHTEST).astype(np.uint8))
+
+    return stretch
+
+
+def _as_rgb(values: AnyArray) -> AnyArray:
+    return values if values.shape[2] == 3 else np.repeat(values, 3, axis=2)
+
+
+def find_voids(white: BoolArray, black: BoolArray) -> BoolArray:
+    """Return (H, W) where there is no photograph, given where it is as good as white and as good as black.
+
+    Only large plain areas count; a little of their edge, which is smeared, goes with them.
+    """
+    void = np.zeros(white.shape, np.uint8)
+    for plain in (white, black):
+        if np.count_nonzero(plain) < min(_VOID_AREA_PX, plain.size // 10):
+            continue
+        core = np.ones((_VOID_CORE_PX, _VOID_CORE_PX), np.uint8)
+        opened = cv2.morphologyEx(plain.view(np.uint8), cv2.MORPH_OPEN, core)
+        _, labels, stats, _ = cv2.connectedComponentsWithStats(opened, ltype=cv2.CV_32S)
+        large = stats[:, cv2.CC_STAT_AREA] >= min(_VOID_AREA_PX, plain.size // 10)
+        large[0] = False
+        void |= large[labels].view(np.uint8)
+    if not void.any():
+        return void.view(np.bool_)
+    grown: AnyArray = cv2.dilate(void, np.ones((_VOID_EDGE_PX, _VOID_EDGE_PX), np.uint8))
+    return grown.view(np.bool_)
+
+
+def is_plain(rgb: AnyArray) -> tuple[BoolArray, BoolArray]:
+    """Return where (H, W, 3) RGB is as good as white, and as good as black."""
+    return rgb.min(axis=2) >= _WHITE, rgb.max(axis=2) <= _BLACK

@@ -1,0 +1,131 @@
+"""The probability of road at every pixel of a photograph: given by a segmenter, kept, and made into masks."""
+
+from __future__ import annotations
+
+import os
+from collections.abc import Sequence
+from dataclasses import dataclass
+from pathlib import Path
+
+import cv2
+import numpy as np
+
+from roadgeo._arrays import AnyArray
+from roadgeo.errors import MaskError
+from roadgeo.geometry.mask import RoadMask
+from roadgeo.storage.files import replacing
+
+__all__ = ["NODATA", "TAG", "ProbabilityMap", "fuse"]
+
+#: 0 to 254 stand for probabilities 0 to 1; this for ground that was not observed.
+NODATA = 255
+
+#: The tag by which our own probability maps are told from masks that users made.
+TAG = "ROADGEO"
+
+
+@dataclass(frozen=True)
+class ProbabilityMap:
+    """Probability of road. Dimensions: H rows, W columns.
+
+    Attributes
+    ----------
+    values : (H, W) uint8
+        254 times the probability; `NODATA` where nothing is known.
+    threshold : float
+        Probabilities above it are road, by the model's own word.
+    name : str
+        Of the photograph.
+    model : str
+        What made it.
+    """
+
+    values: AnyArray
+    threshold: float = 0.5
+    name: str = ""
+    model: str = ""
+
+    def mask(self, threshold: float) -> RoadMask:
+        """Return where the probability exceeds a threshold.
+
+        Raises
+        ------
+        MaskError
+            Nowhere.
+        """
+        seen = self.values != NODATA
+        roads = (self.values > round(254 * threshold)) & seen
+        if not roads.any():
+            raise MaskError(f"{self.name}: no road is seen with a probability above {threshold:g}")
+        return RoadMask(roads, None if seen.all() else seen, self.name)
+
+    def resized(self, shape: tuple[int, int]) -> ProbabilityMap:
+        """Return the same on another grid of (H, W) pixels over the same frame."""
+        if shape == self.values.shape:
+            return self
+        size, seen = shape[::-1], self.values != NODATA
+        smaller = shape[0] < self.values.shape[0]
+        way = cv2.INTER_AREA if smaller else cv2.INTER_LINEAR
+        values: AnyArray = cv2.resize(np.where(seen, self.values, 0).astype(np.uint8), size, interpolation=way)
+        if not seen.all():
+            known = cv2.resize(seen.view(np.uint8), size, interpolation=cv2.INTER_NEAREST)
+            values = np.where(known > 0, np.minimum(values, 254), NODATA).astype(np.uint8)
+        return ProbabilityMap(np.minimum(values, 254) if seen.all() else values, self.threshold, self.name, self.model)
+
+    def write(self, path: str | os.PathLike[str]) -> None:
+        """Write a GeoTIFF on the photograph's pixel grid, with nodata where nothing was observed.
+
+        Raises
+        ------
+        OutputError
+            It cannot be written.
+        """
+        import warnings
+
+        import rasterio
+        from rasterio.errors import NotGeoreferencedWarning
+
+        height, width = self.values.shape
+        profile = {"driver": "GTiff", "count": 1, "dtype": "uint8", "compress": "deflate", "nodata": NODATA}
+        tags = {TAG: "probability of road, 0 to 254", "MODEL": self.model, "THRESHOLD": f"{self.threshold:g}"}
+        with replacing(Path(path), sync=False) as staged, warnings.catch_warnings():
+            warnings.simplefilter("ignore", NotGeoreferencedWarning)
+            with rasterio.open(staged, "w", height=height, width=width, tiled=True, **profile) as dataset:
+                dataset.update_tags(**tags)
+                dataset.write(self.values, 1)
+
+
+def fuse(maps: Sequence[ProbabilityMap]) -> ProbabilityMap:
+    """Fuse looks at one scene: the mean of the log odds of those that saw a pixel; the frame is the first one's.
+
+    Raises
+    ------
+    MaskError
+        They show frames of different proportions.
+    """
+    first = maps[0]
+    height, width = first.values.shape
+    total, count = np.zeros((height, width), np.float32), np.zeros((height, width), np.float32)
+    for one in maps:
+        rows, columns = one.values.shape
+        if abs(rows * width - columns * height) > 0.01 * rows * width:
+            raise MaskError(
+                f"{one.name}: {columns} x {rows} pixels, but {first.name} {width} x {height}; "
+                "expected looks at the same frame: cut them alike, or locate them one by one"
+            )
+        values = one.resized((height, width)).values
+        seen = values != NODATA
+        total += np.where(seen, _log_odds(values, one.threshold), 0)
+        count += seen
+    share = 1.0 / (1.0 + np.exp(-total / np.maximum(count, 1)))
+    fused = np.where(count > 0, np.rint(254 * share), NODATA).astype(np.uint8)
+    models = dict.fromkeys(one.model for one in maps)
+    return ProbabilityMap(fused, 0.5, first.name, " + ".join(models))
+
+
+def _log_odds(values: AnyArray, threshold: float) -> AnyArray:
+    """Return the log odds of each value, 0 at the threshold, for models differ in how sure they are."""
+    table = (np.arange(256, dtype=np.float32).clip(0, 254) + 0.5) / 255
+    odds = np.log(table / (1 - table)) - np.log(threshold / (1 - threshold))
+    found: AnyArray = odds.astype(np.float32)[values]
+    return found

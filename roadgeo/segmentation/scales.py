@@ -1,0 +1,80 @@
+"""At which scale a photograph is shown to a model, where nobody says how large its pixels are.
+
+A few scales are tried on the middle of the photograph. At the right one roads are seen with confidence and hang
+together; at others little is seen, or scraps.
+"""
+
+from __future__ import annotations
+
+import math
+
+import cv2
+import numpy as np
+
+from roadgeo._arrays import AnyArray, BoolArray
+from roadgeo.errors import MaskError
+from roadgeo.segmentation.network import Network
+from roadgeo.segmentation.photograph import Photograph
+from roadgeo.segmentation.probability import NODATA, ProbabilityMap
+from roadgeo.segmentation.tiling import MAX_MAP_PIXELS, map_shape, segment
+
+__all__ = ["PYRAMID", "rank_scales", "scale_of", "score"]
+
+#: Pixels shown to the model for each of the photograph's, along a side; steps that a model of many scales bridges.
+PYRAMID = (1.0, 0.5, 2.0, 0.25, 0.125)
+
+_DEFAULT_RESOLUTION_M = 1.0
+_MIN_SIDE, _MAX_ENLARGED = 192, 4096  # pixels at the model's scale
+_REACH = 0.25  # of a tile: pieces of road this long hang together
+
+
+def scale_of(gsd_m: float, network: Network) -> float:
+    """Return the scale that shows a model ground of its own resolution."""
+    return gsd_m / (network.card.resolution_m or _DEFAULT_RESOLUTION_M)
+
+
+def rank_scales(photograph: Photograph, network: Network) -> list[float]:
+    """Return the scales at which anything like roads is seen in the middle of a photograph, the best first."""
+    scored: list[tuple[float, int, float]] = []
+    for scale in PYRAMID:
+        shape = map_shape(photograph, scale)
+        if min(shape) < _MIN_SIDE or math.prod(shape) > MAX_MAP_PIXELS or (scale > 1 and max(shape) > _MAX_ENLARGED):
+            continue
+        try:
+            found = score(segment(_middle(photograph, network.card.tile, scale), network, scale))
+        except MaskError:  # no ground in the middle
+            found = 0.0
+        scored.append((found, -len(scored), scale))
+    if not scored:
+        return [min(1.0, math.sqrt(MAX_MAP_PIXELS / (photograph.width * photograph.height)))]
+    return [scale for _, _, scale in sorted(scored, reverse=True)]
+
+
+def score(seen: ProbabilityMap) -> float:
+    """Say how much a map looks like roads: how sure it is of them, times how far they hang together, times how much."""
+    known = seen.values != NODATA
+    if not known.any():
+        return 0.0
+    p = np.where(known, seen.values, 0).astype(np.float32) / 254
+    roads = p > 0.5
+    if not roads.any():
+        return 0.0
+    stats = cv2.connectedComponentsWithStats(roads.view(np.uint8))[2]
+    reach = np.maximum(stats[:, cv2.CC_STAT_WIDTH], stats[:, cv2.CC_STAT_HEIGHT])
+    long = reach >= _REACH * min(seen.values.shape)
+    long[0] = False
+    together = float(stats[long, cv2.CC_STAT_AREA].sum()) / float(np.count_nonzero(roads))
+    sure = float(p[roads].sum() / p.sum())
+    return sure * together
+
+
+def _middle(photograph: Photograph, tile: tuple[int, int], scale: float) -> Photograph:
+    """Return the part in the middle of a photograph that fills a tile at a scale."""
+    width = min(photograph.width, max(1, round(tile[1] / scale)))
+    height = min(photograph.height, max(1, round(tile[0] / scale)))
+    left, top = (photograph.width - width) // 2, (photograph.height - height) // 2
+
+    def read(x: float, y: float, w: float, h: float, shape: tuple[int, int]) -> tuple[AnyArray, BoolArray]:
+        return photograph.read(left + x, top + y, w, h, shape)
+
+    return Photograph(photograph.name, width, height, read)

@@ -1,0 +1,141 @@
+"""A model over a whole photograph: overlapping tiles, blended, strip by strip so that memory is bounded."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable, Iterator
+
+import cv2
+import numpy as np
+
+from roadgeo._arrays import AnyArray, BoolArray, Float32Array
+from roadgeo._progress import Say, say_nothing
+from roadgeo.errors import MaskError
+from roadgeo.segmentation.network import Network
+from roadgeo.segmentation.photograph import Photograph, find_voids, is_plain
+from roadgeo.segmentation.probability import NODATA, ProbabilityMap
+
+__all__ = ["MAX_MAP_PIXELS", "map_shape", "segment"]
+
+#: A larger map takes hours, and shows nothing that a smaller one of the same ground does not.
+MAX_MAP_PIXELS = 400_000_000
+
+
+def map_shape(photograph: Photograph, scale: float) -> tuple[int, int]:
+    """Return (H, W) of a map that has `scale` pixels for each of the photograph's, along a side."""
+    return max(1, round(photograph.height * scale)), max(1, round(photograph.width * scale))
+
+
+def segment(photograph: Photograph, network: Network, scale: float = 1.0, say: Say = say_nothing) -> ProbabilityMap:
+    """Find the roads in a photograph.
+
+    Parameters
+    ----------
+    scale : float
+        Pixels shown to the model for each of the photograph's, along a side.
+
+    Returns
+    -------
+    ProbabilityMap
+        Of the size that the model was shown.
+
+    Raises
+    ------
+    MaskError
+        The photograph cannot be read, shows nothing, or is too large at this scale.
+    ModelError
+        The model fails.
+    """
+    shape = map_shape(photograph, scale)
+    if math.prod(shape) > MAX_MAP_PIXELS:
+        raise MaskError(
+            f"{photograph.name}: {shape[1]} x {shape[0]} pixels at the model's scale; expected at most "
+            f"{MAX_MAP_PIXELS:,} in all: say how large a pixel is (--gsd), or cut the photograph up"
+        )
+    values = np.empty(shape, np.uint8)
+    known, white, black = np.ones(shape, bool), np.zeros(shape, bool), np.zeros(shape, bool)
+
+    def read(top: int, rows: int) -> AnyArray:
+        y_scale = photograph.height / shape[0]
+        part = 0.0, top * y_scale, float(photograph.width), rows * y_scale
+        rgb, valid = photograph.read(*part, (rows, shape[1]))
+        known[top : top + rows] = valid
+        white[top : top + rows], black[top : top + rows] = is_plain(rgb)
+        return rgb
+
+    what = f"finding roads in {photograph.name}"
+    say(what, 0.0)
+    for top, rows in _blend(read, shape, network.card.tile, network.card.overlap, network):
+        values[top : top + len(rows)] = np.rint(254 * rows)
+        say(what, (top + len(rows)) / shape[0])
+    known &= ~find_voids(white, black)
+    if not known.any():
+        raise MaskError(f"{photograph.name}: shows no ground, only nodata, white or black; give a photograph")
+    values[~known] = NODATA
+    return ProbabilityMap(values, network.card.threshold, photograph.name, network.name)
+
+
+def _blend(
+    read: Callable[[int, int], AnyArray],
+    shape: tuple[int, int],
+    tile: tuple[int, int],
+    overlap: float,
+    network: Callable[[AnyArray], Float32Array],
+) -> Iterator[tuple[int, Float32Array]]:
+    """Yield the rows of a map from the top down, as (first row, values), each when no further tile reaches it."""
+    height, width = shape
+    tops, lefts = _starts(height, tile[0], overlap), _starts(width, tile[1], overlap)
+    weight = _weight(tile, overlap)
+    total, weights = np.zeros((tile[0], width), np.float32), np.zeros((tile[0], width), np.float32)
+    for top, next_top in zip(tops, [*tops[1:], height], strict=True):
+        rgb = read(top, min(tile[0], height - top))
+        for left in lefts:
+            part = rgb[:, left : left + tile[1]]
+            rows, columns = part.shape[:2]
+            if _is_empty(part):
+                road = np.zeros((rows, columns), np.float32)
+            else:
+                road = network(_fill(part, tile))[:rows, :columns]
+            total[:rows, left : left + columns] += weight[:rows, :columns] * road
+            weights[:rows, left : left + columns] += weight[:rows, :columns]
+        done = next_top - top
+        yield top, np.divide(total[:done], weights[:done])
+        for one in (total, weights):
+            one[: tile[0] - done] = one[done:].copy()
+            one[tile[0] - done :] = 0
+
+
+def _starts(length: int, tile: int, overlap: float) -> list[int]:
+    """Return where tiles begin along a side: evenly spread, with at least this share of overlap."""
+    if length <= tile:
+        return [0]
+    # A few pixels less overlap than asked for are better than one more row of tiles.
+    n = math.ceil((length - tile) / (tile * (1 - overlap)) - 0.01) + 1
+    return [round(i * (length - tile) / (n - 1)) for i in range(n)]
+
+
+def _weight(tile: tuple[int, int], overlap: float) -> Float32Array:
+    """Return (H, W) weights that fall off towards the edges of a tile, where a model sees least around it."""
+    ramps = []
+    for side in tile:
+        distance = np.minimum(np.arange(side) + 0.5, side - 0.5 - np.arange(side))
+        ramps.append(np.minimum(distance / max(overlap * side, 1.0), 1.0))
+    weight: Float32Array = np.outer(*ramps).astype(np.float32)
+    return weight
+
+
+def _fill(part: AnyArray, tile: tuple[int, int]) -> AnyArray:
+    """Return a part of a photograph at the size of a tile: what is missing is its own reflection."""
+    rows, columns = part.shape[:2]
+    below, right = tile[0] - rows, tile[1] - columns
+    if below == right == 0:
+        return part
+    border = cv2.BORDER_REFLECT_101 if below < rows and right < columns else cv2.BORDER_REFLECT
+    filled: AnyArray = cv2.copyMakeBorder(np.ascontiguousarray(part), 0, below, 0, right, border)
+    return filled
+
+
+def _is_empty(part: AnyArray) -> BoolArray | bool:
+    """Whether a part is plain white or black throughout: nothing to show a model."""
+    white, black = is_plain(part)
+    return bool(white.all() or black.all())

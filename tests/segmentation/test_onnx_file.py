@@ -1,0 +1,142 @@
+"""ONNX files are looked at before they run; what is more than a network is refused in one line."""
+
+import contextlib
+from pathlib import Path
+
+import numpy as np
+import onnx
+import pytest
+from onnx import TensorProto, helper, numpy_helper
+from worlds.models import brightness_model, save
+
+from roadgeo.errors import ModelError
+from roadgeo.segmentation.network import load_network
+from roadgeo.segmentation.onnx_file import read_onnx
+
+IMAGE = helper.make_tensor_value_info("image", TensorProto.FLOAT, [1, 3, 64, 64])
+GIVEN = helper.make_tensor_value_info("road", TensorProto.FLOAT, [1, 1, 64, 64])
+
+
+def graph_of(nodes, stored=(), inputs=(IMAGE,), sparse=()):
+    return helper.make_graph(list(nodes), "g", list(inputs), [GIVEN], list(stored), sparse_initializer=list(sparse))
+
+
+def node(operator, inputs, outputs, **attributes):
+    return helper.make_node(operator, inputs, outputs, **attributes)
+
+
+def tensor(name, kind, dims, **content):
+    made = TensorProto(name=name, data_type=kind, **content)
+    made.dims.extend(dims)
+    return made
+
+
+def external():
+    made = tensor("w", TensorProto.FLOAT, [1, 3, 1, 1], data_location=TensorProto.EXTERNAL)
+    made.external_data.add(key="location", value="/etc/passwd")
+    return [node("Conv", ["image", "w"], ["road"])], [made]
+
+
+def loop():
+    body = helper.make_graph(
+        [node("Identity", ["go"], ["on"]), node("Identity", ["x"], ["y"])],
+        "body",
+        [
+            helper.make_tensor_value_info("i", TensorProto.INT64, []),
+            helper.make_tensor_value_info("go", TensorProto.BOOL, []),
+            helper.make_tensor_value_info("x", TensorProto.FLOAT, None),
+        ],
+        [
+            helper.make_tensor_value_info("on", TensorProto.BOOL, []),
+            helper.make_tensor_value_info("y", TensorProto.FLOAT, None),
+        ],
+    )
+    return [node("Loop", ["", "", "image"], ["road"], body=body)], []
+
+
+def constant_attribute():
+    lying = tensor("", TensorProto.FLOAT, [1 << 20, 1 << 20], raw_data=b"1234")
+    return [node("Constant", [], ["road"], value=lying)], []
+
+
+HOSTILE = {
+    "external data": (external, "another file"),
+    "custom operator": (lambda: ([node("Evil", ["image"], ["road"], domain="com.evil")], []), r"com\.evil\.Evil"),
+    "loop": (loop, "control flow"),
+    "random": (lambda: ([node("RandomNormalLike", ["image"], ["road"])], []), "random"),
+    "gigabyte initialiser": (
+        lambda: ([node("Conv", ["image", "w"], ["road"])], [tensor("w", TensorProto.FLOAT, [1 << 16, 1 << 16])]),
+        "larger than any file|holds 0 bits",
+    ),
+    "negative size": (lambda: ([], [tensor("w", TensorProto.FLOAT, [-5])]), "larger than any file"),
+    "constant that lies": (constant_attribute, "larger than any file|holds 32 bits"),
+    "expansion": (
+        lambda: (
+            [node("ConstantOfShape", ["s"], ["road"])],
+            [numpy_helper.from_array(np.array([1, 1, 100_000, 100_000]), "s")],
+        ),
+        "expands a tensor",
+    ),
+    "strings": (lambda: ([], [tensor("w", TensorProto.STRING, [1], string_data=[b"x"])]), "of type 8"),
+}
+
+
+@pytest.mark.parametrize("name", HOSTILE)
+def test_what_is_more_than_a_network_is_refused(tmp_path: Path, name: str) -> None:
+    build, message = HOSTILE[name]
+    path = save(graph_of(*build()), tmp_path / "model.onnx")
+    with pytest.raises(ModelError, match=message) as raised:
+        load_network(path)
+    assert "\n" not in str(raised.value)
+    assert str(path) in str(raised.value)
+
+
+def test_functions_and_training_are_refused(tmp_path: Path) -> None:
+    path = brightness_model(tmp_path / "model.onnx")
+    model = onnx.load(str(path))
+    twin = helper.make_function(
+        "own", "twin", ["x"], ["y"], [node("Identity", ["x"], ["y"])], [helper.make_opsetid("", 17)]
+    )
+    model.functions.append(twin)
+    onnx.save(model, str(path))
+    with pytest.raises(ModelError, match="functions"):
+        read_onnx(path)
+
+
+def test_a_network_is_read(tmp_path: Path) -> None:
+    model = read_onnx(brightness_model(tmp_path / "model.onnx", classes=2, props={"resolution": 50}))
+    assert [port.shape for port in model.inputs] == [(1, 3, 64, 64)]
+    assert [port.name for port in model.outputs] == ["output"]
+    assert model.last == {"output": "Sigmoid"}
+    assert model.metadata == {"resolution": "50"}
+
+
+@pytest.mark.parametrize("left", [0.0, 0.01, 0.1, 0.5, 0.95])
+def test_what_is_damaged_is_said_to_be(tmp_path: Path, left: float) -> None:
+    path = brightness_model(tmp_path / "model.onnx")
+    whole = path.read_bytes()
+    path.write_bytes(whole[: int(left * len(whole))])
+    with pytest.raises(ModelError, match="not an ONNX model"):
+        read_onnx(path)
+
+
+def test_any_damage_ends_in_an_error_or_a_model(tmp_path: Path) -> None:
+    whole = brightness_model(tmp_path / "model.onnx").read_bytes()
+    rng = np.random.default_rng(0)
+    path = tmp_path / "hurt.onnx"
+    for _ in range(300):
+        hurt = bytearray(whole)
+        for at in rng.integers(0, len(hurt), 3):
+            hurt[at] = rng.integers(0, 256)
+        path.write_bytes(hurt)
+        with contextlib.suppress(ModelError):
+            read_onnx(path)
+
+
+def test_missing_and_large_files(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    with pytest.raises(ModelError, match="no such model"):
+        read_onnx(tmp_path / "none.onnx")
+    path = brightness_model(tmp_path / "model.onnx")
+    monkeypatch.setattr("roadgeo.segmentation.onnx_file.MAX_BYTES", 10)
+    with pytest.raises(ModelError, match="at most"):
+        read_onnx(path)

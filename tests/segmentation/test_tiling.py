@@ -1,0 +1,168 @@
+"""Tiles cover a photograph of any size; what they show does not depend on where they lie."""
+
+from pathlib import Path
+
+import cv2
+import numpy as np
+import pytest
+import rasterio
+from worlds.models import brightness_model
+
+from roadgeo.errors import MaskError
+from roadgeo.segmentation.network import load_network
+from roadgeo.segmentation.photograph import open_photograph
+from roadgeo.segmentation.probability import NODATA, TAG, ProbabilityMap, fuse
+from roadgeo.segmentation.tiling import _starts, segment
+
+pytestmark = pytest.mark.filterwarnings("ignore::rasterio.errors.NotGeoreferencedWarning")
+
+
+@pytest.fixture
+def network(tmp_path: Path):
+    return load_network(brightness_model(tmp_path / "m.onnx", props={"tiles_overlap": 25}))
+
+
+@pytest.fixture
+def photo(tmp_path: Path) -> Path:
+    """180 x 150 px, a light street across and one down, on uneven ground."""
+    rng = np.random.default_rng(0)
+    image = rng.integers(20, 90, (150, 180, 3)).astype(np.uint8)
+    image[70:80] = image[:, 100:110] = 230
+    path = tmp_path / "photo.png"
+    cv2.imwrite(str(path), image)
+    return path
+
+
+def streets(shape=(150, 180)) -> np.ndarray:
+    found = np.zeros(shape, bool)
+    found[70:80] = found[:, 100:110] = True
+    return found
+
+
+def test_tiles_join_without_seams(network, photo: Path) -> None:
+    with open_photograph(photo) as opened:
+        found = segment(opened, network)
+    assert found.values.shape == (150, 180)
+    np.testing.assert_array_equal(found.mask(0.5).roads, streets())
+    assert found.mask(0.5).observed is None
+
+
+@pytest.mark.parametrize("side", [64, 65, 100, 127, 400])
+@pytest.mark.parametrize("overlap", [0.05, 0.25, 0.5])
+def test_tiles_cover_a_side(side: int, overlap: float) -> None:
+    starts = _starts(side, 64, overlap)
+    covered = np.zeros(side, int)
+    for start in starts:
+        assert start >= 0
+        assert start + 64 <= side
+        covered[start : start + 64] += 1
+    assert covered.min() > 0
+
+
+@pytest.mark.parametrize("shape", [(64, 64), (70, 300), (90, 66)])
+def test_small_photographs_are_filled_up_by_reflection(tmp_path: Path, network, shape: tuple[int, int]) -> None:
+    image = np.full((*shape, 3), 30, np.uint8)
+    image[:, 20:30] = 240
+    cv2.imwrite(str(tmp_path / "small.png"), image)
+    with open_photograph(tmp_path / "small.png") as opened:
+        found = segment(opened, network, 0.6)
+    roads = found.mask(0.5).roads
+    assert roads.shape == (round(0.6 * shape[0]), round(0.6 * shape[1]))
+    assert roads[:, 14:16].all()
+    assert not roads[:, :10].any()
+
+
+def test_voids_are_not_observed(tmp_path: Path, network, photo: Path) -> None:
+    image = cv2.imread(str(photo))
+    image[:, :60] = 255
+    image[95:, 120:] = 0
+    path = tmp_path / "void.tif"
+    with rasterio.open(
+        path, "w", driver="GTiff", width=180, height=150, count=4, dtype="uint8", photometric="RGB", alpha="yes"
+    ) as dataset:
+        dataset.write(np.moveaxis(image[..., ::-1], 2, 0), [1, 2, 3])
+        alpha = np.full((150, 180), 255, np.uint8)
+        alpha[:30] = 0
+        dataset.write(alpha, 4)
+    with open_photograph(path) as opened:
+        found = segment(opened, network)
+    observed = found.mask(0.5).observed
+    assert observed is not None
+    assert not observed[:30].any()
+    assert not observed[:, :60].any()
+    assert not observed[95:, 120:].any()
+    assert observed[40:85, 70:].all()
+
+
+def test_a_photograph_of_nothing_is_refused(tmp_path: Path, network) -> None:
+    cv2.imwrite(str(tmp_path / "white.png"), np.full((150, 180, 3), 255, np.uint8))
+    with open_photograph(tmp_path / "white.png") as opened, pytest.raises(MaskError, match="shows no ground"):
+        segment(opened, network)
+
+
+@pytest.mark.parametrize("kind", ["grey", "uint16", "palette", "float"])
+def test_other_values_are_made_rgb(tmp_path: Path, network, kind: str) -> None:
+    ground = np.where(streets(), 220, 50)
+    path = tmp_path / "photo.tif"
+    values = {"uint16": (ground * 40).astype(np.uint16), "float": ground.astype(np.float32) / 7}.get(
+        kind, ground.astype(np.uint8)
+    )
+    with rasterio.open(path, "w", driver="GTiff", width=180, height=150, count=1, dtype=values.dtype) as dataset:
+        if kind == "palette":
+            dataset.write(streets().astype(np.uint8), 1)
+            dataset.write_colormap(1, {0: (50, 50, 50, 255), 1: (220, 220, 220, 255)})
+        else:
+            dataset.write(values, 1)
+    with open_photograph(path) as opened:
+        np.testing.assert_array_equal(segment(opened, network).mask(0.5).roads, streets())
+
+
+def test_the_same_on_every_run_and_with_any_number_of_threads(tmp_path: Path, photo: Path) -> None:
+    path = brightness_model(tmp_path / "m.onnx")
+    found = []
+    for threads in (1, 1, 2):
+        with open_photograph(photo) as opened:
+            found.append(segment(opened, load_network(path, threads=threads), 1.3).values)
+    np.testing.assert_array_equal(found[0], found[1])
+    np.testing.assert_array_equal(found[0], found[2])
+
+
+def test_a_map_is_kept_with_nodata(tmp_path: Path) -> None:
+    values = np.full((70, 80), 12, np.uint8)
+    values[:, :40] = NODATA
+    ProbabilityMap(values, 0.4, "photo.jpg", "m.onnx").write(tmp_path / "photo_mask.tif")
+    with rasterio.open(tmp_path / "photo_mask.tif") as dataset:
+        np.testing.assert_array_equal(dataset.read(1), values)
+        assert dataset.nodata == NODATA
+        assert TAG in dataset.tags()
+        assert dataset.tags()["THRESHOLD"] == "0.4"
+
+
+def test_another_grid_keeps_what_was_not_observed() -> None:
+    values = np.full((60, 80), 200, np.uint8)
+    values[:, :40] = NODATA
+    for shape in ((30, 40), (120, 160)):
+        other = ProbabilityMap(values).resized(shape).values
+        assert (other[:, : shape[1] // 2] == NODATA).all()
+        assert (other[:, shape[1] // 2 + 2 :] == 200).all()
+
+
+def test_two_looks_are_fused() -> None:
+    a, b = np.full((50, 60), 127, np.uint8), np.full((100, 120), 127, np.uint8)
+    a[:10], b[:20] = 220, 200
+    a[20:30], b[40:60] = 240, 10
+    a[40:], b[80:] = NODATA, 220
+    fused = fuse([ProbabilityMap(a, name="a"), ProbabilityMap(b, name="b")]).values
+    assert 200 <= fused[5, 5] <= 220
+    assert 100 < fused[25, 25] < 160
+    assert fused[45, 5] == pytest.approx(220, abs=1)
+    both = fuse([ProbabilityMap(np.full((9, 9), NODATA, np.uint8))] * 2).values
+    assert (both == NODATA).all()
+    with pytest.raises(MaskError, match="same frame"):
+        fuse([ProbabilityMap(a, name="a"), ProbabilityMap(np.zeros((50, 90), np.uint8), name="c")])
+
+
+def test_a_model_of_another_threshold_counts_from_there() -> None:
+    sure, shy = np.full((9, 9), 127, np.uint8), np.full((9, 9), 51, np.uint8)
+    fused = fuse([ProbabilityMap(sure, 0.5), ProbabilityMap(shy, 0.2)]).values
+    np.testing.assert_allclose(fused, 127, atol=2)
