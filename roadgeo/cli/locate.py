@@ -307,6 +307,13 @@ def open_references(names: Iterable[str], say: Say = say_nothing) -> list[Refere
     help="auto: the best there is. pair: exactly the paper's matcher.",
 )
 @click.option(
+    "--effort",
+    type=click.Choice(["quick", "full"]),
+    default="full",
+    show_default=True,
+    help="quick: leave out the search by roads alone, for masks that are broken or show few intersections.",
+)
+@click.option(
     "--time-limit",
     metavar="SECONDS",
     type=click.FloatRange(min=0, min_open=True),
@@ -346,6 +353,7 @@ def locate_command(
     north_up: bool,
     camera: float | str | None,
     method: Literal["auto", "pair"],
+    effort: Literal["quick", "full"],
     time_limit: float,
     skip_existing: bool,
     jobs: int,
@@ -406,7 +414,7 @@ def locate_command(
             "--method pair knows no --camera, --gsd, --max-tilt, --near or --north-up: leave them out."
         )
     focal_px = camera if isinstance(camera, float) else None
-    options = make_options(method, gsd, max_tilt, near, north_up, time_limit, focal_px)
+    options = make_options(method, gsd, max_tilt, near, north_up, time_limit, focal_px, effort)
     tasks = name_tasks(find_masks(masks))
     if not tasks:
         raise click.UsageError(f"No images in {', '.join(masks)}.")
@@ -460,6 +468,7 @@ def make_options(
     north_up: bool,
     time_limit: float,
     focal_px: float | None = None,
+    effort: Literal["quick", "full"] = "full",
 ) -> LocateOptions:
     """Put what was given in its place among the options of all stages; the rest stays as it is."""
     from dataclasses import replace
@@ -475,9 +484,8 @@ def make_options(
         focal_px=focal_px,
     )
     match = replace(default.match, camera=known)
-    return replace(
-        default, method=method, near=near, match=match, search=replace(default.search, time_limit_s=time_limit)
-    )
+    limits = replace(default.search, time_limit_s=time_limit)
+    return replace(default, method=method, near=near, effort=effort, match=match, search=limits)
 
 
 def _make_outputs(

@@ -17,6 +17,8 @@ from roadgeo.kernels.growth import grow_each
 from roadgeo.kernels.roads import screen
 from roadgeo.matching.index import ReferenceIndex
 from roadgeo.matching.refinement import Refined, RefineOptions, refine
+from roadgeo.matching.road_growth import Grown
+from roadgeo.matching.road_search import RoadSearch, RoadSearchOptions
 from roadgeo.matching.scene import Scene
 from roadgeo.matching.trace import NO_TRACE, Trace
 from roadgeo.matching.triples import Proposals, TripleOptions, larger, propose, smaller
@@ -27,6 +29,8 @@ __all__ = ["GrowOptions", "Hypothesis", "MatchOptions", "Source", "Sweep", "Trip
 
 #: Matches that fix a homography: so many of a hypothesis' own are no evidence for it.
 MINIMAL = 4
+#: A place that so many intersections of the query propose by roads is settled: each looked at the whole map.
+_OFTEN_ENOUGH = 2
 #: How far a proposal, made of three intersections, may turn the image's up from where it points.
 _ROUGHLY_DEG = 25.0
 
@@ -130,8 +134,10 @@ class MatchOptions:
 
     Attributes
     ----------
+    roads : RoadSearchOptions or None
+        What follows where no triple leads to a place: None for nothing.
     max_places : int
-        The search ends too when so many places were screened on a map of 15,000 intersections, and on a larger one more
+        The sweeps end too when so many places were screened on a map of 15,000 intersections, and on a larger one more
         by the root of the ratio. Where streets are alike, proposals abound, and late ones are seldom right: of 31 masks
         that took more than half a second and were located, all but two had been found among the first 7,000 places.
     """
@@ -145,12 +151,17 @@ class MatchOptions:
     verify: VerifyOptions = field(default_factory=VerifyOptions)
     refine: RefineOptions = field(default_factory=RefineOptions)
     camera: CameraOptions = field(default_factory=CameraOptions)
+    roads: RoadSearchOptions | None = field(default_factory=RoadSearchOptions)
     max_places: int = 12_000
 
 
 @dataclass
 class Hypothesis:
-    """A grown hypothesis and what came of it; `fault` is the camera's last objection, None where it had none."""
+    """A grown hypothesis and what came of it.
+
+    `by_roads`: it grew by roads over the whole frame; `n_found`: so many intersections of the query proposed it;
+    `fault`: the camera's last objection, None where it had none.
+    """
 
     matrix: FloatArray
     seeds: IntArray
@@ -163,6 +174,8 @@ class Hypothesis:
     gsd_m: float = np.nan
     log10_odds: float = -np.inf
     fault: CameraFault | None = None
+    by_roads: bool = False
+    n_found: int = 1
 
 
 class TripleEstimator:
@@ -191,7 +204,54 @@ class TripleEstimator:
         self.n_tuples = self.n_candidates = self.n_screened = self.n_hypotheses = self.n_verified = 0
 
     def rounds(self) -> Iterator[list[Hypothesis]]:
-        """Yield, for one anchor after another, the hypotheses that grew."""
+        """Yield, for one anchor after another, the hypotheses that grew: of triples first, then of roads."""
+        yield from self._rounds_of_triples()
+        if self.options.roads is not None and len(self.scene.intersections):
+            yield from self._rounds_of_roads(self.options.roads)
+
+    def _rounds_of_roads(self, options: RoadSearchOptions) -> Iterator[list[Hypothesis]]:
+        """Yield what grew by roads and is not known yet; a place found again counts as found once more."""
+        roads = RoadSearch(self.scene, self.index, self.options.camera, options, self.near)
+        known: list[Hypothesis] = []
+        tried = 0
+        for grown in roads.rounds():
+            self.n_candidates += roads.n_tried - tried
+            tried = roads.n_tried
+            self.n_hypotheses += len(grown)
+            fresh: list[Hypothesis] = []
+            again: list[Hypothesis] = []
+            for hypothesis in map(self._of_roads, grown):
+                twins = [one for one in known if self._is_found_again(one, hypothesis)]
+                if twins or any(self.same(one, hypothesis) for one in fresh):
+                    again += twins[:1]
+                elif self._is_plausible(hypothesis):
+                    fresh.append(hypothesis)
+            for one in known:
+                one.n_found += any(one is other for other in again)
+            known += fresh
+            self.trace.grown(fresh)
+            yield fresh
+
+    def _is_plausible(self, hypothesis: Hypothesis) -> bool:
+        """Whether a camera can have seen a grown hypothesis."""
+        hypothesis.fault = self.judge(hypothesis.matrix, rough=True)
+        if hypothesis.fault is not None:
+            self.trace.refused(hypothesis.fault, hypothesis.matrix)
+        return hypothesis.fault is None
+
+    def _of_roads(self, grown: Grown) -> Hypothesis:
+        """Make a hypothesis of what grew by roads, with the intersections that match."""
+        scene, matrix = self.scene, grown.matrix / grown.matrix[2, 2]
+        seeds = np.array([grown.anchor])
+        gsd = sampling(matrix, scene.size)
+        _, matched, _ = agreement(matrix, scene, self.index, gsd, seeds, self.options.verify)
+        return Hypothesis(matrix, seeds, grown.share, matched, by_roads=True)
+
+    def _is_found_again(self, known: Hypothesis, hypothesis: Hypothesis) -> bool:
+        """Whether a verified place that is promising was proposed by another intersection as well."""
+        return known.log10_odds >= self.options.verify.promising and self.same(known, hypothesis)
+
+    def _rounds_of_triples(self) -> Iterator[list[Hypothesis]]:
         scene, options = self.scene, self.options
         low, high = options.camera.gsd_m
         scale = (low / options.grow.max_scale_ratio, high * options.grow.max_scale_ratio)
@@ -228,6 +288,8 @@ class TripleEstimator:
         hypothesis = Hypothesis(matrix, np.empty(0, np.int64), 0.0, np.full(n, -1))
         other.score(hypothesis)
         chance_agreement(matrix, self.scene, self.index, 1.0, self.options.verify)
+        if self.options.roads is not None:
+            RoadSearch(self.scene, self.index, self.options.camera, self.options.roads).rehearse()
 
     def _screen(self, proposals: Proposals) -> IntArray:
         """Return the proposals that put roads around the anchor on roads of the map, the best placed first."""
@@ -303,10 +365,7 @@ class TripleEstimator:
         self.trace.grown(grown)
         distinct: list[Hypothesis] = []
         for h in grown:
-            h.fault = self.judge(h.matrix, rough=True)
-            if h.fault is not None:
-                self.trace.refused(h.fault, h.matrix)
-            elif not any(self.same(h, other) for other in distinct):
+            if self._is_plausible(h) and not any(self.same(h, other) for other in distinct):
                 distinct.append(h)
                 if len(distinct) == options.max_verified:
                     break
@@ -346,17 +405,18 @@ class TripleEstimator:
 
     def _converge(self, model: Hypothesis, n_points: int | None) -> bool:
         """Refine until nothing more agrees: more matches make a better fit, and that finds more matches."""
-        scene, options = self.scene, self.options
+        scene, verify = self.scene, self.options.verify
         best = -1.0
+        options = self.refine_options
+        if model.by_roads and self.options.roads is not None:
+            options = self.options.roads.refinement(options)
         for _ in range(5):
-            refined = refine(model.matrix, scene, self.index, model.matched, self.refine_options, n_points)
+            refined = refine(model.matrix, scene, self.index, model.matched, options, n_points, model.by_roads)
             model.fault = None if refined is None else self.judge(refined.matrix)
             if refined is None or model.fault is not None or self._is_far(refined.matrix):
                 return model.refined is not None and best >= 0.0
             gsd = sampling(refined.matrix, scene.size)
-            found, matched, distance = agreement(
-                refined.matrix, scene, self.index, gsd, model.seeds[-MINIMAL:], options.verify
-            )
+            found, matched, distance = agreement(refined.matrix, scene, self.index, gsd, model.seeds[-MINIMAL:], verify)
             if found.forward < best:
                 break
             improved = found.forward > best + 0.01
@@ -385,6 +445,8 @@ class TripleEstimator:
         """
         if model.found is None or model.refined is None or model.chance[1] >= 0.5:
             return False
+        if model.by_roads:
+            return model.n_found >= _OFTEN_ENOUGH
         frame_m = 2.0 * self.scene.half_size * model.gsd_m
         return model.found.forward >= 0.65 and bool(model.refined.corner_sigma_m.max() <= 0.005 * frame_m)
 

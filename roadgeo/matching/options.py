@@ -29,13 +29,17 @@ class LocateOptions:
         Log10 odds by which the best place must lead any other; otherwise the answer is "ambiguous".
     min_intersections : int
         Masks with fewer are not searched.
+    effort : "quick" or "full"
+        Whether roads alone propose places where no triple of intersections leads to one: a search of a second or two on
+        the map of a city.
     """
 
     method: Literal["auto", "pair"] = "auto"
+    effort: Literal["quick", "full"] = "full"
     near: tuple[float, float, float] | None = None
     min_log10_odds: float = 3.5
     min_margin: float = 2.0
-    min_intersections: int = 6
+    min_intersections: int = 3
     query: QueryOptions = field(default_factory=QueryOptions)
     match: MatchOptions = field(default_factory=MatchOptions)
     search: SearchOptions = field(default_factory=SearchOptions)

@@ -31,7 +31,9 @@ class SceneOptions:
     max_intersections: int = 5000
     n_neighbours: int = 12
     max_road_points: int = 600
+    max_dense_points: int = 6000
     min_point_spacing_px: float = 6.0
+    min_dense_spacing_px: float = 3.0
     field_cells: int = 400
 
 
@@ -50,6 +52,8 @@ class Scene:
     neighbours : (N, K) int32
     points, directions : (S, 2) float64
         Points spread evenly along the roads, and unit vectors along the road.
+    dense_points, dense_directions : (D, 2) float64
+        The same, closer together: enough of them within a few roads of any place.
     road_length_px : float
         Length of all roads.
     n_edges : int
@@ -67,6 +71,8 @@ class Scene:
     neighbours: Int32Array
     points: FloatArray
     directions: FloatArray
+    dense_points: FloatArray
+    dense_directions: FloatArray
     road_length_px: float
     n_edges: int
     field: Float32Array
@@ -135,6 +141,7 @@ def prepare_scene(
     length = float(graph.edge_lengths().sum())
     spacing = max(options.min_point_spacing_px, length / options.max_road_points)
     points, directions = sample_roads(graph, spacing)
+    dense = sample_roads(graph, max(options.min_dense_spacing_px, length / options.max_dense_points))
     scale = max(1.0, max(size) / options.field_cells)
     cells = (int(np.ceil(height / scale)), int(np.ceil(width / scale)))
     canvas = np.full(cells, 255, np.uint8)
@@ -156,6 +163,8 @@ def prepare_scene(
         neighbours=neighbours,
         points=points,
         directions=directions,
+        dense_points=dense[0],
+        dense_directions=dense[1],
         road_length_px=length,
         n_edges=graph.n_edges,
         field=field,

@@ -19,7 +19,7 @@ from roadgeo.kernels.triples import UNITS, count_alike, find_sides, gather, look
 from roadgeo.matching.index import ReferenceIndex
 from roadgeo.roads.intersections import Intersections
 
-__all__ = ["Proposals", "TripleOptions", "larger", "propose", "smaller"]
+__all__ = ["Proposals", "TripleOptions", "farthest_first", "larger", "propose", "smaller"]
 
 
 #: Intersections of the maps that bounds are made for: a city's.
@@ -146,7 +146,7 @@ def propose(
     n_usable = usable.sum(axis=(1, 2))
     able = np.flatnonzero(n_usable >= 3)
     rarest = able[np.argsort(total[able] / n_usable[able], kind="stable")]
-    for i in _farthest_first(query.xy[weighed[able]], able) if options.spread else rarest:
+    for i in farthest_first(query.xy[weighed[able]], able) if options.spread else rarest:
         a = weighed[i]
         slots = np.argwhere(usable[i])
         slots = slots[np.argsort(costs[i][usable[i]], kind="stable")]
@@ -178,7 +178,7 @@ def _scattered(numbers: IntArray) -> IntArray:
     return (numbers * 2654435761) % 2**32  # Knuth's multiplicative hash
 
 
-def _farthest_first(xy: FloatArray, names: IntArray) -> Iterator[int]:
+def farthest_first(xy: FloatArray, names: IntArray) -> Iterator[int]:
     """Yield the name of the point nearest to the middle of all, then always of the one farthest from those before."""
     if len(xy) == 0:
         return

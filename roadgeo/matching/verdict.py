@@ -191,6 +191,8 @@ def _why_nothing(query: Query, found: Found, score: float, options: LocateOption
     nothing = f"no place on this map stands out: {best}{searched}"
     if searched:
         return f"{nothing}: more roads in view or a wider search may help"
+    if options.effort == "quick":
+        return f"{nothing}; a search with full effort, more roads in view or another map may help"
     return f"{nothing}; more roads in view or another map may help"
 
 

@@ -157,7 +157,7 @@ def test_too_few_intersections(town):
     search = check(explanation)
     assert search["starved_at"] == "intersections"
     assert search["funnel"]["intersections"] == 1
-    assert search["missing"] == ["only 1 intersections are seen, at least 6 are needed"]
+    assert search["missing"] == ["only 1 intersections are seen, at least 3 are needed"]
     assert draw_explanation(explanation, RoadMask(canvas > 0), town.index).shape[1] == 2000
 
 

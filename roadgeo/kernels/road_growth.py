@@ -1,0 +1,205 @@
+"""Growth of a hypothesis by roads alone: from the roads around one intersection outwards over the whole query.
+
+The parameters are those of `kernels.growth`: p = (h00 h01 h02 h10 h11 h12 h20 h21), h22 = 1, between normalised
+coordinates, query (x - x0) / half_size and reference (X - X0) / unit.
+"""
+
+import math
+from typing import NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+
+from roadgeo.kernels.adjustment import add_row, point_row
+from roadgeo.kernels.compilation import kernel
+from roadgeo.kernels.growth import cholesky, solve_cholesky
+from roadgeo.kernels.roads import nearest_road
+
+__all__ = ["RoadBuckets", "Stages", "fit_to_roads", "grow_by_roads", "share_on_roads"]
+
+#: Points of the first stage, and how many times more each further one has; of more points than these, evenly chosen.
+_FIRST, _MORE, _ENOUGH = 60, 1.45, 120
+#: Search radii of a stage's steps, metres: a proposal's scale and turn are rougher than what a grown map predicts.
+_FIRST_RADII, _RADII = (25.0, 18.0, 12.0), (18.0, 12.0, 12.0)
+#: How far a stage may take the map from the one before: standard deviations of its linear part, and of its place.
+_LINEAR_SIGMA, _PLACE_SIGMA_M = 0.08, 10.0
+_POINT_SIGMA_M = 12.0
+_FEWEST = 6
+
+
+class RoadBuckets(NamedTuple):
+    """The roads of the map (see `kernels.roads`)."""
+
+    segments: NDArray[np.float32]
+    starts: NDArray[np.int32]
+    ids: NDArray[np.int32]
+    grid: tuple[float, float, float]
+    shape: tuple[int, int]
+
+
+class Stages(NamedTuple):
+    """How growth proceeds.
+
+    `affine_until` in normalised units; a stage fails with fewer than `least_share` of its points within `tolerance`
+    metres of a road; `perspective_sigma` is the prior standard deviation of the two perspective parameters; roads count
+    that turn from a point's direction by less than `min_cos` says.
+    """
+
+    affine_until: float
+    least_share: float
+    tolerance: float
+    perspective_sigma: float
+    min_cos: float
+
+
+@kernel()
+def _nearest(
+    p: NDArray[np.float64],
+    unit: float,
+    origin: NDArray[np.float64],
+    point: NDArray[np.float64],
+    direction: NDArray[np.float64],
+    radius: float,
+    min_cos: float,
+    roads: RoadBuckets,
+) -> tuple[float, float, float, float]:
+    """Return how far the nearest road lies from a mapped point, across the road, the road's direction, and w.
+
+    Without a road within `radius` metres the distance is inf.
+    """
+    w = 1.0 + p[6] * point[0] + p[7] * point[1]
+    if w < 0.05:
+        return np.inf, 0.0, 0.0, w
+    x = (p[0] * point[0] + p[1] * point[1] + p[2]) / w
+    y = (p[3] * point[0] + p[4] * point[1] + p[5]) / w
+    dw = p[6] * direction[0] + p[7] * direction[1]
+    dx = p[0] * direction[0] + p[1] * direction[1] - x * dw
+    dy = p[3] * direction[0] + p[4] * direction[1] - y * dw
+    length = math.sqrt(dx * dx + dy * dy)
+    if length == 0.0:
+        return np.inf, 0.0, 0.0, w
+    gx, gy = origin[0] + unit * x, origin[1] + unit * y
+    d, fx, fy, rx, ry = nearest_road(
+        gx, gy, dx / length, dy / length, radius, min_cos,
+        roads.segments, roads.starts, roads.ids, roads.grid, roads.shape,
+    )  # fmt: skip
+    if d == np.inf:
+        return np.inf, 0.0, 0.0, w
+    return (fy - gy) * rx - (fx - gx) * ry, rx, ry, w
+
+
+@kernel()
+def fit_to_roads(
+    p: NDArray[np.float64],
+    unit: float,
+    origin: NDArray[np.float64],
+    points: NDArray[np.float64],
+    directions: NDArray[np.float64],
+    radius: float,
+    min_cos: float,
+    holds: NDArray[np.float64],
+    roads: RoadBuckets,
+) -> bool:
+    """Take one Gauss-Newton step that lays road points on the nearest roads of the map; return whether it worked.
+
+    Residuals lie across the roads, with Cauchy weights of half the search radius.
+
+    Parameters
+    ----------
+    p : (8,) float64
+        Adjusted in place.
+    unit, origin
+        Metres per normalised unit, and the reference point (2,) of the normalised (0, 0).
+    points, directions : (S, 2) float64
+        The query's road points, normalised, and unit vectors along the road.
+    radius : float
+        Roads nearer than this count, metres.
+    min_cos
+        As in `nearest_road`.
+    holds : (8,) float64
+        Weights that hold each parameter where it is.
+    """
+    normal, factor, right, row = np.zeros((8, 8)), np.zeros((8, 8)), np.zeros(8), np.empty(8)
+    met = 0
+    for i in range(points.shape[0]):
+        away, rx, ry, w = _nearest(p, unit, origin, points[i], directions[i], radius, min_cos, roads)
+        if w < 0.05:
+            return False
+        if away == np.inf:
+            continue
+        met += 1
+        point_row(p, points[i, 0], points[i, 1], -ry, rx, row)
+        add_row(normal, right, row, 1.0 / (1.0 + (2.0 * away / radius) ** 2), away / unit)
+    for r in range(8):
+        normal[r, r] += holds[r]
+    if met < _FEWEST or not cholesky(normal, factor):
+        return False
+    solve_cholesky(factor, right)
+    for r in range(8):
+        p[r] += right[r]
+    return True
+
+
+@kernel()
+def share_on_roads(
+    p: NDArray[np.float64],
+    unit: float,
+    origin: NDArray[np.float64],
+    points: NDArray[np.float64],
+    directions: NDArray[np.float64],
+    radius: float,
+    min_cos: float,
+    roads: RoadBuckets,
+) -> float:
+    """Return which share of the points lies within `radius` metres of roads that run their way (see `fit_to_roads`)."""
+    met = 0
+    for i in range(points.shape[0]):
+        if _nearest(p, unit, origin, points[i], directions[i], radius, min_cos, roads)[0] < np.inf:
+            met += 1
+    return float(met / max(points.shape[0], 1))
+
+
+@kernel()
+def grow_by_roads(
+    p: NDArray[np.float64],
+    unit: float,
+    origin: NDArray[np.float64],
+    points: NDArray[np.float64],
+    directions: NDArray[np.float64],
+    stages: Stages,
+    roads: RoadBuckets,
+) -> float:
+    """Grow a map from the nearest points outwards; return the share of all points on roads, or -1: given up.
+
+    Each stage fits the map to the nearest points, more of them each time: an affine map first, a homography beyond
+    `affine_until` and over the whole query.
+
+    Parameters
+    ----------
+    p, unit, origin, points, directions
+        As in `fit_to_roads`; points nearest to (0, 0) first.
+    """
+    n = points.shape[0]
+    count = min(_FIRST, n)
+    radii = _FIRST_RADII
+    holds = np.empty(8)
+    for r in range(6):
+        sigma = _PLACE_SIGMA_M / unit if r % 3 == 2 else _LINEAR_SIGMA
+        holds[r] = (_POINT_SIGMA_M / unit / sigma) ** 2
+    while count > 0:
+        bent = count == n or math.hypot(points[count - 1, 0], points[count - 1, 1]) > stages.affine_until
+        holds[6] = holds[7] = (_POINT_SIGMA_M / unit / stages.perspective_sigma) ** 2 if bent else 1e9
+        step = max(1, count // _ENOUGH)
+        some, along = points[:count:step], directions[:count:step]
+        for k in range(3):
+            radius = max(radii[k], 1.5 * stages.tolerance)
+            if not fit_to_roads(p, unit, origin, some, along, radius, stages.min_cos, holds, roads):
+                return -1.0
+        share = share_on_roads(p, unit, origin, some, along, stages.tolerance, stages.min_cos, roads)
+        if share < stages.least_share:
+            return -1.0
+        if count == n:
+            return share
+        radii = _RADII
+        count = min(int(count * _MORE) + 1, n)
+    return -1.0

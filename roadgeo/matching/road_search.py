@@ -1,0 +1,106 @@
+"""The search by roads: intersections spread over the frame vote for places, and what they propose grows by roads."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Iterator
+from dataclasses import dataclass, field, replace
+from itertools import islice
+
+import numpy as np
+
+from roadgeo._arrays import IntArray
+from roadgeo.geometry.camera import CameraOptions
+from roadgeo.matching.index import ReferenceIndex
+from roadgeo.matching.refinement import RefineOptions
+from roadgeo.matching.road_growth import Grown, RoadGrower, RoadGrowOptions
+from roadgeo.matching.road_votes import VoteOptions, Voter
+from roadgeo.matching.scene import Scene
+from roadgeo.matching.triples import farthest_first
+
+__all__ = ["RoadSearch", "RoadSearchOptions"]
+
+#: How far a proposal, made of two branches, may turn the image's up from where it points.
+_ROUGHLY_DEG = 25.0
+
+
+@dataclass(frozen=True)
+class RoadSearchOptions:
+    """How much is tried.
+
+    Attributes
+    ----------
+    max_anchors : int
+        So many intersections of the query vote, spread over the frame from its middle outwards.
+    max_grown : int
+        So many of an anchor's proposals grow.
+    scale_slack : float
+        Around an anchor the ground sampling may differ by this factor from that at the middle of the frame.
+    least_share : float
+        As of `RefineOptions`, where false roads abound.
+    """
+
+    votes: VoteOptions = field(default_factory=VoteOptions)
+    grow: RoadGrowOptions = field(default_factory=RoadGrowOptions)
+    max_anchors: int = 25
+    max_grown: int = 5
+    scale_slack: float = 1.2
+    least_share: float = 0.2
+
+    def refinement(self, usual: RefineOptions) -> RefineOptions:
+        """Return how what grew by roads is refined."""
+        return replace(usual, least_share=self.least_share)
+
+
+class RoadSearch:
+    """Proposes places for a scene on a map by roads alone; `n_tried` places so far."""
+
+    def __init__(
+        self,
+        scene: Scene,
+        index: ReferenceIndex,
+        camera: CameraOptions,
+        options: RoadSearchOptions,
+        near: tuple[float, float, float] | None = None,
+    ) -> None:
+        """`near` = (x, y, radius) in plane metres restricts where the middle of the frame may lie."""
+        self.scene, self.options = scene, options
+        low, high = camera.gsd_m
+        scale = (low / options.scale_slack, high * options.scale_slack)
+        max_turn = math.radians(_ROUGHLY_DEG) if camera.north_up else math.pi
+        candidates = _within(index, near, scene.half_size * scale[1])
+        self.voter = Voter(scene, index, scale, max_turn, candidates, options.votes)
+        perspective = camera.perspective_sigma(options.grow.perspective_sigma)
+        self.grower = RoadGrower(scene, index, replace(options.grow, perspective_sigma=perspective))
+
+    @property
+    def n_tried(self) -> int:
+        """Places, turns and scales tried so far."""
+        return self.voter.n_tried
+
+    def rehearse(self) -> None:
+        """Compile or load all kernels on a place of no meaning, so that compilation is not charged to a time limit."""
+        self.voter.candidates = self.voter.candidates[:1]
+        next(self.voter.votes(0))
+        self.grower.grow(0, 0, np.array([1.0, 0.0, 0.0, 1.0]))
+
+    def rounds(self) -> Iterator[list[Grown]]:
+        """Yield what grew of one anchor's proposals after another; between parts of a large map nothing."""
+        xy = self.scene.intersections.xy
+        for anchor in islice(farthest_first(xy, np.arange(len(xy))), self.options.max_anchors):
+            for votes in self.voter.votes(anchor):
+                if votes is None:
+                    yield []
+                    continue
+                grown = (
+                    self.grower.grow(anchor, j, affine) for j, affine in zip(votes.reference, votes.affine, strict=True)
+                )
+                some = list(islice(grown, self.options.max_grown))
+                yield [one for one in some if one is not None]
+
+
+def _within(index: ReferenceIndex, near: tuple[float, float, float] | None, reach_m: float) -> IntArray:
+    """Return the map's intersections that a frame around a place in the circle may show."""
+    if near is None:
+        return np.arange(len(index))
+    return np.flatnonzero(np.hypot(*(index.xy - near[:2]).T) < near[2] + reach_m)

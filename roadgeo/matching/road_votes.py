@@ -1,0 +1,188 @@
+"""Proposals from roads: one query intersection and the roads around it, laid on every intersection of the map.
+
+Triples of intersections need three neighbours that are all intact. Where roads are missing, false or few, one intact
+intersection and the roads about it still say where they lie: turned so that two branches agree, at each of many scales,
+most road points fall on roads of the map in the right place, and few elsewhere. How many would by chance is measured
+for each scale, and depends on how dense the map's roads are at the place: without that, scales at which the query
+shrinks to a few blocks would crowd out the rest.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Iterator
+from dataclasses import dataclass, field
+
+import numpy as np
+
+from roadgeo._arrays import FloatArray, IntArray
+from roadgeo.kernels.road_raster import DIRECTIONS
+from roadgeo.kernels.road_votes import (
+    MAX_TURNS,
+    Places,
+    RoadPoints,
+    Trial,
+    chance_rates,
+    find_turns,
+    improve_votes,
+    vote,
+)
+from roadgeo.matching.index import ReferenceIndex
+from roadgeo.matching.road_raster import RasterOptions, RoadRaster, make_raster
+from roadgeo.matching.scene import Scene
+
+__all__ = ["VoteOptions", "Voter", "Votes"]
+
+#: Where the map has hardly a road, chance is not less than this.
+_LEAST_DENSITY = 0.005
+_TURN_STEPS = np.radians([-6.0, -3.0, 0.0, 3.0, 6.0])
+_SCALE_STEPS = np.array([0.96, 1.0, 1.04])
+
+
+@dataclass(frozen=True)
+class VoteOptions:
+    """How the roads around one intersection are compared.
+
+    Attributes
+    ----------
+    branch_tolerance_deg : float
+        How far the two branches that agree may be apart.
+    scale_step : float
+        Ratio of one scale to the next.
+    inner_m, radius_m, max_points : float, float, int
+        Road points between these distances from the intersection are tested, at most so many.
+    own_m, own_cos : float
+        Nearer than `own_m`, roads that run straight away from the intersection, with at least this cosine, are left
+        out: they are its own branches, which agree by construction. It makes the right place stand out more and wrong
+        ones fail sooner.
+    least_points : int
+        A scale at which fewer points are in reach is not tried.
+    trial : Trial
+        Of the sequential test.
+    kept : int
+        The best so many are judged anew, with points as far as `wide_radius_m`.
+    n_chance : int
+        Places at which chance is measured.
+    """
+
+    raster: RasterOptions = field(default_factory=RasterOptions)
+    branch_tolerance_deg: float = 20.0
+    scale_step: float = 1.08
+    inner_m: float = 15.0
+    radius_m: float = 220.0
+    max_points: int = 80
+    own_m: float = 150.0
+    own_cos: float = 0.95
+    least_points: int = 15
+    hit_rate: float = 0.55
+    patience: float = 3.0
+    kept: int = 100
+    wide_radius_m: float = 260.0
+    wide_points: int = 160
+    n_chance: int = 60
+
+
+@dataclass(frozen=True)
+class Votes:
+    """What one query intersection may be. Dimension: M proposals, the best first.
+
+    Attributes
+    ----------
+    anchor : int
+        The query intersection.
+    reference : (M,) int64
+        Map intersections it may be.
+    affine : (M, 4) float64
+        The 2 x 2 map (row-major) from query to reference around it.
+    ratio : (M,) float64
+        Log-likelihood ratio of the road points against chance, nats.
+    """
+
+    anchor: int
+    reference: IntArray
+    affine: FloatArray
+    ratio: FloatArray
+
+
+class Voter:
+    """Compares the roads around intersections of one scene with one map, within limits on scale and turn."""
+
+    def __init__(
+        self,
+        scene: Scene,
+        index: ReferenceIndex,
+        scale: tuple[float, float],
+        max_turn: float,
+        candidates: IntArray,
+        options: VoteOptions,
+    ) -> None:
+        """`scale` in metres per pixel, `max_turn` of the image's up from north in radians, `candidates` on the map."""
+        self.scene, self.index, self.options = scene, index, options
+        self.max_turn, self.candidates = max_turn, candidates
+        n = math.ceil(math.log(scale[1] / scale[0]) / math.log(options.scale_step)) + 1
+        self.scales = np.geomspace(*scale, n)
+        self.tolerance = math.radians(options.branch_tolerance_deg)
+        self.trial = Trial(options.hit_rate, options.patience)
+        self.drawn: RoadRaster = make_raster(index, options.raster)
+        density = np.maximum(self.drawn.density_at(index.xy), _LEAST_DENSITY)
+        self.places = Places(self.drawn.cells(index.xy), np.asarray(index.branches), density)
+        self.n_tried = 0
+
+    def votes(self, anchor: int, chunk: int = 20_000) -> Iterator[Votes | None]:
+        """Yield None after each `chunk` of the map's intersections, and the best proposals in the end."""
+        options = self.options
+        rays = self.scene.intersections.rays[anchor]
+        rays = rays[np.isfinite(rays)].astype(float)
+        points = self._points(anchor, options.inner_m, options.radius_m, options.max_points)
+        chance = self._chance(rays, points, anchor)
+        found, kept = np.empty((options.kept, 5)), 0
+        for first in range(0, len(self.candidates), chunk):
+            kept, tried = vote(
+                self.candidates[first : first + chunk], rays, self.tolerance, self.max_turn, points, self.places,
+                self.drawn.raster, chance, self.trial, found, kept,
+            )  # fmt: skip
+            self.n_tried += tried
+            if first + chunk < len(self.candidates):
+                yield None
+        wide = self._points(anchor, 0.0, options.wide_radius_m, options.wide_points, own=True)
+        improve_votes(found[:kept], _TURN_STEPS, _SCALE_STEPS, wide, self.places, self.drawn.raster, self.trial)
+        best = found[:kept][np.argsort(-found[:kept, 3], kind="stable")]
+        c, s = np.cos(best[:, 1]) * best[:, 2], np.sin(best[:, 1]) * best[:, 2]
+        yield Votes(anchor, best[:, 0].astype(np.int64), np.stack([c, -s, s, c], axis=1), best[:, 3])
+
+    def _points(self, anchor: int, inner_m: float, outer_m: float, most: int, own: bool = False) -> RoadPoints:
+        """Choose the road points to test at each scale, evenly by distance, in random order."""
+        options, scene = self.options, self.scene
+        offsets = scene.dense_points - scene.intersections.xy[anchor]
+        away = np.hypot(*offsets.T)
+        order = np.argsort(away, kind="stable")
+        offsets, away, directions = offsets[order], away[order], scene.dense_directions[order]
+        angles = np.arctan2(directions[:, 1], directions[:, 0]) * (DIRECTIONS / math.pi) + DIRECTIONS
+        radial = np.abs((offsets * directions).sum(axis=1)) > options.own_cos * away
+        rng = np.random.default_rng(anchor)
+        chosen = []
+        for s in self.scales:
+            low, near, high = np.searchsorted(away, np.array([inner_m, options.own_m, outer_m]) / s)
+            others = low + np.flatnonzero(~radial[low:near])
+            usable = np.arange(low, high) if own else np.concatenate([others, np.arange(max(low, near), high)])
+            n = min(len(usable), most)
+            at = np.linspace(0, len(usable) - 1, n).astype(np.int64)
+            chosen.append(usable[rng.permutation(at)] if n >= options.least_points else usable[:0])
+        starts = np.concatenate(([0], np.cumsum([len(c) for c in chosen])))
+        taken = np.concatenate(chosen)
+        return RoadPoints(self.scales, starts, offsets[taken], angles[taken])
+
+    def _chance(self, rays: FloatArray, points: RoadPoints, seed: int) -> FloatArray:
+        """Measure the chance rate at each scale, in units of the density at a place, at places drawn at random."""
+        rng = np.random.default_rng(seed)
+        n = self.options.n_chance
+        sample: list[int] = []
+        turns: list[float] = []
+        room = np.empty(MAX_TURNS)
+        for j in rng.choice(self.candidates, min(4 * n, len(self.candidates)), replace=False):
+            if len(sample) < n and (k := find_turns(rays, self.places.branches, j, self.tolerance, room)):
+                sample.append(j)
+                turns.append(room[rng.integers(k)])
+        out = np.empty(len(self.scales))
+        chance_rates(np.array(sample, np.int64), np.array(turns), points, self.places, self.drawn.raster, out)
+        return out

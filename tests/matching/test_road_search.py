@@ -1,0 +1,146 @@
+"""Proposals and growth by roads, on made-up towns with known homographies."""
+
+import math
+from dataclasses import replace
+
+import numpy as np
+import pytest
+from worlds.scenes import Sight, camera, look, mapped, random_network, scene_of
+
+from roadgeo.geometry.camera import CameraOptions
+from roadgeo.matching.estimator import MatchOptions, TripleEstimator
+from roadgeo.matching.index import build_index
+from roadgeo.matching.road_growth import RoadGrower, RoadGrowOptions
+from roadgeo.matching.road_raster import RasterOptions, make_raster
+from roadgeo.matching.road_search import RoadSearch, RoadSearchOptions
+from roadgeo.matching.road_votes import VoteOptions, Voter
+from roadgeo.matching.search import SearchOptions, search
+
+SCALE = (0.2, 5.0)
+TRUTH = camera((2100, 1900), (1000, 1000), 1.0, 10.0, 20.0, 70.0)
+#: A mask that shows half of the roads, and a fifth as many false ones.
+BROKEN = Sight(0.8, missing=0.5, false=0.2)
+
+
+@pytest.fixture(scope="module")
+def broken(town):
+    return scene_of(look(town[0], TRUTH, sight=BROKEN, seed=4))
+
+
+def everywhere(index):
+    return np.arange(len(index))
+
+
+def corner_gap(matrix, scene, truth=TRUTH):
+    return np.hypot(*(mapped(matrix, scene.corners) - mapped(truth, scene.corners)).T).max()
+
+
+def best_votes(scene, index, anchors, scale=SCALE, max_turn=math.pi):
+    voter = Voter(scene, index, scale, max_turn, everywhere(index), VoteOptions())
+    return [list(voter.votes(int(a)))[-1] for a in anchors]
+
+
+def test_the_right_place_leads_the_votes_of_some_intersections(town, broken):
+    index = town[1]
+    right = 0
+    for votes in best_votes(broken, index, range(0, len(broken.intersections), 2)):
+        assert (np.diff(votes.ratio) <= 0).all()
+        at = mapped(TRUTH, broken.intersections.xy[[votes.anchor]])[0]
+        away = np.hypot(*(index.xy[votes.reference[:3]] - at).T)
+        right += bool((away < 15).any())
+    assert right >= 4
+
+
+def test_limits_on_scale_and_turn_are_kept(town, broken):
+    (votes,) = best_votes(broken, town[1], [0], (0.8, 1.2), 0.5)
+    assert len(votes.reference)
+    scale = np.hypot(votes.affine[:, 0], votes.affine[:, 2])
+    assert (scale > 0.8 * 0.95).all()
+    assert (scale < 1.2 * 1.05).all()
+    turn = np.arctan2(votes.affine[:, 2], votes.affine[:, 0])
+    assert (np.abs(turn) < 0.5 + 0.11).all()
+
+
+def test_a_map_in_parts_gives_the_same_votes(town, broken):
+    voter = Voter(broken, town[1], SCALE, math.pi, everywhere(town[1]), VoteOptions())
+    whole = list(voter.votes(1))
+    parts = list(voter.votes(1, chunk=100))
+    assert len(whole) == 1
+    assert parts[:-1] == [None] * 7
+    assert sorted(parts[-1].ratio) == pytest.approx(sorted(whole[-1].ratio))
+
+
+def test_an_intersection_far_from_all_roads_has_no_votes(town, broken):
+    alone = replace(broken, dense_points=broken.dense_points[:0], dense_directions=broken.dense_directions[:0])
+    (votes,) = best_votes(alone, town[1], [0])
+    assert len(votes.reference) == 0
+
+
+def test_a_rough_proposal_grows_to_the_truth(town, broken):
+    index = town[1]
+    grower = RoadGrower(broken, index, RoadGrowOptions())
+    gaps = []
+    for anchor, at in enumerate(mapped(TRUTH, broken.intersections.xy)):
+        j = int(np.argmin(np.hypot(*(index.xy - at).T)))
+        if np.hypot(*(index.xy[j] - at)) > 5:
+            continue
+        ahead = mapped(TRUTH, broken.intersections.xy[anchor] + np.eye(2)) - at
+        turn, scale = math.radians(3.0), 1.03  # off by as much as the steps of a vote
+        c, s = scale * math.cos(turn), scale * math.sin(turn)
+        affine = np.array([[c, -s], [s, c]]) @ ahead.T
+        grown = grower.grow(anchor, j, affine.ravel())
+        gaps.append(np.inf if grown is None else corner_gap(grown.matrix, broken))
+    assert np.median(gaps) < 8
+
+
+@pytest.mark.parametrize("seed", range(3))
+def test_finds_a_broken_mask_that_triples_do_not(town, seed):
+    network, index = town
+    scene = scene_of(look(network, TRUTH, sight=Sight(0.8, missing=0.6, false=0.3), seed=seed))
+    limits = SearchOptions(time_limit_s=60.0)
+    quick = search(TripleEstimator(scene, index, MatchOptions(roads=None)), limits)
+    assert quick.score < 3.5
+    full = search(TripleEstimator(scene, index, MatchOptions()), limits)
+    assert full.score > 6
+    assert full.score - full.runner_up_score > 4
+    assert corner_gap(full.best.refined.matrix, scene) < 6
+    assert full.best.by_roads
+    assert full.best.n_found >= 2
+
+
+@pytest.mark.parametrize("seed", [2, 3])
+def test_another_town_is_refused(town, seed):
+    stranger = scene_of(look(random_network(seed, 2000.0), camera((1000, 1000)), sight=BROKEN))
+    result = search(TripleEstimator(stranger, town[1], MatchOptions()), SearchOptions(time_limit_s=60.0))
+    assert result.score < 2.5
+    assert result.stopped == "exhausted"
+
+
+def test_near_restricts_where_votes_are_cast(town, broken):
+    index = town[1]
+    everything = RoadSearch(broken, index, CameraOptions(), RoadSearchOptions())
+    around = RoadSearch(broken, index, CameraOptions(gsd_m=(0.8, 1.2)), RoadSearchOptions(), (500.0, 500.0, 100.0))
+    assert len(everything.voter.candidates) == len(index)
+    assert 0 < len(around.voter.candidates) < len(index) / 2
+    nowhere = RoadSearch(broken, index, CameraOptions(), RoadSearchOptions(), (9e6, 9e6, 100.0))
+    assert [len(grown) for grown in nowhere.rounds()] == [0] * len(broken.intersections)
+
+
+def test_the_raster_is_made_once_and_has_a_rim(town):
+    options = RasterOptions()
+    drawn = make_raster(town[1], options)
+    assert make_raster(town[1], options) is drawn
+    assert drawn.rim_m > VoteOptions().wide_radius_m * 1.08
+    cells = drawn.cells(town[1].xy)
+    rows, columns = np.array(drawn.raster.tile_of.shape) * 64
+    rim = drawn.rim_m / options.cell_m
+    assert cells.min() >= rim - 1e-6
+    assert cells[:, 0].max() <= columns - rim
+    assert cells[:, 1].max() <= rows - rim
+    assert not drawn.raster.bits[0].any()
+
+
+def test_a_map_of_few_roads(broken):
+    index = build_index(random_network(7, 400.0))
+    result = search(TripleEstimator(broken, index, MatchOptions()), SearchOptions(time_limit_s=60.0))
+    assert result.score < 2.5
