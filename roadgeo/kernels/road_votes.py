@@ -194,7 +194,7 @@ def vote(
     Returns
     -------
     int, int
-        `kept` now, and how many (turn, scale) pairs were tried.
+        `kept` now, and how many places and turns were tried.
     """
     turns = np.empty(MAX_TURNS)
     rates, gains, losses = np.empty(_LEVELS), np.empty(_LEVELS), np.empty(_LEVELS)
@@ -210,11 +210,11 @@ def vote(
             turn = turns[t]
             if abs(turn) > max_turn:
                 continue
+            tried += 1
             best, where, rate = 0.0, -1, 0.0
             cosine, sine = math.cos(turn) / raster.cell, math.sin(turn) / raster.cell
             for s in range(points.scales.shape[0]):
                 i, last = points.starts[s], points.starts[s + 1]
-                tried += last > i
                 level = int(min(chance[s] * places.density[j], 0.99) * _LEVELS)
                 c, d = cosine * points.scales[s], sine * points.scales[s]
                 ratio = 0.0

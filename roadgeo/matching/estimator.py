@@ -215,7 +215,7 @@ class TripleEstimator:
         known: list[Hypothesis] = []
         tried = 0
         for grown in roads.rounds():
-            self.n_candidates += roads.n_tried - tried
+            self.n_screened += roads.n_tried - tried
             tried = roads.n_tried
             self.n_hypotheses += len(grown)
             fresh: list[Hypothesis] = []

@@ -53,7 +53,7 @@ class RoadSearchOptions:
 
 
 class RoadSearch:
-    """Proposes places for a scene on a map by roads alone; `n_tried` places so far."""
+    """Proposes places for a scene on a map by roads alone."""
 
     def __init__(
         self,
@@ -75,7 +75,7 @@ class RoadSearch:
 
     @property
     def n_tried(self) -> int:
-        """Places, turns and scales tried so far."""
+        """Places and turns tried so far."""
         return self.voter.n_tried
 
     def rehearse(self) -> None:
