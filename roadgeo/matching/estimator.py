@@ -214,10 +214,12 @@ class TripleEstimator:
         roads = RoadSearch(self.scene, self.index, self.options.camera, options, self.near)
         known: list[Hypothesis] = []
         tried = 0
-        for grown in roads.rounds():
+        for anchor, n_proposed, grown in roads.rounds():
             self.n_screened += roads.n_tried - tried
             tried = roads.n_tried
-            self.n_hypotheses += len(grown)
+            self.n_hypotheses += n_proposed
+            if anchor >= 0:
+                self.trace.voted(anchor, n_proposed)
             fresh: list[Hypothesis] = []
             again: list[Hypothesis] = []
             for hypothesis in map(self._of_roads, grown):

@@ -101,6 +101,12 @@ class Record:
         if len(barred):
             self.elsewhere.append(proposals.only(barred))
 
+    def voted(self, anchor: int, n_proposed: int) -> None:
+        """Count proposals of roads: all of them lie on roads."""
+        self.anchors.append(anchor)
+        self.n_proposals += n_proposed
+        self.n_on_roads += n_proposed
+
     def grown(self, hypotheses: Sequence[Hypothesis]) -> None:
         """Count what survived."""
         self.n_survived += len(hypotheses)

@@ -6,6 +6,7 @@ import math
 from collections.abc import Iterator
 from dataclasses import dataclass, field, replace
 from itertools import islice
+from typing import NamedTuple
 
 import numpy as np
 
@@ -18,7 +19,7 @@ from roadgeo.matching.road_votes import VoteOptions, Voter
 from roadgeo.matching.scene import Scene
 from roadgeo.matching.triples import farthest_first
 
-__all__ = ["RoadSearch", "RoadSearchOptions"]
+__all__ = ["RoadRound", "RoadSearch", "RoadSearchOptions"]
 
 #: How far a proposal, made of two branches, may turn the image's up from where it points.
 _ROUGHLY_DEG = 25.0
@@ -50,6 +51,17 @@ class RoadSearchOptions:
     def refinement(self, usual: RefineOptions) -> RefineOptions:
         """Return how what grew by roads is refined."""
         return replace(usual, least_share=self.least_share)
+
+
+class RoadRound(NamedTuple):
+    """What came of one query intersection: how many proposals were to grow, and those that did.
+
+    The anchor is -1 where only a part of a large map was looked at.
+    """
+
+    anchor: int
+    n_proposed: int
+    grown: list[Grown]
 
 
 class RoadSearch:
@@ -84,19 +96,17 @@ class RoadSearch:
         next(self.voter.votes(0))
         self.grower.grow(0, 0, np.array([1.0, 0.0, 0.0, 1.0]))
 
-    def rounds(self) -> Iterator[list[Grown]]:
+    def rounds(self) -> Iterator[RoadRound]:
         """Yield what grew of one anchor's proposals after another; between parts of a large map nothing."""
         xy = self.scene.intersections.xy
         for anchor in islice(farthest_first(xy, np.arange(len(xy))), self.options.max_anchors):
             for votes in self.voter.votes(anchor):
                 if votes is None:
-                    yield []
+                    yield RoadRound(-1, 0, [])
                     continue
-                grown = (
-                    self.grower.grow(anchor, j, affine) for j, affine in zip(votes.reference, votes.affine, strict=True)
-                )
-                some = list(islice(grown, self.options.max_grown))
-                yield [one for one in some if one is not None]
+                best = list(zip(votes.reference, votes.affine, strict=True))[: self.options.max_grown]
+                grown = [self.grower.grow(anchor, j, affine) for j, affine in best]
+                yield RoadRound(anchor, len(best), [one for one in grown if one is not None])
 
 
 def _within(index: ReferenceIndex, near: tuple[float, float, float] | None, reach_m: float) -> IntArray:

@@ -21,6 +21,9 @@ class Trace(Protocol):
     def screened(self, proposals: Proposals, allowed: BoolArray, kept: IntArray) -> None:
         """Note one anchor's proposals: which the user's hints allow, and which put roads on roads."""
 
+    def voted(self, anchor: int, n_proposed: int) -> None:
+        """Note that an intersection and the roads around it proposed so many places that were to grow."""
+
     def grown(self, hypotheses: Sequence[Hypothesis]) -> None:
         """Note what grew from one anchor's proposals."""
 
@@ -38,6 +41,9 @@ class NoTrace:
     """Listens to nothing."""
 
     def screened(self, proposals: Proposals, allowed: BoolArray, kept: IntArray) -> None:
+        """Do nothing."""
+
+    def voted(self, anchor: int, n_proposed: int) -> None:
         """Do nothing."""
 
     def grown(self, hypotheses: Sequence[Hypothesis]) -> None:

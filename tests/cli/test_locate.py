@@ -177,7 +177,7 @@ def test_options_narrow_the_search(porto: Path, capfd: pytest.CaptureFixture[str
             "searched within 2 km of 2.35,48.85, at 0.8 to 1.2 m per pixel",
         ),
     ]:
-        assert main(["locate", mask, "-r", str(porto), *limits]) == 3
+        assert main(["locate", mask, "-r", str(porto), "--effort", "quick", *limits]) == 3
         assert told in capfd.readouterr().out
 
 

@@ -138,7 +138,7 @@ def test_road_points_far_from_the_anchor(town, scene):
 @pytest.mark.parametrize("most", [0, 300])
 def test_places_are_bounded(town, most):
     stranger = scene_of(look(random_network(3, 2000.0), camera((1000, 1000)), sight=Sight(0.5)))
-    options = MatchOptions(max_places=most)
+    options = MatchOptions(max_places=most, roads=None)
     result, estimator = locate(stranger, town[1], options)
     assert result.stopped == "exhausted"
     assert estimator.n_screened <= most + options.grow.max_screened
