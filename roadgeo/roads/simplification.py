@@ -14,6 +14,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from roadgeo._arrays import AnyArray, BoolArray, FloatArray, Int32Array, IntArray
+from roadgeo.errors import RoadSourceError
 from roadgeo.kernels import simplification as kernels
 from roadgeo.roads.graph import RoadGraph
 
@@ -24,6 +25,11 @@ __all__ = ["SimplifyOptions", "coverage", "planarize", "simplify"]
 
 #: Roads at a smaller angle than this run side by side.
 _PARALLEL_COS = float(np.cos(np.radians(25.0)))
+
+#: What lines may hold, far above any map that can be indexed: beyond it they would fill the memory.
+MAX_LENGTH_M = 1e10
+MAX_CELLS = 3_000_000
+MAX_PAIRS, MAX_PAIRS_PER_SEGMENT = 1_000_000, 100
 
 
 @dataclass(frozen=True)
@@ -63,10 +69,17 @@ def planarize(lines: Sequence[LineString] | Any, grid_m: float = 0.1) -> RoadGra
     -------
     RoadGraph
         Every crossing is a node; edges are what lies between two nodes.
+
+    Raises
+    ------
+    RoadSourceError
+        There are so many crossings, or so many kilometres, that they are no roads: memory and time are bounded.
     """
     import shapely
 
-    parts = _noded(_rounded(lines, grid_m), grid_m)
+    rounded = _rounded(lines, grid_m)
+    _require_mappable(rounded)
+    parts = _noded(rounded, grid_m)
     coords = shapely.get_coordinates(parts)
     offsets = np.concatenate(([0], np.cumsum(shapely.get_num_coordinates(parts)))).astype(np.int64)
     at_ends = np.stack((offsets[:-1], offsets[1:] - 1), axis=1).ravel()
@@ -77,6 +90,43 @@ def planarize(lines: Sequence[LineString] | Any, grid_m: float = 0.1) -> RoadGra
     coords[at_ends] = ends[first][edges.ravel()]
     specks = (edges[:, 0] == edges[:, 1]) & (shapely.length(parts) < 2 * grid_m)
     return _keep_edges(RoadGraph(ends[first], edges, coords, offsets), ~(specks | _repeated(edges, offsets)))
+
+
+def _require_mappable(lines: AnyArray) -> None:
+    """Refuse lines whose crossings could not be held in memory, by an estimate that takes hardly any time.
+
+    Segments are sampled once in each cell of a grid, and those that share a cell are counted in pairs. Real maps have 2
+    to 4 pairs for each segment, whatever their size; an estimate may be a few times what crosses.
+    """
+    import shapely
+
+    coords, line = shapely.get_coordinates(lines, return_index=True)
+    inside = line[1:] == line[:-1]
+    start, step = coords[:-1][inside], np.diff(coords, axis=0)[inside]
+    length = np.hypot(*step.T)
+    total, n = float(length.sum()), len(start)
+    if not total <= MAX_LENGTH_M:
+        raise RoadSourceError(
+            f"the lines are {total / 1e3:,.0f} km long, expected at most {MAX_LENGTH_M / 1e3:,.0f}: "
+            "check their CRS, or give a smaller area"
+        )
+    if n == 0:
+        return
+    size = max(2.0 * float(np.median(length)), total / (4e6 + n), 1e-9)
+    count = np.ceil(length / size).astype(np.int64) + 1
+    segment = np.repeat(np.arange(n), count)
+    share = (np.arange(len(segment)) - (np.cumsum(count) - count)[segment]) / (count - 1).clip(1)[segment]
+    column, row = (_cells(start[segment, axis] + step[segment, axis] * share, size) for axis in (0, 1))
+    key = row * (int(column.max()) + 1) + column
+    first = np.ones(len(key), bool)
+    first[1:] = (key[1:] != key[:-1]) | (segment[1:] != segment[:-1])
+    held = np.unique(key[first], return_counts=True)[1].astype(float)
+    pairs, most = float(held @ (held - 1)) / 2, MAX_PAIRS + MAX_PAIRS_PER_SEGMENT * n
+    if pairs > most:
+        raise RoadSourceError(
+            f"the {n:,} pieces of line may cross each other {pairs:,.0f} times, expected at most {most:,} times: "
+            "these are no roads, or the file holds each of them many times over"
+        )
 
 
 def _repeated(edges: Int32Array, offsets: IntArray) -> BoolArray:
@@ -136,7 +186,15 @@ def coverage(graph: RoadGraph, cell_m: float = 300.0) -> list[FloatArray]:
     lines = shapely.linestrings(graph.coords, indices=np.repeat(np.arange(graph.n_edges), np.diff(graph.offsets)))
     dense = shapely.get_coordinates(shapely.segmentize(lines, cell_m))
     around = np.stack(np.meshgrid((-1, 0, 1), (-1, 0, 1)), axis=-1).reshape(-1, 2)
-    cells = np.unique(np.floor(dense / cell_m).astype(np.int64), axis=0)
+    square = np.floor(dense / cell_m).astype(np.int64)
+    corner, rows = square.min(axis=0), int(np.ptp(square[:, 1])) + 1
+    numbers = np.unique((square - corner) @ (rows, 1))
+    if len(numbers) > MAX_CELLS:
+        raise RoadSourceError(
+            f"the roads lie in {len(numbers):,} squares of {cell_m:g} m, expected at most {MAX_CELLS:,}: "
+            "give a smaller area, or check that these are roads"
+        )
+    cells = np.stack(np.divmod(numbers, rows), axis=1) + corner
     cells = np.unique((cells[:, None] + around).reshape(-1, 2), axis=0)
     boxes = shapely.box(*(cells.T * cell_m), *((cells.T + 1) * cell_m))
     shells = shapely.get_exterior_ring(shapely.get_parts(shapely.coverage_union_all(boxes)))

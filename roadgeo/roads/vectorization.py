@@ -42,8 +42,14 @@ class VectorizeOptions:
         Wide roads are reduced to about this width before thinning.
     max_working_pixels
         Larger masks are reduced further, at some loss, so that memory is bounded.
+    max_corners
+        A mask whose outlines have more is noise and is refused before it is cleaned. Real masks have up to 11 for a
+        thousand pixels, 0.7 million where they are as large as can be.
     max_pieces
         A mask that falls into more pieces of road is noise and is refused, so that time and memory are bounded.
+    max_cover
+        What is traced is noise, too, where roads of its length and width would cover more than this share of the frame:
+        those of a dense town cover 0.16.
     closing_widths, opening_widths
         Gaps up to this are closed; threads up to this are cut.
     hole_areas, speck_areas
@@ -66,7 +72,9 @@ class VectorizeOptions:
 
     working_width_px: float = 6.0
     max_working_pixels: int = 64_000_000
+    max_corners: int = 3_000_000
     max_pieces: int = 300_000
+    max_cover: float = 1.0
     closing_widths: float = 0.35
     opening_widths: float = 0.3
     hole_areas: float = 1.2
@@ -121,18 +129,44 @@ def vectorize(mask: RoadMask, options: VectorizeOptions | None = None) -> Vector
     crowded = np.ceil(np.sqrt(mask.roads.size / options.max_working_pixels))
     factor = int(max(round(width_px / options.working_width_px), crowded, 1))
     width = max(width_px / factor, 1.0)
-    states = _clean(_reduce(mask, factor, min(0.5, 0.45 * width_px / factor)), width, options)
+    states = _reduce(mask, factor, min(0.5, 0.45 * width_px / factor))
+    _refuse_corners(states, mask.name or "mask", options)
+    states = _clean(states, width, options)
     distance = cv2.distanceTransform((states != GROUND).view(np.uint8), cv2.DIST_L2, 5)
     skeleton = _skeletonize(states, distance, width, options)
-    if len(skeleton.edges) > options.max_pieces:
-        raise MaskError(
-            f"{mask.name or 'mask'}: falls into {len(skeleton.edges):,} pieces of road, expected at most "
-            f"{options.max_pieces:,}: this looks like noise; smooth it before it is thresholded, or reduce it"
-        )
+    _refuse_noise(skeleton, width, states.size, mask.name or "mask", options)
     if len(skeleton.edges) == 0:
         raise MaskError(f"{mask.name or 'mask'}: no road is left after cleaning; expected roads as non-zero pixels")
     graph, is_open = _to_graph(skeleton, distance, factor, width, options)
     return Vectorization(graph, width_px, is_open)
+
+
+def _refuse_corners(states: AnyArray, name: str, options: VectorizeOptions) -> None:
+    """Refuse what has outlines without number before they are walked along: each has a corner at its upper left."""
+    n_corners = 0
+    rows = max(_STRIP_PIXELS // states.shape[1], 2)
+    for top in range(0, len(states) - 1, rows):
+        roads = states[top : top + rows + 1] != GROUND
+        here, left, above = roads[1:, 1:], roads[1:, :-1], roads[:-1, 1:]
+        n_corners += int(np.count_nonzero((here != left) & (here != above)))
+    if n_corners > options.max_corners:
+        raise MaskError(
+            f"{name}: its roads have {n_corners:,} corners, expected at most {options.max_corners:,}: this looks like "
+            "noise; smooth it before it is thresholded, or reduce it"
+        )
+
+
+def _refuse_noise(skeleton: _Skeleton, width: float, area: int, name: str, options: VectorizeOptions) -> None:
+    """Refuse, before all that takes longer, what was traced where there are no roads: hatching, halftones, noise."""
+    n_pieces, covered = len(skeleton.edges), float(skeleton.lengths.sum()) * width / area
+    told = f"{n_pieces:,} pieces of road, expected at most {options.max_pieces:,}"
+    if covered > options.max_cover:
+        told = f"{n_pieces:,} pieces of road that would cover {covered:.0%} of the frame"
+    elif n_pieces <= options.max_pieces:
+        return
+    raise MaskError(
+        f"{name}: falls into {told}: this looks like noise; smooth it before it is thresholded, or reduce it"
+    )
 
 
 def road_width(mask: RoadMask) -> float:

@@ -6,6 +6,7 @@ from hypothesis import strategies as st
 from naive import simplification as naive
 from shapely.geometry import LineString, MultiLineString
 
+from roadgeo.errors import RoadSourceError
 from roadgeo.kernels import simplification as kernels
 from roadgeo.roads.graph import RoadGraph
 from roadgeo.roads.simplification import SimplifyOptions, _keep_edges, _walk_faces, coverage, planarize, simplify
@@ -405,3 +406,38 @@ def test_narrow_faces_agree_with_their_twin(drawn, width):
         np.sort(np.reshape(faces, (-1, 2)), axis=0) for faces in (found, naive.narrow_faces(lines, width, 200.0))
     )
     np.testing.assert_allclose(seen, wanted, rtol=1e-6)
+
+
+class TestLinesThatAreNoRoads:
+    """They asked for gigabytes; they are counted first, and refused with numbers."""
+
+    def refuse(self, lines, match):
+        with pytest.raises(RoadSourceError, match=match):
+            coverage(planarize(lines))
+
+    def test_a_net_of_meridians_and_parallels(self):
+        """Drawn every 10 degrees, 54 lines: not many crossings, but a quarter of a million squares for each."""
+        way = np.linspace(-2e7, 2e7, 19)
+        across = [LineString([(x, -2e7), (x, 2e7)]) for x in np.linspace(-2e7, 2e7, 36)]
+        self.refuse(
+            across + [LineString([(x, y) for x in way]) for y in way[:-1]], "squares of 300 m, expected at most"
+        )
+
+    def test_lines_that_all_cross(self):
+        rng = np.random.default_rng(0)
+        self.refuse(shapely.linestrings(rng.random((20_000, 2, 2)) * 1e4), "may cross each other 199,990,000 times")
+
+    def test_one_line_that_crosses_itself(self):
+        rng = np.random.default_rng(0)
+        self.refuse([LineString(rng.random((20_000, 2)) * 1e4)], "may cross each other")
+
+    def test_one_road_many_times_over(self):
+        self.refuse([LineString([(0, 0), (500, k * 1e-6)]) for k in range(20_000)], "each of them many times over")
+
+    def test_lines_beyond_the_earth(self):
+        self.refuse([LineString([(0, 0), (1e12, 0)])], "km long, expected at most 10,000,000")
+
+    def test_dense_streets_are_roads(self):
+        ways = [LineString([(0, y), (3000, y)]) for y in range(0, 3000, 15)]
+        graph = planarize(ways + [LineString([(x, 0), (x, 3000)]) for x in range(0, 3000, 15)])
+        assert graph.n_nodes >= 200 * 200

@@ -252,3 +252,29 @@ def test_every_real_mask_gives_a_graph(data_dir: Path) -> None:
         result = vectorize(RoadMask(cv2.imread(str(path), cv2.IMREAD_GRAYSCALE) > 127))
         assert 5.5 < result.road_width_px < 8.5
         assert (result.graph.degree() >= 3).sum() >= 20
+
+
+@pytest.mark.parametrize(
+    ("kind", "message"),
+    [
+        ("checkerboard", "corners, expected at most 3,000,000"),
+        ("hatching", "would cover 1"),
+        ("squares", "would cover 2"),
+    ],
+)
+def test_what_is_no_road_is_refused_before_it_takes_long(kind: str, message: str) -> None:
+    """A checkerboard of single pixels took a minute and 2 GB at 1500 x 1500, and 8 GB at 3000 x 3000."""
+    y, x = np.mgrid[:2600, :2600] if kind == "checkerboard" else np.mgrid[:700, :700]
+    marked = {
+        "checkerboard": (x + y) % 2 == 0,
+        "hatching": ((x + y) % 4 == 0) | ((x - y) % 4 == 0),
+        "squares": (x // 2 + y // 2) % 2 == 0,
+    }[kind]
+    with pytest.raises(MaskError, match=message):
+        vectorize(RoadMask(marked))
+
+
+def test_a_small_checkerboard_is_refused() -> None:
+    y, x = np.mgrid[:400, :400]
+    with pytest.raises(MaskError, match="would cover"):
+        vectorize(RoadMask((x + y) % 2 == 0))
