@@ -188,7 +188,8 @@ def coverage(graph: RoadGraph, cell_m: float = 300.0) -> list[FloatArray]:
     around = np.stack(np.meshgrid((-1, 0, 1), (-1, 0, 1)), axis=-1).reshape(-1, 2)
     square = np.floor(dense / cell_m).astype(np.int64)
     corner, rows = square.min(axis=0), int(np.ptp(square[:, 1])) + 1
-    numbers = np.unique((square - corner) @ (rows, 1))
+    numbers = np.sort((square - corner) @ (rows, 1))  # `np.unique` hashes them: minutes, where they are regular
+    numbers = numbers[np.diff(numbers, prepend=-1) > 0]
     if len(numbers) > MAX_CELLS:
         raise RoadSourceError(
             f"the roads lie in {len(numbers):,} squares of {cell_m:g} m, expected at most {MAX_CELLS:,}: "
