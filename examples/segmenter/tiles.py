@@ -1,0 +1,92 @@
+"""The photographs and their road masks, as arrays."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from pathlib import Path
+
+import cv2
+import numpy as np
+from numpy.typing import NDArray
+from skimage.morphology import skeletonize
+
+__all__ = ["Tile", "fold_of", "half_size", "read_tiles", "unobserved"]
+
+Bytes = NDArray[np.uint8]
+
+
+@dataclass(frozen=True)
+class Tile:
+    """A photograph and what is known of it. Dimensions: H rows, W columns."""
+
+    name: str
+    photo: Bytes  # (H, W, 3) RGB
+    truth: Bytes  # (H, W, 4), 0 or 255: road, observed, centre lines, and (0 to 255) nearness to an intersection
+
+    @property
+    def observed(self) -> NDArray[np.bool_]:
+        """(H, W): whether there is a photograph."""
+        return self.truth[..., 1] > 127
+
+    @property
+    def road(self) -> NDArray[np.bool_]:
+        """(H, W): whether the map shows a road."""
+        return self.truth[..., 0] > 127
+
+
+def read_tiles(folder: Path, limit: int | None = None) -> list[Tile]:
+    """Read `images/NAME.jpg` (or .tif, .png) with `masks/NAME.png`, in order of name."""
+    photos = sorted(p for p in (folder / "images").iterdir() if p.suffix.lower() in {".jpg", ".jpeg", ".png", ".tif"})
+    if not photos:
+        raise SystemExit(f"{folder}/images: holds no photographs; expected NAME.jpg, .png or .tif")
+    return [_read(path, folder / "masks" / f"{path.stem}.png") for path in photos[:limit]]
+
+
+def fold_of(index: int, folds: int) -> int:
+    """Return the fold that holds out the tile of this index: tiles are dealt out in order of their names."""
+    return index % folds
+
+
+def half_size(tile: Tile) -> Tile:
+    """Return the tile at half its size, each pixel the mean of four: what crops of coarse scale are drawn from."""
+    halve = {"fx": 0.5, "fy": 0.5, "interpolation": cv2.INTER_AREA}
+    return Tile(tile.name, cv2.resize(tile.photo, None, **halve), cv2.resize(tile.truth, None, **halve))
+
+
+def unobserved(photo: Bytes, least_area: int = 20_000) -> NDArray[np.bool_]:
+    """Return (H, W) where the photograph is a large plain white or black area: there is none of the ground."""
+    void = np.zeros(photo.shape[:2], bool)
+    for plain in (photo.min(axis=2) >= 250, photo.max(axis=2) <= 3):
+        opened = cv2.morphologyEx(plain.astype(np.uint8), cv2.MORPH_OPEN, np.ones((15, 15), np.uint8))
+        n, labels, stats, _ = cv2.connectedComponentsWithStats(opened)
+        void |= np.isin(labels, [i for i in range(1, n) if stats[i, cv2.CC_STAT_AREA] >= least_area])
+    return void
+
+
+def _read(photo_path: Path, mask_path: Path) -> Tile:
+    photo, mask = cv2.imread(str(photo_path), cv2.IMREAD_COLOR), cv2.imread(str(mask_path), cv2.IMREAD_GRAYSCALE)
+    if photo is None or mask is None or photo.shape[:2] != mask.shape:
+        raise SystemExit(f"{photo_path}: needs a mask of the same size, {mask_path}")
+    photo = cv2.cvtColor(photo, cv2.COLOR_BGR2RGB)
+    # JPEG smears the edge of the void over a few pixels.
+    observed = ~cv2.dilate(unobserved(photo).astype(np.uint8), np.ones((9, 9), np.uint8)).astype(bool)
+    road = mask > 127
+    centre = skeletonize(road)
+    thick = cv2.dilate(centre.astype(np.uint8), np.ones((3, 3), np.uint8))
+    return Tile(
+        photo_path.stem,
+        photo,
+        np.dstack([road * 255, observed * 255, thick * 255, _near_intersections(centre)]).astype(np.uint8),
+    )
+
+
+def _near_intersections(centre: NDArray[np.bool_], sigma: float = 5.0) -> NDArray[np.float32]:
+    """Return 255 at intersections of the centre lines, falling off as a Gaussian of `sigma` px."""
+    neighbours = cv2.filter2D(centre.astype(np.uint8), -1, np.ones((3, 3), np.uint8), borderType=cv2.BORDER_CONSTANT)
+    forks = (centre & (neighbours >= 4)).astype(np.uint8)
+    _, _, _, centroids = cv2.connectedComponentsWithStats(cv2.dilate(forks, np.ones((7, 7), np.uint8)))
+    elsewhere = np.full(centre.shape, 255, np.uint8)
+    for x, y in np.rint(centroids[1:]).astype(int):
+        elsewhere[y, x] = 0
+    distance = cv2.distanceTransform(elsewhere, cv2.DIST_L2, 5)
+    return 255 * np.exp(-0.5 * (distance / sigma) ** 2)
