@@ -24,7 +24,7 @@ from tiles import Tile, fold_of, read_tiles
 from training import TrainingOptions, probabilities, train
 
 SCALES = (1.0, 0.5, 2.0)  # metres per pixel of the held-out photographs that are predicted
-RUN_AT = 1.5  # metres per pixel at which the network sees them: the middle of the scales that it is trained at
+RUN_AT = 1.0  # metres per pixel at which the network sees them
 
 
 def main(arguments: list[str] | None = None) -> None:
