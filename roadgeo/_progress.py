@@ -2,9 +2,11 @@
 
 from __future__ import annotations
 
-from typing import Protocol
+from collections.abc import Callable
+from contextlib import AbstractContextManager, nullcontext
+from typing import Protocol, TypeAlias
 
-__all__ = ["Say", "say_nothing"]
+__all__ = ["Counting", "Say", "count_nothing", "say_nothing"]
 
 
 class Say(Protocol):
@@ -19,3 +21,12 @@ class Say(Protocol):
 
 def say_nothing(text: str, share: float | None = None) -> None:
     """Be the `Say` of callers that do not care."""
+
+
+#: Given how many there are to do, shows how many are done; what it yields counts one more of a sort ("located").
+Counting: TypeAlias = Callable[[int], AbstractContextManager[Callable[[str], None]]]
+
+
+def count_nothing(total: int) -> AbstractContextManager[Callable[[str], None]]:  # noqa: ARG001 (the shape of `Counting`)
+    """Show nothing: for callers that do not ask."""
+    return nullcontext(lambda _: None)

@@ -6,10 +6,14 @@ from dataclasses import dataclass, field
 from html import escape
 from typing import TYPE_CHECKING, Any, Literal
 
+import numpy as np
+
 from roadgeo._arrays import FloatArray
+from roadgeo._version import __version__
 from roadgeo.errors import NotLocatedError
 from roadgeo.geometry.frame import Frame
 from roadgeo.geometry.homography import Homography
+from roadgeo.geometry.mask import plane_to_pixel
 from roadgeo.roads.graph import RoadGraph
 
 if TYPE_CHECKING:
@@ -118,6 +122,10 @@ class Location:
         knows no odds.
     runner_up : Place or None
         The best other place, on any of the references.
+    options : dict or None
+        What was asked, as far as it differs from the usual, in plain values; None: not told.
+    reference_digest : str
+        Of the roads of the reference; "" where it has no file.
     """
 
     query: str
@@ -143,6 +151,8 @@ class Location:
     runner_up: Place | None = None
     seconds: Seconds = field(default_factory=Seconds)
     stats: Stats = field(default_factory=Stats)
+    options: dict[str, Any] | None = field(default=None, repr=False)
+    reference_digest: str = ""
     evidence: Evidence | None = None
     seen: Seen | None = field(default=None, repr=False)
 
@@ -218,6 +228,15 @@ class Location:
         )
         return f"<table><caption>{escape(self.query)}</caption>{cells}</table>"
 
+    def rmse(self) -> tuple[float, float] | None:
+        """Root mean square distance of the matched intersections from where the map has them: metres, pixels."""
+        if self.evidence is None or self.homography is None or not len(self.evidence.query_xy):
+            return None
+        pixels, to_crs = plane_to_pixel(self.evidence.query_xy), Homography(self.homography)
+        errors = (to_crs(pixels) - self.evidence.reference_xy, pixels - to_crs.inverse()(self.evidence.reference_xy))
+        metres, px = (float(np.sqrt(np.mean(np.sum(error**2, axis=1)))) for error in errors)
+        return (metres, px) if np.isfinite([metres, px]).all() else None
+
     def to_dict(self) -> dict[str, Any]:
         """Plain values in the order of the schema, ready for `json.dumps`; evidence and what was seen are left out."""
 
@@ -226,13 +245,17 @@ class Location:
 
         center = self.center
         runner_up = self.runner_up
+        rmse_m, rmse_px = self.rmse() or (None, None)
         return {
             "schema": SCHEMA,
+            "version": __version__,
             "query": self.query,
             "status": self.status,
             "reason": self.reason,
             "reference": self.reference,
+            "reference_digest": self.reference_digest or None,
             "attribution": self.attribution,
+            "options": self.options,
             "crs": self.crs,
             "size": None if self.size is None else list(self.size),
             "homography": rows(self.homography),
@@ -244,6 +267,8 @@ class Location:
             "tilt_deg": self.tilt_deg,
             "tilt_source": self.tilt_source,
             "corner_sigma_m": rows(self.corner_sigma_m),
+            "rmse_m": rmse_m,
+            "rmse_px": rmse_px,
             "n_intersections": self.n_intersections,
             "n_matched": self.n_matched,
             "inlier_ratio": self.inlier_ratio,

@@ -2,7 +2,7 @@
 
 A source takes where to look and `say`, which it may tell what it waits for, and returns `roadgeo.sources.roads.Roads`.
 A segmenter takes the path of a photograph and returns a `roadgeo.RoadMask`, or an array that
-`roadgeo.sources.masks.read_mask` takes. An output is a `roadgeo.outputs.products.Product`. `examples/plugin` has one of
+`roadgeo.sources.masks.read_mask` takes. An output is a `roadgeo.outputs.registry.Output`. `examples/plugin` has one of
 each.
 """
 

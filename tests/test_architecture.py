@@ -11,7 +11,7 @@ ROOT = Path(roadgeo.__file__).parent
 
 #: What each storey holds: folders and modules at the top of the package. One imports from storeys below, and its own.
 STOREYS_TEXT = """
-    words       _version _arrays _folders _progress errors plugins
+    words       _version _arrays _folders _processes _progress errors plugins
     kernels     kernels
     planes      geometry storage
     roads       roads
@@ -19,7 +19,7 @@ STOREYS_TEXT = """
     matching    matching
     references  reference
     exits       outputs
-    workflows   workflows looks queries
+    workflows   workflows looks queries batch
     evaluation  evaluation
     faces       cli qgis demo __main__ __init__
 """

@@ -16,12 +16,11 @@ import shapely
 
 from roadgeo import plugins
 from roadgeo.cli import main
-from roadgeo.cli.locate import Job
 from roadgeo.demo import ROADS, demo_masks
 from roadgeo.errors import MaskError, PluginError
 from roadgeo.geometry.mask import RoadMask
 from roadgeo.geometry.projection import to_lonlat
-from roadgeo.outputs.products import PRODUCTS
+from roadgeo.outputs.registry import ALSO
 from roadgeo.plugins import GROUPS, OUTPUTS, SEGMENTERS, SOURCES, call_plugin, find_plugins, load_plugin
 from roadgeo.sources.masks import read_mask
 from roadgeo.sources.roads import fetch_roads, read_roads
@@ -69,7 +68,7 @@ NOT_CALLABLE = 7
 
 
 def test_our_own_are_registered_like_all_others() -> None:
-    assert {name: load_plugin(OUTPUTS, name) for name in find_plugins(OUTPUTS)} == PRODUCTS
+    assert {name: load_plugin(OUTPUTS, name) for name in find_plugins(OUTPUTS)} == ALSO
     assert {load_plugin(SOURCES, name) for name in find_plugins(SOURCES)} == {read_roads, fetch_roads}
     assert load_plugin(SEGMENTERS, "mask") is read_mask
     declared = tomllib.loads((ROOT / "pyproject.toml").read_text(encoding="utf-8"))["project"]["entry-points"]
@@ -114,10 +113,11 @@ def test_what_a_plugin_refuses_is_said_as_it_says_it(offer) -> None:
 
 @pytest.mark.parametrize("kind", ["mask", "array"])
 def test_a_segmenter_may_return_a_mask_or_an_array(offer, kind: str) -> None:
-    from roadgeo.cli.batch import Task
+    from roadgeo.batch import ReadOptions, Task, _Locating
 
     offer(segmenters_mask=f"{__name__}:see_mask", segmenters_array=f"{__name__}:see_array")
-    job = Job((), None, None, ".", segmenter=kind)  # type: ignore[arg-type]  # only reading is asked of it
+    reading = ReadOptions(segmenter=kind)
+    job = _Locating((), ".", None, None, reading, skip_existing=False)  # type: ignore[arg-type]  # it only reads
     mask = job._read(Task(str(SHEET), "map_sheet"))
     assert mask.name == str(SHEET)
     assert np.array_equal(mask.roads, read_mask(SHEET).roads)
@@ -153,7 +153,7 @@ def test_the_command_line_knows_what_is_installed(
     ("kind", "message"),
     [
         ("sources", "the source 'odd' returned a NoneType, expected roadgeo.sources.roads.Roads"),
-        ("outputs", "the output 'odd' is a function, expected a roadgeo.outputs.products.Product"),
+        ("outputs", "the output 'odd' is a function, expected a roadgeo.outputs.registry.Output"),
         ("segmenters", "the segmenter 'odd' returned a NoneType, expected a RoadMask or an array"),
     ],
 )

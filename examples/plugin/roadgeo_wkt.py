@@ -5,7 +5,7 @@ from pathlib import Path
 import cv2
 import shapely
 
-from roadgeo.outputs.products import Product
+from roadgeo.outputs.registry import Output
 from roadgeo.sources.roads import Roads, project_lines
 
 
@@ -27,4 +27,4 @@ def write_wkt(path, subject):
     path.write_text(f"{shapely.Polygon(subject.place.footprint).wkt}\n")
 
 
-WKT = Product("_footprint.wkt", write_wkt, "footprint as well-known text")
+WKT = Output("wkt", "_footprint.wkt", write_wkt, "footprint as well-known text")

@@ -12,7 +12,7 @@ from roadgeo.cli import ERROR
 from roadgeo.outputs.wording import format_lonlat
 
 if TYPE_CHECKING:
-    from roadgeo.cli.locate import Outcome
+    from roadgeo.batch import Outcome
     from roadgeo.demo import DemoMask
 
 __all__ = ["demo_command"]
@@ -43,14 +43,14 @@ def demo_command(out_dir: str) -> int:
       roadgeo demo
       roadgeo demo --out-dir porto
     """
-    from roadgeo.cli.batch import Task
+    from roadgeo.batch import Task, locate_masks
     from roadgeo.cli.compilation import compile_once
     from roadgeo.cli.folders import make_folder
-    from roadgeo.cli.locate import Job
     from roadgeo.demo import ATTRIBUTION, PHOTO, ROADS, demo_masks
     from roadgeo.outputs.location_files import OutputOptions
+    from roadgeo.outputs.registry import OVERLAY
     from roadgeo.storage.files import write_bytes
-    from roadgeo.workflows import LocateOptions, build_reference
+    from roadgeo.workflows import build_reference
 
     folder, masks = Path(out_dir), demo_masks()
     make_folder(folder / "masks")
@@ -61,11 +61,12 @@ def demo_command(out_dir: str) -> int:
     seconds = perf_counter() - started
     click.echo(f"Porto, {ATTRIBUTION}: {len(reference.index):,} intersections, indexed in {seconds:.1f} s")
     compile_once(reference, quiet=False)
-    job = Job((str(folder / "porto.gpkg"),), LocateOptions(), OutputOptions(), out_dir, plot=True)
-    locate = job.prepare()
+    tasks = [Task(str(mask.path), mask.path.stem) for mask in masks]
+    outputs = OutputOptions(products=(OVERLAY.name,))
     wrong = 0
-    for mask in masks:
-        outcome = locate(Task(str(mask.path), mask.path.stem))
+    for mask, outcome in zip(
+        masks, locate_masks(tasks, [str(folder / "porto.gpkg")], out_dir, outputs=outputs), strict=True
+    ):
         right, text = _judge(outcome, mask)
         wrong += not right
         click.echo(f"\n{mask.path.name}: {mask.title}\n  {text}")
@@ -82,7 +83,7 @@ def _judge(outcome: Outcome, mask: DemoMask) -> tuple[bool, str]:
     """Compare with the truth: whether it is right, and what to say."""
     found = outcome.document
     if outcome.status == "error":
-        return False, outcome.text
+        return False, str(found["reason"])
     if outcome.status != "located":
         right = not mask.in_map
         return right, f"{'refused, as it should be' if right else 'not found, although it is there'}: {found['reason']}"

@@ -7,21 +7,23 @@ import math
 import sys
 import time
 from collections.abc import Iterator, Sequence
+from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Literal
 
 import click
 from click.core import ParameterSource
 
-from roadgeo.cli.parameters import RANGE
-from roadgeo.cli.queries import QUERY_OPTIONS, count_up, query_options, query_sets
+from roadgeo.cli.hints import hint_options, make_options
+from roadgeo.cli.progress import count_up
+from roadgeo.cli.queries import QUERY_OPTIONS, query_options, query_sets
 
 if TYPE_CHECKING:
     from rich.table import Table
 
     from roadgeo.evaluation.scoring import Evaluation, Share, Spread, Summary
+    from roadgeo.evaluation.survey import Survey
     from roadgeo.evaluation.trials import QuerySet, ReferenceLocator
-    from roadgeo.evaluation.truth import Truth
 
 __all__ = ["evaluate_command"]
 
@@ -31,9 +33,7 @@ __all__ = ["evaluate_command"]
 @click.option("--queries", type=click.Path(exists=True, path_type=Path), help="A query set: its folder, or its table.")
 @query_options
 @click.option("--method", type=click.Choice(["auto", "pair"]), default="auto", show_default=True, help="As in locate.")
-@click.option("--known-gsd", metavar="LO:HI", type=RANGE, help="Tell the locator, as --gsd of `roadgeo locate` does.")
-@click.option("--max-tilt", metavar="DEG", type=click.FloatRange(0, 80), help="Tell the locator, as that of locate.")
-@click.option("--north-up", is_flag=True, help="Tell the locator, as that of locate.")
+@hint_options("gsd_m", "max_tilt_deg", "north_up", gsd_m="--known-gsd")
 @click.option(
     "--time-limit", type=click.FloatRange(0.01), metavar="S", default=10.0, show_default=True, help="Per mask."
 )
@@ -65,8 +65,8 @@ def evaluate_command(
     queries: Path | None,
     roads: Path | None,
     method: Literal["auto", "pair"],
-    known_gsd: tuple[float, float] | None,
-    max_tilt: float | None,
+    gsd_m: tuple[float, float] | None,
+    max_tilt_deg: float | None,
     north_up: bool,
     time_limit: float,
     radius: float,
@@ -96,7 +96,6 @@ def evaluate_command(
       roadgeo evaluate boston-ma --queries queries/truth.csv --method pair
       roadgeo evaluate boston-ma --map --height 400 --focal 2000 --size 1200 --noise segmented --check 300
     """
-    from roadgeo.cli.locate import make_options
     from roadgeo.evaluation.trials import ReferenceLocator
     from roadgeo.reference.library import resolve_reference
     from roadgeo.storage.atomic import writing
@@ -108,17 +107,20 @@ def evaluate_command(
             out_dir.mkdir(parents=True, exist_ok=True)
     if height is not None:
         options["gsd"] = (height / (options["focal"] or options["size"]),) * 2
-    locator = ReferenceLocator((path,), make_options(method, known_gsd, max_tilt, None, north_up, time_limit))
-    hints = {"known_gsd": known_gsd, "max_tilt": max_tilt, "north_up": north_up or None, "time_limit_s": time_limit}
-    told = {"reference": path.stem, "method": method, **_known(hints)}
+    hints = {"gsd_m": gsd_m, "max_tilt_deg": max_tilt_deg, "north_up": north_up}
+    locator = ReferenceLocator((path,), make_options(method, time_limit, hints))
+    known = {"known_gsd": gsd_m, "max_tilt": max_tilt_deg, "north_up": north_up or None, "time_limit_s": time_limit}
+    told = {"reference": path.stem, "method": method, **_known(known)}
     if as_map:
-        from roadgeo.cli.localizability import ANY, Survey
+        from roadgeo.evaluation.survey import ANY, Survey
 
         trials = options["count"] or 600
         ((simulation, _), *_) = query_sets(**options | {"intersections": ANY})
         settings = {name: value for name, value in options.items() if name not in ("intersections", "mirrored")}
         settings = _known(settings | {"count": trials, "noise": simulation.kind}) | told
-        Survey(path, simulation, locator, trials, check, jobs, quiet, settings, out_dir).run(as_json)
+        counting = partial(count_up, quiet=quiet)
+        survey = Survey(path, simulation, locator, trials, check, jobs, settings, out_dir, counting)
+        _write_map(survey, as_json, quiet)
         return
     query_set, settings = _query_set(path, queries, roads, options)
     settings |= told
@@ -207,7 +209,7 @@ def _query_set(
     reference: Path, queries: Path | None, roads: Path | None, options: dict[str, Any]
 ) -> tuple[QuerySet, dict[str, Any]]:
     """Choose between a query set on disk and one to draw, and say which."""
-    from roadgeo.evaluation.trials import DrawnMasks, MaskFiles
+    from roadgeo.evaluation.trials import DrawnMasks, MaskFiles, count_elsewhere
     from roadgeo.evaluation.truth import read_truth
 
     if queries is None:
@@ -215,7 +217,7 @@ def _query_set(
         return DrawnMasks(reference, query_sets(**options), roads), _known(options) | drawn_from
     table = queries / "truth.csv" if queries.is_dir() else queries
     truths = read_truth(table)
-    elsewhere = _count_elsewhere(truths, reference)
+    elsewhere = count_elsewhere(truths, reference)
     if elsewhere:
         click.echo(
             f"Warning: the places of {elsewhere} of {len(truths)} masks are not on {reference.stem}; they count against"
@@ -225,21 +227,27 @@ def _query_set(
     return MaskFiles(table.parent, tuple(truths)), {"queries": str(queries)}
 
 
-def _count_elsewhere(truths: Sequence[Truth], reference: Path) -> int:
-    """Count masks whose place lies beyond the bounds of a reference."""
-    import numpy as np
+def _write_map(survey: Survey, as_json: bool, quiet: bool) -> None:
+    """Make the map of localizability; print how much of it promises what."""
+    from roadgeo.evaluation.survey import write_survey
 
-    from roadgeo.geometry.projection import transformer
-    from roadgeo.reference.network_file import read_network
-
-    network = read_network(reference)
-    low, high = network.graph.coords.min(axis=0), network.graph.coords.max(axis=0)
-    count = 0
-    for truth in truths:
-        center = transformer(truth.crs or network.plane.crs, network.plane.crs).transform(*truth.center)
-        xy = network.plane.from_crs(np.array([center], float))
-        count += truth.on_map and not ((xy >= low) & (xy <= high)).all()
-    return count
+    summary, files = write_survey(survey, survey.out_dir or Path())
+    if as_json:
+        click.echo(json.dumps(summary))
+        return
+    if quiet:
+        return
+    for entry in summary["classes"]:
+        line = f"{entry['label']:<28} {100 * entry['area_share']:5.1f} % of the map"
+        if entry["located"]:
+            line += f"; located there: {entry['located']['hits']} of {entry['located']['of']}"
+        click.echo(line)
+    if not summary["classes"][0]["area_share"]:
+        click.echo(
+            "No promise can be made anywhere: too few masks were located, or tried; a larger -n, wider windows or"
+            " better masks may help."
+        )
+    click.echo(f"wrote {files[0]}, {', '.join(path.suffix for path in files[1:])}", err=True)
 
 
 # --- printing ---------------------------------------------------------------------------------------------------------

@@ -53,13 +53,26 @@ class Numbers(click.ParamType):  # type: ignore[type-arg]  # generic only in lat
 
 
 class Plugin(click.ParamType):  # type: ignore[type-arg]
-    """The name of a plugin, and with `has_argument` a colon and what it is to look at: "osm:Boston, MA"."""
+    """The name of a plugin, and with `has_argument` a colon and what it is to look at: "osm:Boston, MA".
+
+    `names` gives the names that are known, where there are more than the plugins'.
+    """
 
     name = "plugin"
 
-    def __init__(self, group: str, *, has_argument: bool = False) -> None:
+    def __init__(
+        self, group: str, *, has_argument: bool = False, names: Callable[[], Sequence[str]] | None = None
+    ) -> None:
         self.group = group
         self.has_argument = has_argument
+        self.names = names
+
+    def _known(self) -> Sequence[str]:
+        if self.names is not None:
+            return self.names()
+        from roadgeo.plugins import find_plugins
+
+        return sorted(find_plugins(self.group))
 
     def convert(self, value: Any, param: click.Parameter | None, ctx: click.Context | None) -> str:
         """Check that it is installed; nothing of it is imported.
@@ -69,10 +82,8 @@ class Plugin(click.ParamType):  # type: ignore[type-arg]
         click.BadParameter
             It is not, or the colon is missing.
         """
-        from roadgeo.plugins import find_plugins
-
         name, colon, _ = str(value).partition(":")
-        known = sorted(find_plugins(self.group))
+        known = self._known()
         if name not in known or bool(colon) != self.has_argument:
             expected = ", ".join(f"{one}:WHERE" if self.has_argument else one for one in known)
             self.fail(f"got {value!r}, expected one of {expected}", param, ctx)
@@ -82,9 +93,7 @@ class Plugin(click.ParamType):  # type: ignore[type-arg]
         """Offer the names that begin so."""
         from click.shell_completion import CompletionItem
 
-        from roadgeo.plugins import find_plugins
-
-        return [CompletionItem(name) for name in sorted(find_plugins(self.group)) if name.startswith(incomplete)]
+        return [CompletionItem(name) for name in self._known() if name.startswith(incomplete)]
 
 
 class Focal(click.ParamType):  # type: ignore[type-arg]

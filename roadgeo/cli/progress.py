@@ -7,14 +7,13 @@ import os
 import sys
 from collections import Counter
 from collections.abc import Callable, Iterator
-from contextlib import contextmanager
-from typing import Any
+from contextlib import AbstractContextManager, contextmanager, nullcontext
 
 import click
 
 from roadgeo._progress import Say, say_nothing
 
-__all__ = ["print_progress", "print_steps", "show_progress", "show_steps"]
+__all__ = ["count_up", "print_steps", "show_steps"]
 
 
 @contextmanager
@@ -75,9 +74,51 @@ def _show_bars() -> Iterator[Say]:
         yield say
 
 
+def name_counts(counts: Counter[str]) -> str:
+    """Say how many there are of each sort, as they came."""
+    return ", ".join(f"{n} {sort}" for sort, n in counts.items())
+
+
 @contextmanager
-def show_progress(total: int, summarize: Callable[[Counter[Any]], str]) -> Iterator[Callable[[Counter[Any]], None]]:
-    """Show a bar of `total` steps; yield what moves it on, given the counts so far, which stand beside it.
+def count_up(
+    total: int, quiet: bool, as_json: bool = False, summarize: Callable[[Counter[str]], str] = name_counts
+) -> Iterator[Callable[[str], None]]:
+    """Show on standard error how many of `total` are done; yield what counts one more of a sort.
+
+    People get a bar on a terminal, unless the JSON of `as_json` fills that too, or there is but one to do. Programs
+    that set ROADGEO_PROGRESS=json get lines like {"progress": {"done": 3, "total": 10, "text": "2 located, 1 failed"}}.
+    """
+    counts: Counter[str] = Counter()
+    if os.environ.get("ROADGEO_PROGRESS") == "json":
+        show: AbstractContextManager[Callable[[str], None]] = nullcontext(_print_counts(total))
+    elif quiet or total < 2 or not sys.stderr.isatty() or (as_json and sys.stdout.isatty()):
+        show = nullcontext(lambda _: None)
+    else:
+        show = _show_bar(total)
+    with show as tell:
+
+        def count(sort: str) -> None:
+            counts[sort] += 1
+            tell(summarize(counts))
+
+        yield count
+
+
+def _print_counts(total: int) -> Callable[[str], None]:
+    """Return what prints one more of `total` as a line of JSON."""
+    done = 0
+
+    def tell(text: str) -> None:
+        nonlocal done
+        done += 1
+        click.echo(json.dumps({"progress": {"done": done, "total": total, "text": text}}), err=True)
+
+    return tell
+
+
+@contextmanager
+def _show_bar(total: int) -> Iterator[Callable[[str], None]]:
+    """Show a bar of `total` steps; yield what moves it on, with a text beside it.
 
     Lines printed to a terminal meanwhile appear above it; standard output that goes elsewhere is left alone.
     """
@@ -88,19 +129,4 @@ def show_progress(total: int, summarize: Callable[[Counter[Any]], str]) -> Itera
     console = Console(stderr=True)
     with Progress(*columns, console=console, transient=True, redirect_stdout=sys.stdout.isatty()) as progress:
         task = progress.add_task("", total=total)
-
-        def advance(counts: Counter[Any]) -> None:
-            progress.update(task, advance=1, description=summarize(counts))
-
-        yield advance
-
-
-@contextmanager
-def print_progress(total: int, summarize: Callable[[Counter[Any]], str]) -> Iterator[Callable[[Counter[Any]], None]]:
-    """Do as `show_progress`, in lines such as {"progress": {"done": 3, "total": 10, "text": "2 located, 1 failed"}}."""
-
-    def advance(counts: Counter[Any]) -> None:
-        progress = {"done": counts.total(), "total": total, "text": summarize(counts)}
-        click.echo(json.dumps({"progress": progress}), err=True)
-
-    yield advance
+        yield lambda text: progress.update(task, advance=1, description=text)

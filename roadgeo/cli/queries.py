@@ -2,11 +2,7 @@
 
 from __future__ import annotations
 
-import os
-import sys
-from collections import Counter
-from collections.abc import Callable, Iterator
-from contextlib import contextmanager
+from collections.abc import Callable
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, TypeVar
 
@@ -17,7 +13,7 @@ from roadgeo.cli.parameters import RANGE, Numbers
 if TYPE_CHECKING:
     from roadgeo.evaluation.simulation import SimulationOptions
 
-__all__ = ["QUERY_OPTIONS", "count_up", "query_options", "query_sets"]
+__all__ = ["QUERY_OPTIONS", "query_options", "query_sets"]
 
 Command = TypeVar("Command", bound=Callable[..., Any])
 
@@ -138,30 +134,6 @@ def query_options(command: Command) -> Command:
     for option in reversed(_OPTIONS):
         command = option(command)
     return command
-
-
-@contextmanager
-def count_up(total: int, quiet: bool) -> Iterator[Callable[[str], None]]:
-    """Show a bar on standard error, where that is a terminal; yields what counts one more of a sort.
-
-    Programs that set ROADGEO_PROGRESS=json get lines of JSON instead.
-    """
-    as_json = os.environ.get("ROADGEO_PROGRESS") == "json"
-    if not as_json and (quiet or not sys.stderr.isatty()):
-        yield lambda _: None
-        return
-    from roadgeo.cli.progress import print_progress, show_progress
-
-    counts: Counter[str] = Counter()
-    show = print_progress if as_json else show_progress
-
-    with show(total, lambda counts: ", ".join(f"{n} {sort}" for sort, n in counts.items())) as advance:
-
-        def count(sort: str) -> None:
-            counts[sort] += 1
-            advance(counts)
-
-        yield count
 
 
 def query_sets(

@@ -7,7 +7,8 @@ from typing import Any
 
 import click
 
-from roadgeo.cli.queries import count_up, query_options, query_sets
+from roadgeo.cli.progress import count_up
+from roadgeo.cli.queries import query_options, query_sets
 
 __all__ = ["simulate_command"]
 

@@ -4,8 +4,8 @@ from __future__ import annotations
 
 import click
 
+from roadgeo.batch import find_masks, name_tasks
 from roadgeo.cli import ERROR
-from roadgeo.cli.batch import find_masks, name_tasks
 from roadgeo.cli.folders import make_folder
 
 __all__ = ["vectorize_command"]
@@ -50,6 +50,11 @@ def vectorize_command(masks: tuple[str, ...], out_dir: str, threshold: float | N
             files = write_vectorized(out_dir, task.stem, mask, graph, scene.intersections)
         except RoadgeoError as error:
             click.echo(f"Error: {error}", err=True)
+            status = ERROR
+            continue
+        except Exception as error:  # of a library: nothing wrong with one mask stops the others
+            what = f"{type(error).__name__}: {error}"
+            click.echo(f"Error: {task.mask}: {what}; this is a fault of roadgeo, please report it", err=True)
             status = ERROR
             continue
         seen = f"{len(scene.intersections)} intersections, {graph.n_edges} roads between them"

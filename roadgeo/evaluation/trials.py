@@ -3,18 +3,15 @@
 from __future__ import annotations
 
 import json
-import multiprocessing
-import signal
-from collections.abc import Callable, Iterator, Mapping, Sequence
-from concurrent.futures import ProcessPoolExecutor
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any, Protocol, TypeAlias
 
-import cv2
 import numpy as np
 
 from roadgeo._arrays import AnyArray
+from roadgeo._processes import run
 from roadgeo.errors import MaskError, OutputError
 from roadgeo.evaluation.landscape import Landscape
 from roadgeo.evaluation.simulation import SimulationOptions, simulate_query, simulate_query_at
@@ -34,6 +31,7 @@ __all__ = [
     "QuerySet",
     "ReferenceLocator",
     "Trial",
+    "count_elsewhere",
     "read_landscape",
     "run_trials",
 ]
@@ -78,6 +76,18 @@ class MaskFiles:
     def open(self) -> Callable[[int], tuple[Truth, Mask]]:
         """Return the function that names the k-th file."""
         return lambda k: (self.truths[k], str(self.folder / self.truths[k].file))
+
+
+def count_elsewhere(truths: Sequence[Truth], reference: Path) -> int:
+    """Count masks whose place lies beyond the bounds of a reference, though its truth does not say so."""
+    network = read_network(reference)
+    low, high = network.graph.coords.min(axis=0), network.graph.coords.max(axis=0)
+    count = 0
+    for truth in truths:
+        center = transformer(truth.crs or network.plane.crs, network.plane.crs).transform(*truth.center)
+        xy = network.plane.from_crs(np.array([center], float))
+        count += truth.on_map and not ((xy >= low) & (xy <= high)).all()
+    return count
 
 
 def read_landscape(geopackage: Path, roads: Path | None = None) -> Landscape:
@@ -226,7 +236,7 @@ def run_trials(
         if progress:
             progress(trial)
     pending = range(len(done), len(queries))
-    for trial in _results(queries, locator, pending, jobs):
+    for trial in run(pending, _Trying(queries, locator), jobs) if pending else ():
         if record is not None:
             _append(record, trial)
         done.append(trial)
@@ -237,41 +247,28 @@ def run_trials(
 
 # --- running ----------------------------------------------------------------------------------------------------------
 
-_draw: Callable[[int], tuple[Truth, Mask]]
-_locate: Callable[[Mask], Answer]
 
+@dataclass(frozen=True)
+class _Trying:
+    """What is done with the number of every query; travels to other processes."""
 
-def _results(queries: QuerySet, locator: Locator, pending: Sequence[int], jobs: int) -> Iterator[Trial]:
-    if not pending:
-        return
-    if jobs == 1:
-        draw, locate = queries.open(), locator.open()
-        for k in pending:
+    queries: QuerySet
+    locator: Locator
+
+    def prepare(self) -> Callable[[int], Trial]:
+        """Open what a process needs, once."""
+        draw, locate = self.queries.open(), self.locator.open()
+
+        def attempt(k: int) -> Trial:
             truth, mask = draw(k)
-            yield Trial(truth, locate(mask))
-        return
-    # Spawned, not forked: the same on every system, and no thread of ours is lost in the child.
-    with ProcessPoolExecutor(
-        min(jobs, len(pending)), multiprocessing.get_context("spawn"), _prepare, (queries, locator)
-    ) as pool:
-        try:
-            yield from pool.map(_run, pending)
-        except BaseException:
-            pool.shutdown(wait=False, cancel_futures=True)
-            raise
+            return Trial(truth, locate(mask))
 
+        return attempt
 
-def _prepare(queries: QuerySet, locator: Locator) -> None:
-    """Open what a worker process needs, once."""
-    global _draw, _locate
-    signal.signal(signal.SIGINT, signal.SIG_IGN)  # Ctrl-C is the parent's to handle
-    cv2.setNumThreads(1)
-    _draw, _locate = queries.open(), locator.open()
-
-
-def _run(k: int) -> Trial:
-    truth, mask = _draw(k)
-    return Trial(truth, _locate(mask))
+    def give_up(self, task: int, reason: str) -> Trial:
+        """Count a query whose process died as not located."""
+        truth, _ = self.queries.open()(task)
+        return Trial(truth, {"status": "not_located", "reason": reason})
 
 
 # --- the record -------------------------------------------------------------------------------------------------------

@@ -2,14 +2,13 @@
 
 from __future__ import annotations
 
-import os
+from pathlib import Path
 
 import cv2
 import numpy as np
 
 from roadgeo._arrays import AnyArray
 from roadgeo.errors import OutputError
-from roadgeo.storage.files import write_bytes
 
 __all__ = [
     "FAINT_INK",
@@ -44,18 +43,18 @@ FAINT_INK: Color = (110, 114, 120)
 SHIFT = 4  # fractional bits of the coordinates that OpenCV draws at
 
 
-def write_png(path: str | os.PathLike[str], image: AnyArray) -> None:
-    """Write a picture (H, W, 3), in one step.
+def write_png(path: Path, image: AnyArray) -> None:
+    """Write a picture (H, W, 3).
 
     Raises
     ------
     OutputError
-        The file cannot be written.
+        It is too large for the format.
     """
     done, encoded = cv2.imencode(".png", image[:, :, ::-1], [cv2.IMWRITE_PNG_COMPRESSION, 9])
     if not done:
         raise OutputError(f"cannot write {path}: OpenCV did not encode the picture; use a smaller one")
-    write_bytes(path, encoded.tobytes())
+    path.write_bytes(encoded.tobytes())
 
 
 def draw_dots(image: AnyArray, centers: AnyArray, radius: float) -> None:

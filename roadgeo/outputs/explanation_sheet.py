@@ -2,8 +2,8 @@
 
 from __future__ import annotations
 
+import json
 import math
-import os
 from collections.abc import Sequence
 from dataclasses import dataclass, fields
 from pathlib import Path
@@ -12,6 +12,7 @@ import cv2
 import numpy as np
 
 from roadgeo._arrays import AnyArray, FloatArray
+from roadgeo.errors import OutputError
 from roadgeo.geometry.mask import RoadMask, plane_to_pixel
 from roadgeo.matching.explanation import Explanation, Funnel, RejectedPlace, Story
 from roadgeo.matching.index import ReferenceIndex
@@ -32,9 +33,10 @@ from roadgeo.outputs.canvas import (
     write_png,
     write_text,
 )
+from roadgeo.outputs.subject import Subject
 from roadgeo.outputs.wording import format_lonlat
 
-__all__ = ["draw_explanation", "write_explanation_picture"]
+__all__ = ["draw_explanation", "write_explanation", "write_explanation_picture"]
 
 AGREES: Color = (0, 128, 128)
 ROAD_PIXEL: Color = (206, 208, 210)
@@ -61,17 +63,22 @@ _STAGES = {
 }
 
 
-def write_explanation_picture(
-    path: str | os.PathLike[str], explanation: Explanation, mask: RoadMask, index: ReferenceIndex
-) -> None:
-    """Write `draw_explanation` as PNG, in one step.
+def write_explanation(path: Path, subject: Subject) -> None:
+    """Write `Explanation.to_dict` as JSON."""
+    told = json.dumps(_explained(subject).to_dict(), indent=2, allow_nan=False)
+    path.write_text(told + "\n", encoding="utf-8", newline="\n")
 
-    Raises
-    ------
-    OutputError
-        The file cannot be written.
-    """
-    write_png(path, draw_explanation(explanation, mask, index))
+
+def write_explanation_picture(path: Path, subject: Subject) -> None:
+    """Write `draw_explanation` as PNG, on the map that came nearest to an answer."""
+    explanation = _explained(subject)
+    write_png(path, draw_explanation(explanation, subject.mask, subject.index_of(explanation.nearest.reference)))
+
+
+def _explained(subject: Subject) -> Explanation:
+    if subject.explanation is None:
+        raise OutputError(f"{subject.location.query}: there is no explanation to write; locate it with `explain`")
+    return subject.explanation
 
 
 def draw_explanation(explanation: Explanation, mask: RoadMask, index: ReferenceIndex) -> AnyArray:

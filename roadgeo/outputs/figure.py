@@ -3,8 +3,8 @@
 from __future__ import annotations
 
 import importlib.util
-import os
 from dataclasses import dataclass
+from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
@@ -16,7 +16,7 @@ from roadgeo.geometry.mask import PIXEL_TO_PLANE, RoadMask, plane_to_pixel
 from roadgeo.location import Location
 from roadgeo.outputs.canvas import FRAME, MAP_ROAD, MATCH, QUERY_ROAD, Color
 from roadgeo.outputs.paths import Placement
-from roadgeo.storage.files import replacing
+from roadgeo.outputs.subject import Subject
 
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
@@ -48,26 +48,18 @@ def has_matplotlib() -> bool:
     return importlib.util.find_spec("matplotlib") is not None
 
 
-def write_figure(
-    path: str | os.PathLike[str],
-    location: Location,
-    mask: RoadMask,
-    roads: FloatArray,
-    attribution: str = "",
-    options: FigureOptions | None = None,
-) -> None:
-    """Write `draw_figure` in one step; the suffix tells the format.
+def write_figure(path: Path, subject: Subject) -> None:
+    """Write `draw_figure`; the suffix tells the format.
 
     Raises
     ------
     OutputError
-        matplotlib is missing, the file cannot be written, or the location has no place.
+        matplotlib is missing.
     """
     if not has_matplotlib():
-        raise OutputError(f"cannot write {path}: figures need matplotlib; pip install 'roadgeo[plot]'")
-    figure = draw_figure(location, mask, roads, attribution, options)
-    with replacing(path) as temporary:
-        figure.savefig(temporary, metadata={"Creator": "roadgeo"} if str(path).endswith(("pdf", "svg")) else None)
+        raise OutputError(f"{subject.location.query}: figures need matplotlib; pip install 'roadgeo[plot]'")
+    figure = draw_figure(subject.location, subject.mask, subject.roads, subject.attribution)
+    figure.savefig(path, metadata={"Creator": "roadgeo"} if path.suffix in {".pdf", ".svg"} else None)
 
 
 def draw_figure(
@@ -81,6 +73,11 @@ def draw_figure(
         Segments x1, y1, x2, y2 of the reference's roads in the location's CRS; those far away are skipped.
     attribution : str
         Whom the map's licence asks to name.
+
+    Raises
+    ------
+    OutputError
+        The location has no place.
     """
     from matplotlib.figure import Figure
 

@@ -1,60 +1,72 @@
-"""Where a result leaves: the warped picture or mask, the GeoPackage, the JSON, what else is asked for; all or none."""
+"""Where a result leaves: every file that is asked for, all or none, the JSON last."""
 
 from __future__ import annotations
 
 import json
 import os
-from collections.abc import Iterable
+from collections.abc import Iterable, Iterator, Sequence
 from contextlib import ExitStack
 from dataclasses import dataclass, field, replace
 from pathlib import Path
 from time import perf_counter
+from typing import NamedTuple
 
-import numpy as np
-
-from roadgeo._arrays import AnyArray, FloatArray
-from roadgeo._version import __version__
-from roadgeo.errors import CrsError, OutputError, PluginError
-from roadgeo.geometry.homography import Homography
-from roadgeo.geometry.mask import PIXEL_TO_PLANE, RoadMask, plane_to_pixel
-from roadgeo.geometry.warping import MapGrid, cover, warp
-from roadgeo.location import Evidence, Location
-from roadgeo.outputs.orthophoto import ImageOptions, choose_target, image_homography, warp_image
-from roadgeo.outputs.paths import FIGURES, OutputPaths, Placement, attributes
-from roadgeo.outputs.products import PRODUCTS, Product, Subject
-from roadgeo.plugins import OUTPUTS, load_plugin
+from roadgeo.errors import OutputError
+from roadgeo.geometry.mask import RoadMask
+from roadgeo.location import Location
+from roadgeo.matching.explanation import Explanation
+from roadgeo.matching.index import ReferenceIndex
+from roadgeo.outputs.orthophoto import ImageOptions
+from roadgeo.outputs.paths import OutputPaths
+from roadgeo.outputs.registry import ALWAYS, JSON, REGISTRY, STYLE, Output, find_outputs
+from roadgeo.outputs.subject import Subject
 from roadgeo.storage.files import replacing
-from roadgeo.storage.geopackage import Layer, write_layers
-from roadgeo.storage.qml import draw_fill, draw_line, draw_marker, draw_palette
 
-__all__ = ["OutputOptions", "write_location"]
-
-#: Values of the warped mask, and how they are drawn: colour, alpha, label. Outside the footprint is nodata.
-OUTSIDE, GROUND, ROAD = 0, 1, 2
-PALETTE = {GROUND: ("#fdf6ec", 0, "no road"), ROAD: ("#e4572e", 255, "road")}
-
-#: A warped mask is drawn in memory, so it is made coarser beyond this.
-_MASK_MAX_PIXELS = 100_000_000
-
-_FOOTPRINT_STYLE = draw_fill("31,111,180,20", "31,111,180", 0.7)
-_ROADS_STYLE = draw_line("228,87,46", 0.5)
-_MATCHES_STYLE = draw_marker("27,38,59", 2.2)
+__all__ = ["OutputOptions", "Written", "wanted_outputs", "write_json", "write_location"]
 
 
 @dataclass(frozen=True)
 class OutputOptions:
-    """What is written for a located mask.
+    """What is written for a mask.
 
     Attributes
     ----------
     image : ImageOptions
         How the picture, or without one the mask, is drawn on the map; masks always with the nearest value.
     products : tuple of str
-        Further forms, by the names of plugins: our own are those in `products.PRODUCTS`.
+        What is written besides, by name: those of `outputs.registry` and of plugins.
     """
 
     image: ImageOptions = field(default_factory=ImageOptions)
     products: tuple[str, ...] = ()
+
+
+class Written(NamedTuple):
+    """What `write_location` did.
+
+    Attributes
+    ----------
+    location : Location
+        With `seconds.write` set.
+    files, removed : list of Path
+        What there is now, the JSON first, and what an earlier run had left that no longer holds.
+    """
+
+    location: Location
+    files: list[Path]
+    removed: list[Path]
+
+
+def wanted_outputs(names: Iterable[str], located: bool, has_photo: bool) -> list[Output]:
+    """Return what is written for a mask: what always is, then what is asked for, as far as it needs no place.
+
+    Raises
+    ------
+    PluginError
+        There is no such output.
+    """
+    wanted = [*ALWAYS, *find_outputs(names)]
+    return [one for one in wanted if (located or not one.needs_place) and not (one is STYLE and has_photo)]
 
 
 def write_location(
@@ -63,16 +75,22 @@ def write_location(
     paths: OutputPaths,
     options: OutputOptions | None = None,
     picture: str | os.PathLike[str] | None = None,
-) -> tuple[Location, list[Path]]:
-    """Write what a location asks for; return it with `seconds.write` set, and the files.
+    indexes: Sequence[ReferenceIndex] = (),
+    explanation: Explanation | None = None,
+) -> Written:
+    """Write what a location asks for, all files or none.
 
-    A located mask gets every file but the overlay (see `outputs.overlay`); any other gets its JSON only. Files that
-    an earlier run left under these names are removed, so that stale results are not mistaken for this run's.
+    Files of an earlier run under these names that show a place are removed where there is none now, so that stale
+    results are not mistaken for this run's.
 
     Parameters
     ----------
     picture : path, optional
         The photograph that the mask was made of: drawn on the map instead of the mask.
+    indexes : sequence of ReferenceIndex, optional
+        The maps that were searched; pictures of the result and its report show the one that it lies on.
+    explanation : Explanation, optional
+        For the outputs that show it.
 
     Raises
     ------
@@ -83,181 +101,47 @@ def write_location(
     CrsError
         The target CRS is unknown or not made for this place.
     PluginError
-        There is no such product.
+        There is no such output.
     """
     started = perf_counter()
     options = options or OutputOptions()
-    source = Path(picture if picture is not None else mask.name or f"{paths.stem}.png")
-    written = [paths.json]
-    chosen = [_product(name) for name in options.products]
-    if not location.located:
-        ours = PRODUCTS.values()
-        products = (product.path(paths.folder, paths.stem, source.name) for product in (*ours, *chosen))
-        pages = [paths.report, paths.explanation, paths.explanation_picture]
-        pictures = [paths.overlay, *map(paths.figure, FIGURES)]
-        _remove([paths.footprint, paths.style, paths.geopackage, *pictures, *pages, *products])
+    photo = None if picture is None else Path(picture)
+    subject = Subject(location, mask, paths, options.image, photo, indexes, explanation)
+    wanted = wanted_outputs(options.products, location.located, photo is not None)
+    targets = {output: paths.of(output, subject.picture.name) for output in wanted}
     with ExitStack() as files:
-
-        def stage(path: Path) -> Path:
-            written.append(path)
-            return files.enter_context(replacing(path, sync=False))
-
         # Entered first, renamed last: whoever sees the JSON finds the other files whole.
-        report = files.enter_context(replacing(paths.json, sync=False))
-        if location.located:
-            place = Placement.of(location)
-            if picture is None:
-                homography, size = place.homography, mask.shape[::-1]
-                grid = _write_mask(stage(paths.footprint), location, mask, options.image)
-                stage(paths.style).write_text(draw_palette(PALETTE), encoding="utf-8")
-            else:
-                homography, size = image_homography(place, mask.shape[::-1], picture)
-                tags = _tags(location, homography)
-                grid = warp_image(picture, stage(paths.footprint), place, homography, tags, options.image)
-            write_layers(stage(paths.geopackage), _layers(location))
-            subject = Subject(location, place, source, size, homography, grid, options.image.crs or place.crs, paths)
-            subject = replace(subject, mask=mask if picture is None else None)
-            for product in chosen:
-                product.write(stage(product.path(paths.folder, paths.stem, source.name)), subject)
+        report = files.enter_context(replacing(targets.pop(JSON), sync=False))
+        for output, path in targets.items():
+            output.write(files.enter_context(replacing(path, sync=False)), subject)
+        removed = [] if location.located else list(_remove(_stale(subject, wanted, options.products)))
+        if photo is not None:  # an earlier mask's style would colour the photograph
+            removed += _remove([paths.of(STYLE)])
         location = replace(location, seconds=replace(location.seconds, write=perf_counter() - started))
-        report.write_text(json.dumps(location.to_dict(), indent=2, allow_nan=False) + "\n", encoding="utf-8")
-    return location, written
+        write_json(report, replace(subject, location=location))
+    return Written(location, [paths.json, *targets.values()], removed)
 
 
-def _product(name: str) -> Product:
-    product = load_plugin(OUTPUTS, name)
-    if not isinstance(product, Product):
-        raise PluginError(
-            f"the output {name!r} is a {type(product).__name__}, expected a roadgeo.outputs.products.Product"
-        )
-    return product
+def write_json(path: Path, subject: Subject) -> None:
+    """Write `Location.to_dict`."""
+    path.write_text(json.dumps(subject.location.to_dict(), indent=2, allow_nan=False) + "\n", encoding="utf-8")
 
 
-def _remove(paths: Iterable[Path]) -> None:
+def _stale(subject: Subject, written: Sequence[Output], names: Iterable[str]) -> list[Path]:
+    """Name what an earlier run may have left of a place that no longer holds, but for what is written now."""
+    outputs = dict.fromkeys([*REGISTRY.values(), *find_outputs(names)])
+    return [subject.paths.of(output, subject.picture.name) for output in outputs if output not in written]
+
+
+def _remove(paths: Iterable[Path]) -> Iterator[Path]:
+    """Delete files, and tell which there were."""
     for path in paths:
         try:
-            path.unlink(missing_ok=True)
+            path.unlink()
+        except FileNotFoundError:
+            continue
         except OSError as error:
             raise OutputError(
                 f"cannot remove {path}, an earlier result that no longer holds: {error.strerror}; remove it yourself"
             ) from error
-
-
-# --- the warped mask --------------------------------------------------------------------------------------------------
-
-
-def _write_mask(path: Path, location: Location, mask: RoadMask, options: ImageOptions) -> MapGrid:
-    """Draw the mask on the map: a Cloud Optimized GeoTIFF with a colour table, nodata outside the footprint."""
-    import rasterio
-    import rasterio.shutil
-
-    place = Placement.of(location)
-    crs, to_target, to_place = choose_target(place, options)
-    max_pixels = min(options.max_pixels, _MASK_MAX_PIXELS)
-    grid = cover(mask.shape[::-1], place.homography, options.resolution, max_pixels, to_target)
-    if grid.width == 0:
-        raise CrsError(f"the footprint lies outside what {crs} is made for; choose another --crs")
-    size = grid.resolution
-    profile = {
-        "driver": "GTiff",
-        "width": grid.width,
-        "height": grid.height,
-        "count": 1,
-        "dtype": "uint8",
-        "nodata": OUTSIDE,
-        "crs": crs,
-        "transform": rasterio.Affine(size, 0.0, grid.west, 0.0, -size, grid.north),
-    }
-    with rasterio.MemoryFile() as memory, rasterio.MemoryFile(ext="tif") as optimized:
-        with memory.open(**profile) as plain:
-            plain.write(warp(_labels(mask), place.homography, grid, to_place), 1)
-            plain.write_colormap(1, {value: _rgba(color) for value, (color, _, _) in PALETTE.items()})
-            plain.update_tags(**_tags(location, place.homography))
-            layout = {"compress": "DEFLATE", "level": 1, "overview_resampling": "nearest", "blocksize": 512}
-            rasterio.shutil.copy(plain, optimized.name, driver="COG", **layout)
-        path.write_bytes(optimized.read())
-    return grid
-
-
-def _labels(mask: RoadMask) -> AnyArray:
-    """(H, W) uint8: OUTSIDE where nothing was observed, GROUND or ROAD elsewhere."""
-    labels = np.where(mask.roads, np.uint8(ROAD), np.uint8(GROUND))
-    if mask.observed is not None:
-        labels[~mask.observed] = OUTSIDE
-    return labels
-
-
-def _rgba(color: str) -> tuple[int, int, int, int]:
-    red, green, blue = bytes.fromhex(color.removeprefix("#"))
-    return red, green, blue, 255
-
-
-def _tags(location: Location, homography: FloatArray) -> dict[str, str]:
-    """Say where it comes from, for `gdalinfo`; the homography is that of what is drawn."""
-    return {
-        "TIFFTAG_SOFTWARE": f"roadgeo {__version__}",
-        "ROADGEO_QUERY": location.query,
-        "ROADGEO_REFERENCE": location.reference,
-        "ROADGEO_HOMOGRAPHY": json.dumps(homography.tolist()),
-        "ROADGEO_LOG10_ODDS": f"{location.log10_odds}",
-        "ROADGEO_ATTRIBUTION": location.attribution,
-    }
-
-
-# --- the GeoPackage ---------------------------------------------------------------------------------------------------
-
-
-def _layers(location: Location) -> list[Layer]:
-    place = Placement.of(location)
-    layers = [
-        Layer(
-            "footprint",
-            "POLYGON",
-            [place.footprint],
-            {name: [value] for name, value in attributes(location).items()},
-            place.crs,
-            _FOOTPRINT_STYLE,
-            "Ground that the image shows",
-        )
-    ]
-    if location.evidence is not None:
-        layers += [_road_layer(place, location.evidence), _match_layer(place, location.evidence)]
-    return layers
-
-
-def _road_layer(place: Placement, evidence: Evidence) -> Layer:
-    """Draw the mask's roads on the map. A homography keeps lines straight, so mapping their vertices is exact."""
-    to_crs = Homography(place.homography @ PIXEL_TO_PLANE)
-    lines = [line for line in map(to_crs, evidence.query_graph.polylines()) if np.isfinite(line).all()]
-    lengths = [float(np.hypot(*np.diff(line, axis=0).T).sum()) for line in lines]
-    return Layer(
-        "query_roads",
-        "LINESTRING",
-        lines,
-        {"length_m": lengths},
-        place.crs,
-        _ROADS_STYLE,
-        "Roads of the mask, as vectorized",
-    )
-
-
-def _match_layer(place: Placement, evidence: Evidence) -> Layer:
-    """Show matched intersections where the map has them, with the way from the mask's to the map's."""
-    pixels = plane_to_pixel(evidence.query_xy)
-    offset = evidence.reference_xy - Homography(place.homography)(pixels)
-    columns = {
-        "column": pixels[:, 0],
-        "row": pixels[:, 1],
-        "residual_m": evidence.residual_m,
-        "dx_m": offset[:, 0],
-        "dy_m": offset[:, 1],
-    }
-    return Layer(
-        "matches",
-        "POINT",
-        evidence.reference_xy,
-        columns,
-        place.crs,
-        _MATCHES_STYLE,
-        "Intersections found both in the mask and on the map",
-    )
+        yield path

@@ -9,7 +9,7 @@ from contextlib import ExitStack
 from dataclasses import dataclass
 from pathlib import Path
 from tempfile import TemporaryDirectory
-from typing import Any, Literal
+from typing import Any, Literal, NamedTuple
 
 import cv2
 import numpy as np
@@ -25,7 +25,7 @@ from roadgeo.geometry.warping import MapGrid, Transform, cover, source_pixels
 from roadgeo.outputs.paths import Placement
 from roadgeo.storage.rasters import open_raster
 
-__all__ = ["ImageOptions", "choose_target", "image_homography", "read_preview", "warp_image"]
+__all__ = ["ImageOptions", "Target", "choose_target", "image_homography", "read_preview", "warp_image"]
 
 ResamplingName = Literal["nearest", "bilinear", "cubic", "lanczos"]
 
@@ -115,8 +115,16 @@ def image_homography(
     return place.homography @ np.diag([*factors, 1.0]), (width, height)
 
 
-def choose_target(place: Placement, options: ImageOptions) -> tuple[str, Transform, Transform]:
-    """Return the target CRS, what takes the place's CRS to it, and what takes it back.
+class Target(NamedTuple):
+    """A CRS to draw in, what takes the place's CRS to it, and what takes it back; None where the two are one."""
+
+    crs: str
+    to_target: Transform
+    to_place: Transform
+
+
+def choose_target(place: Placement, options: ImageOptions) -> Target:
+    """Choose the CRS to draw in.
 
     Raises
     ------
@@ -124,7 +132,7 @@ def choose_target(place: Placement, options: ImageOptions) -> tuple[str, Transfo
         It is unknown.
     """
     if options.crs is None or options.crs == place.crs:
-        return place.crs, None, None
+        return Target(place.crs, None, None)
     from roadgeo.geometry.projection import transformer
 
     there, back = (transformer(*pair) for pair in ((place.crs, options.crs), (options.crs, place.crs)))
@@ -135,7 +143,7 @@ def choose_target(place: Placement, options: ImageOptions) -> tuple[str, Transfo
     def to_place(xy: FloatArray) -> FloatArray:
         return np.stack(back.transform(xy[..., 0], xy[..., 1]), axis=-1)
 
-    return options.crs, to_target, to_place
+    return Target(options.crs, to_target, to_place)
 
 
 def warp_image(

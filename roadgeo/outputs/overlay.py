@@ -5,6 +5,7 @@ from __future__ import annotations
 import math
 import os
 from dataclasses import dataclass
+from pathlib import Path
 
 import cv2
 import numpy as np
@@ -31,6 +32,7 @@ from roadgeo.outputs.canvas import (
     write_text,
 )
 from roadgeo.outputs.paths import Placement
+from roadgeo.outputs.subject import Subject
 from roadgeo.outputs.wording import format_lonlat
 
 __all__ = ["PlotOptions", "draw_overlay", "write_overlay"]
@@ -77,22 +79,9 @@ class _Canvas:
         cv2.polylines(self.image, lines, False, color, width, cv2.LINE_AA, SHIFT)
 
 
-def write_overlay(
-    path: str | os.PathLike[str],
-    location: Location,
-    mask: RoadMask,
-    roads: FloatArray,
-    attribution: str = "",
-    options: PlotOptions | None = None,
-) -> None:
-    """Write `draw_overlay` as PNG, in one step.
-
-    Raises
-    ------
-    OutputError
-        The file cannot be written, or the location has no place.
-    """
-    write_png(path, draw_overlay(location, mask, roads, attribution, options))
+def write_overlay(path: Path, subject: Subject) -> None:
+    """Write `draw_overlay` as PNG."""
+    write_png(path, draw_overlay(subject.location, subject.mask, subject.roads, subject.attribution))
 
 
 def draw_overlay(
@@ -116,6 +105,11 @@ def draw_overlay(
     (height, width, 3) uint8
         The mask as it came on the left, where it lies on the right.
         Red, green, blue.
+
+    Raises
+    ------
+    OutputError
+        The location has no place.
     """
     options = options or PlotOptions()
     place = Placement.of(location)

@@ -5,17 +5,13 @@ from __future__ import annotations
 import os
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
 
 from roadgeo._arrays import FloatArray
 from roadgeo.errors import OutputError
 from roadgeo.location import Location
+from roadgeo.outputs.registry import FOOTPRINT, GEOPACKAGE, JSON, Output
 
-__all__ = ["FIGURES", "OutputPaths", "Placement", "attributes", "output_paths"]
-
-
-#: Formats of `OutputPaths.figure`.
-FIGURES = ("pdf", "svg", "png")
+__all__ = ["OutputPaths", "Placement", "output_paths"]
 
 
 @dataclass(frozen=True)
@@ -49,63 +45,26 @@ class OutputPaths:
     folder: Path
     stem: str
 
-    def _named(self, ending: str) -> Path:
-        return self.folder / f"{self.stem}{ending}"
+    def of(self, output: Output, picture: str = "") -> Path:
+        """Name the file of an output; `picture` is the name of the photograph's or the mask's own file."""
+        return output.path(self.folder, self.stem, picture)
 
     @property
     def footprint(self) -> Path:
         """The picture or the mask on the map."""
-        return self._named("_footprint.tif")
-
-    @property
-    def style(self) -> Path:
-        """How QGIS draws a mask's footprint."""
-        return self._named("_footprint.qml")
+        return self.of(FOOTPRINT)
 
     @property
     def geopackage(self) -> Path:
         """Footprint, matches and roads."""
-        return self._named("_location.gpkg")
-
-    @property
-    def overlay(self) -> Path:
-        """The picture of the result."""
-        return self._named("_overlay.png")
-
-    def figure(self, kind: str) -> Path:
-        """Name the same for papers, in one of the `FIGURES`."""
-        return self._named(f"_figure.{kind}")
-
-    @property
-    def report(self) -> Path:
-        """The page that shows and explains the result."""
-        return self._named("_report.html")
-
-    @property
-    def explanation(self) -> Path:
-        """Why it was or was not located."""
-        return self._named("_explain.json")
-
-    @property
-    def explanation_picture(self) -> Path:
-        """The same to look at."""
-        return self._named("_explain.png")
+        return self.of(GEOPACKAGE)
 
     @property
     def json(self) -> Path:
         """The `Location`."""
-        return self._named("_location.json")
+        return self.of(JSON)
 
 
 def output_paths(folder: str | os.PathLike[str], stem: str) -> OutputPaths:
     """Name the outputs of the mask `stem` in a folder."""
     return OutputPaths(Path(folder), stem)
-
-
-def attributes(location: Location) -> dict[str, Any]:
-    """Return what a footprint carries in every format: plain values."""
-    names = ["query", "status", "reason", "reference", "attribution", "gsd_m", "rotation_deg", "tilt_deg"]
-    names += ["n_intersections", "n_matched", "inlier_ratio", "log10_odds"]
-    sigma = location.corner_sigma_m
-    worst = None if sigma is None else float(sigma.max())
-    return {**{name: getattr(location, name) for name in names}, "max_corner_sigma_m": worst}

@@ -11,6 +11,7 @@ from typing import Any
 import numpy as np
 
 from roadgeo.geometry.antimeridian import cut_ring
+from roadgeo.outputs.columns import NUMBERS, WORDS, attributes
 from roadgeo.storage.files import write_text
 from roadgeo.storage.geopackage import GeometryType, Layer, write_layers
 from roadgeo.storage.qml import draw_fill
@@ -18,8 +19,6 @@ from roadgeo.storage.qml import draw_fill
 __all__ = ["write_summary"]
 
 _STYLE = draw_fill("31,111,180,40", "31,111,180", 0.5)
-_SHARED = ("query", "status", "reason", "reference")
-_NUMBERS = ("gsd_m", "rotation_deg", "tilt_deg", "n_intersections", "n_matched", "inlier_ratio", "log10_odds")
 
 
 def write_summary(folder: Path, documents: Sequence[Mapping[str, Any]]) -> list[Path]:
@@ -45,11 +44,12 @@ def write_summary(folder: Path, documents: Sequence[Mapping[str, Any]]) -> list[
     shapes: tuple[GeometryType, list[Any]] = ("POLYGON", [rings[0] for rings in parts])
     if any(len(rings) > 1 for rings in parts):
         shapes = ("MULTIPOLYGON", parts)
-    footprints = {name: [document[name] for document in located] for name in (*_SHARED, *_NUMBERS)}
+    rows = [attributes(document) for document in located]
+    footprints = {name: [row[name] for row in rows] for name in (*WORDS, *NUMBERS)}
     geopackage, table = folder / "roadgeo_summary.gpkg", folder / "roadgeo_summary.csv"
     layers = [
         Layer("footprints", *shapes, footprints, "EPSG:4326", _STYLE, "Ground that the located masks show"),
-        Layer("others", columns={name: [document.get(name) for document in others] for name in _SHARED}),
+        Layer("others", columns={name: [document.get(name) for document in others] for name in WORDS}),
     ]
     write_layers(geopackage, layers)
     write_text(table, _to_csv(documents))
@@ -59,14 +59,14 @@ def write_summary(folder: Path, documents: Sequence[Mapping[str, Any]]) -> list[
 def _to_csv(documents: Sequence[Mapping[str, Any]]) -> str:
     text = io.StringIO()
     writer = csv.writer(text, lineterminator="\n")
-    writer.writerow([*_SHARED, "lon", "lat", "crs", "x", "y", *_NUMBERS, "footprint_wkt"])
+    writer.writerow([*WORDS, "lon", "lat", "crs", "x", "y", *NUMBERS, "footprint_wkt"])
     for document in documents:
         here = document if document["status"] == "located" else {}
         center = here.get("center") or {}
         position = [center.get("lon"), center.get("lat"), here.get("crs"), center.get("x"), center.get("y")]
-        numbers = [document.get(name) for name in _NUMBERS]
-        shared = [document.get(name, "") for name in _SHARED]
-        writer.writerow([*shared, *position, *numbers, _to_wkt(here.get("footprint_lonlat"))])
+        values = attributes(document)
+        words, numbers = ([values[name] for name in names] for names in (WORDS, NUMBERS))
+        writer.writerow([*words, *position, *numbers, _to_wkt(here.get("footprint_lonlat"))])
     return text.getvalue()
 
 

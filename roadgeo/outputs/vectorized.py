@@ -10,6 +10,7 @@ import numpy as np
 from roadgeo._arrays import AnyArray, FloatArray
 from roadgeo.errors import OutputError
 from roadgeo.geometry.mask import RoadMask, plane_to_pixel
+from roadgeo.outputs.registry import VECTORIZED
 from roadgeo.roads.graph import RoadGraph
 from roadgeo.roads.intersections import Intersections
 from roadgeo.storage.files import write_bytes
@@ -61,7 +62,7 @@ def write_vectorized(
         raise OutputError(
             f"cannot make the folder {folder}: {error.strerror}; choose one that you may write to"
         ) from error
-    package, picture = folder / f"{stem}_vectorized.gpkg", folder / f"{stem}_vectorized.png"
+    package, picture = (folder / f"{stem}{VECTORIZED}{suffix}" for suffix in (".gpkg", ".png"))
     write_layers(package, _layers(graph, intersections))
     encoded, content = cv2.imencode(".png", draw_vectorized(mask, graph, intersections))
     if not encoded:

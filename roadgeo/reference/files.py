@@ -47,6 +47,7 @@ __all__ = [
     "describe_reference",
     "open_reference",
     "rebuild_index",
+    "reference_digest",
     "reference_freshness",
     "reference_paths",
     "write_reference",
@@ -207,6 +208,18 @@ def reference_freshness(path: str | os.PathLike[str]) -> Freshness:
     if not paths.geopackage.is_file():
         return "no GeoPackage"
     return "fresh" if digest == stored_digest(paths.geopackage) else "stale"
+
+
+def reference_digest(path: str | os.PathLike[str]) -> str:
+    """Return the digest of the intersections that a reference's index was built from; "" where there is none to read.
+
+    Raises
+    ------
+    IndexFormatError
+        The index is damaged.
+    """
+    index = reference_paths(path).index
+    return str(read_manifest(index)["about"].get("network", "")) if index.is_file() else ""
 
 
 def describe_reference(path: str | os.PathLike[str]) -> dict[str, Any]:

@@ -17,6 +17,8 @@ from roadgeo.matching.explanation import SCHEMA, Explanation
 from roadgeo.matching.index import build_index
 from roadgeo.matching.search import SearchOptions
 from roadgeo.outputs.explanation_sheet import AGREES, STARVED, draw_explanation, write_explanation_picture
+from roadgeo.outputs.paths import output_paths
+from roadgeo.outputs.subject import Subject
 from roadgeo.reference.reference import Reference, build_network
 from roadgeo.workflows import LocateOptions, explain, locate
 
@@ -186,7 +188,8 @@ class TestPicture:
 
     def test_the_stage_that_starved_is_marked(self, town, mask, tmp_path: Path):
         explanation = explain(mask, town, with_camera(gsd_m=(0.3, 0.7)))
-        write_explanation_picture(tmp_path / "a.png", explanation, mask, town.index)
+        subject = Subject(explanation.location, mask, output_paths(tmp_path, "a"), explanation=explanation)
+        write_explanation_picture(tmp_path / "a.png", replace(subject, indexes=[town.index]))
         picture = cv2.imread(str(tmp_path / "a.png"))[..., ::-1]
         assert (explanation.stories[0].starved_at == "camera") == bool((picture == STARVED).all(axis=2).any())
 

@@ -10,9 +10,11 @@ from roadgeo.errors import OutputError
 from roadgeo.geometry.homography import Homography
 from roadgeo.geometry.mask import RoadMask, pixel_to_plane
 from roadgeo.location import Evidence, Location, Place
-from roadgeo.outputs.location_files import GROUND, OUTSIDE, ROAD, OutputOptions, write_location
+from roadgeo.outputs.footprint import GROUND, OUTSIDE, ROAD
+from roadgeo.outputs.location_files import OutputOptions, write_location
 from roadgeo.outputs.orthophoto import ImageOptions
 from roadgeo.outputs.paths import Placement, output_paths
+from roadgeo.outputs.registry import OVERLAY, STYLE
 from roadgeo.roads.graph import RoadGraph
 from roadgeo.storage.geopackage import layer_names, read_layer
 
@@ -106,7 +108,7 @@ def test_the_warped_mask_is_a_cloud_optimized_geotiff_with_colours(tmp_path: Pat
         assert raster.colormap(1)[ROAD] == (228, 87, 46, 255)
         assert raster.dataset_mask().min() == 0
         assert json.loads(raster.tags()["ROADGEO_HOMOGRAPHY"]) == located().homography.tolist()
-    assert 'type="paletted"' in paths.style.read_text()
+    assert 'type="paletted"' in paths.of(STYLE).read_text()
 
 
 def test_a_far_view_is_coarsened(tmp_path: Path) -> None:
@@ -136,7 +138,7 @@ def test_the_geopackage_holds_footprint_roads_and_residuals(tmp_path: Path) -> N
 
 def test_the_json_is_the_location(tmp_path: Path) -> None:
     paths = output_paths(tmp_path, "a")
-    written, files = write_location(located(), road_mask(), paths)
+    written, files, _ = write_location(located(), road_mask(), paths)
     assert all(path.exists() for path in files)
     assert json.loads(paths.json.read_text()) == json.loads(json.dumps(written.to_dict()))
     assert json.loads(paths.json.read_text())["attribution"] == "© somebody"
@@ -147,7 +149,7 @@ def test_the_json_is_the_location(tmp_path: Path) -> None:
 def test_nothing_georeferenced_stays_for_a_mask_that_was_not_located(tmp_path: Path, status: str) -> None:
     paths = output_paths(tmp_path, "a")
     write_location(located(), road_mask(), paths)
-    paths.overlay.write_bytes(b"an earlier picture")
+    paths.of(OVERLAY).write_bytes(b"an earlier picture")
     write_location(replace(located(), status=status), road_mask(), paths)
     assert [path.name for path in tmp_path.iterdir()] == ["a_location.json"]
     assert json.loads(paths.json.read_text())["status"] == status
@@ -157,7 +159,7 @@ def test_all_files_or_none(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> N
     def fail(*_: object) -> None:
         raise OutputError("disk full")
 
-    monkeypatch.setattr("roadgeo.outputs.location_files.write_layers", fail)
+    monkeypatch.setattr("roadgeo.outputs.location_layers.write_layers", fail)
     with pytest.raises(OutputError, match="disk full"):
         write_location(located(), road_mask(), output_paths(tmp_path, "a"))
     assert list(tmp_path.iterdir()) == []

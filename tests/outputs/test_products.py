@@ -13,11 +13,13 @@ import rasterio
 from outputs.test_location_files import located, road_mask
 
 from roadgeo.geometry.homography import Homography
-from roadgeo.geometry.warping import MapGrid
 from roadgeo.location import Location
+from roadgeo.outputs.kmz import write_kmz
 from roadgeo.outputs.location_files import OutputOptions, write_location
-from roadgeo.outputs.paths import OutputPaths, Placement, output_paths
-from roadgeo.outputs.products import PRODUCTS, Subject, write_geojson, write_kmz
+from roadgeo.outputs.outlines import write_geojson
+from roadgeo.outputs.paths import OutputPaths, output_paths
+from roadgeo.outputs.registry import ALSO
+from roadgeo.outputs.subject import Subject
 from roadgeo.storage.rasters import open_raster
 
 
@@ -29,8 +31,8 @@ def written(tmp_path_factory: pytest.TempPathFactory) -> OutputPaths:
     cv2.imwrite(str(tmp_path / "photo.png"), photo)
     paths = output_paths(tmp_path / "out", "mask")
     paths.folder.mkdir()
-    options = OutputOptions(products=tuple(PRODUCTS))
-    _, files = write_location(located(), road_mask(), paths, options, tmp_path / "photo.png")
+    options = OutputOptions(products=tuple(ALSO))
+    _, files, _ = write_location(located(), road_mask(), paths, options, tmp_path / "photo.png")
     assert sorted(files) == sorted(paths.folder.iterdir())
     return paths
 
@@ -151,10 +153,7 @@ def astride(tmp_path: Path) -> Subject:
     x, y = pyproj.Transformer.from_crs(4326, 32701, always_xy=True).transform(180.0, -16.8)
     H = np.array([[1.0, 0.0, x - 200.0], [0.0, -1.0, y + 150.0], [0.0, 0.0, 1.0]])
     location: Location = replace(located(H), crs="EPSG:32701")
-    place = Placement.of(location)
-    grid = MapGrid(x - 200, y + 150, 1.0, 400, 300)
-    paths = output_paths(tmp_path, "a")
-    return Subject(location, place, tmp_path / "a.png", (400, 300), H, grid, place.crs, paths, road_mask())
+    return Subject(location, road_mask(), output_paths(tmp_path, "a"))
 
 
 def test_a_footprint_astride_180_degrees_is_cut_there(tmp_path: Path) -> None:

@@ -21,7 +21,9 @@ from roadgeo.geometry.homography import Homography
 from roadgeo.geometry.mask import RoadMask, pixel_to_plane, plane_to_pixel
 from roadgeo.location import Evidence, Location, Place
 from roadgeo.matching.index import build_index
-from roadgeo.outputs.report import Entry, ReportOptions, render_batch, render_report, write_batch, write_report
+from roadgeo.outputs.location_files import OutputOptions, write_location
+from roadgeo.outputs.paths import output_paths
+from roadgeo.outputs.report import Entry, ReportOptions, render_batch, render_report, write_batch
 from roadgeo.outputs.report.svg import draw_dots, draw_image, draw_lines, join_segments, thin_lines
 from roadgeo.reference.reference import Reference, build_network
 from roadgeo.sources.masks import read_mask
@@ -200,10 +202,11 @@ def test_a_mask_is_traced_once(
 
 
 def test_the_report_is_written_in_one_step(porto: Reference, drone: RoadMask, found: Location, tmp_path: Path) -> None:
-    write_report(tmp_path / "drone_report.html", found, drone, porto.index, ATTRIBUTION)
-    assert [path.name for path in tmp_path.iterdir()] == ["drone_report.html"]
+    refused, options = replace(found, status="not_located"), OutputOptions(products=("report",))
+    write_location(refused, drone, output_paths(tmp_path, "drone"), options, indexes=[porto.index])
+    assert sorted(path.name for path in tmp_path.iterdir()) == ["drone_location.json", "drone_report.html"]
     with pytest.raises(OutputError, match="cannot write"):
-        write_report(tmp_path / "none" / "drone_report.html", found, drone, porto.index)
+        write_location(refused, drone, output_paths(tmp_path / "none", "drone"), options, indexes=[porto.index])
 
 
 # --- many masks -------------------------------------------------------------------------------------------------------
@@ -361,7 +364,7 @@ def test_a_picture_keeps_to_its_limit(lossless: bool, limit: int) -> None:
 @pytest.fixture(scope="module")
 def report(porto: Reference, drone: RoadMask, found: Location, tmp_path_factory: pytest.TempPathFactory) -> Path:
     path = tmp_path_factory.mktemp("report") / "drone_report.html"
-    write_report(path, rival(found), drone, porto.index, ATTRIBUTION)
+    path.write_text(render_report(rival(found), drone, porto.index, ATTRIBUTION), encoding="utf-8")
     return path
 
 
@@ -525,7 +528,7 @@ def test_both_views_show_the_ground_under_the_pointer(browser: Browser, report: 
 def test_a_mask_without_a_place_opens_too(browser: Browser, porto: Reference, tmp_path: Path) -> None:
     mask = read_mask(DEMO["elsewhere"].path)
     path = tmp_path / "elsewhere_report.html"
-    write_report(path, locate(mask, porto), mask, porto.index, ATTRIBUTION)
+    path.write_text(render_report(locate(mask, porto), mask, porto.index, ATTRIBUTION), encoding="utf-8")
     with browser.open(path, 390, 844, phone=True) as page:
         start = view(page)
         page.run("document.querySelector('[data-act=in]').click()")

@@ -1,11 +1,17 @@
 import csv
+import json
 from pathlib import Path
 
 import numpy as np
 import shapely
-from outputs.test_location_files import located
+from outputs.test_location_files import located, road_mask
 
 from roadgeo.location import Location
+from roadgeo.outputs.columns import attributes
+from roadgeo.outputs.location_layers import write_geopackage
+from roadgeo.outputs.outlines import write_geojson
+from roadgeo.outputs.paths import output_paths
+from roadgeo.outputs.subject import Subject
 from roadgeo.outputs.summary import write_summary
 from roadgeo.storage.geopackage import read_layer
 
@@ -20,6 +26,8 @@ def test_all_footprints_in_one_geopackage_and_one_table(tmp_path: Path) -> None:
     (ring,), footprints = read_layer(geopackage, "footprints")
     np.testing.assert_allclose(ring[:4], RING)
     assert footprints["query"] == ["photo_mask.png"]
+    assert footprints["attribution"] == ["© somebody"]
+    assert footprints["max_corner_sigma_m"] == [0.8]
     _, others = read_layer(geopackage, "others")
     assert others["query"] == ["c.png", "b.png"]
     assert others["reason"] == ["no such file", "nothing, like this, fits"]
@@ -30,6 +38,22 @@ def test_all_footprints_in_one_geopackage_and_one_table(tmp_path: Path) -> None:
     assert shapely.from_wkt(rows[1]["footprint_wkt"]).equals(shapely.Polygon(RING))
     assert [row["footprint_wkt"] for row in rows[::2]] == ["", ""]
     assert float(rows[1]["lon"]) == located().center.lon
+    assert [row["attribution"] for row in rows] == ["", "© somebody", ""]
+    assert [row["max_corner_sigma_m"] for row in rows] == ["", "0.8", ""]
+
+
+def test_every_table_has_the_same_columns(tmp_path: Path) -> None:
+    """A column that is listed once is in the summary, its CSV, and every footprint."""
+    found = {**located().to_dict(), "footprint_lonlat": RING}
+    geopackage, table = write_summary(tmp_path, [found])
+    columns = set(attributes(found))
+    assert columns <= set(read_layer(geopackage, "footprints")[1])
+    assert columns <= set(table.read_text().splitlines()[0].split(","))
+    subject = Subject(located(), road_mask(), output_paths(tmp_path, "a"))
+    write_geopackage(tmp_path / "a.gpkg", subject)
+    assert columns <= set(read_layer(tmp_path / "a.gpkg", "footprint")[1])
+    write_geojson(tmp_path / "a.geojson", subject)
+    assert columns == set(json.loads((tmp_path / "a.geojson").read_text())["properties"])
 
 
 def test_nothing_located_is_a_summary_too(tmp_path: Path) -> None:

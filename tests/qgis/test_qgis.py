@@ -24,7 +24,7 @@ from roadgeo.cli import main
 from roadgeo.demo import ROADS, demo_masks
 from roadgeo.errors import OutputError
 from roadgeo.geometry.homography import Homography
-from roadgeo.outputs.products import PRODUCTS
+from roadgeo.outputs.registry import ALSO
 from roadgeo.qgis import installation
 from roadgeo.qgis.installation import NAME, find_profiles, install_plugin, write_package
 from roadgeo.qgis.plugin import runner
@@ -565,7 +565,7 @@ def test_a_georeferenced_image_agrees_with_the_homography_everywhere(qgis: Qgis,
     size = (width // 2, height // 2)
     picture = coordinate_picture(qgis.folder / "photo.tif", size)
     inputs = [f"IMAGE={picture}", f"MASK={mask}", f"REFERENCE={porto}", f"OUTPUT_FOLDER={folder}"]
-    more = [*(f"PRODUCTS={product}" for product in PRODUCTS), "RESAMPLING=bilinear"]
+    more = [*(f"PRODUCTS={product}" for product in ALSO), "RESAMPLING=bilinear"]
     done = qgis.tool("run", "roadgeo:georeferenceimage", "--", *inputs, *more)
     assert done.returncode == 0, done.stderr
     _, document = read_location(folder / "drone_location.json")
@@ -574,7 +574,7 @@ def test_a_georeferenced_image_agrees_with_the_homography_everywhere(qgis: Qgis,
     pixels, metres = disagreements(qgis, [warped])
     assert pixels < 0.6
     assert metres < 0.01
-    assert all(product.path(folder, "drone", "photo.tif").exists() for product in PRODUCTS.values())
+    assert all(product.path(folder, "drone", "photo.tif").exists() for product in ALSO.values())
 
 
 @pytest.mark.realdata

@@ -20,9 +20,9 @@ from roadgeo.geometry.pinhole import polygon_area
 from roadgeo.location import Location, Place
 from roadgeo.matching.index import ReferenceIndex
 from roadgeo.outputs.paths import Placement
-from roadgeo.outputs.report.views import ReportOptions, Subject, Window, draw_mask, draw_overview, draw_place
+from roadgeo.outputs.report.views import ReportOptions, Shown, Window, draw_mask, draw_overview, draw_place
+from roadgeo.outputs.subject import Subject
 from roadgeo.outputs.wording import format_lonlat
-from roadgeo.storage.files import write_text
 
 __all__ = ["STATUS", "footer", "render_page", "render_report", "section", "write_report"]
 
@@ -36,23 +36,10 @@ _WINDS = ("north", "north-east", "east", "south-east", "south", "south-west", "w
 _FEW = 12
 
 
-def write_report(
-    path: str | os.PathLike[str],
-    location: Location,
-    mask: RoadMask,
-    index: ReferenceIndex,
-    attribution: str = "",
-    picture: str | os.PathLike[str] | None = None,
-    options: ReportOptions | None = None,
-) -> None:
-    """Write `render_report`, in one step.
-
-    Raises
-    ------
-    OutputError
-        The file cannot be written.
-    """
-    write_text(path, render_report(location, mask, index, attribution, picture, options))
+def write_report(path: Path, subject: Subject) -> None:
+    """Write `render_report`."""
+    page = render_report(subject.location, subject.mask, subject.index, subject.attribution, subject.photo)
+    path.write_text(page, encoding="utf-8", newline="\n")
 
 
 def render_report(
@@ -79,7 +66,7 @@ def render_report(
     MaskError
         The picture cannot be read, or the mask shows no roads.
     """
-    subject = Subject.of(location, mask, index, picture, options or ReportOptions(), attribution)
+    subject = Shown.of(location, mask, index, picture, options or ReportOptions(), attribution)
     place = subject.place
     views = [draw_mask(subject)] if place is None else [draw_place(subject, place), draw_mask(subject)]
     parts = [
@@ -195,7 +182,7 @@ def _table(rows: Sequence[tuple[str, str]]) -> str:
     return f'<table class="numbers">{body}</table>'
 
 
-def _numbers(subject: Subject) -> list[tuple[str, str]]:
+def _numbers(subject: Shown) -> list[tuple[str, str]]:
     """Label and value (HTML) of what people ask for first."""
     location, place = subject.location, subject.place
     width, height = subject.size
@@ -237,7 +224,7 @@ def _link(place: Place) -> str:
     return f"{where}<br><small>{place.x:,.1f}, {place.y:,.1f}</small>"
 
 
-def _corners(subject: Subject, place: Placement) -> str:
+def _corners(subject: Shown, place: Placement) -> str:
     """List the corners, each with a button that shows it on the map."""
     location = subject.location
     positions = Window.around(subject, place, subject.options.margin).to_svg(place.footprint)
@@ -254,7 +241,7 @@ def _corners(subject: Subject, place: Placement) -> str:
     return f'<table>{"".join(rows)}</table><p class="faint">Metres in {html.escape(crs)}</p>'
 
 
-def _matches(subject: Subject) -> str:
+def _matches(subject: Shown) -> str:
     """List the matches; the page's script takes their positions from here."""
     matches = subject.matches()
     if matches is None or len(matches.residual_m) == 0:
@@ -278,7 +265,7 @@ def _matches(subject: Subject) -> str:
     )
 
 
-def _details(subject: Subject) -> list[tuple[str, str]]:
+def _details(subject: Shown) -> list[tuple[str, str]]:
     """Label and value (HTML) of everything else, for those who want to check."""
     location = subject.location
     plain = location.to_dict()

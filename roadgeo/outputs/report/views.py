@@ -25,7 +25,7 @@ from roadgeo.outputs.report.svg import draw_dots, draw_image, draw_lines, join_s
 __all__ = [
     "Layer",
     "ReportOptions",
-    "Subject",
+    "Shown",
     "Window",
     "draw_mask",
     "draw_overview",
@@ -77,7 +77,7 @@ class ReportOptions:
 
 
 @dataclass(frozen=True)
-class Subject:
+class Shown:
     """A result and what is drawn of it.
 
     Attributes
@@ -111,7 +111,7 @@ class Subject:
         picture: str | os.PathLike[str] | None,
         options: ReportOptions,
         attribution: str,
-    ) -> Subject:
+    ) -> Shown:
         """Take what was seen in the mask, or look at it anew, and read the picture."""
         seen = location.seen
         if seen is None:
@@ -171,7 +171,7 @@ class Window:
     height: float
 
     @classmethod
-    def around(cls, subject: Subject, place: Placement, margin: float) -> Window:
+    def around(cls, subject: Shown, place: Placement, margin: float) -> Window:
         """Lay it around the footprint, and around the runner-up where that is no farther off than twice its size."""
         ring = place.footprint[np.isfinite(place.footprint).all(axis=1)]
         other = subject.runner_up()
@@ -228,7 +228,7 @@ _RING_SIGN = '<path d="M13 7h.1"/><path class="core" d="M13 7h.1"/>'
 _PICTURE_SIGN = '<rect x="3" y="2" width="20" height="10"/>'
 
 
-def draw_place(subject: Subject, place: Placement) -> str:
+def draw_place(subject: Shown, place: Placement) -> str:
     """Draw the map around a footprint, with what lies on it: an HTML figure."""
     location = subject.location
     window = Window.around(subject, place, subject.options.margin)
@@ -273,7 +273,7 @@ def draw_place(subject: Subject, place: Placement) -> str:
     return draw_viewer(said, window.box, layers, attributes, scale=True, enlarged=True, credit=subject.attribution)
 
 
-def _picture_on_map(subject: Subject, place: Placement, window: Window) -> Layer:
+def _picture_on_map(subject: Shown, place: Placement, window: Window) -> Layer:
     image = subject.draw_picture(_QUERY_COLOR)
     size = image.shape[1], image.shape[0]
     to_crs = place.homography @ np.diag([subject.size[0] / size[0], subject.size[1] / size[1], 1.0])
@@ -337,7 +337,7 @@ def _arrow_scale(location: Location) -> float:
 # --- the mask ---------------------------------------------------------------------------------------------------------
 
 
-def draw_mask(subject: Subject) -> str:
+def draw_mask(subject: Shown) -> str:
     """Draw the mask, or its photograph, with the roads and intersections seen in it: an HTML figure."""
     width, height = subject.size
     is_photograph = subject.photograph is not None
@@ -365,7 +365,7 @@ def draw_mask(subject: Subject) -> str:
 # --- the whole map ----------------------------------------------------------------------------------------------------
 
 
-def draw_overview(subject: Subject) -> str:
+def draw_overview(subject: Shown) -> str:
     """Draw all of the map, and where on it the mask and the runner-up lie."""
     index, location = subject.index, subject.location
     if index.name != location.reference:  # several were searched

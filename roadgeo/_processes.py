@@ -1,0 +1,98 @@
+"""Many tasks in one process or several: results in the order of the tasks; a process that dies costs one of them."""
+
+from __future__ import annotations
+
+import multiprocessing
+import os
+import signal
+import sys
+from collections.abc import Callable, Iterator, Sequence
+from concurrent.futures import ProcessPoolExecutor
+from concurrent.futures.process import BrokenProcessPool
+from typing import Any, Protocol, TypeVar
+
+__all__ = ["Work", "run"]
+
+Task = TypeVar("Task")
+TaskIn = TypeVar("TaskIn", contravariant=True)
+Result = TypeVar("Result")
+ResultOut = TypeVar("ResultOut", covariant=True)
+
+#: What nearly every task needs: a fork server loads it once for all processes.
+_PRELOAD = ["roadgeo.workflows", "roadgeo.outputs.location_files", "roadgeo.sources.masks"]
+
+
+class Work(Protocol[TaskIn, ResultOut]):
+    """What is done with each task; it travels to other processes, so it can be pickled."""
+
+    def prepare(self) -> Callable[[TaskIn], ResultOut]:
+        """Make a process ready (open the references) and return what does one task."""
+
+    def give_up(self, task: TaskIn, reason: str) -> ResultOut:
+        """Make the result of a task whose process died."""
+
+
+def run(tasks: Sequence[Task], work: Work[Task, Result], jobs: int) -> Iterator[Result]:
+    """Do all tasks and yield their results in the order of the tasks, each as soon as it and those before it are there.
+
+    A process that dies (out of memory, a crash in a library) costs one result, not the others.
+    """
+    if jobs == 1 or len(tasks) == 1:
+        do = work.prepare()
+        yield from map(do, tasks)
+        return
+    rest = list(tasks)
+    while rest:
+        done = 0
+        try:
+            for result in _run_together(rest, work, jobs):
+                yield result
+                done += 1
+        except BrokenProcessPool:
+            # Any of those then running may be to blame, so the first that has no result runs again, alone.
+            suspect = rest[done]
+            try:
+                yield from _run_together([suspect], work, 1)
+            except BrokenProcessPool:
+                yield work.give_up(suspect, "the process that worked on it died (out of memory?)")
+            done += 1
+        rest = rest[done:]
+
+
+def _run_together(tasks: Sequence[Task], work: Work[Task, Result], jobs: int) -> Iterator[Result]:
+    # A fork server loads the libraries once for all; where there is none each process starts afresh.
+    method = "forkserver" if "forkserver" in multiprocessing.get_all_start_methods() else "spawn"
+    context = multiprocessing.get_context(method)
+    if method == "forkserver":
+        context.set_forkserver_preload(_PRELOAD)
+    workers = min(jobs, len(tasks))
+    with ProcessPoolExecutor(workers, context, initializer=_start_worker, initargs=(work,)) as pool:
+        futures = [pool.submit(_do, task) for task in tasks]
+        try:
+            for future in futures:
+                yield future.result()
+        except BaseException:
+            for process in multiprocessing.active_children():
+                process.terminate()
+            pool.shutdown(cancel_futures=True)
+            raise
+
+
+_prepared: list[Callable[[Any], Any]] = []
+
+
+def _start_worker(work: Work[Any, Any]) -> None:
+    """Make a worker ready. Ctrl-C is the parent's to handle: it ends the workers, which clean up as they go."""
+    import cv2
+
+    cv2.setNumThreads(1)  # the processes share the processors already
+    signal.signal(signal.SIGINT, signal.SIG_IGN)
+    signal.signal(signal.SIGTERM, lambda *_: sys.exit(128 + signal.SIGTERM))
+    _prepared.append(work.prepare())
+
+
+def _do(task: Any) -> Any:
+    try:
+        return _prepared[0](task)
+    except SystemExit as end:  # the task has cleaned up; the pool would take this for its result, and go on
+        os._exit(int(end.code or 0))

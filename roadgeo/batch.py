@@ -1,0 +1,433 @@
+"""Many masks: what is located, under which names the results go, in one process or several, in input order.
+
+`locate_masks` is what `roadgeo locate` runs: each mask is read, located, written and described, and nothing that is
+wrong with one of them stops the others.
+"""
+
+from __future__ import annotations
+
+import dataclasses
+import glob
+import hashlib
+import json
+import os
+from collections import Counter
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
+from dataclasses import dataclass, field, replace
+from pathlib import Path
+from time import perf_counter
+from typing import TYPE_CHECKING, Any, Literal
+
+from roadgeo._processes import run
+from roadgeo._progress import Say, say_nothing
+from roadgeo.errors import IndexFormatError, PluginError, RoadgeoError
+from roadgeo.outputs.registry import JSON, REPORT, is_result
+
+if TYPE_CHECKING:
+    from roadgeo.geometry.mask import RoadMask
+    from roadgeo.outputs.location_files import OutputOptions
+    from roadgeo.reference.reference import Reference
+    from roadgeo.workflows import LocateOptions
+
+__all__ = [
+    "Outcome",
+    "ReadOptions",
+    "Task",
+    "find_masks",
+    "locate_masks",
+    "name_tasks",
+    "open_references",
+    "write_overview",
+]
+
+Status = Literal["located", "ambiguous", "not_located", "error"]
+
+#: What a folder is searched for.
+SUFFIXES = (".tif", ".tiff", ".png", ".jpg", ".jpeg", ".jp2", ".bmp", ".pgm", ".webp", ".vrt", ".img", ".npy")
+
+
+# --- what is located --------------------------------------------------------------------------------------------------
+
+
+@dataclass(frozen=True)
+class Task:
+    """One mask, and the stem of its results' names."""
+
+    mask: str
+    stem: str
+
+
+def find_masks(arguments: Sequence[str]) -> list[str]:
+    """Expand folders (their images, not our own results) and patterns, which not every shell expands; keep the rest."""
+    found: list[str] = []
+    for argument in arguments:
+        if Path(argument).is_dir():
+            found += sorted(str(path) for path in Path(argument).iterdir() if _is_mask(path))
+        elif glob.has_magic(argument) and not Path(argument).exists():
+            found += sorted(glob.glob(argument, recursive=True)) or [argument]  # noqa: PTH207 (patterns may be absolute)
+        else:
+            found.append(argument)
+    return found
+
+
+def _is_mask(path: Path) -> bool:
+    return path.suffix.lower() in SUFFIXES and not path.name.startswith(".") and not is_result(path.name)
+
+
+def name_tasks(masks: Sequence[str]) -> list[Task]:
+    """Give each mask the stem of its own name; those that would share one get more of their path, until none does.
+
+    So a stem depends on the other masks only where names meet, and then on the mask's path, not on the others' order.
+    """
+    known = [_stems(mask, n) for n, mask in enumerate(masks)]
+    used = [0] * len(masks)
+    while True:
+        stems = [stems[level] for stems, level in zip(known, used, strict=True)]
+        taken = Counter(stem.casefold() for stem in stems)  # one name to file systems that do not tell cases apart
+        shared = [n for n, stem in enumerate(stems) if taken[stem.casefold()] > 1 and used[n] < len(known[n]) - 1]
+        if not shared:
+            return [Task(mask, stem) for mask, stem in zip(masks, stems, strict=True)]
+        for n in shared:
+            used[n] += 1
+
+
+def _stems(mask: str, n: int) -> list[str]:
+    """Return longer and longer stems for the n-th mask: its name, its folder, its format, its path, its number."""
+    path = Path(mask).absolute()
+    folder = f"{path.parent.name}_{path.stem}"
+    format_ = f"{folder}_{path.suffix.lower().removeprefix('.')}"
+    whole = f"{format_}_{hashlib.blake2b(os.fsencode(path), digest_size=4).hexdigest()}"
+    return [path.stem, folder, format_, whole, f"{whole}_{n + 1}"]
+
+
+def open_references(names: Iterable[str], say: Say = say_nothing) -> list[Reference]:
+    """Open references by path or name; none named: all of the library. `say` is told of an index that has to be built.
+
+    Raises
+    ------
+    IndexFormatError
+        A reference is missing or unusable, or the library is empty.
+    """
+    from roadgeo.reference.reference import open_reference
+
+    return [open_reference(path, say) for path in _resolve(names)]
+
+
+def _resolve(names: Iterable[str]) -> list[Path]:
+    from roadgeo.reference.library import library_dir, list_references, resolve_reference
+
+    paths = [resolve_reference(name) for name in names] or list_references()
+    if not paths:
+        raise IndexFormatError(
+            f"the library in {library_dir()} is empty and no --reference was given; build one with `roadgeo index`"
+        )
+    return paths
+
+
+# --- locating it ------------------------------------------------------------------------------------------------------
+
+
+@dataclass(frozen=True)
+class ReadOptions:
+    """How masks are read, and what goes with them.
+
+    Attributes
+    ----------
+    threshold, band
+        As for `sources.masks.read_mask`.
+    segmenter : str or None
+        The files are photographs, in which this plugin finds the roads.
+    images : mapping of mask to photograph
+        Drawn on the map instead of the masks.
+    exif : bool
+        Take the focal length from the photograph, or else the mask.
+    """
+
+    threshold: float | None = None
+    band: int | None = None
+    segmenter: str | None = None
+    images: Mapping[str, str] = field(default_factory=dict)
+    exif: bool = False
+
+    def photo(self, task: Task) -> str | None:
+        """Return the photograph that is drawn, if any."""
+        return self.images.get(task.mask, task.mask if self.segmenter else None)
+
+
+@dataclass(frozen=True)
+class Outcome:
+    """What became of one mask.
+
+    Attributes
+    ----------
+    document : dict
+        Its JSON object.
+    files, removed : tuple of str
+        Written now, and removed because they showed a place that no longer holds.
+    photo : tuple of (str, float) or None
+        The photograph that was drawn, and its width in widths of the mask.
+    earlier : bool
+        An earlier run found it; nothing was done now.
+    """
+
+    status: Status
+    document: dict[str, Any]
+    files: tuple[str, ...] = ()
+    removed: tuple[str, ...] = ()
+    photo: tuple[str, float] | None = None
+    earlier: bool = False
+
+
+def locate_masks(
+    tasks: Sequence[Task],
+    references: Sequence[str] = (),
+    out_dir: str | Path = ".",
+    *,
+    options: LocateOptions | None = None,
+    outputs: OutputOptions | None = None,
+    reading: ReadOptions | None = None,
+    skip_existing: bool = False,
+    jobs: int = 1,
+) -> Iterator[Outcome]:
+    """Locate masks and write their results; yield what became of each in the order of the tasks.
+
+    What is wrong with one mask never stops the others: it has the status "error".
+
+    Parameters
+    ----------
+    references : sequence of str
+        Paths, or names in the library; none: all of the library.
+    skip_existing : bool
+        Keep results of the same question that are whole and younger than their masks.
+    jobs : int
+        Processes; the results do not depend on it.
+
+    Raises
+    ------
+    IndexFormatError
+        A reference is missing or unusable.
+    """
+    from roadgeo.outputs.location_files import OutputOptions
+    from roadgeo.workflows import LocateOptions
+
+    work = _Locating(
+        tuple(references),
+        str(out_dir),
+        options or LocateOptions(),
+        outputs or OutputOptions(),
+        reading or ReadOptions(),
+        skip_existing,
+    )
+    return run(tasks, work, jobs)
+
+
+@dataclass(frozen=True)
+class _Locating:
+    """What is done with every mask; travels to other processes."""
+
+    references: tuple[str, ...]
+    out_dir: str
+    options: LocateOptions
+    outputs: OutputOptions
+    reading: ReadOptions
+    skip_existing: bool
+
+    def prepare(self) -> Callable[[Task], Outcome]:
+        """Open the references."""
+        from roadgeo.reference.files import reference_digest
+        from roadgeo.reference.reference import open_reference
+
+        started = perf_counter()
+        paths = _resolve(self.references)
+        references = [open_reference(path) for path in paths]
+        asked = _Asked(references, [reference_digest(path) for path in paths], perf_counter() - started, self._told())
+        return lambda task: self._do(task, asked)
+
+    def give_up(self, task: Task, reason: str) -> Outcome:
+        """Make the outcome of a mask that could not be worked on."""
+        return _failed(task, reason)
+
+    def _told(self) -> dict[str, Any]:
+        """Return the options that differ from the usual ones, as plain values: what the JSON says was asked."""
+        from roadgeo.outputs.location_files import OutputOptions
+        from roadgeo.workflows import LocateOptions
+
+        reading = replace(self.reading, images={})
+        told = {
+            **_changed(self.options, LocateOptions()),
+            **_changed(reading, ReadOptions()),
+            **_changed(self.outputs.image, OutputOptions().image),
+        }
+        plain: dict[str, Any] = json.loads(json.dumps(told))
+        return plain
+
+    def _do(self, task: Task, asked: _Asked) -> Outcome:
+        """Locate one mask and write its results; the one place where what goes wrong with a mask is caught."""
+        try:
+            earlier = self._earlier(task, asked) if self.skip_existing else None
+            return earlier or self._locate(task, asked)
+        except RoadgeoError as error:
+            return _failed(task, str(error))
+        except MemoryError:
+            return _failed(task, f"{task.mask}: more memory is needed than there is; reduce it or cut it up")
+        except Exception as error:  # whatever libraries raise: cv2.error, errors of GDAL, of plugins ...
+            if os.environ.get("ROADGEO_TRACEBACK"):
+                raise
+            what = " ".join(f"{type(error).__name__}: {error}".split())
+            return _failed(task, f"{task.mask}: {what}; this is a fault of roadgeo, please report it")
+
+    def _earlier(self, task: Task, asked: _Asked) -> Outcome | None:
+        """Return what an earlier run found, if that is whole, the answer to the same question, and younger than it."""
+        from roadgeo.location import SCHEMA
+        from roadgeo.outputs.location_files import wanted_outputs
+        from roadgeo.outputs.paths import output_paths
+
+        paths = output_paths(self.out_dir, task.stem)
+        try:
+            document = json.loads(paths.of(JSON).read_text(encoding="utf-8"))
+            if paths.of(JSON).stat().st_mtime < Path(task.mask).stat().st_mtime:
+                return None
+        except (OSError, ValueError):
+            return None
+        if not isinstance(document, dict) or (document.get("schema"), document.get("query")) != (SCHEMA, task.mask):
+            return None
+        status, photo = document.get("status"), self.reading.photo(task)
+        if status not in {"located", "ambiguous", "not_located"} or not asked.same(document):
+            return None
+        wanted = wanted_outputs(self.outputs.products, status == "located", photo is not None)
+        files = [paths.of(output, Path(photo or task.mask).name) for output in wanted]
+        whole = all(path.is_file() and path.stat().st_size for path in files)
+        return Outcome(status, document, earlier=True) if whole else None
+
+    def _locate(self, task: Task, asked: _Asked) -> Outcome:
+        from roadgeo.outputs.location_files import write_location
+        from roadgeo.outputs.paths import output_paths
+        from roadgeo.outputs.registry import EXPLANATION
+        from roadgeo.workflows import explain, locate
+
+        started = perf_counter()
+        mask = self._read(task)
+        read_seconds = perf_counter() - started
+        options = self._with_focal_length(task, max(mask.shape))
+        asks_why = EXPLANATION.name in self.outputs.products
+        explanation = explain(mask, asked.references, options) if asks_why else None
+        location = locate(mask, asked.references, options) if explanation is None else explanation.location
+        location = replace(
+            location,
+            seconds=replace(location.seconds, open=asked.seconds, read=read_seconds),
+            options=asked.options,
+            reference_digest=asked.digest(location.reference),
+        )
+        paths, photo = output_paths(self.out_dir, task.stem), self.reading.photo(task)
+        indexes = [one.index for one in asked.references]
+        written = write_location(location, mask, paths, self.outputs, photo, indexes, explanation)
+        return Outcome(
+            location.status,
+            written.location.to_dict(),
+            tuple(map(str, written.files)),
+            tuple(map(str, written.removed)),
+            (photo, _scale(photo, mask)) if photo and location.located else None,
+        )
+
+    def _read(self, task: Task) -> RoadMask:
+        """Read the mask, or have a plugin see the roads in a photograph."""
+        import numpy as np
+
+        from roadgeo.geometry.mask import RoadMask
+        from roadgeo.plugins import SEGMENTERS, call_plugin
+        from roadgeo.sources.masks import read_mask
+
+        segmenter, threshold = self.reading.segmenter, self.reading.threshold
+        if segmenter is None:
+            return read_mask(task.mask, threshold=threshold, band=self.reading.band)
+        seen = call_plugin(SEGMENTERS, segmenter, task.mask)
+        if isinstance(seen, RoadMask):
+            return replace(seen, name=task.mask)
+        if not isinstance(seen, np.ndarray):
+            kind = type(seen).__name__
+            raise PluginError(f"the segmenter {segmenter!r} returned a {kind}, expected a RoadMask or an array")
+        return read_mask(seen, threshold=threshold, name=task.mask)
+
+    def _with_focal_length(self, task: Task, longer_side: int) -> LocateOptions:
+        """Return the options, with the focal length that the photograph's EXIF states where that was asked for."""
+        if not self.reading.exif:
+            return self.options
+        from roadgeo.sources.exif import read_focal_length
+
+        focal_px = read_focal_length(self.reading.images.get(task.mask, task.mask)) * longer_side
+        match = self.options.match
+        return replace(self.options, match=replace(match, camera=replace(match.camera, focal_px=focal_px)))
+
+
+@dataclass(frozen=True)
+class _Asked:
+    """What every mask of a batch is asked: on which references, with which options."""
+
+    references: list[Reference]
+    digests: list[str]
+    seconds: float
+    options: dict[str, Any]
+
+    def digest(self, names: str) -> str:
+        """Return the digest of the reference of that name; of all where several were searched in vain."""
+        found = [d for d, one in zip(self.digests, self.references, strict=True) if one.name == names]
+        return ", ".join(found[:1] or self.digests)
+
+    def same(self, document: Mapping[str, Any]) -> bool:
+        """Whether an earlier result answers the same question; where it does not say, it does."""
+        options, digest = document.get("options"), document.get("reference_digest")
+        same_maps = digest is None or set(digest.split(", ")) <= set(self.digests)
+        return same_maps and (options is None or options == self.options)
+
+
+def _changed(options: Any, usual: Any) -> dict[str, Any]:
+    """Return the fields of options that differ from the usual ones; of nested ones likewise."""
+    changed = {}
+    for one in dataclasses.fields(options):
+        value, default = getattr(options, one.name), getattr(usual, one.name)
+        if value != default:
+            changed[one.name] = _changed(value, default) if dataclasses.is_dataclass(value) else value
+    return changed
+
+
+def _failed(task: Task, reason: str) -> Outcome:
+    from roadgeo.location import SCHEMA
+
+    return Outcome("error", {"schema": SCHEMA, "query": task.mask, "status": "error", "reason": reason})
+
+
+def _scale(picture: str, mask: RoadMask) -> float:
+    """How many times the mask's width a picture's is."""
+    from roadgeo.storage.rasters import open_raster
+
+    with open_raster(picture) as source:
+        width: int = source.width
+    return round(width / mask.shape[1], 3)
+
+
+# --- all of them ------------------------------------------------------------------------------------------------------
+
+
+def write_overview(
+    out_dir: str | Path, tasks: Sequence[Task], outcomes: Sequence[Outcome], references: Sequence[Reference] | None
+) -> list[Path]:
+    """Write all footprints in one GeoPackage and one table, and where references are given a page of all reports.
+
+    Raises
+    ------
+    OutputError
+        A file cannot be written.
+    """
+    from roadgeo.outputs.summary import write_summary
+
+    folder, documents = Path(out_dir), [outcome.document for outcome in outcomes]
+    files = write_summary(folder, documents)
+    if references is not None:
+        from roadgeo.outputs.report import Entry, write_batch
+
+        reports = [REPORT.path(folder, task.stem) for task in tasks]
+        there = [path.exists() and one.status != "error" for path, one in zip(reports, outcomes, strict=True)]
+        links = [path.name if here else "" for path, here in zip(reports, there, strict=True)]
+        files.append(folder / "roadgeo_report.html")
+        write_batch(files[-1], list(map(Entry, documents, links)), [one.index for one in references])
+    return files

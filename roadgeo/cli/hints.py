@@ -1,0 +1,99 @@
+"""What the user knows of the camera: options that `locate` and `evaluate` share, under the names of their fields."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from typing import TYPE_CHECKING, Any, Literal, TypeVar
+
+import click
+
+from roadgeo.cli.parameters import CAMERA, NEAR, RANGE
+
+if TYPE_CHECKING:
+    from roadgeo.workflows import LocateOptions
+
+__all__ = ["HINTS", "hint_options", "make_options"]
+
+Command = TypeVar("Command", bound=Callable[..., Any])
+
+#: Parameter: its option on the command line, and what else click is told. All but `near` are fields of `CameraOptions`.
+HINTS: dict[str, tuple[str, dict[str, Any]]] = {
+    "gsd_m": (
+        "--gsd",
+        {"metavar": "LO:HI", "type": RANGE, "help": "Metres per pixel at the middle. Default: 0.2:5."},
+    ),
+    "max_tilt_deg": (
+        "--max-tilt",
+        {
+            "metavar": "DEG",
+            "type": click.FloatRange(0, 80),
+            "help": "Greatest angle of the camera from the vertical. Default: 60.",
+        },
+    ),
+    "focal_px": (
+        "--camera",
+        {
+            "metavar": "PIXELS|exif",
+            "type": CAMERA,
+            "help": "Focal length in pixels of the mask, or exif: as the photograph given by --image (else the mask)"
+            " says.",
+        },
+    ),
+    "near": (
+        "--near",
+        {
+            "metavar": "LON,LAT,RADIUS",
+            "type": NEAR,
+            "help": "The middle lies within RADIUS metres of this place.",
+        },
+    ),
+    "north_up": (
+        "--north-up",
+        {
+            "is_flag": True,
+            "help": "The image's up is north: grid north of the reference, within 5 degrees.",
+        },
+    ),
+}
+
+
+def hint_options(*names: str, **renamed: str) -> Callable[[Command], Command]:
+    """Add options for hints, all of them if none is named; `renamed` gives some another name on the command line."""
+
+    def add(command: Command) -> Command:
+        for name in reversed(names or tuple(HINTS)):
+            option, settings = HINTS[name]
+            command = click.option(renamed.get(name, option), name, **settings)(command)
+        return command
+
+    return add
+
+
+def make_options(
+    method: Literal["auto", "pair"],
+    time_limit_s: float,
+    hints: dict[str, Any],
+    effort: Literal["quick", "full"] = "full",
+) -> LocateOptions:
+    """Put what was given in its place among the options of all stages; the rest stays as it is.
+
+    Raises
+    ------
+    click.UsageError
+        The paper's method knows no hints.
+    """
+    from dataclasses import replace
+
+    from roadgeo.workflows import LocateOptions
+
+    known = {name: value for name, value in hints.items() if value is not None and value is not False}
+    if method == "pair" and known:
+        raise click.UsageError(
+            "--method pair knows no --camera, --gsd, --max-tilt, --near or --north-up: leave them out."
+        )
+    default = LocateOptions()
+    near = known.pop("near", None)
+    known = {name: value for name, value in known.items() if value != "exif"}
+    match = replace(default.match, camera=replace(default.match.camera, **known))
+    search = replace(default.search, time_limit_s=time_limit_s)
+    return replace(default, method=method, near=near, effort=effort, match=match, search=search)

@@ -1,0 +1,213 @@
+"""Every file that a result becomes: its name, how its file is called, what writes it, what it is for.
+
+One list, from which everything else follows: what is written and what an earlier run left that no longer holds, which
+files of a folder are results and no masks, the help texts, the choices in QGIS. To add an output, write a function that
+takes a path and a `Subject`, and list it here. Other packages offer theirs as entry points (see `roadgeo.plugins`).
+
+The modules that write are imported when something is written, so that `--help` need not load them.
+"""
+
+from __future__ import annotations
+
+import importlib
+from collections.abc import Callable, Iterable
+from dataclasses import dataclass
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+from roadgeo.errors import PluginError
+
+if TYPE_CHECKING:
+    from roadgeo.outputs.subject import Subject
+
+__all__ = [
+    "ALSO",
+    "ALWAYS",
+    "FIGURES",
+    "LOCALIZABILITY",
+    "REGISTRY",
+    "VECTORIZED",
+    "Output",
+    "find_outputs",
+    "is_result",
+    "offered",
+]
+
+#: What the names of further results end with, before their suffixes: those of `vectorize` and of `evaluate --map`.
+VECTORIZED, LOCALIZABILITY = "_vectorized", "_localizability"
+
+
+@dataclass(frozen=True)
+class Output:
+    """One file that a result becomes.
+
+    Attributes
+    ----------
+    name : str
+        What it is asked for by; for plugins the name of their entry point counts.
+    ending : str
+        What the file's name ends with, after the result's stem; "{picture}" stands for the picture's own name instead.
+    write : callable
+        Writes the file.
+    summary : str
+        What it is for.
+    needs_place : bool
+        Whether only a located mask has it.
+    option : str
+        What asks for it on the command line; "" where nobody need ask.
+    """
+
+    name: str
+    ending: str
+    write: Callable[[Path, Subject], None]
+    summary: str
+    needs_place: bool = True
+    option: str = ""
+
+    def path(self, folder: Path, stem: str, picture: str = "") -> Path:
+        """Name the file."""
+        return folder / (self.ending.replace("{picture}", picture) if "{" in self.ending else stem + self.ending)
+
+
+def _by(module: str, function: str) -> Callable[[Path, Subject], None]:
+    """Return what imports a module of this package when it is first called."""
+
+    def write(path: Path, subject: Subject) -> None:
+        getattr(importlib.import_module(f"roadgeo.outputs.{module}"), function)(path, subject)
+
+    return write
+
+
+JSON = Output(
+    "json",
+    "_location.json",
+    _by("location_files", "write_json"),
+    "place, homography, odds; also written, with a reason, where nothing was found",
+    needs_place=False,
+)
+FOOTPRINT = Output(
+    "footprint",
+    "_footprint.tif",
+    _by("footprint", "write_footprint"),
+    "the mask, or its --image, on the map (Cloud Optimized GeoTIFF)",
+)
+STYLE = Output("style", "_footprint.qml", _by("footprint", "write_style"), "how QGIS draws a mask's footprint")
+GEOPACKAGE = Output(
+    "geopackage",
+    "_location.gpkg",
+    _by("location_layers", "write_geopackage"),
+    "footprint, matched intersections, roads: opens styled in QGIS",
+)
+OVERLAY = Output(
+    "overlay", "_overlay.png", _by("overlay", "write_overlay"), "the mask and its place, to look at", option="--plot"
+)
+#: The formats of figures for papers.
+FIGURES = {
+    kind: Output(
+        f"figure-{kind}",
+        f"_figure.{kind}",
+        _by("figure", "write_figure"),
+        "the same with axes, for papers",
+        option=f"--figure {kind}",
+    )
+    for kind in ("pdf", "svg", "png")
+}
+REPORT = Output(
+    "report",
+    "_report.html",
+    _by("report.page", "write_report"),
+    "map, mask, residuals and numbers; also where nothing was found",
+    needs_place=False,
+    option="--report",
+)
+EXPLANATION = Output(
+    "explanation",
+    "_explain.json",
+    _by("explanation_sheet", "write_explanation"),
+    "why it was found there, or nowhere",
+    needs_place=False,
+    option="--explain",
+)
+EXPLANATION_PICTURE = Output(
+    "explanation-picture",
+    "_explain.png",
+    _by("explanation_sheet", "write_explanation_picture"),
+    "the same to look at",
+    needs_place=False,
+    option="--explain",
+)
+
+GCPS = Output(
+    "gcps", "_gcps.tif", _by("control_points", "write_gcps"), "the picture's own pixels with 25 control points, GeoTIFF"
+)
+VRT = Output(
+    "vrt", "_gcps.vrt", _by("control_points", "write_vrt"), "the same as a GDAL virtual raster: no pixels are copied"
+)
+POINTS = Output(
+    "points", "{picture}.points", _by("control_points", "write_points"), "control points for the QGIS Georeferencer"
+)
+ODM = Output("odm", "_gcp_list.txt", _by("control_points", "write_odm"), "control points for OpenDroneMap")
+WORLD_FILE = Output(
+    "worldfile", "_footprint.tfw", _by("footprint", "write_world_file"), "world file of the drawn raster"
+)
+GEOJSON = Output("geojson", "_footprint.geojson", _by("outlines", "write_geojson"), "footprint as GeoJSON (RFC 7946)")
+STAC = Output("stac", "_stac.json", _by("outlines", "write_stac"), "STAC Item of the drawn raster")
+KMZ = Output("kmz", "_overlay.kmz", _by("kmz", "write_kmz"), "ground overlay for Google Earth")
+
+#: Written for every located mask; of these only the JSON where there is no place.
+ALWAYS = (JSON, FOOTPRINT, STYLE, GEOPACKAGE)
+#: Written where `--also` asks for them, by the names under which pyproject.toml registers them too.
+ALSO = {output.name: output for output in (GCPS, VRT, POINTS, ODM, WORLD_FILE, GEOJSON, STAC, KMZ)}
+#: All of our own.
+REGISTRY = {
+    output.name: output
+    for output in (*ALWAYS, OVERLAY, *FIGURES.values(), REPORT, EXPLANATION_PICTURE, EXPLANATION, *ALSO.values())
+}
+
+
+def offered() -> list[str]:
+    """Names that `--also` takes: ours, and those of plugins."""
+    from roadgeo.plugins import OUTPUTS, find_plugins
+
+    return sorted({*ALSO, *find_plugins(OUTPUTS)})
+
+
+def find_outputs(names: Iterable[str]) -> list[Output]:
+    """Return outputs by their names, each once: ours, or else those of plugins.
+
+    Raises
+    ------
+    PluginError
+        There is none of that name, or what is offered under it is no `Output`.
+    """
+    return [REGISTRY[name] if name in REGISTRY else _load(name) for name in dict.fromkeys(names)]
+
+
+def _load(name: str) -> Output:
+    from roadgeo.plugins import OUTPUTS, load_plugin
+
+    output = load_plugin(OUTPUTS, name)
+    if not isinstance(output, Output):
+        raise PluginError(
+            f"the output {name!r} is a {type(output).__name__}, expected a roadgeo.outputs.registry.Output"
+        )
+    return output
+
+
+def is_result(name: str) -> bool:
+    """Whether a file of this name is one of our results, or of a plugin's, rather than a mask."""
+    stem, _, _ = name.rpartition(".")
+    endings = [output.ending for output in (*REGISTRY.values(), *_installed()) if "{" not in output.ending]
+    return name.lower().endswith(tuple(endings)) or stem.endswith((VECTORIZED, LOCALIZABILITY))
+
+
+def _installed() -> Iterable[Output]:
+    """Yield the outputs of other packages, but for those that cannot be loaded: nobody has asked for them."""
+    from roadgeo.plugins import OUTPUTS, find_plugins, package_of
+
+    for name, plugin in find_plugins(OUTPUTS).items():
+        if package_of(plugin) != "roadgeo":
+            try:
+                yield _load(name)
+            except PluginError:
+                continue

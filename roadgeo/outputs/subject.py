@@ -1,0 +1,150 @@
+"""What outputs show: a location with all that is at hand for drawing it."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass, field
+from functools import cached_property
+from pathlib import Path
+
+import numpy as np
+
+from roadgeo._arrays import FloatArray
+from roadgeo.errors import CrsError, OutputError
+from roadgeo.geometry.homography import Homography
+from roadgeo.geometry.mask import RoadMask
+from roadgeo.geometry.warping import MapGrid, cover
+from roadgeo.location import Location
+from roadgeo.matching.explanation import Explanation
+from roadgeo.matching.index import ReferenceIndex
+from roadgeo.outputs.orthophoto import ImageOptions, Target, choose_target, image_homography
+from roadgeo.outputs.paths import OutputPaths, Placement
+
+__all__ = ["Subject"]
+
+#: Control points lie on a grid of so many rows and columns, from corner to corner.
+_GRID = 5
+
+#: A warped mask is drawn in memory, so it is made coarser beyond this.
+_MASK_MAX_PIXELS = 100_000_000
+
+
+@dataclass(frozen=True)
+class Subject:
+    """What the outputs show. What needs a place raises an `OutputError` where there is none.
+
+    Attributes
+    ----------
+    photo : Path or None
+        The photograph that the mask was made of, which is drawn in its stead.
+    indexes : sequence of ReferenceIndex
+        The maps that were searched.
+    explanation : Explanation or None
+        Given where one was asked for.
+    """
+
+    location: Location
+    mask: RoadMask
+    paths: OutputPaths
+    image: ImageOptions = field(default_factory=ImageOptions)
+    photo: Path | None = None
+    indexes: Sequence[ReferenceIndex] = ()
+    explanation: Explanation | None = None
+
+    @property
+    def picture(self) -> Path:
+        """The file that is drawn: the photograph, or else the mask, as it came."""
+        return self.photo or Path(self.mask.name or f"{self.paths.stem}.png")
+
+    @property
+    def attribution(self) -> str:
+        """Whom the map's licence asks to name."""
+        return str(self.index.meta.get("attribution") or "") if self.indexes else self.location.attribution
+
+    @property
+    def index(self) -> ReferenceIndex:
+        """The map that it lies on, or the first that was searched."""
+        return self.index_of(self.location.reference)
+
+    def index_of(self, name: str) -> ReferenceIndex:
+        """Return the map of a name, or the first that was searched.
+
+        Raises
+        ------
+        OutputError
+            There is none at all.
+        """
+        if not self.indexes:
+            raise OutputError(f"{self.location.query}: no map is given to draw it on")
+        return next((index for index in self.indexes if index.name == name), self.indexes[0])
+
+    @cached_property
+    def place(self) -> Placement:
+        """Where it lies."""
+        return Placement.of(self.location)
+
+    @cached_property
+    def _registered(self) -> tuple[FloatArray, tuple[int, int]]:
+        mask_size = self.mask.shape[1], self.mask.shape[0]
+        if self.photo is None:
+            return self.place.homography, mask_size
+        return image_homography(self.place, mask_size, self.photo)
+
+    @property
+    def homography(self) -> FloatArray:
+        """(3, 3) from the picture's pixels (column, row; GDAL corner convention) to the place's CRS."""
+        return self._registered[0]
+
+    @property
+    def size(self) -> tuple[int, int]:
+        """Width and height of the picture."""
+        return self._registered[1]
+
+    @cached_property
+    def target(self) -> Target:
+        """CRS of the drawn raster, and the way there and back."""
+        return choose_target(self.place, self.image)
+
+    @property
+    def crs(self) -> str:
+        """CRS of the drawn raster."""
+        return self.target.crs
+
+    @cached_property
+    def grid(self) -> MapGrid:
+        """Pixels of the drawn raster.
+
+        Raises
+        ------
+        CrsError
+            The footprint lies outside what the CRS is made for.
+        """
+        max_pixels = self.image.max_pixels if self.photo else min(self.image.max_pixels, _MASK_MAX_PIXELS)
+        grid = cover(self.size, self.homography, self.image.resolution, max_pixels, self.target.to_target)
+        if grid.width == 0:
+            raise CrsError(f"the footprint lies outside what {self.crs} is made for; choose another --crs")
+        return grid
+
+    @cached_property
+    def roads(self) -> FloatArray:
+        """(S, 4) segments x1, y1, x2, y2 of the map's roads, in the place's CRS."""
+        ends = self.index.segments.reshape(-1, 2).astype(float)
+        return self.index.plane.to_crs(ends).reshape(-1, 4)
+
+    def control_points(self) -> list[tuple[float, float, float, float]]:
+        """Column, row, x, y of 25 points on a grid over the picture."""
+        columns, rows = np.meshgrid(np.linspace(0, self.size[0], _GRID), np.linspace(0, self.size[1], _GRID))
+        pixels = np.stack([columns.ravel(), rows.ravel()], axis=1)
+        points: list[tuple[float, float, float, float]]
+        points = [tuple(point) for point in np.hstack([pixels, Homography(self.homography)(pixels)]).tolist()]
+        return points
+
+    def outline(self) -> FloatArray:
+        """Ring (32, 2) of longitude and latitude around the footprint, counterclockwise; see `antimeridian`."""
+        from roadgeo.geometry.projection import to_lonlat
+
+        width, height = self.size
+        corners = np.array([[0, 0], [0, height], [width, height], [width, 0]], float)
+        sides = zip(corners, np.roll(corners, -1, axis=0), strict=True)
+        pixels = np.concatenate([np.linspace(a, b, 8, endpoint=False) for a, b in sides])
+        return to_lonlat(self.place.crs, Homography(self.homography)(pixels))

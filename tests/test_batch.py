@@ -1,0 +1,89 @@
+"""Which masks are located, under which names, and what one bad mask costs."""
+
+from importlib.metadata import EntryPoint
+from pathlib import Path
+
+import cv2
+import pytest
+from rasterio._err import CPLE_AppDefinedError
+
+from roadgeo import plugins
+from roadgeo.batch import ReadOptions, Task, _Asked, _Locating, find_masks, name_tasks
+from roadgeo.geometry.mask import RoadMask
+from roadgeo.outputs.location_files import OutputOptions
+from roadgeo.outputs.registry import REGISTRY, Output
+from roadgeo.plugins import OUTPUTS
+from roadgeo.workflows import LocateOptions
+
+
+def test_folders_and_patterns_are_expanded(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.chdir(tmp_path)
+    folder = tmp_path / "masks"
+    folder.mkdir()
+    for name in ("b.png", "a.tif", "a_footprint.tif", "b_overlay.png", ".c.png", "notes.txt", "odd[1].png"):
+        (folder / name).touch()
+    assert find_masks(["masks"]) == [str(Path("masks", name)) for name in ("a.tif", "b.png", "odd[1].png")]
+    assert find_masks([str(Path("masks", "?.png")), "missing.png"]) == [str(Path("masks", "b.png")), "missing.png"]
+    assert find_masks([str(Path("masks", "odd[1].png"))]) == [str(Path("masks", "odd[1].png"))]
+    assert find_masks(["none*.png"]) == ["none*.png"]
+
+
+def test_results_never_share_a_name() -> None:
+    tasks = name_tasks(["x/q.png", "y/q.png", "y/q.tif", "y/r.png"])
+    assert [task.stem for task in tasks] == ["x_q", "y_q_png", "y_q_tif", "r"]
+
+
+@pytest.mark.parametrize(
+    "masks",
+    [
+        ["p/x.png", "p/x.tif", "q/p_x_2.png"],
+        ["p/x.png", "p/x.tif", "q/p_x_tif.png"],
+        ["a/q.png", "a/Q.png", "b/Q.PNG"],
+        ["q.png", "q.png", "./q.png", "a/../q.png"],
+        ["1/a/x.png", "2/a/x.png"],
+    ],
+)
+def test_no_two_results_have_one_name(masks: list[str]) -> None:
+    for order in (masks, masks[::-1]):
+        stems = [task.stem.casefold() for task in name_tasks(order)]
+        assert len(set(stems)) == len(masks)
+
+
+def test_a_name_does_not_depend_on_the_order() -> None:
+    masks = ["p/x.png", "p/x.tif", "q/x.png", "r/x.png"]
+    names = {task.mask: task.stem for task in name_tasks(masks)}
+    assert {task.mask: task.stem for task in name_tasks(masks[::-1])} == names
+
+
+def test_results_of_an_earlier_run_are_no_masks(tmp_path: Path) -> None:
+    """Whatever outputs there are, also those of plugins, of `vectorize` and of `evaluate --map`."""
+    names = [output.path(tmp_path, "a", "photo.tif").name for output in REGISTRY.values()]
+    names += ["a_vectorized.png", "porto_localizability.tif", "porto_localizability.png", "a_seen.tif"]
+    for name in ("a.png", *names):
+        (tmp_path / name).touch()
+    with pytest.MonkeyPatch.context() as patch:
+        points = [EntryPoint("seen", f"{__name__}:SEEN", OUTPUTS), EntryPoint("broken", "no_such_module:x", OUTPUTS)]
+        patch.setattr(plugins, "entry_points", lambda group: points)
+        assert find_masks([str(tmp_path)]) == [str(tmp_path / "a.png")]
+
+
+SEEN = Output("seen", "_seen.tif", lambda path, subject: None, "what was seen")
+
+
+class Hazard:
+    """Raises what libraries raise, by the name of the mask."""
+
+    ERRORS = {"cv2": cv2.error("too large"), "gdal": CPLE_AppDefinedError(3, 1, "odd"), "deep": RecursionError()}  # noqa: RUF012
+
+    def __call__(self, path: str, **_: object) -> RoadMask:
+        raise self.ERRORS[Path(path).stem]
+
+
+@pytest.mark.parametrize("kind", Hazard.ERRORS)
+def test_whatever_one_mask_raises_the_others_go_on(kind: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr("roadgeo.sources.masks.read_mask", Hazard())
+    work = _Locating((), str(tmp_path), LocateOptions(), OutputOptions(), ReadOptions(), skip_existing=False)
+    outcome = work._do(Task(f"{kind}.png", kind), _Asked([], [], 0.0, {}))
+    assert outcome.status == "error"
+    assert outcome.document["query"] == f"{kind}.png"
+    assert "please report it" in outcome.document["reason"]

@@ -1,0 +1,91 @@
+import os
+import signal
+import subprocess
+import sys
+import time
+from collections.abc import Callable
+from dataclasses import dataclass
+from pathlib import Path
+
+import pytest
+
+from roadgeo._processes import run
+
+
+@dataclass(frozen=True)
+class Shout:
+    """A toy: upper case, slower for earlier tasks; dies at "die"."""
+
+    def prepare(self) -> Callable[[str], str]:
+        return self.do
+
+    def do(self, task: str) -> str:
+        if task == "die":
+            os._exit(1)
+        time.sleep(0.05 if task == "a" else 0)
+        return task.upper()
+
+    def give_up(self, task: str, reason: str) -> str:
+        return f"{task}: {reason}"
+
+
+@pytest.mark.parametrize("jobs", [1, 2])
+def test_results_come_in_the_order_of_the_tasks(jobs: int) -> None:
+    assert list(run(["a", "b", "c"], Shout(), jobs)) == ["A", "B", "C"]
+
+
+def test_a_process_that_dies_costs_one_result() -> None:
+    results = list(run(["a", "b", "die", "c", "d"], Shout(), 2))
+    assert results == ["A", "B", "die: the process that worked on it died (out of memory?)", "C", "D"]
+
+
+@pytest.mark.skipif(os.name == "nt", reason="signals of POSIX")
+def test_an_interrupt_ends_the_workers(tmp_path: Path) -> None:
+    """Ctrl-C goes to the whole group; nobody is left behind, and nobody prints a traceback."""
+    script = tmp_path / "interrupted.py"
+    script.write_text(
+        "import sys, time\n"
+        "from dataclasses import dataclass\n"
+        "from roadgeo._processes import run\n"
+        "@dataclass(frozen=True)\n"
+        "class Slow:\n"
+        "    def prepare(self): return self.do\n"
+        "    def do(self, task):\n"
+        "        try:\n"
+        "            time.sleep(0 if task == 'a' else 60)\n"
+        "        finally:\n"
+        "            open(task, 'w').close()\n"
+        "    def give_up(self, task, reason): pass\n"
+        "if __name__ == '__main__':\n"
+        "    try:\n"
+        "        for _ in run(list('abcdef'), Slow(), 2): print('one', flush=True)\n"
+        "    except KeyboardInterrupt:\n"
+        "        sys.exit(130)\n"
+    )
+    process = subprocess.Popen(
+        [sys.executable, str(script)],
+        cwd=tmp_path,
+        stdout=subprocess.PIPE,
+        stderr=subprocess.PIPE,
+        text=True,
+        start_new_session=True,
+    )
+    assert process.stdout.readline() == "one\n"
+    time.sleep(0.3)
+    os.killpg(process.pid, signal.SIGINT)
+    _, err = process.communicate(timeout=10)
+    assert process.returncode == 130
+    assert err == ""
+    assert (tmp_path / "b").exists()  # the worker was told, and cleaned up
+    assert not (tmp_path / "f").exists()  # and did not go on with what waited
+    assert is_gone(process.pid)
+
+
+def is_gone(group: int) -> bool:
+    for _ in range(50):
+        try:
+            os.killpg(group, 0)
+        except ProcessLookupError:
+            return True
+        time.sleep(0.1)
+    return False
