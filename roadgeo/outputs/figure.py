@@ -11,8 +11,7 @@ import numpy as np
 
 from roadgeo._arrays import FloatArray
 from roadgeo.errors import OutputError
-from roadgeo.geometry.homography import Homography
-from roadgeo.geometry.mask import PIXEL_TO_PLANE, RoadMask, plane_to_pixel
+from roadgeo.geometry.mask import RoadMask, plane_to_pixel
 from roadgeo.location import Location
 from roadgeo.outputs.canvas import FRAME, MAP_ROAD, MATCH, QUERY_ROAD, Color
 from roadgeo.outputs.paths import Placement
@@ -113,9 +112,7 @@ def _draw_map(axes: Any, location: Location, place: Placement, roads: FloatArray
     # Kilometres from the corner: eastings and northings of seven digits say little on an axis.
     axes.add_collection(LineCollection((ends[near] - low) / 1e3, colors=[_rgb(MAP_ROAD)], linewidths=1.6, label="map"))
     if location.evidence is not None:
-        to_crs = Homography(place.homography @ PIXEL_TO_PLANE)
-        lines = [line for line in map(to_crs, location.evidence.query_graph.polylines()) if np.isfinite(line).all()]
-        lines = [(line - low) / 1e3 for line in lines]
+        lines = [(line - low) / 1e3 for line in place.map_roads(location.evidence.query_graph)]
         axes.add_collection(LineCollection(lines, colors=[_rgb(QUERY_ROAD)], linewidths=0.7, label="mask"))
         matched = (location.evidence.reference_xy - low) / 1e3
         axes.plot(*matched.T, ".", color=_rgb(MATCH), markersize=3, label="matched")

@@ -76,7 +76,8 @@ def _write_mask(path: Path, subject: Subject) -> None:
         plain.update_tags(**_tags(subject))
         # Reduced in memory: left to the COG driver, they are written, compressed and read again on the way.
         plain.build_overviews(_reductions(max(grid.width, grid.height)), Resampling.nearest)
-        rasterio.shutil.copy(plain, optimized.name, driver="COG", compress="DEFLATE", level=1, blocksize=_BLOCK)
+        layout = {"driver": "COG", "compress": "DEFLATE", "level": 1, "blocksize": _BLOCK, "num_threads": 2}
+        rasterio.shutil.copy(plain, optimized.name, **layout)
         path.write_bytes(optimized.read())  # by ourselves: a full disk is an OSError that says so
 
 

@@ -2,17 +2,19 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from pathlib import Path
 
 import numpy as np
 
+from roadgeo._arrays import FloatArray
 from roadgeo.geometry.homography import Homography
-from roadgeo.geometry.mask import PIXEL_TO_PLANE, plane_to_pixel
+from roadgeo.geometry.mask import plane_to_pixel
 from roadgeo.location import Evidence
 from roadgeo.outputs.columns import attributes
 from roadgeo.outputs.paths import Placement
 from roadgeo.outputs.subject import Subject
-from roadgeo.storage.geopackage import Layer, write_layers
+from roadgeo.storage.geopackage import Layer, dump_layers
 from roadgeo.storage.qml import draw_fill, draw_line, draw_marker
 
 __all__ = ["write_geopackage"]
@@ -24,7 +26,7 @@ _MATCHES_STYLE = draw_marker("27,38,59", 2.2)
 
 def write_geopackage(path: Path, subject: Subject) -> None:
     """Write the layers `footprint`, `query_roads` and `matches`, styled for QGIS."""
-    write_layers(path, _layers(subject))
+    dump_layers(path, _layers(subject))
 
 
 def _layers(subject: Subject) -> list[Layer]:
@@ -46,19 +48,27 @@ def _layers(subject: Subject) -> list[Layer]:
 
 
 def _road_layer(place: Placement, evidence: Evidence) -> Layer:
-    """Draw the mask's roads on the map. A homography keeps lines straight, so mapping their vertices is exact."""
-    to_crs = Homography(place.homography @ PIXEL_TO_PLANE)
-    lines = [line for line in map(to_crs, evidence.query_graph.polylines()) if np.isfinite(line).all()]
-    lengths = [float(np.hypot(*np.diff(line, axis=0).T).sum()) for line in lines]
+    """Draw the mask's roads on the map."""
+    lines = place.map_roads(evidence.query_graph)
     return Layer(
         "query_roads",
         "LINESTRING",
         lines,
-        {"length_m": lengths},
+        {"length_m": _lengths(lines)},
         place.crs,
         _ROADS_STYLE,
         "Roads of the mask, as vectorized",
     )
+
+
+def _lengths(lines: Sequence[FloatArray]) -> FloatArray:
+    """Lengths of (V, 2) lines, all at once: calls for single ones would cost more than all else here."""
+    if not lines:
+        return np.empty(0)
+    starts = np.cumsum([0, *map(len, lines)])
+    steps = np.hypot(*np.diff(np.concatenate(lines), axis=0).T)
+    steps[starts[1:-1] - 1] = 0.0  # from one line to the next
+    return np.asarray(np.add.reduceat(steps, starts[:-1]))
 
 
 def _match_layer(place: Placement, evidence: Evidence) -> Layer:

@@ -11,8 +11,7 @@ import cv2
 import numpy as np
 
 from roadgeo._arrays import AnyArray, FloatArray
-from roadgeo.geometry.homography import Homography
-from roadgeo.geometry.mask import PIXEL_TO_PLANE, RoadMask, plane_to_pixel
+from roadgeo.geometry.mask import RoadMask, plane_to_pixel
 from roadgeo.location import Location
 from roadgeo.outputs.canvas import (
     FAINT_INK,
@@ -165,8 +164,7 @@ def _draw_map(canvas: _Canvas, roads: FloatArray) -> None:
 def _draw_query(canvas: _Canvas, location: Location, place: Placement) -> None:
     if location.evidence is None:
         return
-    to_crs = Homography(place.homography @ PIXEL_TO_PLANE)
-    lines = [line for line in map(to_crs, location.evidence.query_graph.polylines()) if np.isfinite(line).all()]
+    lines = place.map_roads(location.evidence.query_graph)
     canvas.draw_lines([canvas.pixels(line) for line in lines], QUERY_ROAD, 2)
 
 

@@ -6,10 +6,15 @@ import os
 from dataclasses import dataclass
 from pathlib import Path
 
+import numpy as np
+
 from roadgeo._arrays import FloatArray
 from roadgeo.errors import OutputError
+from roadgeo.geometry.homography import Homography
+from roadgeo.geometry.mask import PIXEL_TO_PLANE
 from roadgeo.location import Location
 from roadgeo.outputs.registry import FOOTPRINT, GEOPACKAGE, JSON, Output
+from roadgeo.roads.graph import RoadGraph
 
 __all__ = ["OutputPaths", "Placement", "output_paths"]
 
@@ -36,6 +41,18 @@ class Placement:
         if crs is None or homography is None or footprint is None or gsd_m is None:
             raise OutputError(f"{location.query} has no place on the map to draw: it is {location.status}")
         return cls(crs, homography, footprint, gsd_m)
+
+    def map_roads(self, graph: RoadGraph) -> list[FloatArray]:
+        """Lay the mask's roads (query plane) on the map: (V, 2) each, but for those that reach beyond the horizon.
+
+        A homography keeps lines straight, so mapping their vertices is exact.
+        """
+        if graph.n_edges == 0:
+            return []
+        mapped = Homography(self.homography @ PIXEL_TO_PLANE)(graph.coords)
+        whole = np.logical_and.reduceat(np.isfinite(mapped).all(axis=1), graph.offsets[:-1])
+        parts = zip(graph.offsets[:-1].tolist(), graph.offsets[1:].tolist(), strict=True)
+        return [mapped[first:last] for (first, last), seen in zip(parts, whole.tolist(), strict=True) if seen]
 
 
 @dataclass(frozen=True)

@@ -29,6 +29,7 @@ __all__ = [
     "GeometryType",
     "Layer",
     "add_layers",
+    "dump_layers",
     "layer_names",
     "open_read_only",
     "read_layer",
@@ -87,12 +88,27 @@ def write_layers(path: str | os.PathLike[str], layers: Sequence[Layer]) -> None:
         The file cannot be written.
     """
     with replacing(path) as temporary:
-        temporary.unlink(missing_ok=True)
-        try:
-            with closing(sqlite3.connect(temporary)) as database:
-                add_layers(database, layers)
-        except sqlite3.Error as error:
-            raise OutputError(f"cannot write {path}: {error}; choose a folder that you may write to") from error
+        dump_layers(temporary, layers)
+
+
+def dump_layers(path: Path, layers: Sequence[Layer]) -> None:
+    """Write a new GeoPackage as it comes: for files that are staged already.
+
+    Raises
+    ------
+    CrsError
+        A layer's CRS is unknown.
+    OSError
+        The file cannot be written.
+    """
+    try:
+        # Made in memory and written at once: on disk, SQLite writes page by page, many of them several times.
+        with closing(sqlite3.connect(":memory:")) as database:
+            add_layers(database, layers)
+            content = database.serialize()
+    except sqlite3.Error as error:
+        raise OutputError(f"cannot make a GeoPackage: {error}; please report it") from error
+    path.write_bytes(content)
 
 
 def add_layers(
