@@ -5,6 +5,7 @@ Exit status: 0 all well (and every mask located), 3 at least one mask not locate
 
 from __future__ import annotations
 
+import difflib
 import importlib
 import os
 import sys
@@ -52,6 +53,22 @@ class LazyGroup(click.Group):
         module = importlib.import_module(COMMANDS[cmd_name][0])
         return getattr(module, f"{cmd_name}_command")  # type: ignore[no-any-return]
 
+    def resolve_command(
+        self, ctx: click.Context, args: list[str]
+    ) -> tuple[str | None, click.Command | None, list[str]]:
+        """Find the command that is meant; of a name that is mistyped say which may be.
+
+        Raises
+        ------
+        click.UsageError
+            There is no such command.
+        """
+        if args and args[0] not in COMMANDS and not args[0].startswith("-"):
+            near = difflib.get_close_matches(args[0], COMMANDS, n=1)
+            hint = f"Did you mean {near[0]}?" if near else ""
+            raise click.UsageError(f"No such command {args[0]!r}. {hint}".strip(), ctx)
+        return super().resolve_command(ctx, args)
+
     def format_commands(self, ctx: click.Context, formatter: click.HelpFormatter) -> None:  # noqa: ARG002
         """List the summaries without importing anything."""
         with formatter.section("Commands"):
@@ -92,7 +109,8 @@ def main(arguments: Sequence[str] | None = None) -> int:
         )
     except click.UsageError as error:
         asked = error.ctx.command_path if error.ctx else "roadgeo"
-        return _fail(f"{error.format_message().rstrip('.')}. Try '{asked} --help'.", error.exit_code)
+        said = error.format_message().rstrip(".")
+        return _fail(f"{said}{'' if said.endswith('?') else '.'} Try '{asked} --help'.", error.exit_code)
     except click.ClickException as error:
         return _fail(error.format_message(), error.exit_code)
     except (click.Abort, KeyboardInterrupt):

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from typing import TYPE_CHECKING, Any, Literal, TypeVar
 
 import click
@@ -10,9 +10,10 @@ import click
 from roadgeo.cli.parameters import CAMERA, NEAR, RANGE
 
 if TYPE_CHECKING:
+    from roadgeo.reference.reference import Reference
     from roadgeo.workflows import LocateOptions
 
-__all__ = ["HINTS", "hint_options", "make_options"]
+__all__ = ["HINTS", "hint_options", "make_options", "refuse_swapped"]
 
 Command = TypeVar("Command", bound=Callable[..., Any])
 
@@ -67,6 +68,35 @@ def hint_options(*names: str, **renamed: str) -> Callable[[Command], Command]:
         return command
 
     return add
+
+
+def refuse_swapped(near: tuple[float, float, float] | None, references: Sequence[Reference]) -> None:
+    """Ask what is meant where a place lies on no map, but would with longitude and latitude exchanged.
+
+    Raises
+    ------
+    click.UsageError
+        It is so.
+    """
+    if near is None or any(_lies_on(one, near[:2], near[2]) for one in references):
+        return
+    lon, lat, radius = near
+    if abs(lon) <= 90 and any(_lies_on(one, (lat, lon), radius) for one in references):
+        raise click.UsageError(
+            f"--near={lon:.9g},{lat:.9g},{radius:g} lies on none of the maps; longitude comes first:"
+            f" did you mean --near={lat:.9g},{lon:.9g},{radius:g}?"
+        )
+
+
+def _lies_on(reference: Reference, lonlat: tuple[float, float], radius_m: float) -> bool:
+    """Whether a circle touches the bounds of a map."""
+    import numpy as np
+
+    from roadgeo.geometry.projection import from_lonlat
+
+    xy, center = reference.index.xy, from_lonlat(reference.index.plane, np.array([lonlat], float))[0]
+    beyond = np.maximum(xy.min(axis=0) - center, center - xy.max(axis=0))
+    return bool((beyond <= radius_m).all())
 
 
 def make_options(

@@ -10,6 +10,7 @@ import click
 
 from roadgeo._progress import Say
 from roadgeo.cli.parameters import BOX, NEAR, Plugin, verbosity_options
+from roadgeo.errors import RoadSourceError
 
 if TYPE_CHECKING:
     from roadgeo.sources.roads import Roads
@@ -113,6 +114,7 @@ def index_command(
         _rebuild(rebuild, quiet)
         return
     given = _one_source(source)
+    _require_geopackage(out)
     name = name or _name(source, given, out)
     path = Path(out) if out else new_reference(name)
     make_folder(path.parent)  # before the long part
@@ -120,7 +122,10 @@ def index_command(
         reference_freshness(path)  # there must be one
     read = {"roads": _read, "plugin": _read_plugin}.get(given, _fetch)
     with show_steps(quiet) as say:
-        roads = read(source, given, say)
+        try:
+            roads = read(source, given, say)
+        except RoadSourceError as error:
+            raise RoadSourceError(f"{error}{_ask_about_box(source['bbox'])}") from error
         if update:
             reference = update_reference(path, roads, say)
         else:
@@ -131,9 +136,30 @@ def index_command(
             click.echo(f"  {key}: {value}", err=True)
     if not quiet:
         seconds = perf_counter() - started
-        click.echo(
-            f"{path}: {len(reference.index):,} intersections in {seconds:.1f} s; search it with `roadgeo locate`"
+        found = f"{path}: {len(reference.index):,} intersections in {seconds:.1f} s"
+        click.echo(f"{found}; search it with `roadgeo locate MASK -r {out or path.stem}`")
+
+
+#: Endings of what `--out` may be taken for.
+_OTHER_FORMATS = {".shp", ".geojson", ".json", ".fgb", ".kml", ".gml", ".parquet", ".sqlite", ".osm", ".pbf", ".zip"}
+
+
+def _require_geopackage(out: str | None) -> None:
+    """Refuse a reference in another format than the one there is."""
+    if out is not None and Path(out).suffix.lower() in _OTHER_FORMATS:
+        raise click.UsageError(
+            f"--out {out}: a reference is a GeoPackage with its index beside it; did you mean"
+            f" {Path(out).with_suffix('.gpkg')}?"
         )
+
+
+def _ask_about_box(box: tuple[float, float, float, float] | None) -> str:
+    """Ask whether longitudes and latitudes of a box without roads were exchanged, where they may have been."""
+    if box is None:
+        return ""
+    south, west, north, east = box  # if so
+    sound = -90 <= south < north <= 90 and -180 <= west < east <= 180
+    return f" (longitude comes first: did you mean --bbox={west:g},{south:g},{east:g},{north:g}?)" if sound else ""
 
 
 def _rebuild(name: str, quiet: bool) -> None:

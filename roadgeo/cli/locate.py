@@ -13,7 +13,7 @@ import click
 from roadgeo.batch import Outcome, ReadOptions, find_masks, locate_masks, name_tasks, open_references, write_overview
 from roadgeo.cli import ERROR, NOT_LOCATED
 from roadgeo.cli.folders import make_folder
-from roadgeo.cli.hints import HINTS, hint_options, make_options
+from roadgeo.cli.hints import HINTS, hint_options, make_options, refuse_swapped
 from roadgeo.cli.parameters import Plugin, verbosity_options
 from roadgeo.outputs.registry import (
     ALSO,
@@ -243,6 +243,7 @@ def locate_command(
     )
     # Opened here too: what is wrong with them is said once, and the search is compiled before processes start.
     opened = open_references(references, print_steps(quiet))
+    refuse_swapped(given["near"], opened)
     compile_once(opened[0], quiet)
     outcomes: list[Outcome] = []
     with count_up(len(tasks), quiet, as_json, _summarize) as count:

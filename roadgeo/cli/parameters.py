@@ -124,15 +124,26 @@ def _wrong_range(low: float, high: float) -> str:
     return "" if 0 < low <= high < float("inf") else "LO must be above 0 and not above HI"
 
 
+def _swapped(form: str, *numbers: float) -> str:
+    """Ask whether longitude and latitude were exchanged; "" where that would be as wrong. `form` exchanges them."""
+    meant = form.format(*numbers)
+    exchanged = [float(number) for number in meant.split(",")]
+    lons, lats = (exchanged[:1], exchanged[1:2]) if len(exchanged) == 3 else (exchanged[::2], exchanged[1::2])
+    sound = all(-180 <= lon <= 180 for lon in lons) and all(-90 <= lat <= 90 for lat in lats)
+    sound = sound and lats == sorted(lats)
+    return f" (longitude comes first: did you mean {meant}?)" if sound else " (longitude comes first)"
+
+
 def _wrong_place(lon: float, lat: float, radius: float) -> str:
     if not (-180 <= lon <= 180 and -90 <= lat <= 90):
-        return "longitude must lie within ±180, latitude within ±90 (longitude comes first)"
+        return f"longitude must lie within ±180, latitude within ±90{_swapped('{1:g},{0:g},{2:g}', lon, lat, radius)}"
     return "" if 0 < radius < 2e7 else "the radius must be above 0 metres"
 
 
 def _wrong_box(west: float, south: float, east: float, north: float) -> str:
     if not (-90 <= south < north <= 90):
-        return "south must lie below north, both within ±90"
+        swapped = _swapped("{1:g},{0:g},{3:g},{2:g}", west, south, east, north)
+        return f"south must lie below north, both within ±90{swapped}"
     if not (-180 <= west <= 180 and -180 <= east <= 180 and west != east):
         return "west and east must differ and lie within ±180"
     return ""

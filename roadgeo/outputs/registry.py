@@ -124,7 +124,7 @@ EXPLANATION = Output(
     "explanation",
     "_explain.json",
     _by("explanation_sheet", "write_explanation"),
-    "why it was found there, or nowhere",
+    "the same for programs",
     needs_place=False,
     option="--explain",
 )
@@ -132,7 +132,7 @@ EXPLANATION_PICTURE = Output(
     "explanation-picture",
     "_explain.png",
     _by("explanation_sheet", "write_explanation_picture"),
-    "the same to look at",
+    "why it was found there, or nowhere",
     needs_place=False,
     option="--explain",
 )

@@ -11,6 +11,7 @@ from pathlib import Path
 
 from roadgeo.errors import IndexFormatError
 from roadgeo.reference.files import ReferencePaths, reference_paths
+from roadgeo.reference.network_file import not_a_reference
 from roadgeo.storage.atomic import writing
 
 __all__ = ["library_dir", "list_references", "make_slug", "new_reference", "remove_reference", "resolve_reference"]
@@ -74,6 +75,8 @@ def resolve_reference(name_or_path: str | os.PathLike[str]) -> Path:
     for paths in (reference_paths(name), _shelved(name)):
         if paths.geopackage.is_file() or paths.index.is_file():
             return paths.geopackage
+    if Path(name).is_file():
+        raise not_a_reference(name)
     known = [path.stem for path in list_references()]
     near = difflib.get_close_matches(make_slug(name), known, n=1)
     hint = f"did you mean {near[0]}?" if near else "`roadgeo list` shows the library, `roadgeo index` adds to it"

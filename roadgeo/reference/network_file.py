@@ -38,6 +38,7 @@ __all__ = [
     "computed_digest",
     "dump_network",
     "network_digest",
+    "not_a_reference",
     "read_meta",
     "read_network",
     "ring_area",
@@ -170,6 +171,15 @@ def read_network(path: str | os.PathLike[str]) -> RoadNetwork:
     )
 
 
+def not_a_reference(path: str | os.PathLike[str]) -> IndexFormatError:
+    """Return the error for a file that is something else, roads perhaps: it says how to build a reference of them."""
+    reference = Path(path).with_name(f"{Path(path).name.split('.')[0]}_reference.gpkg")
+    return IndexFormatError(
+        f"{os.fspath(path)} is no reference; if it holds roads, build one: "
+        f"`roadgeo index --roads {os.fspath(path)} --out {reference}`, then locate with `-r {reference}`"
+    )
+
+
 def read_meta(path: str | os.PathLike[str]) -> dict[str, Any]:
     """Read the table `roadgeo_meta`: values by key, the program's own under `roadgeo.`.
 
@@ -179,6 +189,8 @@ def read_meta(path: str | os.PathLike[str]) -> dict[str, Any]:
         When the file is missing or is no reference.
     """
     with open_read_only(path) as database:
+        if not database.execute("SELECT 1 FROM sqlite_master WHERE name = 'roadgeo_meta'").fetchall():
+            raise not_a_reference(path)
         require_tables(database, path, "roadgeo_meta")
         rows = database.execute("SELECT key, value FROM roadgeo_meta").fetchall()
     try:

@@ -157,3 +157,21 @@ def test_colours_appear_on_terminals_that_want_them() -> None:
     plain = run_on_a_terminal(["info", "nonesuch"], {"NO_COLOR": "1"})
     assert plain.startswith("Error: no reference 'nonesuch'")
     assert "\x1b" not in plain
+
+
+@pytest.mark.parametrize(("typed", "meant"), [("locat", "locate"), ("vectorise", "vectorize"), ("indx", "index")])
+def test_a_mistyped_command_is_asked_about(typed: str, meant: str, capfd: pytest.CaptureFixture[str]) -> None:
+    assert main([typed, "a.png"]) == 2
+    assert capfd.readouterr().err == f"Error: No such command '{typed}'. Did you mean {meant}? Try 'roadgeo --help'.\n"
+
+
+@pytest.mark.parametrize(
+    ("kind", "text", "meant"),
+    [
+        (NEAR, "42.36,-171.06,5000", "-171.06,42.36,5000"),
+        (BOX, "42.23,-171.19,42.44,-170.95", "-171.19,42.23,-170.95,42.44"),
+    ],
+)
+def test_exchanged_degrees_are_asked_about(kind: Numbers, text: str, meant: str) -> None:
+    with pytest.raises(click.BadParameter, match=f"longitude comes first: did you mean {meant}"):
+        kind.convert(text, None, None)

@@ -226,3 +226,28 @@ def test_the_library_from_filling_to_removing(tmp_path, monkeypatch, capsys):
     assert [line.split()[0] for line in told.splitlines()] == ["fenway-streets", "one", "two"]
     assert main(["remove", "one", "fenway-streets", "--yes"]) == 0
     assert sorted(file.name for file in (tmp_path / "library").iterdir()) == ["two.gpkg", "two.index"]
+
+
+def test_a_reference_is_a_geopackage(tmp_path, monkeypatch, capsys):
+    monkeypatch.chdir(tmp_path)
+    write_streets(tmp_path / "a.geojson")
+    assert main(["index", "--roads", "a.geojson", "--out", "maps/b.shp"]) == 2
+    assert f"did you mean {Path('maps', 'b.gpkg')}?" in capsys.readouterr().err
+    assert not (tmp_path / "maps").exists()
+
+
+def test_the_next_command_is_named(tmp_path, monkeypatch, capsys):
+    monkeypatch.chdir(tmp_path)
+    monkeypatch.setenv("ROADGEO_LIBRARY", str(tmp_path / "library"))
+    write_streets(tmp_path / "a.geojson")
+    assert main(["index", "--roads", "a.geojson", "--out", "maps/b.gpkg"]) == 0
+    assert "search it with `roadgeo locate MASK -r maps/b.gpkg`" in capsys.readouterr().out
+    assert main(["index", "--roads", "a.geojson", "--name", "Fenway, MA"]) == 0
+    assert "search it with `roadgeo locate MASK -r fenway-ma`" in capsys.readouterr().out
+
+
+def test_a_box_with_exchanged_degrees_is_asked_about(tmp_path, monkeypatch, capsys):
+    monkeypatch.chdir(tmp_path)
+    write_streets(tmp_path / "a.geojson")
+    assert main(["index", "--roads", "a.geojson", "--bbox=42.3,-71.2,42.4,-71", "--out", "b.gpkg"]) == 1
+    assert "longitude comes first: did you mean --bbox=-71.2,42.3,-71,42.4?" in capsys.readouterr().err

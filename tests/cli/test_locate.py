@@ -14,11 +14,14 @@ import numpy as np
 import pyproj
 import pytest
 import rasterio
+from worlds.fenway import write_streets
 
+from roadgeo._version import __version__
 from roadgeo.cli import main
 from roadgeo.cli.locate import pair_images
 from roadgeo.demo import ATTRIBUTION, ROADS, DemoMask, demo_masks
 from roadgeo.geometry.homography import Homography
+from roadgeo.reference.files import reference_digest
 from roadgeo.sources.roads import read_roads
 from roadgeo.workflows import build_reference
 
@@ -395,3 +398,83 @@ def test_locate_needs_no_heavy_library(porto: Path, tmp_path: Path) -> None:
     )
     heavy = {"geopandas", "pyogrio", "osmnx", "networkx", "pandas", "matplotlib", "shapely", "rich"}
     assert not heavy & set(done.stdout.split())
+
+
+# --- messages that ask what is meant ----------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize("name", ["streets.geojson", "streets.gpkg"])
+def test_raw_roads_are_no_reference_and_how_to_build_one_is_said(
+    name: str, tmp_path: Path, capfd: pytest.CaptureFixture[str]
+) -> None:
+    write_streets(Path(name))
+    assert main(["locate", str(MASKS["drone"].path), "-r", name]) == 1
+    said = last_line(capfd)
+    assert f"{name} is no reference; if it holds roads, build one: `roadgeo index --roads {name}" in said
+    assert "-r streets_reference.gpkg" in said
+
+
+def test_longitude_and_latitude_that_were_exchanged_are_asked_about(
+    porto: Path, capfd: pytest.CaptureFixture[str]
+) -> None:
+    locate = ["locate", str(MASKS["drone"].path), "-r", str(porto), "-q"]
+    assert main([*locate, "--near=41.15,-8.6,3000"]) == 2
+    assert "lies on none of the maps" in (said := capfd.readouterr().err)
+    assert "did you mean --near=-8.6,41.15,3000?" in said
+    assert main([*locate, "--near=-8.6,41.15,3000"]) == 0
+    assert main([*locate, "--near=2.35,48.85,2000"]) == 3  # elsewhere, either way: no question
+    assert main([*locate, "--near=41.15,-108.6,3000"]) == 2  # no latitude
+    assert "did you mean -108.6,41.15,3000?" in capfd.readouterr().err
+
+
+def test_a_refusal_says_what_it_removed(porto: Path, capfd: pytest.CaptureFixture[str]) -> None:
+    shutil.copy(MASKS["drone"].path, "a.png")
+    assert main(["locate", "a.png", "-r", str(porto), "--plot", "--also", "points", "-q"]) == 0
+    assert main(["locate", "a.png", "-r", str(porto), "--near", "0,0,10"]) == 3
+    removed = capfd.readouterr().out.splitlines()[1].removeprefix("  removed what an earlier run had found: ")
+    assert set(removed.split(", ")) == {
+        *("a_footprint.tif", "a_footprint.qml", "a_location.gpkg", "a_overlay.png", "a.png.points"),
+    }
+    assert sorted(path.name for path in Path().glob("a*")) == ["a.png", "a_location.json"]
+    assert main(["locate", "a.png", "-r", str(porto), "--near", "0,0,10"]) == 3
+    assert "removed" not in capfd.readouterr().out
+
+
+def test_the_style_of_a_mask_does_not_colour_the_photograph(porto: Path) -> None:
+    shutil.copy(MASKS["drone"].path, "a.png")
+    cv2.imwrite("photo.png", np.full((960, 1280, 3), 90, np.uint8))
+    assert main(["locate", "a.png", "-r", str(porto), "-q"]) == 0
+    assert main(["locate", "a.png", "-r", str(porto), "--image", "photo.png", "-q"]) == 0
+    assert not Path("a_footprint.qml").exists()
+
+
+def test_what_is_missing_of_an_earlier_result_is_made_anew(porto: Path, capfd: pytest.CaptureFixture[str]) -> None:
+    shutil.copy(MASKS["drone"].path, "a.png")
+    locate = ["locate", "a.png", "-r", str(porto), "--report", "--plot", "--skip-existing"]
+    assert main(locate[:-2]) == 0
+    capfd.readouterr()
+    for lost in ("a_overlay.png", "a_location.gpkg"):
+        Path(lost).unlink()
+        assert main(locate) == 0
+        assert "before" not in capfd.readouterr().out
+        assert Path(lost).stat().st_size
+    Path("a_report.html").write_bytes(b"")  # as after a power cut
+    assert main(locate) == 0
+    assert Path("a_report.html").stat().st_size
+    capfd.readouterr()
+    assert main(locate) == 0
+    assert capfd.readouterr().out == "a.png: located before\n"
+    assert main([*locate, "--max-tilt", "50"]) == 0  # another question
+    assert "before" not in capfd.readouterr().out
+
+
+def test_the_json_says_how_it_was_made(porto: Path, capfd: pytest.CaptureFixture[str]) -> None:
+    shutil.copy(MASKS["drone"].path, "a.png")
+    assert main(["locate", "a.png", "-r", str(porto), "--json", "-q", "--max-tilt", "50", "--threshold", "99"]) == 0
+    found = json.loads(capfd.readouterr().out)
+    assert found["version"] == __version__
+    assert found["options"] == {"match": {"camera": {"max_tilt_deg": 50.0}}, "threshold": 99.0}
+    assert main(["info", str(porto), "--json"]) == 0
+    assert found["reference_digest"] == reference_digest(porto)
+    assert 0 < found["rmse_m"] < 3
+    assert found["rmse_px"] == pytest.approx(found["rmse_m"] / found["gsd_m"], rel=0.5)
