@@ -7,6 +7,7 @@ import math
 import sys
 import time
 from collections.abc import Iterator, Sequence
+from dataclasses import replace
 from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Literal
@@ -112,19 +113,24 @@ def evaluate_command(
     known = {"known_gsd": gsd_m, "max_tilt": max_tilt_deg, "north_up": north_up or None, "time_limit_s": time_limit}
     told = {"reference": path.stem, "method": method, **_known(known)}
     if as_map:
-        from roadgeo.evaluation.survey import ANY, Survey
-
-        trials = options["count"] or 600
-        ((simulation, _), *_) = query_sets(**options | {"intersections": ANY})
-        settings = {name: value for name, value in options.items() if name not in ("intersections", "mirrored")}
-        settings = _known(settings | {"count": trials, "noise": simulation.kind}) | told
-        counting = partial(count_up, quiet=quiet)
-        survey = Survey(path, simulation, locator, trials, check, jobs, settings, out_dir, counting)
+        survey = _survey(locator, options, told)
+        survey = replace(survey, check=check, jobs=jobs, out_dir=out_dir, counting=partial(count_up, quiet=quiet))
         _write_map(survey, as_json, quiet)
         return
     query_set, settings = _query_set(path, queries, roads, options)
     settings |= told
     _evaluate(query_set, locator, settings, radius, jobs, out_dir, as_json, quiet)
+
+
+def _survey(locator: ReferenceLocator, options: dict[str, Any], told: dict[str, Any]) -> Survey:
+    """Put together what a map of localizability is made with."""
+    from roadgeo.evaluation.survey import ANY, Survey
+
+    trials = options["count"] or 600
+    ((simulation, _), *_) = query_sets(options | {"intersections": ANY})
+    settings = {name: value for name, value in options.items() if name not in ("intersections", "mirrored")}
+    settings = _known(settings | {"count": trials, "noise": simulation.kind}) | told
+    return Survey(locator.references[0], simulation, locator, trials, settings=settings)
 
 
 def _known(settings: dict[str, Any]) -> dict[str, Any]:
@@ -214,7 +220,7 @@ def _query_set(
 
     if queries is None:
         drawn_from = {} if roads is None else {"roads": roads.name}
-        return DrawnMasks(reference, query_sets(**options), roads), _known(options) | drawn_from
+        return DrawnMasks(reference, query_sets(options), roads), _known(options) | drawn_from
     table = queries / "truth.csv" if queries.is_dir() else queries
     truths = read_truth(table)
     elsewhere = count_elsewhere(truths, reference)

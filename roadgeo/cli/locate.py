@@ -84,70 +84,72 @@ def _help() -> str:
     return _HELP.format(always=_listed(ALWAYS), asked=_listed(asked), also=also)
 
 
+#: How the result is drawn, and in which further forms.
+_DRAWING = [
+    click.option("--plot", is_flag=True, help=f"Also write MASK{OVERLAY.ending}: {OVERLAY.summary}."),
+    click.option(
+        "--figure",
+        type=click.Choice(list(FIGURES)),
+        help="Also write MASK_figure, the same with axes, for papers. Needs matplotlib: pip install 'roadgeo[plot]'.",
+    ),
+    click.option(
+        "--report",
+        is_flag=True,
+        help=f"Also write MASK{REPORT.ending}, to look at in a browser, located or not; needs no network.",
+    ),
+    click.option(
+        "--explain",
+        is_flag=True,
+        help=f"Also write MASK{EXPLANATION_PICTURE.ending} and .json: how far the search got, the best rejected"
+        " places, what was missing.",
+    ),
+    click.option(
+        "--image",
+        "images",
+        metavar="PHOTO",
+        type=click.Path(),
+        multiple=True,
+        help="Draw this photograph on the map instead of its mask. One per mask, in order, or a folder of them.",
+    ),
+    click.option(
+        "--also",
+        "products",
+        metavar="NAME",
+        type=Plugin("roadgeo.outputs", names=offered),
+        multiple=True,
+        help="Write a further form of the result: see below. Repeatable.",
+    ),
+    click.option("--gcps", is_flag=True, help=f"The same as --also gcps: {GCPS.summary}."),
+    click.option(
+        "--crs", metavar="CRS", help="CRS of what is drawn, such as EPSG:3857. Default: the reference's, metric."
+    ),
+    click.option(
+        "--resolution",
+        metavar="SIZE",
+        type=click.FloatRange(min=0, min_open=True),
+        help="Pixel size of what is drawn, in units of its CRS. Default: the picture's own.",
+    ),
+    click.option(
+        "--resampling",
+        type=click.Choice(["nearest", "bilinear", "cubic", "lanczos"]),
+        default="cubic",
+        show_default=True,
+        help="How a photograph's values between its pixels are found.",
+    ),
+    click.option(
+        "--max-pixels",
+        metavar="N",
+        type=click.IntRange(1),
+        default=400_000_000,
+        show_default=True,
+        help="Draw coarser rather than more than this.",
+    ),
+]
+
+
 def _drawing_options(command: Command) -> Command:
-    """Add what says how the result is drawn, and in which further forms."""
-    options = [
-        click.option("--plot", is_flag=True, help=f"Also write MASK{OVERLAY.ending}: {OVERLAY.summary}."),
-        click.option(
-            "--figure",
-            type=click.Choice(list(FIGURES)),
-            help="Also write MASK_figure, the same with axes, for papers. Needs matplotlib: pip install"
-            " 'roadgeo[plot]'.",
-        ),
-        click.option(
-            "--report",
-            is_flag=True,
-            help=f"Also write MASK{REPORT.ending}, to look at in a browser, located or not; needs no network.",
-        ),
-        click.option(
-            "--explain",
-            is_flag=True,
-            help=f"Also write MASK{EXPLANATION_PICTURE.ending} and .json: how far the search got, the best rejected"
-            " places, what was missing.",
-        ),
-        click.option(
-            "--image",
-            "images",
-            metavar="PHOTO",
-            type=click.Path(),
-            multiple=True,
-            help="Draw this photograph on the map instead of its mask. One per mask, in order, or a folder of them.",
-        ),
-        click.option(
-            "--also",
-            "products",
-            metavar="NAME",
-            type=Plugin("roadgeo.outputs", names=offered),
-            multiple=True,
-            help="Write a further form of the result: see below. Repeatable.",
-        ),
-        click.option("--gcps", is_flag=True, help=f"The same as --also gcps: {GCPS.summary}."),
-        click.option(
-            "--crs", metavar="CRS", help="CRS of what is drawn, such as EPSG:3857. Default: the reference's, metric."
-        ),
-        click.option(
-            "--resolution",
-            metavar="SIZE",
-            type=click.FloatRange(min=0, min_open=True),
-            help="Pixel size of what is drawn, in units of its CRS. Default: the picture's own.",
-        ),
-        click.option(
-            "--resampling",
-            type=click.Choice(["nearest", "bilinear", "cubic", "lanczos"]),
-            default="cubic",
-            show_default=True,
-            help="How a photograph's values between its pixels are found.",
-        ),
-        click.option(
-            "--max-pixels",
-            metavar="N",
-            type=click.IntRange(1),
-            default=400_000_000,
-            show_default=True,
-            help="Draw coarser rather than more than this.",
-        ),
-    ]
-    for option in reversed(options):
+    """Add the options of `_DRAWING`."""
+    for option in reversed(_DRAWING):
         command = option(command)
     return command
 

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, TypeVar
 
@@ -136,37 +136,25 @@ def query_options(command: Command) -> Command:
     return command
 
 
-def query_sets(
-    *,
-    count: int | None,
-    noise: tuple[str, ...],
-    gsd: tuple[float, float],
-    tilt: tuple[float, float],
-    heading: tuple[float, float],
-    size: int,
-    window: float | None,
-    focal: float | None,
-    intersections: tuple[float, float],
-    road_width: tuple[float, float],
-    mirrored: int,
-    seed: int,
-) -> tuple[tuple[SimulationOptions, int], ...]:
+def query_sets(options: Mapping[str, Any]) -> tuple[tuple[SimulationOptions, int], ...]:
     """Turn the options into sets of queries, one per noise model, and one of mirrored masks where some are wanted."""
     from roadgeo.evaluation.noise import NOISE_MODELS
     from roadgeo.evaluation.simulation import SimulationOptions, ViewOptions
 
+    fewest, most = options["intersections"]
     view = ViewOptions(
-        size_px=(size, size),
-        window_m=window,
-        gsd_m=gsd,
-        tilt_deg=tilt,
-        heading_deg=heading,
-        focal_px=focal,
-        intersections=(int(intersections[0]), int(intersections[1])),
-        road_width_m=road_width,
+        size_px=(options["size"], options["size"]),
+        window_m=options["window"],
+        gsd_m=options["gsd"],
+        tilt_deg=options["tilt"],
+        heading_deg=options["heading"],
+        focal_px=options["focal"],
+        intersections=(int(fewest), int(most)),
+        road_width_m=options["road_width"],
     )
-    sets = [(SimulationOptions(view, NOISE_MODELS[name], name, seed), count or 40) for name in dict.fromkeys(noise)]
-    if mirrored:
+    noise, seed, count = options["noise"], options["seed"], options["count"] or 40
+    sets = [(SimulationOptions(view, NOISE_MODELS[name], name, seed), count) for name in dict.fromkeys(noise)]
+    if options["mirrored"]:
         turned = SimulationOptions(view, NOISE_MODELS[noise[0]], "mirrored", seed, mirrored=True)
-        sets.append((turned, mirrored))
+        sets.append((turned, options["mirrored"]))
     return tuple(sets)

@@ -42,7 +42,7 @@ def simulate_command(reference: str, out_dir: Path, roads: Path | None, quiet: b
     from roadgeo.storage.atomic import writing
     from roadgeo.storage.files import write_bytes
 
-    sets = query_sets(**options)
+    sets = query_sets(options)
     landscape = read_landscape(resolve_reference(reference), roads)
     truths = []
     with count_up(sum(count for _, count in sets), quiet) as advance:

@@ -59,7 +59,7 @@ class Survey:
     simulation: SimulationOptions
     locator: ReferenceLocator
     trials: int
-    check: int
+    check: int = 0
     jobs: int = 1
     settings: Mapping[str, Any] = field(default_factory=dict)
     out_dir: Path | None = None
