@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import json
 import os
 import re
 import shutil
@@ -11,6 +12,7 @@ from collections.abc import Mapping
 from pathlib import Path
 
 from roadgeo.errors import OutputError
+from roadgeo.outputs.registry import ALSO
 from roadgeo.qgis.plugin.runner import REMEMBERED
 from roadgeo.storage.atomic import writing
 from roadgeo.storage.files import replacing, write_bytes
@@ -19,6 +21,9 @@ __all__ = ["NAME", "find_profiles", "install_plugin", "write_package"]
 
 #: Name of the plugin's folder: not `roadgeo`, which would stand before the library of that name in QGIS's Python.
 NAME = "roadgeo_qgis"
+
+#: Name of the file that tells the plugin, which runs without the library, what outputs there are.
+OUTPUTS = "outputs.json"
 
 _PLUGIN = Path(__file__).parent / "plugin"
 
@@ -42,9 +47,9 @@ def install_plugin(profile: Path) -> Path:
     with writing(target):
         if target.exists():
             shutil.rmtree(target)
-        for file in _files():
+        for file, content in _contents().items():
             (target / file).parent.mkdir(parents=True, exist_ok=True)
-            shutil.copyfile(_PLUGIN / file, target / file)
+            (target / file).write_bytes(content)
         executable = _this_executable()
         if executable is not None:
             (target / REMEMBERED).write_text(f"{executable}\n", encoding="utf-8")
@@ -66,18 +71,20 @@ def write_package(path: str | os.PathLike[str], publisher: Mapping[str, str] | N
         It cannot be written.
     """
     with replacing(path) as temporary, zipfile.ZipFile(temporary, "w", zipfile.ZIP_DEFLATED) as archive:
-        for file in _files():
-            content = (_PLUGIN / file).read_bytes()
+        for file, content in _contents().items():
             if file.name == "metadata.txt":
                 content += "".join(f"{key}={value}\n" for key, value in (publisher or {}).items()).encode()
             # A date of its own would make the same plugin another file each time.
             archive.writestr(zipfile.ZipInfo(f"{NAME}/{file.as_posix()}"), content, zipfile.ZIP_DEFLATED)
 
 
-def _files() -> list[Path]:
-    """List the plugin's files, relative to its folder."""
-    files = (file.relative_to(_PLUGIN) for file in _PLUGIN.rglob("*") if file.is_file())
-    return sorted(file for file in files if "__pycache__" not in file.parts)
+def _contents() -> dict[Path, bytes]:
+    """Read the plugin's files, by their paths in its folder; what `--also` offers is written down for it."""
+    files = {file.relative_to(_PLUGIN): file.read_bytes() for file in _PLUGIN.rglob("*") if file.is_file()}
+    files = {file: content for file, content in files.items() if "__pycache__" not in file.parts}
+    offered = {name: output.summary for name, output in ALSO.items()}
+    files[Path(OUTPUTS)] = (json.dumps(offered, indent=1) + "\n").encode()
+    return dict(sorted(files.items()))
 
 
 def _this_executable() -> Path | None:

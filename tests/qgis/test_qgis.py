@@ -150,6 +150,8 @@ def test_installing_replaces_enables_and_remembers(tmp_path: Path) -> None:
         folder = install_plugin(tmp_path)
         assert folder == tmp_path / "python" / "plugins" / NAME
         installed = {path.name for path in folder.rglob("*")}
+        offered = json.loads((folder / installation.OUTPUTS).read_text("utf-8"))
+        assert offered == {name: output.summary for name, output in ALSO.items()}
         assert {"__init__.py", "metadata.txt", "icon.svg", "LICENSE", "algorithms.py"} <= installed
         assert not {"outdated.py", "__pycache__"} & installed
         assert settings.read_bytes() == (

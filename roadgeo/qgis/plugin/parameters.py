@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import json
 from collections.abc import Callable
 from dataclasses import dataclass, field, replace
 from pathlib import Path
@@ -298,6 +299,9 @@ CAMERA = _fold(
     ),
 )
 
+#: What `--also` offers: name and what it is for, written down when the plugin is installed or packed.
+_OUTPUTS: dict[str, str] = json.loads((Path(__file__).parent / "outputs.json").read_text("utf-8"))
+
 PICTURE = (
     _raster(
         "IMAGE",
@@ -332,10 +336,8 @@ PICTURE = (
             "--also",
             "PRODUCTS",
             "Also write",
-            "Further forms of the result: points, for the QGIS Georeferencer; gcps, the image's own pixels with "
-            "control points (GeoTIFF); vrt, the same without copying pixels; odm, for OpenDroneMap; worldfile; "
-            "geojson, the footprint; stac, an Item; kmz, for Google Earth.",
-            ["points", "gcps", "vrt", "odm", "worldfile", "geojson", "stac", "kmz"],
+            f"Further forms of the result. {'; '.join(f'{name}: {what}' for name, what in _OUTPUTS.items())}.",
+            list(_OUTPUTS),
             allowMultiple=True,
         ),
     ),
