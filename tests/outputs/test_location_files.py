@@ -159,7 +159,7 @@ def test_all_files_or_none(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> N
     def fail(*_: object) -> None:
         raise OutputError("disk full")
 
-    monkeypatch.setattr("roadgeo.outputs.location_layers.write_layers", fail)
+    monkeypatch.setattr("roadgeo.outputs.location_layers.dump_layers", fail)
     with pytest.raises(OutputError, match="disk full"):
         write_location(located(), road_mask(), output_paths(tmp_path, "a"))
     assert list(tmp_path.iterdir()) == []
