@@ -63,7 +63,7 @@ class LazyGroup(click.Group):
         click.UsageError
             There is no such command.
         """
-        if args and args[0] not in COMMANDS and not args[0].startswith("-"):
+        if args and not args[0].startswith("-") and self.get_command(ctx, args[0]) is None:
             near = difflib.get_close_matches(args[0], COMMANDS, n=1)
             hint = f"Did you mean {near[0]}?" if near else ""
             raise click.UsageError(f"No such command {args[0]!r}. {hint}".strip(), ctx)
