@@ -5,6 +5,7 @@
 Per tile: IoU; F1 with 3 px of tolerance (Mnih's relaxed precision and recall); intersections of the true mask that
 the predicted one keeps, and their precision, within 10 m: both as roadgeo sees them. Without --threshold each fold is
 cut at the threshold that keeps the intersections of the other folds best (F1). With --roads the masks are located too.
+With maps of one fold only, give --threshold: there is nothing else to choose it on.
 """
 
 from __future__ import annotations
@@ -169,7 +170,10 @@ def _cut_and_trace(maps: list[Map], threshold: float, work: Path) -> dict[str, N
 
 def _choose(fold: int, maps: list[Map], kept: dict[float, dict[str, NDArray[np.int64]]]) -> float:
     """Return the threshold that is best on the tiles of the other folds."""
-    others = [m.name for m in maps if m.fold != fold] or [m.name for m in maps]
+    others = [m.name for m in maps if m.fold != fold]
+    if not others and len(kept) > 1:
+        raise SystemExit("the maps are of one fold: give --threshold")
+    others = others or [m.name for m in maps]
     return max(kept, key=lambda t: _f1(*_rates(sum(kept[t][name] for name in others))))
 
 
