@@ -198,7 +198,7 @@ def _drawing_options(command: Command) -> Command:
     type=click.Choice(["quick", "full"]),
     default="full",
     show_default=True,
-    help="quick: leave out the search by roads alone, for masks that are broken or show few intersections.",
+    help="quick: end the search early, for masks that are clean. full: try harder on those that are broken.",
 )
 @click.option(
     "--time-limit",

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 import time
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, field, replace
 from itertools import islice
 from typing import Protocol
@@ -125,15 +125,27 @@ class Sweep:
 _FURTHER = TripleOptions(n_neighbours=12, max_hits=20_000, max_compared=500_000, spread=True)
 
 
+#: The last resort: every triple that is alike, wherever it leads.
+_SINGLE = TripleOptions(spread=True, single=True, max_hits=6000)
+
+#: How what single triples propose is followed: more is let through, and it may miss more on its way.
+_PATIENT = GrowOptions(max_screened=6000, hit_rate=0.35, patience=9.0, min_matched=1, max_verified=6)
+
+
 @dataclass(frozen=True)
 class MatchOptions:
     """Options of all stages of matching, nested.
+
+    Where the sweeps lead nowhere, the `last` ones follow: they propose far more, less reliably, and what they propose
+    is followed more patiently.
 
     The sweeps follow one another until a place stands out. On training masks no longer search found more on the map of
     one city; on a map of 33 cities the third sweep found 2 in 189.
 
     Attributes
     ----------
+    max_last_places : int
+        As `max_places`, of the last sweeps.
     roads : RoadSearchOptions or None
         What follows where no triple leads to a place: None for nothing.
     max_places : int
@@ -147,12 +159,15 @@ class MatchOptions:
         Sweep(replace(_FURTHER, angle_tolerance_deg=7.5), 30),
         Sweep(replace(_FURTHER, angle_tolerance_deg=10.0), 20),
     )
+    last: tuple[Source, ...] = (Sweep(_SINGLE, 25),)
     grow: GrowOptions = field(default_factory=GrowOptions)
+    last_grow: GrowOptions = _PATIENT
     verify: VerifyOptions = field(default_factory=VerifyOptions)
     refine: RefineOptions = field(default_factory=RefineOptions)
     camera: CameraOptions = field(default_factory=CameraOptions)
     roads: RoadSearchOptions | None = field(default_factory=RoadSearchOptions)
     max_places: int = 12_000
+    max_last_places: int = 100_000
 
 
 @dataclass
@@ -254,17 +269,23 @@ class TripleEstimator:
         return known.log10_odds >= self.options.verify.promising and self.same(known, hypothesis)
 
     def _rounds_of_triples(self) -> Iterator[list[Hypothesis]]:
-        scene, options = self.scene, self.options
-        low, high = options.camera.gsd_m
-        scale = (low / options.grow.max_scale_ratio, high * options.grow.max_scale_ratio)
-        most_places = int(options.max_places * larger(len(self.index)))
-        for source in options.sweeps:
-            for proposals in source.proposals(scene, self.index, scale, options.camera.min_shape_ratio):
+        options, larger_by = self.options, larger(len(self.index))
+        yield from self._sweep(options.sweeps, options.grow, int(options.max_places * larger_by))
+        yield from self._sweep(options.last, options.last_grow, int(options.max_last_places * larger_by))
+
+    def _sweep(self, sources: Sequence[Source], grow: GrowOptions, most_places: int) -> Iterator[list[Hypothesis]]:
+        """Yield what grew from the proposals of these sources, until so many more places were screened."""
+        scene, camera = self.scene, self.options.camera
+        low, high = camera.gsd_m
+        scale = (low / grow.max_scale_ratio, high * grow.max_scale_ratio)
+        most_places += self.n_screened
+        for source in sources:
+            for proposals in source.proposals(scene, self.index, scale, camera.min_shape_ratio):
                 if self.n_screened >= most_places:
                     return
                 self.n_tuples += proposals.n_tuples
                 self.n_candidates += proposals.n_hits
-                yield self._grow_all(proposals)
+                yield self._grow_all(proposals, grow)
 
     def rehearse(self) -> None:
         """Call every kernel once, on places of no meaning: they are compiled or loaded then, and no clock need know."""
@@ -283,7 +304,7 @@ class TripleEstimator:
             0,
             0,
         )
-        other._screen(proposals)
+        other._screen(proposals, self.options.grow)
         other.grow(proposals, np.arange(1))
         x, y = self.index.xy[0] - self.scene.center
         matrix = np.array([[1.0, 0.0, x], [0.0, 1.0, y], [0.0, 0.0, 1.0]])
@@ -293,9 +314,9 @@ class TripleEstimator:
         if self.options.roads is not None:
             RoadSearch(self.scene, self.index, self.options.camera, self.options.roads).rehearse()
 
-    def _screen(self, proposals: Proposals) -> IntArray:
+    def _screen(self, proposals: Proposals, options: GrowOptions) -> IntArray:
         """Return the proposals that put roads around the anchor on roads of the map, the best placed first."""
-        options, scene, index = self.options.grow, self.scene, self.index
+        scene, index = self.scene, self.index
         anchor = scene.intersections.xy[proposals.anchor]
         away = np.hypot(*(scene.points - anchor).T)
         last = scene.neighbours[proposals.anchor]
@@ -331,9 +352,9 @@ class TripleEstimator:
             allowed &= np.abs(np.arctan2(j01, j11)) < math.radians(_ROUGHLY_DEG)
         return allowed
 
-    def grow(self, proposals: Proposals, chosen: IntArray) -> list[Hypothesis]:
+    def grow(self, proposals: Proposals, chosen: IntArray, options: GrowOptions | None = None) -> list[Hypothesis]:
         """Grow the chosen proposals of one anchor; return those that did not wither, the best supported first."""
-        options, scene, index = self.options.grow, self.scene, self.index
+        scene, index, options = self.scene, self.index, options or self.options.grow
         xy, anchor = scene.intersections.xy, proposals.anchor
         order = np.argsort(np.hypot(*(xy - xy[anchor]).T), kind="stable")[: options.max_points]
         partners = np.ascontiguousarray(proposals.partners[chosen])
@@ -358,12 +379,11 @@ class TripleEstimator:
             if np.isfinite(ratios[m])
         ]
 
-    def _grow_all(self, proposals: Proposals) -> list[Hypothesis]:
+    def _grow_all(self, proposals: Proposals, options: GrowOptions) -> list[Hypothesis]:
         """Return the best grown proposals of one anchor that mean different places and that a camera can have seen."""
-        options = self.options.grow
-        chosen = self._screen(proposals)[: options.max_grown]
+        chosen = self._screen(proposals, options)[: options.max_grown]
         self.n_hypotheses += len(chosen)
-        grown = self.grow(proposals, chosen)
+        grown = self.grow(proposals, chosen, options)
         self.trace.grown(grown)
         distinct: list[Hypothesis] = []
         for h in grown:

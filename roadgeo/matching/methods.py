@@ -155,7 +155,8 @@ def promising_options(options: LocateOptions) -> MatchOptions:
     """Call every place promising that may be reported, or come within the margin of one that is; heed the effort."""
     least = options.min_log10_odds - options.min_margin
     verify = replace(options.match.verify, promising=min(options.match.verify.promising, least))
-    return replace(options.match, verify=verify, roads=options.match.roads if options.effort == "full" else None)
+    match = replace(options.match, verify=verify)
+    return match if options.effort == "full" else replace(match, last=(), roads=None)
 
 
 def _near(index: ReferenceIndex, near: tuple[float, float, float] | None) -> tuple[float, float, float] | None:

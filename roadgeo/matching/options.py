@@ -30,8 +30,8 @@ class LocateOptions:
     min_intersections : int
         Masks with fewer are not searched.
     effort : "quick" or "full"
-        Whether roads alone propose places where no triple of intersections leads to one: a search of a second or two on
-        the map of a city.
+        Whether single triples, and then roads alone, propose places where the usual search leads nowhere: a second or
+        two on the map of a city.
     """
 
     method: Literal["auto", "pair"] = "auto"

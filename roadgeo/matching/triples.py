@@ -56,6 +56,9 @@ class TripleOptions:
         Whether anchors come spread over the frame, from its middle outwards, or those first whose triples are rare.
         Rare triples are soon looked up, but often rare because they are wrong: on `noisy` and `hard` training masks 9 %
         of the rarest sixth of the anchors lead to the place, and 44 % of the commonest.
+    single : bool
+        Whether every hit is a proposal, or only what hits of two triples or more agree on. Where the mask lacks every
+        third intersection, triples that share an anchor and are both intact are rare.
     max_weighed : int
         Of more intersections, evenly chosen ones may become anchors: to weigh all would take longer than to use some.
     max_hits, max_compared : int
@@ -70,6 +73,7 @@ class TripleOptions:
     ray_tolerance_deg: float = 25.0
     affine_tolerance: float = 0.3
     spread: bool = False
+    single: bool = False
     max_weighed: int = 1000
     max_hits: int = 12_000
     max_compared: int = 400_000
@@ -161,6 +165,9 @@ def propose(
                 ids, affine, n_hits,
             )  # fmt: skip
             n_compared += compared
+        if options.single:
+            yield _each_hit(int(a), ids[:n_hits], affine[:n_hits].copy(), k, len(slots), n_compared)
+            continue
         out_ids = np.empty((max(n_hits // 2, 1), k + 1), np.int64)
         out_affine = np.empty((len(out_ids), 4))
         out_placed = np.empty(len(out_ids), np.int64)
@@ -171,6 +178,18 @@ def propose(
             int(a), out_ids[best, 0], out_ids[best, 1:], out_affine[best], out_placed[best],
             len(slots), n_compared, n_hits,
         )  # fmt: skip
+
+
+def _each_hit(
+    anchor: int, ids: IntArray, affine: FloatArray, n_slots: int, n_tuples: int, n_compared: int
+) -> Proposals:
+    """Make a proposal of every hit (see `kernels.triples.look_up`): it places two neighbours."""
+    rows = np.arange(len(ids))
+    partners = np.full((len(ids), n_slots), -1, np.int64)
+    partners[rows, ids[:, 1]] = ids[:, 2]
+    partners[rows, ids[:, 3]] = ids[:, 4]
+    placed = np.full(len(ids), 2, np.int64)
+    return Proposals(anchor, ids[:, 0].copy(), partners, affine, placed, n_tuples, n_compared, len(ids))
 
 
 def _scattered(numbers: IntArray) -> IntArray:

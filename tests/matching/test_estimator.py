@@ -138,10 +138,24 @@ def test_road_points_far_from_the_anchor(town, scene):
 @pytest.mark.parametrize("most", [0, 300])
 def test_places_are_bounded(town, most):
     stranger = scene_of(look(random_network(3, 2000.0), camera((1000, 1000)), sight=Sight(0.5)))
-    options = MatchOptions(max_places=most, roads=None)
+    options = MatchOptions(max_places=most, last=(), roads=None)
     result, estimator = locate(stranger, town[1], options)
     assert result.stopped == "exhausted"
     assert estimator.n_screened <= most + options.grow.max_screened
+
+
+def test_single_triples_find_a_mask_that_lacks_half_of_the_roads(town):
+    """Triples that are both intact and share an anchor are too rare there: the usual sweeps lead nowhere."""
+    truth = camera((2000, 2050), (1000, 1000), 1.0, 10.0, 20.0, 130.0)
+    found = {}
+    for seed in range(6):
+        broken = scene_of(look(town[0], truth, sight=Sight(1.5, missing=0.5, false=0.6), seed=seed))
+        for name, options in (("quick", MatchOptions(last=())), ("full", MatchOptions())):
+            result, _ = locate(broken, town[1], options)
+            right = result.score >= 3.5 and gap(result, truth, broken) < 10
+            found[name] = found.get(name, 0) + right
+            assert right or result.score < 3.5
+    assert found["full"] >= found["quick"] + 2
 
 
 def test_more_anchors_are_tried_on_a_small_map(town, scene):

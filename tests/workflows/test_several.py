@@ -62,6 +62,11 @@ def test_one_reference_alone_keeps_its_odds(query, searched):
     assert judge(query, searched("a", (8.0, 0.0), (3.0, 500.0))).log10_odds == 8.0
 
 
+def test_a_quick_refusal_says_that_more_can_be_done(query, searched):
+    assert "full effort" in judge(query, searched("a"), effort="quick").reason
+    assert "full effort" not in judge(query, searched("a")).reason
+
+
 def test_two_places_far_apart_that_are_equally_sure_are_ambiguous(query, searched):
     best = judge(query, searched("b", (20.0, 0.0)), searched("c", (19.0, 30_000.0)))
     assert (best.status, best.reference) == ("ambiguous", "b")
