@@ -164,7 +164,8 @@ def test_too_few_intersections(town):
 
 
 def test_the_papers_method_tells_what_it_counts(town, mask):
-    explanation = explain(mask, town, replace(LocateOptions(), method="pair"))
+    unhurried = SearchOptions(time_limit_s=120.0)  # its kernels may be compiled meanwhile
+    explanation = explain(mask, town, LocateOptions(method="pair", search=unhurried))
     (search,) = explanation.to_dict()["searches"]
     assert explanation.location.located
     assert search["places"] == search["missing"] == []
