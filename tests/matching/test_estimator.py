@@ -150,7 +150,7 @@ def test_single_triples_find_a_mask_that_lacks_half_of_the_roads(town):
     found = {}
     for seed in range(6):
         broken = scene_of(look(town[0], truth, sight=Sight(1.5, missing=0.5, false=0.6), seed=seed))
-        for name, options in (("quick", MatchOptions(last=())), ("full", MatchOptions())):
+        for name, options in (("quick", MatchOptions(last=(), roads=None)), ("full", MatchOptions(roads=None))):
             result, _ = locate(broken, town[1], options)
             right = result.score >= 3.5 and gap(result, truth, broken) < 10
             found[name] = found.get(name, 0) + right
