@@ -9,6 +9,7 @@ import math
 import numpy as np
 from numpy.typing import NDArray
 
+from roadgeo.kernels.arrays import Floats1, Floats2, Int32s1, Ints1, Singles2
 from roadgeo.kernels.compilation import kernel
 from roadgeo.kernels.growth import cholesky, solve_cholesky
 from roadgeo.kernels.roads import nearest_road
@@ -20,9 +21,7 @@ __all__ = ["add_row", "adjust", "point_row"]
 
 
 @kernel()
-def point_row(
-    p: NDArray[np.float64], u: float, v: float, axis_x: float, axis_y: float, row: NDArray[np.float64]
-) -> tuple[float, float, float]:
+def point_row(p: Floats1, u: float, v: float, axis_x: float, axis_y: float, row: Floats1) -> tuple[float, float, float]:
     """Differentiate a predicted point's component along (axis_x, axis_y) by the parameters `p` (8,).
 
     Parameters
@@ -64,17 +63,17 @@ def add_row(
 
 @kernel()
 def adjust(
-    p: NDArray[np.float64],
+    p: Floats1,
     unit: float,
     origin_x: float,
     origin_y: float,
-    points: NDArray[np.float64],
-    directions: NDArray[np.float64],
-    point_cells: NDArray[np.int64],
+    points: Floats2,
+    directions: Floats2,
+    point_cells: Ints1,
     point_weight: float,
-    pairs: NDArray[np.float64],
-    targets: NDArray[np.float64],
-    pair_cells: NDArray[np.int64],
+    pairs: Floats2,
+    targets: Floats2,
+    pair_cells: Ints1,
     pair_weight: float,
     held: NDArray[np.float64],
     held_targets: NDArray[np.float64],
@@ -87,12 +86,12 @@ def adjust(
     prior: float,
     n_iterations: int,
     tolerance_m: float,
-    segments: NDArray[np.float32],
-    starts: NDArray[np.int32],
-    ids: NDArray[np.int32],
+    segments: Singles2,
+    starts: Int32s1,
+    ids: Int32s1,
     grid: tuple[float, float, float],
     shape: tuple[int, int],
-    normal: NDArray[np.float64],
+    normal: Floats2,
 ) -> tuple[int, float]:
     """Adjust a homography by Gauss-Newton with Cauchy weights.
 

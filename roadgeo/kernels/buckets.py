@@ -5,8 +5,8 @@ of ids is needed. `grid` is (x0, y0, bucket size), `shape` is (columns, rows), a
 """
 
 import numpy as np
-from numpy.typing import NDArray
 
+from roadgeo.kernels.arrays import Floats2, Int32s1, Int32s2
 from roadgeo.kernels.compilation import kernel
 
 __all__ = ["nearest_neighbours"]
@@ -14,12 +14,12 @@ __all__ = ["nearest_neighbours"]
 
 @kernel()
 def nearest_neighbours(
-    xy: NDArray[np.float64],
-    starts: NDArray[np.int32],
+    xy: Floats2,
+    starts: Int32s1,
     grid: tuple[float, float, float],
     shape: tuple[int, int],
     k: int,
-) -> NDArray[np.int32]:
+) -> Int32s2:
     """Return each point's k nearest others, nearest first.
 
     Rings of buckets are searched outwards until the k-th distance lies inside the square searched.

@@ -1,34 +1,256 @@
-"""Kernels are compiled once per machine; their code is kept in the user's cache folder, never in the package."""
+"""Kernels: Python functions that run as machine code.
+
+A kernel's types are its annotations, arrays with their number of dimensions (`kernels.arrays`). So all kernels of a
+module are compiled at once, by numba, and their machine code is one file in the user's cache folder. Later processes
+load that file and call into it: numba, which takes longer to import and to load its own cache than a mask takes to be
+located, is then not imported at all.
+
+Kernels without such annotations are parts of others, or are left to numba whole.
+"""
 
 from __future__ import annotations
 
+import ctypes
+import functools
 import hashlib
+import importlib
 import os
 import platform
-from collections.abc import Callable
-from functools import lru_cache
+import struct
+import threading
+from collections.abc import Callable, Iterator, Sequence
+from functools import cached_property, lru_cache
 from pathlib import Path
-from typing import Any, TypeVar
+from typing import Any, NamedTuple, TypeVar, cast
 
-import numba
-from numba import njit
+import numpy as np
 
 from roadgeo._folders import cache_dir, private_temporary_dir, writable
 from roadgeo._version import __version__
+from roadgeo.kernels.arrays import ArrayKind, Kind, TupleKind, kind_of
 
-__all__ = ["kernel", "kernel_folder"]
+__all__ = ["Kernel", "compiled", "entries", "kernel", "kernel_folder", "load", "modules_of_the_search"]
 
 _Function = TypeVar("_Function", bound=Callable[..., Any])
+#: Told how many kernels are compiled, and of how many.
+Progress = Callable[[int, int], None]
+
+_lock = threading.RLock()
+
+
+def kernel(**options: Any) -> Callable[[_Function], _Function]:
+    """Make a kernel of a function; `options` are those of numba's `njit`."""
+
+    def decorate(function: _Function) -> _Function:
+        return cast("_Function", Kernel(function, options))
+
+    return decorate
+
+
+class Kernel:
+    """A function that is called as machine code, from Python and from other kernels.
+
+    Attributes
+    ----------
+    function : callable
+        What it does, in Python.
+    arguments : tuple of Kind or None
+        None: it has no full annotations.
+    result : Kind
+    """
+
+    def __init__(self, function: Callable[..., Any], options: dict[str, Any]) -> None:
+        functools.update_wrapper(self, function)
+        self.function, self.options = function, options
+        self.name, self.module = function.__name__, function.__module__
+        self.arguments, self.result = _kinds(function)
+        self._run: Callable[..., Any] | None = None
+
+    def __call__(self, *args: Any) -> Any:
+        """Call the machine code, which is loaded or compiled before the first call."""
+        return (self._run or self._prepare())(*args)
+
+    @cached_property
+    def part(self) -> Any:
+        """What numba compiles into other kernels."""
+        from numba import njit
+
+        from roadgeo.kernels import machine_code  # noqa: F401 (teaches numba what a `Kernel` is)
+
+        return njit(no_cpython_wrapper=True, no_cfunc_wrapper=True, **self.options)(self.function)
+
+    @cached_property
+    def by_numba(self) -> Any:
+        """The kernel as numba itself would keep and call it."""
+        import numba
+
+        from roadgeo.kernels import machine_code  # noqa: F401
+
+        # The setting is read when a function is decorated; it is put back, for it is everyone's.
+        config: Any = numba.config
+        kept = config.CACHE_DIR
+        config.CACHE_DIR = os.environ.get("NUMBA_CACHE_DIR") or str(kernel_folder())
+        try:
+            return numba.njit(cache=True, **self.options)(self.function)
+        finally:
+            config.CACHE_DIR = kept
+
+    def _prepare(self) -> Callable[..., Any]:
+        if os.environ.get("NUMBA_DISABLE_JIT", "0") not in {"", "0"}:
+            self._run = self.function
+        elif self.arguments is None or self.module in _left_to_numba:
+            self._run = self.by_numba
+        else:
+            load([self.module])
+            if self._run is None:
+                self._run = self.by_numba
+        return self._run
+
+    def bind(self, code: Any, release: Callable[[int], None]) -> None:
+        """Run `code`, a function of two pointers, from now on."""
+        self._run = _Call(self.name, code, self.arguments or (), self.result, release)
+
+
+class _Call:
+    """Calls machine code: arguments packed into one buffer, results unpacked from another, 8 bytes for each number."""
+
+    def __init__(
+        self, name: str, code: Any, arguments: tuple[Kind, ...], result: Kind, release: Callable[[int], None]
+    ) -> None:
+        self.name, self.code, self.release = name, code, release
+        self.arguments, self.result = arguments, result
+        self.pack = struct.Struct("=" + "".join(map(_argument_format, arguments))).pack
+        self.answer = struct.Struct("=" + _result_format(result))
+        self.room = ctypes.c_char * max(self.answer.size, 8)
+
+    def __call__(self, *args: Any) -> Any:
+        slots: list[Any] = []
+        for value, kind in zip(args, self.arguments, strict=True):
+            if type(kind) is ArrayKind:  # most are: not worth a call
+                if value.dtype != kind.dtype or value.ndim != kind.ndim or not value.flags.c_contiguous:
+                    raise TypeError(_mismatch(self.name, value, kind))
+                slots.append(id(value))
+            else:
+                self._fill(slots, value, kind)
+        room = self.room()
+        if self.code(self.pack(*slots), room):
+            raise ArithmeticError(f"kernel {self.name} failed: a division by zero, or no memory left")
+        return self._value(self.result, iter(self.answer.unpack_from(room))) if self.answer.size else None
+
+    def _fill(self, slots: list[Any], value: Any, kind: Kind) -> None:
+        if isinstance(kind, TupleKind):
+            for member, member_kind in zip(value, kind.members, strict=True):
+                self._fill(slots, member, member_kind)
+        elif isinstance(kind, ArrayKind):
+            if value.dtype != kind.dtype or value.ndim != kind.ndim or not value.flags.c_contiguous:
+                raise TypeError(_mismatch(self.name, value, kind))
+            slots.append(id(value))
+        else:
+            slots.append(value)
+
+    def _value(self, kind: Kind, slots: Iterator[Any]) -> Any:
+        if isinstance(kind, TupleKind):
+            return tuple(self._value(member, slots) for member in kind.members)
+        if isinstance(kind, ArrayKind):
+            owner, data = next(slots), next(slots)
+            array = np.empty([next(slots) for _ in range(kind.ndim)], kind.dtype)
+            ctypes.memmove(array.ctypes.data, data, array.nbytes)
+            self.release(owner)
+            return array
+        return bool(next(slots)) if kind is bool else next(slots)
+
+
+def _mismatch(name: str, value: Any, kind: ArrayKind) -> str:
+    return f"kernel {name}: expected a C-contiguous {kind}, got {value.dtype} of shape {value.shape}"
+
+
+def _argument_format(kind: Kind) -> str:
+    if isinstance(kind, TupleKind):
+        return "".join(map(_argument_format, kind.members))
+    return "d" if kind is float else "q"
+
+
+def _result_format(kind: Kind) -> str:
+    if kind is None:
+        return ""
+    if isinstance(kind, TupleKind):
+        return "".join(map(_result_format, kind.members))
+    if isinstance(kind, ArrayKind):
+        return "QQ" + "q" * kind.ndim
+    return "d" if kind is float else "q"
+
+
+def _kinds(function: Callable[..., Any]) -> tuple[tuple[Kind, ...] | None, Kind]:
+    """Read the kinds of a function's arguments and of its result from its annotations."""
+    names = function.__code__.co_varnames[: function.__code__.co_argcount]
+    try:
+        arguments = tuple(kind_of(function.__annotations__[name]) for name in names)
+        result = kind_of(function.__annotations__["return"])
+    except (KeyError, TypeError):
+        return None, None
+    return (arguments, result) if any(isinstance(kind, ArrayKind) for kind in arguments) else (None, None)
+
+
+# --- machine code kept ------------------------------------------------------------------------------------------------
+
+#: Modules whose kernels every search needs. Those of the paper's method are compiled when it is asked for.
+_SEARCH = (
+    "simplification",
+    "thinning",
+    "tracing",
+    "intersections",
+    "buckets",
+    "roads",
+    "triples",
+    "growth",
+    "adjustment",
+)
+_left_to_numba: set[str] = set()
+_kept_alive: list[Any] = []
+
+
+def modules_of_the_search() -> list[str]:
+    """Names of the modules whose kernels every search needs."""
+    return [f"roadgeo.kernels.{name}" for name in _SEARCH]
+
+
+def entries(module: str) -> list[Kernel]:
+    """Kernels of a module that can be called from Python."""
+    values = vars(importlib.import_module(module)).values()
+    return [v for v in values if isinstance(v, Kernel) and v.module == module and v.arguments is not None]
+
+
+class _Engine(NamedTuple):
+    """llvmlite and what it knows of this machine."""
+
+    llvm: Any
+    machine: Any
+    name: str
+
+
+@lru_cache(maxsize=1)
+def _engine() -> _Engine:
+    import llvmlite
+    import llvmlite.binding as llvm
+
+    llvm.initialize_native_target()
+    llvm.initialize_native_asmprinter()
+    cpu, features = llvm.get_host_cpu_name(), llvm.get_host_cpu_features().flatten()
+    target = llvm.Target.from_triple(llvm.get_process_triple())
+    # As numba has it: what is compiled here is for this machine only.
+    reloc = "static" if target.name.startswith("x86") else "default"
+    machine = target.create_target_machine(cpu, features, 3, reloc, "jitdefault", jit=True)
+    return _Engine(llvm, machine, f"{llvmlite.__version__} {cpu} {features}")
 
 
 @lru_cache(maxsize=1)
 def kernel_folder() -> Path:
     """Return the folder of the kernels' machine code, a temporary one where the user's cache folder cannot be written.
 
-    It is named after all that the code depends on: numba looks at the file of a kernel only, not at those of the
-    kernels that it calls.
+    It is named after all that the code depends on.
     """
-    digest = hashlib.sha256(f"{numba.__version__} {platform.machine()} {platform.python_version()}".encode())
+    known = (__version__, _engine().name, platform.machine(), platform.python_version(), np.__version__)
+    digest = hashlib.sha256(" ".join(known).encode())
     for source in sorted(Path(__file__).parent.glob("*.py")):
         digest.update(source.read_bytes())
     name = f"kernels-{__version__}-{digest.hexdigest()[:16]}"
@@ -39,18 +261,69 @@ def kernel_folder() -> Path:
     return folder if writable(folder) else private_temporary_dir() / name
 
 
-def kernel(**options: Any) -> Callable[[_Function], _Function]:
-    """Compile a function on its first call, and keep its machine code in `kernel_folder`."""
+def compiled(modules: Sequence[str] | None = None) -> bool:
+    """Whether the machine code of all these modules (of the search) is there."""
+    return all(_file(module).exists() for module in modules or modules_of_the_search())
 
-    def decorate(function: _Function) -> _Function:
-        # The setting is read when a function is decorated; it is put back, for it is everyone's.
-        config: Any = numba.config
-        kept = config.CACHE_DIR
-        config.CACHE_DIR = os.environ.get("NUMBA_CACHE_DIR") or str(kernel_folder())
-        try:
-            compiled: _Function = njit(cache=True, **options)(function)
-            return compiled
-        finally:
-            config.CACHE_DIR = kept
 
-    return decorate
+def load(modules: Sequence[str] | None = None, progress: Progress | None = None) -> None:
+    """Load the machine code of modules (of the search), after compiling what is not there."""
+    with _lock:
+        wanted = [m for m in modules or modules_of_the_search() if m not in _left_to_numba]
+        missing = [m for m in wanted if not _load(m)]
+        total, done = sum(len(entries(m)) for m in missing), 0
+        for module in missing:
+            _compile(module, lambda n, done=done: progress(done + n, total) if progress else None)  # type: ignore[misc]
+            done += len(entries(module))
+
+
+def _file(module: str) -> Path:
+    return kernel_folder() / f"{module.rsplit('.', 1)[-1]}.o"
+
+
+def _compile(module: str, progress: Callable[[int], None]) -> None:
+    """Compile a module's kernels and keep their code; what this machine cannot keep is left to numba."""
+    from roadgeo.kernels.machine_code import CannotKeep, compile_kernels
+
+    try:
+        code = compile_kernels(entries(module), _engine().llvm, _engine().machine, progress)
+        _bind(module, code)
+    except CannotKeep:
+        _left_to_numba.add(module)
+        return
+    path = _file(module)
+    temporary = path.with_suffix(f".{os.getpid()}.{threading.get_ident()}.part")
+    try:
+        path.parent.mkdir(parents=True, exist_ok=True)
+        temporary.write_bytes(hashlib.sha256(code).digest() + code)
+        temporary.replace(path)  # several processes may do so at once: each file is whole
+    except OSError:
+        temporary.unlink(missing_ok=True)  # the disk is full: the next process compiles again
+
+
+def _load(module: str) -> bool:
+    """Load a module's machine code; False: there is none, or it is damaged."""
+    if all(k._run is not None for k in entries(module)):
+        return True
+    try:
+        content = _file(module).read_bytes()
+    except OSError:
+        return False
+    if hashlib.sha256(content[32:]).digest() != content[:32]:
+        return False
+    _bind(module, content[32:])
+    return True
+
+
+def _bind(module: str, code: bytes) -> None:
+    """Let a module's kernels run machine code."""
+    llvm, machine, _ = _engine()
+    engine = llvm.create_mcjit_compiler(llvm.parse_assembly(""), machine)
+    engine.add_object_file(llvm.ObjectFileRef.from_data(code))
+    engine.finalize_object()
+    _kept_alive.append(engine)
+    # The GIL is held: arrays must not change under a kernel.
+    release = ctypes.PYFUNCTYPE(None, ctypes.c_uint64)(engine.get_function_address("roadgeo_release"))
+    for one in entries(module):
+        address = engine.get_function_address(f"roadgeo_{one.name}")
+        one.bind(ctypes.PYFUNCTYPE(ctypes.c_int32, ctypes.c_char_p, ctypes.c_void_p)(address), release)

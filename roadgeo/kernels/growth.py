@@ -12,6 +12,7 @@ import math
 import numpy as np
 from numpy.typing import NDArray
 
+from roadgeo.kernels.arrays import Floats1, Floats2, Floats3, Int8s3, Int32s1, Int32s2, Ints1, Ints2
 from roadgeo.kernels.compilation import kernel
 from roadgeo.kernels.rays import rays_agree
 
@@ -463,18 +464,18 @@ def grow(
 
 @kernel()
 def grow_each(
-    xy: NDArray[np.float64],
-    branches: NDArray[np.int8],
-    order: NDArray[np.int64],
+    xy: Floats2,
+    branches: Int8s3,
+    order: Ints1,
     half_size: float,
     anchor: int,
-    references: NDArray[np.int64],
-    affines: NDArray[np.float64],
-    neighbours: NDArray[np.int32],
-    partners: NDArray[np.int64],
-    ref_xy: NDArray[np.float64],
-    ref_branches: NDArray[np.int8],
-    starts: NDArray[np.int32],
+    references: Ints1,
+    affines: Floats2,
+    neighbours: Int32s2,
+    partners: Ints2,
+    ref_xy: Floats2,
+    ref_branches: Int8s3,
+    starts: Int32s1,
     grid: tuple[float, float, float],
     shape: tuple[int, int],
     sigma: tuple[float, float],
@@ -485,9 +486,9 @@ def grow_each(
     chance_rate: float,
     patience: float,
     min_matched: int,
-    matched: NDArray[np.int64],
-    matrices: NDArray[np.float64],
-    ratios: NDArray[np.float64],
+    matched: Ints2,
+    matrices: Floats3,
+    ratios: Floats1,
 ) -> None:
     """Grow the M proposals of one anchor (see `grow`).
 
@@ -517,21 +518,21 @@ def grow_each(
 
 @kernel()
 def match_all(
-    matrix: NDArray[np.float64],
-    xy: NDArray[np.float64],
-    branches: NDArray[np.int8],
+    matrix: Floats2,
+    xy: Floats2,
+    branches: Int8s3,
     radius: float,
     min_cos: float,
     shift_x: float,
     shift_y: float,
     one_to_one: bool,
-    ref_xy: NDArray[np.float64],
-    ref_branches: NDArray[np.int8],
-    starts: NDArray[np.int32],
+    ref_xy: Floats2,
+    ref_branches: Int8s3,
+    starts: Int32s1,
     grid: tuple[float, float, float],
     shape: tuple[int, int],
-    matched: NDArray[np.int64],
-    distance: NDArray[np.float64],
+    matched: Ints1,
+    distance: Floats1,
 ) -> int:
     """Match every intersection of the query to the nearest one of the map with agreeing branches.
 

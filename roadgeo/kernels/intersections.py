@@ -3,6 +3,7 @@
 import numpy as np
 from numpy.typing import NDArray
 
+from roadgeo.kernels.arrays import Floats1, Floats2, Int32s2, Ints1, Singles1, Singles2
 from roadgeo.kernels.compilation import kernel
 
 __all__ = ["describe_intersections", "fit_branches", "sort_few"]
@@ -10,15 +11,15 @@ __all__ = ["describe_intersections", "fit_branches", "sort_few"]
 
 @kernel()
 def fit_branches(
-    half_edges: NDArray[np.int64],
-    edges: NDArray[np.int32],
-    offsets: NDArray[np.int64],
-    coords: NDArray[np.float64],
-    lengths: NDArray[np.float64],
+    half_edges: Ints1,
+    edges: Int32s2,
+    offsets: Ints1,
+    coords: Floats2,
+    lengths: Floats1,
     skip: float,
     reach: float,
     least: float,
-) -> NDArray[np.float64]:
+) -> Floats2:
     """Fit a line to each branch by total least squares, every piece of road weighted by its length.
 
     Parameters
@@ -117,16 +118,16 @@ def sort_few(values: NDArray[np.floating], n: int) -> None:
 
 @kernel()
 def describe_intersections(
-    node_xy: NDArray[np.float64],
-    starts: NDArray[np.int64],
-    lines: NDArray[np.float64],
+    node_xy: Floats2,
+    starts: Ints1,
+    lines: Floats2,
     merge_angle: float,
     stiffness: float,
     max_shift: float,
-    xy: NDArray[np.float64],
-    rays: NDArray[np.float32],
-    tangents: NDArray[np.float32],
-    residual: NDArray[np.float32],
+    xy: Floats2,
+    rays: Singles2,
+    tangents: Singles2,
+    residual: Singles1,
 ) -> None:
     """Refine each centre by its branch lines (eq. 1) and merge tangents that are nearly one line (eq. 2-3).
 

@@ -9,6 +9,7 @@ import math
 import numpy as np
 from numpy.typing import NDArray
 
+from roadgeo.kernels.arrays import Bools2, Floats1, Floats2, Int32s1, Ints1, Singles2
 from roadgeo.kernels.compilation import kernel
 
 __all__ = ["backward_agreement", "bin_segments", "forward_distances", "nearest_road", "screen"]
@@ -16,11 +17,11 @@ __all__ = ["backward_agreement", "bin_segments", "forward_distances", "nearest_r
 
 @kernel()
 def bin_segments(
-    segments: NDArray[np.float32],
+    segments: Singles2,
     grid: tuple[float, float, float],
     shape: tuple[int, int],
-    starts: NDArray[np.int64],
-    ids: NDArray[np.int32],
+    starts: Ints1,
+    ids: Int32s1,
 ) -> int:
     """Count the segments of every bucket, or list them.
 
@@ -132,19 +133,19 @@ def nearest_road(
 
 @kernel()
 def forward_distances(
-    matrix: NDArray[np.float64],
-    points: NDArray[np.float64],
-    directions: NDArray[np.float64],
+    matrix: Floats2,
+    points: Floats2,
+    directions: Floats2,
     radius: float,
     min_cos: float,
     shift_x: float,
     shift_y: float,
-    segments: NDArray[np.float32],
-    starts: NDArray[np.int32],
-    ids: NDArray[np.int32],
+    segments: Singles2,
+    starts: Int32s1,
+    ids: Int32s1,
     grid: tuple[float, float, float],
     shape: tuple[int, int],
-    out: NDArray[np.float64],
+    out: Floats1,
 ) -> int:
     """Find how far each road point of the query lies from a road of the map that runs its way.
 
@@ -191,20 +192,20 @@ def forward_distances(
 
 @kernel()
 def backward_agreement(
-    inverse: NDArray[np.float64],
-    bounds: NDArray[np.float64],
+    inverse: Floats2,
+    bounds: Floats1,
     step: float,
     tolerance_m: float,
     shift_x: float,
     shift_y: float,
-    segments: NDArray[np.float32],
-    starts: NDArray[np.int32],
-    ids: NDArray[np.int32],
+    segments: Singles2,
+    starts: Int32s1,
+    ids: Int32s1,
     grid: tuple[float, float, float],
     shape: tuple[int, int],
-    field: NDArray[np.float32],
+    field: Singles2,
     field_scale: float,
-    observed: NDArray[np.bool_],
+    observed: Bools2,
 ) -> tuple[int, int]:
     """Count the map's roads inside the footprint that the query could show, and those that it shows.
 
@@ -276,22 +277,22 @@ def backward_agreement(
 
 @kernel()
 def screen(
-    references: NDArray[np.int64],
-    affines: NDArray[np.float64],
-    anchor_xy: NDArray[np.float64],
-    ref_xy: NDArray[np.float64],
-    points: NDArray[np.float64],
-    directions: NDArray[np.float64],
+    references: Ints1,
+    affines: Floats2,
+    anchor_xy: Floats1,
+    ref_xy: Floats2,
+    points: Floats2,
+    directions: Floats2,
     radius: float,
     radius_px: float,
     min_cos: float,
     least: float,
-    segments: NDArray[np.float32],
-    starts: NDArray[np.int32],
-    ids: NDArray[np.int32],
+    segments: Singles2,
+    starts: Int32s1,
+    ids: Int32s1,
     grid: tuple[float, float, float],
     shape: tuple[int, int],
-    shares: NDArray[np.float64],
+    shares: Floats1,
 ) -> None:
     """Find which part of the query's roads around an anchor lies on roads of the map, under each proposal.
 

@@ -7,6 +7,7 @@ element by element here: the first assignment of a whole row costs numba two sec
 import numpy as np
 from numpy.typing import NDArray
 
+from roadgeo.kernels.arrays import Floats1, Floats2, Int32s1, Int32s2, Ints1, Ints2
 from roadgeo.kernels.compilation import kernel
 
 __all__ = [
@@ -25,9 +26,7 @@ __all__ = [
 
 
 @kernel()
-def join_chains(
-    n_nodes: int, edges: NDArray[np.int32], offsets: NDArray[np.int64], coords: NDArray[np.float64]
-) -> tuple[NDArray[np.int32], NDArray[np.float64], NDArray[np.int64]]:
+def join_chains(n_nodes: int, edges: Int32s2, offsets: Ints1, coords: Floats2) -> tuple[Int32s2, Floats2, Ints1]:
     """Make one edge of every chain of edges whose inner nodes have degree two.
 
     Rings without any other node stay as one loop at an arbitrary node of theirs.
@@ -96,7 +95,7 @@ def join_chains(
 
 
 @kernel()
-def measure_edges(offsets: NDArray[np.int64], coords: NDArray[np.float64]) -> NDArray[np.float64]:
+def measure_edges(offsets: Ints1, coords: Floats2) -> Floats1:
     """Return the (E,) lengths of edges; `offsets` (E + 1,), `coords` (C, 2)."""
     lengths = np.zeros(len(offsets) - 1)
     for e in range(len(lengths)):
@@ -108,7 +107,7 @@ def measure_edges(offsets: NDArray[np.int64], coords: NDArray[np.float64]) -> ND
 
 
 @kernel()
-def close_pairs(xy: NDArray[np.float64], by_x: NDArray[np.int64], radius: float) -> NDArray[np.int64]:
+def close_pairs(xy: Floats2, by_x: Ints1, radius: float) -> Ints2:
     """Find all pairs of points nearer than `radius`, by a sweep along x.
 
     Parameters
@@ -146,9 +145,7 @@ def close_pairs(xy: NDArray[np.float64], by_x: NDArray[np.int64], radius: float)
 
 
 @kernel()
-def draw_together(
-    xy: NDArray[np.float64], pairs: NDArray[np.int64], radius: NDArray[np.float64]
-) -> tuple[NDArray[np.int64], NDArray[np.float64]]:
+def draw_together(xy: Floats2, pairs: Ints2, radius: Floats1) -> tuple[Ints1, Floats2]:
     """Merge pairs of points, in the order given, while the centres of their clusters are nearer than `radius`.
 
     Comparing centres keeps a row of points from becoming one long cluster.
@@ -204,9 +201,7 @@ def draw_together(
 
 
 @kernel()
-def reattach(
-    centre: NDArray[np.float64], ends: NDArray[np.int32], offsets: NDArray[np.int64], coords: NDArray[np.float64]
-) -> tuple[NDArray[np.float64], NDArray[np.int64]]:
+def reattach(centre: Floats2, ends: Int32s2, offsets: Ints1, coords: Floats2) -> tuple[Floats2, Ints1]:
     """Run every edge from the new place of one end node to that of the other, through all its old vertices.
 
     Parameters
@@ -264,14 +259,14 @@ def _point_at(coords: NDArray[np.float64], lo: int, hi: int, along: float) -> tu
 
 @kernel()
 def fuse_twins(
-    edges: NDArray[np.int32],
-    offsets: NDArray[np.int64],
-    coords: NDArray[np.float64],
-    lengths: NDArray[np.float64],
-    by_ends: NDArray[np.int64],
+    edges: Int32s2,
+    offsets: Ints1,
+    coords: Floats2,
+    lengths: Floats1,
+    by_ends: Ints1,
     distance: float,
     spacing: float,
-) -> tuple[NDArray[np.int32], NDArray[np.float64], NDArray[np.int64]]:
+) -> tuple[Int32s2, Floats2, Ints1]:
     """Make one edge, halfway, of edges that run beside each other between the same two nodes.
 
     Parameters
@@ -355,12 +350,12 @@ def fuse_twins(
 
 @kernel()
 def sample_edges(
-    offsets: NDArray[np.int64],
-    coords: NDArray[np.float64],
-    lengths: NDArray[np.float64],
-    starts: NDArray[np.int64],
-    xy: NDArray[np.float64],
-    direction: NDArray[np.float64],
+    offsets: Ints1,
+    coords: Floats2,
+    lengths: Floats1,
+    starts: Ints1,
+    xy: Floats2,
+    direction: Floats2,
 ) -> None:
     """Write points evenly spaced along every edge, both ends included, and the road's direction there.
 
@@ -398,17 +393,17 @@ def sample_edges(
 
 @kernel()
 def find_mates(
-    xy: NDArray[np.float64],
-    direction: NDArray[np.float64],
-    edge: NDArray[np.int32],
-    edges: NDArray[np.int32],
-    starts: NDArray[np.int64],
-    order: NDArray[np.int64],
-    key: NDArray[np.int64],
+    xy: Floats2,
+    direction: Floats2,
+    edge: Int32s1,
+    edges: Int32s2,
+    starts: Ints1,
+    order: Ints1,
+    key: Ints1,
     n_columns: int,
     distance: float,
     min_cos: float,
-) -> tuple[NDArray[np.int64], NDArray[np.float64], NDArray[np.int64]]:
+) -> tuple[Ints1, Floats1, Ints1]:
     """Find the nearest sample of another edge beside each sample, in the same or the opposite direction.
 
     Parameters
@@ -480,14 +475,14 @@ def find_mates(
 
 @kernel()
 def tie_runs(
-    starts: NDArray[np.int64],
-    lengths: NDArray[np.float64],
-    edge: NDArray[np.int32],
-    mate: NDArray[np.int64],
-    apart: NDArray[np.float64],
+    starts: Ints1,
+    lengths: Floats1,
+    edge: Int32s1,
+    mate: Ints1,
+    apart: Floats1,
     split_distance: float,
     least: float,
-) -> NDArray[np.float64]:
+) -> Floats2:
     """Tie two edges together where they begin and where they cease to run side by side.
 
     Parameters
@@ -548,13 +543,13 @@ def tie_runs(
 
 @kernel()
 def cut_edges(
-    edges: NDArray[np.int32],
-    offsets: NDArray[np.int64],
-    coords: NDArray[np.float64],
-    cuts: NDArray[np.float64],
-    cut_starts: NDArray[np.int64],
+    edges: Int32s2,
+    offsets: Ints1,
+    coords: Floats2,
+    cuts: Floats1,
+    cut_starts: Ints1,
     n_nodes: int,
-) -> tuple[NDArray[np.float64], NDArray[np.int32], NDArray[np.float64], NDArray[np.int64]]:
+) -> tuple[Floats2, Int32s2, Floats2, Ints1]:
     """Cut edges at given arc lengths; cut k becomes node `n_nodes + k`.
 
     Parameters
@@ -617,9 +612,7 @@ def cut_edges(
 
 
 @kernel()
-def narrow_faces(
-    follow: NDArray[np.int64], area: NDArray[np.float64], lengths: NDArray[np.float64], width: float, longest: float
-) -> NDArray[np.int64]:
+def narrow_faces(follow: Ints1, area: Floats1, lengths: Floats1, width: float, longest: float) -> Ints1:
     """Find the faces of a plane graph that are small and narrow: a roundabout, the triangle of a slip road.
 
     Parameters

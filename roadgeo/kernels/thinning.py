@@ -8,6 +8,7 @@ road pixels only, so its cost grows with the roads, not with the image.
 import numpy as np
 from numpy.typing import NDArray
 
+from roadgeo.kernels.arrays import Bytes2, Int32s1, Singles2
 from roadgeo.kernels.compilation import kernel
 
 __all__ = ["GROUND", "ROAD", "SOLID", "neighbour_steps", "neighbours", "rethin", "thin", "touches_solid"]
@@ -84,12 +85,12 @@ def _is_ridge(flat: NDArray[np.uint8], depth: NDArray[np.float32], p: np.uint64,
 
 @kernel()
 def rethin(
-    states: NDArray[np.uint8],
-    distance: NDArray[np.float32],
-    pixels: NDArray[np.int32],
+    states: Bytes2,
+    distance: Singles2,
+    pixels: Int32s1,
     min_end_depth: float,
     keep_pairs: bool,
-) -> NDArray[np.int32]:
+) -> Int32s1:
     """Delete what is simple among `pixels` until nothing is, in place; return the pixels left.
 
     Parameters
@@ -149,7 +150,7 @@ def rethin(
 
 
 @kernel()
-def thin(states: NDArray[np.uint8], distance: NDArray[np.float32], min_end_depth: float) -> NDArray[np.int32]:
+def thin(states: Bytes2, distance: Singles2, min_end_depth: float) -> Int32s1:
     """Thin the ROAD pixels to lines, in place, the shallow ones first; return the pixels left.
 
     Parameters and result as in `rethin`.

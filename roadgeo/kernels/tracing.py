@@ -4,8 +4,8 @@ Rows of arrays are copied element by element here: the first assignment of a who
 """
 
 import numpy as np
-from numpy.typing import NDArray
 
+from roadgeo.kernels.arrays import Bools1, Bytes2, Floats2, Int32s1, Int32s2, Ints1, Ints2, Singles2
 from roadgeo.kernels.compilation import kernel
 from roadgeo.kernels.thinning import ROAD, neighbour_steps, neighbours, touches_solid
 
@@ -19,9 +19,7 @@ LOWEST_BIT = np.array([max((code & -code).bit_length() - 1, 0) for code in range
 
 
 @kernel()
-def trace(
-    states: NDArray[np.uint8], pixels: NDArray[np.int32], node_of: NDArray[np.int32]
-) -> tuple[NDArray[np.float64], NDArray[np.bool_], NDArray[np.int32], NDArray[np.int32], NDArray[np.int64]]:
+def trace(states: Bytes2, pixels: Int32s1, node_of: Int32s1) -> tuple[Floats2, Bools1, Int32s2, Int32s1, Ints1]:
     """Split a skeleton into nodes and chains.
 
     A node is a cluster of touching pixels with three ROAD neighbours or more, a pixel with one, a pixel that touches
@@ -142,14 +140,14 @@ def trace(
 
 @kernel()
 def smooth_chains(
-    distance: NDArray[np.float32],
-    chain: NDArray[np.int32],
-    chain_offsets: NDArray[np.int64],
-    ends: NDArray[np.float64],
-    trims: NDArray[np.int64],
+    distance: Singles2,
+    chain: Int32s1,
+    chain_offsets: Ints1,
+    ends: Floats2,
+    trims: Ints2,
     passes: int,
     spacing: int,
-) -> tuple[NDArray[np.float64], NDArray[np.int64]]:
+) -> tuple[Floats2, Ints1]:
     """Turn chains of pixels into smooth sub-pixel polylines.
 
     Each pixel moves to the centroid of the distance ridge in its 3 x 3 neighbourhood; then binomial smoothing

@@ -14,11 +14,11 @@ angles agree are told apart by them, before anything else of the map is read.
 """
 
 import math
-from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
+from roadgeo.kernels.arrays import Floats2, Int8s2, Int8s3, Int32s1, Int32s2, Ints1, Ints2, Ints3, Singles2, UInt64s1
 from roadgeo.kernels.compilation import kernel
 from roadgeo.kernels.rays import rays_agree
 
@@ -65,7 +65,7 @@ def vertex_angle(e1x: float, e1y: float, e2x: float, e2y: float, tangent: float)
 
 
 @kernel()
-def find_sides(tangents: NDArray[np.float32], branches: NDArray[np.int8], sides: NDArray[np.int8]) -> None:
+def find_sides(tangents: Singles2, branches: Int8s3, sides: Int8s2) -> None:
     """Find on which sides branches run along each tangent.
 
     Parameters
@@ -192,14 +192,14 @@ def triple_codes(
 
 @kernel()
 def fill_table(
-    xy: NDArray[np.float64],
-    tangents: NDArray[np.float32],
-    sides: NDArray[np.int8],
-    neighbours: NDArray[np.int32],
+    xy: Floats2,
+    tangents: Singles2,
+    sides: Int8s2,
+    neighbours: Int32s2,
     min_shape: float,
     limit: int,
-    starts: NDArray[Any],
-    entries: NDArray[np.uint64],
+    starts: Ints1,
+    entries: UInt64s1,
 ) -> int:
     """Count codes per table cell, or write the entries.
 
@@ -285,15 +285,15 @@ def vertex_probes(code: NDArray[np.int64], tolerance: int, probes: NDArray[np.in
 
 @kernel()
 def count_alike(
-    xy: NDArray[np.float64],
-    tangents: NDArray[np.float32],
-    sides: NDArray[np.int8],
-    neighbours: NDArray[np.int32],
-    anchors: NDArray[np.int64],
+    xy: Floats2,
+    tangents: Singles2,
+    sides: Int8s2,
+    neighbours: Int32s2,
+    anchors: Ints1,
     min_shape: float,
     limit: int,
-    starts: NDArray[Any],
-    costs: NDArray[np.int64],
+    starts: Int32s1,
+    costs: Ints3,
 ) -> None:
     """Fill `costs[i, s, t]` with the number of table entries in the cells of a triple (anchors[i], slot s, slot t).
 
@@ -335,26 +335,26 @@ def count_alike(
 
 @kernel()
 def look_up(
-    xy: NDArray[np.float64],
-    branches: NDArray[np.int8],
-    tangents: NDArray[np.float32],
-    sides: NDArray[np.int8],
+    xy: Floats2,
+    branches: Int8s3,
+    tangents: Singles2,
+    sides: Int8s2,
     a: int,
     s: int,
     t: int,
-    neighbours: NDArray[np.int32],
+    neighbours: Int32s2,
     limit: int,
     tolerance: int,
     min_cos: float,
-    ref_xy: NDArray[np.float64],
-    ref_branches: NDArray[np.int8],
-    ref_neighbours: NDArray[np.int32],
-    starts: NDArray[Any],
-    entries: NDArray[np.uint64],
+    ref_xy: Floats2,
+    ref_branches: Int8s3,
+    ref_neighbours: Int32s2,
+    starts: Int32s1,
+    entries: UInt64s1,
     scale: tuple[float, float],
     min_ratio: float,
-    hit_ids: NDArray[np.int64],
-    hit_affine: NDArray[np.float64],
+    hit_ids: Ints2,
+    hit_affine: Floats2,
     n_hits: int,
 ) -> tuple[int, int]:
     """Append the map's triples whose codes agree with those of the query triple (a, slot s, slot t).
@@ -461,14 +461,14 @@ def look_up(
 
 @kernel()
 def gather(
-    hit_ids: NDArray[np.int64],
-    hit_affine: NDArray[np.float64],
-    order: NDArray[np.int64],
+    hit_ids: Ints2,
+    hit_affine: Floats2,
+    order: Ints1,
     n_slots: int,
     tolerance: float,
-    out_ids: NDArray[np.int64],
-    out_affine: NDArray[np.float64],
-    out_score: NDArray[np.int64],
+    out_ids: Ints2,
+    out_affine: Floats2,
+    out_score: Ints1,
 ) -> int:
     """Find map intersections A on which hits from different triples of one anchor agree; return how many.
 

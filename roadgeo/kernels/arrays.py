@@ -1,0 +1,93 @@
+"""Arrays of kernels by type and number of dimensions, all C-contiguous, and what an annotation means to a kernel."""
+
+from dataclasses import dataclass
+from typing import Annotated, Any, TypeAlias, get_args, get_origin, get_type_hints
+
+import numpy as np
+from numpy.typing import NDArray
+
+__all__ = [
+    "ArrayKind",
+    "Bools1",
+    "Bools2",
+    "Bytes1",
+    "Bytes2",
+    "Floats1",
+    "Floats2",
+    "Floats3",
+    "Int8s2",
+    "Int8s3",
+    "Int32s1",
+    "Int32s2",
+    "Ints1",
+    "Ints2",
+    "Ints3",
+    "Kind",
+    "Singles1",
+    "Singles2",
+    "TupleKind",
+    "UInt64s1",
+    "kind_of",
+]
+
+Floats1: TypeAlias = Annotated[NDArray[np.float64], 1]
+Floats2: TypeAlias = Annotated[NDArray[np.float64], 2]
+Floats3: TypeAlias = Annotated[NDArray[np.float64], 3]
+Singles1: TypeAlias = Annotated[NDArray[np.float32], 1]
+Singles2: TypeAlias = Annotated[NDArray[np.float32], 2]
+Ints1: TypeAlias = Annotated[NDArray[np.int64], 1]
+Ints2: TypeAlias = Annotated[NDArray[np.int64], 2]
+Ints3: TypeAlias = Annotated[NDArray[np.int64], 3]
+Int32s1: TypeAlias = Annotated[NDArray[np.int32], 1]
+Int32s2: TypeAlias = Annotated[NDArray[np.int32], 2]
+Int8s2: TypeAlias = Annotated[NDArray[np.int8], 2]
+Int8s3: TypeAlias = Annotated[NDArray[np.int8], 3]
+Bytes1: TypeAlias = Annotated[NDArray[np.uint8], 1]
+Bytes2: TypeAlias = Annotated[NDArray[np.uint8], 2]
+UInt64s1: TypeAlias = Annotated[NDArray[np.uint64], 1]
+Bools1: TypeAlias = Annotated[NDArray[np.bool_], 1]
+Bools2: TypeAlias = Annotated[NDArray[np.bool_], 2]
+
+
+@dataclass(frozen=True)
+class ArrayKind:
+    """A C-contiguous array."""
+
+    dtype: np.dtype[Any]
+    ndim: int
+
+    def __str__(self) -> str:
+        return f"{self.dtype} array of {self.ndim} dimensions"
+
+
+@dataclass(frozen=True)
+class TupleKind:
+    """A tuple; `named` is its class where that is a NamedTuple."""
+
+    members: tuple["Kind", ...]
+    named: Any = None
+
+
+#: float, int, bool or None (nothing) stand for themselves.
+Kind: TypeAlias = ArrayKind | TupleKind | type[float] | type[int] | type[bool] | None
+
+
+def kind_of(annotation: Any) -> Kind:
+    """Return what an annotation means to a kernel.
+
+    Raises
+    ------
+    TypeError
+        It does not say enough, such as an array without its number of dimensions.
+    """
+    if annotation in (float, int, bool, None):
+        return annotation  # type: ignore[no-any-return]
+    if get_origin(annotation) is Annotated:
+        array, ndim = get_args(annotation)
+        return ArrayKind(np.dtype(get_args(get_args(array)[1])[0]), ndim)
+    if get_origin(annotation) is tuple:
+        return TupleKind(tuple(map(kind_of, get_args(annotation))))
+    if hasattr(annotation, "_fields"):
+        hints = get_type_hints(annotation, include_extras=True)
+        return TupleKind(tuple(kind_of(hints[name]) for name in annotation._fields), annotation)
+    raise TypeError(f"{annotation} is no type of a kernel's argument")
