@@ -17,11 +17,11 @@ from roadgeo.matching.index import build_index
 from roadgeo.matching.methods import Found, search_reference
 from roadgeo.matching.options import LocateOptions
 from roadgeo.matching.query import Query, read_query
-from roadgeo.matching.rehearsal import rehearse_tracing
 from roadgeo.matching.trace import NO_TRACE, Trace
 from roadgeo.matching.verdict import decide, needed_of
 from roadgeo.reference.reference import BuildOptions, Reference, build_network, open_reference, stored_options
 from roadgeo.roads.kinds import RoadKind
+from roadgeo.warmup import warm_up
 
 if TYPE_CHECKING:
     import geopandas as gpd
@@ -176,7 +176,7 @@ def _as_list(reference: Reference | Sequence[Reference]) -> list[Reference]:
 
 
 def _read(mask: RoadMask | AnyArray | str | Path, options: LocateOptions) -> Query:
-    rehearse_tracing()
+    warm_up()
     return read_query(mask, options.query)
 
 

@@ -56,11 +56,11 @@ def demo_command(out_dir: str) -> int:
     make_folder(folder / "masks")
     for source, name in [(ROADS, ROADS.name), (PHOTO, PHOTO.name), *((m.path, f"masks/{m.path.name}") for m in masks)]:
         write_bytes(folder / name, source.read_bytes())
+    compile_once(quiet=False)
     started = perf_counter()
     reference = build_reference(ROADS, "porto", path=folder / "porto.gpkg", attribution=ATTRIBUTION)
     seconds = perf_counter() - started
     click.echo(f"Porto, {ATTRIBUTION}: {len(reference.index):,} intersections, indexed in {seconds:.1f} s")
-    compile_once(reference, quiet=False)
     tasks = [Task(str(mask.path), mask.path.stem) for mask in masks]
     outputs = OutputOptions(products=(OVERLAY.name,))
     wrong = 0

@@ -121,6 +121,7 @@ def index_command(
     if update:
         reference_freshness(path)  # there must be one
     read = {"roads": _read, "plugin": _read_plugin}.get(given, _fetch)
+    compile_once(quiet)
     with show_steps(quiet) as say:
         try:
             roads = read(source, given, say)
@@ -130,7 +131,6 @@ def index_command(
             reference = update_reference(path, roads, say)
         else:
             reference = build_reference(roads, make_slug(name), path=path, say=say)
-    compile_once(reference, quiet)
     if verbose:
         for key, value in roads.meta.items():
             click.echo(f"  {key}: {value}", err=True)
@@ -169,9 +169,9 @@ def _rebuild(name: str, quiet: bool) -> None:
     from roadgeo.reference.reference import rebuild_reference
 
     path = resolve_reference(name)
+    compile_once(quiet)
     with show_steps(quiet) as say:
         reference = rebuild_reference(path, say)
-    compile_once(reference, quiet)
     if not quiet:
         click.echo(f"{path}: {len(reference.index):,} intersections indexed again")
 

@@ -246,7 +246,7 @@ def locate_command(
     # Opened here too: what is wrong with them is said once, and the search is compiled before processes start.
     opened = open_references(references, print_steps(quiet))
     refuse_swapped(given["near"], opened)
-    compile_once(opened[0], quiet)
+    compile_once(quiet)
     outcomes: list[Outcome] = []
     with count_up(len(tasks), quiet, as_json, _summarize) as count:
         for outcome in locate_masks(

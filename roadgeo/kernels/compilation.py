@@ -73,10 +73,11 @@ class Kernel:
     @cached_property
     def part(self) -> Any:
         """What numba compiles into other kernels."""
-        from numba import njit
+        import numba
 
         from roadgeo.kernels import machine_code  # noqa: F401 (teaches numba what a `Kernel` is)
 
+        njit: Any = numba.njit
         return njit(no_cpython_wrapper=True, no_cfunc_wrapper=True, **self.options)(self.function)
 
     @cached_property
@@ -108,45 +109,37 @@ class Kernel:
 
     def bind(self, code: Any, release: Callable[[int], None]) -> None:
         """Run `code`, a function of two pointers, from now on."""
-        self._run = _Call(self.name, code, self.arguments or (), self.result, release)
+        self._run = _Call(self, code, release)
 
 
 class _Call:
-    """Calls machine code: arguments packed into one buffer, results unpacked from another, 8 bytes for each number."""
+    """Calls machine code: arguments packed into one buffer, results unpacked from another, 8 bytes for each number.
 
-    def __init__(
-        self, name: str, code: Any, arguments: tuple[Kind, ...], result: Kind, release: Callable[[int], None]
-    ) -> None:
-        self.name, self.code, self.release = name, code, release
-        self.arguments, self.result = arguments, result
-        self.pack = struct.Struct("=" + "".join(map(_argument_format, arguments))).pack
-        self.answer = struct.Struct("=" + _result_format(result))
+    Arrays of other types, or not contiguous, are left to `otherwise`.
+    """
+
+    def __init__(self, one: Kernel, code: Any, release: Callable[[int], None]) -> None:
+        self.code, self.release, self.otherwise = code, release, lambda *args: one.by_numba(*args)
+        self.name, self.arguments, self.result = one.name, one.arguments or (), one.result
+        self.pack = struct.Struct("=" + "".join(map(_argument_format, self.arguments))).pack
+        self.answer = struct.Struct("=" + _result_format(one.result))
         self.room = ctypes.c_char * max(self.answer.size, 8)
 
     def __call__(self, *args: Any) -> Any:
         slots: list[Any] = []
         for value, kind in zip(args, self.arguments, strict=True):
-            if type(kind) is ArrayKind:  # most are: not worth a call
+            if type(kind) is ArrayKind:
                 if value.dtype != kind.dtype or value.ndim != kind.ndim or not value.flags.c_contiguous:
-                    raise TypeError(_mismatch(self.name, value, kind))
+                    return self.otherwise(*args)
                 slots.append(id(value))
+            elif type(kind) is TupleKind:
+                slots.extend(value)
             else:
-                self._fill(slots, value, kind)
+                slots.append(value)
         room = self.room()
         if self.code(self.pack(*slots), room):
             raise ArithmeticError(f"kernel {self.name} failed: a division by zero, or no memory left")
         return self._value(self.result, iter(self.answer.unpack_from(room))) if self.answer.size else None
-
-    def _fill(self, slots: list[Any], value: Any, kind: Kind) -> None:
-        if isinstance(kind, TupleKind):
-            for member, member_kind in zip(value, kind.members, strict=True):
-                self._fill(slots, member, member_kind)
-        elif isinstance(kind, ArrayKind):
-            if value.dtype != kind.dtype or value.ndim != kind.ndim or not value.flags.c_contiguous:
-                raise TypeError(_mismatch(self.name, value, kind))
-            slots.append(id(value))
-        else:
-            slots.append(value)
 
     def _value(self, kind: Kind, slots: Iterator[Any]) -> Any:
         if isinstance(kind, TupleKind):
@@ -158,10 +151,6 @@ class _Call:
             self.release(owner)
             return array
         return bool(next(slots)) if kind is bool else next(slots)
-
-
-def _mismatch(name: str, value: Any, kind: ArrayKind) -> str:
-    return f"kernel {name}: expected a C-contiguous {kind}, got {value.dtype} of shape {value.shape}"
 
 
 def _argument_format(kind: Kind) -> str:
@@ -188,7 +177,8 @@ def _kinds(function: Callable[..., Any]) -> tuple[tuple[Kind, ...] | None, Kind]
         result = kind_of(function.__annotations__["return"])
     except (KeyError, TypeError):
         return None, None
-    return (arguments, result) if any(isinstance(kind, ArrayKind) for kind in arguments) else (None, None)
+    numbers = all(not isinstance(m, ArrayKind) for k in arguments if isinstance(k, TupleKind) for m in k.members)
+    return (arguments, result) if numbers and any(isinstance(k, ArrayKind) for k in arguments) else (None, None)
 
 
 # --- machine code kept ------------------------------------------------------------------------------------------------

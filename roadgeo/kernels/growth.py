@@ -18,6 +18,7 @@ from roadgeo.kernels.rays import rays_agree
 
 __all__ = [
     "cholesky",
+    "count_matches",
     "fit_homography",
     "grow",
     "grow_each",
@@ -580,3 +581,28 @@ def match_all(
         if matched[i] >= 0:
             count += 1
     return keep_nearest(matched, distance) if one_to_one else count
+
+
+@kernel()
+def count_matches(
+    matrix: Floats2,
+    xy: Floats2,
+    branches: Int8s3,
+    radius: float,
+    min_cos: float,
+    shifts: Floats2,
+    ref_xy: Floats2,
+    ref_branches: Int8s3,
+    starts: Int32s1,
+    grid: tuple[float, float, float],
+    shape: tuple[int, int],
+    counts: Ints1,
+) -> None:
+    """Fill `counts` (M,) with the number of matches under each of `shifts` (M, 2), metres (see `match_all`)."""
+    matched = np.empty(xy.shape[0], np.int64)
+    distance = np.empty(xy.shape[0])
+    for m in range(shifts.shape[0]):
+        counts[m] = match_all(
+            matrix, xy, branches, radius, min_cos, shifts[m, 0], shifts[m, 1], False,
+            ref_xy, ref_branches, starts, grid, shape, matched, distance,
+        )  # fmt: skip

@@ -131,7 +131,8 @@ def _argument(context: Any, builder: ir.IRBuilder, kind: Kind, numbers: Iterator
     array = context.make_array(_numba_type(kind))(context, builder)
     where = _at(builder, number, _SHAPE)
     shape = [_at(builder, where, 8 * k) for k in range(kind.ndim)]
-    strides, stride = [], _I64(kind.dtype.itemsize)
+    strides: list[Any] = []
+    stride = _I64(kind.dtype.itemsize)
     for length in reversed(shape):
         strides.insert(0, stride)
         stride = builder.mul(stride, length)

@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 from roadgeo.kernels.arrays import Bools2, Floats1, Floats2, Int32s1, Ints1, Singles2
 from roadgeo.kernels.compilation import kernel
 
-__all__ = ["backward_agreement", "bin_segments", "forward_distances", "nearest_road", "screen"]
+__all__ = ["backward_agreement", "bin_segments", "count_near_roads", "forward_distances", "nearest_road", "screen"]
 
 
 @kernel()
@@ -188,6 +188,30 @@ def forward_distances(
         if d < np.inf:
             n += 1
     return n
+
+
+@kernel()
+def count_near_roads(
+    matrix: Floats2,
+    points: Floats2,
+    directions: Floats2,
+    radius: float,
+    min_cos: float,
+    shifts: Floats2,
+    segments: Singles2,
+    starts: Int32s1,
+    ids: Int32s1,
+    grid: tuple[float, float, float],
+    shape: tuple[int, int],
+    counts: Ints1,
+) -> None:
+    """Fill `counts` (M,) with the points near roads under each of `shifts` (M, 2), metres (see `forward_distances`)."""
+    out = np.empty(points.shape[0])
+    for m in range(shifts.shape[0]):
+        counts[m] = forward_distances(
+            matrix, points, directions, radius, min_cos, shifts[m, 0], shifts[m, 1], segments, starts, ids, grid, shape,
+            out,
+        )  # fmt: skip
 
 
 @kernel()

@@ -460,6 +460,45 @@ def look_up(
 
 
 @kernel()
+def look_up_each(
+    xy: Floats2,
+    branches: Int8s3,
+    tangents: Singles2,
+    sides: Int8s2,
+    a: int,
+    slots: Ints2,
+    max_compared: int,
+    neighbours: Int32s2,
+    limit: int,
+    tolerance: int,
+    min_cos: float,
+    ref_xy: Floats2,
+    ref_branches: Int8s3,
+    ref_neighbours: Int32s2,
+    starts: Int32s1,
+    entries: UInt64s1,
+    scale: tuple[float, float],
+    min_ratio: float,
+    hit_ids: Ints2,
+    hit_affine: Floats2,
+) -> tuple[int, int]:
+    """Look up the triples of one anchor, `slots` (T, 2), until there is no room for hits or enough was compared.
+
+    See `look_up`. Returns (hits, entries compared).
+    """
+    n_hits, n_compared = 0, 0
+    for i in range(slots.shape[0]):
+        if n_hits == hit_ids.shape[0] or n_compared > max_compared:
+            break
+        n_hits, compared = look_up(
+            xy, branches, tangents, sides, a, slots[i, 0], slots[i, 1], neighbours, limit, tolerance, min_cos,
+            ref_xy, ref_branches, ref_neighbours, starts, entries, scale, min_ratio, hit_ids, hit_affine, n_hits,
+        )  # fmt: skip
+        n_compared += compared
+    return n_hits, n_compared
+
+
+@kernel()
 def gather(
     hit_ids: Ints2,
     hit_affine: Floats2,

@@ -287,33 +287,6 @@ class TripleEstimator:
                 self.n_candidates += proposals.n_hits
                 yield self._grow_all(proposals, grow)
 
-    def rehearse(self) -> None:
-        """Call every kernel once, on places of no meaning: they are compiled or loaded then, and no clock need know."""
-        n = len(self.scene.intersections)
-        if n == 0 or len(self.index) < MINIMAL:
-            return
-        other = TripleEstimator(self.scene, self.index, self.options)
-        next(other.rounds(), None)
-        proposals = Proposals(
-            0,
-            np.zeros(1, np.int64),
-            np.full((1, 8), -1),
-            np.array([[1.0, 0.0, 0.0, 1.0]]),
-            np.zeros(1, np.int64),
-            0,
-            0,
-            0,
-        )
-        other._screen(proposals, self.options.grow)
-        other.grow(proposals, np.arange(1))
-        x, y = self.index.xy[0] - self.scene.center
-        matrix = np.array([[1.0, 0.0, x], [0.0, 1.0, y], [0.0, 0.0, 1.0]])
-        hypothesis = Hypothesis(matrix, np.empty(0, np.int64), 0.0, np.full(n, -1))
-        other.score(hypothesis)
-        chance_agreement(matrix, self.scene, self.index, 1.0, self.options.verify)
-        if self.options.roads is not None:
-            RoadSearch(self.scene, self.index, self.options.camera, self.options.roads).rehearse()
-
     def _screen(self, proposals: Proposals, options: GrowOptions) -> IntArray:
         """Return the proposals that put roads around the anchor on roads of the map, the best placed first."""
         scene, index = self.scene, self.index

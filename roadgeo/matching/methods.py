@@ -19,7 +19,6 @@ from roadgeo.matching.options import LocateOptions
 from roadgeo.matching.paper.search import match_pairs
 from roadgeo.matching.paper.tuples import PairIndex, PairOptions, build_pair_index
 from roadgeo.matching.query import Query
-from roadgeo.matching.rehearsal import rehearse_search
 from roadgeo.matching.search import SearchResult, search
 from roadgeo.matching.trace import NO_TRACE, Trace
 from roadgeo.roads.intersections import Intersections
@@ -112,7 +111,6 @@ def _search_triples(
             return Found(index, n_searched=len(part))
     cropping_s = time.perf_counter() - started
     estimator = TripleEstimator(query.scene, part, promising_options(options), near, trace)
-    rehearse_search(estimator)
     started = time.perf_counter() - cropping_s
     result = search(estimator, replace(options.search, time_limit_s=time_limit_s - cropping_s))
     elapsed = time.perf_counter() - started

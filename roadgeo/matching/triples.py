@@ -15,7 +15,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from roadgeo._arrays import AnyArray, FloatArray, Int32Array, IntArray
-from roadgeo.kernels.triples import UNITS, count_alike, find_sides, gather, look_up
+from roadgeo.kernels.triples import UNITS, count_alike, find_sides, gather, look_up_each
 from roadgeo.matching.index import ReferenceIndex
 from roadgeo.roads.intersections import Intersections
 
@@ -153,18 +153,13 @@ def propose(
     for i in farthest_first(query.xy[weighed[able]], able) if options.spread else rarest:
         a = weighed[i]
         slots = np.argwhere(usable[i])
-        slots = slots[np.argsort(costs[i][usable[i]], kind="stable")]
-        n_hits = n_compared = 0
-        for s, t in slots:
-            if n_hits == max_hits or n_compared > max_compared:
-                break
-            n_hits, compared = look_up(
-                query.xy, branches, query.tangents, sides, a, s, t, neighbours, options.codes_per_vertex, tolerance,
-                np.cos(np.radians(options.ray_tolerance_deg)),
-                index.xy, index.branches, index.neighbours, index.table_starts, index.table_entries, scale, min_ratio,
-                ids, affine, n_hits,
-            )  # fmt: skip
-            n_compared += compared
+        slots = np.ascontiguousarray(slots[np.argsort(costs[i][usable[i]], kind="stable")])
+        n_hits, n_compared = look_up_each(
+            query.xy, branches, query.tangents, sides, int(a), slots, max_compared, neighbours,
+            options.codes_per_vertex, tolerance, float(np.cos(np.radians(options.ray_tolerance_deg))),
+            index.xy, index.branches, index.neighbours, index.table_starts, index.table_entries, scale, min_ratio,
+            ids, affine,
+        )  # fmt: skip
         if options.single:
             yield _each_hit(int(a), ids[:n_hits], affine[:n_hits].copy(), k, len(slots), n_compared)
             continue

@@ -16,8 +16,8 @@ from dataclasses import dataclass
 import numpy as np
 
 from roadgeo._arrays import FloatArray, IntArray
-from roadgeo.kernels.growth import match_all
-from roadgeo.kernels.roads import backward_agreement, forward_distances
+from roadgeo.kernels.growth import count_matches, match_all
+from roadgeo.kernels.roads import backward_agreement, count_near_roads, forward_distances
 from roadgeo.matching.index import ReferenceIndex
 from roadgeo.matching.scene import Scene
 
@@ -145,11 +145,8 @@ def chance_agreement(
     """
     tolerance = tolerance_m(gsd_m, options)
     found = scene.intersections
-    matched = np.empty(len(found), np.int64)
-    distance = np.empty(len(found))
     thin = max(1, len(scene.points) // options.n_null_points)
     points, directions = (np.ascontiguousarray(array[::thin]) for array in (scene.points, scene.directions))
-    out = np.empty(len(points))
     min_cos = math.cos(math.radians(options.max_turn_deg))
     roads = (index.segments, index.segment_starts, index.segment_ids, index.grid, index.shape)
     inverse, bounds = np.asarray(np.linalg.inv(matrix), float), _bounds(matrix, scene)
@@ -158,14 +155,15 @@ def chance_agreement(
     radius = np.sqrt(low**2 + (high**2 - low**2) * (k + 0.5) / options.n_shifts)
     angle = k * math.pi * (3.0 - math.sqrt(5.0))
     rates = np.empty((len(k), 3))
-    for i, (dx, dy) in enumerate(zip(radius * np.cos(angle), radius * np.sin(angle), strict=True)):
-        n = match_all(
-            matrix, found.xy, scene.branches, 1.5 * tolerance, options.ray_cos, dx, dy, False,
-            index.xy, index.branches, index.point_starts, index.grid, index.shape, matched, distance,
-        )  # fmt: skip
-        near = forward_distances(matrix, points, directions, tolerance, min_cos, dx, dy, *roads, out)
-        rates[i, 0] = n / max(len(found), 1)
-        rates[i, 1] = near / max(len(out), 1)
+    shifts = np.stack((radius * np.cos(angle), radius * np.sin(angle)), axis=1)
+    counts = np.empty(len(k), np.int64)
+    count_matches(
+        matrix, found.xy, scene.branches, 1.5 * tolerance, options.ray_cos, shifts,
+        index.xy, index.branches, index.point_starts, index.grid, index.shape, counts,
+    )  # fmt: skip
+    rates[:, 0] = counts / max(len(found), 1)
+    count_near_roads(matrix, points, directions, tolerance, min_cos, shifts, *roads, counts)
+    rates[:, 1] = counts / max(len(points), 1)
     best = np.argsort(-rates[:, 1])[:12]
     for i in best:
         dx, dy = radius[i] * math.cos(angle[i]), radius[i] * math.sin(angle[i])

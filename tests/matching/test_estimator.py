@@ -123,9 +123,8 @@ def test_little_to_see(town, scene, n):
     few = replace(found, xy=found.xy[:n], rays=found.rays[:n], tangents=found.tangents[:n])
     neighbours = query_neighbours(few.xy, 8) if n else np.empty((0, 8), np.int32)
     little = replace(scene, intersections=few, branches=scene.branches[:n], neighbours=neighbours)
-    result, estimator = locate(little, town[1], MatchOptions(last=(), roads=None))
+    result, _ = locate(little, town[1], MatchOptions(last=(), roads=None))
     assert result.score < 6
-    estimator.rehearse()
     by_roads, _ = locate(little, town[1])
     assert (by_roads.score > 6) == (n > 0)  # one intersection and all the roads are enough
 

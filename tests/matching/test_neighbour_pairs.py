@@ -164,7 +164,6 @@ class TestSources:
     )
     def test_any_mixture_finds_the_place(self, town, scene, sources):
         estimator = TripleEstimator(scene, town[1], MatchOptions(sweeps=sources))
-        estimator.rehearse()
         result = search(estimator, SearchOptions(time_limit_s=60.0))
         assert result.stopped == "accepted"
         corners = mapped(result.best.refined.matrix, scene.corners) - mapped(TRUTH, scene.corners)
