@@ -115,11 +115,11 @@ class Kernel:
 class _Call:
     """Calls machine code: arguments packed into one buffer, results unpacked from another, 8 bytes for each number.
 
-    Arrays of other types, or not contiguous, are left to `otherwise`.
+    Arrays of other types, or not contiguous, are left to numba.
     """
 
     def __init__(self, one: Kernel, code: Any, release: Callable[[int], None]) -> None:
-        self.code, self.release, self.otherwise = code, release, lambda *args: one.by_numba(*args)
+        self.code, self.release, self.kernel = code, release, one
         self.name, self.arguments, self.result = one.name, one.arguments or (), one.result
         self.pack = struct.Struct("=" + "".join(map(_argument_format, self.arguments))).pack
         self.answer = struct.Struct("=" + _result_format(one.result))
@@ -130,7 +130,7 @@ class _Call:
         for value, kind in zip(args, self.arguments, strict=True):
             if type(kind) is ArrayKind:
                 if value.dtype != kind.dtype or value.ndim != kind.ndim or not value.flags.c_contiguous:
-                    return self.otherwise(*args)
+                    return self.kernel.by_numba(*args)
                 slots.append(id(value))
             elif type(kind) is TupleKind:
                 slots.extend(value)
