@@ -127,15 +127,8 @@ class _Call:
 
     def __call__(self, *args: Any) -> Any:
         slots: list[Any] = []
-        for value, kind in zip(args, self.arguments, strict=True):
-            if type(kind) is ArrayKind:
-                if value.dtype != kind.dtype or value.ndim != kind.ndim or not value.flags.c_contiguous:
-                    return self.kernel.by_numba(*args)
-                slots.append(id(value))
-            elif type(kind) is TupleKind:
-                slots.extend(value)
-            else:
-                slots.append(value)
+        if not _fill(slots, args, self.arguments):
+            return self.kernel.by_numba(*args)
         room = self.room()
         if self.code(self.pack(*slots), room):
             raise ArithmeticError(f"kernel {self.name} failed: a division by zero, or no memory left")
@@ -151,6 +144,21 @@ class _Call:
             self.release(owner)
             return array
         return bool(next(slots)) if kind is bool else next(slots)
+
+
+def _fill(slots: list[Any], values: Sequence[Any], kinds: tuple[Kind, ...]) -> bool:
+    """Add what machine code is told of values; False: an array is not what it expects."""
+    for value, kind in zip(values, kinds, strict=True):
+        if type(kind) is ArrayKind:
+            if value.dtype != kind.dtype or value.ndim != kind.ndim or not value.flags.c_contiguous:
+                return False
+            slots.append(id(value))
+        elif type(kind) is TupleKind:
+            if not _fill(slots, value, kind.members):
+                return False
+        else:
+            slots.append(value)
+    return True
 
 
 def _argument_format(kind: Kind) -> str:
@@ -177,8 +185,9 @@ def _kinds(function: Callable[..., Any]) -> tuple[tuple[Kind, ...] | None, Kind]
         result = kind_of(function.__annotations__["return"])
     except (KeyError, TypeError):
         return None, None
-    numbers = all(not isinstance(m, ArrayKind) for k in arguments if isinstance(k, TupleKind) for m in k.members)
-    return (arguments, result) if numbers and any(isinstance(k, ArrayKind) for k in arguments) else (None, None)
+    # With numbers alone, or a private name, it is a part of others.
+    known = any(isinstance(kind, ArrayKind | TupleKind) for kind in arguments) and not function.__name__.startswith("_")
+    return (arguments, result) if known else (None, None)
 
 
 # --- machine code kept ------------------------------------------------------------------------------------------------
@@ -194,6 +203,9 @@ _SEARCH = (
     "triples",
     "growth",
     "adjustment",
+    "road_raster",
+    "road_votes",
+    "road_growth",
 )
 _left_to_numba: set[str] = set()
 _kept_alive: list[Any] = []

@@ -11,6 +11,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from roadgeo.kernels.adjustment import add_row, point_row
+from roadgeo.kernels.arrays import Floats1, Floats2, Int32s1, Singles2
 from roadgeo.kernels.compilation import kernel
 from roadgeo.kernels.growth import cholesky, solve_cholesky
 from roadgeo.kernels.roads import nearest_road
@@ -30,9 +31,9 @@ _FEWEST = 6
 class RoadBuckets(NamedTuple):
     """The roads of the map (see `kernels.roads`)."""
 
-    segments: NDArray[np.float32]
-    starts: NDArray[np.int32]
-    ids: NDArray[np.int32]
+    segments: Singles2
+    starts: Int32s1
+    ids: Int32s1
     grid: tuple[float, float, float]
     shape: tuple[int, int]
 
@@ -161,11 +162,11 @@ def share_on_roads(
 
 @kernel()
 def grow_by_roads(
-    p: NDArray[np.float64],
+    p: Floats1,
     unit: float,
-    origin: NDArray[np.float64],
-    points: NDArray[np.float64],
-    directions: NDArray[np.float64],
+    origin: Floats1,
+    points: Floats2,
+    directions: Floats2,
     stages: Stages,
     roads: RoadBuckets,
 ) -> float:

@@ -10,8 +10,8 @@ import math
 from typing import NamedTuple
 
 import numpy as np
-from numpy.typing import NDArray
 
+from roadgeo.kernels.arrays import Int32s2, Singles2, Words3
 from roadgeo.kernels.compilation import kernel
 
 __all__ = ["DIRECTIONS", "TILE", "Raster", "mark_tiles", "measure_tiles", "paint_roads", "passes"]
@@ -25,15 +25,13 @@ _SHIFT = 6
 class Raster(NamedTuple):
     """The raster as kernels take it: (R, C) int32, (T + 1, TILE, TILE) uint16, and the side of a cell in metres."""
 
-    tile_of: NDArray[np.int32]
-    bits: NDArray[np.uint16]
+    tile_of: Int32s2
+    bits: Words3
     cell: float
 
 
 @kernel()
-def mark_tiles(
-    segments: NDArray[np.float32], x0: float, y0: float, cell: float, reach: float, tile_of: NDArray[np.int32]
-) -> int:
+def mark_tiles(segments: Singles2, x0: float, y0: float, cell: float, reach: float, tile_of: Int32s2) -> int:
     """Give numbers to the tiles that roads of half width `reach` may touch; return how many there are.
 
     Parameters
@@ -67,14 +65,14 @@ def mark_tiles(
 
 @kernel()
 def paint_roads(
-    segments: NDArray[np.float32],
+    segments: Singles2,
     x0: float,
     y0: float,
     cell: float,
     reach: float,
     turn: float,
-    tile_of: NDArray[np.int32],
-    bits: NDArray[np.uint16],
+    tile_of: Int32s2,
+    bits: Words3,
 ) -> None:
     """Set the direction bits of all cells whose centres lie within `reach` metres of a road.
 
@@ -114,7 +112,7 @@ def paint_roads(
 
 
 @kernel()
-def measure_tiles(raster: Raster, out: NDArray[np.float32]) -> None:
+def measure_tiles(raster: Raster, out: Singles2) -> None:
     """Find the share of (cell, direction) pairs that roads set, in each tile and its eight neighbours together.
 
     Parameters

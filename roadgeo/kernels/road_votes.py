@@ -6,6 +6,7 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
+from roadgeo.kernels.arrays import Floats1, Floats2, Int8s3, Ints1
 from roadgeo.kernels.compilation import kernel
 from roadgeo.kernels.road_raster import DIRECTIONS, Raster, passes
 
@@ -27,9 +28,9 @@ class Places(NamedTuple):
     The density is the chance of a point of any direction to meet a road there.
     """
 
-    cells: NDArray[np.float64]
-    branches: NDArray[np.int8]
-    density: NDArray[np.float64]
+    cells: Floats2
+    branches: Int8s3
+    density: Floats1
 
 
 class RoadPoints(NamedTuple):
@@ -39,10 +40,10 @@ class RoadPoints(NamedTuple):
     plane, `angles` (P,) directions in units of pi / DIRECTIONS, at least 0.
     """
 
-    scales: NDArray[np.float64]
-    starts: NDArray[np.int64]
-    offsets: NDArray[np.float64]
-    angles: NDArray[np.float64]
+    scales: Floats1
+    starts: Ints1
+    offsets: Floats2
+    angles: Floats1
 
 
 class Trial(NamedTuple):
@@ -53,9 +54,7 @@ class Trial(NamedTuple):
 
 
 @kernel()
-def find_turns(
-    rays: NDArray[np.float64], branches: NDArray[np.int8], j: int, tolerance: float, turns: NDArray[np.float64]
-) -> int:
+def find_turns(rays: Floats1, branches: Int8s3, j: int, tolerance: float, turns: Floats1) -> int:
     """List the turns that lay all branches of a query intersection on branches of map intersection j, or the reverse.
 
     The poorer of the two may lack branches, but not have others.
@@ -130,12 +129,12 @@ def _count_met(
 
 @kernel()
 def chance_rates(
-    sample: NDArray[np.int64],
-    turns: NDArray[np.float64],
+    sample: Ints1,
+    turns: Floats1,
     points: RoadPoints,
     places: Places,
     raster: Raster,
-    out: NDArray[np.float64],
+    out: Floats1,
 ) -> None:
     """Measure how often points meet roads by chance at each scale, in units of the density of roads at the place.
 
@@ -160,16 +159,16 @@ def chance_rates(
 
 @kernel()
 def vote(
-    candidates: NDArray[np.int64],
-    rays: NDArray[np.float64],
+    candidates: Ints1,
+    rays: Floats1,
     tolerance: float,
     max_turn: float,
     points: RoadPoints,
     places: Places,
     raster: Raster,
-    chance: NDArray[np.float64],
+    chance: Floats1,
     trial: Trial,
-    votes: NDArray[np.float64],
+    votes: Floats2,
     kept: int,
 ) -> tuple[int, int]:
     """Lay the roads around a query intersection on those around map intersections; keep the best.
@@ -259,9 +258,9 @@ def _swap(heap: NDArray[np.float64], a: int, b: int) -> None:
 
 @kernel()
 def improve_votes(
-    votes: NDArray[np.float64],
-    turns: NDArray[np.float64],
-    factors: NDArray[np.float64],
+    votes: Floats2,
+    turns: Floats1,
+    factors: Floats1,
     points: RoadPoints,
     places: Places,
     raster: Raster,

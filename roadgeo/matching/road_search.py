@@ -90,12 +90,6 @@ class RoadSearch:
         """Places and turns tried so far."""
         return self.voter.n_tried
 
-    def rehearse(self) -> None:
-        """Compile or load all kernels on a place of no meaning, so that compilation is not charged to a time limit."""
-        self.voter.candidates = self.voter.candidates[:1]
-        next(self.voter.votes(0))
-        self.grower.grow(0, 0, np.array([1.0, 0.0, 0.0, 1.0]))
-
     def rounds(self) -> Iterator[RoadRound]:
         """Yield what grew of one anchor's proposals after another; between parts of a large map nothing."""
         xy = self.scene.intersections.xy
