@@ -151,4 +151,4 @@ def passes(x: float, y: float, direction: int, raster: Raster) -> int:
     column, row = np.uint32(x), np.uint32(y)
     tile = np.uint32(raster.tile_of[row >> np.uint32(_SHIFT), column >> np.uint32(_SHIFT)])
     word = raster.bits[tile, row & np.uint32(TILE - 1), column & np.uint32(TILE - 1)]
-    return int((np.uint32(word) >> np.uint32(direction)) & np.uint32(1))
+    return int(np.int64((np.uint32(word) >> np.uint32(direction)) & np.uint32(1)))  # signed, as the sums it goes into
