@@ -20,13 +20,16 @@ from typing import TYPE_CHECKING, Any, Literal
 
 from roadgeo._processes import run
 from roadgeo._progress import Say, say_nothing
-from roadgeo.errors import IndexFormatError, PluginError, RoadgeoError
+from roadgeo.errors import IndexFormatError, MaskError, OutputError, RoadgeoError
 from roadgeo.outputs.registry import JSON, REPORT, is_result
 
 if TYPE_CHECKING:
     from roadgeo.geometry.mask import RoadMask
     from roadgeo.outputs.location_files import OutputOptions
+    from roadgeo.outputs.paths import OutputPaths
+    from roadgeo.queries import QueryOptions
     from roadgeo.reference.reference import Reference
+    from roadgeo.segmentation.probability import ProbabilityMap
     from roadgeo.workflows import LocateOptions
 
 __all__ = [
@@ -41,6 +44,9 @@ __all__ = [
 ]
 
 Status = Literal["located", "ambiguous", "not_located", "error"]
+
+#: What a segmenter saw is kept under this name; masks that users make have such names, too.
+_PROBABILITY = "_mask.tif"
 
 #: What a folder is searched for.
 SUFFIXES = (".tif", ".tiff", ".png", ".jpg", ".jpeg", ".jp2", ".bmp", ".pgm", ".webp", ".vrt", ".img", ".npy")
@@ -71,7 +77,9 @@ def find_masks(arguments: Sequence[str]) -> list[str]:
 
 
 def _is_mask(path: Path) -> bool:
-    return path.suffix.lower() in SUFFIXES and not path.name.startswith(".") and not is_result(path.name)
+    if path.suffix.lower() not in SUFFIXES or path.name.startswith(".") or is_result(path.name):
+        return False
+    return not (path.name.endswith(_PROBABILITY) and _is_ours(path))
 
 
 def name_tasks(masks: Sequence[str]) -> list[Task]:
@@ -135,8 +143,8 @@ class ReadOptions:
     ----------
     threshold, band
         As for `sources.masks.read_mask`.
-    segmenter : str or None
-        The files are photographs, in which this plugin finds the roads.
+    segment, segmenters, class_name, fused_with, threads
+        As for `queries.QueryOptions`.
     images : mapping of mask to photograph
         Drawn on the map instead of the masks.
     exif : bool
@@ -145,13 +153,25 @@ class ReadOptions:
 
     threshold: float | None = None
     band: int | None = None
-    segmenter: str | None = None
     images: Mapping[str, str] = field(default_factory=dict)
     exif: bool = False
+    segment: Literal["auto", "always", "never"] = "auto"
+    segmenters: tuple[str, ...] = ()
+    class_name: str | None = None
+    fused_with: tuple[str, ...] = ()
+    threads: int = 1
 
-    def photo(self, task: Task) -> str | None:
-        """Return the photograph that is drawn, if any."""
-        return self.images.get(task.mask, task.mask if self.segmenter else None)
+    def photo(self, task: Task, of_photograph: bool) -> str | None:
+        """Return the photograph that is drawn, if any: one that was given, or the query itself."""
+        return self.images.get(task.mask, task.mask if of_photograph else None)
+
+    def of_query(self) -> QueryOptions:
+        """Return what concerns one query."""
+        from roadgeo.queries import QueryOptions
+
+        return QueryOptions(
+            self.threshold, self.band, self.segment, self.segmenters, self.class_name, self.fused_with, self.threads
+        )
 
 
 @dataclass(frozen=True)
@@ -252,7 +272,7 @@ class _Locating:
         from roadgeo.outputs.location_files import OutputOptions
         from roadgeo.workflows import LocateOptions
 
-        reading = replace(self.reading, images={})
+        reading = replace(self.reading, images={}, threads=ReadOptions.threads)
         told = {
             **_changed(self.options, LocateOptions()),
             **_changed(reading, ReadOptions()),
@@ -291,7 +311,7 @@ class _Locating:
             return None
         if not isinstance(document, dict) or (document.get("schema"), document.get("query")) != (SCHEMA, task.mask):
             return None
-        status, photo = document.get("status"), self.reading.photo(task)
+        status, photo = document.get("status"), self.reading.photo(task, _is_ours(_probability_path(paths)))
         if status not in {"located", "ambiguous", "not_located"} or not asked.same(document):
             return None
         wanted = wanted_outputs(self.outputs.products, status == "located", photo is not None)
@@ -303,60 +323,75 @@ class _Locating:
         from roadgeo.outputs.location_files import write_location
         from roadgeo.outputs.paths import output_paths
         from roadgeo.outputs.registry import EXPLANATION
+        from roadgeo.queries import locate_query
         from roadgeo.workflows import explain, locate
 
         started = perf_counter()
-        mask = self._read(task)
-        read_seconds = perf_counter() - started
-        options = self._with_focal_length(task, max(mask.shape))
-        asks_why = EXPLANATION.name in self.outputs.products
-        explanation = explain(mask, asked.references, options) if asks_why else None
-        location = locate(mask, asked.references, options) if explanation is None else explanation.location
+        how = explain if EXPLANATION.name in self.outputs.products else locate
+        options = self._with_focal_length(task)
+        sighting = locate_query(task.mask, asked.references, options, self.reading.of_query(), how=how)
+        location, mask, explanation = sighting.location, sighting.mask, sighting.explanation
+        spent = location.seconds
+        reading_s = perf_counter() - started - spent.vectorize - spent.match - spent.refine
         location = replace(
             location,
-            seconds=replace(location.seconds, open=asked.seconds, read=read_seconds),
+            seconds=replace(spent, open=asked.seconds, read=max(reading_s, 0.0)),
             options=asked.options,
             reference_digest=asked.digest(location.reference),
         )
-        paths, photo = output_paths(self.out_dir, task.stem), self.reading.photo(task)
+        paths, photo = output_paths(self.out_dir, task.stem), self.reading.photo(task, sighting.of_photograph)
+        kept = _keep(sighting.probability, paths)
         indexes = [one.index for one in asked.references]
         written = write_location(location, mask, paths, self.outputs, photo, indexes, explanation)
         return Outcome(
             location.status,
             written.location.to_dict(),
-            tuple(map(str, written.files)),
+            tuple(map(str, (*written.files, *kept))),
             tuple(map(str, written.removed)),
             (photo, _scale(photo, mask)) if photo and location.located else None,
         )
 
-    def _read(self, task: Task) -> RoadMask:
-        """Read the mask, or have a plugin see the roads in a photograph."""
-        import numpy as np
-
-        from roadgeo.geometry.mask import RoadMask
-        from roadgeo.plugins import SEGMENTERS, call_plugin
-        from roadgeo.sources.masks import read_mask
-
-        segmenter, threshold = self.reading.segmenter, self.reading.threshold
-        if segmenter is None:
-            return read_mask(task.mask, threshold=threshold, band=self.reading.band)
-        seen = call_plugin(SEGMENTERS, segmenter, task.mask)
-        if isinstance(seen, RoadMask):
-            return replace(seen, name=task.mask)
-        if not isinstance(seen, np.ndarray):
-            kind = type(seen).__name__
-            raise PluginError(f"the segmenter {segmenter!r} returned a {kind}, expected a RoadMask or an array")
-        return read_mask(seen, threshold=threshold, name=task.mask)
-
-    def _with_focal_length(self, task: Task, longer_side: int) -> LocateOptions:
+    def _with_focal_length(self, task: Task) -> LocateOptions:
         """Return the options, with the focal length that the photograph's EXIF states where that was asked for."""
         if not self.reading.exif:
             return self.options
         from roadgeo.sources.exif import read_focal_length
+        from roadgeo.storage.rasters import open_raster
 
+        with open_raster(task.mask) as raster:
+            longer_side = max(raster.shape)
         focal_px = read_focal_length(self.reading.images.get(task.mask, task.mask)) * longer_side
         match = self.options.match
         return replace(self.options, match=replace(match, camera=replace(match.camera, focal_px=focal_px)))
+
+
+def _probability_path(paths: OutputPaths) -> Path:
+    return paths.folder / f"{paths.stem}{_PROBABILITY}"
+
+
+def _is_ours(path: Path) -> bool:
+    """Whether a file is a probability map that we wrote, not a mask of the user's."""
+    from roadgeo.segmentation.probability import TAG
+    from roadgeo.storage.rasters import open_raster
+
+    if not path.is_file():
+        return False
+    try:
+        with open_raster(path) as raster:
+            return TAG in raster.tags()
+    except MaskError:
+        return False
+
+
+def _keep(probability: ProbabilityMap | None, paths: OutputPaths) -> list[Path]:
+    """Write what a segmenter saw; a mask that the user made is not overwritten."""
+    if probability is None:
+        return []
+    path = _probability_path(paths)
+    if path.exists() and not _is_ours(path):
+        raise OutputError(f"{path}: is there already, and was not written by roadgeo; choose another --out-dir")
+    probability.write(path)
+    return [path]
 
 
 @dataclass(frozen=True)

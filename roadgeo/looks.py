@@ -55,6 +55,7 @@ class Sighting:
     mask: RoadMask
     explanation: Explanation | None = None
     probability: ProbabilityMap | None = None
+    of_photograph: bool = False
 
 
 def locate_looks(

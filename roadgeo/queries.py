@@ -8,6 +8,7 @@ from __future__ import annotations
 
 import os
 from collections.abc import Callable, Sequence
+from contextlib import suppress
 from dataclasses import dataclass, replace
 from functools import lru_cache, partial
 from pathlib import Path
@@ -25,7 +26,7 @@ from roadgeo.plugins import SEGMENTERS, call_plugin
 from roadgeo.reference.reference import Reference
 from roadgeo.segmentation.network import DEFAULT_MODEL, Network, load_network
 from roadgeo.segmentation.photograph import Photograph, open_photograph
-from roadgeo.segmentation.probability import ProbabilityMap, fuse
+from roadgeo.segmentation.probability import NODATA, ProbabilityMap, fuse
 from roadgeo.segmentation.scales import rank_scales, scale_of
 from roadgeo.segmentation.tiling import segment
 from roadgeo.sources.exif import estimate_gsd
@@ -103,7 +104,8 @@ def locate_query(
         except PhotographError:
             if query.segment == "never":
                 raise
-    return _locate_photograph((path, *query.fused_with), references, options, query, how, say)
+    sighting = _locate_photograph((path, *query.fused_with), references, options, query, how, say)
+    return replace(sighting, of_photograph=True)
 
 
 def is_model(segmenter: str) -> bool:
@@ -191,13 +193,20 @@ def _choose_scales(photograph: Photograph, query: QueryOptions, options: LocateO
 def _see(path: str, segmenter: str, scale: float, query: QueryOptions, say: Say) -> ProbabilityMap:
     """Return what one segmenter sees in one photograph; a mask is sure of itself."""
     if segmenter and not is_model(segmenter):
-        mask = _call_segmenter(segmenter, path, query.threshold)
-        values = np.where(mask.roads, 229, 25).astype(np.uint8)  # 0.9 and 0.1: a mask says nothing of its doubts
-        if mask.observed is not None:
-            values[~mask.observed] = 255
-        return ProbabilityMap(values, 0.5, path, segmenter)
+        return _of_mask(_call_segmenter(segmenter, path, query.threshold), segmenter)
+    if query.segment == "auto" and query.fused_with:
+        with suppress(PhotographError):
+            return _of_mask(read_mask(path, band=query.band, threshold=query.threshold), "mask")
     with open_photograph(path) as photograph:
         return segment(photograph, _network(segmenter, query.class_name, query.threads), scale, say)
+
+
+def _of_mask(mask: RoadMask, model: str) -> ProbabilityMap:
+    """Return a mask as a map of probabilities 0.9 and 0.1: it says nothing of its doubts."""
+    values = np.where(mask.roads, 229, 25).astype(np.uint8)
+    if mask.observed is not None:
+        values[~mask.observed] = NODATA
+    return ProbabilityMap(values, 0.5, mask.name, model)
 
 
 @lru_cache(maxsize=4)

@@ -113,12 +113,10 @@ def test_what_a_plugin_refuses_is_said_as_it_says_it(offer) -> None:
 
 @pytest.mark.parametrize("kind", ["mask", "array"])
 def test_a_segmenter_may_return_a_mask_or_an_array(offer, kind: str) -> None:
-    from roadgeo.batch import ReadOptions, Task, _Locating
+    from roadgeo.queries import _call_segmenter
 
     offer(segmenters_mask=f"{__name__}:see_mask", segmenters_array=f"{__name__}:see_array")
-    reading = ReadOptions(segmenter=kind)
-    job = _Locating((), ".", None, None, reading, skip_existing=False)  # type: ignore[arg-type]  # it only reads
-    mask = job._read(Task(str(SHEET), "map_sheet"))
+    mask = _call_segmenter(kind, str(SHEET), None)
     assert mask.name == str(SHEET)
     assert np.array_equal(mask.roads, read_mask(SHEET).roads)
 

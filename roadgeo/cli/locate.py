@@ -10,11 +10,12 @@ from typing import TYPE_CHECKING, Any, Literal, TypeVar
 
 import click
 
-from roadgeo.batch import Outcome, ReadOptions, find_masks, locate_masks, name_tasks, open_references, write_overview
+from roadgeo.batch import Outcome, find_masks, locate_masks, name_tasks, open_references, write_overview
 from roadgeo.cli import ERROR, NOT_LOCATED
 from roadgeo.cli.folders import make_folder
 from roadgeo.cli.hints import HINTS, hint_options, make_options, refuse_swapped
 from roadgeo.cli.parameters import Plugin, verbosity_options
+from roadgeo.cli.photographs import read_options, segmenting_options
 from roadgeo.outputs.registry import (
     ALSO,
     ALWAYS,
@@ -175,12 +176,7 @@ def _drawing_options(command: Command) -> Command:
 )
 @click.option("--json", "as_json", is_flag=True, help="Print one JSON object per mask and line, in input order.")
 @_drawing_options
-@click.option(
-    "--segmenter",
-    metavar="NAME",
-    type=Plugin("roadgeo.segmenters"),
-    help="The MASKs are photographs: have this plugin find their roads. `roadgeo info --plugins` lists them.",
-)
+@segmenting_options
 @click.option("--threshold", metavar="T", type=float, help="Values above T are road. Default: told by the values.")
 @click.option(
     "--band", metavar="N", type=click.IntRange(1), help="Band that holds the mask. Default: told by the bands."
@@ -235,14 +231,14 @@ def locate_command(
 
     options = make_options(method, time_limit, {name: given[name] for name in HINTS}, effort)
     outputs = _output_options(given)
-    tasks = name_tasks(find_masks(masks))
-    if not tasks:
+    found = find_masks(masks)
+    if not found:
         raise click.UsageError(f"No images in {', '.join(masks)}.")
+    others = found[1:] if given["fuse"] else []
+    tasks = name_tasks(found[:1] if given["fuse"] else found)
     make_folder(out_dir)
     photos = pair_images([task.mask for task in tasks], given["images"])
-    reading = ReadOptions(
-        given["threshold"], given["band"], given["segmenter"], photos, exif=given["focal_px"] == "exif"
-    )
+    reading = read_options(given, photos, others, jobs)
     # Opened here too: what is wrong with them is said once, and the search is compiled before processes start.
     opened = open_references(references, print_steps(quiet))
     refuse_swapped(given["near"], opened)

@@ -108,6 +108,7 @@ def _open_session(content: bytes, name: str, threads: int) -> Any:
     options.use_deterministic_compute = True
     options.log_severity_level = 4  # what goes wrong is raised, and need not be printed too
     options.enable_mem_pattern = False
+    options.add_session_config_entry("session.intra_op.allow_spinning", "0")  # waiting threads leave the core to others
     try:
         return onnxruntime.InferenceSession(content, options, providers=["CPUExecutionProvider"])
     except Exception as error:  # as above
