@@ -342,7 +342,8 @@ class _Locating:
         paths, photo = output_paths(self.out_dir, task.stem), self.reading.photo(task, sighting.of_photograph)
         kept = _keep(sighting.probability, paths)
         indexes = [one.index for one in asked.references]
-        written = write_location(location, mask, paths, self.outputs, photo, indexes, explanation)
+        outputs = self.outputs if mask.roads.any() else _without_views(self.outputs)
+        written = write_location(location, mask, paths, outputs, photo, indexes, explanation)
         return Outcome(
             location.status,
             written.location.to_dict(),
@@ -363,6 +364,14 @@ class _Locating:
         focal_px = read_focal_length(self.reading.images.get(task.mask, task.mask)) * longer_side
         match = self.options.match
         return replace(self.options, match=replace(match, camera=replace(match.camera, focal_px=focal_px)))
+
+
+def _without_views(outputs: OutputOptions) -> OutputOptions:
+    """Leave out what shows the roads of a mask: there are none."""
+    from roadgeo.outputs.registry import EXPLANATION, EXPLANATION_PICTURE
+
+    views = {REPORT.name, EXPLANATION.name, EXPLANATION_PICTURE.name}
+    return replace(outputs, products=tuple(name for name in outputs.products if name not in views))
 
 
 def _probability_path(paths: OutputPaths) -> Path:

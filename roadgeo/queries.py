@@ -143,13 +143,14 @@ def _locate_photograph(
         grid = round(photograph.height / k), round(photograph.width / k)
         scales = _choose_scales(photograph, query, options)
 
-    @lru_cache(1)
+    @lru_cache(_MAX_SCALES)
     def see(scale: float) -> ProbabilityMap:
         seen = [_see(path, name, scale, query, say) for path in paths for name in query.segmenters or ("",)]
         maps = [one.resized(grid) for one in seen]
         return maps[0] if len(maps) == 1 else fuse(maps)
 
-    looks = [look for scale in scales for look in _looks_at(partial(see, scale), scale, query)]
+    at_scales = [_looks_at(partial(see, scale), scale, query) for scale in scales]
+    looks = [looks[0] for looks in at_scales] + at_scales[0][1:]
     options = _on_grid(options, k)
     try:
         return locate_looks(looks, references, options, how)

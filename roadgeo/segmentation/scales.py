@@ -1,18 +1,18 @@
 """At which scale a photograph is shown to a model, where nobody says how large its pixels are.
 
-A few scales are tried on the middle of the photograph. At the right one roads are seen with confidence and hang
-together; at others little is seen, or scraps.
+A few scales are tried on the middle of the photograph. At the right one many intersections are seen with confidence;
+at coarser ones roads run into each other, at finer ones they fall apart and the model is in doubt.
 """
 
 from __future__ import annotations
 
 import math
 
-import cv2
 import numpy as np
 
 from roadgeo._arrays import AnyArray, BoolArray
 from roadgeo.errors import MaskError
+from roadgeo.roads.vectorization import vectorize
 from roadgeo.segmentation.network import Network
 from roadgeo.segmentation.photograph import Photograph
 from roadgeo.segmentation.probability import NODATA, ProbabilityMap
@@ -25,7 +25,8 @@ PYRAMID = (1.0, 0.5, 2.0, 0.25, 0.125)
 
 _DEFAULT_RESOLUTION_M = 1.0
 _MIN_SIDE, _MAX_ENLARGED = 192, 4096  # pixels at the model's scale
-_REACH = 0.25  # of a tile: pieces of road this long hang together
+_TRIED_TILES = 1.9  # side of the part that is tried, tiles: 2 x 2 of them cover it
+_DOUBT = 4  # power of the share of probability that lies on roads
 
 
 def scale_of(gsd_m: float, network: Network) -> float:
@@ -41,7 +42,8 @@ def rank_scales(photograph: Photograph, network: Network) -> list[float]:
         if min(shape) < _MIN_SIDE or math.prod(shape) > MAX_MAP_PIXELS or (scale > 1 and max(shape) > _MAX_ENLARGED):
             continue
         try:
-            found = score(segment(_middle(photograph, network.card.tile, scale), network, scale))
+            part = _middle(photograph, network.card.tile, scale)
+            found = score(segment(part, network, scale)) / (part.width * part.height)
         except MaskError:  # no ground in the middle
             found = 0.0
         scored.append((found, -len(scored), scale))
@@ -51,27 +53,22 @@ def rank_scales(photograph: Photograph, network: Network) -> list[float]:
 
 
 def score(seen: ProbabilityMap) -> float:
-    """Say how much a map looks like roads: how sure it is of them, times how far they hang together, times how much."""
+    """Say how much a map looks like roads: its intersections, weighted down where the model is in doubt."""
     known = seen.values != NODATA
-    if not known.any():
-        return 0.0
     p = np.where(known, seen.values, 0).astype(np.float32) / 254
-    roads = p > 0.5
-    if not roads.any():
+    try:
+        graph = vectorize(seen.mask(seen.threshold)).graph
+    except MaskError:
         return 0.0
-    stats = cv2.connectedComponentsWithStats(roads.view(np.uint8))[2]
-    reach = np.maximum(stats[:, cv2.CC_STAT_WIDTH], stats[:, cv2.CC_STAT_HEIGHT])
-    long = reach >= _REACH * min(seen.values.shape)
-    long[0] = False
-    together = float(stats[long, cv2.CC_STAT_AREA].sum()) / float(np.count_nonzero(roads))
-    sure = float(p[roads].sum() / p.sum())
-    return sure * together
+    degrees = np.bincount(np.asarray(graph.edges).ravel(), minlength=1)
+    sure = float(p[p > seen.threshold].sum() / p.sum())
+    return float(np.count_nonzero(degrees >= 3)) * sure**_DOUBT
 
 
 def _middle(photograph: Photograph, tile: tuple[int, int], scale: float) -> Photograph:
-    """Return the part in the middle of a photograph that fills a tile at a scale."""
-    width = min(photograph.width, max(1, round(tile[1] / scale)))
-    height = min(photograph.height, max(1, round(tile[0] / scale)))
+    """Return the part in the middle of a photograph that fills a few tiles at a scale."""
+    width = min(photograph.width, max(1, round(_TRIED_TILES * tile[1] / scale)))
+    height = min(photograph.height, max(1, round(_TRIED_TILES * tile[0] / scale)))
     left, top = (photograph.width - width) // 2, (photograph.height - height) // 2
 
     def read(x: float, y: float, w: float, h: float, shape: tuple[int, int]) -> tuple[AnyArray, BoolArray]:

@@ -1,0 +1,157 @@
+"""Photographs are recognised, segmented and located like masks; nobody says how large their pixels are."""
+
+import json
+from pathlib import Path
+
+import cv2
+import numpy as np
+import pytest
+import rasterio
+from worlds.models import brightness_model
+
+from roadgeo.cli import main
+from roadgeo.demo import ROADS, demo_masks
+from roadgeo.errors import ModelError, PhotographError
+from roadgeo.queries import QueryOptions, locate_query
+from roadgeo.segmentation.probability import TAG
+from roadgeo.workflows import build_reference
+
+pytestmark = pytest.mark.filterwarnings("ignore::rasterio.errors.NotGeoreferencedWarning")
+
+MASK = next(mask for mask in demo_masks() if mask.path.stem == "drone")
+
+
+@pytest.fixture(scope="module")
+def model(tmp_path_factory: pytest.TempPathFactory) -> str:
+    """Sees a road where a picture is light."""
+    props = {"class_names": {0: "ground", 1: "road"}, "resolution": 100, "tiles_overlap": 10}
+    return str(brightness_model(tmp_path_factory.mktemp("models") / "light.onnx", size=256, props=props))
+
+
+@pytest.fixture(scope="module")
+def demo_reference(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    path = tmp_path_factory.mktemp("reference") / "porto.gpkg"
+    build_reference(str(ROADS), "porto", path=path)
+    return path
+
+
+@pytest.fixture(scope="module")
+def photo(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """The drone's mask as a photograph: light roads on rough, coloured ground."""
+    rng = np.random.default_rng(0)
+    roads = cv2.imread(str(MASK.path), cv2.IMREAD_GRAYSCALE) > 127
+    ground = rng.integers(10, 110, (*roads.shape, 3)).astype(np.uint8)
+    ground[..., 1] //= 2
+    image = np.where(roads[..., None], np.uint8(225), cv2.GaussianBlur(ground, (0, 0), 1))
+    path = tmp_path_factory.mktemp("photos") / "flight.jpg"
+    cv2.imwrite(str(path), image, [cv2.IMWRITE_JPEG_QUALITY, 95])
+    return path
+
+
+def run(capsys: pytest.CaptureFixture[str], *arguments: str) -> dict:
+    assert main(["locate", *arguments, "--json", "--quiet"]) in (0, 3)
+    return json.loads(capsys.readouterr().out)
+
+
+def offset(document: dict, size: int = 1) -> float:
+    """Distance in metres of the middle from where it is."""
+    width, height = document["size"]
+    expected = MASK.homography @ [width / 2, height / 2, 1]
+    found = np.array(document["homography"]) @ [width / 2, height / 2, 1]
+    return float(np.hypot(*(found[:2] / found[2] - expected[:2] / expected[2])))
+
+
+def test_a_photograph_is_located(
+    tmp_path: Path, demo_reference: Path, model: str, photo: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    given = [str(photo), "-r", str(demo_reference), "--segmenter", model, "-o", str(tmp_path)]
+    document = run(capsys, *given)
+    assert document["status"] == "located"
+    assert document["query"] == str(photo)
+    assert offset(document) < 3.0
+    with rasterio.open(tmp_path / "flight_mask.tif") as kept:
+        assert TAG in kept.tags()
+        assert kept.shape == cv2.imread(str(photo)).shape[:2]
+    with rasterio.open(tmp_path / "flight_footprint.tif") as drawn:
+        assert drawn.count >= 3  # the photograph itself, not its mask
+    again = run(capsys, *given)
+    assert again["homography"] == document["homography"]
+
+
+def test_our_own_probability_map_is_no_further_query(
+    tmp_path: Path, demo_reference: Path, model: str, photo: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    (tmp_path / "flight.jpg").write_bytes(photo.read_bytes())
+    given = [str(tmp_path), "-r", str(demo_reference), "--segmenter", model, "-o", str(tmp_path)]
+    run(capsys, *given)
+    assert (tmp_path / "flight_mask.tif").exists()
+    assert run(capsys, *given)["query"].endswith("flight.jpg")
+
+
+def test_a_mask_of_the_users_is_not_overwritten(
+    tmp_path: Path, demo_reference: Path, model: str, photo: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    mine = tmp_path / "flight_mask.tif"
+    cv2.imwrite(str(mine), np.zeros((50, 50), np.uint8))
+    content = mine.read_bytes()
+    status = main(["locate", str(photo), "-r", str(demo_reference), "--segmenter", model, "-o", str(tmp_path)])
+    assert status == 1
+    assert "not written by roadgeo" in capsys.readouterr().err
+    assert mine.read_bytes() == content
+    assert [path.name for path in tmp_path.iterdir()] == ["flight_mask.tif"]
+
+
+def test_never_means_never(demo_reference: Path, model: str, photo: Path) -> None:
+    import roadgeo
+
+    reference = roadgeo.open_reference(demo_reference)
+    with pytest.raises(PhotographError, match="looks like a photograph"):
+        locate_query(str(photo), [reference], query=QueryOptions(segment="never", segmenters=(model,)))
+
+
+def test_a_mask_stays_a_mask(demo_reference: Path, model: str) -> None:
+    import roadgeo
+
+    reference = roadgeo.open_reference(demo_reference)
+    sighting = locate_query(str(MASK.path), [reference], query=QueryOptions(segmenters=(model,)))
+    assert sighting.location.located
+    assert not sighting.of_photograph
+    assert sighting.probability is None
+
+
+def test_without_a_model_it_is_said(demo_reference: Path, photo: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    import roadgeo
+
+    monkeypatch.setattr("importlib.util.find_spec", lambda name: None)
+    with pytest.raises(ModelError, match=r"pip install 'roadgeo\[segment\]'"):
+        locate_query(str(photo), [roadgeo.open_reference(demo_reference)])
+
+
+def test_two_exposures_are_fused(
+    tmp_path: Path, demo_reference: Path, model: str, photo: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    """Each shows one half of the roads."""
+    image = cv2.imread(str(photo))
+    half = image.shape[1] // 2
+    for name, part in (("a.jpg", slice(0, half)), ("b.jpg", slice(half, None))):
+        shaded = image.copy()
+        shaded[:, part] = np.minimum(shaded[:, part], 120)
+        cv2.imwrite(str(tmp_path / name), shaded)
+    pair = [str(tmp_path / "a.jpg"), str(tmp_path / "b.jpg")]
+    out = str(tmp_path / "out")
+    document = run(capsys, *pair, "--fuse", "-r", str(demo_reference), "--segmenter", model, "-o", out)
+    assert document["status"] == "located"
+    assert offset(document) < 3.0
+
+
+def test_a_photograph_that_shows_no_road_is_not_located(
+    tmp_path: Path, demo_reference: Path, model: str, capsys: pytest.CaptureFixture[str]
+) -> None:
+    rng = np.random.default_rng(0)
+    dark = rng.integers(20, 90, (300, 300, 3)).astype(np.uint8)
+    cv2.imwrite(str(tmp_path / "dark.png"), dark)
+    out = str(tmp_path / "out")
+    given = [str(tmp_path / "dark.png"), "-r", str(demo_reference), "--segmenter", model, "-o", out]
+    document = run(capsys, *given, "--segment", "always", "--report")
+    assert document["status"] == "not_located"
+    assert "hardly a road" in document["reason"]
