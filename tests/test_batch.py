@@ -81,7 +81,7 @@ class Hazard:
 
 @pytest.mark.parametrize("kind", Hazard.ERRORS)
 def test_whatever_one_mask_raises_the_others_go_on(kind: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr("roadgeo.sources.masks.read_mask", Hazard())
+    monkeypatch.setattr("roadgeo.queries.open_mask", Hazard())
     work = _Locating((), str(tmp_path), LocateOptions(), OutputOptions(), ReadOptions(), skip_existing=False)
     outcome = work._do(Task(f"{kind}.png", kind), _Asked([], [], 0.0, {}))
     assert outcome.status == "error"

@@ -43,6 +43,9 @@ A mask is an image of the roads that an aerial picture shows: bright or 1 where 
 scale and camera need not be known; what is known shortens the search, and tells places apart that look alike. Give
 files, folders or patterns.
 
+A photograph may stand for its mask: it is recognised, a network finds its roads (pip install 'roadgeo[segment]'), and
+what it saw is kept as PHOTO_mask.tif.
+
 \b
 For each located photo_mask.tif:
 {always}
@@ -66,6 +69,7 @@ Examples:
   roadgeo locate *.png --json --jobs 4 > found.jsonl
   roadgeo locate photo_mask.png --image photo.tif --crs EPSG:3857 --also geojson --also points
   roadgeo locate mask.png --gsd 0.3:0.6 --near=-71.06,42.36,5000
+  roadgeo locate photo.jpg --segmenter my_roads.onnx
 
 Exit status: 0 every mask located, 3 at least one not located, 1 error, 2 usage.
 """

@@ -91,6 +91,8 @@ def load_network(
     if importlib.util.find_spec("onnxruntime") is None:
         raise ModelError(f"to find the roads in a photograph onnxruntime is needed: {INSTALL}")
     path = Path(path) if path is not None else DEFAULT_MODEL
+    if path == DEFAULT_MODEL and not path.exists():
+        raise ModelError("no model is installed with roadgeo; give one that finds roads: --segmenter MODEL.onnx")
     model = read_onnx(path)
     card = read_card(model, path, class_name)
     session = _open_session(model.content, str(path), threads)
