@@ -252,7 +252,7 @@ def bad_mask(name: str) -> Path:
 def test_a_bad_mask_is_one_line_and_status_1(
     name: str, message: str, porto: Path, capfd: pytest.CaptureFixture[str]
 ) -> None:
-    assert main(["locate", str(bad_mask(name)), "-r", str(porto)]) == 1
+    assert main(["locate", str(bad_mask(name)), "-r", str(porto), "--segment", "never"]) == 1
     out, err = capfd.readouterr()
     assert out == ""
     assert err.startswith(f"Error: {name}")
