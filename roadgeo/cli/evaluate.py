@@ -97,6 +97,7 @@ def evaluate_command(
       roadgeo evaluate boston-ma --queries queries/truth.csv --method pair
       roadgeo evaluate boston-ma --map --height 400 --focal 2000 --size 1200 --noise segmented --check 300
     """
+    from roadgeo.cli.compilation import compile_once
     from roadgeo.evaluation.trials import ReferenceLocator
     from roadgeo.reference.library import resolve_reference
     from roadgeo.storage.atomic import writing
@@ -108,6 +109,7 @@ def evaluate_command(
             out_dir.mkdir(parents=True, exist_ok=True)
     if height is not None:
         options["gsd"] = (height / (options["focal"] or options["size"]),) * 2
+    compile_once(quiet)
     hints = {"gsd_m": gsd_m, "max_tilt_deg": max_tilt_deg, "north_up": north_up}
     locator = ReferenceLocator((path,), make_options(method, time_limit, hints))
     known = {"known_gsd": gsd_m, "max_tilt": max_tilt_deg, "north_up": north_up or None, "time_limit_s": time_limit}

@@ -36,12 +36,14 @@ def vectorize_command(masks: tuple[str, ...], out_dir: str, threshold: float | N
       roadgeo vectorize photo_mask.tif
       roadgeo vectorize probability.tif --band 2 --threshold 0.4 --out-dir seen
     """
+    from roadgeo.cli.compilation import compile_once
     from roadgeo.errors import RoadgeoError
     from roadgeo.matching.query import trace_query
     from roadgeo.outputs.vectorized import write_vectorized
     from roadgeo.sources.masks import read_mask
 
     make_folder(out_dir)
+    compile_once(quiet=False)
     status = 0
     for task in name_tasks(find_masks(masks)):
         try:
