@@ -454,7 +454,7 @@ STAGES = {
     "trace": ("vectorization", "thinning", "tracing"),
     "simplify": ("simplification", "graph"),
     "intersections and scene": ("intersections", "scene", "buckets"),
-    "look up": ("triples", "sources", "neighbour_pairs", "pairs"),
+    "look up": ("triples", "pairs"),
     "screen and compare roads": ("roads",),
     "grow and match": ("growth",),
     "refine": ("adjustment", "refinement"),

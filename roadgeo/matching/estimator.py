@@ -84,7 +84,7 @@ class GrowOptions:
 
 
 class Source(Protocol):
-    """Where hypotheses come from: `Sweep` makes them of triples, `sources.PairSweep` of pairs."""
+    """Where hypotheses come from: `Sweep` makes them of triples."""
 
     def proposals(
         self, scene: Scene, index: ReferenceIndex, scale: tuple[float, float], min_ratio: float
@@ -144,6 +144,8 @@ class MatchOptions:
 
     Attributes
     ----------
+    sightings : int
+        Anchors that must lead to a place before it ends the search: a map may hold its twin.
     max_last_places : int
         As `max_places`, of the last sweeps.
     roads : RoadSearchOptions or None
@@ -168,6 +170,7 @@ class MatchOptions:
     roads: RoadSearchOptions | None = field(default_factory=RoadSearchOptions)
     max_places: int = 12_000
     max_last_places: int = 100_000
+    sightings: int = 2
 
 
 @dataclass
@@ -211,6 +214,7 @@ class TripleEstimator:
         # The least that chance reached at the places verified so far: a place that is not promising against it is none.
         self.least_chance = np.array([0.05, 0.2, 0.05])
         self.n_nulls = 0
+        self._whole: list[Hypothesis] = []  # verified, and no better version of them is to be expected
         self.scene = scene
         self.index = index
         self.options = options or MatchOptions()
@@ -359,11 +363,18 @@ class TripleEstimator:
         grown = self.grow(proposals, chosen, options)
         self.trace.grown(grown)
         distinct: list[Hypothesis] = []
+        again: set[int] = set()
         for h in grown:
-            if self._is_plausible(h) and not any(self.same(h, other) for other in distinct):
+            if not self._is_plausible(h):
+                continue
+            known = [k for k, one in enumerate(self._whole) if self.same(one, h)]
+            again.update(known)
+            if not known and not any(self.same(h, other) for other in distinct):
                 distinct.append(h)
                 if len(distinct) == options.max_verified:
                     break
+        for k in again:
+            self._whole[k].n_found += 1
         return distinct
 
     def score(self, model: Hypothesis) -> float:
@@ -372,6 +383,8 @@ class TripleEstimator:
         model.log10_odds = self._verify(model)
         self.refine_s += time.perf_counter() - started
         self.trace.scored(model)
+        if not model.by_roads and self._fits_whole(model):
+            self._whole.append(model)
         return model.log10_odds
 
     def _verify(self, model: Hypothesis) -> float:
@@ -434,14 +447,21 @@ class TripleEstimator:
         return bool(np.hypot(*(mapped[:2] / mapped[2] - self.near[:2])) > self.near[2])
 
     def settled(self, model: Hypothesis) -> bool:
-        """Whether a hypothesis fits the whole frame, so that no better one is to be expected, of its place or another.
+        """Whether a hypothesis fits the whole frame and was found often enough for a twin to have been found beside it.
 
-        Where half of the roads would agree after a shift, streets form a lattice: it may have twins that fit as well.
+        Each anchor that leads to a place would as soon lead to its twin: what several led to, and to nothing else that
+        fits, has none. Where half of the roads would agree after a shift, streets form a lattice: it may have many.
         """
         if model.found is None or model.refined is None or model.chance[1] >= 0.5:
             return False
         if model.by_roads:
             return model.n_found >= _OFTEN_ENOUGH
+        return model.n_found >= self.options.sightings and self._fits_whole(model)
+
+    def _fits_whole(self, model: Hypothesis) -> bool:
+        """Whether a hypothesis fits the whole frame, so that no better version of it is to be expected."""
+        if model.found is None or model.refined is None or not math.isfinite(model.log10_odds):
+            return False
         frame_m = 2.0 * self.scene.half_size * model.gsd_m
         return model.found.forward >= 0.65 and bool(model.refined.corner_sigma_m.max() <= 0.005 * frame_m)
 

@@ -154,7 +154,7 @@ def promising_options(options: LocateOptions) -> MatchOptions:
     least = options.min_log10_odds - options.min_margin
     verify = replace(options.match.verify, promising=min(options.match.verify.promising, least))
     match = replace(options.match, verify=verify)
-    return match if options.effort == "full" else replace(match, last=(), roads=None)
+    return match if options.effort == "full" else replace(match, last=(), roads=None, sightings=1)
 
 
 def _near(index: ReferenceIndex, near: tuple[float, float, float] | None) -> tuple[float, float, float] | None:

@@ -157,6 +157,17 @@ def test_single_triples_find_a_mask_that_lacks_half_of_the_roads(town):
     assert found["full"] >= found["quick"] + 2
 
 
+def test_a_place_ends_the_search_when_several_anchors_led_to_it(town, scene):
+    """One anchor may lead to a place and miss its twin; what two led to, and to nothing else, has none."""
+    once, _ = locate(scene, town[1], MatchOptions(sightings=1))
+    twice, _ = locate(scene, town[1], MatchOptions())
+    assert once.stopped == twice.stopped == "accepted"
+    assert once.n_rounds < twice.n_rounds
+    assert (once.best.n_found, twice.best.n_found) == (1, 2)
+    assert twice.n_scored == once.n_scored  # what is found again is not refined again
+    assert gap(twice, TRUTH, scene) == gap(once, TRUTH, scene)
+
+
 def test_more_anchors_are_tried_on_a_small_map(town, scene):
     index = town[1]
 
