@@ -17,7 +17,7 @@ from roadgeo.matching.refinement import RefineOptions
 from roadgeo.matching.road_growth import Grown, RoadGrower, RoadGrowOptions
 from roadgeo.matching.road_votes import VoteOptions, Voter
 from roadgeo.matching.scene import Scene
-from roadgeo.matching.triples import farthest_first
+from roadgeo.matching.triples import farthest_first, larger
 
 __all__ = ["RoadRound", "RoadSearch", "RoadSearchOptions"]
 
@@ -32,7 +32,8 @@ class RoadSearchOptions:
     Attributes
     ----------
     max_anchors : int
-        So many intersections of the query vote, spread over the frame from its middle outwards.
+        So many intersections of the query vote, spread over the frame from its middle outwards: on a map of 15,000
+        intersections or fewer, and on a larger one fewer by the root of the ratio.
     max_grown : int
         So many of an anchor's proposals grow.
     scale_slack : float
@@ -93,7 +94,8 @@ class RoadSearch:
     def rounds(self) -> Iterator[RoadRound]:
         """Yield what grew of one anchor's proposals after another; between parts of a large map nothing."""
         xy = self.scene.intersections.xy
-        for anchor in islice(farthest_first(xy, np.arange(len(xy))), self.options.max_anchors):
+        most = math.ceil(self.options.max_anchors / larger(len(self.voter.index)))
+        for anchor in islice(farthest_first(xy, np.arange(len(xy))), most):
             for votes in self.voter.votes(anchor):
                 if votes is None:
                     yield RoadRound(-1, 0, [])

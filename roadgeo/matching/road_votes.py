@@ -10,12 +10,13 @@ shrinks to a few blocks would crowd out the rest.
 from __future__ import annotations
 
 import math
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, field
+from typing import NamedTuple
 
 import numpy as np
 
-from roadgeo._arrays import FloatArray, IntArray
+from roadgeo._arrays import BoolArray, FloatArray, IntArray
 from roadgeo.kernels.road_raster import DIRECTIONS
 from roadgeo.kernels.road_votes import (
     MAX_TURNS,
@@ -57,8 +58,8 @@ class VoteOptions:
         ones fail sooner.
     least_points : int
         A scale at which fewer points are in reach is not tried.
-    trial : Trial
-        Of the sequential test.
+    hit_rate, patience : float
+        Of the sequential test: share of points that meet roads in the right place, and the nats lost before it ends.
     kept : int
         The best so many are judged anew, with points as far as `wide_radius_m`.
     n_chance : int
@@ -104,6 +105,19 @@ class Votes:
     ratio: FloatArray
 
 
+class _Around(NamedTuple):
+    """Road points as seen from one intersection, nearest first: (P, 2) offsets and (P,) distances in pixels.
+
+    `angles` (P,) are directions in units of pi / DIRECTIONS; `radial` (P,) tells which run straight away from it.
+    """
+
+    offsets: FloatArray
+    away: FloatArray
+    angles: FloatArray
+    radial: BoolArray
+    rng: np.random.Generator
+
+
 class Voter:
     """Compares the roads around intersections of one scene with one map, within limits on scale and turn."""
 
@@ -133,8 +147,9 @@ class Voter:
         options = self.options
         rays = self.scene.intersections.rays[anchor]
         rays = rays[np.isfinite(rays)].astype(float)
-        points = self._points(anchor, options.inner_m, options.radius_m, options.max_points)
-        chance = self._chance(rays, points, anchor)
+        around = self._around(anchor)
+        points = self._narrow(around)
+        chance = self._chance(rays, points, around.rng)
         found, kept = np.empty((options.kept, 5)), 0
         for first in range(0, len(self.candidates), chunk):
             kept, tried = vote(
@@ -144,37 +159,53 @@ class Voter:
             self.n_tried += tried
             if first + chunk < len(self.candidates):
                 yield None
-        wide = self._points(anchor, 0.0, options.wide_radius_m, options.wide_points, own=True)
+        wide = self._wide(around)
         improve_votes(found[:kept], _TURN_STEPS, _SCALE_STEPS, wide, self.places, self.drawn.raster, self.trial)
         best = found[:kept][np.argsort(-found[:kept, 3], kind="stable")]
         c, s = np.cos(best[:, 1]) * best[:, 2], np.sin(best[:, 1]) * best[:, 2]
         yield Votes(anchor, best[:, 0].astype(np.int64), np.stack([c, -s, s, c], axis=1), best[:, 3])
 
-    def _points(self, anchor: int, inner_m: float, outer_m: float, most: int, own: bool = False) -> RoadPoints:
-        """Choose the road points to test at each scale, evenly by distance, in random order."""
-        options, scene = self.options, self.scene
+    def _around(self, anchor: int) -> _Around:
+        """Return the road points as seen from a query intersection, as far as any scale may reach, nearest first."""
+        scene = self.scene
         offsets = scene.dense_points - scene.intersections.xy[anchor]
         away = np.hypot(*offsets.T)
-        order = np.argsort(away, kind="stable")
+        (near,) = np.nonzero(away < self.options.wide_radius_m / self.scales[0])
+        order = near[np.argsort(away[near], kind="stable")]
         offsets, away, directions = offsets[order], away[order], scene.dense_directions[order]
         angles = np.arctan2(directions[:, 1], directions[:, 0]) * (DIRECTIONS / math.pi) + DIRECTIONS
-        radial = np.abs((offsets * directions).sum(axis=1)) > options.own_cos * away
-        rng = np.random.default_rng(anchor)
-        chosen = []
-        for s in self.scales:
-            low, near, high = np.searchsorted(away, np.array([inner_m, options.own_m, outer_m]) / s)
-            others = low + np.flatnonzero(~radial[low:near])
-            usable = np.arange(low, high) if own else np.concatenate([others, np.arange(max(low, near), high)])
-            n = min(len(usable), most)
-            at = np.linspace(0, len(usable) - 1, n).astype(np.int64)
-            chosen.append(usable[rng.permutation(at)] if n >= options.least_points else usable[:0])
-        starts = np.concatenate(([0], np.cumsum([len(c) for c in chosen])))
-        taken = np.concatenate(chosen)
-        return RoadPoints(self.scales, starts, offsets[taken], angles[taken])
+        radial = np.abs((offsets * directions).sum(axis=1)) > self.options.own_cos * away
+        return _Around(offsets, away, angles, radial, np.random.default_rng(anchor))
 
-    def _chance(self, rays: FloatArray, points: RoadPoints, seed: int) -> FloatArray:
+    def _narrow(self, around: _Around) -> RoadPoints:
+        """Choose the points that vote at each scale: not those of the intersection's own branches."""
+        options, chosen = self.options, []
+        for s in self.scales:
+            low, near, high = np.searchsorted(
+                around.away, np.array([options.inner_m, options.own_m, options.radius_m]) / s
+            )
+            others = low + np.flatnonzero(~around.radial[low:near])
+            chosen.append(np.concatenate([others, np.arange(max(low, near), high)]))
+        return self._thinned(around, chosen, options.max_points)
+
+    def _wide(self, around: _Around) -> RoadPoints:
+        """Choose the points that judge proposals anew: all, further away."""
+        ends = np.searchsorted(around.away, self.options.wide_radius_m / self.scales)
+        return self._thinned(around, [np.arange(n) for n in ends], self.options.wide_points)
+
+    def _thinned(self, around: _Around, usable: Sequence[IntArray], most: int) -> RoadPoints:
+        """Keep at most so many of the usable points of each scale, evenly by distance, in random order."""
+        kept = []
+        for one in usable:
+            n = min(len(one), most)
+            at = around.rng.permutation(np.linspace(0, len(one) - 1, n).astype(np.int64))
+            kept.append(one[at] if n >= self.options.least_points else one[:0])
+        starts = np.concatenate(([0], np.cumsum([len(one) for one in kept])))
+        taken = np.concatenate(kept).astype(np.int64)
+        return RoadPoints(self.scales, starts, around.offsets[taken], around.angles[taken])
+
+    def _chance(self, rays: FloatArray, points: RoadPoints, rng: np.random.Generator) -> FloatArray:
         """Measure the chance rate at each scale, in units of the density at a place, at places drawn at random."""
-        rng = np.random.default_rng(seed)
         n = self.options.n_chance
         sample: list[int] = []
         turns: list[float] = []
