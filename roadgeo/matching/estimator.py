@@ -223,10 +223,12 @@ class TripleEstimator:
         self.n_tuples = self.n_candidates = self.n_screened = self.n_hypotheses = self.n_verified = 0
 
     def rounds(self) -> Iterator[list[Hypothesis]]:
-        """Yield, for one anchor after another, the hypotheses that grew: of triples first, then of roads."""
-        yield from self._rounds_of_triples()
-        if self.options.roads is not None and len(self.scene.intersections):
-            yield from self._rounds_of_roads(self.options.roads)
+        """Yield, for one anchor after another, the hypotheses that grew: of triples, of roads, of single triples."""
+        options, larger_by = self.options, larger(len(self.index))
+        yield from self._sweep(options.sweeps, options.grow, int(options.max_places * larger_by))
+        if options.roads is not None and len(self.scene.intersections):
+            yield from self._rounds_of_roads(options.roads)
+        yield from self._sweep(options.last, options.last_grow, int(options.max_last_places * larger_by))
 
     def _rounds_of_roads(self, options: RoadSearchOptions) -> Iterator[list[Hypothesis]]:
         """Yield what grew by roads and is not known yet; a place found again counts as found once more."""
@@ -271,11 +273,6 @@ class TripleEstimator:
     def _is_found_again(self, known: Hypothesis, hypothesis: Hypothesis) -> bool:
         """Whether a verified place that is promising was proposed by another intersection as well."""
         return known.log10_odds >= self.options.verify.promising and self.same(known, hypothesis)
-
-    def _rounds_of_triples(self) -> Iterator[list[Hypothesis]]:
-        options, larger_by = self.options, larger(len(self.index))
-        yield from self._sweep(options.sweeps, options.grow, int(options.max_places * larger_by))
-        yield from self._sweep(options.last, options.last_grow, int(options.max_last_places * larger_by))
 
     def _sweep(self, sources: Sequence[Source], grow: GrowOptions, most_places: int) -> Iterator[list[Hypothesis]]:
         """Yield what grew from the proposals of these sources, until so many more places were screened."""
