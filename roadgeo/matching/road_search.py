@@ -34,8 +34,9 @@ class RoadSearchOptions:
     max_anchors : int
         So many intersections of the query vote, spread over the frame from its middle outwards: on a map of 15,000
         intersections or fewer, and on a larger one fewer by the root of the ratio.
-    max_grown : int
-        So many of an anchor's proposals grow.
+    max_grown, max_kept : int
+        So many of an anchor's proposals grow, and so many of what grew are compared with the map: where streets are
+        alike, much grows.
     scale_slack : float
         Around an anchor the ground sampling may differ by this factor from that at the middle of the frame.
     least_share : float
@@ -44,8 +45,9 @@ class RoadSearchOptions:
 
     votes: VoteOptions = field(default_factory=VoteOptions)
     grow: RoadGrowOptions = field(default_factory=RoadGrowOptions)
-    max_anchors: int = 25
-    max_grown: int = 5
+    max_anchors: int = 30
+    max_grown: int = 12
+    max_kept: int = 4
     scale_slack: float = 1.2
     least_share: float = 0.2
 
@@ -102,7 +104,8 @@ class RoadSearch:
                     continue
                 best = list(zip(votes.reference, votes.affine, strict=True))[: self.options.max_grown]
                 grown = [self.grower.grow(anchor, j, affine) for j, affine in best]
-                yield RoadRound(anchor, len(best), [one for one in grown if one is not None])
+                some = sorted((one for one in grown if one is not None), key=lambda one: -one.share)
+                yield RoadRound(anchor, len(best), some[: self.options.max_kept])
 
 
 def _within(index: ReferenceIndex, near: tuple[float, float, float] | None, reach_m: float) -> IntArray:
