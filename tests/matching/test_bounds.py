@@ -145,5 +145,5 @@ print(resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / (1 << 20 if sys.platf
 def test_noise_is_refused_by_name_before_it_takes_all_memory():
     ran = subprocess.run([sys.executable, "-c", MEASURE], capture_output=True, text=True, check=True)
     refusal, gigabytes = ran.stdout.splitlines()
-    assert re.fullmatch(r"mask: falls into [\d,]+ pieces of road, expected at most 300,000: .* noise; .*", refusal)
+    assert re.fullmatch(r"mask: its roads have [\d,]+ corners, expected at most 3,000,000: .*", refusal)
     assert float(gigabytes) < 1.5

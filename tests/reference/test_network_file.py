@@ -226,7 +226,7 @@ def test_an_edit_that_qgis_has_not_checkpointed_is_seen(path: Path, network: Roa
     [
         ("DROP TABLE roads", "roads"),
         ("DROP TABLE intersections", "intersections"),
-        ("DROP TABLE roadgeo_meta", "roadgeo_meta"),
+        ("DROP TABLE roadgeo_meta", "is no reference"),
         ("UPDATE roads SET to_node = 1000 WHERE fid = 2", "nodes that do not exist"),
         ("UPDATE roads SET from_node = NULL WHERE fid = 2", "nodes that do not exist"),
         ("UPDATE roads SET from_node = 'x' WHERE fid = 2", "no numbers"),

@@ -88,7 +88,7 @@ def test_from_road_lines_to_every_output(
     if name == "antarctic":
         capsys.readouterr()
         assert main(["locate", *masks, "-r", "map.gpkg", "-o", "more", "--also", "kmz", "-q"]) == 1
-        assert "so near a pole there is no picture in degrees; leave out kmz" in capsys.readouterr().err
+        assert "so near a pole there is no picture in degrees; leave out --also kmz" in capsys.readouterr().err
 
 
 def check_place(location: dict, truth: dict) -> None:
