@@ -1,4 +1,4 @@
-"""Telling what is being done, and how much of it: what long steps call and faces show."""
+"""Progress call-backs: what long steps call, and what the command line and QGIS show."""
 
 from __future__ import annotations
 
@@ -10,17 +10,17 @@ __all__ = ["Counting", "Say", "count_nothing", "say_nothing"]
 
 
 class Say(Protocol):
-    """Told what is being done and, where that is known, which share of it is done already, 0 to 1.
+    """Progress call-back: name of the current step and, if known, the fraction completed (0 to 1).
 
-    The same text again, with another share, means the same step.
+    The same name with another fraction means the same step.
     """
 
     def __call__(self, text: str, share: float | None = None) -> None:
-        """Tell it."""
+        """Report progress."""
 
 
 def say_nothing(text: str, share: float | None = None) -> None:
-    """Be the `Say` of callers that do not care."""
+    """Ignore progress reports."""
 
 
 #: Given how many there are to do, shows how many are done; what it yields counts one more of a sort ("located").
@@ -28,5 +28,5 @@ Counting: TypeAlias = Callable[[int], AbstractContextManager[Callable[[str], Non
 
 
 def count_nothing(total: int) -> AbstractContextManager[Callable[[str], None]]:  # noqa: ARG001 (the shape of `Counting`)
-    """Show nothing: for callers that do not ask."""
+    """Ignore counts."""
     return nullcontext(lambda _: None)

@@ -27,7 +27,7 @@ from roadgeo.matching.verification import Agreement, VerifyOptions, agreement, c
 __all__ = ["GrowOptions", "Hypothesis", "MatchOptions", "Source", "Sweep", "TripleEstimator"]
 
 
-#: Matches that fix a homography: so many of a hypothesis' own are no evidence for it.
+#: Matches that determine a homography; that many seeds are excluded from the evidence.
 MINIMAL = 4
 #: A place that so many intersections of the query propose by roads is settled: each looked at the whole map.
 _OFTEN_ENOUGH = 2

@@ -169,7 +169,7 @@ def refine(
     chosen = matched >= 0
     step = 1 if n_points is None else max(1, len(scene.points) // n_points)
     points = (scene.points[::step] - center) / half_size
-    # A match whose neighbours found none is more likely chance than luck.
+    # Isolated matches are probably accidental.
     around = scene.neighbours[chosen]
     support = ((matched[around] >= 0) & (around >= 0)).sum(axis=1) / np.maximum((around >= 0).sum(axis=1), 1)
     chosen[chosen] = support >= options.least_support

@@ -27,12 +27,12 @@ _USUAL_SIZE = 15_000
 
 
 def larger(n_reference: int) -> float:
-    """Return the root of how many times a map of so many intersections is larger than a usual one, at least 1."""
+    """Return max(1, sqrt(n / 15,000)): the factor by which search budgets grow with the map."""
     return math.sqrt(max(1.0, n_reference / _USUAL_SIZE))
 
 
 def smaller(n_reference: int) -> float:
-    """Return the root of how many times it is smaller, at least 1."""
+    """Return max(1, sqrt(15,000 / n)): the same for maps smaller than a city's."""
     return math.sqrt(max(1.0, _USUAL_SIZE / max(n_reference, 1)))
 
 

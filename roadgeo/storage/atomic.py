@@ -137,7 +137,7 @@ def _locked_folder(parent: Path) -> tuple[Path, BinaryIO]:
 
 
 def _remove_leftovers(parent: Path) -> None:
-    """Remove staging folders whose writer lives no more: nobody holds their lock."""
+    """Remove staging folders of dead writers: their lock is free."""
     for folder in parent.glob(f"{_PREFIX}*{_SUFFIX}"):
         with contextlib.suppress(OSError):  # in use, or being removed by somebody else
             if not (folder / _LOCK).exists():
