@@ -32,8 +32,10 @@ class RoadSearchOptions:
     Attributes
     ----------
     max_anchors : int
-        So many intersections of the query vote, spread over the frame from its middle outwards: on a map of 15,000
-        intersections or fewer, and on a larger one fewer by the root of the ratio.
+        So many intersections of the query vote, spread over the frame from its middle outwards.
+    max_tried, least_anchors : int
+        Fewer vote, but at least so many, once so many places and turns were tried on a map of 15,000 intersections, and
+        on a larger one more by the root of the ratio. In a lattice every crossing can be turned four ways.
     max_grown, max_kept : int
         So many of an anchor's proposals grow, and so many of what grew are compared with the map: where streets are
         alike, much grows.
@@ -46,6 +48,8 @@ class RoadSearchOptions:
     votes: VoteOptions = field(default_factory=VoteOptions)
     grow: RoadGrowOptions = field(default_factory=RoadGrowOptions)
     max_anchors: int = 30
+    max_tried: int = 400_000
+    least_anchors: int = 8
     max_grown: int = 12
     max_kept: int = 4
     scale_slack: float = 1.2
@@ -96,16 +100,19 @@ class RoadSearch:
     def rounds(self) -> Iterator[RoadRound]:
         """Yield what grew of one anchor's proposals after another; between parts of a large map nothing."""
         xy = self.scene.intersections.xy
-        most = math.ceil(self.options.max_anchors / larger(len(self.voter.index)))
-        for anchor in islice(farthest_first(xy, np.arange(len(xy))), most):
+        options, most_tried = self.options, self.options.max_tried * larger(len(self.voter.index))
+        anchors = islice(farthest_first(xy, np.arange(len(xy))), options.max_anchors)
+        for n, anchor in enumerate(anchors):
+            if n >= options.least_anchors and self.n_tried >= most_tried:
+                return
             for votes in self.voter.votes(anchor):
                 if votes is None:
                     yield RoadRound(-1, 0, [])
                     continue
-                best = list(zip(votes.reference, votes.affine, strict=True))[: self.options.max_grown]
+                best = list(zip(votes.reference, votes.affine, strict=True))[: options.max_grown]
                 grown = [self.grower.grow(anchor, j, affine) for j, affine in best]
                 some = sorted((one for one in grown if one is not None), key=lambda one: -one.share)
-                yield RoadRound(anchor, len(best), some[: self.options.max_kept])
+                yield RoadRound(anchor, len(best), some[: options.max_kept])
 
 
 def _within(index: ReferenceIndex, near: tuple[float, float, float] | None, reach_m: float) -> IntArray:

@@ -126,6 +126,16 @@ def test_near_restricts_where_votes_are_cast(town, broken):
     assert all(n == 0 and not grown for _, n, grown in nowhere.rounds())
 
 
+def test_work_is_bounded(town, broken):
+    def n_anchors(**limits):
+        roads = RoadSearch(broken, town[1], CameraOptions(), RoadSearchOptions(**limits))
+        return sum(anchor >= 0 for anchor, _, _ in roads.rounds())
+
+    assert n_anchors() == len(broken.intersections)
+    assert n_anchors(max_anchors=5) == 5
+    assert n_anchors(max_tried=1, least_anchors=3) == 3
+
+
 def test_the_raster_is_made_once_and_has_a_rim(town):
     options = RasterOptions()
     drawn = make_raster(town[1], options)
