@@ -24,10 +24,10 @@ SLOW = ("cli", "docs", "evaluation", "examples", "outputs", "qgis", "workflows")
 
 
 def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
-    """Mark what is slow by its folder, so that no new test there is forgotten."""
+    """Mark what is slow by its folder, and what reads real data, so that no new test there is forgotten."""
     here = Path(__file__).parent
     for item in items:
-        if item.path.relative_to(here).parts[0] in SLOW:
+        if item.path.relative_to(here).parts[0] in SLOW or item.get_closest_marker("realdata"):
             item.add_marker(pytest.mark.slow)
 
 
