@@ -22,6 +22,7 @@ from roadgeo.roads.vectorization import road_width
 from roadgeo.sources.thresholds import Sample, find_thresholds
 from roadgeo.storage.gdal import is_named_remote
 from roadgeo.storage.rasters import image_size, open_raster, require_file, sidecar_nodata
+from roadgeo.storage.silence import silenced
 
 if TYPE_CHECKING:
     from rasterio import DatasetReader
@@ -50,13 +51,14 @@ class _Raster:
     """A raster's values, not necessarily in memory. Dimensions: H rows, W columns, B bands (alpha left out).
 
     `read(top, bottom, step)` returns every `step`-th value of these rows as (rows, columns, B), and where they are
-    valid as (rows, columns) bool, or None for everywhere.
+    valid as (rows, columns) bool, or None for everywhere. `has_alpha`: they are valid where they are not transparent.
     """
 
     name: str
     shape: tuple[int, int]
     n_bands: int
     read: Callable[[int, int, int], tuple[AnyArray, BoolArray | None]]
+    has_alpha: bool = False
 
 
 def read_mask(
@@ -144,6 +146,7 @@ def open_mask(
     """Open a road mask or a soft map of roads: parameters and errors as of `read_mask`."""
     with _open(source, band, name) as raster:
         _require_size(raster.name, *raster.shape)
+        raster = _drawn(raster)
         seen = _sample(raster)
         channel = int(np.argmax(seen.std(axis=0))) if raster.n_bands > 1 else 0
         sample = Sample(raster.name, seen, channel, lambda: _middle_rows(raster, channel))
@@ -151,9 +154,30 @@ def open_mask(
         yield MaskSource(thresholds, raster, channel, voids)
 
 
+def _drawn(raster: _Raster) -> _Raster:
+    """Take the opaque pixels for roads where they are of one dark colour: black roads on transparent ground."""
+    if not raster.has_alpha:
+        return raster
+    step = _sample_step(raster)
+    parts = [raster.read(strip.start, strip.stop, step) for strip in _strips(raster, step)]
+    opaque = np.concatenate([_finite(*part).ravel() for part in parts])
+    values = np.concatenate([values[_finite(values, valid)] for values, valid in parts])
+    if not 0 < opaque.mean() <= _MAX_ROAD_SHARE or values.any():
+        return raster
+
+    def read(top: int, bottom: int, step: int) -> tuple[AnyArray, BoolArray | None]:
+        return _finite(*raster.read(top, bottom, step)).view(np.uint8)[..., None], None
+
+    return _Raster(raster.name, raster.shape, 1, read)
+
+
+def _sample_step(raster: _Raster) -> int:
+    return int(np.ceil(np.sqrt(raster.shape[0] * raster.shape[1] / _SAMPLE_PIXELS)))
+
+
 def _sample(raster: _Raster) -> AnyArray:
     """Return (n, B) observed values, from all over a raster."""
-    step = int(np.ceil(np.sqrt(raster.shape[0] * raster.shape[1] / _SAMPLE_PIXELS)))
+    step = _sample_step(raster)
     parts = [raster.read(strip.start, strip.stop, step) for strip in _strips(raster, step)]
     seen = np.concatenate([values[_finite(values, valid)] for values, valid in parts])
     if len(seen) == 0:
@@ -263,7 +287,7 @@ def _read_with_opencv(path: str, name: str) -> AnyArray | None:
     is_png = content[: len(_PNG_MAGIC)].tobytes() == _PNG_MAGIC
     image = None
     if not is_png or _PNG_END in content[-1024:].tobytes():
-        with contextlib.suppress(cv2.error):
+        with contextlib.suppress(cv2.error), silenced():
             image = cv2.imdecode(content, cv2.IMREAD_UNCHANGED)
     if is_png and image is None:  # GDAL would read the rest as black
         raise MaskError(f"{name}: a PNG that is damaged or cut short; copy or export it again")
@@ -304,7 +328,7 @@ def _of_array(array: AnyArray, band: int | None, name: str, *, alpha: bool) -> _
         rows = slice(top, bottom, step)
         return data[rows, ::step], None if valid is None else valid[rows, ::step]
 
-    return _Raster(name, (data.shape[0], data.shape[1]), data.shape[2], read)
+    return _Raster(name, (data.shape[0], data.shape[1]), data.shape[2], read, alpha)
 
 
 def _of_dataset(dataset: DatasetReader, band: int | None, name: str, nodata: float | None) -> _Raster:
@@ -333,7 +357,8 @@ def _of_dataset(dataset: DatasetReader, band: int | None, name: str, nodata: flo
             valid = known if valid is None else valid & known
         return values, valid
 
-    return _Raster(name, (dataset.height, dataset.width), len(chosen), read)
+    has_alpha = len(colour) < dataset.count
+    return _Raster(name, (dataset.height, dataset.width), len(chosen), read, has_alpha)
 
 
 def _bands(name: str, band: int | None, n_bands: int) -> list[int]:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import logging
 import os
 from collections.abc import Iterable, Sequence
 from dataclasses import dataclass, field, replace
@@ -21,6 +22,8 @@ if TYPE_CHECKING:
     from roadgeo.sources.overpass import FetchOptions
 
 __all__ = ["Box", "Roads", "choose_roads", "fetch_roads", "project_lines", "read_roads"]
+
+_LOG = logging.getLogger(__name__)
 
 #: West, south, east, north in degrees; west > east where it lies astride 180 degrees.
 Box = tuple[float, float, float, float]
@@ -105,7 +108,7 @@ def read_roads(
         say(what)
         source = read_lines(file, layer, lambda share, what=what: say(what, share))  # type: ignore[misc]
         if crs is not None and source.meta["format"] != "OpenStreetMap":
-            source = replace(source, crs=_known_crs(crs))
+            source = replace(source, crs=_overruled(source.crs, crs, file))
         if source.crs is None:
             raise CrsError(f"{file}: says nothing of its CRS; name it, for example --crs EPSG:26986")
         sources.append(_choose(source, file.name, which, tunnels, bbox))
@@ -306,6 +309,21 @@ def _clip(lines: AnyArray, bbox: Box) -> AnyArray:
     lines = shapely.set_coordinates(lines.copy(), coords)
     pieces = [shapely.clip_by_rect(lines, west + turn, south, east + turn, north) for turn in (-360.0, 0.0, 360.0)]
     return simple_lines(np.concatenate(pieces))[0]
+
+
+def _overruled(own: str | None, given: str, file: Path) -> str:
+    """Return the CRS that was given, and warn where a file says another."""
+    from pyproj import CRS
+
+    known = _known_crs(given)
+    if own is not None and not CRS(own).equals(CRS(known), ignore_axis_order=True):
+        _LOG.warning(
+            "%s: says that its CRS is %s; read as %s, as --crs asks. Leave --crs out if that is wrong",
+            file,
+            CRS(own).name if len(own) > len("EPSG:123456") else own,
+            given,
+        )
+    return known
 
 
 def _known_crs(crs: str) -> str:

@@ -85,7 +85,7 @@ def open_raster(
                 _require_plain(dataset, name)
                 yield dataset
         except (RasterioError, CPLE_BaseError) as error:
-            reason = " ".join(str(error).split())[:300]
+            reason = " ".join(str(error.__cause__ or error).split())[:300]  # libtiff's own words, where it has some
             raise MaskError(f"{name}: not a raster that can be read ({reason}); give an image or GeoTIFF") from error
 
 

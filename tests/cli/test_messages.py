@@ -1,0 +1,111 @@
+"""What new users meet first: files that are almost right, and what they are told."""
+
+import struct
+import zlib
+from pathlib import Path
+
+import cv2
+import numpy as np
+import pytest
+import rasterio
+from worlds.fenway import write_streets
+
+from roadgeo.cli import main
+from roadgeo.demo import ATTRIBUTION, ROADS, demo_masks
+from roadgeo.sources.roads import read_roads
+from roadgeo.workflows import build_reference
+
+DRONE = next(mask.path for mask in demo_masks() if mask.path.stem == "drone")
+
+
+@pytest.fixture(scope="module")
+def porto(tmp_path_factory: pytest.TempPathFactory) -> str:
+    path = tmp_path_factory.mktemp("reference") / "porto.gpkg"
+    build_reference(read_roads(ROADS, attribution=ATTRIBUTION), "porto", path=path)
+    return str(path)
+
+
+@pytest.fixture(autouse=True)
+def _desk(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.chdir(tmp_path)
+
+
+def locate(mask: str, porto: str, *more: str) -> int:
+    return main(["locate", mask, "-r", porto, "--effort", "quick", *more])
+
+
+def drone() -> np.ndarray:
+    return cv2.imread(str(DRONE), cv2.IMREAD_GRAYSCALE)
+
+
+def png(rows: np.ndarray, *chunks: tuple[bytes, bytes]) -> bytes:
+    """A PNG with further chunks behind its header."""
+    whole = cv2.imencode(".png", rows)[1].tobytes()
+    more = b"".join(struct.pack(">I", len(d)) + k + d + struct.pack(">I", zlib.crc32(k + d)) for k, d in chunks)
+    return whole[:33] + more + whole[33:]
+
+
+def test_a_crs_against_the_files_own_is_said(tmp_path: Path, caplog: pytest.LogCaptureFixture) -> None:
+    write_streets(tmp_path / "a.gpkg")
+    index = ["index", "--roads", "a.gpkg", "--out", "b.gpkg", "-q", "--crs"]
+    assert main([*index, "EPSG:4258"]) == 0
+    assert "a.gpkg: says that its CRS is EPSG:4326; read as EPSG:4258, as --crs asks" in caplog.text
+    caplog.clear()
+    assert main([*index, "OGC:CRS84"]) == 0  # the same by another name
+    assert not caplog.text
+    assert main([*index, "EPSG:26986"]) == 1  # degrees cannot be its metres
+    assert "says that its CRS is EPSG:4326" in caplog.text
+
+
+@pytest.mark.parametrize("suffix", ["png", "tif"])
+def test_black_roads_on_transparent_ground_are_roads(suffix: str, porto: str) -> None:
+    black = np.dstack([np.zeros((*drone().shape, 3), np.uint8), drone()])
+    if suffix == "png":
+        cv2.imwrite("black.png", black)
+    else:
+        profile = {"driver": "GTiff", "count": 4, "dtype": "uint8", "photometric": "RGB", "alpha": "YES"}
+        profile |= {"height": black.shape[0], "width": black.shape[1], "transform": rasterio.Affine.scale(2)}
+        with rasterio.open("black.tif", "w", **profile) as dataset:
+            dataset.write(black.transpose(2, 0, 1))
+    assert locate(f"black.{suffix}", porto) == 0
+
+
+def test_what_libraries_print_is_swallowed(porto: str, capfd: pytest.CaptureFixture[str]) -> None:
+    """libpng and libjpeg print their warnings themselves; of libtiff's errors the reason is told."""
+    rows = drone()
+    Path("profile.png").write_bytes(png(rows, (b"iCCP", b"bad\0\0" + zlib.compress(b"no profile"))))
+    assert locate("profile.png", porto, "-q") == 0
+    cv2.imwrite("whole.jpg", rows)
+    damaged = bytearray(Path("whole.jpg").read_bytes())
+    damaged[5000:5050] = bytes(50)
+    Path("damaged.jpg").write_bytes(damaged)
+    locate("damaged.jpg", porto, "-q")
+    assert capfd.readouterr().err == ""
+    cv2.imwrite("whole.tif", rows)
+    Path("cut.tif").write_bytes(Path("whole.tif").read_bytes()[:-4000])
+    assert locate("cut.tif", porto, "-q") == 1
+    said = capfd.readouterr().err
+    assert said.startswith("Error: cut.tif: ")
+    assert said.count("\n") == 1
+    assert "previous exception" not in said
+
+
+@pytest.mark.parametrize("most", [40, 0.2])
+def test_maps_of_low_probabilities_are_located(most: float, porto: str, capfd: pytest.CaptureFixture[str]) -> None:
+    """A network that is never sure: its largest value is 40 of 255, or 0.2."""
+    soft = cv2.GaussianBlur(drone(), (0, 0), 2).astype(np.float32) * (most / 255)
+    if most > 1:
+        cv2.imwrite("soft.png", soft.astype(np.uint8))
+    else:
+        cv2.imwrite("soft.tif", soft)
+    assert locate("soft.png" if most > 1 else "soft.tif", porto) == 0
+    assert "located at 41.15" in capfd.readouterr().out
+
+
+def test_several_thresholds_are_tried_before_a_refusal(porto: str, capfd: pytest.CaptureFixture[str]) -> None:
+    soft = np.zeros((400, 400), np.uint8)
+    cv2.line(soft, (100, 0), (140, 400), 255, 9)
+    cv2.line(soft, (0, 200), (400, 200), 255, 9)
+    cv2.imwrite("soft.png", cv2.GaussianBlur(soft, (0, 0), 6))
+    assert locate("soft.png", porto) == 3
+    assert "looks taken)" in capfd.readouterr().out
