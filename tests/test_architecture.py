@@ -11,16 +11,18 @@ ROOT = Path(roadgeo.__file__).parent
 
 #: What each storey holds: folders and modules at the top of the package. One imports from storeys below, and its own.
 STOREYS_TEXT = """
-    words       _version _arrays _folders _processes _progress errors plugins
+    words       _version _arrays _progress errors plugins
+    files       storage
     kernels     kernels
     warmup      warmup
-    planes      geometry storage
+    planes      geometry
     roads       roads
     entrances   sources location segmentation
     matching    matching
     references  reference
     exits       outputs
-    workflows   workflows looks queries batch
+    workflows   workflows
+    running     running
     evaluation  evaluation
     faces       cli qgis demo __main__ __init__
 """

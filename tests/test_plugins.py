@@ -113,7 +113,7 @@ def test_what_a_plugin_refuses_is_said_as_it_says_it(offer) -> None:
 
 @pytest.mark.parametrize("kind", ["mask", "array"])
 def test_a_segmenter_may_return_a_mask_or_an_array(offer, kind: str) -> None:
-    from roadgeo.queries import _call_segmenter
+    from roadgeo.running.queries import _call_segmenter
 
     offer(segmenters_mask=f"{__name__}:see_mask", segmenters_array=f"{__name__}:see_array")
     mask = _call_segmenter(kind, str(SHEET), None)

@@ -12,8 +12,8 @@ from roadgeo.cli import ERROR
 from roadgeo.outputs.wording import format_lonlat
 
 if TYPE_CHECKING:
-    from roadgeo.batch import Outcome
     from roadgeo.demo import DemoMask
+    from roadgeo.running.batch import Outcome
 
 __all__ = ["demo_command"]
 
@@ -43,12 +43,13 @@ def demo_command(out_dir: str) -> int:
       roadgeo demo
       roadgeo demo --out-dir porto
     """
-    from roadgeo.batch import Task, locate_masks
     from roadgeo.cli.compilation import compile_once
     from roadgeo.cli.folders import make_folder
     from roadgeo.demo import ATTRIBUTION, PHOTO, ROADS, demo_masks
     from roadgeo.outputs.location_files import OutputOptions
     from roadgeo.outputs.registry import OVERLAY
+    from roadgeo.running.batch import locate_masks
+    from roadgeo.running.tasks import Task
     from roadgeo.storage.files import write_bytes
     from roadgeo.workflows import build_reference
 

@@ -10,7 +10,6 @@ from typing import TYPE_CHECKING, Any, Literal, TypeVar
 
 import click
 
-from roadgeo.batch import Outcome, find_masks, locate_masks, name_tasks, open_references, write_overview
 from roadgeo.cli import ERROR, NOT_LOCATED
 from roadgeo.cli.folders import make_folder
 from roadgeo.cli.hints import HINTS, hint_options, make_options, refuse_swapped
@@ -29,6 +28,8 @@ from roadgeo.outputs.registry import (
     offered,
 )
 from roadgeo.outputs.wording import format_lonlat
+from roadgeo.running.batch import Outcome, locate_masks, open_references, write_overview
+from roadgeo.running.tasks import find_masks, name_tasks
 
 if TYPE_CHECKING:
     from roadgeo.outputs.location_files import OutputOptions

@@ -4,9 +4,9 @@ from __future__ import annotations
 
 import click
 
-from roadgeo.batch import find_masks, name_tasks
 from roadgeo.cli import ERROR
 from roadgeo.cli.folders import make_folder
+from roadgeo.running.tasks import find_masks, name_tasks
 
 __all__ = ["vectorize_command"]
 

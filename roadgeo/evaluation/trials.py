@@ -11,7 +11,6 @@ from typing import Any, Protocol, TypeAlias
 import numpy as np
 
 from roadgeo._arrays import AnyArray
-from roadgeo._processes import run
 from roadgeo.errors import MaskError, OutputError
 from roadgeo.evaluation.landscape import Landscape
 from roadgeo.evaluation.simulation import SimulationOptions, simulate_query, simulate_query_at
@@ -19,6 +18,7 @@ from roadgeo.evaluation.truth import Truth, truth_from_record, truth_to_record
 from roadgeo.geometry.projection import transformer
 from roadgeo.reference.network_file import read_network
 from roadgeo.reference.reference import open_reference
+from roadgeo.running.processes import run
 from roadgeo.storage.files import write_text
 from roadgeo.workflows import LocateOptions, locate
 

@@ -25,9 +25,9 @@ from typing import Any, NamedTuple, TypeVar, cast
 
 import numpy as np
 
-from roadgeo._folders import cache_dir, private_temporary_dir, writable
 from roadgeo._version import __version__
 from roadgeo.kernels.arrays import ArrayKind, Kind, TupleKind, kind_of
+from roadgeo.storage.folders import cache_dir, private_temporary_dir, writable
 
 __all__ = ["Kernel", "compiled", "entries", "kernel", "kernel_folder", "load", "modules_of_the_search"]
 

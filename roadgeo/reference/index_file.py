@@ -26,12 +26,10 @@ every later roadgeo, and holds the roads, the intersections and the options that
 
 from __future__ import annotations
 
-import io
 import json
 import math
 import mmap
 import os
-import pickle
 import shlex
 import struct
 from collections.abc import Mapping
@@ -44,6 +42,7 @@ import numpy as np
 from roadgeo._arrays import AnyArray
 from roadgeo._version import __version__
 from roadgeo.errors import IndexFormatError
+from roadgeo.reference.plain_values import MAX_PICKLE, dump_plain, load_plain, require_plain
 from roadgeo.storage.atomic import publish, staging
 
 __all__ = [
@@ -70,10 +69,8 @@ _DTYPES = {
 
 # Caps: far above what any reference needs, low enough that parsing the parts we must parse stays under 100 MB.
 _MAX_MANIFEST = 1 << 20
-_MAX_PICKLE = 1 << 20
 _MAX_ARRAYS = 256
 _MAX_DIMENSIONS = 4
-_MAX_DEPTH = 16
 
 
 def write_index(
@@ -112,7 +109,7 @@ def dump_index(
     path: Path, meta: Mapping[str, Any], arrays: Mapping[str, AnyArray], about: Mapping[str, Any] | None = None
 ) -> None:
     """Write an index to a new file, in place; for callers that stage it. A disk error is an `OSError`."""
-    chunks: list[bytes | memoryview] = [_dump_plain(dict(meta))]
+    chunks: list[bytes | memoryview] = [dump_plain(dict(meta))]
     entries = []
     offset = _aligned(len(chunks[0]))
     for name, array in arrays.items():
@@ -129,7 +126,7 @@ def dump_index(
         "pickle": {"size": len(chunks[0]), "digest": _digest(chunks[0])},
         "arrays": entries,
     }
-    _require_plain(manifest)
+    require_plain(manifest)
     header = _header(json.dumps(manifest, allow_nan=False).encode())
     with path.open("xb") as file:
         for chunk in (header, *chunks):
@@ -190,7 +187,10 @@ def read_index(path: str | os.PathLike[str]) -> tuple[dict[str, Any], dict[str, 
     pickled = data[start : start + manifest["pickle"]["size"]]
     if _digest(pickled) != manifest["pickle"]["digest"]:
         _refuse(path, "its pickle is damaged (digest differs)")
-    meta = _load_plain(pickled, path)
+    try:
+        meta = load_plain(pickled)
+    except ValueError as error:
+        _refuse(path, str(error), error)
     arrays = {}
     for entry in manifest["arrays"]:
         array = _view(data, start, entry)
@@ -342,8 +342,8 @@ def _manifest_problem(manifest: Any, size: int) -> str:
     entry = manifest["pickle"]
     if not _is_count(entry.get("size")) or type(entry.get("digest")) is not str:
         return "its pickle's size or digest is missing"
-    if entry["size"] > min(size, _MAX_PICKLE):
-        return f"its pickle is too large: got {entry['size']} bytes, expected at most {min(size, _MAX_PICKLE)}"
+    if entry["size"] > min(size, MAX_PICKLE):
+        return f"its pickle is too large: got {entry['size']} bytes, expected at most {min(size, MAX_PICKLE)}"
     return _arrays_problem(manifest["arrays"], entry["size"], size)
 
 
@@ -395,112 +395,3 @@ def _stored_array(name: str, array: AnyArray) -> AnyArray:
 def _view(data: mmap.mmap, start: int, entry: dict[str, Any]) -> AnyArray:
     """Read-only array over the mapped file, after `_manifest_problem` found none."""
     return np.ndarray(tuple(entry["shape"]), _DTYPES[entry["dtype"]], buffer=data, offset=start + entry["offset"])
-
-
-# --- plain values -----------------------------------------------------------------------------------------------------
-
-# Opcodes of a protocol-5 pickle of plain values, written without a memo, by the size of what follows them. None looks
-# up a name, calls, or refers back; and without back references what comes out is a tree in proportion to the pickle.
-_OPCODES = {
-    pickle.PROTO: 1,
-    pickle.FRAME: 8,
-    pickle.MARK: 0,
-    pickle.STOP: 0,
-    pickle.EMPTY_DICT: 0,
-    pickle.SETITEM: 0,
-    pickle.SETITEMS: 0,
-    pickle.EMPTY_LIST: 0,
-    pickle.APPEND: 0,
-    pickle.APPENDS: 0,
-    pickle.NONE: 0,
-    pickle.NEWTRUE: 0,
-    pickle.NEWFALSE: 0,
-    pickle.BININT: 4,
-    pickle.BININT1: 1,
-    pickle.BININT2: 2,
-    pickle.BINFLOAT: 8,
-}
-_SIZED_OPCODES = {pickle.LONG1: 1, pickle.SHORT_BINUNICODE: 1, pickle.BINUNICODE: 4}
-
-
-class PlainUnpickler(pickle.Unpickler):
-    """Unpickler whose allow-list is empty: the second lock behind `_opcode_problem`."""
-
-    def find_class(self, module: str, name: str) -> NoReturn:
-        """Refuse every name."""
-        raise pickle.UnpicklingError(f"it asks for {module}.{name}")
-
-
-def _require_plain(value: Any) -> None:
-    """Raise TypeError unless `value` is made of plain values, no deeper than allowed."""
-    pending = [(value, 0)]
-    while pending:
-        item, depth = pending.pop()
-        kind = type(item)
-        if depth > _MAX_DEPTH:
-            raise TypeError(f"values nest deeper than {_MAX_DEPTH}")
-        if kind is dict:
-            if not all(type(key) is str for key in item):
-                raise TypeError("a dict has a key that is no str")
-            pending += [(child, depth + 1) for child in item.values()]
-        elif kind is list:
-            pending += [(child, depth + 1) for child in item]
-        elif kind is int and not -(1 << 63) <= item < 1 << 64:
-            raise TypeError("an int has more than 64 bits")
-        elif kind not in (str, int, float, bool, type(None)):
-            raise TypeError(f"a value is no plain dict, list, str, int, float, bool or None but {kind.__name__}")
-
-
-def _dump_plain(value: dict[str, Any]) -> bytes:
-    """Pickle plain values, without a memo."""
-    _require_plain(value)
-    buffer = io.BytesIO()
-    pickler = pickle.Pickler(buffer, protocol=5)
-    pickler.fast = True
-    pickler.dump(value)
-    if buffer.tell() > _MAX_PICKLE:
-        raise TypeError(
-            f"an index's plain values are too large: got {buffer.tell()} bytes, expected at most {_MAX_PICKLE}"
-        )
-    return buffer.getvalue()
-
-
-def _opcode_problem(pickled: bytes) -> str:
-    """Walk over a pickle without running it; '' when it holds only plain opcodes and ends with its STOP."""
-    at = 0
-    while at < len(pickled):
-        opcode = pickled[at : at + 1]
-        at += 1
-        if opcode in _OPCODES:
-            at += _OPCODES[opcode]
-        elif opcode in _SIZED_OPCODES:
-            width = _SIZED_OPCODES[opcode]
-            at += width + int.from_bytes(pickled[at : at + width], "little")
-        else:
-            return f"opcode {opcode!r} is not allowed"
-        if opcode == pickle.STOP:
-            return "" if at == len(pickled) else "something follows its end"
-    return "it is truncated"
-
-
-def _load_plain(pickled: bytes, path: str | os.PathLike[str]) -> dict[str, Any]:
-    """Unpickle plain values of an untrusted file."""
-    problem = _opcode_problem(pickled)
-    if problem:
-        _refuse(path, f"its pickle is not one that roadgeo writes: {problem}")
-    try:
-        value = PlainUnpickler(io.BytesIO(pickled)).load()
-        _require_plain(value)
-    except (
-        pickle.UnpicklingError,
-        TypeError,
-        ValueError,
-        AttributeError,
-        LookupError,
-        EOFError,
-        OverflowError,
-    ) as error:
-        _refuse(path, f"its pickle is not one that roadgeo writes: {error}", error)
-    if type(value) is not dict:
-        _refuse(path, "its pickle holds no dict")
-    return value

@@ -24,13 +24,13 @@ from urllib.parse import urlsplit
 import numpy as np
 
 from roadgeo._arrays import AnyArray
-from roadgeo._folders import cache_dir
 from roadgeo._progress import Say, say_nothing
 from roadgeo._version import __version__
 from roadgeo.errors import RoadSourceError
 from roadgeo.roads.kinds import RoadKind, highways, in_tunnel
 from roadgeo.sources.lines import OSM_ATTRIBUTION, RoadLines
 from roadgeo.sources.vectors import first_line, read_layer
+from roadgeo.storage.folders import cache_dir
 
 __all__ = ["FetchOptions", "box_area", "fetch_lines", "find_place", "read_area", "square"]
 

@@ -17,7 +17,7 @@ from support import kill_writers
 from worlds.networks import grid_network
 
 from roadgeo.errors import IndexFormatError, OutputError
-from roadgeo.reference import index_file
+from roadgeo.reference import plain_values
 from roadgeo.reference.files import (
     check_reference,
     describe_reference,
@@ -324,7 +324,7 @@ def test_a_full_disk_is_named_and_leaves_nothing(tmp_path: Path, network: RoadNe
 
 
 def test_description(path: Path, network: RoadNetwork, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(index_file, "PlainUnpickler", None)
+    monkeypatch.setattr(plain_values, "PlainUnpickler", None)
     found = describe_reference(path)
     assert json.loads(json.dumps(found)) == found
     assert found["name"] == "Grid, MA"

@@ -18,7 +18,7 @@ from hypothesis import strategies as st
 from hypothesis.extra import numpy as hnp
 
 from roadgeo.errors import IndexFormatError, OutputError
-from roadgeo.reference import index_file
+from roadgeo.reference import index_file, plain_values
 from roadgeo.reference.index_file import FORMAT_VERSION, check_index, read_index, read_manifest, write_index
 
 META = {"name": "Böston", "origin": [330000.0, 4690000], "flags": [True, None, -1, 2**40], "options": {"n": 8}}
@@ -79,7 +79,7 @@ def test_round_trip(path: Path) -> None:
 
 
 def test_manifest_is_read_without_unpickling(path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(index_file, "PlainUnpickler", None)
+    monkeypatch.setattr(plain_values, "PlainUnpickler", None)
     manifest = read_manifest(path)
     assert manifest["about"] == {"name": "Böston", "n": 150}
     assert [entry["name"] for entry in manifest["arrays"]] == list(ARRAYS)
@@ -361,7 +361,7 @@ def test_a_pickle_that_calls_is_refused_and_calls_nothing(path: Path, tmp_path: 
 
 def test_the_unpickler_knows_no_names(tmp_path: Path) -> None:
     with pytest.raises(pickle.UnpicklingError, match=r"mkdir"):
-        index_file.PlainUnpickler(io.BytesIO(pickle.dumps(Reduce(tmp_path / "called")))).load()
+        plain_values.PlainUnpickler(io.BytesIO(pickle.dumps(Reduce(tmp_path / "called")))).load()
     assert not (tmp_path / "called").exists()
 
 
@@ -419,7 +419,7 @@ def test_random_pickles_are_refused_or_plain(path: Path, pickled: bytes) -> None
         meta, _ = read_index(path)
     except IndexFormatError:
         return
-    index_file._require_plain(meta)
+    plain_values.require_plain(meta)
 
 
 def test_header_digest_covers_version_and_size() -> None:

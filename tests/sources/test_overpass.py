@@ -7,10 +7,10 @@ import shapely
 from worlds.fake_osm import EMPTY, OUTLINE, fake_osm
 from worlds.fenway import streets, write_vector
 
-from roadgeo._folders import cache_dir
 from roadgeo.errors import RoadSourceError
 from roadgeo.sources.overpass import FetchOptions, fetch_lines, find_place, read_area, square
 from roadgeo.sources.roads import fetch_roads
+from roadgeo.storage.folders import cache_dir
 
 
 @pytest.fixture

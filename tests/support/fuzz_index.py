@@ -20,7 +20,7 @@ from typing import Any
 import numpy as np
 
 from roadgeo.errors import IndexFormatError
-from roadgeo.reference import index_file
+from roadgeo.reference import index_file, plain_values
 from roadgeo.reference.index_file import read_index, write_index
 
 Rng = np.random.Generator
@@ -216,7 +216,7 @@ def is_refused(path: Path, meta: dict[str, Any], arrays: dict[str, np.ndarray], 
     except IndexFormatError:
         return True
     if "pickle" in kind:
-        index_file._require_plain(found_meta)
+        plain_values.require_plain(found_meta)
     else:
         assert found_meta == meta, kind
     if not arrays.keys() <= found.keys():

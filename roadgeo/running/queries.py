@@ -20,10 +20,10 @@ from roadgeo._progress import Say, say_nothing
 from roadgeo.errors import MaskError, PhotographError, PluginError
 from roadgeo.geometry.mask import RoadMask
 from roadgeo.location import Location
-from roadgeo.looks import Locate, Look, Sighting, locate_looks
 from roadgeo.matching.options import LocateOptions
 from roadgeo.plugins import SEGMENTERS, call_plugin
 from roadgeo.reference.reference import Reference
+from roadgeo.running.looks import Locate, Look, Sighting, locate_looks
 from roadgeo.segmentation.network import DEFAULT_MODEL, Network, load_network
 from roadgeo.segmentation.photograph import Photograph, open_photograph
 from roadgeo.segmentation.probability import NODATA, ProbabilityMap, fuse

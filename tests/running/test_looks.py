@@ -6,8 +6,8 @@ import pytest
 from roadgeo.errors import MaskError
 from roadgeo.geometry.mask import RoadMask
 from roadgeo.location import Location, Place, Seconds
-from roadgeo.looks import Look, locate_looks
 from roadgeo.matching.options import LocateOptions
+from roadgeo.running.looks import Look, locate_looks
 
 OPTIONS = LocateOptions()
 MASK = RoadMask(np.eye(40, dtype=bool))

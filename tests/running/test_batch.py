@@ -8,11 +8,12 @@ import pytest
 from rasterio._err import CPLE_AppDefinedError
 
 from roadgeo import plugins
-from roadgeo.batch import ReadOptions, Task, _Asked, _Locating, find_masks, name_tasks
 from roadgeo.geometry.mask import RoadMask
 from roadgeo.outputs.location_files import OutputOptions
 from roadgeo.outputs.registry import REGISTRY, Output
 from roadgeo.plugins import OUTPUTS
+from roadgeo.running.batch import ReadOptions, _Asked, _Locating
+from roadgeo.running.tasks import Task, find_masks, name_tasks
 from roadgeo.workflows import LocateOptions
 
 
@@ -81,7 +82,7 @@ class Hazard:
 
 @pytest.mark.parametrize("kind", Hazard.ERRORS)
 def test_whatever_one_mask_raises_the_others_go_on(kind: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr("roadgeo.queries.open_mask", Hazard())
+    monkeypatch.setattr("roadgeo.running.queries.open_mask", Hazard())
     work = _Locating((), str(tmp_path), LocateOptions(), OutputOptions(), ReadOptions(), skip_existing=False)
     outcome = work._do(Task(f"{kind}.png", kind), _Asked([], [], 0.0, {}))
     assert outcome.status == "error"

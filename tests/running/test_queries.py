@@ -12,7 +12,7 @@ from worlds.models import brightness_model
 from roadgeo.cli import main
 from roadgeo.demo import ROADS, demo_masks
 from roadgeo.errors import ModelError, PhotographError
-from roadgeo.queries import QueryOptions, locate_query
+from roadgeo.running.queries import QueryOptions, locate_query
 from roadgeo.segmentation.probability import TAG
 from roadgeo.workflows import build_reference
 

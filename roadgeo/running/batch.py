@@ -1,111 +1,42 @@
-"""Many masks: what is located, under which names the results go, in one process or several, in input order.
+"""Many masks, in one process or several: each is read, located, written and described, in input order.
 
-`locate_masks` is what `roadgeo locate` runs: each mask is read, located, written and described, and nothing that is
-wrong with one of them stops the others.
+`locate_masks` is what `roadgeo locate` runs. Nothing that is wrong with one mask stops the others.
 """
 
 from __future__ import annotations
 
 import dataclasses
-import glob
-import hashlib
 import json
 import os
-from collections import Counter
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from pathlib import Path
 from time import perf_counter
 from typing import TYPE_CHECKING, Any, Literal
 
-from roadgeo._processes import run
 from roadgeo._progress import Say, say_nothing
-from roadgeo.errors import IndexFormatError, MaskError, OutputError, RoadgeoError
-from roadgeo.outputs.registry import JSON, REPORT, is_result
+from roadgeo.errors import IndexFormatError, RoadgeoError
+from roadgeo.outputs.registry import JSON, REPORT
+from roadgeo.running.probability_files import is_ours, keep_probability, probability_path
+from roadgeo.running.processes import run
+from roadgeo.running.tasks import Task
 
 if TYPE_CHECKING:
     from roadgeo.geometry.mask import RoadMask
     from roadgeo.outputs.location_files import OutputOptions
-    from roadgeo.outputs.paths import OutputPaths
-    from roadgeo.queries import QueryOptions
     from roadgeo.reference.reference import Reference
-    from roadgeo.segmentation.probability import ProbabilityMap
+    from roadgeo.running.queries import QueryOptions
     from roadgeo.workflows import LocateOptions
 
 __all__ = [
     "Outcome",
     "ReadOptions",
-    "Task",
-    "find_masks",
     "locate_masks",
-    "name_tasks",
     "open_references",
     "write_overview",
 ]
 
 Status = Literal["located", "ambiguous", "not_located", "error"]
-
-#: What a segmenter saw is kept under this name; masks that users make have such names, too.
-_PROBABILITY = "_mask.tif"
-
-#: What a folder is searched for.
-SUFFIXES = (".tif", ".tiff", ".png", ".jpg", ".jpeg", ".jp2", ".bmp", ".pgm", ".webp", ".vrt", ".img", ".npy")
-
-
-# --- what is located --------------------------------------------------------------------------------------------------
-
-
-@dataclass(frozen=True)
-class Task:
-    """One mask, and the stem of its results' names."""
-
-    mask: str
-    stem: str
-
-
-def find_masks(arguments: Sequence[str]) -> list[str]:
-    """Expand folders (their images, not our own results) and patterns, which not every shell expands; keep the rest."""
-    found: list[str] = []
-    for argument in arguments:
-        if Path(argument).is_dir():
-            found += sorted(str(path) for path in Path(argument).iterdir() if _is_mask(path))
-        elif glob.has_magic(argument) and not Path(argument).exists():
-            found += sorted(glob.glob(argument, recursive=True)) or [argument]  # noqa: PTH207 (patterns may be absolute)
-        else:
-            found.append(argument)
-    return found
-
-
-def _is_mask(path: Path) -> bool:
-    if path.suffix.lower() not in SUFFIXES or path.name.startswith(".") or is_result(path.name):
-        return False
-    return not (path.name.endswith(_PROBABILITY) and _is_ours(path))
-
-
-def name_tasks(masks: Sequence[str]) -> list[Task]:
-    """Give each mask the stem of its own name; those that would share one get more of their path, until none does.
-
-    So a stem depends on the other masks only where names meet, and then on the mask's path, not on the others' order.
-    """
-    known = [_stems(mask, n) for n, mask in enumerate(masks)]
-    used = [0] * len(masks)
-    while True:
-        stems = [stems[level] for stems, level in zip(known, used, strict=True)]
-        taken = Counter(stem.casefold() for stem in stems)  # one name to file systems that do not tell cases apart
-        shared = [n for n, stem in enumerate(stems) if taken[stem.casefold()] > 1 and used[n] < len(known[n]) - 1]
-        if not shared:
-            return [Task(mask, stem) for mask, stem in zip(masks, stems, strict=True)]
-        for n in shared:
-            used[n] += 1
-
-
-def _stems(mask: str, n: int) -> list[str]:
-    """Return longer and longer stems for the n-th mask: its name, its folder, its format, its path, its number."""
-    path = Path(mask).absolute()
-    folder = f"{path.parent.name}_{path.stem}"
-    format_ = f"{folder}_{path.suffix.lower().removeprefix('.')}"
-    whole = f"{format_}_{hashlib.blake2b(os.fsencode(path), digest_size=4).hexdigest()}"
-    return [path.stem, folder, format_, whole, f"{whole}_{n + 1}"]
 
 
 def open_references(names: Iterable[str], say: Say = say_nothing) -> list[Reference]:
@@ -167,7 +98,7 @@ class ReadOptions:
 
     def of_query(self) -> QueryOptions:
         """Return what concerns one query."""
-        from roadgeo.queries import QueryOptions
+        from roadgeo.running.queries import QueryOptions
 
         return QueryOptions(
             self.threshold, self.band, self.segment, self.segmenters, self.class_name, self.fused_with, self.threads
@@ -311,7 +242,7 @@ class _Locating:
             return None
         if not isinstance(document, dict) or (document.get("schema"), document.get("query")) != (SCHEMA, task.mask):
             return None
-        status, photo = document.get("status"), self.reading.photo(task, _is_ours(_probability_path(paths)))
+        status, photo = document.get("status"), self.reading.photo(task, is_ours(probability_path(paths)))
         if status not in {"located", "ambiguous", "not_located"} or not asked.same(document):
             return None
         wanted = wanted_outputs(self.outputs.products, status == "located", photo is not None)
@@ -323,7 +254,7 @@ class _Locating:
         from roadgeo.outputs.location_files import write_location
         from roadgeo.outputs.paths import output_paths
         from roadgeo.outputs.registry import EXPLANATION
-        from roadgeo.queries import locate_query
+        from roadgeo.running.queries import locate_query
         from roadgeo.workflows import explain, locate
 
         started = perf_counter()
@@ -340,7 +271,7 @@ class _Locating:
             reference_digest=asked.digest(location.reference),
         )
         paths, photo = output_paths(self.out_dir, task.stem), self.reading.photo(task, sighting.of_photograph)
-        kept = _keep(sighting.probability, paths)
+        kept = keep_probability(sighting.probability, paths)
         indexes = [one.index for one in asked.references]
         outputs = self.outputs if mask.roads.any() else _without_views(self.outputs)
         written = write_location(location, mask, paths, outputs, photo, indexes, explanation)
@@ -372,35 +303,6 @@ def _without_views(outputs: OutputOptions) -> OutputOptions:
 
     views = {REPORT.name, EXPLANATION.name, EXPLANATION_PICTURE.name}
     return replace(outputs, products=tuple(name for name in outputs.products if name not in views))
-
-
-def _probability_path(paths: OutputPaths) -> Path:
-    return paths.folder / f"{paths.stem}{_PROBABILITY}"
-
-
-def _is_ours(path: Path) -> bool:
-    """Whether a file is a probability map that we wrote, not a mask of the user's."""
-    from roadgeo.segmentation.probability import TAG
-    from roadgeo.storage.rasters import open_raster
-
-    if not path.is_file():
-        return False
-    try:
-        with open_raster(path) as raster:
-            return TAG in raster.tags()
-    except MaskError:
-        return False
-
-
-def _keep(probability: ProbabilityMap | None, paths: OutputPaths) -> list[Path]:
-    """Write what a segmenter saw; a mask that the user made is not overwritten."""
-    if probability is None:
-        return []
-    path = _probability_path(paths)
-    if path.exists() and not _is_ours(path):
-        raise OutputError(f"{path}: is there already, and was not written by roadgeo; choose another --out-dir")
-    probability.write(path)
-    return [path]
 
 
 @dataclass(frozen=True)

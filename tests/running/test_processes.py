@@ -9,7 +9,7 @@ from pathlib import Path
 
 import pytest
 
-from roadgeo._processes import run
+from roadgeo.running.processes import run
 
 
 @dataclass(frozen=True)
@@ -46,7 +46,7 @@ def test_an_interrupt_ends_the_workers(tmp_path: Path) -> None:
     script.write_text(
         "import sys, time\n"
         "from dataclasses import dataclass\n"
-        "from roadgeo._processes import run\n"
+        "from roadgeo.running.processes import run\n"
         "@dataclass(frozen=True)\n"
         "class Slow:\n"
         "    def prepare(self): return self.do\n"
