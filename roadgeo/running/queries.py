@@ -28,7 +28,7 @@ from roadgeo.segmentation.network import DEFAULT_MODEL, Network, load_network
 from roadgeo.segmentation.photograph import Photograph, open_photograph
 from roadgeo.segmentation.probability import NODATA, ProbabilityMap, fuse
 from roadgeo.segmentation.scales import rank_scales, scale_of
-from roadgeo.segmentation.tiling import segment
+from roadgeo.segmentation.tiling import map_shape, segment
 from roadgeo.sources.exif import estimate_gsd
 from roadgeo.sources.masks import open_mask, read_mask
 from roadgeo.workflows import locate
@@ -145,7 +145,7 @@ def _locate_photograph(
 
     @lru_cache(_MAX_SCALES)
     def see(scale: float) -> ProbabilityMap:
-        seen = [_see(path, name, scale, query, say) for path in paths for name in query.segmenters or ("",)]
+        seen = [_see(path, name, scale, grid, query, say) for path in paths for name in query.segmenters or ("",)]
         maps = [one.resized(grid) for one in seen]
         return maps[0] if len(maps) == 1 else fuse(maps)
 
@@ -191,15 +191,18 @@ def _choose_scales(photograph: Photograph, query: QueryOptions, options: LocateO
     return [scale_of(stated, network), *ranked][:_MAX_SCALES]
 
 
-def _see(path: str, segmenter: str, scale: float, query: QueryOptions, say: Say) -> ProbabilityMap:
-    """Return what one segmenter sees in one photograph; a mask is sure of itself."""
+def _see(
+    path: str, segmenter: str, scale: float, grid: tuple[int, int], query: QueryOptions, say: Say
+) -> ProbabilityMap:
+    """Return what one segmenter sees in one photograph, not much finer than a grid; a mask is sure of itself."""
     if segmenter and not is_model(segmenter):
         return _of_mask(_call_segmenter(segmenter, path, query.threshold), segmenter)
     if query.segment == "auto" and query.fused_with:
         with suppress(PhotographError):
             return _of_mask(read_mask(path, band=query.band, threshold=query.threshold), "mask")
     with open_photograph(path) as photograph:
-        return segment(photograph, _network(segmenter, query.class_name, query.threads), scale, say)
+        step = max(1, int(map_shape(photograph, scale)[0] / grid[0]))
+        return segment(photograph, _network(segmenter, query.class_name, query.threads), scale, say, step=step)
 
 
 def _of_mask(mask: RoadMask, model: str) -> ProbabilityMap:

@@ -18,9 +18,10 @@ from roadgeo.storage.rasters import open_raster
 if TYPE_CHECKING:
     from rasterio import DatasetReader
 
-__all__ = ["MAX_SIDE", "Photograph", "find_voids", "open_photograph"]
+__all__ = ["MAX_SIDE", "Photograph", "find_ground", "find_voids", "open_photograph"]
 
 MIN_SIDE, MAX_SIDE = 64, 60_000
+_STRIP_PIXELS = 1 << 23  # read at a time
 _SAMPLE_SIDE = 1024  # deep values are stretched by what a sample of this size holds
 
 #: A void is a plain white or black area (JPEG smears its values and its edge), larger than any white roof.
@@ -135,6 +136,21 @@ def _find_stretch(dataset: DatasetReader, bands: list[int], name: str) -> Callab
 
 def _as_rgb(values: AnyArray) -> AnyArray:
     return values if values.shape[2] == 3 else np.repeat(values, 3, axis=2)
+
+
+def find_ground(photograph: Photograph, shape: tuple[int, int]) -> BoolArray:
+    """Return where a photograph shows ground: neither nodata nor part of a void. On a grid of (H, W) pixels."""
+    height, width = shape
+    ground, white, black = (np.empty(shape, np.bool_) for _ in range(3))
+    pixel = photograph.height / height
+    n_rows = max(1, _STRIP_PIXELS // width)
+    for top in range(0, height, n_rows):
+        strip = slice(top, min(top + n_rows, height))
+        rows = strip.stop - top
+        rgb, ground[strip] = photograph.read(0.0, top * pixel, float(photograph.width), rows * pixel, (rows, width))
+        white[strip], black[strip] = is_plain(rgb)
+    ground &= ~find_voids(white, black)
+    return ground
 
 
 def find_voids(white: BoolArray, black: BoolArray) -> BoolArray:

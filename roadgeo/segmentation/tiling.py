@@ -12,32 +12,36 @@ from roadgeo._arrays import AnyArray, BoolArray, Float32Array
 from roadgeo._progress import Say, say_nothing
 from roadgeo.errors import MaskError
 from roadgeo.segmentation.network import Network
-from roadgeo.segmentation.photograph import Photograph, find_voids, is_plain
+from roadgeo.segmentation.photograph import Photograph, find_ground, is_plain
 from roadgeo.segmentation.probability import NODATA, ProbabilityMap
 
 __all__ = ["MAX_MAP_PIXELS", "map_shape", "segment"]
 
 #: A larger map takes hours, and shows nothing that a smaller one of the same ground does not.
-MAX_MAP_PIXELS = 400_000_000
+MAX_MAP_PIXELS = 1_000_000_000
 
 
-def map_shape(photograph: Photograph, scale: float) -> tuple[int, int]:
-    """Return (H, W) of a map that has `scale` pixels for each of the photograph's, along a side."""
-    return max(1, round(photograph.height * scale)), max(1, round(photograph.width * scale))
+def map_shape(photograph: Photograph, scale: float, step: int = 1) -> tuple[int, int]:
+    """Return (H, W) of what a model is shown of a photograph: `scale` pixels for each of its own, along a side.
+
+    Both are multiples of `step`.
+    """
+    height, width = photograph.height * scale, photograph.width * scale
+    return step * max(1, round(height / step)), step * max(1, round(width / step))
 
 
-def segment(photograph: Photograph, network: Network, scale: float = 1.0, say: Say = say_nothing) -> ProbabilityMap:
+def segment(
+    photograph: Photograph, network: Network, scale: float = 1.0, say: Say = say_nothing, *, step: int = 1
+) -> ProbabilityMap:
     """Find the roads in a photograph.
 
     Parameters
     ----------
     scale : float
         Pixels shown to the model for each of the photograph's, along a side.
-
-    Returns
-    -------
-    ProbabilityMap
-        Of the size that the model was shown.
+    step : int
+        Pixels shown to the model for each pixel of the map, along a side: memory grows with the map, not with the
+        photograph.
 
     Raises
     ------
@@ -46,33 +50,40 @@ def segment(photograph: Photograph, network: Network, scale: float = 1.0, say: S
     ModelError
         The model fails.
     """
-    shape = map_shape(photograph, scale)
+    shape = map_shape(photograph, scale, step)
     if math.prod(shape) > MAX_MAP_PIXELS:
         raise MaskError(
             f"{photograph.name}: {shape[1]} x {shape[0]} pixels at the model's scale; expected at most "
             f"{MAX_MAP_PIXELS:,} in all: say how large a pixel is (--gsd), or cut the photograph up"
         )
-    values = np.empty(shape, np.uint8)
-    known, white, black = np.ones(shape, bool), np.zeros(shape, bool), np.zeros(shape, bool)
+    values = np.empty((shape[0] // step, shape[1] // step), np.uint8)
+    ground = find_ground(photograph, values.shape)
+    if not ground.any():
+        raise MaskError(f"{photograph.name}: shows no ground, only nodata, white or black; give a photograph")
 
     def read(top: int, rows: int) -> AnyArray:
         y_scale = photograph.height / shape[0]
-        part = 0.0, top * y_scale, float(photograph.width), rows * y_scale
-        rgb, valid = photograph.read(*part, (rows, shape[1]))
-        known[top : top + rows] = valid
-        white[top : top + rows], black[top : top + rows] = is_plain(rgb)
-        return rgb
+        return photograph.read(0.0, top * y_scale, float(photograph.width), rows * y_scale, (rows, shape[1]))[0]
 
     what = f"finding roads in {photograph.name}"
     say(what, 0.0)
-    for top, rows in _blend(read, shape, network.card.tile, network.card.overlap, network):
-        values[top : top + len(rows)] = np.rint(254 * rows)
-        say(what, (top + len(rows)) / shape[0])
-    known &= ~find_voids(white, black)
-    if not known.any():
-        raise MaskError(f"{photograph.name}: shows no ground, only nodata, white or black; give a photograph")
-    values[~known] = NODATA
+    done, rest = 0, np.empty((0, shape[1]), np.float32)
+    for rows in _blend(read, shape, network.card.tile, network.card.overlap, network):
+        rows = np.concatenate([rest, rows])
+        n = len(rows) // step
+        values[done : done + n] = np.rint(254 * _reduce(rows[: n * step], step))
+        done, rest = done + n, rows[n * step :]
+        say(what, done * step / shape[0])
+    values[~ground] = NODATA
     return ProbabilityMap(values, network.card.threshold, photograph.name, network.name)
+
+
+def _reduce(rows: Float32Array, step: int) -> Float32Array:
+    """Return the means of blocks of `step` x `step` values."""
+    if step == 1 or len(rows) == 0:
+        return rows[::step, ::step]
+    size = rows.shape[1] // step, rows.shape[0] // step
+    return np.asarray(cv2.resize(rows, size, interpolation=cv2.INTER_AREA), np.float32)
 
 
 def _blend(
@@ -81,8 +92,8 @@ def _blend(
     tile: tuple[int, int],
     overlap: float,
     network: Callable[[AnyArray], Float32Array],
-) -> Iterator[tuple[int, Float32Array]]:
-    """Yield the rows of a map from the top down, as (first row, values), each when no further tile reaches it."""
+) -> Iterator[Float32Array]:
+    """Yield the rows of a map from the top down, each when no further tile reaches it."""
     height, width = shape
     tops, lefts = _starts(height, tile[0], overlap), _starts(width, tile[1], overlap)
     weight = _weight(tile, overlap)
@@ -99,7 +110,7 @@ def _blend(
             total[:rows, left : left + columns] += weight[:rows, :columns] * road
             weights[:rows, left : left + columns] += weight[:rows, :columns]
         done = next_top - top
-        yield top, np.divide(total[:done], weights[:done])
+        yield np.divide(total[:done], weights[:done])
         for one in (total, weights):
             one[: tile[0] - done] = one[done:].copy()
             one[tile[0] - done :] = 0

@@ -94,6 +94,15 @@ def test_voids_are_not_observed(tmp_path: Path, network, photo: Path) -> None:
     assert observed[40:85, 70:].all()
 
 
+@pytest.mark.parametrize("step", [2, 3, 7])
+def test_a_large_photograph_is_kept_at_a_smaller_size(network, photo: Path, step: int) -> None:
+    with open_photograph(photo) as opened:
+        whole, small = segment(opened, network, step * 0.5), segment(opened, network, step * 0.5, step=step)
+    assert small.values.shape == (75, 90)
+    expected = cv2.resize(whole.values, (90, 75), interpolation=cv2.INTER_AREA)
+    assert np.abs(small.values.astype(int) - expected).max() <= 3
+
+
 def test_a_photograph_of_nothing_is_refused(tmp_path: Path, network) -> None:
     cv2.imwrite(str(tmp_path / "white.png"), np.full((150, 180, 3), 255, np.uint8))
     with open_photograph(tmp_path / "white.png") as opened, pytest.raises(MaskError, match="shows no ground"):
