@@ -232,7 +232,7 @@ def locate_command(
 ) -> int:
     """Find where road masks lie on a map, and draw them there; for the help see above."""
     from roadgeo.cli.compilation import compile_once
-    from roadgeo.cli.progress import count_up, print_steps
+    from roadgeo.cli.progress import count_up, print_steps, show_steps
 
     options = make_options(method, time_limit, {name: given[name] for name in HINTS}, effort)
     outputs = _output_options(given)
@@ -249,7 +249,8 @@ def locate_command(
     refuse_swapped(given["near"], opened)
     compile_once(quiet)
     outcomes: list[Outcome] = []
-    with count_up(len(tasks), quiet, as_json, _summarize) as count:
+    one = len(tasks) == 1
+    with show_steps(quiet or not one) as say, count_up(len(tasks), quiet, as_json, _summarize) as count:
         for outcome in locate_masks(
             tasks,
             references,
@@ -259,10 +260,11 @@ def locate_command(
             reading=reading,
             skip_existing=skip_existing,
             jobs=jobs,
+            say=say,
         ):
             outcomes.append(outcome)
             count(outcome.status)
-            _report(outcome, as_json, quiet, verbose, single=len(tasks) == 1)
+            _report(outcome, as_json, quiet, verbose, single=one)
     counts = Counter[str](outcome.status for outcome in outcomes)
     if len(tasks) > 1:
         files = write_overview(out_dir, tasks, outcomes, opened if given["report"] else None)
@@ -334,7 +336,7 @@ def describe(outcome: Outcome) -> str:
     else:
         where = format_lonlat(found["center"]["lon"], found["center"]["lat"])
         text = f"{found['query']}: {status} at {where} on {found['reference']}: {found['reason']}"
-    if outcome.photo:
+    if outcome.photo and outcome.photo[0] != found["query"]:
         text += f"\n  drew {outcome.photo[0]}, {outcome.photo[1]:g} times the mask's size"
     if outcome.removed:
         text += f"\n  removed what an earlier run had found: {', '.join(outcome.removed)}"

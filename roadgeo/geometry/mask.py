@@ -11,7 +11,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from roadgeo._arrays import BoolArray, FloatArray
+from roadgeo._arrays import AnyArray, BoolArray, FloatArray
 from roadgeo.geometry.frame import Frame
 
 __all__ = ["PIXEL_TO_PLANE", "RoadMask", "pixel_to_plane", "plane_to_pixel"]
@@ -45,11 +45,14 @@ class RoadMask:
         False where nothing is known (nodata, alpha 0, the black corners of a warped image). None: all observed.
     name : str
         What the user calls it (the path as given).
+    probability : (H, W) uint8 or None
+        254 times the probability of road, where the mask was made of that; 255 where nothing is known.
     """
 
     roads: BoolArray
     observed: BoolArray | None = None
     name: str = ""
+    probability: AnyArray | None = None
 
     @property
     def shape(self) -> tuple[int, int]:

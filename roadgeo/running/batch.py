@@ -139,6 +139,7 @@ def locate_masks(
     reading: ReadOptions | None = None,
     skip_existing: bool = False,
     jobs: int = 1,
+    say: Say = say_nothing,
 ) -> Iterator[Outcome]:
     """Locate masks and write their results; yield what became of each in the order of the tasks.
 
@@ -152,6 +153,8 @@ def locate_masks(
         Keep results of the same question that are whole and younger than their masks.
     jobs : int
         Processes; the results do not depend on it.
+    say
+        Told how far a photograph's roads are found; other processes tell nothing.
 
     Raises
     ------
@@ -168,6 +171,7 @@ def locate_masks(
         outputs or OutputOptions(),
         reading or ReadOptions(),
         skip_existing,
+        say if jobs == 1 or len(tasks) == 1 else say_nothing,
     )
     return run(tasks, work, jobs)
 
@@ -182,6 +186,7 @@ class _Locating:
     outputs: OutputOptions
     reading: ReadOptions
     skip_existing: bool
+    say: Say
 
     def prepare(self) -> Callable[[Task], Outcome]:
         """Open the references."""
@@ -260,7 +265,7 @@ class _Locating:
         started = perf_counter()
         how = explain if EXPLANATION.name in self.outputs.products else locate
         options = self._with_focal_length(task)
-        sighting = locate_query(task.mask, asked.references, options, self.reading.of_query(), how=how)
+        sighting = locate_query(task.mask, asked.references, options, self.reading.of_query(), how=how, say=self.say)
         location, mask, explanation = sighting.location, sighting.mask, sighting.explanation
         spent = location.seconds
         reading_s = perf_counter() - started - spent.vectorize - spent.match - spent.refine

@@ -141,7 +141,7 @@ def _locate_photograph(
     with open_photograph(paths[0]) as photograph:
         k = max(1, int(np.ceil(np.sqrt(photograph.width * photograph.height / _MAX_GRID_PIXELS))))
         grid = round(photograph.height / k), round(photograph.width / k)
-        scales = _choose_scales(photograph, query, options)
+        scales = _choose_scales(photograph, query, options, say)
 
     @lru_cache(_MAX_SCALES)
     def see(scale: float) -> ProbabilityMap:
@@ -175,7 +175,7 @@ def _looks_at(see: Callable[[], ProbabilityMap], scale: float, query: QueryOptio
     return [look(share) for share in (_THRESHOLDS if query.threshold is None else (0.0,))]
 
 
-def _choose_scales(photograph: Photograph, query: QueryOptions, options: LocateOptions) -> list[float]:
+def _choose_scales(photograph: Photograph, query: QueryOptions, options: LocateOptions, say: Say) -> list[float]:
     """Return the scales to try, the most promising first: one where the size of a pixel is known."""
     models = [name for name in query.segmenters if is_model(name)] or ([] if query.segmenters else [""])
     if not models:
@@ -184,6 +184,7 @@ def _choose_scales(photograph: Photograph, query: QueryOptions, options: LocateO
     low, high = options.match.camera.gsd_m
     if high <= _KNOWN_SPAN * low:
         return [scale_of(float(np.sqrt(low * high)), network)]
+    say(f"looking for the scale of {photograph.name}")
     ranked = rank_scales(photograph, network)[:_MAX_SCALES]
     stated = estimate_gsd(photograph.name)
     if stated is None or not low <= stated <= high:

@@ -57,7 +57,7 @@ class ProbabilityMap:
         roads = (self.values > round(254 * threshold)) & seen
         if not roads.any():
             raise MaskError(f"{self.name}: no road is seen with a probability above {threshold:g}")
-        return RoadMask(roads, None if seen.all() else seen, self.name)
+        return RoadMask(roads, None if seen.all() else seen, self.name, self.values)
 
     def resized(self, shape: tuple[int, int]) -> ProbabilityMap:
         """Return the same on another grid of (H, W) pixels over the same frame."""

@@ -78,6 +78,21 @@ def test_a_photograph_is_located(
     assert again["homography"] == document["homography"]
 
 
+def test_what_was_seen_is_told_and_drawn(
+    tmp_path: Path, demo_reference: Path, model: str, photo: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    given = [str(photo), "-r", str(demo_reference), "--segmenter", model, "-o", str(tmp_path), "--report"]
+    assert main(["locate", *given]) == 0
+    told = capsys.readouterr()
+    assert "finding roads in" in told.err
+    assert "times the mask's size" not in told.out
+    page = (tmp_path / "flight_report.html").read_text()
+    assert "Roads seen in it" in page
+    assert page.count('id="probability"') == 1
+    assert main(["locate", str(MASK.path), "-r", str(demo_reference), "-o", str(tmp_path), "--report"]) == 0
+    assert "probability" not in (tmp_path / "drone_report.html").read_text().split("<script>")[0].split("</style>")[1]
+
+
 def test_our_own_probability_map_is_no_further_query(
     tmp_path: Path, demo_reference: Path, model: str, photo: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:

@@ -20,7 +20,15 @@ from roadgeo.geometry.pinhole import polygon_area
 from roadgeo.location import Location, Place
 from roadgeo.matching.index import ReferenceIndex
 from roadgeo.outputs.paths import Placement
-from roadgeo.outputs.report.views import ReportOptions, Shown, Window, draw_mask, draw_overview, draw_place
+from roadgeo.outputs.report.views import (
+    ReportOptions,
+    Shown,
+    Window,
+    draw_mask,
+    draw_overview,
+    draw_place,
+    draw_probability,
+)
 from roadgeo.outputs.subject import Subject
 from roadgeo.outputs.wording import format_lonlat
 
@@ -71,7 +79,8 @@ def render_report(
     views = [draw_mask(subject)] if place is None else [draw_place(subject, place), draw_mask(subject)]
     parts = [
         _explain(location),
-        section("In the mask", "".join(views[1:])),
+        section("In the mask" if mask.probability is None else "In the photograph", "".join(views[1:])),
+        section("Roads seen in it", draw_probability(subject)),
         section("Where on the map", draw_overview(subject)),
         section("Numbers", _table(_numbers(subject))),
         "" if place is None else section("Corners", _corners(subject, place)),

@@ -44,7 +44,8 @@ _ARROW_PX, _CIRCLE_PX = 26.0, 60.0
 #: Widths in pixels that views are scaled for until the page's script knows better.
 _PLACE_PX, _MASK_PX, _OVERVIEW_PX = 900, 400, 380
 
-_QUERY_COLOR, _GREY = (228, 87, 46), (150, 155, 163)
+_QUERY_COLOR, _GREY, _PROBABLE = (228, 87, 46), (150, 155, 163), (255, 210, 31)
+_UNKNOWN = 255  # in a map of probabilities
 
 
 @dataclass(frozen=True)
@@ -158,6 +159,21 @@ class Shown:
         if self.mask.observed is not None:
             unseen = cv2.resize((~self.mask.observed).view(np.uint8), size, interpolation=cv2.INTER_NEAREST)
             image[unseen > 0] = (*_GREY, 60)
+        return image
+
+    def draw_probability(self) -> AnyArray | None:
+        """Draw what a segmenter saw, the surer the denser: (h, w, 4) uint8, or None where there was none."""
+        seen = self.mask.probability
+        if seen is None:
+            return None
+        factor = min(1.0, self.options.picture_px / max(self.size))
+        size = [max(round(side * factor), 1) for side in self.size]
+        reduced = cv2.resize(np.where(seen == _UNKNOWN, 0, seen), size, interpolation=cv2.INTER_AREA)
+        image = np.empty((*reduced.shape, 4), np.uint8)
+        image[..., :3], image[..., 3] = (
+            _PROBABLE,
+            np.bitwise_and(reduced, 0xF0),
+        )  # few levels of opacity are coded in few bytes
         return image
 
 
@@ -348,8 +364,10 @@ def draw_mask(subject: Shown) -> str:
     taken = set(map(tuple, matched.tolist()))
     others = np.array([xy for xy in subject.seen.tolist() if tuple(xy) not in taken]).reshape(-1, 2)
     others = others[: subject.options.max_query_vertices // 4]
+    probable = "" if subject.mask.probability is None else '<use href="#probability"/>'
     layers = [
         Layer("picture", "photograph" if is_photograph else "mask", picture, _PICTURE_SIGN),
+        Layer("probability", "probability of road", probable, _PICTURE_SIGN, shown=False),
         Layer("query-roads", "its roads", draw_lines(subject.lines)),
         Layer(
             "unmatched", "other intersections" if len(matched) else "its intersections", _draw_rings(others), _RING_SIGN
@@ -360,6 +378,19 @@ def draw_mask(subject: Shown) -> str:
     said = f"The mask {subject.location.query}, with the roads and intersections seen in it"
     attributes = {"data-frame": "mask", "style": f"--u:{max(width, height) / _MASK_PX:.4g}"}
     return draw_viewer(said, box, layers, attributes)
+
+
+def draw_probability(subject: Shown) -> str:
+    """Draw what a segmenter saw, on its own: an SVG, or nothing. The layer of `draw_mask` shows the same picture."""
+    probable = subject.draw_probability()
+    if probable is None:
+        return ""
+    box = (0.0, 0.0, float(subject.size[0]), float(subject.size[1]))
+    picture = draw_image(probable, box, subject.options.picture_bytes, lossless=True)
+    view = " ".join(f"{value:g}" for value in box)
+    said = "Probability of road: light where it is high"
+    drawn = f'<g id="probability">{picture}</g>'
+    return f'<svg class="overview seen" viewBox="{view}" role="img" aria-label="{said}">{drawn}</svg>'
 
 
 # --- the whole map ----------------------------------------------------------------------------------------------------
