@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass, field
+from enum import StrEnum
 from html import escape
 from typing import TYPE_CHECKING, Any, Literal
 
@@ -19,11 +20,43 @@ from roadgeo.roads.graph import RoadGraph
 if TYPE_CHECKING:
     import geopandas as gpd
 
-__all__ = ["SCHEMA", "Evidence", "Location", "Place", "Seconds", "Seen", "Stats", "Status"]
+__all__ = ["SCHEMA", "Evidence", "Location", "Place", "Reason", "Seconds", "Seen", "Stats", "Status"]
 
 SCHEMA = "roadgeo.location/1"
 
 Status = Literal["located", "ambiguous", "not_located"]
+
+
+class Reason(StrEnum):
+    """Why a mask was located, or not: what programs go by, where people read the sentence beside it."""
+
+    LOCATED = "located"
+    #: Two places fit almost equally; or two looks at one scene find two.
+    TWO_PLACES = "two_places"
+    TWO_LOOKS = "two_looks"
+    #: The mask shows too few intersections, or hardly a road.
+    FEW_INTERSECTIONS = "few_intersections"
+    FEW_ROADS = "few_roads"
+    #: The map has too few around the place that was given.
+    FEW_NEAR = "few_near"
+    #: Stopped before everything was tried.
+    TIME_LIMIT = "time_limit"
+    #: Nothing fits better than chance would.
+    NOTHING_STANDS_OUT = "nothing_stands_out"
+    #: Something did, but not by enough for all the looks that were taken.
+    TOO_MANY_LOOKS = "too_many_looks"
+    #: Turned over, left to right, it would be located.
+    MIRRORED = "mirrored"
+    #: The mask, the photograph or what goes with it cannot be read or used; a result cannot be written.
+    INVALID = "invalid"
+    NOT_WRITTEN = "not_written"
+    #: There is no reference, or none that can be used.
+    NO_REFERENCE = "no_reference"
+    #: A segmenter or another plugin failed.
+    PLUGIN = "plugin"
+    MEMORY = "memory"
+    #: Of roadgeo itself.
+    FAULT = "fault"
 
 
 @dataclass(frozen=True)
@@ -120,8 +153,12 @@ class Location:
     log10_odds : float or None
         Of the best place; also where that is not enough to report it. None where no place was verified, or the method
         knows no odds.
-    runner_up : Place or None
-        The best other place, on any of the references.
+    reason_code : Reason
+        The reason for programs.
+    corner_covariance_m2 : (8, 8) float64 or None
+        Covariance of the corners' x and y in the CRS: x, y of TL, then of TR, BR, BL.
+    alternatives : tuple of Place
+        The best other places on any of the references, best first, in the CRS of the best one.
     options : dict or None
         What was asked, as far as it differs from the usual, in plain values; None: not told.
     reference_digest : str
@@ -155,6 +192,9 @@ class Location:
     reference_digest: str = ""
     evidence: Evidence | None = None
     seen: Seen | None = field(default=None, repr=False)
+    reason_code: Reason = Reason.NOTHING_STANDS_OUT
+    corner_covariance_m2: FloatArray | None = field(default=None, repr=False)
+    alternatives: tuple[Place, ...] = ()
 
     @property
     def located(self) -> bool:
@@ -243,8 +283,11 @@ class Location:
         def rows(array: FloatArray | None) -> list[Any] | None:
             return None if array is None else array.tolist()
 
+        def place(one: Place) -> dict[str, Any]:
+            middle = {"x": one.x, "y": one.y, "lon": one.lon, "lat": one.lat}
+            return {"center": middle, "log10_odds": one.log10_odds}
+
         center = self.center
-        runner_up = self.runner_up
         rmse_m, rmse_px = self.rmse() or (None, None)
         return {
             "schema": SCHEMA,
@@ -252,6 +295,7 @@ class Location:
             "query": self.query,
             "status": self.status,
             "reason": self.reason,
+            "reason_code": self.reason_code.value,
             "reference": self.reference,
             "reference_digest": self.reference_digest or None,
             "attribution": self.attribution,
@@ -261,24 +305,21 @@ class Location:
             "homography": rows(self.homography),
             "footprint": rows(self.footprint),
             "footprint_lonlat": rows(self.footprint_lonlat),
-            "center": None if center is None else {"x": center.x, "y": center.y, "lon": center.lon, "lat": center.lat},
+            "center": None if center is None else place(center)["center"],
             "gsd_m": self.gsd_m,
             "rotation_deg": self.rotation_deg,
             "tilt_deg": self.tilt_deg,
             "tilt_source": self.tilt_source,
             "corner_sigma_m": rows(self.corner_sigma_m),
+            "corner_covariance_m2": rows(self.corner_covariance_m2),
             "rmse_m": rmse_m,
             "rmse_px": rmse_px,
             "n_intersections": self.n_intersections,
             "n_matched": self.n_matched,
             "inlier_ratio": self.inlier_ratio,
             "log10_odds": self.log10_odds,
-            "runner_up": None
-            if runner_up is None
-            else {
-                "center": {"x": runner_up.x, "y": runner_up.y, "lon": runner_up.lon, "lat": runner_up.lat},
-                "log10_odds": runner_up.log10_odds,
-            },
+            "runner_up": None if self.runner_up is None else place(self.runner_up),
+            "alternatives": [place(one) for one in self.alternatives],
             "seconds": {
                 "open": self.seconds.open,
                 "read": self.seconds.read,

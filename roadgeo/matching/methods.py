@@ -45,6 +45,8 @@ class Fit:
     log10_odds : float
         NaN where the method knows none.
     corner_sigma_m : (4,) float64 or None
+    corner_covariance_m2 : (8, 8) float64 or None
+        As in `Refined`.
     """
 
     index: ReferenceIndex
@@ -54,6 +56,7 @@ class Fit:
     agreeing: float = math.nan
     log10_odds: float = math.nan
     corner_sigma_m: FloatArray | None = None
+    corner_covariance_m2: FloatArray | None = None
 
 
 @dataclass(frozen=True)
@@ -144,6 +147,7 @@ def _fits(estimator: TripleEstimator, result: SearchResult[Hypothesis]) -> tuple
                 model.found.forward,
                 score,
                 model.refined.corner_sigma_m,
+                model.refined.corner_covariance_m2,
             )
         )
     return tuple(fits)

@@ -39,6 +39,7 @@ def place_frame(location: Location, query: Query, fit: Fit, focal_px: float | No
         footprint_lonlat=lonlat[:4],
         center=Place(float(ground[4, 0]), float(ground[4, 1]), float(lonlat[4, 0]), float(lonlat[4, 1]), odds),
         corner_sigma_m=fit.corner_sigma_m,
+        corner_covariance_m2=fit.corner_covariance_m2,
         gsd_m=camera.gsd_m,
         rotation_deg=(camera.rotation_deg + north + 180.0) % 360.0 - 180.0,
         tilt_deg=camera.tilt_deg,

@@ -80,11 +80,14 @@ class Refined:
         Standard deviations of the frame's corners: root mean squares of their distances from the truth.
     rms_m : float
         Of the road points' distances from the map's roads, robustly.
+    corner_covariance_m2 : (8, 8) float64
+        Of the corners' x and y, in the order x, y of the first, x, y of the second, and so on.
     """
 
     matrix: FloatArray
     corner_sigma_m: FloatArray
     rms_m: float
+    corner_covariance_m2: FloatArray
 
 
 def _parameters(matrix: FloatArray, center: FloatArray, half_size: float) -> tuple[FloatArray, FloatArray, float]:
@@ -191,7 +194,9 @@ def refine(
         return None
     covariance = np.linalg.inv(normal) * (rms / unit) ** 2
     rows = _corner_rows(p, (scene.corners - center) / half_size)
-    variance = np.einsum("nai,ij,naj->n", rows, covariance, rows) * unit**2
-    result = _matrix(p, center, half_size, origin, unit)
+    derivatives = rows.reshape(8, 8)
     floor = options.sigma_floor_m**2 + (options.sigma_floor_px * gsd) ** 2
-    return Refined(result / result[2, 2], np.sqrt(variance + floor), rms)
+    corners = derivatives @ covariance @ derivatives.T * unit**2 + 0.5 * floor * np.eye(8)
+    result = _matrix(p, center, half_size, origin, unit)
+    sigma = np.sqrt(np.diag(corners).reshape(4, 2).sum(axis=1))
+    return Refined(result / result[2, 2], sigma, rms, corners)

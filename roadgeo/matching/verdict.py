@@ -10,7 +10,7 @@ import numpy as np
 
 from roadgeo.geometry.camera import CameraOptions, sampling
 from roadgeo.geometry.projection import from_lonlat
-from roadgeo.location import Location, Place, Seen, Stats
+from roadgeo.location import Location, Place, Reason, Seen, Stats
 from roadgeo.matching.methods import Fit, Found
 from roadgeo.matching.options import LocateOptions
 from roadgeo.matching.placing import center_of, place_frame
@@ -55,22 +55,23 @@ def decide(query: Query, found: Sequence[Found], options: LocateOptions) -> Loca
         return _decide_pairs(location, query, found, options)
     candidates = _pool(query, found)
     best = candidates[0] if candidates else None
-    rival = None if best is None else next((one for one in candidates[1:] if _differ(query, best, one)), None)
-    location = replace(
-        location,
-        log10_odds=None if best is None else best.score,
-        runner_up=None if best is None or rival is None else _seen_from(best, rival),
-    )
+    rivals = [] if best is None else [one for one in candidates[1:] if _differ(query, best, one)]
+    rival = rivals[0] if rivals else None
+    if best is not None:
+        others = tuple(_seen_from(best, one) for one in rivals)
+        location = replace(
+            location, log10_odds=best.score, runner_up=others[0] if others else None, alternatives=others
+        )
     if best is None or best.score < options.min_log10_odds:
         return _refuse(location, query, found, best, options)
     placed = place_frame(_on(location, best.found), query, best.fit, options.match.camera.focal_px)
     if rival is not None and best.score - rival.score < options.min_margin:
-        return replace(placed, status="ambiguous", reason=_twins(best, rival))
+        return replace(placed, status="ambiguous", reason=_twins(best, rival), reason_code=Reason.TWO_PLACES)
     reason = (
         f"{placed.n_matched} of {placed.n_intersections} intersections and {best.fit.agreeing:.0%} of the roads agree"
         f"; odds 10^{best.score:.1f} against chance"
     )
-    return replace(placed, status="located", reason=reason)
+    return replace(placed, status="located", reason=reason, reason_code=Reason.LOCATED)
 
 
 def _describe_work(query: Query, found: Sequence[Found]) -> Location:
@@ -145,7 +146,7 @@ def _decide_pairs(location: Location, query: Query, found: Sequence[Found], opti
     if best is None:
         return _refuse(location, query, found, None, options)
     placed = place_frame(_on(location, best), query, best.fits[0])
-    return replace(placed, status="located", reason=best.said)
+    return replace(placed, status="located", reason=best.said, reason_code=Reason.LOCATED)
 
 
 # --- refusals ---------------------------------------------------------------------------------------------------------
@@ -157,7 +158,8 @@ def _refuse(
     """Say why nothing is reported: of several references, for the one that came nearest."""
     nearest = best.found if best is not None else max(found, key=lambda one: one.n_tried)
     score = best.score if best is not None else -math.inf
-    reason = _why_nothing(query, nearest, score, options)
+    code, reason = _why_nothing(query, nearest, score, options)
+    location = replace(location, reason_code=code)
     if len(found) == 1:
         return replace(_on(location, nearest), reason=reason)
     names = ", ".join(one.index.name for one in found)
@@ -170,16 +172,17 @@ def _refuse(
     )
 
 
-def _why_nothing(query: Query, found: Found, score: float, options: LocateOptions) -> str:
-    """Say why nothing is reported, and what may help."""
+def _why_nothing(query: Query, found: Found, score: float, options: LocateOptions) -> tuple[Reason, str]:
+    """Say why nothing is reported, to programs and to people, and what may help."""
     n, needed = len(query.scene.intersections), options.min_intersections
     if n < needed:
-        return f"only {n} intersections are seen, at least {needed} are needed"
+        return Reason.FEW_INTERSECTIONS, f"only {n} intersections are seen, at least {needed} are needed"
     if found.said:
-        return found.said
+        return Reason.NOTHING_STANDS_OUT, found.said
     searched = searched_within(options)
     if options.near is not None and found.n_searched < needed:
-        return f"the map has {found.n_searched} intersections around the place given by near{searched}"
+        few = f"the map has {found.n_searched} intersections around the place given by near{searched}"
+        return Reason.FEW_NEAR, few
     if math.isfinite(score):
         best = f"the best has log10 odds {score:.1f}, {options.min_log10_odds:g} are needed"
     else:
@@ -187,13 +190,15 @@ def _why_nothing(query: Query, found: Found, score: float, options: LocateOption
     if found.stopped == "time":
         limit, tracing_s = options.search.time_limit_s, query.seconds.vectorize
         tracing = f", of which tracing the mask took {tracing_s:.1f} s" if tracing_s > limit / 4 else ""
-        return f"stopped at the time limit of {limit:g} s{tracing}; of the places tried, {best}{searched}"
+        told = f"stopped at the time limit of {limit:g} s{tracing}; of the places tried, {best}{searched}"
+        return Reason.TIME_LIMIT, told
     nothing = f"no place on this map stands out: {best}{searched}"
+    advice = "; more roads in view or another map may help"
     if searched:
-        return f"{nothing}: more roads in view or a wider search may help"
-    if options.effort == "quick":
-        return f"{nothing}; a search with full effort, more roads in view or another map may help"
-    return f"{nothing}; more roads in view or another map may help"
+        advice = ": more roads in view or a wider search may help"
+    elif options.effort == "quick":
+        advice = "; a search with full effort, more roads in view or another map may help"
+    return Reason.NOTHING_STANDS_OUT, f"{nothing}{advice}"
 
 
 def searched_within(options: LocateOptions) -> str:

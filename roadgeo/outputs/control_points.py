@@ -2,13 +2,17 @@
 
 from __future__ import annotations
 
+import csv
 import xml.etree.ElementTree as ET
 from pathlib import Path
 from tempfile import TemporaryDirectory
 
+import numpy as np
+
+from roadgeo.geometry.projection import to_lonlat
 from roadgeo.outputs.subject import Subject
 
-__all__ = ["write_gcps", "write_odm", "write_points", "write_vrt"]
+__all__ = ["write_gcps", "write_match_points", "write_matches", "write_odm", "write_points", "write_vrt"]
 
 
 def write_gcps(path: Path, subject: Subject) -> None:
@@ -60,6 +64,37 @@ def write_points(path: Path, subject: Subject) -> None:
     # QGIS places a picture without georeference below the x axis.
     lines += [f"{x!r},{y!r},{column!r},{-row!r},1,0,0,0" for column, row, x, y in subject.control_points()]
     path.write_text("\n".join(lines) + "\n", encoding="utf-8")
+
+
+def write_match_points(path: Path, subject: Subject) -> None:
+    """Write the matched intersections for the QGIS Georeferencer: what was measured, where `write_points` is exact."""
+    import pyproj
+
+    wkt = pyproj.CRS.from_user_input(subject.place.crs).to_wkt()
+    lines = [f"#CRS: {wkt}", "mapX,mapY,sourceX,sourceY,enable,dX,dY,residual"]
+    for one in subject.matches():
+        # QGIS's residuals are in pixels of the source, from the point to where the transformation has it.
+        dx, dy = one.fitted_column - one.column, one.row - one.fitted_row
+        apart = float(np.hypot(dx, dy))
+        lines.append(f"{one.x!r},{one.y!r},{one.column!r},{-one.row!r},1,{dx!r},{dy!r},{apart!r}")
+    path.write_text("\n".join(lines) + "\n", encoding="utf-8")
+
+
+def write_matches(path: Path, subject: Subject) -> None:
+    """Write the matched intersections as a table: where the picture shows them, where the map has them, how far apart.
+
+    `column`, `row` are pixels of the picture from the corner of its first pixel; `x`, `y` the map's coordinates in
+    `crs`; `dx_m`, `dy_m` lead from where the homography puts the picture's intersection to the map's.
+    """
+    matches = subject.matches()
+    lonlat = to_lonlat(subject.place.crs, np.array([(one.x, one.y) for one in matches], float).reshape(-1, 2))
+    with path.open("w", encoding="utf-8", newline="") as file:
+        table = csv.writer(file, lineterminator="\n")
+        table.writerow(["id", "column", "row", "x", "y", "lon", "lat", "dx_m", "dy_m", "residual_m", "crs"])
+        for number, (one, (lon, lat)) in enumerate(zip(matches, lonlat.tolist(), strict=True), 1):
+            where = [one.column, one.row, one.x, one.y, f"{lon:.9f}", f"{lat:.9f}"]
+            apart = [one.dx_m, one.dy_m, float(np.hypot(one.dx_m, one.dy_m))]
+            table.writerow([number, *where, *apart, subject.place.crs])
 
 
 def write_odm(path: Path, subject: Subject) -> None:

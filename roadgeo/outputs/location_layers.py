@@ -10,22 +10,29 @@ import numpy as np
 from roadgeo._arrays import FloatArray
 from roadgeo.geometry.homography import Homography
 from roadgeo.geometry.mask import plane_to_pixel
-from roadgeo.location import Evidence
+from roadgeo.location import Evidence, Location
 from roadgeo.outputs.columns import attributes
 from roadgeo.outputs.paths import Placement
 from roadgeo.outputs.subject import Subject
 from roadgeo.storage.geopackage import Layer, dump_layers
-from roadgeo.storage.qml import draw_fill, draw_line, draw_marker
+from roadgeo.storage.qml import draw_arrow, draw_fill, draw_line, draw_marker
 
 __all__ = ["write_geopackage"]
 
 _FOOTPRINT_STYLE = draw_fill("31,111,180,20", "31,111,180", 0.7)
 _ROADS_STYLE = draw_line("228,87,46", 0.5)
 _MATCHES_STYLE = draw_marker("27,38,59", 2.2)
+_RESIDUALS_STYLE = draw_arrow("27,38,59", 0.4)
+_CORNERS_STYLE = draw_marker("31,111,180", 1.8)
+_ALTERNATIVES_STYLE = draw_marker("240,180,41", 3.0)
+
+_CORNERS = ("top left", "top right", "bottom right", "bottom left")
+#: A residual is drawn so many times as long as it is: metres cannot be seen on a footprint of a kilometre.
+_EXAGGERATION = 20.0
 
 
 def write_geopackage(path: Path, subject: Subject) -> None:
-    """Write the layers `footprint`, `query_roads` and `matches`, styled for QGIS."""
+    """Write the layers `footprint`, `query_roads`, `residuals`, `matches`, `corners` and `alternatives`, styled."""
     dump_layers(path, _layers(subject))
 
 
@@ -43,8 +50,8 @@ def _layers(subject: Subject) -> list[Layer]:
         )
     ]
     if evidence is not None:
-        layers += [_road_layer(place, evidence), _match_layer(place, evidence)]
-    return layers
+        layers += [_road_layer(place, evidence), _residual_layer(place, evidence), _match_layer(place, evidence)]
+    return [*layers, _corner_layer(place, subject.location), _alternative_layer(place, subject.location)]
 
 
 def _road_layer(place: Placement, evidence: Evidence) -> Layer:
@@ -90,4 +97,56 @@ def _match_layer(place: Placement, evidence: Evidence) -> Layer:
         place.crs,
         _MATCHES_STYLE,
         "Intersections found both in the mask and on the map",
+    )
+
+
+def _residual_layer(place: Placement, evidence: Evidence) -> Layer:
+    """Draw from each of the mask's matched intersections towards the map's, exaggerated."""
+    start = Homography(place.homography)(plane_to_pixel(evidence.query_xy))
+    offset = evidence.reference_xy - start
+    return Layer(
+        "residuals",
+        "LINESTRING",
+        list(np.stack([start, start + _EXAGGERATION * offset], axis=1)),
+        {"residual_m": evidence.residual_m, "dx_m": offset[:, 0], "dy_m": offset[:, 1]},
+        place.crs,
+        _RESIDUALS_STYLE,
+        f"From the mask's intersections towards the map's, {_EXAGGERATION:g} times as long as the residuals are",
+    )
+
+
+def _corner_layer(place: Placement, location: Location) -> Layer:
+    """Show the corners of the frame, each with the covariance of its position."""
+    sigma, covariance = location.corner_sigma_m, location.corner_covariance_m2
+    unknown = np.full(4, np.nan)
+    blocks = np.full((4, 2, 2), np.nan)
+    if covariance is not None:
+        blocks = np.stack([covariance[i : i + 2, i : i + 2] for i in range(0, 8, 2)])
+    columns = {
+        "corner": list(_CORNERS),
+        "sigma_m": unknown if sigma is None else sigma,
+        "var_x_m2": blocks[:, 0, 0],
+        "cov_xy_m2": blocks[:, 0, 1],
+        "var_y_m2": blocks[:, 1, 1],
+    }
+    told = "Corners of the frame; how far each may be off, and the covariance of its x and y"
+    return Layer("corners", "POINT", place.footprint, columns, place.crs, _CORNERS_STYLE, told)
+
+
+def _alternative_layer(place: Placement, location: Location) -> Layer:
+    """Show where else the mask might lie."""
+    others = location.alternatives
+    return Layer(
+        "alternatives",
+        "POINT",
+        np.array([(one.x, one.y) for one in others], float).reshape(-1, 2),
+        {
+            "rank": np.arange(2, 2 + len(others)),
+            "log10_odds": np.array([one.log10_odds for one in others], float),
+            "lon": np.array([one.lon for one in others], float),
+            "lat": np.array([one.lat for one in others], float),
+        },
+        place.crs,
+        _ALTERNATIVES_STYLE,
+        "Middles of the best other places, with their odds",
     )

@@ -146,6 +146,18 @@ VRT = Output(
 POINTS = Output(
     "points", "{picture}.points", _by("control_points", "write_points"), "control points for the QGIS Georeferencer"
 )
+MATCHES = Output(
+    "matches",
+    "_matches.csv",
+    _by("control_points", "write_matches"),
+    "the matched intersections, in pixels and on the map, with residuals (CSV)",
+)
+MATCH_POINTS = Output(
+    "match-points",
+    "{picture}_matches.points",
+    _by("control_points", "write_match_points"),
+    "the matched intersections for the QGIS Georeferencer, with residuals",
+)
 ODM = Output("odm", "_gcp_list.txt", _by("control_points", "write_odm"), "control points for OpenDroneMap")
 WORLD_FILE = Output(
     "worldfile", "_footprint.tfw", _by("footprint", "write_world_file"), "world file of the drawn raster"
@@ -157,7 +169,9 @@ KMZ = Output("kmz", "_overlay.kmz", _by("kmz", "write_kmz"), "ground overlay for
 #: Written for every located mask; of these only the JSON where there is no place.
 ALWAYS = (JSON, FOOTPRINT, STYLE, GEOPACKAGE)
 #: Written where `--also` asks for them, by the names under which pyproject.toml registers them too.
-ALSO = {output.name: output for output in (GCPS, VRT, POINTS, ODM, WORLD_FILE, GEOJSON, STAC, KMZ)}
+ALSO = {
+    output.name: output for output in (GCPS, VRT, POINTS, MATCHES, MATCH_POINTS, ODM, WORLD_FILE, GEOJSON, STAC, KMZ)
+}
 #: All of our own.
 REGISTRY = {
     output.name: output

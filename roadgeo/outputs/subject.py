@@ -6,13 +6,14 @@ from collections.abc import Sequence
 from dataclasses import dataclass, field
 from functools import cached_property
 from pathlib import Path
+from typing import NamedTuple
 
 import numpy as np
 
 from roadgeo._arrays import FloatArray
 from roadgeo.errors import CrsError, OutputError
 from roadgeo.geometry.homography import Homography
-from roadgeo.geometry.mask import RoadMask
+from roadgeo.geometry.mask import RoadMask, plane_to_pixel
 from roadgeo.geometry.warping import MapGrid, cover
 from roadgeo.location import Location
 from roadgeo.matching.explanation import Explanation
@@ -20,13 +21,38 @@ from roadgeo.matching.index import ReferenceIndex
 from roadgeo.outputs.orthophoto import ImageOptions, Target, choose_target, image_homography
 from roadgeo.outputs.paths import OutputPaths, Placement
 
-__all__ = ["Subject"]
+__all__ = ["Match", "Subject"]
 
 #: Control points lie on a grid of so many rows and columns, from corner to corner.
 _GRID = 5
 
 #: A warped mask is drawn in memory, so it is made coarser beyond this.
 _MASK_MAX_PIXELS = 100_000_000
+
+
+class Match(NamedTuple):
+    """An intersection in the picture and on the map.
+
+    Attributes
+    ----------
+    column, row : float
+        Where the picture shows it, pixels from the corner of the first one.
+    x, y : float
+        Where the map has it, in the place's CRS.
+    fitted_column, fitted_row : float
+        Where the homography says that the picture should show it.
+    dx_m, dy_m : float
+        From where the homography puts the picture's to the map's.
+    """
+
+    column: float
+    row: float
+    x: float
+    y: float
+    fitted_column: float
+    fitted_row: float
+    dx_m: float
+    dy_m: float
 
 
 @dataclass(frozen=True)
@@ -138,6 +164,24 @@ class Subject:
         points: list[tuple[float, float, float, float]]
         points = [tuple(point) for point in np.hstack([pixels, Homography(self.homography)(pixels)]).tolist()]
         return points
+
+    def matches(self) -> list[Match]:
+        """Return the intersections that were found both in the picture and on the map.
+
+        Raises
+        ------
+        OutputError
+            There is no place, or nothing is known of what it rests on.
+        """
+        evidence, place = self.location.evidence, self.place
+        if evidence is None:
+            raise OutputError(f"{self.location.query}: its matched intersections are not known any more")
+        to_map, to_picture = Homography(self.homography), Homography(self.homography).inverse()
+        found = Homography(place.homography)(plane_to_pixel(evidence.query_xy))
+        pixels = to_picture(found)  # the picture's, which may be larger than the mask
+        fitted = to_picture(evidence.reference_xy)
+        offset = evidence.reference_xy - to_map(pixels)
+        return [Match(*row) for row in np.hstack([pixels, evidence.reference_xy, fitted, offset]).tolist()]
 
     def outline(self) -> FloatArray:
         """Ring (32, 2) of longitude and latitude around the footprint, counterclockwise; see `antimeridian`."""

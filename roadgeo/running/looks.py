@@ -14,7 +14,7 @@ import numpy as np
 
 from roadgeo.errors import MaskError
 from roadgeo.geometry.mask import RoadMask
-from roadgeo.location import Location
+from roadgeo.location import Location, Place, Reason
 from roadgeo.matching.explanation import Explanation
 from roadgeo.matching.options import LocateOptions
 from roadgeo.reference.reference import Reference
@@ -114,16 +114,28 @@ def _discount(sighting: Sighting, look: Look, tried: int, options: LocateOptions
         return replace(sighting, location=_refused(location, few))
     reason = f"{location.reason}; at {look.what}, for which as look {tried} a factor of {tried} is off the odds"
     center = None if location.center is None else replace(location.center, log10_odds=odds)
-    runner_up = location.runner_up
-    if runner_up is not None:
-        runner_up = replace(runner_up, log10_odds=runner_up.log10_odds - off)
-    location = replace(location, reason=reason, log10_odds=odds, center=center, runner_up=runner_up)
+    others = tuple(_less_sure(one, off) for one in location.alternatives)
+    runner_up = location.runner_up and _less_sure(location.runner_up, off)
+    location = replace(
+        location, reason=reason, log10_odds=odds, center=center, runner_up=runner_up, alternatives=others
+    )
     return replace(sighting, location=location)
+
+
+def _less_sure(place: Place, off: float) -> Place:
+    return replace(place, log10_odds=place.log10_odds - off)
 
 
 def _refused(location: Location, reason: str) -> Location:
     """Return a location of which nothing is left but what was seen."""
-    bare = Location(location.query, "not_located", reason, location.reference, location.attribution)
+    bare = Location(
+        location.query,
+        "not_located",
+        reason,
+        location.reference,
+        location.attribution,
+        reason_code=Reason.TOO_MANY_LOOKS,
+    )
     seen = {name: getattr(location, name) for name in ("size", "n_intersections", "seconds", "stats", "seen")}
     return replace(bare, **seen)
 
@@ -148,7 +160,15 @@ def _best_of(sightings: Sequence[Sighting], options: LocateOptions) -> Sighting:
         lead = (location.log10_odds or 0.0) - (rival.log10_odds or 0.0)
         if lead < options.min_margin:
             reason = f"two looks find two places almost equally: they differ by {lead:.1f} in log10 odds"
-            location = replace(location, status="ambiguous", reason=reason, runner_up=rival.center)
+            others = () if rival.center is None else (rival.center, *location.alternatives)
+            location = replace(
+                location,
+                status="ambiguous",
+                reason=reason,
+                reason_code=Reason.TWO_LOOKS,
+                runner_up=rival.center,
+                alternatives=others,
+            )
     return replace(best, location=location)
 
 

@@ -19,7 +19,7 @@ import numpy as np
 from roadgeo._progress import Say, say_nothing
 from roadgeo.errors import MaskError, PhotographError, PluginError
 from roadgeo.geometry.mask import RoadMask
-from roadgeo.location import Location
+from roadgeo.location import Location, Reason
 from roadgeo.matching.options import LocateOptions
 from roadgeo.plugins import SEGMENTERS, call_plugin
 from roadgeo.reference.reference import Reference
@@ -157,7 +157,9 @@ def _locate_photograph(
     except MaskError as error:
         names = ", ".join(one.name for one in references)
         reason = f"hardly a road is seen in the photograph ({error})"
-        location = Location(paths[0], "not_located", reason, names, size=(grid[1], grid[0]))
+        location = Location(
+            paths[0], "not_located", reason, names, size=(grid[1], grid[0]), reason_code=Reason.FEW_ROADS
+        )
         return Sighting(location, RoadMask(np.zeros(grid, np.bool_), name=paths[0]), probability=see(scales[0]))
 
 

@@ -4,13 +4,22 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 
-__all__ = ["draw_fill", "draw_line", "draw_marker", "draw_palette"]
+__all__ = ["draw_arrow", "draw_fill", "draw_line", "draw_marker", "draw_palette"]
 
 
 def draw_line(color: str, width_mm: float, casing: str = "", casing_width_mm: float = 0.0) -> str:
     """Style a line layer; with a `casing`, over a wider line of that colour. Colours are "r,g,b" or "r,g,b,a"."""
     layers = _layer("SimpleLine", _line_options(casing, casing_width_mm)) if casing else ""
     return _vector("line", layers + _layer("SimpleLine", _line_options(color, width_mm)))
+
+
+def draw_arrow(color: str, width_mm: float) -> str:
+    """Style a line layer with an arrow from the first vertex to the last."""
+    head = '<symbol type="fill" name="@0@0" alpha="1">' + _layer("SimpleFill", {"color": color}) + "</symbol>"
+    options = {"arrow_width": f"{width_mm}", "arrow_start_width": f"{width_mm}", "is_curved": "0"}
+    sizes = {"head_length": "1.4", "head_thickness": "0.9", "head_type": "0", "arrow_type": "0"}
+    arrow = _layer("ArrowLine", {**options, **sizes}).replace("</layer>", f"{head}</layer>")
+    return _vector("line", arrow)
 
 
 def draw_fill(color: str, outline: str, outline_width_mm: float) -> str:

@@ -57,6 +57,9 @@ def test_the_homography_is_recovered_where_the_query_is_exact(town, exact, tilt,
     assert np.sqrt(np.mean(gaps**2)) < 0.1
     assert result.rms_m < 0.1
     assert (result.corner_sigma_m < 0.15 + 0.15 * gsd).all()
+    variances = np.diag(result.corner_covariance_m2).reshape(4, 2).sum(axis=1)
+    np.testing.assert_allclose(variances, result.corner_sigma_m**2)
+    assert np.linalg.eigvalsh(result.corner_covariance_m2).min() > 0
     assert result.matrix[2, 2] == 1.0
 
 

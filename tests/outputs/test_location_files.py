@@ -121,7 +121,9 @@ def test_a_far_view_is_coarsened(tmp_path: Path) -> None:
 def test_the_geopackage_holds_footprint_roads_and_residuals(tmp_path: Path) -> None:
     location, paths = located(), output_paths(tmp_path, "a")
     write_location(location, road_mask(), paths)
-    assert layer_names(paths.geopackage) == ["footprint", "query_roads", "matches", "layer_styles"]
+    assert layer_names(paths.geopackage) == [
+        *("footprint", "query_roads", "residuals", "matches", "corners", "alternatives", "layer_styles"),
+    ]
     rings, attributes = read_layer(paths.geopackage, "footprint")
     np.testing.assert_allclose(rings[0][:4], location.footprint)
     assert attributes["query"] == ["photo_mask.png"]
@@ -134,6 +136,26 @@ def test_the_geopackage_holds_footprint_roads_and_residuals(tmp_path: Path) -> N
     assert (matches["column"][0], matches["row"][0]) == (50.5, 60.5)
     lines, _ = read_layer(paths.geopackage, "query_roads")
     np.testing.assert_allclose(lines[0][0], points[0] - (0.3, 0.4))
+    arrows, _ = read_layer(paths.geopackage, "residuals")
+    np.testing.assert_allclose(arrows[0][1] - arrows[0][0], 20 * np.array([0.3, 0.4]), atol=1e-6)
+
+
+def test_the_geopackage_holds_other_places_and_how_sure_the_corners_are(tmp_path: Path) -> None:
+    paths = output_paths(tmp_path, "a")
+    covariance = np.kron(np.diag([1.0, 2.0, 3.0, 4.0]), [[1.0, 0.5], [0.5, 2.0]])
+    others = (Place(530000.0, 4555000.0, -8.7, 41.0, 3.5), Place(530001.0, 4555002.0, -8.6, 41.2, 1.5))
+    location = replace(located(), corner_covariance_m2=covariance, alternatives=others)
+    write_location(location, road_mask(), paths)
+    points, corners = read_layer(paths.geopackage, "corners")
+    np.testing.assert_allclose(points, location.footprint)
+    assert corners["var_y_m2"] == [2.0, 4.0, 6.0, 8.0]
+    assert corners["cov_xy_m2"] == [0.5, 1.0, 1.5, 2.0]
+    points, places = read_layer(paths.geopackage, "alternatives")
+    np.testing.assert_allclose(points, [(530000.0, 4555000.0), (530001.0, 4555002.0)])
+    assert (places["rank"], places["log10_odds"]) == ([2, 3], [3.5, 1.5])
+    document = json.loads(paths.json.read_text())
+    assert document["corner_covariance_m2"] == covariance.tolist()
+    assert [one["log10_odds"] for one in document["alternatives"]] == [3.5, 1.5]
 
 
 def test_the_json_is_the_location(tmp_path: Path) -> None:

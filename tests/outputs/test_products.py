@@ -1,3 +1,4 @@
+import csv
 import json
 import shutil
 import xml.etree.ElementTree as ET
@@ -61,6 +62,27 @@ def test_points_for_the_qgis_georeferencer(written: OutputPaths) -> None:
     assert header == "mapX,mapY,sourceX,sourceY,enable,dX,dY,residual"
     x, y, column, row = np.array([line.split(",")[:4] for line in rows], float).T
     np.testing.assert_allclose(np.stack([x, y], 1), photo_homography()(np.stack([column, -row], 1)), atol=1e-6)
+
+
+def test_the_matches_are_told_with_their_residuals(written: OutputPaths) -> None:
+    with (written.folder / "mask_matches.csv").open(encoding="utf-8") as file:
+        rows = list(csv.DictReader(file))
+    evidence = located().evidence
+    assert len(rows) == len(evidence.query_xy)
+    pixels = np.array([(row["column"], row["row"]) for row in rows], float)
+    np.testing.assert_allclose(pixels, 2 * evidence.query_xy * (1, -1), atol=1e-6)  # the photograph's, not the mask's
+    on_map = np.array([(row["x"], row["y"]) for row in rows], float)
+    np.testing.assert_allclose(on_map, evidence.reference_xy)
+    offset = np.array([(row["dx_m"], row["dy_m"]) for row in rows], float)
+    np.testing.assert_allclose(photo_homography()(pixels) + offset, on_map, atol=1e-6)
+    np.testing.assert_allclose([float(row["residual_m"]) for row in rows], evidence.residual_m, atol=1e-6)
+    _, header, *lines = (written.folder / "photo.png_matches.points").read_text().splitlines()
+    assert header == "mapX,mapY,sourceX,sourceY,enable,dX,dY,residual"
+    points = np.array([line.split(",") for line in lines], float)
+    np.testing.assert_allclose(points[:, :2], on_map)
+    np.testing.assert_allclose(points[:, 2:4], pixels * (1, -1))
+    fitted = points[:, 2:4] + points[:, 5:7]  # in QGIS's pixels, y up
+    np.testing.assert_allclose(photo_homography()(fitted * (1, -1)), on_map, atol=1e-6)
 
 
 def test_control_points_for_opendronemap(written: OutputPaths) -> None:
