@@ -121,7 +121,7 @@ def locate_all(maps: list[Map], chosen: dict[str, float], options: argparse.Name
     reference = work / "roads.gpkg"
     if not reference.exists():
         subprocess.run([*ROADGEO, "index", "--roads", str(options.roads), "--out", str(reference), "-q"], check=True)
-    places = _places(options.data, reference)
+    places = read_places(options.data, reference)
     kinds = {
         "true masks": {m.name: (m.truth, m.observed) for m in maps},
         "predicted masks": {m.name: (m.road > 255 * chosen[m.name], m.observed) for m in maps},
@@ -152,7 +152,7 @@ def judge(results: list[dict], places: dict[str, tuple[float, float]]) -> tuple[
 ROADGEO = [sys.executable, "-m", "roadgeo"]
 
 
-def _places(data: Path, reference: Path) -> dict[str, tuple[float, float]]:
+def read_places(data: Path, reference: Path) -> dict[str, tuple[float, float]]:
     crs = geopandas.read_file(reference, layer="roads", rows=1).crs
     to_map = Transformer.from_crs(26986, crs, always_xy=True)
     with (data / "tiles.csv").open() as lines:

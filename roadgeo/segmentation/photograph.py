@@ -21,7 +21,7 @@ if TYPE_CHECKING:
 __all__ = ["MAX_SIDE", "Photograph", "find_ground", "find_voids", "open_photograph"]
 
 MIN_SIDE, MAX_SIDE = 64, 60_000
-_STRIP_PIXELS = 1 << 23  # read at a time
+_STRIP_PIXELS = 1 << 21  # read at a time
 _SAMPLE_SIDE = 1024  # deep values are stretched by what a sample of this size holds
 
 #: A void is a plain white or black area (JPEG smears its values and its edge), larger than any white roof.

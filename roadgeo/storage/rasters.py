@@ -43,6 +43,7 @@ _NAMES = "GeoTIFF, PNG, JPEG, JPEG 2000, WebP, BMP, PNM, GIF, Erdas Imagine"
 #: A block is decoded whole: more than this for one is a bomb, or should be tiled.
 _MAX_BLOCK_BYTES = 2 << 30
 _MAX_SIDECAR = 1 << 20
+_CACHE_BYTES = 256 << 20  # of decoded blocks; GDAL's own is a twentieth of the machine's memory
 _HEAD_BYTES = 8192
 
 
@@ -171,7 +172,10 @@ def _opened(path: str, drivers: list[str], remote: bool) -> Iterator[DatasetRead
     from rasterio.errors import RasterioIOError
 
     may_fetch = remote or drivers == ["VRT"]
-    with rasterio.Env(**{key: value for key, value in SEALED.items() if not (may_fetch and key in NETWORK)}):
+    with rasterio.Env(
+        GDAL_CACHEMAX=_CACHE_BYTES,
+        **{key: value for key, value in SEALED.items() if not (may_fetch and key in NETWORK)},
+    ):
         for last, driver in enumerate(drivers, 1 - len(drivers)):
             try:
                 dataset = rasterio.open(path, driver=driver)
