@@ -24,7 +24,7 @@ __all__ = ["SCHEMA", "Evidence", "Location", "Place", "Reason", "Seconds", "Seen
 
 SCHEMA = "roadgeo.location/1"
 
-Status = Literal["located", "ambiguous", "not_located"]
+Status = Literal["located", "ambiguous", "not_located", "error"]
 
 
 class Reason(StrEnum):
@@ -161,6 +161,8 @@ class Location:
         The best other places on any of the references, best first, in the CRS of the best one.
     options : dict or None
         What was asked, as far as it differs from the usual, in plain values; None: not told.
+    command : str
+        The command line that makes this result again; "" where another program asked.
     reference_digest : str
         Of the roads of the reference; "" where it has no file.
     """
@@ -190,6 +192,7 @@ class Location:
     stats: Stats = field(default_factory=Stats)
     options: dict[str, Any] | None = field(default=None, repr=False)
     reference_digest: str = ""
+    command: str = field(default="", repr=False)
     evidence: Evidence | None = None
     seen: Seen | None = field(default=None, repr=False)
     reason_code: Reason = Reason.NOTHING_STANDS_OUT
@@ -300,6 +303,7 @@ class Location:
             "reference_digest": self.reference_digest or None,
             "attribution": self.attribution,
             "options": self.options,
+            "command": self.command or None,
             "crs": self.crs,
             "size": None if self.size is None else list(self.size),
             "homography": rows(self.homography),

@@ -67,6 +67,7 @@ class LazyGroup(click.Group):
             near = difflib.get_close_matches(args[0], COMMANDS, n=1)
             hint = f"Did you mean {near[0]}?" if near else ""
             raise click.UsageError(f"No such command {args[0]!r}. {hint}".strip(), ctx)
+        ctx.meta["roadgeo.arguments"] = list(args)  # see `cli.command_line`
         return super().resolve_command(ctx, args)
 
     def format_commands(self, ctx: click.Context, formatter: click.HelpFormatter) -> None:  # noqa: ARG002

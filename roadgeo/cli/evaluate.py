@@ -15,6 +15,7 @@ from typing import TYPE_CHECKING, Any, Literal
 import click
 from click.core import ParameterSource
 
+from roadgeo.cli.command_line import made_by
 from roadgeo.cli.hints import hint_options, make_options
 from roadgeo.cli.progress import count_up
 from roadgeo.cli.queries import QUERY_OPTIONS, query_options, query_sets
@@ -190,20 +191,28 @@ def _evaluate(
 
     truths = [trial.truth for trial in trials]
     evaluation = evaluate(truths, [trial.answer for trial in trials], settings, radius)
+    document = evaluation.to_dict() | _made_of(locator)
     if out_dir is not None:
         from roadgeo.evaluation.report import render_report
         from roadgeo.storage.files import write_text
 
         title = f"{settings['reference']}: {len(trials)} masks"
-        write_text(out_dir / "evaluation.json", json.dumps(evaluation.to_dict(), indent=1) + "\n")
+        write_text(out_dir / "evaluation.json", json.dumps(document, indent=1) + "\n")
         write_text(out_dir / "report.html", render_report(evaluation, truths, title))
     if as_json:
-        click.echo(json.dumps({name: part for name, part in evaluation.to_dict().items() if name != "scores"}))
+        click.echo(json.dumps({name: part for name, part in document.items() if name != "scores"}))
     elif not quiet:
         _print(evaluation)
         earlier = f" ({before} of them recorded before)" if before else ""
         where = f"; see {out_dir}" if out_dir else ""
         click.echo(f"{len(trials)} masks{earlier} in {elapsed:.1f} s{where}", err=True)
+
+
+def _made_of(locator: ReferenceLocator) -> dict[str, Any]:
+    """Return what a JSON says of its making."""
+    from roadgeo.reference.files import reference_digest
+
+    return made_by() | {"reference_digest": ", ".join(map(reference_digest, locator.references)) or None}
 
 
 def _recorded(record: Path | None) -> int:
@@ -239,7 +248,7 @@ def _write_map(survey: Survey, as_json: bool, quiet: bool) -> None:
     """Make the map of localizability; print how much of it promises what."""
     from roadgeo.evaluation.survey import write_survey
 
-    summary, files = write_survey(survey, survey.out_dir or Path())
+    summary, files = write_survey(survey, survey.out_dir or Path(), _made_of(survey.locator))
     if as_json:
         click.echo(json.dumps(summary))
         return

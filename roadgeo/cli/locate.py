@@ -11,6 +11,7 @@ from typing import TYPE_CHECKING, Any, Literal, TypeVar
 import click
 
 from roadgeo.cli import ERROR, NOT_LOCATED
+from roadgeo.cli.command_line import said_options
 from roadgeo.cli.folders import make_folder
 from roadgeo.cli.hints import HINTS, hint_options, make_options, refuse_swapped
 from roadgeo.cli.parameters import Plugin, verbosity_options
@@ -37,6 +38,9 @@ if TYPE_CHECKING:
 __all__ = ["describe", "locate_command", "pair_images"]
 
 Command = TypeVar("Command", bound=Callable[..., Any])
+
+#: Options that change nothing of a result, or that are said mask by mask.
+_OF_NO_ACCOUNT = {"as_json", "images", "jobs", "quiet", "skip_existing", "verbose"}
 
 _HELP = """Find where road MASKs lie on a map, and draw them there.
 
@@ -260,6 +264,7 @@ def locate_command(
             reading=reading,
             skip_existing=skip_existing,
             jobs=jobs,
+            command=said_options(_OF_NO_ACCOUNT),
             say=say,
         ):
             outcomes.append(outcome)

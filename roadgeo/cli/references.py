@@ -8,8 +8,13 @@ from typing import Any
 import click
 
 from roadgeo.cli import ERROR
+from roadgeo.cli.command_line import made_by
 
 __all__ = ["check_command", "info_command", "list_command", "remove_command"]
+
+
+#: Of what `info --json` and `list --json` print.
+SCHEMA = "roadgeo.reference-info/1"
 
 
 @click.command("info", short_help="Describe a reference.")
@@ -39,7 +44,7 @@ def info_command(reference: str | None, plugins: bool, as_json: bool) -> None:
 
     described = describe_reference(resolve_reference(reference))
     if as_json:
-        click.echo(json.dumps(described, indent=2))
+        click.echo(json.dumps({"schema": SCHEMA, **made_by(), **described}, indent=2))
         return
     width = max(len(label) for label, _ in _lines(described))
     for label, value in _lines(described):
@@ -121,7 +126,8 @@ def list_command(as_json: bool) -> int:
             click.echo(f"Error: {error}", err=True)
             status = ERROR
             continue
-        click.echo(json.dumps(described) if as_json else f"{path.stem:<{width}}  {_summary(described)}")
+        whole = {"schema": SCHEMA, **made_by(), **described}
+        click.echo(json.dumps(whole) if as_json else f"{path.stem:<{width}}  {_summary(described)}")
     return status
 
 

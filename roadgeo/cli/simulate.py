@@ -7,6 +7,7 @@ from typing import Any
 
 import click
 
+from roadgeo.cli.command_line import made_by
 from roadgeo.cli.progress import count_up
 from roadgeo.cli.queries import query_options, query_sets
 
@@ -55,7 +56,7 @@ def simulate_command(reference: str, out_dir: Path, roads: Path | None, quiet: b
                 write_bytes(out_dir / query.truth.file, cv2.imencode(".png", query.mask)[1].tobytes())
                 truths.append(query.truth)
                 advance(simulation.kind)
-    write_truth(out_dir, truths)
+    write_truth(out_dir, truths, made_by())
     if not quiet:
         click.echo(
             f"{len(truths)} masks in {out_dir}; next: roadgeo evaluate {reference} --queries {out_dir}", err=True

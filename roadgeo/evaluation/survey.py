@@ -120,8 +120,15 @@ class Survey:
         return summary
 
 
-def write_survey(survey: Survey, out_dir: Path) -> tuple[dict[str, Any], list[Path]]:
+def write_survey(
+    survey: Survey, out_dir: Path, told: Mapping[str, Any] | None = None
+) -> tuple[dict[str, Any], list[Path]]:
     """Make the map, and write it as GeoTIFF with a style for QGIS, as picture and in figures.
+
+    Parameters
+    ----------
+    told : mapping, optional
+        Plain values that the figures are to say besides: version, command and so on.
 
     Returns
     -------
@@ -142,7 +149,7 @@ def write_survey(survey: Survey, out_dir: Path) -> tuple[dict[str, Any], list[Pa
     write_bytes(files[0], to_geotiff(found))
     write_text(files[1], to_qml())
     write_bytes(files[2], draw_localizability(network, found, title))
-    summary = survey.summarize(found)
+    summary = {**survey.summarize(found), "settings": survey.settings, **(told or {})}
     write_text(files[3], json.dumps(summary, indent=1) + "\n")
     return summary, files
 

@@ -24,7 +24,7 @@ import csv
 import io
 import json
 import os
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
@@ -86,8 +86,8 @@ class Truth:
         return Homography(self.homography)(np.array(self.size) / 2)
 
 
-def write_truth(folder: str | os.PathLike[str], truths: Sequence[Truth]) -> None:
-    """Write `truth.csv`, `truth.json` and `footprints.gpkg` into a folder.
+def write_truth(folder: str | os.PathLike[str], truths: Sequence[Truth], told: Mapping[str, Any] | None = None) -> None:
+    """Write `truth.csv`, `truth.json` and `footprints.gpkg` into a folder; `told` are further values for the JSON.
 
     Raises
     ------
@@ -96,7 +96,7 @@ def write_truth(folder: str | os.PathLike[str], truths: Sequence[Truth]) -> None
     """
     target = Path(folder)
     write_text(target / "truth.csv", _to_csv(truths))
-    write_text(target / "truth.json", _to_json(truths))
+    write_text(target / "truth.json", _to_json(truths, told or {}))
     if truths:
         write_layers(target / "footprints.gpkg", [_to_layer(truths)])
 
@@ -172,8 +172,10 @@ def truth_from_record(record: dict[str, Any], crs: str | None = None) -> Truth:
     )
 
 
-def _to_json(truths: Sequence[Truth]) -> str:
-    return json.dumps({"schema": SCHEMA, "queries": [truth_to_record(truth) for truth in truths]}, indent=1) + "\n"
+def _to_json(truths: Sequence[Truth], told: Mapping[str, Any]) -> str:
+    return (
+        json.dumps({"schema": SCHEMA, **told, "queries": [truth_to_record(truth) for truth in truths]}, indent=1) + "\n"
+    )
 
 
 def _to_csv(truths: Sequence[Truth]) -> str:

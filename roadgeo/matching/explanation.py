@@ -3,7 +3,8 @@
 `Explanation.to_dict` gives schema `roadgeo.explanation/1`:
 
 ============  ==========================================================================================================
-query         as in `Location`, and so are `status` and `reason`
+query         as in `Location`, and so are `status`, `reason`, `reason_code`, `version`, `options`, `command` and
+              `reference_digest`
 seen          `intersections` (all of them usable up to `SceneOptions.max_intersections`), how many of them have two
               tangents or more, `roads`, their length and the frame's size in pixels, the share of it that was observed
 searches      one for each reference, in the order in which they were searched:
@@ -38,6 +39,7 @@ from typing import Any
 import numpy as np
 
 from roadgeo._arrays import BoolArray, FloatArray, IntArray
+from roadgeo._version import __version__
 from roadgeo.geometry.camera import CameraFault, CameraOptions, pose, sampling
 from roadgeo.geometry.projection import to_lonlat
 from roadgeo.kernels.roads import forward_distances
@@ -283,9 +285,14 @@ class Explanation:
         location, scene = self.location, self.scene
         return {
             "schema": SCHEMA,
+            "version": __version__,
             "query": location.query,
             "status": location.status,
             "reason": location.reason,
+            "reason_code": location.reason_code.value,
+            "reference_digest": location.reference_digest or None,
+            "options": location.options,
+            "command": location.command or None,
             "seen": {
                 "size": list(scene.size),
                 "intersections": len(scene.intersections),

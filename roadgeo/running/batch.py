@@ -8,6 +8,7 @@ from __future__ import annotations
 import dataclasses
 import json
 import os
+import shlex
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from pathlib import Path
@@ -15,7 +16,7 @@ from time import perf_counter
 from typing import TYPE_CHECKING, Any, Literal
 
 from roadgeo._progress import Say, say_nothing
-from roadgeo.errors import IndexFormatError, RoadgeoError
+from roadgeo.errors import IndexFormatError, ModelError, OutputError, PluginError, RoadgeoError
 from roadgeo.outputs.registry import JSON, REPORT
 from roadgeo.running.probability_files import is_ours, keep_probability, probability_path
 from roadgeo.running.processes import run
@@ -23,6 +24,7 @@ from roadgeo.running.tasks import Task
 
 if TYPE_CHECKING:
     from roadgeo.geometry.mask import RoadMask
+    from roadgeo.location import Status
     from roadgeo.outputs.location_files import OutputOptions
     from roadgeo.reference.reference import Reference
     from roadgeo.running.queries import QueryOptions
@@ -35,8 +37,6 @@ __all__ = [
     "open_references",
     "write_overview",
 ]
-
-Status = Literal["located", "ambiguous", "not_located", "error"]
 
 
 def open_references(names: Iterable[str], say: Say = say_nothing) -> list[Reference]:
@@ -139,6 +139,7 @@ def locate_masks(
     reading: ReadOptions | None = None,
     skip_existing: bool = False,
     jobs: int = 1,
+    command: Sequence[str] = (),
     say: Say = say_nothing,
 ) -> Iterator[Outcome]:
     """Locate masks and write their results; yield what became of each in the order of the tasks.
@@ -153,6 +154,8 @@ def locate_masks(
         Keep results of the same question that are whole and younger than their masks.
     jobs : int
         Processes; the results do not depend on it.
+    command : sequence of str
+        Options that ask for the same on the command line, for the results to name.
     say
         Told how far a photograph's roads are found; other processes tell nothing.
 
@@ -171,6 +174,7 @@ def locate_masks(
         outputs or OutputOptions(),
         reading or ReadOptions(),
         skip_existing,
+        tuple(command),
         say if jobs == 1 or len(tasks) == 1 else say_nothing,
     )
     return run(tasks, work, jobs)
@@ -186,6 +190,7 @@ class _Locating:
     outputs: OutputOptions
     reading: ReadOptions
     skip_existing: bool
+    command: tuple[str, ...]
     say: Say
 
     def prepare(self) -> Callable[[Task], Outcome]:
@@ -201,7 +206,24 @@ class _Locating:
 
     def give_up(self, task: Task, reason: str) -> Outcome:
         """Make the outcome of a mask that could not be worked on."""
-        return _failed(task, reason)
+        return self._failed(task, "FAULT", reason)
+
+    def _failed(self, task: Task, code: str, reason: str) -> Outcome:
+        """Describe a failure, of which `code` is the name in `Reason`, with the keys of every other result."""
+        from roadgeo.location import Location, Reason
+
+        location = Location(
+            task.mask, "error", reason, options=self._told(), command=self._command(task), reason_code=Reason[code]
+        )
+        return Outcome("error", location.to_dict())
+
+    def _command(self, task: Task) -> str:
+        """Return the command line that makes one result again."""
+        if not self.command:
+            return ""
+        photo = self.reading.images.get(task.mask)
+        drawn = [f"--image={photo}"] if photo else []
+        return shlex.join(["roadgeo", "locate", task.mask, *self.reading.fused_with, *drawn, *self.command])
 
     def _told(self) -> dict[str, Any]:
         """Return the options that differ from the usual ones, as plain values: what the JSON says was asked."""
@@ -223,14 +245,15 @@ class _Locating:
             earlier = self._earlier(task, asked) if self.skip_existing else None
             return earlier or self._locate(task, asked)
         except RoadgeoError as error:
-            return _failed(task, str(error))
+            return self._failed(task, _code_of(error), str(error))
         except MemoryError:
-            return _failed(task, f"{task.mask}: more memory is needed than there is; reduce it or cut it up")
+            reason = f"{task.mask}: more memory is needed than there is; reduce it or cut it up"
+            return self._failed(task, "MEMORY", reason)
         except Exception as error:  # whatever libraries raise: cv2.error, errors of GDAL, of plugins ...
             if os.environ.get("ROADGEO_TRACEBACK"):
                 raise
             what = " ".join(f"{type(error).__name__}: {error}".split())
-            return _failed(task, f"{task.mask}: {what}; this is a fault of roadgeo, please report it")
+            return self._failed(task, "FAULT", f"{task.mask}: {what}; this is a fault of roadgeo, please report it")
 
     def _earlier(self, task: Task, asked: _Asked) -> Outcome | None:
         """Return what an earlier run found, if that is whole, the answer to the same question, and younger than it."""
@@ -273,9 +296,11 @@ class _Locating:
             location,
             seconds=replace(spent, open=asked.seconds, read=max(reading_s, 0.0)),
             options=asked.options,
+            command=self._command(task),
             reference_digest=asked.digest(location.reference),
         )
         paths, photo = output_paths(self.out_dir, task.stem), self.reading.photo(task, sighting.of_photograph)
+        explanation = explanation and replace(explanation, location=location)
         kept = keep_probability(sighting.probability, paths)
         indexes = [one.index for one in asked.references]
         outputs = self.outputs if mask.roads.any() else _without_views(self.outputs)
@@ -341,10 +366,17 @@ def _changed(options: Any, usual: Any) -> dict[str, Any]:
     return changed
 
 
-def _failed(task: Task, reason: str) -> Outcome:
-    from roadgeo.location import SCHEMA
+#: What each kind of error means to programs: names in `location.Reason`.
+_CODES = (
+    (IndexFormatError, "NO_REFERENCE"),
+    (OutputError, "NOT_WRITTEN"),
+    (ModelError, "PLUGIN"),
+    (PluginError, "PLUGIN"),
+)
 
-    return Outcome("error", {"schema": SCHEMA, "query": task.mask, "status": "error", "reason": reason})
+
+def _code_of(error: RoadgeoError) -> str:
+    return next((code for kind, code in _CODES if isinstance(error, kind)), "INVALID")
 
 
 def _scale(picture: str, mask: RoadMask) -> float:

@@ -3,6 +3,7 @@
 import json
 
 import cv2
+import jsonschema
 import numpy as np
 import pytest
 from worlds.towns import lattice_town
@@ -12,6 +13,7 @@ from roadgeo.evaluation.truth import read_truth
 from roadgeo.reference.network_file import as_stored, write_network
 from roadgeo.roads.intersections import find_intersections
 from roadgeo.roads.network import RoadNetwork
+from roadgeo.schemas import read_schema
 
 SMALL = ["--size", "500", "--gsd", "1:1", "--tilt", "0:20", "--intersections", "10:99"]
 
@@ -39,12 +41,14 @@ def test_simulate_writes_masks_and_truth(town, tmp_path):
         assert (tmp_path / "a" / truth.file).read_bytes() == (tmp_path / "b" / truth.file).read_bytes()
     assert (tmp_path / "a" / "truth.csv").read_text() == (tmp_path / "b" / "truth.csv").read_text()
     assert (tmp_path / "a" / "footprints.gpkg").is_file()
+    jsonschema.validate(json.loads((tmp_path / "a" / "truth.json").read_text()), read_schema("truth"))
 
 
 def figures(value):
     """All figures but times, mask by mask too."""
     if isinstance(value, dict):
-        return {name: figures(part) for name, part in value.items() if name not in ("compute_s", "seconds")}
+        left_out = ("compute_s", "seconds", "command")
+        return {name: figures(part) for name, part in value.items() if name not in left_out}
     return [figures(part) for part in value] if isinstance(value, list) else value
 
 
@@ -71,7 +75,12 @@ def test_evaluate_gives_the_same_figures_however_it_is_run(town, tmp_path, capsy
 
     assert run("evaluate", town, *options, "--json", "-o", tmp_path / "once") == 0  # from the record
     printed = json.loads(capsys.readouterr().out)
-    assert printed == {name: part for name, part in once.items() if name != "scores"}
+    for document in (once, printed):
+        jsonschema.validate(document, read_schema("evaluation"))
+    assert printed | {"command": ""} == {name: part for name, part in once.items() if name != "scores"} | {
+        "command": ""
+    }
+    assert f"-o {tmp_path / 'once'}" in once["command"]
 
 
 def test_an_interrupted_run_says_that_it_can_go_on(town, tmp_path, capsys, monkeypatch):
@@ -112,13 +121,15 @@ def test_a_map_is_written_styled(town, tmp_path, capsys, monkeypatch):
     assert run("evaluate", town, *options, "-o", tmp_path) == 0
     assert {path.suffix for path in tmp_path.glob("town_localizability.*")} == {".tif", ".qml", ".png", ".json"}
     summary = json.loads((tmp_path / "town_localizability.json").read_text())
+    jsonschema.validate(summary, read_schema("localizability"))
     assert sum(entry["area_share"] for entry in summary["classes"]) == pytest.approx(1.0)
     assert "would be located" in capsys.readouterr().out
-    pictures = [(tmp_path / f"town_localizability.{kind}").read_bytes() for kind in ("tif", "png", "json")]
+    pictures = [(tmp_path / f"town_localizability.{kind}").read_bytes() for kind in ("tif", "png")]
     monkeypatch.setattr("roadgeo.evaluation.trials.simulate_query_at", None)  # from the record
     monkeypatch.setattr("roadgeo.evaluation.trials.simulate_query", None)
     assert run("evaluate", town, *options, "-j", 2, "-o", tmp_path) == 0
-    assert [(tmp_path / f"town_localizability.{kind}").read_bytes() for kind in ("tif", "png", "json")] == pictures
+    assert [(tmp_path / f"town_localizability.{kind}").read_bytes() for kind in ("tif", "png")] == pictures
+    assert figures(json.loads((tmp_path / "town_localizability.json").read_text())) == figures(summary)
     capsys.readouterr()
     assert run("evaluate", town, *options, "--seed", 1, "-o", tmp_path) == 1
     assert "another run" in capsys.readouterr().err

@@ -289,6 +289,8 @@ def _details(subject: Shown) -> list[tuple[str, str]]:
         matrix = "\n".join("  ".join(f"{value: .9e}" for value in row) for row in location.homography)
         note = "takes (column, row, 1) to the CRS; the middle of the first pixel is (0.5, 0.5)"
         rows.append(("Homography", f"<pre>{matrix}</pre><small>{note}</small>"))
+    if location.command:
+        rows.append(("Made by", f"<code>{html.escape(location.command)}</code>"))
     return rows
 
 
