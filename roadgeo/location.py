@@ -161,6 +161,8 @@ class Location:
         The best other places on any of the references, best first, in the CRS of the best one.
     options : dict or None
         What was asked, as far as it differs from the usual, in plain values; None: not told.
+    stated_offset_m : float or None
+        How far the middle lies from where the mask's own georeference puts it; None where it has none.
     command : str
         The command line that makes this result again; "" where another program asked.
     reference_digest : str
@@ -193,6 +195,7 @@ class Location:
     options: dict[str, Any] | None = field(default=None, repr=False)
     reference_digest: str = ""
     command: str = field(default="", repr=False)
+    stated_offset_m: float | None = None
     evidence: Evidence | None = None
     seen: Seen | None = field(default=None, repr=False)
     reason_code: Reason = Reason.NOTHING_STANDS_OUT
@@ -316,6 +319,7 @@ class Location:
             "tilt_source": self.tilt_source,
             "corner_sigma_m": rows(self.corner_sigma_m),
             "corner_covariance_m2": rows(self.corner_covariance_m2),
+            "stated_offset_m": self.stated_offset_m,
             "rmse_m": rmse_m,
             "rmse_px": rmse_px,
             "n_intersections": self.n_intersections,

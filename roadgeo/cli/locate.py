@@ -341,6 +341,8 @@ def describe(outcome: Outcome) -> str:
     else:
         where = format_lonlat(found["center"]["lon"], found["center"]["lat"])
         text = f"{found['query']}: {status} at {where} on {found['reference']}: {found['reason']}"
+    if found.get("stated_offset_m") is not None:
+        text += f"\n  the mask's own georeference puts its middle {found['stated_offset_m']:,.1f} m from there"
     if outcome.photo and outcome.photo[0] != found["query"]:
         text += f"\n  drew {outcome.photo[0]}, {outcome.photo[1]:g} times the mask's size"
     if outcome.removed:

@@ -24,7 +24,7 @@ from roadgeo.running.tasks import Task
 
 if TYPE_CHECKING:
     from roadgeo.geometry.mask import RoadMask
-    from roadgeo.location import Status
+    from roadgeo.location import Location, Status
     from roadgeo.outputs.location_files import OutputOptions
     from roadgeo.reference.reference import Reference
     from roadgeo.running.queries import QueryOptions
@@ -297,6 +297,7 @@ class _Locating:
             seconds=replace(spent, open=asked.seconds, read=max(reading_s, 0.0)),
             options=asked.options,
             command=self._command(task),
+            stated_offset_m=_off_stated(task.mask, location),
             reference_digest=asked.digest(location.reference),
         )
         paths, photo = output_paths(self.out_dir, task.stem), self.reading.photo(task, sighting.of_photograph)
@@ -377,6 +378,18 @@ _CODES = (
 
 def _code_of(error: RoadgeoError) -> str:
     return next((code for kind, code in _CODES if isinstance(error, kind)), "INVALID")
+
+
+def _off_stated(mask: str, location: Location) -> float | None:
+    """Return how far a found middle lies from where the mask's own georeference puts it; None without one."""
+    from roadgeo.sources.georeference import read_stated_middle
+
+    stated = None if location.center is None else read_stated_middle(mask)
+    if stated is None or location.center is None:
+        return None
+    from pyproj import Geod
+
+    return float(Geod(ellps="WGS84").inv(*stated, location.center.lon, location.center.lat)[2])
 
 
 def _scale(picture: str, mask: RoadMask) -> float:

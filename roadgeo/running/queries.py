@@ -24,6 +24,7 @@ from roadgeo.matching.options import LocateOptions
 from roadgeo.plugins import SEGMENTERS, call_plugin
 from roadgeo.reference.reference import Reference
 from roadgeo.running.looks import Locate, Look, Sighting, locate_looks
+from roadgeo.running.mirroring import ask_mirrored
 from roadgeo.segmentation.network import DEFAULT_MODEL, Network, load_network
 from roadgeo.segmentation.photograph import Photograph, open_photograph
 from roadgeo.segmentation.probability import NODATA, ProbabilityMap, fuse
@@ -100,7 +101,8 @@ def locate_query(
     wants_mask = query.segment == "never" or (query.segment == "auto" and not has_plugin)
     if wants_mask and not query.fused_with:
         try:
-            return _locate_mask(path, references, options, query, how)
+            sighting = _locate_mask(path, references, options, query, how)
+            return ask_mirrored(sighting, references, options)
         except PhotographError:
             if query.segment == "never":
                 raise

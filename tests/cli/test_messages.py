@@ -1,5 +1,6 @@
 """What new users meet first: files that are almost right, and what they are told."""
 
+import json
 import struct
 import zlib
 from pathlib import Path
@@ -109,3 +110,28 @@ def test_several_thresholds_are_tried_before_a_refusal(porto: str, capfd: pytest
     cv2.imwrite("soft.png", cv2.GaussianBlur(soft, (0, 0), 6))
     assert locate("soft.png", porto) == 3
     assert "looks taken)" in capfd.readouterr().out
+
+
+def test_a_mirrored_mask_is_refused_with_the_reason(porto: str, capfd: pytest.CaptureFixture[str]) -> None:
+    cv2.imwrite("mirrored.png", drone()[:, ::-1])
+    assert locate("mirrored.png", porto, "--json", "-q") == 3
+    refused = json.loads(capfd.readouterr().out)
+    assert refused["reason_code"] == "mirrored"
+    assert refused["homography"] is None
+    assert "turned over, left to right, it lies at 41.15" in refused["reason"]
+    assert sorted(path.name for path in Path().iterdir()) == ["mirrored.png", "mirrored_location.json"]
+
+
+def test_the_place_that_a_mask_states_is_compared(porto: str, capfd: pytest.CaptureFixture[str]) -> None:
+    """A mask that has a georeference, which is 120 m off in the east."""
+    assert locate(str(DRONE), porto, "--json", "-q") == 0
+    found = json.loads(capfd.readouterr().out)
+    assert found["stated_offset_m"] is None
+    height, width = drone().shape
+    x, y = found["center"]["x"] + 120.0, found["center"]["y"]
+    place = rasterio.Affine(1, 0, x - width / 2, 0, -1, y + height / 2)
+    profile = {"driver": "GTiff", "count": 1, "dtype": "uint8", "height": height, "width": width}
+    with rasterio.open("stated.tif", "w", **profile, crs=found["crs"], transform=place) as dataset:
+        dataset.write(drone(), 1)
+    assert locate("stated.tif", porto) == 0
+    assert "georeference puts its middle 120." in capfd.readouterr().out
