@@ -2,7 +2,7 @@
 
 >>> import roadgeo
 >>> ref = roadgeo.build_reference(roads_gdf)  # or roadgeo.open_reference("boston.gpkg")
->>> loc = roadgeo.locate("image_mask.tif", ref)
+>>> loc = roadgeo.locate("image_mask.tif", ref, gsd=(0.3, 0.6))  # or an array, a PIL image, a photograph ...
 >>> loc.status, loc.center, loc.log10_odds
 
 Names are imported when they are first used, so that `import roadgeo` costs nothing.
@@ -16,14 +16,16 @@ from typing import TYPE_CHECKING, Any
 from roadgeo._version import __version__
 
 if TYPE_CHECKING:
+    from roadgeo.api import Answer, locate
     from roadgeo.errors import RoadgeoError
     from roadgeo.geometry.mask import RoadMask
     from roadgeo.location import Location
     from roadgeo.matching.options import LocateOptions
     from roadgeo.reference.reference import BuildOptions, Reference, open_reference
-    from roadgeo.workflows import build_reference, explain, locate
+    from roadgeo.workflows import build_reference, explain
 
 __all__ = [
+    "Answer",
     "BuildOptions",
     "LocateOptions",
     "Location",
@@ -38,6 +40,7 @@ __all__ = [
 ]
 
 _HOMES = {
+    "Answer": "api",
     "BuildOptions": "reference.reference",
     "LocateOptions": "matching.options",
     "Location": "location",
@@ -46,7 +49,7 @@ _HOMES = {
     "RoadgeoError": "errors",
     "build_reference": "workflows",
     "explain": "workflows",
-    "locate": "workflows",
+    "locate": "api",
     "open_reference": "reference.reference",
 }
 

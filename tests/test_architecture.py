@@ -24,7 +24,7 @@ STOREYS_TEXT = """
     workflows   workflows
     running     running
     evaluation  evaluation
-    faces       cli qgis demo __main__ __init__
+    faces       api cli qgis demo __main__ __init__
 """
 STOREYS = {name: storey for storey, line in enumerate(STOREYS_TEXT.split("\n")) for name in line.split()[1:]}
 

@@ -52,13 +52,18 @@ def write_world_file(path: Path, subject: Subject) -> None:
     path.write_text("".join(f"{value!r}\n" for value in values), encoding="ascii")
 
 
+def warp_mask(subject: Subject) -> AnyArray:
+    """Draw the mask on the rows and columns of `subject.grid`: OUTSIDE the footprint, GROUND or ROAD in it."""
+    return warp(_labels(subject.mask), subject.place.homography, subject.grid, subject.target.to_place)
+
+
 def _write_mask(path: Path, subject: Subject) -> None:
     """Draw the mask on the map, with a colour table, nodata outside the footprint."""
     import rasterio
     import rasterio.shutil
     from rasterio.enums import Resampling
 
-    grid, place = subject.grid, subject.place
+    grid = subject.grid
     size = grid.resolution
     profile = {
         "driver": "MEM",
@@ -71,7 +76,7 @@ def _write_mask(path: Path, subject: Subject) -> None:
         "transform": rasterio.Affine(size, 0.0, grid.west, 0.0, -size, grid.north),
     }
     with rasterio.MemoryFile(ext="tif") as optimized, rasterio.open("", "w", **profile) as plain:
-        plain.write(warp(_labels(subject.mask), place.homography, grid, subject.target.to_place), 1)
+        plain.write(warp_mask(subject), 1)
         plain.write_colormap(1, {value: _rgba(color) for value, (color, _, _) in PALETTE.items()})
         plain.update_tags(**_tags(subject))
         # Reduced in memory: left to the COG driver, they are written, compressed and read again on the way.

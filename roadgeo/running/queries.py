@@ -16,6 +16,7 @@ from typing import Literal
 
 import numpy as np
 
+from roadgeo._arrays import AnyArray
 from roadgeo._progress import Say, say_nothing
 from roadgeo.errors import MaskError, PhotographError, PluginError
 from roadgeo.geometry.mask import RoadMask
@@ -77,7 +78,7 @@ class QueryOptions:
 
 
 def locate_query(
-    path: str,
+    path: str | AnyArray,
     references: Sequence[Reference],
     options: LocateOptions | None = None,
     query: QueryOptions | None = None,
@@ -85,7 +86,7 @@ def locate_query(
     how: Locate = locate,
     say: Say = say_nothing,
 ) -> Sighting:
-    """Locate a mask or a photograph.
+    """Locate a mask or a photograph; an array, (H, W) or (H, W, bands), is a mask.
 
     Raises
     ------
@@ -104,8 +105,10 @@ def locate_query(
             sighting = _locate_mask(path, references, options, query, how)
             return ask_mirrored(sighting, references, options)
         except PhotographError:
-            if query.segment == "never":
+            if query.segment == "never" or not isinstance(path, str):
                 raise
+    if not isinstance(path, str):
+        raise MaskError("the roads of a photograph are found in files only: save it as GeoTIFF or PNG first")
     sighting = _locate_photograph((path, *query.fused_with), references, options, query, how, say)
     return replace(sighting, of_photograph=True)
 
@@ -116,7 +119,7 @@ def is_model(segmenter: str) -> bool:
 
 
 def _locate_mask(
-    path: str, references: Sequence[Reference], options: LocateOptions, query: QueryOptions, how: Locate
+    path: str | AnyArray, references: Sequence[Reference], options: LocateOptions, query: QueryOptions, how: Locate
 ) -> Sighting:
     """Locate a mask, or a soft map of roads at the thresholds that its values suggest."""
     with open_mask(path, band=query.band, threshold=query.threshold) as opened:

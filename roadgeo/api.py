@@ -1,0 +1,210 @@
+"""What Python programs call: as the command line does it, but with what they have at hand, and nothing is written."""
+
+from __future__ import annotations
+
+import os
+from collections.abc import Iterable, Sequence
+from dataclasses import dataclass, field, fields, replace
+from pathlib import Path
+from typing import TYPE_CHECKING, Any, TypeAlias
+
+import numpy as np
+
+from roadgeo.errors import NotLocatedError, OutputError
+from roadgeo.geometry.mask import RoadMask
+from roadgeo.location import Location
+from roadgeo.matching.index import ReferenceIndex
+from roadgeo.matching.options import LocateOptions
+from roadgeo.reference.reference import Reference
+
+if TYPE_CHECKING:
+    import xarray as xr
+    from matplotlib.figure import Figure
+
+    from roadgeo.outputs.subject import Subject
+
+__all__ = ["Answer", "locate"]
+
+#: A reference that is open, its file, its name in the library; or several of them.
+References: TypeAlias = "Reference | str | os.PathLike[str] | Iterable[Reference | str | os.PathLike[str]]"
+
+
+@dataclass(frozen=True, repr=False)
+class Answer(Location):
+    """A `Location` with the mask that it is about, and the references that were searched: it can be drawn and written.
+
+    Attributes
+    ----------
+    mask : RoadMask
+        The roads as they were read, or found in a photograph.
+    photo : str or None
+        The photograph, where the query was one.
+    """
+
+    mask: RoadMask = field(default_factory=lambda: RoadMask(np.zeros((1, 1), np.bool_)), repr=False)
+    photo: str | None = None
+    indexes: tuple[ReferenceIndex, ...] = field(default=(), repr=False)
+
+    def write(self, out_dir: str | os.PathLike[str] = ".", also: Sequence[str] = (), stem: str = "") -> list[Path]:
+        """Write the files that `roadgeo locate` writes; return their paths.
+
+        Parameters
+        ----------
+        also : sequence of str
+            Further outputs by name: "overlay", "report", "geojson", "matches" and what else `roadgeo locate --help`
+            lists.
+        stem : str
+            What the names of the files begin with. Default: as the query's file.
+
+        Raises
+        ------
+        OutputError
+            A file cannot be written.
+        PluginError
+            There is no such output.
+        """
+        from roadgeo.outputs.location_files import OutputOptions, write_location
+        from roadgeo.outputs.paths import output_paths
+        from roadgeo.storage.atomic import writing
+
+        with writing(out_dir):
+            Path(out_dir).mkdir(parents=True, exist_ok=True)
+        paths = output_paths(out_dir, stem or Path(self.query).stem or "mask")
+        options = OutputOptions(products=tuple(also))
+        return write_location(self, self.mask, paths, options, self.photo, self.indexes).files
+
+    def plot(self) -> Figure:
+        """Draw the mask and its place on the map, as a matplotlib figure.
+
+        Raises
+        ------
+        NotLocatedError
+            There is no place.
+        OutputError
+            matplotlib is missing.
+        """
+        from roadgeo.outputs.figure import draw_figure, has_matplotlib
+
+        if not has_matplotlib():
+            raise OutputError("plot() needs matplotlib: pip install 'roadgeo[plot]'")
+        subject = self._subject()
+        return draw_figure(self, self.mask, subject.roads, subject.attribution)
+
+    def to_xarray(self) -> xr.DataArray:
+        """Return the mask on the map, dimensions y and x: 0 outside the footprint, 1 ground, 2 road.
+
+        `attrs["crs"]` and `attrs["transform"]` say where it lies.
+
+        Raises
+        ------
+        NotLocatedError
+            There is no place.
+        """
+        import xarray as xr
+
+        from roadgeo.outputs.footprint import warp_mask
+
+        subject = self._subject()
+        grid, values = subject.grid, warp_mask(subject)
+        x = grid.west + grid.resolution * (np.arange(grid.width) + 0.5)
+        y = grid.north - grid.resolution * (np.arange(grid.height) + 0.5)
+        transform = (grid.resolution, 0.0, grid.west, 0.0, -grid.resolution, grid.north)
+        told = {"crs": subject.crs, "transform": transform, "query": self.query, "attribution": subject.attribution}
+        return xr.DataArray(values, {"y": y, "x": x}, ("y", "x"), name="road", attrs=told)
+
+    def _subject(self) -> Subject:
+        from roadgeo.outputs.paths import output_paths
+        from roadgeo.outputs.subject import Subject
+
+        if not self.located:
+            raise NotLocatedError(f"{self.query or 'the mask'} has no place: {self.reason}")
+        return Subject(self, self.mask, output_paths(".", "mask"), indexes=self.indexes)
+
+
+def locate(
+    mask: Any,
+    reference: References = (),
+    options: LocateOptions | None = None,
+    *,
+    gsd: float | tuple[float, float] | None = None,
+    near: tuple[float, float, float] | None = None,
+    max_tilt: float | None = None,
+    north_up: bool | None = None,
+    focal: float | None = None,
+) -> Answer:
+    """Find where a road mask, or a photograph, lies on a map. Nothing is written.
+
+    A mask that is not found is an answer with a reason, not an error.
+
+    >>> location = roadgeo.locate("photo_mask.png", "boston-ma", gsd=(0.3, 0.6))
+    >>> location.status, location.center, location.reason
+
+    Parameters
+    ----------
+    mask : path, array, PIL image, xarray DataArray, rasterio dataset or RoadMask
+        Bright, or 1, where there is road; or the file of a photograph, whose roads are found first. Arrays have the
+        shape (H, W), (H, W, C) or (C, H, W).
+    reference : Reference, path or name, or several
+        Files REF.gpkg, or names in the library. Default: all of the library.
+    options : LocateOptions
+        Everything that can be chosen. The following override it.
+    gsd : float or (float, float)
+        Metres per pixel at the middle, at least and at most; a single value stands for 0.8 to 1.25 times it.
+    near : (longitude, latitude, metres)
+        The middle lies within that distance of this place.
+    max_tilt : float
+        Greatest angle of the camera from the vertical, degrees.
+    north_up : bool
+        The image's up is grid north of the reference, within 5 degrees.
+    focal : float
+        Focal length in pixels of the mask.
+
+    Raises
+    ------
+    MaskError
+        The mask cannot be read or shows no roads.
+    IndexFormatError
+        A reference is missing or unusable.
+    """
+    from roadgeo.running.looks import Sighting
+    from roadgeo.running.pictures import read_picture
+    from roadgeo.running.queries import locate_query
+    from roadgeo.workflows import locate as locate_mask
+
+    references = _open(reference)
+    hints = {"gsd_m": _range(gsd), "max_tilt_deg": max_tilt, "north_up": north_up, "focal_px": focal}
+    options = _with_hints(options or LocateOptions(), hints, near)
+    if isinstance(mask, RoadMask):
+        sighting = Sighting(locate_mask(mask, references, options), mask)
+    else:
+        sighting = locate_query(read_picture(mask), references, options)
+    found = {one.name: getattr(sighting.location, one.name) for one in fields(Location)}
+    indexes = tuple(one.index for one in references)
+    photo = str(mask) if sighting.of_photograph else None
+    return Answer(**found, mask=sighting.mask, photo=photo, indexes=indexes)
+
+
+def _open(reference: References) -> list[Reference]:
+    """Open what is not open yet; nothing named: all of the library."""
+    from roadgeo.running.batch import open_references
+
+    given = [reference] if isinstance(reference, Reference | str | os.PathLike) else list(reference)
+    if not given:
+        return open_references(())
+    return [one if isinstance(one, Reference) else open_references([os.fspath(one)])[0] for one in given]
+
+
+def _range(gsd: float | tuple[float, float] | None) -> tuple[float, float] | None:
+    if gsd is None or isinstance(gsd, tuple):
+        return gsd
+    return 0.8 * float(gsd), 1.25 * float(gsd)
+
+
+def _with_hints(
+    options: LocateOptions, hints: dict[str, Any], near: tuple[float, float, float] | None
+) -> LocateOptions:
+    """Put what is known of the camera in its place."""
+    known = {name: value for name, value in hints.items() if value is not None}
+    camera = replace(options.match.camera, **known)
+    options = replace(options, match=replace(options.match, camera=camera))
+    return options if near is None else replace(options, near=near)

@@ -1,0 +1,91 @@
+"""Pictures that other libraries hold: arrays, PIL images, xarray, rasterio datasets. Nothing of those is imported."""
+
+from __future__ import annotations
+
+import os
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from roadgeo._arrays import AnyArray
+from roadgeo.errors import MaskError
+
+__all__ = ["read_picture"]
+
+#: An axis no longer than this holds bands: a mask has at least 32 rows and columns.
+_MAX_BANDS = 16
+
+
+def read_picture(picture: Any) -> str | AnyArray:
+    """Return what `sources.masks` reads: the path of a file, or an (H, W) or (H, W, bands) array.
+
+    Parameters
+    ----------
+    picture : path, array, PIL image, xarray DataArray or rasterio dataset
+        Of an array with three axes the short one (up to 16) holds the bands: first as rasterio has it (C, H, W), or
+        last as others do (H, W, C). A dataset that is a file is read as that file. What is transparent, masked or
+        nodata was not observed.
+
+    Raises
+    ------
+    MaskError
+        It is none of these.
+    """
+    if isinstance(picture, str | os.PathLike):
+        return os.fspath(picture)
+    if hasattr(picture, "read_masks"):  # rasterio
+        return _read_dataset(picture)
+    if hasattr(picture, "getbands"):  # PIL
+        return _read_pil(picture)
+    if hasattr(picture, "dims") and hasattr(picture, "values"):  # xarray
+        return _read_xarray(picture)
+    array = np.ma.asanyarray(picture)
+    if array.ndim not in (2, 3):
+        raise MaskError(f"an array of shape {array.shape}; expected (rows, columns), with bands first or last")
+    return _bands_last(array)
+
+
+def _bands_last(array: AnyArray) -> AnyArray:
+    """Move bands that come first to the end; a single band goes."""
+    if array.ndim == 3 and array.shape[0] <= _MAX_BANDS < array.shape[2]:
+        array = np.moveaxis(array, 0, 2)
+    return array[..., 0] if array.ndim == 3 and array.shape[2] == 1 else array
+
+
+def _transparent(values: AnyArray, alpha: AnyArray) -> AnyArray:
+    """Mask what is transparent; of black drawn on transparent ground the alpha itself shows the roads."""
+    if not values[alpha > 0].any():
+        return alpha
+    hidden = np.repeat((alpha == 0)[..., None], values.shape[2], axis=2)
+    masked: AnyArray = np.ma.masked_array(values, hidden)
+    return masked
+
+
+def _read_pil(image: Any) -> AnyArray:
+    bands = image.getbands()
+    if bands[0] == "P":
+        image = image.convert("RGBA" if "transparency" in image.info else "RGB")
+        bands = image.getbands()
+    values = np.asarray(image)
+    return _transparent(values[..., :-1], values[..., -1]) if bands[-1] == "A" else values
+
+
+def _read_dataset(dataset: Any) -> str | AnyArray:
+    if Path(dataset.name).is_file():
+        return str(dataset.name)
+    return _bands_last(dataset.read(masked=True))
+
+
+def _read_xarray(data: Any) -> AnyArray:
+    """Take the last two axes, or those called y and x (row and column, latitude and longitude), for the picture's."""
+    names = [str(name).lower() for name in data.dims]
+    rows = next((i for i, name in enumerate(names) if name in {"y", "row", "rows", "lat", "latitude"}), None)
+    columns = next((i for i, name in enumerate(names) if name in {"x", "column", "col", "lon", "longitude"}), None)
+    values = np.asarray(data.values)
+    if rows is None or columns is None:
+        return _bands_last(values)
+    rest = [i for i in range(values.ndim) if i not in (rows, columns)]
+    if len(rest) > 1:
+        raise MaskError(f"an array of the dimensions {', '.join(names)}; choose a time or level first")
+    return _bands_last(np.transpose(values, (rows, columns, *rest)))

@@ -1,0 +1,130 @@
+"""What Python programs call, with all that they may have at hand."""
+
+from pathlib import Path
+
+import cv2
+import numpy as np
+import pytest
+import rasterio
+
+import roadgeo
+from roadgeo.demo import PHOTO, ROADS, demo_masks
+from roadgeo.errors import MaskError, NotLocatedError
+from roadgeo.matching.options import LocateOptions
+
+DRONE = next(mask.path for mask in demo_masks() if mask.path.stem == "drone")
+QUICK = LocateOptions(effort="quick")
+
+pytestmark = pytest.mark.slow
+
+
+@pytest.fixture(scope="module")
+def porto() -> roadgeo.Reference:
+    return roadgeo.build_reference(ROADS, "porto")
+
+
+@pytest.fixture(scope="module")
+def answer(porto: roadgeo.Reference) -> roadgeo.Answer:
+    return roadgeo.locate(DRONE, porto, QUICK)
+
+
+def picture(kind: str, folder: Path) -> object:
+    """The demonstration's mask as another library holds it."""
+    rows = cv2.imread(str(DRONE), cv2.IMREAD_GRAYSCALE)
+    colours = np.repeat(rows[..., None], 3, axis=2)
+    if kind == "PIL":
+        return pytest.importorskip("PIL.Image").open(DRONE)
+    if kind == "PIL, black on transparent":
+        image = pytest.importorskip("PIL.Image")
+        return image.fromarray(np.dstack([np.zeros_like(colours), rows]), "RGBA")
+    if kind.startswith("xarray"):
+        array = pytest.importorskip("xarray").DataArray
+        return array(colours.transpose(2, 1, 0), dims=("band", "x", "y"))
+    if kind == "rasterio":
+        profile = {"driver": "GTiff", "count": 1, "dtype": "uint8", "height": rows.shape[0], "width": rows.shape[1]}
+        with rasterio.open(folder / "a.tif", "w", transform=rasterio.Affine.scale(2), **profile) as dataset:
+            dataset.write(rows, 1)
+        return rasterio.open(folder / "a.tif")
+    shapes = {"HW": rows > 127, "HWC": colours, "CHW": colours.transpose(2, 0, 1), "1HW": rows[None]}
+    return {"text": str(DRONE), "path": DRONE, **shapes}[kind]
+
+
+@pytest.mark.parametrize(
+    "kind",
+    ["text", "HW", "HWC", "CHW", "1HW", "PIL", "PIL, black on transparent", "xarray", "rasterio"],
+)
+def test_a_mask_is_located_however_it_is_held(
+    kind: str, porto: roadgeo.Reference, answer: roadgeo.Answer, tmp_path: Path
+) -> None:
+    found = roadgeo.locate(picture(kind, tmp_path), porto, QUICK)
+    assert found.located
+    np.testing.assert_allclose(found.footprint, answer.footprint, atol=1.0)
+
+
+def test_what_is_no_picture_is_named(porto: roadgeo.Reference) -> None:
+    with pytest.raises(MaskError, match=r"array of shape \(4,\); expected \(rows, columns\)"):
+        roadgeo.locate(np.zeros(4), porto)
+    with pytest.raises(MaskError, match="looks like a photograph"):
+        roadgeo.locate(cv2.imread(str(PHOTO)), porto)
+
+
+def test_references_go_by_path_and_by_name(
+    porto: roadgeo.Reference, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setenv("ROADGEO_LIBRARY", str(tmp_path))
+    porto.save(tmp_path / "porto.gpkg")
+    for reference in ((), "porto", tmp_path / "porto.gpkg", [porto, "porto"]):
+        assert roadgeo.locate(DRONE, reference, QUICK).located
+
+
+def test_what_is_known_narrows_the_search(porto: roadgeo.Reference) -> None:
+    known = {"gsd": 1.0, "near": (-8.6, 41.15, 3000.0), "max_tilt": 50.0}
+    assert roadgeo.locate(DRONE, porto, QUICK, **known).located
+    for wrong, code in (
+        ({"near": (2.35, 48.85, 100.0)}, "few_near"),
+        ({"gsd": (2.0, 3.0), "max_tilt": 5.0, "north_up": True}, "nothing_stands_out"),
+    ):
+        refused = roadgeo.locate(DRONE, porto, QUICK, **wrong)
+        assert (refused.status, refused.reason_code) == ("not_located", code)
+
+
+def test_a_photograph_goes_the_way_of_the_command_line(
+    porto: roadgeo.Reference, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    from roadgeo.running import queries
+    from roadgeo.running.looks import Sighting
+
+    def segmented(paths: tuple[str, ...], *_: object) -> Sighting:
+        return Sighting(roadgeo.Location(paths[0], "not_located", "hardly a road"), roadgeo.RoadMask(np.zeros((9, 9))))
+
+    monkeypatch.setattr(queries, "_locate_photograph", segmented)
+    found = roadgeo.locate(PHOTO, porto)
+    assert (found.reason, found.photo) == ("hardly a road", str(PHOTO))
+
+
+def test_an_answer_is_written_as_by_the_command_line(answer: roadgeo.Answer, tmp_path: Path) -> None:
+    files = answer.write(tmp_path / "out", also=["overlay", "report", "matches"])
+    assert sorted(path.name for path in files) == sorted(path.name for path in (tmp_path / "out").iterdir())
+    assert {"drone_footprint.tif", "drone_overlay.png", "drone_report.html"} <= {path.name for path in files}
+
+
+def test_an_answer_is_an_array_on_the_map(answer: roadgeo.Answer, tmp_path: Path) -> None:
+    pytest.importorskip("xarray")
+    array = answer.to_xarray()
+    (path,) = (path for path in answer.write(tmp_path) if path.suffix == ".tif")
+    with rasterio.open(path) as raster:
+        np.testing.assert_array_equal(array.values, raster.read(1))
+        assert tuple(raster.transform)[:6] == array.attrs["transform"]
+        np.testing.assert_allclose((array.x[0], array.y[0]), raster.xy(0, 0))
+        assert raster.crs.to_epsg() == int(array.attrs["crs"].split(":")[1])
+
+
+def test_an_answer_is_drawn(answer: roadgeo.Answer, porto: roadgeo.Reference, tmp_path: Path) -> None:
+    pytest.importorskip("matplotlib")
+    answer.plot().savefig(tmp_path / "a.png", dpi=60)
+    assert cv2.imread(str(tmp_path / "a.png")).std() > 10
+    refused = roadgeo.locate(DRONE, porto, QUICK, near=(2.0, 48.0, 10.0))
+    for draw in (refused.plot, refused.to_xarray):
+        with pytest.raises(NotLocatedError):
+            draw()
+    assert [path.name for path in refused.write(tmp_path / "refused")] == ["drone_location.json"]
