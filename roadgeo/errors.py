@@ -4,6 +4,8 @@ A message says what was wrong, what was got, what was expected and what to do, o
 found on the map is no error: it is a `Location` with a reason.
 """
 
+from roadgeo._text import visible
+
 __all__ = [
     "CrsError",
     "IndexFormatError",
@@ -20,6 +22,10 @@ __all__ = [
 
 class RoadgeoError(Exception):
     """Base of every error that roadgeo raises on purpose."""
+
+    def __str__(self) -> str:
+        """Tell it in one line, whatever names and files it quotes."""
+        return visible(super().__str__())
 
 
 class RoadSourceError(RoadgeoError):

@@ -11,7 +11,7 @@ ROOT = Path(roadgeo.__file__).parent
 
 #: What each storey holds: folders and modules at the top of the package. One imports from storeys below, and its own.
 STOREYS_TEXT = """
-    words       _version _arrays _progress errors plugins schemas
+    words       _version _arrays _progress _text errors plugins schemas
     files       storage
     kernels     kernels
     warmup      warmup

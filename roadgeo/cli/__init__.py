@@ -14,6 +14,7 @@ from collections.abc import Sequence
 import click
 
 from roadgeo._version import __version__
+from roadgeo.cli.printing import echo
 from roadgeo.errors import RoadgeoError
 from roadgeo.storage.gdal import skip_drivers
 
@@ -97,7 +98,7 @@ def cli(ctx: click.Context) -> None:
     if os.environ.get("NO_COLOR"):
         ctx.color = False
     if ctx.invoked_subcommand is None:
-        click.echo(ctx.get_help())
+        echo(ctx.get_help())
         ctx.exit(USAGE)
 
 
@@ -115,7 +116,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
     except click.ClickException as error:
         return _fail(error.format_message(), error.exit_code)
     except (click.Abort, KeyboardInterrupt):
-        click.echo("Interrupted.", err=True)
+        echo("Interrupted.", err=True)
         return INTERRUPTED
     except RoadgeoError as error:
         return _fail(str(error), ERROR)
@@ -133,5 +134,5 @@ def main(arguments: Sequence[str] | None = None) -> int:
 
 def _fail(message: str, status: int) -> int:
     error = click.style("Error:", fg="red") + " " + " ".join(message.split())
-    click.echo(error, err=True, color=False if os.environ.get("NO_COLOR") else None)
+    echo(error, err=True, color=False if os.environ.get("NO_COLOR") else None)
     return status

@@ -5,6 +5,8 @@ from __future__ import annotations
 import click
 from click.shell_completion import get_completion_class
 
+from roadgeo.cli.printing import echo
+
 __all__ = ["completion_command"]
 
 
@@ -23,4 +25,4 @@ def completion_command(shell: str) -> None:
 
     kind = get_completion_class(shell)
     assert kind is not None  # noqa: S101 (the choices above are those that click knows)
-    click.echo(kind(cli, {}, "roadgeo", "_ROADGEO_COMPLETE").source())
+    echo(kind(cli, {}, "roadgeo", "_ROADGEO_COMPLETE").source())

@@ -9,6 +9,7 @@ from typing import TYPE_CHECKING, Any
 import click
 
 from roadgeo.cli import ERROR
+from roadgeo.cli.printing import echo
 from roadgeo.outputs.wording import format_lonlat
 
 if TYPE_CHECKING:
@@ -61,7 +62,7 @@ def demo_command(out_dir: str) -> int:
     started = perf_counter()
     reference = build_reference(ROADS, "porto", path=folder / "porto.gpkg", attribution=ATTRIBUTION)
     seconds = perf_counter() - started
-    click.echo(f"Porto, {ATTRIBUTION}: {len(reference.index):,} intersections, indexed in {seconds:.1f} s")
+    echo(f"Porto, {ATTRIBUTION}: {len(reference.index):,} intersections, indexed in {seconds:.1f} s")
     tasks = [Task(str(mask.path), mask.path.stem) for mask in masks]
     outputs = OutputOptions(products=(OVERLAY.name,))
     wrong = 0
@@ -70,13 +71,13 @@ def demo_command(out_dir: str) -> int:
     ):
         right, text = _judge(outcome, mask)
         wrong += not right
-        click.echo(f"\n{mask.path.name}: {mask.title}\n  {text}")
-    click.echo(
+        echo(f"\n{mask.path.name}: {mask.title}\n  {text}")
+    echo(
         f"\nLook at {folder / 'drone_overlay.png'}. In QGIS, open {folder / 'drone_footprint.tif'} and "
         f"{folder / 'drone_location.gpkg'} over {folder / 'porto.gpkg'}. The masks are in {folder / 'masks'}."
     )
     if wrong:
-        click.echo(f"Error: {wrong} masks came out wrong; please report it", err=True)
+        echo(f"Error: {wrong} masks came out wrong; please report it", err=True)
     return ERROR if wrong else 0
 
 

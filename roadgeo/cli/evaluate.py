@@ -15,8 +15,10 @@ from typing import TYPE_CHECKING, Any, Literal
 import click
 from click.core import ParameterSource
 
+from roadgeo._text import visible
 from roadgeo.cli.command_line import made_by
 from roadgeo.cli.hints import hint_options, make_options
+from roadgeo.cli.printing import echo
 from roadgeo.cli.progress import count_up
 from roadgeo.cli.queries import QUERY_OPTIONS, query_options, query_sets
 
@@ -185,7 +187,7 @@ def _evaluate(
             )
     except KeyboardInterrupt:
         if record is not None:
-            click.echo(f"{_recorded(record)} of {len(queries)} masks are kept; the same command goes on.", err=True)
+            echo(f"{_recorded(record)} of {len(queries)} masks are kept; the same command goes on.", err=True)
         raise
     elapsed = time.perf_counter() - started
 
@@ -200,12 +202,12 @@ def _evaluate(
         write_text(out_dir / "evaluation.json", json.dumps(document, indent=1) + "\n")
         write_text(out_dir / "report.html", render_report(evaluation, truths, title))
     if as_json:
-        click.echo(json.dumps({name: part for name, part in document.items() if name != "scores"}))
+        echo(json.dumps({name: part for name, part in document.items() if name != "scores"}))
     elif not quiet:
         _print(evaluation)
         earlier = f" ({before} of them recorded before)" if before else ""
         where = f"; see {out_dir}" if out_dir else ""
-        click.echo(f"{len(trials)} masks{earlier} in {elapsed:.1f} s{where}", err=True)
+        echo(f"{len(trials)} masks{earlier} in {elapsed:.1f} s{where}", err=True)
 
 
 def _made_of(locator: ReferenceLocator) -> dict[str, Any]:
@@ -236,7 +238,7 @@ def _query_set(
     truths = read_truth(table)
     elsewhere = count_elsewhere(truths, reference)
     if elsewhere:
-        click.echo(
+        echo(
             f"Warning: the places of {elsewhere} of {len(truths)} masks are not on {reference.stem}; they count against"
             " recall. In a table of truths, on_map False says that a mask has no place there.",
             err=True,
@@ -250,7 +252,7 @@ def _write_map(survey: Survey, as_json: bool, quiet: bool) -> None:
 
     summary, files = write_survey(survey, survey.out_dir or Path(), _made_of(survey.locator))
     if as_json:
-        click.echo(json.dumps(summary))
+        echo(json.dumps(summary))
         return
     if quiet:
         return
@@ -258,13 +260,13 @@ def _write_map(survey: Survey, as_json: bool, quiet: bool) -> None:
         line = f"{entry['label']:<28} {100 * entry['area_share']:5.1f} % of the map"
         if entry["located"]:
             line += f"; located there: {entry['located']['hits']} of {entry['located']['of']}"
-        click.echo(line)
+        echo(line)
     if not summary["classes"][0]["area_share"]:
-        click.echo(
+        echo(
             "No promise can be made anywhere: too few masks were located, or tried; a larger -n, wider windows or"
             " better masks may help."
         )
-    click.echo(f"wrote {files[0]}, {', '.join(path.suffix for path in files[1:])}", err=True)
+    echo(f"wrote {files[0]}, {', '.join(path.suffix for path in files[1:])}", err=True)
 
 
 # --- printing ---------------------------------------------------------------------------------------------------------
@@ -279,11 +281,12 @@ def _print(evaluation: Evaluation) -> None:
     for by, groups in evaluation.breakdowns.items():
         console.print(_table(TITLES[by], [*groups, evaluation.total] if by == "kind" else groups))
     for line in _verdicts(evaluation):
-        console.print(line, highlight=False)
+        console.print(line, highlight=False, markup=False)
 
 
 def _table(title: str, groups: Sequence[Summary]) -> Table:
     from rich.box import SIMPLE_HEAD
+    from rich.markup import escape
     from rich.table import Table
 
     table = Table(title=title, title_justify="left", box=SIMPLE_HEAD, pad_edge=False, padding=(0, 1, 0, 0))
@@ -293,7 +296,7 @@ def _table(title: str, groups: Sequence[Summary]) -> Table:
         table.add_column(head, justify="right" if head else "left", no_wrap=True)
     for group in groups:
         table.add_row(
-            group.name,
+            escape(visible(group.name)),
             str(group.queries),
             _percent(group.precision),
             _percent(group.recall),

@@ -10,6 +10,7 @@ import click
 
 from roadgeo._progress import Say
 from roadgeo.cli.parameters import BOX, NEAR, Plugin, verbosity_options
+from roadgeo.cli.printing import echo
 from roadgeo.errors import RoadSourceError
 
 if TYPE_CHECKING:
@@ -133,11 +134,11 @@ def index_command(
             reference = build_reference(roads, make_slug(name), path=path, say=say)
     if verbose:
         for key, value in roads.meta.items():
-            click.echo(f"  {key}: {value}", err=True)
+            echo(f"  {key}: {value}", err=True)
     if not quiet:
         seconds = perf_counter() - started
         found = f"{path}: {len(reference.index):,} intersections in {seconds:.1f} s"
-        click.echo(f"{found}; search it with `roadgeo locate MASK -r {out or path.stem}`")
+        echo(f"{found}; search it with `roadgeo locate MASK -r {out or path.stem}`")
 
 
 #: Endings of what `--out` may be taken for.
@@ -173,7 +174,7 @@ def _rebuild(name: str, quiet: bool) -> None:
     with show_steps(quiet) as say:
         reference = rebuild_reference(path, say)
     if not quiet:
-        click.echo(f"{path}: {len(reference.index):,} intersections indexed again")
+        echo(f"{path}: {len(reference.index):,} intersections indexed again")
 
 
 # --- where the roads come from ----------------------------------------------------------------------------------------

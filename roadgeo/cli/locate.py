@@ -10,12 +10,14 @@ from typing import TYPE_CHECKING, Any, Literal, TypeVar
 
 import click
 
+from roadgeo._text import visible
 from roadgeo.cli import ERROR, NOT_LOCATED
 from roadgeo.cli.command_line import said_options
 from roadgeo.cli.folders import make_folder
 from roadgeo.cli.hints import HINTS, hint_options, make_options, refuse_swapped
 from roadgeo.cli.parameters import Plugin, verbosity_options
 from roadgeo.cli.photographs import read_options, segmenting_options
+from roadgeo.cli.printing import echo
 from roadgeo.outputs.registry import (
     ALSO,
     ALWAYS,
@@ -274,7 +276,7 @@ def locate_command(
     if len(tasks) > 1:
         files = write_overview(out_dir, tasks, outcomes, opened if given["report"] else None)
         if not quiet:
-            click.echo(f"{_summarize(counts)}; all footprints: {', '.join(map(str, files))}", err=True)
+            echo(f"{_summarize(counts)}; all footprints: {', '.join(map(str, files))}", err=True)
     return ERROR if counts["error"] else 0 if counts["located"] == len(tasks) else NOT_LOCATED
 
 
@@ -332,21 +334,22 @@ def describe(outcome: Outcome) -> str:
     found = outcome.document
     words = outcome.status.replace("_", " ")
     if outcome.status == "error":
-        return f"{click.style('Error:', fg='red')} {' '.join(found['reason'].split())}"
+        return f"{click.style('Error:', fg='red')} {visible(found['reason'])}"
+    query = visible(found["query"])
     if outcome.earlier:
-        return f"{found['query']}: {words} before"
+        return f"{query}: {words} before"
     status = click.style(words, fg="green" if outcome.status == "located" else "yellow")
     if outcome.status != "located" or found["center"] is None:
-        text = f"{found['query']}: {status}: {found['reason']}"
+        text = f"{query}: {status}: {visible(found['reason'])}"
     else:
         where = format_lonlat(found["center"]["lon"], found["center"]["lat"])
-        text = f"{found['query']}: {status} at {where} on {found['reference']}: {found['reason']}"
+        text = f"{query}: {status} at {where} on {visible(found['reference'])}: {visible(found['reason'])}"
     if found.get("stated_offset_m") is not None:
         text += f"\n  the mask's own georeference puts its middle {found['stated_offset_m']:,.1f} m from there"
     if outcome.photo and outcome.photo[0] != found["query"]:
-        text += f"\n  drew {outcome.photo[0]}, {outcome.photo[1]:g} times the mask's size"
+        text += f"\n  drew {visible(outcome.photo[0])}, {outcome.photo[1]:g} times the mask's size"
     if outcome.removed:
-        text += f"\n  removed what an earlier run had found: {', '.join(outcome.removed)}"
+        text += f"\n  removed what an earlier run had found: {visible(', '.join(outcome.removed))}"
     return text
 
 
@@ -363,17 +366,17 @@ def _summarize(counts: Counter[str]) -> str:
 
 def _report(outcome: Outcome, as_json: bool, quiet: bool, verbose: bool, single: bool) -> None:
     if as_json:
-        click.echo(json.dumps(outcome.document))
+        echo(json.dumps(outcome.document))
     if outcome.status == "error":
-        click.echo(describe(outcome), err=True)
+        echo(describe(outcome), err=True)
         return
     if quiet:
         return
-    click.echo(describe(outcome), err=as_json)
+    echo(describe(outcome), err=as_json)
     if verbose:
-        click.echo(_details(outcome.document), err=as_json)
+        echo(_details(outcome.document), err=as_json)
     if (single or verbose) and outcome.files and outcome.status == "located":
-        click.echo("  wrote " + ", ".join(outcome.files), err=as_json)
+        echo("  wrote " + visible(", ".join(outcome.files)), err=as_json)
 
 
 def _details(document: dict[str, Any]) -> str:

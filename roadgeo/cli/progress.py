@@ -9,9 +9,8 @@ from collections import Counter
 from collections.abc import Callable, Iterator
 from contextlib import AbstractContextManager, contextmanager, nullcontext
 
-import click
-
 from roadgeo._progress import Say, say_nothing
+from roadgeo.cli.printing import echo
 
 __all__ = ["count_up", "print_steps", "show_steps"]
 
@@ -44,11 +43,11 @@ def print_steps(quiet: bool) -> Say:
     def say(text: str, share: float | None = None) -> None:
         nonlocal last
         if text != last[0]:
-            click.echo(f"{text} ...", err=True)
+            echo(f"{text} ...", err=True)
             last = text, -1
         if as_json and share is not None and int(100 * share) != last[1]:
             last = text, int(100 * share)
-            click.echo(json.dumps({"progress": {"done": last[1], "total": 100, "text": text}}), err=True)
+            echo(json.dumps({"progress": {"done": last[1], "total": 100, "text": text}}), err=True)
 
     return say
 
@@ -59,7 +58,7 @@ def _show_bars() -> Iterator[Say]:
     from rich.console import Console
     from rich.progress import BarColumn, Progress, TaskProgressColumn, TextColumn, TimeRemainingColumn
 
-    columns = (TextColumn("{task.description}"), BarColumn(), TaskProgressColumn(), TimeRemainingColumn())
+    columns = (TextColumn("{task.description}", markup=False), BarColumn(), TaskProgressColumn(), TimeRemainingColumn())
     with Progress(*columns, console=Console(stderr=True), transient=True) as progress:
 
         def say(text: str, share: float | None = None) -> None:
@@ -111,7 +110,7 @@ def _print_counts(total: int) -> Callable[[str], None]:
     def tell(text: str) -> None:
         nonlocal done
         done += 1
-        click.echo(json.dumps({"progress": {"done": done, "total": total, "text": text}}), err=True)
+        echo(json.dumps({"progress": {"done": done, "total": total, "text": text}}), err=True)
 
     return tell
 

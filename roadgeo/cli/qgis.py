@@ -4,6 +4,8 @@ from __future__ import annotations
 
 import click
 
+from roadgeo.cli.printing import echo
+
 __all__ = ["qgis_command"]
 
 
@@ -41,8 +43,8 @@ def install_command(profile: str) -> None:
     from roadgeo.qgis.installation import find_profiles, install_plugin
 
     for folder in find_profiles(profile):
-        click.echo(f"installed {install_plugin(folder)}")
-    click.echo("Start QGIS anew: the Processing toolbox has a group roadgeo.", err=True)
+        echo(f"installed {install_plugin(folder)}")
+    echo("Start QGIS anew: the Processing toolbox has a group roadgeo.", err=True)
 
 
 @qgis_command.command("zip", short_help="Make the plugin's package.")
@@ -72,4 +74,4 @@ def zip_command(out: str | None, **publisher: str | None) -> None:
 
     path = out or f"{NAME}-{_version.__version__}.zip"
     write_package(path, {key: value for key, value in publisher.items() if value})
-    click.echo(f"wrote {path}")
+    echo(f"wrote {path}")

@@ -7,8 +7,10 @@ from typing import Any
 
 import click
 
+from roadgeo._text import visible
 from roadgeo.cli import ERROR
 from roadgeo.cli.command_line import made_by
+from roadgeo.cli.printing import echo
 
 __all__ = ["check_command", "info_command", "list_command", "remove_command"]
 
@@ -44,11 +46,11 @@ def info_command(reference: str | None, plugins: bool, as_json: bool) -> None:
 
     described = describe_reference(resolve_reference(reference))
     if as_json:
-        click.echo(json.dumps({"schema": SCHEMA, **made_by(), **described}, indent=2))
+        echo(json.dumps({"schema": SCHEMA, **made_by(), **described}, indent=2))
         return
     width = max(len(label) for label, _ in _lines(described))
     for label, value in _lines(described):
-        click.echo(f"{label:<{width}}  {value}")
+        echo(f"{label:<{width}}  {visible(value)}")
 
 
 def _list_plugins(as_json: bool) -> None:
@@ -59,11 +61,11 @@ def _list_plugins(as_json: bool) -> None:
         (one.group, one.name, f"{one.dist.name} {one.dist.version}" if one.dist else "", one.value) for one in found
     ]
     if as_json:
-        click.echo(json.dumps([dict(zip(("group", "name", "package", "object"), row, strict=True)) for row in rows]))
+        echo(json.dumps([dict(zip(("group", "name", "package", "object"), row, strict=True)) for row in rows]))
         return
     widths = [max((len(row[i]) for row in rows), default=0) for i in range(3)]
     for row in rows:
-        click.echo("  ".join([*(text.ljust(width) for text, width in zip(row, widths, strict=False)), row[3]]))
+        echo("  ".join([*(text.ljust(width) for text, width in zip(row, widths, strict=False)), row[3]]))
 
 
 @click.command("check", short_help="Verify every byte and number of a reference.")
@@ -90,11 +92,11 @@ def check_command(references: tuple[str, ...]) -> int:
         except RoadgeoError as error:
             problems = [str(error)]
         for problem in problems:
-            click.echo(f"Error: {problem}", err=True)
+            echo(f"Error: {visible(str(problem))}", err=True)
         if problems:
             status = ERROR
         else:
-            click.echo(f"{reference}: sound")
+            echo(visible(f"{reference}: sound"))
     return status
 
 
@@ -116,18 +118,18 @@ def list_command(as_json: bool) -> int:
 
     paths = list_references()
     if not paths:
-        click.echo(f"The library in {library_dir()} is empty; `roadgeo index` adds to it.", err=True)
+        echo(f"The library in {library_dir()} is empty; `roadgeo index` adds to it.", err=True)
     width = max((len(path.stem) for path in paths), default=0)
     status = 0
     for path in paths:
         try:
             described = describe_reference(path)
         except RoadgeoError as error:
-            click.echo(f"Error: {error}", err=True)
+            echo(f"Error: {error}", err=True)
             status = ERROR
             continue
         whole = {"schema": SCHEMA, **made_by(), **described}
-        click.echo(json.dumps(whole) if as_json else f"{path.stem:<{width}}  {_summary(described)}")
+        echo(json.dumps(whole) if as_json else visible(f"{path.stem:<{width}}  {_summary(described)}"))
     return status
 
 
@@ -148,7 +150,7 @@ def remove_command(names: tuple[str, ...], yes: bool) -> None:
         click.confirm(f"Delete {', '.join(names)} from {library_dir()}?", abort=True, err=True)
     for name in names:
         for path in remove_reference(name):
-            click.echo(f"removed {path}")
+            echo(f"removed {path}")
 
 
 def _lines(described: dict[str, Any]) -> list[tuple[str, str]]:

@@ -8,6 +8,7 @@ from typing import Any
 import click
 
 from roadgeo.cli.command_line import made_by
+from roadgeo.cli.printing import echo
 from roadgeo.cli.progress import count_up
 from roadgeo.cli.queries import query_options, query_sets
 
@@ -58,6 +59,4 @@ def simulate_command(reference: str, out_dir: Path, roads: Path | None, quiet: b
                 advance(simulation.kind)
     write_truth(out_dir, truths, made_by())
     if not quiet:
-        click.echo(
-            f"{len(truths)} masks in {out_dir}; next: roadgeo evaluate {reference} --queries {out_dir}", err=True
-        )
+        echo(f"{len(truths)} masks in {out_dir}; next: roadgeo evaluate {reference} --queries {out_dir}", err=True)

@@ -4,8 +4,10 @@ from __future__ import annotations
 
 import click
 
+from roadgeo._text import visible
 from roadgeo.cli import ERROR
 from roadgeo.cli.folders import make_folder
+from roadgeo.cli.printing import echo
 from roadgeo.running.tasks import find_masks, name_tasks
 
 __all__ = ["vectorize_command"]
@@ -51,14 +53,14 @@ def vectorize_command(masks: tuple[str, ...], out_dir: str, threshold: float | N
             scene, graph = trace_query(mask)
             files = write_vectorized(out_dir, task.stem, mask, graph, scene.intersections)
         except RoadgeoError as error:
-            click.echo(f"Error: {error}", err=True)
+            echo(f"Error: {error}", err=True)
             status = ERROR
             continue
         except Exception as error:  # of a library: nothing wrong with one mask stops the others
-            what = f"{type(error).__name__}: {error}"
-            click.echo(f"Error: {task.mask}: {what}; this is a fault of roadgeo, please report it", err=True)
+            what = visible(f"{task.mask}: {type(error).__name__}: {error}")
+            echo(f"Error: {what}; this is a fault of roadgeo, please report it", err=True)
             status = ERROR
             continue
         seen = f"{len(scene.intersections)} intersections, {graph.n_edges} roads between them"
-        click.echo(f"{task.mask}: {seen}; wrote {', '.join(map(str, files))}")
+        echo(visible(f"{task.mask}: {seen}; wrote {', '.join(map(str, files))}"))
     return status

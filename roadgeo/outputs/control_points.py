@@ -23,12 +23,12 @@ def write_gcps(path: Path, subject: Subject) -> None:
     """
     import rasterio.shutil
 
-    from roadgeo.storage.rasters import open_raster
+    from roadgeo.storage.rasters import open_raster, writing_raster
 
     with TemporaryDirectory(dir=path.parent, prefix=".roadgeo-") as folder:
         vrt = Path(folder) / "gcps.vrt"
         write_vrt(vrt, subject)
-        with open_raster(vrt, is_ours=True) as source:
+        with open_raster(vrt, is_ours=True) as source, writing_raster(path):
             rasterio.shutil.copy(source, path, driver="GTiff", compress="DEFLATE", tiled=True, bigtiff="IF_SAFER")
 
 
@@ -37,9 +37,9 @@ def write_vrt(path: Path, subject: Subject) -> None:
     import pyproj
     import rasterio.shutil
 
-    from roadgeo.storage.rasters import open_raster
+    from roadgeo.storage.rasters import open_raster, writing_raster
 
-    with open_raster(subject.picture.absolute()) as source:
+    with open_raster(subject.picture.absolute()) as source, writing_raster(path):
         rasterio.shutil.copy(source, path, driver="VRT")
     document = ET.parse(path)  # noqa: S314 (GDAL wrote it just now)
     root = document.getroot()

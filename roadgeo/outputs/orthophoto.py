@@ -16,14 +16,13 @@ import numpy as np
 import rasterio
 import rasterio.shutil
 from rasterio.enums import ColorInterp, Resampling
-from rasterio.errors import RasterioError
 from rasterio.windows import Window
 
 from roadgeo._arrays import AnyArray, FloatArray
-from roadgeo.errors import CrsError, MaskError, OutputError
+from roadgeo.errors import CrsError, MaskError
 from roadgeo.geometry.warping import MapGrid, Transform, cover, source_pixels
 from roadgeo.outputs.paths import Placement
-from roadgeo.storage.rasters import open_raster
+from roadgeo.storage.rasters import open_raster, writing_raster
 
 __all__ = ["ImageOptions", "Target", "choose_target", "image_homography", "read_preview", "warp_image"]
 
@@ -186,11 +185,9 @@ def warp_image(
             raise CrsError(f"the footprint lies outside what {crs} is made for; choose another --crs")
         plan = _Plan(picture, homography, to_place, grid, _INTERPOLATION[options.resampling])
         drawn = folder / "drawn.tif"
-        try:
+        with writing_raster(target):
             _draw(plan, drawn, crs, tags)
             _optimize(drawn, target, options)
-        except RasterioError as error:
-            raise OutputError(f"cannot write {target}: {error}; is the disk full?") from error
     return grid
 
 
@@ -204,9 +201,10 @@ def _tile(path: str | os.PathLike[str], folder: Path) -> str | os.PathLike[str]:
         if size < _TILED_BYTES or picture.block_shapes[0][1] != picture.width:
             return path
         copy = folder / "tiles.tif"
-        rasterio.shutil.copy(
-            picture, copy, driver="GTiff", tiled=True, blockxsize=512, blockysize=512, bigtiff="IF_SAFER"
-        )
+        with writing_raster(copy):
+            rasterio.shutil.copy(
+                picture, copy, driver="GTiff", tiled=True, blockxsize=512, blockysize=512, bigtiff="IF_SAFER"
+            )
         return copy
 
 

@@ -213,7 +213,7 @@ class _Locating:
         from roadgeo.location import Location, Reason
 
         location = Location(
-            task.mask, "error", reason, options=self._told(), command=self._command(task), reason_code=Reason[code]
+            task.query, "error", reason, options=self._told(), command=self._command(task), reason_code=Reason[code]
         )
         return Outcome("error", location.to_dict())
 
@@ -223,7 +223,7 @@ class _Locating:
             return ""
         photo = self.reading.images.get(task.mask)
         drawn = [f"--image={photo}"] if photo else []
-        return shlex.join(["roadgeo", "locate", task.mask, *self.reading.fused_with, *drawn, *self.command])
+        return shlex.join(["roadgeo", "locate", task.query, *self.reading.fused_with, *drawn, *self.command])
 
     def _told(self) -> dict[str, Any]:
         """Return the options that differ from the usual ones, as plain values: what the JSON says was asked."""
@@ -246,14 +246,17 @@ class _Locating:
             return earlier or self._locate(task, asked)
         except RoadgeoError as error:
             return self._failed(task, _code_of(error), str(error))
+        except UnicodeEncodeError:  # libraries take no other names
+            reason = f"{task.query}: its name is no text, or that of the picture; rename it"
+            return self._failed(task, "INVALID", reason)
         except MemoryError:
-            reason = f"{task.mask}: more memory is needed than there is; reduce it or cut it up"
+            reason = f"{task.query}: more memory is needed than there is; reduce it or cut it up"
             return self._failed(task, "MEMORY", reason)
         except Exception as error:  # whatever libraries raise: cv2.error, errors of GDAL, of plugins ...
             if os.environ.get("ROADGEO_TRACEBACK"):
                 raise
             what = " ".join(f"{type(error).__name__}: {error}".split())
-            return self._failed(task, "FAULT", f"{task.mask}: {what}; this is a fault of roadgeo, please report it")
+            return self._failed(task, "FAULT", f"{task.query}: {what}; this is a fault of roadgeo, please report it")
 
     def _earlier(self, task: Task, asked: _Asked) -> Outcome | None:
         """Return what an earlier run found, if that is whole, the answer to the same question, and younger than it."""
@@ -268,7 +271,7 @@ class _Locating:
                 return None
         except (OSError, ValueError):
             return None
-        if not isinstance(document, dict) or (document.get("schema"), document.get("query")) != (SCHEMA, task.mask):
+        if not isinstance(document, dict) or (document.get("schema"), document.get("query")) != (SCHEMA, task.query):
             return None
         status, photo = document.get("status"), self.reading.photo(task, is_ours(probability_path(paths)))
         if status not in {"located", "ambiguous", "not_located"} or not asked.same(document):
@@ -294,6 +297,7 @@ class _Locating:
         reading_s = perf_counter() - started - spent.vectorize - spent.match - spent.refine
         location = replace(
             location,
+            query=task.query,
             seconds=replace(spent, open=asked.seconds, read=max(reading_s, 0.0)),
             options=asked.options,
             command=self._command(task),

@@ -10,6 +10,7 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
+from roadgeo._text import visible
 from roadgeo.outputs.registry import is_result
 from roadgeo.running.probability_files import ENDING, is_ours
 
@@ -19,12 +20,21 @@ __all__ = ["SUFFIXES", "Task", "find_masks", "name_tasks"]
 SUFFIXES = (".tif", ".tiff", ".png", ".jpg", ".jpeg", ".jp2", ".bmp", ".pgm", ".webp", ".vrt", ".img", ".npy")
 
 
+#: File systems take names of 255 bytes; outputs, and what they are called while they are written, need the rest.
+_MAX_STEM_BYTES = 180
+
+
 @dataclass(frozen=True)
 class Task:
     """One mask, and the stem of its results' names."""
 
     mask: str
     stem: str
+
+    @property
+    def query(self) -> str:
+        """What results call the mask: its path, with bytes that are no text as escapes."""
+        return os.fsencode(self.mask).decode(errors="backslashreplace")
 
 
 def find_masks(arguments: Sequence[str]) -> list[str]:
@@ -68,5 +78,19 @@ def _stems(mask: str, n: int) -> list[str]:
     path = Path(mask).absolute()
     folder = f"{path.parent.name}_{path.stem}"
     format_ = f"{folder}_{path.suffix.lower().removeprefix('.')}"
-    whole = f"{format_}_{hashlib.blake2b(os.fsencode(path), digest_size=4).hexdigest()}"
-    return [path.stem, folder, format_, whole, f"{whole}_{n + 1}"]
+    whole = f"{format_}_{_digest(os.fspath(path))}"
+    return [_shortened(stem) for stem in (path.stem, folder, format_, whole, f"{whole}_{n + 1}")]
+
+
+def _shortened(stem: str) -> str:
+    """Leave room for what is put behind a stem; a digest keeps apart what differs further on or is no text."""
+    name = os.fsencode(stem)
+    if len(name) <= _MAX_STEM_BYTES and visible(stem) == stem:
+        return stem
+    name = "".join(letter if visible(letter) == letter else "_" for letter in stem).encode()
+    kept = name[: _MAX_STEM_BYTES - 9].decode(errors="ignore")
+    return f"{kept}_{_digest(stem)}"
+
+
+def _digest(text: str) -> str:
+    return hashlib.blake2b(os.fsencode(text), digest_size=4).hexdigest()

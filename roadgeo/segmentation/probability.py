@@ -85,12 +85,17 @@ class ProbabilityMap:
         import rasterio
         from rasterio.errors import NotGeoreferencedWarning
 
+        from roadgeo.storage.rasters import writing_raster
+
         height, width = self.values.shape
         profile = {"driver": "GTiff", "count": 1, "dtype": "uint8", "compress": "deflate", "nodata": NODATA}
         tags = {TAG: "probability of road, 0 to 254", "MODEL": self.model, "THRESHOLD": f"{self.threshold:g}"}
         with replacing(Path(path), sync=False) as staged, warnings.catch_warnings():
             warnings.simplefilter("ignore", NotGeoreferencedWarning)
-            with rasterio.open(staged, "w", height=height, width=width, tiled=True, **profile) as dataset:
+            with (
+                writing_raster(path),
+                rasterio.open(staged, "w", height=height, width=width, tiled=True, **profile) as dataset,
+            ):
                 dataset.update_tags(**tags)
                 dataset.write(self.values, 1)
 

@@ -15,6 +15,7 @@ import cv2
 import numpy as np
 
 from roadgeo._arrays import AnyArray, BoolArray
+from roadgeo._text import visible
 from roadgeo.errors import MaskError
 from roadgeo.geometry.mask import RoadMask
 from roadgeo.roads.observed import find_voids
@@ -254,7 +255,7 @@ def _told_apart(name: str, roads: BoolArray, observed: BoolArray | None) -> tupl
     inverted = ~roads if observed is None else observed & ~roads
     if not inverted.any():
         raise MaskError(f"{name}: every pixel is light; expected roads as light pixels on dark ground")
-    _LOG.warning("%s: dark roads on light ground: read as inverted", name)
+    _LOG.warning("%s: dark roads on light ground: read as inverted", visible(name))
     return inverted, observed
 
 

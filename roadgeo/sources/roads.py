@@ -13,6 +13,7 @@ import numpy as np
 
 from roadgeo._arrays import AnyArray, FloatArray
 from roadgeo._progress import Say, say_nothing
+from roadgeo._text import visible
 from roadgeo.errors import CrsError, RoadSourceError
 from roadgeo.geometry.projection import LocalPlane, choose_plane, transformer
 from roadgeo.roads.kinds import RoadKind, drives
@@ -319,7 +320,7 @@ def _overruled(own: str | None, given: str, file: Path) -> str:
     if own is not None and not CRS(own).equals(CRS(known), ignore_axis_order=True):
         _LOG.warning(
             "%s: says that its CRS is %s; read as %s, as --crs asks. Leave --crs out if that is wrong",
-            file,
+            visible(str(file)),
             CRS(own).name if len(own) > len("EPSG:123456") else own,
             given,
         )

@@ -8,6 +8,7 @@ from contextlib import contextmanager
 from pathlib import Path
 
 from roadgeo.errors import OutputError
+from roadgeo.storage.atomic import sync_file, writing
 
 __all__ = ["replacing", "write_bytes", "write_text"]
 
@@ -27,17 +28,16 @@ def replacing(path: str | os.PathLike[str], sync: bool = True) -> Iterator[Path]
     target = Path(path)
     temporary = target.with_name(f".{target.stem}.{os.getpid()}.part{target.suffix}")
     try:
-        try:
-            yield temporary
-            if sync:
-                _sync(temporary)
-            temporary.replace(target)
-        finally:
-            temporary.unlink(missing_ok=True)
-    except OSError as error:
-        raise OutputError(
-            f"cannot write {target}: {error.strerror or error}; choose a folder that exists and that you may write to"
-        ) from error
+        with writing(target):
+            try:
+                yield temporary
+                if sync:
+                    sync_file(temporary)
+                temporary.replace(target)
+            finally:
+                temporary.unlink(missing_ok=True)
+    except OutputError as error:
+        raise OutputError(str(error).replace(str(temporary), str(target))) from error
 
 
 def write_bytes(path: str | os.PathLike[str], content: bytes) -> None:
@@ -49,8 +49,3 @@ def write_bytes(path: str | os.PathLike[str], content: bytes) -> None:
 def write_text(path: str | os.PathLike[str], content: str) -> None:
     """Write a whole UTF-8 text file with line feeds in one step (see `replacing`)."""
     write_bytes(path, content.encode())
-
-
-def _sync(path: Path) -> None:
-    with path.open("rb+") as file:
-        os.fsync(file.fileno())

@@ -17,13 +17,13 @@ from contextlib import contextmanager
 from pathlib import Path
 from typing import TYPE_CHECKING, BinaryIO
 
-from roadgeo.errors import MaskError
+from roadgeo.errors import MaskError, OutputError
 from roadgeo.storage.gdal import CONSENT, NETWORK, SEALED, allowed_drivers, is_named_remote
 
 if TYPE_CHECKING:
     from rasterio import DatasetReader
 
-__all__ = ["image_size", "open_raster", "require_file", "sidecar_nodata"]
+__all__ = ["image_size", "open_raster", "require_file", "sidecar_nodata", "writing_raster"]
 
 #: First bytes of the formats that are read, and GDAL's names of their drivers.
 _DRIVERS = (
@@ -52,6 +52,8 @@ def open_raster(
     path: str | os.PathLike[str], name: str | None = None, *, is_ours: bool = False
 ) -> Iterator[DatasetReader]:
     """Open a raster that may lack a georeference; what goes wrong while it is open is told in the same way.
+
+    What is written meanwhile is written in `writing_raster`.
 
     Parameters
     ----------
@@ -85,9 +87,32 @@ def open_raster(
             with _opened(os.fspath(path) if remote else str(Path(path).absolute()), drivers, remote) as dataset:
                 _require_plain(dataset, name)
                 yield dataset
+        except UnicodeEncodeError as error:
+            raise MaskError(f"{name}: its name is no text, GDAL does not take it; rename it") from error
         except (RasterioError, CPLE_BaseError) as error:
             reason = " ".join(str(error.__cause__ or error).split())[:300]  # libtiff's own words, where it has some
             raise MaskError(f"{name}: not a raster that can be read ({reason}); give an image or GeoTIFF") from error
+
+
+@contextmanager
+def writing_raster(path: str | os.PathLike[str]) -> Iterator[None]:
+    """Turn an error of GDAL in the block, which writes `path`, into one line, also where another raster is open.
+
+    Raises
+    ------
+    OutputError
+        It cannot be written.
+    """
+    from rasterio._err import CPLE_BaseError
+    from rasterio.errors import RasterioError
+
+    try:
+        yield
+    except (RasterioError, CPLE_BaseError) as error:
+        reason = " ".join(str(error.__cause__ or error).split())[:300]
+        raise OutputError(
+            f"cannot write {os.fspath(path)}: {reason}; is the disk full, or the picture damaged?"
+        ) from error
 
 
 def require_file(path: str | os.PathLike[str], name: str) -> None:

@@ -1,0 +1,26 @@
+"""Text that came from strangers (names of files, of references, in files), made fit to be shown."""
+
+from __future__ import annotations
+
+import re
+
+__all__ = ["visible"]
+
+#: Control characters; those that turn the direction of text; line separators; bytes of names that are no text.
+_UNSEEN = re.compile("[\x00-\x1f\x7f-\x9f\u061c\u200e\u200f\u2028-\u202e\u2066-\u2069\ud800-\udfff]")
+#: What `click.style` writes, and line ends.
+_OURS = re.compile("(\x1b\\[(?:0|1|3[1-7])m|[\n\t])")
+
+
+def visible(text: str, *, ours: bool = False) -> str:
+    r"""Write characters that a terminal obeys instead of showing them as escapes: "\x1b".
+
+    Line ends and tabs become spaces, unless the text is `ours`: then they stay, and so do colours.
+    """
+    if ours:
+        return "".join(part if i % 2 else _UNSEEN.sub(_escape, part) for i, part in enumerate(_OURS.split(text)))
+    return _UNSEEN.sub(_escape, re.sub("[\r\n\t]+", " ", text))
+
+
+def _escape(match: re.Match[str]) -> str:
+    return match[0].encode("unicode_escape", "surrogatepass").decode("ascii")

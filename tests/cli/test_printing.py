@@ -1,0 +1,82 @@
+"""Names of files and of references, and what files say, are shown on a terminal, not obeyed by it."""
+
+import json
+import os
+import sqlite3
+from pathlib import Path
+
+import cv2
+import numpy as np
+import pytest
+from worlds.fenway import write_streets
+
+from roadgeo._text import visible
+from roadgeo.cli import main
+from roadgeo.cli.printing import echo
+from roadgeo.errors import MaskError
+from roadgeo.running.tasks import name_tasks
+
+ESCAPES = "a\x1b]0;owned\x07\x1b[2J\x9b31m\u202eb"
+FORBIDDEN = ("\x1b", "\x07", "\x9b", "\u202e")
+
+
+def test_what_a_terminal_obeys_is_shown_instead() -> None:
+    assert visible(ESCAPES) == "a\\x1b]0;owned\\x07\\x1b[2J\\x9b31m\\u202eb"
+    assert visible("two\nlines\r\n and\ttabs") == "two lines  and tabs"
+    assert visible("Zürich 東京 नगर 👩‍🚀") == "Zürich 東京 नगर 👩‍🚀"
+    assert visible(os.fsdecode(b"caf\xe9")) == "caf\\udce9"
+    assert str(MaskError(f"{ESCAPES}\n: no such file")) == f"{visible(ESCAPES)} : no such file"
+
+
+def test_our_own_colours_and_lines_stay(capsys: pytest.CaptureFixture[str]) -> None:
+    echo("\x1b[31mError:\x1b[0m one\n  two \x1b[8m hidden", color=True)
+    assert capsys.readouterr().out == "\x1b[31mError:\x1b[0m one\n  two \\x1b[8m hidden\n"
+
+
+@pytest.mark.parametrize("name", [f"{ESCAPES}.png", os.fsdecode(b"caf\xe9\n.png"), "[bold].png"])
+def test_names_of_masks_do_not_speak_to_the_terminal(
+    name: str, tmp_path: Path, capfd: pytest.CaptureFixture[str]
+) -> None:
+    mask = np.zeros((64, 64), np.uint8)
+    mask[30:34] = mask[:, 30:34] = 255
+    (tmp_path / name).write_bytes(cv2.imencode(".png", mask)[1].tobytes())
+    write_streets(tmp_path / "roads.gpkg")
+    assert main(["index", "--roads", str(tmp_path / "roads.gpkg"), "--out", str(tmp_path / "r.gpkg"), "-q"]) == 0
+    (tmp_path / f"not_{name}").write_bytes(b"no image")
+    masks = [str(tmp_path / name), str(tmp_path / f"not_{name}")]
+    assert main(["locate", *masks, "-r", str(tmp_path / "r.gpkg"), "-o", str(tmp_path), "--verbose"]) == 1
+    assert main(["vectorize", *masks, "-o", str(tmp_path)]) == 1
+    said = "".join(capfd.readouterr())
+    assert not [one for one in FORBIDDEN if one in said]
+    assert "intersections are seen" in said
+    assert "fault of roadgeo" not in said
+
+
+def test_names_of_references_do_not_speak_to_the_terminal(
+    tmp_path: Path, capfd: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setenv("ROADGEO_LIBRARY", str(tmp_path))
+    write_streets(tmp_path / "roads.geojson")
+    index = ["index", "--roads", str(tmp_path / "roads.geojson"), "--out"]
+    assert main([*index, str(tmp_path / f"{ESCAPES}.gpkg")]) == 0
+    with sqlite3.connect(tmp_path / f"{ESCAPES}.gpkg") as database:
+        told = (json.dumps(f"{ESCAPES}\nOpenStreetMap"), "attribution")
+        database.execute("UPDATE roadgeo_meta SET value = ? WHERE key = ?", told)
+    assert main(["list"]) == 0
+    assert main(["info", str(tmp_path / f"{ESCAPES}.gpkg")]) == 0
+    main(["check", str(tmp_path / f"{ESCAPES}.gpkg")])
+    assert main(["locate", "missing.png", "-r", f"no{ESCAPES}"]) == 1
+    said = "".join(capfd.readouterr())
+    assert not [one for one in FORBIDDEN if one in said]
+    assert "\\x1b]0;owned" in said
+
+
+@pytest.mark.parametrize("letter", ["a", "ü", "東"])
+def test_long_names_leave_room_for_what_is_put_behind_them(letter: str, tmp_path: Path) -> None:
+    """Names of 236 bytes and more left none, and what was found could not be written."""
+    longest = letter * (250 // len(letter.encode()))
+    first, second = name_tasks([f"{tmp_path}/{longest}.png", f"{tmp_path}/{longest[:-1]}x.png"])
+    assert first.stem != second.stem
+    assert first.stem[:50] == longest[:50]
+    assert max(len(os.fsencode(one.stem)) for one in (first, second)) <= 180
+    assert name_tasks([f"{tmp_path}/{letter * 60}.png"])[0].stem == letter * 60
