@@ -41,9 +41,12 @@ def estimate_gsd(path: str | os.PathLike[str]) -> float | None:
     "GPSAltitude", which counts from the sea. None where either is missing.
     """
     with open_raster(path) as source:
-        tags = {**source.tags(), **source.tags(ns="EXIF")}
-        xmp = "".join(source.tags(ns="xml:XMP").values())
         longer_side: int = max(source.shape)
+        try:
+            tags = {**source.tags(), **source.tags(ns="EXIF")}
+            xmp = "".join(source.tags(ns="xml:XMP").values())
+        except UnicodeDecodeError:  # damaged
+            return None
     focal = _number(tags.get("EXIF_FocalLengthIn35mmFilm", ""))
     relative = re.search(r"RelativeAltitude\W{1,4}([-+]?\d+(\.\d+)?)", xmp)
     height = _number(relative[1]) if relative else _number(tags.get("EXIF_GPSAltitude", ""))

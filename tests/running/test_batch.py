@@ -8,6 +8,7 @@ import pytest
 from rasterio._err import CPLE_AppDefinedError
 
 from roadgeo import plugins
+from roadgeo._progress import say_nothing
 from roadgeo.geometry.mask import RoadMask
 from roadgeo.outputs.location_files import OutputOptions
 from roadgeo.outputs.registry import REGISTRY, Output
@@ -83,7 +84,7 @@ class Hazard:
 @pytest.mark.parametrize("kind", Hazard.ERRORS)
 def test_whatever_one_mask_raises_the_others_go_on(kind: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr("roadgeo.running.queries.open_mask", Hazard())
-    work = _Locating((), str(tmp_path), LocateOptions(), OutputOptions(), ReadOptions(), skip_existing=False)
+    work = _Locating((), str(tmp_path), LocateOptions(), OutputOptions(), ReadOptions(), False, (), say_nothing)
     outcome = work._do(Task(f"{kind}.png", kind), _Asked([], [], 0.0, {}))
     assert outcome.status == "error"
     assert outcome.document["query"] == f"{kind}.png"

@@ -1,0 +1,23 @@
+"""Files that fuzzing started from, and those that it broke readers with: each is read, or refused in one line."""
+
+from pathlib import Path
+
+import pytest
+from support.readers import READERS, drivers_registered_once, feed, seeds
+
+FILES = [(name, path) for name in READERS if name != "index" for path in seeds(name)]
+
+
+@pytest.fixture(scope="module", autouse=True)
+def _gdal():
+    with drivers_registered_once():
+        yield
+
+
+@pytest.mark.parametrize(("name", "path"), FILES, ids=lambda one: one.name if isinstance(one, Path) else one)
+def test_each_is_read_or_refused(name: str, path: Path, tmp_path: Path) -> None:
+    feed(READERS[name], tmp_path)(path.read_bytes())
+
+
+def test_every_reader_has_a_file() -> None:
+    assert {name for name, _ in FILES} == READERS.keys() - {"index"}  # `fuzz_index.py` makes its own
