@@ -14,6 +14,7 @@ from roadgeo._version import __version__
 from roadgeo.errors import NotLocatedError
 from roadgeo.geometry.frame import Frame
 from roadgeo.geometry.homography import Homography
+from roadgeo.geometry.lens import Lens
 from roadgeo.geometry.mask import plane_to_pixel
 from roadgeo.roads.graph import RoadGraph
 
@@ -143,6 +144,9 @@ class Location:
         Corners TL, TR, BR, BL of the frame in the CRS, and as longitude, latitude.
     corner_sigma_m : (4,) float64
         Standard deviations of those corners' positions: root mean squares of their distances from the truth.
+    lens_k1 : float
+        Radial distortion by the lens (see `geometry.lens`), estimated where the mask shows one, else 0. The
+        homography, footprint and corners are those of the frame as a pinhole would have seen it.
     rotation_deg : float
         Direction of the image's up at its centre, clockwise from true north.
     tilt_deg : float or None
@@ -184,6 +188,7 @@ class Location:
     rotation_deg: float | None = None
     tilt_deg: float | None = None
     tilt_source: str | None = None
+    lens_k1: float = 0.0
     corner_sigma_m: FloatArray | None = None
     n_intersections: int = 0
     n_matched: int = 0
@@ -215,7 +220,8 @@ class Location:
         NotLocatedError
             There is no place: `status` is "not_located".
         """
-        return self._placed()(pixels)
+        place = self._placed()
+        return place(self._lens.straighten(pixels) if self.lens_k1 else pixels)
 
     def map_to_pixel(self, xy: FloatArray) -> FloatArray:
         """Take (..., 2) coordinates of the location's CRS to pixel positions (column, row).
@@ -225,7 +231,12 @@ class Location:
         NotLocatedError
             There is no place: `status` is "not_located".
         """
-        return self._placed().inverse()(xy)
+        pixels = self._placed().inverse()(xy)
+        return self._lens.bend(pixels) if self.lens_k1 else pixels
+
+    @property
+    def _lens(self) -> Lens:
+        return Lens.of(self.lens_k1, self.size or (1, 1))
 
     def _placed(self) -> Homography:
         if self.homography is None or self.size is None:
@@ -279,6 +290,7 @@ class Location:
         if self.evidence is None or self.homography is None or not len(self.evidence.query_xy):
             return None
         pixels, to_crs = plane_to_pixel(self.evidence.query_xy), Homography(self.homography)
+        pixels = self._lens.straighten(pixels) if self.lens_k1 else pixels
         errors = (to_crs(pixels) - self.evidence.reference_xy, pixels - to_crs.inverse()(self.evidence.reference_xy))
         metres, px = (float(np.sqrt(np.mean(np.sum(error**2, axis=1)))) for error in errors)
         return (metres, px) if np.isfinite([metres, px]).all() else None
@@ -317,6 +329,7 @@ class Location:
             "rotation_deg": self.rotation_deg,
             "tilt_deg": self.tilt_deg,
             "tilt_source": self.tilt_source,
+            "lens_k1": None if center is None else self.lens_k1,
             "corner_sigma_m": rows(self.corner_sigma_m),
             "corner_covariance_m2": rows(self.corner_covariance_m2),
             "stated_offset_m": self.stated_offset_m,

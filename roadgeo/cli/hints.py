@@ -21,7 +21,7 @@ Command = TypeVar("Command", bound=Callable[..., Any])
 HINTS: dict[str, tuple[str, dict[str, Any]]] = {
     "gsd_m": (
         "--gsd",
-        {"metavar": "LO:HI", "type": RANGE, "help": "Metres per pixel at the middle. Default: 0.2:5."},
+        {"metavar": "LO:HI", "type": RANGE, "help": "Metres per pixel at the middle. Default: 0.1:12."},
     ),
     "max_tilt_deg": (
         "--max-tilt",

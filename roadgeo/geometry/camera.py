@@ -55,7 +55,7 @@ class CameraOptions:
         The image's up is north, within 5 degrees.
     """
 
-    gsd_m: tuple[float, float] = (0.2, 5.0)
+    gsd_m: tuple[float, float] = (0.1, 12.0)
     max_tilt_deg: float = 60.0
     focal_px: float | None = None
     max_skew: float = 0.35

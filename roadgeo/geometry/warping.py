@@ -12,6 +12,7 @@ import numpy as np
 from roadgeo._arrays import AnyArray, FloatArray
 from roadgeo.geometry.frame import Frame
 from roadgeo.geometry.homography import Homography
+from roadgeo.geometry.lens import Lens
 
 __all__ = ["MapGrid", "Transform", "choose_grid", "cover", "source_pixels", "warp"]
 
@@ -94,6 +95,7 @@ def warp(
     grid: MapGrid,
     to_place: Transform = None,
     interpolation: int = cv2.INTER_NEAREST,
+    lens: Lens | None = None,
 ) -> AnyArray:
     """Resample an image (H, W) or (H, W, bands) onto a grid; 0 outside the image.
 
@@ -104,6 +106,8 @@ def warp(
         plane, so nothing beyond the horizon is drawn twice.
     to_place : callable or None
         Takes the grid's CRS to that of `pixel_to_crs`.
+    lens : Lens, optional
+        Behind it the image is that of a pinhole, of which the homography speaks.
     """
     drawn = np.zeros((grid.height, grid.width, *image.shape[2:]), image.dtype)
     to_corner, to_center = np.eye(3), np.eye(3)  # OpenCV counts from the centre of the first pixel
@@ -113,12 +117,13 @@ def warp(
         for column in range(0, grid.width, BLOCK):
             block = drawn[row : row + BLOCK, column : column + BLOCK]
             size = block.shape[1::-1]
-            if to_place is None:
+            if to_place is None and lens is None:
                 source = to_center @ crs_to_pixel @ grid.to_crs_matrix(column, row) @ to_corner
                 block[...] = cv2.warpPerspective(image, source, size, flags=interpolation | cv2.WARP_INVERSE_MAP)
             else:
-                pixels = source_pixels(pixel_to_crs, grid, column, row, size, to_place) - 0.5
-                maps = np.nan_to_num(pixels, nan=-9.0).astype(np.float32)
+                pixels = source_pixels(pixel_to_crs, grid, column, row, size, to_place)
+                seen = pixels if lens is None else lens.bend(pixels)
+                maps = np.nan_to_num(seen - 0.5, nan=-9.0).astype(np.float32)
                 block[...] = cv2.remap(image, maps[..., 0], maps[..., 1], interpolation)
     return drawn
 

@@ -206,6 +206,7 @@ _SEARCH = (
     "road_raster",
     "road_votes",
     "road_growth",
+    "residuals",
 )
 _left_to_numba: set[str] = set()
 _kept_alive: list[Any] = []

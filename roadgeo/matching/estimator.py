@@ -6,8 +6,6 @@ import math
 import time
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, field, replace
-from itertools import islice
-from typing import Protocol
 
 import numpy as np
 
@@ -16,12 +14,14 @@ from roadgeo.geometry.camera import CameraFault, CameraOptions, judge, sampling
 from roadgeo.kernels.growth import grow_each
 from roadgeo.kernels.roads import screen
 from roadgeo.matching.index import ReferenceIndex
+from roadgeo.matching.lens import LensOptions, find_lens, straighten_scene
 from roadgeo.matching.refinement import Refined, RefineOptions, refine
 from roadgeo.matching.road_growth import Grown
 from roadgeo.matching.road_search import RoadSearch, RoadSearchOptions
 from roadgeo.matching.scene import Scene
+from roadgeo.matching.sweeps import LAST, USUAL, Source, Sweep
 from roadgeo.matching.trace import NO_TRACE, Trace
-from roadgeo.matching.triples import Proposals, TripleOptions, larger, propose, smaller
+from roadgeo.matching.triples import Proposals, larger
 from roadgeo.matching.verification import Agreement, VerifyOptions, agreement, chance_agreement, log10_odds
 
 __all__ = ["GrowOptions", "Hypothesis", "MatchOptions", "Source", "Sweep", "TripleEstimator"]
@@ -83,51 +83,6 @@ class GrowOptions:
     max_verified: int = 3
 
 
-class Source(Protocol):
-    """Where hypotheses come from: `Sweep` makes them of triples."""
-
-    def proposals(
-        self, scene: Scene, index: ReferenceIndex, scale: tuple[float, float], min_ratio: float
-    ) -> Iterator[Proposals]:
-        """Yield what one query intersection after another may be, with the work it took, the most promising first.
-
-        `scale` = (least, greatest) root of the determinant of a proposed map, metres per pixel; `min_ratio` is the
-        least ratio of its singular values.
-        """
-
-
-@dataclass(frozen=True)
-class Sweep:
-    """One pass over the query's anchors: how many, and how widely their triples are looked up.
-
-    Attributes
-    ----------
-    triples : TripleOptions
-    max_anchors : int
-        On a map of 15,000 intersections or more; on a smaller one, where each takes less time, more.
-    most_more : float
-        At most by this factor.
-    """
-
-    triples: TripleOptions
-    max_anchors: int
-    most_more: float = 3.0
-
-    def proposals(
-        self, scene: Scene, index: ReferenceIndex, scale: tuple[float, float], min_ratio: float
-    ) -> Iterator[Proposals]:
-        """Yield the proposals of the anchors (see `Source`)."""
-        anchors = propose(scene.intersections, scene.branches, scene.neighbours, index, scale, min_ratio, self.triples)
-        return islice(anchors, int(self.max_anchors * min(smaller(len(index)), self.most_more)))
-
-
-#: Where the rarest triples lead nowhere, more neighbours are taken, all over the frame.
-_FURTHER = TripleOptions(n_neighbours=12, max_hits=20_000, max_compared=500_000, spread=True)
-
-
-#: The last resort: every triple that is alike, wherever it leads.
-_SINGLE = TripleOptions(spread=True, single=True, max_hits=6000)
-
 #: How what single triples propose is followed: more is let through, and it may miss more on its way.
 _PATIENT = GrowOptions(max_screened=6000, hit_rate=0.35, patience=9.0, min_matched=1, max_verified=6)
 
@@ -150,24 +105,23 @@ class MatchOptions:
         As `max_places`, of the last sweeps.
     roads : RoadSearchOptions or None
         What follows where no triple leads to a place: None for nothing.
+    lens : LensOptions or None
+        Of a lens that is looked for behind promising places: None for a pinhole.
     max_places : int
         The sweeps end too when so many places were screened on a map of 15,000 intersections, and on a larger one more
         by the root of the ratio. Where streets are alike, proposals abound, and late ones are seldom right: of 31 masks
         that took more than half a second and were located, all but two had been found among the first 7,000 places.
     """
 
-    sweeps: tuple[Source, ...] = (
-        Sweep(TripleOptions(), 40),
-        Sweep(replace(_FURTHER, angle_tolerance_deg=7.5), 30),
-        Sweep(replace(_FURTHER, angle_tolerance_deg=10.0), 20),
-    )
-    last: tuple[Source, ...] = (Sweep(_SINGLE, 25),)
+    sweeps: tuple[Source, ...] = USUAL
+    last: tuple[Source, ...] = LAST
     grow: GrowOptions = field(default_factory=GrowOptions)
     last_grow: GrowOptions = _PATIENT
     verify: VerifyOptions = field(default_factory=VerifyOptions)
     refine: RefineOptions = field(default_factory=RefineOptions)
     camera: CameraOptions = field(default_factory=CameraOptions)
     roads: RoadSearchOptions | None = field(default_factory=RoadSearchOptions)
+    lens: LensOptions | None = field(default_factory=LensOptions)
     max_places: int = 12_000
     max_last_places: int = 100_000
     sightings: int = 2
@@ -378,6 +332,8 @@ class TripleEstimator:
         """Refine a hypothesis and return its log10 odds."""
         started = time.perf_counter()
         model.log10_odds = self._verify(model)
+        if model.log10_odds >= self.options.verify.promising:
+            self._look_through_lens(model)
         self.refine_s += time.perf_counter() - started
         self.trace.scored(model)
         if not model.by_roads and self._fits_whole(model):
@@ -401,6 +357,30 @@ class TripleEstimator:
         self.least_chance = np.minimum(self.least_chance, chance) if self.n_nulls else chance
         self.n_nulls += 1
         return model.log10_odds
+
+    def _look_through_lens(self, model: Hypothesis) -> None:
+        """Take a lens into a promising place where one explains it better."""
+        index, options, refined, agreeing = self.index, self.options, model.refined, model.found
+        if options.lens is None or refined is None or agreeing is None:
+            return
+        lens = find_lens(refined.matrix, self.scene, index, agreeing.forward, self.refine_options, options.lens)
+        if lens is None or self.judge(lens.matrix) is not None or self._is_far(lens.matrix):
+            return
+        scene, gsd = straighten_scene(self.scene, lens.k1), sampling(lens.matrix, self.scene.size)
+        seeds = model.seeds[-MINIMAL:]
+        found, matched, distance = agreement(lens.matrix, scene, index, gsd, seeds, options.verify)
+        chance = chance_agreement(lens.matrix, scene, index, gsd, options.verify)
+        odds = log10_odds(found, chance, scene.n_edges, self.n_screened, options.verify)
+        if odds < model.log10_odds or found.forward < agreeing.forward:
+            return
+        model.refined, model.matrix = lens.refined, lens.matrix
+        model.found, model.chance, model.log10_odds = found, chance, odds
+        model.matched, model.distance, model.gsd_m = matched, distance, gsd
+
+    def scene_of(self, model: Hypothesis) -> Scene:
+        """Return the scene as a pinhole sees it, behind the lens that a hypothesis found."""
+        lens_k1 = 0.0 if model.refined is None else model.refined.lens_k1
+        return straighten_scene(self.scene, lens_k1) if lens_k1 else self.scene
 
     def _odds(self, model: Hypothesis, chance: FloatArray) -> float:
         found = model.found

@@ -359,7 +359,7 @@ def _describe(
     location: Location,
     needed: Needed,
 ) -> RejectedPlace:
-    model, scene, index = entry.model, search.scene, search.index
+    model, scene, index = entry.model, search.scene_of(entry.model), search.index
     verify = search.options.verify
     camera = pose(model.matrix, scene.size)
     measured = model.chance != (1.0, 1.0, 1.0)

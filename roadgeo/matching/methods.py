@@ -47,6 +47,8 @@ class Fit:
     corner_sigma_m : (4,) float64 or None
     corner_covariance_m2 : (8, 8) float64 or None
         As in `Refined`.
+    lens_k1 : float
+        As of `Refined`.
     """
 
     index: ReferenceIndex
@@ -57,6 +59,7 @@ class Fit:
     log10_odds: float = math.nan
     corner_sigma_m: FloatArray | None = None
     corner_covariance_m2: FloatArray | None = None
+    lens_k1: float = 0.0
 
 
 @dataclass(frozen=True)
@@ -148,6 +151,7 @@ def _fits(estimator: TripleEstimator, result: SearchResult[Hypothesis]) -> tuple
                 score,
                 model.refined.corner_sigma_m,
                 model.refined.corner_covariance_m2,
+                model.refined.lens_k1,
             )
         )
     return tuple(fits)

@@ -38,6 +38,7 @@ def place_frame(location: Location, query: Query, fit: Fit, focal_px: float | No
         footprint=ground[:4],
         footprint_lonlat=lonlat[:4],
         center=Place(float(ground[4, 0]), float(ground[4, 1]), float(lonlat[4, 0]), float(lonlat[4, 1]), odds),
+        lens_k1=fit.lens_k1,
         corner_sigma_m=fit.corner_sigma_m,
         corner_covariance_m2=fit.corner_covariance_m2,
         gsd_m=camera.gsd_m,

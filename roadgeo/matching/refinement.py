@@ -12,7 +12,16 @@ from roadgeo.kernels.adjustment import adjust, point_row
 from roadgeo.matching.index import ReferenceIndex
 from roadgeo.matching.scene import Scene
 
-__all__ = ["RefineOptions", "Refined", "refine"]
+__all__ = [
+    "RefineOptions",
+    "Refined",
+    "corner_covariance",
+    "corner_sigmas",
+    "denormalise",
+    "normalise",
+    "refine",
+    "spacing_m",
+]
 
 
 @dataclass(frozen=True)
@@ -82,15 +91,18 @@ class Refined:
         Of the road points' distances from the map's roads, robustly.
     corner_covariance_m2 : (8, 8) float64
         Of the corners' x and y, in the order x, y of the first, x, y of the second, and so on.
+    lens_k1 : float
+        Of the lens behind which the query plane is that of a pinhole (see `geometry.lens`); 0 without one.
     """
 
     matrix: FloatArray
     corner_sigma_m: FloatArray
     rms_m: float
     corner_covariance_m2: FloatArray
+    lens_k1: float = 0.0
 
 
-def _parameters(matrix: FloatArray, center: FloatArray, half_size: float) -> tuple[FloatArray, FloatArray, float]:
+def normalise(matrix: FloatArray, center: FloatArray, half_size: float) -> tuple[FloatArray, FloatArray, float]:
     """Normalise a homography.
 
     Return the eight parameters of `kernels.growth`, the reference point under the middle, and the unit in metres.
@@ -105,15 +117,15 @@ def _parameters(matrix: FloatArray, center: FloatArray, half_size: float) -> tup
     return (p / p[2, 2]).ravel()[:8], origin, unit
 
 
-def _matrix(p: FloatArray, center: FloatArray, half_size: float, origin: FloatArray, unit: float) -> FloatArray:
-    """Undo `_parameters`."""
+def denormalise(p: FloatArray, center: FloatArray, half_size: float, origin: FloatArray, unit: float) -> FloatArray:
+    """Undo `normalise`."""
     from_query = np.array([[1.0, 0.0, -center[0]], [0.0, 1.0, -center[1]], [0.0, 0.0, half_size]])
     to_reference = np.array([[unit, 0.0, origin[0]], [0.0, unit, origin[1]], [0.0, 0.0, 1.0]])
     matrix = to_reference @ np.append(p, 1.0).reshape(3, 3) @ from_query
     return np.asarray(matrix / half_size)
 
 
-def _spacing(scene: Scene, unit: float) -> float:
+def spacing_m(scene: Scene, unit: float) -> float:
     """Return the distance between neighbouring road points in metres."""
     return scene.road_length_px * unit / scene.half_size / max(len(scene.points), 1)
 
@@ -132,6 +144,20 @@ def _corner_rows(p: FloatArray, uv: FloatArray) -> FloatArray:
         point_row(p, u, v, 1.0, 0.0, rows[i, 0])
         point_row(p, u, v, 0.0, 1.0, rows[i, 1])
     return rows
+
+
+def corner_covariance(
+    p: FloatArray, covariance: FloatArray, scene: Scene, unit: float, options: RefineOptions
+) -> FloatArray:
+    """Return the covariance (8, 8) of the frame's corners, square metres (see `Refined`), from that of `p` (8, 8)."""
+    derivatives = _corner_rows(p, (scene.corners - scene.center) / scene.half_size).reshape(8, 8)
+    floor = options.sigma_floor_m**2 + (options.sigma_floor_px * unit / scene.half_size) ** 2
+    return np.asarray(derivatives @ covariance @ derivatives.T * unit**2 + 0.5 * floor * np.eye(8))
+
+
+def corner_sigmas(covariance: FloatArray) -> FloatArray:
+    """Return the standard deviations (4,) of corners from their covariance (8, 8)."""
+    return np.asarray(np.sqrt(np.diag(covariance).reshape(4, 2).sum(axis=1)))
 
 
 def _held_points(p: FloatArray, n: int) -> tuple[FloatArray, FloatArray]:
@@ -166,7 +192,7 @@ def refine(
     """
     options = options or RefineOptions()
     center, half_size = scene.center, scene.half_size
-    p, origin, unit = _parameters(matrix, center, half_size)
+    p, origin, unit = normalise(matrix, center, half_size)
     gsd = unit / half_size
     sigma_m = math.hypot(options.sigma_m, options.sigma_px * gsd)
     chosen = matched >= 0
@@ -182,7 +208,7 @@ def refine(
     normal = np.empty((8, 8))
     _, rms = adjust(
         p, unit, origin[0], origin[1], points, np.ascontiguousarray(scene.directions[::step]), _cells(points, options),
-        min(1.0, _spacing(scene, unit) * step / options.correlation_m),
+        min(1.0, spacing_m(scene, unit) * step / options.correlation_m),
         pairs, (index.xy[matched[chosen]] - origin) / unit, _cells(pairs, options), options.intersection_weight,
         grid, targets, held_weight,
         options.n_cells**2, options.least_share, options.max_radius_m + options.max_radius_px * gsd,
@@ -192,11 +218,7 @@ def refine(
     )  # fmt: skip
     if not np.isfinite(rms):
         return None
-    covariance = np.linalg.inv(normal) * (rms / unit) ** 2
-    rows = _corner_rows(p, (scene.corners - center) / half_size)
-    derivatives = rows.reshape(8, 8)
-    floor = options.sigma_floor_m**2 + (options.sigma_floor_px * gsd) ** 2
-    corners = derivatives @ covariance @ derivatives.T * unit**2 + 0.5 * floor * np.eye(8)
-    result = _matrix(p, center, half_size, origin, unit)
-    sigma = np.sqrt(np.diag(corners).reshape(4, 2).sum(axis=1))
-    return Refined(result / result[2, 2], sigma, rms, corners)
+    inverse = np.asarray(np.linalg.inv(normal) * (rms / unit) ** 2, float)
+    result = denormalise(p, center, half_size, origin, unit)
+    covariance = corner_covariance(p, inverse, scene, unit, options)
+    return Refined(result / result[2, 2], corner_sigmas(covariance), rms, covariance)

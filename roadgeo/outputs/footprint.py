@@ -54,7 +54,9 @@ def write_world_file(path: Path, subject: Subject) -> None:
 
 def warp_mask(subject: Subject) -> AnyArray:
     """Draw the mask on the rows and columns of `subject.grid`: OUTSIDE the footprint, GROUND or ROAD in it."""
-    return warp(_labels(subject.mask), subject.place.homography, subject.grid, subject.target.to_place)
+    labels, place = _labels(subject.mask), subject.place
+    lens = place.lens((labels.shape[1], labels.shape[0]))
+    return warp(labels, place.homography, subject.grid, subject.target.to_place, lens=lens)
 
 
 def _write_mask(path: Path, subject: Subject) -> None:

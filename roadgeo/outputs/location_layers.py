@@ -8,7 +8,6 @@ from pathlib import Path
 import numpy as np
 
 from roadgeo._arrays import FloatArray
-from roadgeo.geometry.homography import Homography
 from roadgeo.geometry.mask import plane_to_pixel
 from roadgeo.location import Evidence, Location
 from roadgeo.outputs.columns import attributes
@@ -81,7 +80,7 @@ def _lengths(lines: Sequence[FloatArray]) -> FloatArray:
 def _match_layer(place: Placement, evidence: Evidence) -> Layer:
     """Show matched intersections where the map has them, with the way from the mask's to the map's."""
     pixels = plane_to_pixel(evidence.query_xy)
-    offset = evidence.reference_xy - Homography(place.homography)(pixels)
+    offset = evidence.reference_xy - place.to_crs(pixels)
     columns = {
         "column": pixels[:, 0],
         "row": pixels[:, 1],

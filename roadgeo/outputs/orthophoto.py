@@ -20,6 +20,7 @@ from rasterio.windows import Window
 
 from roadgeo._arrays import AnyArray, FloatArray
 from roadgeo.errors import CrsError, MaskError
+from roadgeo.geometry.lens import Lens
 from roadgeo.geometry.warping import MapGrid, Transform, cover, source_pixels
 from roadgeo.outputs.paths import Placement
 from roadgeo.storage.rasters import open_raster, writing_raster
@@ -183,7 +184,8 @@ def warp_image(
         grid = cover(size, homography, options.resolution, options.max_pixels, to_target)
         if grid.width == 0:
             raise CrsError(f"the footprint lies outside what {crs} is made for; choose another --crs")
-        plan = _Plan(picture, homography, to_place, grid, _INTERPOLATION[options.resampling])
+        interpolation, lens = _INTERPOLATION[options.resampling], place.lens(size)
+        plan = _Plan(picture, homography, to_place, grid, interpolation, lens)
         drawn = folder / "drawn.tif"
         with writing_raster(target):
             _draw(plan, drawn, crs, tags)
@@ -230,6 +232,7 @@ class _Plan:
     to_place: Transform
     grid: MapGrid
     interpolation: int
+    lens: Lens | None = None
 
     @property
     def size(self) -> tuple[int, int]:
@@ -321,6 +324,7 @@ def _blocks(plan: _Plan) -> Iterator[tuple[Window, AnyArray]]:
         for column in range(0, plan.grid.width, _BLOCK):
             size = min(_BLOCK, plan.grid.width - column), min(_BLOCK, plan.grid.height - row)
             pixels = source_pixels(plan.homography, plan.grid, column, row, size, plan.to_place)
+            pixels = pixels if plan.lens is None else plan.lens.bend(pixels)
             inside = np.all((pixels > 0) & (pixels < plan.size), axis=2)
             window = Window(column, row, *size)
             if inside.any():

@@ -11,7 +11,8 @@ import numpy as np
 from roadgeo._arrays import FloatArray
 from roadgeo.errors import OutputError
 from roadgeo.geometry.homography import Homography
-from roadgeo.geometry.mask import PIXEL_TO_PLANE
+from roadgeo.geometry.lens import Lens
+from roadgeo.geometry.mask import plane_to_pixel
 from roadgeo.location import Location
 from roadgeo.outputs.registry import FOOTPRINT, GEOPACKAGE, JSON, Output
 from roadgeo.roads.graph import RoadGraph
@@ -27,6 +28,8 @@ class Placement:
     homography: FloatArray
     footprint: FloatArray
     gsd_m: float
+    size: tuple[int, int] = (1, 1)
+    lens_k1: float = 0.0
 
     @classmethod
     def of(cls, location: Location) -> Placement:
@@ -40,7 +43,16 @@ class Placement:
         crs, homography, footprint, gsd_m = location.crs, location.homography, location.footprint, location.gsd_m
         if crs is None or homography is None or footprint is None or gsd_m is None:
             raise OutputError(f"{location.query} has no place on the map to draw: it is {location.status}")
-        return cls(crs, homography, footprint, gsd_m)
+        return cls(crs, homography, footprint, gsd_m, location.size or (1, 1), location.lens_k1)
+
+    def lens(self, size: tuple[int, int]) -> Lens | None:
+        """Return the lens in front of a picture of the frame, of `size` (width, height); None without one."""
+        return Lens.of(self.lens_k1, size) if self.lens_k1 else None
+
+    def to_crs(self, pixels: FloatArray) -> FloatArray:
+        """Take (..., 2) pixels of the mask (column, row; GDAL corner convention) to the CRS."""
+        lens = self.lens(self.size)
+        return Homography(self.homography)(pixels if lens is None else lens.straighten(pixels))
 
     def map_roads(self, graph: RoadGraph) -> list[FloatArray]:
         """Lay the mask's roads (query plane) on the map: (V, 2) each, but for those that reach beyond the horizon.
@@ -49,7 +61,7 @@ class Placement:
         """
         if graph.n_edges == 0:
             return []
-        mapped = Homography(self.homography @ PIXEL_TO_PLANE)(graph.coords)
+        mapped = self.to_crs(plane_to_pixel(graph.coords))
         whole = np.logical_and.reduceat(np.isfinite(mapped).all(axis=1), graph.offsets[:-1])
         parts = zip(graph.offsets[:-1].tolist(), graph.offsets[1:].tolist(), strict=True)
         return [mapped[first:last] for (first, last), seen in zip(parts, whole.tolist(), strict=True) if seen]

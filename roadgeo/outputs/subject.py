@@ -161,8 +161,10 @@ class Subject:
         """Column, row, x, y of 25 points on a grid over the picture."""
         columns, rows = np.meshgrid(np.linspace(0, self.size[0], _GRID), np.linspace(0, self.size[1], _GRID))
         pixels = np.stack([columns.ravel(), rows.ravel()], axis=1)
+        lens = self.place.lens(self.size)
+        straight = pixels if lens is None else lens.straighten(pixels)
         points: list[tuple[float, float, float, float]]
-        points = [tuple(point) for point in np.hstack([pixels, Homography(self.homography)(pixels)]).tolist()]
+        points = [tuple(point) for point in np.hstack([pixels, Homography(self.homography)(straight)]).tolist()]
         return points
 
     def matches(self) -> list[Match]:
@@ -177,10 +179,12 @@ class Subject:
         if evidence is None:
             raise OutputError(f"{self.location.query}: its matched intersections are not known any more")
         to_map, to_picture = Homography(self.homography), Homography(self.homography).inverse()
-        found = Homography(place.homography)(plane_to_pixel(evidence.query_xy))
-        pixels = to_picture(found)  # the picture's, which may be larger than the mask
+        found = place.to_crs(plane_to_pixel(evidence.query_xy))
+        lens = place.lens(self.size)
+        straight = to_picture(found)  # the picture's, which may be larger than the mask
         fitted = to_picture(evidence.reference_xy)
-        offset = evidence.reference_xy - to_map(pixels)
+        offset = evidence.reference_xy - to_map(straight)
+        pixels, fitted = (straight, fitted) if lens is None else (lens.bend(straight), lens.bend(fitted))
         return [Match(*row) for row in np.hstack([pixels, evidence.reference_xy, fitted, offset]).tolist()]
 
     def outline(self) -> FloatArray:

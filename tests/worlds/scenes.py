@@ -168,3 +168,22 @@ def scene_of(graph: RoadGraph, size: tuple[int, int] = (1000, 1000), px_per_m: f
         ),
     )
     return prepare_scene(graph, found, size, **changes)
+
+
+def shaken(matrix, scene, size_m, rng):
+    """The homography after its frame's corners have moved by some metres."""
+    import cv2
+
+    corners = mapped(matrix, scene.corners)
+    moved = (corners + rng.normal(0, size_m, (4, 2)) - corners[0]).astype(np.float32)
+    return np.array([[1, 0, corners[0, 0]], [0, 1, corners[0, 1]], [0, 0, 1]]) @ cv2.getPerspectiveTransform(
+        scene.corners.astype(np.float32), moved
+    )
+
+
+def sight_of(network, seed, tilt=0.0, sight=None, gsd=1.0):
+    """(truth, scene) of a camera somewhere over the town."""
+    rng = np.random.default_rng(seed)
+    center = tuple(rng.uniform(1300, 2700, 2))
+    truth = camera(center, (1000, 1000), gsd, tilt, rng.uniform(0, 360), rng.uniform(0, 360))
+    return truth, scene_of(look(network, truth, sight=sight, seed=seed), px_per_m=1 / gsd)

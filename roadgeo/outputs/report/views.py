@@ -254,7 +254,7 @@ def draw_place(subject: Shown, place: Placement) -> str:
     crossings = window.to_svg(crossings[wide.holds(crossings)][: subject.options.max_map_vertices // 4])
     corners = window.to_svg(place.footprint)
     to_svg = Homography(window.to_svg_matrix() @ place.homography)
-    query = [line for line in map(to_svg, subject.lines) if np.isfinite(line).all()]
+    query = [line for line in (window.to_svg(place.to_crs(one)) for one in subject.lines) if np.isfinite(line).all()]
     layers = [
         _picture_on_map(subject, place, window),
         Layer("map-roads", "roads of the map", draw_lines(thin_lines(roads, subject.options.max_map_vertices))),
@@ -264,7 +264,7 @@ def draw_place(subject: Shown, place: Placement) -> str:
     ]
     matches = subject.matches()
     if matches is not None:
-        at, found = window.to_svg(matches.reference_xy), to_svg(plane_to_pixel(matches.query_xy))
+        at, found = window.to_svg(matches.reference_xy), window.to_svg(place.to_crs(plane_to_pixel(matches.query_xy)))
         layers += [
             Layer("residuals", "residuals", _draw_arrows(at, found - at), '<path d="M3 7h18m-5-4l5 4l-5 4"/>'),
             Layer("matches", "matched intersections", draw_dots(at, ("halo", "")), _DOT_SIGN),
@@ -297,7 +297,8 @@ def _picture_on_map(subject: Shown, place: Placement, window: Window) -> Layer:
     is_photograph = subject.photograph is not None
     if grid.width == 0:
         return Layer("picture", "", "")
-    warped = warp(image, to_crs, grid, interpolation=cv2.INTER_LINEAR if is_photograph else cv2.INTER_NEAREST)
+    interpolation = cv2.INTER_LINEAR if is_photograph else cv2.INTER_NEAREST
+    warped = warp(image, to_crs, grid, interpolation=interpolation, lens=place.lens(size))
     x, y = window.to_svg(np.array([grid.west, grid.north]))
     box = (x, y, grid.width * grid.resolution, grid.height * grid.resolution)
     picture = draw_image(warped, box, subject.options.picture_bytes, lossless=not is_photograph)

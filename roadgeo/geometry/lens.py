@@ -1,0 +1,86 @@
+"""Radial distortion by a lens: where a pinhole camera would have put what a lens shows.
+
+One parameter, k1: what a pinhole puts at distance r from the middle of the frame, in halves of its longer side, a lens
+puts at r (1 + k1 r^2) in the same direction. k1 < 0 is a barrel, k1 > 0 a pincushion.
+"""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass
+
+import numpy as np
+
+from roadgeo._arrays import FloatArray
+
+__all__ = ["Lens"]
+
+#: A barrel folds over where r (1 + k1 r^2) no longer grows; nothing is seen so far out.
+_UNFOLDED = 0.98
+_NEWTON_STEPS = 8
+
+
+@dataclass(frozen=True)
+class Lens:
+    """A lens in front of a frame. `center` and points are in any one plane, pixels; `k1` 0 is a pinhole.
+
+    Attributes
+    ----------
+    center : (x, y)
+    half_side : float
+        Half of the frame's longer side.
+    """
+
+    k1: float
+    center: tuple[float, float]
+    half_side: float
+
+    @classmethod
+    def of(cls, k1: float, size: tuple[int, int], *, y_up: bool = False) -> Lens:
+        """Return the lens of a frame of `size` (width, height); in the query plane with `y_up`, else in pixels."""
+        width, height = size
+        return cls(k1, (width / 2, -height / 2 if y_up else height / 2), max(width, height) / 2)
+
+    def straighten(self, points: FloatArray) -> FloatArray:
+        """Take (..., 2) points as the lens shows them to where a pinhole would have put them."""
+        offset = (points - self.center) / self.half_side
+        seen = np.hypot(offset[..., 0], offset[..., 1])
+        scale = np.divide(self._radius(seen), seen, out=np.ones_like(seen), where=seen > 0)
+        return np.asarray(self.center + self.half_side * offset * scale[..., None])
+
+    def straighten_directions(self, points: FloatArray, directions: FloatArray) -> FloatArray:
+        """Take (..., 2) unit vectors at such points along."""
+        offset = (points - self.center) / self.half_side
+        seen = np.hypot(offset[..., 0], offset[..., 1])
+        square = self._radius(seen) ** 2
+        radial = np.divide(offset, seen[..., None], out=np.zeros_like(offset), where=seen[..., None] > 0)
+        along = (directions * radial).sum(axis=-1, keepdims=True)
+        across, outwards = 1.0 / (1.0 + self.k1 * square), 1.0 / (1.0 + 3.0 * self.k1 * square)
+        turned = across[..., None] * directions + ((outwards - across)[..., None] * along) * radial
+        return np.asarray(turned / np.linalg.norm(turned, axis=-1, keepdims=True))
+
+    def bend(self, points: FloatArray) -> FloatArray:
+        """Take (..., 2) points where a pinhole would put them to where the lens shows them; the inverse."""
+        offset = (points - self.center) / self.half_side
+        square = np.minimum((offset**2).sum(axis=-1, keepdims=True), self._farthest() ** 2)
+        return np.asarray(self.center + self.half_side * offset * (1.0 + self.k1 * square))
+
+    def moves(self, points: FloatArray) -> FloatArray:
+        """Return the derivative (..., 2) of `straighten(points)` by k1."""
+        straight = (self.straighten(points) - self.center) / self.half_side
+        square = (straight**2).sum(axis=-1, keepdims=True)
+        return np.asarray(-self.half_side * straight * square / (1.0 + 3.0 * self.k1 * square))
+
+    def _farthest(self) -> float:
+        """Return the distance, as a pinhole sees it, up to which the lens does not fold over."""
+        return math.inf if self.k1 >= 0.0 else _UNFOLDED / math.sqrt(-3.0 * self.k1)
+
+    def _radius(self, seen: FloatArray) -> FloatArray:
+        """Solve r (1 + k1 r^2) = seen, by Newton's method from where it converges."""
+        farthest = self._farthest()
+        if math.isfinite(farthest):
+            seen = np.minimum(seen, farthest * (1.0 + self.k1 * farthest**2))
+        r = seen.copy()
+        for _ in range(_NEWTON_STEPS):
+            r -= (r * (1.0 + self.k1 * r * r) - seen) / (1.0 + 3.0 * self.k1 * r * r)
+        return r

@@ -1,0 +1,69 @@
+"""Passes over a query's intersections that propose places by triples: how many, and how widely they look."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from dataclasses import dataclass, replace
+from itertools import islice
+from typing import Protocol
+
+from roadgeo.matching.index import ReferenceIndex
+from roadgeo.matching.scene import Scene
+from roadgeo.matching.triples import Proposals, TripleOptions, propose, smaller
+
+__all__ = ["LAST", "USUAL", "Source", "Sweep"]
+
+
+class Source(Protocol):
+    """Where hypotheses come from: `Sweep` makes them of triples."""
+
+    def proposals(
+        self, scene: Scene, index: ReferenceIndex, scale: tuple[float, float], min_ratio: float
+    ) -> Iterator[Proposals]:
+        """Yield what one query intersection after another may be, with the work it took, the most promising first.
+
+        `scale` = (least, greatest) root of the determinant of a proposed map, metres per pixel; `min_ratio` is the
+        least ratio of its singular values.
+        """
+
+
+@dataclass(frozen=True)
+class Sweep:
+    """One pass over the query's anchors: how many, and how widely their triples are looked up.
+
+    Attributes
+    ----------
+    triples : TripleOptions
+    max_anchors : int
+        On a map of 15,000 intersections or more; on a smaller one, where each takes less time, more.
+    most_more : float
+        At most by this factor.
+    """
+
+    triples: TripleOptions
+    max_anchors: int
+    most_more: float = 3.0
+
+    def proposals(
+        self, scene: Scene, index: ReferenceIndex, scale: tuple[float, float], min_ratio: float
+    ) -> Iterator[Proposals]:
+        """Yield the proposals of the anchors (see `Source`)."""
+        anchors = propose(scene.intersections, scene.branches, scene.neighbours, index, scale, min_ratio, self.triples)
+        return islice(anchors, int(self.max_anchors * min(smaller(len(index)), self.most_more)))
+
+
+#: Where the rarest triples lead nowhere, more neighbours are taken, all over the frame.
+_FURTHER = TripleOptions(n_neighbours=12, max_hits=20_000, max_compared=500_000, spread=True)
+
+
+#: The last resort: every triple that is alike, wherever it leads.
+_SINGLE = TripleOptions(spread=True, single=True, max_hits=6000)
+
+#: The sweeps that follow one another until a place stands out.
+USUAL: tuple[Source, ...] = (
+    Sweep(TripleOptions(), 40),
+    Sweep(replace(_FURTHER, angle_tolerance_deg=7.5), 30),
+    Sweep(replace(_FURTHER, angle_tolerance_deg=10.0), 20),
+)
+#: The last resort.
+LAST: tuple[Source, ...] = (Sweep(_SINGLE, 25),)
