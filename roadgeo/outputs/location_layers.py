@@ -101,7 +101,7 @@ def _match_layer(place: Placement, evidence: Evidence) -> Layer:
 
 def _residual_layer(place: Placement, evidence: Evidence) -> Layer:
     """Draw from each of the mask's matched intersections towards the map's, exaggerated."""
-    start = Homography(place.homography)(plane_to_pixel(evidence.query_xy))
+    start = place.to_crs(plane_to_pixel(evidence.query_xy))
     offset = evidence.reference_xy - start
     return Layer(
         "residuals",
