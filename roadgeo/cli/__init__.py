@@ -27,6 +27,7 @@ ERROR, USAGE, NOT_LOCATED, INTERRUPTED = 1, 2, 3, 130
 COMMANDS = {
     "index": ("roadgeo.cli.index", "Build a reference: the searchable roads of a place."),
     "locate": ("roadgeo.cli.locate", "Find road masks on a reference and draw them there."),
+    "verify": ("roadgeo.cli.verify", "Check whether georeferenced images are where they say."),
     "vectorize": ("roadgeo.cli.vectorize", "Show what roads are seen in a mask."),
     "info": ("roadgeo.cli.references", "Describe a reference."),
     "check": ("roadgeo.cli.references", "Verify every byte and number of a reference."),

@@ -1,0 +1,215 @@
+"""`roadgeo verify`: options, one call, printing."""
+
+from __future__ import annotations
+
+import json
+from collections import Counter
+from dataclasses import replace
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+import click
+
+from roadgeo.cli import ERROR, NOT_LOCATED
+from roadgeo.cli.command_line import made_by
+from roadgeo.cli.folders import make_folder
+from roadgeo.cli.parameters import verbosity_options
+from roadgeo.cli.photographs import read_options, segmenting_options
+
+if TYPE_CHECKING:
+    from roadgeo.running.verifying import Verified, VerifyRun
+
+__all__ = ["describe", "verify_command"]
+
+#: Exit statuses besides those of all commands.
+OFF = 4
+
+_COLORS = {"agrees": "green", "off": "red", "unknown": "yellow"}
+
+
+@click.command("verify", short_help="Check whether georeferenced images are where they say.")
+@click.argument("images", metavar="IMAGE...", nargs=-1, required=True, type=click.Path())
+@click.option(
+    "-r",
+    "--reference",
+    "references",
+    metavar="REF",
+    type=click.Path(),
+    multiple=True,
+    help="Reference to hold them against: REF.gpkg, or a name in the library. Repeatable. Default: all of the library.",
+)
+@click.option(
+    "-o",
+    "--out-dir",
+    metavar="DIR",
+    default=".",
+    type=click.Path(file_okay=False),
+    help="Where files go; made if missing. Default: here.",
+)
+@click.option("--json", "as_json", is_flag=True, help="Print one JSON object per image and line, in input order.")
+@click.option(
+    "--fix",
+    is_flag=True,
+    help="Of each image that is off, write IMAGE_fixed.tif: the same pixels with the corrected georeference; and"
+    " IMAGE_fixed.points, for the QGIS Georeferencer.",
+)
+@click.option("--in-place", is_flag=True, help="Correct the georeference of GeoTIFFs that are off themselves.")
+@click.option(
+    "--josm", is_flag=True, help="Write roadgeo_offsets.xml: imagery offset bookmarks, as JOSM's preferences hold them."
+)
+@click.option(
+    "--tolerance",
+    metavar="METRES",
+    type=click.FloatRange(0.1, 100),
+    default=3.0,
+    show_default=True,
+    help="An image agrees if, on average over the frame, it is off by less.",
+)
+@click.option(
+    "--reach",
+    metavar="METRES",
+    type=click.FloatRange(20, 2000),
+    default=350.0,
+    show_default=True,
+    help="How far off it may be: nothing beyond is looked at.",
+)
+@click.option(
+    "--max-turn",
+    metavar="DEG",
+    type=click.FloatRange(0, 45),
+    default=6.0,
+    show_default=True,
+    help="By how much it may be turned.",
+)
+@click.option("--crs", metavar="CRS", help="CRS of images that name none, such as EPSG:25832.")
+@segmenting_options
+@click.option("--threshold", metavar="T", type=float, help="Values above T are road. Default: told by the values.")
+@click.option(
+    "--band", metavar="N", type=click.IntRange(1), help="Band that holds the mask. Default: told by the bands."
+)
+@click.option("-j", "--jobs", metavar="N", type=click.IntRange(1), default=1, show_default=True, help="Processes.")
+@verbosity_options
+def verify_command(
+    images: tuple[str, ...],
+    out_dir: str,
+    as_json: bool,
+    fix: bool,
+    in_place: bool,
+    josm: bool,
+    jobs: int,
+    quiet: bool,
+    verbose: bool,
+    **given: Any,
+) -> int:
+    """Check whether georeferenced IMAGEs are where they say, by the roads they show.
+
+    An image is a road mask or a photograph (pip install 'roadgeo[segment]') with a place: a geotransform, control
+    points, or a world file. Its roads are held against those of a reference, from the given place outwards; the world
+    is never searched (that is what `roadgeo locate` does). Of each image is said that it
+
+    \b
+      agrees      within --tolerance
+      is off      by so many metres to move it east and north, degrees to turn it clockwise,
+                  and its scale, with standard deviations; --fix writes it corrected
+      is unknown  it cannot be judged, and why: few roads, another map, streets that repeat
+
+    For several images also roadgeo_verify.csv, with a row each. Its columns mercator_east and mercator_north are the
+    offset that JOSM asks for; `id` ends the address of iD or Rapid, where it moves the imagery.
+
+    \b
+    Examples:
+      roadgeo verify ortho.tif
+      roadgeo verify tiles/ --reference boston-ma --fix --out-dir fixed
+      roadgeo verify scan.jpg --crs EPSG:25832 --tolerance 10
+      roadgeo verify *.tif --json --jobs 4 > verified.jsonl
+
+    Exit status: 0 all agree, 4 at least one is off, 3 none is off but some are unknown, 1 error, 2 usage.
+    """
+    from roadgeo.cli.compilation import compile_once
+    from roadgeo.cli.progress import count_up, print_steps
+    from roadgeo.outputs.verification_files import write_josm, write_table
+    from roadgeo.running.batch import open_references
+    from roadgeo.running.tasks import find_masks, name_tasks
+    from roadgeo.running.verifying import verify_images
+
+    found = find_masks(images)
+    if not found:
+        raise click.UsageError(f"No images in {', '.join(images)}.")
+    tasks = name_tasks(found[:1] if given["fuse"] else found)
+    settings = _settings(given, found[1:] if given["fuse"] else [], jobs)
+    open_references(settings.references, print_steps(quiet))  # what is wrong with them is said once
+    compile_once(quiet)
+    if fix or josm or len(tasks) > 1:
+        make_folder(out_dir)
+    results: list[Verified] = []
+    with count_up(len(tasks), quiet, as_json) as count:
+        for task, one in zip(tasks, verify_images(tasks, settings, jobs), strict=True):
+            results.append(one)
+            count(one.verdict)
+            files = _correct(one, Path(task.mask), Path(out_dir) / task.stem, fix, in_place)
+            _report(one, files, as_json, quiet, verbose)
+    documents = [one.document for one in results]
+    if josm:
+        write_josm(Path(out_dir) / "roadgeo_offsets.xml", documents)
+    counts = Counter(one.verdict for one in results)
+    if len(tasks) > 1:
+        write_table(Path(out_dir) / "roadgeo_verify.csv", documents)
+        if not quiet:
+            said = ", ".join(f"{n} {verdict}" for verdict, n in counts.items())
+            click.echo(f"{said}; all of them: {Path(out_dir) / 'roadgeo_verify.csv'}", err=True)
+    return ERROR if counts["error"] else OFF if counts["off"] else NOT_LOCATED if counts["unknown"] else 0
+
+
+def _settings(given: dict[str, Any], others: list[str], jobs: int) -> VerifyRun:
+    """Put together what was asked."""
+    from roadgeo.matching.checking import CheckOptions
+    from roadgeo.running.verifying import VerifyRun
+
+    usual = CheckOptions()
+    search = replace(usual.search, reach_m=given["reach"], turn_deg=given["max_turn"])
+    options = replace(usual, tolerance_m=given["tolerance"], search=search)
+    reading = read_options({**given, "focal_px": None}, {}, others, jobs)
+    return VerifyRun(given["references"], options, reading.of_query(), given["crs"])
+
+
+def _correct(one: Verified, image: Path, stem: Path, fix: bool, in_place: bool) -> list[Path]:
+    """Write the corrected files of an image that is off, as far as they are asked for."""
+    from roadgeo.outputs.verification_files import write_fixed, write_in_place, write_points
+
+    if one.corrected is None:
+        return []
+    files = []
+    if fix:
+        files = [stem.with_name(f"{stem.name}_fixed{ending}") for ending in (".tif", ".points")]
+        write_fixed(image, files[0], one.corrected)
+        write_points(files[1], one.corrected)
+    if in_place:
+        write_in_place(image, one.corrected)
+        files.append(image)
+    return files
+
+
+def describe(document: dict[str, Any]) -> str:
+    """Say what became of an image, in a line."""
+    verdict, found = document["verdict"], document.get("displacement")
+    word = click.style(verdict, fg=_COLORS.get(verdict))
+    if verdict == "off" and found is not None:
+        return (
+            f"{document['image']}: {word}: move it {found['east_m']:+.1f} m east, {found['north_m']:+.1f} m north"
+            f" (± {found['sigma_m']:.1f} m), turn it {found['turn_deg']:+.2f}°, scale it by {found['scale']:.4f};"
+            f" {document['agreeing']:.0%} of the roads agree then, {document['agreeing_as_given']:.0%} as it is"
+        )
+    return f"{document['image']}: {word}: {document['reason']}"
+
+
+def _report(one: Verified, files: list[Path], as_json: bool, quiet: bool, verbose: bool) -> None:
+    if as_json:
+        click.echo(json.dumps({**one.document, **made_by()}))
+    if one.verdict == "error":
+        click.echo(f"{click.style('Error:', fg='red')} {' '.join(one.document['reason'].split())}", err=True)
+    elif not quiet:
+        click.echo(describe(one.document), err=as_json)
+        if verbose and one.document.get("log10_lead") is not None:
+            click.echo(f"  leads any other place nearby by 10^{one.document['log10_lead']:.1f}", err=as_json)
+        if files:
+            click.echo(f"  wrote {', '.join(map(str, files))}", err=as_json)

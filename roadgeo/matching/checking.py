@@ -1,0 +1,294 @@
+"""Is a given place right? The best place near it, by how much it leads all others there, and how far off it lies."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+from dataclasses import dataclass, field, replace
+from typing import Literal
+
+import numpy as np
+
+from roadgeo._arrays import BoolArray, FloatArray, IntArray
+from roadgeo.geometry.camera import sampling
+from roadgeo.geometry.displacement import Displacement, measure
+from roadgeo.geometry.homography import Homography
+from roadgeo.kernels.roads import forward_distances
+from roadgeo.matching.index import ReferenceIndex
+from roadgeo.matching.local_search import LocalSearchOptions, move_about, search_nearby
+from roadgeo.matching.refinement import Refined, RefineOptions, refine
+from roadgeo.matching.scene import Scene
+from roadgeo.matching.verification import VerifyOptions, agreement, tolerance_m
+
+__all__ = ["CheckOptions", "Checked", "Verdict", "check_place"]
+
+Verdict = Literal["agrees", "off", "unknown"]
+
+_NO_SEEDS: IntArray = np.array([], np.int64)
+
+
+@dataclass(frozen=True)
+class CheckOptions:
+    """What counts as right, and as beyond doubt.
+
+    Attributes
+    ----------
+    tolerance_m : float
+        A place agrees where the frame, on average, is off by less.
+    min_log10, min_log10_as_given : float
+        Log10 odds that the best place must have against each other place nearby, and where it is the given one: of a
+        dozen places that fit by chance, the best is seldom that.
+    min_chi2 : float
+        What is off must differ from nothing by this: 18.5 is met by chance once in 1000 with 4 degrees of freedom.
+    max_sigma_m : float
+        Where the frame's place is less sure than this, nothing is said.
+    min_roads_m : float
+        Length of road that mask and map must each show.
+    max_drift_m : float
+        Refinement that moves the corners by more than this has lost its way.
+    piece_m : float
+        Roads agree or not over about this length; pieces are independent.
+    perspective_sigma : float
+        Prior standard deviation of the perspective that is left: georeferenced images are rectified.
+    """
+
+    tolerance_m: float = 3.0
+    min_log10: float = 2.0
+    min_log10_as_given: float = 1.0
+    min_chi2: float = 18.5
+    max_sigma_m: float = 3.0
+    min_roads_m: float = 300.0
+    max_drift_m: float = 40.0
+    piece_m: float = 60.0
+    perspective_sigma: float = 0.003
+    search: LocalSearchOptions = field(default_factory=LocalSearchOptions)
+    verify: VerifyOptions = field(default_factory=VerifyOptions)
+    refine: RefineOptions = field(default_factory=RefineOptions)
+
+
+@dataclass(frozen=True)
+class Checked:
+    """What became of a given place.
+
+    Attributes
+    ----------
+    displacement : Displacement or None
+        From where it was put to where it belongs, on the reference plane. None where that is not known.
+    matrix : (3, 3) float64 or None
+        Query plane to reference plane, corrected.
+    log10_lead : float or None
+        Log10 odds of the best place against its hardest rival.
+    rival : Displacement or None
+        Where that lies.
+    agreeing : float or None
+        Share of the roads, of mask and map, that agree at the best place; `agreeing_as_given` at the given one.
+    matched : (N,) int or None
+        Map intersection of each query intersection, or -1.
+    """
+
+    verdict: Verdict
+    reason: str
+    displacement: Displacement | None = None
+    matrix: FloatArray | None = None
+    log10_lead: float | None = None
+    rival: Displacement | None = None
+    agreeing: float | None = None
+    agreeing_as_given: float | None = None
+    matched: IntArray | None = None
+
+
+def check_place(start: FloatArray, scene: Scene, index: ReferenceIndex, options: CheckOptions | None = None) -> Checked:
+    """Check the place of a scene: nothing further than the search's reach is looked at.
+
+    Parameters
+    ----------
+    start : (3, 3) float64
+        Query plane to reference plane, as it is given.
+    """
+    options = options or CheckOptions()
+    gsd = sampling(start, scene.size)
+    if scene.road_length_px * gsd < options.min_roads_m:
+        return Checked("unknown", f"too few roads: the mask shows {scene.road_length_px * gsd:.0f} m of them")
+    judge = _Judge(scene, index, start, options)
+    if judge.map_length_m < options.min_roads_m:
+        return Checked("unknown", f"the map has {judge.map_length_m:.0f} m of roads there: not on this map")
+    return _judge_best(judge, judge.refine_all([start, *judge.propose()]))
+
+
+@dataclass(frozen=True)
+class _Place:
+    """A place, how well each piece of the frame agrees there, and what refined it, where that could be done."""
+
+    matrix: FloatArray
+    pieces: FloatArray
+    matched: IntArray
+    refined: Refined | None
+
+
+class _Judge:
+    """Refines places of one scene and tells how well they agree."""
+
+    def __init__(self, scene: Scene, index: ReferenceIndex, start: FloatArray, options: CheckOptions) -> None:
+        self.scene, self.index, self.start, self.options = scene, index, start, options
+        self.gsd = sampling(start, scene.size)
+        self.corners = Homography(start)(scene.corners)
+        self.samples = self._sample_map()
+        width, height = scene.size
+        self.cell_px = max(options.piece_m / self.gsd, 1.0)
+        self.cells = (math.ceil(height / self.cell_px), math.ceil(width / self.cell_px))
+        tilted = np.abs(start[2, :2]).max() / abs(start[2] @ np.append(scene.center, 1.0)) * scene.half_size > 0.01
+        sigma = options.refine.perspective_sigma if tilted else options.perspective_sigma
+        self.refine_options = replace(options.refine, perspective_sigma=sigma)
+
+    def _sample_map(self) -> FloatArray:
+        """Return (S, 2) points along the roads around the frame, one in `backward_step_m` metres."""
+        low = self.corners.min(axis=0) - 1.5 * self.options.search.reach_m
+        high = self.corners.max(axis=0) + 1.5 * self.options.search.reach_m
+        a, b = self.index.segments[:, :2].astype(float), self.index.segments[:, 2:].astype(float)
+        near = (np.maximum(a, b) > low).all(axis=1) & (np.minimum(a, b) < high).all(axis=1)
+        a, b = a[near], b[near]
+        along = np.concatenate(([0.0], np.cumsum(np.hypot(*(b - a).T))))
+        at = np.arange(self.step_m / 2, along[-1], self.step_m)
+        segment = np.minimum(np.searchsorted(along, at, side="right") - 1, max(len(a) - 1, 0))
+        share = (at - along[segment]) / np.maximum(np.diff(along)[segment], 1e-9) if len(a) else at
+        return np.asarray(a[segment] + share[:, None] * (b - a)[segment]) if len(a) else np.empty((0, 2))
+
+    @property
+    def step_m(self) -> float:
+        """Distance between samples of the map's roads."""
+        return self.options.verify.backward_step_m
+
+    @property
+    def map_length_m(self) -> float:
+        """Length of the map's roads inside the frame as it is given, metres."""
+        return self.step_m * float(self._in_frame(self.start)[1].sum())
+
+    def propose(self) -> list[FloatArray]:
+        """Return the starts of the places nearby."""
+        center = Homography(self.start)(self.scene.center)
+        shifts = search_nearby(self.start, self.scene, self.index, self.options.search)
+        return [move_about(center, shift) @ self.start for shift in shifts]
+
+    def refine_all(self, starts: Sequence[FloatArray]) -> list[_Place]:
+        """Refine places roughly, and return those that are different ones, the one that agrees best first."""
+        places = [self.refine(start, 200) for start in starts]
+        distinct: list[_Place] = []
+        for place in sorted(places, key=lambda place: -place.pieces.sum()):
+            if all(self.gap(place.matrix, other.matrix) >= self.options.search.apart_m for other in distinct):
+                distinct.append(place)
+        return distinct
+
+    def refine(self, start: FloatArray, n_points: int | None) -> _Place:
+        """Refine a place until its matches settle; where it loses its way, it stays as it is."""
+        matrix, refined = start, None
+        matched = np.full(len(self.scene.intersections), -1)
+        for _ in range(3):
+            _, matched, _ = agreement(matrix, self.scene, self.index, self.gsd, _NO_SEEDS, self.options.verify)
+            step = refine(matrix, self.scene, self.index, matched, self.refine_options, n_points, held=True)
+            if step is None or not self.gap(step.matrix, start) < self.options.max_drift_m:
+                break
+            refined, matrix = step, step.matrix
+        return _Place(matrix, self.pieces(matrix), matched, refined)
+
+    def pieces(self, matrix: FloatArray) -> FloatArray:
+        """Return the share of the roads in each piece of the frame that agree; a half where there are none."""
+        scene, verify, index = self.scene, self.options.verify, self.index
+        tolerance = tolerance_m(self.gsd, verify)
+        points = scene.dense_points
+        away = np.empty(len(points))
+        forward_distances(
+            matrix, points, scene.dense_directions, tolerance, math.cos(math.radians(verify.max_turn_deg)), 0.0, 0.0,
+            index.segments, index.segment_starts, index.segment_ids, index.grid, index.shape, away,
+        )  # fmt: skip
+        seen, inside = self._in_frame(matrix)
+        seen = seen[inside]
+        rows, columns = self._field_cells(seen)
+        near = scene.field[rows, columns] * scene.field_scale <= tolerance / self.gsd + 0.7 * scene.field_scale
+        spacing_m = scene.road_length_px * self.gsd / max(len(points), 1)
+        n = self.cells[0] * self.cells[1]
+        at, back = self._cell_of(points), self._cell_of(seen)
+        shown = np.bincount(at, np.isfinite(away) * spacing_m, n) + np.bincount(back, near * self.step_m, n)
+        there = np.bincount(at, minlength=n) * spacing_m + np.bincount(back, minlength=n) * self.step_m
+        return np.where(there > 0, shown / np.maximum(there, 1e-9), 0.5)
+
+    def _in_frame(self, matrix: FloatArray) -> tuple[FloatArray, BoolArray]:
+        """Return the map's samples on the query plane, and which of them lie on observed ground of the frame."""
+        scene, to_query = self.scene, Homography(matrix).facing(self.scene.center).inverse()
+        seen = to_query(self.samples)
+        x, y = seen[:, 0], -seen[:, 1]
+        inside = (x > 0) & (y > 0) & (x < scene.size[0]) & (y < scene.size[1])
+        rows, columns = self._field_cells(seen[inside])
+        inside[inside] = scene.observed[rows, columns]
+        return seen, inside
+
+    def _field_cells(self, xy: FloatArray) -> tuple[IntArray, IntArray]:
+        """Return rows and columns of the scene's reduced frame."""
+        cells = (xy * (1.0, -1.0) / self.scene.field_scale).astype(np.int64)
+        return (
+            np.minimum(cells[:, 1], self.scene.field.shape[0] - 1),
+            np.minimum(cells[:, 0], self.scene.field.shape[1] - 1),
+        )
+
+    def _cell_of(self, xy: FloatArray) -> IntArray:
+        """Return the number of the piece of the frame that each point lies in."""
+        cells = (xy * (1.0, -1.0) / self.cell_px).astype(np.int64)
+        rows, columns = (np.clip(cells[:, k], 0, self.cells[1 - k] - 1) for k in (1, 0))
+        return np.asarray(rows * self.cells[1] + columns)
+
+    def displacement(self, place: _Place) -> Displacement:
+        """Return how far a place lies from the given one."""
+        covariance = np.zeros((8, 8)) if place.refined is None else place.refined.corner_covariance_m2
+        return measure(self.corners, Homography(place.matrix)(self.scene.corners), covariance)
+
+    def gap(self, a: FloatArray, b: FloatArray) -> float:
+        """Root mean square distance, metres, of where two homographies put the frame's corners."""
+        gaps = Homography(a)(self.scene.corners) - Homography(b)(self.scene.corners)
+        return float(np.sqrt(np.mean(np.sum(gaps**2, axis=1))))
+
+
+def _lead(a: _Place, b: _Place) -> float:
+    """Log10 odds that one place agrees better than another by more than chance.
+
+    Were they alike, each piece of the frame would speak for either with the same probability: by Hoeffding's bound the
+    sum of such differences d exceeds t with a probability of at most exp(-t^2 / (2 sum d^2)).
+    """
+    difference = a.pieces - b.pieces
+    total, squares = float(difference.sum()), float((difference**2).sum())
+    return 0.0 if total <= 0.0 or squares == 0.0 else total**2 / (2.0 * squares) / math.log(10.0)
+
+
+def _judge_best(judge: _Judge, places: Sequence[_Place]) -> Checked:
+    """Judge the best of some places, the best first, against the others."""
+    options = judge.options
+    best = judge.refine(places[0].matrix, None)
+    rivals = [place for place in places[1:] if judge.gap(place.matrix, best.matrix) >= options.search.apart_m]
+    hardest = min(rivals, key=lambda rival: _lead(best, rival), default=None)
+    if best.refined is None or hardest is None:
+        return Checked("unknown", f"no place within {options.search.reach_m:g} m fits")
+    found, lead = judge.displacement(best), _lead(best, hardest)
+    known = Checked(
+        "unknown",
+        "",
+        found,
+        best.matrix,
+        lead,
+        judge.displacement(hardest),
+        float(np.mean(best.pieces)),
+        float(np.mean(judge.pieces(judge.start))),
+        best.matched,
+    )
+    off, sigma = found.over(judge.corners), found.sigma_over(judge.corners)
+    said = f"off by {off:.1f} ± {sigma:.1f} m"
+    agrees = off <= options.tolerance_m
+    needed = options.min_log10_as_given if agrees else options.min_log10
+    if lead < needed:
+        told = f"the best leads by 10^{lead:.1f}, 10^{needed:g} is needed"
+        nothing = f"no place within {options.search.reach_m:g} m stands out: {told}"
+        return replace(known, displacement=None, matrix=None, matched=None, reason=nothing)
+    if sigma > options.max_sigma_m:
+        return replace(known, reason=f"the roads place it to {sigma:.1f} m only")
+    if agrees:
+        return replace(known, verdict="agrees", reason=said)
+    if found.significance < options.min_chi2:
+        return replace(known, reason=f"{said}: that may be chance")
+    return replace(known, verdict="off", reason=said)

@@ -1,0 +1,232 @@
+"""Many georeferenced images: is each where it says? What `roadgeo verify` runs."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable, Iterator, Sequence
+from dataclasses import dataclass, field, replace
+from time import perf_counter
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+
+from roadgeo._arrays import FloatArray
+from roadgeo._version import __version__
+from roadgeo.errors import CrsError, RoadgeoError
+from roadgeo.geometry.displacement import Displacement
+from roadgeo.geometry.frame import Frame
+from roadgeo.geometry.homography import Homography
+from roadgeo.geometry.mask import PIXEL_TO_PLANE, RoadMask
+from roadgeo.geometry.projection import LocalPlane, grid_north, to_lonlat
+from roadgeo.location import Location
+from roadgeo.matching.checking import Checked, CheckOptions, check_place
+from roadgeo.matching.options import LocateOptions
+from roadgeo.matching.query import read_query
+from roadgeo.outputs.verification_files import editor_offset, id_fragment
+from roadgeo.running.processes import run
+from roadgeo.running.queries import QueryOptions, locate_query
+from roadgeo.running.tasks import Task
+from roadgeo.sources.georeference import Georeference, read_georeference
+
+if TYPE_CHECKING:
+    from roadgeo.reference.reference import Reference
+
+__all__ = ["SCHEMA", "Verified", "VerifyRun", "verify_image", "verify_images"]
+
+SCHEMA = "roadgeo.verification/1"
+
+
+@dataclass(frozen=True)
+class Verified:
+    """What became of one image: its JSON object, and the corrected georeference where it is off."""
+
+    document: dict[str, Any]
+    corrected: Georeference | None = None
+
+    @property
+    def verdict(self) -> str:
+        """One of "agrees", "off", "unknown" and "error"."""
+        return str(self.document["verdict"])
+
+
+@dataclass(frozen=True)
+class VerifyRun:
+    """How images are read and judged; `crs` is that of world files, or stands for what images say."""
+
+    references: tuple[str, ...] = ()
+    options: CheckOptions = field(default_factory=CheckOptions)
+    query: QueryOptions = field(default_factory=QueryOptions)
+    crs: str | None = None
+
+    def prepare(self) -> Callable[[Task], Verified]:
+        """Open the references."""
+        from roadgeo.running.batch import open_references
+        from roadgeo.warmup import warm_up
+
+        references = open_references(self.references)
+        warm_up()
+        return lambda task: verify_image(task.mask, references, self)
+
+    def give_up(self, task: Task, reason: str) -> Verified:
+        """Make the outcome of an image that could not be worked on."""
+        return _failed(task.mask, reason)
+
+
+def verify_images(tasks: Sequence[Task], settings: VerifyRun, jobs: int = 1) -> Iterator[Verified]:
+    """Verify images in one process or several; yield what became of each, in their order."""
+    return run(tasks, settings, jobs)
+
+
+def verify_image(image: str, references: Sequence[Reference], settings: VerifyRun | None = None) -> Verified:
+    """Say whether an image lies where its georeference says; what is wrong with it is told, not raised."""
+    settings = settings or VerifyRun()
+    started = perf_counter()
+    try:
+        place = read_georeference(image, settings.crs)
+        if place is None:
+            return Verified(_document(image, Checked("unknown", "it has no georeference: use `roadgeo locate`")))
+        found = _best(_Image(image, place, settings), references)
+        return replace(found, document={**found.document, "seconds": round(perf_counter() - started, 3)})
+    except RoadgeoError as error:
+        return _failed(image, str(error))
+
+
+@dataclass(frozen=True)
+class _Image:
+    name: str
+    place: Georeference
+    settings: VerifyRun
+
+
+def _best(image: _Image, references: Sequence[Reference]) -> Verified:
+    """Judge an image on the reference whose map shows most intersections in its frame."""
+    counted = [(_count_inside(image.place, one), k) for k, one in enumerate(references)]
+    most, k = max(counted, key=lambda pair: (pair[0], -pair[1]))
+    reference = references[k]
+    if most == 0:
+        names = ", ".join(one.name for one in references)
+        return Verified(
+            _document(image.name, Checked("unknown", f"it lies on none of the maps ({names})"), image.place)
+        )
+    start = image.place.on_plane(reference.index.plane)
+    checked = _look(image, reference, start)
+    found = checked.displacement
+    if found is None or checked.verdict != "off":
+        return Verified(_document(image.name, checked, image.place, reference))
+    corrected = image.place.moved(found.matrix @ start, reference.index.plane)
+    return Verified(_document(image.name, checked, image.place, reference, corrected), corrected)
+
+
+def _count_inside(place: Georeference, reference: Reference) -> int:
+    """Count the map's intersections within the bounds of an image."""
+    plane = reference.index.plane
+    try:
+        corners = Homography(place.on_plane(plane)).facing(Frame(*place.size).center)(Frame(*place.size).corners)
+    except CrsError:
+        return 0
+    inside = (reference.index.xy >= corners.min(axis=0)) & (reference.index.xy <= corners.max(axis=0))
+    return int(inside.all(axis=1).sum())
+
+
+def _look(image: _Image, reference: Reference, start: FloatArray) -> Checked:
+    """Read the roads of a mask or a photograph, at several thresholds if need be, and check the place with each."""
+    results: list[Checked] = []
+    width = image.place.size[0]
+
+    def check(mask: RoadMask, _: Sequence[Reference], options: LocateOptions) -> Location:
+        query = read_query(mask, options.query)
+        coarser = np.diag([width / mask.shape[1]] * 2 + [1.0])  # large photographs are segmented on a coarser grid
+        checked = check_place(start @ coarser @ PIXEL_TO_PLANE, query.scene, reference.index, image.settings.options)
+        results.append(checked)
+        known = checked.verdict != "unknown"
+        return Location(mask.name, "located" if known else "not_located", checked.reason, seconds=query.seconds)
+
+    gsd = math.sqrt(abs(np.linalg.det(Homography(start).jacobian(Frame(*image.place.size).center))))
+    options = LocateOptions()
+    match = replace(options.match, camera=replace(options.match.camera, gsd_m=(gsd / 1.1, gsd * 1.1)))
+    search = replace(options.search, time_limit_s=60.0)
+    locate_query(image.name, [reference], replace(options, match=match, search=search), image.settings.query, how=check)
+    if not results:
+        return Checked("unknown", "hardly a road is seen in it")
+    return next((one for one in results if one.verdict != "unknown"), results[0])
+
+
+# --- telling ----------------------------------------------------------------------------------------------------------
+
+
+def _failed(image: str, reason: str) -> Verified:
+    return Verified({"schema": SCHEMA, "image": image, "verdict": "error", "reason": reason})
+
+
+def _document(
+    image: str,
+    checked: Checked,
+    place: Georeference | None = None,
+    reference: Reference | None = None,
+    corrected: Georeference | None = None,
+) -> dict[str, Any]:
+    """Put the result into plain values, ready for `json.dumps`."""
+    document: dict[str, Any] = {
+        "schema": SCHEMA,
+        "version": __version__,
+        "image": image,
+        "verdict": checked.verdict,
+        "reason": checked.reason,
+        "log10_lead": checked.log10_lead,
+        "agreeing": checked.agreeing,
+        "agreeing_as_given": checked.agreeing_as_given,
+    }
+    if place is not None:
+        middle = Homography(place.matrix).facing(Frame(*place.size).center)(Frame(*place.size).center)
+        lon, lat = to_lonlat(place.crs, middle[None])[0].tolist()
+        document |= {
+            "crs": place.crs,
+            "size": list(place.size),
+            "georeference": place.source,
+            "as_given": place.matrix.tolist(),
+            "corrected": None if corrected is None else corrected.matrix.tolist(),
+            "center": {"lon": lon, "lat": lat},
+        }
+    if reference is not None and place is not None:
+        document["reference"] = reference.name
+        document["attribution"] = str(reference.index.meta.get("attribution") or "")
+        plane, lat = reference.index.plane, document["center"]["lat"]
+        known, rival = checked.displacement, checked.rival
+        frame = None if known is None else _frame_of(place, reference)
+        document["displacement"] = None if known is None else _told(known, plane, frame)
+        document["rival"] = None if rival is None else _told(rival, plane, None)
+        if checked.verdict == "off":
+            shift = document["displacement"]
+            offset = editor_offset(shift["east_m"], shift["north_m"], lat)
+            document["editors"] = {
+                "mercator_east": offset[0],
+                "mercator_north": offset[1],
+                "id": id_fragment(document["center"]["lon"], lat, offset),
+            }
+    return document
+
+
+def _frame_of(place: Georeference, reference: Reference) -> FloatArray:
+    frame = Frame(*place.size)
+    return Homography(place.on_plane(reference.index.plane)).facing(frame.center)(frame.corners)
+
+
+def _told(found: Displacement, plane: LocalPlane, corners: FloatArray | None) -> dict[str, float]:
+    """Give a displacement as plain values, east and north as they are on Earth, not on the plane's grid."""
+    turn = math.radians(grid_north(plane, plane.to_crs(found.about)))
+    east = found.east_m * math.cos(turn) + found.north_m * math.sin(turn)
+    north = found.north_m * math.cos(turn) - found.east_m * math.sin(turn)
+    told = {"east_m": east, "north_m": north, "turn_deg": found.turn_deg, "scale": found.scale}
+    if corners is None:
+        return told
+    sigma = np.sqrt(np.diag(found.covariance))
+    return {
+        **told,
+        "sigma_east_m": float(sigma[0]),
+        "sigma_north_m": float(sigma[1]),
+        "sigma_turn_deg": math.degrees(float(sigma[2])),
+        "sigma_scale": float(sigma[3]),
+        "off_m": found.over(corners),
+        "sigma_m": found.sigma_over(corners),
+        "residual_m": found.residual_m,
+    }

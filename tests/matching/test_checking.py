@@ -1,0 +1,69 @@
+"""Given places on made-up towns: right, off, or not to be judged."""
+
+import numpy as np
+import pytest
+from worlds.scenes import Sight, camera, look, scene_of
+
+from roadgeo.geometry.homography import Homography
+from roadgeo.matching.checking import check_place
+from roadgeo.matching.local_search import LocalSearchOptions, Shift, move_about, search_nearby
+
+SIGHT = Sight(sigma_m=1.0, missing=0.2, false=0.1)
+
+
+@pytest.fixture(scope="module")
+def sights(town):
+    """(truth, scene) of three frames without tilt."""
+    found = []
+    for seed, heading in ((1, 10.0), (2, 200.0), (3, 300.0)):
+        truth = camera((1700.0 + 200 * seed, 2000.0), (900, 700), 1.0, heading_deg=heading)
+        found.append((truth, scene_of(look(town[0], truth, (900, 700), SIGHT, seed), (900, 700))))
+    return found
+
+
+def lied(truth, scene, shift):
+    """Where a georeference that is off by a shift puts the scene."""
+    return move_about(Homography(truth)(scene.center), shift) @ truth
+
+
+def test_a_right_place_agrees(town, sights) -> None:
+    for truth, scene in sights:
+        found = check_place(truth, scene, town[1])
+        assert found.verdict == "agrees", found.reason
+        assert found.agreeing == pytest.approx(found.agreeing_as_given, abs=0.05)
+
+
+@pytest.mark.parametrize(
+    "shift", [Shift(6, 0, 0, 1, 0), Shift(-3, -4, 1, 1, 0), Shift(80, -60, -5, 1, 0), Shift(-200, 220, 3, 1, 0)]
+)
+def test_a_wrong_one_is_off_by_what_it_was_moved_by(town, sights, shift) -> None:
+    for truth, scene in sights:
+        found = check_place(lied(truth, scene, shift), scene, town[1])
+        assert found.verdict == "off", found.reason
+        center = Homography(found.matrix)(scene.center)
+        assert np.hypot(*(center - Homography(truth)(scene.center))) < 1.5
+        assert found.displacement.turn_deg == pytest.approx(-shift.turn_deg, abs=0.2)
+        assert np.hypot(found.displacement.east_m + shift.east_m, found.displacement.north_m + shift.north_m) < 1.5
+
+
+def test_what_lies_beyond_the_reach_or_on_another_map_is_not_judged(town, sights) -> None:
+    truth, scene = sights[0]
+    for shift in (Shift(700, 500, 0, 1, 0), Shift(0, 0, 90, 1, 0)):
+        assert check_place(lied(truth, scene, shift), scene, town[1]).verdict == "unknown"
+    away = check_place(lied(truth, scene, Shift(50_000, 0, 0, 1, 0)), scene, town[1])
+    assert (away.verdict, away.displacement) == ("unknown", None)
+    assert "not on this map" in away.reason
+
+
+def test_hardly_a_road_is_no_evidence(town) -> None:
+    truth = camera((2000.0, 2000.0), (60, 60), 1.0)
+    found = check_place(truth, scene_of(look(town[0], truth, (60, 60)), (60, 60)), town[1])
+    assert found.verdict == "unknown"
+    assert "too few roads" in found.reason
+
+
+def test_the_search_finds_shift_and_turn_to_its_steps(town, sights) -> None:
+    truth, scene = sights[1]
+    best = search_nearby(lied(truth, scene, Shift(150, -90, 4, 1, 0)), scene, town[1], LocalSearchOptions())[0]
+    assert (best.east_m, best.north_m) == pytest.approx((-150, 90), abs=8)
+    assert best.turn_deg == pytest.approx(-4, abs=1.2)

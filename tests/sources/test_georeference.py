@@ -1,0 +1,80 @@
+"""Georeferences of rasters: read from every place where they may stand, and moved."""
+
+from pathlib import Path
+
+import cv2
+import numpy as np
+import pytest
+import rasterio
+from rasterio.control import GroundControlPoint
+
+from roadgeo.errors import CrsError, MaskError
+from roadgeo.geometry.homography import Homography
+from roadgeo.geometry.projection import LocalPlane, transformer
+from roadgeo.sources.georeference import read_georeference
+
+PLACE = rasterio.Affine(0.5, 0.1, 330_000.0, 0.1, -0.5, 4_690_000.0)
+PLANE = LocalPlane("EPSG:32619", (330_000.0, 4_690_000.0))
+
+
+def at(place: rasterio.Affine, column: float, row: float) -> tuple[float, float]:
+    a, b, c, d, e, f = place[:6]
+    return a * column + b * row + c, d * column + e * row + f
+
+
+def write(path: Path, **given: object) -> Path:
+    profile = {"driver": "GTiff", "width": 80, "height": 60, "count": 1, "dtype": "uint8"}
+    with rasterio.open(path, "w", **profile, **given) as file:
+        file.write(np.zeros((60, 80), np.uint8), 1)
+    return path
+
+
+def test_a_geotransform_is_read_and_taken_to_a_plane(tmp_path: Path) -> None:
+    found = read_georeference(write(tmp_path / "a.tif", crs="EPSG:32619", transform=PLACE))
+    assert found is not None
+    assert (found.crs, found.size, found.source) == ("EPSG:32619", (80, 60), "geotransform")
+    assert Homography(found.on_plane(PLANE))(np.array([80.0, 60.0])) == pytest.approx((46.0, -22.0), abs=1e-6)
+
+
+def test_another_crs_comes_out_to_a_millimetre_and_moves_back(tmp_path: Path) -> None:
+    to = transformer("EPSG:32619", "EPSG:3857")
+    west, north = to.transform(330_000, 4_690_000)
+    place = rasterio.Affine(0.7, 0, west, 0, -0.7, north)
+    found = read_georeference(write(tmp_path / "a.tif", crs="EPSG:3857", transform=place))
+    assert found is not None
+    on_plane = found.on_plane(PLANE)
+    x, y = transformer("EPSG:3857", "EPSG:32619").transform(*at(place, 33, 41))
+    assert PLANE.to_crs(Homography(on_plane)(np.array([33.0, 41.0]))) == pytest.approx((x, y), abs=1e-3)
+    assert found.moved(on_plane, PLANE).matrix == pytest.approx(found.matrix, abs=1e-3)
+
+
+@pytest.mark.parametrize("count", [3, 4, 5, 9])
+def test_control_points_are_fitted(tmp_path: Path, count: int) -> None:
+    spots = [(0, 0), (80, 0), (80, 60), (0, 60), (40, 30), (20, 10), (60, 10), (20, 50), (60, 50)][:count]
+    points = [GroundControlPoint(row, column, *at(PLACE, column, row)) for column, row in spots]
+    found = read_georeference(write(tmp_path / "a.tif", gcps=points, crs="EPSG:32619"))
+    assert found is not None
+    assert found.source == "control points"
+    pixels, there = found.control_points()
+    assert there == pytest.approx(np.array([at(PLACE, *pixel) for pixel in pixels]), abs=1e-4)
+
+
+def test_a_world_file_beside_a_picture_is_read(tmp_path: Path) -> None:
+    path = tmp_path / "scan.png"
+    cv2.imwrite(str(path), np.zeros((60, 80), np.uint8))
+    assert read_georeference(path) is None
+    (tmp_path / "scan.pgw").write_text("0.5\n0.1\n0.1\n-0.5\n330000.3\n4689999.8\n")
+    with pytest.raises(CrsError, match="--crs"):
+        read_georeference(path)
+    found = read_georeference(path, "EPSG:32619")
+    assert found is not None
+    assert found.matrix == pytest.approx(np.array(PLACE).reshape(3, 3), abs=1e-9)
+    (tmp_path / "scan.pgw").write_text("no numbers here")
+    with pytest.raises(MaskError, match="six numbers"):
+        read_georeference(path, "EPSG:32619")
+
+
+def test_a_place_without_an_area_is_refused(tmp_path: Path) -> None:
+    flat = rasterio.Affine(0.5, 0.0, 330_000.0, 0.5, 0.0, 4_690_000.0)
+    with pytest.raises(MaskError, match="to a line"):
+        read_georeference(write(tmp_path / "a.tif", crs="EPSG:32619", transform=flat))
