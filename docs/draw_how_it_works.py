@@ -13,7 +13,9 @@ import numpy as np
 
 import roadgeo
 from roadgeo.demo import ATTRIBUTION, ROADS, demo_masks
-from roadgeo.kernels.triples import UNITS, find_sides, look_up
+from roadgeo.kernels.structs import Hits, TripleLimits, TripleQuery
+from roadgeo.kernels.triple_codes import UNITS, find_sides
+from roadgeo.kernels.triples import look_up_each
 from roadgeo.matching.index import ReferenceIndex, build_index
 from roadgeo.matching.query import trace_query
 from roadgeo.matching.scene import Scene
@@ -113,19 +115,18 @@ def find_triple(scene: Scene, index: ReferenceIndex, to_map: np.ndarray) -> tupl
     neighbours = np.ascontiguousarray(scene.neighbours[:, : options.n_neighbours])
     sides = np.empty(tangents.shape, np.int8)
     find_sides(tangents, scene.branches, sides)
+    seen = TripleQuery(xy, scene.branches, tangents, sides, neighbours)
+    tolerance = round(options.angle_tolerance_deg * UNITS / 180)
+    limits = TripleLimits(1, tolerance, float(np.cos(np.radians(options.ray_tolerance_deg))), (0.1, 10.0), 0.33)
     good = []
     for proposals in propose(scene.intersections, scene.branches, neighbours, index, (0.1, 10.0), 0.33, options):
         a = proposals.anchor
         for s in range(8):
             for t in range(s + 1, 8):
                 b, c = neighbours[a, s], neighbours[a, t]
-                ids, affine = np.empty((12_000, 5), np.int64), np.empty((12_000, 4))
-                n, _ = look_up(
-                    xy, scene.branches, tangents, sides, a, s, t, neighbours, 1,
-                    round(options.angle_tolerance_deg * UNITS / 180), np.cos(np.radians(options.ray_tolerance_deg)),
-                    index.xy, index.branches, index.neighbours, index.table_starts, index.table_entries,
-                    (0.1, 10.0), 0.33, ids, affine, 0,
-                )  # fmt: skip
+                found = Hits(np.empty((12_000, 5), np.int64), np.empty((12_000, 4)))
+                n, _ = look_up_each(seen, a, np.array([[s, t]]), 10**9, index.triple_map, limits, found)
+                ids = found.ids
                 hits = ids[:n][:, [0, 2, 4]]
                 triple = np.array([a, b, c])
                 edges = xy[triple] - xy[np.roll(triple, 1)]

@@ -1,23 +1,27 @@
 """Least-squares adjustment of a homography to matched intersections and to the roads of the map.
 
-The parameters are those of `kernels.growth`: p = (h00 h01 h02 h10 h11 h12 h20 h21), h22 = 1, between normalised
-coordinates, query (x - x0) / half_size and reference (X - X0) / unit.
+The parameters are those of `kernels.homography_fit`, between normalised coordinates: query (x - x0) / half_size and
+reference (X - X0) / unit.
 """
 
 import math
+from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
 
-from roadgeo.kernels.arrays import Floats1, Floats2, Int32s1, Ints1, Singles2
+from roadgeo.kernels.arrays import Bools1, Floats1, Floats2
 from roadgeo.kernels.compilation import kernel
-from roadgeo.kernels.growth import cholesky, solve_cholesky
+from roadgeo.kernels.homography_fit import cholesky, solve_cholesky
 from roadgeo.kernels.roads import nearest_road
+from roadgeo.kernels.structs import AdjustLimits, Held, Plane, PointPairs, RoadBuckets, RoadPoints
 
 #: Steps of an adjustment in which points are held near their start.
 _HELD_STEPS = 6
+#: Points nearer to the horizon than this w make the adjustment fail.
+_LEAST_W = 0.02
 
-__all__ = ["add_row", "adjust", "point_row"]
+__all__ = ["add_row", "adjust", "carry", "point_row"]
 
 
 @kernel()
@@ -62,69 +66,209 @@ def add_row(
 
 
 @kernel()
+def carry(p: Floats1, u: float, v: float, du: float, dv: float) -> tuple[float, float, float, float, float, float]:
+    """Map a normalised point and a direction there; return x', y', w, the direction unscaled, and its length.
+
+    Near the horizon (w < 0.02) only w is meant.
+    """
+    w = 1.0 + p[6] * u + p[7] * v
+    if w < _LEAST_W:
+        return 0.0, 0.0, w, 0.0, 0.0, 0.0
+    x, y = (p[0] * u + p[1] * v + p[2]) / w, (p[3] * u + p[4] * v + p[5]) / w
+    dw = p[6] * du + p[7] * dv
+    dx = p[0] * du + p[1] * dv - x * dw
+    dy = p[3] * du + p[4] * dv - y * dw
+    return x, y, w, dx, dy, math.sqrt(dx * dx + dy * dy)
+
+
+class _System(NamedTuple):
+    """Normal equations, (8, 8) and (8,), and the Cholesky factor of those before."""
+
+    normal: Floats2
+    right: Floats1
+    factor: Floats2
+    row: Floats1
+    work: Floats1
+
+
+class _Met(NamedTuple):
+    """What the search for roads met: of each road point, and of each cell of the frame."""
+
+    met: Bools1
+    normals: Floats2  # unit vectors across the road
+    residuals: Floats1  # metres across it
+    sigmas: Floats1
+    searched: Floats1
+    hits: Floats1
+    shares: Floats1
+
+
+@kernel()
+def _begin_system(p: NDArray[np.float64], prior: float, system: _System) -> None:
+    """Empty the normal equations but for the prior on the two perspective parameters."""
+    system.normal[:] = 0.0
+    system.right[:] = 0.0
+    for r in range(8):
+        system.normal[r, r] = 1e-9
+    for r in range(6, 8):
+        system.normal[r, r] += prior
+        system.right[r] -= prior * p[r]
+
+
+@kernel()
+def _add_pairs(
+    p: NDArray[np.float64],
+    unit: float,
+    pairs: PointPairs,
+    limits: AdjustLimits,
+    shares: NDArray[np.float64],
+    system: _System,
+) -> bool:
+    """Add matched intersections; False: one lies at the horizon."""
+    for i in range(pairs.query.shape[0]):
+        if shares[pairs.cells[i]] < limits.least_share:
+            continue
+        for axis in range(2):
+            x, y, w = point_row(p, pairs.query[i, 0], pairs.query[i, 1], 1.0 - axis, 1.0 * axis, system.row)
+            if w < _LEAST_W:
+                return False
+            dx, dy = pairs.reference[i, 0] - x, pairs.reference[i, 1] - y
+            far = math.sqrt(dx * dx + dy * dy) * unit
+            if far > limits.max_radius:
+                continue
+            weight = pairs.weight / (1.0 + (far / (2.0 * limits.sigma_m)) ** 2)
+            add_row(system.normal, system.right, system.row, weight, dx if axis == 0 else dy)
+    return True
+
+
+@kernel()
+def _add_held(p: NDArray[np.float64], held: Held, weight: float, system: _System) -> bool:
+    """Add points that are held; False: one lies at the horizon."""
+    for i in range(held.query.shape[0]):
+        for axis in range(2):
+            x, y, w = point_row(p, held.query[i, 0], held.query[i, 1], 1.0 - axis, 1.0 * axis, system.row)
+            if w < _LEAST_W:
+                return False
+            residual = held.reference[i, 0] - x if axis == 0 else held.reference[i, 1] - y
+            add_row(system.normal, system.right, system.row, weight, residual)
+    return True
+
+
+@kernel()
+def _spread(system: _System) -> float:
+    """Return the variance of what `system.row` is the derivative of, |L^-1 row|^2, L the factor of the step before."""
+    total = 0.0
+    for r in range(8):
+        value = system.row[r]
+        for c in range(r):
+            value -= system.factor[r, c] * system.work[c]
+        system.work[r] = value / system.factor[r, r]
+        total += system.work[r] * system.work[r]
+    return total
+
+
+@kernel()
+def _search_roads(
+    p: NDArray[np.float64],
+    plane: Plane,
+    points: RoadPoints,
+    limits: AdjustLimits,
+    roads: RoadBuckets,
+    system: _System,
+    found: _Met,
+) -> bool:
+    """Find each road point's road, and which share of each cell's points met one; False: one lies at the horizon."""
+    found.searched[:] = 0.0
+    found.hits[:] = 0.0
+    for i in range(points.xy.shape[0]):
+        found.met[i] = False
+        u, v = points.xy[i, 0], points.xy[i, 1]
+        x, y, w, dx, dy, length = carry(p, u, v, points.directions[i, 0], points.directions[i, 1])
+        if w < _LEAST_W:
+            return False
+        if length == 0.0:
+            continue
+        dx /= length
+        dy /= length
+        # How far the road may lie follows from how sure the fit is here.
+        point_row(p, u, v, -dy, dx, system.row)
+        sigma = limits.sigma_m * math.sqrt(1.0 + _spread(system))
+        if 3.0 * sigma > limits.max_radius:
+            continue
+        found.searched[points.cells[i]] += 1.0
+        gx, gy = plane.x + plane.unit * x, plane.y + plane.unit * y
+        d, fx, fy, rx, ry = nearest_road(gx, gy, dx, dy, 3.0 * sigma, limits.min_cos, roads)
+        if d == np.inf:
+            continue
+        found.met[i] = True
+        found.hits[points.cells[i]] += 1.0
+        found.normals[i, 0], found.normals[i, 1] = -ry, rx
+        found.residuals[i] = (fx - gx) * -ry + (fy - gy) * rx
+        found.sigmas[i] = sigma
+    for c in range(limits.n_cells):
+        found.shares[c] = found.hits[c] / found.searched[c] if found.searched[c] > 0.0 else 1.0
+    return True
+
+
+@kernel()
+def _add_roads(
+    p: NDArray[np.float64], unit: float, points: RoadPoints, least_share: float, system: _System, found: _Met
+) -> tuple[int, float]:
+    """Add the road points that met a road; return how many, and the scale of their residuals (see `adjust`)."""
+    used, weights, slopes, squares = 0, 0.0, 0.0, 0.0
+    for i in range(points.xy.shape[0]):
+        if not found.met[i] or found.shares[points.cells[i]] < least_share:
+            continue
+        point_row(p, points.xy[i, 0], points.xy[i, 1], found.normals[i, 0], found.normals[i, 1], system.row)
+        weight = 1.0 / (1.0 + (found.residuals[i] / found.sigmas[i]) ** 2)
+        add_row(system.normal, system.right, system.row, points.weight * weight, found.residuals[i] / unit)
+        used += 1
+        weights += weight
+        slopes += weight * (2.0 * weight - 1.0)  # of the influence, by the residual
+        squares += (weight * found.residuals[i]) ** 2
+    if weights > 0.0:
+        return used, math.sqrt(squares * weights) / max(slopes, 0.1 * weights)
+    return used, np.inf
+
+
+@kernel()
+def _step(p: NDArray[np.float64], system: _System) -> float:
+    """Solve the normal equations and move the parameters; return the largest move, -1 where that fails."""
+    for r in range(8):
+        for c in range(r):
+            system.normal[c, r] = system.normal[r, c]
+    if not cholesky(system.normal, system.factor):
+        return -1.0
+    solve_cholesky(system.factor, system.right)
+    largest = 0.0
+    for r in range(8):
+        p[r] += system.right[r]
+        largest = max(largest, abs(system.right[r]))
+    return largest
+
+
+@kernel()
 def adjust(
     p: Floats1,
-    unit: float,
-    origin_x: float,
-    origin_y: float,
-    points: Floats2,
-    directions: Floats2,
-    point_cells: Ints1,
-    point_weight: float,
-    pairs: Floats2,
-    targets: Floats2,
-    pair_cells: Ints1,
-    pair_weight: float,
-    held: Floats2,
-    held_targets: Floats2,
-    held_weight: float,
-    n_cells: int,
-    least_share: float,
-    max_radius: float,
-    min_cos: float,
-    sigma_m: float,
-    prior: float,
-    n_iterations: int,
-    tolerance_m: float,
-    segments: Singles2,
-    starts: Int32s1,
-    ids: Int32s1,
-    grid: tuple[float, float, float],
-    shape: tuple[int, int],
+    plane: Plane,
+    points: RoadPoints,
+    pairs: PointPairs,
+    held: Held,
+    limits: AdjustLimits,
+    roads: RoadBuckets,
     normal: Floats2,
 ) -> tuple[int, float]:
     """Adjust a homography by Gauss-Newton with Cauchy weights.
 
-    The first step takes matched intersections, and points held where the map to be adjusted put them. Then a road
-    point's residual is its distance across the nearest road of the map that runs its way. How far off it may be is
-    predicted from the system so far: it is searched as far as three times that, and not at all beyond `max_radius`, so
-    that the fit grows outwards from where it is sure. Where fewer than `least_share` of a cell's searched points meet a
-    road, what does meet one is chance, and the cell waits.
+    The first step takes matched intersections, and points held where the map to be adjusted put them, for the first
+    `_HELD_STEPS`. Then a road point's residual is its distance across the nearest road of the map that runs its way.
+    How far off it may be is predicted from the system so far: it is searched as far as three times that, and not at all
+    beyond the greatest radius, so that the fit grows outwards from where it is sure.
 
     Parameters
     ----------
     p : (8,) float64
         Adjusted in place.
-    unit, origin_x, origin_y : float
-        Metres per normalised unit, and the reference point of the normalised (0, 0).
-    points, directions : (S, 2) float64
-        The query's road points, normalised, and unit vectors along the road.
-    pairs, targets : (M, 2) float64
-        Matched intersections in query and reference, normalised.
-    point_cells : (S,) int64, pair_cells : (M,) int64
-        The one of `n_cells` cells of the frame that each lies in.
-    point_weight, pair_weight : float
-        Of an observation, against one of standard deviation `sigma_m`.
-    held, held_targets : (G, 2) float64
-        Points that hold the fit near its start while little else does, normalised.
-    held_weight : float
-        As `point_weight`, of each, in the first step; half of it in the next, and so on, and none after `_HELD_STEPS`.
-    max_radius, sigma_m, tolerance_m : float
-        Metres. The iteration ends when no parameter moves by more than the tolerance.
-    min_cos, segments, starts, ids, grid, shape
-        As in `nearest_road`.
-    prior : float
-        Weight that holds the two perspective parameters near zero.
     normal : (8, 8) float64
         Filled with the last normal matrix.
 
@@ -136,116 +280,33 @@ def adjust(
         Scale of their residuals, metres: its square times the inverse of `normal` is the covariance of an M-estimate
         (Huber 1981, 7.6), which a merely weighted rms would claim too small. inf where it failed or there are none.
     """
-    right = np.empty(8)
-    row = np.empty(8)
-    work = np.empty(8)
-    factor = np.zeros((8, 8))
-    n = points.shape[0]
-    met = np.empty(n, np.bool_)
-    normals = np.empty((n, 2))
-    residuals = np.empty(n)
-    sigmas = np.empty(n)
-    searched = np.empty(n_cells)
-    hits = np.empty(n_cells)
-    shares = np.ones(n_cells)
+    n = points.xy.shape[0]
+    system = _System(normal, np.empty(8), np.zeros((8, 8)), np.empty(8), np.empty(8))
+    found = _Met(
+        np.empty(n, np.bool_), np.empty((n, 2)), np.empty(n), np.empty(n),
+        np.empty(limits.n_cells), np.empty(limits.n_cells), np.ones(limits.n_cells),
+    )  # fmt: skip
     previous = -1
     rms = np.inf
-    for iteration in range(n_iterations + 1):
-        normal[:] = 0.0
-        right[:] = 0.0
-        for r in range(8):
-            normal[r, r] = 1e-9
-        for r in range(6, 8):
-            normal[r, r] += prior
-            right[r] -= prior * p[r]
-        for i in range(pairs.shape[0]):
-            if shares[pair_cells[i]] < least_share:
-                continue
-            for axis in range(2):
-                x, y, w = point_row(p, pairs[i, 0], pairs[i, 1], 1.0 - axis, 1.0 * axis, row)
-                if w < 0.02:
-                    return -1, np.inf
-                dx, dy = targets[i, 0] - x, targets[i, 1] - y
-                far = math.sqrt(dx * dx + dy * dy) * unit
-                if far > max_radius:
-                    continue
-                weight = pair_weight / (1.0 + (far / (2.0 * sigma_m)) ** 2)
-                add_row(normal, right, row, weight, dx if axis == 0 else dy)
-        if iteration < _HELD_STEPS:
-            for i in range(held.shape[0]):
-                for axis in range(2):
-                    x, y, w = point_row(p, held[i, 0], held[i, 1], 1.0 - axis, 1.0 * axis, row)
-                    if w < 0.02:
-                        return -1, np.inf
-                    residual = held_targets[i, 0] - x if axis == 0 else held_targets[i, 1] - y
-                    add_row(normal, right, row, held_weight * 0.5**iteration, residual)
-        used, weights, slopes, squares = 0, 0.0, 0.0, 0.0
-        if iteration > 0:
-            searched[:] = 0.0
-            hits[:] = 0.0
-            for i in range(n):
-                met[i] = False
-                u, v = points[i, 0], points[i, 1]
-                w = 1.0 + p[6] * u + p[7] * v
-                if w < 0.02:
-                    return -1, np.inf
-                x, y = (p[0] * u + p[1] * v + p[2]) / w, (p[3] * u + p[4] * v + p[5]) / w
-                dw = p[6] * directions[i, 0] + p[7] * directions[i, 1]
-                dx = p[0] * directions[i, 0] + p[1] * directions[i, 1] - x * dw
-                dy = p[3] * directions[i, 0] + p[4] * directions[i, 1] - y * dw
-                length = math.sqrt(dx * dx + dy * dy)
-                if length == 0.0:
-                    continue
-                dx /= length
-                dy /= length
-                point_row(p, u, v, -dy, dx, row)
-                spread = 0.0
-                for r in range(8):  # |L^-1 row|^2
-                    value = row[r]
-                    for c in range(r):
-                        value -= factor[r, c] * work[c]
-                    work[r] = value / factor[r, r]
-                    spread += work[r] * work[r]
-                sigma = sigma_m * math.sqrt(1.0 + spread)
-                if 3.0 * sigma > max_radius:
-                    continue
-                searched[point_cells[i]] += 1.0
-                gx, gy = origin_x + unit * x, origin_y + unit * y
-                d, fx, fy, rx, ry = nearest_road(
-                    gx, gy, dx, dy, 3.0 * sigma, min_cos, segments, starts, ids, grid, shape
-                )
-                if d == np.inf:
-                    continue
-                met[i] = True
-                hits[point_cells[i]] += 1.0
-                normals[i, 0], normals[i, 1] = -ry, rx
-                residuals[i] = (fx - gx) * -ry + (fy - gy) * rx
-                sigmas[i] = sigma
-            for c in range(n_cells):
-                shares[c] = hits[c] / searched[c] if searched[c] > 0.0 else 1.0
-            for i in range(n):
-                if not met[i] or shares[point_cells[i]] < least_share:
-                    continue
-                point_row(p, points[i, 0], points[i, 1], normals[i, 0], normals[i, 1], row)
-                weight = 1.0 / (1.0 + (residuals[i] / sigmas[i]) ** 2)
-                add_row(normal, right, row, point_weight * weight, residuals[i] / unit)
-                used += 1
-                weights += weight
-                slopes += weight * (2.0 * weight - 1.0)  # of the influence, by the residual
-                squares += (weight * residuals[i]) ** 2
-            if weights > 0.0:
-                rms = math.sqrt(squares * weights) / max(slopes, 0.1 * weights)
-        for r in range(8):
-            for c in range(r):
-                normal[c, r] = normal[r, c]
-        if not cholesky(normal, factor):
+    for iteration in range(limits.n_iterations + 1):
+        _begin_system(p, limits.prior, system)
+        if not _add_pairs(p, plane.unit, pairs, limits, found.shares, system):
             return -1, np.inf
-        solve_cholesky(factor, right)
-        largest = 0.0
-        for r in range(8):
-            p[r] += right[r]
-            largest = max(largest, abs(right[r]))
-        if iteration > (1 if held.shape[0] == 0 else _HELD_STEPS) and largest * unit < tolerance_m and used <= previous:
+        if iteration < _HELD_STEPS and not _add_held(p, held, held.weight * 0.5**iteration, system):
+            return -1, np.inf
+        used = 0
+        if iteration > 0:
+            if not _search_roads(p, plane, points, limits, roads, system, found):
+                return -1, np.inf
+            used, scale = _add_roads(p, plane.unit, points, limits.least_share, system, found)
+            if scale != np.inf:
+                rms = scale
+        largest = _step(p, system)
+        if largest < 0.0:
+            return -1, np.inf
+        # Not done while points are held, or more roads are still being met.
+        settled = iteration > (1 if held.query.shape[0] == 0 else _HELD_STEPS)
+        if settled and largest * plane.unit < limits.tolerance_m and used <= previous:
             break
         previous = used
     return previous, rms

@@ -195,12 +195,15 @@ def _kinds(function: Callable[..., Any]) -> tuple[tuple[Kind, ...] | None, Kind]
 #: Modules whose kernels every search needs. Those of the paper's method are compiled when it is asked for.
 _SEARCH = (
     "simplification",
+    "parallel_roads",
     "thinning",
     "tracing",
     "intersections",
     "buckets",
     "roads",
+    "triple_codes",
     "triples",
+    "point_matching",
     "growth",
     "adjustment",
     "road_raster",

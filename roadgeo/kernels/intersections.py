@@ -1,4 +1,4 @@
-"""Kernels of `roadgeo.intersections`: lines fitted to branches, and the centre and tangents of each intersection."""
+"""Kernels of `roadgeo.roads.intersections`: lines fitted to branches, centres and tangents of intersections."""
 
 import numpy as np
 from numpy.typing import NDArray
@@ -7,6 +7,17 @@ from roadgeo.kernels.arrays import Floats1, Floats2, Int32s2, Ints1, Singles1, S
 from roadgeo.kernels.compilation import kernel
 
 __all__ = ["describe_intersections", "fit_branches", "sort_few"]
+
+
+@kernel()
+def _line_of(mx: float, my: float, sxx: float, sxy: float, syy: float) -> tuple[float, float]:
+    """Return the direction of the line fitted to means and mean squares, and the mean square distance from it."""
+    cxx = sxx - mx * mx
+    cyy = syy - my * my
+    cxy = sxy - mx * my
+    angle = 0.5 * np.arctan2(2 * cxy, cxx - cyy)
+    spread = 0.5 * (cxx + cyy) - np.sqrt(0.25 * (cxx - cyy) ** 2 + cxy * cxy)
+    return angle, max(spread, 0.0)
 
 
 @kernel()
@@ -53,6 +64,7 @@ def fit_branches(
         start = max(min(skip, end - least), 0.0)
         lo = offsets[e]
         n = offsets[e + 1] - lo
+        # moments of the pieces of road between `start` and `end`, from the branch's first vertex
         weight = sx = sy = sxx = sxy = syy = 0.0
         first_x = first_y = last_x = last_y = 0.0
         done = 0.0
@@ -86,21 +98,15 @@ def fit_branches(
                 break
         if weight == 0.0:
             continue
-        mx = sx / weight
-        my = sy / weight
-        cxx = sxx / weight - mx * mx
-        cyy = syy / weight - my * my
-        cxy = sxy / weight - mx * my
-        angle = 0.5 * np.arctan2(2 * cxy, cxx - cyy)
+        angle, away = _line_of(sx / weight, sy / weight, sxx / weight, sxy / weight, syy / weight)
         if np.cos(angle) * (last_x - first_x) + np.sin(angle) * (last_y - first_y) < 0:
             angle += np.pi
         if angle >= np.pi:
             angle -= 2 * np.pi
-        lines[b, 0] = mx + coords[lo, 0]
-        lines[b, 1] = my + coords[lo, 1]
+        lines[b, 0] = sx / weight + coords[lo, 0]
+        lines[b, 1] = sy / weight + coords[lo, 1]
         lines[b, 2] = angle
-        spread = 0.5 * (cxx + cyy) - np.sqrt(0.25 * (cxx - cyy) ** 2 + cxy * cxy)
-        lines[b, 3] = max(spread, 0.0)
+        lines[b, 3] = away
     return lines
 
 
@@ -114,6 +120,36 @@ def sort_few(values: NDArray[np.floating], n: int) -> None:
             values[k] = values[k - 1]
             k -= 1
         values[k] = value
+
+
+@kernel()
+def _merge_tangents(angle: NDArray[np.float64], count: int, merge_angle: float, tangents: NDArray[np.float32]) -> None:
+    """Make one tangent of angles that are nearly one line (eq. 2-3).
+
+    `angle[:count]` is ascending, in [0, pi); `count` is 1 or more.
+    """
+    first = 0  # start after the widest gap, so that no line is cut in two at 0 = pi
+    widest = angle[0] + np.pi - angle[count - 1]
+    for k in range(1, count):
+        if angle[k] - angle[k - 1] > widest:
+            widest = angle[k] - angle[k - 1]
+            first = k
+    n_lines = 0
+    total = 0.0
+    members = 0
+    for k in range(count):
+        i = first + k
+        value = angle[i] if i < count else angle[i - count] + np.pi
+        if members > 0 and value - total / members >= merge_angle:
+            tangents[n_lines] = (total / members) % np.pi
+            n_lines += 1
+            total = 0.0
+            members = 0
+        total += value
+        members += 1
+    tangents[n_lines] = (total / members) % np.pi
+    n_lines += 1
+    sort_few(tangents, n_lines)
 
 
 @kernel()
@@ -186,25 +222,4 @@ def describe_intersections(
         for k in range(count):
             angle[k] = angle[k] % np.pi
         sort_few(angle, count)
-        first = 0  # start after the widest gap, so that no line is cut in two at 0 = pi
-        widest = angle[0] + np.pi - angle[count - 1]
-        for k in range(1, count):
-            if angle[k] - angle[k - 1] > widest:
-                widest = angle[k] - angle[k - 1]
-                first = k
-        n_lines = 0
-        total = 0.0
-        members = 0
-        for k in range(count):
-            i = first + k
-            value = angle[i] if i < count else angle[i - count] + np.pi
-            if members > 0 and value - total / members >= merge_angle:
-                tangents[n, n_lines] = (total / members) % np.pi
-                n_lines += 1
-                total = 0.0
-                members = 0
-            total += value
-            members += 1
-        tangents[n, n_lines] = (total / members) % np.pi
-        n_lines += 1
-        sort_few(tangents[n], n_lines)
+        _merge_tangents(angle, count, merge_angle, tangents[n])

@@ -6,8 +6,8 @@ import numpy as np
 
 from roadgeo.kernels.arrays import Floats1, Floats2
 from roadgeo.kernels.compilation import kernel
-from roadgeo.kernels.road_growth import RoadBuckets
 from roadgeo.kernels.roads import nearest_road
+from roadgeo.kernels.structs import RoadBuckets
 
 __all__ = ["road_residuals"]
 
@@ -39,8 +39,7 @@ def road_residuals(
     for i in range(mapped.shape[0]):
         x, y = mapped[i, 0], mapped[i, 1]
         d, fx, fy, rx, ry = nearest_road(
-            x, y, along[i, 0], along[i, 1], radii[i], min_cos,
-            roads.segments, roads.starts, roads.ids, roads.grid, roads.shape,
+            x, y, along[i, 0], along[i, 1], radii[i], min_cos, roads,
         )  # fmt: skip
         if d == np.inf or math.isnan(d):
             out[i, 0] = out[i, 1] = out[i, 2] = np.nan

@@ -1,7 +1,7 @@
 """Growth of a hypothesis by roads alone: from the roads around one intersection outwards over the whole query.
 
-The parameters are those of `kernels.growth`: p = (h00 h01 h02 h10 h11 h12 h20 h21), h22 = 1, between normalised
-coordinates, query (x - x0) / half_size and reference (X - X0) / unit.
+The parameters are those of `kernels.homography_fit`, between normalised coordinates: query (x - x0) / half_size and
+reference (X - X0) / unit.
 """
 
 import math
@@ -10,13 +10,14 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from roadgeo.kernels.adjustment import add_row, point_row
-from roadgeo.kernels.arrays import Floats1, Floats2, Int32s1, Singles2
+from roadgeo.kernels.adjustment import add_row, carry, point_row
+from roadgeo.kernels.arrays import Floats1, Floats2
 from roadgeo.kernels.compilation import kernel
-from roadgeo.kernels.growth import cholesky, solve_cholesky
+from roadgeo.kernels.homography_fit import cholesky, solve_cholesky
 from roadgeo.kernels.roads import nearest_road
+from roadgeo.kernels.structs import RoadBuckets
 
-__all__ = ["RoadBuckets", "Stages", "fit_to_roads", "grow_by_roads", "share_on_roads"]
+__all__ = ["Stages", "fit_to_roads", "grow_by_roads", "share_on_roads"]
 
 #: Points of the first stage, and how many times more each further one has; of more points than these, evenly chosen.
 _FIRST, _MORE, _ENOUGH = 60, 1.45, 120
@@ -26,16 +27,6 @@ _FIRST_RADII, _RADII = (25.0, 18.0, 12.0), (18.0, 12.0, 12.0)
 _LINEAR_SIGMA, _PLACE_SIGMA_M = 0.08, 10.0
 _POINT_SIGMA_M = 12.0
 _FEWEST = 6
-
-
-class RoadBuckets(NamedTuple):
-    """The roads of the map (see `kernels.roads`)."""
-
-    segments: Singles2
-    starts: Int32s1
-    ids: Int32s1
-    grid: tuple[float, float, float]
-    shape: tuple[int, int]
 
 
 class Stages(NamedTuple):
@@ -68,22 +59,11 @@ def _nearest(
 
     Without a road within `radius` metres the distance is inf.
     """
-    w = 1.0 + p[6] * point[0] + p[7] * point[1]
-    if w < 0.05:
-        return np.inf, 0.0, 0.0, w
-    x = (p[0] * point[0] + p[1] * point[1] + p[2]) / w
-    y = (p[3] * point[0] + p[4] * point[1] + p[5]) / w
-    dw = p[6] * direction[0] + p[7] * direction[1]
-    dx = p[0] * direction[0] + p[1] * direction[1] - x * dw
-    dy = p[3] * direction[0] + p[4] * direction[1] - y * dw
-    length = math.sqrt(dx * dx + dy * dy)
-    if length == 0.0:
+    x, y, w, dx, dy, length = carry(p, point[0], point[1], direction[0], direction[1])
+    if w < 0.05 or length == 0.0:
         return np.inf, 0.0, 0.0, w
     gx, gy = origin[0] + unit * x, origin[1] + unit * y
-    d, fx, fy, rx, ry = nearest_road(
-        gx, gy, dx / length, dy / length, radius, min_cos,
-        roads.segments, roads.starts, roads.ids, roads.grid, roads.shape,
-    )  # fmt: skip
+    d, fx, fy, rx, ry = nearest_road(gx, gy, dx / length, dy / length, radius, min_cos, roads)
     if d == np.inf:
         return np.inf, 0.0, 0.0, w
     return (fy - gy) * rx - (fx - gx) * ry, rx, ry, w

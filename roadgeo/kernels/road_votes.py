@@ -197,6 +197,7 @@ def vote(
     """
     turns = np.empty(MAX_TURNS)
     rates, gains, losses = np.empty(_LEVELS), np.empty(_LEVELS), np.empty(_LEVELS)
+    # what a hit and a miss weigh, by the chance rate
     for level in range(_LEVELS):
         rates[level] = min(max((level + 0.5) / _LEVELS, _LEAST_RATE), 0.8 * trial.hit_rate)
         gains[level] = math.log(trial.hit_rate / rates[level])
@@ -211,6 +212,7 @@ def vote(
                 continue
             tried += 1
             best, where, rate = 0.0, -1, 0.0
+            # the best scale: points are counted in blocks, and a scale is left when it has lost too much
             cosine, sine = math.cos(turn) / raster.cell, math.sin(turn) / raster.cell
             for s in range(points.scales.shape[0]):
                 i, last = points.starts[s], points.starts[s + 1]
@@ -224,6 +226,7 @@ def vote(
                     i = stop
                 if ratio > best:
                     best, where, rate = ratio, s, rates[level]
+            # the heap keeps the best votes
             if where >= 0 and (kept < votes.shape[0] or best > votes[0, 3]):
                 row = kept if kept < votes.shape[0] else 0
                 kept = min(kept + 1, votes.shape[0])

@@ -19,6 +19,74 @@ LOWEST_BIT = np.array([max((code & -code).bit_length() - 1, 0) for code in range
 
 
 @kernel()
+def _label(states: Bytes2, pixels: Int32s1, node_of: Int32s1) -> int:
+    """Tell pixels of chains from those of nodes by how many neighbours they have; return the sum of the latter's."""
+    flat = states.ravel()
+    stride = np.uint64(states.shape[1])
+    slots = 0
+    for i in range(len(pixels)):
+        p = np.uint64(pixels[i])
+        around = neighbours(flat, p, stride)
+        solid = touches_solid(flat, p, stride)
+        if COUNT[around] == 2 and not solid:
+            node_of[p] = PATH
+        else:
+            node_of[p] = OPEN_END if solid else JUNCTION if COUNT[around] > 2 else FREE_END
+            slots += COUNT[around]
+    return slots
+
+
+@kernel()
+def _gather_nodes(
+    states: Bytes2, pixels: Int32s1, node_of: Int32s1, members: Int32s1, first: Ints1, is_open: Bools1
+) -> tuple[int, int]:
+    """Give nodes their numbers; return how many there are, and how many pixels they have.
+
+    Junctions that touch are one node.     Node k gets the pixels `members[first[k]:first[k + 1]]`.
+    """
+    flat = states.ravel()
+    steps = neighbour_steps(states.shape[1])
+    n_nodes = 0
+    n_members = 0
+    for i in range(len(pixels)):
+        seed = np.uint64(pixels[i])
+        kind = node_of[seed]
+        if kind > FREE_END:
+            continue
+        first[n_nodes] = n_members
+        is_open[n_nodes] = kind == OPEN_END
+        members[n_members] = seed
+        n_members += 1
+        node_of[seed] = n_nodes
+        head = first[n_nodes]
+        while kind == JUNCTION and head < n_members:
+            p = np.uint64(members[head])
+            head += 1
+            for k in range(8):
+                q = p + steps[k]
+                if flat[q] == ROAD and node_of[q] == JUNCTION:
+                    node_of[q] = n_nodes
+                    members[n_members] = q
+                    n_members += 1
+        n_nodes += 1
+    first[n_nodes] = n_members
+    return n_nodes, n_members
+
+
+@kernel()
+def _mean_places(members: Int32s1, first: Ints1, n_nodes: int, width: int) -> Floats2:
+    """Return the mean (column, row) of each node's pixels."""
+    xy = np.zeros((n_nodes, 2))
+    for node in range(n_nodes):
+        for i in range(first[node], first[node + 1]):
+            xy[node, 0] += members[i] % width
+            xy[node, 1] += members[i] // width
+        xy[node, 0] /= first[node + 1] - first[node]
+        xy[node, 1] /= first[node + 1] - first[node]
+    return xy
+
+
+@kernel()
 def trace(states: Bytes2, pixels: Int32s1, node_of: Int32s1) -> tuple[Floats2, Bools1, Int32s2, Int32s1, Ints1]:
     """Split a skeleton into nodes and chains.
 
@@ -50,45 +118,11 @@ def trace(states: Bytes2, pixels: Int32s1, node_of: Int32s1) -> tuple[Floats2, B
     stride = np.uint64(width)
     steps = neighbour_steps(width)
     n = len(pixels)
-    slots = 0
-    for i in range(n):
-        p = np.uint64(pixels[i])
-        around = neighbours(flat, p, stride)
-        solid = touches_solid(flat, p, stride)
-        if COUNT[around] == 2 and not solid:
-            node_of[p] = PATH
-        else:
-            node_of[p] = OPEN_END if solid else JUNCTION if COUNT[around] > 2 else FREE_END
-            slots += COUNT[around]
-
+    slots = _label(states, pixels, node_of)
     members = np.empty(n, np.int32)  # pixels of the nodes, node after node
     first = np.empty(n + 1, np.int64)
     is_open = np.zeros(n, np.bool_)
-    n_nodes = 0
-    n_members = 0
-    for i in range(n):
-        seed = np.uint64(pixels[i])
-        kind = node_of[seed]
-        if kind > FREE_END:
-            continue
-        first[n_nodes] = n_members
-        is_open[n_nodes] = kind == OPEN_END
-        members[n_members] = seed
-        n_members += 1
-        node_of[seed] = n_nodes
-        head = first[n_nodes]
-        while kind == JUNCTION and head < n_members:
-            p = np.uint64(members[head])
-            head += 1
-            for k in range(8):
-                q = p + steps[k]
-                if flat[q] == ROAD and node_of[q] == JUNCTION:
-                    node_of[q] = n_nodes
-                    members[n_members] = q
-                    n_members += 1
-        n_nodes += 1
-    first[n_nodes] = n_members
-
+    n_nodes, n_members = _gather_nodes(states, pixels, node_of, members, first, is_open)
     edges = np.empty((slots + n // 2 + 1, 2), np.int32)
     offsets = np.zeros(len(edges) + 1, np.int64)
     chain = np.empty(n, np.int32)
@@ -96,6 +130,7 @@ def trace(states: Bytes2, pixels: Int32s1, node_of: Int32s1) -> tuple[Floats2, B
     n_chain = 0
     m = 0
     next_ring = 0
+    # Walk from every pixel of a node along all chains that leave it.
     while True:
         if m == n_members:  # all nodes done: is there a ring left?
             while next_ring < n and node_of[pixels[next_ring]] != PATH:
@@ -127,14 +162,7 @@ def trace(states: Bytes2, pixels: Int32s1, node_of: Int32s1) -> tuple[Floats2, B
             edges[n_edges, 1] = node_of[q]
             n_edges += 1
             offsets[n_edges] = n_chain
-
-    xy = np.zeros((n_nodes, 2))
-    for node in range(n_nodes):
-        for i in range(first[node], first[node + 1]):
-            xy[node, 0] += members[i] % width
-            xy[node, 1] += members[i] // width
-        xy[node, 0] /= first[node + 1] - first[node]
-        xy[node, 1] /= first[node + 1] - first[node]
+    xy = _mean_places(members, first, n_nodes, width)
     return xy, is_open[:n_nodes].copy(), edges[:n_edges].copy(), chain[:n_chain].copy(), offsets[: n_edges + 1].copy()
 
 

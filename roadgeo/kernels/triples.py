@@ -1,36 +1,19 @@
-"""Triples of neighbouring intersections: their affine-invariant codes, the table of codes, and its look-up.
+"""Look-up of triples: which triples of the map have the codes of a query's triple (see `kernels.triple_codes`)."""
 
-A triple (X, Y, Z), counterclockwise, is sent by an affine map to an equilateral triangle; two tangent lines at each
-vertex then give six angles that hardly change from map to image. At a vertex with edge vectors e1, e2 to the next two
-vertices, a direction d = alpha e1 + beta e2 has, against the axis towards the triangle's middle, the angle
-atan2((beta - alpha) sin 30, (alpha + beta) cos 30). Angles are measured in units of pi / 72, in cells of 8 units (20
-degrees).
-
-Two sorted cells at a vertex make one of 45 pairs, three vertices one of 45^3 table cells. An entry is a uint64:
-`anchor << 40 | slot of Y << 37 | slot of Z << 34 | sides << 24 | six positions within the cells`, slots being columns
-of `neighbours`. Each position takes 4 bits of which the highest is 0: with that bit set as a guard, one subtraction
-compares all six. `sides` says on which sides of each vertex the road along a tangent leaves it: most entries whose
-angles agree are told apart by them, before anything else of the map is read.
-"""
-
-import math
+from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
 
-from roadgeo.kernels.arrays import Floats2, Int8s2, Int8s3, Int32s1, Int32s2, Ints1, Ints2, Ints3, Singles2, UInt64s1
+from roadgeo.kernels.arrays import Floats2, Int8s2, Int32s1, Int32s2, Ints1, Ints2, Ints3, Singles2
 from roadgeo.kernels.compilation import kernel
 from roadgeo.kernels.rays import rays_agree
+from roadgeo.kernels.structs import Hits, TripleLimits, TripleMap, TripleQuery
+from roadgeo.kernels.triple_codes import BOTH, CELL_UNITS, CELLS, PAIRS, orient, pair_id, triple_codes, turned
 
-UNITS = 72  # per half turn
-CELL_UNITS = 8
+__all__ = ["count_alike", "gather", "look_up_each", "vertex_probes"]
+
 GUARDS = 0x888888
-CELLS = UNITS // CELL_UNITS
-PAIRS = CELLS * (CELLS + 1) // 2
-TABLE = PAIRS**3
-MAX_NEIGHBOURS = 8  # slots take 3 bits
-MAX_ANCHORS = 1 << 24
-FORWARDS, BACKWARDS, BOTH = 0, 1, 2
 
 #: Bit r of `ALIKE[q]`: whether sides r of a vertex of the map are those of q or more, or fewer, on both tangents.
 ALIKE = np.array(
@@ -45,207 +28,6 @@ ALIKE = np.array(
     ],
     np.int64,
 )
-
-
-@kernel()
-def pair_id(low: int, high: int) -> int:
-    """Return the number of the sorted pair of cells low <= high, from 0 to PAIRS - 1."""
-    return low * CELLS - (low * (low - 1)) // 2 + (high - low)
-
-
-@kernel()
-def vertex_angle(e1x: float, e1y: float, e2x: float, e2y: float, tangent: float) -> float:
-    """Return a direction's angle in the equilateral frame, in units, 0 <= angle < 2 UNITS (float)."""
-    dx, dy = math.cos(tangent), math.sin(tangent)
-    alpha = dx * e2y - dy * e2x
-    beta = e1x * dy - e1y * dx
-    angle = math.atan2((beta - alpha) * 0.5, (alpha + beta) * 0.8660254037844386)
-    angle = angle * (UNITS / math.pi)
-    return angle % (2 * UNITS)
-
-
-@kernel()
-def find_sides(tangents: Singles2, branches: Int8s3, sides: Int8s2) -> None:
-    """Find on which sides branches run along each tangent.
-
-    Parameters
-    ----------
-    tangents : (N, T) float32
-        Directions in radians, NaN behind the last.
-    branches : (N, R, 2) int8
-        As in `rays_agree`.
-    sides : (N, T) int8
-        Filled with FORWARDS, BACKWARDS or BOTH; BOTH too where no branch is found.
-    """
-    for i in range(tangents.shape[0]):
-        for t in range(tangents.shape[1]):
-            sides[i, t] = BOTH
-            if np.isnan(tangents[i, t]):
-                continue
-            dx, dy = math.cos(tangents[i, t]), math.sin(tangents[i, t])
-            forwards, backwards = False, False
-            for r in range(branches.shape[1]):
-                along = dx * branches[i, r, 0] + dy * branches[i, r, 1]
-                forwards |= along > 0.87 * 127.0
-                backwards |= along < -0.87 * 127.0
-            if forwards != backwards:
-                sides[i, t] = FORWARDS if forwards else BACKWARDS
-
-
-@kernel()
-def turned(side: int) -> int:
-    """Return a side as seen from the other end."""
-    return BOTH if side == BOTH else 1 - side
-
-
-@kernel()
-def vertex_codes(
-    xy: NDArray[np.float64],
-    tangents: NDArray[np.float32],
-    sides: NDArray[np.int8],
-    i: int,
-    j: int,
-    k: int,
-    limit: int,
-    out: NDArray[np.int64],
-) -> int:
-    """Write the codes of vertex i of the triangle i, j, k; return how many.
-
-    A code is a sorted pair of units u1 <= u2, and 3 s1 + s2, the sides of the two (see `find_sides`) as the equilateral
-    frame sees them. There is one for every two of the vertex's tangents; of more than `limit`, those that cross most
-    openly.
-    """
-    e1x, e1y = xy[j, 0] - xy[i, 0], xy[j, 1] - xy[i, 1]
-    e2x, e2y = xy[k, 0] - xy[i, 0], xy[k, 1] - xy[i, 1]
-    n = 0
-    m = 0
-    while m < tangents.shape[1] and not np.isnan(tangents[i, m]):
-        m += 1
-    openness = np.empty(limit, np.int64)
-    units = np.empty(m, np.int64)
-    seen = np.empty(m, np.int64)
-    for p in range(m):
-        units[p] = int(vertex_angle(e1x, e1y, e2x, e2y, tangents[i, p])) % (2 * UNITS)
-        side = int(np.int64(sides[i, p]))
-        seen[p] = side if units[p] < UNITS else turned(side)
-        units[p] %= UNITS
-    for p in range(m):
-        for q in range(p + 1, m):
-            between = min(abs(units[p] - units[q]), UNITS - abs(units[p] - units[q]))
-            if n == limit and between <= openness[n - 1]:
-                continue
-            place = min(n, limit - 1)
-            while place > 0 and openness[place - 1] < between:
-                openness[place] = openness[place - 1]
-                out[place] = out[place - 1]
-                place -= 1
-            openness[place] = between
-            first, second = (p, q) if units[p] <= units[q] else (q, p)
-            out[place, 0], out[place, 1], out[place, 2] = units[first], units[second], 3 * seen[first] + seen[second]
-            n = min(n + 1, limit)
-    return n
-
-
-@kernel()
-def orient(xy: NDArray[np.float64], a: int, b: int, c: int, min_shape: float) -> int:
-    """Return +1 if a, b, c run counterclockwise, -1 if clockwise, 0 if the triangle is too thin.
-
-    The shape is twice the area over the square of the longest side: 0.87 for an equilateral triangle, 0 for a line.
-    """
-    abx, aby = xy[b, 0] - xy[a, 0], xy[b, 1] - xy[a, 1]
-    acx, acy = xy[c, 0] - xy[a, 0], xy[c, 1] - xy[a, 1]
-    bcx, bcy = acx - abx, acy - aby
-    cross = abx * acy - aby * acx
-    longest = max(abx * abx + aby * aby, acx * acx + acy * acy, bcx * bcx + bcy * bcy)
-    if not abs(cross) > min_shape * longest:  # three points in one place are thin too
-        return 0
-    return 1 if cross > 0 else -1
-
-
-@kernel()
-def has_both(neighbours: NDArray[np.int32], i: int, j: int, k: int) -> bool:
-    """Whether j and k both stand among the neighbours of i."""
-    found = 0
-    for s in range(neighbours.shape[1]):
-        if neighbours[i, s] == j or neighbours[i, s] == k:
-            found += 1
-    return found == 2
-
-
-@kernel()
-def triple_codes(
-    xy: NDArray[np.float64],
-    tangents: NDArray[np.float32],
-    sides: NDArray[np.int8],
-    a: int,
-    b: int,
-    c: int,
-    limit: int,
-    codes: NDArray[np.int64],
-    n: NDArray[np.int64],
-) -> None:
-    """Fill `codes[v, :n[v]]` for the three vertices of the counterclockwise triangle a, b, c."""
-    n[0] = vertex_codes(xy, tangents, sides, a, b, c, limit, codes[0])
-    n[1] = vertex_codes(xy, tangents, sides, b, c, a, limit, codes[1])
-    n[2] = vertex_codes(xy, tangents, sides, c, a, b, limit, codes[2])
-
-
-@kernel()
-def fill_table(
-    xy: Floats2,
-    tangents: Singles2,
-    sides: Int8s2,
-    neighbours: Int32s2,
-    min_shape: float,
-    limit: int,
-    starts: Ints1,
-    entries: UInt64s1,
-) -> int:
-    """Count codes per table cell, or write the entries.
-
-    With an empty `entries`, `starts[cell + 1]` is incremented for every code. Otherwise `starts` holds each cell's
-    first free place, and is moved on as entries are written. A triple that several vertices could anchor is stored
-    once, by the lowest of them.
-    """
-    write = entries.shape[0] > 0
-    codes = np.empty((3, limit, 3), np.int64)
-    n = np.empty(3, np.int64)
-    total = 0
-    for a in range(xy.shape[0]):
-        for s in range(neighbours.shape[1]):
-            b0 = int(np.int64(neighbours[a, s]))  # of one type everywhere, vertex_codes is compiled once
-            if b0 < 0:
-                break
-            for t in range(s + 1, neighbours.shape[1]):
-                c0 = int(np.int64(neighbours[a, t]))
-                if c0 < 0:
-                    break
-                turn = orient(xy, a, b0, c0, min_shape)
-                if turn == 0:
-                    continue
-                if (b0 < a and has_both(neighbours, b0, a, c0)) or (c0 < a and has_both(neighbours, c0, a, b0)):
-                    continue
-                b, c, sb, sc = (b0, c0, s, t) if turn > 0 else (c0, b0, t, s)
-                triple_codes(xy, tangents, sides, a, b, c, limit, codes, n)
-                for p in range(n[0]):
-                    for q in range(n[1]):
-                        for r in range(n[2]):
-                            cell = 0
-                            fine, around = np.uint64(0), np.uint64(0)
-                            for v in range(3):
-                                w = p if v == 0 else (q if v == 1 else r)
-                                u1, u2 = codes[v, w, 0], codes[v, w, 1]
-                                cell = cell * PAIRS + pair_id(u1 // CELL_UNITS, u2 // CELL_UNITS)
-                                fine = (fine << np.uint64(8)) | np.uint64((u1 % CELL_UNITS) * 16 + u2 % CELL_UNITS)
-                                around = around * np.uint64(9) + np.uint64(codes[v, w, 2])
-                            if write:
-                                head = (np.uint64(a) << np.uint64(40)) | (np.uint64((sb << 3) | sc) << np.uint64(34))
-                                entries[starts[cell]] = head | (around << np.uint64(24)) | fine
-                                starts[cell] += 1
-                            else:
-                                starts[cell + 1] += 1
-                            total += 1
-    return total
 
 
 @kernel()
@@ -333,58 +115,114 @@ def count_alike(
                 costs[i, s, t] = total if n[0] * n[1] * n[2] > 0 else -1
 
 
-@kernel()
-def look_up(
-    xy: Floats2,
-    branches: Int8s3,
-    tangents: Singles2,
-    sides: Int8s2,
-    a: int,
-    s: int,
-    t: int,
-    neighbours: Int32s2,
-    limit: int,
-    tolerance: int,
-    min_cos: float,
-    ref_xy: Floats2,
-    ref_branches: Int8s3,
-    ref_neighbours: Int32s2,
-    starts: Int32s1,
-    entries: UInt64s1,
-    scale: tuple[float, float],
-    min_ratio: float,
-    hit_ids: Ints2,
-    hit_affine: Floats2,
-    n_hits: int,
-) -> tuple[int, int]:
-    """Append the map's triples whose codes agree with those of the query triple (a, slot s, slot t).
+class _Triangle(NamedTuple):
+    """A query triple, counterclockwise: its points, the slots of two of them, its edges, twice its area."""
 
-    Angles may differ by `tolerance` units, branches by an angle of cosine `min_cos`. A hit is `hit_ids` = (A, slot of
-    b, B, slot of c, C), b and c counterclockwise after a, and `hit_affine` = the 2 x 2 matrix (row-major) that takes
-    the query triangle to the reference triangle. Gates: `scale` = (least, greatest) root of its determinant, and
-    `min_ratio`, the least ratio of its singular values. Returns (hits so far, entries compared).
-    """
-    b, c = int(np.int64(neighbours[a, s])), int(np.int64(neighbours[a, t]))
+    a: int
+    b: int
+    c: int
+    s: int
+    t: int
+    abx: float
+    aby: float
+    acx: float
+    acy: float
+    cross: float
+
+
+@kernel()
+def _triangle(query: TripleQuery, a: int, s: int, t: int) -> _Triangle:
+    """Return the triple of an anchor and two of its neighbours."""
+    xy = query.xy
+    b, c = int(np.int64(query.neighbours[a, s])), int(np.int64(query.neighbours[a, t]))
+    if (xy[b, 0] - xy[a, 0]) * (xy[c, 1] - xy[a, 1]) - (xy[b, 1] - xy[a, 1]) * (xy[c, 0] - xy[a, 0]) < 0:
+        b, c, s, t = c, b, t, s
     abx, aby = xy[b, 0] - xy[a, 0], xy[b, 1] - xy[a, 1]
     acx, acy = xy[c, 0] - xy[a, 0], xy[c, 1] - xy[a, 1]
-    if abx * acy - aby * acx < 0:
-        b, c, s, t = c, b, t, s
-        abx, aby, acx, acy = acx, acy, abx, aby
-    cross = abx * acy - aby * acx
-    codes = np.empty((3, limit, 3), np.int64)
+    return _Triangle(a, b, c, s, t, abx, aby, acx, acy, abx * acy - aby * acx)
+
+
+@kernel()
+def _places(entry: np.uint64, turn: int, table: TripleMap) -> tuple[int, int, int]:
+    """Return the map's triple of an entry, the partner of the query's anchor first, or -1: it is none.
+
+    A file's bits may have been flipped: no entry is believed.
+    """
+    x = np.int64(entry >> np.uint64(40))
+    y = np.int64((entry >> np.uint64(37)) & np.uint64(7))
+    z = np.int64((entry >> np.uint64(34)) & np.uint64(7))
+    if x >= table.xy.shape[0] or max(y, z) >= table.neighbours.shape[1]:
+        return -1, -1, -1
+    y, z = np.int64(table.neighbours[x, y]), np.int64(table.neighbours[x, z])
+    if min(y, z) < 0:
+        return -1, -1, -1
+    if turn == 1:
+        return int(y), int(z), int(x)
+    if turn == 2:
+        return int(z), int(x), int(y)
+    return int(x), int(y), int(z)
+
+
+@kernel()
+def _fit_triangle(
+    query: TripleQuery, one: _Triangle, x: int, y: int, z: int, table: TripleMap, limits: TripleLimits
+) -> tuple[bool, tuple[float, float, float, float]]:
+    """Return whether the map's triple x, y, z may be the query's, and the 2 x 2 map (row-major) that takes it there."""
+    bx, by = table.xy[y, 0] - table.xy[x, 0], table.xy[y, 1] - table.xy[x, 1]
+    cx, cy = table.xy[z, 0] - table.xy[x, 0], table.xy[z, 1] - table.xy[x, 1]
+    det = (bx * cy - by * cx) / one.cross
+    if det < limits.scale[0] * limits.scale[0] or det > limits.scale[1] * limits.scale[1]:
+        return False, (0.0, 0.0, 0.0, 0.0)
+    j00 = (bx * one.acy - cx * one.aby) / one.cross
+    j01 = (cx * one.abx - bx * one.acx) / one.cross
+    j10 = (by * one.acy - cy * one.aby) / one.cross
+    j11 = (cy * one.abx - by * one.acx) / one.cross
+    # singular values s1 >= s2: s1 s2 = det, s1^2 + s2^2 = |J|^2
+    square = j00 * j00 + j01 * j01 + j10 * j10 + j11 * j11
+    if square * limits.min_ratio > det * (1.0 + limits.min_ratio * limits.min_ratio):
+        return False, (0.0, 0.0, 0.0, 0.0)
+    agree = (
+        rays_agree(query.branches, one.a, table.branches, x, j00, j01, j10, j11, limits.min_cos)
+        and rays_agree(query.branches, one.b, table.branches, y, j00, j01, j10, j11, limits.min_cos)
+        and rays_agree(query.branches, one.c, table.branches, z, j00, j01, j10, j11, limits.min_cos)
+    )
+    return agree, (j00, j01, j10, j11)
+
+
+@kernel()
+def _add_hit(
+    hits: Hits, n: int, one: _Triangle, x: int, y: int, z: int, affine: tuple[float, float, float, float]
+) -> None:
+    hits.ids[n, 0] = x
+    hits.ids[n, 1], hits.ids[n, 2] = one.s, y
+    hits.ids[n, 3], hits.ids[n, 4] = one.t, z
+    hits.affine[n, 0], hits.affine[n, 1] = affine[0], affine[1]
+    hits.affine[n, 2], hits.affine[n, 3] = affine[2], affine[3]
+
+
+@kernel()
+def _look_up(
+    query: TripleQuery, one: _Triangle, table: TripleMap, limits: TripleLimits, hits: Hits, n_hits: int
+) -> tuple[int, int]:
+    """Append the map's triples whose codes agree with those of a query triple; return (hits so far, entries compared).
+
+    See `look_up_each`.
+    """
+    codes = np.empty((3, limits.codes_per_vertex, 3), np.int64)
     n = np.empty(3, np.int64)
-    triple_codes(xy, tangents, sides, a, b, c, limit, codes, n)
+    triple_codes(query.xy, query.tangents, query.sides, one.a, one.b, one.c, limits.codes_per_vertex, codes, n)
     probes = np.empty((3, 64, 4), np.int64)
     n_probes = np.empty(3, np.int64)
     compared = 0
+    # Every vertex may have several codes, every code several cells, and the stored triple may start at any vertex.
     for p in range(n[0]):
-        n_probes[0] = vertex_probes(codes[0, p], tolerance, probes[0])
+        n_probes[0] = vertex_probes(codes[0, p], limits.tolerance, probes[0])
         for q in range(n[1]):
-            n_probes[1] = vertex_probes(codes[1, q], tolerance, probes[1])
+            n_probes[1] = vertex_probes(codes[1, q], limits.tolerance, probes[1])
             for r in range(n[2]):
-                n_probes[2] = vertex_probes(codes[2, r], tolerance, probes[2])
+                n_probes[2] = vertex_probes(codes[2, r], limits.tolerance, probes[2])
                 for turn in range(3):
-                    # The stored triple may start at another vertex: X, Y, Z = a, b, c or c, a, b or b, c, a.
+                    # X, Y, Z = a, b, c or c, a, b or b, c, a
                     vx, vy, vz = (0, 1, 2) if turn == 0 else ((2, 0, 1) if turn == 1 else (1, 2, 0))
                     for i in range(n_probes[vx]):
                         ki = probes[vx, i, 0] * PAIRS
@@ -397,103 +235,52 @@ def look_up(
                                 lows = lj | probes[vz, k, 1]
                                 highs = hj | probes[vz, k, 2]
                                 alike_x, alike_y, alike_z = probes[vx, i, 3], probes[vy, j, 3], probes[vz, k, 3]
-                                for e in range(starts[cell], starts[cell + 1]):
+                                for e in range(table.starts[cell], table.starts[cell + 1]):
                                     compared += 1
-                                    entry = entries[e]
+                                    entry = table.entries[e]
+                                    # All six angles at once, then the sides, then the map itself.
                                     fine = np.int64(entry & np.uint64(0xFFFFFF))
                                     if ((fine | GUARDS) - lows) & (highs - fine) & GUARDS != GUARDS:
                                         continue
                                     around = np.int64((entry >> np.uint64(24)) & np.uint64(1023))
-                                    if (alike_x >> (around // 81)) & (alike_y >> (around // 9 % 9)) & (
-                                        alike_z >> (around % 9)
-                                    ) & 1 == 0:
+                                    alike = (alike_x >> (around // 81)) & (alike_y >> (around // 9 % 9))
+                                    if alike & (alike_z >> (around % 9)) & 1 == 0:
                                         continue
-                                    x = np.int64(entry >> np.uint64(40))
-                                    y = np.int64((entry >> np.uint64(37)) & np.uint64(7))
-                                    z = np.int64((entry >> np.uint64(34)) & np.uint64(7))
-                                    # A file's bits may have been flipped: no entry is believed.
-                                    if x >= ref_xy.shape[0] or max(y, z) >= ref_neighbours.shape[1]:
+                                    x, y, z = _places(entry, turn, table)
+                                    if x < 0:
                                         continue
-                                    y, z = np.int64(ref_neighbours[x, y]), np.int64(ref_neighbours[x, z])
-                                    if min(y, z) < 0:
+                                    fits, affine = _fit_triangle(query, one, x, y, z, table, limits)
+                                    if not fits:
                                         continue
-                                    if turn == 1:
-                                        x, y, z = y, z, x
-                                    elif turn == 2:
-                                        x, y, z = z, x, y
-                                    bx, by = ref_xy[y, 0] - ref_xy[x, 0], ref_xy[y, 1] - ref_xy[x, 1]
-                                    cx, cy = ref_xy[z, 0] - ref_xy[x, 0], ref_xy[z, 1] - ref_xy[x, 1]
-                                    det = (bx * cy - by * cx) / cross
-                                    if det < scale[0] * scale[0] or det > scale[1] * scale[1]:
-                                        continue
-                                    j00 = (bx * acy - cx * aby) / cross
-                                    j01 = (cx * abx - bx * acx) / cross
-                                    j10 = (by * acy - cy * aby) / cross
-                                    j11 = (cy * abx - by * acx) / cross
-                                    # singular values s1 >= s2: s1 s2 = det, s1^2 + s2^2 = |J|^2
-                                    square = j00 * j00 + j01 * j01 + j10 * j10 + j11 * j11
-                                    if square * min_ratio > det * (1.0 + min_ratio * min_ratio):
-                                        continue
-                                    if not (
-                                        rays_agree(branches, a, ref_branches, int(x), j00, j01, j10, j11, min_cos)
-                                        and rays_agree(
-                                            branches, int(b), ref_branches, int(y), j00, j01, j10, j11, min_cos
-                                        )
-                                        and rays_agree(
-                                            branches, int(c), ref_branches, int(z), j00, j01, j10, j11, min_cos
-                                        )
-                                    ):
-                                        continue
-                                    if n_hits >= hit_ids.shape[0]:
+                                    if n_hits >= hits.ids.shape[0]:
                                         return n_hits, compared
-                                    hit_ids[n_hits, 0] = x
-                                    hit_ids[n_hits, 1] = s
-                                    hit_ids[n_hits, 2] = y
-                                    hit_ids[n_hits, 3] = t
-                                    hit_ids[n_hits, 4] = z
-                                    hit_affine[n_hits, 0] = j00
-                                    hit_affine[n_hits, 1] = j01
-                                    hit_affine[n_hits, 2] = j10
-                                    hit_affine[n_hits, 3] = j11
+                                    _add_hit(hits, n_hits, one, x, y, z, affine)
                                     n_hits += 1
     return n_hits, compared
 
 
 @kernel()
 def look_up_each(
-    xy: Floats2,
-    branches: Int8s3,
-    tangents: Singles2,
-    sides: Int8s2,
+    query: TripleQuery,
     a: int,
     slots: Ints2,
     max_compared: int,
-    neighbours: Int32s2,
-    limit: int,
-    tolerance: int,
-    min_cos: float,
-    ref_xy: Floats2,
-    ref_branches: Int8s3,
-    ref_neighbours: Int32s2,
-    starts: Int32s1,
-    entries: UInt64s1,
-    scale: tuple[float, float],
-    min_ratio: float,
-    hit_ids: Ints2,
-    hit_affine: Floats2,
+    table: TripleMap,
+    limits: TripleLimits,
+    hits: Hits,
 ) -> tuple[int, int]:
-    """Look up the triples of one anchor, `slots` (T, 2), until there is no room for hits or enough was compared.
+    """Find the map's triples whose codes agree with those of one anchor's triples (a, slot s, slot t).
 
-    See `look_up`. Returns (hits, entries compared).
+    The triples, `slots` (T, 2), are looked up one after another until there is no room for hits or enough was compared.
+    A hit is `hits.ids` = (A, slot of b, B, slot of c, C), b and c counterclockwise after a, and `hits.affine` = the
+    2 x 2 matrix (row-major) that takes the query triangle to the reference triangle. Returns (hits, entries compared).
     """
     n_hits, n_compared = 0, 0
     for i in range(slots.shape[0]):
-        if n_hits == hit_ids.shape[0] or n_compared > max_compared:
+        if n_hits == hits.ids.shape[0] or n_compared > max_compared:
             break
-        n_hits, compared = look_up(
-            xy, branches, tangents, sides, a, slots[i, 0], slots[i, 1], neighbours, limit, tolerance, min_cos,
-            ref_xy, ref_branches, ref_neighbours, starts, entries, scale, min_ratio, hit_ids, hit_affine, n_hits,
-        )  # fmt: skip
+        one = _triangle(query, a, slots[i, 0], slots[i, 1])
+        n_hits, compared = _look_up(query, one, table, limits, hits, n_hits)
         n_compared += compared
     return n_hits, n_compared
 
@@ -520,11 +307,13 @@ def gather(
     partner = np.empty(n_slots, np.int64)
     start = 0
     while start < order.shape[0]:
+        # all hits on one map intersection
         stop = start + 1
         a = hit_ids[order[start], 0]
         while stop < order.shape[0] and hit_ids[order[stop], 0] == a:
             stop += 1
         if stop - start >= 2 and n < out_score.shape[0]:
+            # the hit with which most others agree
             best = 2
             size = min(stop - start, 200)
             for i in range(start, start + size):
@@ -536,6 +325,7 @@ def gather(
                 partner[hit_ids[u, 3]] = hit_ids[u, 4]
                 placed = 2
                 m00, m01, m10, m11, m = 0.0, 0.0, 0.0, 0.0, 0
+                # those whose maps are alike, and that send no shared neighbour elsewhere
                 for j in range(start, start + size):
                     v = order[j]
                     d00 = hit_affine[v, 0] - hit_affine[u, 0]

@@ -13,6 +13,7 @@ from roadgeo._arrays import BoolArray, FloatArray, IntArray
 from roadgeo.geometry.camera import CameraFault, CameraOptions, judge, sampling
 from roadgeo.kernels.growth import grow_each
 from roadgeo.kernels.roads import screen
+from roadgeo.kernels.structs import GrowthLimits, GrowthQuery
 from roadgeo.matching.index import ReferenceIndex
 from roadgeo.matching.lens import LensOptions, find_lens, straighten_scene
 from roadgeo.matching.refinement import Refined, RefineOptions, refine
@@ -259,8 +260,7 @@ class TripleEstimator:
             proposals.reference[looked_at], proposals.affine[looked_at], anchor,
             index.xy, scene.points[near], scene.directions[near],
             options.screen_radius_m, options.screen_radius_px, math.cos(math.radians(options.ray_tolerance_deg)),
-            options.screen_share,
-            index.segments, index.segment_starts, index.segment_ids, index.grid, index.shape, shares,
+            options.screen_share, index.road_buckets, shares,
         )  # fmt: skip
         good = shares >= options.screen_share
         kept, shares = looked_at[good], shares[good]
@@ -290,14 +290,16 @@ class TripleEstimator:
         matched = np.empty((len(chosen), len(xy)), np.int64)
         matrices = np.empty((len(chosen), 3, 3))
         ratios = np.empty(len(chosen))
-        grow_each(
-            xy, scene.branches, order, scene.half_size, anchor,
-            proposals.reference[chosen], proposals.affine[chosen], neighbours, partners,
-            index.xy, index.branches, index.point_starts, index.grid, index.shape,
+        limits = GrowthLimits(
             (options.sigma_m, options.sigma_px), (options.radius_m, options.radius_px),
             math.cos(math.radians(options.ray_tolerance_deg)),
             self.options.camera.perspective_sigma(options.perspective_sigma),
-            options.hit_rate, options.chance_rate, options.patience, options.min_matched, matched, matrices, ratios,
+            options.hit_rate, options.chance_rate, options.patience,
+        )  # fmt: skip
+        grow_each(
+            GrowthQuery(xy, scene.branches, neighbours, order, scene.half_size, anchor),
+            proposals.reference[chosen], proposals.affine[chosen], partners,
+            index.point_buckets, limits, options.min_matched, matched, matrices, ratios,
         )  # fmt: skip
         best = np.argsort(-ratios, kind="stable")
         seeds = [np.append(neighbours[anchor][partners[m] >= 0], anchor) for m in best]

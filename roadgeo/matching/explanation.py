@@ -372,8 +372,7 @@ def _describe(
     distance = np.empty(len(scene.points))
     forward_distances(
         model.matrix, scene.points, scene.directions, tolerance_m(camera.gsd_m, verify),
-        math.cos(math.radians(verify.max_turn_deg)), 0.0, 0.0,
-        index.segments, index.segment_starts, index.segment_ids, index.grid, index.shape, distance,
+        math.cos(math.radians(verify.max_turn_deg)), 0.0, 0.0, index.road_buckets, distance,
     )  # fmt: skip
     place = RejectedPlace(
         matrix=model.matrix,

@@ -1,7 +1,7 @@
 """The reference index: everything `locate` needs of a road network, in flat arrays that can be memory-mapped.
 
 Intersections are stored sorted by bucket of one grid, which also lists the road segments; the table of triple codes
-(`kernels.triples`) points into them. Positions are metres from the plane's origin.
+(`kernels.triple_codes`) points into them. Positions are metres from the plane's origin.
 """
 
 from __future__ import annotations
@@ -9,6 +9,7 @@ from __future__ import annotations
 import math
 from collections.abc import Mapping
 from dataclasses import asdict, dataclass, fields, replace
+from functools import cached_property
 from typing import Any
 
 import numpy as np
@@ -19,7 +20,8 @@ from roadgeo.errors import IndexFormatError
 from roadgeo.geometry.projection import LocalPlane
 from roadgeo.kernels.buckets import nearest_neighbours
 from roadgeo.kernels.roads import bin_segments
-from roadgeo.kernels.triples import MAX_ANCHORS, MAX_NEIGHBOURS, TABLE, fill_table, find_sides
+from roadgeo.kernels.structs import PointBuckets, RoadBuckets, TripleMap
+from roadgeo.kernels.triple_codes import MAX_ANCHORS, MAX_NEIGHBOURS, TABLE, fill_table, find_sides
 from roadgeo.roads.graph import RoadGraph
 from roadgeo.roads.intersections import MAX_BRANCHES
 from roadgeo.roads.network import RoadNetwork
@@ -93,7 +95,7 @@ class ReferenceIndex:
     segment_starts : (B + 1,) int32, segment_ids : int32
         Segments that touch each bucket.
     table_starts : (TABLE + 1,) int32, table_entries : (T,) uint64
-        Codes of triples, see `kernels.triples`.
+        Codes of triples, see `kernels.triple_codes`.
     source : (N,) int32
         Row of each intersection in the network's `intersections`.
     """
@@ -138,6 +140,21 @@ class ReferenceIndex:
         """(columns, rows) of buckets."""
         columns, rows = self.meta["shape"]
         return int(columns), int(rows)
+
+    @cached_property
+    def road_buckets(self) -> RoadBuckets:
+        """The roads, as kernels take them."""
+        return RoadBuckets(self.segments, self.segment_starts, self.segment_ids, self.grid, self.shape)
+
+    @cached_property
+    def point_buckets(self) -> PointBuckets:
+        """The intersections, as kernels take them."""
+        return PointBuckets(self.xy, self.branches, self.point_starts, self.grid, self.shape)
+
+    @cached_property
+    def triple_map(self) -> TripleMap:
+        """The table of triples, as kernels take it."""
+        return TripleMap(self.xy, self.branches, self.neighbours, self.table_starts, self.table_entries)
 
     @property
     def nbytes(self) -> int:
@@ -307,7 +324,7 @@ def unpack_tangents(packed: AnyArray) -> Float32Array:
 def _tabulate(
     xy: FloatArray, tangents: Float32Array, branches: AnyArray, neighbours: Int32Array, options: IndexOptions
 ) -> tuple[Int32Array, AnyArray]:
-    """Return starts and entries of the table of triples (see `kernels.triples`).
+    """Return starts and entries of the table of triples (see `kernels.triple_codes`).
 
     Within a cell the entries stand in random order, always the same: where a look-up ends before the cell does, it has
     seen all parts of the map alike.

@@ -11,7 +11,6 @@ import numpy as np
 from roadgeo._arrays import BoolArray, FloatArray
 from roadgeo.geometry.lens import Lens
 from roadgeo.kernels.residuals import road_residuals
-from roadgeo.kernels.road_growth import RoadBuckets
 from roadgeo.matching.index import ReferenceIndex
 from roadgeo.matching.refinement import (
     Refined,
@@ -82,7 +81,7 @@ class _Problem:
     def __init__(self, matrix: FloatArray, scene: Scene, index: ReferenceIndex, options: RefineOptions) -> None:
         self.scene, self.options = scene, options
         self.p, self.origin, self.unit = normalise(matrix, scene.center, scene.half_size)
-        self.roads = RoadBuckets(index.segments, index.segment_starts, index.segment_ids, index.grid, index.shape)
+        self.roads = index.road_buckets
         gsd = self.unit / scene.half_size
         self.sigma_m = math.hypot(options.sigma_m, options.sigma_px * gsd)
         self.max_radius = options.max_radius_m + options.max_radius_px * gsd

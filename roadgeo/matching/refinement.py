@@ -9,6 +9,7 @@ import numpy as np
 
 from roadgeo._arrays import FloatArray, IntArray
 from roadgeo.kernels.adjustment import adjust, point_row
+from roadgeo.kernels.structs import AdjustLimits, Held, Plane, PointPairs, RoadPoints
 from roadgeo.matching.index import ReferenceIndex
 from roadgeo.matching.scene import Scene
 
@@ -105,7 +106,8 @@ class Refined:
 def normalise(matrix: FloatArray, center: FloatArray, half_size: float) -> tuple[FloatArray, FloatArray, float]:
     """Normalise a homography.
 
-    Return the eight parameters of `kernels.growth`, the reference point under the middle, and the unit in metres.
+    Return the eight parameters (see `kernels.homography_fit`), the reference point under the middle, and the unit in
+    metres.
     """
     mapped = matrix @ (center[0], center[1], 1.0)
     origin = mapped[:2] / mapped[2]
@@ -206,16 +208,24 @@ def refine(
     grid, targets = _held_points(p, 6 if held or len(pairs) < options.few_matches else 0)
     held_weight = 8.0 / 36.0 * (sigma_m / max(options.held_m, options.held_px * gsd)) ** 2
     normal = np.empty((8, 8))
-    _, rms = adjust(
-        p, unit, origin[0], origin[1], points, np.ascontiguousarray(scene.directions[::step]), _cells(points, options),
-        min(1.0, spacing_m(scene, unit) * step / options.correlation_m),
-        pairs, (index.xy[matched[chosen]] - origin) / unit, _cells(pairs, options), options.intersection_weight,
-        grid, targets, held_weight,
+    limits = AdjustLimits(
         options.n_cells**2, options.least_share, options.max_radius_m + options.max_radius_px * gsd,
-        np.cos(np.radians(options.max_turn_deg)), sigma_m,
+        float(np.cos(np.radians(options.max_turn_deg))), sigma_m,
         (sigma_m / unit / options.perspective_sigma) ** 2, options.n_iterations, options.tolerance_m,
-        index.segments, index.segment_starts, index.segment_ids, index.grid, index.shape, normal,
     )  # fmt: skip
+    directions = np.ascontiguousarray(scene.directions[::step])
+    weight = min(1.0, spacing_m(scene, unit) * step / options.correlation_m)
+    places = (index.xy[matched[chosen]] - origin) / unit
+    _, rms = adjust(
+        p,
+        Plane(unit, origin[0], origin[1]),
+        RoadPoints(points, directions, _cells(points, options), weight),
+        PointPairs(pairs, places, _cells(pairs, options), options.intersection_weight),
+        Held(grid, targets, held_weight),
+        limits,
+        index.road_buckets,
+        normal,
+    )
     if not np.isfinite(rms):
         return None
     inverse = np.asarray(np.linalg.inv(normal) * (rms / unit) ** 2, float)

@@ -8,7 +8,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from roadgeo._arrays import FloatArray
-from roadgeo.kernels.road_growth import RoadBuckets, Stages, grow_by_roads
+from roadgeo.kernels.road_growth import Stages, grow_by_roads
 from roadgeo.matching.index import ReferenceIndex
 from roadgeo.matching.scene import Scene
 
@@ -57,7 +57,6 @@ class RoadGrower:
 
     def __init__(self, scene: Scene, index: ReferenceIndex, options: RoadGrowOptions) -> None:
         self.scene, self.index, self.options = scene, index, options
-        self.roads = RoadBuckets(index.segments, index.segment_starts, index.segment_ids, index.grid, index.shape)
         thin = max(1, len(scene.dense_points) // options.max_points)
         self.points, self.directions = scene.dense_points[::thin], scene.dense_directions[::thin]
 
@@ -78,7 +77,8 @@ class RoadGrower:
             math.cos(math.radians(options.max_turn_deg)),
         )
         origin = self.index.xy[reference]
-        share = grow_by_roads(p, unit, origin, away[order] / half_size, self.directions[order], stages, self.roads)
+        points, roads = away[order] / half_size, self.index.road_buckets
+        share = grow_by_roads(p, unit, origin, points, self.directions[order], stages, roads)
         if share < 0.0:
             return None
         from_query = np.array([[1.0, 0.0, -at[0]], [0.0, 1.0, -at[1]], [0.0, 0.0, half_size]])

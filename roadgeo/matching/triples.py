@@ -15,7 +15,9 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from roadgeo._arrays import AnyArray, FloatArray, Int32Array, IntArray
-from roadgeo.kernels.triples import UNITS, count_alike, find_sides, gather, look_up_each
+from roadgeo.kernels.structs import Hits, TripleLimits, TripleQuery
+from roadgeo.kernels.triple_codes import UNITS, find_sides
+from roadgeo.kernels.triples import count_alike, gather, look_up_each
 from roadgeo.matching.index import ReferenceIndex
 from roadgeo.roads.intersections import Intersections
 
@@ -45,7 +47,7 @@ class TripleOptions:
     n_neighbours : int
         Triples are formed with pairs of so many nearest neighbours of the anchor.
     min_shape : float
-        Thinner triangles are left out (see `kernels.triples.orient`); the map's may be thinner still.
+        Thinner triangles are left out (see `kernels.triple_codes.orient`); the map's may be thinner still.
     codes_per_vertex : int
         Of an intersection with three tangents or more, so many pairs of tangents are looked up.
     angle_tolerance_deg, ray_tolerance_deg : float
@@ -143,8 +145,10 @@ def propose(
     )  # fmt: skip
     tolerance = round(options.angle_tolerance_deg * UNITS / 180.0)
     max_hits, max_compared = options.bounds(len(index))
-    ids = np.empty((max_hits, 5), np.int64)
-    affine = np.empty((max_hits, 4))
+    ids, affine = hits = Hits(np.empty((max_hits, 5), np.int64), np.empty((max_hits, 4)))
+    min_cos = float(np.cos(np.radians(options.ray_tolerance_deg)))
+    limits = TripleLimits(options.codes_per_vertex, tolerance, min_cos, scale, min_ratio)
+    seen = TripleQuery(query.xy, branches, query.tangents, sides, neighbours)
     usable = costs >= 0
     total = np.where(usable, costs, 0).sum(axis=(1, 2))
     n_usable = usable.sum(axis=(1, 2))
@@ -154,12 +158,7 @@ def propose(
         a = weighed[i]
         slots = np.argwhere(usable[i])
         slots = np.ascontiguousarray(slots[np.argsort(costs[i][usable[i]], kind="stable")])
-        n_hits, n_compared = look_up_each(
-            query.xy, branches, query.tangents, sides, int(a), slots, max_compared, neighbours,
-            options.codes_per_vertex, tolerance, float(np.cos(np.radians(options.ray_tolerance_deg))),
-            index.xy, index.branches, index.neighbours, index.table_starts, index.table_entries, scale, min_ratio,
-            ids, affine,
-        )  # fmt: skip
+        n_hits, n_compared = look_up_each(seen, int(a), slots, max_compared, index.triple_map, limits, hits)
         if options.single:
             yield _each_hit(int(a), ids[:n_hits], affine[:n_hits].copy(), k, len(slots), n_compared)
             continue
@@ -178,7 +177,7 @@ def propose(
 def _each_hit(
     anchor: int, ids: IntArray, affine: FloatArray, n_slots: int, n_tuples: int, n_compared: int
 ) -> Proposals:
-    """Make a proposal of every hit (see `kernels.triples.look_up`): it places two neighbours."""
+    """Make a proposal of every hit (see `kernels.triples.look_up_each`): it places two neighbours."""
     rows = np.arange(len(ids))
     partners = np.full((len(ids), n_slots), -1, np.int64)
     partners[rows, ids[:, 1]] = ids[:, 2]

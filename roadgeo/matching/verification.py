@@ -16,7 +16,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from roadgeo._arrays import FloatArray, IntArray
-from roadgeo.kernels.growth import count_matches, match_all
+from roadgeo.kernels.point_matching import count_matches, match_all
 from roadgeo.kernels.roads import backward_agreement, count_near_roads, forward_distances
 from roadgeo.matching.index import ReferenceIndex
 from roadgeo.matching.scene import Scene
@@ -115,18 +115,17 @@ def agreement(
     distance = np.empty(len(found))
     match_all(
         matrix, found.xy, scene.branches, 1.5 * tolerance, options.ray_cos, 0.0, 0.0, True,
-        index.xy, index.branches, index.point_starts, index.grid, index.shape, matched, distance,
+        index.point_buckets, matched, distance,
     )  # fmt: skip
     counted = np.ones(len(found), bool)
     counted[seeds] = False
     out = np.empty(len(scene.points))
     min_cos = math.cos(math.radians(options.max_turn_deg))
-    roads = (index.segments, index.segment_starts, index.segment_ids, index.grid, index.shape)
-    near = forward_distances(matrix, scene.points, scene.directions, tolerance, min_cos, 0.0, 0.0, *roads, out)
+    roads = index.road_buckets
+    near = forward_distances(matrix, scene.points, scene.directions, tolerance, min_cos, 0.0, 0.0, roads, out)
     seen, shown = backward_agreement(
         np.asarray(np.linalg.inv(matrix), float), _bounds(matrix, scene), options.backward_step_m, tolerance, 0.0, 0.0,
-        *roads,
-        scene.field, scene.field_scale, scene.observed,
+        roads, scene.field, scene.field_scale, scene.observed,
     )  # fmt: skip
     result = Agreement(
         int((matched[counted] >= 0).sum()), int(counted.sum()),
@@ -148,7 +147,7 @@ def chance_agreement(
     thin = max(1, len(scene.points) // options.n_null_points)
     points, directions = (np.ascontiguousarray(array[::thin]) for array in (scene.points, scene.directions))
     min_cos = math.cos(math.radians(options.max_turn_deg))
-    roads = (index.segments, index.segment_starts, index.segment_ids, index.grid, index.shape)
+    roads = index.road_buckets
     inverse, bounds = np.asarray(np.linalg.inv(matrix), float), _bounds(matrix, scene)
     k = np.arange(0, options.n_shifts, every)
     low, high = options.shift_m
@@ -159,16 +158,16 @@ def chance_agreement(
     counts = np.empty(len(k), np.int64)
     count_matches(
         matrix, found.xy, scene.branches, 1.5 * tolerance, options.ray_cos, shifts,
-        index.xy, index.branches, index.point_starts, index.grid, index.shape, counts,
+        index.point_buckets, counts,
     )  # fmt: skip
     rates[:, 0] = counts / max(len(found), 1)
-    count_near_roads(matrix, points, directions, tolerance, min_cos, shifts, *roads, counts)
+    count_near_roads(matrix, points, directions, tolerance, min_cos, shifts, roads, counts)
     rates[:, 1] = counts / max(len(points), 1)
     best = np.argsort(-rates[:, 1])[:12]
     for i in best:
         dx, dy = radius[i] * math.cos(angle[i]), radius[i] * math.sin(angle[i])
         seen, shown = backward_agreement(
-            inverse, bounds, 2 * options.backward_step_m, tolerance, dx, dy, *roads,
+            inverse, bounds, 2 * options.backward_step_m, tolerance, dx, dy, roads,
             scene.field, scene.field_scale, scene.observed,
         )  # fmt: skip
         rates[i, 2] = shown / max(seen, 1)

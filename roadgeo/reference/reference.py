@@ -11,7 +11,7 @@ from roadgeo._arrays import AnyArray
 from roadgeo._progress import Say, say_nothing
 from roadgeo.errors import IndexFormatError, RoadSourceError
 from roadgeo.geometry.projection import LocalPlane
-from roadgeo.kernels.triples import MAX_NEIGHBOURS
+from roadgeo.kernels.triple_codes import MAX_NEIGHBOURS
 from roadgeo.matching.index import IndexOptions, ReferenceIndex, build_index
 from roadgeo.roads.intersections import IntersectionOptions, find_intersections
 from roadgeo.roads.network import RoadNetwork

@@ -16,6 +16,7 @@ import numpy as np
 from roadgeo._arrays import AnyArray, BoolArray, FloatArray, Int32Array, IntArray
 from roadgeo.errors import RoadSourceError
 from roadgeo.kernels import simplification as kernels
+from roadgeo.kernels.parallel_roads import find_mates, fuse_twins, sample_edges, tie_runs
 from roadgeo.roads.graph import RoadGraph
 
 if TYPE_CHECKING:
@@ -305,7 +306,7 @@ def _fuse_parallels(graph: RoadGraph, options: SimplifyOptions) -> RoadGraph:
     if not ((ends[1:] == ends[:-1]).all(axis=1) & (ends[1:, 0] != ends[1:, 1])).any():
         return graph if tied is halved else tied
     turned = _turned(tied)
-    edges, coords, offsets = kernels.fuse_twins(
+    edges, coords, offsets = fuse_twins(
         turned.edges,
         turned.offsets,
         turned.coords,
@@ -318,14 +319,14 @@ def _fuse_parallels(graph: RoadGraph, options: SimplifyOptions) -> RoadGraph:
 
 
 def _find_ties(graph: RoadGraph, options: SimplifyOptions) -> FloatArray:
-    """Find where roads begin and cease to run side by side, or end at the side of another: see `kernels.tie_runs`."""
+    """Find where roads begin and cease to run side by side, or end at the side of another: see `tie_runs`."""
     lengths = _lengths(graph)
     count = np.ceil(lengths / (0.4 * options.fuse_distance)).astype(np.int64) + 1
     count = np.maximum(count, 2)
     starts = np.concatenate(([0], np.cumsum(count)))
     xy = np.empty((starts[-1], 2))
     direction = np.empty((starts[-1], 2))
-    kernels.sample_edges(graph.offsets, graph.coords, lengths, starts, xy, direction)
+    sample_edges(graph.offsets, graph.coords, lengths, starts, xy, direction)
     edge = np.repeat(np.arange(graph.n_edges, dtype=np.int32), count)
     # On a map of many cities these arrays are the largest: none is kept longer than it is needed.
     column = _cells(xy[:, 0], options.fuse_distance)
@@ -336,7 +337,7 @@ def _find_ties(graph: RoadGraph, options: SimplifyOptions) -> FloatArray:
     del column
     order = np.argsort(key, kind="stable")
     key = key[order]
-    mate, apart, touch = kernels.find_mates(
+    mate, apart, touch = find_mates(
         xy,
         direction,
         edge,
@@ -349,7 +350,7 @@ def _find_ties(graph: RoadGraph, options: SimplifyOptions) -> FloatArray:
         _PARALLEL_COS,
     )
     del xy, direction, order, key
-    runs = kernels.tie_runs(starts, lengths, edge, mate, apart, 0.7 * options.fuse_distance, options.merge_radius)
+    runs = tie_runs(starts, lengths, edge, mate, apart, 0.7 * options.fuse_distance, options.merge_radius)
     end = np.flatnonzero(touch >= 0)
     there = touch[end]
     share = (there - starts[edge[there]]) / (count[edge[there]] - 1)

@@ -5,7 +5,8 @@ import pytest
 from kernels.test_roads import binned
 from naive import kernels as naive
 
-from roadgeo.kernels.adjustment import add_row, adjust, point_row
+from roadgeo.kernels.adjustment import add_row, adjust, carry, point_row
+from roadgeo.kernels.structs import AdjustLimits, Held, Plane, PointPairs, RoadPoints
 
 P = np.array([0.9, -0.2, 0.05, 0.25, 1.1, -0.02, 0.12, -0.08])
 UNIT, ORIGIN = 400.0, np.array([350.0, 320.0])
@@ -71,7 +72,9 @@ class Town:
 
 def run(town, p, **changes):
     p, normal = p.copy(), np.empty((8, 8))
-    n, rms = adjust(p, UNIT, *ORIGIN, *town.arguments(**changes), *town.roads, normal)
+    values = town.arguments(**changes)
+    points, pairs, held, limits = RoadPoints(*values[:4]), PointPairs(*values[4:8]), Held(*values[8:11]), values[11:]
+    n, rms = adjust(p, Plane(UNIT, *ORIGIN), points, pairs, held, AdjustLimits(*limits), town.roads, normal)
     return p, n, rms, normal
 
 
@@ -87,6 +90,19 @@ def test_point_row_is_the_derivative(axis):
     assert (x, y) == pytest.approx(naive.predict(P, 0.3, -0.5))
     assert w == pytest.approx(1 + P[6] * 0.3 - P[7] * 0.5)
     assert np.allclose(row, axis @ naive.predict_rows(P, 0.3, -0.5), atol=1e-8)
+
+
+@pytest.mark.parametrize("uv", [(0.3, -0.5), (-0.6, 0.1)])
+def test_carry_maps_a_point_and_a_direction(uv):
+    x, y, w, dx, dy, length = carry(P, *uv, 0.6, -0.8)
+    assert (x, y) == pytest.approx(naive.predict(P, *uv))
+    ahead = naive.jacobian(np.append(P, 1.0).reshape(3, 3), np.array(uv)) @ (0.6, -0.8)
+    assert np.array([dx, dy]) / w == pytest.approx(ahead, abs=1e-6)
+    assert length == pytest.approx(np.hypot(dx, dy))
+
+
+def test_beyond_the_horizon_nothing_is_carried():
+    assert carry(P, -10.0, 10.0, 1.0, 0.0)[2] < 0.02
 
 
 def test_add_row_sums_normal_equations():

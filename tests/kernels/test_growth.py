@@ -6,17 +6,16 @@ from hypothesis import given
 from hypothesis import strategies as st
 from naive import kernels as naive
 
-from roadgeo.kernels.growth import (
+from roadgeo.kernels.growth import grow, grow_each
+from roadgeo.kernels.homography_fit import (
     cholesky,
     fit_homography,
-    grow,
-    keep_nearest,
-    match_all,
-    nearest_alike,
     predict,
     prediction_variance,
     solve_cholesky,
 )
+from roadgeo.kernels.point_matching import count_matches, keep_nearest, match_all, nearest_alike
+from roadgeo.kernels.structs import GrowthLimits, GrowthQuery, PointBuckets
 from roadgeo.matching.index import neighbour_grid, sort_by_bucket
 
 TOLERANCE = np.radians(25)
@@ -61,7 +60,7 @@ class World:
 
     @property
     def reference(self):
-        return self.ref_xy, self.ref_branches, self.starts, self.grid, self.shape
+        return PointBuckets(self.ref_xy, self.ref_branches, self.starts, self.grid, self.shape)
 
     def seeds(self, anchor, k=8, placed=3):
         """(order, neighbours, partners, affine) around an anchor whose nearest neighbours are placed right."""
@@ -151,7 +150,7 @@ class TestNearestAlike:
         rng = np.random.default_rng(3)
         for i, (x, y) in enumerate(rng.uniform(-100, 1600, (len(world.xy), 2))):
             J = rng.normal(0, 1, (2, 2))
-            found = nearest_alike(x, y, radius, world.branches, i, *world.reference, *J.ravel(), MIN_COS)
+            found = nearest_alike(x, y, radius, world.branches, i, world.reference, *J.ravel(), MIN_COS)
             near = {
                 naive.nearest_alike(x, y, radius, world.branches, i, world.ref_xy, world.ref_branches, J, TOLERANCE + e)
                 for e in (-0.02, 0.0, 0.02)
@@ -161,7 +160,7 @@ class TestNearestAlike:
 
     @pytest.mark.parametrize("place", [(np.nan, 0.0), (1e300, 100.0), (-1e300, -1e300), (700.0, np.inf)])
     def test_places_that_are_none(self, world, place):
-        found = nearest_alike(*place, 50.0, world.branches, 0, *world.reference, 1.0, 0.0, 0.0, 1.0, MIN_COS)
+        found = nearest_alike(*place, 50.0, world.branches, 0, world.reference, 1.0, 0.0, 0.0, 1.0, MIN_COS)
         assert found == (-1, 50.0)
 
 
@@ -187,7 +186,7 @@ class TestMatchAll:
         def run(one_to_one):
             matched, distance = np.empty(len(world.xy), np.int64), np.empty(len(world.xy))
             n = match_all(
-                TRUTH, world.xy, world.branches, 90.0, MIN_COS, *shift, one_to_one, *world.reference, matched, distance
+                TRUTH, world.xy, world.branches, 90.0, MIN_COS, *shift, one_to_one, world.reference, matched, distance
             )
             assert n == (matched >= 0).sum() > 0
             return matched, distance
@@ -205,13 +204,26 @@ class TestMatchAll:
 
     def test_the_true_homography_matches_the_true_points(self, world):
         matched, distance = np.empty(len(world.xy), np.int64), np.empty(len(world.xy))
-        match_all(TRUTH, world.xy, world.branches, 5.0, MIN_COS, 0.0, 0.0, True, *world.reference, matched, distance)
+        match_all(TRUTH, world.xy, world.branches, 5.0, MIN_COS, 0.0, 0.0, True, world.reference, matched, distance)
         assert np.array_equal(matched[world.truth >= 0], world.truth[world.truth >= 0])
         assert (distance[world.truth >= 0] < 3).all()
 
+    def test_counts_like_the_twin(self, world):
+        shifts = np.array([(0.0, 0.0), (60.0, -35.0), (-150.0, 90.0)])
+        counts = np.empty(3, np.int64)
+        count_matches(TRUTH, world.xy, world.branches, 90.0, MIN_COS, shifts, world.reference, counts)
+        seen = TRUTH, world.xy, world.branches, 90.0
+        few, many = (
+            naive.count_matches(*seen, t, shifts, world.ref_xy, world.ref_branches)
+            for t in (TOLERANCE - 0.02, TOLERANCE + 0.02)  # branches are compared to a degree
+        )
+        assert (np.array(few) <= counts).all()
+        assert (counts <= np.array(many)).all()
+        assert counts.min() > 0
+
     def test_no_query(self, world):
         nothing = np.empty((0, 2)), np.empty((0, 8, 2), np.int8), 5.0, MIN_COS, 0.0, 0.0, True
-        assert match_all(TRUTH, *nothing, *world.reference, np.empty(0, np.int64), np.empty(0)) == 0
+        assert match_all(TRUTH, *nothing, world.reference, np.empty(0, np.int64), np.empty(0)) == 0
 
 
 class TestGrow:
@@ -222,10 +234,10 @@ class TestGrow:
         order, neighbours, partners, affine = seeds
         matched, distance = np.empty(len(world.xy), np.int64), np.empty(len(world.xy))
         matrix = np.empty((3, 3))
-        result = grow(
-            world.xy, world.branches, order, 500.0, anchor, ref_anchor, affine, neighbours, partners,
-            *world.reference, *self.NUMBERS, MIN_COS, *self.RATES, matched, distance, matrix,
-        )  # fmt: skip
+        sigma_m, radius_m = self.NUMBERS
+        limits = GrowthLimits((sigma_m, 0.0), (radius_m, 0.0), MIN_COS, *self.RATES)
+        query = GrowthQuery(world.xy, world.branches, neighbours, order, 500.0, anchor)
+        result = grow(query, ref_anchor, affine, partners, world.reference, limits, matched, distance, matrix)
         return result, matched, distance, matrix
 
     @pytest.mark.parametrize("seed", range(6))
@@ -286,3 +298,24 @@ class TestGrow:
         alone = nothing.copy()
         alone[0] = 3
         assert self.run(world, anchor, 0, (order, neighbours, alone, affine))[0] == (0, 0, -np.inf)
+
+    def test_each_proposal_grows_as_it_does_alone(self, world):
+        anchor = int(np.flatnonzero(world.truth >= 0)[0])
+        order, neighbours, partners, affine = world.seeds(anchor)
+        references = np.array([world.truth[anchor], 3])
+        sigma_m, radius_m = self.NUMBERS
+        limits = GrowthLimits((sigma_m, 0.0), (radius_m, 0.0), MIN_COS, *self.RATES)
+        query = GrowthQuery(world.xy, world.branches, neighbours, order, 500.0, anchor)
+        matched, matrices = np.empty((2, len(world.xy)), np.int64), np.empty((2, 3, 3))
+        for least in (1, 10**6):
+            ratios = np.empty(2)
+            grow_each(
+                query, references, np.stack([affine] * 2), np.stack([partners] * 2), world.reference, limits, least,
+                matched, matrices, ratios,
+            )  # fmt: skip
+            for m, reference in enumerate(references):
+                (n, _, ratio), alone, _, matrix = self.run(world, anchor, reference, world.seeds(anchor))
+                assert ratios[m] == (ratio if n >= least else -np.inf)
+                assert np.array_equal(matched[m], alone)
+                assert ratio == -np.inf or np.array_equal(matrices[m], matrix)
+            assert (least == 1) == np.isfinite(ratios).any()

@@ -2,9 +2,10 @@
 
 import numpy as np
 import pytest
+from naive import kernels as naive
 from worlds.scenes import random_network
 
-from roadgeo.kernels.road_growth import RoadBuckets, Stages, fit_to_roads, grow_by_roads, share_on_roads
+from roadgeo.kernels.road_growth import Stages, fit_to_roads, grow_by_roads, share_on_roads
 from roadgeo.matching.index import build_index
 from roadgeo.matching.scene import sample_roads
 
@@ -19,7 +20,7 @@ NO_HOLDS = np.zeros(8)
 def roads():
     network = random_network(3, 2000.0)
     index = build_index(network)
-    return network, RoadBuckets(index.segments, index.segment_starts, index.segment_ids, index.grid, index.shape)
+    return network, index.road_buckets
 
 
 def truth(turn_deg=25.0, tilt=(0.06, -0.04)):
@@ -87,6 +88,28 @@ def test_a_step_from_the_truth_goes_nowhere(roads):
     before = p.copy()
     assert fit_to_roads(p, UNIT, ORIGIN, points, along, 10.0, MIN_COS, NO_HOLDS, buckets)
     assert corner_gap(p, before) < 0.5
+
+
+@pytest.mark.parametrize("holds", [NO_HOLDS, np.array([0.0, 0.5, 0, 0, 0, 2.0, 1e9, 1e9])])
+def test_a_step_like_the_twin(roads, holds):
+    network, buckets = roads
+    points, along = (array[::25] for array in seen(network, truth()))
+    start = truth() + np.random.default_rng(1).normal(0, 0.004, 8)
+    p = start.copy()
+    assert fit_to_roads(p, UNIT, ORIGIN, points, along, 20.0, MIN_COS, holds, buckets)
+    expected = naive.fit_to_roads(start, UNIT, ORIGIN, points, along, 20.0, MIN_COS, holds, buckets.segments)
+    assert corner_gap(p, start) > 1
+    assert np.allclose(p, expected, atol=1e-5)
+
+
+def test_share_like_the_twin(roads):
+    network, buckets = roads
+    points, along = (array[::10] for array in seen(network, truth(), false=0.3))
+    for radius in (4.0, 15.0):
+        arguments = truth(), UNIT, ORIGIN, points, along, radius, MIN_COS
+        share = share_on_roads(*arguments, buckets)
+        assert share == pytest.approx(naive.share_on_roads(*arguments, buckets.segments))
+        assert 0 < share < 1
 
 
 def test_a_held_parameter_stays(roads):

@@ -4,14 +4,22 @@ import numpy as np
 import pytest
 from naive import kernels as naive
 
-from roadgeo.kernels.roads import backward_agreement, bin_segments, forward_distances, nearest_road, screen
+from roadgeo.kernels.roads import (
+    backward_agreement,
+    bin_segments,
+    count_near_roads,
+    forward_distances,
+    nearest_road,
+    screen,
+)
+from roadgeo.kernels.structs import RoadBuckets
 
 GRID, SHAPE = (-50.0, 20.0, 100.0), (8, 6)
 MIN_COS = np.cos(np.radians(25))
 
 
 def binned(segments, grid=GRID, shape=SHAPE):
-    """(segments, starts, ids, grid, shape) as the kernels take them."""
+    """Segments in buckets, as the kernels take them."""
     segments = np.asarray(segments, np.float32).reshape(-1, 4)
     counts = np.zeros(shape[0] * shape[1] + 1, np.int64)
     total = bin_segments(segments, grid, shape, counts, np.empty(0, np.int32))
@@ -21,7 +29,7 @@ def binned(segments, grid=GRID, shape=SHAPE):
     assert bin_segments(segments, grid, shape, free, ids) == total
     if total:
         assert np.array_equal(free[:-1], starts[1:])
-    return segments, starts.astype(np.int32), ids, grid, shape
+    return RoadBuckets(segments, starts.astype(np.int32), ids, grid, shape)
 
 
 def town(seed=0, n=120, longest=150.0):
@@ -67,7 +75,7 @@ class TestNearestRoad:
         roads = town(1)
         rng = np.random.default_rng(2)
         for (x, y), (dx, dy) in zip(rng.uniform(-100, 800, (120, 2)), directions(rng, 120), strict=True):
-            d, *rest = nearest_road(x, y, dx, dy, radius, min_cos, *roads)
+            d, *rest = nearest_road(x, y, dx, dy, radius, min_cos, roads)
             distance, foot, direction = naive.nearest_road(x, y, dx, dy, radius, min_cos, roads[0])
             if not (roads[3][0] < x < 750 and roads[3][1] < y < 620):
                 continue  # outside the grid only its rim is known
@@ -76,12 +84,12 @@ class TestNearestRoad:
                 assert rest == pytest.approx([*foot, *direction], abs=2e-3)
 
     def test_no_roads_and_roads_of_no_length(self):
-        assert nearest_road(0.0, 0.0, 1.0, 0.0, 50.0, 0.0, *binned(np.empty((0, 4))))[0] == np.inf
-        assert nearest_road(100.0, 100.0, 1.0, 0.0, 50.0, 0.0, *binned([[100, 100, 100, 100]]))[0] == np.inf
+        assert nearest_road(0.0, 0.0, 1.0, 0.0, 50.0, 0.0, binned(np.empty((0, 4))))[0] == np.inf
+        assert nearest_road(100.0, 100.0, 1.0, 0.0, 50.0, 0.0, binned([[100, 100, 100, 100]]))[0] == np.inf
 
     @pytest.mark.parametrize("place", [(np.nan, 0.0), (1e300, 0.0), (-1e300, 1e300), (np.inf, 100.0)])
     def test_places_that_are_none(self, place):
-        assert nearest_road(*place, 1.0, 0.0, 50.0, 0.0, *town())[0] == np.inf
+        assert nearest_road(*place, 1.0, 0.0, 50.0, 0.0, town())[0] == np.inf
 
 
 TILTED = np.array([[0.9, -0.3, 260.0], [0.25, 1.1, 420.0], [2e-4, -3e-4, 1.0]])
@@ -94,7 +102,7 @@ class TestForwardDistances:
         rng = np.random.default_rng(4)
         points, along = rng.uniform((0, -250), (250, 0), (60, 2)), directions(rng, 60)
         out = np.empty(60)
-        n = forward_distances(TILTED, points, along, 30.0, MIN_COS, *shift, *roads, out)
+        n = forward_distances(TILTED, points, along, 30.0, MIN_COS, *shift, roads, out)
         expected = naive.forward_distances(TILTED, points, along, 30.0, MIN_COS, shift, roads[0])
         assert np.isfinite(expected).any()
         assert np.allclose(out, expected, atol=2e-3)
@@ -105,13 +113,26 @@ class TestForwardDistances:
         horizon = np.array([[1.0, 0, 300], [0, 1.0, 300], [0, -0.1, 1.0]])
         out = np.empty(2)
         points = np.array([[0.0, 20.0], [0.0, 10.0]])  # w = -1, 0
-        assert forward_distances(horizon, points, np.array([[1.0, 0], [0, 1]]), 1e3, 0.0, 0.0, 0.0, *roads, out) == 0
+        assert forward_distances(horizon, points, np.array([[1.0, 0], [0, 1]]), 1e3, 0.0, 0.0, 0.0, roads, out) == 0
         assert np.isinf(out).all()
 
     def test_no_points(self):
         assert (
-            forward_distances(TILTED, np.empty((0, 2)), np.empty((0, 2)), 9.0, 0.5, 0.0, 0.0, *town(), np.empty(0)) == 0
+            forward_distances(TILTED, np.empty((0, 2)), np.empty((0, 2)), 9.0, 0.5, 0.0, 0.0, town(), np.empty(0)) == 0
         )
+
+
+class TestCountNearRoads:
+    def test_like_the_twin(self):
+        roads = town(3)
+        rng = np.random.default_rng(4)
+        points, along = rng.uniform((0, -250), (250, 0), (40, 2)), directions(rng, 40)
+        shifts = np.array([(0.0, 0.0), (31.0, -17.0), (-200.0, 60.0)])
+        counts = np.empty(3, np.int64)
+        count_near_roads(TILTED, points, along, 30.0, MIN_COS, shifts, roads, counts)
+        expected = naive.count_near_roads(TILTED, points, along, 30.0, MIN_COS, shifts, roads.segments)
+        assert counts.tolist() == expected
+        assert min(expected) > 0
 
 
 class TestBackwardAgreement:
@@ -127,7 +148,7 @@ class TestBackwardAgreement:
         corners = np.array([[0, 0, 1], [300, 0, 1], [300, -250, 1], [0, -250, 1]]) @ TILTED.T
         corners = corners[:, :2] / corners[:, 2:]
         bounds = np.concatenate([corners.min(axis=0), corners.max(axis=0)])
-        found = backward_agreement(inverse, bounds, 4.0, 6.0, *shift, *roads, field, scale, observed)
+        found = backward_agreement(inverse, bounds, 4.0, 6.0, *shift, roads, field, scale, observed)
 
         def inside(x, y):
             return GRID[0] <= x < GRID[0] + 800 and GRID[1] <= y < GRID[1] + 600
@@ -141,14 +162,14 @@ class TestBackwardAgreement:
         blind = np.zeros((10, 10), bool)
         everywhere = np.array([-1e4, -1e4, 1e4, 1e4])
         move = np.array([[1.0, 0, -100], [0, 1, -400], [0, 0, 1]])
-        assert backward_agreement(move, everywhere, 1.0, 5.0, 0.0, 0.0, *town(), field, 20.0, blind) == (0, 0)
+        assert backward_agreement(move, everywhere, 1.0, 5.0, 0.0, 0.0, town(), field, 20.0, blind) == (0, 0)
 
     @pytest.mark.parametrize("w", [0.0, 1e-300, np.nan])
     def test_pixels_at_infinity_are_outside(self, w):
         inverse = np.array([[1.0, 0, 0], [0, -1.0, 0], [0, 0, w]])
         field, observed = np.zeros((10, 10), np.float32), np.ones((10, 10), bool)
         bounds = np.array([-1e4, -1e4, 1e4, 1e4])
-        assert backward_agreement(inverse, bounds, 1.0, 5.0, 0.0, 0.0, *town(), field, 20.0, observed) == (0, 0)
+        assert backward_agreement(inverse, bounds, 1.0, 5.0, 0.0, 0.0, town(), field, 20.0, observed) == (0, 0)
 
 
 class TestScreen:
@@ -164,7 +185,7 @@ class TestScreen:
         affines += rng.normal(0, 0.05, affines.shape)
         shares = np.full(n, np.nan)
         anchor = np.array([40.0, -30.0])
-        screen(references, affines, anchor, ref_xy, points, along, 8.0, 4.0, MIN_COS, least, *roads, shares)
+        screen(references, affines, anchor, ref_xy, points, along, 8.0, 4.0, MIN_COS, least, roads, shares)
         expected = naive.screen(references, affines, anchor, ref_xy, points, along, 8.0, 4.0, MIN_COS, least, roads[0])
         return shares, expected
 

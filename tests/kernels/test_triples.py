@@ -12,7 +12,8 @@ from kernels.test_growth import branches_of
 from naive import kernels as naive
 
 from roadgeo.kernels.buckets import nearest_neighbours
-from roadgeo.kernels.triples import (
+from roadgeo.kernels.structs import Hits, TripleLimits, TripleMap, TripleQuery
+from roadgeo.kernels.triple_codes import (
     BACKWARDS,
     BOTH,
     CELL_UNITS,
@@ -21,18 +22,15 @@ from roadgeo.kernels.triples import (
     PAIRS,
     TABLE,
     UNITS,
-    count_alike,
     fill_table,
     find_sides,
-    gather,
     has_both,
-    look_up,
     orient,
     pair_id,
     vertex_angle,
     vertex_codes,
-    vertex_probes,
 )
+from roadgeo.kernels.triples import count_alike, gather, look_up_each, vertex_probes
 
 MIN_SHAPE = 0.08
 MIN_COS = np.cos(np.radians(25))
@@ -270,53 +268,49 @@ class TestCountAlike:
 class TestLookUp:
     SCALE, MIN_RATIO = (0.2, 5.0), 0.3
 
-    def run(self, world, query, a, s, t, tolerance, room=5000):
-        ids, affine = np.empty((room, 5), np.int64), np.empty((room, 4))
-        n, compared = look_up(
-            query.xy, query.branches, query.tangents, query.sides, a, s, t, query.neighbours, 3, tolerance, MIN_COS,
-            world.xy, world.branches, world.neighbours, world.starts, world.entries, self.SCALE, self.MIN_RATIO,
-            ids, affine, 0,
+    def run(self, world, query, a, slots, tolerance, room=5000, most=10**9):
+        hits = Hits(np.empty((room, 5), np.int64), np.empty((room, 4)))
+        n, compared = look_up_each(
+            TripleQuery(query.xy, query.branches, query.tangents, query.sides, query.neighbours),
+            a, np.array(slots), most,
+            TripleMap(world.xy, world.branches, world.neighbours, world.starts, world.entries),
+            TripleLimits(3, tolerance, MIN_COS, self.SCALE, self.MIN_RATIO), hits,
         )  # fmt: skip
-        return ids[:n], affine[:n], compared
+        return hits.ids[:n], hits.affine[:n], compared
 
     @pytest.mark.parametrize("tolerance", [1, 5])
     def test_like_the_twin(self, world, tolerance):
         query = seen_through(world, np.array([[1.2, -0.4], [0.3, 0.9]]), noise=0.05)
-        table = list(world.decoded())
-        found, expected = set(), set()
-        for a, (s, t) in ((a, slots) for a in range(0, 60, 4) for slots in combinations(range(4), 2)):
-            b, c = query.neighbours[a, s], query.neighbours[a, t]
-            shape = naive.shape_of(query.xy, a, b, c)
-            if abs(shape) < MIN_SHAPE:
-                continue
-            b, c = (b, c) if shape > 0 else (c, b)
-            ids, _, compared = self.run(world, query, a, s, t, tolerance)
-            found.update((a, b, c, *hit) for hit in ids[:, [0, 2, 4]].tolist())
-            edges = np.stack([query.xy[b] - query.xy[a], query.xy[c] - query.xy[a]], axis=1)
-            codes = (
-                naive.vertex_codes(query.xy, query.tangents, query.branches, *v, 3)
-                for v in [(a, b, c), (b, c, a), (c, a, b)]
+        n = 0
+        for a in range(0, 60, 4):
+            around = [query.neighbours[a, slot] for slot in range(4)]
+            slots = [
+                (s, t)
+                for s, t in combinations(range(4), 2)
+                if abs(naive.shape_of(query.xy, a, around[s], around[t])) >= MIN_SHAPE
+            ]
+            ids, _, compared = self.run(world, query, a, slots, tolerance)
+            found = {(around[s], around[t], *hit) for s, t, *hit in ids[:, [1, 3, 0, 2, 4]].tolist()}
+            expected = naive.look_up_each(
+                query, a, slots, world, 3, tolerance, np.radians(25), self.SCALE, self.MIN_RATIO
             )
-            hits = [hit for code in product(*codes) for hit in naive.look_up(code, table, tolerance)]
-            assert compared >= len(hits)
-            for x, y, z in hits:
-                J = np.stack([world.xy[y] - world.xy[x], world.xy[z] - world.xy[x]], axis=1) @ np.linalg.inv(edges)
-                big, small = np.linalg.svd(J, compute_uv=False)
-                scale = np.sqrt(np.linalg.det(J))
-                if not self.SCALE[0] <= scale <= self.SCALE[1] or small / big < self.MIN_RATIO:
-                    continue
-                pairs = zip((a, b, c), (x, y, z), strict=True)
-                if all(naive.rays_agree(query.branches, i, world.branches, j, J, np.radians(25)) for i, j in pairs):
-                    expected.add((a, b, c, x, y, z))
-        assert len(expected) > 10
-        assert found == expected  # a hit may be reported more than once
+            assert found == expected  # a hit may be reported more than once
+            assert compared >= len(ids)
+            n += len(expected)
+        assert n > 10
+
+    def test_enough_is_enough(self, world):
+        slots = list(combinations(range(4), 2))
+        _, _, compared = self.run(world, world, 8, slots, 5)
+        for most in (0, compared // 2):
+            assert most < self.run(world, world, 8, slots, 5, most=most)[2] <= compared
 
     def test_every_triple_finds_itself_through_its_affine_map(self, world):
         A = np.array([[1.2, -0.4], [0.3, 0.9]])
         query = seen_through(world, A)
         n_found = 0
         for a, s, t in {(a, *sorted(slots)) for a, *slots in self.slots(world)}:
-            ids, affine, _ = self.run(world, query, a, s, t, 2)
+            ids, affine, _ = self.run(world, query, a, [(s, t)], 2)
             b, c = world.neighbours[a, s], world.neighbours[a, t]
             hits = [row for row, hit in enumerate(ids[:, [0, 2, 4]].tolist()) if hit in ([a, b, c], [a, c, b])]
             assert hits
@@ -332,9 +326,9 @@ class TestLookUp:
 
     def test_stops_where_the_room_ends(self, world):
         a, s, t = next(self.slots(world))
-        everything = self.run(world, world, a, *sorted((s, t)), 5)[0]
+        everything = self.run(world, world, a, [sorted((s, t))], 5)[0]
         assert len(everything) >= 1
-        assert len(self.run(world, world, a, *sorted((s, t)), 5, room=0)[0]) == 0
+        assert len(self.run(world, world, a, [sorted((s, t))], 5, room=0)[0]) == 0
 
     def test_believes_no_entry(self, world):
         damaged = World()
@@ -343,7 +337,7 @@ class TestLookUp:
             0, 2**40, len(damaged.entries), dtype=np.uint64
         ) << np.uint64(24)
         for a, s, t in self.slots(world):
-            ids, *_ = self.run(damaged, world, a, *sorted((s, t)), 5)
+            ids, *_ = self.run(damaged, world, a, [sorted((s, t))], 5)
             assert ((ids[:, [0, 2, 4]] >= 0) & (ids[:, [0, 2, 4]] < 60)).all()
 
 
@@ -376,6 +370,19 @@ class TestGather:
     )
     def test_hits_that_do_not(self, hits, affines):
         assert len(self.run(hits, affines)[0]) == 0
+
+    @pytest.mark.parametrize("seed", range(4))
+    def test_like_the_twin(self, seed):
+        rng = np.random.default_rng(seed)
+        slots = np.sort([rng.choice(5, 2, replace=False) for _ in range(80)], axis=1)
+        hits = np.c_[rng.integers(0, 6, 80), slots[:, 0], rng.integers(0, 3, 80), slots[:, 1], rng.integers(0, 3, 80)]
+        affines = np.array([1.0, 0, 0, 1]) + rng.normal(0, 0.2, (80, 4))
+        ids, affine, placed = self.run(hits, affines, 5)
+        expected = naive.gather(hits, affines, 5, 0.3)
+        assert len(expected) > 2
+        assert ids.tolist() == [[a, *places] for a, places, *_ in expected]
+        assert placed.tolist() == [n for _, _, n, _ in expected]
+        assert np.allclose(affine, [mean for *_, mean in expected])
 
     def test_every_map_intersection_proposes_once(self):
         hits = [(a, s, 10 * a + s, s + 1, 10 * a + s + 1) for a in (3, 5, 4) for s in range(3)]

@@ -12,7 +12,7 @@ from naive import kernels as naive
 from worlds.scenes import PLANE
 
 from roadgeo.errors import IndexFormatError, RoadSourceError
-from roadgeo.kernels.triples import TABLE
+from roadgeo.kernels.triple_codes import TABLE
 from roadgeo.matching.index import (
     IndexOptions,
     ReferenceIndex,

@@ -4,7 +4,7 @@ from itertools import combinations, permutations, product
 
 import numpy as np
 
-from roadgeo.kernels.triples import UNITS
+from roadgeo.kernels.triple_codes import UNITS
 
 # buckets
 
@@ -93,6 +93,11 @@ def forward_distances(matrix, points, directions, radius, min_cos, shift, segmen
         along = jacobian(matrix, point) @ direction
         found[i] = nearest_road(*(place + shift), *(along / np.hypot(*along)), radius, min_cos, segments)[0]
     return found
+
+
+def count_near_roads(matrix, points, directions, radius, min_cos, shifts, segments):
+    found = (forward_distances(matrix, points, directions, radius, min_cos, shift, segments) for shift in shifts)
+    return [np.isfinite(distances).sum() for distances in found]
 
 
 def backward_agreement(inverse, step, tolerance_m, shift, segments, inside, field, field_scale, observed):
@@ -199,6 +204,11 @@ def match_all(matrix, xy, branches, radius, tolerance, shift, one_to_one, ref_xy
     return keep_nearest(matched, distance) if one_to_one else matched, distance
 
 
+def count_matches(matrix, xy, branches, radius, tolerance, shifts, ref_xy, ref_branches):
+    found = (match_all(matrix, xy, branches, radius, tolerance, shift, False, ref_xy, ref_branches) for shift in shifts)
+    return [(matched >= 0).sum() for matched, _ in found]
+
+
 def grow(
     xy, branches, order, half_size, anchor, ref_anchor, affine, neighbours, partners, ref_xy, ref_branches,
     sigma_m, radius_m, tolerance, perspective_sigma, hit_rate, chance_rate, patience,
@@ -272,6 +282,41 @@ def grow(
     to_ground = np.array([[unit, 0, ref_xy[ref_anchor, 0]], [0, unit, ref_xy[ref_anchor, 1]], [0, 0, 1]])
     matrix = to_ground @ np.append(p, 1.0).reshape(3, 3) @ np.vstack([to_query, [0, 0, 1]])
     return ratio, hits, len(others), matched, matrix
+
+
+# growth by roads
+
+
+def nearest_in_plane(p, unit, origin, point, direction, radius, min_cos, segments):
+    """(place, foot, direction) of the road nearest to a mapped road point, or None."""
+    place = origin + unit * predict(p, *point)
+    along = jacobian(np.append(p, 1.0).reshape(3, 3), point) @ direction
+    distance, foot, road = nearest_road(*place, *(along / np.hypot(*along)), radius, min_cos, segments)
+    return (place, foot, road) if distance < np.inf else None
+
+
+def fit_to_roads(p, unit, origin, points, directions, radius, min_cos, holds, segments):
+    """The parameters after one Gauss-Newton step, with Cauchy weights of half the radius."""
+    rows, weights, residuals = [], [], []
+    for point, direction in zip(points, directions, strict=True):
+        found = nearest_in_plane(p, unit, origin, point, direction, radius, min_cos, segments)
+        if found is not None:
+            place, foot, road = found
+            across = np.array([-road[1], road[0]])
+            away = across @ (foot - place)
+            rows.append(across @ predict_rows(p, *point))
+            weights.append(1.0 / (1.0 + (2.0 * away / radius) ** 2))
+            residuals.append(away / unit)
+    A, W = np.array(rows), np.array(weights)
+    return p + np.linalg.solve(A.T @ (W[:, None] * A) + np.diag(holds), A.T @ (W * residuals))
+
+
+def share_on_roads(p, unit, origin, points, directions, radius, min_cos, segments):
+    met = [
+        nearest_in_plane(p, unit, origin, *pair, radius, min_cos, segments) is not None
+        for pair in zip(points, directions, strict=True)
+    ]
+    return np.mean(met)
 
 
 # adjustment
@@ -423,3 +468,46 @@ def look_up(code, table, tolerance):
             if all(alike(u, v, tolerance) for u, v in zip(code, turned, strict=True)):
                 hits.append(tuple(corners[(v + turn) % 3] for v in range(3)))
     return hits
+
+
+def look_up_each(query, a, slots, world, limit, tolerance, ray_tolerance, scale, min_ratio):
+    """All (b, c, A, B, C), b and c counterclockwise after a, of one anchor's triples, through the gates."""
+    table, found = list(world.decoded()), set()
+    for s, t in slots:
+        b, c = query.neighbours[a, s], query.neighbours[a, t]
+        b, c = (b, c) if shape_of(query.xy, a, b, c) > 0 else (c, b)
+        edges = np.stack([query.xy[b] - query.xy[a], query.xy[c] - query.xy[a]], axis=1)
+        vertices = [(a, b, c), (b, c, a), (c, a, b)]
+        codes = (vertex_codes(query.xy, query.tangents, query.branches, *v, limit) for v in vertices)
+        for x, y, z in (hit for code in product(*codes) for hit in look_up(code, table, tolerance)):
+            J = np.stack([world.xy[y] - world.xy[x], world.xy[z] - world.xy[x]], axis=1) @ np.linalg.inv(edges)
+            big, small = np.linalg.svd(J, compute_uv=False)
+            if not scale[0] <= np.sqrt(np.linalg.det(J)) <= scale[1] or small / big < min_ratio:
+                continue
+            pairs = zip((a, b, c), (x, y, z), strict=True)
+            if all(rays_agree(query.branches, i, world.branches, j, J, ray_tolerance) for i, j in pairs):
+                found.add((b, c, x, y, z))
+    return found
+
+
+def gather(ids, affine, n_slots, tolerance):
+    """(A, partners, number placed, mean map) of each map intersection on which hits of several triples agree."""
+    out = []
+    for a in sorted(set(ids[:, 0].tolist())):
+        group = np.flatnonzero(ids[:, 0] == a)
+        best = None
+        for u in group:
+            limit = tolerance * np.sqrt(2.0 * np.linalg.det(affine[u].reshape(2, 2)))
+            partner = {int(ids[u, 1]): int(ids[u, 2]), int(ids[u, 3]): int(ids[u, 4])}
+            together = []
+            for v in group:
+                placed = {int(ids[v, 1]): int(ids[v, 2]), int(ids[v, 3]): int(ids[v, 4])}
+                alike = np.linalg.norm(affine[v] - affine[u]) <= limit
+                if alike and all(partner.get(slot, place) == place for slot, place in placed.items()):
+                    partner.update(placed)
+                    together.append(v)
+            if len(partner) > (2 if best is None else best[2]):
+                places = [partner.get(slot, -1) for slot in range(n_slots)]
+                best = a, places, len(partner), affine[together].mean(axis=0)
+        out += [] if best is None else [best]
+    return out

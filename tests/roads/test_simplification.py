@@ -7,6 +7,7 @@ from naive import simplification as naive
 from shapely.geometry import LineString, MultiLineString
 
 from roadgeo.errors import RoadSourceError
+from roadgeo.kernels import parallel_roads
 from roadgeo.kernels import simplification as kernels
 from roadgeo.roads.graph import RoadGraph
 from roadgeo.roads.simplification import SimplifyOptions, _keep_edges, _walk_faces, coverage, planarize, simplify
@@ -298,7 +299,7 @@ def test_twins_are_fused_as_by_the_twin(graph, distance):
     lines = [line[::-1] if turned else line for line, turned in zip(graph.polylines(), back, strict=True)]
     graph = RoadGraph.from_polylines(graph.xy, np.sort(graph.edges, axis=1), lines)
     by_ends = np.lexsort((graph.edges[:, 1], graph.edges[:, 0]))
-    edges, coords, offsets = kernels.fuse_twins(
+    edges, coords, offsets = parallel_roads.fuse_twins(
         graph.edges, graph.offsets, graph.coords, graph.edge_lengths(), by_ends, distance, 3.0
     )
     fused = RoadGraph(graph.xy, edges, coords, offsets)
@@ -327,7 +328,7 @@ def test_mates_and_touches_agree_with_their_twin(graph, distance):
     count = np.ceil(lengths / 6.0).astype(int) + 2
     starts = np.concatenate(([0], np.cumsum(count)))
     xy, direction = np.empty((2, starts[-1], 2))
-    kernels.sample_edges(graph.offsets, graph.coords, lengths, starts, xy, direction)
+    parallel_roads.sample_edges(graph.offsets, graph.coords, lengths, starts, xy, direction)
     for e, line in enumerate(graph.polylines()):
         shares = np.linspace(0, 1, count[e])
         expected = [LineString(line).interpolate(s, normalized=True).coords[0] for s in shares]
@@ -339,7 +340,7 @@ def test_mates_and_touches_agree_with_their_twin(graph, distance):
     columns = int(cell[:, 0].max()) + 2
     key = cell[:, 1] * columns + cell[:, 0]
     order = np.argsort(key, kind="stable")
-    mate, apart, touch = kernels.find_mates(
+    mate, apart, touch = parallel_roads.find_mates(
         xy, direction, edge, graph.edges, starts, order, key[order], columns, distance, 0.9
     )
     ends = np.stack((starts[:-1], starts[1:] - 1), axis=1).ravel()
@@ -359,7 +360,7 @@ def test_runs_are_tied_at_their_ends(mates, least):
     edge = np.repeat(np.arange(3), n)
     mate = np.full(3 * n, -1)
     mate[:n] = [-1 if m is None else m * n + k for k, m in enumerate(mates)]
-    ties = kernels.tie_runs(starts, lengths, edge, mate, np.full(3 * n, 5.0), 7.0, least)
+    ties = parallel_roads.tie_runs(starts, lengths, edge, mate, np.full(3 * n, 5.0), 7.0, least)
     expected = [
         [0, 10.0 * k, mates[k], 10.0 * k]
         for first, last in naive.runs(mates)
@@ -374,7 +375,7 @@ def test_a_run_ends_where_a_gap_opens():
     apart = np.array([5.0, 5.0, 5.0, 6.0, 8.0, 9.5, 10.0])
     mate = np.array([7, 8, 9, 10, 11, 12, -1] + [-1] * 7)
     edge = np.repeat([0, 1], 7)
-    ties = kernels.tie_runs(
+    ties = parallel_roads.tie_runs(
         np.array([0, 7, 14]), np.full(2, 60.0), edge, mate, np.concatenate((apart, apart)), 7.0, 10.0
     )
     assert ties.tolist() == [[0, 0, 1, 0], [0, 30, 1, 30]]

@@ -1,0 +1,174 @@
+"""Intersections of the query matched to the nearest ones of the map whose branches agree."""
+
+import math
+
+import numpy as np
+from numpy.typing import NDArray
+
+from roadgeo.kernels.arrays import Floats1, Floats2, Int8s3, Ints1
+from roadgeo.kernels.compilation import kernel
+from roadgeo.kernels.rays import rays_agree
+from roadgeo.kernels.structs import PointBuckets
+
+__all__ = ["count_matches", "keep_nearest", "match_all", "nearest_alike"]
+
+
+@kernel()
+def nearest_alike(
+    x: float,
+    y: float,
+    radius: float,
+    branches: NDArray[np.int8],
+    i: int,
+    points: PointBuckets,
+    j00: float,
+    j01: float,
+    j10: float,
+    j11: float,
+    min_cos: float,
+) -> tuple[int, float]:
+    """Return the number and distance of the nearest intersection of the map with agreeing branches, or (-1, `radius`).
+
+    Parameters
+    ----------
+    x, y, radius : float
+        Metres on the reference plane; intersections nearer than this count.
+    branches, i, j00, j01, j10, j11, min_cos
+        As in `rays_agree`.
+    points : PointBuckets
+        The map's intersections.
+    """
+    best, where = radius, -1
+    if not abs(x) + abs(y) < 1e15:  # infinite or NaN: no bucket has such a number
+        return where, best
+    c0 = max(int(np.floor((x - radius - points.grid[0]) / points.grid[2])), 0)
+    c1 = min(int(np.floor((x + radius - points.grid[0]) / points.grid[2])), points.shape[0] - 1)
+    r0 = max(int(np.floor((y - radius - points.grid[1]) / points.grid[2])), 0)
+    r1 = min(int(np.floor((y + radius - points.grid[1]) / points.grid[2])), points.shape[1] - 1)
+    if c1 < c0:
+        return where, best
+    for r in range(r0, r1 + 1):
+        for j in range(points.starts[r * points.shape[0] + c0], points.starts[r * points.shape[0] + c1 + 1]):
+            dx, dy = points.xy[j, 0] - x, points.xy[j, 1] - y
+            d = math.sqrt(dx * dx + dy * dy)
+            if d < best and rays_agree(branches, i, points.branches, j, j00, j01, j10, j11, min_cos):
+                best, where = d, j
+    return where, best
+
+
+@kernel()
+def keep_nearest(matched: NDArray[np.int64], distance: NDArray[np.float64]) -> int:
+    """Let the nearest of several claimants keep a partner, the first of equals; return the number of matches left.
+
+    Parameters
+    ----------
+    matched : (N,) int64
+        Partners or -1; the losers' are set to -1.
+    distance : (N,) float64
+        Of each to its partner.
+    """
+    n = matched.shape[0]
+    size = 4
+    while size < 2 * n:
+        size *= 2
+    keeper = np.full(size, -1, np.int64)  # a hash table by partner, probed linearly
+    count = 0
+    for i in range(n):
+        if matched[i] < 0:
+            continue
+        slot = (matched[i] * 40503) & (size - 1)
+        while keeper[slot] >= 0 and matched[keeper[slot]] != matched[i]:
+            slot = (slot + 1) & (size - 1)
+        k = keeper[slot]
+        if k < 0:
+            keeper[slot] = i
+            count += 1
+        elif distance[i] < distance[k]:
+            keeper[slot] = i
+            matched[k] = -1
+        else:
+            matched[i] = -1
+    return count
+
+
+@kernel()
+def match_all(
+    matrix: Floats2,
+    xy: Floats2,
+    branches: Int8s3,
+    radius: float,
+    min_cos: float,
+    shift_x: float,
+    shift_y: float,
+    one_to_one: bool,
+    points: PointBuckets,
+    matched: Ints1,
+    distance: Floats1,
+) -> int:
+    """Match every intersection of the query to the nearest one of the map with agreeing branches.
+
+    Parameters
+    ----------
+    matrix : (3, 3) float64
+        Query plane to reference plane; the shift, in metres, is added.
+    xy : (N, 2) float64, branches : (N, R, 2) int8
+        The query's intersections.
+    radius : float
+        Metres.
+    min_cos : float
+        As in `rays_agree`.
+    one_to_one : bool
+        Whether only the nearest of several claimants keeps an intersection.
+    points : PointBuckets
+        The map's intersections.
+    matched : (N,) int64
+        Filled with map intersections or -1.
+    distance : (N,) float64
+        Filled with metres, `radius` where there is none.
+
+    Returns
+    -------
+    int
+        Number of matches.
+    """
+    n = xy.shape[0]
+    count = 0
+    for i in range(n):
+        matched[i] = -1
+        distance[i] = radius
+        u, v = xy[i, 0], xy[i, 1]
+        w = matrix[2, 0] * u + matrix[2, 1] * v + matrix[2, 2]
+        if w <= 0.0:
+            continue
+        x = (matrix[0, 0] * u + matrix[0, 1] * v + matrix[0, 2]) / w
+        y = (matrix[1, 0] * u + matrix[1, 1] * v + matrix[1, 2]) / w
+        matched[i], distance[i] = nearest_alike(
+            x + shift_x, y + shift_y, radius, branches, i, points,
+            (matrix[0, 0] - x * matrix[2, 0]) / w, (matrix[0, 1] - x * matrix[2, 1]) / w,
+            (matrix[1, 0] - y * matrix[2, 0]) / w, (matrix[1, 1] - y * matrix[2, 1]) / w,
+            min_cos,
+        )  # fmt: skip
+        if matched[i] >= 0:
+            count += 1
+    return keep_nearest(matched, distance) if one_to_one else count
+
+
+@kernel()
+def count_matches(
+    matrix: Floats2,
+    xy: Floats2,
+    branches: Int8s3,
+    radius: float,
+    min_cos: float,
+    shifts: Floats2,
+    points: PointBuckets,
+    counts: Ints1,
+) -> None:
+    """Fill `counts` (M,) with the number of matches under each of `shifts` (M, 2), metres (see `match_all`)."""
+    matched = np.empty(xy.shape[0], np.int64)
+    distance = np.empty(xy.shape[0])
+    for m in range(shifts.shape[0]):
+        counts[m] = match_all(
+            matrix, xy, branches, radius, min_cos, shifts[m, 0], shifts[m, 1], False,
+            points, matched, distance,
+        )  # fmt: skip

@@ -1,0 +1,164 @@
+"""What travels together through kernels, as NamedTuples.
+
+Planes are in metres (reference) or pixels, y up (query). `grid` and `shape` are those of `kernels.buckets`.
+"""
+
+from typing import NamedTuple
+
+from roadgeo.kernels.arrays import Floats2, Int8s2, Int8s3, Int32s1, Int32s2, Ints1, Ints2, Singles2, UInt64s1
+
+__all__ = [
+    "AdjustLimits",
+    "GrowthLimits",
+    "GrowthQuery",
+    "Held",
+    "Hits",
+    "Plane",
+    "PointBuckets",
+    "PointPairs",
+    "RoadBuckets",
+    "RoadPoints",
+    "TripleLimits",
+    "TripleMap",
+    "TripleQuery",
+]
+
+
+class RoadBuckets(NamedTuple):
+    """The roads of the map (see `kernels.roads`)."""
+
+    segments: Singles2  # (S, 4)
+    starts: Int32s1  # (B + 1,)
+    ids: Int32s1
+    grid: tuple[float, float, float]
+    shape: tuple[int, int]
+
+
+class PointBuckets(NamedTuple):
+    """The intersections of the map, sorted by bucket (see `kernels.buckets`)."""
+
+    xy: Floats2  # (N, 2)
+    branches: Int8s3  # (N, R, 2), as in `rays_agree`
+    starts: Int32s1  # (B + 1,)
+    grid: tuple[float, float, float]
+    shape: tuple[int, int]
+
+
+# --- triples ----------------------------------------------------------------------------------------------------------
+
+
+class TripleQuery(NamedTuple):
+    """Intersections whose triples are looked up."""
+
+    xy: Floats2  # (N, 2)
+    branches: Int8s3  # (N, R, 2), as in `rays_agree`
+    tangents: Singles2  # (N, T) radians, NaN behind the last
+    sides: Int8s2  # (N, T), as left by `find_sides`
+    neighbours: Int32s2  # (N, K), -1 behind the last
+
+
+class TripleMap(NamedTuple):
+    """Intersections of the map, and the table of their triples' codes."""
+
+    xy: Floats2  # (M, 2)
+    branches: Int8s3  # (M, R, 2)
+    neighbours: Int32s2  # (M, K)
+    starts: Int32s1  # (TABLE + 1,)
+    entries: UInt64s1
+
+
+class TripleLimits(NamedTuple):
+    """What a look-up lets through."""
+
+    codes_per_vertex: int
+    tolerance: int  # of angles, in units
+    min_cos: float  # of the angle between branches
+    scale: tuple[float, float]  # least and greatest root of the map's determinant
+    min_ratio: float  # least ratio of its singular values
+
+
+class Hits(NamedTuple):
+    """Room for what a look-up finds."""
+
+    ids: Ints2  # (H, 5): A, slot of b, B, slot of c, C
+    affine: Floats2  # (H, 4): the 2 x 2 map, row-major, from query to reference
+
+
+# --- growth -----------------------------------------------------------------------------------------------------------
+
+
+class GrowthQuery(NamedTuple):
+    """The query as it is grown over from one anchor."""
+
+    xy: Floats2  # (N, 2)
+    branches: Int8s3  # (N, R, 2)
+    neighbours: Int32s2  # (N, K)
+    order: Ints1  # points by distance from the anchor: all of them or the nearest, the others are left out
+    half_size: float  # of the frame, pixels
+    anchor: int
+
+
+class GrowthLimits(NamedTuple):
+    """How growth goes on, and when it gives up."""
+
+    sigma: tuple[float, float]  # standard deviation of a matched intersection: metres of the map, pixels of the query
+    radius: tuple[float, float]  # greatest search radius, likewise
+    min_cos: float  # as in `rays_agree`
+    perspective_sigma: float  # standard deviation of the two perspective parameters, a priori
+    hit_rate: float  # share of points that meet a partner in the right place
+    chance_rate: float  # and by chance
+    patience: float  # nats
+
+
+# --- adjustment -------------------------------------------------------------------------------------------------------
+
+
+class Plane(NamedTuple):
+    """Normalised coordinates of the reference: metres per unit, and the point (metres) of the normalised (0, 0)."""
+
+    unit: float
+    x: float
+    y: float
+
+
+class RoadPoints(NamedTuple):
+    """Road points of the query, normalised."""
+
+    xy: Floats2  # (S, 2)
+    directions: Floats2  # (S, 2) unit vectors along the road
+    cells: Ints1  # (S,) the cell of the frame that each lies in
+    weight: float  # of one, against an observation of standard deviation `AdjustLimits.sigma_m`
+
+
+class PointPairs(NamedTuple):
+    """Matched intersections in query and reference, normalised."""
+
+    query: Floats2  # (M, 2)
+    reference: Floats2  # (M, 2)
+    cells: Ints1  # (M,)
+    weight: float
+
+
+class Held(NamedTuple):
+    """Points that hold an adjustment near its start while little else does, normalised."""
+
+    query: Floats2  # (G, 2)
+    reference: Floats2  # (G, 2)
+    weight: float  # in the first step; half of it in the next, and so on
+
+
+class AdjustLimits(NamedTuple):
+    """How an adjustment goes on.
+
+    Where fewer than `least_share` of a cell's searched points meet a road, what does meet one is chance, and the cell
+    waits. The iteration ends when no parameter moves by more than `tolerance_m`.
+    """
+
+    n_cells: int
+    least_share: float
+    max_radius: float  # metres
+    min_cos: float  # as in `nearest_road`
+    sigma_m: float
+    prior: float  # weight that holds the two perspective parameters near zero
+    n_iterations: int
+    tolerance_m: float

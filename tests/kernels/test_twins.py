@@ -1,0 +1,95 @@
+"""Every public kernel has a slow twin that a test compares it with, or there is a reason why not."""
+
+import importlib
+import inspect
+import pkgutil
+import re
+from pathlib import Path
+
+import naive
+import pytest
+
+from roadgeo import kernels
+from roadgeo.kernels.compilation import Kernel
+
+#: Twins of other names: of one item where the kernel does all, or of what the kernel's result is made of.
+TWINS = {
+    "cross_ratios": "describe_pairs",
+    "cut_edges": "cut_edge",
+    "describe_intersections": "merge_lines",
+    "find_sides": "sides_of",
+    "fit_branches": "fit_branch",
+    "fuse_twins": "are_twins",
+    "orient": "shape_of",
+    "paint_roads": "bits_at",
+    "passes": "word_at",
+    "point_row": "predict_rows",
+    "smooth_chains": "smooth_chain",
+    "tie_runs": "runs",
+    "vertex_probes": "alike",
+    "vote": "ratio",
+    "improve_votes": "hits",
+    "chance_rates": "hits",
+}
+
+#: What a test calls instead of a kernel that it compares.
+CALLS = {"describe_intersections": "find_intersections", "fit_branches": "find_intersections"}
+
+#: Why a kernel has none.
+REASONS = {
+    "add_row": "compared with A^T W A, one line of numpy",
+    "carry": "compared with the twins of `predict` and of the Jacobian",
+    "cholesky": "compared with numpy.linalg",
+    "count_alike": "compared with the decoded table, counted in the test",
+    "grow_by_roads": "a loop over two kernels with twins; tested on known homographies",
+    "grow_each": "compared with `grow`, which has a twin",
+    "has_both": "a test states its two cases",
+    "mark_tiles": "`paint_roads` on what it marks is compared with a twin that knows no tiles",
+    "measure_edges": "compared with the lengths that the graph computes",
+    "measure_tiles": "compared with numpy's count of bits",
+    "neighbour_steps": "part of thinning and tracing, whose twins use rows and columns",
+    "neighbours": "part of thinning and tracing, whose twins use rows and columns",
+    "order_tree": "`search_tree` on its result is compared with a twin that knows no tree",
+    "pair_id": "compared with the numbers it counts through, all of them",
+    "rethin": "the second half of `thin`, which has a twin",
+    "sample_edges": "compared with shapely's interpolation along lines",
+    "solve_cholesky": "compared with numpy.linalg",
+    "sort_few": "part of `describe_intersections`; rays are tested to ascend",
+    "touches_solid": "part of thinning and tracing, whose twins use rows and columns",
+    "triple_codes": "three calls of `vertex_codes`, which has a twin",
+    "turned": "part of `vertex_codes`, which has a twin",
+}
+
+
+def public_kernels() -> list[str]:
+    modules = [importlib.import_module(f"roadgeo.kernels.{one.name}") for one in pkgutil.iter_modules(kernels.__path__)]
+    found = {
+        name
+        for module in modules
+        for name, value in vars(module).items()
+        if isinstance(value, Kernel) and name[0] != "_"
+    }
+    return sorted(found)
+
+
+def twins() -> dict[str, object]:
+    modules = [importlib.import_module(f"naive.{one.name}") for one in pkgutil.iter_modules(naive.__path__)]
+    return {name: value for module in modules for name, value in inspect.getmembers(module, inspect.isfunction)}
+
+
+USES = "\n".join(path.read_text() for path in Path(__file__).parents[1].rglob("test_*.py") if path != Path(__file__))
+
+
+@pytest.mark.parametrize("kernel", public_kernels())
+def test_every_kernel_has_a_twin_or_a_reason(kernel: str) -> None:
+    twin = TWINS.get(kernel, kernel)
+    if kernel in REASONS:
+        assert twin not in twins(), "it has a twin, the reason can go"
+        return
+    assert twin in twins(), "write a slow twin in tests/naive, or say in REASONS why there is none"
+    assert re.search(rf"\bnaive\.{twin}\b", USES), f"no test compares anything with naive.{twin}"
+    assert re.search(rf"\b{CALLS.get(kernel, kernel)}\b", USES), f"no test calls {kernel}"
+
+
+def test_reasons_are_of_kernels() -> None:
+    assert set(REASONS) | set(TWINS) <= set(public_kernels())
