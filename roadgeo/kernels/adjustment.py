@@ -14,7 +14,7 @@ from roadgeo.kernels.arrays import Bools1, Floats1, Floats2
 from roadgeo.kernels.compilation import kernel
 from roadgeo.kernels.homography_fit import cholesky, solve_cholesky
 from roadgeo.kernels.roads import nearest_road
-from roadgeo.kernels.structs import AdjustLimits, Held, Plane, PointPairs, RoadBuckets, RoadPoints
+from roadgeo.kernels.structs import AdjustLimits, Held, Plane, PointPairs, RoadBuckets, RoadSamples
 
 #: Steps of an adjustment in which points are held near their start.
 _HELD_STEPS = 6
@@ -65,7 +65,7 @@ def add_row(
         right[r] += scaled * residual
 
 
-@kernel()
+@kernel(forceinline=True)
 def carry(p: Floats1, u: float, v: float, du: float, dv: float) -> tuple[float, float, float, float, float, float]:
     """Map a normalised point and a direction there; return x', y', w, the direction unscaled, and its length.
 
@@ -154,7 +154,7 @@ def _add_held(p: NDArray[np.float64], held: Held, weight: float, system: _System
     return True
 
 
-@kernel()
+@kernel(forceinline=True)
 def _spread(system: _System) -> float:
     """Return the variance of what `system.row` is the derivative of, |L^-1 row|^2, L the factor of the step before."""
     total = 0.0
@@ -171,7 +171,7 @@ def _spread(system: _System) -> float:
 def _search_roads(
     p: NDArray[np.float64],
     plane: Plane,
-    points: RoadPoints,
+    points: RoadSamples,
     limits: AdjustLimits,
     roads: RoadBuckets,
     system: _System,
@@ -212,7 +212,7 @@ def _search_roads(
 
 @kernel()
 def _add_roads(
-    p: NDArray[np.float64], unit: float, points: RoadPoints, least_share: float, system: _System, found: _Met
+    p: NDArray[np.float64], unit: float, points: RoadSamples, least_share: float, system: _System, found: _Met
 ) -> tuple[int, float]:
     """Add the road points that met a road; return how many, and the scale of their residuals (see `adjust`)."""
     used, weights, slopes, squares = 0, 0.0, 0.0, 0.0
@@ -251,7 +251,7 @@ def _step(p: NDArray[np.float64], system: _System) -> float:
 def adjust(
     p: Floats1,
     plane: Plane,
-    points: RoadPoints,
+    points: RoadSamples,
     pairs: PointPairs,
     held: Held,
     limits: AdjustLimits,

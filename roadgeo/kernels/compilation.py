@@ -39,7 +39,10 @@ _lock = threading.RLock()
 
 
 def kernel(**options: Any) -> Callable[[_Function], _Function]:
-    """Make a kernel of a function; `options` are those of numba's `njit`."""
+    """Make a kernel of a function; `options` are those of numba's `njit`.
+
+    Parts that run often and take several NamedTuples need `forceinline=True`: a call copies all of their members.
+    """
 
     def decorate(function: _Function) -> _Function:
         return cast("_Function", Kernel(function, options))

@@ -76,7 +76,7 @@ def _begin(
     )
 
 
-@kernel()
+@kernel(forceinline=True)
 def _match(growth: _Growth, i: int, j: int, points: PointBuckets, matched: NDArray[np.int64]) -> None:
     """Match query point i to map intersection j."""
     matched[i] = j
@@ -107,12 +107,12 @@ def _place_seeds(
     return n_seeds
 
 
-@kernel()
+@kernel(forceinline=True)
 def _fit(growth: _Growth, matched: NDArray[np.int64]) -> bool:
     return fit_homography(growth.query, growth.image, matched, growth.prior, growth.p, growth.normal, growth.factor)
 
 
-@kernel()
+@kernel(forceinline=True)
 def _predict_radius(growth: _Growth, i: int) -> tuple[float, float, float, float]:
     """Return where point i is predicted, its w, and its search radius in metres: -1 at the horizon."""
     u, v = growth.query[i, 0], growth.query[i, 1]
@@ -124,7 +124,7 @@ def _predict_radius(growth: _Growth, i: int) -> tuple[float, float, float, float
     return x, y, w, _SIGMAS * math.sqrt(sigma * sigma + growth.sigma_m * growth.sigma_m)
 
 
-@kernel()
+@kernel(forceinline=True)
 def _search(
     growth: _Growth,
     i: int,

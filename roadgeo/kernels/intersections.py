@@ -203,6 +203,7 @@ def describe_intersections(
             b1 += nx * away
             b2 += ny * away
             square += lines[b, 3]
+        # the point nearest to all lines, not too far from the node
         det = a11 * a22 - a12 * a12
         dx = (a22 * b1 - a12 * b2) / det
         dy = (a11 * b2 - a12 * b1) / det

@@ -16,6 +16,7 @@ from roadgeo.kernels.compilation import kernel
 
 __all__ = [
     "PairBuckets",
+    "PairQuery",
     "cross_ratios",
     "describe_pairs",
     "evaluate_pairs",
@@ -43,6 +44,16 @@ class PairBuckets(NamedTuple):
     items: NDArray[Any]  # (N,) the intersection at each place
     xy: NDArray[Any]  # (N, 2) its position
     codes: NDArray[Any]  # (N,) uint8, its type
+
+
+class PairQuery(NamedTuple):
+    """The query as a tuple (P1, P2) of its intersections sees it, in the tuple's frame."""
+
+    uv: NDArray[Any]  # (N, 2) float64, intersections: those likely to miss come first, so that failures end soon
+    codes: NDArray[Any]  # (N,) uint8, their types
+    corners: NDArray[Any]  # (4, 2) float64, the image's
+    cot_1: NDArray[Any]  # (N_q,) float64, cotangents of the tangents at P1 in the order in which they correspond
+    cot_2: NDArray[Any]  # at P2
 
 
 @kernel(error_model="numpy")
@@ -356,11 +367,7 @@ def _count_inliers(uv, codes, buckets, model, radius, least, stamps, stamp):  # 
 
 @kernel(error_model="numpy")
 def evaluate_pairs(  # type: ignore[no-untyped-def]
-    uv,
-    codes,
-    corners,
-    cot_1,
-    cot_2,
+    query,
     pairs,
     rows,
     draws,
@@ -382,14 +389,7 @@ def evaluate_pairs(  # type: ignore[no-untyped-def]
 
     Parameters
     ----------
-    uv : (N, 2) float64
-        Query intersections in the query tuple's frame; those likely to miss come first, so that failures end soon.
-    codes : (N,) uint8
-        Their types.
-    corners : (4, 2) float64
-        The image's corners in the same frame.
-    cot_1, cot_2 : (N_q,) float64
-        Cotangents of the query tuple's tangents at P1 and P2 in the order in which they correspond.
+    query : PairQuery
     pairs : (P, 2) int32
         All reference tuples of this type.
     rows : (C,) int32
@@ -421,6 +421,7 @@ def evaluate_pairs(  # type: ignore[no-untyped-def]
         Hypotheses whose inliers were counted.
     """
     n_models = 0
+    corners = query.corners
     found_1 = np.empty(_MAX_TANGENTS)
     found_2 = np.empty(_MAX_TANGENTS)
     n_candidates = len(rows) if len(rows) > 0 else len(pairs)
@@ -431,10 +432,10 @@ def evaluate_pairs(  # type: ignore[no-untyped-def]
         x, y = xy[i, 0], xy[i, 1]
         dx, dy = xy[j, 0] - x, xy[j, 1] - y
         phi = math.atan2(dy, dx)
-        _cotangents(tangents, i, len(cot_1), phi, found_1)
-        _cotangents(tangents, j, len(cot_2), phi, found_2)
-        alpha_1, beta_1 = _fit_pencil(cot_1, found_1, len(cot_1))
-        alpha_2, beta_2 = _fit_pencil(cot_2, found_2, len(cot_2))
+        _cotangents(tangents, i, len(query.cot_1), phi, found_1)
+        _cotangents(tangents, j, len(query.cot_2), phi, found_2)
+        alpha_1, beta_1 = _fit_pencil(query.cot_1, found_1, len(query.cot_1))
+        alpha_2, beta_2 = _fit_pencil(query.cot_2, found_2, len(query.cot_2))
         if is_physical:
             ahead = alpha_1 > 0.0 and alpha_2 > 0.0
             for c in range(4):
@@ -444,7 +445,7 @@ def evaluate_pairs(  # type: ignore[no-untyped-def]
                 continue
         n_models += 1
         trial = (alpha_1, beta_1, alpha_2, beta_2, x, y, dx, dy)
-        inliers = _count_inliers(uv, codes, buckets, trial, radius, best, stamps, draw)
+        inliers = _count_inliers(query.uv, query.codes, buckets, trial, radius, best, stamps, draw)
         if inliers > best:
             best = inliers
             for k in range(8):

@@ -17,7 +17,7 @@ __all__ = [
     "PointBuckets",
     "PointPairs",
     "RoadBuckets",
-    "RoadPoints",
+    "RoadSamples",
     "TripleLimits",
     "TripleMap",
     "TripleQuery",
@@ -121,7 +121,7 @@ class Plane(NamedTuple):
     y: float
 
 
-class RoadPoints(NamedTuple):
+class RoadSamples(NamedTuple):
     """Road points of the query, normalised."""
 
     xy: Floats2  # (S, 2)

@@ -130,7 +130,7 @@ class _Triangle(NamedTuple):
     cross: float
 
 
-@kernel()
+@kernel(forceinline=True)
 def _triangle(query: TripleQuery, a: int, s: int, t: int) -> _Triangle:
     """Return the triple of an anchor and two of its neighbours."""
     xy = query.xy
@@ -142,7 +142,7 @@ def _triangle(query: TripleQuery, a: int, s: int, t: int) -> _Triangle:
     return _Triangle(a, b, c, s, t, abx, aby, acx, acy, abx * acy - aby * acx)
 
 
-@kernel()
+@kernel(forceinline=True)
 def _places(entry: np.uint64, turn: int, table: TripleMap) -> tuple[int, int, int]:
     """Return the map's triple of an entry, the partner of the query's anchor first, or -1: it is none.
 
@@ -163,7 +163,7 @@ def _places(entry: np.uint64, turn: int, table: TripleMap) -> tuple[int, int, in
     return int(x), int(y), int(z)
 
 
-@kernel()
+@kernel(forceinline=True)
 def _fit_triangle(
     query: TripleQuery, one: _Triangle, x: int, y: int, z: int, table: TripleMap, limits: TripleLimits
 ) -> tuple[bool, tuple[float, float, float, float]]:
@@ -189,7 +189,7 @@ def _fit_triangle(
     return agree, (j00, j01, j10, j11)
 
 
-@kernel()
+@kernel(forceinline=True)
 def _add_hit(
     hits: Hits, n: int, one: _Triangle, x: int, y: int, z: int, affine: tuple[float, float, float, float]
 ) -> None:

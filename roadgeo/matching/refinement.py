@@ -9,7 +9,7 @@ import numpy as np
 
 from roadgeo._arrays import FloatArray, IntArray
 from roadgeo.kernels.adjustment import adjust, point_row
-from roadgeo.kernels.structs import AdjustLimits, Held, Plane, PointPairs, RoadPoints
+from roadgeo.kernels.structs import AdjustLimits, Held, Plane, PointPairs, RoadSamples
 from roadgeo.matching.index import ReferenceIndex
 from roadgeo.matching.scene import Scene
 
@@ -219,7 +219,7 @@ def refine(
     _, rms = adjust(
         p,
         Plane(unit, origin[0], origin[1]),
-        RoadPoints(points, directions, _cells(points, options), weight),
+        RoadSamples(points, directions, _cells(points, options), weight),
         PointPairs(pairs, places, _cells(pairs, options), options.intersection_weight),
         Held(grid, targets, held_weight),
         limits,

@@ -6,7 +6,7 @@ from kernels.test_roads import binned
 from naive import kernels as naive
 
 from roadgeo.kernels.adjustment import add_row, adjust, carry, point_row
-from roadgeo.kernels.structs import AdjustLimits, Held, Plane, PointPairs, RoadPoints
+from roadgeo.kernels.structs import AdjustLimits, Held, Plane, PointPairs, RoadSamples
 
 P = np.array([0.9, -0.2, 0.05, 0.25, 1.1, -0.02, 0.12, -0.08])
 UNIT, ORIGIN = 400.0, np.array([350.0, 320.0])
@@ -73,7 +73,7 @@ class Town:
 def run(town, p, **changes):
     p, normal = p.copy(), np.empty((8, 8))
     values = town.arguments(**changes)
-    points, pairs, held, limits = RoadPoints(*values[:4]), PointPairs(*values[4:8]), Held(*values[8:11]), values[11:]
+    points, pairs, held, limits = RoadSamples(*values[:4]), PointPairs(*values[4:8]), Held(*values[8:11]), values[11:]
     n, rms = adjust(p, Plane(UNIT, *ORIGIN), points, pairs, held, AdjustLimits(*limits), town.roads, normal)
     return p, n, rms, normal
 

@@ -266,11 +266,14 @@ def evaluate(search, correspondence, t, row, least=-1):
     """The inlier count and homography of one candidate."""
     first, second = search.query.xy[list(correspondence.ends)]
     model = np.empty(8)
-    count, _ = kernels.evaluate_pairs(
+    query = kernels.PairQuery(
         homographies.to_pair_frame(search.query.xy, first, second),
         search.codes,
         homographies.to_pair_frame(search.frame, first, second),
         *correspondence.cotangents,
+    )
+    count, _ = kernels.evaluate_pairs(
+        query,
         search.index.tuples(t),
         np.array([row], np.int32),
         np.array([0, 1, 0, 1]),

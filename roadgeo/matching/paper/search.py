@@ -239,18 +239,17 @@ class _Search:
         first, second = self.query.xy[list(correspondence.ends)]
         uv = to_pair_frame(self.query.xy[self.judges], first, second)
         corners = to_pair_frame(self.frame, first, second)
+        query = kernels.PairQuery(uv, self.codes[self.judges], corners, *correspondence.cotangents)
         start, stride = _permutation(correspondence.n_match, self.rng)
         stamps = np.full(len(self.index.codes) if self.options.one_to_one else 0, -1, np.int64)
         model = np.empty(8)
+        # The kernel comes back now and then, for a look at the clock.
         per_call = max(1, _TESTS_PER_CALL // len(uv))
         done = 0
         while done < n_draws and not self.is_late:
             until = min(done + per_call, n_draws)
             best, n_models = kernels.evaluate_pairs(
-                uv,
-                self.codes[self.judges],
-                corners,
-                *correspondence.cotangents,
+                query,
                 self.index.tuples(t),
                 correspondence.rows,
                 np.array([done, until, start, stride]),
