@@ -135,6 +135,17 @@ def screen(references, affines, anchor_xy, ref_xy, points, directions, radius, r
     return np.array(shares)
 
 
+def road_residuals(mapped, along, radii, min_cos, segments):
+    """(S, 3): the way to the nearest road along its normal, and the normal; NaN where there is no road."""
+    out = np.full((len(mapped), 3), np.nan)
+    for i, (place, direction, radius) in enumerate(zip(mapped, along, radii, strict=True)):
+        distance, foot, road = nearest_road(*place, *direction, radius, min_cos, segments)
+        if distance < np.inf:
+            across = np.array([-road[1], road[0]])
+            out[i] = across @ (foot - place), *across
+    return out
+
+
 # growth
 
 
