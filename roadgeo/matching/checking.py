@@ -198,7 +198,7 @@ class _Judge:
         away = np.empty(len(points))
         forward_distances(
             matrix, points, scene.dense_directions, tolerance, math.cos(math.radians(verify.max_turn_deg)), 0.0, 0.0,
-            index.segments, index.segment_starts, index.segment_ids, index.grid, index.shape, away,
+            index.road_buckets, away,
         )  # fmt: skip
         seen, inside = self._in_frame(matrix)
         seen = seen[inside]
