@@ -15,7 +15,8 @@ from roadgeo.geometry.mask import RoadMask
 from roadgeo.location import Location
 from roadgeo.matching.index import ReferenceIndex
 from roadgeo.matching.options import LocateOptions
-from roadgeo.reference.reference import Reference
+from roadgeo.reference.reference import AnyReference, Reference
+from roadgeo.reference.shards import ShardedReference
 
 if TYPE_CHECKING:
     import xarray as xr
@@ -26,7 +27,7 @@ if TYPE_CHECKING:
 __all__ = ["Answer", "locate"]
 
 #: A reference that is open, its file, its name in the library; or several of them.
-References: TypeAlias = "Reference | str | os.PathLike[str] | Iterable[Reference | str | os.PathLike[str]]"
+References: TypeAlias = "AnyReference | str | os.PathLike[str] | Iterable[AnyReference | str | os.PathLike[str]]"
 
 
 @dataclass(frozen=True, repr=False)
@@ -179,19 +180,19 @@ def locate(
     else:
         sighting = locate_query(read_picture(mask), references, options)
     found = {one.name: getattr(sighting.location, one.name) for one in fields(Location)}
-    indexes = tuple(one.index for one in references)
+    indexes = tuple(one.index_of(sighting.location) for one in references)
     photo = str(mask) if sighting.of_photograph else None
     return Answer(**found, mask=sighting.mask, photo=photo, indexes=indexes)
 
 
-def _open(reference: References) -> list[Reference]:
+def _open(reference: References) -> list[AnyReference]:
     """Open what is not open yet; nothing named: all of the library."""
     from roadgeo.running.batch import open_references
 
-    given = [reference] if isinstance(reference, Reference | str | os.PathLike) else list(reference)
+    given = [reference] if isinstance(reference, Reference | ShardedReference | str | os.PathLike) else list(reference)
     if not given:
         return open_references(())
-    return [one if isinstance(one, Reference) else open_references([os.fspath(one)])[0] for one in given]
+    return [open_references([os.fspath(one)])[0] if isinstance(one, str | os.PathLike) else one for one in given]
 
 
 def _range(gsd: float | tuple[float, float] | None) -> tuple[float, float] | None:

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import os
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING
 
@@ -14,12 +14,12 @@ from roadgeo.geometry.mask import RoadMask
 from roadgeo.location import Location
 from roadgeo.matching.explanation import Explanation, Record, tell
 from roadgeo.matching.index import build_index
-from roadgeo.matching.methods import Found, search_reference
+from roadgeo.matching.methods import Found, search_references
 from roadgeo.matching.options import LocateOptions
 from roadgeo.matching.query import Query, read_query
 from roadgeo.matching.trace import NO_TRACE, Trace
 from roadgeo.matching.verdict import decide, needed_of
-from roadgeo.reference.reference import BuildOptions, Reference, build_network, open_reference, stored_options
+from roadgeo.reference.reference import AnyReference, BuildOptions, Reference, build_network, open_whole, stored_options
 from roadgeo.roads.kinds import RoadKind
 from roadgeo.warmup import warm_up
 
@@ -77,7 +77,7 @@ def build_reference(
     if path is None:
         return reference
     reference.save(path, say)
-    return open_reference(path)  # as `locate` has it: memory-mapped arrays are another type to compiled code
+    return open_whole(path)  # as `locate` has it: memory-mapped arrays are another type to compiled code
 
 
 def update_reference(path: str | Path, roads: Roads, say: Say = say_nothing) -> Reference:
@@ -112,7 +112,7 @@ def update_reference(path: str | Path, roads: Roads, say: Say = say_nothing) -> 
     drawn_alike = UpdateOptions(simplify=options.simplify, intersections=options.intersections)
     network = as_stored(replace_area(old, lines, area, meta, drawn_alike))
     Reference(build_index(network, options.index, say), network).save(path, say)
-    return open_reference(path)
+    return open_whole(path)
 
 
 def _require_same_scale(lines: AnyArray, moved: AnyArray) -> None:
@@ -131,7 +131,7 @@ def _require_same_scale(lines: AnyArray, moved: AnyArray) -> None:
 
 def locate(
     mask: RoadMask | AnyArray | str | Path,
-    reference: Reference | Sequence[Reference],
+    reference: AnyReference | Sequence[AnyReference],
     options: LocateOptions | None = None,
 ) -> Location:
     """Find where a road mask lies on one of the references.
@@ -145,12 +145,12 @@ def locate(
     """
     options, references = options or LocateOptions(), _as_list(reference)
     query = _read(mask, options)
-    return decide(query, _search(query, references, options, [NO_TRACE] * len(references)), options)
+    return decide(query, _search(query, references, options), options)
 
 
 def explain(
     mask: RoadMask | AnyArray | str | Path,
-    reference: Reference | Sequence[Reference],
+    reference: AnyReference | Sequence[AnyReference],
     options: LocateOptions | None = None,
 ) -> Explanation:
     """Locate a mask as `locate` does, and tell how far the search got, what it rejected and what was missing.
@@ -161,15 +161,20 @@ def explain(
         The mask cannot be read or shows no roads.
     """
     options, references = options or LocateOptions(), _as_list(reference)
-    query, records = _read(mask, options), [Record() for _ in references]
-    found = _search(query, references, options, records)
+    query, records = _read(mask, options), list[Record]()
+
+    def record() -> Record:
+        records.append(Record())
+        return records[-1]
+
+    found = _search(query, references, options, record)
     alone = [decide(query, [one], options) for one in found]
     stories = [tell(query, *each, needed_of(options)) for each in zip(found, alone, records, strict=True)]
     return Explanation(decide(query, found, options), query.scene, query.graph, tuple(stories))
 
 
-def _as_list(reference: Reference | Sequence[Reference]) -> list[Reference]:
-    references = [reference] if isinstance(reference, Reference) else list(reference)
+def _as_list(reference: AnyReference | Sequence[AnyReference]) -> list[AnyReference]:
+    references = list(reference) if isinstance(reference, Sequence) else [reference]
     if not references:
         raise RoadSourceError("no reference to search: build one with `roadgeo index`")
     return references
@@ -181,13 +186,12 @@ def _read(mask: RoadMask | AnyArray | str | Path, options: LocateOptions) -> Que
 
 
 def _search(
-    query: Query, references: Sequence[Reference], options: LocateOptions, traces: Sequence[Trace]
+    query: Query,
+    references: Sequence[AnyReference],
+    options: LocateOptions,
+    make_trace: Callable[[], Trace] = lambda: NO_TRACE,
 ) -> list[Found]:
-    """Search one reference after another; each gets an even share of the time that is left."""
-    left = options.search.time_limit_s - query.seconds.vectorize
-    found: list[Found] = []
-    for one, trace in zip(references, traces, strict=True):
-        share = max(left, 0.0) / (len(references) - len(found))
-        found.append(search_reference(query, one.index, options, share, trace))
-        left -= found[-1].match_s + found[-1].refine_s
-    return found
+    """Search all references together, within the time that tracing left."""
+    left = max(options.search.time_limit_s - query.seconds.vectorize, 0.0)
+    parts = [part for one in references for part in one.parts]
+    return search_references(query, parts, options, left, make_trace)

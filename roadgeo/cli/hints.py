@@ -10,7 +10,7 @@ import click
 from roadgeo.cli.parameters import CAMERA, NEAR, RANGE
 
 if TYPE_CHECKING:
-    from roadgeo.reference.reference import Reference
+    from roadgeo.reference.reference import AnyReference
     from roadgeo.workflows import LocateOptions
 
 __all__ = ["HINTS", "hint_options", "make_options", "refuse_swapped"]
@@ -70,7 +70,7 @@ def hint_options(*names: str, **renamed: str) -> Callable[[Command], Command]:
     return add
 
 
-def refuse_swapped(near: tuple[float, float, float] | None, references: Sequence[Reference]) -> None:
+def refuse_swapped(near: tuple[float, float, float] | None, references: Sequence[AnyReference]) -> None:
     """Ask what is meant where a place lies on no map, but would with longitude and latitude exchanged.
 
     Raises
@@ -88,15 +88,9 @@ def refuse_swapped(near: tuple[float, float, float] | None, references: Sequence
         )
 
 
-def _lies_on(reference: Reference, lonlat: tuple[float, float], radius_m: float) -> bool:
-    """Whether a circle touches the bounds of a map."""
-    import numpy as np
-
-    from roadgeo.geometry.projection import from_lonlat
-
-    xy, center = reference.index.xy, from_lonlat(reference.index.plane, np.array([lonlat], float))[0]
-    beyond = np.maximum(xy.min(axis=0) - center, center - xy.max(axis=0))
-    return bool((beyond <= radius_m).all())
+def _lies_on(reference: AnyReference, lonlat: tuple[float, float], radius_m: float) -> bool:
+    """Whether a circle touches the bounds of a map, or of a shard of it."""
+    return any(part.may_hold((*lonlat, radius_m)) for part in reference.parts)
 
 
 def make_options(

@@ -11,6 +11,7 @@ import click
 from roadgeo._progress import Say
 from roadgeo.cli.parameters import BOX, NEAR, Plugin, verbosity_options
 from roadgeo.cli.printing import echo
+from roadgeo.cli.shards import build_in_shards, shard_options
 from roadgeo.errors import RoadSourceError
 
 if TYPE_CHECKING:
@@ -78,9 +79,19 @@ __all__ = ["index_command"]
     type=click.Path(),
     help="Where it goes. Default: into the library, under its name.",
 )
+@shard_options
 @verbosity_options
 def index_command(
-    out: str | None, name: str | None, update: bool, rebuild: str | None, quiet: bool, verbose: bool, **source: Any
+    out: str | None,
+    name: str | None,
+    update: bool,
+    rebuild: str | None,
+    shards: dict[str, Any] | None,
+    margin: float,
+    jobs: int,
+    quiet: bool,
+    verbose: bool,
+    **source: Any,
 ) -> None:
     """Build a reference: draw the roads of a place as a mask shows them, and index their intersections.
 
@@ -91,6 +102,9 @@ def index_command(
     place, the box, the polygon, or where the roads of --roads lie) its roads are replaced, or added where it has none.
     The rest stays as it is, and so do the options it was built with.
 
+    With --shards a map of any size is built piece by piece from road files, in as much memory as one piece needs; the
+    result is a folder, REF.shards, and is searched as one map. The same command goes on with a build cut short.
+
     \b
     Examples:
       roadgeo index --osm "Boston, MA"
@@ -100,6 +114,7 @@ def index_command(
       roadgeo index --update --osm "Cambridge, MA" --name boston-ma
       roadgeo index --update --roads new_estate.geojson --out maps/streets.gpkg
       roadgeo index --rebuild maps/streets.gpkg
+      roadgeo index --roads germany.osm.pbf --shards auto --jobs 4
     """
     from roadgeo.cli.compilation import compile_once
     from roadgeo.cli.folders import make_folder
@@ -115,8 +130,14 @@ def index_command(
         _rebuild(rebuild, quiet)
         return
     given = _one_source(source)
-    _require_geopackage(out)
+    if shards is None:
+        _require_geopackage(out)
     name = name or _name(source, given, out)
+    if shards is not None:
+        if update:
+            raise click.UsageError("--update changes a reference of one piece; build one in --shards again instead.")
+        build_in_shards(source, name, out, shards, margin, jobs, quiet)
+        return
     path = Path(out) if out else new_reference(name)
     make_folder(path.parent)  # before the long part
     if update:
@@ -249,7 +270,7 @@ def _name(source: dict[str, Any], given: str, out: str | None) -> str:
     if out:
         from roadgeo.reference.files import reference_paths
 
-        return reference_paths(out).geopackage.stem
+        return reference_paths(out).geopackage.stem.removesuffix(".shards")
     if given == "plugin":
         return Path(source["plugin"].partition(":")[2]).stem or "roads"
     if given in {"roads", "polygon"}:

@@ -41,7 +41,7 @@ def info_command(reference: str | None, plugins: bool, as_json: bool) -> None:
         return
     if reference is None:
         raise click.UsageError("Missing argument 'REF'.")
-    from roadgeo.reference.files import describe_reference
+    from roadgeo.reference.inspection import describe_reference
     from roadgeo.reference.library import resolve_reference
 
     described = describe_reference(resolve_reference(reference))
@@ -82,7 +82,7 @@ def check_command(references: tuple[str, ...]) -> int:
       roadgeo check maps/*.gpkg
     """
     from roadgeo.errors import RoadgeoError
-    from roadgeo.reference.files import check_reference
+    from roadgeo.reference.inspection import check_reference
     from roadgeo.reference.library import resolve_reference
 
     status = 0
@@ -113,7 +113,7 @@ def list_command(as_json: bool) -> int:
       roadgeo list --json
     """
     from roadgeo.errors import RoadgeoError
-    from roadgeo.reference.files import describe_reference
+    from roadgeo.reference.inspection import describe_reference
     from roadgeo.reference.library import library_dir, list_references
 
     paths = list_references()
@@ -164,8 +164,10 @@ def _lines(described: dict[str, Any]) -> list[tuple[str, str]]:
         ("state", _STATES[described["freshness"]]),
         ("CRS", _crs_text(str(described.get("crs")))),
         ("intersections", f"{counts.get('intersections', 0):,}"),
-        ("roads", _road_text(described)),
+        *([("roads", _road_text(described))] if "roads" in counts else []),
     ]
+    if shards := described.get("shards"):
+        lines.append(("shards", _shards_text(shards)))
     if described.get("area_km2"):
         lines.append(("area", f"{described['area_km2']:,.0f} km²"))
         lines.append(("density", f"{described['intersections_per_km2']:.0f} intersections per km²"))
@@ -185,6 +187,7 @@ _STATES = {
     "no index": "no index: it is built when the reference is first used",
     "old format": "index of an earlier roadgeo: it is built again when the reference is next used",
     "no GeoPackage": "ready; the GeoPackage is missing",
+    "shards missing": "shards are missing; `roadgeo index --shards` builds them again",
 }
 
 
@@ -196,6 +199,11 @@ def _crs_text(crs: str) -> str:
 def _road_text(described: dict[str, Any]) -> str:
     count = f"{described.get('counts', {}).get('roads', 0):,}"
     return f"{count}, {described['road_km']:,.0f} km" if "road_km" in described else count
+
+
+def _shards_text(shards: dict[str, Any]) -> str:
+    largest = f"the largest of {shards['largest']:,} intersections"
+    return f"{shards['count']:,}, {largest}, with margins of {shards['margin_m'] / 1e3:g} km"
 
 
 def _summary(described: dict[str, Any]) -> str:

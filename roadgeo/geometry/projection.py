@@ -5,6 +5,7 @@ Longitude comes before latitude everywhere. pyproj is imported on first use.
 
 from __future__ import annotations
 
+import math
 from dataclasses import dataclass
 from functools import lru_cache
 from typing import TYPE_CHECKING
@@ -17,7 +18,18 @@ from roadgeo.errors import CrsError
 if TYPE_CHECKING:
     from pyproj import Transformer
 
-__all__ = ["LocalPlane", "choose_plane", "from_lonlat", "grid_north", "serves_as_plane", "to_lonlat", "transformer"]
+__all__ = [
+    "LocalPlane",
+    "choose_plane",
+    "from_lonlat",
+    "grid_north",
+    "metres_apart",
+    "serves_as_plane",
+    "to_lonlat",
+    "transformer",
+]
+
+_EARTH_RADIUS_M = 6.371e6
 
 #: UTM reaches from 80 S to 84 N; the polar stereographic planes (UPS) lie beyond.
 _UPS_NORTH, _UPS_SOUTH = 84.0, -80.0
@@ -148,6 +160,13 @@ def from_lonlat(plane: LocalPlane, lonlat: FloatArray) -> FloatArray:
     points = np.asarray(lonlat, float)
     en = transformer("EPSG:4326", plane.crs).transform(points[:, 0], points[:, 1])
     return plane.from_crs(np.stack(en, axis=1))
+
+
+def metres_apart(a: FloatArray, b: FloatArray) -> float:
+    """Return about how far two places, (2,) longitude and latitude, lie apart; exact for near ones."""
+    turn = (float(a[0] - b[0]) + 180.0) % 360.0 - 180.0
+    east = math.radians(turn) * math.cos(math.radians(float(a[1] + b[1]) / 2.0))
+    return _EARTH_RADIUS_M * math.hypot(east, math.radians(float(a[1] - b[1])))
 
 
 def grid_north(plane: LocalPlane, en: FloatArray) -> float:

@@ -6,6 +6,7 @@ import math
 import time
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, field, replace
+from typing import TypeAlias
 
 import numpy as np
 
@@ -25,7 +26,7 @@ from roadgeo.matching.trace import NO_TRACE, Trace
 from roadgeo.matching.triples import Proposals, larger
 from roadgeo.matching.verification import Agreement, VerifyOptions, agreement, chance_agreement, log10_odds
 
-__all__ = ["GrowOptions", "Hypothesis", "MatchOptions", "Source", "Sweep", "TripleEstimator"]
+__all__ = ["GrowOptions", "Hypothesis", "Ledger", "MatchOptions", "Source", "Sweep", "TripleEstimator"]
 
 
 #: Matches that determine a homography; that many seeds are excluded from the evidence.
@@ -84,6 +85,9 @@ class GrowOptions:
     max_verified: int = 3
 
 
+#: What led to a hypothesis: number of the stage, and intersection of the query.
+Lead: TypeAlias = tuple[int, int]
+
 #: How what single triples propose is followed: more is let through, and it may miss more on its way.
 _PATIENT = GrowOptions(max_screened=6000, hit_rate=0.35, patience=9.0, min_matched=1, max_verified=6)
 
@@ -132,8 +136,8 @@ class MatchOptions:
 class Hypothesis:
     """A grown hypothesis and what came of it.
 
-    `by_roads`: it grew by roads over the whole frame; `n_found`: so many intersections of the query proposed it;
-    `fault`: the camera's last objection, None where it had none.
+    `by_roads`: it grew by roads over the whole frame; `leads`: the intersections of the query that proposed it, each
+    with the number of the stage in which it did; `fault`: the camera's last objection, None where it had none.
     """
 
     matrix: FloatArray
@@ -148,7 +152,19 @@ class Hypothesis:
     log10_odds: float = -np.inf
     fault: CameraFault | None = None
     by_roads: bool = False
-    n_found: int = 1
+    leads: list[Lead] = field(default_factory=list)
+
+    @property
+    def n_found(self) -> int:
+        """So many intersections of the query proposed it."""
+        return len(self.leads)
+
+
+@dataclass
+class Ledger:
+    """Places tried in one search, on all of its parts together: each of them could have agreed by chance."""
+
+    n_tried: int = 0
 
 
 class TripleEstimator:
@@ -161,9 +177,14 @@ class TripleEstimator:
         options: MatchOptions | None = None,
         near: tuple[float, float, float] | None = None,
         trace: Trace = NO_TRACE,
+        ledger: Ledger | None = None,
     ) -> None:
-        """`near` = (x, y, radius) in plane metres restricts where the middle of the frame may lie."""
+        """`near` = (x, y, radius) in plane metres restricts where the middle of the frame may lie.
+
+        The `ledger` is shared with the estimators of other parts that are searched together with this one.
+        """
         self.near = near
+        self.ledger = ledger or Ledger()
         self.trace = trace
         self.refine_s = 0.0
         # The least that chance reached at the places verified so far: a place that is not promising against it is none.
@@ -176,25 +197,59 @@ class TripleEstimator:
         camera, usual = self.options.camera, self.options.refine
         self.refine_options = replace(usual, perspective_sigma=camera.perspective_sigma(usual.perspective_sigma))
         self.n_tuples = self.n_candidates = self.n_screened = self.n_hypotheses = self.n_verified = 0
+        self._tried: set[Lead] = set()
+        self._roads: RoadSearch | None = None
+        self._grown_by_roads: list[Hypothesis] = []
 
-    def rounds(self) -> Iterator[list[Hypothesis]]:
+    def stages(self) -> Iterator[Iterator[list[Hypothesis]]]:
         """Yield, for one anchor after another, the hypotheses that grew: of triples, of roads, of single triples."""
         options, larger_by = self.options, larger(len(self.index))
-        yield from self._sweep(options.sweeps, options.grow, int(options.max_places * larger_by))
+        most = int(options.max_places * larger_by)
+        for stage, source in enumerate(options.sweeps):
+            yield self._sweep(stage, source, options.grow, most)
         if options.roads is not None and len(self.scene.intersections):
-            yield from self._rounds_of_roads(options.roads)
-        yield from self._sweep(options.last, options.last_grow, int(options.max_last_places * larger_by))
+            yield self._rounds_of_roads(options.roads)
+        most = self.n_screened + int(options.max_last_places * larger_by)
+        for stage, source in enumerate(options.last, len(options.sweeps) + 1):
+            yield self._sweep(stage, source, options.last_grow, most)
 
-    def _rounds_of_roads(self, options: RoadSearchOptions) -> Iterator[list[Hypothesis]]:
+    def leads(self, model: Hypothesis) -> list[Lead]:
+        """Return what led to a hypothesis (see `search.Estimator`)."""
+        return model.leads
+
+    def follow(self, leads: Sequence[Lead]) -> Iterator[list[Hypothesis]]:
+        """Yield what grew from anchors that led to a place on another part (see `search.Estimator`)."""
+        options = self.options
+        for stage, anchor in leads:
+            if (stage, anchor) in self._tried:
+                continue
+            if stage < len(options.sweeps):
+                yield from self._sweep(stage, options.sweeps[stage], options.grow, only=[anchor])
+            elif stage > len(options.sweeps):
+                source = options.last[stage - len(options.sweeps) - 1]
+                yield from self._sweep(stage, source, options.last_grow, only=[anchor])
+            elif options.roads is not None:
+                yield from self._rounds_of_roads(options.roads, [anchor])
+
+    def _count(self, n_places: int) -> None:
+        """Note that so many more places were tried."""
+        self.n_screened += n_places
+        self.ledger.n_tried += n_places
+
+    def _rounds_of_roads(
+        self, options: RoadSearchOptions, only: Sequence[int] | None = None
+    ) -> Iterator[list[Hypothesis]]:
         """Yield what grew by roads and is not known yet; a place found again counts as found once more."""
-        roads = RoadSearch(self.scene, self.index, self.options.camera, options, self.near)
-        known: list[Hypothesis] = []
-        tried = 0
-        for anchor, n_proposed, grown in roads.rounds():
-            self.n_screened += roads.n_tried - tried
+        if self._roads is None:
+            self._roads = RoadSearch(self.scene, self.index, self.options.camera, options, self.near)
+        roads, known, stage = self._roads, self._grown_by_roads, len(self.options.sweeps)
+        tried = roads.n_tried
+        for anchor, n_proposed, grown in roads.rounds(only):
+            self._count(roads.n_tried - tried)
             tried = roads.n_tried
             self.n_hypotheses += n_proposed
             if anchor >= 0:
+                self._tried.add((stage, anchor))
                 self.trace.voted(anchor, n_proposed)
             fresh: list[Hypothesis] = []
             again: list[Hypothesis] = []
@@ -205,7 +260,9 @@ class TripleEstimator:
                 elif self._is_plausible(hypothesis):
                     fresh.append(hypothesis)
             for one in known:
-                one.n_found += any(one is other for other in again)
+                one.leads += [(stage, anchor)] * any(one is other for other in again)
+            for one in fresh:
+                one.leads.append((stage, anchor))
             known += fresh
             self.trace.grown(fresh)
             yield fresh
@@ -229,19 +286,29 @@ class TripleEstimator:
         """Whether a verified place that is promising was proposed by another intersection as well."""
         return known.log10_odds >= self.options.verify.promising and self.same(known, hypothesis)
 
-    def _sweep(self, sources: Sequence[Source], grow: GrowOptions, most_places: int) -> Iterator[list[Hypothesis]]:
-        """Yield what grew from the proposals of these sources, until so many more places were screened."""
+    def _sweep(
+        self,
+        stage: int,
+        source: Source,
+        grow: GrowOptions,
+        most_places: float = math.inf,
+        only: Sequence[int] | None = None,
+    ) -> Iterator[list[Hypothesis]]:
+        """Yield what grew from the proposals of a source, until so many places were screened in all."""
         scene, camera = self.scene, self.options.camera
         low, high = camera.gsd_m
         scale = (low / grow.max_scale_ratio, high * grow.max_scale_ratio)
-        most_places += self.n_screened
-        for source in sources:
-            for proposals in source.proposals(scene, self.index, scale, camera.min_shape_ratio):
-                if self.n_screened >= most_places:
-                    return
-                self.n_tuples += proposals.n_tuples
-                self.n_candidates += proposals.n_hits
-                yield self._grow_all(proposals, grow)
+        if self.n_screened >= most_places:
+            return
+        for proposals in source.proposals(scene, self.index, scale, camera.min_shape_ratio, only):
+            if self.n_screened >= most_places:
+                return
+            if (stage, proposals.anchor) in self._tried:
+                continue
+            self._tried.add((stage, proposals.anchor))
+            self.n_tuples += proposals.n_tuples
+            self.n_candidates += proposals.n_hits
+            yield self._grow_all(proposals, grow, stage)
 
     def _screen(self, proposals: Proposals, options: GrowOptions) -> IntArray:
         """Return the proposals that put roads around the anchor on roads of the map, the best placed first."""
@@ -254,7 +321,7 @@ class TripleEstimator:
         near = near[away[near] < reach]
         allowed = self._is_allowed(proposals)
         looked_at = np.flatnonzero(allowed)[: options.max_screened]
-        self.n_screened += len(looked_at)
+        self._count(len(looked_at))
         shares = np.zeros(len(looked_at))
         screen(
             proposals.reference[looked_at], proposals.affine[looked_at], anchor,
@@ -309,7 +376,7 @@ class TripleEstimator:
             if np.isfinite(ratios[m])
         ]
 
-    def _grow_all(self, proposals: Proposals, options: GrowOptions) -> list[Hypothesis]:
+    def _grow_all(self, proposals: Proposals, options: GrowOptions, stage: int) -> list[Hypothesis]:
         """Return the best grown proposals of one anchor that mean different places and that a camera can have seen."""
         chosen = self._screen(proposals, options)[: options.max_grown]
         self.n_hypotheses += len(chosen)
@@ -326,8 +393,8 @@ class TripleEstimator:
                 distinct.append(h)
                 if len(distinct) == options.max_verified:
                     break
-        for k in again:
-            self._whole[k].n_found += 1
+        for one in (*distinct, *(self._whole[k] for k in again)):
+            one.leads.append((stage, proposals.anchor))
         return distinct
 
     def score(self, model: Hypothesis) -> float:
@@ -388,7 +455,7 @@ class TripleEstimator:
         found = model.found
         if found is None:
             return -math.inf
-        return log10_odds(found, chance, self.scene.n_edges, self.n_screened, self.options.verify)
+        return log10_odds(found, chance, self.scene.n_edges, self.ledger.n_tried, self.options.verify)
 
     def _converge(self, model: Hypothesis, n_points: int | None) -> bool:
         """Refine until nothing more agrees: more matches make a better fit, and that finds more matches."""

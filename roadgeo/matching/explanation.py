@@ -9,8 +9,8 @@ seen          `intersections` (all of them usable up to `SceneOptions.max_inters
               tangents or more, `roads`, their length and the frame's size in pixels, the share of it that was observed
 searches      one for each reference, in the order in which they were searched:
 
-              `reference`, `stopped` ("accepted", "exhausted", "time", or "" where there was nothing to search for),
-              `needed` (the least log10 odds and margin)
+              `reference`, `stopped` ("accepted", "exhausted", "time", "elsewhere": a place on another reference ended
+              the search, or "" where there was nothing to search for), `needed` (the least log10 odds and margin)
 
               `funnel`, what went into and came out of each stage: `anchors` (intersections tried), `tuples` of the
               mask looked up, `candidates` (tuples of the map like them), `proposals` (places on which several agree),
@@ -140,8 +140,8 @@ def _without_limits(record: Record, estimator: TripleEstimator) -> list[_Scored]
     """Verify the best of the places that the camera refused as if it had not."""
     scene, index, options = estimator.scene, estimator.index, estimator.options
     camera = CameraOptions(gsd_m=(0.0, math.inf), max_tilt_deg=180.0, max_skew=math.inf)
-    free = TripleEstimator(scene, index, replace(options, camera=camera))
-    free.least_chance, free.n_screened = estimator.least_chance, estimator.n_screened
+    free = TripleEstimator(scene, index, replace(options, camera=camera), ledger=estimator.ledger)
+    free.least_chance = estimator.least_chance
     nobody = np.empty(0, np.int64)
     compared = []
     for fault, unscaled in record.unscaled:

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import math
 import time
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field, replace
 from functools import lru_cache
 
@@ -11,19 +12,20 @@ import numpy as np
 
 from roadgeo._arrays import FloatArray, IntArray
 from roadgeo.geometry.homography import Homography
-from roadgeo.geometry.projection import from_lonlat
+from roadgeo.geometry.projection import from_lonlat, metres_apart, to_lonlat
 from roadgeo.location import Stats
-from roadgeo.matching.estimator import Hypothesis, MatchOptions, TripleEstimator
+from roadgeo.matching.estimator import Hypothesis, Ledger, MatchOptions, TripleEstimator
 from roadgeo.matching.index import ReferenceIndex, crop, unpack_tangents
 from roadgeo.matching.options import LocateOptions
 from roadgeo.matching.paper.search import match_pairs
 from roadgeo.matching.paper.tuples import PairIndex, PairOptions, build_pair_index
+from roadgeo.matching.parts import Near, Part, same_within_m
 from roadgeo.matching.query import Query
-from roadgeo.matching.search import SearchResult, search
+from roadgeo.matching.search import Search, SearchResult, search_together
 from roadgeo.matching.trace import NO_TRACE, Trace
 from roadgeo.roads.intersections import Intersections
 
-__all__ = ["Fit", "Found", "search_reference"]
+__all__ = ["Fit", "Found", "search_references"]
 
 
 @dataclass(frozen=True)
@@ -93,44 +95,92 @@ class Found:
     refine_s: float = 0.0
 
 
-def search_reference(
-    query: Query, index: ReferenceIndex, options: LocateOptions, time_limit_s: float, trace: Trace = NO_TRACE
-) -> Found:
-    """Search one reference for a query, by the method and within the limits of the options."""
+def search_references(
+    query: Query,
+    parts: Sequence[Part],
+    options: LocateOptions,
+    time_limit_s: float,
+    make_trace: Callable[[], Trace] = lambda: NO_TRACE,
+) -> list[Found]:
+    """Search references, or parts of them, for a query together, by the method and within the limits of the options.
+
+    Those that cannot hold the place are not opened, unless that is none of them; nothing is told of them. For each of
+    the others a trace is made, in the order of what is returned.
+    """
+    frame_m = 2.0 * query.scene.half_size * options.match.camera.gsd_m[1]
+    indexes = _open(parts, options.near, frame_m)
+    traces = [make_trace() for _ in indexes]
     if len(query.scene.intersections) < options.min_intersections:
-        return Found(index)
+        return [Found(index) for index in indexes]
     if options.method == "pair":
-        return _search_pairs(query, index, options.pair, time_limit_s)
-    return _search_triples(query, index, options, time_limit_s, trace)
+        return _search_pairs_in_turn(query, indexes, options.pair, time_limit_s)
+    started, ledger = time.perf_counter(), Ledger()
+    opened = [_Attempt.open(query, one, options, trace, ledger) for one, trace in zip(indexes, traces, strict=True)]
+    left = time_limit_s - (time.perf_counter() - started)
+    estimators = {one.search: one.estimator for one in opened if one.search is not None and one.estimator is not None}
+
+    def same(one: Search[Hypothesis], a: Hypothesis, other: Search[Hypothesis], b: Hypothesis) -> bool:
+        return _same_ground(estimators[one], a, estimators[other], b)
+
+    search_together(list(estimators), replace(options.search, time_limit_s=left), same)
+    return [one.found() for one in opened]
 
 
-def _search_triples(
-    query: Query, index: ReferenceIndex, options: LocateOptions, time_limit_s: float, trace: Trace
-) -> Found:
-    started = time.perf_counter()
-    part, near = index, _near(index, options.near)
-    if near is not None:
-        part = _part(
-            index, near[:2], _rounded_up(near[2] + 2.0 * query.scene.half_size * options.match.camera.gsd_m[1])
+def _open(parts: Sequence[Part], near: Near | None, frame_m: float) -> list[ReferenceIndex]:
+    """Open the parts that may hold a place; the first where none does, to say so."""
+    able = [part for part in parts if near is None or part.may_hold(near, frame_m)]
+    return [part.open() for part in able or parts[:1]]
+
+
+def _same_ground(one: TripleEstimator, a: Hypothesis, other: TripleEstimator, b: Hypothesis) -> bool:
+    """Whether hypotheses on two parts mean one place."""
+    places = [
+        to_lonlat(estimator.index.plane.crs, estimator.index.plane.to_crs(estimator.center(model)[None]))[0]
+        for estimator, model in ((one, a), (other, b))
+    ]
+    return metres_apart(*places) <= same_within_m(one.index, other.index, b.matrix, other.scene.size)
+
+
+@dataclass(frozen=True)
+class _Attempt:
+    """A reference that is searched; or is not, for it has hardly an intersection near the place that was given."""
+
+    index: ReferenceIndex
+    n_searched: int
+    estimator: TripleEstimator | None = None
+    search: Search[Hypothesis] | None = None
+    trace: Trace = NO_TRACE
+
+    @classmethod
+    def open(
+        cls, query: Query, index: ReferenceIndex, options: LocateOptions, trace: Trace, ledger: Ledger
+    ) -> _Attempt:
+        part, near = index, _near(index, options.near)
+        if near is not None:
+            reach = _rounded_up(near[2] + 2.0 * query.scene.half_size * options.match.camera.gsd_m[1])
+            part = _part(index, near[:2], reach)
+            if len(part) < options.min_intersections:
+                return cls(index, len(part))
+        estimator = TripleEstimator(query.scene, part, promising_options(options), near, trace, ledger)
+        return cls(index, len(part), estimator, Search(estimator), trace)
+
+    def found(self) -> Found:
+        """Tell what came of it."""
+        estimator = self.estimator
+        if self.search is None or estimator is None:
+            return Found(self.index, n_searched=self.n_searched)
+        result = self.search.result()
+        self.trace.finished(estimator, result)
+        return Found(
+            self.index,
+            _fits(estimator, result),
+            result.stopped,
+            n_searched=self.n_searched,
+            n_tried=estimator.n_screened,
+            stats=Stats(estimator.n_tuples, estimator.n_candidates, estimator.n_hypotheses, estimator.n_verified),
+            match_s=self.search.seconds - estimator.refine_s,
+            refine_s=estimator.refine_s,
         )
-        if len(part) < options.min_intersections:
-            return Found(index, n_searched=len(part))
-    cropping_s = time.perf_counter() - started
-    estimator = TripleEstimator(query.scene, part, promising_options(options), near, trace)
-    started = time.perf_counter() - cropping_s
-    result = search(estimator, replace(options.search, time_limit_s=time_limit_s - cropping_s))
-    elapsed = time.perf_counter() - started
-    trace.finished(estimator, result)
-    return Found(
-        index,
-        _fits(estimator, result),
-        result.stopped,
-        n_searched=len(part),
-        n_tried=estimator.n_screened,
-        stats=Stats(estimator.n_tuples, estimator.n_candidates, estimator.n_hypotheses, estimator.n_verified),
-        match_s=elapsed - estimator.refine_s,
-        refine_s=estimator.refine_s,
-    )
 
 
 def _fits(estimator: TripleEstimator, result: SearchResult[Hypothesis]) -> tuple[Fit, ...]:
@@ -178,7 +228,7 @@ def _rounded_up(radius_m: float) -> float:
     return float(1.25 ** math.ceil(math.log(radius_m) / math.log(1.25)))
 
 
-@lru_cache(maxsize=4)
+@lru_cache(maxsize=32)
 def _part(index: ReferenceIndex, center: tuple[float, float], radius_m: float) -> ReferenceIndex:
     """Crop a reference to a circle, unless it hardly reaches beyond: made once for a batch."""
     inside = np.hypot(*(index.xy - center).T) <= radius_m
@@ -186,6 +236,17 @@ def _part(index: ReferenceIndex, center: tuple[float, float], radius_m: float) -
 
 
 # --- the paper's method -----------------------------------------------------------------------------------------------
+
+
+def _search_pairs_in_turn(
+    query: Query, indexes: Sequence[ReferenceIndex], options: PairOptions, time_limit_s: float
+) -> list[Found]:
+    """Search one reference after another; each gets an even share of the time that is left."""
+    found: list[Found] = []
+    for index in indexes:
+        left = max(time_limit_s - sum(one.match_s for one in found), 0.0)
+        found.append(_search_pairs(query, index, options, left / (len(indexes) - len(found))))
+    return found
 
 
 def _search_pairs(query: Query, index: ReferenceIndex, options: PairOptions, time_limit_s: float) -> Found:

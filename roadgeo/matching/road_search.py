@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, field, replace
 from itertools import islice
 from typing import NamedTuple
@@ -89,6 +89,7 @@ class RoadSearch:
         max_turn = math.radians(_ROUGHLY_DEG) if camera.north_up else math.pi
         candidates = _within(index, near, scene.half_size * scale[1])
         self.voter = Voter(scene, index, scale, max_turn, candidates, options.votes)
+        self._tried: set[int] = set()
         perspective = camera.perspective_sigma(options.grow.perspective_sigma)
         self.grower = RoadGrower(scene, index, replace(options.grow, perspective_sigma=perspective))
 
@@ -97,14 +98,20 @@ class RoadSearch:
         """Places and turns tried so far."""
         return self.voter.n_tried
 
-    def rounds(self) -> Iterator[RoadRound]:
-        """Yield what grew of one anchor's proposals after another; between parts of a large map nothing."""
+    def rounds(self, only: Sequence[int] | None = None) -> Iterator[RoadRound]:
+        """Yield what grew of one anchor's proposals after another; between parts of a large map nothing.
+
+        `only` names the anchors to try. None is tried twice.
+        """
         xy = self.scene.intersections.xy
         options, most_tried = self.options, self.options.max_tried * larger(len(self.voter.index))
-        anchors = islice(farthest_first(xy, np.arange(len(xy))), options.max_anchors)
+        anchors = islice(farthest_first(xy, np.arange(len(xy))), options.max_anchors) if only is None else only
         for n, anchor in enumerate(anchors):
             if n >= options.least_anchors and self.n_tried >= most_tried:
                 return
+            if anchor in self._tried:
+                continue
+            self._tried.add(anchor)
             for votes in self.voter.votes(anchor):
                 if votes is None:
                     yield RoadRound(-1, 0, [])

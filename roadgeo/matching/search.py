@@ -1,4 +1,8 @@
-"""The hypothesise-and-test loop. It knows no roads and no geometry: a toy model over integers tests it."""
+"""The hypothesise-and-test loop. It knows no roads and no geometry: a toy model over integers tests it.
+
+One loop drives one problem or many parts of one: breadth first, a little of every part at each stage, and what ends it
+is one answer that stands out from all others, whichever parts they come from.
+"""
 
 from __future__ import annotations
 
@@ -7,16 +11,16 @@ from collections.abc import Iterable, Iterator, Sequence
 from dataclasses import dataclass
 from typing import Generic, Protocol, TypeVar
 
-__all__ = ["Estimator", "SearchOptions", "SearchResult", "search"]
+__all__ = ["Estimator", "Search", "SearchOptions", "SearchResult", "search", "search_together"]
 
 Model = TypeVar("Model")
 
 
 class Estimator(Protocol[Model]):
-    """What the loop asks of a problem."""
+    """What the loop asks of a problem, or of one part of it."""
 
-    def rounds(self) -> Iterator[Iterable[Model]]:
-        """Yield hypotheses, a round at a time, the most promising rounds first.
+    def stages(self) -> Iterator[Iterator[Iterable[Model]]]:
+        """Yield stage after stage, the cheapest first; each yields hypotheses a round at a time, the best hopes first.
 
         All hypotheses that one sample of the query admits belong to one round, so that twins of a place are met
         together.
@@ -30,6 +34,12 @@ class Estimator(Protocol[Model]):
 
     def same(self, a: Model, b: Model) -> bool:
         """Whether two models mean the same answer."""
+
+    def leads(self, model: Model) -> Sequence[tuple[int, int]]:
+        """Return the samples that led to a model, each with the number of its stage: they would lead to a twin, too."""
+
+    def follow(self, leads: Sequence[tuple[int, int]]) -> Iterator[Iterable[Model]]:
+        """Yield rounds of such of these samples as were not tried on this part yet."""
 
 
 @dataclass(frozen=True)
@@ -56,7 +66,10 @@ class SearchOptions:
 
 @dataclass(frozen=True)
 class SearchResult(Generic[Model]):
-    """Best model, the best that means something else, their scores (-inf where there is none), and what ended it."""
+    """Best model, the best that means something else, their scores (-inf where there is none), and what ended it.
+
+    `stopped` is "accepted"; "exhausted"; "time"; or "elsewhere", where another part's answer ended the search.
+    """
 
     best: Model | None
     score: float
@@ -64,48 +77,179 @@ class SearchResult(Generic[Model]):
     runner_up_score: float
     n_rounds: int
     n_scored: int
-    stopped: str  # "accepted", "exhausted" or "time"
+    stopped: str
+
+
+class Search(Generic[Model]):
+    """The search of one part, which goes on a round at a time.
+
+    Attributes
+    ----------
+    leaders : list of (score, model)
+        The best model of each of the two best answers, the best first.
+    stage : int
+        Number of the stage that comes next.
+    ended : bool
+        Whether all stages are through.
+    accepted_since : int or None
+        Rounds done when the best model first reached what ends a search.
+    seconds : float
+        Spent on this part.
+    """
+
+    def __init__(self, estimator: Estimator[Model]) -> None:
+        """Begin, without doing anything yet."""
+        self.estimator = estimator
+        self.leaders: list[tuple[float, Model]] = []
+        self.stage = self.n_rounds = self.n_scored = 0
+        self.ended = False
+        self.accepted_since: int | None = None
+        self.stopped = ""
+        self.seconds = 0.0
+        self._stages = estimator.stages()
+        self._rounds: Iterator[Iterable[Model]] | None = next(self._stages, None)
+
+    @property
+    def lead(self) -> float:
+        """Score of the best answer."""
+        return self.leaders[0][0] if self.leaders else float("-inf")
+
+    def advance(self, deadline: float) -> bool:
+        """Do one round; where the stage has none left pass to the next, and return False."""
+        started = time.perf_counter()
+        models = None if self._rounds is None else next(self._rounds, None)
+        if models is None:
+            self._rounds = next(self._stages, None)
+            self.ended = self._rounds is None
+            self.stage += 1
+        else:
+            self.n_rounds += 1
+            self._take(models, deadline)
+        self.seconds += time.perf_counter() - started
+        return models is not None
+
+    def follow(self, leads: Sequence[tuple[int, int]], deadline: float) -> None:
+        """Try samples that led to an answer on another part, as far as they were not tried yet."""
+        started = time.perf_counter()
+        for models in self.estimator.follow(leads):
+            self._take(models, deadline)
+            if time.perf_counter() > deadline:
+                break
+        self.seconds += time.perf_counter() - started
+
+    def _take(self, models: Iterable[Model], deadline: float) -> None:
+        """Score the models of a round."""
+        for model in models:
+            self._enter(self.estimator.score(model), model)
+            self.n_scored += 1
+            if time.perf_counter() > deadline:
+                break
+
+    def _enter(self, score: float, model: Model) -> None:
+        """Keep the two best different answers after a new one came in."""
+        ranked = sorted([*self.leaders, (score, model)], key=lambda item: -item[0])
+        others = (one for one in ranked[1:] if not self.estimator.same(one[1], ranked[0][1]))
+        self.leaders = [ranked[0], *[one for one in [next(others, None)] if one is not None]]
+
+    def result(self) -> SearchResult[Model]:
+        """Return what came of it."""
+        found: list[tuple[float, Model | None]] = [*self.leaders, (float("-inf"), None), (float("-inf"), None)]
+        (score, best), (second, runner_up) = found[:2]
+        return SearchResult(best, score, runner_up, second, self.n_rounds, self.n_scored, self.stopped)
 
 
 def search(estimator: Estimator[Model], options: SearchOptions | None = None) -> SearchResult[Model]:
     """Score hypotheses round by round until one stands out, they are exhausted, or time is up."""
+    alone = Search(estimator)
+    search_together([alone], options)
+    return alone.result()
+
+
+class Same(Protocol[Model]):
+    """Tells whether the answers of two parts are one, where parts overlap."""
+
+    def __call__(self, one: Search[Model], a: Model, other: Search[Model], b: Model) -> bool:
+        """Whether model `a` of one part and `b` of another mean the same answer."""
+
+
+def search_together(
+    parts: Sequence[Search[Model]], options: SearchOptions | None = None, same: Same[Model] | None = None
+) -> None:
+    """Search many parts until one answer stands out from those of all, they are exhausted, or time is up.
+
+    A round of each part in turn, one stage after another. A part whose answer stands out goes on alone until that is
+    settled. What led there is tried on all other parts then: if they hold a twin, it is found, and the search goes on.
+    """
     options = options or SearchOptions()
-    deadline = time.perf_counter() + options.time_limit_s
-    leaders: list[tuple[float, Model]] = []  # the best model of each of the two best answers, best first
-    n_rounds = n_scored = 0
-    first_accepted: int | None = None
-    stopped = "exhausted"
-    for models in estimator.rounds():
-        n_rounds += 1
-        for model in models:
-            leaders = _enter(leaders, (estimator.score(model), model), estimator)
-            n_scored += 1
-            if time.perf_counter() > deadline:
-                break
-        lead = leaders[0][0] if leaders else float("-inf")
-        second = leaders[1][0] if len(leaders) > 1 else float("-inf")
-        if lead >= options.accept and lead - second >= options.margin:
-            if first_accepted is None:
-                first_accepted = n_rounds
-            if estimator.settled(leaders[0][1]) or n_rounds - first_accepted >= options.more_rounds:
-                stopped = "accepted"
-                break
-        if time.perf_counter() > deadline:
-            stopped = "time"
-            break
-    best = leaders[0] if leaders else (float("-inf"), None)
-    runner_up = leaders[1] if len(leaders) > 1 else (float("-inf"), None)
-    return SearchResult(best[1], best[0], runner_up[1], runner_up[0], n_rounds, n_scored, stopped)
+    ended_by = _Together(parts, options, same).run()
+    for one in parts:
+        if ended_by == "time" and not one.ended:
+            one.stopped = "time"
+        else:
+            one.stopped = one.stopped or ("exhausted" if one.ended else "elsewhere")
 
 
-def _enter(
-    leaders: Sequence[tuple[float, Model]], entry: tuple[float, Model], estimator: Estimator[Model]
-) -> list[tuple[float, Model]]:
-    """Return the two best different answers after a new one came in."""
-    ranked = sorted([*leaders, entry], key=lambda item: -item[0])
-    kept = ranked[:1]
-    for candidate in ranked[1:]:
-        if not estimator.same(candidate[1], kept[0][1]):
-            kept.append(candidate)
-            break
-    return kept
+class _Together(Generic[Model]):
+    """The loop over parts; see `search_together`."""
+
+    def __init__(self, parts: Sequence[Search[Model]], options: SearchOptions, same: Same[Model] | None) -> None:
+        self.parts, self.options, self.same = parts, options, same
+        self.deadline = time.perf_counter() + options.time_limit_s
+
+    def run(self) -> str:
+        stage = 0
+        while running := [one for one in self.parts if not one.ended]:
+            here = [one for one in running if one.stage == stage]
+            while here:
+                for one in here:
+                    if ended_by := self._go_on(one):
+                        return ended_by
+                here = [one for one in here if one.stage == stage and not one.ended]
+            stage += 1
+        return "exhausted"
+
+    def _go_on(self, one: Search[Model]) -> str:
+        """Do a round of a part, and more while its answer stands out; say what ends the search, "" if nothing does."""
+        goes_on = one.advance(self.deadline)
+        while goes_on:
+            standing = self._stands_out(one)
+            if standing and self._is_final(one):
+                self._try_elsewhere(one)
+                if self._stands_out(one):
+                    one.stopped = "accepted"
+                    return "accepted"
+                standing = False
+            if time.perf_counter() > self.deadline:
+                return "time"
+            if not standing or len(self.parts) == 1:
+                break
+            goes_on = one.advance(self.deadline) or (not one.ended and one.advance(self.deadline))
+        return ""
+
+    def _try_elsewhere(self, one: Search[Model]) -> None:
+        """Try what led to a part's best answer on the others, which may hold its twin."""
+        leads = one.estimator.leads(one.leaders[0][1])
+        for other in self.parts:
+            if other is not one:
+                other.follow(leads, self.deadline)
+
+    def _stands_out(self, one: Search[Model]) -> bool:
+        """Whether a part's best answer leads every other one, on any part."""
+        if one.lead < self.options.accept:
+            return False
+        best = one.leaders[0][1]
+        if any(one.lead - score < self.options.margin for score, _ in one.leaders[1:]):
+            return False
+        return all(
+            one.lead - score >= self.options.margin or (self.same is not None and self.same(one, best, other, model))
+            for other in self.parts
+            if other is not one
+            for score, model in other.leaders
+        )
+
+    def _is_final(self, one: Search[Model]) -> bool:
+        """Whether no better version of a part's best answer is to be expected, or was waited for long enough."""
+        if one.accepted_since is None:
+            one.accepted_since = one.n_rounds
+        waited = one.n_rounds - one.accepted_since
+        return one.estimator.settled(one.leaders[0][1]) or waited >= self.options.more_rounds

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, replace
 from itertools import islice
 from typing import Protocol
@@ -18,12 +18,17 @@ class Source(Protocol):
     """Where hypotheses come from: `Sweep` makes them of triples."""
 
     def proposals(
-        self, scene: Scene, index: ReferenceIndex, scale: tuple[float, float], min_ratio: float
+        self,
+        scene: Scene,
+        index: ReferenceIndex,
+        scale: tuple[float, float],
+        min_ratio: float,
+        only: Sequence[int] | None = None,
     ) -> Iterator[Proposals]:
         """Yield what one query intersection after another may be, with the work it took, the most promising first.
 
         `scale` = (least, greatest) root of the determinant of a proposed map, metres per pixel; `min_ratio` is the
-        least ratio of its singular values.
+        least ratio of its singular values; `only` names the intersections to try, all that are worth it by default.
         """
 
 
@@ -45,10 +50,16 @@ class Sweep:
     most_more: float = 3.0
 
     def proposals(
-        self, scene: Scene, index: ReferenceIndex, scale: tuple[float, float], min_ratio: float
+        self,
+        scene: Scene,
+        index: ReferenceIndex,
+        scale: tuple[float, float],
+        min_ratio: float,
+        only: Sequence[int] | None = None,
     ) -> Iterator[Proposals]:
         """Yield the proposals of the anchors (see `Source`)."""
-        anchors = propose(scene.intersections, scene.branches, scene.neighbours, index, scale, min_ratio, self.triples)
+        found, limits = scene.intersections, (scale, min_ratio)
+        anchors = propose(found, scene.branches, scene.neighbours, index, *limits, self.triples, only)
         return islice(anchors, int(self.max_anchors * min(smaller(len(index)), self.most_more)))
 
 

@@ -9,7 +9,7 @@ ever.
 from __future__ import annotations
 
 import math
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -131,11 +131,14 @@ def propose(
     scale: tuple[float, float],
     min_ratio: float,
     options: TripleOptions,
+    only: Sequence[int] | None = None,
 ) -> Iterator[Proposals]:
-    """Yield the proposals of one anchor after another (see `TripleOptions.spread`)."""
+    """Yield the proposals of one anchor after another (see `TripleOptions.spread`); `only` names the anchors to try."""
     neighbours = np.ascontiguousarray(neighbours[:, : options.n_neighbours])
     k = neighbours.shape[1]
     weighed = np.arange(0, len(query), max(1, math.ceil(len(query) / options.max_weighed)))
+    if only is not None:
+        weighed = np.array(only, np.int64)
     sides = np.empty(query.tangents.shape, np.int8)
     find_sides(query.tangents, branches, sides)
     costs = np.empty((len(weighed), k, k), np.int64)

@@ -8,17 +8,16 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from roadgeo.geometry.camera import CameraOptions, sampling
-from roadgeo.geometry.projection import from_lonlat
+from roadgeo.geometry.camera import CameraOptions
+from roadgeo.geometry.projection import from_lonlat, metres_apart
 from roadgeo.location import Location, Place, Reason, Seen, Stats
 from roadgeo.matching.methods import Fit, Found
 from roadgeo.matching.options import LocateOptions
+from roadgeo.matching.parts import same_within_m
 from roadgeo.matching.placing import center_of, place_frame
 from roadgeo.matching.query import Query
 
 __all__ = ["Needed", "decide", "needed_of"]
-
-_EARTH_RADIUS_M = 6.371e6
 
 
 @dataclass(frozen=True)
@@ -55,7 +54,7 @@ def decide(query: Query, found: Sequence[Found], options: LocateOptions) -> Loca
         return _decide_pairs(location, query, found, options)
     candidates = _pool(query, found)
     best = candidates[0] if candidates else None
-    rivals = [] if best is None else [one for one in candidates[1:] if _differ(query, best, one)]
+    rivals = candidates[1:]
     rival = rivals[0] if rivals else None
     if best is not None:
         others = tuple(_seen_from(best, one) for one in rivals)
@@ -103,25 +102,21 @@ def _on(location: Location, found: Found) -> Location:
 
 
 def _pool(query: Query, found: Sequence[Found]) -> list[_Candidate]:
-    """Return the places of all references, the best first; their odds count the places tried on all of them."""
-    tried = sum(one.n_tried for one in found)
-    pool = []
-    for one in found:
-        for fit in one.fits:
-            odds = fit.log10_odds - math.log10(max(tried, 1) / max(one.n_tried, 1))
-            corrected = replace(fit, log10_odds=odds)
-            pool.append(_Candidate(one, corrected, center_of(query, corrected)))
-    return sorted(pool, key=lambda candidate: -candidate.score)
+    """Return the places of all references, the best first; where parts overlap, each once."""
+    pool = [_Candidate(one, fit, center_of(query, fit)) for one in found for fit in one.fits]
+    distinct: list[_Candidate] = []
+    for candidate in sorted(pool, key=lambda candidate: -candidate.score):
+        if all(_differ(query, one, candidate) for one in distinct):
+            distinct.append(candidate)
+    return distinct
 
 
 def _differ(query: Query, a: _Candidate, b: _Candidate) -> bool:
-    """Whether two candidates are different places; on different maps if more than half a frame lies between them."""
+    """Whether two candidates are different places: of one part always, of two if they lie too far apart to be one."""
     if a.found is b.found:
         return True
-    east = math.radians(a.center.lon - b.center.lon) * math.cos(math.radians(b.center.lat))
-    north = math.radians(a.center.lat - b.center.lat)
-    frame_m = sampling(b.fit.matrix, query.scene.size) * max(query.scene.size)
-    return _EARTH_RADIUS_M * math.hypot(east, north) > 0.5 * frame_m
+    places = [np.array([one.center.lon, one.center.lat]) for one in (a, b)]
+    return metres_apart(*places) > same_within_m(a.found.index, b.found.index, b.fit.matrix, query.scene.size)
 
 
 def _seen_from(best: _Candidate, rival: _Candidate) -> Place:
@@ -135,7 +130,7 @@ def _seen_from(best: _Candidate, rival: _Candidate) -> Place:
 
 def _twins(best: _Candidate, rival: _Candidate) -> str:
     on = ("", "")
-    if best.found is not rival.found:
+    if best.found.index.name != rival.found.index.name:
         on = (f" on {best.found.index.name}", f" on {rival.found.index.name}")
     return f"two places fit almost equally: log10 odds {best.score:.1f}{on[0]} and {rival.score:.1f}{on[1]}"
 
@@ -160,9 +155,10 @@ def _refuse(
     score = best.score if best is not None else -math.inf
     code, reason = _why_nothing(query, nearest, score, options)
     location = replace(location, reason_code=code)
-    if len(found) == 1:
+    distinct = dict.fromkeys(one.index.name for one in found)  # shards bear the name of their map
+    if len(distinct) == 1:
         return replace(_on(location, nearest), reason=reason)
-    names = ", ".join(one.index.name for one in found)
+    names = ", ".join(distinct)
     owed = dict.fromkeys(_on(location, one).attribution for one in found)
     return replace(
         location,

@@ -5,6 +5,7 @@ from __future__ import annotations
 import difflib
 import os
 import re
+import shutil
 import sys
 import unicodedata
 from pathlib import Path
@@ -12,6 +13,7 @@ from pathlib import Path
 from roadgeo.errors import IndexFormatError
 from roadgeo.reference.files import ReferencePaths, reference_paths
 from roadgeo.reference.network_file import not_a_reference
+from roadgeo.reference.shards import ENDING, manifest_path
 from roadgeo.storage.atomic import writing
 
 __all__ = ["library_dir", "list_references", "make_slug", "new_reference", "remove_reference", "resolve_reference"]
@@ -52,10 +54,11 @@ def new_reference(name: str) -> Path:
 
 
 def list_references() -> list[Path]:
-    """Every reference in the library, by name; a file without its other half counts."""
+    """Every reference in the library, by name; a file without its other half counts, and so do folders of shards."""
     folder = library_dir()
     stems = {file.with_suffix("") for suffix in ("gpkg", "index") for file in folder.glob(f"[!.]*.{suffix}")}
-    return sorted(reference_paths(stem).geopackage for stem in stems)
+    shards = {path for path in folder.glob(f"[!.]*{ENDING}") if manifest_path(path)}
+    return sorted([*(reference_paths(stem).geopackage for stem in stems), *shards])
 
 
 def resolve_reference(name_or_path: str | os.PathLike[str]) -> Path:
@@ -64,7 +67,7 @@ def resolve_reference(name_or_path: str | os.PathLike[str]) -> Path:
     Returns
     -------
     Path
-        Of its GeoPackage, which may be absent where the index stands alone.
+        Of its GeoPackage, which may be absent where the index stands alone; or of its folder of shards.
 
     Raises
     ------
@@ -75,6 +78,10 @@ def resolve_reference(name_or_path: str | os.PathLike[str]) -> Path:
     for paths in (reference_paths(name), _shelved(name)):
         if paths.geopackage.is_file() or paths.index.is_file():
             return paths.geopackage
+    for path in (Path(name), _shelved(name).geopackage.with_suffix("")):
+        manifest = manifest_path(path)
+        if manifest is not None:
+            return manifest.parent
     if Path(name).is_file():
         raise not_a_reference(name)
     known = [path.stem for path in list_references()]
@@ -100,14 +107,19 @@ def remove_reference(name: str) -> list[Path]:
     """
     paths = _shelved(name)
     files = [file for file in (paths.index, paths.geopackage) if file.is_file()]
+    shards = paths.geopackage.with_suffix(ENDING)
+    if manifest_path(shards):
+        files.append(shards)
     if not files:
         raise IndexFormatError(f"no reference {name!r} in {library_dir()}; `roadgeo list` shows what there is")
     for file in files:
         with writing(file):
-            file.unlink()
+            shutil.rmtree(file) if file.is_dir() else file.unlink()
     return files
 
 
 def _shelved(name: str) -> ReferencePaths:
     """Return where the library keeps a reference of that name; a file's suffix may stand behind it."""
-    return reference_paths(library_dir() / make_slug(name.removesuffix(".gpkg").removesuffix(".index")))
+    return reference_paths(
+        library_dir() / make_slug(name.removesuffix(".gpkg").removesuffix(".index").removesuffix(ENDING))
+    )

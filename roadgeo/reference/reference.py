@@ -5,23 +5,30 @@ from __future__ import annotations
 from collections.abc import Callable, Sequence
 from dataclasses import asdict, dataclass, field, fields
 from pathlib import Path
-from typing import Any, TypeVar
+from typing import TYPE_CHECKING, Any, TypeAlias, TypeVar
 
 from roadgeo._arrays import AnyArray
 from roadgeo._progress import Say, say_nothing
 from roadgeo.errors import IndexFormatError, RoadSourceError
 from roadgeo.geometry.projection import LocalPlane
 from roadgeo.kernels.triple_codes import MAX_NEIGHBOURS
+from roadgeo.location import Location
 from roadgeo.matching.index import IndexOptions, ReferenceIndex, build_index
+from roadgeo.matching.parts import Part, Whole
 from roadgeo.roads.intersections import IntersectionOptions, find_intersections
 from roadgeo.roads.network import RoadNetwork
 from roadgeo.roads.simplification import SimplifyOptions, planarize, simplify
 
+if TYPE_CHECKING:
+    from roadgeo.reference.shards import ShardedReference
+
 __all__ = [
+    "AnyReference",
     "BuildOptions",
     "Reference",
     "build_network",
     "open_reference",
+    "open_whole",
     "rebuild_reference",
     "stored_options",
 ]
@@ -48,6 +55,19 @@ class Reference:
         """What the user calls it."""
         return self.index.name
 
+    @property
+    def parts(self) -> tuple[Part, ...]:
+        """What is searched: itself."""
+        return (Whole(self.index),)
+
+    def index_of(self, location: Location) -> ReferenceIndex:  # noqa: ARG002 (that of the one piece there is)
+        """Return the index that a location is drawn with."""
+        return self.index
+
+    def indexes_at(self, places: Sequence[tuple[float, float]]) -> list[ReferenceIndex]:  # noqa: ARG002
+        """Return the indexes that show places."""
+        return [self.index]
+
     def save(self, path: str | Path, say: Say = say_nothing) -> None:
         """Write `path`.gpkg and `path`.index (see `files.write_reference`)."""
         from roadgeo.reference.files import write_reference
@@ -55,6 +75,10 @@ class Reference:
         if self.network is None:
             raise RoadSourceError(f"{self.name}: opened from a file, there is nothing new to save")
         write_reference(path, self.network, (self.index.meta, self.index.arrays()), say)
+
+
+#: One piece, or shards.
+AnyReference: TypeAlias = "Reference | ShardedReference"
 
 
 def build_network(
@@ -115,14 +139,27 @@ def _read_options(kind: type[_Options], stored: Any, stage: str) -> _Options:
     return kind(**values)
 
 
-def open_reference(path: str | Path, say: Say = say_nothing) -> Reference:
-    """Open REF.gpkg with its REF.index; a missing index, or one of an earlier format, is built from the GeoPackage.
+def open_reference(path: str | Path, say: Say = say_nothing) -> AnyReference:
+    """Open a reference: REF.gpkg with its REF.index, or REF.shards.
+
+    A missing index, or one of an earlier format, is built from the GeoPackage. Of shards only the manifest is read;
+    each is opened when it is first searched.
 
     Raises
     ------
     IndexFormatError
         If there is no such reference, or it is damaged, hostile, stale or of another version.
     """
+    from roadgeo.reference.files import reference_paths
+    from roadgeo.reference.shards import manifest_path, open_shards
+
+    paths = reference_paths(path)
+    manifest = None if paths.geopackage.is_file() or paths.index.is_file() else manifest_path(path)
+    return open_whole(path, say) if manifest is None else open_shards(manifest)
+
+
+def open_whole(path: str | Path, say: Say = say_nothing) -> Reference:
+    """Open a reference of one piece (see `open_reference`)."""
     from roadgeo.reference.files import open_reference as open_parts
     from roadgeo.reference.files import reference_paths
 
@@ -143,7 +180,7 @@ def rebuild_reference(path: str | Path, say: Say = say_nothing) -> Reference:
     from roadgeo.reference.files import rebuild_index
 
     rebuild_index(path, _index_builder(path, say))
-    return open_reference(path)
+    return open_whole(path)
 
 
 def _index_builder(path: str | Path, say: Say) -> Callable[[RoadNetwork], tuple[dict[str, Any], dict[str, AnyArray]]]:

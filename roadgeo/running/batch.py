@@ -26,7 +26,7 @@ if TYPE_CHECKING:
     from roadgeo.geometry.mask import RoadMask
     from roadgeo.location import Location, Status
     from roadgeo.outputs.location_files import OutputOptions
-    from roadgeo.reference.reference import Reference
+    from roadgeo.reference.reference import AnyReference
     from roadgeo.running.queries import QueryOptions
     from roadgeo.workflows import LocateOptions
 
@@ -39,7 +39,7 @@ __all__ = [
 ]
 
 
-def open_references(names: Iterable[str], say: Say = say_nothing) -> list[Reference]:
+def open_references(names: Iterable[str], say: Say = say_nothing) -> list[AnyReference]:
     """Open references by path or name; none named: all of the library. `say` is told of an index that has to be built.
 
     Raises
@@ -195,7 +195,7 @@ class _Locating:
 
     def prepare(self) -> Callable[[Task], Outcome]:
         """Open the references."""
-        from roadgeo.reference.files import reference_digest
+        from roadgeo.reference.inspection import reference_digest
         from roadgeo.reference.reference import open_reference
 
         started = perf_counter()
@@ -307,7 +307,7 @@ class _Locating:
         paths, photo = output_paths(self.out_dir, task.stem), self.reading.photo(task, sighting.of_photograph)
         explanation = explanation and replace(explanation, location=location)
         kept = keep_probability(sighting.probability, paths)
-        indexes = [one.index for one in asked.references]
+        indexes = [one.index_of(location) for one in asked.references]
         outputs = self.outputs if mask.roads.any() else _without_views(self.outputs)
         written = write_location(location, mask, paths, outputs, photo, indexes, explanation)
         return Outcome(
@@ -344,7 +344,7 @@ def _without_views(outputs: OutputOptions) -> OutputOptions:
 class _Asked:
     """What every mask of a batch is asked: on which references, with which options."""
 
-    references: list[Reference]
+    references: list[AnyReference]
     digests: list[str]
     seconds: float
     options: dict[str, Any]
@@ -409,7 +409,7 @@ def _scale(picture: str, mask: RoadMask) -> float:
 
 
 def write_overview(
-    out_dir: str | Path, tasks: Sequence[Task], outcomes: Sequence[Outcome], references: Sequence[Reference] | None
+    out_dir: str | Path, tasks: Sequence[Task], outcomes: Sequence[Outcome], references: Sequence[AnyReference] | None
 ) -> list[Path]:
     """Write all footprints in one GeoPackage and one table, and where references are given a page of all reports.
 
@@ -429,5 +429,12 @@ def write_overview(
         there = [path.exists() and one.status != "error" for path, one in zip(reports, outcomes, strict=True)]
         links = [path.name if here else "" for path, here in zip(reports, there, strict=True)]
         files.append(folder / "roadgeo_report.html")
-        write_batch(files[-1], list(map(Entry, documents, links)), [one.index for one in references])
+        indexes = [index for one in references for index in one.indexes_at(_places_on(one.name, documents))]
+        write_batch(files[-1], list(map(Entry, documents, links)), indexes)
     return files
+
+
+def _places_on(name: str, documents: Sequence[Mapping[str, Any]]) -> list[tuple[float, float]]:
+    """Return longitude and latitude of what was found on a reference."""
+    centers = [one["center"] for one in documents if one.get("center") and one.get("reference") == name]
+    return [(center["lon"], center["lat"]) for center in centers]

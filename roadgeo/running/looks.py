@@ -17,7 +17,7 @@ from roadgeo.geometry.mask import RoadMask
 from roadgeo.location import Location, Place, Reason
 from roadgeo.matching.explanation import Explanation
 from roadgeo.matching.options import LocateOptions
-from roadgeo.reference.reference import Reference
+from roadgeo.reference.reference import AnyReference
 from roadgeo.segmentation.probability import ProbabilityMap
 
 __all__ = ["Locate", "Look", "Sighting", "locate_looks"]
@@ -25,7 +25,7 @@ __all__ = ["Locate", "Look", "Sighting", "locate_looks"]
 #: Share of the time left that a look may take; the last one may take all.
 _SHARE = 0.6
 
-Locate = Callable[[RoadMask, Sequence[Reference], LocateOptions], "Location | Explanation"]
+Locate = Callable[[RoadMask, Sequence[AnyReference], LocateOptions], "Location | Explanation"]
 
 
 @dataclass(frozen=True)
@@ -59,7 +59,7 @@ class Sighting:
 
 
 def locate_looks(
-    looks: Sequence[Look], references: Sequence[Reference], options: LocateOptions, how: Locate
+    looks: Sequence[Look], references: Sequence[AnyReference], options: LocateOptions, how: Locate
 ) -> Sighting:
     """Take one look after another until one is located, within the time limit of the search.
 
@@ -94,7 +94,7 @@ def _limited(options: LocateOptions, time_limit_s: float) -> LocateOptions:
     return replace(options, search=replace(options.search, time_limit_s=time_limit_s))
 
 
-def _take(look: Look, references: Sequence[Reference], options: LocateOptions, how: Locate) -> Sighting:
+def _take(look: Look, references: Sequence[AnyReference], options: LocateOptions, how: Locate) -> Sighting:
     mask = look.make()
     found = how(mask, references, options)
     probability = look.probability() if look.probability else None

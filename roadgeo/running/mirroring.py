@@ -8,7 +8,7 @@ from dataclasses import replace
 from roadgeo.location import Location, Reason
 from roadgeo.matching.options import LocateOptions
 from roadgeo.outputs.wording import format_lonlat
-from roadgeo.reference.reference import Reference
+from roadgeo.reference.reference import AnyReference
 from roadgeo.running.looks import Sighting
 from roadgeo.workflows import locate
 
@@ -19,7 +19,7 @@ _TIME_LIMIT_S = 2.0
 _WORTH_A_TRY = {Reason.NOTHING_STANDS_OUT, Reason.TIME_LIMIT}
 
 
-def ask_mirrored(sighting: Sighting, references: Sequence[Reference], options: LocateOptions) -> Sighting:
+def ask_mirrored(sighting: Sighting, references: Sequence[AnyReference], options: LocateOptions) -> Sighting:
     """Try a refused mask turned over, left to right; where that is located, the refusal says so.
 
     It stays refused: a mirrored image has no place, and only its owner knows how it came about.

@@ -23,7 +23,7 @@ from roadgeo.geometry.mask import RoadMask
 from roadgeo.location import Location, Reason
 from roadgeo.matching.options import LocateOptions
 from roadgeo.plugins import SEGMENTERS, call_plugin
-from roadgeo.reference.reference import Reference
+from roadgeo.reference.reference import AnyReference
 from roadgeo.running.looks import Locate, Look, Sighting, locate_looks
 from roadgeo.running.mirroring import ask_mirrored
 from roadgeo.segmentation.network import DEFAULT_MODEL, Network, load_network
@@ -79,7 +79,7 @@ class QueryOptions:
 
 def locate_query(
     path: str | AnyArray,
-    references: Sequence[Reference],
+    references: Sequence[AnyReference],
     options: LocateOptions | None = None,
     query: QueryOptions | None = None,
     *,
@@ -119,7 +119,7 @@ def is_model(segmenter: str) -> bool:
 
 
 def _locate_mask(
-    path: str | AnyArray, references: Sequence[Reference], options: LocateOptions, query: QueryOptions, how: Locate
+    path: str | AnyArray, references: Sequence[AnyReference], options: LocateOptions, query: QueryOptions, how: Locate
 ) -> Sighting:
     """Locate a mask, or a soft map of roads at the thresholds that its values suggest."""
     with open_mask(path, band=query.band, threshold=query.threshold) as opened:
@@ -132,7 +132,7 @@ def _locate_mask(
 
 def _locate_photograph(
     paths: Sequence[str],
-    references: Sequence[Reference],
+    references: Sequence[AnyReference],
     options: LocateOptions,
     query: QueryOptions,
     how: Locate,

@@ -23,13 +23,14 @@ from roadgeo.matching.checking import Checked, CheckOptions, check_place
 from roadgeo.matching.options import LocateOptions
 from roadgeo.matching.query import read_query
 from roadgeo.outputs.verification_files import editor_offset, id_fragment
+from roadgeo.reference.reference import Reference
 from roadgeo.running.processes import run
 from roadgeo.running.queries import QueryOptions, locate_query
 from roadgeo.running.tasks import Task
 from roadgeo.sources.georeference import Georeference, read_georeference
 
 if TYPE_CHECKING:
-    from roadgeo.reference.reference import Reference
+    from roadgeo.reference.reference import AnyReference
 
 __all__ = ["SCHEMA", "Verified", "VerifyRun", "verify_image", "verify_images"]
 
@@ -77,7 +78,7 @@ def verify_images(tasks: Sequence[Task], settings: VerifyRun, jobs: int = 1) -> 
     return run(tasks, settings, jobs)
 
 
-def verify_image(image: str, references: Sequence[Reference], settings: VerifyRun | None = None) -> Verified:
+def verify_image(image: str, references: Sequence[AnyReference], settings: VerifyRun | None = None) -> Verified:
     """Say whether an image lies where its georeference says; what is wrong with it is told, not raised."""
     settings = settings or VerifyRun()
     started = perf_counter()
@@ -85,7 +86,8 @@ def verify_image(image: str, references: Sequence[Reference], settings: VerifyRu
         place = read_georeference(image, settings.crs)
         if place is None:
             return Verified(_document(image, Checked("unknown", "it has no georeference: use `roadgeo locate`")))
-        found = _best(_Image(image, place, settings), references)
+        pieces = [Reference(index) for one in references for index in one.indexes_at([place.middle()])]
+        found = _best(_Image(image, place, settings), pieces)
         return replace(found, document={**found.document, "seconds": round(perf_counter() - started, 3)})
     except RoadgeoError as error:
         return _failed(image, str(error))
@@ -104,7 +106,7 @@ def _best(image: _Image, references: Sequence[Reference]) -> Verified:
     most, k = max(counted, key=lambda pair: (pair[0], -pair[1]))
     reference = references[k]
     if most == 0:
-        names = ", ".join(one.name for one in references)
+        names = ", ".join(dict.fromkeys(one.name for one in references))
         return Verified(
             _document(image.name, Checked("unknown", f"it lies on none of the maps ({names})"), image.place)
         )
@@ -133,7 +135,7 @@ def _look(image: _Image, reference: Reference, start: FloatArray) -> Checked:
     results: list[Checked] = []
     width = image.place.size[0]
 
-    def check(mask: RoadMask, _: Sequence[Reference], options: LocateOptions) -> Location:
+    def check(mask: RoadMask, _: Sequence[AnyReference], options: LocateOptions) -> Location:
         query = read_query(mask, options.query)
         coarser = np.diag([width / mask.shape[1]] * 2 + [1.0])  # large photographs are segmented on a coarser grid
         checked = check_place(start @ coarser @ PIXEL_TO_PLANE, query.scene, reference.index, image.settings.options)

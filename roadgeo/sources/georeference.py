@@ -67,6 +67,12 @@ class Georeference:
             raise CrsError(f"its corners lie outside what {self.crs[:40]} or {plane.crs[:40]} is made for")
         return _fit(pixels, xy, projective=True)
 
+    def middle(self) -> tuple[float, float]:
+        """Return longitude and latitude of the middle of the frame."""
+        center = Frame(*self.size).center
+        lon, lat = to_lonlat(self.crs, Homography(self.matrix).facing(center)(np.array([center])))[0].tolist()
+        return lon, lat
+
     def moved(self, on_plane: FloatArray, plane: LocalPlane) -> Georeference:
         """Return the georeference that puts the raster where `on_plane` (3, 3), pixels to a plane, does.
 

@@ -7,6 +7,7 @@ osmnx's `.graphml`, GeoParquet, and everything else that GDAL reads (GeoPackage,
 from __future__ import annotations
 
 from collections.abc import Callable, Iterator, Sequence
+from contextlib import contextmanager
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any, BinaryIO
@@ -19,20 +20,33 @@ from roadgeo.roads.kinds import in_tunnel, names_highways
 from roadgeo.sources.vectors import first_line, list_layers, read_layer, require_file
 
 __all__ = [
+    "GRAPH_ENDINGS",
+    "KIND_COLUMNS",
     "OSM_ATTRIBUTION",
+    "OSM_ENDINGS",
+    "PARQUET_ENDINGS",
+    "TUNNEL_COLUMNS",
     "RoadLines",
+    "choose_layer",
     "crs_name",
+    "from_columns",
+    "from_frame",
+    "geometry_columns",
+    "join_lines",
     "list_sources",
     "read_lines",
+    "reading",
+    "require_rows",
     "simple_lines",
+    "stream_osm",
     "table_lines",
 ]
 
 OSM_ATTRIBUTION = "© OpenStreetMap contributors, ODbL 1.0"
 
-_OSM = (".osm.pbf", ".pbf", ".osm", ".osm.gz", ".osm.bz2", ".osm.xml")
-_PARQUET = (".parquet", ".geoparquet")
-_GRAPH = (".graphml",)
+OSM_ENDINGS = (".osm.pbf", ".pbf", ".osm", ".osm.gz", ".osm.bz2", ".osm.xml")
+PARQUET_ENDINGS = (".parquet", ".geoparquet")
+GRAPH_ENDINGS = (".graphml",)
 _OTHER = (".gpkg", ".shp", ".geojson", ".geojsonl", ".fgb", ".gml", ".kml", ".sqlite", ".tab", ".mif", ".shz")
 
 #: PBF files are read in parts of about this size; what may stand in them at most, as their specification says.
@@ -42,8 +56,8 @@ _PART, _MAX_BLOB, _MAX_BLOB_HEADER = 1 << 20, 32 << 20, 64 << 10
 _UNPACKED_FREE, _UNPACKED_TIMES = 64 << 20, 100
 
 #: Columns that may say what kind of road a line is: OpenStreetMap's, Geofabrik's, Overture's.
-_KIND_COLUMNS = ("highway", "fclass", "class")
-_TUNNEL_COLUMNS = ("tunnel", "road_flags")
+KIND_COLUMNS = ("highway", "fclass", "class")
+TUNNEL_COLUMNS = ("tunnel", "road_flags")
 
 #: Layers to prefer where a file has several with lines.
 _LAYERS = ("roads", "edges", "lines")
@@ -86,7 +100,11 @@ def list_sources(path: Path) -> list[Path]:
         raise RoadSourceError(f"{path}: no such file or folder")
     if not path.is_dir() or path.suffix.lower() == ".gdb":
         return [path]
-    found = sorted(file for file in path.iterdir() if file.name.lower().endswith(_OSM + _PARQUET + _GRAPH + _OTHER))
+    found = sorted(
+        file
+        for file in path.iterdir()
+        if file.name.lower().endswith(OSM_ENDINGS + PARQUET_ENDINGS + GRAPH_ENDINGS + _OTHER)
+    )
     if not found:
         raise RoadSourceError(f"{path}: no road file in this folder; expected names like *.gpkg, *.shp or *.osm.pbf")
     return found
@@ -108,45 +126,56 @@ def read_lines(path: Path, layer: str | None = None, advance: Callable[[float], 
     RoadSourceError
         The file is missing, unreadable, empty or holds no lines.
     """
-    from pyproj.exceptions import ProjError
-    from shapely.errors import ShapelyError
-
-    require_file(path)
-    try:
+    with reading(path):
         read = _read(path, layer, advance)
-    except (ProjError, ShapelyError, RuntimeError, ValueError, LookupError, ArithmeticError, OSError) as error:
-        # Many libraries read such files, and what a damaged one makes them raise is theirs to know.
-        raise RoadSourceError(f"{path}: damaged, or not what its name says: {first_line(error)}") from error
     if len(read.lines) == 0:
         raise RoadSourceError(f"{path}: no lines in it, expected the centre lines of roads")
     return read
 
 
+@contextmanager
+def reading(path: Path) -> Iterator[None]:
+    """Turn what goes wrong with a road file into a `RoadSourceError`."""
+    from pyproj.exceptions import ProjError
+    from shapely.errors import ShapelyError
+
+    require_file(path)
+    try:
+        yield
+    except (ProjError, ShapelyError, RuntimeError, ValueError, LookupError, ArithmeticError, OSError) as error:
+        # Many libraries read such files, and what a damaged one makes them raise is theirs to know.
+        raise RoadSourceError(f"{path}: damaged, or not what its name says: {first_line(error)}") from error
+
+
 def _read(path: Path, layer: str | None, advance: Callable[[float], None]) -> RoadLines:
     name = path.name.lower()
-    if name.endswith(_OSM):
+    if name.endswith(OSM_ENDINGS):
         return _read_osm(path, advance)
-    if name.endswith(_GRAPH):
+    if name.endswith(GRAPH_ENDINGS):
         return _read_graphml(path)
-    return _read_parquet(path) if name.endswith(_PARQUET) else _read_gdal(path, layer)
+    return _read_parquet(path) if name.endswith(PARQUET_ENDINGS) else _read_gdal(path, layer)
 
 
 def _read_osm(path: Path, advance: Callable[[float], None]) -> RoadLines:
-    """Stream the ways with a `highway` tag out of an OpenStreetMap file."""
+    """Read the ways with a `highway` tag of an OpenStreetMap file."""
+    return join_lines(list(stream_osm(path, None, advance)))
+
+
+def stream_osm(
+    path: Path, most: int | None, advance: Callable[[float], None], places: str = "flex_mem"
+) -> Iterator[RoadLines]:
+    """Yield the ways with a `highway` tag, at most so many at a time; `places` is osmium's index of the nodes."""
     import osmium
-    import shapely
 
     factory = osmium.geom.WKBFactory()
-    shapes: list[str] = []
-    highway: list[str] = []
-    tunnel: list[str | None] = []
+    ways: list[tuple[str, str, str | None]] = []
     broken = 0
     try:
         _refuse_bomb(path)
         with osmium.io.Reader(str(path), osmium.osm.NOTHING) as reader:
             header = reader.header()
             timestamp = header.get("osmosis_replication_timestamp") or header.get("timestamp") or None
-        for way in _highways(path, advance):
+        for way in _highways(path, advance, places):
             tags = way.tags
             if tags.get("area") == "yes":
                 continue
@@ -154,18 +183,36 @@ def _read_osm(path: Path, advance: Callable[[float], None]) -> RoadLines:
             if shape is None:
                 broken += 1
                 continue
-            shapes.append(shape)
-            highway.append(tags["highway"])
-            tunnel.append(tags.get("tunnel"))
+            ways.append((shape, tags["highway"], tags.get("tunnel")))
+            if len(ways) == most:
+                yield _from_ways(ways, broken, timestamp)
+                ways, broken = [], 0
     except (RuntimeError, OSError, ValueError) as error:
         raise RoadSourceError(f"{path}: not readable as OpenStreetMap data: {first_line(error)}") from error
-    lines, place = simple_lines(shapely.from_wkb(np.array(shapes, object)))
-    meta = {"format": "OpenStreetMap", "features": len(shapes) + broken, "attribution": OSM_ATTRIBUTION}
+    yield _from_ways(ways, broken, timestamp)
+
+
+def _from_ways(ways: Sequence[tuple[str, str, str | None]], broken: int, timestamp: str | None) -> RoadLines:
+    """Make lines of ways (hexadecimal WKB, `highway`, `tunnel`)."""
+    import shapely
+
+    shapes, highway, tunnel = np.array(ways, object).reshape(-1, 3).T
+    lines, place = simple_lines(shapely.from_wkb(shapes))
+    meta = {"format": "OpenStreetMap", "features": len(ways) + broken, "attribution": OSM_ATTRIBUTION}
     if timestamp:
         meta["osm_timestamp"] = timestamp
-    return RoadLines(
-        lines, "EPSG:4326", np.array(highway, object)[place], in_tunnel(np.array(tunnel, object))[place], meta
-    )
+    return RoadLines(lines, "EPSG:4326", highway[place], in_tunnel(tunnel)[place], meta)
+
+
+def join_lines(parts: Sequence[RoadLines]) -> RoadLines:
+    """Put parts of one source together."""
+    if len(parts) == 1:
+        return parts[0]
+    first = parts[0]
+    highway = None if first.highway is None else np.concatenate([one.highway for one in parts])
+    tunnel = None if first.tunnel is None else np.concatenate([one.tunnel for one in parts])
+    meta = {**first.meta, "features": sum(one.meta["features"] for one in parts)}
+    return RoadLines(np.concatenate([one.lines for one in parts]), first.crs, highway, tunnel, meta)
 
 
 def _refuse_bomb(path: Path) -> None:
@@ -190,12 +237,12 @@ def _refuse_bomb(path: Path) -> None:
         raise RoadSourceError(f"{path}: unpacks to more than {times}; unpack it yourself if you trust it")
 
 
-def _highways(path: Path, advance: Callable[[float], None]) -> Iterator[Any]:
+def _highways(path: Path, advance: Callable[[float], None], index: str) -> Iterator[Any]:
     """Yield the ways with a `highway` tag, which know where their nodes are."""
     import osmium
 
     pool = osmium.io.ThreadPool()
-    places = osmium.NodeLocationsForWays(osmium.index.create_map("flex_mem"))
+    places = osmium.NodeLocationsForWays(osmium.index.create_map(index))
     places.ignore_errors()
     wanted = osmium.filter.EntityFilter(osmium.osm.WAY), osmium.filter.KeyFilter("highway")
     for part, share in _osm_parts(path):
@@ -290,9 +337,9 @@ def _read_graphml(path: Path) -> RoadLines:
         edges = ox.graph_to_gdfs(graph, nodes=False, fill_edge_geometry=True)
     except (ET.ParseError, nx.NetworkXError, KeyError, ValueError, AttributeError) as error:
         raise RoadSourceError(f"{path}: not a street network saved by osmnx: {first_line(error)}") from error
-    columns = {name: edges[name].to_numpy(object) for name in edges.columns if name in _KIND_COLUMNS + _TUNNEL_COLUMNS}
+    columns = {name: edges[name].to_numpy(object) for name in edges.columns if name in KIND_COLUMNS + TUNNEL_COLUMNS}
     meta = {"format": "GraphML", "attribution": OSM_ATTRIBUTION}
-    return _from_columns(edges.geometry.to_numpy(), crs_name(edges.crs), columns, meta)
+    return from_columns(edges.geometry.to_numpy(), crs_name(edges.crs), columns, meta)
 
 
 def _read_parquet(path: Path) -> RoadLines:
@@ -303,12 +350,17 @@ def _read_parquet(path: Path) -> RoadLines:
 
     try:
         names = pq.read_schema(path).names
-        _require_rows(path)
-        wanted = [name for name in _KIND_COLUMNS + _TUNNEL_COLUMNS + ("subtype",) if name in names]
-        geometry = _geometry_columns(path)
+        require_rows(path)
+        wanted = [name for name in KIND_COLUMNS + TUNNEL_COLUMNS + ("subtype",) if name in names]
+        geometry = geometry_columns(path)
         frame = gpd.read_parquet(path, columns=geometry[:1] + wanted)
     except (ValueError, pa.ArrowException, OSError) as error:
         raise RoadSourceError(f"{path}: not readable as GeoParquet: {first_line(error)}") from error
+    return from_frame(frame, wanted)
+
+
+def from_frame(frame: Any, wanted: Sequence[str]) -> RoadLines:
+    """Make lines of a table of GeoParquet."""
     meta = {"format": "GeoParquet"}
     if "subtype" in frame:  # Overture keeps railways and waterways among its segments
         frame = frame[frame["subtype"] == "road"]
@@ -316,10 +368,10 @@ def _read_parquet(path: Path) -> RoadLines:
     columns = {name: frame[name].to_numpy(object) for name in wanted if name != "subtype"}
     if "road_flags" in columns:
         columns["road_flags"] = _overture_flags(columns["road_flags"])
-    return _from_columns(frame.geometry.to_numpy(), crs_name(frame.crs), columns, meta)
+    return from_columns(frame.geometry.to_numpy(), crs_name(frame.crs), columns, meta)
 
 
-def _require_rows(path: Path) -> None:
+def require_rows(path: Path) -> None:
     """Refuse what says to hold more rows than bytes: a few bytes may stand for billions of equal rows."""
     import pyarrow.parquet as pq
 
@@ -330,7 +382,7 @@ def _require_rows(path: Path) -> None:
         raise ValueError(f"its {size:,} bytes say to hold {meta.num_rows:,} rows and {unpacked:,} bytes")
 
 
-def _geometry_columns(path: Path) -> list[str]:
+def geometry_columns(path: Path) -> list[str]:
     """Return the geometry columns of a GeoParquet file, the primary one first."""
     import json
 
@@ -355,15 +407,15 @@ def _read_gdal(path: Path, layer: str | None) -> RoadLines:
     """Read what GDAL reads as lines."""
     import shapely
 
-    layer = _choose_layer(path, layer)
-    found = read_layer(path, layer, _KIND_COLUMNS + _TUNNEL_COLUMNS)
+    layer = choose_layer(path, layer)
+    found = read_layer(path, layer, KIND_COLUMNS + TUNNEL_COLUMNS)
     if found.shapes is None:
         raise RoadSourceError(f"{path}: layer {layer!r} has no geometry, expected lines")
     shapes = shapely.from_wkb(found.shapes, on_invalid="ignore")
-    return _from_columns(shapes, crs_name(found.crs), found.columns, {"format": found.driver, "layer": layer})
+    return from_columns(shapes, crs_name(found.crs), found.columns, {"format": found.driver, "layer": layer})
 
 
-def _choose_layer(path: Path, layer: str | None) -> str:
+def choose_layer(path: Path, layer: str | None) -> str:
     """Return the layer to read: the one asked for, or the one with lines."""
     layers = list_layers(path)
     names = [name for name, _ in layers]
@@ -383,16 +435,16 @@ def _choose_layer(path: Path, layer: str | None) -> str:
 
 def table_lines(table: Any, name: str) -> RoadLines:
     """Return the lines of a GeoDataFrame."""
-    known = [column for column in table.columns if str(column).lower() in _KIND_COLUMNS + _TUNNEL_COLUMNS]
+    known = [column for column in table.columns if str(column).lower() in KIND_COLUMNS + TUNNEL_COLUMNS]
     columns = {str(column).lower(): table[column].to_numpy(object) for column in known}
-    return _from_columns(table.geometry.to_numpy(), crs_name(table.crs), columns, {"name": name})
+    return from_columns(table.geometry.to_numpy(), crs_name(table.crs), columns, {"name": name})
 
 
-def _from_columns(shapes: AnyArray, crs: str | None, columns: dict[str, AnyArray], meta: dict[str, Any]) -> RoadLines:
+def from_columns(shapes: AnyArray, crs: str | None, columns: dict[str, AnyArray], meta: dict[str, Any]) -> RoadLines:
     """Keep the lines and what is known about each."""
     lines, place = simple_lines(shapes)
-    kinds = [columns[name] for name in _KIND_COLUMNS if name in columns and names_highways(columns[name])]
-    tunnels = [in_tunnel(columns[name])[place] for name in _TUNNEL_COLUMNS if name in columns]
+    kinds = [columns[name] for name in KIND_COLUMNS if name in columns and names_highways(columns[name])]
+    tunnels = [in_tunnel(columns[name])[place] for name in TUNNEL_COLUMNS if name in columns]
     return RoadLines(
         lines,
         crs,

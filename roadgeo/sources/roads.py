@@ -22,7 +22,17 @@ from roadgeo.sources.lines import RoadLines, crs_name, list_sources, read_lines,
 if TYPE_CHECKING:
     from roadgeo.sources.overpass import FetchOptions
 
-__all__ = ["Box", "Roads", "choose_roads", "fetch_roads", "project_lines", "read_roads"]
+__all__ = [
+    "Box",
+    "Roads",
+    "choose_lines",
+    "choose_roads",
+    "fetch_roads",
+    "join_roads",
+    "overruled_crs",
+    "project_lines",
+    "read_roads",
+]
 
 _LOG = logging.getLogger(__name__)
 
@@ -109,11 +119,11 @@ def read_roads(
         say(what)
         source = read_lines(file, layer, lambda share, what=what: say(what, share))  # type: ignore[misc]
         if crs is not None and source.meta["format"] != "OpenStreetMap":
-            source = replace(source, crs=_overruled(source.crs, crs, file))
+            source = replace(source, crs=overruled_crs(source.crs, crs, file))
         if source.crs is None:
             raise CrsError(f"{file}: says nothing of its CRS; name it, for example --crs EPSG:26986")
-        sources.append(_choose(source, file.name, which, tunnels, bbox))
-    roads = _join(sources, {"roads": which, "tunnels": tunnels, "bbox": _plain(bbox)}, attribution)
+        sources.append(choose_lines(source, file.name, which, tunnels, bbox))
+    roads = join_roads(sources, {"roads": which, "tunnels": tunnels, "bbox": _plain(bbox)}, attribution)
     return roads if bbox is None else replace(roads, area=box_area(bbox))
 
 
@@ -140,8 +150,8 @@ def choose_roads(
     source = table_lines(roads, "the roads")
     if source.crs is None:
         raise CrsError("the roads have no CRS; set one, for example roads.set_crs('EPSG:26986')")
-    chosen = _choose(source, "the roads", which, tunnels, None)
-    return _join([chosen], {"roads": which, "tunnels": tunnels, "bbox": None}, attribution)
+    chosen = choose_lines(source, "the roads", which, tunnels, None)
+    return join_roads([chosen], {"roads": which, "tunnels": tunnels, "bbox": None}, attribution)
 
 
 def fetch_roads(
@@ -196,8 +206,8 @@ def fetch_roads(
     else:
         area, name = read_area(polygon)
     source = fetch_lines(area, which, tunnels, options, say)
-    chosen = _choose(source, name, which, tunnels, None)
-    return replace(_join([chosen], {"roads": which, "tunnels": tunnels, "bbox": _plain(bbox)}, None), area=area)
+    chosen = choose_lines(source, name, which, tunnels, None)
+    return replace(join_roads([chosen], {"roads": which, "tunnels": tunnels, "bbox": _plain(bbox)}, None), area=area)
 
 
 def project_lines(shapes: Iterable[Any], crs: Any) -> tuple[AnyArray, LocalPlane]:
@@ -214,11 +224,11 @@ def project_lines(shapes: Iterable[Any], crs: Any) -> tuple[AnyArray, LocalPlane
     name = crs_name(crs)
     if name is None:
         raise CrsError("the roads have no CRS; set one, for example roads.set_crs('EPSG:26986')")
-    roads = _join([RoadLines(lines, name, meta={"name": "the roads"})], {}, None)
+    roads = join_roads([RoadLines(lines, name, meta={"name": "the roads"})], {}, None)
     return roads.lines, roads.plane
 
 
-def _choose(source: RoadLines, name: str, which: RoadKind, tunnels: bool, bbox: Box | None) -> RoadLines:
+def choose_lines(source: RoadLines, name: str, which: RoadKind, tunnels: bool, bbox: Box | None) -> RoadLines:
     """Keep the lines that were asked for, and count what was left out."""
     wanted = np.ones(len(source.lines), bool) if source.highway is None else drives(source.highway, which)
     hidden = np.zeros(len(wanted), bool) if tunnels or source.tunnel is None else source.tunnel & wanted
@@ -238,7 +248,7 @@ def _choose(source: RoadLines, name: str, which: RoadKind, tunnels: bool, bbox: 
     return RoadLines(lines, crs, meta=meta)
 
 
-def _join(sources: Sequence[RoadLines], meta: dict[str, Any], attribution: str | None) -> Roads:
+def join_roads(sources: Sequence[RoadLines], meta: dict[str, Any], attribution: str | None) -> Roads:
     """Take the lines of all sources to one plane."""
     filled = [source for source in sources if len(source.lines)]
     if not filled:
@@ -312,7 +322,7 @@ def _clip(lines: AnyArray, bbox: Box) -> AnyArray:
     return simple_lines(np.concatenate(pieces))[0]
 
 
-def _overruled(own: str | None, given: str, file: Path) -> str:
+def overruled_crs(own: str | None, given: str, file: Path) -> str:
     """Return the CRS that was given, and warn where a file says another."""
     from pyproj import CRS
 
@@ -328,6 +338,13 @@ def _overruled(own: str | None, given: str, file: Path) -> str:
 
 
 def _known_crs(crs: str) -> str:
+    """Return the name of a CRS that a user gave.
+
+    Raises
+    ------
+    CrsError
+        It is none of places on Earth.
+    """
     name = crs_name(crs)
     if name is None:
         raise CrsError(f"{crs!r} is no CRS of places on Earth; expected for example EPSG:26986")

@@ -23,7 +23,7 @@ from roadgeo.errors import RoadSourceError
 from roadgeo.storage.gdal import CONSENT, NETWORK, allowed_drivers
 from roadgeo.storage.sqlite import opened, table_problem
 
-__all__ = ["VectorLayer", "first_line", "list_layers", "read_layer", "require_file"]
+__all__ = ["VectorLayer", "count_features", "first_line", "list_layers", "read_layer", "require_file"]
 
 #: GDAL's names of the drivers that may read; they read the file, and those beside it that belong to it.
 _DRIVERS = {
@@ -72,8 +72,26 @@ def list_layers(path: Path) -> list[tuple[str, str]]:
         return [(str(name), str(kind)) for name, kind in pyogrio.list_layers(path)]
 
 
-def read_layer(path: Path, layer: str | None, columns: Sequence[str]) -> VectorLayer:
+def count_features(path: Path, layer: str) -> int:
+    """Return how many features a layer says to hold.
+
+    Raises
+    ------
+    RoadSourceError
+        As `list_layers`.
+    """
+    import pyogrio
+
+    with _guarded(path):
+        return int(pyogrio.read_info(path, layer=layer, force_feature_count=True)["features"])
+
+
+def read_layer(
+    path: Path, layer: str | None, columns: Sequence[str], skip: int = 0, most: int | None = None
+) -> VectorLayer:
     """Read a layer (the first by default), with those of the named columns (in lower case) that it has.
+
+    Some features are left out before, and at most so many are read.
 
     Raises
     ------
@@ -87,7 +105,8 @@ def read_layer(path: Path, layer: str | None, columns: Sequence[str]) -> VectorL
         _require_stored(path, layer)
         info = pyogrio.read_info(path, layer=layer)
         wanted = [name for name in info["fields"] if name.lower() in columns]
-        meta, _, shapes, values = pyogrio.raw.read(path, layer=layer, columns=wanted, force_2d=True)
+        part = {"skip_features": skip, "max_features": most}
+        meta, _, shapes, values = pyogrio.raw.read(path, layer=layer, columns=wanted, force_2d=True, **part)
     named = {name.lower(): column for name, column in zip(meta["fields"], values, strict=True)}
     return VectorLayer(shapes, named, meta["crs"], info["driver"])
 

@@ -5,20 +5,30 @@ from dataclasses import dataclass, field
 
 import pytest
 
-from roadgeo.matching.search import SearchOptions, search
+from roadgeo.matching.search import Search, SearchOptions, search, search_together
 
 
 @dataclass
 class Toy:
-    """Rounds of models; two models mean the same answer where their tens agree."""
+    """Rounds of models; two models mean the same answer where their tens agree; `hidden` ones are found by a lead."""
 
     plan: list[list[tuple[int, float]]]
     settled_from: float = float("-inf")
     seconds: float = 0.0
     scored: list[int] = field(default_factory=list)
 
-    def rounds(self):
-        yield from self.plan
+    hidden: dict[int, list[tuple[int, float]]] = field(default_factory=dict)
+
+    def stages(self):
+        yield iter(self.plan)
+
+    def leads(self, model):
+        return [(0, model[0])]
+
+    def follow(self, leads):
+        for _, sample in leads:
+            if sample in self.hidden:
+                yield self.hidden.pop(sample)
 
     def score(self, model):
         time.sleep(self.seconds)
@@ -102,3 +112,69 @@ def test_impossible_models_lose_to_any_other():
     result = search(Toy([[(1, float("-inf")), (50, -3.0)]]))
     assert answers(result) == (50, 1)
     assert result.score == -3.0
+
+
+# --- many parts -------------------------------------------------------------------------------------------------------
+
+
+class InStages(Toy):
+    """The same, with one round a stage."""
+
+    def stages(self):
+        for models in self.plan:
+            yield iter([models])
+
+
+def together(*toys, options=None):
+    """Search parts together; an answer of one is that of another where their tens agree."""
+    parts = [Search(toy) for toy in toys]
+    search_together(parts, options, lambda one, a, other, b: a[0] // 10 == b[0] // 10)
+    return parts
+
+
+def test_parts_take_turns_and_an_answer_that_stands_out_ends_all():
+    toys = [Toy([[(10 * n + k, 1.0)] for k in range(5)]) for n in range(3)]
+    toys[1].plan[2] = [(17, 30.0)]
+    parts = together(*toys)
+    assert [len(toy.scored) for toy in toys] == [3, 3, 2]
+    assert [one.stopped for one in parts] == ["elsewhere", "accepted", "elsewhere"]
+    assert parts[1].result().best == (17, 30.0)
+
+
+def test_no_part_goes_to_the_next_stage_before_the_others():
+    toys = [InStages([[(n, 1.0)], [(n, 2.0)]]) for n in range(2)]
+    toys[0].plan = [[(0, 1.0)]] * 3
+    order = []
+    for n, toy in enumerate(toys):
+        toy.score = lambda model, n=n: order.append(n) or model[1]
+    assert [one.stopped for one in together(*toys)] == ["exhausted", "exhausted"]
+    assert order == [0, 1, 0, 1, 0]
+
+
+def test_a_twin_on_another_part_is_found_before_an_answer_is_accepted():
+    """What led to the answer is tried on the parts that have not come to it yet."""
+    a, b = Toy([[], [(17, 30.0)], []]), Toy([[], [], []], hidden={17: [(52, 29.0)]})
+    parts = together(a, b)
+    assert [one.stopped for one in parts] == ["exhausted", "exhausted"]
+    assert (parts[0].lead, parts[1].lead) == (30.0, 29.0)
+
+
+def test_the_same_place_on_a_part_that_overlaps_is_no_rival():
+    a, b = Toy([[(17, 30.0)], []]), Toy([[], []], hidden={17: [(11, 29.0)]})
+    assert [one.stopped for one in together(a, b)] == ["accepted", "elsewhere"]
+
+
+def test_a_part_that_stands_out_goes_on_until_it_is_settled():
+    a = Toy([[(17, 30.0)], [(18, 31.0)], [(19, 101.0)], [(1, 0.0)]], settled_from=100.0)
+    b = Toy([[(50, 1.0)]] * 4)
+    assert [one.stopped for one in together(a, b)] == ["accepted", "elsewhere"]
+    assert (a.scored, b.scored) == ([17, 18, 19], [])
+
+
+def test_many_parts_share_one_time_limit():
+    toys = [Toy([[(k, 1.0)] for k in range(100)], seconds=0.005) for _ in range(4)]
+    started = time.perf_counter()
+    parts = together(*toys, options=SearchOptions(time_limit_s=0.05))
+    assert time.perf_counter() - started < 2.0
+    assert {one.stopped for one in parts} == {"time"}
+    assert max(len(toy.scored) for toy in toys) - min(len(toy.scored) for toy in toys) <= 1

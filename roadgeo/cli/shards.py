@@ -1,0 +1,122 @@
+"""`roadgeo index --shards`: a map of any size, piece by piece."""
+
+from __future__ import annotations
+
+import re
+from collections.abc import Callable
+from pathlib import Path
+from time import perf_counter
+from typing import Any, TypeVar
+
+import click
+
+from roadgeo.cli.printing import echo
+
+__all__ = ["build_in_shards", "shard_options"]
+
+Command = TypeVar("Command", bound=Callable[..., Any])
+
+
+class _Shards(click.ParamType):  # type: ignore[type-arg]  # generic only in late versions of click
+    """How a map is cut: "auto", about how many shards, or the side of square ones: "25km"."""
+
+    name = "shards"
+
+    def convert(self, value: Any, param: click.Parameter | None, ctx: click.Context | None) -> dict[str, Any]:
+        """Return what the options of the build are given.
+
+        Raises
+        ------
+        click.BadParameter
+            It is none of these.
+        """
+        if isinstance(value, dict):
+            return value
+        size = re.fullmatch(r"([0-9.]+) ?km", value)
+        if value == "auto":
+            return {}
+        if value.isdecimal() and int(value) > 0:
+            return {"count": int(value)}
+        if size and size[1].count(".") < 2 and size[1] != "." and 1 <= float(size[1]) <= 1000:
+            return {"size_m": 1000.0 * float(size[1])}
+        return self.fail(f"got {value!r}, expected auto, a number, or a side such as 25km (1 to 1000)", param, ctx)
+
+
+_OPTIONS = [
+    click.option(
+        "--shards",
+        metavar="auto|N|SIZEkm",
+        type=_Shards(),
+        help="Build REF.shards, in pieces: as many as is good, about N, or squares of a side. For maps of any size.",
+    ),
+    click.option(
+        "--margin",
+        metavar="METRES",
+        type=click.FloatRange(0, 100_000),
+        default=3000.0,
+        show_default=True,
+        help="With --shards: ground that neighbours share, half the diagonal of the largest frame to locate.",
+    ),
+    click.option(
+        "-j",
+        "--jobs",
+        metavar="N",
+        type=click.IntRange(1),
+        default=1,
+        show_default=True,
+        help="With --shards: processes, each of which builds a shard at a time.",
+    ),
+]
+
+
+def shard_options(command: Command) -> Command:
+    """Add the options that say how a map is cut."""
+    for option in reversed(_OPTIONS):
+        command = option(command)
+    return command
+
+
+def build_in_shards(
+    source: dict[str, Any], name: str, out: str | None, shards: dict[str, Any], margin: float, jobs: int, quiet: bool
+) -> None:
+    """Build a reference in shards from road files, and say what there is.
+
+    Raises
+    ------
+    click.UsageError
+        The roads do not come from files, or `--out` names something else.
+    """
+    from roadgeo.cli.compilation import compile_once
+    from roadgeo.cli.folders import make_folder
+    from roadgeo.cli.progress import show_steps
+    from roadgeo.reference.library import make_slug, new_reference
+    from roadgeo.reference.shards import ENDING
+    from roadgeo.running.sharding import RoadFiles, ShardOptions, build_shards
+
+    if not source["roads"]:
+        raise click.UsageError("--shards goes with --roads: what is fetched from OpenStreetMap fits in one piece.")
+    started = perf_counter()
+    path = Path(out) if out else new_reference(name).with_suffix(ENDING)
+    if path.suffix != ENDING:
+        if path.suffix in {".gpkg", ".index"}:
+            raise click.UsageError(f"--out {out}: with --shards that is a folder; did you mean {path.stem}{ENDING}?")
+        path = path.with_name(f"{path.name}{ENDING}")
+    make_folder(path)
+    files = RoadFiles(
+        tuple(map(Path, source["roads"])),
+        source["layer"],
+        source["crs"],
+        source["kinds"],
+        source["tunnels"],
+        source["bbox"],
+        source["attribution"],
+    )
+    compile_once(quiet)
+    with show_steps(quiet) as say:
+        options = ShardOptions(**shards, margin_m=margin)
+        reference = build_shards(files, path, make_slug(name), options, jobs=jobs, say=say)
+    if not quiet:
+        entries = reference.manifest.filled
+        n = sum(entry.own_intersections for entry in entries)
+        found = f"{path}: {n:,} intersections in {len(entries)} shards in {perf_counter() - started:.1f} s"
+        echo(f"{found}; search it with `roadgeo locate MASK -r {out or path.stem}`")

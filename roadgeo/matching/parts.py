@@ -1,0 +1,83 @@
+"""What is searched: whole references and shards of larger ones, opened when they are needed."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass
+from functools import lru_cache
+from typing import Protocol, TypeAlias
+
+import numpy as np
+
+from roadgeo._arrays import FloatArray
+from roadgeo.geometry.camera import sampling
+from roadgeo.geometry.frame import Frame
+from roadgeo.geometry.projection import from_lonlat
+from roadgeo.matching.index import ReferenceIndex
+
+__all__ = ["Near", "Part", "Whole", "same_within_m", "touches"]
+
+#: Longitude, latitude and a radius in metres.
+Near: TypeAlias = tuple[float, float, float]
+
+#: Metres of a degree of latitude, a little too few.
+_DEGREE_M = 110_500.0
+
+
+class Part(Protocol):
+    """A map, or a piece of one, that is searched together with others."""
+
+    def may_hold(self, near: Near, frame_m: float = 0.0) -> bool:
+        """Whether a frame of that size at most, whose middle lies within a circle, may show it; it is not opened."""
+
+    def open(self) -> ReferenceIndex:
+        """Return its index."""
+
+
+@dataclass(frozen=True)
+class Whole:
+    """A reference of one piece, which is open already."""
+
+    index: ReferenceIndex
+
+    def may_hold(self, near: Near, frame_m: float = 0.0) -> bool:
+        """Whether the circle, widened by the frame, touches the bounds of its intersections."""
+        center = from_lonlat(self.index.plane, np.array([near[:2]], float))[0]
+        low, high = _bounds(self.index)
+        beyond = np.maximum(low - center, center - high)
+        return bool((beyond <= near[2] + frame_m).all())
+
+    def open(self) -> ReferenceIndex:
+        """Return its index."""
+        return self.index
+
+
+@lru_cache(maxsize=1024)
+def _bounds(index: ReferenceIndex) -> tuple[FloatArray, FloatArray]:
+    """Return the least and the greatest coordinates of a map's intersections."""
+    return index.xy.min(axis=0), index.xy.max(axis=0)
+
+
+def touches(box: tuple[float, float, float, float], near: Near) -> bool:
+    """Whether a circle may touch a box of (west, south, east, north) degrees."""
+    west, south, east, north = box
+    lon, lat, radius = near
+    reach = radius / _DEGREE_M
+    if not south - reach <= lat <= north + reach:
+        return False
+    widest = min(max(abs(south), abs(north), abs(lat)) + reach, 89.9)
+    beyond = reach / math.cos(math.radians(widest))
+    return any(west - beyond <= lon + turn <= east + beyond for turn in (-360.0, 0.0, 360.0))
+
+
+def same_within_m(one: ReferenceIndex, other: ReferenceIndex, matrix: FloatArray, size: tuple[int, int]) -> float:
+    """Return how far apart two places may lie on two parts and still be one.
+
+    Shards of one map agree as well as a map with itself: as in `TripleEstimator.same`. Other maps may differ a little,
+    and a place on one of them is taken for that on the other within half a frame.
+    """
+    gsd_m = sampling(matrix, size)
+    shard_of = one.meta.get("shard_of")
+    if shard_of and shard_of == other.meta.get("shard_of"):
+        return max(50.0, 0.05 * gsd_m * Frame(*size).half_diagonal)
+    return 0.5 * gsd_m * max(size)

@@ -1,0 +1,364 @@
+"""A reference in shards: a folder with a manifest and, for each piece of the ground, an ordinary reference.
+
+Layout of `NAME.shards`::
+
+    manifest.json      what there is (schema "roadgeo.shards/1"); written last, so a folder with one is whole
+    BUILD/SHARD.gpkg   and SHARD.index: an ordinary reference each, never changed once it is there
+
+Each shard has ground of its own and, around it, a margin that its neighbours have, too: a frame whose middle lies on
+its own ground lies on it wholly, as long as half of the frame's diagonal is no longer than the margin. What the
+manifest says of a shard is enough not to open it.
+"""
+
+from __future__ import annotations
+
+import contextlib
+import json
+import os
+import re
+from collections.abc import Sequence
+from dataclasses import asdict, dataclass, field
+from functools import cached_property
+from hashlib import blake2b
+from pathlib import Path
+from typing import Any
+
+from roadgeo._progress import Say, say_nothing
+from roadgeo._version import __version__
+from roadgeo.errors import IndexFormatError
+from roadgeo.location import Location
+from roadgeo.matching.index import ReferenceIndex
+from roadgeo.matching.parts import Near, touches
+from roadgeo.reference.files import check_reference, reference_digest, reference_paths
+from roadgeo.reference.spool import Bounds
+from roadgeo.storage.atomic import publish, staging
+
+__all__ = [
+    "ENDING",
+    "Manifest",
+    "Shard",
+    "ShardEntry",
+    "ShardedReference",
+    "check_shards",
+    "describe_shards",
+    "manifest_path",
+    "open_shards",
+    "read_manifest",
+    "shards_digest",
+    "write_manifest",
+]
+
+SCHEMA = "roadgeo.shards/1"
+ENDING = ".shards"
+
+_MANIFEST = "manifest.json"
+_MAX_MANIFEST = 256 << 20
+
+#: What a folder or a shard may be called: nothing that leads elsewhere.
+_NAME = re.compile(r"[\w-]{1,80}")
+
+
+@dataclass(frozen=True)
+class ShardEntry:
+    """What a manifest says of a shard.
+
+    Attributes
+    ----------
+    name : str
+        Of its files.
+    ground, reach : (west, south, east, north)
+        Degrees: the ground that is its own, and that with its margin.
+    crs : str
+        Of its plane; "" where it has too few intersections to be searched, and no files.
+    intersections, own_intersections : int
+        In all, and on its own ground.
+    road_km : float
+    bytes : int
+        Of both files.
+    digest : str
+        Of its intersections (see `network_file.network_digest`).
+    """
+
+    name: str
+    ground: Bounds
+    reach: Bounds
+    crs: str = ""
+    intersections: int = 0
+    own_intersections: int = 0
+    road_km: float = 0.0
+    bytes: int = 0
+    digest: str = ""
+
+    @classmethod
+    def from_dict(cls, values: Any) -> ShardEntry:
+        """Read one out of JSON values, which may hold anything.
+
+        Raises
+        ------
+        ValueError
+            They are none.
+        """
+        if type(values) is not dict or values.keys() != cls.__dataclass_fields__.keys():
+            raise ValueError("a shard lacks an entry")
+        for bounds in (values["ground"], values["reach"]):
+            if type(bounds) is not list or len(bounds) != 4 or not all(_is_number(side) for side in bounds):
+                raise ValueError("a shard has no bounds")
+        texts, numbers = ("name", "crs", "digest"), ("intersections", "own_intersections", "road_km", "bytes")
+        if any(type(values[key]) is not str for key in texts) or not all(_is_number(values[key]) for key in numbers):
+            raise ValueError("a shard's entry has the wrong type")
+        if not _NAME.fullmatch(values["name"]):
+            raise ValueError(f"{values['name']!r} is no name of a shard")
+        return cls(**{**values, "ground": tuple(values["ground"]), "reach": tuple(values["reach"])})
+
+
+def _is_number(value: object) -> bool:
+    return type(value) in (int, float) and -1e15 < value < 1e15  # type: ignore[operator]
+
+
+@dataclass(frozen=True)
+class Manifest:
+    """What a sharded reference is made of.
+
+    Attributes
+    ----------
+    build : str
+        Name of the folder of its shards: a digest of what they were built from, and how.
+    crs : str
+        That the roads came in.
+    margin_m : float
+    meta : dict
+        As in the shards: sources, attribution, kinds of roads, options.
+    """
+
+    name: str
+    build: str
+    crs: str
+    margin_m: float
+    meta: dict[str, Any] = field(repr=False)
+    shards: tuple[ShardEntry, ...] = field(repr=False)
+    roadgeo: str = __version__
+
+    @property
+    def filled(self) -> tuple[ShardEntry, ...]:
+        """The shards that can be searched."""
+        return tuple(entry for entry in self.shards if entry.crs)
+
+    def to_dict(self) -> dict[str, Any]:
+        """Plain values."""
+        return {"schema": SCHEMA, **asdict(self)}
+
+
+def manifest_path(path: str | os.PathLike[str]) -> Path | None:
+    """Return the manifest of a sharded reference, given that, its folder or what that is called; None if it is none."""
+    given = Path(path)
+    if given.name == _MANIFEST:
+        given = given.parent
+    for folder in (given, given.with_name(f"{given.name}{ENDING}")):
+        if (folder / _MANIFEST).is_file():
+            return folder / _MANIFEST
+    return None
+
+
+def read_manifest(path: Path) -> Manifest:
+    """Read a manifest.
+
+    Raises
+    ------
+    IndexFormatError
+        It is missing, damaged, or of another version.
+    """
+    again = "build it again with `roadgeo index --shards`"
+    try:
+        if path.stat().st_size > _MAX_MANIFEST:
+            raise IndexFormatError(f"{path}: is too large to be a manifest of shards; {again}")
+        return _parse_manifest(json.loads(path.read_text(encoding="utf-8")))
+    except OSError as error:
+        raise IndexFormatError(f"{path}: {(error.strerror or str(error)).lower()}; {again}") from error
+    except (ValueError, TypeError, LookupError, RecursionError) as error:
+        raise IndexFormatError(f"{path}: is damaged, or of another version: {error}; {again}") from error
+
+
+def _parse_manifest(told: Any) -> Manifest:
+    """Make a manifest of JSON values, which may hold anything."""
+    if type(told) is not dict or told.pop("schema", None) != SCHEMA:
+        raise ValueError(f"expected an object of schema {SCHEMA}")
+    shards = tuple(ShardEntry.from_dict(values) for values in told.pop("shards"))
+    found = Manifest(**told, shards=shards)
+    texts = (found.name, found.build, found.crs, found.roadgeo)
+    if any(type(text) is not str for text in texts) or not _NAME.fullmatch(found.build):
+        raise ValueError("a name is wrong")
+    if type(found.meta) is not dict or not _is_number(found.margin_m) or not found.filled:
+        raise ValueError("it has no shards")
+    return found
+
+
+def write_manifest(folder: Path, manifest: Manifest) -> Path:
+    """Write the manifest of a folder, whole or not at all.
+
+    Raises
+    ------
+    OutputError
+        It cannot be written.
+    """
+    path = folder / _MANIFEST
+    with staging(path) as staged:
+        (staged / _MANIFEST).write_text(json.dumps(manifest.to_dict(), indent=1, allow_nan=False), encoding="utf-8")
+        publish(staged / _MANIFEST, path)
+    return path
+
+
+# --- searching --------------------------------------------------------------------------------------------------------
+
+
+@dataclass(frozen=True)
+class Shard:
+    """A shard that is opened when it is needed, and then stays open: its arrays are memory-mapped."""
+
+    entry: ShardEntry
+    path: Path
+
+    def may_hold(self, near: Near, frame_m: float = 0.0) -> bool:  # noqa: ARG002 (its margin holds the frame)
+        """Whether the middle of a frame may lie on its own ground and within a circle."""
+        return touches(self.entry.ground, near)
+
+    def open(self) -> ReferenceIndex:
+        """Return its index.
+
+        Raises
+        ------
+        IndexFormatError
+            It is missing, damaged, or not the one that the manifest names.
+        """
+        return self._index
+
+    @cached_property
+    def _index(self) -> ReferenceIndex:
+        from roadgeo.reference.reference import open_whole
+
+        if reference_digest(self.path) not in {self.entry.digest, ""}:
+            raise IndexFormatError(f"{self.path}: is not the shard that the manifest names; build the reference again")
+        return open_whole(self.path).index
+
+
+@dataclass(frozen=True)
+class ShardedReference:
+    """A map in shards; it is searched as one (see `reference.Reference`)."""
+
+    path: Path
+    manifest: Manifest
+    parts: tuple[Shard, ...] = field(repr=False)
+
+    @property
+    def name(self) -> str:
+        """What the user calls it."""
+        return self.manifest.name
+
+    def index_of(self, location: Location) -> ReferenceIndex:
+        """Return the index of the shard that a location lies on; of the first where there is no place."""
+        center = location.center
+        if center is None:
+            return self.parts[0].open()
+        near = (center.lon, center.lat, 0.0)
+        here = [one for one in self.parts if one.entry.crs == location.crs and touches(one.entry.reach, near)]
+        return min(here or self.parts, key=lambda one: not touches(one.entry.ground, near)).open()
+
+    def indexes_at(self, places: Sequence[tuple[float, float]]) -> list[ReferenceIndex]:
+        """Return the indexes of the shards on whose ground places (longitude, latitude) lie, at least one."""
+        held = [one for one in self.parts if any(touches(one.entry.ground, (*place, 0.0)) for place in places)]
+        return [one.open() for one in (held or self.parts[:1])[:_MOST_DRAWN]]
+
+
+#: A page of an overview draws no more shards than this.
+_MOST_DRAWN = 9
+
+
+def open_shards(path: Path) -> ShardedReference:
+    """Open a sharded reference by its manifest; none of its shards yet.
+
+    Raises
+    ------
+    IndexFormatError
+        The manifest is damaged.
+    """
+    manifest = read_manifest(path)
+    parts = tuple(Shard(entry, _shard_path(path, manifest, entry)) for entry in manifest.filled)
+    _allow_open_files(2 * len(parts))
+    return ShardedReference(path.parent, manifest, parts)
+
+
+def _shard_path(path: Path, manifest: Manifest, entry: ShardEntry) -> Path:
+    return path.parent / manifest.build / f"{entry.name}.gpkg"
+
+
+def _allow_open_files(more: int) -> None:
+    """Ask the system for as many open files as there are shards: each that is mapped counts as one."""
+    with contextlib.suppress(ImportError, ValueError, OSError):
+        import resource
+
+        soft, hard = resource.getrlimit(resource.RLIMIT_NOFILE)
+        wanted = min(more + 1024, hard) if hard != resource.RLIM_INFINITY else more + 1024
+        if wanted > soft != resource.RLIM_INFINITY:
+            resource.setrlimit(resource.RLIMIT_NOFILE, (wanted, hard))
+
+
+# --- describing and checking ------------------------------------------------------------------------------------------
+
+
+def shards_digest(path: Path) -> str:
+    """Return a digest of the intersections of all shards.
+
+    Raises
+    ------
+    IndexFormatError
+        The manifest is damaged.
+    """
+    digests = "".join(entry.digest for entry in read_manifest(path).filled)
+    return blake2b(digests.encode(), digest_size=16).hexdigest()
+
+
+def describe_shards(path: Path) -> dict[str, Any]:
+    """Describe a sharded reference in plain values, as `files.describe_reference` does; no shard is opened.
+
+    Raises
+    ------
+    IndexFormatError
+        The manifest is damaged.
+    """
+    manifest = read_manifest(path)
+    shards, filled = manifest.shards, manifest.filled
+    missing = [entry for entry in filled if not reference_paths(_shard_path(path, manifest, entry)).index.is_file()]
+    west, south, east, north = zip(*(entry.reach for entry in filled), strict=True)
+    return {
+        "name": manifest.name,
+        "freshness": "shards missing" if missing else "fresh",
+        "files": {str(path.parent): path.stat().st_size + sum(entry.bytes for entry in shards)},
+        "crs": ", ".join(dict.fromkeys(entry.crs for entry in filled)),
+        "counts": {"intersections": sum(entry.own_intersections for entry in filled)},
+        "meta": manifest.meta,
+        "roadgeo": manifest.roadgeo,
+        "extent_lonlat": [min(west), min(south), max(east), max(north)],
+        "shards": {
+            "count": len(filled),
+            "without_roads": len(shards) - len(filled),
+            "margin_m": manifest.margin_m,
+            "largest": max(entry.intersections for entry in filled),
+            "with_margins": sum(entry.intersections for entry in filled),
+        },
+    }
+
+
+def check_shards(path: Path, say: Say = say_nothing) -> list[str]:
+    """Verify all shards thoroughly, and that they are those that the manifest names; return the problems."""
+    try:
+        manifest = read_manifest(path)
+    except IndexFormatError as error:
+        return [str(error)]
+    problems: list[str] = []
+    for n, entry in enumerate(manifest.filled):
+        say(f"checking {len(manifest.filled)} shards", n / len(manifest.filled))
+        shard = _shard_path(path, manifest, entry)
+        found: Sequence[str] = check_reference(shard)
+        if not found and reference_digest(shard) != entry.digest:
+            found = [f"{shard}: is not the shard that the manifest names; build the reference again"]
+        problems += found
+    return problems

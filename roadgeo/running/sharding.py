@@ -1,0 +1,333 @@
+"""Building a reference in shards: roads are streamed once onto disk, and each shard is built from what lies near it.
+
+Memory is bounded by what one shard needs: about 12 kB for each of its intersections, margins included. A build that is
+killed goes on where it stopped, and one that is done is not done again, as long as its sources and options are the
+same.
+"""
+
+from __future__ import annotations
+
+import contextlib
+import json
+import math
+import shutil
+from collections.abc import Callable, Iterator, Sequence
+from dataclasses import asdict, dataclass, field, replace
+from hashlib import blake2b
+from pathlib import Path
+from typing import Any, TypeAlias
+
+import numpy as np
+
+from roadgeo._progress import Say, say_nothing
+from roadgeo.errors import CrsError, RoadgeoError, RoadSourceError
+from roadgeo.geometry.projection import transformer
+from roadgeo.matching.index import build_index
+from roadgeo.reference.index_file import FORMAT_VERSION
+from roadgeo.reference.reference import BuildOptions, Reference, build_network
+from roadgeo.reference.shard_plan import ShardBox, bounds_in_degrees, plan_shards, widen
+from roadgeo.reference.shards import Manifest, ShardedReference, ShardEntry, manifest_path, open_shards, write_manifest
+from roadgeo.reference.spool import Spool
+from roadgeo.roads.kinds import RoadKind
+from roadgeo.running.processes import run
+from roadgeo.sources.lines import RoadLines, list_sources
+from roadgeo.sources.roads import Box, choose_lines, join_roads, overruled_crs
+from roadgeo.sources.streams import stream_lines
+from roadgeo.storage.atomic import writing
+from roadgeo.storage.files import write_bytes
+
+__all__ = ["RoadFiles", "ShardOptions", "build_shards"]
+
+#: A shard of this many straight pieces of road has 30,000 to 80,000 intersections, and takes 0.4 to 1 GB to build.
+_SEGMENTS = 200_000
+
+#: Lines are put on disk by cells of this size.
+_CELL_M = 5000.0
+_DEGREE_M = 111_320.0
+
+#: (tasks, work, jobs) to results in the order of the tasks: `_processes.run`, or what does the same elsewhere.
+Runner: TypeAlias = Callable[[Sequence[ShardBox], "ShardWork"], Iterator[ShardEntry | str]]
+
+
+@dataclass(frozen=True)
+class RoadFiles:
+    """Road files, and which of their roads are taken (see `sources.roads.read_roads`)."""
+
+    paths: tuple[Path, ...]
+    layer: str | None = None
+    crs: str | None = None
+    which: RoadKind = "drivable"
+    tunnels: bool = False
+    bbox: Box | None = None
+    attribution: str | None = None
+
+    @property
+    def files(self) -> list[Path]:
+        """The files; a folder stands for those in it."""
+        return [file for path in self.paths for file in list_sources(path)]
+
+
+@dataclass(frozen=True)
+class ShardOptions:
+    """How a map is cut.
+
+    Attributes
+    ----------
+    count : int or None
+        About so many shards; None: as many as keep each at a size that is quick to build.
+    size_m : float or None
+        Side of square shards instead.
+    margin_m : float
+        Ground around each shard that its neighbours have, too: half the diagonal of the largest frame that is to be
+        located as well as on one piece.
+    """
+
+    count: int | None = None
+    size_m: float | None = None
+    margin_m: float = 3000.0
+    build: BuildOptions = field(default_factory=BuildOptions)
+
+
+def build_shards(
+    roads: RoadFiles,
+    folder: Path,
+    name: str,
+    options: ShardOptions | None = None,
+    *,
+    jobs: int = 1,
+    runner: Runner | None = None,
+    say: Say = say_nothing,
+) -> ShardedReference:
+    """Build a reference in shards, or go on with a build that was cut short.
+
+    Parameters
+    ----------
+    folder : Path
+        Where its manifest goes; made if it is missing. A reference that is there is replaced in the end.
+    jobs : int
+        Processes; each builds a shard at a time.
+    runner : callable, optional
+        Does the shards instead: on a cluster, for instance.
+
+    Raises
+    ------
+    RoadSourceError, CrsError
+        A source is missing, unreadable or without CRS; there are no roads; a shard could not be built.
+    OutputError
+        A file cannot be written.
+    """
+    options = options or ShardOptions()
+    build = _fingerprint(roads, name, options)
+    done = manifest_path(folder)
+    if done is not None:
+        with contextlib.suppress(RoadgeoError):
+            there = open_shards(done)
+            if there.manifest.build == build:
+                return there
+    work = folder / f".{build}"
+    with writing(work):
+        work.mkdir(parents=True, exist_ok=True)
+        (folder / build).mkdir(exist_ok=True)
+    spooled = _spool(roads, work, options, say)
+    boxes = _plan(spooled, options)
+    shards = ShardWork(str(work), str(folder / build), {**spooled.meta, "name": name, "shard_of": build}, options)
+    entries = []
+    for n, entry in enumerate((runner or (lambda tasks, how: run(tasks, how, jobs)))(boxes, shards), 1):
+        if isinstance(entry, str):
+            raise RoadSourceError(f"{folder}: {entry}; the same command goes on with what is missing")
+        entries.append(entry)
+        say(f"building {len(boxes)} shards", n / len(boxes))
+    if not any(entry.crs for entry in entries):
+        raise RoadSourceError(f"{folder}: no shard has three intersections; take a larger area or other --kinds")
+    manifest = Manifest(name, build, spooled.crs, options.margin_m, shards.meta, tuple(entries))
+    path = write_manifest(folder, manifest)
+    _tidy(folder, build)
+    return open_shards(path)
+
+
+def _fingerprint(roads: RoadFiles, name: str, options: ShardOptions) -> str:
+    """Return a digest of what is built, and how: equal for the same question."""
+    files = [(str(file.resolve()), file.stat().st_size, file.stat().st_mtime_ns) for file in roads.files]
+    asked = [files, asdict(replace(roads, paths=())), asdict(options), name, FORMAT_VERSION]
+    return blake2b(json.dumps(asked).encode(), digest_size=8).hexdigest()
+
+
+def _tidy(folder: Path, build: str) -> None:
+    """Remove what is no longer needed: lines on disk, and the shards of earlier builds."""
+    for other in folder.iterdir():
+        if other.is_dir() and other.name != build:
+            shutil.rmtree(other, ignore_errors=True)
+
+
+# --- lines onto disk --------------------------------------------------------------------------------------------------
+
+
+@dataclass(frozen=True)
+class _Spooled:
+    """Lines on disk: their CRS, the size of the cells, the straight pieces in each, and where they came from."""
+
+    crs: str
+    size: float
+    n_segments: dict[tuple[int, int], int]
+    meta: dict[str, Any]
+
+
+def _spool(roads: RoadFiles, work: Path, options: ShardOptions, say: Say) -> _Spooled:
+    """Stream the lines of all sources onto disk, unless that is done already."""
+    path = work / "lines.json"
+    if path.is_file():
+        told = json.loads(path.read_text(encoding="utf-8"))
+        counts = {(x, y): n for x, y, n in told.pop("n_segments")}
+        return _Spooled(**told, n_segments=counts)
+    spooled = _stream(roads, work / "lines", options, None, say)
+    if spooled is None:  # sources of different CRS
+        spooled = _stream(roads, work / "lines", options, "EPSG:4326", say)
+    if spooled is None or not spooled.n_segments:
+        raise RoadSourceError(f"{', '.join(map(str, roads.paths))}: no roads of the kind asked for; try other --kinds")
+    rows = [[x, y, n] for (x, y), n in spooled.n_segments.items()]
+    write_bytes(path, json.dumps({**spooled.__dict__, "n_segments": rows}).encode())
+    return spooled
+
+
+def _stream(roads: RoadFiles, folder: Path, options: ShardOptions, crs: str | None, say: Say) -> _Spooled | None:
+    """Put the lines on disk in a CRS, or in that which all sources have; None if they have different ones."""
+    with writing(folder):
+        shutil.rmtree(folder, ignore_errors=True)
+        folder.mkdir()
+    spool, sources = None, []
+    for file in roads.files:
+        told: dict[str, Any] = {}
+        what = f"reading {file.name}"
+        say(what)
+        for part in stream_lines(file, roads.layer, advance=lambda share, what=what: say(what, share)):  # type: ignore[misc]
+            chosen = choose_lines(_with_crs(part, roads, file), file.name, roads.which, roads.tunnels, roads.bbox)
+            _add_up(told, chosen.meta)
+            crs = crs or chosen.crs
+            if spool is None:
+                spool = Spool(folder, _cell_size(str(crs), options))
+            if chosen.crs != crs and crs != "EPSG:4326":
+                return None
+            with writing(folder):
+                spool.add(_to(chosen, str(crs)))
+        sources.append(told)
+    calls = dict.fromkeys(one["attribution"] for one in sources if one.get("attribution"))
+    meta = {
+        "roads": roads.which,
+        "tunnels": roads.tunnels,
+        "bbox": None if roads.bbox is None else list(roads.bbox),
+        "sources": sources,
+        "attribution": "; ".join(calls) if roads.attribution is None else roads.attribution,
+    }
+    return None if spool is None else _Spooled(str(crs), spool.size, dict(spool.n_segments), meta)
+
+
+def _with_crs(part: RoadLines, roads: RoadFiles, file: Path) -> RoadLines:
+    if roads.crs is not None and part.meta["format"] != "OpenStreetMap":
+        return replace(part, crs=overruled_crs(part.crs, roads.crs, file))
+    if part.crs is None:
+        raise CrsError(f"{file}: says nothing of its CRS; name it, for example --crs EPSG:26986")
+    return part
+
+
+def _add_up(told: dict[str, Any], part: dict[str, Any]) -> None:
+    """Add the counts of a part of a source to what is told of it."""
+    for key, value in part.items():
+        is_count = type(value) is int
+        told[key] = told.get(key, 0) + value if is_count else value
+
+
+def _to(lines: RoadLines, crs: str) -> Any:
+    """Return lines in another CRS."""
+    import shapely
+
+    if lines.crs == crs:
+        return lines.lines
+    coords = shapely.get_coordinates(lines.lines)
+    moved = np.stack(transformer(str(lines.crs), crs).transform(coords[:, 0], coords[:, 1]), axis=1)
+    return shapely.set_coordinates(lines.lines.copy(), moved)
+
+
+def _metres(crs: str) -> float | None:
+    """Return the metres of a unit of a CRS; None for degrees."""
+    from pyproj import CRS
+
+    known = CRS.from_user_input(crs)
+    return float(known.axis_info[0].unit_conversion_factor) if known.is_projected else None
+
+
+def _cell_size(crs: str, options: ShardOptions) -> float:
+    return (options.size_m or _CELL_M) / (_metres(crs) or _DEGREE_M)
+
+
+def _plan(spooled: _Spooled, options: ShardOptions) -> list[ShardBox]:
+    """Cut the ground into shards."""
+    total = sum(spooled.n_segments.values())
+    if options.size_m is not None:
+        most = 0.0
+    elif options.count is not None:
+        most = math.ceil(total / options.count) * 1.2  # halves of halves are not quite even
+    else:
+        most = _SEGMENTS
+    return plan_shards(spooled.n_segments, spooled.size, most)
+
+
+# --- shards -----------------------------------------------------------------------------------------------------------
+
+
+@dataclass(frozen=True)
+class ShardWork:
+    """Builds shards; travels to other processes (see `_processes.Work`)."""
+
+    work: str
+    folder: str
+    meta: dict[str, Any]
+    options: ShardOptions
+
+    def prepare(self) -> Callable[[ShardBox], ShardEntry | str]:
+        """Return what builds one shard, unless it is there."""
+        told = json.loads((Path(self.work) / "lines.json").read_text(encoding="utf-8"))
+        spool, crs = Spool(Path(self.work) / "lines", told["size"]), str(told["crs"])
+        return lambda box: self._build(box, spool, crs)
+
+    def give_up(self, task: ShardBox, reason: str) -> str:
+        """Say that a shard could not be built."""
+        return f"shard {task.name}: {reason}"
+
+    def _build(self, box: ShardBox, spool: Spool, crs: str) -> ShardEntry:
+        done = Path(self.folder) / f"{box.name}.json"
+        if done.is_file():
+            return ShardEntry.from_dict(json.loads(done.read_text(encoding="utf-8")))
+        reach = widen(box.core, self.options.margin_m, _metres(crs))
+        entry = ShardEntry(box.name, bounds_in_degrees(box.core, crs), bounds_in_degrees(reach, crs))
+        lines = spool.read(reach)
+        if len(lines):
+            entry = self._build_reference(entry, RoadLines(lines, crs, meta={"name": box.name}), box)
+        write_bytes(done, json.dumps(asdict(entry)).encode())  # last: what it tells of is there
+        return entry
+
+    def _build_reference(self, entry: ShardEntry, lines: RoadLines, box: ShardBox) -> ShardEntry:
+        """Build and write the reference of a shard; without three intersections there is none."""
+        from roadgeo.reference.files import reference_digest, reference_paths
+        from roadgeo.reference.network_file import as_stored
+
+        joined = join_roads([lines], {}, None)
+        meta = {**self.meta, "plane": joined.meta["plane"], "shard": box.name}
+        network = as_stored(build_network(joined.lines, joined.plane, meta, self.options.build))
+        if len(network.intersections) < 3:
+            return entry
+        index = build_index(network, self.options.build.index)
+        path = Path(self.folder) / f"{box.name}.gpkg"
+        Reference(index, network).save(path)
+        there = transformer(joined.plane.crs, str(lines.crs)).transform(*joined.plane.to_crs(index.xy).T)
+        x0, y0, x1, y1 = box.core
+        own = (there[0] >= x0) & (there[0] < x1) & (there[1] >= y0) & (there[1] < y1)
+        files = reference_paths(path)
+        return replace(
+            entry,
+            crs=joined.plane.crs,
+            intersections=len(index),
+            own_intersections=int(own.sum()),
+            road_km=round(float(network.graph.edge_lengths().sum()) / 1e3, 3),
+            bytes=files.geopackage.stat().st_size + files.index.stat().st_size,
+            digest=reference_digest(path),
+        )

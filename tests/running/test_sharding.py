@@ -1,0 +1,201 @@
+"""A map in shards: built piece by piece, gone on with after a failure, and searched as one map."""
+
+import json
+import shutil
+from dataclasses import replace
+
+import numpy as np
+import pytest
+import shapely
+from worlds.fenway import write_vector
+from worlds.scenes import PLANE, Sight, camera, look, mapped, random_lines, scene_of
+
+from roadgeo.cli import main
+from roadgeo.errors import IndexFormatError, RoadSourceError
+from roadgeo.location import Seconds
+from roadgeo.matching.methods import search_references
+from roadgeo.matching.options import LocateOptions
+from roadgeo.matching.query import Query
+from roadgeo.matching.verdict import decide
+from roadgeo.reference.inspection import check_reference, reference_digest
+from roadgeo.reference.reference import open_reference
+from roadgeo.running import sharding
+from roadgeo.running.sharding import RoadFiles, ShardOptions, build_shards
+from roadgeo.workflows import build_reference
+
+pytestmark = pytest.mark.slow
+
+SIDE = 5000.0
+OPTIONS = ShardOptions(size_m=2500.0, margin_m=1000.0)
+
+
+@pytest.fixture(scope="module")
+def roads(tmp_path_factory):
+    """A town of 5 x 5 km as a road file, in degrees."""
+    lines = [shapely.LineString(PLANE.to_crs(np.array(line.coords))) for line in random_lines(5, SIDE)]
+    return write_vector_crs(tmp_path_factory.mktemp("roads") / "town.gpkg", lines)
+
+
+def write_vector_crs(path, lines):
+    write_vector(path, lines, crs=PLANE.crs)
+    return path
+
+
+@pytest.fixture(scope="module")
+def whole(roads):
+    return build_reference(roads, "town")
+
+
+@pytest.fixture(scope="module")
+def sharded(roads, tmp_path_factory):
+    return build_shards(RoadFiles((roads,)), tmp_path_factory.mktemp("sharded") / "town.shards", "town", OPTIONS)
+
+
+def locate(place, *references, near=None, **sight):
+    """Locate what a camera sees at a place of the town (metres from its corner)."""
+    truth = camera(place, (1000, 1000), 1.0, 10.0, 40.0, 130.0)
+    graph = look(towns_network(), truth, sight=Sight(1.5, **sight), seed=3)
+    query = Query("q", scene_of(graph), graph, Seconds())
+    options = LocateOptions(near=near)
+    options = replace(options, search=replace(options.search, time_limit_s=60.0))
+    parts = [part for one in references for part in one.parts]
+    return decide(query, search_references(query, parts, options, 60.0), options)
+
+
+def towns_network(cache=[]):  # noqa: B006 (made once)
+    from worlds.scenes import random_network
+
+    if not cache:
+        cache.append(random_network(5, SIDE))
+    return cache[0]
+
+
+def gap(location, place):
+    truth = PLANE.to_crs(mapped(camera(place, (1000, 1000), 1.0, 10.0, 40.0, 130.0), np.array([[500.0, -500.0]])))[0]
+    return np.hypot(location.center.x - truth[0], location.center.y - truth[1])
+
+
+def test_shards_hold_what_the_whole_holds(whole, sharded):
+    entries = sharded.manifest.filled
+    assert len(entries) >= 4
+    assert sum(entry.own_intersections for entry in entries) == pytest.approx(len(whole.index), abs=3)
+    assert {entry.crs for entry in entries} == {whole.index.plane.crs}
+    assert check_reference(sharded.path) == []
+
+
+@pytest.mark.parametrize("place", [(1200.0, 1300.0), (2500.0, 2500.0), (2500.0, 3700.0), (3800.0, 900.0)])
+def test_shards_answer_as_the_whole_does(whole, sharded, place):
+    """In the middle of a shard, on a border, and where four meet: one place, and no twin of itself."""
+    answers = [locate(place, one) for one in (whole, sharded)]
+    for one in answers:
+        assert (one.status, one.reference) == ("located", "town")
+        assert gap(one, place) < 2.0
+    assert answers[1].log10_odds == pytest.approx(answers[0].log10_odds, abs=2.0)
+    assert np.allclose(answers[0].footprint, answers[1].footprint, atol=1.0)
+
+
+def test_a_stranger_is_refused_once_for_all_shards(sharded):
+    from worlds.scenes import random_network
+
+    graph = look(random_network(77, 2000.0), camera((1000, 1000)), sight=Sight(1.5))
+    query = Query("q", scene_of(graph), graph, Seconds())
+    options = replace(LocateOptions(), effort="quick")
+    answer = decide(query, search_references(query, sharded.parts, options, 60.0), options)
+    assert (answer.status, answer.reference) == ("not_located", "town")
+    assert "looked on" not in answer.reason
+
+
+def test_only_shards_that_may_hold_the_place_are_opened(sharded, roads):
+    fresh = open_reference(sharded.path)
+    place = (1200.0, 1300.0)
+    found = locate(place, fresh)
+    opened = [one for one in fresh.parts if "_index" in vars(one)]
+    assert len(opened) == len(fresh.parts)
+    fresh = open_reference(sharded.path)
+    near = (found.center.lon, found.center.lat, 200.0)
+    assert locate(place, fresh, near=near).located
+    opened = [one for one in fresh.parts if "_index" in vars(one)]
+    assert len(opened) == 1
+    far = locate(place, open_reference(sharded.path), near=(10.0, 10.0, 500.0))
+    assert far.status == "not_located"
+    assert "around the place given by near" in far.reason
+
+
+def test_a_build_that_was_cut_short_goes_on(roads, tmp_path, monkeypatch):
+    folder, built = tmp_path / "town.shards", []
+    usual = sharding.build_network
+
+    def dies(lines, plane, meta, *rest):
+        built.append(meta["shard"])
+        if len(built) == 3:
+            raise KeyboardInterrupt
+        return usual(lines, plane, meta, *rest)
+
+    monkeypatch.setattr(sharding, "build_network", dies)
+    with pytest.raises(KeyboardInterrupt):
+        build_shards(RoadFiles((roads,)), folder, "town", OPTIONS)
+    with pytest.raises(IndexFormatError):
+        open_reference(folder)
+    streamed = []
+    monkeypatch.setattr(sharding, "stream_lines", lambda *_, **__: streamed.append(1) or iter(()))
+    reference = build_shards(RoadFiles((roads,)), folder, "town", OPTIONS)
+    assert not streamed
+    assert len(built) == len(set(built)) + 1  # only the one that died was begun twice
+    digest = reference_digest(folder)
+    again = build_shards(RoadFiles((roads,)), folder, "town", OPTIONS)
+    assert (len(built), again.manifest) == (len(reference.parts) + 1, reference.manifest)
+    assert {path.name for path in folder.iterdir()} == {"manifest.json", reference.manifest.build}
+    assert reference_digest(folder) == digest
+
+
+def test_two_processes_build_the_same(roads, sharded, tmp_path):
+    other = build_shards(RoadFiles((roads,)), tmp_path / "town.shards", "town", OPTIONS, jobs=2)
+    assert [e.digest for e in other.manifest.shards] == [e.digest for e in sharded.manifest.shards]
+
+
+def test_a_shard_of_another_build_is_refused(sharded, tmp_path):
+    shutil.copytree(sharded.path, tmp_path / "town.shards")
+    fresh = open_reference(tmp_path / "town.shards")
+    one, other = fresh.parts[:2]
+    for ending in (".gpkg", ".index"):
+        shutil.copy(other.path.with_suffix(ending), one.path.with_suffix(ending))
+    with pytest.raises(IndexFormatError, match="not the shard"):
+        one.open()
+    assert any("not the shard" in problem for problem in check_reference(fresh.path))
+
+
+def test_no_roads_no_shards(tmp_path):
+    path = tmp_path / "a.gpkg"
+    write_vector(path, [shapely.LineString([(0, 0), (0.01, 0)])])
+    with pytest.raises(RoadSourceError, match="no shard has three intersections"):
+        build_shards(RoadFiles((path,)), tmp_path / "a.shards", "a")
+
+
+def test_the_command_line_builds_describes_lists_and_removes(roads, tmp_path, monkeypatch, capsys):
+    monkeypatch.setenv("ROADGEO_LIBRARY", str(tmp_path / "library"))
+    (tmp_path / "library").mkdir()
+    assert main(["index", "--roads", str(roads), "--shards", "2km", "--margin", "500", "--name", "Town"]) == 0
+    assert "shards in" in capsys.readouterr().out
+    assert main(["info", "town"]) == 0
+    assert "with margins of 0.5 km" in capsys.readouterr().out
+    assert main(["info", "town", "--json"]) == 0
+    assert json.loads(capsys.readouterr().out)["shards"]["count"] >= 3
+    assert main(["check", "town"]) == 0
+    assert main(["list"]) == 0
+    assert "town" in capsys.readouterr().out
+    assert main(["remove", "town", "--yes"]) == 0
+    assert not list((tmp_path / "library").iterdir())
+
+
+@pytest.mark.parametrize(
+    ("given", "told"),
+    [
+        (["--shards", "many", "--roads", "x"], "expected auto, a number, or a side"),
+        (["--shards", "4", "--osm", "Boston"], "--shards goes with --roads"),
+        (["--shards", "4", "--roads", "x", "--out", "a.gpkg"], "did you mean a.shards"),
+        (["--shards", "4", "--roads", "x", "--update"], "--update changes a reference of one piece"),
+    ],
+)
+def test_what_cannot_be_asked_is_a_usage_error(given, told, capsys):
+    assert main(["index", *given]) == 2
+    assert told in capsys.readouterr().err
