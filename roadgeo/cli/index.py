@@ -9,6 +9,7 @@ from typing import TYPE_CHECKING, Any
 import click
 
 from roadgeo._progress import Say
+from roadgeo.cli.clusters import cluster_options, make_cluster
 from roadgeo.cli.parameters import BOX, NEAR, Plugin, verbosity_options
 from roadgeo.cli.printing import echo
 from roadgeo.cli.shards import build_in_shards, shard_options
@@ -80,6 +81,7 @@ __all__ = ["index_command"]
     help="Where it goes. Default: into the library, under its name.",
 )
 @shard_options
+@cluster_options
 @verbosity_options
 def index_command(
     out: str | None,
@@ -89,6 +91,8 @@ def index_command(
     shards: dict[str, Any] | None,
     margin: float,
     jobs: int,
+    engine: str | None,
+    scheduler: str | None,
     quiet: bool,
     verbose: bool,
     **source: Any,
@@ -136,7 +140,8 @@ def index_command(
     if shards is not None:
         if update:
             raise click.UsageError("--update changes a reference of one piece; build one in --shards again instead.")
-        build_in_shards(source, name, out, shards, margin, jobs, quiet)
+        cluster = make_cluster(engine, scheduler, jobs)
+        build_in_shards(source, name, out, shards, margin, jobs, cluster, quiet)
         return
     path = Path(out) if out else new_reference(name)
     make_folder(path.parent)  # before the long part

@@ -12,6 +12,7 @@ import click
 
 from roadgeo._text import visible
 from roadgeo.cli import ERROR, NOT_LOCATED
+from roadgeo.cli.clusters import cluster_options, make_cluster
 from roadgeo.cli.command_line import said_options
 from roadgeo.cli.folders import make_folder
 from roadgeo.cli.hints import HINTS, hint_options, make_options, refuse_swapped
@@ -42,7 +43,7 @@ __all__ = ["describe", "locate_command", "pair_images"]
 Command = TypeVar("Command", bound=Callable[..., Any])
 
 #: Options that change nothing of a result, or that are said mask by mask.
-_OF_NO_ACCOUNT = {"as_json", "images", "jobs", "quiet", "skip_existing", "verbose"}
+_OF_NO_ACCOUNT = {"as_json", "engine", "images", "jobs", "quiet", "scheduler", "skip_existing", "verbose"}
 
 _HELP = """Find where road MASKs lie on a map, and draw them there.
 
@@ -221,6 +222,7 @@ def _drawing_options(command: Command) -> Command:
     help="Keep results that are there and younger than their masks, or make them anew, the default.",
 )
 @click.option("-j", "--jobs", metavar="N", type=click.IntRange(1), default=1, show_default=True, help="Processes.")
+@cluster_options
 @verbosity_options
 def locate_command(
     masks: tuple[str, ...],
@@ -232,6 +234,8 @@ def locate_command(
     time_limit: float,
     skip_existing: bool,
     jobs: int,
+    engine: str | None,
+    scheduler: str | None,
     quiet: bool,
     verbose: bool,
     **given: Any,
@@ -266,6 +270,7 @@ def locate_command(
             reading=reading,
             skip_existing=skip_existing,
             jobs=jobs,
+            cluster=make_cluster(engine, scheduler, jobs),
             command=said_options(_OF_NO_ACCOUNT),
             say=say,
         ):

@@ -6,11 +6,14 @@ import re
 from collections.abc import Callable
 from pathlib import Path
 from time import perf_counter
-from typing import Any, TypeVar
+from typing import TYPE_CHECKING, Any, TypeVar
 
 import click
 
 from roadgeo.cli.printing import echo
+
+if TYPE_CHECKING:
+    from roadgeo.running.cluster import Cluster
 
 __all__ = ["build_in_shards", "shard_options"]
 
@@ -77,7 +80,14 @@ def shard_options(command: Command) -> Command:
 
 
 def build_in_shards(
-    source: dict[str, Any], name: str, out: str | None, shards: dict[str, Any], margin: float, jobs: int, quiet: bool
+    source: dict[str, Any],
+    name: str,
+    out: str | None,
+    shards: dict[str, Any],
+    margin: float,
+    jobs: int,
+    cluster: Cluster | None,
+    quiet: bool,
 ) -> None:
     """Build a reference in shards from road files, and say what there is.
 
@@ -114,7 +124,7 @@ def build_in_shards(
     compile_once(quiet)
     with show_steps(quiet) as say:
         options = ShardOptions(**shards, margin_m=margin)
-        reference = build_shards(files, path, make_slug(name), options, jobs=jobs, say=say)
+        reference = build_shards(files, path, make_slug(name), options, jobs=jobs, cluster=cluster, say=say)
     if not quiet:
         entries = reference.manifest.filled
         n = sum(entry.own_intersections for entry in entries)

@@ -389,7 +389,8 @@ def build_index(network: RoadNetwork, options: IndexOptions | None = None, say: 
         raise RoadSourceError(f"the roads have {len(found)} intersections, at least 3 are needed: take a larger area")
     if len(found) > MAX_ANCHORS:
         raise RoadSourceError(
-            f"the roads have {len(found):,} intersections, at most {MAX_ANCHORS:,} can be indexed: split the area"
+            f"the roads have {len(found):,} intersections, at most {MAX_ANCHORS:,} are indexed in one piece:"
+            " cut them up with `roadgeo index --shards auto`"
         )
     what = f"indexing {len(found):,} intersections"
     say(what, 0.0)

@@ -3,8 +3,8 @@
 from __future__ import annotations
 
 import math
+from collections import OrderedDict
 from dataclasses import dataclass
-from functools import lru_cache
 
 import numpy as np
 
@@ -57,6 +57,11 @@ class RoadRaster:
         """Nothing that kernels look up may lie further than this from all roads and intersections."""
         return self.raster.cell * TILE
 
+    @property
+    def nbytes(self) -> int:
+        """Size of its arrays."""
+        return int(self.raster.tile_of.nbytes + self.raster.bits.nbytes + self.density.nbytes)
+
     def cells(self, xy: FloatArray) -> FloatArray:
         """Return (N, 2) plane metres as cells from the corner."""
         return np.asarray((xy - self.origin) / self.raster.cell)
@@ -67,9 +72,27 @@ class RoadRaster:
         return np.asarray(self.density[tiles[:, 1], tiles[:, 0]], float)
 
 
-@lru_cache(maxsize=4)
+#: Rasters that are kept, the one used last at the end, and how many bytes they may take together.
+_drawn: OrderedDict[tuple[ReferenceIndex, RasterOptions], RoadRaster] = OrderedDict()
+_MOST_BYTES = 500_000_000
+
+
 def make_raster(index: ReferenceIndex, options: RasterOptions) -> RoadRaster:
-    """Draw the roads of a reference: some hundredths of a second and 13 MB for a city of 400 km2."""
+    """Return the raster of a reference, drawn anew unless it is kept from before.
+
+    Drawing takes some hundredths of a second, and 13 MB, for a city of 400 km2. Those used last are kept, up to a size:
+    many masks are looked for on the same maps, one after the other.
+    """
+    key = (index, options)
+    if key not in _drawn:
+        _drawn[key] = _draw(index, options)
+        while len(_drawn) > 1 and sum(one.nbytes for one in _drawn.values()) > _MOST_BYTES:
+            _drawn.popitem(last=False)
+    _drawn.move_to_end(key)
+    return _drawn[key]
+
+
+def _draw(index: ReferenceIndex, options: RasterOptions) -> RoadRaster:
     segments, size = index.segments, options.cell_m * TILE
     ends = segments.reshape(-1, 2)
     low = np.minimum(ends.min(axis=0), index.xy.min(axis=0)) - size

@@ -27,6 +27,7 @@ if TYPE_CHECKING:
     from roadgeo.location import Location, Status
     from roadgeo.outputs.location_files import OutputOptions
     from roadgeo.reference.reference import AnyReference
+    from roadgeo.running.cluster import Cluster
     from roadgeo.running.queries import QueryOptions
     from roadgeo.workflows import LocateOptions
 
@@ -139,6 +140,7 @@ def locate_masks(
     reading: ReadOptions | None = None,
     skip_existing: bool = False,
     jobs: int = 1,
+    cluster: Cluster | None = None,
     command: Sequence[str] = (),
     say: Say = say_nothing,
 ) -> Iterator[Outcome]:
@@ -154,6 +156,8 @@ def locate_masks(
         Keep results of the same question that are whole and younger than their masks.
     jobs : int
         Processes; the results do not depend on it.
+    cluster : Cluster, optional
+        Where it is done instead; the results do not depend on that either.
     command : sequence of str
         Options that ask for the same on the command line, for the results to name.
     say
@@ -167,6 +171,8 @@ def locate_masks(
     from roadgeo.outputs.location_files import OutputOptions
     from roadgeo.workflows import LocateOptions
 
+    if cluster is not None:  # whose workers may have another library
+        references = [str(path.absolute()) for path in _resolve(references)]
     work = _Locating(
         tuple(references),
         str(out_dir),
@@ -175,9 +181,9 @@ def locate_masks(
         reading or ReadOptions(),
         skip_existing,
         tuple(command),
-        say if jobs == 1 or len(tasks) == 1 else say_nothing,
+        say if cluster is None and (jobs == 1 or len(tasks) == 1) else say_nothing,
     )
-    return run(tasks, work, jobs)
+    return run(tasks, work, jobs) if cluster is None else cluster.run(tasks, work)
 
 
 @dataclass(frozen=True)

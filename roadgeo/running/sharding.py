@@ -11,11 +11,11 @@ import contextlib
 import json
 import math
 import shutil
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable
 from dataclasses import asdict, dataclass, field, replace
 from hashlib import blake2b
 from pathlib import Path
-from typing import Any, TypeAlias
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
@@ -36,6 +36,9 @@ from roadgeo.sources.streams import stream_lines
 from roadgeo.storage.atomic import writing
 from roadgeo.storage.files import write_bytes
 
+if TYPE_CHECKING:
+    from roadgeo.running.cluster import Cluster
+
 __all__ = ["RoadFiles", "ShardOptions", "build_shards"]
 
 #: A shard of this many straight pieces of road has 30,000 to 80,000 intersections, and takes 0.4 to 1 GB to build.
@@ -44,9 +47,6 @@ _SEGMENTS = 200_000
 #: Lines are put on disk by cells of this size.
 _CELL_M = 5000.0
 _DEGREE_M = 111_320.0
-
-#: (tasks, work, jobs) to results in the order of the tasks: `_processes.run`, or what does the same elsewhere.
-Runner: TypeAlias = Callable[[Sequence[ShardBox], "ShardWork"], Iterator[ShardEntry | str]]
 
 
 @dataclass(frozen=True)
@@ -95,7 +95,7 @@ def build_shards(
     options: ShardOptions | None = None,
     *,
     jobs: int = 1,
-    runner: Runner | None = None,
+    cluster: Cluster | None = None,
     say: Say = say_nothing,
 ) -> ShardedReference:
     """Build a reference in shards, or go on with a build that was cut short.
@@ -106,8 +106,8 @@ def build_shards(
         Where its manifest goes; made if it is missing. A reference that is there is replaced in the end.
     jobs : int
         Processes; each builds a shard at a time.
-    runner : callable, optional
-        Does the shards instead: on a cluster, for instance.
+    cluster : Cluster, optional
+        Builds them instead, one at a time on each of its workers, which see the same files.
 
     Raises
     ------
@@ -132,7 +132,7 @@ def build_shards(
     boxes = _plan(spooled, options)
     shards = ShardWork(str(work), str(folder / build), {**spooled.meta, "name": name, "shard_of": build}, options)
     entries = []
-    for n, entry in enumerate((runner or (lambda tasks, how: run(tasks, how, jobs)))(boxes, shards), 1):
+    for n, entry in enumerate(run(boxes, shards, jobs) if cluster is None else cluster.run(boxes, shards), 1):
         if isinstance(entry, str):
             raise RoadSourceError(f"{folder}: {entry}; the same command goes on with what is missing")
         entries.append(entry)

@@ -148,11 +148,6 @@ def test_a_build_that_was_cut_short_goes_on(roads, tmp_path, monkeypatch):
     assert reference_digest(folder) == digest
 
 
-def test_two_processes_build_the_same(roads, sharded, tmp_path):
-    other = build_shards(RoadFiles((roads,)), tmp_path / "town.shards", "town", OPTIONS, jobs=2)
-    assert [e.digest for e in other.manifest.shards] == [e.digest for e in sharded.manifest.shards]
-
-
 def test_a_shard_of_another_build_is_refused(sharded, tmp_path):
     shutil.copytree(sharded.path, tmp_path / "town.shards")
     fresh = open_reference(tmp_path / "town.shards")

@@ -1,0 +1,194 @@
+"""Many tasks on a Dask cluster: results in the order of the tasks, as from one process; a worker that dies costs none.
+
+Tasks travel in groups. No more groups are under way than keep all workers busy, so that neither the scheduler nor this
+process holds more than those, whatever the number of tasks. A group whose worker dies is done again on another; one
+that kills every worker is done task by task, and what kills them again is given up.
+
+Workers read the same files under the same paths. Each has one thread; kernels are compiled on each host once.
+"""
+
+from __future__ import annotations
+
+import contextlib
+import os
+import pickle
+import tempfile
+import uuid
+from collections import deque
+from collections.abc import Callable, Iterator, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any, TypeVar
+
+from roadgeo.errors import RoadgeoError
+from roadgeo.running.processes import Work
+
+__all__ = ["Cluster", "run_on_cluster"]
+
+Task = TypeVar("Task")
+Result = TypeVar("Result")
+
+#: Most tasks in a group. A group should take seconds: what takes less is lost in sending it about.
+_MOST_TOGETHER = 100
+
+#: Groups under way for each worker, and so many times a group is done again elsewhere.
+_AHEAD, _RETRIES = 2, 3
+
+#: A scheduler must answer, and have a worker, within this time.
+_PATIENCE_S = 30
+
+_SAID = "pip install 'roadgeo[dask]'"
+
+
+@dataclass(frozen=True)
+class Cluster:
+    """Where tasks are done.
+
+    Attributes
+    ----------
+    scheduler : str or None
+        Address of a Dask scheduler, such as tcp://10.0.0.1:8786; None: processes on this machine, `workers` of them.
+    workers : int
+    together : int
+        Most tasks in a group.
+    """
+
+    scheduler: str | None = None
+    workers: int = 1
+    together: int = _MOST_TOGETHER
+
+    def run(self, tasks: Sequence[Task], work: Work[Task, Result]) -> Iterator[Result]:
+        """Do all tasks and yield their results in order (see `run_on_cluster`)."""
+        return run_on_cluster(tasks, work, self)
+
+
+def run_on_cluster(tasks: Sequence[Task], work: Work[Task, Result], cluster: Cluster) -> Iterator[Result]:
+    """Do all tasks on a cluster and yield their results in the order of the tasks, each group as it comes.
+
+    Raises
+    ------
+    RoadgeoError
+        Dask is not installed; there is no scheduler at the address, or it went away.
+    """
+    try:
+        from distributed import Client
+    except ImportError as error:
+        raise RoadgeoError(f"a cluster needs dask: {_SAID}") from error
+
+    with contextlib.ExitStack() as stack:
+        address = cluster.scheduler or stack.enter_context(_local_cluster(cluster.workers))
+        try:
+            client = stack.enter_context(Client(address, timeout=_PATIENCE_S))
+            client.wait_for_workers(1, timeout=_PATIENCE_S)
+        except (OSError, ValueError) as error:
+            what = " ".join(str(error).split())
+            raise RoadgeoError(
+                f"no Dask scheduler with workers at {address}: {what}; start them with `dask scheduler`, `dask worker`"
+            ) from error
+        yield from _Stream(client, work, cluster.together).results(tasks)
+
+
+@contextlib.contextmanager
+def _local_cluster(workers: int) -> Iterator[Any]:
+    """Start worker processes on this machine, for as long as they are needed."""
+    import dask
+    from distributed import LocalCluster
+
+    told = {"distributed.worker.multiprocessing-method": "spawn", "distributed.logging.distributed": "error"}
+    with (
+        dask.config.set(told),
+        LocalCluster(
+            n_workers=workers,
+            threads_per_worker=1,
+            processes=True,
+            dashboard_address=None,
+            memory_limit=0,
+            silence_logs=50,
+        ) as cluster,
+    ):
+        yield cluster
+
+
+class _Stream:
+    """Sends groups of tasks and takes their results, a bounded number at a time."""
+
+    def __init__(self, client: Any, work: Work[Any, Any], together: int) -> None:
+        self.client, self.work, self.together = client, work, together
+        self.token = uuid.uuid4().hex
+        self.folder, self.pickled = str(Path.cwd()), pickle.dumps(work)
+
+    def results(self, tasks: Sequence[Task]) -> Iterator[Any]:
+        """Yield the results of all tasks in order."""
+        size = max(1, min(self.together, len(tasks) // (4 * self._n_workers())))
+        groups = deque(tasks[first : first + size] for first in range(0, len(tasks), size))
+        under_way: deque[tuple[Any, Sequence[Any]]] = deque()
+        try:
+            while groups or under_way:
+                while groups and len(under_way) < _AHEAD * self._n_workers() + 1:
+                    group = groups.popleft()
+                    under_way.append((self._send(group), group))
+                future, group = under_way.popleft()
+                yield from self._take(future, group)
+        finally:
+            with contextlib.suppress(Exception):
+                self.client.cancel([future for future, _ in under_way])
+
+    def _n_workers(self) -> int:
+        """Return how many workers there are now: they may come and go."""
+        return max(1, len(self.client.nthreads()))
+
+    def _send(self, group: Sequence[Any]) -> Any:
+        sent = (self.token, self.folder, self.pickled, list(group))
+        return self.client.submit(_do_group, *sent, pure=False, retries=_RETRIES)
+
+    def _take(self, future: Any, group: Sequence[Any]) -> list[Any]:
+        """Return the results of a group; one that kills its workers is done task by task."""
+        from concurrent.futures import CancelledError
+
+        from distributed.scheduler import KilledWorker
+
+        try:
+            return list(future.result())
+        except KilledWorker:
+            if len(group) > 1:
+                alone = [(self._send([task]), [task]) for task in group]
+                return [result for one in alone for result in self._take(*one)]
+            return [self.work.give_up(group[0], "the workers that it was given to died, one after another")]
+        except (CancelledError, OSError) as error:
+            raise RoadgeoError("the Dask scheduler went away; the same command with --skip-existing goes on") from error
+
+
+# --- on a worker ------------------------------------------------------------------------------------------------------
+
+_prepared: dict[str, Callable[[Any], Any]] = {}
+
+
+def _do_group(token: str, folder: str, pickled: bytes, tasks: Sequence[Any]) -> list[Any]:
+    """Do tasks one after another, in the folder where they were asked for; make the worker ready first, once."""
+    if token not in _prepared:
+        os.chdir(folder)
+        import cv2
+
+        from roadgeo.warmup import warm_up
+
+        cv2.setNumThreads(1)
+        with _one_of_host():
+            warm_up()
+        _prepared.clear()  # of earlier runs, whose maps are no longer needed
+        _prepared[token] = pickle.loads(pickled).prepare()  # noqa: S301 (from our own client)
+    do = _prepared[token]
+    return [do(task) for task in tasks]
+
+
+@contextlib.contextmanager
+def _one_of_host() -> Iterator[None]:
+    """Let one process of this host compile kernels while the others wait for what it compiled."""
+    try:
+        import fcntl
+    except ImportError:  # Windows
+        yield
+        return
+    path = Path(tempfile.gettempdir()) / f"roadgeo-compiling-{os.getuid()}.lock"
+    with path.open("ab") as lock:
+        fcntl.flock(lock, fcntl.LOCK_EX)
+        yield
