@@ -37,6 +37,7 @@ __all__ = ["evaluate_command"]
 @click.option("--queries", type=click.Path(exists=True, path_type=Path), help="A query set: its folder, or its table.")
 @query_options
 @click.option("--method", type=click.Choice(["auto", "pair"]), default="auto", show_default=True, help="As in locate.")
+@click.option("--effort", type=click.Choice(["quick", "full"]), default="full", show_default=True, help="As in locate.")
 @hint_options("gsd_m", "max_tilt_deg", "north_up", gsd_m="--known-gsd")
 @click.option(
     "--time-limit", type=click.FloatRange(0.01), metavar="S", default=10.0, show_default=True, help="Per mask."
@@ -69,6 +70,7 @@ def evaluate_command(
     queries: Path | None,
     roads: Path | None,
     method: Literal["auto", "pair"],
+    effort: Literal["quick", "full"],
     gsd_m: tuple[float, float] | None,
     max_tilt_deg: float | None,
     north_up: bool,
@@ -114,9 +116,10 @@ def evaluate_command(
         options["gsd"] = (height / (options["focal"] or options["size"]),) * 2
     compile_once(quiet)
     hints = {"gsd_m": gsd_m, "max_tilt_deg": max_tilt_deg, "north_up": north_up}
-    locator = ReferenceLocator((path,), make_options(method, time_limit, hints))
+    locator = ReferenceLocator((path,), make_options(method, time_limit, hints, effort))
     known = {"known_gsd": gsd_m, "max_tilt": max_tilt_deg, "north_up": north_up or None, "time_limit_s": time_limit}
-    told = {"reference": path.stem, "method": method, **_known(known)}
+    quicker = {"effort": effort} if effort != "full" else {}
+    told = {"reference": path.stem, "method": method, **_known(known), **quicker}
     if as_map:
         survey = _survey(locator, options, told)
         survey = replace(survey, check=check, jobs=jobs, out_dir=out_dir, counting=partial(count_up, quiet=quiet))

@@ -17,6 +17,7 @@ from roadgeo.location import Stats
 from roadgeo.matching.estimator import Hypothesis, Ledger, MatchOptions, TripleEstimator
 from roadgeo.matching.index import ReferenceIndex, crop, unpack_tangents
 from roadgeo.matching.options import LocateOptions
+from roadgeo.matching.paper.quality import well_fitted
 from roadgeo.matching.paper.search import match_pairs
 from roadgeo.matching.paper.tuples import PairIndex, PairOptions, build_pair_index
 from roadgeo.matching.parts import Near, Part, same_within_m
@@ -254,7 +255,9 @@ def _search_pairs(query: Query, index: ReferenceIndex, options: PairOptions, tim
     scene = query.scene
     reference, table = _pair_index(index, options)
     limited = replace(options, time_limit_s=time_limit_s)
-    match = match_pairs(scene.intersections, reference, table, scene.corners, limited)
+    seen = scene.intersections
+    taken = np.flatnonzero(seen.residual <= options.max_fit_error_px) if options.discard_poor else np.arange(len(seen))
+    match = match_pairs(seen.only(taken), reference, table, scene.corners, limited)
     found = Found(
         index,
         said=match.reason,
@@ -265,7 +268,7 @@ def _search_pairs(query: Query, index: ReferenceIndex, options: PairOptions, tim
     if match.homography is None:
         return found
     matched = np.full(len(scene.intersections), -1, np.int64)
-    matched[match.matches[:, 0]] = match.matches[:, 1]
+    matched[taken[match.matches[:, 0]]] = reference.node[match.matches[:, 1]]
     chosen = matched >= 0
     gap = Homography(match.homography)(scene.intersections.xy[chosen]) - index.xy[matched[chosen]]
     distance = np.zeros(len(matched))
@@ -280,4 +283,6 @@ def _pair_index(index: ReferenceIndex, options: PairOptions) -> tuple[Intersecti
     vectors = index.branches.astype(np.float32)
     rays = np.where(vectors.any(axis=2), np.arctan2(vectors[..., 1], vectors[..., 0]), np.nan)
     found = Intersections(index.xy, rays, unpack_tangents(index.tangents), np.zeros(n, np.float32), np.arange(n))
+    if options.discard_poor:
+        found = found.only(np.flatnonzero(well_fitted(index)))
     return found, build_pair_index(found, options)

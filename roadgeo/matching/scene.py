@@ -125,7 +125,7 @@ def _nearest(found: Intersections, center: FloatArray, most: int) -> Intersectio
     if len(found) <= most:
         return found
     kept = np.sort(np.argsort(np.hypot(*(found.xy - center).T), kind="stable")[:most])
-    return Intersections(found.xy[kept], found.rays[kept], found.tangents[kept], found.residual[kept], found.node[kept])
+    return found.only(kept)
 
 
 def prepare_scene(

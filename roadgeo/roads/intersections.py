@@ -74,6 +74,11 @@ class Intersections:
         """N."""
         return len(self.xy)
 
+    def only(self, chosen: IntArray) -> Intersections:
+        """Return some of them, in the order of their numbers `chosen`."""
+        xy, rays, tangents = self.xy[chosen], self.rays[chosen], self.tangents[chosen]
+        return Intersections(xy, rays, tangents, self.residual[chosen], self.node[chosen])
+
     def branches(self) -> AnyArray:
         """(N, R, 2) int8: the rays as unit vectors scaled to 127, zeros behind the last (see `kernels.rays`)."""
         vectors = np.stack([np.cos(self.rays), np.sin(self.rays)], axis=-1) * 127.0

@@ -378,7 +378,7 @@ def test_errors_are_shown_as_qgis_shows_errors(qgis: Qgis, porto: Path) -> None:
     done = qgis.tool("run", "roadgeo:locatemask", "--", mask, f"REFERENCE={qgis.folder / 'none.gpkg'}", folder)
     assert done.returncode == 1
     assert "ERROR:\tno reference '" in done.stderr
-    done = qgis.tool("run", "roadgeo:locatemask", "--", mask, f"REFERENCE={porto}", folder, "GSD_MIN=9")
+    done = qgis.tool("run", "roadgeo:locatemask", "--", mask, f"REFERENCE={porto}", folder, "GSD_MIN=90")
     assert done.returncode == 1
     assert "LO must be above 0 and not above HI" in done.stderr
     done = qgis.tool("run", "roadgeo:buildreference", "--", f"OUTPUT={qgis.folder / 'x.gpkg'}")

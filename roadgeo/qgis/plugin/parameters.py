@@ -250,14 +250,14 @@ CAMERA = _fold(
         "Least pixel size, metres",
         "How much ground a pixel at the middle of the mask covers, at least and at most: the search is narrowed.",
         _scales,
-        {"type": QgsProcessingParameterNumber.Type.Double, "defaultValue": 0.2, "minValue": 1e-3},
+        {"type": QgsProcessingParameterNumber.Type.Double, "defaultValue": 0.1, "minValue": 1e-3},
     ),
     Option(
         QgsProcessingParameterNumber,
         "GSD_MAX",
         "Greatest pixel size, metres",
         "See above.",
-        settings={"type": QgsProcessingParameterNumber.Type.Double, "defaultValue": 5.0, "minValue": 1e-3},
+        settings={"type": QgsProcessingParameterNumber.Type.Double, "defaultValue": 12.0, "minValue": 1e-3},
     ),
     _number(
         "--max-tilt",
@@ -288,6 +288,14 @@ CAMERA = _fold(
         "Within, metres",
         "How near.",
         settings={"type": QgsProcessingParameterNumber.Type.Double, "defaultValue": 10_000.0, "minValue": 1.0},
+    ),
+    _choice(
+        "--effort",
+        "EFFORT",
+        "Effort",
+        "quick: end the search early, for masks that are clean. full: try harder on those that are broken.",
+        ["quick", "full"],
+        defaultValue="full",
     ),
     _number(
         "--time-limit",
