@@ -18,6 +18,7 @@ from roadgeo.matching.methods import Found, search_references
 from roadgeo.matching.options import LocateOptions
 from roadgeo.matching.query import Query, read_query
 from roadgeo.matching.trace import NO_TRACE, Trace
+from roadgeo.matching.truth_record import make_record, tell_truth
 from roadgeo.matching.verdict import decide, needed_of
 from roadgeo.reference.reference import AnyReference, BuildOptions, Reference, build_network, open_whole, stored_options
 from roadgeo.roads.kinds import RoadKind
@@ -164,12 +165,16 @@ def explain(
     query, records = _read(mask, options), list[Record]()
 
     def record() -> Record:
-        records.append(Record())
+        records.append(make_record(query.name, options))
         return records[-1]
 
     found = _search(query, references, options, record)
     alone = [decide(query, [one], options) for one in found]
-    stories = [tell(query, *each, needed_of(options)) for each in zip(found, alone, records, strict=True)]
+    needed = needed_of(options)
+    stories = [
+        tell_truth(tell(query, one, answer, record, needed), record, answer, needed)
+        for one, answer, record in zip(found, alone, records, strict=True)
+    ]
     return Explanation(decide(query, found, options), query.scene, query.graph, tuple(stories))
 
 

@@ -5,6 +5,7 @@ from __future__ import annotations
 import json
 from collections import Counter
 from collections.abc import Callable, Mapping, Sequence
+from dataclasses import replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Literal, TypeVar
 
@@ -19,6 +20,7 @@ from roadgeo.cli.hints import HINTS, hint_options, make_options, refuse_swapped
 from roadgeo.cli.parameters import Plugin, verbosity_options
 from roadgeo.cli.photographs import read_options, segmenting_options
 from roadgeo.cli.printing import echo
+from roadgeo.cli.truths import read_truths
 from roadgeo.outputs.registry import (
     ALSO,
     ALWAYS,
@@ -115,6 +117,11 @@ _DRAWING = [
         is_flag=True,
         help=f"Also write MASK{EXPLANATION_PICTURE.ending} and .json: how far the search got, the best rejected"
         " places, what was missing.",
+    ),
+    click.option(
+        "--truth",
+        metavar="LON,LAT|FILE",
+        help="With --explain: where the middle really lies, or a truth.csv of many masks; says which stage lost it.",
     ),
     click.option(
         "--image",
@@ -245,6 +252,7 @@ def locate_command(
     from roadgeo.cli.progress import count_up, print_steps, show_steps
 
     options = make_options(method, time_limit, {name: given[name] for name in HINTS}, effort)
+    options = replace(options, truths=read_truths(given["truth"], explain=given["explain"]))
     outputs = _output_options(given)
     found = find_masks(masks)
     if not found:

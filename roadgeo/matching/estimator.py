@@ -200,6 +200,7 @@ class TripleEstimator:
         self._tried: set[Lead] = set()
         self._roads: RoadSearch | None = None
         self._grown_by_roads: list[Hypothesis] = []
+        trace.began(self)
 
     def stages(self) -> Iterator[Iterator[list[Hypothesis]]]:
         """Yield, for one anchor after another, the hypotheses that grew: of triples, of roads, of single triples."""

@@ -24,6 +24,8 @@ searches      one for each reference, in the order in which they were searched:
 
               `missing`: sentences
 
+              `truth`: what became of the true place, where it was given; see `truth_record.TruthStory`
+
               `places`: the best ones, best first; see `RejectedPlace`
 ============  ==========================================================================================================
 """
@@ -34,7 +36,7 @@ import math
 from collections import Counter
 from collections.abc import Sequence
 from dataclasses import asdict, dataclass, replace
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
@@ -53,6 +55,9 @@ from roadgeo.matching.triples import Proposals
 from roadgeo.matching.verdict import Needed
 from roadgeo.matching.verification import Agreement, agreement, tolerance_m
 from roadgeo.roads.graph import RoadGraph
+
+if TYPE_CHECKING:
+    from roadgeo.matching.truth_record import TruthStory
 
 __all__ = ["SCHEMA", "Explanation", "Funnel", "Record", "RejectedPlace", "Story", "tell"]
 
@@ -93,6 +98,9 @@ class Record:
         self.elsewhere: list[Proposals] = []
         self.estimator: TripleEstimator | None = None
         self.result: SearchResult[Hypothesis] | None = None
+
+    def began(self, estimator: TripleEstimator) -> None:
+        """Nothing is known yet."""
 
     def screened(self, proposals: Proposals, allowed: BoolArray, kept: IntArray) -> None:
         """Note one anchor's proposals (see `Trace`); some that point elsewhere than a camera may are kept for later."""
@@ -246,6 +254,7 @@ class Story:
     starved_at: str | None
     missing: tuple[str, ...]
     places: tuple[RejectedPlace, ...] = ()
+    truth: TruthStory | None = None
 
     def to_dict(self) -> dict[str, Any]:
         """Plain values, ready for `json.dumps`."""
@@ -258,6 +267,7 @@ class Story:
             "starved_at": self.starved_at,
             "missing": list(self.missing),
             "places": [place.to_dict() for place in self.places],
+            "truth": self.truth and self.truth.to_dict(),
         }
 
 

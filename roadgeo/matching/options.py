@@ -29,6 +29,9 @@ class LocateOptions:
         Log10 odds by which the best place must lead any other; otherwise the answer is "ambiguous".
     min_intersections : int
         Masks with fewer are not searched.
+    truths : tuple of (str, lon, lat)
+        For explanations: where the middle of the frame of masks whose names end so really lies. The search does not
+        look at it.
     effort : "quick" or "full"
         Whether single triples, and then roads alone, propose places where the usual search leads nowhere: a second or
         two on the map of a city.
@@ -40,6 +43,7 @@ class LocateOptions:
     min_log10_odds: float = 3.5
     min_margin: float = 2.0
     min_intersections: int = 3
+    truths: tuple[tuple[str, float, float], ...] = ()
     query: QueryOptions = field(default_factory=QueryOptions)
     match: MatchOptions = field(default_factory=MatchOptions)
     search: SearchOptions = field(default_factory=SearchOptions)

@@ -18,6 +18,9 @@ __all__ = ["NO_TRACE", "NoTrace", "Trace"]
 class Trace(Protocol):
     """Told of each stage of a search. It only listens: a traced search finds the same."""
 
+    def began(self, estimator: TripleEstimator) -> None:
+        """Note what is going to search."""
+
     def screened(self, proposals: Proposals, allowed: BoolArray, kept: IntArray) -> None:
         """Note one anchor's proposals: which the user's hints allow, and which put roads on roads."""
 
@@ -39,6 +42,9 @@ class Trace(Protocol):
 
 class NoTrace:
     """Listens to nothing."""
+
+    def began(self, estimator: TripleEstimator) -> None:
+        """Do nothing."""
 
     def screened(self, proposals: Proposals, allowed: BoolArray, kept: IntArray) -> None:
         """Do nothing."""

@@ -13,6 +13,7 @@ from worlds.scenes import PLANE, camera, look, mapped, random_network
 from roadgeo.cli import main
 from roadgeo.geometry.camera import CameraOptions
 from roadgeo.geometry.mask import RoadMask, plane_to_pixel
+from roadgeo.geometry.projection import to_lonlat
 from roadgeo.matching.explanation import SCHEMA, Explanation
 from roadgeo.matching.index import build_index
 from roadgeo.matching.search import SearchOptions
@@ -218,3 +219,45 @@ def test_from_the_command_line(town, mask, tmp_path: Path, monkeypatch, capfd):
     assert main(["locate", "a.png", "-r", "town.gpkg", "-q", "--gsd", "0.3:0.7"]) == 3
     assert not Path("a_explain.json").exists()
     assert capfd.readouterr().err == ""
+
+
+# --- the true place ---------------------------------------------------------------------------------------------------
+
+
+def lonlat_of(town, matrix, away_m=0.0):
+    """Longitude and latitude of the frame's middle, moved east."""
+    middle = mapped(matrix, np.array([[SIZE[0] / 2, -SIZE[1] / 2]])) + np.array([away_m, 0.0])
+    return tuple(to_lonlat(town.index.plane.crs, town.index.plane.to_crs(middle))[0].tolist())
+
+
+def truth_told(mask, town, options, lonlat):
+    explanation = explain(mask, town, replace(options, truths=(("mask.png", *lonlat),)))
+    (search,) = explanation.to_dict()["searches"]
+    return search["truth"], explanation
+
+
+def test_the_true_place_of_a_located_mask_is_not_lost(town, mask):
+    told, _ = truth_told(mask, town, LocateOptions(), lonlat_of(town, TRUTH))
+    assert told["lost_at"] is None
+    assert told["counts"]["proposals"] >= told["counts"]["on_roads"] >= 1
+    assert told["log10_odds"] > 8
+
+
+def test_a_place_off_the_map_and_one_that_nothing_proposes_are_told_apart(town, mask):
+    other = mask_of(random_network(9))
+    told, explanation = truth_told(other, town, LocateOptions(effort="quick"), lonlat_of(town, TRUTH, 90_000.0))
+    assert told["lost_at"] == "map"
+    assert told["said"] in explanation.nearest.missing
+    far = lonlat_of(town, TRUTH, 900.0)
+    assert truth_told(mask, town, LocateOptions(), far)[0]["lost_at"] in {"proposals", "on_roads", "survived"}
+
+
+def test_a_camera_that_refuses_the_true_place_is_named(town, mask):
+    told, _ = truth_told(mask, town, with_camera(gsd_m=(1.4, 5.0)), lonlat_of(town, TRUTH))
+    assert told["lost_at"] == "camera"
+    assert "ground sampling" in told["said"]
+
+
+def test_a_truth_of_another_mask_is_left_alone(town, mask):
+    explanation = explain(mask, town, replace(LocateOptions(), truths=(("other.png", 0.0, 0.0),)))
+    assert explanation.to_dict()["searches"][0]["truth"] is None

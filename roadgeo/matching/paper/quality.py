@@ -9,7 +9,6 @@ import numpy as np
 
 from roadgeo._arrays import BoolArray
 from roadgeo.kernels.residuals import road_residuals
-from roadgeo.kernels.road_growth import RoadBuckets
 from roadgeo.matching.index import ReferenceIndex
 
 __all__ = ["QualityOptions", "well_fitted"]
@@ -50,9 +49,8 @@ def well_fitted(index: ReferenceIndex, options: QualityOptions | None = None) ->
     points = (index.xy[at, None] + steps[:, None] * ahead[:, None]).reshape(-1, 2)
     along = np.repeat(ahead, len(steps), axis=0)
     out = np.empty((len(points), 3))
-    roads = RoadBuckets(index.segments, index.segment_starts, index.segment_ids, index.grid, index.shape)
     reach = np.full(len(points), options.reach_m)
-    road_residuals(points, along, reach, math.cos(math.radians(options.max_turn_deg)), roads, out)
+    road_residuals(points, along, reach, math.cos(math.radians(options.max_turn_deg)), index.road_buckets, out)
     error = np.abs(out[:, 0]).reshape(-1, len(steps)).mean(axis=1)  # NaN where the branch is too short
     good = np.ones(len(index), bool)
     good[at[~(error <= options.max_error_m)]] = False

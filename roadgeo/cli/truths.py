@@ -1,0 +1,52 @@
+"""`--truth` of `roadgeo locate --explain`: where masks really lie, for one or from a table."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import click
+
+__all__ = ["read_truths"]
+
+
+def read_truths(given: str | None, *, explain: bool) -> tuple[tuple[str, float, float], ...]:
+    """Return name, longitude and latitude of every mask whose place was given; the name "" stands for any.
+
+    Parameters
+    ----------
+    given : str or None
+        LON,LAT, or a table as `roadgeo simulate` writes it.
+
+    Raises
+    ------
+    click.UsageError
+        It is neither, or nothing is to be explained.
+    MaskError, RoadSourceError
+        The table cannot be read.
+    """
+    if given is None:
+        return ()
+    if not explain:
+        raise click.UsageError("--truth says nothing without --explain: add it.")
+    if Path(given).is_file():
+        return _from_table(Path(given))
+    try:
+        lon, lat = (float(value) for value in given.split(","))
+    except ValueError:
+        lon = lat = float("nan")
+    if not (abs(lon) <= 180.0 and abs(lat) <= 90.0):
+        raise click.UsageError(f"--truth {given!r}: expected LON,LAT in degrees, or a table such as truth.csv.")
+    return (("", lon, lat),)
+
+
+def _from_table(path: Path) -> tuple[tuple[str, float, float], ...]:
+    from roadgeo.evaluation.truth import read_truth
+    from roadgeo.geometry.projection import transformer
+
+    truths = []
+    for truth in read_truth(path):
+        if truth.crs is None:
+            raise click.UsageError(f"{path} does not say its CRS: add a column crs.")
+        lon, lat = transformer(truth.crs, "EPSG:4326").transform(*truth.center)
+        truths.append((truth.file, float(lon), float(lat)))
+    return tuple(truths)
