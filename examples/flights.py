@@ -1,0 +1,154 @@
+"""How well flights are followed: simulated low flights over real cities, their motion known or told by their masks.
+
+    python examples/flights.py boston.gpkg slc.gpkg liege.gpkg --flights 20 --seed 7
+
+Each flight is followed as `roadgeo track` does it, and then cut: frames of a flight over the next city come instead, as
+if nothing had happened. What is counted: the frame at which a flight was placed, whether it was placed right, how far
+the middle of each frame lies from the truth, processor time of a tracked frame, and after how many frames a cut was
+noticed. The flights of a seed are always the same; the defaults of `TrackOptions` were chosen on seed 100.
+"""
+
+import argparse
+import json
+import os
+import time
+from collections import Counter
+from dataclasses import asdict, dataclass, field
+from pathlib import Path
+
+for name in ("NUMBA_NUM_THREADS", "OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS"):
+    os.environ.setdefault(name, "1")
+
+import cv2
+import numpy as np
+
+from roadgeo.evaluation.flights import Flight, FlightOptions, simulate_flight
+from roadgeo.evaluation.landscape import Landscape
+from roadgeo.flights.tracker import FlightFrame, Tracked, Tracker
+from roadgeo.geometry.mask import RoadMask
+from roadgeo.reference.network_file import read_network
+from roadgeo.reference.reference import Reference, open_reference
+from roadgeo.sources.masks import read_mask
+
+#: A fix is wrong where a frame's middle lies further than this from the truth, metres.
+WRONG_M = 50.0
+CUT_FRAMES = 6
+
+
+@dataclass
+class Result:
+    """What became of one flight."""
+
+    city: str
+    number: int
+    frames: int
+    fixed_at: int | None = None
+    wrong: bool = False
+    errors_m: list[float] = field(default_factory=list)
+    sigmas_m: list[float] = field(default_factory=list)
+    statuses: dict[str, int] = field(default_factory=dict)
+    tracking_ms: list[float] = field(default_factory=list)
+    search_s: float = 0.0
+    cut_noticed_after: int | None = None
+    cut_claimed: int = 0
+
+
+def masks_of(flight: Flight) -> list[RoadMask]:
+    return [read_mask(mask, voids=False, name=f"frame {k}") for k, mask in enumerate(flight.masks())]
+
+
+def fly(flight: Flight, other: Flight, reference: Reference, city: str, own_motion: bool) -> Result:
+    result = Result(city, flight.number, len(flight.views))
+    tracker, known = Tracker([reference]), dict[int, Tracked]()
+    masks, frames = masks_of(flight), []
+    for k, mask in enumerate(masks):
+        motion = flight.motion[k] if k else None
+        if own_motion and k:
+            from roadgeo.flights.motion import between_masks
+
+            motion = between_masks(masks[k - 1], mask, frames[-1].motion)
+        frames.append(FlightFrame(k, mask.name, float(k), mask, motion))
+        was_lost, started = tracker.is_lost, time.process_time()
+        known.update({one.frame.number: one for one in tracker.feed(frames[-1])})
+        spent = time.process_time() - started
+        if was_lost:
+            result.search_s += spent
+        else:
+            result.tracking_ms.append(1000.0 * spent)
+    for k, one in known.items():
+        if one.pose is not None:
+            truth = flight.views[k].homography(np.array(flight.options.size_px) / 2)
+            result.errors_m.append(float(np.hypot(*(one.pose.center - truth))))
+            result.sigmas_m.append(one.pose.sigma_m)
+    result.statuses = dict(Counter(one.status for one in known.values()))
+    result.fixed_at = tracker.fixes[0].last + 1 if tracker.fixes else None
+    result.wrong = any(error > WRONG_M for error in result.errors_m)
+    if not tracker.is_lost:
+        cut(tracker, flight, other, result)
+    return result
+
+
+def cut(tracker: Tracker, flight: Flight, other: Flight, result: Result) -> None:
+    """Go on with frames from elsewhere, and motion as if the flight went on."""
+    for k, mask in enumerate(masks_of(other)[:CUT_FRAMES]):
+        frame = FlightFrame(len(flight.views) + k, mask.name, 0.0, mask, flight.motion[1 + k])
+        news = tracker.feed(frame)
+        if any(one.status == "lost" for one in news):
+            result.cut_noticed_after = k + 1
+            return
+        result.cut_claimed += news[-1].status == "tracked"
+
+
+def summarize(results: list[Result]) -> dict[str, float]:
+    errors = np.concatenate([one.errors_m for one in results] or [np.zeros(0)])
+    sigmas = np.concatenate([one.sigmas_m for one in results])
+    tracking = np.concatenate([one.tracking_ms for one in results])
+    cuts = [one.cut_noticed_after for one in results if one.fixed_at]
+    return {
+        "flights": len(results),
+        "frames": sum(one.frames for one in results),
+        "fixed within 12 frames": float(np.mean([one.fixed_at is not None and one.fixed_at <= 12 for one in results])),
+        "fixed": float(np.mean([one.fixed_at is not None for one in results])),
+        "wrong flights": sum(one.wrong for one in results),
+        "frames placed": len(errors) / sum(one.frames for one in results),
+        "error m, median": float(np.median(errors)),
+        "error m, p95": float(np.quantile(errors, 0.95)),
+        "error m, max": float(errors.max()),
+        "error / sigma, rms": float(np.sqrt(np.mean((errors / sigmas) ** 2))),
+        "tracking ms, mean": float(tracking.mean()),
+        "tracking ms, p99": float(np.quantile(tracking, 0.99)),
+        "cuts noticed within 3 frames": float(np.mean([n is not None and n <= 3 for n in cuts])),
+        "search s, median": float(np.median([one.search_s for one in results])),
+    }
+
+
+def main() -> None:
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument("references", nargs="+", help="REF.gpkg of each city")
+    parser.add_argument("--flights", type=int, default=20, help="per city")
+    parser.add_argument("--seed", type=int, default=1)
+    parser.add_argument("--motion", choices=["given", "masks"], default="given")
+    parser.add_argument("--out", type=Path, help="write a JSON line for each flight")
+    given = parser.parse_args()
+    cv2.setNumThreads(1)
+    options = FlightOptions(seed=given.seed)
+    landscapes = [Landscape.from_network(read_network(Path(path))) for path in given.references]
+    references = [open_reference(path) for path in given.references]
+    results = []
+    for k in range(given.flights):
+        flights = [simulate_flight(one, options, k) for one in landscapes]
+        for c, flight in enumerate(flights):
+            other = flights[(c + 1) % len(flights)]
+            results.append(fly(flight, other, references[c], references[c].name, given.motion == "masks"))
+            one = results[-1]
+            print(f"{one.city} {k}: fixed at {one.fixed_at} of {one.frames}, {one.statuses}, largest error"
+                  f" {max(one.errors_m, default=0.0):.1f} m, cut noticed after {one.cut_noticed_after}", flush=True)  # fmt: skip
+            if given.out:
+                with given.out.open("a") as file:
+                    file.write(json.dumps(asdict(one)) + "\n")
+    for name, value in summarize(results).items():
+        print(f"{name:32} {value:.3g}")
+
+
+if __name__ == "__main__":
+    main()

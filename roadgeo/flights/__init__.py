@@ -1,0 +1,1 @@
+"""Flights: frames that follow one another are placed together, tracked, and answered live."""

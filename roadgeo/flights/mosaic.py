@@ -1,0 +1,157 @@
+"""Frames of a flight laid together on one plane: a larger query than any of them.
+
+Frames are chained by the homographies between neighbours. On the plane of a tilted frame a flight shrinks towards the
+horizon; so the plane is levelled: turned until all frames show about as much ground, as they do from one height.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import cv2
+import numpy as np
+from scipy.optimize import least_squares
+
+from roadgeo._arrays import AnyArray, FloatArray
+from roadgeo.geometry.frame import Frame
+from roadgeo.geometry.homography import Homography
+from roadgeo.geometry.mask import RoadMask
+
+__all__ = ["Mosaic", "MosaicOptions", "chain", "lay_together", "level"]
+
+
+@dataclass(frozen=True)
+class MosaicOptions:
+    """How frames are laid together.
+
+    Attributes
+    ----------
+    road_px : float
+        Roads are drawn about so wide, so that large frames do not make a larger mosaic than tracing needs.
+    max_pixels : int
+        A larger mosaic is drawn coarser.
+    share : float
+        A pixel is road where more than this share of the frames that see it show one: roads are missed more often
+        than they are invented.
+    height_sigma : float
+        How much the height over the ground varies during a flight, as a share of it.
+    tilt_sigma : float
+        Tangent of a usual tilt of the camera.
+    """
+
+    road_px: float = 9.0
+    max_pixels: int = 16_000_000
+    share: float = 0.34
+    height_sigma: float = 0.04
+    tilt_sigma: float = 0.3
+
+
+@dataclass(frozen=True)
+class Mosaic:
+    """Frames on one plane. Dimension: K frames.
+
+    Attributes
+    ----------
+    mask : RoadMask
+        What they show together.
+    to_mosaic : (K, 3, 3) float64
+        Pixel of each frame to pixel of the mask, GDAL's corner convention.
+    """
+
+    mask: RoadMask
+    to_mosaic: FloatArray
+
+
+def chain(motion: Sequence[FloatArray] | FloatArray) -> FloatArray:
+    """Return (K, 3, 3): pixel of each frame to pixel of the first, from frame-to-frame motion (the first is ignored)."""
+    matrices = [np.eye(3)]
+    for step in list(motion)[1:]:
+        product = matrices[-1] @ step
+        matrices.append(product / np.linalg.norm(product))
+    return np.stack(matrices)
+
+
+def level(chained: FloatArray, frame: Frame, options: MosaicOptions | None = None) -> FloatArray:
+    """Take chained frames (K, 3, 3) to a plane on which all show about as much ground.
+
+    Returns
+    -------
+    (K, 3, 3) float64
+        Pixel of each frame to that plane; its unit is half a frame's diagonal, its origin the middle of the first one.
+    """
+    options = options or MosaicOptions()
+    unit = frame.half_diagonal
+    to_unit = np.array([[1.0, 0.0, -frame.center[0]], [0.0, 1.0, -frame.center[1]], [0.0, 0.0, unit]]) / unit
+    local = to_unit @ chained @ np.linalg.inv(to_unit)  # the middle of each frame is (0, 0)
+    local = local / np.cbrt(np.linalg.det(local))[:, None, None]
+
+    def residuals(line: FloatArray) -> FloatArray:
+        # The area scale at a frame's middle is det / w^3, and a line at infinity changes w alone.
+        w = local[:, 2, 2] + local[:, :2, 2] @ line
+        size = -1.5 * np.log(np.maximum(w, 1e-6))
+        return np.concatenate(((size - size.mean()) / 2.0 / options.height_sigma, line / options.tilt_sigma))
+
+    line = least_squares(residuals, np.zeros(2), max_nfev=40).x if len(local) > 1 else np.zeros(2)
+    levelled = np.array([[1.0, 0.0, 0.0], [0.0, 1.0, 0.0], [line[0], line[1], 1.0]]) @ local @ to_unit
+    middle = np.append(frame.center, 1.0)
+    return np.asarray(levelled * np.sign(levelled[:, 2] @ middle)[:, None, None])
+
+
+def lay_together(
+    masks: Sequence[RoadMask], motion: Sequence[FloatArray], road_px: float, options: MosaicOptions | None = None
+) -> Mosaic | None:
+    """Lay frames of one size on one plane; None where the motion cannot be that of a camera above a plane.
+
+    Parameters
+    ----------
+    motion : K matrices (3, 3)
+        Pixel of each frame to pixel of the one before; the first is ignored.
+    road_px : float
+        Width of a road in the frames.
+    """
+    options = options or MosaicOptions()
+    height, width = masks[0].shape
+    frame = Frame(width, height)
+    levelled = level(chain(motion), frame, options)
+    corners = np.stack([Homography(matrix)(frame.corners) for matrix in levelled])
+    if not _is_sound(corners):
+        return None
+    low, high = corners.min(axis=(0, 1)), corners.max(axis=(0, 1))
+    per_unit = frame.half_diagonal * min(1.0, options.road_px / road_px)
+    scale = min(per_unit, float(np.sqrt(options.max_pixels / np.prod(high - low))))
+    to_pixel = np.array([[scale, 0.0, -scale * low[0]], [0.0, scale, -scale * low[1]], [0.0, 0.0, 1.0]])
+    to_mosaic = to_pixel @ levelled
+    columns, rows = np.ceil((high - low) * scale).astype(int) + 1
+    roads, seen = np.zeros((rows, columns), np.uint8), np.zeros((rows, columns), np.uint8)
+    for mask, matrix in zip(masks, to_mosaic, strict=True):
+        _paint(mask, matrix, roads, seen)
+    shown = (seen > 0) & (roads > options.share * seen)
+    return Mosaic(RoadMask(shown, seen > 0, masks[0].name), to_mosaic)
+
+
+def _is_sound(corners: FloatArray) -> bool:
+    """Whether all frames (K, 4, 2) look at the plane from above, none much larger than another."""
+    if not np.isfinite(corners).all():
+        return False
+    x, y = corners[..., 0], corners[..., 1]
+    areas = 0.5 * np.sum(x * np.roll(y, -1, axis=1) - y * np.roll(x, -1, axis=1), axis=1)
+    return bool(areas.min() > 0.0 and areas.max() < 16.0 * areas.min())
+
+
+def _paint(mask: RoadMask, matrix: FloatArray, roads: AnyArray, seen: AnyArray) -> None:
+    """Count where a frame shows road, and where it sees at all, on the mosaic; both (R, C) uint8 are changed."""
+    height, width = mask.shape
+    corners = Homography(matrix)(Frame(width, height).corners)
+    left, top = np.maximum(np.floor(corners.min(axis=0)).astype(int) - 1, 0)
+    right, bottom = np.ceil(corners.max(axis=0)).astype(int) + 2
+    part = np.s_[top:bottom, left:right]
+    # OpenCV counts from pixel centres.
+    inward = np.array([[1.0, 0.0, 0.5], [0.0, 1.0, 0.5], [0.0, 0.0, 1.0]])
+    outward = np.array([[1.0, 0.0, -0.5 - left], [0.0, 1.0, -0.5 - top], [0.0, 0.0, 1.0]])
+    size = roads[part].shape[::-1]
+    warp = outward @ matrix @ inward
+    values = mask.roads.view(np.uint8) * np.uint8(255)
+    known = np.full(mask.shape, 255, np.uint8) if mask.observed is None else mask.observed.view(np.uint8) * np.uint8(255)
+    roads[part] += cv2.warpPerspective(values, warp, size, flags=cv2.INTER_AREA) > 127
+    seen[part] += cv2.warpPerspective(known, warp, size, flags=cv2.INTER_NEAREST) > 127

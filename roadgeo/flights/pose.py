@@ -1,0 +1,226 @@
+"""Where a frame lies, as the places of its corners with their covariance: predicted by motion, corrected by roads.
+
+An extended Kalman filter. Its state is a frame's four corners on the reference plane in metres, eight numbers that say
+the same as a homography; measurements are the distances of the frame's road points from roads of the map.
+"""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass
+
+import numpy as np
+
+from roadgeo._arrays import FloatArray
+from roadgeo.geometry.frame import Frame
+from roadgeo.geometry.homography import Homography
+from roadgeo.geometry.mask import PIXEL_TO_PLANE
+from roadgeo.kernels.adjustment import point_row
+from roadgeo.kernels.road_equations import road_equations
+from roadgeo.kernels.road_growth import RoadBuckets
+from roadgeo.matching.index import ReferenceIndex
+from roadgeo.matching.scene import Scene
+
+__all__ = ["FilterOptions", "Pose", "correct", "predict", "start"]
+
+
+@dataclass(frozen=True)
+class FilterOptions:
+    """How motion and roads are weighed.
+
+    Attributes
+    ----------
+    motion_px : float
+        Standard deviation of a corner's place in the frame before, by the motion.
+    sigma_m, sigma_px : float
+        Standard deviation of a road point across the road: the map's and the mask's.
+    correlation_m : float
+        Errors of the map and of the mask keep their sign over about this length of road.
+    radii : tuple of (float, float)
+        Of each step of the adjustment: roads are looked for so many metres, and so many standard deviations of the
+        prediction, away; the lesser of the two counts.
+    least_radius_m : float
+        They are always looked for so far away.
+    max_turn_deg : float
+        Roads count that run the point's way, within this angle.
+    fewest : int
+        With fewer road points on roads a frame is not corrected.
+    """
+
+    motion_px: float = 1.5
+    sigma_m: float = 1.2
+    sigma_px: float = 0.9
+    correlation_m: float = 30.0
+    radii: tuple[tuple[float, float], ...] = ((25.0, 3.0), (18.0, 2.5), (12.0, 2.0), (8.0, 1.5), (6.0, 1.5))
+    least_radius_m: float = 5.0
+    max_turn_deg: float = 25.0
+    fewest: int = 20
+
+
+@dataclass(frozen=True)
+class Pose:
+    """A frame's place.
+
+    Attributes
+    ----------
+    corners : (4, 2) float64
+        TL, TR, BR, BL on the reference plane, metres.
+    covariance : (8, 8) float64
+        Of the corners x0 y0 x1 y1 ..., square metres.
+    frame : Frame
+    """
+
+    corners: FloatArray
+    covariance: FloatArray
+    frame: Frame
+
+    @property
+    def homography(self) -> Homography:
+        """Pixel (column, row) to the reference plane."""
+        local = _Local.of(self)
+        return Homography(local.matrix(local.parameters(self.corners)) @ PIXEL_TO_PLANE)
+
+    @property
+    def center(self) -> FloatArray:
+        """(2,) where the middle of the frame lies."""
+        return self.homography(self.frame.center)
+
+    @property
+    def gsd_m(self) -> float:
+        """Metres per pixel in the middle of the frame."""
+        return math.sqrt(abs(float(np.linalg.det(self.homography.jacobian(self.frame.center)))))
+
+    @property
+    def sigma_m(self) -> float:
+        """Standard deviation of the middle's place: root mean square of its distance from the truth."""
+        row = _rows(_Local.of(self), self.corners, np.zeros((1, 2)))
+        return math.sqrt(float(np.trace(row @ self.covariance @ row.T)))
+
+    @property
+    def corner_sigma_m(self) -> FloatArray:
+        """(4,) the same of the corners."""
+        return np.asarray(np.sqrt(self.covariance.diagonal().reshape(4, 2).sum(axis=1)))
+
+
+@dataclass(frozen=True)
+class _Local:
+    """Normalised coordinates: of a frame, (0, 0) is its middle; of the plane, `origin`, in units of `unit` metres."""
+
+    frame: Frame
+    origin: FloatArray
+    unit: float
+
+    @classmethod
+    def of(cls, pose: Pose) -> _Local:
+        diagonals = np.hypot(*(pose.corners[2:] - pose.corners[:2]).T)
+        return cls(pose.frame, pose.corners.mean(axis=0), float(diagonals.mean()) / 2.0)
+
+    @property
+    def corners(self) -> FloatArray:
+        """(4, 2) the frame's corners, y up."""
+        return self.query(self.frame.plane_corners)
+
+    def query(self, xy: FloatArray) -> FloatArray:
+        """Take (..., 2) points of the query plane to normalised ones."""
+        return np.asarray((xy - self.frame.plane_center) / self.frame.half_diagonal)
+
+    def parameters(self, corners: FloatArray) -> FloatArray:
+        """Return p (8,) of the map that takes the frame's corners to these (4, 2), metres."""
+        uv, xy = self.corners, (corners - self.origin) / self.unit
+        system = np.zeros((8, 8))
+        system[0::2, 0:2], system[0::2, 2] = uv, 1.0
+        system[1::2, 3:5], system[1::2, 5] = uv, 1.0
+        system[0::2, 6:], system[1::2, 6:] = -xy[:, :1] * uv, -xy[:, 1:] * uv
+        return np.asarray(np.linalg.solve(system, xy.ravel()))
+
+    def places(self, p: FloatArray, uv: FloatArray) -> FloatArray:
+        """Return where p puts (N, 2) normalised points, metres."""
+        mapped = np.c_[uv, np.ones(len(uv))] @ np.append(p, 1.0).reshape(3, 3).T
+        return np.asarray(self.origin + self.unit * mapped[:, :2] / mapped[:, 2:])
+
+    def matrix(self, p: FloatArray) -> FloatArray:
+        """Return p as a map from the query plane, pixels, to the reference plane, metres; w is 1 in the middle."""
+        half, (x, y) = self.frame.half_diagonal, self.frame.plane_center
+        from_query = np.array([[1.0, 0.0, -x], [0.0, 1.0, -y], [0.0, 0.0, half]]) / half
+        to_plane = np.array([[self.unit, 0.0, self.origin[0]], [0.0, self.unit, self.origin[1]], [0.0, 0.0, 1.0]])
+        return np.asarray(to_plane @ np.append(p, 1.0).reshape(3, 3) @ from_query)
+
+    def derivative(self, p: FloatArray, uv: FloatArray) -> FloatArray:
+        """Return the derivative (2N, 8) of places, metres, by p."""
+        rows = np.empty((len(uv), 2, 8))
+        for i, (u, v) in enumerate(uv):
+            point_row(p, u, v, 1.0, 0.0, rows[i, 0])
+            point_row(p, u, v, 0.0, 1.0, rows[i, 1])
+        return np.asarray(self.unit * rows.reshape(-1, 8))
+
+
+def _rows(local: _Local, corners: FloatArray, uv: FloatArray) -> FloatArray:
+    """Return the derivative (2N, 8) of places of normalised points by the places of the frame's corners."""
+    p = local.parameters(corners)
+    return np.asarray(local.derivative(p, uv) @ np.linalg.inv(local.derivative(p, local.corners)))
+
+
+def start(homography: Homography, frame: Frame, sigma_m: float) -> Pose:
+    """Return the pose of a frame whose homography (pixel to plane) is known, each corner to `sigma_m`."""
+    return Pose(homography(frame.corners), np.eye(8) * sigma_m**2 / 2.0, frame)
+
+
+def predict(pose: Pose, motion: FloatArray, options: FilterOptions, sigma_px: float | None = None) -> Pose | None:
+    """Return where the next frame lies by its motion alone; None where that cannot be.
+
+    Parameters
+    ----------
+    motion : (3, 3) float64
+        Pixel of the next frame to pixel of this one.
+    sigma_px : float, optional
+        Error of the motion, where it is another than the options say.
+    """
+    local = _Local.of(pose)
+    seen = Homography(motion).facing(pose.frame.center)(pose.frame.corners)
+    if not np.isfinite(seen).all():
+        return None
+    uv = local.query(seen * (1.0, -1.0))
+    p = local.parameters(pose.corners)
+    if (np.c_[uv, np.ones(4)] @ np.append(p[6:], 1.0) < 0.05).any():
+        return None
+    rows = _rows(local, pose.corners, uv)
+    noise = (pose.gsd_m * (options.motion_px if sigma_px is None else sigma_px)) ** 2
+    covariance = rows @ pose.covariance @ rows.T + np.eye(8) * noise
+    return Pose(local.places(p, uv), covariance, pose.frame)
+
+
+def correct(pose: Pose, scene: Scene, index: ReferenceIndex, options: FilterOptions) -> Pose | None:
+    """Lay a frame's roads on those of the map, starting from a predicted pose; None where there are too few."""
+    local, gsd = _Local.of(pose), pose.gsd_m
+    p = local.parameters(pose.corners)
+    corners = local.corners
+    weight = np.linalg.inv(pose.covariance)
+    sigma = math.hypot(options.sigma_m, options.sigma_px * gsd)
+    roads = RoadBuckets(index.segments, index.segment_starts, index.segment_ids, index.grid, index.shape)
+    points = np.ascontiguousarray(local.query(scene.points))
+    spacing = scene.road_length_px * gsd / max(len(points), 1)
+    share = min(1.0, spacing / options.correlation_m)  # points closer than that are no independent observations
+    unsure = float(pose.corner_sigma_m.mean())
+    normal, right = np.empty((8, 8)), np.empty(8)
+    for most_m, deviations in options.radii:
+        radius = max(min(most_m, deviations * unsure), options.least_radius_m)
+        normal[:], right[:] = 0.0, 0.0
+        met = road_equations(
+            p, local.unit, local.origin, points, scene.directions, radius, max(sigma, radius / 3.0),
+            math.cos(math.radians(options.max_turn_deg)), roads, normal, right,
+        )  # fmt: skip
+        if met < options.fewest:
+            return None
+        jacobian = local.derivative(p, corners)
+        scale = share * (local.unit / sigma) ** 2
+        pulled = (pose.corners - local.places(p, corners)).ravel()
+        step = np.linalg.solve(
+            scale * normal + jacobian.T @ weight @ jacobian, scale * right + jacobian.T @ weight @ pulled
+        )
+        p = p + step
+        if (np.c_[corners, np.ones(4)] @ np.append(p[6:], 1.0) < 0.05).any() or not np.isfinite(p).all():
+            return None
+    jacobian = local.derivative(p, corners)
+    information = scale * normal + jacobian.T @ weight @ jacobian
+    covariance = jacobian @ np.linalg.inv(information) @ jacobian.T
+    return Pose(local.places(p, corners), (covariance + covariance.T) / 2.0, pose.frame)

@@ -1,0 +1,348 @@
+"""The way of a flight: frames are laid together until the map knows them, then each is followed from the one before.
+
+While nothing is known, each frame is laid to those before, and the mosaic is located like any mask: the evidence is
+that of the engine, and each further look takes its share off. From there on a frame is predicted by its motion, laid on
+the roads nearby, and checked against chance. Frames that do not agree are taken for predicted; where several in a row
+do not, the flight is lost, and the search begins anew with them.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Iterable, Iterator, Sequence
+from dataclasses import dataclass, field, replace
+from typing import Literal
+
+import numpy as np
+
+from roadgeo._arrays import FloatArray
+from roadgeo.errors import MaskError
+from roadgeo.flights.mosaic import Mosaic, MosaicOptions, lay_together
+from roadgeo.flights.pose import FilterOptions, Pose, correct, predict, start
+from roadgeo.geometry.frame import Frame
+from roadgeo.geometry.homography import Homography
+from roadgeo.geometry.mask import PIXEL_TO_PLANE, RoadMask
+from roadgeo.location import Location
+from roadgeo.matching.options import LocateOptions
+from roadgeo.matching.query import trace_query
+from roadgeo.matching.scene import Scene
+from roadgeo.matching.verification import agreement, chance_agreement, log10_odds
+from roadgeo.reference.reference import Reference
+from roadgeo.roads.vectorization import road_width
+from roadgeo.warmup import warm_up
+from roadgeo.workflows import locate
+
+__all__ = ["FlightFrame", "Fix", "FrameStatus", "TrackOptions", "Tracked", "Tracker", "track"]
+
+FrameStatus = Literal["located", "tracked", "predicted", "lost"]
+
+
+@dataclass(frozen=True)
+class TrackOptions:
+    """How a flight is followed.
+
+    Attributes
+    ----------
+    locate : LocateOptions
+        How mosaics are located; the hints are of the frames.
+    most_frames : int
+        Of more frames that wait for a place, the latest are laid together.
+    fewest_intersections, more_intersections : int
+        A mosaic is looked for once it shows so many intersections, and again when it shows so many more.
+    start_sigma_m : float
+        Standard deviation of a located mosaic.
+    least_odds : float
+        Log10 odds against chance by which a tracked frame agrees with the map. Of simulated frames in place 98 % have
+        0.3 and more; of frames from elsewhere none had more than 0.1.
+    patience : int
+        After so many frames in a row that do not agree the flight is lost.
+    lost_frames : float
+        It is lost, too, when it may be off by this share of a frame.
+    """
+
+    locate: LocateOptions = field(default_factory=LocateOptions)
+    mosaic: MosaicOptions = field(default_factory=MosaicOptions)
+    filter: FilterOptions = field(default_factory=FilterOptions)
+    most_frames: int = 16
+    fewest_intersections: int = 6
+    more_intersections: int = 2
+    start_sigma_m: float = 3.0
+    least_odds: float = 0.2
+    patience: int = 3
+    lost_frames: float = 0.3
+
+
+@dataclass(frozen=True)
+class FlightFrame:
+    """A frame as it comes in.
+
+    Attributes
+    ----------
+    time_s : float
+        Since the flight began.
+    mask : RoadMask
+    motion : (3, 3) float64 or None
+        Pixel of this frame to pixel of the one before; None: not known.
+    """
+
+    number: int
+    name: str
+    time_s: float
+    mask: RoadMask
+    motion: FloatArray | None = None
+
+    @property
+    def frame(self) -> Frame:
+        """Its size."""
+        height, width = self.mask.shape
+        return Frame(width, height)
+
+
+@dataclass(frozen=True)
+class Tracked:
+    """What is known of a frame.
+
+    Attributes
+    ----------
+    status : str
+        "located": placed by the search, alone or in a mosaic. "tracked": followed from the frame before, and the map
+        agrees. "predicted": by its motion alone, hardly a road agrees. "lost": not known.
+    pose : Pose or None
+        None where it is lost.
+    reference : Reference or None
+    log10_odds : float
+        Against chance at this place, of this frame alone; NaN where it was not compared.
+    known_at : int
+        Number of the frame at which this was known: a frame that waited in a mosaic was placed later.
+    reason : str
+    """
+
+    frame: FlightFrame
+    status: FrameStatus
+    reason: str
+    known_at: int
+    pose: Pose | None = None
+    reference: Reference | None = None
+    log10_odds: float = math.nan
+
+
+@dataclass(frozen=True)
+class Fix:
+    """A mosaic that was located: of the frames `first` to `last`."""
+
+    first: int
+    last: int
+    location: Location
+
+
+@dataclass(frozen=True)
+class _Waiting:
+    """A frame that waits for a place, traced; None where it shows no roads."""
+
+    frame: FlightFrame
+    scene: Scene | None
+
+
+class Tracker:
+    """Follows one flight, frame by frame.
+
+    Attributes
+    ----------
+    fixes : list of Fix
+        Each time the flight was located.
+    """
+
+    def __init__(self, references: Sequence[Reference], options: TrackOptions | None = None) -> None:
+        warm_up()
+        self.references, self.options = list(references), options or TrackOptions()
+        self.fixes: list[Fix] = []
+        self._pose: Pose | None = None
+        self._reference: Reference | None = None
+        self._doubtful: list[_Waiting] = []  # frames in a row that do not agree
+        self._window: list[_Waiting] = []
+        self._looks = self._looked_at = 0
+
+    @property
+    def is_lost(self) -> bool:
+        """Whether the next frame has to be searched for."""
+        return self._pose is None
+
+    def feed(self, frame: FlightFrame) -> list[Tracked]:
+        """Take the next frame; return what is known of it now, after what has become known of earlier ones."""
+        waiting = _Waiting(frame, _trace(frame.mask, self.options))
+        if self._pose is not None:
+            return self._follow(waiting)
+        return self._search(waiting)
+
+    # --- tracking -----------------------------------------------------------------------------------------------------
+
+    def _follow(self, waiting: _Waiting) -> list[Tracked]:
+        """Take the next frame of a flight whose place is known."""
+        frame = waiting.frame
+        tracked = self._step(waiting, frame.number, "tracked")
+        if tracked.status == "predicted" and waiting.scene is not None:
+            self._doubtful.append(waiting)
+        else:
+            self._doubtful = []
+        if tracked.status == "lost" or len(self._doubtful) >= self.options.patience:
+            return self._lose(waiting, tracked.reason)
+        return [tracked]
+
+    def _step(self, waiting: _Waiting, known_at: int, status: FrameStatus) -> Tracked:
+        """Predict a frame from the one before, lay it on the roads, and check that they agree."""
+        frame, options = waiting.frame, self.options
+        assert self._pose is not None  # noqa: S101 (callers see to it)
+        assert self._reference is not None  # noqa: S101
+        predicted = None if frame.motion is None else predict(self._pose, frame.motion, options.filter)
+        if predicted is None:
+            why = "its motion is not known" if frame.motion is None else "its motion is that of no camera"
+            return Tracked(frame, "lost", why, known_at)
+        return self._judge(waiting, predicted, known_at, status)
+
+    def _judge(self, waiting: _Waiting, predicted: Pose, known_at: int, status: FrameStatus) -> Tracked:
+        frame, scene, reference = waiting.frame, waiting.scene, self._reference
+        assert reference is not None  # noqa: S101
+        corrected = None if scene is None else correct(predicted, scene, reference.index, self.options.filter)
+        odds, why = math.nan, "it shows hardly a road of the map; placed by its motion"
+        if corrected is not None and scene is not None:
+            odds = _odds(corrected, scene, reference, self.options.locate)
+            if odds >= self.options.least_odds:
+                self._pose = corrected
+                why = f"its roads agree; log10 odds {odds:.1f} against chance here"
+                return Tracked(frame, status, why, known_at, corrected, reference, odds)
+            why = f"its roads do not agree (log10 odds {odds:.1f} against chance here); placed by its motion"
+        frame_m = predicted.frame.half_diagonal * 2.0 * predicted.gsd_m
+        if predicted.sigma_m > self.options.lost_frames * frame_m:
+            return Tracked(frame, "lost", "no road has agreed for too long", known_at)
+        self._pose = predicted
+        return Tracked(frame, "predicted", why, known_at, predicted, reference, odds)
+
+    def _lose(self, waiting: _Waiting, reason: str) -> list[Tracked]:
+        """Declare the flight lost: frames that did not agree wait for a place again."""
+        doubtful = self._doubtful if self._doubtful and self._doubtful[-1] is waiting else [*self._doubtful, waiting]
+        known_at = waiting.frame.number
+        why = f"lost: {len(doubtful)} frames in a row do not agree with the map" if len(doubtful) > 1 else reason
+        self._pose, self._reference = None, None
+        self._window, self._doubtful = list(doubtful), []
+        self._looks = self._looked_at = 0
+        return [Tracked(one.frame, "lost", why, known_at) for one in doubtful]
+
+    # --- searching ----------------------------------------------------------------------------------------------------
+
+    def _search(self, waiting: _Waiting) -> list[Tracked]:
+        """Lay the next frame to those that wait, and look for all of them where that is worth while."""
+        frame = waiting.frame
+        if frame.motion is None or (self._window and self._window[-1].frame.frame != frame.frame):
+            self._window = []
+            self._looked_at = 0
+        self._window = [*self._window, waiting][-self.options.most_frames :]
+        masks = [one.frame.mask for one in self._window]
+        mosaic = lay_together(masks, [_motion(one) for one in self._window], _road_px(masks), self.options.mosaic)
+        if mosaic is None:
+            self._window, self._looked_at = [waiting], 0
+            return [Tracked(frame, "lost", "the motion is that of no camera; begun anew", frame.number)]
+        n_seen = _count_intersections(mosaic, self.options)
+        least = max(self.options.fewest_intersections, self._looked_at + self.options.more_intersections)
+        if n_seen < least:
+            why = f"waits: {len(masks)} frames show {n_seen} intersections, looked for again with {least}"
+            return [Tracked(frame, "lost", why, frame.number)]
+        self._looks += 1
+        self._looked_at = n_seen
+        location = locate(mosaic.mask, self.references, self._look_options(mosaic, masks))
+        if not location.located:
+            return [Tracked(frame, "lost", f"{len(masks)} frames: {location.reason}", frame.number)]
+        return self._settle(location, mosaic) or [
+            Tracked(frame, "lost", "a place was found, but the frames by themselves do not agree", frame.number)
+        ]
+
+    def _look_options(self, mosaic: Mosaic, masks: Sequence[RoadMask]) -> LocateOptions:
+        """Return options for a mosaic: its pixels are others than the frames', and each look takes its share off."""
+        options, camera = self.options.locate, self.options.locate.match.camera
+        height, width = masks[0].shape
+        shrunk = [_scale(matrix, Frame(width, height)) for matrix in mosaic.to_mosaic]
+        low, high = camera.gsd_m[0] / max(shrunk), camera.gsd_m[1] / min(shrunk)
+        camera = replace(camera, gsd_m=(low, high), focal_px=None)
+        near = options.near
+        if near is not None:
+            near = (near[0], near[1], near[2] + 0.5 * max(mosaic.mask.shape) * high)
+        odds = options.min_log10_odds + math.log10(self._looks)
+        return replace(options, match=replace(options.match, camera=camera), near=near, min_log10_odds=odds)
+
+    def _settle(self, location: Location, mosaic: Mosaic) -> list[Tracked]:
+        """Place all frames that waited, each by itself; nothing where most of them do not agree."""
+        reference = next(one for one in self.references if one.name == location.reference)
+        plane = reference.index.plane
+        to_plane = np.linalg.inv(plane.to_crs_matrix()) @ location.homography @ mosaic.to_mosaic
+        first, last = self._window[0].frame, self._window[-1].frame
+        self._reference = reference
+        placed: list[Tracked] = []
+        for waiting, matrix in zip(self._window, to_plane, strict=True):
+            frame = waiting.frame
+            homography = Homography(matrix).facing(frame.frame.center)
+            here = start(homography, frame.frame, self.options.start_sigma_m)
+            if np.isfinite(here.corners).all():
+                placed.append(self._judge(waiting, here, last.number, "located"))
+        agreed = sum(one.status == "located" for one in placed)
+        if len(placed) < len(self._window) or agreed < 0.5 * len(placed):
+            self._pose, self._reference = None, None
+            return []
+        self.fixes.append(Fix(first.number, last.number, location))
+        self._window, self._doubtful = [], []
+        self._looks = self._looked_at = 0
+        return placed
+
+
+def track(
+    frames: Iterable[FlightFrame], references: Sequence[Reference], options: TrackOptions | None = None
+) -> list[Tracked]:
+    """Follow a flight to its end; return what is known of each frame in the end, in order."""
+    known: dict[int, Tracked] = {}
+    for _, news in follow(frames, references, options):
+        known.update({one.frame.number: one for one in news})
+    return [known[number] for number in sorted(known)]
+
+
+def follow(
+    frames: Iterable[FlightFrame], references: Sequence[Reference], options: TrackOptions | None = None
+) -> Iterator[tuple[FlightFrame, list[Tracked]]]:
+    """Follow a flight; yield each frame with what has become known by it."""
+    tracker = Tracker(references, options)
+    for frame in frames:
+        yield frame, tracker.feed(frame)
+
+
+def _trace(mask: RoadMask, options: TrackOptions) -> Scene | None:
+    try:
+        return trace_query(mask, options.locate.query)[0]
+    except MaskError:
+        return None  # a frame without roads is no error: it is followed by its motion
+
+
+def _motion(waiting: _Waiting) -> FloatArray:
+    return np.eye(3) if waiting.frame.motion is None else waiting.frame.motion
+
+
+def _road_px(masks: Sequence[RoadMask]) -> float:
+    """Return the usual width of a road in frames, pixels."""
+    shown = [road_width(mask) for mask in masks if mask.roads.any()]
+    return float(np.median(shown)) if shown else 1.0
+
+
+def _count_intersections(mosaic: Mosaic, options: TrackOptions) -> int:
+    scene = _trace(mosaic.mask, options)
+    return 0 if scene is None else len(scene.intersections)
+
+
+def _scale(matrix: FloatArray, frame: Frame) -> float:
+    """Return how many pixels of a mosaic a frame's pixel is wide, in its middle."""
+    return math.sqrt(abs(float(np.linalg.det(Homography(matrix).jacobian(frame.center)))))
+
+
+def _odds(pose: Pose, scene: Scene, reference: Reference, options: LocateOptions) -> float:
+    """Return the log10 odds of a frame at its place against chance nearby."""
+    matrix = pose.homography.matrix @ PIXEL_TO_PLANE
+    nobody = np.empty(0, np.int64)
+    verify, index, gsd = options.match.verify, reference.index, pose.gsd_m
+    found, _, _ = agreement(matrix, scene, index, gsd, nobody, verify)
+    chance = chance_agreement(matrix, scene, index, gsd, verify, 6)
+    return log10_odds(found, chance, scene.n_edges, 1, verify)
