@@ -1,6 +1,6 @@
 """How well flights are followed: simulated low flights over real cities, their motion known or told by their masks.
 
-    python examples/flights.py boston.gpkg slc.gpkg liege.gpkg --flights 20 --seed 7
+    OMP_NUM_THREADS=1 python examples/flights.py boston.gpkg slc.gpkg liege.gpkg --flights 20 --seed 7
 
 Each flight is followed as `roadgeo track` does it, and then cut: frames of a flight over the next city come instead, as
 if nothing had happened. What is counted: the frame at which a flight was placed, whether it was placed right, how far
@@ -10,14 +10,10 @@ noticed. The flights of a seed are always the same; the defaults of `TrackOption
 
 import argparse
 import json
-import os
 import time
 from collections import Counter
 from dataclasses import asdict, dataclass, field
 from pathlib import Path
-
-for name in ("NUMBA_NUM_THREADS", "OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS"):
-    os.environ.setdefault(name, "1")
 
 import cv2
 import numpy as np
@@ -141,8 +137,9 @@ def main() -> None:
             other = flights[(c + 1) % len(flights)]
             results.append(fly(flight, other, references[c], references[c].name, given.motion == "masks"))
             one = results[-1]
-            print(f"{one.city} {k}: fixed at {one.fixed_at} of {one.frames}, {one.statuses}, largest error"
-                  f" {max(one.errors_m, default=0.0):.1f} m, cut noticed after {one.cut_noticed_after}", flush=True)  # fmt: skip
+            told = f"{one.city} {k}: fixed at {one.fixed_at} of {one.frames}, {one.statuses}"
+            largest = max(one.errors_m, default=0.0)
+            print(f"{told}, largest error {largest:.1f} m, cut noticed after {one.cut_noticed_after}", flush=True)
             if given.out:
                 with given.out.open("a") as file:
                     file.write(json.dumps(asdict(one)) + "\n")

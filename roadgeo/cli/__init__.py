@@ -28,6 +28,7 @@ COMMANDS = {
     "index": ("roadgeo.cli.index", "Build a reference: the searchable roads of a place."),
     "locate": ("roadgeo.cli.locate", "Find road masks on a reference and draw them there."),
     "verify": ("roadgeo.cli.verify", "Check whether georeferenced images are where they say."),
+    "track": ("roadgeo.cli.track", "Follow a flight over the map, frame by frame."),
     "vectorize": ("roadgeo.cli.vectorize", "Show what roads are seen in a mask."),
     "info": ("roadgeo.cli.references", "Describe a reference."),
     "check": ("roadgeo.cli.references", "Verify every byte and number of a reference."),

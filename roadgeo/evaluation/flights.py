@@ -1,4 +1,4 @@
-"""Flights whose way is known: overlapping frames by one camera, as road masks, and how each follows from the one before.
+"""Flights whose way is known: overlapping frames of one camera, as road masks, and how each follows from the last.
 
 Frames are views of a road map with what goes wrong in real masks (`noise`). Some roads are hidden in all frames of a
 flight, as trees hide them; others are missed in one frame and seen in the next. All is drawn from seeds, flight by
@@ -11,6 +11,7 @@ import zlib
 from collections.abc import Iterator
 from dataclasses import dataclass, field, replace
 from functools import cached_property
+from itertools import pairwise
 
 import numpy as np
 
@@ -112,7 +113,7 @@ class Flight:
         rng = _generator(self.options, self.number, "hidden")
         graph = self.landscape.graph
         kept = np.flatnonzero(rng.random(graph.n_edges) >= rng.uniform(*self.options.hidden))
-        return RoadGraph.from_polylines(graph.xy, graph.edges[kept], [graph.polyline(e) for e in kept])
+        return RoadGraph.from_polylines(graph.xy, graph.edges[kept], [graph.polyline(e) for e in kept.tolist()])
 
 
 def simulate_flight(landscape: Landscape, options: FlightOptions, number: int) -> Flight:
@@ -133,8 +134,8 @@ def simulate_flight(landscape: Landscape, options: FlightOptions, number: int) -
         if np.mean((seen >= least) & (seen <= most)) >= 0.9:
             return Flight(landscape, options, number, views, _motion(views, options.motion_px, rng))
     raise RoadSourceError(
-        f"no flight whose frames show {least} to {most} intersections was found in {MAX_TRIES} draws; give a larger map,"
-        " or ask for other ones"
+        f"no flight whose frames show {least} to {most} intersections was found in {MAX_TRIES} draws; give a larger"
+        " map, or ask for other ones"
     )
 
 
@@ -177,7 +178,7 @@ def _draw_views(landscape: Landscape, options: FlightOptions, rng: np.random.Gen
 def _motion(views: tuple[View, ...], error_px: float, rng: np.random.Generator) -> FloatArray:
     """Return what a measurement of the motion gives, (K, 3, 3): each corner of a frame is placed with an error."""
     motion = [np.eye(3)]
-    for before, view in zip(views, views[1:], strict=False):
+    for before, view in pairwise(views):
         corners = Frame(*view.size_px).corners
         exact = before.homography.inverse() @ view.homography
         motion.append(_through(corners, exact(corners) + rng.normal(0.0, error_px, (4, 2))).matrix)
@@ -188,4 +189,5 @@ def _through(source: FloatArray, target: FloatArray) -> Homography:
     """Return the homography that takes four points to four others, (4, 2) each."""
     import cv2
 
-    return Homography(cv2.getPerspectiveTransform(source.astype(np.float32), target.astype(np.float32)))
+    matrix = cv2.getPerspectiveTransform(source.astype(np.float32), target.astype(np.float32))
+    return Homography(np.asarray(matrix, np.float64))

@@ -64,7 +64,7 @@ class Mosaic:
 
 
 def chain(motion: Sequence[FloatArray] | FloatArray) -> FloatArray:
-    """Return (K, 3, 3): pixel of each frame to pixel of the first, from frame-to-frame motion (the first is ignored)."""
+    """Return (K, 3, 3), pixel of each frame to pixel of the first, from K motions, of which the first is ignored."""
     matrices = [np.eye(3)]
     for step in list(motion)[1:]:
         product = matrices[-1] @ step
@@ -152,6 +152,8 @@ def _paint(mask: RoadMask, matrix: FloatArray, roads: AnyArray, seen: AnyArray) 
     size = roads[part].shape[::-1]
     warp = outward @ matrix @ inward
     values = mask.roads.view(np.uint8) * np.uint8(255)
-    known = np.full(mask.shape, 255, np.uint8) if mask.observed is None else mask.observed.view(np.uint8) * np.uint8(255)
+    known = (
+        np.full(mask.shape, 255, np.uint8) if mask.observed is None else mask.observed.view(np.uint8) * np.uint8(255)
+    )
     roads[part] += cv2.warpPerspective(values, warp, size, flags=cv2.INTER_AREA) > 127
     seen[part] += cv2.warpPerspective(known, warp, size, flags=cv2.INTER_NEAREST) > 127

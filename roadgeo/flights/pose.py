@@ -21,7 +21,7 @@ from roadgeo.kernels.road_growth import RoadBuckets
 from roadgeo.matching.index import ReferenceIndex
 from roadgeo.matching.scene import Scene
 
-__all__ = ["FilterOptions", "Pose", "correct", "predict", "start"]
+__all__ = ["FilterOptions", "Pose", "correct", "predict", "roads_of", "start"]
 
 
 @dataclass(frozen=True)
@@ -30,8 +30,6 @@ class FilterOptions:
 
     Attributes
     ----------
-    motion_px : float
-        Standard deviation of a corner's place in the frame before, by the motion.
     sigma_m, sigma_px : float
         Standard deviation of a road point across the road: the map's and the mask's.
     correlation_m : float
@@ -47,7 +45,6 @@ class FilterOptions:
         With fewer road points on roads a frame is not corrected.
     """
 
-    motion_px: float = 1.5
     sigma_m: float = 1.2
     sigma_px: float = 0.9
     correlation_m: float = 30.0
@@ -165,15 +162,15 @@ def start(homography: Homography, frame: Frame, sigma_m: float) -> Pose:
     return Pose(homography(frame.corners), np.eye(8) * sigma_m**2 / 2.0, frame)
 
 
-def predict(pose: Pose, motion: FloatArray, options: FilterOptions, sigma_px: float | None = None) -> Pose | None:
+def predict(pose: Pose, motion: FloatArray, sigma_px: float) -> Pose | None:
     """Return where the next frame lies by its motion alone; None where that cannot be.
 
     Parameters
     ----------
     motion : (3, 3) float64
         Pixel of the next frame to pixel of this one.
-    sigma_px : float, optional
-        Error of the motion, where it is another than the options say.
+    sigma_px : float
+        Standard deviation of where the motion puts a corner.
     """
     local = _Local.of(pose)
     seen = Homography(motion).facing(pose.frame.center)(pose.frame.corners)
@@ -184,19 +181,23 @@ def predict(pose: Pose, motion: FloatArray, options: FilterOptions, sigma_px: fl
     if (np.c_[uv, np.ones(4)] @ np.append(p[6:], 1.0) < 0.05).any():
         return None
     rows = _rows(local, pose.corners, uv)
-    noise = (pose.gsd_m * (options.motion_px if sigma_px is None else sigma_px)) ** 2
+    noise = (pose.gsd_m * sigma_px) ** 2 / 2.0
     covariance = rows @ pose.covariance @ rows.T + np.eye(8) * noise
     return Pose(local.places(p, uv), covariance, pose.frame)
 
 
-def correct(pose: Pose, scene: Scene, index: ReferenceIndex, options: FilterOptions) -> Pose | None:
+def roads_of(index: ReferenceIndex) -> RoadBuckets:
+    """Return the roads of a map as `correct` takes them."""
+    return RoadBuckets(index.segments, index.segment_starts, index.segment_ids, index.grid, index.shape)
+
+
+def correct(pose: Pose, scene: Scene, roads: RoadBuckets, options: FilterOptions) -> Pose | None:
     """Lay a frame's roads on those of the map, starting from a predicted pose; None where there are too few."""
     local, gsd = _Local.of(pose), pose.gsd_m
     p = local.parameters(pose.corners)
     corners = local.corners
     weight = np.linalg.inv(pose.covariance)
     sigma = math.hypot(options.sigma_m, options.sigma_px * gsd)
-    roads = RoadBuckets(index.segments, index.segment_starts, index.segment_ids, index.grid, index.shape)
     points = np.ascontiguousarray(local.query(scene.points))
     spacing = scene.road_length_px * gsd / max(len(points), 1)
     share = min(1.0, spacing / options.correlation_m)  # points closer than that are no independent observations

@@ -18,7 +18,8 @@ import numpy as np
 from roadgeo._arrays import FloatArray
 from roadgeo.errors import MaskError
 from roadgeo.flights.mosaic import Mosaic, MosaicOptions, lay_together
-from roadgeo.flights.pose import FilterOptions, Pose, correct, predict, start
+from roadgeo.flights.pose import FilterOptions, Pose, correct, predict, roads_of, start
+from roadgeo.geometry.camera import CameraOptions
 from roadgeo.geometry.frame import Frame
 from roadgeo.geometry.homography import Homography
 from roadgeo.geometry.mask import PIXEL_TO_PLANE, RoadMask
@@ -32,7 +33,7 @@ from roadgeo.roads.vectorization import road_width
 from roadgeo.warmup import warm_up
 from roadgeo.workflows import locate
 
-__all__ = ["FlightFrame", "Fix", "FrameStatus", "TrackOptions", "Tracked", "Tracker", "track"]
+__all__ = ["Fix", "FlightFrame", "FrameStatus", "TrackOptions", "Tracked", "Tracker", "follow", "track"]
 
 FrameStatus = Literal["located", "tracked", "predicted", "lost"]
 
@@ -83,6 +84,8 @@ class FlightFrame:
     mask : RoadMask
     motion : (3, 3) float64 or None
         Pixel of this frame to pixel of the one before; None: not known.
+    motion_px : float
+        Standard deviation of where it puts a corner.
     """
 
     number: int
@@ -90,6 +93,7 @@ class FlightFrame:
     time_s: float
     mask: RoadMask
     motion: FloatArray | None = None
+    motion_px: float = 1.5
 
     @property
     def frame(self) -> Frame:
@@ -190,10 +194,10 @@ class Tracker:
 
     def _step(self, waiting: _Waiting, known_at: int, status: FrameStatus) -> Tracked:
         """Predict a frame from the one before, lay it on the roads, and check that they agree."""
-        frame, options = waiting.frame, self.options
-        assert self._pose is not None  # noqa: S101 (callers see to it)
-        assert self._reference is not None  # noqa: S101
-        predicted = None if frame.motion is None else predict(self._pose, frame.motion, options.filter)
+        frame = waiting.frame
+        predicted = (
+            None if self._pose is None or frame.motion is None else predict(self._pose, frame.motion, frame.motion_px)
+        )
         if predicted is None:
             why = "its motion is not known" if frame.motion is None else "its motion is that of no camera"
             return Tracked(frame, "lost", why, known_at)
@@ -201,10 +205,13 @@ class Tracker:
 
     def _judge(self, waiting: _Waiting, predicted: Pose, known_at: int, status: FrameStatus) -> Tracked:
         frame, scene, reference = waiting.frame, waiting.scene, self._reference
-        assert reference is not None  # noqa: S101
-        corrected = None if scene is None else correct(predicted, scene, reference.index, self.options.filter)
+        corrected = (
+            None
+            if scene is None or reference is None
+            else correct(predicted, scene, roads_of(reference.index), self.options.filter)
+        )
         odds, why = math.nan, "it shows hardly a road of the map; placed by its motion"
-        if corrected is not None and scene is not None:
+        if corrected is not None and scene is not None and reference is not None:
             odds = _odds(corrected, scene, reference, self.options.locate)
             if odds >= self.options.least_odds:
                 self._pose = corrected
@@ -221,7 +228,7 @@ class Tracker:
         """Declare the flight lost: frames that did not agree wait for a place again."""
         doubtful = self._doubtful if self._doubtful and self._doubtful[-1] is waiting else [*self._doubtful, waiting]
         known_at = waiting.frame.number
-        why = f"lost: {len(doubtful)} frames in a row do not agree with the map" if len(doubtful) > 1 else reason
+        why = f"{len(doubtful)} frames in a row do not agree with the map" if len(doubtful) > 1 else reason
         self._pose, self._reference = None, None
         self._window, self._doubtful = list(doubtful), []
         self._looks = self._looked_at = 0
@@ -260,19 +267,21 @@ class Tracker:
         options, camera = self.options.locate, self.options.locate.match.camera
         height, width = masks[0].shape
         shrunk = [_scale(matrix, Frame(width, height)) for matrix in mosaic.to_mosaic]
-        low, high = camera.gsd_m[0] / max(shrunk), camera.gsd_m[1] / min(shrunk)
-        camera = replace(camera, gsd_m=(low, high), focal_px=None)
+        if camera.gsd_m != CameraOptions().gsd_m:
+            camera = replace(camera, gsd_m=(camera.gsd_m[0] / max(shrunk), camera.gsd_m[1] / min(shrunk)))
+        camera = replace(camera, focal_px=None)  # a mosaic is no picture by one camera
         near = options.near
         if near is not None:
-            near = (near[0], near[1], near[2] + 0.5 * max(mosaic.mask.shape) * high)
-        odds = options.min_log10_odds + math.log10(self._looks)
+            near = (near[0], near[1], near[2] + 0.5 * max(mosaic.mask.shape) * camera.gsd_m[1])
+        odds = round(options.min_log10_odds + math.log10(self._looks), 1)
         return replace(options, match=replace(options.match, camera=camera), near=near, min_log10_odds=odds)
 
     def _settle(self, location: Location, mosaic: Mosaic) -> list[Tracked]:
         """Place all frames that waited, each by itself; nothing where most of them do not agree."""
         reference = next(one for one in self.references if one.name == location.reference)
         plane = reference.index.plane
-        to_plane = np.linalg.inv(plane.to_crs_matrix()) @ location.homography @ mosaic.to_mosaic
+        to_crs = np.asarray(location.homography, np.float64)
+        to_plane = np.linalg.inv(plane.to_crs_matrix()) @ to_crs @ mosaic.to_mosaic
         first, last = self._window[0].frame, self._window[-1].frame
         self._reference = reference
         placed: list[Tracked] = []

@@ -78,4 +78,3 @@ def road_equations(
         for c in range(r):
             normal[c, r] = normal[r, c]
     return met
-

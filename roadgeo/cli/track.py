@@ -1,0 +1,262 @@
+"""`roadgeo track`: options, one call, printing."""
+
+from __future__ import annotations
+
+import json
+from collections import Counter
+from collections.abc import Iterator
+from datetime import UTC, datetime
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+import click
+
+from roadgeo.cli import NOT_LOCATED
+from roadgeo.cli.folders import make_folder
+from roadgeo.cli.hints import hint_options, make_options, refuse_swapped
+from roadgeo.cli.parameters import verbosity_options
+
+if TYPE_CHECKING:
+    from roadgeo.flights.frames import FrameOptions
+    from roadgeo.flights.rows import Row
+    from roadgeo.flights.tracker import FlightFrame, Tracked, TrackOptions
+
+__all__ = ["track_command"]
+
+_HELP = """Follow a flight over the map, frame by frame.
+
+FRAMES overlap, each with the one before: masks of roads or photographs (files, folders or patterns, in order), or a
+video. One low frame shows too few roads to be located; so frames are laid together until the map knows them, and from
+there on each is followed from the one before, in some hundredths of a second. What does not agree with the map is said:
+
+\b
+  located    placed by the search, with those that waited beside it
+  tracked    followed from the frame before; the map agrees
+  predicted  by its motion alone: hardly a road agrees here
+  lost       not known; the search begins anew
+
+How a frame moved is told by the photographs, or roughly by the masks alone; best is --motion FILE, what your odometry
+knows: a CSV with the columns frame (the file's name) and h00 ... h22, row by row, the homography that takes a pixel
+(column, row) of the frame to the pixel of the frame before that shows the same ground. The first frame needs none.
+
+\b
+What is written to --out-dir:
+  flight.gpkg     footprints, centres and the track, styled for QGIS
+  flight.geojson  the same for the web, with times
+  flight.gpx      the track, for GPS programs
+  flight.csv      one row a frame, columns named as in MISB ST 0601
+  flight.html     the flight on the map, to play in a browser; needs no network
+
+\b
+Examples:
+  roadgeo track frames/ --reference boston-ma --motion odometry.csv
+  roadgeo track flight.mp4 --every 0.5 --start 2024-05-01T09:30:00Z --out-dir found
+  roadgeo track frame_*.png --json > flight.jsonl
+  roadgeo track frames/ --mavlink udpout:127.0.0.1:14550
+
+Exit status: 0 every frame has a place, 3 at least one is lost, 1 error, 2 usage.
+"""
+
+
+class Moment(click.ParamType):  # type: ignore[type-arg]
+    """A time, UTC unless it says otherwise."""
+
+    name = "time"
+
+    def convert(self, value: Any, param: click.Parameter | None, ctx: click.Context | None) -> datetime:
+        """Parse the text.
+
+        Raises
+        ------
+        click.BadParameter
+            It is no time.
+        """
+        if isinstance(value, datetime):
+            return value
+        try:
+            moment = datetime.fromisoformat(str(value))
+        except ValueError:
+            self.fail(f"got {value!r}, expected a time such as 2024-05-01T09:30:00Z", param, ctx)
+        return moment if moment.tzinfo else moment.replace(tzinfo=UTC)
+
+
+@click.command("track", short_help="Follow a flight over the map, frame by frame.", help=_HELP)
+@click.argument("frames", metavar="FRAMES...", nargs=-1, required=True, type=click.Path())
+@click.option(
+    "-r",
+    "--reference",
+    "references",
+    metavar="REF",
+    type=click.Path(),
+    multiple=True,
+    help="Reference to search: REF.gpkg, or a name in the library. Repeatable. Default: all of the library.",
+)
+@click.option(
+    "-o", "--out-dir", metavar="DIR", default=".", type=click.Path(file_okay=False), help="Where the results go."
+)
+@click.option("--name", default="flight", show_default=True, help="What the results are called.")
+@click.option("--json", "as_json", is_flag=True, help="Print a JSON object per frame and line, as soon as it is known.")
+@click.option("--motion", metavar="FILE", type=click.Path(), help="How each frame moved: see above.")
+@click.option(
+    "--motion-sigma",
+    metavar="PX",
+    type=click.FloatRange(min=0, min_open=True),
+    help="How far off the motion may put a corner. Default: 1.5, of masks 12.",
+)
+@click.option(
+    "--every",
+    metavar="SECONDS",
+    type=click.FloatRange(min=0),
+    default=1.0,
+    show_default=True,
+    help="Time between the frames that are taken of a video.",
+)
+@click.option(
+    "--interval",
+    metavar="SECONDS",
+    type=click.FloatRange(min=0),
+    default=1.0,
+    show_default=True,
+    help="Time between images.",
+)
+@click.option("--start", metavar="TIME", type=Moment(), help="When the first frame was taken.")
+@click.option(
+    "--segment",
+    type=click.Choice(["auto", "always", "never"]),
+    default="auto",
+    show_default=True,
+    help="Find the roads in photographs first: in what looks like one, in everything, or in nothing.",
+)
+@click.option("--segmenter", "model", metavar="MODEL.onnx", type=click.Path(), default="", help="Who finds them.")
+@click.option("--class", "class_name", metavar="NAME", help="Class of the model that is road.")
+@click.option("--threshold", metavar="T", type=float, help="Values above T are road. Default: told by the values.")
+@click.option("--band", metavar="N", type=click.IntRange(1), help="Band that holds the mask.")
+@hint_options("gsd_m", "max_tilt_deg", "near")
+@click.option(
+    "--time-limit",
+    metavar="SECONDS",
+    type=click.FloatRange(min=0, min_open=True),
+    default=10.0,
+    show_default=True,
+    help="Of one search.",
+)
+@verbosity_options
+def track_command(
+    frames: tuple[str, ...],
+    references: tuple[str, ...],
+    out_dir: str,
+    name: str,
+    as_json: bool,
+    start: datetime | None,
+    quiet: bool,
+    verbose: bool,
+    **given: Any,
+) -> int:
+    """Follow a flight over the map, frame by frame; for the help see above."""
+    from roadgeo.cli.compilation import compile_once
+    from roadgeo.cli.progress import print_steps
+    from roadgeo.flights.report import Thumbnails
+    from roadgeo.flights.rows import make_rows
+    from roadgeo.running.batch import open_references
+
+    options, reading = _track_options(given), _frame_options(given)
+    opened = open_references(references, print_steps(quiet))
+    refuse_swapped(given["near"], opened)
+    make_folder(out_dir)
+    compile_once(quiet)
+    known: dict[int, Tracked] = {}
+    pictures = Thumbnails()
+    for frame, news in _follow(frames, reading, opened, options):
+        pictures.add(frame.number, frame.mask)
+        for one in news:
+            known[one.frame.number] = _without_mask(one)
+        for row in make_rows(news, start):
+            _print(row, as_json, quiet, verbose)
+    tracked = [known[number] for number in sorted(known)]
+    if not tracked:
+        raise click.UsageError(f"No frames in {', '.join(frames)}.")
+    rows = make_rows(tracked, start)
+    files = _write(Path(out_dir), name, tracked, rows, pictures)
+    counts = Counter(row.status for row in rows)
+    if not quiet:
+        told = ", ".join(f"{n} {status}" for status, n in counts.items())
+        click.echo(f"{len(rows)} frames: {told}; wrote {', '.join(files)}", err=True)
+    return NOT_LOCATED if counts["lost"] else 0
+
+
+def _follow(
+    frames: tuple[str, ...], reading: FrameOptions, opened: Any, options: TrackOptions
+) -> Iterator[tuple[FlightFrame, list[Tracked]]]:
+    from roadgeo.flights.frames import read_frames
+    from roadgeo.flights.tracker import follow
+
+    return follow(read_frames(frames, reading), opened, options)
+
+
+def _track_options(given: dict[str, Any]) -> TrackOptions:
+    from roadgeo.flights.tracker import TrackOptions
+
+    hints = {name: given[name] for name in ("gsd_m", "max_tilt_deg", "near")}
+    return TrackOptions(locate=make_options("auto", given["time_limit"], hints))
+
+
+def _frame_options(given: dict[str, Any]) -> FrameOptions:
+    from roadgeo.flights.frames import FrameOptions
+    from roadgeo.flights.motion import read_motion
+
+    motion = None if given["motion"] is None else read_motion(given["motion"])
+    return FrameOptions(
+        given["threshold"],
+        given["band"],
+        given["segment"],
+        given["model"],
+        given["class_name"],
+        given["gsd_m"],
+        motion,
+        given["motion_sigma"],
+        given["every"],
+        given["interval"],
+    )
+
+
+def _without_mask(one: Tracked) -> Tracked:
+    """Forget the pixels of a frame: a long flight has many."""
+    from dataclasses import replace
+
+    import numpy as np
+
+    from roadgeo.geometry.mask import RoadMask
+
+    bare = RoadMask(np.zeros((1, 1), np.bool_), name=one.frame.name)
+    return replace(one, frame=replace(one.frame, mask=bare))
+
+
+def _write(folder: Path, name: str, tracked: list[Tracked], rows: list[Row], pictures: Any) -> list[str]:
+    from roadgeo.flights.outputs import WRITERS
+    from roadgeo.flights.report import render_flight
+    from roadgeo.storage.files import write_text
+
+    written = []
+    for ending, (write, _) in WRITERS.items():
+        path = folder / f"{name}{ending}"
+        path.unlink(missing_ok=True)  # a stale result must not be mistaken for this run's
+        write(path, rows)
+        written += [str(path)] if path.exists() else []
+    page = folder / f"{name}.html"
+    write_text(page, render_flight(name, tracked, rows, pictures.kept))
+    return [*written, str(page)]
+
+
+_SHOWN = {"located": "green", "tracked": "green", "predicted": "yellow", "lost": "red"}
+
+
+def _print(row: Row, as_json: bool, quiet: bool, verbose: bool) -> None:
+    if as_json:
+        click.echo(json.dumps(row.to_dict()))
+    elif not quiet:
+        from roadgeo.outputs.wording import format_lonlat
+
+        status = click.style(row.status, fg=_SHOWN[row.status])
+        where = "" if row.center is None else f" at {format_lonlat(*row.center)}, sigma {row.sigma_m:.1f} m"
+        why = f": {row.reason}" if verbose or row.status in ("lost", "predicted") else ""
+        click.echo(f"{row.name}: {status}{where}{why}")

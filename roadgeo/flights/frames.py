@@ -1,0 +1,212 @@
+"""Where frames enter: masks, photographs or a video become road masks with times, one after another.
+
+Memory holds two frames at a time. How a frame moved is taken from a file, or told by the photographs, or by the masks.
+"""
+
+from __future__ import annotations
+
+import os
+import tempfile
+from collections.abc import Iterator, Mapping, Sequence
+from contextlib import ExitStack
+from dataclasses import dataclass, field, replace
+from functools import lru_cache
+from pathlib import Path
+from typing import Literal, NamedTuple
+
+import cv2
+import numpy as np
+
+from roadgeo._arrays import AnyArray, FloatArray
+from roadgeo.errors import MaskError, PhotographError
+from roadgeo.flights.motion import between_images, between_masks
+from roadgeo.flights.tracker import FlightFrame
+from roadgeo.geometry.mask import RoadMask
+from roadgeo.running.tasks import find_masks
+from roadgeo.sources.masks import read_mask
+
+__all__ = ["VIDEOS", "FrameOptions", "read_frames"]
+
+#: What is taken for a video, by its name.
+VIDEOS = (".mp4", ".mov", ".avi", ".mkv", ".m4v", ".mpg", ".mpeg", ".ts", ".webm", ".wmv")
+
+
+@dataclass(frozen=True)
+class FrameOptions:
+    """How frames are read.
+
+    Attributes
+    ----------
+    threshold, band, segment
+        As for `running.queries.QueryOptions`.
+    model : str
+        File of the network that finds roads in photographs; "": the one that ships.
+    gsd_m : (low, high) or None
+        Metres per pixel, where that is known: photographs are shown to the network at its own.
+    motion : mapping of frame name to (3, 3), or None
+        Pixel of a frame to pixel of the one before.
+    motion_px : float or None
+        Standard deviation of where the motion puts a corner. None: what is usual for its source.
+    every_s : float
+        Of a video, the time between the frames taken; 0: all.
+    interval_s : float
+        Time between images, which say nothing of it.
+    """
+
+    threshold: float | None = None
+    band: int | None = None
+    segment: Literal["auto", "always", "never"] = "auto"
+    model: str = ""
+    class_name: str | None = None
+    gsd_m: tuple[float, float] | None = None
+    motion: Mapping[str, FloatArray] | None = None
+    motion_px: float | None = None
+    every_s: float = 1.0
+    interval_s: float = 1.0
+    threads: int = 1
+
+
+class _Image(NamedTuple):
+    """A frame's file, what it is called, and when it was taken."""
+
+    path: str
+    name: str
+    time_s: float
+
+
+@dataclass
+class _Last:
+    """What is remembered of the frame before."""
+
+    mask: RoadMask | None = None
+    grey: AnyArray | None = None
+    motion: FloatArray | None = None
+    scale: dict[str, float] = field(default_factory=dict)
+
+
+def read_frames(arguments: Sequence[str], options: FrameOptions | None = None) -> Iterator[FlightFrame]:
+    """Read frames of a flight: files, folders, patterns, or videos, in order.
+
+    Raises
+    ------
+    MaskError
+        One cannot be read, or is neither a mask nor a photograph.
+    ModelError
+        There is no network to find roads in photographs, or it fails.
+    """
+    options, last = options or FrameOptions(), _Last()
+    with ExitStack() as stack:
+        for number, image in enumerate(_images(arguments, options, stack)):
+            mask, grey = _read(image, options, last)
+            motion, error_px = _motion(image.name, mask, grey, options, last) if number else (None, 1.5)
+            last.mask, last.grey, last.motion = mask, grey, motion
+            yield FlightFrame(number, image.name, image.time_s, mask, motion, options.motion_px or error_px)
+
+
+def _images(arguments: Sequence[str], options: FrameOptions, stack: ExitStack) -> Iterator[_Image]:
+    number = 0
+    for argument in arguments:
+        if Path(argument).suffix.lower() in VIDEOS and Path(argument).is_file():
+            yield from _video(argument, options, stack)
+            continue
+        for path in find_masks([argument]):
+            yield _Image(path, Path(path).name, number * options.interval_s)
+            number += 1
+
+
+def _video(path: str, options: FrameOptions, stack: ExitStack) -> Iterator[_Image]:
+    """Take frames of a video; each is a file for as long as it is read."""
+    folder = stack.enter_context(tempfile.TemporaryDirectory(prefix="roadgeo-"))
+    video = cv2.VideoCapture(path)
+    stack.callback(video.release)
+    rate = video.get(cv2.CAP_PROP_FPS)
+    if not video.isOpened() or not 0.01 < rate < 10_000:
+        raise MaskError(f"{path}: no video that OpenCV reads; give its frames as images")
+    taken, next_s = 0, 0.0
+    for k in range(1 << 31):
+        if not video.grab():
+            break
+        if k / rate + 1e-9 < next_s:
+            continue
+        next_s = k / rate + options.every_s
+        good, picture = video.retrieve()
+        if not good:
+            continue
+        target = str(Path(folder) / "frame.png")
+        cv2.imwrite(target, picture)
+        taken += 1
+        yield _Image(target, f"{Path(path).stem}_{k:06d}", k / rate)
+    if not taken:
+        raise MaskError(f"{path}: no frame of the video can be read; give its frames as images")
+
+
+def _read(image: _Image, options: FrameOptions, last: _Last) -> tuple[RoadMask, AnyArray | None]:
+    """Read a frame as a mask, and as a grey picture where it is a photograph."""
+    if options.segment != "always":
+        try:
+            mask = read_mask(image.path, band=options.band, threshold=options.threshold, name=image.name)
+        except PhotographError:
+            if options.segment == "never":
+                raise
+        except MaskError:
+            blank = _blank(image)
+            if blank is None:
+                raise
+            return blank, None
+        else:
+            return mask, None
+    grey = cv2.imread(image.path, cv2.IMREAD_GRAYSCALE)
+    return _segment(image, options, last), grey
+
+
+def _blank(image: _Image) -> RoadMask | None:
+    """Return a mask without any road, which a flight may hold, though nobody can locate it; None if it is none."""
+    values = cv2.imread(os.fspath(image.path), cv2.IMREAD_UNCHANGED)
+    if values is None or values.ndim != 2 or values.any():
+        return None
+    return RoadMask(np.zeros(values.shape, np.bool_), name=image.name)
+
+
+def _segment(image: _Image, options: FrameOptions, last: _Last) -> RoadMask:
+    """Find the roads in a photograph, at the scale that its pixels have, or that served the first one best."""
+    from roadgeo.segmentation.photograph import open_photograph
+    from roadgeo.segmentation.scales import rank_scales, scale_of
+    from roadgeo.segmentation.tiling import segment
+
+    network = _network(options.model, options.class_name, options.threads)
+    with open_photograph(image.path) as photograph:
+        if "scale" not in last.scale:
+            known = options.gsd_m
+            scale = (
+                rank_scales(photograph, network)[0]
+                if known is None
+                else scale_of(float(np.sqrt(np.prod(known))), network)
+            )
+            last.scale["scale"] = scale
+        seen = segment(photograph, network, last.scale["scale"]).resized((photograph.height, photograph.width))
+    try:
+        mask = seen.mask(seen.threshold if options.threshold is None else options.threshold)
+    except MaskError:
+        mask = RoadMask(np.zeros((photograph.height, photograph.width), np.bool_))
+    return replace(mask, name=image.name)
+
+
+@lru_cache(maxsize=1)
+def _network(path: str, class_name: str | None, threads: int):  # type: ignore[no-untyped-def]
+    from roadgeo.segmentation.network import DEFAULT_MODEL, load_network
+
+    return load_network(Path(path) if path else DEFAULT_MODEL, class_name=class_name, threads=threads)
+
+
+def _motion(
+    name: str, mask: RoadMask, grey: AnyArray | None, options: FrameOptions, last: _Last
+) -> tuple[FloatArray | None, float]:
+    """Return how a frame moved against the one before, and how far off that may put a corner, pixels."""
+    if options.motion is not None:
+        found = options.motion.get(name, options.motion.get(Path(name).stem))
+        return found, 1.5
+    if last.mask is None or last.mask.shape != mask.shape:
+        return None, 1.5
+    if grey is not None and last.grey is not None:
+        return between_images(last.grey, grey), 1.5
+    return between_masks(last.mask, mask, last.motion), 12.0

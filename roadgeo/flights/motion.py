@@ -1,0 +1,238 @@
+"""How a frame moved against the one before: from a file, from the photographs, or from the roads that both masks show.
+
+A motion is a homography, pixel (column, row; GDAL's corner convention) of a frame to pixel of the frame before.
+"""
+
+from __future__ import annotations
+
+import csv
+import io
+import math
+import os
+from collections.abc import Sequence
+from pathlib import Path
+
+import cv2
+import numpy as np
+
+from roadgeo._arrays import AnyArray, FloatArray
+from roadgeo.errors import MaskError, RoadSourceError
+from roadgeo.flights.pose import FilterOptions, Pose, correct
+from roadgeo.geometry.frame import Frame
+from roadgeo.geometry.homography import Homography
+from roadgeo.geometry.mask import RoadMask
+from roadgeo.kernels.road_growth import RoadBuckets
+from roadgeo.kernels.roads import bin_segments
+from roadgeo.matching.query import trace_query
+from roadgeo.matching.scene import Scene
+from roadgeo.roads.graph import RoadGraph
+
+__all__ = ["between_images", "between_masks", "read_motion", "write_motion"]
+
+_COLUMNS = [f"h{i}{j}" for i in range(3) for j in range(3)]
+
+#: Photographs are compared at no more than this side; of so many features this many must agree on a homography.
+_IMAGE_SIDE, _FEATURES, _FEWEST_FEATURES = 1000, 2000, 25
+
+#: Masks are compared roughly at about this side, turned by these angles, and shifted by up to this share of a frame.
+_ROUGH_SIDE, _TURNS_DEG, _FARTHEST = 96, (-12.0, -8.0, -4.0, 0.0, 4.0, 8.0, 12.0), 0.7
+
+#: How far a rough motion may be off: shift in pixels of the rough grid, turn, scale and the rest as shares of a frame.
+_SHIFT_CELLS, _LINEAR_SIGMA, _CORNER_SIGMA = 3.0, 0.05, 0.008
+#: The least share of road points in the overlap that must lie on roads of the other mask.
+_LEAST_SHARE = 0.6
+#: Flights go on as they went: the middle of a frame moves by no more than this share of a frame otherwise than before.
+_STEADY = 0.2
+_FILTER = FilterOptions(
+    sigma_m=2.0,
+    sigma_px=1.0,
+    correlation_m=60.0,
+    radii=((40.0, 3.0), (25.0, 2.5), (16.0, 2.0), (10.0, 2.0), (8.0, 1.5), (8.0, 1.5)),
+    least_radius_m=6.0,
+)
+
+
+def read_motion(path: str | os.PathLike[str]) -> dict[str, FloatArray]:
+    """Read motions by the frames' names: a CSV file with the columns `frame` and `h00` ... `h22`, row by row.
+
+    Raises
+    ------
+    RoadSourceError
+        There is no such file, or it is no such table.
+    """
+    try:
+        text = Path(path).read_text(encoding="utf-8-sig")
+    except (OSError, UnicodeDecodeError) as error:
+        cause = error.strerror if isinstance(error, OSError) else error
+        raise RoadSourceError(f"cannot read {path}: {cause}; expected a CSV file of motions") from error
+    try:
+        rows = list(csv.DictReader(io.StringIO(text)))
+        found = {row["frame"]: np.array([float(row[name]) for name in _COLUMNS]).reshape(3, 3) for row in rows}
+    except (KeyError, ValueError, TypeError) as error:
+        raise RoadSourceError(
+            f"{path} is no table of motions ({type(error).__name__}: {error}); expected the columns frame, h00 ... h22"
+        ) from error
+    bad = [name for name, matrix in found.items() if not np.isfinite(matrix).all() or not np.linalg.det(matrix)]
+    if bad or not found:
+        what = f"frame {bad[0]} has no homography" if bad else "it has no rows"
+        raise RoadSourceError(f"{path} is no table of motions: {what}; expected 3 x 3 numbers that can be inverted")
+    return found
+
+
+def write_motion(names: Sequence[str], motion: Sequence[FloatArray] | FloatArray) -> str:
+    """Return what `read_motion` reads."""
+    text = io.StringIO()
+    table = csv.writer(text, lineterminator="\n")
+    table.writerow(["frame", *_COLUMNS])
+    for name, matrix in zip(names, motion, strict=True):
+        table.writerow([name, *map(repr, np.asarray(matrix, float).ravel().tolist())])
+    return text.getvalue()
+
+
+# --- photographs ------------------------------------------------------------------------------------------------------
+
+
+def between_images(before: AnyArray, image: AnyArray) -> FloatArray | None:
+    """Return the motion between two grey photographs (H, W) uint8; None where hardly anything is seen in both."""
+    scale = min(1.0, _IMAGE_SIDE / max(*image.shape, *before.shape))
+    finder = cv2.ORB_create(_FEATURES)  # type: ignore[attr-defined]
+    found = [
+        finder.detectAndCompute(cv2.resize(one, None, fx=scale, fy=scale, interpolation=cv2.INTER_AREA), None)
+        for one in (before, image)
+    ]
+    if any(descriptors is None or len(points) < _FEWEST_FEATURES for points, descriptors in found):
+        return None
+    pairs = cv2.BFMatcher(cv2.NORM_HAMMING, crossCheck=True).match(found[1][1], found[0][1])
+    if len(pairs) < _FEWEST_FEATURES:
+        return None
+    source = np.array([found[1][0][pair.queryIdx].pt for pair in pairs])
+    target = np.array([found[0][0][pair.trainIdx].pt for pair in pairs])
+    matrix, agree = cv2.findHomography(source, target, cv2.USAC_MAGSAC, 2.0, maxIters=5000, confidence=0.999)
+    if matrix is None or int(agree.sum()) < _FEWEST_FEATURES:
+        return None
+    # OpenCV counts from pixel centres, and of the reduced pictures.
+    shrink = np.array([[scale, 0.0, -0.5], [0.0, scale, -0.5], [0.0, 0.0, 1.0]])
+    return np.asarray(np.linalg.inv(shrink) @ matrix @ shrink)
+
+
+# --- masks ------------------------------------------------------------------------------------------------------------
+
+
+def between_masks(before: RoadMask, mask: RoadMask, last: FloatArray | None = None) -> FloatArray | None:
+    """Return the motion between two masks by the roads that both show; None where those do not agree.
+
+    Parameters
+    ----------
+    last : (3, 3) float64, optional
+        The motion of the frame before: flights go on as they went.
+    """
+    try:
+        (scene, _), (_, graph) = trace_query(mask), trace_query(before)
+    except MaskError:
+        return None
+    height, width = mask.shape
+    frame = Frame(width, height)
+    roads = _buckets(graph)
+    best: tuple[float, FloatArray] | None = None
+    for guess in ([] if last is None else [last]) + _rough_motions(before, mask):
+        found = _refine(guess, frame, scene, roads)
+        if found is None or (last is not None and not _goes_on(found[1], last, frame)):
+            continue
+        if best is None or found[0] > best[0]:
+            best = found
+    return None if best is None or best[0] < _LEAST_SHARE else best[1]
+
+
+def _goes_on(motion: FloatArray, last: FloatArray, frame: Frame) -> bool:
+    moved, before = (Homography(matrix)(frame.center) for matrix in (motion, last))
+    return bool(np.hypot(*(moved - before)) < _STEADY * max(frame.width, frame.height))
+
+
+def _refine(guess: FloatArray, frame: Frame, scene: Scene, roads: RoadBuckets) -> tuple[float, FloatArray] | None:
+    """Lay a mask on the roads of the one before, near a rough motion; return how well they agree, and the motion."""
+    corners = Homography(guess).facing(frame.center)(frame.corners)
+    if not np.isfinite(corners).all():
+        return None
+    pose = Pose(corners * (1.0, -1.0), _rough_covariance(frame), frame)
+    placed = correct(pose, scene, roads, _FILTER)
+    if placed is None:
+        return None
+    motion = np.diag([1.0, -1.0, 1.0]) @ placed.homography.matrix
+    return _agreement(motion, frame, scene, roads), np.asarray(motion / motion[2, 2])
+
+
+def _rough_covariance(frame: Frame) -> FloatArray:
+    """Return how unsure a rough motion is: (8, 8) of the corners, which mostly shift, turn and grow together."""
+    unit = frame.half_diagonal
+    x, y = ((frame.plane_corners - frame.plane_center) / unit).T
+    zero, one = np.zeros(4), np.ones(4)
+    modes = np.stack([np.stack(pair, axis=1).ravel() for pair in ((one, zero), (zero, one), (x, y), (-y, x))])
+    sigmas = np.array([_SHIFT_CELLS * max(frame.width, frame.height) / _ROUGH_SIDE] * 2 + [_LINEAR_SIGMA * unit] * 2)
+    return np.asarray((modes.T * sigmas**2) @ modes + np.eye(8) * (_CORNER_SIGMA * unit) ** 2)
+
+
+def _agreement(motion: FloatArray, frame: Frame, scene: Scene, roads: RoadBuckets) -> float:
+    """Return the share of road points inside the other frame that lie on its roads; 0 where hardly any are inside."""
+    from roadgeo.kernels.roads import forward_distances
+
+    pixels = Homography(motion)(scene.points * (1.0, -1.0))
+    inside = np.asarray(((pixels > 0) & (pixels < (frame.width, frame.height))).all(axis=1))
+    if inside.sum() < 0.1 * len(inside) or inside.sum() < _FILTER.fewest:
+        return 0.0
+    matrix = np.diag([1.0, -1.0, 1.0]) @ motion @ np.diag([1.0, -1.0, 1.0])
+    points, along = (np.ascontiguousarray(array[inside]) for array in (scene.points, scene.directions))
+    near = forward_distances(
+        matrix, points, along, 6.0, math.cos(math.radians(25.0)), 0.0, 0.0, *roads, np.empty(len(points))
+    )
+    return float(near / len(points))
+
+
+def _buckets(graph: RoadGraph) -> RoadBuckets:
+    """Sort the roads of a traced mask into buckets, so that they can be looked up like those of a map."""
+    parts = [np.hstack([line[:-1], line[1:]]) for line in graph.polylines()]
+    segments = np.ascontiguousarray(np.concatenate(parts), np.float32)
+    ends = segments.reshape(-1, 2)
+    low, size = ends.min(axis=0), 32.0
+    columns, rows = (int(side / size) + 1 for side in ends.max(axis=0) - low)
+    grid, shape = (float(low[0]), float(low[1]), size), (columns, rows)
+    counts = np.zeros(columns * rows + 1, np.int64)
+    total = bin_segments(segments, grid, shape, counts, np.empty(0, np.int32))
+    starts, ids = np.cumsum(counts), np.empty(total, np.int32)
+    bin_segments(segments, grid, shape, starts.copy(), ids)
+    return RoadBuckets(segments, starts.astype(np.int32), ids, grid, shape)
+
+
+def _rough_motions(before: RoadMask, mask: RoadMask) -> list[FloatArray]:
+    """Return the shifts, one for each turn, at which the roads of two masks cover each other most; the best two."""
+    height, width = mask.shape
+    scale = _ROUGH_SIDE / max(height, width)
+    size = (round(width * scale), round(height * scale))
+    grown = (2 * size[1], 2 * size[0])
+    fixed = np.conj(np.fft.rfft2(_soft(before.roads, size), grown))
+    center, found = np.array([width, height]) / 2.0, []
+    reduced = _soft(mask.roads, size)
+    for degrees in _TURNS_DEG:
+        turn = cv2.getRotationMatrix2D(((size[0] - 1) / 2.0, (size[1] - 1) / 2.0), degrees, 1.0)
+        moved = np.fft.rfft2(cv2.warpAffine(reduced, turn, size), grown)
+        cover = np.fft.irfft2(np.conj(fixed * moved), grown)
+        rows, columns = (np.fft.fftfreq(n, 1.0 / n) for n in grown)
+        far = (np.abs(rows)[:, None] > _FARTHEST * size[1]) | (np.abs(columns)[None] > _FARTHEST * size[0])
+        # Where frames overlap less, less can agree.
+        shared = (1.0 - np.abs(rows)[:, None] / size[1]).clip(0.1) * (1.0 - np.abs(columns)[None] / size[0]).clip(0.1)
+        worth = np.where(far, -np.inf, cover / np.sqrt(shared))
+        row, column = np.unravel_index(int(np.argmax(worth)), worth.shape)
+        shift = np.array([columns[column], rows[row]]) / scale
+        angle = math.radians(degrees)
+        # OpenCV's angles turn counterclockwise as seen, in pixels with rows downwards.
+        rotation = np.array([[math.cos(angle), math.sin(angle)], [-math.sin(angle), math.cos(angle)]])
+        motion = np.eye(3)
+        motion[:2, :2], motion[:2, 2] = rotation, center - rotation @ center + shift
+        found.append((float(worth[row, column]), motion))
+    found.sort(key=lambda one: -one[0])
+    return [motion for _, motion in found[:2]]
+
+
+def _soft(roads: AnyArray, size: tuple[int, int]) -> AnyArray:
+    """Reduce a mask (H, W) bool to a size (width, height), blurred, with mean 0."""
+    soft = cv2.GaussianBlur(cv2.resize(roads.astype(np.float32), size, interpolation=cv2.INTER_AREA), (0, 0), 1.0)
+    return np.asarray(soft - soft.mean(), np.float32)

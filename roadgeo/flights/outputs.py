@@ -1,0 +1,167 @@
+"""What a flight leaves: a GeoPackage, GeoJSON, GPX, a CSV with the names of MISB ST 0601, and a report."""
+
+from __future__ import annotations
+
+import csv
+import io
+import json
+import math
+from collections.abc import Callable, Sequence
+from html import escape
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from roadgeo._version import __version__
+from roadgeo.flights.rows import Row
+from roadgeo.storage.files import write_text
+from roadgeo.storage.geopackage import Layer, write_layers
+from roadgeo.storage.qml import draw_fill, draw_line, draw_marker
+
+__all__ = ["WRITERS", "to_csv", "to_geojson", "to_gpx", "write_geopackage"]
+
+#: Radius within which a place lies with 90 %, in standard deviations of its distance (both axes alike).
+_CE90 = math.sqrt(-math.log(0.1))
+
+
+def to_csv(rows: Sequence[Row]) -> str:
+    """Return a table, one row a frame; columns that MISB ST 0601 knows have its names and units."""
+    text = io.StringIO()
+    table = csv.writer(text, lineterminator="\n")
+    corners = [f"Corner {what} Point {k} (Full)" for k in range(1, 5) for what in ("Latitude", "Longitude")]
+    first = ["Frame", "Name", "Time s", "Precision Time Stamp", "Status"]
+    center = ["Frame Center Latitude", "Frame Center Longitude"]
+    numbers = ["Target Error Estimate - CE90", "Sigma m", "Ground Sampling m", "Image Heading", "Log10 Odds"]
+    table.writerow([*first, *center, *corners, *numbers, "Known At Frame", "Reason"])
+    for row in rows:
+        stamp = "" if row.time is None else str(round(row.time.timestamp() * 1e6))
+        at = ["", ""] if row.center is None else [f"{row.center[1]:.8f}", f"{row.center[0]:.8f}"]
+        ring = [""] * 8 if row.footprint is None else [f"{v:.8f}" for lon, lat in row.footprint for v in (lat, lon)]
+        values = [_CE90 * row.sigma_m, row.sigma_m, row.gsd_m, row.heading_deg, row.log10_odds]
+        told = ["" if math.isnan(value) else f"{value:.4f}" for value in values]
+        table.writerow(
+            [
+                row.number,
+                row.name,
+                f"{row.time_s:.3f}",
+                stamp,
+                row.status,
+                *at,
+                *ring,
+                *told,
+                row.known_at,
+                row.reason,
+            ]
+        )
+    return text.getvalue()
+
+
+def to_geojson(rows: Sequence[Row]) -> str:
+    """Return footprints and the track (RFC 7946), with times as `coordTimes` has them."""
+    placed = [row for row in rows if row.center is not None and row.footprint is not None]
+    features = [
+        {
+            "type": "Feature",
+            "geometry": {"type": "Polygon", "coordinates": [_ring(row)]},
+            "properties": {
+                key: value
+                for key, value in row.to_dict().items()
+                if key not in ("footprint_lonlat", "homography", "center", "schema")
+            },
+        }
+        for row in placed
+    ]
+    if len(placed) > 1:
+        line = {"type": "LineString", "coordinates": [list(row.center or ()) for row in placed]}
+        times = [row.to_dict()["time"] or row.time_s for row in placed]
+        features.append({"type": "Feature", "geometry": line, "properties": {"name": "track", "coordTimes": times}})
+    return json.dumps({"type": "FeatureCollection", "features": features}) + "\n"
+
+
+def _ring(row: Row) -> list[list[float]]:
+    """Return a closed ring, counterclockwise as RFC 7946 asks."""
+    corners = np.asarray(row.footprint)[::-1].tolist()
+    return [*corners, corners[0]]
+
+
+def to_gpx(rows: Sequence[Row]) -> str:
+    """Return the track (GPX 1.1); it is broken where the flight was lost."""
+    segments: list[list[str]] = [[]]
+    for row in rows:
+        if row.center is None:
+            if segments[-1]:
+                segments.append([])
+            continue
+        when = "" if row.time is None else f"<time>{row.to_dict()['time']}</time>"
+        segments[-1].append(
+            f'<trkpt lat="{row.center[1]:.8f}" lon="{row.center[0]:.8f}">{when}'
+            f"<name>{escape(row.name)}</name><type>{row.status}</type></trkpt>"
+        )
+    body = "".join(f"<trkseg>{''.join(points)}</trkseg>" for points in segments if points)
+    return (
+        f'<?xml version="1.0" encoding="UTF-8"?>\n<gpx version="1.1" creator="roadgeo {__version__}" '
+        f'xmlns="http://www.topografix.com/GPX/1/1"><trk><name>flight</name>{body}</trk></gpx>\n'
+    )
+
+
+def write_geopackage(path: Path, rows: Sequence[Row]) -> None:
+    """Write layers `footprints`, `centers` and `track`, in longitude and latitude; nothing where no frame has a place.
+
+    Raises
+    ------
+    OutputError
+        It cannot be written.
+    """
+    placed = [row for row in rows if row.center is not None]
+    if not placed:
+        return
+    columns: dict[str, list[Any]] = {
+        "frame": [row.number for row in placed],
+        "name": [row.name for row in placed],
+        "time": [row.to_dict()["time"] for row in placed],
+        "time_s": [row.time_s for row in placed],
+        "status": [row.status for row in placed],
+        "sigma_m": [row.sigma_m for row in placed],
+        "gsd_m": [row.gsd_m for row in placed],
+        "heading_deg": [row.heading_deg for row in placed],
+        "log10_odds": [row.log10_odds for row in placed],
+        "reference": [row.reference for row in placed],
+        "reason": [row.reason for row in placed],
+    }
+    centers = np.array([row.center for row in placed])
+    layers = [
+        Layer("footprints", "POLYGON", [row.footprint for row in placed], columns, "EPSG:4326",
+              draw_fill("228,87,46,25", "228,87,46", 0.3)),
+        Layer("centers", "POINT", centers, columns, "EPSG:4326", draw_marker("228,87,46", 2.0)),
+    ]  # fmt: skip
+    runs = _runs(rows)
+    if runs:
+        told = {"first": [run[0].number for run in runs], "last": [run[-1].number for run in runs]}
+        lines = [np.array([row.center for row in run]) for run in runs]
+        layers.insert(1, Layer("track", "LINESTRING", lines, told, "EPSG:4326", draw_line("40,40,40", 0.6)))
+    write_layers(path, layers)
+
+
+def _runs(rows: Sequence[Row]) -> list[list[Row]]:
+    """Return runs of two frames and more that have places."""
+    runs: list[list[Row]] = [[]]
+    for row in rows:
+        if row.center is None:
+            runs.append([])
+        else:
+            runs[-1].append(row)
+    return [run for run in runs if len(run) > 1]
+
+
+def _text(make: Callable[[Sequence[Row]], str]) -> Callable[[Path, Sequence[Row]], None]:
+    return lambda path, rows: write_text(path, make(rows))
+
+
+#: Ending of each file, what writes it, and what it is for.
+WRITERS: dict[str, tuple[Callable[[Path, Sequence[Row]], None], str]] = {
+    ".gpkg": (write_geopackage, "footprints, centres and the track, styled for QGIS"),
+    ".geojson": (_text(to_geojson), "the same for the web, with times"),
+    ".gpx": (_text(to_gpx), "the track, for GPS programs"),
+    ".csv": (_text(to_csv), "one row a frame, columns named as in MISB ST 0601"),
+}

@@ -1,0 +1,111 @@
+"""One row for each frame of a flight: plain values that all outputs share."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+from dataclasses import dataclass
+from datetime import UTC, datetime, timedelta
+from typing import Any
+
+import numpy as np
+
+from roadgeo._arrays import FloatArray
+from roadgeo.flights.tracker import Tracked
+from roadgeo.geometry.projection import grid_north, to_lonlat
+
+__all__ = ["Row", "make_rows"]
+
+
+@dataclass(frozen=True)
+class Row:
+    """What is known of a frame, for people and files.
+
+    Attributes
+    ----------
+    time : datetime or None
+        UTC; None where nobody said when the flight began.
+    center : (lon, lat) or None
+    footprint : (4, 2) float64 or None
+        Corners TL, TR, BR, BL as longitude and latitude.
+    sigma_m : float
+        Standard deviation of the centre's place.
+    heading_deg : float
+        Direction of the image's up, clockwise from true north.
+    homography : (3, 3) float64 or None
+        Pixel (column, row) to `crs`.
+    """
+
+    number: int
+    name: str
+    time_s: float
+    time: datetime | None
+    status: str
+    reason: str
+    known_at: int
+    reference: str = ""
+    center: tuple[float, float] | None = None
+    footprint: FloatArray | None = None
+    sigma_m: float = math.nan
+    gsd_m: float = math.nan
+    heading_deg: float = math.nan
+    log10_odds: float = math.nan
+    crs: str = ""
+    homography: FloatArray | None = None
+
+    def to_dict(self) -> dict[str, Any]:
+        """Plain values, ready for `json.dumps`."""
+
+        def number(value: float) -> float | None:
+            return None if math.isnan(value) else value
+
+        return {
+            "schema": "roadgeo.frame/1",
+            "frame": self.number,
+            "name": self.name,
+            "time_s": self.time_s,
+            "time": None if self.time is None else self.time.isoformat().replace("+00:00", "Z"),
+            "status": self.status,
+            "reason": self.reason,
+            "known_at": self.known_at,
+            "reference": self.reference or None,
+            "center": None if self.center is None else {"lon": self.center[0], "lat": self.center[1]},
+            "footprint_lonlat": None if self.footprint is None else self.footprint.tolist(),
+            "sigma_m": number(self.sigma_m),
+            "gsd_m": number(self.gsd_m),
+            "heading_deg": number(self.heading_deg),
+            "log10_odds": number(self.log10_odds),
+            "crs": self.crs or None,
+            "homography": None if self.homography is None else self.homography.tolist(),
+        }
+
+
+def make_rows(tracked: Sequence[Tracked], begun: datetime | None = None) -> list[Row]:
+    """Describe frames; `begun` says when the first one was taken."""
+    return [_row(one, begun) for one in tracked]
+
+
+def _row(one: Tracked, begun: datetime | None) -> Row:
+    frame = one.frame
+    when = None if begun is None else begun.astimezone(UTC) + timedelta(seconds=frame.time_s)
+    bare = (frame.number, frame.name, frame.time_s, when, one.status, one.reason, one.known_at)
+    if one.pose is None or one.reference is None:
+        return Row(*bare)
+    plane, pose = one.reference.index.plane, one.pose
+    ground = plane.to_crs(np.vstack([pose.corners, pose.center]))
+    lonlat = to_lonlat(plane.crs, ground)
+    up = pose.homography.jacobian(pose.frame.center) @ (0.0, -1.0)
+    heading = math.degrees(math.atan2(up[0], up[1])) + grid_north(plane, ground[4])
+    matrix = plane.to_crs_matrix() @ pose.homography.matrix
+    return Row(
+        *bare,
+        one.reference.name,
+        (float(lonlat[4, 0]), float(lonlat[4, 1])),
+        lonlat[:4],
+        pose.sigma_m,
+        pose.gsd_m,
+        heading % 360.0,
+        one.log10_odds,
+        plane.crs,
+        matrix / matrix[2, 2],
+    )
