@@ -1,0 +1,77 @@
+"""Motion between frames: files, photographs, masks."""
+
+import cv2
+import numpy as np
+import pytest
+
+from roadgeo.errors import RoadSourceError
+from roadgeo.flights.motion import between_images, between_masks, read_motion, write_motion
+from roadgeo.geometry.homography import Homography
+from roadgeo.geometry.mask import RoadMask
+
+MOTION = np.array([[0.99, 0.03, 12.0], [-0.03, 1.01, -80.0], [1e-5, -2e-5, 1.0]])
+CORNERS = np.array([[0.0, 0.0], [320, 0], [320, 240], [0, 240]])
+
+
+def seen(before, motion):
+    """What the next frame shows of the ground that `before` shows."""
+    half = np.array([[1.0, 0, 0.5], [0, 1, 0.5], [0, 0, 1]])
+    warp = np.linalg.inv(half) @ motion @ half
+    return cv2.warpPerspective(before, warp, before.shape[::-1], flags=cv2.INTER_LINEAR | cv2.WARP_INVERSE_MAP)
+
+
+def gap(found, truth):
+    return np.hypot(*(Homography(found)(CORNERS) - Homography(truth)(CORNERS)).T).max()
+
+
+def test_photographs_tell_it_to_a_pixel():
+    rng = np.random.default_rng(1)
+    ground = cv2.resize(rng.integers(0, 255, (60, 80)).astype(np.uint8), (320, 240), interpolation=cv2.INTER_CUBIC)
+    found = between_images(ground, seen(ground, MOTION))
+    assert found is not None
+    assert gap(found, MOTION) < 1.0
+
+
+def test_photographs_of_other_places_tell_nothing():
+    rng = np.random.default_rng(1)
+    one, other = rng.integers(0, 255, (2, 240, 320)).astype(np.uint8)
+    assert between_images(one, other) is None
+    assert between_images(np.zeros((240, 320), np.uint8), one) is None
+
+
+def streets():
+    mask = np.zeros((240, 320), np.uint8)
+    for a, b in (((0, 40), (320, 70)), ((60, 0), (90, 240)), ((200, 0), (180, 240)), ((0, 170), (320, 130)),
+                 ((90, 150), (160, 240)), ((250, 60), (320, 20))):  # fmt: skip
+        cv2.line(mask, a, b, 255, 9)
+    return mask
+
+
+def test_masks_tell_it_roughly():
+    before = streets()
+    motion = np.array([[0.998, 0.03, 5.0], [-0.03, 0.998, -50.0], [0.0, 0.0, 1.0]])
+    after = seen(before, motion)
+    found = between_masks(RoadMask(before > 127), RoadMask(after > 127))
+    assert found is not None
+    assert gap(found, motion) < 8.0
+
+
+def test_masks_without_roads_tell_nothing():
+    blank = RoadMask(np.zeros((240, 320), bool))
+    assert between_masks(blank, RoadMask(streets() > 127)) is None
+
+
+def test_a_file_is_read_as_it_was_written(tmp_path):
+    path = tmp_path / "motion.csv"
+    path.write_text(write_motion(["a.png", "b.png"], [np.eye(3), MOTION]))
+    assert np.array_equal(read_motion(path)["b.png"], MOTION)
+
+
+@pytest.mark.parametrize(
+    "text", ["", "frame,h00\na,1\n", "frame,h00,h01,h02,h10,h11,h12,h20,h21,h22\na,0,0,0,0,0,0,0,0,0\n", "\0\xff"]
+)
+def test_other_files_are_refused(tmp_path, text):
+    path = tmp_path / "motion.csv"
+    path.write_text(text)
+    with pytest.raises(RoadSourceError):
+        read_motion(path)

@@ -1,0 +1,77 @@
+"""A flight over a made-up town: found, followed, lost where it ends."""
+
+import numpy as np
+import pytest
+
+from roadgeo.evaluation.flights import FlightOptions, simulate_flight
+from roadgeo.evaluation.landscape import Landscape
+from roadgeo.flights.tracker import FlightFrame, Tracker, track
+from roadgeo.geometry.mask import RoadMask
+from roadgeo.reference.reference import Reference
+
+OPTIONS = FlightOptions(size_px=(400, 300), n_frames=(9, 9), gsd_m=(1.0, 1.2), turn_deg=1.0, intersections=(2, 30))
+
+pytestmark = pytest.mark.slow
+
+
+@pytest.fixture(scope="module")
+def flight(town):
+    network, index = town
+    flown = simulate_flight(Landscape.from_network(network), OPTIONS, 1)
+    frames = [
+        FlightFrame(k, f"{k}", float(k), RoadMask(mask > 127), flown.motion[k] if k else None)
+        for k, mask in enumerate(flown.masks())
+    ]
+    return flown, frames, Reference(index, network)
+
+
+def error(flown, one):
+    truth = flown.views[one.frame.number].homography(one.frame.frame.center)
+    return np.hypot(*(one.pose.center - truth))
+
+
+def test_all_frames_are_placed_to_metres_those_that_waited_too(flight):
+    flown, frames, reference = flight
+    tracked = track(frames, [reference])
+    assert [one.frame.number for one in tracked] == list(range(9))
+    assert {one.status for one in tracked} <= {"located", "tracked", "predicted"}
+    assert max(error(flown, one) for one in tracked) < 5.0
+    assert tracked[0].status == "located"
+    assert tracked[0].known_at > 0 or len(flown.views) == 1
+
+
+def test_a_cut_is_noticed_within_three_frames_and_taken_back(flight):
+    _, frames, reference = flight
+    tracker = Tracker([reference])
+    for frame in frames:
+        tracker.feed(frame)
+    assert not tracker.is_lost
+    rng = np.random.default_rng(3)
+    news = []
+    for k in range(3):
+        strange = np.zeros((300, 400), bool)
+        for row in rng.integers(0, 280, 3):
+            strange[row : row + 9] = True
+        news = tracker.feed(FlightFrame(9 + k, f"{9 + k}", 0.0, RoadMask(strange), frames[1].motion))
+    assert tracker.is_lost
+    assert [one.status for one in news] == ["lost"] * 3
+    assert [one.pose for one in news] == [None] * 3
+
+
+def test_a_frame_without_roads_is_followed_by_its_motion(flight):
+    flown, frames, reference = flight
+    blank = RoadMask(np.zeros((300, 400), bool))
+    frames = [*frames[:7], FlightFrame(7, "7", 7.0, blank, frames[7].motion), frames[8]]
+    tracked = track(frames, [reference])
+    assert tracked[7].status == "predicted"
+    assert error(flown, tracked[7]) < 10.0
+    assert tracked[8].status == "tracked"
+
+
+def test_without_motion_a_flight_is_lost(flight):
+    _, frames, reference = flight
+    tracker = Tracker([reference])
+    for frame in frames:
+        tracker.feed(frame)
+    news = tracker.feed(FlightFrame(9, "9", 9.0, frames[8].mask))
+    assert [one.status for one in news] == ["lost"]
