@@ -23,7 +23,7 @@ STOREYS_TEXT = """
     exits       outputs
     workflows   workflows
     running     running
-    flights     flights
+    flights     flights serving
     evaluation  evaluation
     faces       api cli qgis demo __main__ __init__
 """

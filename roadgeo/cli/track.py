@@ -52,7 +52,6 @@ Examples:
   roadgeo track frames/ --reference boston-ma --motion odometry.csv
   roadgeo track flight.mp4 --every 0.5 --start 2024-05-01T09:30:00Z --out-dir found
   roadgeo track frame_*.png --json > flight.jsonl
-  roadgeo track frames/ --mavlink udpout:127.0.0.1:14550
 
 Exit status: 0 every frame has a place, 3 at least one is lost, 1 error, 2 usage.
 """

@@ -21,8 +21,8 @@ from roadgeo.flights.pose import FilterOptions, Pose, correct
 from roadgeo.geometry.frame import Frame
 from roadgeo.geometry.homography import Homography
 from roadgeo.geometry.mask import RoadMask
-from roadgeo.kernels.road_growth import RoadBuckets
 from roadgeo.kernels.roads import bin_segments
+from roadgeo.kernels.structs import RoadBuckets
 from roadgeo.matching.query import trace_query
 from roadgeo.matching.scene import Scene
 from roadgeo.roads.graph import RoadGraph
@@ -182,7 +182,7 @@ def _agreement(motion: FloatArray, frame: Frame, scene: Scene, roads: RoadBucket
     matrix = np.diag([1.0, -1.0, 1.0]) @ motion @ np.diag([1.0, -1.0, 1.0])
     points, along = (np.ascontiguousarray(array[inside]) for array in (scene.points, scene.directions))
     near = forward_distances(
-        matrix, points, along, 6.0, math.cos(math.radians(25.0)), 0.0, 0.0, *roads, np.empty(len(points))
+        matrix, points, along, 6.0, math.cos(math.radians(25.0)), 0.0, 0.0, roads, np.empty(len(points))
     )
     return float(near / len(points))
 

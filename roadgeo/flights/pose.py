@@ -17,11 +17,10 @@ from roadgeo.geometry.homography import Homography
 from roadgeo.geometry.mask import PIXEL_TO_PLANE
 from roadgeo.kernels.adjustment import point_row
 from roadgeo.kernels.road_equations import road_equations
-from roadgeo.kernels.road_growth import RoadBuckets
-from roadgeo.matching.index import ReferenceIndex
+from roadgeo.kernels.structs import RoadBuckets
 from roadgeo.matching.scene import Scene
 
-__all__ = ["FilterOptions", "Pose", "correct", "predict", "roads_of", "start"]
+__all__ = ["FilterOptions", "Pose", "correct", "predict", "start"]
 
 
 @dataclass(frozen=True)
@@ -157,9 +156,9 @@ def _rows(local: _Local, corners: FloatArray, uv: FloatArray) -> FloatArray:
     return np.asarray(local.derivative(p, uv) @ np.linalg.inv(local.derivative(p, local.corners)))
 
 
-def start(homography: Homography, frame: Frame, sigma_m: float) -> Pose:
-    """Return the pose of a frame whose homography (pixel to plane) is known, each corner to `sigma_m`."""
-    return Pose(homography(frame.corners), np.eye(8) * sigma_m**2 / 2.0, frame)
+def start(corners: FloatArray, frame: Frame, sigma_m: float) -> Pose:
+    """Return the pose of a frame whose corners (4, 2) are known, each to `sigma_m` metres."""
+    return Pose(corners, np.eye(8) * sigma_m**2 / 2.0, frame)
 
 
 def predict(pose: Pose, motion: FloatArray, sigma_px: float) -> Pose | None:
@@ -184,11 +183,6 @@ def predict(pose: Pose, motion: FloatArray, sigma_px: float) -> Pose | None:
     noise = (pose.gsd_m * sigma_px) ** 2 / 2.0
     covariance = rows @ pose.covariance @ rows.T + np.eye(8) * noise
     return Pose(local.places(p, uv), covariance, pose.frame)
-
-
-def roads_of(index: ReferenceIndex) -> RoadBuckets:
-    """Return the roads of a map as `correct` takes them."""
-    return RoadBuckets(index.segments, index.segment_starts, index.segment_ids, index.grid, index.shape)
 
 
 def correct(pose: Pose, scene: Scene, roads: RoadBuckets, options: FilterOptions) -> Pose | None:

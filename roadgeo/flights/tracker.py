@@ -18,7 +18,7 @@ import numpy as np
 from roadgeo._arrays import FloatArray
 from roadgeo.errors import MaskError
 from roadgeo.flights.mosaic import Mosaic, MosaicOptions, lay_together
-from roadgeo.flights.pose import FilterOptions, Pose, correct, predict, roads_of, start
+from roadgeo.flights.pose import FilterOptions, Pose, correct, predict, start
 from roadgeo.geometry.camera import CameraOptions
 from roadgeo.geometry.frame import Frame
 from roadgeo.geometry.homography import Homography
@@ -208,7 +208,7 @@ class Tracker:
         corrected = (
             None
             if scene is None or reference is None
-            else correct(predicted, scene, roads_of(reference.index), self.options.filter)
+            else correct(predicted, scene, reference.index.road_buckets, self.options.filter)
         )
         odds, why = math.nan, "it shows hardly a road of the map; placed by its motion"
         if corrected is not None and scene is not None and reference is not None:
@@ -274,22 +274,21 @@ class Tracker:
         if near is not None:
             near = (near[0], near[1], near[2] + 0.5 * max(mosaic.mask.shape) * camera.gsd_m[1])
         odds = round(options.min_log10_odds + math.log10(self._looks), 1)
-        return replace(options, match=replace(options.match, camera=camera), near=near, min_log10_odds=odds)
+        match = replace(options.match, camera=camera, lens=None)
+        return replace(options, match=match, near=near, min_log10_odds=odds)
 
     def _settle(self, location: Location, mosaic: Mosaic) -> list[Tracked]:
         """Place all frames that waited, each by itself; nothing where most of them do not agree."""
         reference = next(one for one in self.references if one.name == location.reference)
         plane = reference.index.plane
-        to_crs = np.asarray(location.homography, np.float64)
-        to_plane = np.linalg.inv(plane.to_crs_matrix()) @ to_crs @ mosaic.to_mosaic
         first, last = self._window[0].frame, self._window[-1].frame
         self._reference = reference
         placed: list[Tracked] = []
-        for waiting, matrix in zip(self._window, to_plane, strict=True):
-            frame = waiting.frame
-            homography = Homography(matrix).facing(frame.frame.center)
-            here = start(homography, frame.frame, self.options.start_sigma_m)
-            if np.isfinite(here.corners).all():
+        for waiting, matrix in zip(self._window, mosaic.to_mosaic, strict=True):
+            frame = waiting.frame.frame
+            corners = plane.from_crs(location.pixel_to_map(Homography(matrix)(frame.corners)))
+            if np.isfinite(corners).all():
+                here = start(corners, frame, self.options.start_sigma_m)
                 placed.append(self._judge(waiting, here, last.number, "located"))
         agreed = sum(one.status == "located" for one in placed)
         if len(placed) < len(self._window) or agreed < 0.5 * len(placed):

@@ -11,8 +11,8 @@ import numpy as np
 from roadgeo.kernels.adjustment import add_row, point_row
 from roadgeo.kernels.arrays import Floats1, Floats2
 from roadgeo.kernels.compilation import kernel
-from roadgeo.kernels.road_growth import RoadBuckets
 from roadgeo.kernels.roads import nearest_road
+from roadgeo.kernels.structs import RoadBuckets
 
 __all__ = ["road_equations"]
 
@@ -64,10 +64,7 @@ def road_equations(
         if length == 0.0:
             continue
         gx, gy = origin[0] + unit * x, origin[1] + unit * y
-        d, fx, fy, rx, ry = nearest_road(
-            gx, gy, dx / length, dy / length, radius, min_cos,
-            roads.segments, roads.starts, roads.ids, roads.grid, roads.shape,
-        )  # fmt: skip
+        d, fx, fy, rx, ry = nearest_road(gx, gy, dx / length, dy / length, radius, min_cos, roads)
         if not d < radius:
             continue
         met += 1

@@ -4,7 +4,6 @@ import numpy as np
 from worlds.scenes import random_network
 
 from roadgeo.kernels.road_equations import road_equations
-from roadgeo.kernels.road_growth import RoadBuckets
 from roadgeo.kernels.roads import nearest_road
 from roadgeo.matching.index import build_index
 from roadgeo.matching.scene import sample_roads
@@ -23,7 +22,7 @@ def twin(p, points, directions, radius, sigma, roads):
         x, y = place(p, uv)
         ahead = place(p, uv + 1e-6 * along) - (x, y)
         dx, dy = ahead / np.hypot(*ahead)
-        d, fx, fy, rx, ry = nearest_road(x, y, dx, dy, radius, MIN_COS, *roads)
+        d, fx, fy, rx, ry = nearest_road(x, y, dx, dy, radius, MIN_COS, roads)
         if d == np.inf:
             continue
         met += 1
@@ -39,7 +38,7 @@ def twin(p, points, directions, radius, sigma, roads):
 def test_it_is_the_sum_over_points_that_meet_roads():
     network = random_network(3, 1400.0)
     index = build_index(network)
-    roads = RoadBuckets(index.segments, index.segment_starts, index.segment_ids, index.grid, index.shape)
+    roads = index.road_buckets
     points, directions = sample_roads(network.graph, 60.0)
     uv = (points - ORIGIN) / UNIT
     near = np.hypot(*uv.T) < 1.0
@@ -56,7 +55,7 @@ def test_it_is_the_sum_over_points_that_meet_roads():
 def test_beyond_the_horizon_nothing_is_met():
     network = random_network(3, 1400.0)
     index = build_index(network)
-    roads = RoadBuckets(index.segments, index.segment_starts, index.segment_ids, index.grid, index.shape)
+    roads = index.road_buckets
     p = np.array([1.0, 0, 0, 0, 1.0, 0, -2.0, 0])
     normal, right = np.zeros((8, 8)), np.zeros(8)
     points, along = np.array([[0.9, 0.0]]), np.array([[1.0, 0.0]])
