@@ -64,10 +64,10 @@ class TrackOptions:
     locate: LocateOptions = field(default_factory=LocateOptions)
     mosaic: MosaicOptions = field(default_factory=MosaicOptions)
     filter: FilterOptions = field(default_factory=FilterOptions)
-    most_frames: int = 16
+    most_frames: int = 32
     fewest_intersections: int = 6
     more_intersections: int = 2
-    start_sigma_m: float = 3.0
+    start_sigma_m: float = 4.0
     least_odds: float = 0.2
     patience: int = 3
     lost_frames: float = 0.3
