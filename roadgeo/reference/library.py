@@ -13,6 +13,7 @@ from pathlib import Path
 from roadgeo.errors import IndexFormatError
 from roadgeo.reference.files import ReferencePaths, reference_paths
 from roadgeo.reference.network_file import not_a_reference
+from roadgeo.reference.remote import fetch_manifest, is_remote
 from roadgeo.reference.shards import ENDING, manifest_path
 from roadgeo.storage.atomic import writing
 
@@ -62,7 +63,7 @@ def list_references() -> list[Path]:
 
 
 def resolve_reference(name_or_path: str | os.PathLike[str]) -> Path:
-    """Find a reference: a file as given, else one in the library by its name.
+    """Find a reference: a file as given, else one in the library by its name; of a URL, its manifest is fetched.
 
     Returns
     -------
@@ -75,6 +76,8 @@ def resolve_reference(name_or_path: str | os.PathLike[str]) -> Path:
         When there is neither.
     """
     name = os.fspath(name_or_path)
+    if is_remote(name):
+        return fetch_manifest(name)
     for paths in (reference_paths(name), _shelved(name)):
         if paths.geopackage.is_file() or paths.index.is_file():
             return paths.geopackage

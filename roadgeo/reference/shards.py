@@ -30,6 +30,7 @@ from roadgeo.location import Location
 from roadgeo.matching.index import ReferenceIndex
 from roadgeo.matching.parts import Near, touches
 from roadgeo.reference.files import check_reference, reference_digest, reference_paths
+from roadgeo.reference.remote import fetch_shard
 from roadgeo.reference.spool import Bounds
 from roadgeo.storage.atomic import publish, staging
 
@@ -235,9 +236,25 @@ class Shard:
     def _index(self) -> ReferenceIndex:
         from roadgeo.reference.reference import open_whole
 
+        paths = reference_paths(self.path)
+        if not paths.index.is_file() and not paths.geopackage.is_file():
+            self._fetch()
+        try:
+            return open_whole(self._checked()).index
+        except IndexFormatError:  # what was fetched may have been damaged since
+            if not self._fetch():
+                raise
+        return open_whole(self._checked()).index
+
+    def _fetch(self) -> bool:
+        """Fetch it, if it lies elsewhere; return whether it does."""
+        return fetch_shard(self.path.parent.parent, self.path.parent.name, self.entry.name)
+
+    def _checked(self) -> Path:
+        """Return where it lies, if it is the one that the manifest names."""
         if reference_digest(self.path) not in {self.entry.digest, ""}:
             raise IndexFormatError(f"{self.path}: is not the shard that the manifest names; build the reference again")
-        return open_whole(self.path).index
+        return self.path
 
 
 @dataclass(frozen=True)

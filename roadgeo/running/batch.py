@@ -64,6 +64,16 @@ def _resolve(names: Iterable[str]) -> list[Path]:
     return paths
 
 
+def _named_for_workers(names: Sequence[str]) -> list[str]:
+    """Name references by their paths, for workers may have another library; what lies elsewhere each host fetches."""
+    from roadgeo.reference.library import resolve_reference
+    from roadgeo.reference.remote import is_remote
+
+    if not names:
+        return [str(path.absolute()) for path in _resolve(names)]
+    return [name if is_remote(name) else str(resolve_reference(name).absolute()) for name in names]
+
+
 # --- locating it ------------------------------------------------------------------------------------------------------
 
 
@@ -171,8 +181,8 @@ def locate_masks(
     from roadgeo.outputs.location_files import OutputOptions
     from roadgeo.workflows import LocateOptions
 
-    if cluster is not None:  # whose workers may have another library
-        references = [str(path.absolute()) for path in _resolve(references)]
+    if cluster is not None:
+        references = _named_for_workers(references)
     work = _Locating(
         tuple(references),
         str(out_dir),

@@ -1,0 +1,114 @@
+"""Shards in a store: fetched when they are searched, once, checked, and kept."""
+
+import functools
+import http.server
+import shutil
+import threading
+
+import pytest
+from worlds.scenes import random_network
+
+from roadgeo.errors import IndexFormatError
+from roadgeo.location import Location
+from roadgeo.matching.index import build_index
+from roadgeo.reference.files import reference_digest
+from roadgeo.reference.library import resolve_reference
+from roadgeo.reference.network_file import as_stored
+from roadgeo.reference.reference import Reference, open_reference
+from roadgeo.reference.shards import Manifest, ShardEntry, write_manifest
+
+fsspec = pytest.importorskip("fsspec")
+
+
+@pytest.fixture(scope="module")
+def built(tmp_path_factory):
+    """A folder with a manifest and one shard."""
+    folder = tmp_path_factory.mktemp("built") / "town.shards"
+    (folder / "00ff").mkdir(parents=True)
+    network = as_stored(random_network(1, 1500.0))
+    reference = Reference(build_index(network), network)
+    reference.save(folder / "00ff" / "a.gpkg")
+    index, digest = reference.index, reference_digest(folder / "00ff" / "a.gpkg")
+    entry = ShardEntry(
+        "a", (-180, -90, 180, 90), (-180, -90, 180, 90), index.plane.crs, len(index), len(index), 1.0, 1, digest
+    )
+    write_manifest(folder, Manifest("town", "00ff", index.plane.crs, 3000.0, {}, (entry,)))
+    return folder
+
+
+@pytest.fixture(autouse=True)
+def cache(tmp_path, monkeypatch):
+    monkeypatch.setenv("ROADGEO_CACHE", str(tmp_path / "cache"))
+    return tmp_path / "cache"
+
+
+@pytest.fixture
+def in_memory(built):
+    files = fsspec.filesystem("memory")
+    files.put(str(built), "/bucket/town.shards", recursive=True)
+    yield files
+    files.rm("/bucket", recursive=True)
+
+
+URL = "memory://bucket/town.shards"
+
+
+def test_a_shard_is_fetched_once_when_it_is_opened(in_memory, built, cache):
+    reference = open_reference(URL)
+    assert not list(cache.rglob("*.index"))
+    index = reference.parts[0].open()
+    assert len(index) == len(open_reference(built).parts[0].open())
+    in_memory.rm("/bucket/town.shards/00ff", recursive=True)
+    assert len(open_reference(f"{URL}/manifest.json").parts[0].open()) == len(index)
+    assert len(list(cache.rglob("*.index"))) == 1
+    assert not list(cache.rglob("*.tmp"))
+    assert reference.index_of(Location("q", "not_located", "")) is index
+
+
+def test_a_name_that_is_a_url_resolves_to_what_stands_for_it(in_memory):
+    folder = resolve_reference(URL)
+    assert folder.name.endswith("town.shards")
+    assert open_reference(folder).parts[0].open().name == "town 1"
+
+
+def test_what_was_damaged_here_is_fetched_again(in_memory, cache):
+    open_reference(URL).parts[0].open()
+    (index,) = cache.rglob("*.index")
+    index.write_bytes(index.read_bytes()[:-100])
+    assert len(open_reference(URL).parts[0].open()) > 90
+
+
+def test_another_shard_in_its_place_is_refused(in_memory, built, tmp_path):
+    network = as_stored(random_network(2, 1500.0))
+    Reference(build_index(network), network).save(tmp_path / "other.gpkg")
+    in_memory.put(str(tmp_path / "other.index"), "/bucket/town.shards/00ff/a.index")
+    with pytest.raises(IndexFormatError, match="not the shard that the manifest names"):
+        open_reference(URL).parts[0].open()
+
+
+@pytest.mark.parametrize("url", ["memory://bucket/none.shards", "nothing://at/all"])
+def test_what_is_not_there_is_an_error_on_one_line(url, cache):
+    with pytest.raises(IndexFormatError, match="cannot be fetched") as error:
+        open_reference(url)
+    assert "\n" not in str(error.value)
+    assert not list(cache.rglob("manifest.json"))
+
+
+def test_a_web_server_will_do(built, tmp_path):
+    pytest.importorskip("aiohttp")
+    shutil.copytree(built, tmp_path / "www" / "town.shards")
+    handler = functools.partial(_Quiet, directory=str(tmp_path / "www"))
+    with http.server.ThreadingHTTPServer(("127.0.0.1", 0), handler) as server:
+        thread = threading.Thread(target=server.serve_forever, kwargs={"poll_interval": 0.02}, daemon=True)
+        thread.start()
+        try:
+            reference = open_reference(f"http://127.0.0.1:{server.server_port}/town.shards")
+            assert len(reference.parts[0].open()) > 90
+        finally:
+            server.shutdown()
+            thread.join()
+
+
+class _Quiet(http.server.SimpleHTTPRequestHandler):
+    def log_message(self, *_):
+        pass
