@@ -102,13 +102,13 @@ def main() -> None:
     known = {(one["city"], one["foreign"], one["k"]) for one in done}
     landscapes = [read_landscape(path) for path in given.references]
     with tempfile.TemporaryDirectory() as folder, given.out.open("a") as out:
-        for n, path in enumerate(given.references):
-            reference, foreign = open_reference(path), landscapes[n - 1]
-            for k in range(given.count + given.count // 10):
-                elsewhere = foreign if k >= given.count else None
+        opened = [open_reference(path) for path in given.references]
+        for k in range(given.count + given.count // 10):  # all places in turn: a part of it tells of all
+            for n, path in enumerate(given.references):
+                elsewhere = landscapes[n - 1] if k >= given.count else None
                 if (path.stem, elsewhere is not None, k) in known:
                     continue
-                record = trial(k, given.seed, landscapes[n], elsewhere, reference, Path(folder))
+                record = trial(k, given.seed, landscapes[n], elsewhere, opened[n], Path(folder))
                 done.append({"city": path.stem, **record})
                 out.write(json.dumps(done[-1]) + "\n")
                 out.flush()

@@ -73,12 +73,15 @@ class Displacement:
 
 
 def measure(start: FloatArray, end: FloatArray, end_covariance: FloatArray) -> Displacement:
-    """Fit the similarity that takes the corners (4, 2) of a frame from `start` to `end` by least squares.
+    """Fit the similarity that takes the corners (4, 2) of a frame from `start` to `end`.
+
+    By least squares that heed the corners' errors: what the roads of a frame hardly determine, such as the far corner
+    of one that shows roads on one side only, hardly counts.
 
     Parameters
     ----------
     end_covariance : (8, 8)
-        Of x and y of the corners in turn, square metres.
+        Of x and y of the corners in turn, square metres; positive definite.
     """
     about = start.mean(axis=0)
     x, y = (start - about).T
@@ -89,8 +92,9 @@ def measure(start: FloatArray, end: FloatArray, end_covariance: FloatArray) -> D
     rows[:, 0, 3], rows[:, 1, 3] = x, y
     design = rows.reshape(8, 4)
     moved = (end - start).reshape(8)
-    solve = np.linalg.pinv(design)
-    east, north, b, a = solve @ moved
+    weighted = np.linalg.solve(end_covariance, design).T
+    covariance = np.asarray(np.linalg.inv(weighted @ design))
+    east, north, b, a = covariance @ weighted @ moved
     left = (moved - design @ (east, north, b, a)).reshape(4, 2)
     return Displacement(
         about,
@@ -98,6 +102,6 @@ def measure(start: FloatArray, end: FloatArray, end_covariance: FloatArray) -> D
         float(north),
         -math.degrees(math.atan2(b, 1.0 + a)),
         float(math.hypot(1.0 + a, b)),
-        solve @ end_covariance @ solve.T,
+        covariance,
         float(np.sqrt(np.mean(np.sum(left**2, axis=1)))),
     )

@@ -237,7 +237,7 @@ class _Judge:
 
     def displacement(self, place: _Place) -> Displacement:
         """Return how far a place lies from the given one."""
-        covariance = np.zeros((8, 8)) if place.refined is None else place.refined.corner_covariance_m2
+        covariance = np.eye(8) if place.refined is None else place.refined.corner_covariance_m2
         return measure(self.corners, Homography(place.matrix)(self.scene.corners), covariance)
 
     def gap(self, a: FloatArray, b: FloatArray) -> float:
