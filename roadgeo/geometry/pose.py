@@ -1,0 +1,266 @@
+"""Where the camera was and how it pointed, from where the corners of its frame lie on the ground, with covariance.
+
+Four points determine a homography, so the corners of a frame and their covariance hold all that it says of the camera.
+A pinhole with square pixels whose axis meets the middle of the frame, above level ground, has six unknowns, or seven
+with its focal length. They are fitted to the corners by least squares, each corner weighed as its errors demand.
+
+Looking straight down, focal length and height cannot be told apart: a lens half as long at half the height sees the
+same. So an unknown focal length has a prior, that of usual lenses; what the homography does not tell keeps the prior's
+width, and so does the height.
+
+Camera axes: x to the right, y to the image's top, z backwards, so that a camera without rotation looks straight down
+with its top to the north.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable, Iterable
+from dataclasses import dataclass
+from typing import Literal
+
+import numpy as np
+
+from roadgeo._arrays import FloatArray
+from roadgeo.geometry.frame import Frame
+from roadgeo.geometry.homography import Homography
+
+#: Focal lengths that an adjustment may start from, in usual ones.
+_FACTORS = (0.35, 0.5, 0.7, 1.0, 1.4, 2.0, 3.0)
+
+__all__ = ["Pose", "PoseOptions", "find_pose", "omega_phi_kappa", "quaternion", "turned"]
+
+
+@dataclass(frozen=True)
+class PoseOptions:
+    """What is known of the lens.
+
+    Attributes
+    ----------
+    focal_px : float or None
+        Focal length, pixels of the frame; None: unknown.
+    usual_focal : float
+        Of usual lenses, in halves of the frame's diagonal.
+    usual_sigma : float
+        Standard deviation of the log of a usual focal length: between 35 and 85 degrees across the diagonal.
+    told_sigma : float
+        The homography tells the focal length where its log is as sure as that.
+    """
+
+    focal_px: float | None = None
+    usual_focal: float = 1.5
+    usual_sigma: float = 0.45
+    told_sigma: float = 0.15
+    n_iterations: int = 30
+
+
+@dataclass(frozen=True)
+class Pose:
+    """A camera above the plane.
+
+    Attributes
+    ----------
+    position : (3,) float64
+        x, y on the plane and height above it, metres.
+    rotation : (3, 3) float64
+        Camera axes to x, y of the plane and up.
+    covariance : (6, 6) float64
+        Of the position, metres, and of heading, pitch and roll, degrees.
+    focal_px, focal_sigma_px : float
+        Focal length and its standard deviation: 0 where it was given.
+    source : str
+        What it rests on: a "camera" that was given, the "homography", or a usual lens that is "assumed".
+    """
+
+    position: FloatArray
+    rotation: FloatArray
+    covariance: FloatArray
+    focal_px: float
+    focal_sigma_px: float
+    source: Literal["camera", "homography", "assumed"]
+
+    @property
+    def angles_deg(self) -> FloatArray:
+        """Heading, pitch, roll of an aircraft that looks straight down from its belly, its nose at the image's top.
+
+        Heading clockwise from the plane's y axis, pitch positive with the nose up, roll with the right wing down.
+        """
+        return _angles(self.rotation)
+
+    @property
+    def tilt_deg(self) -> float:
+        """Angle of the optical axis from the vertical."""
+        return math.degrees(math.acos(min(1.0, float(self.rotation[2, 2]))))
+
+
+def find_pose(
+    homography: FloatArray, size: tuple[int, int], corner_covariance: FloatArray, options: PoseOptions | None = None
+) -> Pose | None:
+    """Find the camera behind a homography; None where no camera above the ground sees it.
+
+    Parameters
+    ----------
+    homography : (3, 3) float64
+        Pixel (column, row; corner convention) to plane metres, x east and y north.
+    corner_covariance : (8, 8) float64
+        Of the corners' x and y on the plane, square metres (see `Location.corner_covariance_m2`).
+    """
+    options = options or PoseOptions()
+    frame = Frame(*size)
+    corners = Homography(homography).facing(frame.center)(frame.corners)
+    if not np.isfinite(corners).all():
+        return None
+    usual = options.usual_focal * frame.half_diagonal
+    tried = [options.focal_px] if options.focal_px else [usual * factor for factor in _FACTORS]
+    weights = np.linalg.cholesky(np.linalg.inv(corner_covariance)).T
+
+    def cost(p: FloatArray) -> float:
+        away = weights @ (_corners_seen(p, frame) - corners).ravel()
+        return float(np.nan_to_num(away @ away, nan=np.inf))
+
+    start = min(_starts(homography, frame, tried), key=cost, default=None)
+    found = None if start is None else _fit(start, frame, corners, weights, options)
+    return None if found is None else _describe(*found, options)
+
+
+def _starts(homography: FloatArray, frame: Frame, focals: Iterable[float]) -> Iterable[FloatArray]:
+    """Yield (7,) parameters of pinholes of some focal lengths that nearly see a homography (Zhang 2000, 3.1)."""
+    to_middle = np.array([[1.0, 0.0, -frame.center[0]], [0.0, -1.0, frame.center[1]], [0.0, 0.0, 1.0]])
+    g = to_middle @ Homography(homography).facing(frame.center).inverse().matrix
+    for focal in focals:
+        m = np.diag([1.0 / focal, 1.0 / focal, -1.0]) @ g
+        m = m / math.sqrt(np.linalg.norm(m[:, 0]) * np.linalg.norm(m[:, 1]))
+        u, _, vt = np.linalg.svd(m[:, :2], full_matrices=False)
+        x, y = (u @ vt).T
+        rotation = np.stack([x, y, np.cross(x, y)])  # rows: the plane's axes in the camera's
+        position = -rotation @ m[:, 2]
+        if position[2] > 0:
+            yield np.array([*position, *_rotation_vector(rotation), math.log(focal)])
+
+
+def _fit(
+    start: FloatArray, frame: Frame, corners: FloatArray, weights: FloatArray, options: PoseOptions
+) -> tuple[FloatArray, FloatArray] | None:
+    """Adjust parameters to the corners by Levenberg and Marquardt; return them and their covariance."""
+    prior = math.log(options.focal_px or options.usual_focal * frame.half_diagonal)
+    prior_sigma = 1e-6 if options.focal_px else options.usual_sigma
+
+    def residuals(p: FloatArray) -> FloatArray:
+        away = weights @ (_corners_seen(p, frame) - corners).ravel()
+        return np.append(away, (p[6] - prior) / prior_sigma)
+
+    p, damping = start, 1e-3
+    scale = np.array([start[2]] * 3 + [1.0] * 4)
+    r = residuals(p)
+    for _ in range(options.n_iterations):
+        jacobian = _differentiate(residuals, p, scale)
+        normal = jacobian.T @ jacobian
+        step = np.linalg.solve(normal + damping * np.diag(np.diag(normal)), -jacobian.T @ r)
+        tried = residuals(p + step)
+        if not np.isfinite(tried).all() or tried @ tried > r @ r:
+            damping *= 10.0
+            continue
+        done = float(r @ r - tried @ tried) < 1e-9 * float(r @ r) + 1e-12
+        p, r, damping = p + step, tried, damping / 10.0
+        if done:
+            break
+    if not np.isfinite(r).all() or p[2] <= 0:
+        return None
+    jacobian = _differentiate(residuals, p, scale)
+    return p, np.asarray(np.linalg.inv(jacobian.T @ jacobian))
+
+
+def _corners_seen(p: FloatArray, frame: Frame) -> FloatArray:
+    """Return where a pinhole sees the corners of its frame on the plane, (4, 2); NaN above the horizon."""
+    pixels = (frame.corners - frame.center) * (1.0, -1.0)
+    rays = np.c_[pixels, np.full(4, -math.exp(p[6]))] @ _rotation(p[3:6]).T
+    with np.errstate(divide="ignore", invalid="ignore"):
+        reach = np.where(rays[:, 2] < 0, -p[2] / rays[:, 2], np.nan)
+    return np.asarray(p[:2] + rays[:, :2] * reach[:, None])
+
+
+def _differentiate(function: Callable[[FloatArray], FloatArray], p: FloatArray, scale: FloatArray) -> FloatArray:
+    """Differentiate a vector of values by the parameters, from both sides."""
+    columns = []
+    for k, one in enumerate(scale):
+        step = np.zeros(len(p))
+        step[k] = 1e-6 * one
+        columns.append((function(p + step) - function(p - step)) / (2e-6 * one))
+    return np.stack(columns, axis=1)
+
+
+def _describe(p: FloatArray, covariance: FloatArray, options: PoseOptions) -> Pose:
+    """Take the covariance of the parameters to that of position and angles."""
+
+    def angles(vector: FloatArray) -> FloatArray:
+        away = _angles(_rotation(vector)) - _angles(_rotation(p[3:6]))
+        return np.asarray((away + 180.0) % 360.0 - 180.0)
+
+    to = np.zeros((6, 7))
+    to[:3, :3] = np.eye(3)
+    to[3:, 3:6] = _differentiate(angles, p[3:6], np.ones(3))
+    focal, sigma = math.exp(p[6]), math.sqrt(covariance[6, 6])
+    source: Literal["camera", "homography", "assumed"] = "homography" if sigma < options.told_sigma else "assumed"
+    if options.focal_px:
+        source, sigma = "camera", 0.0
+    return Pose(p[:3], _rotation(p[3:6]), to @ covariance @ to.T, focal, focal * sigma, source)
+
+
+# --- rotations --------------------------------------------------------------------------------------------------------
+
+
+def _rotation(vector: FloatArray) -> FloatArray:
+    """Return the rotation (3, 3) about a vector by its length, radians (Rodrigues)."""
+    angle = float(np.linalg.norm(vector))
+    if angle < 1e-12:
+        return np.eye(3)
+    x, y, z = vector / angle
+    cross = np.array([[0.0, -z, y], [z, 0.0, -x], [-y, x, 0.0]])
+    return np.asarray(np.eye(3) + math.sin(angle) * cross + (1.0 - math.cos(angle)) * cross @ cross)
+
+
+def _rotation_vector(rotation: FloatArray) -> FloatArray:
+    """Undo `_rotation`."""
+    x, y, z, w = quaternion(rotation)
+    length = math.sqrt(x * x + y * y + z * z)
+    return np.zeros(3) if length < 1e-12 else np.array([x, y, z]) / length * 2.0 * math.atan2(length, w)
+
+
+def _angles(rotation: FloatArray) -> FloatArray:
+    """Return heading, pitch and roll (see `Pose.angles_deg`)."""
+    right, ahead, up = rotation.T
+    heading = math.atan2(ahead[0], ahead[1])
+    pitch = math.asin(max(-1.0, min(1.0, float(ahead[2]))))
+    return np.degrees([heading, pitch, math.atan2(-right[2], up[2])])
+
+
+def turned(rotation: FloatArray, clockwise_deg: float) -> FloatArray:
+    """Return a rotation counted from a north that lies so far clockwise of the plane's y axis."""
+    return _rotation(np.array([0.0, 0.0, math.radians(clockwise_deg)])) @ rotation
+
+
+def omega_phi_kappa(rotation: FloatArray) -> tuple[float, float, float]:
+    """Return the angles, radians, of R = Rx(omega) Ry(phi) Rz(kappa), camera axes to east, north, up (PATB)."""
+    phi = math.asin(max(-1.0, min(1.0, float(rotation[0, 2]))))
+    return (
+        math.atan2(-rotation[1, 2], rotation[2, 2]),
+        phi,
+        math.atan2(-rotation[0, 1], rotation[0, 0]),
+    )
+
+
+def quaternion(rotation: FloatArray) -> tuple[float, float, float, float]:
+    """Return x, y, z, w of a rotation, w not negative (Shepperd 1978)."""
+    r = rotation
+    squares = np.array([1 + r[0, 0] - r[1, 1] - r[2, 2], 1 - r[0, 0] + r[1, 1] - r[2, 2],
+                        1 - r[0, 0] - r[1, 1] + r[2, 2], 1 + r[0, 0] + r[1, 1] + r[2, 2]])  # fmt: skip
+    k = int(np.argmax(squares))
+    products = np.array([
+        [squares[0], r[0, 1] + r[1, 0], r[0, 2] + r[2, 0], r[2, 1] - r[1, 2]],
+        [r[0, 1] + r[1, 0], squares[1], r[1, 2] + r[2, 1], r[0, 2] - r[2, 0]],
+        [r[0, 2] + r[2, 0], r[1, 2] + r[2, 1], squares[2], r[1, 0] - r[0, 1]],
+        [r[2, 1] - r[1, 2], r[0, 2] - r[2, 0], r[1, 0] - r[0, 1], squares[3]],
+    ])  # fmt: skip
+    q = products[k] / (2.0 * math.sqrt(squares[k]))
+    q = -q if q[3] < 0 else q
+    return float(q[0]), float(q[1]), float(q[2]), float(q[3])
