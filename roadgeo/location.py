@@ -21,7 +21,7 @@ from roadgeo.roads.graph import RoadGraph
 if TYPE_CHECKING:
     import geopandas as gpd
 
-__all__ = ["SCHEMA", "Evidence", "Location", "Place", "Reason", "Seconds", "Seen", "Stats", "Status"]
+__all__ = ["SCHEMA", "Camera", "Evidence", "Location", "Place", "Reason", "Seconds", "Seen", "Stats", "Status"]
 
 SCHEMA = "roadgeo.location/1"
 
@@ -69,6 +69,75 @@ class Place:
     lon: float
     lat: float
     log10_odds: float
+
+
+@dataclass(frozen=True)
+class Camera:
+    """Where the camera was, and how it pointed (see `geometry.pose`).
+
+    Attributes
+    ----------
+    x, y : float
+        In the location's CRS.
+    height_m : float
+        Above the ground in the frame, taken for level.
+    heading_deg, pitch_deg, roll_deg : float
+        Of an aircraft that looks straight down from its belly, its nose at the image's top: heading clockwise from true
+        north, pitch positive with the nose up, roll with the right wing down.
+    focal_px, focal_sigma_px : float
+        Focal length in pixels of the mask, and its standard deviation: 0 where it was given.
+    source : str
+        What the focal length rests on, as in `Location.tilt_source`.
+    covariance : (6, 6) float64
+        Of x, y and height, metres, and of the three angles, degrees.
+    rotation : (3, 3) float64
+        Axes of the camera (x right, y to the image's top, z backwards) to east, north and up.
+    ground_m, ground_spread_m : float or None
+        Mean height of the ground in the frame by a terrain model, and its standard deviation; None: none was given.
+    """
+
+    x: float
+    y: float
+    lon: float
+    lat: float
+    height_m: float
+    heading_deg: float
+    pitch_deg: float
+    roll_deg: float
+    focal_px: float
+    focal_sigma_px: float
+    source: str
+    covariance: FloatArray = field(repr=False)
+    rotation: FloatArray = field(repr=False)
+    ground_m: float | None = None
+    ground_spread_m: float | None = None
+
+    @property
+    def tilt_deg(self) -> float:
+        """Angle of the optical axis from the vertical."""
+        return float(np.degrees(np.arccos(min(1.0, float(self.rotation[2, 2])))))
+
+    @property
+    def altitude_m(self) -> float | None:
+        """Height in the terrain model's system; None without one."""
+        return None if self.ground_m is None else self.ground_m + self.height_m
+
+    def to_dict(self) -> dict[str, Any]:
+        """Plain values."""
+        sigma = np.sqrt(np.diag(self.covariance)).tolist()
+        names = ("x_m", "y_m", "height_m", "heading_deg", "pitch_deg", "roll_deg")
+        told = {name: getattr(self, name) for name in ("x", "y", "lon", "lat", *names[2:])}
+        return {
+            **told,
+            "ground_m": self.ground_m,
+            "ground_spread_m": self.ground_spread_m,
+            "altitude_m": self.altitude_m,
+            "focal_px": self.focal_px,
+            "source": self.source,
+            "sigma": {**dict(zip(names, sigma, strict=True)), "focal_px": self.focal_sigma_px},
+            "covariance": self.covariance.tolist(),
+            "rotation": self.rotation.tolist(),
+        }
 
 
 @dataclass(frozen=True)
@@ -161,6 +230,8 @@ class Location:
         The reason for programs.
     corner_covariance_m2 : (8, 8) float64 or None
         Covariance of the corners' x and y in the CRS: x, y of TL, then of TR, BR, BL.
+    camera : Camera or None
+        Where the camera was; None where no camera above the ground would see the frame so.
     alternatives : tuple of Place
         The best other places on any of the references, best first, in the CRS of the best one.
     options : dict or None
@@ -206,6 +277,7 @@ class Location:
     reason_code: Reason = Reason.NOTHING_STANDS_OUT
     corner_covariance_m2: FloatArray | None = field(default=None, repr=False)
     alternatives: tuple[Place, ...] = ()
+    camera: Camera | None = field(default=None, repr=False)
 
     @property
     def located(self) -> bool:
@@ -332,6 +404,7 @@ class Location:
             "lens_k1": None if center is None else self.lens_k1,
             "corner_sigma_m": rows(self.corner_sigma_m),
             "corner_covariance_m2": rows(self.corner_covariance_m2),
+            "camera": None if self.camera is None else self.camera.to_dict(),
             "stated_offset_m": self.stated_offset_m,
             "rmse_m": rmse_m,
             "rmse_px": rmse_px,

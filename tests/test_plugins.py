@@ -129,7 +129,7 @@ def test_a_segmenter_may_return_a_mask_or_an_array(offer, kind: str) -> None:
         (["index", "--source", "files:a.gpkg", "--roads", "a.gpkg"], 2, "Give one source of roads"),
         (["index", "--source", "files:missing.gpkg"], 1, "missing.gpkg"),
         (["locate", "a.png", "--segmenter", "eyes"], 2, "got 'eyes', expected one of mask"),
-        (["locate", "a.png", "--also", "bread"], 2, "got 'bread', expected one of gcps, geojson, kmz"),
+        (["locate", "a.png", "--also", "bread"], 2, "got 'bread', expected one of gcps, geojson, geopose"),
         (["info"], 2, "Missing argument 'REF'"),
     ],
 )

@@ -196,6 +196,13 @@ def _drawing_options(command: Command) -> Command:
 @click.option("--json", "as_json", is_flag=True, help="Print one JSON object per mask and line, in input order.")
 @_drawing_options
 @segmenting_options
+@click.option(
+    "--dem",
+    metavar="FILE",
+    default="",
+    type=click.Path(),
+    help="Terrain model (GeoTIFF, metres): how high the ground lies, and so how high the camera was above the sea.",
+)
 @click.option("--threshold", metavar="T", type=float, help="Values above T are road. Default: told by the values.")
 @click.option(
     "--band", metavar="N", type=click.IntRange(1), help="Band that holds the mask. Default: told by the bands."
@@ -287,7 +294,7 @@ def locate_command(
             _report(outcome, as_json, quiet, verbose, single=one)
     counts = Counter[str](outcome.status for outcome in outcomes)
     if len(tasks) > 1:
-        files = write_overview(out_dir, tasks, outcomes, opened if given["report"] else None)
+        files = write_overview(out_dir, tasks, outcomes, opened if given["report"] else None, given["products"])
         if not quiet:
             echo(f"{_summarize(counts)}; all footprints: {', '.join(map(str, files))}", err=True)
     return ERROR if counts["error"] else 0 if counts["located"] == len(tasks) else NOT_LOCATED

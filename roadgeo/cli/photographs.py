@@ -88,4 +88,5 @@ def read_options(given: Mapping[str, Any], photos: Mapping[str, str], others: Se
         class_name=given["class_name"],
         fused_with=tuple(others),
         threads=1 if jobs > 1 else min(os.cpu_count() or 1, _MAX_THREADS),
+        dem=given.get("dem") or "",
     )

@@ -16,7 +16,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable, Iterable
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Literal
 
 import numpy as np
@@ -110,6 +110,8 @@ def find_pose(
     corners = Homography(homography).facing(frame.center)(frame.corners)
     if not np.isfinite(corners).all():
         return None
+    origin = np.append(corners.mean(axis=0), 0.0)  # eastings and northings are large numbers
+    homography, corners = _moved_to(origin, homography), corners - origin[:2]
     usual = options.usual_focal * frame.half_diagonal
     tried = [options.focal_px] if options.focal_px else [usual * factor for factor in _FACTORS]
     weights = np.linalg.cholesky(np.linalg.inv(corner_covariance)).T
@@ -120,7 +122,15 @@ def find_pose(
 
     start = min(_starts(homography, frame, tried), key=cost, default=None)
     found = None if start is None else _fit(start, frame, corners, weights, options)
-    return None if found is None else _describe(*found, options)
+    if found is None:
+        return None
+    pose = _describe(*found, options)
+    return replace(pose, position=pose.position + origin)
+
+
+def _moved_to(origin: FloatArray, homography: FloatArray) -> FloatArray:
+    """Return a homography to coordinates that count from an origin."""
+    return np.array([[1.0, 0.0, -origin[0]], [0.0, 1.0, -origin[1]], [0.0, 0.0, 1.0]]) @ homography
 
 
 def _starts(homography: FloatArray, frame: Frame, focals: Iterable[float]) -> Iterable[FloatArray]:
@@ -156,6 +166,7 @@ def _fit(
         jacobian = _differentiate(residuals, p, scale)
         normal = jacobian.T @ jacobian
         step = np.linalg.solve(normal + damping * np.diag(np.diag(normal)), -jacobian.T @ r)
+        step = step / max(1.0, float(np.abs(step / scale).max()))  # no further than by its height, or a radian
         tried = residuals(p + step)
         if not np.isfinite(tried).all() or tried @ tried > r @ r:
             damping *= 10.0

@@ -9,8 +9,9 @@ import numpy as np
 
 from roadgeo.geometry.camera import pose
 from roadgeo.geometry.mask import PIXEL_TO_PLANE
+from roadgeo.geometry.pose import PoseOptions, find_pose, turned
 from roadgeo.geometry.projection import grid_north, to_lonlat
-from roadgeo.location import Evidence, Location, Place
+from roadgeo.location import Camera, Evidence, Location, Place
 from roadgeo.matching.methods import Fit
 from roadgeo.matching.query import Query
 
@@ -30,6 +31,7 @@ def place_frame(location: Location, query: Query, fit: Fit, focal_px: float | No
     north = grid_north(plane, ground[4])
     chosen = fit.matched >= 0
     reference_xy = plane.to_crs(fit.index.xy[fit.matched[chosen]])
+    seat = _find_camera(fit, scene.size, focal_px, north)
     odds = 0.0 if math.isnan(fit.log10_odds) else fit.log10_odds
     return replace(
         location,
@@ -43,13 +45,30 @@ def place_frame(location: Location, query: Query, fit: Fit, focal_px: float | No
         corner_covariance_m2=fit.corner_covariance_m2,
         gsd_m=camera.gsd_m,
         rotation_deg=(camera.rotation_deg + north + 180.0) % 360.0 - 180.0,
-        tilt_deg=camera.tilt_deg,
-        tilt_source=camera.source,
+        tilt_deg=camera.tilt_deg if seat is None else seat.tilt_deg,
+        tilt_source=camera.source if seat is None else seat.source,
         n_matched=int(chosen.sum()),
         inlier_ratio=float(chosen.mean()),
         log10_odds=None if math.isnan(fit.log10_odds) else fit.log10_odds,
+        camera=seat,
         evidence=Evidence(query.graph, scene.intersections.xy[chosen], reference_xy, fit.distance[chosen]),
     )
+
+
+def _find_camera(fit: Fit, size: tuple[int, int], focal_px: float | None, north: float) -> Camera | None:
+    """Return where the camera of a fit was; `north` is the direction of the plane's y axis from true north."""
+    if fit.corner_covariance_m2 is None:
+        return None
+    found = find_pose(fit.matrix @ PIXEL_TO_PLANE, size, fit.corner_covariance_m2, PoseOptions(focal_px))
+    if found is None:
+        return None
+    plane, rotation = fit.index.plane, turned(found.rotation, -north)
+    x, y = plane.to_crs(found.position[:2]).tolist()
+    lon, lat = to_lonlat(plane.crs, np.array([[x, y]]))[0].tolist()
+    heading, pitch, roll = replace(found, rotation=rotation).angles_deg.tolist()
+    height = float(found.position[2])
+    lens = (found.focal_px, found.focal_sigma_px, found.source)
+    return Camera(x, y, lon, lat, height, heading, pitch, roll, *lens, found.covariance, rotation)
 
 
 def center_of(query: Query, fit: Fit) -> Place:

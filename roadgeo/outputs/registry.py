@@ -165,13 +165,31 @@ WORLD_FILE = Output(
 GEOJSON = Output("geojson", "_footprint.geojson", _by("outlines", "write_geojson"), "footprint as GeoJSON (RFC 7946)")
 STAC = Output("stac", "_stac.json", _by("outlines", "write_stac"), "STAC Item of the drawn raster")
 KMZ = Output("kmz", "_overlay.kmz", _by("kmz", "write_kmz"), "ground overlay for Google Earth")
+GEOPOSE = Output(
+    "geopose",
+    "_geopose.json",
+    _by("cameras", "write_geopose"),
+    "where the camera was, as OGC GeoPose (Basic-Quaternion)",
+)
+ORTHORITY = Output(
+    "orthority", "_ext_param.geojson", _by("cameras", "write_orthority"), "where the camera was, as Orthority reads it"
+)
+ODM_GEO = Output(
+    "odm-geo",
+    "_geo.txt",
+    _by("cameras", "write_odm_geo"),
+    "where the camera was, for OpenDroneMap; of several masks also geo.txt",
+)
+IIIF = Output("iiif", "_iiif.json", _by("iiif", "write_iiif"), "IIIF Georeference Annotation, for Allmaps and viewers")
 
 #: Written for every located mask; of these only the JSON where there is no place.
 ALWAYS = (JSON, FOOTPRINT, STYLE, GEOPACKAGE)
+_FURTHER = (
+    *(GCPS, VRT, POINTS, MATCHES, MATCH_POINTS, ODM, WORLD_FILE, GEOJSON, STAC, KMZ),
+    *(IIIF, GEOPOSE, ORTHORITY, ODM_GEO),
+)
 #: Written where `--also` asks for them, by the names under which pyproject.toml registers them too.
-ALSO = {
-    output.name: output for output in (GCPS, VRT, POINTS, MATCHES, MATCH_POINTS, ODM, WORLD_FILE, GEOJSON, STAC, KMZ)
-}
+ALSO = {output.name: output for output in _FURTHER}
 #: All of our own.
 REGISTRY = {
     output.name: output

@@ -15,16 +15,18 @@ from pathlib import Path
 from time import perf_counter
 from typing import TYPE_CHECKING, Any, Literal
 
+import numpy as np
+
 from roadgeo._progress import Say, say_nothing
 from roadgeo.errors import IndexFormatError, ModelError, OutputError, PluginError, RoadgeoError
-from roadgeo.outputs.registry import JSON, REPORT
+from roadgeo.outputs.registry import JSON, ODM_GEO, REPORT
 from roadgeo.running.probability_files import is_ours, keep_probability, probability_path
 from roadgeo.running.processes import run
 from roadgeo.running.tasks import Task
 
 if TYPE_CHECKING:
     from roadgeo.geometry.mask import RoadMask
-    from roadgeo.location import Location, Status
+    from roadgeo.location import Camera, Location, Status
     from roadgeo.outputs.location_files import OutputOptions
     from roadgeo.reference.reference import AnyReference
     from roadgeo.running.cluster import Cluster
@@ -91,6 +93,8 @@ class ReadOptions:
         Drawn on the map instead of the masks.
     exif : bool
         Take the focal length from the photograph, or else the mask.
+    dem : str
+        Terrain model that says how high the ground lies under the camera; "" for none.
     """
 
     threshold: float | None = None
@@ -102,6 +106,7 @@ class ReadOptions:
     class_name: str | None = None
     fused_with: tuple[str, ...] = ()
     threads: int = 1
+    dem: str = ""
 
     def photo(self, task: Task, of_photograph: bool) -> str | None:
         """Return the photograph that is drawn, if any: one that was given, or the query itself."""
@@ -314,6 +319,7 @@ class _Locating:
         location = replace(
             location,
             query=task.query,
+            camera=_on_ground(location, self.reading.dem),
             seconds=replace(spent, open=asked.seconds, read=max(reading_s, 0.0)),
             options=asked.options,
             command=self._command(task),
@@ -400,6 +406,23 @@ def _code_of(error: RoadgeoError) -> str:
     return next((code for kind, code in _CODES if isinstance(error, kind)), "INVALID")
 
 
+def _on_ground(location: Location, dem: str) -> Camera | None:
+    """Return the camera with the height of the ground in its frame, where a terrain model knows that."""
+    if not dem or location.camera is None or location.crs is None or location.size is None:
+        return location.camera
+    from roadgeo.sources.elevation import ground_heights
+
+    width, height = location.size
+    columns, rows = np.meshgrid(np.linspace(0.05, 0.95, 7) * width, np.linspace(0.05, 0.95, 7) * height)
+    heights = ground_heights(
+        dem, location.pixel_to_map(np.stack([columns, rows], axis=-1).reshape(-1, 2)), location.crs
+    )
+    known = heights[np.isfinite(heights)]
+    if not len(known):
+        return location.camera
+    return replace(location.camera, ground_m=float(known.mean()), ground_spread_m=float(known.std()))
+
+
 def _off_stated(mask: str, location: Location) -> float | None:
     """Return how far a found middle lies from where the mask's own georeference puts it; None without one."""
     from roadgeo.sources.georeference import read_stated_middle
@@ -425,9 +448,15 @@ def _scale(picture: str, mask: RoadMask) -> float:
 
 
 def write_overview(
-    out_dir: str | Path, tasks: Sequence[Task], outcomes: Sequence[Outcome], references: Sequence[AnyReference] | None
+    out_dir: str | Path,
+    tasks: Sequence[Task],
+    outcomes: Sequence[Outcome],
+    references: Sequence[AnyReference] | None,
+    products: Sequence[str] = (),
 ) -> list[Path]:
     """Write all footprints in one GeoPackage and one table, and where references are given a page of all reports.
+
+    Where the `products` asked for hold "odm-geo", also one `geo.txt` with all cameras.
 
     Raises
     ------
@@ -438,6 +467,12 @@ def write_overview(
 
     folder, documents = Path(out_dir), [outcome.document for outcome in outcomes]
     files = write_summary(folder, documents)
+    if ODM_GEO.name in products:
+        from roadgeo.outputs.cameras import write_odm_geos
+
+        files.append(folder / "geo.txt")
+        names = [one.photo[0] if one.photo else one.document["query"] for one in outcomes]
+        write_odm_geos(files[-1], [{**each, "query": name} for each, name in zip(documents, names, strict=True)])
     if references is not None:
         from roadgeo.outputs.report import Entry, write_batch
 

@@ -1,0 +1,43 @@
+"""The height of the ground: a terrain model that the user gives."""
+
+from __future__ import annotations
+
+import os
+
+import numpy as np
+
+from roadgeo._arrays import FloatArray
+from roadgeo.errors import CrsError, MaskError
+from roadgeo.geometry.projection import transformer
+from roadgeo.sources.lines import crs_name
+from roadgeo.storage.rasters import open_raster
+
+__all__ = ["ground_heights"]
+
+
+def ground_heights(dem: str | os.PathLike[str], xy: FloatArray, crs: str) -> FloatArray:
+    """Return the heights, metres, of a terrain model at points (N, 2) of a CRS; NaN where it knows none.
+
+    Of each point the pixel that it lies in.
+
+    Raises
+    ------
+    MaskError
+        It cannot be read.
+    CrsError
+        It names no CRS.
+    """
+    with open_raster(dem) as raster:
+        if raster.crs is None or raster.transform.is_identity:
+            raise CrsError(
+                f"{os.fspath(dem)}: has no georeference; expected a terrain model such as a GeoTIFF with a CRS"
+            )
+        if raster.dtypes[0].startswith("complex"):
+            raise MaskError(f"{os.fspath(dem)}: holds complex values; expected heights in metres")
+        there = np.stack(transformer(crs, crs_name(raster.crs.to_wkt())).transform(*np.asarray(xy, float).T), axis=1)
+        inside = np.isfinite(there).all(axis=1)
+        values = np.full(len(there), np.nan)
+        for i in np.flatnonzero(inside):
+            found = next(iter(raster.sample([there[i]], indexes=1, masked=True)))
+            values[i] = float(found[0]) if not np.ma.is_masked(found) else np.nan
+        return values
