@@ -232,6 +232,11 @@ class TripleEstimator:
             elif options.roads is not None:
                 yield from self._rounds_of_roads(options.roads, [anchor])
 
+    @property
+    def n_anchors(self) -> int:
+        """Intersections of the query that were looked for."""
+        return len({anchor for _, anchor in self._tried})
+
     def _count(self, n_places: int) -> None:
         """Note that so many more places were tried."""
         self.n_screened += n_places

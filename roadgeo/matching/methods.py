@@ -83,6 +83,8 @@ class Found:
         Intersections of the part of the reference that was searched.
     n_tried : int
         Places that were screened.
+    n_anchors : int
+        Intersections of the query that were looked for.
     """
 
     index: ReferenceIndex
@@ -91,6 +93,7 @@ class Found:
     said: str = ""
     n_searched: int = 0
     n_tried: int = 0
+    n_anchors: int = 0
     stats: Stats = field(default_factory=Stats)
     match_s: float = 0.0
     refine_s: float = 0.0
@@ -178,6 +181,7 @@ class _Attempt:
             result.stopped,
             n_searched=self.n_searched,
             n_tried=estimator.n_screened,
+            n_anchors=estimator.n_anchors,
             stats=Stats(estimator.n_tuples, estimator.n_candidates, estimator.n_hypotheses, estimator.n_verified),
             match_s=self.search.seconds - estimator.refine_s,
             refine_s=estimator.refine_s,

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import time
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from pathlib import Path
 
 from roadgeo._arrays import AnyArray
@@ -54,7 +54,8 @@ def trace_query(mask: RoadMask, options: QueryOptions | None = None) -> tuple[Sc
         ),
     )
     height, wide = mask.shape
-    return prepare_scene(graph, found, (wide, height), mask.observed, options.scene), graph
+    scene = prepare_scene(graph, found, (wide, height), mask.observed, options.scene)
+    return replace(scene, road_width_px=width), graph
 
 
 @dataclass(frozen=True)

@@ -43,6 +43,12 @@ class RoadSearchOptions:
         Around an anchor the ground sampling may differ by this factor from that at the middle of the frame.
     least_share : float
         As of `RefineOptions`, where false roads abound.
+    road_width_m, telling_width_px : (low, high), float
+        Where roads are drawn at least so many pixels wide, they are no thin lines, and only scales are tried at which
+        they are so wide on the ground.
+    far_m : float
+        Pixels that are greater hardly show what is around an intersection: a place given by near is not looked for
+        further away than frames of such pixels reach.
     """
 
     votes: VoteOptions = field(default_factory=VoteOptions)
@@ -54,6 +60,18 @@ class RoadSearchOptions:
     max_kept: int = 4
     scale_slack: float = 1.2
     least_share: float = 0.2
+    road_width_m: tuple[float, float] = (2.0, 75.0)
+    telling_width_px: float = 6.0
+    far_m: float = 5.0
+
+    def scales(self, camera: CameraOptions, road_width_px: float) -> tuple[float, float]:
+        """Return the least and greatest ground sampling around an intersection to try."""
+        low, high = camera.gsd_m
+        low, high = low / self.scale_slack, high * self.scale_slack
+        if road_width_px < self.telling_width_px:
+            return low, high
+        least, most = (width / road_width_px for width in self.road_width_m)
+        return (max(low, least), min(high, most)) if least < high and most > low else (low, high)
 
     def refinement(self, usual: RefineOptions) -> RefineOptions:
         """Return how what grew by roads is refined."""
@@ -84,10 +102,9 @@ class RoadSearch:
     ) -> None:
         """`near` = (x, y, radius) in plane metres restricts where the middle of the frame may lie."""
         self.scene, self.options = scene, options
-        low, high = camera.gsd_m
-        scale = (low / options.scale_slack, high * options.scale_slack)
+        scale = options.scales(camera, scene.road_width_px)
         max_turn = math.radians(_ROUGHLY_DEG) if camera.north_up else math.pi
-        candidates = _within(index, near, scene.half_size * scale[1])
+        candidates = _within(index, near, scene.half_size * min(scale[1], max(options.far_m, scale[0])))
         self.voter = Voter(scene, index, scale, max_turn, candidates, options.votes)
         self._tried: set[int] = set()
         perspective = camera.perspective_sigma(options.grow.perspective_sigma)

@@ -63,6 +63,8 @@ class Scene:
     field_scale : float
         Pixels per cell.
     observed : (h, w) bool
+    road_width_px : float
+        Usual width of the mask's roads; 0: not known.
     """
 
     size: tuple[int, int]
@@ -78,6 +80,7 @@ class Scene:
     field: Float32Array
     field_scale: float
     observed: BoolArray
+    road_width_px: float = 0.0
 
     @property
     def center(self) -> FloatArray:

@@ -187,6 +187,7 @@ def _why_nothing(query: Query, found: Found, score: float, options: LocateOption
         limit, tracing_s = options.search.time_limit_s, query.seconds.vectorize
         tracing = f", of which tracing the mask took {tracing_s:.1f} s" if tracing_s > limit / 4 else ""
         told = f"stopped at the time limit of {limit:g} s{tracing}; of the places tried, {best}{searched}"
+        told += f"; {_how_far(query, found, options)}"
         return Reason.TIME_LIMIT, told
     nothing = f"no place on this map stands out: {best}{searched}"
     advice = "; more roads in view or another map may help"
@@ -195,6 +196,18 @@ def _why_nothing(query: Query, found: Found, score: float, options: LocateOption
     elif options.effort == "quick":
         advice = "; a search with full effort, more roads in view or another map may help"
     return Reason.NOTHING_STANDS_OUT, f"{nothing}{advice}"
+
+
+def _how_far(query: Query, found: Found, options: LocateOptions) -> str:
+    """Say how far a search got that was cut short, and what would shorten it."""
+    far = f"{found.n_anchors} of {len(query.scene.intersections)} intersections had been looked for"
+    (low, high), usual = options.match.camera.gsd_m, CameraOptions().gsd_m
+    if (low, high) == usual:
+        share = 2.0 * math.log(1.3) / math.log(high / low)
+        return f"{far}; a pixel size known to 30 % (--gsd) leaves {share:.0%} of the scales to try"
+    if options.near is None:
+        return f"{far}; a place known to some kilometres (--near) leaves less of the map to try"
+    return far
 
 
 def searched_within(options: LocateOptions) -> str:

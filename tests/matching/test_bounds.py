@@ -102,6 +102,7 @@ def test_the_reason_says_what_took_the_time(lattice):
     options = LocateOptions(search=SearchOptions(time_limit_s=0.05))
     location = locate(mask, lattice, options)
     assert location.reason.startswith("stopped at the time limit of 0.05 s, of which tracing the mask took 0.")
+    assert " intersections had been looked for; a pixel size known to 30 % (--gsd) leaves 11%" in location.reason
 
 
 def test_of_many_intersections_those_around_the_middle_are_kept():

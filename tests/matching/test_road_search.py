@@ -154,3 +154,11 @@ def test_a_map_of_few_roads(broken):
     index = build_index(random_network(7, 400.0))
     result = search(TripleEstimator(broken, index, MatchOptions()), SearchOptions(time_limit_s=60.0))
     assert result.score < 2.5
+
+
+def test_wide_roads_leave_out_scales_at_which_they_would_be_no_roads():
+    options, camera = RoadSearchOptions(scale_slack=1.0), CameraOptions(gsd_m=(0.1, 12.0))
+    assert options.scales(camera, 0.0) == (0.1, 12.0)
+    assert options.scales(camera, 3.0) == (0.1, 12.0)
+    assert options.scales(camera, 10.0) == pytest.approx((0.2, 7.5))
+    assert options.scales(CameraOptions(gsd_m=(9.0, 12.0)), 10.0) == (9.0, 12.0)
