@@ -23,7 +23,7 @@ from score import ROADGEO, read_places
 from tiles import Tile, fold_of, read_tiles
 
 VIEWS = ("1 m", "0.5 m", "2 m", "half", "perspective")
-RIGHT_M = 5.0  # of the middle of the frame
+RIGHT_M, WRONG_M = 5.0, 50.0  # of the middle of the frame, which may lie where nothing was seen
 SIDE = 1200  # pixels of a view in perspective
 Matrix = NDArray[np.float64]
 
@@ -36,8 +36,8 @@ def main() -> None:
         options.work.mkdir(parents=True, exist_ok=True)
         _roadgeo("index", "--roads", options.roads, "--out", reference, "-q")
     places = read_places(options.data, reference)
-    print("| view | true masks located | photographs located | of those | wrongly | elsewhere |")
-    print("|---|---|---|---|---|---|")
+    print("| view | true masks within 5 m | photographs within 5 m | of those | 5 to 50 m | wrong | elsewhere |")
+    print("|---|---|---|---|---|---|---|")
     for view in VIEWS:
         print(_measure(view, tiles, reference, places, options), flush=True)
 
@@ -58,10 +58,12 @@ def _measure(
     for other in options.elsewhere:
         found = _locate(folder / "photos", folder / f"on_{other.stem}", other, segmenter)
         elsewhere += sum(one["status"] == "located" for one in found.values())
-    both = [name for name, ok in right["true"].items() if ok and right["seen"].get(name)]
-    n_true, n_seen = (sum(one.values()) for one in right.values())
-    wrong = sum(not ok for ok in right["seen"].values())
-    return f"| {view} | {n_true} of {len(tiles)} | {n_seen} | {len(both)} of {n_true} | {wrong} | {elsewhere} |"
+    both = [name for name, off in right["true"].items() if max(off, right["seen"].get(name, np.inf)) <= RIGHT_M]
+    n_true, n_seen = (sum(off <= RIGHT_M for off in one.values()) for one in right.values())
+    coarse = sum(RIGHT_M < off <= WRONG_M for off in right["seen"].values())
+    wrong = sum(off > WRONG_M for off in right["seen"].values())
+    counts = f"{n_seen} | {len(both)} of {n_true} | {coarse} | {wrong} | {elsewhere}"
+    return f"| {view} | {n_true} of {len(tiles)} | {counts} |"
 
 
 def view_of(tile: Tile, view: str) -> tuple[Matrix, tuple[int, int]]:
@@ -115,8 +117,8 @@ def _locate(queries: Path, out: Path, reference: Path, more: list[str]) -> dict[
 
 def _judge(
     found: dict[str, dict], views: dict[str, tuple[Matrix, tuple[int, int]]], places: dict[str, tuple[float, float]]
-) -> dict[str, bool]:
-    """Say of each that is located whether the middle of its frame lies where it should."""
+) -> dict[str, float]:
+    """Return of each that is located how many metres the middle of its frame is off."""
     judged = {}
     for name, one in found.items():
         if one["status"] != "located":
@@ -126,9 +128,7 @@ def _judge(
         x, y = places[name]
         right = np.array([x + column - 750, y - (row - 750)])  # photographs of 1500 px of 1 m
         columns, rows = one["size"]
-        judged[name] = bool(
-            np.linalg.norm(_apply(np.array(one["homography"]), columns / 2, rows / 2) - right) <= RIGHT_M
-        )
+        judged[name] = float(np.linalg.norm(_apply(np.array(one["homography"]), columns / 2, rows / 2) - right))
     return judged
 
 
