@@ -17,7 +17,7 @@ def qgis_command() -> None:
     Examples:
       roadgeo qgis install
       roadgeo qgis install --profile surveys
-      roadgeo qgis zip --out roadgeo_qgis.zip
+      roadgeo qgis package --out roadgeo_qgis.zip
     """
 
 
@@ -47,7 +47,7 @@ def install_command(profile: str) -> None:
     echo("Start QGIS anew: the Processing toolbox has a group roadgeo.", err=True)
 
 
-@qgis_command.command("zip", short_help="Make the plugin's package.")
+@qgis_command.command("package", short_help="Make the plugin's package.")
 @click.option(
     "-o",
     "--out",
@@ -55,19 +55,20 @@ def install_command(profile: str) -> None:
     help="The package. Default: roadgeo_qgis-VERSION.zip.",
     type=click.Path(dir_okay=False),
 )
-@click.option("--email", metavar="ADDRESS", help="The publisher's, which the plugin repository asks for.")
-@click.option("--repository", metavar="URL", help="Where the source code is, which it asks for too.")
-@click.option("--tracker", metavar="URL", help="Where to report problems, which it asks for too.")
+@click.option("--email", metavar="ADDRESS", help="The publisher's. Default, here and below: as the package says.")
+@click.option("--repository", metavar="URL", help="Where the source code is.")
+@click.option("--tracker", metavar="URL", help="Where to report problems.")
 @click.option("--homepage", metavar="URL", help="Where the documentation is.")
-def zip_command(out: str | None, **publisher: str | None) -> None:
+def package_command(out: str | None, **publisher: str | None) -> None:
     """Make the package that QGIS installs (Plugins > Manage and Install Plugins > Install from ZIP).
 
-    QGIS's plugin repository takes the same package, with the publisher's --email, --repository and --tracker.
+    QGIS's plugin repository (plugins.qgis.org) takes the same package. It asks for the publisher's address, for the
+    source code and for where to report problems: give yours.
 
     \b
     Examples:
-      roadgeo qgis zip
-      roadgeo qgis zip --out roadgeo_qgis.zip
+      roadgeo qgis package
+      roadgeo qgis package --out roadgeo_qgis.zip
     """
     from roadgeo import _version
     from roadgeo.qgis.installation import NAME, write_package

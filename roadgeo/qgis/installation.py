@@ -9,6 +9,7 @@ import shutil
 import sys
 import zipfile
 from collections.abc import Mapping
+from email.utils import parseaddr
 from pathlib import Path
 
 from roadgeo.errors import OutputError
@@ -63,7 +64,7 @@ def write_package(path: str | os.PathLike[str], publisher: Mapping[str, str] | N
     Parameters
     ----------
     publisher : mapping, optional
-        What the repository also asks for and only the publisher knows: `email`, `repository`, `tracker`, `homepage`.
+        What the repository also asks for: `email`, `repository`, `tracker`, `homepage`. Default: as the package says.
 
     Raises
     ------
@@ -73,9 +74,25 @@ def write_package(path: str | os.PathLike[str], publisher: Mapping[str, str] | N
     with replacing(path) as temporary, zipfile.ZipFile(temporary, "w", zipfile.ZIP_DEFLATED) as archive:
         for file, content in _contents().items():
             if file.name == "metadata.txt":
-                content += "".join(f"{key}={value}\n" for key, value in (publisher or {}).items()).encode()
+                told = {**_publisher(), **(publisher or {})}
+                content += "".join(f"{key}={value}\n" for key, value in told.items()).encode()
             # A date of its own would make the same plugin another file each time.
             archive.writestr(zipfile.ZipInfo(f"{NAME}/{file.as_posix()}"), content, zipfile.ZIP_DEFLATED)
+
+
+def _publisher() -> dict[str, str]:
+    """Return whom and where to ask, as pyproject.toml says it of the whole package."""
+    from importlib.metadata import metadata
+
+    package = metadata("roadgeo")
+    urls = dict(entry.split(", ", 1) for entry in package.get_all("Project-URL") or [])
+    told = {
+        "email": parseaddr(package["Author-email"] or "")[1],
+        "homepage": urls.get("Homepage", ""),
+        "repository": urls.get("Repository", ""),
+        "tracker": urls.get("Issues", ""),
+    }
+    return {key: value for key, value in told.items() if value}
 
 
 def _contents() -> dict[Path, bytes]:

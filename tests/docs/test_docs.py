@@ -214,7 +214,7 @@ def test_a_page_with_a_mistake_fails(old: str, new: str, desk: Path) -> None:
 @pytest.mark.parametrize(
     ("text", "wrong"),
     [
-        ("`roadgeo locate --gsd 1:2`, `--plot`, `roadgeo qgis zip --email`, `roadgeo COMMAND --help`, `-j 2`", 0),
+        ("`roadgeo locate --gsd 1:2`, `--plot`, `roadgeo qgis package --email`, `roadgeo COMMAND --help`, `-j 2`", 0),
         ("`roadgeo locale`", 1),
         ("`roadgeo locate --kinds`", 1),
         ("`--plott`", 1),

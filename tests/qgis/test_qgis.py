@@ -196,12 +196,14 @@ def test_the_package_is_what_the_plugin_repository_takes(tmp_path: Path, monkeyp
         "--tracker",
         "https://example.org/t",
     ]
-    assert main(["qgis", "zip", *publisher]) == 0
+    assert main(["qgis", "package", *publisher]) == 0
     with zipfile.ZipFile(f"roadgeo_qgis-{roadgeo.__version__}.zip") as archive:
         names = archive.namelist()
         metadata = archive.read(f"{NAME}/metadata.txt").decode()
     assert all(name.startswith(f"{NAME}/") for name in names)
-    assert {f"{NAME}/{name}" for name in ("__init__.py", "metadata.txt", "LICENSE", "icon.svg")} <= set(names)
+    assert {f"{NAME}/{name}" for name in ("__init__.py", "metadata.txt", "LICENSE", "icon.png", "help.html")} <= set(
+        names
+    )
     assert not [name for name in names if "__pycache__" in name or name.endswith(runner.REMEMBERED)]
     parser = configparser.ConfigParser(interpolation=None)
     parser.read_string(metadata)
@@ -218,6 +220,7 @@ def test_the_package_is_what_the_plugin_repository_takes(tmp_path: Path, monkeyp
         "tracker",
     }
     assert all(general.get(key) for key in asked)
+    assert (general["email"], general["tracker"]) == ("a@example.org", "https://example.org/t")
     assert general["version"] == roadgeo.__version__
     assert general["hasProcessingProvider"] == "yes"
     assert (PLUGIN / general["icon"]).is_file()
@@ -225,6 +228,41 @@ def test_the_package_is_what_the_plugin_repository_takes(tmp_path: Path, monkeyp
     for name in ("a.zip", "b.zip"):
         write_package(name)
     assert Path("a.zip").read_bytes() == Path("b.zip").read_bytes()
+
+
+def test_the_package_keeps_to_the_rules_of_the_plugin_repository(tmp_path: Path) -> None:
+    """Those that plugins.qgis.org checks when a package is handed in, and those that its reviewers ask for."""
+    path = tmp_path / "plugin.zip"
+    write_package(path)
+    assert path.stat().st_size < 20e6
+    with zipfile.ZipFile(path) as archive:
+        names = archive.namelist()
+        parser = configparser.ConfigParser(interpolation=None)
+        parser.read_string(archive.read(f"{NAME}/metadata.txt").decode())
+        icon = archive.read(f"{NAME}/{parser['general']['icon']}")
+    assert {name.split("/")[0] for name in names} == {NAME}  # one folder, of a name that Python can import
+    assert re.fullmatch(r"[a-z][a-z0-9_]*", NAME)
+    assert not [name for name in names if re.search(r"(^|/)(\.|__MACOSX|__pycache__|ui_)|\.(pyc|so|dll|exe)$", name)]
+    general = parser["general"]
+    assert re.fullmatch(r"[^@\s]+@[^@\s]+\.[a-z]+", general["email"])
+    for key in ("homepage", "repository", "tracker"):
+        assert general[key].startswith("https://")
+    assert re.fullmatch(r"\d+\.\d+\.\d+", general["version"])
+    assert general["version"] in general["changelog"]
+    assert not re.search(r"<\w+>", general["description"] + general["about"])
+    assert (general["experimental"], general["deprecated"]) == ("True", "False")
+    assert general["category"] in {"Raster", "Vector", "Database", "Mesh", "Web"}
+    assert icon.startswith(b"\x89PNG")
+    assert {general["qgisMinimumVersion"], general["qgisMaximumVersion"]} == {"3.22", "4.99"}
+
+
+def test_every_algorithm_has_its_place_in_the_help_page() -> None:
+    names = re.findall(r'NAME, TITLE = "(\w+)"', (PLUGIN / "algorithms.py").read_text("utf-8"))
+    page = (PLUGIN / "help.html").read_text("utf-8")
+    assert len(names) == 6
+    assert set(re.findall(r'<h2 id="(\w+)"', page)) == {*names, "program"}
+    assert "src=" not in page  # it needs no network
+    assert "href=" not in page
 
 
 @pytest.mark.parametrize("path", sorted(PLUGIN.glob("*.py")), ids=lambda path: path.name)
@@ -340,7 +378,7 @@ def read_location(path: Path) -> tuple[Homography, dict]:
 
 def test_the_provider_loads_and_explains_itself(qgis: Qgis) -> None:
     listed = qgis.tool("list").stdout
-    names = ["buildreference", "locatemask", "locatemasks", "vectorizemask", "georeferenceimage"]
+    names = ["buildreference", "locatemask", "locatemasks", "vectorizemask", "georeferenceimage", "maplocalizability"]
     assert [name for name in names if f"roadgeo:{name}\t" in listed] == names
     assert "* roadgeo_qgis" in qgis.tool("plugins").stdout
     explained = qgis.tool("help", "roadgeo:georeferenceimage").stdout
@@ -445,6 +483,7 @@ def test_results_are_loaded_with_their_styles(qgis: Qgis, porto: Path) -> None:
         "MASK": str(MASKS["drone"].path),
         "REFERENCE": str(porto),
         "OUTPUT_FOLDER": str(qgis.folder / "loaded"),
+        "REPORT": True,
     }
     roads = {"ROADS": str(ROADS), "KINDS": "all", "OUTPUT": str(qgis.folder / "again.gpkg")}
     (built, done), _, _ = qgis.ask(
@@ -454,7 +493,10 @@ def test_results_are_loaded_with_their_styles(qgis: Qgis, porto: Path) -> None:
     assert built["layers"]["again roads"]["colors"] == [MAP_ROAD]
     assert set(built["layers"]) == {"again roads", "again coverage", "again intersections"}
     layers = done["layers"]
-    assert set(layers) == {"drone", "drone footprint", "drone matches", "drone roads"}
+    assert set(layers) == {"drone", "drone footprint", "drone matches", "drone residuals", "drone roads"}
+    assert {layer["group"] for layer in layers.values()} == {"drone"}
+    assert Path(done["results"]["REPORT_PAGE"]).name == "drone_report.html"
+    assert Path(done["results"]["REPORT_PAGE"]).exists()
     assert all(layer["valid"] and layer["crs"] == "EPSG:32629" for layer in layers.values())
     assert layers["drone"]["renderer"] == "paletted"
     assert layers["drone footprint"]["colors"] == [FOOTPRINT]
@@ -464,7 +506,7 @@ def test_results_are_loaded_with_their_styles(qgis: Qgis, porto: Path) -> None:
 def test_every_output_opens_without_a_word(qgis: Qgis, porto: Path, located: Path) -> None:
     package = located / "drone_location.gpkg"
     files = [(str(porto), layer) for layer in ("coverage", "roads", "tangents", "intersections")]
-    files += [(str(package), layer) for layer in ("footprint", "matches", "query_roads")]
+    files += [(str(package), layer) for layer in ("footprint", "residuals", "corners", "matches", "query_roads")]
     files += [(str(located / "drone_footprint.tif"), "")]
     layers, warnings, printed = qgis.ask(*(("load", {"path": path, "layer": layer}) for path, layer in files))
     assert all(layer["valid"] for layer in layers)

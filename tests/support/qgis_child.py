@@ -104,7 +104,9 @@ def configure(executable):
 
 def describe(layer):
     """Say what a layer is and how it is drawn."""
-    known = {"valid": layer.isValid(), "crs": layer.crs().authid()}
+    node = QgsProject.instance().layerTreeRoot().findLayer(layer.id())
+    group = "" if node is None or node.parent() is None else node.parent().name()
+    known = {"valid": layer.isValid(), "crs": layer.crs().authid(), "group": group}
     if isinstance(layer, QgsRasterLayer):
         return {**known, "bands": layer.bandCount(), "renderer": layer.renderer().type()}
     symbols = layer.renderer().symbols(qgis.core.QgsRenderContext())

@@ -7,23 +7,50 @@ from typing import Any, ClassVar
 
 from qgis.core import (
     QgsProcessingAlgorithm,
+    QgsProcessingOutputFile,
     QgsProcessingOutputNumber,
     QgsProcessingOutputRasterLayer,
     QgsProcessingOutputString,
     QgsProcessingOutputVectorLayer,
 )
+from qgis.PyQt.QtCore import QUrl
 from qgis.PyQt.QtGui import QIcon
 
-from .parameters import BATCH, CAMERA, MASK, MASK_VALUES, OUTPUT_FOLDER, PICTURE, REFERENCE, ROADS, Option, Values
+from .parameters import (
+    BATCH,
+    CAMERA,
+    ITS_MASK,
+    LOCALIZABILITY,
+    MASK,
+    MASK_VALUES,
+    OUTPUT_FOLDER,
+    PICTURE,
+    QUERY,
+    REFERENCE,
+    REPORT,
+    ROADS,
+    SEGMENT,
+    Option,
+    Values,
+)
 from .session import Session
 from .settings import NOT_FOUND, locate_executable
 
-__all__ = ["ALGORITHMS", "BuildReference", "GeoreferenceImage", "LocateMask", "LocateMasks", "VectorizeMask"]
+__all__ = [
+    "ALGORITHMS",
+    "BuildReference",
+    "GeoreferenceImage",
+    "LocateMask",
+    "LocateMasks",
+    "MapLocalizability",
+    "VectorizeMask",
+]
 
 
 class RoadgeoAlgorithm(QgsProcessingAlgorithm):
     """What the algorithms share: each has a name, a help text, options, outputs and its `work`."""
 
+    session: Session
     NAME: ClassVar[str]
     TITLE: ClassVar[str]
     TAGS: ClassVar[str]
@@ -56,13 +83,19 @@ class RoadgeoAlgorithm(QgsProcessingAlgorithm):
         hints = (f"<p><b>{option.label}</b><br>{option.hint}</p>" for option in self.OPTIONS)
         return f"<p>{self.HELP}</p>" + "".join(hints)
 
+    def helpUrl(self) -> str:
+        """Page behind the button Help: it ships with the plugin, and needs no network."""
+        page = QUrl.fromLocalFile(str(Path(__file__).parent / "help.html"))
+        page.setFragment(self.NAME)
+        return str(page.toString())
+
     def tags(self) -> list[str]:
         """Other words to find it by."""
         return self.TAGS.split()
 
     def icon(self) -> Any:
         """Show the provider's own."""
-        return QIcon(str(Path(__file__).parent / "icon.svg"))
+        return QIcon(str(Path(__file__).parent / "icon.png"))
 
     def createInstance(self) -> RoadgeoAlgorithm:
         """Make another one, for each run."""
@@ -82,7 +115,13 @@ class RoadgeoAlgorithm(QgsProcessingAlgorithm):
 
     def processAlgorithm(self, parameters: dict[str, Any], context: Any, feedback: Any) -> dict[str, Any]:
         """Run."""
-        return self.work(Values(self, parameters, context, feedback), Session(context, feedback))
+        self.session = Session(context, feedback)
+        return self.work(Values(self, parameters, context, feedback), self.session)
+
+    def postProcessAlgorithm(self, context: Any, feedback: Any) -> dict[str, Any]:  # noqa: ARG002 (QGIS's signature)
+        """Open the pages that were asked for; QGIS calls this in the thread of its window."""
+        self.session.open_pages()
+        return {}
 
 
 class BuildReference(RoadgeoAlgorithm):
@@ -118,27 +157,29 @@ _LOCATION_OUTPUTS = {
     "LOG10_ODDS": (QgsProcessingOutputNumber, "Odds against chance, decimal logarithm"),
     "FOOTPRINT": (QgsProcessingOutputRasterLayer, "On the map"),
     "LOCATION": (QgsProcessingOutputVectorLayer, "Footprint, matched intersections, roads"),
+    "REPORT_PAGE": (QgsProcessingOutputFile, "Report"),
 }
 
 
 class LocateMask(RoadgeoAlgorithm):
     """One mask."""
 
-    NAME, TITLE = "locatemask", "Locate mask"
-    TAGS = "georeference geolocate footprint position match roads"
+    NAME, TITLE = "locatemask", "Locate mask or photograph"
+    TAGS = "georeference geolocate footprint position match roads photo"
     HELP = (
-        "Finds where a road mask lies on a road reference, with no position, heading, scale or camera known. "
-        "A located mask is drawn on the map, with its footprint, its roads and the intersections that matched. "
-        "One that is not surely found is refused, with the reason."
+        "Finds where a road mask, or a photograph, lies on a road reference, with no position, heading, scale or "
+        "camera known. In a photograph a network finds the roads first. What is located is drawn on the map, with its "
+        "footprint, its roads and the intersections that matched. What is not surely found is refused, with the reason."
     )
-    OPTIONS = (MASK, REFERENCE, *MASK_VALUES, *CAMERA, OUTPUT_FOLDER)
+    OPTIONS = (QUERY, REFERENCE, REPORT, *MASK_VALUES, *SEGMENT, *CAMERA, OUTPUT_FOLDER)
     OUTPUTS = _LOCATION_OUTPUTS
 
     def work(self, values: Values, session: Session) -> dict[str, Any]:
         """Locate it; load mask, footprint, roads and matches."""
         mask, folder = values.raster("MASK"), values.get("String", "OUTPUT_FOLDER")
         found = session.call("locate", mask, "--json", f"--out-dir={folder}", *self.arguments(values))
-        return {"OUTPUT_FOLDER": folder, **_show_location(found, Path(folder) / Path(mask).stem, session)}
+        shown = _show_location(found, Path(folder) / Path(mask).stem, session)
+        return {"OUTPUT_FOLDER": folder, **shown, **_show_report(values, Path(folder) / Path(mask).stem, session)}
 
 
 class GeoreferenceImage(RoadgeoAlgorithm):
@@ -148,18 +189,20 @@ class GeoreferenceImage(RoadgeoAlgorithm):
     TAGS = "warp photo orthorectify gcp control points"
     HELP = (
         "Finds where the road mask of an image lies on a road reference, and draws the image itself there: a Cloud "
-        "Optimized GeoTIFF, transparent outside its footprint. The ground is taken for a plane. "
-        "An image that is not surely found is refused, with the reason."
+        "Optimized GeoTIFF, transparent outside its footprint. Without a mask a network finds the roads of the image. "
+        "The ground is taken for a plane. An image that is not surely found is refused, with the reason."
     )
-    OPTIONS = (PICTURE[0], MASK, REFERENCE, *PICTURE[1:], *MASK_VALUES, *CAMERA, OUTPUT_FOLDER)
+    OPTIONS = (PICTURE[0], ITS_MASK, REFERENCE, REPORT, *PICTURE[1:], *MASK_VALUES, *SEGMENT, *CAMERA, OUTPUT_FOLDER)
     OUTPUTS = _LOCATION_OUTPUTS
 
     def work(self, values: Values, session: Session) -> dict[str, Any]:
         """Locate the mask and warp the image; load both results."""
-        mask, image, folder = values.raster("MASK"), values.raster("IMAGE"), values.get("String", "OUTPUT_FOLDER")
-        to = ["--json", f"--image={image}", f"--out-dir={folder}"]
+        image, folder = values.raster("IMAGE"), values.get("String", "OUTPUT_FOLDER")
+        mask = values.raster("MASK") if values.given("MASK") else image
+        to = ["--json", f"--out-dir={folder}", *([f"--image={image}"] if values.given("MASK") else [])]
         found = session.call("locate", mask, *to, *self.arguments(values))
-        return {"OUTPUT_FOLDER": folder, **_show_location(found, Path(folder) / Path(mask).stem, session)}
+        shown = _show_location(found, Path(folder) / Path(mask).stem, session)
+        return {"OUTPUT_FOLDER": folder, **shown, **_show_report(values, Path(folder) / Path(mask).stem, session)}
 
 
 class LocateMasks(RoadgeoAlgorithm):
@@ -208,9 +251,38 @@ class VectorizeMask(RoadgeoAlgorithm):
         mask, folder = values.raster("MASK"), values.get("String", "OUTPUT_FOLDER")
         session.call("vectorize", mask, f"--out-dir={folder}", *self.arguments(values))
         path = Path(folder) / f"{Path(mask).stem}_vectorized.gpkg"
-        roads = session.show(path, "Roads as seen", "roads")
-        session.show(path, "Intersections as seen", "intersections")
+        roads = session.show(path, "Roads as seen", "roads", Path(mask).stem)
+        session.show(path, "Intersections as seen", "intersections", Path(mask).stem)
         return {"OUTPUT_FOLDER": folder, "VECTORIZED": roads}
+
+
+class MapLocalizability(RoadgeoAlgorithm):
+    """Where it would work."""
+
+    NAME, TITLE = "maplocalizability", "Map where masks would be located"
+    TAGS = "localizability promise evaluate simulate plan flight where"
+    HELP = (
+        "Says before a flight where it would be located: masks as the camera would see them are drawn from the "
+        "reference's own roads, all over the map, and each is searched for. Takes some minutes."
+    )
+    OPTIONS = LOCALIZABILITY
+    OUTPUTS: ClassVar[dict[str, tuple[Any, str]]] = {"MAP": (QgsProcessingOutputRasterLayer, "Where it would work")}
+
+    def work(self, values: Values, session: Session) -> dict[str, Any]:
+        """Try masks all over the map; load what that shows."""
+        reference, folder = values.get("File", "REFERENCE"), values.get("String", "OUTPUT_FOLDER")
+        session.call("evaluate", reference, "--map", "--json", f"--out-dir={folder}", *self.arguments(values))
+        path = Path(folder) / f"{Path(reference).stem}_localizability.tif"
+        return {"OUTPUT_FOLDER": folder, "MAP": session.show(path, f"{Path(reference).stem}: where it would work")}
+
+
+def _show_report(values: Values, stem: Path, session: Session) -> dict[str, Any]:
+    """Return the report that was asked for, to be opened in the browser."""
+    page = stem.with_name(f"{stem.name}_report.html")
+    if not values.get("Boolean", "REPORT") or not page.exists():
+        return {}
+    session.pages.append(page)
+    return {"REPORT_PAGE": str(page)}
 
 
 def _show_location(found: list[dict[str, Any]], stem: Path, session: Session) -> dict[str, Any]:
@@ -223,8 +295,10 @@ def _show_location(found: list[dict[str, Any]], stem: Path, session: Session) ->
         session.feedback.pushWarning(f"{stem.name}: {location['reason']}")
         return results
     footprint, package = stem.with_name(f"{stem.name}_footprint.tif"), stem.with_name(f"{stem.name}_location.gpkg")
-    session.show(package, f"{stem.name} matches", "matches")
-    session.show(package, f"{stem.name} roads", "query_roads")
+    name = stem.name
+    session.show(package, f"{name} matches", "matches", name)
+    session.show(package, f"{name} residuals", "residuals", name)
+    session.show(package, f"{name} roads", "query_roads", name)
     return {
         **results,
         "LONGITUDE": location["center"]["lon"],
@@ -232,8 +306,8 @@ def _show_location(found: list[dict[str, Any]], stem: Path, session: Session) ->
         "GSD": location["gsd_m"],
         "ROTATION": location["rotation_deg"],
         "LOG10_ODDS": location["log10_odds"],
-        "LOCATION": session.show(package, f"{stem.name} footprint", "footprint"),
-        "FOOTPRINT": session.show(footprint, stem.name),
+        "LOCATION": session.show(package, f"{name} footprint", "footprint", name),
+        "FOOTPRINT": session.show(footprint, name, group=name),
     }
 
 
@@ -243,4 +317,4 @@ def _count(found: list[dict[str, Any]]) -> dict[str, Any]:
     return {"LOCATED": located, "NOT_LOCATED": len(statuses) - located - failed, "FAILED": failed}
 
 
-ALGORITHMS = (BuildReference, LocateMask, LocateMasks, VectorizeMask, GeoreferenceImage)
+ALGORITHMS = (BuildReference, LocateMask, LocateMasks, VectorizeMask, GeoreferenceImage, MapLocalizability)

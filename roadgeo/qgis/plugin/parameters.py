@@ -32,12 +32,17 @@ from qgis.core import (
 __all__ = [
     "BATCH",
     "CAMERA",
+    "ITS_MASK",
+    "LOCALIZABILITY",
     "MASK",
     "MASK_VALUES",
     "OUTPUT_FOLDER",
     "PICTURE",
+    "QUERY",
     "REFERENCE",
+    "REPORT",
     "ROADS",
+    "SEGMENT",
     "Option",
     "Values",
 ]
@@ -220,6 +225,14 @@ MASK = _raster(
     "Road mask",
     "An image of the roads that the aerial picture shows: bright, or 1, where there is road. It needs no georeference.",
 )
+QUERY = replace(
+    MASK,
+    label="Road mask, or photograph",
+    hint=f"{MASK.hint} A photograph is recognised, and a network finds its roads.",
+)
+ITS_MASK = replace(
+    MASK, hint=f"{MASK.hint} Empty: a network finds the roads of the image.", settings={"optional": True}
+)
 _THRESHOLD = _number("--threshold", "THRESHOLD", "Threshold", "Values above it are road. Empty: told by the values.")
 _BAND_HINT = "Band that holds the mask. Empty: told by the bands."
 MASK_VALUES = _fold(
@@ -232,6 +245,29 @@ MASK_VALUES = _fold(
         {"parentLayerParameterName": "MASK", "optional": True},
     ),
     _THRESHOLD,
+)
+
+SEGMENT = _fold(
+    _choice(
+        "--segment",
+        "SEGMENT",
+        "Find roads in photographs",
+        "In what looks like one (auto), in everything (always), or in nothing (never).",
+        ["auto", "always", "never"],
+        defaultValue="auto",
+    ),
+    Option(
+        QgsProcessingParameterFile,
+        "SEGMENTER",
+        "Model for photographs",
+        "A segmentation model, as QGIS's Deepness takes them. Empty: the one that ships with roadgeo.",
+        _said("--segmenter", "File"),
+        {"extension": "onnx", "optional": True},
+    ),
+)
+
+REPORT = _switch(
+    "--report", "REPORT", "Open a report", "Writes a page with map, mask, residuals and numbers, and opens it."
 )
 
 REFERENCE = Option(
@@ -417,4 +453,43 @@ ROADS = (
 
 OUTPUT_FOLDER = Option(
     QgsProcessingParameterFolderDestination, "OUTPUT_FOLDER", "Folder for the results", "Made if it is missing."
+)
+
+LOCALIZABILITY = (
+    replace(
+        REFERENCE,
+        hint="What Build road reference made.",
+        say=lambda *_: [],
+        settings={"extension": "gpkg", "optional": False},
+    ),
+    _number(
+        "--height",
+        "HEIGHT",
+        "Height above ground, metres",
+        "Of the flight. With the focal length it says how large a pixel is.",
+        defaultValue=400.0,
+        minValue=1.0,
+    ),
+    _number("--focal", "FOCAL", "Focal length, pixels", "Of the camera.", defaultValue=1000.0, minValue=1.0),
+    _integer("--size", "SIZE", "Side of the image, pixels", "Of a square one.", defaultValue=1000, minValue=32),
+    _choice(
+        "--noise",
+        "NOISE",
+        "How good the masks are",
+        "Clean, as a network makes them (segmented), or poor.",
+        ["clean", "segmented", "poor"],
+        defaultValue="segmented",
+    ),
+    *_fold(
+        _integer(
+            "--count",
+            "COUNT",
+            "Masks to try",
+            "More of them tell neighbouring places apart more surely, and take longer.",
+            defaultValue=600,
+            minValue=1,
+        ),
+        _integer("--jobs", "JOBS", "Processes", "How many masks are tried at once.", defaultValue=1, minValue=1),
+    ),
+    OUTPUT_FOLDER,
 )

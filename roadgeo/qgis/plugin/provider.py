@@ -31,7 +31,7 @@ class RoadgeoProvider(QgsProcessingProvider):
 
     def icon(self) -> Any:
         """Crossroads under a pin."""
-        return QIcon(str(Path(__file__).parent / "icon.svg"))
+        return QIcon(str(Path(__file__).parent / "icon.png"))
 
     def load(self) -> bool:
         """Add settings and algorithms."""

@@ -12,8 +12,12 @@ from qgis.core import (
     QgsProcessingException,
     QgsProcessingLayerPostProcessorInterface,
     QgsProcessingUtils,
+    QgsProject,
 )
 from qgis.PyQt import sip
+from qgis.PyQt.QtCore import QUrl
+from qgis.PyQt.QtGui import QDesktopServices
+from qgis.utils import iface
 
 from .runner import run
 from .settings import NOT_FOUND, locate_executable
@@ -25,20 +29,38 @@ _WELL, _ERROR = (0, 3), 1
 
 
 class _Styler(QgsProcessingLayerPostProcessorInterface):
-    """Gives a layer the style that roadgeo wrote with it; Processing would pick one at random."""
+    """Gives a layer the style that roadgeo wrote with it, where Processing would pick one at random, and its group."""
+
+    def __init__(self, group: str) -> None:
+        super().__init__()
+        self.group = group
 
     def postProcessLayer(self, layer: Any, context: Any, feedback: Any) -> None:  # noqa: ARG002 (QGIS's signature)
         layer.loadDefaultStyle()
         layer.triggerRepaint()
+        if self.group:
+            _move_to_group(layer, self.group)
+
+
+def _move_to_group(layer: Any, name: str) -> None:
+    """Put a layer that was just added to the project below a group of that name, on top of the others there."""
+    root = QgsProject.instance().layerTreeRoot()
+    node = root.findLayer(layer.id())
+    if node is None:
+        return
+    group = root.findGroup(name) or root.insertGroup(0, name)
+    if node.parent() is not group:
+        group.insertChildNode(0, node.clone())
+        node.parent().removeChildNode(node)
 
 
 #: QGIS deletes a styler with its context, but keeps no reference to what Python knows of it.
 _STYLERS: list[_Styler] = []
 
 
-def _new_styler() -> _Styler:
+def _new_styler(group: str) -> _Styler:
     _STYLERS[:] = [styler for styler in _STYLERS if not sip.isdeleted(styler)]
-    _STYLERS.append(_Styler())
+    _STYLERS.append(_Styler(group))
     return _STYLERS[-1]
 
 
@@ -49,12 +71,15 @@ class Session:
     ----------
     documents : list of dict
         The JSON objects that it printed.
+    pages : list of Path
+        Reports to open when all is done.
     """
 
     def __init__(self, context: Any, feedback: Any) -> None:
         self.context, self.feedback = context, feedback
         self.documents: list[dict[str, Any]] = []
         self.errors: list[str] = []
+        self.pages: list[Path] = []
 
     def call(self, *arguments: str, some_may_fail: bool = False) -> list[dict[str, Any]]:
         """Run roadgeo with some arguments and return the JSON objects that it printed; none once cancelled.
@@ -94,17 +119,22 @@ class Session:
         elif line.strip():
             self.feedback.pushInfo(line)
 
-    def show(self, path: Path, title: str, layer: str = "") -> str:
-        """Have a result loaded, with its style, when all is done; return what QGIS opens it by."""
+    def show(self, path: Path, title: str, layer: str = "", group: str = "") -> str:
+        """Have a result loaded, with its style and in its group, when all is done; return what QGIS opens it by."""
         source = f"{path}|layername={layer}" if layer else str(path)
         project = self.context.project()
         if project is not None and not self.feedback.isCanceled():
             hint = QgsProcessingUtils.LayerHint.Vector if layer else QgsProcessingUtils.LayerHint.Raster
             details = QgsProcessingContext.LayerDetails(title, project, title, hint)
             details.forceName = True
-            details.setPostProcessor(_new_styler())
+            details.setPostProcessor(_new_styler(group))
             self.context.addLayerToLoadOnCompletion(source, details)
         return source
+
+    def open_pages(self) -> None:
+        """Show reports in the browser, where there is a window."""
+        for page in self.pages if iface is not None else []:
+            QDesktopServices.openUrl(QUrl.fromLocalFile(str(page)))
 
 
 def _parse(line: str) -> dict[str, Any] | None:

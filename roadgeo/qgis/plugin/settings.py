@@ -15,8 +15,8 @@ __all__ = ["NOT_FOUND", "add_settings", "locate_executable", "remove_settings"]
 _EXECUTABLE = "ROADGEO_EXECUTABLE"
 
 NOT_FOUND = (
-    "The program roadgeo was not found. Install it, for instance with `pipx install roadgeo`, or set its path in "
-    "Settings > Options > Processing > Providers > roadgeo."
+    "The program roadgeo was not found. Install it as its README tells, then run `roadgeo qgis install`; or set its "
+    "path in Settings > Options > Processing > Providers > roadgeo."
 )
 
 
