@@ -478,6 +478,13 @@ def test_a_mask_is_vectorized(qgis: Qgis) -> None:
     assert done["layers"]["Roads as seen"]["colors"] == ["#ffbe28"]
 
 
+def test_where_masks_would_be_located_is_mapped(qgis: Qgis, porto: Path) -> None:
+    arguments = {"REFERENCE": str(porto), "OUTPUT_FOLDER": str(qgis.folder / "where"), "COUNT": 4, "NOISE": "clean"}
+    (done,), _, _ = qgis.ask(("run", {"algorithm": "roadgeo:maplocalizability", "parameters": arguments}))
+    assert set(done["layers"]) == {"porto: where it would work"}
+    assert done["layers"]["porto: where it would work"]["renderer"] == "paletted"
+
+
 def test_results_are_loaded_with_their_styles(qgis: Qgis, porto: Path) -> None:
     arguments = {
         "MASK": str(MASKS["drone"].path),
