@@ -7,6 +7,8 @@ from collections.abc import Callable, Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING
 
+import numpy as np
+
 from roadgeo._arrays import AnyArray
 from roadgeo._progress import Say, say_nothing
 from roadgeo.errors import RoadSourceError
@@ -22,6 +24,8 @@ from roadgeo.matching.truth_record import make_record, tell_truth
 from roadgeo.matching.verdict import decide, needed_of
 from roadgeo.reference.reference import AnyReference, BuildOptions, Reference, build_network, open_whole, stored_options
 from roadgeo.roads.kinds import RoadKind
+from roadgeo.roads.labels import label_roads
+from roadgeo.roads.network import RoadNetwork
 from roadgeo.warmup import warm_up
 
 if TYPE_CHECKING:
@@ -73,7 +77,8 @@ def build_reference(
 
     chosen = choose_roads(roads, kinds, tunnels, attribution, say)
     options = options or BuildOptions()
-    network = as_stored(build_network(chosen.lines, chosen.plane, {"name": name, **chosen.meta}, options, say))
+    network = build_network(chosen.lines, chosen.plane, {"name": name, **chosen.meta}, options, say)
+    network = as_stored(label_roads(network, [chosen.lines], [chosen.names], [chosen.kinds]))
     reference = Reference(build_index(network, options.index, say), network)
     if path is None:
         return reference
@@ -111,9 +116,20 @@ def update_reference(path: str | Path, roads: Roads, say: Say = say_nothing) -> 
     }
     say(f"drawing {len(lines):,} lines among the others as a mask shows them")
     drawn_alike = UpdateOptions(simplify=options.simplify, intersections=options.intersections)
-    network = as_stored(replace_area(old, lines, area, meta, drawn_alike))
+    network = replace_area(old, lines, area, meta, drawn_alike)
+    names, kinds = [roads.names, old.names], [roads.kinds, old.kinds]
+    network = as_stored(label_roads(network, [lines, _drawn(old)], names, kinds))
     Reference(build_index(network, options.index, say), network).save(path, say)
     return open_whole(path)
+
+
+def _drawn(network: RoadNetwork) -> AnyArray:
+    """Return the roads of a network as shapely lines."""
+    import shapely
+
+    graph = network.graph
+    numbers = np.repeat(np.arange(graph.n_edges), np.diff(graph.offsets))
+    return np.asarray(shapely.linestrings(graph.coords, indices=numbers) if graph.n_edges else [], object)
 
 
 def _require_same_scale(lines: AnyArray, moved: AnyArray) -> None:

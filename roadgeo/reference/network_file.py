@@ -31,7 +31,7 @@ from roadgeo.roads.intersections import MAX_BRANCHES, Intersections
 from roadgeo.roads.network import RoadNetwork
 from roadgeo.storage.atomic import publish, staging
 from roadgeo.storage.geopackage import Layer, add_layers, open_read_only, read_layer, require_tables
-from roadgeo.storage.qml import draw_fill, draw_line, draw_marker
+from roadgeo.storage.qml import draw_fill, draw_line, draw_marker, name_features, seen_from, widen_by
 
 __all__ = [
     "as_stored",
@@ -49,6 +49,19 @@ __all__ = [
 SCHEMA = "roadgeo.reference/1"
 
 _TANGENT_LINE_M = 30.0
+
+#: Scales from which points and names are drawn in QGIS; before, they would hide the roads.
+_INTERSECTIONS_FROM, _NAMES_FROM = 50_000, 12_000
+
+#: Roads are drawn the wider the more they carry; those of an unknown kind as streets are.
+_WIDTHS_MM = {
+    0.9: ("motorway", "trunk", "primary"),
+    0.6: ("secondary", "tertiary", "motorway_link", "trunk_link", "primary_link"),
+    0.2: ("service", "track", "footway", "path", "cycleway", "steps", "pedestrian"),
+}
+_ROADS_STYLE = name_features(
+    widen_by(draw_line("84,110,122", 0.35), "highway", _WIDTHS_MM, 0.35), "name", "55,71,79", _NAMES_FROM
+)
 _RAYS = [f"ray{i}_deg" for i in range(1, MAX_BRANCHES + 1)]
 _TANGENTS = [f"tangent{i}_deg" for i in range(1, MAX_BRANCHES + 1)]
 _NO_NODE = -1
@@ -63,7 +76,13 @@ _ALIASES = {
         **{name: f"Tangent {i}, degrees from east" for i, name in enumerate(_TANGENTS, 1)},
     },
     "tangents": {"intersection": "Intersection", "angle_deg": "Degrees from east"},
-    "roads": {"from_node": "From node", "to_node": "To node", "length_m": "Length (m)"},
+    "roads": {
+        "from_node": "From node",
+        "to_node": "To node",
+        "length_m": "Length (m)",
+        "name": "Name",
+        "highway": "Kind (OpenStreetMap's highway)",
+    },
     "coverage": {"area_km2": "Area (km²)"},
 }
 
@@ -130,7 +149,10 @@ def write_network(path: str | os.PathLike[str], network: RoadNetwork) -> None:
 def dump_network(path: Path, network: RoadNetwork, say: Say = say_nothing) -> None:
     """Write a network to a new file, in place; for callers that stage it. A disk error is an `OSError`."""
     meta = _stored_meta(network)
-    layers = [replace(layer, style=_with_aliases(layer.style, _ALIASES[layer.name])) for layer in _map_layers(network)]
+    layers = []
+    for layer in _map_layers(network):
+        aliases = {name: alias for name, alias in _ALIASES[layer.name].items() if name in layer.columns}
+        layers.append(replace(layer, style=_with_aliases(layer.style, aliases)))
     layers.append(
         Layer(
             "roadgeo_meta",
@@ -162,12 +184,15 @@ def read_network(path: str | os.PathLike[str]) -> RoadNetwork:
     meta = read_meta(path)
     plane = _plane(path, meta)
     rings, _ = read_layer(path, "coverage")
+    graph, table = _read_graph(path, plane, meta.get("roadgeo.nodes"))
     return RoadNetwork(
-        graph=_read_graph(path, plane, meta.get("roadgeo.nodes")),
+        graph=graph,
         intersections=_read_intersections(path, plane),
         plane=plane,
         coverage=tuple(plane.from_crs(ring) for ring in rings),
         meta={key: value for key, value in meta.items() if not key.startswith("roadgeo.")},
+        names=_texts(table, "name"),
+        kinds=_texts(table, "highway"),
     )
 
 
@@ -272,9 +297,14 @@ def _map_layers(network: RoadNetwork) -> list[Layer]:
             "roads",
             "LINESTRING",
             np.split(plane.to_crs(graph.coords), graph.offsets[1:-1]) if graph.n_edges else [],
-            {"from_node": graph.edges[:, 0], "to_node": graph.edges[:, 1], "length_m": graph.edge_lengths()},
+            {
+                "from_node": graph.edges[:, 0],
+                "to_node": graph.edges[:, 1],
+                "length_m": graph.edge_lengths(),
+                **_labels(network),
+            },
             plane.crs,
-            draw_line("84,110,122", 0.35),
+            _ROADS_STYLE,
             "Roads noded at every crossing, as a mask shows them",
         ),
         _tangent_layer(found, plane),
@@ -291,10 +321,16 @@ def _map_layers(network: RoadNetwork) -> list[Layer]:
                 **dict(zip(_TANGENTS, np.degrees(found.tangents.astype(float)).T, strict=True)),
             },
             plane.crs,
-            draw_marker("228,87,46", 1.6),
+            seen_from(draw_marker("228,87,46", 1.6), _INTERSECTIONS_FROM),
             "Road intersections with their branches and tangents: what the index is built from",
         ),
     ]
+
+
+def _labels(network: RoadNetwork) -> dict[str, list[str | None]]:
+    """Columns of what is known of the streets; text, NULL where nothing is."""
+    known = {"name": network.names, "highway": network.kinds}
+    return {key: [text or None for text in column.tolist()] for key, column in known.items() if column is not None}
 
 
 def _tangent_layer(found: Intersections, plane: LocalPlane) -> Layer:
@@ -365,8 +401,17 @@ def _plane(path: str | os.PathLike[str], meta: Mapping[str, Any]) -> LocalPlane:
     raise IndexFormatError(f"{path}: its table roadgeo_meta lacks the CRS or the origin; make the file again")
 
 
-def _read_graph(path: str | os.PathLike[str], plane: LocalPlane, n_nodes: Any) -> RoadGraph:
-    """Roads with their nodes; a node takes its position from the roads that end in it."""
+def _texts(table: Mapping[str, Sequence[Any]], name: str) -> AnyArray | None:
+    """One column of text, "" for what is none; None where there is no such column."""
+    if name not in table:
+        return None
+    return np.array([value if isinstance(value, str) else "" for value in table[name]], object)
+
+
+def _read_graph(
+    path: str | os.PathLike[str], plane: LocalPlane, n_nodes: Any
+) -> tuple[RoadGraph, Mapping[str, Sequence[Any]]]:
+    """Roads with their nodes, and their columns; a node takes its position from the roads that end in it."""
     lines, table = read_layer(path, "roads")
     edges = np.array([_column(path, table, name, -1) for name in ("from_node", "to_node")], np.int64).T.reshape(-1, 2)
     if type(n_nodes) is not int or n_nodes > 2 * len(edges) or (edges < 0).any() or (edges >= n_nodes).any():
@@ -377,7 +422,7 @@ def _read_graph(path: str | os.PathLike[str], plane: LocalPlane, n_nodes: Any) -
     coords = plane.from_crs(graph.coords)
     graph.xy[graph.edges[:, 0]] = coords[graph.offsets[:-1]]
     graph.xy[graph.edges[:, 1]] = coords[graph.offsets[1:] - 1]
-    return replace(graph, coords=coords)
+    return replace(graph, coords=coords), table
 
 
 def _read_intersections(path: str | os.PathLike[str], plane: LocalPlane) -> Intersections:

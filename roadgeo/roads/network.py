@@ -5,7 +5,7 @@ from __future__ import annotations
 from dataclasses import dataclass, field
 from typing import Any
 
-from roadgeo._arrays import FloatArray
+from roadgeo._arrays import AnyArray, FloatArray
 from roadgeo.geometry.projection import LocalPlane
 from roadgeo.roads.graph import RoadGraph
 from roadgeo.roads.intersections import Intersections
@@ -29,6 +29,8 @@ class RoadNetwork:
         Closed rings, in plane metres, around the ground where the map knows its roads.
     meta : dict
         Plain values: name, sources, attribution, options, versions.
+    names, kinds : (E,) object or None
+        What the street of each road is called, and its `highway`: text, "" where that is not known; to look at.
     """
 
     graph: RoadGraph
@@ -36,3 +38,5 @@ class RoadNetwork:
     plane: LocalPlane
     coverage: tuple[FloatArray, ...] = ()
     meta: dict[str, Any] = field(default_factory=dict)
+    names: AnyArray | None = None
+    kinds: AnyArray | None = None

@@ -10,13 +10,14 @@ from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import Any, BinaryIO
+from typing import Any
 
 import numpy as np
 
 from roadgeo._arrays import AnyArray, BoolArray
 from roadgeo.errors import RoadSourceError
 from roadgeo.roads.kinds import in_tunnel, names_highways
+from roadgeo.sources.pbf import osm_parts
 from roadgeo.sources.vectors import first_line, list_layers, read_layer, require_file
 
 __all__ = [
@@ -49,15 +50,15 @@ PARQUET_ENDINGS = (".parquet", ".geoparquet")
 GRAPH_ENDINGS = (".graphml",)
 _OTHER = (".gpkg", ".shp", ".geojson", ".geojsonl", ".fgb", ".gml", ".kml", ".sqlite", ".tab", ".mif", ".shz")
 
-#: PBF files are read in parts of about this size; what may stand in them at most, as their specification says.
-_PART, _MAX_BLOB, _MAX_BLOB_HEADER = 1 << 20, 32 << 20, 64 << 10
-
 #: A compressed file may unpack to so many bytes, and beyond them to so many times its size.
 _UNPACKED_FREE, _UNPACKED_TIMES = 64 << 20, 100
 
 #: Columns that may say what kind of road a line is: OpenStreetMap's, Geofabrik's, Overture's.
 KIND_COLUMNS = ("highway", "fclass", "class")
 TUNNEL_COLUMNS = ("tunnel", "road_flags")
+#: What a street is called: OpenStreetMap's and Geofabrik's, those of two American makers of maps.
+_NAME_COLUMNS = ("name", "street_name", "fullname")
+_COLUMNS = KIND_COLUMNS + TUNNEL_COLUMNS + _NAME_COLUMNS
 
 #: Layers to prefer where a file has several with lines.
 _LAYERS = ("roads", "edges", "lines")
@@ -79,6 +80,8 @@ class RoadLines:
         Runs in a tunnel.
     meta : dict
         Provenance: plain values.
+    name : (L,) object or None
+        What the streets are called, text or None; to look at.
     """
 
     lines: AnyArray
@@ -86,6 +89,7 @@ class RoadLines:
     highway: AnyArray | None = None
     tunnel: BoolArray | None = None
     meta: dict[str, Any] = field(default_factory=dict)
+    name: AnyArray | None = None
 
 
 def list_sources(path: Path) -> list[Path]:
@@ -168,7 +172,7 @@ def stream_osm(
     import osmium
 
     factory = osmium.geom.WKBFactory()
-    ways: list[tuple[str, str, str | None]] = []
+    ways: list[tuple[str, str, str | None, str | None]] = []
     broken = 0
     try:
         _refuse_bomb(path)
@@ -183,7 +187,7 @@ def stream_osm(
             if shape is None:
                 broken += 1
                 continue
-            ways.append((shape, tags["highway"], tags.get("tunnel")))
+            ways.append((shape, tags["highway"], tags.get("tunnel"), tags.get("name") or tags.get("ref")))
             if len(ways) == most:
                 yield _from_ways(ways, broken, timestamp)
                 ways, broken = [], 0
@@ -192,16 +196,18 @@ def stream_osm(
     yield _from_ways(ways, broken, timestamp)
 
 
-def _from_ways(ways: Sequence[tuple[str, str, str | None]], broken: int, timestamp: str | None) -> RoadLines:
-    """Make lines of ways (hexadecimal WKB, `highway`, `tunnel`)."""
+def _from_ways(
+    ways: Sequence[tuple[str, str, str | None, str | None]], broken: int, timestamp: str | None
+) -> RoadLines:
+    """Make lines of ways (hexadecimal WKB, `highway`, `tunnel`, name)."""
     import shapely
 
-    shapes, highway, tunnel = np.array(ways, object).reshape(-1, 3).T
+    shapes, highway, tunnel, called = np.array(ways, object).reshape(-1, 4).T
     lines, place = simple_lines(shapely.from_wkb(shapes))
     meta = {"format": "OpenStreetMap", "features": len(ways) + broken, "attribution": OSM_ATTRIBUTION}
     if timestamp:
         meta["osm_timestamp"] = timestamp
-    return RoadLines(lines, "EPSG:4326", highway[place], in_tunnel(tunnel)[place], meta)
+    return RoadLines(lines, "EPSG:4326", highway[place], in_tunnel(tunnel)[place], meta, called[place])
 
 
 def join_lines(parts: Sequence[RoadLines]) -> RoadLines:
@@ -211,8 +217,9 @@ def join_lines(parts: Sequence[RoadLines]) -> RoadLines:
     first = parts[0]
     highway = None if first.highway is None else np.concatenate([one.highway for one in parts])
     tunnel = None if first.tunnel is None else np.concatenate([one.tunnel for one in parts])
+    called = None if first.name is None else np.concatenate([one.name for one in parts])
     meta = {**first.meta, "features": sum(one.meta["features"] for one in parts)}
-    return RoadLines(np.concatenate([one.lines for one in parts]), first.crs, highway, tunnel, meta)
+    return RoadLines(np.concatenate([one.lines for one in parts]), first.crs, highway, tunnel, meta, called)
 
 
 def _refuse_bomb(path: Path) -> None:
@@ -245,72 +252,10 @@ def _highways(path: Path, advance: Callable[[float], None], index: str) -> Itera
     places = osmium.NodeLocationsForWays(osmium.index.create_map(index))
     places.ignore_errors()
     wanted = osmium.filter.EntityFilter(osmium.osm.WAY), osmium.filter.KeyFilter("highway")
-    for part, share in _osm_parts(path):
+    for part, share in osm_parts(path):
         with osmium.io.Reader(part, osmium.osm.NODE | osmium.osm.WAY, thread_pool=pool) as reader:
             yield from osmium.OsmFileIterator(reader, places, *wanted)
         advance(share)
-
-
-def _osm_parts(path: Path) -> Iterator[tuple[Any, float]]:
-    """Yield what osmium is to read one after another, and the share of the file that is read then.
-
-    A PBF file is a row of blobs, the first of them a header, each with a header of its own. It is cut between them,
-    for osmium does not tell how far it is. Other files are left whole.
-    """
-    import osmium
-
-    if not path.name.lower().endswith(".pbf"):
-        yield str(path), 1.0
-        return
-    size = path.stat().st_size
-    with path.open("rb") as file:
-        header = _read_blob(file)
-        while file.tell() < size:
-            part = bytearray()
-            while len(part) < _PART and file.tell() < size:
-                part += _read_blob(file)
-            yield osmium.io.FileBuffer(header + part, "pbf"), file.tell() / size
-
-
-def _read_blob(file: BinaryIO) -> bytes:
-    """Read one blob of a PBF file, the header before it, and the size of that before both.
-
-    Raises
-    ------
-    RuntimeError
-        As osmium does: it is cut off, or there is none.
-    """
-    prefix = file.read(4)
-    header = file.read(min(int.from_bytes(prefix, "big"), _MAX_BLOB_HEADER))
-    size = _blob_size(header)
-    blob = file.read(min(size, _MAX_BLOB))
-    if len(prefix) < 4 or len(header) != int.from_bytes(prefix, "big") or len(blob) != size:
-        raise RuntimeError("it is cut off, damaged or no PBF file")
-    return prefix + header + blob
-
-
-def _blob_size(header: bytes) -> int:
-    """Find the size of a blob in its header: field 3, a number, of a Protocol Buffers message; -1 where it is not."""
-    at = 0
-
-    def number() -> int:
-        nonlocal at
-        value = shift = 0
-        while at < len(header):
-            byte = header[at]
-            value |= (byte & 127) << shift
-            at, shift = at + 1, shift + 7
-            if byte < 128:
-                break
-        return value
-
-    while at < len(header):
-        field, kind = divmod(number(), 8)
-        value = number()
-        if field == 3 and kind == 0:
-            return value
-        at += value if kind == 2 else 0  # text, or an index that nobody needs
-    return -1
 
 
 def _way_shape(way: Any, factory: Any) -> str | None:
@@ -337,7 +282,7 @@ def _read_graphml(path: Path) -> RoadLines:
         edges = ox.graph_to_gdfs(graph, nodes=False, fill_edge_geometry=True)
     except (ET.ParseError, nx.NetworkXError, KeyError, ValueError, AttributeError) as error:
         raise RoadSourceError(f"{path}: not a street network saved by osmnx: {first_line(error)}") from error
-    columns = {name: edges[name].to_numpy(object) for name in edges.columns if name in KIND_COLUMNS + TUNNEL_COLUMNS}
+    columns = {name: edges[name].to_numpy(object) for name in edges.columns if name in _COLUMNS}
     meta = {"format": "GraphML", "attribution": OSM_ATTRIBUTION}
     return from_columns(edges.geometry.to_numpy(), crs_name(edges.crs), columns, meta)
 
@@ -408,7 +353,7 @@ def _read_gdal(path: Path, layer: str | None) -> RoadLines:
     import shapely
 
     layer = choose_layer(path, layer)
-    found = read_layer(path, layer, KIND_COLUMNS + TUNNEL_COLUMNS)
+    found = read_layer(path, layer, _COLUMNS)
     if found.shapes is None:
         raise RoadSourceError(f"{path}: layer {layer!r} has no geometry, expected lines")
     shapes = shapely.from_wkb(found.shapes, on_invalid="ignore")
@@ -435,7 +380,7 @@ def choose_layer(path: Path, layer: str | None) -> str:
 
 def table_lines(table: Any, name: str) -> RoadLines:
     """Return the lines of a GeoDataFrame."""
-    known = [column for column in table.columns if str(column).lower() in KIND_COLUMNS + TUNNEL_COLUMNS]
+    known = [column for column in table.columns if str(column).lower() in _COLUMNS]
     columns = {str(column).lower(): table[column].to_numpy(object) for column in known}
     return from_columns(table.geometry.to_numpy(), crs_name(table.crs), columns, {"name": name})
 
@@ -445,12 +390,14 @@ def from_columns(shapes: AnyArray, crs: str | None, columns: dict[str, AnyArray]
     lines, place = simple_lines(shapes)
     kinds = [columns[name] for name in KIND_COLUMNS if name in columns and names_highways(columns[name])]
     tunnels = [in_tunnel(columns[name])[place] for name in TUNNEL_COLUMNS if name in columns]
+    called = [columns[name][place] for name in _NAME_COLUMNS if name in columns]
     return RoadLines(
         lines,
         crs,
         kinds[0][place] if kinds else None,
         np.logical_or.reduce(tunnels) if tunnels else None,
         {"features": len(shapes), **meta},
+        called[0] if called else None,
     )
 
 

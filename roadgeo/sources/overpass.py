@@ -133,11 +133,11 @@ def fetch_lines(
             shutil.rmtree(folder, ignore_errors=True)
             raise RoadSourceError(f"OpenStreetMap has no {which} roads there; check the area or try another --kinds")
         timestamp = _timestamp(folder)
-    ends, highway, tunnel = (np.concatenate(column) for column in zip(*pieces, strict=True))
+    ends, highway, tunnel, called = (np.concatenate(column) for column in zip(*pieces, strict=True))
     meta = {"format": "OpenStreetMap", "features": len(ends), "attribution": OSM_ATTRIBUTION}
     meta |= {"server": options.overpass_url} | ({"osm_timestamp": timestamp} if timestamp else {})
     meta |= {"date": options.date} if options.date else {}
-    return RoadLines(shapely.linestrings(ends), "EPSG:4326", highway, in_tunnel(tunnel), meta)
+    return RoadLines(shapely.linestrings(ends), "EPSG:4326", highway, in_tunnel(tunnel), meta, called)
 
 
 def box_area(bbox: tuple[float, float, float, float]) -> Any:
@@ -218,17 +218,17 @@ def _count_parts(area: Any) -> int:
         return 1
 
 
-def _edges(graph: Any) -> tuple[AnyArray, AnyArray, AnyArray]:
-    """Return the pieces of ways in an osmnx graph, each once: ends (P, 2, 2), highway (P,), tunnel (P,)."""
+def _edges(graph: Any) -> tuple[AnyArray, AnyArray, AnyArray, AnyArray]:
+    """Return the pieces of ways in an osmnx graph, each once: ends (P, 2, 2), highway, tunnel and name (P,)."""
     place = {node: (data["x"], data["y"]) for node, data in graph.nodes(data=True)}
     pieces = {(min(u, v), max(u, v)): data for u, v, data in graph.edges(data=True) if u != v}
     ends = np.array([(place[u], place[v]) for u, v in pieces], float).reshape(-1, 2, 2)
     columns = []
-    for key in ("highway", "tunnel"):
+    for key in ("highway", "tunnel", "name"):
         column = np.empty(len(pieces), object)
         column[:] = [data.get(key) for data in pieces.values()]
         columns.append(column)
-    return ends, columns[0], columns[1]
+    return ends, columns[0], columns[1], columns[2]
 
 
 def _hemispheres(area: Any) -> list[Any]:
@@ -270,7 +270,7 @@ def _asking(options: FetchOptions, query: str, say: Say, n_parts: int = 1) -> It
         "http_user_agent": f"roadgeo/{__version__}",
         "http_referer": "roadgeo",
         "use_cache": True,
-        "useful_tags_way": ["highway", "tunnel"],
+        "useful_tags_way": ["highway", "name", "tunnel"],
     }
     lookup = socket.getaddrinfo
     with _answers(options, query) as folder:

@@ -57,12 +57,16 @@ class Roads:
         `attribution`, `roads` (which kinds), `tunnels`, `bbox`.
     area : shapely Polygon or MultiPolygon, or None
         The ground whose roads were asked for, in degrees; None where it was all that there are.
+    names, kinds : (L,) object or None
+        What each street is called, and its `highway`: text, "" where that is not known; None: of none.
     """
 
     lines: AnyArray
     plane: LocalPlane
     meta: dict[str, Any] = field(default_factory=dict)
     area: Any = None
+    names: AnyArray | None = None
+    kinds: AnyArray | None = None
 
     def __len__(self) -> int:
         """L."""
@@ -232,10 +236,11 @@ def choose_lines(source: RoadLines, name: str, which: RoadKind, tunnels: bool, b
     """Keep the lines that were asked for, and count what was left out."""
     wanted = np.ones(len(source.lines), bool) if source.highway is None else drives(source.highway, which)
     hidden = np.zeros(len(wanted), bool) if tunnels or source.tunnel is None else source.tunnel & wanted
-    lines = source.lines[wanted & ~hidden]
-    crs = source.crs
+    chosen = np.flatnonzero(wanted & ~hidden)
+    lines, crs = source.lines[chosen], source.crs
     if bbox is not None:
-        lines, crs = _clip(_to_degrees(lines, source.crs, name), bbox), "EPSG:4326"
+        lines, place = _clip(_to_degrees(lines, source.crs, name), bbox)
+        chosen, crs = chosen[place], "EPSG:4326"
     meta = {
         "name": name,
         **source.meta,
@@ -245,7 +250,9 @@ def choose_lines(source: RoadLines, name: str, which: RoadKind, tunnels: bool, b
         "tunnels": int(hidden.sum()),
         "kept": len(lines),
     }
-    return RoadLines(lines, crs, meta=meta)
+    called = None if source.name is None else source.name[chosen]
+    kinds = None if source.highway is None else source.highway[chosen]
+    return RoadLines(lines, crs, kinds, meta=meta, name=called)
 
 
 def join_roads(sources: Sequence[RoadLines], meta: dict[str, Any], attribution: str | None) -> Roads:
@@ -267,7 +274,25 @@ def join_roads(sources: Sequence[RoadLines], meta: dict[str, Any], attribution: 
             "sources": [source.meta for source in sources],
             "attribution": "; ".join(calls) if attribution is None else attribution,
         },
+        names=_as_text([source.name for source in filled], filled),
+        kinds=_as_text([source.highway for source in filled], filled),
     )
+
+
+def _as_text(columns: Sequence[AnyArray | None], sources: Sequence[RoadLines]) -> AnyArray | None:
+    """Join columns to (L,) text, "" where nothing is known; None where no source knows any."""
+    if all(column is None for column in columns):
+        return None
+    text = np.full(sum(len(source.lines) for source in sources), "", object)
+    start = 0
+    for column, source in zip(columns, sources, strict=True):
+        for i, value in enumerate(() if column is None else column, start):
+            if isinstance(value, str):
+                text[i] = value
+            elif isinstance(value, Iterable):
+                text[i] = ";".join(map(str, value))
+        start += len(source.lines)
+    return text
 
 
 def _spread(source: RoadLines) -> FloatArray:
@@ -307,8 +332,14 @@ def _to_degrees(lines: AnyArray, crs: str | None, name: str) -> AnyArray:
     return np.asarray(shapely.set_coordinates(lines.copy(), lonlat))
 
 
-def _clip(lines: AnyArray, bbox: Box) -> AnyArray:
-    """Cut lines in degrees at the border of a box; a line or a box may lie astride 180 degrees."""
+def _clip(lines: AnyArray, bbox: Box) -> tuple[AnyArray, AnyArray]:
+    """Cut lines in degrees at the border of a box; a line or a box may lie astride 180 degrees.
+
+    Returns
+    -------
+    pieces, line
+        And the line that each piece came from.
+    """
     import shapely
 
     west, south, east, north = bbox
@@ -319,7 +350,8 @@ def _clip(lines: AnyArray, bbox: Box) -> AnyArray:
     coords[astride, 0] %= 360.0
     lines = shapely.set_coordinates(lines.copy(), coords)
     pieces = [shapely.clip_by_rect(lines, west + turn, south, east + turn, north) for turn in (-360.0, 0.0, 360.0)]
-    return simple_lines(np.concatenate(pieces))[0]
+    found, place = simple_lines(np.concatenate(pieces))
+    return found, place % max(len(lines), 1)
 
 
 def overruled_crs(own: str | None, given: str, file: Path) -> str:

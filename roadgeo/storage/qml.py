@@ -2,9 +2,18 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 
-__all__ = ["draw_arrow", "draw_fill", "draw_line", "draw_marker", "draw_palette"]
+__all__ = [
+    "draw_arrow",
+    "draw_fill",
+    "draw_line",
+    "draw_marker",
+    "draw_palette",
+    "name_features",
+    "seen_from",
+    "widen_by",
+]
 
 
 def draw_line(color: str, width_mm: float, casing: str = "", casing_width_mm: float = 0.0) -> str:
@@ -61,6 +70,44 @@ def draw_palette(entries: Mapping[int, tuple[str, int, str]]) -> str:
         '<pipe><rasterrenderer type="paletted" band="1" opacity="1" alphaBand="-1" nodataColor="">'
         f"<rasterTransparency/><colorPalette>{rows}</colorPalette></rasterrenderer></pipe>"
     )
+
+
+def widen_by(style: str, column: str, widths_mm: Mapping[float, Sequence[str]], other_mm: float) -> str:
+    """Let the width of a line follow a column: a width for the values of each group, another for all else."""
+    cases = " ".join(
+        f"WHEN &quot;{column}&quot; IN ({', '.join(f'&#39;{value}&#39;' for value in values)}) THEN {width}"
+        for width, values in widths_mm.items()
+    )
+    expression = f"CASE {cases} ELSE {other_mm} END"
+    rule = (
+        '<data_defined_properties><Option type="Map"><Option type="QString" name="name" value=""/>'
+        '<Option type="Map" name="properties"><Option type="Map" name="outlineWidth">'
+        '<Option type="bool" name="active" value="true"/>'
+        f'<Option type="QString" name="expression" value="{expression}"/><Option type="int" name="type" value="3"/>'
+        '</Option></Option><Option type="QString" name="type" value="collection"/></Option></data_defined_properties>'
+    )
+    return style.replace("</layer>", f"{rule}</layer>")
+
+
+def name_features(style: str, column: str, color: str, from_scale: int) -> str:
+    """Write a column along the lines of a layer, at scales of 1 : `from_scale` and larger."""
+    labels = (
+        '<labeling type="simple"><settings calloutType="simple">'
+        f'<text-style fieldName="{column}" fontFamily="Sans" fontSize="8" fontSizeUnit="Point" textColor="{color},255"'
+        ' textOpacity="1" isExpression="0" namedStyle="Regular"><text-buffer bufferDraw="1" bufferSize="0.7"'
+        ' bufferSizeUnits="MM" bufferColor="255,255,255,255" bufferOpacity="0.8"/></text-style>'
+        '<placement placement="3" placementFlags="9" dist="0.3" distUnits="MM" repeatDistance="80"'
+        ' repeatDistanceUnits="MM" maxCurvedCharAngleIn="25" maxCurvedCharAngleOut="-25"/>'
+        f'<rendering scaleVisibility="1" scaleMin="0" scaleMax="{from_scale}" mergeLines="1" drawLabels="1"/>'
+        "</settings></labeling>"
+    )
+    return style.replace("Symbology", "Symbology|Labeling").replace("</qgis>", f"{labels}</qgis>")
+
+
+def seen_from(style: str, scale: int) -> str:
+    """Show a layer at scales of 1 : `scale` and larger only."""
+    shown = f'hasScaleBasedVisibilityFlag="1" minScale="{scale}" maxScale="0"'
+    return style.replace("Symbology", "Symbology|Rendering").replace("<qgis ", f"<qgis {shown} ")
 
 
 def _line_options(color: str, width_mm: float) -> dict[str, str]:

@@ -14,7 +14,6 @@ from shapely.geometry import (
 from worlds.fenway import streets, write_streets, write_vector
 
 from roadgeo.errors import RoadSourceError
-from roadgeo.sources import lines as lines_module
 from roadgeo.sources.lines import OSM_ATTRIBUTION, list_sources, read_lines, simple_lines
 
 FORMATS = [
@@ -193,7 +192,7 @@ def test_nonsense_is_refused_on_one_line(tmp_path, name):
 def test_pbf_files_are_read_in_parts_and_progress_is_told(tmp_path, monkeypatch, part_size):
     file = write_streets(tmp_path / "a.osm.pbf")
     whole = read_lines(file)
-    monkeypatch.setattr(lines_module, "_PART", part_size)
+    monkeypatch.setattr("roadgeo.sources.pbf._PART", part_size)
     told = []
     read = read_lines(file, advance=told.append)
     assert shapely.equals(read.lines, whole.lines).all()

@@ -1,0 +1,61 @@
+"""Which street a road of the network is: names and kinds, handed down from the lines that it was drawn from."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import replace
+
+import numpy as np
+
+from roadgeo._arrays import AnyArray
+from roadgeo.roads.graph import RoadGraph
+from roadgeo.roads.network import RoadNetwork
+
+__all__ = ["label_roads"]
+
+#: A road lies no further than this from the line that it was drawn from: dual carriageways are drawn in their middle.
+_REACH_M = 30.0
+
+
+def label_roads(
+    network: RoadNetwork, lines: Sequence[AnyArray], names: Sequence[AnyArray | None], kinds: Sequence[AnyArray | None]
+) -> RoadNetwork:
+    """Give each road the name and the kind of the line that is nearest to its middle.
+
+    Parameters
+    ----------
+    lines : sequence of (L,) object
+        Shapely lines in plane metres, of one or more sources.
+    names, kinds : sequence of (L,) object or None
+        Text of each source's lines; None where it knows none.
+    """
+    if all(column is None for column in (*names, *kinds)):
+        return network
+    nearest = _nearest(network.graph, np.concatenate(list(lines)))
+    columns = [_joined(column, lines) for column in (names, kinds)]
+    named, classed = (np.append(column, "")[nearest] for column in columns)
+    return replace(network, names=named, kinds=classed)
+
+
+def _joined(columns: Sequence[AnyArray | None], lines: Sequence[AnyArray]) -> AnyArray:
+    """Join the columns of all sources, "" where one knows none."""
+    return np.concatenate(
+        [
+            np.full(len(own), "", object) if column is None else column
+            for column, own in zip(columns, lines, strict=True)
+        ]
+    )
+
+
+def _nearest(graph: RoadGraph, lines: AnyArray) -> AnyArray:
+    """Return the line nearest to the middle of each road, (E,); -1 where none is near."""
+    import shapely
+
+    found = np.full(graph.n_edges, -1, np.int64)
+    if graph.n_edges == 0 or len(lines) == 0:
+        return found
+    roads = shapely.linestrings(graph.coords, indices=np.repeat(np.arange(graph.n_edges), np.diff(graph.offsets)))
+    middles = shapely.line_interpolate_point(roads, 0.5, normalized=True)
+    edge, line = shapely.STRtree(lines).query_nearest(middles, max_distance=_REACH_M, all_matches=False)
+    found[edge] = line
+    return found
