@@ -104,11 +104,11 @@ def evaluate_command(
     """
     from roadgeo.cli.compilation import compile_once
     from roadgeo.evaluation.trials import ReferenceLocator
-    from roadgeo.reference.library import resolve_reference
+    from roadgeo.reference.library import resolve_whole
     from roadgeo.storage.atomic import writing
 
     _refuse_idle("--map" if as_map else "" if queries is None else "--queries")
-    path = resolve_reference(reference)
+    path = resolve_whole(reference)
     if out_dir is not None:
         with writing(out_dir):
             out_dir.mkdir(parents=True, exist_ok=True)

@@ -192,10 +192,10 @@ def _ask_about_box(box: tuple[float, float, float, float] | None) -> str:
 def _rebuild(name: str, quiet: bool) -> None:
     from roadgeo.cli.compilation import compile_once
     from roadgeo.cli.progress import show_steps
-    from roadgeo.reference.library import resolve_reference
+    from roadgeo.reference.library import resolve_whole
     from roadgeo.reference.reference import rebuild_reference
 
-    path = resolve_reference(name)
+    path = resolve_whole(name)
     compile_once(quiet)
     with show_steps(quiet) as say:
         reference = rebuild_reference(path, say)

@@ -40,12 +40,12 @@ def simulate_command(reference: str, out_dir: Path, roads: Path | None, quiet: b
     from roadgeo.evaluation.simulation import simulate_query
     from roadgeo.evaluation.trials import read_landscape
     from roadgeo.evaluation.truth import write_truth
-    from roadgeo.reference.library import resolve_reference
+    from roadgeo.reference.library import resolve_whole
     from roadgeo.storage.atomic import writing
     from roadgeo.storage.files import write_bytes
 
     sets = query_sets(options)
-    landscape = read_landscape(resolve_reference(reference), roads)
+    landscape = read_landscape(resolve_whole(reference), roads)
     truths = []
     with count_up(sum(count for _, count in sets), quiet) as advance:
         for simulation, count in sets:

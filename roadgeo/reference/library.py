@@ -17,7 +17,15 @@ from roadgeo.reference.remote import fetch_manifest, is_remote
 from roadgeo.reference.shards import ENDING, manifest_path
 from roadgeo.storage.atomic import writing
 
-__all__ = ["library_dir", "list_references", "make_slug", "new_reference", "remove_reference", "resolve_reference"]
+__all__ = [
+    "library_dir",
+    "list_references",
+    "make_slug",
+    "new_reference",
+    "remove_reference",
+    "resolve_reference",
+    "resolve_whole",
+]
 
 
 def library_dir() -> Path:
@@ -91,6 +99,22 @@ def resolve_reference(name_or_path: str | os.PathLike[str]) -> Path:
     near = difflib.get_close_matches(make_slug(name), known, n=1)
     hint = f"did you mean {near[0]}?" if near else "`roadgeo list` shows the library, `roadgeo index` adds to it"
     raise IndexFormatError(f"no reference {name!r}, neither as a file nor in {library_dir()}: {hint}")
+
+
+def resolve_whole(name_or_path: str | os.PathLike[str]) -> Path:
+    """Find a reference of one piece (see `resolve_reference`).
+
+    Raises
+    ------
+    IndexFormatError
+        There is none, or it is in shards.
+    """
+    path = resolve_reference(name_or_path)
+    manifest = manifest_path(path) if path.suffix == ENDING else None
+    if manifest is not None:
+        first = next(path.glob("[!.]*/*.gpkg"), path)
+        raise IndexFormatError(f"{path}: is in shards, one piece is needed; name one of them, such as {first}")
+    return path
 
 
 def remove_reference(name: str) -> list[Path]:

@@ -182,6 +182,14 @@ def test_the_command_line_builds_describes_lists_and_removes(roads, tmp_path, mo
     assert not list((tmp_path / "library").iterdir())
 
 
+@pytest.mark.parametrize("asked", [["simulate", "-o", "q"], ["evaluate", "-n", "1"], ["index", "--rebuild"]])
+def test_what_needs_one_piece_says_so(sharded, asked, capsys):
+    assert main([*asked, str(sharded.path)]) == 1
+    told = capsys.readouterr().err
+    assert "is in shards, one piece is needed; name one of them, such as" in told
+    assert told.count("\n") == 1
+
+
 @pytest.mark.parametrize(
     ("given", "told"),
     [
