@@ -90,7 +90,8 @@ def test_a_page_does_what_it_says(page: str, desk: Path) -> None:
     left_out = {block.line for block in blocks(PAGES[page]) if block.text.startswith(ELSEWHERE)}
     with fake_osm() as osm:
         osm.places = Places()
-        run_page(PAGES[page], ["--overpass-url", f"{osm.url}/api", "--nominatim-url", osm.url], left_out)
+        servers = ["--overpass-url", f"{osm.url}/api", "--nominatim-url", osm.url]
+        run_page(PAGES[page], servers, left_out, figures=page == "docs/tutorial.md")
     assert not documents.missing_files(PAGES[page], desk)
 
 
@@ -229,6 +230,21 @@ def test_names_that_do_not_exist_are_found(text: str, wrong: int) -> None:
 def test_links_that_lead_nowhere_are_found() -> None:
     text = "# A page\n[a](qgis.md) [b](none.md) ![c](none.png) [d](#a-page) [e](#b-page) [f](https://a.org/b)"
     assert documents.broken_links(ROOT / "docs" / "faq.md", text) == ["none.md", "none.png", "#b-page"]
+
+
+@pytest.mark.parametrize(
+    ("line", "got", "wrong"),
+    [
+        ("99 intersections, 227 roads", "x2.png: 101 intersections, 221 roads between them", 0),
+        ("99 intersections, 227 roads", "x2.png: 81 intersections, 227 roads between them", 1),
+        ("located at 41.15250° N", "a.png: located at 41.15260° N", 0),
+        ("located at 41.15250° N", "a.png: located at 41.25250° N", 1),
+        ("2,649 intersections   45 km²", "porto  2,649 intersections  95 km²", 1),
+        ("odds 10^71.7", "odds 10^40.1 against chance", 1),
+    ],
+)
+def test_figures_that_drifted_are_noticed(line: str, got: str, wrong: int) -> None:
+    assert len(documents.drifted(line, got)) == wrong
 
 
 def test_pipes_and_redirections_work(desk: Path) -> None:

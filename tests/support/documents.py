@@ -19,6 +19,8 @@ FENCE = re.compile(r"^```(\w+)\n(.*?)^```$", re.DOTALL | re.MULTILINE)
 INLINE = re.compile(r"(?<!`)`([^`\n]+)`(?!`)")
 NUMBER = re.compile(r"\d[\d,]*(?:\.\d+)?")
 OPTION = re.compile(r"(?<![\w-])--?[a-z][\w-]*")
+#: Blocks of text whose figures depend on how far a search gets in its time: tables of `evaluate`.
+HASTY = re.compile(r"recall|of the map")
 FILE = re.compile(r"[a-z0-9_./-]+\.(?:tif|gpkg|index|json|jsonl|geojson|png|html|csv|zip|kmz|points|txt|vrt|qml|tfw)")
 
 
@@ -52,8 +54,10 @@ def prose(text):
 # --- running ----------------------------------------------------------------------------------------------------------
 
 
-def run_page(text, servers=(), left_out=frozenset()):
+def run_page(text, servers=(), left_out=frozenset(), *, figures=False):
     """Run a page's bash and python blocks in order, in this folder; hold its text blocks against what was printed.
+
+    With `figures` the numbers in them must be right, too, but for those that depend on the machine's speed.
 
     Raises AssertionError at what does not come out as the page says. `servers` are options that lead what is fetched
     to servers on loopback; `left_out` are the lines of blocks that are run elsewhere.
@@ -68,7 +72,7 @@ def run_page(text, servers=(), left_out=frozenset()):
         elif block.language == "python":
             printed = run_program(block, names)
         elif block.language == "text":
-            compare(block, printed)
+            compare(block, printed, figures)
 
 
 def run_program(block, names):
@@ -154,14 +158,33 @@ def captured(call):
     return both.getvalue(), out.getvalue()
 
 
-def compare(block, printed):
+def compare(block, printed, figures=False):
     """Hold a text block against what was printed: the same lines in the same order, but for numbers and gaps (...)."""
-    lines = iter(map(normalise, printed.splitlines()))
+    lines = iter(printed.splitlines())
     for line in block.text.splitlines():
         wanted = normalise(line)
         if wanted in {"", "..."}:
             continue
-        assert any(wanted in got for got in lines), f"line {block.line}: not printed: {line}\nbut\n{printed}"
+        got = next((got for got in lines if wanted in normalise(got)), None)
+        assert got is not None, f"line {block.line}: not printed: {line}\nbut\n{printed}"
+        if figures and not HASTY.search(block.text):
+            wrong = drifted(line, got)
+            assert not wrong, f"line {block.line}: {', '.join(wrong)} in: {line}\nbut printed: {got}"
+
+
+def drifted(line, got):
+    """Numbers of a line that differ from those that were printed, by more than a rebuilt machine or library makes."""
+    before = normalise(got).index(normalise(line))
+    skipped = normalise(got)[:before].count("#")
+    wanted, found = NUMBER.findall(line), NUMBER.findall(got)[skipped:]
+    return [f"{a} is {b} now" for a, b in zip(wanted, found, strict=False) if not alike(a, b)]
+
+
+def alike(wanted, got):
+    """Whether two numbers agree: those with four decimals and more are degrees, to 100 m; others to 5 %, or 2."""
+    a, b = (float(text.replace(",", "")) for text in (wanted, got))
+    exact = len(wanted.partition(".")[2]) >= 4
+    return abs(a - b) <= (0.001 if exact else max(2.0, 0.05 * abs(a)))
 
 
 def normalise(line):
