@@ -46,6 +46,8 @@ class CheckOptions:
         Length of road that mask and map must each show.
     max_drift_m : float
         Refinement that moves the corners by more than this has lost its way.
+    twin_m : float
+        Half of what lies between the lines of a dual carriageway, up to 1.8 times as much.
     piece_m : float
         Roads agree or not over about this length; pieces are independent.
     perspective_sigma : float
@@ -59,6 +61,7 @@ class CheckOptions:
     max_sigma_m: float = 3.0
     min_roads_m: float = 300.0
     max_drift_m: float = 40.0
+    twin_m: float = 10.0
     piece_m: float = 60.0
     perspective_sigma: float = 0.003
     search: LocalSearchOptions = field(default_factory=LocalSearchOptions)
@@ -181,14 +184,40 @@ class _Judge:
     def refine(self, start: FloatArray, n_points: int | None) -> _Place:
         """Refine a place until its matches settle; where it loses its way, it stays as it is."""
         matrix, refined = start, None
+        scene = self.scene if n_points else self.without_twins(start)
         matched = np.full(len(self.scene.intersections), -1)
         for _ in range(3):
             _, matched, _ = agreement(matrix, self.scene, self.index, self.gsd, _NO_SEEDS, self.options.verify)
-            step = refine(matrix, self.scene, self.index, matched, self.refine_options, n_points, held=True)
+            step = refine(matrix, scene, self.index, matched, self.refine_options, n_points, held=True)
             if step is None or not self.gap(step.matrix, start) < self.options.max_drift_m:
                 break
             refined, matrix = step, step.matrix
         return _Place(matrix, self.pieces(matrix), matched, refined)
+
+    def without_twins(self, matrix: FloatArray) -> Scene:
+        """Return the scene without road points that have parallel roads of the map on both sides.
+
+        A mask often shows a dual carriageway as one line, halfway between the two of the map: were it laid on either,
+        the frame would be off by half their distance.
+        """
+        scene, to_map = self.scene, Homography(matrix).facing(self.scene.center)
+        points = to_map(scene.points)
+        ahead = to_map(scene.points + scene.directions) - points
+        along = ahead / np.maximum(np.hypot(*ahead.T), 1e-12)[:, None]
+        aside = along[:, ::-1] * (1.0, -1.0)
+        beside = []
+        for side in (1.0, -1.0):
+            away = np.empty(len(points))
+            shifted = np.ascontiguousarray(points + side * self.options.twin_m * aside)
+            min_cos = math.cos(math.radians(self.options.verify.max_turn_deg))
+            radius, roads = 0.8 * self.options.twin_m, self.index.road_buckets
+            forward_distances(np.eye(3), shifted, np.ascontiguousarray(along), radius, min_cos, 0.0, 0.0, roads, away)
+            beside.append(np.isfinite(away))
+        alone = ~(beside[0] & beside[1])
+        if alone.mean() < 0.4:
+            return scene
+        kept = [np.ascontiguousarray(array[alone]) for array in (scene.points, scene.directions)]
+        return replace(scene, points=kept[0], directions=kept[1], road_length_px=scene.road_length_px * alone.mean())
 
     def pieces(self, matrix: FloatArray) -> FloatArray:
         """Return the share of the roads in each piece of the frame that agree; a half where there are none."""
@@ -289,6 +318,6 @@ def _judge_best(judge: _Judge, places: Sequence[_Place]) -> Checked:
         return replace(known, reason=f"the roads place it to {sigma:.1f} m only")
     if agrees:
         return replace(known, verdict="agrees", reason=said)
-    if found.significance < options.min_chi2:
+    if found.significance < options.min_chi2 or off - sigma < options.tolerance_m:
         return replace(known, reason=f"{said}: that may be chance")
     return replace(known, verdict="off", reason=said)
