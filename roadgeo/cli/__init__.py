@@ -29,6 +29,7 @@ COMMANDS = {
     "locate": ("roadgeo.cli.locate", "Find road masks on a reference and draw them there."),
     "verify": ("roadgeo.cli.verify", "Check whether georeferenced images are where they say."),
     "track": ("roadgeo.cli.track", "Follow a flight over the map, frame by frame."),
+    "apply": ("roadgeo.cli.apply", "Put another picture of a located frame on the map."),
     "vectorize": ("roadgeo.cli.vectorize", "Show what roads are seen in a mask."),
     "info": ("roadgeo.cli.references", "Describe a reference."),
     "check": ("roadgeo.cli.references", "Verify every byte and number of a reference."),

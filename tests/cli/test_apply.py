@@ -1,0 +1,83 @@
+"""`roadgeo apply`: other pictures of a located frame."""
+
+import json
+from pathlib import Path
+
+import cv2
+import numpy as np
+import pytest
+import rasterio
+
+from roadgeo.cli import main
+from roadgeo.demo import ATTRIBUTION, PHOTO, ROADS, demo_masks
+from roadgeo.running.applying import read_location
+from roadgeo.sources.roads import read_roads
+from roadgeo.workflows import build_reference
+
+DRONE = next(mask.path for mask in demo_masks() if mask.path.stem == "drone")
+
+
+@pytest.fixture(scope="module")
+def located(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """The location of the demonstration's drone mask, with its photograph drawn by `locate` itself."""
+    folder = tmp_path_factory.mktemp("located")
+    build_reference(read_roads(ROADS, attribution=ATTRIBUTION), "porto", path=folder / "porto.gpkg")
+    given = ["-r", str(folder / "porto.gpkg"), "--image", str(PHOTO), "--effort", "quick", "-q", "-o", str(folder)]
+    assert main(["locate", str(DRONE), *given]) == 0
+    return folder
+
+
+def test_the_photograph_comes_out_as_if_locate_had_drawn_it(located: Path, tmp_path: Path) -> None:
+    given = ["--also", "iiif", "--also", "geopose", "--also", "points", "-o", str(tmp_path), "-q"]
+    assert main(["apply", str(located / "drone_location.json"), str(PHOTO), *given]) == 0
+    names = {path.name for path in tmp_path.iterdir()}
+    stem = PHOTO.stem
+    assert names == {f"{stem}_footprint.tif", f"{stem}_iiif.json", f"{stem}_geopose.json", f"{PHOTO.name}.points"}
+    with (
+        rasterio.open(tmp_path / f"{stem}_footprint.tif") as ours,
+        rasterio.open(located / "drone_footprint.tif") as his,
+    ):
+        assert (ours.transform, ours.crs) == (his.transform, his.crs)
+        assert (ours.read() == his.read()).all()
+
+
+def test_what_is_read_is_what_was_written(located: Path) -> None:
+    document = json.loads((located / "drone_location.json").read_text())
+    told = read_location(located / "drone_location.json").to_dict()
+    for key in ("homography", "footprint", "center", "camera", "corner_covariance_m2", "lens_k1", "size"):
+        assert told[key] == document[key]
+
+
+def test_another_size_is_scaled_and_another_shape_only_where_asked(
+    located: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capfd: pytest.CaptureFixture[str]
+) -> None:
+    monkeypatch.chdir(tmp_path)
+    photo = cv2.imread(str(PHOTO))
+    height, width = photo.shape[:2]
+    cv2.imwrite("small.png", cv2.resize(photo, (width // 2, height // 2)))
+    cv2.imwrite("flat.png", cv2.resize(photo, (width, height // 2)))
+    location = str(located / "drone_location.json")
+    assert main(["apply", location, "small.png", "-q"]) == 0
+    assert main(["apply", location, "flat.png", "-q"]) == 1
+    assert "expected the same frame" in capfd.readouterr().err
+    assert not Path("flat_footprint.tif").exists()
+    assert main(["apply", location, "flat.png", "--stretch", "-q"]) == 0
+    with rasterio.open("small_footprint.tif") as small, rasterio.open("flat_footprint.tif") as flat:
+        assert np.allclose(small.bounds, flat.bounds, atol=4)
+
+
+def test_what_is_no_location_is_refused_in_a_line(
+    located: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capfd: pytest.CaptureFixture[str]
+) -> None:
+    monkeypatch.chdir(tmp_path)
+    document = json.loads((located / "drone_location.json").read_text())
+    changes = ({"homography": [[1, 2], [3, 4]]}, {"size": [10**9, 5]}, {"camera": {"x": 1}})
+    for wrong in ("{", "[]", '{"schema": "other/1"}', *(json.dumps({**document, **change}) for change in changes)):
+        Path("a.json").write_text(wrong)
+        assert main(["apply", "a.json", str(PHOTO)]) == 1
+        assert "give the *_location.json that `roadgeo locate` wrote" in capfd.readouterr().err
+    Path("a.json").write_text(json.dumps({**document, "status": "ambiguous"}))
+    assert main(["apply", "a.json", str(PHOTO)]) == 3
+    assert main(["apply", str(located / "drone_location.json"), str(PHOTO), "--also", "matches"]) == 1
+    assert "have `roadgeo locate` write it" in capfd.readouterr().err
+    assert {path.name for path in tmp_path.iterdir()} == {"a.json"}
