@@ -1,11 +1,13 @@
 """Road lines on disk by cells of a grid: written as they come from sources of any size, read for any box.
 
-A cell has one file, a row of blocks: number of lines and of coordinates, the lines' numbers, how many coordinates each
-has, and those. A line is stored in every cell that it touches, and read once.
+A cell has one file, a row of blocks: number of lines, of coordinates and of bytes of text, the lines' numbers, how many
+coordinates each has, those, and what each is called and its kind as JSON. A line is stored in every cell that it
+touches, and read once.
 """
 
 from __future__ import annotations
 
+import json
 import math
 import struct
 from collections import defaultdict
@@ -24,7 +26,7 @@ Cell: TypeAlias = tuple[int, int]
 #: x0, y0, x1, y1 in units of the spool's CRS.
 Bounds: TypeAlias = tuple[float, float, float, float]
 
-_HEADER = struct.Struct("<QQ")
+_HEADER = struct.Struct("<QQQ")
 
 #: Lines whose bounds touch more cells are long, or astride 180 degrees: they are stored where their vertices lie.
 _MOST_CELLS = 64
@@ -45,8 +47,8 @@ class Spool:
         self.n_lines = 0
         self.n_segments: dict[Cell, int] = defaultdict(int)
 
-    def add(self, lines: AnyArray) -> None:
-        """Store (L,) LineStrings."""
+    def add(self, lines: AnyArray, labels: AnyArray | None = None) -> None:
+        """Store (L,) LineStrings, and the name and kind of each, (L, 2) text, as far as they are known."""
         import shapely
 
         if not len(lines):
@@ -61,7 +63,7 @@ class Spool:
         row, cells = row[order], cells[order]
         cuts = np.flatnonzero((cells[1:] != cells[:-1]).any(axis=1)) + 1
         for members, cell in zip(np.split(row, cuts), cells[np.concatenate(([0], cuts))], strict=True):
-            self._append((int(cell[0]), int(cell[1])), np.unique(members), coords, starts)
+            self._append((int(cell[0]), int(cell[1])), np.unique(members), (coords, starts), labels)
         self.n_lines += len(lines)
 
     def _cells_of(self, bounds: FloatArray, coords: FloatArray, owner: IntArray) -> tuple[IntArray, IntArray]:
@@ -79,19 +81,24 @@ class Spool:
             np.concatenate([cells, np.floor(coords[own] / self.size).astype(np.int64)]),
         )
 
-    def _append(self, cell: Cell, members: IntArray, coords: FloatArray, starts: IntArray) -> None:
-        """Add a block to the file of a cell."""
+    def _append(
+        self, cell: Cell, members: IntArray, drawn: tuple[FloatArray, IntArray], labels: AnyArray | None
+    ) -> None:
+        """Add a block to the file of a cell; `drawn` = coordinates of all lines, and where each line's start."""
+        coords, starts = drawn
         lengths = starts[members + 1] - starts[members]
         first = np.repeat(starts[members] - np.cumsum(lengths) + lengths, lengths)
         taken = coords[first + np.arange(len(first))]
         with self._path(cell).open("ab") as file:
-            file.write(_HEADER.pack(len(members), len(taken)))
+            text = b"" if labels is None else json.dumps(labels[members].tolist()).encode()
+            file.write(_HEADER.pack(len(members), len(taken), len(text)))
             file.write((members + self.n_lines).astype("<u8").tobytes())
             file.write(lengths.astype("<u4").tobytes())
             file.write(taken.astype("<f8").tobytes())
+            file.write(text)
 
-    def read(self, box: Bounds) -> AnyArray:
-        """Return the lines that touch a box, cut at its border, in the order in which they came."""
+    def read(self, box: Bounds) -> tuple[AnyArray, AnyArray]:
+        """Return the lines that touch a box, cut at its border, in the order in which they came, and their labels."""
         import shapely
 
         from roadgeo.sources.lines import simple_lines
@@ -100,11 +107,12 @@ class Spool:
         near = sorted((x, y) for x, y in self.cells() if x0 <= x <= x1 and y0 <= y <= y1)
         blocks = [block for cell in near for block in _read_blocks(self._path(cell))]
         if not blocks:
-            return np.empty(0, object)
-        numbers, lengths, coords = (np.concatenate(column) for column in zip(*blocks, strict=True))
+            return np.empty(0, object), np.empty((0, 2), object)
+        numbers, lengths, coords, labels = (np.concatenate(column) for column in zip(*blocks, strict=True))
         lines = shapely.linestrings(coords, indices=np.repeat(np.arange(len(lengths)), lengths))
         _, chosen = np.unique(numbers, return_index=True)
-        return simple_lines(shapely.clip_by_rect(lines[chosen], *box))[0]
+        cut, place = simple_lines(shapely.clip_by_rect(lines[chosen], *box))
+        return cut, labels[chosen][place]
 
     def cells(self) -> list[Cell]:
         """Return the cells that hold something."""
@@ -115,17 +123,21 @@ class Spool:
         return self.folder / f"{cell[0]}_{cell[1]}.lines"
 
 
-def _read_blocks(path: Path) -> list[tuple[IntArray, IntArray, FloatArray]]:
-    """Return the blocks of a cell: numbers, lengths, (C, 2) coordinates."""
+def _read_blocks(path: Path) -> list[tuple[IntArray, IntArray, FloatArray, AnyArray]]:
+    """Return the blocks of a cell: numbers, lengths, (C, 2) coordinates, (L, 2) labels."""
     if not path.is_file():
         return []
     data, at, blocks = path.read_bytes(), 0, []
     while at < len(data):
-        n, m = _HEADER.unpack_from(data, at)
+        n, m, size = _HEADER.unpack_from(data, at)
         at += _HEADER.size
         numbers = np.frombuffer(data, "<u8", n, at).astype(np.int64)
         lengths = np.frombuffer(data, "<u4", n, at + 8 * n).astype(np.int64)
         coords = np.frombuffer(data, "<f8", 2 * m, at + 12 * n).reshape(m, 2)
         at += 12 * n + 16 * m
-        blocks.append((numbers, lengths, coords))
+        labels = np.full((n, 2), "", object)
+        if size:
+            labels[:] = json.loads(data[at : at + size])
+        at += size
+        blocks.append((numbers, lengths, coords, labels))
     return blocks

@@ -29,9 +29,10 @@ from roadgeo.reference.shard_plan import ShardBox, bounds_in_degrees, plan_shard
 from roadgeo.reference.shards import Manifest, ShardedReference, ShardEntry, manifest_path, open_shards, write_manifest
 from roadgeo.reference.spool import Spool
 from roadgeo.roads.kinds import RoadKind
+from roadgeo.roads.labels import label_roads
 from roadgeo.running.processes import run
 from roadgeo.sources.lines import RoadLines, list_sources
-from roadgeo.sources.roads import Box, choose_lines, join_roads, overruled_crs
+from roadgeo.sources.roads import Box, as_text, choose_lines, join_roads, overruled_crs
 from roadgeo.sources.streams import stream_lines
 from roadgeo.storage.atomic import writing
 from roadgeo.storage.files import write_bytes
@@ -208,7 +209,7 @@ def _stream(roads: RoadFiles, folder: Path, options: ShardOptions, crs: str | No
             if chosen.crs != crs and crs != "EPSG:4326":
                 return None
             with writing(folder):
-                spool.add(_to(chosen, str(crs)))
+                spool.add(_to(chosen, str(crs)), _labels(chosen))
         sources.append(told)
     calls = dict.fromkeys(one["attribution"] for one in sources if one.get("attribution"))
     meta = {
@@ -245,6 +246,14 @@ def _to(lines: RoadLines, crs: str) -> Any:
     coords = shapely.get_coordinates(lines.lines)
     moved = np.stack(transformer(str(lines.crs), crs).transform(coords[:, 0], coords[:, 1]), axis=1)
     return shapely.set_coordinates(lines.lines.copy(), moved)
+
+
+def _labels(lines: RoadLines) -> Any:
+    """Return the name and the kind of each line, (L, 2) text; None where nothing is known."""
+    columns = [as_text([column], [lines]) for column in (lines.name, lines.highway)]
+    if all(column is None for column in columns):
+        return None
+    return np.stack([np.full(len(lines.lines), "", object) if one is None else one for one in columns], axis=1)
 
 
 def _metres(crs: str) -> float | None:
@@ -299,9 +308,10 @@ class ShardWork:
             return ShardEntry.from_dict(json.loads(done.read_text(encoding="utf-8")))
         reach = widen(box.core, self.options.margin_m, _metres(crs))
         entry = ShardEntry(box.name, bounds_in_degrees(box.core, crs), bounds_in_degrees(reach, crs))
-        lines = spool.read(reach)
+        lines, labels = spool.read(reach)
         if len(lines):
-            entry = self._build_reference(entry, RoadLines(lines, crs, meta={"name": box.name}), box)
+            names, kinds = labels.T if (labels != "").any() else (None, None)
+            entry = self._build_reference(entry, RoadLines(lines, crs, kinds, meta={"name": box.name}, name=names), box)
         write_bytes(done, json.dumps(asdict(entry)).encode())  # last: what it tells of is there
         return entry
 
@@ -312,7 +322,8 @@ class ShardWork:
 
         joined = join_roads([lines], {}, None)
         meta = {**self.meta, "plane": joined.meta["plane"], "shard": box.name}
-        network = as_stored(build_network(joined.lines, joined.plane, meta, self.options.build))
+        network = build_network(joined.lines, joined.plane, meta, self.options.build)
+        network = as_stored(label_roads(network, [joined.lines], [joined.names], [joined.kinds]))
         if len(network.intersections) < 3:
             return entry
         index = build_index(network, self.options.build.index)

@@ -21,12 +21,11 @@ from roadgeo.sources.pbf import osm_parts
 from roadgeo.sources.vectors import first_line, list_layers, read_layer, require_file
 
 __all__ = [
+    "COLUMNS",
     "GRAPH_ENDINGS",
-    "KIND_COLUMNS",
     "OSM_ATTRIBUTION",
     "OSM_ENDINGS",
     "PARQUET_ENDINGS",
-    "TUNNEL_COLUMNS",
     "RoadLines",
     "choose_layer",
     "crs_name",
@@ -58,7 +57,7 @@ KIND_COLUMNS = ("highway", "fclass", "class")
 TUNNEL_COLUMNS = ("tunnel", "road_flags")
 #: What a street is called: OpenStreetMap's and Geofabrik's, those of two American makers of maps.
 _NAME_COLUMNS = ("name", "street_name", "fullname")
-_COLUMNS = KIND_COLUMNS + TUNNEL_COLUMNS + _NAME_COLUMNS
+COLUMNS = KIND_COLUMNS + TUNNEL_COLUMNS + _NAME_COLUMNS
 
 #: Layers to prefer where a file has several with lines.
 _LAYERS = ("roads", "edges", "lines")
@@ -282,7 +281,7 @@ def _read_graphml(path: Path) -> RoadLines:
         edges = ox.graph_to_gdfs(graph, nodes=False, fill_edge_geometry=True)
     except (ET.ParseError, nx.NetworkXError, KeyError, ValueError, AttributeError) as error:
         raise RoadSourceError(f"{path}: not a street network saved by osmnx: {first_line(error)}") from error
-    columns = {name: edges[name].to_numpy(object) for name in edges.columns if name in _COLUMNS}
+    columns = {name: edges[name].to_numpy(object) for name in edges.columns if name in COLUMNS}
     meta = {"format": "GraphML", "attribution": OSM_ATTRIBUTION}
     return from_columns(edges.geometry.to_numpy(), crs_name(edges.crs), columns, meta)
 
@@ -296,7 +295,7 @@ def _read_parquet(path: Path) -> RoadLines:
     try:
         names = pq.read_schema(path).names
         require_rows(path)
-        wanted = [name for name in KIND_COLUMNS + TUNNEL_COLUMNS + ("subtype",) if name in names]
+        wanted = [name for name in (*COLUMNS, "subtype") if name in names]
         geometry = geometry_columns(path)
         frame = gpd.read_parquet(path, columns=geometry[:1] + wanted)
     except (ValueError, pa.ArrowException, OSError) as error:
@@ -353,7 +352,7 @@ def _read_gdal(path: Path, layer: str | None) -> RoadLines:
     import shapely
 
     layer = choose_layer(path, layer)
-    found = read_layer(path, layer, _COLUMNS)
+    found = read_layer(path, layer, COLUMNS)
     if found.shapes is None:
         raise RoadSourceError(f"{path}: layer {layer!r} has no geometry, expected lines")
     shapes = shapely.from_wkb(found.shapes, on_invalid="ignore")
@@ -380,7 +379,7 @@ def choose_layer(path: Path, layer: str | None) -> str:
 
 def table_lines(table: Any, name: str) -> RoadLines:
     """Return the lines of a GeoDataFrame."""
-    known = [column for column in table.columns if str(column).lower() in _COLUMNS]
+    known = [column for column in table.columns if str(column).lower() in COLUMNS]
     columns = {str(column).lower(): table[column].to_numpy(object) for column in known}
     return from_columns(table.geometry.to_numpy(), crs_name(table.crs), columns, {"name": name})
 

@@ -25,6 +25,7 @@ if TYPE_CHECKING:
 __all__ = [
     "Box",
     "Roads",
+    "as_text",
     "choose_lines",
     "choose_roads",
     "fetch_roads",
@@ -274,12 +275,12 @@ def join_roads(sources: Sequence[RoadLines], meta: dict[str, Any], attribution: 
             "sources": [source.meta for source in sources],
             "attribution": "; ".join(calls) if attribution is None else attribution,
         },
-        names=_as_text([source.name for source in filled], filled),
-        kinds=_as_text([source.highway for source in filled], filled),
+        names=as_text([source.name for source in filled], filled),
+        kinds=as_text([source.highway for source in filled], filled),
     )
 
 
-def _as_text(columns: Sequence[AnyArray | None], sources: Sequence[RoadLines]) -> AnyArray | None:
+def as_text(columns: Sequence[AnyArray | None], sources: Sequence[RoadLines]) -> AnyArray | None:
     """Join columns to (L,) text, "" where nothing is known; None where no source knows any."""
     if all(column is None for column in columns):
         return None

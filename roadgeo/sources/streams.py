@@ -9,11 +9,10 @@ from typing import Any
 
 from roadgeo.errors import RoadSourceError
 from roadgeo.sources.lines import (
+    COLUMNS,
     GRAPH_ENDINGS,
-    KIND_COLUMNS,
     OSM_ENDINGS,
     PARQUET_ENDINGS,
-    TUNNEL_COLUMNS,
     RoadLines,
     choose_layer,
     crs_name,
@@ -90,7 +89,7 @@ def _stream_parquet(path: Path, most: int, advance: Callable[[float], None]) -> 
         geometry, crs = geometry_columns(path)[0], crs_name(_parquet_crs(path))
         with pq.ParquetFile(path) as file:
             names = file.schema_arrow.names
-            wanted = [name for name in (*KIND_COLUMNS, *TUNNEL_COLUMNS, "subtype") if name in names]
+            wanted = [name for name in (*COLUMNS, "subtype") if name in names]
             done = 0
             for batch in file.iter_batches(most, columns=[geometry, *wanted]):
                 table = batch.to_pandas()
@@ -135,7 +134,7 @@ def _stream_gdal(path: Path, layer: str | None, most: int, advance: Callable[[fl
     layer = choose_layer(path, layer)
     total = max(count_features(path, layer), 1)
     for skip in range(0, total, most):
-        found = read_layer(path, layer, (*KIND_COLUMNS, *TUNNEL_COLUMNS), skip, most)
+        found = read_layer(path, layer, COLUMNS, skip, most)
         if found.shapes is None:
             raise RoadSourceError(f"{path}: layer {layer!r} has no geometry, expected lines")
         shapes = shapely.from_wkb(found.shapes, on_invalid="ignore")

@@ -21,12 +21,16 @@ def test_lines_come_back_for_any_box_as_if_all_had_been_cut(tmp_path):
     lines = np.array(random_lines(3, 2000.0), object)
     spool = Spool(tmp_path, 250.0)
     for first in range(0, len(lines), 100):  # as a source gives them
-        spool.add(lines[first : first + 100])
+        spool.add(lines[first : first + 100], np.array([[f"Ö{first}", ""]] * len(lines[first : first + 100]), object))
     for box in ((0.0, 0.0, 2000.0, 2000.0), (130.0, 260.0, 700.0, 1400.0), (5000.0, 0.0, 6000.0, 10.0)):
         expected = shapely.clip_by_rect(lines, *box)
         expected = shapely.get_parts(expected[~shapely.is_empty(expected)])
-        found = Spool(tmp_path, 250.0).read(box)
+        found, labels = Spool(tmp_path, 250.0).read(box)
+        assert labels.shape == (len(found), 2)
         assert shapely.equals_exact(found, expected[shapely.get_type_id(expected) == 1], 0.0).all()
+    found, labels = spool.read((0.0, 0.0, 2000.0, 2000.0))
+    first = next(k for k, line in enumerate(found) if line.equals(lines[105]))
+    assert labels[first].tolist() == ["Ö100", ""]
     assert sum(spool.n_segments.values()) == shapely.get_num_coordinates(lines).sum() - len(lines)
 
 
@@ -34,7 +38,9 @@ def test_a_line_across_half_the_world_is_found_where_its_vertices_lie(tmp_path):
     spool = Spool(tmp_path, 0.05)
     spool.add(np.array([shapely.LineString([(-179.99, 10.0), (179.99, 10.01)])], object))
     assert len(spool.cells()) == 2
-    assert len(spool.read((179.9, 9.9, 180.0, 10.1))) == 1
+    lines, labels = spool.read((179.9, 9.9, 180.0, 10.1))
+    assert len(lines) == 1
+    assert labels.tolist() == [["", ""]]
 
 
 # --- where a map is cut -----------------------------------------------------------------------------------------------

@@ -18,6 +18,7 @@ from roadgeo.matching.options import LocateOptions
 from roadgeo.matching.query import Query
 from roadgeo.matching.verdict import decide
 from roadgeo.reference.inspection import check_reference, reference_digest
+from roadgeo.reference.network_file import read_network
 from roadgeo.reference.reference import open_reference
 from roadgeo.running import sharding
 from roadgeo.running.sharding import RoadFiles, ShardOptions, build_shards
@@ -37,7 +38,8 @@ def roads(tmp_path_factory):
 
 
 def write_vector_crs(path, lines):
-    write_vector(path, lines, crs=PLANE.crs)
+    n = len(lines)
+    write_vector(path, lines, crs=PLANE.crs, highway=["residential"] * n, name=[f"{k}th Street" for k in range(n)])
     return path
 
 
@@ -81,6 +83,12 @@ def test_shards_hold_what_the_whole_holds(whole, sharded):
     assert sum(entry.own_intersections for entry in entries) == pytest.approx(len(whole.index), abs=3)
     assert {entry.crs for entry in entries} == {whole.index.plane.crs}
     assert check_reference(sharded.path) == []
+
+
+def test_streets_keep_their_names_and_kinds(sharded):
+    network = read_network(sharded.parts[0].path)
+    assert set(network.kinds) == {"residential"}
+    assert all(name.endswith("th Street") for name in network.names)
 
 
 @pytest.mark.parametrize("place", [(1200.0, 1300.0), (2500.0, 2500.0), (2500.0, 3700.0), (3800.0, 900.0)])
