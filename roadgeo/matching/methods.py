@@ -259,9 +259,7 @@ def _search_pairs(query: Query, index: ReferenceIndex, options: PairOptions, tim
     scene = query.scene
     reference, table = _pair_index(index, options)
     limited = replace(options, time_limit_s=time_limit_s)
-    seen = scene.intersections
-    taken = np.flatnonzero(seen.residual <= options.max_fit_error_px) if options.discard_poor else np.arange(len(seen))
-    match = match_pairs(seen.only(taken), reference, table, scene.corners, limited)
+    match = match_pairs(scene.intersections, reference, table, scene.corners, limited)
     found = Found(
         index,
         said=match.reason,
@@ -272,7 +270,7 @@ def _search_pairs(query: Query, index: ReferenceIndex, options: PairOptions, tim
     if match.homography is None:
         return found
     matched = np.full(len(scene.intersections), -1, np.int64)
-    matched[taken[match.matches[:, 0]]] = reference.node[match.matches[:, 1]]
+    matched[match.matches[:, 0]] = reference.node[match.matches[:, 1]]
     chosen = matched >= 0
     gap = Homography(match.homography)(scene.intersections.xy[chosen]) - index.xy[matched[chosen]]
     distance = np.zeros(len(matched))

@@ -12,9 +12,9 @@ from roadgeo.reference.reference import build_network
 
 @pytest.fixture(scope="module")
 def index():
-    """A lattice of 200 m with one street that bends right beside every intersection it crosses."""
+    """A lattice of 200 m with one street that winds."""
     at = np.arange(6) * 200.0
-    bent = [(x + d, 400.0 + (6.0 if d else 0.0)) for x in at for d in (-16.0, 0.0, 16.0)]
+    bent = [(x, 400.0 + 3.0 * (-1) ** k) for k, x in enumerate(np.arange(-50.0, 1051.0, 10.0))]
     rows = [LineString(bent) if y == 400.0 else LineString([(-50, y), (1050, y)]) for y in at]
     return build_index(build_network([*rows, *(LineString([(x, -50), (x, 1050)]) for x in at)], PLANE, {"name": "l"}))
 

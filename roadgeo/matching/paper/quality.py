@@ -51,7 +51,11 @@ def well_fitted(index: ReferenceIndex, options: QualityOptions | None = None) ->
     out = np.empty((len(points), 3))
     reach = np.full(len(points), options.reach_m)
     road_residuals(points, along, reach, math.cos(math.radians(options.max_turn_deg)), index.road_buckets, out)
-    error = np.abs(out[:, 0]).reshape(-1, len(steps)).mean(axis=1)  # NaN where the branch is too short
+    across = np.column_stack([-along[:, 1], along[:, 0]])
+    offsets = (out[:, 0] * (out[:, 1:] * across).sum(axis=1)).reshape(-1, len(steps))
+    # What is left beside the line fitted to a branch, which need not meet the intersection; NaN: it is too short.
+    basis = np.linalg.qr(np.column_stack([np.ones(len(steps)), steps]))[0]
+    error = np.abs(offsets - offsets @ basis @ basis.T).mean(axis=1)
     good = np.ones(len(index), bool)
     good[at[~(error <= options.max_error_m)]] = False
     return good

@@ -61,10 +61,8 @@ class PairOptions:
     max_tuple_intersections : int
         Of larger queries, this many intersections at random form the tuples; all of them still judge.
     discard_poor : bool
-        Leave out intersections whose branches are too short or fit their tangents badly, as section 4.2 does: of the
-        reference by `quality.well_fitted`, of the query by `max_fit_error_px`.
-    max_fit_error_px : float
-        Rms distance of the query's branches from their tangents.
+        Leave out intersections of the reference whose branches are too short or fit their tangents badly, as section
+        4.2 does (see `quality.well_fitted`).
     time_limit_s : float
         The search stops after this many seconds.
     """
@@ -84,7 +82,6 @@ class PairOptions:
     rarest_first: bool = True
     max_tuple_intersections: int = 1000
     discard_poor: bool = True
-    max_fit_error_px: float = 0.5
     time_limit_s: float = 10.0
 
 
