@@ -236,6 +236,8 @@ class Location:
         The best other places on any of the references, best first, in the CRS of the best one.
     options : dict or None
         What was asked, as far as it differs from the usual, in plain values; None: not told.
+    mirrored : bool
+        The mask has this place turned over only, left to right: the homography mirrors.
     stated_offset_m : float or None
         How far the middle lies from where the mask's own georeference puts it; None where it has none.
     command : str
@@ -278,6 +280,7 @@ class Location:
     corner_covariance_m2: FloatArray | None = field(default=None, repr=False)
     alternatives: tuple[Place, ...] = ()
     camera: Camera | None = field(default=None, repr=False)
+    mirrored: bool = False
 
     @property
     def located(self) -> bool:
@@ -405,6 +408,7 @@ class Location:
             "corner_sigma_m": rows(self.corner_sigma_m),
             "corner_covariance_m2": rows(self.corner_covariance_m2),
             "camera": None if self.camera is None else self.camera.to_dict(),
+            "mirrored": self.mirrored,
             "stated_offset_m": self.stated_offset_m,
             "rmse_m": rmse_m,
             "rmse_px": rmse_px,

@@ -197,6 +197,11 @@ def _drawing_options(command: Command) -> Command:
 @_drawing_options
 @segmenting_options
 @click.option(
+    "--allow-mirror",
+    is_flag=True,
+    help="Where a mask has no place, turn it over: film scanned from its back. Without it, that is only told.",
+)
+@click.option(
     "--dem",
     metavar="FILE",
     default="",

@@ -88,6 +88,7 @@ def _from_document(document: dict[str, Any]) -> Location:
         corner_covariance_m2=None if covariance is None else _array(covariance, (8, 8)),
         log10_odds=document.get("log10_odds"),
         camera=None if camera is None else _camera(camera),
+        mirrored=bool(document.get("mirrored")),
     )
 
 

@@ -95,6 +95,8 @@ class ReadOptions:
         Take the focal length from the photograph, or else the mask.
     dem : str
         Terrain model that says how high the ground lies under the camera; "" for none.
+    allow_mirror : bool
+        Masks that were mirrored have the place that they have turned over.
     """
 
     threshold: float | None = None
@@ -107,6 +109,7 @@ class ReadOptions:
     fused_with: tuple[str, ...] = ()
     threads: int = 1
     dem: str = ""
+    allow_mirror: bool = False
 
     def photo(self, task: Task, of_photograph: bool) -> str | None:
         """Return the photograph that is drawn, if any: one that was given, or the query itself."""
@@ -117,8 +120,9 @@ class ReadOptions:
         from roadgeo.running.queries import QueryOptions
 
         return QueryOptions(
-            self.threshold, self.band, self.segment, self.segmenters, self.class_name, self.fused_with, self.threads
-        )
+            self.threshold, self.band, self.segment, self.segmenters, self.class_name, self.fused_with, self.threads,
+            "allow" if self.allow_mirror else "tell",
+        )  # fmt: skip
 
 
 @dataclass(frozen=True)

@@ -66,6 +66,8 @@ class QueryOptions:
         Further looks at the same frame, fused with each query.
     threads : int
         Of a model; fixed, so that results are the same on every run.
+    mirror : "tell", "never" or "allow"
+        Of a mask that is refused, and would be located turned over: whether that is said, not asked, or the answer.
     """
 
     threshold: float | None = None
@@ -75,6 +77,7 @@ class QueryOptions:
     class_name: str | None = None
     fused_with: tuple[str, ...] = ()
     threads: int = 1
+    mirror: Literal["tell", "never", "allow"] = "tell"
 
 
 def locate_query(
@@ -103,7 +106,8 @@ def locate_query(
     if wants_mask and not query.fused_with:
         try:
             sighting = _locate_mask(path, references, options, query, how)
-            return ask_mirrored(sighting, references, options)
+            asked = query.mirror != "never"
+            return ask_mirrored(sighting, references, options, query.mirror == "allow") if asked else sighting
         except PhotographError:
             if query.segment == "never" or not isinstance(path, str):
                 raise

@@ -147,7 +147,8 @@ def _look(image: _Image, reference: Reference, start: FloatArray) -> Checked:
     options = LocateOptions()
     match = replace(options.match, camera=replace(options.match.camera, gsd_m=(gsd / 1.1, gsd * 1.1)))
     search = replace(options.search, time_limit_s=60.0)
-    locate_query(image.name, [reference], replace(options, match=match, search=search), image.settings.query, how=check)
+    query = replace(image.settings.query, mirror="never")  # that would search the whole map
+    locate_query(image.name, [reference], replace(options, match=match, search=search), query, how=check)
     if not results:
         return Checked("unknown", "hardly a road is seen in it")
     return next((one for one in results if one.verdict != "unknown"), results[0])

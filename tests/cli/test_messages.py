@@ -122,6 +122,27 @@ def test_a_mirrored_mask_is_refused_with_the_reason(porto: str, capfd: pytest.Ca
     assert sorted(path.name for path in Path().iterdir()) == ["mirrored.png", "mirrored_location.json"]
 
 
+def test_a_mirrored_mask_is_located_where_that_is_allowed(porto: str, capfd: pytest.CaptureFixture[str]) -> None:
+    """What is drawn of it is what is drawn of the mask the right way round."""
+    cv2.imwrite("mirrored.png", drone()[:, ::-1])
+    more = ["--plot", "--report", "--also", "gcps"]
+    assert locate("mirrored.png", porto, "--allow-mirror", "--json", "-q", *more) == 0
+    found = json.loads(capfd.readouterr().out)
+    assert locate(str(DRONE), porto, "--allow-mirror", "--json", "-q") == 0
+    straight = json.loads(capfd.readouterr().out)
+    assert (found["mirrored"], straight["mirrored"]) == (True, False)
+    assert "the mask is mirrored" in found["reason"]
+    assert found["camera"] is None
+    assert np.linalg.det(found["homography"]) * np.linalg.det(straight["homography"]) < 0
+    corners, others = np.array(found["footprint"]), np.array(straight["footprint"])[[1, 0, 3, 2]]
+    assert corners == pytest.approx(others, abs=0.5)
+    assert found["rmse_m"] == pytest.approx(straight["rmse_m"], abs=0.2)
+    with rasterio.open("mirrored_footprint.tif") as ours, rasterio.open("drone_footprint.tif") as his:
+        assert np.allclose(ours.bounds, his.bounds, atol=2)
+        same = ours.read(1)[5:-5, 5:-5] == his.read(1)[5 : ours.height - 5, 5 : ours.width - 5]
+        assert same.mean() > 0.98
+
+
 def test_the_place_that_a_mask_states_is_compared(porto: str, capfd: pytest.CaptureFixture[str]) -> None:
     """A mask that has a georeference, which is 120 m off in the east."""
     assert locate(str(DRONE), porto, "--json", "-q") == 0
