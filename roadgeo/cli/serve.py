@@ -1,0 +1,142 @@
+"""`roadgeo serve`: options, one call."""
+
+from __future__ import annotations
+
+import os
+import signal
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+import click
+
+from roadgeo.cli.parameters import verbosity_options
+
+if TYPE_CHECKING:
+    from roadgeo.serving.server import ServeOptions
+
+__all__ = ["serve_command"]
+
+_HELP = """Keep references open, and answer who posts a mask or a photograph.
+
+\b
+  POST /locate                           an image as the body -> the answer, JSON as of locate --json
+  POST /processes/locate/execution       the same by OGC API - Processes, the image in JSON, base64
+  GET  / /api /conformance /processes /processes/locate /jobs
+
+\b
+What is known goes into the URL, or beside the image in JSON:
+  near=LON,LAT,RADIUS  gsd=LOW,HIGH  maxTilt=DEG  focal=PIXELS  northUp=true  timeLimit=SECONDS
+
+It listens on this machine only. With --host others may ask, and then all must show a token:
+`Authorization: Bearer TOKEN`, which the environment variable ROADGEO_TOKEN or --token-file gives. There is no
+encryption; put a proxy before it where the network is not your own.
+
+Requests wait for a free process, so many as --waiting says; whoever comes then hears 503 and when to come again. The
+size of images, the time to send and to search are bounded too. Ctrl-C ends it.
+
+\b
+Examples:
+  roadgeo serve --reference boston-ma
+  curl --data-binary @photo_mask.png http://127.0.0.1:8017/locate
+  curl --data-binary @photo_mask.png "http://127.0.0.1:8017/locate?near=-71.06,42.36,5000"
+  ROADGEO_TOKEN=secret roadgeo serve --host 0.0.0.0 --jobs 4
+
+Exit status: 0 ended, 1 error, 2 usage.
+"""
+
+
+@click.command("serve", short_help="Answer over HTTP where masks and photographs lie.", help=_HELP)
+@click.option(
+    "-r",
+    "--reference",
+    "references",
+    metavar="REF",
+    type=click.Path(),
+    multiple=True,
+    help="Reference to search: REF.gpkg, or a name in the library. Repeatable. Default: all of the library.",
+)
+@click.option("--host", metavar="ADDRESS", help="Listen there, and ask for a token. Default: 127.0.0.1, without one.")
+@click.option("--port", type=click.IntRange(0, 65535), default=8017, show_default=True, help="0: any that is free.")
+@click.option("--token-file", metavar="FILE", type=click.Path(), help="The token is the first line of this file.")
+@click.option("-j", "--jobs", metavar="N", type=click.IntRange(1), default=1, show_default=True, help="Processes.")
+@click.option(
+    "--waiting", metavar="N", type=click.IntRange(0), default=8, show_default=True, help="Requests that may wait."
+)
+@click.option(
+    "--max-bytes", metavar="N", type=click.IntRange(1), default=64_000_000, show_default=True, help="Of a body."
+)
+@click.option(
+    "--max-pixels", metavar="N", type=click.IntRange(1), default=64_000_000, show_default=True, help="Of an image."
+)
+@click.option(
+    "--time-limit",
+    metavar="SECONDS",
+    type=click.FloatRange(min=0, min_open=True),
+    default=10.0,
+    show_default=True,
+    help="Of a search; requests may ask for less.",
+)
+@verbosity_options
+def serve_command(references: tuple[str, ...], quiet: bool, verbose: bool, **given: Any) -> int:  # noqa: ARG001
+    """Keep references open, and answer; for the help see above."""
+    from roadgeo.cli.compilation import compile_once
+    from roadgeo.cli.progress import print_steps
+    from roadgeo.errors import OutputError
+    from roadgeo.running.batch import open_references
+    from roadgeo.serving.server import Server
+    from roadgeo.serving.workers import Workers
+
+    options = _options(given)
+    compile_once(quiet)
+    names = [one.name for one in open_references(references, print_steps(quiet))]
+    workers = Workers(references, options.workers, options.waiting)
+    try:
+        server = Server(workers, names, options)
+    except OSError as error:
+        workers.close()
+        where = f"{options.host} port {options.port}"
+        raise OutputError(f"cannot listen on {where}: {error.strerror or error}; choose another --port") from error
+    host, port = server.server_address[:2]
+    click.echo(f"Listening on http://{host}:{port}/ for masks of {', '.join(names)}; Ctrl-C ends it.", err=True)
+    signal.signal(signal.SIGTERM, signal.default_int_handler)
+    try:
+        server.serve_forever()
+    except KeyboardInterrupt:
+        pass
+    finally:
+        server.close()
+    return 0
+
+
+def _options(given: dict[str, Any]) -> ServeOptions:
+    """Put together what the server allows.
+
+    Raises
+    ------
+    click.UsageError
+        Others may ask, and there is no token.
+    """
+    from roadgeo.serving.server import LOOPBACK, ServeOptions
+
+    token = os.environ.get("ROADGEO_TOKEN", "").strip()
+    if given["token_file"] is not None:
+        try:
+            token = Path(given["token_file"]).read_text(encoding="utf-8").split("\n", 1)[0].strip()
+        except (OSError, UnicodeDecodeError) as error:
+            raise click.UsageError(f"Cannot read the token: {error}.") from error
+        if not token:
+            raise click.UsageError(f"{given['token_file']} is empty, expected a token in its first line.")
+    host = given["host"] or "127.0.0.1"
+    if host not in LOOPBACK and not token:
+        raise click.UsageError("--host needs a token: set ROADGEO_TOKEN, or give --token-file FILE.")
+    return ServeOptions(
+        host=host,
+        port=given["port"],
+        token=token,
+        workers=given["jobs"],
+        waiting=given["waiting"],
+        max_bytes=given["max_bytes"],
+        max_pixels=given["max_pixels"],
+        time_limit_s=given["time_limit"],
+        connections=given["jobs"] + given["waiting"] + 64,
+    )

@@ -1,0 +1,114 @@
+"""What the server says of itself: the documents of OGC API - Processes, part 1."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from typing import Any
+
+from roadgeo._version import __version__
+
+__all__ = ["DOCUMENTS", "documents_of", "problem"]
+
+_CORE = "http://www.opengis.net/spec/ogcapi-processes-1/1.0/conf"
+_CONFORMS = [f"{_CORE}/{part}" for part in ("core", "ogc-process-description", "json", "oas30")]
+
+DOCUMENTS = ("/", "/api", "/conformance", "/processes", "/processes/locate", "/jobs")
+
+_HINTS: dict[str, dict[str, Any]] = {
+    "near": {
+        "title": "The middle lies within RADIUS metres of this place: LON,LAT,RADIUS",
+        "schema": {"type": "array", "items": {"type": "number"}, "minItems": 3, "maxItems": 3},
+    },
+    "gsd": {
+        "title": "Metres per pixel at the middle, least and greatest",
+        "schema": {"type": "array", "items": {"type": "number"}, "minItems": 2, "maxItems": 2},
+    },
+    "maxTilt": {
+        "title": "Greatest angle of the camera from the vertical, degrees",
+        "schema": {"type": "number", "minimum": 0, "maximum": 80},
+    },
+    "focal": {"title": "Focal length in pixels", "schema": {"type": "number", "exclusiveMinimum": 0}},
+    "northUp": {"title": "The image's up is north, within 5 degrees", "schema": {"type": "boolean"}},
+    "timeLimit": {"title": "Seconds to search", "schema": {"type": "number", "exclusiveMinimum": 0}},
+}
+
+
+def documents_of(references: Sequence[str]) -> dict[str, dict[str, Any]]:
+    """Return each document by its path."""
+    summary = {
+        "id": "locate",
+        "title": "Locate a road mask or a photograph",
+        "description": "Finds where an aerial image was taken from its roads alone, on " + ", ".join(references) + ".",
+        "version": __version__,
+        "jobControlOptions": ["sync-execute"],
+        "outputTransmission": ["value"],
+        "links": [_link("/processes/locate", "self", "this process")],
+    }
+    image = {
+        "title": "The mask or photograph, base64",
+        "schema": {"type": "string", "contentEncoding": "base64", "contentMediaType": "image/*"},
+        "minOccurs": 1,
+        "maxOccurs": 1,
+    }
+    hints = {name: {**hint, "minOccurs": 0, "maxOccurs": 1} for name, hint in _HINTS.items()}
+    location = {"title": "The answer, schema roadgeo.location/1", "schema": {"type": "object"}}
+    return {
+        "/": {
+            "title": "roadgeo",
+            "description": "Locates aerial images from their roads alone.",
+            "links": [
+                _link("/", "self", "this document"),
+                _link("/api", "service-desc", "the API", "application/vnd.oai.openapi+json;version=3.0"),
+                _link("/conformance", "http://www.opengis.net/def/rel/ogc/1.0/conformance", "what it conforms to"),
+                _link("/processes", "http://www.opengis.net/def/rel/ogc/1.0/processes", "processes"),
+                _link("/jobs", "http://www.opengis.net/def/rel/ogc/1.0/job-list", "jobs"),
+            ],
+        },
+        "/conformance": {"conformsTo": _CONFORMS},
+        "/api": _api(),
+        "/processes": {"processes": [summary], "links": [_link("/processes", "self", "processes")]},
+        "/processes/locate": {
+            **summary,
+            "inputs": {"image": image, **hints},
+            "outputs": {"location": location},
+            "links": [
+                *summary["links"],
+                _link("/processes/locate/execution", "http://www.opengis.net/def/rel/ogc/1.0/execute", "run it"),
+            ],
+        },
+        "/jobs": {"jobs": [], "links": [_link("/jobs", "self", "every request is answered at once: there are none")]},
+    }
+
+
+def problem(status: int, title: str, detail: str) -> dict[str, Any]:
+    """Return what is wrong, as RFC 7807 has it."""
+    return {"type": "about:blank", "status": status, "title": title, "detail": detail}
+
+
+def _link(href: str, rel: str, title: str, media: str = "application/json") -> dict[str, str]:
+    return {"href": href, "rel": rel, "type": media, "title": title}
+
+
+def _api() -> dict[str, Any]:
+    """Return the API in OpenAPI 3.0, in short."""
+    answer = {"200": {"description": "the answer", "content": {"application/json": {"schema": {"type": "object"}}}}}
+    busy = {"503": {"description": "as many requests as may be are waiting; Retry-After says when to come again"}}
+    binary = {"schema": {"type": "string", "format": "binary"}}
+    parameters = [{"name": name, "in": "query", "schema": {"type": "string"}} for name in _HINTS]
+    paths: dict[str, Any] = {path: {"get": {"responses": answer}} for path in DOCUMENTS}
+    paths["/locate"] = {
+        "post": {
+            "summary": "Locate the image that is the body",
+            "parameters": parameters,
+            "requestBody": {"required": True, "content": {"image/*": binary, "application/octet-stream": binary}},
+            "responses": {**answer, **busy},
+        }
+    }
+    paths["/processes/locate/execution"] = {
+        "post": {
+            "summary": "Locate an image",
+            "requestBody": {"required": True, "content": {"application/json": {"schema": {"type": "object"}}}},
+            "responses": {**answer, **busy},
+        }
+    }
+    return {"openapi": "3.0.3", "info": {"title": "roadgeo", "version": __version__}, "paths": paths}

@@ -1,0 +1,72 @@
+"""What is asked of the server, and what is refused."""
+
+import base64
+import json
+
+import pytest
+
+from roadgeo.serving.requests import Refused, ending_of, read_execution, read_hints, read_query_string
+
+
+@pytest.mark.parametrize(
+    ("head", "ending"),
+    [
+        (b"\x89PNG\r\n\x1a\n....", ".png"),
+        (b"\xff\xd8\xff\xe0", ".jpg"),
+        (b"II*\0....", ".tif"),
+        (b"RIFF....WEBP", ".webp"),
+    ],
+)
+def test_images_are_known_by_how_they_begin(head, ending):
+    assert ending_of(head) == ending
+
+
+@pytest.mark.parametrize("head", [b"", b"<VRTDataset", b"PK\x03\x04", b"\x93NUMPY\x01", b"RIFF....AVI ", b"#!/bin/sh"])
+def test_what_may_refer_to_other_files_is_refused(head):
+    with pytest.raises(Refused) as refused:
+        ending_of(head)
+    assert refused.value.status == 415
+
+
+def test_hints_come_from_the_url():
+    found = read_query_string("near=-71.06,42.36,5000&gsd=0.3,0.6&maxTilt=20&focal=900&northUp=true&timeLimit=3")
+    assert found == {
+        "near": (-71.06, 42.36, 5000.0), "gsd_m": (0.3, 0.6), "max_tilt_deg": 20.0, "focal_px": 900.0,
+        "north_up": True, "time_limit_s": 3.0,
+    }  # fmt: skip
+    assert read_query_string("") == {}
+
+
+@pytest.mark.parametrize(
+    "text",
+    ["near=1,2", "near=200,0,5", "gsd=2,1", "gsd=nan,1", "maxTilt=x", "maxTilt=inf", "colour=red", "a;b", "near",
+     "&".join(f"a{k}=1" for k in range(50))],
+)  # fmt: skip
+def test_other_urls_are_refused(text):
+    with pytest.raises(Refused) as refused:
+        read_query_string(text)
+    assert refused.value.status == 400
+
+
+def test_an_image_comes_in_json():
+    body = json.dumps({"inputs": {"image": {"value": base64.b64encode(b"abc").decode()}, "gsd": [0.5, 1]}}).encode()
+    assert read_execution(body) == (b"abc", {"gsd_m": (0.5, 1.0)})
+
+
+@pytest.mark.parametrize(
+    "body",
+    [b"", b"{}", b"[" * 100_000, b'{"inputs": 3}', b'{"inputs": {"image": {"href": "http://10.0.0.1/"}}}',
+     b'{"inputs": {"image": "*"}}', b'{"inputs": {"image": 3}}', b'{"inputs": {"image": "", "near": "x"}}',
+     b'{"inputs": {"image": "", "near": [1e999, 0, 1]}}', b"\xff\xfe"],
+)  # fmt: skip
+def test_other_json_is_refused(body):
+    with pytest.raises(Refused) as refused:
+        read_execution(body)
+    assert refused.value.status == 400
+
+
+def test_a_flag_is_no_number():
+    with pytest.raises(Refused):
+        read_hints({"focal": True})
+    with pytest.raises(Refused):
+        read_hints({"northUp": 1})
