@@ -96,8 +96,10 @@ def serve_command(references: tuple[str, ...], quiet: bool, verbose: bool, **giv
         workers.close()
         where = f"{options.host} port {options.port}"
         raise OutputError(f"cannot listen on {where}: {error.strerror or error}; choose another --port") from error
-    host, port = server.server_address[:2]
-    click.echo(f"Listening on http://{host}:{port}/ for masks of {', '.join(names)}; Ctrl-C ends it.", err=True)
+    host = f"[{options.host}]" if ":" in options.host else options.host
+    click.echo(
+        f"Listening on http://{host}:{server.server_port}/ for masks of {', '.join(names)}; Ctrl-C ends it.", err=True
+    )
     signal.signal(signal.SIGTERM, signal.default_int_handler)
     try:
         server.serve_forever()

@@ -306,7 +306,8 @@ class _Handler(BaseHTTPRequestHandler):
 
     def _read_chunks(self) -> bytes:
         """Read a chunked body (RFC 9112, 7.1)."""
-        parts, total, most = [], 0, self.server.options.max_bytes
+        parts: list[bytes] = []
+        total, most = 0, self.server.options.max_bytes
         self.close_connection = True  # trailers are left unread
         while True:
             line = self.rfile.readline(256)
