@@ -93,7 +93,7 @@ def test_json_lines_stand_in_input_order_and_alone_on_standard_output(
     assert [one["query"] for one in found] == ["a.png", "missing.png", "b.png", "c.png"]
     assert [one["status"] for one in found] == ["not_located", "error", "error", "located"]
     assert all(one["schema"] == "roadgeo.location/1" and one["reason"] for one in found)
-    assert [one.get("attribution") for one in found] == [ATTRIBUTION, None, None, ATTRIBUTION]
+    assert [one["attribution"] for one in found] == [ATTRIBUTION, "", "", ATTRIBUTION]
     assert status == 1
     assert err.count("Error: ") == 2
     assert "1 located, 1 not located, 2 failed" in err
@@ -108,7 +108,7 @@ def test_processes_give_the_same_results(porto: Path, tmp_path: Path, capfd: pyt
         out, err = capfd.readouterr()
         assert err == ""
         results.append([json.loads(line) for line in out.splitlines()])
-    alone, together = ([{**one, "seconds": None} for one in found] for found in results)
+    alone, together = ([{**one, "seconds": None, "command": None} for one in found] for found in results)
     assert alone == together
     assert [one["status"] == "located" for one in alone] == [mask.in_map for mask in MASKS.values()]
     for found, mask in zip(alone, MASKS.values(), strict=True):

@@ -135,6 +135,7 @@ def test_a_mask_of_elsewhere(town):
     assert all(place["why"] != "located" for place in search["places"])
 
 
+@pytest.mark.slow
 def test_blocks_like_one_another(lattice):
     mask = mask_of(lattice.network)
     explanation = explain(mask, lattice)
@@ -164,6 +165,7 @@ def test_too_few_intersections(town):
     assert draw_explanation(explanation, RoadMask(canvas > 0), town.index).shape[1] == 2000
 
 
+@pytest.mark.slow
 def test_the_papers_method_tells_what_it_counts(town, mask):
     unhurried = SearchOptions(time_limit_s=120.0)  # its kernels may be compiled meanwhile
     explanation = explain(mask, town, LocateOptions(method="pair", search=unhurried))
@@ -204,6 +206,7 @@ class TestPicture:
         assert draw_explanation(explain(mask, town), mask, town.index).shape[1] == 2000
 
 
+@pytest.mark.slow
 def test_from_the_command_line(town, mask, tmp_path: Path, monkeypatch, capfd):
     monkeypatch.chdir(tmp_path)
     monkeypatch.setenv("ROADGEO_LIBRARY", str(tmp_path / "library"))
