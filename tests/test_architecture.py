@@ -73,3 +73,9 @@ def test_kernels_import_numpy_only(path: Path) -> None:
         for name in names:
             allowed = {"numpy", "math", "typing", "dataclasses", "__future__"}
             assert name.split(".")[0] in allowed or name.startswith("roadgeo.kernels")
+
+
+def test_commands_print_in_one_place() -> None:
+    """There, what names may hold besides text is shown, not obeyed by the terminal."""
+    printing = [path.name for path in (ROOT / "cli").glob("*.py") if "click.echo(" in path.read_text()]
+    assert printing == ["printing.py"]

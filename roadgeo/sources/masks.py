@@ -41,7 +41,7 @@ _MAX_ROAD_SHARE = 0.35  # of a frame
 
 #: OpenCV reads what is no larger than this when decoded: importing rasterio would take longer than reading the mask.
 _MAX_DECODED_BYTES = 1 << 29
-_PNG_MAGIC, _PNG_END = b"\x89PNG\r\n", b"IEND"
+_PNG_MAGIC, _PNG_END = b"\x89PNG\r\n\x1a\n", b"IEND"
 
 #: What is larger, whatever its sign, stands for no value: the least number of a type is often written for nodata.
 _MAX_VALUE = 1e30
@@ -287,12 +287,23 @@ def _read_with_opencv(path: str, name: str) -> AnyArray | None:
     content = np.fromfile(path, np.uint8)
     is_png = content[: len(_PNG_MAGIC)].tobytes() == _PNG_MAGIC
     image = None
-    if not is_png or _PNG_END in content[-1024:].tobytes():
+    if not is_png or _is_whole_png(content.data):
         with contextlib.suppress(cv2.error), silenced():
             image = cv2.imdecode(content, cv2.IMREAD_UNCHANGED)
     if is_png and image is None:  # GDAL would read the rest as black
         raise MaskError(f"{name}: a PNG that is damaged or cut short; copy or export it again")
     return image
+
+
+def _is_whole_png(content: memoryview) -> bool:
+    """Whether all chunks lie within a PNG, the last of them too: for one that claims a gigabyte, that is allocated."""
+    at = len(_PNG_MAGIC)
+    while at + 12 <= len(content):
+        size, kind = int.from_bytes(content[at : at + 4], "big"), bytes(content[at + 4 : at + 8])
+        at += 12 + size
+        if kind == _PNG_END:
+            return at <= len(content)
+    return False
 
 
 def _require_size(name: str, height: int, width: int) -> None:

@@ -306,6 +306,20 @@ def test_files_that_are_none(tmp_path: Path, roads: np.ndarray) -> None:
         assert "\n" not in str(raised.value)
 
 
+def test_a_png_is_not_decoded_where_a_chunk_claims_more_than_there_is(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """300 bytes that claimed a chunk of a gigabyte took as much memory."""
+    content = cv2.imencode(".png", np.eye(64, dtype=np.uint8) * 255)[1].tobytes()
+    (tmp_path / "whole.png").write_bytes(content + b"what some programs append")
+    assert read_mask(tmp_path / "whole.png").roads.sum() == 64
+    at = content.index(b"IDAT") - 4
+    (tmp_path / "a.png").write_bytes(content[:at] + (1 << 30).to_bytes(4, "big") + content[at + 4 :])
+    monkeypatch.delattr(cv2, "imdecode")
+    with pytest.raises(MaskError, match="damaged or cut short"):
+        read_mask(tmp_path / "a.png")
+
+
 def test_voids_are_told_on_request(tmp_path: Path) -> None:
     image = np.zeros((400, 400), np.uint8)
     for x in range(15, 400, 30):
