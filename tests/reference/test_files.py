@@ -266,6 +266,27 @@ def test_readers_are_not_disturbed_by_a_writer(tmp_path: Path) -> None:
     assert min(n_opened.values()) > 0
 
 
+@pytest.mark.slow
+def test_four_processes_read_what_is_replaced_a_hundred_times(tmp_path: Path) -> None:
+    path = tmp_path / "REF.gpkg"
+    networks = [as_stored(grid_network(size, size, seed=size)) for size in kill_writers.SIZES]
+    write_reference(path, networks[0], kill_writers.parts(networks[0]))
+    command = [sys.executable, kill_writers.__file__, "--read", str(path)]
+    readers = [subprocess.Popen(command, stdout=subprocess.PIPE, text=True) for _ in range(4)]
+    try:
+        assert [reader.stdout.readline() for reader in readers if reader.stdout] == ["reading\n"] * 4
+        for n in range(100):
+            write_reference(path, networks[n % 2], kill_writers.parts(networks[n % 2]))
+    finally:
+        (tmp_path / "stop").touch()
+        told = [reader.communicate(timeout=60)[0].split() for reader in readers]
+    assert [reader.returncode for reader in readers] == [0] * 4
+    for torn, small, large in told:
+        assert int(torn) == 0
+        assert int(small)
+        assert int(large)
+
+
 def test_an_index_that_comes_and_goes_while_it_is_opened(
     tmp_path: Path, network: RoadNetwork, monkeypatch: pytest.MonkeyPatch
 ) -> None:

@@ -19,6 +19,8 @@ import time
 from pathlib import Path
 from typing import Any
 
+import numpy as np
+
 sys.path.insert(0, str(Path(__file__).parents[1]))  # run as a program, this file finds `worlds` beside its folder
 
 from worlds.networks import grid_network
@@ -43,6 +45,18 @@ def write_for_ever(path: Path) -> None:
         for network in networks:
             write_reference(path, network, parts(network))
             print("written", flush=True)
+
+
+def read_for_ever(path: Path) -> None:
+    """Open a reference again and again until told to stop; print how often what was torn, and each size, was met."""
+    known = {len(xy): xy for xy in (as_stored(grid_network(size, size, seed=size)).intersections.xy for size in SIZES)}
+    met = dict.fromkeys([0, *known], 0)
+    print("reading", flush=True)
+    while not path.with_name("stop").exists():
+        meta, arrays = open_reference(path, parts)
+        whole = meta["n"] in known and np.array_equal(arrays["xy"], known[meta["n"]])
+        met[meta["n"] if whole else 0] += 1
+    print(*met.values(), flush=True)
 
 
 def kill_own_writer(path: Path, rng: random.Random) -> None:
@@ -126,8 +140,12 @@ def main() -> None:
     parser.add_argument("--count", type=int, default=100)
     parser.add_argument("--seed", type=int, default=0)
     parser.add_argument("--write", type=Path, help=argparse.SUPPRESS)
+    parser.add_argument("--read", type=Path, help=argparse.SUPPRESS)
     parser.add_argument("command", nargs="*")
     options = parser.parse_args()
+    if options.read:
+        read_for_ever(options.read)
+        return
     if options.write:
         write_for_ever(options.write)
     print(json.dumps(run(options.count, options.seed, options.command)))
