@@ -16,7 +16,7 @@ import click
 from roadgeo._version import __version__
 from roadgeo.cli.printing import echo
 from roadgeo.errors import RoadgeoError
-from roadgeo.storage.gdal import skip_drivers
+from roadgeo.storage.gdal import forget_missing_proj_data, skip_drivers
 
 __all__ = ["COMMANDS", "ERROR", "INTERRUPTED", "NOT_LOCATED", "cli", "main"]
 
@@ -109,6 +109,7 @@ def cli(ctx: click.Context) -> None:
 def main(arguments: Sequence[str] | None = None) -> int:
     """Run the command line and return its exit status; every error is one line on standard error."""
     skip_drivers()
+    forget_missing_proj_data()
     try:
         status = cli.main(
             args=None if arguments is None else list(arguments), prog_name="roadgeo", standalone_mode=False

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+from contextlib import ExitStack
 from pathlib import Path
 
 import numpy as np
@@ -65,6 +66,8 @@ def _write_mask(path: Path, subject: Subject) -> None:
     import rasterio.shutil
     from rasterio.enums import Resampling
 
+    from roadgeo.storage.rasters import writing_raster
+
     grid = subject.grid
     size = grid.resolution
     profile = {
@@ -77,7 +80,10 @@ def _write_mask(path: Path, subject: Subject) -> None:
         "crs": subject.crs,
         "transform": rasterio.Affine(size, 0.0, grid.west, 0.0, -size, grid.north),
     }
-    with rasterio.MemoryFile(ext="tif") as optimized, rasterio.open("", "w", **profile) as plain:
+    with ExitStack() as stack:
+        stack.enter_context(writing_raster(path))
+        optimized = stack.enter_context(rasterio.MemoryFile(ext="tif"))
+        plain = stack.enter_context(rasterio.open("", "w", **profile))
         plain.write(warp_mask(subject), 1)
         plain.write_colormap(1, {value: _rgba(color) for value, (color, _, _) in PALETTE.items()})
         plain.update_tags(**_tags(subject))

@@ -9,7 +9,15 @@ from __future__ import annotations
 import os
 from pathlib import Path
 
-__all__ = ["CONSENT", "NETWORK", "SEALED", "allowed_drivers", "is_named_remote", "skip_drivers"]
+__all__ = [
+    "CONSENT",
+    "NETWORK",
+    "SEALED",
+    "allowed_drivers",
+    "forget_missing_proj_data",
+    "is_named_remote",
+    "skip_drivers",
+]
 
 #: Environment variable that names further drivers to allow, for example "VRT" or "VRT,netCDF".
 CONSENT = "ROADGEO_GDAL_DRIVERS"
@@ -38,6 +46,17 @@ def skip_drivers() -> None:
     kept = set(allowed_drivers())
     names = dict.fromkeys(name for name in (*before, *_SKIPPED) if name and name not in kept)
     os.environ["GDAL_SKIP"] = ",".join(names)
+
+
+def forget_missing_proj_data() -> None:
+    """Forget where PROJ's data are said to be (another installation's, long gone) if they are not there.
+
+    The libraries bring their own, which they would not look for. Call it before they are loaded.
+    """
+    for name in ("PROJ_DATA", "PROJ_LIB"):
+        folders = os.environ.get(name, "").split(os.pathsep)
+        if not any((Path(folder) / "proj.db").is_file() for folder in folders if folder):
+            os.environ.pop(name, None)
 
 
 def allowed_drivers() -> list[str]:

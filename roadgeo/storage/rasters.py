@@ -106,15 +106,16 @@ def writing_raster(path: str | os.PathLike[str]) -> Iterator[None]:
         It cannot be written.
     """
     from rasterio._err import CPLE_BaseError
-    from rasterio.errors import RasterioError
+    from rasterio.errors import CRSError, RasterioError
 
     try:
         yield
-    except (RasterioError, CPLE_BaseError) as error:
+    except (RasterioError, CPLE_BaseError, CRSError) as error:
         reason = " ".join(str(error.__cause__ or error).split())[:300]
-        raise OutputError(
-            f"cannot write {os.fspath(path)}: {reason}; is the disk full, or the picture damaged?"
-        ) from error
+        doubt = "is the disk full, or the picture damaged?"
+        if "proj.db" in reason:
+            doubt = "PROJ's data are missing: unset PROJ_DATA and PROJ_LIB, or install rasterio again"
+        raise OutputError(f"cannot write {os.fspath(path)}: {reason}; {doubt}") from error
 
 
 def require_file(path: str | os.PathLike[str], name: str) -> None:

@@ -32,7 +32,7 @@ from roadgeo.matching.options import LocateOptions
 from roadgeo.reference.reference import Reference, open_reference
 from roadgeo.workflows import locate
 
-SIDE = 500
+SIDE = 300
 
 
 def resident_mb() -> float:
@@ -48,14 +48,14 @@ def draw_masks(folder: Path, count: int) -> list[Path]:
     rng = np.random.default_rng(0)
     paths = []
     for k in range(count):
-        x, y = rng.uniform(200, 1300, 2)
+        x, y = rng.uniform(250, 750, 2)
         seen = shapely.affinity.rotate(
-            shapely.MultiLineString(random_lines(1 + (k % 5 == 3), 2000.0)), rng.uniform(0, 360), origin=(x, y)
+            shapely.MultiLineString(random_lines(1 + (k % 5 == 3), 1000.0, 60.0)), rng.uniform(0, 360), origin=(x, y)
         )
         mask = np.zeros((SIDE, SIDE), np.uint8)
         for line in seen.geoms:
             at = (np.array(line.coords) - (x, y)) * (1, -1) + SIDE / 2
-            cv2.polylines(mask, [np.rint(at).astype(np.int32)], False, 255, 8)
+            cv2.polylines(mask, [np.rint(at).astype(np.int32)], False, 255, 6)
         content = cv2.imencode(".png", mask)[1].tobytes()
         paths.append(folder / f"{k}.png")
         paths[-1].write_bytes(content[: len(content) // 2] if k % 10 == 7 else content)
@@ -65,7 +65,7 @@ def draw_masks(folder: Path, count: int) -> list[Path]:
 def main(count: int, effort: str = "quick") -> dict[str, Any]:
     """Locate `count` masks, and tell what each tenth of them took."""
     folder = Path(tempfile.mkdtemp(prefix="roadgeo-endurance-"))
-    network = random_network(1, 2000.0)
+    network = random_network(1, 1000.0, 60.0)
     Reference(build_index(network), network).save(folder / "town.gpkg")
     masks = draw_masks(folder, 50)
     options = LocateOptions(effort=effort)
