@@ -1,0 +1,174 @@
+"""Change one thing at a time in the geometry core; its tests must notice.
+
+    python tests/support/mutate.py [MODULE ...] [--sample 100]
+
+Operators, comparisons, numbers, conditions and returned values inside functions of `roadgeo.geometry` (homography, frame,
+camera, pinhole) are changed one after another, and tests/geometry is run on each mutant until a test fails. Tests are
+collected once; each mutant lives in a fork. Prints the mutants that survive, and one JSON object.
+"""
+
+import argparse
+import ast
+import contextlib
+import copy
+import importlib
+import io
+import json
+import os
+import random
+import signal
+import sys
+import types
+from collections.abc import Iterator
+from pathlib import Path
+from typing import Any
+
+import pytest
+
+ROOT = Path(__file__).parents[2]
+MODULES = ("homography", "frame", "camera", "pinhole")
+SECONDS = 120
+
+SWAPS: dict[type[ast.AST], type[ast.AST]] = {
+    ast.Add: ast.Sub,
+    ast.Sub: ast.Add,
+    ast.Mult: ast.Div,
+    ast.Div: ast.Mult,
+    ast.Pow: ast.Mult,
+    ast.Lt: ast.GtE,
+    ast.GtE: ast.Lt,
+    ast.Gt: ast.LtE,
+    ast.LtE: ast.Gt,
+    ast.Eq: ast.NotEq,
+    ast.NotEq: ast.Eq,
+    ast.And: ast.Or,
+    ast.Or: ast.And,
+    ast.USub: ast.UAdd,
+    ast.Is: ast.IsNot,
+    ast.IsNot: ast.Is,
+    ast.MatMult: ast.Mult,
+}
+
+
+def changes(node: ast.AST) -> Iterator[tuple[str, Any]]:
+    """Yield what to call each change of a node, and the value of its field `op`, `ops`, `value` or `test`."""
+    if isinstance(node, ast.BinOp | ast.BoolOp | ast.UnaryOp | ast.AugAssign) and type(node.op) in SWAPS:
+        yield "op", SWAPS[type(node.op)]()
+    if isinstance(node, ast.Compare) and type(node.ops[0]) in SWAPS:
+        yield "ops", [SWAPS[type(node.ops[0])](), *node.ops[1:]]
+    if isinstance(node, ast.Constant) and isinstance(node.value, int | float):
+        yield "value", not node.value if isinstance(node.value, bool) else node.value + 1
+    if isinstance(node, ast.If | ast.IfExp | ast.While):
+        yield "test", ast.UnaryOp(ast.Not(), node.test)
+    if isinstance(node, ast.Return) and node.value is not None and not isinstance(node.value, ast.Constant):
+        yield "value", ast.Constant(None)
+
+
+def inside_functions(tree: ast.Module) -> Iterator[ast.AST]:
+    """Yield the nodes of function bodies, without annotations, decorators, defaults and docstrings."""
+    for function in (node for node in ast.walk(tree) if isinstance(node, ast.FunctionDef)):
+        for statement in function.body:
+            for node in ast.walk(statement):
+                if not isinstance(node, ast.FunctionDef):
+                    yield node
+
+
+def mutants(source: str) -> Iterator[tuple[str, ast.Module]]:
+    """Yield every mutant of a module, with where and what was changed."""
+    tree = ast.parse(source)
+    nodes = list(dict.fromkeys(inside_functions(tree)))
+    for node in nodes:
+        for field, value in changes(node):
+            kept = getattr(node, field)
+            before = ast.unparse(node)
+            setattr(node, field, value)
+            ast.fix_missing_locations(tree)
+            yield f"{node.lineno}: {before[:60]} -> {ast.unparse(node)[:60]}", copy.deepcopy(tree)
+            setattr(node, field, kept)
+
+
+def codes(code: types.CodeType, prefix: str = "") -> Iterator[tuple[str, types.CodeType]]:
+    """Yield the code of functions by their qualified names."""
+    for one in code.co_consts:
+        if isinstance(one, types.CodeType):
+            yield one.co_qualname, one
+            yield from codes(one)
+
+
+def install(module: types.ModuleType, tree: ast.Module) -> None:
+    """Give a module's functions, wherever they were imported to, the code of a mutant."""
+    mutated = dict(codes(compile(tree, str(module.__file__), "exec")))
+    owners = [module, *(value for value in vars(module).values() if isinstance(value, type))]
+    for owner in owners:
+        for value in list(vars(owner).values()):
+            for function in (
+                value,
+                getattr(value, "fget", None),
+                getattr(value, "__func__", None),
+                getattr(value, "func", None),
+            ):
+                function = getattr(function, "__wrapped__", function)
+                if isinstance(function, types.FunctionType) and function.__module__ == module.__name__:
+                    function.__code__ = mutated.get(function.__qualname__, function.__code__)
+
+
+class Loop:
+    """A plugin of pytest: runs the collected tests on each mutant in place of once."""
+
+    def __init__(self, names: list[str], sample: int, seed: int) -> None:
+        self.found: list[tuple[str, bool]] = []
+        self.jobs = [
+            (importlib.import_module(f"roadgeo.geometry.{name}"), where, tree)
+            for name in names
+            for where, tree in mutants((ROOT / f"roadgeo/geometry/{name}.py").read_text("utf-8"))
+        ]
+        self.total = len(self.jobs)
+        if sample and sample < self.total:
+            self.jobs = random.Random(seed).sample(self.jobs, sample)
+
+    def pytest_runtestloop(self, session: pytest.Session) -> bool:
+        assert self.passes(session, None, None), "the tests must pass before anything is changed"
+        for module, where, tree in self.jobs:
+            survived = self.passes(session, module, tree)
+            self.found.append((f"{module.__name__}:{where}", survived))
+            if survived:
+                os.write(2, f"survived {module.__name__}:{where}\n".encode())
+        return True
+
+    def passes(self, session: pytest.Session, module: types.ModuleType | None, tree: ast.Module | None) -> bool:
+        """Run the tests in a fork until one fails; what takes too long has failed."""
+        child = os.fork()
+        if child:
+            return os.waitpid(child, 0)[1] == 0
+        signal.setitimer(signal.ITIMER_PROF, SECONDS)
+        status = 1
+        with contextlib.suppress(BaseException):
+            if module is not None and tree is not None:
+                install(module, tree)
+            for n, item in enumerate(session.items):
+                following = session.items[n + 1] if n + 1 < len(session.items) else None
+                item.config.hook.pytest_runtest_protocol(item=item, nextitem=following)
+                if session.testsfailed:
+                    break
+            else:
+                status = 0
+        os._exit(status)
+
+
+def main() -> None:
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument("modules", nargs="*", default=list(MODULES))
+    parser.add_argument("--sample", type=int, default=0, help="Of all mutants only so many, drawn at random.")
+    parser.add_argument("--seed", type=int, default=0)
+    options = parser.parse_args()
+    loop = Loop(options.modules, options.sample, options.seed)
+    with contextlib.redirect_stdout(io.StringIO()):
+        pytest.main(["-q", "-x", "-p", "no:cacheprovider", str(ROOT / "tests/geometry")], plugins=[loop])
+    killed = sum(not survived for _, survived in loop.found)
+    share = round(killed / max(len(loop.found), 1), 3)
+    print(json.dumps({"mutants": loop.total, "tried": len(loop.found), "killed": killed, "share": share}))
+
+
+if __name__ == "__main__":
+    sys.path[:0] = [str(ROOT), str(ROOT / "tests")]
+    main()
