@@ -159,12 +159,16 @@ class Seconds:
 
 @dataclass(frozen=True)
 class Stats:
-    """How much work the search did."""
+    """How much work the search did: counts, and what they would take one core of a usual machine, in milliseconds.
+
+    Of a larger map more is allowed, and counts as less (see `matching.search.SearchOptions`).
+    """
 
     tuples_sampled: int = 0
     candidates: int = 0
     hypotheses: int = 0
     verified: int = 0
+    work_ms: int = 0
 
 
 @dataclass(frozen=True)
@@ -234,6 +238,9 @@ class Location:
         Where the camera was; None where no camera above the ground would see the frame so.
     alternatives : tuple of Place
         The best other places on any of the references, best first, in the CRS of the best one.
+    stopped : str
+        What ended the search: "accepted", an answer that stands out; "exhausted", nothing was left to try; "work" or
+        "time", a limit. Only with "time" may the answer depend on the machine and its load. "" where none was needed.
     options : dict or None
         What was asked, as far as it differs from the usual, in plain values; None: not told.
     mirrored : bool
@@ -270,6 +277,7 @@ class Location:
     runner_up: Place | None = None
     seconds: Seconds = field(default_factory=Seconds)
     stats: Stats = field(default_factory=Stats)
+    stopped: str = ""
     options: dict[str, Any] | None = field(default=None, repr=False)
     reference_digest: str = ""
     command: str = field(default="", repr=False)
@@ -432,5 +440,7 @@ class Location:
                 "candidates": self.stats.candidates,
                 "hypotheses": self.stats.hypotheses,
                 "verified": self.stats.verified,
+                "work_ms": self.stats.work_ms,
             },
+            "stopped": self.stopped,
         }

@@ -39,9 +39,7 @@ __all__ = ["evaluate_command"]
 @click.option("--method", type=click.Choice(["auto", "pair"]), default="auto", show_default=True, help="As in locate.")
 @click.option("--effort", type=click.Choice(["quick", "full"]), default="full", show_default=True, help="As in locate.")
 @hint_options("gsd_m", "max_tilt_deg", "north_up", gsd_m="--known-gsd")
-@click.option(
-    "--time-limit", type=click.FloatRange(0.01), metavar="S", default=10.0, show_default=True, help="Per mask."
-)
+@click.option("--time-limit", type=click.FloatRange(0.01), metavar="S", help="Per mask. Default: as in locate.")
 @click.option(
     "--radius", metavar="METRES", type=click.FloatRange(0.01), default=20.0, show_default=True, help="Right if nearer."
 )
@@ -74,7 +72,7 @@ def evaluate_command(
     gsd_m: tuple[float, float] | None,
     max_tilt_deg: float | None,
     north_up: bool,
-    time_limit: float,
+    time_limit: float | None,
     radius: float,
     jobs: int,
     as_map: bool,

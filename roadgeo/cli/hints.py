@@ -95,7 +95,7 @@ def _lies_on(reference: AnyReference, lonlat: tuple[float, float], radius_m: flo
 
 def make_options(
     method: Literal["auto", "pair"],
-    time_limit_s: float,
+    time_limit_s: float | None,
     hints: dict[str, Any],
     effort: Literal["quick", "full"] = "full",
 ) -> LocateOptions:
@@ -119,5 +119,7 @@ def make_options(
     near = known.pop("near", None)
     known = {name: value for name, value in known.items() if value != "exif"}
     match = replace(default.match, camera=replace(default.match.camera, **known))
-    search = replace(default.search, time_limit_s=time_limit_s)
-    return replace(default, method=method, near=near, effort=effort, match=match, search=search)
+    search, pair = default.search, default.pair
+    if time_limit_s is not None:
+        search, pair = replace(search, time_limit_s=time_limit_s), replace(pair, time_limit_s=time_limit_s)
+    return replace(default, method=method, near=near, effort=effort, match=match, search=search, pair=pair)

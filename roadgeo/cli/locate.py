@@ -231,9 +231,7 @@ def _drawing_options(command: Command) -> Command:
     "--time-limit",
     metavar="SECONDS",
     type=click.FloatRange(min=0, min_open=True),
-    default=10.0,
-    show_default=True,
-    help="Stop searching for a mask after this time.",
+    help="Stop searching for a mask after this time, wherever the search is. Default: 60, with --method pair 10.",
 )
 @click.option(
     "--skip-existing/--overwrite",
@@ -250,7 +248,7 @@ def locate_command(
     as_json: bool,
     method: Literal["auto", "pair"],
     effort: Literal["quick", "full"],
-    time_limit: float,
+    time_limit: float | None,
     skip_existing: bool,
     jobs: int,
     engine: str | None,

@@ -15,6 +15,7 @@ from roadgeo.cli.command_line import made_by
 from roadgeo.cli.folders import make_folder
 from roadgeo.cli.parameters import verbosity_options
 from roadgeo.cli.photographs import read_options, segmenting_options
+from roadgeo.cli.printing import echo
 
 if TYPE_CHECKING:
     from roadgeo.running.verifying import Verified, VerifyRun
@@ -156,7 +157,7 @@ def verify_command(
         write_table(Path(out_dir) / "roadgeo_verify.csv", documents)
         if not quiet:
             said = ", ".join(f"{n} {verdict}" for verdict, n in counts.items())
-            click.echo(f"{said}; all of them: {Path(out_dir) / 'roadgeo_verify.csv'}", err=True)
+            echo(f"{said}; all of them: {Path(out_dir) / 'roadgeo_verify.csv'}", err=True)
     return ERROR if counts["error"] else OFF if counts["off"] else NOT_LOCATED if counts["unknown"] else 0
 
 
@@ -204,12 +205,12 @@ def describe(document: dict[str, Any]) -> str:
 
 def _report(one: Verified, files: list[Path], as_json: bool, quiet: bool, verbose: bool) -> None:
     if as_json:
-        click.echo(json.dumps({**one.document, **made_by()}))
+        echo(json.dumps({**one.document, **made_by()}))
     if one.verdict == "error":
-        click.echo(f"{click.style('Error:', fg='red')} {' '.join(one.document['reason'].split())}", err=True)
+        echo(f"{click.style('Error:', fg='red')} {' '.join(one.document['reason'].split())}", err=True)
     elif not quiet:
-        click.echo(describe(one.document), err=as_json)
+        echo(describe(one.document), err=as_json)
         if verbose and one.document.get("log10_lead") is not None:
-            click.echo(f"  leads any other place nearby by 10^{one.document['log10_lead']:.1f}", err=as_json)
+            echo(f"  leads any other place nearby by 10^{one.document['log10_lead']:.1f}", err=as_json)
         if files:
-            click.echo(f"  wrote {', '.join(map(str, files))}", err=as_json)
+            echo(f"  wrote {', '.join(map(str, files))}", err=as_json)

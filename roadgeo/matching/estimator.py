@@ -25,6 +25,7 @@ from roadgeo.matching.sweeps import LAST, USUAL, Source, Sweep
 from roadgeo.matching.trace import NO_TRACE, Trace
 from roadgeo.matching.triples import Proposals, larger
 from roadgeo.matching.verification import Agreement, VerifyOptions, agreement, chance_agreement, log10_odds
+from roadgeo.matching.work import Work
 
 __all__ = ["GrowOptions", "Hypothesis", "Ledger", "MatchOptions", "Source", "Sweep", "TripleEstimator"]
 
@@ -213,6 +214,13 @@ class TripleEstimator:
         most = self.n_screened + int(options.max_last_places * larger_by)
         for stage, source in enumerate(options.last, len(options.sweeps) + 1):
             yield self._sweep(stage, source, options.last_grow, most)
+
+    @property
+    def work(self) -> float:
+        """Seconds that a usual machine takes for what was done (see `search.Estimator`)."""
+        points = len(self.scene.dense_points)
+        counts = (len(self._tried), self.n_candidates, self.n_screened, self.n_hypotheses, self.n_verified, points)
+        return Work(*counts).seconds
 
     def leads(self, model: Hypothesis) -> list[Lead]:
         """Return what led to a hypothesis (see `search.Estimator`)."""

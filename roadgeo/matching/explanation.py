@@ -9,8 +9,9 @@ seen          `intersections` (all of them usable up to `SceneOptions.max_inters
               tangents or more, `roads`, their length and the frame's size in pixels, the share of it that was observed
 searches      one for each reference, in the order in which they were searched:
 
-              `reference`, `stopped` ("accepted", "exhausted", "time", "elsewhere": a place on another reference ended
-              the search, or "" where there was nothing to search for), `needed` (the least log10 odds and margin)
+              `reference`, `stopped` ("accepted", "exhausted", "work" or "time", "elsewhere": a place on another
+              reference ended the search, or "" where there was nothing to search for), `needed` (the least log10 odds
+              and margin)
 
               `funnel`, what went into and came out of each stage: `anchors` (intersections tried), `tuples` of the
               mask looked up, `candidates` (tuples of the map like them), `proposals` (places on which several agree),
@@ -486,8 +487,8 @@ def _missing(
 ) -> list[str]:
     """Say what was missing, the surest first."""
     told, scene = [], search.scene
-    if result.stopped == "time":
-        told.append("time: the search was stopped by its limit, places may be left untried")
+    if result.stopped in ("time", "work"):
+        told.append(f"{result.stopped}: the search was stopped by its limit, places may be left untried")
     starved = _starved(funnel, record, result, needed)
     if starved in _NOTHING:
         told.append(_NOTHING[starved])

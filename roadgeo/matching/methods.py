@@ -24,6 +24,7 @@ from roadgeo.matching.parts import Near, Part, same_within_m
 from roadgeo.matching.query import Query
 from roadgeo.matching.search import Search, SearchResult, search_together
 from roadgeo.matching.trace import NO_TRACE, Trace
+from roadgeo.matching.triples import larger
 from roadgeo.roads.intersections import Intersections
 
 __all__ = ["Fit", "Found", "search_references"]
@@ -117,7 +118,7 @@ def search_references(
     if len(query.scene.intersections) < options.min_intersections:
         return [Found(index) for index in indexes]
     if options.method == "pair":
-        return _search_pairs_in_turn(query, indexes, options.pair, time_limit_s)
+        return _search_pairs_in_turn(query, indexes, options.pair, min(time_limit_s, options.pair.time_limit_s))
     started, ledger = time.perf_counter(), Ledger()
     opened = [_Attempt.open(query, one, options, trace, ledger) for one, trace in zip(indexes, traces, strict=True)]
     left = time_limit_s - (time.perf_counter() - started)
@@ -126,8 +127,10 @@ def search_references(
     def same(one: Search[Hypothesis], a: Hypothesis, other: Search[Hypothesis], b: Hypothesis) -> bool:
         return _same_ground(estimators[one], a, estimators[other], b)
 
-    search_together(list(estimators), replace(options.search, time_limit_s=left), same)
-    return [one.found() for one in opened]
+    scale = larger(sum(one.n_searched for one in opened))
+    limits = replace(options.search, time_limit_s=left, work_limit_s=scale * options.search.work_limit_s)
+    search_together(list(estimators), limits, same)
+    return [one.found(scale) for one in opened]
 
 
 def _open(parts: Sequence[Part], near: Near | None, frame_m: float) -> list[ReferenceIndex]:
@@ -168,8 +171,8 @@ class _Attempt:
         estimator = TripleEstimator(query.scene, part, promising_options(options), near, trace, ledger)
         return cls(index, len(part), estimator, Search(estimator), trace)
 
-    def found(self) -> Found:
-        """Tell what came of it."""
+    def found(self, scale: float) -> Found:
+        """Tell what came of it; work is told for a map `scale` times smaller."""
         estimator = self.estimator
         if self.search is None or estimator is None:
             return Found(self.index, n_searched=self.n_searched)
@@ -182,7 +185,13 @@ class _Attempt:
             n_searched=self.n_searched,
             n_tried=estimator.n_screened,
             n_anchors=estimator.n_anchors,
-            stats=Stats(estimator.n_tuples, estimator.n_candidates, estimator.n_hypotheses, estimator.n_verified),
+            stats=Stats(
+                estimator.n_tuples,
+                estimator.n_candidates,
+                estimator.n_hypotheses,
+                estimator.n_verified,
+                round(1000 * estimator.work / scale),
+            ),
             match_s=self.search.seconds - estimator.refine_s,
             refine_s=estimator.refine_s,
         )

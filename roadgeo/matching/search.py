@@ -1,7 +1,8 @@
 """The hypothesise-and-test loop. It knows no roads and no geometry: a toy model over integers tests it.
 
 One loop drives one problem or many parts of one: breadth first, a little of every part at each stage, and what ends it
-is one answer that stands out from all others, whichever parts they come from.
+is one answer that stands out from all others, whichever parts they come from. How long it goes on where none does is
+told by work, which is counted, so that a busy machine finds what an idle one finds; the clock is the last resort.
 """
 
 from __future__ import annotations
@@ -25,6 +26,10 @@ class Estimator(Protocol[Model]):
         All hypotheses that one sample of the query admits belong to one round, so that twins of a place are met
         together.
         """
+
+    @property
+    def work(self) -> float:
+        """What was done so far, in seconds of a usual machine; told by counts, not by a clock."""
 
     def score(self, model: Model) -> float:
         """Return the log10 odds of a model against chance."""
@@ -54,21 +59,42 @@ class SearchOptions:
         ... and leads the best different model by as much.
     more_rounds : int
         A model that reaches both but is not settled is kept for so many more rounds, in case a better version comes.
+    work_limit_s : float
+        No further round is begun, and no further model scored, after so much work: seconds of a usual machine, counted,
+        not measured, so that answers do not depend on the load. On a map of 15,000 intersections, and on a larger one
+        more by the root of the ratio.
     time_limit_s : float
-        No further round is begun, and no further model scored, after this time.
+        The same after this time by the clock: the last resort.
     """
 
     accept: float = 8.0
     margin: float = 4.0
     more_rounds: int = 25
-    time_limit_s: float = 10.0
+    work_limit_s: float = 10.0
+    time_limit_s: float = 60.0
+
+
+class _Budget:
+    """What is left of a search's work and time."""
+
+    def __init__(self, options: SearchOptions) -> None:
+        self.left_s = options.work_limit_s
+        self.deadline = time.perf_counter() + options.time_limit_s
+
+    @property
+    def spent(self) -> str:
+        """Say what is used up: "work", "time", or "" for neither."""
+        if self.left_s <= 0.0:
+            return "work"
+        return "time" if time.perf_counter() > self.deadline else ""
 
 
 @dataclass(frozen=True)
 class SearchResult(Generic[Model]):
     """Best model, the best that means something else, their scores (-inf where there is none), and what ended it.
 
-    `stopped` is "accepted"; "exhausted"; "time"; or "elsewhere", where another part's answer ended the search.
+    `stopped` is "accepted"; "exhausted"; "work" or "time", the limits; or "elsewhere", where another part's answer
+    ended the search.
     """
 
     best: Model | None
@@ -106,6 +132,7 @@ class Search(Generic[Model]):
         self.accepted_since: int | None = None
         self.stopped = ""
         self.seconds = 0.0
+        self._charged_s = 0.0
         self._stages = estimator.stages()
         self._rounds: Iterator[Iterable[Model]] | None = next(self._stages, None)
 
@@ -114,7 +141,7 @@ class Search(Generic[Model]):
         """Score of the best answer."""
         return self.leaders[0][0] if self.leaders else float("-inf")
 
-    def advance(self, deadline: float) -> bool:
+    def advance(self, budget: _Budget) -> bool:
         """Do one round; where the stage has none left pass to the next, and return False."""
         started = time.perf_counter()
         models = None if self._rounds is None else next(self._rounds, None)
@@ -124,26 +151,34 @@ class Search(Generic[Model]):
             self.stage += 1
         else:
             self.n_rounds += 1
-            self._take(models, deadline)
+            self._take(models, budget)
+        self._charge(budget)
         self.seconds += time.perf_counter() - started
         return models is not None
 
-    def follow(self, leads: Sequence[tuple[int, int]], deadline: float) -> None:
+    def follow(self, leads: Sequence[tuple[int, int]], budget: _Budget) -> None:
         """Try samples that led to an answer on another part, as far as they were not tried yet."""
         started = time.perf_counter()
         for models in self.estimator.follow(leads):
-            self._take(models, deadline)
-            if time.perf_counter() > deadline:
+            self._take(models, budget)
+            if budget.spent:
                 break
         self.seconds += time.perf_counter() - started
 
-    def _take(self, models: Iterable[Model], deadline: float) -> None:
+    def _take(self, models: Iterable[Model], budget: _Budget) -> None:
         """Score the models of a round."""
         for model in models:
             self._enter(self.estimator.score(model), model)
             self.n_scored += 1
-            if time.perf_counter() > deadline:
+            self._charge(budget)
+            if budget.spent:
                 break
+
+    def _charge(self, budget: _Budget) -> None:
+        """Take the work done since the last time off what is left."""
+        work = self.estimator.work
+        budget.left_s -= work - self._charged_s
+        self._charged_s = work
 
     def _enter(self, score: float, model: Model) -> None:
         """Keep the two best different answers after a new one came in."""
@@ -159,7 +194,7 @@ class Search(Generic[Model]):
 
 
 def search(estimator: Estimator[Model], options: SearchOptions | None = None) -> SearchResult[Model]:
-    """Score hypotheses round by round until one stands out, they are exhausted, or time is up."""
+    """Score hypotheses round by round until one stands out, they are exhausted, or a limit is reached."""
     alone = Search(estimator)
     search_together([alone], options)
     return alone.result()
@@ -175,7 +210,7 @@ class Same(Protocol[Model]):
 def search_together(
     parts: Sequence[Search[Model]], options: SearchOptions | None = None, same: Same[Model] | None = None
 ) -> None:
-    """Search many parts until one answer stands out from those of all, they are exhausted, or time is up.
+    """Search many parts until one answer stands out from those of all, they are exhausted, or a limit is reached.
 
     A round of each part in turn, one stage after another. A part whose answer stands out goes on alone until that is
     settled. What led there is tried on all other parts then: if they hold a twin, it is found, and the search goes on.
@@ -183,8 +218,8 @@ def search_together(
     options = options or SearchOptions()
     ended_by = _Together(parts, options, same).run()
     for one in parts:
-        if ended_by == "time" and not one.ended:
-            one.stopped = "time"
+        if ended_by in ("work", "time") and not one.ended:
+            one.stopped = ended_by
         else:
             one.stopped = one.stopped or ("exhausted" if one.ended else "elsewhere")
 
@@ -194,7 +229,7 @@ class _Together(Generic[Model]):
 
     def __init__(self, parts: Sequence[Search[Model]], options: SearchOptions, same: Same[Model] | None) -> None:
         self.parts, self.options, self.same = parts, options, same
-        self.deadline = time.perf_counter() + options.time_limit_s
+        self.budget = _Budget(options)
 
     def run(self) -> str:
         stage = 0
@@ -210,7 +245,7 @@ class _Together(Generic[Model]):
 
     def _go_on(self, one: Search[Model]) -> str:
         """Do a round of a part, and more while its answer stands out; say what ends the search, "" if nothing does."""
-        goes_on = one.advance(self.deadline)
+        goes_on = one.advance(self.budget)
         while goes_on:
             standing = self._stands_out(one)
             if standing and self._is_final(one):
@@ -219,11 +254,11 @@ class _Together(Generic[Model]):
                     one.stopped = "accepted"
                     return "accepted"
                 standing = False
-            if time.perf_counter() > self.deadline:
-                return "time"
+            if spent := self.budget.spent:
+                return spent
             if not standing or len(self.parts) == 1:
                 break
-            goes_on = one.advance(self.deadline) or (not one.ended and one.advance(self.deadline))
+            goes_on = one.advance(self.budget) or (not one.ended and one.advance(self.budget))
         return ""
 
     def _try_elsewhere(self, one: Search[Model]) -> None:
@@ -231,7 +266,7 @@ class _Together(Generic[Model]):
         leads = one.estimator.leads(one.leaders[0][1])
         for other in self.parts:
             if other is not one:
-                other.follow(leads, self.deadline)
+                other.follow(leads, self.budget)
 
     def _stands_out(self, one: Search[Model]) -> bool:
         """Whether a part's best answer leads every other one, on any part."""

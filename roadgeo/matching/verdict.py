@@ -20,6 +20,10 @@ from roadgeo.matching.query import Query
 __all__ = ["Needed", "decide", "needed_of"]
 
 
+#: What is said where the clock ended a search: the one case in which an answer depends on the machine and its load.
+_CUT_SHORT = "so that another run may tell otherwise"
+
+
 @dataclass(frozen=True)
 class Needed:
     """What an answer must reach; see `LocateOptions`."""
@@ -64,11 +68,12 @@ def decide(query: Query, found: Sequence[Found], options: LocateOptions) -> Loca
     if best is None or best.score < options.min_log10_odds:
         return _refuse(location, query, found, best, options)
     placed = place_frame(_on(location, best.found), query, best.fit, options.match.camera.focal_px)
+    cut = f"; stopped at the time limit, {_CUT_SHORT}" if location.stopped == "time" else ""
     if rival is not None and best.score - rival.score < options.min_margin:
-        return replace(placed, status="ambiguous", reason=_twins(best, rival), reason_code=Reason.TWO_PLACES)
+        return replace(placed, status="ambiguous", reason=_twins(best, rival) + cut, reason_code=Reason.TWO_PLACES)
     reason = (
         f"{placed.n_matched} of {placed.n_intersections} intersections and {best.fit.agreeing:.0%} of the roads agree"
-        f"; odds 10^{best.score:.1f} against chance"
+        f"; odds 10^{best.score:.1f} against chance{cut}"
     )
     return replace(placed, status="located", reason=reason, reason_code=Reason.LOCATED)
 
@@ -81,6 +86,7 @@ def _describe_work(query: Query, found: Sequence[Found]) -> Location:
         sum(one.candidates for one in stats),
         sum(one.hypotheses for one in stats),
         sum(one.verified for one in stats),
+        sum(one.work_ms for one in stats),
     )
     match_s, refine_s = sum(one.match_s for one in found), sum(one.refine_s for one in found)
     xy = query.scene.intersections.xy
@@ -92,8 +98,15 @@ def _describe_work(query: Query, found: Sequence[Found]) -> Location:
         n_intersections=len(xy),
         seconds=replace(query.seconds, match=match_s, refine=refine_s),
         stats=work,
+        stopped=_ended_by(found),
         seen=Seen(query.graph, xy),
     )
+
+
+def _ended_by(found: Sequence[Found]) -> str:
+    """Say what ended a search of one or more parts: an answer, a limit, or that nothing was left to try."""
+    ends = {one.stopped for one in found}
+    return next((end for end in ("accepted", "time", "work", "exhausted") if end in ends), "")
 
 
 def _on(location: Location, found: Found) -> Location:
@@ -183,11 +196,14 @@ def _why_nothing(query: Query, found: Found, score: float, options: LocateOption
         best = f"the best has log10 odds {score:.1f}, {options.min_log10_odds:g} are needed"
     else:
         best = "none passed the tests"
+    if found.stopped == "work":
+        told = f"stopped after as much work as a search may take; of the places tried, {best}{searched}"
+        return Reason.TIME_LIMIT, f"{told}; {_how_far(query, found, options)}"
     if found.stopped == "time":
         limit, tracing_s = options.search.time_limit_s, query.seconds.vectorize
         tracing = f", of which tracing the mask took {tracing_s:.1f} s" if tracing_s > limit / 4 else ""
-        told = f"stopped at the time limit of {limit:g} s{tracing}; of the places tried, {best}{searched}"
-        told += f"; {_how_far(query, found, options)}"
+        stopped = f"stopped at the time limit of {limit:g} s{tracing}, {_CUT_SHORT}"
+        told = f"{stopped}; of the places tried, {best}{searched}; {_how_far(query, found, options)}"
         return Reason.TIME_LIMIT, told
     nothing = f"no place on this map stands out: {best}{searched}"
     advice = "; more roads in view or another map may help"

@@ -1,7 +1,7 @@
 """Several looks at one scene: a soft map at several thresholds, a photograph at several scales.
 
-Each look is a mask of its own and is located by `workflows.locate`. All share one time limit. Who looks k times finds
-a chance resemblance k times as often, so log10(k) is taken off the odds.
+Each look is a mask of its own and is located by `workflows.locate`. All share the limits of one search. Who looks k
+times finds a chance resemblance k times as often, so log10(k) is taken off the odds.
 """
 
 from __future__ import annotations
@@ -22,7 +22,7 @@ from roadgeo.segmentation.probability import ProbabilityMap
 
 __all__ = ["Locate", "Look", "Sighting", "locate_looks"]
 
-#: Share of the time left that a look may take; the last one may take all.
+#: Share of the work left that a look may take; the last one may take all.
 _SHARE = 0.6
 
 Locate = Callable[[RoadMask, Sequence[AnyReference], LocateOptions], "Location | Explanation"]
@@ -61,7 +61,7 @@ class Sighting:
 def locate_looks(
     looks: Sequence[Look], references: Sequence[AnyReference], options: LocateOptions, how: Locate
 ) -> Sighting:
-    """Take one look after another until one is located, within the time limit of the search.
+    """Take one look after another until one is located, within the limits of one search.
 
     Raises
     ------
@@ -70,18 +70,19 @@ def locate_looks(
     """
     sightings: list[Sighting] = []
     failure: MaskError | None = None
-    left = options.search.time_limit_s
+    work_left, time_left = options.search.work_limit_s, options.search.time_limit_s
     for tried, look in enumerate(looks, 1):
-        if tried > 1 and left <= 0.05 * options.search.time_limit_s:
+        if tried > 1 and (work_left <= 0.05 * options.search.work_limit_s or time_left <= 0.0):
             break
-        limit = left if tried == len(looks) else _SHARE * left
+        share = 1.0 if tried == len(looks) else _SHARE
         try:
-            sighting = _take(look, references, _limited(options, limit), how)
+            sighting = _take(look, references, _limited(options, share * work_left, time_left), how)
         except MaskError as error:
             failure = failure or error
             continue
         seconds = sighting.location.seconds
-        left -= seconds.vectorize + seconds.match + seconds.refine
+        work_left -= sighting.location.stats.work_ms / 1000
+        time_left -= seconds.vectorize + seconds.match + seconds.refine
         sightings.append(_discount(sighting, look, tried, options))
         if sightings[-1].location.located:
             break
@@ -90,8 +91,9 @@ def locate_looks(
     return _best_of(sightings, options)
 
 
-def _limited(options: LocateOptions, time_limit_s: float) -> LocateOptions:
-    return replace(options, search=replace(options.search, time_limit_s=time_limit_s))
+def _limited(options: LocateOptions, work_limit_s: float, time_limit_s: float) -> LocateOptions:
+    limits = replace(options.search, work_limit_s=work_limit_s, time_limit_s=max(time_limit_s, 0.0))
+    return replace(options, search=limits)
 
 
 def _take(look: Look, references: Sequence[AnyReference], options: LocateOptions, how: Locate) -> Sighting:
@@ -136,7 +138,8 @@ def _refused(location: Location, reason: str) -> Location:
         location.attribution,
         reason_code=Reason.TOO_MANY_LOOKS,
     )
-    seen = {name: getattr(location, name) for name in ("size", "n_intersections", "seconds", "stats", "seen")}
+    kept = ("size", "n_intersections", "seconds", "stats", "stopped", "seen")
+    seen = {name: getattr(location, name) for name in kept}
     return replace(bare, **seen)
 
 

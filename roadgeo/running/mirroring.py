@@ -21,7 +21,7 @@ from roadgeo.workflows import locate
 __all__ = ["ask_mirrored"]
 
 #: What a try may take; a mask that is merely turned over is found at once.
-_TIME_LIMIT_S = 2.0
+_WORK_LIMIT_S = 2.0
 _WORTH_A_TRY = {Reason.NOTHING_STANDS_OUT, Reason.TIME_LIMIT}
 
 
@@ -40,7 +40,7 @@ def ask_mirrored(
     observed = None if mask.observed is None else mask.observed[:, ::-1].copy()
     turned = replace(mask, roads=mask.roads[:, ::-1].copy(), observed=observed)
     if not allowed:
-        search = replace(options.search, time_limit_s=min(_TIME_LIMIT_S, options.search.time_limit_s))
+        search = replace(options.search, work_limit_s=min(_WORK_LIMIT_S, options.search.work_limit_s))
         options = replace(options, effort="quick", search=search)
     found = locate(turned, references, options)
     if allowed and found.located:

@@ -19,6 +19,10 @@ class Toy:
 
     hidden: dict[int, list[tuple[int, float]]] = field(default_factory=dict)
 
+    @property
+    def work(self):
+        return float(len(self.scored))
+
     def stages(self):
         yield iter(self.plan)
 
@@ -106,6 +110,24 @@ def test_time_is_bounded(per_round):
     assert result.stopped == "time"
     assert 0 < result.n_scored < 50
     assert result.n_scored == len(toy.scored)
+
+
+@pytest.mark.parametrize("per_round", [1, 100])
+@pytest.mark.parametrize("seconds", [0.0, 0.005])
+def test_work_is_bounded_by_counts_not_by_the_clock(per_round, seconds):
+    """On a busy machine a limit by the clock alone struck earlier, and another answer came of it."""
+    models = [(k, 1.0 + k / 100) for k in range(100)]
+    toy = Toy([models[i : i + per_round] for i in range(0, 100, per_round)], seconds=seconds)
+    result = search(toy, SearchOptions(work_limit_s=20.0, time_limit_s=60.0))
+    assert (result.stopped, result.n_scored) == ("work", 20)
+    assert answers(result) == (19, 9)
+
+
+def test_parts_share_the_work():
+    toys = [Toy([[(100 * n + k, 1.0)] for k in range(50)]) for n in range(3)]
+    parts = together(*toys, options=SearchOptions(work_limit_s=30.0))
+    assert [len(toy.scored) for toy in toys] == [10, 10, 10]
+    assert [one.stopped for one in parts] == ["work"] * 3
 
 
 def test_impossible_models_lose_to_any_other():

@@ -1,11 +1,11 @@
-"""Several looks share one time limit, and each costs its part of the odds."""
+"""Several looks share the limits of one search, and each costs its part of the odds."""
 
 import numpy as np
 import pytest
 
 from roadgeo.errors import MaskError
 from roadgeo.geometry.mask import RoadMask
-from roadgeo.location import Location, Place, Seconds
+from roadgeo.location import Location, Place, Stats
 from roadgeo.matching.options import LocateOptions
 from roadgeo.running.looks import Look, locate_looks
 
@@ -17,15 +17,17 @@ SQUARE = np.array([[0, 1000], [1000, 1000], [1000, 0], [0, 0]], float)
 def found(status="located", odds=9.0, lon=10.0, seconds=1.0):
     place = Place(500.0, 500.0, lon, 50.0, odds)
     known = {"footprint": SQUARE, "center": place, "log10_odds": odds}
-    return Location("q", status, "why", seconds=Seconds(match=seconds), **(known if status != "not_located" else {}))
+    return Location(
+        "q", status, "why", stats=Stats(work_ms=round(1000 * seconds)), **(known if status != "not_located" else {})
+    )
 
 
 def take(*answers, options=OPTIONS):
-    """Locate looks whose answers are given; return the sighting and the time limits that were set."""
+    """Locate looks whose answers are given; return the sighting and the limits of work that were set."""
     limits, left = [], list(answers)
 
     def how(mask, references, options):
-        limits.append(options.search.time_limit_s)
+        limits.append(options.search.work_limit_s)
         answer = left.pop(0)
         if isinstance(answer, Exception):
             raise answer
@@ -53,7 +55,6 @@ def test_each_look_costs_its_part_of_the_odds_and_of_the_time():
     assert location.center.log10_odds == location.log10_odds
     assert "off the odds" in location.reason
     np.testing.assert_allclose(limits, [6.0, 5.4, 9.0])
-    assert location.seconds.match == 2.0
 
 
 def test_what_is_too_unlikely_for_a_second_look_is_refused():

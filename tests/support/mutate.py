@@ -2,9 +2,9 @@
 
     python tests/support/mutate.py [MODULE ...] [--sample 100]
 
-Operators, comparisons, numbers, conditions and returned values inside functions of `roadgeo.geometry` (homography, frame,
-camera, pinhole) are changed one after another, and tests/geometry is run on each mutant until a test fails. Tests are
-collected once; each mutant lives in a fork. Prints the mutants that survive, and one JSON object.
+Operators, comparisons, numbers, conditions and returned values inside functions of `roadgeo.geometry` (homography,
+frame, camera, pinhole) are changed one after another, and the tests of these modules run on each mutant until one fails.
+Tests are collected once; each mutant lives in a fork. Prints the mutants that survive, and one JSON object.
 """
 
 import argparse
@@ -87,7 +87,7 @@ def mutants(source: str) -> Iterator[tuple[str, ast.Module]]:
             setattr(node, field, kept)
 
 
-def codes(code: types.CodeType, prefix: str = "") -> Iterator[tuple[str, types.CodeType]]:
+def codes(code: types.CodeType) -> Iterator[tuple[str, types.CodeType]]:
     """Yield the code of functions by their qualified names."""
     for one in code.co_consts:
         if isinstance(one, types.CodeType):
@@ -101,15 +101,11 @@ def install(module: types.ModuleType, tree: ast.Module) -> None:
     owners = [module, *(value for value in vars(module).values() if isinstance(value, type))]
     for owner in owners:
         for value in list(vars(owner).values()):
-            for function in (
-                value,
-                getattr(value, "fget", None),
-                getattr(value, "__func__", None),
-                getattr(value, "func", None),
-            ):
-                function = getattr(function, "__wrapped__", function)
-                if isinstance(function, types.FunctionType) and function.__module__ == module.__name__:
-                    function.__code__ = mutated.get(function.__qualname__, function.__code__)
+            wrapped = [getattr(value, name, None) for name in ("fget", "__func__", "func")]
+            for function in (value, *wrapped):
+                inner = getattr(function, "__wrapped__", function)
+                if isinstance(inner, types.FunctionType) and inner.__module__ == module.__name__:
+                    inner.__code__ = mutated.get(inner.__qualname__, inner.__code__)
 
 
 class Loop:
@@ -163,7 +159,8 @@ def main() -> None:
     options = parser.parse_args()
     loop = Loop(options.modules, options.sample, options.seed)
     with contextlib.redirect_stdout(io.StringIO()):
-        pytest.main(["-q", "-x", "-p", "no:cacheprovider", str(ROOT / "tests/geometry")], plugins=[loop])
+        tests = [str(ROOT / f"tests/geometry/test_{name}.py") for name in MODULES]
+        pytest.main(["-q", "-x", "-p", "no:cacheprovider", *tests], plugins=[loop])
     killed = sum(not survived for _, survived in loop.found)
     share = round(killed / max(len(loop.found), 1), 3)
     print(json.dumps({"mutants": loop.total, "tried": len(loop.found), "killed": killed, "share": share}))

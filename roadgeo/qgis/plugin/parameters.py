@@ -338,7 +338,7 @@ CAMERA = _fold(
         "TIME_LIMIT",
         "Time limit, seconds",
         "Stop searching for a mask after this time.",
-        defaultValue=10.0,
+        defaultValue=60.0,
         minValue=0.1,
     ),
 )
