@@ -15,6 +15,7 @@ from roadgeo.cli import NOT_LOCATED
 from roadgeo.cli.folders import make_folder
 from roadgeo.cli.hints import hint_options, make_options, refuse_swapped
 from roadgeo.cli.parameters import verbosity_options
+from roadgeo.cli.printing import echo
 
 if TYPE_CHECKING:
     from roadgeo.flights.frames import FrameOptions
@@ -179,7 +180,7 @@ def track_command(
     counts = Counter(row.status for row in rows)
     if not quiet:
         told = ", ".join(f"{n} {status}" for status, n in counts.items())
-        click.echo(f"{len(rows)} frames: {told}; wrote {', '.join(files)}", err=True)
+        echo(f"{len(rows)} frames: {told}; wrote {', '.join(files)}", err=True)
     return NOT_LOCATED if counts["lost"] else 0
 
 
@@ -251,11 +252,11 @@ _SHOWN = {"located": "green", "tracked": "green", "predicted": "yellow", "lost":
 
 def _print(row: Row, as_json: bool, quiet: bool, verbose: bool) -> None:
     if as_json:
-        click.echo(json.dumps(row.to_dict()))
+        echo(json.dumps(row.to_dict()))
     elif not quiet:
         from roadgeo.outputs.wording import format_lonlat
 
         status = click.style(row.status, fg=_SHOWN[row.status])
         where = "" if row.center is None else f" at {format_lonlat(*row.center)}, sigma {row.sigma_m:.1f} m"
         why = f": {row.reason}" if verbose or row.status in ("lost", "predicted") else ""
-        click.echo(f"{row.name}: {status}{where}{why}")
+        echo(f"{row.name}: {status}{where}{why}")

@@ -3,8 +3,8 @@
     python tests/support/mutate.py [MODULE ...] [--sample 100]
 
 Operators, comparisons, numbers, conditions and returned values inside functions of `roadgeo.geometry` (homography,
-frame, camera, pinhole) are changed one after another, and the tests of these modules run on each mutant until one fails.
-Tests are collected once; each mutant lives in a fork. Prints the mutants that survive, and one JSON object.
+frame, camera, pinhole) are changed one after another, and the tests of these modules run on each mutant until one
+fails. Tests are collected once; each mutant lives in a fork. Prints the mutants that survive, and one JSON object.
 """
 
 import argparse
