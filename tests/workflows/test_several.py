@@ -160,7 +160,7 @@ def test_a_refusal_names_the_limits_that_were_given(query, searched, near, camer
     reason = judge(query, searched("a", stopped=stopped), near=near, match=match).reason
     if stopped == "time":
         assert reason.startswith("stopped at the time limit of 60 s")
-        assert reason.endswith(told.partition(": ")[0] if near or camera else "none passed the tests")
+        assert (told.partition(": ")[0] if near or camera else "none passed the tests") in reason
     else:
         assert told in reason
         assert reason.endswith(" may help")
