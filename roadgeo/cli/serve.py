@@ -10,6 +10,7 @@ from typing import TYPE_CHECKING, Any
 import click
 
 from roadgeo.cli.parameters import verbosity_options
+from roadgeo.cli.printing import echo
 
 if TYPE_CHECKING:
     from roadgeo.serving.server import ServeOptions
@@ -97,9 +98,7 @@ def serve_command(references: tuple[str, ...], quiet: bool, verbose: bool, **giv
         where = f"{options.host} port {options.port}"
         raise OutputError(f"cannot listen on {where}: {error.strerror or error}; choose another --port") from error
     host = f"[{options.host}]" if ":" in options.host else options.host
-    click.echo(
-        f"Listening on http://{host}:{server.server_port}/ for masks of {', '.join(names)}; Ctrl-C ends it.", err=True
-    )
+    echo(f"Listening on http://{host}:{server.server_port}/ for masks of {', '.join(names)}; Ctrl-C ends it.", err=True)
     signal.signal(signal.SIGTERM, signal.default_int_handler)
     try:
         server.serve_forever()
