@@ -65,6 +65,7 @@ def shelf(tmp_path_factory):
         (folder / "drawn" / "clean").rename(folder / "masks")
         for name in ("photo_mask.tif", "photo_mask.png", "photo.tif", "photo.jpg"):
             shutil.copy(folder / "masks" / "q_0000.png", folder / name)
+        shutil.copytree(folder / "masks", folder / "flight")
         shutil.rmtree("drawn")
     return folder
 
