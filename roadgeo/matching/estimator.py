@@ -163,9 +163,21 @@ class Hypothesis:
 
 @dataclass
 class Ledger:
-    """Places tried in one search, on all of its parts together: each of them could have agreed by chance."""
+    """Places tried in one search, on all of its parts together: each of them could have agreed by chance.
 
+    Attributes
+    ----------
+    n_reference : int
+        Intersections of all parts: what is tried on them is bounded as on one map of that size.
+    n_tried : int
+    n_usual, n_last : int
+        Places screened by the usual sweeps, and by the last ones.
+    """
+
+    n_reference: int = 0
     n_tried: int = 0
+    n_usual: int = 0
+    n_last: int = 0
 
 
 class TripleEstimator:
@@ -205,15 +217,13 @@ class TripleEstimator:
 
     def stages(self) -> Iterator[Iterator[list[Hypothesis]]]:
         """Yield, for one anchor after another, the hypotheses that grew: of triples, of roads, of single triples."""
-        options, larger_by = self.options, larger(len(self.index))
-        most = int(options.max_places * larger_by)
+        options = self.options
         for stage, source in enumerate(options.sweeps):
-            yield self._sweep(stage, source, options.grow, most)
+            yield self._sweep(stage, source, options.grow)
         if options.roads is not None and len(self.scene.intersections):
             yield self._rounds_of_roads(options.roads)
-        most = self.n_screened + int(options.max_last_places * larger_by)
         for stage, source in enumerate(options.last, len(options.sweeps) + 1):
-            yield self._sweep(stage, source, options.last_grow, most)
+            yield self._sweep(stage, source, options.last_grow)
 
     @property
     def work(self) -> float:
@@ -300,22 +310,24 @@ class TripleEstimator:
         """Whether a verified place that is promising was proposed by another intersection as well."""
         return known.log10_odds >= self.options.verify.promising and self.same(known, hypothesis)
 
+    def _enough(self, stage: int) -> bool:
+        """Whether as many places were screened by the usual sweeps, or the last, as on one map of all parts' size."""
+        options, larger_by = self.options, larger(max(self.ledger.n_reference, len(self.index)))
+        if stage < len(options.sweeps):
+            return self.ledger.n_usual >= int(options.max_places * larger_by)
+        return self.ledger.n_last >= int(options.max_last_places * larger_by)
+
     def _sweep(
-        self,
-        stage: int,
-        source: Source,
-        grow: GrowOptions,
-        most_places: float = math.inf,
-        only: Sequence[int] | None = None,
+        self, stage: int, source: Source, grow: GrowOptions, only: Sequence[int] | None = None
     ) -> Iterator[list[Hypothesis]]:
-        """Yield what grew from the proposals of a source, until so many places were screened in all."""
+        """Yield what grew from the proposals of a source, until enough places were screened."""
         scene, camera = self.scene, self.options.camera
         low, high = camera.gsd_m
         scale = (low / grow.max_scale_ratio, high * grow.max_scale_ratio)
-        if self.n_screened >= most_places:
+        if only is None and self._enough(stage):
             return
         for proposals in source.proposals(scene, self.index, scale, camera.min_shape_ratio, only):
-            if self.n_screened >= most_places:
+            if only is None and self._enough(stage):
                 return
             if (stage, proposals.anchor) in self._tried:
                 continue
@@ -392,7 +404,12 @@ class TripleEstimator:
 
     def _grow_all(self, proposals: Proposals, options: GrowOptions, stage: int) -> list[Hypothesis]:
         """Return the best grown proposals of one anchor that mean different places and that a camera can have seen."""
+        before = self.n_screened
         chosen = self._screen(proposals, options)[: options.max_grown]
+        if stage < len(self.options.sweeps):
+            self.ledger.n_usual += self.n_screened - before
+        else:
+            self.ledger.n_last += self.n_screened - before
         self.n_hypotheses += len(chosen)
         grown = self.grow(proposals, chosen, options)
         self.trace.grown(grown)

@@ -121,6 +121,7 @@ def search_references(
         return _search_pairs_in_turn(query, indexes, options.pair, min(time_limit_s, options.pair.time_limit_s))
     started, ledger = time.perf_counter(), Ledger()
     opened = [_Attempt.open(query, one, options, trace, ledger) for one, trace in zip(indexes, traces, strict=True)]
+    ledger.n_reference = sum(one.n_searched for one in opened if one.search is not None)
     left = time_limit_s - (time.perf_counter() - started)
     estimators = {one.search: one.estimator for one in opened if one.search is not None and one.estimator is not None}
 
