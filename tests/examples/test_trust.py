@@ -1,0 +1,55 @@
+"""`examples/trust`: its counts, bounds and blocks; and that a run is made and goes on."""
+
+import importlib.util
+import sys
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+TRUST = Path(__file__).parents[2] / "examples" / "trust" / "trust.py"
+
+
+@pytest.fixture(scope="module")
+def trust():
+    spec = importlib.util.spec_from_file_location("trust", TRUST)
+    module = importlib.util.module_from_spec(spec)
+    sys.modules["trust"] = module
+    spec.loader.exec_module(module)
+    return module
+
+
+def test_bounds_are_those_of_clopper_and_pearson(trust):
+    # Of none in n the upper bound is 1 - (rest / 2)^(1 / n); 5 of 20: tables of the binomial distribution.
+    assert trust.bounds(0, 100) == pytest.approx((0.0, 1 - 0.025 ** (1 / 100)))
+    assert trust.bounds(100, 100) == pytest.approx((0.025 ** (1 / 100), 1.0))
+    assert trust.bounds(5, 20) == pytest.approx((0.0866, 0.4910), abs=1e-4)
+
+
+def test_rows_are_counted_by_threshold_band_and_kind(trust):
+    rows = [
+        trust.Row("there", "mild", 20.0, np.inf, True, 0.1),
+        trust.Row("there", "few", 5.5, 1.0, False, 0.1),  # ambiguous: the lead is too short
+        trust.Row("there", "noisy", 4.2, 3.0, False, 0.1),
+        trust.Row("elsewhere", "mild", 3.7, 2.5, False, 0.1),
+        trust.Row("mirrored", "torn", 2.1, np.inf, False, 0.1),
+    ]
+    told = {row[0]: row[1:] for row in trust.threshold_table(rows, 3.5, 2.0)}
+    assert told["2"][:2] == ["-", "-"]
+    assert told["2"][2].startswith("2 of 2")
+    assert [cell.split(":")[0] for cell in told["3.5"]] == ["1 of 3", "1 of 3", "1 of 2"]
+    assert [cell.split(":")[0] for cell in told["5"]] == ["1 of 3", "0 of 3", "0 of 2"]
+    bands = {row[0]: row[1:] for row in trust.band_table(rows, 3.5, 2.0)}
+    assert bands["3.5 to 4"][0] == "1"
+    assert bands["4 to 4.5"][1].startswith("1 of 1")
+    assert bands["5 to 6"][0] == "0"
+    kinds = {row[0]: row for row in trust.kind_table(rows, 3.5, 2.0)}
+    assert kinds["elsewhere"][-2] == "3.7"
+
+
+def test_shuffled_masks_keep_their_roads_but_not_their_places(trust):
+    mask = (np.random.default_rng(1).random((120, 126)) > 0.9).astype(np.uint8) * 255
+    mixed = trust.shuffled(mask, 3)
+    assert mixed.shape == (120, 120)
+    assert (mixed > 0).sum() == (mask[:, :120] > 0).sum()
+    assert (mixed != mask[:, :120]).mean() > 0.1
