@@ -19,6 +19,7 @@ from roadgeo.matching.refinement import (
     corner_sigmas,
     denormalise,
     normalise,
+    scatter_m,
     spacing_m,
 )
 from roadgeo.matching.scene import Scene
@@ -170,7 +171,7 @@ def fit_lens(
         ):
             break
         n_met = len(rows)
-    covariance = inverse * (rms / problem.unit) ** 2
+    covariance = inverse * (scatter_m(rms, problem.sigma_m, refinement) / problem.unit) ** 2
     if not np.isfinite(covariance).all() or not np.isfinite(problem.p).all():
         return None
     found = denormalise(problem.p, scene.center, scene.half_size, problem.origin, problem.unit)

@@ -21,6 +21,7 @@ __all__ = [
     "denormalise",
     "normalise",
     "refine",
+    "scatter_m",
     "spacing_m",
 ]
 
@@ -56,6 +57,9 @@ class RefineOptions:
     sigma_floor_m, sigma_floor_px : float
         Accuracy of the map and of the mask as a whole, which no number of points improves: lines are drawn and thinned
         to whole pixels. Fitted to the corners of training masks.
+    usual_rms : float
+        Rms of road points in units of their standard deviation. Where it is more, the mask is bent: its errors are not
+        only greater, they keep their sign as much further. Fitted likewise.
     """
 
     max_radius_m: float = 20.0
@@ -71,6 +75,7 @@ class RefineOptions:
     correlation_m: float = 60.0
     sigma_floor_m: float = 0.1
     sigma_floor_px: float = 0.15
+    usual_rms: float = 0.7
     held_m: float = 5.0
     held_px: float = 3.0
     few_matches: int = 8
@@ -157,6 +162,11 @@ def corner_covariance(
     return np.asarray(derivatives @ covariance @ derivatives.T * unit**2 + 0.5 * floor * np.eye(8))
 
 
+def scatter_m(rms: float, sigma_m: float, options: RefineOptions) -> float:
+    """Return what road points of this rms and standard deviation count as in the covariance of a fit, metres."""
+    return rms * max(1.0, rms / (options.usual_rms * sigma_m))
+
+
 def corner_sigmas(covariance: FloatArray) -> FloatArray:
     """Return the standard deviations (4,) of corners from their covariance (8, 8)."""
     return np.asarray(np.sqrt(np.diag(covariance).reshape(4, 2).sum(axis=1)))
@@ -228,7 +238,7 @@ def refine(
     )
     if not np.isfinite(rms):
         return None
-    inverse = np.asarray(np.linalg.inv(normal) * (rms / unit) ** 2, float)
+    inverse = np.asarray(np.linalg.inv(normal) * (scatter_m(rms, sigma_m, options) / unit) ** 2, float)
     result = denormalise(p, center, half_size, origin, unit)
     covariance = corner_covariance(p, inverse, scene, unit, options)
     return Refined(result / result[2, 2], corner_sigmas(covariance), rms, covariance)
