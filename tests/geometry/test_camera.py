@@ -92,8 +92,8 @@ def test_what_is_not_plausible():
     assert judge(matrix @ mirror, SIZE, OPTIONS) is CameraFault.MIRRORED
     assert judge(-matrix @ mirror, SIZE, OPTIONS) is CameraFault.MIRRORED
     assert judge(camera((0, 0), SIZE, 1.0, 75.0, 0.0, 0.0, 1000.0), SIZE, OPTIONS) is CameraFault.HORIZON
-    assert judge(camera((0, 0), SIZE, 9.0), SIZE, OPTIONS) is CameraFault.SAMPLING
-    assert judge(camera((0, 0), SIZE, 0.1), SIZE, OPTIONS) is CameraFault.SAMPLING
+    assert judge(camera((0, 0), SIZE, 15.0), SIZE, OPTIONS) is CameraFault.SAMPLING
+    assert judge(camera((0, 0), SIZE, 0.05), SIZE, OPTIONS) is CameraFault.SAMPLING
     assert judge(stretch @ camera((0, 0), SIZE, 0.7), SIZE, OPTIONS) is CameraFault.SKEW
     assert judge(camera((0, 0), SIZE, 1.0, 50.0, 0.0, 0.0, 4000.0), SIZE, CameraOptions(max_tilt_deg=30.0)) is (
         CameraFault.TILT
