@@ -103,7 +103,7 @@ class _Met(NamedTuple):
     shares: Floats1
 
 
-@kernel()
+@kernel(forceinline=True)
 def _begin_system(p: NDArray[np.float64], prior: float, system: _System) -> None:
     """Empty the normal equations but for the prior on the two perspective parameters."""
     system.normal[:] = 0.0
@@ -115,7 +115,7 @@ def _begin_system(p: NDArray[np.float64], prior: float, system: _System) -> None
         system.right[r] -= prior * p[r]
 
 
-@kernel()
+@kernel(forceinline=True)
 def _add_pairs(
     p: NDArray[np.float64],
     unit: float,
@@ -141,7 +141,7 @@ def _add_pairs(
     return True
 
 
-@kernel()
+@kernel(forceinline=True)
 def _add_held(p: NDArray[np.float64], held: Held, weight: float, system: _System) -> bool:
     """Add points that are held; False: one lies at the horizon."""
     for i in range(held.query.shape[0]):
@@ -155,19 +155,19 @@ def _add_held(p: NDArray[np.float64], held: Held, weight: float, system: _System
 
 
 @kernel(forceinline=True)
-def _spread(system: _System) -> float:
-    """Return the variance of what `system.row` is the derivative of, |L^-1 row|^2, L the factor of the step before."""
+def _spread(row: NDArray[np.float64], factor: NDArray[np.float64], work: NDArray[np.float64]) -> float:
+    """Return the variance of what `row` is the derivative of, |L^-1 row|^2, L the factor of the step before."""
     total = 0.0
     for r in range(8):
-        value = system.row[r]
+        value = row[r]
         for c in range(r):
-            value -= system.factor[r, c] * system.work[c]
-        system.work[r] = value / system.factor[r, r]
-        total += system.work[r] * system.work[r]
+            value -= factor[r, c] * work[c]
+        work[r] = value / factor[r, r]
+        total += work[r] * work[r]
     return total
 
 
-@kernel()
+@kernel(forceinline=True)
 def _search_roads(
     p: NDArray[np.float64],
     plane: Plane,
@@ -178,12 +178,16 @@ def _search_roads(
     found: _Met,
 ) -> bool:
     """Find each road point's road, and which share of each cell's points met one; False: one lies at the horizon."""
-    found.searched[:] = 0.0
-    found.hits[:] = 0.0
-    for i in range(points.xy.shape[0]):
-        found.met[i] = False
-        u, v = points.xy[i, 0], points.xy[i, 1]
-        x, y, w, dx, dy, length = carry(p, u, v, points.directions[i, 0], points.directions[i, 1])
+    xy, directions, cells, _ = points
+    segments, starts, ids, grid, shape = roads
+    met, normals, residuals, sigmas, searched, hits, shares = found
+    factor, row, work = system.factor, system.row, system.work
+    searched[:] = 0.0
+    hits[:] = 0.0
+    for i in range(xy.shape[0]):
+        met[i] = False
+        u, v = xy[i, 0], xy[i, 1]
+        x, y, w, dx, dy, length = carry(p, u, v, directions[i, 0], directions[i, 1])
         if w < _LEAST_W:
             return False
         if length == 0.0:
@@ -191,47 +195,52 @@ def _search_roads(
         dx /= length
         dy /= length
         # How far the road may lie follows from how sure the fit is here.
-        point_row(p, u, v, -dy, dx, system.row)
-        sigma = limits.sigma_m * math.sqrt(1.0 + _spread(system))
+        point_row(p, u, v, -dy, dx, row)
+        sigma = limits.sigma_m * math.sqrt(1.0 + _spread(row, factor, work))
         if 3.0 * sigma > limits.max_radius:
             continue
-        found.searched[points.cells[i]] += 1.0
+        searched[cells[i]] += 1.0
         gx, gy = plane.x + plane.unit * x, plane.y + plane.unit * y
-        d, fx, fy, rx, ry = nearest_road(gx, gy, dx, dy, 3.0 * sigma, limits.min_cos, roads)
+        d, fx, fy, rx, ry = nearest_road(
+            gx, gy, dx, dy, 3.0 * sigma, limits.min_cos, segments, starts, ids, grid, shape
+        )
         if d == np.inf:
             continue
-        found.met[i] = True
-        found.hits[points.cells[i]] += 1.0
-        found.normals[i, 0], found.normals[i, 1] = -ry, rx
-        found.residuals[i] = (fx - gx) * -ry + (fy - gy) * rx
-        found.sigmas[i] = sigma
+        met[i] = True
+        hits[cells[i]] += 1.0
+        normals[i, 0], normals[i, 1] = -ry, rx
+        residuals[i] = (fx - gx) * -ry + (fy - gy) * rx
+        sigmas[i] = sigma
     for c in range(limits.n_cells):
-        found.shares[c] = found.hits[c] / found.searched[c] if found.searched[c] > 0.0 else 1.0
+        shares[c] = hits[c] / searched[c] if searched[c] > 0.0 else 1.0
     return True
 
 
-@kernel()
+@kernel(forceinline=True)
 def _add_roads(
     p: NDArray[np.float64], unit: float, points: RoadSamples, least_share: float, system: _System, found: _Met
 ) -> tuple[int, float]:
     """Add the road points that met a road; return how many, and the scale of their residuals (see `adjust`)."""
+    xy, _, cells, own = points
+    met, normals, residuals, sigmas, _, _, shares = found
+    normal, right, row = system.normal, system.right, system.row
     used, weights, slopes, squares = 0, 0.0, 0.0, 0.0
-    for i in range(points.xy.shape[0]):
-        if not found.met[i] or found.shares[points.cells[i]] < least_share:
+    for i in range(xy.shape[0]):
+        if not met[i] or shares[cells[i]] < least_share:
             continue
-        point_row(p, points.xy[i, 0], points.xy[i, 1], found.normals[i, 0], found.normals[i, 1], system.row)
-        weight = 1.0 / (1.0 + (found.residuals[i] / found.sigmas[i]) ** 2)
-        add_row(system.normal, system.right, system.row, points.weight * weight, found.residuals[i] / unit)
+        point_row(p, xy[i, 0], xy[i, 1], normals[i, 0], normals[i, 1], row)
+        weight = 1.0 / (1.0 + (residuals[i] / sigmas[i]) ** 2)
+        add_row(normal, right, row, own * weight, residuals[i] / unit)
         used += 1
         weights += weight
         slopes += weight * (2.0 * weight - 1.0)  # of the influence, by the residual
-        squares += (weight * found.residuals[i]) ** 2
+        squares += (weight * residuals[i]) ** 2
     if weights > 0.0:
         return used, math.sqrt(squares * weights) / max(slopes, 0.1 * weights)
     return used, np.inf
 
 
-@kernel()
+@kernel(forceinline=True)
 def _step(p: NDArray[np.float64], system: _System) -> float:
     """Solve the normal equations and move the parameters; return the largest move, -1 where that fails."""
     for r in range(8):

@@ -44,7 +44,7 @@ class _Growth(NamedTuple):
     work: Floats1  # (8,)
 
 
-@kernel()
+@kernel(forceinline=True)
 def _begin(
     query: GrowthQuery, ref_anchor: int, affine: NDArray[np.float64], points: PointBuckets, limits: GrowthLimits
 ) -> _Growth:
@@ -84,7 +84,7 @@ def _match(growth: _Growth, i: int, j: int, points: PointBuckets, matched: NDArr
     growth.image[i, 1] = (points.xy[j, 1] - growth.y0) / growth.unit
 
 
-@kernel()
+@kernel(forceinline=True)
 def _place_seeds(
     growth: _Growth,
     query: GrowthQuery,
@@ -107,44 +107,30 @@ def _place_seeds(
     return n_seeds
 
 
-@kernel(forceinline=True)
+@kernel()
 def _fit(growth: _Growth, matched: NDArray[np.int64]) -> bool:
     return fit_homography(growth.query, growth.image, matched, growth.prior, growth.p, growth.normal, growth.factor)
 
 
 @kernel(forceinline=True)
-def _predict_radius(growth: _Growth, i: int) -> tuple[float, float, float, float]:
-    """Return where point i is predicted, its w, and its search radius in metres: -1 at the horizon."""
-    u, v = growth.query[i, 0], growth.query[i, 1]
-    x, y, w = predict(growth.p, u, v)
+def _predict_radius(
+    p: NDArray[np.float64], factor: NDArray[np.float64], work: NDArray[np.float64], u: float, v: float, sigma_m: float
+) -> tuple[float, float, float, float]:
+    """Return where a query point is predicted, its w, and its search radius in metres: -1 at the horizon."""
+    x, y, w = predict(p, u, v)
     if w < _LEAST_W:
         return x, y, w, -1.0
-    variance = prediction_variance(growth.factor, growth.p, u, v, growth.work)
-    sigma = growth.sigma_m * math.sqrt(0.5 * variance)
-    return x, y, w, _SIGMAS * math.sqrt(sigma * sigma + growth.sigma_m * growth.sigma_m)
+    sigma = sigma_m * math.sqrt(0.5 * prediction_variance(factor, p, u, v, work))
+    return x, y, w, _SIGMAS * math.sqrt(sigma * sigma + sigma_m * sigma_m)
 
 
 @kernel(forceinline=True)
-def _search(
-    growth: _Growth,
-    i: int,
-    x: float,
-    y: float,
-    w: float,
-    radius: float,
-    query: GrowthQuery,
-    points: PointBuckets,
-    min_cos: float,
-) -> tuple[int, float]:
-    """Return the map intersection around the predicted place of point i, or -1, and its distance."""
-    p = growth.p
-    return nearest_alike(
-        growth.x0 + growth.unit * x, growth.y0 + growth.unit * y, radius, query.branches, i, points,
-        (p[0] - x * p[6]) / w, (p[1] - x * p[7]) / w, (p[3] - y * p[6]) / w, (p[4] - y * p[7]) / w, min_cos,
-    )  # fmt: skip
+def _jacobian(p: NDArray[np.float64], x: float, y: float, w: float) -> tuple[float, float, float, float]:
+    """Return the derivatives of a predicted point by u and v, row-major."""
+    return (p[0] - x * p[6]) / w, (p[1] - x * p[7]) / w, (p[3] - y * p[6]) / w, (p[4] - y * p[7]) / w
 
 
-@kernel()
+@kernel(forceinline=True)
 def _expand(
     growth: _Growth,
     query: GrowthQuery,
@@ -154,22 +140,28 @@ def _expand(
     matched: NDArray[np.int64],
 ) -> tuple[int, int, bool]:
     """Match ever more points, the nearest first, and refit; return matches, tests, and whether growth goes on."""
+    uv, image, p, factor, work = growth.query, growth.image, growth.p, growth.factor, growth.work
+    x0, y0, unit, branches = growth.x0, growth.y0, growth.unit, query.branches
+    ref_xy, ref_branches, starts, grid, shape = points
     ratio = 0.0
-    tested = np.zeros(growth.seed.shape[0], np.bool_)
+    done = growth.seed.copy()
     n_matched, n_tested = 0, 0
     fitted = n_seeds
     for _ in range(_ROUNDS):
         news = 0
         for index in range(query.order.shape[0]):
             i = query.order[index]
-            if growth.seed[i] or matched[i] >= 0 or tested[i]:
+            if done[i]:
                 continue
             # A point waits until it is predicted well enough.
-            x, y, w, radius = _predict_radius(growth, i)
+            x, y, w, radius = _predict_radius(p, factor, work, uv[i, 0], uv[i, 1], growth.sigma_m)
             if w < _LEAST_W or radius > growth.radius_m:
                 continue
-            j, _ = _search(growth, i, x, y, w, radius, query, points, limits.min_cos)
-            tested[i] = True
+            j, _ = nearest_alike(
+                x0 + unit * x, y0 + unit * y, radius, branches, i,
+                ref_xy, ref_branches, starts, grid, shape, _jacobian(p, x, y, w), limits.min_cos,
+            )  # fmt: skip
+            done[i] = True
             n_tested += 1
             if j < 0:
                 ratio += growth.loss
@@ -177,7 +169,8 @@ def _expand(
                     return n_matched, n_tested, False
                 continue
             ratio += growth.gain
-            _match(growth, i, j, points, matched)
+            matched[i] = j
+            image[i, 0], image[i, 1] = (ref_xy[j, 0] - x0) / unit, (ref_xy[j, 1] - y0) / unit
             n_matched += 1
             news += 1
             if n_seeds + n_matched >= _MORE * fitted:
@@ -191,7 +184,7 @@ def _expand(
     return n_matched, n_tested, True
 
 
-@kernel()
+@kernel(forceinline=True)
 def _match_anew(
     growth: _Growth,
     query: GrowthQuery,
@@ -201,16 +194,23 @@ def _match_anew(
     distance: NDArray[np.float64],
 ) -> tuple[int, int, float]:
     """Match all points anew, one to one; return matches and tests besides the seeds, and the log-likelihood ratio."""
+    uv, image, p, factor, work = growth.query, growth.image, growth.p, growth.factor, growth.work
+    x0, y0, unit, branches = growth.x0, growth.y0, growth.unit, query.branches
+    ref_xy, ref_branches, starts, grid, shape = points
     n_matched, n_tested, ratio = 0, 0, 0.0
     matched[:] = -1
     for index in range(query.order.shape[0]):
         i = query.order[index]
-        x, y, w, radius = _predict_radius(growth, i)
+        x, y, w, radius = _predict_radius(p, factor, work, uv[i, 0], uv[i, 1], growth.sigma_m)
         if w < _LEAST_W:
             continue
-        j, distance[i] = _search(growth, i, x, y, w, min(radius, growth.radius_m), query, points, min_cos)
+        j, distance[i] = nearest_alike(
+            x0 + unit * x, y0 + unit * y, min(radius, growth.radius_m), branches, i,
+            ref_xy, ref_branches, starts, grid, shape, _jacobian(p, x, y, w), min_cos,
+        )  # fmt: skip
+        matched[i] = j
         if j >= 0:
-            _match(growth, i, j, points, matched)
+            image[i, 0], image[i, 1] = (ref_xy[j, 0] - x0) / unit, (ref_xy[j, 1] - y0) / unit
     keep_nearest(matched, distance)
     for index in range(query.order.shape[0]):
         i = query.order[index]
@@ -225,7 +225,7 @@ def _match_anew(
     return n_matched, n_tested, ratio
 
 
-@kernel()
+@kernel(forceinline=True)
 def _write_matrix(growth: _Growth, query: GrowthQuery, matrix: NDArray[np.float64]) -> None:
     """Undo the normalisation: X = x0 + unit * predict((x - xa) / half_size)."""
     p, half_size = growth.p, query.half_size

@@ -20,11 +20,12 @@ def nearest_alike(
     radius: float,
     branches: NDArray[np.int8],
     i: int,
-    points: PointBuckets,
-    j00: float,
-    j01: float,
-    j10: float,
-    j11: float,
+    ref_xy: NDArray[np.float64],
+    ref_branches: NDArray[np.int8],
+    starts: NDArray[np.int32],
+    grid: tuple[float, float, float],
+    shape: tuple[int, int],
+    jacobian: tuple[float, float, float, float],
     min_cos: float,
 ) -> tuple[int, float]:
     """Return the number and distance of the nearest intersection of the map with agreeing branches, or (-1, `radius`).
@@ -33,25 +34,26 @@ def nearest_alike(
     ----------
     x, y, radius : float
         Metres on the reference plane; intersections nearer than this count.
-    branches, i, j00, j01, j10, j11, min_cos
-        As in `rays_agree`.
-    points : PointBuckets
-        The map's intersections.
+    branches, i, jacobian, min_cos
+        As in `rays_agree`; the Jacobian row-major.
+    ref_xy, ref_branches, starts, grid, shape
+        The map's intersections, as in `PointBuckets`.
     """
+    j00, j01, j10, j11 = jacobian
     best, where = radius, -1
     if not abs(x) + abs(y) < 1e15:  # infinite or NaN: no bucket has such a number
         return where, best
-    c0 = max(int(np.floor((x - radius - points.grid[0]) / points.grid[2])), 0)
-    c1 = min(int(np.floor((x + radius - points.grid[0]) / points.grid[2])), points.shape[0] - 1)
-    r0 = max(int(np.floor((y - radius - points.grid[1]) / points.grid[2])), 0)
-    r1 = min(int(np.floor((y + radius - points.grid[1]) / points.grid[2])), points.shape[1] - 1)
+    c0 = max(int(np.floor((x - radius - grid[0]) / grid[2])), 0)
+    c1 = min(int(np.floor((x + radius - grid[0]) / grid[2])), shape[0] - 1)
+    r0 = max(int(np.floor((y - radius - grid[1]) / grid[2])), 0)
+    r1 = min(int(np.floor((y + radius - grid[1]) / grid[2])), shape[1] - 1)
     if c1 < c0:
         return where, best
     for r in range(r0, r1 + 1):
-        for j in range(points.starts[r * points.shape[0] + c0], points.starts[r * points.shape[0] + c1 + 1]):
-            dx, dy = points.xy[j, 0] - x, points.xy[j, 1] - y
+        for j in range(starts[r * shape[0] + c0], starts[r * shape[0] + c1 + 1]):
+            dx, dy = ref_xy[j, 0] - x, ref_xy[j, 1] - y
             d = math.sqrt(dx * dx + dy * dy)
-            if d < best and rays_agree(branches, i, points.branches, j, j00, j01, j10, j11, min_cos):
+            if d < best and rays_agree(branches, i, ref_branches, j, j00, j01, j10, j11, min_cos):
                 best, where = d, j
     return where, best
 
@@ -131,6 +133,7 @@ def match_all(
     int
         Number of matches.
     """
+    ref_xy, ref_branches, starts, grid, shape = points
     n = xy.shape[0]
     count = 0
     for i in range(n):
@@ -142,12 +145,13 @@ def match_all(
             continue
         x = (matrix[0, 0] * u + matrix[0, 1] * v + matrix[0, 2]) / w
         y = (matrix[1, 0] * u + matrix[1, 1] * v + matrix[1, 2]) / w
-        matched[i], distance[i] = nearest_alike(
-            x + shift_x, y + shift_y, radius, branches, i, points,
+        jacobian = (
             (matrix[0, 0] - x * matrix[2, 0]) / w, (matrix[0, 1] - x * matrix[2, 1]) / w,
             (matrix[1, 0] - y * matrix[2, 0]) / w, (matrix[1, 1] - y * matrix[2, 1]) / w,
-            min_cos,
         )  # fmt: skip
+        matched[i], distance[i] = nearest_alike(
+            x + shift_x, y + shift_y, radius, branches, i, ref_xy, ref_branches, starts, grid, shape, jacobian, min_cos
+        )
         if matched[i] >= 0:
             count += 1
     return keep_nearest(matched, distance) if one_to_one else count

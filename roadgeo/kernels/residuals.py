@@ -39,7 +39,8 @@ def road_residuals(
     for i in range(mapped.shape[0]):
         x, y = mapped[i, 0], mapped[i, 1]
         d, fx, fy, rx, ry = nearest_road(
-            x, y, along[i, 0], along[i, 1], radii[i], min_cos, roads,
+            x, y, along[i, 0], along[i, 1], radii[i], min_cos,
+            roads.segments, roads.starts, roads.ids, roads.grid, roads.shape,
         )  # fmt: skip
         if d == np.inf or math.isnan(d):
             out[i, 0] = out[i, 1] = out[i, 2] = np.nan

@@ -63,7 +63,10 @@ def _nearest(
     if w < 0.05 or length == 0.0:
         return np.inf, 0.0, 0.0, w
     gx, gy = origin[0] + unit * x, origin[1] + unit * y
-    d, fx, fy, rx, ry = nearest_road(gx, gy, dx / length, dy / length, radius, min_cos, roads)
+    d, fx, fy, rx, ry = nearest_road(
+        gx, gy, dx / length, dy / length, radius, min_cos,
+        roads.segments, roads.starts, roads.ids, roads.grid, roads.shape,
+    )  # fmt: skip
     if d == np.inf:
         return np.inf, 0.0, 0.0, w
     return (fy - gy) * rx - (fx - gx) * ry, rx, ry, w

@@ -7,6 +7,7 @@ and `shape` are those of `kernels.buckets`.
 import math
 
 import numpy as np
+from numpy.typing import NDArray
 
 from roadgeo.kernels.arrays import Bools2, Floats1, Floats2, Int32s1, Ints1, Singles2
 from roadgeo.kernels.compilation import kernel
@@ -76,7 +77,11 @@ def nearest_road(
     dy: float,
     radius: float,
     min_cos: float,
-    roads: RoadBuckets,
+    segments: NDArray[np.float32],
+    starts: NDArray[np.int32],
+    ids: NDArray[np.int32],
+    grid: tuple[float, float, float],
+    shape: tuple[int, int],
 ) -> tuple[float, float, float, float, float]:
     """Return the distance of the nearest road that runs along (dx, dy), its foot point and its own direction.
 
@@ -99,17 +104,17 @@ def nearest_road(
     found = False
     if not abs(x) + abs(y) < 1e15:  # infinite or NaN: no bucket has such a number
         return np.inf, fx, fy, ux, uy
-    c0 = max(int(np.floor((x - radius - roads.grid[0]) / roads.grid[2])), 0)
-    c1 = min(int(np.floor((x + radius - roads.grid[0]) / roads.grid[2])), roads.shape[0] - 1)
-    r0 = max(int(np.floor((y - radius - roads.grid[1]) / roads.grid[2])), 0)
-    r1 = min(int(np.floor((y + radius - roads.grid[1]) / roads.grid[2])), roads.shape[1] - 1)
+    c0 = max(int(np.floor((x - radius - grid[0]) / grid[2])), 0)
+    c1 = min(int(np.floor((x + radius - grid[0]) / grid[2])), shape[0] - 1)
+    r0 = max(int(np.floor((y - radius - grid[1]) / grid[2])), 0)
+    r1 = min(int(np.floor((y + radius - grid[1]) / grid[2])), shape[1] - 1)
     for r in range(r0, r1 + 1):
         for c in range(c0, c1 + 1):
-            bucket = r * roads.shape[0] + c
-            for e in range(roads.starts[bucket], roads.starts[bucket + 1]):
-                s = roads.ids[e]
-                ax, ay = roads.segments[s, 0], roads.segments[s, 1]
-                sx, sy = roads.segments[s, 2] - ax, roads.segments[s, 3] - ay
+            bucket = r * shape[0] + c
+            for e in range(starts[bucket], starts[bucket + 1]):
+                s = ids[e]
+                ax, ay = segments[s, 0], segments[s, 1]
+                sx, sy = segments[s, 2] - ax, segments[s, 3] - ay
                 square = sx * sx + sy * sy
                 t = ((x - ax) * sx + (y - ay) * sy) / square if square > 0.0 else 0.0
                 t = min(max(t, 0.0), 1.0)
@@ -157,6 +162,7 @@ def forward_distances(
     int
         How many are finite.
     """
+    segments, starts, ids, grid, shape = roads
     n = 0
     for i in range(points.shape[0]):
         u, v = points[i, 0], points[i, 1]
@@ -173,7 +179,9 @@ def forward_distances(
         length = math.sqrt(dx * dx + dy * dy)
         if length == 0.0:
             continue
-        d = nearest_road(x + shift_x, y + shift_y, dx / length, dy / length, radius, min_cos, roads)[0]
+        d = nearest_road(
+            x + shift_x, y + shift_y, dx / length, dy / length, radius, min_cos, segments, starts, ids, grid, shape
+        )[0]
         out[i] = d
         if d < np.inf:
             n += 1
@@ -236,11 +244,12 @@ def backward_agreement(
     seen, shown : int
         Samples on observed ground, and how many of them lie near a road of the query.
     """
+    segments, starts, ids, grid, shape = roads
     n_seen, n_near = 0, 0
-    c0 = max(int(np.floor((bounds[0] + shift_x - roads.grid[0]) / roads.grid[2])), 0)
-    c1 = min(int(np.floor((bounds[2] + shift_x - roads.grid[0]) / roads.grid[2])), roads.shape[0] - 1)
-    r0 = max(int(np.floor((bounds[1] + shift_y - roads.grid[1]) / roads.grid[2])), 0)
-    r1 = min(int(np.floor((bounds[3] + shift_y - roads.grid[1]) / roads.grid[2])), roads.shape[1] - 1)
+    c0 = max(int(np.floor((bounds[0] + shift_x - grid[0]) / grid[2])), 0)
+    c1 = min(int(np.floor((bounds[2] + shift_x - grid[0]) / grid[2])), shape[0] - 1)
+    r0 = max(int(np.floor((bounds[1] + shift_y - grid[1]) / grid[2])), 0)
+    r1 = min(int(np.floor((bounds[3] + shift_y - grid[1]) / grid[2])), shape[1] - 1)
     det = (
         inverse[0, 0] * (inverse[1, 1] * inverse[2, 2] - inverse[1, 2] * inverse[2, 1])
         - inverse[0, 1] * (inverse[1, 0] * inverse[2, 2] - inverse[1, 2] * inverse[2, 0])
@@ -248,11 +257,11 @@ def backward_agreement(
     )
     for r in range(r0, r1 + 1):
         for c in range(c0, c1 + 1):
-            bucket = r * roads.shape[0] + c
-            for e in range(roads.starts[bucket], roads.starts[bucket + 1]):
-                s = roads.ids[e]
-                ax, ay = roads.segments[s, 0], roads.segments[s, 1]
-                sx, sy = roads.segments[s, 2] - ax, roads.segments[s, 3] - ay
+            bucket = r * shape[0] + c
+            for e in range(starts[bucket], starts[bucket + 1]):
+                s = ids[e]
+                ax, ay = segments[s, 0], segments[s, 1]
+                sx, sy = segments[s, 2] - ax, segments[s, 3] - ay
                 length = math.sqrt(sx * sx + sy * sy)
                 # An even phase over all segments, so that short ones are sampled in proportion to their length.
                 count = int(length / step + ((s * 0.6180339887) % 1.0))
@@ -260,10 +269,7 @@ def backward_agreement(
                     t = (k + 0.5) / count
                     x, y = ax + t * sx, ay + t * sy
                     # A segment may be listed in several buckets: each sample counts in its own.
-                    if (
-                        int(np.floor((x - roads.grid[0]) / roads.grid[2])) != c
-                        or int(np.floor((y - roads.grid[1]) / roads.grid[2])) != r
-                    ):
+                    if int(np.floor((x - grid[0]) / grid[2])) != c or int(np.floor((y - grid[1]) / grid[2])) != r:
                         continue
                     x -= shift_x
                     y -= shift_y
@@ -320,6 +326,7 @@ def screen(
     shares : (M,) float64
         Filled; 1 where there are no points, for then nothing speaks against a proposal.
     """
+    segments, starts, ids, grid, shape = roads
     n = points.shape[0]
     for m in range(references.shape[0]):
         x0, y0 = ref_xy[references[m], 0], ref_xy[references[m], 1]
@@ -333,7 +340,7 @@ def screen(
             length = math.sqrt(dx * dx + dy * dy)
             d = nearest_road(
                 x0 + j00 * u + j01 * v, y0 + j10 * u + j11 * v, dx / length, dy / length, reach, min_cos,
-                roads,
+                segments, starts, ids, grid, shape,
             )[0]  # fmt: skip
             if d < np.inf:
                 hits += 1

@@ -130,7 +130,7 @@ class _Triangle(NamedTuple):
     cross: float
 
 
-@kernel(forceinline=True)
+@kernel()
 def _triangle(query: TripleQuery, a: int, s: int, t: int) -> _Triangle:
     """Return the triple of an anchor and two of its neighbours."""
     xy = query.xy
@@ -143,7 +143,7 @@ def _triangle(query: TripleQuery, a: int, s: int, t: int) -> _Triangle:
 
 
 @kernel(forceinline=True)
-def _places(entry: np.uint64, turn: int, table: TripleMap) -> tuple[int, int, int]:
+def _places(entry: np.uint64, turn: int, ref_neighbours: NDArray[np.int32]) -> tuple[int, int, int]:
     """Return the map's triple of an entry, the partner of the query's anchor first, or -1: it is none.
 
     A file's bits may have been flipped: no entry is believed.
@@ -151,9 +151,9 @@ def _places(entry: np.uint64, turn: int, table: TripleMap) -> tuple[int, int, in
     x = np.int64(entry >> np.uint64(40))
     y = np.int64((entry >> np.uint64(37)) & np.uint64(7))
     z = np.int64((entry >> np.uint64(34)) & np.uint64(7))
-    if x >= table.xy.shape[0] or max(y, z) >= table.neighbours.shape[1]:
+    if x >= ref_neighbours.shape[0] or max(y, z) >= ref_neighbours.shape[1]:
         return -1, -1, -1
-    y, z = np.int64(table.neighbours[x, y]), np.int64(table.neighbours[x, z])
+    y, z = np.int64(ref_neighbours[x, y]), np.int64(ref_neighbours[x, z])
     if min(y, z) < 0:
         return -1, -1, -1
     if turn == 1:
@@ -164,40 +164,45 @@ def _places(entry: np.uint64, turn: int, table: TripleMap) -> tuple[int, int, in
 
 
 @kernel(forceinline=True)
-def _fit_triangle(
-    query: TripleQuery, one: _Triangle, x: int, y: int, z: int, table: TripleMap, limits: TripleLimits
-) -> tuple[bool, tuple[float, float, float, float]]:
-    """Return whether the map's triple x, y, z may be the query's, and the 2 x 2 map (row-major) that takes it there."""
-    bx, by = table.xy[y, 0] - table.xy[x, 0], table.xy[y, 1] - table.xy[x, 1]
-    cx, cy = table.xy[z, 0] - table.xy[x, 0], table.xy[z, 1] - table.xy[x, 1]
+def _fit_affine(
+    one: _Triangle, ref_xy: NDArray[np.float64], x: int, y: int, z: int, limits: TripleLimits
+) -> tuple[bool, float, float, float, float]:
+    """Return the 2 x 2 map (row-major) from the query's triple to the map's triple x, y, z, and whether it passes."""
+    bx, by = ref_xy[y, 0] - ref_xy[x, 0], ref_xy[y, 1] - ref_xy[x, 1]
+    cx, cy = ref_xy[z, 0] - ref_xy[x, 0], ref_xy[z, 1] - ref_xy[x, 1]
     det = (bx * cy - by * cx) / one.cross
     if det < limits.scale[0] * limits.scale[0] or det > limits.scale[1] * limits.scale[1]:
-        return False, (0.0, 0.0, 0.0, 0.0)
+        return False, 0.0, 0.0, 0.0, 0.0
     j00 = (bx * one.acy - cx * one.aby) / one.cross
     j01 = (cx * one.abx - bx * one.acx) / one.cross
     j10 = (by * one.acy - cy * one.aby) / one.cross
     j11 = (cy * one.abx - by * one.acx) / one.cross
     # singular values s1 >= s2: s1 s2 = det, s1^2 + s2^2 = |J|^2
     square = j00 * j00 + j01 * j01 + j10 * j10 + j11 * j11
-    if square * limits.min_ratio > det * (1.0 + limits.min_ratio * limits.min_ratio):
-        return False, (0.0, 0.0, 0.0, 0.0)
-    agree = (
-        rays_agree(query.branches, one.a, table.branches, x, j00, j01, j10, j11, limits.min_cos)
-        and rays_agree(query.branches, one.b, table.branches, y, j00, j01, j10, j11, limits.min_cos)
-        and rays_agree(query.branches, one.c, table.branches, z, j00, j01, j10, j11, limits.min_cos)
-    )
-    return agree, (j00, j01, j10, j11)
+    passes = not square * limits.min_ratio > det * (1.0 + limits.min_ratio * limits.min_ratio)
+    return passes, j00, j01, j10, j11
 
 
 @kernel(forceinline=True)
-def _add_hit(
-    hits: Hits, n: int, one: _Triangle, x: int, y: int, z: int, affine: tuple[float, float, float, float]
-) -> None:
-    hits.ids[n, 0] = x
-    hits.ids[n, 1], hits.ids[n, 2] = one.s, y
-    hits.ids[n, 3], hits.ids[n, 4] = one.t, z
-    hits.affine[n, 0], hits.affine[n, 1] = affine[0], affine[1]
-    hits.affine[n, 2], hits.affine[n, 3] = affine[2], affine[3]
+def _agree(
+    branches: NDArray[np.int8],
+    one: _Triangle,
+    ref_branches: NDArray[np.int8],
+    x: int,
+    y: int,
+    z: int,
+    j00: float,
+    j01: float,
+    j10: float,
+    j11: float,
+    min_cos: float,
+) -> bool:
+    """Return whether the branches at all three vertices agree."""
+    return (
+        rays_agree(branches, one.a, ref_branches, x, j00, j01, j10, j11, min_cos)
+        and rays_agree(branches, one.b, ref_branches, y, j00, j01, j10, j11, min_cos)
+        and rays_agree(branches, one.c, ref_branches, z, j00, j01, j10, j11, min_cos)
+    )
 
 
 @kernel()
@@ -208,6 +213,8 @@ def _look_up(
 
     See `look_up_each`.
     """
+    branches, (ids, affine) = query.branches, hits
+    ref_xy, ref_branches, ref_neighbours, starts, entries = table
     codes = np.empty((3, limits.codes_per_vertex, 3), np.int64)
     n = np.empty(3, np.int64)
     triple_codes(query.xy, query.tangents, query.sides, one.a, one.b, one.c, limits.codes_per_vertex, codes, n)
@@ -235,9 +242,9 @@ def _look_up(
                                 lows = lj | probes[vz, k, 1]
                                 highs = hj | probes[vz, k, 2]
                                 alike_x, alike_y, alike_z = probes[vx, i, 3], probes[vy, j, 3], probes[vz, k, 3]
-                                for e in range(table.starts[cell], table.starts[cell + 1]):
+                                for e in range(starts[cell], starts[cell + 1]):
                                     compared += 1
-                                    entry = table.entries[e]
+                                    entry = entries[e]
                                     # All six angles at once, then the sides, then the map itself.
                                     fine = np.int64(entry & np.uint64(0xFFFFFF))
                                     if ((fine | GUARDS) - lows) & (highs - fine) & GUARDS != GUARDS:
@@ -246,15 +253,20 @@ def _look_up(
                                     alike = (alike_x >> (around // 81)) & (alike_y >> (around // 9 % 9))
                                     if alike & (alike_z >> (around % 9)) & 1 == 0:
                                         continue
-                                    x, y, z = _places(entry, turn, table)
+                                    x, y, z = _places(entry, turn, ref_neighbours)
                                     if x < 0:
                                         continue
-                                    fits, affine = _fit_triangle(query, one, x, y, z, table, limits)
-                                    if not fits:
+                                    passes, j00, j01, j10, j11 = _fit_affine(one, ref_xy, x, y, z, limits)
+                                    if not passes or not _agree(
+                                        branches, one, ref_branches, x, y, z, j00, j01, j10, j11, limits.min_cos
+                                    ):
                                         continue
-                                    if n_hits >= hits.ids.shape[0]:
+                                    if n_hits >= ids.shape[0]:
                                         return n_hits, compared
-                                    _add_hit(hits, n_hits, one, x, y, z, affine)
+                                    ids[n_hits, 0], ids[n_hits, 1], ids[n_hits, 2] = x, one.s, y
+                                    ids[n_hits, 3], ids[n_hits, 4] = one.t, z
+                                    affine[n_hits, 0], affine[n_hits, 1] = j00, j01
+                                    affine[n_hits, 2], affine[n_hits, 3] = j10, j11
                                     n_hits += 1
     return n_hits, compared
 

@@ -150,7 +150,7 @@ class TestNearestAlike:
         rng = np.random.default_rng(3)
         for i, (x, y) in enumerate(rng.uniform(-100, 1600, (len(world.xy), 2))):
             J = rng.normal(0, 1, (2, 2))
-            found = nearest_alike(x, y, radius, world.branches, i, world.reference, *J.ravel(), MIN_COS)
+            found = nearest_alike(x, y, radius, world.branches, i, *world.reference, tuple(J.ravel()), MIN_COS)
             near = {
                 naive.nearest_alike(x, y, radius, world.branches, i, world.ref_xy, world.ref_branches, J, TOLERANCE + e)
                 for e in (-0.02, 0.0, 0.02)
@@ -160,7 +160,7 @@ class TestNearestAlike:
 
     @pytest.mark.parametrize("place", [(np.nan, 0.0), (1e300, 100.0), (-1e300, -1e300), (700.0, np.inf)])
     def test_places_that_are_none(self, world, place):
-        found = nearest_alike(*place, 50.0, world.branches, 0, world.reference, 1.0, 0.0, 0.0, 1.0, MIN_COS)
+        found = nearest_alike(*place, 50.0, world.branches, 0, *world.reference, (1.0, 0.0, 0.0, 1.0), MIN_COS)
         assert found == (-1, 50.0)
 
 

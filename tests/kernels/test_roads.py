@@ -75,7 +75,7 @@ class TestNearestRoad:
         roads = town(1)
         rng = np.random.default_rng(2)
         for (x, y), (dx, dy) in zip(rng.uniform(-100, 800, (120, 2)), directions(rng, 120), strict=True):
-            d, *rest = nearest_road(x, y, dx, dy, radius, min_cos, roads)
+            d, *rest = nearest_road(x, y, dx, dy, radius, min_cos, *roads)
             distance, foot, direction = naive.nearest_road(x, y, dx, dy, radius, min_cos, roads[0])
             if not (roads[3][0] < x < 750 and roads[3][1] < y < 620):
                 continue  # outside the grid only its rim is known
@@ -84,12 +84,12 @@ class TestNearestRoad:
                 assert rest == pytest.approx([*foot, *direction], abs=2e-3)
 
     def test_no_roads_and_roads_of_no_length(self):
-        assert nearest_road(0.0, 0.0, 1.0, 0.0, 50.0, 0.0, binned(np.empty((0, 4))))[0] == np.inf
-        assert nearest_road(100.0, 100.0, 1.0, 0.0, 50.0, 0.0, binned([[100, 100, 100, 100]]))[0] == np.inf
+        assert nearest_road(0.0, 0.0, 1.0, 0.0, 50.0, 0.0, *binned(np.empty((0, 4))))[0] == np.inf
+        assert nearest_road(100.0, 100.0, 1.0, 0.0, 50.0, 0.0, *binned([[100, 100, 100, 100]]))[0] == np.inf
 
     @pytest.mark.parametrize("place", [(np.nan, 0.0), (1e300, 0.0), (-1e300, 1e300), (np.inf, 100.0)])
     def test_places_that_are_none(self, place):
-        assert nearest_road(*place, 1.0, 0.0, 50.0, 0.0, town())[0] == np.inf
+        assert nearest_road(*place, 1.0, 0.0, 50.0, 0.0, *town())[0] == np.inf
 
 
 TILTED = np.array([[0.9, -0.3, 260.0], [0.25, 1.1, 420.0], [2e-4, -3e-4, 1.0]])
