@@ -64,7 +64,19 @@ def road_equations(
         if length == 0.0:
             continue
         gx, gy = origin[0] + unit * x, origin[1] + unit * y
-        d, fx, fy, rx, ry = nearest_road(gx, gy, dx / length, dy / length, radius, min_cos, roads)
+        d, fx, fy, rx, ry = nearest_road(
+            gx,
+            gy,
+            dx / length,
+            dy / length,
+            radius,
+            min_cos,
+            roads.segments,
+            roads.starts,
+            roads.ids,
+            roads.grid,
+            roads.shape,
+        )
         if not d < radius:
             continue
         met += 1

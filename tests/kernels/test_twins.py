@@ -52,6 +52,7 @@ REASONS = {
     "order_tree": "`search_tree` on its result is compared with a twin that knows no tree",
     "pair_id": "compared with the numbers it counts through, all of them",
     "rethin": "the second half of `thin`, which has a twin",
+    "road_equations": "its twin stands beside its test",
     "sample_edges": "compared with shapely's interpolation along lines",
     "solve_cholesky": "compared with numpy.linalg",
     "sort_few": "part of `describe_intersections`; rays are tested to ascend",

@@ -10,6 +10,7 @@ from roadgeo.errors import OutputError
 from roadgeo.geometry.homography import Homography
 from roadgeo.geometry.mask import RoadMask, pixel_to_plane
 from roadgeo.location import Evidence, Location, Place
+from roadgeo.outputs import footprint
 from roadgeo.outputs.footprint import GROUND, OUTSIDE, ROAD
 from roadgeo.outputs.location_files import OutputOptions, write_location
 from roadgeo.outputs.orthophoto import ImageOptions
@@ -109,6 +110,19 @@ def test_the_warped_mask_is_a_cloud_optimized_geotiff_with_colours(tmp_path: Pat
         assert raster.dataset_mask().min() == 0
         assert json.loads(raster.tags()["ROADGEO_HOMOGRAPHY"]) == located().homography.tolist()
     assert 'type="paletted"' in paths.of(STYLE).read_text()
+
+
+def test_without_zstd_masks_are_deflated(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(footprint, "_compression", lambda: "DEFLATE")
+    drawn = {}
+    for name in ("a", "b"):
+        paths = output_paths(tmp_path, name)
+        write_location(located(), road_mask(), paths)
+        with rasterio.open(paths.footprint) as raster:
+            drawn[raster.compression.name.upper()] = raster.read(1)
+        monkeypatch.undo()
+    assert "DEFLATE" in drawn
+    assert all(np.array_equal(pixels, drawn["DEFLATE"]) for pixels in drawn.values())
 
 
 def test_a_far_view_is_coarsened(tmp_path: Path) -> None:
