@@ -103,7 +103,7 @@ def _compression() -> str:
     try:
         with rasterio.MemoryFile(ext="tif") as file, file.open(
             driver="GTiff", width=1, height=1, count=1, dtype="uint8", compress="ZSTD", crs="EPSG:4326",
-            transform=rasterio.Affine(1.0, 0.0, 0.0, 0.0, -1.0, 0.0),
+            transform=rasterio.Affine(2.0, 0.0, 0.0, 0.0, -2.0, 0.0),
         ):  # fmt: skip
             return "ZSTD"
     except RasterioError:
