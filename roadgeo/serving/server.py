@@ -105,6 +105,9 @@ class Server(ThreadingHTTPServer):
             )
             with suppress(OSError):
                 request.sendall(refusal)
+                request.setblocking(False)
+                while request.recv(_CHUNK):  # closed with bytes unread, the connection would take the answer with it
+                    pass
             self.shutdown_request(request)
             return
         super().process_request(request, client_address)
