@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import os
 import signal
+from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -13,6 +14,7 @@ from roadgeo.cli.parameters import verbosity_options
 from roadgeo.cli.printing import echo
 
 if TYPE_CHECKING:
+    from roadgeo.flights.mavlink import MavlinkSender
     from roadgeo.serving.server import ServeOptions
 
 __all__ = ["serve_command"]
@@ -35,12 +37,16 @@ encryption; put a proxy before it where the network is not your own.
 Requests wait for a free process, so many as --waiting says; whoever comes then hears 503 and when to come again. The
 size of images, the time to send and to search are bounded too. Ctrl-C ends it.
 
+With --mavlink each place that is found goes to an autopilot, too: that of the camera where the request gives its focal
+length, otherwise the frame's middle (pip install 'roadgeo[mavlink]').
+
 \b
 Examples:
   roadgeo serve --reference boston-ma
   curl --data-binary @photo_mask.png http://127.0.0.1:8017/locate
   curl --data-binary @photo_mask.png "http://127.0.0.1:8017/locate?near=-71.06,42.36,5000"
   ROADGEO_TOKEN=secret roadgeo serve --host 0.0.0.0 --jobs 4
+  roadgeo serve --mavlink udpout:127.0.0.1:14550
 
 Exit status: 0 ended, 1 error, 2 usage.
 """
@@ -77,12 +83,14 @@ Exit status: 0 ended, 1 error, 2 usage.
     show_default=True,
     help="Of a search; requests may ask for less.",
 )
+@click.option("--mavlink", metavar="URL", help="Also send places to an autopilot, to such as udpout:127.0.0.1:14550.")
 @verbosity_options
-def serve_command(references: tuple[str, ...], quiet: bool, verbose: bool, **given: Any) -> int:  # noqa: ARG001
+def serve_command(references: tuple[str, ...], mavlink: str | None, quiet: bool, verbose: bool, **given: Any) -> int:  # noqa: ARG001
     """Keep references open, and answer; for the help see above."""
     from roadgeo.cli.compilation import compile_once
     from roadgeo.cli.progress import print_steps
-    from roadgeo.errors import OutputError
+    from roadgeo.errors import OutputError, RoadgeoError
+    from roadgeo.flights.mavlink import MavlinkSender
     from roadgeo.running.batch import open_references
     from roadgeo.serving.server import Server
     from roadgeo.serving.workers import Workers
@@ -92,7 +100,11 @@ def serve_command(references: tuple[str, ...], quiet: bool, verbose: bool, **giv
     names = [one.name for one in open_references(references, print_steps(quiet))]
     workers = Workers(references, options.workers, options.waiting)
     try:
-        server = Server(workers, names, options)
+        sender = None if mavlink is None else MavlinkSender(mavlink)
+        server = Server(workers, names, options, None if sender is None else partial(_tell, sender))
+    except RoadgeoError:
+        workers.close()
+        raise
     except OSError as error:
         workers.close()
         where = f"{options.host} port {options.port}"
@@ -106,7 +118,18 @@ def serve_command(references: tuple[str, ...], quiet: bool, verbose: bool, **giv
         pass
     finally:
         server.close()
+        if sender is not None:
+            sender.close()
     return 0
+
+
+def _tell(sender: MavlinkSender, found: dict[str, Any], came_s: float) -> None:
+    """Send the place of a mask that was located; it was taken when its request came."""
+    from roadgeo.flights.mavlink import fix_of
+
+    fix = fix_of(found, came_s)
+    if fix is not None:
+        sender.send(fix)
 
 
 def _options(given: dict[str, Any]) -> ServeOptions:

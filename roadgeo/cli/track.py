@@ -3,8 +3,10 @@
 from __future__ import annotations
 
 import json
+import time
 from collections import Counter
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
 from datetime import UTC, datetime
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -48,11 +50,17 @@ What is written to --out-dir:
   flight.csv      one row a frame, columns named as in MISB ST 0601
   flight.html     the flight on the map, to play in a browser; needs no network
 
+With --camera the place of the camera is told, too: not that of the ground in the frame's middle. That is what an
+autopilot needs; --mavlink sends it as soon as it is known, for PX4 (GLOBAL_POSITION_SENSOR) and ArduPilot
+(EXTERNAL_POSITION_ESTIMATE), with its standard deviation and delay; without --camera, the frame's middle. It needs
+pip install 'roadgeo[mavlink]'.
+
 \b
 Examples:
   roadgeo track frames/ --reference boston-ma --motion odometry.csv
   roadgeo track flight.mp4 --every 0.5 --start 2024-05-01T09:30:00Z --out-dir found
   roadgeo track frame_*.png --json > flight.jsonl
+  roadgeo track frames/ --camera 640 --mavlink udpout:127.0.0.1:14550
 
 Exit status: 0 every frame has a place, 3 at least one is lost, 1 error, 2 usage.
 """
@@ -133,6 +141,14 @@ class Moment(click.ParamType):  # type: ignore[type-arg]
 @click.option("--band", metavar="N", type=click.IntRange(1), help="Band that holds the mask.")
 @hint_options("gsd_m", "max_tilt_deg", "near")
 @click.option(
+    "--camera",
+    "focal_px",
+    metavar="PIXELS",
+    type=click.FloatRange(min=0, min_open=True),
+    help="Focal length in pixels of the frames: the place of the camera is told, too.",
+)
+@click.option("--mavlink", metavar="URL", help="Also send places to an autopilot, to such as udpout:127.0.0.1:14550.")
+@click.option(
     "--time-limit",
     metavar="SECONDS",
     type=click.FloatRange(min=0, min_open=True),
@@ -148,6 +164,8 @@ def track_command(
     name: str,
     as_json: bool,
     start: datetime | None,
+    mavlink: str | None,
+    focal_px: float | None,
     quiet: bool,
     verbose: bool,
     **given: Any,
@@ -166,16 +184,18 @@ def track_command(
     compile_once(quiet)
     known: dict[int, Tracked] = {}
     pictures = Thumbnails()
-    for frame, news in _follow(frames, reading, opened, options):
-        pictures.add(frame.number, frame.mask)
-        for one in news:
-            known[one.frame.number] = _without_mask(one)
-        for row in make_rows(news, start):
-            _print(row, as_json, quiet, verbose)
+    with _sender(mavlink) as send:
+        for frame, news in _follow(frames, reading, opened, options):
+            pictures.add(frame.number, frame.mask)
+            known.update({one.frame.number: _without_mask(one) for one in news})
+            fresh = make_rows(news, start, focal_px)
+            send(fresh[-1])
+            for row in fresh:
+                _print(row, as_json, quiet, verbose)
     tracked = [known[number] for number in sorted(known)]
     if not tracked:
         raise click.UsageError(f"No frames in {', '.join(frames)}.")
-    rows = make_rows(tracked, start)
+    rows = make_rows(tracked, start, focal_px)
     files = _write(Path(out_dir), name, tracked, rows, pictures)
     counts = Counter(row.status for row in rows)
     if not quiet:
@@ -191,6 +211,27 @@ def _follow(
     from roadgeo.flights.tracker import follow
 
     return follow(read_frames(frames, reading), opened, options)
+
+
+@contextmanager
+def _sender(url: str | None) -> Iterator[Callable[[Row], None]]:
+    """Yield what sends the place of the latest frame; it was taken when it is read, unless its time is told."""
+    if url is None:
+        yield lambda _: None
+        return
+    from roadgeo.flights.mavlink import MavlinkSender, fix_of
+
+    with MavlinkSender(url) as sender:
+        read_at = time.time()
+
+        def send(row: Row) -> None:
+            nonlocal read_at
+            fix = fix_of(row.to_dict(), read_at if row.time is None else row.time.timestamp())
+            if fix is not None:
+                sender.send(fix)
+            read_at = time.time()
+
+        yield send
 
 
 def _track_options(given: dict[str, Any]) -> TrackOptions:

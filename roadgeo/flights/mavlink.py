@@ -13,14 +13,14 @@ import os
 import re
 import threading
 import time
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
 from roadgeo.errors import OutputError
 
-__all__ = ["MavlinkOptions", "MavlinkSender", "PositionFix", "has_pymavlink"]
+__all__ = ["MavlinkOptions", "MavlinkSender", "PositionFix", "fix_of", "has_pymavlink"]
 
 #: MAV_COMP_ID_VISUAL_INERTIAL_ODOMETRY and MAV_TYPE_ONBOARD_CONTROLLER: what we are to the autopilot.
 _COMPONENT, _TYPE = 197, 18
@@ -70,6 +70,24 @@ class PositionFix:
     lat: float
     sigma_m: float
     taken_s: float
+
+
+def fix_of(found: Mapping[str, Any], taken_s: float) -> PositionFix | None:
+    """Return where to say that we are, of a frame's row or a location as plain values; None where that is not known.
+
+    That is the place of the camera where its focal length was given, and otherwise that of the frame's middle.
+    """
+    camera = found.get("camera")
+    if camera and camera.get("source", "camera") == "camera":
+        told = camera.get("sigma")
+        sigma = camera["sigma_m"] if told is None else math.hypot(told["x_m"], told["y_m"])
+        return PositionFix(camera["lon"], camera["lat"], sigma, taken_s)
+    if found.get("center") is None or found.get("status") == "ambiguous":
+        return None
+    sigma = found.get("sigma_m")
+    if sigma is None:
+        sigma = max(found.get("corner_sigma_m") or [math.nan])
+    return PositionFix(found["center"]["lon"], found["center"]["lat"], sigma, taken_s)
 
 
 def has_pymavlink() -> bool:

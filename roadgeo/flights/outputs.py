@@ -33,7 +33,8 @@ def to_csv(rows: Sequence[Row]) -> str:
     first = ["Frame", "Name", "Time s", "Precision Time Stamp", "Status"]
     center = ["Frame Center Latitude", "Frame Center Longitude"]
     numbers = ["Target Error Estimate - CE90", "Sigma m", "Ground Sampling m", "Image Heading", "Log10 Odds"]
-    table.writerow([*first, *center, *corners, *numbers, "Known At Frame", "Reason"])
+    sensor = ["Sensor Latitude", "Sensor Longitude", "Sensor Height Above Ground m", "Sensor Sigma m"]
+    table.writerow([*first, *center, *corners, *numbers, *sensor, "Known At Frame", "Reason"])
     for row in rows:
         stamp = "" if row.time is None else str(round(row.time.timestamp() * 1e6))
         at = ["", ""] if row.center is None else [f"{row.center[1]:.8f}", f"{row.center[0]:.8f}"]
@@ -50,11 +51,19 @@ def to_csv(rows: Sequence[Row]) -> str:
                 *at,
                 *ring,
                 *told,
+                *_sensor(row),
                 row.known_at,
                 row.reason,
             ]
         )
     return text.getvalue()
+
+
+def _sensor(row: Row) -> list[str]:
+    if row.camera is None:
+        return [""] * 4
+    camera = row.camera
+    return [f"{camera.lat:.8f}", f"{camera.lon:.8f}", f"{camera.height_m:.2f}", f"{camera.sigma_m:.2f}"]
 
 
 def to_geojson(rows: Sequence[Row]) -> str:
@@ -67,7 +76,7 @@ def to_geojson(rows: Sequence[Row]) -> str:
             "properties": {
                 key: value
                 for key, value in row.to_dict().items()
-                if key not in ("footprint_lonlat", "homography", "center", "schema")
+                if key not in ("footprint_lonlat", "homography", "center", "camera", "schema")
             },
         }
         for row in placed

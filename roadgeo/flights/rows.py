@@ -4,17 +4,29 @@ from __future__ import annotations
 
 import math
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import asdict, dataclass
 from datetime import UTC, datetime, timedelta
 from typing import Any
 
 import numpy as np
 
 from roadgeo._arrays import FloatArray
+from roadgeo.flights.pose import Pose
 from roadgeo.flights.tracker import Tracked
-from roadgeo.geometry.projection import grid_north, to_lonlat
+from roadgeo.geometry.pose import PoseOptions, find_pose
+from roadgeo.geometry.projection import LocalPlane, grid_north, to_lonlat
 
-__all__ = ["Row", "make_rows"]
+__all__ = ["CameraPlace", "Row", "make_rows"]
+
+
+@dataclass(frozen=True)
+class CameraPlace:
+    """Where the camera was: degrees, and metres above the ground; `sigma_m` is of its horizontal place."""
+
+    lon: float
+    lat: float
+    height_m: float
+    sigma_m: float
 
 
 @dataclass(frozen=True)
@@ -34,6 +46,8 @@ class Row:
         Direction of the image's up, clockwise from true north.
     homography : (3, 3) float64 or None
         Pixel (column, row) to `crs`.
+    camera : CameraPlace or None
+        Where the camera was; None unless its focal length was given.
     """
 
     number: int
@@ -52,6 +66,7 @@ class Row:
     log10_odds: float = math.nan
     crs: str = ""
     homography: FloatArray | None = None
+    camera: CameraPlace | None = None
 
     def to_dict(self) -> dict[str, Any]:
         """Plain values, ready for `json.dumps`."""
@@ -75,17 +90,18 @@ class Row:
             "gsd_m": number(self.gsd_m),
             "heading_deg": number(self.heading_deg),
             "log10_odds": number(self.log10_odds),
+            "camera": None if self.camera is None else asdict(self.camera),
             "crs": self.crs or None,
             "homography": None if self.homography is None else self.homography.tolist(),
         }
 
 
-def make_rows(tracked: Sequence[Tracked], begun: datetime | None = None) -> list[Row]:
-    """Describe frames; `begun` says when the first one was taken."""
-    return [_row(one, begun) for one in tracked]
+def make_rows(tracked: Sequence[Tracked], begun: datetime | None = None, focal_px: float | None = None) -> list[Row]:
+    """Describe frames; `begun` says when the first one was taken, `focal_px` what the camera's focal length is."""
+    return [_row(one, begun, focal_px) for one in tracked]
 
 
-def _row(one: Tracked, begun: datetime | None) -> Row:
+def _row(one: Tracked, begun: datetime | None, focal_px: float | None) -> Row:
     frame = one.frame
     when = None if begun is None else begun.astimezone(UTC) + timedelta(seconds=frame.time_s)
     bare = (frame.number, frame.name, frame.time_s, when, one.status, one.reason, one.known_at)
@@ -108,4 +124,16 @@ def _row(one: Tracked, begun: datetime | None) -> Row:
         one.log10_odds,
         plane.crs,
         matrix / matrix[2, 2],
+        None if focal_px is None else _camera(pose, plane, focal_px),
     )
+
+
+def _camera(pose: Pose, plane: LocalPlane, focal_px: float) -> CameraPlace | None:
+    """Find the camera of a focal length behind a frame; None where there is none above the ground."""
+    size = round(pose.frame.width), round(pose.frame.height)
+    found = find_pose(pose.homography.matrix, size, pose.covariance, PoseOptions(focal_px=focal_px))
+    if found is None:
+        return None
+    lon, lat = to_lonlat(plane.crs, plane.to_crs(found.position[None, :2]))[0]
+    sigma = math.sqrt(float(np.trace(found.covariance[:2, :2])))
+    return CameraPlace(float(lon), float(lat), float(found.position[2]), sigma)

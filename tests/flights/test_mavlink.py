@@ -11,7 +11,7 @@ from dataclasses import replace
 import pytest
 
 from roadgeo.errors import OutputError
-from roadgeo.flights.mavlink import MavlinkOptions, MavlinkSender, PositionFix, has_pymavlink
+from roadgeo.flights.mavlink import MavlinkOptions, MavlinkSender, PositionFix, fix_of, has_pymavlink
 
 pytestmark = pytest.mark.slow
 
@@ -142,3 +142,16 @@ def test_without_pymavlink_it_is_said_what_to_install(monkeypatch):
     monkeypatch.setattr("roadgeo.flights.mavlink.has_pymavlink", lambda: False)
     with pytest.raises(OutputError, match=r"roadgeo\[mavlink\]"):
         MavlinkSender("udpout:127.0.0.1:1")
+
+
+def test_the_camera_is_told_where_its_lens_is_known_and_the_middle_otherwise():
+    middle = {"status": "tracked", "center": {"lon": 1.0, "lat": 2.0}, "sigma_m": 3.0, "camera": None}
+    assert fix_of(middle, 5.0) == PositionFix(1.0, 2.0, 3.0, 5.0)
+    row = {**middle, "camera": {"lon": 1.5, "lat": 2.5, "height_m": 300.0, "sigma_m": 4.0}}
+    assert fix_of(row, 5.0) == PositionFix(1.5, 2.5, 4.0, 5.0)
+    location = {"status": "located", "center": {"lon": 1.0, "lat": 2.0}, "corner_sigma_m": [1.0, 2.0, 1.5, 1.0]}
+    assumed = {"lon": 1.5, "lat": 2.5, "source": "assumed", "sigma": {"x_m": 3.0, "y_m": 4.0}}
+    assert fix_of({**location, "camera": assumed}, 5.0) == PositionFix(1.0, 2.0, 2.0, 5.0)
+    assert fix_of({**location, "camera": {**assumed, "source": "camera"}}, 5.0) == PositionFix(1.5, 2.5, 5.0, 5.0)
+    assert fix_of({"status": "not_located", "center": None}, 5.0) is None
+    assert fix_of({**location, "status": "ambiguous"}, 5.0) is None
