@@ -308,6 +308,7 @@ def test_a_name_is_needed_by_nobody(tmp_path: Path, network: RoadNetwork) -> Non
     assert describe_reference(tmp_path / "bare")["name"] == "bare"
 
 
+@pytest.mark.slow
 def test_killed_writers_leave_a_whole_reference() -> None:
     states = kill_writers.run(count=4, seed=1, command=[])
     assert states["whole"] + states["index built again"] == 4

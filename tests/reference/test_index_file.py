@@ -92,6 +92,7 @@ plain = st.recursive(
 )
 
 
+@pytest.mark.slow
 @given(
     meta=st.dictionaries(st.text(), plain, max_size=5),
     array=hnp.arrays(st.sampled_from(list(index_file._DTYPES.values())), hnp.array_shapes(min_dims=0, min_side=0)),
@@ -214,6 +215,7 @@ def test_every_truncation_and_extension_is_refused(path: Path) -> None:
     assert refused_or_equal(path)
 
 
+@pytest.mark.slow
 @given(data=st.data())
 @settings(max_examples=300, suppress_health_check=[HealthCheck.function_scoped_fixture], deadline=None)
 def test_moved_ranges_are_refused_or_harmless(path: Path, data: st.DataObject) -> None:
@@ -438,6 +440,7 @@ def test_a_missing_folder_is_named(tmp_path: Path) -> None:
 # --- five thousand mutants --------------------------------------------------------------------------------------------
 
 
+@pytest.mark.slow
 def test_mutants_are_refused_or_equal_and_cost_little_memory() -> None:
     """In a process of its own, whose crash or memory would show."""
     script = Path(__file__).parents[1] / "support" / "fuzz_index.py"

@@ -305,6 +305,7 @@ class TestHostileTables:
         with pytest.raises(IndexFormatError, match="is computed"):
             read_network(path)
 
+    @pytest.mark.slow
     def test_a_tree_that_never_ends(self, path):
         """Pages of a table that all lead to the same page: a few kilobytes hold 400 to the fourth power rows."""
         deep_tree(path, "roads")

@@ -50,6 +50,7 @@ def test_the_roads_of_a_place(osm, pauses):
     assert '["tunnel"!~"^(yes|avalanche_protector)$"]' in query
 
 
+@pytest.mark.slow
 def test_answers_are_kept_and_grow_old(osm, pauses):
     first = fetch_roads("Fenway, Boston", options=ask(osm))
     said = []

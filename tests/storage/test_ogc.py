@@ -12,6 +12,7 @@ from roadgeo.cli import main
 from roadgeo.demo import ROADS, demo_masks
 
 
+@pytest.mark.slow
 def test_all_that_is_written_is_valid(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setenv("ROADGEO_LIBRARY", str(tmp_path / "library"))
     monkeypatch.chdir(tmp_path)
