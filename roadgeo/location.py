@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass, field
+from dataclasses import asdict, dataclass, field
 from enum import StrEnum
 from html import escape
 from typing import TYPE_CHECKING, Any, Literal
@@ -390,6 +390,7 @@ class Location:
 
         center = self.center
         rmse_m, rmse_px = self.rmse() or (None, None)
+        # The order in which people read it: what was asked, where it lies, how sure that is, what it took.
         return {
             "schema": SCHEMA,
             "version": __version__,
@@ -426,21 +427,7 @@ class Location:
             "log10_odds": self.log10_odds,
             "runner_up": None if self.runner_up is None else place(self.runner_up),
             "alternatives": [place(one) for one in self.alternatives],
-            "seconds": {
-                "open": self.seconds.open,
-                "read": self.seconds.read,
-                "vectorize": self.seconds.vectorize,
-                "match": self.seconds.match,
-                "refine": self.seconds.refine,
-                "write": self.seconds.write,
-                "total": self.seconds.total,
-            },
-            "stats": {
-                "tuples_sampled": self.stats.tuples_sampled,
-                "candidates": self.stats.candidates,
-                "hypotheses": self.stats.hypotheses,
-                "verified": self.stats.verified,
-                "work_ms": self.stats.work_ms,
-            },
+            "seconds": {**asdict(self.seconds), "total": self.seconds.total},
+            "stats": asdict(self.stats),
             "stopped": self.stopped,
         }
