@@ -1,0 +1,44 @@
+"""The same input gives the same result bit for bit: in any order, with any number of processes and threads."""
+
+import json
+import os
+import subprocess
+import sys
+from pathlib import Path
+
+import pytest
+
+from roadgeo.demo import ROADS, demo_masks
+from roadgeo.workflows import build_reference
+
+MASKS = [one.path for one in demo_masks()]
+CODE = "import sys; from roadgeo.cli import main; sys.exit(main(sys.argv[1:]) == 1)"
+
+
+@pytest.fixture(scope="module")
+def porto(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    path = tmp_path_factory.mktemp("reference") / "porto.gpkg"
+    build_reference(ROADS, "porto", path=path)
+    return path
+
+
+def answers(porto: Path, out: Path, masks: list[Path], *more: str, threads: int = 1) -> dict[str, object]:
+    """Locate masks in a process of its own; return all that is told of each, but for seconds and the command."""
+    names = ("NUMBA_NUM_THREADS", "OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS", "OPENCV_FOR_THREADS_NUM")
+    environment = {**os.environ, **dict.fromkeys(names, str(threads)), "PYTHONHASHSEED": str(threads)}
+    command = ["locate", *map(str, masks), "-r", str(porto), "-o", str(out), "--json", "-q", *more]
+    done = subprocess.run(
+        [sys.executable, "-c", CODE, *command], env=environment, capture_output=True, text=True, timeout=600
+    )
+    assert done.returncode == 0, done.stderr
+    told = [json.loads(line) for line in done.stdout.splitlines()]
+    assert len(told) == len(masks)
+    for one in told:
+        del one["seconds"], one["command"]
+    return {one["query"]: one for one in told}
+
+
+def test_order_processes_and_threads_change_nothing(porto: Path, tmp_path: Path) -> None:
+    once = answers(porto, tmp_path / "a", MASKS)
+    assert {one["status"] for one in once.values()} == {"located", "not_located"}
+    assert answers(porto, tmp_path / "b", MASKS[::-1], "--jobs", "3", threads=4) == once
