@@ -1,10 +1,13 @@
 """Start-up: what is compiled is loaded without numba, and what is not is compiled with a word to the user."""
 
+import os
 import subprocess
 import sys
+import time
+from pathlib import Path
 
 from roadgeo.kernels.compilation import compiled, entries, modules_of_the_search
-from roadgeo.warmup import warm_up
+from roadgeo.warmup import remove_unused, warm_up
 
 #: Every array on the way from roads and mask to a place must be what the kernels expect, or numba is asked for help.
 LOCATE = """
@@ -29,3 +32,21 @@ def test_all_kernels_of_the_search_are_kept_as_machine_code() -> None:
 def test_a_warm_process_does_not_import_numba() -> None:
     warm_up()
     subprocess.run([sys.executable, "-c", LOCATE], check=True, timeout=300)
+
+
+def test_machine_code_that_was_not_used_for_weeks_is_removed(tmp_path: Path) -> None:
+    own, young, old, other = (tmp_path / name for name in ("kernels-1-a", "kernels-1-b", "kernels-0-c", "downloads"))
+    for folder in (own, young, old, other):
+        folder.mkdir()
+        (folder / "growth.o").write_bytes(b"code")
+    for folder in (own, old, other):
+        os.utime(folder, (time.time() - 40 * 86_400,) * 2)
+    (tmp_path / "kernels-link").symlink_to(other)
+    remove_unused(own)
+    assert sorted(path.name for path in tmp_path.iterdir()) == [
+        "downloads",
+        "kernels-1-a",
+        "kernels-1-b",
+        "kernels-link",
+    ]
+    assert (other / "growth.o").exists()

@@ -174,7 +174,8 @@ def locate_masks(
     skip_existing : bool
         Keep results of the same question that are whole and younger than their masks.
     jobs : int
-        Processes; the results do not depend on it.
+        Processes; the results do not depend on it. In a script, several need `if __name__ == "__main__":` around the
+        call, for each of them imports the script.
     cluster : Cluster, optional
         Where it is done instead; the results do not depend on that either.
     command : sequence of str

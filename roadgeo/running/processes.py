@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import contextlib
 import multiprocessing
 import os
 import signal
@@ -9,7 +10,10 @@ import sys
 from collections.abc import Callable, Iterator, Sequence
 from concurrent.futures import ProcessPoolExecutor
 from concurrent.futures.process import BrokenProcessPool
+from pathlib import Path
 from typing import Any, Protocol, TypeVar
+
+from roadgeo.errors import RoadgeoError
 
 __all__ = ["Work", "run"]
 
@@ -41,6 +45,7 @@ def run(tasks: Sequence[Task], work: Work[Task, Result], jobs: int) -> Iterator[
         do = work.prepare()
         yield from map(do, tasks)
         return
+    _require_guard()
     rest = list(tasks)
     while rest:
         done = 0
@@ -57,6 +62,23 @@ def run(tasks: Sequence[Task], work: Work[Task, Result], jobs: int) -> Iterator[
                 yield work.give_up(suspect, "the process that worked on it died (out of memory?)")
             done += 1
         rest = rest[done:]
+
+
+def _require_guard() -> None:
+    """Refuse to start processes from a script that would, imported by each of them, start them again.
+
+    Raises
+    ------
+    RoadgeoError
+        It has no `if __name__ == "__main__":`.
+    """
+    script = getattr(sys.modules.get("__main__"), "__file__", None)
+    with contextlib.suppress(OSError):
+        if script and script.endswith(".py") and "__name__" not in Path(script).read_text("utf-8", "replace"):
+            raise RoadgeoError(
+                f"{script}: several processes import this script again, each of them: put what it does under "
+                'if __name__ == "__main__":, or use jobs=1'
+            )
 
 
 def _run_together(tasks: Sequence[Task], work: Work[Task, Result], jobs: int) -> Iterator[Result]:

@@ -89,3 +89,19 @@ def is_gone(group: int) -> bool:
             return True
         time.sleep(0.1)
     return False
+
+
+@pytest.mark.parametrize(("guard", "status"), [("", 1), ("if __name__ == '__main__':", 0)])
+def test_a_script_that_would_start_itself_again_is_told_so(guard: str, status: int, tmp_path: Path) -> None:
+    """Its processes died, and masks failed for want of memory, it was said."""
+    script = tmp_path / "script.py"
+    begin = guard or "if True:"
+    script.write_text(
+        f"from running.test_processes import Shout\nfrom roadgeo.running.processes import run\n{begin}\n"
+        "    print(list(run(list('abc'), Shout(), 2)))\n"
+    )
+    tests = Path(__file__).parents[1]
+    environment = {**os.environ, "PYTHONPATH": f"{tests}{os.pathsep}{tests.parent}"}
+    done = subprocess.run([sys.executable, script], env=environment, capture_output=True, text=True, timeout=120)
+    assert done.returncode == status, done.stderr
+    assert "['A', 'B', 'C']" in done.stdout if guard else "put what it does under if __name__ ==" in done.stderr
