@@ -243,6 +243,8 @@ class Location:
         "time", a limit. Only with "time" may the answer depend on the machine and its load. "" where none was needed.
     options : dict or None
         What was asked, as far as it differs from the usual, in plain values; None: not told.
+    query_to_pixel : (3, 3) float64 or None
+        Of roads that came as lines: their coordinates to pixels of the mask that was drawn of them.
     mirrored : bool
         The mask has this place turned over only, left to right: the homography mirrors.
     stated_offset_m : float or None
@@ -289,6 +291,7 @@ class Location:
     alternatives: tuple[Place, ...] = ()
     camera: Camera | None = field(default=None, repr=False)
     mirrored: bool = False
+    query_to_pixel: FloatArray | None = field(default=None, repr=False)
 
     @property
     def located(self) -> bool:
@@ -418,6 +421,7 @@ class Location:
             "corner_covariance_m2": rows(self.corner_covariance_m2),
             "camera": None if self.camera is None else self.camera.to_dict(),
             "mirrored": self.mirrored,
+            "query_to_pixel": rows(self.query_to_pixel),
             "stated_offset_m": self.stated_offset_m,
             "rmse_m": rmse_m,
             "rmse_px": rmse_px,

@@ -54,7 +54,7 @@ scale and camera need not be known; what is known shortens the search, and tells
 files, folders or patterns.
 
 A photograph may stand for its mask: it is recognised, a network finds its roads (pip install 'roadgeo[segment]'), and
-what it saw is kept as PHOTO_mask.tif.
+what it saw is kept as PHOTO_mask.tif. So may roads as lines, in pixels, metres or degrees: roads.geojson, tracks.gpkg.
 
 \b
 For each located photo_mask.tif:
@@ -196,6 +196,13 @@ def _drawing_options(command: Command) -> Command:
 @click.option("--json", "as_json", is_flag=True, help="Print one JSON object per mask and line, in input order.")
 @_drawing_options
 @segmenting_options
+@click.option(
+    "--units",
+    type=click.Choice(["auto", "pixels", "metres"]),
+    default="auto",
+    show_default=True,
+    help="What the coordinates are of roads that come as lines (GeoJSON, GeoPackage ...). auto: told by the CRS.",
+)
 @click.option(
     "--allow-mirror",
     is_flag=True,

@@ -90,4 +90,5 @@ def read_options(given: Mapping[str, Any], photos: Mapping[str, str], others: Se
         threads=1 if jobs > 1 else min(os.cpu_count() or 1, _MAX_THREADS),
         dem=given.get("dem") or "",
         allow_mirror=bool(given.get("allow_mirror")),
+        units=given.get("units") or "auto",
     )

@@ -97,6 +97,8 @@ class ReadOptions:
         Terrain model that says how high the ground lies under the camera; "" for none.
     allow_mirror : bool
         Masks that were mirrored have the place that they have turned over.
+    units : "auto", "pixels" or "metres"
+        Of roads that come as lines.
     """
 
     threshold: float | None = None
@@ -110,6 +112,7 @@ class ReadOptions:
     threads: int = 1
     dem: str = ""
     allow_mirror: bool = False
+    units: Literal["auto", "pixels", "metres"] = "auto"
 
     def photo(self, task: Task, of_photograph: bool) -> str | None:
         """Return the photograph that is drawn, if any: one that was given, or the query itself."""
@@ -121,7 +124,7 @@ class ReadOptions:
 
         return QueryOptions(
             self.threshold, self.band, self.segment, self.segmenters, self.class_name, self.fused_with, self.threads,
-            "allow" if self.allow_mirror else "tell",
+            "allow" if self.allow_mirror else "tell", self.units,
         )  # fmt: skip
 
 

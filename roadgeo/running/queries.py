@@ -19,6 +19,7 @@ import numpy as np
 from roadgeo._arrays import AnyArray
 from roadgeo._progress import Say, say_nothing
 from roadgeo.errors import MaskError, PhotographError, PluginError
+from roadgeo.geometry.camera import CameraOptions
 from roadgeo.geometry.mask import RoadMask
 from roadgeo.location import Location, Reason
 from roadgeo.matching.options import LocateOptions
@@ -31,6 +32,7 @@ from roadgeo.segmentation.photograph import Photograph, open_photograph
 from roadgeo.segmentation.probability import NODATA, ProbabilityMap, fuse
 from roadgeo.segmentation.scales import rank_scales, scale_of
 from roadgeo.segmentation.tiling import map_shape, segment
+from roadgeo.sources.drawn_roads import ENDINGS, Units, draw_roads
 from roadgeo.sources.exif import estimate_gsd
 from roadgeo.sources.masks import open_mask, read_mask
 from roadgeo.workflows import locate
@@ -68,6 +70,8 @@ class QueryOptions:
         Of a model; fixed, so that results are the same on every run.
     mirror : "tell", "never" or "allow"
         Of a mask that is refused, and would be located turned over: whether that is said, not asked, or the answer.
+    units : "auto", "pixels" or "metres"
+        Of roads that come as lines (see `sources.drawn_roads`).
     """
 
     threshold: float | None = None
@@ -78,6 +82,7 @@ class QueryOptions:
     fused_with: tuple[str, ...] = ()
     threads: int = 1
     mirror: Literal["tell", "never", "allow"] = "tell"
+    units: Units = "auto"
 
 
 def locate_query(
@@ -101,6 +106,8 @@ def locate_query(
         A segmenter fails.
     """
     options, query = options or LocateOptions(), query or QueryOptions()
+    if isinstance(path, str) and path.lower().endswith(ENDINGS):
+        return _locate_lines(path, references, options, query, how)
     has_plugin = any(not is_model(name) for name in query.segmenters)
     wants_mask = query.segment == "never" or (query.segment == "auto" and not has_plugin)
     if wants_mask and not query.fused_with:
@@ -120,6 +127,21 @@ def locate_query(
 def is_model(segmenter: str) -> bool:
     """Whether a segmenter is the file of a model, not the name of a plugin."""
     return segmenter.lower().endswith(".onnx")
+
+
+def _locate_lines(
+    path: str, references: Sequence[AnyReference], options: LocateOptions, query: QueryOptions, how: Locate
+) -> Sighting:
+    """Locate roads that come as lines; what their units tell of scale and north is heeded unless the user said more."""
+    drawing, camera = draw_roads(path, query.units), options.match.camera
+    if drawing.unit_m is not None and camera.gsd_m == CameraOptions().gsd_m:
+        known = (drawing.unit_m / 1.05, drawing.unit_m * 1.05)
+        tilt = min(camera.max_tilt_deg, 10.0)  # they were measured on the ground, or on a map
+        camera = replace(camera, gsd_m=known, max_tilt_deg=tilt, north_up=camera.north_up or drawing.north_up)
+    options = replace(options, match=replace(options.match, camera=camera))
+    sighting = locate_looks([Look("its lines", lambda: drawing.mask)], references, options, how)
+    sighting = ask_mirrored(sighting, references, options, query.mirror == "allow")
+    return replace(sighting, location=replace(sighting.location, query_to_pixel=drawing.to_pixel))
 
 
 def _locate_mask(

@@ -1,0 +1,128 @@
+"""Roads as lines in place of a mask: digitised on a picture, surveyed in metres, or inferred from GPS tracks.
+
+They are drawn as a mask would show them, and located like one.
+"""
+
+from __future__ import annotations
+
+import os
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Literal
+
+import cv2
+import numpy as np
+
+from roadgeo._arrays import BoolArray, FloatArray, IntArray
+from roadgeo.errors import MaskError, RoadSourceError
+from roadgeo.geometry.mask import RoadMask
+
+__all__ = ["ENDINGS", "Drawing", "Units", "draw_roads"]
+
+Units = Literal["auto", "pixels", "metres"]
+
+#: Names of files that hold lines, not pixels.
+ENDINGS = (".geojson", ".gpkg", ".fgb", ".shp", ".gpx", ".kml", ".parquet")
+
+_MOST_PX, _LEAST_PX, _MARGIN_PX = 4000, 400, 24
+_ROAD_M, _ROAD_PX = 8.0, 6.0
+_MOST_DEGREES = 3.0  # wider than this they are no frame
+
+
+@dataclass(frozen=True)
+class Drawing:
+    """Lines drawn as a mask.
+
+    Attributes
+    ----------
+    to_pixel : (3, 3) float64 or None
+        The lines' coordinates to pixels of the mask (column, row; corner convention). None where they came in degrees.
+    unit_m : float or None
+        Metres per pixel, where the lines' units say.
+    north_up : bool
+        Whether they say that up is north, within a few degrees.
+    """
+
+    mask: RoadMask
+    to_pixel: FloatArray | None
+    unit_m: float | None
+    north_up: bool
+
+
+def draw_roads(path: str | os.PathLike[str], units: Units = "auto") -> Drawing:
+    """Read the lines of a file and draw them.
+
+    Parameters
+    ----------
+    units : "auto", "pixels" or "metres"
+        What their coordinates are. By default degrees or metres where the file names a CRS that they fit, and pixels of
+        a picture where all lie below the x axis, as QGIS digitises on one. Pixels above it are rows, downwards.
+
+    Raises
+    ------
+    MaskError
+        The file holds no lines, or does not tell its units.
+    """
+    from roadgeo.sources.lines import read_lines
+
+    name = os.fspath(path)
+    try:
+        read = read_lines(Path(path))
+    except RoadSourceError as error:
+        raise MaskError(str(error)) from error
+    import shapely
+
+    coords, owner = shapely.get_coordinates(read.lines, return_index=True)
+    kind = _tell_units(name, coords, read.crs) if units == "auto" else units
+    degrees = kind == "degrees"
+    if degrees:
+        coords = _to_metres(coords)
+    # The lines' plane with y up: rows of a picture count downwards.
+    downwards = kind == "pixels" and coords[:, 1].max() > 0
+    flip = np.diag([1.0, -1.0, 1.0]) if not downwards else np.eye(3)
+    low, high = coords.min(axis=0), coords.max(axis=0)
+    side = float((high - low).max())
+    if not 0 < side < 1e9:
+        raise MaskError(f"{name}: its lines cover {side:g} units; expected a frame of roads")
+    unit = max(side / _MOST_PX, 1.0) if kind == "pixels" else float(np.clip(1.0, side / _MOST_PX, side / _LEAST_PX))
+    top = low[1] if downwards else -high[1]
+    shift = np.array([[1.0, 0.0, _MARGIN_PX - low[0] / unit], [0.0, 1.0, _MARGIN_PX - top / unit], [0.0, 0.0, 1.0]])
+    to_pixel = shift @ np.diag([1.0 / unit, 1.0 / unit, 1.0]) @ flip
+    width, height = np.ceil((high - low) / unit).astype(int) + 2 * _MARGIN_PX
+    road = _ROAD_PX if kind == "pixels" else float(np.clip(_ROAD_M / unit, 4.0, 12.0))
+    roads = _draw(coords @ to_pixel[:2, :2].T + to_pixel[:2, 2], owner, (int(width), int(height)), round(road))
+    mask = RoadMask(roads, name=name)
+    return Drawing(mask, None if degrees else to_pixel, None if kind == "pixels" else unit, degrees)
+
+
+def _tell_units(name: str, coords: FloatArray, crs: str | None) -> Literal["pixels", "metres", "degrees"]:
+    """Tell what coordinates are by their CRS and size."""
+    low, high = coords.min(axis=0), coords.max(axis=0)
+    if crs is not None:
+        from pyproj import CRS
+
+        known = CRS.from_user_input(crs)
+        if not known.is_geographic:
+            return "metres"
+        fits = bool((np.abs(low) <= (180, 90)).all() and (np.abs(high) <= (180, 90)).all())
+        if fits and (high - low).max() <= _MOST_DEGREES:
+            return "degrees"
+    if high[1] <= 0:
+        return "pixels"
+    raise MaskError(f"{name}: does not say what its coordinates are; give --units pixels or --units metres")
+
+
+def _to_metres(lonlat: FloatArray) -> FloatArray:
+    """Take degrees to metres of a plane around them."""
+    from roadgeo.geometry.projection import choose_plane, from_lonlat
+
+    return from_lonlat(choose_plane(lonlat), lonlat)
+
+
+def _draw(pixels: FloatArray, owner: IntArray, size: tuple[int, int], width: int) -> BoolArray:
+    """Draw lines (corner convention; `owner` numbers them) as (H, W) bool."""
+    canvas = np.zeros(size[::-1], np.uint8)
+    fixed = np.round((pixels - 0.5) * 16.0).astype(np.int32)
+    lines = np.split(fixed, np.flatnonzero(np.diff(owner)) + 1)
+    cv2.polylines(canvas, lines, False, 255, max(width, 1), cv2.LINE_8, 4)
+    return np.asarray(canvas > 0)
