@@ -23,6 +23,7 @@ from roadgeo.geometry.camera import CameraOptions
 from roadgeo.geometry.frame import Frame
 from roadgeo.geometry.homography import Homography
 from roadgeo.geometry.mask import PIXEL_TO_PLANE, RoadMask
+from roadgeo.kernels.compilation import load
 from roadgeo.location import Location
 from roadgeo.matching.options import LocateOptions
 from roadgeo.matching.query import trace_query
@@ -158,6 +159,7 @@ class Tracker:
 
     def __init__(self, references: Sequence[Reference], options: TrackOptions | None = None) -> None:
         warm_up()
+        load(["roadgeo.kernels.road_equations"])  # compiled before the first frame, not while it flies by
         self.references, self.options = list(references), options or TrackOptions()
         self.fixes: list[Fix] = []
         self._pose: Pose | None = None
