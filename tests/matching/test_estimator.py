@@ -8,10 +8,10 @@ import shapely
 from worlds.scenes import PLANE, Sight, camera, look, mapped, random_lines, random_network, scene_of
 
 from roadgeo.geometry.camera import CameraOptions
-from roadgeo.matching.estimator import MatchOptions, Sweep, TripleEstimator
+from roadgeo.matching.estimator import Ledger, MatchOptions, Sweep, TripleEstimator
 from roadgeo.matching.index import build_index
 from roadgeo.matching.scene import query_neighbours
-from roadgeo.matching.search import SearchOptions, search
+from roadgeo.matching.search import Search, SearchOptions, search, search_together
 from roadgeo.matching.triples import TripleOptions
 from roadgeo.reference.reference import build_network
 
@@ -141,6 +141,15 @@ def test_places_are_bounded(town, most):
     result, estimator = locate(stranger, town[1], options)
     assert result.stopped == "exhausted"
     assert estimator.n_screened <= most + options.grow.max_screened
+
+
+def test_places_on_many_maps_are_bounded_as_on_one(town):
+    stranger = scene_of(look(random_network(3, 2000.0), camera((1000, 1000)), sight=Sight(0.5)))
+    options, ledger = MatchOptions(max_places=40, last=(), roads=None), Ledger(n_reference=3 * len(town[1]))
+    parts = [TripleEstimator(stranger, town[1], options, ledger=ledger) for _ in range(3)]
+    search_together([Search(one) for one in parts], SearchOptions(time_limit_s=60.0))
+    assert ledger.n_tried == ledger.n_usual == sum(one.n_screened for one in parts)
+    assert 40 <= ledger.n_tried < 40 + max(one.n_screened for one in parts)
 
 
 def test_single_triples_find_a_mask_that_lacks_half_of_the_roads(town):
