@@ -298,7 +298,7 @@ class _Locating:
             document = json.loads(paths.of(JSON).read_text(encoding="utf-8"))
             if paths.of(JSON).stat().st_mtime < Path(task.mask).stat().st_mtime:
                 return None
-        except (OSError, ValueError):
+        except (OSError, ValueError, RecursionError):
             return None
         if not isinstance(document, dict) or (document.get("schema"), document.get("query")) != (SCHEMA, task.query):
             return None

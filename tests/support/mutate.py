@@ -4,7 +4,7 @@
 
 Operators, comparisons, numbers, conditions and returned values inside functions of `roadgeo.geometry` (homography,
 frame, camera, pinhole) are changed one after another, and the tests of these modules run on each mutant until one
-fails. Tests are collected once; each mutant lives in a fork. Prints the mutants that survive, and one JSON object.
+fails. Tests are collected once; each mutant lives in a fork. Prints each mutant, and one JSON object.
 """
 
 import argparse
@@ -127,8 +127,8 @@ class Loop:
         for module, where, tree in self.jobs:
             survived = self.passes(session, module, tree)
             self.found.append((f"{module.__name__}:{where}", survived))
-            if survived:
-                os.write(2, f"survived {module.__name__}:{where}\n".encode())
+            told = f"{len(self.found)} {'survived' if survived else 'killed'} {module.__name__}:{where}\n"
+            os.write(2, told.encode())
         return True
 
     def passes(self, session: pytest.Session, module: types.ModuleType | None, tree: ast.Module | None) -> bool:
