@@ -19,6 +19,7 @@ from roadgeo.matching.refinement import (
     corner_sigmas,
     denormalise,
     normalise,
+    refine,
     scatter_m,
     spacing_m,
 )
@@ -44,6 +45,8 @@ class LensOptions:
         ... and moves the frame's corners by at least so much.
     linear_sigma, place_sigma_m, perspective_sigma : float
         How far off the homography may be that the fit begins with.
+    starts : tuple of float
+        Values of k1 to begin with in turn, where beginning with 0 does not explain enough.
     n_iterations : int
         At most.
     """
@@ -55,15 +58,20 @@ class LensOptions:
     linear_sigma: float = 0.02
     place_sigma_m: float = 5.0
     perspective_sigma: float = 0.05
+    starts: tuple[float, ...] = (-0.15, -0.08, 0.08)
     n_iterations: int = 14
 
 
 @dataclass(frozen=True)
 class LensFit:
-    """A refined homography from the straightened query plane, with its lens, and the standard deviation of k1."""
+    """A refined homography from the straightened query plane, with its lens.
+
+    `k1_sigma` is the standard deviation of k1, `share` that part of the road points that lies on roads.
+    """
 
     refined: Refined
     k1_sigma: float
+    share: float
 
     @property
     def k1(self) -> float:
@@ -177,7 +185,7 @@ def fit_lens(
     found = denormalise(problem.p, scene.center, scene.half_size, problem.origin, problem.unit)
     corners = corner_covariance(problem.p, covariance[:8, :8], scene, problem.unit, refinement)
     refined = Refined(found / found[2, 2], corner_sigmas(corners), rms, corners, k1)
-    return LensFit(refined, math.sqrt(max(covariance[8, 8], 0.0)))
+    return LensFit(refined, math.sqrt(max(covariance[8, 8], 0.0)), n_met / len(scene.points))
 
 
 def find_lens(
@@ -194,12 +202,33 @@ def find_lens(
     """
     if agreeing >= options.enough and not _hints_at_lens(_Problem(matrix, scene, index, refinement), options):
         return None
-    found = fit_lens(matrix, scene, index, 0.0, refinement, options)
+    found = _fit_from_many(matrix, scene, index, refinement, options)
     if found is None or abs(found.k1) < options.significance * found.k1_sigma:
         return None
     corners = scene.corners.astype(float)
     moved = Lens.of(found.k1, scene.size, y_up=True).bend(corners) - corners
     return found if np.hypot(*moved.T).max() >= options.least_px else None
+
+
+def _fit_from_many(
+    matrix: FloatArray, scene: Scene, index: ReferenceIndex, refinement: RefineOptions, options: LensOptions
+) -> LensFit | None:
+    """Fit a lens from one value of k1 after another, until enough of the roads lie on roads; return the best."""
+    best = None
+    nothing = np.full(len(scene.intersections), -1, np.int64)
+    for k1 in (0.0, *options.starts):
+        start = matrix
+        if k1:
+            held = refine(matrix, straighten_scene(scene, k1), index, nothing, refinement, held=True)
+            if held is None:
+                continue
+            start = held.matrix
+        found = fit_lens(start, scene, index, k1, refinement, options)
+        if found is not None and (best is None or found.share > best.share):
+            best = found
+        if best is not None and best.share >= options.enough:
+            break
+    return best
 
 
 def _hints_at_lens(problem: _Problem, options: LensOptions) -> bool:
