@@ -54,6 +54,7 @@ def demo_command(out_dir: str) -> int:
     from roadgeo.storage.files import write_bytes
     from roadgeo.workflows import build_reference
 
+    # what the demonstration starts from is left beside its results
     folder, masks = Path(out_dir), demo_masks()
     make_folder(folder / "masks")
     for source, name in [(ROADS, ROADS.name), (PHOTO, PHOTO.name), *((m.path, f"masks/{m.path.name}") for m in masks)]:
@@ -63,6 +64,7 @@ def demo_command(out_dir: str) -> int:
     reference = build_reference(ROADS, "porto", path=folder / "porto.gpkg", attribution=ATTRIBUTION)
     seconds = perf_counter() - started
     echo(f"Porto, {ATTRIBUTION}: {len(reference.index):,} intersections, indexed in {seconds:.1f} s")
+    # each mask is judged as soon as it is done
     tasks = [Task(str(mask.path), mask.path.stem) for mask in masks]
     outputs = OutputOptions(products=(OVERLAY.name,))
     wrong = 0

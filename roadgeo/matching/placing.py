@@ -23,6 +23,7 @@ def place_frame(location: Location, query: Query, fit: Fit, focal_px: float | No
     plane, scene = fit.index.plane, query.scene
     homography = plane.to_crs_matrix() @ fit.matrix @ PIXEL_TO_PLANE
     width, height = scene.size
+    # the four corners and the middle
     pixels = np.array([[0, 0, 1], [width, 0, 1], [width, height, 1], [0, height, 1], [width / 2, height / 2, 1]], float)
     ground = pixels @ homography.T
     ground = ground[:, :2] / ground[:, 2:]

@@ -142,9 +142,11 @@ def prepare_scene(
     options = options or SceneOptions()
     width, height = size
     length = float(graph.edge_lengths().sum())
+    # points along the roads: some for a quick look, more for one intersection's surroundings
     spacing = max(options.min_point_spacing_px, length / options.max_road_points)
     points, directions = sample_roads(graph, spacing)
     dense = sample_roads(graph, max(options.min_dense_spacing_px, length / options.max_dense_points))
+    # how far each cell of the frame is from a road; drawn from the graph, for what is thinner than a cell counts too
     scale = max(1.0, max(size) / options.field_cells)
     cells = (int(np.ceil(height / scale)), int(np.ceil(width / scale)))
     canvas = np.full(cells, 255, np.uint8)

@@ -322,6 +322,7 @@ class _Locating:
         options = self._with_focal_length(task)
         sighting = locate_query(task.mask, asked.references, options, self.reading.of_query(), how=how, say=self.say)
         location, mask, explanation = sighting.location, sighting.mask, sighting.explanation
+        # the clock of the search knows its own steps only: the rest was reading
         spent = location.seconds
         reading_s = perf_counter() - started - spent.vectorize - spent.match - spent.refine
         location = replace(

@@ -154,6 +154,7 @@ def build_pair_index(intersections: Intersections, options: PairOptions | None =
     options = options or PairOptions()
     codes = type_codes(intersections)
     pairs = list_pairs(intersections, codes, options.d_max_m, options)
+    # tuples of one type side by side
     keys = type_keys(codes, pairs)
     order = np.argsort(keys, kind="stable")
     found, sizes = np.unique(keys, return_counts=True)
@@ -164,6 +165,7 @@ def build_pair_index(intersections: Intersections, options: PairOptions | None =
     for t, d_b in enumerate(types.tolist()):
         of_type = pairs[order[offsets[t] : offsets[t + 1]]]
         subsets, n_first = line_subsets(d_b[2], d_b[3])
+        # of each type a tree over the cross ratios of its lines
         tree = np.empty((len(of_type), len(subsets)), np.float32)
         if len(subsets):
             kernels.describe_pairs(of_type, xy, tangents, fixed(codes, np.uint8), subsets, n_first, tree)
