@@ -22,7 +22,7 @@ def twin(p, points, directions, radius, sigma, roads):
         x, y = place(p, uv)
         ahead = place(p, uv + 1e-6 * along) - (x, y)
         dx, dy = ahead / np.hypot(*ahead)
-        d, fx, fy, rx, ry = nearest_road(x, y, dx, dy, radius, MIN_COS, roads)
+        d, fx, fy, rx, ry = nearest_road(x, y, dx, dy, radius, MIN_COS, *roads)
         if d == np.inf:
             continue
         met += 1

@@ -10,6 +10,9 @@ from scipy import ndimage
 
 from roadgeo.kernels.thinning import GROUND, ROAD, SOLID, rethin, thin
 
+#: Steps to neighbours are unsigned, modulo 2**64; without compilation numpy warns where they wrap.
+pytestmark = pytest.mark.filterwarnings("ignore:overflow encountered in scalar add:RuntimeWarning")
+
 
 def framed(picture: str) -> np.ndarray:
     """States of a drawing: "#" road, "." ground, "x" solid; with a ring of solid around it."""

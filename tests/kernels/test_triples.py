@@ -216,7 +216,7 @@ class TestVertexProbes:
     def test_probe_exactly_what_is_alike(self, tolerance):
         rng = np.random.default_rng(3)
         every = [(u, v, sides) for u in range(UNITS) for v in range(u, UNITS) for sides in range(9)]
-        for u1, u2 in np.sort(rng.integers(0, UNITS, (12, 2)), axis=1).tolist():
+        for u1, u2 in np.sort(rng.integers(0, UNITS, (4, 2)), axis=1).tolist():
             own = int(rng.integers(9))
             probes = np.empty((64, 4), np.int64)
             n = vertex_probes(np.array([u1, u2, own]), tolerance, probes)
@@ -282,7 +282,7 @@ class TestLookUp:
     def test_like_the_twin(self, world, tolerance):
         query = seen_through(world, np.array([[1.2, -0.4], [0.3, 0.9]]), noise=0.05)
         n = 0
-        for a in range(0, 60, 4):
+        for a in range(0, 60, 9):
             around = [query.neighbours[a, slot] for slot in range(4)]
             slots = [
                 (s, t)
@@ -336,7 +336,7 @@ class TestLookUp:
         damaged.entries = (damaged.entries & np.uint64(0xFFFFFF)) | rng.integers(
             0, 2**40, len(damaged.entries), dtype=np.uint64
         ) << np.uint64(24)
-        for a, s, t in self.slots(world):
+        for a, s, t in list(self.slots(world))[::40]:
             ids, *_ = self.run(damaged, world, a, [sorted((s, t))], 5)
             assert ((ids[:, [0, 2, 4]] >= 0) & (ids[:, [0, 2, 4]] < 60)).all()
 
