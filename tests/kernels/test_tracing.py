@@ -4,7 +4,6 @@ from collections import Counter
 
 import cv2
 import numpy as np
-import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 from kernels.test_thinning import depth, framed, random_states
@@ -12,9 +11,6 @@ from naive import tracing as naive
 
 from roadgeo.kernels.thinning import ROAD, thin
 from roadgeo.kernels.tracing import smooth_chains, trace
-
-#: Steps to neighbours are unsigned, modulo 2**64; without compilation numpy warns where they wrap.
-pytestmark = pytest.mark.filterwarnings("ignore:overflow encountered in scalar add:RuntimeWarning")
 
 Traced = tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray, np.ndarray]
 

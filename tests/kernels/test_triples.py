@@ -282,7 +282,7 @@ class TestLookUp:
     def test_like_the_twin(self, world, tolerance):
         query = seen_through(world, np.array([[1.2, -0.4], [0.3, 0.9]]), noise=0.05)
         n = 0
-        for a in range(0, 60, 9):
+        for a in range(0, 60, 4):
             around = [query.neighbours[a, slot] for slot in range(4)]
             slots = [
                 (s, t)
