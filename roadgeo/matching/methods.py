@@ -53,6 +53,8 @@ class Fit:
         As in `Refined`.
     lens_k1 : float
         As of `Refined`.
+    agreement : float
+        Mean of the shares of intersections, of the query's roads and of the map's roads that agree.
     """
 
     index: ReferenceIndex
@@ -64,6 +66,7 @@ class Fit:
     corner_sigma_m: FloatArray | None = None
     corner_covariance_m2: FloatArray | None = None
     lens_k1: float = 0.0
+    agreement: float = math.nan
 
 
 @dataclass(frozen=True)
@@ -75,7 +78,7 @@ class Found:
     index : ReferenceIndex
         The whole reference.
     fits : tuple of Fit
-        The best place and the best other one, as far as there are any.
+        The best place, the best other one, and of the rest the one that agrees best, as far as there are any.
     stopped : str
         As in `SearchResult`; "" where nothing was searched, or by the paper's method.
     said : str
@@ -181,7 +184,7 @@ class _Attempt:
         self.trace.finished(estimator, result)
         return Found(
             self.index,
-            _fits(estimator, result),
+            _fits(estimator, result, self.search.promising),
             result.stopped,
             n_searched=self.n_searched,
             n_tried=estimator.n_screened,
@@ -198,28 +201,40 @@ class _Attempt:
         )
 
 
-def _fits(estimator: TripleEstimator, result: SearchResult[Hypothesis]) -> tuple[Fit, ...]:
-    """Return the best place and the runner-up, as far as they were verified."""
-    fits = []
-    for model, score in ((result.best, result.score), (result.runner_up, result.runner_up_score)):
-        if model is None or model.refined is None or model.found is None or model.distance is None:
-            continue
-        if not math.isfinite(score):
-            continue
-        fits.append(
-            Fit(
-                estimator.index,
-                model.refined.matrix,
-                model.matched,
-                model.distance,
-                model.found.forward,
-                score,
-                model.refined.corner_sigma_m,
-                model.refined.corner_covariance_m2,
-                model.refined.lens_k1,
-            )
-        )
-    return tuple(fits)
+def _fits(
+    estimator: TripleEstimator, result: SearchResult[Hypothesis], promising: Sequence[tuple[float, Hypothesis]]
+) -> tuple[Fit, ...]:
+    """Return the best place, the runner-up, and of the other promising ones the one that agrees best."""
+    chosen = [_fit(estimator, result.best, result.score), _fit(estimator, result.runner_up, result.runner_up_score)]
+    leaders = [model for model in (result.best, result.runner_up) if model is not None]
+    others = [
+        _fit(estimator, model, score)
+        for score, model in promising
+        if not any(estimator.same(model, leader) for leader in leaders)
+    ]
+    chosen.append(max(filter(None, others), key=lambda fit: fit.agreement, default=None))
+    return tuple(filter(None, chosen))
+
+
+def _fit(estimator: TripleEstimator, model: Hypothesis | None, score: float) -> Fit | None:
+    """Return a place that was verified."""
+    if model is None or model.refined is None or model.found is None or model.distance is None:
+        return None
+    if not math.isfinite(score):
+        return None
+    found = model.found
+    return Fit(
+        estimator.index,
+        model.refined.matrix,
+        model.matched,
+        model.distance,
+        found.forward,
+        score,
+        model.refined.corner_sigma_m,
+        model.refined.corner_covariance_m2,
+        model.refined.lens_k1,
+        (found.rate + found.forward + found.backward) / 3,
+    )
 
 
 def promising_options(options: LocateOptions) -> MatchOptions:

@@ -113,6 +113,8 @@ class Search(Generic[Model]):
     ----------
     leaders : list of (score, model)
         The best model of each of the two best answers, the best first.
+    promising : list of (score, model)
+        All with a score above 0.
     stage : int
         Number of the stage that comes next.
     ended : bool
@@ -127,6 +129,7 @@ class Search(Generic[Model]):
         """Begin, without doing anything yet."""
         self.estimator = estimator
         self.leaders: list[tuple[float, Model]] = []
+        self.promising: list[tuple[float, Model]] = []
         self.stage = self.n_rounds = self.n_scored = 0
         self.ended = False
         self.accepted_since: int | None = None
@@ -182,6 +185,8 @@ class Search(Generic[Model]):
 
     def _enter(self, score: float, model: Model) -> None:
         """Keep the two best different answers after a new one came in."""
+        if score > 0:
+            self.promising.append((score, model))
         ranked = sorted([*self.leaders, (score, model)], key=lambda item: -item[0])
         others = (one for one in ranked[1:] if not self.estimator.same(one[1], ranked[0][1]))
         self.leaders = [ranked[0], *[one for one in [next(others, None)] if one is not None]]

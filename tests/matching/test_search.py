@@ -196,7 +196,7 @@ def test_a_part_that_stands_out_goes_on_until_it_is_settled():
 def test_many_parts_share_one_time_limit():
     toys = [Toy([[(k, 1.0)] for k in range(100)], seconds=0.005) for _ in range(4)]
     started = time.perf_counter()
-    parts = together(*toys, options=SearchOptions(time_limit_s=0.05))
+    parts = together(*toys, options=SearchOptions(work_limit_s=1e9, time_limit_s=0.05))
     assert time.perf_counter() - started < 2.0
     assert {one.stopped for one in parts} == {"time"}
     assert max(len(toy.scored) for toy in toys) - min(len(toy.scored) for toy in toys) <= 1

@@ -427,7 +427,7 @@ def test_errors_are_shown_as_qgis_shows_errors(qgis: Qgis, porto: Path) -> None:
 def test_without_the_executable_nothing_runs_and_the_advice_is_there(qgis: Qgis) -> None:
     answers, _, _ = qgis.ask(("configure", {"executable": "/no/such/roadgeo"}), ("configure", {"executable": ""}))
     assert not answers[0][0]
-    assert "pipx install roadgeo" in answers[0][1]
+    assert "roadgeo qgis install" in answers[0][1]
     assert answers[1] == [True, ""]
 
 

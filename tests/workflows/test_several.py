@@ -85,6 +85,21 @@ def test_a_weak_place_does_not_beat_a_pair_of_far_surer_ones(query, searched):
     assert best.log10_odds == 30.0
 
 
+@pytest.mark.parametrize(
+    ("agreement", "odds", "status"), [(0.89, 6.2, "ambiguous"), (0.89, 3.0, "located"), (0.75, 6.2, "located")]
+)
+def test_a_rival_that_agrees_better_is_heard(query, searched, agreement: float, odds: float, status: str) -> None:
+    """In a lattice the true place scores little, for chance is high there: a worse one must not pass for it."""
+    found = searched("a", (13.0, 0.0), (7.1, 5000.0), (odds, 30_000.0))
+    rates = [0.73, 0.65, agreement]
+    fits = tuple(replace(fit, agreement=rate) for fit, rate in zip(found.fits, rates, strict=True))
+    best = judge(query, replace(found, fits=fits))
+    assert best.status == status
+    if status == "ambiguous":
+        assert "agrees in 73%, one with 6.2 in 89%" in best.reason
+        assert best.runner_up.x == pytest.approx(PLANE.origin[0] + 30_000.0, abs=1.0)
+
+
 def test_a_place_that_is_refused_alone_is_a_rival_all_the_same(query, searched):
     """At 3.4 a place is not reported; it is still too near to 4.0 for that to be the answer."""
     best = judge(query, searched("a", (4.5, 0.0)), searched("b", (3.4, 30_000.0)))
