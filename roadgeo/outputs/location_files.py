@@ -57,8 +57,8 @@ class Written(NamedTuple):
     removed: list[Path]
 
 
-def wanted_outputs(names: Iterable[str], located: bool, has_photo: bool) -> list[Output]:
-    """Return what is written for a mask: what always is, then what is asked for, as far as it needs no place.
+def wanted_outputs(names: Iterable[str], located: bool, has_photo: bool, has_camera: bool = True) -> list[Output]:
+    """Return what is written for a mask: what always is, then what is asked for, as far as there is what it needs.
 
     Raises
     ------
@@ -66,7 +66,8 @@ def wanted_outputs(names: Iterable[str], located: bool, has_photo: bool) -> list
         There is no such output.
     """
     wanted = [*ALWAYS, *find_outputs(names)]
-    return [one for one in wanted if (located or not one.needs_place) and not (one is STYLE and has_photo)]
+    wanted = [one for one in wanted if (located or not one.needs_place) and (has_camera or not one.needs_camera)]
+    return [one for one in wanted if not (one is STYLE and has_photo)]
 
 
 def write_location(
@@ -107,14 +108,14 @@ def write_location(
     options = options or OutputOptions()
     photo = None if picture is None else Path(picture)
     subject = Subject(location, mask, paths, options.image, photo, indexes, explanation)
-    wanted = wanted_outputs(options.products, location.located, photo is not None)
+    wanted = wanted_outputs(options.products, location.located, photo is not None, location.camera is not None)
     targets = {output: paths.of(output, subject.picture.name) for output in wanted}
     with ExitStack() as files:
         # Entered first, renamed last: whoever sees the JSON finds the other files whole.
         report = files.enter_context(replacing(targets.pop(JSON), sync=False))
         for output, path in targets.items():
             output.write(files.enter_context(replacing(path, sync=False)), subject)
-        removed = [] if location.located else list(_remove(_stale(subject, wanted, options.products)))
+        removed = list(_remove(_stale(subject, wanted, options.products)))
         if photo is not None:  # an earlier mask's style would colour the photograph
             removed += _remove([paths.of(STYLE)])
         location = replace(location, seconds=replace(location.seconds, write=perf_counter() - started))
@@ -128,8 +129,10 @@ def write_json(path: Path, subject: Subject) -> None:
 
 
 def _stale(subject: Subject, written: Sequence[Output], names: Iterable[str]) -> list[Path]:
-    """Name what an earlier run may have left of a place that no longer holds, but for what is written now."""
+    """Name what an earlier run may have left of a place or a camera that no longer holds."""
     outputs = dict.fromkeys([*REGISTRY.values(), *find_outputs(names)])
+    if subject.location.located:
+        outputs = dict.fromkeys(one for one in outputs if one.needs_camera and subject.location.camera is None)
     return [subject.paths.of(output, subject.picture.name) for output in outputs if output not in written]
 
 

@@ -53,6 +53,8 @@ class Output:
         What it is for.
     needs_place : bool
         Whether only a located mask has it.
+    needs_camera : bool
+        Whether only a mask has it that a camera above the ground may have taken.
     option : str
         What asks for it on the command line; "" where nobody need ask.
     """
@@ -63,6 +65,7 @@ class Output:
     summary: str
     needs_place: bool = True
     option: str = ""
+    needs_camera: bool = False
 
     def path(self, folder: Path, stem: str, picture: str = "") -> Path:
         """Name the file."""
@@ -170,15 +173,21 @@ GEOPOSE = Output(
     "_geopose.json",
     _by("cameras", "write_geopose"),
     "where the camera was, as OGC GeoPose (Basic-Quaternion)",
+    needs_camera=True,
 )
 ORTHORITY = Output(
-    "orthority", "_ext_param.geojson", _by("cameras", "write_orthority"), "where the camera was, as Orthority reads it"
+    "orthority",
+    "_ext_param.geojson",
+    _by("cameras", "write_orthority"),
+    "where the camera was, as Orthority reads it",
+    needs_camera=True,
 )
 ODM_GEO = Output(
     "odm-geo",
     "_geo.txt",
     _by("cameras", "write_odm_geo"),
     "where the camera was, for OpenDroneMap; of several masks also geo.txt",
+    needs_camera=True,
 )
 IIIF = Output("iiif", "_iiif.json", _by("iiif", "write_iiif"), "IIIF Georeference Annotation, for Allmaps and viewers")
 

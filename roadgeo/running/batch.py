@@ -305,7 +305,7 @@ class _Locating:
         status, photo = document.get("status"), self.reading.photo(task, is_ours(probability_path(paths)))
         if status not in {"located", "ambiguous", "not_located"} or not asked.same(document):
             return None
-        wanted = wanted_outputs(self.outputs.products, status == "located", photo is not None)
+        wanted = wanted_outputs(self.outputs.products, status == "located", bool(photo), bool(document.get("camera")))
         files = [paths.of(output, Path(photo or task.mask).name) for output in wanted]
         whole = all(path.is_file() and path.stat().st_size for path in files)
         return Outcome(status, document, earlier=True) if whole else None
