@@ -261,7 +261,7 @@ class _Locating:
 
         reading = replace(self.reading, images={}, threads=ReadOptions.threads)
         told = {
-            **_changed(self.options, LocateOptions()),
+            **_changed(replace(self.options, truths=()), LocateOptions()),
             **_changed(reading, ReadOptions()),
             **_changed(self.outputs.image, OutputOptions().image),
         }
