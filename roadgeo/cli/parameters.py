@@ -7,7 +7,7 @@ from typing import Any, TypeVar
 
 import click
 
-__all__ = ["BOX", "CAMERA", "NEAR", "RANGE", "Numbers", "Plugin", "verbosity_options"]
+__all__ = ["BOX", "CAMERA", "NEAR", "RANGE", "Numbers", "Plugin", "references_option", "verbosity_options"]
 
 Command = TypeVar("Command", bound=Callable[..., Any])
 
@@ -164,3 +164,16 @@ def verbosity_options(command: Command) -> Command:
     verbose = click.option("-v", "--verbose", is_flag=True, help="Say more: times, counts, files read.")
     quiet = click.option("-q", "--quiet", is_flag=True, help="Say nothing but errors, and what --json prints.")
     return verbose(quiet(command))
+
+
+def references_option(purpose: str = "Reference to search") -> Callable[[Command], Command]:
+    """Make the option that names the references."""
+    return click.option(
+        "-r",
+        "--reference",
+        "references",
+        metavar="REF",
+        type=click.Path(),
+        multiple=True,
+        help=f"{purpose}: REF.gpkg, or a name in the library. Repeatable. Default: all of the library.",
+    )

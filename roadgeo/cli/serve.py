@@ -10,7 +10,7 @@ from typing import TYPE_CHECKING, Any
 
 import click
 
-from roadgeo.cli.parameters import verbosity_options
+from roadgeo.cli.parameters import references_option, verbosity_options
 from roadgeo.cli.printing import echo
 
 if TYPE_CHECKING:
@@ -53,15 +53,7 @@ Exit status: 0 ended, 1 error, 2 usage.
 
 
 @click.command("serve", short_help="Answer over HTTP where masks and photographs lie.", help=_HELP)
-@click.option(
-    "-r",
-    "--reference",
-    "references",
-    metavar="REF",
-    type=click.Path(),
-    multiple=True,
-    help="Reference to search: REF.gpkg, or a name in the library. Repeatable. Default: all of the library.",
-)
+@references_option()
 @click.option("--host", metavar="ADDRESS", help="Listen there, and ask for a token. Default: 127.0.0.1, without one.")
 @click.option("--port", type=click.IntRange(0, 65535), default=8017, show_default=True, help="0: any that is free.")
 @click.option("--token-file", metavar="FILE", type=click.Path(), help="The token is the first line of this file.")

@@ -16,7 +16,7 @@ import click
 from roadgeo.cli import NOT_LOCATED
 from roadgeo.cli.folders import make_folder
 from roadgeo.cli.hints import hint_options, make_options, refuse_swapped
-from roadgeo.cli.parameters import verbosity_options
+from roadgeo.cli.parameters import references_option, verbosity_options
 from roadgeo.cli.printing import echo
 
 if TYPE_CHECKING:
@@ -90,15 +90,7 @@ class Moment(click.ParamType):  # type: ignore[type-arg]
 
 @click.command("track", short_help="Follow a flight over the map, frame by frame.", help=_HELP)
 @click.argument("frames", metavar="FRAMES...", nargs=-1, required=True, type=click.Path())
-@click.option(
-    "-r",
-    "--reference",
-    "references",
-    metavar="REF",
-    type=click.Path(),
-    multiple=True,
-    help="Reference to search: REF.gpkg, or a name in the library. Repeatable. Default: all of the library.",
-)
+@references_option()
 @click.option(
     "-o", "--out-dir", metavar="DIR", default=".", type=click.Path(file_okay=False), help="Where the results go."
 )

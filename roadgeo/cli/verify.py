@@ -13,7 +13,7 @@ import click
 from roadgeo.cli import ERROR, NOT_LOCATED
 from roadgeo.cli.command_line import made_by
 from roadgeo.cli.folders import make_folder
-from roadgeo.cli.parameters import verbosity_options
+from roadgeo.cli.parameters import references_option, verbosity_options
 from roadgeo.cli.photographs import read_options, segmenting_options
 from roadgeo.cli.printing import echo
 
@@ -30,15 +30,7 @@ _COLORS = {"agrees": "green", "off": "red", "unknown": "yellow"}
 
 @click.command("verify", short_help="Check whether georeferenced images are where they say.")
 @click.argument("images", metavar="IMAGE...", nargs=-1, required=True, type=click.Path())
-@click.option(
-    "-r",
-    "--reference",
-    "references",
-    metavar="REF",
-    type=click.Path(),
-    multiple=True,
-    help="Reference to hold them against: REF.gpkg, or a name in the library. Repeatable. Default: all of the library.",
-)
+@references_option("Reference to hold them against")
 @click.option(
     "-o",
     "--out-dir",
