@@ -20,7 +20,7 @@ MODULES = [
     "roadgeo.geometry.homography",
     "roadgeo.outputs.registry",
     "roadgeo.plugins",
-    "roadgeo.schemas",
+    "roadgeo.outputs.schemas",
     "roadgeo.errors",
 ]
 

@@ -12,7 +12,7 @@ import matplotlib as mpl
 import numpy as np
 
 import roadgeo
-from roadgeo.demo import ATTRIBUTION, ROADS, demo_masks
+from roadgeo.evaluation.demo import ATTRIBUTION, ROADS, demo_masks
 from roadgeo.kernels.structs import Hits, TripleLimits, TripleQuery
 from roadgeo.kernels.triple_codes import UNITS, find_sides
 from roadgeo.kernels.triples import look_up_each

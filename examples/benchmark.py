@@ -43,8 +43,8 @@ import cv2  # noqa: E402
 import numpy as np  # noqa: E402
 
 import roadgeo.kernels  # noqa: E402
-from roadgeo.demo import demo_masks  # noqa: E402
 from roadgeo.errors import MaskError, RoadgeoError, RoadSourceError  # noqa: E402
+from roadgeo.evaluation.demo import demo_masks  # noqa: E402
 from roadgeo.evaluation.landscape import Landscape, visible_intersections  # noqa: E402
 from roadgeo.evaluation.noise import NoiseModel, draw_mask  # noqa: E402
 from roadgeo.evaluation.scoring import Score, Share, calibrate_odds, calibrate_sigma, score, share  # noqa: E402

@@ -20,10 +20,10 @@ import numpy as np
 
 from roadgeo.evaluation.flights import Flight, FlightOptions, simulate_flight
 from roadgeo.evaluation.landscape import Landscape
-from roadgeo.flights.tracker import FlightFrame, Tracked, Tracker
 from roadgeo.geometry.mask import RoadMask
 from roadgeo.reference.network_file import read_network
 from roadgeo.reference.reference import Reference, open_reference
+from roadgeo.running.flights.tracker import FlightFrame, Tracked, Tracker
 from roadgeo.sources.masks import read_mask
 
 #: A fix is wrong where a frame's middle lies further than this from the truth, metres.
@@ -60,7 +60,7 @@ def fly(flight: Flight, other: Flight, reference: Reference, city: str, own_moti
     for k, mask in enumerate(masks):
         motion = flight.motion[k] if k else None
         if own_motion and k:
-            from roadgeo.flights.motion import between_masks
+            from roadgeo.running.flights.motion import between_masks
 
             motion = between_masks(masks[k - 1], mask, frames[-1].motion)
         frames.append(FlightFrame(k, mask.name, float(k), mask, motion))

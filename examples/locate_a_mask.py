@@ -7,7 +7,7 @@ import geopandas as gpd
 import numpy as np
 
 import roadgeo
-from roadgeo.demo import ROADS, demo_masks
+from roadgeo.evaluation.demo import ROADS, demo_masks
 
 # Roads of any kind and CRS, as a GeoDataFrame of lines; here a piece of Porto that ships with roadgeo.
 reference = roadgeo.build_reference(gpd.read_file(ROADS), name="porto")

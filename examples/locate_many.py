@@ -8,7 +8,7 @@ import cv2
 import geopandas as gpd
 
 import roadgeo
-from roadgeo.demo import ROADS, demo_masks
+from roadgeo.evaluation.demo import ROADS, demo_masks
 from roadgeo.geometry.mask import RoadMask
 from roadgeo.outputs.location_files import write_location
 from roadgeo.outputs.paths import output_paths

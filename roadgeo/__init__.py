@@ -13,7 +13,8 @@ from __future__ import annotations
 import importlib
 from typing import TYPE_CHECKING, Any
 
-from roadgeo._version import __version__
+#: Packaging reads it here without importing anything; nothing heavy may be imported above.
+__version__ = "0.1.0"
 
 if TYPE_CHECKING:
     from roadgeo.api import Answer, locate
@@ -21,6 +22,7 @@ if TYPE_CHECKING:
     from roadgeo.geometry.mask import RoadMask
     from roadgeo.location import Location
     from roadgeo.matching.options import LocateOptions
+    from roadgeo.outputs.schemas import read_schema
     from roadgeo.reference.reference import BuildOptions, Reference, open_reference
     from roadgeo.workflows import build_reference, explain
 
@@ -37,6 +39,7 @@ __all__ = [
     "explain",
     "locate",
     "open_reference",
+    "read_schema",
 ]
 
 _HOMES = {
@@ -51,6 +54,7 @@ _HOMES = {
     "explain": "workflows",
     "locate": "api",
     "open_reference": "reference.reference",
+    "read_schema": "outputs.schemas",
 }
 
 

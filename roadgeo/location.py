@@ -9,8 +9,8 @@ from typing import TYPE_CHECKING, Any, Literal
 
 import numpy as np
 
+from roadgeo import __version__
 from roadgeo._arrays import FloatArray
-from roadgeo._version import __version__
 from roadgeo.errors import NotLocatedError
 from roadgeo.geometry.frame import Frame
 from roadgeo.geometry.homography import Homography

@@ -13,6 +13,7 @@ from roadgeo._arrays import AnyArray
 from roadgeo._progress import Say, say_nothing
 from roadgeo.errors import RoadSourceError
 from roadgeo.geometry.mask import RoadMask
+from roadgeo.kernels.warmup import warm_up
 from roadgeo.location import Location
 from roadgeo.matching.explanation import Explanation, Record, tell
 from roadgeo.matching.index import build_index
@@ -26,7 +27,6 @@ from roadgeo.reference.reference import AnyReference, BuildOptions, Reference, b
 from roadgeo.roads.kinds import RoadKind
 from roadgeo.roads.labels import label_roads
 from roadgeo.roads.network import RoadNetwork
-from roadgeo.warmup import warm_up
 
 if TYPE_CHECKING:
     import geopandas as gpd

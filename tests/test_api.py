@@ -8,8 +8,8 @@ import pytest
 import rasterio
 
 import roadgeo
-from roadgeo.demo import PHOTO, ROADS, demo_masks
 from roadgeo.errors import MaskError, NotLocatedError
+from roadgeo.evaluation.demo import PHOTO, ROADS, demo_masks
 from roadgeo.matching.options import LocateOptions
 
 DRONE = next(mask.path for mask in demo_masks() if mask.path.stem == "drone")

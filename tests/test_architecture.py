@@ -9,23 +9,26 @@ import roadgeo
 
 ROOT = Path(roadgeo.__file__).parent
 
-#: What each storey holds: folders and modules at the top of the package. One imports from storeys below, and its own.
+#: What each storey holds: what stands at the top of the package, and folders within folders that have a storey of their
+#: own. One imports from storeys below, and its own.
 STOREYS_TEXT = """
-    words       _version _arrays _progress _text errors plugins schemas
-    files       storage
-    kernels     kernels
-    warmup      warmup
-    planes      geometry
-    roads       roads
-    entrances   sources location segmentation
-    matching    matching
-    references  reference
-    exits       outputs
-    workflows   workflows
-    running     running
-    flights     flights serving
-    evaluation  evaluation
-    faces       api cli qgis demo __main__ __init__
+    words         _arrays _progress _text errors plugins
+    files         storage
+    kernels       kernels
+    planes        geometry
+    roads         roads
+    entrances     sources location
+    photographs   sources.segmentation
+    matching      matching
+    references    reference
+    schemas       outputs.schemas
+    exits         outputs
+    workflows     workflows
+    running       running
+    flights       running.flights running.serving
+    evaluation    evaluation
+    demonstration evaluation.demo
+    faces         api cli qgis __main__ __init__
 """
 STOREYS = {name: storey for storey, line in enumerate(STOREYS_TEXT.split("\n")) for name in line.split()[1:]}
 
@@ -34,33 +37,45 @@ def modules() -> list[Path]:
     return sorted(p for p in ROOT.rglob("*.py") if "plugin" not in p.parts)
 
 
-def storey(path: Path) -> int:
-    return STOREYS[path.relative_to(ROOT).with_suffix("").parts[0]]
+def storey(module: str) -> int | None:
+    """The storey of a module below `roadgeo`; None for what stands on none, as names of the package itself."""
+    folder, _, rest = module.partition(".")
+    return STOREYS.get(f"{folder}.{rest.split('.')[0]}", STOREYS.get(folder))
 
 
 def imported(path: Path) -> set[str]:
-    """First names below `roadgeo` that a module imports, anywhere in it."""
+    """Modules below `roadgeo` that a module imports, or imports from, anywhere in it."""
     names = set()
     for node in ast.walk(ast.parse(path.read_text())):
         if isinstance(node, ast.ImportFrom) and node.module and node.module.split(".")[0] == "roadgeo":
-            parts = node.module.split(".")
-            names |= {parts[1]} if len(parts) > 1 else {alias.name for alias in node.names}
+            module = node.module.partition(".")[2]
+            names |= {f"{module}.{alias.name}".strip(".") for alias in node.names}
         elif isinstance(node, ast.Import):
-            names |= {alias.name.split(".")[1] for alias in node.names if alias.name.startswith("roadgeo.")}
+            names |= {alias.name.partition(".")[2] for alias in node.names if alias.name.startswith("roadgeo.")}
     return names
 
 
 @pytest.mark.parametrize("path", modules(), ids=lambda p: str(p.relative_to(ROOT)))
 def test_imports_go_down_only(path: Path) -> None:
-    own = path.relative_to(ROOT).with_suffix("").parts[0]
-    for name in imported(path) - {own}:
-        if name in STOREYS and not (own == "__main__" or own == "__init__"):
-            assert STOREYS[name] <= storey(path), f"{path.name} (storey {storey(path)}) imports {name}"
+    own = path.relative_to(ROOT).with_suffix("").as_posix().replace("/", ".")
+    at = storey(own)
+    assert at is not None, f"{own} stands on no storey"
+    if own in {"__main__", "__init__"}:
+        return  # they lead to everything
+    for name in imported(path):
+        assert (storey(name) or 0) <= at, f"{own} (storey {at}) imports {name}"
+
+
+def test_the_top_of_the_package_can_be_seen_at_a_glance() -> None:
+    folders = {path.name for path in ROOT.iterdir() if (path / "__init__.py").is_file()}
+    files = {path.stem for path in ROOT.glob("*.py")} - {"__init__", "__main__"}
+    assert len(folders) <= 12
+    assert len(files) <= 8
 
 
 @pytest.mark.parametrize(
     "path",
-    [p for p in modules() if p.parent.name == "kernels" and p.stem not in {"compilation", "machine_code"}],
+    [p for p in modules() if p.parent.name == "kernels" and p.stem not in {"compilation", "machine_code", "warmup"}],
     ids=lambda p: p.name,
 )
 def test_kernels_import_numpy_only(path: Path) -> None:

@@ -16,8 +16,8 @@ import shapely
 
 from roadgeo import plugins
 from roadgeo.cli import main
-from roadgeo.demo import ROADS, demo_masks
 from roadgeo.errors import MaskError, PluginError
+from roadgeo.evaluation.demo import ROADS, demo_masks
 from roadgeo.geometry.mask import RoadMask
 from roadgeo.geometry.projection import to_lonlat
 from roadgeo.outputs.registry import ALSO

@@ -23,7 +23,7 @@ import shapely
 from shapely.geometry import LineString
 from shapely.ops import substring
 
-import roadgeo.demo
+import roadgeo.evaluation.demo
 from roadgeo._arrays import AnyArray, Float32Array, FloatArray
 from roadgeo.geometry.homography import Homography
 from roadgeo.storage.geopackage import Layer, write_layers
@@ -254,4 +254,4 @@ def blur(roads: AnyArray, camera: Camera, rng: np.random.Generator) -> AnyArray:
 
 
 if __name__ == "__main__":
-    make_demo(sys.argv[1], sys.argv[2], Path(roadgeo.demo.__file__).parent / "data")
+    make_demo(sys.argv[1], sys.argv[2], Path(roadgeo.evaluation.demo.__file__).parent / "data")

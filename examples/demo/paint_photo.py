@@ -18,7 +18,7 @@ import shapely
 from make_demo import WIDTH_M
 
 from roadgeo._arrays import AnyArray
-from roadgeo.demo import PHOTO, ROADS, demo_masks
+from roadgeo.evaluation.demo import PHOTO, ROADS, demo_masks
 from roadgeo.geometry.homography import Homography
 
 __all__ = ["paint_photo"]

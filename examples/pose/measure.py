@@ -19,10 +19,10 @@ from roadgeo.evaluation.simulation import SimulationOptions, ViewOptions, simula
 from roadgeo.evaluation.trials import read_landscape
 from roadgeo.geometry.mask import RoadMask
 from roadgeo.geometry.pose import Pose, PoseOptions, find_pose
+from roadgeo.kernels.warmup import warm_up
 from roadgeo.matching.options import LocateOptions
 from roadgeo.reference.reference import open_reference
 from roadgeo.roads.observed import find_voids
-from roadgeo.warmup import warm_up
 from roadgeo.workflows import locate
 
 FOCAL, SIDE = 1200.0, 1200

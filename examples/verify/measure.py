@@ -21,10 +21,10 @@ from roadgeo.evaluation.noise import NOISE_MODELS
 from roadgeo.evaluation.simulation import SimulationOptions, ViewOptions, draw_view, simulate_query
 from roadgeo.evaluation.trials import read_landscape
 from roadgeo.geometry.homography import Homography
+from roadgeo.kernels.warmup import warm_up
 from roadgeo.matching.local_search import Shift, move_about
 from roadgeo.reference.reference import open_reference
 from roadgeo.running.verifying import verify_image
-from roadgeo.warmup import warm_up
 
 KINDS = ("clean", "segmented", "poor")
 VIEW = ViewOptions((1000, 1000), gsd_m=(0.5, 2.0), heading_deg=(0.0, 360.0), intersections=(10, 1_000_000))

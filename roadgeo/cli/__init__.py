@@ -13,7 +13,7 @@ from collections.abc import Sequence
 
 import click
 
-from roadgeo._version import __version__
+from roadgeo import __version__
 from roadgeo.cli.printing import echo
 from roadgeo.errors import RoadgeoError
 from roadgeo.storage.gdal import forget_missing_proj_data, skip_drivers

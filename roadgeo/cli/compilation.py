@@ -8,7 +8,7 @@ __all__ = ["compile_once"]
 def compile_once(quiet: bool) -> None:
     """Make the kernels ready; where they were not compiled yet, show that on standard error."""
     from roadgeo.cli.progress import show_steps
-    from roadgeo.warmup import warm_up
+    from roadgeo.kernels.warmup import warm_up
 
     with show_steps(quiet) as say:
         warm_up(say)

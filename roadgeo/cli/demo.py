@@ -13,7 +13,7 @@ from roadgeo.cli.printing import echo
 from roadgeo.outputs.wording import format_lonlat
 
 if TYPE_CHECKING:
-    from roadgeo.demo import DemoMask
+    from roadgeo.evaluation.demo import DemoMask
     from roadgeo.running.batch import Outcome
 
 __all__ = ["demo_command"]
@@ -46,7 +46,7 @@ def demo_command(out_dir: str) -> int:
     """
     from roadgeo.cli.compilation import compile_once
     from roadgeo.cli.folders import make_folder
-    from roadgeo.demo import ATTRIBUTION, PHOTO, ROADS, demo_masks
+    from roadgeo.evaluation.demo import ATTRIBUTION, PHOTO, ROADS, demo_masks
     from roadgeo.outputs.location_files import OutputOptions
     from roadgeo.outputs.registry import OVERLAY
     from roadgeo.running.batch import locate_masks

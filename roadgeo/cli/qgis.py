@@ -70,9 +70,9 @@ def package_command(out: str | None, **publisher: str | None) -> None:
       roadgeo qgis package
       roadgeo qgis package --out roadgeo_qgis.zip
     """
-    from roadgeo import _version
+    from roadgeo import __version__
     from roadgeo.qgis.installation import NAME, write_package
 
-    path = out or f"{NAME}-{_version.__version__}.zip"
+    path = out or f"{NAME}-{__version__}.zip"
     write_package(path, {key: value for key, value in publisher.items() if value})
     echo(f"wrote {path}")

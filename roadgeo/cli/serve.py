@@ -14,8 +14,8 @@ from roadgeo.cli.parameters import references_option, verbosity_options
 from roadgeo.cli.printing import echo
 
 if TYPE_CHECKING:
-    from roadgeo.flights.mavlink import MavlinkSender
-    from roadgeo.serving.server import ServeOptions
+    from roadgeo.running.flights.mavlink import MavlinkSender
+    from roadgeo.running.serving.server import ServeOptions
 
 __all__ = ["serve_command"]
 
@@ -82,10 +82,10 @@ def serve_command(references: tuple[str, ...], mavlink: str | None, quiet: bool,
     from roadgeo.cli.compilation import compile_once
     from roadgeo.cli.progress import print_steps
     from roadgeo.errors import OutputError, RoadgeoError
-    from roadgeo.flights.mavlink import MavlinkSender
     from roadgeo.running.batch import open_references
-    from roadgeo.serving.server import Server
-    from roadgeo.serving.workers import Workers
+    from roadgeo.running.flights.mavlink import MavlinkSender
+    from roadgeo.running.serving.server import Server
+    from roadgeo.running.serving.workers import Workers
 
     options = _options(given)
     compile_once(quiet)
@@ -117,7 +117,7 @@ def serve_command(references: tuple[str, ...], mavlink: str | None, quiet: bool,
 
 def _tell(sender: MavlinkSender, found: dict[str, Any], came_s: float) -> None:
     """Send the place of a mask that was located; it was taken when its request came."""
-    from roadgeo.flights.mavlink import fix_of
+    from roadgeo.running.flights.mavlink import fix_of
 
     fix = fix_of(found, came_s)
     if fix is not None:
@@ -132,7 +132,7 @@ def _options(given: dict[str, Any]) -> ServeOptions:
     click.UsageError
         Others may ask, and there is no token.
     """
-    from roadgeo.serving.server import LOOPBACK, ServeOptions
+    from roadgeo.running.serving.server import LOOPBACK, ServeOptions
 
     token = os.environ.get("ROADGEO_TOKEN", "").strip()
     if given["token_file"] is not None:

@@ -20,9 +20,9 @@ from roadgeo.cli.parameters import references_option, verbosity_options
 from roadgeo.cli.printing import echo
 
 if TYPE_CHECKING:
-    from roadgeo.flights.frames import FrameOptions
-    from roadgeo.flights.rows import Row
-    from roadgeo.flights.tracker import FlightFrame, Tracked, TrackOptions
+    from roadgeo.running.flights.frames import FrameOptions
+    from roadgeo.running.flights.rows import Row
+    from roadgeo.running.flights.tracker import FlightFrame, Tracked, TrackOptions
 
 __all__ = ["track_command"]
 
@@ -165,9 +165,9 @@ def track_command(
     """Follow a flight over the map, frame by frame; for the help see above."""
     from roadgeo.cli.compilation import compile_once
     from roadgeo.cli.progress import print_steps
-    from roadgeo.flights.report import Thumbnails
-    from roadgeo.flights.rows import make_rows
     from roadgeo.running.batch import open_references
+    from roadgeo.running.flights.report import Thumbnails
+    from roadgeo.running.flights.rows import make_rows
 
     options, reading = _track_options(given), _frame_options(given)
     opened = open_references(references, print_steps(quiet))
@@ -199,8 +199,8 @@ def track_command(
 def _follow(
     frames: tuple[str, ...], reading: FrameOptions, opened: Any, options: TrackOptions
 ) -> Iterator[tuple[FlightFrame, list[Tracked]]]:
-    from roadgeo.flights.frames import read_frames
-    from roadgeo.flights.tracker import follow
+    from roadgeo.running.flights.frames import read_frames
+    from roadgeo.running.flights.tracker import follow
 
     return follow(read_frames(frames, reading), opened, options)
 
@@ -211,7 +211,7 @@ def _sender(url: str | None) -> Iterator[Callable[[Row], None]]:
     if url is None:
         yield lambda _: None
         return
-    from roadgeo.flights.mavlink import MavlinkSender, fix_of
+    from roadgeo.running.flights.mavlink import MavlinkSender, fix_of
 
     with MavlinkSender(url) as sender:
         read_at = time.time()
@@ -227,15 +227,15 @@ def _sender(url: str | None) -> Iterator[Callable[[Row], None]]:
 
 
 def _track_options(given: dict[str, Any]) -> TrackOptions:
-    from roadgeo.flights.tracker import TrackOptions
+    from roadgeo.running.flights.tracker import TrackOptions
 
     hints = {name: given[name] for name in ("gsd_m", "max_tilt_deg", "near")}
     return TrackOptions(locate=make_options("auto", given["time_limit"], hints))
 
 
 def _frame_options(given: dict[str, Any]) -> FrameOptions:
-    from roadgeo.flights.frames import FrameOptions
-    from roadgeo.flights.motion import read_motion
+    from roadgeo.running.flights.frames import FrameOptions
+    from roadgeo.running.flights.motion import read_motion
 
     motion = None if given["motion"] is None else read_motion(given["motion"])
     return FrameOptions(
@@ -265,8 +265,8 @@ def _without_mask(one: Tracked) -> Tracked:
 
 
 def _write(folder: Path, name: str, tracked: list[Tracked], rows: list[Row], pictures: Any) -> list[str]:
-    from roadgeo.flights.outputs import WRITERS
-    from roadgeo.flights.report import render_flight
+    from roadgeo.running.flights.outputs import WRITERS
+    from roadgeo.running.flights.report import render_flight
     from roadgeo.storage.files import write_text
 
     written = []

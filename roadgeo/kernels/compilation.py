@@ -25,7 +25,7 @@ from typing import Any, NamedTuple, TypeVar, cast
 
 import numpy as np
 
-from roadgeo._version import __version__
+from roadgeo import __version__
 from roadgeo.kernels.arrays import ArrayKind, Kind, TupleKind, kind_of
 from roadgeo.storage.folders import cache_dir, private_temporary_dir, writable
 

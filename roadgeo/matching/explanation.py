@@ -41,8 +41,8 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
+from roadgeo import __version__
 from roadgeo._arrays import BoolArray, FloatArray, IntArray
-from roadgeo._version import __version__
 from roadgeo.geometry.camera import CameraFault, CameraOptions, pose, sampling
 from roadgeo.geometry.projection import to_lonlat
 from roadgeo.kernels.roads import forward_distances

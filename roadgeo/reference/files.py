@@ -12,9 +12,9 @@ from typing import Any, Literal, TypeAlias
 
 import numpy as np
 
+from roadgeo import __version__
 from roadgeo._arrays import AnyArray
 from roadgeo._progress import Say, say_nothing
-from roadgeo._version import __version__
 from roadgeo.errors import IndexFormatError, OutputError
 from roadgeo.reference.index_file import (
     FORMAT_VERSION,

@@ -23,8 +23,8 @@ from hashlib import blake2b
 from pathlib import Path
 from typing import Any
 
+from roadgeo import __version__
 from roadgeo._progress import Say, say_nothing
-from roadgeo._version import __version__
 from roadgeo.errors import IndexFormatError
 from roadgeo.location import Location
 from roadgeo.matching.index import ReferenceIndex

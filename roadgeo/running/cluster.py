@@ -169,7 +169,7 @@ def _do_group(token: str, folder: str, pickled: bytes, tasks: Sequence[Any]) -> 
         os.chdir(folder)
         import cv2
 
-        from roadgeo.warmup import warm_up
+        from roadgeo.kernels.warmup import warm_up
 
         cv2.setNumThreads(1)
         with _one_of_host():

@@ -18,7 +18,7 @@ from roadgeo.location import Location, Place, Reason
 from roadgeo.matching.explanation import Explanation
 from roadgeo.matching.options import LocateOptions
 from roadgeo.reference.reference import AnyReference
-from roadgeo.segmentation.probability import ProbabilityMap
+from roadgeo.sources.segmentation.probability import ProbabilityMap
 
 __all__ = ["Locate", "Look", "Sighting", "locate_looks"]
 

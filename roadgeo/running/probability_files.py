@@ -9,7 +9,7 @@ from roadgeo.errors import MaskError, OutputError
 
 if TYPE_CHECKING:
     from roadgeo.outputs.paths import OutputPaths
-    from roadgeo.segmentation.probability import ProbabilityMap
+    from roadgeo.sources.segmentation.probability import ProbabilityMap
 
 __all__ = ["ENDING", "is_ours", "keep_probability", "probability_path"]
 
@@ -24,7 +24,7 @@ def probability_path(paths: OutputPaths) -> Path:
 
 def is_ours(path: Path) -> bool:
     """Whether a file is a probability map that we wrote, not a mask of the user's."""
-    from roadgeo.segmentation.probability import TAG
+    from roadgeo.sources.segmentation.probability import TAG
     from roadgeo.storage.rasters import open_raster
 
     if not path.is_file():

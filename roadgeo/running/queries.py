@@ -27,14 +27,14 @@ from roadgeo.plugins import SEGMENTERS, call_plugin
 from roadgeo.reference.reference import AnyReference
 from roadgeo.running.looks import Locate, Look, Sighting, locate_looks
 from roadgeo.running.mirroring import ask_mirrored
-from roadgeo.segmentation.network import DEFAULT_MODEL, Network, load_network
-from roadgeo.segmentation.photograph import Photograph, open_photograph
-from roadgeo.segmentation.probability import NODATA, ProbabilityMap, fuse
-from roadgeo.segmentation.scales import rank_scales, scale_of
-from roadgeo.segmentation.tiling import map_shape, segment
 from roadgeo.sources.drawn_roads import ENDINGS, Units, draw_roads
 from roadgeo.sources.exif import estimate_gsd
 from roadgeo.sources.masks import open_mask, read_mask
+from roadgeo.sources.segmentation.network import DEFAULT_MODEL, Network, load_network
+from roadgeo.sources.segmentation.photograph import Photograph, open_photograph
+from roadgeo.sources.segmentation.probability import NODATA, ProbabilityMap, fuse
+from roadgeo.sources.segmentation.scales import rank_scales, scale_of
+from roadgeo.sources.segmentation.tiling import map_shape, segment
 from roadgeo.workflows import locate
 
 __all__ = ["QueryOptions", "is_model", "locate_query"]

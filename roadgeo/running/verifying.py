@@ -10,8 +10,8 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
+from roadgeo import __version__
 from roadgeo._arrays import FloatArray
-from roadgeo._version import __version__
 from roadgeo.errors import CrsError, RoadgeoError
 from roadgeo.geometry.displacement import Displacement
 from roadgeo.geometry.frame import Frame
@@ -61,8 +61,8 @@ class VerifyRun:
 
     def prepare(self) -> Callable[[Task], Verified]:
         """Open the references."""
+        from roadgeo.kernels.warmup import warm_up
         from roadgeo.running.batch import open_references
-        from roadgeo.warmup import warm_up
 
         references = open_references(self.references)
         warm_up()

@@ -23,9 +23,9 @@ from urllib.parse import urlsplit
 
 import numpy as np
 
+from roadgeo import __version__
 from roadgeo._arrays import AnyArray
 from roadgeo._progress import Say, say_nothing
-from roadgeo._version import __version__
 from roadgeo.errors import RoadSourceError
 from roadgeo.roads.kinds import RoadKind, highways, in_tunnel
 from roadgeo.sources.lines import OSM_ATTRIBUTION, RoadLines

@@ -9,7 +9,7 @@ import pytest
 import rasterio
 
 from roadgeo.cli import main
-from roadgeo.demo import ATTRIBUTION, PHOTO, ROADS, demo_masks
+from roadgeo.evaluation.demo import ATTRIBUTION, PHOTO, ROADS, demo_masks
 from roadgeo.running.applying import read_location
 from roadgeo.sources.roads import read_roads
 from roadgeo.workflows import build_reference

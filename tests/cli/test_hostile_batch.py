@@ -11,7 +11,7 @@ import pytest
 import rasterio
 
 from roadgeo.cli import main
-from roadgeo.demo import ROADS, demo_masks
+from roadgeo.evaluation.demo import ROADS, demo_masks
 from roadgeo.workflows import build_reference
 
 

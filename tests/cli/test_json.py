@@ -8,9 +8,9 @@ import jsonschema
 import pytest
 
 from roadgeo.cli import main
-from roadgeo.demo import ATTRIBUTION, PHOTO, ROADS, demo_masks
+from roadgeo.evaluation.demo import ATTRIBUTION, PHOTO, ROADS, demo_masks
 from roadgeo.location import Location, Reason
-from roadgeo.schemas import NAMES, read_schema
+from roadgeo.outputs.schemas import NAMES, read_schema
 from roadgeo.sources.roads import read_roads
 from roadgeo.workflows import build_reference
 

@@ -9,7 +9,7 @@ import pytest
 import shapely
 
 from roadgeo.cli import main
-from roadgeo.demo import ATTRIBUTION, ROADS, demo_masks
+from roadgeo.evaluation.demo import ATTRIBUTION, ROADS, demo_masks
 from roadgeo.geometry.homography import Homography
 from roadgeo.sources.roads import read_roads
 from roadgeo.workflows import build_reference

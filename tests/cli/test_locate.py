@@ -16,10 +16,10 @@ import pytest
 import rasterio
 from worlds.fenway import write_streets
 
-from roadgeo._version import __version__
+from roadgeo import __version__
 from roadgeo.cli import main
 from roadgeo.cli.locate import pair_images
-from roadgeo.demo import ATTRIBUTION, ROADS, DemoMask, demo_masks
+from roadgeo.evaluation.demo import ATTRIBUTION, ROADS, DemoMask, demo_masks
 from roadgeo.geometry.homography import Homography
 from roadgeo.reference.files import reference_digest
 from roadgeo.sources.roads import read_roads

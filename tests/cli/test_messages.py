@@ -12,7 +12,7 @@ import rasterio
 from worlds.fenway import write_streets
 
 from roadgeo.cli import main
-from roadgeo.demo import ATTRIBUTION, ROADS, demo_masks
+from roadgeo.evaluation.demo import ATTRIBUTION, ROADS, demo_masks
 from roadgeo.sources.roads import read_roads
 from roadgeo.workflows import build_reference
 

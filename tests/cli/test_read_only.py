@@ -11,9 +11,9 @@ from pathlib import Path
 import pytest
 
 import roadgeo
-from roadgeo.demo import ROADS, demo_masks
+from roadgeo.evaluation.demo import ROADS, demo_masks
 from roadgeo.kernels.compilation import compiled, kernel_folder
-from roadgeo.warmup import warm_up
+from roadgeo.kernels.warmup import warm_up
 from roadgeo.workflows import build_reference
 
 CODE = "import sys, roadgeo.cli; print(roadgeo.__file__); sys.exit(roadgeo.cli.main())"

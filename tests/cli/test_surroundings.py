@@ -12,8 +12,8 @@ import pytest
 import rasterio
 
 from roadgeo.cli import main
-from roadgeo.demo import ROADS, demo_masks
 from roadgeo.errors import OutputError
+from roadgeo.evaluation.demo import ROADS, demo_masks
 from roadgeo.storage.gdal import forget_missing_proj_data
 from roadgeo.storage.rasters import writing_raster
 from roadgeo.workflows import build_reference, locate

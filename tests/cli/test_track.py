@@ -13,8 +13,8 @@ import pytest
 from roadgeo.cli import main
 from roadgeo.evaluation.flights import FlightOptions, simulate_flight
 from roadgeo.evaluation.landscape import Landscape
-from roadgeo.flights.motion import write_motion
 from roadgeo.reference.reference import Reference
+from roadgeo.running.flights.motion import write_motion
 
 OPTIONS = FlightOptions(size_px=(400, 300), n_frames=(7, 7), gsd_m=(1.0, 1.2), turn_deg=1.0, intersections=(2, 30))
 

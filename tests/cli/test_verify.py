@@ -12,9 +12,9 @@ import pytest
 import rasterio
 
 from roadgeo.cli import main
-from roadgeo.demo import ATTRIBUTION, ROADS, demo_masks
+from roadgeo.evaluation.demo import ATTRIBUTION, ROADS, demo_masks
 from roadgeo.geometry.homography import Homography
-from roadgeo.schemas import read_schema
+from roadgeo.outputs.schemas import read_schema
 from roadgeo.sources.roads import read_roads
 from roadgeo.workflows import build_reference
 

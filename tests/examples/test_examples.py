@@ -4,7 +4,7 @@ from pathlib import Path
 
 import pytest
 
-from roadgeo.demo import ROADS
+from roadgeo.evaluation.demo import ROADS
 
 EXAMPLES = Path(__file__).parents[2] / "examples"
 

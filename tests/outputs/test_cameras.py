@@ -8,7 +8,7 @@ import pytest
 from scipy.spatial.transform import Rotation
 
 from roadgeo.cli import main
-from roadgeo.demo import ATTRIBUTION, ROADS, demo_masks
+from roadgeo.evaluation.demo import ATTRIBUTION, ROADS, demo_masks
 from roadgeo.geometry.homography import Homography
 from roadgeo.geometry.projection import LocalPlane, from_lonlat
 from roadgeo.sources.roads import read_roads

@@ -18,7 +18,7 @@ from roadgeo.outputs.orthophoto import ImageOptions
 from roadgeo.outputs.paths import output_paths
 from roadgeo.outputs.registry import REGISTRY
 from roadgeo.outputs.subject import Subject
-from roadgeo.segmentation.probability import ProbabilityMap
+from roadgeo.sources.segmentation.probability import ProbabilityMap
 from roadgeo.storage.files import replacing
 
 folder = Path(sys.argv[1])

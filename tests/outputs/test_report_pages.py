@@ -15,8 +15,8 @@ from hypothesis.extra.numpy import arrays
 from support.browser import Browser, Page, browser
 
 from roadgeo.cli import main
-from roadgeo.demo import ATTRIBUTION, ROADS, demo_masks
 from roadgeo.errors import MaskError, OutputError
+from roadgeo.evaluation.demo import ATTRIBUTION, ROADS, demo_masks
 from roadgeo.geometry.homography import Homography
 from roadgeo.geometry.mask import RoadMask, pixel_to_plane, plane_to_pixel
 from roadgeo.location import Evidence, Location, Place

@@ -21,8 +21,8 @@ import rasterio
 
 import roadgeo
 from roadgeo.cli import main
-from roadgeo.demo import ROADS, demo_masks
 from roadgeo.errors import OutputError
+from roadgeo.evaluation.demo import ROADS, demo_masks
 from roadgeo.geometry.homography import Homography
 from roadgeo.outputs.registry import ALSO
 from roadgeo.qgis import installation

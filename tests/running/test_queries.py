@@ -10,10 +10,10 @@ import rasterio
 from worlds.models import brightness_model
 
 from roadgeo.cli import main
-from roadgeo.demo import ROADS, demo_masks
 from roadgeo.errors import ModelError, PhotographError
+from roadgeo.evaluation.demo import ROADS, demo_masks
 from roadgeo.running.queries import QueryOptions, locate_query
-from roadgeo.segmentation.probability import TAG
+from roadgeo.sources.segmentation.probability import TAG
 from roadgeo.workflows import build_reference
 
 pytestmark = pytest.mark.filterwarnings("ignore::rasterio.errors.NotGeoreferencedWarning")

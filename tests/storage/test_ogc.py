@@ -9,7 +9,7 @@ import pytest
 from support.ogc import validate
 
 from roadgeo.cli import main
-from roadgeo.demo import ROADS, demo_masks
+from roadgeo.evaluation.demo import ROADS, demo_masks
 
 
 @pytest.mark.slow

@@ -14,12 +14,12 @@ from roadgeo.errors import RoadgeoError
 from roadgeo.evaluation.truth import read_truth
 from roadgeo.reference.index_file import read_index
 from roadgeo.reference.network_file import read_network
-from roadgeo.segmentation.card import read_card
-from roadgeo.segmentation.onnx_file import read_onnx
 from roadgeo.sources import vectors
 from roadgeo.sources.exif import estimate_gsd, read_focal_length
 from roadgeo.sources.lines import read_lines
 from roadgeo.sources.masks import read_mask
+from roadgeo.sources.segmentation.card import read_card
+from roadgeo.sources.segmentation.onnx_file import read_onnx
 
 CORPUS = Path(__file__).parents[1] / "corpus"
 

@@ -8,7 +8,7 @@ from pathlib import Path
 
 import pytest
 
-from roadgeo.demo import ROADS, demo_masks
+from roadgeo.evaluation.demo import ROADS, demo_masks
 from roadgeo.workflows import build_reference
 
 MASKS = [one.path for one in demo_masks() if one.path.stem in ("drone", "elsewhere", "map_sheet")]

@@ -14,7 +14,7 @@ from pathlib import Path, PurePath
 
 import numpy as np
 
-from roadgeo._version import __version__
+from roadgeo import __version__
 from roadgeo.geometry.mask import RoadMask, plane_to_pixel
 from roadgeo.geometry.pinhole import polygon_area
 from roadgeo.location import Location, Place

@@ -7,13 +7,13 @@ import time
 from pathlib import Path
 
 from roadgeo.kernels.compilation import compiled, entries, modules_of_the_search
-from roadgeo.warmup import remove_unused, warm_up
+from roadgeo.kernels.warmup import remove_unused, warm_up
 
 #: Every array on the way from roads and mask to a place must be what the kernels expect, or numba is asked for help.
 LOCATE = """
 import sys
 import roadgeo
-from roadgeo.demo import ROADS, demo_masks
+from roadgeo.evaluation.demo import ROADS, demo_masks
 reference = roadgeo.build_reference(ROADS, "porto")
 assert roadgeo.locate(demo_masks()[0].path, reference).status == "located"
 assert "numba" not in sys.modules

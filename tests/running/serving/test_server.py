@@ -9,8 +9,8 @@ from contextlib import contextmanager, suppress
 
 import pytest
 
-from roadgeo.serving.server import ServeOptions, Server
-from roadgeo.serving.workers import Answer, Full
+from roadgeo.running.serving.server import ServeOptions, Server
+from roadgeo.running.serving.workers import Answer, Full
 
 PNG = b"\x89PNG\r\n\x1a\n" + bytes(40)
 FOUND = {"schema": "roadgeo.location/1", "status": "located", "center": {"lon": 1.0, "lat": 2.0}}

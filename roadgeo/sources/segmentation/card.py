@@ -16,7 +16,7 @@ from pathlib import Path
 from typing import Any
 
 from roadgeo.errors import ModelError
-from roadgeo.segmentation.onnx_file import OnnxFile, Port
+from roadgeo.sources.segmentation.onnx_file import OnnxFile, Port
 
 __all__ = ["ModelCard", "read_card"]
 

@@ -8,7 +8,7 @@ import pytest
 from worlds.models import brightness_model
 
 from roadgeo.errors import ModelError
-from roadgeo.segmentation.network import DEFAULT_MODEL, load_network
+from roadgeo.sources.segmentation.network import DEFAULT_MODEL, load_network
 
 DEEPNESS = {
     "model_type": "Segmentor",

@@ -11,9 +11,9 @@ import numpy as np
 from roadgeo._arrays import AnyArray, BoolArray, Float32Array
 from roadgeo._progress import Say, say_nothing
 from roadgeo.errors import MaskError
-from roadgeo.segmentation.network import Network
-from roadgeo.segmentation.photograph import Photograph, find_ground, is_plain
-from roadgeo.segmentation.probability import NODATA, ProbabilityMap
+from roadgeo.sources.segmentation.network import Network
+from roadgeo.sources.segmentation.photograph import Photograph, find_ground, is_plain
+from roadgeo.sources.segmentation.probability import NODATA, ProbabilityMap
 
 __all__ = ["MAX_MAP_PIXELS", "map_shape", "segment"]
 

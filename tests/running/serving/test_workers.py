@@ -20,7 +20,7 @@ from roadgeo.evaluation.landscape import Landscape
 from roadgeo.evaluation.noise import NOISE_MODELS
 from roadgeo.evaluation.simulation import SimulationOptions, ViewOptions, simulate_query
 from roadgeo.reference.reference import Reference
-from roadgeo.serving.workers import Asked, Workers
+from roadgeo.running.serving.workers import Asked, Workers
 
 pytestmark = pytest.mark.slow
 

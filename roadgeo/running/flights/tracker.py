@@ -17,13 +17,12 @@ import numpy as np
 
 from roadgeo._arrays import FloatArray
 from roadgeo.errors import MaskError
-from roadgeo.flights.mosaic import Mosaic, MosaicOptions, lay_together
-from roadgeo.flights.pose import FilterOptions, Pose, correct, predict, start
 from roadgeo.geometry.camera import CameraOptions
 from roadgeo.geometry.frame import Frame
 from roadgeo.geometry.homography import Homography
 from roadgeo.geometry.mask import PIXEL_TO_PLANE, RoadMask
 from roadgeo.kernels.compilation import load
+from roadgeo.kernels.warmup import warm_up
 from roadgeo.location import Location
 from roadgeo.matching.options import LocateOptions
 from roadgeo.matching.query import trace_query
@@ -31,7 +30,8 @@ from roadgeo.matching.scene import Scene
 from roadgeo.matching.verification import agreement, chance_agreement, log10_odds
 from roadgeo.reference.reference import Reference
 from roadgeo.roads.vectorization import road_width
-from roadgeo.warmup import warm_up
+from roadgeo.running.flights.mosaic import Mosaic, MosaicOptions, lay_together
+from roadgeo.running.flights.pose import FilterOptions, Pose, correct, predict, start
 from roadgeo.workflows import locate
 
 __all__ = ["Fix", "FlightFrame", "FrameStatus", "TrackOptions", "Tracked", "Tracker", "follow", "track"]

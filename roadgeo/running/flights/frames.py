@@ -19,9 +19,9 @@ import numpy as np
 
 from roadgeo._arrays import AnyArray, FloatArray
 from roadgeo.errors import MaskError, PhotographError
-from roadgeo.flights.motion import between_images, between_masks
-from roadgeo.flights.tracker import FlightFrame
 from roadgeo.geometry.mask import RoadMask
+from roadgeo.running.flights.motion import between_images, between_masks
+from roadgeo.running.flights.tracker import FlightFrame
 from roadgeo.running.tasks import find_masks
 from roadgeo.sources.masks import read_mask
 
@@ -169,9 +169,9 @@ def _blank(image: _Image) -> RoadMask | None:
 
 def _segment(image: _Image, options: FrameOptions, last: _Last) -> RoadMask:
     """Find the roads in a photograph, at the scale that its pixels have, or that served the first one best."""
-    from roadgeo.segmentation.photograph import open_photograph
-    from roadgeo.segmentation.scales import rank_scales, scale_of
-    from roadgeo.segmentation.tiling import segment
+    from roadgeo.sources.segmentation.photograph import open_photograph
+    from roadgeo.sources.segmentation.scales import rank_scales, scale_of
+    from roadgeo.sources.segmentation.tiling import segment
 
     network = _network(options.model, options.class_name, options.threads)
     with open_photograph(image.path) as photograph:
@@ -193,7 +193,7 @@ def _segment(image: _Image, options: FrameOptions, last: _Last) -> RoadMask:
 
 @lru_cache(maxsize=1)
 def _network(path: str, class_name: str | None, threads: int):  # type: ignore[no-untyped-def]
-    from roadgeo.segmentation.network import DEFAULT_MODEL, load_network
+    from roadgeo.sources.segmentation.network import DEFAULT_MODEL, load_network
 
     return load_network(Path(path) if path else DEFAULT_MODEL, class_name=class_name, threads=threads)
 

@@ -9,10 +9,10 @@ import rasterio
 from worlds.models import brightness_model
 
 from roadgeo.errors import MaskError
-from roadgeo.segmentation.network import load_network
-from roadgeo.segmentation.photograph import open_photograph
-from roadgeo.segmentation.probability import NODATA, TAG, ProbabilityMap, fuse
-from roadgeo.segmentation.tiling import _starts, segment
+from roadgeo.sources.segmentation.network import load_network
+from roadgeo.sources.segmentation.photograph import open_photograph
+from roadgeo.sources.segmentation.probability import NODATA, TAG, ProbabilityMap, fuse
+from roadgeo.sources.segmentation.tiling import _starts, segment
 
 pytestmark = pytest.mark.filterwarnings("ignore::rasterio.errors.NotGeoreferencedWarning")
 

@@ -5,9 +5,9 @@ import numpy as np
 import pytest
 
 from roadgeo.errors import RoadSourceError
-from roadgeo.flights.motion import between_images, between_masks, read_motion, write_motion
 from roadgeo.geometry.homography import Homography
 from roadgeo.geometry.mask import RoadMask
+from roadgeo.running.flights.motion import between_images, between_masks, read_motion, write_motion
 
 MOTION = np.array([[0.99, 0.03, 12.0], [-0.03, 1.01, -80.0], [1e-5, -2e-5, 1.0]])
 CORNERS = np.array([[0.0, 0.0], [320, 0], [320, 240], [0, 240]])

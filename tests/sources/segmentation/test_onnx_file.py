@@ -10,8 +10,8 @@ from onnx import TensorProto, helper, numpy_helper
 from worlds.models import brightness_model, save
 
 from roadgeo.errors import ModelError
-from roadgeo.segmentation.network import load_network
-from roadgeo.segmentation.onnx_file import read_onnx
+from roadgeo.sources.segmentation.network import load_network
+from roadgeo.sources.segmentation.onnx_file import read_onnx
 
 IMAGE = helper.make_tensor_value_info("image", TensorProto.FLOAT, [1, 3, 64, 64])
 GIVEN = helper.make_tensor_value_info("road", TensorProto.FLOAT, [1, 1, 64, 64])
@@ -137,6 +137,6 @@ def test_missing_and_large_files(tmp_path: Path, monkeypatch: pytest.MonkeyPatch
     with pytest.raises(ModelError, match="no such model"):
         read_onnx(tmp_path / "none.onnx")
     path = brightness_model(tmp_path / "model.onnx")
-    monkeypatch.setattr("roadgeo.segmentation.onnx_file.MAX_BYTES", 10)
+    monkeypatch.setattr("roadgeo.sources.segmentation.onnx_file.MAX_BYTES", 10)
     with pytest.raises(ModelError, match="at most"):
         read_onnx(path)

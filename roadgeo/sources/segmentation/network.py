@@ -13,8 +13,8 @@ import numpy as np
 
 from roadgeo._arrays import AnyArray, Float32Array
 from roadgeo.errors import ModelError
-from roadgeo.segmentation.card import ModelCard, read_card
-from roadgeo.segmentation.onnx_file import read_onnx
+from roadgeo.sources.segmentation.card import ModelCard, read_card
+from roadgeo.sources.segmentation.onnx_file import read_onnx
 
 __all__ = ["DEFAULT_MODEL", "INSTALL", "Network", "load_network"]
 

@@ -5,7 +5,7 @@ import json
 
 import pytest
 
-from roadgeo.serving.requests import Refused, ending_of, read_execution, read_hints, read_query_string
+from roadgeo.running.serving.requests import Refused, ending_of, read_execution, read_hints, read_query_string
 
 
 @pytest.mark.parametrize(

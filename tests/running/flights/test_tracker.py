@@ -5,9 +5,9 @@ import pytest
 
 from roadgeo.evaluation.flights import FlightOptions, simulate_flight
 from roadgeo.evaluation.landscape import Landscape
-from roadgeo.flights.tracker import FlightFrame, Tracker, track
 from roadgeo.geometry.mask import RoadMask
 from roadgeo.reference.reference import Reference
+from roadgeo.running.flights.tracker import FlightFrame, Tracker, track
 
 OPTIONS = FlightOptions(size_px=(400, 300), n_frames=(9, 9), gsd_m=(1.0, 1.2), turn_deg=1.0, intersections=(2, 30))
 

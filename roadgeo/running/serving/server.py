@@ -23,10 +23,10 @@ from pathlib import Path
 from typing import Any
 from urllib.parse import urlsplit
 
-from roadgeo._version import __version__
-from roadgeo.serving.documents import documents_of, problem
-from roadgeo.serving.requests import LIMIT, Refused, ending_of, read_execution, read_query_string
-from roadgeo.serving.workers import Answer, Asked, Full, Workers
+from roadgeo import __version__
+from roadgeo.running.serving.documents import documents_of, problem
+from roadgeo.running.serving.requests import LIMIT, Refused, ending_of, read_execution, read_query_string
+from roadgeo.running.serving.workers import Answer, Asked, Full, Workers
 
 __all__ = ["LOOPBACK", "ServeOptions", "Server"]
 

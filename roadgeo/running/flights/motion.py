@@ -17,7 +17,6 @@ import numpy as np
 
 from roadgeo._arrays import AnyArray, FloatArray
 from roadgeo.errors import MaskError, RoadSourceError
-from roadgeo.flights.pose import FilterOptions, Pose, correct
 from roadgeo.geometry.frame import Frame
 from roadgeo.geometry.homography import Homography
 from roadgeo.geometry.mask import RoadMask
@@ -26,6 +25,7 @@ from roadgeo.kernels.structs import RoadBuckets
 from roadgeo.matching.query import trace_query
 from roadgeo.matching.scene import Scene
 from roadgeo.roads.graph import RoadGraph
+from roadgeo.running.flights.pose import FilterOptions, Pose, correct
 
 __all__ = ["between_images", "between_masks", "read_motion", "write_motion"]
 

@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Sequence
 from typing import Any
 
-from roadgeo._version import __version__
+from roadgeo import __version__
 
 __all__ = ["DOCUMENTS", "documents_of", "problem"]
 

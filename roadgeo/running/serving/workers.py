@@ -172,8 +172,8 @@ def _serve(pipe: Connection, names: list[str]) -> None:
     import cv2
 
     from roadgeo.errors import RoadgeoError
+    from roadgeo.kernels.warmup import warm_up
     from roadgeo.running.batch import open_references
-    from roadgeo.warmup import warm_up
 
     cv2.setNumThreads(1)
     try:

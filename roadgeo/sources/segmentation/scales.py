@@ -13,10 +13,10 @@ import numpy as np
 from roadgeo._arrays import AnyArray, BoolArray
 from roadgeo.errors import MaskError
 from roadgeo.roads.vectorization import vectorize
-from roadgeo.segmentation.network import Network
-from roadgeo.segmentation.photograph import Photograph
-from roadgeo.segmentation.probability import NODATA, ProbabilityMap
-from roadgeo.segmentation.tiling import MAX_MAP_PIXELS, map_shape, segment
+from roadgeo.sources.segmentation.network import Network
+from roadgeo.sources.segmentation.photograph import Photograph
+from roadgeo.sources.segmentation.probability import NODATA, ProbabilityMap
+from roadgeo.sources.segmentation.tiling import MAX_MAP_PIXELS, map_shape, segment
 
 __all__ = ["PYRAMID", "rank_scales", "scale_of", "score"]
 
