@@ -166,14 +166,19 @@ def _noded(lines: AnyArray, grid: float) -> AnyArray:
     return np.asarray(parts[shapely.get_num_coordinates(parts) >= 2])
 
 
-def coverage(graph: RoadGraph, cell_m: float = 300.0) -> list[FloatArray]:
-    """Outline the ground where the map knows its roads: every cell with a road, those around it, and what they enclose.
+def coverage(graph: RoadGraph, cell_m: float = 150.0, gap_m: float = 600.0) -> list[FloatArray]:
+    """Outline the ground where the map knows its roads, no farther than the roads themselves reach.
+
+    Covered is every cell with a road, what lies in gaps between such cells, and what they enclose; of that, what lies
+    within the convex hull of each part's roads, and a road's width around it.
 
     Parameters
     ----------
     graph : RoadGraph
         In metres.
     cell_m : float
+    gap_m : float
+        Widest gap that is closed.
 
     Returns
     -------
@@ -185,10 +190,21 @@ def coverage(graph: RoadGraph, cell_m: float = 300.0) -> list[FloatArray]:
     if graph.n_edges == 0:
         return []
     lines = shapely.linestrings(graph.coords, indices=np.repeat(np.arange(graph.n_edges), np.diff(graph.offsets)))
-    dense = shapely.get_coordinates(shapely.segmentize(lines, cell_m))
-    around = np.stack(np.meshgrid((-1, 0, 1), (-1, 0, 1)), axis=-1).reshape(-1, 2)
-    square = np.floor(dense / cell_m).astype(np.int64)
-    corner, rows = square.min(axis=0), int(np.ptp(square[:, 1])) + 1
+    stripes = _stripes(shapely.get_coordinates(shapely.segmentize(lines, cell_m / 2)), cell_m)
+    half = gap_m / 2
+    grown = shapely.get_parts(shapely.union_all(shapely.box(*(stripes + (-half, -half, half, half)).T)))
+    filled = shapely.union_all(shapely.polygons(shapely.get_exterior_ring(grown)))  # without holes, nor islands in them
+    parts = shapely.get_parts(shapely.buffer(filled, -half, join_style="mitre"))
+    parts = shapely.get_parts(shapely.intersection(parts, _hulls(lines, parts)))
+    rings = shapely.get_exterior_ring(parts[shapely.get_dimensions(parts) == 2])  # where they touch is no ground
+    rings = np.where(shapely.is_ccw(rings), rings, shapely.reverse(rings))
+    return [shapely.get_coordinates(ring) for ring in rings]
+
+
+def _stripes(points: FloatArray, cell_m: float) -> FloatArray:
+    """(S, 4) left, bottom, right, top of the squares of a grid that hold points, those above one another joined."""
+    square = np.floor(points / cell_m).astype(np.int64)
+    corner, rows = square.min(axis=0), int(np.ptp(square[:, 1])) + 2
     numbers = np.sort((square - corner) @ (rows, 1))  # `np.unique` hashes them: minutes, where they are regular
     numbers = numbers[np.diff(numbers, prepend=-1) > 0]
     if len(numbers) > MAX_CELLS:
@@ -196,14 +212,18 @@ def coverage(graph: RoadGraph, cell_m: float = 300.0) -> list[FloatArray]:
             f"the roads lie in {len(numbers):,} squares of {cell_m:g} m, expected at most {MAX_CELLS:,}: "
             "give a smaller area, or check that these are roads"
         )
-    cells = np.stack(np.divmod(numbers, rows), axis=1) + corner
-    cells = np.unique((cells[:, None] + around).reshape(-1, 2), axis=0)
-    boxes = shapely.box(*(cells.T * cell_m), *((cells.T + 1) * cell_m))
-    shells = shapely.get_exterior_ring(shapely.get_parts(shapely.coverage_union_all(boxes)))
-    whole = shapely.union_all(shapely.polygons(shells))  # an island inside another's hole is part of it
-    rings = shapely.get_exterior_ring(shapely.get_parts(whole))
-    rings = np.where(shapely.is_ccw(rings), rings, shapely.reverse(rings))
-    return [shapely.get_coordinates(ring) for ring in rings]
+    ends = [numbers[np.diff(numbers, prepend=-2) > 1], numbers[np.diff(numbers, append=numbers[-1] + 2) > 1]]
+    low, high = (np.stack(np.divmod(end, rows), axis=1) + corner for end in ends)
+    return np.hstack([low, high + 1]) * cell_m
+
+
+def _hulls(lines: AnyArray, parts: AnyArray, width_m: float = 10.0) -> AnyArray:
+    """Return the convex hull of the roads that meet each part, as wide as a road where they lie in one line."""
+    import shapely
+
+    part, line = shapely.STRtree(lines).query(parts, predicate="intersects")
+    hulls = [shapely.convex_hull(shapely.multilinestrings(lines[line[part == n]])) for n in range(len(parts))]
+    return np.asarray(shapely.buffer(hulls, width_m, cap_style="square", join_style="mitre"))
 
 
 def simplify(

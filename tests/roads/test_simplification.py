@@ -229,13 +229,43 @@ def test_a_dead_end_at_the_side_of_a_road_meets_it():
     assert degrees(graph) == [1, 1, 1, 3]
 
 
-def test_coverage_surrounds_the_roads_and_what_they_enclose():
-    (ring,) = coverage(network([(0, 0), (3000, 0), (3000, 3000), (0, 3000), (0, 0)]), cell_m=300)
-    assert ring.min(axis=0).tolist() == [-300, -300]
-    assert ring.max(axis=0).tolist() == [3600, 3600]
-    np.testing.assert_array_equal(ring[0], ring[-1])
+def area(ring):
     x, y = ring.T
-    assert (x[:-1] * y[1:] - x[1:] * y[:-1]).sum() / 2 == 3900**2
+    return (x[:-1] * y[1:] - x[1:] * y[:-1]).sum() / 2
+
+
+def test_coverage_surrounds_the_roads_and_what_they_enclose():
+    (ring,) = coverage(network([(0, 0), (3000, 0), (3000, 3000), (0, 3000), (0, 0)]))
+    np.testing.assert_allclose([ring.min(axis=0), ring.max(axis=0)], [[0, 0], [3010, 3010]])
+    np.testing.assert_array_equal(ring[0], ring[-1])
+    assert area(ring) == pytest.approx(3010**2)
+
+
+@pytest.mark.parametrize("turn", [0.0, 0.3, 0.8])
+def test_coverage_ends_where_the_roads_end(turn):
+    """Whichever way a grid of streets lies, and where a bay cuts into it."""
+    at = np.arange(0.0, 4001.0, 200.0)
+    streets = [[(x, 0), (x, 4000)] for x in at] + [[(0, y), (4000 if y < 2500 else 1500, y)] for y in at]
+    streets = [street for street in streets if street[0][0] <= 1500 or street[0] != street[1]]
+    streets += [[(x, 0), (x, 2400)] for x in at[at > 1500]]
+    streets = [street for street in streets if not (street[0][0] > 1500 and street[1][1] > 2500)]
+    matrix = np.array([[np.cos(turn), -np.sin(turn)], [np.sin(turn), np.cos(turn)]])
+    (ring,) = coverage(network(*(np.array(street) @ matrix.T for street in streets)))
+    roads = shapely.union_all([LineString(np.array(street) @ matrix.T) for street in streets])
+    whole = shapely.Polygon(ring)
+    assert whole.difference(roads.convex_hull.buffer(15.0)).area < 1.0
+    assert whole.difference(roads.buffer(215.0)).area < 0.02e6  # the diagonal of a cell; and the inner corner
+    known = shapely.union_all([shapely.box(0, 0, 4000, 2400), shapely.box(0, 0, 1400, 4000)])
+    known = shapely.transform(known, lambda xy: xy @ matrix.T)
+    assert known.difference(whole).area < 0.001 * known.area  # roads that cut a cell's corner
+
+
+def test_coverage_bridges_gaps_but_no_bays():
+    near = coverage(network([(0, 0), (1000, 0), (1000, 1000)], [(0, 500), (900, 500)]))
+    far = coverage(network([(0, 0), (3000, 0), (3000, 3000)]))
+    assert len(near) == len(far) == 1
+    assert area(near[0]) > 0.3e6
+    assert area(far[0]) < 6000 * 2 * 150
 
 
 def test_far_roads_are_covered_apart():
@@ -421,7 +451,7 @@ class TestLinesThatAreNoRoads:
         way = np.linspace(-2e7, 2e7, 19)
         across = [LineString([(x, -2e7), (x, 2e7)]) for x in np.linspace(-2e7, 2e7, 36)]
         self.refuse(
-            across + [LineString([(x, y) for x in way]) for y in way[:-1]], "squares of 300 m, expected at most"
+            across + [LineString([(x, y) for x in way]) for y in way[:-1]], "squares of 150 m, expected at most"
         )
 
     def test_lines_that_all_cross(self):
