@@ -192,8 +192,10 @@ def coverage(graph: RoadGraph, cell_m: float = 150.0, gap_m: float = 600.0) -> l
     lines = shapely.linestrings(graph.coords, indices=np.repeat(np.arange(graph.n_edges), np.diff(graph.offsets)))
     stripes = _stripes(shapely.get_coordinates(shapely.segmentize(lines, cell_m / 2)), cell_m)
     half = gap_m / 2
-    grown = shapely.get_parts(shapely.union_all(shapely.box(*(stripes + (-half, -half, half, half)).T)))
-    filled = shapely.union_all(shapely.polygons(shapely.get_exterior_ring(grown)))  # without holes, nor islands in them
+    left, bottom, right, top = stripes.T
+    grown = shapely.union_all(shapely.box(left - half, bottom - half, right + half, top + half))
+    shells = shapely.get_exterior_ring(shapely.get_parts(grown))
+    filled = shapely.union_all(shapely.polygons(shells))  # without holes, nor islands in them
     parts = shapely.get_parts(shapely.buffer(filled, -half, join_style="mitre"))
     parts = shapely.get_parts(shapely.intersection(parts, _hulls(lines, parts)))
     rings = shapely.get_exterior_ring(parts[shapely.get_dimensions(parts) == 2])  # where they touch is no ground

@@ -14,9 +14,9 @@ import cv2
 import geopandas as gpd
 import numpy as np
 import pytest
-from qgis.test_qgis import find_qgis
 from support import documents
 from support.documents import ROOT, blocks, run_page
+from support.real_qgis import find_qgis
 from worlds.fake_osm import OUTLINE, fake_osm, place
 from worlds.fenway import streets, write_streets, write_vector
 

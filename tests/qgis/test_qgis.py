@@ -7,7 +7,6 @@ import os
 import re
 import shutil
 import signal
-import subprocess
 import sys
 import time
 import zipfile
@@ -18,11 +17,12 @@ import cv2
 import numpy as np
 import pytest
 import rasterio
+from support.real_qgis import Qgis
 
 import roadgeo
 from roadgeo.cli import main
 from roadgeo.errors import OutputError
-from roadgeo.evaluation.demo import ROADS, demo_masks
+from roadgeo.evaluation.demo import PHOTO, ROADS, demo_masks
 from roadgeo.geometry.homography import Homography
 from roadgeo.outputs.registry import ALSO
 from roadgeo.qgis import installation
@@ -31,7 +31,6 @@ from roadgeo.qgis.plugin import runner
 from roadgeo.workflows import LocateOptions
 
 PLUGIN = Path(installation.__file__).parent / "plugin"
-CHILD = Path(__file__).parents[1] / "support" / "qgis_child.py"
 MASKS = {mask.path.stem: mask for mask in demo_masks()}
 ROAD, FOOTPRINT, MAP_ROAD = "#e4572e", "#1f6fb4", "#546e7a"
 
@@ -279,86 +278,6 @@ def test_the_plugin_is_written_for_every_qgis_from_3_22_to_qt_6(path: Path) -> N
 # --- in QGIS ----------------------------------------------------------------------------------------------------------
 
 
-@dataclass(frozen=True)
-class Qgis:
-    """The real QGIS with a profile of its own, into which the plugin was installed."""
-
-    process: str
-    python: str
-    folder: Path
-    environ: dict[str, str]
-
-    def tool(self, *arguments: str, folder: Path | None = None) -> subprocess.CompletedProcess[str]:
-        """Run `qgis_process`."""
-        return self._run([self.process, *arguments], folder)
-
-    def ask(self, *tasks: tuple[str, dict]) -> tuple[list, list[str], str]:
-        """Do tasks of `qgis_child`: what they return, QGIS's warnings, and what was printed as an error."""
-        wanted, answers = self.folder / "tasks.json", self.folder / "answers.json"
-        wanted.write_text(json.dumps(tasks), "utf-8")
-        answers.unlink(missing_ok=True)
-        done = self._run([self.python, str(CHILD), str(wanted), str(answers)])
-        assert answers.exists(), done.stdout + done.stderr
-        document = json.loads(answers.read_text("utf-8"))
-        printed = "".join(line for line in done.stderr.splitlines(True) if "setapi() is deprecated" not in line)
-        return document["answers"], document["warnings"], printed
-
-    def _run(self, command: list[str], folder: Path | None = None) -> subprocess.CompletedProcess[str]:
-        settings = {"env": self.environ, "cwd": folder or self.folder, "timeout": 240}
-        return subprocess.run(command, capture_output=True, text=True, check=False, **settings)
-
-
-def find_qgis() -> tuple[str, str] | None:
-    """Return `qgis_process` and the Python that QGIS can be imported in."""
-    process = shutil.which("qgis_process.bin") or shutil.which("qgis_process")
-    pythons = [path for path in ("/usr/bin/python3", shutil.which("python3")) if path and Path(path).exists()]
-    for python in pythons if process else []:
-        if subprocess.run([python, "-c", "import qgis.core"], capture_output=True, check=False).returncode == 0:
-            return process, python
-    return None
-
-
-@pytest.fixture(scope="module")
-def qgis(tmp_path_factory: pytest.TempPathFactory) -> Qgis:
-    found = find_qgis()
-    if found is None:
-        if os.environ.get("ROADGEO_REQUIRE_QGIS"):
-            pytest.fail("ROADGEO_REQUIRE_QGIS is set, and QGIS is not installed")
-        pytest.skip("QGIS is not installed (Debian: qgis python3-qgis qgis-providers)")
-    folder = tmp_path_factory.mktemp("qgis")
-    runtime = folder / "runtime"
-    runtime.mkdir(mode=0o700)
-    kept = {
-        name: os.environ[name]
-        for name in ("PATH", "HOME", "NUMBA_CACHE_DIR", "NUMBA_NUM_THREADS")
-        if name in os.environ
-    }
-    own = {
-        "QGIS_CUSTOM_CONFIG_PATH": str(folder / "config"),
-        "QT_QPA_PLATFORM": "offscreen",
-        "XDG_RUNTIME_DIR": str(runtime),
-        "ROADGEO_LIBRARY": str(folder / "library"),
-        "LANG": "C.UTF-8",
-        "PYTHONPATH": "/nowhere",  # what QGIS may set and roadgeo must not see
-        "PROJ_LIB": "/usr/share/proj",
-    }
-    with pytest.MonkeyPatch.context() as patch:
-        patch.setenv("QGIS_CUSTOM_CONFIG_PATH", own["QGIS_CUSTOM_CONFIG_PATH"])
-        assert main(["qgis", "install"]) == 0
-    return Qgis(*found, folder, {**kept, **own})
-
-
-@pytest.fixture(scope="module")
-def porto(qgis: Qgis) -> Path:
-    """The reference that *Build road reference* makes."""
-    path = qgis.folder / "porto.gpkg"
-    done = qgis.tool("run", "roadgeo:buildreference", "--", f"ROADS={ROADS}", "KINDS=all", f"OUTPUT={path}")
-    assert done.returncode == 0, done.stderr
-    assert f"OUTPUT:\t{path}" in done.stdout
-    assert path.with_suffix(".index").exists()
-    return path
-
-
 @pytest.fixture(scope="module")
 def located(qgis: Qgis, porto: Path) -> Path:
     """The folder with what *Locate mask* makes of a mask."""
@@ -396,6 +315,26 @@ def test_a_located_mask_lies_where_the_truth_says(located: Path) -> None:
     middle = np.array(document["size"]) / 2
     x, y = Homography(MASKS["drone"].homography)(middle)
     assert np.hypot(document["center"]["x"] - x, document["center"]["y"] - y) < 2
+
+
+def test_a_photograph_is_located(qgis: Qgis, porto: Path) -> None:
+    """The option finds its roads; told never to, it is taken for a mask, and no mask looks like that."""
+    pytest.importorskip("onnxruntime")
+    folder = qgis.folder / "photograph"
+    wanted = ["--", f"MASK={PHOTO}", f"REFERENCE={porto}", f"OUTPUT_FOLDER={folder}"]
+    done = qgis.tool("run", "roadgeo:locatemask", *wanted, "GSD_MIN=0.7", "GSD_MAX=1.4", "SEGMENT=auto")
+    assert done.returncode == 0, done.stderr
+    assert "STATUS:\tlocated" in done.stdout
+    assert f"FOOTPRINT:\t{folder / 'drone_photo_footprint.tif'}" in done.stdout
+    with rasterio.open(folder / "drone_photo_footprint.tif") as warped:  # the photograph itself, not its roads
+        assert warped.count >= 3
+    assert (folder / "drone_photo_mask.tif").exists()
+    _, document = read_location(folder / "drone_photo_location.json")
+    truth = Homography(MASKS["drone"].homography)(np.array(document["size"]) / 2)  # the mask was made of it
+    assert np.hypot(document["center"]["x"] - truth[0], document["center"]["y"] - truth[1]) < 5
+    done = qgis.tool("run", "roadgeo:locatemask", *wanted, "SEGMENT=never")
+    assert done.returncode == 1
+    assert "ERROR:\t" in done.stderr
 
 
 def test_a_refused_mask_is_a_warning_with_the_reason(qgis: Qgis, porto: Path) -> None:
