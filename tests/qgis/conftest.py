@@ -7,7 +7,7 @@ import pytest
 from support.real_qgis import Qgis, find_qgis
 
 from roadgeo.cli import main
-from roadgeo.demo import ROADS
+from roadgeo.evaluation.demo import ROADS
 
 
 @pytest.fixture(scope="session")

@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 from support.real_qgis import Qgis
 
-from roadgeo.demo import demo_masks
+from roadgeo.evaluation.demo import demo_masks
 
 FOOTPRINT, ROAD = "#1f6fb4", "#e4572e"
 
