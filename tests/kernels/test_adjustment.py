@@ -142,6 +142,7 @@ def test_like_the_twin(seed, changes):
 
 
 @pytest.mark.parametrize("seed", range(3))
+@pytest.mark.slow
 def test_like_the_twin_where_points_are_held(seed):
     town, start = Town(seed, noise=1.5, pairs=3), jittered(P, 0.004, seed)
     p, n, rms, normal = run(town, start, held_at=start)

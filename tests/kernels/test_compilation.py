@@ -61,6 +61,7 @@ def compute(site: Path, home: Path, **more: str) -> list[str]:
     return lines
 
 
+@pytest.mark.slow
 def test_nothing_is_left_in_the_package(installed: Path, tmp_path: Path) -> None:
     before = sorted(installed.rglob("*"))
     home = tmp_path / "home"
@@ -71,6 +72,7 @@ def test_nothing_is_left_in_the_package(installed: Path, tmp_path: Path) -> None
     assert any(p.is_file() for p in folder.rglob("*"))
 
 
+@pytest.mark.slow
 def test_a_read_only_installation_without_a_home_computes(installed: Path, tmp_path: Path) -> None:
     home, temporary = tmp_path / "home", tmp_path / "temporary"
     home.mkdir()

@@ -6,6 +6,8 @@ import sys
 import time
 from pathlib import Path
 
+import pytest
+
 from roadgeo.kernels.compilation import compiled, entries, modules_of_the_search
 from roadgeo.kernels.warmup import remove_unused, warm_up
 
@@ -13,6 +15,7 @@ from roadgeo.kernels.warmup import remove_unused, warm_up
 LOCATE = """
 import sys
 import roadgeo
+
 from roadgeo.evaluation.demo import ROADS, demo_masks
 reference = roadgeo.build_reference(ROADS, "porto")
 assert roadgeo.locate(demo_masks()[0].path, reference).status == "located"
@@ -29,6 +32,7 @@ def test_all_kernels_of_the_search_are_kept_as_machine_code() -> None:
     assert len(kept) > 25
 
 
+@pytest.mark.slow
 def test_a_warm_process_does_not_import_numba() -> None:
     warm_up()
     subprocess.run([sys.executable, "-c", LOCATE], check=True, timeout=300)

@@ -61,6 +61,7 @@ def scene(town):
 
 
 @pytest.mark.parametrize("seed", [2, 3])
+@pytest.mark.slow
 def test_another_town_is_refused(town, seed):
     stranger = scene_of(look(random_network(seed, 2000.0), camera((1000, 1000)), sight=Sight(0.5)))
     result, _ = locate(stranger, town[1], limits=SearchOptions(time_limit_s=3.0))
@@ -74,6 +75,7 @@ def test_a_mirrored_view_is_refused(town):
     assert locate(scene_of(mirrored), town[1], limits=SearchOptions(time_limit_s=3.0))[0].score < 6
 
 
+@pytest.mark.slow
 def test_twins_leave_no_margin():
     centre = random_lines(5, 1500.0)
     lines = [shapely.affinity.translate(line, dx, dy) for dx, dy in [(0, 0), (4000, 700)] for line in centre]
@@ -152,6 +154,7 @@ def test_places_on_many_maps_are_bounded_as_on_one(town):
     assert 40 <= ledger.n_tried < 40 + max(one.n_screened for one in parts)
 
 
+@pytest.mark.slow
 def test_single_triples_find_a_mask_that_lacks_half_of_the_roads(town):
     """Triples that are both intact and share an anchor are too rare there: the usual sweeps lead nowhere."""
     truth = camera((2000, 2050), (1000, 1000), 1.0, 10.0, 20.0, 130.0)

@@ -190,6 +190,7 @@ class TestPicture:
         assert (picture == AGREES).all(axis=2).sum() > 500
         assert not (picture == STARVED).all(axis=2).any()
 
+    @pytest.mark.slow
     def test_the_stage_that_starved_is_marked(self, town, mask, tmp_path: Path):
         explanation = explain(mask, town, with_camera(gsd_m=(0.3, 0.7)))
         subject = Subject(explanation.location, mask, output_paths(tmp_path, "a"), explanation=explanation)

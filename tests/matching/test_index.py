@@ -94,6 +94,7 @@ class TestBuildIndex:
         assert drawn.length == pytest.approx(roads.length, rel=1e-3)
         assert drawn.hausdorff_distance(roads) <= IndexOptions().simplify_m + 1e-3
 
+    @pytest.mark.slow
     def test_every_segment_is_listed(self, town):
         index = town[1]
         crossed = naive.bin_segments(index.segments, index.grid, index.shape)

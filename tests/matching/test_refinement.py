@@ -72,6 +72,7 @@ def test_claimed_accuracy_is_honest(town, view):
     assert np.median(errors) < 1.5
 
 
+@pytest.mark.slow
 def test_more_noise_is_claimed_as_such(town):
     claims = [calibration(town, range(4), sight=Sight(s))[1].mean() for s in (0.3, 1.0, 2.5)]
     assert claims[0] < claims[1] < claims[2]

@@ -248,6 +248,7 @@ def test_readers_keep_the_reference_they_opened(path: Path, network: RoadNetwork
     np.testing.assert_array_equal(open_reference(path)[1]["xy"], newer.intersections.xy)
 
 
+@pytest.mark.slow
 def test_readers_are_not_disturbed_by_a_writer(tmp_path: Path) -> None:
     """Every opening gives one whole reference, while another process replaces it again and again."""
     path = tmp_path / "REF.gpkg"

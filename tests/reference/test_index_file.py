@@ -194,6 +194,7 @@ def refused_or_equal(path: Path) -> bool:
     return False
 
 
+@pytest.mark.slow
 def test_every_flipped_bit_is_refused_or_harmless(path: Path) -> None:
     raw = path.read_bytes()
     rng = np.random.default_rng(1)

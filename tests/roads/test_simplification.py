@@ -446,6 +446,7 @@ class TestLinesThatAreNoRoads:
         with pytest.raises(RoadSourceError, match=match):
             coverage(planarize(lines))
 
+    @pytest.mark.slow
     def test_a_net_of_meridians_and_parallels(self):
         """Drawn every 10 degrees, 54 lines: not many crossings, but a quarter of a million squares for each."""
         way = np.linspace(-2e7, 2e7, 19)

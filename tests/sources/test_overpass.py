@@ -12,6 +12,8 @@ from roadgeo.sources.overpass import FetchOptions, fetch_lines, find_place, read
 from roadgeo.sources.roads import fetch_roads
 from roadgeo.storage.folders import cache_dir
 
+pytestmark = pytest.mark.slow  # a server, asked again and again
+
 
 @pytest.fixture
 def osm(tmp_path, monkeypatch):
