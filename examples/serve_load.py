@@ -33,6 +33,12 @@ def post(port: int, body: bytes, path: str = "/locate", timeout: float = 90.0) -
 
 
 def send(port: int, data: bytes, timeout: float) -> tuple[int, float, bool]:
+    answer, seconds = ask(port, data, timeout)
+    return status_of(answer), seconds, b"Retry-After" in answer
+
+
+def ask(port: int, data: bytes, timeout: float) -> tuple[bytes, float]:
+    """Return all that is answered, and seconds."""
     started, answer = time.perf_counter(), b""
     try:
         with socket.create_connection(("127.0.0.1", port), timeout=timeout) as sock:
@@ -41,8 +47,12 @@ def send(port: int, data: bytes, timeout: float) -> tuple[int, float, bool]:
                 answer += part
     except OSError:
         pass  # what was answered before the connection broke counts
-    status = int(answer[9:12]) if answer[:5] == b"HTTP/" and answer[9:12].isdigit() else 0
-    return status, time.perf_counter() - started, b"Retry-After" in answer
+    return answer, time.perf_counter() - started
+
+
+def status_of(answer: bytes) -> int:
+    """Return the status of an answer, 0 of what is none."""
+    return int(answer[9:12]) if answer[:5] == b"HTTP/" and answer[9:12].isdigit() else 0
 
 
 def steady(port: int, mask: bytes, rate: float, seconds: float) -> list[tuple[int, float, bool]]:
@@ -99,9 +109,12 @@ def attack(port: int, mask: bytes, count: int, seed: int = 0) -> Counter[int]:
 
     def one(k: int) -> None:
         data, patience = hostile(random.Random(seed * 1_000_003 + k), mask)
-        status = send(port, data, patience)[0]
+        answer, seconds = ask(port, data, patience)
+        status = status_of(answer)
         with lock:
             seen[status] += 1
+        if status == 500:  # a fault of the server: say which request, so that it can be sent again
+            print(f"request {k} after {seconds:.1f} s: {data[:80]!r} -> {answer[-300:]!r}", flush=True)
 
     with ThreadPoolExecutor(16) as pool:
         list(pool.map(one, range(count)))

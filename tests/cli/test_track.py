@@ -2,18 +2,26 @@
 
 import csv
 import json
+import math
 import sqlite3
+import time
 import xml.etree.ElementTree as ET
 from contextlib import closing
+from datetime import UTC, datetime
+from itertools import pairwise
 
 import cv2
+import jsonschema
 import numpy as np
 import pytest
+from support.mavlink_peer import listening, of_kind
 
 from roadgeo.cli import main
 from roadgeo.evaluation.flights import FlightOptions, simulate_flight
 from roadgeo.evaluation.landscape import Landscape
+from roadgeo.outputs.schemas import read_schema
 from roadgeo.reference.reference import Reference
+from roadgeo.running.flights.mavlink import has_pymavlink
 from roadgeo.running.flights.motion import write_motion
 
 OPTIONS = FlightOptions(size_px=(400, 300), n_frames=(7, 7), gsd_m=(1.0, 1.2), turn_deg=1.0, intersections=(2, 30))
@@ -40,7 +48,10 @@ def test_a_flight_is_followed_and_written(flown, tmp_path, capfd):
     focal = str(flight.views[0].focal_px)
     given = ["-o", str(tmp_path), "--start", "2024-05-01T09:30:00", "--json", "--camera", focal]
     assert main([*command, *given]) == 0
-    rows = {one["frame"]: one for one in map(json.loads, capfd.readouterr().out.splitlines())}
+    told = [json.loads(line) for line in capfd.readouterr().out.splitlines()]
+    for one in told:
+        jsonschema.validate(one, read_schema("frame"))
+    rows = {one["frame"]: one for one in told}
     assert sorted(rows) == list(range(7))
     assert rows[6]["time"] == "2024-05-01T09:30:06Z"
     for k, row in rows.items():
@@ -63,6 +74,32 @@ def test_a_flight_is_followed_and_written(flown, tmp_path, capfd):
     page = (tmp_path / "flight.html").read_text()
     assert "frame_6.png" in page
     assert "http://" not in page.replace("http://www.w3.org", "")
+
+
+@pytest.mark.skipif(not has_pymavlink(), reason="needs pymavlink")
+def test_an_autopilot_hears_what_is_printed(flown, tmp_path, capfd):
+    folder, flight, _ = flown
+    command = ["track", str(folder / "frames"), "-r", str(folder / "town.gpkg"), "--motion", str(folder / "motion.csv")]
+    began = time.time() - 60.0
+    start = datetime.fromtimestamp(began, UTC).isoformat()
+    given = ["-o", str(tmp_path), "--json", "-q", "--camera", str(flight.views[0].focal_px), "--start", start]
+    with listening(count=100, patience_s=4) as (url, heard):
+        assert main([*command, *given, "--mavlink", url]) == 0
+    rows = [json.loads(line) for line in capfd.readouterr().out.splitlines()]
+    cameras = {(round(r["camera"]["lat"] * 1e7), round(r["camera"]["lon"] * 1e7)): r for r in rows if r["camera"]}
+    places, commands = of_kind(heard, "GLOBAL_POSITION_SENSOR"), of_kind(heard, "COMMAND_INT")
+    assert len(places) == len(commands) > 0
+    for place, command in zip(places, commands, strict=True):
+        row = cameras[place["lat"], place["lon"]]
+        assert (command["command"], command["x"], command["y"]) == (43003, place["lat"], place["lon"])
+        assert math.isclose(place["eph"], row["camera"]["sigma_m"], rel_tol=1e-6)
+        assert math.isclose(command["param3"], row["camera"]["sigma_m"], rel_tol=1e-6)
+        # When the frame was taken, and how long ago that was when its place was sent.
+        taken = began + row["time_s"]
+        assert place["time_usec"] / 1e6 == pytest.approx(taken, abs=1e-3)
+        assert taken + place["processing_time"] / 1e6 == pytest.approx(place["heard_at"], abs=1.0)
+    sent = [place["time_usec"] + place["processing_time"] for place in places]
+    assert all(later - earlier >= 0.09e6 for earlier, later in pairwise(sent))  # 10 a second at most
 
 
 def test_a_video_is_a_flight(flown, tmp_path, capfd):

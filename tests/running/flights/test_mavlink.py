@@ -1,14 +1,11 @@
 """MAVLink on loopback: what another process decodes is what was sent."""
 
-import json
 import math
-import socket
-import subprocess
-import sys
 import time
 from dataclasses import replace
 
 import pytest
+from support.mavlink_peer import free_port, listening, of_kind
 
 from roadgeo.errors import OutputError
 from roadgeo.running.flights.mavlink import MavlinkOptions, MavlinkSender, PositionFix, fix_of, has_pymavlink
@@ -17,63 +14,17 @@ pytestmark = pytest.mark.slow
 
 needs = pytest.mark.skipif(not has_pymavlink(), reason="needs pymavlink")
 
-#: A peer: prints every message it decodes as a line of JSON, until it has heard so many places. Of the datagrams that
-#: come it loses every so manieth, as a radio does.
-PEER = """
-import json, os, sys, time
-os.environ["MAVLINK20"] = "1"
-from pymavlink import mavutil
-port, count, lose = map(int, sys.argv[1:])
-mavutil.set_dialect("common")
-link = mavutil.mavlink_connection(f"udpin:127.0.0.1:{port}")
-received, recv = 0, link.recv
-def losing(n=None):
-    global received
-    data = recv(n)
-    received += bool(data)
-    return b"" if lose and data and received % lose == 0 else data
-link.recv = losing
-print("ready", flush=True)
-heard, end = 0, time.time() + 20
-while time.time() < end:
-    message = link.recv_match(blocking=True, timeout=0.1)
-    if message is None:
-        continue
-    said = {k: (None if isinstance(v, float) and v != v else v) for k, v in message.to_dict().items()}
-    said.update(id_=message.get_msgId(), lost=link.mav_loss, src=message.get_srcComponent())
-    print(json.dumps(said), flush=True)
-    heard += message.get_type() == "GLOBAL_POSITION_SENSOR"
-    if heard == count:  # the command that goes with the last place is still to come
-        heard, end = heard + 1, time.time() + 0.4
-"""
-
-
-def free_port():
-    with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as sock:
-        sock.bind(("127.0.0.1", 0))
-        return sock.getsockname()[1]
-
 
 def talk(fixes, count, lose=0, pause_s=0.0, **options):
     """Send places, whose times are how long ago frames were taken, to a peer in another process.
 
     Return what it decoded, and the sender.
     """
-    port = free_port()
-    command = [sys.executable, "-c", PEER, str(port), str(count), str(lose)]
-    with subprocess.Popen(command, stdout=subprocess.PIPE, text=True) as peer:
-        assert peer.stdout.readline() == "ready\n"
-        with MavlinkSender(f"udpout:127.0.0.1:{port}", MavlinkOptions(**options)) as sender:
-            for fix in fixes:
-                sender.send(replace(fix, taken_s=time.time() - fix.taken_s))
-                time.sleep(pause_s)
-            heard = [json.loads(line) for line in peer.stdout]
-        assert peer.wait(30) == 0
+    with listening(count, lose) as (url, heard), MavlinkSender(url, MavlinkOptions(**options)) as sender:
+        for fix in fixes:
+            sender.send(replace(fix, taken_s=time.time() - fix.taken_s))
+            time.sleep(pause_s)
     return heard, sender
-
-
-def of(heard, kind):
-    return [one for one in heard if one["mavpackettype"] == kind]
 
 
 @needs
@@ -81,7 +32,7 @@ def test_a_peer_decodes_what_was_sent():
     fixes = [PositionFix(-71.0954851 + 0.001 * k, 42.3450061, 0.8 + k, 0.25) for k in range(3)]
     started = time.time()
     heard, _ = talk(fixes, 3, max_rate_hz=1000.0, pause_s=0.01)
-    places, commands = of(heard, "GLOBAL_POSITION_SENSOR"), of(heard, "COMMAND_INT")
+    places, commands = of_kind(heard, "GLOBAL_POSITION_SENSOR"), of_kind(heard, "COMMAND_INT")
     assert len(places) == len(commands) == 3
     for fix, place, command in zip(fixes, places, commands, strict=True):
         assert place["id_"] == 296
@@ -98,7 +49,7 @@ def test_a_peer_decodes_what_was_sent():
         assert math.isclose(place["processing_time"] / 1e6, command["param2"], abs_tol=1e-4)
     sent = [one["param1"] for one in commands]
     assert sent == sorted(sent)
-    assert of(heard, "HEARTBEAT")
+    assert of_kind(heard, "HEARTBEAT")
     assert {one["src"] for one in heard} == {197}
 
 
@@ -117,7 +68,7 @@ def test_places_that_come_too_fast_are_left_out():
 def test_losses_are_seen_by_the_peer_and_the_rest_arrives():
     fixes = [PositionFix(1.0, 2.0 + 0.001 * k, 1.0, 0.0) for k in range(30)]
     heard, sender = talk(fixes, 20, lose=5, pause_s=0.005, max_rate_hz=1000.0)
-    places = of(heard, "GLOBAL_POSITION_SENSOR")
+    places = of_kind(heard, "GLOBAL_POSITION_SENSOR")
     assert sender.n_sent == 30
     assert 20 <= len(places) < 30
     assert heard[-1]["lost"] > 0
@@ -128,7 +79,7 @@ def test_losses_are_seen_by_the_peer_and_the_rest_arrives():
 @needs
 def test_heartbeats_come_at_their_rate():
     heard, _ = talk([PositionFix(1.0, 2.0, 1.0, 0.0)] * 10, 10, pause_s=0.1, max_rate_hz=100.0, heartbeat_hz=10.0)
-    assert 6 <= len(of(heard, "HEARTBEAT")) <= 25
+    assert 6 <= len(of_kind(heard, "HEARTBEAT")) <= 25
 
 
 @needs

@@ -7,18 +7,22 @@ import signal
 import struct
 import subprocess
 import sys
+import time
 import urllib.error
 import urllib.request
 import zlib
+from contextlib import nullcontext
 
 import cv2
 import numpy as np
 import pytest
+from support.mavlink_peer import listening, of_kind
 
 from roadgeo.errors import IndexFormatError
 from roadgeo.evaluation.landscape import Landscape
 from roadgeo.evaluation.noise import NOISE_MODELS
 from roadgeo.evaluation.simulation import SimulationOptions, ViewOptions, simulate_query
+from roadgeo.running.flights.mavlink import has_pymavlink
 from roadgeo.reference.reference import Reference
 from roadgeo.running.serving.workers import Asked, Workers
 
@@ -87,11 +91,18 @@ def test_the_command_serves_until_it_is_interrupted(place):
     folder, truth = place
     program = "import sys; from roadgeo.cli import main; sys.exit(main())"
     command = [sys.executable, "-c", program, "serve", "-r", str(folder / "town.gpkg"), "--port", "0"]
-    with subprocess.Popen(command, stderr=subprocess.PIPE, text=True) as process:
+    peer = listening(count=1, patience_s=60) if has_pymavlink() else nullcontext(("", []))
+    with (
+        peer as (url, heard),
+        subprocess.Popen(
+            [*command, *(["--mavlink", url] if url else [])], stderr=subprocess.PIPE, text=True
+        ) as process,
+    ):
         try:
             line = next(line for line in process.stderr if "Listening" in line)
             address = re.search(r"http://127\.0\.0\.1:\d+/", line)[0]
             asked = urllib.request.Request(address + "locate", (folder / "mask.png").read_bytes(), method="POST")
+            asked_at = time.time()
             with urllib.request.urlopen(asked, timeout=60) as answer:
                 found = json.load(answer)
             assert found["status"] == "located"
@@ -103,6 +114,14 @@ def test_the_command_serves_until_it_is_interrupted(place):
         finally:
             process.send_signal(signal.SIGINT)
         assert process.wait(20) == 0
+    if heard:
+        (place,), (command,) = of_kind(heard, "GLOBAL_POSITION_SENSOR"), of_kind(heard, "COMMAND_INT")
+        there = (round(found["center"]["lat"] * 1e7), round(found["center"]["lon"] * 1e7))
+        assert (place["lat"], place["lon"]) == (command["x"], command["y"]) == there
+        assert place["eph"] == pytest.approx(max(found["corner_sigma_m"]), rel=1e-6)
+        assert asked_at - 0.1 < place["time_usec"] / 1e6 < place["heard_at"]
+        assert place["time_usec"] + place["processing_time"] <= place["heard_at"] * 1e6
+    assert bool(heard) == has_pymavlink()
 
 
 @pytest.mark.parametrize("options", [["--host", "0.0.0.0"], ["--token-file", os.devnull]])
