@@ -135,12 +135,19 @@ def agreement(
 
 
 def chance_agreement(
-    matrix: FloatArray, scene: Scene, index: ReferenceIndex, gsd_m: float, options: VerifyOptions, every: int = 1
+    matrix: FloatArray,
+    scene: Scene,
+    index: ReferenceIndex,
+    gsd_m: float,
+    options: VerifyOptions,
+    every: int = 1,
+    n_best: int = 1,
 ) -> tuple[float, float, float]:
     """Return the rates (intersections, forward, backward) that the best shifted positions reach.
 
     Shifts lie on a sunflower spiral between the two radii of `shift_m`, so that all directions and distances are met
-    evenly. Of only `every` n-th of them the best cannot be better than of all: that is a quick lower bound.
+    evenly. Of only `every` n-th of them the best cannot be better than of all: that is a quick lower bound. Of a place
+    that nobody chose by this query the best of all shifts is too hard a rival: the mean of the `n_best` best is taken.
     """
     tolerance = tolerance_m(gsd_m, options)
     found = scene.intersections
@@ -163,7 +170,7 @@ def chance_agreement(
     rates[:, 0] = counts / max(len(found), 1)
     count_near_roads(matrix, points, directions, tolerance, min_cos, shifts, roads, counts)
     rates[:, 1] = counts / max(len(points), 1)
-    best = np.argsort(-rates[:, 1])[:12]
+    best = np.argsort(-rates[:, 1])[: 12 if n_best == 1 else 4 * n_best]
     for i in best:
         dx, dy = radius[i] * math.cos(angle[i]), radius[i] * math.sin(angle[i])
         seen, shown = backward_agreement(
@@ -171,7 +178,11 @@ def chance_agreement(
             scene.field, scene.field_scale, scene.observed,
         )  # fmt: skip
         rates[i, 2] = shown / max(seen, 1)
-    return float(rates[:, 0].max()), float(rates[:, 1].max()), float(rates[best, 2].max())
+    return _mean_of_best(rates[:, 0], n_best), _mean_of_best(rates[:, 1], n_best), _mean_of_best(rates[best, 2], n_best)
+
+
+def _mean_of_best(rates: FloatArray, count: int) -> float:
+    return float(rates.max()) if count == 1 else float(np.sort(rates)[-count:].mean())
 
 
 def _information(rate: float, chance: float) -> float:

@@ -13,12 +13,12 @@ import cv2
 import numpy as np
 from scipy.optimize import least_squares
 
-from roadgeo._arrays import AnyArray, FloatArray
+from roadgeo._arrays import AnyArray, BoolArray, FloatArray
 from roadgeo.geometry.frame import Frame
 from roadgeo.geometry.homography import Homography
 from roadgeo.geometry.mask import RoadMask
 
-__all__ = ["Mosaic", "MosaicOptions", "chain", "lay_together", "level"]
+__all__ = ["Mosaic", "MosaicOptions", "chain", "lay_together", "level", "unseen_before"]
 
 
 @dataclass(frozen=True)
@@ -123,11 +123,28 @@ def lay_together(
     to_pixel = np.array([[scale, 0.0, -scale * low[0]], [0.0, scale, -scale * low[1]], [0.0, 0.0, 1.0]])
     to_mosaic = to_pixel @ levelled
     columns, rows = np.ceil((high - low) * scale).astype(int) + 1
-    roads, seen = np.zeros((rows, columns), np.uint8), np.zeros((rows, columns), np.uint8)
-    for mask, matrix in zip(masks, to_mosaic, strict=True):
+    shown, seen = _paint_all(masks, to_mosaic, (rows, columns), options)
+    return Mosaic(RoadMask(shown, seen, masks[0].name), to_mosaic)
+
+
+def unseen_before(
+    masks: Sequence[RoadMask], mosaic: Mosaic, count: int, options: MosaicOptions | None = None
+) -> RoadMask:
+    """Return what a mosaic of these masks shows where none of its first `count` frames saw anything."""
+    options, shape = options or MosaicOptions(), mosaic.mask.shape
+    shown, seen = _paint_all(masks[count:], mosaic.to_mosaic[count:], shape, options)
+    fresh = seen & ~_paint_all(masks[:count], mosaic.to_mosaic[:count], shape, options)[1]
+    return RoadMask(shown & fresh, fresh, mosaic.mask.name)
+
+
+def _paint_all(
+    masks: Sequence[RoadMask], matrices: FloatArray, shape: tuple[int, int], options: MosaicOptions
+) -> tuple[BoolArray, BoolArray]:
+    """Return where frames show road, and where they see, on a mosaic of so many rows and columns."""
+    roads, seen = np.zeros(shape, np.uint8), np.zeros(shape, np.uint8)
+    for mask, matrix in zip(masks, matrices, strict=True):
         _paint(mask, matrix, roads, seen)
-    shown = (seen > 0) & (roads > options.share * seen)
-    return Mosaic(RoadMask(shown, seen > 0, masks[0].name), to_mosaic)
+    return (seen > 0) & (roads > options.share * seen), seen > 0
 
 
 def _is_sound(corners: FloatArray) -> bool:

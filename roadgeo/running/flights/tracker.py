@@ -25,14 +25,14 @@ from roadgeo.kernels.compilation import load
 from roadgeo.kernels.warmup import warm_up
 from roadgeo.location import Location
 from roadgeo.matching.options import LocateOptions
-from roadgeo.matching.query import trace_query
+from roadgeo.matching.query import Query, read_query, trace_query
 from roadgeo.matching.scene import Scene
 from roadgeo.matching.verification import agreement, chance_agreement, log10_odds
 from roadgeo.reference.reference import Reference
 from roadgeo.roads.vectorization import road_width
+from roadgeo.running.flights.candidates import CandidateOptions, Candidates, Look
 from roadgeo.running.flights.mosaic import Mosaic, MosaicOptions, lay_together
 from roadgeo.running.flights.pose import FilterOptions, Pose, correct, predict, start
-from roadgeo.workflows import locate
 
 __all__ = ["Fix", "FlightFrame", "FrameStatus", "TrackOptions", "Tracked", "Tracker", "follow", "track"]
 
@@ -49,8 +49,9 @@ class TrackOptions:
         How mosaics are located; the hints are of the frames.
     most_frames : int
         Of more frames that wait for a place, the latest are laid together.
-    fewest_intersections, more_intersections : int
-        A mosaic is looked for once it shows so many intersections, and again when it shows so many more.
+    fewest_intersections, more_intersections, more_frames : int
+        A mosaic is looked for once it shows so many intersections, and again when it shows so many more, or so many
+        frames have come since.
     start_sigma_m : float
         Standard deviation of a located mosaic.
     least_odds : float
@@ -64,10 +65,12 @@ class TrackOptions:
 
     locate: LocateOptions = field(default_factory=LocateOptions)
     mosaic: MosaicOptions = field(default_factory=MosaicOptions)
+    candidates: CandidateOptions = field(default_factory=CandidateOptions)
     filter: FilterOptions = field(default_factory=FilterOptions)
     most_frames: int = 32
     fewest_intersections: int = 6
     more_intersections: int = 2
+    more_frames: int = 3
     start_sigma_m: float = 4.0
     least_odds: float = 0.2
     patience: int = 3
@@ -166,7 +169,8 @@ class Tracker:
         self._reference: Reference | None = None
         self._doubtful: list[_Waiting] = []  # frames in a row that do not agree
         self._window: list[_Waiting] = []
-        self._looks = self._looked_at = 0
+        self._looked_at = self._waited = 0
+        self._candidates = self._no_candidates()
 
     @property
     def is_lost(self) -> bool:
@@ -233,8 +237,16 @@ class Tracker:
         why = f"{len(doubtful)} frames in a row do not agree with the map" if len(doubtful) > 1 else reason
         self._pose, self._reference = None, None
         self._window, self._doubtful = list(doubtful), []
-        self._looks = self._looked_at = 0
+        self._forget()
         return [Tracked(one.frame, "lost", why, known_at) for one in doubtful]
+
+    def _no_candidates(self) -> Candidates:
+        return Candidates(self.references, self.options.candidates, self.options.mosaic)
+
+    def _forget(self) -> None:
+        """Forget what earlier frames proposed."""
+        self._looked_at = self._waited = 0
+        self._candidates = self._no_candidates()
 
     # --- searching ----------------------------------------------------------------------------------------------------
 
@@ -243,21 +255,26 @@ class Tracker:
         frame = waiting.frame
         if frame.motion is None or (self._window and self._window[-1].frame.frame != frame.frame):
             self._window = []
-            self._looked_at = 0
+            self._forget()
         self._window = [*self._window, waiting][-self.options.most_frames :]
         masks = [one.frame.mask for one in self._window]
         mosaic = lay_together(masks, [_motion(one) for one in self._window], _road_px(masks), self.options.mosaic)
         if mosaic is None:
-            self._window, self._looked_at = [waiting], 0
+            self._window = [waiting]
+            self._forget()
             return [Tracked(frame, "lost", "the motion is that of no camera; begun anew", frame.number)]
-        n_seen = _count_intersections(mosaic, self.options)
+        query = _read(mosaic, self.options)
+        n_seen = 0 if query is None else len(query.scene.intersections)
         least = max(self.options.fewest_intersections, self._looked_at + self.options.more_intersections)
-        if n_seen < least:
+        if query is None or (n_seen < least and not self._candidates):
             why = f"waits: {len(masks)} frames show {n_seen} intersections, looked for again with {least}"
             return [Tracked(frame, "lost", why, frame.number)]
-        self._looks += 1
-        self._looked_at = n_seen
-        location = locate(mosaic.mask, self.references, self._look_options(mosaic, masks))
+        self._waited += 1
+        searched = n_seen >= least or self._waited >= self.options.more_frames
+        if searched:
+            self._looked_at, self._waited = n_seen, 0
+        look = Look(query, mosaic, [one.frame.number for one in self._window], masks, searched)
+        location = self._candidates.look(look, self._look_options(mosaic, masks))
         if not location.located:
             return [Tracked(frame, "lost", f"{len(masks)} frames: {location.reason}", frame.number)]
         return self._settle(location, mosaic) or [
@@ -275,9 +292,8 @@ class Tracker:
         near = options.near
         if near is not None:
             near = (near[0], near[1], near[2] + 0.5 * max(mosaic.mask.shape) * camera.gsd_m[1])
-        odds = round(options.min_log10_odds + math.log10(self._looks), 1)
         match = replace(options.match, camera=camera, lens=None)
-        return replace(options, match=match, near=near, min_log10_odds=odds)
+        return replace(options, match=match, near=near)
 
     def _settle(self, location: Location, mosaic: Mosaic) -> list[Tracked]:
         """Place all frames that waited, each by itself; nothing where most of them do not agree."""
@@ -298,7 +314,7 @@ class Tracker:
             return []
         self.fixes.append(Fix(first.number, last.number, location))
         self._window, self._doubtful = [], []
-        self._looks = self._looked_at = 0
+        self._forget()
         return placed
 
 
@@ -338,9 +354,12 @@ def _road_px(masks: Sequence[RoadMask]) -> float:
     return float(np.median(shown)) if shown else 1.0
 
 
-def _count_intersections(mosaic: Mosaic, options: TrackOptions) -> int:
-    scene = _trace(mosaic.mask, options)
-    return 0 if scene is None else len(scene.intersections)
+def _read(mosaic: Mosaic, options: TrackOptions) -> Query | None:
+    """Trace a mosaic; None where it shows no roads."""
+    try:
+        return read_query(mosaic.mask, options.locate.query)
+    except MaskError:
+        return None
 
 
 def _scale(matrix: FloatArray, frame: Frame) -> float:

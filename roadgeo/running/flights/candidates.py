@@ -1,0 +1,330 @@
+"""Places that earlier frames of a flight proposed, tested by later ones on ground that was not seen before.
+
+What a search finds pays for all the places it tried: a hundred thousand and more, five decades of odds. A place that
+was proposed once, and then agrees with ground that the search did not know, pays only for how many were proposed
+before it. Where streets are alike a flight is so found some frames sooner.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+from dataclasses import dataclass, field, replace
+
+import numpy as np
+
+from roadgeo._arrays import FloatArray, IntArray
+from roadgeo.errors import MaskError
+from roadgeo.running.flights.mosaic import Mosaic, MosaicOptions, unseen_before
+from roadgeo.geometry.camera import judge, sampling
+from roadgeo.geometry.frame import Frame
+from roadgeo.geometry.homography import Homography
+from roadgeo.geometry.mask import PIXEL_TO_PLANE, RoadMask
+from roadgeo.location import Location
+from roadgeo.matching.checking import CheckOptions, check_place
+from roadgeo.matching.estimator import Hypothesis, TripleEstimator
+from roadgeo.matching.index import ReferenceIndex
+from roadgeo.matching.methods import Fit, Found, search_references
+from roadgeo.matching.options import LocateOptions
+from roadgeo.matching.query import Query, trace_query
+from roadgeo.matching.refinement import refine
+from roadgeo.matching.scene import Scene
+from roadgeo.matching.trace import NoTrace
+from roadgeo.matching.verdict import decide
+from roadgeo.matching.verification import agreement, chance_agreement, log10_odds
+from roadgeo.reference.reference import Reference
+
+__all__ = ["CandidateOptions", "Candidates", "Look"]
+
+_NO_SEEDS: IntArray = np.array([], np.int64)
+
+
+@dataclass(frozen=True)
+class CandidateOptions:
+    """How many places are kept, and which.
+
+    Attributes
+    ----------
+    per_look : int
+        Best places of each look that are tested by the frames to come.
+    most : int
+        Of more, the best are kept.
+    hopeless : float
+        Log10 odds of later ground by which a place is given up.
+    fewest_roads : int
+        Ground that shows fewer roads than this is no test yet.
+    n_best : int
+        Chance is what so many of the best shifted places reach on average.
+    check : CheckOptions
+        A place that would do is compared with all places near it: it may be one block off. Where it does not lead them
+        chance is what the best shifted place reaches.
+    """
+
+    per_look: int = 30
+    most: int = 60
+    hopeless: float = -2.0
+    fewest_roads: int = 6
+    n_best: int = 8
+    check: CheckOptions = field(default_factory=lambda: CheckOptions(tolerance_m=20.0, max_sigma_m=10.0))
+
+
+@dataclass(frozen=True)
+class Look:
+    """Frames laid together, and which they are.
+
+    Attributes
+    ----------
+    numbers : sequence of int
+        Number of each frame.
+    masks : sequence of RoadMask
+    searched : bool
+        Whether the map is searched for them; otherwise only what was proposed is tested.
+    """
+
+    query: Query
+    mosaic: Mosaic
+    numbers: Sequence[int]
+    masks: Sequence[RoadMask]
+    searched: bool
+
+
+@dataclass
+class _Candidate:
+    """A place.
+
+    Attributes
+    ----------
+    index : ReferenceIndex
+        What it was found on.
+    whole : ReferenceIndex
+        The reference that is part of.
+    matrix : (3, 3) float64
+        Pixel of the frame `seen_at` to reference plane.
+    since : int
+        Number of the latest frame that proposed it.
+    proposed : float
+        Log10 odds by which it was proposed, less all that were tried.
+    rank : int
+        So many were proposed before it at that look.
+    n_looks : int
+        Looks at the map until then.
+    tested : float
+        Log10 odds of the ground seen since.
+    fit : Fit or None
+        Where it was last laid; None before its first test.
+    """
+
+    index: ReferenceIndex
+    whole: ReferenceIndex
+    matrix: FloatArray
+    seen_at: int
+    since: int
+    proposed: float
+    rank: int
+    n_looks: int
+    tested: float = 0.0
+    fit: Fit | None = None
+
+    @property
+    def log10_odds(self) -> float:
+        """What speaks for it: all that was seen, less what was tried; or what was seen since, less the rank.
+
+        Of the two what says more, less the looks. The weights 1 / ((r + 1) (r + 2)) of the ranks r = 0, 1, ... have the
+        sum 1: however many places are tested, they pay as one does.
+        """
+        paid = math.log10(self.n_looks)
+        return self.tested + max(self.proposed, -math.log10((self.rank + 1) * (self.rank + 2))) - paid
+
+
+class _Recorder(NoTrace):
+    """Keeps what a search compared with the map."""
+
+    def __init__(self) -> None:
+        self.estimator: TripleEstimator | None = None
+        self.scored_models: list[Hypothesis] = []
+
+    def began(self, estimator: TripleEstimator) -> None:
+        """Note what searches."""
+        self.estimator = estimator
+
+    def scored(self, model: Hypothesis) -> None:
+        """Note a place."""
+        self.scored_models.append(model)
+
+    def best(self, count: int) -> list[Hypothesis]:
+        """Return the best places, each once."""
+        estimator, kept = self.estimator, list[Hypothesis]()
+        if estimator is None:
+            return kept
+        for model in sorted(self.scored_models, key=lambda one: -one.log10_odds):
+            if len(kept) == count or not math.isfinite(model.log10_odds):
+                break
+            if model.found is not None and not any(estimator.same(model, one) for one in kept):
+                kept.append(model)
+        return kept
+
+
+@dataclass
+class Candidates:
+    """The places that one lost flight may be at.
+
+    Attributes
+    ----------
+    n_looks : int
+        Searches of the map so far: each takes its share off the odds.
+    """
+
+    references: Sequence[Reference]
+    options: CandidateOptions = field(default_factory=CandidateOptions)
+    mosaic: MosaicOptions = field(default_factory=MosaicOptions)
+    n_looks: int = 0
+    _kept: list[_Candidate] = field(default_factory=list)
+
+    def __len__(self) -> int:
+        return len(self._kept)
+
+    def look(self, look: Look, options: LocateOptions) -> Location:
+        """Test what was proposed, search the map where that is due, and judge both together."""
+        self._test(look, options)
+        recorders: list[_Recorder] = []
+
+        def record() -> _Recorder:
+            recorders.append(_Recorder())
+            return recorders[-1]
+
+        found: list[Found] = []
+        if look.searched:
+            parts = [part for one in self.references for part in one.parts]
+            self.n_looks += 1
+            found = search_references(look.query, parts, options, options.search.time_limit_s, record)
+        location = decide(look.query, self._with_tested(found, look), options)
+        for one, recorder in zip(found, recorders, strict=False):
+            self._take(one, recorder, look)
+        self._kept = sorted(self._kept, key=lambda one: -one.log10_odds)[: self.options.most]
+        return location
+
+    def _test(self, look: Look, options: LocateOptions) -> None:
+        """Lay all that frames have shown on each place, and count what was not seen when it was proposed."""
+        scenes: dict[int, Scene | None] = {}
+        due: list[tuple[_Candidate, Scene]] = []
+        for one in self._kept:
+            if one.since not in scenes:
+                scenes[one.since] = self._ground_since(look, one.since, options)
+            scene = scenes[one.since]
+            if scene is not None and scene.n_edges >= self.options.fewest_roads:
+                due.append((one, scene))
+        for one, scene in due:
+            _test_candidate(one, scene, look, options, self.options)
+        self._kept = [one for one in self._kept if not one.tested < self.options.hopeless]
+
+    def _ground_since(self, look: Look, since: int, options: LocateOptions) -> Scene | None:
+        """Return what is seen on ground that no frame up to `since` saw; None where that shows no roads."""
+        later = sum(number > since for number in look.numbers)
+        mask = unseen_before(look.masks, look.mosaic, len(look.masks) - later, self.mosaic)
+        try:
+            return trace_query(mask, options.query)[0]
+        except MaskError:
+            return None
+
+    def _with_tested(self, found: list[Found], look: Look) -> list[Found]:
+        """Add places that stood a test to what was found; each place counts by what speaks most for it."""
+        paid = math.log10(max(self.n_looks, 1))
+        merged = [replace(one, fits=tuple(_less(fit, paid) for fit in one.fits)) for one in found]
+        for one in self._kept:
+            if one.fit is None:
+                continue
+            fit = replace(one.fit, log10_odds=one.log10_odds)
+            k = next((k for k, other in enumerate(merged) if other.index is one.whole), len(merged))
+            if k == len(merged):
+                merged.append(Found(one.whole, n_searched=len(one.whole)))
+            merged[k] = replace(merged[k], fits=_added(merged[k].fits, fit, look.query.scene.size))
+        return merged or [Found(one.index) for one in self.references]
+
+    def _take(self, found: Found, recorder: _Recorder, look: Look) -> None:
+        """Keep what a search proposed, unless it is known."""
+        last, to_frame = look.numbers[-1], PIXEL_TO_PLANE @ look.mosaic.to_mosaic[-1]
+        scene, estimator = look.query.scene, recorder.estimator
+        if estimator is None:
+            return
+        for rank, model in enumerate(recorder.best(self.options.per_look)):
+            proposed = _fully_scored(model, estimator)
+            new = _Candidate(
+                estimator.index, found.index, model.matrix @ to_frame, last, last, proposed, rank, self.n_looks
+            )
+            here = (one for one in self._kept if one.whole is found.index)
+            old = next((one for one in here if _are_one(_lay(one, look), model.matrix, scene.size)), None)
+            if old is None or old.log10_odds < new.log10_odds:
+                self._kept = [*(one for one in self._kept if one is not old), new]
+
+
+def _fully_scored(model: Hypothesis, estimator: TripleEstimator) -> float:
+    """Return the log10 odds of a place, less all that were tried, also where the search stopped to look at it."""
+    scene, index, verify = estimator.scene, estimator.index, estimator.options.verify
+    if model.found is None:
+        return -math.inf
+    chance = chance_agreement(model.matrix, scene, index, model.gsd_m, verify)
+    return log10_odds(model.found, chance, scene.n_edges, estimator.ledger.n_tried, verify)
+
+
+def _test_candidate(
+    one: _Candidate, scene: Scene, look: Look, locate: LocateOptions, options: CandidateOptions
+) -> None:
+    """Refine a place on all that was seen; compare it with the map on ground that had not been seen."""
+    whole, verify, camera = look.query.scene, locate.match.verify, locate.match.camera
+    one.tested, one.fit = -math.inf, None
+    matrix = _lay(one, look)
+    if matrix is None or judge(matrix, whole.size, camera, rough=True) is not None:
+        return
+    _, matched, _ = agreement(matrix, whole, one.index, sampling(matrix, whole.size), _NO_SEEDS, verify)
+    refined = refine(matrix, whole, one.index, matched, locate.match.refine, held=True)
+    if refined is None or judge(refined.matrix, whole.size, camera) is not None:
+        return
+    matrix, gsd = refined.matrix, sampling(refined.matrix, whole.size)
+    found, matched, distance = agreement(matrix, whole, one.index, gsd, _NO_SEEDS, verify)
+    one.matrix, one.seen_at = matrix @ PIXEL_TO_PLANE @ look.mosaic.to_mosaic[-1], look.numbers[-1]
+    fresh, _, _ = agreement(matrix, scene, one.index, gsd, _NO_SEEDS, verify)
+    for n_best in (options.n_best, 1):
+        chance = chance_agreement(matrix, scene, one.index, gsd, verify, n_best=n_best)
+        one.tested = log10_odds(fresh, chance, scene.n_edges, 1, verify)
+        if one.log10_odds < locate.min_log10_odds - locate.min_margin or _leads(matrix, whole, one.index, options):
+            break
+    one.fit = Fit(
+        one.index, matrix, matched, distance, found.forward, one.tested,
+        refined.corner_sigma_m, refined.corner_covariance_m2,
+        agreement=(found.rate + found.forward + found.backward) / 3,
+    )  # fmt: skip
+
+
+def _leads(matrix: FloatArray, scene: Scene, index: ReferenceIndex, options: CandidateOptions) -> bool:
+    """Whether a place agrees better than all others near it."""
+    return check_place(matrix, scene, index, options.check).verdict == "agrees"
+
+
+def _lay(one: _Candidate, look: Look) -> FloatArray | None:
+    """Return where a place puts the mosaic, query plane to reference plane; None where their frames do not touch."""
+    if one.seen_at not in look.numbers:
+        return None
+    to_mosaic = look.mosaic.to_mosaic[list(look.numbers).index(one.seen_at)]
+    matrix = one.matrix @ np.linalg.inv(to_mosaic) @ PIXEL_TO_PLANE
+    return np.asarray(matrix / matrix[2, 2])
+
+
+def _less(fit: Fit, paid: float) -> Fit:
+    return replace(fit, log10_odds=fit.log10_odds - paid)
+
+
+def _are_one(a: FloatArray | None, b: FloatArray, size: tuple[int, int]) -> bool:
+    """Whether two places put the middle of a mosaic within 50 m, or a twentieth of its size, of each other."""
+    if a is None:
+        return False
+    frame = Frame(*size)
+    apart = np.hypot(*(Homography(a)(frame.plane_center) - Homography(b)(frame.plane_center)))
+    return bool(apart < max(50.0, 0.05 * sampling(b, size) * frame.half_diagonal))
+
+
+def _added(fits: tuple[Fit, ...], fit: Fit, size: tuple[int, int]) -> tuple[Fit, ...]:
+    """Add a fit to others on its reference, which lie apart; of those at one place the likeliest stays."""
+    twins = [one for one in fits if _are_one(one.matrix, fit.matrix, size)]
+    if any(one.log10_odds >= fit.log10_odds for one in twins):
+        return fits
+    return (*(one for one in fits if not any(one is twin for twin in twins)), fit)
