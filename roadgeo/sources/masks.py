@@ -18,6 +18,7 @@ from roadgeo._arrays import AnyArray, BoolArray
 from roadgeo._text import visible
 from roadgeo.errors import MaskError
 from roadgeo.geometry.mask import RoadMask
+from roadgeo.roads.borders import find_border
 from roadgeo.roads.observed import find_voids
 from roadgeo.roads.vectorization import road_width
 from roadgeo.sources.thresholds import Sample, find_thresholds
@@ -84,8 +85,8 @@ def read_mask(
     name : str, optional
         What to call the mask. Default: the path as given.
     voids : bool
-        Whether to look for black corners that a warped image left in its frame. Nodata, NaN and alpha 0 are never
-        taken for observed ground.
+        Whether to look for black corners that a warped image left in its frame, and for what a scan shows around its
+        map: margins, the line around it, captions. Nodata, NaN and alpha 0 are never taken for observed ground.
 
     Returns
     -------
@@ -128,6 +129,8 @@ class MaskSource:
         name = self._raster.name
         roads, observed = _separate(self._raster, self._channel, threshold)
         roads, observed = _told_apart(name, roads, observed)
+        if self._voids:
+            roads, observed = _without_border(name, roads, observed)
         if self._voids and observed is None:
             observed = find_voids(roads, road_width(RoadMask(roads, name=name)))
         if observed is not None:
@@ -257,6 +260,15 @@ def _told_apart(name: str, roads: BoolArray, observed: BoolArray | None) -> tupl
         raise MaskError(f"{name}: every pixel is light; expected roads as light pixels on dark ground")
     _LOG.warning("%s: dark roads on light ground: read as inverted", visible(name))
     return inverted, observed
+
+
+def _without_border(name: str, roads: BoolArray, observed: BoolArray | None) -> tuple[BoolArray, BoolArray | None]:
+    """Leave out what a scan shows around its map."""
+    on_map = find_border(roads, road_width(RoadMask(roads, name=name)))
+    if on_map is None or not (roads & on_map).any():
+        return roads, observed
+    _LOG.warning("%s: what lies beyond the border of the map is left out", visible(name))
+    return roads & on_map, on_map if observed is None else observed & on_map
 
 
 @contextmanager

@@ -1,0 +1,175 @@
+"""What a scan shows besides its map: solid margins, the line around the map, and captions beyond it.
+
+All of it would be taken for roads. A margin is solid along a whole side. The line around a map (its neat line) is
+straight over most of the sheet, on three sides at least, and no road crosses it: a street as straight has others that
+go on beyond it. A caption is a strip of small marks, with an empty strip between them and the map.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import cv2
+import numpy as np
+
+from roadgeo._arrays import BoolArray, FloatArray
+
+__all__ = ["BorderOptions", "find_border"]
+
+
+@dataclass(frozen=True)
+class BorderOptions:
+    """When something is no part of the map.
+
+    Attributes
+    ----------
+    solid : float
+        Rows and columns of a margin are road by at least this share.
+    most : float
+        Largest share of the sheet's side that is cut from one side.
+    max_turn_deg : float
+        Sheets lie askew on a scanner by no more.
+    least_line : float
+        Share of a side that the line around the map must cover.
+    most_crossed : float
+        Share of it where there may be road just beyond it.
+    least_sides : int
+        So many sides must have a line.
+    least_marks : int
+        A caption has so many marks.
+    max_mark : float
+        Each is no wider than this share of the sheet.
+    max_side : int
+        Larger sheets are reduced to this before they are looked at.
+    """
+
+    solid: float = 0.9
+    most: float = 0.3
+    max_turn_deg: float = 2.5
+    least_line: float = 0.6
+    most_crossed: float = 0.004
+    least_sides: int = 3
+    least_marks: int = 6
+    max_mark: float = 0.12
+    max_side: int = 800
+
+
+@dataclass(frozen=True)
+class _Line:
+    """A side's line as seen from that side, in pixels: `depth` of its inner edge in the middle, and its slope."""
+
+    depth: float
+    slope: float
+
+
+def find_border(roads: BoolArray, road_width_px: float, options: BorderOptions | None = None) -> BoolArray | None:
+    """Return which pixels of a sheet lie on its map, (H, W) bool; None where nothing tells that some do not.
+
+    Parameters
+    ----------
+    roads : (H, W) bool
+    road_width_px : float
+    """
+    options = options or BorderOptions()
+    factor = max(1, -(-max(roads.shape) // options.max_side))
+    small = _reduced(roads, factor)
+    width = max(road_width_px / factor, 1.0)
+    on_map = np.ones(small.shape, np.bool_)
+    for turns in range(4):  # as seen from each side: a margin's first row is row 0
+        seen = np.rot90(on_map, turns)
+        seen[: _solid_depth(np.rot90(small, turns), options)] = False
+    for turns in range(4):
+        seen = np.rot90(on_map, turns)
+        seen[: _caption_depth(np.rot90(small & on_map, turns), width, options)] = False
+    lines = [_find_line(np.rot90(small & on_map, turns), width, options) for turns in range(4)]
+    if sum(line is not None for line in lines) >= options.least_sides:
+        for turns, line in enumerate(lines):
+            if line is not None:
+                _cut(np.rot90(on_map, turns), line)
+    if on_map.all() or not (small & on_map).any():
+        return None
+    height, wide = roads.shape
+    if factor > 1:
+        on_map = cv2.resize(on_map.view(np.uint8), (wide, height), interpolation=cv2.INTER_NEAREST).astype(np.bool_)
+    return on_map
+
+
+def _reduced(roads: BoolArray, factor: int) -> BoolArray:
+    """Reduce a sheet; a pixel shows road where any of those it stands for does."""
+    if factor == 1:
+        return roads
+    size = (-(-roads.shape[1] // factor), -(-roads.shape[0] // factor))
+    return np.asarray(cv2.resize(roads.view(np.uint8) * np.uint8(255), size, interpolation=cv2.INTER_AREA) > 0)
+
+
+def _solid_depth(roads: BoolArray, options: BorderOptions) -> int:
+    """Return the rows of a solid margin, 0 for none; its ragged edge belongs to it."""
+    share = roads[: int(options.most * len(roads))].mean(axis=1)
+    solid = share >= options.solid
+    depth = int(np.argmin(solid)) if not solid.all() else 0
+    if depth < 3:
+        return 0
+    ragged = share[depth : depth + max(3, depth // 4)] >= 0.5
+    return depth + (int(np.flatnonzero(ragged)[-1]) + 1 if ragged.any() else 0)
+
+
+def _caption_depth(roads: BoolArray, width: float, options: BorderOptions) -> int:
+    """Return the rows of a strip of small marks, with the empty strip between them and the map; 0 for none."""
+    height, wide = roads.shape
+    empty = ~roads[: int(options.most * height)].any(axis=1)
+    shown = np.flatnonzero(~empty)
+    if not len(shown):
+        return 0
+    gap = max(2.0 * width, 6.0)
+    starts = np.flatnonzero(np.diff(np.concatenate(([False], empty, [False])).astype(np.int8)) == 1)
+    stops = np.flatnonzero(np.diff(np.concatenate(([False], empty, [False])).astype(np.int8)) == -1)
+    inner = [stop for start, stop in zip(starts, stops, strict=True) if start > shown[0] and stop - start >= gap]
+    for depth in sorted(inner, reverse=True):
+        _, _, boxes, _ = cv2.connectedComponentsWithStats(roads[:depth].astype(np.uint8))
+        marks = boxes[1:]
+        small = marks[:, cv2.CC_STAT_WIDTH] <= options.max_mark * wide
+        if len(marks) >= options.least_marks and small.all():
+            return int(depth)
+    return 0
+
+
+def _find_line(roads: BoolArray, width: float, options: BorderOptions) -> _Line | None:
+    """Return the innermost line along the first rows that no road crosses; None where there is none."""
+    height, wide = roads.shape
+    deep = int(options.most * height)
+    rows, columns = np.nonzero(roads[:deep])
+    beyond = round(1.5 * width) + 1
+    found: list[tuple[float, _Line]] = []
+    for slope in np.tan(np.radians(np.linspace(-options.max_turn_deg, options.max_turn_deg, 21))):
+        depth = np.rint(rows - slope * (columns - wide / 2)).astype(np.int64)
+        kept = (depth >= 0) & (depth < deep)
+        cover = np.bincount(depth[kept], minlength=deep) / wide
+        line = _innermost(cover, beyond, options)
+        if line is not None:
+            found.append((float(cover[line]), _Line(line + 1.0, float(slope))))
+    if not found:
+        return None
+    best = max(cover for cover, _ in found)
+    return max((line for cover, line in found if cover >= 0.97 * best), key=lambda line: line.depth)
+
+
+def _innermost(cover: FloatArray, beyond: int, options: BorderOptions) -> int | None:
+    """Return the last row of the innermost line that nothing crosses, of the share (D,) of each row that is road."""
+    on_line = cover >= options.least_line
+    for last in np.flatnonzero(on_line[:-1] & ~on_line[1:])[::-1]:  # where a line ends, seen from outside
+        first = int(last)
+        while first > 0 and cover[first - 1] > options.most_crossed:
+            first -= 1
+        # Just beyond the line there is nothing; or the line is the end of the sheet.
+        outside = cover[max(first - beyond, 0) : first]
+        is_clear = (outside <= options.most_crossed).all() if first else cover[0] >= options.least_line
+        if last - first <= 3 * beyond and is_clear:
+            return int(last)
+    return None
+
+
+def _cut(on_map: BoolArray, line: _Line) -> None:
+    """Clear what lies beyond a line, and the line."""
+    height, wide = on_map.shape
+    depth = np.ceil(line.depth + 1.0 + line.slope * (np.arange(wide) - wide / 2))
+    on_map &= np.arange(height)[:, None] >= depth
