@@ -15,7 +15,6 @@ import numpy as np
 
 from roadgeo._arrays import FloatArray, IntArray
 from roadgeo.errors import MaskError
-from roadgeo.running.flights.mosaic import Mosaic, MosaicOptions, unseen_before
 from roadgeo.geometry.camera import judge, sampling
 from roadgeo.geometry.frame import Frame
 from roadgeo.geometry.homography import Homography
@@ -33,6 +32,7 @@ from roadgeo.matching.trace import NoTrace
 from roadgeo.matching.verdict import decide
 from roadgeo.matching.verification import agreement, chance_agreement, log10_odds
 from roadgeo.reference.reference import Reference
+from roadgeo.running.flights.mosaic import Mosaic, MosaicOptions, unseen_before
 
 __all__ = ["CandidateOptions", "Candidates", "Look"]
 

@@ -22,8 +22,8 @@ from roadgeo.errors import IndexFormatError
 from roadgeo.evaluation.landscape import Landscape
 from roadgeo.evaluation.noise import NOISE_MODELS
 from roadgeo.evaluation.simulation import SimulationOptions, ViewOptions, simulate_query
-from roadgeo.running.flights.mavlink import has_pymavlink
 from roadgeo.reference.reference import Reference
+from roadgeo.running.flights.mavlink import has_pymavlink
 from roadgeo.running.serving.workers import Asked, Workers
 
 pytestmark = pytest.mark.slow
