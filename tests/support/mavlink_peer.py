@@ -4,13 +4,14 @@ import json
 import socket
 import subprocess
 import sys
+import time
 from collections.abc import Iterator
 from contextlib import contextmanager
 from typing import Any
 
 __all__ = ["free_port", "listening", "of_kind"]
 
-#: Prints every message it decodes as a line of JSON, until it has heard so many places. Of the datagrams that come it
+#: Prints every message it decodes as a line of JSON, until it has heard so many places or is ended. Of the datagrams that come it
 #: loses every so manieth, as a radio does.
 _PEER = """
 import json, os, sys, time
@@ -36,7 +37,7 @@ while time.time() < end:
     said.update(id_=message.get_msgId(), lost=link.mav_loss, src=message.get_srcComponent(), heard_at=time.time())
     print(json.dumps(said), flush=True)
     heard += message.get_type() == "GLOBAL_POSITION_SENSOR"
-    if heard == count:  # the command that goes with the last place is still to come
+    if count and heard == count:  # the command that goes with the last place is still to come
         heard, end = heard + 1, time.time() + 0.4
 """
 
@@ -49,16 +50,25 @@ def free_port() -> int:
 
 
 @contextmanager
-def listening(count: int, lose: int = 0, patience_s: int = 20) -> Iterator[tuple[str, list[dict[str, Any]]]]:
-    """Start a peer; yield the address to send to, and a list that holds what it decoded once the block has ended."""
+def listening(count: int = 0, lose: int = 0, patience_s: int = 120) -> Iterator[tuple[str, list[dict[str, Any]]]]:
+    """Start a peer; yield the address to send to, and a list that holds what it decoded once the block has ended.
+
+    With a `count` it listens on until it has heard so many places; without one, to the end of the block.
+    """
     port, heard = free_port(), list[dict[str, Any]]()
     command = [sys.executable, "-c", _PEER, *map(str, (port, count, lose, patience_s))]
     with subprocess.Popen(command, stdout=subprocess.PIPE, text=True) as peer:
         assert peer.stdout is not None
         assert peer.stdout.readline() == "ready\n"
-        yield f"udpout:127.0.0.1:{port}", heard
-        heard += [json.loads(line) for line in peer.stdout]
-        assert peer.wait(30) == 0
+        try:
+            yield f"udpout:127.0.0.1:{port}", heard
+            if not count:
+                time.sleep(0.5)  # what was sent last is still on its way
+                peer.terminate()
+            heard += [json.loads(line) for line in peer.stdout]
+            peer.wait(30)
+        finally:
+            peer.kill()
 
 
 def of_kind(heard: list[dict[str, Any]], kind: str) -> list[dict[str, Any]]:

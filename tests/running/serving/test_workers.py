@@ -91,7 +91,7 @@ def test_the_command_serves_until_it_is_interrupted(place):
     folder, truth = place
     program = "import sys; from roadgeo.cli import main; sys.exit(main())"
     command = [sys.executable, "-c", program, "serve", "-r", str(folder / "town.gpkg"), "--port", "0"]
-    peer = listening(count=1, patience_s=60) if has_pymavlink() else nullcontext(("", []))
+    peer = listening() if has_pymavlink() else nullcontext(("", []))
     with (
         peer as (url, heard),
         subprocess.Popen(
