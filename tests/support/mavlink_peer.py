@@ -11,8 +11,8 @@ from typing import Any
 
 __all__ = ["free_port", "listening", "of_kind"]
 
-#: Prints every message it decodes as a line of JSON, until it has heard so many places or is ended. Of the datagrams that come it
-#: loses every so manieth, as a radio does.
+#: Prints every message it decodes as a line of JSON, until it has heard so many places or is ended. Of the datagrams
+#: that come it loses every so manieth, as a radio does.
 _PEER = """
 import json, os, sys, time
 os.environ["MAVLINK20"] = "1"
