@@ -15,11 +15,12 @@ from roadgeo.errors import RoadSourceError
 from roadgeo.geometry.mask import RoadMask
 from roadgeo.kernels.warmup import warm_up
 from roadgeo.location import Location
-from roadgeo.matching.explanation import Explanation, Record, tell
+from roadgeo.matching.explanation import Explanation, tell
 from roadgeo.matching.index import build_index
 from roadgeo.matching.methods import Found, search_references
 from roadgeo.matching.options import LocateOptions
 from roadgeo.matching.query import Query, read_query
+from roadgeo.matching.record import Record
 from roadgeo.matching.trace import NO_TRACE, Trace
 from roadgeo.matching.truth_record import make_record, tell_truth
 from roadgeo.matching.verdict import decide, needed_of

@@ -50,6 +50,7 @@ def demo_command(out_dir: str) -> int:
     from roadgeo.outputs.location_files import OutputOptions
     from roadgeo.outputs.registry import OVERLAY
     from roadgeo.running.batch import locate_masks
+    from roadgeo.running.options import BatchOptions
     from roadgeo.running.tasks import Task
     from roadgeo.storage.files import write_bytes
     from roadgeo.workflows import build_reference
@@ -66,11 +67,10 @@ def demo_command(out_dir: str) -> int:
     echo(f"Porto, {ATTRIBUTION}: {len(reference.index):,} intersections, indexed in {seconds:.1f} s")
     # each mask is judged as soon as it is done
     tasks = [Task(str(mask.path), mask.path.stem) for mask in masks]
-    outputs = OutputOptions(products=(OVERLAY.name,))
+    options = BatchOptions(outputs=OutputOptions(products=(OVERLAY.name,)))
     wrong = 0
-    for mask, outcome in zip(
-        masks, locate_masks(tasks, [str(folder / "porto.gpkg")], out_dir, outputs=outputs), strict=True
-    ):
+    outcomes = locate_masks(tasks, [str(folder / "porto.gpkg")], out_dir, options)
+    for mask, outcome in zip(masks, outcomes, strict=True):
         right, text = _judge(outcome, mask)
         wrong += not right
         echo(f"\n{mask.path.name}: {mask.title}\n  {text}")

@@ -35,6 +35,7 @@ from roadgeo.outputs.registry import (
 )
 from roadgeo.outputs.wording import format_lonlat
 from roadgeo.running.batch import Outcome, locate_masks, open_references, write_overview
+from roadgeo.running.options import BatchOptions
 from roadgeo.running.tasks import find_masks, name_tasks
 
 if TYPE_CHECKING:
@@ -282,13 +283,9 @@ def locate_command(
             tasks,
             references,
             out_dir,
-            options=options,
-            outputs=outputs,
-            reading=reading,
-            skip_existing=skip_existing,
+            BatchOptions(options, outputs, reading, skip_existing, tuple(said_options(_OF_NO_ACCOUNT))),
             jobs=jobs,
             cluster=make_cluster(engine, scheduler, jobs),
-            command=said_options(_OF_NO_ACCOUNT),
             say=say,
         ):
             outcomes.append(outcome)

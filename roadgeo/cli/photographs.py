@@ -11,7 +11,7 @@ import click
 from roadgeo.cli.parameters import Plugin
 
 if TYPE_CHECKING:
-    from roadgeo.running.batch import ReadOptions
+    from roadgeo.running.options import ReadOptions
 
 __all__ = ["read_options", "segmenting_options"]
 
@@ -76,7 +76,7 @@ def segmenting_options(command: Command) -> Command:
 
 def read_options(given: Mapping[str, Any], photos: Mapping[str, str], others: Sequence[str], jobs: int) -> ReadOptions:
     """Put together how what is given is read; `others` are fused with each query."""
-    from roadgeo.running.batch import ReadOptions
+    from roadgeo.running.options import ReadOptions
 
     return ReadOptions(
         given["threshold"],

@@ -10,6 +10,7 @@ from typing import Literal
 import numpy as np
 
 from roadgeo._arrays import FloatArray
+from roadgeo.geometry.homography import Homography
 
 __all__ = ["CameraFault", "CameraOptions", "CameraPose", "judge", "pose", "sampling"]
 
@@ -104,15 +105,9 @@ class CameraPose:
     source: Literal["camera", "homography", "assumed"] = "homography"
 
 
-def _jacobian(matrix: FloatArray, xy: FloatArray) -> FloatArray:
-    mapped = matrix @ (xy[0], xy[1], 1.0)
-    image = mapped[:2] / mapped[2]
-    return np.asarray((matrix[:2, :2] - np.outer(image, matrix[2, :2])) / mapped[2])
-
-
 def sampling(matrix: FloatArray, size: tuple[int, int]) -> float:
     """Return the ground sampling at the middle of the frame, metres per pixel."""
-    jacobian = _jacobian(matrix, np.array([size[0] / 2.0, -size[1] / 2.0]))
+    jacobian = Homography(matrix).jacobian(np.array([size[0] / 2.0, -size[1] / 2.0]))
     return math.sqrt(abs(jacobian[0, 0] * jacobian[1, 1] - jacobian[0, 1] * jacobian[1, 0]))
 
 
@@ -150,7 +145,7 @@ def pose(matrix: FloatArray, size: tuple[int, int], focal_px: float | None = Non
 
     The focal length is that of the pinhole that fits best, and of a usual lens where all fit alike, as near the nadir.
     """
-    jacobian = _jacobian(matrix, np.array([size[0] / 2.0, -size[1] / 2.0]))
+    jacobian = Homography(matrix).jacobian(np.array([size[0] / 2.0, -size[1] / 2.0]))
     gsd = sampling(matrix, size)
     rotation = math.degrees(math.atan2(jacobian[0, 1], jacobian[1, 1]))
     fits = _pinholes(matrix, size, focal_px)
@@ -190,7 +185,7 @@ def judge(matrix: FloatArray, size: tuple[int, int], options: CameraOptions, rou
     if fits.tilt_deg[fits.skew <= fits.skew.min() + further].min() > options.max_tilt_deg + slack_deg:
         return CameraFault.TILT
     if options.north_up:
-        jacobian = _jacobian(matrix, np.array([width / 2.0, -height / 2.0]))
+        jacobian = Homography(matrix).jacobian(np.array([width / 2.0, -height / 2.0]))
         if abs(math.degrees(math.atan2(jacobian[0, 1], jacobian[1, 1]))) > slack_deg:
             return CameraFault.NOT_NORTH_UP
     return None

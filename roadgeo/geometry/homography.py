@@ -1,6 +1,6 @@
 """Homographies of the plane: x_ref = H x_query.
 
-`H` is scaled so that w > 0 over the image; then det H > 0 means "not mirrored". Estimation lives in `estimator`.
+`H` is scaled so that w > 0 over the image; then det H > 0 means "not mirrored". Estimation lives in `matching`.
 """
 
 from __future__ import annotations
@@ -9,7 +9,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from roadgeo._arrays import FloatArray
+from roadgeo._arrays import BoolArray, FloatArray
 
 __all__ = ["Homography"]
 
@@ -22,11 +22,21 @@ class Homography:
 
     def __call__(self, xy: FloatArray) -> FloatArray:
         """Map (..., 2) points; those beyond the horizon (w <= 0) become NaN."""
-        points = np.asarray(xy, float)
-        mapped = points @ self.matrix[:, :2].T + self.matrix[:, 2]
-        w = mapped[..., 2:]
         with np.errstate(divide="ignore", invalid="ignore"):
-            return np.where(w > 0, mapped[..., :2] / w, np.nan)
+            return np.where(self.ahead(xy)[..., None], self.everywhere(xy), np.nan)
+
+    def everywhere(self, xy: FloatArray) -> FloatArray:
+        """Map (..., 2) points, those beyond the horizon too: quicker where there are none (w > 0 over the image)."""
+        mapped = self._homogeneous(xy)
+        return np.asarray(mapped[..., :2] / mapped[..., 2:])
+
+    def ahead(self, xy: FloatArray) -> BoolArray:
+        """Tell which of (..., 2) points lie on this side of the horizon."""
+        return np.asarray(self._homogeneous(xy)[..., 2] > 0)
+
+    def _homogeneous(self, xy: FloatArray) -> FloatArray:
+        """Return (..., 3) homogeneous coordinates of where points (..., 2) come to lie."""
+        return np.asarray(np.asarray(xy, float) @ self.matrix[:, :2].T + self.matrix[:, 2])
 
     def inverse(self) -> Homography:
         """Return the map back; where w was positive it is so again, as H^-1 (H x) = x has the third element 1."""
@@ -38,17 +48,23 @@ class Homography:
 
     def jacobian(self, xy: FloatArray) -> FloatArray:
         """Return the (..., 2, 2) derivative d(x', y') / d(x, y) at (..., 2) points with w > 0."""
-        points = np.asarray(xy, float)
-        mapped = points @ self.matrix[:, :2].T + self.matrix[:, 2]
-        w = mapped[..., 2]
-        image = mapped[..., :2] / w[..., None]
+        w = self._homogeneous(xy)[..., 2]
+        image = self.everywhere(xy)
         linear = self.matrix[:2, :2] - image[..., :, None] * self.matrix[2, :2]
         return np.asarray(linear / w[..., None, None])
 
+    def by_elements(self, xy: FloatArray) -> FloatArray:
+        """Return the (N, 2, 8) derivative of mapped points by the matrix's elements but the last, at (N, 2) points."""
+        points, image = np.asarray(xy, float), self.everywhere(xy)
+        rows = np.column_stack([points, np.ones(len(points))]) / self._homogeneous(points)[:, 2:]
+        derivative = np.zeros((len(points), 2, 8))
+        derivative[:, 0, 0:3] = derivative[:, 1, 3:6] = rows
+        derivative[:, :, 6:8] = -image[:, :, None] * rows[:, None, :2]
+        return derivative
+
     def facing(self, xy: FloatArray) -> Homography:
         """Return the same map with its sign chosen so that w > 0 at the point `xy` (2,)."""
-        w = float(np.asarray(xy, float) @ self.matrix[2, :2] + self.matrix[2, 2])
-        return self if w > 0 else Homography(-self.matrix)
+        return self if self.ahead(xy) else Homography(-self.matrix)
 
     def normalised(self) -> Homography:
         """Return the same map scaled so that the last element is 1 (where it is not 0), for writing down."""

@@ -6,91 +6,33 @@ import math
 import time
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, field, replace
-from typing import TypeAlias
 
 import numpy as np
 
 from roadgeo._arrays import BoolArray, FloatArray, IntArray
 from roadgeo.geometry.camera import CameraFault, CameraOptions, judge, sampling
-from roadgeo.kernels.growth import grow_each
-from roadgeo.kernels.roads import screen
-from roadgeo.kernels.structs import GrowthLimits, GrowthQuery
+from roadgeo.geometry.homography import Homography
+from roadgeo.matching.growing import PATIENT, GrowOptions, grow_proposals, screen_proposals
+from roadgeo.matching.hypothesis import MINIMAL, Hypothesis, Lead
 from roadgeo.matching.index import ReferenceIndex
 from roadgeo.matching.lens import LensOptions, find_lens, straighten_scene
-from roadgeo.matching.refinement import Refined, RefineOptions, refine
+from roadgeo.matching.refinement import RefineOptions, refine
 from roadgeo.matching.road_growth import Grown
 from roadgeo.matching.road_search import RoadSearch, RoadSearchOptions
 from roadgeo.matching.scene import Scene
 from roadgeo.matching.sweeps import LAST, USUAL, Source, Sweep
 from roadgeo.matching.trace import NO_TRACE, Trace
 from roadgeo.matching.triples import Proposals, larger
-from roadgeo.matching.verification import Agreement, VerifyOptions, agreement, chance_agreement, log10_odds
+from roadgeo.matching.verification import VerifyOptions, agreement, chance_agreement, log10_odds
 from roadgeo.matching.work import Work
 
-__all__ = ["GrowOptions", "Hypothesis", "Ledger", "MatchOptions", "Source", "Sweep", "TripleEstimator"]
+__all__ = ["Ledger", "MatchOptions", "Source", "Sweep", "TripleEstimator"]
 
 
-#: Matches that determine a homography; that many seeds are excluded from the evidence.
-MINIMAL = 4
 #: A place that so many intersections of the query propose by roads is settled: each looked at the whole map.
 _OFTEN_ENOUGH = 2
 #: How far a proposal, made of three intersections, may turn the image's up from where it points.
 _ROUGHLY_DEG = 25.0
-
-
-@dataclass(frozen=True)
-class GrowOptions:
-    """How proposals are screened and grown (see `kernels.roads.screen`, `kernels.growth.grow`).
-
-    Lengths have a part in metres, the map's, and one in pixels, the mask's.
-
-    Attributes
-    ----------
-    max_scale_ratio : float
-        Away from the middle of a tilted frame the ground sampling may differ from that at the middle by this factor.
-    screen_points, screen_radius_m, screen_radius_px, screen_share
-        Of so many road points near the anchor, this share must lie within these radii of roads of the map.
-    max_screened, max_grown, max_verified : int
-        Bounds of one anchor's work: proposals screened, grown, and grown ones scored.
-    sigma_m, sigma_px, radius_m, radius_px
-        Standard deviation of an intersection's place, and the greatest search radius.
-    perspective_sigma : float
-        Prior standard deviation of the two perspective parameters.
-    hit_rate, chance_rate, patience : float
-        Of the sequential test: share of intersections that match if true and if not, and the nats lost before it
-        gives up.
-    min_matched : int
-        Least matches besides the seeds.
-    max_points : int
-        Of more intersections, those nearest to the anchor decide how well a hypothesis grows.
-    """
-
-    max_scale_ratio: float = 2.0
-    screen_points: int = 40
-    screen_radius_m: float = 8.0
-    screen_radius_px: float = 4.0
-    screen_share: float = 0.6
-    max_screened: int = 600
-    sigma_m: float = 3.5
-    sigma_px: float = 1.5
-    radius_m: float = 20.0
-    radius_px: float = 5.0
-    ray_tolerance_deg: float = 25.0
-    perspective_sigma: float = 0.4
-    hit_rate: float = 0.45
-    chance_rate: float = 0.08
-    patience: float = 6.0
-    min_matched: int = 2
-    max_points: int = 1000
-    max_grown: int = 150
-    max_verified: int = 3
-
-
-#: What led to a hypothesis: number of the stage, and intersection of the query.
-Lead: TypeAlias = tuple[int, int]
-
-#: How what single triples propose is followed: more is let through, and it may miss more on its way.
-_PATIENT = GrowOptions(max_screened=6000, hit_rate=0.35, patience=9.0, min_matched=1, max_verified=6)
 
 
 @dataclass(frozen=True)
@@ -122,7 +64,7 @@ class MatchOptions:
     sweeps: tuple[Source, ...] = USUAL
     last: tuple[Source, ...] = LAST
     grow: GrowOptions = field(default_factory=GrowOptions)
-    last_grow: GrowOptions = _PATIENT
+    last_grow: GrowOptions = PATIENT
     verify: VerifyOptions = field(default_factory=VerifyOptions)
     refine: RefineOptions = field(default_factory=RefineOptions)
     camera: CameraOptions = field(default_factory=CameraOptions)
@@ -131,34 +73,6 @@ class MatchOptions:
     max_places: int = 12_000
     max_last_places: int = 100_000
     sightings: int = 2
-
-
-@dataclass
-class Hypothesis:
-    """A grown hypothesis and what came of it.
-
-    `by_roads`: it grew by roads over the whole frame; `leads`: the intersections of the query that proposed it, each
-    with the number of the stage in which it did; `fault`: the camera's last objection, None where it had none.
-    """
-
-    matrix: FloatArray
-    seeds: IntArray
-    support: float
-    matched: IntArray
-    refined: Refined | None = None
-    found: Agreement | None = None
-    chance: tuple[float, float, float] = (1.0, 1.0, 1.0)
-    distance: FloatArray | None = None
-    gsd_m: float = np.nan
-    log10_odds: float = -np.inf
-    fault: CameraFault | None = None
-    by_roads: bool = False
-    leads: list[Lead] = field(default_factory=list)
-
-    @property
-    def n_found(self) -> int:
-        """So many intersections of the query proposed it."""
-        return len(self.leads)
 
 
 @dataclass
@@ -337,27 +251,11 @@ class TripleEstimator:
             yield self._grow_all(proposals, grow, stage)
 
     def _screen(self, proposals: Proposals, options: GrowOptions) -> IntArray:
-        """Return the proposals that put roads around the anchor on roads of the map, the best placed first."""
-        scene, index = self.scene, self.index
-        anchor = scene.intersections.xy[proposals.anchor]
-        away = np.hypot(*(scene.points - anchor).T)
-        last = scene.neighbours[proposals.anchor]
-        reach = np.hypot(*(scene.intersections.xy[last[last >= 0]] - anchor).T).max(initial=0.0)
-        near = np.argsort(away, kind="stable")[: options.screen_points]
-        near = near[away[near] < reach]
+        """Return the proposals that are allowed and lie on roads, the best placed first."""
         allowed = self._is_allowed(proposals)
         looked_at = np.flatnonzero(allowed)[: options.max_screened]
         self._count(len(looked_at))
-        shares = np.zeros(len(looked_at))
-        screen(
-            proposals.reference[looked_at], proposals.affine[looked_at], anchor,
-            index.xy, scene.points[near], scene.directions[near],
-            options.screen_radius_m, options.screen_radius_px, math.cos(math.radians(options.ray_tolerance_deg)),
-            options.screen_share, index.road_buckets, shares,
-        )  # fmt: skip
-        good = shares >= options.screen_share
-        kept, shares = looked_at[good], shares[good]
-        kept = kept[np.argsort(-(proposals.placed[kept] + shares), kind="stable")]
+        kept = screen_proposals(self.scene, self.index, proposals, looked_at, options)
         self.trace.screened(proposals, allowed, kept)
         return kept
 
@@ -375,32 +273,8 @@ class TripleEstimator:
 
     def grow(self, proposals: Proposals, chosen: IntArray, options: GrowOptions | None = None) -> list[Hypothesis]:
         """Grow the chosen proposals of one anchor; return those that did not wither, the best supported first."""
-        scene, index, options = self.scene, self.index, options or self.options.grow
-        xy, anchor = scene.intersections.xy, proposals.anchor
-        order = np.argsort(np.hypot(*(xy - xy[anchor]).T), kind="stable")[: options.max_points]
-        partners = np.ascontiguousarray(proposals.partners[chosen])
-        neighbours = np.ascontiguousarray(scene.neighbours[:, : partners.shape[1]])
-        matched = np.empty((len(chosen), len(xy)), np.int64)
-        matrices = np.empty((len(chosen), 3, 3))
-        ratios = np.empty(len(chosen))
-        limits = GrowthLimits(
-            (options.sigma_m, options.sigma_px), (options.radius_m, options.radius_px),
-            math.cos(math.radians(options.ray_tolerance_deg)),
-            self.options.camera.perspective_sigma(options.perspective_sigma),
-            options.hit_rate, options.chance_rate, options.patience,
-        )  # fmt: skip
-        grow_each(
-            GrowthQuery(xy, scene.branches, neighbours, order, scene.half_size, anchor),
-            proposals.reference[chosen], proposals.affine[chosen], partners,
-            index.point_buckets, limits, options.min_matched, matched, matrices, ratios,
-        )  # fmt: skip
-        best = np.argsort(-ratios, kind="stable")
-        seeds = [np.append(neighbours[anchor][partners[m] >= 0], anchor) for m in best]
-        return [
-            Hypothesis(matrices[m] / matrices[m, 2, 2], made_of, float(ratios[m]), matched[m])
-            for m, made_of in zip(best, seeds, strict=True)
-            if np.isfinite(ratios[m])
-        ]
+        options, camera = options or self.options.grow, self.options.camera
+        return grow_proposals(self.scene, self.index, proposals, chosen, options, camera)
 
     def _grow_all(self, proposals: Proposals, options: GrowOptions, stage: int) -> list[Hypothesis]:
         """Return the best grown proposals of one anchor that mean different places and that a camera can have seen."""
@@ -520,8 +394,7 @@ class TripleEstimator:
         """Whether the middle of the frame lies outside the circle that the user gave."""
         if self.near is None:
             return False
-        mapped = matrix @ np.append(self.scene.center, 1.0)
-        return bool(np.hypot(*(mapped[:2] / mapped[2] - self.near[:2])) > self.near[2])
+        return bool(np.hypot(*(Homography(matrix).everywhere(self.scene.center) - self.near[:2])) > self.near[2])
 
     def settled(self, model: Hypothesis) -> bool:
         """Whether a hypothesis fits the whole frame and was found often enough for a twin to have been found beside it.
@@ -545,8 +418,7 @@ class TripleEstimator:
     def center(self, model: Hypothesis) -> FloatArray:
         """Where the middle of the frame lies, in plane metres."""
         matrix = model.refined.matrix if model.refined is not None else model.matrix
-        mapped = matrix @ np.append(self.scene.center, 1.0)
-        return np.asarray(mapped[:2] / mapped[2])
+        return Homography(matrix).everywhere(self.scene.center)
 
     def same(self, a: Hypothesis, b: Hypothesis) -> bool:
         """Whether two hypotheses put the middle of the frame within 50 m, or a twentieth of its size, of each other."""

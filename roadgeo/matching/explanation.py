@@ -34,7 +34,6 @@ searches      one for each reference, in the order in which they were searched:
 from __future__ import annotations
 
 import math
-from collections import Counter
 from collections.abc import Sequence
 from dataclasses import asdict, dataclass, replace
 from typing import TYPE_CHECKING, Any
@@ -42,127 +41,35 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from roadgeo import __version__
-from roadgeo._arrays import BoolArray, FloatArray, IntArray
-from roadgeo.geometry.camera import CameraFault, CameraOptions, pose, sampling
+from roadgeo._arrays import BoolArray, FloatArray
+from roadgeo.geometry.camera import CameraFault, pose
+from roadgeo.geometry.homography import Homography
 from roadgeo.geometry.projection import to_lonlat
 from roadgeo.kernels.roads import forward_distances
 from roadgeo.location import Location, Place
-from roadgeo.matching.estimator import Hypothesis, TripleEstimator
+from roadgeo.matching.estimator import TripleEstimator
+from roadgeo.matching.hypothesis import Hypothesis
 from roadgeo.matching.methods import Found
 from roadgeo.matching.query import Query
+from roadgeo.matching.record import Record, Scored, without_limits
 from roadgeo.matching.scene import Scene
 from roadgeo.matching.search import SearchResult
-from roadgeo.matching.triples import Proposals
 from roadgeo.matching.verdict import Needed
-from roadgeo.matching.verification import Agreement, agreement, tolerance_m
+from roadgeo.matching.verification import Agreement, tolerance_m
 from roadgeo.roads.graph import RoadGraph
 
 if TYPE_CHECKING:
     from roadgeo.matching.truth_record import TruthStory
 
-__all__ = ["SCHEMA", "Explanation", "Funnel", "Record", "RejectedPlace", "Story", "tell"]
+__all__ = ["SCHEMA", "Explanation", "Funnel", "RejectedPlace", "Story", "tell"]
 
 SCHEMA = "roadgeo.explanation/1"
 
-#: Places that are shown, places that a camera refused which are looked at again, and how many of those are kept.
-_MAX_PLACES, _MAX_RETRIED, _MAX_REFUSED, _MAX_ELSEWHERE = 6, 6, 200, 20
-
-#: Limits that a user may have set too narrow; other faults hold for every camera.
-_NEGOTIABLE = (CameraFault.SAMPLING, CameraFault.SKEW, CameraFault.TILT, CameraFault.NOT_NORTH_UP)
+#: Places that are shown.
+_MAX_PLACES = 6
 
 #: Masks with fewer intersections are seldom located.
 _USUAL_INTERSECTIONS = 12
-
-
-# --- what is recorded -------------------------------------------------------------------------------------------------
-
-
-@dataclass(frozen=True)
-class _Scored:
-    """A hypothesis that was verified, its odds, and the camera's objection if that ended it."""
-
-    model: Hypothesis
-    log10_odds: float
-    fault: CameraFault | None = None
-
-
-class Record:
-    """A `Trace` that remembers what became of everything a search tried."""
-
-    def __init__(self) -> None:
-        """Begin empty."""
-        self.anchors: list[int] = []
-        self.n_proposals = self.n_on_roads = self.n_survived = 0
-        self.refusals: Counter[CameraFault] = Counter()
-        self.unscaled: list[tuple[CameraFault, FloatArray]] = []
-        self.models: list[_Scored] = []
-        self.elsewhere: list[Proposals] = []
-        self.estimator: TripleEstimator | None = None
-        self.result: SearchResult[Hypothesis] | None = None
-
-    def began(self, estimator: TripleEstimator) -> None:
-        """Nothing is known yet."""
-
-    def screened(self, proposals: Proposals, allowed: BoolArray, kept: IntArray) -> None:
-        """Note one anchor's proposals (see `Trace`); some that point elsewhere than a camera may are kept for later."""
-        self.anchors.append(proposals.anchor)
-        self.n_proposals += len(proposals.reference)
-        self.n_on_roads += len(kept)
-        barred = np.flatnonzero(~allowed)[:_MAX_ELSEWHERE]
-        if len(barred):
-            self.elsewhere.append(proposals.only(barred))
-
-    def voted(self, anchor: int, n_proposed: int) -> None:
-        """Count proposals of roads: all of them lie on roads."""
-        self.anchors.append(anchor)
-        self.n_proposals += n_proposed
-        self.n_on_roads += n_proposed
-
-    def grown(self, hypotheses: Sequence[Hypothesis]) -> None:
-        """Count what survived."""
-        self.n_survived += len(hypotheses)
-
-    def refused(self, fault: CameraFault, matrix: FloatArray) -> None:
-        """Count a camera's refusal; those that other limits would allow are looked at again (see `without_limits`)."""
-        self.refusals[fault] += 1
-        if fault in _NEGOTIABLE and len(self.unscaled) < _MAX_REFUSED:
-            self.unscaled.append((fault, matrix))
-
-    def scored(self, model: Hypothesis) -> None:
-        """Keep what was verified."""
-        fault = None if math.isfinite(model.log10_odds) else model.fault
-        if fault is not None:
-            self.refusals[fault] += 1
-        self.models.append(_Scored(model, model.log10_odds, fault))
-
-    def finished(self, estimator: TripleEstimator, result: SearchResult[Hypothesis]) -> None:
-        """Keep the result, and grow what points elsewhere than a camera may: to tell that it would fit."""
-        self.estimator, self.result = estimator, result
-        for proposals in self.elsewhere:
-            for hypothesis in estimator.grow(proposals, np.arange(len(proposals.reference)))[:_MAX_RETRIED]:
-                fault = estimator.judge(hypothesis.matrix, rough=True)
-                if fault is not None:
-                    self.refused(fault, hypothesis.matrix)
-
-
-def _without_limits(record: Record, estimator: TripleEstimator) -> list[_Scored]:
-    """Verify the best of the places that the camera refused as if it had not."""
-    scene, index, options = estimator.scene, estimator.index, estimator.options
-    camera = CameraOptions(gsd_m=(0.0, math.inf), max_tilt_deg=180.0, max_skew=math.inf)
-    free = TripleEstimator(scene, index, replace(options, camera=camera), ledger=estimator.ledger)
-    free.least_chance = estimator.least_chance
-    nobody = np.empty(0, np.int64)
-    compared = []
-    for fault, unscaled in record.unscaled:
-        matrix = unscaled / unscaled[2, 2]
-        gsd = sampling(matrix, scene.size)
-        found, matched, _ = agreement(matrix, scene, index, gsd, nobody, options.verify)
-        compared.append((found.rate + found.forward, fault, Hypothesis(matrix, nobody, 0.0, matched)))
-    compared.sort(key=lambda entry: -entry[0])
-    return [_Scored(model, free.score(model), fault) for _, fault, model in compared[:_MAX_RETRIED]]
-
-
-# --- what is told -----------------------------------------------------------------------------------------------------
 
 
 @dataclass(frozen=True)
@@ -336,7 +243,7 @@ def tell(query: Query, found: Found, location: Location, record: Record, needed:
         search.n_verified,
         search.n_nulls,
     )
-    entries = [*record.models, *([] if located else _without_limits(record, search))]
+    entries = [*record.models, *([] if located else without_limits(record, search))]
     ranked = _distinct(search, sorted(entries, key=lambda entry: _rank(entry, needed)))
     places = tuple(_describe(search, entry, result, location, needed) for entry in ranked)
     starved = None if located else _starved(funnel, record, result, needed)
@@ -345,14 +252,14 @@ def tell(query: Query, found: Found, location: Location, record: Record, needed:
     return Story(name, result.stopped, needed, funnel, refusals, starved, missing, places)
 
 
-def _rank(entry: _Scored, needed: Needed) -> tuple[bool, float]:
+def _rank(entry: Scored, needed: Needed) -> tuple[bool, float]:
     """Sort by odds; what the camera refused comes last, unless nothing else kept it from being the answer."""
     return entry.fault is not None and entry.log10_odds < needed.log10_odds, -entry.log10_odds
 
 
-def _distinct(search: TripleEstimator, entries: Sequence[_Scored]) -> list[_Scored]:
+def _distinct(search: TripleEstimator, entries: Sequence[Scored]) -> list[Scored]:
     """Return the best entry of each place."""
-    kept: list[_Scored] = []
+    kept: list[Scored] = []
     for entry in entries:
         if kept and not math.isfinite(entry.log10_odds):
             break
@@ -365,7 +272,7 @@ def _distinct(search: TripleEstimator, entries: Sequence[_Scored]) -> list[_Scor
 
 def _describe(
     search: TripleEstimator,
-    entry: _Scored,
+    entry: Scored,
     result: SearchResult[Hypothesis],
     location: Location,
     needed: Needed,
@@ -375,9 +282,7 @@ def _describe(
     camera = pose(model.matrix, scene.size)
     measured = model.chance != (1.0, 1.0, 1.0)
     chance = model.chance if measured else tuple(float(share) for share in search.least_chance)
-    corners = np.vstack([scene.corners, scene.center])
-    ground = np.c_[corners, np.ones(5)] @ model.matrix.T
-    ground = ground[:, :2] / ground[:, 2:]
+    ground = Homography(model.matrix).everywhere(np.vstack([scene.corners, scene.center]))
     in_crs = index.plane.to_crs(ground)
     lonlat = to_lonlat(index.plane.crs, in_crs)
     distance = np.empty(len(scene.points))
@@ -407,7 +312,7 @@ def _describe(
 
 
 def _why(
-    place: RejectedPlace, entry: _Scored, result: SearchResult[Hypothesis], location: Location, needed: Needed
+    place: RejectedPlace, entry: Scored, result: SearchResult[Hypothesis], location: Location, needed: Needed
 ) -> str:
     """Say why a place is not the answer."""
     if entry.fault is not None:

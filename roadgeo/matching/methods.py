@@ -14,7 +14,8 @@ from roadgeo._arrays import FloatArray, IntArray
 from roadgeo.geometry.homography import Homography
 from roadgeo.geometry.projection import from_lonlat, metres_apart, to_lonlat
 from roadgeo.location import Stats
-from roadgeo.matching.estimator import Hypothesis, Ledger, MatchOptions, TripleEstimator
+from roadgeo.matching.estimator import Ledger, MatchOptions, TripleEstimator
+from roadgeo.matching.hypothesis import Hypothesis
 from roadgeo.matching.index import ReferenceIndex, crop, unpack_tangents
 from roadgeo.matching.options import LocateOptions
 from roadgeo.matching.paper.quality import well_fitted

@@ -8,6 +8,8 @@ from dataclasses import replace
 import numpy as np
 
 from roadgeo.geometry.camera import pose
+from roadgeo.geometry.frame import Frame
+from roadgeo.geometry.homography import Homography
 from roadgeo.geometry.mask import PIXEL_TO_PLANE
 from roadgeo.geometry.pose import PoseOptions, find_pose, turned
 from roadgeo.geometry.projection import grid_north, to_lonlat
@@ -22,11 +24,8 @@ def place_frame(location: Location, query: Query, fit: Fit, focal_px: float | No
     """Fill in everything that follows from a fit's homography and its matches; `focal_px` if it is known."""
     plane, scene = fit.index.plane, query.scene
     homography = plane.to_crs_matrix() @ fit.matrix @ PIXEL_TO_PLANE
-    width, height = scene.size
-    # the four corners and the middle
-    pixels = np.array([[0, 0, 1], [width, 0, 1], [width, height, 1], [0, height, 1], [width / 2, height / 2, 1]], float)
-    ground = pixels @ homography.T
-    ground = ground[:, :2] / ground[:, 2:]
+    frame = Frame(*scene.size)
+    ground = Homography(homography).everywhere(np.vstack([frame.corners, frame.center]))
     lonlat = to_lonlat(plane.crs, ground)
     camera = pose(fit.matrix, scene.size, focal_px)
     north = grid_north(plane, ground[4])
@@ -75,7 +74,6 @@ def _find_camera(fit: Fit, size: tuple[int, int], focal_px: float | None, north:
 def center_of(query: Query, fit: Fit) -> Place:
     """Return where the middle of the frame lies."""
     plane = fit.index.plane
-    mapped = fit.matrix @ np.append(query.scene.center, 1.0)
-    ground = plane.to_crs((mapped[:2] / mapped[2])[None])
+    ground = plane.to_crs(Homography(fit.matrix).everywhere(query.scene.center)[None])
     lonlat = to_lonlat(plane.crs, ground)
     return Place(float(ground[0, 0]), float(ground[0, 1]), float(lonlat[0, 0]), float(lonlat[0, 1]), fit.log10_odds)

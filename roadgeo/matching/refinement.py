@@ -8,6 +8,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from roadgeo._arrays import FloatArray, IntArray
+from roadgeo.geometry.homography import Homography
 from roadgeo.kernels.adjustment import adjust, point_row
 from roadgeo.kernels.structs import AdjustLimits, Held, Plane, PointPairs, RoadSamples
 from roadgeo.matching.index import ReferenceIndex
@@ -114,10 +115,9 @@ def normalise(matrix: FloatArray, center: FloatArray, half_size: float) -> tuple
     Return the eight parameters (see `kernels.homography_fit`), the reference point under the middle, and the unit in
     metres.
     """
-    mapped = matrix @ (center[0], center[1], 1.0)
-    origin = mapped[:2] / mapped[2]
-    linear = (matrix[:2, :2] - np.outer(origin, matrix[2, :2])) / mapped[2]
-    unit = half_size * float(np.sqrt(abs(np.linalg.det(linear))))
+    homography = Homography(matrix)
+    origin = homography.everywhere(center)
+    unit = half_size * float(np.sqrt(abs(np.linalg.det(homography.jacobian(center)))))
     to_query = np.array([[half_size, 0.0, center[0]], [0.0, half_size, center[1]], [0.0, 0.0, 1.0]])
     from_reference = np.array([[1.0, 0.0, -origin[0]], [0.0, 1.0, -origin[1]], [0.0, 0.0, unit]])
     p = from_reference @ matrix @ to_query
@@ -176,8 +176,7 @@ def _held_points(p: FloatArray, n: int) -> tuple[FloatArray, FloatArray]:
     """Return an n x n grid of normalised points over the frame, (n * n, 2), and where `p` puts them."""
     side = np.linspace(-0.7, 0.7, n)
     uv = np.stack(np.meshgrid(side, side), axis=-1).reshape(-1, 2)
-    mapped = np.c_[uv, np.ones(len(uv))] @ np.append(p, 1.0).reshape(3, 3).T
-    return uv, mapped[:, :2] / mapped[:, 2:]
+    return uv, Homography(np.append(p, 1.0).reshape(3, 3)).everywhere(uv)
 
 
 def refine(

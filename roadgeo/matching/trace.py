@@ -8,7 +8,8 @@ from typing import TYPE_CHECKING, Protocol
 if TYPE_CHECKING:
     from roadgeo._arrays import BoolArray, FloatArray, IntArray
     from roadgeo.geometry.camera import CameraFault
-    from roadgeo.matching.estimator import Hypothesis, TripleEstimator
+    from roadgeo.matching.estimator import TripleEstimator
+    from roadgeo.matching.hypothesis import Hypothesis
     from roadgeo.matching.search import SearchResult
     from roadgeo.matching.triples import Proposals
 

@@ -13,11 +13,14 @@ import numpy as np
 
 from roadgeo._arrays import BoolArray, FloatArray, IntArray
 from roadgeo.geometry.camera import CameraFault, sampling
+from roadgeo.geometry.homography import Homography
 from roadgeo.geometry.projection import from_lonlat
 from roadgeo.location import Location
-from roadgeo.matching.estimator import Hypothesis, TripleEstimator
-from roadgeo.matching.explanation import Record, Story
+from roadgeo.matching.estimator import TripleEstimator
+from roadgeo.matching.explanation import Story
+from roadgeo.matching.hypothesis import Hypothesis
 from roadgeo.matching.options import LocateOptions
+from roadgeo.matching.record import Record
 from roadgeo.matching.triples import Proposals
 from roadgeo.matching.verdict import Needed
 
@@ -122,9 +125,8 @@ class TruthRecord(Record):
         if self.estimator is None:
             return False
         scene = self.estimator.scene
-        mapped = matrix @ np.append(scene.center, 1.0)
         scale = np.array([sampling(matrix, scene.size)])
-        return bool(self._is_near((mapped[:2] / mapped[2])[None], scale)[0])
+        return bool(self._is_near(Homography(matrix).everywhere(scene.center)[None], scale)[0])
 
     def told(self, location: Location, needed: Needed) -> TruthStory:
         """Tell which stage lost the truth; `location` is the answer on this reference."""

@@ -16,6 +16,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from roadgeo._arrays import FloatArray, IntArray
+from roadgeo.geometry.homography import Homography
 from roadgeo.kernels.point_matching import count_matches, match_all
 from roadgeo.kernels.roads import backward_agreement, count_near_roads, forward_distances
 from roadgeo.matching.index import ReferenceIndex
@@ -84,8 +85,7 @@ def tolerance_m(gsd_m: float, options: VerifyOptions) -> float:
 
 
 def _bounds(matrix: FloatArray, scene: Scene) -> FloatArray:
-    corners = np.c_[scene.corners, np.ones(4)] @ matrix.T
-    ground = corners[:, :2] / corners[:, 2:]
+    ground = Homography(matrix).everywhere(scene.corners)
     return np.concatenate([ground.min(axis=0), ground.max(axis=0)])
 
 

@@ -13,6 +13,7 @@ import numpy as np
 
 from roadgeo._arrays import AnyArray, FloatArray
 from roadgeo.errors import OutputError
+from roadgeo.geometry.homography import Homography
 from roadgeo.geometry.mask import RoadMask, plane_to_pixel
 from roadgeo.matching.explanation import Explanation, Funnel, RejectedPlace, Story
 from roadgeo.matching.index import ReferenceIndex
@@ -223,9 +224,8 @@ def _strokes(scene: Scene, place: RejectedPlace, chosen: AnyArray) -> FloatArray
     """Map (C, 2, 2) short strokes along the mask's roads around the chosen road points to the plane."""
     half = 0.5 * scene.road_length_px / max(len(scene.points), 1) * scene.directions[chosen]
     ends = np.stack([scene.points[chosen] - half, scene.points[chosen] + half], axis=1)
-    mapped = np.concatenate([ends, np.ones((*ends.shape[:2], 1))], axis=2) @ place.matrix.T
-    ahead = (mapped[..., 2] > 0).all(axis=1)
-    return np.asarray(mapped[ahead, :, :2] / mapped[ahead, :, 2:])
+    strokes = Homography(place.matrix)(ends)
+    return strokes[np.isfinite(strokes).all(axis=(1, 2))]
 
 
 def _caption(panel: AnyArray, origin: tuple[int, int], side: int, number: int, place: RejectedPlace) -> None:

@@ -10,16 +10,17 @@ import json
 import os
 import shlex
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, replace
 from pathlib import Path
 from time import perf_counter
-from typing import TYPE_CHECKING, Any, Literal
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
 from roadgeo._progress import Say, say_nothing
 from roadgeo.errors import IndexFormatError, ModelError, OutputError, PluginError, RoadgeoError
 from roadgeo.outputs.registry import JSON, ODM_GEO, REPORT
+from roadgeo.running.options import BatchOptions, ReadOptions
 from roadgeo.running.probability_files import is_ours, keep_probability, probability_path
 from roadgeo.running.processes import run
 from roadgeo.running.tasks import Task
@@ -30,12 +31,10 @@ if TYPE_CHECKING:
     from roadgeo.outputs.location_files import OutputOptions
     from roadgeo.reference.reference import AnyReference
     from roadgeo.running.cluster import Cluster
-    from roadgeo.running.queries import QueryOptions
     from roadgeo.workflows import LocateOptions
 
 __all__ = [
     "Outcome",
-    "ReadOptions",
     "locate_masks",
     "open_references",
     "write_overview",
@@ -80,55 +79,6 @@ def _named_for_workers(names: Sequence[str]) -> list[str]:
 
 
 @dataclass(frozen=True)
-class ReadOptions:
-    """How masks are read, and what goes with them.
-
-    Attributes
-    ----------
-    threshold, band
-        As for `sources.masks.read_mask`.
-    segment, segmenters, class_name, fused_with, threads
-        As for `queries.QueryOptions`.
-    images : mapping of mask to photograph
-        Drawn on the map instead of the masks.
-    exif : bool
-        Take the focal length from the photograph, or else the mask.
-    dem : str
-        Terrain model that says how high the ground lies under the camera; "" for none.
-    allow_mirror : bool
-        Masks that were mirrored have the place that they have turned over.
-    units : "auto", "pixels" or "metres"
-        Of roads that come as lines.
-    """
-
-    threshold: float | None = None
-    band: int | None = None
-    images: Mapping[str, str] = field(default_factory=dict)
-    exif: bool = False
-    segment: Literal["auto", "always", "never"] = "auto"
-    segmenters: tuple[str, ...] = ()
-    class_name: str | None = None
-    fused_with: tuple[str, ...] = ()
-    threads: int = 1
-    dem: str = ""
-    allow_mirror: bool = False
-    units: Literal["auto", "pixels", "metres"] = "auto"
-
-    def photo(self, task: Task, of_photograph: bool) -> str | None:
-        """Return the photograph that is drawn, if any: one that was given, or the query itself."""
-        return self.images.get(task.mask, task.mask if of_photograph else None)
-
-    def of_query(self) -> QueryOptions:
-        """Return what concerns one query."""
-        from roadgeo.running.queries import QueryOptions
-
-        return QueryOptions(
-            self.threshold, self.band, self.segment, self.segmenters, self.class_name, self.fused_with, self.threads,
-            "allow" if self.allow_mirror else "tell", self.units,
-        )  # fmt: skip
-
-
-@dataclass(frozen=True)
 class Outcome:
     """What became of one mask.
 
@@ -156,14 +106,10 @@ def locate_masks(
     tasks: Sequence[Task],
     references: Sequence[str] = (),
     out_dir: str | Path = ".",
+    options: BatchOptions | None = None,
     *,
-    options: LocateOptions | None = None,
-    outputs: OutputOptions | None = None,
-    reading: ReadOptions | None = None,
-    skip_existing: bool = False,
     jobs: int = 1,
     cluster: Cluster | None = None,
-    command: Sequence[str] = (),
     say: Say = say_nothing,
 ) -> Iterator[Outcome]:
     """Locate masks and write their results; yield what became of each in the order of the tasks.
@@ -174,15 +120,11 @@ def locate_masks(
     ----------
     references : sequence of str
         Paths, or names in the library; none: all of the library.
-    skip_existing : bool
-        Keep results of the same question that are whole and younger than their masks.
     jobs : int
         Processes; the results do not depend on it. In a script, several need `if __name__ == "__main__":` around the
         call, for each of them imports the script.
     cluster : Cluster, optional
         Where it is done instead; the results do not depend on that either.
-    command : sequence of str
-        Options that ask for the same on the command line, for the results to name.
     say
         Told how far a photograph's roads are found; other processes tell nothing.
 
@@ -191,21 +133,10 @@ def locate_masks(
     IndexFormatError
         A reference is missing or unusable.
     """
-    from roadgeo.outputs.location_files import OutputOptions
-    from roadgeo.workflows import LocateOptions
-
     if cluster is not None:
         references = _named_for_workers(references)
-    work = _Locating(
-        tuple(references),
-        str(out_dir),
-        options or LocateOptions(),
-        outputs or OutputOptions(),
-        reading or ReadOptions(),
-        skip_existing,
-        tuple(command),
-        say if cluster is None and (jobs == 1 or len(tasks) == 1) else say_nothing,
-    )
+    heard = say if cluster is None and (jobs == 1 or len(tasks) == 1) else say_nothing
+    work = _Locating(tuple(references), str(out_dir), options or BatchOptions(), heard)
     return run(tasks, work, jobs) if cluster is None else cluster.run(tasks, work)
 
 
@@ -215,12 +146,18 @@ class _Locating:
 
     references: tuple[str, ...]
     out_dir: str
-    options: LocateOptions
-    outputs: OutputOptions
-    reading: ReadOptions
-    skip_existing: bool
-    command: tuple[str, ...]
+    options: BatchOptions
     say: Say
+
+    @property
+    def reading(self) -> ReadOptions:
+        """How masks are read."""
+        return self.options.reading
+
+    @property
+    def outputs(self) -> OutputOptions:
+        """What is written."""
+        return self.options.outputs
 
     def prepare(self) -> Callable[[Task], Outcome]:
         """Open the references."""
@@ -248,22 +185,21 @@ class _Locating:
 
     def _command(self, task: Task) -> str:
         """Return the command line that makes one result again."""
-        if not self.command:
+        if not self.options.command:
             return ""
         photo = self.reading.images.get(task.mask)
         drawn = [f"--image={photo}"] if photo else []
-        return shlex.join(["roadgeo", "locate", task.query, *self.reading.fused_with, *drawn, *self.command])
+        fused = self.reading.fused_with
+        return shlex.join(["roadgeo", "locate", task.query, *fused, *drawn, *self.options.command])
 
     def _told(self) -> dict[str, Any]:
         """Return the options that differ from the usual ones, as plain values: what the JSON says was asked."""
-        from roadgeo.outputs.location_files import OutputOptions
-        from roadgeo.workflows import LocateOptions
-
+        usual = BatchOptions()
         reading = replace(self.reading, images={}, threads=ReadOptions.threads)
         told = {
-            **_changed(replace(self.options, truths=()), LocateOptions()),
-            **_changed(reading, ReadOptions()),
-            **_changed(self.outputs.image, OutputOptions().image),
+            **_changed(replace(self.options.search, truths=()), usual.search),
+            **_changed(reading, usual.reading),
+            **_changed(self.outputs.image, usual.outputs.image),
         }
         plain: dict[str, Any] = json.loads(json.dumps(told))
         return plain
@@ -271,7 +207,7 @@ class _Locating:
     def _do(self, task: Task, asked: _Asked) -> Outcome:
         """Locate one mask and write its results; the one place where what goes wrong with a mask is caught."""
         try:
-            earlier = self._earlier(task, asked) if self.skip_existing else None
+            earlier = self._earlier(task, asked) if self.options.skip_existing else None
             return earlier or self._locate(task, asked)
         except RoadgeoError as error:
             return self._failed(task, _code_of(error), str(error))
@@ -352,15 +288,15 @@ class _Locating:
     def _with_focal_length(self, task: Task) -> LocateOptions:
         """Return the options, with the focal length that the photograph's EXIF states where that was asked for."""
         if not self.reading.exif:
-            return self.options
+            return self.options.search
         from roadgeo.sources.exif import read_focal_length
         from roadgeo.storage.rasters import open_raster
 
         with open_raster(task.mask) as raster:
             longer_side = max(raster.shape)
         focal_px = read_focal_length(self.reading.images.get(task.mask, task.mask)) * longer_side
-        match = self.options.match
-        return replace(self.options, match=replace(match, camera=replace(match.camera, focal_px=focal_px)))
+        match = self.options.search.match
+        return replace(self.options.search, match=replace(match, camera=replace(match.camera, focal_px=focal_px)))
 
 
 def _without_views(outputs: OutputOptions) -> OutputOptions:

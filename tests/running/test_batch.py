@@ -10,12 +10,11 @@ from rasterio._err import CPLE_AppDefinedError
 from roadgeo import plugins
 from roadgeo._progress import say_nothing
 from roadgeo.geometry.mask import RoadMask
-from roadgeo.outputs.location_files import OutputOptions
 from roadgeo.outputs.registry import REGISTRY, Output
 from roadgeo.plugins import OUTPUTS
-from roadgeo.running.batch import ReadOptions, _Asked, _Locating
+from roadgeo.running.batch import _Asked, _Locating
+from roadgeo.running.options import BatchOptions
 from roadgeo.running.tasks import Task, find_masks, name_tasks
-from roadgeo.workflows import LocateOptions
 
 
 def test_folders_and_patterns_are_expanded(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
@@ -84,7 +83,7 @@ class Hazard:
 @pytest.mark.parametrize("kind", Hazard.ERRORS)
 def test_whatever_one_mask_raises_the_others_go_on(kind: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr("roadgeo.running.queries.open_mask", Hazard())
-    work = _Locating((), str(tmp_path), LocateOptions(), OutputOptions(), ReadOptions(), False, (), say_nothing)
+    work = _Locating((), str(tmp_path), BatchOptions(), say_nothing)
     outcome = work._do(Task(f"{kind}.png", kind), _Asked([], [], 0.0, {}))
     assert outcome.status == "error"
     assert outcome.document["query"] == f"{kind}.png"

@@ -7,6 +7,7 @@ import math
 import numpy as np
 
 from roadgeo._arrays import FloatArray
+from roadgeo.geometry.homography import Homography
 
 __all__ = ["fit_points", "pair_homography", "to_pair_frame"]
 
@@ -44,20 +45,13 @@ def fit_points(homography: FloatArray, query_xy: FloatArray, reference_xy: Float
     cost, best = np.inf, h
     for _ in range(10):
         h = h / h[2, 2]
-        mapped = p @ h[:, :2].T + h[:, 2]
-        image = mapped[:, :2] / mapped[:, 2:]
+        image = Homography(h).everywhere(p)
         residual = target - image
         if not np.sum(residual**2) < cost * (1 - 1e-12):
             break
         cost, best = float(np.sum(residual**2)), h
-        rows = np.column_stack([p, np.ones(len(p))]) / mapped[:, 2:]
-        zero = np.zeros_like(rows)
-        jacobian = np.concatenate(
-            [
-                np.column_stack([rows, zero, -image[:, :1] * rows[:, :2]]),
-                np.column_stack([zero, rows, -image[:, 1:] * rows[:, :2]]),
-            ]
-        )
+        # the rows of x, then those of y
+        jacobian = Homography(h).by_elements(p).transpose(1, 0, 2).reshape(-1, 8)
         step = np.linalg.lstsq(jacobian, residual.T.ravel(), rcond=None)[0]
         h = h + np.append(step, 0.0).reshape(3, 3)
     return np.asarray(np.linalg.inv(to_reference) @ best @ to_query)

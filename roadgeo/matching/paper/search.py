@@ -271,9 +271,8 @@ class _Search:
 
     def matches(self, homography: FloatArray) -> IntArray:
         """Return the (M, 2) matching pairs MP under a homography (eq. 10)."""
-        mapped = np.column_stack([self.query.xy, np.ones(len(self.query))]) @ homography.T
         with np.errstate(divide="ignore", invalid="ignore"):
-            xy = mapped[:, :2] / mapped[:, 2:]
+            xy = Homography(homography).everywhere(self.query.xy)
         nearest = np.empty(len(xy), np.int32)
         kernels.nearest_of_type(xy, self.codes, self.buckets, self.options.inlier_distance_m, nearest)
         found = np.flatnonzero(nearest >= 0)

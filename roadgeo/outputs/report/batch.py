@@ -15,7 +15,8 @@ import numpy as np
 
 from roadgeo.matching.index import ReferenceIndex
 from roadgeo.outputs.report.page import STATUS, footer, render_page, section
-from roadgeo.outputs.report.views import Layer, Window, draw_viewer, draw_whole_map, ring_data
+from roadgeo.outputs.report.viewer import Layer, draw_viewer, ring_data
+from roadgeo.outputs.report.views import Window, draw_whole_map
 from roadgeo.outputs.wording import format_lonlat
 from roadgeo.storage.files import write_text
 

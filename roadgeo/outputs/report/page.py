@@ -20,13 +20,13 @@ from roadgeo.geometry.pinhole import polygon_area
 from roadgeo.location import Location, Place
 from roadgeo.matching.index import ReferenceIndex
 from roadgeo.outputs.paths import Placement
+from roadgeo.outputs.report.place_view import draw_place
 from roadgeo.outputs.report.views import (
     ReportOptions,
     Shown,
     Window,
     draw_mask,
     draw_overview,
-    draw_place,
     draw_probability,
 )
 from roadgeo.outputs.subject import Subject

@@ -21,7 +21,8 @@ from roadgeo.geometry.homography import Homography
 from roadgeo.geometry.mask import PIXEL_TO_PLANE, RoadMask
 from roadgeo.location import Location
 from roadgeo.matching.checking import CheckOptions, check_place
-from roadgeo.matching.estimator import Hypothesis, TripleEstimator
+from roadgeo.matching.estimator import TripleEstimator
+from roadgeo.matching.hypothesis import Hypothesis
 from roadgeo.matching.index import ReferenceIndex
 from roadgeo.matching.methods import Fit, Found, search_references
 from roadgeo.matching.options import LocateOptions

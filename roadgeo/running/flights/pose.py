@@ -131,8 +131,7 @@ class _Local:
 
     def places(self, p: FloatArray, uv: FloatArray) -> FloatArray:
         """Return where p puts (N, 2) normalised points, metres."""
-        mapped = np.c_[uv, np.ones(len(uv))] @ np.append(p, 1.0).reshape(3, 3).T
-        return np.asarray(self.origin + self.unit * mapped[:, :2] / mapped[:, 2:])
+        return np.asarray(self.origin + self.unit * Homography(np.append(p, 1.0).reshape(3, 3)).everywhere(uv))
 
     def matrix(self, p: FloatArray) -> FloatArray:
         """Return p as a map from the query plane, pixels, to the reference plane, metres; w is 1 in the middle."""

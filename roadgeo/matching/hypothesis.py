@@ -1,0 +1,49 @@
+"""A hypothesis: a homography that grew from proposals, and what came of it."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, field
+from typing import TypeAlias
+
+import numpy as np
+
+from roadgeo._arrays import FloatArray, IntArray
+from roadgeo.geometry.camera import CameraFault
+from roadgeo.matching.refinement import Refined
+from roadgeo.matching.verification import Agreement
+
+__all__ = ["MINIMAL", "Hypothesis", "Lead"]
+
+#: Matches that determine a homography; that many seeds are excluded from the evidence.
+MINIMAL = 4
+
+#: What led to a hypothesis: number of the stage, and intersection of the query.
+Lead: TypeAlias = tuple[int, int]
+
+
+@dataclass
+class Hypothesis:
+    """A grown hypothesis and what came of it.
+
+    `by_roads`: it grew by roads over the whole frame; `leads`: the intersections of the query that proposed it, each
+    with the number of the stage in which it did; `fault`: the camera's last objection, None where it had none.
+    """
+
+    matrix: FloatArray
+    seeds: IntArray
+    support: float
+    matched: IntArray
+    refined: Refined | None = None
+    found: Agreement | None = None
+    chance: tuple[float, float, float] = (1.0, 1.0, 1.0)
+    distance: FloatArray | None = None
+    gsd_m: float = np.nan
+    log10_odds: float = -np.inf
+    fault: CameraFault | None = None
+    by_roads: bool = False
+    leads: list[Lead] = field(default_factory=list)
+
+    @property
+    def n_found(self) -> int:
+        """So many intersections of the query proposed it."""
+        return len(self.leads)
