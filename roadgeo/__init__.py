@@ -1,7 +1,7 @@
 """roadgeo: locate an aerial image from its roads alone.
 
 >>> import roadgeo
->>> ref = roadgeo.build_reference(roads_gdf)  # or roadgeo.open_reference("boston.gpkg")
+>>> ref = roadgeo.build_reference(roads_gdf)  # or a file, shapely lines ...; or roadgeo.open_reference("boston.gpkg")
 >>> loc = roadgeo.locate("image_mask.tif", ref, gsd=(0.3, 0.6))  # or an array, a PIL image, a photograph ...
 >>> loc.status, loc.center, loc.log10_odds
 
@@ -17,14 +17,14 @@ from typing import TYPE_CHECKING, Any
 __version__ = "0.1.0"
 
 if TYPE_CHECKING:
-    from roadgeo.api import Answer, locate
+    from roadgeo.api import Answer, build_reference, locate
     from roadgeo.errors import RoadgeoError
     from roadgeo.geometry.mask import RoadMask
     from roadgeo.location import Location
     from roadgeo.matching.options import LocateOptions
     from roadgeo.outputs.schemas import read_schema
     from roadgeo.reference.reference import BuildOptions, Reference, open_reference
-    from roadgeo.workflows import build_reference, explain
+    from roadgeo.workflows import explain
 
 __all__ = [
     "Answer",
@@ -50,7 +50,7 @@ _HOMES = {
     "Reference": "reference.reference",
     "RoadMask": "geometry.mask",
     "RoadgeoError": "errors",
-    "build_reference": "workflows",
+    "build_reference": "api",
     "explain": "workflows",
     "locate": "api",
     "open_reference": "reference.reference",

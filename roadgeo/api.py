@@ -15,8 +15,9 @@ from roadgeo.geometry.mask import RoadMask
 from roadgeo.location import Location
 from roadgeo.matching.index import ReferenceIndex
 from roadgeo.matching.options import LocateOptions
-from roadgeo.reference.reference import AnyReference, Reference
+from roadgeo.reference.reference import AnyReference, BuildOptions, Reference
 from roadgeo.reference.shards import ShardedReference
+from roadgeo.roads.kinds import RoadKind
 
 if TYPE_CHECKING:
     import xarray as xr
@@ -24,7 +25,7 @@ if TYPE_CHECKING:
 
     from roadgeo.outputs.subject import Subject
 
-__all__ = ["Answer", "locate"]
+__all__ = ["Answer", "build_reference", "locate"]
 
 #: A reference that is open, its file, its name in the library; or several of them.
 References: TypeAlias = "AnyReference | str | os.PathLike[str] | Iterable[AnyReference | str | os.PathLike[str]]"
@@ -120,6 +121,54 @@ class Answer(Location):
         if not self.located:
             raise NotLocatedError(f"{self.query or 'the mask'} has no place: {self.reason}")
         return Subject(self, self.mask, output_paths(".", "mask"), indexes=self.indexes)
+
+
+def build_reference(
+    roads: Any,
+    name: str = "",
+    options: BuildOptions | None = None,
+    *,
+    crs: Any = None,
+    path: str | os.PathLike[str] | None = None,
+    kinds: RoadKind = "drivable",
+    tunnels: bool = False,
+    attribution: str | None = None,
+) -> Reference:
+    """Build a reference from roads, as `roadgeo index` does.
+
+    >>> reference = roadgeo.build_reference("streets.gpkg", "boston")
+    >>> reference = roadgeo.build_reference(lines, "boston", crs="EPSG:26986")  # shapely lines, or arrays
+
+    Parameters
+    ----------
+    roads : path or paths, GeoDataFrame, GeoSeries, osmnx graph, shapely lines, arrays, or Roads
+        A path is a road file or a folder of them. Arrays are of shape (N, 2), x or longitude first, one for each line;
+        or a single one, where rows of NaN stand between the lines.
+    name : str
+        What the reference is called.
+    crs : anything that pyproj knows, optional
+        CRS of the coordinates. Needed for shapely lines and arrays, and for files that do not say.
+    path : path, optional
+        Write it there, REF.gpkg and REF.index, and open it from there. Default: nothing is written.
+    kinds : "main", "drivable", "vehicles" or "all"
+        Which roads are taken, where they tell their kind (`highway`, `fclass` or `class`).
+    tunnels : bool
+        Take tunnels too, which a mask does not show.
+    attribution : str, optional
+        Whom to name beside the map, where the roads do not say.
+
+    Raises
+    ------
+    CrsError, RoadSourceError
+        No CRS; no lines; fewer than three intersections.
+    OutputError
+        It cannot be written.
+    """
+    from roadgeo.sources.held_roads import choose_roads
+    from roadgeo.workflows import build_reference as build
+
+    chosen = choose_roads(roads, kinds, tunnels, attribution, crs=crs)
+    return build(chosen, name, options, path=None if path is None else Path(path))
 
 
 def locate(

@@ -17,7 +17,7 @@ from roadgeo._text import visible
 from roadgeo.errors import CrsError, RoadSourceError
 from roadgeo.geometry.projection import LocalPlane, choose_plane, transformer
 from roadgeo.roads.kinds import RoadKind, drives
-from roadgeo.sources.lines import RoadLines, crs_name, list_sources, read_lines, simple_lines, table_lines
+from roadgeo.sources.lines import RoadLines, crs_name, list_sources, read_lines, simple_lines
 
 if TYPE_CHECKING:
     from roadgeo.sources.overpass import FetchOptions
@@ -27,7 +27,6 @@ __all__ = [
     "Roads",
     "as_text",
     "choose_lines",
-    "choose_roads",
     "fetch_roads",
     "join_roads",
     "overruled_crs",
@@ -130,33 +129,6 @@ def read_roads(
         sources.append(choose_lines(source, file.name, which, tunnels, bbox))
     roads = join_roads(sources, {"roads": which, "tunnels": tunnels, "bbox": _plain(bbox)}, attribution)
     return roads if bbox is None else replace(roads, area=box_area(bbox))
-
-
-def choose_roads(
-    roads: Roads | Any | str | os.PathLike[str],
-    which: RoadKind = "drivable",
-    tunnels: bool = False,
-    attribution: str | None = None,
-    say: Say = say_nothing,
-) -> Roads:
-    """Return the roads to build a reference from: as they are, or those of a GeoDataFrame or of files.
-
-    Raises
-    ------
-    CrsError
-        A table has no CRS, or coordinates that do not fit it.
-    RoadSourceError
-        There are no lines of the kind asked for.
-    """
-    if isinstance(roads, Roads):
-        return roads if attribution is None else replace(roads, meta={**roads.meta, "attribution": attribution})
-    if isinstance(roads, str | os.PathLike):
-        return read_roads(roads, which=which, tunnels=tunnels, attribution=attribution, say=say)
-    source = table_lines(roads, "the roads")
-    if source.crs is None:
-        raise CrsError("the roads have no CRS; set one, for example roads.set_crs('EPSG:26986')")
-    chosen = choose_lines(source, "the roads", which, tunnels, None)
-    return join_roads([chosen], {"roads": which, "tunnels": tunnels, "bbox": None}, attribution)
 
 
 def fetch_roads(
@@ -355,7 +327,7 @@ def _clip(lines: AnyArray, bbox: Box) -> tuple[AnyArray, AnyArray]:
     return found, place % max(len(lines), 1)
 
 
-def overruled_crs(own: str | None, given: str, file: Path) -> str:
+def overruled_crs(own: str | None, given: str, file: Path | str) -> str:
     """Return the CRS that was given, and warn where a file says another."""
     from pyproj import CRS
 

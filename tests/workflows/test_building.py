@@ -1,13 +1,16 @@
 """Roads to a reference: one builder for the command line and for Python, from whatever holds the roads."""
 
 import geopandas
+import networkx as nx
 import numpy as np
 import pandas as pd
 import pytest
+import shapely
 from worlds.fenway import streets
 
+import roadgeo
 from roadgeo.cli import main
-from roadgeo.errors import CrsError
+from roadgeo.errors import CrsError, RoadSourceError
 from roadgeo.reference.reference import open_reference
 from roadgeo.workflows import build_reference
 
@@ -42,5 +45,72 @@ def test_whom_to_name_is_kept(roads, tmp_path):
 
 
 def test_a_table_without_a_crs_is_refused(roads):
-    with pytest.raises(CrsError, match="no CRS; set one"):
+    with pytest.raises(CrsError, match="no CRS; name it"):
         build_reference(roads.set_crs(None, allow_override=True))
+
+
+def held(kind, roads):
+    """The same roads as a program may hold them, and what else it then says."""
+    lines, coordinates = list(roads.geometry), [np.array(line.coords) for line in roads.geometry]
+    if kind == "graph of osmnx":
+        graph = nx.MultiDiGraph(crs="EPSG:4326")
+        for n, (line, highway, tunnel) in enumerate(zip(lines, roads.highway, roads.tunnel, strict=True)):
+            ends = [(f"{n}{side}", dict(zip("xy", line.coords[at], strict=True))) for side, at in (("a", 0), ("b", -1))]
+            graph.add_nodes_from(ends)
+            graph.add_edge(ends[0][0], ends[1][0], 0, geometry=line, highway=highway, tunnel=tunnel)
+        return graph, {}
+    if kind == "one array":
+        return np.concatenate([np.vstack([part, [np.nan, np.nan]]) for part in coordinates]), {"crs": 4326}
+    crs = {"crs": "EPSG:4326"}
+    return {
+        "GeoSeries": (roads.geometry, {}),
+        "table without a CRS": (roads.set_crs(None, allow_override=True), crs),
+        "shapely lines": (lines, crs),
+        "array of shapely lines": (np.array(lines, object), crs),
+        "one shapely geometry": (shapely.MultiLineString(lines), crs),
+        "arrays": (coordinates, crs),
+        "lists of points": ([points.tolist() for points in coordinates], crs),
+        "arrays with heights": ([np.column_stack([points, points[:, 0]]) for points in coordinates], crs),
+    }[kind]
+
+
+@pytest.mark.parametrize(
+    "kind",
+    [
+        "GeoSeries",
+        "table without a CRS",
+        "graph of osmnx",
+        "shapely lines",
+        "array of shapely lines",
+        "one shapely geometry",
+        "arrays",
+        "one array",
+        "lists of points",
+        "arrays with heights",
+    ],
+)
+def test_roads_are_taken_however_they_are_held(kind, roads):
+    drivable = roads[roads.highway.isin(["residential", "primary", "secondary", "tertiary"]) & roads.tunnel.isna()]
+    given, more = held(kind, drivable)
+    expected = roadgeo.build_reference(drivable, "fenway", kinds="all")
+    found = roadgeo.build_reference(given, "fenway", kinds="all", **more)
+    np.testing.assert_allclose(found.index.xy, expected.index.xy, atol=1e-6)
+
+
+@pytest.mark.parametrize(
+    ("given", "error", "match"),
+    [
+        ([np.zeros((2, 2))], CrsError, "no CRS; name it"),
+        ([np.zeros((2, 5))], RoadSourceError, r"list cannot be read: coordinates of shape \(2, 5\); expected a path"),
+        (7, RoadSourceError, "of type int cannot be read"),
+        ([], CrsError, "no CRS"),
+    ],
+)
+def test_what_holds_no_roads_is_named(given, error, match):
+    with pytest.raises(error, match=match):
+        roadgeo.build_reference(given)
+
+
+def test_a_crs_that_is_none_is_named():
+    with pytest.raises(CrsError, match="'here' is no CRS"):
+        roadgeo.build_reference([np.zeros((2, 2))], crs="here")
