@@ -178,6 +178,7 @@ def _evaluate(
     from roadgeo.evaluation.scoring import evaluate
     from roadgeo.evaluation.trials import run_trials
 
+    # Locate: each answer is written down as it comes, so that the same command goes on where one was stopped.
     record = None if out_dir is None else out_dir / "trials.jsonl"
     before = _recorded(record)
     started = time.perf_counter()
@@ -192,6 +193,7 @@ def _evaluate(
         raise
     elapsed = time.perf_counter() - started
 
+    # Score, write, print.
     truths = [trial.truth for trial in trials]
     evaluation = evaluate(truths, [trial.answer for trial in trials], settings, radius)
     document = evaluation.to_dict() | _made_of(locator)

@@ -87,6 +87,7 @@ def serve_command(references: tuple[str, ...], mavlink: str | None, quiet: bool,
     from roadgeo.running.serving.server import Server
     from roadgeo.running.serving.workers import Workers
 
+    # Compiled and opened here first: what is wrong with the references is said before anything listens.
     options = _options(given)
     compile_once(quiet)
     names = [one.name for one in open_references(references, print_steps(quiet))]
@@ -101,6 +102,7 @@ def serve_command(references: tuple[str, ...], mavlink: str | None, quiet: bool,
         workers.close()
         where = f"{options.host} port {options.port}"
         raise OutputError(f"cannot listen on {where}: {error.strerror or error}; choose another --port") from error
+    # Listen until Ctrl-C, or until a supervisor ends it.
     host = f"[{options.host}]" if ":" in options.host else options.host
     echo(f"Listening on http://{host}:{server.server_port}/ for masks of {', '.join(names)}; Ctrl-C ends it.", err=True)
     signal.signal(signal.SIGTERM, signal.default_int_handler)

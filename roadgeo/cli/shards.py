@@ -105,6 +105,7 @@ def build_in_shards(
 
     if not source["roads"]:
         raise click.UsageError("--shards goes with --roads: what is fetched from OpenStreetMap fits in one piece.")
+    # Where to: a folder, in the library unless `--out` says otherwise.
     started = perf_counter()
     path = Path(out) if out else new_reference(name).with_suffix(ENDING)
     if path.suffix != ENDING:
@@ -112,6 +113,7 @@ def build_in_shards(
             raise click.UsageError(f"--out {out}: with --shards that is a folder; did you mean {path.stem}{ENDING}?")
         path = path.with_name(f"{path.name}{ENDING}")
     make_folder(path)
+    # What from, and how.
     files = RoadFiles(
         tuple(map(Path, source["roads"])),
         source["layer"],

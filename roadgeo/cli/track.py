@@ -174,6 +174,7 @@ def track_command(
     refuse_swapped(given["near"], opened)
     make_folder(out_dir)
     compile_once(quiet)
+    # Frames are told of as they come; what is learnt later of earlier ones takes the place of what was known.
     known: dict[int, Tracked] = {}
     pictures = Thumbnails()
     with _sender(mavlink) as send:

@@ -428,6 +428,7 @@ def evaluate_pairs(  # type: ignore[no-untyped-def]
     for draw in range(draws[0], draws[1]):
         chosen = (draws[2] + draw * draws[3]) % n_candidates
         row = rows[chosen] if len(rows) > 0 else chosen
+        # The homography of a candidate, from the directions of the roads at its two ends.
         i, j = pairs[row, 0], pairs[row, 1]
         x, y = xy[i, 0], xy[i, 1]
         dx, dy = xy[j, 0] - x, xy[j, 1] - y
@@ -436,6 +437,7 @@ def evaluate_pairs(  # type: ignore[no-untyped-def]
         _cotangents(tangents, j, len(query.cot_2), phi, found_2)
         alpha_1, beta_1 = _fit_pencil(query.cot_1, found_1, len(query.cot_1))
         alpha_2, beta_2 = _fit_pencil(query.cot_2, found_2, len(query.cot_2))
+        # A camera sees it only where neither end is mirrored and no corner lies beyond the horizon.
         if is_physical:
             ahead = alpha_1 > 0.0 and alpha_2 > 0.0
             for c in range(4):

@@ -56,6 +56,7 @@ def road_equations(
         w = 1.0 + p[6] * u + p[7] * v
         if w < 0.05:
             continue
+        # Where the point comes to lie, and which way its road runs there.
         x, y = (p[0] * u + p[1] * v + p[2]) / w, (p[3] * u + p[4] * v + p[5]) / w
         dw = p[6] * directions[i, 0] + p[7] * directions[i, 1]
         dx = p[0] * directions[i, 0] + p[1] * directions[i, 1] - x * dw
@@ -79,6 +80,7 @@ def road_equations(
         )
         if not d < radius:
             continue
+        # One equation, across the road (rx, ry) of the map that it met at (fx, fy).
         met += 1
         point_row(p, u, v, -ry, rx, row)
         away = (fy - gy) * rx - (fx - gx) * ry

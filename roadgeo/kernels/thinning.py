@@ -66,18 +66,22 @@ def touches_solid(flat: NDArray[np.uint8], p: np.uint64, stride: np.uint64) -> b
 
 @kernel()
 def neighbour_steps(stride: int) -> NDArray[np.uint64]:
-    """Return the (8,) steps to the neighbours in flat indices, counterclockwise from east, modulo 2**64.
+    """Return the (8,) steps in flat indices from a pixel's north-western neighbour to all, counterclockwise from east.
 
-    Unsigned like all indices here: numba then leaves out the check for negative ones.
+    Neighbour k of pixel p is `p - stride - 1 + steps[k]`. None is negative: indices here are unsigned, so that numba
+    leaves out the check for negative ones.
     """
-    return np.array([1, 1 - stride, -stride, -1 - stride, -1, stride - 1, stride, stride + 1]).astype(np.uint64)
+    below = 2 * stride
+    return np.array([stride + 2, 2, 1, 0, stride, below, below + 1, below + 2]).astype(np.uint64)
 
 
 @kernel()
-def _is_ridge(flat: NDArray[np.uint8], depth: NDArray[np.float32], p: np.uint64, steps: NDArray[np.uint64]) -> bool:
-    """Tell whether no neighbour that is left lies deeper than pixel `p`."""
+def _is_ridge(
+    flat: NDArray[np.uint8], depth: NDArray[np.float32], p: np.uint64, back: np.uint64, steps: NDArray[np.uint64]
+) -> bool:
+    """Tell whether no neighbour that is left lies deeper than pixel `p`; `back` leads to the north-west one."""
     for k in range(8):
-        q = p + steps[k]
+        q = p - back + steps[k]
         if flat[q] != GROUND and depth[q] > depth[p]:
             return False
     return True
@@ -113,7 +117,7 @@ def rethin(
     flat = states.ravel()
     depth = distance.ravel()
     stride = np.uint64(states.shape[1])
-    steps = neighbour_steps(states.shape[1])
+    back, steps = stride + np.uint64(1), neighbour_steps(states.shape[1])
     left = pixels.copy()
     n = len(left)
     changed = True
@@ -128,7 +132,12 @@ def rethin(
             if (
                 role == KEEP
                 or (role == TIP and depth[p] >= min_end_depth)
-                or (keep_pairs and role == CORNER and depth[p] >= min_end_depth and _is_ridge(flat, depth, p, steps))
+                or (
+                    keep_pairs
+                    and role == CORNER
+                    and depth[p] >= min_end_depth
+                    and _is_ridge(flat, depth, p, back, steps)
+                )
             ):
                 left[kept] = left[i]
                 kept += 1
@@ -137,8 +146,8 @@ def rethin(
             flat[p] = GROUND
             while role == TIP:  # follow a line that is eaten from its end
                 for k in range(8):
-                    if flat[p + steps[k]] != GROUND:
-                        p += steps[k]
+                    if flat[p - back + steps[k]] != GROUND:
+                        p = p - back + steps[k]
                         break
                 role = ROLES[neighbours(flat, p, stride)]
                 if flat[p] != ROAD or role != TIP or depth[p] >= min_end_depth:

@@ -42,10 +42,10 @@ def _gather_nodes(
 ) -> tuple[int, int]:
     """Give nodes their numbers; return how many there are, and how many pixels they have.
 
-    Junctions that touch are one node.     Node k gets the pixels `members[first[k]:first[k + 1]]`.
+    Junctions that touch are one node. Node k gets the pixels `members[first[k]:first[k + 1]]`.
     """
     flat = states.ravel()
-    steps = neighbour_steps(states.shape[1])
+    back, steps = np.uint64(states.shape[1] + 1), neighbour_steps(states.shape[1])
     n_nodes = 0
     n_members = 0
     for i in range(len(pixels)):
@@ -63,7 +63,7 @@ def _gather_nodes(
             p = np.uint64(members[head])
             head += 1
             for k in range(8):
-                q = p + steps[k]
+                q = p - back + steps[k]
                 if flat[q] == ROAD and node_of[q] == JUNCTION:
                     node_of[q] = n_nodes
                     members[n_members] = q
@@ -116,7 +116,7 @@ def trace(states: Bytes2, pixels: Int32s1, node_of: Int32s1) -> tuple[Floats2, B
     flat = states.ravel()
     width = states.shape[1]
     stride = np.uint64(width)
-    steps = neighbour_steps(width)
+    back, steps = stride + np.uint64(1), neighbour_steps(width)
     n = len(pixels)
     slots = _label(states, pixels, node_of)
     members = np.empty(n, np.int32)  # pixels of the nodes, node after node
@@ -145,7 +145,7 @@ def trace(states: Bytes2, pixels: Int32s1, node_of: Int32s1) -> tuple[Floats2, B
         p = np.uint64(members[m])
         m += 1
         for k in range(8):
-            q = p + steps[k]
+            q = p - back + steps[k]
             if flat[q] != ROAD or node_of[q] == WALKED or node_of[q] == node_of[p]:
                 continue
             if node_of[q] >= 0 and node_of[p] > node_of[q]:
@@ -156,9 +156,9 @@ def trace(states: Bytes2, pixels: Int32s1, node_of: Int32s1) -> tuple[Floats2, B
                 node_of[q] = WALKED
                 chain[n_chain] = q
                 n_chain += 1
-                onward = neighbours(flat, np.uint64(q), stride) & ~(1 << ((came_along + 4) & 7))
+                onward = np.int64(neighbours(flat, q, stride)) & ~(1 << ((came_along + 4) & 7))
                 came_along = LOWEST_BIT[onward]
-                q += steps[came_along]
+                q = q - back + steps[came_along]
             edges[n_edges, 1] = node_of[q]
             n_edges += 1
             offsets[n_edges] = n_chain

@@ -147,6 +147,27 @@ def orient(xy: NDArray[np.float64], a: int, b: int, c: int, min_shape: float) ->
 
 
 @kernel()
+def count_neighbours(neighbours: NDArray[np.int32], a: int) -> int:
+    """Return how many neighbours an intersection has: they fill the first slots, -1 stands in the others."""
+    n = 0
+    while n < neighbours.shape[1] and neighbours[a, n] >= 0:
+        n += 1
+    return n
+
+
+@kernel()
+def neighbour_pair(
+    xy: NDArray[np.float64], neighbours: NDArray[np.int32], a: int, s: int, t: int, min_shape: float
+) -> tuple[int, int, int, int]:
+    """Return b, c and their slots: neighbours s and t of a, counterclockwise; b = -1 where the triangle is too thin."""
+    b, c = int(np.int64(neighbours[a, s])), int(np.int64(neighbours[a, t]))  # of one type everywhere
+    turn = orient(xy, a, b, c, min_shape)
+    if turn == 0:
+        return -1, -1, s, t
+    return (b, c, s, t) if turn > 0 else (c, b, t, s)
+
+
+@kernel()
 def has_both(neighbours: NDArray[np.int32], i: int, j: int, k: int) -> bool:
     """Whether j and k both stand among the neighbours of i."""
     found = 0
@@ -196,20 +217,16 @@ def fill_table(
     n = np.empty(3, np.int64)
     total = 0
     for a in range(xy.shape[0]):
-        for s in range(neighbours.shape[1]):
-            b0 = int(np.int64(neighbours[a, s]))  # of one type everywhere, vertex_codes is compiled once
-            if b0 < 0:
-                break
-            for t in range(s + 1, neighbours.shape[1]):
-                c0 = int(np.int64(neighbours[a, t]))
-                if c0 < 0:
-                    break
-                turn = orient(xy, a, b0, c0, min_shape)
-                if turn == 0:
+        n_around = count_neighbours(neighbours, a)
+        for s in range(n_around):
+            for t in range(s + 1, n_around):
+                b, c, sb, sc = neighbour_pair(xy, neighbours, a, s, t, min_shape)
+                if b < 0:
                     continue
-                if (b0 < a and has_both(neighbours, b0, a, c0)) or (c0 < a and has_both(neighbours, c0, a, b0)):
+                # Several vertices could anchor it: the lowest does.
+                if (b < a and has_both(neighbours, b, a, c)) or (c < a and has_both(neighbours, c, a, b)):
                     continue
-                b, c, sb, sc = (b0, c0, s, t) if turn > 0 else (c0, b0, t, s)
+                # One entry for every combination of the codes of its three vertices.
                 triple_codes(xy, tangents, sides, a, b, c, limit, codes, n)
                 for p in range(n[0]):
                     for q in range(n[1]):

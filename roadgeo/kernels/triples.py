@@ -9,7 +9,17 @@ from roadgeo.kernels.arrays import Floats2, Int8s2, Int32s1, Int32s2, Ints1, Int
 from roadgeo.kernels.compilation import kernel
 from roadgeo.kernels.rays import rays_agree
 from roadgeo.kernels.structs import Hits, TripleLimits, TripleMap, TripleQuery
-from roadgeo.kernels.triple_codes import BOTH, CELL_UNITS, CELLS, PAIRS, orient, pair_id, triple_codes, turned
+from roadgeo.kernels.triple_codes import (
+    BOTH,
+    CELL_UNITS,
+    CELLS,
+    PAIRS,
+    count_neighbours,
+    neighbour_pair,
+    pair_id,
+    triple_codes,
+    turned,
+)
 
 __all__ = ["count_alike", "gather", "look_up_each", "vertex_probes"]
 
@@ -86,18 +96,12 @@ def count_alike(
     costs[:] = -1
     for i in range(anchors.shape[0]):
         a = anchors[i]
-        for s in range(neighbours.shape[1]):
-            b0 = int(np.int64(neighbours[a, s]))  # of one type everywhere, vertex_codes is compiled once
-            if b0 < 0:
-                break
-            for t in range(s + 1, neighbours.shape[1]):
-                c0 = int(np.int64(neighbours[a, t]))
-                if c0 < 0:
-                    break
-                turn = orient(xy, a, b0, c0, min_shape)
-                if turn == 0:
+        n_around = count_neighbours(neighbours, a)
+        for s in range(n_around):
+            for t in range(s + 1, n_around):
+                b, c, _, _ = neighbour_pair(xy, neighbours, a, s, t, min_shape)
+                if b < 0:
                     continue
-                b, c = (b0, c0) if turn > 0 else (c0, b0)
                 triple_codes(xy, tangents, sides, a, b, c, limit, codes, n)
                 total = 0
                 for p in range(n[0]):

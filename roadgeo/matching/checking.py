@@ -288,6 +288,7 @@ def _lead(a: _Place, b: _Place) -> float:
 
 def _judge_best(judge: _Judge, places: Sequence[_Place]) -> Checked:
     """Judge the best of some places, the best first, against the others."""
+    # The best place against the rival that comes nearest to it.
     options = judge.options
     best = judge.refine(places[0].matrix, None)
     rivals = [place for place in places[1:] if judge.gap(place.matrix, best.matrix) >= options.search.apart_m]
@@ -306,6 +307,7 @@ def _judge_best(judge: _Judge, places: Sequence[_Place]) -> Checked:
         float(np.mean(judge.pieces(judge.start))),
         best.matched,
     )
+    # What follows from how far it lies from where it was said to be.
     off, sigma = found.over(judge.corners), found.sigma_over(judge.corners)
     said = f"off by {off:.1f} ± {sigma:.1f} m"
     agrees = off <= options.tolerance_m

@@ -22,11 +22,13 @@ __all__ = ["center_of", "place_frame"]
 
 def place_frame(location: Location, query: Query, fit: Fit, focal_px: float | None = None) -> Location:
     """Fill in everything that follows from a fit's homography and its matches; `focal_px` if it is known."""
+    # Where the corners and the middle lie, in the map's CRS.
     plane, scene = fit.index.plane, query.scene
     homography = plane.to_crs_matrix() @ fit.matrix @ PIXEL_TO_PLANE
     frame = Frame(*scene.size)
     ground = Homography(homography).everywhere(np.vstack([frame.corners, frame.center]))
     lonlat = to_lonlat(plane.crs, ground)
+    # How the camera looked at it, and which intersections say so.
     camera = pose(fit.matrix, scene.size, focal_px)
     north = grid_north(plane, ground[4])
     chosen = fit.matched >= 0

@@ -25,6 +25,7 @@ def write_iiif(path: Path, subject: Subject) -> None:
     """
     from roadgeo.geometry.projection import to_lonlat
 
+    # A feature for each control point: a pixel of the picture, and where it lies.
     width, height = subject.size
     points = np.array(subject.control_points())
     lonlat = to_lonlat(subject.place.crs, points[:, 2:])
@@ -36,6 +37,7 @@ def write_iiif(path: Path, subject: Subject) -> None:
         }
         for (column, row), (lon, lat) in zip(points[:, :2].tolist(), lonlat.tolist(), strict=True)
     ]
+    # The annotation that ties them to the picture, all of which is shown.
     outline = f"0,0 {width},0 {width},{height} 0,{height}"
     name = subject.picture.name
     annotation = {

@@ -283,6 +283,7 @@ def ring_area(ring: FloatArray) -> float:
 def _map_layers(network: RoadNetwork) -> list[Layer]:
     """Layers in the order in which they are drawn, the lowest first."""
     graph, found, plane = network.graph, network.intersections, network.plane
+    # Each: name, kind of geometry, geometries, columns, CRS, style, what it is.
     return [
         Layer(
             "coverage",

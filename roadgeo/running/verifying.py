@@ -179,6 +179,7 @@ def _document(
         "agreeing": checked.agreeing,
         "agreeing_as_given": checked.agreeing_as_given,
     }
+    # Where the image says that it lies.
     if place is not None:
         middle = Homography(place.matrix).facing(Frame(*place.size).center)(Frame(*place.size).center)
         lon, lat = to_lonlat(place.crs, middle[None])[0].tolist()
@@ -190,6 +191,7 @@ def _document(
             "corrected": None if corrected is None else corrected.matrix.tolist(),
             "center": {"lon": lon, "lat": lat},
         }
+    # Where the roads say that it lies, against that, and against the best other place.
     if reference is not None and place is not None:
         document["reference"] = reference.name
         document["attribution"] = str(reference.index.meta.get("attribution") or "")

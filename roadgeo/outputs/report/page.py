@@ -193,6 +193,7 @@ def _table(rows: Sequence[tuple[str, str]]) -> str:
 
 def _numbers(subject: Shown) -> list[tuple[str, str]]:
     """Label and value (HTML) of what people ask for first."""
+    # The place and the camera, where they are known.
     location, place = subject.location, subject.place
     width, height = subject.size
     frame = f"{width} × {height} pixels"
@@ -211,6 +212,7 @@ def _numbers(subject: Shown) -> list[tuple[str, str]]:
     if sigma is not None and np.isfinite(sigma).all():
         low, high = sigma.min(), sigma.max()
         rows.append(("Corners", f"± {low:.1f} to {high:.1f} m <small>(standard deviation)</small>"))
+    # What speaks for it.
     matched = f"{location.n_matched} of {location.n_intersections} matched"
     rows.append(("Intersections", matched if place else f"{location.n_intersections} seen"))
     if location.evidence is not None and len(location.evidence.residual_m):

@@ -43,6 +43,7 @@ _QUERY_COLOR = (228, 87, 46)
 
 def draw_place(subject: Shown, place: Placement) -> str:
     """Draw the map around a footprint, with what lies on it: an HTML figure."""
+    # What there is to draw, in metres from the window's corner.
     location = subject.location
     window = Window.around(subject, place, subject.options.margin)
     wide = Window.around(subject, place, subject.options.reach)
@@ -52,6 +53,7 @@ def draw_place(subject: Shown, place: Placement) -> str:
     corners = window.to_svg(place.footprint)
     to_svg = Homography(window.to_svg_matrix() @ place.homography)
     query = [line for line in (window.to_svg(place.to_crs(one)) for one in subject.lines) if np.isfinite(line).all()]
+    # Layers from the lowest up.
     layers = [
         _picture_on_map(subject, place, window),
         Layer("map-roads", "roads of the map", draw_lines(thin_lines(roads, subject.options.max_map_vertices))),
@@ -73,6 +75,7 @@ def draw_place(subject: Shown, place: Placement) -> str:
     if other is not None and window.holds(other):
         cross = pin(window.to_svg(other), '<path d="M-9-9L9 9M-9 9L9-9"/>', "runner-up")
         layers.append(Layer("runner-up", "runner-up", cross, '<path d="M8 2l10 10m0-10l-10 10"/>'))
+    # What the page's script needs to keep widths and arrows legible at every scale.
     arrows, per_px = _arrow_scale(location), window.width / _PLACE_PX
     attributes = {
         "data-frame": "map",

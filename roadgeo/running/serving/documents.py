@@ -35,6 +35,7 @@ _HINTS: dict[str, dict[str, Any]] = {
 
 def documents_of(references: Sequence[str]) -> dict[str, dict[str, Any]]:
     """Return each document by its path."""
+    # The one process there is: what it takes and what it returns.
     summary = {
         "id": "locate",
         "title": "Locate a road mask or a photograph",
@@ -52,6 +53,7 @@ def documents_of(references: Sequence[str]) -> dict[str, dict[str, Any]]:
     }
     hints = {name: {**hint, "minOccurs": 0, "maxOccurs": 1} for name, hint in _HINTS.items()}
     location = {"title": "The answer, schema roadgeo.location/1", "schema": {"type": "object"}}
+    # All documents; the paths are those of OGC API Processes.
     return {
         "/": {
             "title": "roadgeo",
