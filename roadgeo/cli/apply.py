@@ -7,7 +7,7 @@ from typing import Any
 import click
 
 from roadgeo.cli.folders import make_folder
-from roadgeo.cli.parameters import Plugin
+from roadgeo.cli.parameters import Plugin, out_dir_option
 from roadgeo.cli.printing import echo
 from roadgeo.outputs.registry import offered
 
@@ -17,14 +17,7 @@ __all__ = ["apply_command"]
 @click.command("apply", short_help="Put another picture of a located frame on the map.")
 @click.argument("location", metavar="LOCATION.json", type=click.Path())
 @click.argument("pictures", metavar="PICTURE...", nargs=-1, required=True, type=click.Path())
-@click.option(
-    "-o",
-    "--out-dir",
-    metavar="DIR",
-    default=".",
-    type=click.Path(file_okay=False),
-    help="Where the results go; made if missing. Default: here.",
-)
+@out_dir_option()
 @click.option(
     "--stretch",
     is_flag=True,

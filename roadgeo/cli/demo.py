@@ -9,6 +9,7 @@ from typing import TYPE_CHECKING, Any
 import click
 
 from roadgeo.cli import ERROR
+from roadgeo.cli.parameters import out_dir_option
 from roadgeo.cli.printing import echo
 from roadgeo.outputs.wording import format_lonlat
 
@@ -23,15 +24,7 @@ MAX_ERROR_M = 5.0
 
 
 @click.command("demo", short_help="Locate five masks in Porto: needs no network and no data.")
-@click.option(
-    "-o",
-    "--out-dir",
-    metavar="DIR",
-    default="roadgeo_demo",
-    show_default=True,
-    type=click.Path(file_okay=False),
-    help="Where everything is written; made if missing.",
-)
+@out_dir_option("Where everything is written; made if missing.", "roadgeo_demo", show_default=True)
 def demo_command(out_dir: str) -> int:
     """Show the whole way on real data: build a reference, locate masks, write every output, compare with the truth.
 

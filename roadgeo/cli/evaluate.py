@@ -18,6 +18,7 @@ from click.core import ParameterSource
 from roadgeo._text import visible
 from roadgeo.cli.command_line import made_by
 from roadgeo.cli.hints import hint_options, make_options
+from roadgeo.cli.parameters import out_dir_option
 from roadgeo.cli.printing import echo
 from roadgeo.cli.progress import count_up
 from roadgeo.cli.queries import QUERY_OPTIONS, query_options, query_sets
@@ -58,9 +59,7 @@ __all__ = ["evaluate_command"]
     default=0,
     help="With --map: try N other masks and count those located in each class.",
 )
-@click.option(
-    "-o", "--out-dir", type=click.Path(file_okay=False, path_type=Path), help="Write here, and go on from here."
-)
+@out_dir_option("Write here, and go on from here.", None, Path)
 @click.option("--json", "as_json", is_flag=True, help="Print the figures as one JSON object.")
 @click.option("-q", "--quiet", is_flag=True, help="Say nothing but errors, and what --json prints.")
 def evaluate_command(

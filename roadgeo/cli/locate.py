@@ -17,7 +17,7 @@ from roadgeo.cli.clusters import cluster_options, make_cluster
 from roadgeo.cli.command_line import said_options
 from roadgeo.cli.folders import make_folder
 from roadgeo.cli.hints import HINTS, hint_options, make_options, refuse_swapped
-from roadgeo.cli.parameters import Plugin, references_option, verbosity_options
+from roadgeo.cli.parameters import Plugin, out_dir_option, references_option, verbosity_options
 from roadgeo.cli.photographs import read_options, segmenting_options
 from roadgeo.cli.printing import echo
 from roadgeo.cli.truths import read_truths
@@ -178,14 +178,7 @@ def _drawing_options(command: Command) -> Command:
 @click.command("locate", short_help="Find road masks on a reference and draw them there.", help=_help())
 @click.argument("masks", metavar="MASK...", nargs=-1, required=True, type=click.Path())
 @references_option()
-@click.option(
-    "-o",
-    "--out-dir",
-    metavar="DIR",
-    default=".",
-    type=click.Path(file_okay=False),
-    help="Where the results go; made if missing. Default: here.",
-)
+@out_dir_option()
 @click.option("--json", "as_json", is_flag=True, help="Print one JSON object per mask and line, in input order.")
 @_drawing_options
 @segmenting_options

@@ -3,11 +3,22 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
+from pathlib import Path
 from typing import Any, TypeVar
 
 import click
 
-__all__ = ["BOX", "CAMERA", "NEAR", "RANGE", "Numbers", "Plugin", "references_option", "verbosity_options"]
+__all__ = [
+    "BOX",
+    "CAMERA",
+    "NEAR",
+    "RANGE",
+    "Numbers",
+    "Plugin",
+    "out_dir_option",
+    "references_option",
+    "verbosity_options",
+]
 
 Command = TypeVar("Command", bound=Callable[..., Any])
 
@@ -177,3 +188,14 @@ def references_option(purpose: str = "Reference to search") -> Callable[[Command
         multiple=True,
         help=f"{purpose}: REF.gpkg, or a name in the library. Repeatable. Default: all of the library.",
     )
+
+
+def out_dir_option(
+    help_text: str = "Where the results go; made if missing. Default: here.",
+    default: str | None = ".",
+    path_type: type[str] | type[Path] = str,
+    **more: Any,
+) -> Callable[[Command], Command]:
+    """Make the option that says where results go."""
+    kind = click.Path(file_okay=False, path_type=path_type)
+    return click.option("-o", "--out-dir", metavar="DIR", default=default, type=kind, help=help_text, **more)

@@ -8,6 +8,7 @@ from typing import Any
 import click
 
 from roadgeo.cli.command_line import made_by
+from roadgeo.cli.parameters import out_dir_option
 from roadgeo.cli.printing import echo
 from roadgeo.cli.progress import count_up
 from roadgeo.cli.queries import query_options, query_sets
@@ -17,9 +18,7 @@ __all__ = ["simulate_command"]
 
 @click.command("simulate", short_help="Draw road masks whose place is known.")
 @click.argument("reference", metavar="REF")
-@click.option(
-    "-o", "--out-dir", type=click.Path(file_okay=False, path_type=Path), required=True, help="Where to write."
-)
+@out_dir_option("Where to write.", None, Path, required=True)
 @query_options
 @click.option("-q", "--quiet", is_flag=True, help="Say nothing but errors.")
 def simulate_command(reference: str, out_dir: Path, roads: Path | None, quiet: bool, **options: Any) -> None:

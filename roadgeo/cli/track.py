@@ -16,7 +16,7 @@ import click
 from roadgeo.cli import NOT_LOCATED
 from roadgeo.cli.folders import make_folder
 from roadgeo.cli.hints import hint_options, make_options, refuse_swapped
-from roadgeo.cli.parameters import references_option, verbosity_options
+from roadgeo.cli.parameters import out_dir_option, references_option, verbosity_options
 from roadgeo.cli.printing import echo
 
 if TYPE_CHECKING:
@@ -91,9 +91,7 @@ class Moment(click.ParamType):  # type: ignore[type-arg]
 @click.command("track", short_help="Follow a flight over the map, frame by frame.", help=_HELP)
 @click.argument("frames", metavar="FRAMES...", nargs=-1, required=True, type=click.Path())
 @references_option()
-@click.option(
-    "-o", "--out-dir", metavar="DIR", default=".", type=click.Path(file_okay=False), help="Where the results go."
-)
+@out_dir_option()
 @click.option("--name", default="flight", show_default=True, help="What the results are called.")
 @click.option("--json", "as_json", is_flag=True, help="Print a JSON object per frame and line, as soon as it is known.")
 @click.option("--motion", metavar="FILE", type=click.Path(), help="How each frame moved: see above.")

@@ -7,6 +7,7 @@ import click
 from roadgeo._text import visible
 from roadgeo.cli import ERROR
 from roadgeo.cli.folders import make_folder
+from roadgeo.cli.parameters import out_dir_option
 from roadgeo.cli.printing import echo
 from roadgeo.running.tasks import find_masks, name_tasks
 
@@ -15,14 +16,7 @@ __all__ = ["vectorize_command"]
 
 @click.command("vectorize", short_help="Show what roads are seen in a mask.")
 @click.argument("masks", metavar="MASK...", nargs=-1, required=True, type=click.Path())
-@click.option(
-    "-o",
-    "--out-dir",
-    metavar="DIR",
-    default=".",
-    type=click.Path(file_okay=False),
-    help="Where the results go; made if missing. Default: here.",
-)
+@out_dir_option()
 @click.option("--threshold", metavar="T", type=float, help="Values above T are road. Default: told by the values.")
 @click.option(
     "--band", metavar="N", type=click.IntRange(1), help="Band that holds the mask. Default: told by the bands."

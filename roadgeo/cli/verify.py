@@ -13,7 +13,7 @@ import click
 from roadgeo.cli import ERROR, NOT_LOCATED
 from roadgeo.cli.command_line import made_by
 from roadgeo.cli.folders import make_folder
-from roadgeo.cli.parameters import references_option, verbosity_options
+from roadgeo.cli.parameters import out_dir_option, references_option, verbosity_options
 from roadgeo.cli.photographs import read_options, segmenting_options
 from roadgeo.cli.printing import echo
 
@@ -31,14 +31,7 @@ _COLORS = {"agrees": "green", "off": "red", "unknown": "yellow"}
 @click.command("verify", short_help="Check whether georeferenced images are where they say.")
 @click.argument("images", metavar="IMAGE...", nargs=-1, required=True, type=click.Path())
 @references_option("Reference to hold them against")
-@click.option(
-    "-o",
-    "--out-dir",
-    metavar="DIR",
-    default=".",
-    type=click.Path(file_okay=False),
-    help="Where files go; made if missing. Default: here.",
-)
+@out_dir_option("Where files go; made if missing. Default: here.")
 @click.option("--json", "as_json", is_flag=True, help="Print one JSON object per image and line, in input order.")
 @click.option(
     "--fix",

@@ -7,7 +7,7 @@ from pathlib import Path
 import cv2
 import numpy as np
 
-from roadgeo._arrays import AnyArray
+from roadgeo._arrays import AnyArray, BoolArray, FloatArray
 from roadgeo.errors import OutputError
 
 __all__ = [
@@ -24,6 +24,8 @@ __all__ = [
     "draw_dots",
     "draw_outline",
     "draw_plate",
+    "fixed_point",
+    "touching",
     "write_png",
     "write_text",
 ]
@@ -55,6 +57,16 @@ def write_png(path: Path, image: AnyArray) -> None:
     if not done:
         raise OutputError(f"cannot write {path}: OpenCV did not encode the picture; use a smaller one")
     path.write_bytes(encoded.tobytes())
+
+
+def fixed_point(pixels: AnyArray) -> AnyArray:
+    """Turn pixels into the fixed-point ones that OpenCV draws at."""
+    return np.asarray(np.rint(pixels * (1 << SHIFT)).astype(np.int32))
+
+
+def touching(ends: AnyArray, low: FloatArray, high: FloatArray) -> BoolArray:
+    """Tell which segments, by their ends (S, 2, 2), may touch the box between two of its corners."""
+    return np.asarray((ends.max(axis=1) >= low).all(axis=1) & (ends.min(axis=1) <= high).all(axis=1))
 
 
 def draw_dots(image: AnyArray, centers: AnyArray, radius: float) -> None:

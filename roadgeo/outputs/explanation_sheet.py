@@ -31,6 +31,8 @@ from roadgeo.outputs.canvas import (
     Color,
     draw_dots,
     draw_outline,
+    fixed_point,
+    touching,
     write_png,
     write_text,
 )
@@ -132,7 +134,7 @@ def _draw_seen(scene: Scene, mask: RoadMask, lines: Sequence[FloatArray]) -> Any
         small[unseen] = UNSEEN
 
     def pixels(xy: FloatArray) -> AnyArray:
-        return np.rint((plane_to_pixel(xy) * scale - 0.5) * (1 << SHIFT)).astype(np.int32)
+        return fixed_point(plane_to_pixel(xy) * scale - 0.5)
 
     cv2.polylines(small, [pixels(line) for line in lines], False, QUERY_ROAD, 1, cv2.LINE_AA, SHIFT)
     n = len(scene.intersections)
@@ -181,7 +183,7 @@ class _Tile:
         """Take plane positions (..., 2) to fixed-point pixels."""
         at = (xy - self.low) * self.scale
         at[..., 1] = len(self.image) - at[..., 1]
-        return np.rint(np.clip(at - 0.5, -20_000, 20_000) * (1 << SHIFT)).astype(np.int32)
+        return fixed_point(np.clip(at - 0.5, -20_000, 20_000))
 
 
 def _draw_places(places: Sequence[RejectedPlace], scene: Scene, index: ReferenceIndex) -> AnyArray:
@@ -209,7 +211,7 @@ def _draw_place(place: RejectedPlace, scene: Scene, index: ReferenceIndex, side:
     frame = tile.pixels(place.footprint)
     cv2.fillPoly(tile.image, [frame], LIT, cv2.LINE_AA, SHIFT)
     ends = index.segments.reshape(-1, 2, 2)
-    near = (ends.max(axis=1) >= middle - reach).all(axis=1) & (ends.min(axis=1) <= middle + reach).all(axis=1)
+    near = touching(ends, middle - reach, middle + reach)
     width = int(np.clip(round(9.0 * tile.scale), 2, 9))
     roads = list(tile.pixels(ends[near].astype(np.float64)))
     cv2.polylines(tile.image, roads, False, MAP_ROAD, width, cv2.LINE_AA, SHIFT)

@@ -13,7 +13,7 @@ from roadgeo._arrays import FloatArray
 from roadgeo.errors import OutputError
 from roadgeo.geometry.mask import RoadMask, plane_to_pixel
 from roadgeo.location import Location
-from roadgeo.outputs.canvas import FRAME, MAP_ROAD, MATCH, QUERY_ROAD, Color
+from roadgeo.outputs.canvas import FRAME, MAP_ROAD, MATCH, QUERY_ROAD, Color, touching
 from roadgeo.outputs.paths import Placement
 from roadgeo.outputs.subject import Subject
 
@@ -108,7 +108,7 @@ def _draw_map(axes: Any, location: Location, place: Placement, roads: FloatArray
     around = margin * float((high - low).max())
     low, high = low - around, high + around
     ends = roads.reshape(-1, 2, 2)
-    near = (ends.max(axis=1) >= low).all(axis=1) & (ends.min(axis=1) <= high).all(axis=1)
+    near = touching(ends, low, high)
     # Kilometres from the corner: eastings and northings of seven digits say little on an axis.
     axes.add_collection(LineCollection((ends[near] - low) / 1e3, colors=[_rgb(MAP_ROAD)], linewidths=1.6, label="map"))
     if location.evidence is not None:

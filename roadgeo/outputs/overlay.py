@@ -11,6 +11,7 @@ import cv2
 import numpy as np
 
 from roadgeo._arrays import AnyArray, FloatArray
+from roadgeo.geometry.frame import Frame
 from roadgeo.geometry.mask import RoadMask, plane_to_pixel
 from roadgeo.location import Location
 from roadgeo.outputs.canvas import (
@@ -27,6 +28,8 @@ from roadgeo.outputs.canvas import (
     draw_dots,
     draw_outline,
     draw_plate,
+    fixed_point,
+    touching,
     write_png,
     write_text,
 )
@@ -71,7 +74,7 @@ class _Canvas:
     def pixels(self, xy: FloatArray) -> AnyArray:
         """Take CRS positions (..., 2) to the fixed-point pixels that OpenCV draws at."""
         at = (xy - (self.west, self.north)) * (self.scale, -self.scale) + (-0.5, self.top - 0.5)
-        return np.rint(np.clip(at, -20_000, 20_000) * (1 << SHIFT)).astype(np.int32)
+        return fixed_point(np.clip(at, -20_000, 20_000))
 
     def draw_lines(self, lines: list[AnyArray], color: Color, width: int) -> None:
         """Draw polylines given in fixed-point pixels."""
@@ -156,9 +159,8 @@ def _draw_map(canvas: _Canvas, roads: FloatArray) -> None:
     low = np.array([canvas.west, canvas.north - height / canvas.scale])
     high = np.array([canvas.west + width / canvas.scale, canvas.north + canvas.top / canvas.scale])
     ends = roads.reshape(-1, 2, 2)
-    near = (ends.max(axis=1) >= low).all(axis=1) & (ends.min(axis=1) <= high).all(axis=1)
     street = int(np.clip(round(9.0 * canvas.scale), 2, 12))
-    canvas.draw_lines(list(canvas.pixels(ends[near])), MAP_ROAD, street)
+    canvas.draw_lines(list(canvas.pixels(ends[touching(ends, low, high)])), MAP_ROAD, street)
 
 
 def _draw_query(canvas: _Canvas, location: Location, place: Placement) -> None:
@@ -197,7 +199,7 @@ def _draw_north(canvas: _Canvas) -> None:
     x, y = width - 2 * size, canvas.top + round(2.2 * size)
     draw_plate(canvas.image, (x - round(1.3 * size), y - round(1.8 * size)), (width - size // 2, y + round(2.6 * size)))
     arrow = np.array([[x, y - 1.4 * size], [x + 0.8 * size, y + size], [x, y + 0.5 * size], [x - 0.8 * size, y + size]])
-    cv2.fillPoly(canvas.image, [np.rint(arrow * (1 << SHIFT)).astype(np.int32)], INK, cv2.LINE_AA, SHIFT)
+    cv2.fillPoly(canvas.image, [fixed_point(arrow)], INK, cv2.LINE_AA, SHIFT)
     write_text(canvas.image, "N", (x - round(0.36 * size), y + round(2.2 * size)), size, INK, bold=True)
 
 
@@ -258,9 +260,8 @@ def _draw_mask(location: Location, mask: RoadMask, height: int, width: int) -> A
     small = cv2.resize(gray, size, interpolation=cv2.INTER_AREA if scale < 1 else cv2.INTER_NEAREST)
     left, top = (width - size[0]) // 2 + _GAP // 4, (height - size[1]) // 2
     panel[top : top + size[1], left : left + size[0]] = small[..., None]
-    corners = (np.array([[0, 0], [1, 0], [1, 1], [0, 1]]) * size + (left, top)) * (1 << SHIFT)
-    draw_outline(panel, np.rint(corners).astype(np.int32))
+    draw_outline(panel, fixed_point(np.add(Frame(*size).corners, (left, top))))
     if location.evidence is not None:
         at = plane_to_pixel(location.evidence.query_xy) * scale + (left - 0.5, top - 0.5)
-        draw_dots(panel, np.rint(at * (1 << SHIFT)).astype(int), 3.6 if location.n_matched < 200 else 2.4)
+        draw_dots(panel, fixed_point(at), 3.6 if location.n_matched < 200 else 2.4)
     return panel

@@ -15,6 +15,7 @@ from roadgeo.geometry.mask import RoadMask, plane_to_pixel
 from roadgeo.location import Evidence, Location, Seen
 from roadgeo.matching.index import ReferenceIndex
 from roadgeo.matching.query import trace_query
+from roadgeo.outputs.canvas import touching
 from roadgeo.outputs.paths import Placement
 from roadgeo.outputs.report.svg import draw_dots, draw_image, draw_lines, thin_lines
 from roadgeo.outputs.report.viewer import (
@@ -217,7 +218,7 @@ class Window:
         low = index.plane.from_crs(np.array([self.west, self.north - self.height]))
         high = index.plane.from_crs(np.array([self.west + self.width, self.north]))
         ends = index.segments.reshape(-1, 2, 2)
-        near = (ends.max(axis=1) >= low).all(axis=1) & (ends.min(axis=1) <= high).all(axis=1)
+        near = touching(ends, low, high)
         return index.plane.to_crs(ends[near].astype(float))
 
 
