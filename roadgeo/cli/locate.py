@@ -17,7 +17,7 @@ from roadgeo.cli.clusters import cluster_options, make_cluster
 from roadgeo.cli.command_line import said_options
 from roadgeo.cli.folders import make_folder
 from roadgeo.cli.hints import HINTS, hint_options, make_options, refuse_swapped
-from roadgeo.cli.parameters import Plugin, out_dir_option, references_option, verbosity_options
+from roadgeo.cli.parameters import ASPECT, Plugin, out_dir_option, references_option, verbosity_options
 from roadgeo.cli.photographs import read_options, segmenting_options
 from roadgeo.cli.printing import echo
 from roadgeo.cli.truths import read_truths
@@ -193,6 +193,12 @@ def _drawing_options(command: Command) -> Command:
     "--allow-mirror",
     is_flag=True,
     help="Where a mask has no place, turn it over: film scanned from its back. Without it, that is only told.",
+)
+@click.option(
+    "--aspect",
+    metavar="RATIO|unknown",
+    type=ASPECT,
+    help="How many times a pixel is as wide as high, of scans that are stretched; unknown: from 0.5 to 2 is tried.",
 )
 @click.option(
     "--dem",

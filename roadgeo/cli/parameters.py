@@ -9,6 +9,7 @@ from typing import Any, TypeVar
 import click
 
 __all__ = [
+    "ASPECT",
     "BOX",
     "CAMERA",
     "NEAR",
@@ -166,6 +167,33 @@ RANGE = Numbers("range", ("LO", "HI"), ":", _wrong_range)
 NEAR = Numbers("place", ("LON", "LAT", "RADIUS"), ",", _wrong_place)
 #: A focal length in pixels, or where to find it.
 CAMERA = Focal()
+
+
+class Aspect(click.ParamType):  # type: ignore[type-arg]
+    """How many times a pixel is as wide as high, or the word "unknown"."""
+
+    name = "aspect"
+
+    def convert(self, value: Any, param: click.Parameter | None, ctx: click.Context | None) -> float | str:
+        """Parse the text.
+
+        Raises
+        ------
+        click.BadParameter
+            Neither "unknown" nor a ratio that is searched.
+        """
+        if value == "unknown":
+            return "unknown"
+        try:
+            ratio = float(value)
+        except (TypeError, ValueError):
+            ratio = 0.0
+        if not 0.25 <= ratio <= 4.0:
+            self.fail(f"got {value!r}, expected a number from 0.25 to 4, or unknown", param, ctx)
+        return ratio
+
+
+ASPECT = Aspect()
 #: A box in degrees; west may exceed east, across the 180th meridian.
 BOX = Numbers("box", ("W", "S", "E", "N"), ",", _wrong_box)
 

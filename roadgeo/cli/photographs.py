@@ -91,4 +91,5 @@ def read_options(given: Mapping[str, Any], photos: Mapping[str, str], others: Se
         dem=given.get("dem") or "",
         allow_mirror=bool(given.get("allow_mirror")),
         units=given.get("units") or "auto",
+        aspect=given.get("aspect"),
     )

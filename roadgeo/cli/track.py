@@ -42,6 +42,9 @@ How a frame moved is told by the photographs, or roughly by the masks alone; bes
 knows: a CSV with the columns frame (the file's name) and h00 ... h22, row by row, the homography that takes a pixel
 (column, row) of the frame to the pixel of the frame before that shows the same ground. The first frame needs none.
 
+Frames of an archive are in no order: with --unordered each is laid on each other, by what the pictures show or by the
+roads of the masks; what overlaps is solved together, located together, and each frame is placed.
+
 \b
 What is written to --out-dir:
   flight.gpkg     footprints, centres and the track, styled for QGIS
@@ -61,6 +64,7 @@ Examples:
   roadgeo track flight.mp4 --every 0.5 --start 2024-05-01T09:30:00Z --out-dir found
   roadgeo track frame_*.png --json > flight.jsonl
   roadgeo track frames/ --camera 640 --mavlink udpout:127.0.0.1:14550
+  roadgeo track --unordered strip_1951/*.tif --out-dir found
 
 Exit status: 0 every frame has a place, 3 at least one is lost, 1 error, 2 usage.
 """
@@ -101,6 +105,7 @@ class Moment(click.ParamType):  # type: ignore[type-arg]
     type=click.FloatRange(min=0, min_open=True),
     help="How far off the motion may put a corner. Default: 1.5, of masks 12.",
 )
+@click.option("--unordered", is_flag=True, help="The frames are in no order; all are solved together.")
 @click.option(
     "--every",
     metavar="SECONDS",
@@ -156,6 +161,7 @@ def track_command(
     start: datetime | None,
     mavlink: str | None,
     focal_px: float | None,
+    unordered: bool,
     quiet: bool,
     verbose: bool,
     **given: Any,
@@ -167,6 +173,8 @@ def track_command(
     from roadgeo.running.flights.report import Thumbnails
     from roadgeo.running.flights.rows import make_rows
 
+    if unordered and (mavlink or given["motion"]):
+        raise click.UsageError("--unordered frames are no flight: leave out --mavlink and --motion.")
     options, reading = _track_options(given), _frame_options(given)
     opened = open_references(references, print_steps(quiet))
     refuse_swapped(given["near"], opened)
@@ -176,7 +184,8 @@ def track_command(
     known: dict[int, Tracked] = {}
     pictures = Thumbnails()
     with _sender(mavlink) as send:
-        for frame, news in _follow(frames, reading, opened, options):
+        follow = _place_all if unordered else _follow
+        for frame, news in follow(frames, reading, opened, options):
             pictures.add(frame.number, frame.mask)
             known.update({one.frame.number: _without_mask(one) for one in news})
             fresh = make_rows(news, start, focal_px)
@@ -202,6 +211,16 @@ def _follow(
     from roadgeo.running.flights.tracker import follow
 
     return follow(read_frames(frames, reading), opened, options)
+
+
+def _place_all(
+    frames: tuple[str, ...], reading: FrameOptions, opened: Any, options: TrackOptions
+) -> Iterator[tuple[FlightFrame, list[Tracked]]]:
+    from roadgeo.running.flights.frames import read_stills
+    from roadgeo.running.flights.strips import place_strips
+
+    for one in place_strips(list(read_stills(frames, reading)), opened, options):
+        yield one.frame, [one]
 
 
 @contextmanager

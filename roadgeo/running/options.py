@@ -35,6 +35,8 @@ class ReadOptions:
         Masks that were mirrored have the place that they have turned over.
     units : "auto", "pixels" or "metres"
         Of roads that come as lines.
+    aspect : float, "unknown" or None
+        How many times a pixel is as wide as high; None: once.
     """
 
     threshold: float | None = None
@@ -49,6 +51,7 @@ class ReadOptions:
     dem: str = ""
     allow_mirror: bool = False
     units: Literal["auto", "pixels", "metres"] = "auto"
+    aspect: float | Literal["unknown"] | None = None
 
     def photo(self, task: Task, of_photograph: bool) -> str | None:
         """Return the photograph that is drawn, if any: one that was given, or the query itself."""
@@ -60,7 +63,7 @@ class ReadOptions:
 
         return QueryOptions(
             self.threshold, self.band, self.segment, self.segmenters, self.class_name, self.fused_with, self.threads,
-            "allow" if self.allow_mirror else "tell", self.units,
+            "allow" if self.allow_mirror else "tell", self.units, self.aspect,
         )  # fmt: skip
 
 

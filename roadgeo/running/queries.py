@@ -27,6 +27,7 @@ from roadgeo.plugins import SEGMENTERS, call_plugin
 from roadgeo.reference.reference import AnyReference
 from roadgeo.running.looks import Locate, Look, Sighting, locate_looks
 from roadgeo.running.mirroring import ask_mirrored
+from roadgeo.running.stretching import ask_stretched
 from roadgeo.sources.drawn_roads import ENDINGS, Units, draw_roads
 from roadgeo.sources.exif import estimate_gsd
 from roadgeo.sources.masks import open_mask, read_mask
@@ -72,6 +73,8 @@ class QueryOptions:
         Of a mask that is refused, and would be located turned over: whether that is said, not asked, or the answer.
     units : "auto", "pixels" or "metres"
         Of roads that come as lines (see `sources.drawn_roads`).
+    aspect : float, "unknown" or None
+        How many times a pixel of a mask is as wide as high; None: once.
     """
 
     threshold: float | None = None
@@ -83,6 +86,7 @@ class QueryOptions:
     threads: int = 1
     mirror: Literal["tell", "never", "allow"] = "tell"
     units: Units = "auto"
+    aspect: float | Literal["unknown"] | None = None
 
 
 def locate_query(
@@ -113,6 +117,8 @@ def locate_query(
     if wants_mask and not query.fused_with:
         try:
             sighting = _locate_mask(path, references, options, query, how)
+            if query.aspect is not None:
+                return ask_stretched(sighting, references, options, query.aspect)
             asked = query.mirror != "never"
             return ask_mirrored(sighting, references, options, query.mirror == "allow") if asked else sighting
         except PhotographError:

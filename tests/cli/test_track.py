@@ -102,6 +102,24 @@ def test_an_autopilot_hears_what_is_printed(flown, tmp_path, capfd):
     assert all(later - earlier >= 0.09e6 for earlier, later in pairwise(sent))  # 10 a second at most
 
 
+def test_frames_in_no_order_are_placed_together(flown, tmp_path, capfd):
+    folder, flight, plane = flown
+    order = ["frame_2.png", "frame_0.png", "frame_3.png", "frame_1.png"]
+    frames = [str(folder / "frames" / name) for name in order]
+    command = ["track", "--unordered", *frames, "-r", str(folder / "town.gpkg"), "-o", str(tmp_path), "--json"]
+    assert main(command) in (0, 3)
+    rows = [json.loads(line) for line in capfd.readouterr().out.splitlines()]
+    placed = [row for row in rows if row["status"] == "located"]
+    assert len(placed) >= 3  # low frames show few roads: one of them may be linked to none
+    assert [row["name"] for row in placed] == sorted(row["name"] for row in placed)
+    for row in placed:
+        k = int(row["name"][6])
+        middle = np.array(row["homography"]) @ (200.0, 150.0, 1.0)
+        truth = plane.to_crs(flight.views[k].homography(np.array([200.0, 150.0])))
+        assert np.hypot(*(middle[:2] / middle[2] - truth)) < 5.0
+    assert main([*command, "--mavlink", "udpout:127.0.0.1:1"]) == 2
+
+
 def test_a_video_is_a_flight(flown, tmp_path, capfd):
     folder, _, _ = flown
     video = cv2.VideoWriter(str(tmp_path / "flight.avi"), cv2.VideoWriter_fourcc(*"MJPG"), 2.0, (400, 300))

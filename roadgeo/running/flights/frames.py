@@ -25,7 +25,7 @@ from roadgeo.running.flights.tracker import FlightFrame
 from roadgeo.running.tasks import find_masks
 from roadgeo.sources.masks import read_mask
 
-__all__ = ["VIDEOS", "FrameOptions", "read_frames"]
+__all__ = ["VIDEOS", "FrameOptions", "read_frames", "read_stills"]
 
 #: What is taken for a video, by its name.
 VIDEOS = (".mp4", ".mov", ".avi", ".mkv", ".m4v", ".mpg", ".mpeg", ".ts", ".webm", ".wmv")
@@ -101,6 +101,23 @@ def read_frames(arguments: Sequence[str], options: FrameOptions | None = None) -
             motion, error_px = _motion(image.name, mask, grey, options, last) if number else (None, 1.5)
             last.mask, last.grey, last.motion = mask, grey, motion
             yield FlightFrame(number, image.name, image.time_s, mask, motion, options.motion_px or error_px)
+
+
+def read_stills(
+    arguments: Sequence[str], options: FrameOptions | None = None
+) -> Iterator[tuple[FlightFrame, AnyArray | None]]:
+    """Read frames that are in no order: files, folders or patterns; each with its picture in grey where it is one.
+
+    Raises
+    ------
+    MaskError, ModelError
+        As of `read_frames`.
+    """
+    options, last = options or FrameOptions(), _Last()
+    with ExitStack() as stack:
+        for number, image in enumerate(_images(arguments, options, stack)):
+            mask, grey = _read(image, options, last)
+            yield FlightFrame(number, image.name, image.time_s, mask), grey
 
 
 def _images(arguments: Sequence[str], options: FrameOptions, stack: ExitStack) -> Iterator[_Image]:

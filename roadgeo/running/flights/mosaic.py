@@ -18,7 +18,7 @@ from roadgeo.geometry.frame import Frame
 from roadgeo.geometry.homography import Homography
 from roadgeo.geometry.mask import RoadMask
 
-__all__ = ["Mosaic", "MosaicOptions", "chain", "lay_together", "level", "unseen_before"]
+__all__ = ["Mosaic", "MosaicOptions", "chain", "lay_down", "lay_together", "level", "unseen_before"]
 
 
 @dataclass(frozen=True)
@@ -110,10 +110,17 @@ def lay_together(
     road_px : float
         Width of a road in the frames.
     """
+    return lay_down(masks, chain(motion), road_px, options)
+
+
+def lay_down(
+    masks: Sequence[RoadMask], to_plane: FloatArray, road_px: float, options: MosaicOptions | None = None
+) -> Mosaic | None:
+    """Lay frames of one size, whose pixels (K, 3, 3) `to_plane` takes to one plane, on it, levelled; see above."""
     options = options or MosaicOptions()
     height, width = masks[0].shape
     frame = Frame(width, height)
-    levelled = level(chain(motion), frame, options)
+    levelled = level(to_plane, frame, options)
     corners = np.stack([Homography(matrix)(frame.corners) for matrix in levelled])
     if not _is_sound(corners):
         return None

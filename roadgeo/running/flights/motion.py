@@ -10,6 +10,7 @@ import io
 import math
 import os
 from collections.abc import Sequence
+from dataclasses import dataclass, replace
 from pathlib import Path
 
 import cv2
@@ -27,7 +28,7 @@ from roadgeo.matching.scene import Scene
 from roadgeo.roads.graph import RoadGraph
 from roadgeo.running.flights.pose import FilterOptions, Pose, correct
 
-__all__ = ["between_images", "between_masks", "read_motion", "write_motion"]
+__all__ = ["TracedMask", "between_images", "between_masks", "overlay", "read_motion", "write_motion"]
 
 _COLUMNS = [f"h{i}{j}" for i in range(3) for j in range(3)]
 
@@ -41,6 +42,8 @@ _ROUGH_SIDE, _TURNS_DEG, _FARTHEST = 96, (-12.0, -8.0, -4.0, 0.0, 4.0, 8.0, 12.0
 _SHIFT_CELLS, _LINEAR_SIGMA, _CORNER_SIGMA = 3.0, 0.05, 0.008
 #: The least share of road points in the overlap that must lie on roads of the other mask.
 _LEAST_SHARE = 0.6
+#: Frames in no order are laid on each other where they share so much: less agrees by chance.
+_LEAST_SHARED = 0.3
 #: Flights go on as they went: the middle of a frame moves by no more than this share of a frame otherwise than before.
 _STEADY = 0.2
 _FILTER = FilterOptions(
@@ -115,6 +118,10 @@ def between_images(before: AnyArray, image: AnyArray) -> FloatArray | None:
     return np.asarray(np.linalg.inv(shrink) @ matrix @ shrink)
 
 
+def _half_turn(frame: Frame) -> FloatArray:
+    return np.array([[-1.0, 0.0, frame.width], [0.0, -1.0, frame.height], [0.0, 0.0, 1.0]])
+
+
 # --- masks ------------------------------------------------------------------------------------------------------------
 
 
@@ -141,6 +148,62 @@ def between_masks(before: RoadMask, mask: RoadMask, last: FloatArray | None = No
         if best is None or found[0] > best[0]:
             best = found
     return None if best is None or best[0] < _LEAST_SHARE else best[1]
+
+
+@dataclass(frozen=True)
+class TracedMask:
+    """A mask, traced, that is laid on many others."""
+
+    mask: RoadMask
+    scene: Scene
+    roads: RoadBuckets
+
+    @classmethod
+    def of(cls, mask: RoadMask) -> TracedMask | None:
+        """Trace a mask; None where it shows no roads."""
+        try:
+            scene, graph = trace_query(mask)
+        except MaskError:
+            return None
+        return cls(mask, scene, _buckets(graph))
+
+
+def overlay(one: TracedMask, other: TracedMask) -> tuple[FloatArray, float] | None:
+    """Lay a mask on another that was taken anywhere near, either way up; None where their roads do not agree.
+
+    Returns
+    -------
+    (3, 3) float64
+        Pixel of `other` to pixel of `one`.
+    float
+        How sure that is: the share of roads that agree, of the mask that has less, times that of the frame that both
+        see.
+    """
+    height, width = other.mask.shape
+    frame = Frame(width, height)
+    best: tuple[float, FloatArray] | None = None
+    for turn in (np.eye(3), _half_turn(frame)):
+        seen = other.mask if turn[0, 0] > 0 else replace(other.mask, roads=other.mask.roads[::-1, ::-1].copy())
+        for guess in _rough_motions(one.mask, seen):
+            found = _refine(guess @ turn, frame, other.scene, one.roads)
+            if found is None or found[0] < _LEAST_SHARE:
+                continue
+            back = _agreement(np.asarray(np.linalg.inv(found[1]), float), frame, one.scene, other.roads)
+            shared = _shared(found[1], frame)
+            if min(back / _LEAST_SHARE, shared / _LEAST_SHARED) < 1.0:
+                continue
+            sure = min(found[0], back) * shared
+            if best is None or sure > best[0]:
+                best = (sure, found[1])
+    return None if best is None else (best[1], best[0])
+
+
+def _shared(motion: FloatArray, frame: Frame) -> float:
+    """Return the share of a frame that the other one sees, too."""
+    side = np.linspace(0.05, 0.95, 10)
+    grid = np.stack(np.meshgrid(side * frame.width, side * frame.height), axis=-1).reshape(-1, 2)
+    there = Homography(motion).facing(frame.center)(grid)
+    return float(((there > 0) & (there < (frame.width, frame.height))).all(axis=1).mean())
 
 
 def _goes_on(motion: FloatArray, last: FloatArray, frame: Frame) -> bool:

@@ -274,14 +274,14 @@ class Tracker:
         if searched:
             self._looked_at, self._waited = n_seen, 0
         look = Look(query, mosaic, [one.frame.number for one in self._window], masks, searched)
-        location = self._candidates.look(look, self._look_options(mosaic, masks))
+        location = self._candidates.look(look, self.look_options(mosaic, masks))
         if not location.located:
             return [Tracked(frame, "lost", f"{len(masks)} frames: {location.reason}", frame.number)]
         return self._settle(location, mosaic) or [
             Tracked(frame, "lost", "a place was found, but the frames by themselves do not agree", frame.number)
         ]
 
-    def _look_options(self, mosaic: Mosaic, masks: Sequence[RoadMask]) -> LocateOptions:
+    def look_options(self, mosaic: Mosaic, masks: Sequence[RoadMask]) -> LocateOptions:
         """Return options for a mosaic: its pixels are others than the frames', and each look takes its share off."""
         options, camera = self.options.locate, self.options.locate.match.camera
         height, width = masks[0].shape
@@ -294,6 +294,16 @@ class Tracker:
             near = (near[0], near[1], near[2] + 0.5 * max(mosaic.mask.shape) * camera.gsd_m[1])
         match = replace(options.match, camera=camera, lens=None)
         return replace(options, match=match, near=near)
+
+    def place(self, location: Location, mosaic: Mosaic, frames: Sequence[FlightFrame]) -> list[Tracked]:
+        """Place frames whose mosaic was located, each by itself; nothing where most of them do not agree."""
+        self._window = [_Waiting(one, _trace(one.mask, self.options)) for one in frames]
+        return self._settle(location, mosaic)
+
+    def place_beside(self, known: Tracked, frame: FlightFrame) -> Tracked:
+        """Place a frame from another one, whose place is known and to whose pixels its motion leads."""
+        self._pose, self._reference = known.pose, known.reference
+        return self._step(_Waiting(frame, _trace(frame.mask, self.options)), frame.number, "located")
 
     def _settle(self, location: Location, mosaic: Mosaic) -> list[Tracked]:
         """Place all frames that waited, each by itself; nothing where most of them do not agree."""

@@ -1,0 +1,259 @@
+"""Strips of an archive: frames that overlap, in no order, are solved together and placed together.
+
+Each pair of frames is laid on each other, by what their pictures show or by their roads. The links that result make
+one or more nets; in each, all frames are adjusted at once, so that every link agrees with the others, and the mosaic of
+all is located like one mask. There each frame is laid on the roads of the map by itself.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+from itertools import combinations
+
+import numpy as np
+from scipy.optimize import least_squares
+
+from roadgeo._arrays import AnyArray, FloatArray
+from roadgeo.geometry.frame import Frame
+from roadgeo.geometry.homography import Homography
+from roadgeo.geometry.mask import RoadMask
+from roadgeo.reference.reference import Reference
+from roadgeo.roads.vectorization import road_width
+from roadgeo.running.flights.mosaic import lay_down
+from roadgeo.running.flights.motion import TracedMask, between_images, overlay
+from roadgeo.running.flights.tracker import FlightFrame, Tracked, Tracker, TrackOptions
+from roadgeo.workflows import locate
+
+__all__ = ["Link", "StripOptions", "adjust", "find_links", "find_nets", "place_strips"]
+
+
+@dataclass(frozen=True)
+class StripOptions:
+    """How a strip is solved.
+
+    Attributes
+    ----------
+    start_sigma_m : float
+        Standard deviation of a frame in a located mosaic.
+    link_px : float
+        Standard deviation of where a link puts a corner.
+    least_odds : float
+        Log10 odds against chance by which a frame agrees with the map.
+    most_gap : float
+        A link that puts a frame's corners this share of its half diagonal off where the others put them is none.
+    """
+
+    start_sigma_m: float = 8.0
+    link_px: float = 12.0
+    least_odds: float = 1.0
+    most_gap: float = 0.25
+
+
+@dataclass(frozen=True)
+class Link:
+    """Two frames that overlap.
+
+    Attributes
+    ----------
+    one, other : int
+    motion : (3, 3) float64
+        Pixel of `other` to pixel of `one`.
+    weight : float
+        How sure it is.
+    """
+
+    one: int
+    other: int
+    motion: FloatArray
+    weight: float
+
+
+def place_strips(
+    frames: Sequence[tuple[FlightFrame, AnyArray | None]],
+    references: Sequence[Reference],
+    options: TrackOptions | None = None,
+    strips: StripOptions | None = None,
+) -> list[Tracked]:
+    """Place frames of one or more strips; return what is known of each, in the order in which they lie beside another.
+
+    Parameters
+    ----------
+    frames : sequence of (FlightFrame, (H, W) uint8 or None)
+        Their motion is not looked at; beside each its picture in grey, where there is one.
+    """
+    strips = strips or StripOptions()
+    options = options or TrackOptions()
+    options = replace(options, start_sigma_m=strips.start_sigma_m, least_odds=strips.least_odds)
+    stills = [frame for frame, _ in frames]
+    links = find_links(stills, [grey for _, grey in frames])
+    placed: list[Tracked] = []
+    for net, matrices in find_nets([one.frame for one in stills], links, strips):
+        order = _along(matrices, stills[net[0]].frame, [stills[k].name for k in net])
+        members = [replace(stills[net[k]], number=n, time_s=stills[n].time_s) for n, k in enumerate(order, len(placed))]
+        of_net = _Net(members, matrices[order], _within([net[k] for k in order], links), options, strips)
+        placed += of_net.place(references)
+    return placed
+
+
+@dataclass(frozen=True)
+class _Net:
+    """Frames that hang together: (K, 3, 3) from the pixels of each to one plane, and the links between them."""
+
+    frames: Sequence[FlightFrame]
+    matrices: FloatArray
+    links: Sequence[Link]
+    options: TrackOptions
+    strips: StripOptions
+
+    def place(self, references: Sequence[Reference]) -> list[Tracked]:
+        """Locate all of them as one mosaic, or else each alone; from the surest the others are placed, link by link."""
+        tracker, why = Tracker(references, self.options), "no roads are seen"
+        for chosen in [range(len(self.frames)), *([k] for k in range(len(self.frames)) if len(self.frames) > 1)]:
+            placed, said = self._locate(tracker, list(chosen), references)
+            if placed:
+                surest = max(placed, key=lambda one: one.log10_odds)
+                return self._spread(tracker, self.frames.index(surest.frame), surest)
+            why = said if len(chosen) > 1 or len(self.frames) == 1 else why
+        return [Tracked(one, "lost", why, one.number) for one in self.frames]
+
+    def _locate(
+        self, tracker: Tracker, chosen: Sequence[int], references: Sequence[Reference]
+    ) -> tuple[list[Tracked], str]:
+        """Return the frames that were placed by the mosaic of some; none, and why."""
+        frames = [self.frames[k] for k in chosen]
+        masks = [one.mask for one in frames]
+        if not any(mask.roads.any() for mask in masks):
+            return [], "no roads are seen"
+        mosaic = lay_down(masks, self.matrices[list(chosen)], _road_px(masks), self.options.mosaic)
+        if mosaic is None:
+            return [], "the frames do not fit together on one plane"
+        location = locate(mosaic.mask, references, tracker.look_options(mosaic, masks))
+        if not location.located:
+            return [], f"{len(frames)} frames together: {location.reason}"
+        placed = [one for one in tracker.place(location, mosaic, frames) if one.status == "located"]
+        return placed, "a place was found, but the frames by themselves do not agree"
+
+    def _spread(self, tracker: Tracker, first: int, surest: Tracked) -> list[Tracked]:
+        """Place frames beside those that are placed, along the surest links first."""
+        known = {first: surest}
+        left = sorted(self.links, key=lambda one: -one.weight)
+        while (link := next((one for one in left if (one.one in known) != (one.other in known)), None)) is not None:
+            left.remove(link)
+            at, to = (link.one, link.other) if link.one in known else (link.other, link.one)
+            motion = link.motion if at == link.one else np.asarray(np.linalg.inv(link.motion), float)
+            frame = replace(self.frames[to], motion=motion, motion_px=self.strips.link_px)
+            beside = tracker.place_beside(known[at], frame)
+            if beside.status == "located" or (beside.status == "predicted" and math.isnan(beside.log10_odds)):
+                known[to] = beside
+        why = "its roads do not agree with the map where its neighbours put it"
+        return [known.get(k, Tracked(one, "lost", why, one.number)) for k, one in enumerate(self.frames)]
+
+
+def _road_px(masks: Sequence[RoadMask]) -> float:
+    return float(np.median([road_width(mask) for mask in masks if mask.roads.any()]))
+
+
+def find_links(frames: Sequence[FlightFrame], greys: Sequence[AnyArray | None]) -> list[Link]:
+    """Lay each frame on each other: by their pictures where both have one, otherwise by their roads."""
+    traced = [TracedMask.of(one.mask) if grey is None else None for one, grey in zip(frames, greys, strict=True)]
+    links = []
+    for i, j in combinations(range(len(frames)), 2):
+        if frames[i].mask.shape != frames[j].mask.shape:
+            continue
+        found = _link(traced[i], traced[j], greys[i], greys[j])
+        if found is not None:
+            links.append(Link(i, j, *found))
+    return links
+
+
+def _link(
+    one: TracedMask | None, other: TracedMask | None, grey: AnyArray | None, other_grey: AnyArray | None
+) -> tuple[FloatArray, float] | None:
+    if grey is not None and other_grey is not None:
+        motion = between_images(grey, other_grey)
+        return None if motion is None else (motion, 1.0)
+    return None if one is None or other is None else overlay(one, other)
+
+
+def find_nets(
+    frames: Sequence[Frame], links: Sequence[Link], options: StripOptions | None = None
+) -> list[tuple[list[int], FloatArray]]:
+    """Return the nets that links make, the largest first: its frames, and (K, 3, 3) from their pixels to one plane."""
+    options = options or StripOptions()
+    nets = [[k] for k in range(len(frames))]
+    at: list[FloatArray] = [np.eye(3) for _ in frames]
+    kept: list[Link] = []
+    for link in sorted(links, key=lambda one: -one.weight):
+        mine = next(net for net in nets if link.one in net)
+        theirs = next(net for net in nets if link.other in net)
+        if mine is not theirs:  # the surest links join nets: those join as rigid wholes
+            move = at[link.one] @ link.motion @ np.linalg.inv(at[link.other])
+            for k in theirs:
+                at[k] = move @ at[k]
+                at[k] = at[k] / np.cbrt(np.linalg.det(at[k]))
+            mine += theirs
+            nets.remove(theirs)
+        elif _gap(at[link.one] @ link.motion, at[link.other], frames[link.other]) > options.most_gap:
+            continue
+        kept.append(link)
+    nets.sort(key=len, reverse=True)
+    return [(net, adjust([at[k] for k in net], frames[net[0]], _within(net, kept))) for net in nets]
+
+
+def _within(net: Sequence[int], links: Sequence[Link]) -> list[Link]:
+    """Return the links of a net, numbered in it."""
+    number = {k: n for n, k in enumerate(net)}
+    return [replace(one, one=number[one.one], other=number[one.other]) for one in links if one.one in number]
+
+
+def _gap(a: FloatArray, b: FloatArray, frame: Frame) -> float:
+    """Return how far apart two homographies put a frame's corners, in half diagonals of where the second puts them."""
+    there, here = (Homography(one).facing(frame.center)(frame.corners) for one in (a, b))
+    size = np.hypot(*(here[2:] - here[:2]).T).mean() / 2.0
+    gap = np.hypot(*(there - here).T).max() / size
+    return float(gap) if np.isfinite(gap) else np.inf
+
+
+def adjust(start: Sequence[FloatArray], frame: Frame, links: Sequence[Link]) -> FloatArray:
+    """Adjust homographies (K, 3, 3) of frames of one size to one plane, so that all links agree as well as they can.
+
+    The first stays. What is made least is how far the two frames of a link put the corners of their overlap apart.
+    """
+    matrices = np.stack(start)
+    if len(matrices) < 3 or not links:
+        return matrices
+    unit = np.array([[frame.half_diagonal, 0.0, frame.center[0]], [0.0, frame.half_diagonal, frame.center[1]]])
+    to_pixel = np.vstack((unit, (0.0, 0.0, 1.0)))
+    local = matrices @ to_pixel
+    local = local / local[:, 2:, 2:]
+    scale = np.abs(local[0, :2, :2]).max()
+    base = np.array([[-1.0, -1.0], [1.0, -1.0], [1.0, 1.0], [-1.0, 1.0]]) * 0.6
+    points = np.stack([Homography(np.linalg.inv(to_pixel) @ one.motion @ to_pixel)(base) for one in links])
+    ones, others = (np.array([getattr(link, name) for link in links]) for name in ("one", "other"))
+    weight = np.sqrt([link.weight for link in links])[:, None, None] / scale
+
+    def places(matrix: FloatArray, xy: FloatArray) -> FloatArray:
+        mapped = np.einsum("kij,knj->kni", matrix, np.concatenate((xy, np.ones((*xy.shape[:2], 1))), axis=2))
+        return np.asarray(mapped[..., :2] / mapped[..., 2:])
+
+    def residuals(free: FloatArray) -> FloatArray:
+        moved = local.copy()
+        moved[1:].reshape(-1, 9)[:, :8] += free.reshape(-1, 8) * step
+        gap = places(moved[ones], points) - places(moved[others], np.broadcast_to(base, points.shape))
+        return np.asarray((weight * gap).ravel())
+
+    step = np.array([1.0, 1.0, 1.0, 1.0, 1.0, 1.0, 1.0 / scale, 1.0 / scale]) * scale
+    free = least_squares(residuals, np.zeros(8 * (len(local) - 1)), loss="soft_l1", f_scale=0.02, max_nfev=30).x
+    local[1:].reshape(-1, 9)[:, :8] += free.reshape(-1, 8) * step
+    return np.asarray(local @ np.linalg.inv(to_pixel))
+
+
+def _along(matrices: FloatArray, frame: Frame, names: Sequence[str]) -> list[int]:
+    """Return the order of frames along the line on which they lie, from the end whose name comes first."""
+    middles = np.stack([Homography(one).facing(frame.center)(frame.center) for one in matrices])
+    away = middles - middles.mean(axis=0)
+    axis = np.linalg.svd(away)[2][0]
+    order: list[int] = np.argsort(away @ axis, kind="stable").tolist()
+    return order if names[order[0]] <= names[order[-1]] else order[::-1]
