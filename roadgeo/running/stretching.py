@@ -1,7 +1,7 @@
 """A scan whose pixels are not square, or nobody knows: the mask is stretched until it is located.
 
 A facsimile, a film scanned too fast, a picture made to fit a page: along one side the ground is sampled finer than
-along the other, by a factor that nobody wrote down. No camera sees ground so, and the search looks for what cameras see.
+along the other, by a factor that nobody wrote down. No camera sees ground so, and the search looks for what one sees.
 """
 
 from __future__ import annotations

@@ -168,34 +168,41 @@ class TracedMask:
         return cls(mask, scene, _buckets(graph))
 
 
-def overlay(one: TracedMask, other: TracedMask) -> tuple[FloatArray, float] | None:
-    """Lay a mask on another that was taken anywhere near, either way up; None where their roads do not agree.
+def overlay(one: TracedMask, other: TracedMask) -> list[tuple[FloatArray, float]]:
+    """Lay a mask on another that was taken anywhere near, either way up, where their roads agree.
+
+    Where streets are alike there may be two such places, a block apart; none means that they do not overlap.
 
     Returns
     -------
-    (3, 3) float64
-        Pixel of `other` to pixel of `one`.
-    float
-        How sure that is: the share of roads that agree, of the mask that has less, times that of the frame that both
-        see.
+    list of ((3, 3) float64, float)
+        Pixel of `other` to pixel of `one`, and how sure that is: the share of roads that agree, of the mask that has
+        less, times that of the frame that both see. The surest first.
     """
     height, width = other.mask.shape
     frame = Frame(width, height)
-    best: tuple[float, FloatArray] | None = None
+    found: list[tuple[FloatArray, float]] = []
     for turn in (np.eye(3), _half_turn(frame)):
         seen = other.mask if turn[0, 0] > 0 else replace(other.mask, roads=other.mask.roads[::-1, ::-1].copy())
-        for guess in _rough_motions(one.mask, seen):
-            found = _refine(guess @ turn, frame, other.scene, one.roads)
-            if found is None or found[0] < _LEAST_SHARE:
+        for guess in _rough_motions(one.mask, seen, 4):
+            laid = _refine(guess @ turn, frame, other.scene, one.roads)
+            if laid is None or laid[0] < _LEAST_SHARE:
                 continue
-            back = _agreement(np.asarray(np.linalg.inv(found[1]), float), frame, one.scene, other.roads)
-            shared = _shared(found[1], frame)
-            if min(back / _LEAST_SHARE, shared / _LEAST_SHARED) < 1.0:
-                continue
-            sure = min(found[0], back) * shared
-            if best is None or sure > best[0]:
-                best = (sure, found[1])
-    return None if best is None else (best[1], best[0])
+            back = _agreement(np.asarray(np.linalg.inv(laid[1]), float), frame, one.scene, other.roads)
+            shared = _shared(laid[1], frame)
+            if back >= _LEAST_SHARE and shared >= _LEAST_SHARED:
+                found.append((laid[1], min(laid[0], back) * shared))
+    found.sort(key=lambda pair: -pair[1])
+    distinct: list[tuple[FloatArray, float]] = []
+    for motion, sure in found:
+        if not any(_is_same_motion(motion, known, frame) for known, _ in distinct):
+            distinct.append((motion, sure))
+    return distinct[:3]
+
+
+def _is_same_motion(a: FloatArray, b: FloatArray, frame: Frame) -> bool:
+    apart = Homography(a)(frame.center) - Homography(b)(frame.center)
+    return bool(np.hypot(*apart) < 0.05 * frame.half_diagonal)
 
 
 def _shared(motion: FloatArray, frame: Frame) -> float:
@@ -265,8 +272,11 @@ def _buckets(graph: RoadGraph) -> RoadBuckets:
     return RoadBuckets(segments, starts.astype(np.int32), ids, grid, shape)
 
 
-def _rough_motions(before: RoadMask, mask: RoadMask) -> list[FloatArray]:
-    """Return the shifts, one for each turn, at which the roads of two masks cover each other most; the best two."""
+def _rough_motions(before: RoadMask, mask: RoadMask, count: int = 2) -> list[FloatArray]:
+    """Return the shifts at which the roads of two masks cover each other most: the best ones, each of another turn.
+
+    Of more than two, the two best shifts of each turn are among them.
+    """
     height, width = mask.shape
     scale = _ROUGH_SIDE / max(height, width)
     size = (round(width * scale), round(height * scale))
@@ -283,16 +293,19 @@ def _rough_motions(before: RoadMask, mask: RoadMask) -> list[FloatArray]:
         # Where frames overlap less, less can agree.
         shared = (1.0 - np.abs(rows)[:, None] / size[1]).clip(0.1) * (1.0 - np.abs(columns)[None] / size[0]).clip(0.1)
         worth = np.where(far, -np.inf, cover / np.sqrt(shared))
-        row, column = np.unravel_index(int(np.argmax(worth)), worth.shape)
-        shift = np.array([columns[column], rows[row]]) / scale
         angle = math.radians(degrees)
         # OpenCV's angles turn counterclockwise as seen, in pixels with rows downwards.
         rotation = np.array([[math.cos(angle), math.sin(angle)], [-math.sin(angle), math.cos(angle)]])
-        motion = np.eye(3)
-        motion[:2, :2], motion[:2, 2] = rotation, center - rotation @ center + shift
-        found.append((float(worth[row, column]), motion))
+        for _ in range(1 if count <= 2 else 2):
+            row, column = np.unravel_index(int(np.argmax(worth)), worth.shape)
+            shift = np.array([columns[column], rows[row]]) / scale
+            motion = np.eye(3)
+            motion[:2, :2], motion[:2, 2] = rotation, center - rotation @ center + shift
+            found.append((float(worth[row, column]), motion))
+            around = (np.abs(rows - rows[row]) < 8)[:, None] & (np.abs(columns - columns[column]) < 8)[None]
+            worth[around] = -np.inf
     found.sort(key=lambda one: -one[0])
-    return [motion for _, motion in found[:2]]
+    return [motion for _, motion in found[:count]]
 
 
 def _soft(roads: AnyArray, size: tuple[int, int]) -> AnyArray:

@@ -18,7 +18,9 @@ from scipy.optimize import least_squares
 from roadgeo._arrays import AnyArray, FloatArray
 from roadgeo.geometry.frame import Frame
 from roadgeo.geometry.homography import Homography
-from roadgeo.geometry.mask import RoadMask
+from roadgeo.geometry.mask import PIXEL_TO_PLANE, RoadMask
+from roadgeo.matching.checking import check_place
+from roadgeo.matching.query import trace_query
 from roadgeo.reference.reference import Reference
 from roadgeo.roads.vectorization import road_width
 from roadgeo.running.flights.mosaic import lay_down
@@ -112,6 +114,7 @@ class _Net:
         tracker, why = Tracker(references, self.options), "no roads are seen"
         for chosen in [range(len(self.frames)), *([k] for k in range(len(self.frames)) if len(self.frames) > 1)]:
             placed, said = self._locate(tracker, list(chosen), references)
+            placed = [one for one in placed if self._stands(one)]
             if placed:
                 surest = max(placed, key=lambda one: one.log10_odds)
                 return self._spread(tracker, self.frames.index(surest.frame), surest)
@@ -129,7 +132,11 @@ class _Net:
         mosaic = lay_down(masks, self.matrices[list(chosen)], _road_px(masks), self.options.mosaic)
         if mosaic is None:
             return [], "the frames do not fit together on one plane"
-        location = locate(mosaic.mask, references, tracker.look_options(mosaic, masks))
+        options = tracker.look_options(mosaic, masks)
+        paid = math.log10(1 + len(self.frames))  # so many searches are made: each could agree by chance
+        location = locate(
+            mosaic.mask, references, replace(options, min_log10_odds=round(options.min_log10_odds + paid, 1))
+        )
         if not location.located:
             return [], f"{len(frames)} frames together: {location.reason}"
         placed = [one for one in tracker.place(location, mosaic, frames) if one.status == "located"]
@@ -145,10 +152,21 @@ class _Net:
             motion = link.motion if at == link.one else np.asarray(np.linalg.inv(link.motion), float)
             frame = replace(self.frames[to], motion=motion, motion_px=self.strips.link_px)
             beside = tracker.place_beside(known[at], frame)
-            if beside.status == "located" or (beside.status == "predicted" and math.isnan(beside.log10_odds)):
+            if self._stands(beside):
                 known[to] = beside
         why = "its roads do not agree with the map where its neighbours put it"
         return [known.get(k, Tracked(one, "lost", why, one.number)) for k, one in enumerate(self.frames)]
+
+    def _stands(self, one: Tracked) -> bool:
+        """Whether a frame is where it was put, and not a block beside; one without roads has nothing to say."""
+        if one.status == "predicted":
+            return math.isnan(one.log10_odds)
+        if one.status != "located" or one.pose is None or one.reference is None:
+            return False
+        scene = trace_query(one.frame.mask, self.options.locate.query)[0]
+        start = one.pose.homography.matrix @ PIXEL_TO_PLANE
+        checked = check_place(start / start[2, 2], scene, one.reference.index, self.options.candidates.check)
+        return checked.verdict == "agrees"
 
 
 def _road_px(masks: Sequence[RoadMask]) -> float:
@@ -162,19 +180,17 @@ def find_links(frames: Sequence[FlightFrame], greys: Sequence[AnyArray | None]) 
     for i, j in combinations(range(len(frames)), 2):
         if frames[i].mask.shape != frames[j].mask.shape:
             continue
-        found = _link(traced[i], traced[j], greys[i], greys[j])
-        if found is not None:
-            links.append(Link(i, j, *found))
+        links += [Link(i, j, *found) for found in _link(traced[i], traced[j], greys[i], greys[j])]
     return links
 
 
 def _link(
     one: TracedMask | None, other: TracedMask | None, grey: AnyArray | None, other_grey: AnyArray | None
-) -> tuple[FloatArray, float] | None:
+) -> list[tuple[FloatArray, float]]:
     if grey is not None and other_grey is not None:
         motion = between_images(grey, other_grey)
-        return None if motion is None else (motion, 1.0)
-    return None if one is None or other is None else overlay(one, other)
+        return [] if motion is None else [(motion, 1.0)]
+    return [] if one is None or other is None else overlay(one, other)
 
 
 def find_nets(
