@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import json
 import os
 from collections.abc import Iterable, Sequence
 from dataclasses import dataclass, field, fields, replace
@@ -145,7 +146,7 @@ def build_reference(
         A path is a road file or a folder of them. Arrays are of shape (N, 2), x or longitude first, one for each line;
         or a single one, where rows of NaN stand between the lines.
     name : str
-        What the reference is called.
+        What the reference is called. Default: as the file at `path`, if that is given.
     crs : anything that pyproj knows, optional
         CRS of the coordinates. Needed for shapely lines and arrays, and for files that do not say.
     path : path, optional
@@ -168,7 +169,8 @@ def build_reference(
     from roadgeo.workflows import build_reference as build
 
     chosen = choose_roads(roads, kinds, tunnels, attribution, crs=crs)
-    return build(chosen, name, options, path=None if path is None else Path(path))
+    where = None if path is None else Path(path)
+    return build(chosen, name or (where.stem if where else ""), options, path=where)
 
 
 def locate(
@@ -228,10 +230,28 @@ def locate(
         sighting = Sighting(locate_mask(mask, references, options), mask)
     else:
         sighting = locate_query(read_picture(mask), references, options)
+    told = {"options": _told(options), "reference_digest": _digest(references, sighting.location)}
     found = {one.name: getattr(sighting.location, one.name) for one in fields(Location)}
     indexes = tuple(one.index_of(sighting.location) for one in references)
     photo = str(mask) if sighting.of_photograph else None
-    return Answer(**found, mask=sighting.mask, photo=photo, indexes=indexes)
+    return Answer(**{**found, **told}, mask=sighting.mask, photo=photo, indexes=indexes)
+
+
+def _told(options: LocateOptions) -> dict[str, Any]:
+    """Return the options that differ from the usual ones, as the command line writes them down."""
+    from roadgeo.running.batch import changed_options
+
+    plain: dict[str, Any] = json.loads(json.dumps(changed_options(replace(options, truths=()), LocateOptions())))
+    return plain
+
+
+def _digest(references: Sequence[AnyReference], location: Location) -> str:
+    """Return the digest of the reference of a place, else of all; those that were not written have none."""
+    from roadgeo.reference.inspection import reference_digest
+
+    here = [one for one in references if one.name == location.reference][:1] or references
+    paths = [one.index.path if isinstance(one, Reference) else one.path for one in here]
+    return ", ".join(reference_digest(path) for path in paths if path)
 
 
 def _open(reference: References) -> list[AnyReference]:

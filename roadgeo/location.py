@@ -348,7 +348,7 @@ class Location:
         """Say the answer in one line."""
         if self.center is None:
             return f"<Location {self.query!r}: {self.status}, {self.reason}>"
-        place = f"{self.center.lat:.6f}, {self.center.lon:.6f} on {self.reference}"
+        place = f"{self.center.lat:.6f}, {self.center.lon:.6f}" + (f" on {self.reference}" if self.reference else "")
         score = "" if self.log10_odds is None else f", log10 odds {self.log10_odds:.1f}"
         return f"<Location {self.query!r}: {self.status} at {place}{score}>"
 

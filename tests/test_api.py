@@ -1,5 +1,6 @@
 """What Python programs call, with all that they may have at hand."""
 
+import json
 from pathlib import Path
 
 import cv2
@@ -11,6 +12,8 @@ import roadgeo
 from roadgeo.errors import MaskError, NotLocatedError
 from roadgeo.evaluation.demo import PHOTO, ROADS, demo_masks
 from roadgeo.matching.options import LocateOptions
+from roadgeo.reference.inspection import reference_digest
+from roadgeo.sources.roads import read_roads
 
 DRONE = next(mask.path for mask in demo_masks() if mask.path.stem == "drone")
 QUICK = LocateOptions(effort="quick")
@@ -75,6 +78,20 @@ def test_references_go_by_path_and_by_name(
     porto.save(tmp_path / "porto.gpkg")
     for reference in ((), "porto", tmp_path / "porto.gpkg", [porto, "porto"]):
         assert roadgeo.locate(DRONE, reference, QUICK).located
+
+
+def test_an_answer_says_what_was_asked_and_of_which_map(porto: roadgeo.Reference, tmp_path: Path) -> None:
+    """As the JSON of the command line does, but for the command."""
+    built = roadgeo.build_reference(ROADS, path=tmp_path / "city.gpkg")
+    assert repr(built) == f"<Reference 'city': 2,649 intersections, EPSG:32629, {tmp_path / 'city.gpkg'}>"
+    found = roadgeo.locate(DRONE, built, QUICK, gsd=1.0)
+    assert found.options == {"effort": "quick", "match": {"camera": {"gsd_m": [0.8, 1.25]}}}
+    assert found.reference_digest == reference_digest(tmp_path / "city.gpkg")
+    for one in (porto, porto.index, found, found.mask, read_roads(ROADS), roadgeo.explain(found.mask, built, QUICK)):
+        assert "\n" not in repr(one)
+        assert len(repr(one)) < 200
+    (written,) = (path for path in found.write(tmp_path) if path.suffix == ".json")
+    assert json.loads(written.read_text())["reference_digest"] == found.reference_digest
 
 
 def test_what_is_known_narrows_the_search(porto: roadgeo.Reference) -> None:

@@ -54,6 +54,11 @@ class RoadMask:
     name: str = ""
     probability: AnyArray | None = None
 
+    def __repr__(self) -> str:
+        """Say in one line what it is."""
+        height, width = self.roads.shape
+        return f"<RoadMask {self.name!r}: {width} x {height} pixels, {self.roads.mean():.1%} road>"
+
     @property
     def shape(self) -> tuple[int, int]:
         """(H, W)."""

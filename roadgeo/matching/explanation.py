@@ -188,6 +188,10 @@ class Explanation:
     graph: RoadGraph
     stories: tuple[Story, ...]
 
+    def __repr__(self) -> str:
+        """Say the answer in one line."""
+        return f"<Explanation of {self.location!r}, on {len(self.stories)} references>"
+
     @property
     def nearest(self) -> Story:
         """The story of the reference that the mask was located on, or else came nearest to it."""

@@ -118,6 +118,10 @@ class ReferenceIndex:
         """N."""
         return len(self.xy)
 
+    def __repr__(self) -> str:
+        """Say in one line what it is."""
+        return f"<ReferenceIndex {self.name!r}: {len(self):,} intersections>"
+
     @property
     def name(self) -> str:
         """What the user calls the reference."""

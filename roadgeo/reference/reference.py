@@ -50,6 +50,11 @@ class Reference:
     index: ReferenceIndex
     network: RoadNetwork | None = None
 
+    def __repr__(self) -> str:
+        """Say in one line what it is."""
+        lies = self.index.path or "not written"
+        return f"<Reference {self.name!r}: {len(self.index):,} intersections, {self.index.meta['crs']}, {lies}>"
+
     @property
     def name(self) -> str:
         """What the user calls it."""

@@ -35,6 +35,7 @@ if TYPE_CHECKING:
 
 __all__ = [
     "Outcome",
+    "changed_options",
     "locate_masks",
     "open_references",
     "write_overview",
@@ -197,9 +198,9 @@ class _Locating:
         usual = BatchOptions()
         reading = replace(self.reading, images={}, threads=ReadOptions.threads)
         told = {
-            **_changed(replace(self.options.search, truths=()), usual.search),
-            **_changed(reading, usual.reading),
-            **_changed(self.outputs.image, usual.outputs.image),
+            **changed_options(replace(self.options.search, truths=()), usual.search),
+            **changed_options(reading, usual.reading),
+            **changed_options(self.outputs.image, usual.outputs.image),
         }
         plain: dict[str, Any] = json.loads(json.dumps(told))
         return plain
@@ -328,13 +329,13 @@ class _Asked:
         return same_maps and (options is None or options == self.options)
 
 
-def _changed(options: Any, usual: Any) -> dict[str, Any]:
+def changed_options(options: Any, usual: Any) -> dict[str, Any]:
     """Return the fields of options that differ from the usual ones; of nested ones likewise."""
     changed = {}
     for one in dataclasses.fields(options):
         value, default = getattr(options, one.name), getattr(usual, one.name)
         if value != default:
-            changed[one.name] = _changed(value, default) if dataclasses.is_dataclass(value) else value
+            changed[one.name] = changed_options(value, default) if dataclasses.is_dataclass(value) else value
     return changed
 
 

@@ -72,6 +72,10 @@ class Roads:
         """L."""
         return len(self.lines)
 
+    def __repr__(self) -> str:
+        """Say in one line what it is."""
+        return f"<Roads: {len(self):,} lines, {self.plane.crs[:40]}>"
+
 
 def read_roads(
     path: str | os.PathLike[str] | Sequence[str | os.PathLike[str]],
