@@ -8,7 +8,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 from worlds.scenes import camera
 
-from roadgeo.geometry.camera import CameraFault, CameraOptions, judge, pose
+from roadgeo.geometry.camera import _USUAL_FOCAL, CameraFault, CameraOptions, judge, pose
 
 SIZE = (1200, 900)
 OPTIONS = CameraOptions()
@@ -148,3 +148,59 @@ def test_what_is_known_of_the_tilt_narrows_what_is_looked_for():
     assert sigmas == sorted(sigmas)
     assert sigmas[0] < 0.05
     assert sigmas[-1] == 0.4
+
+
+@pytest.mark.parametrize(("rough", "slack_deg", "slack"), [(False, 5.0, 1.0), (True, 15.0, 1.25)])
+def test_limits_are_where_they_are_said_to_be(rough, slack_deg, slack):
+    def fault(matrix, **options):
+        return judge(matrix, SIZE, CameraOptions(**options), rough)
+
+    for tilt, expected in [(30.0 + slack_deg - 0.2, None), (30.0 + slack_deg + 0.2, CameraFault.TILT)]:
+        seen = camera((0, 0), SIZE, 1.0, tilt, 20.0, 60.0, 3000.0)
+        assert fault(seen, max_tilt_deg=30.0, focal_px=3000.0) is expected
+    for gsd in (0.5 / slack * 0.99, 1.5 * slack * 1.01):
+        assert fault(camera((0, 0), SIZE, gsd), gsd_m=(0.5, 1.5)) is CameraFault.SAMPLING
+    for gsd in (0.5 / slack * 1.01, 1.5 * slack * 0.99):
+        assert fault(camera((0, 0), SIZE, gsd), gsd_m=(0.5, 1.5)) is None
+    for heading, expected in [(slack_deg - 0.1, None), (slack_deg + 0.1, CameraFault.NOT_NORTH_UP)]:
+        assert fault(camera((0, 0), SIZE, 1.0, 0.0, 0.0, heading), north_up=True) is expected
+        assert fault(camera((0, 0), SIZE, 1.0, 0.0, 0.0, -heading), north_up=True) is expected
+    for stretch, expected in [(0.35 * slack - 0.01, None), (0.35 * slack + 0.01, CameraFault.SKEW)]:
+        assert fault(np.diag([1.0, np.exp(stretch), 1.0])) is expected
+
+
+@pytest.mark.parametrize("side", [-1.0, 1.0])
+@pytest.mark.parametrize("axis", [0, 1])
+def test_the_horizon_must_not_come_too_near_to_a_corner(axis, side):
+    """The least w over the frame is at least a twentieth of that in its middle."""
+    for least, too_near in [(0.049, True), (0.051, False)]:
+        about_middle = np.eye(3)
+        about_middle[2, axis] = side * (1.0 - least) / (SIZE[axis] / 2)  # w = 1 in the middle
+        matrix = about_middle @ np.array([[1.0, 0, -SIZE[0] / 2], [0, 1, SIZE[1] / 2], [0, 0, 1]])
+        assert (judge(matrix, SIZE, OPTIONS) is CameraFault.HORIZON) is too_near
+
+
+def test_a_middle_on_the_horizon_is_degenerate():
+    assert judge(np.array([[1.0, 0, 0], [0, 1, 0], [1, 0, -600]]), SIZE, OPTIONS) is CameraFault.DEGENERATE
+
+
+def test_skew_is_the_greater_of_shear_and_stretch():
+    assert pose(np.diag([1.0, 2.2, 1.0]), SIZE).skew == pytest.approx(np.log(2.2))
+    assert pose(np.diag([2.2, 1.0, 1.0]), SIZE).skew == pytest.approx(np.log(2.2))
+    sheared = pose(np.array([[1.0, 0.3, 0], [0, 1, 0], [0, 0, 1]]), SIZE)
+    assert sheared.skew == pytest.approx(0.3 / np.sqrt(1.09))
+    assert sheared.gsd_m == pytest.approx(1.0)
+
+
+def test_a_lens_is_assumed_to_be_a_usual_one():
+    usual = pose(camera((0, 0), SIZE, 1.0), SIZE)
+    assert usual.source == "assumed"
+    assert usual.focal_px == pytest.approx(_USUAL_FOCAL * np.hypot(*SIZE) / 2, rel=0.1)
+
+
+def test_what_is_known_of_the_tilt_in_figures():
+    assert CameraOptions(max_tilt_deg=0.0).min_shape_ratio == pytest.approx(0.85 * np.cos(np.radians(25.0)))
+    assert CameraOptions(max_tilt_deg=30.0).min_shape_ratio == pytest.approx(0.85 * np.cos(np.radians(55.0)))
+    assert CameraOptions(max_tilt_deg=89.0).min_shape_ratio == 0.33
+    assert CameraOptions(max_tilt_deg=5.0).perspective_sigma(9.0) == pytest.approx(0.03 + 0.7 * np.tan(np.radians(5)))
+    assert CameraOptions(max_tilt_deg=89.0).perspective_sigma(9.0) == pytest.approx(0.03 + 0.7 * np.tan(np.radians(80)))

@@ -66,3 +66,23 @@ def test_beyond_the_horizon_there_is_no_image(w):
 def test_a_last_element_of_zero_is_left_alone():
     matrix = np.array([[1.0, 0, 0], [0, 1, 0], [0, 1, 0]])
     assert np.array_equal(Homography(matrix).normalised().matrix, matrix)
+
+
+@given(homographies())
+def test_derivatives_by_elements_are_the_limits_of_differences(H):
+    step = 1e-6
+    derivatives = H.by_elements(POINTS)
+    assert derivatives.shape == (len(POINTS), 2, 8)
+    for k in range(8):
+        moved = step * np.eye(9)[k].reshape(3, 3)
+        difference = (Homography(H.matrix + moved)(POINTS) - Homography(H.matrix - moved)(POINTS)) / (2 * step)
+        assert np.allclose(derivatives[..., k], difference, rtol=1e-3, atol=1e-3)
+
+
+def test_everywhere_maps_what_lies_beyond_the_horizon_too():
+    H = Homography(np.array([[2.0, 0, 0], [0, 1, 0], [0, 1, -1]]))
+    points = np.array([[3.0, 0.0], [3.0, 3.0]])
+    assert H.everywhere(points).tolist() == [[-6.0, 0.0], [3.0, 1.5]]
+    assert H.ahead(points).tolist() == [False, True]
+    assert H.facing(points[0]).matrix.tolist() == (-H.matrix).tolist()
+    assert H.facing(points[1]) is H

@@ -5,7 +5,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from roadgeo.geometry.pinhole import make_view, sees_ground, warp_mask
+from roadgeo.geometry.pinhole import make_view, polygon_area, sees_ground, warp_mask
 
 CENTER = (1000.0, 2000.0)
 
@@ -69,3 +69,23 @@ def test_a_mask_warped_by_nothing_stays():
     warped, matrix = warp_mask(mask, 0.0, 0.0, 0.0)
     assert np.array_equal(warped, mask)
     assert matrix / matrix[2, 2] == pytest.approx(np.eye(3), abs=1e-12)
+
+
+def test_the_ray_to_the_corner_decides_whether_the_ground_is_seen():
+    """A corner 50 pixels up and aside of a lens of 100: its ray is 85 degrees from the vertical at 57.96 of tilt."""
+    assert sees_ground(make_view(CENTER, (100, 100), 1.0, 57.8))
+    assert not sees_ground(make_view(CENTER, (100, 100), 1.0, 58.1))
+
+
+def test_w_is_one_in_the_middle_and_the_lens_as_long_as_the_frame():
+    view = make_view(CENTER, (120, 80), 0.7, 35.0, 20.0, 50.0)
+    assert view.focal_px == 120.0
+    assert view.homography.matrix[2] @ (60.0, 40.0, 1.0) == pytest.approx(1.0)
+    pixel = np.array([20.0, 70.0])
+    area = abs(np.linalg.det(view.homography.jacobian(pixel)))
+    assert float(view.sampling(pixel)) == pytest.approx(np.sqrt(area))
+
+
+def test_areas_of_polygons():
+    triangle = np.array([[1.0, 1.0], [5.0, 1.0], [1.0, 4.0]])
+    assert polygon_area(triangle) == polygon_area(triangle[::-1]) == 6.0
