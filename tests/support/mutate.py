@@ -123,6 +123,10 @@ class Loop:
             self.jobs = random.Random(seed).sample(self.jobs, sample)
 
     def pytest_runtestloop(self, session: pytest.Session) -> bool:
+        from hypothesis import Phase, settings  # pytest wants to be the first to import it
+
+        settings.register_profile("first failure", settings(phases=[Phase.explicit, Phase.generate]))
+        settings.load_profile("first failure")  # what fails need not be made small
         assert self.passes(session, None, None), "the tests must pass before anything is changed"
         for module, where, tree in self.jobs:
             survived = self.passes(session, module, tree)
@@ -138,11 +142,14 @@ class Loop:
             return os.waitpid(child, 0)[1] == 0
         signal.setitimer(signal.ITIMER_PROF, SECONDS)
         status = 1
+        items = session.items
+        if module is not None:  # the tests of what was changed come first
+            items = sorted(items, key=lambda item: not item.path.stem.endswith(module.__name__.rpartition(".")[2]))
         with contextlib.suppress(BaseException):
             if module is not None and tree is not None:
                 install(module, tree)
-            for n, item in enumerate(session.items):
-                following = session.items[n + 1] if n + 1 < len(session.items) else None
+            for n, item in enumerate(items):
+                following = items[n + 1] if n + 1 < len(items) else None
                 item.config.hook.pytest_runtest_protocol(item=item, nextitem=following)
                 if session.testsfailed:
                     break
