@@ -48,15 +48,19 @@ class Lens:
         scale = np.divide(self._radius(seen), seen, out=np.ones_like(seen), where=seen > 0)
         return np.asarray(self.center + self.half_side * offset * scale[..., None])
 
-    def straighten_directions(self, points: FloatArray, directions: FloatArray) -> FloatArray:
-        """Take (..., 2) unit vectors at such points along."""
+    def stretch(self, points: FloatArray) -> FloatArray:
+        """Return the derivative (..., 2, 2) of `straighten(points)` by the points."""
         offset = (points - self.center) / self.half_side
         seen = np.hypot(offset[..., 0], offset[..., 1])
         square = self._radius(seen) ** 2
         radial = np.divide(offset, seen[..., None], out=np.zeros_like(offset), where=seen[..., None] > 0)
-        along = (directions * radial).sum(axis=-1, keepdims=True)
         across, outwards = 1.0 / (1.0 + self.k1 * square), 1.0 / (1.0 + 3.0 * self.k1 * square)
-        turned = across[..., None] * directions + ((outwards - across)[..., None] * along) * radial
+        along = radial[..., :, None] * radial[..., None, :]
+        return np.asarray(across[..., None, None] * np.eye(2) + (outwards - across)[..., None, None] * along)
+
+    def straighten_directions(self, points: FloatArray, directions: FloatArray) -> FloatArray:
+        """Take (..., 2) unit vectors at such points along."""
+        turned = (self.stretch(points) @ directions[..., None])[..., 0]
         return np.asarray(turned / np.linalg.norm(turned, axis=-1, keepdims=True))
 
     def bend(self, points: FloatArray) -> FloatArray:
@@ -77,6 +81,8 @@ class Lens:
 
     def _radius(self, seen: FloatArray) -> FloatArray:
         """Solve r (1 + k1 r^2) = seen, by Newton's method from where it converges."""
+        if self.k1 == 0.0:
+            return seen
         farthest = self._farthest()
         if math.isfinite(farthest):
             seen = np.minimum(seen, farthest * (1.0 + self.k1 * farthest**2))

@@ -15,7 +15,15 @@ from roadgeo.geometry.homography import Homography
 from roadgeo.matching.growing import PATIENT, GrowOptions, grow_proposals, screen_proposals
 from roadgeo.matching.hypothesis import MINIMAL, Hypothesis, Lead
 from roadgeo.matching.index import ReferenceIndex
-from roadgeo.matching.lens import LensOptions, find_lens, straighten_scene
+from roadgeo.matching.lens import (
+    LensFit,
+    LensOptions,
+    core_excess,
+    find_lens,
+    is_significant,
+    regrow,
+    straighten_scene,
+)
 from roadgeo.matching.refinement import RefineOptions, refine
 from roadgeo.matching.road_growth import Grown
 from roadgeo.matching.road_search import RoadSearch, RoadSearchOptions
@@ -117,6 +125,8 @@ class TripleEstimator:
         # The least that chance reached at the places verified so far: a place that is not promising against it is none.
         self.least_chance = np.array([0.05, 0.2, 0.05])
         self.n_nulls = 0
+        self._lenses_tried = False
+        self._dropped: list[Hypothesis] = []
         self._whole: list[Hypothesis] = []  # verified, and no better version of them is to be expected
         self.scene = scene
         self.index = index
@@ -136,6 +146,8 @@ class TripleEstimator:
             yield self._sweep(stage, source, options.grow)
         if options.roads is not None and len(self.scene.intersections):
             yield self._rounds_of_roads(options.roads)
+        if options.lens is not None and options.last:
+            yield self._rounds_of_lenses(options.lens)
         for stage, source in enumerate(options.last, len(options.sweeps) + 1):
             yield self._sweep(stage, source, options.last_grow)
 
@@ -305,9 +317,14 @@ class TripleEstimator:
     def score(self, model: Hypothesis) -> float:
         """Refine a hypothesis and return its log10 odds."""
         started = time.perf_counter()
-        model.log10_odds = self._verify(model)
-        if model.log10_odds >= self.options.verify.promising:
+        if model.lens is None:
+            model.log10_odds = self._verify(model)
+        if model.lens is not None:
+            self._see_through(model, model.lens)
+        elif model.log10_odds >= self.options.verify.promising:
             self._look_through_lens(model)
+        elif model.refined is not None and not self._lenses_tried:
+            self._dropped.append(model)
         self.refine_s += time.perf_counter() - started
         self.trace.scored(model)
         if not model.by_roads and self._fits_whole(model):
@@ -340,16 +357,47 @@ class TripleEstimator:
         lens = find_lens(refined.matrix, self.scene, index, agreeing.forward, self.refine_options, options.lens)
         if lens is None or self.judge(lens.matrix) is not None or self._is_far(lens.matrix):
             return
-        scene, gsd = straighten_scene(self.scene, lens.k1), sampling(lens.matrix, self.scene.size)
-        seeds = model.seeds[-MINIMAL:]
-        found, matched, distance = agreement(lens.matrix, scene, index, gsd, seeds, options.verify)
-        chance = chance_agreement(lens.matrix, scene, index, gsd, options.verify)
-        odds = log10_odds(found, chance, scene.n_edges, self.n_screened, options.verify)
-        if odds < model.log10_odds or found.forward < agreeing.forward:
+        seen = replace(model)
+        self._see_through(seen, lens)
+        if seen.found is None or seen.log10_odds < model.log10_odds or seen.found.forward < agreeing.forward:
             return
+        model.refined, model.matrix, model.gsd_m = seen.refined, seen.matrix, seen.gsd_m
+        model.found, model.chance, model.log10_odds = seen.found, seen.chance, seen.log10_odds
+        model.matched, model.distance = seen.matched, seen.distance
+
+    def _see_through(self, model: Hypothesis, lens: LensFit) -> None:
+        """Verify a hypothesis as seen through a lens."""
+        index, verify = self.index, self.options.verify
+        scene = straighten_scene(self.scene, lens.k1) if lens.k1 else self.scene
         model.refined, model.matrix = lens.refined, lens.matrix
-        model.found, model.chance, model.log10_odds = found, chance, odds
-        model.matched, model.distance, model.gsd_m = matched, distance, gsd
+        model.gsd_m = gsd = sampling(lens.matrix, scene.size)
+        seeds = model.seeds[-MINIMAL:]
+        model.found, model.matched, model.distance = agreement(lens.matrix, scene, index, gsd, seeds, verify)
+        model.chance = chance_agreement(lens.matrix, scene, index, gsd, verify)
+        model.log10_odds = log10_odds(model.found, model.chance, scene.n_edges, self.ledger.n_tried, verify)
+
+    def _rounds_of_lenses(self, options: LensOptions) -> Iterator[list[Hypothesis]]:
+        """Yield places that were dropped and that fit after all when grown anew, behind a lens."""
+        scene, index, refinement = self.scene, self.index, self.refine_options
+        self._lenses_tried = True
+        gains = [core_excess(one.matrix, scene, index, refinement, options) for one in self._dropped]
+        places: list[Hypothesis] = []
+        for k in np.argsort(-np.array(gains), kind="stable"):
+            one = self._dropped[k]
+            twin = next((other for other in places if self.same(one, other)), None)
+            if twin is not None:
+                twin.leads += [lead for lead in one.leads if lead not in twin.leads]
+            elif len(places) < options.max_places:
+                places.append(one)
+        for one in places:
+            self.n_verified += 1
+            found = regrow(one.matrix, scene, index, refinement, options)
+            if found is None or self.judge(found.matrix) is not None or self._is_far(found.matrix):
+                yield []
+            elif is_significant(found, scene, options):
+                yield [replace(one, lens=found)]
+            else:  # no lens: it had not grown over the whole frame
+                yield [replace(one, matrix=found.matrix, refined=None, by_roads=True)]
 
     def scene_of(self, model: Hypothesis) -> Scene:
         """Return the scene as a pinhole sees it, behind the lens that a hypothesis found."""

@@ -9,6 +9,7 @@ import numpy as np
 
 from roadgeo._arrays import FloatArray, IntArray
 from roadgeo.geometry.camera import CameraFault
+from roadgeo.matching.lens import LensFit
 from roadgeo.matching.refinement import Refined
 from roadgeo.matching.verification import Agreement
 
@@ -26,7 +27,8 @@ class Hypothesis:
     """A grown hypothesis and what came of it.
 
     `by_roads`: it grew by roads over the whole frame; `leads`: the intersections of the query that proposed it, each
-    with the number of the stage in which it did; `fault`: the camera's last objection, None where it had none.
+    with the number of the stage in which it did; `fault`: the camera's last objection, None where it had none; `lens`:
+    how it fits when it is grown anew behind a lens.
     """
 
     matrix: FloatArray
@@ -41,6 +43,7 @@ class Hypothesis:
     log10_odds: float = -np.inf
     fault: CameraFault | None = None
     by_roads: bool = False
+    lens: LensFit | None = None
     leads: list[Lead] = field(default_factory=list)
 
     @property

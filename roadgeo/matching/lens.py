@@ -8,25 +8,32 @@ from dataclasses import dataclass, replace
 import cv2
 import numpy as np
 
-from roadgeo._arrays import BoolArray, FloatArray
+from roadgeo._arrays import FloatArray
 from roadgeo.geometry.lens import Lens
-from roadgeo.kernels.residuals import road_residuals
 from roadgeo.matching.index import ReferenceIndex
+from roadgeo.matching.lens_equations import LensEquations
 from roadgeo.matching.refinement import (
     Refined,
     RefineOptions,
     corner_covariance,
     corner_sigmas,
     denormalise,
-    normalise,
-    refine,
+    robust_rms,
     scatter_m,
-    spacing_m,
 )
 from roadgeo.matching.scene import Scene
 from roadgeo.roads.intersections import Intersections
 
-__all__ = ["LensFit", "LensOptions", "find_lens", "fit_lens", "straighten_scene"]
+__all__ = [
+    "LensFit",
+    "LensOptions",
+    "core_excess",
+    "find_lens",
+    "fit_lens",
+    "is_significant",
+    "regrow",
+    "straighten_scene",
+]
 
 
 @dataclass(frozen=True)
@@ -43,23 +50,49 @@ class LensOptions:
         k1 counts when it is so many of its standard deviations from 0 ...
     least_px : float
         ... and moves the frame's corners by at least so much.
-    linear_sigma, place_sigma_m, perspective_sigma : float
-        How far off the homography may be that the fit begins with.
+    n_cells, core_share : int, float
+        The frame is divided into so many cells a side. The fit begins with those around the one where most road points
+        lie on roads, as far as they do in this part of its share.
+    fewest : int
+        Road points that a fit needs.
+    slack : float
+        While a fit grows, places may be so many times further off than it says.
     starts : tuple of float
         Values of k1 to begin with in turn, where beginning with 0 does not explain enough.
     n_iterations : int
         At most.
+    soon, hopeless : int, float
+        A fit that after so many iterations has met less than this share of the road points is given up: wrong places
+        end at 0.2 to 0.4, right ones at 0.75 to 0.9 (training masks).
+    max_places : int
+        So many places that were dropped are grown anew, those first where most road points in one part of the frame
+        lie on roads beyond the share `chance_share` ...
+    quick_points, quick_starts : int, tuple of float
+        ... first with so many road points and these values of k1 to begin with ...
+    least_share : float
+        ... and verified where so many of them end on roads.
+    center_sigma_px : float
+        Standard deviation of the place of the lens's middle in each direction: conventions differ by half a pixel.
     """
 
     enough: float = 0.8
     sigma: float = 0.1
     significance: float = 5.0
     least_px: float = 3.0
-    linear_sigma: float = 0.02
-    place_sigma_m: float = 5.0
-    perspective_sigma: float = 0.05
+    n_cells: int = 10
+    core_share: float = 0.75
+    fewest: int = 12
+    slack: float = 2.0
     starts: tuple[float, ...] = (-0.15, -0.08, 0.08)
-    n_iterations: int = 14
+    n_iterations: int = 30
+    soon: int = 8
+    hopeless: float = 0.4
+    max_places: int = 12
+    chance_share: float = 0.3
+    quick_points: int = 300
+    quick_starts: tuple[float, ...] = (0.0, -0.07, -0.15)
+    least_share: float = 0.6
+    center_sigma_px: float = 0.5
 
 
 @dataclass(frozen=True)
@@ -84,56 +117,6 @@ class LensFit:
         return self.refined.matrix
 
 
-class _Problem:
-    """Road points of a scene on one map, as nine parameters see them: eight of the homography, and k1."""
-
-    def __init__(self, matrix: FloatArray, scene: Scene, index: ReferenceIndex, options: RefineOptions) -> None:
-        self.scene, self.options = scene, options
-        self.p, self.origin, self.unit = normalise(matrix, scene.center, scene.half_size)
-        self.roads = index.road_buckets
-        gsd = self.unit / scene.half_size
-        self.sigma_m = math.hypot(options.sigma_m, options.sigma_px * gsd)
-        self.max_radius = options.max_radius_m + options.max_radius_px * gsd
-        self.weight = min(1.0, spacing_m(scene, self.unit) / options.correlation_m)
-        self.min_cos = math.cos(math.radians(options.max_turn_deg))
-
-    def rows(self, k1: float) -> tuple[FloatArray, FloatArray, FloatArray]:
-        """Return places (S, 2) and unit directions (S, 2) on the map, and derivatives (S, 2, 9) of the places."""
-        scene, p = self.scene, self.p
-        lens = Lens.of(k1, scene.size, y_up=True)
-        uv = (lens.straighten(scene.points) - scene.center) / scene.half_size
-        turned = lens.straighten_directions(scene.points, scene.directions)
-        linear, w = p[:6].reshape(2, 3), 1.0 + uv @ p[6:8]
-        w = np.where(w < 0.02, np.nan, w)[:, None]
-        xy = (uv @ linear[:, :2].T + linear[:, 2]) / w
-        jacobian = (linear[None, :, :2] - xy[:, :, None] * p[6:8]) / w[:, :, None]
-        along = np.einsum("nij,nj->ni", jacobian, turned)
-        rows = np.zeros((len(uv), 2, 9))
-        for axis in range(2):
-            rows[:, axis, 3 * axis : 3 * axis + 3] = np.c_[uv, np.ones(len(uv))] / w
-        rows[:, :, 6:8] = -xy[:, :, None] * uv[:, None, :] / w[:, :, None]
-        rows[:, :, 8] = np.einsum("nij,nj->ni", jacobian, lens.moves(scene.points) / scene.half_size)
-        return xy, along / np.linalg.norm(along, axis=1, keepdims=True), rows
-
-    def observe(self, k1: float, inverse: FloatArray) -> tuple[FloatArray, FloatArray, FloatArray, BoolArray]:
-        """Find the roads near points whose places are sure enough.
-
-        Return rows (M, 9), residuals (M,) in metres, their standard deviations (M,), and which points (S,) they are of.
-        """
-        xy, along, rows = self.rows(k1)
-        spread = np.einsum("nai,ij,naj->n", rows, inverse, rows)
-        sigma = self.sigma_m * np.sqrt(1.0 + spread)
-        sure = np.isfinite(sigma) & (3.0 * sigma <= self.max_radius)
-        out = np.empty((int(sure.sum()), 3))
-        mapped = np.ascontiguousarray(self.origin + self.unit * xy[sure])
-        road_residuals(mapped, np.ascontiguousarray(along[sure]), 3.0 * sigma[sure], self.min_cos, self.roads, out)
-        met = np.isfinite(out[:, 0])
-        which = sure.copy()
-        which[sure] = met
-        across = np.einsum("nai,na->ni", rows[which], out[met, 1:])
-        return across, out[met, 0], sigma[which], which
-
-
 def fit_lens(
     matrix: FloatArray,
     scene: Scene,
@@ -141,51 +124,65 @@ def fit_lens(
     k1: float = 0.0,
     refinement: RefineOptions | None = None,
     options: LensOptions | None = None,
+    start: float | None = None,
 ) -> LensFit | None:
     """Adjust a homography and k1 to the roads of the map by Gauss-Newton with Cauchy weights; None where that fails.
 
-    Points far out take part when those nearer the middle say where they lie: how sure each is follows from the fit.
+    It begins with the part of the frame that the homography lays on roads, and grows from there: points further out
+    take part when those nearer say where they lie, and how sure each is follows from the fit.
+
+    Parameters
+    ----------
+    matrix : (3, 3)
+        Query plane, as a pinhole behind a lens with `k1` shows it, to reference plane: right to some metres over part
+        of the frame.
+    start : float, optional
+        Value of k1 to begin with, other than `k1`.
     """
     options, refinement = options or LensOptions(), refinement or RefineOptions()
-    problem = _Problem(matrix, scene, index, refinement)
-    sigmas = np.array([options.linear_sigma] * 6 + [options.perspective_sigma] * 2 + [options.sigma])
-    sigmas[[2, 5]] = options.place_sigma_m / problem.unit
-    hold = (problem.sigma_m / problem.unit / sigmas) ** 2
-    inverse = np.diag(1.0 / hold)
-    lasting = np.zeros(9)
-    lasting[6:] = (problem.sigma_m / problem.unit / np.array([refinement.perspective_sigma] * 2 + [options.sigma])) ** 2
-    rms, n_met, last_held = math.inf, 0, options.n_iterations // 2
+    equations = LensEquations(matrix, scene, index, refinement)
+    core, _ = equations.core(k1, options.n_cells, options.core_share)
+    if core.sum() < options.fewest:
+        return None
+    prior = equations.prior(options.sigma)
+    rows = equations.begin(k1, start, core)
+    k1 = k1 if start is None else start
+    inverse = _inverse(rows.reshape(-1, 9), np.full(2 * len(rows), 0.5 * equations.weight), prior)
+    rms, n_met, slack = math.inf, 0, options.slack
     for iteration in range(options.n_iterations):
-        rows, residuals, sigma, _ = problem.observe(k1, inverse)
-        if len(rows) < 12:
+        # Points further out take part as soon as the fit so far says where they lie.
+        rows, residuals, sigma, _ = equations.observe(k1, inverse, slack)
+        if len(rows) < options.fewest or (
+            iteration > options.soon and len(rows) < options.hopeless * len(scene.points)
+        ):
             return None
         weights = 1.0 / (1.0 + (residuals / sigma) ** 2)
-        held = lasting + hold * 0.5**iteration * (iteration < last_held)
-        normal = problem.weight * (rows * weights[:, None]).T @ rows + np.diag(held)
-        right = problem.weight * (rows * weights[:, None]).T @ (residuals / problem.unit)
-        right -= lasting * np.append(np.append(np.zeros(6), problem.p[6:8]), k1)
-        try:
-            inverse = np.asarray(np.linalg.inv(normal), float)
-        except np.linalg.LinAlgError:
-            return None
+        inverse = _inverse(rows, equations.weight * weights, prior)
+        right = equations.weight * (rows * weights[:, None]).T @ (residuals / equations.unit)
+        right[6:] -= prior[6:] * np.append(equations.p[6:8], k1)
         step = inverse @ right
-        problem.p, k1 = problem.p + step[:8], float(np.clip(k1 + step[8], -0.5, 0.5))
-        slope = max(float((weights * (2.0 * weights - 1.0)).sum()), 0.1 * float(weights.sum()))
-        rms = math.sqrt(float(((weights * residuals) ** 2).sum()) * float(weights.sum())) / slope
-        if (
-            iteration > last_held
-            and len(rows) <= n_met
-            and np.abs(step[:8]).max() * problem.unit < refinement.tolerance_m
-        ):
-            break
+        equations.p, k1 = equations.p + step[:8], float(np.clip(k1 + step[8], -0.5, 0.5))
+        if not np.isfinite(step).all():
+            return None
+        rms = robust_rms(residuals, weights)
+        if len(rows) <= n_met and np.abs(step[:8]).max() * equations.unit < refinement.tolerance_m:
+            if slack == 1.0:
+                break
+            slack = 1.0
         n_met = len(rows)
-    covariance = inverse * (scatter_m(rms, problem.sigma_m, refinement) / problem.unit) ** 2
-    if not np.isfinite(covariance).all() or not np.isfinite(problem.p).all():
-        return None
-    found = denormalise(problem.p, scene.center, scene.half_size, problem.origin, problem.unit)
-    corners = corner_covariance(problem.p, covariance[:8, :8], scene, problem.unit, refinement)
+    covariance = inverse * (scatter_m(rms, equations.sigma_m, refinement) / equations.unit) ** 2
+    found = denormalise(equations.p, scene.center, scene.half_size, equations.origin, equations.unit)
+    corners = corner_covariance(equations.p, covariance[:8, :8], scene, equations.unit, refinement)
     refined = Refined(found / found[2, 2], corner_sigmas(corners), rms, corners, k1)
-    return LensFit(refined, math.sqrt(max(covariance[8, 8], 0.0)), n_met / len(scene.points))
+    return LensFit(refined, math.sqrt(max(covariance[8, 8], 0.0)), len(rows) / len(scene.points))
+
+
+def _inverse(rows: FloatArray, weights: FloatArray, prior: FloatArray) -> FloatArray:
+    """Return the inverse of the normal matrix of weighted rows (M, 9) and a diagonal prior (9,); NaN if it has none."""
+    try:
+        return np.asarray(np.linalg.inv((rows * weights[:, None]).T @ rows + np.diag(prior)), float)
+    except np.linalg.LinAlgError:
+        return np.full((9, 9), np.nan)
 
 
 def find_lens(
@@ -200,14 +197,43 @@ def find_lens(
 
     `agreeing` is the share of the mask's roads that agree without a lens.
     """
-    if agreeing >= options.enough and not _hints_at_lens(_Problem(matrix, scene, index, refinement), options):
+    if agreeing >= options.enough and not _hints_at_lens(LensEquations(matrix, scene, index, refinement), options):
         return None
     found = _fit_from_many(matrix, scene, index, refinement, options)
-    if found is None or abs(found.k1) < options.significance * found.k1_sigma:
-        return None
+    return found if found is not None and is_significant(found, scene, options) else None
+
+
+def is_significant(found: LensFit, scene: Scene, options: LensOptions) -> bool:
+    """Whether a fit shows a lens: that of a pinhole finds some k1, too."""
     corners = scene.corners.astype(float)
     moved = Lens.of(found.k1, scene.size, y_up=True).bend(corners) - corners
-    return found if np.hypot(*moved.T).max() >= options.least_px else None
+    return abs(found.k1) >= options.significance * found.k1_sigma and bool(np.hypot(*moved.T).max() >= options.least_px)
+
+
+def core_excess(
+    matrix: FloatArray, scene: Scene, index: ReferenceIndex, refinement: RefineOptions, options: LensOptions
+) -> float:
+    """Return by how many road points the part of the frame that lies on roads exceeds what chance gives there."""
+    core, inside = LensEquations(matrix, scene, index, refinement).core(0.0, options.n_cells, options.core_share)
+    return float(core.sum() - options.chance_share * inside.sum())
+
+
+def regrow(
+    matrix: FloatArray, scene: Scene, index: ReferenceIndex, refinement: RefineOptions, options: LensOptions
+) -> LensFit | None:
+    """Grow a homography anew from the part of the frame that it lays on roads; None where that does not go far."""
+    quick = _thinned(scene, options.quick_points)
+    for k1 in options.quick_starts:
+        rough = fit_lens(matrix, quick, index, 0.0, refinement, options, k1)
+        if rough is not None and rough.share >= options.least_share:
+            return fit_lens(rough.matrix, scene, index, rough.k1, refinement, options)
+    return None
+
+
+def _thinned(scene: Scene, n_points: int) -> Scene:
+    """Return a scene with about so many of its road points."""
+    step = max(1, len(scene.points) // n_points)
+    return replace(scene, points=scene.points[::step], directions=np.ascontiguousarray(scene.directions[::step]))
 
 
 def _fit_from_many(
@@ -215,15 +241,8 @@ def _fit_from_many(
 ) -> LensFit | None:
     """Fit a lens from one value of k1 after another, until enough of the roads lie on roads; return the best."""
     best = None
-    nothing = np.full(len(scene.intersections), -1, np.int64)
     for k1 in (0.0, *options.starts):
-        start = matrix
-        if k1:
-            held = refine(matrix, straighten_scene(scene, k1), index, nothing, refinement, held=True)
-            if held is None:
-                continue
-            start = held.matrix
-        found = fit_lens(start, scene, index, k1, refinement, options)
+        found = fit_lens(matrix, scene, index, 0.0, refinement, options, k1)
         if found is not None and (best is None or found.share > best.share):
             best = found
         if best is not None and best.share >= options.enough:
@@ -231,7 +250,7 @@ def _fit_from_many(
     return best
 
 
-def _hints_at_lens(problem: _Problem, options: LensOptions) -> bool:
+def _hints_at_lens(problem: LensEquations, options: LensOptions) -> bool:
     """Whether one step from a pinhole would make k1 significant."""
     rows, residuals, sigma, _ = problem.observe(0.0, np.zeros((9, 9)))
     if len(rows) < 12:

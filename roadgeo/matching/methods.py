@@ -14,6 +14,7 @@ from roadgeo._arrays import FloatArray, IntArray
 from roadgeo.geometry.homography import Homography
 from roadgeo.geometry.projection import from_lonlat, metres_apart, to_lonlat
 from roadgeo.location import Stats
+from roadgeo.matching.accuracy import with_honest_corners
 from roadgeo.matching.estimator import Ledger, MatchOptions, TripleEstimator
 from roadgeo.matching.hypothesis import Hypothesis
 from roadgeo.matching.index import ReferenceIndex, crop, unpack_tangents
@@ -206,6 +207,7 @@ def _fits(
     estimator: TripleEstimator, result: SearchResult[Hypothesis], promising: Sequence[tuple[float, Hypothesis]]
 ) -> tuple[Fit, ...]:
     """Return the best place, the runner-up, and of the other promising ones the one that agrees best."""
+    _measure_corners(estimator, result.best)
     chosen = [_fit(estimator, result.best, result.score), _fit(estimator, result.runner_up, result.runner_up_score)]
     leaders = [model for model in (result.best, result.runner_up) if model is not None]
     others = [
@@ -217,23 +219,31 @@ def _fits(
     return tuple(filter(None, chosen))
 
 
+def _measure_corners(estimator: TripleEstimator, best: Hypothesis | None) -> None:
+    """Measure how sure the corners of a place are that may be reported."""
+    lens = estimator.options.lens
+    if best is not None and best.refined is not None and best.found is not None and lens is not None:
+        scene, index, options = estimator.scene, estimator.index, estimator.refine_options
+        best.refined = with_honest_corners(best.refined, scene, index, best.found.forward, options, lens)
+
+
 def _fit(estimator: TripleEstimator, model: Hypothesis | None, score: float) -> Fit | None:
     """Return a place that was verified."""
     if model is None or model.refined is None or model.found is None or model.distance is None:
         return None
     if not math.isfinite(score):
         return None
-    found = model.found
+    found, refined = model.found, model.refined
     return Fit(
         estimator.index,
-        model.refined.matrix,
+        refined.matrix,
         model.matched,
         model.distance,
         found.forward,
         score,
-        model.refined.corner_sigma_m,
-        model.refined.corner_covariance_m2,
-        model.refined.lens_k1,
+        refined.corner_sigma_m,
+        refined.corner_covariance_m2,
+        refined.lens_k1,
         (found.rate + found.forward + found.backward) / 3,
     )
 

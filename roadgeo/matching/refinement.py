@@ -22,6 +22,7 @@ __all__ = [
     "denormalise",
     "normalise",
     "refine",
+    "robust_rms",
     "scatter_m",
     "spacing_m",
 ]
@@ -165,6 +166,12 @@ def corner_covariance(
 def scatter_m(rms: float, sigma_m: float, options: RefineOptions) -> float:
     """Return what road points of this rms and standard deviation count as in the covariance of a fit, metres."""
     return rms * max(1.0, rms / (options.usual_rms * sigma_m))
+
+
+def robust_rms(residuals: FloatArray, weights: FloatArray) -> float:
+    """Return the scale of residuals (M,) with Cauchy weights: as of `kernels.adjustment.adjust`."""
+    slopes = max(float((weights * (2.0 * weights - 1.0)).sum()), 0.1 * float(weights.sum()))
+    return math.sqrt(float(((weights * residuals) ** 2).sum()) * float(weights.sum())) / slopes
 
 
 def corner_sigmas(covariance: FloatArray) -> FloatArray:

@@ -7,8 +7,9 @@ import pytest
 from worlds.scenes import Sight, mapped, shaken, sight_of
 
 from roadgeo.geometry.lens import Lens
-from roadgeo.matching.lens import LensOptions, find_lens, fit_lens, straighten_scene
-from roadgeo.matching.refinement import RefineOptions
+from roadgeo.matching.accuracy import with_honest_corners
+from roadgeo.matching.lens import LensOptions, core_excess, find_lens, fit_lens, regrow, straighten_scene
+from roadgeo.matching.refinement import Refined, RefineOptions, refine
 
 
 def through_lens(scene, k1):
@@ -45,3 +46,83 @@ def test_a_lens_is_taken_only_where_it_pays(town, k1, pays):
 def test_roads_that_lie_nowhere_near_the_map_have_no_lens(town):
     truth, scene = sight_of(town[0], 8)
     assert fit_lens(truth + np.array([[0, 0, 90_000.0], [0, 0, 0], [0, 0, 0]]), scene, town[1]) is None
+
+
+def bent_start(truth, scene, k1):
+    """A homography that is right in one part of the frame, as growth from there would leave it: affine, of a lens."""
+    lens = Lens.of(k1, scene.size, y_up=True)
+    there = scene.center + 0.25 * (scene.corners[0] - scene.center)
+    seen = there + np.array([[0.0, 0.0], [30.0, 0.0], [0.0, 30.0]])
+    places = mapped(truth, lens.straighten(seen))
+    linear = np.stack([places[1] - places[0], places[2] - places[0]], axis=1) / 30.0
+    matrix = np.eye(3)
+    matrix[:2, :2], matrix[:2, 2] = linear, places[0] - linear @ seen[0]
+    return matrix
+
+
+@pytest.mark.parametrize("k1", [-0.16, -0.08, 0.1])
+def test_what_fits_in_one_part_of_the_frame_grows_over_all_of_it_behind_a_lens(town, k1):
+    truth, straight = sight_of(town[0], 5, tilt=15, sight=Sight(0.6))
+    scene = through_lens(straight, k1)
+    start = bent_start(truth, scene, k1)
+    corners = mapped(truth, scene.corners)
+    assert np.hypot(*(mapped(start, scene.corners) - corners).T).max() > 60.0  # metres
+    found = regrow(start, scene, town[1], RefineOptions(), LensOptions())
+    assert found.k1 == pytest.approx(k1, abs=0.002)
+    assert np.hypot(*(mapped(found.matrix, scene.corners) - corners).T).max() < 2.0
+
+
+def test_a_wrong_place_does_not_grow_and_its_core_is_chance(town):
+    truth, scene = sight_of(town[0], 5, tilt=15, sight=Sight(0.6))
+    wrong = np.array([[1.0, 0, 137.0], [0, 1.0, 211.0], [0, 0, 1]]) @ truth
+    given = (scene, town[1], RefineOptions(), LensOptions())
+    assert regrow(wrong, *given) is None
+    assert core_excess(wrong, *given) < 0.3 * core_excess(truth, *given)
+
+
+def honest(matrix, scene, index, agreeing, k1=0.0):
+    """The deviations of the corners that are claimed for a homography."""
+    claimed = Refined(matrix, np.ones(4), 1.0, np.eye(8), k1)
+    return with_honest_corners(claimed, scene, index, agreeing, RefineOptions(), LensOptions()).corner_sigma_m
+
+
+def test_corners_are_unsure_where_only_the_middle_of_a_frame_agrees(town):
+    truth, straight = sight_of(town[0], 5, tilt=15, sight=Sight(0.6))
+    inside = np.abs(straight.points - straight.center).max(axis=1) < 0.4 * straight.half_size
+    astray = np.where(inside[:, None], straight.points, straight.points + np.array([47.0, 31.0]))
+    middle = replace(straight, points=astray)
+    assert (honest(truth, straight, town[1], 0.95) < 2.0).all()
+    assert (honest(truth, middle, town[1], 0.4) > 2.0).all()
+    assert honest(truth, middle, town[1], 0.4).max() > 20.0
+
+
+def test_corners_that_a_tilted_frame_shows_far_away_are_less_sure(town):
+    truth, scene = sight_of(town[0], 5, tilt=45, sight=Sight(0.6))
+    refined = refine(truth, scene, town[1], np.full(len(scene.intersections), -1), held=True)
+    sigma = honest(refined.matrix, scene, town[1], 0.95)
+    corners = np.c_[scene.corners, np.ones(4)] @ refined.matrix[2]
+    assert np.argmax(sigma) in np.argsort(corners)[:2]  # a smaller w is further away
+
+
+def test_the_unknown_middle_of_a_lens_makes_corners_less_sure(town):
+    truth, straight = sight_of(town[0], 5, tilt=15, sight=Sight(0.6))
+    scene = through_lens(straight, -0.12)
+    claimed = Refined(truth, np.ones(4), 1.0, np.eye(8), -0.12)
+    known, unknown = (
+        with_honest_corners(claimed, scene, town[1], 0.95, RefineOptions(), LensOptions(center_sigma_px=sigma))
+        for sigma in (0.0, 2.0)
+    )
+    assert (unknown.corner_sigma_m > 1.2 * known.corner_sigma_m).all()
+
+
+def test_where_hardly_a_road_is_met_the_claim_stays(town):
+    truth, scene = sight_of(town[0], 8)
+    nowhere = truth + np.array([[0, 0, 90_000.0], [0, 0, 0], [0, 0, 0]])
+    assert (honest(nowhere, scene, town[1], 0.9) == 1.0).all()
+
+
+def test_where_most_of_a_frame_is_astray_and_hardly_a_road_is_left_the_claim_stays(town):
+    truth, scene = sight_of(town[0], 8)
+    few = replace(scene, points=scene.points[:20], directions=scene.directions[:20])
+    shifted = np.array([[1.0, 0, 23.0], [0, 1.0, 17.0], [0, 0, 1]]) @ truth
+    assert np.isfinite(honest(shifted, few, town[1], 0.1)).all()

@@ -1,0 +1,161 @@
+"""Road points of a scene on a map as nine parameters see them: eight of a homography, and one of the lens before it."""
+
+from __future__ import annotations
+
+import math
+from typing import NamedTuple
+
+import cv2
+import numpy as np
+
+from roadgeo._arrays import BoolArray, FloatArray
+from roadgeo.geometry.lens import Lens
+from roadgeo.kernels.residuals import road_residuals
+from roadgeo.matching.index import ReferenceIndex
+from roadgeo.matching.refinement import RefineOptions, normalise, spacing_m
+from roadgeo.matching.scene import Scene
+
+__all__ = ["LensEquations", "Observed"]
+
+#: Steps that take the homography of the core from one k1 to another.
+_STEPS = 4
+#: Points nearer to the horizon than this w are not seen.
+_LEAST_W = 0.02
+#: Road points that the share of a cell and its neighbours is counted against, where there are fewer.
+_FEWEST = 12
+
+
+class Observed(NamedTuple):
+    """Roads that were met by M of S points.
+
+    Attributes
+    ----------
+    rows : (M, 9) float64
+        Derivatives of the points' places across the roads, normalised.
+    residuals, sigma : (M,) float64
+        Ways to the roads and their standard deviations, metres.
+    which : (S,) bool
+        The points.
+    """
+
+    rows: FloatArray
+    residuals: FloatArray
+    sigma: FloatArray
+    which: BoolArray
+
+
+class LensEquations:
+    """Road points of a scene on one map, as nine parameters see them: eight of the homography, and k1."""
+
+    def __init__(self, matrix: FloatArray, scene: Scene, index: ReferenceIndex, options: RefineOptions) -> None:
+        self.scene, self.options = scene, options
+        self.p, self.origin, self.unit = normalise(matrix, scene.center, scene.half_size)
+        self.roads = index.road_buckets
+        gsd = self.unit / scene.half_size
+        self.sigma_m = math.hypot(options.sigma_m, options.sigma_px * gsd)
+        self.max_radius = options.max_radius_m + options.max_radius_px * gsd
+        self.weight = min(1.0, spacing_m(scene, self.unit) / options.correlation_m)
+        self.min_cos = math.cos(math.radians(options.max_turn_deg))
+
+    def rows(self, k1: float) -> tuple[FloatArray, FloatArray, FloatArray]:
+        """Return places (S, 2) and unit directions (S, 2) on the map, and derivatives (S, 2, 9) of the places."""
+        scene, p = self.scene, self.p
+        lens = Lens.of(k1, scene.size, y_up=True)
+        turned = lens.straighten_directions(scene.points, scene.directions)
+        uv, (linear, w, xy) = self._straight(k1), self._project(k1)
+        jacobian = (linear[None, :, :2] - xy[:, :, None] * p[6:8]) / w[:, :, None]
+        along = (jacobian @ turned[:, :, None])[..., 0]
+        rows = np.zeros((len(uv), 2, 9))
+        for axis in range(2):
+            rows[:, axis, 3 * axis : 3 * axis + 3] = np.c_[uv, np.ones(len(uv))] / w
+        rows[:, :, 6:8] = -xy[:, :, None] * uv[:, None, :] / w[:, :, None]
+        rows[:, :, 8] = np.einsum("nij,nj->ni", jacobian, lens.moves(scene.points) / scene.half_size)
+        return xy, along / np.linalg.norm(along, axis=1, keepdims=True), rows
+
+    def held(self, sigmas: FloatArray) -> FloatArray:
+        """Return the weights that hold parameters whose standard deviations are `sigmas`."""
+        return np.asarray((self.sigma_m / self.unit / sigmas) ** 2)
+
+    def prior(self, k1_sigma: float) -> FloatArray:
+        """Return the weights (9,) that hold the perspective and k1 near 0."""
+        return np.append(np.zeros(6), self.held(np.array([self.options.perspective_sigma] * 2 + [k1_sigma])))
+
+    def local_scale(self, k1: float) -> tuple[FloatArray, FloatArray]:
+        """Return how far on the ground a pixel reaches across each road (S,), metres; and see below.
+
+        Also the derivatives (S, 2, 2) of normalised places by where the middle of the lens is, in pixels.
+        """
+        scene, (linear, w, xy) = self.scene, self._project(k1)
+        stretch = Lens.of(k1, scene.size, y_up=True).stretch(scene.points)
+        jacobian = (linear[None, :, :2] - xy[:, :, None] * self.p[6:8]) / w[:, :, None] / scene.half_size
+        whole = jacobian @ stretch
+        along = np.linalg.norm((whole @ scene.directions[:, :, None])[..., 0], axis=1)
+        return self.unit * np.abs(np.linalg.det(whole)) / along, jacobian @ (np.eye(2) - stretch)
+
+    def _project(self, k1: float) -> tuple[FloatArray, FloatArray, FloatArray]:
+        """Return the parameters (2, 3) but for the perspective, and of each point w (S, 1) and its place (S, 2)."""
+        uv = self._straight(k1)
+        linear, w = self.p[:6].reshape(2, 3), 1.0 + uv @ self.p[6:8]
+        w = np.where(w < _LEAST_W, np.nan, w)[:, None]
+        return linear, w, (uv @ linear[:, :2].T + linear[:, 2]) / w
+
+    def _straight(self, k1: float) -> FloatArray:
+        """Return the normalised points (S, 2) as a pinhole sees them."""
+        scene = self.scene
+        return np.asarray(
+            (Lens.of(k1, scene.size, y_up=True).straighten(scene.points) - scene.center) / scene.half_size
+        )
+
+    def core(self, k1: float, n_cells: int, least: float) -> tuple[BoolArray, BoolArray]:
+        """Return which points (S,) lie on roads in the part of the frame where most do, and which lie in that part.
+
+        It is made of those of the frame's `n_cells` x `n_cells` cells, around the best one, in which at least the part
+        `least` of its share of points lies on roads.
+        """
+        met, n = self.observe(k1, np.zeros((9, 9))).which, n_cells
+        column, row = np.clip((self.scene.points / self.scene.size * (n, -n)).astype(int), 0, n - 1).T
+        counts = np.zeros((2, n, n))
+        np.add.at(counts[0], (row, column), met)
+        np.add.at(counts[1], (row, column), 1.0)
+        # A cell is judged together with its neighbours: alone it has a few points.
+        hits, points = (9.0 * cv2.blur(one, (3, 3), borderType=cv2.BORDER_CONSTANT) for one in counts)
+        shares = hits / np.maximum(points, _FEWEST)
+        best = np.unravel_index(shares.argmax(), shares.shape)
+        good = shares >= least * shares.max()
+        _, parts = cv2.connectedComponents(good.astype(np.uint8), connectivity=4)
+        inside = np.asarray(parts[row, column] == parts[best])
+        return met & inside, inside
+
+    def begin(self, k1: float, start: float | None, core: BoolArray) -> FloatArray:
+        """Return the derivatives (C, 2, 9) of core points' places.
+
+        With another k1 to `start` from, let the parameters put the points where they did.
+        """
+        places, _, rows = self.rows(k1)
+        if start is None or start == k1:
+            return rows[core]
+        target = places[core]
+        for _ in range(_STEPS):
+            places, _, rows = self.rows(start)
+            flat = rows[core, :, :8].reshape(-1, 8)
+            away = (target - places[core]).ravel()
+            self.p = self.p + np.linalg.solve(flat.T @ flat + 1e-4 * np.eye(8), flat.T @ away)
+        return self.rows(start)[2][core]
+
+    def observe(self, k1: float, inverse: FloatArray, slack: float = 1.0) -> Observed:
+        """Find the roads near points whose places are sure enough.
+
+        How far off a place may be follows from the `inverse` (9, 9) of the normal matrix so far, times `slack`.
+        """
+        xy, along, rows = self.rows(k1)
+        spread = ((rows @ inverse) * rows).sum(axis=(1, 2))
+        sigma = self.sigma_m * np.sqrt(1.0 + slack**2 * np.maximum(spread, 0.0))
+        sure = np.isfinite(sigma) & (3.0 * sigma <= self.max_radius)
+        out = np.empty((int(sure.sum()), 3))
+        mapped = np.ascontiguousarray(self.origin + self.unit * xy[sure])
+        road_residuals(mapped, np.ascontiguousarray(along[sure]), 3.0 * sigma[sure], self.min_cos, self.roads, out)
+        met = np.isfinite(out[:, 0])
+        which = sure.copy()
+        which[sure] = met
+        across = np.einsum("nai,na->ni", rows[which], out[met, 1:])
+        return Observed(across, out[met, 0], sigma[which], which)
