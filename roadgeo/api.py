@@ -16,7 +16,7 @@ from roadgeo.geometry.mask import RoadMask
 from roadgeo.location import Location
 from roadgeo.matching.index import ReferenceIndex
 from roadgeo.matching.options import LocateOptions
-from roadgeo.reference.reference import AnyReference, BuildOptions, Reference
+from roadgeo.reference.reference import AnyReference, BuildOptions, Reference, swapped_near
 from roadgeo.reference.shards import ShardedReference
 from roadgeo.roads.kinds import RoadKind
 
@@ -217,6 +217,8 @@ def locate(
         The mask cannot be read or shows no roads.
     IndexFormatError
         A reference is missing or unusable.
+    ValueError
+        `near` lies on no map, but would with longitude and latitude exchanged.
     """
     from roadgeo.running.looks import Sighting
     from roadgeo.running.pictures import read_picture
@@ -225,6 +227,9 @@ def locate(
 
     references = _open(reference)
     hints = {"gsd_m": _range(gsd), "max_tilt_deg": max_tilt, "north_up": north_up, "focal_px": focal}
+    meant = None if near is None else swapped_near(near, references)
+    if meant is not None:
+        raise ValueError(f"near={near} lies on none of the maps; longitude comes first: did you mean near={meant}?")
     options = _with_hints(options or LocateOptions(), hints, near)
     if isinstance(mask, RoadMask):
         sighting = Sighting(locate_mask(mask, references, options), mask)

@@ -103,6 +103,8 @@ def test_what_is_known_narrows_the_search(porto: roadgeo.Reference) -> None:
     ):
         refused = roadgeo.locate(DRONE, porto, QUICK, **wrong)
         assert (refused.status, refused.reason_code) == ("not_located", code)
+    with pytest.raises(ValueError, match=r"did you mean near=\(-8.6, 41.15, 3000.0\)"):
+        roadgeo.locate(DRONE, porto, QUICK, near=(41.15, -8.6, 3000.0))
 
 
 def test_a_photograph_goes_the_way_of_the_command_line(

@@ -78,19 +78,14 @@ def refuse_swapped(near: tuple[float, float, float] | None, references: Sequence
     click.UsageError
         It is so.
     """
-    if near is None or any(_lies_on(one, near[:2], near[2]) for one in references):
-        return
-    lon, lat, radius = near
-    if abs(lon) <= 90 and any(_lies_on(one, (lat, lon), radius) for one in references):
+    from roadgeo.reference.reference import swapped_near
+
+    meant = None if near is None else swapped_near(near, references)
+    if near is not None and meant is not None:
         raise click.UsageError(
-            f"--near={lon:.9g},{lat:.9g},{radius:g} lies on none of the maps; longitude comes first:"
-            f" did you mean --near={lat:.9g},{lon:.9g},{radius:g}?"
+            f"--near={near[0]:.9g},{near[1]:.9g},{near[2]:g} lies on none of the maps; longitude comes first:"
+            f" did you mean --near={meant[0]:.9g},{meant[1]:.9g},{meant[2]:g}?"
         )
-
-
-def _lies_on(reference: AnyReference, lonlat: tuple[float, float], radius_m: float) -> bool:
-    """Whether a circle touches the bounds of a map, or of a shard of it."""
-    return any(part.may_hold((*lonlat, radius_m)) for part in reference.parts)
 
 
 def make_options(

@@ -31,6 +31,7 @@ __all__ = [
     "open_whole",
     "rebuild_reference",
     "stored_options",
+    "swapped_near",
 ]
 
 
@@ -84,6 +85,20 @@ class Reference:
 
 #: One piece, or shards.
 AnyReference: TypeAlias = "Reference | ShardedReference"
+
+
+def swapped_near(
+    near: tuple[float, float, float], references: Sequence[AnyReference]
+) -> tuple[float, float, float] | None:
+    """Return a circle (longitude, latitude, metres) the other way round, where only then it touches one of the maps."""
+    lon, lat, radius = near
+    if abs(lon) > 90.0 or _touches(near, references):
+        return None
+    return (lat, lon, radius) if _touches((lat, lon, radius), references) else None
+
+
+def _touches(near: tuple[float, float, float], references: Sequence[AnyReference]) -> bool:
+    return any(part.may_hold(near) for one in references for part in one.parts)
 
 
 def build_network(
