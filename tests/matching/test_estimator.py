@@ -69,6 +69,7 @@ def test_another_town_is_refused(town, seed):
     assert result.stopped in {"exhausted", "time"}
 
 
+@pytest.mark.slow
 def test_a_mirrored_view_is_refused(town):
     graph = look(town[0], TRUTH)
     mirrored = replace(graph, xy=graph.xy * (-1, 1) + (1000, 0), coords=graph.coords * (-1, 1) + (1000, 0))
@@ -98,6 +99,7 @@ class TestNear:
         assert result.score >= ACCEPT
         assert gap(result, TRUTH, scene) < 5
 
+    @pytest.mark.slow
     def test_the_place_is_not_reported_outside_the_circle(self, town, scene):
         x, y = mapped(TRUTH, scene.center[None])[0]
         result, _ = locate(scene, town[1], near=(x + 700, y, 500.0), limits=SearchOptions(time_limit_s=3.0))

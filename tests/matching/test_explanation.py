@@ -128,6 +128,7 @@ def test_a_place_off_the_map_is_told(town, mask):
     assert search["missing"] == [explanation.location.reason]
 
 
+@pytest.mark.slow
 def test_a_mask_of_elsewhere(town):
     search = check(explain(mask_of(random_network(77)), town))
     assert search["starved_at"] in {"odds", "survived", "on_roads", "camera"}
@@ -256,6 +257,7 @@ def test_a_place_off_the_map_and_one_that_nothing_proposes_are_told_apart(town, 
     assert truth_told(mask, town, LocateOptions(), far)[0]["lost_at"] in {"proposals", "on_roads", "survived"}
 
 
+@pytest.mark.slow
 def test_a_camera_that_refuses_the_true_place_is_named(town, mask):
     told, _ = truth_told(mask, town, with_camera(gsd_m=(1.4, 5.0)), lonlat_of(town, TRUTH))
     assert told["lost_at"] == "camera"

@@ -317,6 +317,7 @@ def test_killed_writers_leave_a_whole_reference() -> None:
 
 @pytest.mark.skipif(not hasattr(os, "fork"), reason="needs resource limits")
 @pytest.mark.parametrize("limit", [1000, 60_000, 200_000])
+@pytest.mark.slow
 def test_a_full_disk_is_named_and_leaves_nothing(tmp_path: Path, network: RoadNetwork, limit: int) -> None:
     """A limit on the size of files stands in for a full disk: it strikes the GeoPackage first, or the index."""
     write_reference(tmp_path / "grid.gpkg", network, parts(network))

@@ -262,6 +262,7 @@ def test_every_real_mask_gives_a_graph(data_dir: Path) -> None:
         ("squares", "would cover 2"),
     ],
 )
+@pytest.mark.slow
 def test_what_is_no_road_is_refused_before_it_takes_long(kind: str, message: str) -> None:
     """A checkerboard of single pixels took a minute and 2 GB at 1500 x 1500, and 8 GB at 3000 x 3000."""
     y, x = np.mgrid[:2600, :2600] if kind == "checkerboard" else np.mgrid[:700, :700]
