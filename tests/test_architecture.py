@@ -1,6 +1,7 @@
 """Import order is the architecture: a module imports only from storeys below its own (or its own, listed)."""
 
 import ast
+import re
 from pathlib import Path
 
 import pytest
@@ -94,3 +95,10 @@ def test_commands_print_in_one_place() -> None:
     """There, what names may hold besides text is shown, not obeyed by the terminal."""
     printing = [path.name for path in (ROOT / "cli").glob("*.py") if "click.echo(" in path.read_text()]
     assert printing == ["printing.py"]
+
+
+def test_points_are_divided_by_w_in_one_place() -> None:
+    """`geometry.homography` maps points; kernels, which know no classes, map their own."""
+    dividing = re.compile(r"\[[^\]]*:2\]\s*/\s*\w+\[[^\]]*\b2:?\]")
+    found = [path.name for path in ROOT.rglob("*.py") if dividing.search(path.read_text())]
+    assert found == ["homography.py"]

@@ -11,7 +11,7 @@ import numpy as np
 
 from roadgeo._arrays import BoolArray, FloatArray
 
-__all__ = ["Homography"]
+__all__ = ["Homography", "map_each"]
 
 
 @dataclass(frozen=True)
@@ -70,3 +70,9 @@ class Homography:
         """Return the same map scaled so that the last element is 1 (where it is not 0), for writing down."""
         last = self.matrix[2, 2]
         return Homography(self.matrix / last) if last != 0 else self
+
+
+def map_each(matrices: FloatArray, xy: FloatArray) -> FloatArray:
+    """Map (K, N, 2) points, those of each of K homographies (K, 3, 3) by it; those beyond the horizon too."""
+    mapped = np.einsum("kij,knj->kni", matrices, np.concatenate((xy, np.ones((*xy.shape[:2], 1))), axis=2))
+    return np.asarray(mapped[..., :2] / mapped[..., 2:])

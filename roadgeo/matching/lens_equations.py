@@ -9,6 +9,7 @@ import cv2
 import numpy as np
 
 from roadgeo._arrays import BoolArray, FloatArray
+from roadgeo.geometry.homography import Homography
 from roadgeo.geometry.lens import Lens
 from roadgeo.kernels.residuals import road_residuals
 from roadgeo.matching.index import ReferenceIndex
@@ -59,18 +60,16 @@ class LensEquations:
 
     def rows(self, k1: float) -> tuple[FloatArray, FloatArray, FloatArray]:
         """Return places (S, 2) and unit directions (S, 2) on the map, and derivatives (S, 2, 9) of the places."""
-        scene, p = self.scene, self.p
+        scene = self.scene
         lens = Lens.of(k1, scene.size, y_up=True)
         turned = lens.straighten_directions(scene.points, scene.directions)
-        uv, (linear, w, xy) = self._straight(k1), self._project(k1)
-        jacobian = (linear[None, :, :2] - xy[:, :, None] * p[6:8]) / w[:, :, None]
+        homography, uv = self._seen(k1)
+        jacobian = homography.jacobian(uv)
         along = (jacobian @ turned[:, :, None])[..., 0]
         rows = np.zeros((len(uv), 2, 9))
-        for axis in range(2):
-            rows[:, axis, 3 * axis : 3 * axis + 3] = np.c_[uv, np.ones(len(uv))] / w
-        rows[:, :, 6:8] = -xy[:, :, None] * uv[:, None, :] / w[:, :, None]
+        rows[:, :, :8] = homography.by_elements(uv)
         rows[:, :, 8] = np.einsum("nij,nj->ni", jacobian, lens.moves(scene.points) / scene.half_size)
-        return xy, along / np.linalg.norm(along, axis=1, keepdims=True), rows
+        return homography.everywhere(uv), along / np.linalg.norm(along, axis=1, keepdims=True), rows
 
     def held(self, sigmas: FloatArray) -> FloatArray:
         """Return the weights that hold parameters whose standard deviations are `sigmas`."""
@@ -85,19 +84,18 @@ class LensEquations:
 
         Also the derivatives (S, 2, 2) of normalised places by where the middle of the lens is, in pixels.
         """
-        scene, (linear, w, xy) = self.scene, self._project(k1)
+        scene, (homography, uv) = self.scene, self._seen(k1)
         stretch = Lens.of(k1, scene.size, y_up=True).stretch(scene.points)
-        jacobian = (linear[None, :, :2] - xy[:, :, None] * self.p[6:8]) / w[:, :, None] / scene.half_size
+        jacobian = homography.jacobian(uv) / scene.half_size
         whole = jacobian @ stretch
         along = np.linalg.norm((whole @ scene.directions[:, :, None])[..., 0], axis=1)
         return self.unit * np.abs(np.linalg.det(whole)) / along, jacobian @ (np.eye(2) - stretch)
 
-    def _project(self, k1: float) -> tuple[FloatArray, FloatArray, FloatArray]:
-        """Return the parameters (2, 3) but for the perspective, and of each point w (S, 1) and its place (S, 2)."""
+    def _seen(self, k1: float) -> tuple[Homography, FloatArray]:
+        """Return the normalised homography, and its points (S, 2) as a pinhole sees them; NaN near the horizon."""
         uv = self._straight(k1)
-        linear, w = self.p[:6].reshape(2, 3), 1.0 + uv @ self.p[6:8]
-        w = np.where(w < _LEAST_W, np.nan, w)[:, None]
-        return linear, w, (uv @ linear[:, :2].T + linear[:, 2]) / w
+        seen = 1.0 + uv @ self.p[6:8] >= _LEAST_W
+        return Homography(np.append(self.p, 1.0).reshape(3, 3)), np.where(seen[:, None], uv, np.nan)
 
     def _straight(self, k1: float) -> FloatArray:
         """Return the normalised points (S, 2) as a pinhole sees them."""

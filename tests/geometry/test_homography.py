@@ -5,7 +5,7 @@ import pytest
 from hypothesis import assume, given
 from hypothesis import strategies as st
 
-from roadgeo.geometry.homography import Homography
+from roadgeo.geometry.homography import Homography, map_each
 
 POINTS = np.array([[0.0, 0.0], [1.0, 2.0], [-1.5, 0.5], [2.0, -2.0]])
 
@@ -86,3 +86,10 @@ def test_everywhere_maps_what_lies_beyond_the_horizon_too():
     assert H.ahead(points).tolist() == [False, True]
     assert H.facing(points[0]).matrix.tolist() == (-H.matrix).tolist()
     assert H.facing(points[1]) is H
+
+
+@given(homographies(), homographies())
+def test_each_maps_its_own_points(A, B):
+    points = np.stack([POINTS, POINTS[::-1]])
+    mapped = map_each(np.stack([A.matrix, B.matrix]), points)
+    assert np.allclose(mapped, [A(points[0]), B(points[1])])

@@ -17,7 +17,7 @@ from scipy.optimize import least_squares
 
 from roadgeo._arrays import AnyArray, FloatArray
 from roadgeo.geometry.frame import Frame
-from roadgeo.geometry.homography import Homography
+from roadgeo.geometry.homography import Homography, map_each
 from roadgeo.geometry.mask import PIXEL_TO_PLANE, RoadMask
 from roadgeo.matching.checking import check_place
 from roadgeo.matching.query import trace_query
@@ -250,14 +250,10 @@ def adjust(start: Sequence[FloatArray], frame: Frame, links: Sequence[Link]) -> 
     ones, others = (np.array([getattr(link, name) for link in links]) for name in ("one", "other"))
     weight = np.sqrt([link.weight for link in links])[:, None, None] / scale
 
-    def places(matrix: FloatArray, xy: FloatArray) -> FloatArray:
-        mapped = np.einsum("kij,knj->kni", matrix, np.concatenate((xy, np.ones((*xy.shape[:2], 1))), axis=2))
-        return np.asarray(mapped[..., :2] / mapped[..., 2:])
-
     def residuals(free: FloatArray) -> FloatArray:
         moved = local.copy()
         moved[1:].reshape(-1, 9)[:, :8] += free.reshape(-1, 8) * step
-        gap = places(moved[ones], points) - places(moved[others], np.broadcast_to(base, points.shape))
+        gap = map_each(moved[ones], points) - map_each(moved[others], np.broadcast_to(base, points.shape))
         return np.asarray((weight * gap).ravel())
 
     step = np.array([1.0, 1.0, 1.0, 1.0, 1.0, 1.0, 1.0 / scale, 1.0 / scale]) * scale
