@@ -8,6 +8,7 @@ from pathlib import Path
 
 CHILD = Path(__file__).with_name("qgis_child.py")
 WINDOW = Path(__file__).with_name("qgis_window.py")
+DOCK = Path(__file__).with_name("qgis_dock.py")
 
 
 @dataclass(frozen=True)
@@ -36,14 +37,22 @@ class Qgis:
 
     def press_run(self, algorithm: str, parameters: dict) -> dict:
         """Open an algorithm's dialog in QGIS's own window, on a virtual screen, and press Run; see `qgis_window`."""
-        pictures = {name: str(self.folder / f"{name}.png") for name in ("dialog", "log", "window")}
+        return self._in_window(WINDOW, {"algorithm": algorithm, "parameters": parameters}, ("dialog", "log", "window"))
+
+    def use_dock(self, **task: str) -> dict:
+        """Use the panel of matches in QGIS's own window, on a virtual screen; see `qgis_dock`."""
+        return self._in_window(DOCK, task, ("window", "dock"))
+
+    def _in_window(self, script: Path, wanted: dict, shown: tuple[str, ...]) -> dict:
+        """Run a script in QGIS's own window; return what it answers, and the files of the pictures it takes."""
+        pictures = {name: str(self.folder / f"{name}.png") for name in shown}
         task, answer = self.folder / "task.json", self.folder / "answer.json"
-        wanted = {"algorithm": algorithm, "parameters": parameters, "answer": str(answer), **pictures}
-        task.write_text(json.dumps(wanted), "utf-8")
+        answer.unlink(missing_ok=True)
+        task.write_text(json.dumps({**wanted, "answer": str(answer), **pictures}), "utf-8")
         command = ["xvfb-run", "--auto-servernum", "--server-args=-screen 0 1280x900x24"]
-        command += ["qgis", "--nologo", "--noversioncheck", "--code", str(WINDOW)]
-        shown = {**self.environ, "QT_QPA_PLATFORM": "xcb", "ROADGEO_TASK": str(task)}
-        done = replace(self, environ=shown)._run(command)
+        command += ["qgis", "--nologo", "--noversioncheck", "--code", str(script)]
+        environ = {**self.environ, "QT_QPA_PLATFORM": "xcb", "ROADGEO_TASK": str(task)}
+        done = replace(self, environ=environ)._run(command)
         assert answer.exists(), done.stdout + done.stderr
         return {**json.loads(answer.read_text("utf-8")), **pictures}
 

@@ -7,8 +7,8 @@ from typing import Any
 __all__ = ["classFactory"]
 
 
-def classFactory(iface: Any) -> Any:  # noqa: ARG001 (QGIS's signature)
+def classFactory(iface: Any) -> Any:
     """Make the plugin, as QGIS asks for it."""
     from .provider import RoadgeoPlugin
 
-    return RoadgeoPlugin()
+    return RoadgeoPlugin(iface)

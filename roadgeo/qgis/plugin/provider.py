@@ -6,6 +6,7 @@ from pathlib import Path
 from typing import Any
 
 from qgis.core import QgsApplication, QgsProcessingProvider
+from qgis.PyQt.QtCore import Qt
 from qgis.PyQt.QtGui import QIcon
 
 from .algorithms import ALGORITHMS
@@ -52,8 +53,11 @@ class RoadgeoProvider(QgsProcessingProvider):
 class RoadgeoPlugin:
     """What QGIS loads and unloads."""
 
-    def __init__(self) -> None:
+    def __init__(self, iface: Any = None) -> None:
+        self.iface = iface
         self.provider: RoadgeoProvider | None = None
+        self.dock: Any = None
+        self.action: Any = None
 
     def initProcessing(self) -> None:
         """Register the provider; without a window only this is called."""
@@ -61,9 +65,24 @@ class RoadgeoPlugin:
         QgsApplication.processingRegistry().addProvider(self.provider)
 
     def initGui(self) -> None:
-        """Start in a window."""
+        """Start in a window: with a panel, which is shown when it is asked for."""
         self.initProcessing()
+        if self.iface is None:
+            return
+        from .dock import MatchDock
+
+        self.dock = MatchDock(self.iface.mainWindow())
+        self.iface.addDockWidget(Qt.DockWidgetArea.BottomDockWidgetArea, self.dock)
+        self.dock.hide()
+        self.action = self.dock.toggleViewAction()
+        self.action.setIcon(QIcon(str(Path(__file__).parent / "icon.png")))
+        self.iface.addPluginToMenu("roadgeo", self.action)
 
     def unload(self) -> None:
         """Leave."""
+        if self.dock is not None:
+            self.iface.removePluginMenu("roadgeo", self.action)
+            self.iface.removeDockWidget(self.dock)
+            self.dock.deleteLater()
+            self.dock = None
         QgsApplication.processingRegistry().removeProvider(self.provider)

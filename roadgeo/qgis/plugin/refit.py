@@ -1,0 +1,151 @@
+"""Matched intersections, and the homography through those that are switched on. Knows nothing of QGIS.
+
+Matches come from a control-point file as `roadgeo locate --also match-points` writes it, and as the Georeferencer does.
+"""
+
+from __future__ import annotations
+
+import csv
+import math
+from collections.abc import Sequence
+from dataclasses import dataclass, field
+from pathlib import Path
+
+import numpy as np
+
+__all__ = ["FEWEST", "Fit", "Match", "fit", "format_points", "place", "read_points"]
+
+#: Points that a homography needs.
+FEWEST = 4
+
+_COLUMNS = "mapX,mapY,sourceX,sourceY,enable,dX,dY,residual"
+
+
+@dataclass(frozen=True)
+class Match:
+    """A point of the picture, pixels from its top left corner, and the same on the map, in its CRS."""
+
+    column: float
+    row: float
+    x: float
+    y: float
+    on: bool = True
+
+
+@dataclass(frozen=True)
+class Fit:
+    """What goes through the matches.
+
+    Attributes
+    ----------
+    matrix : (3, 3) float64 or None
+        Pixel (column, row) to map; None where too few matches are on, or they lie on a line.
+    residuals : list of float
+        Of each match, on or off, map units from where the fit puts it; NaN without a fit.
+    """
+
+    matrix: np.ndarray | None
+    residuals: list[float] = field(default_factory=list)
+
+    @property
+    def rms(self) -> float:
+        """Root mean square of the residuals that are known."""
+        known = [one for one in self.residuals if math.isfinite(one)]
+        return math.sqrt(sum(one * one for one in known) / len(known)) if known else math.nan
+
+
+def read_points(path: str | Path) -> tuple[str, list[Match]]:
+    """Read a control-point file: the map's CRS as WKT ("" where it is not told), and the matches.
+
+    Raises
+    ------
+    ValueError
+        It is none.
+    """
+    try:
+        lines = Path(path).read_text("utf-8-sig").splitlines()
+    except (OSError, UnicodeDecodeError) as error:
+        raise ValueError(f"{path} cannot be read: {error}") from error
+    told = [line for line in lines if line.startswith("#")]
+    crs = next((line.partition(":")[2].strip() for line in told if line.startswith("#CRS:")), "")
+    try:
+        rows = list(csv.DictReader(line for line in lines if line and not line.startswith("#")))
+        matches = [
+            Match(float(r["sourceX"]), -float(r["sourceY"]), float(r["mapX"]), float(r["mapY"]), r["enable"] != "0")
+            for r in rows
+        ]
+    except (KeyError, TypeError, ValueError) as error:
+        raise ValueError(f"{path} is no file of control points: expected the columns {_COLUMNS}") from error
+    if not all(math.isfinite(v) for one in matches for v in (one.column, one.row, one.x, one.y)):
+        raise ValueError(f"{path} holds a control point that is no number")
+    return crs, matches
+
+
+def format_points(crs: str, matches: Sequence[Match], found: Fit) -> str:
+    """Return what `read_points` and the Georeferencer read."""
+    lines = [*([f"#CRS: {crs}"] if crs else []), _COLUMNS]
+    for one, apart in zip(matches, found.residuals, strict=True):
+        told = apart if math.isfinite(apart) else 0.0
+        lines.append(f"{one.x!r},{one.y!r},{one.column!r},{-one.row!r},{int(one.on)},0,0,{told!r}")
+    return "\n".join(lines) + "\n"
+
+
+def fit(matches: Sequence[Match]) -> Fit:
+    """Fit a homography to the matches that are on: least squares of the distances on the map (Gauss-Newton).
+
+    Four are met exactly. It starts from the linear solution in normalised coordinates (Hartley & Zisserman, 4.1, 4.4).
+    """
+    chosen = [one for one in matches if one.on]
+    nothing = Fit(None, [math.nan] * len(matches))
+    if len(chosen) < FEWEST:
+        return nothing
+    source = np.array([(one.column, one.row) for one in chosen])
+    target = np.array([(one.x, one.y) for one in chosen])
+    from_source, from_target = _normaliser(source), _normaliser(target)
+    uv, xy = place(from_source, source), place(from_target, target)
+    system = np.zeros((2 * len(uv), 9))
+    system[0::2, 0:2], system[0::2, 2] = uv, 1.0
+    system[1::2, 3:5], system[1::2, 5] = uv, 1.0
+    system[0::2, 6:8], system[0::2, 8] = -xy[:, :1] * uv, -xy[:, 0]
+    system[1::2, 6:8], system[1::2, 8] = -xy[:, 1:] * uv, -xy[:, 1]
+    _, sizes, rows = np.linalg.svd(system)
+    if sizes[7] < 1e-9 * sizes[0]:
+        return nothing  # points on a line
+    matrix = _improved(rows[-1].reshape(3, 3), uv, xy)
+    if matrix is None:
+        return nothing
+    matrix = np.linalg.inv(from_target) @ matrix @ from_source
+    every = place(matrix, np.array([(one.column, one.row) for one in matches]))
+    gaps = every - np.array([(one.x, one.y) for one in matches])
+    return Fit(matrix / matrix[2, 2], np.hypot(*gaps.T).tolist())
+
+
+def place(matrix: np.ndarray, points: np.ndarray) -> np.ndarray:
+    """Return where a homography puts points (N, 2)."""
+    mapped = np.c_[points, np.ones(len(points))] @ matrix.T
+    return np.asarray(mapped[:, :2] / mapped[:, 2:])
+
+
+def _normaliser(points: np.ndarray) -> np.ndarray:
+    """Return the map that moves the middle of points to 0 and their usual distance from it to 1."""
+    middle = points.mean(axis=0)
+    size = max(float(np.hypot(*(points - middle).T).mean()), 1e-12)
+    return np.array([[1.0, 0.0, -middle[0]], [0.0, 1.0, -middle[1]], [0.0, 0.0, size]]) / size
+
+
+def _improved(matrix: np.ndarray, uv: np.ndarray, xy: np.ndarray) -> np.ndarray | None:
+    """Make the squared distances from `xy` least; None where the horizon lies among the points."""
+    for _ in range(8):
+        mapped = np.c_[uv, np.ones(len(uv))] @ matrix.T
+        w = mapped[:, 2:]
+        if (w * w[0] <= 1e-9).any():
+            return None
+        where, rows = mapped[:, :2] / w, np.c_[uv, np.ones(len(uv))] / w
+        jacobian = np.zeros((2 * len(uv), 9))
+        jacobian[0::2, 0:3], jacobian[1::2, 3:6] = rows, rows
+        jacobian[0::2, 6:], jacobian[1::2, 6:] = -where[:, :1] * rows, -where[:, 1:] * rows
+        step = np.linalg.lstsq(jacobian, (xy - where).ravel(), rcond=1e-12)[0]
+        matrix = matrix + step.reshape(3, 3)
+        if np.abs(step).max() < 1e-12:
+            break
+    return matrix
