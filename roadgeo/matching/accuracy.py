@@ -30,7 +30,8 @@ def with_honest_corners(
 
     The fit takes all residuals for equally uncertain. But a pixel far out in a tilted frame, or near a lens's edge,
     reaches further on the ground: how residuals grow with it is measured. The middle of a lens is not known exactly.
-    And where only one part of the frame agrees, the rest may be seen through a lens that was not found.
+    And where only one part of the frame agrees, the rest may be seen through a lens that was not found,
+    or not rightly.
 
     The matrix stays as it is, and so does the covariance where too few roads are met.
     """
@@ -41,7 +42,7 @@ def with_honest_corners(
     reach, by_center = equations.local_scale(k1)
     used = np.ones(len(seen.rows), bool)
     partly = False
-    if not k1 and agreeing < lens.enough:
+    if agreeing < lens.enough:
         _, inside = equations.core(k1, lens.n_cells, _LEAST_SHARE)
         if partly := bool(inside[reach < _AS_NEAR * np.median(reach[seen.which])].mean() < _MOST_OF_FRAME):
             used = inside[seen.which]
@@ -49,7 +50,7 @@ def with_honest_corners(
         return refined
     reach, by_center = reach[seen.which][used], by_center[seen.which][used]
     everything, residuals, sigma = seen.rows[used], seen.residuals[used], seen.sigma[used]
-    free = 9 if k1 else 8
+    free = 9 if k1 and not partly else 8
     rows = everything[:, :free]
     # sandwich estimate of an M-estimator's covariance (Huber 1981, 6.3)
     weights = 1.0 / (1.0 + (residuals / sigma) ** 2)
@@ -58,11 +59,10 @@ def with_honest_corners(
     scatter = _scatter(residuals, weights, reach, options.usual_rms * equations.sigma_m) / equations.unit
     covariance = inverse @ ((rows * (equations.weight * scatter**2)[:, None]).T @ rows) @ inverse
     # parameters that were not estimated, by what they would do to the others
+    unknown = lens.sigma * partly * everything[:, 8:]
     if k1:
         across = everything[:, [2, 5]] / np.linalg.norm(everything[:, [2, 5]], axis=1, keepdims=True)
-        unknown = lens.center_sigma_px * np.einsum("ni,nij->nj", across, by_center)
-    else:
-        unknown = lens.sigma * partly * everything[:, 8:]
+        unknown = np.c_[unknown, lens.center_sigma_px * np.einsum("ni,nij->nj", across, by_center)]
     moved = inverse @ (scaled.T @ unknown)
     covariance = covariance + moved @ moved.T
     corners = corner_covariance(equations.p, covariance[:8, :8], scene, equations.unit, options)

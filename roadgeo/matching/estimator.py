@@ -125,7 +125,6 @@ class TripleEstimator:
         # The least that chance reached at the places verified so far: a place that is not promising against it is none.
         self.least_chance = np.array([0.05, 0.2, 0.05])
         self.n_nulls = 0
-        self._lenses_tried = False
         self._dropped: list[Hypothesis] = []
         self._whole: list[Hypothesis] = []  # verified, and no better version of them is to be expected
         self.scene = scene
@@ -150,6 +149,8 @@ class TripleEstimator:
             yield self._rounds_of_lenses(options.lens)
         for stage, source in enumerate(options.last, len(options.sweeps) + 1):
             yield self._sweep(stage, source, options.last_grow)
+        if options.lens is not None and options.last:
+            yield self._rounds_of_lenses(options.lens)
 
     @property
     def work(self) -> float:
@@ -323,7 +324,7 @@ class TripleEstimator:
             self._see_through(model, model.lens)
         elif model.log10_odds >= self.options.verify.promising:
             self._look_through_lens(model)
-        elif model.refined is not None and not self._lenses_tried:
+        elif model.refined is not None:
             self._dropped.append(model)
         self.refine_s += time.perf_counter() - started
         self.trace.scored(model)
@@ -379,11 +380,11 @@ class TripleEstimator:
     def _rounds_of_lenses(self, options: LensOptions) -> Iterator[list[Hypothesis]]:
         """Yield places that were dropped and that fit after all when grown anew, behind a lens."""
         scene, index, refinement = self.scene, self.index, self.refine_options
-        self._lenses_tried = True
-        gains = [core_excess(one.matrix, scene, index, refinement, options) for one in self._dropped]
+        dropped, self._dropped = self._dropped, []
+        gains = [core_excess(one.matrix, scene, index, refinement, options) for one in dropped]
         places: list[Hypothesis] = []
         for k in np.argsort(-np.array(gains), kind="stable"):
-            one = self._dropped[k]
+            one = dropped[k]
             twin = next((other for other in places if self.same(one, other)), None)
             if twin is not None:
                 twin.leads += [lead for lead in one.leads if lead not in twin.leads]

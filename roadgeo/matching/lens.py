@@ -35,6 +35,9 @@ __all__ = [
     "straighten_scene",
 ]
 
+#: A fit that puts so much more of the roads on roads is worth another one.
+_MORE = 0.01
+
 
 @dataclass(frozen=True)
 class LensOptions:
@@ -59,7 +62,7 @@ class LensOptions:
         While a fit grows, places may be so many times further off than it says.
     starts : tuple of float
         Values of k1 to begin with in turn, where beginning with 0 does not explain enough.
-    n_iterations : int
+    n_iterations, n_restarts : int
         At most.
     soon, hopeless : int, float
         A fit that after so many iterations has met less than this share of the road points is given up: wrong places
@@ -85,6 +88,7 @@ class LensOptions:
     slack: float = 2.0
     starts: tuple[float, ...] = (-0.15, -0.08, 0.08)
     n_iterations: int = 30
+    n_restarts: int = 3
     soon: int = 8
     hopeless: float = 0.4
     max_places: int = 12
@@ -226,7 +230,7 @@ def regrow(
     for k1 in options.quick_starts:
         rough = fit_lens(matrix, quick, index, 0.0, refinement, options, k1)
         if rough is not None and rough.share >= options.least_share:
-            return fit_lens(rough.matrix, scene, index, rough.k1, refinement, options)
+            return _improved(rough, scene, index, refinement, options)
     return None
 
 
@@ -247,7 +251,23 @@ def _fit_from_many(
             best = found
         if best is not None and best.share >= options.enough:
             break
-    return best
+    return best if best is None else _improved(best, scene, index, refinement, options)
+
+
+def _improved(
+    found: LensFit, scene: Scene, index: ReferenceIndex, refinement: RefineOptions, options: LensOptions
+) -> LensFit:
+    """Fit anew from where a fit ended, as long as more of the roads come to lie on roads: it may have been stuck."""
+    for _ in range(options.n_restarts):
+        starts = (found.k1,) if found.share >= options.enough else (found.k1, 0.0, 2.0 * found.k1)
+        again = (fit_lens(found.matrix, scene, index, found.k1, refinement, options, k1) for k1 in starts)
+        best = max((one for one in again if one is not None), key=lambda one: one.share, default=None)
+        if best is None or best.share < found.share:
+            break
+        more, found = best.share > found.share + _MORE, best
+        if not more:
+            break
+    return found
 
 
 def _hints_at_lens(problem: LensEquations, options: LensOptions) -> bool:

@@ -126,3 +126,12 @@ def test_where_most_of_a_frame_is_astray_and_hardly_a_road_is_left_the_claim_sta
     few = replace(scene, points=scene.points[:20], directions=scene.directions[:20])
     shifted = np.array([[1.0, 0, 23.0], [0, 1.0, 17.0], [0, 0, 1]]) @ truth
     assert np.isfinite(honest(shifted, few, town[1], 0.1)).all()
+
+
+def test_a_fit_that_ended_early_is_taken_up_where_it_ended(town):
+    truth, straight = sight_of(town[0], 5, tilt=15, sight=Sight(0.6))
+    scene = through_lens(straight, -0.08)
+    start, given = bent_start(truth, scene, -0.08), (scene, town[1], 0.4, RefineOptions())
+    once, again = (find_lens(start, *given, LensOptions(n_iterations=2, starts=(), n_restarts=n)) for n in (0, 3))
+    assert abs(once.k1 + 0.08) > 0.001
+    assert again.k1 == pytest.approx(-0.08, abs=0.001)
