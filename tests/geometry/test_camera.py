@@ -8,7 +8,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 from worlds.scenes import camera
 
-from roadgeo.geometry.camera import _USUAL_FOCAL, CameraFault, CameraOptions, judge, pose
+from roadgeo.geometry.camera import _USUAL_FOCAL, CameraFault, CameraOptions, judge, pose, sampling
 
 SIZE = (1200, 900)
 OPTIONS = CameraOptions()
@@ -204,3 +204,16 @@ def test_what_is_known_of_the_tilt_in_figures():
     assert CameraOptions(max_tilt_deg=89.0).min_shape_ratio == 0.33
     assert CameraOptions(max_tilt_deg=5.0).perspective_sigma(9.0) == pytest.approx(0.03 + 0.7 * np.tan(np.radians(5)))
     assert CameraOptions(max_tilt_deg=89.0).perspective_sigma(9.0) == pytest.approx(0.03 + 0.7 * np.tan(np.radians(80)))
+
+
+@given(tilt=tilts, azimuth=turns, heading=turns)
+def test_up_and_sampling_are_those_in_the_middle_of_the_frame(tilt, azimuth, heading):
+    matrix = camera((0, 0), SIZE, 1.0, tilt, azimuth, heading, 1000.0)
+    middle = np.array([SIZE[0] / 2, -SIZE[1] / 2])
+    ends = [matrix @ (*(middle + step), 1.0) for step in ((0.0, -1e-3), (0.0, 1e-3), (-1e-3, 0.0), (1e-3, 0.0))]
+    down, up, left, right = (end[:2] / end[2] for end in ends)
+    seen = pose(matrix, SIZE)
+    assert angle_between(seen.rotation_deg, np.degrees(np.arctan2(*(up - down)))) < 1e-3
+    area = abs(np.linalg.det([(right - left) / 2e-3, (up - down) / 2e-3]))
+    assert seen.gsd_m == pytest.approx(np.sqrt(area), rel=1e-5)
+    assert sampling(matrix, SIZE) == seen.gsd_m
