@@ -98,7 +98,7 @@ def test_commands_print_in_one_place() -> None:
 
 
 def test_points_are_divided_by_w_in_one_place() -> None:
-    """`geometry.homography` maps points; kernels, which know no classes, map their own, and so does the plugin in QGIS."""
+    """`geometry.homography` maps points; kernels, which know no classes, map their own; so does the plugin."""
     dividing = re.compile(r"\[[^\]]*:2\]\s*/\s*\w+\[[^\]]*\b2:?\]")
     found = [path.name for path in modules() if dividing.search(path.read_text())]
     assert found == ["homography.py"]
