@@ -81,7 +81,7 @@ class LensOptions:
     enough: float = 0.8
     sigma: float = 0.1
     significance: float = 5.0
-    least_px: float = 3.0
+    least_px: float = 5.0
     n_cells: int = 10
     core_share: float = 0.75
     fewest: int = 12
