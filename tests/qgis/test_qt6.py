@@ -77,6 +77,8 @@ def test_it_loads_runs_and_unloads(python: str, plugin: Path, tmp_path: Path) ->
         ("session.py", "QgsProcessingUtils.LayerHint.Vector", "QgsProcessingUtils.Vector"),
         ("provider.py", "from qgis.PyQt.QtGui import QIcon", "from qgis.PyQt.QtWidgets import QAction as QIcon"),
         ("session.py", "from qgis.PyQt import sip", "import sip"),
+        ("dock.py", "Qt.", "Qt.AlignCenter or Qt."),
+        ("dock.py", "QDockWidget,", "QDockWidget, QDesktopWidget,"),
     ],
 )
 def test_what_only_pyqt5_knows_is_found(

@@ -7,6 +7,7 @@ played by classes with the enumerations that the plugin needs, which are known b
 what came out as JSON.
 """
 
+import ast
 import enum
 import importlib
 import json
@@ -278,12 +279,36 @@ class Browser(QObject):
         self.pages.append(url.toLocalFile())
 
 
+def unknown_names(folder):
+    """What the plugin's sources take from Qt, by import or as `Class.name.name`, and PyQt6 does not have."""
+    wrong = []
+    for path in sorted(Path(folder).glob("*.py")):
+        tree, known = ast.parse(path.read_text("utf-8")), {}
+        for node in ast.walk(tree):
+            if isinstance(node, ast.ImportFrom) and (node.module or "").startswith("qgis.PyQt."):
+                module = importlib.import_module(node.module.replace("qgis.PyQt", "PyQt6"))
+                known |= {one.asname or one.name: getattr(module, one.name, None) for one in node.names}
+        wrong += [f"{path.name}: {name}" for name, found in known.items() if found is None]
+        for node in ast.walk(tree):
+            words, inner = [], node
+            while isinstance(inner, ast.Attribute):
+                words, inner = [inner.attr, *words], inner.value
+            if words and isinstance(inner, ast.Name) and isinstance(known.get(inner.id), type):
+                found = known[inner.id]
+                for word in words:
+                    found = getattr(found, word, None)
+                wrong += [] if found is not None else [f"{path.name}: {'.'.join([inner.id, *words])}"]
+    return wrong
+
+
 def main():
     """Load the plugin, look at all that it offers, run an algorithm, and unload it."""
     folder, mask, found = sys.argv[1:]
     application = QGuiApplication(["qgis", "-platform", "offscreen"])
     browser = Browser()
     QDesktopServices.setUrlHandler("file", browser.open)
+    wrong = unknown_names(folder)
+    assert not wrong, f"PyQt6 has no {', '.join(wrong)}"
     play_qgis()
     sys.path.insert(0, str(Path(folder).parent))
     plugin = importlib.import_module(Path(folder).name).classFactory(None)
