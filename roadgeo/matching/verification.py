@@ -37,10 +37,14 @@ class VerifyOptions:
         Usual error of a traced road in pixels.
     n_shifts : int
         Shifted positions of the null model.
+    n_anchors : int
+        So many intersections of the map, nearest to the middle of the frame, are also shifted onto those around them,
+        at most `n_shifts` times: in a lattice only shifts by whole blocks fit as well as the place itself, and a spiral
+        misses most of them.
     saturation : float
         However many intersections or roads agree, they count as fewer than so many independent trials: chance varies
-        from place to place by more than a binomial law allows, and no number of trials helps against that. Fitted to
-        the best wrong places of training queries whose true place was forbidden.
+        from place to place by more than a binomial law allows, and no number of trials helps against that. Of 342
+        searches for masks without a place, in five cities, none scored above 1.2.
     promising : float
         Log10 odds that a place must reach against the least chance seen so far before a null of its own is measured.
         They are an upper bound: below 1.5 a place is neither located (3.5) nor within the margin (2.0) of one that is.
@@ -54,7 +58,8 @@ class VerifyOptions:
     shift_m: tuple[float, float] = (30.0, 320.0)
     n_shifts: int = 150
     n_null_points: int = 150
-    saturation: float = 60.0
+    n_anchors: int = 3
+    saturation: float = 250.0
     promising: float = 1.5
 
     @property
@@ -156,13 +161,9 @@ def chance_agreement(
     min_cos = math.cos(math.radians(options.max_turn_deg))
     roads = index.road_buckets
     inverse, bounds = np.asarray(np.linalg.inv(matrix), float), _bounds(matrix, scene)
-    k = np.arange(0, options.n_shifts, every)
-    low, high = options.shift_m
-    radius = np.sqrt(low**2 + (high**2 - low**2) * (k + 0.5) / options.n_shifts)
-    angle = k * math.pi * (3.0 - math.sqrt(5.0))
-    rates = np.empty((len(k), 3))
-    shifts = np.stack((radius * np.cos(angle), radius * np.sin(angle)), axis=1)
-    counts = np.empty(len(k), np.int64)
+    shifts = np.concatenate((_spiral(options), _onto_neighbours(matrix, scene, index, options)))[::every]
+    rates = np.empty((len(shifts), 3))
+    counts = np.empty(len(shifts), np.int64)
     count_matches(
         matrix, found.xy, scene.branches, 1.5 * tolerance, options.ray_cos, shifts,
         index.point_buckets, counts,
@@ -172,7 +173,7 @@ def chance_agreement(
     rates[:, 1] = counts / max(len(points), 1)
     best = np.argsort(-rates[:, 1])[: 12 if n_best == 1 else 4 * n_best]
     for i in best:
-        dx, dy = radius[i] * math.cos(angle[i]), radius[i] * math.sin(angle[i])
+        dx, dy = shifts[i]
         seen, shown = backward_agreement(
             inverse, bounds, 2 * options.backward_step_m, tolerance, dx, dy, roads,
             scene.field, scene.field_scale, scene.observed,
@@ -183,6 +184,32 @@ def chance_agreement(
 
 def _mean_of_best(rates: FloatArray, count: int) -> float:
     return float(rates.max()) if count == 1 else float(np.sort(rates)[-count:].mean())
+
+
+def _spiral(options: VerifyOptions) -> FloatArray:
+    """Return shifts (n_shifts, 2) in metres on a sunflower spiral: all directions and distances are met evenly."""
+    k = np.arange(options.n_shifts)
+    low, high = options.shift_m
+    radius = np.sqrt(low**2 + (high**2 - low**2) * (k + 0.5) / options.n_shifts)
+    angle = k * math.pi * (3.0 - math.sqrt(5.0))
+    return np.stack((radius * np.cos(angle), radius * np.sin(angle)), axis=1)
+
+
+def _onto_neighbours(matrix: FloatArray, scene: Scene, index: ReferenceIndex, options: VerifyOptions) -> FloatArray:
+    """Return shifts (M, 2) in metres that lay an intersection of the map near the frame's middle on others around it.
+
+    In a lattice only a shift by whole blocks fits as well as the place itself.
+    """
+    low, high = options.shift_m
+    middle = Homography(matrix)(scene.center)
+    near = index.xy[np.abs(index.xy - middle).max(axis=1) < 2.0 * high]
+    if not len(near):
+        return np.empty((0, 2))
+    anchors = near[np.argsort(((near - middle) ** 2).sum(axis=1))[: options.n_anchors]]
+    shifts = (near - anchors[:, None]).reshape(-1, 2)
+    length = np.hypot(*shifts.T)
+    nearest = np.argsort(length)
+    return np.asarray(shifts[nearest[(length[nearest] > low) & (length[nearest] < high)][: options.n_shifts]])
 
 
 def _information(rate: float, chance: float) -> float:
