@@ -214,8 +214,8 @@ def _onto_neighbours(matrix: FloatArray, scene: Scene, index: ReferenceIndex, op
 
 def _information(rate: float, chance: float) -> float:
     """Log-likelihood ratio in nats per trial: a rate against the chance rate, negative where the rate is the lower."""
-    rate = min(max(rate, 1e-3), 1.0 - 1e-3)
-    chance = min(max(chance, 0.02), 0.98)
+    # Both are bounded alike: what agrees wholly, where chance agrees wholly, tells nothing.
+    rate, chance = (min(max(share, 0.02), 0.98) for share in (rate, chance))
     nats = rate * math.log(rate / chance) + (1.0 - rate) * math.log((1.0 - rate) / (1.0 - chance))
     return nats if rate > chance else -nats
 

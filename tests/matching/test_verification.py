@@ -136,6 +136,7 @@ class TestOdds:
 
     def test_chance_itself_is_no_evidence(self):
         assert self.odds(0.1, 0.3, 0.3) == pytest.approx(0, abs=1e-9)
+        assert self.odds(1.0, 1.0, 1.0, 2500, (1.0, 1.0, 0.99), 5000.0) == pytest.approx(0, abs=1e-9)
         assert self.odds(0.05, 0.2, 0.2) < 0
 
     @pytest.mark.parametrize("chance", [(0, 0, 0), (1, 1, 1)])
