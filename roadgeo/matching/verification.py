@@ -43,8 +43,11 @@ class VerifyOptions:
         misses most of them.
     saturation : float
         However many intersections or roads agree, they count as fewer than so many independent trials: chance varies
-        from place to place by more than a binomial law allows, and no number of trials helps against that. Of 342
-        searches for masks without a place, in five cities, none scored above 1.2.
+        from place to place by more than a binomial law allows, and no number of trials helps against that.
+    least_rates : (float, float, float)
+        At the true place at least so much agrees, of intersections, of the query's roads and of the map's; of worse
+        masks a little evidence is lost. Where a piece of a mask fits and the rest does not, that tells against it.
+        Of 511 searches in eight cities for masks without a place, none scored above 0.8 with these and `saturation`.
     promising : float
         Log10 odds that a place must reach against the least chance seen so far before a null of its own is measured.
         They are an upper bound: below 1.5 a place is neither located (3.5) nor within the margin (2.0) of one that is.
@@ -60,6 +63,7 @@ class VerifyOptions:
     n_null_points: int = 150
     n_anchors: int = 3
     saturation: float = 250.0
+    least_rates: tuple[float, float, float] = (0.2, 0.5, 0.5)
     promising: float = 1.5
 
     @property
@@ -212,12 +216,21 @@ def _onto_neighbours(matrix: FloatArray, scene: Scene, index: ReferenceIndex, op
     return np.asarray(shifts[nearest[(length[nearest] > low) & (length[nearest] < high)][: options.n_shifts]])
 
 
-def _information(rate: float, chance: float) -> float:
-    """Log-likelihood ratio in nats per trial: a rate against the chance rate, negative where the rate is the lower."""
-    # Both are bounded alike: what agrees wholly, where chance agrees wholly, tells nothing.
+def _information(rate: float, chance: float, least: float) -> float:
+    """Return the log-likelihood ratio in nats per trial of a rate: the true place against chance.
+
+    At the true place the rate is what it is here, but at least `least`; the ratio is negative where the rate is below
+    that of chance.
+    """
+    # Rates and chance are bounded alike: what agrees wholly, where chance agrees wholly, tells nothing.
     rate, chance = (min(max(share, 0.02), 0.98) for share in (rate, chance))
-    nats = rate * math.log(rate / chance) + (1.0 - rate) * math.log((1.0 - rate) / (1.0 - chance))
-    return nats if rate > chance else -nats
+    nats = math.copysign(_divergence(rate, chance), rate - chance)
+    return nats - _divergence(rate, max(rate, least))
+
+
+def _divergence(rate: float, expected: float) -> float:
+    """Return the Kullback-Leibler divergence of two rates, in nats per trial."""
+    return rate * math.log(rate / expected) + (1.0 - rate) * math.log((1.0 - rate) / (1.0 - expected))
 
 
 def log10_odds(
@@ -225,15 +238,17 @@ def log10_odds(
 ) -> float:
     """Log10 odds of a place against chance, corrected for the candidates tried.
 
-    Log-likelihood ratios of the three rates against the rates by chance, times the number of independent trials, less
-    the logarithm of the number of places tried.
+    Log-likelihood ratios of the three rates, the true place against chance, times the number of independent trials,
+    less the logarithm of the number of places tried.
     """
 
     def independent(trials: float) -> float:
         return trials / (1.0 + trials / options.saturation)
 
-    nats = independent(found.tested) * _information(found.rate, chance[0])
+    rates = (found.rate, found.forward, found.backward)
+    intersections, forward, backward = map(_information, rates, chance, options.least_rates)
+    nats = independent(found.tested) * intersections
     # Forward and backward agreement are two views of the same roads: each counts half.
-    both = _information(found.forward, chance[1]) + _information(found.backward, chance[2])
+    both = forward + backward
     nats += independent(0.5 * n_roads) * both
     return (nats - math.log(max(n_candidates, 1))) / math.log(10.0)

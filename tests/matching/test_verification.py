@@ -134,8 +134,14 @@ class TestOdds:
         usual, higher = (0.1, 0.3, 0.3), (0.1 + more, 0.3 + more, 0.3 + more)
         assert self.odds(rate, forward, backward, n, higher) <= self.odds(rate, forward, backward, n, usual) + 1e-9
 
+    def test_a_piece_that_fits_is_no_place(self):
+        # A mirrored mask of Montevideo, at the best wrong place: much more than chance, and much too little.
+        assert self.odds(39 / 184, 0.30, 0.30, 184, (0.05, 0.15, 0.27), 347.0, 269) < 1
+        assert self.odds(0.25, 0.55, 0.60, 184, (0.05, 0.15, 0.27), 347.0, 269) > 10
+
     def test_chance_itself_is_no_evidence(self):
-        assert self.odds(0.1, 0.3, 0.3) == pytest.approx(0, abs=1e-9)
+        assert self.odds(0.3, 0.6, 0.6, chance=(0.3, 0.6, 0.6)) == pytest.approx(0, abs=1e-9)
+        assert self.odds(0.1, 0.3, 0.3) < 0
         assert self.odds(1.0, 1.0, 1.0, 2500, (1.0, 1.0, 0.99), 5000.0) == pytest.approx(0, abs=1e-9)
         assert self.odds(0.05, 0.2, 0.2) < 0
 
