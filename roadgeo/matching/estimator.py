@@ -341,7 +341,9 @@ class TripleEstimator:
             if not self._converge(model, n_points):
                 return -np.inf
             if every:
-                model.chance = chance_agreement(model.matrix, scene, index, model.gsd_m, options.verify, every)
+                model.chance = chance_agreement(
+                    model.matrix, scene, index, model.gsd_m, options.verify, every, near=self.near
+                )
                 chance = np.array(model.chance)
             model.log10_odds = self._odds(model, chance)
             if model.log10_odds < options.verify.promising:
@@ -374,7 +376,7 @@ class TripleEstimator:
         model.gsd_m = gsd = sampling(lens.matrix, scene.size)
         seeds = model.seeds[-MINIMAL:]
         model.found, model.matched, model.distance = agreement(lens.matrix, scene, index, gsd, seeds, verify)
-        model.chance = chance_agreement(lens.matrix, scene, index, gsd, verify)
+        model.chance = chance_agreement(lens.matrix, scene, index, gsd, verify, near=self.near)
         model.log10_odds = log10_odds(model.found, model.chance, scene.n_edges, self.ledger.n_tried, verify)
 
     def _rounds_of_lenses(self, options: LensOptions) -> Iterator[list[Hypothesis]]:

@@ -26,6 +26,9 @@ _CUT_SHORT = "so that another run may tell otherwise"
 #: A rival whose intersections and roads agree by so much more, as a share, makes the best place ambiguous.
 _FULLER = 0.05
 
+#: Mean share of intersections and roads that agree as at the true place of a good mask.
+_LIKE_THE_TRUTH = 0.85
+
 
 @dataclass(frozen=True)
 class Needed:
@@ -68,10 +71,13 @@ def decide(query: Query, found: Sequence[Found], options: LocateOptions) -> Loca
         location = replace(
             location, log10_odds=best.score, runner_up=others[0] if others else None, alternatives=others
         )
-    if best is None or best.score < options.min_log10_odds:
+    alike = best is not None and rival is not None and _are_alike(best, rival)
+    if best is None or (best.score < options.min_log10_odds and not alike):
         return _refuse(location, query, found, best, options)
     placed = place_frame(_on(location, best.found), query, best.fit, options.match.camera.focal_px)
     cut = f"; stopped at the time limit, {_CUT_SHORT}" if location.stopped == "time" else ""
+    if rival is not None and best.score < options.min_log10_odds:
+        return replace(placed, status="ambiguous", reason=_alike(best, rival) + cut, reason_code=Reason.TWO_PLACES)
     if rival is not None and best.score - rival.score < options.min_margin:
         return replace(placed, status="ambiguous", reason=_twins(best, rival) + cut, reason_code=Reason.TWO_PLACES)
     fuller = next((one for one in rivals if _is_fuller(one, best, options)), None)
@@ -154,6 +160,18 @@ def _twins(best: _Candidate, rival: _Candidate) -> str:
     if best.found.index.name != rival.found.index.name:
         on = (f" on {best.found.index.name}", f" on {rival.found.index.name}")
     return f"two places fit almost equally: log10 odds {best.score:.1f}{on[0]} and {rival.score:.1f}{on[1]}"
+
+
+def _are_alike(best: _Candidate, rival: _Candidate) -> bool:
+    """Whether two places agree so well, both, that only streets that repeat explain it, however low their odds are."""
+    return min(best.fit.agreement, rival.fit.agreement) >= _LIKE_THE_TRUTH
+
+
+def _alike(best: _Candidate, rival: _Candidate) -> str:
+    return (
+        f"two places fit almost equally, for streets repeat there: {best.fit.agreement:.0%} agrees at one, "
+        f"{rival.fit.agreement:.0%} at another"
+    )
 
 
 def _is_fuller(rival: _Candidate, best: _Candidate, options: LocateOptions) -> bool:

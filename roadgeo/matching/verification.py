@@ -151,12 +151,15 @@ def chance_agreement(
     options: VerifyOptions,
     every: int = 1,
     n_best: int = 1,
+    near: tuple[float, float, float] | None = None,
 ) -> tuple[float, float, float]:
     """Return the rates (intersections, forward, backward) that the best shifted positions reach.
 
     Shifts lie on a sunflower spiral between the two radii of `shift_m`, so that all directions and distances are met
-    evenly. Of only `every` n-th of them the best cannot be better than of all: that is a quick lower bound. Of a place
-    that nobody chose by this query the best of all shifts is too hard a rival: the mean of the `n_best` best is taken.
+    evenly, and where intersections of the map come to lie on others, unless that takes the middle of the frame out of
+    the circle `near` = (x, y, radius), plane metres. Of only `every` n-th of them the best cannot be better than of
+    all: that is a quick lower bound. Of a place that nobody chose by this query the best of all shifts is too hard a
+    rival: the mean of the `n_best` best is taken.
     """
     tolerance = tolerance_m(gsd_m, options)
     found = scene.intersections
@@ -165,7 +168,7 @@ def chance_agreement(
     min_cos = math.cos(math.radians(options.max_turn_deg))
     roads = index.road_buckets
     inverse, bounds = np.asarray(np.linalg.inv(matrix), float), _bounds(matrix, scene)
-    shifts = np.concatenate((_spiral(options), _onto_neighbours(matrix, scene, index, options)))[::every]
+    shifts = np.concatenate((_spiral(options), _onto_neighbours(matrix, scene, index, options, near)))[::every]
     rates = np.empty((len(shifts), 3))
     counts = np.empty(len(shifts), np.int64)
     count_matches(
@@ -199,7 +202,13 @@ def _spiral(options: VerifyOptions) -> FloatArray:
     return np.stack((radius * np.cos(angle), radius * np.sin(angle)), axis=1)
 
 
-def _onto_neighbours(matrix: FloatArray, scene: Scene, index: ReferenceIndex, options: VerifyOptions) -> FloatArray:
+def _onto_neighbours(
+    matrix: FloatArray,
+    scene: Scene,
+    index: ReferenceIndex,
+    options: VerifyOptions,
+    within: tuple[float, float, float] | None,
+) -> FloatArray:
     """Return shifts (M, 2) in metres that lay an intersection of the map near the frame's middle on others around it.
 
     In a lattice only a shift by whole blocks fits as well as the place itself.
@@ -212,8 +221,11 @@ def _onto_neighbours(matrix: FloatArray, scene: Scene, index: ReferenceIndex, op
     anchors = near[np.argsort(((near - middle) ** 2).sum(axis=1))[: options.n_anchors]]
     shifts = (near - anchors[:, None]).reshape(-1, 2)
     length = np.hypot(*shifts.T)
-    nearest = np.argsort(length)
-    return np.asarray(shifts[nearest[(length[nearest] > low) & (length[nearest] < high)][: options.n_shifts]])
+    possible = (length > low) & (length < high)
+    if within is not None:
+        possible &= np.hypot(*(middle + shifts - within[:2]).T) <= within[2]
+    shifts, length = shifts[possible], length[possible]
+    return np.asarray(shifts[np.argsort(length)[: options.n_shifts]])
 
 
 def _information(rate: float, chance: float, least: float) -> float:
