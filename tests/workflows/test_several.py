@@ -86,7 +86,7 @@ def test_a_weak_place_does_not_beat_a_pair_of_far_surer_ones(query, searched):
 
 
 @pytest.mark.parametrize(
-    ("agreement", "odds", "status"), [(0.89, 6.2, "ambiguous"), (0.89, 3.0, "located"), (0.75, 6.2, "located")]
+    ("agreement", "odds", "status"), [(0.89, 6.2, "ambiguous"), (0.89, 2.9, "located"), (0.75, 6.2, "located")]
 )
 def test_a_rival_that_agrees_better_is_heard(query, searched, agreement: float, odds: float, status: str) -> None:
     """In a lattice the true place scores little, for chance is high there: a worse one must not pass for it."""
@@ -101,10 +101,20 @@ def test_a_rival_that_agrees_better_is_heard(query, searched, agreement: float, 
 
 
 def test_a_place_that_is_refused_alone_is_a_rival_all_the_same(query, searched):
-    """At 3.4 a place is not reported; it is still too near to 4.0 for that to be the answer."""
-    best = judge(query, searched("a", (4.5, 0.0)), searched("b", (3.4, 30_000.0)))
+    """At 2.9 a place is not reported; it is still too near to 4.0 for that to be the answer."""
+    best = judge(query, searched("a", (4.0, 0.0)), searched("b", (2.9, 30_000.0)))
     assert best.status == "ambiguous"
-    assert best.runner_up.log10_odds == 3.4
+    assert best.runner_up.log10_odds == 2.9
+
+
+@pytest.mark.parametrize(("agreements", "status"), [((0.95, 0.9), "ambiguous"), ((0.95, 0.6), "not_located")])
+def test_where_streets_repeat_both_places_are_told(query, searched, agreements, status: str) -> None:
+    """Chance is as good there as the places are, so that neither has odds."""
+    found = searched("a", (-2.0, 0.0), (-2.1, 5000.0))
+    fits = tuple(replace(fit, agreement=rate) for fit, rate in zip(found.fits, agreements, strict=True))
+    best = judge(query, replace(found, fits=fits))
+    assert best.status == status
+    assert ("streets repeat there: 95% agrees at one, 90% at another" in best.reason) == (status == "ambiguous")
 
 
 @pytest.mark.parametrize("names", [["a"], ["a", "b"]])
@@ -114,9 +124,9 @@ def test_a_refusal_says_where_it_looked(query, searched, names):
 
 
 def test_a_refusal_tells_the_odds_of_the_best_and_of_the_next_place(query, searched):
-    best = judge(query, searched("a", (3.0, 0.0), (1.0, 2000.0)), searched("b", (2.0, 30_000.0)))
+    best = judge(query, searched("a", (2.8, 0.0), (1.0, 2000.0)), searched("b", (2.0, 30_000.0)))
     assert (best.status, best.center) == ("not_located", None)
-    assert (best.log10_odds, best.runner_up.log10_odds) == (3.0, 2.0)
+    assert (best.log10_odds, best.runner_up.log10_odds) == (2.8, 2.0)
     assert best.runner_up.x == pytest.approx(PLANE.origin[0] + 30_000.0, abs=1.0)
 
 
