@@ -62,6 +62,7 @@ def decide(query: Query, found: Sequence[Found], options: LocateOptions) -> Loca
     location = _describe_work(query, found)
     if options.method == "pair":
         return _decide_pairs(location, query, found, options)
+    # The best place of all references, and the others.
     candidates = _pool(query, found)
     best = candidates[0] if candidates else None
     rivals = candidates[1:]
@@ -76,6 +77,7 @@ def decide(query: Query, found: Sequence[Found], options: LocateOptions) -> Loca
         return _refuse(location, query, found, best, options)
     placed = place_frame(_on(location, best.found), query, best.fit, options.match.camera.focal_px)
     cut = f"; stopped at the time limit, {_CUT_SHORT}" if location.stopped == "time" else ""
+    # It has a place: the answer, unless another place is as good.
     if rival is not None and best.score < options.min_log10_odds:
         return replace(placed, status="ambiguous", reason=_alike(best, rival) + cut, reason_code=Reason.TWO_PLACES)
     if rival is not None and best.score - rival.score < options.min_margin:
