@@ -36,6 +36,17 @@ _CHUNK = 1 << 16
 _MOST_DRAINED = 1 << 20  # a refused body up to this is read, so that its sender hears the answer
 
 
+def _too_many() -> bytes:
+    """Return the answer to a connection for which there is no thread."""
+    status = HTTPStatus.SERVICE_UNAVAILABLE
+    body = json.dumps(problem(status, status.phrase, "too many connections are open; come again")).encode()
+    head = f"HTTP/1.1 503 {status.phrase}\r\nRetry-After: 1\r\nContent-Type: application/problem+json\r\n"
+    return f"{head}Content-Length: {len(body)}\r\nConnection: close\r\n\r\n".encode() + body
+
+
+_TOO_MANY = _too_many()
+
+
 @dataclass(frozen=True)
 class ServeOptions:
     """What the server allows.
@@ -100,11 +111,8 @@ class Server(ThreadingHTTPServer):
         """Take a connection, or say that there are too many."""
         if not self._free.acquire(blocking=False):
             request.settimeout(0.2)
-            refusal = (
-                b"HTTP/1.1 503 Service Unavailable\r\nRetry-After: 1\r\nContent-Length: 0\r\nConnection: close\r\n\r\n"
-            )
             with suppress(OSError):
-                request.sendall(refusal)
+                request.sendall(_TOO_MANY)
                 request.setblocking(False)
                 while request.recv(_CHUNK):  # closed with bytes unread, the connection would take the answer with it
                     pass

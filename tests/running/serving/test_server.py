@@ -210,6 +210,8 @@ def test_too_many_connections_are_refused_politely():
         said = send_raw(server, b"GET / HTTP/1.1\r\nHost: localhost\r\n\r\n", 2.0)
         assert b" 503 " in said[:40]
         assert b"Retry-After" in said
+        assert b"application/problem+json" in said
+        assert json.loads(said.partition(b"\r\n\r\n")[2])["status"] == 503
 
 
 def test_with_a_token_nobody_else_is_answered():
