@@ -92,12 +92,15 @@ class Ledger:
     n_reference : int
         Intersections of all parts: what is tried on them is bounded as on one map of that size.
     n_tried : int
+    tried_by : dict of int to int
+        As many had been tried when a stage, by its number, was last at work.
     n_usual, n_last : int
         Places screened by the usual sweeps, and by the last ones.
     """
 
     n_reference: int = 0
     n_tried: int = 0
+    tried_by: dict[int, int] = field(default_factory=dict)
     n_usual: int = 0
     n_last: int = 0
 
@@ -182,10 +185,11 @@ class TripleEstimator:
         """Intersections of the query that were looked for."""
         return len({anchor for _, anchor in self._tried})
 
-    def _count(self, n_places: int) -> None:
-        """Note that so many more places were tried."""
+    def _count(self, n_places: int, stage: int) -> None:
+        """Note that a stage tried so many more places."""
         self.n_screened += n_places
         self.ledger.n_tried += n_places
+        self.ledger.tried_by[stage] = self.ledger.n_tried
 
     def _rounds_of_roads(
         self, options: RoadSearchOptions, only: Sequence[int] | None = None
@@ -196,7 +200,7 @@ class TripleEstimator:
         roads, known, stage = self._roads, self._grown_by_roads, len(self.options.sweeps)
         tried = roads.n_tried
         for anchor, n_proposed, grown in roads.rounds(only):
-            self._count(roads.n_tried - tried)
+            self._count(roads.n_tried - tried, stage)
             tried = roads.n_tried
             self.n_hypotheses += n_proposed
             if anchor >= 0:
@@ -263,11 +267,11 @@ class TripleEstimator:
             self.n_candidates += proposals.n_hits
             yield self._grow_all(proposals, grow, stage)
 
-    def _screen(self, proposals: Proposals, options: GrowOptions) -> IntArray:
+    def _screen(self, proposals: Proposals, options: GrowOptions, stage: int) -> IntArray:
         """Return the proposals that are allowed and lie on roads, the best placed first."""
         allowed = self._is_allowed(proposals)
         looked_at = np.flatnonzero(allowed)[: options.max_screened]
-        self._count(len(looked_at))
+        self._count(len(looked_at), stage)
         kept = screen_proposals(self.scene, self.index, proposals, looked_at, options)
         self.trace.screened(proposals, allowed, kept)
         return kept
@@ -292,7 +296,7 @@ class TripleEstimator:
     def _grow_all(self, proposals: Proposals, options: GrowOptions, stage: int) -> list[Hypothesis]:
         """Return the best grown proposals of one anchor that mean different places and that a camera can have seen."""
         before = self.n_screened
-        chosen = self._screen(proposals, options)[: options.max_grown]
+        chosen = self._screen(proposals, options, stage)[: options.max_grown]
         if stage < len(self.options.sweeps):
             self.ledger.n_usual += self.n_screened - before
         else:
@@ -326,11 +330,21 @@ class TripleEstimator:
             self._look_through_lens(model)
         elif model.refined is not None:
             self._dropped.append(model)
+        model.n_tried = self.ledger.n_tried
         self.refine_s += time.perf_counter() - started
         self.trace.scored(model)
         if not model.by_roads and self._fits_whole(model):
             self._whole.append(model)
         return model.log10_odds
+
+    def evidence(self, model: Hypothesis) -> float:
+        """Return the log10 odds of a hypothesis without what is charged for the places tried."""
+        return model.log10_odds + math.log10(max(model.n_tried, 1))
+
+    def charge(self, model: Hypothesis) -> float:
+        """Return what is charged for the places tried until the stage ended that led to a hypothesis, as log10."""
+        ended = [self.ledger.tried_by.get(stage, 0) for stage, _ in model.leads[:1]]
+        return math.log10(max(model.n_tried, *ended, 1))
 
     def _verify(self, model: Hypothesis) -> float:
         self.n_verified += 1

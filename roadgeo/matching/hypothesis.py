@@ -27,8 +27,8 @@ class Hypothesis:
     """A grown hypothesis and what came of it.
 
     `by_roads`: it grew by roads over the whole frame; `leads`: the intersections of the query that proposed it, each
-    with the number of the stage in which it did; `fault`: the camera's last objection, None where it had none; `lens`:
-    how it fits when it is grown anew behind a lens.
+    with the number of the stage in which it did; `n_tried`: places tried when it was scored; `fault`: the camera's last
+    objection, None where it had none; `lens`: how it fits when it is grown anew behind a lens.
     """
 
     matrix: FloatArray
@@ -41,6 +41,7 @@ class Hypothesis:
     distance: FloatArray | None = None
     gsd_m: float = np.nan
     log10_odds: float = -np.inf
+    n_tried: int = 1
     fault: CameraFault | None = None
     by_roads: bool = False
     lens: LensFit | None = None

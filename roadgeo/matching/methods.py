@@ -182,11 +182,11 @@ class _Attempt:
         estimator = self.estimator
         if self.search is None or estimator is None:
             return Found(self.index, n_searched=self.n_searched)
-        result = self.search.result()
+        result, places = _charge_alike(estimator, self.search)
         self.trace.finished(estimator, result)
         return Found(
             self.index,
-            _fits(estimator, result, self.search.promising),
+            _fits(estimator, result, places),
             result.stopped,
             n_searched=self.n_searched,
             n_tried=estimator.n_screened,
@@ -203,8 +203,29 @@ class _Attempt:
         )
 
 
+def _charge_alike(
+    estimator: TripleEstimator, search: Search[Hypothesis]
+) -> tuple[SearchResult[Hypothesis], list[tuple[float, Hypothesis]]]:
+    """Charge all places alike, for what was tried until the stage ended that led to the best; return them in order.
+
+    In the search each is charged for what was tried before it; so it would lead its twin by having been met first.
+    """
+    result = search.result()
+    met = {
+        id(model): model for model in (result.best, result.runner_up, *(one for _, one in search.promising)) if model
+    }
+    ranked = sorted(met.values(), key=lambda model: -estimator.evidence(model))
+    if not ranked:
+        return result, []
+    charge = estimator.charge(ranked[0])
+    places = [(estimator.evidence(model) - charge, model) for model in ranked]
+    (score, best), *rest = places
+    second, runner_up = next((one for one in rest if not estimator.same(one[1], best)), (-math.inf, None))
+    return replace(result, best=best, score=score, runner_up=runner_up, runner_up_score=second), places
+
+
 def _fits(
-    estimator: TripleEstimator, result: SearchResult[Hypothesis], promising: Sequence[tuple[float, Hypothesis]]
+    estimator: TripleEstimator, result: SearchResult[Hypothesis], places: Sequence[tuple[float, Hypothesis]]
 ) -> tuple[Fit, ...]:
     """Return the best place, the runner-up, and of the other promising ones the one that agrees best."""
     _measure_corners(estimator, result.best)
@@ -212,7 +233,7 @@ def _fits(
     leaders = [model for model in (result.best, result.runner_up) if model is not None]
     others = [
         _fit(estimator, model, score)
-        for score, model in promising
+        for score, model in places
         if not any(estimator.same(model, leader) for leader in leaders)
     ]
     chosen.append(max(filter(None, others), key=lambda fit: fit.agreement, default=None))

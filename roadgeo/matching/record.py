@@ -87,6 +87,14 @@ class Record:
     def finished(self, estimator: TripleEstimator, result: SearchResult[Hypothesis]) -> None:
         """Keep the result, and grow what points elsewhere than a camera may: to tell that it would fit."""
         self.estimator, self.result = estimator, result
+        if result.best is not None:
+            charge = estimator.charge(result.best)
+            self.models = [
+                replace(one, log10_odds=estimator.evidence(one.model) - charge)
+                if math.isfinite(one.log10_odds)
+                else one
+                for one in self.models
+            ]
         for proposals in self.elsewhere:
             for hypothesis in estimator.grow(proposals, np.arange(len(proposals.reference)))[:_MAX_RETRIED]:
                 fault = estimator.judge(hypothesis.matrix, rough=True)
