@@ -217,7 +217,9 @@ def _charge_alike(
     ranked = sorted(met.values(), key=lambda model: -estimator.evidence(model))
     if not ranked:
         return result, []
-    charge = estimator.charge(ranked[0])
+    versions = [model for model in ranked if estimator.same(model, ranked[0])]
+    # Of a place that was met in an early stage and better in a late one the early one counts, if that is more.
+    charge = estimator.evidence(ranked[0]) - max(estimator.evidence(one) - estimator.charge(one) for one in versions)
     places = [(estimator.evidence(model) - charge, model) for model in ranked]
     (score, best), *rest = places
     second, runner_up = next((one for one in rest if not estimator.same(one[1], best)), (-math.inf, None))

@@ -88,7 +88,7 @@ class Record:
         """Keep the result, and grow what points elsewhere than a camera may: to tell that it would fit."""
         self.estimator, self.result = estimator, result
         if result.best is not None:
-            charge = estimator.charge(result.best)
+            charge = estimator.evidence(result.best) - result.score
             self.models = [
                 replace(one, log10_odds=estimator.evidence(one.model) - charge)
                 if math.isfinite(one.log10_odds)

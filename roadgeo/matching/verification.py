@@ -168,7 +168,8 @@ def chance_agreement(
     min_cos = math.cos(math.radians(options.max_turn_deg))
     roads = index.road_buckets
     inverse, bounds = np.asarray(np.linalg.inv(matrix), float), _bounds(matrix, scene)
-    shifts = np.concatenate((_spiral(options), _onto_neighbours(matrix, scene, index, options, near)))[::every]
+    shifts = np.concatenate((_spiral(options), _onto_neighbours(matrix, scene, index, options, near)))
+    shifts = np.ascontiguousarray(shifts[::every])
     rates = np.empty((len(shifts), 3))
     counts = np.empty(len(shifts), np.int64)
     count_matches(

@@ -59,7 +59,7 @@ def shelf(tmp_path_factory):
         write_vector(folder / "outline.geojson", [OUTLINE])
         # Masks of the same streets stand for those that readers draw.
         index = ["index", "--roads", "massachusetts.osm.pbf", "--out", "city.gpkg", "--quiet"]
-        view = ["--noise", "clean", "--size", "600", "--gsd", "1:1", "--intersections", "15:1000", "--count", "3"]
+        view = ["--noise", "clean", "--size", "600", "--gsd", "1:1", "--intersections", "40:1000", "--count", "3"]
         assert main(index) == 0
         assert main(["simulate", "city.gpkg", "--out-dir", "drawn", "--quiet", *view]) == 0
         (folder / "drawn" / "clean").rename(folder / "masks")

@@ -13,7 +13,7 @@ import pytest
 import roadgeo
 
 RECIPE = Path(__file__).parents[2] / "examples" / "segmenter"
-MODEL = Path(roadgeo.__file__).parent / "segmentation" / "model" / "roads.onnx"
+MODEL = Path(roadgeo.__file__).parent / "sources" / "segmentation" / "model" / "roads.onnx"
 
 
 def streets(size: int, pitch: int, start: int, width: int = 8) -> np.ndarray:

@@ -45,5 +45,12 @@ def test_later_stages_cost_earlier_places_nothing(estimator):
     assert charged(estimator, place(6.0, 100_000, 1)).score == pytest.approx(6.0 - math.log10(5.0))
 
 
+def test_a_place_met_again_in_a_later_stage_is_charged_as_in_the_first(estimator):
+    estimator.same = lambda a, b: True
+    early, late = place(7.0, 100, 0), place(4.0, 500_000, 1)  # the later fits better: 9.7 instead of 9.0
+    result = charged(estimator, early, late)
+    assert (result.best, result.score) == (late, pytest.approx(5.0))
+
+
 def test_nothing_found_is_nothing_charged(estimator):
     assert charged(estimator).best is None
