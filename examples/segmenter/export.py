@@ -25,8 +25,8 @@ METADATA = {
     "standardization_mean": [0.0, 0.0, 0.0],  # the network standardizes by itself
     "standardization_std": [1.0, 1.0, 1.0],
     "seg_thresh": 0.5,
-    "version": "2",
-    "training_data": "22 photographs of the Massachusetts Roads Dataset (Mnih, 2013), 1 m per pixel",
+    "version": "3",
+    "training_data": "34 photographs of the Massachusetts Roads Dataset (Mnih, 2013), 1 m per pixel",
     "licence": "weights as the project; the photographs and masks they were trained on state no licence",
 }
 
