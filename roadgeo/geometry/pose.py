@@ -28,6 +28,11 @@ from roadgeo.geometry.homography import Homography
 #: Focal lengths that an adjustment may start from, in usual ones.
 _FACTORS = (0.35, 0.5, 0.7, 1.0, 1.4, 2.0, 3.0)
 
+#: `v @ _CROSS` is the matrix that takes the cross product with v.
+_CROSS = np.zeros((3, 3, 3))
+_CROSS[0, 2, 1] = _CROSS[1, 0, 2] = _CROSS[2, 1, 0] = 1.0
+_CROSS[0, 1, 2] = _CROSS[1, 2, 0] = _CROSS[2, 0, 1] = -1.0
+
 __all__ = ["Pose", "PoseOptions", "find_pose", "omega_phi_kappa", "quaternion", "turned"]
 
 
@@ -156,8 +161,8 @@ def _fit(
     prior_sigma = 1e-6 if options.focal_px else options.usual_sigma
 
     def residuals(p: FloatArray) -> FloatArray:
-        away = weights @ (_corners_seen(p, frame) - corners).ravel()
-        return np.append(away, (p[6] - prior) / prior_sigma)
+        away = (_corners_seen(p, frame) - corners).reshape(*p.shape[:-1], 8) @ weights.T
+        return np.concatenate((away, (p[..., 6:] - prior) / prior_sigma), axis=-1)
 
     p, damping = start, 1e-3
     scale = np.array([start[2]] * 3 + [1.0] * 4)
@@ -182,22 +187,21 @@ def _fit(
 
 
 def _corners_seen(p: FloatArray, frame: Frame) -> FloatArray:
-    """Return where a pinhole sees the corners of its frame on the plane, (4, 2); NaN above the horizon."""
-    pixels = (frame.corners - frame.center) * (1.0, -1.0)
-    rays = np.c_[pixels, np.full(4, -math.exp(p[6]))] @ _rotation(p[3:6]).T
+    """Return where pinholes (..., 7) see the corners of their frame on the plane, (..., 4, 2); NaN above the horizon."""
+    rays = np.empty((*p.shape[:-1], 4, 3))
+    rays[..., :2] = (frame.corners - frame.center) * (1.0, -1.0)
+    rays[..., 2] = -np.exp(p[..., 6:])
+    rays = rays @ np.swapaxes(_rotation(p[..., 3:6]), -1, -2)
     with np.errstate(divide="ignore", invalid="ignore"):
-        reach = np.where(rays[:, 2] < 0, -p[2] / rays[:, 2], np.nan)
-    return np.asarray(p[:2] + rays[:, :2] * reach[:, None])
+        reach = np.where(rays[..., 2] < 0, -p[..., 2:3] / rays[..., 2], np.nan)
+    return np.asarray(p[..., None, :2] + rays[..., :2] * reach[..., None])
 
 
 def _differentiate(function: Callable[[FloatArray], FloatArray], p: FloatArray, scale: FloatArray) -> FloatArray:
-    """Differentiate a vector of values by the parameters, from both sides."""
-    columns = []
-    for k, one in enumerate(scale):
-        step = np.zeros(len(p))
-        step[k] = 1e-6 * one
-        columns.append((function(p + step) - function(p - step)) / (2e-6 * one))
-    return np.stack(columns, axis=1)
+    """Differentiate a vector of values by the parameters, from both sides; the function takes many at once."""
+    steps = np.diag(1e-6 * scale)
+    after, before = function(p + np.stack((steps, -steps)))
+    return np.asarray((after - before).T / (2e-6 * scale))
 
 
 def _describe(p: FloatArray, covariance: FloatArray, options: PoseOptions) -> Pose:
@@ -221,13 +225,11 @@ def _describe(p: FloatArray, covariance: FloatArray, options: PoseOptions) -> Po
 
 
 def _rotation(vector: FloatArray) -> FloatArray:
-    """Return the rotation (3, 3) about a vector by its length, radians (Rodrigues)."""
-    angle = float(np.linalg.norm(vector))
-    if angle < 1e-12:
-        return np.eye(3)
-    x, y, z = vector / angle
-    cross = np.array([[0.0, -z, y], [z, 0.0, -x], [-y, x, 0.0]])
-    return np.asarray(np.eye(3) + math.sin(angle) * cross + (1.0 - math.cos(angle)) * cross @ cross)
+    """Return the rotations (..., 3, 3) about vectors (..., 3) by their length, radians (Rodrigues)."""
+    angle = np.linalg.norm(vector, axis=-1)[..., None, None]
+    cross = np.tensordot(vector, _CROSS, axes=1)
+    half = 0.5 * np.sinc(angle / (2.0 * math.pi)) ** 2  # (1 - cos) / angle^2, also where that is 0 / 0
+    return np.asarray(np.eye(3) + np.sinc(angle / math.pi) * cross + half * (cross @ cross))
 
 
 def _rotation_vector(rotation: FloatArray) -> FloatArray:
@@ -238,11 +240,11 @@ def _rotation_vector(rotation: FloatArray) -> FloatArray:
 
 
 def _angles(rotation: FloatArray) -> FloatArray:
-    """Return heading, pitch and roll (see `Pose.angles_deg`)."""
-    right, ahead, up = rotation.T
-    heading = math.atan2(ahead[0], ahead[1])
-    pitch = math.asin(max(-1.0, min(1.0, float(ahead[2]))))
-    return np.degrees([heading, pitch, math.atan2(-right[2], up[2])])
+    """Return heading, pitch and roll (..., 3) of rotations (..., 3, 3); see `Pose.angles_deg`."""
+    right, ahead, up = np.moveaxis(rotation, -1, 0)
+    heading = np.arctan2(ahead[..., 0], ahead[..., 1])
+    pitch = np.arcsin(np.clip(ahead[..., 2], -1.0, 1.0))
+    return np.degrees(np.stack((heading, pitch, np.arctan2(-right[..., 2], up[..., 2])), axis=-1))
 
 
 def turned(rotation: FloatArray, clockwise_deg: float) -> FloatArray:

@@ -81,11 +81,8 @@ def find_border(roads: BoolArray, road_width_px: float, options: BorderOptions |
     for turns in range(4):
         seen = np.rot90(on_map, turns)
         seen[: _caption_depth(np.rot90(small & on_map, turns), width, options)] = False
-    lines = [_find_line(np.rot90(small & on_map, turns), width, options) for turns in range(4)]
-    if sum(line is not None for line in lines) >= options.least_sides:
-        for turns, line in enumerate(lines):
-            if line is not None:
-                _cut(np.rot90(on_map, turns), line)
+    for turns, line in _find_lines(small & on_map, width, options):
+        _cut(np.rot90(on_map, turns), line)
     if on_map.all() or not (small & on_map).any():
         return None
     height, wide = roads.shape
@@ -133,17 +130,25 @@ def _caption_depth(roads: BoolArray, width: float, options: BorderOptions) -> in
     return 0
 
 
+def _find_lines(roads: BoolArray, width: float, options: BorderOptions) -> list[tuple[int, _Line]]:
+    """Return the lines of sides, by the quarter turns that bring them to the top; none where too few sides have one."""
+    found: list[tuple[int, _Line]] = []
+    for turns in range(4):
+        line = _find_line(np.rot90(roads, turns), width, options)
+        if line is not None:
+            found.append((turns, line))
+        elif turns + 1 - len(found) > 4 - options.least_sides:
+            return []
+    return found
+
+
 def _find_line(roads: BoolArray, width: float, options: BorderOptions) -> _Line | None:
     """Return the innermost line along the first rows that no road crosses; None where there is none."""
-    height, wide = roads.shape
-    deep = int(options.most * height)
-    rows, columns = np.nonzero(roads[:deep])
+    wide = roads.shape[1]
     beyond = round(1.5 * width) + 1
+    slopes = np.tan(np.radians(np.linspace(-options.max_turn_deg, options.max_turn_deg, 21)))
     found: list[tuple[float, _Line]] = []
-    for slope in np.tan(np.radians(np.linspace(-options.max_turn_deg, options.max_turn_deg, 21))):
-        depth = np.rint(rows - slope * (columns - wide / 2)).astype(np.int64)
-        kept = (depth >= 0) & (depth < deep)
-        cover = np.bincount(depth[kept], minlength=deep) / wide
+    for slope, cover in zip(slopes, _covers(roads, int(options.most * len(roads)), slopes), strict=True):
         line = _innermost(cover, beyond, options)
         if line is not None:
             found.append((float(cover[line]), _Line(line + 1.0, float(slope))))
@@ -151,6 +156,24 @@ def _find_line(roads: BoolArray, width: float, options: BorderOptions) -> _Line 
         return None
     best = max(cover for cover, _ in found)
     return max((line for cover, line in found if cover >= 0.97 * best), key=lambda line: line.depth)
+
+
+def _covers(roads: BoolArray, deep: int, slopes: FloatArray) -> list[FloatArray]:
+    """Return which share of each of the first `deep` rows (deep,) is road, rows sloping by `slopes`."""
+    wide = roads.shape[1]
+    shifts = np.rint(slopes[:, None] * (np.arange(wide) - wide / 2)).astype(np.int64)
+    most = int(np.abs(shifts).max())
+    # Columns that are shifted alike are counted at once, by sums over all columns before them.
+    sums = np.zeros((deep + 2 * most, wide + 1), np.int32)
+    np.cumsum(np.ascontiguousarray(roads[:deep]), axis=1, out=sums[most : most + deep, 1:])
+    rows = np.arange(deep)[:, None] + most
+    covers = []
+    for shift in shifts:
+        starts = np.flatnonzero(np.diff(shift, prepend=most + 1))
+        stops = np.append(starts[1:], wide)
+        rows_there = rows + shift[starts]
+        covers.append((sums[rows_there, stops] - sums[rows_there, starts]).sum(axis=1) / wide)
+    return covers
 
 
 def _innermost(cover: FloatArray, beyond: int, options: BorderOptions) -> int | None:
