@@ -130,9 +130,9 @@ class MaskSource:
         roads, observed = _separate(self._raster, self._channel, threshold)
         roads, observed = _told_apart(name, roads, observed)
         if self._voids:
-            roads, observed = _without_border(name, roads, observed)
-        if self._voids and observed is None:
-            observed = find_voids(roads, road_width(RoadMask(roads, name=name)))
+            width = road_width(RoadMask(roads, name=name))
+            roads, observed = _without_border(name, roads, observed, width)
+            observed = find_voids(roads, width) if observed is None else observed
         if observed is not None:
             roads &= observed
         return RoadMask(roads, observed, name)
@@ -183,7 +183,7 @@ def _sample(raster: _Raster) -> AnyArray:
     """Return (n, B) observed values, from all over a raster."""
     step = _sample_step(raster)
     parts = [raster.read(strip.start, strip.stop, step) for strip in _strips(raster, step)]
-    seen = np.concatenate([values[_finite(values, valid)] for values, valid in parts])
+    seen = np.concatenate([_observed(values, valid) for values, valid in parts])
     if len(seen) == 0:
         raise MaskError(f"{raster.name}: holds no observed pixel, only nodata, NaN or alpha 0; give a mask with roads")
     return seen
@@ -238,6 +238,12 @@ def _compare(values: AnyArray, threshold: float, above: BoolArray) -> None:
         np.greater_equal(values, max(int(np.floor(threshold)) + 1, limits.min), out=above)
 
 
+def _observed(values: AnyArray, valid: BoolArray | None) -> AnyArray:
+    """Return (n, B) values of pixels that are valid numbers."""
+    finite = _finite(values, valid)
+    return values.reshape(-1, values.shape[2]) if finite.all() else np.asarray(values[finite])
+
+
 def _finite(values: AnyArray, valid: BoolArray | None) -> BoolArray:
     """Return (rows, columns) where values are valid numbers."""
     finite = np.ones(values.shape[:2], np.bool_) if valid is None else valid
@@ -262,9 +268,11 @@ def _told_apart(name: str, roads: BoolArray, observed: BoolArray | None) -> tupl
     return inverted, observed
 
 
-def _without_border(name: str, roads: BoolArray, observed: BoolArray | None) -> tuple[BoolArray, BoolArray | None]:
+def _without_border(
+    name: str, roads: BoolArray, observed: BoolArray | None, road_width_px: float
+) -> tuple[BoolArray, BoolArray | None]:
     """Leave out what a scan shows around its map."""
-    on_map = find_border(roads, road_width(RoadMask(roads, name=name)))
+    on_map = find_border(roads, road_width_px)
     if on_map is None or not (roads & on_map).any():
         return roads, observed
     _LOG.warning("%s: what lies beyond the border of the map is left out", visible(name))
