@@ -160,6 +160,23 @@ class ReferenceIndex:
         """The table of triples, as kernels take it."""
         return TripleMap(self.xy, self.branches, self.neighbours, self.table_starts, self.table_entries)
 
+    def within(self, middle: FloatArray, reach_m: float) -> FloatArray:
+        """Return (M, 2) the intersections less than `reach_m` from `middle`, (2,) plane metres, in both x and y.
+
+        Only the buckets there are looked at: what it costs does not grow with the map.
+        """
+        x0, y0, size = self.grid
+        columns, rows = self.shape
+        ends = np.stack([np.subtract(middle, reach_m), np.add(middle, reach_m)])
+        ends = np.nan_to_num(ends, nan=np.inf)  # beyond the horizon: nothing is near
+        (left, low), (right, high) = np.clip((ends - (x0, y0)) // size, 0, (columns - 1, rows - 1)).astype(int)
+        starts = self.point_starts
+        parts = [
+            self.xy[starts[row * columns + left] : starts[row * columns + right + 1]] for row in range(low, high + 1)
+        ]
+        near = np.concatenate(parts)
+        return near[np.abs(near - middle).max(axis=1) < reach_m]
+
     @property
     def nbytes(self) -> int:
         """Size of all arrays."""

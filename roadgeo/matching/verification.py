@@ -216,7 +216,7 @@ def _onto_neighbours(
     """
     low, high = options.shift_m
     middle = Homography(matrix)(scene.center)
-    near = index.xy[np.abs(index.xy - middle).max(axis=1) < 2.0 * high]
+    near = index.within(middle, 2.0 * high)
     if not len(near):
         return np.empty((0, 2))
     anchors = near[np.argsort(((near - middle) ** 2).sum(axis=1))[: options.n_anchors]]

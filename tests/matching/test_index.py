@@ -345,3 +345,12 @@ def test_within_a_cell_entries_come_from_all_parts_of_the_map(town):
     inside = cells[1:] == cells[:-1]
     later = northing[1:][inside] - northing[:-1][inside]
     assert abs((later > 0).mean() - 0.5) < 0.05
+
+
+@pytest.mark.parametrize("reach_m", [1.0, 90.0, 640.0, 1e5])
+@pytest.mark.parametrize("away_m", [(0.0, 0.0), (350.0, -900.0), (-1e5, 40.0), (3e4, np.nan)])
+def test_what_lies_near_is_found_in_the_buckets_there(town, reach_m, away_m):
+    index = town[1]
+    middle = index.xy.mean(axis=0) + away_m
+    slowly = index.xy[np.abs(index.xy - middle).max(axis=1) < reach_m]
+    assert np.array_equal(index.within(middle, reach_m), slowly)
