@@ -187,7 +187,7 @@ def _fit(
 
 
 def _corners_seen(p: FloatArray, frame: Frame) -> FloatArray:
-    """Return where pinholes (..., 7) see the corners of their frame on the plane, (..., 4, 2); NaN above the horizon."""
+    """Return where pinholes (..., 7) see their frames' corners on the plane, (..., 4, 2); NaN above the horizon."""
     rays = np.empty((*p.shape[:-1], 4, 3))
     rays[..., :2] = (frame.corners - frame.center) * (1.0, -1.0)
     rays[..., 2] = -np.exp(p[..., 6:])

@@ -167,13 +167,13 @@ class ReferenceIndex:
         """
         x0, y0, size = self.grid
         columns, rows = self.shape
-        ends = np.stack([np.subtract(middle, reach_m), np.add(middle, reach_m)])
-        ends = np.nan_to_num(ends, nan=np.inf)  # beyond the horizon: nothing is near
-        (left, low), (right, high) = np.clip((ends - (x0, y0)) // size, 0, (columns - 1, rows - 1)).astype(int)
-        starts = self.point_starts
-        parts = [
-            self.xy[starts[row * columns + left] : starts[row * columns + right + 1]] for row in range(low, high + 1)
-        ]
+        # Beyond the horizon nothing is near.
+        ends = np.nan_to_num([middle - reach_m, middle + reach_m], nan=np.inf, posinf=np.inf, neginf=-np.inf)
+        cells = np.floor((ends - (x0, y0)) / size)
+        (left, low), (right, high) = np.clip(cells, 0, (columns - 1, rows - 1)).astype(int)
+        starts = self.point_starts[columns * np.arange(low, high + 1) + left]
+        stops = self.point_starts[columns * np.arange(low, high + 1) + right + 1]
+        parts = [self.xy[start:stop] for start, stop in zip(starts, stops, strict=True)]
         near = np.concatenate(parts)
         return near[np.abs(near - middle).max(axis=1) < reach_m]
 
