@@ -244,7 +244,7 @@ def _angles(rotation: FloatArray) -> FloatArray:
     right, ahead, up = np.moveaxis(rotation, -1, 0)
     heading = np.arctan2(ahead[..., 0], ahead[..., 1])
     pitch = np.arcsin(np.clip(ahead[..., 2], -1.0, 1.0))
-    return np.degrees(np.stack((heading, pitch, np.arctan2(-right[..., 2], up[..., 2])), axis=-1))
+    return np.asarray(np.degrees(np.stack((heading, pitch, np.arctan2(-right[..., 2], up[..., 2])), axis=-1)))
 
 
 def turned(rotation: FloatArray, clockwise_deg: float) -> FloatArray:

@@ -175,7 +175,7 @@ class ReferenceIndex:
         stops = self.point_starts[columns * np.arange(low, high + 1) + right + 1]
         parts = [self.xy[start:stop] for start, stop in zip(starts, stops, strict=True)]
         near = np.concatenate(parts)
-        return near[np.abs(near - middle).max(axis=1) < reach_m]
+        return np.asarray(near[np.abs(near - middle).max(axis=1) < reach_m])
 
     @property
     def nbytes(self) -> int:
