@@ -10,6 +10,7 @@ from typing import Literal
 import numpy as np
 
 from roadgeo._arrays import FloatArray
+from roadgeo.geometry.frame import Frame
 from roadgeo.geometry.homography import Homography
 
 __all__ = ["CameraFault", "CameraOptions", "CameraPose", "judge", "pose", "sampling"]
@@ -107,7 +108,7 @@ class CameraPose:
 
 def sampling(matrix: FloatArray, size: tuple[int, int]) -> float:
     """Return the ground sampling at the middle of the frame, metres per pixel."""
-    jacobian = Homography(matrix).jacobian(np.array([size[0] / 2.0, -size[1] / 2.0]))
+    jacobian = Homography(matrix).jacobian(Frame(*size).plane_center)
     return math.sqrt(abs(jacobian[0, 0] * jacobian[1, 1] - jacobian[0, 1] * jacobian[1, 0]))
 
 
@@ -126,7 +127,7 @@ def _pinholes(matrix: FloatArray, size: tuple[int, int], focal_px: float | None)
     For each focal length f the columns of diag(1/f, 1/f, 1) G, G the inverse map with the frame's middle as origin,
     should be perpendicular and equally long (Hartley & Zisserman, 8.1.1).
     """
-    center = (size[0] / 2.0, -size[1] / 2.0)
+    center = Frame(*size).plane_center
     shift = np.array([[1.0, 0.0, -center[0]], [0.0, 1.0, -center[1]], [0.0, 0.0, 1.0]])
     g = shift @ np.linalg.inv(matrix)
     focal = np.array([focal_px]) if focal_px else _FOCAL_STEPS * math.hypot(*size) / 2.0
@@ -145,7 +146,7 @@ def pose(matrix: FloatArray, size: tuple[int, int], focal_px: float | None = Non
 
     The focal length is that of the pinhole that fits best, and of a usual lens where all fit alike, as near the nadir.
     """
-    jacobian = Homography(matrix).jacobian(np.array([size[0] / 2.0, -size[1] / 2.0]))
+    jacobian = Homography(matrix).jacobian(Frame(*size).plane_center)
     gsd = sampling(matrix, size)
     rotation = math.degrees(math.atan2(jacobian[0, 1], jacobian[1, 1]))
     fits = _pinholes(matrix, size, focal_px)
@@ -167,12 +168,11 @@ def judge(matrix: FloatArray, size: tuple[int, int], options: CameraOptions, rou
     """
     if not np.isfinite(matrix).all():
         return CameraFault.DEGENERATE
-    width, height = size
-    corners = np.array([[0, 0, 1], [width, 0, 1], [width, -height, 1], [0, -height, 1]], float)
-    middle = float(matrix[2] @ (width / 2.0, -height / 2.0, 1.0))
+    frame, homography = Frame(*size), Homography(matrix)
+    middle = float(homography.w(frame.plane_center))
     if middle == 0.0:
         return CameraFault.DEGENERATE
-    if (corners @ matrix[2] / middle < 0.05).any():
+    if (homography.w(frame.plane_corners) / middle < 0.05).any():
         return CameraFault.HORIZON
     if np.linalg.det(matrix) / middle**3 <= 0:
         return CameraFault.MIRRORED
@@ -185,7 +185,7 @@ def judge(matrix: FloatArray, size: tuple[int, int], options: CameraOptions, rou
     if fits.tilt_deg[fits.skew <= fits.skew.min() + further].min() > options.max_tilt_deg + slack_deg:
         return CameraFault.TILT
     if options.north_up:
-        jacobian = Homography(matrix).jacobian(np.array([width / 2.0, -height / 2.0]))
+        jacobian = homography.jacobian(frame.plane_center)
         if abs(math.degrees(math.atan2(jacobian[0, 1], jacobian[1, 1]))) > slack_deg:
             return CameraFault.NOT_NORTH_UP
     return None

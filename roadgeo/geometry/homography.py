@@ -32,7 +32,11 @@ class Homography:
 
     def ahead(self, xy: FloatArray) -> BoolArray:
         """Tell which of (..., 2) points lie on this side of the horizon."""
-        return np.asarray(self._homogeneous(xy)[..., 2] > 0)
+        return np.asarray(self.w(xy) > 0)
+
+    def w(self, xy: FloatArray) -> FloatArray:
+        """Return what the coordinates of where (..., 2) points come to lie are divided by, (...,)."""
+        return np.asarray(self._homogeneous(xy)[..., 2])
 
     def _homogeneous(self, xy: FloatArray) -> FloatArray:
         """Return (..., 3) homogeneous coordinates of where points (..., 2) come to lie."""
@@ -48,7 +52,7 @@ class Homography:
 
     def jacobian(self, xy: FloatArray) -> FloatArray:
         """Return the (..., 2, 2) derivative d(x', y') / d(x, y) at (..., 2) points with w > 0."""
-        w = self._homogeneous(xy)[..., 2]
+        w = self.w(xy)
         image = self.everywhere(xy)
         linear = self.matrix[:2, :2] - image[..., :, None] * self.matrix[2, :2]
         return np.asarray(linear / w[..., None, None])

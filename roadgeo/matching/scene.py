@@ -158,7 +158,7 @@ def prepare_scene(
         seen = np.ones(cells, bool)
     else:
         seen = cv2.resize(observed.astype(np.uint8), cells[::-1], interpolation=cv2.INTER_AREA) > 0
-    intersections = _nearest(intersections, np.array([width / 2.0, -height / 2.0]), options.max_intersections)
+    intersections = _nearest(intersections, Frame(*size).plane_center, options.max_intersections)
     k = options.n_neighbours
     neighbours = query_neighbours(intersections.xy, k) if len(intersections) else np.empty((0, k), np.int32)
     return Scene(

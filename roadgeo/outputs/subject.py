@@ -12,6 +12,7 @@ import numpy as np
 
 from roadgeo._arrays import FloatArray
 from roadgeo.errors import CrsError, OutputError
+from roadgeo.geometry.frame import Frame
 from roadgeo.geometry.homography import Homography
 from roadgeo.geometry.mask import RoadMask, plane_to_pixel
 from roadgeo.geometry.warping import MapGrid, cover
@@ -191,8 +192,7 @@ class Subject:
         """Ring (32, 2) of longitude and latitude around the footprint, counterclockwise; see `antimeridian`."""
         from roadgeo.geometry.projection import to_lonlat
 
-        width, height = self.size
-        corners = np.array([[0, 0], [0, height], [width, height], [width, 0]], float)
+        corners = Frame(*self.size).corners[[0, 3, 2, 1]]
         sides = zip(corners, np.roll(corners, -1, axis=0), strict=True)
         pixels = np.concatenate([np.linspace(a, b, 8, endpoint=False) for a, b in sides])
         return to_lonlat(self.place.crs, Homography(self.homography)(pixels))

@@ -15,6 +15,7 @@ import cv2
 import numpy as np
 
 from roadgeo._arrays import AnyArray, FloatArray
+from roadgeo.geometry.frame import Frame
 from roadgeo.geometry.homography import Homography
 from roadgeo.geometry.mask import RoadMask
 from roadgeo.location import Location
@@ -72,8 +73,7 @@ def _as_it_came(found: Location, refused: Location, to_stretched: FloatArray) ->
         return found
     homography = found.homography @ to_stretched
     homography = homography / homography[2, 2]
-    width, height = refused.size
-    jacobian = Homography(homography).jacobian(np.array([width / 2.0, height / 2.0]))
+    jacobian = Homography(homography).jacobian(Frame(*refused.size).center)
     wide, high = np.hypot(*jacobian)
     from_stretched, spent = 1.0 / to_stretched[[0, 1], [0, 1]], refused.seconds
     return replace(
