@@ -215,6 +215,8 @@ class Location:
         Query pixel (column, row; GDAL corner convention) to CRS.
     footprint, footprint_lonlat : (4, 2) float64
         Corners TL, TR, BR, BL of the frame in the CRS, and as longitude, latitude.
+    fitted : str or None
+        "similarity" where the camera looked straight down, as far as the roads tell, else "homography".
     corner_sigma_m : (4,) float64
         Standard deviations of those corners' positions: root mean squares of their distances from the truth.
     lens_k1 : float
@@ -270,6 +272,7 @@ class Location:
     rotation_deg: float | None = None
     tilt_deg: float | None = None
     tilt_source: str | None = None
+    fitted: str | None = None
     lens_k1: float = 0.0
     corner_sigma_m: FloatArray | None = None
     n_intersections: int = 0
@@ -416,6 +419,7 @@ class Location:
             "rotation_deg": self.rotation_deg,
             "tilt_deg": self.tilt_deg,
             "tilt_source": self.tilt_source,
+            "fitted": self.fitted,
             "lens_k1": None if center is None else self.lens_k1,
             "corner_sigma_m": rows(self.corner_sigma_m),
             "corner_covariance_m2": rows(self.corner_covariance_m2),

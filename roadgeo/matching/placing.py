@@ -7,15 +7,18 @@ from dataclasses import replace
 
 import numpy as np
 
+from roadgeo._arrays import FloatArray
 from roadgeo.geometry.camera import pose
 from roadgeo.geometry.frame import Frame
 from roadgeo.geometry.homography import Homography
 from roadgeo.geometry.mask import PIXEL_TO_PLANE
 from roadgeo.geometry.pose import PoseOptions, find_pose, turned
 from roadgeo.geometry.projection import grid_north, to_lonlat
+from roadgeo.geometry.similarity import find_similarity
 from roadgeo.location import Camera, Evidence, Location, Place
 from roadgeo.matching.methods import Fit
 from roadgeo.matching.query import Query
+from roadgeo.matching.refinement import corner_sigmas
 
 __all__ = ["center_of", "place_frame"]
 
@@ -24,16 +27,18 @@ def place_frame(location: Location, query: Query, fit: Fit, focal_px: float | No
     """Fill in everything that follows from a fit's homography and its matches; `focal_px` if it is known."""
     # Where the corners and the middle lie, in the map's CRS.
     plane, scene = fit.index.plane, query.scene
-    homography = plane.to_crs_matrix() @ fit.matrix @ PIXEL_TO_PLANE
     frame = Frame(*scene.size)
+    level = _level(fit, frame)
+    homography = plane.to_crs_matrix() @ level.matrix @ PIXEL_TO_PLANE
     ground = Homography(homography).everywhere(np.vstack([frame.corners, frame.center]))
     lonlat = to_lonlat(plane.crs, ground)
     # How the camera looked at it, and which intersections say so.
-    camera = pose(fit.matrix, scene.size, focal_px)
+    camera = pose(level.matrix, scene.size, focal_px)
     north = grid_north(plane, ground[4])
     chosen = fit.matched >= 0
     reference_xy = plane.to_crs(fit.index.xy[fit.matched[chosen]])
-    seat = _find_camera(fit, scene.size, focal_px, north)
+    # That of the camera is the covariance of all eight parameters: the pose of one that looks straight down has six.
+    seat = _find_camera(fit, level.matrix, scene.size, focal_px, north)
     odds = 0.0 if math.isnan(fit.log10_odds) else fit.log10_odds
     return replace(
         location,
@@ -42,9 +47,10 @@ def place_frame(location: Location, query: Query, fit: Fit, focal_px: float | No
         footprint=ground[:4],
         footprint_lonlat=lonlat[:4],
         center=Place(float(ground[4, 0]), float(ground[4, 1]), float(lonlat[4, 0]), float(lonlat[4, 1]), odds),
+        fitted="homography" if level is fit else "similarity",
         lens_k1=fit.lens_k1,
-        corner_sigma_m=fit.corner_sigma_m,
-        corner_covariance_m2=fit.corner_covariance_m2,
+        corner_sigma_m=level.corner_sigma_m,
+        corner_covariance_m2=level.corner_covariance_m2,
         gsd_m=camera.gsd_m,
         rotation_deg=(camera.rotation_deg + north + 180.0) % 360.0 - 180.0,
         tilt_deg=camera.tilt_deg if seat is None else seat.tilt_deg,
@@ -57,11 +63,27 @@ def place_frame(location: Location, query: Query, fit: Fit, focal_px: float | No
     )
 
 
-def _find_camera(fit: Fit, size: tuple[int, int], focal_px: float | None, north: float) -> Camera | None:
-    """Return where the camera of a fit was; `north` is the direction of the plane's y axis from true north."""
+def _level(fit: Fit, frame: Frame) -> Fit:
+    """Return a fit as a camera sees it that looks straight down, unless the fit says that it was tilted."""
+    if fit.corner_covariance_m2 is None:
+        return fit
+    found = find_similarity(fit.matrix, frame.plane_corners, fit.corner_covariance_m2)
+    if found is None:
+        return fit
+    matrix, covariance = found
+    return replace(fit, matrix=matrix, corner_covariance_m2=covariance, corner_sigma_m=corner_sigmas(covariance))
+
+
+def _find_camera(
+    fit: Fit, matrix: FloatArray, size: tuple[int, int], focal_px: float | None, north: float
+) -> Camera | None:
+    """Return where the camera was, given the `matrix` of a fit, levelled or not.
+
+    `north` is the direction of the plane's y axis from true north.
+    """
     if fit.corner_covariance_m2 is None:
         return None
-    found = find_pose(fit.matrix @ PIXEL_TO_PLANE, size, fit.corner_covariance_m2, PoseOptions(focal_px))
+    found = find_pose(matrix @ PIXEL_TO_PLANE, size, fit.corner_covariance_m2, PoseOptions(focal_px))
     if found is None:
         return None
     plane, rotation = fit.index.plane, turned(found.rotation, -north)
