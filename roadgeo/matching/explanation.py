@@ -281,14 +281,18 @@ def _describe(
     location: Location,
     needed: Needed,
 ) -> RejectedPlace:
+    """Tell all that was found out about a place that was verified."""
     model, scene, index = entry.model, search.scene_of(entry.model), search.index
     verify = search.options.verify
     camera = pose(model.matrix, scene.size)
+    # chance at the place, or the least seen elsewhere where it was not worth measuring
     measured = model.chance != (1.0, 1.0, 1.0)
     chance = model.chance if measured else tuple(float(share) for share in search.least_chance)
+    # where it lies
     ground = Homography(model.matrix).everywhere(np.vstack([scene.corners, scene.center]))
     in_crs = index.plane.to_crs(ground)
     lonlat = to_lonlat(index.plane.crs, in_crs)
+    # which of the query's road points agree
     distance = np.empty(len(scene.points))
     forward_distances(
         model.matrix, scene.points, scene.directions, tolerance_m(camera.gsd_m, verify),

@@ -139,6 +139,7 @@ def propose(
     weighed = np.arange(0, len(query), max(1, math.ceil(len(query) / options.max_weighed)))
     if only is not None:
         weighed = np.array(only, np.int64)
+    # how many entries of the table each pair of an anchor's neighbours would have to be compared with
     sides = np.empty(query.tangents.shape, np.int8)
     find_sides(query.tangents, branches, sides)
     costs = np.empty((len(weighed), k, k), np.int64)
@@ -152,12 +153,14 @@ def propose(
     min_cos = float(np.cos(np.radians(options.ray_tolerance_deg)))
     limits = TripleLimits(options.codes_per_vertex, tolerance, min_cos, scale, min_ratio)
     seen = TripleQuery(query.xy, branches, query.tangents, sides, neighbours)
+    # anchors with rare codes first, or those that lie furthest from the ones before
     usable = costs >= 0
     total = np.where(usable, costs, 0).sum(axis=(1, 2))
     n_usable = usable.sum(axis=(1, 2))
     able = np.flatnonzero(n_usable >= 3)
     rarest = able[np.argsort(total[able] / n_usable[able], kind="stable")]
     for i in farthest_first(query.xy[weighed[able]], able) if options.spread else rarest:
+        # hits of an anchor's triples, rare codes first
         a = weighed[i]
         slots = np.argwhere(usable[i])
         slots = np.ascontiguousarray(slots[np.argsort(costs[i][usable[i]], kind="stable")])
@@ -165,6 +168,7 @@ def propose(
         if options.single:
             yield _each_hit(int(a), ids[:n_hits], affine[:n_hits].copy(), k, len(slots), n_compared)
             continue
+        # hits on one intersection of the map that agree make one proposal: most neighbours placed first
         out_ids = np.empty((max(n_hits // 2, 1), k + 1), np.int64)
         out_affine = np.empty((len(out_ids), 4))
         out_placed = np.empty(len(out_ids), np.int64)
