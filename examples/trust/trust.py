@@ -12,19 +12,22 @@ mirrored    like `there`, turned over: no camera sees that
 shuffled    like `there`, cut into 6 x 6 blocks that were mixed and turned: roads like the map's, laid out like none
 
 Every search is a line in `results/EFFORT/CITY_KIND.jsonl`; a run that was stopped goes on where it was, and a larger
-count goes on from a smaller one. Masks of all cities and kinds take turns, so that a table of half a run is fair. The
-table tells, for thresholds of the score, how many masks with a place would be located rightly, and how many others or
-places would be reported wrongly, with bounds of 95 % confidence (Clopper and Pearson, Biometrika 26, 1934).
+count goes on from a smaller one. Masks of all cities and kinds take turns, so that a table of half a run is fair. In
+the end `results/EFFORT.csv` holds a short line of each; `--add` counts such files of earlier runs, of other seeds, with
+this one. The table tells, for thresholds of the score, how many masks with a place would be located rightly, and how
+many others or places would be reported wrongly, with bounds of 95 % confidence (Clopper and Pearson, Biometrika 26,
+1934).
 """
 
 from __future__ import annotations
 
 import argparse
+import csv
 import math
 import os
 import sys
 from collections.abc import Callable, Iterator, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, fields, replace
 from functools import lru_cache
 from pathlib import Path
 from typing import Any
@@ -215,6 +218,8 @@ def _open(key: tuple[Path, ...], locator: ReferenceLocator) -> Callable[[Mask], 
 class Row:
     """What one search came to: the kind of its mask, the best score, its lead, and whether the place was right."""
 
+    city: str
+    seed: int
     kind: str
     worn: str
     score: float
@@ -227,13 +232,35 @@ class Row:
         return self.score >= threshold and self.lead >= margin
 
 
-def row_of(kind: str, trial: Trial) -> Row:
+def row_of(city: str, seed: int, kind: str, trial: Trial) -> Row:
     found: Score = score(trial.truth, trial.answer)
     rival = (trial.answer.get("runner_up") or {}).get("log10_odds")
     best = found.log10_odds if math.isfinite(found.log10_odds) else -math.inf
     lead = math.inf if rival is None else best - rival
     seconds = sum(found.seconds.get(step, 0.0) for step in ("match", "refine"))
-    return Row(kind, trial.truth.kind.split("_")[-1], best, lead, found.right, seconds)
+    return Row(city, seed, kind, trial.truth.kind.split("_")[-1], best, lead, found.right, seconds)
+
+
+def write_rows(path: Path, rows: Sequence[Row]) -> None:
+    """Write a line of comma-separated values a search."""
+    with path.open("w", newline="", encoding="utf-8") as file:
+        writer = csv.writer(file)
+        writer.writerow([f.name for f in fields(Row)])
+        for r in rows:
+            numbers = (f"{r.score:.2f}", f"{r.lead:.2f}", int(r.right), f"{r.seconds:.2f}")
+            writer.writerow([r.city, r.seed, r.kind, r.worn, *numbers])
+
+
+def read_rows(path: Path) -> list[Row]:
+    """Read what `write_rows` wrote."""
+    with path.open(newline="", encoding="utf-8") as file:
+        return [
+            Row(
+                r["city"], int(r["seed"]), r["kind"], r["worn"], float(r["score"]), float(r["lead"]),
+                r["right"] == "1", float(r["seconds"]),
+            )
+            for r in csv.DictReader(file)
+        ]  # fmt: skip
 
 
 def bounds(hits: int, of: int, confidence: float = 0.95) -> tuple[float, float]:
@@ -319,6 +346,9 @@ def parse(arguments: Sequence[str] | None) -> argparse.Namespace:
     parser.add_argument("--effort", choices=["quick", "full"], default="full")
     parser.add_argument("--jobs", type=int, default=1, help="processes")
     parser.add_argument("--seed", type=int, default=0)
+    parser.add_argument(
+        "--add", type=Path, nargs="*", default=[], help="EFFORT.csv of earlier runs, to be counted with"
+    )
     parser.add_argument("--time-limit", type=float, default=60.0, help="seconds a mask (60: the search ends by itself)")
     return parser.parse_args(arguments)
 
@@ -327,11 +357,15 @@ def main(arguments: Sequence[str] | None = None) -> None:
     options = parse(arguments)
     options.out.mkdir(parents=True, exist_ok=True)
     cities = [open_city(path, options.out) for path in options.cities]
-    rows = [row_of(kind, trial) for _, kind, ran in search_all(cities, options) for trial in ran]
+    found = search_all(cities, options)
+    rows = [row_of(city, options.seed, kind, trial) for city, kind, ran in found for trial in ran]
+    write_rows(options.out / f"{options.effort}.csv", rows)
+    rows += [row for path in options.add for row in read_rows(path)]
     usual = LocateOptions()
     least, margin = usual.min_log10_odds, usual.min_margin
     n = sum(r.kind != "there" for r in rows)
-    head = f"{len(rows)} searches with {options.effort} effort on {len(cities)} maps, {n} of masks without a place"
+    n_maps = len({r.city for r in rows})
+    head = f"{len(rows)} searches with {options.effort} effort on {n_maps} maps, {n} of masks without a place"
     tables = (threshold_table(rows, least, margin), band_table(rows, least, margin), kind_table(rows, least, margin))
     text = "\n\n".join([head, *map(render, tables)])
     print(text)

@@ -28,11 +28,11 @@ def test_bounds_are_those_of_clopper_and_pearson(trust):
 
 def test_rows_are_counted_by_threshold_band_and_kind(trust):
     rows = [
-        trust.Row("there", "mild", 20.0, np.inf, True, 0.1),
-        trust.Row("there", "few", 5.5, 1.0, False, 0.1),  # ambiguous: the lead is too short
-        trust.Row("there", "noisy", 4.2, 3.0, False, 0.1),
-        trust.Row("elsewhere", "mild", 3.7, 2.5, False, 0.1),
-        trust.Row("mirrored", "torn", 2.1, np.inf, False, 0.1),
+        trust.Row("porto", 1, "there", "mild", 20.0, np.inf, True, 0.1),
+        trust.Row("porto", 1, "there", "few", 5.5, 1.0, False, 0.1),  # ambiguous: the lead is too short
+        trust.Row("porto", 1, "there", "noisy", 4.2, 3.0, False, 0.1),
+        trust.Row("porto", 1, "elsewhere", "mild", 3.7, 2.5, False, 0.1),
+        trust.Row("porto", 1, "mirrored", "torn", 2.1, np.inf, False, 0.1),
     ]
     told = {row[0]: row[1:] for row in trust.threshold_table(rows, 3.5, 2.0)}
     assert told["2"][:2] == ["-", "-"]
@@ -45,6 +45,15 @@ def test_rows_are_counted_by_threshold_band_and_kind(trust):
     assert bands["5 to 6"][0] == "0"
     kinds = {row[0]: row for row in trust.kind_table(rows, 3.5, 2.0)}
     assert kinds["elsewhere"][-2] == "3.7"
+
+
+def test_rows_come_back_from_their_file(trust, tmp_path):
+    rows = [
+        trust.Row("porto", 1, "there", "mild", 20.25, np.inf, True, 0.5),
+        trust.Row("chicago", 2, "mirrored", "torn", -np.inf, np.inf, False, 1.25),
+    ]
+    trust.write_rows(tmp_path / "quick.csv", rows)
+    assert trust.read_rows(tmp_path / "quick.csv") == rows
 
 
 def test_shuffled_masks_keep_their_roads_but_not_their_places(trust):
