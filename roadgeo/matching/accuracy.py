@@ -50,7 +50,7 @@ def with_honest_corners(
         return refined
     reach, by_center = reach[seen.which][used], by_center[seen.which][used]
     everything, residuals, sigma = seen.rows[used], seen.residuals[used], seen.sigma[used]
-    free = 9 if k1 and not partly else 8
+    free = 9 if k1 or partly else 8
     rows = everything[:, :free]
     # sandwich estimate of an M-estimator's covariance (Huber 1981, 6.3)
     weights = 1.0 / (1.0 + (residuals / sigma) ** 2)
@@ -58,13 +58,15 @@ def with_honest_corners(
     inverse = np.linalg.pinv(scaled.T @ rows + np.diag(equations.prior(lens.sigma)[:free]), hermitian=True)
     scatter = _scatter(residuals, weights, reach, options.usual_rms * equations.sigma_m) / equations.unit
     covariance = inverse @ ((rows * (equations.weight * scatter**2)[:, None]).T @ rows) @ inverse
-    # parameters that were not estimated, by what they would do to the others
-    unknown = lens.sigma * partly * everything[:, 8:]
-    if k1:
+    if partly:  # a lens that is told from none where k1 is so many times its deviation may be anything below that
+        unseen = min(lens.sigma, lens.significance / math.sqrt(3.0) * math.sqrt(covariance[8, 8]))
+        by_k1 = covariance[:, 8] / covariance[8, 8]
+        covariance = covariance + max(unseen**2 - covariance[8, 8], 0.0) * np.outer(by_k1, by_k1)
+    if k1:  # the middle of the lens, which was not estimated, by what it would do to what was
         across = everything[:, [2, 5]] / np.linalg.norm(everything[:, [2, 5]], axis=1, keepdims=True)
-        unknown = np.c_[unknown, lens.center_sigma_px * np.einsum("ni,nij->nj", across, by_center)]
-    moved = inverse @ (scaled.T @ unknown)
-    covariance = covariance + moved @ moved.T
+        unknown = lens.center_sigma_px * np.einsum("ni,nij->nj", across, by_center)
+        moved = inverse @ (scaled.T @ unknown)
+        covariance = covariance + moved @ moved.T
     corners = corner_covariance(equations.p, covariance[:8, :8], scene, equations.unit, options)
     if not np.isfinite(corners).all():
         return refined

@@ -8,7 +8,7 @@ from dataclasses import replace
 import numpy as np
 
 from roadgeo._arrays import FloatArray
-from roadgeo.geometry.camera import pose
+from roadgeo.geometry.camera import pose, sampling
 from roadgeo.geometry.frame import Frame
 from roadgeo.geometry.homography import Homography
 from roadgeo.geometry.mask import PIXEL_TO_PLANE
@@ -16,23 +16,29 @@ from roadgeo.geometry.pose import PoseOptions, find_pose, turned
 from roadgeo.geometry.projection import grid_north, to_lonlat
 from roadgeo.geometry.similarity import find_similarity
 from roadgeo.location import Camera, Evidence, Location, Place
+from roadgeo.matching.estimator import MatchOptions
 from roadgeo.matching.methods import Fit
 from roadgeo.matching.query import Query
 from roadgeo.matching.refinement import corner_sigmas
+from roadgeo.matching.verification import VerifyOptions, agreement
 
 __all__ = ["center_of", "place_frame"]
 
+#: A similarity agrees with as many of the query's roads as the homography but for this share, or it is none.
+_LEAST_LOST = 0.02
 
-def place_frame(location: Location, query: Query, fit: Fit, focal_px: float | None = None) -> Location:
-    """Fill in everything that follows from a fit's homography and its matches; `focal_px` if it is known."""
+
+def place_frame(location: Location, query: Query, fit: Fit, options: MatchOptions) -> Location:
+    """Fill in everything that follows from a fit's homography and its matches."""
     # Where the corners and the middle lie, in the map's CRS.
     plane, scene = fit.index.plane, query.scene
     frame = Frame(*scene.size)
-    level = _level(fit, frame)
+    level = _level(fit, query, options.verify)
     homography = plane.to_crs_matrix() @ level.matrix @ PIXEL_TO_PLANE
     ground = Homography(homography).everywhere(np.vstack([frame.corners, frame.center]))
     lonlat = to_lonlat(plane.crs, ground)
     # How the camera looked at it, and which intersections say so.
+    focal_px = options.camera.focal_px
     camera = pose(level.matrix, scene.size, focal_px)
     north = grid_north(plane, ground[4])
     chosen = fit.matched >= 0
@@ -63,14 +69,20 @@ def place_frame(location: Location, query: Query, fit: Fit, focal_px: float | No
     )
 
 
-def _level(fit: Fit, frame: Frame) -> Fit:
-    """Return a fit as a camera sees it that looks straight down, unless the fit says that it was tilted."""
-    if fit.corner_covariance_m2 is None:
+def _level(fit: Fit, query: Query, options: VerifyOptions) -> Fit:
+    """Return a fit as a camera sees it that looks straight down, unless the roads say that it was tilted."""
+    if fit.corner_covariance_m2 is None or fit.lens_k1:
         return fit
-    found = find_similarity(fit.matrix, frame.plane_corners, fit.corner_covariance_m2)
+    scene = query.scene
+    found = find_similarity(fit.matrix, scene.corners, fit.corner_covariance_m2)
     if found is None:
         return fit
     matrix, covariance = found
+    # The covariance may be too cautious. Roads that agreed must go on to agree.
+    gsd = sampling(matrix, scene.size)
+    agreeing, _, _ = agreement(matrix, scene, fit.index, gsd, np.empty(0, np.int64), options)
+    if not agreeing.forward >= fit.agreeing - _LEAST_LOST:
+        return fit
     return replace(fit, matrix=matrix, corner_covariance_m2=covariance, corner_sigma_m=corner_sigmas(covariance))
 
 

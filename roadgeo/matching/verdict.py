@@ -75,7 +75,7 @@ def decide(query: Query, found: Sequence[Found], options: LocateOptions) -> Loca
     alike = best is not None and rival is not None and _are_alike(best, rival)
     if best is None or (best.score < options.min_log10_odds and not alike):
         return _refuse(location, query, found, best, options)
-    placed = place_frame(_on(location, best.found), query, best.fit, options.match.camera.focal_px)
+    placed = place_frame(_on(location, best.found), query, best.fit, options.match)
     cut = f"; stopped at the time limit, {_CUT_SHORT}" if location.stopped == "time" else ""
     # It has a place: the answer, unless another place is as good.
     if rival is not None and best.score < options.min_log10_odds:
@@ -197,7 +197,7 @@ def _decide_pairs(location: Location, query: Query, found: Sequence[Found], opti
     best = next((one for one in found if one.fits), None)
     if best is None:
         return _refuse(location, query, found, None, options)
-    placed = place_frame(_on(location, best), query, best.fits[0])
+    placed = place_frame(_on(location, best), query, best.fits[0], options.match)
     return replace(placed, status="located", reason=best.said, reason_code=Reason.LOCATED)
 
 

@@ -1,0 +1,43 @@
+"""What follows from a fit: a view straight down is levelled, others are not, however unsure their corners are."""
+
+import numpy as np
+import pytest
+from worlds.scenes import Sight, look, sight_of
+
+from roadgeo.location import Location, Seconds
+from roadgeo.matching.estimator import MatchOptions
+from roadgeo.matching.methods import Fit
+from roadgeo.matching.placing import place_frame
+from roadgeo.matching.query import Query
+
+
+def placed(town, tilt: float, sigma_m: float, shaken_m: float = 0.0) -> tuple[Location, np.ndarray]:
+    """The place of a view whose corners are said to be so unsure, and the true corners in the CRS."""
+    network, index = town
+    truth, scene = sight_of(network, 5, tilt=tilt, sight=Sight(0.6))
+    nobody = np.full(len(scene.intersections), -1)
+    bent = truth + shaken_m * 1e-5 * np.array([[1.0, -2.0, 0.0], [1.5, 1.0, 0.0], [0.0, 0.0, 0.0]])
+    sigmas, covariance = np.full(4, np.sqrt(2) * sigma_m), sigma_m**2 * np.eye(8)
+    fit = Fit(index, bent, nobody, np.full(len(nobody), np.inf), 0.9, 20.0, sigmas, covariance)
+    query = Query("q", scene, look(network, truth), Seconds())
+    corners = np.c_[scene.corners, np.ones(4)] @ truth.T
+    return place_frame(Location("q", "located", ""), query, fit, MatchOptions()), index.plane.to_crs(
+        corners[:, :2] / corners[:, 2:]
+    )
+
+
+def test_a_view_straight_down_is_levelled_and_its_corners_are_surer(town):
+    location, corners = placed(town, 0.0, 2.0, shaken_m=100.0)
+    assert location.fitted == "similarity"
+    assert location.corner_sigma_m == pytest.approx(np.full(4, 2.0))  # half of eight parameters
+    assert location.tilt_deg == pytest.approx(0.0, abs=1e-3)
+    assert np.hypot(*(location.footprint - corners).T).max() < 2.0
+    assert np.isfinite(location.camera.covariance).all()
+
+
+@pytest.mark.parametrize("sigma_m", [1.0, 3000.0])
+def test_a_tilted_view_is_not_however_unsure_its_corners_are(town, sigma_m):
+    location, corners = placed(town, 15.0, sigma_m)
+    assert location.fitted == "homography"
+    assert location.footprint == pytest.approx(corners, abs=1e-3)
+    assert location.corner_sigma_m == pytest.approx(np.full(4, np.sqrt(2) * sigma_m))
