@@ -27,7 +27,7 @@ def placed(town, tilt: float, sigma_m: float, shaken_m: float = 0.0) -> tuple[Lo
 
 
 def test_a_view_straight_down_is_levelled_and_its_corners_are_surer(town):
-    location, corners = placed(town, 0.0, 2.0, shaken_m=100.0)
+    location, corners = placed(town, 0.0, 2.0, shaken_m=50.0)
     assert location.fitted == "similarity"
     assert location.corner_sigma_m == pytest.approx(np.full(4, 2.0))  # half of eight parameters
     assert location.tilt_deg == pytest.approx(0.0, abs=1e-3)
