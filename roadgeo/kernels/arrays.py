@@ -58,6 +58,9 @@ class ArrayKind:
     dtype: np.dtype[Any]
     ndim: int
 
+    def __str__(self) -> str:
+        return f"{self.dtype} array of {self.ndim} dimensions"
+
 
 @dataclass(frozen=True)
 class TupleKind:
