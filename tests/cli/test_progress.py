@@ -92,6 +92,40 @@ with show_steps(False) as say:
     assert re.search(r"\x1b\[1A\x1b\[2K\s*$", terminal.text)  # and the last lines are gone
 
 
+def test_on_a_terminal_many_masks_are_counted_beside_a_bar():
+    """Nothing of the bar stays; lines that are printed meanwhile do."""
+    code = """
+import time
+from roadgeo.cli.printing import echo
+from roadgeo.cli.progress import count_up
+with count_up(3, False) as count:
+    for sort in ("located", "located", "not located"):
+        time.sleep(0.2)
+        echo(f"one more {sort}", err=True)
+        count(sort)
+    time.sleep(0.2)
+"""
+    terminal = Terminal(sys.executable, "-c", code)
+    assert terminal.end() == 0
+    assert re.search(r"2/3.* 2 located", terminal.text)
+    assert re.search(r"3/3.* 2 located, 1 not located", terminal.text)
+    assert terminal.text.count("one more") == 3
+    assert "\x1b[?25h" in terminal.text
+    assert re.search(r"\x1b\[2K\s*$", terminal.text)
+
+
+@pytest.mark.parametrize(("total", "quiet", "as_json"), [(3, True, False), (1, False, False)])
+def test_a_single_mask_and_a_quiet_run_have_no_bar(total, quiet, as_json):
+    code = f"""
+from roadgeo.cli.progress import count_up
+with count_up({total}, {quiet}, {as_json}) as count:
+    count("located")
+"""
+    terminal = Terminal(sys.executable, "-c", code)
+    assert terminal.end() == 0
+    assert terminal.text == ""
+
+
 @pytest.mark.parametrize("step", ["reading", "cutting", "drawing", "indexing", "writing"])
 def test_ctrl_c_during_any_step_leaves_nothing_behind(tmp_path, step):
     """The command waits in that step, as it would with a large map."""

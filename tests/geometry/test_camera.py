@@ -180,6 +180,15 @@ def test_the_horizon_must_not_come_too_near_to_a_corner(axis, side):
         assert (judge(matrix, SIZE, OPTIONS) is CameraFault.HORIZON) is too_near
 
 
+@pytest.mark.parametrize("corner", [(-1, -1), (-1, 1), (1, -1), (1, 1)])
+def test_the_horizon_must_not_come_too_near_to_any_one_corner(corner):
+    for least, too_near in [(0.045, True), (0.055, False)]:
+        about_middle = np.eye(3)
+        about_middle[2, :2] = np.array(corner) * (1.0 - least) / np.array(SIZE)  # each side takes half of it off
+        matrix = about_middle @ np.array([[1.0, 0, -SIZE[0] / 2], [0, 1, SIZE[1] / 2], [0, 0, 1]])
+        assert (judge(matrix, SIZE, OPTIONS) is CameraFault.HORIZON) is too_near
+
+
 def test_a_middle_on_the_horizon_is_degenerate():
     assert judge(np.array([[1.0, 0, 0], [0, 1, 0], [1, 0, -600]]), SIZE, OPTIONS) is CameraFault.DEGENERATE
 

@@ -5,6 +5,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
+from roadgeo.geometry.homography import Homography
 from roadgeo.geometry.pinhole import make_view, polygon_area, sees_ground, warp_mask
 
 CENTER = (1000.0, 2000.0)
@@ -62,6 +63,21 @@ def test_a_warped_mask_shows_what_its_matrix_says():
     source = source[:, :2] / source[:, 2:]
     assert source.min(axis=0) == pytest.approx([180, 80], abs=1.5)
     assert source.max(axis=0) == pytest.approx([200, 100], abs=1.5)
+
+
+@pytest.mark.parametrize(
+    ("heading", "up"), [(0, (0, -1)), (90, (1, 0)), (180, (0, 1)), (270, (-1, 0)), (30, (0.5, -0.866))]
+)
+def test_a_mask_is_warped_as_a_camera_sees_it(heading, up):
+    """From the middle of the frame, its up runs over the mask towards the heading; the tilt sees farther."""
+    _, matrix = warp_mask(np.zeros((200, 300), np.uint8), 25.0, 70.0, heading)
+    view, middle = Homography(matrix), np.array([150.0, 100.0])
+    assert view(middle) == pytest.approx(middle)
+    jacobian = view.jacobian(middle)
+    ahead = jacobian @ [0, -1]
+    assert ahead / np.hypot(*ahead) == pytest.approx(up, abs=1e-3)
+    assert np.linalg.det(jacobian) > 0  # not mirrored
+    assert np.linalg.svd(jacobian, compute_uv=False) == pytest.approx([1 / np.cos(np.radians(25)), 1])
 
 
 def test_a_mask_warped_by_nothing_stays():

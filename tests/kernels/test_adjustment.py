@@ -191,7 +191,28 @@ def test_too_little_to_stand_on(pairs):
     assert np.isfinite(p).all()
 
 
-def test_the_horizon_is_refused():
+@pytest.mark.parametrize("beyond", ["pairs", "points", "held"])
+def test_the_horizon_is_refused(beyond):
+    town, place = Town(0), np.array([-10.0, 10.0])
+    if beyond == "held":
+        town.held = lambda p: (place[None], place[None])
+    else:
+        getattr(town, beyond)[0] = place
+    town.cells = lambda xy: np.zeros(len(xy), np.int64)
+    assert run(town, P, held_at=P)[1:3] == (-1, np.inf)
+
+
+def test_a_match_that_is_no_place_is_refused():
     town = Town(0)
-    town.pairs[0] = (-10.0, 10.0)
+    town.targets[0] = np.nan
     assert run(town, P)[1:3] == (-1, np.inf)
+
+
+def test_matches_beyond_the_greatest_radius_do_not_count():
+    town, start = Town(2, noise=0.5), jittered(P, 0.002)
+    town.targets[:3] += 0.1  # 57 m off
+    p, n, rms, _ = run(town, start)
+    town.pairs, town.targets = town.pairs[3:], town.targets[3:]
+    expected, n_expected, rms_expected, _ = run(town, start)
+    assert np.array_equal(p, expected)
+    assert (n, rms) == (n_expected, rms_expected)

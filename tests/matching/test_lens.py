@@ -8,8 +8,10 @@ from worlds.scenes import Sight, mapped, shaken, sight_of
 
 from roadgeo.geometry.lens import Lens
 from roadgeo.matching.accuracy import with_honest_corners
+from roadgeo.matching.estimator import TripleEstimator
 from roadgeo.matching.lens import LensOptions, core_excess, find_lens, fit_lens, regrow, straighten_scene
 from roadgeo.matching.refinement import Refined, RefineOptions, refine
+from roadgeo.matching.search import SearchOptions, search
 
 
 def through_lens(scene, k1):
@@ -143,3 +145,16 @@ def test_a_fit_that_ended_early_is_taken_up_where_it_ended(town):
     once, again = (find_lens(start, *given, LensOptions(n_iterations=2, starts=(), n_restarts=n)) for n in (0, 3))
     assert abs(once.k1 + 0.08) > 0.001
     assert again.k1 == pytest.approx(-0.08, abs=0.001)
+
+
+@pytest.mark.parametrize("k1", [-0.12, -0.04, 0.0, 0.05])
+def test_a_search_finds_what_a_lens_saw(town, k1):
+    """Also where the lens bends so much that a pinhole fits one part of the frame only."""
+    truth, straight = sight_of(town[0], 5, tilt=10, sight=Sight(0.6))
+    scene = through_lens(straight, k1)
+    result = search(TripleEstimator(scene, town[1]), SearchOptions(time_limit_s=60.0))
+    refined = result.best.refined
+    assert result.score > SearchOptions().accept
+    assert refined.lens_k1 == pytest.approx(k1, abs=0.005)
+    gaps = np.hypot(*(mapped(refined.matrix, straight.corners) - mapped(truth, straight.corners)).T)
+    assert gaps.max() < 6.0

@@ -154,6 +154,7 @@ points = st.lists(st.tuples(st.integers(0, 40), st.integers(0, 40)), max_size=25
 
 @settings(max_examples=100, deadline=None)
 @given(points)
+@example([(x, y) for x in range(5) for y in range(5)])  # 300 pairs: room for 25 is made at first
 def test_pairs_and_clusters_agree_with_their_twins(places):
     xy = np.array(places, float).reshape(-1, 2)
     pairs = kernels.close_pairs(xy, np.argsort(xy[:, 0], kind="stable"), 7.0)
@@ -398,6 +399,20 @@ def test_runs_are_tied_at_their_ends(mates, least):
         for k in (first, last)
     ]
     np.testing.assert_allclose(ties, np.array(expected).reshape(-1, 4))
+
+
+def test_as_many_runs_as_there_are():
+    """40 of them: room for 32 is made at first."""
+    n = 3 * 40
+    mates = [None if k % 3 == 2 else 1 for k in range(n)]
+    edge, mate = np.repeat([0, 1], n), np.full(2 * n, -1)
+    mate[:n] = [-1 if m is None else n + k for k, m in enumerate(mates)]
+    ties = parallel_roads.tie_runs(
+        np.array([0, n, 2 * n]), np.full(2, 10.0 * (n - 1)), edge, mate, np.full(2 * n, 5.0), 7.0, 10.0
+    )
+    expected = [[0, 10.0 * k, 1, 10.0 * k] for run in naive.runs(mates) for k in run]
+    assert len(expected) == 80
+    np.testing.assert_allclose(ties, expected)
 
 
 def test_a_run_ends_where_a_gap_opens():

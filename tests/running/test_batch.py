@@ -1,19 +1,22 @@
 """Which masks are located, under which names, and what one bad mask costs."""
 
+from dataclasses import replace
 from importlib.metadata import EntryPoint
 from pathlib import Path
 
 import cv2
+import numpy as np
 import pytest
 from rasterio._err import CPLE_AppDefinedError
+from sources.test_exif import jpeg_with_exif
 
 from roadgeo import plugins
 from roadgeo._progress import say_nothing
 from roadgeo.geometry.mask import RoadMask
 from roadgeo.outputs.registry import REGISTRY, Output
 from roadgeo.plugins import OUTPUTS
-from roadgeo.running.batch import _Asked, _Locating
-from roadgeo.running.options import BatchOptions
+from roadgeo.running.batch import Outcome, _Asked, _Locating
+from roadgeo.running.options import BatchOptions, ReadOptions
 from roadgeo.running.tasks import Task, find_masks, name_tasks
 
 
@@ -74,17 +77,47 @@ SEEN = Output("seen", "_seen.tif", lambda path, subject: None, "what was seen")
 class Hazard:
     """Raises what libraries raise, by the name of the mask."""
 
-    ERRORS = {"cv2": cv2.error("too large"), "gdal": CPLE_AppDefinedError(3, 1, "odd"), "deep": RecursionError()}  # noqa: RUF012
+    ERRORS = {  # noqa: RUF012
+        "cv2": (cv2.error("too large"), "fault", "please report it"),
+        "gdal": (CPLE_AppDefinedError(3, 1, "odd"), "fault", "please report it"),
+        "deep": (RecursionError(), "fault", "please report it"),
+        "large": (MemoryError(), "memory", "reduce it or cut it up"),
+        "name": (UnicodeEncodeError("utf-8", "\udce9", 0, 1, "surrogate"), "invalid", "rename it"),
+    }
 
     def __call__(self, path: str, **_: object) -> RoadMask:
-        raise self.ERRORS[Path(path).stem]
+        raise self.ERRORS[Path(path).stem][0]
+
+
+def hazardous(kind: str, folder: Path, patch: pytest.MonkeyPatch) -> Outcome:
+    patch.setattr("roadgeo.running.queries.open_mask", Hazard())
+    work = _Locating((), str(folder), BatchOptions(), say_nothing)
+    return work._do(Task(f"{kind}.png", kind), _Asked([], [], 0.0, {}))
 
 
 @pytest.mark.parametrize("kind", Hazard.ERRORS)
 def test_whatever_one_mask_raises_the_others_go_on(kind: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr("roadgeo.running.queries.open_mask", Hazard())
-    work = _Locating((), str(tmp_path), BatchOptions(), say_nothing)
-    outcome = work._do(Task(f"{kind}.png", kind), _Asked([], [], 0.0, {}))
+    _, code, remedy = Hazard.ERRORS[kind]
+    outcome = hazardous(kind, tmp_path, monkeypatch)
     assert outcome.status == "error"
     assert outcome.document["query"] == f"{kind}.png"
-    assert "please report it" in outcome.document["reason"]
+    assert outcome.document["reason_code"] == code
+    assert remedy in outcome.document["reason"]
+
+
+def test_who_looks_for_a_fault_is_shown_it(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setenv("ROADGEO_TRACEBACK", "1")
+    with pytest.raises(RecursionError):
+        hazardous("deep", tmp_path, monkeypatch)
+
+
+def test_the_focal_length_of_exif_is_in_pixels_of_the_mask(tmp_path: Path) -> None:
+    """24 mm on film 36 mm wide; the photograph, which says so, is smaller than the mask."""
+    photo, mask = jpeg_with_exif(tmp_path / "photo.jpg", 24), tmp_path / "mask.png"
+    cv2.imwrite(str(mask), np.zeros((400, 600), np.uint8))
+    task = Task(str(mask), "mask")
+    reading = ReadOptions(images={str(mask): str(photo)}, exif=True)
+    work = _Locating((), str(tmp_path), BatchOptions(reading=reading), say_nothing)
+    assert work._with_focal_length(task).match.camera.focal_px == pytest.approx(400.0)
+    plain = replace(work, options=BatchOptions(reading=replace(reading, exif=False)))
+    assert plain._with_focal_length(task).match.camera.focal_px is None

@@ -1,5 +1,6 @@
 """Tasks on a real scheduler with worker processes, some of which are killed."""
 
+import contextlib
 import json
 import os
 import signal
@@ -62,8 +63,12 @@ def scheduler(tmp_path_factory):
             time.sleep(0.1)
         yield json.loads(told.read_text())["address"]
     finally:
-        for process in reversed(processes):  # with those that they started
-            os.killpg(process.pid, signal.SIGKILL)
+        for process in reversed(processes):
+            process.terminate()
+            with contextlib.suppress(subprocess.TimeoutExpired):
+                process.wait(10)
+            with contextlib.suppress(ProcessLookupError):  # nobody of those that it started is left
+                os.killpg(process.pid, signal.SIGKILL)
             process.wait()
 
 
@@ -125,6 +130,18 @@ def test_shards_and_masks_come_out_as_from_one_process(scheduler, tmp_path, monk
         assert {key: value for key, value in one.items() if key != "seconds"} == {
             key: value for key, value in other.items() if key != "seconds"
         }
+
+
+def test_without_a_scheduler_processes_of_this_machine_do_it(scheduler, tmp_path):
+    """Also beside another cluster, which serves its status where Dask does."""
+    assert list(Cluster(workers=2).run(range(8), Squares(str(tmp_path)))) == [n * n for n in range(8)]
+    assert set(counts(tmp_path).values()) == {1}
+
+
+def test_without_dask_the_command_is_said(monkeypatch):
+    monkeypatch.setitem(sys.modules, "distributed", None)
+    with pytest.raises(RoadgeoError, match=r"pip install 'roadgeo\[dask\]'"):
+        list(Cluster().run([1], Squares("")))
 
 
 def test_no_scheduler_is_an_error_on_one_line(monkeypatch):

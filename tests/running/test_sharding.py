@@ -11,7 +11,8 @@ from worlds.fenway import write_vector
 from worlds.scenes import PLANE, Sight, camera, look, mapped, random_lines, scene_of
 
 from roadgeo.cli import main
-from roadgeo.errors import IndexFormatError, RoadSourceError
+from roadgeo.errors import CrsError, IndexFormatError, RoadSourceError
+from roadgeo.geometry.projection import transformer
 from roadgeo.location import Seconds
 from roadgeo.matching.methods import search_references
 from roadgeo.matching.options import LocateOptions
@@ -172,6 +173,33 @@ def test_no_roads_no_shards(tmp_path):
     write_vector(path, [shapely.LineString([(0, 0), (0.01, 0)])])
     with pytest.raises(RoadSourceError, match="no shard has three intersections"):
         build_shards(RoadFiles((path,)), tmp_path / "a.shards", "a")
+
+
+def test_files_of_different_crs_become_one_map(roads, sharded, tmp_path):
+    """Half of the town is in degrees: then all of it is cut in degrees."""
+    lines = [shapely.LineString(PLANE.to_crs(np.array(line.coords))) for line in random_lines(5, SIDE)]
+    halves = [write_vector_crs(tmp_path / "metres.gpkg", lines[::2]), tmp_path / "degrees.geojson"]
+    way = transformer(PLANE.crs, "EPSG:4326")
+    degrees = shapely.transform(lines[1::2], lambda xy: np.stack(way.transform(*xy.T), axis=1))
+    write_vector(halves[1], degrees, crs="EPSG:4326", highway=["residential"] * len(degrees))
+    mixed = build_shards(RoadFiles(tuple(halves)), tmp_path / "mixed.shards", "town", OPTIONS)
+    assert check_reference(mixed.path) == []
+    assert len(mixed.manifest.shards) > 1
+    found = locate((2500.0, 2500.0), mixed)
+    assert found.located
+    assert gap(found, (2500.0, 2500.0)) < 5.0
+
+
+def test_a_file_without_a_crs_asks_for_it(tmp_path):
+    path = write_vector(tmp_path / "a.shp", [shapely.LineString([(0, 0), (1000, 0)])])
+    path.with_suffix(".prj").unlink()
+    with pytest.raises(CrsError, match=r"says nothing of its CRS; name it, for example --crs EPSG:26986"):
+        build_shards(RoadFiles((path,)), tmp_path / "a.shards", "a")
+
+
+def test_kinds_that_are_not_there(roads, tmp_path):
+    with pytest.raises(RoadSourceError, match="no roads of the kind asked for; try other --kinds"):
+        build_shards(RoadFiles((roads,), which="main"), tmp_path / "a.shards", "a")
 
 
 def test_the_command_line_builds_describes_lists_and_removes(roads, tmp_path, monkeypatch, capsys):

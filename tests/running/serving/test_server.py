@@ -156,6 +156,8 @@ POST = b"POST /locate HTTP/1.1\r\nHost: localhost\r\n"
         (POST + b"Content-Length: 9\r\nTransfer-Encoding: chunked\r\n\r\n", b" 400 "),
         (POST + b"Transfer-Encoding: chunked\r\n\r\nxyz\r\n", b" 400 "),
         (POST + b"Transfer-Encoding: chunked\r\n\r\nfffff\r\n", b" 413 "),
+        (POST + b"Transfer-Encoding: chunked\r\n\r\n3\r\nabcdef\r\n0\r\n\r\n", b" 400 "),
+        (b"GET / HTTP/1.1\r\nHost: [::1\r\n\r\n", b" 403 "),
         (POST + b"Content-Length: 99999\r\nExpect: 100-continue\r\n\r\n", b" 413 "),
         (b"GET / HTTP/1.1\r\n" + b"".join(b"X-%d: 1\r\n" % k for k in range(200)) + b"\r\n", b" 431 "),
         (b"GET / HTTP/1.1\r\nX: " + b"a" * 70_000 + b"\r\n\r\n", b" 431 "),
@@ -167,6 +169,58 @@ def test_heads_that_are_none_get_an_answer_and_the_next_is_served(head, status):
     with serving(max_bytes=1000, head_s=1.0, body_s=1.0) as server:
         assert status in send_raw(server, head, 3.0)[:60]
         assert ask(server, "GET", "/")[0].status == 200
+
+
+def test_a_head_is_asked_for_alone():
+    with serving() as server:
+        (head, _), (whole, document) = (ask(server, method, "/processes") for method in ("HEAD", "GET"))
+        assert head.status == 200
+        assert head.headers["Content-Length"] == whole.headers["Content-Length"]
+        assert document
+        answer = send_raw(server, b"HEAD /processes HTTP/1.1\r\nHost: localhost\r\nConnection: close\r\n\r\n", 1.0)
+        assert answer.endswith(b"\r\n\r\n")
+
+
+def test_a_body_that_may_be_taken_is_asked_for():
+    with serving() as server, socket.create_connection(("127.0.0.1", server.server_port), timeout=5) as sock:
+        sock.sendall(POST + b"Content-Length: %d\r\nExpect: 100-continue\r\n\r\n" % len(PNG))
+        assert sock.recv(100).startswith(b"HTTP/1.1 100 ")
+        sock.sendall(PNG)
+        assert sock.recv(100).startswith(b"HTTP/1.1 200 ")
+
+
+def test_a_body_that_ends_before_it_should_is_not_located():
+    workers = Workers()
+    with serving(workers) as server, socket.create_connection(("127.0.0.1", server.server_port), timeout=5) as sock:
+        sock.sendall(POST + b"Content-Length: %d\r\n\r\n" % len(PNG) + PNG[:-1])
+        sock.shutdown(socket.SHUT_WR)
+        answer = sock.makefile("rb").read()
+    assert answer.startswith(b"HTTP/1.1 400 ")
+    assert b"the body ends before it should" in answer
+    assert not workers.asked
+
+
+def test_what_workers_refuse_is_a_problem():
+    workers = Workers()
+    workers.ask = lambda _: Answer(422, {"detail": "the image: no road in it"})
+    with serving(workers) as server:
+        answer, document = ask(server, "POST", "/locate", PNG)
+    assert answer.status == document["status"] == 422
+    assert answer.headers["Content-Type"] == "application/problem+json"
+    assert document["detail"] == "the image: no road in it"
+
+
+def has_ipv6():
+    with suppress(OSError), socket.create_server(("::1", 0), family=socket.AF_INET6):
+        return True
+    return False
+
+
+@pytest.mark.skipif(not has_ipv6(), reason="no IPv6 here")
+def test_it_listens_on_ipv6_too():
+    with serving(host="::1") as server, socket.create_connection(("::1", server.server_port), timeout=5) as sock:
+        sock.sendall(b"GET / HTTP/1.1\r\nHost: [::1]\r\n\r\n")
+        assert sock.recv(100).startswith(b"HTTP/1.1 200 ")
 
 
 def test_slow_senders_are_cut_off():

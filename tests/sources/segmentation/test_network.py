@@ -5,7 +5,8 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from worlds.models import brightness_model
+from onnx import TensorProto, helper
+from worlds.models import brightness_model, save
 
 from roadgeo.errors import ModelError
 from roadgeo.sources.segmentation.network import DEFAULT_MODEL, load_network
@@ -147,7 +148,45 @@ def test_the_class_can_be_named(tmp_path: Path) -> None:
         load_network(path, class_name="blue")
 
 
+def one_node(path: Path, operator: str, **attributes: object) -> Path:
+    """A model of one operator, whose output is said to be an image of a road."""
+    shape = [1, 3, 64, 64]
+    ports = [[helper.make_tensor_value_info(name, TensorProto.FLOAT, shape)] for name in ("image", "road")]
+    graph = helper.make_graph([helper.make_node(operator, ["image"], ["road"], **attributes)], "g", *ports)
+    return save(graph, path, props={"class_names": {0: "road", 1: "a", 2: "b"}})
+
+
+def test_values_between_0_and_1_are_taken_for_probabilities(tmp_path: Path) -> None:
+    network = load_network(one_node(tmp_path / "m.onnx", "Identity"))
+    assert network(np.full((64, 64, 3), 51, np.uint8)) == pytest.approx(np.full((64, 64), 0.2))
+
+
+def test_a_model_that_cannot_be_loaded(tmp_path: Path) -> None:
+    with pytest.raises(ModelError, match=r"cannot be loaded .* made for a newer version") as raised:
+        load_network(one_node(tmp_path / "m.onnx", "NoSuchOperator"))
+    assert "\n" not in str(raised.value)
+
+
+def test_a_model_that_fails_while_it_runs(tmp_path: Path) -> None:
+    network = load_network(brightness_model(tmp_path / "m.onnx"))
+    with pytest.raises(ModelError, match=r"fails while it runs .*; is it made for RGB pictures") as raised:
+        network(np.zeros((32, 32, 3), np.uint8))
+    assert "\n" not in str(raised.value)
+
+
+def test_a_model_that_gives_no_image(tmp_path: Path) -> None:
+    path = one_node(tmp_path / "m.onnx", "Flatten", axis=2)
+    with pytest.raises(ModelError, match=r"gives an array of shape \(3, 4096\)"):
+        load_network(path)
+
+
 def test_without_onnxruntime_the_command_is_said(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr("importlib.util.find_spec", lambda name: None)
     with pytest.raises(ModelError, match=r"pip install 'roadgeo\[segment\]'"):
         load_network(DEFAULT_MODEL)
+
+
+def test_without_the_model_that_ships_one_is_asked_for(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr("roadgeo.sources.segmentation.network.DEFAULT_MODEL", tmp_path / "none.onnx")
+    with pytest.raises(ModelError, match="give one that finds roads: --segmenter"):
+        load_network()

@@ -1,0 +1,63 @@
+"""The library: listed, checked and emptied."""
+
+import json
+from pathlib import Path
+
+import pytest
+from worlds.fenway import write_streets
+
+from roadgeo.cli import main
+
+
+@pytest.fixture
+def library(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
+    """A library with two references, `bad` of which is damaged."""
+    folder = tmp_path / "library"
+    monkeypatch.setenv("ROADGEO_LIBRARY", str(folder))
+    streets = write_streets(tmp_path / "streets.geojson")
+    for name in ("bad", "good"):
+        assert main(["index", "--roads", str(streets), "--name", name, "--quiet"]) == 0
+    (folder / "bad.gpkg").write_bytes((folder / "bad.gpkg").read_bytes()[:5000])
+    return folder
+
+
+def test_what_is_damaged_is_said_and_the_rest_is_listed(library: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    assert main(["list", "--json"]) == 1
+    told = capsys.readouterr()
+    assert [json.loads(line)["name"] for line in told.out.splitlines()] == ["good"]
+    assert told.err.startswith(f"Error: {library / 'bad.gpkg'}")
+    assert len(told.err.splitlines()) == 1
+
+
+def test_every_reference_is_checked(library: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    assert main(["check", "bad", "nonesuch", "good"]) == 1
+    told = capsys.readouterr()
+    assert told.out == "good: sound\n"
+    first, *_, last = told.err.splitlines()
+    assert first.startswith(f"Error: {library / 'bad.gpkg'}")
+    assert last.startswith("Error: no reference 'nonesuch'")
+
+
+@pytest.mark.parametrize(("typed", "left"), [("y\n", ["bad"]), ("n\n", ["bad", "good"]), ("", ["bad", "good"])])
+def test_before_one_is_removed_it_is_asked(
+    library: Path, typed: str, left: list[str], capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    answers = iter([typed.strip()] if typed else [])
+
+    def answer(_: str) -> str:
+        try:
+            return next(answers)
+        except StopIteration:
+            raise EOFError from None
+
+    monkeypatch.setattr("click.termui.visible_prompt_func", answer)
+    assert main(["remove", "good"]) == (0 if typed == "y\n" else 130)
+    assert sorted(path.stem for path in library.glob("*.gpkg")) == left
+
+
+def test_an_empty_library_says_how_it_is_filled(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setenv("ROADGEO_LIBRARY", str(tmp_path))
+    assert main(["list"]) == 0
+    assert capsys.readouterr() == ("", f"The library in {tmp_path} is empty; `roadgeo index` adds to it.\n")

@@ -1,0 +1,88 @@
+"""The stage that lost the true place is the first that it did not come out of."""
+
+import math
+from types import SimpleNamespace
+
+import numpy as np
+import pytest
+from worlds.scenes import PLANE, random_network
+
+from roadgeo.geometry.camera import CameraFault, CameraOptions
+from roadgeo.geometry.projection import to_lonlat
+from roadgeo.location import Location, Place
+from roadgeo.matching.index import build_index
+from roadgeo.matching.truth_record import TruthRecord
+from roadgeo.matching.verdict import Needed
+
+NEEDED = Needed(log10_odds=3.0, margin=2.0, intersections=3)
+REFUSED = Location("q", "not_located", "")
+
+
+@pytest.fixture(scope="module")
+def estimator():
+    """What a record asks of an estimator: the map, the frame (of 1000 pixels) and the camera."""
+    scene = SimpleNamespace(half_size=707.0, size=(1000, 1000))
+    return SimpleNamespace(
+        index=build_index(random_network(1, 1000.0)), scene=scene, options=SimpleNamespace(camera=CameraOptions())
+    )
+
+
+def lonlat(x, y):
+    return tuple(to_lonlat(PLANE.crs, PLANE.to_crs(np.array([[x, y]])))[0])
+
+
+def told(estimator, met=(), best=-math.inf, at=(500.0, 500.0), answer=REFUSED):
+    record = TruthRecord(lonlat(*at))
+    record.began(estimator)
+    record.met.update(met)
+    record.best = best
+    record.faults.update([CameraFault.TILT, CameraFault.SKEW, CameraFault.TILT] if "camera" in met else [])
+    return record.told(answer, NEEDED)
+
+
+@pytest.mark.parametrize(
+    ("met", "lost_at", "said"),
+    [
+        ([], "proposals", "was never proposed"),
+        (["proposals"], "on_roads", "the roads around the intersection did not agree"),
+        (["proposals", "on_roads"], "survived", "what was followed outwards from there did not fit"),
+        (["proposals", "on_roads", "survived"], "verified", "was not among the best of its intersection"),
+        (["survived", "verified"], "verified", "could not be refined"),
+        (["survived", "camera"], "camera", "refused it: tilt out of range, no camera sees a plane so"),
+    ],
+)
+def test_the_first_stage_that_it_did_not_come_out_of(estimator, met, lost_at, said):
+    story = told(estimator, met)
+    assert story.lost_at == lost_at
+    assert said in story.said
+    assert story.log10_odds is None
+    assert {stage for stage, n in story.counts.items() if n} == set(met)
+
+
+def place(x, y):
+    return Location("q", "located", "", center=Place(0.0, 0.0, *lonlat(x, y), 9.0), gsd_m=1.0)
+
+
+@pytest.mark.parametrize(
+    ("best", "answer", "lost_at", "said"),
+    [
+        (2.5, REFUSED, "odds", "reached log10 odds 2.5, 3 are needed"),
+        (9.0, REFUSED, "margin", "reached log10 odds 9.0, but another place as much"),
+        (9.0, place(5000.0, 500.0), "margin", "but another place as much"),
+        (9.0, place(520.0, 500.0), None, "reached log10 odds 9.0 and was located"),
+    ],
+)
+def test_what_was_measured_is_weighed(estimator, best, answer, lost_at, said):
+    story = told(estimator, ["verified"], best, answer=answer)
+    assert (story.lost_at, story.log10_odds) == (lost_at, best)
+    assert said in story.said
+
+
+def test_off_the_map_nothing_else_counts(estimator):
+    story = told(estimator, ["proposals"], at=(90_000.0, 500.0))
+    assert (story.lost_at, story.said) == ("map", "the true place lies off the map that was searched")
+
+
+def test_where_nothing_was_searched_it_is_said():
+    story = TruthRecord((-71.0, 42.0)).told(REFUSED, NEEDED)
+    assert (story.lost_at, story.said) == ("map", "the true place: nothing was searched")

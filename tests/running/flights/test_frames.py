@@ -1,0 +1,110 @@
+"""Frames come as masks, photographs or videos, and tell how they moved."""
+
+from dataclasses import replace
+from pathlib import Path
+
+import cv2
+import numpy as np
+import pytest
+from running.flights.test_motion import MOTION, gap, seen, streets
+from worlds.models import brightness_model
+
+from roadgeo.errors import MaskError, PhotographError
+from roadgeo.evaluation.demo import PHOTO
+from roadgeo.running.flights.frames import FrameOptions, read_frames, read_stills
+
+
+def shift(dx: float, dy: float) -> np.ndarray:
+    return np.array([[1.0, 0, dx], [0, 1, dy], [0, 0, 1]])
+
+
+@pytest.fixture
+def model(tmp_path: Path) -> FrameOptions:
+    """Frames of half a metre, and a network that takes what is light for road."""
+    path = brightness_model(tmp_path / "light.onnx", props={"resolution": 50})
+    return FrameOptions(model=str(path), gsd_m=(0.4, 0.625))
+
+
+@pytest.fixture
+def photographs(tmp_path: Path) -> list[str]:
+    """Two cuts of a photograph: the second begins 40 pixels to the right of the first and 24 below."""
+    picture = cv2.imread(str(PHOTO))
+    for k, (left, top) in enumerate([(300, 200), (340, 224)]):
+        cv2.imwrite(str(tmp_path / f"{k}.png"), picture[top : top + 300, left : left + 400])
+    return [str(tmp_path / "0.png"), str(tmp_path / "1.png")]
+
+
+def test_in_photographs_roads_are_found_and_they_tell_the_motion(model: FrameOptions, photographs: list[str]) -> None:
+    first, second = read_frames(photographs, model)
+    light = cv2.imread(photographs[0]).mean(axis=2)
+    assert first.mask.roads[light > 150].mean() > 0.95
+    assert first.mask.roads[light < 105].mean() < 0.05
+    assert first.motion is None
+    assert gap(second.motion, shift(40.0, 24.0)) < 1.0
+    assert (second.name, second.time_s, second.motion_px) == ("1.png", 1.0, 1.5)
+
+
+def test_where_the_scale_is_not_known_one_serves_all(model: FrameOptions, photographs: list[str]) -> None:
+    frames = list(read_frames(photographs, replace(model, gsd_m=None)))
+    assert [frame.mask.roads.shape for frame in frames] == [(300, 400)] * 2
+    assert all(frame.mask.roads.any() for frame in frames)
+
+
+def test_a_photograph_without_roads_is_a_frame_of_the_flight(model: FrameOptions, tmp_path: Path) -> None:
+    path = tmp_path / "sea.png"
+    cv2.imwrite(str(path), np.random.default_rng(0).integers(20, 60, (300, 400, 3)).astype(np.uint8))
+    (frame,) = read_frames([str(path)], replace(model, segment="always"))
+    assert frame.mask.roads.shape == (300, 400)
+    assert not frame.mask.roads.any()
+
+
+def test_stills_keep_their_picture(model: FrameOptions, photographs: list[str], tmp_path: Path) -> None:
+    cv2.imwrite(str(tmp_path / "mask.png"), streets())
+    (_, grey), (_, none) = read_stills([photographs[0], str(tmp_path / "mask.png")], model)
+    assert np.array_equal(grey, cv2.imread(photographs[0], cv2.IMREAD_GRAYSCALE))
+    assert none is None
+
+
+def test_photographs_are_refused_where_masks_are_meant(photographs: list[str]) -> None:
+    with pytest.raises(PhotographError):
+        list(read_frames(photographs, FrameOptions(segment="never")))
+
+
+@pytest.fixture
+def masks(tmp_path: Path) -> list[str]:
+    """Masks of a flight: the second moved by MOTION, the third of another size, the fourth without any road."""
+    first = streets()
+    for k, mask in enumerate([first, seen(first, MOTION), first[:200], np.zeros((200, 320), np.uint8)]):
+        cv2.imwrite(str(tmp_path / f"m{k}.png"), mask)
+    return [str(tmp_path / f"m{k}.png") for k in range(4)]
+
+
+def test_masks_tell_the_motion_where_they_can(masks: list[str]) -> None:
+    frames = list(read_frames(masks))
+    assert gap(frames[1].motion, MOTION) < 12.0
+    assert frames[1].motion_px == 12.0
+    assert frames[2].motion is None
+    assert not frames[3].mask.roads.any()
+    assert frames[3].motion is None
+
+
+def test_the_motion_that_is_given_counts(masks: list[str]) -> None:
+    """It goes by the frame's name, with or without its ending."""
+    given = {"m1.png": MOTION, "m2": shift(1.0, 2.0)}
+    frames = list(read_frames(masks, FrameOptions(motion=given, motion_px=3.0)))
+    assert np.array_equal(frames[1].motion, MOTION)
+    assert np.array_equal(frames[2].motion, given["m2"])
+    assert frames[3].motion is None
+    assert {frame.motion_px for frame in frames} == {3.0}
+
+
+def test_what_is_no_frame_is_said(tmp_path: Path) -> None:
+    (tmp_path / "a.png").write_bytes(b"no image")
+    with pytest.raises(MaskError, match=r"a\.png"):
+        list(read_frames([str(tmp_path / "a.png")]))
+
+
+def test_what_is_no_video_is_said(tmp_path: Path, capfd: pytest.CaptureFixture[str]) -> None:
+    (tmp_path / "a.mp4").write_bytes(b"no video")
+    with pytest.raises(MaskError, match="no video that OpenCV reads; give its frames as images"):
+        list(read_frames([str(tmp_path / "a.mp4")]))

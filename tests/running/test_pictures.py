@@ -1,0 +1,92 @@
+"""What other libraries hold becomes an array of rows and columns, bands last."""
+
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+import rasterio
+import xarray
+from PIL import Image
+from rasterio.io import MemoryFile
+
+from roadgeo.errors import MaskError
+from roadgeo.running.pictures import read_picture
+
+GREY = np.arange(40 * 50, dtype=np.uint8).reshape(40, 50)
+RGB = np.stack([GREY, GREY + 1, GREY + 2], axis=-1)
+
+
+@pytest.mark.filterwarnings("ignore::rasterio.errors.NotGeoreferencedWarning")
+def test_a_dataset_that_is_no_file_is_read_with_its_nodata() -> None:
+    shape = {"count": 3, "height": 40, "width": 50, "dtype": "uint8"}
+    with MemoryFile() as file:
+        with file.open(driver="GTiff", nodata=0, **shape) as dataset:
+            dataset.write(np.moveaxis(RGB, 2, 0))
+        with file.open() as dataset:
+            read = read_picture(dataset)
+    assert np.array_equal(np.ma.getdata(read), RGB)
+    assert np.array_equal(np.ma.getmaskarray(read), RGB == 0)
+
+
+@pytest.mark.filterwarnings("ignore::rasterio.errors.NotGeoreferencedWarning")
+def test_a_dataset_that_is_a_file_is_that_file(tmp_path: Path) -> None:
+    path = tmp_path / "a.tif"
+    with rasterio.open(path, "w", driver="GTiff", dtype="uint8", count=1, height=40, width=50) as dataset:
+        dataset.write(GREY, 1)
+    with rasterio.open(path) as dataset:
+        assert read_picture(dataset) == str(path)
+
+
+def paletted(**info: Any) -> Image.Image:
+    """Two colours: 0 is a dark red, 1 is white."""
+    image = Image.fromarray((GREY > 100).astype(np.uint8), "L").convert("P")
+    image.putdata(list((GREY > 100).astype(np.uint8).ravel()))
+    image.putpalette([90, 10, 10, 255, 255, 255])
+    image.info.update(info)
+    return image
+
+
+def test_a_palette_stands_for_its_colours() -> None:
+    read = read_picture(paletted())
+    assert read[GREY > 100].tolist() == [[255, 255, 255]] * (GREY > 100).sum()
+    assert read[0, 0].tolist() == [90, 10, 10]
+
+
+def test_a_transparent_colour_of_a_palette_was_not_observed() -> None:
+    read = read_picture(paletted(transparency=0))
+    assert np.array_equal(np.ma.getmaskarray(read)[..., 0], GREY <= 100)
+    assert (np.ma.getdata(read)[GREY > 100] == 255).all()
+
+
+def test_black_on_transparent_ground_is_seen_by_its_alpha() -> None:
+    alpha = np.where(GREY > 100, 255, 0).astype(np.uint8)
+    drawn = Image.fromarray(np.dstack([np.zeros_like(RGB), alpha]))
+    assert np.array_equal(read_picture(drawn), alpha)
+
+
+@pytest.mark.parametrize(
+    ("dims", "axes"),
+    [
+        (("y", "x"), (0, 1)),
+        (("x", "y"), (1, 0)),
+        (("lon", "lat"), (1, 0)),
+        (("one", "other"), (0, 1)),  # not named: as they stand
+    ],
+)
+def test_axes_by_their_names(dims: tuple[str, str], axes: tuple[int, int]) -> None:
+    read = read_picture(xarray.DataArray(GREY.transpose(axes), dims=dims))
+    assert np.array_equal(read, GREY)
+
+
+@pytest.mark.parametrize("dims", [("band", "y", "x"), ("y", "x", "band"), ("x", "band", "y")])
+def test_bands_come_last(dims: tuple[str, ...]) -> None:
+    axes = {"y": 0, "x": 1, "band": 2}
+    data = xarray.DataArray(RGB.transpose([axes[name] for name in dims]), dims=dims)
+    assert np.array_equal(read_picture(data), RGB)
+
+
+def test_of_several_times_one_is_to_be_chosen() -> None:
+    data = xarray.DataArray(RGB[None], dims=("time", "y", "x", "band"))
+    with pytest.raises(MaskError, match="dimensions time, y, x, band; choose a time or level first"):
+        read_picture(data)

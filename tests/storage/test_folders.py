@@ -1,0 +1,77 @@
+"""Where things are kept, on each platform."""
+
+import os
+import tempfile
+from pathlib import Path
+
+import pytest
+
+from roadgeo.storage.folders import cache_dir, private_temporary_dir, writable
+
+HOME = Path("/home/somebody")
+SETTINGS = ("ROADGEO_CACHE", "XDG_CACHE_HOME", "LOCALAPPDATA")
+
+
+@pytest.mark.parametrize(
+    ("platform", "settings", "expected"),
+    [
+        ("linux", {}, HOME / ".cache/roadgeo"),
+        ("linux", {"XDG_CACHE_HOME": "/fast"}, Path("/fast/roadgeo")),
+        ("darwin", {"XDG_CACHE_HOME": "/fast"}, HOME / "Library/Caches/roadgeo"),
+        ("win32", {}, HOME / "AppData/Local/roadgeo/cache"),
+        ("win32", {"LOCALAPPDATA": "/users/local"}, Path("/users/local/roadgeo/cache")),
+        ("win32", {"ROADGEO_CACHE": "~/here"}, HOME / "here"),
+    ],
+)
+def test_what_can_be_made_again_lies_where_the_platform_keeps_it(
+    platform: str, settings: dict[str, str], expected: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    for name in SETTINGS:
+        monkeypatch.delenv(name, raising=False)
+    for name in ("HOME", "USERPROFILE"):
+        monkeypatch.setenv(name, str(HOME))
+    monkeypatch.setattr("sys.platform", platform)
+    for name, value in settings.items():
+        monkeypatch.setenv(name, value)
+    assert cache_dir() == expected
+
+
+@pytest.fixture
+def temporary(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
+    monkeypatch.setattr(tempfile, "tempdir", str(tmp_path))
+    return tmp_path
+
+
+@pytest.mark.skipif(os.name == "nt", reason="permission bits of POSIX")
+class TestPrivateTemporaryDir:
+    def test_it_is_the_users_alone_and_stays_the_same(self, temporary: Path) -> None:
+        folder = private_temporary_dir()
+        assert folder == private_temporary_dir() == temporary / f"roadgeo-{os.getuid()}"
+        assert folder.stat().st_mode & 0o777 == 0o700
+
+    def test_one_that_others_may_write_to_is_not_used(self, temporary: Path) -> None:
+        taken = temporary / f"roadgeo-{os.getuid()}"
+        taken.mkdir()
+        taken.chmod(0o777)
+        folder = private_temporary_dir()
+        assert folder != taken
+        assert folder.stat().st_mode & 0o777 == 0o700
+
+    def test_a_link_is_not_followed(self, temporary: Path) -> None:
+        (temporary / "elsewhere").mkdir(mode=0o700)
+        (temporary / f"roadgeo-{os.getuid()}").symlink_to(temporary / "elsewhere")
+        assert private_temporary_dir().resolve() != temporary / "elsewhere"
+
+
+def test_without_users_the_temporary_folder_is_private_already(
+    temporary: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.delattr(os, "getuid", raising=False)
+    assert private_temporary_dir() == temporary / "roadgeo"
+
+
+def test_a_folder_is_made_to_see_whether_it_can_be_written_to(tmp_path: Path) -> None:
+    assert writable(tmp_path / "a/b")
+    assert not list((tmp_path / "a/b").iterdir())
+    (tmp_path / "file").touch()
+    assert not writable(tmp_path / "file/c")
