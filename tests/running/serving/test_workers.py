@@ -1,5 +1,6 @@
 """Processes that locate, on a real reference: what is hostile ends in an answer, and the next is located."""
 
+import errno
 import json
 import os
 import re
@@ -7,24 +8,26 @@ import signal
 import struct
 import subprocess
 import sys
+import threading
 import time
 import urllib.error
 import urllib.request
 import zlib
-from contextlib import nullcontext
+from contextlib import contextmanager, nullcontext
+from dataclasses import replace
 
 import cv2
 import numpy as np
 import pytest
 from support.mavlink_peer import listening, of_kind
 
-from roadgeo.errors import IndexFormatError
+from roadgeo.errors import IndexFormatError, ModelError
 from roadgeo.evaluation.landscape import Landscape
 from roadgeo.evaluation.noise import NOISE_MODELS
 from roadgeo.evaluation.simulation import SimulationOptions, ViewOptions, simulate_query
 from roadgeo.reference.reference import Reference
 from roadgeo.running.flights.mavlink import has_pymavlink
-from roadgeo.running.serving.workers import Asked, Workers
+from roadgeo.running.serving.workers import Asked, Workers, _locate
 
 pytestmark = pytest.mark.slow
 
@@ -72,7 +75,6 @@ def test_a_process_locates_and_survives_what_is_hostile(place, tmp_path):
         first = workers._all[0]._process
         first.kill()
         first.join()
-        assert workers.ask(Asked(str(folder / "mask.png"), {}, 10.0, 64_000_000)).status == 500
         answer = workers.ask(Asked(str(folder / "mask.png"), {"gsd_m": (0.5, 2.0)}, 10.0, 64_000_000))
         assert answer.status == 200
         found = answer.document
@@ -80,6 +82,86 @@ def test_a_process_locates_and_survives_what_is_hostile(place, tmp_path):
         assert np.hypot(found["center"]["x"] - truth.center[0], found["center"]["y"] - truth.center[1]) < 5.0
     finally:
         workers.close()
+
+
+@pytest.fixture
+def one_worker(place):
+    workers = Workers([str(place[0] / "town.gpkg")], 1, 2)
+    yield workers, Asked(str(place[0] / "mask.png"), {"gsd_m": (0.5, 2.0)}, 10.0, 64_000_000)
+    workers.close()
+
+
+@contextmanager
+def asked_beside(workers, asked):
+    """Ask a process that stands still: a list that holds the answer after the block."""
+    answers = []
+    os.kill(workers._all[0]._process.pid, signal.SIGSTOP)
+    thread = threading.Thread(target=lambda: answers.append(workers.ask(asked)))
+    thread.start()
+    yield answers
+    thread.join(60)
+
+
+def test_a_process_that_breaks_at_work_costs_nobody_an_answer(one_worker):
+    workers, asked = one_worker
+    with asked_beside(workers, asked) as answers:
+        time.sleep(0.2)
+        workers._all[0]._process.kill()
+    assert [one.status for one in answers] == [200]
+
+
+def test_an_image_that_breaks_every_process_is_told_so(one_worker, monkeypatch):
+    def broken(self, asked):
+        raise EOFError
+
+    workers, asked = one_worker
+    with monkeypatch.context() as patch:
+        patch.setattr("roadgeo.running.serving.workers._Worker.ask", broken)
+        assert workers.ask(asked).status == 500
+    assert workers.ask(asked).status == 200
+
+
+def test_what_takes_too_long_is_ended_and_no_fault(one_worker, monkeypatch):
+    workers, asked = one_worker
+    monkeypatch.setattr("roadgeo.running.serving.workers._GRACE_S", 0.3)
+    with asked_beside(workers, replace(asked, time_limit_s=0.2)) as answers:
+        pass
+    assert [one.status for one in answers] == [503]
+    assert "longer than 0.5 s" in answers[0].document["detail"]
+    monkeypatch.undo()
+    assert workers.ask(asked).status == 200
+
+
+def test_a_system_without_room_for_a_process_is_no_fault(one_worker, monkeypatch):
+    def none(*_):
+        raise OSError(errno.EAGAIN, os.strerror(errno.EAGAIN))
+
+    workers, asked = one_worker
+    workers._all[0]._process.kill()
+    with monkeypatch.context() as patch:
+        patch.setattr("multiprocessing.process.BaseProcess.start", none)
+        assert [workers.ask(asked).status for _ in range(2)] == [503, 503]
+    assert workers.ask(asked).status == 200
+
+
+def test_who_asks_while_the_server_ends_is_told(one_worker):
+    workers, asked = one_worker
+    with asked_beside(workers, asked) as answers:
+        time.sleep(0.2)
+        workers.close()
+    assert [one.status for one in answers] == [503]
+    assert not workers._all[0]._process.is_alive()
+
+
+def test_photographs_are_refused_where_there_is_no_model_for_them(monkeypatch):
+    def none(*_):
+        raise ModelError("photographs need onnxruntime: pip install 'roadgeo[segment]'")
+
+    monkeypatch.setattr("roadgeo.running.serving.workers._size", lambda _: (10, 10))
+    monkeypatch.setattr("roadgeo.running.queries.locate_query", none)
+    answer = _locate(Asked("photo.jpg", {}, 1.0, 1000), [])
+    assert answer.status == 415
+    assert "onnxruntime" in answer.document["detail"]
 
 
 def test_a_missing_reference_is_said(tmp_path):
