@@ -18,11 +18,14 @@ from pathlib import Path
 import cv2
 import numpy as np
 
+from roadgeo._arrays import FloatArray
 from roadgeo.evaluation.flights import Flight, FlightOptions, simulate_flight
 from roadgeo.evaluation.landscape import Landscape
+from roadgeo.geometry.homography import Homography
 from roadgeo.geometry.mask import RoadMask
 from roadgeo.reference.network_file import read_network
 from roadgeo.reference.reference import Reference, open_reference
+from roadgeo.running.flights.motion import Odometer
 from roadgeo.running.flights.tracker import FlightFrame, Tracked, Tracker
 from roadgeo.sources.masks import read_mask
 
@@ -47,6 +50,7 @@ class Result:
     search_s: float = 0.0
     cut_noticed_after: int | None = None
     cut_claimed: int = 0
+    motion_errors_px: list[float | None] = field(default_factory=list)
 
 
 def masks_of(flight: Flight) -> list[RoadMask]:
@@ -55,17 +59,16 @@ def masks_of(flight: Flight) -> list[RoadMask]:
 
 def fly(flight: Flight, other: Flight, reference: Reference, city: str, own_motion: bool) -> Result:
     result = Result(city, flight.number, len(flight.views))
-    tracker, known = Tracker([reference]), dict[int, Tracked]()
-    masks, frames = masks_of(flight), []
+    tracker, odometer, known = Tracker([reference]), Odometer(), dict[int, Tracked]()
+    masks = masks_of(flight)
     for k, mask in enumerate(masks):
-        motion = flight.motion[k] if k else None
+        motion, motion_px = (flight.motion[k], 1.5) if k else (None, 1.5)
         if own_motion and k:
-            from roadgeo.running.flights.motion import between_masks
-
-            motion = between_masks(masks[k - 1], mask, frames[-1].motion)
-        frames.append(FlightFrame(k, mask.name, float(k), mask, motion))
+            motion, motion_px = odometer.move(masks[k - 1], mask)
+            result.motion_errors_px.append(motion_error(flight, k, motion))
+        frame = FlightFrame(k, mask.name, float(k), mask, motion, motion_px)
         was_lost, started = tracker.is_lost, time.process_time()
-        known.update({one.frame.number: one for one in tracker.feed(frames[-1])})
+        known.update({one.frame.number: one for one in tracker.feed(frame)})
         spent = time.process_time() - started
         if was_lost:
             result.search_s += spent
@@ -84,6 +87,15 @@ def fly(flight: Flight, other: Flight, reference: Reference, city: str, own_moti
     return result
 
 
+def motion_error(flight: Flight, k: int, motion: FloatArray | None) -> float | None:
+    """How far the middle of a frame is put from where the frame before shows it, pixels; None: nowhere."""
+    if motion is None:
+        return None
+    middle = np.array(flight.options.size_px) / 2
+    truth = flight.views[k - 1].homography.inverse()(flight.views[k].homography(middle))
+    return float(np.hypot(*(Homography(motion)(middle) - truth)))
+
+
 def cut(tracker: Tracker, flight: Flight, other: Flight, result: Result) -> None:
     """Go on with frames from elsewhere, and motion as if the flight went on."""
     for k, mask in enumerate(masks_of(other)[:CUT_FRAMES]):
@@ -93,6 +105,18 @@ def cut(tracker: Tracker, flight: Flight, other: Flight, result: Result) -> None
             result.cut_noticed_after = k + 1
             return
         result.cut_claimed += news[-1].status == "tracked"
+
+
+def summarize_motion(results: list[Result]) -> dict[str, float]:
+    """How good the motion is that masks tell."""
+    told = [error for one in results for error in one.motion_errors_px]
+    known = np.array([error for error in told if error is not None])
+    return {
+        "motion known": len(known) / len(told),
+        "motion error px, median": float(np.median(known)),
+        "motion error px, p95": float(np.quantile(known, 0.95)),
+        "motion off by more than 50 px": float(np.mean(known > 50.0)),
+    }
 
 
 def summarize(results: list[Result]) -> dict[str, float]:
@@ -143,7 +167,8 @@ def main() -> None:
             if given.out:
                 with given.out.open("a") as file:
                     file.write(json.dumps(asdict(one)) + "\n")
-    for name, value in summarize(results).items():
+    told = summarize(results) | (summarize_motion(results) if given.motion == "masks" else {})
+    for name, value in told.items():
         print(f"{name:32} {value:.3g}")
 
 

@@ -1,9 +1,9 @@
 """What `roadgeo verify` writes: corrected copies, control points, one table of all, and offsets for map editors.
 
-Editors of OpenStreetMap move imagery by metres of the Mercator map, which are longer than those on the ground by
-1 / cos(latitude): JOSM as bookmarks in its preferences (`imagery.offsetbookmarks`, in EPSG:3857), iD and Rapid as
-`offset=east,north` in the fragment of the URL. Both move the imagery to the east and north where the numbers are
-positive.
+Editors of OpenStreetMap move imagery by metres of the Mercator map, which are longer than those on the ground by about
+1 / cos(latitude): JOSM as bookmarks in its preferences (`imagery.offsetbookmarks`, in EPSG:3857), which it imports from
+a file of commands whose root is `config`; iD and Rapid as `offset=east,north` in the fragment of the URL. Both move the
+imagery to the east and north where the numbers are positive.
 """
 
 from __future__ import annotations
@@ -18,6 +18,7 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
+from roadgeo._text import visible
 from roadgeo.errors import OutputError
 from roadgeo.storage.files import replacing, write_text
 
@@ -31,16 +32,26 @@ _COLUMNS = (
     "residual_m", "log10_lead", "agreeing", "agreeing_as_given", "lon", "lat", "mercator_east", "mercator_north", "id",
 )  # fmt: skip
 
+#: Radii of WGS 84.
+_EQUATORIAL_M, _POLAR_M = 6378137.0, 6356752.314245
+
 
 def editor_offset(east_m: float, north_m: float, lat: float) -> tuple[float, float]:
-    """Return a shift on the ground as metres of the Mercator map."""
+    """Return a shift on the ground as metres of the Mercator map, which draws the ellipsoid's latitudes on a sphere."""
     stretch = 1.0 / math.cos(math.radians(lat))
-    return east_m * stretch, north_m * stretch
+    flat = (_POLAR_M / _EQUATORIAL_M) ** 2
+    round_ = math.sqrt(1.0 - (1.0 - flat) * math.sin(math.radians(lat)) ** 2)
+    # The radii of curvature are a / round_ to the east and a flat / round_^3 to the north.
+    return east_m * stretch * round_, north_m * stretch * round_**3 / flat
 
 
 def id_fragment(lon: float, lat: float, offset: tuple[float, float]) -> str:
-    """Return the fragment of a URL that opens iD or Rapid there with its imagery moved."""
-    return f"#map=17/{lat:.5f}/{lon:.5f}&offset={offset[0]:.2f},{offset[1]:.2f}"
+    """Return the fragment of a URL that opens iD or Rapid there with its imagery moved by metres of the Mercator map.
+
+    Both take a metre to the north for one of a globe whose meridian has the polar radius.
+    """
+    east, north = offset[0], offset[1] * _POLAR_M / _EQUATORIAL_M
+    return f"#map=17/{lat:.5f}/{lon:.5f}&offset={east:.2f},{north:.2f}"
 
 
 def write_table(path: Path, documents: Sequence[Mapping[str, Any]]) -> None:
@@ -59,17 +70,18 @@ def _cell(document: Mapping[str, Any], name: str) -> Any:
 
 
 def write_josm(path: Path, documents: Sequence[Mapping[str, Any]]) -> None:
-    """Write the offsets of images that are off as bookmarks, in the form of JOSM's preferences."""
-    root = ET.Element("preferences", xmlns="http://josm.openstreetmap.de/preferences-1.0")
-    bookmarks = ET.SubElement(root, "maps", key="imagery.offsetbookmarks")
+    """Write the offsets of images that are off as bookmarks that JOSM adds to those it has."""
+    root = ET.Element("config")
+    preferences = ET.SubElement(root, "preferences", operation="append")
+    bookmarks = ET.SubElement(preferences, "maps", key="imagery.offsetbookmarks")
     for document in documents:
         if document["verdict"] != "off":
             continue
         entry = ET.SubElement(bookmarks, "map")
         values = {
             "projection_code": "EPSG:3857",
-            "imagery_name": Path(document["image"]).name,
-            "name": f"roadgeo {Path(document['image']).stem}",
+            "imagery_name": _plain(Path(document["image"]).name),
+            "name": f"roadgeo {_plain(Path(document['image']).stem)}",
             "dx": f"{document['editors']['mercator_east']:.3f}",
             "dy": f"{document['editors']['mercator_north']:.3f}",
             "center_lon": f"{document['center']['lon']:.7f}",
@@ -79,6 +91,11 @@ def write_josm(path: Path, documents: Sequence[Mapping[str, Any]]) -> None:
             ET.SubElement(entry, "tag", key=key, value=value)
     ET.indent(root)
     write_text(path, ET.tostring(root, encoding="unicode", xml_declaration=True) + "\n")
+
+
+def _plain(name: str) -> str:
+    """Return a name as JOSM may read it: what stands in ${} it would run as a program, and XML has no control signs."""
+    return visible(name).replace("${", "$(")
 
 
 def write_points(path: Path, place: Georeference) -> None:

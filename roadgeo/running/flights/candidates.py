@@ -2,7 +2,8 @@
 
 What a search finds pays for all the places it tried: a hundred thousand and more, five decades of odds. A place that
 was proposed once, and then agrees with ground that the search did not know, pays only for how many were proposed
-before it. Where streets are alike a flight is so found some frames sooner.
+before it; or it pays for all that were tried, and counts all that was seen. So each frame that comes may tell, whether
+or not the map is searched again, and where streets are alike a flight is found some frames sooner.
 """
 
 from __future__ import annotations
@@ -103,8 +104,10 @@ class _Candidate:
         Pixel of the frame `seen_at` to reference plane.
     since : int
         Number of the latest frame that proposed it.
+    n_tried : int
+        Places that were tried until then.
     proposed : float
-        Log10 odds by which it was proposed, less all that were tried.
+        Log10 odds of all that was seen, less all that were tried.
     rank : int
         So many were proposed before it at that look.
     n_looks : int
@@ -112,7 +115,7 @@ class _Candidate:
     tested : float
         Log10 odds of the ground seen since.
     fit : Fit or None
-        Where it was last laid; None before its first test.
+        Where it was last laid; None before any frame came.
     """
 
     index: ReferenceIndex
@@ -120,6 +123,7 @@ class _Candidate:
     matrix: FloatArray
     seen_at: int
     since: int
+    n_tried: int
     proposed: float
     rank: int
     n_looks: int
@@ -130,11 +134,53 @@ class _Candidate:
     def log10_odds(self) -> float:
         """What speaks for it: all that was seen, less what was tried; or what was seen since, less the rank.
 
-        Of the two what says more, less the looks. The weights 1 / ((r + 1) (r + 2)) of the ranks r = 0, 1, ... have the
-        sum 1: however many places are tested, they pay as one does.
+        Of the two what says more, less the looks.
         """
-        paid = math.log10(self.n_looks)
-        return self.tested + max(self.proposed, -math.log10((self.rank + 1) * (self.rank + 2))) - paid
+        return max(self.proposed, self.later) - math.log10(self.n_looks)
+
+    @property
+    def later(self) -> float:
+        """What was seen since, less the rank.
+
+        The weights 1 / ((r + 1) (r + 2)) of the ranks r = 0, 1, ... have the sum 1: however many places are tested,
+        they pay as one does.
+        """
+        return self.tested - math.log10((self.rank + 1) * (self.rank + 2))
+
+    def lay(self, look: Look, options: LocateOptions) -> None:
+        """Refine it on all that was seen, and count that; without a fit it can be no place of these frames."""
+        whole, match = look.query.scene, options.match
+        matrix, self.fit = _lay(self, look), None
+        if matrix is None or judge(matrix, whole.size, match.camera, rough=True) is not None:
+            return
+        _, matched, _ = agreement(matrix, whole, self.index, sampling(matrix, whole.size), _NO_SEEDS, match.verify)
+        refined = refine(matrix, whole, self.index, matched, match.refine, held=True)
+        if refined is None or judge(refined.matrix, whole.size, match.camera) is not None:
+            return
+        matrix, gsd = refined.matrix, sampling(refined.matrix, whole.size)
+        found, matched, distance = agreement(matrix, whole, self.index, gsd, _NO_SEEDS, match.verify)
+        chance = chance_agreement(matrix, whole, self.index, gsd, match.verify)
+        self.proposed = log10_odds(found, chance, whole.n_edges, self.n_tried, match.verify)
+        self.matrix, self.seen_at = matrix @ PIXEL_TO_PLANE @ look.mosaic.to_mosaic[-1], look.numbers[-1]
+        self.fit = Fit(
+            self.index, matrix, matched, distance, found.forward, self.proposed,
+            refined.corner_sigma_m, refined.corner_covariance_m2,
+            agreement=(found.rate + found.forward + found.backward) / 3,
+        )  # fmt: skip
+
+    def test(self, fresh: Scene | None, look: Look, locate: LocateOptions, options: CandidateOptions) -> None:
+        """Compare it with the map on ground that had not been seen when it was proposed."""
+        self.tested = 0.0
+        if self.fit is None or fresh is None:
+            return
+        whole, verify, matrix = look.query.scene, locate.match.verify, self.fit.matrix
+        gsd, least = sampling(matrix, whole.size), locate.min_log10_odds - locate.min_margin
+        found, _, _ = agreement(matrix, fresh, self.index, gsd, _NO_SEEDS, verify)
+        for n_best in (options.n_best, 1):
+            chance = chance_agreement(matrix, fresh, self.index, gsd, verify, n_best=n_best)
+            self.tested = log10_odds(found, chance, fresh.n_edges, 1, verify)
+            if self.later - math.log10(self.n_looks) < least or _leads(matrix, whole, self.index, options):
+                break
 
 
 class _Recorder(NoTrace):
@@ -205,27 +251,24 @@ class Candidates:
         return location
 
     def _test(self, look: Look, options: LocateOptions) -> None:
-        """Lay all that frames have shown on each place, and count what was not seen when it was proposed."""
+        """Lay all that frames have shown on each place; count all of it, and what was not seen when it was proposed."""
         scenes: dict[int, Scene | None] = {}
-        due: list[tuple[_Candidate, Scene]] = []
         for one in self._kept:
             if one.since not in scenes:
                 scenes[one.since] = self._ground_since(look, one.since, options)
-            scene = scenes[one.since]
-            if scene is not None and scene.n_edges >= self.options.fewest_roads:
-                due.append((one, scene))
-        for one, scene in due:
-            _test_candidate(one, scene, look, options, self.options)
-        self._kept = [one for one in self._kept if not one.tested < self.options.hopeless]
+            one.lay(look, options)
+            one.test(scenes[one.since], look, options, self.options)
+        self._kept = [one for one in self._kept if one.fit is not None and one.tested >= self.options.hopeless]
 
     def _ground_since(self, look: Look, since: int, options: LocateOptions) -> Scene | None:
-        """Return what is seen on ground that no frame up to `since` saw; None where that shows no roads."""
+        """Return what is seen on ground that no frame up to `since` saw; None where that shows hardly a road."""
         later = sum(number > since for number in look.numbers)
         mask = unseen_before(look.masks, look.mosaic, len(look.masks) - later, self.mosaic)
         try:
-            return trace_query(mask, options.query)[0]
+            scene = trace_query(mask, options.query)[0]
         except MaskError:
             return None
+        return scene if scene.n_edges >= self.options.fewest_roads else None
 
     def _with_tested(self, found: list[Found], look: Look) -> list[Found]:
         """Add places that stood a test to what was found; each place counts by what speaks most for it."""
@@ -248,9 +291,9 @@ class Candidates:
         if estimator is None:
             return
         for rank, model in enumerate(recorder.best(self.options.per_look)):
-            proposed = _fully_scored(model, estimator)
+            n_tried, proposed = estimator.ledger.n_tried, _fully_scored(model, estimator)
             new = _Candidate(
-                estimator.index, found.index, model.matrix @ to_frame, last, last, proposed, rank, self.n_looks
+                estimator.index, found.index, model.matrix @ to_frame, last, last, n_tried, proposed, rank, self.n_looks
             )
             here = (one for one in self._kept if one.whole is found.index)
             old = next((one for one in here if _are_one(_lay(one, look), model.matrix, scene.size)), None)
@@ -265,35 +308,6 @@ def _fully_scored(model: Hypothesis, estimator: TripleEstimator) -> float:
         return -math.inf
     chance = chance_agreement(model.matrix, scene, index, model.gsd_m, verify)
     return log10_odds(model.found, chance, scene.n_edges, estimator.ledger.n_tried, verify)
-
-
-def _test_candidate(
-    one: _Candidate, scene: Scene, look: Look, locate: LocateOptions, options: CandidateOptions
-) -> None:
-    """Refine a place on all that was seen; compare it with the map on ground that had not been seen."""
-    whole, verify, camera = look.query.scene, locate.match.verify, locate.match.camera
-    one.tested, one.fit = -math.inf, None
-    matrix = _lay(one, look)
-    if matrix is None or judge(matrix, whole.size, camera, rough=True) is not None:
-        return
-    _, matched, _ = agreement(matrix, whole, one.index, sampling(matrix, whole.size), _NO_SEEDS, verify)
-    refined = refine(matrix, whole, one.index, matched, locate.match.refine, held=True)
-    if refined is None or judge(refined.matrix, whole.size, camera) is not None:
-        return
-    matrix, gsd = refined.matrix, sampling(refined.matrix, whole.size)
-    found, matched, distance = agreement(matrix, whole, one.index, gsd, _NO_SEEDS, verify)
-    one.matrix, one.seen_at = matrix @ PIXEL_TO_PLANE @ look.mosaic.to_mosaic[-1], look.numbers[-1]
-    fresh, _, _ = agreement(matrix, scene, one.index, gsd, _NO_SEEDS, verify)
-    for n_best in (options.n_best, 1):
-        chance = chance_agreement(matrix, scene, one.index, gsd, verify, n_best=n_best)
-        one.tested = log10_odds(fresh, chance, scene.n_edges, 1, verify)
-        if one.log10_odds < locate.min_log10_odds - locate.min_margin or _leads(matrix, whole, one.index, options):
-            break
-    one.fit = Fit(
-        one.index, matrix, matched, distance, found.forward, one.tested,
-        refined.corner_sigma_m, refined.corner_covariance_m2,
-        agreement=(found.rate + found.forward + found.backward) / 3,
-    )  # fmt: skip
 
 
 def _leads(matrix: FloatArray, scene: Scene, index: ReferenceIndex, options: CandidateOptions) -> bool:

@@ -20,7 +20,7 @@ import numpy as np
 from roadgeo._arrays import AnyArray, FloatArray
 from roadgeo.errors import MaskError, PhotographError
 from roadgeo.geometry.mask import RoadMask
-from roadgeo.running.flights.motion import between_images, between_masks
+from roadgeo.running.flights.motion import Odometer, between_images
 from roadgeo.running.flights.tracker import FlightFrame
 from roadgeo.running.tasks import find_masks
 from roadgeo.sources.masks import read_mask
@@ -80,7 +80,7 @@ class _Last:
 
     mask: RoadMask | None = None
     grey: AnyArray | None = None
-    motion: FloatArray | None = None
+    odometer: Odometer = field(default_factory=Odometer)
     scale: dict[str, float] = field(default_factory=dict)
 
 
@@ -99,7 +99,7 @@ def read_frames(arguments: Sequence[str], options: FrameOptions | None = None) -
         for number, image in enumerate(_images(arguments, options, stack)):
             mask, grey = _read(image, options, last)
             motion, error_px = _motion(image.name, mask, grey, options, last) if number else (None, 1.5)
-            last.mask, last.grey, last.motion = mask, grey, motion
+            last.mask, last.grey = mask, grey
             yield FlightFrame(number, image.name, image.time_s, mask, motion, options.motion_px or error_px)
 
 
@@ -226,4 +226,4 @@ def _motion(
         return None, 1.5
     if grey is not None and last.grey is not None:
         return between_images(last.grey, grey), 1.5
-    return between_masks(last.mask, mask, last.motion), 12.0
+    return last.odometer.move(last.mask, mask)

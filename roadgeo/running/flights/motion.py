@@ -12,6 +12,7 @@ import os
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
+from typing import NamedTuple
 
 import cv2
 import numpy as np
@@ -28,7 +29,7 @@ from roadgeo.matching.scene import Scene
 from roadgeo.roads.graph import RoadGraph
 from roadgeo.running.flights.pose import FilterOptions, Pose, correct
 
-__all__ = ["TracedMask", "between_images", "between_masks", "overlay", "read_motion", "write_motion"]
+__all__ = ["Odometer", "TracedMask", "between_images", "between_masks", "overlay", "read_motion", "write_motion"]
 
 _COLUMNS = [f"h{i}{j}" for i in range(3) for j in range(3)]
 
@@ -44,8 +45,14 @@ _SHIFT_CELLS, _LINEAR_SIGMA, _CORNER_SIGMA = 3.0, 0.05, 0.008
 _LEAST_SHARE = 0.6
 #: Frames in no order are laid on each other where they share so much: less agrees by chance.
 _LEAST_SHARED = 0.3
-#: Flights go on as they went: the middle of a frame moves by no more than this share of a frame otherwise than before.
-_STEADY = 0.2
+#: Flights go on as they went: the middle of a frame moves by no more than this share of a frame otherwise than before,
+#: and of what moved otherwise so much is taken off, per frame's side.
+_STEADY, _OTHERWISE = 0.1, 1.28
+#: How well a motion must fit (see `_Laid`), where that of the frame before is known, and where it is not; by how much
+#: it must then lead any other.
+_LEAST_AGAIN, _LEAST_FIRST, _LEAD_FIRST = 0.3, 0.55, 0.06
+#: How far off a corner may be put by masks, and by taking the flight to go on as it went; and how often in a row it is.
+_MASKS_PX, _HELD_PX, _MOST_HELD = 12.0, 30.0, 2
 _FILTER = FilterOptions(
     sigma_m=2.0,
     sigma_px=1.0,
@@ -133,21 +140,96 @@ def between_masks(before: RoadMask, mask: RoadMask, last: FloatArray | None = No
     last : (3, 3) float64, optional
         The motion of the frame before: flights go on as they went.
     """
-    try:
-        (scene, _), (_, graph) = trace_query(mask), trace_query(before)
-    except MaskError:
-        return None
-    height, width = mask.shape
+    one, other = TracedMask.of(before), TracedMask.of(mask)
+    return None if one is None or other is None else _between(one, other, last)
+
+
+@dataclass
+class Odometer:
+    """Tells how each mask of a flight moved; where the masks do not tell, it goes on as it went, a frame or two."""
+
+    _traced: TracedMask | None = None
+    _motion: FloatArray | None = None
+    _held: int = 0
+
+    def move(self, before: RoadMask, mask: RoadMask) -> tuple[FloatArray | None, float]:
+        """Return the motion of a mask against the one before, None where nothing tells it; and how far off it may be.
+
+        Returns
+        -------
+        (3, 3) float64 or None
+        float
+            Standard deviation of a corner, pixels.
+        """
+        known = self._traced if self._traced is not None and self._traced.mask is before else TracedMask.of(before)
+        self._traced = TracedMask.of(mask)
+        found = None if known is None or self._traced is None else _between(known, self._traced, self._motion)
+        if found is not None:
+            self._motion, self._held = found, 0
+            return found, _MASKS_PX
+        self._held += 1
+        if self._held > _MOST_HELD:
+            self._motion = None
+        return self._motion, _HELD_PX
+
+
+class _Laid(NamedTuple):
+    """A mask laid on another: how, the share of roads that agree, and of the frame that both see.
+
+    Where frames share less, less can disagree: how well it fits is the agreement, times the root of what is shared.
+    """
+
+    motion: FloatArray
+    agreement: float
+    shared: float
+
+    @property
+    def fit(self) -> float:
+        return self.agreement * math.sqrt(self.shared)
+
+    def rivals(self, other: _Laid) -> bool:
+        """Whether it fits, or agrees where enough is shared, about as well: streets that repeat do."""
+        agrees = self.shared >= _LEAST_SHARED and self.agreement > other.agreement - _LEAD_FIRST
+        return agrees or self.fit > other.fit - _LEAD_FIRST
+
+
+def _between(one: TracedMask, other: TracedMask, last: FloatArray | None) -> FloatArray | None:
+    """Return the motion of `other` against `one`, as the roads of both and the motion of the frame before tell it."""
+    height, width = other.mask.shape
     frame = Frame(width, height)
-    roads = _buckets(graph)
-    best: tuple[float, FloatArray] | None = None
-    for guess in ([] if last is None else [last]) + _rough_motions(before, mask):
-        found = _refine(guess, frame, scene, roads)
-        if found is None or (last is not None and not _goes_on(found[1], last, frame)):
-            continue
-        if best is None or found[0] > best[0]:
-            best = found
-    return None if best is None or best[0] < _LEAST_SHARE else best[1]
+    guesses = _rough_motions(one.mask, other.mask, 2 * len(_TURNS_DEG))
+    if last is not None:
+        guesses = [last, *(guess for guess in guesses if _otherwise(guess, last, frame) < 2.0 * _STEADY)]
+    laid = [found for guess in guesses if (found := _lay(guess, frame, one, other)) is not None]
+    return _surest(laid, frame) if last is None else _steadiest(laid, last, frame)
+
+
+def _surest(laid: Sequence[_Laid], frame: Frame) -> FloatArray | None:
+    """Return the motion that fits best; None where that is little, or another one fits as well."""
+    best = max(laid, key=lambda one: one.fit, default=None)
+    if best is None or best.fit < _LEAST_FIRST:
+        return None
+    others = (one for one in laid if not _is_same_motion(one.motion, best.motion, frame))
+    return None if any(one.rivals(best) for one in others) else best.motion
+
+
+def _steadiest(laid: Sequence[_Laid], last: FloatArray, frame: Frame) -> FloatArray | None:
+    """Return the motion that fits best, and goes on as the one before; None where that is little."""
+    worth = [
+        (one.fit - _OTHERWISE * off, one) for one in laid if (off := _otherwise(one.motion, last, frame)) < _STEADY
+    ]
+    fit, best = max(worth, key=lambda pair: pair[0], default=(0.0, None))
+    return best.motion if best is not None and fit >= _LEAST_AGAIN else None
+
+
+def _lay(guess: FloatArray, frame: Frame, one: TracedMask, other: TracedMask) -> _Laid | None:
+    """Lay a mask on another, near a rough motion; None where they hardly share a road."""
+    found = _refine(guess, frame, other.scene, one.roads)
+    if found is None:
+        return None
+    there, motion = found
+    back = _agreement(np.asarray(np.linalg.inv(motion), float), frame, one.scene, other.roads)
+    return _Laid(motion, 0.5 * (there + back), _shared(motion, frame))
 
 
 @dataclass(frozen=True)
@@ -213,9 +295,10 @@ def _shared(motion: FloatArray, frame: Frame) -> float:
     return float(((there > 0) & (there < (frame.width, frame.height))).all(axis=1).mean())
 
 
-def _goes_on(motion: FloatArray, last: FloatArray, frame: Frame) -> bool:
+def _otherwise(motion: FloatArray, last: FloatArray, frame: Frame) -> float:
+    """Return by how much the middle of a frame moved otherwise than before, as a share of the frame's longer side."""
     moved, before = (Homography(matrix)(frame.center) for matrix in (motion, last))
-    return bool(np.hypot(*(moved - before)) < _STEADY * max(frame.width, frame.height))
+    return float(np.hypot(*(moved - before)) / max(frame.width, frame.height))
 
 
 def _refine(guess: FloatArray, frame: Frame, scene: Scene, roads: RoadBuckets) -> tuple[float, FloatArray] | None:

@@ -10,6 +10,7 @@ from __future__ import annotations
 import hmac
 import io
 import json
+import logging
 import socket
 import tempfile
 import threading
@@ -21,14 +22,17 @@ from http import HTTPStatus
 from http.server import BaseHTTPRequestHandler, ThreadingHTTPServer
 from pathlib import Path
 from typing import Any
-from urllib.parse import urlsplit
+from urllib.parse import SplitResult, urlsplit
 
 from roadgeo import __version__
+from roadgeo._text import visible
 from roadgeo.running.serving.documents import documents_of, problem
 from roadgeo.running.serving.requests import LIMIT, Refused, ending_of, read_execution, read_query_string
 from roadgeo.running.serving.workers import Answer, Asked, Full, Workers
 
 __all__ = ["LOOPBACK", "ServeOptions", "Server"]
+
+_LOG = logging.getLogger(__name__)
 
 LOOPBACK = ("127.0.0.1", "::1", "localhost")
 
@@ -136,6 +140,19 @@ class Server(ThreadingHTTPServer):
         self.workers.close()
 
 
+def _host_of(address: str) -> str | None:
+    """Return the name in an address; None where that cannot be read."""
+    try:
+        return urlsplit(address).hostname
+    except ValueError:
+        return None
+
+
+def _is_length(text: str) -> bool:
+    """Whether a header says how long a body is: not every digit of Unicode is one of HTTP's."""
+    return text.isascii() and text.isdigit() and len(text) < 19
+
+
 class _Timely(io.RawIOBase):
     """Reads of a socket, all of which together end at a deadline: slow senders get no further."""
 
@@ -212,9 +229,16 @@ class _Handler(BaseHTTPRequestHandler):
         except TimeoutError:
             self.close_connection = True
             self._refuse(Refused(408, "the request took too long to be sent"))
+        except ConnectionError:  # whoever asked has gone
+            self.close_connection = True
+        except Exception:
+            _LOG.exception("a fault of the server at %s", visible(self.requestline[:200]))
+            self.close_connection = True
+            self._refuse(Refused(500, "a fault of roadgeo: its log tells which"))
         else:
             if answer.status >= 400:
-                self._refuse(Refused(answer.status, answer.document["detail"]))
+                again = 1 if answer.status == 503 else None
+                self._refuse(Refused(answer.status, answer.document["detail"], again))
             else:
                 self._send(answer.status, answer.document)
 
@@ -230,18 +254,22 @@ class _Handler(BaseHTTPRequestHandler):
         elif self._name() not in LOOPBACK:
             raise Refused(403, "this server answers to localhost and 127.0.0.1 only")
         origin = self.headers.get("Origin")
-        if origin and urlsplit(origin).hostname not in LOOPBACK:
+        if origin and _host_of(origin) not in LOOPBACK:
             raise Refused(403, "this server does not answer to pages of other sites")
 
     def _name(self) -> str | None:
         """Return under which name this server was asked: other names may be tricks of a page in a browser."""
+        return _host_of("//" + self.headers.get("Host", "localhost"))
+
+    def _target(self) -> SplitResult:
+        """Return what is asked for."""
         try:
-            return urlsplit("//" + self.headers.get("Host", "localhost")).hostname
-        except ValueError:
-            return None
+            return urlsplit(self.path)
+        except ValueError as error:
+            raise Refused(400, f"the address cannot be read: {error}") from error
 
     def _document(self) -> Answer:
-        path = urlsplit(self.path).path.rstrip("/") or "/"
+        path = self._target().path.rstrip("/") or "/"
         document = self.server.documents.get(path)
         if document is None:
             raise Refused(404, f"there is nothing at {path[:80]}; begin at /")
@@ -249,7 +277,7 @@ class _Handler(BaseHTTPRequestHandler):
 
     def _locate(self) -> Answer:
         came = time.time()
-        parts = urlsplit(self.path)
+        parts = self._target()
         if parts.path not in ("/locate", "/processes/locate/execution"):
             if parts.path in self.server.documents:
                 raise Refused(405, "expected GET")
@@ -263,19 +291,30 @@ class _Handler(BaseHTTPRequestHandler):
         else:
             body, hints = read_execution(body)
         answer = self._ask(body, hints)
-        if answer.status == 200 and self.server.told is not None:
-            self.server.told(answer.document, came)
+        if answer.status == 200:
+            self._tell(answer.document, came)
         if parts.path == "/locate" or answer.status >= 400:
             return answer
         return Answer(200, {"location": answer.document})
 
+    def _tell(self, document: dict[str, Any], came: float) -> None:
+        """Tell others of a place; what they make of it is not the matter of who asked."""
+        try:
+            if self.server.told is not None:
+                self.server.told(document, came)
+        except Exception:
+            _LOG.exception("a place could not be told")
+
     def _ask(self, image: bytes, hints: dict[str, Any]) -> Answer:
-        options = self.server.options
+        options, ending = self.server.options, ending_of(image[:16])
         limit = min(hints.pop(LIMIT, options.time_limit_s), options.time_limit_s)
-        with tempfile.TemporaryDirectory(prefix="roadgeo-") as folder:
-            path = Path(folder) / f"image{ending_of(image[:16])}"
-            path.write_bytes(image)
-            return self.server.workers.ask(Asked(str(path), hints, limit, options.max_pixels))
+        try:
+            with tempfile.TemporaryDirectory(prefix="roadgeo-", ignore_cleanup_errors=True) as folder:
+                path = Path(folder) / f"image{ending}"
+                path.write_bytes(image)
+                return self.server.workers.ask(Asked(str(path), hints, limit, options.max_pixels))
+        except OSError as error:
+            raise Refused(503, f"the image cannot be kept: {error.strerror or error}; come again", 1) from error
 
     def _require_size(self) -> None:
         """Refuse a body that says it is too large, or does not say how it ends."""
@@ -289,7 +328,7 @@ class _Handler(BaseHTTPRequestHandler):
         if coding:
             return
         length = next(iter(lengths), "")
-        if not (length.isascii() and length.isdigit() and len(length) < 19):
+        if not _is_length(length):
             self.close_connection = True
             raise Refused(411, "expected Content-Length, or Transfer-Encoding: chunked")
         if int(length) > self.server.options.max_bytes:
@@ -352,7 +391,7 @@ class _Handler(BaseHTTPRequestHandler):
         length = self.headers.get("Content-Length", "0")
         if self._body_read or (self.command in ("GET", "HEAD") and length == "0"):
             return
-        if not length.isdigit() or len(length) > 18 or self.headers.get("Transfer-Encoding") or self.close_connection:
+        if not _is_length(length) or self.headers.get("Transfer-Encoding") or self.close_connection:
             self.close_connection = True
             return
         if int(length) > _MOST_DRAINED or self.headers.get("Expect"):

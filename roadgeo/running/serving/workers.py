@@ -1,10 +1,12 @@
 """Processes that locate for the server: what they are given may break them, and then another one is started.
 
-Only so many requests may work or wait at once; whoever comes then is told to come again.
+Only so many requests may work or wait at once; whoever comes then is told to come again. A process that breaks costs
+nobody an answer, unless the next one breaks by the same image.
 """
 
 from __future__ import annotations
 
+import logging
 import multiprocessing
 import queue
 import signal
@@ -17,8 +19,14 @@ from typing import Any
 
 __all__ = ["Answer", "Asked", "Full", "Workers"]
 
+_LOG = logging.getLogger(__name__)
+
 #: A process that has not answered so long after its time limit is ended.
 _GRACE_S = 15.0
+#: So long it may open its references.
+_START_S = 120.0
+#: Processes that are given an image, one after another, as long as they break.
+_TRIES = 2
 
 
 class Full(Exception):  # noqa: N818 (a state of the server, not a fault)
@@ -56,14 +64,13 @@ class Workers:
 
     def __init__(self, references: Sequence[str], count: int, waiting: int) -> None:
         """Start them; `waiting` more requests than there are processes may wait."""
-        self._references = list(references)
-        self._context = multiprocessing.get_context("spawn")
+        context = multiprocessing.get_context("spawn")
         self._idle: queue.Queue[_Worker] = queue.Queue()
         self._places = threading.Semaphore(count + waiting)
         self._all: list[_Worker] = []
         self._lock = threading.Lock()
         self._closed = False
-        for worker in [_Worker(self._context, self._references) for _ in range(count)]:
+        for worker in [_Worker(context, references) for _ in range(count)]:
             self._all.append(worker)
             worker.wait_until_ready()
             self._idle.put(worker)
@@ -88,24 +95,35 @@ class Workers:
         try:
             worker = self._idle.get()
             try:
-                answer = worker.ask(asked)
-                if answer is None:
-                    worker = self._replace(worker)
-                    return Answer(500, {"detail": "the process that worked on it was ended: it took too long or broke"})
-                return answer
+                return self._ask(worker, asked)
             finally:
                 self._idle.put(worker)
         finally:
             self._places.release()
 
-    def _replace(self, broken: _Worker) -> _Worker:
-        broken.end()
-        fresh = _Worker(self._context, self._references)
+    def _ask(self, worker: _Worker, asked: Asked) -> Answer:
+        """Ask a process; where it breaks start it anew and ask again, for it may have broken while it was idle."""
+        try:
+            for _ in range(_TRIES):
+                try:
+                    return worker.ask(asked)
+                except TimeoutError as error:
+                    self._restart(worker, f"it took {error}")
+                    told = f"it took {error} and was ended; reduce the image, or come again when less is asked"
+                    return Answer(503, {"detail": told})
+                except (EOFError, OSError) as error:
+                    self._restart(worker, f"it broke ({type(error).__name__})")
+        except OSError as error:
+            return Answer(503, {"detail": f"no process can be started: {error.strerror or error}; come again"})
+        return Answer(500, {"detail": f"it broke {_TRIES} processes, one after another; send another image"})
+
+    def _restart(self, worker: _Worker, why: str) -> None:
         with self._lock:
-            self._all = [fresh if one is broken else one for one in self._all]
             if self._closed:
-                fresh.end()
-        return fresh
+                raise OSError("the server is ending")
+            _LOG.warning("a process of the server is started anew: %s", why)
+            worker.end()
+            worker.start()
 
     def close(self) -> None:
         """End all processes."""
@@ -118,11 +136,26 @@ class Workers:
 class _Worker:
     """One process, and the pipe to it."""
 
-    def __init__(self, context: Any, references: list[str]) -> None:
-        self._pipe, theirs = context.Pipe()
-        self._process = context.Process(target=_serve, args=(theirs, references), daemon=True)
-        self._process.start()
-        theirs.close()
+    def __init__(self, context: Any, references: Sequence[str]) -> None:
+        self._context, self._references = context, list(references)
+        self.start()
+
+    def start(self) -> None:
+        """Start the process.
+
+        Raises
+        ------
+        OSError
+            The system has no room for it.
+        """
+        self._is_open = False
+        self._pipe, theirs = self._context.Pipe()
+        try:
+            process = self._context.Process(target=_serve, args=(theirs, self._references), daemon=True)
+            process.start()
+        finally:
+            theirs.close()
+        self._process = process
 
     def wait_until_ready(self) -> None:
         """Wait for its references to be open.
@@ -135,26 +168,38 @@ class _Worker:
         from roadgeo.errors import IndexFormatError
 
         try:
-            said = self._pipe.recv()
-        except EOFError:
-            said = "a process of the server ended while it opened the references"
-        if said is not True:
-            raise IndexFormatError(str(said))
-
-    def ask(self, asked: Asked) -> Answer | None:
-        """Return its answer; None where it gave none."""
-        try:
-            self._pipe.send(asked)
-            deadline = asked.time_limit_s + _GRACE_S
-            while self._pipe.poll(deadline):
-                said = self._pipe.recv()
-                if isinstance(said, Answer):
-                    return said
-                if said is not True:  # a fresh process whose references cannot be opened
-                    return Answer(503, {"detail": str(said)})
+            why = self._open()
         except (EOFError, OSError):
-            pass
-        return None
+            why = "a process of the server ended while it opened the references"
+        if why:
+            raise IndexFormatError(why)
+
+    def ask(self, asked: Asked) -> Answer:
+        """Return its answer.
+
+        Raises
+        ------
+        TimeoutError
+            It takes too long.
+        EOFError, OSError
+            The process has ended.
+        """
+        if why := self._open():
+            return Answer(503, {"detail": why})
+        self._pipe.send(asked)
+        answer: Answer = self._receive(asked.time_limit_s + _GRACE_S)
+        return answer
+
+    def _open(self) -> str:
+        """Wait until a fresh process has opened its references; return why it cannot, "" where it can."""
+        said = self._is_open or self._receive(_START_S)
+        self._is_open = said is True
+        return "" if self._is_open else str(said)
+
+    def _receive(self, patience_s: float) -> Any:
+        if not self._pipe.poll(patience_s):
+            raise TimeoutError(f"longer than {patience_s:g} s")
+        return self._pipe.recv()
 
     def end(self) -> None:
         """End the process."""
@@ -193,7 +238,7 @@ def _serve(pipe: Connection, names: list[str]) -> None:
 def _locate(asked: Asked, references: Sequence[Any]) -> Answer:
     from dataclasses import replace
 
-    from roadgeo.errors import MaskError, RoadgeoError
+    from roadgeo.errors import MaskError, ModelError, RoadgeoError
     from roadgeo.running.queries import locate_query
     from roadgeo.workflows import LocateOptions
 
@@ -212,9 +257,12 @@ def _locate(asked: Asked, references: Sequence[Any]) -> Answer:
         return Answer(200, location.to_dict())
     except MaskError as error:
         return Answer(422, {"detail": _without(asked.path, str(error))})
+    except ModelError as error:  # the image is a photograph, and none are read here
+        return Answer(415, {"detail": _without(asked.path, str(error))})
     except RoadgeoError as error:
         return Answer(500, {"detail": _without(asked.path, str(error))})
     except Exception as error:
+        _LOG.exception("a fault of roadgeo")
         return Answer(
             500, {"detail": f"a fault of roadgeo: {type(error).__name__}: {_without(asked.path, str(error))}"}
         )

@@ -47,10 +47,23 @@ def test_what_a_weak_look_proposed_is_found_by_ground_that_comes_later(flown):
     first = candidates.look(look_at(flown, 4, True), LocateOptions(min_log10_odds=60.0))
     assert not first.located
     assert len(candidates) > 1
-    alone = candidates.look(look_at(flown, 4, False), LocateOptions())
-    assert not alone.located  # no ground that was not seen when it was proposed
+    alone = candidates.look(look_at(flown, 4, False), LocateOptions(min_log10_odds=60.0))
+    assert alone.log10_odds == pytest.approx(first.log10_odds, abs=1.0)  # the same ground tells the same again
+    assert all(one.tested == 0.0 for one in candidates._kept)
     later = look_at(flown, 8, False)
     location = candidates.look(later, LocateOptions())
+    assert location.located
+    assert off_by(location, flown, later) < 5.0
+    assert max(one.tested for one in candidates._kept) > 3.0
+
+
+@pytest.mark.slow
+def test_each_frame_counts_though_it_brings_too_little_ground_for_a_test(flown):
+    candidates = Candidates([flown[2]], CandidateOptions(fewest_roads=1000))
+    candidates.look(look_at(flown, 4, True), LocateOptions(min_log10_odds=60.0))
+    later = look_at(flown, 8, False)
+    location = candidates.look(later, LocateOptions())
+    assert all(one.tested == 0.0 for one in candidates._kept)
     assert location.located
     assert off_by(location, flown, later) < 5.0
 

@@ -1,13 +1,17 @@
 """Motion between frames: files, photographs, masks."""
 
+from itertools import pairwise
+
 import cv2
 import numpy as np
 import pytest
 
 from roadgeo.errors import RoadSourceError
+from roadgeo.evaluation.flights import FlightOptions, simulate_flight
+from roadgeo.evaluation.landscape import Landscape
 from roadgeo.geometry.homography import Homography
 from roadgeo.geometry.mask import RoadMask
-from roadgeo.running.flights.motion import between_images, between_masks, read_motion, write_motion
+from roadgeo.running.flights.motion import Odometer, between_images, between_masks, read_motion, write_motion
 
 MOTION = np.array([[0.99, 0.03, 12.0], [-0.03, 1.01, -80.0], [1e-5, -2e-5, 1.0]])
 CORNERS = np.array([[0.0, 0.0], [320, 0], [320, 240], [0, 240]])
@@ -54,6 +58,52 @@ def test_masks_tell_it_roughly():
     found = between_masks(RoadMask(before > 127), RoadMask(after > 127))
     assert found is not None
     assert gap(found, motion) < 8.0
+
+
+def lattice(left, top):
+    """A frame of streets that repeat every 60 pixels."""
+    columns, rows = np.arange(left, left + 320)[None], np.arange(top, top + 240)[:, None]
+    return RoadMask((columns % 60 < 9) | (rows % 60 < 9))
+
+
+def test_masks_whose_streets_repeat_tell_it_only_to_who_knows_how_the_frame_before_moved():
+    before, after = lattice(0, 0), lattice(3, -85)
+    assert between_masks(before, after) is None
+    last = np.array([[1.0, 0.0, 0.0], [0.0, 1.0, -80.0], [0.0, 0.0, 1.0]])
+    found = between_masks(before, after, last)
+    assert found is not None
+    assert gap(found, np.array([[1.0, 0.0, 3.0], [0.0, 1.0, -85.0], [0.0, 0.0, 1.0]])) < 5.0
+
+
+def test_a_flight_goes_on_as_it_went_for_two_frames_that_tell_nothing():
+    motion = np.array([[0.998, 0.03, 5.0], [-0.03, 0.998, -50.0], [0.0, 0.0, 1.0]])
+    first, second = RoadMask(streets() > 127), RoadMask(seen(streets(), motion) > 127)
+    blank, odometer = [RoadMask(np.zeros((240, 320), bool)) for _ in range(3)], Odometer()
+    known, sigma = odometer.move(first, second)
+    assert gap(known, motion) < 8.0
+    for before, after in pairwise([second, *blank[:2]]):
+        held, unsure = odometer.move(before, after)
+        assert np.array_equal(held, known)
+        assert unsure > sigma
+    assert odometer.move(blank[1], blank[2])[0] is None
+    assert odometer.move(blank[2], first)[0] is None
+
+
+def test_masks_of_a_flight_tell_it_frame_by_frame(town):
+    options = FlightOptions(
+        size_px=(500, 400), n_frames=(10, 10), gsd_m=(0.6, 0.7), turn_deg=1.0, intersections=(2, 12)
+    )
+    flown = simulate_flight(Landscape.from_network(town[0]), options, 2)
+    masks, middle, odometer = [RoadMask(mask > 127) for mask in flown.masks()], np.array([250.0, 200.0]), Odometer()
+    off = []
+    for k in range(1, 10):
+        found, _ = odometer.move(masks[k - 1], masks[k])
+        if found is not None:
+            truth = flown.views[k - 1].homography.inverse()(flown.views[k].homography(middle))
+            off.append(np.hypot(*(Homography(found)(middle) - truth)))
+    assert len(off) >= 7
+    assert np.median(off) < 5.0
+    assert max(off) < 50.0
 
 
 def test_masks_without_roads_tell_nothing():

@@ -1,13 +1,20 @@
 """A flight over a made-up town: found, followed, lost where it ends."""
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
+import shapely
 
 from roadgeo.evaluation.flights import FlightOptions, simulate_flight
 from roadgeo.evaluation.landscape import Landscape
 from roadgeo.geometry.mask import RoadMask
+from roadgeo.geometry.projection import LocalPlane
+from roadgeo.matching.index import build_index
 from roadgeo.reference.reference import Reference
-from roadgeo.running.flights.tracker import FlightFrame, Tracker, track
+from roadgeo.running.flights.pose import start
+from roadgeo.running.flights.tracker import FlightFrame, Tracked, Tracker, track
+from roadgeo.workflows import build_network
 
 OPTIONS = FlightOptions(size_px=(400, 300), n_frames=(9, 9), gsd_m=(1.0, 1.2), turn_deg=1.0, intersections=(2, 30))
 
@@ -75,3 +82,35 @@ def test_without_motion_a_flight_is_lost(flight):
         tracker.feed(frame)
     news = tracker.feed(FlightFrame(9, "9", 9.0, frames[8].mask))
     assert [one.status for one in news] == ["lost"]
+
+
+@pytest.fixture(scope="module")
+def lattice():
+    """Equal blocks of 110 x 90 m, of which some are not parted by a street."""
+    rng = np.random.default_rng(5)
+    lines = [
+        shapely.LineString([a, b])
+        for x in range(0, 3300, 110)
+        for y in range(0, 3150, 90)
+        for a, b in (((x, y), (x + 110, y)), ((x, y), (x, y + 90)))
+        if rng.random() < 0.9
+    ]
+    network = build_network(lines, LocalPlane("EPSG:32619", (330000.0, 4690000.0)), {"name": "lattice"})
+    flown = simulate_flight(Landscape.from_network(network), replace(OPTIONS, n_frames=(12, 12)), 3)
+    return flown, Reference(build_index(network), network)
+
+
+def test_frames_are_followed_where_a_block_beside_would_do_as_well(lattice):
+    """What is known is not a block off: that streets are alike tells nothing against a frame that was followed."""
+    flown, reference = lattice
+    tracker = Tracker([reference])
+    statuses = []
+    for k, mask in enumerate(flown.masks()):
+        frame = FlightFrame(k, str(k), float(k), RoadMask(mask > 127), flown.motion[k])
+        if k:
+            before = start(flown.views[k - 1].homography(frame.frame.corners), frame.frame, 2.0)
+            known = Tracked(frame, "located", "", k - 1, before, reference)
+            placed = tracker.place_beside(known, frame)
+            statuses.append(placed.status)
+            assert error(flown, placed) < 5.0
+    assert statuses.count("located") >= 10, statuses

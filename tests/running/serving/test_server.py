@@ -1,8 +1,11 @@
 """The server over real sockets, with workers that answer at once, slowly, or not."""
 
+import errno
 import http.client
 import json
+import os
 import socket
+import struct
 import threading
 import time
 from contextlib import contextmanager, suppress
@@ -44,8 +47,8 @@ class Workers:
 
 
 @contextmanager
-def serving(workers=None, **options):
-    server = Server(workers or Workers(), ["town"], ServeOptions(port=0, **options))
+def serving(workers=None, told=None, **options):
+    server = Server(workers or Workers(), ["town"], ServeOptions(port=0, **options), told)
     thread = threading.Thread(target=server.serve_forever, kwargs={"poll_interval": 0.02}, daemon=True)
     thread.start()
     try:
@@ -163,6 +166,11 @@ POST = b"POST /locate HTTP/1.1\r\nHost: localhost\r\n"
         (b"GET / HTTP/1.1\r\nX: " + b"a" * 70_000 + b"\r\n\r\n", b" 431 "),
         (b"GET /" + b"a" * 70_000 + b" HTTP/1.1\r\n\r\n", b" 414 "),
         (b"\0\xff\xfe nonsense\r\n\r\n", b" 400 "),
+        (b"POST http://[/locate HTTP/1.1\r\nHost: localhost\r\nContent-Length: 0\r\n\r\n", b" 400 "),
+        (b"GET http://[/ HTTP/1.1\r\nHost: localhost\r\n\r\n", b" 400 "),
+        (b"GET / HTTP/1.1\r\nHost: [\r\n\r\n", b" 403 "),
+        (b"GET / HTTP/1.1\r\nHost: localhost\r\nOrigin: http://[\r\n\r\n", b" 403 "),
+        (b"POST /locate HTTP/1.1\r\nHost: evil.example\r\nContent-Length: \xb2\r\n\r\n", b" 403 "),
     ],
 )
 def test_heads_that_are_none_get_an_answer_and_the_next_is_served(head, status):
@@ -221,6 +229,54 @@ def test_it_listens_on_ipv6_too():
     with serving(host="::1") as server, socket.create_connection(("::1", server.server_port), timeout=5) as sock:
         sock.sendall(b"GET / HTTP/1.1\r\nHost: [::1]\r\n\r\n")
         assert sock.recv(100).startswith(b"HTTP/1.1 200 ")
+
+
+def test_a_fault_is_told_and_logged_and_the_next_is_served(caplog):
+    workers = Workers()
+    workers.ask = lambda _: {}["nothing"]
+    with serving(workers) as server:
+        answer, document = ask(server, "POST", "/locate", PNG)
+        assert (answer.status, document["status"]) == (500, 500)
+        assert "KeyError" in caplog.text
+        assert "POST /locate" in caplog.text
+        assert ask(server, "GET", "/")[0].status == 200
+
+
+def test_a_disk_that_is_full_is_no_fault(monkeypatch):
+    def full(*_, **__):
+        raise OSError(errno.ENOSPC, os.strerror(errno.ENOSPC))
+
+    with serving() as server:
+        monkeypatch.setattr("pathlib.Path.write_bytes", full)
+        answer, document = ask(server, "POST", "/locate", PNG)
+        assert (answer.status, answer.headers["Retry-After"]) == (503, "1")
+        assert "No space left" in document["detail"]
+
+
+def test_who_asked_gets_the_place_though_it_cannot_be_told_to_others():
+    def told(*_):
+        raise OSError("no autopilot")
+
+    with serving(told=told) as server:
+        assert ask(server, "POST", "/locate", PNG)[1] == FOUND
+
+
+def test_an_answer_that_takes_too_long_says_when_to_come_again():
+    workers = Workers()
+    workers.ask = lambda _: Answer(503, {"detail": "it took longer than 25 s and was ended"})
+    with serving(workers) as server:
+        answer, document = ask(server, "POST", "/locate", PNG)
+        assert (answer.status, answer.headers["Retry-After"]) == (503, "1")
+        assert "25 s" in document["detail"]
+
+
+def test_whoever_goes_while_sending_is_no_fault(caplog):
+    with serving() as server:
+        with socket.create_connection(("127.0.0.1", server.server_port)) as sock:
+            sock.sendall(POST + b"Content-Length: 1000\r\n\r\nabc")
+            sock.setsockopt(socket.SOL_SOCKET, socket.SO_LINGER, struct.pack("ii", 1, 0))  # close with a reset
+        assert ask(server, "GET", "/")[0].status == 200
+    assert not caplog.records
 
 
 def test_slow_senders_are_cut_off():

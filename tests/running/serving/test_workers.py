@@ -1,11 +1,9 @@
 """Processes that locate, on a real reference: what is hostile ends in an answer, and the next is located."""
 
 import json
-import multiprocessing
 import os
 import re
 import signal
-import socket
 import struct
 import subprocess
 import sys
@@ -13,7 +11,6 @@ import time
 import urllib.error
 import urllib.request
 import zlib
-from concurrent.futures import ThreadPoolExecutor
 from contextlib import nullcontext
 
 import cv2
@@ -21,14 +18,13 @@ import numpy as np
 import pytest
 from support.mavlink_peer import listening, of_kind
 
-from roadgeo.cli import main
 from roadgeo.errors import IndexFormatError
 from roadgeo.evaluation.landscape import Landscape
 from roadgeo.evaluation.noise import NOISE_MODELS
 from roadgeo.evaluation.simulation import SimulationOptions, ViewOptions, simulate_query
 from roadgeo.reference.reference import Reference
 from roadgeo.running.flights.mavlink import has_pymavlink
-from roadgeo.running.serving.workers import Asked, Workers, _serve
+from roadgeo.running.serving.workers import Asked, Workers
 
 pytestmark = pytest.mark.slow
 
@@ -76,7 +72,6 @@ def test_a_process_locates_and_survives_what_is_hostile(place, tmp_path):
         first = workers._all[0]._process
         first.kill()
         first.join()
-        assert workers.ask(Asked(str(folder / "mask.png"), {}, 10.0, 64_000_000)).status == 500
         answer = workers.ask(Asked(str(folder / "mask.png"), {"gsd_m": (0.5, 2.0)}, 10.0, 64_000_000))
         assert answer.status == 200
         found = answer.document
@@ -84,77 +79,6 @@ def test_a_process_locates_and_survives_what_is_hostile(place, tmp_path):
         assert np.hypot(found["center"]["x"] - truth.center[0], found["center"]["y"] - truth.center[1]) < 5.0
     finally:
         workers.close()
-
-
-def answers(pipe, questions):
-    """What a process says to questions until nobody asks any more; the first says whether it is ready."""
-    said = [pipe.recv()]
-    for asked in questions:
-        pipe.send(asked)
-        said.append(pipe.recv())
-    pipe.close()
-    return said
-
-
-def serve(references, questions, monkeypatch):
-    """Do what a process does, in this one."""
-    monkeypatch.setattr(signal, "signal", lambda *_: None)
-    ours, its = multiprocessing.Pipe()
-    with ThreadPoolExecutor(1) as pool:
-        said = pool.submit(answers, ours, questions)
-        _serve(its, references)
-        return said.result()
-
-
-def test_what_a_process_answers(place, tmp_path, monkeypatch):
-    folder, _ = place
-    (tmp_path / "cut.png").write_bytes((folder / "mask.png").read_bytes()[:400])
-    (tmp_path / "bomb.png").write_bytes(png(60_000, 60_000))
-    cv2.imwrite(str(tmp_path / "mask.tif"), cv2.imread(str(folder / "mask.png"), cv2.IMREAD_GRAYSCALE))
-    asked = [
-        Asked(str(folder / "mask.png"), {"gsd_m": (0.5, 2.0)}, 10.0, 64_000_000),
-        Asked(str(tmp_path / "mask.tif"), {"near": (0.0, 0.0, 10.0)}, 10.0, 64_000_000),
-        Asked(str(tmp_path / "mask.tif"), {}, 10.0, 100),
-        Asked(str(tmp_path / "bomb.png"), {}, 10.0, 64_000_000),
-        Asked(str(tmp_path / "cut.png"), {}, 10.0, 64_000_000),
-    ]
-    ready, found, elsewhere, small, bomb, cut = serve([str(folder / "town.gpkg")], asked, monkeypatch)
-    assert ready is True
-    assert (found.status, found.document["status"], found.document["query"]) == (200, "located", "")
-    assert (elsewhere.status, elsewhere.document["reason_code"]) == (200, "few_near")
-    assert (small.status, small.document["detail"][:15]) == (413, "900 x 900 pixel")
-    assert bomb.status == 413
-    assert cut.status == 422
-    assert "the image" in cut.document["detail"]
-    assert str(tmp_path) not in cut.document["detail"]
-
-
-def test_a_fault_is_answered_and_not_where_files_lie(place, tmp_path, monkeypatch):
-    def fail(path, *_):
-        raise ZeroDivisionError(f"in {path}")
-
-    monkeypatch.setattr("roadgeo.running.queries.locate_query", fail)
-    folder, _ = place
-    asked = [Asked(str(folder / "mask.png"), {}, 10.0, 64_000_000)]
-    _, answer = serve([str(folder / "town.gpkg")], asked, monkeypatch)
-    assert answer.status == 500
-    assert answer.document == {"detail": "a fault of roadgeo: ZeroDivisionError: in the image"}
-
-
-def test_a_process_that_cannot_open_its_references_says_so(tmp_path, monkeypatch):
-    (said,) = serve([str(tmp_path / "nonesuch.gpkg")], [], monkeypatch)
-    assert "nonesuch.gpkg" in said
-
-
-def test_a_port_that_is_taken_is_said(place, capsys):
-    folder, _ = place
-    with socket.create_server(("127.0.0.1", 0)) as taken:
-        port = taken.getsockname()[1]
-        assert main(["serve", "-r", str(folder / "town.gpkg"), "--port", str(port), "--jobs", "1"]) == 1
-    said = capsys.readouterr().err.splitlines()[-1]
-    assert said.startswith(f"Error: cannot listen on 127.0.0.1 port {port}: ")
-    assert said.endswith("choose another --port")
-    assert not multiprocessing.active_children()
 
 
 def test_a_missing_reference_is_said(tmp_path):
