@@ -24,6 +24,7 @@ import numpy as np
 from roadgeo._arrays import FloatArray
 from roadgeo.geometry.frame import Frame
 from roadgeo.geometry.homography import Homography
+from roadgeo.geometry.whitening import whitener
 
 #: Focal lengths that an adjustment may start from, in usual ones.
 _FACTORS = (0.35, 0.5, 0.7, 1.0, 1.4, 2.0, 3.0)
@@ -119,7 +120,7 @@ def find_pose(
     homography, corners = _moved_to(origin, homography), corners - origin[:2]
     usual = options.usual_focal * frame.half_diagonal
     tried = [options.focal_px] if options.focal_px else [usual * factor for factor in _FACTORS]
-    weights = np.linalg.cholesky(np.linalg.inv(corner_covariance)).T
+    weights = whitener(corner_covariance)
 
     def cost(p: FloatArray) -> float:
         away = weights @ (_corners_seen(p, frame) - corners).ravel()

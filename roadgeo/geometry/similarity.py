@@ -13,6 +13,7 @@ import numpy as np
 
 from roadgeo._arrays import FloatArray
 from roadgeo.geometry.homography import Homography
+from roadgeo.geometry.whitening import whitener
 
 __all__ = ["Similarity", "find_similarity"]
 
@@ -43,17 +44,18 @@ def find_similarity(homography: FloatArray, corners: FloatArray, corner_covarian
     corner_covariance : (8, 8) float64
         Of their places: x and y of the first, then of the second, and so on.
     """
+    if not np.isfinite(corner_covariance).all():
+        return None
     places, middle = Homography(homography).everywhere(corners), corners.mean(axis=0)
     origin = places.mean(axis=0)
     # X = a x - b y + X0, Y = b x + a y + Y0
     (x, y), zero, one = (corners - middle).T, np.zeros(4), np.ones(4)
     design = np.stack([np.c_[x, -y, one, zero], np.c_[y, x, zero, one]], axis=1).reshape(8, 4)
-    weighted = np.linalg.solve(corner_covariance, design)
-    covariance = np.linalg.inv(design.T @ weighted)
-    observed = (places - origin).ravel()
-    parameters = covariance @ weighted.T @ observed
-    remaining = observed - design @ parameters
-    if not remaining @ np.linalg.solve(corner_covariance, remaining) <= _MOST:
+    weights, observed = whitener(corner_covariance), (places - origin).ravel()
+    covariance = np.linalg.inv((weights @ design).T @ (weights @ design))
+    parameters = covariance @ (weights @ design).T @ (weights @ observed)
+    remaining = weights @ (observed - design @ parameters)
+    if not remaining @ remaining <= _MOST:
         return None
     a, b = parameters[:2]
     matrix = np.array([[a, -b, 0.0], [b, a, 0.0], [0.0, 0.0, 1.0]])
