@@ -223,6 +223,7 @@ def _motion(
         found = options.motion.get(name, options.motion.get(Path(name).stem))
         return found, 1.5
     if last.mask is None or last.mask.shape != mask.shape:
+        last.odometer = Odometer()  # another camera: how the flight went on tells nothing
         return None, 1.5
     if grey is not None and last.grey is not None:
         return between_images(last.grey, grey), 1.5
