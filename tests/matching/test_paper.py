@@ -470,14 +470,29 @@ def test_few_intersections_are_not_searched(reference, index):
     assert match.confidence == 0.0
 
 
-def test_time_limit_stops_the_search(reference, index):
+@pytest.mark.parametrize("limit", ["work", "time"])
+def test_limits_stop_the_search(reference, index, limit):
     rng = np.random.default_rng(13)
     query, _ = view(reference, camera(rng, (2000, 2000), gsd=2.0), rng)
-    match = match_pairs(query, reference, index, FRAME, PairOptions(time_limit_s=0.0))
+    match = match_pairs(query, reference, index, FRAME, replace(PairOptions(), **{f"{limit}_limit_s": 0.0}))
     assert match.homography is None
-    assert match.n_samples == 1
-    assert match.hypotheses == 0
-    assert match.reason.startswith("stopped after 0 s")
+    assert (match.n_samples, match.hypotheses) == (1, 0)
+    assert match.stopped == limit
+    assert match.reason.startswith("stopped a")
+
+
+def test_the_answer_does_not_depend_on_the_load(reference, index, monkeypatch):
+    """However slowly the machine gets on: the limit is work, which is counted."""
+    rng = np.random.default_rng(10)
+    query, _ = view(random_network(rng), camera(rng, (2000, 2000), gsd=2.0), rng)
+    options = PairOptions(work_limit_s=0.05, time_limit_s=math.inf)
+    once = match_pairs(query, reference, index, FRAME, options)
+    seconds = iter(range(0, 10**9, 30))
+    monkeypatch.setattr(paper_search.time, "perf_counter", lambda: next(seconds))
+    again = match_pairs(query, reference, index, FRAME, options)
+    assert once.stopped == "work"
+    assert 0.05 <= once.work_s < 0.1
+    assert replace(again, matches=None, seconds=0.0) == replace(once, matches=None, seconds=0.0)
 
 
 def test_large_queries_form_tuples_of_a_sample(reference, index):

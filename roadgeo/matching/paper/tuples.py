@@ -63,8 +63,10 @@ class PairOptions:
     discard_poor : bool
         Leave out intersections of the reference whose branches are too short or fit their tangents badly, as section
         4.2 does (see `quality.well_fitted`).
+    work_limit_s : float
+        The search stops after so much work: seconds of a usual machine, counted, not measured.
     time_limit_s : float
-        The search stops after this many seconds.
+        The same after this time by the clock: the last resort.
     """
 
     d_max_m: float = 1000.0
@@ -82,7 +84,8 @@ class PairOptions:
     rarest_first: bool = True
     max_tuple_intersections: int = 1000
     discard_poor: bool = True
-    time_limit_s: float = 10.0
+    work_limit_s: float = 10.0
+    time_limit_s: float = 60.0
 
 
 @dataclass(frozen=True)
