@@ -190,7 +190,7 @@ def stream_osm(
             if len(ways) == most:
                 yield _from_ways(ways, broken, timestamp)
                 ways, broken = [], 0
-    except (RuntimeError, OSError, ValueError) as error:
+    except (RuntimeError, OSError, ValueError, osmium.InvalidLocationError) as error:
         raise RoadSourceError(f"{path}: not readable as OpenStreetMap data: {first_line(error)}") from error
     yield _from_ways(ways, broken, timestamp)
 

@@ -21,7 +21,7 @@ from http import HTTPStatus
 from http.server import BaseHTTPRequestHandler, ThreadingHTTPServer
 from pathlib import Path
 from typing import Any
-from urllib.parse import urlsplit
+from urllib.parse import SplitResult, urlsplit
 
 from roadgeo import __version__
 from roadgeo.running.serving.documents import documents_of, problem
@@ -153,6 +153,22 @@ class _Timely(io.RawIOBase):
         return self._connection.recv_into(buffer)
 
 
+def _split(url: str) -> SplitResult:
+    """Take the URL of a request apart, or refuse it."""
+    try:
+        return urlsplit(url)
+    except ValueError as error:
+        raise Refused(400, "the URL cannot be read; begin at /") from error
+
+
+def _host_of(url: str) -> str | None:
+    """Return the host that a URL names; None where it is none."""
+    try:
+        return urlsplit(url).hostname
+    except ValueError:
+        return None
+
+
 class _Handler(BaseHTTPRequestHandler):
     server: Server
     server_version = f"roadgeo/{__version__}"
@@ -230,18 +246,15 @@ class _Handler(BaseHTTPRequestHandler):
         elif self._name() not in LOOPBACK:
             raise Refused(403, "this server answers to localhost and 127.0.0.1 only")
         origin = self.headers.get("Origin")
-        if origin and urlsplit(origin).hostname not in LOOPBACK:
+        if origin and _host_of(origin) not in LOOPBACK:
             raise Refused(403, "this server does not answer to pages of other sites")
 
     def _name(self) -> str | None:
         """Return under which name this server was asked: other names may be tricks of a page in a browser."""
-        try:
-            return urlsplit("//" + self.headers.get("Host", "localhost")).hostname
-        except ValueError:
-            return None
+        return _host_of("//" + self.headers.get("Host", "localhost"))
 
     def _document(self) -> Answer:
-        path = urlsplit(self.path).path.rstrip("/") or "/"
+        path = _split(self.path).path.rstrip("/") or "/"
         document = self.server.documents.get(path)
         if document is None:
             raise Refused(404, f"there is nothing at {path[:80]}; begin at /")
@@ -249,7 +262,7 @@ class _Handler(BaseHTTPRequestHandler):
 
     def _locate(self) -> Answer:
         came = time.time()
-        parts = urlsplit(self.path)
+        parts = _split(self.path)
         if parts.path not in ("/locate", "/processes/locate/execution"):
             if parts.path in self.server.documents:
                 raise Refused(405, "expected GET")
