@@ -9,6 +9,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from naive import paper as naive
 
+from roadgeo.errors import IndexFormatError
 from roadgeo.geometry.homography import Homography
 from roadgeo.kernels import pairs as kernels
 from roadgeo.matching.paper import homographies
@@ -507,6 +508,15 @@ def test_large_queries_form_tuples_of_a_sample(reference, index):
 def test_index_of_another_reference_is_misuse(reference, index):
     with pytest.raises(ValueError, match="rebuild"):
         match_pairs(reference, random_network(np.random.default_rng(0), n=5), index, FRAME)
+
+
+def test_a_map_that_is_forged_to_fill_the_memory_is_refused():
+    """All intersections of a city within a kilometre."""
+    forged = random_network(np.random.default_rng(3), n=400, side=900.0)
+    crowd = forged.only(np.arange(14_000) % 400)
+    shifted = replace(crowd, xy=crowd.xy + np.random.default_rng(4).normal(0, 20, (14_000, 2)))
+    with pytest.raises(IndexFormatError, match="the paper's method does not fit it"):
+        build_pair_index(shifted)
 
 
 def test_query_shrunk_onto_a_few_places_is_no_match():
