@@ -24,7 +24,16 @@ import atheris
 
 sys.path.insert(0, str(Path(__file__).parents[1]))
 
-with atheris.instrument_imports(include=["roadgeo"], exclude=["roadgeo.kernels"]):
+_ROOT = Path(__file__).parents[2]
+#: Folders that compute: kernels are compiled, and of arrays that are compared atheris keeps every one.
+_COMPUTING = [
+    ".".join(path.relative_to(_ROOT).with_suffix("").parts)
+    for folder in ("kernels", "geometry", "roads", "matching")
+    for path in (_ROOT / "roadgeo" / folder).rglob("*.py")
+]
+_INSTRUMENTED = {"include": ["roadgeo"], "exclude": [*_COMPUTING, "roadgeo.sources.thresholds"]}
+
+with atheris.instrument_imports(**_INSTRUMENTED):
     from support.readers import CORPUS, READERS, drivers_registered_once, feed, seeds
 
 _SECONDS, _BYTES = 5, 1 << 30
@@ -134,7 +143,7 @@ def main() -> None:
     results = (given.folder / given.reader).resolve()
     with drivers_registered_once():
         one = feed(READERS[given.reader], folder)
-        with atheris.instrument_imports(include=["roadgeo"], exclude=["roadgeo.kernels"]):
+        with atheris.instrument_imports(**_INSTRUMENTED):
             for path in seeds(given.reader):  # what is compiled or imported at first use takes longer than 5 seconds
                 try:
                     one(path.read_bytes())
