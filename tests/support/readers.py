@@ -79,6 +79,11 @@ def with_checksums(content: bytes) -> bytes:
     return bytes(made)
 
 
+def read_pixels(path: Path) -> None:
+    """Read a mask, and leave out what is computed from its pixels alone, which `read_values` has done."""
+    read_mask(path, voids=False)
+
+
 def read_mask_beside(path: Path) -> None:
     read_mask(path.with_suffix("").with_suffix(""))
 
@@ -238,9 +243,9 @@ _SHAPES = ("roads.shp", "roads.shx", "roads.dbf")
 
 READERS = {
     "png": Reader(read_mask, "mask.png", packed=with_checksums),
-    "jpeg": Reader(read_mask, "mask.jpg"),
-    "tiff": Reader(read_mask, "mask.tif"),
-    "mask": Reader(read_mask, "mask.gif"),  # of the other formats
+    "jpeg": Reader(read_pixels, "mask.jpg"),
+    "tiff": Reader(read_pixels, "mask.tif"),
+    "mask": Reader(read_pixels, "mask.gif"),  # of the other formats
     "vrt": Reader(refuse_mask, "mask.vrt"),
     "sidecar": Reader(read_mask_beside, "mask.png.aux.xml", ("mask.png",)),
     "values": Reader(read_values, "values.bin"),
