@@ -85,7 +85,7 @@ class Judge:
             self._watch.on = False
             self._keep(content, error)
         if self.count % 100 == 0:
-            self._counter.write_text(str(self.count))
+            self._write_down()
         if self.count >= self._most:
             self.end()
 
@@ -106,9 +106,14 @@ class Judge:
             (self._findings / name).write_bytes(content)
             (self._findings / f"{name}.txt").write_text(told)
 
+    def _write_down(self) -> None:
+        written = self._counter.with_suffix(".new")
+        written.write_text(str(self.count))
+        written.replace(self._counter)
+
     def end(self) -> None:
         """Write down what was counted, and leave at once: libFuzzer does not come back."""
-        self._counter.write_text(str(self.count))
+        self._write_down()
         found = sorted(path.name for path in self._findings.glob("*.txt"))
         print(f"{self.count} files, findings: {', '.join(found) or 'none'}", flush=True)
         os._exit(int(any(self._findings.iterdir())))
