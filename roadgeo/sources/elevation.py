@@ -32,6 +32,8 @@ def ground_heights(dem: str | os.PathLike[str], xy: FloatArray, crs: str) -> Flo
             raise CrsError(
                 f"{os.fspath(dem)}: has no georeference; expected a terrain model such as a GeoTIFF with a CRS"
             )
+        if not abs(raster.transform.determinant) > 0.0:
+            raise CrsError(f"{os.fspath(dem)}: its pixels cover no ground; georeference it again")
         if raster.dtypes[0].startswith("complex"):
             raise MaskError(f"{os.fspath(dem)}: holds complex values; expected heights in metres")
         own = crs_name(raster.crs.to_wkt())

@@ -279,7 +279,7 @@ def _read_graphml(path: Path) -> RoadLines:
     try:
         graph = ox.load_graphml(path)
         edges = ox.graph_to_gdfs(graph, nodes=False, fill_edge_geometry=True)
-    except (ET.ParseError, nx.NetworkXError, KeyError, ValueError, AttributeError) as error:
+    except (ET.ParseError, nx.NetworkXError, KeyError, ValueError, TypeError, AttributeError) as error:
         raise RoadSourceError(f"{path}: not a street network saved by osmnx: {first_line(error)}") from error
     columns = {name: edges[name].to_numpy(object) for name in edges.columns if name in COLUMNS}
     meta = {"format": "GraphML", "attribution": OSM_ATTRIBUTION}
