@@ -297,10 +297,9 @@ def _read_parquet(path: Path) -> RoadLines:
         require_rows(path)
         wanted = [name for name in (*COLUMNS, "subtype") if name in names]
         geometry = geometry_columns(path)
-        frame = gpd.read_parquet(path, columns=geometry[:1] + wanted)
-    except (ValueError, pa.ArrowException, OSError) as error:
+        return from_frame(gpd.read_parquet(path, columns=geometry[:1] + wanted), wanted)
+    except (ValueError, pa.ArrowException, OSError) as error:  # of its text, only when that is looked at
         raise RoadSourceError(f"{path}: not readable as GeoParquet: {first_line(error)}") from error
-    return from_frame(frame, wanted)
 
 
 def from_frame(frame: Any, wanted: Sequence[str]) -> RoadLines:
