@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from contextlib import suppress
 from pathlib import Path
 
 import click
@@ -28,7 +29,7 @@ def read_truths(given: str | None, *, explain: bool) -> tuple[tuple[str, float, 
         return ()
     if not explain:
         raise click.UsageError("--truth says nothing without --explain: add it.")
-    if Path(given).is_file():
+    if _is_file(given):
         return _from_table(Path(given))
     try:
         lon, lat = (float(value) for value in given.split(","))
@@ -37,6 +38,12 @@ def read_truths(given: str | None, *, explain: bool) -> tuple[tuple[str, float, 
     if not (abs(lon) <= 180.0 and abs(lat) <= 90.0):
         raise click.UsageError(f"--truth {given!r}: expected LON,LAT in degrees, or a table such as truth.csv.")
     return (("", lon, lat),)
+
+
+def _is_file(given: str) -> bool:
+    with suppress(OSError, ValueError):  # too long for a name, or none
+        return Path(given).is_file()
+    return False
 
 
 def _from_table(path: Path) -> tuple[tuple[str, float, float], ...]:

@@ -82,7 +82,7 @@ class Found:
     fits : tuple of Fit
         The best place, the best other one, and of the rest the one that agrees best, as far as there are any.
     stopped : str
-        As in `SearchResult`; "" where nothing was searched, or by the paper's method.
+        As in `SearchResult`; "" where nothing was searched.
     said : str
         What the method itself says of the result.
     n_searched : int
@@ -123,7 +123,7 @@ def search_references(
     if len(query.scene.intersections) < options.min_intersections:
         return [Found(index) for index in indexes]
     if options.method == "pair":
-        return _search_pairs_in_turn(query, indexes, options.pair, min(time_limit_s, options.pair.time_limit_s))
+        return _search_pairs_in_turn(query, indexes, _within(options, time_limit_s))
     started, ledger = time.perf_counter(), Ledger()
     opened = [_Attempt.open(query, one, options, trace, ledger) for one, trace in zip(indexes, traces, strict=True)]
     ledger.n_reference = sum(one.n_searched for one in opened if one.search is not None)
@@ -302,28 +302,39 @@ def _part(index: ReferenceIndex, center: tuple[float, float], radius_m: float) -
 # --- the paper's method -----------------------------------------------------------------------------------------------
 
 
-def _search_pairs_in_turn(
-    query: Query, indexes: Sequence[ReferenceIndex], options: PairOptions, time_limit_s: float
-) -> list[Found]:
-    """Search one reference after another; each gets an even share of the time that is left."""
+def _within(options: LocateOptions, time_limit_s: float) -> PairOptions:
+    """Return the options of the paper's method, within the limits of the whole search."""
+    pair = options.pair
+    return replace(
+        pair,
+        work_limit_s=min(pair.work_limit_s, options.search.work_limit_s),
+        time_limit_s=min(pair.time_limit_s, time_limit_s),
+    )
+
+
+def _search_pairs_in_turn(query: Query, indexes: Sequence[ReferenceIndex], options: PairOptions) -> list[Found]:
+    """Search one reference after another; each gets an even share of the work and the time that are left."""
     found: list[Found] = []
-    for index in indexes:
-        left = max(time_limit_s - sum(one.match_s for one in found), 0.0)
-        found.append(_search_pairs(query, index, options, left / (len(indexes) - len(found))))
+    work_s, time_s = options.work_limit_s, options.time_limit_s
+    for n_left in range(len(indexes), 0, -1):
+        share = replace(options, work_limit_s=work_s / n_left, time_limit_s=time_s / n_left)
+        one = _search_pairs(query, indexes[-n_left], options, share)
+        work_s, time_s = max(work_s - one.stats.work_ms / 1000, 0.0), max(time_s - one.match_s, 0.0)
+        found.append(one)
     return found
 
 
-def _search_pairs(query: Query, index: ReferenceIndex, options: PairOptions, time_limit_s: float) -> Found:
-    """Run the paper's method: what it finds has no odds, for it knows none."""
+def _search_pairs(query: Query, index: ReferenceIndex, options: PairOptions, share: PairOptions) -> Found:
+    """Run the paper's method, within a share of its limits: what it finds has no odds, for it knows none."""
     scene = query.scene
     reference, table = _pair_index(index, options)
-    limited = replace(options, time_limit_s=time_limit_s)
-    match = match_pairs(scene.intersections, reference, table, scene.corners, limited)
+    match = match_pairs(scene.intersections, reference, table, scene.corners, share)
     found = Found(
         index,
+        stopped=match.stopped,
         said=match.reason,
         n_searched=len(index),
-        stats=Stats(match.n_samples, match.candidates, match.hypotheses, match.hypotheses),
+        stats=Stats(match.n_samples, match.candidates, match.hypotheses, match.hypotheses, round(1000 * match.work_s)),
         match_s=match.seconds,
     )
     if match.homography is None:

@@ -231,7 +231,7 @@ def _why_nothing(query: Query, found: Found, score: float, options: LocateOption
     if n < needed:
         return Reason.FEW_INTERSECTIONS, f"only {n} intersections are seen, at least {needed} are needed"
     if found.said:
-        return Reason.NOTHING_STANDS_OUT, found.said
+        return Reason.TIME_LIMIT if found.stopped in ("work", "time") else Reason.NOTHING_STANDS_OUT, found.said
     searched = searched_within(options)
     if options.near is not None and found.n_searched < needed:
         few = f"the map has {found.n_searched} intersections around the place given by near{searched}"

@@ -41,7 +41,7 @@ def read_location(path: str | os.PathLike[str]) -> Location:
     try:
         document = _read_document(Path(path))
         location = None if document.get("homography") is None else _from_document(document)
-    except (OSError, ValueError, KeyError, TypeError, AttributeError) as error:
+    except (OSError, ValueError, KeyError, TypeError, AttributeError, OverflowError, RecursionError) as error:
         raise MaskError(
             f"{name}: no location ({error}); give the *_location.json that `roadgeo locate` wrote"
         ) from error

@@ -32,9 +32,14 @@ def ground_heights(dem: str | os.PathLike[str], xy: FloatArray, crs: str) -> Flo
             raise CrsError(
                 f"{os.fspath(dem)}: has no georeference; expected a terrain model such as a GeoTIFF with a CRS"
             )
+        if not abs(raster.transform.determinant) > 0.0:
+            raise CrsError(f"{os.fspath(dem)}: its pixels cover no ground; georeference it again")
         if raster.dtypes[0].startswith("complex"):
             raise MaskError(f"{os.fspath(dem)}: holds complex values; expected heights in metres")
-        there = np.stack(transformer(crs, crs_name(raster.crs.to_wkt())).transform(*np.asarray(xy, float).T), axis=1)
+        own = crs_name(raster.crs.to_wkt())
+        if own is None:
+            raise CrsError(f"{os.fspath(dem)}: its CRS is none of places on Earth; assign the right one")
+        there = np.stack(transformer(crs, own).transform(*np.asarray(xy, float).T), axis=1)
         inside = np.isfinite(there).all(axis=1)
         values = np.full(len(there), np.nan)
         for i in np.flatnonzero(inside):

@@ -190,7 +190,7 @@ def stream_osm(
             if len(ways) == most:
                 yield _from_ways(ways, broken, timestamp)
                 ways, broken = [], 0
-    except (RuntimeError, OSError, ValueError) as error:
+    except (RuntimeError, OSError, ValueError, osmium.InvalidLocationError) as error:
         raise RoadSourceError(f"{path}: not readable as OpenStreetMap data: {first_line(error)}") from error
     yield _from_ways(ways, broken, timestamp)
 
@@ -279,7 +279,7 @@ def _read_graphml(path: Path) -> RoadLines:
     try:
         graph = ox.load_graphml(path)
         edges = ox.graph_to_gdfs(graph, nodes=False, fill_edge_geometry=True)
-    except (ET.ParseError, nx.NetworkXError, KeyError, ValueError, AttributeError) as error:
+    except (ET.ParseError, nx.NetworkXError, KeyError, ValueError, TypeError, AttributeError) as error:
         raise RoadSourceError(f"{path}: not a street network saved by osmnx: {first_line(error)}") from error
     columns = {name: edges[name].to_numpy(object) for name in edges.columns if name in COLUMNS}
     meta = {"format": "GraphML", "attribution": OSM_ATTRIBUTION}
@@ -297,10 +297,9 @@ def _read_parquet(path: Path) -> RoadLines:
         require_rows(path)
         wanted = [name for name in (*COLUMNS, "subtype") if name in names]
         geometry = geometry_columns(path)
-        frame = gpd.read_parquet(path, columns=geometry[:1] + wanted)
-    except (ValueError, pa.ArrowException, OSError) as error:
+        return from_frame(gpd.read_parquet(path, columns=geometry[:1] + wanted), wanted)
+    except (ValueError, pa.ArrowException, OSError) as error:  # of its text, only when that is looked at
         raise RoadSourceError(f"{path}: not readable as GeoParquet: {first_line(error)}") from error
-    return from_frame(frame, wanted)
 
 
 def from_frame(frame: Any, wanted: Sequence[str]) -> RoadLines:

@@ -287,7 +287,8 @@ def _asking(options: FetchOptions, query: str, say: Say, n_parts: int = 1) -> It
             raise RoadSourceError(f"{host} did not answer within {options.timeout_s:g} s; try again later") from error
         except requests.exceptions.RequestException as error:
             raise RoadSourceError(f"{host} cannot be reached or broke off; is there a network connection?") from error
-        except (ValueError, KeyError) as error:
+        except (ValueError, LookupError, TypeError, AttributeError, ArithmeticError, RecursionError) as error:
+            # JSON of any shape: what it makes osmnx raise is osmnx's to know.
             shutil.rmtree(folder, ignore_errors=True)
             raise RoadSourceError(f"{host} gave an answer that makes no sense: {first_line(error)}") from error
         finally:

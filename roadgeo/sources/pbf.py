@@ -10,6 +10,7 @@ __all__ = ["osm_parts"]
 
 #: PBF files are read in parts of about this size; what may stand in them at most, as their specification says.
 _PART, _MAX_BLOB, _MAX_BLOB_HEADER = 1 << 20, 32 << 20, 64 << 10
+_NUMBER_BITS = 70
 
 
 def osm_parts(path: Path) -> Iterator[tuple[Any, float]]:
@@ -61,7 +62,7 @@ def _blob_size(header: bytes) -> int:
             byte = header[at]
             value |= (byte & 127) << shift
             at, shift = at + 1, shift + 7
-            if byte < 128:
+            if byte < 128 or shift == _NUMBER_BITS:
                 break
         return value
 

@@ -11,6 +11,7 @@ import mmap
 import os
 import re
 import sqlite3
+import tempfile
 import threading
 import warnings
 from collections.abc import Iterator, Sequence
@@ -68,8 +69,8 @@ def list_layers(path: Path) -> list[tuple[str, str]]:
     """
     import pyogrio
 
-    with _guarded(path):
-        return [(str(name), str(kind)) for name, kind in pyogrio.list_layers(path)]
+    with _guarded(path) as file:
+        return [(str(name), str(kind)) for name, kind in pyogrio.list_layers(file)]
 
 
 def count_features(path: Path, layer: str) -> int:
@@ -82,8 +83,8 @@ def count_features(path: Path, layer: str) -> int:
     """
     import pyogrio
 
-    with _guarded(path):
-        return int(pyogrio.read_info(path, layer=layer, force_feature_count=True)["features"])
+    with _guarded(path) as file:
+        return int(pyogrio.read_info(file, layer=layer, force_feature_count=True)["features"])
 
 
 def read_layer(
@@ -100,13 +101,13 @@ def read_layer(
     """
     import pyogrio
 
-    with _guarded(path):
-        layer = layer or str(pyogrio.list_layers(path)[0][0])
+    with _guarded(path) as file:
+        layer = layer or str(pyogrio.list_layers(file)[0][0])
         _require_stored(path, layer)
-        info = pyogrio.read_info(path, layer=layer)
+        info = pyogrio.read_info(file, layer=layer)
         wanted = [name for name in info["fields"] if name.lower() in columns]
         part = {"skip_features": skip, "max_features": most}
-        meta, _, shapes, values = pyogrio.raw.read(path, layer=layer, columns=wanted, force_2d=True, **part)
+        meta, _, shapes, values = pyogrio.raw.read(file, layer=layer, columns=wanted, force_2d=True, **part)
     named = {name.lower(): column for name, column in zip(meta["fields"], values, strict=True)}
     return VectorLayer(shapes, named, meta["crs"], info["driver"])
 
@@ -120,23 +121,41 @@ def require_file(path: Path) -> None:
 
 
 @contextmanager
-def _guarded(path: Path) -> Iterator[None]:
-    """Check what can be checked without GDAL, then read with as little of it as is needed."""
+def _guarded(path: Path) -> Iterator[Path]:
+    """Check what can be checked without GDAL, then read with as little of it as is needed; yield what to open."""
     from pyogrio.errors import CRSError, DataLayerError, DataSourceError
 
     require_file(path)
     _refuse_links(path)
     _require_stored(path)
     try:
-        with _few_drivers(), _offline(), warnings.catch_warnings():
+        with _few_drivers(), _offline(), _aside(path) as file, warnings.catch_warnings():
             warnings.simplefilter("ignore")
-            yield
+            yield file
     except CRSError as error:
         raise RoadSourceError(f"{path}: names a CRS that is none: {first_line(error)}") from error
     except (DataSourceError, DataLayerError, UnicodeDecodeError) as error:
         told = "of a format that is not read here" if "not recognized" in str(error) else first_line(error)
         hint = f"; save it as GeoPackage, or allow GDAL's driver with {CONSENT}" if told.startswith("of") else ""
         raise RoadSourceError(f"{path}: not readable as a map of roads: {told}{hint}") from error
+
+
+@contextmanager
+def _aside(path: Path) -> Iterator[Path]:
+    """Yield a link to an XML file in a passing folder: GDAL writes down beside a GML file what it found in it."""
+    if not path.is_file() or _head(path)[:1] != b"<":
+        yield path
+        return
+    with tempfile.TemporaryDirectory(prefix="roadgeo-") as folder:
+        link = Path(folder) / path.name
+        link.symlink_to(path.absolute())
+        yield link
+
+
+def _head(path: Path) -> bytes:
+    """Return how a file begins, less a byte order mark and blanks."""
+    with path.open("rb") as file:
+        return file.read(512).lstrip(b"\xef\xbb\xbf \t\r\n")
 
 
 @contextmanager
@@ -176,11 +195,9 @@ def _offline() -> Iterator[None]:
 
 def _refuse_links(path: Path) -> None:
     """Refuse a GeoJSON whose CRS is said elsewhere: its coordinates would be taken for degrees."""
-    if not path.is_file() or path.stat().st_size == 0:
+    if not path.is_file() or _head(path)[:1] not in (b"{", b"["):
         return
     with path.open("rb") as file, mmap.mmap(file.fileno(), 0, access=mmap.ACCESS_READ) as content:
-        if content[:512].lstrip(b"\xef\xbb\xbf \t\r\n")[:1] not in (b"{", b"["):
-            return
         at = content.find(b'"crs"')
         while at >= 0:
             if _LINK.match(content[at : at + 4096]):

@@ -45,6 +45,7 @@ _MAX_BLOCK_BYTES = 2 << 30
 _MAX_SIDECAR = 1 << 20
 _CACHE_BYTES = 256 << 20  # of decoded blocks; GDAL's own is a twentieth of the machine's memory
 _HEAD_BYTES = 8192
+_BOXES_OF_BOXES = (b"jp2h", b"res ", b"asoc", b"jpch", b"jplh")  # of JPEG 2000
 
 
 @contextmanager
@@ -80,6 +81,8 @@ def open_raster(
         drivers = allowed_drivers() + [driver for _, driver in _DRIVERS[:-1]]
     else:
         drivers = _drivers(Path(path), name, allowed_drivers() + ["VRT"] * is_ours)
+    if not remote and drivers == ["JP2OpenJPEG"]:
+        _require_boxes(Path(path), name)
     with warnings.catch_warnings():
         warnings.simplefilter("ignore", NotGeoreferencedWarning)
         try:
@@ -191,6 +194,30 @@ def _drivers(path: Path, name: str, more: list[str]) -> list[str]:
             f"or name GDAL's driver for it, if you trust the file: {CONSENT}=netCDF"
         )
     return [driver] if driver else more
+
+
+def _require_boxes(path: Path, name: str) -> None:
+    """Refuse a JPEG 2000 whose boxes do not lie within each other: one in a header without an end, GDAL reads forever.
+
+    ISO/IEC 15444-1, I.4: four bytes of size, four of kind; size 1 means that eight more bytes tell it, 0 that the box
+    reaches to the end of the file, which only the last may.
+    """
+    with path.open("rb") as file:
+        if file.read(8)[4:] != b"jP  ":
+            return
+        within = [(0, path.stat().st_size)]
+        while within:
+            at, end = within.pop()
+            while at + 8 <= end:
+                file.seek(at)
+                size, kind, large = struct.unpack(">I4sQ", file.read(16).ljust(16, b"\0"))
+                size, head = (large, 16) if size == 1 else (size, 8)
+                if size == 0 and end == path.stat().st_size and kind not in _BOXES_OF_BOXES:
+                    break
+                if not head <= size <= end - at:
+                    raise MaskError(f"{name}: a JPEG 2000 that is damaged or cut short; copy or export it again")
+                within += [(at + head, at + size)] * (kind in _BOXES_OF_BOXES)
+                at += size
 
 
 @contextmanager

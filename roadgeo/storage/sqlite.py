@@ -25,8 +25,11 @@ def opened(path: Path) -> Iterator[sqlite3.Connection]:
     # the latest state lies in the journal beside it, which an immutable file would not have.
     state = "" if path.with_name(f"{path.name}-wal").exists() else "&immutable=1"
     with closing(sqlite3.connect(f"{path.absolute().as_uri()}?mode=ro{state}", uri=True)) as database:
-        _guard(database, path)
-        yield database
+        try:
+            _guard(database, path)
+            yield database
+        except UnicodeDecodeError as error:  # of a message that quotes the file
+            raise sqlite3.DatabaseError("its schema is no text") from error
 
 
 def _guard(database: sqlite3.Connection, path: Path) -> None:

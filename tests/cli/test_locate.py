@@ -4,8 +4,10 @@ import json
 import os
 import re
 import shutil
+import signal
 import subprocess
 import sys
+import time
 from pathlib import Path
 
 import click
@@ -135,6 +137,28 @@ def test_what_was_cut_short_goes_on_where_it_was(
     os.utime("drone.png", (2e9, 2e9))  # the mask was made anew
     assert main([*locate, "--skip-existing"]) == 3
     assert json.loads(capfd.readouterr().out.splitlines()[0])["reason"] != "found before"
+
+
+def test_a_batch_that_was_killed_goes_on_where_it_was(porto: Path, capfd: pytest.CaptureFixture[str]) -> None:
+    """What was written is whole, and what was not is done."""
+    names = [f"drone_{n}" for n in range(6)]
+    for name in names:
+        shutil.copy(MASKS["drone"].path, f"{name}.png")
+    given = [*(f"{name}.png" for name in names), "-r", str(porto), "-o", "out", "--json", "-q", "--effort", "quick"]
+    batch = subprocess.Popen([sys.executable, "-m", "roadgeo", "locate", *given], stdout=subprocess.DEVNULL)
+    while not Path("out/drone_1_location.json").exists():
+        assert batch.poll() is None
+        time.sleep(0.001)
+    batch.kill()
+    assert batch.wait() == -signal.SIGKILL
+    written = {path: path.stat().st_mtime_ns for path in Path("out").glob("*_location.json")}
+    assert 2 <= len(written) < 6
+    assert main(["locate", *given, "--skip-existing"]) == 0
+    assert len(capfd.readouterr().out.splitlines()) == 6
+    found = [json.loads(Path(f"out/{name}_location.json").read_text()) for name in names]
+    assert [one["homography"] for one in found] == [found[0]["homography"]] * 6
+    assert all(path.stat().st_mtime_ns == at for path, at in written.items() if "drone_0" in path.name)
+    assert {path.name for path in Path("out").iterdir() if path.name.startswith((".", "tmp"))} == set()
 
 
 def test_the_photograph_is_drawn_in_the_crs_asked_for(

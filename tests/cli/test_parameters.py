@@ -1,11 +1,15 @@
 """What is typed becomes what is meant, or one line says what was expected."""
 
+import math
+
 import click
 import pytest
 from click.shell_completion import ShellComplete
+from hypothesis import given
+from hypothesis import strategies as st
 
 from roadgeo.cli import cli
-from roadgeo.cli.parameters import Aspect, Focal, Plugin
+from roadgeo.cli.parameters import ASPECT, BOX, CAMERA, NEAR, RANGE, Aspect, Focal, Numbers, Plugin
 
 
 def offered(*typed: str, incomplete: str) -> list[str]:
@@ -38,3 +42,30 @@ def test_names_of_plugins_are_offered() -> None:
 def test_commands_are_offered() -> None:
     assert offered(incomplete="ver") == ["verify"]
     assert "vectorize" in offered(incomplete="ve")
+
+
+TEXTS = st.text(max_size=40) | st.lists(st.floats().map(str) | st.integers().map(str), min_size=1, max_size=5).map(
+    ",".join
+)
+
+
+@pytest.mark.parametrize("kind", [BOX, NEAR, RANGE], ids=lambda kind: kind.name)
+@given(text=TEXTS)
+def test_any_text_is_finite_numbers_or_refused(kind: Numbers, text: str) -> None:
+    text = text.replace(",", kind.separator)
+    try:
+        found = kind.convert(text, None, None)
+    except click.BadParameter:
+        return
+    assert len(found) == len(kind.names)
+    assert all(map(math.isfinite, found))
+
+
+@given(TEXTS)
+def test_any_text_is_a_length_a_ratio_or_refused(text: str) -> None:
+    for kind in (CAMERA, ASPECT):
+        try:
+            found = kind.convert(text, None, None)
+        except click.BadParameter:
+            continue
+        assert found in ("exif", "unknown") or 0 < float(found) < math.inf

@@ -9,6 +9,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from naive import paper as naive
 
+from roadgeo.errors import IndexFormatError
 from roadgeo.geometry.homography import Homography
 from roadgeo.kernels import pairs as kernels
 from roadgeo.matching.paper import homographies
@@ -470,14 +471,29 @@ def test_few_intersections_are_not_searched(reference, index):
     assert match.confidence == 0.0
 
 
-def test_time_limit_stops_the_search(reference, index):
+@pytest.mark.parametrize("limit", ["work", "time"])
+def test_limits_stop_the_search(reference, index, limit):
     rng = np.random.default_rng(13)
     query, _ = view(reference, camera(rng, (2000, 2000), gsd=2.0), rng)
-    match = match_pairs(query, reference, index, FRAME, PairOptions(time_limit_s=0.0))
+    match = match_pairs(query, reference, index, FRAME, replace(PairOptions(), **{f"{limit}_limit_s": 0.0}))
     assert match.homography is None
-    assert match.n_samples == 1
-    assert match.hypotheses == 0
-    assert match.reason.startswith("stopped after 0 s")
+    assert (match.n_samples, match.hypotheses) == (1, 0)
+    assert match.stopped == limit
+    assert match.reason.startswith("stopped a")
+
+
+def test_the_answer_does_not_depend_on_the_load(reference, index, monkeypatch):
+    """However slowly the machine gets on: the limit is work, which is counted."""
+    rng = np.random.default_rng(10)
+    query, _ = view(random_network(rng), camera(rng, (2000, 2000), gsd=2.0), rng)
+    options = PairOptions(work_limit_s=0.05, time_limit_s=math.inf)
+    once = match_pairs(query, reference, index, FRAME, options)
+    seconds = iter(range(0, 10**9, 30))
+    monkeypatch.setattr(paper_search.time, "perf_counter", lambda: next(seconds))
+    again = match_pairs(query, reference, index, FRAME, options)
+    assert once.stopped == "work"
+    assert 0.05 <= once.work_s < 0.1
+    assert replace(again, matches=None, seconds=0.0) == replace(once, matches=None, seconds=0.0)
 
 
 def test_large_queries_form_tuples_of_a_sample(reference, index):
@@ -492,6 +508,15 @@ def test_large_queries_form_tuples_of_a_sample(reference, index):
 def test_index_of_another_reference_is_misuse(reference, index):
     with pytest.raises(ValueError, match="rebuild"):
         match_pairs(reference, random_network(np.random.default_rng(0), n=5), index, FRAME)
+
+
+def test_a_map_that_is_forged_to_fill_the_memory_is_refused():
+    """All intersections of a city within a kilometre."""
+    forged = random_network(np.random.default_rng(3), n=400, side=900.0)
+    crowd = forged.only(np.arange(14_000) % 400)
+    shifted = replace(crowd, xy=crowd.xy + np.random.default_rng(4).normal(0, 20, (14_000, 2)))
+    with pytest.raises(IndexFormatError, match="the paper's method does not fit it"):
+        build_pair_index(shifted)
 
 
 def test_query_shrunk_onto_a_few_places_is_no_match():

@@ -1,35 +1,113 @@
-"""The readers of files that may come from strangers, each with the name that its file has when it is fuzzed.
+"""The readers of what may come from strangers, each with the name that its file has when it is fuzzed.
 
 `tests/support/fuzz_readers.py` feeds them mutants, `tests/test_corpus.py` replays what is kept in `tests/corpus`.
 """
 
 import contextlib
+import os
+import shutil
 import warnings
+import zlib
 from collections.abc import Callable, Iterator
-from contextlib import contextmanager
+from contextlib import ExitStack, contextmanager
+from itertools import islice
 from pathlib import Path
 from typing import NamedTuple
 
+import click
+import numpy as np
+import shapely
+
+from roadgeo.cli.parameters import ASPECT, BOX, CAMERA, NEAR, RANGE
+from roadgeo.cli.track import Moment
+from roadgeo.cli.truths import read_truths
 from roadgeo.errors import RoadgeoError
 from roadgeo.evaluation.truth import read_truth
+from roadgeo.geometry.projection import LocalPlane
 from roadgeo.reference.index_file import read_index
 from roadgeo.reference.network_file import read_network
+from roadgeo.reference.shards import describe_shards, open_shards
+from roadgeo.running.applying import apply_location, read_location
+from roadgeo.running.flights.frames import FrameOptions, _video
+from roadgeo.running.flights.motion import read_motion
+from roadgeo.running.serving.requests import Refused, ending_of, read_execution, read_query_string
 from roadgeo.sources import vectors
+from roadgeo.sources.elevation import ground_heights
 from roadgeo.sources.exif import estimate_gsd, read_focal_length
-from roadgeo.sources.lines import read_lines
+from roadgeo.sources.georeference import read_georeference, read_stated_middle
 from roadgeo.sources.masks import read_mask
+from roadgeo.sources.overpass import FetchOptions, fetch_lines, find_place
+from roadgeo.sources.roads import read_roads
 from roadgeo.sources.segmentation.card import read_card
 from roadgeo.sources.segmentation.onnx_file import read_onnx
+from roadgeo.sources.segmentation.photograph import find_ground, open_photograph
+from roadgeo.sources.streams import stream_lines
+from support.untrusted_web import answered, serve_request
 
 CORPUS = Path(__file__).parents[1] / "corpus"
+#: What may be raised: our own errors, and how the command line and the server say that something makes no sense.
+REFUSALS = (RoadgeoError, click.UsageError, Refused)
+
+
+def _as_it_is(content: bytes) -> bytes:
+    return content
 
 
 class Reader(NamedTuple):
-    """What reads the bytes, as a file of which name, beside which other files of `corpus/beside`."""
+    """What reads the bytes, as a file of which name, beside which other files of `corpus/beside`; see also `packed`."""
 
     read: Callable[[Path], object]
     name: str
     beside: tuple[str, ...] = ()
+    packed: Callable[[bytes], bytes] = _as_it_is
+
+
+# --- rasters ----------------------------------------------------------------------------------------------------------
+
+
+def with_checksums(content: bytes) -> bytes:
+    """Make the checksums of a PNG agree with its chunks: else mutants get no further than to the first of them."""
+    if not content.startswith(b"\x89PNG\r\n\x1a\n"):
+        return content
+    made, at = bytearray(content), 8
+    while at + 12 <= len(made):
+        end = at + 8 + int.from_bytes(made[at : at + 4], "big")
+        if end + 4 > len(made):
+            break
+        made[end : end + 4] = zlib.crc32(made[at + 4 : end]).to_bytes(4, "big")
+        at = end + 4
+    return bytes(made)
+
+
+def read_pixels(path: Path) -> None:
+    """Read a mask, and leave out what is computed from its pixels alone, which `read_values` has done."""
+    read_mask(path, voids=False)
+
+
+def read_mask_beside(path: Path) -> None:
+    read_mask(path.with_suffix("").with_suffix(""))
+
+
+def refuse_mask(path: Path) -> None:
+    """Read what names other files: it must not be read."""
+    if b"<VRTDataset" in path.read_bytes():
+        try:
+            read_mask(path)
+        except RoadgeoError:
+            return
+        raise AssertionError("a virtual raster was read")
+    read_mask(path)
+
+
+_TYPES = (np.uint8, np.uint16, np.int16, np.int32, np.float32, np.float64, np.bool_)
+
+
+def read_values(path: Path) -> None:
+    """Take bytes for the pixels of an array, after two that say which type and how many bands it has."""
+    content = path.read_bytes().ljust(10, b"\0")
+    kind, bands = _TYPES[content[0] % len(_TYPES)], 1 + content[1] % 4
+    values = np.frombuffer(content[2 : 2 + (len(content) - 2) // 8 * 8], kind)
+    read_mask(np.resize(values, (64, 64, bands)))
 
 
 def read_exif(path: Path) -> None:
@@ -37,60 +115,205 @@ def read_exif(path: Path) -> None:
     read_focal_length(path)
 
 
+def read_photograph(path: Path) -> None:
+    with open_photograph(path) as photograph:
+        find_ground(photograph, (64, 64))
+        photograph.read(0.0, 0.0, 60.0, 60.0, (40, 40))
+
+
+def read_place(path: Path) -> None:
+    """Read where a raster says that it lies, as all that uses it does."""
+    read_stated_middle(path)
+    found = read_georeference(path, "EPSG:32629")
+    if found is not None:
+        found.middle()
+        found.control_points()
+        plane = LocalPlane("EPSG:32629", (5e5, 4.5e6))
+        found.moved(found.on_plane(plane), plane)
+
+
+def read_world_file(path: Path) -> None:
+    read_place(path.with_name("mask.png"))
+
+
+def read_terrain(path: Path) -> None:
+    ground_heights(path, np.array([(500_100.0, 4_500_100.0), (0.0, 0.0)]), "EPSG:32629")
+
+
+def read_frames(path: Path) -> None:
+    """Take the first frames of a video."""
+    with ExitStack() as stack:
+        list(islice(_video(str(path), FrameOptions(), stack), 3))
+
+
+# --- documents --------------------------------------------------------------------------------------------------------
+
+
 def read_model(path: Path) -> None:
     read_card(read_onnx(path), path)
-
-
-def read_mask_beside(path: Path) -> None:
-    read_mask(path.with_suffix("").with_suffix(""))
 
 
 def read_model_beside(path: Path) -> None:
     read_model(path.with_suffix(".onnx"))
 
 
+def read_truth_beside(path: Path) -> None:
+    read_truth(path.with_name("local.csv"))
+
+
+def read_shards(path: Path) -> None:
+    open_shards(path)
+    describe_shards(path)
+
+
+def apply(path: Path) -> None:
+    """Read a location and, for one in fifty, put a picture there; what is written goes away again."""
+    location, out = read_location(path), path.with_name("out")
+    if zlib.crc32(path.read_bytes()) % 50:
+        return
+    out.mkdir()
+    try:
+        apply_location(location, [str(path.with_name("mask.png"))], out, products=("points", "geopose"), stretch=True)
+    finally:
+        shutil.rmtree(out, ignore_errors=True)
+
+
+_HINTS = {
+    b"N": NEAR.convert,
+    b"B": BOX.convert,
+    b"R": RANGE.convert,
+    b"C": CAMERA.convert,
+    b"A": ASPECT.convert,
+    b"M": Moment().convert,
+    b"T": lambda text, *_: read_truths(text, explain=True),
+}
+
+
+def read_hint(path: Path) -> None:
+    """Read what is typed behind an option, after a letter for which one."""
+    content = path.read_bytes()
+    if content[:1] in _HINTS:
+        _HINTS[content[:1]](os.fsdecode(content[1:]), None, None)
+
+
+def read_request(path: Path) -> None:
+    """Read the parts of a request to the server, as far as they are one."""
+    content = path.read_bytes()
+    for part in (read_execution, lambda body: read_query_string(body.decode("latin-1")), lambda body: ending_of(body)):
+        with contextlib.suppress(Refused):
+            part(content)
+
+
+def serve(path: Path) -> None:
+    answer = serve_request(path.read_bytes())
+    assert answer.startswith((b"HTTP/1.1 ", b"")), answer[:80]
+
+
+_OPTIONS = FetchOptions("http://127.0.0.1:9/api", "http://127.0.0.1:9", cache=False, retries=0)
+
+
+def read_overpass(path: Path) -> None:
+    with answered(path.read_bytes()):
+        fetch_lines(shapely.box(-8.61, 41.14, -8.60, 41.15), "drivable", False, _OPTIONS)
+
+
+def read_nominatim(path: Path) -> None:
+    with answered(path.read_bytes()):
+        find_place("Porto", _OPTIONS)
+
+
+# --- roads ------------------------------------------------------------------------------------------------------------
+
+
+def read_map(path: Path) -> None:
+    """Read roads onto a plane."""
+    read_roads(path, which="all", crs="EPSG:4326" if path.suffix == ".csv" else None)
+
+
+def read_in_parts(path: Path) -> None:
+    for _ in stream_lines(path, most=2):
+        pass
+
+
 def read_shapes(path: Path) -> None:
-    read_lines(path.with_suffix(".shp"))
+    read_roads(path.with_suffix(".shp"), crs="EPSG:32629")
 
 
 _SHAPES = ("roads.shp", "roads.shx", "roads.dbf")
 
 READERS = {
-    "mask": Reader(read_mask, "mask.png"),
+    "png": Reader(read_mask, "mask.png", packed=with_checksums),
+    "jpeg": Reader(read_pixels, "mask.jpg"),
+    "tiff": Reader(read_pixels, "mask.tif"),
+    "mask": Reader(read_pixels, "mask.gif"),  # of the other formats
+    "vrt": Reader(refuse_mask, "mask.vrt"),
     "sidecar": Reader(read_mask_beside, "mask.png.aux.xml", ("mask.png",)),
+    "values": Reader(read_values, "values.bin"),
     "exif": Reader(read_exif, "photo.jpg"),
+    "photograph": Reader(read_photograph, "photo.tif"),
+    "place": Reader(read_place, "photo.tif"),
+    "worldfile": Reader(read_world_file, "mask.pgw", ("mask.png",)),
+    "terrain": Reader(read_terrain, "dem.tif"),
+    "video": Reader(read_frames, "flight.avi"),
     "onnx": Reader(read_model, "model.onnx"),
     "stac": Reader(read_model_beside, "model.json", ("model.onnx",)),
     "index": Reader(read_index, "a.index"),
     "reference": Reader(read_network, "a.gpkg"),
+    "shards": Reader(read_shards, "manifest.json"),
     "truth": Reader(read_truth, "truth.csv"),
-    "geojson": Reader(read_lines, "roads.geojson"),
-    "osm": Reader(read_lines, "roads.osm"),
-    "pbf": Reader(read_lines, "roads.osm.pbf"),
-    "gpkg": Reader(read_lines, "roads.gpkg"),
-    "graphml": Reader(read_lines, "roads.graphml"),
-    "parquet": Reader(read_lines, "roads.parquet"),
+    "truth_crs": Reader(read_truth_beside, "meta.json", ("local.csv",)),
+    "location": Reader(apply, "mask_location.json", ("mask.png",)),
+    "motion": Reader(read_motion, "motion.csv"),
+    "hints": Reader(read_hint, "hint.txt"),
+    "request": Reader(read_request, "body.json"),
+    "http": Reader(serve, "request.txt"),
+    "overpass": Reader(read_overpass, "overpass.json"),
+    "nominatim": Reader(read_nominatim, "nominatim.json"),
+    "geojson": Reader(read_map, "roads.geojson"),
+    "parts": Reader(read_in_parts, "roads.geojson"),
+    "geojsonl": Reader(read_map, "roads.geojsonl"),
+    "csv": Reader(read_map, "roads.csv"),
+    "gml": Reader(read_map, "roads.gml"),
+    "kml": Reader(read_map, "roads.kml"),
+    "gpx": Reader(read_map, "roads.gpx"),
+    "mif": Reader(read_map, "roads.mif", ("roads.mid",)),
+    "flatgeobuf": Reader(read_map, "roads.fgb"),
+    "sqlite": Reader(read_map, "roads.sqlite"),
+    "osm": Reader(read_map, "roads.osm"),
+    "osm_parts": Reader(read_in_parts, "roads.osm.pbf"),
+    "osm_gz": Reader(read_map, "roads.osm.gz"),
+    "osm_bz2": Reader(read_map, "roads.osm.bz2"),
+    "pbf": Reader(read_map, "roads.osm.pbf"),
+    "gpkg": Reader(read_map, "roads.gpkg"),
+    "graphml": Reader(read_map, "roads.graphml"),
+    "parquet": Reader(read_map, "roads.parquet"),
     "shp": Reader(read_shapes, "roads.shp", _SHAPES),
     "shx": Reader(read_shapes, "roads.shx", _SHAPES),
     "dbf": Reader(read_shapes, "roads.dbf", _SHAPES),
 }
 
 
+def _names(folder: Path) -> set[str]:
+    return {path.name for path in folder.iterdir()}
+
+
 def feed(reader: Reader, folder: Path) -> Callable[[bytes], None]:
-    """Return what has bytes read as a file in a folder: they may be read, or refused in one line."""
+    """Return what has bytes read as a file in a folder: they may be read, or refused in one line; nothing is left."""
     for name in reader.beside:
         (folder / name).write_bytes((CORPUS / "beside" / name).read_bytes())
-    path = folder / reader.name
+    path, there = folder / reader.name, {reader.name, *reader.beside, *_names(folder)}
 
     def one(content: bytes) -> None:
-        path.write_bytes(content)
+        path.write_bytes(reader.packed(content))
         try:
             with warnings.catch_warnings():
                 warnings.simplefilter("ignore")
                 reader.read(path)
-        except RoadgeoError as error:
+        except REFUSALS as error:
             if "\n" in str(error):
                 raise AssertionError("more than a line") from error
+        left = _names(folder) - there
+        assert not left, f"left behind: {left}"
 
     return one
 

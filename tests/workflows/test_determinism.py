@@ -6,13 +6,20 @@ import subprocess
 import sys
 from pathlib import Path
 
+import cv2
 import pytest
 
-from roadgeo.evaluation.demo import ROADS, demo_masks
+from roadgeo.evaluation.demo import PHOTO, ROADS, demo_masks
 from roadgeo.workflows import build_reference
 
 MASKS = [one.path for one in demo_masks() if one.path.stem in ("drone", "elsewhere", "map_sheet")]
-CODE = "import sys; from roadgeo.cli import main; sys.exit(main(sys.argv[1:]) == 1)"
+#: The number of processors, for as many threads does the network take, and then a command.
+CODE = """
+import os, sys
+os.cpu_count = lambda: int(sys.argv[1])
+from roadgeo.cli import main
+sys.exit(main(sys.argv[2:]) == 1)
+"""
 
 
 @pytest.fixture(scope="module")
@@ -28,7 +35,11 @@ def answers(porto: Path, out: Path, masks: list[Path], *more: str, threads: int 
     environment = {**os.environ, **dict.fromkeys(names, str(threads)), "PYTHONHASHSEED": str(threads)}
     command = ["locate", *map(str, masks), "-r", str(porto), "-o", str(out), "--json", "-q", "--effort", "quick", *more]
     done = subprocess.run(
-        [sys.executable, "-c", CODE, *command], env=environment, capture_output=True, text=True, timeout=600
+        [sys.executable, "-c", CODE, str(threads), *command],
+        env=environment,
+        capture_output=True,
+        text=True,
+        timeout=600,
     )
     assert done.returncode == 0, done.stderr
     told = [json.loads(line) for line in done.stdout.splitlines()]
@@ -42,3 +53,18 @@ def test_order_processes_and_threads_change_nothing(porto: Path, tmp_path: Path)
     once = answers(porto, tmp_path / "a", MASKS)
     assert {one["status"] for one in once.values()} == {"located", "not_located"}
     assert answers(porto, tmp_path / "b", MASKS[::-1], "--jobs", "3", threads=4) == once
+
+
+def test_photographs_too(porto: Path, tmp_path: Path) -> None:
+    """One is met twice, and onnxruntime has one thread or three."""
+    whole = cv2.imread(str(PHOTO))
+    photos = [tmp_path / name for name in ("left.png", "right.png", "left_again.png")]
+    for path, part in zip(photos, (whole[:512, :640], whole[-512:, -640:], whole[:512, :640]), strict=True):
+        cv2.imwrite(str(path), part)
+    hints = ("--gsd", "0.9:1.1")
+    once = answers(porto, tmp_path / "a", photos, *hints)
+    left, right, again = (once[str(path)] for path in photos)
+    assert left == {**again, "query": left["query"]} != {**right, "query": left["query"]}
+    assert left["n_intersections"] > 10
+    assert answers(porto, tmp_path / "b", photos[::-1], *hints, threads=3) == once
+    assert answers(porto, tmp_path / "c", photos, *hints, "--jobs", "2") == once

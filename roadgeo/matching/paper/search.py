@@ -39,11 +39,12 @@ from roadgeo.matching.paper.tuples import (
     type_keys,
     type_table,
 )
+from roadgeo.matching.work import PairWork
 from roadgeo.roads.intersections import Intersections
 
 __all__ = ["PairMatch", "match_pairs", "query_draws", "reference_draws"]
 
-#: Intersections tested in one kernel call, about a tenth of a second: the grain of the time limit.
+#: Intersections tested in one kernel call, about a tenth of a second: the grain of the limits.
 _TESTS_PER_CALL = 5_000_000
 
 
@@ -70,6 +71,10 @@ class PairMatch:
     confidence : float
         Probability that the search, as far as it got, finds a place that is there: 1 - P_fail-sum (eq. 12).
     reason : str
+    stopped : str
+        What ended the search: "accepted", "exhausted", or a limit, "work" or "time"; "" where there was none.
+    work_s : float
+        What was done, in seconds of a usual machine (see `work.PairWork`).
     seconds : float
     """
 
@@ -82,6 +87,8 @@ class PairMatch:
     hypotheses: int
     confidence: float
     reason: str
+    stopped: str
+    work_s: float
     seconds: float
 
 
@@ -138,14 +145,12 @@ def match_pairs(
         search.test(a, b, t)
         if search.is_located:
             return search.located()
-        if search.is_late:
-            return search.not_located(
-                f"stopped after {options.time_limit_s:.3g} s and {search.n_samples} query tuples (confidence "
-                f"{search.confidence:.3g}): none matched more than {options.delta_inlier:.0%} of the intersections"
-            )
+        if search.spent:
+            return search.cut_short(search.spent)
     return search.not_located(
         f"no such place (confidence {search.confidence:.3g}): none matched more than {options.delta_inlier:.0%} of the "
-        f"intersections in {search.n_samples} query tuples and {search.hypotheses} hypotheses"
+        f"intersections in {search.n_samples} query tuples and {search.hypotheses} hypotheses",
+        "exhausted",
     )
 
 
@@ -201,12 +206,19 @@ class _Search:
         self.judges = np.argsort(frequency[self.codes], kind="stable")
         self.best = math.floor(options.delta_inlier * len(query))
         self.homography: FloatArray | None = None
-        self.n_samples = self.n_sum = self.candidates = self.hypotheses = 0
+        self.n_samples = self.n_sum = self.candidates = self.tested = self.hypotheses = 0
         self.log_p_fail = 0.0
 
     @property
-    def is_late(self) -> bool:
-        return time.perf_counter() - self.begin > self.options.time_limit_s
+    def work_s(self) -> float:
+        return PairWork(self.n_samples, self.tested, self.hypotheses, len(self.query)).seconds
+
+    @property
+    def spent(self) -> str:
+        """Say which limit is reached: "work", "time", or "" for neither."""
+        if self.work_s >= self.options.work_limit_s:
+            return "work"
+        return "time" if time.perf_counter() - self.begin > self.options.time_limit_s else ""
 
     @property
     def is_located(self) -> bool:
@@ -217,7 +229,7 @@ class _Search:
         return -math.expm1(self.log_p_fail)
 
     def test(self, a: int, b: int, t: int) -> None:
-        """Draw candidates for the query tuple (a, b) of type `t` and test them, until the time is up."""
+        """Draw candidates for the query tuple (a, b) of type `t` and test them, within the limits."""
         correspondences = _correspondences(self.query, a, b, t, self.index, self.options)
         n_match = sum(c.n_match for c in correspondences)
         k = reference_draws(n_match, self.options.lambda_1)
@@ -233,7 +245,7 @@ class _Search:
         self.log_p_fail += math.log1p(-p_query * (1.0 - p_fail_reference))
 
     def _test_correspondence(self, correspondence: _Correspondence, t: int, n_draws: int) -> int:
-        """Test `n_draws` candidates in random order; return how many the time allowed."""
+        """Test `n_draws` candidates in random order; return how many the limits allowed."""
         if n_draws == 0:
             return 0
         first, second = self.query.xy[list(correspondence.ends)]
@@ -243,10 +255,10 @@ class _Search:
         start, stride = _permutation(correspondence.n_match, self.rng)
         stamps = np.full(len(self.index.codes) if self.options.one_to_one else 0, -1, np.int64)
         model = np.empty(8)
-        # The kernel comes back now and then, for a look at the clock.
+        # The kernel comes back now and then, for a look at the limits.
         per_call = max(1, _TESTS_PER_CALL // len(uv))
         done = 0
-        while done < n_draws and not self.is_late:
+        while done < n_draws and not self.spent:
             until = min(done + per_call, n_draws)
             best, n_models = kernels.evaluate_pairs(
                 query,
@@ -266,6 +278,7 @@ class _Search:
                 self.best = best
                 self.homography = pair_homography(model, first, second)
             self.hypotheses += n_models
+            self.tested += until - done
             done = until
         return done
 
@@ -293,7 +306,7 @@ class _Search:
         )
         facing = Homography(homography).facing(self.frame.mean(axis=0)).matrix
         facing = facing / (facing[2] @ [*self.frame.mean(axis=0), 1.0])
-        return self._report(facing, matches, ratio, reason)
+        return self._report(facing, matches, ratio, reason, "accepted")
 
     def _refine(self, homography: FloatArray) -> tuple[FloatArray, IntArray]:
         """Alternate between the gold-standard fit and matching, as long as that matches more."""
@@ -314,11 +327,25 @@ class _Search:
         w = self.frame @ homography[2, :2] + homography[2, 2]
         return self.options.tangent_orders == "all" or bool(np.all(w * w[0] > 0))
 
-    def not_located(self, reason: str) -> PairMatch:
-        """Report that no place was found."""
-        return self._report(None, np.empty((0, 2), np.int64), 0.0, reason)
+    def cut_short(self, limit: str) -> PairMatch:
+        """Report that no place was found before a limit was reached."""
+        options = self.options
+        ended = "after as much work as a search may take"
+        if limit == "time":
+            ended = f"at the time limit of {options.time_limit_s:g} s, so that a machine with less to do may find more"
+        return self.not_located(
+            f"stopped {ended}; {self.n_samples} query tuples (confidence {self.confidence:.3g}): none matched more "
+            f"than {options.delta_inlier:.0%} of the intersections",
+            limit,
+        )
 
-    def _report(self, homography: FloatArray | None, matches: IntArray, ratio: float, reason: str) -> PairMatch:
+    def not_located(self, reason: str, stopped: str = "") -> PairMatch:
+        """Report that no place was found."""
+        return self._report(None, np.empty((0, 2), np.int64), 0.0, reason, stopped)
+
+    def _report(
+        self, homography: FloatArray | None, matches: IntArray, ratio: float, reason: str, stopped: str
+    ) -> PairMatch:
         return PairMatch(
             homography,
             matches,
@@ -329,6 +356,8 @@ class _Search:
             self.hypotheses,
             self.confidence,
             reason,
+            stopped,
+            self.work_s,
             time.perf_counter() - self.begin,
         )
 

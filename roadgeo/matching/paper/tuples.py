@@ -11,6 +11,7 @@ from typing import Literal
 import numpy as np
 
 from roadgeo._arrays import AnyArray, Float32Array, FloatArray, Int32Array, IntArray
+from roadgeo.errors import IndexFormatError
 from roadgeo.kernels import pairs as kernels
 from roadgeo.roads.intersections import Intersections
 
@@ -25,6 +26,10 @@ __all__ = [
     "type_keys",
     "type_table",
 ]
+
+
+#: A dense city of 15,000 intersections has some millions; each takes about 50 bytes while the tables are built.
+_MAX_TUPLES = 50_000_000
 
 
 @dataclass(frozen=True)
@@ -63,8 +68,10 @@ class PairOptions:
     discard_poor : bool
         Leave out intersections of the reference whose branches are too short or fit their tangents badly, as section
         4.2 does (see `quality.well_fitted`).
+    work_limit_s : float
+        The search stops after so much work: seconds of a usual machine, counted, not measured.
     time_limit_s : float
-        The search stops after this many seconds.
+        The same after this time by the clock: the last resort.
     """
 
     d_max_m: float = 1000.0
@@ -82,7 +89,8 @@ class PairOptions:
     rarest_first: bool = True
     max_tuple_intersections: int = 1000
     discard_poor: bool = True
-    time_limit_s: float = 10.0
+    work_limit_s: float = 10.0
+    time_limit_s: float = 60.0
 
 
 @dataclass(frozen=True)
@@ -150,8 +158,14 @@ def build_pair_index(intersections: Intersections, options: PairOptions | None =
         Reference plane, metres.
     options : PairOptions
         `d_max_m` and `min_line_angle_deg` matter.
+
+    Raises
+    ------
+    IndexFormatError
+        More intersections lie close to each other than on any map.
     """
     options = options or PairOptions()
+    _require_few(intersections.xy, options.d_max_m)
     codes = type_codes(intersections)
     pairs = list_pairs(intersections, codes, options.d_max_m, options)
     # tuples of one type side by side
@@ -186,6 +200,21 @@ def build_pair_index(intersections: Intersections, options: PairOptions | None =
         starts=fixed(starts, np.int32),
         items=fixed(items, np.int32),
     )
+
+
+def _require_few(xy: FloatArray, d_max_m: float) -> None:
+    """Refuse a map whose tuples would fill the memory, before they are listed."""
+    from scipy.spatial import cKDTree
+
+    if len(xy) ** 2 <= _MAX_TUPLES:
+        return
+    tree = cKDTree(xy)
+    count = (int(tree.count_neighbors(tree, d_max_m)) - len(xy)) // 2
+    if count > _MAX_TUPLES:
+        raise IndexFormatError(
+            f"the map has {count:,} pairs of intersections nearer than {d_max_m:g} m, expected at most {_MAX_TUPLES:,};"
+            " the paper's method does not fit it: use the usual one"
+        )
 
 
 def type_codes(intersections: Intersections) -> AnyArray:

@@ -3,7 +3,10 @@
 import base64
 import json
 
+import numpy as np
 import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
 
 from roadgeo.running.serving.requests import Refused, ending_of, read_execution, read_hints, read_query_string
 
@@ -70,3 +73,20 @@ def test_a_flag_is_no_number():
         read_hints({"focal": True})
     with pytest.raises(Refused):
         read_hints({"northUp": 1})
+
+
+HINTS = st.sampled_from(["near", "gsd", "maxTilt", "focal", "northUp", "timeLimit", "colour"])
+VALUES = st.recursive(
+    st.none() | st.booleans() | st.integers() | st.floats() | st.text(max_size=5), lambda one: st.lists(one, max_size=4)
+)
+
+
+@given(st.dictionaries(HINTS, VALUES, max_size=4))
+@settings(max_examples=40)
+def test_any_hints_are_finite_numbers_or_refused(values):
+    try:
+        found = read_hints(values)
+    except Refused:
+        return
+    for value in found.values():
+        assert value is True or value is False or np.isfinite(value).all()

@@ -1,0 +1,28 @@
+"""Thresholds of values of every kind: within them, or refused in a line."""
+
+import numpy as np
+from hypothesis import given, settings
+from hypothesis import strategies as st
+from hypothesis.extra import numpy as arrays
+
+from roadgeo._arrays import AnyArray
+from roadgeo.errors import MaskError
+from roadgeo.sources.thresholds import Sample, find_thresholds
+
+KINDS = st.sampled_from([np.uint8, np.int16, np.int32, np.float32, np.float64])
+
+
+@given(st.data())
+@settings(max_examples=150)
+def test_thresholds_lie_among_the_values(data: st.DataObject) -> None:
+    kind = data.draw(KINDS)
+    numbers = st.floats(-(2.0**100), 2.0**100, width=32) if np.dtype(kind).kind == "f" else None
+    few = data.draw(arrays.arrays(kind, data.draw(st.integers(1, 12)), elements=numbers))
+    rows: AnyArray = np.resize(few, (12, 12))
+    try:
+        found = find_thresholds(Sample("it", rows.reshape(-1, 1), 0, lambda: rows))
+    except MaskError:
+        return
+    low, high = float(rows.min()), float(rows.max())
+    assert 1 <= len(found) <= 3
+    assert all(np.isfinite(one) and min(low, np.nextafter(low, -np.inf)) <= one <= high for one in found)
