@@ -1,30 +1,37 @@
 """Processes that locate, on a real reference: what is hostile ends in an answer, and the next is located."""
 
+import errno
 import json
+import multiprocessing
 import os
 import re
 import signal
+import socket
 import struct
 import subprocess
 import sys
+import threading
 import time
 import urllib.error
 import urllib.request
 import zlib
-from contextlib import nullcontext
+from concurrent.futures import ThreadPoolExecutor
+from contextlib import contextmanager, nullcontext
+from dataclasses import replace
 
 import cv2
 import numpy as np
 import pytest
 from support.mavlink_peer import listening, of_kind
 
-from roadgeo.errors import IndexFormatError
+from roadgeo.cli import main
+from roadgeo.errors import IndexFormatError, ModelError
 from roadgeo.evaluation.landscape import Landscape
 from roadgeo.evaluation.noise import NOISE_MODELS
 from roadgeo.evaluation.simulation import SimulationOptions, ViewOptions, simulate_query
 from roadgeo.reference.reference import Reference
 from roadgeo.running.flights.mavlink import has_pymavlink
-from roadgeo.running.serving.workers import Asked, Workers
+from roadgeo.running.serving.workers import Asked, Workers, _locate, _serve
 
 pytestmark = pytest.mark.slow
 
@@ -79,6 +86,157 @@ def test_a_process_locates_and_survives_what_is_hostile(place, tmp_path):
         assert np.hypot(found["center"]["x"] - truth.center[0], found["center"]["y"] - truth.center[1]) < 5.0
     finally:
         workers.close()
+
+
+def answers(pipe, questions):
+    """What a process says to questions until nobody asks any more; the first says whether it is ready."""
+    said = [pipe.recv()]
+    for asked in questions:
+        pipe.send(asked)
+        said.append(pipe.recv())
+    pipe.close()
+    return said
+
+
+def serve(references, questions, monkeypatch):
+    """Do what a process does, in this one."""
+    monkeypatch.setattr(signal, "signal", lambda *_: None)
+    ours, its = multiprocessing.Pipe()
+    with ThreadPoolExecutor(1) as pool:
+        said = pool.submit(answers, ours, questions)
+        _serve(its, references)
+        return said.result()
+
+
+def test_what_a_process_answers(place, tmp_path, monkeypatch):
+    folder, _ = place
+    (tmp_path / "cut.png").write_bytes((folder / "mask.png").read_bytes()[:400])
+    (tmp_path / "bomb.png").write_bytes(png(60_000, 60_000))
+    cv2.imwrite(str(tmp_path / "mask.tif"), cv2.imread(str(folder / "mask.png"), cv2.IMREAD_GRAYSCALE))
+    asked = [
+        Asked(str(folder / "mask.png"), {"gsd_m": (0.5, 2.0)}, 10.0, 64_000_000),
+        Asked(str(tmp_path / "mask.tif"), {"near": (0.0, 0.0, 10.0)}, 10.0, 64_000_000),
+        Asked(str(tmp_path / "mask.tif"), {}, 10.0, 100),
+        Asked(str(tmp_path / "bomb.png"), {}, 10.0, 64_000_000),
+        Asked(str(tmp_path / "cut.png"), {}, 10.0, 64_000_000),
+    ]
+    ready, found, elsewhere, small, bomb, cut = serve([str(folder / "town.gpkg")], asked, monkeypatch)
+    assert ready is True
+    assert (found.status, found.document["status"], found.document["query"]) == (200, "located", "")
+    assert (elsewhere.status, elsewhere.document["reason_code"]) == (200, "few_near")
+    assert (small.status, small.document["detail"][:15]) == (413, "900 x 900 pixel")
+    assert bomb.status == 413
+    assert cut.status == 422
+    assert "the image" in cut.document["detail"]
+    assert str(tmp_path) not in cut.document["detail"]
+
+
+def test_a_fault_is_answered_and_not_where_files_lie(place, tmp_path, monkeypatch):
+    def fail(path, *_):
+        raise ZeroDivisionError(f"in {path}")
+
+    monkeypatch.setattr("roadgeo.running.queries.locate_query", fail)
+    folder, _ = place
+    asked = [Asked(str(folder / "mask.png"), {}, 10.0, 64_000_000)]
+    _, answer = serve([str(folder / "town.gpkg")], asked, monkeypatch)
+    assert answer.status == 500
+    assert answer.document == {"detail": "a fault of roadgeo: ZeroDivisionError: in the image"}
+
+
+def test_a_process_that_cannot_open_its_references_says_so(tmp_path, monkeypatch):
+    (said,) = serve([str(tmp_path / "nonesuch.gpkg")], [], monkeypatch)
+    assert "nonesuch.gpkg" in said
+
+
+def test_a_port_that_is_taken_is_said(place, capsys):
+    folder, _ = place
+    with socket.create_server(("127.0.0.1", 0)) as taken:
+        port = taken.getsockname()[1]
+        assert main(["serve", "-r", str(folder / "town.gpkg"), "--port", str(port), "--jobs", "1"]) == 1
+    said = capsys.readouterr().err.splitlines()[-1]
+    assert said.startswith(f"Error: cannot listen on 127.0.0.1 port {port}: ")
+    assert said.endswith("choose another --port")
+    assert not multiprocessing.active_children()
+
+
+@pytest.fixture
+def one_worker(place):
+    workers = Workers([str(place[0] / "town.gpkg")], 1, 2)
+    yield workers, Asked(str(place[0] / "mask.png"), {"gsd_m": (0.5, 2.0)}, 10.0, 64_000_000)
+    workers.close()
+
+
+@contextmanager
+def asked_beside(workers, asked):
+    """Ask a process that stands still: a list that holds the answer after the block."""
+    answers = []
+    os.kill(workers._all[0]._process.pid, signal.SIGSTOP)
+    thread = threading.Thread(target=lambda: answers.append(workers.ask(asked)))
+    thread.start()
+    yield answers
+    thread.join(60)
+
+
+def test_a_process_that_breaks_at_work_costs_nobody_an_answer(one_worker):
+    workers, asked = one_worker
+    with asked_beside(workers, asked) as answers:
+        time.sleep(0.2)
+        workers._all[0]._process.kill()
+    assert [one.status for one in answers] == [200]
+
+
+def test_an_image_that_breaks_every_process_is_told_so(one_worker, monkeypatch):
+    def broken(self, asked):
+        raise EOFError
+
+    workers, asked = one_worker
+    with monkeypatch.context() as patch:
+        patch.setattr("roadgeo.running.serving.workers._Worker.ask", broken)
+        assert workers.ask(asked).status == 500
+    assert workers.ask(asked).status == 200
+
+
+def test_what_takes_too_long_is_ended_and_no_fault(one_worker, monkeypatch):
+    workers, asked = one_worker
+    monkeypatch.setattr("roadgeo.running.serving.workers._GRACE_S", 0.3)
+    with asked_beside(workers, replace(asked, time_limit_s=0.2)) as answers:
+        pass
+    assert [one.status for one in answers] == [503]
+    assert "longer than 0.5 s" in answers[0].document["detail"]
+    monkeypatch.undo()
+    assert workers.ask(asked).status == 200
+
+
+def test_a_system_without_room_for_a_process_is_no_fault(one_worker, monkeypatch):
+    def none(*_):
+        raise OSError(errno.EAGAIN, os.strerror(errno.EAGAIN))
+
+    workers, asked = one_worker
+    workers._all[0]._process.kill()
+    with monkeypatch.context() as patch:
+        patch.setattr("multiprocessing.process.BaseProcess.start", none)
+        assert [workers.ask(asked).status for _ in range(2)] == [503, 503]
+    assert workers.ask(asked).status == 200
+
+
+def test_who_asks_while_the_server_ends_is_told(one_worker):
+    workers, asked = one_worker
+    with asked_beside(workers, asked) as answers:
+        time.sleep(0.2)
+        workers.close()
+    assert [one.status for one in answers] == [503]
+    assert not workers._all[0]._process.is_alive()
+
+
+def test_photographs_are_refused_where_there_is_no_model_for_them(monkeypatch):
+    def none(*_):
+        raise ModelError("photographs need onnxruntime: pip install 'roadgeo[segment]'")
+
+    monkeypatch.setattr("roadgeo.running.serving.workers._size", lambda _: (10, 10))
+    monkeypatch.setattr("roadgeo.running.queries.locate_query", none)
+    answer = _locate(Asked("photo.jpg", {}, 1.0, 1000), [])
+    assert answer.status == 415
+    assert "onnxruntime" in answer.document["detail"]
 
 
 def test_a_missing_reference_is_said(tmp_path):
