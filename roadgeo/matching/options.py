@@ -40,7 +40,7 @@ class LocateOptions:
     method: Literal["auto", "pair"] = "auto"
     effort: Literal["quick", "full"] = "full"
     near: tuple[float, float, float] | None = None
-    min_log10_odds: float = 3.0
+    min_log10_odds: float = 3.5
     min_margin: float = 2.0
     min_intersections: int = 3
     truths: tuple[tuple[str, float, float], ...] = ()

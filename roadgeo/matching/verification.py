@@ -50,7 +50,7 @@ class VerifyOptions:
         Of 511 searches in eight cities for masks without a place, none scored above 0.8 with these and `saturation`.
     promising : float
         Log10 odds that a place must reach against the least chance seen so far before a null of its own is measured.
-        They are an upper bound: below 1 a place is neither located (3) nor within the margin (2.0) of one that is.
+        They are an upper bound: below 1 a place is neither located (3.5) nor within the margin (2.0) of one that is.
     """
 
     map_sigma_m: float = 1.8
