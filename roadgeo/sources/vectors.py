@@ -148,7 +148,10 @@ def _aside(path: Path) -> Iterator[Path]:
         return
     with tempfile.TemporaryDirectory(prefix="roadgeo-") as folder:
         link = Path(folder) / path.name
-        link.symlink_to(path.absolute())
+        try:
+            link.symlink_to(path.absolute())
+        except OSError:  # no links here (Windows, without leave)
+            link = path
         yield link
 
 

@@ -132,18 +132,6 @@ def _half_turn(frame: Frame) -> FloatArray:
 # --- masks ------------------------------------------------------------------------------------------------------------
 
 
-def between_masks(before: RoadMask, mask: RoadMask, last: FloatArray | None = None) -> FloatArray | None:
-    """Return the motion between two masks by the roads that both show; None where those do not agree.
-
-    Parameters
-    ----------
-    last : (3, 3) float64, optional
-        The motion of the frame before: flights go on as they went.
-    """
-    one, other = TracedMask.of(before), TracedMask.of(mask)
-    return None if one is None or other is None else _between(one, other, last)
-
-
 @dataclass
 class Odometer:
     """Tells how each mask of a flight moved; where the masks do not tell, it goes on as it went, a frame or two."""
@@ -163,7 +151,7 @@ class Odometer:
         """
         known = self._traced if self._traced is not None and self._traced.mask is before else TracedMask.of(before)
         self._traced = TracedMask.of(mask)
-        found = None if known is None or self._traced is None else _between(known, self._traced, self._motion)
+        found = None if known is None or self._traced is None else between_masks(known, self._traced, self._motion)
         if found is not None:
             self._motion, self._held = found, 0
             return found, _MASKS_PX
@@ -193,8 +181,14 @@ class _Laid(NamedTuple):
         return agrees or self.fit > other.fit - _LEAD_FIRST
 
 
-def _between(one: TracedMask, other: TracedMask, last: FloatArray | None) -> FloatArray | None:
-    """Return the motion of `other` against `one`, as the roads of both and the motion of the frame before tell it."""
+def between_masks(one: TracedMask, other: TracedMask, last: FloatArray | None = None) -> FloatArray | None:
+    """Return the motion (3, 3) of `other` against `one` by the roads that both show; None where those do not tell it.
+
+    Parameters
+    ----------
+    last : (3, 3) float64, optional
+        The motion of the frame before: flights go on as they went.
+    """
     height, width = other.mask.shape
     frame = Frame(width, height)
     guesses = _rough_motions(one.mask, other.mask, 2 * len(_TURNS_DEG))

@@ -11,7 +11,14 @@ from roadgeo.evaluation.flights import FlightOptions, simulate_flight
 from roadgeo.evaluation.landscape import Landscape
 from roadgeo.geometry.homography import Homography
 from roadgeo.geometry.mask import RoadMask
-from roadgeo.running.flights.motion import Odometer, between_images, between_masks, read_motion, write_motion
+from roadgeo.running.flights.motion import (
+    Odometer,
+    TracedMask,
+    between_images,
+    between_masks,
+    read_motion,
+    write_motion,
+)
 
 MOTION = np.array([[0.99, 0.03, 12.0], [-0.03, 1.01, -80.0], [1e-5, -2e-5, 1.0]])
 CORNERS = np.array([[0.0, 0.0], [320, 0], [320, 240], [0, 240]])
@@ -55,7 +62,7 @@ def test_masks_tell_it_roughly():
     before = streets()
     motion = np.array([[0.998, 0.03, 5.0], [-0.03, 0.998, -50.0], [0.0, 0.0, 1.0]])
     after = seen(before, motion)
-    found = between_masks(RoadMask(before > 127), RoadMask(after > 127))
+    found = between_masks(*map(TracedMask.of, (RoadMask(before > 127), RoadMask(after > 127))))
     assert found is not None
     assert gap(found, motion) < 8.0
 
@@ -67,7 +74,7 @@ def lattice(left, top):
 
 
 def test_masks_whose_streets_repeat_tell_it_only_to_who_knows_how_the_frame_before_moved():
-    before, after = lattice(0, 0), lattice(3, -85)
+    before, after = map(TracedMask.of, (lattice(0, 0), lattice(3, -85)))
     assert between_masks(before, after) is None
     last = np.array([[1.0, 0.0, 0.0], [0.0, 1.0, -80.0], [0.0, 0.0, 1.0]])
     found = between_masks(before, after, last)
@@ -108,7 +115,8 @@ def test_masks_of_a_flight_tell_it_frame_by_frame(town):
 
 def test_masks_without_roads_tell_nothing():
     blank = RoadMask(np.zeros((240, 320), bool))
-    assert between_masks(blank, RoadMask(streets() > 127)) is None
+    assert TracedMask.of(blank) is None
+    assert Odometer().move(blank, RoadMask(streets() > 127))[0] is None
 
 
 def test_a_file_is_read_as_it_was_written(tmp_path):
