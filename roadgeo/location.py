@@ -5,7 +5,7 @@ from __future__ import annotations
 from dataclasses import asdict, dataclass, field
 from enum import StrEnum
 from html import escape
-from typing import TYPE_CHECKING, Any, Literal
+from typing import TYPE_CHECKING, Any, Literal, NamedTuple
 
 import numpy as np
 
@@ -21,7 +21,20 @@ from roadgeo.roads.graph import RoadGraph
 if TYPE_CHECKING:
     import geopandas as gpd
 
-__all__ = ["SCHEMA", "Camera", "Evidence", "Location", "Place", "Reason", "Seconds", "Seen", "Stats", "Status"]
+__all__ = [
+    "ERROR_RATES",
+    "SCHEMA",
+    "Camera",
+    "ErrorRate",
+    "Evidence",
+    "Location",
+    "Place",
+    "Reason",
+    "Seconds",
+    "Seen",
+    "Stats",
+    "Status",
+]
 
 SCHEMA = "roadgeo.location/1"
 
@@ -58,6 +71,34 @@ class Reason(StrEnum):
     MEMORY = "memory"
     #: Of roadgeo itself.
     FAULT = "fault"
+
+
+class ErrorRate(NamedTuple):
+    """How many places were wrong of those with scores like this one: counted, four in five masks without a place.
+
+    Attributes
+    ----------
+    score : float
+        `log10_odds` from here to the next band's.
+    reported, wrong : int
+        Places of such scores that `examples/trust` saw reported, and how many of them were wrong.
+    at_most : float
+        The share that is wrong, with 95 % confidence (Clopper and Pearson, Biometrika 26, 1934; its upper end).
+    """
+
+    score: float
+    reported: int
+    wrong: int
+    at_most: float
+
+
+#: By bands of the score, from the threshold on; a test counts them again in `examples/trust/results`.
+ERROR_RATES = (
+    ErrorRate(3.5, 11, 0, 0.285),
+    ErrorRate(5.0, 16, 0, 0.206),
+    ErrorRate(8.0, 79, 0, 0.046),
+    ErrorRate(15.0, 409, 0, 0.009),
+)
 
 
 @dataclass(frozen=True)
@@ -301,6 +342,13 @@ class Location:
         """Whether one place was found."""
         return self.status == "located"
 
+    @property
+    def error_rate(self) -> ErrorRate | None:
+        """How often places of such scores were wrong; None where none is reported, or with a lower score than usual."""
+        if not self.located or self.log10_odds is None:
+            return None
+        return next((rate for rate in reversed(ERROR_RATES) if self.log10_odds >= rate.score), None)
+
     def pixel_to_map(self, pixels: FloatArray) -> FloatArray:
         """Take (..., 2) pixel positions (column, row; the top-left corner is 0, 0) to the location's CRS.
 
@@ -433,6 +481,7 @@ class Location:
             "n_matched": self.n_matched,
             "inlier_ratio": self.inlier_ratio,
             "log10_odds": self.log10_odds,
+            "error_rate": None if self.error_rate is None else self.error_rate._asdict(),
             "runner_up": None if self.runner_up is None else place(self.runner_up),
             "alternatives": [place(one) for one in self.alternatives],
             "seconds": {**asdict(self.seconds), "total": self.seconds.total},

@@ -37,6 +37,25 @@ def test_a_location_says_the_answer_in_one_line():
     assert "<tr>" in REFUSED._repr_html_()
 
 
+@pytest.mark.parametrize(
+    ("location", "score"),
+    [
+        (LOCATED, 8.0),
+        (replace(LOCATED, log10_odds=3.5), 3.5),
+        (replace(LOCATED, log10_odds=4.99), 3.5),
+        (replace(LOCATED, log10_odds=99.0), 15.0),
+        (replace(LOCATED, log10_odds=3.4), None),  # a lower threshold was asked for: nothing was counted there
+        (replace(LOCATED, status="ambiguous"), None),
+        (replace(LOCATED, log10_odds=None), None),
+        (REFUSED, None),
+    ],
+)
+def test_a_place_tells_how_often_such_places_were_wrong(location, score):
+    rate = location.error_rate
+    assert (None if rate is None else rate.score) == score
+    assert location.to_dict()["error_rate"] == (None if rate is None else rate._asdict())
+
+
 def test_pixels_go_to_the_map_and_back():
     pixels = np.array([[0.0, 0.0], [400.0, 300.0], [12.5, 7.25]])
     there = LOCATED.pixel_to_map(pixels)

@@ -46,6 +46,7 @@ from roadgeo.evaluation.scoring import Score, score  # noqa: E402
 from roadgeo.evaluation.simulation import SimulationOptions, ViewOptions, simulate_query  # noqa: E402
 from roadgeo.evaluation.trials import Mask, ReferenceLocator, Trial, run_trials  # noqa: E402
 from roadgeo.evaluation.truth import Truth  # noqa: E402
+from roadgeo.location import ERROR_RATES  # noqa: E402
 from roadgeo.reference.reference import open_reference  # noqa: E402
 from roadgeo.sources.roads import Roads, read_roads  # noqa: E402
 from roadgeo.workflows import LocateOptions, build_reference  # noqa: E402
@@ -295,9 +296,9 @@ def threshold_table(rows: Sequence[Row], least: float, margin: float) -> list[li
 
 
 def band_table(rows: Sequence[Row], least: float, margin: float) -> list[list[str]]:
-    """Tell for each band of the score which share of the places reported in it is wrong."""
+    """Tell for each band of `ERROR_RATES`, which results state, what share of the places reported in it is wrong."""
     table = [["score", "reported", "wrong"]]
-    edges = [t for t in THRESHOLDS if t >= least]
+    edges = [least, *(rate.score for rate in ERROR_RATES if rate.score > least)]
     for low, high in zip(edges, [*edges[1:], math.inf], strict=True):
         inside = [r for r in rows if low <= r.score < high and r.lead >= margin]
         name = f"{low:g} to {high:g}" if high < math.inf else f"{low:g} and more"

@@ -7,6 +7,9 @@ from pathlib import Path
 import numpy as np
 import pytest
 
+from roadgeo.location import ERROR_RATES
+from roadgeo.workflows import LocateOptions
+
 TRUST = Path(__file__).parents[2] / "examples" / "trust" / "trust.py"
 
 
@@ -40,11 +43,23 @@ def test_rows_are_counted_by_threshold_band_and_kind(trust):
     assert [cell.split(":")[0] for cell in told["3.5"]] == ["1 of 3", "1 of 3", "1 of 2"]
     assert [cell.split(":")[0] for cell in told["5"]] == ["1 of 3", "0 of 3", "0 of 2"]
     bands = {row[0]: row[1:] for row in trust.band_table(rows, 3.5, 2.0)}
-    assert bands["3.5 to 4"][0] == "1"
-    assert bands["4 to 4.5"][1].startswith("1 of 1")
-    assert bands["5 to 6"][0] == "0"
+    assert bands["3.5 to 5"][0] == "2"
+    assert bands["3.5 to 5"][1].startswith("2 of 2")
+    assert bands["5 to 8"][0] == "0"
     kinds = {row[0]: row for row in trust.kind_table(rows, 3.5, 2.0)}
     assert kinds["elsewhere"][-2] == "3.7"
+
+
+def test_the_error_rates_that_results_state_are_those_counted(trust):
+    margin = LocateOptions().min_margin
+    rows = [row for path in sorted((TRUST.parent / "results").glob("*.csv")) for row in trust.read_rows(path)]
+    highest = [rate.score for rate in ERROR_RATES[1:]] + [np.inf]
+    for rate, end in zip(ERROR_RATES, highest, strict=True):
+        found = [row for row in rows if row.reported(rate.score, margin) and row.score < end]
+        wrong = sum(not row.right for row in found)
+        assert (rate.reported, rate.wrong) == (len(found), wrong)
+        assert rate.at_most == pytest.approx(trust.bounds(wrong, len(found))[1], abs=5e-4)
+    assert ERROR_RATES[0].score == LocateOptions().min_log10_odds
 
 
 def test_rows_come_back_from_their_file(trust, tmp_path):
