@@ -126,6 +126,7 @@ def test_exact_observations_give_the_homography(seed):
     assert corner_gap(p, P) < 0.02
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("changes", [{}, {"max_radius": 12.0}, {"least_share": 0.8}, {"prior": 10.0}])
 @pytest.mark.parametrize("seed", range(3))
 def test_like_the_twin(seed, changes):

@@ -189,7 +189,8 @@ class TestScreen:
         expected = naive.screen(references, affines, anchor, ref_xy, points, along, 8.0, 4.0, MIN_COS, least, roads[0])
         return shares, expected
 
-    @pytest.mark.parametrize("least", [*(pytest.param(x, marks=pytest.mark.slow) for x in (0.0, 0.4)), 0.2])
+    @pytest.mark.slow
+    @pytest.mark.parametrize("least", [0.0, 0.2, 0.4])
     def test_like_the_twin(self, least):
         rng = np.random.default_rng(9)
         shares, expected = self.run(rng.uniform((0, -80), (80, 0), (25, 2)), directions(rng, 25), least)

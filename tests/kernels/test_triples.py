@@ -212,7 +212,8 @@ class TestSides:
 
 
 class TestVertexProbes:
-    @pytest.mark.parametrize("tolerance", [*(pytest.param(n, marks=pytest.mark.slow) for n in (0, 2)), 5])
+    @pytest.mark.slow
+    @pytest.mark.parametrize("tolerance", [0, 2, 5])
     def test_probe_exactly_what_is_alike(self, tolerance):
         rng = np.random.default_rng(3)
         every = [(u, v, sides) for u in range(UNITS) for v in range(u, UNITS) for sides in range(9)]
@@ -278,7 +279,8 @@ class TestLookUp:
         )  # fmt: skip
         return hits.ids[:n], hits.affine[:n], compared
 
-    @pytest.mark.parametrize("tolerance", [pytest.param(1, marks=pytest.mark.slow), 5])
+    @pytest.mark.slow
+    @pytest.mark.parametrize("tolerance", [1, 5])
     def test_like_the_twin(self, world, tolerance):
         query = seen_through(world, np.array([[1.2, -0.4], [0.3, 0.9]]), noise=0.05)
         n = 0

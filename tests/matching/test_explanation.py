@@ -102,6 +102,7 @@ def test_watching_changes_nothing(town, mask):
     )  # fmt: skip
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     ("limits", "fault", "value"),
     [

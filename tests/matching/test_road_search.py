@@ -108,6 +108,7 @@ def test_finds_a_broken_mask_that_triples_do_not(town, seed):
     assert full.best.n_found >= 2
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("seed", [2, 3])
 def test_another_town_is_refused(town, seed):
     stranger = scene_of(look(random_network(seed, 2000.0), camera((1000, 1000)), sight=BROKEN))

@@ -207,6 +207,7 @@ def test_every_flipped_bit_is_refused_or_harmless(path: Path) -> None:
     assert n_refused > 1900  # harmless are only paddings
 
 
+@pytest.mark.slow
 def test_every_truncation_and_extension_is_refused(path: Path) -> None:
     raw = path.read_bytes()
     for size in [*range(0, 4000, 37), *range(len(raw) - 200, len(raw)), *range(4000, len(raw), 4001)]:

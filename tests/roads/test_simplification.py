@@ -242,6 +242,7 @@ def test_coverage_surrounds_the_roads_and_what_they_enclose():
     assert area(ring) == pytest.approx(3010**2)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("turn", [0.0, 0.8])
 def test_coverage_ends_where_the_roads_end(turn):
     """Whichever way a grid of streets lies, and where a bay cuts into it."""
