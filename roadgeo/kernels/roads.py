@@ -13,7 +13,7 @@ from roadgeo.kernels.arrays import Bools2, Floats1, Floats2, Int32s1, Ints1, Sin
 from roadgeo.kernels.compilation import kernel
 from roadgeo.kernels.structs import RoadBuckets
 
-__all__ = ["backward_agreement", "bin_segments", "count_near_roads", "forward_distances", "nearest_road", "screen"]
+__all__ = ["backward_agreement", "bin_segments", "forward_distances", "nearest_road", "screen", "shares_near_roads"]
 
 
 @kernel()
@@ -189,23 +189,32 @@ def forward_distances(
 
 
 @kernel()
-def count_near_roads(
+def shares_near_roads(
     matrix: Floats2,
     points: Floats2,
     directions: Floats2,
+    weights: Floats1,
     radius: float,
     min_cos: float,
     shifts: Floats2,
     roads: RoadBuckets,
-    counts: Ints1,
+    shares: Floats1,
 ) -> None:
-    """Fill `counts` (M,) with the points near roads under each of `shifts` (M, 2), metres (see `forward_distances`)."""
+    """Fill `shares` (M,) with the share of the points near roads under each of `shifts` (M, 2), metres.
+
+    Points count by `weights` (S,), at least one of them more than 0; the rest is as in `forward_distances`.
+    """
     out = np.empty(points.shape[0])
+    total = 0.0
+    for i in range(points.shape[0]):
+        total += weights[i]
     for m in range(shifts.shape[0]):
-        counts[m] = forward_distances(
-            matrix, points, directions, radius, min_cos, shifts[m, 0], shifts[m, 1], roads,
-            out,
-        )  # fmt: skip
+        forward_distances(matrix, points, directions, radius, min_cos, shifts[m, 0], shifts[m, 1], roads, out)
+        near = 0.0
+        for i in range(points.shape[0]):
+            if out[i] < np.inf:
+                near += weights[i]
+        shares[m] = near / total if total > 0.0 else 0.0
 
 
 @kernel()

@@ -391,7 +391,7 @@ class TripleEstimator:
         seeds = model.seeds[-MINIMAL:]
         model.found, model.matched, model.distance = agreement(lens.matrix, scene, index, gsd, seeds, verify)
         model.chance = chance_agreement(lens.matrix, scene, index, gsd, verify, near=self.near)
-        model.log10_odds = log10_odds(model.found, model.chance, scene.n_edges, self.ledger.n_tried, verify)
+        model.log10_odds = log10_odds(model.found, model.chance, scene.n_statements, self.ledger.n_tried, verify)
 
     def _rounds_of_lenses(self, options: LensOptions) -> Iterator[list[Hypothesis]]:
         """Yield places that were dropped and that fit after all when grown anew, behind a lens."""
@@ -425,7 +425,7 @@ class TripleEstimator:
         found = model.found
         if found is None:
             return -math.inf
-        return log10_odds(found, chance, self.scene.n_edges, self.ledger.n_tried, self.options.verify)
+        return log10_odds(found, chance, self.scene.n_statements, self.ledger.n_tried, self.options.verify)
 
     def _converge(self, model: Hypothesis, n_points: int | None) -> bool:
         """Refine until nothing more agrees: more matches make a better fit, and that finds more matches."""

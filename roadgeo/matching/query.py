@@ -54,7 +54,7 @@ def trace_query(mask: RoadMask, options: QueryOptions | None = None) -> tuple[Sc
         ),
     )
     height, wide = mask.shape
-    scene = prepare_scene(graph, found, (wide, height), mask.observed, options.scene)
+    scene = prepare_scene(graph, found, (wide, height), mask.observed, options.scene, mask.probability)
     return replace(scene, road_width_px=width), graph
 
 

@@ -16,6 +16,12 @@ from roadgeo.roads.intersections import Intersections
 
 __all__ = ["Scene", "SceneOptions", "prepare_scene", "query_neighbours", "sample_roads"]
 
+#: Values of `RoadMask.probability` where nothing is known, and where there is road for sure.
+_UNKNOWN, _SURE = 255, 254.0
+
+#: A road's middle is traced within a pixel.
+_NEAR = (-1, 0, 1)
+
 
 @dataclass(frozen=True)
 class SceneOptions:
@@ -52,12 +58,14 @@ class Scene:
     neighbours : (N, K) int32
     points, directions : (S, 2) float64
         Points spread evenly along the roads, and unit vectors along the road.
+    weights : (S,) float64
+        What each point counts where roads are compared: its probability of road, 1 where the mask tells none.
     dense_points, dense_directions : (D, 2) float64
         The same, closer together: enough of them within a few roads of any place.
     road_length_px : float
         Length of all roads.
     n_edges : int
-        Edges of the road graph: about the number of independent statements that the roads make.
+        Edges of the road graph.
     field : (h, w) float32
         Distance from each cell to the nearest road, in cells; rows downwards as in the image.
     field_scale : float
@@ -73,6 +81,7 @@ class Scene:
     neighbours: Int32Array
     points: FloatArray
     directions: FloatArray
+    weights: FloatArray
     dense_points: FloatArray
     dense_directions: FloatArray
     road_length_px: float
@@ -96,6 +105,15 @@ class Scene:
     def half_size(self) -> float:
         """Half the frame's diagonal in pixels."""
         return Frame(*self.size).half_diagonal
+
+    @property
+    def n_statements(self) -> float:
+        """About how many independent statements the roads make: their number, and fewer where few of them count.
+
+        That many of equal weight would be as sure a mean (Kish, Survey Sampling, 1965, 11.7).
+        """
+        squares = len(self.weights) * float((self.weights**2).sum())
+        return self.n_edges * float(self.weights.sum()) ** 2 / squares if squares > 0.0 else 0.0
 
 
 def query_neighbours(xy: FloatArray, k: int) -> Int32Array:
@@ -131,14 +149,27 @@ def _nearest(found: Intersections, center: FloatArray, most: int) -> Intersectio
     return found.only(kept)
 
 
+def _probability_at(points: FloatArray, probability: AnyArray) -> FloatArray:
+    """Return the greatest probability of road (S,) within a pixel of each point (S, 2) of the query plane."""
+    height, width = probability.shape
+    known = np.where(probability == _UNKNOWN, np.uint8(0), probability)
+    column, row = np.clip((points * (1.0, -1.0)).astype(np.int64), 0, (width - 1, height - 1)).T
+    around = [known[np.clip(row + i, 0, height - 1), np.clip(column + j, 0, width - 1)] for i in _NEAR for j in _NEAR]
+    return np.asarray(np.max(around, axis=0) / _SURE)
+
+
 def prepare_scene(
     graph: RoadGraph,
     intersections: Intersections,
     size: tuple[int, int],
     observed: BoolArray | None = None,
     options: SceneOptions | None = None,
+    probability: AnyArray | None = None,
 ) -> Scene:
-    """Prepare a vectorized mask for matching; `size` is (width, height), `observed` (height, width)."""
+    """Prepare a vectorized mask for matching; `size` is (width, height), `observed` and `probability` (height, width).
+
+    `probability` is that of `RoadMask`: roads that are less sure count less.
+    """
     options = options or SceneOptions()
     width, height = size
     length = float(graph.edge_lengths().sum())
@@ -168,6 +199,7 @@ def prepare_scene(
         neighbours=neighbours,
         points=points,
         directions=directions,
+        weights=np.ones(len(points)) if probability is None else _probability_at(points, probability),
         dense_points=dense[0],
         dense_directions=dense[1],
         road_length_px=length,

@@ -18,7 +18,7 @@ import numpy as np
 from roadgeo._arrays import FloatArray, IntArray
 from roadgeo.geometry.homography import Homography
 from roadgeo.kernels.point_matching import count_matches, match_all
-from roadgeo.kernels.roads import backward_agreement, count_near_roads, forward_distances
+from roadgeo.kernels.roads import backward_agreement, forward_distances, shares_near_roads
 from roadgeo.matching.index import ReferenceIndex
 from roadgeo.matching.scene import Scene
 
@@ -131,14 +131,15 @@ def agreement(
     out = np.empty(len(scene.points))
     min_cos = math.cos(math.radians(options.max_turn_deg))
     roads = index.road_buckets
-    near = forward_distances(matrix, scene.points, scene.directions, tolerance, min_cos, 0.0, 0.0, roads, out)
+    forward_distances(matrix, scene.points, scene.directions, tolerance, min_cos, 0.0, 0.0, roads, out)
+    forward = float(np.average(np.isfinite(out), weights=scene.weights)) if scene.weights.any() else 0.0
     seen, shown = backward_agreement(
         np.asarray(np.linalg.inv(matrix), float), _bounds(matrix, scene), options.backward_step_m, tolerance, 0.0, 0.0,
         roads, scene.field, scene.field_scale, scene.observed,
     )  # fmt: skip
     result = Agreement(
         int((matched[counted] >= 0).sum()), int(counted.sum()),
-        near / max(len(out), 1), shown / max(seen, 1), seen,
+        forward, shown / max(seen, 1), seen,
     )  # fmt: skip
     return result, matched, distance
 
@@ -164,7 +165,9 @@ def chance_agreement(
     tolerance = tolerance_m(gsd_m, options)
     found = scene.intersections
     thin = max(1, len(scene.points) // options.n_null_points)
-    points, directions = (np.ascontiguousarray(array[::thin]) for array in (scene.points, scene.directions))
+    points, directions, weights = (
+        np.ascontiguousarray(array[::thin]) for array in (scene.points, scene.directions, scene.weights)
+    )
     min_cos = math.cos(math.radians(options.max_turn_deg))
     roads = index.road_buckets
     inverse, bounds = np.asarray(np.linalg.inv(matrix), float), _bounds(matrix, scene)
@@ -177,8 +180,9 @@ def chance_agreement(
         index.point_buckets, counts,
     )  # fmt: skip
     rates[:, 0] = counts / max(len(found), 1)
-    count_near_roads(matrix, points, directions, tolerance, min_cos, shifts, roads, counts)
-    rates[:, 1] = counts / max(len(points), 1)
+    shares = np.empty(len(shifts))
+    shares_near_roads(matrix, points, directions, weights, tolerance, min_cos, shifts, roads, shares)
+    rates[:, 1] = shares
     best = np.argsort(-rates[:, 1])[: 12 if n_best == 1 else 4 * n_best]
     for i in best:
         dx, dy = shifts[i]

@@ -7,10 +7,10 @@ from naive import kernels as naive
 from roadgeo.kernels.roads import (
     backward_agreement,
     bin_segments,
-    count_near_roads,
     forward_distances,
     nearest_road,
     screen,
+    shares_near_roads,
 )
 from roadgeo.kernels.structs import RoadBuckets
 
@@ -122,16 +122,17 @@ class TestForwardDistances:
         )
 
 
-class TestCountNearRoads:
-    def test_like_the_twin(self):
+class TestSharesNearRoads:
+    @pytest.mark.parametrize("weigh", [np.ones_like, lambda points: points % 1.0])
+    def test_like_the_twin(self, weigh):
         roads = town(3)
         rng = np.random.default_rng(4)
         points, along = rng.uniform((0, -250), (250, 0), (40, 2)), directions(rng, 40)
         shifts = np.array([(0.0, 0.0), (31.0, -17.0), (-200.0, 60.0)])
-        counts = np.empty(3, np.int64)
-        count_near_roads(TILTED, points, along, 30.0, MIN_COS, shifts, roads, counts)
-        expected = naive.count_near_roads(TILTED, points, along, 30.0, MIN_COS, shifts, roads.segments)
-        assert counts.tolist() == expected
+        weights, shares = weigh(points[:, 0]), np.empty(3)
+        shares_near_roads(TILTED, points, along, weights, 30.0, MIN_COS, shifts, roads, shares)
+        expected = naive.shares_near_roads(TILTED, points, along, weights, 30.0, MIN_COS, shifts, roads.segments)
+        np.testing.assert_allclose(shares, expected, rtol=1e-12)
         assert min(expected) > 0
 
 

@@ -133,7 +133,7 @@ def test_where_hardly_a_road_is_met_the_claim_stays(town):
 
 def test_where_most_of_a_frame_is_astray_and_hardly_a_road_is_left_the_claim_stays(town):
     truth, scene = sight_of(town[0], 8)
-    few = replace(scene, points=scene.points[:20], directions=scene.directions[:20])
+    few = replace(scene, points=scene.points[:20], directions=scene.directions[:20], weights=scene.weights[:20])
     shifted = np.array([[1.0, 0, 23.0], [0, 1.0, 17.0], [0, 0, 1]]) @ truth
     assert np.isfinite(honest(shifted, few, town[1], 0.1)).all()
 

@@ -1,5 +1,7 @@
 """Scenes: what the search sees of a query."""
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 import shapely
@@ -103,6 +105,21 @@ class TestPrepareScene:
         assert not scene.observed[:, :20].any()
         assert scene.observed[:, 20:].all()
         assert prepare_scene(CROSS, find_intersections(CROSS), (200, 100)).observed.all()
+
+    def test_roads_count_by_their_probability(self):
+        plain = prepare_scene(CROSS, find_intersections(CROSS), (200, 100))
+        assert (plain.weights == 1.0).all()
+        assert plain.n_statements == plain.n_edges == 2
+        probability = np.full((100, 200), 127, np.uint8)
+        probability[:, 100:] = 254
+        probability[:40] = 255  # nothing is known there
+        scene = prepare_scene(CROSS, find_intersections(CROSS), (200, 100), probability=probability)
+        column, row = scene.points.T * [[1], [-1]]
+        sure = (np.abs(column - 100) > 2) & (np.abs(row - 40) > 2)  # a pixel away from each
+        expected = np.select([row < 40, column < 100], [0.0, 0.5], 1.0)
+        np.testing.assert_allclose(scene.weights[sure], expected[sure])
+        # Were half of the points sure and the others not seen at all, they would state half as much.
+        assert replace(scene, weights=np.arange(50) % 2.0).n_statements == pytest.approx(1.0)
 
     def test_a_query_without_roads(self):
         scene = prepare_scene(NOTHING, find_intersections(NOTHING), (300, 200))

@@ -101,7 +101,7 @@ class TestChance:
         assert min(chance) > 0.8
         found, *_ = agree(truth, lattice, index)
         assert found.forward > 0.97
-        assert log10_odds(found, chance, lattice.n_edges, 100, OPTIONS) < 4
+        assert log10_odds(found, chance, lattice.n_statements, 100, OPTIONS) < 4
 
     def test_the_same_place_has_the_same_chance(self, town, scene):
         assert chance_agreement(TRUTH, scene, town[1], 1.0, OPTIONS) == chance_agreement(

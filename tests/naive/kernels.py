@@ -95,9 +95,9 @@ def forward_distances(matrix, points, directions, radius, min_cos, shift, segmen
     return found
 
 
-def count_near_roads(matrix, points, directions, radius, min_cos, shifts, segments):
+def shares_near_roads(matrix, points, directions, weights, radius, min_cos, shifts, segments):
     found = (forward_distances(matrix, points, directions, radius, min_cos, shift, segments) for shift in shifts)
-    return [np.isfinite(distances).sum() for distances in found]
+    return [np.average(np.isfinite(distances), weights=weights) for distances in found]
 
 
 def backward_agreement(inverse, step, tolerance_m, shift, segments, inside, field, field_scale, observed):

@@ -160,7 +160,7 @@ class _Candidate:
         matrix, gsd = refined.matrix, sampling(refined.matrix, whole.size)
         found, matched, distance = agreement(matrix, whole, self.index, gsd, _NO_SEEDS, match.verify)
         chance = chance_agreement(matrix, whole, self.index, gsd, match.verify)
-        self.proposed = log10_odds(found, chance, whole.n_edges, self.n_tried, match.verify)
+        self.proposed = log10_odds(found, chance, whole.n_statements, self.n_tried, match.verify)
         self.matrix, self.seen_at = matrix @ PIXEL_TO_PLANE @ look.mosaic.to_mosaic[-1], look.numbers[-1]
         self.fit = Fit(
             self.index, matrix, matched, distance, found.forward, self.proposed,
@@ -178,7 +178,7 @@ class _Candidate:
         found, _, _ = agreement(matrix, fresh, self.index, gsd, _NO_SEEDS, verify)
         for n_best in (options.n_best, 1):
             chance = chance_agreement(matrix, fresh, self.index, gsd, verify, n_best=n_best)
-            self.tested = log10_odds(found, chance, fresh.n_edges, 1, verify)
+            self.tested = log10_odds(found, chance, fresh.n_statements, 1, verify)
             if self.later - math.log10(self.n_looks) < least or _leads(matrix, whole, self.index, options):
                 break
 
@@ -307,7 +307,7 @@ def _fully_scored(model: Hypothesis, estimator: TripleEstimator) -> float:
     if model.found is None:
         return -math.inf
     chance = chance_agreement(model.matrix, scene, index, model.gsd_m, verify)
-    return log10_odds(model.found, chance, scene.n_edges, estimator.ledger.n_tried, verify)
+    return log10_odds(model.found, chance, scene.n_statements, estimator.ledger.n_tried, verify)
 
 
 def _leads(matrix: FloatArray, scene: Scene, index: ReferenceIndex, options: CandidateOptions) -> bool:

@@ -391,4 +391,4 @@ def _odds(pose: Pose, scene: Scene, reference: Reference, options: LocateOptions
     # rival: shifts that meet whole blocks are left out, and what it would agree in elsewhere several of the best tell.
     nearby = replace(verify, n_anchors=0)
     chance = chance_agreement(matrix, scene, index, gsd, nearby, _EVERY, _RIVALS)
-    return log10_odds(found, chance, scene.n_edges, 1, verify)
+    return log10_odds(found, chance, scene.n_statements, 1, verify)
