@@ -21,9 +21,12 @@ from roadgeo.kernels.triple_codes import (
     turned,
 )
 
-__all__ = ["count_alike", "gather", "look_up_each", "vertex_probes"]
+__all__ = ["count_alike", "gather", "look_up_each", "next_alike", "vertex_probes"]
 
 GUARDS = 0x888888
+
+#: In cells of more entries those whose sides are not alike are passed over; in smaller ones that would take longer.
+LONG_CELL = 32
 
 #: Bit r of `ALIKE[q]`: whether sides r of a vertex of the map are those of q or more, or fewer, on both tangents.
 ALIKE = np.array(
@@ -209,6 +212,51 @@ def _agree(
     )
 
 
+@kernel(forceinline=True)
+def _sides(entry: np.uint64) -> int:
+    """Return the sides of an entry's three vertices, 81 x + 9 y + z: what entries of a cell are sorted by."""
+    return int(np.int64((entry >> np.uint64(24)) & np.uint64(1023)))
+
+
+@kernel()
+def _first_with(entries: NDArray[np.uint64], e: int, end: int, sides: int) -> int:
+    """Return the first entry from `e` to `end` whose sides are at least `sides`: in steps that double, then halve."""
+    step = 1
+    while e + step < end and _sides(entries[e + step]) < sides:
+        e += step
+        step *= 2
+    low, high = e, min(e + step, end)
+    while low < high:
+        middle = (low + high) // 2
+        if _sides(entries[middle]) < sides:
+            low = middle + 1
+        else:
+            high = middle
+    return low
+
+
+@kernel()
+def next_alike(
+    entries: NDArray[np.uint64], e: int, end: int, alike_x: int, alike_y: int, alike_z: int
+) -> tuple[int, int]:
+    """Return the next run of entries with the same sides that are alike at all three vertices (see `vertex_probes`).
+
+    Entries `e` to `end` are sorted by their sides. Returns (end, end) where there is none.
+    """
+    while e < end:
+        sides = _sides(entries[e])
+        if (alike_x >> (sides // 81)) & 1 == 0:
+            e = _first_with(entries, e, end, (sides // 81 + 1) * 81)
+        elif (alike_y >> (sides // 9 % 9)) & 1 == 0:
+            e = _first_with(entries, e, end, (sides // 9 + 1) * 9)
+        else:
+            stop = _first_with(entries, e, end, sides + 1)
+            if (alike_z >> (sides % 9)) & 1 != 0:
+                return e, stop
+            e = stop
+    return end, end
+
+
 @kernel()
 def _look_up(
     query: TripleQuery, one: _Triangle, table: TripleMap, limits: TripleLimits, hits: Hits, n_hits: int
@@ -246,32 +294,38 @@ def _look_up(
                                 lows = lj | probes[vz, k, 1]
                                 highs = hj | probes[vz, k, 2]
                                 alike_x, alike_y, alike_z = probes[vx, i, 3], probes[vy, j, 3], probes[vz, k, 3]
-                                for e in range(starts[cell], starts[cell + 1]):
-                                    compared += 1
-                                    entry = entries[e]
-                                    # All six angles at once, then the sides, then the map itself.
-                                    fine = np.int64(entry & np.uint64(0xFFFFFF))
-                                    if ((fine | GUARDS) - lows) & (highs - fine) & GUARDS != GUARDS:
-                                        continue
-                                    around = np.int64((entry >> np.uint64(24)) & np.uint64(1023))
-                                    alike = (alike_x >> (around // 81)) & (alike_y >> (around // 9 % 9))
-                                    if alike & (alike_z >> (around % 9)) & 1 == 0:
-                                        continue
-                                    x, y, z = _places(entry, turn, ref_neighbours)
-                                    if x < 0:
-                                        continue
-                                    passes, j00, j01, j10, j11 = _fit_affine(one, ref_xy, x, y, z, limits)
-                                    if not passes or not _agree(
-                                        branches, one, ref_branches, x, y, z, j00, j01, j10, j11, limits.min_cos
-                                    ):
-                                        continue
-                                    if n_hits >= ids.shape[0]:
-                                        return n_hits, compared
-                                    ids[n_hits, 0], ids[n_hits, 1], ids[n_hits, 2] = x, one.s, y
-                                    ids[n_hits, 3], ids[n_hits, 4] = one.t, z
-                                    affine[n_hits, 0], affine[n_hits, 1] = j00, j01
-                                    affine[n_hits, 2], affine[n_hits, 3] = j10, j11
-                                    n_hits += 1
+                                e, end = np.int64(starts[cell]), np.int64(starts[cell + 1])
+                                while e < end:
+                                    stop = end
+                                    if end - e > LONG_CELL:
+                                        e, stop = next_alike(entries, e, end, alike_x, alike_y, alike_z)
+                                    compared += stop - e
+                                    while e < stop:
+                                        entry = entries[e]
+                                        e += 1
+                                        # All six angles at once, then the sides, then the map itself.
+                                        fine = np.int64(entry & np.uint64(0xFFFFFF))
+                                        if ((fine | GUARDS) - lows) & (highs - fine) & GUARDS != GUARDS:
+                                            continue
+                                        around = _sides(entry)
+                                        alike = (alike_x >> (around // 81)) & (alike_y >> (around // 9 % 9))
+                                        if alike & (alike_z >> (around % 9)) & 1 == 0:
+                                            continue
+                                        x, y, z = _places(entry, turn, ref_neighbours)
+                                        if x < 0:
+                                            continue
+                                        passes, j00, j01, j10, j11 = _fit_affine(one, ref_xy, x, y, z, limits)
+                                        if not passes or not _agree(
+                                            branches, one, ref_branches, x, y, z, j00, j01, j10, j11, limits.min_cos
+                                        ):
+                                            continue
+                                        if n_hits >= ids.shape[0]:
+                                            return n_hits, compared
+                                        ids[n_hits, 0], ids[n_hits, 1], ids[n_hits, 2] = x, one.s, y
+                                        ids[n_hits, 3], ids[n_hits, 4] = one.t, z
+                                        affine[n_hits, 0], affine[n_hits, 1] = j00, j01
+                                        affine[n_hits, 2], affine[n_hits, 3] = j10, j11
+                                        n_hits += 1
     return n_hits, compared
 
 

@@ -28,6 +28,7 @@ from roadgeo.matching.refinement import RefineOptions, refine
 from roadgeo.matching.road_growth import Grown
 from roadgeo.matching.road_search import RoadSearch, RoadSearchOptions
 from roadgeo.matching.scene import Scene
+from roadgeo.matching.shared_sweeps import SharedSweeps, Stage
 from roadgeo.matching.sweeps import LAST, USUAL, Source, Sweep
 from roadgeo.matching.trace import NO_TRACE, Trace
 from roadgeo.matching.triples import Proposals, larger
@@ -116,10 +117,11 @@ class TripleEstimator:
         near: tuple[float, float, float] | None = None,
         trace: Trace = NO_TRACE,
         ledger: Ledger | None = None,
+        sweeps: SharedSweeps[TripleEstimator] | None = None,
     ) -> None:
         """`near` = (x, y, radius) in plane metres restricts where the middle of the frame may lie.
 
-        The `ledger` is shared with the estimators of other parts that are searched together with this one.
+        The `ledger` and the `sweeps` are shared with the estimators of other parts that are searched with this one.
         """
         self.near = near
         self.ledger = ledger or Ledger()
@@ -139,19 +141,21 @@ class TripleEstimator:
         self._tried: set[Lead] = set()
         self._roads: RoadSearch | None = None
         self._grown_by_roads: list[Hypothesis] = []
+        self.sweeps = sweeps or SharedSweeps(scene, camera)
+        self.sweeps.members.append(self)
         trace.began(self)
 
     def stages(self) -> Iterator[Iterator[list[Hypothesis]]]:
         """Yield, for one anchor after another, the hypotheses that grew: of triples, of roads, of single triples."""
         options = self.options
         for stage, source in enumerate(options.sweeps):
-            yield self._sweep(stage, source, options.grow)
+            yield self.sweeps.rounds(self, Stage(stage, source, options.grow))
         if options.roads is not None and len(self.scene.intersections):
             yield self._rounds_of_roads(options.roads)
         if options.lens is not None and options.last:
             yield self._rounds_of_lenses(options.lens)
         for stage, source in enumerate(options.last, len(options.sweeps) + 1):
-            yield self._sweep(stage, source, options.last_grow)
+            yield self.sweeps.rounds(self, Stage(stage, source, options.last_grow))
         if options.lens is not None and options.last:
             yield self._rounds_of_lenses(options.lens)
 
@@ -168,17 +172,11 @@ class TripleEstimator:
 
     def follow(self, leads: Sequence[Lead]) -> Iterator[list[Hypothesis]]:
         """Yield what grew from anchors that led to a place on another part (see `search.Estimator`)."""
-        options = self.options
         for stage, anchor in leads:
-            if (stage, anchor) in self._tried:
-                continue
-            if stage < len(options.sweeps):
-                yield from self._sweep(stage, options.sweeps[stage], options.grow, only=[anchor])
-            elif stage > len(options.sweeps):
-                source = options.last[stage - len(options.sweeps) - 1]
-                yield from self._sweep(stage, source, options.last_grow, only=[anchor])
-            elif options.roads is not None:
-                yield from self._rounds_of_roads(options.roads, [anchor])
+            if stage != len(self.options.sweeps):
+                yield self.sweeps.pending(self, stage, anchor)
+            elif self.options.roads is not None:
+                yield from self._rounds_of_roads(self.options.roads, [anchor])
 
     @property
     def n_anchors(self) -> int:
@@ -241,42 +239,33 @@ class TripleEstimator:
         """Whether a verified place that is promising was proposed by another intersection as well."""
         return known.log10_odds >= self.options.verify.promising and self.same(known, hypothesis)
 
-    def _enough(self, stage: int) -> bool:
+    def known_places(self) -> list[Hypothesis]:
+        """Return what was verified and fits (see `shared_sweeps.Member`)."""
+        return self._whole
+
+    def enough(self, stage: Stage) -> bool:
         """Whether as many places were screened by the usual sweeps, or the last, as on one map of all parts' size."""
         options, larger_by = self.options, larger(max(self.ledger.n_reference, len(self.index)))
-        if stage < len(options.sweeps):
+        if stage.number < len(options.sweeps):
             return self.ledger.n_usual >= int(options.max_places * larger_by)
         return self.ledger.n_last >= int(options.max_last_places * larger_by)
 
-    def _sweep(
-        self, stage: int, source: Source, grow: GrowOptions, only: Sequence[int] | None = None
-    ) -> Iterator[list[Hypothesis]]:
-        """Yield what grew from the proposals of a source, until enough places were screened."""
-        scene, camera = self.scene, self.options.camera
-        low, high = camera.gsd_m
-        scale = (low / grow.max_scale_ratio, high * grow.max_scale_ratio)
-        if only is None and self._enough(stage):
-            return
-        for proposals in source.proposals(scene, self.index, scale, camera.min_shape_ratio, only):
-            if only is None and self._enough(stage):
-                return
-            if (stage, proposals.anchor) in self._tried:
-                continue
-            self._tried.add((stage, proposals.anchor))
-            self.n_tuples += proposals.n_tuples
-            self.n_candidates += proposals.n_hits
-            yield self._grow_all(proposals, grow, stage)
-
-    def _screen(self, proposals: Proposals, options: GrowOptions, stage: int) -> IntArray:
+    def screen(self, proposals: Proposals, allowed: BoolArray, most: int, stage: Stage) -> IntArray:
         """Return the proposals that are allowed and lie on roads, the best placed first."""
-        allowed = self._is_allowed(proposals)
-        looked_at = np.flatnonzero(allowed)[: options.max_screened]
-        self._count(len(looked_at), stage)
-        kept = screen_proposals(self.scene, self.index, proposals, looked_at, options)
+        self._tried.add((stage.number, proposals.anchor))
+        self.n_tuples += proposals.n_tuples
+        self.n_candidates += proposals.n_hits
+        looked_at = np.flatnonzero(allowed)[:most]
+        self._count(len(looked_at), stage.number)
+        if stage.number < len(self.options.sweeps):
+            self.ledger.n_usual += len(looked_at)
+        else:
+            self.ledger.n_last += len(looked_at)
+        kept = screen_proposals(self.scene, self.index, proposals, looked_at, stage.grow)
         self.trace.screened(proposals, allowed, kept)
         return kept
 
-    def _is_allowed(self, proposals: Proposals) -> BoolArray:
+    def allow(self, proposals: Proposals) -> BoolArray:
         """Tell which proposals put the frame's middle where it may be, and its up where it may point."""
         j00, j01, j10, j11 = proposals.affine.T
         allowed = np.ones(len(j00), bool)
@@ -293,16 +282,10 @@ class TripleEstimator:
         options, camera = options or self.options.grow, self.options.camera
         return grow_proposals(self.scene, self.index, proposals, chosen, options, camera)
 
-    def _grow_all(self, proposals: Proposals, options: GrowOptions, stage: int) -> list[Hypothesis]:
+    def follow_up(self, proposals: Proposals, chosen: IntArray, stage: Stage) -> list[Hypothesis]:
         """Return the best grown proposals of one anchor that mean different places and that a camera can have seen."""
-        before = self.n_screened
-        chosen = self._screen(proposals, options, stage)[: options.max_grown]
-        if stage < len(self.options.sweeps):
-            self.ledger.n_usual += self.n_screened - before
-        else:
-            self.ledger.n_last += self.n_screened - before
         self.n_hypotheses += len(chosen)
-        grown = self.grow(proposals, chosen, options)
+        grown = self.grow(proposals, chosen, stage.grow)
         self.trace.grown(grown)
         distinct: list[Hypothesis] = []
         again: set[int] = set()
@@ -313,10 +296,10 @@ class TripleEstimator:
             again.update(known)
             if not known and not any(self.same(h, other) for other in distinct):
                 distinct.append(h)
-                if len(distinct) == options.max_verified:
+                if len(distinct) == stage.grow.max_verified:
                     break
         for one in (*distinct, *(self._whole[k] for k in again)):
-            one.leads.append((stage, proposals.anchor))
+            one.leads.append((stage.number, proposals.anchor))
         return distinct
 
     def score(self, model: Hypothesis) -> float:

@@ -76,6 +76,8 @@ def screen_proposals(
     scene: Scene, index: ReferenceIndex, proposals: Proposals, looked_at: IntArray, options: GrowOptions
 ) -> IntArray:
     """Return those of the proposals `looked_at` that put roads around the anchor on roads of the map, best first."""
+    if len(looked_at) == 0:
+        return looked_at
     anchor = scene.intersections.xy[proposals.anchor]
     away = np.hypot(*(scene.points - anchor).T)
     last = scene.neighbours[proposals.anchor]
@@ -103,6 +105,8 @@ def grow_proposals(
     camera: CameraOptions,
 ) -> list[Hypothesis]:
     """Grow the chosen proposals of one anchor; return those that did not wither, the best supported first."""
+    if len(chosen) == 0:
+        return []
     # The query: intersections outwards from the anchor, and which of its neighbours each proposal is made of.
     xy, anchor = scene.intersections.xy, proposals.anchor
     order = np.argsort(np.hypot(*(xy - xy[anchor]).T), kind="stable")[: options.max_points]

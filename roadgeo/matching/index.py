@@ -279,7 +279,7 @@ def _are_short(segments: AnyArray, ids: AnyArray) -> bool:
 
 
 def check_table(index: ReferenceIndex) -> None:
-    """Check that every table entry points to intersections that exist.
+    """Check that every table entry points to intersections that exist, and stands where it is looked for.
 
     `from_parts` leaves that to the kernels, which believe no entry: it would read the whole table.
     """
@@ -293,6 +293,9 @@ def check_table(index: ReferenceIndex) -> None:
         slots = ((entries >> np.uint64(shift)) & np.uint64(7)).astype(np.int64)
         if int(slots.max()) >= index.neighbours.shape[1] or (index.neighbours[anchors, slots] < 0).any():
             raise IndexFormatError("a table entry is out of range; rebuild the index with `roadgeo index`")
+    places = _place_in_table(np.repeat(np.arange(TABLE, dtype=np.int32), np.diff(index.table_starts)), entries)
+    if (places[1:] < places[:-1]).any():
+        raise IndexFormatError("the table's entries are not in order; rebuild the index with `roadgeo index`")
 
 
 def neighbour_grid(xy: FloatArray, min_bucket: float) -> tuple[tuple[float, float, float], tuple[int, int]]:
@@ -347,8 +350,9 @@ def _tabulate(
 ) -> tuple[Int32Array, AnyArray]:
     """Return starts and entries of the table of triples (see `kernels.triple_codes`).
 
-    Within a cell the entries stand in random order, always the same: where a look-up ends before the cell does, it has
-    seen all parts of the map alike.
+    Within a cell the entries are sorted by their sides, so that a look-up passes over those that are not alike, and
+    among equals stand in random order, always the same: where a look-up ends before the cell does, it has seen all
+    parts of the map alike.
     """
     sides = np.empty(tangents.shape, np.int8)
     find_sides(tangents, branches, sides)
@@ -359,9 +363,16 @@ def _tabulate(
     entries = np.empty(total, np.uint64)
     fill_table(xy, tangents, sides, neighbours, *shape_limit, starts.copy(), entries)
     order = np.random.default_rng(_SHUFFLE_SEED).permutation(total)
-    cells = np.repeat(np.arange(TABLE, dtype=np.int32), np.diff(starts))
-    entries = entries[order[np.argsort(cells[order], kind="stable")]]
+    entries = entries[order]
+    cells = np.repeat(np.arange(TABLE, dtype=np.int32), np.diff(starts))[order]
+    entries = entries[np.argsort(_place_in_table(cells, entries), kind="stable")]
     return starts.astype(np.int32), entries
+
+
+def _place_in_table(cells: Int32Array, entries: AnyArray) -> Int32Array:
+    """Return what entries are sorted by: their cells, and within those their sides (see `kernels.triple_codes`)."""
+    sides = ((entries >> np.uint64(24)) & np.uint64(1023)).astype(np.int32)
+    return np.asarray(cells * np.int32(1024) + sides, np.int32)
 
 
 def crop(index: ReferenceIndex, center: tuple[float, float], radius_m: float) -> ReferenceIndex:

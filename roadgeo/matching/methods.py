@@ -25,6 +25,7 @@ from roadgeo.matching.paper.tuples import PairIndex, PairOptions, build_pair_ind
 from roadgeo.matching.parts import Near, Part, same_within_m
 from roadgeo.matching.query import Query
 from roadgeo.matching.search import Search, SearchResult, search_together
+from roadgeo.matching.shared_sweeps import SharedSweeps
 from roadgeo.matching.trace import NO_TRACE, Trace
 from roadgeo.matching.triples import larger
 from roadgeo.roads.intersections import Intersections
@@ -125,7 +126,9 @@ def search_references(
     if options.method == "pair":
         return _search_pairs_in_turn(query, indexes, _within(options, time_limit_s))
     started, ledger = time.perf_counter(), Ledger()
-    opened = [_Attempt.open(query, one, options, trace, ledger) for one, trace in zip(indexes, traces, strict=True)]
+    sweeps: SharedSweeps[TripleEstimator] = SharedSweeps(query.scene, options.match.camera, _same_place)
+    shared = (ledger, sweeps)
+    opened = [_Attempt.open(query, one, options, trace, *shared) for one, trace in zip(indexes, traces, strict=True)]
     ledger.n_reference = sum(one.n_searched for one in opened if one.search is not None)
     left = time_limit_s - (time.perf_counter() - started)
     estimators = {one.search: one.estimator for one in opened if one.search is not None and one.estimator is not None}
@@ -154,6 +157,12 @@ def _same_ground(one: TripleEstimator, a: Hypothesis, other: TripleEstimator, b:
     return metres_apart(*places) <= same_within_m(one.index, other.index, b.matrix, other.scene.size)
 
 
+def _same_place(one: TripleEstimator, a: Hypothesis, other: TripleEstimator, b: Hypothesis) -> bool:
+    """Whether hypotheses on two shards of one map mean one place."""
+    shard_of = one.index.meta.get("shard_of")
+    return bool(shard_of) and shard_of == other.index.meta.get("shard_of") and _same_ground(one, a, other, b)
+
+
 @dataclass(frozen=True)
 class _Attempt:
     """A reference that is searched; or is not, for it has hardly an intersection near the place that was given."""
@@ -166,7 +175,13 @@ class _Attempt:
 
     @classmethod
     def open(
-        cls, query: Query, index: ReferenceIndex, options: LocateOptions, trace: Trace, ledger: Ledger
+        cls,
+        query: Query,
+        index: ReferenceIndex,
+        options: LocateOptions,
+        trace: Trace,
+        ledger: Ledger,
+        sweeps: SharedSweeps[TripleEstimator],
     ) -> _Attempt:
         part, near = index, _near(index, options.near)
         if near is not None:
@@ -174,7 +189,7 @@ class _Attempt:
             part = _part(index, near[:2], reach)
             if len(part) < options.min_intersections:
                 return cls(index, len(part))
-        estimator = TripleEstimator(query.scene, part, promising_options(options), near, trace, ledger)
+        estimator = TripleEstimator(query.scene, part, promising_options(options), near, trace, ledger, sweeps)
         return cls(index, len(part), estimator, Search(estimator), trace)
 
     def found(self, scale: float) -> Found:

@@ -18,17 +18,12 @@ class Source(Protocol):
     """Where hypotheses come from: `Sweep` makes them of triples."""
 
     def proposals(
-        self,
-        scene: Scene,
-        index: ReferenceIndex,
-        scale: tuple[float, float],
-        min_ratio: float,
-        only: Sequence[int] | None = None,
-    ) -> Iterator[Proposals]:
-        """Yield what one query intersection after another may be, with the work it took, the most promising first.
+        self, scene: Scene, indexes: Sequence[ReferenceIndex], scale: tuple[float, float], min_ratio: float
+    ) -> Iterator[list[Proposals]]:
+        """Yield what one query intersection after another may be on each index, the most promising first.
 
         `scale` = (least, greatest) root of the determinant of a proposed map, metres per pixel; `min_ratio` is the
-        least ratio of its singular values; `only` names the intersections to try, all that are worth it by default.
+        least ratio of its singular values.
         """
 
 
@@ -50,17 +45,13 @@ class Sweep:
     most_more: float = 3.0
 
     def proposals(
-        self,
-        scene: Scene,
-        index: ReferenceIndex,
-        scale: tuple[float, float],
-        min_ratio: float,
-        only: Sequence[int] | None = None,
-    ) -> Iterator[Proposals]:
+        self, scene: Scene, indexes: Sequence[ReferenceIndex], scale: tuple[float, float], min_ratio: float
+    ) -> Iterator[list[Proposals]]:
         """Yield the proposals of the anchors (see `Source`)."""
-        found, limits = scene.intersections, (scale, min_ratio)
-        anchors = propose(found, scene.branches, scene.neighbours, index, *limits, self.triples, only)
-        return islice(anchors, int(self.max_anchors * min(smaller(len(index)), self.most_more)))
+        found = scene.intersections
+        anchors = propose(found, scene.branches, scene.neighbours, indexes, scale, min_ratio, self.triples)
+        more = min(smaller(sum(map(len, indexes))), self.most_more)
+        return islice(anchors, int(self.max_anchors * more))
 
 
 #: Where the rarest triples lead nowhere, more neighbours are taken, all over the frame.

@@ -11,6 +11,7 @@ from __future__ import annotations
 import math
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, replace
+from functools import lru_cache
 
 import numpy as np
 
@@ -80,9 +81,10 @@ class TripleOptions:
     max_hits: int = 12_000
     max_compared: int = 400_000
 
-    def bounds(self, n_reference: int) -> tuple[int, int]:
-        """Return `max_hits` and `max_compared` for a map of so many intersections."""
-        return int(self.max_hits * larger(n_reference)), int(self.max_compared * larger(n_reference))
+    def bounds(self, n_reference: int, share: float = 1.0) -> tuple[int, int]:
+        """Return `max_hits` and `max_compared` for a share of a map of so many intersections."""
+        scale = share * larger(n_reference)
+        return max(int(self.max_hits * scale), 1), int(self.max_compared * scale)
 
 
 @dataclass(frozen=True)
@@ -127,32 +129,28 @@ def propose(
     query: Intersections,
     branches: AnyArray,
     neighbours: Int32Array,
-    index: ReferenceIndex,
+    indexes: Sequence[ReferenceIndex],
     scale: tuple[float, float],
     min_ratio: float,
     options: TripleOptions,
-    only: Sequence[int] | None = None,
-) -> Iterator[Proposals]:
-    """Yield the proposals of one anchor after another (see `TripleOptions.spread`); `only` names the anchors to try."""
+) -> Iterator[list[Proposals]]:
+    """Yield, for one anchor after another (see `TripleOptions.spread`), what it proposes on each of the indexes.
+
+    Which anchors and triples come first, and how much is compared, is told by all indexes together, as if they were
+    one; each gets a share of the bounds that grows with what it has to compare.
+    """
     neighbours = np.ascontiguousarray(neighbours[:, : options.n_neighbours])
-    k = neighbours.shape[1]
     weighed = np.arange(0, len(query), max(1, math.ceil(len(query) / options.max_weighed)))
-    if only is not None:
-        weighed = np.array(only, np.int64)
-    # how many entries of the table each pair of an anchor's neighbours would have to be compared with
+    # how many entries of the tables each pair of an anchor's neighbours would have to be compared with
     sides = np.empty(query.tangents.shape, np.int8)
     find_sides(query.tangents, branches, sides)
-    costs = np.empty((len(weighed), k, k), np.int64)
-    count_alike(
-        query.xy, query.tangents, sides, neighbours, weighed, options.min_shape, options.codes_per_vertex,
-        index.table_starts, costs,
-    )  # fmt: skip
+    seen = TripleQuery(query.xy, branches, query.tangents, sides, neighbours)
+    costs = _count_alike(seen, weighed, options, _starts(tuple(indexes)))
+    n_reference = sum(map(len, indexes))
     tolerance = round(options.angle_tolerance_deg * UNITS / 180.0)
-    max_hits, max_compared = options.bounds(len(index))
-    ids, affine = hits = Hits(np.empty((max_hits, 5), np.int64), np.empty((max_hits, 4)))
     min_cos = float(np.cos(np.radians(options.ray_tolerance_deg)))
     limits = TripleLimits(options.codes_per_vertex, tolerance, min_cos, scale, min_ratio)
-    seen = TripleQuery(query.xy, branches, query.tangents, sides, neighbours)
+    hits = Hits(np.empty((options.bounds(n_reference)[0], 5), np.int64), np.empty((options.bounds(n_reference)[0], 4)))
     # anchors with rare codes first, or those that lie furthest from the ones before
     usable = costs >= 0
     total = np.where(usable, costs, 0).sum(axis=(1, 2))
@@ -160,25 +158,76 @@ def propose(
     able = np.flatnonzero(n_usable >= 3)
     rarest = able[np.argsort(total[able] / n_usable[able], kind="stable")]
     for i in farthest_first(query.xy[weighed[able]], able) if options.spread else rarest:
-        # hits of an anchor's triples, rare codes first
-        a = weighed[i]
+        a = int(weighed[i])
         slots = np.argwhere(usable[i])
         slots = np.ascontiguousarray(slots[np.argsort(costs[i][usable[i]], kind="stable")])
-        n_hits, n_compared = look_up_each(seen, int(a), slots, max_compared, index.triple_map, limits, hits)
-        if options.single:
-            yield _each_hit(int(a), ids[:n_hits], affine[:n_hits].copy(), k, len(slots), n_compared)
-            continue
-        # hits on one intersection of the map that agree make one proposal: most neighbours placed first
-        out_ids = np.empty((max(n_hits // 2, 1), k + 1), np.int64)
-        out_affine = np.empty((len(out_ids), 4))
-        out_placed = np.empty(len(out_ids), np.int64)
-        order = np.argsort(ids[:n_hits, 0], kind="stable")
-        n = gather(ids, affine, order, k, options.affine_tolerance, out_ids, out_affine, out_placed)
-        best = np.lexsort((_scattered(out_ids[:n, 0]), -out_placed[:n]))
-        yield Proposals(
-            int(a), out_ids[best, 0], out_ids[best, 1:], out_affine[best], out_placed[best],
-            len(slots), n_compared, n_hits,
-        )  # fmt: skip
+        shares = _shares(seen, a, indexes, options)
+        yield [
+            _look_up(seen, a, slots, index, options.bounds(n_reference, share), limits, hits, options)
+            for index, share in zip(indexes, shares, strict=True)
+        ]
+
+
+@lru_cache(maxsize=4)
+def _starts(indexes: tuple[ReferenceIndex, ...]) -> Int32Array:
+    """Return where the cells of the tables of all indexes would start in one; in larger units where they are many."""
+    if len(indexes) == 1:
+        return indexes[0].table_starts
+    starts = np.zeros(len(indexes[0].table_starts), np.int64)
+    for index in indexes:
+        starts += index.table_starts
+    return (starts >> max(0, int(starts[-1]).bit_length() - 31)).astype(np.int32)
+
+
+def _count_alike(seen: TripleQuery, anchors: IntArray, options: TripleOptions, starts: Int32Array) -> IntArray:
+    """Return how many entries of a table are in the cells of each triple of the anchors (see `count_alike`)."""
+    k = seen.neighbours.shape[1]
+    costs = np.empty((len(anchors), k, k), np.int64)
+    count_alike(
+        seen.xy, seen.tangents, seen.sides, seen.neighbours, anchors, options.min_shape, options.codes_per_vertex,
+        starts, costs,
+    )  # fmt: skip
+    return costs
+
+
+def _shares(seen: TripleQuery, anchor: int, indexes: Sequence[ReferenceIndex], options: TripleOptions) -> FloatArray:
+    """Return how to share out an anchor's work: half of it by size, half by what there is to compare."""
+    if len(indexes) == 1:
+        return np.ones(1)
+    one = np.array([anchor])
+    sizes = np.array([len(index) for index in indexes], float)
+    costs = [np.maximum(_count_alike(seen, one, options, index.table_starts), 0).sum() for index in indexes]
+    return np.asarray(sizes / sizes.sum() + np.array(costs) / max(sum(costs), 1)) / 2.0
+
+
+def _look_up(
+    seen: TripleQuery,
+    anchor: int,
+    slots: IntArray,
+    index: ReferenceIndex,
+    bounds: tuple[int, int],
+    limits: TripleLimits,
+    hits: Hits,
+    options: TripleOptions,
+) -> Proposals:
+    """Look an anchor's triples up in one index; return what they propose there, the best placed first."""
+    max_hits, max_compared = bounds
+    ids, affine = hits = Hits(hits.ids[:max_hits], hits.affine[:max_hits])
+    n_hits, n_compared = look_up_each(seen, anchor, slots, max_compared, index.triple_map, limits, hits)
+    k = seen.neighbours.shape[1]
+    if options.single:
+        return _each_hit(anchor, ids[:n_hits], affine[:n_hits].copy(), k, len(slots), n_compared)
+    # hits on one intersection of the map that agree make one proposal: most neighbours placed first
+    out_ids = np.empty((max(n_hits // 2, 1), k + 1), np.int64)
+    out_affine = np.empty((len(out_ids), 4))
+    out_placed = np.empty(len(out_ids), np.int64)
+    order = np.argsort(ids[:n_hits, 0], kind="stable")
+    n = gather(ids, affine, order, k, options.affine_tolerance, out_ids, out_affine, out_placed)
+    best = np.lexsort((_scattered(out_ids[:n, 0]), -out_placed[:n]))
+    return Proposals(
+        anchor, out_ids[best, 0], out_ids[best, 1:], out_affine[best], out_placed[best],
+        len(slots), n_compared, n_hits,
+    )  # fmt: skip
 
 
 def _each_hit(

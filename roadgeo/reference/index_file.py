@@ -57,7 +57,7 @@ __all__ = [
 ]
 
 #: See the module's docstring for when it goes up, and what becomes of other versions.
-FORMAT_VERSION = 3
+FORMAT_VERSION = 4
 
 _MAGIC = b"\x89roadgeo index\r\n"
 _PREAMBLE = struct.Struct("<16sII32s8x")

@@ -30,7 +30,7 @@ from roadgeo.kernels.triple_codes import (
     vertex_angle,
     vertex_codes,
 )
-from roadgeo.kernels.triples import count_alike, gather, look_up_each, vertex_probes
+from roadgeo.kernels.triples import LONG_CELL, count_alike, gather, look_up_each, next_alike, vertex_probes
 
 MIN_SHAPE = 0.08
 MIN_COS = np.cos(np.radians(25))
@@ -64,6 +64,8 @@ class World:
         free = self.starts.copy()
         assert fill_table(*arguments, free, self.entries) == total
         assert np.array_equal(free[:-1], self.starts[1:])
+        cells = np.repeat(np.arange(TABLE), np.diff(self.starts))
+        self.entries = self.entries[np.lexsort((self.entries >> np.uint64(24) & np.uint64(1023), cells))]
         self.starts = self.starts.astype(np.int32)
 
     @property
@@ -237,6 +239,31 @@ class TestVertexProbes:
             assert found == {other for other in every if naive.alike(code(u1, u2, own), code(*other), tolerance)}
 
 
+class TestNextAlike:
+    @given(
+        st.lists(st.one_of(st.integers(0, 728), st.integers(0, 20)), max_size=80),
+        st.tuples(*[st.sets(st.integers(0, 8))] * 3),
+        st.integers(0, 80),
+    )
+    def test_like_the_twin(self, sides, alike, e):
+        sides = np.sort(np.array(sides, np.int64))
+        noise = np.random.default_rng(0).integers(0, 2**24, len(sides))
+        entries = (sides.astype(np.uint64) << np.uint64(24)) | noise.astype(np.uint64) | np.uint64(5 << 40)
+        e = min(e, len(sides))
+        bits = [sum(1 << digit for digit in some) for some in alike]
+        assert next_alike(entries, e, len(sides), *bits) == naive.next_alike(sides, e, alike)
+
+    def test_ends_where_nothing_is_in_order(self):
+        entries = np.random.default_rng(1).integers(0, 2**63, 500).astype(np.uint64)
+        e, n = 0, 0
+        while e < 500:
+            first, stop = next_alike(entries, e, 500, 5, 9, 511)
+            assert e <= first <= stop <= 500
+            assert first < stop or stop == 500
+            e, n = stop, n + 1
+        assert n > 0
+
+
 def cell_of(code):
     """The cells of three codes."""
     return tuple((u // CELL_UNITS, v // CELL_UNITS) for (u, _), (v, _) in code)
@@ -300,6 +327,30 @@ class TestLookUp:
             assert compared >= len(ids)
             n += len(expected)
         assert n > 10
+
+    def test_entries_that_are_not_alike_are_passed_over_in_long_cells(self):
+        """Many times the same triples, with other sides too: each is found as often, and few others are compared."""
+        world = World()
+        copies, rng = 40, np.random.default_rng(5)
+        cells = np.repeat(np.arange(TABLE), np.diff(world.starts))
+        entries = np.repeat(world.entries, copies)
+        others = np.arange(len(entries)) % copies > 0
+        sides = rng.integers(0, 729, len(entries)).astype(np.uint64) << np.uint64(24)
+        entries[others] = (entries & ~np.uint64(1023 << 24) | sides)[others]
+        many = World()
+        cells = np.repeat(cells, copies)
+        many.entries = entries[np.lexsort((entries >> np.uint64(24) & np.uint64(1023), cells))]
+        many.starts = (world.starts * copies).astype(np.int32)
+        assert np.diff(many.starts).max() > LONG_CELL
+        n, n_before, n_compared = 0, 0, 0
+        for a, s, t in list(self.slots(world))[::40]:
+            before = self.run(world, world, a, [sorted((s, t))], 5)
+            after = self.run(many, world, a, [sorted((s, t))], 5)
+            found = Counter(map(tuple, after[0].tolist()))
+            assert not Counter(map(tuple, before[0].tolist())) - found
+            n, n_before, n_compared = n + 1, n_before + before[2], n_compared + after[2]
+        assert n > 5
+        assert n_compared < 0.7 * copies * n_before
 
     def test_enough_is_enough(self, world):
         slots = list(combinations(range(4), 2))

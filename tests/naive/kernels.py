@@ -481,6 +481,18 @@ def look_up(code, table, tolerance):
     return hits
 
 
+def next_alike(sides, e, alike):
+    """(first, last + 1) of the next run of equal sides from `e` on that stand in all three sets; the end if none do."""
+    while e < len(sides):
+        stop = e
+        while stop < len(sides) and sides[stop] == sides[e]:
+            stop += 1
+        if all(digit in some for digit, some in zip(np.unravel_index(sides[e], (9, 9, 9)), alike, strict=True)):
+            return e, stop
+        e = stop
+    return e, e
+
+
 def look_up_each(query, a, slots, world, limit, tolerance, ray_tolerance, scale, min_ratio):
     """All (b, c, A, B, C), b and c counterclockwise after a, of one anchor's triples, through the gates."""
     table, found = list(world.decoded()), set()

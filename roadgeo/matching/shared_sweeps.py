@@ -1,0 +1,167 @@
+"""Sweeps over all parts of one search: an intersection of the query is looked for on all of them at a time.
+
+What it proposes is bounded as on one map: of all parts together the best proposals are screened, of those that lie on
+roads as many are grown, and of what grew the best are verified. So a search of many parts takes little longer than that
+of one, and the place has to be better than chance on each of them only once.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterator, Sequence
+from typing import Generic, NamedTuple, Protocol, TypeAlias, TypeVar
+
+import numpy as np
+
+from roadgeo._arrays import BoolArray, IntArray
+from roadgeo.geometry.camera import CameraOptions
+from roadgeo.matching.growing import GrowOptions
+from roadgeo.matching.hypothesis import Hypothesis
+from roadgeo.matching.index import ReferenceIndex
+from roadgeo.matching.scene import Scene
+from roadgeo.matching.sweeps import Source
+from roadgeo.matching.triples import Proposals
+
+__all__ = ["Member", "SharedSweeps", "Stage"]
+
+
+class Stage(NamedTuple):
+    """A sweep: its number among the stages of a search, where its proposals come from, and how they are followed."""
+
+    number: int
+    source: Source
+    grow: GrowOptions
+
+
+class Member(Protocol):
+    """One part that is searched."""
+
+    @property
+    def index(self) -> ReferenceIndex:
+        """What is searched."""
+
+    def allow(self, proposals: Proposals) -> BoolArray:
+        """Tell which proposals the user's hints allow."""
+
+    def screen(self, proposals: Proposals, allowed: BoolArray, most: int, stage: Stage) -> IntArray:
+        """Return those of the first `most` that are allowed and that lie on roads, the best first."""
+
+    def follow_up(self, proposals: Proposals, chosen: IntArray, stage: Stage) -> list[Hypothesis]:
+        """Return what grew from the chosen proposals, different places, the best supported first."""
+
+    def enough(self, stage: Stage) -> bool:
+        """Whether as many places were screened on all parts as are on one map of their size."""
+
+    def known_places(self) -> Sequence[Hypothesis]:
+        """Return the hypotheses that were verified and fit, of which no better version is to be expected."""
+
+
+AnyMember = TypeVar("AnyMember", bound=Member)
+
+#: Whether hypotheses on two parts are one place of one map, which is cut into overlapping pieces.
+SamePlace: TypeAlias = Callable[[AnyMember, Hypothesis, AnyMember, Hypothesis], bool]
+
+
+class SharedSweeps(Generic[AnyMember]):
+    """The sweeps of the parts of one search; each part takes from them what concerns it.
+
+    Attributes
+    ----------
+    members : list
+        The parts; all have joined before the first takes anything.
+    """
+
+    def __init__(self, scene: Scene, camera: CameraOptions, same_place: SamePlace[AnyMember] | None = None) -> None:
+        """Begin without parts. `same_place` is asked of hypotheses on different parts."""
+        self.scene, self.camera, self.same_place = scene, camera, same_place
+        self.members: list[AnyMember] = []
+        self._rounds: dict[int, Iterator[_Round]] = {}
+        self._done: dict[int, list[_Round]] = {}
+
+    def rounds(self, member: AnyMember, stage: Stage) -> Iterator[list[Hypothesis]]:
+        """Yield what grew on a part from the proposals of one anchor after another, until enough were screened."""
+        rounds = self._rounds.setdefault(stage.number, self._work(stage))
+        done = self._done.setdefault(stage.number, [])
+        n = 0
+        while True:
+            if n == len(done):
+                one = next(rounds, None)
+                if one is None:
+                    return
+                done.append(one)
+            yield done[n].grown.pop(id(member), [])
+            n += 1
+
+    def pending(self, member: AnyMember, stage: int, anchor: int) -> list[Hypothesis]:
+        """Return what grew on a part from an anchor and was not taken yet."""
+        found = (one.grown.pop(id(member), []) for one in self._done.get(stage, []) if one.anchor == anchor)
+        return next(found, [])
+
+    def _work(self, stage: Stage) -> Iterator[_Round]:
+        low, high = self.camera.gsd_m
+        scale = (low / stage.grow.max_scale_ratio, high * stage.grow.max_scale_ratio)
+        if self.members[0].enough(stage):
+            return
+        indexes = [member.index for member in self.members]
+        for proposals in stage.source.proposals(self.scene, indexes, scale, self.camera.min_shape_ratio):
+            if self.members[0].enough(stage):
+                return
+            yield _Round(proposals[0].anchor, self._grow(proposals, stage))
+
+    def _grow(self, proposals: Sequence[Proposals], stage: Stage) -> dict[int, list[Hypothesis]]:
+        """Follow one anchor's proposals on all parts; return the best of what grew by the part's identity."""
+        members, options = self.members, stage.grow
+        # The best placed are screened ...
+        allowed = [member.allow(one) for member, one in zip(members, proposals, strict=True)]
+        placed = [one.placed[may] for one, may in zip(proposals, allowed, strict=True)]
+        kept = [
+            member.screen(one, may, most, stage)
+            for member, one, may, most in zip(
+                members, proposals, allowed, _best(placed, options.max_screened), strict=True
+            )
+        ]
+        # ... an even share of those that lie on roads grows ...
+        share = min(options.max_grown / max(sum(map(len, kept)), 1), 1.0)
+        grown = [
+            (member, hypothesis)
+            for member, one, rows in zip(members, proposals, kept, strict=True)
+            for hypothesis in member.follow_up(one, rows[: int(np.ceil(share * len(rows)))], stage)
+        ]
+        # ... and the best of what grew are verified.
+        best: list[tuple[AnyMember, Hypothesis]] = []
+        for member, hypothesis in sorted(grown, key=lambda pair: -pair[1].support):
+            if len(best) == options.max_verified:
+                break
+            if not self._is_met(member, hypothesis, best):
+                best.append((member, hypothesis))
+        return {id(member): [one for owner, one in best if owner is member] for member, _ in best}
+
+    def _is_met(self, member: AnyMember, hypothesis: Hypothesis, best: Sequence[tuple[AnyMember, Hypothesis]]) -> bool:
+        """Whether another part that overlaps this one has the same place."""
+        if self.same_place is None:
+            return False
+        known = [(other, one) for other in self.members for one in other.known_places()]
+        return any(
+            other is not member and self.same_place(member, hypothesis, other, one) for other, one in (*best, *known)
+        )
+
+
+class _Round(NamedTuple):
+    """What grew from an anchor's proposals, by the identity of the part it grew on; less what was taken."""
+
+    anchor: int
+    grown: dict[int, list[Hypothesis]]
+
+
+def _best(placed: Sequence[IntArray], most: int) -> IntArray:
+    """Return how many of each part's proposals, the best placed first, are among the best `most` of all.
+
+    Of equals each part gives one in turn.
+    """
+    counts = np.array([len(one) for one in placed])
+    if counts.sum() <= most:
+        return counts
+    owners = np.repeat(np.arange(len(placed)), counts)
+    all_placed = np.concatenate(placed)
+    turns = np.concatenate([np.arange(len(one)) - np.searchsorted(-one, -one) for one in placed])
+    chosen = np.lexsort((turns, -all_placed))[:most]
+    return np.bincount(owners[chosen], minlength=len(placed))

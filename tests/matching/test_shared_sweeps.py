@@ -1,0 +1,156 @@
+"""Parts are swept together: an intersection of the query on all of them, and the best of what it proposes goes on."""
+
+from dataclasses import dataclass, field
+
+import numpy as np
+import pytest
+from worlds.scenes import camera, look, random_network, scene_of
+
+from roadgeo.geometry.camera import CameraOptions
+from roadgeo.matching.estimator import Ledger, MatchOptions, TripleEstimator
+from roadgeo.matching.growing import GrowOptions
+from roadgeo.matching.hypothesis import Hypothesis
+from roadgeo.matching.index import build_index
+from roadgeo.matching.search import Search, SearchOptions, search_together
+from roadgeo.matching.shared_sweeps import SharedSweeps, Stage
+from roadgeo.matching.sweeps import Sweep
+from roadgeo.matching.triples import Proposals, TripleOptions
+
+
+@dataclass(eq=False)
+class Part:
+    """Proposes places with so many neighbours placed; what grows of each is supported as it was placed."""
+
+    placed: list[list[int]]
+    index: object = None
+    screened: list[int] = field(default_factory=list)
+    whole: list[Hypothesis] = field(default_factory=list)
+
+    def allow(self, proposals):
+        return np.ones(len(proposals.placed), bool)
+
+    def screen(self, proposals, allowed, most, stage):
+        self.screened.append(most)
+        return np.arange(most)
+
+    def follow_up(self, proposals, chosen, stage):
+        return [Hypothesis(np.eye(3), chosen[:1], float(one), chosen) for one in proposals.placed[chosen]]
+
+    def enough(self, stage):
+        return False
+
+    def known_places(self):
+        return self.whole
+
+
+class Plan:
+    """Proposes what the parts hold, an anchor after another."""
+
+    def __init__(self, parts):
+        self.parts = parts
+
+    def proposals(self, scene, indexes, scale, min_ratio):
+        for anchor, rows in enumerate(zip(*(part.placed for part in self.parts), strict=True)):
+            yield [proposals_of(anchor, placed) for placed in rows]
+
+
+def proposals_of(anchor, placed):
+    n = len(placed)
+    return Proposals(anchor, np.arange(n), np.zeros((n, 2), int), np.zeros((n, 4)), np.array(placed, int), 1, n, n)
+
+
+def swept(parts, same_place=None, **options):
+    sweeps = SharedSweeps(None, CameraOptions(), same_place)
+    sweeps.members += parts
+    stage = Stage(0, Plan(parts), GrowOptions(**options))
+    return sweeps, stage
+
+
+def supports(hypotheses):
+    return [one.support for one in hypotheses]
+
+
+def test_the_best_of_all_parts_are_verified_each_where_it_grew():
+    parts = [Part([[5, 3], [2]]), Part([[9, 1], [8]]), Part([[4], []])]
+    sweeps, stage = swept(parts, max_verified=3)
+    found = [[supports(one) for one in sweeps.rounds(part, stage)] for part in parts]
+    assert found == [[[5.0], [2.0]], [[9.0], [8.0]], [[4.0], []]]
+
+
+@pytest.mark.parametrize(("most", "shares"), [(100, [4, 2, 1]), (3, [1, 2, 0]), (5, [2, 2, 1]), (1, [0, 1, 0])])
+def test_the_best_placed_are_screened_and_of_equals_each_part_gives_one_in_turn(most, shares):
+    parts = [Part([[3, 3, 3, 3]]), Part([[4, 3]]), Part([[3]])]
+    sweeps, stage = swept(parts, max_screened=most)
+    for part in parts:
+        list(sweeps.rounds(part, stage))
+    assert [part.screened for part in parts] == [[share] for share in shares]
+
+
+def test_what_lies_on_roads_grows_in_even_shares():
+    parts = [Part([[3] * 8]), Part([[3] * 4])]
+    sweeps, stage = swept(parts, max_grown=6, max_verified=100)
+    assert [len(next(sweeps.rounds(part, stage))) for part in parts] == [4, 2]
+
+
+def test_what_a_part_did_not_take_yet_can_be_asked_for_once():
+    parts = [Part([[5], [6]]), Part([[7], [8]])]
+    sweeps, stage = swept(parts)
+    first = sweeps.rounds(parts[0], stage)
+    assert [supports(next(first)), supports(next(first))] == [[5.0], [6.0]]
+    assert supports(sweeps.pending(parts[1], 0, 1)) == [8.0]
+    assert sweeps.pending(parts[1], 0, 1) == []
+    assert sweeps.pending(parts[1], 7, 1) == []
+    assert [supports(one) for one in sweeps.rounds(parts[1], stage)] == [[7.0], []]
+
+
+def test_a_place_on_ground_that_shards_share_is_verified_once():
+    def same_place(one, a, other, b):
+        return a.support // 10 == b.support // 10
+
+    parts = [Part([[19, 31]]), Part([[18, 52, 45]]), Part([[11, 60]])]
+    parts[2].whole.append(Hypothesis(np.eye(3), np.zeros(1, int), 50.0, np.zeros(1, int)))
+    sweeps, stage = swept(parts, same_place, max_verified=4)
+    found = [sorted(supports(next(sweeps.rounds(part, stage)))) for part in parts]
+    assert found == [[19.0, 31.0], [45.0], [60.0]]
+
+
+# --- with real parts --------------------------------------------------------------------------------------------------
+
+TRUTH = camera((1000, 1000), (1000, 1000), 1.0, 10.0, 20.0, 130.0)
+
+
+@pytest.fixture(scope="module")
+def towns():
+    networks = [random_network(seed, 2000.0) for seed in (11, 12, 13, 14)]
+    return networks, [build_index(network) for network in networks]
+
+
+def search_all(scene, indexes, options=None):
+    ledger, sweeps = Ledger(sum(map(len, indexes))), SharedSweeps(scene, CameraOptions())
+    parts = [Search(TripleEstimator(scene, one, options, ledger=ledger, sweeps=sweeps)) for one in indexes]
+    search_together(parts, SearchOptions(time_limit_s=60.0))
+    return parts
+
+
+def test_a_place_is_found_on_any_of_many_towns(towns):
+    networks, indexes = towns
+    for k, network in enumerate(networks):
+        parts = search_all(scene_of(look(network, TRUTH)), indexes)
+        assert [one.stopped for one in parts] == ["accepted" if n == k else "elsewhere" for n in range(4)]
+
+
+def test_a_twin_on_another_part_is_met(towns):
+    networks, indexes = towns
+    parts = search_all(scene_of(look(networks[1], TRUTH)), [*indexes, indexes[1]], MatchOptions(last=(), roads=None))
+    assert "accepted" not in [one.stopped for one in parts]
+    assert min(parts[1].lead, parts[4].lead) > 8.0
+
+
+def test_many_parts_take_as_many_places_as_one(towns):
+    """Of one anchor's proposals on all parts as many are screened and verified as on one map."""
+    _, indexes = towns
+    stranger = scene_of(look(random_network(3, 2000.0), TRUTH))
+    options = MatchOptions(sweeps=(Sweep(TripleOptions(), 1),), last=(), roads=None, grow=GrowOptions(max_screened=50))
+    parts = search_all(stranger, indexes, options)
+    assert sum(one.estimator.n_screened for one in parts) <= 3 * 50
+    assert sum(one.n_scored for one in parts) <= 3 * options.grow.max_verified
