@@ -258,6 +258,66 @@ def next_alike(
 
 
 @kernel()
+def _list_probes(
+    codes: NDArray[np.int64], n: NDArray[np.int64], tolerance: int, listed: NDArray[np.int64]
+) -> tuple[int, NDArray[np.int64]]:
+    """List the cells that may hold a triple with these codes: (cell, turn, lows, highs, alike x, y, z) each.
+
+    Returns how many there are, and `listed` or, where it is too small, a larger array.
+    """
+    probes = np.empty((3, 64, 4), np.int64)
+    n_probes = np.empty(3, np.int64)
+    m = 0
+    # Every vertex may have several codes, every code several cells, and the stored triple may start at any vertex.
+    for p in range(n[0]):
+        n_probes[0] = vertex_probes(codes[0, p], tolerance, probes[0])
+        for q in range(n[1]):
+            n_probes[1] = vertex_probes(codes[1, q], tolerance, probes[1])
+            for r in range(n[2]):
+                n_probes[2] = vertex_probes(codes[2, r], tolerance, probes[2])
+                room = m + 3 * n_probes[0] * n_probes[1] * n_probes[2]
+                if room > listed.shape[0]:
+                    larger = np.empty((2 * room, 7), np.int64)
+                    for i in range(m):
+                        for column in range(7):
+                            larger[i, column] = listed[i, column]
+                    listed = larger
+                for turn in range(3):
+                    # X, Y, Z = a, b, c or c, a, b or b, c, a
+                    vx, vy, vz = (0, 1, 2) if turn == 0 else ((2, 0, 1) if turn == 1 else (1, 2, 0))
+                    for i in range(n_probes[vx]):
+                        for j in range(n_probes[vy]):
+                            for k in range(n_probes[vz]):
+                                cell = (probes[vx, i, 0] * PAIRS + probes[vy, j, 0]) * PAIRS + probes[vz, k, 0]
+                                lows = probes[vx, i, 1] << 16 | probes[vy, j, 1] << 8 | probes[vz, k, 1]
+                                highs = probes[vx, i, 2] << 16 | probes[vy, j, 2] << 8 | probes[vz, k, 2] | GUARDS
+                                listed[m, 0], listed[m, 1], listed[m, 2], listed[m, 3] = cell, turn, lows, highs
+                                listed[m, 4], listed[m, 5] = probes[vx, i, 3], probes[vy, j, 3]
+                                listed[m, 6] = probes[vz, k, 3]
+                                m += 1
+    return m, listed
+
+
+@kernel()
+def _find_cells(
+    listed: NDArray[np.int64], m: int, starts: NDArray[np.int32], entries: NDArray[np.uint64], ends: NDArray[np.int64]
+) -> None:
+    """Fill `ends` (m + 1, 2) with where the listed cells' entries start and end, and touch the first of each.
+
+    Cells lie all over the table. Here no load waits for another, so that processors overlap them; where each is read
+    when it is compared, most of the time of a look-up is spent waiting.
+    """
+    for i in range(m):
+        ends[i, 0] = starts[listed[i, 0]]
+        ends[i, 1] = starts[listed[i, 0] + 1]
+    touched = np.uint64(0)
+    for i in range(m):
+        if ends[i, 0] < ends[i, 1]:
+            touched ^= entries[ends[i, 0]]
+    ends[m, 0] = np.int64(touched >> np.uint64(1))  # a use of it, or it would not be read
+
+
+@kernel()
 def _look_up(
     query: TripleQuery, one: _Triangle, table: TripleMap, limits: TripleLimits, hits: Hits, n_hits: int
 ) -> tuple[int, int]:
@@ -270,62 +330,43 @@ def _look_up(
     codes = np.empty((3, limits.codes_per_vertex, 3), np.int64)
     n = np.empty(3, np.int64)
     triple_codes(query.xy, query.tangents, query.sides, one.a, one.b, one.c, limits.codes_per_vertex, codes, n)
-    probes = np.empty((3, 64, 4), np.int64)
-    n_probes = np.empty(3, np.int64)
+    m, listed = _list_probes(codes, n, limits.tolerance, np.empty((256, 7), np.int64))
+    ends = np.empty((m + 1, 2), np.int64)
+    _find_cells(listed, m, starts, entries, ends)
     compared = 0
-    # Every vertex may have several codes, every code several cells, and the stored triple may start at any vertex.
-    for p in range(n[0]):
-        n_probes[0] = vertex_probes(codes[0, p], limits.tolerance, probes[0])
-        for q in range(n[1]):
-            n_probes[1] = vertex_probes(codes[1, q], limits.tolerance, probes[1])
-            for r in range(n[2]):
-                n_probes[2] = vertex_probes(codes[2, r], limits.tolerance, probes[2])
-                for turn in range(3):
-                    # X, Y, Z = a, b, c or c, a, b or b, c, a
-                    vx, vy, vz = (0, 1, 2) if turn == 0 else ((2, 0, 1) if turn == 1 else (1, 2, 0))
-                    for i in range(n_probes[vx]):
-                        ki = probes[vx, i, 0] * PAIRS
-                        li, hi = probes[vx, i, 1] << 16, probes[vx, i, 2] << 16 | GUARDS
-                        for j in range(n_probes[vy]):
-                            kj = (ki + probes[vy, j, 0]) * PAIRS
-                            lj, hj = li | probes[vy, j, 1] << 8, hi | probes[vy, j, 2] << 8
-                            for k in range(n_probes[vz]):
-                                cell = kj + probes[vz, k, 0]
-                                lows = lj | probes[vz, k, 1]
-                                highs = hj | probes[vz, k, 2]
-                                alike_x, alike_y, alike_z = probes[vx, i, 3], probes[vy, j, 3], probes[vz, k, 3]
-                                e, end = np.int64(starts[cell]), np.int64(starts[cell + 1])
-                                while e < end:
-                                    stop = end
-                                    if end - e > LONG_CELL:
-                                        e, stop = next_alike(entries, e, end, alike_x, alike_y, alike_z)
-                                    compared += stop - e
-                                    while e < stop:
-                                        entry = entries[e]
-                                        e += 1
-                                        # All six angles at once, then the sides, then the map itself.
-                                        fine = np.int64(entry & np.uint64(0xFFFFFF))
-                                        if ((fine | GUARDS) - lows) & (highs - fine) & GUARDS != GUARDS:
-                                            continue
-                                        around = _sides(entry)
-                                        alike = (alike_x >> (around // 81)) & (alike_y >> (around // 9 % 9))
-                                        if alike & (alike_z >> (around % 9)) & 1 == 0:
-                                            continue
-                                        x, y, z = _places(entry, turn, ref_neighbours)
-                                        if x < 0:
-                                            continue
-                                        passes, j00, j01, j10, j11 = _fit_affine(one, ref_xy, x, y, z, limits)
-                                        if not passes or not _agree(
-                                            branches, one, ref_branches, x, y, z, j00, j01, j10, j11, limits.min_cos
-                                        ):
-                                            continue
-                                        if n_hits >= ids.shape[0]:
-                                            return n_hits, compared
-                                        ids[n_hits, 0], ids[n_hits, 1], ids[n_hits, 2] = x, one.s, y
-                                        ids[n_hits, 3], ids[n_hits, 4] = one.t, z
-                                        affine[n_hits, 0], affine[n_hits, 1] = j00, j01
-                                        affine[n_hits, 2], affine[n_hits, 3] = j10, j11
-                                        n_hits += 1
+    for i in range(m):
+        turn, lows, highs = listed[i, 1], listed[i, 2], listed[i, 3]
+        alike_x, alike_y, alike_z = listed[i, 4], listed[i, 5], listed[i, 6]
+        e, end = ends[i, 0], ends[i, 1]
+        while e < end:
+            stop = end
+            if end - e > LONG_CELL:
+                e, stop = next_alike(entries, e, end, alike_x, alike_y, alike_z)
+            compared += stop - e
+            while e < stop:
+                entry = entries[e]
+                e += 1
+                # All six angles at once, then the sides, then the map itself.
+                fine = np.int64(entry & np.uint64(0xFFFFFF))
+                if ((fine | GUARDS) - lows) & (highs - fine) & GUARDS != GUARDS:
+                    continue
+                around = _sides(entry)
+                alike = (alike_x >> (around // 81)) & (alike_y >> (around // 9 % 9))
+                if alike & (alike_z >> (around % 9)) & 1 == 0:
+                    continue
+                x, y, z = _places(entry, turn, ref_neighbours)
+                if x < 0:
+                    continue
+                passes, j00, j01, j10, j11 = _fit_affine(one, ref_xy, x, y, z, limits)
+                if not passes or not _agree(branches, one, ref_branches, x, y, z, j00, j01, j10, j11, limits.min_cos):
+                    continue
+                if n_hits >= ids.shape[0]:
+                    return n_hits, compared
+                ids[n_hits, 0], ids[n_hits, 1], ids[n_hits, 2] = x, one.s, y
+                ids[n_hits, 3], ids[n_hits, 4] = one.t, z
+                affine[n_hits, 0], affine[n_hits, 1] = j00, j01
+                affine[n_hits, 2], affine[n_hits, 3] = j10, j11
+                n_hits += 1
     return n_hits, compared
 
 

@@ -282,25 +282,21 @@ class TripleEstimator:
         options, camera = options or self.options.grow, self.options.camera
         return grow_proposals(self.scene, self.index, proposals, chosen, options, camera)
 
-    def follow_up(self, proposals: Proposals, chosen: IntArray, stage: Stage) -> list[Hypothesis]:
-        """Return the best grown proposals of one anchor that mean different places and that a camera can have seen."""
+    def follow_up(self, proposals: Proposals, chosen: IntArray, stage: Stage) -> Iterator[Hypothesis]:
+        """Yield the grown proposals of one anchor that mean different places and that a camera can have seen."""
+        lead = (stage.number, proposals.anchor)
         self.n_hypotheses += len(chosen)
         grown = self.grow(proposals, chosen, stage.grow)
         self.trace.grown(grown)
         distinct: list[Hypothesis] = []
-        again: set[int] = set()
-        for h in grown:
-            if not self._is_plausible(h):
-                continue
-            known = [k for k, one in enumerate(self._whole) if self.same(one, h)]
-            again.update(known)
+        for h in filter(self._is_plausible, grown):
+            known = [one for one in self._whole if self.same(one, h)]
+            for one in known:
+                one.leads += [lead] * (lead not in one.leads)
             if not known and not any(self.same(h, other) for other in distinct):
+                h.leads.append(lead)
                 distinct.append(h)
-                if len(distinct) == stage.grow.max_verified:
-                    break
-        for one in (*distinct, *(self._whole[k] for k in again)):
-            one.leads.append((stage.number, proposals.anchor))
-        return distinct
+                yield h
 
     def score(self, model: Hypothesis) -> float:
         """Refine a hypothesis and return its log10 odds."""

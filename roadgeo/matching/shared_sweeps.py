@@ -7,6 +7,8 @@ of one, and the place has to be better than chance on each of them only once.
 
 from __future__ import annotations
 
+import heapq
+import math
 from collections.abc import Callable, Iterator, Sequence
 from typing import Generic, NamedTuple, Protocol, TypeAlias, TypeVar
 
@@ -45,8 +47,8 @@ class Member(Protocol):
     def screen(self, proposals: Proposals, allowed: BoolArray, most: int, stage: Stage) -> IntArray:
         """Return those of the first `most` that are allowed and that lie on roads, the best first."""
 
-    def follow_up(self, proposals: Proposals, chosen: IntArray, stage: Stage) -> list[Hypothesis]:
-        """Return what grew from the chosen proposals, different places, the best supported first."""
+    def follow_up(self, proposals: Proposals, chosen: IntArray, stage: Stage) -> Iterator[Hypothesis]:
+        """Yield what grew from the chosen proposals, different places, the best supported first."""
 
     def enough(self, stage: Stage) -> bool:
         """Whether as many places were screened on all parts as are on one map of their size."""
@@ -122,17 +124,17 @@ class SharedSweeps(Generic[AnyMember]):
         # ... an even share of those that lie on roads grows ...
         share = min(options.max_grown / max(sum(map(len, kept)), 1), 1.0)
         grown = [
-            (member, hypothesis)
+            _owned(member, member.follow_up(one, rows[: math.ceil(share * len(rows))], stage))
             for member, one, rows in zip(members, proposals, kept, strict=True)
-            for hypothesis in member.follow_up(one, rows[: int(np.ceil(share * len(rows)))], stage)
+            if len(rows)
         ]
         # ... and the best of what grew are verified.
         best: list[tuple[AnyMember, Hypothesis]] = []
-        for member, hypothesis in sorted(grown, key=lambda pair: -pair[1].support):
-            if len(best) == options.max_verified:
-                break
+        for member, hypothesis in heapq.merge(*grown, key=lambda pair: -pair[1].support):
             if not self._is_met(member, hypothesis, best):
                 best.append((member, hypothesis))
+                if len(best) == options.max_verified:
+                    break
         return {id(member): [one for owner, one in best if owner is member] for member, _ in best}
 
     def _is_met(self, member: AnyMember, hypothesis: Hypothesis, best: Sequence[tuple[AnyMember, Hypothesis]]) -> bool:
@@ -143,6 +145,11 @@ class SharedSweeps(Generic[AnyMember]):
         return any(
             other is not member and self.same_place(member, hypothesis, other, one) for other, one in (*best, *known)
         )
+
+
+def _owned(member: AnyMember, grown: Iterator[Hypothesis]) -> Iterator[tuple[AnyMember, Hypothesis]]:
+    """Yield what grew, with the part it grew on."""
+    return ((member, hypothesis) for hypothesis in grown)
 
 
 class _Round(NamedTuple):

@@ -187,7 +187,7 @@ def test_more_anchors_are_tried_on_a_small_map(town, scene):
 
     def n_anchors(most_more):
         sweep = Sweep(TripleOptions(), 5, most_more)
-        return len(list(sweep.proposals(scene, index, (0.1, 10.0), 0.33)))
+        return len(list(sweep.proposals(scene, [index], (0.1, 10.0), 0.33)))
 
     assert n_anchors(1.0) == 5
     assert n_anchors(1.0) < n_anchors(3.0) <= 15
