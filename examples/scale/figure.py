@@ -2,7 +2,7 @@
 
     python examples/scale/figure.py examples/scale/results/cost.csv docs/scale.svg
 
-The table has a row for each size: `intersections`, `median_s`, `refusal_s`, `memory_mb`, `disk_mb`, `build_s`.
+The table has a row for each size: `intersections`, `median_s`, `refusal_s`, `memory_mb`, `disk_mb`.
 """
 
 import argparse
@@ -21,10 +21,9 @@ PANELS = {
         ("disk_mb", "on disk", "#8d99ae"),
         ("memory_mb", "resident, most", "#2b2d42"),
     ],
-    "Building, minutes of one core": [("build_s", "all shards", "#2b2d42")],
 }
 #: What a column is divided by.
-UNITS = {"disk_mb": 1000.0, "memory_mb": 1000.0, "build_s": 60.0}
+UNITS = {"disk_mb": 1000.0, "memory_mb": 1000.0}
 
 
 def draw(rows: list[dict[str, str]], target: Path) -> None:
@@ -33,7 +32,7 @@ def draw(rows: list[dict[str, str]], target: Path) -> None:
     plt.rcParams.update(
         {"svg.fonttype": "none", "svg.hashsalt": "roadgeo", "font.size": 9, "font.family": "sans-serif"}
     )
-    figure, axes = plt.subplots(1, len(PANELS), figsize=(10.5, 3.4), layout="constrained")
+    figure, axes = plt.subplots(1, len(PANELS), figsize=(8.0, 3.4), layout="constrained")
     for axis, (title, lines) in zip(axes, PANELS.items(), strict=True):
         for column, name, colour in lines:
             points = [(float(row["intersections"]), float(row[column])) for row in rows if row.get(column)]
