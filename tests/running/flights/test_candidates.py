@@ -95,3 +95,23 @@ def test_ground_counts_once():
     everything = unseen_before(masks, mosaic, 0)
     assert np.array_equal(everything.roads, mosaic.mask.roads)
     assert not (fresh.roads & ~mosaic.mask.roads).any()
+
+
+@pytest.mark.slow
+def test_the_place_that_agrees_best_is_compared_with_all_others(flown):
+    """Its odds are, at least, those by which it leads its twins, also where chance nearby leaves little of them."""
+    candidates = Candidates([flown[2]])
+    location = candidates.look(look_at(flown, 8, True), LocateOptions())
+    compared = [one for one in candidates._kept if one.leading > -math.inf]
+    assert location.located
+    assert len(compared) == 1
+    assert compared[0].leading > 3.5
+    assert compared[0].log10_odds >= compared[0].leading - math.log10(compared[0].n_looks)
+
+
+@pytest.mark.slow
+def test_where_nothing_stands_out_no_twin_is_looked_for(flown):
+    candidates = Candidates([flown[2]])
+    candidates.look(look_at(flown, 8, True), LocateOptions(min_log10_odds=300.0))
+    assert len(candidates)
+    assert all(one.leading == -math.inf for one in candidates._kept)
