@@ -257,6 +257,20 @@ class Candidates:
     def look(self, look: Look, options: LocateOptions) -> Location:
         """Test what was proposed, search the map where that is due, and judge both together."""
         self._test(look, options)
+        self.n_looks += look.searched
+        if look.searched and options.effort == "full":
+            # A quick search proposes the place nearly as often, in a tenth of the time: it will do where that leads.
+            location = self._search(look, replace(options, effort="quick"))
+            if location.located and self._has_leader(options):
+                return location
+        return self._search(look, options)
+
+    def _has_leader(self, options: LocateOptions) -> bool:
+        """Whether a place leads all others by what is asked."""
+        return any(one.leading - math.log10(one.n_looks) >= options.min_log10_odds for one in self._kept)
+
+    def _search(self, look: Look, options: LocateOptions) -> Location:
+        """Search the map where that is due, and judge what is found together with what was proposed before."""
         recorders: list[_Recorder] = []
 
         def record() -> _Recorder:
@@ -266,12 +280,11 @@ class Candidates:
         found: list[Found] = []
         if look.searched:
             parts = [part for one in self.references for part in one.parts]
-            self.n_looks += 1
             found = search_references(look.query, parts, options, options.search.time_limit_s, record)
         for one, recorder in zip(found, recorders, strict=False):
             self._take(one, recorder, look)
         for candidate in self._kept:
-            if candidate.since == look.numbers[-1]:
+            if candidate.since == look.numbers[-1] and candidate.fit is None:
                 candidate.lay(look, options)
         self._find_leader(look, options)
         location = decide(look.query, self._with_tested(found, look), options)
@@ -342,7 +355,8 @@ class Candidates:
         scene, estimator = look.query.scene, recorder.estimator
         if estimator is None:
             return
-        for rank, model in enumerate(recorder.best(self.options.per_look)):
+        last_rank = max((one.rank for one in self._kept if one.since == last and one.whole is found.index), default=-1)
+        for rank, model in enumerate(recorder.best(self.options.per_look), last_rank + 1):
             n_tried, proposed = estimator.ledger.n_tried, _fully_scored(model, estimator)
             new = _Candidate(
                 estimator.index, found.index, model.matrix @ to_frame, last, last, n_tried, proposed, rank, self.n_looks
