@@ -24,7 +24,7 @@ __all__ = ["PieceCounts", "Pieces", "log10_lead", "sample_roads"]
 
 
 class PieceCounts(NamedTuple):
-    """Metres of road in each piece of a frame at a place, (P,) each.
+    """Metres of road in each piece of a frame at a place, (P,) each, at the scale that all places are compared at.
 
     Attributes
     ----------
@@ -80,7 +80,7 @@ class Pieces:
         width, height = self.scene.size
         return math.ceil(height / self._cell_px), math.ceil(width / self._cell_px)
 
-    def count(self, matrix: FloatArray, samples: FloatArray) -> PieceCounts:
+    def count(self, matrix: FloatArray, samples: FloatArray, scale: float = 1.0) -> PieceCounts:
         """Compare the scene with the map at a place.
 
         Parameters
@@ -89,27 +89,30 @@ class Pieces:
             Query plane to reference plane.
         samples : (S, 2) float64
             Points along the map's roads, one in `step_m` metres, wherever the frame may lie (see `sample_roads`).
+        scale : float
+            Metres per pixel at this place, as a multiple of `gsd_m`. Roads agree within as many pixels at all scales:
+            within as many metres they would agree by chance wherever the frame is laid small.
         """
         scene, verify = self.scene, self.verify
         tolerance = tolerance_m(self.gsd_m, verify)
         points = scene.dense_points
         away = np.empty(len(points))
         forward_distances(
-            matrix, points, scene.dense_directions, tolerance, math.cos(math.radians(verify.max_turn_deg)), 0.0, 0.0,
-            self.index.road_buckets, away,
+            matrix, points, scene.dense_directions, scale * tolerance, math.cos(math.radians(verify.max_turn_deg)),
+            0.0, 0.0, self.index.road_buckets, away,
         )  # fmt: skip
         seen, inside = self.in_frame(matrix, samples)
         seen = seen[inside]
         rows, columns = self._field_cells(seen)
         near = scene.field[rows, columns] * scene.field_scale <= tolerance / self.gsd_m + 0.7 * scene.field_scale
         spacing_m = scene.road_length_px * self.gsd_m / max(len(points), 1)
-        n = self._cells[0] * self._cells[1]
+        step_m, n = self.step_m / scale, self._cells[0] * self._cells[1]
         at, back = self._cell_of(points), self._cell_of(seen)
         return PieceCounts(
             np.asarray(np.bincount(at, minlength=n) * spacing_m, float),
             np.asarray(np.bincount(at, np.isfinite(away), n) * spacing_m, float),
-            np.asarray(np.bincount(back, minlength=n) * self.step_m, float),
-            np.asarray(np.bincount(back, near, n) * self.step_m, float),
+            np.asarray(np.bincount(back, minlength=n) * step_m, float),
+            np.asarray(np.bincount(back, near, n) * step_m, float),
         )
 
     def in_frame(self, matrix: FloatArray, samples: FloatArray) -> tuple[FloatArray, BoolArray]:

@@ -65,7 +65,7 @@ class Contest:
     Attributes
     ----------
     gsd_m : float
-        Metres per pixel by which the query's roads are measured at all places.
+        Metres per pixel at which roads are measured, and how near they must be to agree, at all places.
     """
 
     def __init__(self, scene: Scene, gsd_m: float, match: MatchOptions, options: TwinOptions | None = None) -> None:
@@ -76,8 +76,8 @@ class Contest:
         pieces = Pieces(self.scene, index, self.gsd_m, self.options.piece_m, self.match.verify)
         ground = Homography(matrix).everywhere(self.scene.corners)
         samples = sample_roads(index, ground.min(axis=0), ground.max(axis=0), pieces.step_m)
-        unseen = self.options.unseen * self.gsd_m / sampling(matrix, self.scene.size)
-        return pieces.count(matrix, samples).worth(unseen) / self.options.piece_m
+        scale = sampling(matrix, self.scene.size) / self.gsd_m
+        return pieces.count(matrix, samples, scale).worth(self.options.unseen) / self.options.piece_m
 
     def twins_of(self, matrix: FloatArray, index: ReferenceIndex) -> list[FloatArray]:
         """Return other places (3, 3) that most of the roads would fit, each laid on the map as well as it can be."""

@@ -43,6 +43,18 @@ def test_a_place_beside_agrees_less(town, seen):
     assert log10_lead(there.worth(0.5) - here.worth(0.5)) == 0.0
 
 
+def test_a_place_laid_small_agrees_within_as_many_pixels_not_metres(town, seen):
+    """Within as many metres, its roads would agree wherever it is laid small enough."""
+    truth, scene = seen
+    small = move_about(Homography(truth)(scene.center), Shift(0.0, 0.0, 0.0, 0.2, 0.0)) @ truth
+    ground = Homography(small)(scene.corners)
+    pieces = Pieces(scene, town[1], 1.0, 60.0, VerifyOptions())
+    samples = sample_roads(town[1], ground.min(axis=0), ground.max(axis=0), pieces.step_m)
+    found, loose = (pieces.count(small, samples, scale) for scale in (0.2, 1.0))
+    assert found.agreeing.sum() < 0.5 * loose.agreeing.sum()
+    assert found.mapped.sum() == pytest.approx(5.0 * loose.mapped.sum())
+
+
 def test_shares_and_worth_of_few_numbers():
     counts = PieceCounts(*(np.array(row, float) for row in ([60, 0, 40], [60, 0, 10], [40, 0, 60], [20, 0, 60])))
     assert counts.shares.tolist() == [0.8, 0.5, 0.7]

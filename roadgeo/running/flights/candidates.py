@@ -46,6 +46,9 @@ __all__ = ["CandidateOptions", "Candidates", "Look"]
 
 _NO_SEEDS: IntArray = np.array([], np.int64)
 
+#: So often the places are compared at the scale of the best one, until it stays that.
+_MOST_SCALES = 4
+
 
 @dataclass(frozen=True)
 class CandidateOptions:
@@ -309,9 +312,17 @@ class Candidates:
         if not laid:
             return
         scene, size = look.query.scene, look.query.scene.size
-        contest = Contest(scene, sampling(laid[0][1].matrix, size), options.match, self.options.twins)
-        worth = [contest.weigh(fit.matrix, fit.index) for _, fit in laid]
-        k = int(np.argmax([pieces.sum() for pieces in worth]))
+        # How near roads must be depends on the scale: that of the best place itself counts.
+        gsd, k = float(np.quantile([sampling(fit.matrix, size) for _, fit in laid], 0.75)), -1
+        for _ in range(_MOST_SCALES):
+            contest = Contest(scene, gsd, options.match, self.options.twins)
+            worth = [contest.weigh(fit.matrix, fit.index) for _, fit in laid]
+            before, k = k, int(np.argmax([pieces.sum() for pieces in worth]))
+            if k == before:
+                break
+            gsd = sampling(laid[k][1].matrix, size)
+        else:
+            return
         best, fit = laid[k]
 
         def lead(matrix: FloatArray, index: ReferenceIndex, pieces: FloatArray) -> float:
