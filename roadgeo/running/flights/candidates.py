@@ -59,7 +59,7 @@ class CandidateOptions:
     per_look : int
         Best places of each look that are tested by the frames to come.
     most : int
-        Of more, the best are kept.
+        Of more, the half with the best odds are kept, and of the others those that agree best.
     hopeless : float
         Log10 odds of later ground by which a place is given up.
     fewest_roads : int
@@ -130,6 +130,8 @@ class _Candidate:
     leading : float
         Log10 odds by which it agrees better than any other place, or, if that is less, better than streets usually do,
         less all that were tried; -inf where that was not asked.
+    worth : float
+        Sum of what all pieces of the mosaic say for it.
     fit : Fit or None
         Where it was last laid; None before any frame came.
     """
@@ -145,6 +147,7 @@ class _Candidate:
     n_looks: int
     tested: float = 0.0
     leading: float = -math.inf
+    worth: float = -math.inf
     fit: Fit | None = None
 
     @property
@@ -291,8 +294,17 @@ class Candidates:
                 candidate.lay(look, options)
         self._find_leader(look, options)
         location = decide(look.query, self._with_tested(found, look), options)
-        self._kept = sorted(self._kept, key=lambda one: -one.log10_odds)[: self.options.most]
+        self._kept = self._best_kept()
         return location
+
+    def _best_kept(self) -> list[_Candidate]:
+        """Return the places that are kept: half of them have the best odds, the others agree best.
+
+        In a lattice the odds of the place are as low as those of others, until it leads them.
+        """
+        by_odds = sorted(self._kept, key=lambda one: -one.log10_odds)
+        n = self.options.most // 2
+        return by_odds[:n] + sorted(by_odds[n:], key=lambda one: -one.worth)[: self.options.most - n]
 
     def _test(self, look: Look, options: LocateOptions) -> None:
         """Lay all that frames have shown on each place; count all of it, and what was not seen when it was proposed."""
@@ -323,6 +335,8 @@ class Candidates:
             gsd = sampling(laid[k][1].matrix, size)
         else:
             return
+        for (one, _), pieces in zip(laid, worth, strict=True):
+            one.worth = float(pieces.sum())
         best, fit = laid[k]
 
         def lead(matrix: FloatArray, index: ReferenceIndex, pieces: FloatArray) -> float:
