@@ -210,7 +210,7 @@ class _Candidate:
         gsd = sampling(matrix, scene.size)
         found, _, _ = agreement(matrix, scene, self.index, gsd, _NO_SEEDS, verify)
         chance = chance_agreement(matrix, scene, self.index, gsd, verify, n_best=usual)
-        return log10_odds(found, chance, scene.n_edges, self.n_tried, verify)
+        return log10_odds(found, chance, scene.n_statements, self.n_tried, verify)
 
 
 class _Recorder(NoTrace):
