@@ -9,16 +9,17 @@ from typing import Literal
 
 import numpy as np
 
-from roadgeo._arrays import BoolArray, FloatArray, IntArray
+from roadgeo._arrays import FloatArray, IntArray
 from roadgeo.geometry.camera import sampling
 from roadgeo.geometry.displacement import Displacement, measure
 from roadgeo.geometry.homography import Homography
 from roadgeo.kernels.roads import forward_distances
 from roadgeo.matching.index import ReferenceIndex
 from roadgeo.matching.local_search import LocalSearchOptions, move_about, search_nearby
+from roadgeo.matching.pieces import Pieces, log10_lead, sample_roads
 from roadgeo.matching.refinement import Refined, RefineOptions, refine
 from roadgeo.matching.scene import Scene
-from roadgeo.matching.verification import VerifyOptions, agreement, tolerance_m
+from roadgeo.matching.verification import VerifyOptions, agreement
 
 __all__ = ["CheckOptions", "Checked", "Verdict", "check_place"]
 
@@ -135,36 +136,18 @@ class _Judge:
         self.scene, self.index, self.start, self.options = scene, index, start, options
         self.gsd = sampling(start, scene.size)
         self.corners = Homography(start)(scene.corners)
-        self.samples = self._sample_map()
-        width, height = scene.size
-        self.cell_px = max(options.piece_m / self.gsd, 1.0)
-        self.cells = (math.ceil(height / self.cell_px), math.ceil(width / self.cell_px))
+        self._pieces = Pieces(scene, index, self.gsd, options.piece_m, options.verify)
+        reach = 1.5 * options.search.reach_m
+        low, high = self.corners.min(axis=0) - reach, self.corners.max(axis=0) + reach
+        self.samples = sample_roads(index, low, high, self._pieces.step_m)
         tilted = np.abs(start[2, :2]).max() / abs(start[2] @ np.append(scene.center, 1.0)) * scene.half_size > 0.01
         sigma = options.refine.perspective_sigma if tilted else options.perspective_sigma
         self.refine_options = replace(options.refine, perspective_sigma=sigma)
 
-    def _sample_map(self) -> FloatArray:
-        """Return (S, 2) points along the roads around the frame, one in `backward_step_m` metres."""
-        low = self.corners.min(axis=0) - 1.5 * self.options.search.reach_m
-        high = self.corners.max(axis=0) + 1.5 * self.options.search.reach_m
-        a, b = self.index.segments[:, :2].astype(float), self.index.segments[:, 2:].astype(float)
-        near = (np.maximum(a, b) > low).all(axis=1) & (np.minimum(a, b) < high).all(axis=1)
-        a, b = a[near], b[near]
-        along = np.concatenate(([0.0], np.cumsum(np.hypot(*(b - a).T))))
-        at = np.arange(self.step_m / 2, along[-1], self.step_m)
-        segment = np.minimum(np.searchsorted(along, at, side="right") - 1, max(len(a) - 1, 0))
-        share = (at - along[segment]) / np.maximum(np.diff(along)[segment], 1e-9) if len(a) else at
-        return np.asarray(a[segment] + share[:, None] * (b - a)[segment]) if len(a) else np.empty((0, 2))
-
-    @property
-    def step_m(self) -> float:
-        """Distance between samples of the map's roads."""
-        return self.options.verify.backward_step_m
-
     @property
     def map_length_m(self) -> float:
         """Length of the map's roads inside the frame as it is given, metres."""
-        return self.step_m * float(self._in_frame(self.start)[1].sum())
+        return self._pieces.step_m * float(self._pieces.in_frame(self.start, self.samples)[1].sum())
 
     def propose(self) -> list[FloatArray]:
         """Return the starts of the places nearby."""
@@ -222,48 +205,7 @@ class _Judge:
 
     def pieces(self, matrix: FloatArray) -> FloatArray:
         """Return the share of the roads in each piece of the frame that agree; a half where there are none."""
-        scene, verify, index = self.scene, self.options.verify, self.index
-        tolerance = tolerance_m(self.gsd, verify)
-        points = scene.dense_points
-        away = np.empty(len(points))
-        forward_distances(
-            matrix, points, scene.dense_directions, tolerance, math.cos(math.radians(verify.max_turn_deg)), 0.0, 0.0,
-            index.road_buckets, away,
-        )  # fmt: skip
-        seen, inside = self._in_frame(matrix)
-        seen = seen[inside]
-        rows, columns = self._field_cells(seen)
-        near = scene.field[rows, columns] * scene.field_scale <= tolerance / self.gsd + 0.7 * scene.field_scale
-        spacing_m = scene.road_length_px * self.gsd / max(len(points), 1)
-        n = self.cells[0] * self.cells[1]
-        at, back = self._cell_of(points), self._cell_of(seen)
-        shown = np.bincount(at, np.isfinite(away) * spacing_m, n) + np.bincount(back, near * self.step_m, n)
-        there = np.bincount(at, minlength=n) * spacing_m + np.bincount(back, minlength=n) * self.step_m
-        return np.where(there > 0, shown / np.maximum(there, 1e-9), 0.5)
-
-    def _in_frame(self, matrix: FloatArray) -> tuple[FloatArray, BoolArray]:
-        """Return the map's samples on the query plane, and which of them lie on observed ground of the frame."""
-        scene, to_query = self.scene, Homography(matrix).facing(self.scene.center).inverse()
-        seen = to_query(self.samples)
-        x, y = seen[:, 0], -seen[:, 1]
-        inside = (x > 0) & (y > 0) & (x < scene.size[0]) & (y < scene.size[1])
-        rows, columns = self._field_cells(seen[inside])
-        inside[inside] = scene.observed[rows, columns]
-        return seen, inside
-
-    def _field_cells(self, xy: FloatArray) -> tuple[IntArray, IntArray]:
-        """Return rows and columns of the scene's reduced frame."""
-        cells = (xy * (1.0, -1.0) / self.scene.field_scale).astype(np.int64)
-        return (
-            np.minimum(cells[:, 1], self.scene.field.shape[0] - 1),
-            np.minimum(cells[:, 0], self.scene.field.shape[1] - 1),
-        )
-
-    def _cell_of(self, xy: FloatArray) -> IntArray:
-        """Return the number of the piece of the frame that each point lies in."""
-        cells = (xy * (1.0, -1.0) / self.cell_px).astype(np.int64)
-        rows, columns = (np.clip(cells[:, k], 0, self.cells[1 - k] - 1) for k in (1, 0))
-        return np.asarray(rows * self.cells[1] + columns)
+        return self._pieces.count(matrix, self.samples).shares
 
     def displacement(self, place: _Place) -> Displacement:
         """Return how far a place lies from the given one."""
@@ -277,14 +219,8 @@ class _Judge:
 
 
 def _lead(a: _Place, b: _Place) -> float:
-    """Log10 odds that one place agrees better than another by more than chance.
-
-    Were they alike, each piece of the frame would speak for either with the same probability: by Hoeffding's bound the
-    sum of such differences d exceeds t with a probability of at most exp(-t^2 / (2 sum d^2)).
-    """
-    difference = a.pieces - b.pieces
-    total, squares = float(difference.sum()), float((difference**2).sum())
-    return 0.0 if total <= 0.0 or squares == 0.0 else total**2 / (2.0 * squares) / math.log(10.0)
+    """Log10 odds that one place agrees better than another by more than chance."""
+    return log10_lead(a.pieces - b.pieces)
 
 
 def _judge_best(judge: _Judge, places: Sequence[_Place]) -> Checked:

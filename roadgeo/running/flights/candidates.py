@@ -4,6 +4,10 @@ What a search finds pays for all the places it tried: a hundred thousand and mor
 was proposed once, and then agrees with ground that the search did not know, pays only for how many were proposed
 before it; or it pays for all that were tried, and counts all that was seen. So each frame that comes may tell, whether
 or not the map is searched again, and where streets are alike a flight is found some frames sooner.
+
+Where they form a lattice, chance nearby is the block beside, and neither comes to much. There two questions are asked
+apart: whether the place fits better than streets usually do, less all places that were tried; and whether it agrees
+better, piece by piece, than any other place that the roads would fit. The weaker answer counts.
 """
 
 from __future__ import annotations
@@ -27,10 +31,12 @@ from roadgeo.matching.hypothesis import Hypothesis
 from roadgeo.matching.index import ReferenceIndex
 from roadgeo.matching.methods import Fit, Found, search_references
 from roadgeo.matching.options import LocateOptions
+from roadgeo.matching.pieces import log10_lead
 from roadgeo.matching.query import Query, trace_query
 from roadgeo.matching.refinement import refine
 from roadgeo.matching.scene import Scene
 from roadgeo.matching.trace import NoTrace
+from roadgeo.matching.twins import Contest, TwinOptions
 from roadgeo.matching.verdict import decide
 from roadgeo.matching.verification import agreement, chance_agreement, log10_odds
 from roadgeo.reference.reference import Reference
@@ -39,6 +45,9 @@ from roadgeo.running.flights.mosaic import Mosaic, MosaicOptions, unseen_before
 __all__ = ["CandidateOptions", "Candidates", "Look"]
 
 _NO_SEEDS: IntArray = np.array([], np.int64)
+
+#: So often the places are compared at the scale of the best one, until it stays that.
+_MOST_SCALES = 4
 
 
 @dataclass(frozen=True)
@@ -50,13 +59,15 @@ class CandidateOptions:
     per_look : int
         Best places of each look that are tested by the frames to come.
     most : int
-        Of more, the best are kept.
+        Of more, the half with the best odds are kept, and of the others those that agree best.
     hopeless : float
         Log10 odds of later ground by which a place is given up.
     fewest_roads : int
         Ground that shows fewer roads than this is no test yet.
     n_best : int
         Chance is what so many of the best shifted places reach on average.
+    usual : int
+        How well streets usually fit is what so many of the best shifted places reach on average.
     check : CheckOptions
         A place that would do is compared with all places near it: it may be one block off. Where it does not lead them
         chance is what the best shifted place reaches.
@@ -67,6 +78,8 @@ class CandidateOptions:
     hopeless: float = -2.0
     fewest_roads: int = 6
     n_best: int = 8
+    usual: int = 60
+    twins: TwinOptions = field(default_factory=TwinOptions)
     check: CheckOptions = field(default_factory=lambda: CheckOptions(tolerance_m=20.0, max_sigma_m=10.0))
 
 
@@ -114,6 +127,11 @@ class _Candidate:
         Looks at the map until then.
     tested : float
         Log10 odds of the ground seen since.
+    leading : float
+        Log10 odds by which it agrees better than any other place, or, if that is less, better than streets usually do,
+        less all that were tried; -inf where that was not asked.
+    worth : float
+        Sum of what all pieces of the mosaic say for it.
     fit : Fit or None
         Where it was last laid; None before any frame came.
     """
@@ -128,15 +146,17 @@ class _Candidate:
     rank: int
     n_looks: int
     tested: float = 0.0
+    leading: float = -math.inf
+    worth: float = -math.inf
     fit: Fit | None = None
 
     @property
     def log10_odds(self) -> float:
-        """What speaks for it: all that was seen, less what was tried; or what was seen since, less the rank.
+        """What speaks for it: all that was seen, less what was tried; what was seen since, less the rank; or its lead.
 
-        Of the two what says more, less the looks.
+        Of these what says most, less the looks.
         """
-        return max(self.proposed, self.later) - math.log10(self.n_looks)
+        return max(self.proposed, self.later, self.leading) - math.log10(self.n_looks)
 
     @property
     def later(self) -> float:
@@ -181,6 +201,16 @@ class _Candidate:
             self.tested = log10_odds(found, chance, fresh.n_statements, 1, verify)
             if self.later - math.log10(self.n_looks) < least or _leads(matrix, whole, self.index, options):
                 break
+
+    def stands_out(self, look: Look, locate: LocateOptions, usual: int) -> float:
+        """Return the log10 odds of all that was seen against how well streets usually fit, less all that were tried."""
+        if self.fit is None:
+            return -math.inf
+        scene, verify, matrix = look.query.scene, locate.match.verify, self.fit.matrix
+        gsd = sampling(matrix, scene.size)
+        found, _, _ = agreement(matrix, scene, self.index, gsd, _NO_SEEDS, verify)
+        chance = chance_agreement(matrix, scene, self.index, gsd, verify, n_best=usual)
+        return log10_odds(found, chance, scene.n_statements, self.n_tried, verify)
 
 
 class _Recorder(NoTrace):
@@ -233,6 +263,20 @@ class Candidates:
     def look(self, look: Look, options: LocateOptions) -> Location:
         """Test what was proposed, search the map where that is due, and judge both together."""
         self._test(look, options)
+        self.n_looks += look.searched
+        if look.searched and options.effort == "full":
+            # A quick search proposes the place nearly as often, in a tenth of the time: it will do where that leads.
+            location = self._search(look, replace(options, effort="quick"))
+            if location.located and self._has_leader(options):
+                return location
+        return self._search(look, options)
+
+    def _has_leader(self, options: LocateOptions) -> bool:
+        """Whether a place leads all others by what is asked."""
+        return any(one.leading - math.log10(one.n_looks) >= options.min_log10_odds for one in self._kept)
+
+    def _search(self, look: Look, options: LocateOptions) -> Location:
+        """Search the map where that is due, and judge what is found together with what was proposed before."""
         recorders: list[_Recorder] = []
 
         def record() -> _Recorder:
@@ -242,13 +286,25 @@ class Candidates:
         found: list[Found] = []
         if look.searched:
             parts = [part for one in self.references for part in one.parts]
-            self.n_looks += 1
             found = search_references(look.query, parts, options, options.search.time_limit_s, record)
-        location = decide(look.query, self._with_tested(found, look), options)
         for one, recorder in zip(found, recorders, strict=False):
             self._take(one, recorder, look)
-        self._kept = sorted(self._kept, key=lambda one: -one.log10_odds)[: self.options.most]
+        for candidate in self._kept:
+            if candidate.since == look.numbers[-1] and candidate.fit is None:
+                candidate.lay(look, options)
+        self._find_leader(look, options)
+        location = decide(look.query, self._with_tested(found, look), options)
+        self._kept = self._best_kept()
         return location
+
+    def _best_kept(self) -> list[_Candidate]:
+        """Return the places that are kept: half of them have the best odds, the others agree best.
+
+        In a lattice the odds of the place are as low as those of others, until it leads them.
+        """
+        by_odds = sorted(self._kept, key=lambda one: -one.log10_odds)
+        n = self.options.most // 2
+        return by_odds[:n] + sorted(by_odds[n:], key=lambda one: -one.worth)[: self.options.most - n]
 
     def _test(self, look: Look, options: LocateOptions) -> None:
         """Lay all that frames have shown on each place; count all of it, and what was not seen when it was proposed."""
@@ -259,6 +315,40 @@ class Candidates:
             one.lay(look, options)
             one.test(scenes[one.since], look, options, self.options)
         self._kept = [one for one in self._kept if one.fit is not None and one.tested >= self.options.hopeless]
+
+    def _find_leader(self, look: Look, options: LocateOptions) -> None:
+        """Compare the place that agrees best with all others that were proposed, then with its twins on the map."""
+        for one in self._kept:
+            one.leading = -math.inf
+        laid = [(one, one.fit) for one in self._kept if one.fit is not None]
+        if not laid:
+            return
+        scene, size = look.query.scene, look.query.scene.size
+        # How near roads must be depends on the scale: that of the best place itself counts.
+        gsd, k = float(np.quantile([sampling(fit.matrix, size) for _, fit in laid], 0.75)), -1
+        for _ in range(_MOST_SCALES):
+            contest = Contest(scene, gsd, options.match, self.options.twins)
+            worth = [contest.weigh(fit.matrix, fit.index) for _, fit in laid]
+            before, k = k, int(np.argmax([pieces.sum() for pieces in worth]))
+            if k == before:
+                break
+            gsd = sampling(laid[k][1].matrix, size)
+        else:
+            return
+        for (one, _), pieces in zip(laid, worth, strict=True):
+            one.worth = float(pieces.sum())
+        best, fit = laid[k]
+
+        def lead(matrix: FloatArray, index: ReferenceIndex, pieces: FloatArray) -> float:
+            one = index is fit.index and _are_one(matrix, fit.matrix, size)
+            return math.inf if one else log10_lead(worth[k] - pieces)
+
+        leads = [lead(other.matrix, other.index, pieces) for (_, other), pieces in zip(laid, worth, strict=True)]
+        leading = min(best.stands_out(look, options, self.options.usual), *leads)
+        if leading - math.log10(best.n_looks) >= options.min_log10_odds:
+            twins = contest.twins_of(fit.matrix, fit.index)
+            leads = [lead(twin, fit.index, contest.weigh(twin, fit.index)) for twin in twins]
+            best.leading = min(leading, *leads)
 
     def _ground_since(self, look: Look, since: int, options: LocateOptions) -> Scene | None:
         """Return what is seen on ground that no frame up to `since` saw; None where that shows hardly a road."""
@@ -290,7 +380,8 @@ class Candidates:
         scene, estimator = look.query.scene, recorder.estimator
         if estimator is None:
             return
-        for rank, model in enumerate(recorder.best(self.options.per_look)):
+        last_rank = max((one.rank for one in self._kept if one.since == last and one.whole is found.index), default=-1)
+        for rank, model in enumerate(recorder.best(self.options.per_look), last_rank + 1):
             n_tried, proposed = estimator.ledger.n_tried, _fully_scored(model, estimator)
             new = _Candidate(
                 estimator.index, found.index, model.matrix @ to_frame, last, last, n_tried, proposed, rank, self.n_looks

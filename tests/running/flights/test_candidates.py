@@ -12,7 +12,7 @@ from roadgeo.geometry.mask import RoadMask
 from roadgeo.matching.options import LocateOptions
 from roadgeo.matching.query import read_query
 from roadgeo.reference.reference import Reference
-from roadgeo.running.flights.candidates import CandidateOptions, Candidates, Look
+from roadgeo.running.flights.candidates import CandidateOptions, Candidates, Look, _Candidate
 from roadgeo.running.flights.mosaic import MosaicOptions, lay_together, unseen_before
 
 FLIGHT = FlightOptions(size_px=(400, 300), n_frames=(9, 9), gsd_m=(1.0, 1.2), turn_deg=1.0, intersections=(2, 30))
@@ -95,3 +95,32 @@ def test_ground_counts_once():
     everything = unseen_before(masks, mosaic, 0)
     assert np.array_equal(everything.roads, mosaic.mask.roads)
     assert not (fresh.roads & ~mosaic.mask.roads).any()
+
+
+@pytest.mark.slow
+def test_the_place_that_agrees_best_is_compared_with_all_others(flown):
+    """Its odds are, at least, those by which it leads its twins, also where chance nearby leaves little of them."""
+    candidates = Candidates([flown[2]])
+    location = candidates.look(look_at(flown, 8, True), LocateOptions())
+    compared = [one for one in candidates._kept if one.leading > -math.inf]
+    assert location.located
+    assert len(compared) == 1
+    assert compared[0].leading > 3.5
+    assert compared[0].log10_odds >= compared[0].leading - math.log10(compared[0].n_looks)
+
+
+@pytest.mark.slow
+def test_where_nothing_stands_out_no_twin_is_looked_for(flown):
+    candidates = Candidates([flown[2]])
+    candidates.look(look_at(flown, 8, True), LocateOptions(min_log10_odds=300.0))
+    assert len(candidates)
+    assert all(one.leading == -math.inf for one in candidates._kept)
+
+
+def test_places_that_agree_are_kept_though_many_others_have_better_odds():
+    """In a lattice the place has the odds of many others; of late ones, which paid for less, too many pushed it out."""
+    candidates = Candidates([], CandidateOptions(most=4))
+    for proposed, worth in ((-4.0, 1.0), (-4.1, 2.0), (-4.2, 3.0), (-4.3, 4.0), (-4.4, 5.0), (-5.5, 60.0)):
+        kept = _Candidate(None, None, np.eye(3), 0, 0, 1, proposed, 9, 1, worth=worth)
+        candidates._kept.append(kept)
+    assert [one.worth for one in candidates._best_kept()] == [1.0, 2.0, 60.0, 5.0]

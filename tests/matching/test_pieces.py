@@ -1,0 +1,75 @@
+"""What each piece of a frame says of a place, on scenes with a known one."""
+
+import math
+
+import numpy as np
+import pytest
+from worlds.scenes import Sight, camera, look, scene_of
+
+from roadgeo.geometry.homography import Homography
+from roadgeo.matching.local_search import Shift, move_about
+from roadgeo.matching.pieces import PieceCounts, Pieces, log10_lead, sample_roads
+from roadgeo.matching.verification import VerifyOptions
+
+
+@pytest.fixture(scope="module")
+def seen(town):
+    truth = camera((1900.0, 2000.0), (900, 700), 1.0, heading_deg=40.0)
+    return truth, scene_of(look(town[0], truth, (900, 700), Sight(sigma_m=1.0, missing=0.2), 1), (900, 700))
+
+
+def count(seen, index, matrix):
+    scene = seen[1]
+    pieces = Pieces(scene, index, 1.0, 60.0, VerifyOptions())
+    ground = Homography(matrix)(scene.corners)
+    return pieces.count(matrix, sample_roads(index, ground.min(axis=0), ground.max(axis=0), pieces.step_m))
+
+
+def test_pieces_sum_up_to_the_roads(town, seen):
+    truth, scene = seen
+    found = count(seen, town[1], truth)
+    assert found.drawn.sum() == pytest.approx(scene.road_length_px)
+    assert found.agreeing.sum() > 0.9 * found.drawn.sum()
+    assert 0.7 * found.mapped.sum() < found.shown.sum() < 0.9 * found.mapped.sum()  # a fifth is missing
+    assert ((found.agreeing <= found.drawn) & (found.shown <= found.mapped)).all()
+
+
+def test_a_place_beside_agrees_less(town, seen):
+    truth, scene = seen
+    beside = move_about(Homography(truth)(scene.center), Shift(60.0, 40.0, 0.0, 1.0, 0.0)) @ truth
+    here, there = (count(seen, town[1], matrix) for matrix in (truth, beside))
+    assert log10_lead(here.shares - there.shares) > 3.0
+    assert log10_lead(here.worth(0.5) - there.worth(0.5)) > 3.0
+    assert log10_lead(there.worth(0.5) - here.worth(0.5)) == 0.0
+
+
+def test_a_place_laid_small_agrees_within_as_many_pixels_not_metres(town, seen):
+    """Within as many metres, its roads would agree wherever it is laid small enough."""
+    truth, scene = seen
+    small = move_about(Homography(truth)(scene.center), Shift(0.0, 0.0, 0.0, 0.2, 0.0)) @ truth
+    ground = Homography(small)(scene.corners)
+    pieces = Pieces(scene, town[1], 1.0, 60.0, VerifyOptions())
+    samples = sample_roads(town[1], ground.min(axis=0), ground.max(axis=0), pieces.step_m)
+    found, loose = (pieces.count(small, samples, scale) for scale in (0.2, 1.0))
+    assert found.agreeing.sum() < 0.5 * loose.agreeing.sum()
+    assert found.mapped.sum() == pytest.approx(5.0 * loose.mapped.sum())
+
+
+def test_shares_and_worth_of_few_numbers():
+    counts = PieceCounts(*(np.array(row, float) for row in ([60, 0, 40], [60, 0, 10], [40, 0, 60], [20, 0, 60])))
+    assert counts.shares.tolist() == [0.8, 0.5, 0.7]
+    assert counts.worth(0.5).tolist() == [50.0, 0.0, 10.0]
+
+
+def test_alike_places_lead_by_nothing_and_one_sided_pieces_by_a_fifth_of_a_decade_each():
+    assert log10_lead(np.zeros(9)) == 0.0
+    assert log10_lead(np.array([1.0, -1.0, 0.0])) == 0.0
+    assert log10_lead(np.ones(10)) == pytest.approx(10 / (2 * math.log(10)))
+
+
+def test_roads_are_sampled_where_they_touch_a_box(town):
+    index = town[1]
+    assert sample_roads(index, np.array([-9e5, -9e5]), np.array([-8e5, -8e5]), 12.0).shape == (0, 2)
+    everywhere = sample_roads(index, np.array([-1e5, -1e5]), np.array([1e5, 1e5]), 12.0)
+    lengths = np.hypot(*(index.segments[:, 2:] - index.segments[:, :2]).T)
+    assert len(everywhere) == pytest.approx(lengths.sum() / 12.0, abs=1.0)
