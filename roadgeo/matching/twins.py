@@ -9,6 +9,7 @@ from __future__ import annotations
 
 import math
 from dataclasses import dataclass, field
+from typing import NamedTuple
 
 import numpy as np
 
@@ -18,12 +19,12 @@ from roadgeo.geometry.homography import Homography
 from roadgeo.matching.estimator import MatchOptions
 from roadgeo.matching.index import ReferenceIndex
 from roadgeo.matching.local_search import LocalSearchOptions, Shift, move_about, search_nearby
-from roadgeo.matching.pieces import Pieces, sample_roads
+from roadgeo.matching.pieces import Pieces, log10_lead, sample_roads
 from roadgeo.matching.refinement import refine
 from roadgeo.matching.scene import Scene
 from roadgeo.matching.verification import agreement
 
-__all__ = ["Contest", "TwinOptions"]
+__all__ = ["Contest", "Twin", "TwinOptions", "best_twin"]
 
 _NO_SEEDS: IntArray = np.array([], np.int64)
 
@@ -46,17 +47,58 @@ class TwinOptions:
         So many places that most road points fit are compared.
     n_points : int
         Road points that each of them is laid by.
+    apart : float
+        Middles of two places lie further from each other than this share of half the frame's diagonal.
     """
 
     piece_m: float = 60.0
     unseen: float = 0.5
     n_places: int = 40
     n_points: int = 200
+    apart: float = 0.04
     search: LocalSearchOptions = field(
         default_factory=lambda: LocalSearchOptions(
             reach_m=8000.0, turn_deg=0.0, cell_m=10.0, road_m=20.0, max_points=200, n_places=40
         )
     )
+
+
+class Twin(NamedTuple):
+    """Another place that the roads would fit (query plane to reference plane, 3 x 3), and log10 odds that it is worse."""
+
+    matrix: FloatArray
+    log10_lead: float
+
+
+def best_twin(
+    matrix: FloatArray,
+    scene: Scene,
+    index: ReferenceIndex,
+    match: MatchOptions,
+    options: TwinOptions,
+    within: tuple[float, float, float] | None = None,
+) -> Twin | None:
+    """Return the other place that the roads would fit best, piece by piece; None where nothing else can be meant.
+
+    Parameters
+    ----------
+    within : (x, y, radius), optional
+        Plane metres: the middle of the frame is known to lie there.
+    """
+    contest = Contest(scene, sampling(matrix, scene.size), match, options)
+    worth, here = contest.weigh(matrix, index), Homography(matrix)(scene.center)
+    frame_m = scene.half_size * contest.gsd_m
+    best: Twin | None = None
+    for twin in contest.twins_of(matrix, index):
+        there = Homography(twin)(scene.center)
+        if np.hypot(*(there - here)) < options.apart * frame_m or judge(twin, scene.size, match.camera) is not None:
+            continue
+        if within is not None and np.hypot(*(there - within[:2])) > within[2]:
+            continue
+        lead = log10_lead(worth - contest.weigh(twin, index))
+        if best is None or lead < best.log10_lead:
+            best = Twin(twin, lead)
+    return best
 
 
 class Contest:

@@ -8,14 +8,17 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from roadgeo.geometry.camera import CameraOptions
+from roadgeo.geometry.camera import CameraOptions, sampling
 from roadgeo.geometry.projection import from_lonlat, metres_apart
 from roadgeo.location import Location, Place, Reason, Seen, Stats
+from roadgeo.matching.lens import straighten_scene
 from roadgeo.matching.methods import Fit, Found
 from roadgeo.matching.options import LocateOptions
 from roadgeo.matching.parts import same_within_m
 from roadgeo.matching.placing import center_of, place_frame
 from roadgeo.matching.query import Query
+from roadgeo.matching.twins import best_twin
+from roadgeo.matching.verification import chance_agreement
 
 __all__ = ["Needed", "decide", "needed_of"]
 
@@ -87,6 +90,10 @@ def decide(query: Query, found: Sequence[Found], options: LocateOptions) -> Loca
         reason = _fuller(best, fuller) + cut
         runner_up = _seen_from(best, fuller)
         return replace(placed, status="ambiguous", reason=reason, reason_code=Reason.TWO_PLACES, runner_up=runner_up)
+    twin = _twin(query, best, options)
+    if twin is not None and best.score - twin.log10_odds < options.min_margin:
+        reason = _repeated(best, twin) + cut
+        return replace(placed, status="ambiguous", reason=reason, reason_code=Reason.TWO_PLACES, runner_up=twin)
     reason = (
         f"{placed.n_matched} of {placed.n_intersections} intersections and {best.fit.agreeing:.0%} of the roads agree"
         f"; odds 10^{best.score:.1f} against chance{cut}"
@@ -189,6 +196,39 @@ def _fuller(best: _Candidate, rival: _Candidate) -> str:
     return (
         f"two places fit: one with log10 odds {best.score:.1f} agrees in {best.fit.agreement:.0%}, "
         f"one with {rival.score:.1f} in {rival.fit.agreement:.0%}"
+    )
+
+
+def _twin(query: Query, best: _Candidate, options: LocateOptions) -> Place | None:
+    """Return the place that the roads would fit best beside a weak one where streets repeat, with odds by its lead.
+
+    Chance is measured nearby. Where a part of the frame fits a lattice it beats all shifts by whole blocks, as the true
+    place does; but that part fits as well wherever blocks have that size (a mask of Portland in Chicago: 10^6, with
+    72 % of the roads).
+    """
+    fit, match = best.fit, options.match
+    if options.twins is None or best.score >= options.certain:
+        return None
+    scene = straighten_scene(query.scene, fit.lens_k1) if fit.lens_k1 else query.scene
+    chance = chance_agreement(fit.matrix, scene, fit.index, sampling(fit.matrix, scene.size), match.verify)
+    if chance[1] < options.repeating:
+        return None
+    within = None
+    if options.near is not None:
+        x, y = from_lonlat(fit.index.plane, np.array([options.near[:2]]))[0]
+        within = (float(x), float(y), options.near[2])
+    twin = best_twin(fit.matrix, scene, fit.index, match, options.twins, within)
+    if twin is None:
+        return None
+    there = center_of(query, replace(fit, matrix=twin.matrix))
+    return replace(there, log10_odds=best.score - twin.log10_lead)
+
+
+def _repeated(best: _Candidate, twin: Place) -> str:
+    away = math.hypot(best.center.x - twin.x, best.center.y - twin.y)
+    return (
+        f"streets repeat: {away:.0f} m away they agree almost as well, piece by piece, as where the odds are "
+        f"10^{best.score:.1f} against chance"
     )
 
 

@@ -293,7 +293,8 @@ class Candidates:
             if candidate.since == look.numbers[-1] and candidate.fit is None:
                 candidate.lay(look, options)
         self._find_leader(look, options)
-        location = decide(look.query, self._with_tested(found, look), options)
+        # Flights compare with twins themselves, over all frames.
+        location = decide(look.query, self._with_tested(found, look), replace(options, twins=None))
         self._kept = self._best_kept()
         return location
 
