@@ -64,7 +64,7 @@ class TwinOptions:
 
 
 class Twin(NamedTuple):
-    """Another place that the roads would fit (query plane to reference plane, 3 x 3), and log10 odds that it is worse."""
+    """Another place that the roads would fit, query plane to reference plane (3, 3); log10 odds that it is worse."""
 
     matrix: FloatArray
     log10_lead: float

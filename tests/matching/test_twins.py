@@ -5,15 +5,23 @@ import pytest
 import shapely
 from worlds.scenes import Sight, camera, look, scene_of
 
+from roadgeo.geometry.camera import CameraOptions
 from roadgeo.geometry.homography import Homography
 from roadgeo.geometry.projection import LocalPlane
+from roadgeo.location import Reason, Seconds
 from roadgeo.matching.estimator import MatchOptions
 from roadgeo.matching.index import build_index
 from roadgeo.matching.local_search import Shift, move_about
+from roadgeo.matching.methods import Fit, Found
+from roadgeo.matching.options import LocateOptions
 from roadgeo.matching.pieces import log10_lead
-from roadgeo.matching.twins import Contest
+from roadgeo.matching.query import Query
+from roadgeo.matching.twins import Contest, TwinOptions, best_twin
+from roadgeo.matching.verdict import decide
+from roadgeo.roads.graph import RoadGraph
 from roadgeo.workflows import build_network
 
+NOTHING = RoadGraph.from_polylines(np.empty((0, 2)), np.empty((0, 2), int), [])
 BLOCK = (110, 90)
 SIZE = (700, 500)
 
@@ -74,3 +82,48 @@ def test_where_all_blocks_are_equal_nothing_leads():
     here = among.weigh(truth, index)
     twins = among.twins_of(truth, index)
     assert min(log10_lead(here - among.weigh(one, index)) for one in twins) < 1.0
+    twin = best_twin(truth, among.scene, index, MatchOptions(), TwinOptions(n_places=12))
+    assert twin is not None
+    assert twin.log10_lead < 1.0
+
+
+def test_the_best_twin_leads_a_wrong_place_and_not_the_right_one(broken):
+    truth, index, among = broken
+    options = TwinOptions(n_places=12)
+    wrong = best_twin(beside(truth, among), among.scene, index, MatchOptions(), options)
+    right = best_twin(truth, among.scene, index, MatchOptions(), options)
+    assert wrong.log10_lead == 0.0
+    assert right.log10_lead > 1.0
+    middle = Homography(truth)(among.scene.center)
+    assert np.hypot(*(Homography(right.matrix)(among.scene.center) - middle)) > 10.0
+
+
+@pytest.mark.parametrize(
+    ("odds", "options", "status"),
+    [
+        (6.0, {}, "ambiguous"),
+        (25.0, {}, "located"),  # beyond doubt
+        (6.0, {"twins": None}, "located"),
+        (6.0, {"repeating": 1.1}, "located"),  # streets that do not repeat
+    ],
+)
+def test_a_weak_place_must_lead_its_twins(broken, odds, options, status):
+    truth, index, among = broken
+    nobody = np.full(len(among.scene.intersections), -1)
+    wrong = Fit(index, beside(truth, among), nobody, np.zeros(len(nobody)), 0.7, odds, np.ones(4))
+    query = Query("view.png", among.scene, NOTHING, Seconds())
+    answer = decide(query, [Found(index, (wrong,))], LocateOptions(**options))
+    assert answer.status == status
+    if status == "ambiguous":
+        assert answer.reason.startswith("streets repeat: 110 m away they agree almost as well")
+        assert answer.reason_code == Reason.TWO_PLACES
+        assert answer.runner_up.log10_odds == odds
+
+
+def test_only_what_the_user_allows_is_a_twin(broken):
+    truth, index, among = broken
+    options, middle = TwinOptions(n_places=12), Homography(truth)(among.scene.center)
+    assert best_twin(truth, among.scene, index, MatchOptions(), options, (*middle, 20.0)) is None
+    turned = MatchOptions(camera=CameraOptions(north_up=True))
+    wrong = best_twin(beside(truth, among), among.scene, index, turned, options)
+    assert wrong is None  # the view is turned by 15 degrees
