@@ -7,9 +7,11 @@ The table has a row for each size: `intersections`, `median_s`, `refusal_s`, `me
 
 import argparse
 import csv
+import math
 from pathlib import Path
 
 import matplotlib.pyplot as plt
+from matplotlib.ticker import LogLocator, NullFormatter
 
 #: Title of each panel, and its lines: column, name and colour.
 PANELS = {
@@ -39,6 +41,14 @@ def draw(rows: list[dict[str, str]], target: Path) -> None:
             xs, ys = zip(*((x, y / UNITS.get(column, 1.0)) for x, y in points), strict=True)
             axis.plot(xs, ys, "o-", color=colour, label=name, markersize=4)
         axis.set(xscale="log", yscale="log", xlabel="intersections", title=title)
+        # The same range of maps in all panels, and only powers of ten are written out.
+        sizes = [float(row["intersections"]) for row in rows]
+        axis.set_xlim(0.7 * min(sizes), 1.4 * max(sizes))
+        for scale in (axis.xaxis, axis.yaxis):
+            scale.set_major_locator(LogLocator(10.0))
+            scale.set_minor_formatter(NullFormatter())
+        low, high = axis.get_ylim()
+        axis.set_ylim(10 ** math.floor(math.log10(low)), 10 ** math.ceil(math.log10(high)))
         axis.grid(which="major", color="#dddddd", linewidth=0.6)
         axis.spines[["top", "right"]].set_visible(False)
         axis.legend(frameon=False)
