@@ -1,0 +1,50 @@
+"""`examples/scale`: maps made of one, masks located on all of them, and the figure of what that costs."""
+
+import csv
+import subprocess
+import sys
+from pathlib import Path
+
+import pytest
+
+import roadgeo
+from roadgeo.evaluation.demo import ROADS
+from roadgeo.reference.reference import open_reference
+
+SCALE = Path(__file__).parents[2] / "examples" / "scale"
+
+
+def run(name: str, *arguments: object, cwd: Path) -> str:
+    command = [sys.executable, str(SCALE / name), *map(str, arguments)]
+    return subprocess.run(command, capture_output=True, text=True, cwd=cwd, check=True).stdout
+
+
+@pytest.mark.slow
+def test_a_mask_has_one_place_on_maps_that_were_made_of_one(tmp_path: Path) -> None:
+    one = tmp_path / "map_00.shards"
+    for command in (
+        ["index", "--roads", ROADS, "--shards", "auto", "--out", one],
+        ["index", "--roads", ROADS, "--out", tmp_path / "porto.gpkg"],
+        ["simulate", tmp_path / "porto.gpkg", "-o", tmp_path / "masks", "-n", "2", "--noise", "clean", "--size", "700"],
+    ):
+        subprocess.run([sys.executable, "-m", "roadgeo", *map(str, command), "--quiet"], check=True)
+    assert "map_01.shards" in run("maps.py", one, "--count", 2, cwd=tmp_path)
+    assert run("maps.py", one, "--count", 2, cwd=tmp_path) == ""  # it is there already
+    maps = sorted(tmp_path.glob("map_*.shards"))
+    told = run("measure.py", *maps, "--masks", tmp_path / "masks", "--counts", 1, 2, "--out", "measured", cwd=tmp_path)
+    assert told
+    with (tmp_path / "measured" / "table_quick.csv").open(newline="") as file:
+        rows = list(csv.DictReader(file))
+    assert [int(row["masks"]) for row in rows] == [2, 2]
+    assert [int(row["wrong"]) for row in rows] == [0, 0]
+    assert int(rows[1]["intersections"]) == 2 * int(rows[0]["intersections"]) > 500
+    mask = next((tmp_path / "masks" / "clean").glob("*.png"))
+    assert roadgeo.locate(mask, [open_reference(path) for path in maps]).reference == open_reference(one).name
+
+
+def test_the_figure_shows_the_table(tmp_path: Path) -> None:
+    pytest.importorskip("matplotlib")
+    run("figure.py", SCALE / "results" / "cost.csv", "scale.svg", cwd=tmp_path)
+    drawn = (tmp_path / "scale.svg").read_text()
+    assert "located (median)" in drawn
+    assert "Gigabytes" in drawn
