@@ -21,6 +21,7 @@ from worlds.fake_osm import OUTLINE, fake_osm, place
 from worlds.fenway import streets, write_streets, write_vector
 
 from roadgeo.cli import main
+from roadgeo.kernels.compilation import kernel_folder
 
 README = (ROOT / "README.md").read_text(encoding="utf-8")
 PAGES = {
@@ -72,9 +73,12 @@ def shelf(tmp_path_factory):
 
 @pytest.fixture
 def desk(shelf, tmp_path, monkeypatch):
-    """A copy of the shelf to work in, with an empty library and a home of its own."""
+    """A copy of the shelf to work in, with an empty library and a home of its own; no kernel is compiled anew."""
     folder = tmp_path / "desk"
     shutil.copytree(shelf, folder)
+    kernels = kernel_folder()
+    (tmp_path / "roadgeo_cache").mkdir()
+    (tmp_path / "roadgeo_cache" / kernels.name).symlink_to(kernels, target_is_directory=True)
     for name in ("HOME", "XDG_DATA_HOME", "ROADGEO_CACHE", "ROADGEO_LIBRARY"):
         monkeypatch.setenv(name, str(tmp_path / name.lower()))
     (tmp_path / "home").mkdir()
