@@ -52,7 +52,7 @@ class LocateOptions:
     min_intersections: int = 3
     certain: float = 20.0
     repeating: float = 0.35
-    twins: TwinOptions | None = field(default_factory=lambda: TwinOptions(n_places=12))
+    twins: TwinOptions | None = field(default_factory=lambda: TwinOptions.nearby(4000.0, n_places=12))
     truths: tuple[tuple[str, float, float], ...] = ()
     query: QueryOptions = field(default_factory=QueryOptions)
     match: MatchOptions = field(default_factory=MatchOptions)

@@ -8,7 +8,7 @@ So the place is compared with all others that the roads would fit, on the whole 
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from typing import NamedTuple
 
 import numpy as np
@@ -61,6 +61,12 @@ class TwinOptions:
             reach_m=8000.0, turn_deg=0.0, cell_m=10.0, road_m=20.0, max_points=200, n_places=40
         )
     )
+
+    @classmethod
+    def nearby(cls, reach_m: float, n_places: int) -> TwinOptions:
+        """Return the usual options with another reach: the time that a comparison takes grows with its square."""
+        usual = cls()
+        return replace(usual, n_places=n_places, search=replace(usual.search, reach_m=reach_m))
 
 
 class Twin(NamedTuple):
