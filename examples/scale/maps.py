@@ -87,7 +87,8 @@ def main() -> None:
     parser.add_argument("--count", type=int, default=10)
     given = parser.parse_args()
     first = manifest_path(given.first)
-    assert first is not None, f"{given.first} is no reference in shards"
+    if first is None:
+        raise SystemExit(f"Error: {given.first}: no reference in shards; build one with `roadgeo index --shards auto`")
     for k in range(1, given.count):
         folder = given.first.with_name(f"map_{k:02d}.shards")
         if not (folder / "manifest.json").is_file():
