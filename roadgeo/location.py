@@ -183,7 +183,7 @@ class Camera:
 
 @dataclass(frozen=True)
 class Seconds:
-    """Wall time of each step, seconds."""
+    """Wall time of each step, seconds; of several places the best is chosen within `match`."""
 
     open: float = 0.0
     read: float = 0.0

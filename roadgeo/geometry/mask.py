@@ -7,18 +7,21 @@ The *query plane* is (x, y) = (column, -row), y up, in pixels: rows are flipped 
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 
 from roadgeo._arrays import AnyArray, BoolArray, FloatArray
 from roadgeo.geometry.frame import Frame
 
-__all__ = ["PIXEL_TO_PLANE", "RoadMask", "pixel_to_plane", "plane_to_pixel"]
+__all__ = ["PIXEL_TO_PLANE", "PROBABILITY_SURE", "PROBABILITY_UNKNOWN", "RoadMask", "pixel_to_plane", "plane_to_pixel"]
 
 #: 3 x 3 homography that takes pixels (column, row) to the query plane (x, y). It is its own inverse.
 PIXEL_TO_PLANE: FloatArray = np.diag([1.0, -1.0, 1.0])
 PIXEL_TO_PLANE.setflags(write=False)
+
+#: Values of `RoadMask.probability` where there is road for sure, and where nothing is known.
+PROBABILITY_SURE, PROBABILITY_UNKNOWN = 254, 255
 
 
 def pixel_to_plane(pixels: FloatArray) -> FloatArray:
@@ -58,6 +61,12 @@ class RoadMask:
         """Say in one line what it is."""
         height, width = self.roads.shape
         return f"<RoadMask {self.name!r}: {width} x {height} pixels, {self.roads.mean():.1%} road>"
+
+    def mirrored(self) -> RoadMask:
+        """Return it turned over, left to right."""
+        more = (self.observed, self.probability)
+        observed, probability = (None if one is None else one[:, ::-1].copy() for one in more)
+        return replace(self, roads=self.roads[:, ::-1].copy(), observed=observed, probability=probability)
 
     @property
     def shape(self) -> tuple[int, int]:

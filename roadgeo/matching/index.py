@@ -146,6 +146,11 @@ class ReferenceIndex:
         return int(columns), int(rows)
 
     @cached_property
+    def bounds(self) -> tuple[FloatArray, FloatArray]:
+        """Least and greatest coordinates of the intersections, (2,) each, plane metres."""
+        return self.xy.min(axis=0), self.xy.max(axis=0)
+
+    @cached_property
     def road_buckets(self) -> RoadBuckets:
         """The roads, as kernels take them."""
         return RoadBuckets(self.segments, self.segment_starts, self.segment_ids, self.grid, self.shape)

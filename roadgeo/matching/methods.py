@@ -139,6 +139,7 @@ def search_references(
     scale = larger(sum(one.n_searched for one in opened))
     limits = replace(options.search, time_limit_s=left, work_limit_s=scale * options.search.work_limit_s)
     search_together(list(estimators), limits, same)
+    sweeps.end()
     return [one.found(scale) for one in opened]
 
 

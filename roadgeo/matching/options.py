@@ -30,12 +30,8 @@ class LocateOptions:
         Log10 odds by which the best place must lead any other; otherwise the answer is "ambiguous".
     min_intersections : int
         Masks with fewer are not searched.
-    certain : float
-        A place of lower log10 odds among streets that repeat is compared with all its twins around, piece by piece.
-    repeating : float
-        Streets repeat where chance puts this share of the mask's roads on roads.
     twins : TwinOptions or None
-        How; None: not at all.
+        Whether and how a weak place among streets that repeat is compared with its twins around, piece by piece.
     truths : tuple of (str, lon, lat)
         For explanations: where the middle of the frame of masks whose names end so really lies. The search does not
         look at it.
@@ -50,8 +46,6 @@ class LocateOptions:
     min_log10_odds: float = 3.5
     min_margin: float = 2.0
     min_intersections: int = 3
-    certain: float = 20.0
-    repeating: float = 0.35
     twins: TwinOptions | None = field(default_factory=lambda: TwinOptions.nearby(4000.0, n_places=12))
     truths: tuple[tuple[str, float, float], ...] = ()
     query: QueryOptions = field(default_factory=QueryOptions)

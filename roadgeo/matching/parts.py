@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import math
 from dataclasses import dataclass
-from functools import lru_cache
 from typing import Protocol, TypeAlias
 
 import numpy as np
@@ -43,19 +42,13 @@ class Whole:
     def may_hold(self, near: Near, frame_m: float = 0.0) -> bool:
         """Whether the circle, widened by the frame, touches the bounds of its intersections."""
         center = from_lonlat(self.index.plane, np.array([near[:2]], float))[0]
-        low, high = _bounds(self.index)
+        low, high = self.index.bounds
         beyond = np.maximum(low - center, center - high)
         return bool((beyond <= near[2] + frame_m).all())
 
     def open(self) -> ReferenceIndex:
         """Return its index."""
         return self.index
-
-
-@lru_cache(maxsize=1024)
-def _bounds(index: ReferenceIndex) -> tuple[FloatArray, FloatArray]:
-    """Return the least and the greatest coordinates of a map's intersections."""
-    return index.xy.min(axis=0), index.xy.max(axis=0)
 
 
 def touches(box: tuple[float, float, float, float], near: Near) -> bool:

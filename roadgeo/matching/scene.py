@@ -9,15 +9,13 @@ import numpy as np
 
 from roadgeo._arrays import AnyArray, BoolArray, Float32Array, FloatArray, Int32Array
 from roadgeo.geometry.frame import Frame
+from roadgeo.geometry.mask import PROBABILITY_SURE, PROBABILITY_UNKNOWN
 from roadgeo.kernels.buckets import nearest_neighbours
 from roadgeo.matching.index import neighbour_grid, sort_by_bucket
 from roadgeo.roads.graph import RoadGraph
 from roadgeo.roads.intersections import Intersections
 
 __all__ = ["Scene", "SceneOptions", "prepare_scene", "query_neighbours", "sample_roads"]
-
-#: Values of `RoadMask.probability` where nothing is known, and where there is road for sure.
-_UNKNOWN, _SURE = 255, 254.0
 
 #: A road's middle is traced within a pixel.
 _NEAR = (-1, 0, 1)
@@ -152,10 +150,10 @@ def _nearest(found: Intersections, center: FloatArray, most: int) -> Intersectio
 def _probability_at(points: FloatArray, probability: AnyArray) -> FloatArray:
     """Return the greatest probability of road (S,) within a pixel of each point (S, 2) of the query plane."""
     height, width = probability.shape
-    known = np.where(probability == _UNKNOWN, np.uint8(0), probability)
+    known = np.where(probability == PROBABILITY_UNKNOWN, np.uint8(0), probability)
     column, row = np.clip((points * (1.0, -1.0)).astype(np.int64), 0, (width - 1, height - 1)).T
     around = [known[np.clip(row + i, 0, height - 1), np.clip(column + j, 0, width - 1)] for i in _NEAR for j in _NEAR]
-    return np.asarray(np.max(around, axis=0) / _SURE)
+    return np.asarray(np.max(around, axis=0) / PROBABILITY_SURE)
 
 
 def prepare_scene(

@@ -98,6 +98,12 @@ class SharedSweeps(Generic[AnyMember]):
         found = (one.grown.pop(id(member), []) for one in self._done.get(stage, []) if one.anchor == anchor)
         return next(found, [])
 
+    def end(self) -> None:
+        """Let go of the parts: each holds on to this, and a cycle would keep their maps open for a while."""
+        self.members.clear()
+        self._rounds.clear()
+        self._done.clear()
+
     def _work(self, stage: Stage) -> Iterator[_Round]:
         low, high = self.camera.gsd_m
         scale = (low / stage.grow.max_scale_ratio, high * stage.grow.max_scale_ratio)

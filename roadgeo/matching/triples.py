@@ -168,11 +168,13 @@ def propose(
         ]
 
 
-@lru_cache(maxsize=4)
 def _starts(indexes: tuple[ReferenceIndex, ...]) -> Int32Array:
     """Return where the cells of the tables of all indexes would start in one; in larger units where they are many."""
-    if len(indexes) == 1:
-        return indexes[0].table_starts
+    return indexes[0].table_starts if len(indexes) == 1 else _added_starts(indexes)
+
+
+@lru_cache(maxsize=1)  # it keeps the indexes open
+def _added_starts(indexes: tuple[ReferenceIndex, ...]) -> Int32Array:
     starts = np.zeros(len(indexes[0].table_starts), np.int64)
     for index in indexes:
         starts += index.table_starts

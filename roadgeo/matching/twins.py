@@ -38,6 +38,10 @@ class TwinOptions:
 
     Attributes
     ----------
+    certain : float
+        A place that has these log10 odds is not compared.
+    repeating : float
+        Nor is one where chance puts less than this share of the mask's roads on roads: streets do not repeat there.
     piece_m : float
         Roads agree or not over about this length; pieces are independent.
     unseen : float
@@ -51,6 +55,8 @@ class TwinOptions:
         Middles of two places lie further from each other than this share of half the frame's diagonal.
     """
 
+    certain: float = 20.0
+    repeating: float = 0.35
     piece_m: float = 60.0
     unseen: float = 0.5
     n_places: int = 40

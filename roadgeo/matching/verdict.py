@@ -5,6 +5,7 @@ from __future__ import annotations
 import math
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
+from time import perf_counter
 
 import numpy as np
 
@@ -62,6 +63,14 @@ class _Candidate:
 
 def decide(query: Query, found: Sequence[Found], options: LocateOptions) -> Location:
     """Judge the places found on one or more references, and describe the answer."""
+    started = perf_counter()
+    location = _judge(query, found, options)
+    seconds = location.seconds
+    return replace(location, seconds=replace(seconds, match=seconds.match + perf_counter() - started))
+
+
+def _judge(query: Query, found: Sequence[Found], options: LocateOptions) -> Location:
+    """Compare the places with each other and with what is asked for; describe the best, or say why there is none."""
     location = _describe_work(query, found)
     if options.method == "pair":
         return _decide_pairs(location, query, found, options)
@@ -206,18 +215,18 @@ def _twin(query: Query, best: _Candidate, options: LocateOptions) -> Place | Non
     place does; but that part fits as well wherever blocks have that size (a mask of Portland in Chicago: 10^6, with
     72 % of the roads).
     """
-    fit, match = best.fit, options.match
-    if options.twins is None or best.score >= options.certain:
+    fit, match, twins = best.fit, options.match, options.twins
+    if twins is None or best.score >= twins.certain:
         return None
     scene = straighten_scene(query.scene, fit.lens_k1) if fit.lens_k1 else query.scene
     chance = chance_agreement(fit.matrix, scene, fit.index, sampling(fit.matrix, scene.size), match.verify)
-    if chance[1] < options.repeating:
+    if chance[1] < twins.repeating:
         return None
     within = None
     if options.near is not None:
         x, y = from_lonlat(fit.index.plane, np.array([options.near[:2]]))[0]
         within = (float(x), float(y), options.near[2])
-    twin = best_twin(fit.matrix, scene, fit.index, match, options.twins, within)
+    twin = best_twin(fit.matrix, scene, fit.index, match, twins, within)
     if twin is None:
         return None
     there = center_of(query, replace(fit, matrix=twin.matrix))

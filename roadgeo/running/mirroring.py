@@ -36,9 +36,7 @@ def ask_mirrored(
     refused = sighting.location
     if refused.status != "not_located" or refused.reason_code not in _WORTH_A_TRY or options.method == "pair":
         return sighting
-    mask = sighting.mask
-    observed = None if mask.observed is None else mask.observed[:, ::-1].copy()
-    turned = replace(mask, roads=mask.roads[:, ::-1].copy(), observed=observed)
+    turned = sighting.mask.mirrored()
     if not allowed:
         search = replace(options.search, work_limit_s=min(_WORK_LIMIT_S, options.search.work_limit_s))
         options = replace(options, effort="quick", search=search)

@@ -62,9 +62,11 @@ def _stretched(mask: RoadMask, stretch: float) -> tuple[RoadMask, FloatArray]:
         scaled = cv2.resize(values.astype(np.float32), (new_width, new_height), interpolation=cv2.INTER_LINEAR)
         return np.asarray(scaled > 0.5)
 
-    observed = None if mask.observed is None else resize(mask.observed)
+    observed, probability = None if mask.observed is None else resize(mask.observed), mask.probability
+    if probability is not None:
+        probability = cv2.resize(probability, (new_width, new_height), interpolation=cv2.INTER_NEAREST)
     to_stretched = np.diag([new_width / width, new_height / height, 1.0])
-    return replace(mask, roads=resize(mask.roads), observed=observed), to_stretched
+    return replace(mask, roads=resize(mask.roads), observed=observed, probability=probability), to_stretched
 
 
 def _as_it_came(found: Location, refused: Location, to_stretched: FloatArray) -> Location:

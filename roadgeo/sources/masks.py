@@ -17,11 +17,11 @@ import numpy as np
 from roadgeo._arrays import AnyArray, BoolArray
 from roadgeo._text import visible
 from roadgeo.errors import MaskError
-from roadgeo.geometry.mask import RoadMask
+from roadgeo.geometry.mask import PROBABILITY_SURE, PROBABILITY_UNKNOWN, RoadMask
 from roadgeo.roads.borders import find_border
 from roadgeo.roads.observed import find_voids
 from roadgeo.roads.vectorization import road_width
-from roadgeo.sources.thresholds import Sample, find_thresholds
+from roadgeo.sources.thresholds import Sample, find_thresholds, ground_and_road
 from roadgeo.storage.gdal import is_named_remote
 from roadgeo.storage.rasters import image_size, open_raster, require_file, sidecar_nodata
 from roadgeo.storage.silence import silenced
@@ -117,6 +117,7 @@ class MaskSource:
     _raster: _Raster
     _channel: int
     _voids: bool
+    _levels: tuple[float, float] | None  # a soft map's values of ground and of road
 
     def read(self, threshold: float) -> RoadMask:
         """Read where values lie above a threshold as road.
@@ -135,7 +136,15 @@ class MaskSource:
             observed = find_voids(roads, width) if observed is None else observed
         if observed is not None:
             roads &= observed
-        return RoadMask(roads, observed, name)
+        return RoadMask(roads, observed, name, self._probability(roads))
+
+    def _probability(self, roads: BoolArray) -> AnyArray | None:
+        """Return how sure each pixel is to be road, as `RoadMask.probability`; None of a mask, which does not say."""
+        if self._levels is None:
+            return None
+        sure = _between(self._raster, self._channel, *self._levels)
+        dark = np.median(sure[roads]) < PROBABILITY_SURE / 2  # of dark roads on light ground
+        return np.where(sure == PROBABILITY_UNKNOWN, sure, PROBABILITY_SURE - sure) if dark else sure
 
 
 @contextmanager
@@ -155,7 +164,8 @@ def open_mask(
         channel = int(np.argmax(seen.std(axis=0))) if raster.n_bands > 1 else 0
         sample = Sample(raster.name, seen, channel, lambda: _middle_rows(raster, channel))
         thresholds = find_thresholds(sample) if threshold is None else (threshold,)
-        yield MaskSource(thresholds, raster, channel, voids)
+        levels = ground_and_road(sample, thresholds[0]) if len(thresholds) > 1 else None
+        yield MaskSource(thresholds, raster, channel, voids, levels)
 
 
 def _drawn(raster: _Raster) -> _Raster:
@@ -218,6 +228,17 @@ def _separate(raster: _Raster, channel: int, threshold: float) -> tuple[BoolArra
             f"{_sample(raster)[:, channel].max():g}; expected roads as light pixels (or give a lower threshold)"
         )
     return roads, observed
+
+
+def _between(raster: _Raster, channel: int, ground: float, road: float) -> AnyArray:
+    """Return where values of a band lie between those of ground and road, as `RoadMask.probability`."""
+    shares = np.full(raster.shape, PROBABILITY_UNKNOWN, np.uint8)
+    for strip in _strips(raster, 1):
+        values, valid = raster.read(strip.start, strip.stop, 1)
+        finite = _finite(values, valid)
+        share = np.clip((values[..., channel][finite].astype(np.float32) - ground) / (road - ground), 0.0, 1.0)
+        shares[strip][finite] = np.rint(PROBABILITY_SURE * share)
+    return shares
 
 
 def _strips(raster: _Raster, step: int) -> Iterator[slice]:

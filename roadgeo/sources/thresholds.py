@@ -16,7 +16,7 @@ from roadgeo.errors import MaskError, PhotographError
 from roadgeo.geometry.mask import RoadMask
 from roadgeo.roads.vectorization import road_width
 
-__all__ = ["Sample", "find_thresholds"]
+__all__ = ["Sample", "find_thresholds", "ground_and_road"]
 
 _COLOURED_SHARE = 0.05  # more than this: a photograph
 _GREY_SHARE = 0.25  # more than this is neither dark nor light: a soft map on uneven ground
@@ -87,17 +87,28 @@ def find_thresholds(sample: Sample) -> tuple[float, ...]:
     return (usual,) if grey <= _CRISP_SHARE else _spread(values, usual)
 
 
+def ground_and_road(sample: Sample, threshold: float) -> tuple[float, float]:
+    """Return the usual values below and above a threshold that parts them."""
+    return _medians(sample.seen[:, sample.channel].astype(np.float64), threshold)
+
+
+def _medians(values: AnyArray, threshold: float) -> tuple[float, float]:
+    above = values > threshold
+    return float(np.median(values[~above])), float(np.median(values[above]))
+
+
 def _spread(values: AnyArray, first: float) -> tuple[float, ...]:
     """Return the first threshold and those between ground and roads that part (n,) values otherwise."""
     above = values > first
     if not above.any() or above.all():
         return (first,)
-    ground, road = float(np.median(values[~above])), float(np.median(values[above]))
+    ground, road = _medians(values, first)
     chosen = [first]
-    areas = [float(above.mean())]
+    inverted = bool(above.mean() > 0.5)  # dark roads on light ground
+    areas = [float(np.mean(above != inverted))]
     for share in _FURTHER:
         threshold = ground + share * (road - ground)
-        area = float(np.mean(values > threshold))
+        area = float(np.mean((values > threshold) != inverted))
         if area > 0 and all(max(area, one) > 1.15 * min(area, one) for one in areas):
             chosen.append(threshold)
             areas.append(area)

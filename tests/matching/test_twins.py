@@ -104,7 +104,7 @@ def test_the_best_twin_leads_a_wrong_place_and_not_the_right_one(broken):
         (6.0, {}, "ambiguous"),
         (25.0, {}, "located"),  # beyond doubt
         (6.0, {"twins": None}, "located"),
-        (6.0, {"repeating": 1.1}, "located"),  # streets that do not repeat
+        (6.0, {"twins": TwinOptions(repeating=1.1)}, "located"),  # streets that do not repeat
     ],
 )
 def test_a_weak_place_must_lead_its_twins(broken, odds, options, status):

@@ -246,6 +246,30 @@ def test_a_mask_has_one_threshold(town: np.ndarray) -> None:
         assert opened.thresholds == (60,)
 
 
+@pytest.mark.parametrize("inverted", [False, True])
+def test_a_soft_map_says_how_sure_each_pixel_is(town: np.ndarray, inverted: bool) -> None:
+    sure = np.where(np.arange(500) < 250, 1.0, 0.5)  # on the right, half as sure
+    share = cv2.GaussianBlur(town.astype(np.float32), (0, 0), 1.5) * sure
+    values = np.ma.masked_array(1.0 - share if inverted else share, np.zeros(share.shape, bool))
+    values[:40] = np.ma.masked
+    with open_mask(values.astype(np.float32)) as opened:
+        mask = opened.read(0.6 if inverted else 0.4)
+    probability = mask.probability
+    assert probability is not None
+    assert probability.dtype == np.uint8
+    assert (probability[:40] == 255).all()
+    assert (probability[40:] < 255).all()
+    left, right = (probability[40:, half][town[40:, half]] for half in (slice(250), slice(250, None)))
+    assert np.median(left) > 1.5 * np.median(right)
+    assert np.median(probability[40:][~town[40:]]) == 0
+    np.testing.assert_array_equal(mask.mirrored().probability, probability[:, ::-1])
+
+
+def test_a_mask_does_not_say_how_sure_it_is(town: np.ndarray) -> None:
+    assert read_mask(town).probability is None
+    assert read_mask(soft_map(town), threshold=60).probability is None
+
+
 @pytest.mark.parametrize("sigma", [1, 2, 4])
 def test_a_faint_map_is_no_map_of_classes(tmp_path: Path, town: np.ndarray, sigma: float) -> None:
     faint = np.rint(cv2.GaussianBlur(town * np.float32(12), (0, 0), sigma)).astype(np.uint8)
