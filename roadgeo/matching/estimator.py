@@ -461,11 +461,10 @@ class TripleEstimator:
 
     def center(self, model: Hypothesis) -> FloatArray:
         """Where the middle of the frame lies, in plane metres."""
-        matrix = model.refined.matrix if model.refined is not None else model.matrix
-        return Homography(matrix).everywhere(self.scene.center)
+        spot = model.spot(self.scene.size)
+        return np.array([spot.x, spot.y])
 
     def same(self, a: Hypothesis, b: Hypothesis) -> bool:
         """Whether two hypotheses put the middle of the frame within 50 m, or a twentieth of its size, of each other."""
-        gsd = sampling(a.matrix, self.scene.size)
-        limit = max(50.0, 0.05 * gsd * self.scene.half_size)
-        return bool(np.hypot(*(self.center(a) - self.center(b))) < limit)
+        one, other = a.spot(self.scene.size), b.spot(self.scene.size)
+        return math.hypot(one.x - other.x, one.y - other.y) < one.reach_m

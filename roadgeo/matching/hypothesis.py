@@ -3,23 +3,39 @@
 from __future__ import annotations
 
 from dataclasses import dataclass, field
-from typing import TypeAlias
+from typing import NamedTuple, TypeAlias
 
 import numpy as np
 
 from roadgeo._arrays import FloatArray, IntArray
-from roadgeo.geometry.camera import CameraFault
+from roadgeo.geometry.camera import CameraFault, sampling
+from roadgeo.geometry.frame import Frame
+from roadgeo.geometry.homography import Homography
 from roadgeo.matching.lens import LensFit
 from roadgeo.matching.refinement import Refined
 from roadgeo.matching.verification import Agreement
 
-__all__ = ["MINIMAL", "Hypothesis", "Lead"]
+__all__ = ["MINIMAL", "Hypothesis", "Lead", "Spot"]
 
 #: Matches that determine a homography; that many seeds are excluded from the evidence.
 MINIMAL = 4
 
 #: What led to a hypothesis: number of the stage, and intersection of the query.
 Lead: TypeAlias = tuple[int, int]
+
+
+class Spot(NamedTuple):
+    """Where the middle of a frame lies by a hypothesis.
+
+    `x`, `y`: plane metres; `reach_m`: what lies nearer means the same place, 50 m or a twentieth of the frame's size;
+    `matrix`, `laid`: the homographies that it was computed of, before and after refinement.
+    """
+
+    matrix: FloatArray
+    laid: FloatArray
+    x: float
+    y: float
+    reach_m: float
 
 
 @dataclass
@@ -46,6 +62,18 @@ class Hypothesis:
     by_roads: bool = False
     lens: LensFit | None = None
     leads: list[Lead] = field(default_factory=list)
+    _spot: Spot | None = field(default=None, repr=False)
+
+    def spot(self, size: tuple[int, int]) -> Spot:
+        """Return where the middle of a frame of that size lies; kept, for in a lattice it is asked for without end."""
+        laid = self.refined.matrix if self.refined is not None else self.matrix
+        kept = self._spot
+        if kept is None or kept.matrix is not self.matrix or kept.laid is not laid:
+            frame = Frame(*size)
+            x, y = Homography(laid).everywhere(frame.plane_center).tolist()
+            reach_m = max(50.0, 0.05 * sampling(self.matrix, size) * frame.half_diagonal)
+            kept = self._spot = Spot(self.matrix, laid, x, y, reach_m)
+        return kept
 
     @property
     def n_found(self) -> int:
