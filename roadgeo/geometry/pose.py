@@ -6,7 +6,9 @@ with its focal length. They are fitted to the corners by least squares, each cor
 
 Looking straight down, focal length and height cannot be told apart: a lens half as long at half the height sees the
 same. So an unknown focal length has a prior, that of usual lenses; what the homography does not tell keeps the prior's
-width, and so does the height.
+width, and so does the height. What is adjusted is chosen so that the focal length, where the view hardly tells it,
+changes without the others: where the axis meets the ground, metres per pixel there, and tilt per focal length. With
+position and angles themselves the sum of squares has a long, bent valley, in which an adjustment hardly moves.
 
 Camera axes: x to the right, y to the image's top, z backwards, so that a camera without rotation looks straight down
 with its top to the north.
@@ -15,7 +17,7 @@ with its top to the north.
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Iterable
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 from typing import Literal
 
@@ -120,17 +122,14 @@ def find_pose(
     homography, corners = _moved_to(origin, homography), corners - origin[:2]
     usual = options.usual_focal * frame.half_diagonal
     tried = [options.focal_px] if options.focal_px else [usual * factor for factor in _FACTORS]
-    weights = whitener(corner_covariance)
+    prior = math.log(options.focal_px or usual), 1e-6 if options.focal_px else options.usual_sigma
+    problem = _Problem(frame, corners, whitener(corner_covariance), *prior)
 
-    def cost(p: FloatArray) -> float:
-        away = weights @ (_corners_seen(p, frame) - corners).ravel()
-        return float(np.nan_to_num(away @ away, nan=np.inf))
-
-    start = min(_starts(homography, frame, tried), key=cost, default=None)
-    found = None if start is None else _fit(start, frame, corners, weights, options)
+    starts = problem.starts(homography, tried)
+    found = None if not starts else _fit(problem.nearest(starts), problem, options.n_iterations)
     if found is None:
         return None
-    pose = _describe(*found, options)
+    pose = _describe(*found, problem, options)
     return replace(pose, position=pose.position + origin)
 
 
@@ -139,63 +138,98 @@ def _moved_to(origin: FloatArray, homography: FloatArray) -> FloatArray:
     return np.array([[1.0, 0.0, -origin[0]], [0.0, 1.0, -origin[1]], [0.0, 0.0, 1.0]]) @ homography
 
 
-def _starts(homography: FloatArray, frame: Frame, focals: Iterable[float]) -> Iterable[FloatArray]:
-    """Yield (7,) parameters of pinholes of some focal lengths that nearly see a homography (Zhang 2000, 3.1)."""
-    to_middle = np.array([[1.0, 0.0, -frame.center[0]], [0.0, -1.0, frame.center[1]], [0.0, 0.0, 1.0]])
-    g = to_middle @ Homography(homography).facing(frame.center).inverse().matrix
-    for focal in focals:
-        m = np.diag([1.0 / focal, 1.0 / focal, -1.0]) @ g
+@dataclass(frozen=True)
+class _Problem:
+    """Corners (4, 2) to be seen by a pinhole of seven parameters, (..., 7).
+
+    They are x and y where its axis meets the ground, log metres per pixel there, its heading, its tilt about two axes
+    were its focal length that of `log_focal`, and the log of its focal length, with which the tilt grows in proportion.
+    """
+
+    frame: Frame
+    corners: FloatArray
+    weights: FloatArray
+    log_focal: float
+    log_focal_sigma: float
+
+    def starts(self, homography: FloatArray, focals: Sequence[float]) -> list[FloatArray]:
+        """Return pinholes of some focal lengths that nearly see a homography, if they are above the ground."""
+        middle = self.frame.center
+        to_middle = np.array([[1.0, 0.0, -middle[0]], [0.0, -1.0, middle[1]], [0.0, 0.0, 1.0]])
+        seen_by = to_middle @ Homography(homography).facing(middle).inverse().matrix
+        found = (self._start(seen_by, focal) for focal in focals)
+        return [one for one in found if one is not None]
+
+    def _start(self, seen_by: FloatArray, focal: float) -> FloatArray | None:
+        """Take the plane's homography to pixels, from the middle, y up, apart (Zhang 2000, 3.1)."""
+        m = np.diag([1.0 / focal, 1.0 / focal, -1.0]) @ seen_by
         m = m / math.sqrt(np.linalg.norm(m[:, 0]) * np.linalg.norm(m[:, 1]))
         u, _, vt = np.linalg.svd(m[:, :2], full_matrices=False)
         x, y = (u @ vt).T
         rotation = np.stack([x, y, np.cross(x, y)])  # rows: the plane's axes in the camera's
-        position = -rotation @ m[:, 2]
-        if position[2] > 0:
-            yield np.array([*position, *_rotation_vector(rotation), math.log(focal)])
+        position, up = -rotation @ m[:, 2], rotation[:, 2]
+        if position[2] <= 0.0 or up[2] <= 1e-3:
+            return None
+        reach = position[2] / up[2]
+        tilt = _tilt_to(up)
+        right = (_rotation(np.append(tilt, 0.0)).T @ rotation)[:, 0]
+        lean = tilt / math.exp(math.log(focal) - self.log_focal)
+        ground = position - reach * up
+        return np.array([*ground[:2], math.log(reach / focal), math.atan2(right[1], right[0]), *lean, math.log(focal)])
+
+    def camera(self, p: FloatArray) -> tuple[FloatArray, FloatArray]:
+        """Return positions (..., 3) and rotations (..., 3, 3)."""
+        tilt = np.concatenate((p[..., 4:6] * np.exp(p[..., 6:] - self.log_focal), np.zeros_like(p[..., :1])), axis=-1)
+        cos, sin, one, none = np.cos(p[..., 3]), np.sin(p[..., 3]), np.ones_like(p[..., 3]), np.zeros_like(p[..., 3])
+        heading = np.stack((cos, -sin, none, sin, cos, none, none, none, one), axis=-1).reshape(*p.shape[:-1], 3, 3)
+        rotation = _rotation(tilt) @ heading
+        ground = np.concatenate((p[..., :2], np.zeros_like(p[..., :1])), axis=-1)
+        return ground + np.exp(p[..., 2:3] + p[..., 6:]) * rotation[..., 2], rotation
+
+    def residuals(self, p: FloatArray) -> FloatArray:
+        """Return the corners' distances from where they are seen, whitened, and the focal length's from usual ones."""
+        position, rotation = self.camera(p)
+        rays = np.empty((*p.shape[:-1], 4, 3))
+        rays[..., :2] = (self.frame.corners - self.frame.center) * (1.0, -1.0)
+        rays[..., 2] = -np.exp(p[..., 6:])
+        rays = rays @ np.swapaxes(rotation, -1, -2)
+        with np.errstate(divide="ignore", invalid="ignore"):  # above the horizon
+            reach = np.where(rays[..., 2] < 0, -position[..., 2:] / rays[..., 2], np.nan)
+        seen = position[..., None, :2] + rays[..., :2] * reach[..., None]
+        away = (seen - self.corners).reshape(*p.shape[:-1], 8) @ self.weights.T
+        return np.concatenate((away, (p[..., 6:] - self.log_focal) / self.log_focal_sigma), axis=-1)
+
+    def nearest(self, starts: Sequence[FloatArray]) -> FloatArray:
+        """Return the parameters whose sum of squares is least: it has none where a corner lies above the horizon."""
+        squares = (self.residuals(np.stack(starts)) ** 2).sum(axis=1)
+        return starts[int(np.argmin(np.nan_to_num(squares, nan=np.inf)))]
 
 
-def _fit(
-    start: FloatArray, frame: Frame, corners: FloatArray, weights: FloatArray, options: PoseOptions
-) -> tuple[FloatArray, FloatArray] | None:
-    """Adjust parameters to the corners by Levenberg and Marquardt; return them and their covariance."""
-    prior = math.log(options.focal_px or options.usual_focal * frame.half_diagonal)
-    prior_sigma = 1e-6 if options.focal_px else options.usual_sigma
-
-    def residuals(p: FloatArray) -> FloatArray:
-        away = (_corners_seen(p, frame) - corners).reshape(*p.shape[:-1], 8) @ weights.T
-        return np.concatenate((away, (p[..., 6:] - prior) / prior_sigma), axis=-1)
-
+def _fit(start: FloatArray, problem: _Problem, n_iterations: int) -> tuple[FloatArray, FloatArray] | None:
+    """Adjust parameters by Levenberg and Marquardt; return them and their covariance."""
     p, damping = start, 1e-3
-    scale = np.array([start[2]] * 3 + [1.0] * 4)
-    r = residuals(p)
-    for _ in range(options.n_iterations):
-        jacobian = _differentiate(residuals, p, scale)
+    reach = math.exp(start[2] + start[6])
+    scale = np.array([reach, reach] + [1.0] * 5)
+    r = problem.residuals(p)
+    for _ in range(n_iterations):
+        jacobian = _differentiate(problem.residuals, p, scale)
         normal = jacobian.T @ jacobian
         step = np.linalg.solve(normal + damping * np.diag(np.diag(normal)), -jacobian.T @ r)
         step = step / max(1.0, float(np.abs(step / scale).max()))  # no further than by its height, or a radian
-        tried = residuals(p + step)
+        tried = problem.residuals(p + step)
         if not np.isfinite(tried).all() or tried @ tried > r @ r:
+            if np.abs(step / scale).max() < 1e-9:
+                break
             damping *= 10.0
             continue
         done = float(r @ r - tried @ tried) < 1e-9 * float(r @ r) + 1e-12
         p, r, damping = p + step, tried, damping / 10.0
         if done:
             break
-    if not np.isfinite(r).all() or p[2] <= 0:
+    if not np.isfinite(r).all():
         return None
-    jacobian = _differentiate(residuals, p, scale)
+    jacobian = _differentiate(problem.residuals, p, scale)
     return p, np.asarray(np.linalg.inv(jacobian.T @ jacobian))
-
-
-def _corners_seen(p: FloatArray, frame: Frame) -> FloatArray:
-    """Return where pinholes (..., 7) see their frames' corners on the plane, (..., 4, 2); NaN above the horizon."""
-    rays = np.empty((*p.shape[:-1], 4, 3))
-    rays[..., :2] = (frame.corners - frame.center) * (1.0, -1.0)
-    rays[..., 2] = -np.exp(p[..., 6:])
-    rays = rays @ np.swapaxes(_rotation(p[..., 3:6]), -1, -2)
-    with np.errstate(divide="ignore", invalid="ignore"):
-        reach = np.where(rays[..., 2] < 0, -p[..., 2:3] / rays[..., 2], np.nan)
-    return np.asarray(p[..., None, :2] + rays[..., :2] * reach[..., None])
 
 
 def _differentiate(function: Callable[[FloatArray], FloatArray], p: FloatArray, scale: FloatArray) -> FloatArray:
@@ -205,21 +239,22 @@ def _differentiate(function: Callable[[FloatArray], FloatArray], p: FloatArray, 
     return np.asarray((after - before).T / (2e-6 * scale))
 
 
-def _describe(p: FloatArray, covariance: FloatArray, options: PoseOptions) -> Pose:
-    """Take the covariance of the parameters to that of position and angles."""
+def _describe(p: FloatArray, covariance: FloatArray, problem: _Problem, options: PoseOptions) -> Pose:
+    """Take parameters and their covariance to those of position and angles."""
+    position, rotation = problem.camera(p)
 
-    def angles(vector: FloatArray) -> FloatArray:
-        away = _angles(_rotation(vector)) - _angles(_rotation(p[3:6]))
-        return np.asarray((away + 180.0) % 360.0 - 180.0)
+    def placed(parameters: FloatArray) -> FloatArray:
+        positions, rotations = problem.camera(parameters)
+        away = (_angles(rotations) - _angles(rotation) + 180.0) % 360.0 - 180.0
+        return np.concatenate((positions, away), axis=-1)
 
-    to = np.zeros((6, 7))
-    to[:3, :3] = np.eye(3)
-    to[3:, 3:6] = _differentiate(angles, p[3:6], np.ones(3))
+    reach = math.exp(p[2] + p[6])
+    to = _differentiate(placed, p, np.array([reach, reach] + [1.0] * 5))
     focal, sigma = math.exp(p[6]), math.sqrt(covariance[6, 6])
     source: Literal["camera", "homography", "assumed"] = "homography" if sigma < options.told_sigma else "assumed"
     if options.focal_px:
         source, sigma = "camera", 0.0
-    return Pose(p[:3], _rotation(p[3:6]), to @ covariance @ to.T, focal, focal * sigma, source)
+    return Pose(position, rotation, to @ covariance @ to.T, focal, focal * sigma, source)
 
 
 # --- rotations --------------------------------------------------------------------------------------------------------
@@ -233,11 +268,11 @@ def _rotation(vector: FloatArray) -> FloatArray:
     return np.asarray(np.eye(3) + np.sinc(angle / math.pi) * cross + half * (cross @ cross))
 
 
-def _rotation_vector(rotation: FloatArray) -> FloatArray:
-    """Undo `_rotation`."""
-    x, y, z, w = quaternion(rotation)
-    length = math.sqrt(x * x + y * y + z * z)
-    return np.zeros(3) if length < 1e-12 else np.array([x, y, z]) / length * 2.0 * math.atan2(length, w)
+def _tilt_to(up: FloatArray) -> FloatArray:
+    """Return the level vector (2,), a turn by its length, radians, that takes (0, 0, 1) to a direction (3,)."""
+    level = math.hypot(up[0], up[1])
+    angle = math.atan2(level, up[2])
+    return np.array([-up[1], up[0]]) * (angle / level if level > 0.0 else 0.0)
 
 
 def _angles(rotation: FloatArray) -> FloatArray:

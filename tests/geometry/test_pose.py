@@ -52,6 +52,19 @@ def test_straight_down_an_unknown_focal_length_is_assumed_and_the_height_is_as_u
     assert found.position[:2] == pytest.approx(position[:2], abs=1e-2)
 
 
+@pytest.mark.parametrize("tilt", [0.0, 0.5, 3.0])
+@pytest.mark.parametrize("spread", [0.01, 0.3])
+def test_a_focal_length_that_the_homography_does_not_tell_is_the_usual_one(tilt: float, spread: float) -> None:
+    homography, position, _ = view_of(tilt)
+    found = find_pose(homography, SIZE, spread**2 * np.eye(8))
+    assert found is not None
+    away = (np.log(FOCAL) - np.log(found.focal_px)) / (found.focal_sigma_px / found.focal_px)
+    assert abs(away) < 1.0  # 1125, usual here, is a quarter of a standard deviation away
+    if tilt == 0.0:
+        assert found.focal_px == pytest.approx(1125.0, rel=1e-3)
+        assert found.position[2] == pytest.approx(position[2] * 1.125, rel=1e-3)
+
+
 @pytest.mark.parametrize("options", [PoseOptions(FOCAL), PoseOptions()])
 def test_its_covariance_is_that_of_many_trials(options: PoseOptions) -> None:
     homography, position, _ = view_of(35.0)
