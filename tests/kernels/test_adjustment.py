@@ -105,6 +105,7 @@ def test_beyond_the_horizon_nothing_is_carried():
     assert carry(P, -10.0, 10.0, 1.0, 0.0)[2] < 0.02
 
 
+@pytest.mark.slow
 def test_add_row_sums_normal_equations():
     rng = np.random.default_rng(0)
     A, W, b = rng.normal(0, 1, (20, 8)), rng.uniform(0, 1, 20), rng.normal(0, 1, 20)

@@ -102,6 +102,7 @@ def test_a_step_like_the_twin(roads, holds):
     assert np.allclose(p, expected, atol=1e-5)
 
 
+@pytest.mark.slow
 def test_share_like_the_twin(roads):
     network, buckets = roads
     points, along = (array[::10] for array in seen(network, truth(), false=0.3))

@@ -55,6 +55,7 @@ def test_thin_equals_its_slow_twin(states: np.ndarray, min_end_depth: float) -> 
     np.testing.assert_array_equal(actual, expected)
 
 
+@pytest.mark.slow
 @settings(deadline=None, max_examples=200)
 @given(random_states())
 def test_thinning_joins_and_parts_nothing(states: np.ndarray) -> None:
@@ -69,6 +70,7 @@ def test_thinning_joins_and_parts_nothing(states: np.ndarray) -> None:
         assert ndimage.label(before, connected)[1] == ndimage.label(after, connected)[1]
 
 
+@pytest.mark.slow
 @settings(deadline=None, max_examples=100)
 @given(random_states())
 def test_what_is_left_is_one_pixel_wide(states: np.ndarray) -> None:

@@ -125,6 +125,7 @@ def test_vertex_angle_like_the_twin(phi, wide, one, two, tangent):
     assert min(gap, 2 * UNITS - gap) < 1e-6
 
 
+@pytest.mark.slow
 @given(st.lists(st.floats(-3, 3), min_size=4, max_size=4), angles)
 def test_vertex_angle_does_not_change_under_affine_maps(matrix, tangent):
     A = np.array(matrix).reshape(2, 2)
@@ -240,6 +241,7 @@ class TestVertexProbes:
 
 
 class TestNextAlike:
+    @pytest.mark.slow
     @given(
         st.lists(st.one_of(st.integers(0, 728), st.integers(0, 20)), max_size=80),
         st.tuples(*[st.sets(st.integers(0, 8))] * 3),

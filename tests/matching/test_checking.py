@@ -33,6 +33,7 @@ def test_a_right_place_agrees(town, sights) -> None:
         assert found.agreeing == pytest.approx(found.agreeing_as_given, abs=0.05)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     "shift", [Shift(6, 0, 0, 1, 0), Shift(-3, -4, 1, 1, 0), Shift(80, -60, -5, 1, 0), Shift(-200, 220, 3, 1, 0)]
 )

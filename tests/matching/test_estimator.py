@@ -107,6 +107,7 @@ class TestNear:
 
 
 class TestCamera:
+    @pytest.mark.slow
     @pytest.mark.parametrize(
         "options",
         [CameraOptions(gsd_m=(2.0, 4.0)), CameraOptions(gsd_m=(0.2, 0.6)), CameraOptions(north_up=True)],
@@ -133,6 +134,7 @@ def test_little_to_see(town, scene, n):
     assert (by_roads.score > 6) == (n > 0)  # one intersection and all the roads are enough
 
 
+@pytest.mark.slow
 def test_road_points_far_from_the_anchor(town, scene):
     sparse = replace(scene, points=scene.points[:0], directions=scene.directions[:0], weights=scene.weights[:0])
     locate(sparse, town[1], limits=SearchOptions(time_limit_s=0.5))
@@ -193,6 +195,7 @@ def test_more_anchors_are_tried_on_a_small_map(town, scene):
     assert n_anchors(1.0) < n_anchors(3.0) <= 15
 
 
+@pytest.mark.slow
 def test_time_is_bounded(town):
     rng = np.random.default_rng(0)
     noise = look(random_network(9, 3000.0), camera((1500, 1500), (2600, 2600)), (2600, 2600), Sight(3.0), 1)

@@ -185,6 +185,7 @@ def test_each_reference_has_its_story(town, mask, lattice):
 
 
 class TestPicture:
+    @pytest.mark.slow
     def test_what_agrees_and_what_does_not(self, town, mask):
         picture = draw_explanation(explain(mask, town), mask, town.index)
         assert picture.dtype == np.uint8
@@ -249,6 +250,7 @@ def test_the_true_place_of_a_located_mask_is_not_lost(town, mask):
     assert told["log10_odds"] > 8
 
 
+@pytest.mark.slow
 def test_a_place_off_the_map_and_one_that_nothing_proposes_are_told_apart(town, mask):
     other = mask_of(random_network(9))
     told, explanation = truth_told(other, town, LocateOptions(effort="quick"), lonlat_of(town, TRUTH, 90_000.0))

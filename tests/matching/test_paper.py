@@ -194,6 +194,7 @@ def test_four_symmetric_lines_are_harmonic():
     assert out[0] == 2.0
 
 
+@pytest.mark.slow
 @settings(max_examples=30, deadline=None)
 @given(st.integers(0, 2**32 - 1), st.floats(0, 50))
 def test_cross_ratios_are_invariant_under_homographies(seed, tilt_deg):

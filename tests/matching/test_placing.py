@@ -35,6 +35,7 @@ def test_a_view_straight_down_is_levelled_and_its_corners_are_surer(town):
     assert np.isfinite(location.camera.covariance).all()
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("sigma_m", [1.0, 3000.0])
 def test_a_tilted_view_is_not_however_unsure_its_corners_are(town, sigma_m):
     location, corners = placed(town, 15.0, sigma_m)

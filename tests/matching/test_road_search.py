@@ -127,6 +127,7 @@ def test_near_restricts_where_votes_are_cast(town, broken):
     assert all(n == 0 and not grown for _, n, grown in nowhere.rounds())
 
 
+@pytest.mark.slow
 def test_work_is_bounded(town, broken):
     def n_anchors(**limits):
         roads = RoadSearch(broken, town[1], CameraOptions(), RoadSearchOptions(**limits))

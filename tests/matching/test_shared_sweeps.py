@@ -133,6 +133,7 @@ def search_all(scene, indexes, options=None):
     return parts
 
 
+@pytest.mark.slow
 def test_a_place_is_found_on_any_of_many_towns(towns):
     networks, indexes = towns
     for k, network in enumerate(networks):
@@ -140,6 +141,7 @@ def test_a_place_is_found_on_any_of_many_towns(towns):
         assert [one.stopped for one in parts] == ["accepted" if n == k else "elsewhere" for n in range(4)]
 
 
+@pytest.mark.slow
 def test_a_twin_on_another_part_is_met(towns):
     networks, indexes = towns
     parts = search_all(scene_of(look(networks[1], TRUTH)), [*indexes, indexes[1]], MatchOptions(last=(), roads=None))

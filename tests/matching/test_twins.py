@@ -66,6 +66,7 @@ def test_the_place_leads_a_block_beside_by_the_streets_that_are_missing_there(br
     assert log10_lead(there - here) == 0.0
 
 
+@pytest.mark.slow
 def test_twins_are_found_all_over_the_lattice_and_laid_on_its_streets(broken):
     truth, index, among = broken
     twins = among.twins_of(beside(truth, among), index)
@@ -77,6 +78,7 @@ def test_twins_are_found_all_over_the_lattice_and_laid_on_its_streets(broken):
     assert min(leads) > 1.0
 
 
+@pytest.mark.slow
 def test_where_all_blocks_are_equal_nothing_leads():
     truth, index, among = contest(1.0)
     here = among.weigh(truth, index)
@@ -87,6 +89,7 @@ def test_where_all_blocks_are_equal_nothing_leads():
     assert twin.log10_lead < 1.0
 
 
+@pytest.mark.slow
 def test_the_best_twin_leads_a_wrong_place_and_not_the_right_one(broken):
     truth, index, among = broken
     options = TwinOptions(n_places=12)

@@ -124,6 +124,7 @@ class TestOdds:
             one - np.log10(n_candidates)
         )
 
+    @pytest.mark.slow
     @given(rates, rates, rates, trials, st.floats(0.01, 0.3))
     def test_more_agreement_is_better(self, rate, forward, backward, n, more):
         better = (min(value + more, 1.0) for value in (rate, forward, backward))

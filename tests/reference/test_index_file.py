@@ -141,6 +141,7 @@ def test_what_the_format_does_not_store_is_refused_in_writing(tmp_path: Path, me
     assert list(tmp_path.iterdir()) == []
 
 
+@pytest.mark.slow
 def test_deep_values_are_refused_in_writing(tmp_path: Path) -> None:
     deep: list[Any] = []
     for _ in range(100_000):
@@ -415,6 +416,7 @@ def test_hand_made_pickles_are_refused(path: Path, pickled: bytes) -> None:
         read_index(path)
 
 
+@pytest.mark.slow
 @given(pickled=st.binary(max_size=60))
 @settings(max_examples=300, suppress_health_check=[HealthCheck.function_scoped_fixture], deadline=None)
 def test_random_pickles_are_refused_or_plain(path: Path, pickled: bytes) -> None:

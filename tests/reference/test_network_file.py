@@ -65,6 +65,7 @@ def test_round_trip_is_exact(path: Path, network: RoadNetwork) -> None:
     np.testing.assert_array_equal(found.coverage, network.coverage)
 
 
+@pytest.mark.slow
 @given(
     xy=st.lists(st.floats(-2e6, 2e6), min_size=2, max_size=2),
     origin=st.tuples(st.integers(-(10**7), 10**7), st.integers(-(10**7), 10**7)),

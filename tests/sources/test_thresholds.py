@@ -1,6 +1,7 @@
 """Thresholds of values of every kind: within them, or refused in a line."""
 
 import numpy as np
+import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 from hypothesis.extra import numpy as arrays
@@ -12,6 +13,7 @@ from roadgeo.sources.thresholds import Sample, find_thresholds
 KINDS = st.sampled_from([np.uint8, np.int16, np.int32, np.float32, np.float64])
 
 
+@pytest.mark.slow
 @given(st.data())
 @settings(max_examples=150)
 def test_thresholds_lie_among_the_values(data: st.DataObject) -> None:

@@ -7,6 +7,7 @@ from hypothesis import strategies as st
 from roadgeo.sources.segmentation.protobuf import WireError, fields, integers
 
 
+@pytest.mark.slow
 @given(st.binary(max_size=200))
 def test_any_bytes_are_fields_within_them_or_refused(content: bytes) -> None:
     try:
