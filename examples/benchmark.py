@@ -553,7 +553,7 @@ def parse(arguments: Sequence[str] | None) -> argparse.Namespace:
     parser.add_argument("--kinds", nargs="+", default=[*KINDS, "hard"], choices=[*KINDS, "hard"], metavar="KIND")
     parser.add_argument("--methods", nargs="+", default=["auto", "pair"], choices=["auto", "pair"], metavar="METHOD")
     parser.add_argument("--elsewhere", type=int, default=12, help="masks of each city to look for where they are not")
-    parser.add_argument("--time-limit", type=float, default=10.0, help="seconds a mask (10)")
+    parser.add_argument("--time-limit", type=float, default=60.0, help="seconds a mask (60: a search ends by itself)")
     parser.add_argument("--seed", type=int, default=0)
     parser.add_argument("--roads", help="file of road lines in each folder of masks (ref_20km.gpkg or roads.gpkg)")
     parser.add_argument("-j", "--jobs", type=int, default=1, help="processes; times are honest with 1 only")
