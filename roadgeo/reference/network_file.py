@@ -17,7 +17,7 @@ from contextlib import closing
 from dataclasses import replace
 from hashlib import blake2b
 from pathlib import Path
-from typing import Any
+from typing import Any, Literal
 
 import numpy as np
 
@@ -183,7 +183,7 @@ def read_network(path: str | os.PathLike[str]) -> RoadNetwork:
     """
     meta = read_meta(path)
     plane = _plane(path, meta)
-    rings, _ = read_layer(path, "coverage")
+    rings, _ = _read_shapes(path, "coverage", "ring")
     graph, table = _read_graph(path, plane, meta.get("roadgeo.nodes"))
     return RoadNetwork(
         graph=graph,
@@ -409,11 +409,22 @@ def _texts(table: Mapping[str, Sequence[Any]], name: str) -> AnyArray | None:
     return np.array([value if isinstance(value, str) else "" for value in table[name]], object)
 
 
+def _read_shapes(
+    path: str | os.PathLike[str], layer: str, kind: Literal["point", "line", "ring"]
+) -> tuple[list[FloatArray], Mapping[str, Sequence[Any]]]:
+    """Geometries and columns of a layer; each of its rows has a geometry of that kind."""
+    shapes, table = read_layer(path, layer)
+    n_rows = max(map(len, table.values()), default=0)
+    if len(shapes) != n_rows or any(one.ndim != (1 if kind == "point" else 2) for one in shapes):
+        raise IndexFormatError(f"{path}: its layer '{layer}' holds a geometry that is no {kind}; make the file again")
+    return shapes, table
+
+
 def _read_graph(
     path: str | os.PathLike[str], plane: LocalPlane, n_nodes: Any
 ) -> tuple[RoadGraph, Mapping[str, Sequence[Any]]]:
     """Roads with their nodes, and their columns; a node takes its position from the roads that end in it."""
-    lines, table = read_layer(path, "roads")
+    lines, table = _read_shapes(path, "roads", "line")
     edges = np.array([_column(path, table, name, -1) for name in ("from_node", "to_node")], np.int64).T.reshape(-1, 2)
     if type(n_nodes) is not int or n_nodes > 2 * len(edges) or (edges < 0).any() or (edges >= n_nodes).any():
         raise IndexFormatError(f"{path}: its layer 'roads' names nodes that do not exist; make the file again")
@@ -427,7 +438,7 @@ def _read_graph(
 
 
 def _read_intersections(path: str | os.PathLike[str], plane: LocalPlane) -> Intersections:
-    points, table = read_layer(path, "intersections")
+    points, table = _read_shapes(path, "intersections", "point")
     xy = plane.from_crs(np.array(points, float).reshape(-1, 2))
     rays, tangents = _angles(path, table, _RAYS), _angles(path, table, _TANGENTS)
     residual = np.array(_column(path, table, "residual_m", np.nan), np.float32)

@@ -322,6 +322,23 @@ class TestHostileTables:
         with pytest.raises(IndexFormatError, match="lacks its column"):
             read_network(path)
 
+    @pytest.mark.parametrize("layer", ["roads", "intersections", "coverage"])
+    def test_a_layer_that_is_no_layer_of_geometries(self, path, layer):
+        self.forge(path, f"DELETE FROM gpkg_geometry_columns WHERE table_name = '{layer}';")
+        with pytest.raises(IndexFormatError, match=f"its layer '{layer}' holds a geometry that is no"):
+            read_network(path)
+
+    @pytest.mark.parametrize(("layer", "of"), [("roads", "intersections"), ("intersections", "roads")])
+    def test_a_geometry_of_another_kind(self, path, layer, of):
+        with closing(sqlite3.connect(path)) as database:
+            for (trigger,) in database.execute("SELECT name FROM sqlite_master WHERE type = 'trigger'").fetchall():
+                database.execute(f'DROP TRIGGER "{trigger}"')
+            (one,) = database.execute(f"SELECT geom FROM {of} LIMIT 1").fetchone()
+            database.execute(f"UPDATE {layer} SET geom = ? WHERE rowid = 2", (one,))
+            database.commit()
+        with pytest.raises(IndexFormatError, match=f"its layer '{layer}' holds a geometry that is no"):
+            read_network(path)
+
 
 def deep_tree(path, table, depth=4):
     """Put a tree of interior pages above a table's root whose branches are all the same page below."""

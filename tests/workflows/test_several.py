@@ -54,7 +54,8 @@ def test_the_surest_place_wins_and_all_work_counts(query, searched):
     assert (best.status, best.reference) == ("located", "b")
     assert best.log10_odds == 20.0  # the search counted the places that it tried on all of them
     assert best.runner_up is not None
-    assert (best.seconds.match, best.seconds.refine, best.seconds.vectorize) == (3.0, 1.5, 0.1)
+    assert (best.seconds.refine, best.seconds.vectorize) == (1.5, 0.1)
+    assert 3.0 < best.seconds.match < 3.5  # and what it took to choose between them
 
 
 def test_one_reference_alone_keeps_its_odds(query, searched):
