@@ -2,11 +2,12 @@
 
 A homography has eight parameters, a similarity four. Where an image shows few roads, the other four are noise, and
 where it shows none they bend the frame by metres. They are kept only if the corners' covariance says that they are
-there.
+there. Where it nearly says so, what was set aside may be there for all that, and the result is as unsure.
 """
 
 from __future__ import annotations
 
+import math
 from typing import NamedTuple
 
 import numpy as np
@@ -23,10 +24,16 @@ _MOST = 13.28
 
 
 class Similarity(NamedTuple):
-    """A similarity as a homography (3, 3), and the covariance (8, 8) of where it puts the corners."""
+    """A similarity as a homography (3, 3), and the covariance (8, 8) of where it puts the corners.
+
+    `doubt` (8, 8) is to be added to that where nobody knows that the camera looked straight down: what was set aside
+    counts as an error, weighed by the share of level views of which less has to be. Of 958 frames tilted by up to 60
+    degrees five were taken for level, and without it were off by two to ten times what was claimed.
+    """
 
     matrix: FloatArray
     corner_covariance: FloatArray
+    doubt: FloatArray
 
 
 def find_similarity(homography: FloatArray, corners: FloatArray, corner_covariance: FloatArray) -> Similarity | None:
@@ -54,10 +61,12 @@ def find_similarity(homography: FloatArray, corners: FloatArray, corner_covarian
     weights, observed = whitener(corner_covariance), (places - origin).ravel()
     covariance = np.linalg.inv((weights @ design).T @ (weights @ design))
     parameters = covariance @ (weights @ design).T @ (weights @ observed)
-    remaining = weights @ (observed - design @ parameters)
-    if not remaining @ remaining <= _MOST:
+    set_aside = observed - design @ parameters
+    square = float(np.sum((weights @ set_aside) ** 2))
+    if not square <= _MOST:
         return None
+    less = 1.0 - math.exp(-square / 2.0) * (1.0 + square / 2.0)  # chi-squared with four degrees of freedom
     a, b = parameters[:2]
     matrix = np.array([[a, -b, 0.0], [b, a, 0.0], [0.0, 0.0, 1.0]])
     matrix[:2, 2] = origin + parameters[2:] - matrix[:2, :2] @ middle
-    return Similarity(matrix, np.asarray(design @ covariance @ design.T))
+    return Similarity(matrix, np.asarray(design @ covariance @ design.T), less * np.outer(set_aside, set_aside))

@@ -77,7 +77,7 @@ def _level(fit: Fit, query: Query, options: VerifyOptions) -> Fit:
     found = find_similarity(fit.matrix, scene.corners, fit.corner_covariance_m2)
     if found is None:
         return fit
-    matrix, covariance = found
+    matrix, covariance = found.matrix, found.corner_covariance + found.doubt
     # The covariance may be too cautious. Roads that agreed must go on to agree.
     gsd = sampling(matrix, scene.size)
     agreeing, _, _ = agreement(matrix, scene, fit.index, gsd, np.empty(0, np.int64), options)

@@ -75,6 +75,22 @@ def test_the_covariance_is_that_of_what_is_left():
     assert measured == pytest.approx(np.sqrt(np.diag(stated)), rel=0.15)
 
 
+@pytest.mark.parametrize("sigma_m", [0.5, 3.0])
+def test_a_tilted_view_that_is_taken_for_level_is_as_unsure_as_it_is_wrong(sigma_m):
+    rng = np.random.default_rng(2)
+    corners, covariance = FRAME.plane_corners, covariance_of(sigma_m, rng)
+    errors, claimed = [], []
+    for tilt_deg in np.linspace(0.0, 2.0, 400):
+        true = Homography(view(tilt_deg)).everywhere(corners)
+        seen = (true.ravel() + np.linalg.cholesky(covariance) @ rng.normal(size=8)).reshape(4, 2)
+        found = find_similarity(through(corners, seen), corners, covariance)
+        if found is not None:
+            errors.append(np.sum((Homography(found.matrix).everywhere(corners) - true) ** 2))
+            claimed.append(np.trace(found.corner_covariance + found.doubt))
+    assert len(errors) > 20
+    assert 0.6 < np.sqrt(np.mean(np.divide(errors, claimed))) < 1.4
+
+
 @pytest.mark.parametrize("tilt_deg", [1.0, 10.0, 45.0])
 def test_a_tilted_camera_is_left_alone(tilt_deg):
     covariance = covariance_of(0.2, np.random.default_rng(1))
