@@ -2,9 +2,12 @@
 
 from __future__ import annotations
 
+import zlib
 from collections.abc import Iterator
 from pathlib import Path
 from typing import Any, BinaryIO
+
+from roadgeo.sources.protobuf import WireError, fields
 
 __all__ = ["osm_parts"]
 
@@ -48,7 +51,43 @@ def _read_blob(file: BinaryIO) -> bytes:
     blob = file.read(min(size, _MAX_BLOB))
     if len(prefix) < 4 or len(header) != int.from_bytes(prefix, "big") or len(blob) != size:
         raise RuntimeError("it is cut off, damaged or no PBF file")
+    _require_text(blob)
     return prefix + header + blob
+
+
+def _require_text(blob: bytes) -> None:
+    """Refuse a blob with a zero byte in a text: osmium takes it for the end of that, and reads on beyond all texts.
+
+    Raises
+    ------
+    RuntimeError
+        There is one; or the blob is compressed in another way than with zlib, so that it cannot be looked at.
+    """
+    try:
+        for field, table in fields(memoryview(_unpacked(blob))):
+            # Zero bytes are rare, but for the length of the empty text that every table begins with.
+            if field == 1 and not isinstance(table, int) and table[2:].tobytes().count(0):
+                _require_no_zero(table)
+    except WireError as error:
+        raise RuntimeError("it is cut off, damaged or no PBF file") from error
+
+
+def _require_no_zero(table: memoryview) -> None:
+    for _, text in fields(table):
+        if not isinstance(text, int) and text.tobytes().count(0):
+            raise RuntimeError("it is damaged: a text in it holds a zero byte")
+
+
+def _unpacked(blob: bytes) -> bytes:
+    """Return what is in a blob: of its fields 1 is that as it is, 3 what zlib made of it; there is but one."""
+    contents = [(field, content) for field, content in fields(memoryview(blob)) if not isinstance(content, int)]
+    if len(contents) != 1 or contents[0][0] not in {1, 3}:
+        raise RuntimeError("a part of it is not compressed by zlib; write it with that, as osmium does by default")
+    ((field, content),) = contents
+    try:
+        return content.tobytes() if field == 1 else zlib.decompressobj().decompress(content, _MAX_BLOB + 1)
+    except zlib.error as error:
+        raise RuntimeError("it is damaged: a part of it cannot be unpacked") from error
 
 
 def _blob_size(header: bytes) -> int:

@@ -14,7 +14,7 @@ from dataclasses import dataclass, field
 from pathlib import Path
 
 from roadgeo.errors import ModelError
-from roadgeo.sources.segmentation.protobuf import WireError, fields, integers
+from roadgeo.sources.protobuf import WireError, fields, integers
 
 __all__ = ["MAX_BYTES", "OnnxFile", "Port", "read_onnx"]
 

@@ -1,7 +1,7 @@
 """The wire format of Protocol Buffers: fields of a message, read without its schema.
 
-Enough to look at an ONNX file before anything executes it. The `onnx` package would bring 15 MB and protobuf with it;
-here a message is walked in place, and large fields are never copied.
+Enough to look at an ONNX file before anything executes it, and at the text of a PBF file before osmium does. The `onnx`
+package would bring 15 MB and protobuf with it; here a message is walked in place, and large fields are never copied.
 https://protobuf.dev/programming-guides/encoding/
 """
 

@@ -4,7 +4,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from roadgeo.sources.segmentation.protobuf import WireError, fields, integers
+from roadgeo.sources.protobuf import WireError, fields, integers
 
 
 @pytest.mark.slow
