@@ -76,16 +76,17 @@ def _each(values: AnyArray, test: Any) -> BoolArray:
     verdicts: dict[Any, bool] = {}
     result = np.empty(len(values), bool)
     for i, value in enumerate(values):
-        key = value if isinstance(value, str | float | int | bool | None) else tuple(map(str, value))
+        one = value.item() if isinstance(value, np.generic) else value
+        key = tuple(map(str, one)) if isinstance(one, Iterable) and not isinstance(one, str) else one
         if key not in verdicts:
             verdicts[key] = bool(test(_names(key)))
         result[i] = verdicts[key]
     return result
 
 
-def _names(value: str | float | bool | Iterable[str] | None) -> set[str]:
+def _names(value: Any) -> set[str]:
     """Split one value into its names."""
     if value is None or (isinstance(value, float) and value != value):
         return set()
-    text = str(value) if isinstance(value, str | float | int) else ";".join(value)
+    text = ";".join(value) if isinstance(value, tuple) else str(value)
     return {name for name in re.split(r"[^a-z0-9_]+", text.lower()) if name}

@@ -76,3 +76,11 @@ def test_tunnels(value, tunnel):
 )
 def test_columns_of_highways_are_told_from_others(values, expected):
     assert names_highways(column(*values)) == expected
+
+
+@pytest.mark.parametrize("value", [np.True_, np.int64(3), np.float64("nan"), np.str_("primary"), b"primary", 1j])
+def test_values_of_any_type_are_no_fault(value):
+    """Tables of strangers hold what they like: a column of yes and no was one that no test had."""
+    kinds = np.array([value, None], object)
+    assert drives(kinds, "all").shape == in_tunnel(kinds).shape == (2,)
+    assert names_highways(kinds) == (value == "primary")
