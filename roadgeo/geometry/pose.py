@@ -226,7 +226,7 @@ def _fit(start: FloatArray, problem: _Problem, n_iterations: int) -> tuple[Float
         p, r, damping = p + step, tried, damping / 10.0
         if done:
             break
-    if not np.isfinite(r).all():
+    if not np.isfinite(r).all() or problem.camera(p)[0][2] <= 0.0:
         return None
     jacobian = _differentiate(problem.residuals, p, scale)
     return p, np.asarray(np.linalg.inv(jacobian.T @ jacobian))

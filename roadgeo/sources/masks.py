@@ -143,7 +143,7 @@ class MaskSource:
         if self._levels is None:
             return None
         sure = _between(self._raster, self._channel, *self._levels)
-        dark = np.median(sure[roads]) < PROBABILITY_SURE / 2  # of dark roads on light ground
+        dark = roads.any() and np.median(sure[roads]) < PROBABILITY_SURE / 2  # roads on light ground
         return np.where(sure == PROBABILITY_UNKNOWN, sure, PROBABILITY_SURE - sure) if dark else sure
 
 
