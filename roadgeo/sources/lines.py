@@ -17,7 +17,7 @@ import numpy as np
 from roadgeo._arrays import AnyArray, BoolArray
 from roadgeo.errors import RoadSourceError
 from roadgeo.roads.kinds import in_tunnel, names_highways
-from roadgeo.sources.pbf import osm_parts
+from roadgeo.sources.pbf import osm_head, osm_parts
 from roadgeo.sources.vectors import first_line, list_layers, read_layer, require_file
 
 __all__ = [
@@ -175,7 +175,7 @@ def stream_osm(
     broken = 0
     try:
         _refuse_bomb(path)
-        with osmium.io.Reader(str(path), osmium.osm.NOTHING) as reader:
+        with osmium.io.Reader(osm_head(path), osmium.osm.NOTHING) as reader:
             header = reader.header()
             timestamp = header.get("osmosis_replication_timestamp") or header.get("timestamp") or None
         for way in _highways(path, advance, places):

@@ -9,11 +9,21 @@ from typing import Any, BinaryIO
 
 from roadgeo.sources.protobuf import WireError, fields
 
-__all__ = ["osm_parts"]
+__all__ = ["osm_head", "osm_parts"]
 
 #: PBF files are read in parts of about this size; what may stand in them at most, as their specification says.
 _PART, _MAX_BLOB, _MAX_BLOB_HEADER = 1 << 20, 32 << 20, 64 << 10
 _NUMBER_BITS = 70
+
+
+def osm_head(path: Path) -> Any:
+    """Return what osmium is to read for a file's header: of a damaged PBF file on disk it forgets to close it."""
+    import osmium
+
+    if not path.name.lower().endswith(".pbf"):
+        return str(path)
+    with path.open("rb") as file:
+        return osmium.io.FileBuffer(_read_blob(file), "pbf")
 
 
 def osm_parts(path: Path) -> Iterator[tuple[Any, float]]:

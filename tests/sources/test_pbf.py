@@ -2,12 +2,15 @@
 
 import zlib
 from contextlib import suppress
+from pathlib import Path
 
 import pytest
 from hypothesis import example, given
 from hypothesis import strategies as st
 
+from roadgeo.errors import RoadSourceError
 from roadgeo.sources.pbf import _blob_size, _require_text
+from roadgeo.sources.roads import read_roads
 
 
 def varint(number: int) -> bytes:
@@ -70,3 +73,16 @@ def test_any_blob_is_taken_or_refused(content: bytes) -> None:
     for one in (content, text(1, content), text(3, zlib.compress(content))):
         with suppress(RuntimeError):
             _require_text(one)
+
+
+@pytest.mark.skipif(not Path("/proc/self/fd").is_dir(), reason="the system does not tell what files are open")
+def test_a_damaged_header_leaves_no_file_open(tmp_path: Path) -> None:
+    path = tmp_path / "roads.osm.pbf"
+    header = text(1, b"OSMHeader") + varint(24) + varint(8)
+    path.write_bytes(len(header).to_bytes(4, "big") + header + text(1, b"\x0a\x04abc"))
+    counts = []
+    for _ in range(4):
+        with pytest.raises(RoadSourceError):
+            read_roads(path)
+        counts.append(len(list(Path("/proc/self/fd").iterdir())))
+    assert counts[1] == counts[-1]
