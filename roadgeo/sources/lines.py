@@ -298,7 +298,7 @@ def _read_parquet(path: Path) -> RoadLines:
         wanted = [name for name in (*COLUMNS, "subtype") if name in names]
         geometry = geometry_columns(path)
         return from_frame(gpd.read_parquet(path, columns=geometry[:1] + wanted), wanted)
-    except (ValueError, pa.ArrowException, OSError) as error:  # of its text, only when that is looked at
+    except (ValueError, TypeError, pa.ArrowException, OSError) as error:  # of its text, only when that is looked at
         raise RoadSourceError(f"{path}: not readable as GeoParquet: {first_line(error)}") from error
 
 
