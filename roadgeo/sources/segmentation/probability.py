@@ -12,13 +12,13 @@ import numpy as np
 
 from roadgeo._arrays import AnyArray
 from roadgeo.errors import MaskError
-from roadgeo.geometry.mask import RoadMask
+from roadgeo.geometry.mask import PROBABILITY_UNKNOWN, RoadMask
 from roadgeo.storage.files import replacing
 
 __all__ = ["NODATA", "TAG", "ProbabilityMap", "fuse"]
 
 #: 0 to 254 stand for probabilities 0 to 1; this for ground that was not observed.
-NODATA = 255
+NODATA = PROBABILITY_UNKNOWN
 
 #: The tag by which our own probability maps are told from masks that users made.
 TAG = "ROADGEO"
