@@ -131,12 +131,14 @@ def _read(name: str, stream: IO[str], lines: queue.Queue[tuple[str, str]]) -> No
 
 
 def _stop(process: subprocess.Popen[str]) -> None:
-    """Interrupt the child as Ctrl-C does, so that it ends its workers and removes half-written files; else kill it."""
+    """Interrupt the child as Ctrl-C does: it ends its workers and removes half-written files. Kill what it leaves.
+
+    A worker that a hurried child left behind would hold the pipes open, and `run` would wait for it.
+    """
     if sys.platform != "win32":
         process.send_signal(signal.SIGINT)
         with contextlib.suppress(subprocess.TimeoutExpired):
             process.wait(_GRACE_S)
-            return
     _kill(process)
 
 
