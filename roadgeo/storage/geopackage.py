@@ -10,7 +10,7 @@ import os
 import sqlite3
 import struct
 from collections.abc import Callable, Iterator, Mapping, Sequence
-from contextlib import closing, contextmanager
+from contextlib import closing, contextmanager, suppress
 from dataclasses import dataclass, field
 from functools import lru_cache
 from pathlib import Path
@@ -44,6 +44,8 @@ PIXELS = ""
 
 _WKB_TYPES = {"POINT": 1, "LINESTRING": 2, "POLYGON": 3, "MULTIPOLYGON": 6}
 _CUSTOM_SRS_ID = 100_000  # for a CRS without an EPSG code; one such CRS per layer is numbered upwards from here
+_SQL_TYPES = {"b": "BOOLEAN", "i": "INTEGER", "u": "INTEGER", "f": "REAL"}  # by numpy's kinds
+_NOW = "strftime('%Y-%m-%dT%H:%M:%fZ','now')"
 _POINT = np.dtype([("header", "S4"), ("srs_id", "<i4"), ("order", "u1"), ("type", "<u4"), ("xy", "<f8", 2)])
 _HEADER = struct.Struct("<4si4d")  # magic, version and flags; srs_id; envelope min x, max x, min y, max y
 _ENVELOPE_BYTES = {0: 0, 1: 32, 2: 48, 3: 48, 4: 64}
@@ -101,10 +103,13 @@ def dump_layers(path: Path, layers: Sequence[Layer]) -> None:
     OSError
         The file cannot be written.
     """
+    tables = [_Table.of(layer) for layer in layers]
+    srs_ids = _srs_ids(tables)
     try:
         # Made in memory and written at once: on disk, SQLite writes page by page, many of them several times.
         with closing(sqlite3.connect(":memory:")) as database:
-            add_layers(database, layers)
+            database.deserialize(_empty(tuple(tables)))
+            _fill_tables(database, tables, layers, srs_ids)
             content = database.serialize()
     except sqlite3.Error as error:
         raise OutputError(f"cannot make a GeoPackage: {error}; please report it") from error
@@ -125,24 +130,11 @@ def add_layers(
     sqlite3.Error
         The file cannot be written.
     """
+    tables = [_Table.of(layer) for layer in layers]
+    srs_ids = _srs_ids(tables)
     database.executescript("PRAGMA journal_mode = OFF; PRAGMA synchronous = OFF;")
-    database.executescript(_SCHEMA)
-    srs_ids: dict[str, int] = {}
-    for crs in dict.fromkeys(["EPSG:4326", *(layer.crs for layer in layers if layer.geometry_type)]):
-        srs_ids[crs] = _add_srs(database, crs, _CUSTOM_SRS_ID + len(srs_ids))
-    n_rows = [max((len(column) for column in layer.columns.values()), default=0) for layer in layers]
-    for n, layer in enumerate(layers):
-        advance(sum(n_rows[:n]) / max(sum(n_rows), 1))
-        _add_layer(database, layer, srs_ids.get(layer.crs, 0))
-    styled = [layer for layer in layers if layer.style]
-    if styled:
-        database.executescript(_STYLES_SCHEMA)
-        database.executemany(
-            "INSERT INTO layer_styles (f_table_catalog, f_table_schema, f_table_name, f_geometry_column, styleName,"
-            " styleQML, styleSLD, useAsDefault, description, owner) VALUES ('', '', ?, 'geom', ?, ?, '', 1, '', '')",
-            [(layer.name, layer.name, layer.style) for layer in styled],
-        )
-    database.commit()
+    _make_tables(database, tables, srs_ids)
+    _fill_tables(database, tables, layers, srs_ids, advance)
 
 
 def layer_names(path: str | os.PathLike[str]) -> list[str]:
@@ -288,18 +280,28 @@ END;
 """
 
 
-def _add_srs(database: sqlite3.Connection, crs: str, custom_id: int) -> int:
-    """Register a CRS and return its srs_id."""
-    if crs == PIXELS:
-        return -1
-    name, code, definition = _describe_crs(crs)
-    srs_id = custom_id if code is None else code
-    organization = "NONE" if code is None else "EPSG"
-    database.execute(
-        "INSERT OR IGNORE INTO gpkg_spatial_ref_sys VALUES (?, ?, ?, ?, ?, '')",
-        (name, srs_id, organization, srs_id, definition),
-    )
-    return srs_id
+@dataclass(frozen=True)
+class _Table:
+    """What a layer is before it has rows; `columns` are (name, SQL type)."""
+
+    name: str
+    geometry_type: GeometryType | None
+    columns: tuple[tuple[str, str], ...]
+    crs: str
+    styled: bool
+    description: str
+
+    @classmethod
+    def of(cls, layer: Layer) -> _Table:
+        columns = tuple((name, _sql_type(values)) for name, values in layer.columns.items())
+        return cls(layer.name, layer.geometry_type, columns, layer.crs, bool(layer.style), layer.description)
+
+
+def _srs_ids(tables: Sequence[_Table]) -> dict[str, int]:
+    """Number each CRS: by its EPSG code, else upwards from `_CUSTOM_SRS_ID`."""
+    used = dict.fromkeys(["EPSG:4326", *(table.crs for table in tables if table.geometry_type)])
+    codes = {crs: -1 if crs == PIXELS else _describe_crs(crs)[1] for crs in used}
+    return {crs: _CUSTOM_SRS_ID + n if code is None else code for n, (crs, code) in enumerate(codes.items())}
 
 
 @lru_cache(maxsize=32)
@@ -314,58 +316,96 @@ def _describe_crs(crs: str) -> tuple[str, int | None, str]:
         raise CrsError(f"unknown CRS {crs[:60]!r}; give an EPSG code such as EPSG:32619") from error
 
 
-def _add_layer(database: sqlite3.Connection, layer: Layer, srs_id: int) -> None:
-    columns = {name: _sql_values(values) for name, values in layer.columns.items()}
-    declared = ["fid INTEGER PRIMARY KEY AUTOINCREMENT NOT NULL"]
-    declared += [f"geom {layer.geometry_type}"] if layer.geometry_type else []
-    declared += [f"{_quoted(name)} {sql_type}" for name, (sql_type, _) in columns.items()]
-    database.execute(f"CREATE TABLE {_quoted(layer.name)} ({', '.join(declared)})")
+@lru_cache(maxsize=8)
+def _empty(tables: tuple[_Table, ...]) -> bytes:
+    """Make a GeoPackage without rows: results have the same tables, which take as long to make as to fill."""
+    with closing(sqlite3.connect(":memory:")) as database:
+        _make_tables(database, tables, _srs_ids(tables))
+        return database.serialize()
 
-    values: list[Sequence[Any]] = [column for _, column in columns.values()]
+
+def _make_tables(database: sqlite3.Connection, tables: Sequence[_Table], srs_ids: Mapping[str, int]) -> None:
+    database.executescript(_SCHEMA)
+    for crs, srs_id in srs_ids.items():
+        if crs != PIXELS:
+            name, code, definition = _describe_crs(crs)
+            organization = "NONE" if code is None else "EPSG"
+            entry = (name, srs_id, organization, srs_id, definition)
+            database.execute("INSERT OR IGNORE INTO gpkg_spatial_ref_sys VALUES (?, ?, ?, ?, ?, '')", entry)
+    for table in tables:
+        _make_table(database, table, srs_ids.get(table.crs, 0))
+    if any(table.styled for table in tables):
+        database.executescript(_STYLES_SCHEMA)
+    database.commit()
+
+
+def _make_table(database: sqlite3.Connection, table: _Table, srs_id: int) -> None:
+    declared = ["fid INTEGER PRIMARY KEY AUTOINCREMENT NOT NULL"]
+    declared += [f"geom {table.geometry_type}"] if table.geometry_type else []
+    declared += [f"{_quoted(name)} {sql_type}" for name, sql_type in table.columns]
+    database.execute(f"CREATE TABLE {_quoted(table.name)} ({', '.join(declared)})")
+    database.execute(
+        "INSERT INTO gpkg_contents (table_name, data_type, identifier, description, srs_id) VALUES (?, ?, ?, ?, ?)",
+        (table.name, "features" if table.geometry_type else "attributes", table.name, table.description, srs_id),
+    )
+    if not table.geometry_type:
+        return
+    entry = (table.name, table.geometry_type, srs_id)
+    database.execute("INSERT INTO gpkg_geometry_columns VALUES (?, 'geom', ?, ?, 0, 0)", entry)
+    # Without SQLite's rtree module the file is as valid, only slower to pan over.
+    with suppress(sqlite3.OperationalError):
+        database.execute(f'CREATE VIRTUAL TABLE "rtree_{table.name}_geom" USING rtree(id, minx, maxx, miny, maxy)')
+        database.execute(
+            "INSERT INTO gpkg_extensions VALUES (?, 'geom', 'gpkg_rtree_index',"
+            " 'http://www.geopackage.org/spec120/#extension_rtree', 'write-only')",
+            (table.name,),
+        )
+
+
+def _fill_tables(
+    database: sqlite3.Connection,
+    tables: Sequence[_Table],
+    layers: Sequence[Layer],
+    srs_ids: Mapping[str, int],
+    advance: Callable[[float], None] = lambda _: None,
+) -> None:
+    """Give empty tables the rows of their layers; `advance` is told which share of them is written."""
+    n_rows = [max((len(column) for column in layer.columns.values()), default=0) for layer in layers]
+    indexed = {name for (name,) in database.execute("SELECT table_name FROM gpkg_extensions")}
+    database.execute(f"UPDATE gpkg_contents SET last_change = {_NOW}")
+    for n, (table, layer) in enumerate(zip(tables, layers, strict=True)):
+        advance(sum(n_rows[:n]) / max(sum(n_rows), 1))
+        bounds = _fill_table(database, table, layer, srs_ids.get(table.crs, 0))
+        if len(bounds):
+            extent = [*bounds[:, [0, 2]].min(axis=0).tolist(), *bounds[:, [1, 3]].max(axis=0).tolist()]
+            update = "UPDATE gpkg_contents SET min_x = ?, min_y = ?, max_x = ?, max_y = ? WHERE table_name = ?"
+            database.execute(update, (*extent, table.name))
+            if table.name in indexed:
+                _fill_spatial_index(database, f"rtree_{table.name}_geom", bounds)
+        if table.name in indexed:
+            database.executescript(_RTREE_TRIGGERS.format(t=table.name))
+    if styled := [(layer.name, layer.name, layer.style) for layer in layers if layer.style]:
+        database.executemany(
+            "INSERT INTO layer_styles (f_table_catalog, f_table_schema, f_table_name, f_geometry_column, styleName,"
+            " styleQML, styleSLD, useAsDefault, description, owner) VALUES ('', '', ?, 'geom', ?, ?, '', 1, '', '')",
+            styled,
+        )
+    database.commit()
+
+
+def _fill_table(database: sqlite3.Connection, table: _Table, layer: Layer, srs_id: int) -> FloatArray:
+    """Insert a layer's rows and return their (N, 4) bounds, or none for a table without geometry."""
+    typed = zip(layer.columns.values(), table.columns, strict=True)
+    values: list[Sequence[Any]] = [_sql_values(column, sql_type) for column, (_, sql_type) in typed]
     bounds = np.empty((0, 4))
-    if layer.geometry_type:
-        blobs, bounds = _encode(layer.geometry_type, layer.geometries, srs_id)
+    if table.geometry_type:
+        blobs, bounds = _encode(table.geometry_type, layer.geometries, srs_id)
         values.insert(0, blobs)
     if values:
         marks = ", ".join("?" * (len(values) + 1))
         rows = zip(range(1, len(values[0]) + 1), *values, strict=True)
-        database.executemany(f"INSERT INTO {_quoted(layer.name)} VALUES ({marks})", rows)
-    _register(database, layer, srs_id, bounds)
-    if layer.geometry_type:
-        _add_spatial_index(database, layer.name, bounds)
-
-
-def _register(database: sqlite3.Connection, layer: Layer, srs_id: int, bounds: FloatArray) -> None:
-    extent: list[float | None] = [None] * 4
-    if len(bounds):
-        extent = [*bounds[:, [0, 2]].min(axis=0).tolist(), *bounds[:, [1, 3]].max(axis=0).tolist()]
-    kind = "features" if layer.geometry_type else "attributes"
-    database.execute(
-        "INSERT INTO gpkg_contents (table_name, data_type, identifier, description, min_x, min_y, max_x, max_y, srs_id)"
-        " VALUES (?, ?, ?, ?, ?, ?, ?, ?, ?)",
-        (layer.name, kind, layer.name, layer.description, *extent, srs_id),
-    )
-    if layer.geometry_type:
-        database.execute(
-            "INSERT INTO gpkg_geometry_columns VALUES (?, 'geom', ?, ?, 0, 0)",
-            (layer.name, layer.geometry_type, srs_id),
-        )
-
-
-def _add_spatial_index(database: sqlite3.Connection, name: str, bounds: FloatArray) -> None:
-    """Add the R-tree extension; without SQLite's rtree module the file is as valid, only slower to pan over."""
-    try:
-        database.execute(f'CREATE VIRTUAL TABLE "rtree_{name}_geom" USING rtree(id, minx, maxx, miny, maxy)')
-    except sqlite3.OperationalError:
-        return
-    if len(bounds):
-        _fill_spatial_index(database, f"rtree_{name}_geom", bounds)
-    database.executescript(_RTREE_TRIGGERS.format(t=name))
-    database.execute(
-        "INSERT INTO gpkg_extensions VALUES (?, 'geom', 'gpkg_rtree_index',"
-        " 'http://www.geopackage.org/spec120/#extension_rtree', 'write-only')",
-        (name,),
-    )
+        database.executemany(f"INSERT INTO {_quoted(table.name)} VALUES ({marks})", rows)
+    return bounds
 
 
 def _fill_spatial_index(database: sqlite3.Connection, table: str, bounds: FloatArray) -> None:
@@ -380,19 +420,23 @@ def _fill_spatial_index(database: sqlite3.Connection, table: str, bounds: FloatA
     database.executemany(f'INSERT INTO "{table}_rowid" VALUES (?, ?)', enumerate(tree.leaves.tolist(), 1))
 
 
-def _sql_values(values: Sequence[Any] | AnyArray) -> tuple[str, list[Any]]:
-    """Return the SQL type and the plain Python values of one column."""
-    plain = values.tolist() if isinstance(values, np.ndarray) else list(values)
-    kinds = {type(value) for value in plain if value is not None}
-    if isinstance(values, np.ndarray) and values.dtype.kind in "biuf":  # it knows its type even when empty
-        kinds = {{"b": bool, "f": float}.get(values.dtype.kind, int)}
+def _sql_type(values: Sequence[Any] | AnyArray) -> str:
+    if isinstance(values, np.ndarray) and values.dtype.kind in _SQL_TYPES:  # it knows its type even when empty
+        return _SQL_TYPES[values.dtype.kind]
+    kinds = {type(value) for value in values if value is not None}
     if kinds <= {bool} and kinds:
-        return "BOOLEAN", plain
+        return "BOOLEAN"
     if kinds <= {bool, int} and kinds:
-        return "INTEGER", plain
-    if kinds <= {bool, int, float} and kinds:
-        return "REAL", [None if value != value else value for value in plain]  # NaN differs from itself
-    return "TEXT", plain
+        return "INTEGER"
+    return "REAL" if kinds <= {bool, int, float} and kinds else "TEXT"
+
+
+def _sql_values(values: Sequence[Any] | AnyArray, sql_type: str) -> list[Any]:
+    """Return the plain Python values of one column."""
+    plain = values.tolist() if isinstance(values, np.ndarray) else list(values)
+    if sql_type == "REAL":
+        return [None if value != value else value for value in plain]  # NaN differs from itself
+    return plain
 
 
 def _encode(kind: GeometryType, geometries: Sequence[Any] | FloatArray, srs_id: int) -> tuple[list[bytes], FloatArray]:
