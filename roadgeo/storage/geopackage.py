@@ -21,6 +21,7 @@ import numpy as np
 from roadgeo._arrays import AnyArray, FloatArray
 from roadgeo.errors import CrsError, IndexFormatError, OutputError
 from roadgeo.storage.files import replacing
+from roadgeo.storage.geopackage_sql import NOW, RTREE_TRIGGERS, SCHEMA, STYLES_SCHEMA
 from roadgeo.storage.rtree import pack_rtree
 from roadgeo.storage.sqlite import opened, table_problem
 
@@ -45,7 +46,6 @@ PIXELS = ""
 _WKB_TYPES = {"POINT": 1, "LINESTRING": 2, "POLYGON": 3, "MULTIPOLYGON": 6}
 _CUSTOM_SRS_ID = 100_000  # for a CRS without an EPSG code; one such CRS per layer is numbered upwards from here
 _SQL_TYPES = {"b": "BOOLEAN", "i": "INTEGER", "u": "INTEGER", "f": "REAL"}  # by numpy's kinds
-_NOW = "strftime('%Y-%m-%dT%H:%M:%fZ','now')"
 _POINT = np.dtype([("header", "S4"), ("srs_id", "<i4"), ("order", "u1"), ("type", "<u4"), ("xy", "<f8", 2)])
 _HEADER = struct.Struct("<4si4d")  # magic, version and flags; srs_id; envelope min x, max x, min y, max y
 _ENVELOPE_BYTES = {0: 0, 1: 32, 2: 48, 3: 48, 4: 64}
@@ -207,78 +207,6 @@ def open_read_only(path: str | os.PathLike[str]) -> Iterator[sqlite3.Connection]
 
 # --- writing ----------------------------------------------------------------------------------------------------------
 
-_SCHEMA = """
-PRAGMA application_id = 0x47504B47;
-PRAGMA user_version = 10300;
-CREATE TABLE gpkg_spatial_ref_sys (
-    srs_name TEXT NOT NULL, srs_id INTEGER NOT NULL PRIMARY KEY, organization TEXT NOT NULL,
-    organization_coordsys_id INTEGER NOT NULL, definition TEXT NOT NULL, description TEXT);
-CREATE TABLE gpkg_contents (
-    table_name TEXT NOT NULL PRIMARY KEY, data_type TEXT NOT NULL, identifier TEXT UNIQUE, description TEXT DEFAULT '',
-    last_change DATETIME NOT NULL DEFAULT (strftime('%Y-%m-%dT%H:%M:%fZ','now')),
-    min_x DOUBLE, min_y DOUBLE, max_x DOUBLE, max_y DOUBLE, srs_id INTEGER,
-    CONSTRAINT fk_gc_r_srs_id FOREIGN KEY (srs_id) REFERENCES gpkg_spatial_ref_sys(srs_id));
-CREATE TABLE gpkg_geometry_columns (
-    table_name TEXT NOT NULL, column_name TEXT NOT NULL, geometry_type_name TEXT NOT NULL, srs_id INTEGER NOT NULL,
-    z TINYINT NOT NULL, m TINYINT NOT NULL,
-    CONSTRAINT pk_geom_cols PRIMARY KEY (table_name, column_name), CONSTRAINT uk_gc_table_name UNIQUE (table_name),
-    CONSTRAINT fk_gc_tn FOREIGN KEY (table_name) REFERENCES gpkg_contents(table_name),
-    CONSTRAINT fk_gc_srs FOREIGN KEY (srs_id) REFERENCES gpkg_spatial_ref_sys(srs_id));
-CREATE TABLE gpkg_extensions (
-    table_name TEXT, column_name TEXT, extension_name TEXT NOT NULL, definition TEXT NOT NULL, scope TEXT NOT NULL,
-    CONSTRAINT ge_tce UNIQUE (table_name, column_name, extension_name));
-INSERT INTO gpkg_spatial_ref_sys VALUES
-    ('Undefined Cartesian SRS', -1, 'NONE', -1, 'undefined', 'undefined Cartesian coordinate reference system'),
-    ('Undefined geographic SRS', 0, 'NONE', 0, 'undefined', 'undefined geographic coordinate reference system');
-"""
-
-_STYLES_SCHEMA = """
-CREATE TABLE layer_styles (
-    id INTEGER PRIMARY KEY AUTOINCREMENT NOT NULL, f_table_catalog TEXT(256), f_table_schema TEXT(256),
-    f_table_name TEXT(256), f_geometry_column TEXT(256), styleName TEXT(30), styleQML TEXT, styleSLD TEXT,
-    useAsDefault BOOLEAN, description TEXT, owner TEXT(30), ui TEXT(30),
-    update_time DATETIME DEFAULT (strftime('%Y-%m-%dT%H:%M:%fZ','now')));
-INSERT INTO gpkg_contents (table_name, data_type, identifier) VALUES ('layer_styles', 'attributes', 'layer_styles');
-"""
-
-# As the GeoPackage standard spells them (annex F.3); a writer that edits the layer keeps the index true through them.
-_RTREE_TRIGGERS = """
-CREATE TRIGGER "rtree_{t}_geom_insert" AFTER INSERT ON "{t}"
-  WHEN (new."geom" NOT NULL AND NOT ST_IsEmpty(NEW."geom"))
-BEGIN
-  INSERT OR REPLACE INTO "rtree_{t}_geom" VALUES (
-    NEW."fid", ST_MinX(NEW."geom"), ST_MaxX(NEW."geom"), ST_MinY(NEW."geom"), ST_MaxY(NEW."geom"));
-END;
-CREATE TRIGGER "rtree_{t}_geom_update1" AFTER UPDATE OF "geom" ON "{t}"
-  WHEN OLD."fid" = NEW."fid" AND (NEW."geom" NOTNULL AND NOT ST_IsEmpty(NEW."geom"))
-BEGIN
-  INSERT OR REPLACE INTO "rtree_{t}_geom" VALUES (
-    NEW."fid", ST_MinX(NEW."geom"), ST_MaxX(NEW."geom"), ST_MinY(NEW."geom"), ST_MaxY(NEW."geom"));
-END;
-CREATE TRIGGER "rtree_{t}_geom_update2" AFTER UPDATE OF "geom" ON "{t}"
-  WHEN OLD."fid" = NEW."fid" AND (NEW."geom" ISNULL OR ST_IsEmpty(NEW."geom"))
-BEGIN
-  DELETE FROM "rtree_{t}_geom" WHERE id = OLD."fid";
-END;
-CREATE TRIGGER "rtree_{t}_geom_update3" AFTER UPDATE ON "{t}"
-  WHEN OLD."fid" != NEW."fid" AND (NEW."geom" NOTNULL AND NOT ST_IsEmpty(NEW."geom"))
-BEGIN
-  DELETE FROM "rtree_{t}_geom" WHERE id = OLD."fid";
-  INSERT OR REPLACE INTO "rtree_{t}_geom" VALUES (
-    NEW."fid", ST_MinX(NEW."geom"), ST_MaxX(NEW."geom"), ST_MinY(NEW."geom"), ST_MaxY(NEW."geom"));
-END;
-CREATE TRIGGER "rtree_{t}_geom_update4" AFTER UPDATE ON "{t}"
-  WHEN OLD."fid" != NEW."fid" AND (NEW."geom" ISNULL OR ST_IsEmpty(NEW."geom"))
-BEGIN
-  DELETE FROM "rtree_{t}_geom" WHERE id IN (OLD."fid", NEW."fid");
-END;
-CREATE TRIGGER "rtree_{t}_geom_delete" AFTER DELETE ON "{t}"
-  WHEN old."geom" NOT NULL
-BEGIN
-  DELETE FROM "rtree_{t}_geom" WHERE id = OLD."fid";
-END;
-"""
-
 
 @dataclass(frozen=True)
 class _Table:
@@ -298,7 +226,7 @@ class _Table:
 
 
 def _srs_ids(tables: Sequence[_Table]) -> dict[str, int]:
-    """Number each CRS: by its EPSG code, else upwards from `_CUSTOM_SRS_ID`."""
+    """Return a number for each CRS: its EPSG code, else upwards from `_CUSTOM_SRS_ID`."""
     used = dict.fromkeys(["EPSG:4326", *(table.crs for table in tables if table.geometry_type)])
     codes = {crs: -1 if crs == PIXELS else _describe_crs(crs)[1] for crs in used}
     return {crs: _CUSTOM_SRS_ID + n if code is None else code for n, (crs, code) in enumerate(codes.items())}
@@ -325,7 +253,7 @@ def _empty(tables: tuple[_Table, ...]) -> bytes:
 
 
 def _make_tables(database: sqlite3.Connection, tables: Sequence[_Table], srs_ids: Mapping[str, int]) -> None:
-    database.executescript(_SCHEMA)
+    database.executescript(SCHEMA)
     for crs, srs_id in srs_ids.items():
         if crs != PIXELS:
             name, code, definition = _describe_crs(crs)
@@ -335,7 +263,7 @@ def _make_tables(database: sqlite3.Connection, tables: Sequence[_Table], srs_ids
     for table in tables:
         _make_table(database, table, srs_ids.get(table.crs, 0))
     if any(table.styled for table in tables):
-        database.executescript(_STYLES_SCHEMA)
+        database.executescript(STYLES_SCHEMA)
     database.commit()
 
 
@@ -372,7 +300,7 @@ def _fill_tables(
     """Give empty tables the rows of their layers; `advance` is told which share of them is written."""
     n_rows = [max((len(column) for column in layer.columns.values()), default=0) for layer in layers]
     indexed = {name for (name,) in database.execute("SELECT table_name FROM gpkg_extensions")}
-    database.execute(f"UPDATE gpkg_contents SET last_change = {_NOW}")
+    database.execute(f"UPDATE gpkg_contents SET last_change = {NOW}")
     for n, (table, layer) in enumerate(zip(tables, layers, strict=True)):
         advance(sum(n_rows[:n]) / max(sum(n_rows), 1))
         bounds = _fill_table(database, table, layer, srs_ids.get(table.crs, 0))
@@ -383,7 +311,7 @@ def _fill_tables(
             if table.name in indexed:
                 _fill_spatial_index(database, f"rtree_{table.name}_geom", bounds)
         if table.name in indexed:
-            database.executescript(_RTREE_TRIGGERS.format(t=table.name))
+            database.executescript(RTREE_TRIGGERS.format(t=table.name))
     if styled := [(layer.name, layer.name, layer.style) for layer in layers if layer.style]:
         database.executemany(
             "INSERT INTO layer_styles (f_table_catalog, f_table_schema, f_table_name, f_geometry_column, styleName,"
