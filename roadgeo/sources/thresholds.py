@@ -35,6 +35,8 @@ _MAX_DEPTH = 2.3  # ninth decile of the depth of light pixels, of its mean: 1.8 
 _MIN_STEPS_OF_ONE, _MIN_LEVELS_FILLED = 0.8, 0.7
 _MANY_LEVELS = 8  # more classes than this do not look like roads
 
+_BINS = 256  # of a histogram that a threshold is found by
+
 #: Further thresholds of a soft map, as shares of the way from the ground's value to the roads'.
 _FURTHER = (0.3, 0.7)
 
@@ -76,6 +78,10 @@ def find_thresholds(sample: Sample) -> tuple[float, ...]:
     low, high = levels[0], levels[-1]
     if len(levels) <= 2:
         return (float(low + high) / 2 if high > low else float(np.nextafter(high, -np.inf) if high > 0 else high),)
+    if np.any(np.diff(np.linspace(low, high, _BINS + 1)) <= 0):
+        raise MaskError(
+            f"{sample.name}: {len(levels)} values from {low:g} to {high:g}, too alike to part; give a threshold"
+        )
     if sample.seen.dtype.kind in "iu" and high <= _MAX_CLASS:
         _refuse_classes(sample, levels)
         return _spread(values, _otsu(values))
@@ -187,7 +193,7 @@ def _shows_roads(rows: AnyArray, threshold: float) -> bool:
 
 def _otsu(values: AnyArray) -> float:
     """Return the value that parts two groups best: largest variance between them (Otsu 1979)."""
-    counts, edges = np.histogram(values, bins=256)
+    counts, edges = np.histogram(values, bins=_BINS)
     centres = (edges[:-1] + edges[1:]) / 2
     below = np.cumsum(counts)[:-1]
     sums = np.cumsum(counts * centres)

@@ -28,3 +28,9 @@ def test_thresholds_lie_among_the_values(data: st.DataObject) -> None:
     low, high = float(rows.min()), float(rows.max())
     assert 1 <= len(found) <= 3
     assert all(np.isfinite(one) and min(low, np.nextafter(low, -np.inf)) <= one <= high for one in found)
+
+
+def test_values_that_differ_by_rounding_are_refused() -> None:
+    rows: AnyArray = np.resize(1e16 + np.arange(3) * 2.0, (12, 12))
+    with pytest.raises(MaskError, match=r"it: 3 values from 1e\+16 to 1e\+16, too alike to part; give a threshold"):
+        find_thresholds(Sample("it", rows.reshape(-1, 1), 0, lambda: rows))
