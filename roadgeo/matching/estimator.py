@@ -38,6 +38,8 @@ from roadgeo.matching.work import Work
 __all__ = ["Ledger", "MatchOptions", "Source", "Sweep", "TripleEstimator"]
 
 
+#: A place is looked at through a lens once, and again where so much more of the mask's roads agrees.
+_BETTER = 0.05
 #: A place that so many intersections of the query propose by roads is settled: each looked at the whole map.
 _OFTEN_ENOUGH = 2
 #: How far a proposal, made of three intersections, may turn the image's up from where it points.
@@ -58,6 +60,8 @@ class MatchOptions:
     ----------
     sightings : int
         Anchors that must lead to a place before it ends the search: a map may hold its twin.
+    certain : float
+        A place with these log10 odds needs no twins to be looked for among streets that repeat.
     max_last_places : int
         As `max_places`, of the last sweeps.
     roads : RoadSearchOptions or None
@@ -82,6 +86,7 @@ class MatchOptions:
     max_places: int = 12_000
     max_last_places: int = 100_000
     sightings: int = 2
+    certain: float = 20.0
 
 
 @dataclass
@@ -131,6 +136,7 @@ class TripleEstimator:
         self.least_chance = np.array([0.05, 0.2, 0.05])
         self.n_nulls = 0
         self._dropped: list[Hypothesis] = []
+        self._looked: list[tuple[Hypothesis, float]] = []  # through a lens, and which share of roads agreed without
         self._whole: list[Hypothesis] = []  # verified, and no better version of them is to be expected
         self.scene = scene
         self.index = index
@@ -350,6 +356,9 @@ class TripleEstimator:
         index, options, refined, agreeing = self.index, self.options, model.refined, model.found
         if options.lens is None or refined is None or agreeing is None:
             return
+        if any(share > agreeing.forward - _BETTER and self.same(other, model) for other, share in self._looked):
+            return
+        self._looked.append((model, agreeing.forward))
         lens = find_lens(refined.matrix, self.scene, index, agreeing.forward, self.refine_options, options.lens)
         if lens is None or self.judge(lens.matrix) is not None or self._is_far(lens.matrix):
             return
@@ -444,9 +453,11 @@ class TripleEstimator:
         """Whether a hypothesis fits the whole frame and was found often enough for a twin to have been found beside it.
 
         Each anchor that leads to a place would as soon lead to its twin: what several led to, and to nothing else that
-        fits, has none. Where half of the roads would agree after a shift, streets form a lattice: it may have many.
+        fits, has none. Where half of the roads would agree after a shift, streets form a lattice: it may have many,
+        unless it is certain.
         """
-        if model.found is None or model.refined is None or model.chance[1] >= 0.5:
+        repeats = model.chance[1] >= 0.5
+        if model.found is None or model.refined is None or (repeats and model.log10_odds < self.options.certain):
             return False
         if model.by_roads:
             return model.n_found >= _OFTEN_ENOUGH

@@ -61,7 +61,8 @@ class LensOptions:
     slack : float
         While a fit grows, places may be so many times further off than it says.
     starts : tuple of float
-        Values of k1 to begin with in turn, where beginning with 0 does not explain enough.
+        Values of k1 to begin with in turn, where beginning with 0 does not explain enough; first with few road points,
+        and with all of them where a lens shows.
     n_iterations, n_restarts : int
         At most.
     soon, hopeless : int, float
@@ -203,15 +204,24 @@ def find_lens(
     """
     if agreeing >= options.enough and not _hints_at_lens(LensEquations(matrix, scene, index, refinement), options):
         return None
-    found = _fit_from_many(matrix, scene, index, refinement, options)
-    return found if found is not None and is_significant(found, scene, options) else None
+    rough = _fit_from_many(matrix, _thinned(scene, options.quick_points), index, refinement, options)
+    if rough is None or _moves_px(rough, scene) < 0.5 * options.least_px:
+        return None
+    found = _improved(rough, scene, index, refinement, options)
+    return found if is_significant(found, scene, options) else None
 
 
 def is_significant(found: LensFit, scene: Scene, options: LensOptions) -> bool:
     """Whether a fit shows a lens: that of a pinhole finds some k1, too."""
+    enough_px = _moves_px(found, scene) >= options.least_px
+    return enough_px and abs(found.k1) >= options.significance * found.k1_sigma
+
+
+def _moves_px(found: LensFit, scene: Scene) -> float:
+    """Return how far the lens moves the frame's corners, at most."""
     corners = scene.corners.astype(float)
     moved = Lens.of(found.k1, scene.size, y_up=True).bend(corners) - corners
-    return abs(found.k1) >= options.significance * found.k1_sigma and bool(np.hypot(*moved.T).max() >= options.least_px)
+    return float(np.hypot(*moved.T).max())
 
 
 def core_excess(
@@ -256,7 +266,7 @@ def _fit_from_many(
             best = found
         if best is not None and best.share >= options.enough:
             break
-    return best if best is None else _improved(best, scene, index, refinement, options)
+    return best
 
 
 def _improved(

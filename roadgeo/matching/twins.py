@@ -55,7 +55,7 @@ class TwinOptions:
         Middles of two places lie further from each other than this share of half the frame's diagonal.
     """
 
-    certain: float = 20.0
+    certain: float = MatchOptions.certain
     repeating: float = 0.35
     piece_m: float = 60.0
     unseen: float = 0.5
