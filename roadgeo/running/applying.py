@@ -75,7 +75,7 @@ def _from_document(document: dict[str, Any]) -> Location:
         str(document["reason"]),
         str(document.get("reference") or ""),
         str(document.get("attribution") or ""),
-        str(document["crs"]),
+        _crs(str(document["crs"])),
         (width, height),
         homography,
         _array(document["footprint"], (4, 2)),
@@ -90,6 +90,17 @@ def _from_document(document: dict[str, Any]) -> Location:
         camera=None if camera is None else _camera(camera),
         mirrored=bool(document.get("mirrored")),
     )
+
+
+def _crs(told: str) -> str:
+    """Return a CRS as every library reads it."""
+    import pyproj
+
+    try:
+        code = pyproj.CRS.from_user_input(told).to_epsg()
+    except pyproj.exceptions.ProjError:
+        raise ValueError(f"unknown CRS {told[:60]!r}") from None
+    return told if code is None else f"EPSG:{code}"
 
 
 def _place(document: dict[str, Any]) -> Place:

@@ -9,6 +9,7 @@ import pytest
 import rasterio
 
 from roadgeo.cli import main
+from roadgeo.errors import MaskError
 from roadgeo.evaluation.demo import ATTRIBUTION, PHOTO, ROADS, demo_masks
 from roadgeo.running.applying import read_location
 from roadgeo.sources.roads import read_roads
@@ -46,6 +47,16 @@ def test_what_is_read_is_what_was_written(located: Path) -> None:
     told = read_location(located / "drone_location.json").to_dict()
     for key in ("homography", "footprint", "center", "camera", "corner_covariance_m2", "lens_k1", "size"):
         assert told[key] == document[key]
+
+
+@pytest.mark.parametrize(
+    ("crs", "said"), [("EPSG:32629?", "unknown CRS 'EPSG:32629\\?'"), ("x" * 900, "unknown CRS 'x{60}'")]
+)
+def test_a_crs_that_nobody_knows_is_refused(crs: str, said: str, located: Path, tmp_path: Path) -> None:
+    document = json.loads((located / "drone_location.json").read_text())
+    (tmp_path / "a_location.json").write_text(json.dumps({**document, "crs": crs}))
+    with pytest.raises(MaskError, match=said):
+        read_location(tmp_path / "a_location.json")
 
 
 def test_another_size_is_scaled_and_another_shape_only_where_asked(
