@@ -34,6 +34,10 @@ class Frame:
         """Distance from the middle to a corner, pixels."""
         return math.hypot(self.width, self.height) / 2
 
+    def one_place_m(self, gsd_m: float) -> float:
+        """Return how near two places of a frame of `gsd_m` metres per pixel lie, by their middles, that are one."""
+        return max(50.0, 0.05 * gsd_m * self.half_diagonal)
+
     @property
     def plane_corners(self) -> FloatArray:
         """(4, 2) corners TL, TR, BR, BL on the query plane: y up (see `geometry.mask`)."""

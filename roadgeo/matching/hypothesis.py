@@ -71,7 +71,7 @@ class Hypothesis:
         if kept is None or kept.matrix is not self.matrix or kept.laid is not laid:
             frame = Frame(*size)
             x, y = Homography(laid).everywhere(frame.plane_center).tolist()
-            reach_m = max(50.0, 0.05 * sampling(self.matrix, size) * frame.half_diagonal)
+            reach_m = frame.one_place_m(sampling(self.matrix, size))
             kept = self._spot = Spot(self.matrix, laid, x, y, reach_m)
         return kept
 

@@ -72,5 +72,5 @@ def same_within_m(one: ReferenceIndex, other: ReferenceIndex, matrix: FloatArray
     gsd_m = sampling(matrix, size)
     shard_of = one.meta.get("shard_of")
     if shard_of and shard_of == other.meta.get("shard_of"):
-        return max(50.0, 0.05 * gsd_m * Frame(*size).half_diagonal)
+        return Frame(*size).one_place_m(gsd_m)
     return 0.5 * gsd_m * max(size)

@@ -426,7 +426,7 @@ def _are_one(a: FloatArray | None, b: FloatArray, size: tuple[int, int]) -> bool
         return False
     frame = Frame(*size)
     apart = np.hypot(*(Homography(a)(frame.plane_center) - Homography(b)(frame.plane_center)))
-    return bool(apart < max(50.0, 0.05 * sampling(b, size) * frame.half_diagonal))
+    return bool(apart < frame.one_place_m(sampling(b, size)))
 
 
 def _added(fits: tuple[Fit, ...], fit: Fit, size: tuple[int, int]) -> tuple[Fit, ...]:

@@ -12,7 +12,7 @@ import numpy as np
 
 from roadgeo._arrays import AnyArray
 from roadgeo.errors import MaskError
-from roadgeo.geometry.mask import PROBABILITY_UNKNOWN, RoadMask
+from roadgeo.geometry.mask import PROBABILITY_SURE, PROBABILITY_UNKNOWN, RoadMask
 from roadgeo.storage.files import replacing
 
 __all__ = ["NODATA", "TAG", "ProbabilityMap", "fuse"]
@@ -54,7 +54,7 @@ class ProbabilityMap:
             Nowhere.
         """
         seen = self.values != NODATA
-        roads = (self.values > round(254 * threshold)) & seen
+        roads = (self.values > round(PROBABILITY_SURE * threshold)) & seen
         if not roads.any():
             raise MaskError(f"{self.name}: no road is seen with a probability above {threshold:g}")
         return RoadMask(roads, None if seen.all() else seen, self.name, self.values)
@@ -69,8 +69,10 @@ class ProbabilityMap:
         values: AnyArray = cv2.resize(np.where(seen, self.values, 0).astype(np.uint8), size, interpolation=way)
         if not seen.all():
             known = cv2.resize(seen.view(np.uint8), size, interpolation=cv2.INTER_NEAREST)
-            values = np.where(known > 0, np.minimum(values, 254), NODATA).astype(np.uint8)
-        return ProbabilityMap(np.minimum(values, 254) if seen.all() else values, self.threshold, self.name, self.model)
+            values = np.where(known > 0, np.minimum(values, PROBABILITY_SURE), NODATA).astype(np.uint8)
+        return ProbabilityMap(
+            np.minimum(values, PROBABILITY_SURE) if seen.all() else values, self.threshold, self.name, self.model
+        )
 
     def write(self, path: str | os.PathLike[str]) -> None:
         """Write a GeoTIFF on the photograph's pixel grid, with nodata where nothing was observed.
