@@ -339,10 +339,33 @@ class Tracker:
         if len(placed) < len(self._window) or agreed < 0.5 * len(placed):
             self._pose, self._reference = None, None
             return []
+        self._place_from_surest(placed, last.number)
+        self._pose = placed[-1].pose
         self.fixes.append(Fix(first.number, last.number, location))
         self._window, self._doubtful = [], []
         self._forget()
         return placed
+
+    def _place_from_surest(self, placed: list[Tracked], known_at: int) -> None:
+        """Place frames once more, by motion from the surest one in both directions; keep what agrees better.
+
+        A mosaic bends: what lies far from the roads that located it may be anywhere.
+        """
+        odds = [one.log10_odds if one.status == "located" else -math.inf for one in placed]
+        surest = int(np.argmax(odds))
+        for way, there in ((1, len(placed)), (-1, -1)):
+            for k in range(surest + way, there, way):
+                later = self._window[max(k, k - way)]
+                motion = _motion(later) if way > 0 else np.asarray(np.linalg.inv(_motion(later)))
+                beside, here = placed[k - way].pose, self._window[k]
+                moved = None if beside is None else predict(beside, motion, later.frame.motion_px)
+                if moved is None:
+                    again = Tracked(here.frame, "lost", "too far from frames that agree", known_at)
+                else:
+                    again = self._judge(here, moved, known_at, "located")
+                agrees = again.status == "located" and again.log10_odds > odds[k]
+                if agrees or placed[k].status != "located":
+                    placed[k] = again
 
 
 def track(

@@ -134,3 +134,17 @@ def test_roads_that_bend_a_frame_as_no_camera_sees_it_do_not_agree(flight, monke
     assert (told.status, told.reason) == ("predicted", "on its roads: no camera sees a plane so; placed by its motion")
     tracker.feed(frames[7])
     assert [one.status for one in tracker.feed(frames[8])] == ["lost"] * 3
+
+
+def test_a_frame_that_the_mosaic_bends_away_is_placed_from_its_neighbour(flight, monkeypatch):
+    flown, frames, reference = flight
+    settle = Tracker._settle
+
+    def bent(self, location, mosaic):
+        away = np.array([[1.0, 0.0, 150.0], [0.0, 1.0, 0.0], [0.0, 0.0, 1.0]])
+        return settle(self, location, replace(mosaic, to_mosaic=[away @ mosaic.to_mosaic[0], *mosaic.to_mosaic[1:]]))
+
+    monkeypatch.setattr(Tracker, "_settle", bent)
+    tracked = track(frames, [reference])
+    assert tracked[0].status == "located"
+    assert error(flown, tracked[0]) < 3.0 * tracked[0].pose.sigma_m < 10.0
