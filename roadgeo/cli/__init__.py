@@ -6,6 +6,7 @@ Exit status: 0 all well (and every mask located), 3 at least one mask not locate
 from __future__ import annotations
 
 import difflib
+import gc
 import importlib
 import os
 import sys
@@ -21,6 +22,10 @@ from roadgeo.storage.gdal import forget_missing_proj_data, skip_drivers
 __all__ = ["COMMANDS", "ERROR", "INTERRUPTED", "NOT_LOCATED", "cli", "main"]
 
 ERROR, USAGE, NOT_LOCATED, INTERRUPTED = 1, 2, 3, 130
+
+#: Objects after which Python looks for cycles that nobody holds. A command makes few; to look for them after every 700
+#: objects, as is usual, takes some per cent of the time of a short one.
+_COLLECT_AFTER = 200_000
 
 #: Name of each command: the module whose `command` it is, and its summary, which stands here so that `--help` need not
 #: import the module.
@@ -108,6 +113,8 @@ def cli(ctx: click.Context) -> None:
 
 def main(arguments: Sequence[str] | None = None) -> int:
     """Run the command line and return its exit status; every error is one line on standard error."""
+    if arguments is None:  # the process is ours
+        gc.set_threshold(_COLLECT_AFTER)
     skip_drivers()
     forget_missing_proj_data()
     try:
