@@ -349,13 +349,16 @@ class Tracker:
     def _place_from_surest(self, placed: list[Tracked], known_at: int) -> None:
         """Place frames once more, by motion from the surest one in both directions; keep what agrees better.
 
-        A mosaic bends: what lies far from the roads that located it may be anywhere.
+        A mosaic bends: what lies far from the roads that located it may be anywhere. Frames of an archive, which have
+        neither motion nor order, stay.
         """
         odds = [one.log10_odds if one.status == "located" else -math.inf for one in placed]
         surest = int(np.argmax(odds))
         for way, there in ((1, len(placed)), (-1, -1)):
             for k in range(surest + way, there, way):
                 later = self._window[max(k, k - way)]
+                if later.frame.motion is None:
+                    break
                 motion = _motion(later) if way > 0 else np.asarray(np.linalg.inv(_motion(later)))
                 beside, here = placed[k - way].pose, self._window[k]
                 moved = None if beside is None else predict(beside, motion, later.frame.motion_px)

@@ -148,3 +148,16 @@ def test_a_frame_that_the_mosaic_bends_away_is_placed_from_its_neighbour(flight,
     tracked = track(frames, [reference])
     assert tracked[0].status == "located"
     assert error(flown, tracked[0]) < 3.0 * tracked[0].pose.sigma_m < 10.0
+
+
+def test_frames_without_motion_stay_where_the_mosaic_puts_them(flight, monkeypatch):
+    """Those of an archive have no order: the one before is no neighbour."""
+    _, frames, reference = flight
+    given = []
+    settle = Tracker._settle
+    monkeypatch.setattr(Tracker, "_settle", lambda self, *found: given.append(found) or settle(self, *found))
+    known = track(frames, [reference])
+    n = sum(one.status == "located" for one in known)
+    monkeypatch.setattr("roadgeo.running.flights.tracker.predict", lambda *_: pytest.fail("moved without a motion"))
+    placed = Tracker([reference]).place(*given[-1], [replace(frame, motion=None) for frame in frames[:n]])
+    assert [one.status for one in placed] == ["located"] * n
