@@ -119,7 +119,7 @@ def find_triple(scene: Scene, index: ReferenceIndex, to_map: np.ndarray) -> tupl
     tolerance = round(options.angle_tolerance_deg * UNITS / 180)
     limits = TripleLimits(1, tolerance, float(np.cos(np.radians(options.ray_tolerance_deg))), (0.1, 10.0), 0.33)
     good = []
-    for (proposals,) in propose(scene.intersections, scene.branches, neighbours, [index], (0.1, 10.0), 0.33, options):
+    for (proposals,) in propose(scene, [index], (0.1, 10.0), 0.33, options):
         a = proposals.anchor
         for s in range(8):
             for t in range(s + 1, 8):

@@ -246,7 +246,9 @@ def _told(options: LocateOptions) -> dict[str, Any]:
     """Return the options that differ from the usual ones, as the command line writes them down."""
     from roadgeo.running.batch import changed_options
 
-    plain: dict[str, Any] = json.loads(json.dumps(changed_options(replace(options, truths=()), LocateOptions())))
+    plain: dict[str, Any] = json.loads(
+        json.dumps(changed_options(replace(options, truths=(), threads=1), LocateOptions()))
+    )
     return plain
 
 

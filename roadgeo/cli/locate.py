@@ -237,7 +237,15 @@ def _drawing_options(command: Command) -> Command:
     default=False,
     help="Keep results that are there and younger than their masks, or make them anew, the default.",
 )
-@click.option("-j", "--jobs", metavar="N", type=click.IntRange(1), default=1, show_default=True, help="Processes.")
+@click.option(
+    "-j",
+    "--jobs",
+    metavar="N",
+    type=click.IntRange(1),
+    default=1,
+    show_default=True,
+    help="Processes; for one mask alone: threads. Results do not depend on it.",
+)
 @cluster_options
 @verbosity_options
 def locate_command(
@@ -268,6 +276,7 @@ def locate_command(
         raise click.UsageError(f"No images in {', '.join(masks)}.")
     others = found[1:] if given["fuse"] else []
     tasks = name_tasks(found[:1] if given["fuse"] else found)
+    options = replace(options, threads=jobs if len(tasks) == 1 else 1)
     make_folder(out_dir)
     photos = pair_images([task.mask for task in tasks], given["images"])
     reading = read_options(given, photos, others, jobs)

@@ -333,8 +333,8 @@ def _bind(module: str, code: bytes) -> None:
     engine.add_object_file(llvm.ObjectFileRef.from_data(code))
     engine.finalize_object()
     _kept_alive.append(engine)
-    # The GIL is held: arrays must not change under a kernel.
     release = ctypes.PYFUNCTYPE(None, ctypes.c_uint64)(engine.get_function_address("roadgeo_release"))
+    # Other threads run meanwhile (`matching.ahead`): none of them writes to arrays that a kernel was given.
     for one in entries(module):
         address = engine.get_function_address(f"roadgeo_{one.name}")
-        one.bind(ctypes.PYFUNCTYPE(ctypes.c_int32, ctypes.c_char_p, ctypes.c_void_p)(address), release)
+        one.bind(ctypes.CFUNCTYPE(ctypes.c_int32, ctypes.c_char_p, ctypes.c_void_p)(address), release)

@@ -200,7 +200,7 @@ class TripleEstimator:
     ) -> Iterator[list[Hypothesis]]:
         """Yield what grew by roads and is not known yet; a place found again counts as found once more."""
         if self._roads is None:
-            self._roads = RoadSearch(self.scene, self.index, self.options.camera, options, self.near)
+            self._roads = RoadSearch(self.scene, self.index, self.options.camera, options, self.near, self.sweeps.ahead)
         roads, known, stage = self._roads, self._grown_by_roads, len(self.options.sweeps)
         tried = roads.n_tried
         for anchor, n_proposed, grown in roads.rounds(only):

@@ -15,6 +15,7 @@ from roadgeo.geometry.homography import Homography
 from roadgeo.geometry.projection import from_lonlat, metres_apart, to_lonlat
 from roadgeo.location import Stats
 from roadgeo.matching.accuracy import with_honest_corners
+from roadgeo.matching.ahead import Ahead
 from roadgeo.matching.estimator import Ledger, MatchOptions, TripleEstimator
 from roadgeo.matching.hypothesis import Hypothesis
 from roadgeo.matching.index import ReferenceIndex, crop, unpack_tangents
@@ -125,8 +126,8 @@ def search_references(
         return [Found(index) for index in indexes]
     if options.method == "pair":
         return _search_pairs_in_turn(query, indexes, _within(options, time_limit_s))
-    started, ledger = time.perf_counter(), Ledger()
-    sweeps: SharedSweeps[TripleEstimator] = SharedSweeps(query.scene, options.match.camera, _same_place)
+    started, ledger, ahead = time.perf_counter(), Ledger(), Ahead(options.threads)
+    sweeps: SharedSweeps[TripleEstimator] = SharedSweeps(query.scene, options.match.camera, _same_place, ahead)
     shared = (ledger, sweeps)
     opened = [_Attempt.open(query, one, options, trace, *shared) for one, trace in zip(indexes, traces, strict=True)]
     ledger.n_reference = sum(one.n_searched for one in opened if one.search is not None)
@@ -140,6 +141,7 @@ def search_references(
     limits = replace(options.search, time_limit_s=left, work_limit_s=scale * options.search.work_limit_s)
     search_together(list(estimators), limits, same)
     sweeps.end()
+    ahead.close()
     return [one.found(scale) for one in opened]
 
 

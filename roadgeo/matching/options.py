@@ -38,6 +38,8 @@ class LocateOptions:
     effort : "quick" or "full"
         Whether single triples, and then roads alone, propose places where the usual search leads nowhere: a second or
         two on the map of a city.
+    threads : int
+        Of the search for one mask. The answer does not depend on it.
     """
 
     method: Literal["auto", "pair"] = "auto"
@@ -48,6 +50,7 @@ class LocateOptions:
     min_intersections: int = 3
     twins: TwinOptions | None = field(default_factory=lambda: TwinOptions.nearby(4000.0, n_places=12))
     truths: tuple[tuple[str, float, float], ...] = ()
+    threads: int = 1
     query: QueryOptions = field(default_factory=QueryOptions)
     match: MatchOptions = field(default_factory=MatchOptions)
     search: SearchOptions = field(default_factory=SearchOptions)

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterable, Iterator, Sequence
 from dataclasses import dataclass, field, replace
 from itertools import islice
 from typing import NamedTuple
@@ -12,10 +12,11 @@ import numpy as np
 
 from roadgeo._arrays import IntArray
 from roadgeo.geometry.camera import CameraOptions
+from roadgeo.matching.ahead import ALONE, Ahead
 from roadgeo.matching.index import ReferenceIndex
 from roadgeo.matching.refinement import RefineOptions
 from roadgeo.matching.road_growth import Grown, RoadGrower, RoadGrowOptions
-from roadgeo.matching.road_votes import VoteOptions, Voter
+from roadgeo.matching.road_votes import VoteOptions, Voter, Votes
 from roadgeo.matching.scene import Scene
 from roadgeo.matching.triples import farthest_first, larger
 
@@ -90,7 +91,13 @@ class RoadRound(NamedTuple):
 
 
 class RoadSearch:
-    """Proposes places for a scene on a map by roads alone."""
+    """Proposes places for a scene on a map by roads alone.
+
+    Attributes
+    ----------
+    n_tried : int
+        Places and turns tried so far.
+    """
 
     def __init__(
         self,
@@ -99,9 +106,11 @@ class RoadSearch:
         camera: CameraOptions,
         options: RoadSearchOptions,
         near: tuple[float, float, float] | None = None,
+        ahead: Ahead = ALONE,
     ) -> None:
         """`near` = (x, y, radius) in plane metres restricts where the middle of the frame may lie."""
-        self.scene, self.options = scene, options
+        self.scene, self.options, self.ahead = scene, options, ahead
+        self.n_tried = 0
         scale = options.scales(camera, scene.road_width_px)
         max_turn = math.radians(_ROUGHLY_DEG) if camera.north_up else math.pi
         candidates = _within(index, near, scene.half_size * min(scale[1], max(options.far_m, scale[0])))
@@ -109,11 +118,6 @@ class RoadSearch:
         self._tried: set[int] = set()
         perspective = camera.perspective_sigma(options.grow.perspective_sigma)
         self.grower = RoadGrower(scene, index, replace(options.grow, perspective_sigma=perspective))
-
-    @property
-    def n_tried(self) -> int:
-        """Places and turns tried so far."""
-        return self.voter.n_tried
 
     def rounds(self, only: Sequence[int] | None = None) -> Iterator[RoadRound]:
         """Yield what grew of one anchor's proposals after another; between parts of a large map nothing.
@@ -123,13 +127,14 @@ class RoadSearch:
         xy = self.scene.intersections.xy
         options, most_tried = self.options, self.options.max_tried * larger(len(self.voter.index))
         anchors = islice(farthest_first(xy, np.arange(len(xy))), options.max_anchors) if only is None else only
-        for n, anchor in enumerate(anchors):
+        for n, (anchor, steps) in enumerate(self.ahead.map(self._vote, anchors)):
             if n >= options.least_anchors and self.n_tried >= most_tried:
                 return
             if anchor in self._tried:
                 continue
             self._tried.add(anchor)
-            for votes in self.voter.votes(anchor):
+            for tried, votes in steps:
+                self.n_tried += tried
                 if votes is None:
                     yield RoadRound(-1, 0, [])
                     continue
@@ -137,6 +142,11 @@ class RoadSearch:
                 grown = [self.grower.grow(anchor, j, affine) for j, affine in best]
                 some = sorted((one for one in grown if one is not None), key=lambda one: -one.share)
                 yield RoadRound(anchor, len(best), some[: options.max_kept])
+
+    def _vote(self, anchor: int) -> tuple[int, Iterable[tuple[int, Votes | None]]]:
+        """Return an anchor and its votes, step by step; in threads all of them are there at once."""
+        steps = self.voter.votes(anchor)
+        return anchor, steps if self.ahead.threads == 1 else list(steps)
 
 
 def _within(index: ReferenceIndex, near: tuple[float, float, float] | None, reach_m: float) -> IntArray:

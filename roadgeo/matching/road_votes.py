@@ -140,30 +140,31 @@ class Voter:
         self.drawn: RoadRaster = make_raster(index, options.raster)
         density = np.maximum(self.drawn.density_at(index.xy), _LEAST_DENSITY)
         self.places = Places(self.drawn.cells(index.xy), np.asarray(index.branches), density)
-        self.n_tried = 0
 
-    def votes(self, anchor: int, chunk: int = 20_000) -> Iterator[Votes | None]:
-        """Yield None after each `chunk` of the map's intersections, and the best proposals in the end."""
+    def votes(self, anchor: int, chunk: int = 20_000) -> Iterator[tuple[int, Votes | None]]:
+        """Yield, after each `chunk` of the map's intersections, how many places and turns were tried on it.
+
+        With the last come the best proposals, before it None.
+        """
         options = self.options
         rays = self.scene.intersections.rays[anchor]
         rays = rays[np.isfinite(rays)].astype(float)
         around = self._around(anchor)
         points = self._narrow(around)
         chance = self._chance(rays, points, around.rng)
-        found, kept = np.empty((options.kept, 5)), 0
+        found, kept, tried = np.empty((options.kept, 5)), 0, 0
         for first in range(0, len(self.candidates), chunk):
             kept, tried = vote(
                 self.candidates[first : first + chunk], rays, self.tolerance, self.max_turn, points, self.places,
                 self.drawn.raster, chance, self.trial, found, kept,
             )  # fmt: skip
-            self.n_tried += tried
             if first + chunk < len(self.candidates):
-                yield None
+                yield tried, None
         wide = self._wide(around)
         improve_votes(found[:kept], _TURN_STEPS, _SCALE_STEPS, wide, self.places, self.drawn.raster, self.trial)
         best = found[:kept][np.argsort(-found[:kept, 3], kind="stable")]
         c, s = np.cos(best[:, 1]) * best[:, 2], np.sin(best[:, 1]) * best[:, 2]
-        yield Votes(anchor, best[:, 0].astype(np.int64), np.stack([c, -s, s, c], axis=1), best[:, 3])
+        yield tried, Votes(anchor, best[:, 0].astype(np.int64), np.stack([c, -s, s, c], axis=1), best[:, 3])
 
     def _around(self, anchor: int) -> _Around:
         """Return the road points as seen from a query intersection, as far as any scale may reach, nearest first."""

@@ -16,6 +16,7 @@ import numpy as np
 
 from roadgeo._arrays import BoolArray, IntArray
 from roadgeo.geometry.camera import CameraOptions
+from roadgeo.matching.ahead import ALONE, Ahead
 from roadgeo.matching.growing import GrowOptions
 from roadgeo.matching.hypothesis import Hypothesis
 from roadgeo.matching.index import ReferenceIndex
@@ -72,9 +73,15 @@ class SharedSweeps(Generic[AnyMember]):
         The parts; all have joined before the first takes anything.
     """
 
-    def __init__(self, scene: Scene, camera: CameraOptions, same_place: SamePlace[AnyMember] | None = None) -> None:
+    def __init__(
+        self,
+        scene: Scene,
+        camera: CameraOptions,
+        same_place: SamePlace[AnyMember] | None = None,
+        ahead: Ahead = ALONE,
+    ) -> None:
         """Begin without parts. `same_place` is asked of hypotheses on different parts."""
-        self.scene, self.camera, self.same_place = scene, camera, same_place
+        self.scene, self.camera, self.same_place, self.ahead = scene, camera, same_place, ahead
         self.members: list[AnyMember] = []
         self._rounds: dict[int, Iterator[_Round]] = {}
         self._done: dict[int, list[_Round]] = {}
@@ -110,7 +117,7 @@ class SharedSweeps(Generic[AnyMember]):
         if self.members[0].enough(stage):
             return
         indexes = [member.index for member in self.members]
-        for proposals in stage.source.proposals(self.scene, indexes, scale, self.camera.min_shape_ratio):
+        for proposals in stage.source.proposals(self.scene, indexes, scale, self.camera.min_shape_ratio, self.ahead):
             if self.members[0].enough(stage):
                 return
             yield _Round(proposals[0].anchor, self._grow(proposals, stage))

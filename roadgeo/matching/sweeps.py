@@ -7,6 +7,7 @@ from dataclasses import dataclass, replace
 from itertools import islice
 from typing import Protocol
 
+from roadgeo.matching.ahead import ALONE, Ahead
 from roadgeo.matching.index import ReferenceIndex
 from roadgeo.matching.scene import Scene
 from roadgeo.matching.triples import Proposals, TripleOptions, propose, smaller
@@ -18,12 +19,17 @@ class Source(Protocol):
     """Where hypotheses come from: `Sweep` makes them of triples."""
 
     def proposals(
-        self, scene: Scene, indexes: Sequence[ReferenceIndex], scale: tuple[float, float], min_ratio: float
+        self,
+        scene: Scene,
+        indexes: Sequence[ReferenceIndex],
+        scale: tuple[float, float],
+        min_ratio: float,
+        ahead: Ahead = ALONE,
     ) -> Iterator[list[Proposals]]:
         """Yield what one query intersection after another may be on each index, the most promising first.
 
         `scale` = (least, greatest) root of the determinant of a proposed map, metres per pixel; `min_ratio` is the
-        least ratio of its singular values.
+        least ratio of its singular values. `ahead` looks for the next intersections meanwhile.
         """
 
 
@@ -45,11 +51,15 @@ class Sweep:
     most_more: float = 3.0
 
     def proposals(
-        self, scene: Scene, indexes: Sequence[ReferenceIndex], scale: tuple[float, float], min_ratio: float
+        self,
+        scene: Scene,
+        indexes: Sequence[ReferenceIndex],
+        scale: tuple[float, float],
+        min_ratio: float,
+        ahead: Ahead = ALONE,
     ) -> Iterator[list[Proposals]]:
         """Yield the proposals of the anchors (see `Source`)."""
-        found = scene.intersections
-        anchors = propose(found, scene.branches, scene.neighbours, indexes, scale, min_ratio, self.triples)
+        anchors = propose(scene, indexes, scale, min_ratio, self.triples, ahead)
         more = min(smaller(sum(map(len, indexes))), self.most_more)
         return islice(anchors, int(self.max_anchors * more))
 

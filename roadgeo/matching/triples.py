@@ -9,18 +9,20 @@ ever.
 from __future__ import annotations
 
 import math
+import threading
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, replace
 from functools import lru_cache
 
 import numpy as np
 
-from roadgeo._arrays import AnyArray, FloatArray, Int32Array, IntArray
+from roadgeo._arrays import FloatArray, Int32Array, IntArray
 from roadgeo.kernels.structs import Hits, TripleLimits, TripleQuery
 from roadgeo.kernels.triple_codes import UNITS, find_sides
 from roadgeo.kernels.triples import count_alike, gather, look_up_each
+from roadgeo.matching.ahead import ALONE, Ahead
 from roadgeo.matching.index import ReferenceIndex
-from roadgeo.roads.intersections import Intersections
+from roadgeo.matching.scene import Scene
 
 __all__ = ["Proposals", "TripleOptions", "farthest_first", "larger", "propose", "smaller"]
 
@@ -126,20 +128,20 @@ class Proposals:
 
 
 def propose(
-    query: Intersections,
-    branches: AnyArray,
-    neighbours: Int32Array,
+    scene: Scene,
     indexes: Sequence[ReferenceIndex],
     scale: tuple[float, float],
     min_ratio: float,
     options: TripleOptions,
+    ahead: Ahead = ALONE,
 ) -> Iterator[list[Proposals]]:
     """Yield, for one anchor after another (see `TripleOptions.spread`), what it proposes on each of the indexes.
 
     Which anchors and triples come first, and how much is compared, is told by all indexes together, as if they were
     one; each gets a share of the bounds that grows with what it has to compare.
     """
-    neighbours = np.ascontiguousarray(neighbours[:, : options.n_neighbours])
+    query, branches = scene.intersections, scene.branches
+    neighbours = np.ascontiguousarray(scene.neighbours[:, : options.n_neighbours])
     weighed = np.arange(0, len(query), max(1, math.ceil(len(query) / options.max_weighed)))
     # how many entries of the tables each pair of an anchor's neighbours would have to be compared with
     sides = np.empty(query.tangents.shape, np.int8)
@@ -150,22 +152,32 @@ def propose(
     tolerance = round(options.angle_tolerance_deg * UNITS / 180.0)
     min_cos = float(np.cos(np.radians(options.ray_tolerance_deg)))
     limits = TripleLimits(options.codes_per_vertex, tolerance, min_cos, scale, min_ratio)
-    hits = Hits(np.empty((options.bounds(n_reference)[0], 5), np.int64), np.empty((options.bounds(n_reference)[0], 4)))
+    room = _Room(options.bounds(n_reference)[0])
     # anchors with rare codes first, or those that lie furthest from the ones before
     usable = costs >= 0
     total = np.where(usable, costs, 0).sum(axis=(1, 2))
     n_usable = usable.sum(axis=(1, 2))
     able = np.flatnonzero(n_usable >= 3)
     rarest = able[np.argsort(total[able] / n_usable[able], kind="stable")]
-    for i in farthest_first(query.xy[weighed[able]], able) if options.spread else rarest:
+
+    def look_up(i: int) -> list[Proposals]:
         a = int(weighed[i])
         slots = np.argwhere(usable[i])
         slots = np.ascontiguousarray(slots[np.argsort(costs[i][usable[i]], kind="stable")])
         shares = _shares(seen, a, indexes, options)
-        yield [
-            _look_up(seen, a, slots, index, options.bounds(n_reference, share), limits, hits, options)
+        return [
+            _look_up(seen, a, slots, index, options.bounds(n_reference, share), limits, room.hits, options)
             for index, share in zip(indexes, shares, strict=True)
         ]
+
+    yield from ahead.map(look_up, farthest_first(query.xy[weighed[able]], able) if options.spread else rarest)
+
+
+class _Room(threading.local):
+    """Where each thread puts its hits."""
+
+    def __init__(self, most: int) -> None:
+        self.hits = Hits(np.empty((most, 5), np.int64), np.empty((most, 4)))
 
 
 def _starts(indexes: tuple[ReferenceIndex, ...]) -> Int32Array:

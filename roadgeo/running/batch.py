@@ -198,7 +198,7 @@ class _Locating:
         usual = BatchOptions()
         reading = replace(self.reading, images={}, threads=ReadOptions.threads)
         told = {
-            **changed_options(replace(self.options.search, truths=()), usual.search),
+            **changed_options(replace(self.options.search, truths=(), threads=1), usual.search),
             **changed_options(reading, usual.reading),
             **changed_options(self.outputs.image, usual.outputs.image),
         }

@@ -50,7 +50,7 @@ class Plan:
     def __init__(self, parts):
         self.parts = parts
 
-    def proposals(self, scene, indexes, scale, min_ratio):
+    def proposals(self, scene, indexes, scale, min_ratio, ahead):
         for anchor, rows in enumerate(zip(*(part.placed for part in self.parts), strict=True)):
             yield [proposals_of(anchor, placed) for placed in rows]
 

@@ -55,6 +55,13 @@ def test_order_processes_and_threads_change_nothing(porto: Path, tmp_path: Path)
     assert answers(porto, tmp_path / "b", MASKS[::-1], "--jobs", "3", threads=4) == once
 
 
+def test_threads_search_for_one_mask_as_one_does(porto: Path, tmp_path: Path) -> None:
+    """With all that is tried for a mask that has no place."""
+    elsewhere = [mask for mask in MASKS if mask.stem == "elsewhere"]
+    once = answers(porto, tmp_path / "a", elsewhere, "--effort", "full")
+    assert answers(porto, tmp_path / "b", elsewhere, "--effort", "full", "--jobs", "3") == once
+
+
 def test_photographs_too(porto: Path, tmp_path: Path) -> None:
     """One is met twice, and onnxruntime has one thread or three."""
     whole = cv2.imread(str(PHOTO))
