@@ -18,6 +18,7 @@ from roadgeo.matching.parts import Part, Whole
 from roadgeo.roads.intersections import IntersectionOptions, find_intersections
 from roadgeo.roads.network import RoadNetwork
 from roadgeo.roads.simplification import SimplifyOptions, planarize, simplify
+from roadgeo.storage.memory import give_back_memory
 
 if TYPE_CHECKING:
     from roadgeo.reference.shards import ShardedReference
@@ -117,8 +118,10 @@ def build_network(
     options = options or BuildOptions()
     say(f"cutting {len(lines):,} lines where they cross")
     graph = planarize(lines)
+    give_back_memory()
     drawing = "drawing them as a mask shows them"
     graph = simplify(graph, options.simplify, lambda share: say(drawing, share))
+    give_back_memory()
     found = find_intersections(graph, options.intersections)
     return RoadNetwork(graph, found, plane, tuple(coverage(graph)), {**meta, "options": asdict(options)})
 

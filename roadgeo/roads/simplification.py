@@ -18,6 +18,7 @@ from roadgeo.errors import RoadSourceError
 from roadgeo.kernels import simplification as kernels
 from roadgeo.kernels.parallel_roads import find_mates, fuse_twins, sample_edges, tie_runs
 from roadgeo.roads.graph import RoadGraph
+from roadgeo.storage.memory import give_back_memory
 
 if TYPE_CHECKING:
     from shapely.geometry import LineString
@@ -26,6 +27,9 @@ __all__ = ["SimplifyOptions", "coverage", "planarize", "simplify"]
 
 #: Roads at a smaller angle than this run side by side.
 _PARALLEL_COS = float(np.cos(np.radians(25.0)))
+
+#: Of a map with more, memory that one step has freed is given back before the next needs its own.
+_MANY_EDGES = 100_000
 
 #: What lines may hold, far above any map that can be indexed: beyond it they would fill the memory.
 MAX_LENGTH_M = 1e10
@@ -252,6 +256,8 @@ def simplify(
         before = graph.n_nodes, graph.n_edges
         for n_steps, step in enumerate(steps):
             advance((n_passes + n_steps / len(steps)) / options.max_passes)
+            if graph.n_edges > _MANY_EDGES:
+                give_back_memory()
             changed = step(graph, options)
             graph = graph if changed is graph else _join_chains(changed)
         if (graph.n_nodes, graph.n_edges) == before:
