@@ -5,7 +5,7 @@ from __future__ import annotations
 import os
 from collections.abc import Callable, Sequence
 from pathlib import Path
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, cast
 
 import numpy as np
 
@@ -179,13 +179,9 @@ def explain(
         The mask cannot be read or shows no roads.
     """
     options, references = options or LocateOptions(), _as_list(reference)
-    query, records = _read(mask, options), list[Record]()
-
-    def record() -> Record:
-        records.append(make_record(query.name, options))
-        return records[-1]
-
-    found = _search(query, references, options, record)
+    query = _read(mask, options)
+    found = _search(query, references, options, lambda: make_record(query.name, options))
+    records = [cast("Record", one.trace) for one in found]
     alone = [decide(query, [one], options) for one in found]
     needed = needed_of(options)
     stories = [

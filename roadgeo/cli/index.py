@@ -61,6 +61,11 @@ __all__ = ["index_command"]
 @click.option("--nominatim-url", metavar="URL", help="Nominatim server that finds --osm places.")
 @click.option("--no-cache", is_flag=True, help="Fetch anew what was fetched before.")
 @click.option(
+    "--coarse",
+    is_flag=True,
+    help="Draw main roads alone, as pixels of 2 to 12 m show them: a map of a whole region, for images of 5 to 50 km.",
+)
+@click.option(
     "--update",
     is_flag=True,
     help="Bring a reference up to date: replace its roads on the ground asked for, or add that; keep the rest.",
@@ -86,6 +91,7 @@ __all__ = ["index_command"]
 def index_command(
     out: str | None,
     name: str | None,
+    coarse: bool,
     update: bool,
     rebuild: str | None,
     shards: dict[str, Any] | None,
@@ -119,21 +125,25 @@ def index_command(
       roadgeo index --update --roads new_estate.geojson --out maps/streets.gpkg
       roadgeo index --rebuild maps/streets.gpkg
       roadgeo index --roads germany.osm.pbf --shards auto --jobs 4
+      roadgeo index --osm "Massachusetts" --coarse --name massachusetts-main
     """
     from roadgeo.cli.compilation import compile_once
     from roadgeo.cli.folders import make_folder
     from roadgeo.cli.progress import show_steps
     from roadgeo.reference.files import reference_freshness
     from roadgeo.reference.library import make_slug, new_reference
+    from roadgeo.reference.reference import COARSE
     from roadgeo.workflows import build_reference, update_reference
 
     started = perf_counter()
     if rebuild is not None:
-        if update or name or out or any(source[option] for option in (*_FETCHED, "bbox", "roads", "plugin")):
+        if update or coarse or name or out or any(source[option] for option in (*_FETCHED, "bbox", "roads", "plugin")):
             raise click.UsageError("--rebuild takes nothing but the reference: its roads are in its GeoPackage.")
         _rebuild(rebuild, quiet)
         return
     given = _one_source(source)
+    if coarse:
+        source["kinds"] = _kinds_of_coarse(update, shards is not None)
     if shards is None:
         _require_geopackage(out)
     name = name or _name(source, given, out)
@@ -157,7 +167,7 @@ def index_command(
         if update:
             reference = update_reference(path, roads, say)
         else:
-            reference = build_reference(roads, make_slug(name), path=path, say=say)
+            reference = build_reference(roads, make_slug(name), COARSE if coarse else None, path=path, say=say)
     if verbose:
         for key, value in roads.meta.items():
             echo(f"  {key}: {value}", err=True)
@@ -165,6 +175,17 @@ def index_command(
         seconds = perf_counter() - started
         found = f"{path}: {len(reference.index):,} intersections in {seconds:.1f} s"
         echo(f"{found}; search it with `roadgeo locate MASK -r {out or path.stem}`")
+
+
+def _kinds_of_coarse(update: bool, in_shards: bool) -> str:
+    """Return which roads a coarse map holds: main ones, unless the user named others."""
+    if update:
+        raise click.UsageError("--update keeps the options that a reference was built with: leave out --coarse.")
+    if in_shards:
+        raise click.UsageError("--shards makes a coarse map beside the shards: leave out --coarse.")
+    context = click.get_current_context()
+    named = context.get_parameter_source("kinds") is not click.core.ParameterSource.DEFAULT
+    return str(context.params["kinds"]) if named else "main"
 
 
 #: Endings of what `--out` may be taken for.

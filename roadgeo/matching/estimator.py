@@ -152,12 +152,18 @@ class TripleEstimator:
         trace.began(self)
 
     def stages(self) -> Iterator[Iterator[list[Hypothesis]]]:
-        """Yield, for one anchor after another, the hypotheses that grew: of triples, of roads, of single triples."""
+        """Yield, for one anchor after another, the hypotheses that grew: of triples, of roads, of single triples.
+
+        On a coarse map roads come first: an intersection is seldom merged there as a mask shows it.
+        """
         options = self.options
-        for stage, source in enumerate(options.sweeps):
-            yield self.sweeps.rounds(self, Stage(stage, source, options.grow))
+        sweeps = [
+            self.sweeps.rounds(self, Stage(stage, source, options.grow)) for stage, source in enumerate(options.sweeps)
+        ]
+        roads = []
         if options.roads is not None and len(self.scene.intersections):
-            yield self._rounds_of_roads(options.roads)
+            roads.append(self._rounds_of_roads(options.roads))
+        yield from sweeps + roads if self.index.coarseness == 1.0 else roads + sweeps
         if options.lens is not None and options.last:
             yield self._rounds_of_lenses(options.lens)
         for stage, source in enumerate(options.last, len(options.sweeps) + 1):
@@ -173,8 +179,12 @@ class TripleEstimator:
         return Work(*counts).seconds
 
     def leads(self, model: Hypothesis) -> list[Lead]:
-        """Return what led to a hypothesis (see `search.Estimator`)."""
-        return model.leads
+        """Return what led to a hypothesis (see `search.Estimator`).
+
+        On a coarse map nothing that is worth a try on others: it holds all the ground that they show, and coarse maps
+        are searched for the same intersections side by side.
+        """
+        return model.leads if self.index.coarseness == 1.0 else []
 
     def follow(self, leads: Sequence[Lead]) -> Iterator[list[Hypothesis]]:
         """Yield what grew from anchors that led to a place on another part (see `search.Estimator`)."""
@@ -200,7 +210,8 @@ class TripleEstimator:
     ) -> Iterator[list[Hypothesis]]:
         """Yield what grew by roads and is not known yet; a place found again counts as found once more."""
         if self._roads is None:
-            self._roads = RoadSearch(self.scene, self.index, self.options.camera, options, self.near, self.sweeps.ahead)
+            on_map = options.on(self.index.coarseness)
+            self._roads = RoadSearch(self.scene, self.index, self.options.camera, on_map, self.near, self.sweeps.ahead)
         roads, known, stage = self._roads, self._grown_by_roads, len(self.options.sweeps)
         tried = roads.n_tried
         for anchor, n_proposed, grown in roads.rounds(only):

@@ -25,8 +25,10 @@ from roadgeo.kernels.triple_codes import MAX_ANCHORS, MAX_NEIGHBOURS, TABLE, fil
 from roadgeo.roads.graph import RoadGraph
 from roadgeo.roads.intersections import MAX_BRANCHES
 from roadgeo.roads.network import RoadNetwork
+from roadgeo.roads.simplification import SimplifyOptions
 
 __all__ = [
+    "COARSENESS",
     "IndexOptions",
     "ReferenceIndex",
     "build_index",
@@ -43,6 +45,10 @@ _SHUFFLE_SEED = 7
 #: What an index from a stranger may hold: the kernels sample segments every few metres, in each bucket that lists them.
 _MAX_DISTANCE_M = 5e7
 _MAX_SEGMENT_M, _MAX_MEAN_SEGMENT_M = 1e6, 1e4
+
+#: How many times as far as usual roads are merged on a coarse map: as pixels of 2 to 12 m show them.
+COARSENESS = 6.0
+_LEAST_COARSE, _MOST_COARSE = 2.0, 50.0
 
 
 @dataclass(frozen=True)
@@ -132,6 +138,15 @@ class ReferenceIndex:
         """Where the index's plane lies on Earth."""
         x, y = self.meta["origin"]
         return LocalPlane(str(self.meta["crs"]), (float(x), float(y)))
+
+    @cached_property
+    def coarseness(self) -> float:
+        """How many times as far as on an ordinary map roads were merged: 1, or that of a coarse map."""
+        merged_m: Any = self.meta
+        for key in ("options", "simplify", "merge_radius"):
+            merged_m = merged_m.get(key) if isinstance(merged_m, Mapping) else None
+        ratio = merged_m / SimplifyOptions.merge_radius if type(merged_m) in {int, float} else 1.0
+        return ratio if _LEAST_COARSE <= ratio <= _MOST_COARSE else 1.0
 
     @property
     def grid(self) -> tuple[float, float, float]:

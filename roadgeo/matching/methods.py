@@ -25,6 +25,7 @@ from roadgeo.matching.paper.search import match_pairs
 from roadgeo.matching.paper.tuples import PairIndex, PairOptions, build_pair_index
 from roadgeo.matching.parts import Near, Part, same_within_m
 from roadgeo.matching.query import Query
+from roadgeo.matching.road_search import COARSE_PIXEL_M
 from roadgeo.matching.search import Search, SearchResult, search_together
 from roadgeo.matching.shared_sweeps import SharedSweeps
 from roadgeo.matching.trace import NO_TRACE, Trace
@@ -32,6 +33,10 @@ from roadgeo.matching.triples import larger
 from roadgeo.roads.intersections import Intersections
 
 __all__ = ["Fit", "Found", "search_references"]
+
+
+#: Work that a first look at coarse maps may take.
+_FIRST_LOOK_S = 0.03
 
 
 @dataclass(frozen=True)
@@ -93,6 +98,8 @@ class Found:
         Places that were screened.
     n_anchors : int
         Intersections of the query that were looked for.
+    trace : Trace
+        What was noted of the search.
     """
 
     index: ReferenceIndex
@@ -105,6 +112,7 @@ class Found:
     stats: Stats = field(default_factory=Stats)
     match_s: float = 0.0
     refine_s: float = 0.0
+    trace: Trace = NO_TRACE
 
 
 def search_references(
@@ -116,16 +124,51 @@ def search_references(
 ) -> list[Found]:
     """Search references, or parts of them, for a query together, by the method and within the limits of the options.
 
-    Those that cannot hold the place are not opened, unless that is none of them; nothing is told of them. For each of
-    the others a trace is made, in the order of what is returned.
+    Those that cannot hold the place are not opened, unless that is none of them; nothing is told of them. A trace is
+    made for each of the others. Coarse maps come first: where a place stands out on them, the others are not opened.
     """
+    started = time.perf_counter()
+    coarse, fine = _split(parts, options)
+    if coarse and fine and options.method != "pair":
+        found = _search(query, coarse, _at_first_look(coarse, options), time_limit_s, make_trace)
+        if any(one.stopped == "accepted" for one in found):
+            return found
+    return _search(query, coarse + fine, options, time_limit_s - (time.perf_counter() - started), make_trace)
+
+
+def _split(parts: Sequence[Part], options: LocateOptions) -> tuple[list[Part], list[Part]]:
+    """Return the coarse maps, unless pixels are too small for them, and the others."""
+    coarse = [part for part in parts if part.coarseness > 1.0]
+    fine = [part for part in parts if part.coarseness == 1.0]
+    largest_m = options.match.camera.gsd_m[1]
+    return [one for one in coarse if largest_m > one.coarseness * COARSE_PIXEL_M or not fine], fine
+
+
+def _at_first_look(coarse: Sequence[Part], options: LocateOptions) -> LocateOptions:
+    """Return the options for a look at coarse maps alone: a quick one, unless pixels are so large as they show."""
+    least_m = options.match.camera.gsd_m[0]
+    if all(least_m >= one.coarseness * COARSE_PIXEL_M for one in coarse):
+        return options
+    search = replace(options.search, work_limit_s=min(_FIRST_LOOK_S, options.search.work_limit_s))
+    return replace(options, effort="quick", search=search)
+
+
+def _search(
+    query: Query,
+    parts: Sequence[Part],
+    options: LocateOptions,
+    time_limit_s: float,
+    make_trace: Callable[[], Trace],
+) -> list[Found]:
+    """Search parts together."""
     frame_m = 2.0 * query.scene.half_size * options.match.camera.gsd_m[1]
     indexes = _open(parts, options.near, frame_m)
     traces = [make_trace() for _ in indexes]
     if len(query.scene.intersections) < options.min_intersections:
-        return [Found(index) for index in indexes]
+        return [Found(index, trace=trace) for index, trace in zip(indexes, traces, strict=True)]
     if options.method == "pair":
-        return _search_pairs_in_turn(query, indexes, _within(options, time_limit_s))
+        found = _search_pairs_in_turn(query, indexes, _within(options, time_limit_s))
+        return [replace(one, trace=trace) for one, trace in zip(found, traces, strict=True)]
     started, ledger, ahead = time.perf_counter(), Ledger(), Ahead(options.threads)
     sweeps: SharedSweeps[TripleEstimator] = SharedSweeps(query.scene, options.match.camera, _same_place, ahead)
     shared = (ledger, sweeps)
@@ -191,7 +234,7 @@ class _Attempt:
             reach = _rounded_up(near[2] + 2.0 * query.scene.half_size * options.match.camera.gsd_m[1])
             part = _part(index, near[:2], reach)
             if len(part) < options.min_intersections:
-                return cls(index, len(part))
+                return cls(index, len(part), trace=trace)
         estimator = TripleEstimator(query.scene, part, promising_options(options), near, trace, ledger, sweeps)
         return cls(index, len(part), estimator, Search(estimator), trace)
 
@@ -199,7 +242,7 @@ class _Attempt:
         """Tell what came of it; work is told for a map `scale` times smaller."""
         estimator = self.estimator
         if self.search is None or estimator is None:
-            return Found(self.index, n_searched=self.n_searched)
+            return Found(self.index, n_searched=self.n_searched, trace=self.trace)
         result, places = _charge_alike(estimator, self.search)
         self.trace.finished(estimator, result)
         return Found(
@@ -218,6 +261,7 @@ class _Attempt:
             ),
             match_s=self.search.seconds - estimator.refine_s,
             refine_s=estimator.refine_s,
+            trace=self.trace,
         )
 
 

@@ -29,6 +29,10 @@ class Part(Protocol):
     def may_hold(self, near: Near, frame_m: float = 0.0) -> bool:
         """Whether a frame of that size at most, whose middle lies within a circle, may show it; it is not opened."""
 
+    @property
+    def coarseness(self) -> float:
+        """That of its index, which is not opened."""
+
     def open(self) -> ReferenceIndex:
         """Return its index."""
 
@@ -45,6 +49,11 @@ class Whole:
         low, high = self.index.bounds
         beyond = np.maximum(low - center, center - high)
         return bool((beyond <= near[2] + frame_m).all())
+
+    @property
+    def coarseness(self) -> float:
+        """That of its index."""
+        return self.index.coarseness
 
     def open(self) -> ReferenceIndex:
         """Return its index."""

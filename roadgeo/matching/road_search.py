@@ -20,7 +20,10 @@ from roadgeo.matching.road_votes import VoteOptions, Voter, Votes
 from roadgeo.matching.scene import Scene
 from roadgeo.matching.triples import farthest_first, larger
 
-__all__ = ["RoadRound", "RoadSearch", "RoadSearchOptions"]
+__all__ = ["COARSE_PIXEL_M", "RoadRound", "RoadSearch", "RoadSearchOptions"]
+
+#: The smallest pixels that are looked for on a map of coarseness 1; of a coarse map so many times as large.
+COARSE_PIXEL_M = 0.35
 
 #: How far a proposal, made of two branches, may turn the image's up from where it points.
 _ROUGHLY_DEG = 25.0
@@ -50,6 +53,8 @@ class RoadSearchOptions:
     far_m : float
         Pixels that are greater hardly show what is around an intersection: a place given by near is not looked for
         further away than frames of such pixels reach.
+    least_gsd_m : float
+        Smaller pixels are not tried: they show more than a coarse map.
     """
 
     votes: VoteOptions = field(default_factory=VoteOptions)
@@ -64,11 +69,20 @@ class RoadSearchOptions:
     road_width_m: tuple[float, float] = (2.0, 75.0)
     telling_width_px: float = 6.0
     far_m: float = 5.0
+    least_gsd_m: float = 0.0
+
+    def on(self, coarseness: float) -> RoadSearchOptions:
+        """Return them for a map of some coarseness: on a coarse one more lies around an intersection."""
+        if coarseness == 1.0:
+            return self
+        far_m, least_gsd_m = coarseness * self.far_m, coarseness * COARSE_PIXEL_M
+        return replace(self, votes=self.votes.on(coarseness), far_m=far_m, least_gsd_m=least_gsd_m)
 
     def scales(self, camera: CameraOptions, road_width_px: float) -> tuple[float, float]:
         """Return the least and greatest ground sampling around an intersection to try."""
         low, high = camera.gsd_m
-        low, high = low / self.scale_slack, high * self.scale_slack
+        low, high = max(low / self.scale_slack, self.least_gsd_m), high * self.scale_slack
+        high = max(high, low)
         if road_width_px < self.telling_width_px:
             return low, high
         least, most = (width / road_width_px for width in self.road_width_m)

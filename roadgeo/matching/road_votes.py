@@ -11,7 +11,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Iterator, Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from typing import NamedTuple
 
 import numpy as np
@@ -81,6 +81,12 @@ class VoteOptions:
     wide_radius_m: float = 260.0
     wide_points: int = 160
     n_chance: int = 60
+
+    def on(self, coarseness: float) -> VoteOptions:
+        """Return them for a coarse map: all lengths are so many times as long."""
+        raster = replace(self.raster, cell_m=coarseness * self.raster.cell_m, reach_m=coarseness * self.raster.reach_m)
+        lengths = ("inner_m", "radius_m", "own_m", "wide_radius_m")
+        return replace(self, raster=raster, **{name: coarseness * getattr(self, name) for name in lengths})
 
 
 @dataclass(frozen=True)

@@ -11,7 +11,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 
@@ -48,6 +48,10 @@ class VerifyOptions:
         At the true place at least so much agrees, of intersections, of the query's roads and of the map's; of worse
         masks a little evidence is lost. Where a piece of a mask fits and the rest does not, that tells against it.
         Of 511 searches in eight cities for masks without a place, none scored above 0.8 with these and `saturation`.
+    statement_m : float
+        So much of the map's roads is one independent statement, if they are fewer than those of the query. At 220 right
+        places of masks of all kinds the map had 62 m and more of road for each statement of the query; at a wrong one,
+        a frame of 180 m that a mask of main roads was laid on, 11 m.
     promising : float
         Log10 odds that a place must reach against the least chance seen so far before a null of its own is measured.
         They are an upper bound: below 1 a place is neither located (3.5) nor within the margin (2.0) of one that is.
@@ -63,6 +67,7 @@ class VerifyOptions:
     n_null_points: int = 150
     n_anchors: int = 3
     saturation: float = 250.0
+    statement_m: float = 50.0
     least_rates: tuple[float, float, float] = (0.2, 0.5, 0.5)
     promising: float = 1.0
 
@@ -171,6 +176,7 @@ def chance_agreement(
     min_cos = math.cos(math.radians(options.max_turn_deg))
     roads = index.road_buckets
     inverse, bounds = np.asarray(np.linalg.inv(matrix), float), _bounds(matrix, scene)
+    options = _with_shifts_beyond(tolerance, options)
     shifts = np.concatenate((_spiral(options), _onto_neighbours(matrix, scene, index, options, near)))
     shifts = np.ascontiguousarray(shifts[::every])
     rates = np.empty((len(shifts), 3))
@@ -196,6 +202,16 @@ def chance_agreement(
 
 def _mean_of_best(rates: FloatArray, count: int) -> float:
     return float(rates.max()) if count == 1 else float(np.sort(rates)[-count:].mean())
+
+
+def _with_shifts_beyond(tolerance: float, options: VerifyOptions) -> VerifyOptions:
+    """Return the options with shifts that are no shorter than three times what roads may be apart, and agree.
+
+    Where a pixel is 10 m, those within 30 m are the place itself: all of its roads agree there, too.
+    """
+    low, high = options.shift_m
+    wider = max(1.0, 3.0 * tolerance / low)
+    return replace(options, shift_m=(wider * low, wider * high))
 
 
 def _spiral(options: VerifyOptions) -> FloatArray:
@@ -265,7 +281,8 @@ def log10_odds(
     rates = (found.rate, found.forward, found.backward)
     intersections, forward, backward = map(_information, rates, chance, options.least_rates)
     nats = independent(found.tested) * intersections
-    # Forward and backward agreement are two views of the same roads: each counts half.
-    both = forward + backward
-    nats += independent(0.5 * n_roads) * both
+    # Forward and backward agreement are two views of the same roads: each counts half. In favour of a place the map
+    # states no more than it has roads in the frame: a few that meet some of the many roads of a mask are no proof.
+    n_shown = found.n_seen * options.backward_step_m / options.statement_m if backward > 0.0 else n_roads
+    nats += independent(0.5 * n_roads) * forward + independent(0.5 * min(n_roads, n_shown)) * backward
     return (nats - math.log(max(n_candidates, 1))) / math.log(10.0)

@@ -13,7 +13,7 @@ from roadgeo.errors import IndexFormatError, RoadSourceError
 from roadgeo.geometry.projection import LocalPlane
 from roadgeo.kernels.triple_codes import MAX_NEIGHBOURS
 from roadgeo.location import Location
-from roadgeo.matching.index import IndexOptions, ReferenceIndex, build_index
+from roadgeo.matching.index import COARSENESS, IndexOptions, ReferenceIndex, build_index
 from roadgeo.matching.parts import Part, Whole
 from roadgeo.roads.intersections import IntersectionOptions, find_intersections
 from roadgeo.roads.network import RoadNetwork
@@ -24,6 +24,7 @@ if TYPE_CHECKING:
     from roadgeo.reference.shards import ShardedReference
 
 __all__ = [
+    "COARSE",
     "AnyReference",
     "BuildOptions",
     "Reference",
@@ -43,6 +44,10 @@ class BuildOptions:
     simplify: SimplifyOptions = field(default_factory=SimplifyOptions)
     intersections: IntersectionOptions = field(default_factory=IntersectionOptions)
     index: IndexOptions = field(default_factory=IndexOptions)
+
+
+#: Of a coarse map, for images whose pixels show main roads alone.
+COARSE = BuildOptions(simplify=SimplifyOptions().times(COARSENESS))
 
 
 @dataclass(frozen=True)

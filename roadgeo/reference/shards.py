@@ -4,6 +4,7 @@ Layout of `NAME.shards`::
 
     manifest.json      what there is (schema "roadgeo.shards/1"); written last, so a folder with one is whole
     BUILD/SHARD.gpkg   and SHARD.index: an ordinary reference each, never changed once it is there
+    BUILD/coarse.gpkg  and coarse.index: the main roads of all the ground in one piece, drawn as large pixels show them
 
 Each shard has ground of its own and, around it, a margin that its neighbours have, too: a frame whose middle lies on
 its own ground lies on it wholly, as long as half of the frame's diagonal is no longer than the margin. What the
@@ -23,11 +24,13 @@ from hashlib import blake2b
 from pathlib import Path
 from typing import Any
 
+import numpy as np
+
 from roadgeo import __version__
 from roadgeo._progress import Say, say_nothing
 from roadgeo.errors import IndexFormatError
 from roadgeo.location import Location
-from roadgeo.matching.index import ReferenceIndex
+from roadgeo.matching.index import COARSENESS, ReferenceIndex
 from roadgeo.matching.parts import Near, touches
 from roadgeo.reference.files import check_reference, reference_digest, reference_paths
 from roadgeo.reference.remote import fetch_shard
@@ -129,6 +132,8 @@ class Manifest:
     margin_m : float
     meta : dict
         As in the shards: sources, attribution, kinds of roads, options.
+    coarse : ShardEntry or None
+        The main roads of all the ground, for images that show no others. None: it was built before there were such.
     """
 
     name: str
@@ -138,11 +143,17 @@ class Manifest:
     meta: dict[str, Any] = field(repr=False)
     shards: tuple[ShardEntry, ...] = field(repr=False)
     roadgeo: str = __version__
+    coarse: ShardEntry | None = None
 
     @property
     def filled(self) -> tuple[ShardEntry, ...]:
         """The shards that can be searched."""
         return tuple(entry for entry in self.shards if entry.crs)
+
+    @property
+    def files(self) -> tuple[ShardEntry, ...]:
+        """All that has files: the shards, and the coarse map."""
+        return (*self.filled, *([self.coarse] if self.coarse is not None and self.coarse.crs else []))
 
     def to_dict(self) -> dict[str, Any]:
         """Plain values."""
@@ -184,7 +195,8 @@ def _parse_manifest(told: Any) -> Manifest:
     if type(told) is not dict or told.pop("schema", None) != SCHEMA:
         raise ValueError(f"expected an object of schema {SCHEMA}")
     shards = tuple(ShardEntry.from_dict(values) for values in told.pop("shards"))
-    found = Manifest(**told, shards=shards)
+    coarse = told.pop("coarse", None)
+    found = Manifest(**told, shards=shards, coarse=None if coarse is None else ShardEntry.from_dict(coarse))
     texts = (found.name, found.build, found.crs, found.roadgeo)
     if any(type(text) is not str for text in texts) or not _NAME.fullmatch(found.build):
         raise ValueError("a name is wrong")
@@ -217,6 +229,7 @@ class Shard:
 
     entry: ShardEntry
     path: Path
+    coarseness: float = 1.0
 
     def may_hold(self, near: Near, frame_m: float = 0.0) -> bool:  # noqa: ARG002 (its margin holds the frame)
         """Whether the middle of a frame may lie on its own ground and within a circle."""
@@ -263,7 +276,13 @@ class ShardedReference:
 
     path: Path
     manifest: Manifest
-    parts: tuple[Shard, ...] = field(repr=False)
+    shards: tuple[Shard, ...] = field(repr=False)
+    coarse: Shard | None = field(repr=False, default=None)
+
+    @property
+    def parts(self) -> tuple[Shard, ...]:
+        """What is searched: the coarse map, if there is one, and the shards."""
+        return self.shards if self.coarse is None else (self.coarse, *self.shards)
 
     @property
     def name(self) -> str:
@@ -271,18 +290,25 @@ class ShardedReference:
         return self.manifest.name
 
     def index_of(self, location: Location) -> ReferenceIndex:
-        """Return the index of the shard that a location lies on; of the first where there is no place."""
+        """Return the index of the shard that a location lies on; of the first where there is no place.
+
+        Of a frame that a shard may not show wholly it is that of the coarse map.
+        """
         center = location.center
-        if center is None:
-            return self.parts[0].open()
+        if center is None or location.footprint is None:
+            return self.shards[0].open()
         near = (center.lon, center.lat, 0.0)
         here = [one for one in self.parts if one.entry.crs == location.crs and touches(one.entry.reach, near)]
-        return min(here or self.parts, key=lambda one: not touches(one.entry.ground, near)).open()
+        wide = np.ptp(location.footprint, axis=0).max() > 2.0 * self.manifest.margin_m
+        return min(
+            here or self.shards,
+            key=lambda one: ((one is self.coarse) != wide, not touches(one.entry.ground, near)),
+        ).open()
 
     def indexes_at(self, places: Sequence[tuple[float, float]]) -> list[ReferenceIndex]:
         """Return the indexes of the shards on whose ground places (longitude, latitude) lie, at least one."""
-        held = [one for one in self.parts if any(touches(one.entry.ground, (*place, 0.0)) for place in places)]
-        return [one.open() for one in (held or self.parts[:1])[:_MOST_DRAWN]]
+        held = [one for one in self.shards if any(touches(one.entry.ground, (*place, 0.0)) for place in places)]
+        return [one.open() for one in (held or self.shards[:1])[:_MOST_DRAWN]]
 
 
 #: A page of an overview draws no more shards than this.
@@ -298,9 +324,12 @@ def open_shards(path: Path) -> ShardedReference:
         The manifest is damaged.
     """
     manifest = read_manifest(path)
-    parts = tuple(Shard(entry, _shard_path(path, manifest, entry)) for entry in manifest.filled)
-    _allow_open_files(2 * len(parts))
-    return ShardedReference(path.parent, manifest, parts)
+    shards = tuple(Shard(entry, _shard_path(path, manifest, entry)) for entry in manifest.filled)
+    coarse = None
+    if manifest.coarse is not None and manifest.coarse.crs:
+        coarse = Shard(manifest.coarse, _shard_path(path, manifest, manifest.coarse), COARSENESS)
+    _allow_open_files(2 * len(shards))
+    return ShardedReference(path.parent, manifest, shards, coarse)
 
 
 def _shard_path(path: Path, manifest: Manifest, entry: ShardEntry) -> Path:
@@ -329,7 +358,7 @@ def shards_digest(path: Path) -> str:
     IndexFormatError
         The manifest is damaged.
     """
-    digests = "".join(entry.digest for entry in read_manifest(path).filled)
+    digests = "".join(entry.digest for entry in read_manifest(path).files)
     return blake2b(digests.encode(), digest_size=16).hexdigest()
 
 
@@ -343,12 +372,14 @@ def describe_shards(path: Path) -> dict[str, Any]:
     """
     manifest = read_manifest(path)
     shards, filled = manifest.shards, manifest.filled
-    missing = [entry for entry in filled if not reference_paths(_shard_path(path, manifest, entry)).index.is_file()]
+    missing = [
+        entry for entry in manifest.files if not reference_paths(_shard_path(path, manifest, entry)).index.is_file()
+    ]
     west, south, east, north = zip(*(entry.reach for entry in filled), strict=True)
     return {
         "name": manifest.name,
         "freshness": "shards missing" if missing else "fresh",
-        "files": {str(path.parent): path.stat().st_size + sum(entry.bytes for entry in shards)},
+        "files": {str(path.parent): path.stat().st_size + sum(entry.bytes for entry in manifest.files)},
         "crs": ", ".join(dict.fromkeys(entry.crs for entry in filled)),
         "counts": {"intersections": sum(entry.own_intersections for entry in filled)},
         "meta": manifest.meta,
@@ -360,6 +391,7 @@ def describe_shards(path: Path) -> dict[str, Any]:
             "margin_m": manifest.margin_m,
             "largest": max(entry.intersections for entry in filled),
             "with_margins": sum(entry.intersections for entry in filled),
+            "coarse": 0 if manifest.coarse is None else manifest.coarse.intersections,
         },
     }
 
@@ -371,8 +403,8 @@ def check_shards(path: Path, say: Say = say_nothing) -> list[str]:
     except IndexFormatError as error:
         return [str(error)]
     problems: list[str] = []
-    for n, entry in enumerate(manifest.filled):
-        say(f"checking {len(manifest.filled)} shards", n / len(manifest.filled))
+    for n, entry in enumerate(manifest.files):
+        say(f"checking {len(manifest.files)} shards", n / len(manifest.files))
         shard = _shard_path(path, manifest, entry)
         found: Sequence[str] = check_reference(shard)
         if not found and reference_digest(shard) != entry.digest:

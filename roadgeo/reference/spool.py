@@ -11,12 +11,13 @@ import json
 import math
 import struct
 from collections import defaultdict
+from collections.abc import Callable, Sequence
 from pathlib import Path
 from typing import TypeAlias
 
 import numpy as np
 
-from roadgeo._arrays import AnyArray, FloatArray, IntArray
+from roadgeo._arrays import AnyArray, BoolArray, FloatArray, IntArray
 
 __all__ = ["Bounds", "Cell", "Spool"]
 
@@ -25,6 +26,9 @@ Cell: TypeAlias = tuple[int, int]
 
 #: x0, y0, x1, y1 in units of the spool's CRS.
 Bounds: TypeAlias = tuple[float, float, float, float]
+
+#: Numbers, lengths, (C, 2) coordinates, (L, 2) labels.
+_Block: TypeAlias = tuple[IntArray, IntArray, FloatArray, AnyArray]
 
 _HEADER = struct.Struct("<QQQ")
 
@@ -105,14 +109,21 @@ class Spool:
 
         x0, y0, x1, y1 = (math.floor(side / self.size) for side in box)
         near = sorted((x, y) for x, y in self.cells() if x0 <= x <= x1 and y0 <= y <= y1)
-        blocks = [block for cell in near for block in _read_blocks(self._path(cell))]
-        if not blocks:
-            return np.empty(0, object), np.empty((0, 2), object)
-        numbers, lengths, coords, labels = (np.concatenate(column) for column in zip(*blocks, strict=True))
-        lines = shapely.linestrings(coords, indices=np.repeat(np.arange(len(lengths)), lengths))
-        _, chosen = np.unique(numbers, return_index=True)
-        cut, place = simple_lines(shapely.clip_by_rect(lines[chosen], *box))
-        return cut, labels[chosen][place]
+        lines, labels = _join([block for cell in near for block in _read_blocks(self._path(cell))])
+        cut, place = simple_lines(shapely.clip_by_rect(lines, *box))
+        return cut, labels[place]
+
+    def choose(self, wanted: Callable[[AnyArray], BoolArray]) -> tuple[AnyArray, AnyArray]:
+        """Return the lines whose labels (L, 2) are wanted, in the order in which they came, and their labels.
+
+        Only they are held in memory.
+        """
+        blocks = []
+        for cell in sorted(self.cells()):
+            for numbers, lengths, coords, labels in _read_blocks(self._path(cell)):
+                keep = wanted(labels)
+                blocks.append((numbers[keep], lengths[keep], coords[np.repeat(keep, lengths)], labels[keep]))
+        return _join(blocks)
 
     def cells(self) -> list[Cell]:
         """Return the cells that hold something."""
@@ -123,8 +134,20 @@ class Spool:
         return self.folder / f"{cell[0]}_{cell[1]}.lines"
 
 
-def _read_blocks(path: Path) -> list[tuple[IntArray, IntArray, FloatArray, AnyArray]]:
-    """Return the blocks of a cell: numbers, lengths, (C, 2) coordinates, (L, 2) labels."""
+def _join(blocks: Sequence[_Block]) -> tuple[AnyArray, AnyArray]:
+    """Return the lines of blocks, each once, in the order in which they came, and their labels."""
+    import shapely
+
+    if not blocks:
+        return np.empty(0, object), np.empty((0, 2), object)
+    numbers, lengths, coords, labels = (np.concatenate(column) for column in zip(*blocks, strict=True))
+    lines = shapely.linestrings(coords, indices=np.repeat(np.arange(len(lengths)), lengths))
+    _, chosen = np.unique(numbers, return_index=True)
+    return lines[chosen], labels[chosen]
+
+
+def _read_blocks(path: Path) -> list[_Block]:
+    """Return the blocks of a cell."""
     if not path.is_file():
         return []
     data, at, blocks = path.read_bytes(), 0, []

@@ -8,16 +8,19 @@ from typing import Any, Literal, get_args
 
 import numpy as np
 
-from roadgeo._arrays import AnyArray, BoolArray
+from roadgeo._arrays import AnyArray, BoolArray, IntArray
 
-__all__ = ["ROAD_KINDS", "RoadKind", "drives", "highways", "in_tunnel", "names_highways"]
+__all__ = ["MAIN_CLASSES", "ROAD_KINDS", "RoadKind", "drives", "highways", "in_tunnel", "main_ranks", "names_highways"]
 
 #: From few roads to many. "main": motorways to tertiary roads. "drivable": with residential and other public streets.
 #: "vehicles": with service roads and tracks. "all": with footways, cycleways, steps; whatever is a line.
 RoadKind = Literal["main", "drivable", "vehicles", "all"]
 ROAD_KINDS: tuple[RoadKind, ...] = get_args(RoadKind)
 
-_MAIN = {name + link for name in ("motorway", "trunk", "primary", "secondary", "tertiary") for link in ("", "_link")}
+#: Main roads, the greatest first.
+MAIN_CLASSES = ("motorway", "trunk", "primary", "secondary", "tertiary")
+
+_MAIN = {name + link for name in MAIN_CLASSES for link in ("", "_link")}
 _DRIVABLE = _MAIN | {"residential", "unclassified", "living_street", "road", "residential_link"}
 _VEHICLES = _DRIVABLE | {"service", "track", "track_grade1", "track_grade2", "track_grade3", "track_grade4"}
 _VEHICLES |= {"track_grade5", "busway", "bus_guideway", "raceway", "escape"}
@@ -57,6 +60,14 @@ def drives(values: AnyArray, kind: RoadKind) -> BoolArray:
         return _each(values, lambda names: not names or bool(names - _NO_ROADS))
     members = _MEMBERS[kind]
     return _each(values, lambda names: bool(names & members) if names else kind != "main")
+
+
+def main_ranks(values: AnyArray) -> IntArray:
+    """Return (L,) the rank of each line among main roads, by values of `highway`: 0 for motorways; -1: it is none."""
+    ranks = np.full(len(values), -1)
+    for rank, name in reversed(list(enumerate(MAIN_CLASSES))):
+        ranks[_each(values, lambda names, name=name: bool(names & {name, f"{name}_link"}))] = rank
+    return ranks
 
 
 def names_highways(values: AnyArray) -> bool:

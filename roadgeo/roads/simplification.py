@@ -8,7 +8,7 @@ the skeleton of a mask, what the width of the roads does to both.
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
@@ -57,6 +57,11 @@ class SimplifyOptions:
     fuse_distance: float = 12.0
     stub_length: float = 15.0
     max_passes: int = 3
+
+    def times(self, factor: float) -> SimplifyOptions:
+        """Return them with lengths that are so many times as long."""
+        lengths = ("merge_radius", "fuse_distance", "stub_length")
+        return replace(self, **{name: factor * getattr(self, name) for name in lengths})
 
 
 def planarize(lines: Sequence[LineString] | Any, grid_m: float = 0.1) -> RoadGraph:

@@ -11,7 +11,7 @@ import contextlib
 import json
 import math
 import shutil
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import asdict, dataclass, field, replace
 from hashlib import blake2b
 from pathlib import Path
@@ -24,11 +24,18 @@ from roadgeo.errors import CrsError, RoadgeoError, RoadSourceError
 from roadgeo.geometry.projection import transformer
 from roadgeo.matching.index import build_index
 from roadgeo.reference.index_file import FORMAT_VERSION
-from roadgeo.reference.reference import BuildOptions, Reference, build_network
+from roadgeo.reference.reference import COARSE, BuildOptions, Reference, build_network
 from roadgeo.reference.shard_plan import ShardBox, bounds_in_degrees, plan_shards, widen
-from roadgeo.reference.shards import Manifest, ShardedReference, ShardEntry, manifest_path, open_shards, write_manifest
+from roadgeo.reference.shards import (
+    Manifest,
+    ShardedReference,
+    ShardEntry,
+    manifest_path,
+    open_shards,
+    write_manifest,
+)
 from roadgeo.reference.spool import Spool
-from roadgeo.roads.kinds import RoadKind
+from roadgeo.roads.kinds import MAIN_CLASSES, RoadKind, main_ranks
 from roadgeo.roads.labels import label_roads
 from roadgeo.running.processes import run
 from roadgeo.sources.lines import RoadLines, list_sources
@@ -44,6 +51,10 @@ __all__ = ["RoadFiles", "ShardOptions", "build_shards"]
 
 #: A shard of this many straight pieces of road has 30,000 to 80,000 intersections, and takes 0.4 to 1 GB to build.
 _SEGMENTS = 200_000
+
+#: Vertices of main roads that are drawn in one piece, as the coarse map, in up to 3 GB. Of more only the greater kinds.
+_MOST_MAIN = 5_000_000
+_COARSE = "coarse"
 
 #: Lines are put on disk by cells of this size.
 _CELL_M = 5000.0
@@ -123,7 +134,7 @@ def build_shards(
     if done is not None:
         with contextlib.suppress(RoadgeoError):
             there = open_shards(done)
-            if there.manifest.build == build:
+            if there.manifest.build == build and there.manifest.coarse is not None:
                 return there
     work = folder / f".{build}"
     with writing(work):
@@ -132,15 +143,17 @@ def build_shards(
     spooled = _spool(roads, work, options, say)
     boxes = _plan(spooled, options)
     shards = ShardWork(str(work), str(folder / build), {**spooled.meta, "name": name, "shard_of": build}, options)
+    tasks = [_coarse_box(boxes), *boxes]  # it takes longest
     entries = []
-    for n, entry in enumerate(run(boxes, shards, jobs) if cluster is None else cluster.run(boxes, shards), 1):
+    for n, entry in enumerate(run(tasks, shards, jobs) if cluster is None else cluster.run(tasks, shards), 1):
         if isinstance(entry, str):
             raise RoadSourceError(f"{folder}: {entry}; the same command goes on with what is missing")
         entries.append(entry)
-        say(f"building {len(boxes)} shards", n / len(boxes))
+        say(f"building {len(boxes)} shards", n / len(tasks))
+    coarse, *entries = entries
     if not any(entry.crs for entry in entries):
         raise RoadSourceError(f"{folder}: no shard has three intersections; take a larger area or other --kinds")
-    manifest = Manifest(name, build, spooled.crs, options.margin_m, shards.meta, tuple(entries))
+    manifest = Manifest(name, build, spooled.crs, options.margin_m, shards.meta, tuple(entries), coarse=coarse)
     path = write_manifest(folder, manifest)
     _tidy(folder, build)
     return open_shards(path)
@@ -268,6 +281,24 @@ def _cell_size(crs: str, options: ShardOptions) -> float:
     return (options.size_m or _CELL_M) / (_metres(crs) or _DEGREE_M)
 
 
+def _coarse_box(boxes: Sequence[ShardBox]) -> ShardBox:
+    """Return the box of the coarse map: all the ground."""
+    low, high = (np.array([box.core[k : k + 2] for box in boxes]) for k in (0, 2))
+    west, south, east, north = (float(side) for side in (*low.min(axis=0), *high.max(axis=0)))
+    return ShardBox(_COARSE, (west, south, east, north))
+
+
+def _main_roads(spool: Spool) -> tuple[Any, Any]:
+    """Return main roads and their labels: the greatest kinds that are few enough to be drawn in one piece."""
+    import shapely
+
+    lines, labels = spool.choose(lambda labels: main_ranks(labels[:, 1]) >= 0)
+    ranks = main_ranks(labels[:, 1])
+    sizes = np.bincount(ranks, shapely.get_num_coordinates(lines), len(MAIN_CLASSES))
+    chosen = ranks < max(1, int((np.cumsum(sizes) <= _MOST_MAIN).sum()))
+    return lines[chosen], labels[chosen]
+
+
 def _plan(spooled: _Spooled, options: ShardOptions) -> list[ShardBox]:
     """Cut the ground into shards."""
     total = sum(spooled.n_segments.values())
@@ -308,7 +339,7 @@ class ShardWork:
             return ShardEntry.from_dict(json.loads(done.read_text(encoding="utf-8")))
         reach = widen(box.core, self.options.margin_m, _metres(crs))
         entry = ShardEntry(box.name, bounds_in_degrees(box.core, crs), bounds_in_degrees(reach, crs))
-        lines, labels = spool.read(reach)
+        lines, labels = spool.read(reach) if box.name != _COARSE else _main_roads(spool)
         if len(lines):
             names, kinds = labels.T if (labels != "").any() else (None, None)
             entry = self._build_reference(entry, RoadLines(lines, crs, kinds, meta={"name": box.name}, name=names), box)
@@ -321,8 +352,11 @@ class ShardWork:
         from roadgeo.reference.network_file import as_stored
 
         joined = join_roads([lines], {}, None)
-        meta = {**self.meta, "plane": joined.meta["plane"], "shard": box.name}
-        network = build_network(joined.lines, joined.plane, meta, self.options.build)
+        meta, options = {**self.meta, "plane": joined.meta["plane"], "shard": box.name}, self.options.build
+        if box.name == _COARSE:
+            del meta["shard_of"]  # a place on it lies not quite where it lies on a shard
+            options = replace(options, simplify=COARSE.simplify)
+        network = build_network(joined.lines, joined.plane, meta, options)
         network = as_stored(label_roads(network, [joined.lines], [joined.names], [joined.kinds]))
         if len(network.intersections) < 3:
             return entry

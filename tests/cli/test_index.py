@@ -14,8 +14,10 @@ import pytest
 import shapely
 from worlds.fake_osm import EMPTY, fake_osm
 from worlds.fenway import write_streets, write_vector
+from worlds.scenes import random_lines
 
 from roadgeo.cli import main
+from roadgeo.reference.reference import open_reference
 
 
 @pytest.fixture
@@ -87,6 +89,31 @@ def test_files_become_a_reference(tmp_path, capsys):
     ("given", "name"),
     [(["--out", "My b.gpkg"], "my-b"), (["--out", "b.index"], "b"), (["--name", "C", "--out", "b"], "c")],
 )
+def test_a_coarse_map_holds_main_roads_merged_farther(tmp_path, capsys):
+    lines = [shapely.LineString(np.array(line.coords)) for line in random_lines(8, 30_000.0, 1200.0)]
+    streets = [shapely.LineString(np.array(line.coords)) for line in random_lines(5, 3000.0)]
+    kinds = ["primary"] * len(lines) + ["residential"] * len(streets)
+    roads = write_vector(tmp_path / "region.gpkg", [*lines, *streets], crs="EPSG:32629", highway=kinds)
+    assert index("--roads", roads, "--coarse", "--out", tmp_path / "coarse.gpkg", quiet=True) == 0
+    coarse = open_reference(tmp_path / "coarse.gpkg").index
+    assert coarse.coarseness == 6.0
+    assert coarse.meta["roads"] == "main"
+    assert index("--roads", roads, "--coarse", "--kinds", "drivable", "--out", tmp_path / "b.gpkg", quiet=True) == 0
+    assert len(open_reference(tmp_path / "b.gpkg").index) > len(coarse)
+
+
+@pytest.mark.parametrize(
+    ("more", "told"),
+    [
+        (["--update", "--name", "a"], "--update keeps the options"),
+        (["--shards", "auto"], "--shards makes a coarse map beside the shards"),
+    ],
+)
+def test_where_a_coarse_map_cannot_be_asked_for(more, told, capsys):
+    assert index("--roads", "x.gpkg", "--coarse", *more) == 2
+    assert told in capsys.readouterr().err
+
+
 def test_a_reference_is_called_after_its_own_file(tmp_path, monkeypatch, capsys, given, name):
     monkeypatch.chdir(tmp_path)
     assert index("--roads", write_streets(tmp_path / "a.geojson"), *given, quiet=True) == 0

@@ -12,7 +12,7 @@ from roadgeo.matching.estimator import MatchOptions, TripleEstimator
 from roadgeo.matching.index import build_index
 from roadgeo.matching.road_growth import RoadGrower, RoadGrowOptions
 from roadgeo.matching.road_raster import RasterOptions, make_raster
-from roadgeo.matching.road_search import RoadSearch, RoadSearchOptions
+from roadgeo.matching.road_search import COARSE_PIXEL_M, RoadSearch, RoadSearchOptions
 from roadgeo.matching.road_votes import VoteOptions, Voter
 from roadgeo.matching.search import SearchOptions, search
 
@@ -69,6 +69,16 @@ def test_a_map_in_parts_gives_the_same_votes(town, broken):
     assert [votes for _, votes in parts[:-1]] == [None] * 7
     assert sorted(parts[-1][1].ratio) == pytest.approx(sorted(whole[-1][1].ratio))
     assert sum(tried for tried, _ in parts) == whole[0][0]
+
+
+def test_on_a_coarse_map_more_of_the_ground_is_looked_at():
+    usual = RoadSearchOptions()
+    assert usual.on(1.0) is usual
+    coarse = usual.on(6.0)
+    assert coarse.votes.radius_m == 6.0 * usual.votes.radius_m
+    assert coarse.votes.raster.cell_m == 6.0 * usual.votes.raster.cell_m
+    assert coarse.scales(CameraOptions(gsd_m=(0.1, 12.0)), 4.0) == (6.0 * COARSE_PIXEL_M, 12.0 * usual.scale_slack)
+    assert coarse.scales(CameraOptions(gsd_m=(0.1, 0.5)), 4.0)[0] > 0.5
 
 
 def test_an_intersection_far_from_all_roads_has_no_votes(town, broken):

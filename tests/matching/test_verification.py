@@ -7,7 +7,7 @@ import pytest
 import shapely
 from hypothesis import given
 from hypothesis import strategies as st
-from worlds.scenes import PLANE, Sight, camera, look, mapped, scene_of
+from worlds.scenes import PLANE, Sight, camera, look, mapped, random_network, scene_of
 
 from roadgeo.matching.index import build_index
 from roadgeo.matching.verification import (
@@ -103,6 +103,14 @@ class TestChance:
         assert found.forward > 0.97
         assert log10_odds(found, chance, lattice.n_statements, 100, OPTIONS) < 4
 
+    @pytest.mark.parametrize("gsd_m", [1.0, 3.0, 6.0, 12.0])
+    def test_chance_is_as_low_where_pixels_are_large(self, gsd_m):
+        """Roads agree within 3 pixels: shifts by less are the place itself, and chance would be as good as it."""
+        wide = random_network(4, 2000.0 * gsd_m, 120.0 * gsd_m)
+        truth = camera((1000.0 * gsd_m, 1000.0 * gsd_m), gsd_m=gsd_m)
+        chance = chance_agreement(truth, scene_of(look(wide, truth)), build_index(wide), gsd_m, OPTIONS)
+        assert max(chance) < 0.6
+
     def test_the_same_place_has_the_same_chance(self, town, scene):
         assert chance_agreement(TRUTH, scene, town[1], 1.0, OPTIONS) == chance_agreement(
             3.0 * TRUTH, scene, town[1], 1.0, OPTIONS
@@ -139,6 +147,12 @@ class TestOdds:
         # A mirrored mask of Montevideo, at the best wrong place: much more than chance, and much too little.
         assert self.odds(39 / 184, 0.30, 0.30, 184, (0.05, 0.15, 0.27), 347.0, 269) < 1
         assert self.odds(0.25, 0.55, 0.60, 184, (0.05, 0.15, 0.27), 347.0, 269) > 10
+
+    def test_a_few_roads_of_the_map_are_no_proof(self):
+        """A frame of 180 m, laid on a corner of the map, agrees with a mask of a whole region as far as it goes."""
+        found = Agreement(0, 37, 0.32, 0.91, 102)
+        assert log10_odds(found, (0.0, 0.12, 0.40), 108.0, 1, OPTIONS) < 3.5
+        assert log10_odds(replace(found, n_seen=900), (0.0, 0.12, 0.40), 108.0, 1, OPTIONS) > 7
 
     def test_chance_itself_is_no_evidence(self):
         assert self.odds(0.3, 0.6, 0.6, chance=(0.3, 0.6, 0.6)) == pytest.approx(0, abs=1e-9)

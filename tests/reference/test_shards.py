@@ -11,7 +11,7 @@ from worlds.scenes import random_lines
 from roadgeo.errors import IndexFormatError
 from roadgeo.matching.parts import touches
 from roadgeo.reference.shard_plan import bounds_in_degrees, plan_shards, widen
-from roadgeo.reference.shards import Manifest, ShardEntry, manifest_path, read_manifest, write_manifest
+from roadgeo.reference.shards import Manifest, ShardEntry, manifest_path, open_shards, read_manifest, write_manifest
 from roadgeo.reference.spool import Spool
 
 # --- lines on disk ----------------------------------------------------------------------------------------------------
@@ -32,6 +32,20 @@ def test_lines_come_back_for_any_box_as_if_all_had_been_cut(tmp_path):
     first = next(k for k, line in enumerate(found) if line.equals(lines[105]))
     assert labels[first].tolist() == ["Ö100", ""]
     assert sum(spool.n_segments.values()) == shapely.get_num_coordinates(lines).sum() - len(lines)
+
+
+def test_lines_are_chosen_by_their_labels_each_once(tmp_path):
+    lines = np.array(random_lines(3, 2000.0), object)
+    labels = np.array([[f"{k}", ("main", "other")[k % 2]] for k in range(len(lines))], object)
+    spool = Spool(tmp_path, 250.0)
+    for first in range(0, len(lines), 100):
+        spool.add(lines[first : first + 100], labels[first : first + 100])
+    found, told = spool.choose(lambda labels: labels[:, 1] == "main")
+    assert told.tolist() == labels[::2].tolist()
+    assert shapely.equals_exact(found, lines[::2], 0.0).all()
+    none, told = spool.choose(lambda labels: labels[:, 1] == "")
+    assert (len(none), told.shape) == (0, (0, 2))
+    assert len(Spool(tmp_path / "nothing", 1.0).choose(lambda labels: labels[:, 1] == "")[0]) == 0
 
 
 def test_a_line_across_half_the_world_is_found_where_its_vertices_lie(tmp_path):
@@ -94,8 +108,20 @@ ENTRY = ShardEntry("0_0_1x1", (0, 0, 1, 1), (-1, -1, 2, 2), "EPSG:32631", 10, 8,
 MANIFEST = Manifest("m", "00ff", "EPSG:4326", 3000.0, {"attribution": "x"}, (ENTRY, replace(ENTRY, name="e", crs="")))
 
 
-def test_a_manifest_is_read_as_it_was_written(tmp_path):
-    path = write_manifest(tmp_path, MANIFEST)
+@pytest.mark.parametrize("coarse", [None, replace(ENTRY, name="coarse"), replace(ENTRY, name="coarse", crs="")])
+def test_a_manifest_is_read_as_it_was_written(tmp_path, coarse):
+    manifest = replace(MANIFEST, coarse=coarse)
+    path = write_manifest(tmp_path, manifest)
+    assert read_manifest(path) == manifest
+    reference = open_shards(path)
+    assert [one.entry.name for one in reference.parts] == ["coarse", "0_0_1x1"][0 if coarse and coarse.crs else 1 :]
+
+
+def test_a_manifest_of_before_there_were_coarse_maps_is_read(tmp_path):
+    told = MANIFEST.to_dict()
+    del told["coarse"]
+    path = tmp_path / "manifest.json"
+    path.write_text(json.dumps(told))
     assert read_manifest(path) == MANIFEST
     assert manifest_path(tmp_path) == manifest_path(path) == path
     assert manifest_path(tmp_path / "none") is None
@@ -110,6 +136,9 @@ def test_a_manifest_is_read_as_it_was_written(tmp_path):
         {"shards": []},
         {"shards": [{}]},
         {"shards": 3},
+        {"coarse": 3},
+        {"coarse": {"name": "coarse"}},
+        {"coarse": {**MANIFEST.to_dict()["shards"][0], "name": "../coarse"}},
         {"meta": []},
         {"margin_m": "3"},
         {"more": 1},

@@ -1,7 +1,7 @@
 import numpy as np
 import pytest
 
-from roadgeo.roads.kinds import ROAD_KINDS, drives, highways, in_tunnel, names_highways
+from roadgeo.roads.kinds import ROAD_KINDS, drives, highways, in_tunnel, main_ranks, names_highways
 
 
 def column(*values):
@@ -76,6 +76,11 @@ def test_tunnels(value, tunnel):
 )
 def test_columns_of_highways_are_told_from_others(values, expected):
     assert names_highways(column(*values)) == expected
+
+
+def test_main_roads_have_ranks():
+    values = column("motorway_link", "trunk", "residential", None, "tertiary;primary", ["secondary"], "", "motorway")
+    assert main_ranks(values).tolist() == [0, 1, -1, -1, 2, 3, -1, 0]
 
 
 @pytest.mark.parametrize("value", [np.True_, np.int64(3), np.float64("nan"), np.str_("primary"), b"primary", 1j])

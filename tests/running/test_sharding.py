@@ -14,13 +14,15 @@ from roadgeo.cli import main
 from roadgeo.errors import CrsError, IndexFormatError, RoadSourceError
 from roadgeo.geometry.projection import transformer
 from roadgeo.location import Seconds
+from roadgeo.matching import methods
 from roadgeo.matching.methods import search_references
 from roadgeo.matching.options import LocateOptions
 from roadgeo.matching.query import Query
 from roadgeo.matching.verdict import decide
 from roadgeo.reference.inspection import check_reference, reference_digest
 from roadgeo.reference.network_file import read_network
-from roadgeo.reference.reference import open_reference
+from roadgeo.reference.reference import build_network, open_reference
+from roadgeo.reference.shards import write_manifest
 from roadgeo.running import sharding
 from roadgeo.running.sharding import RoadFiles, ShardOptions, build_shards
 from roadgeo.workflows import build_reference
@@ -87,7 +89,7 @@ def test_shards_hold_what_the_whole_holds(whole, sharded):
 
 
 def test_streets_keep_their_names_and_kinds(sharded):
-    network = read_network(sharded.parts[0].path)
+    network = read_network(sharded.shards[0].path)
     assert set(network.kinds) == {"residential"}
     assert all(name.endswith("th Street") for name in network.names)
 
@@ -128,6 +130,101 @@ def test_only_shards_that_may_hold_the_place_are_opened(sharded, roads):
     far = locate(place, open_reference(sharded.path), near=(10.0, 10.0, 500.0))
     assert far.status == "not_located"
     assert "around the place given by near" in far.reason
+
+
+# --- the coarse map ---------------------------------------------------------------------------------------------------
+
+
+@pytest.fixture(scope="module")
+def main_roads():
+    """Those of 30 x 30 km."""
+    return random_lines(8, 30_000.0, 1200.0)
+
+
+@pytest.fixture(scope="module")
+def region(main_roads, tmp_path_factory):
+    """Main roads, and the streets of a town among them, in shards."""
+    folder, streets = tmp_path_factory.mktemp("region"), random_lines(5, 3000.0)
+    kinds = [("motorway", "primary_link", "tertiary")[k % 3] for k in range(len(main_roads))]
+    lines = [shapely.LineString(PLANE.to_crs(np.array(line.coords))) for line in (*main_roads, *streets)]
+    write_vector(folder / "region.gpkg", lines, crs=PLANE.crs, highway=kinds + ["residential"] * len(streets))
+    options = ShardOptions(size_m=15_000.0, margin_m=1000.0)
+    return build_shards(RoadFiles((folder / "region.gpkg",)), folder / "region.shards", "region", options)
+
+
+def wide_view(main_roads, **hints):
+    """Return a query of pixels of 10 m, where it lies, and options."""
+    truth = camera((14_000.0, 16_000.0), (1000, 1000), 10.0, 10.0, 40.0, 130.0)
+    graph = look(build_network(main_roads, PLANE, {}), truth, sight=Sight(5.0), seed=3)
+    options = LocateOptions()
+    seen = replace(options.match.camera, **hints)
+    options = replace(options, match=replace(options.match, camera=seen))
+    return Query("q", scene_of(graph), graph, Seconds()), mapped(truth, np.array([[500.0, -500.0]]))[0], options
+
+
+def opened(reference):
+    return [one.entry.name for one in reference.parts if "_index" in vars(one)]
+
+
+def test_main_roads_make_a_coarse_map_beside_the_shards(region):
+    entry = region.manifest.coarse
+    assert entry.intersections == pytest.approx(sum(one.own_intersections for one in region.manifest.filled), rel=0.7)
+    network = read_network(region.coarse.path)
+    assert set(network.kinds) == {"motorway", "primary_link", "tertiary"}
+    assert region.coarse.open().coarseness == region.coarse.coarseness == 6.0
+    assert region.shards[0].open().coarseness == 1.0
+    assert check_reference(region.path) == []
+    assert {one.name for one in region.manifest.files} == {"coarse", *(one.name for one in region.manifest.filled)}
+
+
+@pytest.mark.parametrize("hints", [{}, {"gsd_m": (8.0, 12.0)}])
+def test_a_wide_view_is_found_on_the_coarse_map_alone(region, main_roads, hints):
+    fresh = open_reference(region.path)
+    query, place, options = wide_view(main_roads, **hints)
+    found = decide(query, search_references(query, fresh.parts, options, 60.0), options)
+    assert (found.status, found.reference) == ("located", "region")
+    assert np.hypot(*(np.array([found.center.x, found.center.y]) - PLANE.to_crs(place[None])[0])) < 20.0
+    assert opened(fresh) == ["coarse"]
+    assert fresh.index_of(found) is fresh.coarse.open()
+
+
+def test_small_pixels_are_not_looked_for_on_the_coarse_map(region, main_roads):
+    fresh = open_reference(region.path)
+    query, _, options = wide_view(main_roads, gsd_m=(0.3, 1.5))
+    options = replace(options, effort="quick")
+    assert search_references(query, fresh.parts, options, 60.0)[0].fits == ()
+    assert set(opened(fresh)) == {one.name for one in fresh.manifest.filled}
+
+
+def test_what_the_coarse_map_leaves_open_is_looked_for_on_all(region, main_roads, monkeypatch):
+    """Without a first look it is found all the same: on the coarse map roads come first."""
+    monkeypatch.setattr(methods, "_split", lambda parts, _: ([], list(parts)))
+    fresh = open_reference(region.path)
+    query, place, options = wide_view(main_roads)
+    found = decide(query, search_references(query, fresh.parts, options, 60.0), options)
+    assert found.located
+    assert np.hypot(*(np.array([found.center.x, found.center.y]) - PLANE.to_crs(place[None])[0])) < 20.0
+    assert len(opened(fresh)) == len(fresh.parts)
+
+
+def test_a_build_of_before_there_were_coarse_maps_gets_one(region, tmp_path, monkeypatch):
+    folder = tmp_path / "region.shards"
+    shutil.copytree(region.path, folder)
+    (folder / region.manifest.build / "coarse.json").unlink()
+    write_manifest(folder, replace(region.manifest, coarse=None))
+    built, usual = [], sharding.build_network
+    monkeypatch.setattr(sharding, "build_network", lambda *given: built.append(given[2]["shard"]) or usual(*given))
+    source = RoadFiles((region.path.parent / "region.gpkg",))
+    again = build_shards(source, folder, "region", ShardOptions(size_m=15_000.0, margin_m=1000.0))
+    assert built == ["coarse"]
+    assert again.manifest == region.manifest
+
+
+def test_of_too_many_main_roads_the_greatest_are_drawn(region, main_roads, tmp_path, monkeypatch):
+    monkeypatch.setattr(sharding, "_MOST_MAIN", 0.8 * shapely.get_num_coordinates(main_roads).sum())
+    source = RoadFiles((region.path.parent / "region.gpkg",))
+    fewer = build_shards(source, tmp_path / "region.shards", "region", ShardOptions(size_m=15_000.0, margin_m=1000.0))
+    assert set(read_network(fewer.coarse.path).kinds) == {"motorway", "primary_link"}
 
 
 def test_a_build_that_was_cut_short_goes_on(roads, tmp_path, monkeypatch):

@@ -15,6 +15,7 @@ from __future__ import annotations
 import math
 from collections.abc import Sequence
 from dataclasses import dataclass, field, replace
+from typing import cast
 
 import numpy as np
 
@@ -277,18 +278,12 @@ class Candidates:
 
     def _search(self, look: Look, options: LocateOptions) -> Location:
         """Search the map where that is due, and judge what is found together with what was proposed before."""
-        recorders: list[_Recorder] = []
-
-        def record() -> _Recorder:
-            recorders.append(_Recorder())
-            return recorders[-1]
-
         found: list[Found] = []
         if look.searched:
             parts = [part for one in self.references for part in one.parts]
-            found = search_references(look.query, parts, options, options.search.time_limit_s, record)
-        for one, recorder in zip(found, recorders, strict=False):
-            self._take(one, recorder, look)
+            found = search_references(look.query, parts, options, options.search.time_limit_s, _Recorder)
+        for one in found:
+            self._take(one, cast("_Recorder", one.trace), look)
         for candidate in self._kept:
             if candidate.since == look.numbers[-1] and candidate.fit is None:
                 candidate.lay(look, options)
