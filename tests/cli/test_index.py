@@ -85,10 +85,6 @@ def test_files_become_a_reference(tmp_path, capsys):
     assert (tmp_path / "fenway.index").exists()
 
 
-@pytest.mark.parametrize(
-    ("given", "name"),
-    [(["--out", "My b.gpkg"], "my-b"), (["--out", "b.index"], "b"), (["--name", "C", "--out", "b"], "c")],
-)
 def test_a_coarse_map_holds_main_roads_merged_farther(tmp_path, capsys):
     lines = [shapely.LineString(np.array(line.coords)) for line in random_lines(8, 30_000.0, 1200.0)]
     streets = [shapely.LineString(np.array(line.coords)) for line in random_lines(5, 3000.0)]
@@ -114,6 +110,10 @@ def test_where_a_coarse_map_cannot_be_asked_for(more, told, capsys):
     assert told in capsys.readouterr().err
 
 
+@pytest.mark.parametrize(
+    ("given", "name"),
+    [(["--out", "My b.gpkg"], "my-b"), (["--out", "b.index"], "b"), (["--name", "C", "--out", "b"], "c")],
+)
 def test_a_reference_is_called_after_its_own_file(tmp_path, monkeypatch, capsys, given, name):
     monkeypatch.chdir(tmp_path)
     assert index("--roads", write_streets(tmp_path / "a.geojson"), *given, quiet=True) == 0
