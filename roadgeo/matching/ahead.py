@@ -56,6 +56,14 @@ class Ahead:
         if self._pool is not None:
             self._pool.shutdown(wait=False, cancel_futures=True)
 
+    def __enter__(self) -> Ahead:
+        """Use it, and close it in the end."""
+        return self
+
+    def __exit__(self, *_: object) -> None:
+        """Close it."""
+        self.close()
+
 
 #: Each piece of work is done when it is used.
 ALONE = Ahead()

@@ -127,13 +127,17 @@ def search_references(
     Those that cannot hold the place are not opened, unless that is none of them; nothing is told of them. A trace is
     made for each of the others. Coarse maps come first: where a place stands out on them, the others are not opened.
     """
-    started = time.perf_counter()
     coarse, fine = _split(parts, options)
-    if coarse and fine and options.method != "pair":
-        found = _search(query, coarse, _at_first_look(coarse, options), time_limit_s, make_trace)
+    with Ahead(options.threads) as ahead:
+        if not coarse or not fine or options.method == "pair":
+            return _search(query, coarse + fine, options, time_limit_s, make_trace, ahead)
+        started = time.perf_counter()
+        found = _search(query, coarse, _at_first_look(coarse, options), time_limit_s, make_trace, ahead)
         if any(one.stopped == "accepted" for one in found):
             return found
-    return _search(query, coarse + fine, options, time_limit_s - (time.perf_counter() - started), make_trace)
+        spent_s = time.perf_counter() - started
+        first, *others = _search(query, coarse + fine, options, time_limit_s - spent_s, make_trace, ahead)
+        return [replace(first, match_s=first.match_s + spent_s), *others]
 
 
 def _split(parts: Sequence[Part], options: LocateOptions) -> tuple[list[Part], list[Part]]:
@@ -159,6 +163,7 @@ def _search(
     options: LocateOptions,
     time_limit_s: float,
     make_trace: Callable[[], Trace],
+    ahead: Ahead,
 ) -> list[Found]:
     """Search parts together."""
     frame_m = 2.0 * query.scene.half_size * options.match.camera.gsd_m[1]
@@ -169,7 +174,7 @@ def _search(
     if options.method == "pair":
         found = _search_pairs_in_turn(query, indexes, _within(options, time_limit_s))
         return [replace(one, trace=trace) for one, trace in zip(found, traces, strict=True)]
-    started, ledger, ahead = time.perf_counter(), Ledger(), Ahead(options.threads)
+    started, ledger = time.perf_counter(), Ledger()
     sweeps: SharedSweeps[TripleEstimator] = SharedSweeps(query.scene, options.match.camera, _same_place, ahead)
     shared = (ledger, sweeps)
     opened = [_Attempt.open(query, one, options, trace, *shared) for one, trace in zip(indexes, traces, strict=True)]
@@ -184,7 +189,6 @@ def _search(
     limits = replace(options.search, time_limit_s=left, work_limit_s=scale * options.search.work_limit_s)
     search_together(list(estimators), limits, same)
     sweeps.end()
-    ahead.close()
     return [one.found(scale) for one in opened]
 
 

@@ -34,7 +34,7 @@ from roadgeo.reference.shards import (
     open_shards,
     write_manifest,
 )
-from roadgeo.reference.spool import Spool
+from roadgeo.reference.spool import Bounds, Spool
 from roadgeo.roads.kinds import MAIN_CLASSES, RoadKind, main_ranks
 from roadgeo.roads.labels import label_roads
 from roadgeo.running.processes import run
@@ -55,6 +55,9 @@ _SEGMENTS = 200_000
 #: Vertices of main roads that are drawn in one piece, as the coarse map, in up to 3 GB. Of more only the greater kinds.
 _MOST_MAIN = 5_000_000
 _COARSE = "coarse"
+
+#: A plane around the middle of ground so wide is too large by 7 % at its rim.
+_WIDEST_DEG = 60.0
 
 #: Lines are put on disk by cells of this size.
 _CELL_M = 5000.0
@@ -288,10 +291,17 @@ def _coarse_box(boxes: Sequence[ShardBox]) -> ShardBox:
     return ShardBox(_COARSE, (west, south, east, north))
 
 
-def _main_roads(spool: Spool) -> tuple[Any, Any]:
-    """Return main roads and their labels: the greatest kinds that are few enough to be drawn in one piece."""
+def _main_roads(spool: Spool, ground: Bounds) -> tuple[Any, Any]:
+    """Return main roads and their labels: the greatest kinds that are few enough to be drawn in one piece.
+
+    There are none where the ground (west, south, east, north, degrees) is so wide that no plane is true to scale.
+    """
     import shapely
 
+    west, south, east, north = ground
+    nearest_equator = 0.0 if south * north < 0.0 else min(abs(south), abs(north))
+    if max((east - west) * math.cos(math.radians(nearest_equator)), north - south) > _WIDEST_DEG:
+        return spool.choose(lambda labels: np.zeros(len(labels), bool))
     lines, labels = spool.choose(lambda labels: main_ranks(labels[:, 1]) >= 0)
     ranks = main_ranks(labels[:, 1])
     sizes = np.bincount(ranks, shapely.get_num_coordinates(lines), len(MAIN_CLASSES))
@@ -339,7 +349,7 @@ class ShardWork:
             return ShardEntry.from_dict(json.loads(done.read_text(encoding="utf-8")))
         reach = widen(box.core, self.options.margin_m, _metres(crs))
         entry = ShardEntry(box.name, bounds_in_degrees(box.core, crs), bounds_in_degrees(reach, crs))
-        lines, labels = spool.read(reach) if box.name != _COARSE else _main_roads(spool)
+        lines, labels = spool.read(reach) if box.name != _COARSE else _main_roads(spool, entry.ground)
         if len(lines):
             names, kinds = labels.T if (labels != "").any() else (None, None)
             entry = self._build_reference(entry, RoadLines(lines, crs, kinds, meta={"name": box.name}, name=names), box)

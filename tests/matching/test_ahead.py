@@ -44,10 +44,9 @@ def test_alone_each_is_done_when_it_is_used():
 
 
 def test_items_are_worked_on_at_the_same_time():
-    ahead = Ahead(2)
     both = threading.Barrier(2, timeout=30)
-    assert len(list(ahead.map(lambda _: both.wait(), range(4)))) == 4
-    ahead.close()
+    with Ahead(2) as ahead:
+        assert len(list(ahead.map(lambda _: both.wait(), range(4)))) == 4
 
 
 def test_what_goes_wrong_is_told_where_it_is_used(ahead):

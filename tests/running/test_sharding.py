@@ -207,6 +207,16 @@ def test_what_the_coarse_map_leaves_open_is_looked_for_on_all(region, main_roads
     assert len(opened(fresh)) == len(fresh.parts)
 
 
+def test_main_roads_of_half_the_globe_have_no_coarse_map(tmp_path):
+    town = [np.array(line.coords) / 111_320.0 for line in random_lines(5, 2000.0)]
+    lines = [shapely.LineString(xy + np.array([lon, 1.0])) for lon in (-40.0, 0.0, 40.0) for xy in town]
+    write_vector(tmp_path / "world.gpkg", lines, crs="EPSG:4326", highway=["primary"] * len(lines))
+    built = build_shards(RoadFiles((tmp_path / "world.gpkg",)), tmp_path / "a.shards", "a", ShardOptions(count=3))
+    assert built.coarse is None
+    assert built.manifest.coarse.crs == ""
+    assert len(built.shards) >= 3
+
+
 def test_a_build_of_before_there_were_coarse_maps_gets_one(region, tmp_path, monkeypatch):
     folder = tmp_path / "region.shards"
     shutil.copytree(region.path, folder)
