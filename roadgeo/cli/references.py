@@ -203,7 +203,8 @@ def _road_text(described: dict[str, Any]) -> str:
 
 def _shards_text(shards: dict[str, Any]) -> str:
     largest = f"the largest of {shards['largest']:,} intersections"
-    return f"{shards['count']:,}, {largest}, with margins of {shards['margin_m'] / 1e3:g} km"
+    coarse = f", and a coarse map of {shards['coarse']:,}" if shards["coarse"] else ""
+    return f"{shards['count']:,}, {largest}, with margins of {shards['margin_m'] / 1e3:g} km{coarse}"
 
 
 def _summary(described: dict[str, Any]) -> str:

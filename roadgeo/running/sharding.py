@@ -53,7 +53,7 @@ __all__ = ["RoadFiles", "ShardOptions", "build_shards"]
 _SEGMENTS = 200_000
 
 #: Vertices of main roads that are drawn in one piece, as the coarse map, in up to 3 GB. Of more only the greater kinds.
-_MOST_MAIN = 5_000_000
+_MOST_MAIN = 3_000_000
 _COARSE = "coarse"
 
 #: A plane around the middle of ground so wide is too large by 7 % at its rim.

@@ -177,6 +177,11 @@ def test_main_roads_make_a_coarse_map_beside_the_shards(region):
     assert {one.name for one in region.manifest.files} == {"coarse", *(one.name for one in region.manifest.filled)}
 
 
+def test_the_coarse_map_is_told_of(region, capsys):
+    assert main(["info", str(region.path)]) == 0
+    assert f"and a coarse map of {region.manifest.coarse.intersections:,}" in capsys.readouterr().out
+
+
 @pytest.mark.parametrize("hints", [{}, {"gsd_m": (8.0, 12.0)}])
 def test_a_wide_view_is_found_on_the_coarse_map_alone(region, main_roads, hints):
     fresh = open_reference(region.path)
