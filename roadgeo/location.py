@@ -96,8 +96,8 @@ class ErrorRate(NamedTuple):
 ERROR_RATES = (
     ErrorRate(3.5, 25, 0, 0.137),
     ErrorRate(5.0, 39, 0, 0.090),
-    ErrorRate(8.0, 136, 0, 0.027),
-    ErrorRate(15.0, 803, 0, 0.005),
+    ErrorRate(8.0, 142, 0, 0.026),
+    ErrorRate(15.0, 814, 0, 0.005),
 )
 
 
