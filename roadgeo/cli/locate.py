@@ -276,7 +276,9 @@ def locate_command(
         raise click.UsageError(f"No images in {', '.join(masks)}.")
     others = found[1:] if given["fuse"] else []
     tasks = name_tasks(found[:1] if given["fuse"] else found)
-    options = replace(options, threads=jobs if len(tasks) == 1 else 1)
+    cluster = make_cluster(engine, scheduler, jobs)
+    # A mask alone gets threads; on a cluster each worker keeps to one.
+    options = replace(options, threads=jobs if len(tasks) == 1 and cluster is None else 1)
     make_folder(out_dir)
     photos = pair_images([task.mask for task in tasks], given["images"])
     reading = read_options(given, photos, others, jobs)
@@ -293,7 +295,7 @@ def locate_command(
             out_dir,
             BatchOptions(options, outputs, reading, skip_existing, tuple(said_options(_OF_NO_ACCOUNT))),
             jobs=jobs,
-            cluster=make_cluster(engine, scheduler, jobs),
+            cluster=cluster,
             say=say,
         ):
             outcomes.append(outcome)
