@@ -12,6 +12,7 @@ from typing import TYPE_CHECKING, Any, TypeAlias
 import numpy as np
 
 from roadgeo.errors import NotLocatedError, OutputError
+from roadgeo.geometry.areas import Box, find_area, is_box
 from roadgeo.geometry.mask import RoadMask
 from roadgeo.location import Location
 from roadgeo.matching.index import ReferenceIndex
@@ -180,6 +181,7 @@ def locate(
     *,
     gsd: float | tuple[float, float] | None = None,
     near: tuple[float, float, float] | None = None,
+    within: str | Box | None = None,
     max_tilt: float | None = None,
     north_up: bool | None = None,
     focal: float | None = None,
@@ -204,6 +206,8 @@ def locate(
         Metres per pixel at the middle, at least and at most; a single value stands for 0.8 to 1.25 times it.
     near : (longitude, latitude, metres)
         The middle lies within that distance of this place.
+    within : str or (west, south, east, north)
+        The middle lies in this country or state, or within these degrees.
     max_tilt : float
         Greatest angle of the camera from the vertical, degrees.
     north_up : bool
@@ -218,7 +222,7 @@ def locate(
     IndexFormatError
         A reference is missing or unusable.
     ValueError
-        `near` lies on no map, but would with longitude and latitude exchanged.
+        `near` lies on no map, but would with longitude and latitude exchanged; `within` is no area.
     """
     from roadgeo.running.looks import Sighting
     from roadgeo.running.pictures import read_picture
@@ -230,7 +234,10 @@ def locate(
     meant = None if near is None else swapped_near(near, references)
     if meant is not None:
         raise ValueError(f"near={near} lies on none of the maps; longitude comes first: did you mean near={meant}?")
-    options = _with_hints(options or LocateOptions(), hints, near)
+    area = find_area(within) if isinstance(within, str) else within
+    if area is not None and not is_box(area):
+        raise ValueError(f"within={area}: expected west, south, east and north in degrees, south below north")
+    options = _with_hints(options or LocateOptions(), hints, near, area)
     if isinstance(mask, RoadMask):
         sighting = Sighting(locate_mask(mask, references, options), mask)
     else:
@@ -278,10 +285,14 @@ def _range(gsd: float | tuple[float, float] | None) -> tuple[float, float] | Non
 
 
 def _with_hints(
-    options: LocateOptions, hints: dict[str, Any], near: tuple[float, float, float] | None
+    options: LocateOptions,
+    hints: dict[str, Any],
+    near: tuple[float, float, float] | None,
+    within: Box | None,
 ) -> LocateOptions:
-    """Put what is known of the camera in its place."""
+    """Put what is known of the camera and the place where the search looks for it."""
     known = {name: value for name, value in hints.items() if value is not None}
     camera = replace(options.match.camera, **known)
-    options = replace(options, match=replace(options.match, camera=camera))
+    within = options.match.within if within is None else within
+    options = replace(options, match=replace(options.match, camera=camera, within=within))
     return options if near is None else replace(options, near=near)

@@ -95,16 +95,21 @@ def test_an_answer_says_what_was_asked_and_of_which_map(porto: roadgeo.Reference
 
 
 def test_what_is_known_narrows_the_search(porto: roadgeo.Reference) -> None:
-    known = {"gsd": 1.0, "near": (-8.6, 41.15, 3000.0), "max_tilt": 50.0}
+    known = {"gsd": 1.0, "near": (-8.6, 41.15, 3000.0), "within": "Portugal", "max_tilt": 50.0}
     assert roadgeo.locate(DRONE, porto, QUICK, **known).located
     for wrong, code in (
         ({"near": (2.35, 48.85, 100.0)}, "few_near"),
+        ({"within": "Germany"}, "few_near"),
+        ({"within": (-8.7, 41.0, -8.65, 41.3)}, "nothing_stands_out"),
         ({"gsd": (2.0, 3.0), "max_tilt": 5.0, "north_up": True}, "nothing_stands_out"),
     ):
         refused = roadgeo.locate(DRONE, porto, QUICK, **wrong)
         assert (refused.status, refused.reason_code) == ("not_located", code)
     with pytest.raises(ValueError, match=r"did you mean near=\(-8.6, 41.15, 3000.0\)"):
         roadgeo.locate(DRONE, porto, QUICK, near=(41.15, -8.6, 3000.0))
+    for within in ("Portugol", (41.1, -8.6, 41.2, -8.7)):
+        with pytest.raises(ValueError, match=r"Portugol|south below north"):
+            roadgeo.locate(DRONE, porto, QUICK, within=within)
 
 
 def test_a_photograph_goes_the_way_of_the_command_line(

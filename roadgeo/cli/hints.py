@@ -7,7 +7,7 @@ from typing import TYPE_CHECKING, Any, Literal, TypeVar
 
 import click
 
-from roadgeo.cli.parameters import CAMERA, NEAR, RANGE
+from roadgeo.cli.parameters import CAMERA, NEAR, RANGE, WITHIN
 
 if TYPE_CHECKING:
     from roadgeo.reference.reference import AnyReference
@@ -17,7 +17,8 @@ __all__ = ["HINTS", "hint_options", "make_options", "refuse_swapped"]
 
 Command = TypeVar("Command", bound=Callable[..., Any])
 
-#: Parameter: its option on the command line, and what else click is told. All but `near` are fields of `CameraOptions`.
+#: Parameter: its option on the command line, and what else click is told. All but `near` and `within` are fields of
+#: `CameraOptions`.
 HINTS: dict[str, tuple[str, dict[str, Any]]] = {
     "gsd_m": (
         "--gsd",
@@ -46,6 +47,14 @@ HINTS: dict[str, tuple[str, dict[str, Any]]] = {
             "metavar": "LON,LAT,RADIUS",
             "type": NEAR,
             "help": "The middle lies within RADIUS metres of this place.",
+        },
+    ),
+    "within": (
+        "--within",
+        {
+            "metavar": "AREA",
+            "type": WITHIN,
+            "help": "The middle lies in this country or state, or within WEST,SOUTH,EAST,NORTH in degrees.",
         },
     ),
     "north_up": (
@@ -108,12 +117,12 @@ def make_options(
     known = {name: value for name, value in hints.items() if value is not None and value is not False}
     if method == "pair" and known:
         raise click.UsageError(
-            "--method pair knows no --camera, --gsd, --max-tilt, --near or --north-up: leave them out."
+            "--method pair knows no --camera, --gsd, --max-tilt, --near, --within or --north-up: leave them out."
         )
     default = LocateOptions()
-    near = known.pop("near", None)
+    near, within = known.pop("near", None), known.pop("within", None)
     known = {name: value for name, value in known.items() if value != "exif"}
-    match = replace(default.match, camera=replace(default.match.camera, **known))
+    match = replace(default.match, camera=replace(default.match.camera, **known), within=within)
     search, pair = default.search, default.pair
     if time_limit_s is not None:
         search, pair = replace(search, time_limit_s=time_limit_s), replace(pair, time_limit_s=time_limit_s)

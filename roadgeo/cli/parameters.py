@@ -14,6 +14,7 @@ __all__ = [
     "CAMERA",
     "NEAR",
     "RANGE",
+    "WITHIN",
     "Numbers",
     "Plugin",
     "out_dir_option",
@@ -132,6 +133,29 @@ class Focal(click.ParamType):  # type: ignore[type-arg]
         return focal
 
 
+class Area(click.ParamType):  # type: ignore[type-arg]
+    """A country, a state, or bounds in degrees."""
+
+    name = "area"
+
+    def convert(self, value: Any, param: click.Parameter | None, ctx: click.Context | None) -> tuple[float, ...]:
+        """Look its bounds up.
+
+        Raises
+        ------
+        click.BadParameter
+            There is no such area.
+        """
+        if isinstance(value, tuple):
+            return value
+        from roadgeo.geometry.areas import find_area
+
+        try:
+            return find_area(value)
+        except ValueError as error:
+            self.fail(str(error), param, ctx)
+
+
 def _wrong_range(low: float, high: float) -> str:
     return "" if 0 < low <= high < float("inf") else "LO must be above 0 and not above HI"
 
@@ -167,6 +191,8 @@ RANGE = Numbers("range", ("LO", "HI"), ":", _wrong_range)
 NEAR = Numbers("place", ("LON", "LAT", "RADIUS"), ",", _wrong_place)
 #: A focal length in pixels, or where to find it.
 CAMERA = Focal()
+#: A country or state, or bounds in degrees.
+WITHIN = Area()
 
 
 class Aspect(click.ParamType):  # type: ignore[type-arg]

@@ -28,7 +28,8 @@ _HELP = """Keep references open, and answer who posts a mask or a photograph.
 
 \b
 What is known goes into the URL, or beside the image in JSON:
-  near=LON,LAT,RADIUS  gsd=LOW,HIGH  maxTilt=DEG  focal=PIXELS  northUp=true  timeLimit=SECONDS
+  near=LON,LAT,RADIUS  within=WEST,SOUTH,EAST,NORTH  gsd=LOW,HIGH
+  maxTilt=DEG  focal=PIXELS  northUp=true  timeLimit=SECONDS
 
 It listens on this machine only. With --host others may ask, and then all must show a token:
 `Authorization: Bearer TOKEN`, which the environment variable ROADGEO_TOKEN or --token-file gives. There is no

@@ -134,7 +134,7 @@ class Moment(click.ParamType):  # type: ignore[type-arg]
 @click.option("--class", "class_name", metavar="NAME", help="Class of the model that is road.")
 @click.option("--threshold", metavar="T", type=float, help="Values above T are road. Default: told by the values.")
 @click.option("--band", metavar="N", type=click.IntRange(1), help="Band that holds the mask.")
-@hint_options("gsd_m", "max_tilt_deg", "near")
+@hint_options("gsd_m", "max_tilt_deg", "near", "within")
 @click.option(
     "--camera",
     "focal_px",
@@ -247,7 +247,7 @@ def _sender(url: str | None) -> Iterator[Callable[[Row], None]]:
 def _track_options(given: dict[str, Any]) -> TrackOptions:
     from roadgeo.running.flights.tracker import TrackOptions
 
-    hints = {name: given[name] for name in ("gsd_m", "max_tilt_deg", "near")}
+    hints = {name: given[name] for name in ("gsd_m", "max_tilt_deg", "near", "within")}
     return TrackOptions(locate=make_options("auto", given["time_limit"], hints))
 
 

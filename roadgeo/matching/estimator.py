@@ -10,8 +10,10 @@ from dataclasses import dataclass, field, replace
 import numpy as np
 
 from roadgeo._arrays import BoolArray, FloatArray, IntArray
+from roadgeo.geometry.areas import Box, lies_in
 from roadgeo.geometry.camera import CameraFault, CameraOptions, judge, sampling
 from roadgeo.geometry.homography import Homography
+from roadgeo.geometry.projection import to_lonlat
 from roadgeo.matching.growing import PATIENT, GrowOptions, grow_proposals, screen_proposals
 from roadgeo.matching.hypothesis import MINIMAL, Hypothesis, Lead
 from roadgeo.matching.index import ReferenceIndex
@@ -72,6 +74,8 @@ class MatchOptions:
         The sweeps end too when so many places were screened on a map of 15,000 intersections, and on a larger one more
         by the root of the ratio. Where streets are alike, proposals abound, and late ones are seldom right: of 31 masks
         that took more than half a second and were located, all but two had been found among the first 7,000 places.
+    within : (west, south, east, north) or None
+        Degrees: the middle of the frame is known to lie there (see `geometry.areas`).
     """
 
     sweeps: tuple[Source, ...] = USUAL
@@ -87,6 +91,7 @@ class MatchOptions:
     max_last_places: int = 100_000
     sightings: int = 2
     certain: float = 20.0
+    within: Box | None = None
 
 
 @dataclass
@@ -455,10 +460,12 @@ class TripleEstimator:
         return judge(matrix, self.scene.size, self.options.camera, rough)
 
     def _is_far(self, matrix: FloatArray) -> bool:
-        """Whether the middle of the frame lies outside the circle that the user gave."""
-        if self.near is None:
-            return False
-        return bool(np.hypot(*(Homography(matrix).everywhere(self.scene.center) - self.near[:2])) > self.near[2])
+        """Whether the middle of the frame lies outside the circle, or the box, that the user gave."""
+        middle, within = Homography(matrix).everywhere(self.scene.center), self.options.within
+        if self.near is not None and np.hypot(*(middle - self.near[:2])) > self.near[2]:
+            return True
+        plane = self.index.plane
+        return within is not None and not lies_in(within, *to_lonlat(plane.crs, plane.to_crs(middle[None]))[0])
 
     def settled(self, model: Hypothesis) -> bool:
         """Whether a hypothesis fits the whole frame and was found often enough for a twin to have been found beside it.

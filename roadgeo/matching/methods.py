@@ -23,7 +23,7 @@ from roadgeo.matching.options import LocateOptions
 from roadgeo.matching.paper.quality import well_fitted
 from roadgeo.matching.paper.search import match_pairs
 from roadgeo.matching.paper.tuples import PairIndex, PairOptions, build_pair_index
-from roadgeo.matching.parts import Near, Part, same_within_m
+from roadgeo.matching.parts import Part, Whole, same_within_m
 from roadgeo.matching.query import Query
 from roadgeo.matching.road_search import COARSE_PIXEL_M
 from roadgeo.matching.search import Search, SearchResult, search_together
@@ -167,7 +167,7 @@ def _search(
 ) -> list[Found]:
     """Search parts together."""
     frame_m = 2.0 * query.scene.half_size * options.match.camera.gsd_m[1]
-    indexes = _open(parts, options.near, frame_m)
+    indexes = _open(parts, options, frame_m)
     traces = [make_trace() for _ in indexes]
     if len(query.scene.intersections) < options.min_intersections:
         return [Found(index, trace=trace) for index, trace in zip(indexes, traces, strict=True)]
@@ -192,10 +192,12 @@ def _search(
     return [one.found(scale) for one in opened]
 
 
-def _open(parts: Sequence[Part], near: Near | None, frame_m: float) -> list[ReferenceIndex]:
+def _open(parts: Sequence[Part], options: LocateOptions, frame_m: float) -> list[ReferenceIndex]:
     """Open the parts that may hold a place; the first where none does, to say so."""
+    near, within = options.near, options.match.within
     able = [part for part in parts if near is None or part.may_hold(near, frame_m)]
-    return [part.open() for part in able or parts[:1]]
+    able = [part for part in able if within is None or part.touches(within)]
+    return [part.open() for part in able] or [parts[0].open()]
 
 
 def _same_ground(one: TripleEstimator, a: Hypothesis, other: TripleEstimator, b: Hypothesis) -> bool:
@@ -233,7 +235,9 @@ class _Attempt:
         ledger: Ledger,
         sweeps: SharedSweeps[TripleEstimator],
     ) -> _Attempt:
-        part, near = index, _near(index, options.near)
+        part, near, within = index, _near(index, options.near), options.match.within
+        if within is not None and not Whole(index).touches(within):
+            return cls(index, 0, trace=trace)
         if near is not None:
             reach = _rounded_up(near[2] + 2.0 * query.scene.half_size * options.match.camera.gsd_m[1])
             part = _part(index, near[:2], reach)

@@ -9,9 +9,10 @@ from typing import Protocol, TypeAlias
 import numpy as np
 
 from roadgeo._arrays import FloatArray
+from roadgeo.geometry.areas import Box, overlap
 from roadgeo.geometry.camera import sampling
 from roadgeo.geometry.frame import Frame
-from roadgeo.geometry.projection import from_lonlat
+from roadgeo.geometry.projection import from_lonlat, transformer
 from roadgeo.matching.index import ReferenceIndex
 
 __all__ = ["Near", "Part", "Whole", "same_within_m", "touches"]
@@ -28,6 +29,9 @@ class Part(Protocol):
 
     def may_hold(self, near: Near, frame_m: float = 0.0) -> bool:
         """Whether a frame of that size at most, whose middle lies within a circle, may show it; it is not opened."""
+
+    def touches(self, box: Box) -> bool:
+        """Whether the middle of a frame that it shows may lie in a box; it is not opened."""
 
     @property
     def coarseness(self) -> float:
@@ -49,6 +53,12 @@ class Whole:
         low, high = self.index.bounds
         beyond = np.maximum(low - center, center - high)
         return bool((beyond <= near[2] + frame_m).all())
+
+    def touches(self, box: Box) -> bool:
+        """Whether the bounds of its intersections share ground with a box."""
+        plane = self.index.plane
+        ends = plane.to_crs(np.array(self.index.bounds)).ravel()
+        return overlap(box, transformer(plane.crs, "EPSG:4326").transform_bounds(*ends))
 
     @property
     def coarseness(self) -> float:

@@ -282,9 +282,9 @@ def _why_nothing(query: Query, found: Found, score: float, options: LocateOption
     if found.said:
         return Reason.TIME_LIMIT if found.stopped in ("work", "time") else Reason.NOTHING_STANDS_OUT, found.said
     searched = searched_within(options)
-    if options.near is not None and found.n_searched < needed:
-        few = f"the map has {found.n_searched} intersections around the place given by near{searched}"
-        return Reason.FEW_NEAR, few
+    if found.n_searched < needed and (options.near is not None or options.match.within is not None):
+        given = "around the place given by near" if options.near is not None else "in the area given by within"
+        return Reason.FEW_NEAR, f"the map has {found.n_searched} intersections {given}{searched}"
     if math.isfinite(score):
         best = f"the best has log10 odds {score:.1f}, {options.min_log10_odds:g} are needed"
     else:
@@ -327,6 +327,8 @@ def searched_within(options: LocateOptions) -> str:
         lon, lat, radius = options.near
         reach = f"{radius:g} m" if radius < 1000 else f"{radius / 1000:g} km"
         limits.append(f"within {reach} of {lon:.9g},{lat:.9g}")
+    if options.match.within is not None:
+        limits.append("within longitudes {0:g} to {2:g} and latitudes {1:g} to {3:g}".format(*options.match.within))
     if camera.gsd_m != usual.gsd_m:
         limits.append(f"at {camera.gsd_m[0]:g} to {camera.gsd_m[1]:g} m per pixel")
     if camera.max_tilt_deg != usual.max_tilt_deg:

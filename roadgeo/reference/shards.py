@@ -29,6 +29,7 @@ import numpy as np
 from roadgeo import __version__
 from roadgeo._progress import Say, say_nothing
 from roadgeo.errors import IndexFormatError
+from roadgeo.geometry.areas import Box, overlap
 from roadgeo.location import Location
 from roadgeo.matching.index import COARSENESS, ReferenceIndex
 from roadgeo.matching.parts import Near, touches
@@ -234,6 +235,10 @@ class Shard:
     def may_hold(self, near: Near, frame_m: float = 0.0) -> bool:  # noqa: ARG002 (its margin holds the frame)
         """Whether the middle of a frame may lie on its own ground and within a circle."""
         return touches(self.entry.ground, near)
+
+    def touches(self, box: Box) -> bool:
+        """Whether its own ground and a box share some."""
+        return overlap(box, self.entry.ground)
 
     def open(self) -> ReferenceIndex:
         """Return its index.

@@ -194,11 +194,13 @@ def test_options_narrow_the_search(porto: Path, capfd: pytest.CaptureFixture[str
     mask = str(MASKS["map_sheet"].path)
     reference = ["-r", str(porto), "-q"]
     assert main(["locate", mask, *reference, "--north-up", "--gsd", "0.8:1.2", "--near=-8.629,41.1625,500"]) == 0
+    assert main(["locate", mask, *reference, "--within", "Portugal"]) == 0
     assert main(["locate", mask, *reference, "--gsd", "2:3"]) == 3
     assert main(["locate", mask, *reference, "--near=-8.60,41.15,500"]) == 3
     assert capfd.readouterr().out == ""
     for limits, told in [
         (["--near=-8.60,41.15,500"], "searched within 500 m of -8.6,41.15: "),
+        (["--within", "Italy"], "the map has 0 intersections in the area given by within; searched within longitudes"),
         (
             ["--near=2.35,48.85,2000", "--gsd", "0.8:1.2"],
             "searched within 2 km of 2.35,48.85, at 0.8 to 1.2 m per pixel",
@@ -380,6 +382,8 @@ def test_a_folder_that_cannot_be_written_to_is_named(
         ["locate"],
         ["locate", "a.png", "--gsd", "3"],
         ["locate", "a.png", "--near", "1,2"],
+        ["locate", "a.png", "--within", "1,2,3"],
+        ["locate", "a.png", "--within", "Atlantis"],
         ["locate", "a.png", "--jobs", "0"],
         ["locate", "a.png", "--method", "magic"],
         ["index"],

@@ -56,13 +56,14 @@ def sharded(roads, tmp_path_factory):
     return build_shards(RoadFiles((roads,)), tmp_path_factory.mktemp("sharded") / "town.shards", "town", OPTIONS)
 
 
-def locate(place, *references, near=None, **sight):
+def locate(place, *references, near=None, within=None, **sight):
     """Locate what a camera sees at a place of the town (metres from its corner)."""
     truth = camera(place, (1000, 1000), 1.0, 10.0, 40.0, 130.0)
     graph = look(towns_network(), truth, sight=Sight(1.5, **sight), seed=3)
     query = Query("q", scene_of(graph), graph, Seconds())
     options = LocateOptions(near=near)
     options = replace(options, search=replace(options.search, time_limit_s=60.0))
+    options = replace(options, match=replace(options.match, within=within))
     parts = [part for one in references for part in one.parts]
     return decide(query, search_references(query, parts, options, 60.0), options)
 
@@ -130,6 +131,20 @@ def test_only_shards_that_may_hold_the_place_are_opened(sharded, roads):
     far = locate(place, open_reference(sharded.path), near=(10.0, 10.0, 500.0))
     assert far.status == "not_located"
     assert "around the place given by near" in far.reason
+
+
+def test_only_shards_that_touch_the_area_are_opened(sharded, whole):
+    place = (1200.0, 1300.0)
+    center = locate(place, whole).center
+    box = (center.lon - 0.002, center.lat - 0.002, center.lon + 0.002, center.lat + 0.002)
+    fresh = open_reference(sharded.path)
+    assert locate(place, fresh, within=box).located
+    assert 1 <= sum("_index" in vars(one) for one in fresh.parts) < len(fresh.parts)
+    beside = (box[0] + 0.006, box[1], box[2] + 0.02, box[3])
+    for reference in (fresh, whole):
+        assert locate(place, reference, within=beside).status == "not_located"
+        far = locate(place, reference, within=(10.0, 10.0, 10.1, 10.1))
+        assert far.reason.startswith("the map has 0 intersections in the area given by within; searched within longi")
 
 
 # --- the coarse map ---------------------------------------------------------------------------------------------------

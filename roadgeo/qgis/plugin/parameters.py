@@ -325,6 +325,13 @@ CAMERA = _fold(
         "How near.",
         settings={"type": QgsProcessingParameterNumber.Type.Double, "defaultValue": 10_000.0, "minValue": 1.0},
     ),
+    _text(
+        "--within",
+        "WITHIN",
+        "In the area",
+        "The middle of the mask lies in this country or state (Liechtenstein; USA - Utah), or within"
+        " WEST,SOUTH,EAST,NORTH in degrees. Empty: not known.",
+    ),
     _choice(
         "--effort",
         "EFFORT",

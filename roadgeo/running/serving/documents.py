@@ -19,6 +19,10 @@ _HINTS: dict[str, dict[str, Any]] = {
         "title": "The middle lies within RADIUS metres of this place: LON,LAT,RADIUS",
         "schema": {"type": "array", "items": {"type": "number"}, "minItems": 3, "maxItems": 3},
     },
+    "within": {
+        "title": "The middle lies within these degrees: WEST,SOUTH,EAST,NORTH",
+        "schema": {"type": "array", "items": {"type": "number"}, "minItems": 4, "maxItems": 4},
+    },
     "gsd": {
         "title": "Metres per pixel at the middle, least and greatest",
         "schema": {"type": "array", "items": {"type": "number"}, "minItems": 2, "maxItems": 2},

@@ -10,6 +10,8 @@ from collections.abc import Mapping
 from typing import Any
 from urllib.parse import parse_qs
 
+from roadgeo.geometry.areas import is_box
+
 __all__ = ["LIMIT", "Refused", "ending_of", "read_execution", "read_hints", "read_query_string"]
 
 #: How files begin that are read. What refers to other files, as a VRT does, is none of them.
@@ -26,7 +28,7 @@ _MAGIC = {
     b"\0\0\0\x0cjP  ": ".jp2",
 }
 
-_NAMES = ("near", "gsd", "maxTilt", "focal", "northUp", "timeLimit")
+_NAMES = ("near", "within", "gsd", "maxTilt", "focal", "northUp", "timeLimit")
 
 
 class Refused(Exception):  # noqa: N818 (an answer, not a fault)
@@ -94,6 +96,10 @@ def read_hints(values: Mapping[str, Any]) -> dict[str, Any]:
         lon, lat, radius = _numbers(values, "near", 3)
         _require(-180 <= lon <= 180 and -90 <= lat <= 90 and 0 < radius < 2e7, "near", "LON,LAT,RADIUS in metres")
         hints["near"] = (lon, lat, radius)
+    if "within" in values:
+        west, south, east, north = _numbers(values, "within", 4)
+        hints["within"] = (west, south, east, north)
+        _require(is_box(hints["within"]), "within", "WEST,SOUTH,EAST,NORTH in degrees, south below north")
     if "gsd" in values:
         low, high = _numbers(values, "gsd", 2)
         _require(0 < low <= high < 1e4, "gsd", "LOW,HIGH in metres per pixel")

@@ -42,7 +42,7 @@ class Asked:
     path : str
         The file that holds it.
     hints : dict
-        `near`, `gsd_m`, `max_tilt_deg`, `focal_px`, `north_up`, as far as they are known.
+        `near`, `within`, `gsd_m`, `max_tilt_deg`, `focal_px`, `north_up`, as far as they are known.
     """
 
     path: str
@@ -249,8 +249,8 @@ def _locate(asked: Asked, references: Sequence[Any]) -> Answer:
             return Answer(413, {"detail": told})
         default = LocateOptions()
         hints = dict(asked.hints)
-        near = hints.pop("near", None)
-        match = replace(default.match, camera=replace(default.match.camera, **hints))
+        near, within = hints.pop("near", None), hints.pop("within", None)
+        match = replace(default.match, camera=replace(default.match.camera, **hints), within=within)
         search = replace(default.search, time_limit_s=asked.time_limit_s)
         options = replace(default, near=near, match=match, search=search)
         location = replace(locate_query(asked.path, references, options).location, query="")

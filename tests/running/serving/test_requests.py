@@ -32,9 +32,12 @@ def test_what_may_refer_to_other_files_is_refused(head):
 
 
 def test_hints_come_from_the_url():
-    found = read_query_string("near=-71.06,42.36,5000&gsd=0.3,0.6&maxTilt=20&focal=900&northUp=true&timeLimit=3")
+    found = read_query_string(
+        "near=-71.06,42.36,5000&within=-73,41,-70,43&gsd=0.3,0.6&maxTilt=20&focal=900&northUp=true&timeLimit=3"
+    )
     assert found == {
-        "near": (-71.06, 42.36, 5000.0), "gsd_m": (0.3, 0.6), "max_tilt_deg": 20.0, "focal_px": 900.0,
+        "near": (-71.06, 42.36, 5000.0), "within": (-73.0, 41.0, -70.0, 43.0),
+        "gsd_m": (0.3, 0.6), "max_tilt_deg": 20.0, "focal_px": 900.0,
         "north_up": True, "time_limit_s": 3.0,
     }  # fmt: skip
     assert read_query_string("") == {}
@@ -42,7 +45,8 @@ def test_hints_come_from_the_url():
 
 @pytest.mark.parametrize(
     "text",
-    ["near=1,2", "near=200,0,5", "gsd=2,1", "gsd=nan,1", "maxTilt=x", "maxTilt=inf", "colour=red", "a;b", "near",
+    ["near=1,2", "near=200,0,5", "within=1,2,3", "within=1,3,2,3",
+     "gsd=2,1", "gsd=nan,1", "maxTilt=x", "maxTilt=inf", "colour=red", "a;b", "near",
      "&".join(f"a{k}=1" for k in range(50))],
 )  # fmt: skip
 def test_other_urls_are_refused(text):
