@@ -18,7 +18,7 @@ from roadgeo.matching.parts import Part, Whole
 from roadgeo.roads.intersections import IntersectionOptions, find_intersections
 from roadgeo.roads.network import RoadNetwork
 from roadgeo.roads.simplification import SimplifyOptions, planarize, simplify
-from roadgeo.storage.memory import give_back_memory
+from roadgeo.storage.memory import give_back_memory, let_pages_go
 
 if TYPE_CHECKING:
     from roadgeo.reference.shards import ShardedReference
@@ -194,7 +194,9 @@ def open_whole(path: str | Path, say: Say = say_nothing) -> Reference:
     from roadgeo.reference.files import reference_paths
 
     meta, arrays = open_parts(path, _index_builder(path, say))
-    return Reference(ReferenceIndex.from_parts(meta, arrays, str(reference_paths(path).geopackage)))
+    index = ReferenceIndex.from_parts(meta, arrays, str(reference_paths(path).geopackage))
+    let_pages_go(arrays.values())
+    return Reference(index)
 
 
 def rebuild_reference(path: str | Path, say: Say = say_nothing) -> Reference:

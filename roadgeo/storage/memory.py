@@ -1,11 +1,15 @@
-"""Memory that libraries have freed, given back to the system."""
+"""Memory that is no longer needed, given back to the system: what libraries have freed, pages of mapped files."""
 
 from __future__ import annotations
 
 import contextlib
 import ctypes
+import mmap
+from collections.abc import Iterable
 
-__all__ = ["give_back_memory"]
+from roadgeo._arrays import AnyArray
+
+__all__ = ["give_back_memory", "let_pages_go"]
 
 
 def give_back_memory() -> None:
@@ -16,3 +20,22 @@ def give_back_memory() -> None:
     """
     with contextlib.suppress(AttributeError, OSError, TypeError):  # not on macOS, Windows and musl
         ctypes.CDLL(None).malloc_trim(0)
+
+
+def let_pages_go(arrays: Iterable[AnyArray]) -> None:
+    """Take the pages of memory-mapped arrays out of this process; those that are used come back by themselves.
+
+    An index is read whole when it is opened, to sum its bytes. A search then looks at part of it.
+    """
+    mapped = {id(base): base for base in map(_mapped_file, arrays) if base is not None}
+    for base in mapped.values():
+        with contextlib.suppress(AttributeError, OSError):  # not on Windows
+            base.madvise(mmap.MADV_DONTNEED)
+
+
+def _mapped_file(array: AnyArray) -> mmap.mmap | None:
+    """Return the file that an array is a view of, if it is one and cannot have been written to."""
+    base: object = array
+    while base is not None and not isinstance(base, mmap.mmap):
+        base = base.obj if isinstance(base, memoryview) else getattr(base, "base", None)
+    return None if array.flags.writeable else base
