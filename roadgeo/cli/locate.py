@@ -46,7 +46,7 @@ __all__ = ["describe", "locate_command", "pair_images"]
 Command = TypeVar("Command", bound=Callable[..., Any])
 
 #: Options that change nothing of a result, or that are said mask by mask.
-_OF_NO_ACCOUNT = {"as_json", "engine", "images", "jobs", "quiet", "scheduler", "skip_existing", "verbose"}
+_OF_NO_ACCOUNT = {"as_json", "divide_map", "engine", "images", "jobs", "quiet", "scheduler", "skip_existing", "verbose"}
 
 _HELP = """Find where road MASKs lie on a map, and draw them there.
 
@@ -247,6 +247,12 @@ def _drawing_options(command: Command) -> Command:
     help="Processes; for one mask alone: threads. Results do not depend on it.",
 )
 @cluster_options
+@click.option(
+    "--divide-map",
+    is_flag=True,
+    help="On a Dask cluster: each worker keeps and searches a share of the map's shards, for all masks: for maps that"
+    " no machine holds.",
+)
 @verbosity_options
 def locate_command(
     masks: tuple[str, ...],
@@ -260,6 +266,7 @@ def locate_command(
     jobs: int,
     engine: str | None,
     scheduler: str | None,
+    divide_map: bool,
     quiet: bool,
     verbose: bool,
     **given: Any,
@@ -277,6 +284,10 @@ def locate_command(
     others = found[1:] if given["fuse"] else []
     tasks = name_tasks(found[:1] if given["fuse"] else found)
     cluster = make_cluster(engine, scheduler, jobs)
+    if divide_map:
+        if cluster is None or method == "pair" or given["explain"]:
+            raise click.UsageError("--divide-map goes with --engine dask, without --method pair and --explain.")
+        cluster = replace(cluster, divide_map=True)
     # A mask alone gets threads; on a cluster each worker keeps to one.
     options = replace(options, threads=jobs if len(tasks) == 1 and cluster is None else 1)
     make_folder(out_dir)

@@ -102,7 +102,8 @@ class Ledger:
     ----------
     n_reference : int
         Intersections of all parts: what is tried on them is bounded as on one map of that size.
-    n_tried : int
+    n_tried, beside : int, float
+        Those, and how many are tried on the whole map for each that is tried here (see `LocateOptions.elsewhere`).
     tried_by : dict of int to int
         As many had been tried when a stage, by its number, was last at work.
     n_usual, n_last : int
@@ -114,6 +115,7 @@ class Ledger:
     tried_by: dict[int, int] = field(default_factory=dict)
     n_usual: int = 0
     n_last: int = 0
+    beside: float = 1.0
 
 
 class TripleEstimator:
@@ -207,7 +209,7 @@ class TripleEstimator:
     def _count(self, n_places: int, stage: int) -> None:
         """Note that a stage tried so many more places."""
         self.n_screened += n_places
-        self.ledger.n_tried += n_places
+        self.ledger.n_tried += round(self.ledger.beside * n_places)
         self.ledger.tried_by[stage] = self.ledger.n_tried
 
     def _rounds_of_roads(
@@ -461,10 +463,9 @@ class TripleEstimator:
 
     def _is_far(self, matrix: FloatArray) -> bool:
         """Whether the middle of the frame lies outside the circle, or the box, that the user gave."""
-        middle, within = Homography(matrix).everywhere(self.scene.center), self.options.within
+        middle, plane, within = Homography(matrix).everywhere(self.scene.center), self.index.plane, self.options.within
         if self.near is not None and np.hypot(*(middle - self.near[:2])) > self.near[2]:
             return True
-        plane = self.index.plane
         return within is not None and not lies_in(within, *to_lonlat(plane.crs, plane.to_crs(middle[None]))[0])
 
     def settled(self, model: Hypothesis) -> bool:

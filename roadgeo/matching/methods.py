@@ -178,7 +178,9 @@ def _search(
     sweeps: SharedSweeps[TripleEstimator] = SharedSweeps(query.scene, options.match.camera, _same_place, ahead)
     shared = (ledger, sweeps)
     opened = [_Attempt.open(query, one, options, trace, *shared) for one, trace in zip(indexes, traces, strict=True)]
-    ledger.n_reference = sum(one.n_searched for one in opened if one.search is not None)
+    n_here = sum(one.n_searched for one in opened if one.search is not None)
+    ledger.n_reference = n_here + options.elsewhere
+    ledger.beside = ledger.n_reference / max(n_here, 1)
     left = time_limit_s - (time.perf_counter() - started)
     estimators = {one.search: one.estimator for one in opened if one.search is not None and one.estimator is not None}
 
@@ -194,10 +196,14 @@ def _search(
 
 def _open(parts: Sequence[Part], options: LocateOptions, frame_m: float) -> list[ReferenceIndex]:
     """Open the parts that may hold a place; the first where none does, to say so."""
+    able = [part for part in parts if may_show(part, options, frame_m)]
+    return [part.open() for part in able or parts[:1]]
+
+
+def may_show(part: Part, options: LocateOptions, frame_m: float) -> bool:
+    """Whether a part may show a frame of that size at most, as far as the user knows where; it is not opened."""
     near, within = options.near, options.match.within
-    able = [part for part in parts if near is None or part.may_hold(near, frame_m)]
-    able = [part for part in able if within is None or part.touches(within)]
-    return [part.open() for part in able] or [parts[0].open()]
+    return (near is None or part.may_hold(near, frame_m)) and (within is None or part.touches(within))
 
 
 def _same_ground(one: TripleEstimator, a: Hypothesis, other: TripleEstimator, b: Hypothesis) -> bool:

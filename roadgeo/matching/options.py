@@ -40,6 +40,8 @@ class LocateOptions:
         two on the map of a city.
     threads : int
         Of the search for one mask. The answer does not depend on it.
+    elsewhere : int
+        Intersections of the map that other processes search. A place is charged as if they were searched here, too.
     """
 
     method: Literal["auto", "pair"] = "auto"
@@ -51,6 +53,7 @@ class LocateOptions:
     twins: TwinOptions | None = field(default_factory=lambda: TwinOptions.nearby(4000.0, n_places=12))
     truths: tuple[tuple[str, float, float], ...] = ()
     threads: int = 1
+    elsewhere: int = 0
     query: QueryOptions = field(default_factory=QueryOptions)
     match: MatchOptions = field(default_factory=MatchOptions)
     search: SearchOptions = field(default_factory=SearchOptions)

@@ -17,8 +17,8 @@ import contextlib
 import json
 import os
 import re
-from collections.abc import Sequence
-from dataclasses import asdict, dataclass, field
+from collections.abc import Collection, Sequence
+from dataclasses import asdict, dataclass, field, replace
 from functools import cached_property
 from hashlib import blake2b
 from pathlib import Path
@@ -294,19 +294,25 @@ class ShardedReference:
         """What the user calls it."""
         return self.manifest.name
 
+    def only(self, names: Collection[str]) -> ShardedReference:
+        """Return the same map, of which only parts of these names are searched."""
+        kept = tuple(shard for shard in self.shards if shard.entry.name in names)
+        coarse = self.coarse if self.coarse is not None and self.coarse.entry.name in names else None
+        return replace(self, shards=kept, coarse=coarse)
+
     def index_of(self, location: Location) -> ReferenceIndex:
-        """Return the index of the shard that a location lies on; of the first where there is no place.
+        """Return the index of the shard that a location lies on; of the last where there is no place.
 
         Of a frame that a shard may not show wholly it is that of the coarse map.
         """
         center = location.center
         if center is None or location.footprint is None:
-            return self.shards[0].open()
+            return self.parts[-1].open()
         near = (center.lon, center.lat, 0.0)
         here = [one for one in self.parts if one.entry.crs == location.crs and touches(one.entry.reach, near)]
         wide = np.ptp(location.footprint, axis=0).max() > 2.0 * self.manifest.margin_m
         return min(
-            here or self.shards,
+            here or self.parts,
             key=lambda one: ((one is self.coarse) != wide, not touches(one.entry.ground, near)),
         ).open()
 

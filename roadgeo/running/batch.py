@@ -31,9 +31,12 @@ if TYPE_CHECKING:
     from roadgeo.outputs.location_files import OutputOptions
     from roadgeo.reference.reference import AnyReference
     from roadgeo.running.cluster import Cluster
+    from roadgeo.running.looks import Locate
     from roadgeo.workflows import LocateOptions
 
 __all__ = [
+    "Asked",
+    "Locating",
     "Outcome",
     "changed_options",
     "locate_masks",
@@ -137,12 +140,18 @@ def locate_masks(
     if cluster is not None:
         references = _named_for_workers(references)
     heard = say if cluster is None and (jobs == 1 or len(tasks) == 1) else say_nothing
-    work = _Locating(tuple(references), str(out_dir), options or BatchOptions(), heard)
-    return run(tasks, work, jobs) if cluster is None else cluster.run(tasks, work)
+    work = Locating(tuple(references), str(out_dir), options or BatchOptions(), heard)
+    if cluster is None:
+        return run(tasks, work, jobs)
+    if cluster.divide_map:
+        from roadgeo.running.divided import run_divided
+
+        return run_divided(tasks, work, cluster)
+    return cluster.run(tasks, work)
 
 
 @dataclass(frozen=True)
-class _Locating:
+class Locating:
     """What is done with every mask; travels to other processes."""
 
     references: tuple[str, ...]
@@ -162,14 +171,19 @@ class _Locating:
 
     def prepare(self) -> Callable[[Task], Outcome]:
         """Open the references."""
+        asked = self.ask()
+        return lambda task: self.do(task, asked)
+
+    def ask(self) -> Asked:
+        """Open the references, and say what every mask is asked."""
         from roadgeo.reference.inspection import reference_digest
         from roadgeo.reference.reference import open_reference
 
         started = perf_counter()
         paths = _resolve(self.references)
         references = [open_reference(path) for path in paths]
-        asked = _Asked(references, [reference_digest(path) for path in paths], perf_counter() - started, self._told())
-        return lambda task: self._do(task, asked)
+        digests = [(one.name, reference_digest(path)) for one, path in zip(references, paths, strict=True)]
+        return Asked(references, digests, perf_counter() - started, self._told())
 
     def give_up(self, task: Task, reason: str) -> Outcome:
         """Make the outcome of a mask that could not be worked on."""
@@ -198,18 +212,17 @@ class _Locating:
         usual = BatchOptions()
         reading = replace(self.reading, images={}, threads=ReadOptions.threads)
         told = {
-            **changed_options(replace(self.options.search, truths=(), threads=1), usual.search),
+            **changed_options(replace(self.options.search, truths=(), threads=1, elsewhere=0), usual.search),
             **changed_options(reading, usual.reading),
             **changed_options(self.outputs.image, usual.outputs.image),
         }
         plain: dict[str, Any] = json.loads(json.dumps(told))
         return plain
 
-    def _do(self, task: Task, asked: _Asked) -> Outcome:
+    def do(self, task: Task, asked: Asked, how: Locate | None = None) -> Outcome:
         """Locate one mask and write its results; the one place where what goes wrong with a mask is caught."""
         try:
-            earlier = self._earlier(task, asked) if self.options.skip_existing else None
-            return earlier or self._locate(task, asked)
+            return self.earlier(task, asked) or self._locate(task, asked, how)
         except RoadgeoError as error:
             return self._failed(task, _code_of(error), str(error))
         except UnicodeEncodeError:  # libraries take no other names
@@ -224,8 +237,13 @@ class _Locating:
             what = " ".join(f"{type(error).__name__}: {error}".split())
             return self._failed(task, "FAULT", f"{task.query}: {what}; this is a fault of roadgeo, please report it")
 
-    def _earlier(self, task: Task, asked: _Asked) -> Outcome | None:
-        """Return what an earlier run found, if that is whole, the answer to the same question, and younger than it."""
+    def earlier(self, task: Task, asked: Asked) -> Outcome | None:
+        """Return what an earlier run found, if that is whole, the answer to the same question, and younger than it.
+
+        None too where results of before are not to be kept.
+        """
+        if not self.options.skip_existing:
+            return None
         from roadgeo.location import SCHEMA
         from roadgeo.outputs.location_files import wanted_outputs
         from roadgeo.outputs.paths import output_paths
@@ -247,7 +265,7 @@ class _Locating:
         whole = all(path.is_file() and path.stat().st_size for path in files)
         return Outcome(status, document, earlier=True) if whole else None
 
-    def _locate(self, task: Task, asked: _Asked) -> Outcome:
+    def _locate(self, task: Task, asked: Asked, how: Locate | None) -> Outcome:
         from roadgeo.outputs.location_files import write_location
         from roadgeo.outputs.paths import output_paths
         from roadgeo.outputs.registry import EXPLANATION
@@ -255,8 +273,8 @@ class _Locating:
         from roadgeo.workflows import explain, locate
 
         started = perf_counter()
-        how = explain if EXPLANATION.name in self.outputs.products else locate
-        options = self._with_focal_length(task)
+        how = how or (explain if EXPLANATION.name in self.outputs.products else locate)
+        options = self.search_options(task)
         sighting = locate_query(task.mask, asked.references, options, self.reading.of_query(), how=how, say=self.say)
         location, mask, explanation = sighting.location, sighting.mask, sighting.explanation
         # the clock of the search knows its own steps only: the rest was reading
@@ -286,7 +304,7 @@ class _Locating:
             (photo, _scale(photo, mask)) if photo and location.located else None,
         )
 
-    def _with_focal_length(self, task: Task) -> LocateOptions:
+    def search_options(self, task: Task) -> LocateOptions:
         """Return the options, with the focal length that the photograph's EXIF states where that was asked for."""
         if not self.reading.exif:
             return self.options.search
@@ -309,23 +327,23 @@ def _without_views(outputs: OutputOptions) -> OutputOptions:
 
 
 @dataclass(frozen=True)
-class _Asked:
-    """What every mask of a batch is asked: on which references, with which options."""
+class Asked:
+    """What every mask of a batch is asked: on which references, of which digests by name, with which options."""
 
     references: list[AnyReference]
-    digests: list[str]
+    digests: list[tuple[str, str]]
     seconds: float
     options: dict[str, Any]
 
     def digest(self, names: str) -> str:
         """Return the digest of the reference of that name; of all where several were searched in vain."""
-        found = [d for d, one in zip(self.digests, self.references, strict=True) if one.name == names]
-        return ", ".join(found[:1] or self.digests)
+        found = [digest for name, digest in self.digests if name == names]
+        return ", ".join(found[:1] or [digest for _, digest in self.digests])
 
     def same(self, document: Mapping[str, Any]) -> bool:
         """Whether an earlier result answers the same question; where it does not say, it does."""
         options, digest = document.get("options"), document.get("reference_digest")
-        same_maps = digest is None or set(digest.split(", ")) <= set(self.digests)
+        same_maps = digest is None or set(digest.split(", ")) <= {each for _, each in self.digests}
         return same_maps and (options is None or options == self.options)
 
 

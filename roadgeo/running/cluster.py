@@ -15,7 +15,7 @@ import pickle
 import tempfile
 import uuid
 from collections import deque
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, TypeVar
@@ -23,7 +23,7 @@ from typing import Any, TypeVar
 from roadgeo.errors import RoadgeoError
 from roadgeo.running.processes import Work
 
-__all__ = ["Cluster", "run_on_cluster"]
+__all__ = ["RETRIES", "Cluster", "Made", "Stream", "connected", "prepared", "run_on_cluster"]
 
 Task = TypeVar("Task")
 Result = TypeVar("Result")
@@ -32,7 +32,7 @@ Result = TypeVar("Result")
 _MOST_TOGETHER = 100
 
 #: Groups under way for each worker, and so many times a group is done again elsewhere.
-_AHEAD, _RETRIES = 2, 3
+_AHEAD, RETRIES = 2, 3
 
 #: A scheduler must answer, and have a worker, within this time.
 _PATIENCE_S = 30
@@ -51,11 +51,14 @@ class Cluster:
     workers : int
     together : int
         Most tasks in a group.
+    divide_map : bool
+        Each worker searches parts of the map for all masks, not all of the map for some (see `running.divided`).
     """
 
     scheduler: str | None = None
     workers: int = 1
     together: int = _MOST_TOGETHER
+    divide_map: bool = False
 
     def run(self, tasks: Sequence[Task], work: Work[Task, Result]) -> Iterator[Result]:
         """Do all tasks and yield their results in order (see `run_on_cluster`)."""
@@ -69,6 +72,19 @@ def run_on_cluster(tasks: Sequence[Task], work: Work[Task, Result], cluster: Clu
     ------
     RoadgeoError
         Dask is not installed; there is no scheduler at the address, or it went away.
+    """
+    with connected(cluster) as client:
+        yield from Stream(client, work, cluster.together).results(tasks)
+
+
+@contextlib.contextmanager
+def connected(cluster: Cluster) -> Iterator[Any]:
+    """Connect to a cluster's scheduler, or start one; return Dask's client.
+
+    Raises
+    ------
+    RoadgeoError
+        Dask is not installed; there is no scheduler at the address.
     """
     try:
         from distributed import Client
@@ -85,7 +101,7 @@ def run_on_cluster(tasks: Sequence[Task], work: Work[Task, Result], cluster: Clu
             raise RoadgeoError(
                 f"no Dask scheduler with workers at {address}: {what}; start them with `dask scheduler`, `dask worker`"
             ) from error
-        yield from _Stream(client, work, cluster.together).results(tasks)
+        yield client
 
 
 @contextlib.contextmanager
@@ -109,13 +125,12 @@ def _local_cluster(workers: int) -> Iterator[Any]:
         yield cluster
 
 
-class _Stream:
+class Stream:
     """Sends groups of tasks and takes their results, a bounded number at a time."""
 
-    def __init__(self, client: Any, work: Work[Any, Any], together: int) -> None:
+    def __init__(self, client: Any, work: Any, together: int) -> None:
         self.client, self.work, self.together = client, work, together
-        self.token = uuid.uuid4().hex
-        self.folder, self.pickled = str(Path.cwd()), pickle.dumps(work)
+        self.made = Made(uuid.uuid4().hex, str(Path.cwd()), pickle.dumps(work))
 
     def results(self, tasks: Sequence[Task]) -> Iterator[Any]:
         """Yield the results of all tasks in order."""
@@ -138,8 +153,10 @@ class _Stream:
         return max(1, len(self.client.nthreads()))
 
     def _send(self, group: Sequence[Any]) -> Any:
-        sent = (self.token, self.folder, self.pickled, list(group))
-        return self.client.submit(_do_group, *sent, pure=False, retries=_RETRIES)
+        return self.client.submit(_do_group, self.made, list(group), pure=False, retries=RETRIES)
+
+    def _results_of(self, future: Any) -> list[Any]:
+        return list(future.result())
 
     def _take(self, future: Any, group: Sequence[Any]) -> list[Any]:
         """Return the results of a group; one that kills its workers is done task by task."""
@@ -148,7 +165,7 @@ class _Stream:
         from distributed.scheduler import KilledWorker
 
         try:
-            return list(future.result())
+            return self._results_of(future)
         except KilledWorker:
             if len(group) > 1:
                 alone = [(self._send([task]), [task]) for task in group]
@@ -160,13 +177,28 @@ class _Stream:
 
 # --- on a worker ------------------------------------------------------------------------------------------------------
 
-_prepared: dict[str, Callable[[Any], Any]] = {}
+_prepared: dict[str, Any] = {}
 
 
-def _do_group(token: str, folder: str, pickled: bytes, tasks: Sequence[Any]) -> list[Any]:
-    """Do tasks one after another, in the folder where they were asked for; make the worker ready first, once."""
-    if token not in _prepared:
-        os.chdir(folder)
+@dataclass(frozen=True)
+class Made:
+    """Work on its way to the workers: a name for it, the folder that it was asked for in, and itself."""
+
+    token: str
+    folder: str
+    pickled: bytes
+
+
+def _do_group(made: Made, tasks: Sequence[Any]) -> list[Any]:
+    """Do tasks one after another."""
+    do = prepared(made)
+    return [do(task) for task in tasks]
+
+
+def prepared(made: Made) -> Any:
+    """Return work that is ready, in the folder where it was asked for; make it and this worker ready first, once."""
+    if made.token not in _prepared:
+        os.chdir(made.folder)
         import cv2
 
         from roadgeo.kernels.warmup import warm_up
@@ -175,9 +207,8 @@ def _do_group(token: str, folder: str, pickled: bytes, tasks: Sequence[Any]) -> 
         with _one_of_host():
             warm_up()
         _prepared.clear()  # of earlier runs, whose maps are no longer needed
-        _prepared[token] = pickle.loads(pickled).prepare()  # noqa: S301 (from our own client)
-    do = _prepared[token]
-    return [do(task) for task in tasks]
+        _prepared[made.token] = pickle.loads(made.pickled).prepare()  # noqa: S301 (from our own client)
+    return _prepared[made.token]
 
 
 @contextlib.contextmanager

@@ -15,7 +15,7 @@ from roadgeo._progress import say_nothing
 from roadgeo.geometry.mask import RoadMask
 from roadgeo.outputs.registry import REGISTRY, Output
 from roadgeo.plugins import OUTPUTS
-from roadgeo.running.batch import Outcome, _Asked, _Locating
+from roadgeo.running.batch import Asked, Locating, Outcome
 from roadgeo.running.options import BatchOptions, ReadOptions
 from roadgeo.running.tasks import Task, find_masks, name_tasks
 
@@ -91,8 +91,8 @@ class Hazard:
 
 def hazardous(kind: str, folder: Path, patch: pytest.MonkeyPatch) -> Outcome:
     patch.setattr("roadgeo.running.queries.open_mask", Hazard())
-    work = _Locating((), str(folder), BatchOptions(), say_nothing)
-    return work._do(Task(f"{kind}.png", kind), _Asked([], [], 0.0, {}))
+    work = Locating((), str(folder), BatchOptions(), say_nothing)
+    return work.do(Task(f"{kind}.png", kind), Asked([], [], 0.0, {}))
 
 
 @pytest.mark.parametrize("kind", Hazard.ERRORS)
@@ -117,7 +117,7 @@ def test_the_focal_length_of_exif_is_in_pixels_of_the_mask(tmp_path: Path) -> No
     cv2.imwrite(str(mask), np.zeros((400, 600), np.uint8))
     task = Task(str(mask), "mask")
     reading = ReadOptions(images={str(mask): str(photo)}, exif=True)
-    work = _Locating((), str(tmp_path), BatchOptions(reading=reading), say_nothing)
-    assert work._with_focal_length(task).match.camera.focal_px == pytest.approx(400.0)
+    work = Locating((), str(tmp_path), BatchOptions(reading=reading), say_nothing)
+    assert work.search_options(task).match.camera.focal_px == pytest.approx(400.0)
     plain = replace(work, options=BatchOptions(reading=replace(reading, exif=False)))
-    assert plain._with_focal_length(task).match.camera.focal_px is None
+    assert plain.search_options(task).match.camera.focal_px is None

@@ -1,0 +1,138 @@
+"""A map that is divided among workers: who searches what, and whose place counts."""
+
+import json
+from dataclasses import replace
+
+import cv2
+import numpy as np
+import pytest
+import shapely
+from worlds.fenway import write_vector
+from worlds.scenes import PLANE, random_lines
+
+from roadgeo.cli import main
+from roadgeo.location import Location
+
+pytest.importorskip("distributed")
+from roadgeo.running.divided import Ballot, Vote, count, owners
+
+PARTS = [f"0/{n}" for n in range(300)]
+
+
+def test_each_part_has_one_owner_and_a_worker_that_goes_leaves_the_others_alone():
+    workers = [f"tcp://10.0.0.{k}:4000" for k in range(6)]
+    before = owners(PARTS, workers)
+    assert sorted(part for share in before.values() for part in share) == sorted(PARTS)
+    assert all(25 <= len(share) <= 80 for share in before.values())
+    after = owners(PARTS, workers[1:])
+    for worker in workers[1:]:
+        assert set(before[worker]) <= set(after[worker])
+    assert owners(["0/"], workers[:1]) == {workers[0]: ["0/"]}
+
+
+LOCATED = Location("q", "located", "found", log10_odds=9.0)
+REFUSED = Location("q", "not_located", "nothing", log10_odds=2.0)
+
+
+@pytest.mark.parametrize(
+    ("votes", "ballot"),
+    [
+        ([Vote(), Vote(((9.0, "b1"),), LOCATED), Vote((), REFUSED)], Ballot(("b1",), located=True)),
+        (
+            [Vote(((4.0, "a2"), (2.5, "a1")), LOCATED), Vote(((9.0, "b1"), (3.0, "b1")), LOCATED)],
+            Ballot(("b1", "a2", "a1"), located=True),
+        ),
+        # A weak place elsewhere is a rival of one that is located, but no place by itself.
+        ([Vote(((2.0, "a1"),), REFUSED), Vote(((3.6, "b1"),), LOCATED)], Ballot(("b1", "a1"), located=True)),
+        ([Vote(((2.0, "a1"),), REFUSED), Vote((), None)], Ballot(("a",), refusal=REFUSED)),
+        ([Vote((), replace(REFUSED, log10_odds=None)), Vote((), REFUSED)], Ballot(("b",), refusal=REFUSED)),
+        ([Vote((), None), Vote((), replace(REFUSED, log10_odds=None))],
+         Ballot(("b",), refusal=replace(REFUSED, log10_odds=None))),
+        (
+            [Vote(((9.0, "a1"), (8.5, "a2")), replace(LOCATED, status="ambiguous")), Vote((), REFUSED)],
+            Ballot(("a1", "a2")),
+        ),
+        ([Vote(), Vote()], Ballot(("a",))),
+    ],
+)  # fmt: skip
+def test_votes_are_counted(votes, ballot):
+    assert count(votes, ["a", "b", "c"][: len(votes)]) == ballot
+
+
+@pytest.fixture(scope="module")
+def town(tmp_path_factory):
+    """A folder with the shards of a town, one more map, and masks of both, of another town, and of nothing."""
+    folder = tmp_path_factory.mktemp("divided")
+    lines = {"town": random_lines(5, 3000.0), "hamlet": random_lines(8, 3000.0), "stranger": random_lines(6, 3000.0)}
+    for name in ("town", "hamlet"):
+        shifted = [shapely.transform(line, PLANE.to_crs) for line in lines[name]]
+        write_vector(folder / f"{name}.gpkg", shifted, crs=PLANE.crs)
+        shards = ["--shards", "2km", "--margin", "700"] if name == "town" else []
+        out = folder / ("town.shards" if shards else "hamlet_map.gpkg")
+        asked = ["index", "--roads", str(folder / f"{name}.gpkg"), *shards, "--name", name, "-q", "--out", str(out)]
+        assert main(asked) == 0
+    for mask, name, corner in (
+        ("a", "town", 900.0),
+        ("b", "town", 300.0),
+        ("c", "hamlet", 600.0),
+        ("d", "stranger", 0.0),
+    ):
+        drawn = np.zeros((1000, 1000), np.uint8)
+        for line in lines[name]:
+            xy = (np.array(line.coords) - corner) * (1, -1) + (0, 1000)
+            cv2.polylines(drawn, [np.round(xy).astype(np.int32)], False, 255, 9)
+        cv2.imwrite(str(folder / f"{mask}.png"), drawn)
+    (folder / "e.png").write_bytes(b"\x89PNG\r\n\x1a\nnothing")
+    return folder
+
+
+@pytest.mark.slow
+def test_a_divided_map_answers_as_the_whole_does(town, monkeypatch, capsys):
+    monkeypatch.chdir(town)
+    asked = [
+        "locate",
+        *(f"{mask}.png" for mask in "abcde"),
+        "-r",
+        "town.shards",
+        "-r",
+        "hamlet_map.gpkg",
+        "--json",
+        "-q",
+    ]
+    found = {}
+    divided = ["--engine", "dask", "--jobs", "3", "--divide-map"]
+    for out, more in (("whole", []), ("divided", divided), ("divided", [*divided, "--skip-existing"])):
+        assert main([*asked, "-o", out, "--effort", "quick", *more]) == 1
+        found[out] = [json.loads(line) for line in capsys.readouterr().out.splitlines()]
+        for one, other in zip(found["whole"], found[out], strict=True):
+            same = ("query", "status", "reference", "attribution", "reference_digest", "reason_code", "crs", "options")
+            assert [one[key] for key in same] == [other[key] for key in same]
+            if one["center"]:
+                assert np.allclose(one["footprint"], other["footprint"], atol=1e-6)
+                assert other["log10_odds"] == pytest.approx(one["log10_odds"], abs=1.5)
+    told = [(one["status"], one["reference"]) for one in found["divided"]]
+    assert told[:3] == [("located", "town"), ("located", "town"), ("located", "hamlet")]
+    assert [status for status, _ in told[3:]] == ["not_located", "error"]
+    assert sorted(path.name for path in (town / "whole").iterdir()) == sorted(
+        path.name for path in (town / "divided").iterdir()
+    )
+
+
+@pytest.mark.slow
+def test_a_place_counts_only_against_all_of_the_map(town, monkeypatch, capsys):
+    """Where two maps hold a place, neither worker may report it alone."""
+    monkeypatch.chdir(town)
+    east = np.array([50_000.0, 0.0])
+    twins = [shapely.transform(line, lambda xy: PLANE.to_crs(xy) + east) for line in random_lines(8, 3000.0)]
+    write_vector(town / "twin.gpkg", twins, crs=PLANE.crs)
+    assert main(["index", "--roads", "twin.gpkg", "--name", "twin", "-q", "--out", "twin_map.gpkg"]) == 0
+    asked = ["locate", "c.png", "-r", "hamlet_map.gpkg", "-r", "twin_map.gpkg", "--json", "-q", "--effort", "quick"]
+    for out, more in (("one", []), ("two", ["--engine", "dask", "--jobs", "2", "--divide-map"])):
+        main([*asked, "-o", out, *more])
+        assert json.loads(capsys.readouterr().out)["status"] == "ambiguous"
+
+
+@pytest.mark.parametrize("more", [[], ["--engine", "dask", "--method", "pair"], ["--engine", "dask", "--explain"]])
+def test_it_needs_a_cluster_and_the_usual_search(more, capsys):
+    assert main(["locate", __file__, "--divide-map", *more]) == 2
+    assert "--divide-map goes with --engine dask" in capsys.readouterr().err
