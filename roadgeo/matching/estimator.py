@@ -17,6 +17,7 @@ from roadgeo.geometry.projection import to_lonlat
 from roadgeo.matching.growing import PATIENT, GrowOptions, grow_proposals, screen_proposals
 from roadgeo.matching.hypothesis import MINIMAL, Hypothesis, Lead
 from roadgeo.matching.index import ReferenceIndex
+from roadgeo.matching.ledger import Ledger
 from roadgeo.matching.lens import (
     LensFit,
     LensOptions,
@@ -26,6 +27,7 @@ from roadgeo.matching.lens import (
     regrow,
     straighten_scene,
 )
+from roadgeo.matching.pieces import share_won
 from roadgeo.matching.refinement import RefineOptions, refine
 from roadgeo.matching.road_growth import Grown
 from roadgeo.matching.road_search import RoadSearch, RoadSearchOptions
@@ -92,30 +94,6 @@ class MatchOptions:
     sightings: int = 2
     certain: float = 20.0
     within: Box | None = None
-
-
-@dataclass
-class Ledger:
-    """Places tried in one search, on all of its parts together: each of them could have agreed by chance.
-
-    Attributes
-    ----------
-    n_reference : int
-        Intersections of all parts: what is tried on them is bounded as on one map of that size.
-    n_tried, beside : int, float
-        Those, and how many are tried on the whole map for each that is tried here (see `LocateOptions.elsewhere`).
-    tried_by : dict of int to int
-        As many had been tried when a stage, by its number, was last at work.
-    n_usual, n_last : int
-        Places screened by the usual sweeps, and by the last ones.
-    """
-
-    n_reference: int = 0
-    n_tried: int = 0
-    tried_by: dict[int, int] = field(default_factory=dict)
-    n_usual: int = 0
-    n_last: int = 0
-    beside: float = 1.0
 
 
 class TripleEstimator:
@@ -333,12 +311,22 @@ class TripleEstimator:
             self._look_through_lens(model)
         elif model.refined is not None:
             self._dropped.append(model)
+        if model.log10_odds > 0.0 and self._loses(model):
+            model.log10_odds = 0.0
         model.n_tried = self.ledger.n_tried
         self.refine_s += time.perf_counter() - started
         self.trace.scored(model)
         if not model.by_roads and self._fits_whole(model):
             self._whole.append(model)
         return model.log10_odds
+
+    def _loses(self, model: Hypothesis) -> bool:
+        """Whether only a piece of the frame fits, as a quarter of Porto Alegre fits that is its own mirror image."""
+        verify, found = self.options.verify, model.found
+        if found is None or found.forward + found.backward >= 1.5:
+            return False
+        won = share_won(model.matrix, self.scene_of(model), self.index, model.gsd_m, verify)
+        return won < verify.least_won
 
     def evidence(self, model: Hypothesis) -> float:
         """Return the log10 odds of a hypothesis without what is charged for the places tried."""

@@ -16,9 +16,10 @@ from roadgeo.geometry.projection import from_lonlat, metres_apart, to_lonlat
 from roadgeo.location import Stats
 from roadgeo.matching.accuracy import with_honest_corners
 from roadgeo.matching.ahead import Ahead
-from roadgeo.matching.estimator import Ledger, MatchOptions, TripleEstimator
+from roadgeo.matching.estimator import MatchOptions, TripleEstimator
 from roadgeo.matching.hypothesis import Hypothesis
 from roadgeo.matching.index import ReferenceIndex, crop, unpack_tangents
+from roadgeo.matching.ledger import Ledger
 from roadgeo.matching.options import LocateOptions
 from roadgeo.matching.paper.quality import well_fitted
 from roadgeo.matching.paper.search import match_pairs

@@ -8,8 +8,9 @@ import shapely
 from worlds.scenes import PLANE, Sight, camera, look, mapped, random_lines, random_network, scene_of
 
 from roadgeo.geometry.camera import CameraOptions
-from roadgeo.matching.estimator import Ledger, MatchOptions, Sweep, TripleEstimator
+from roadgeo.matching.estimator import MatchOptions, Sweep, TripleEstimator
 from roadgeo.matching.index import build_index
+from roadgeo.matching.ledger import Ledger
 from roadgeo.matching.scene import query_neighbours
 from roadgeo.matching.search import Search, SearchOptions, search, search_together
 from roadgeo.matching.triples import TripleOptions

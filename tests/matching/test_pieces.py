@@ -2,14 +2,18 @@
 
 import math
 
+import cv2
 import numpy as np
 import pytest
-from worlds.scenes import Sight, camera, look, scene_of
+from worlds.scenes import Sight, camera, look, random_network, scene_of
 
+import roadgeo
 from roadgeo.geometry.homography import Homography
 from roadgeo.matching.local_search import Shift, move_about
-from roadgeo.matching.pieces import PieceCounts, Pieces, log10_lead, sample_roads
+from roadgeo.matching.options import LocateOptions
+from roadgeo.matching.pieces import PieceCounts, Pieces, log10_lead, sample_roads, share_won
 from roadgeo.matching.verification import VerifyOptions
+from roadgeo.reference.reference import Reference
 
 
 @pytest.fixture(scope="module")
@@ -73,3 +77,36 @@ def test_roads_are_sampled_where_they_touch_a_box(town):
     everywhere = sample_roads(index, np.array([-1e5, -1e5]), np.array([1e5, 1e5]), 12.0)
     lengths = np.hypot(*(index.segments[:, 2:] - index.segments[:, :2]).T)
     assert len(everywhere) == pytest.approx(lengths.sum() / 12.0, abs=1.0)
+
+
+def drawn(network, matrix, size):
+    """Draw what a camera sees, with all its roads."""
+    graph = look(network, matrix, size, Sight(sigma_m=0.5), 1)
+    mask = np.zeros(size[::-1], np.uint8)
+    for k in range(len(graph.edges)):
+        line = graph.coords[graph.offsets[k] : graph.offsets[k + 1]] * (1, -1)
+        cv2.polylines(mask, [np.round(line).astype(np.int32)], False, 255, 9)
+    return mask
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize(("share", "located"), [(0.42, False), (0.75, True)])
+def test_a_piece_that_fits_is_no_place_where_most_of_the_frame_does_not(town, share, located):
+    """As in Porto Alegre, where a quarter is like its mirror image: turned over, a mask of it was located at 10^8."""
+    truth, size = camera((1900.0, 2000.0), (1300, 1300), 1.0, heading_deg=40.0), (1300, 1300)
+    mask, stranger = drawn(town[0], truth, size), drawn(random_network(2, 4000.0), truth, size)
+    kept = int(share * size[0])
+    mask[:, kept:] = stranger[:, kept:]
+    found = roadgeo.locate(mask, Reference(town[1]), LocateOptions(effort="quick"))
+    assert found.located == located
+    assert located or found.log10_odds <= 0.0
+
+
+def test_most_of_the_frame_is_won_at_the_place_and_little_beside(town, seen):
+    truth, scene = seen
+    beside = move_about(Homography(truth)(scene.center), Shift(60.0, 40.0, 0.0, 1.0, 0.0)) @ truth
+    here, there = (share_won(matrix, scene, town[1], 1.0, VerifyOptions()) for matrix in (truth, beside))
+    assert here > 0.95
+    assert there < 0.2
+    far = np.array([[1.0, 0.0, 1e6], [0.0, 1.0, 1e6], [0.0, 0.0, 1.0]])
+    assert share_won(far, scene, town[1], 1.0, VerifyOptions()) == 1.0  # no roads there, nothing is lost

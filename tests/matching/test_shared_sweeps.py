@@ -7,10 +7,11 @@ import pytest
 from worlds.scenes import camera, look, random_network, scene_of
 
 from roadgeo.geometry.camera import CameraOptions
-from roadgeo.matching.estimator import Ledger, MatchOptions, TripleEstimator
+from roadgeo.matching.estimator import MatchOptions, TripleEstimator
 from roadgeo.matching.growing import GrowOptions
 from roadgeo.matching.hypothesis import Hypothesis
 from roadgeo.matching.index import build_index
+from roadgeo.matching.ledger import Ledger
 from roadgeo.matching.search import Search, SearchOptions, search_together
 from roadgeo.matching.shared_sweeps import SharedSweeps, Stage
 from roadgeo.matching.sweeps import Sweep
