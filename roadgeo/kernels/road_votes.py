@@ -212,14 +212,17 @@ def vote(
                 continue
             tried += 1
             best, where, rate = 0.0, -1, 0.0
-            # the best scale: points are counted in blocks, and a scale is left when it has lost too much
+            # the best scale: points are counted in blocks, and a scale is left when it has lost too much, or when all
+            # points that are left would not make it better than another scale and the worst vote that is kept
+            least = votes[0, 3] if kept == votes.shape[0] else 0.0
             cosine, sine = math.cos(turn) / raster.cell, math.sin(turn) / raster.cell
             for s in range(points.scales.shape[0]):
                 i, last = points.starts[s], points.starts[s + 1]
                 level = int(min(chance[s] * places.density[j], 0.99) * _LEVELS)
                 c, d = cosine * points.scales[s], sine * points.scales[s]
                 ratio = 0.0
-                while i < last and ratio >= -trial.patience:
+                enough = max(best, least)
+                while i < last and ratio >= -trial.patience and ratio + gains[level] * (last - i) > enough:
                     stop = min(i + _BLOCK, last)
                     met = _count_met(points, i, stop, x, y, turn, c, d, raster)
                     ratio += gains[level] * met + losses[level] * (stop - i - met)
