@@ -30,10 +30,12 @@ from roadgeo.matching.lens import (
 from roadgeo.matching.pieces import share_won
 from roadgeo.matching.refinement import RefineOptions, refine
 from roadgeo.matching.road_growth import Grown
-from roadgeo.matching.road_search import RoadSearch, RoadSearchOptions
+from roadgeo.matching.road_search import RoadSearchOptions
+from roadgeo.matching.road_views import RoadViews
 from roadgeo.matching.scene import Scene
 from roadgeo.matching.shared_sweeps import SharedSweeps, Stage
 from roadgeo.matching.sweeps import LAST, USUAL, Source, Sweep
+from roadgeo.matching.tilted import TiltOptions
 from roadgeo.matching.trace import NO_TRACE, Trace
 from roadgeo.matching.triples import Proposals, larger
 from roadgeo.matching.verification import VerifyOptions, agreement, chance_agreement, log10_odds
@@ -72,6 +74,8 @@ class MatchOptions:
         What follows where no triple leads to a place: None for nothing.
     lens : LensOptions or None
         Of a lens that is looked for behind promising places: None for a pinhole.
+    tilted : TiltOptions or None
+        Of steep views, which are looked for last: None for none.
     max_places : int
         The sweeps end too when so many places were screened on a map of 15,000 intersections, and on a larger one more
         by the root of the ratio. Where streets are alike, proposals abound, and late ones are seldom right: of 31 masks
@@ -89,6 +93,7 @@ class MatchOptions:
     camera: CameraOptions = field(default_factory=CameraOptions)
     roads: RoadSearchOptions | None = field(default_factory=RoadSearchOptions)
     lens: LensOptions | None = field(default_factory=LensOptions)
+    tilted: TiltOptions | None = field(default_factory=TiltOptions)
     max_places: int = 12_000
     max_last_places: int = 100_000
     sightings: int = 2
@@ -130,10 +135,10 @@ class TripleEstimator:
         self.refine_options = replace(usual, perspective_sigma=camera.perspective_sigma(usual.perspective_sigma))
         self.n_tuples = self.n_candidates = self.n_screened = self.n_hypotheses = self.n_verified = 0
         self._tried: set[Lead] = set()
-        self._roads: RoadSearch | None = None
         self._grown_by_roads: list[Hypothesis] = []
         self.sweeps = sweeps or SharedSweeps(scene, camera)
         self.sweeps.members.append(self)
+        self._views = RoadViews(scene, index, self.options, near, self.sweeps)
         trace.began(self)
 
     def stages(self) -> Iterator[Iterator[list[Hypothesis]]]:
@@ -147,12 +152,14 @@ class TripleEstimator:
         ]
         roads = []
         if options.roads is not None and len(self.scene.intersections):
-            roads.append(self._rounds_of_roads(options.roads))
+            roads.append(self._rounds_of_roads())
         yield from sweeps + roads if self.index.coarseness == 1.0 else roads + sweeps
         if options.lens is not None and options.last:
             yield self._rounds_of_lenses(options.lens)
         for stage, source in enumerate(options.last, len(options.sweeps) + 1):
             yield self.sweeps.rounds(self, Stage(stage, source, options.last_grow))
+        for view in self._views.tilted() if roads else ():
+            yield self._rounds_of_roads(view)
         if options.lens is not None and options.last:
             yield self._rounds_of_lenses(options.lens)
 
@@ -174,10 +181,11 @@ class TripleEstimator:
     def follow(self, leads: Sequence[Lead]) -> Iterator[list[Hypothesis]]:
         """Yield what grew from anchors that led to a place on another part (see `search.Estimator`)."""
         for stage, anchor in leads:
-            if stage != len(self.options.sweeps):
+            view = self._views.view_of(stage)
+            if view is None:
                 yield self.sweeps.pending(self, stage, anchor)
-            elif self.options.roads is not None:
-                yield from self._rounds_of_roads(self.options.roads, [anchor])
+            else:
+                yield from self._rounds_of_roads(view, [anchor])
 
     @property
     def n_anchors(self) -> int:
@@ -190,14 +198,9 @@ class TripleEstimator:
         self.ledger.n_tried += round(self.ledger.beside * n_places)
         self.ledger.tried_by[stage] = self.ledger.n_tried
 
-    def _rounds_of_roads(
-        self, options: RoadSearchOptions, only: Sequence[int] | None = None
-    ) -> Iterator[list[Hypothesis]]:
+    def _rounds_of_roads(self, view: int = 0, only: Sequence[int] | None = None) -> Iterator[list[Hypothesis]]:
         """Yield what grew by roads and is not known yet; a place found again counts as found once more."""
-        if self._roads is None:
-            on_map = options.on(self.index.coarseness)
-            self._roads = RoadSearch(self.scene, self.index, self.options.camera, on_map, self.near, self.sweeps.ahead)
-        roads, known, stage = self._roads, self._grown_by_roads, len(self.options.sweeps)
+        roads, known, stage = self._views.search(view), self._grown_by_roads, self._views.stage_of(view)
         tried = roads.n_tried
         for anchor, n_proposed, grown in roads.rounds(only):
             self._count(roads.n_tried - tried, stage)
@@ -208,7 +211,7 @@ class TripleEstimator:
                 self.trace.voted(anchor, n_proposed)
             fresh: list[Hypothesis] = []
             again: list[Hypothesis] = []
-            for hypothesis in map(self._of_roads, grown):
+            for hypothesis in (self._of_roads(one, view) for one in grown):
                 twins = [one for one in known if self._is_found_again(one, hypothesis)]
                 if twins or any(self.same(one, hypothesis) for one in fresh):
                     again += twins[:1]
@@ -229,9 +232,10 @@ class TripleEstimator:
             self.trace.refused(hypothesis.fault, hypothesis.matrix)
         return hypothesis.fault is None
 
-    def _of_roads(self, grown: Grown) -> Hypothesis:
+    def _of_roads(self, grown: Grown, view: int) -> Hypothesis:
         """Make a hypothesis of what grew by roads, with the intersections that match."""
-        scene, matrix = self.scene, grown.matrix / grown.matrix[2, 2]
+        scene, matrix = self.scene, grown.matrix @ self._views.seen_by(view)
+        matrix = matrix / matrix[2, 2]
         seeds = np.array([grown.anchor])
         gsd = sampling(matrix, scene.size)
         _, matched, _ = agreement(matrix, scene, self.index, gsd, seeds, self.options.verify)
@@ -323,7 +327,7 @@ class TripleEstimator:
     def _loses(self, model: Hypothesis) -> bool:
         """Whether only a piece of the frame fits, as a quarter of Porto Alegre fits that is its own mirror image."""
         verify, found = self.options.verify, model.found
-        if found is None or found.forward + found.backward >= 1.5:
+        if found is None or found.forward >= verify.least_rates[1]:
             return False
         won = share_won(model.matrix, self.scene_of(model), self.index, model.gsd_m, verify)
         return won < verify.least_won

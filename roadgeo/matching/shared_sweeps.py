@@ -14,7 +14,7 @@ from typing import Generic, NamedTuple, Protocol, TypeAlias, TypeVar
 
 import numpy as np
 
-from roadgeo._arrays import BoolArray, IntArray
+from roadgeo._arrays import BoolArray, FloatArray, IntArray
 from roadgeo.geometry.camera import CameraOptions
 from roadgeo.matching.ahead import ALONE, Ahead
 from roadgeo.matching.growing import GrowOptions
@@ -22,6 +22,7 @@ from roadgeo.matching.hypothesis import Hypothesis
 from roadgeo.matching.index import ReferenceIndex
 from roadgeo.matching.scene import Scene
 from roadgeo.matching.sweeps import Source
+from roadgeo.matching.tilted import TiltOptions, likely_views
 from roadgeo.matching.triples import Proposals
 
 __all__ = ["Member", "SharedSweeps", "Stage"]
@@ -85,6 +86,7 @@ class SharedSweeps(Generic[AnyMember]):
         self.members: list[AnyMember] = []
         self._rounds: dict[int, Iterator[_Round]] = {}
         self._done: dict[int, list[_Round]] = {}
+        self._views: dict[TiltOptions, list[FloatArray]] = {}
 
     def rounds(self, member: AnyMember, stage: Stage) -> Iterator[list[Hypothesis]]:
         """Yield what grew on a part from the proposals of one anchor after another, until enough were screened."""
@@ -104,6 +106,12 @@ class SharedSweeps(Generic[AnyMember]):
         """Return what grew on a part from an anchor and was not taken yet."""
         found = (one.grown.pop(id(member), []) for one in self._done.get(stage, []) if one.anchor == anchor)
         return next(found, [])
+
+    def views(self, options: TiltOptions) -> list[FloatArray]:
+        """Return how the scene may look from above (see `tilted.likely_views`), for all parts alike."""
+        if options not in self._views:
+            self._views[options] = likely_views(self.scene, options)
+        return self._views[options]
 
     def end(self) -> None:
         """Let go of the parts: each holds on to this, and a cycle would keep their maps open for a while."""

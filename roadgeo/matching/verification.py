@@ -53,9 +53,9 @@ class VerifyOptions:
         places of masks of all kinds the map had 62 m and more of road for each statement of the query; at a wrong one,
         a frame of 180 m that a mask of main roads was laid on, 11 m.
     least_won : float
-        So much of the roads must lie where most of them agree, of the frame cut into sixteenths: a place that loses
-        more is none, however well the rest fits. At 140 right places, 80 of them with less than 60 % of the roads, it
-        is 0.55 and more; at a wrong one that had 10^8, 0.47.
+        Where less of the query's roads agree than `least_rates` says, so much of all roads must lie where most of them
+        agree, of the frame cut into sixteenths: a place that loses more is none, however well the rest fits. At the 8
+        of 1,142 right places where that was asked it is 0.55 and more; at a wrong one that had 10^8, 0.47.
     promising : float
         Log10 odds that a place must reach against the least chance seen so far before a null of its own is measured.
         They are an upper bound: below 1 a place is neither located (3.5) nor within the margin (2.0) of one that is.
