@@ -62,7 +62,7 @@ class RoadSearchOptions:
     max_anchors: int = 30
     max_tried: int = 400_000
     least_anchors: int = 8
-    max_grown: int = 12
+    max_grown: int = 40
     max_kept: int = 4
     scale_slack: float = 1.2
     least_share: float = 0.2
