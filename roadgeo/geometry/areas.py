@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-import difflib
-import sqlite3
 from contextlib import closing
 from functools import lru_cache
 from pathlib import Path
@@ -38,6 +36,8 @@ def find_area(text: str) -> Box:
     if ending:
         names = " or ".join(extents[known][0] for known in sorted(ending)[:6])
         raise ValueError(f"{text!r} may be {names}: give the whole name")
+    import difflib
+
     alike = difflib.get_close_matches(wanted, extents, n=1, cutoff=0.75)
     hint = f"did you mean {extents[alike[0]][0]!r}, or else " if alike else ""
     raise ValueError(f"no country or state is called {text!r}; {hint}give {_BOUNDS}")
@@ -91,6 +91,8 @@ def _extents() -> dict[str, tuple[str, Box]]:
 
     PROJ, which every user has, brings them; its database has had this table since version 7.2.
     """
+    import sqlite3  # not for those who name no area
+
     from pyproj.datadir import get_data_dir
 
     asked = (
