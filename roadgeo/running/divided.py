@@ -78,18 +78,20 @@ class Ballot:
     refusal: Location | None = None
 
 
-def count(votes: Sequence[Vote], parts: Sequence[str]) -> Ballot:
-    """Count the votes of all shares for one mask; `parts` has one part of each share."""
+def count(votes: Sequence[Vote], shares: Sequence[Sequence[str]]) -> Ballot:
+    """Count the votes of all shares for one mask."""
     answers = [vote.answer for vote in votes]
-    if any(answer is not None and answer.status != "not_located" for answer in answers):
+    found = [k for k, answer in enumerate(answers) if answer is not None and answer.status != "not_located"]
+    if found:
         places = sorted((place for vote in votes for place in vote.places), reverse=True)
-        chosen = tuple(dict.fromkeys(part for _, part in places))
+        # A place so weak that its part is not named may be ambiguous all the same: then all of its share is searched.
+        chosen = tuple(dict.fromkeys(part for _, part in places)) or tuple(shares[found[0]])
         return Ballot(chosen, any(answer is not None and answer.located for answer in answers))
     nearest = max(range(len(votes)), key=lambda k: _odds(answers[k]))
     refusal = answers[nearest]
     owed = dict.fromkeys(one for answer in answers if answer for one in answer.attribution.split("; ") if one)
     refusal = None if refusal is None else replace(refusal, attribution="; ".join(owed))
-    return Ballot((parts[nearest],), refusal=refusal)
+    return Ballot((shares[nearest][0],), refusal=refusal)
 
 
 def _odds(answer: Location | None) -> float:
@@ -149,7 +151,7 @@ class _DividedStream(Stream):
     def _send(self, group: Sequence[Any]) -> Any:
         work: _Division = self.work
         shares = owners(list(work.sizes), sorted(self.client.nthreads()) or [""])
-        first = [share[0] for share in shares.values()]
+        all_shares = list(shares.values())
 
         def on_each(do: Any, *more: Any) -> list[Any]:
             # A worker that is gone is no reason to wait for it.
@@ -157,8 +159,8 @@ class _DividedStream(Stream):
             sent = (self.made, list(group))
             return [self.client.submit(do, *sent, share, *more, workers=[at], **where) for at, share in shares.items()]
 
-        looked = self.client.submit(_count_all, first, *on_each(_vote_all, True, None), pure=False)
-        voted = self.client.submit(_count_all, first, *on_each(_vote_all, False, looked), pure=False)
+        looked = self.client.submit(_count_all, all_shares, *on_each(_vote_all, True, None), pure=False)
+        voted = self.client.submit(_count_all, all_shares, *on_each(_vote_all, False, looked), pure=False)
         return on_each(_finish_all, self.client.submit(_decided, looked, voted, pure=False))
 
     def _results_of(self, future: Any) -> list[Any]:
@@ -180,9 +182,9 @@ def _vote_all(
     return [Vote() if is_done else voter.vote(task, share, first) for task, is_done in zip(tasks, done, strict=True)]
 
 
-def _count_all(parts: Sequence[str], *votes: Sequence[Vote]) -> list[Ballot]:
+def _count_all(shares: Sequence[Sequence[str]], *votes: Sequence[Vote]) -> list[Ballot]:
     """Count the votes of all shares for each mask of a group."""
-    return [count(of_mask, parts) for of_mask in zip(*votes, strict=True)]
+    return [count(of_mask, shares) for of_mask in zip(*votes, strict=True)]
 
 
 def _decided(looked: Sequence[Ballot], voted: Sequence[Ballot]) -> list[Ballot]:

@@ -53,10 +53,11 @@ REFUSED = Location("q", "not_located", "nothing", log10_odds=2.0)
             Ballot(("a1", "a2")),
         ),
         ([Vote(), Vote()], Ballot(("a",))),
+        ([Vote((), REFUSED), Vote((), replace(LOCATED, status="ambiguous", log10_odds=0.5))], Ballot(("b", "b2"))),
     ],
 )  # fmt: skip
 def test_votes_are_counted(votes, ballot):
-    assert count(votes, ["a", "b", "c"][: len(votes)]) == ballot
+    assert count(votes, [["a", "a2"], ["b", "b2"], ["c"]][: len(votes)]) == ballot
 
 
 @pytest.fixture(scope="module")
