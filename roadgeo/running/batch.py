@@ -187,9 +187,9 @@ class Locating:
 
     def give_up(self, task: Task, reason: str) -> Outcome:
         """Make the outcome of a mask that could not be worked on."""
-        return self._failed(task, "FAULT", reason)
+        return self.failed(task, "FAULT", reason)
 
-    def _failed(self, task: Task, code: str, reason: str) -> Outcome:
+    def failed(self, task: Task, code: str, reason: str) -> Outcome:
         """Describe a failure, of which `code` is the name in `Reason`, with the keys of every other result."""
         from roadgeo.location import Location, Reason
 
@@ -224,18 +224,18 @@ class Locating:
         try:
             return self.earlier(task, asked) or self._locate(task, asked, how)
         except RoadgeoError as error:
-            return self._failed(task, _code_of(error), str(error))
+            return self.failed(task, _code_of(error), str(error))
         except UnicodeEncodeError:  # libraries take no other names
             reason = f"{task.query}: its name is no text, or that of the picture; rename it"
-            return self._failed(task, "INVALID", reason)
+            return self.failed(task, "INVALID", reason)
         except MemoryError:
             reason = f"{task.query}: more memory is needed than there is; reduce it or cut it up"
-            return self._failed(task, "MEMORY", reason)
+            return self.failed(task, "MEMORY", reason)
         except Exception as error:  # whatever libraries raise: cv2.error, errors of GDAL, of plugins ...
             if os.environ.get("ROADGEO_TRACEBACK"):
                 raise
             what = " ".join(f"{type(error).__name__}: {error}".split())
-            return self._failed(task, "FAULT", f"{task.query}: {what}; this is a fault of roadgeo, please report it")
+            return self.failed(task, "FAULT", f"{task.query}: {what}; this is a fault of roadgeo, please report it")
 
     def earlier(self, task: Task, asked: Asked) -> Outcome | None:
         """Return what an earlier run found, if that is whole, the answer to the same question, and younger than it.

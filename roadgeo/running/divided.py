@@ -22,6 +22,7 @@ from hashlib import blake2b
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
+from roadgeo.errors import IndexFormatError
 from roadgeo.location import Location
 from roadgeo.matching.methods import may_show, search_references
 from roadgeo.matching.verdict import decide
@@ -53,10 +54,13 @@ class Vote:
         Log10 odds of places that may be reported, or be rivals of one that is, and the parts that they lie on.
     answer : Location or None
         None: the mask cannot be searched for, or was left alone.
+    missing : str
+        What is wrong with a part that cannot be opened.
     """
 
     places: tuple[tuple[float, str], ...] = ()
     answer: Location | None = None
+    missing: str = ""
 
 
 @dataclass(frozen=True)
@@ -71,15 +75,21 @@ class Ballot:
         Whether a share has one.
     refusal : Location or None
         Of the share that came nearest, where none has a place.
+    missing : str
+        What is wrong with a part of the map, which was not searched: then nothing can be said of the mask.
     """
 
     parts: tuple[str, ...]
     located: bool = False
     refusal: Location | None = None
+    missing: str = ""
 
 
 def count(votes: Sequence[Vote], shares: Sequence[Sequence[str]]) -> Ballot:
     """Count the votes of all shares for one mask."""
+    missing = next((vote.missing for vote in votes if vote.missing), "")
+    if missing:
+        return Ballot((shares[0][0],), missing=missing)
     answers = [vote.answer for vote in votes]
     found = [k for k, answer in enumerate(answers) if answer is not None and answer.status != "not_located"]
     if found:
@@ -256,6 +266,8 @@ class _Voter:
             reading = locating.reading.of_query()
             reading = replace(reading, mirror="allow" if reading.mirror == "allow" else "never")
             answer = locate_query(task.mask, self._only(share), options, reading, how=how).location
+        except IndexFormatError as error:
+            return Vote(missing=str(error))
         except Exception:
             return Vote()
         return Vote(tuple(places), answer)
@@ -263,6 +275,8 @@ class _Voter:
     def finish(self, task: Task, ballot: Ballot) -> Outcome:
         """Search the parts that have places together, and write the results; write a refusal as it is."""
         locating = self.division.locating
+        if ballot.missing:
+            return locating.failed(task, "NO_REFERENCE", ballot.missing)
         search = self._on(locating.options.search, ballot.parts)
         locating = replace(locating, options=replace(locating.options, search=search))
         asked = replace(self.asked, references=self._only(ballot.parts))

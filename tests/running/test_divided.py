@@ -1,7 +1,9 @@
 """A map that is divided among workers: who searches what, and whose place counts."""
 
 import json
+import shutil
 from dataclasses import replace
+from pathlib import Path
 
 import cv2
 import numpy as np
@@ -53,6 +55,7 @@ REFUSED = Location("q", "not_located", "nothing", log10_odds=2.0)
             Ballot(("a1", "a2")),
         ),
         ([Vote(), Vote()], Ballot(("a",))),
+        ([Vote(((9.0, "a1"),), LOCATED), Vote(missing="b is damaged")], Ballot(("a",), missing="b is damaged")),
         ([Vote((), REFUSED), Vote((), replace(LOCATED, status="ambiguous", log10_odds=0.5))], Ballot(("b", "b2"))),
     ],
 )  # fmt: skip
@@ -131,6 +134,18 @@ def test_a_place_counts_only_against_all_of_the_map(town, monkeypatch, capsys):
     for out, more in (("one", []), ("two", ["--engine", "dask", "--jobs", "2", "--divide-map"])):
         main([*asked, "-o", out, *more])
         assert json.loads(capsys.readouterr().out)["status"] == "ambiguous"
+
+
+@pytest.mark.slow
+def test_of_a_map_that_lacks_a_part_nothing_is_said(town, tmp_path, monkeypatch, capsys):
+    monkeypatch.chdir(tmp_path)
+    shutil.copytree(town / "town.shards", "town.shards")
+    for path in sorted(Path("town.shards").glob("*/*.*"))[:2]:
+        path.write_bytes(b"nothing")
+    asked = ["locate", str(town / "b.png"), "-r", "town.shards", "--json", "-q", "--effort", "quick"]
+    assert main([*asked, "--engine", "dask", "--jobs", "2", "--divide-map"]) == 1
+    told = json.loads(capsys.readouterr().out)
+    assert (told["status"], told["reason_code"]) == ("error", "no_reference")
 
 
 @pytest.mark.parametrize("more", [[], ["--engine", "dask", "--method", "pair"], ["--engine", "dask", "--explain"]])
