@@ -146,7 +146,7 @@ class Stream:
                 yield from self._take(future, group)
         finally:
             with contextlib.suppress(Exception):
-                self.client.cancel([future for future, _ in under_way])
+                self.client.cancel([getattr(future, "futures", future) for future, _ in under_way])
 
     def _n_workers(self) -> int:
         """Return how many workers there are now: they may come and go."""

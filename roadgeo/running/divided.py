@@ -1,8 +1,8 @@
 """Masks on a map that is divided among the workers of a cluster, for maps that no machine holds.
 
 A part of the map, a shard or a whole reference, belongs to the worker for which a hash of the two is greatest
-(rendezvous hashing): where a worker goes, its parts go to the others, and all else stays where it was fetched. Another
-worker does what one that died was to do. For a group of masks
+(rendezvous hashing): where a worker goes, its parts go to the others, and all else stays where it was fetched. What was
+under way when a worker died is sent once more. For a group of masks
 
 1. each worker takes a quick look for every mask on its parts;
 2. masks that no worker located are searched for on all parts, as thoroughly as was asked;
@@ -42,6 +42,11 @@ __all__ = ["Ballot", "Vote", "count", "owners", "run_divided"]
 
 #: Seconds of work of the first look, on a map of 15,000 intersections: nearly all masks that are found need less.
 _FIRST_LOOK_S = 0.1
+
+#: Seconds after which it is looked whether all workers live that a group waits for.
+_LOOK_AGAIN_S = 2.0
+
+_DIED = "the workers that hold parts of the map died, again and again"
 
 
 @dataclass(frozen=True)
@@ -155,28 +160,51 @@ def _size(part: Part) -> int:
     return len(part.open()) if entry is None else int(entry.own_intersections)
 
 
+@dataclass(frozen=True)
+class _Sent:
+    """A group of masks under way: what will come, the workers that must live, and how often it was sent before."""
+
+    futures: Sequence[Any]
+    group: Sequence[Any]
+    workers: frozenset[str]
+    again: int
+
+
 class _DividedStream(Stream):
     """Sends every group of masks to all workers."""
 
-    def _send(self, group: Sequence[Any]) -> Any:
+    def _send(self, group: Sequence[Any], again: int = 0) -> Any:
         work: _Division = self.work
         shares = owners(list(work.sizes), sorted(self.client.nthreads()) or [""])
         all_shares = list(shares.values())
 
         def on_each(do: Any, *more: Any) -> list[Any]:
-            # A worker that is gone is no reason to wait for it.
-            where = {"allow_other_workers": True, "pure": False, "retries": RETRIES}
+            # There and nowhere else: were it allowed, idle workers would take shares over, and fetch them.
+            where = {"allow_other_workers": False, "pure": False, "retries": RETRIES}
             sent = (self.made, list(group))
             return [self.client.submit(do, *sent, share, *more, workers=[at], **where) for at, share in shares.items()]
 
         looked = self.client.submit(_count_all, all_shares, *on_each(_vote_all, True, None), pure=False)
         voted = self.client.submit(_count_all, all_shares, *on_each(_vote_all, False, looked), pure=False)
-        return on_each(_finish_all, self.client.submit(_decided, looked, voted, pure=False))
+        futures = on_each(_finish_all, self.client.submit(_decided, looked, voted, pure=False))
+        return _Sent(futures, group, frozenset(shares), again)
 
     def _results_of(self, future: Any) -> list[Any]:
+        sent: _Sent = future
         found: dict[int, Outcome] = {}
-        for one in future:
-            found.update(one.result())
+        left = list(sent.futures)
+        while left:
+            try:
+                found.update(left[-1].result(timeout=_LOOK_AGAIN_S))
+                left.pop()
+            except TimeoutError:
+                if sent.workers <= set(self.client.nthreads()):
+                    continue
+                # A worker is gone, and nobody else may do what it was to do: all of the group is sent once more.
+                self.client.cancel(sent.futures)
+                if sent.again == RETRIES:
+                    return [self.work.give_up(task, _DIED) for task in sent.group]
+                return self._take(self._send(sent.group, sent.again + 1), sent.group)
         return [found[k] for k in range(len(found))]
 
 

@@ -16,6 +16,7 @@ from roadgeo.cli import main
 from roadgeo.location import Location
 
 pytest.importorskip("distributed")
+from roadgeo.running import divided
 from roadgeo.running.divided import Ballot, Vote, count, owners
 
 PARTS = [f"0/{n}" for n in range(300)]
@@ -152,3 +153,51 @@ def test_of_a_map_that_lacks_a_part_nothing_is_said(town, tmp_path, monkeypatch,
 def test_it_needs_a_cluster_and_the_usual_search(more, capsys):
     assert main(["locate", __file__, "--divide-map", *more]) == 2
     assert "--divide-map goes with --engine dask" in capsys.readouterr().err
+
+
+class Work:
+    """Stands for what is done with masks on a map of a few parts."""
+
+    sizes = dict.fromkeys(PARTS[:4], 100)
+
+    def give_up(self, task, reason):
+        return f"{task}: {reason}"
+
+
+class Future:
+    def __init__(self, found=None):
+        self.found = found
+
+    def result(self, timeout):
+        if self.found is None:
+            raise TimeoutError
+        return self.found
+
+
+class Client:
+    """A cluster of three workers, which die and come back under other names once a group was sent, `deaths` times."""
+
+    def __init__(self, deaths):
+        self.deaths, self.groups = deaths, 0
+
+    def nthreads(self):
+        return {f"tcp://{self.groups}-{k}": 1 for k in range(3)}
+
+    def submit(self, do, *given, workers=(), **_):
+        if do is divided._decided:
+            self.groups += 1
+        if do is not divided._finish_all:
+            return Future({})
+        return Future() if self.groups <= self.deaths else Future({0: "found"})
+
+    def cancel(self, futures):
+        assert all(future.found is None for future in futures)
+
+
+@pytest.mark.parametrize(("deaths", "found"), [(0, ["found"]), (2, ["found"]), (9, [f"q: {divided._DIED}"])])
+def test_what_a_dead_worker_was_to_do_is_sent_once_more(deaths, found, monkeypatch):
+    monkeypatch.setattr(divided, "_LOOK_AGAIN_S", 0.01)
+    client = Client(deaths)
+    stream = divided._DividedStream(client, Work(), 1)
+    assert stream._take(stream._send(["q"]), ["q"]) == found
+    assert client.groups == min(deaths, divided.RETRIES) + 1
