@@ -2,12 +2,13 @@
 
 from __future__ import annotations
 
+import os
 from contextlib import closing
 from functools import lru_cache
 from pathlib import Path
 from typing import TypeAlias
 
-__all__ = ["Box", "find_area", "is_box", "lies_in", "overlap", "read_box"]
+__all__ = ["Box", "find_area", "is_box", "lies_in", "overlap"]
 
 #: West, south, east and north in degrees. West is greater than east where it crosses the antimeridian.
 Box: TypeAlias = tuple[float, float, float, float]
@@ -24,7 +25,7 @@ def find_area(text: str) -> Box:
         There is none of that name, or there are several.
     """
     if any(sign.isdigit() for sign in text):
-        return read_box(text)
+        return _read_box(text)
     extents, wanted = _extents(), " ".join(text.split()).casefold()
     if not wanted:
         raise ValueError(f"got {text!r}, expected {_BOUNDS} or the name of a country or state")
@@ -43,14 +44,7 @@ def find_area(text: str) -> Box:
     raise ValueError(f"no country or state is called {text!r}; {hint}give {_BOUNDS}")
 
 
-def read_box(text: str) -> Box:
-    """Read "WEST,SOUTH,EAST,NORTH".
-
-    Raises
-    ------
-    ValueError
-        It is none.
-    """
+def _read_box(text: str) -> Box:
     try:
         west, south, east, north = (float(part) for part in text.split(","))
     except ValueError as error:
@@ -99,9 +93,9 @@ def _extents() -> dict[str, tuple[str, Box]]:
         "SELECT name, west_lon, south_lat, east_lon, north_lat FROM extent"
         " WHERE auth_name = 'EPSG' AND NOT deprecated AND west_lon IS NOT NULL AND south_lat < north_lat"
     )
-    for folder in get_data_dir().split(";"):
-        path = Path(folder) / "proj.db"
-        if path.is_file():
-            with closing(sqlite3.connect(f"{path.resolve().as_uri()}?mode=ro", uri=True)) as database:
-                return {str(name).casefold(): (str(name), tuple(box)) for name, *box in database.execute(asked)}
-    raise ValueError(f"areas have no names here, for PROJ's database is missing; give {_BOUNDS}")
+    path = Path(get_data_dir().split(os.pathsep)[0]) / "proj.db"
+    try:
+        with closing(sqlite3.connect(f"{path.resolve().as_uri()}?mode=ro", uri=True)) as database:
+            return {str(name).casefold(): (str(name), tuple(box)) for name, *box in database.execute(asked)}
+    except sqlite3.Error as error:
+        raise ValueError(f"areas have no names here: {path}: {error}; give {_BOUNDS}") from error

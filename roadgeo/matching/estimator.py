@@ -142,7 +142,9 @@ class TripleEstimator:
         trace.began(self)
 
     def stages(self) -> Iterator[Iterator[list[Hypothesis]]]:
-        """Yield, for one anchor after another, the hypotheses that grew: of triples, of roads, of single triples.
+        """Yield, for one anchor after another, the hypotheses that grew.
+
+        Triples propose them, then roads, single triples, and roads of the scene as it may look from above.
 
         On a coarse map roads come first: an intersection is seldom merged there as a mask shows it.
         """

@@ -17,7 +17,8 @@ from __future__ import annotations
 
 import math
 from collections.abc import Iterator, Mapping, Sequence
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, replace
+from functools import cached_property
 from hashlib import blake2b
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -264,11 +265,11 @@ class _Voter:
 
     division: _Division
     asked: Asked
-    names: dict[str, str] = field(init=False)
 
-    def __post_init__(self) -> None:
-        names = {_path(part): name for name, part in _parts_of(self.asked.references).items()}
-        object.__setattr__(self, "names", names)
+    @cached_property
+    def names(self) -> dict[str, str]:
+        """Names of all parts by their files."""
+        return {_path(part): name for name, part in _parts_of(self.asked.references).items()}
 
     def vote(self, task: Task, share: Sequence[str], first: bool) -> Vote:
         """Search a share for a mask. What is wrong with the mask is told when it is finished."""

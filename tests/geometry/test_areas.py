@@ -2,6 +2,7 @@
 
 import pytest
 
+from roadgeo.geometry import areas
 from roadgeo.geometry.areas import find_area, lies_in, overlap
 
 PORTO, SALT_LAKE_CITY, AUCKLAND, TIFLIS = (-8.6, 41.15), (-111.9, 40.76), (174.76, -36.85), (44.8, 41.7)
@@ -61,3 +62,15 @@ def test_what_is_no_area_is_refused(name, said):
 )
 def test_boxes_share_ground_across_the_antimeridian_too(one, other, they_do):
     assert overlap(one, other) == overlap(other, one) == they_do
+
+
+def test_without_projs_database_names_are_refused_and_bounds_are_not(tmp_path, monkeypatch):
+    monkeypatch.setattr("pyproj.datadir.get_data_dir", lambda: str(tmp_path))
+    areas._extents.cache_clear()
+    for content in (None, b"no database at all"):
+        if content is not None:
+            (tmp_path / "proj.db").write_bytes(content)
+        with pytest.raises(ValueError, match=r"areas have no names here.*give WEST"):
+            find_area("Portugal")
+    assert find_area("1,2,3,4") == (1.0, 2.0, 3.0, 4.0)
+    areas._extents.cache_clear()
