@@ -457,6 +457,8 @@ class TripleEstimator:
 
     def _is_far(self, matrix: FloatArray) -> bool:
         """Whether the middle of the frame lies outside the circle, or the box, that the user gave."""
+        if self.near is None and self.options.within is None:
+            return False
         middle, plane, within = Homography(matrix).everywhere(self.scene.center), self.index.plane, self.options.within
         if self.near is not None and np.hypot(*(middle - self.near[:2])) > self.near[2]:
             return True
