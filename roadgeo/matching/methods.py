@@ -32,6 +32,7 @@ from roadgeo.matching.shared_sweeps import SharedSweeps
 from roadgeo.matching.trace import NO_TRACE, Trace
 from roadgeo.matching.triples import larger
 from roadgeo.roads.intersections import Intersections
+from roadgeo.storage.memory import let_pages_go
 
 __all__ = ["Fit", "Found", "search_references"]
 
@@ -169,6 +170,8 @@ def _search(
     """Search parts together."""
     frame_m = 2.0 * query.scene.half_size * options.match.camera.gsd_m[1]
     indexes = _open(parts, options, frame_m)
+    if len(indexes) > 1:  # every search reads all tables, but few roads: those that masks before this one led to go
+        let_pages_go(array for index in indexes for array in index.road_buckets[:3])
     traces = [make_trace() for _ in indexes]
     if len(query.scene.intersections) < options.min_intersections:
         return [Found(index, trace=trace) for index, trace in zip(indexes, traces, strict=True)]

@@ -7,6 +7,8 @@ import ctypes
 import mmap
 from collections.abc import Iterable
 
+import numpy as np
+
 from roadgeo._arrays import AnyArray
 
 __all__ = ["give_back_memory", "let_pages_go"]
@@ -25,12 +27,19 @@ def give_back_memory() -> None:
 def let_pages_go(arrays: Iterable[AnyArray]) -> None:
     """Take the pages of memory-mapped arrays out of this process; those that are used come back by themselves.
 
-    An index is read whole when it is opened, to sum its bytes. A search then looks at part of it.
+    An index is read whole when it is opened, to sum its bytes. A search then looks at part of it. Pages that an array
+    shares with what lies beside it in the file stay.
     """
-    mapped = {id(base): base for base in map(_mapped_file, arrays) if base is not None}
-    for base in mapped.values():
-        with contextlib.suppress(AttributeError, OSError):  # not on Windows
-            base.madvise(mmap.MADV_DONTNEED)
+    for array in arrays:
+        mapped = _mapped_file(array)
+        if mapped is None or not array.size:
+            continue
+        start = array.ctypes.data - np.frombuffer(mapped, np.uint8).ctypes.data
+        end = start + array.itemsize + int(np.subtract(array.shape, 1) @ np.array(array.strides))
+        first, last = -(-start // mmap.PAGESIZE) * mmap.PAGESIZE, end // mmap.PAGESIZE * mmap.PAGESIZE
+        if first < last:
+            with contextlib.suppress(AttributeError, OSError):  # not on Windows
+                mapped.madvise(mmap.MADV_DONTNEED, first, last - first)
 
 
 def _mapped_file(array: AnyArray) -> mmap.mmap | None:

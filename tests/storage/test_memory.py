@@ -52,3 +52,16 @@ def test_pages_of_a_mapped_file_are_let_go_and_come_back(tmp_path) -> None:
     let_pages_go([*views, values, values[3:].view(np.uint8), np.frombuffer(b"abcd", np.uint8)])
     assert before - resident_mb() > 55.0
     assert views[0].sum() == total
+
+
+@pytest.mark.skipif(not sys.platform.startswith("linux"), reason="it asks Linux for what is resident")
+def test_what_lies_beside_it_in_the_file_stays(tmp_path) -> None:
+    np.arange(8_000_000, dtype=np.int64).tofile(tmp_path / "values")
+    with (tmp_path / "values").open("rb") as file:
+        mapped = mmap.mmap(file.fileno(), 0, access=mmap.ACCESS_READ)
+    first, second = (np.frombuffer(mapped, np.int64, 4_000_000 - 7, start) for start in (0, 32_000_000))
+    total = first.sum() + second.sum()
+    before = resident_mb()
+    let_pages_go([second, second[:0], second[5:6]])
+    assert 25.0 < before - resident_mb() < 35.0
+    assert first.sum() + second.sum() == total
