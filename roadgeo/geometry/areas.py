@@ -24,7 +24,8 @@ def find_area(text: str) -> Box:
     ValueError
         There is none of that name, or there are several.
     """
-    if any(sign.isdigit() for sign in text):
+    words = " " in text.strip() and any(sign.isalpha() for sign in text)  # as "Germany - onshore east of 12°E" has
+    if any(sign.isdigit() for sign in text) and not words:
         return _read_box(text)
     extents, wanted = _extents(), " ".join(text.split()).casefold()
     if not wanted:

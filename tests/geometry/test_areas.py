@@ -19,6 +19,8 @@ PORTO, SALT_LAKE_CITY, AUCKLAND, TIFLIS = (-8.6, 41.15), (-111.9, 40.76), (174.7
         ("New Zealand", AUCKLAND),
         ("Georgia", TIFLIS),
         ("-9,41,-8,42", PORTO),
+        ("-9, 41, -8, 42", PORTO),
+        ("Europe - 12°W to 6°W and ETRS89 by country", PORTO),
         ("170,-40,-170,-30", AUCKLAND),
     ],
 )
@@ -35,6 +37,7 @@ def test_an_area_is_found_by_its_name_or_its_bounds(name, place):
         ("", "expected WEST"),
         ("1,2,3", "got '1,2,3'"),
         ("1,2,3,x", "got '1,2,3,x'"),
+        ("Germny 12", "give WEST,SOUTH"),
         ("1,5,3,4", "south below north"),
         ("1,2,1,4", "south below north"),
         ("nan,2,3,4", "south below north"),
