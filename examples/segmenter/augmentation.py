@@ -24,6 +24,7 @@ class Crops:
 
     tiles: list[Tile]
     size: int  # px
+    scales: tuple[float, float] = (0.8, 1.6)  # metres per pixel of most of them, of photographs of 1 m
 
     def __post_init__(self) -> None:
         halves = [half_size(tile) for tile in self.tiles]
@@ -39,7 +40,7 @@ class Crops:
     def draw(self, rng: Generator) -> tuple[Floats, Floats]:
         """Return a photograph (S, S, 3), 0..1, and its truth (S, S, 4), 0..1, as in `Tile.truth`."""
         i = rng.choice(len(self.tiles), p=self._weights)
-        scale = _draw_scale(rng)
+        scale = _draw_scale(rng, self.scales)
         coarse = scale >= 1.6  # bilinear sampling alone would skip pixels
         tile, shrunk = (self._halves[i], 2.0) if coarse else (self.tiles[i], 1.0)
         matrix = self._place(rng, i, scale, shrunk)
@@ -90,10 +91,10 @@ class Crops:
         return photo.astype(np.float32) / 255, truth.astype(np.float32) / 255
 
 
-def _draw_scale(rng: Generator) -> float:
+def _draw_scale(rng: Generator, mostly: tuple[float, float]) -> float:
     """Return metres per pixel (of photographs of 1 m): mostly near what the model is run at, now and then far off."""
     if rng.random() < 0.7:
-        return float(np.exp(rng.uniform(np.log(1.1), np.log(2.0))))
+        return float(np.exp(rng.uniform(*np.log(mostly))))
     return float(np.exp(rng.uniform(np.log(0.45), np.log(2.8))))
 
 

