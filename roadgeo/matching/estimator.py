@@ -14,6 +14,7 @@ from roadgeo.geometry.areas import Box, lies_in
 from roadgeo.geometry.camera import CameraFault, CameraOptions, judge, sampling
 from roadgeo.geometry.homography import Homography
 from roadgeo.geometry.projection import to_lonlat
+from roadgeo.matching.exactness import exact_log10_odds
 from roadgeo.matching.growing import PATIENT, GrowOptions, grow_proposals, screen_proposals
 from roadgeo.matching.hypothesis import MINIMAL, Hypothesis, Lead
 from roadgeo.matching.index import ReferenceIndex
@@ -38,7 +39,7 @@ from roadgeo.matching.sweeps import LAST, USUAL, Source, Sweep
 from roadgeo.matching.tilted import TiltOptions
 from roadgeo.matching.trace import NO_TRACE, Trace
 from roadgeo.matching.triples import Proposals, larger
-from roadgeo.matching.verification import VerifyOptions, agreement, chance_agreement, log10_odds
+from roadgeo.matching.verification import VerifyOptions, agreement, chance_agreement, least_chance, log10_odds
 from roadgeo.matching.work import Work
 
 __all__ = ["Ledger", "MatchOptions", "Source", "Sweep", "TripleEstimator"]
@@ -122,8 +123,7 @@ class TripleEstimator:
         self.ledger = ledger or Ledger()
         self.trace = trace
         self.refine_s = 0.0
-        # The least that chance reached at the places verified so far: a place that is not promising against it is none.
-        self.least_chance = np.array([0.05, 0.2, 0.05])
+        self.chances: list[FloatArray] = []  # at the places verified so far, quickly measured
         self.n_nulls = 0
         self._dropped: list[Hypothesis] = []
         self._looked: list[tuple[Hypothesis, float]] = []  # through a lens, and which share of roads agreed without
@@ -308,15 +308,19 @@ class TripleEstimator:
 
     def score(self, model: Hypothesis) -> float:
         """Refine a hypothesis and return its log10 odds."""
-        started = time.perf_counter()
+        started, options = time.perf_counter(), self.options
         if model.lens is None:
             model.log10_odds = self._verify(model)
         if model.lens is not None:
             self._see_through(model, model.lens)
-        elif model.log10_odds >= self.options.verify.promising:
+        elif model.log10_odds >= options.verify.promising:
             self._look_through_lens(model)
         elif model.refined is not None:
             self._dropped.append(model)
+        if model.log10_odds >= options.verify.promising - options.verify.most_raised:
+            scene, n_tried = self.scene_of(model), self.ledger.n_tried
+            verify, certain = options.verify, options.certain
+            model.log10_odds = exact_log10_odds(model, scene, self.index, n_tried, verify, certain, self.near)
         if model.log10_odds > 0.0 and self._loses(model):
             model.log10_odds = 0.0
         model.n_tried = self.ledger.n_tried
@@ -347,7 +351,7 @@ class TripleEstimator:
         self.n_verified += 1
         scene, index, options = self.scene, self.index, self.options
         # What a wrong place reaches is soon seen; only promising ones are worth all points and all of a null model.
-        chance = self.least_chance
+        chance = least_chance(self.chances)
         for n_points, every in ((150, 0), (300, 6), (None, 1)):
             if not self._converge(model, n_points):
                 return -np.inf
@@ -356,10 +360,10 @@ class TripleEstimator:
                     model.matrix, scene, index, model.gsd_m, options.verify, every, near=self.near
                 )
                 chance = np.array(model.chance)
+                self.chances += [chance] * (every > 1)
             model.log10_odds = self._odds(model, chance)
-            if model.log10_odds < options.verify.promising:
+            if model.log10_odds < options.verify.promising - options.verify.most_raised:
                 return model.log10_odds
-        self.least_chance = np.minimum(self.least_chance, chance) if self.n_nulls else chance
         self.n_nulls += 1
         return model.log10_odds
 

@@ -55,7 +55,7 @@ from roadgeo.matching.record import Record, Scored, without_limits
 from roadgeo.matching.scene import Scene
 from roadgeo.matching.search import SearchResult
 from roadgeo.matching.verdict import Needed
-from roadgeo.matching.verification import Agreement, tolerance_m
+from roadgeo.matching.verification import Agreement, least_chance, tolerance_m
 from roadgeo.roads.graph import RoadGraph
 
 if TYPE_CHECKING:
@@ -287,7 +287,7 @@ def _describe(
     camera = pose(model.matrix, scene.size)
     # chance at the place, or the least seen elsewhere where it was not worth measuring
     measured = model.chance != (1.0, 1.0, 1.0)
-    chance = model.chance if measured else tuple(float(share) for share in search.least_chance)
+    chance = model.chance if measured else tuple(float(share) for share in least_chance(search.chances))
     # where it lies
     ground = Homography(model.matrix).everywhere(np.vstack([scene.corners, scene.center]))
     in_crs = index.plane.to_crs(ground)

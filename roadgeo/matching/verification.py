@@ -22,7 +22,19 @@ from roadgeo.kernels.roads import backward_agreement, forward_distances, shares_
 from roadgeo.matching.index import ReferenceIndex
 from roadgeo.matching.scene import Scene
 
-__all__ = ["Agreement", "VerifyOptions", "agreement", "chance_agreement", "log10_odds", "tolerance_m"]
+__all__ = [
+    "Agreement",
+    "VerifyOptions",
+    "agreement",
+    "chance_agreement",
+    "least_chance",
+    "log10_odds",
+    "tolerance_m",
+]
+
+#: So many places tell what chance reaches at least elsewhere on the map.
+_ENOUGH_PLACES = 4
+_OPEN_GROUND = (0.05, 0.2, 0.05)
 
 
 @dataclass(frozen=True)
@@ -59,6 +71,12 @@ class VerifyOptions:
     promising : float
         Log10 odds that a place must reach against the least chance seen so far before a null of its own is measured.
         They are an upper bound: below 1 a place is neither located (3.5) nor within the margin (2.0) of one that is.
+    finer : tuple of float
+        Shares of the tolerance within which roads and intersections are compared as well (see `exactness`).
+    most_raised : float
+        That what agrees does so exactly raises log10 odds by no more. In a lattice blocks differ by metres: a place
+        that was fitted to them agrees more exactly than its shifted copies, wherever it lies (a mask of Chicago that
+        was turned over: 0.4, and 22 within a third of the tolerance).
     """
 
     map_sigma_m: float = 1.8
@@ -75,6 +93,12 @@ class VerifyOptions:
     least_rates: tuple[float, float, float] = (0.2, 0.5, 0.5)
     least_won: float = 0.5
     promising: float = 1.0
+    finer: tuple[float, ...] = (0.6, 0.35)
+    most_raised: float = 1.5
+
+    def within(self, share: float) -> VerifyOptions:
+        """Return the options with a share of the tolerance."""
+        return replace(self, map_sigma_m=share * self.map_sigma_m, pixel_sigma_px=share * self.pixel_sigma_px)
 
     @property
     def ray_cos(self) -> float:
@@ -203,6 +227,14 @@ def chance_agreement(
         )  # fmt: skip
         rates[i, 2] = shown / max(seen, 1)
     return _mean_of_best(rates[:, 0], n_best), _mean_of_best(rates[:, 1], n_best), _mean_of_best(rates[best, 2], n_best)
+
+
+def least_chance(chances: Sequence[FloatArray]) -> FloatArray:
+    """Return the least rates (3,) that chance reached at places seen before: what is no place against these is none.
+
+    A few places say little of others: before there are enough it is a guess, of open ground.
+    """
+    return np.asarray(np.min(chances, axis=0)) if len(chances) >= _ENOUGH_PLACES else np.array(_OPEN_GROUND)
 
 
 def _mean_of_best(rates: FloatArray, count: int) -> float:
