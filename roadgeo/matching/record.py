@@ -107,7 +107,7 @@ def without_limits(record: Record, estimator: TripleEstimator) -> list[Scored]:
     scene, index, options = estimator.scene, estimator.index, estimator.options
     camera = CameraOptions(gsd_m=(0.0, math.inf), max_tilt_deg=180.0, max_skew=math.inf)
     free = TripleEstimator(scene, index, replace(options, camera=camera), ledger=estimator.ledger)
-    free.chances = estimator.chances
+    free.chances = list(estimator.chances)
     nobody = np.empty(0, np.int64)
     compared = []
     for fault, unscaled in record.unscaled:

@@ -69,7 +69,8 @@ class VerifyOptions:
         agree, of the frame cut into sixteenths: a place that loses more is none, however well the rest fits. At the 8
         of 1,142 right places where that was asked it is 0.55 and more; at a wrong one that had 10^8, 0.47.
     promising : float
-        Log10 odds that a place must reach against the least chance seen so far before a null of its own is measured.
+        Log10 odds that a place must reach against the least chance seen so far, raised as far as they may be, before a
+        null of its own is measured.
         They are an upper bound: below 1 a place is neither located (3.5) nor within the margin (2.0) of one that is.
     finer : tuple of float
         Shares of the tolerance within which roads and intersections are compared as well (see `exactness`).
