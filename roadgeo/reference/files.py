@@ -5,6 +5,7 @@ from __future__ import annotations
 import contextlib
 import math
 import os
+import time
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass, fields
 from pathlib import Path
@@ -62,6 +63,13 @@ Freshness: TypeAlias = Literal["fresh", "stale", "no index", "old format", "no G
 
 #: Largest distance between the intersections of a tuple whose types are counted, as in the paper's Figure 7 (eq. 8).
 TUPLE_DISTANCE_M = 500.0
+
+#: Seconds after which a stale index is one: until then a writer may be about to replace it.
+_PATIENCE_S = 0.5
+
+
+class _StaleError(IndexFormatError):
+    """The index was built from other intersections than those of the GeoPackage beside it."""
 
 
 @dataclass(frozen=True)
@@ -141,23 +149,26 @@ def open_reference(
         When there is no such reference, or its index is missing (without `rebuild`), damaged, hostile or stale.
     """
     paths = reference_paths(path)
-    failed = None
+    failed, patience = None, time.monotonic() + _PATIENCE_S
     while True:
         before = _identities(paths)
         try:
             return _open(paths, rebuild)
-        except IndexFormatError:
+        except IndexFormatError as error:
             # Another process may have replaced the reference meanwhile: what we saw was half the old one, half the new.
             # Equal files before and after are no proof, for an index may have come and gone between; twice is.
             if _identities(paths) == before == failed:
-                raise
+                # But a third may have built the old index beside the new GeoPackage, which a busy writer will replace.
+                if not isinstance(error, _StaleError) or time.monotonic() > patience:
+                    raise
+                time.sleep(0.02)
             failed = before
 
 
 def _open(paths: ReferencePaths, rebuild: Callable[[RoadNetwork], IndexParts] | None) -> IndexParts:
     freshness = reference_freshness(paths.geopackage)
     if freshness == "stale":
-        raise IndexFormatError(
+        raise _StaleError(
             f"{paths.index} is stale: the intersections of {paths.geopackage.name} were changed after it was built; "
             + remedy(paths.index)
         )

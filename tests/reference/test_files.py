@@ -6,6 +6,7 @@ import subprocess
 import sys
 import time
 from collections.abc import Iterator
+from concurrent.futures import ThreadPoolExecutor
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
@@ -265,6 +266,26 @@ def test_readers_are_not_disturbed_by_a_writer(tmp_path: Path) -> None:
             n_opened[meta["n"]] += 1
         writer.kill()
     assert min(n_opened.values()) > 0
+
+
+def test_an_index_that_is_stale_for_a_moment_is_waited_for(path: Path) -> None:
+    """A reader that met no index built the old one's, and a busy writer has yet to replace it."""
+    older = reference_paths(path).index.read_bytes()
+    newer = as_stored(grid_network(seed=7))
+    write_reference(path, newer, parts(newer))
+    index = reference_paths(path).index
+    whole = index.read_bytes()
+    index.write_bytes(older)
+
+    def publish() -> None:
+        time.sleep(0.1)
+        aside = index.with_suffix(".new")
+        aside.write_bytes(whole)
+        aside.replace(index)
+
+    with ThreadPoolExecutor(1) as writer:
+        writer.submit(publish)
+        np.testing.assert_array_equal(open_reference(path)[1]["xy"], newer.intersections.xy)
 
 
 @pytest.mark.slow
