@@ -14,7 +14,7 @@ from roadgeo.geometry.areas import Box, lies_in
 from roadgeo.geometry.camera import CameraFault, CameraOptions, judge, sampling
 from roadgeo.geometry.homography import Homography
 from roadgeo.geometry.projection import to_lonlat
-from roadgeo.matching.exactness import exact_log10_odds
+from roadgeo.matching.exactness import exact_log10_odds, may_stand
 from roadgeo.matching.growing import PATIENT, GrowOptions, grow_proposals, screen_proposals
 from roadgeo.matching.hypothesis import MINIMAL, Hypothesis, Lead
 from roadgeo.matching.index import ReferenceIndex
@@ -317,7 +317,7 @@ class TripleEstimator:
             self._look_through_lens(model)
         elif model.refined is not None:
             self._dropped.append(model)
-        if model.log10_odds >= options.verify.promising - options.verify.most_raised:
+        if may_stand(model, options.verify):
             scene, n_tried = self.scene_of(model), self.ledger.n_tried
             verify, certain = options.verify, options.certain
             model.log10_odds = exact_log10_odds(model, scene, self.index, n_tried, verify, certain, self.near)
@@ -362,7 +362,7 @@ class TripleEstimator:
                 chance = np.array(model.chance)
                 self.chances += [chance] * (every > 1)
             model.log10_odds = self._odds(model, chance)
-            if model.log10_odds < options.verify.promising - options.verify.most_raised:
+            if not may_stand(model, options.verify):
                 return model.log10_odds
         self.n_nulls += 1
         return model.log10_odds

@@ -2,14 +2,26 @@
 
 from __future__ import annotations
 
+import math
+from dataclasses import replace
 from statistics import fmean
 
 from roadgeo.matching.hypothesis import MINIMAL, Hypothesis
 from roadgeo.matching.index import ReferenceIndex
 from roadgeo.matching.scene import Scene
-from roadgeo.matching.verification import VerifyOptions, agreement, chance_agreement, log10_odds
+from roadgeo.matching.verification import Agreement, VerifyOptions, agreement, chance_agreement, log10_odds
 
-__all__ = ["exact_log10_odds"]
+__all__ = ["exact_log10_odds", "may_stand"]
+
+#: Masks are whole as often as not, as far as is known: each kind is charged for the other.
+_TWO_KINDS = math.log10(2.0)
+
+
+def may_stand(model: Hypothesis, options: VerifyOptions) -> bool:
+    """Whether a place that was verified within the usual tolerance may be located after finer ones."""
+    if model.found is None or not math.isfinite(model.log10_odds):
+        return False
+    return _is_whole(model.found, options) or model.log10_odds >= options.promising - options.most_raised
 
 
 def exact_log10_odds(
@@ -21,20 +33,37 @@ def exact_log10_odds(
     certain: float,
     near: tuple[float, float, float] | None = None,
 ) -> float:
-    """Return the log10 odds of a place: the mean of those within the usual tolerance and within finer ones.
+    """Return the log10 odds of a place: those of a mask of any kind, or of a whole one if they are higher.
 
-    How accurate a mask is on its map is not known. At its own place most of what agrees does so exactly, and the odds
-    within all tolerances are alike; where something like it lies, such as another motorway junction, it agrees roughly.
-    Odds are pooled by the mean of their logarithms (Genest and Zidek, Statistical Science 1, 1986), which is low where
-    they disagree. `model.log10_odds` are those within the usual tolerance; they are raised by `options.most_raised`
-    at most, and stay what they are from `certain` on.
+    Of any kind they are the mean of those within the usual tolerance and within finer ones. How accurate a mask is on
+    its map is not known. At its own place most of what agrees does so exactly, and the odds within all tolerances are
+    alike; where something like it lies, such as another motorway junction, it agrees roughly. Odds are pooled by the
+    mean of their logarithms (Genest and Zidek, Statistical Science 1, 1986), which is low where they disagree.
+    `model.log10_odds` are those within the usual tolerance; they are raised by `options.most_raised` at most, and stay
+    what they are from `certain` on.
+
+    A whole mask shows nearly all that the map shows, and little else, within the finest tolerance. Then not only each
+    road is a statement but every piece of it: a winding road of a kilometre is as hard to meet by chance as many short
+    ones. In a lattice a place that was fitted agrees more exactly than its shifted copies: what chance reaches is taken
+    within a wider tolerance, the finest but one.
     """
     if model.log10_odds >= certain:
         return model.log10_odds
     logs = [model.log10_odds]
+    found, chance, wider = None, model.chance, model.chance
     for share in options.finer:
-        verify = options.within(share)
+        verify, wider = options.within(share), chance
         found, _, _ = agreement(model.matrix, scene, index, model.gsd_m, model.seeds[-MINIMAL:], verify)
         chance = chance_agreement(model.matrix, scene, index, model.gsd_m, verify, near=near)
         logs.append(log10_odds(found, chance, scene.n_statements, n_candidates, verify))
-    return min(fmean(logs), model.log10_odds + options.most_raised)
+    pooled = min(fmean(logs), model.log10_odds + options.most_raised)
+    if found is None or not _is_whole(found, options):
+        return pooled
+    whole = replace(options, least_rates=options.whole_rates, statement_m=options.whole_statement_m)
+    n_pieces = scene.counting_length_px * model.gsd_m / options.whole_statement_m
+    of_whole = log10_odds(found, wider, n_pieces, n_candidates, whole) - _TWO_KINDS
+    return max(pooled, of_whole)
+
+
+def _is_whole(found: Agreement, options: VerifyOptions) -> bool:
+    return min(found.forward, found.backward) >= options.least_whole

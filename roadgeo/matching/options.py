@@ -49,7 +49,7 @@ class LocateOptions:
     near: tuple[float, float, float] | None = None
     min_log10_odds: float = 3.5
     min_margin: float = 2.0
-    min_intersections: int = 3
+    min_intersections: int = 1
     twins: TwinOptions | None = field(default_factory=lambda: TwinOptions.nearby(4000.0, n_places=12))
     truths: tuple[tuple[str, float, float], ...] = ()
     threads: int = 1

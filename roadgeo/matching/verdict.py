@@ -278,7 +278,8 @@ def _why_nothing(query: Query, found: Found, score: float, options: LocateOption
     """Say why nothing is reported, to programs and to people, and what may help."""
     n, needed = len(query.scene.intersections), options.min_intersections
     if n < needed:
-        return Reason.FEW_INTERSECTIONS, f"only {n} intersections are seen, at least {needed} are needed"
+        seen = f"only {n} intersections are seen" if n else "no intersections are seen"
+        return Reason.FEW_INTERSECTIONS, f"{seen}, at least {needed} {'is' if needed == 1 else 'are'} needed"
     if found.said:
         return Reason.TIME_LIMIT if found.stopped in ("work", "time") else Reason.NOTHING_STANDS_OUT, found.said
     searched = searched_within(options)

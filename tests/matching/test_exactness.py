@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 from worlds.scenes import Sight, camera, look, scene_of
 
-from roadgeo.matching.exactness import exact_log10_odds
+from roadgeo.matching.exactness import exact_log10_odds, may_stand
 from roadgeo.matching.hypothesis import Hypothesis
 from roadgeo.matching.verification import VerifyOptions, agreement, chance_agreement, least_chance, log10_odds
 
@@ -48,9 +48,37 @@ def test_what_agrees_roughly_has_less(town, scene):
     assert exact_log10_odds(model, scene, town[1], 1, OPTIONS, 1e3) < 0.75 * model.log10_odds
 
 
-def test_exactness_raises_odds_by_no_more_than_is_said(town, scene):
-    model = replace(verified(TRUTH, scene, town[1]), log10_odds=2.0)
-    assert exact_log10_odds(model, scene, town[1], 1, OPTIONS, 1e3) == 2.0 + OPTIONS.most_raised
+@pytest.fixture(scope="module")
+def broken(town):
+    """Two thirds of the roads are missing, and as many are false."""
+    return scene_of(look(town[0], TRUTH, sight=Sight(0.5, 0.65, 0.65)))
+
+
+def test_exactness_raises_odds_of_a_broken_mask_by_no_more_than_is_said(town, broken):
+    model = replace(verified(TRUTH, broken, town[1]), log10_odds=2.0)
+    assert exact_log10_odds(model, broken, town[1], 1, OPTIONS, 1e3) == 2.0 + OPTIONS.most_raised
+
+
+def test_every_piece_of_a_whole_mask_is_a_statement(town, scene):
+    """Two winding roads of a kilometre each are two roads, but hard to meet by chance."""
+    few = replace(scene, n_edges=4, intersections=scene.intersections.only(np.arange(1)), branches=scene.branches[:1])
+    model = verified(TRUTH, few, town[1])
+    assert model.log10_odds < 3.5
+    assert exact_log10_odds(model, few, town[1], 100_000, OPTIONS, 1e3) > 10.0
+
+
+@pytest.mark.parametrize("worse", [4.0, None])
+def test_pieces_of_no_other_mask_are(town, scene, broken, worse):
+    one, matrix = (broken, TRUTH) if worse is None else (scene, shifted(worse))
+    few = replace(one, n_edges=4, intersections=one.intersections.only(np.arange(1)), branches=one.branches[:1])
+    model = verified(matrix, few, town[1])
+    assert exact_log10_odds(model, few, town[1], 1, OPTIONS, 1e3) < model.log10_odds + OPTIONS.most_raised
+
+
+def test_a_place_that_a_camera_cannot_see_stands_no_chance(town, scene):
+    assert may_stand(replace(verified(TRUTH, scene, town[1]), log10_odds=-5.0), OPTIONS)
+    assert not may_stand(replace(verified(TRUTH, scene, town[1]), log10_odds=-np.inf), OPTIONS)
+    assert not may_stand(Hypothesis(TRUTH, NO_SEEDS, 1.0, NO_SEEDS), OPTIONS)
 
 
 def test_places_tried_are_charged_once(town, scene):

@@ -67,6 +67,29 @@ def test_few_ends_are_not_enough() -> None:
     assert find_voids(roads, WIDTH, VoidOptions(sure_ends=2, least_ends=2)) is not None
 
 
+def test_half_a_frame_is_told_by_three_ends() -> None:
+    """So few may end on a line by chance, but not where half of the frame lies beyond it and is empty."""
+    image = np.zeros((SIZE, SIZE), np.uint8)
+    for y in (100, 310, 480):
+        cv2.line(image, (0, y), (SIZE, y + 60), 255, WIDTH)
+    cv2.line(image, (120, 0), (150, SIZE), 255, WIDTH)
+    image[:, 300:] = 0
+    observed = find_voids(image > 0, WIDTH)
+    assert observed is not None
+    assert observed[:, :298].all()
+    assert not observed[:, 302:].any()
+    image[:, 300:] = image[:, :300]  # where roads go on beyond, no road ends
+    assert find_voids(image > 0, WIDTH) is None
+
+
+def test_three_ends_beside_a_narrow_strip_are_not_enough() -> None:
+    image = np.zeros((SIZE, SIZE), np.uint8)
+    for y in (100, 310, 480):
+        cv2.line(image, (0, y), (SIZE, y + 60), 255, WIDTH)
+    image[:, SIZE - 40 :] = 0
+    assert find_voids(image > 0, WIDTH) is None
+
+
 @pytest.mark.parametrize("shape", [(1, 1), (40, 60)])
 def test_a_mask_of_road_alone(shape: tuple[int, int]) -> None:
     assert find_voids(np.ones(shape, bool), 5.0) is None
