@@ -69,7 +69,7 @@ SCHEMA = "roadgeo.explanation/1"
 _MAX_PLACES = 6
 
 #: Masks with fewer intersections are seldom located.
-_USUAL_INTERSECTIONS = 12
+_USUAL_INTERSECTIONS = 6
 
 
 @dataclass(frozen=True)
