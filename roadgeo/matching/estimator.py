@@ -317,10 +317,9 @@ class TripleEstimator:
             self._look_through_lens(model)
         elif model.refined is not None:
             self._dropped.append(model)
-        if may_stand(model, options.verify):
-            scene, n_tried = self.scene_of(model), self.ledger.n_tried
-            verify, certain = options.verify, options.certain
-            model.log10_odds = exact_log10_odds(model, scene, self.index, n_tried, verify, certain, self.near)
+        scene, n_tried = self.scene_of(model), self.ledger.n_tried
+        verify, certain = options.verify, options.certain
+        model.log10_odds = exact_log10_odds(model, scene, self.index, n_tried, verify, certain, self.near)
         if model.log10_odds > 0.0 and self._loses(model):
             model.log10_odds = 0.0
         model.n_tried = self.ledger.n_tried

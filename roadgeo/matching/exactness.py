@@ -47,7 +47,7 @@ def exact_log10_odds(
     ones. In a lattice a place that was fitted agrees more exactly than its shifted copies: what chance reaches is taken
     within a wider tolerance, the finest but one.
     """
-    if model.log10_odds >= certain:
+    if model.log10_odds >= certain or not may_stand(model, options):
         return model.log10_odds
     logs = [model.log10_odds]
     found, chance, wider = None, model.chance, model.chance

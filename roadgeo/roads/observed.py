@@ -34,7 +34,9 @@ class VoidOptions:
         Beyond a line with so much of the frame, fewer roads need end on it: of 360 masks without a void 31 had a line
         on which 3 roads end, and at most 0.07 of the frame lay beyond any of them.
     wide_ends
-        So many.
+        So many. One of 55 real masks had a line with 3 ends beside a wood, 0.33 of the frame's side long.
+    wide_length
+        As `min_length`, of such a line.
     max_cut
         Largest share of the frame that may lie beyond one line.
     """
@@ -45,6 +47,7 @@ class VoidOptions:
     min_length: float = 0.12
     wide: float = 0.15
     wide_ends: int = 3
+    wide_length: float = 0.45
     max_cut: float = 0.75
 
 
@@ -78,9 +81,10 @@ def find_voids(roads: BoolArray, road_width_px: float, options: VoidOptions | No
     is_warped = max(ends, default=0) >= options.sure_ends
     observed = np.ones(roads.shape, np.bool_)
     for side, n in zip(sides, ends, strict=True):
-        if n >= min(options.least_ends, options.wide_ends):
-            least = 0.0 if is_warped and n >= options.least_ends else options.wide
-            _cut(observed, side, least, options.max_cut)
+        if is_warped and n >= options.least_ends:
+            _cut(observed, side, 0.0, options.max_cut)
+        elif n >= options.wide_ends and side.length >= options.wide_length * min(roads.shape):
+            _cut(observed, side, options.wide, options.max_cut)
     return None if observed.all() else observed
 
 

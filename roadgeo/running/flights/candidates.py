@@ -27,7 +27,8 @@ from roadgeo.geometry.homography import Homography
 from roadgeo.geometry.mask import PIXEL_TO_PLANE, RoadMask
 from roadgeo.location import Location
 from roadgeo.matching.checking import CheckOptions, check_place
-from roadgeo.matching.estimator import TripleEstimator
+from roadgeo.matching.estimator import MatchOptions, TripleEstimator
+from roadgeo.matching.exactness import exact_log10_odds
 from roadgeo.matching.hypothesis import Hypothesis
 from roadgeo.matching.index import ReferenceIndex
 from roadgeo.matching.methods import Fit, Found, search_references
@@ -181,7 +182,8 @@ class _Candidate:
         matrix, gsd = refined.matrix, sampling(refined.matrix, whole.size)
         found, matched, distance = agreement(matrix, whole, self.index, gsd, _NO_SEEDS, match.verify)
         chance = chance_agreement(matrix, whole, self.index, gsd, match.verify)
-        self.proposed = log10_odds(found, chance, whole.n_statements, self.n_tried, match.verify)
+        model = Hypothesis(matrix, _NO_SEEDS, 1.0, matched, found=found, chance=chance, gsd_m=gsd)
+        self.proposed = _odds(model, whole, self.index, self.n_tried, match)
         self.matrix, self.seen_at = matrix @ PIXEL_TO_PLANE @ look.mosaic.to_mosaic[-1], look.numbers[-1]
         self.fit = Fit(
             self.index, matrix, matched, distance, found.forward, self.proposed,
@@ -394,7 +396,16 @@ def _fully_scored(model: Hypothesis, estimator: TripleEstimator) -> float:
     if model.found is None:
         return -math.inf
     chance = chance_agreement(model.matrix, scene, index, model.gsd_m, verify)
-    return log10_odds(model.found, chance, scene.n_statements, estimator.ledger.n_tried, verify)
+    return _odds(replace(model, chance=chance), scene, index, estimator.ledger.n_tried, estimator.options)
+
+
+def _odds(model: Hypothesis, scene: Scene, index: ReferenceIndex, n_tried: int, match: MatchOptions) -> float:
+    """Return the log10 odds of a place that was compared with the map, as a search does it."""
+    if model.found is None:
+        return -math.inf
+    usual = log10_odds(model.found, model.chance, scene.n_statements, n_tried, match.verify)
+    model = replace(model, log10_odds=usual)
+    return exact_log10_odds(model, scene, index, n_tried, match.verify, match.certain)
 
 
 def _leads(matrix: FloatArray, scene: Scene, index: ReferenceIndex, options: CandidateOptions) -> bool:
