@@ -36,7 +36,7 @@ class VoidOptions:
     wide_ends
         So many. One of 55 real masks had a line with 3 ends beside a wood, 0.33 of the frame's side long.
     wide_length
-        As `min_length`, of such a line.
+        As `min_length`, of a line with fewer than `least_ends`.
     max_cut
         Largest share of the frame that may lie beyond one line.
     """
@@ -81,10 +81,10 @@ def find_voids(roads: BoolArray, road_width_px: float, options: VoidOptions | No
     is_warped = max(ends, default=0) >= options.sure_ends
     observed = np.ones(roads.shape, np.bool_)
     for side, n in zip(sides, ends, strict=True):
-        if is_warped and n >= options.least_ends:
-            _cut(observed, side, 0.0, options.max_cut)
-        elif n >= options.wide_ends and side.length >= options.wide_length * min(roads.shape):
-            _cut(observed, side, options.wide, options.max_cut)
+        is_long = n >= options.wide_ends and side.length >= options.wide_length * min(roads.shape)
+        if n >= options.least_ends or is_long:
+            least = 0.0 if is_warped and n >= options.least_ends else options.wide
+            _cut(observed, side, least, options.max_cut)
     return None if observed.all() else observed
 
 
