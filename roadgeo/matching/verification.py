@@ -83,7 +83,7 @@ class VerifyOptions:
         else (see `exactness`).
     least_whole : float
         Where less of the query's roads or of the map's agree within the finest tolerance, the mask is not whole. At
-        the best 1,809 wrong places of 210 masks 6 had more; at 100 of 108 right ones of few intersections or half of
+        the best 1,809 wrong places of 305 masks 6 had more; at 100 of 108 right ones of few intersections or half of
         the frame it is so.
     """
 
