@@ -18,6 +18,7 @@ from roadgeo.matching.exactness import exact_log10_odds, may_stand
 from roadgeo.matching.growing import PATIENT, GrowOptions, grow_proposals, screen_proposals
 from roadgeo.matching.hypothesis import MINIMAL, Hypothesis, Lead
 from roadgeo.matching.index import ReferenceIndex
+from roadgeo.matching.leaning import lean_as_a_camera
 from roadgeo.matching.ledger import Ledger
 from roadgeo.matching.lens import (
     LensFit,
@@ -310,6 +311,7 @@ class TripleEstimator:
         """Refine a hypothesis and return its log10 odds."""
         started, options = time.perf_counter(), self.options
         if model.lens is None:
+            lean_as_a_camera(model, self.scene, self.index, options.camera, options.verify)
             model.log10_odds = self._verify(model)
         if model.lens is not None:
             self._see_through(model, model.lens)
@@ -317,9 +319,8 @@ class TripleEstimator:
             self._look_through_lens(model)
         elif model.refined is not None:
             self._dropped.append(model)
-        scene, n_tried = self.scene_of(model), self.ledger.n_tried
-        verify, certain = options.verify, options.certain
-        model.log10_odds = exact_log10_odds(model, scene, self.index, n_tried, verify, certain, self.near)
+        scene, tried, certain = self.scene_of(model), self.ledger.n_tried, options.certain
+        model.log10_odds = exact_log10_odds(model, scene, self.index, tried, options.verify, certain, self.near)
         if model.log10_odds > 0.0 and self._loses(model):
             model.log10_odds = 0.0
         model.n_tried = self.ledger.n_tried
@@ -334,8 +335,7 @@ class TripleEstimator:
         verify, found = self.options.verify, model.found
         if found is None or found.forward >= verify.least_rates[1]:
             return False
-        won = share_won(model.matrix, self.scene_of(model), self.index, model.gsd_m, verify)
-        return won < verify.least_won
+        return share_won(model.matrix, self.scene_of(model), self.index, model.gsd_m, verify) < verify.least_won
 
     def evidence(self, model: Hypothesis) -> float:
         """Return the log10 odds of a hypothesis without what is charged for the places tried."""
@@ -409,12 +409,13 @@ class TripleEstimator:
                 twin.leads += [lead for lead in one.leads if lead not in twin.leads]
             elif len(places) < options.max_places:
                 places.append(one)
+        self.trace.grown(places)
         for one in places:
-            self.n_verified += 1
             found = regrow(one.matrix, scene, index, refinement, options)
             if found is None or self.judge(found.matrix) is not None or self._is_far(found.matrix):
                 yield []
             elif is_significant(found, scene, options):
+                self.n_verified += 1
                 yield [replace(one, lens=found)]
             else:  # no lens: it had not grown over the whole frame
                 yield [replace(one, matrix=found.matrix, refined=None, by_roads=True)]

@@ -1,4 +1,4 @@
-"""How exactly a mask and the map agree at a place: its odds within finer tolerances."""
+"""How exactly a mask and the map agree at a place: its odds within finer tolerances, and in the foreground."""
 
 from __future__ import annotations
 
@@ -6,6 +6,7 @@ import math
 from dataclasses import replace
 from statistics import fmean
 
+from roadgeo.matching.foreground import foreground
 from roadgeo.matching.hypothesis import MINIMAL, Hypothesis
 from roadgeo.matching.index import ReferenceIndex
 from roadgeo.matching.scene import Scene
@@ -46,7 +47,35 @@ def exact_log10_odds(
     road is a statement but every piece of it: a winding road of a kilometre is as hard to meet by chance as many short
     ones. In a lattice a place that was fitted agrees more exactly than its shifted copies: what chance reaches is taken
     within a wider tolerance, the finest but one.
+
+    Where the camera leaned, the place has the odds of the foreground alone if they are higher and most agrees there
+    (see `foreground`).
     """
+    odds = _exact(model, scene, index, n_candidates, options, certain, near)
+    if odds >= certain:
+        return odds
+    part = foreground(model, scene, options.foreground, options.least_whole)
+    if part is None:
+        return odds
+    found, _, _ = agreement(model.matrix, part.scene, index, model.gsd_m, part.seeds[-MINIMAL:], options)
+    if not _is_whole(found, options):
+        return odds
+    chance = chance_agreement(model.matrix, part.scene, index, model.gsd_m, options, near=near)
+    usual = log10_odds(found, chance, part.scene.n_statements, n_candidates, options)
+    seen = replace(model, found=found, chance=chance, log10_odds=usual, seeds=part.seeds)
+    return max(odds, _exact(seen, part.scene, index, n_candidates, options, certain, near) - _TWO_KINDS)
+
+
+def _exact(
+    model: Hypothesis,
+    scene: Scene,
+    index: ReferenceIndex,
+    n_candidates: int,
+    options: VerifyOptions,
+    certain: float,
+    near: tuple[float, float, float] | None,
+) -> float:
+    """Return the odds of a place by all that a scene shows."""
     if model.log10_odds >= certain or not may_stand(model, options):
         return model.log10_odds
     logs = [model.log10_odds]

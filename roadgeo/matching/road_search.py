@@ -121,8 +121,13 @@ class RoadSearch:
         options: RoadSearchOptions,
         near: tuple[float, float, float] | None = None,
         ahead: Ahead = ALONE,
+        voters: IntArray | None = None,
     ) -> None:
-        """`near` = (x, y, radius) in plane metres restricts where the middle of the frame may lie."""
+        """`near` = (x, y, radius) in plane metres restricts where the middle of the frame may lie.
+
+        Of the query's intersections only the `voters` propose.
+        """
+        self.voters = np.arange(len(scene.intersections)) if voters is None else voters
         self.scene, self.options, self.ahead = scene, options, ahead
         self.n_tried = 0
         scale = options.scales(camera, scene.road_width_px)
@@ -138,9 +143,9 @@ class RoadSearch:
 
         `only` names the anchors to try. None is tried twice.
         """
-        xy = self.scene.intersections.xy
+        xy = self.scene.intersections.xy[self.voters]
         options, most_tried = self.options, self.options.max_tried * larger(len(self.voter.index))
-        anchors = islice(farthest_first(xy, np.arange(len(xy))), options.max_anchors) if only is None else only
+        anchors = islice(farthest_first(xy, self.voters), options.max_anchors) if only is None else only
         for n, (anchor, steps) in enumerate(self.ahead.map(self._vote, anchors)):
             if n >= options.least_anchors and self.n_tried >= most_tried:
                 return

@@ -8,6 +8,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from roadgeo._arrays import FloatArray
+from roadgeo.matching.foreground import before
 from roadgeo.matching.index import ReferenceIndex
 from roadgeo.matching.road_search import RoadSearch
 from roadgeo.matching.scene import Scene
@@ -68,9 +69,11 @@ class RoadViews:
             if options.roads is None:
                 raise ValueError("roads propose nothing here: expected `MatchOptions.roads`")
             on_map = options.roads.on(self.index.coarseness)
+            voters = np.arange(len(scene.intersections))
             if view > 0 and tilted is not None:
-                on_map = replace(on_map, max_anchors=tilted.max_anchors)
-                scene = rectify(scene, self.seen_by(view))
+                on_map, seen_by = replace(on_map, max_anchors=tilted.max_anchors), self.seen_by(view)
+                voters = np.flatnonzero(before(scene.intersections.xy, seen_by, scene, tilted.coarser))
+                scene = rectify(scene, seen_by, tilted.coarser)
             ahead = self.sweeps.ahead
-            self._searches[view] = RoadSearch(scene, self.index, options.camera, on_map, self.near, ahead)
+            self._searches[view] = RoadSearch(scene, self.index, options.camera, on_map, self.near, ahead, voters)
         return self._searches[view]

@@ -9,10 +9,14 @@ from worlds.scenes import Sight, camera, look, mapped, scene_of
 
 from roadgeo.geometry.homography import Homography
 from roadgeo.location import Seconds
+from roadgeo.matching.estimator import MatchOptions
+from roadgeo.matching.foreground import before
 from roadgeo.matching.methods import search_references
 from roadgeo.matching.options import LocateOptions
 from roadgeo.matching.parts import Whole
 from roadgeo.matching.query import Query
+from roadgeo.matching.road_views import RoadViews
+from roadgeo.matching.shared_sweeps import SharedSweeps
 from roadgeo.matching.tilted import TiltOptions, evenness, likely_views, rectification, rectify
 from roadgeo.matching.verdict import decide
 
@@ -67,6 +71,34 @@ def test_scenes_move_with_their_roads(town):
     step = mapped(view, (start + 1e-3 * np.array([math.cos(angle), math.sin(angle)]))[None])[0]
     away = step - moved.intersections.xy[n]
     assert apart_deg(math.degrees(math.atan2(*away[::-1])), math.degrees(moved.intersections.rays[n, ray])) < 0.5
+
+
+def test_far_roads_are_left_out(town):
+    truth, _, scene = seen(town[0], 3, 50.0)
+    view = rectification(scene, 50.0, horizon_deg(truth), 1.2)
+    moved = rectify(scene, view, 1.6)
+    kept = before(scene.dense_points, view, scene, 1.6)
+    assert 0.2 < kept.mean() < 0.9
+    assert np.allclose(mapped(np.linalg.inv(view), moved.dense_points), scene.dense_points[kept])
+    assert len(moved.dense_directions) == kept.sum()
+    assert len(moved.intersections) == len(scene.intersections)
+
+
+def test_far_intersections_do_not_vote(town):
+    """Their numbers are those of the scene, by which hypotheses know them."""
+    _, _, scene = seen(town[0], 5, 54.0)
+    options, index = MatchOptions(), town[1]
+    views = RoadViews(scene, index, options, None, SharedSweeps(scene, options.camera))
+    for view in views.tilted():
+        near = np.flatnonzero(before(scene.intersections.xy, views.seen_by(view), scene, options.tilted.coarser))
+        voters = views.search(view).voters
+        assert np.array_equal(voters, near)
+        assert 0 < len(near) < len(scene.intersections)
+        tried = {one.anchor for one in views.search(view).rounds() if one.anchor >= 0}
+        assert tried
+        assert tried <= set(near)
+    assert len(views.tilted()) > 0
+    assert len(views.search(0).voters) == len(scene.intersections)
 
 
 def test_roads_crowd_towards_the_horizon(town):
