@@ -311,8 +311,8 @@ class TripleEstimator:
         """Refine a hypothesis and return its log10 odds."""
         started, options = time.perf_counter(), self.options
         if model.lens is None:
-            lean_as_a_camera(model, self.scene, self.index, options.camera, options.verify)
-            model.log10_odds = self._verify(model)
+            leans = lean_as_a_camera(model, self.scene, self.index, options.camera, options.verify)
+            model.log10_odds = self._verify(model) if leans else -math.inf
         if model.lens is not None:
             self._see_through(model, model.lens)
         elif model.log10_odds >= options.verify.promising:

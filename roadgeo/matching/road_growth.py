@@ -59,13 +59,13 @@ class RoadGrower:
         self.scene, self.index, self.options = scene, index, options
         thin = max(1, len(scene.dense_points) // options.max_points)
         self.points, self.directions = scene.dense_points[::thin], scene.dense_directions[::thin]
+        self._anchor, self._outwards = -1, (self.points, self.directions)
 
     def grow(self, anchor: int, reference: int, affine: FloatArray) -> Grown | None:
         """Grow from query intersection `anchor` on map intersection `reference`, laid there by `affine` (4,), 2 x 2."""
         options, half_size = self.options, self.scene.half_size
         at = self.scene.intersections.xy[anchor]
-        away = self.points - at
-        order = np.argsort(np.hypot(*away.T), kind="stable")
+        points, directions = self._outwards_from(anchor)
         gsd = math.sqrt(affine[0] * affine[3] - affine[1] * affine[2])
         unit = half_size * gsd
         p = np.array([affine[0], affine[1], 0.0, affine[2], affine[3], 0.0, 0.0, 0.0]) / gsd
@@ -77,11 +77,21 @@ class RoadGrower:
             math.cos(math.radians(options.max_turn_deg)),
         )
         origin = self.index.xy[reference]
-        points, roads = away[order] / half_size, self.index.road_buckets
-        share = grow_by_roads(p, unit, origin, points, self.directions[order], stages, roads)
+        share = grow_by_roads(p, unit, origin, points, directions, stages, self.index.road_buckets)
         if share < 0.0:
             return None
         from_query = np.array([[1.0, 0.0, -at[0]], [0.0, 1.0, -at[1]], [0.0, 0.0, half_size]])
         to_reference = np.array([[unit, 0.0, origin[0]], [0.0, unit, origin[1]], [0.0, 0.0, 1.0]])
         matrix = to_reference @ np.append(p, 1.0).reshape(3, 3) @ from_query
         return Grown(anchor, np.asarray(matrix / (matrix[2] @ np.append(self.scene.center, 1.0))), share)
+
+    def _outwards_from(self, anchor: int) -> tuple[FloatArray, FloatArray]:
+        """Return the road points around an intersection, the nearest first, normalised, and the roads' directions.
+
+        Kept: an intersection makes many proposals.
+        """
+        if anchor != self._anchor:
+            away = self.points - self.scene.intersections.xy[anchor]
+            order = np.argsort(np.hypot(*away.T), kind="stable")
+            self._anchor, self._outwards = anchor, (away[order] / self.scene.half_size, self.directions[order])
+        return self._outwards

@@ -8,6 +8,7 @@ from worlds.scenes import Sight, camera, look, mapped, scene_of
 
 from roadgeo.geometry.camera import _USUAL_FOCAL, CameraFault, CameraOptions, judge
 from roadgeo.geometry.homography import Homography
+from roadgeo.matching.estimator import TripleEstimator
 from roadgeo.matching.hypothesis import Hypothesis
 from roadgeo.matching.leaning import lean_as_a_camera
 from roadgeo.matching.verification import VerifyOptions
@@ -42,7 +43,7 @@ def test_a_proposal_tells_how_a_camera_leans(town, scene):
     seed = near_the_middle(scene)
     model = hypothesis(scene, affine_around(TRUTH, scene.intersections.xy[seed]), seed)
     assert judge(model.matrix, SIZE, CAMERA) is CameraFault.SKEW
-    lean_as_a_camera(model, scene, town[1], CAMERA, VERIFY)
+    assert lean_as_a_camera(model, scene, town[1], CAMERA, VERIFY)
     assert judge(model.matrix, SIZE, CAMERA) is None
     assert np.abs(mapped(model.matrix, scene.corners) - mapped(TRUTH, scene.corners)).max() < 1.0
     assert (model.matched >= 0).mean() > 0.7
@@ -51,7 +52,7 @@ def test_a_proposal_tells_how_a_camera_leans(town, scene):
 
 def test_what_a_camera_can_see_stays_as_it_is(town, scene):
     model = hypothesis(scene, TRUTH, 0)
-    lean_as_a_camera(model, scene, town[1], CAMERA, VERIFY)
+    assert lean_as_a_camera(model, scene, town[1], CAMERA, VERIFY)
     assert model.matrix is TRUTH
     assert not model.by_roads
 
@@ -60,6 +61,31 @@ def test_what_none_can_see_stays_as_it_is(town, scene):
     seed = near_the_middle(scene)
     skewed = affine_around(TRUTH, scene.intersections.xy[seed])
     model = hypothesis(scene, skewed, seed)
-    lean_as_a_camera(model, scene, town[1], replace(CAMERA, max_tilt_deg=30.0), VERIFY)
+    assert not lean_as_a_camera(model, scene, town[1], replace(CAMERA, max_tilt_deg=30.0), VERIFY)
     assert model.matrix is skewed
     assert not model.by_roads
+
+
+def test_where_no_camera_fits_nothing_is_verified(town, scene):
+    """Seen by a camera as it may be, but not on this map's roads."""
+    seed = near_the_middle(scene)
+    away = np.array([[1, 0, 260.0], [0, 1, -140.0], [0, 0, 1]]) @ TRUTH
+    model = hypothesis(scene, affine_around(away, scene.intersections.xy[seed]), seed)
+    assert not lean_as_a_camera(model, scene, town[1], CAMERA, VERIFY)
+    assert model.fault is CameraFault.SKEW
+
+
+def test_the_search_refuses_it_for_its_skew(town, scene):
+    seed = near_the_middle(scene)
+    away = np.array([[1, 0, 260.0], [0, 1, -140.0], [0, 0, 1]]) @ TRUTH
+    model = hypothesis(scene, affine_around(away, scene.intersections.xy[seed]), seed)
+    estimator = TripleEstimator(scene, town[1])
+    assert estimator.score(model) == -np.inf
+    assert estimator.n_verified == 0
+
+
+def test_the_search_verifies_what_leans(town, scene):
+    seed = near_the_middle(scene)
+    model = hypothesis(scene, affine_around(TRUTH, scene.intersections.xy[seed]), seed)
+    assert TripleEstimator(scene, town[1]).score(model) > 20.0
+    assert np.abs(mapped(model.refined.matrix, scene.corners) - mapped(TRUTH, scene.corners)).max() < 2.0
