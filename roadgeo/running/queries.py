@@ -6,6 +6,7 @@ thresholds and, where nobody says how large a pixel is, at several scales (`look
 
 from __future__ import annotations
 
+import math
 import os
 from collections.abc import Callable, Sequence
 from contextlib import suppress
@@ -27,6 +28,7 @@ from roadgeo.plugins import SEGMENTERS, call_plugin
 from roadgeo.reference.reference import AnyReference
 from roadgeo.running.looks import Locate, Look, Sighting, locate_looks
 from roadgeo.running.mirroring import ask_mirrored
+from roadgeo.running.regridding import of_own_pixels, on_grid
 from roadgeo.running.stretching import ask_stretched
 from roadgeo.sources.drawn_roads import ENDINGS, Units, draw_roads
 from roadgeo.sources.exif import estimate_gsd
@@ -43,6 +45,9 @@ __all__ = ["QueryOptions", "is_model", "locate_query"]
 #: The mask of a larger photograph is reduced, so that time and memory are bounded.
 _MAX_GRID_PIXELS = 64_000_000
 _MAX_SCALES = 3
+#: Roads of a photograph whose pixels are coarser than a model's are traced on the model's, but of no more than so many
+#: times its own along a side: narrow gaps between roads close on coarse ones.
+_MOST_FINER, _LEAST_FINER = 2.0, 1.25
 _KNOWN_SPAN = 1.7  # a range of pixel sizes narrower than this is one scale
 
 #: Further thresholds of a probability map, as shares of the way from the model's own to 0 (below 0) and to 1.
@@ -177,8 +182,10 @@ def _locate_photograph(
         return locate_looks([Look("the segmenter's own threshold", lambda: mask)], references, options, how)
     with open_photograph(paths[0]) as photograph:
         k = max(1, int(np.ceil(np.sqrt(photograph.width * photograph.height / _MAX_GRID_PIXELS))))
-        grid = round(photograph.height / k), round(photograph.width / k)
+        own = round(photograph.height / k), round(photograph.width / k)
         scales = _choose_scales(photograph, query, options, say)
+        finer = _how_much_finer(own, scales[0])
+        grid = round(finer * own[0]), round(finer * own[1])
 
     @lru_cache(_MAX_SCALES)
     def see(scale: float) -> ProbabilityMap:
@@ -188,16 +195,30 @@ def _locate_photograph(
 
     at_scales = [_looks_at(partial(see, scale), scale, query) for scale in scales]
     looks = [looks[0] for looks in at_scales] + at_scales[0][1:]
-    options = _on_grid(options, k)
+    options = _on_grid(options, k / finer)
     try:
-        return locate_looks(looks, references, options, how)
+        return _of_own_pixels(locate_looks(looks, references, options, how), own)
     except MaskError as error:
         names = ", ".join(one.name for one in references)
         reason = f"hardly a road is seen in the photograph ({error})"
-        location = Location(
-            paths[0], "not_located", reason, names, size=(grid[1], grid[0]), reason_code=Reason.FEW_ROADS
-        )
-        return Sighting(location, RoadMask(np.zeros(grid, np.bool_), name=paths[0]), probability=see(scales[0]))
+        location = Location(paths[0], "not_located", reason, names, size=(own[1], own[0]), reason_code=Reason.FEW_ROADS)
+        nothing, seen = RoadMask(np.zeros(own, np.bool_), name=paths[0]), see(scales[0]).resized(own)
+        return Sighting(location, nothing, probability=seen)
+
+
+def _how_much_finer(own: tuple[int, int], scale: float) -> float:
+    """Return how many times finer than a photograph's own (H, W) pixels its roads are traced."""
+    finer = min(scale, _MOST_FINER, math.sqrt(_MAX_GRID_PIXELS / math.prod(own)))
+    return finer if finer >= _LEAST_FINER else 1.0
+
+
+def _of_own_pixels(sighting: Sighting, own: tuple[int, int]) -> Sighting:
+    """Return what was found on a finer grid as it is of a photograph's own pixels, (H, W)."""
+    if sighting.mask.shape == own:
+        return sighting
+    probability = None if sighting.probability is None else sighting.probability.resized(own)
+    location, mask = of_own_pixels(sighting.location, own[::-1]), on_grid(sighting.mask, own)
+    return replace(sighting, location=location, mask=mask, probability=probability)
 
 
 def _looks_at(see: Callable[[], ProbabilityMap], scale: float, query: QueryOptions) -> list[Look]:
@@ -270,8 +291,8 @@ def _call_segmenter(name: str, path: str, threshold: float | None) -> RoadMask:
     return read_mask(seen, threshold=threshold, name=os.fspath(path))
 
 
-def _on_grid(options: LocateOptions, k: int) -> LocateOptions:
-    """Return what is known of the camera in pixels of a grid k times coarser than the photograph."""
+def _on_grid(options: LocateOptions, k: float) -> LocateOptions:
+    """Return what is known of the camera in pixels of a grid k times as coarse as the photograph."""
     camera = options.match.camera
     focal = None if camera.focal_px is None else camera.focal_px / k
     camera = replace(camera, gsd_m=(k * camera.gsd_m[0], k * camera.gsd_m[1]), focal_px=focal)

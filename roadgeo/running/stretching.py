@@ -11,18 +11,16 @@ from collections.abc import Sequence
 from dataclasses import replace
 from typing import Literal
 
-import cv2
 import numpy as np
 
-from roadgeo._arrays import AnyArray, FloatArray
 from roadgeo.geometry.frame import Frame
 from roadgeo.geometry.homography import Homography
 from roadgeo.geometry.mask import RoadMask
 from roadgeo.location import Location
 from roadgeo.matching.options import LocateOptions
 from roadgeo.reference.reference import AnyReference
-from roadgeo.roads.graph import RoadGraph
 from roadgeo.running.looks import Sighting
+from roadgeo.running.regridding import of_own_pixels, on_grid
 from roadgeo.workflows import locate
 
 __all__ = ["STRETCHES", "ask_stretched"]
@@ -46,43 +44,30 @@ def ask_stretched(
     stretches = STRETCHES if aspect == "unknown" else (aspect,)
     paid = replace(options, min_log10_odds=options.min_log10_odds + math.log10(len(stretches)))
     for stretch in stretches:
-        mask, to_stretched = _stretched(sighting.mask, stretch)
-        found = locate(mask, references, paid)
+        found = locate(_stretched(sighting.mask, stretch), references, paid)
         if found.located:
-            return replace(sighting, location=_as_it_came(found, sighting.location, to_stretched))
+            return replace(sighting, location=_as_it_came(found, sighting.location))
     return sighting
 
 
-def _stretched(mask: RoadMask, stretch: float) -> tuple[RoadMask, FloatArray]:
-    """Return a mask with square pixels, of about as many, and (3, 3) from its pixels to those."""
+def _stretched(mask: RoadMask, stretch: float) -> RoadMask:
+    """Return a mask with square pixels, of about as many."""
     height, width = mask.shape
-    new_width, new_height = round(width * math.sqrt(stretch)), round(height / math.sqrt(stretch))
-
-    def resize(values: AnyArray) -> AnyArray:
-        scaled = cv2.resize(values.astype(np.float32), (new_width, new_height), interpolation=cv2.INTER_LINEAR)
-        return np.asarray(scaled > 0.5)
-
-    observed, probability = None if mask.observed is None else resize(mask.observed), mask.probability
-    if probability is not None:
-        probability = cv2.resize(probability, (new_width, new_height), interpolation=cv2.INTER_NEAREST)
-    to_stretched = np.diag([new_width / width, new_height / height, 1.0])
-    return replace(mask, roads=resize(mask.roads), observed=observed, probability=probability), to_stretched
+    return on_grid(mask, (round(height / math.sqrt(stretch)), round(width * math.sqrt(stretch))))
 
 
-def _as_it_came(found: Location, refused: Location, to_stretched: FloatArray) -> Location:
+def _as_it_came(found: Location, refused: Location) -> Location:
     """Return the place of a mask that was located stretched, as it is of the mask itself; no camera saw it so."""
-    if found.homography is None or refused.size is None or found.evidence is None:
+    if refused.size is None:
         return found
-    homography = found.homography @ to_stretched
-    homography = homography / homography[2, 2]
-    jacobian = Homography(homography).jacobian(Frame(*refused.size).center)
-    wide, high = np.hypot(*jacobian)
-    from_stretched, spent = 1.0 / to_stretched[[0, 1], [0, 1]], refused.seconds
+    own, spent = of_own_pixels(found, refused.size), refused.seconds
+    if own.homography is None:
+        return own
+    wide, high = np.hypot(*Homography(own.homography).jacobian(Frame(*refused.size).center))
     return replace(
-        found,
+        own,
         reason=f"{found.reason}; its pixels are {wide / high:.2f} times as wide as high",
-        size=refused.size,
-        homography=homography,
+        gsd_m=found.gsd_m,
         camera=None,
         tilt_deg=None,
         seconds=replace(
@@ -91,14 +76,5 @@ def _as_it_came(found: Location, refused: Location, to_stretched: FloatArray) ->
             match=spent.match + found.seconds.match,
             refine=spent.refine + found.seconds.refine,
         ),
-        evidence=replace(
-            found.evidence,
-            query_graph=_scaled(found.evidence.query_graph, from_stretched),
-            query_xy=found.evidence.query_xy * from_stretched,
-        ),
         seen=refused.seen,
     )
-
-
-def _scaled(graph: RoadGraph, factors: FloatArray) -> RoadGraph:
-    return replace(graph, xy=graph.xy * factors, coords=graph.coords * factors)

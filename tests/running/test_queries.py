@@ -12,7 +12,7 @@ from worlds.models import brightness_model
 from roadgeo.cli import main
 from roadgeo.errors import ModelError, PhotographError
 from roadgeo.evaluation.demo import ROADS, demo_masks
-from roadgeo.running.queries import QueryOptions, locate_query
+from roadgeo.running.queries import QueryOptions, _how_much_finer, locate_query
 from roadgeo.sources.segmentation.probability import TAG
 from roadgeo.workflows import build_reference
 
@@ -76,6 +76,44 @@ def test_a_photograph_is_located(
         assert drawn.count >= 3  # the photograph itself, not its mask
     again = run(capsys, *given)
     assert again["homography"] == document["homography"]
+
+
+def test_roads_of_coarse_pixels_are_traced_on_the_models_grid(
+    tmp_path: Path, demo_reference: Path, model: str, photo: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    """What is told and drawn is of the photograph's own pixels all the same."""
+    image = cv2.imread(str(photo))
+    small = cv2.resize(image, None, fx=0.5, fy=0.5, interpolation=cv2.INTER_AREA)
+    cv2.imwrite(str(tmp_path / "coarse.png"), small)
+    given = ["-r", str(demo_reference), "--segmenter", model, "-o", str(tmp_path)]
+    fine = run(capsys, str(photo), *given, "--gsd", "0.6:1")
+    coarse = run(capsys, str(tmp_path / "coarse.png"), *given, "--gsd", "1.2:2", "--report")
+    height, width = small.shape[:2]
+    assert coarse["status"] == "located"
+    assert coarse["size"] == [width, height]
+    assert coarse["n_intersections"] > 0.8 * fine["n_intersections"]
+    truth = MASK.homography @ np.diag([2.0, 2.0, 1.0]) @ [width / 2, height / 2, 1]
+    found = np.array(coarse["homography"]) @ [width / 2, height / 2, 1]
+    assert np.hypot(*(found[:2] / found[2] - truth[:2] / truth[2])) < 3.0
+    assert coarse["gsd_m"] == pytest.approx(2 * fine["gsd_m"], rel=0.02)
+    with rasterio.open(tmp_path / "coarse_mask.tif") as kept:
+        assert kept.shape == (height, width)
+
+
+@pytest.mark.parametrize(
+    ("own", "scale", "expected"),
+    [
+        ((750, 750), 2.0, 2.0),
+        ((750, 750), 1.6, 1.6),
+        ((750, 750), 4.0, 2.0),  # no finer than that: a model sees nothing there
+        ((750, 750), 1.1, 1.0),  # hardly finer
+        ((3000, 3000), 0.5, 1.0),  # never coarser
+        ((5000, 6400), 2.0, 2.0**0.5),  # memory is bounded
+        ((8000, 8000), 2.0, 1.0),
+    ],
+)
+def test_how_much_finer(own: tuple[int, int], scale: float, expected: float) -> None:
+    assert _how_much_finer(own, scale) == pytest.approx(expected)
 
 
 def test_what_was_seen_is_told_and_drawn(

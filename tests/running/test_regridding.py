@@ -1,0 +1,62 @@
+"""A location by other pixels than a query's own says the same of the ground."""
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+from roadgeo.evaluation.demo import ROADS, demo_masks
+from roadgeo.geometry.homography import Homography
+from roadgeo.running.regridding import of_own_pixels, on_grid
+from roadgeo.sources.masks import read_mask
+from roadgeo.workflows import build_reference, locate
+
+MASK = next(mask for mask in demo_masks() if mask.path.stem == "drone")
+
+
+@pytest.fixture(scope="module")
+def located():
+    location = locate(read_mask(MASK.path), [build_reference(str(ROADS), "porto")])
+    assert location.located
+    return location
+
+
+@pytest.mark.parametrize("factor", [(0.5, 0.5), (2.0, 2.0), (0.5, 1.0)])
+def test_corners_stay_where_they_are(located, factor):
+    size = tuple(round(side * f) for side, f in zip(located.size, factor, strict=True))
+    own = of_own_pixels(located, size)
+    assert own.size == size
+    corners = np.array([(0, 0), (size[0], 0), size, (0, size[1])], float)
+    assert np.allclose(Homography(own.homography)(corners), located.footprint)
+    scale = np.array(size) / located.size
+    assert np.allclose(own.evidence.query_xy, located.evidence.query_xy * scale)
+    assert np.allclose(own.evidence.query_graph.coords, located.evidence.query_graph.coords * scale)
+    assert np.allclose(own.seen.xy, located.seen.xy * scale)
+    assert own.gsd_m == pytest.approx(located.gsd_m / np.sqrt(scale.prod()))
+    assert own.camera.focal_px == pytest.approx(located.camera.focal_px * np.sqrt(scale.prod()))
+    for name in ("footprint", "corner_sigma_m", "tilt_deg", "rotation_deg", "log10_odds", "n_intersections"):
+        assert np.array_equal(getattr(own, name), getattr(located, name))
+
+
+def test_what_has_no_place_has_none_on_another_grid(located):
+    bare = replace(located, homography=None, camera=None, seen=None, evidence=None, gsd_m=None)
+    own = of_own_pixels(bare, (10, 10))
+    assert own.size == (10, 10)
+    assert own.homography is None
+    assert of_own_pixels(located, located.size) is located
+    nothing = replace(located, size=None)
+    assert of_own_pixels(nothing, (10, 10)) is nothing
+
+
+def test_masks_on_another_grid():
+    mask = read_mask(MASK.path)
+    height, width = mask.shape
+    seen = np.ones(mask.shape, np.bool_)
+    seen[: height // 2] = False
+    values = np.where(mask.roads, 200, 30).astype(np.uint8)
+    small = on_grid(replace(mask, observed=seen, probability=values), (height // 2, width // 2))
+    assert small.shape == small.observed.shape == small.probability.shape == (height // 2, width // 2)
+    assert small.roads.mean() == pytest.approx(mask.roads.mean(), rel=0.1)
+    assert not small.observed[: height // 4 - 1].any()
+    assert small.observed[height // 4 + 1 :].all()
+    assert set(np.unique(small.probability)) == {30, 200}
