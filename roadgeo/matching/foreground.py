@@ -84,6 +84,8 @@ def _only(scene: Scene, line: FloatArray, kept: IntArray) -> Scene:
         points=scene.points[near],
         directions=scene.directions[near],
         weights=scene.weights[near],
+        merged=None if scene.merged is None else scene.merged[near],
+        at_merged=None if scene.at_merged is None else scene.at_merged[kept],
         dense_points=scene.dense_points[dense],
         dense_directions=scene.dense_directions[dense],
         road_length_px=share * scene.road_length_px,

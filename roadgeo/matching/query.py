@@ -9,7 +9,7 @@ from pathlib import Path
 from roadgeo._arrays import AnyArray
 from roadgeo.geometry.mask import RoadMask
 from roadgeo.location import Seconds
-from roadgeo.matching.scene import Scene, SceneOptions, prepare_scene
+from roadgeo.matching.scene import Scene, SceneOptions, find_merged, near_any, prepare_scene
 from roadgeo.roads.graph import RoadGraph
 from roadgeo.roads.intersections import IntersectionOptions, find_intersections
 from roadgeo.roads.simplification import SimplifyOptions, simplify
@@ -55,7 +55,9 @@ def trace_query(mask: RoadMask, options: QueryOptions | None = None) -> tuple[Sc
     )
     height, wide = mask.shape
     scene = prepare_scene(graph, found, (wide, height), mask.observed, options.scene, mask.probability)
-    return replace(scene, road_width_px=width), graph
+    merged = find_merged(mask.roads, scene.points, scene.directions, width)
+    at_merged = near_any(scene.intersections.xy, scene.points[merged], 2.0 * width)
+    return replace(scene, road_width_px=width, merged=merged, at_merged=at_merged), graph
 
 
 @dataclass(frozen=True)
