@@ -199,9 +199,7 @@ class _Judge:
         alone = ~(beside[0] & beside[1])
         if alone.mean() < 0.4:
             return scene
-        kept = [np.ascontiguousarray(array[alone]) for array in (scene.points, scene.directions, scene.weights)]
-        length = scene.road_length_px * alone.mean()
-        return replace(scene, points=kept[0], directions=kept[1], weights=kept[2], road_length_px=length)
+        return replace(scene.of_points(alone), road_length_px=scene.road_length_px * alone.mean())
 
     def pieces(self, matrix: FloatArray) -> FloatArray:
         """Return the share of the roads in each piece of the frame that agree; a half where there are none."""

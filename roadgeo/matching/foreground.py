@@ -77,14 +77,10 @@ def _only(scene: Scene, line: FloatArray, kept: IntArray) -> Scene:
     near, dense = (_side(xy, line) >= 0.0 for xy in (scene.points, scene.dense_points))
     share, xy = float(near.mean()), scene.intersections.xy[kept]
     return replace(
-        scene,
+        scene.of_points(near),
         intersections=scene.intersections.only(kept),
         branches=np.ascontiguousarray(scene.branches[kept]),
         neighbours=query_neighbours(xy, scene.neighbours.shape[1]) if len(kept) else scene.neighbours[:0],
-        points=scene.points[near],
-        directions=scene.directions[near],
-        weights=scene.weights[near],
-        merged=None if scene.merged is None else scene.merged[near],
         at_merged=None if scene.at_merged is None else scene.at_merged[kept],
         dense_points=scene.dense_points[dense],
         dense_directions=scene.dense_directions[dense],

@@ -246,13 +246,7 @@ def regrow(
 
 def _thinned(scene: Scene, n_points: int) -> Scene:
     """Return a scene with about so many of its road points."""
-    step = max(1, len(scene.points) // n_points)
-    return replace(
-        scene,
-        points=scene.points[::step],
-        directions=np.ascontiguousarray(scene.directions[::step]),
-        weights=scene.weights[::step],
-    )
+    return scene.of_points(slice(None, None, max(1, len(scene.points) // n_points)))
 
 
 def _fit_from_many(

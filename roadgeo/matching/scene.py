@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import cv2
 import numpy as np
@@ -113,6 +113,16 @@ class Scene:
     def half_size(self) -> float:
         """Half the frame's diagonal in pixels."""
         return Frame(*self.size).half_diagonal
+
+    def of_points(self, kept: BoolArray | slice) -> Scene:
+        """Return the scene with some of its road points only."""
+        return replace(
+            self,
+            points=np.ascontiguousarray(self.points[kept]),
+            directions=np.ascontiguousarray(self.directions[kept]),
+            weights=np.ascontiguousarray(self.weights[kept]),
+            merged=None if self.merged is None else self.merged[kept],
+        )
 
     @property
     def n_statements(self) -> float:

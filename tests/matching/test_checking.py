@@ -1,11 +1,13 @@
 """Given places on made-up towns: right, off, or not to be judged."""
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 from worlds.scenes import Sight, camera, look, scene_of
 
 from roadgeo.geometry.homography import Homography
-from roadgeo.matching.checking import check_place
+from roadgeo.matching.checking import CheckOptions, check_place
 from roadgeo.matching.local_search import LocalSearchOptions, Shift, move_about, search_nearby
 
 SIGHT = Sight(sigma_m=1.0, missing=0.2, false=0.1)
@@ -31,6 +33,14 @@ def test_a_right_place_agrees(town, sights) -> None:
         found = check_place(truth, scene, town[1])
         assert found.verdict == "agrees", found.reason
         assert found.agreeing == pytest.approx(found.agreeing_as_given, abs=0.05)
+
+
+def test_points_that_have_a_twin_beside_them_are_left_out_with_all_that_is_known_of_them(town, sights) -> None:
+    """As if a block were a dual carriageway."""
+    truth, scene = sights[0]
+    known = replace(scene, merged=np.arange(len(scene.points)) % 5 == 0, at_merged=np.zeros(len(scene.branches), bool))
+    for twin_m in (80.0, 100.0):
+        assert check_place(truth, known, town[1], CheckOptions(twin_m=twin_m)).verdict in ("agrees", "unknown")
 
 
 @pytest.mark.slow

@@ -215,6 +215,19 @@ class TestMergedRoads:
         assert np.array_equal(scene.at_merged, low)
 
 
+@pytest.mark.parametrize("kept", [slice(None, None, 3), np.arange(600) % 2 == 0])
+@pytest.mark.parametrize("knows", [True, False])
+def test_some_of_the_points_keep_all_that_is_known_of_them(town, kept, knows):
+    scene = scene_of(look(town[0], camera((2000, 1900), (1000, 1000), 1.0)))
+    kept = kept if isinstance(kept, slice) else kept[: len(scene.points)]
+    scene = replace(scene, merged=scene.points[:, 0] > 500 if knows else None)
+    some = scene.of_points(kept)
+    for name in ("points", "directions", "weights", "merged")[: 4 if knows else 3]:
+        assert np.array_equal(getattr(some, name), getattr(scene, name)[kept])
+    assert knows or some.merged is None
+    assert some.intersections is scene.intersections
+
+
 @given(st.integers(0, 30), st.integers(0, 30), st.floats(0.1, 60.0), st.integers(0, 2**32 - 1))
 def test_what_lies_near_any_point(n, m, away, seed):
     rng = np.random.default_rng(seed)
