@@ -76,12 +76,13 @@ def _only(scene: Scene, line: FloatArray, kept: IntArray) -> Scene:
     before = scene.field_scale * (columns * line[0] - rows[:, None] * line[1]) + line[2] >= 0.0
     near, dense = (_side(xy, line) >= 0.0 for xy in (scene.points, scene.dense_points))
     share, xy = float(near.mean()), scene.intersections.xy[kept]
+    part = scene.of_points(near)
     return replace(
-        scene.of_points(near),
+        part,
         intersections=scene.intersections.only(kept),
         branches=np.ascontiguousarray(scene.branches[kept]),
         neighbours=query_neighbours(xy, scene.neighbours.shape[1]) if len(kept) else scene.neighbours[:0],
-        at_merged=None if scene.at_merged is None else scene.at_merged[kept],
+        merged_at=None if part.merged_at is None else part.merged_at[kept],
         dense_points=scene.dense_points[dense],
         dense_directions=scene.dense_directions[dense],
         road_length_px=share * scene.road_length_px,

@@ -9,7 +9,8 @@ from pathlib import Path
 from roadgeo._arrays import AnyArray
 from roadgeo.geometry.mask import RoadMask
 from roadgeo.location import Seconds
-from roadgeo.matching.scene import Scene, SceneOptions, find_merged, near_any, prepare_scene
+from roadgeo.matching.merged_roads import mark_merged
+from roadgeo.matching.scene import Scene, SceneOptions, prepare_scene
 from roadgeo.roads.graph import RoadGraph
 from roadgeo.roads.intersections import IntersectionOptions, find_intersections
 from roadgeo.roads.simplification import SimplifyOptions, simplify
@@ -55,9 +56,7 @@ def trace_query(mask: RoadMask, options: QueryOptions | None = None) -> tuple[Sc
     )
     height, wide = mask.shape
     scene = prepare_scene(graph, found, (wide, height), mask.observed, options.scene, mask.probability)
-    merged = find_merged(mask.roads, scene.points, scene.directions, width)
-    at_merged = near_any(scene.intersections.xy, scene.points[merged], 2.0 * width)
-    return replace(scene, road_width_px=width, merged=merged, at_merged=at_merged), graph
+    return mark_merged(replace(scene, road_width_px=width), mask.roads, width), graph
 
 
 @dataclass(frozen=True)

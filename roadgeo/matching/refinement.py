@@ -7,11 +7,12 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from roadgeo._arrays import BoolArray, FloatArray, IntArray
+from roadgeo._arrays import FloatArray, IntArray
 from roadgeo.geometry.homography import Homography
 from roadgeo.kernels.adjustment import adjust, point_row
 from roadgeo.kernels.structs import AdjustLimits, Held, Plane, PointPairs, RoadSamples
 from roadgeo.matching.index import ReferenceIndex
+from roadgeo.matching.merged_roads import without_merged
 from roadgeo.matching.scene import Scene
 
 __all__ = [
@@ -48,9 +49,8 @@ class RefineOptions:
         How far off a homography that is held near its start may be.
     few_matches : int
         With fewer matches the start is held: they alone would not determine a homography, and it would be forgotten.
-    most_merged : float
-        Where roads of the mask may have merged (see `Scene.merged`) their points do not take part, unless they are a
-        larger share of all.
+    most_unsure : float
+        Without the points of merged roads a fit's corners may be so many times less sure.
     least_support : float
         Matches take part when at least this share of their neighbours are matched.
     n_cells, least_share : int, float
@@ -74,7 +74,7 @@ class RefineOptions:
     intersection_weight: float = 0.3
     max_turn_deg: float = 25.0
     perspective_sigma: float = 0.5
-    most_merged: float = 0.5
+    most_unsure: float = 2.0
     least_support: float = 0.3
     n_cells: int = 8
     least_share: float = 0.5
@@ -183,14 +183,6 @@ def corner_sigmas(covariance: FloatArray) -> FloatArray:
     return np.asarray(np.sqrt(np.diag(covariance).reshape(4, 2).sum(axis=1)))
 
 
-def _not_told_apart(scene: Scene, options: RefineOptions) -> tuple[BoolArray, BoolArray]:
-    """Tell which road points (S,) and intersections (N,) a fit leaves out: where roads have merged, if not most."""
-    merged, at_merged = scene.merged, scene.at_merged
-    if merged is None or at_merged is None or merged.sum() > options.most_merged * len(merged):
-        return np.zeros(len(scene.points), np.bool_), np.zeros(len(scene.intersections), np.bool_)
-    return merged, at_merged
-
-
 def _held_points(p: FloatArray, n: int) -> tuple[FloatArray, FloatArray]:
     """Return an n x n grid of normalised points over the frame, (n * n, 2), and where `p` puts them."""
     side = np.linspace(-0.7, 0.7, n)
@@ -209,6 +201,9 @@ def refine(
 ) -> Refined | None:
     """Adjust a homography by Gauss-Newton with Cauchy weights; None where that fails.
 
+    With all points, it is adjusted once more to those that do not lie between two roads of the map, where roads of the
+    mask have merged (see `merged_roads`), and that is taken unless it is much less sure.
+
     Parameters
     ----------
     matrix : (3, 3)
@@ -221,20 +216,39 @@ def refine(
         Hold the homography near its start also where there are matches enough: it is right all over the frame.
     """
     options = options or RefineOptions()
+    found = _adjusted(matrix, scene, index, matched, options, n_points, held)
+    if found is None or n_points is not None:
+        return found
+    apart, left = without_merged(found.matrix, scene, index, matched, options.max_turn_deg)
+    if apart is scene:
+        return found
+    without = _adjusted(matrix, apart, index, left, options, n_points, held)
+    if without is None or without.corner_sigma_m.max() > options.most_unsure * found.corner_sigma_m.max():
+        return found
+    return without
+
+
+def _adjusted(
+    matrix: FloatArray,
+    scene: Scene,
+    index: ReferenceIndex,
+    matched: IntArray,
+    options: RefineOptions,
+    n_points: int | None,
+    held: bool,
+) -> Refined | None:
+    """Adjust a homography to all that a scene shows."""
     center, half_size = scene.center, scene.half_size
     p, origin, unit = normalise(matrix, center, half_size)
     gsd = unit / half_size
     sigma_m = math.hypot(options.sigma_m, options.sigma_px * gsd)
     chosen = matched >= 0
     step = 1 if n_points is None else max(1, len(scene.points) // n_points)
-    merged, at_merged = _not_told_apart(scene, options)
-    used = np.flatnonzero(~merged)[::step]
-    points = (scene.points[used] - center) / half_size
+    points = (scene.points[::step] - center) / half_size
     # Isolated matches are probably accidental.
     around = scene.neighbours[chosen]
     support = ((matched[around] >= 0) & (around >= 0)).sum(axis=1) / np.maximum((around >= 0).sum(axis=1), 1)
     chosen[chosen] = support >= options.least_support
-    chosen &= ~at_merged
     pairs = (scene.intersections.xy[chosen] - center) / half_size
     grid, targets = _held_points(p, 6 if held or len(pairs) < options.few_matches else 0)
     held_weight = 8.0 / 36.0 * (sigma_m / max(options.held_m, options.held_px * gsd)) ** 2
@@ -244,7 +258,7 @@ def refine(
         float(np.cos(np.radians(options.max_turn_deg))), sigma_m,
         (sigma_m / unit / options.perspective_sigma) ** 2, options.n_iterations, options.tolerance_m,
     )  # fmt: skip
-    directions = scene.directions[used]
+    directions = np.ascontiguousarray(scene.directions[::step])
     weight = min(1.0, spacing_m(scene, unit) * step / options.correlation_m)
     places = (index.xy[matched[chosen]] - origin) / unit
     _, rms = adjust(

@@ -7,7 +7,7 @@ from dataclasses import dataclass, replace
 import cv2
 import numpy as np
 
-from roadgeo._arrays import AnyArray, BoolArray, Float32Array, FloatArray, Int32Array
+from roadgeo._arrays import AnyArray, BoolArray, Float32Array, FloatArray, Int32Array, IntArray
 from roadgeo.geometry.frame import Frame
 from roadgeo.geometry.mask import PROBABILITY_SURE, PROBABILITY_UNKNOWN
 from roadgeo.kernels.buckets import nearest_neighbours
@@ -15,13 +15,10 @@ from roadgeo.matching.index import neighbour_grid, sort_by_bucket
 from roadgeo.roads.graph import RoadGraph
 from roadgeo.roads.intersections import Intersections
 
-__all__ = ["Scene", "SceneOptions", "find_merged", "near_any", "prepare_scene", "query_neighbours", "sample_roads"]
+__all__ = ["Scene", "SceneOptions", "prepare_scene", "query_neighbours", "sample_roads"]
 
 #: A road's middle is traced within a pixel.
 _NEAR = (-1, 0, 1)
-#: Roads have merged where a mask is so many times wider than usual, and by so many pixels, at most of so many points in
-#: a row: at crossings it is wide as well, but not for long.
-_MERGED, _LEAST_MORE, _IN_A_ROW = 1.6, 4.0, 5
 
 
 @dataclass(frozen=True)
@@ -77,8 +74,8 @@ class Scene:
     merged : (S,) bool or None
         Points where the mask is so much wider than usual that two roads may have merged, such as the carriageways of a
         motorway: the line between them is neither's. None: not known.
-    at_merged : (N,) bool or None
-        Intersections within two road widths of such points.
+    merged_at : (N,) int64 or None
+        Of each intersection the nearest such point, within two road widths; -1: none.
     """
 
     size: tuple[int, int]
@@ -97,7 +94,7 @@ class Scene:
     observed: BoolArray
     road_width_px: float = 0.0
     merged: BoolArray | None = None
-    at_merged: BoolArray | None = None
+    merged_at: IntArray | None = None
 
     @property
     def center(self) -> FloatArray:
@@ -116,12 +113,15 @@ class Scene:
 
     def of_points(self, kept: BoolArray | slice) -> Scene:
         """Return the scene with some of its road points only."""
+        number = np.full(len(self.points) + 1, -1)
+        number[:-1][kept] = np.arange(len(self.points[kept]))
         return replace(
             self,
             points=np.ascontiguousarray(self.points[kept]),
             directions=np.ascontiguousarray(self.directions[kept]),
             weights=np.ascontiguousarray(self.weights[kept]),
             merged=None if self.merged is None else self.merged[kept],
+            merged_at=None if self.merged_at is None else number[self.merged_at],
         )
 
     @property
@@ -184,38 +184,6 @@ def _probability_at(points: FloatArray, probability: AnyArray) -> FloatArray:
     column, row = np.clip((points * (1.0, -1.0)).astype(np.int64), 0, (width - 1, height - 1)).T
     around = [known[np.clip(row + i, 0, height - 1), np.clip(column + j, 0, width - 1)] for i in _NEAR for j in _NEAR]
     return np.asarray(np.max(around, axis=0) / PROBABILITY_SURE)
-
-
-def find_merged(roads: BoolArray, points: FloatArray, directions: FloatArray, width: float) -> BoolArray:
-    """Tell at which points (S, 2) of the query plane a mask's roads (H, W) are so wide that two may have merged.
-
-    `directions` (S, 2) run along the road; `width` is the usual one, pixels, where not most have merged.
-    """
-    if not len(points):
-        return np.zeros(0, np.bool_)
-    across, pixels = directions[:, ::-1] * (-1.0, -1.0), points * (1.0, -1.0)
-    reach = np.arange(0.0, np.ceil(_MERGED * width) + 1.0)
-    height, wide = roads.shape
-    widths = np.zeros(len(points))
-    for side in (-1.0, 1.0):
-        at = np.floor(pixels[:, None] + side * reach[:, None] * across[:, None]).astype(np.int64)
-        inside = ((at >= 0) & (at < (wide, height))).all(axis=2)
-        column, row = np.clip(at, 0, (wide - 1, height - 1)).transpose(2, 0, 1)
-        on_road = inside & roads[row, column]
-        # The line may run in the narrow gap between two carriageways.
-        before_it = ~np.logical_or.accumulate(on_road, axis=1) & (reach < width)
-        widths += np.where(np.logical_and.accumulate(on_road | before_it, axis=1) & on_road, reach, 0.0).max(axis=1)
-    usual = min(width, float(np.median(widths)))
-    flags = np.pad(widths > max(_MERGED * usual, usual + _LEAST_MORE), _IN_A_ROW // 2, mode="edge")
-    return np.asarray(np.lib.stride_tricks.sliding_window_view(flags, _IN_A_ROW).mean(axis=1) > 0.5)
-
-
-def near_any(xy: FloatArray, points: FloatArray, away: float) -> BoolArray:
-    """Tell which of `xy` (N, 2) lie within a distance of any of `points` (M, 2)."""
-    near = np.zeros(len(xy), np.bool_)
-    for point in points:
-        near |= ((xy - point) ** 2).sum(axis=1) < away**2
-    return near
 
 
 def prepare_scene(

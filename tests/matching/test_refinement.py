@@ -1,7 +1,5 @@
 """Refinement on made-up towns with known homographies."""
 
-from dataclasses import replace
-
 import numpy as np
 import pytest
 from worlds.scenes import Sight, mapped, shaken, sight_of
@@ -123,59 +121,3 @@ def test_few_true_matches_are_enough_where_roads_agree(town, n_matches):
     assert result is not None
     gaps = np.hypot(*(mapped(result.matrix, scene.corners) - mapped(truth, scene.corners)).T)
     assert gaps.max() < 2.0
-
-
-@pytest.fixture(scope="module")
-def merged_sight(town):
-    """(truth, scene, merged, at_merged): in a quarter of the frame roads lie 4 m beside where they are.
-
-    The middle of a motorway is none of its carriageways.
-    """
-    truth, scene = sight_of(town[0], 10, 10)
-    merged, at_merged = (
-        (at[:, 0] > scene.center[0]) & (at[:, 1] > scene.center[1]) for at in (scene.points, scene.intersections.xy)
-    )
-    across = scene.directions[:, ::-1] * (-1.0, 1.0)
-    points = np.where(merged[:, None], scene.points + 4.0 * across, scene.points)
-    return truth, replace(scene, points=points), merged, at_merged
-
-
-def error_of(sight, index, options=None, **flags):
-    """Root mean square over the inner frame, metres, and what is claimed of its corners."""
-    truth, scene, _, _ = sight
-    nothing = np.full(len(scene.intersections), -1)
-    result = refine(truth, replace(scene, **flags), index, nothing, options)
-    inner = scene.center + 0.8 * (scene.corners - scene.center)
-    gaps = np.hypot(*(mapped(result.matrix, inner) - mapped(truth, inner)).T)
-    return float(np.sqrt(np.mean(gaps**2))), float(result.corner_sigma_m.mean())
-
-
-def test_merged_roads_do_not_bend_the_fit(merged_sight, exact):
-    _, _, merged, at_merged = merged_sight
-    without, _ = error_of(merged_sight, exact)
-    error, claimed = error_of(merged_sight, exact, merged=merged, at_merged=at_merged)
-    assert error < 0.3
-    assert error < 0.3 * without
-    assert error < 2.0 * claimed
-
-
-def test_where_most_roads_have_merged_they_are_all_that_there_is(merged_sight, exact):
-    _, _, merged, at_merged = merged_sight
-    without, _ = error_of(merged_sight, exact)
-    options = RefineOptions(most_merged=0.1)
-    assert error_of(merged_sight, exact, options, merged=merged, at_merged=at_merged)[0] == without
-
-
-def test_intersections_on_merged_roads_are_left_out(town, exact):
-    truth, scene = sight_of(town[0], 10, 10)
-    _, matched, _ = agreement(truth, scene, exact, 1.0, NO_SEEDS, VerifyOptions())
-    at_merged = np.zeros(len(matched), np.bool_)
-    at_merged[np.flatnonzero(matched >= 0)[:5]] = True
-    merged = np.arange(len(scene.points)) < 3
-    with_them = replace(scene, merged=merged, at_merged=np.zeros_like(at_merged))
-    without = replace(scene, merged=merged, at_merged=at_merged)
-    one, other = (refine(truth, seen, exact, matched) for seen in (with_them, without))
-    assert not np.allclose(one.matrix, other.matrix, rtol=0.0, atol=1e-9)
-    spoiled = np.where(at_merged, (matched + 7) % len(exact), matched)
-    same = refine(truth, without, exact, spoiled)
-    assert np.abs(mapped(same.matrix, scene.corners) - mapped(other.matrix, scene.corners)).max() < 0.05

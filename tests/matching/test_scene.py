@@ -10,12 +10,8 @@ from hypothesis import strategies as st
 from naive import kernels as naive
 from worlds.scenes import camera, look, scene_of
 
-from roadgeo.geometry.mask import RoadMask
-from roadgeo.matching.query import trace_query
 from roadgeo.matching.scene import (
     SceneOptions,
-    find_merged,
-    near_any,
     prepare_scene,
     query_neighbours,
     sample_roads,
@@ -143,94 +139,22 @@ class TestPrepareScene:
         assert (np.hypot(*np.diff(scene.points, axis=0).T) > 0).all()
 
 
-def mask_of(*strips):
-    """A mask of 200 x 400 pixels with roads between rows, from a column to another: (top, bottom, left, right)."""
-    roads = np.zeros((200, 400), np.bool_)
-    for top, bottom, left, right in strips:
-        roads[top:bottom, left:right] = True
-    return roads
-
-
-class TestMergedRoads:
-    """Two roads side by side, of which the mask shows a line between them."""
-
-    SINGLE = (20, 30, 0, 400)
-
-    def flags(self, merged, line_at, *, spacing=10.0):
-        """Flags along a single road at row 25 and along a line at another row, columns 5, 15, ... of each."""
-        columns = np.arange(5.0, 400.0, spacing)
-        points = np.concatenate([np.stack([columns, np.full(len(columns), -at)], axis=1) for at in (25.0, line_at)])
-        directions = np.tile([1.0, 0.0], (len(points), 1))
-        found = find_merged(mask_of(self.SINGLE, *merged), points, directions, 10.0)
-        return found[: len(columns)], found[len(columns) :]
-
-    @pytest.mark.parametrize("gap", [0, 3, 8])
-    def test_their_line_is_told_by_its_width(self, gap):
-        """Whether they touch or leave a narrow gap in which the line runs."""
-        middle = 110.0
-        pair = [(int(middle - gap / 2 - 10), int(middle - gap / 2), 0, 400), (int(middle + gap / 2), 125, 0, 400)]
-        alone, together = self.flags(pair, middle)
-        assert not alone.any()
-        assert together.all()
-
-    def test_two_lines_side_by_side_are_two_roads(self):
-        _, one = self.flags([(100, 110, 0, 400), (113, 123, 0, 400)], 105.0)
-        assert not one.any()
-
-    def test_roads_are_wide_for_a_while_where_they_cross(self):
-        _, crossed = self.flags([(105, 115, 0, 400), (50, 170, 200, 210)], 110.0)
-        assert not crossed.any()
-
-    def test_only_where_they_run_together(self):
-        _, partly = self.flags([(105, 115, 0, 400), (115, 125, 0, 200)], 113.0)
-        assert partly[:18].all()
-        assert not partly[22:].any()
-
-    def test_beyond_the_frame_is_no_road(self):
-        columns = np.arange(2.0, 400.0, 4.0)
-        points = np.stack([columns, np.full(len(columns), -4.0)], axis=1)
-        directions = np.tile([1.0, 0.0], (len(points), 1))
-        assert not find_merged(mask_of((0, 8, 0, 400)), points, directions, 10.0).any()
-
-    def test_thin_lines_are_no_merged_roads(self):
-        """Of lines of a pixel, many have two."""
-        rng = np.random.default_rng(3)
-        roads = mask_of((50, 51, 0, 400), (51, 52, 100, 300), (150, 151, 0, 400))
-        columns = rng.uniform(0.0, 399.0, 200)
-        points = np.stack([columns, np.where(columns < 200, -50.5, -150.5)], axis=1)
-        assert not find_merged(roads, points, np.tile([1.0, 0.0], (200, 1)), 1.3).any()
-
-    def test_no_points(self):
-        nothing = np.empty((0, 2))
-        assert find_merged(mask_of(self.SINGLE), nothing, nothing, 10.0).shape == (0,)
-
-    def test_a_traced_mask_knows_them(self):
-        mask = RoadMask(mask_of(self.SINGLE, (100, 122, 0, 400), (20, 110, 60, 70), (20, 110, 330, 340)))
-        scene, _ = trace_query(mask)
-        wide = np.abs(scene.points[:, 1] + 111) < 4
-        assert scene.merged[wide].mean() > 0.9
-        assert scene.merged[~wide].mean() < 0.1
-        low = scene.intersections.xy[:, 1] < -90
-        assert low.any()
-        assert np.array_equal(scene.at_merged, low)
-
-
 @pytest.mark.parametrize("kept", [slice(None, None, 3), np.arange(600) % 2 == 0])
 @pytest.mark.parametrize("knows", [True, False])
 def test_some_of_the_points_keep_all_that_is_known_of_them(town, kept, knows):
     scene = scene_of(look(town[0], camera((2000, 1900), (1000, 1000), 1.0)))
     kept = kept if isinstance(kept, slice) else kept[: len(scene.points)]
-    scene = replace(scene, merged=scene.points[:, 0] > 500 if knows else None)
+    merged = scene.points[:, 0] > 500
+    at = np.resize(np.append(np.flatnonzero(merged)[:7], -1), len(scene.intersections))
+    scene = replace(scene, merged=merged, merged_at=at) if knows else scene
     some = scene.of_points(kept)
     for name in ("points", "directions", "weights", "merged")[: 4 if knows else 3]:
         assert np.array_equal(getattr(some, name), getattr(scene, name)[kept])
-    assert knows or some.merged is None
+    assert knows or (some.merged is None and some.merged_at is None)
+    if knows:
+        left = some.merged_at >= 0
+        assert 0 < left.sum() < len(left)
+        assert np.array_equal(some.points[some.merged_at[left]], scene.points[at[left]])
+        gone = set(map(tuple, scene.points[at[~left & (at >= 0)]]))
+        assert not gone & set(map(tuple, some.points))
     assert some.intersections is scene.intersections
-
-
-@given(st.integers(0, 30), st.integers(0, 30), st.floats(0.1, 60.0), st.integers(0, 2**32 - 1))
-def test_what_lies_near_any_point(n, m, away, seed):
-    rng = np.random.default_rng(seed)
-    xy, points = rng.uniform(0, 100, (n, 2)), rng.uniform(0, 100, (m, 2))
-    slow = [any(np.hypot(*(one - other)) < away for other in points) for one in xy]
-    assert near_any(xy, points, away).tolist() == slow

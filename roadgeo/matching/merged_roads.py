@@ -1,0 +1,105 @@
+"""Where roads of a mask have merged: what looks like one wide road may be the two carriageways of a motorway.
+
+The line that is traced of them runs between the two of the map. Were it laid on either, the frame would be off by half
+their distance; so a fit does not rest on it where it has others.
+"""
+
+from __future__ import annotations
+
+import math
+from dataclasses import replace
+
+import numpy as np
+
+from roadgeo._arrays import BoolArray, FloatArray, IntArray
+from roadgeo.geometry.homography import Homography
+from roadgeo.kernels.roads import forward_distances
+from roadgeo.matching.index import ReferenceIndex
+from roadgeo.matching.scene import Scene
+
+__all__ = ["find_merged", "mark_merged", "without_merged"]
+
+#: Roads have merged where a mask is so many times wider than usual, and by so many pixels, at most of so many points in
+#: a row: at crossings it is wide as well, but not for long.
+_MERGED, _LEAST_MORE, _IN_A_ROW = 1.6, 4.0, 5
+#: Intersections belong to merged roads within so many road widths of their points.
+_NEAR_WIDTHS = 2.0
+#: The map has two roads where one lies beside a point, 3 to 23 metres from it.
+_BESIDE_M, _GIVE_OR_TAKE_M = 13.0, 10.0
+#: A fit needs points: where more of them have merged, they are all that there is.
+_MOST = 0.5
+
+
+def mark_merged(scene: Scene, roads: BoolArray, width: float) -> Scene:
+    """Return the scene of a mask, its roads (H, W) usually `width` pixels wide, with what is known of merged roads."""
+    merged = find_merged(roads, scene.points, scene.directions, width)
+    xy, away = scene.intersections.xy, _NEAR_WIDTHS * width
+    return replace(scene, merged=merged, merged_at=_nearest_of(xy, scene.points, np.flatnonzero(merged), away))
+
+
+def find_merged(roads: BoolArray, points: FloatArray, directions: FloatArray, width: float) -> BoolArray:
+    """Tell at which points (S, 2) of the query plane a mask's roads (H, W) are so wide that two may have merged.
+
+    `directions` (S, 2) run along the road; `width` is the usual one, pixels, where not most have merged.
+    """
+    if not len(points):
+        return np.zeros(0, np.bool_)
+    across, pixels = directions[:, ::-1] * (-1.0, -1.0), points * (1.0, -1.0)
+    reach = np.arange(0.0, np.ceil(_MERGED * width) + 1.0)
+    height, wide = roads.shape
+    widths = np.zeros(len(points))
+    for side in (-1.0, 1.0):
+        at = np.floor(pixels[:, None] + side * reach[:, None] * across[:, None]).astype(np.int64)
+        inside = ((at >= 0) & (at < (wide, height))).all(axis=2)
+        column, row = np.clip(at, 0, (wide - 1, height - 1)).transpose(2, 0, 1)
+        on_road = inside & roads[row, column]
+        # The line may run in the narrow gap between two carriageways.
+        before_it = ~np.logical_or.accumulate(on_road, axis=1) & (reach < width)
+        widths += np.where(np.logical_and.accumulate(on_road | before_it, axis=1) & on_road, reach, 0.0).max(axis=1)
+    usual = min(width, float(np.median(widths)))
+    flags = np.pad(widths > max(_MERGED * usual, usual + _LEAST_MORE), _IN_A_ROW // 2, mode="edge")
+    return np.asarray(np.lib.stride_tricks.sliding_window_view(flags, _IN_A_ROW).mean(axis=1) > 0.5)
+
+
+def _nearest_of(xy: FloatArray, points: FloatArray, among: IntArray, away: float) -> IntArray:
+    """Return which of `points` (S, 2), `among` those numbered, lies nearest to each of `xy` (N, 2); -1: none within."""
+    nearest, least = np.full(len(xy), -1), np.full(len(xy), away**2)
+    for number in among:
+        square = ((xy - points[number]) ** 2).sum(axis=1)
+        closer = square < least
+        nearest[closer], least[closer] = number, square[closer]
+    return nearest
+
+
+def without_merged(
+    matrix: FloatArray, scene: Scene, index: ReferenceIndex, matched: IntArray, max_turn_deg: float
+) -> tuple[Scene, IntArray]:
+    """Return the scene, and the matches (N,), without points and intersections of merged roads; themselves if none.
+
+    Only where the map has two roads: where it has one, the mask's is wide, or near in a steep view.
+    """
+    if scene.merged is None or scene.merged_at is None or not scene.merged.any():
+        return scene, matched
+    between = np.zeros(len(scene.points), np.bool_)
+    between[scene.merged] = _has_road_beside(matrix, scene.of_points(scene.merged), index, max_turn_deg)
+    if not 0.0 < between.mean() <= _MOST:
+        return scene, matched
+    length = scene.road_length_px * float(1.0 - between.mean())
+    apart = replace(scene.of_points(~between), road_length_px=length)
+    return apart, np.where((scene.merged_at >= 0) & between[scene.merged_at], -1, matched)
+
+
+def _has_road_beside(matrix: FloatArray, scene: Scene, index: ReferenceIndex, max_turn_deg: float) -> BoolArray:
+    """Tell which road points (S,) have a road of the map beside them, which runs their way."""
+    to_map = Homography(matrix).facing(scene.center)
+    points = to_map(scene.points)
+    ahead = to_map(scene.points + scene.directions) - points
+    along = np.ascontiguousarray(ahead / np.maximum(np.hypot(*ahead.T), 1e-12)[:, None])
+    beside, min_cos = np.zeros(len(points), np.bool_), math.cos(math.radians(max_turn_deg))
+    for side in (_BESIDE_M, -_BESIDE_M):
+        away, shifted = np.empty(len(points)), np.ascontiguousarray(points + side * along[:, ::-1] * (1.0, -1.0))
+        forward_distances(
+            np.eye(3), shifted, along, _GIVE_OR_TAKE_M, min_cos, 0.0, 0.0, index.road_buckets, away
+        )  # fmt: skip
+        beside |= np.isfinite(away)
+    return beside
