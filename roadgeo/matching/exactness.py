@@ -52,7 +52,7 @@ def exact_log10_odds(
     (see `foreground`).
     """
     odds = _exact(model, scene, index, n_candidates, options, certain, near)
-    if odds >= certain:
+    if odds >= certain or not math.isfinite(odds):  # -inf: the camera, or where the frame may lie, rules it out
         return odds
     part = foreground(model, scene, options.foreground, options.least_whole)
     if part is None:

@@ -112,6 +112,15 @@ def test_a_place_counts_by_its_foreground_where_the_rest_is_lost(town, merged):
     assert exact_log10_odds(model, merged, town[1], 1, OPTIONS, 1e3) > max(without, 0.0) + 10.0
 
 
+@pytest.mark.parametrize("refused", [True, False])
+def test_what_was_refused_stays_refused(town, merged, refused):
+    """A camera, or where the frame may lie, ruled it out after it had been compared with the map."""
+    model = verified(STEEP, merged, town[1])
+    if refused:
+        model.log10_odds = -np.inf
+    assert np.isfinite(exact_log10_odds(model, merged, town[1], 1, OPTIONS, 1e3)) != refused
+
+
 def test_a_wrong_place_gains_nothing(town, merged):
     away = np.array([[1, 0, 260.0], [0, 1, -140.0], [0, 0, 1]]) @ STEEP
     model = verified(away, merged, town[1])
