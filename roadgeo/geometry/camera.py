@@ -197,8 +197,8 @@ def judge(matrix: FloatArray, size: tuple[int, int], options: CameraOptions, rou
     """Return why a homography is not plausible, or None if it is.
 
     Some camera within the options must fit about as well as any. A `rough` homography, of a few matches or of a part of
-    the frame, may still become plausible: its bounds are wider, and it may be skewed: of 16 steep
-    views that were lost, two were refused for that and fit once refined.
+    the frame, may still become plausible: its bounds are wider, and it may be skewed. Of 16 steep views that were lost,
+    two were refused for that and fit once refined.
     """
     if not np.isfinite(matrix).all():
         return CameraFault.DEGENERATE

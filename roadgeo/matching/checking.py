@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import math
 from collections.abc import Sequence
 from dataclasses import dataclass, field, replace
 from typing import Literal
@@ -13,9 +12,9 @@ from roadgeo._arrays import FloatArray, IntArray
 from roadgeo.geometry.camera import sampling
 from roadgeo.geometry.displacement import Displacement, measure
 from roadgeo.geometry.homography import Homography
-from roadgeo.kernels.roads import forward_distances
 from roadgeo.matching.index import ReferenceIndex
 from roadgeo.matching.local_search import LocalSearchOptions, move_about, search_nearby
+from roadgeo.matching.merged_roads import roads_beside
 from roadgeo.matching.pieces import Pieces, log10_lead, sample_roads
 from roadgeo.matching.refinement import Refined, RefineOptions, refine
 from roadgeo.matching.scene import Scene
@@ -183,20 +182,9 @@ class _Judge:
         A mask often shows a dual carriageway as one line, halfway between the two of the map: were it laid on either,
         the frame would be off by half their distance.
         """
-        scene, to_map = self.scene, Homography(matrix).facing(self.scene.center)
-        points = to_map(scene.points)
-        ahead = to_map(scene.points + scene.directions) - points
-        along = ahead / np.maximum(np.hypot(*ahead.T), 1e-12)[:, None]
-        aside = along[:, ::-1] * (1.0, -1.0)
-        beside = []
-        for side in (1.0, -1.0):
-            away = np.empty(len(points))
-            shifted = np.ascontiguousarray(points + side * self.options.twin_m * aside)
-            min_cos = math.cos(math.radians(self.options.verify.max_turn_deg))
-            radius, roads = 0.8 * self.options.twin_m, self.index.road_buckets
-            forward_distances(np.eye(3), shifted, np.ascontiguousarray(along), radius, min_cos, 0.0, 0.0, roads, away)
-            beside.append(np.isfinite(away))
-        alone = ~(beside[0] & beside[1])
+        scene, twin_m, max_turn = self.scene, self.options.twin_m, self.options.verify.max_turn_deg
+        right, left = roads_beside(matrix, scene, self.index, twin_m, 0.8 * twin_m, max_turn)
+        alone = ~(right & left)
         if alone.mean() < 0.4:
             return scene
         return replace(scene.of_points(alone), road_length_px=scene.road_length_px * alone.mean())

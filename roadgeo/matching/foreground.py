@@ -48,7 +48,8 @@ def foreground(model: Hypothesis, scene: Scene, coarser: float, least_share: flo
     if shown.sum() < _LEAST_POINTS or agreeing < least_share * most:
         return None
     kept = np.flatnonzero(_side(scene.intersections.xy, line) >= 0.0)
-    return Foreground(_only(scene, line, kept), np.flatnonzero(np.isin(kept, model.seeds)))
+    seeds = model.seeds[np.isin(model.seeds, kept)]
+    return Foreground(_only(scene, line, kept), np.searchsorted(kept, seeds))
 
 
 def before(xy: FloatArray, matrix: FloatArray, scene: Scene, coarser: float) -> BoolArray:
@@ -73,7 +74,7 @@ def _side(xy: FloatArray, line: FloatArray) -> FloatArray:
 def _only(scene: Scene, line: FloatArray, kept: IntArray) -> Scene:
     """Return a scene of what lies before a line, with the intersections `kept`."""
     rows, columns = (np.arange(n) + 0.5 for n in scene.observed.shape)
-    before = scene.field_scale * (columns * line[0] - rows[:, None] * line[1]) + line[2] >= 0.0
+    ahead = scene.field_scale * (columns * line[0] - rows[:, None] * line[1]) + line[2] >= 0.0
     near, dense = (_side(xy, line) >= 0.0 for xy in (scene.points, scene.dense_points))
     share, xy = float(near.mean()), scene.intersections.xy[kept]
     part = scene.of_points(near)
@@ -87,5 +88,5 @@ def _only(scene: Scene, line: FloatArray, kept: IntArray) -> Scene:
         dense_directions=scene.dense_directions[dense],
         road_length_px=share * scene.road_length_px,
         n_edges=round(share * scene.n_edges),
-        observed=scene.observed & before,
+        observed=scene.observed & ahead,
     )

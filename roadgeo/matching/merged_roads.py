@@ -17,7 +17,7 @@ from roadgeo.kernels.roads import forward_distances
 from roadgeo.matching.index import ReferenceIndex
 from roadgeo.matching.scene import Scene
 
-__all__ = ["find_merged", "mark_merged", "without_merged"]
+__all__ = ["find_merged", "mark_merged", "roads_beside", "without_merged"]
 
 #: Roads have merged where a mask is so many times wider than usual, and by so many pixels, at most of so many points in
 #: a row: at crossings it is wide as well, but not for long.
@@ -81,7 +81,9 @@ def without_merged(
     if scene.merged is None or scene.merged_at is None or not scene.merged.any():
         return scene, matched
     between = np.zeros(len(scene.points), np.bool_)
-    between[scene.merged] = _has_road_beside(matrix, scene.of_points(scene.merged), index, max_turn_deg)
+    merged = scene.of_points(scene.merged)
+    right, left = roads_beside(matrix, merged, index, _BESIDE_M, _GIVE_OR_TAKE_M, max_turn_deg)
+    between[scene.merged] = right | left
     if not 0.0 < between.mean() <= _MOST:
         return scene, matched
     length = scene.road_length_px * float(1.0 - between.mean())
@@ -89,17 +91,19 @@ def without_merged(
     return apart, np.where((scene.merged_at >= 0) & between[scene.merged_at], -1, matched)
 
 
-def _has_road_beside(matrix: FloatArray, scene: Scene, index: ReferenceIndex, max_turn_deg: float) -> BoolArray:
-    """Tell which road points (S,) have a road of the map beside them, which runs their way."""
+def roads_beside(
+    matrix: FloatArray, scene: Scene, index: ReferenceIndex, beside_m: float, give_or_take_m: float, max_turn_deg: float
+) -> tuple[BoolArray, BoolArray]:
+    """Tell which road points (S,) have a road of the map that runs their way so far to the right, and to the left."""
     to_map = Homography(matrix).facing(scene.center)
     points = to_map(scene.points)
     ahead = to_map(scene.points + scene.directions) - points
     along = np.ascontiguousarray(ahead / np.maximum(np.hypot(*ahead.T), 1e-12)[:, None])
-    beside, min_cos = np.zeros(len(points), np.bool_), math.cos(math.radians(max_turn_deg))
-    for side in (_BESIDE_M, -_BESIDE_M):
-        away, shifted = np.empty(len(points)), np.ascontiguousarray(points + side * along[:, ::-1] * (1.0, -1.0))
-        forward_distances(
-            np.eye(3), shifted, along, _GIVE_OR_TAKE_M, min_cos, 0.0, 0.0, index.road_buckets, away
-        )  # fmt: skip
-        beside |= np.isfinite(away)
-    return beside
+    min_cos, roads = math.cos(math.radians(max_turn_deg)), index.road_buckets
+
+    def beside(away_m: float) -> BoolArray:
+        away, shifted = np.empty(len(points)), np.ascontiguousarray(points + away_m * along[:, ::-1] * (1.0, -1.0))
+        forward_distances(np.eye(3), shifted, along, give_or_take_m, min_cos, 0.0, 0.0, roads, away)
+        return np.isfinite(away)
+
+    return beside(beside_m), beside(-beside_m)
