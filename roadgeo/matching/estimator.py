@@ -409,7 +409,6 @@ class TripleEstimator:
                 twin.leads += [lead for lead in one.leads if lead not in twin.leads]
             elif len(places) < options.max_places:
                 places.append(one)
-        self.trace.grown(places)
         for one in places:
             found = regrow(one.matrix, scene, index, refinement, options)
             if found is None or self.judge(found.matrix) is not None or self._is_far(found.matrix):

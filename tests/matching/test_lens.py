@@ -4,14 +4,16 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
-from worlds.scenes import Sight, mapped, shaken, sight_of
+from worlds.scenes import Sight, mapped, random_network, shaken, sight_of
 
 from roadgeo.geometry.lens import Lens
 from roadgeo.matching.accuracy import with_honest_corners
 from roadgeo.matching.estimator import TripleEstimator
+from roadgeo.matching.hypothesis import Hypothesis
 from roadgeo.matching.lens import LensOptions, core_excess, find_lens, fit_lens, regrow, straighten_scene
 from roadgeo.matching.refinement import Refined, RefineOptions, refine
 from roadgeo.matching.search import SearchOptions, search
+from roadgeo.matching.trace import NoTrace
 
 
 def through_lens(scene, k1):
@@ -145,6 +147,22 @@ def test_a_fit_that_ended_early_is_taken_up_where_it_ended(town):
     once, again = (find_lens(start, *given, LensOptions(n_iterations=2, starts=(), n_restarts=n)) for n in (0, 3))
     assert abs(once.k1 + 0.08) > 0.001
     assert again.k1 == pytest.approx(-0.08, abs=0.001)
+
+
+def test_a_place_that_is_grown_anew_behind_a_lens_is_told_as_grown_once(town):
+    """It grew before it was dropped: else more would be said to survive than was proposed."""
+
+    class Told(NoTrace):
+        def __init__(self):
+            self.grew: list[Hypothesis] = []
+
+        def grown(self, hypotheses):
+            self.grew += hypotheses
+
+    _, elsewhere = sight_of(random_network(77), 5, sight=Sight(0.6))
+    told = Told()
+    search(TripleEstimator(elsewhere, town[1], trace=told), SearchOptions(time_limit_s=60.0))
+    assert len({id(one) for one in told.grew}) == len(told.grew) > 0
 
 
 @pytest.mark.parametrize("k1", [-0.12, -0.04, 0.0, 0.05])
