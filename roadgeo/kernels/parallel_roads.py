@@ -9,7 +9,7 @@ from numpy.typing import NDArray
 from roadgeo.kernels.arrays import Floats1, Floats2, Int32s1, Int32s2, Ints1
 from roadgeo.kernels.compilation import kernel
 
-__all__ = ["find_mates", "fuse_twins", "sample_edges", "tie_runs"]
+__all__ = ["find_mates", "fuse_twins", "roads_alongside", "sample_edges", "tie_runs"]
 
 
 @kernel()
@@ -309,3 +309,43 @@ def tie_runs(
                 ties[size, 3] = (mate[k] - starts[f]) * other
                 size += 1
     return ties[:size].copy()
+
+
+@kernel()
+def roads_alongside(
+    xy: Floats2, along: Floats2, reach: Floats1, least: float, most: float, min_cos: float, out: Floats2
+) -> None:
+    """Find how far beside each road point the nearest road lies that runs its way.
+
+    Parameters
+    ----------
+    xy, along : (S, 2) float64
+        Points on roads, and unit vectors along the road.
+    reach : (S,) float64
+        Of two points, one lies beside the other if it is no further than the larger of theirs ahead or behind.
+    least, most : float
+        Only roads between these distances count.
+    min_cos : float
+        Least |cosine| of the angle between the two roads.
+    out : (S, 2) float64
+        Filled: the way across to the other road, at right angles to the mean of their directions; NaN where there is
+        none.
+    """
+    for i in range(len(xy)):
+        nearest = most
+        out[i, 0] = out[i, 1] = np.nan
+        for j in range(len(xy)):
+            cos = along[i, 0] * along[j, 0] + along[i, 1] * along[j, 1]
+            if abs(cos) < min_cos or i == j:
+                continue
+            side = 1.0 if cos > 0.0 else -1.0
+            length = np.sqrt(2.0 + 2.0 * abs(cos))
+            east = (along[i, 0] + side * along[j, 0]) / length
+            north = (along[i, 1] + side * along[j, 1]) / length
+            dx = xy[j, 0] - xy[i, 0]
+            dy = xy[j, 1] - xy[i, 1]
+            across = dy * east - dx * north
+            if least < abs(across) < nearest and abs(dx * east + dy * north) <= max(reach[i], reach[j]):
+                nearest = abs(across)
+                out[i, 0] = -across * north
+                out[i, 1] = across * east

@@ -11,13 +11,15 @@ from functools import lru_cache
 import numpy as np
 
 from roadgeo._arrays import FloatArray, IntArray
+from roadgeo.geometry.camera import sampling
 from roadgeo.geometry.homography import Homography
 from roadgeo.geometry.projection import from_lonlat, metres_apart, to_lonlat
 from roadgeo.location import Stats
 from roadgeo.matching.accuracy import with_honest_corners
 from roadgeo.matching.ahead import Ahead
+from roadgeo.matching.carriageways import refine_between
 from roadgeo.matching.estimator import MatchOptions, TripleEstimator
-from roadgeo.matching.hypothesis import Hypothesis
+from roadgeo.matching.hypothesis import MINIMAL, Hypothesis
 from roadgeo.matching.index import ReferenceIndex, crop, unpack_tangents
 from roadgeo.matching.ledger import Ledger
 from roadgeo.matching.options import LocateOptions
@@ -26,11 +28,14 @@ from roadgeo.matching.paper.search import match_pairs
 from roadgeo.matching.paper.tuples import PairIndex, PairOptions, build_pair_index
 from roadgeo.matching.parts import Part, Whole, same_within_m
 from roadgeo.matching.query import Query
+from roadgeo.matching.refinement import Refined
 from roadgeo.matching.road_search import COARSE_PIXEL_M
+from roadgeo.matching.scene import Scene
 from roadgeo.matching.search import Search, SearchResult, search_together
 from roadgeo.matching.shared_sweeps import SharedSweeps
 from roadgeo.matching.trace import NO_TRACE, Trace
 from roadgeo.matching.triples import larger
+from roadgeo.matching.verification import agreement
 from roadgeo.roads.intersections import Intersections
 from roadgeo.storage.memory import let_pages_go
 
@@ -323,11 +328,29 @@ def _fits(
 
 
 def _measure_corners(estimator: TripleEstimator, best: Hypothesis | None) -> None:
-    """Measure how sure the corners of a place are that may be reported."""
+    """Refine a place that may be reported for the last time, and measure how sure its corners are."""
     lens = estimator.options.lens
-    if best is not None and best.refined is not None and best.found is not None and lens is not None:
-        scene, index, options = estimator.scene, estimator.index, estimator.refine_options
-        best.refined = with_honest_corners(best.refined, scene, index, best.found.forward, options, lens)
+    if best is None or best.refined is None or best.found is None or lens is None:
+        return
+    scene = (
+        _laid_between_carriageways(estimator, best, best.refined) if best.refined.lens_k1 == 0.0 else estimator.scene
+    )
+    agreeing, options = best.found.forward, estimator.refine_options
+    best.refined = with_honest_corners(best.refined, scene, estimator.index, agreeing, options, lens)
+
+
+def _laid_between_carriageways(estimator: TripleEstimator, best: Hypothesis, refined: Refined) -> Scene:
+    """Lay the middle of a mask's two roads on the map's one; return the scene with road points there.
+
+    What was found before stands: the odds rest on it.
+    """
+    scene, index, verify = estimator.scene, estimator.index, estimator.options.verify
+    best.refined, seen = refine_between(refined, scene, index, best.matched, estimator.refine_options)
+    if seen is not scene:
+        best.matrix, best.gsd_m = best.refined.matrix, sampling(best.refined.matrix, scene.size)
+        seeds = best.seeds[-MINIMAL:]
+        _, best.matched, best.distance = agreement(best.matrix, scene, index, best.gsd_m, seeds, verify)
+    return seen
 
 
 def _fit(estimator: TripleEstimator, model: Hypothesis | None, score: float) -> Fit | None:

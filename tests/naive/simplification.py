@@ -114,3 +114,22 @@ def narrow_faces(lines, width, longest):
     rings = [outer_rings(face) for face in get_parts(polygonize(lines))]
     faces = [(2 * Polygon(r[0]).area - sum(Polygon(ring).area for ring in r), sum(x.length for x in r)) for r in rings]
     return sorted(f for f in faces if f[1] < longest and 2 * f[0] < width * f[1])
+
+
+def roads_alongside(xy, along, reach, least, most, min_cos):
+    """The way across from each point to the nearest point abreast of it on a road alike in direction."""
+    ways = np.full(xy.shape, np.nan)
+    for i in range(len(xy)):
+        for j in range(len(xy)):
+            cos = along[i] @ along[j]
+            if i == j or abs(cos) < min_cos:
+                continue
+            mean = along[i] + np.sign(cos) * along[j]
+            mean = mean / np.hypot(*mean)
+            ahead = (xy[j] - xy[i]) @ mean
+            across = (xy[j] - xy[i]) - ahead * mean
+            away = np.hypot(*across)
+            abreast = abs(ahead) <= max(reach[i], reach[j])
+            if least < away < most and abreast and not np.hypot(*ways[i]) <= away:
+                ways[i] = across
+    return ways
