@@ -12,6 +12,7 @@ from roadgeo._arrays import FloatArray, IntArray
 from roadgeo.geometry.camera import sampling
 from roadgeo.geometry.displacement import Displacement, measure
 from roadgeo.geometry.homography import Homography
+from roadgeo.matching.carriageways import refine_between
 from roadgeo.matching.index import ReferenceIndex
 from roadgeo.matching.local_search import LocalSearchOptions, move_about, search_nearby
 from roadgeo.matching.merged_roads import roads_beside
@@ -174,6 +175,9 @@ class _Judge:
             if step is None or not self.gap(step.matrix, start) < self.options.max_drift_m:
                 break
             refined, matrix = step, step.matrix
+        if refined is not None and n_points is None:
+            refined, _ = refine_between(refined, scene, self.index, matched, self.refine_options)
+            matrix = refined.matrix
         return _Place(matrix, self.pieces(matrix), matched, refined)
 
     def without_twins(self, matrix: FloatArray) -> Scene:

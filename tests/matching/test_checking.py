@@ -4,6 +4,7 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
+from matching.test_merged_roads import motorways
 from worlds.scenes import Sight, camera, look, scene_of
 
 from roadgeo.geometry.homography import Homography
@@ -78,3 +79,12 @@ def test_the_search_finds_shift_and_turn_to_its_steps(town, sights) -> None:
     best = search_nearby(lied(truth, scene, Shift(150, -90, 4, 1, 0)), scene, town[1], LocalSearchOptions())[0]
     assert (best.east_m, best.north_m) == pytest.approx((-150, 90), abs=8)
     assert best.turn_deg == pytest.approx(-4, abs=1.2)
+
+
+@pytest.mark.parametrize("heading", [10.0, 120.0, 250.0])
+def test_two_roads_of_a_mask_that_are_one_on_the_map_do_not_put_it_off(town, heading) -> None:
+    """A fit to either of them would, by half of how far they are apart; here all roads are such."""
+    truth = camera((2000.0, 2000.0), (900, 700), 1.0, heading_deg=heading)
+    scene = scene_of(look(motorways(town[0], lambda at: True, 20.0), truth, (900, 700)), (900, 700))
+    found = check_place(truth, scene, town[1])
+    assert found.verdict != "off", found.reason
