@@ -116,6 +116,9 @@ def nearest_road(
                 ax, ay = segments[s, 0], segments[s, 1]
                 sx, sy = segments[s, 2] - ax, segments[s, 3] - ay
                 square = sx * sx + sy * sy
+                across = (x - ax) * sy - (y - ay) * sx
+                if across * across > best * square:  # as most are: too far from the line, told without a division
+                    continue
                 t = ((x - ax) * sx + (y - ay) * sy) / square if square > 0.0 else 0.0
                 t = min(max(t, 0.0), 1.0)
                 ex, ey = ax + t * sx - x, ay + t * sy - y
