@@ -433,10 +433,7 @@ class TripleEstimator:
     def _converge(self, model: Hypothesis, n_points: int | None) -> bool:
         """Refine until nothing more agrees: more matches make a better fit, and that finds more matches."""
         scene, verify = self.scene, self.options.verify
-        best = -1.0
-        options = self.refine_options
-        if model.by_roads and self.options.roads is not None:
-            options = self.options.roads.refinement(options)
+        best, options = -1.0, self.refinement(model)
         for _ in range(5):
             refined = refine(model.matrix, scene, self.index, model.matched, options, n_points, model.by_roads)
             model.fault = None if refined is None else self.judge(refined.matrix)
@@ -453,6 +450,11 @@ class TripleEstimator:
             if not improved:
                 break
         return True
+
+    def refinement(self, model: Hypothesis) -> RefineOptions:
+        """Return how a hypothesis is refined."""
+        roads, usual = self.options.roads, self.refine_options
+        return roads.refinement(usual) if model.by_roads and roads is not None else usual
 
     def judge(self, matrix: FloatArray, rough: bool = False) -> CameraFault | None:
         """Return why a homography is not plausible for the camera, or None if it is."""

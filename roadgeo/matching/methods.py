@@ -345,7 +345,7 @@ def _laid_between_carriageways(estimator: TripleEstimator, best: Hypothesis, ref
     What was found before stands: the odds rest on it.
     """
     scene, index, verify = estimator.scene, estimator.index, estimator.options.verify
-    best.refined, seen = refine_between(refined, scene, index, best.matched, estimator.refine_options)
+    best.refined, seen = refine_between(refined, scene, index, best.matched, estimator.refinement(best))
     if seen is not scene:
         best.matrix, best.gsd_m = best.refined.matrix, sampling(best.refined.matrix, scene.size)
         seeds = best.seeds[-MINIMAL:]
