@@ -45,7 +45,6 @@ from roadgeo.matching.work import Work
 
 __all__ = ["Ledger", "MatchOptions", "Source", "Sweep", "TripleEstimator"]
 
-
 #: A place is looked at through a lens once, and again where so much more of the mask's roads agrees.
 _BETTER = 0.05
 #: A place that so many intersections of the query propose by roads is settled: each looked at the whole map.
