@@ -1,4 +1,4 @@
-"""A picture of a result: the mask, and its roads, matched intersections and footprint on the map (PNG, by OpenCV)."""
+"""A picture of a result: photograph and mask, and their roads, matches and footprint on the map (PNG, by OpenCV)."""
 
 from __future__ import annotations
 
@@ -33,6 +33,7 @@ from roadgeo.outputs.canvas import (
     write_png,
     write_text,
 )
+from roadgeo.outputs.orthophoto import read_preview
 from roadgeo.outputs.paths import Placement
 from roadgeo.outputs.subject import Subject
 from roadgeo.outputs.wording import format_lonlat
@@ -53,7 +54,7 @@ class PlotOptions:
     margin : float
         Ground shown around the footprint, in lengths of its longer side.
     mask_share : float
-        Width of the panel that shows the mask as it came, as a share of `map_px`.
+        Width of the panel that shows photograph and mask as they came, as a share of `map_px`.
     """
 
     map_px: int = 1400
@@ -83,7 +84,8 @@ class _Canvas:
 
 def write_overlay(path: Path, subject: Subject) -> None:
     """Write `draw_overlay` as PNG."""
-    write_png(path, draw_overlay(subject.location, subject.mask, subject.roads, subject.attribution))
+    photo = None if subject.photo is None else read_preview(subject.photo, PlotOptions.map_px)
+    write_png(path, draw_overlay(subject.location, subject.mask, subject.roads, subject.attribution, photo=photo))
 
 
 def draw_overlay(
@@ -92,6 +94,7 @@ def draw_overlay(
     roads: FloatArray,
     attribution: str = "",
     options: PlotOptions | None = None,
+    photo: AnyArray | None = None,
 ) -> AnyArray:
     """Draw a located mask on the map.
 
@@ -101,11 +104,13 @@ def draw_overlay(
         Segments x1, y1, x2, y2 of the reference's roads in the location's CRS; those far away are skipped.
     attribution : str
         Whom the map's licence asks to name.
+    photo : (h, w, 4) uint8, optional
+        The photograph that the mask was made of, at any scale: red, green, blue, alpha.
 
     Returns
     -------
     (height, width, 3) uint8
-        The mask as it came on the left, where it lies on the right.
+        The mask as it came, below the photograph, on the left; where it lies on the right.
         Red, green, blue.
 
     Raises
@@ -125,7 +130,7 @@ def draw_overlay(
     _draw_scale_bar(canvas)
     _draw_north(canvas)
     _draw_legend(canvas)
-    left = _draw_mask(location, mask, canvas.image.shape[0], round(options.map_px * options.mask_share))
+    left = _draw_frames(location, mask, photo, canvas.image.shape[0], round(options.map_px * options.mask_share))
     gap = np.full((canvas.image.shape[0], _GAP, 3), LIT, np.uint8)
     picture = np.hstack([left, gap, canvas.image])
     _draw_title(picture, location, canvas.top)
@@ -244,24 +249,40 @@ def _draw_legend(canvas: _Canvas) -> None:
     write_text(image, "matched intersections", (x + size, baseline), size, INK)
 
 
-# --- the mask ---------------------------------------------------------------------------------------------------------
+# --- the photograph and the mask --------------------------------------------------------------------------------------
 
 
-def _draw_mask(location: Location, mask: RoadMask, height: int, width: int) -> AnyArray:
-    """Draw the mask as it came, with its matched intersections, in the middle of a panel of the given size."""
+def _draw_frames(location: Location, mask: RoadMask, photo: AnyArray | None, height: int, width: int) -> AnyArray:
+    """Draw the photograph, if there is one, above the mask, in the middle of a panel of the given size."""
     panel = np.full((height, width, 3), LIT, np.uint8)
     rows, columns = mask.shape
-    room = np.array([width - 2 * _GAP, height - 6 * _GAP])
+    n = 1 if photo is None else 2
+    room = np.array([width - 2 * _GAP, (height - (4 + 2 * n) * _GAP) / n])
     scale = float((room / (columns, rows)).min())
+    size = (max(round(columns * scale), 1), max(round(rows * scale), 1))
+    left, top = (width - size[0]) // 2 + _GAP // 4, (height - n * size[1] - (n - 1) * 2 * _GAP) // 2
+    if photo is not None:
+        _draw_frame(panel, _over_paper(cv2.resize(photo, size, interpolation=cv2.INTER_AREA)), left, top)
+        top += size[1] + 2 * _GAP
     gray = np.where(mask.roads, np.uint8(60), np.uint8(236))
     if mask.observed is not None:
         gray[~mask.observed] = 200
-    size = (round(columns * scale), round(rows * scale))
     small = cv2.resize(gray, size, interpolation=cv2.INTER_AREA if scale < 1 else cv2.INTER_NEAREST)
-    left, top = (width - size[0]) // 2 + _GAP // 4, (height - size[1]) // 2
-    panel[top : top + size[1], left : left + size[0]] = small[..., None]
-    draw_outline(panel, fixed_point(np.add(Frame(*size).corners, (left, top))))
+    _draw_frame(panel, small[..., None], left, top)
     if location.evidence is not None:
         at = plane_to_pixel(location.evidence.query_xy) * scale + (left - 0.5, top - 0.5)
         draw_dots(panel, fixed_point(at), 3.6 if location.n_matched < 200 else 2.4)
     return panel
+
+
+def _draw_frame(panel: AnyArray, picture: AnyArray, left: int, top: int) -> None:
+    """Draw a picture (h, w, 1 or 3) into a panel, and its outline, with a triangle where its up is."""
+    height, width = picture.shape[:2]
+    panel[top : top + height, left : left + width] = picture
+    draw_outline(panel, fixed_point(np.add(Frame(width, height).corners, (left, top))))
+
+
+def _over_paper(picture: AnyArray) -> AnyArray:
+    """Return a picture (h, w, 4), red, green, blue, alpha, without what is transparent in it: (h, w, 3)."""
+    opacity = picture[..., 3:] / 255.0
+    return np.asarray(np.rint(opacity * picture[..., :3] + (1.0 - opacity) * np.array(PAPER)), np.uint8)

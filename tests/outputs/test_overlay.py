@@ -53,6 +53,29 @@ def test_a_location_without_evidence_is_drawn_without_roads() -> None:
     assert (picture == FRAME).all(axis=2).any()
 
 
+@pytest.mark.parametrize("shape", [(40, 60), (400, 600), (900, 300)])
+def test_a_photograph_is_drawn_above_its_mask_and_what_is_transparent_is_not(shape: tuple[int, int]) -> None:
+    photo = np.full((*shape, 4), (10, 200, 30, 255), np.uint8)
+    photo[:, shape[1] // 2 :, 3] = 0
+    with_it = draw_overlay(located(), road_mask(), map_roads(), photo=photo)
+    without = draw_overlay(located(), road_mask(), map_roads())
+    assert with_it.shape == without.shape
+    green = np.argwhere((with_it == (10, 200, 30)).all(axis=2))
+    width = 0.6 * PlotOptions.map_px
+    assert len(green) > 0.02 * width**2
+    assert green[:, 1].max() < 0.6 * width  # half of it is transparent
+    assert green[:, 0].max() < 0.55 * len(with_it)  # above the mask
+    mask = np.argwhere((with_it[:, : int(width)] == 60).all(axis=2))
+    assert mask[:, 0].min() > green[:, 0].max()
+
+
+def test_the_photograph_of_a_result_is_drawn(tmp_path: Path) -> None:
+    cv2.imwrite(str(tmp_path / "photo.png"), np.full((40, 60, 3), (30, 200, 10), np.uint8))
+    write_overlay(tmp_path / "a.png", replace(subject(), photo=tmp_path / "photo.png"))
+    drawn = cv2.imread(str(tmp_path / "a.png"))
+    assert (drawn == (30, 200, 10)).all(axis=2).sum() > 10_000
+
+
 def test_the_picture_is_written(tmp_path: Path) -> None:
     write_overlay(tmp_path / "a.png", subject())
     drawn = draw_overlay(located(), road_mask(), map_roads(), "© them")
