@@ -28,8 +28,10 @@ _APART_M, _ONE = (3.0, 30.0), 0.35
 _BESIDE = 0.55
 #: Intersections within so many of these ways are of such a road: the map has them in the middle too.
 _NEAR = 2.0
-#: Where the middle lies follows from the fit, and the fit from it.
-_ROUNDS = 2
+#: A smaller share of the points does not bend a fit.
+_FEW = 0.03
+#: Where the middle lies follows from the fit, and the fit from it: first from about so many points, then from all.
+_ROUNDS = (200, None)
 #: Points within so many standard deviations of a road lie on it.
 _ON_ROADS = 4.0
 
@@ -39,13 +41,13 @@ def refine_between(
 ) -> tuple[Refined, Scene]:
     """Refine a homography once more where the map has one road for two of the mask.
 
-    Return it and the scene with road points between the two, or what was given where there are none, or where no more
-    of the points lie on roads so: a false road beside a true one looks alike.
+    Return it and the scene with road points between the two, or what was given where there are few, or where no more of
+    the points lie on roads so: a false road beside a true one looks alike.
     """
     found, seen = refined, scene
-    for _ in range(_ROUNDS):
+    for n_points in _ROUNDS:
         moved, left = between_carriageways(found.matrix, scene, index, matched, options.max_turn_deg)
-        again = None if moved is scene else refine(found.matrix, moved, index, left, options, held=True)
+        again = None if moved is scene else refine(found.matrix, moved, index, left, options, n_points, held=True)
         if again is None:
             return refined, scene
         found, seen = again, moved
@@ -56,7 +58,7 @@ def refine_between(
 def between_carriageways(
     matrix: FloatArray, scene: Scene, index: ReferenceIndex, matched: IntArray, max_turn_deg: float
 ) -> tuple[Scene, IntArray]:
-    """Return the scene with road points halfway between two roads where the map has one; itself if there are none.
+    """Return the scene with road points halfway between two roads where the map has one; itself if there are few.
 
     The matches (N,) come without those at such points.
     """
@@ -68,7 +70,7 @@ def between_carriageways(
     reach = np.where(np.isfinite(apart), apart, 0.0) + _APART_M[0]
     feet = [_nearest(start, along, reach, min_cos, index) for start in (at, at + across)]
     one = np.hypot(*(feet[0] - feet[1]).T) < _ONE * apart  # not where anything is NaN
-    if not one.any():
+    if one.mean() < _FEW:
         return scene, matched
     points = scene.points.copy()
     points[one] = Homography(np.asarray(np.linalg.inv(matrix), float)).everywhere(at[one] + 0.5 * across[one])
