@@ -16,6 +16,7 @@ from roadgeo.geometry.homography import Homography
 from roadgeo.kernels.parallel_roads import roads_alongside
 from roadgeo.kernels.residuals import road_residuals
 from roadgeo.matching.index import ReferenceIndex
+from roadgeo.matching.merged_roads import nearest_of
 from roadgeo.matching.refinement import Refined, RefineOptions, refine
 from roadgeo.matching.scene import Scene
 
@@ -62,6 +63,8 @@ def between_carriageways(
 
     The matches (N,) come without those at such points.
     """
+    if not len(scene.points):
+        return scene, matched
     min_cos = math.cos(math.radians(max_turn_deg))
     at, along, step_m = _on_map(matrix, scene)
     across = np.empty_like(at)
@@ -74,9 +77,9 @@ def between_carriageways(
         return scene, matched
     points = scene.points.copy()
     points[one] = Homography(np.asarray(np.linalg.inv(matrix), float)).everywhere(at[one] + 0.5 * across[one])
-    xy, step = scene.intersections.xy, scene.road_length_px / len(points)
-    near = (np.hypot(*(xy[:, None] - scene.points[one]).transpose(2, 0, 1)) < _NEAR * step).any(axis=1)
-    return replace(scene, points=points), np.where(near, -1, matched)
+    reach_px = _NEAR * scene.road_length_px / len(points)
+    there = nearest_of(scene.intersections.xy, scene.points, np.flatnonzero(one), reach_px) >= 0
+    return replace(scene, points=points), np.where(there, -1, matched)
 
 
 def _on_roads(matrix: FloatArray, scene: Scene, index: ReferenceIndex, options: RefineOptions) -> float:

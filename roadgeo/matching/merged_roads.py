@@ -17,7 +17,7 @@ from roadgeo.kernels.roads import forward_distances
 from roadgeo.matching.index import ReferenceIndex
 from roadgeo.matching.scene import Scene
 
-__all__ = ["find_merged", "mark_merged", "roads_beside", "without_merged"]
+__all__ = ["find_merged", "mark_merged", "nearest_of", "roads_beside", "without_merged"]
 
 #: Roads have merged where a mask is so many times wider than usual, and by so many pixels, at most of so many points in
 #: a row: at crossings it is wide as well, but not for long.
@@ -34,7 +34,7 @@ def mark_merged(scene: Scene, roads: BoolArray, width: float) -> Scene:
     """Return the scene of a mask, its roads (H, W) usually `width` pixels wide, with what is known of merged roads."""
     merged = find_merged(roads, scene.points, scene.directions, width)
     xy, away = scene.intersections.xy, _NEAR_WIDTHS * width
-    return replace(scene, merged=merged, merged_at=_nearest_of(xy, scene.points, np.flatnonzero(merged), away))
+    return replace(scene, merged=merged, merged_at=nearest_of(xy, scene.points, np.flatnonzero(merged), away))
 
 
 def find_merged(roads: BoolArray, points: FloatArray, directions: FloatArray, width: float) -> BoolArray:
@@ -61,7 +61,7 @@ def find_merged(roads: BoolArray, points: FloatArray, directions: FloatArray, wi
     return np.asarray(np.lib.stride_tricks.sliding_window_view(flags, _IN_A_ROW).mean(axis=1) > 0.5)
 
 
-def _nearest_of(xy: FloatArray, points: FloatArray, among: IntArray, away: float) -> IntArray:
+def nearest_of(xy: FloatArray, points: FloatArray, among: IntArray, away: float) -> IntArray:
     """Return which of `points` (S, 2), `among` those numbered, lies nearest to each of `xy` (N, 2); -1: none within."""
     nearest, least = np.full(len(xy), -1), np.full(len(xy), away**2)
     for number in among:

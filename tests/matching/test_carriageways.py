@@ -108,7 +108,9 @@ def test_without_any_nothing_changes(town):
     scene = scene_of(look(town[0], truth))
     given, nothing = fit(truth, scene, town[1]), np.full(len(scene.intersections), -1)
     alone = replace(scene, points=scene.points[:1], directions=scene.directions[:1], weights=scene.weights[:1])
-    assert between_carriageways(truth, alone, town[1], nothing, 25.0) == (alone, nothing)
+    none = replace(alone, points=np.empty((0, 2)), directions=np.empty((0, 2)), weights=np.empty(0))
+    for one in (alone, none):
+        assert between_carriageways(truth, one, town[1], nothing, 25.0) == (one, nothing)
     found, _ = refine_between(given, scene, town[1], nothing, RefineOptions())
     assert error_of(found.matrix, truth, scene) < error_of(given.matrix, truth, scene) + 0.05
 

@@ -11,7 +11,7 @@ from worlds.scenes import mapped, sight_of
 
 from roadgeo.geometry.mask import RoadMask
 from roadgeo.matching.index import IndexOptions, build_index
-from roadgeo.matching.merged_roads import _nearest_of, find_merged, without_merged
+from roadgeo.matching.merged_roads import nearest_of, find_merged, without_merged
 from roadgeo.matching.query import trace_query
 from roadgeo.matching.refinement import RefineOptions, refine
 from roadgeo.roads.graph import RoadGraph
@@ -91,11 +91,11 @@ class TestMergedRoads:
 
 
 @given(st.integers(0, 30), st.integers(1, 30), st.floats(0.1, 60.0), st.integers(0, 2**32 - 1))
-def test_the_nearest_of_some_points(n, m, away, seed):
+def test_thenearest_of_some_points(n, m, away, seed):
     rng = np.random.default_rng(seed)
     xy, points = rng.uniform(0, 100, (n, 2)), rng.uniform(0, 100, (m, 2))
     among = np.flatnonzero(rng.random(m) < 0.5)
-    found = _nearest_of(xy, points, among, away)
+    found = nearest_of(xy, points, among, away)
     for one, number in zip(xy, found, strict=True):
         distances = np.hypot(*(points[among] - one).T)
         if len(among) and distances.min() < away:
