@@ -11,7 +11,7 @@ from worlds.scenes import mapped, sight_of
 
 from roadgeo.geometry.mask import RoadMask
 from roadgeo.matching.index import IndexOptions, build_index
-from roadgeo.matching.merged_roads import nearest_of, find_merged, without_merged
+from roadgeo.matching.merged_roads import find_merged, nearest_of, without_merged
 from roadgeo.matching.query import trace_query
 from roadgeo.matching.refinement import RefineOptions, refine
 from roadgeo.roads.graph import RoadGraph
