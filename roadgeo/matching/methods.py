@@ -332,24 +332,25 @@ def _measure_corners(estimator: TripleEstimator, best: Hypothesis | None) -> Non
     lens = estimator.options.lens
     if best is None or best.refined is None or best.found is None or lens is None:
         return
-    scene = (
-        _laid_between_carriageways(estimator, best, best.refined) if best.refined.lens_k1 == 0.0 else estimator.scene
-    )
+    scene = estimator.scene
+    if best.refined.lens_k1 == 0.0:
+        scene = _lay_between_carriageways(estimator, best, best.refined)
     agreeing, options = best.found.forward, estimator.refine_options
     best.refined = with_honest_corners(best.refined, scene, estimator.index, agreeing, options, lens)
 
 
-def _laid_between_carriageways(estimator: TripleEstimator, best: Hypothesis, refined: Refined) -> Scene:
+def _lay_between_carriageways(estimator: TripleEstimator, best: Hypothesis, refined: Refined) -> Scene:
     """Lay the middle of a mask's two roads on the map's one; return the scene with road points there.
 
     What was found before stands: the odds rest on it.
     """
     scene, index, verify = estimator.scene, estimator.index, estimator.options.verify
-    best.refined, seen = refine_between(refined, scene, index, best.matched, estimator.refinement(best))
-    if seen is not scene:
-        best.matrix, best.gsd_m = best.refined.matrix, sampling(best.refined.matrix, scene.size)
-        seeds = best.seeds[-MINIMAL:]
-        _, best.matched, best.distance = agreement(best.matrix, scene, index, best.gsd_m, seeds, verify)
+    found, seen = refine_between(refined, scene, index, best.matched, estimator.refinement(best))
+    if seen is scene or estimator.judge(found.matrix) is not None:
+        return scene
+    gsd, seeds = sampling(found.matrix, scene.size), best.seeds[-MINIMAL:]
+    best.refined, best.matrix, best.gsd_m = found, found.matrix, gsd
+    _, best.matched, best.distance = agreement(found.matrix, scene, index, gsd, seeds, verify)
     return seen
 
 

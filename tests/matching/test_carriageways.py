@@ -8,9 +8,14 @@ from matching.test_explanation import mask_of
 from matching.test_merged_roads import motorways
 from worlds.scenes import camera, look, mapped, random_network, scene_of
 
+from roadgeo.geometry.camera import CameraFault, sampling
 from roadgeo.matching.carriageways import between_carriageways, refine_between
+from roadgeo.matching.estimator import TripleEstimator
+from roadgeo.matching.hypothesis import Hypothesis
 from roadgeo.matching.index import build_index
+from roadgeo.matching.methods import _measure_corners
 from roadgeo.matching.refinement import RefineOptions, refine
+from roadgeo.matching.verification import agreement
 from roadgeo.reference.reference import Reference
 from roadgeo.workflows import locate
 
@@ -113,6 +118,23 @@ def test_without_any_nothing_changes(town):
         assert between_carriageways(truth, one, town[1], nothing, 25.0) == (one, nothing)
     found, _ = refine_between(given, scene, town[1], nothing, RefineOptions())
     assert error_of(found.matrix, truth, scene) < error_of(given.matrix, truth, scene) + 0.05
+
+
+@pytest.mark.parametrize("fault", [None, CameraFault.TILT])
+def test_a_place_is_refined_so_for_the_last_time_unless_no_camera_sees_it(town, seen, monkeypatch, fault):
+    truth, scene = seen
+    estimator = TripleEstimator(scene, town[1])
+    monkeypatch.setattr(estimator, "judge", lambda matrix, rough=False: fault)
+    given = fit(truth, scene, town[1])
+    nothing = np.full(len(scene.intersections), -1)
+    gsd = sampling(given.matrix, scene.size)
+    found, _, _ = agreement(given.matrix, scene, town[1], gsd, nothing[:0], estimator.options.verify)
+    best = Hypothesis(given.matrix, nothing[:0], 1.0, nothing, refined=given, found=found, gsd_m=gsd)
+    _measure_corners(estimator, best)
+    error, before = (error_of(matrix, truth, scene) for matrix in (best.refined.matrix, given.matrix))
+    assert best.found is found  # the odds rest on it
+    assert np.array_equal(best.matrix, best.refined.matrix)
+    assert error == before if fault else error < 0.4 * before
 
 
 def test_a_located_mask_lies_right(town):
