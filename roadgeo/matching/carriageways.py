@@ -16,7 +16,7 @@ from roadgeo.geometry.homography import Homography
 from roadgeo.kernels.parallel_roads import roads_alongside
 from roadgeo.kernels.residuals import road_residuals
 from roadgeo.matching.index import ReferenceIndex
-from roadgeo.matching.merged_roads import nearest_of
+from roadgeo.matching.merged_roads import nearest_of, points_on_map
 from roadgeo.matching.refinement import Refined, RefineOptions, refine
 from roadgeo.matching.scene import Scene
 
@@ -66,9 +66,9 @@ def between_carriageways(
     if not len(scene.points):
         return scene, matched
     min_cos = math.cos(math.radians(max_turn_deg))
-    at, along, step_m = _on_map(matrix, scene)
-    across = np.empty_like(at)
-    roads_alongside(at, along, _BESIDE * step_m, *_APART_M, min_cos, across)
+    at, along, gsd = points_on_map(matrix, scene)
+    across, step_px = np.empty_like(at), scene.road_length_px / len(at)
+    roads_alongside(at, along, _BESIDE * step_px * gsd, *_APART_M, min_cos, across)
     apart = np.hypot(*across.T)
     reach = np.where(np.isfinite(apart), apart, 0.0) + _APART_M[0]
     feet = [_nearest(start, along, reach, min_cos, index) for start in (at, at + across)]
@@ -76,30 +76,19 @@ def between_carriageways(
     if one.mean() < _FEW:
         return scene, matched
     points = scene.points.copy()
-    points[one] = Homography(np.asarray(np.linalg.inv(matrix), float)).everywhere(at[one] + 0.5 * across[one])
-    reach_px = _NEAR * scene.road_length_px / len(points)
-    there = nearest_of(scene.intersections.xy, scene.points, np.flatnonzero(one), reach_px) >= 0
+    points[one] = Homography(matrix).inverse().everywhere(at[one] + 0.5 * across[one])
+    there = nearest_of(scene.intersections.xy, scene.points, np.flatnonzero(one), _NEAR * step_px) >= 0
     return replace(scene, points=points), np.where(there, -1, matched)
 
 
 def _on_roads(matrix: FloatArray, scene: Scene, index: ReferenceIndex, options: RefineOptions) -> float:
     """Return the sum of the road points' weights in a fit."""
-    at, along, step_m = _on_map(matrix, scene)
-    gsd = float(np.median(step_m)) * len(scene.points) / scene.road_length_px
-    sigma = math.hypot(options.sigma_m, options.sigma_px * gsd)
+    at, along, gsd = points_on_map(matrix, scene)
+    sigma = math.hypot(options.sigma_m, options.sigma_px * float(np.median(gsd)))
     found = np.empty((len(at), 3))
     min_cos = math.cos(math.radians(options.max_turn_deg))
     road_residuals(at, along, np.full(len(at), _ON_ROADS * sigma), min_cos, index.road_buckets, found)
     return float(np.nansum(1.0 / (1.0 + (found[:, 0] / sigma) ** 2)))
-
-
-def _on_map(matrix: FloatArray, scene: Scene) -> tuple[FloatArray, FloatArray, FloatArray]:
-    """Return the road points on the map (S, 2), unit vectors along the road (S, 2), and metres between points (S,)."""
-    to_map = Homography(matrix).facing(scene.center)
-    at = np.ascontiguousarray(to_map(scene.points))
-    ahead = to_map(scene.points + scene.directions) - at
-    length = np.maximum(np.hypot(*ahead.T), 1e-12)
-    return at, np.ascontiguousarray(ahead / length[:, None]), length * scene.road_length_px / len(scene.points)
 
 
 def _nearest(at: FloatArray, along: FloatArray, reach: FloatArray, min_cos: float, index: ReferenceIndex) -> FloatArray:

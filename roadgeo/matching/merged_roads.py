@@ -17,7 +17,7 @@ from roadgeo.kernels.roads import forward_distances
 from roadgeo.matching.index import ReferenceIndex
 from roadgeo.matching.scene import Scene
 
-__all__ = ["find_merged", "mark_merged", "nearest_of", "roads_beside", "without_merged"]
+__all__ = ["find_merged", "mark_merged", "nearest_of", "points_on_map", "roads_beside", "without_merged"]
 
 #: Roads have merged where a mask is so many times wider than usual, and by so many pixels, at most of so many points in
 #: a row: at crossings it is wide as well, but not for long.
@@ -95,10 +95,7 @@ def roads_beside(
     matrix: FloatArray, scene: Scene, index: ReferenceIndex, beside_m: float, give_or_take_m: float, max_turn_deg: float
 ) -> tuple[BoolArray, BoolArray]:
     """Tell which road points (S,) have a road of the map that runs their way so far to the right, and to the left."""
-    to_map = Homography(matrix).facing(scene.center)
-    points = to_map(scene.points)
-    ahead = to_map(scene.points + scene.directions) - points
-    along = np.ascontiguousarray(ahead / np.maximum(np.hypot(*ahead.T), 1e-12)[:, None])
+    points, along, _ = points_on_map(matrix, scene)
     min_cos, roads = math.cos(math.radians(max_turn_deg)), index.road_buckets
 
     def beside(away_m: float) -> BoolArray:
@@ -107,3 +104,12 @@ def roads_beside(
         return np.isfinite(away)
 
     return beside(beside_m), beside(-beside_m)
+
+
+def points_on_map(matrix: FloatArray, scene: Scene) -> tuple[FloatArray, FloatArray, FloatArray]:
+    """Return road points on the map (S, 2), unit vectors along the roads (S, 2), and metres per pixel there (S,)."""
+    to_map = Homography(matrix).facing(scene.center)
+    points = np.ascontiguousarray(to_map(scene.points))
+    ahead = to_map(scene.points + scene.directions) - points
+    length = np.maximum(np.hypot(*ahead.T), 1e-12)
+    return points, np.ascontiguousarray(ahead / length[:, None]), length
