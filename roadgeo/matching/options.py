@@ -31,7 +31,8 @@ class LocateOptions:
     min_intersections : int
         Masks with fewer are not searched.
     twins : TwinOptions or None
-        Whether and how a weak place among streets that repeat is compared with its twins around, piece by piece.
+        Whether and how a weak place among streets that repeat is compared with its twins around, piece by piece: one
+        that does not lead them is ambiguous, and one that leads them clearly needs no better odds against chance.
     truths : tuple of (str, lon, lat)
         For explanations: where the middle of the frame of masks whose names end so really lies. The search does not
         look at it.
@@ -50,7 +51,7 @@ class LocateOptions:
     min_log10_odds: float = 3.5
     min_margin: float = 2.0
     min_intersections: int = 1
-    twins: TwinOptions | None = field(default_factory=lambda: TwinOptions.nearby(4000.0, n_places=12))
+    twins: TwinOptions | None = field(default_factory=lambda: TwinOptions.nearby(4000.0, n_places=40))
     truths: tuple[tuple[str, float, float], ...] = ()
     threads: int = 1
     elsewhere: int = 0

@@ -168,11 +168,22 @@ def share_won(
     return float(weight[counted.shares >= 0.5].sum() / weight.sum()) if weight.any() else 1.0
 
 
+#: Weighted sums of random signs exceed their standard deviation times z at most so many times as often as a normal
+#: variable does (Bentkus and Dzindzalieta, Bernoulli 21, 2015).
+_OFTENER_THAN_NORMAL = 0.25 / (0.5 * math.erfc(1.0))
+
+
 def log10_lead(difference: FloatArray) -> float:
     """Log10 odds that one place agrees better than another by more than chance, from their difference in each piece.
 
-    Were they alike, each piece of the frame would speak for either with the same probability: by Hoeffding's bound the
-    sum of such differences d exceeds t with a probability of at most exp(-t^2 / (2 sum d^2)).
+    Were they alike, each piece of the frame would speak for either with the same probability. The sum of such
+    differences exceeds z times the root of the sum of their squares with a probability of at most exp(-z^2 / 2)
+    (Hoeffding), and of at most 3.18 times that of a normal variable: the smaller one counts.
     """
     total, squares = float(difference.sum()), float((difference**2).sum())
-    return 0.0 if total <= 0.0 or squares == 0.0 else total**2 / (2.0 * squares) / math.log(10.0)
+    if total <= 0.0 or squares == 0.0:
+        return 0.0
+    z = total / math.sqrt(squares)
+    hoeffding = -0.5 * z**2 / math.log(10.0)
+    tail = _OFTENER_THAN_NORMAL * 0.5 * math.erfc(z / math.sqrt(2.0))
+    return -min(hoeffding, math.log10(tail)) if tail > 0.0 else -hoeffding

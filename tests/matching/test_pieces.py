@@ -1,10 +1,13 @@
 """What each piece of a frame says of a place, on scenes with a known one."""
 
+import itertools
 import math
 
 import cv2
 import numpy as np
 import pytest
+from hypothesis import given
+from hypothesis import strategies as st
 from worlds.scenes import Sight, camera, look, random_network, scene_of
 
 import roadgeo
@@ -65,10 +68,27 @@ def test_shares_and_worth_of_few_numbers():
     assert counts.worth(0.5).tolist() == [50.0, 0.0, 10.0]
 
 
-def test_alike_places_lead_by_nothing_and_one_sided_pieces_by_a_fifth_of_a_decade_each():
+def test_alike_places_lead_by_nothing():
     assert log10_lead(np.zeros(9)) == 0.0
     assert log10_lead(np.array([1.0, -1.0, 0.0])) == 0.0
-    assert log10_lead(np.ones(10)) == pytest.approx(10 / (2 * math.log(10)))
+
+
+@given(
+    st.lists(st.floats(0.1, 1.0), min_size=1, max_size=10).flatmap(
+        lambda sizes: st.tuples(
+            st.just(sizes), st.lists(st.sampled_from([-1, 1]), min_size=len(sizes), max_size=len(sizes))
+        )
+    )
+)
+def test_a_lead_is_never_surer_than_all_ways_to_draw_the_signs_tell(drawn):
+    sizes, signs = map(np.array, drawn)
+    all_signs = np.array(list(itertools.product((-1, 1), repeat=len(sizes))))
+    as_much = np.mean(all_signs @ sizes >= (signs @ sizes) - 1e-9)
+    assert 10.0 ** -log10_lead(signs * sizes) >= as_much - 1e-12
+
+
+def test_a_long_lead_is_counted_without_end():
+    assert 1000.0 < log10_lead(np.ones(10_000)) < 10_000 * math.log10(2.0)
 
 
 def test_roads_are_sampled_where_they_touch_a_box(town):

@@ -1,5 +1,7 @@
 """Twins on a lattice: a block beside fits nearly as well, and piece by piece it does not."""
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 import shapely
@@ -40,18 +42,23 @@ def lattice(kept: float):
     return network, build_index(network)
 
 
-def contest(kept: float):
+def contest(kept: float, size: tuple[int, int] = SIZE):
     """Return the true place, the map, and places of a view of it that are compared."""
     network, index = lattice(kept)
     low, high = network.graph.xy.min(axis=0), network.graph.xy.max(axis=0)
-    truth = camera(tuple(((low + high) / 2).tolist()), SIZE, 1.0, heading_deg=15.0)
-    scene = scene_of(look(network, truth, SIZE, Sight(sigma_m=1.0, missing=0.15, false=0.05), 2), SIZE)
+    truth = camera(tuple(((low + high) / 2).tolist()), size, 1.0, heading_deg=15.0)
+    scene = scene_of(look(network, truth, size, Sight(sigma_m=1.0, missing=0.15, false=0.05), 2), size)
     return truth, index, Contest(scene, 1.0, MatchOptions())
 
 
 @pytest.fixture(scope="module")
 def broken():
     return contest(0.8)
+
+
+@pytest.fixture(scope="module")
+def wider():
+    return contest(0.8, (900, 700))
 
 
 def beside(truth, among):
@@ -121,6 +128,39 @@ def test_a_weak_place_must_lead_its_twins(broken, odds, options, status):
         assert answer.reason.startswith("streets repeat: 110 m away they agree almost as well")
         assert answer.reason_code == Reason.TWO_PLACES
         assert answer.runner_up.log10_odds == odds
+
+
+@pytest.mark.parametrize(
+    ("at", "agreement", "n_searched", "status"),
+    [
+        ("truth", 0.9, 15_000, "located"),
+        ("truth", 0.6, 15_000, "not_located"),  # much of the mask has no place there
+        ("truth", 0.9, 10**12, "not_located"),  # many such places on so large a map
+        ("beside", 0.9, 15_000, "not_located"),
+    ],
+)
+def test_a_place_of_low_odds_is_proved_by_its_lead_where_streets_repeat(wider, at, agreement, n_searched, status):
+    truth, index, among = wider
+    matrix = truth if at == "truth" else beside(truth, among)
+    nobody = np.full(len(among.scene.intersections), -1)
+    fit = Fit(index, matrix, nobody, np.zeros(len(nobody)), 0.9, -1.0, np.ones(4), agreement=agreement)
+    query = Query("view.png", among.scene, NOTHING, Seconds())
+    answer = decide(query, [Found(index, (fit,), n_searched=n_searched)], LocateOptions())
+    assert answer.status == status
+    if answer.located:
+        assert answer.log10_odds >= 3.5
+        assert "any other place where these streets repeat" in answer.reason
+
+
+def test_a_place_as_good_on_another_map_keeps_a_lead_from_proving_anything(wider):
+    truth, index, among = wider
+    nobody = np.full(len(among.scene.intersections), -1)
+    fit = Fit(index, truth, nobody, np.zeros(len(nobody)), 0.9, -1.0, np.ones(4), agreement=0.9)
+    away = move_about(Homography(truth)(among.scene.center), Shift(900.0, 0.0, 0.0, 1.0, 0.0)) @ truth
+    other = replace(fit, matrix=away, log10_odds=-2.0)
+    query = Query("view.png", among.scene, NOTHING, Seconds())
+    answer = decide(query, [Found(index, (fit,)), Found(index, (other,))], LocateOptions())
+    assert answer.status == "ambiguous"
 
 
 def test_only_what_the_user_allows_is_a_twin(broken):
