@@ -157,17 +157,13 @@ class _Problem:
         middle = self.frame.center
         to_middle = np.array([[1.0, 0.0, -middle[0]], [0.0, -1.0, middle[1]], [0.0, 0.0, 1.0]])
         seen_by = to_middle @ Homography(homography).facing(middle).inverse().matrix
-        found = (self._start(seen_by, focal) for focal in focals)
+        rotations, positions = _take_apart(seen_by, np.asarray(focals, float))
+        found = map(self._start, rotations, positions, focals)
         return [one for one in found if one is not None]
 
-    def _start(self, seen_by: FloatArray, focal: float) -> FloatArray | None:
-        """Take the plane's homography to pixels, from the middle, y up, apart (Zhang 2000, 3.1)."""
-        m = np.diag([1.0 / focal, 1.0 / focal, -1.0]) @ seen_by
-        m = m / math.sqrt(np.linalg.norm(m[:, 0]) * np.linalg.norm(m[:, 1]))
-        u, _, vt = np.linalg.svd(m[:, :2], full_matrices=False)
-        x, y = (u @ vt).T
-        rotation = np.stack([x, y, np.cross(x, y)])  # rows: the plane's axes in the camera's
-        position, up = -rotation @ m[:, 2], rotation[:, 2]
+    def _start(self, rotation: FloatArray, position: FloatArray, focal: float) -> FloatArray | None:
+        """Return the parameters of a camera above the ground."""
+        up = rotation[:, 2]
         if position[2] <= 0.0 or up[2] <= 1e-3:
             return None
         reach = position[2] / up[2]
@@ -203,6 +199,24 @@ class _Problem:
         """Return the parameters whose sum of squares is least: it has none where a corner lies above the horizon."""
         squares = (self.residuals(np.stack(starts)) ** 2).sum(axis=1)
         return starts[int(np.argmin(np.nan_to_num(squares, nan=np.inf)))]
+
+
+def _take_apart(seen_by: FloatArray, focals: FloatArray) -> tuple[FloatArray, FloatArray]:
+    """Take the plane's homography to pixels, from the middle, y up, apart for (F,) focal lengths (Zhang 2000, 3.1).
+
+    Returns
+    -------
+    rotations : (F, 3, 3) float64
+        Their rows are the plane's axes in the camera's.
+    positions : (F, 3) float64
+    """
+    m = np.stack([1.0 / focals, 1.0 / focals, -np.ones_like(focals)], axis=1)[:, :, None] * seen_by
+    lengths = np.linalg.norm(m, axis=1)
+    m = m / np.sqrt(lengths[:, 0] * lengths[:, 1])[:, None, None]
+    u, _, vt = np.linalg.svd(m[:, :, :2], full_matrices=False)
+    axes = np.swapaxes(u @ vt, 1, 2)
+    rotations = np.concatenate((axes, np.cross(axes[:, :1], axes[:, 1:])), axis=1)
+    return rotations, -np.einsum("fij,fj->fi", rotations, m[:, :, 2])
 
 
 def _fit(start: FloatArray, problem: _Problem, n_iterations: int) -> tuple[FloatArray, FloatArray] | None:

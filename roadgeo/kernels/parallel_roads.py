@@ -335,17 +335,18 @@ def roads_alongside(
         nearest = most
         out[i, 0] = out[i, 1] = np.nan
         for j in range(len(xy)):
+            dx = xy[j, 0] - xy[i, 0]
+            dy = xy[j, 1] - xy[i, 1]
+            ahead = max(reach[i], reach[j])
             cos = along[i, 0] * along[j, 0] + along[i, 1] * along[j, 1]
-            if abs(cos) < min_cos or i == j:
+            if dx * dx + dy * dy > most * most + ahead * ahead or abs(cos) < min_cos or i == j:
                 continue
             side = 1.0 if cos > 0.0 else -1.0
             length = np.sqrt(2.0 + 2.0 * abs(cos))
             east = (along[i, 0] + side * along[j, 0]) / length
             north = (along[i, 1] + side * along[j, 1]) / length
-            dx = xy[j, 0] - xy[i, 0]
-            dy = xy[j, 1] - xy[i, 1]
             across = dy * east - dx * north
-            if least < abs(across) < nearest and abs(dx * east + dy * north) <= max(reach[i], reach[j]):
+            if least < abs(across) < nearest and abs(dx * east + dy * north) <= ahead:
                 nearest = abs(across)
                 out[i, 0] = -across * north
                 out[i, 1] = across * east

@@ -168,27 +168,32 @@ def forward_distances(
     segments, starts, ids, grid, shape = roads
     n = 0
     for i in range(points.shape[0]):
-        u, v = points[i, 0], points[i, 1]
-        w = matrix[2, 0] * u + matrix[2, 1] * v + matrix[2, 2]
+        ahead, x, y, dx, dy = _carry(matrix, points[i, 0], points[i, 1], directions[i, 0], directions[i, 1])
         out[i] = np.inf
-        if w <= 0.0:
+        if not ahead:
             continue
-        x = (matrix[0, 0] * u + matrix[0, 1] * v + matrix[0, 2]) / w
-        y = (matrix[1, 0] * u + matrix[1, 1] * v + matrix[1, 2]) / w
-        du, dv = directions[i, 0], directions[i, 1]
-        dw = matrix[2, 0] * du + matrix[2, 1] * dv
-        dx = matrix[0, 0] * du + matrix[0, 1] * dv - x * dw
-        dy = matrix[1, 0] * du + matrix[1, 1] * dv - y * dw
-        length = math.sqrt(dx * dx + dy * dy)
-        if length == 0.0:
-            continue
-        d = nearest_road(
-            x + shift_x, y + shift_y, dx / length, dy / length, radius, min_cos, segments, starts, ids, grid, shape
-        )[0]
-        out[i] = d
-        if d < np.inf:
+        x, y = x + shift_x, y + shift_y
+        out[i] = nearest_road(x, y, dx, dy, radius, min_cos, segments, starts, ids, grid, shape)[0]
+        if out[i] < np.inf:
             n += 1
     return n
+
+
+@kernel(forceinline=True)
+def _carry(matrix: Floats2, u: float, v: float, du: float, dv: float) -> tuple[bool, float, float, float, float]:
+    """Map a point and a unit vector along its road: whether that has a direction this side of the horizon, and both."""
+    w = matrix[2, 0] * u + matrix[2, 1] * v + matrix[2, 2]
+    if w <= 0.0:
+        return False, 0.0, 0.0, 0.0, 0.0
+    x = (matrix[0, 0] * u + matrix[0, 1] * v + matrix[0, 2]) / w
+    y = (matrix[1, 0] * u + matrix[1, 1] * v + matrix[1, 2]) / w
+    dw = matrix[2, 0] * du + matrix[2, 1] * dv
+    dx = matrix[0, 0] * du + matrix[0, 1] * dv - x * dw
+    dy = matrix[1, 0] * du + matrix[1, 1] * dv - y * dw
+    length = math.sqrt(dx * dx + dy * dy)
+    if length == 0.0:
+        return False, x, y, 0.0, 0.0
+    return True, x, y, dx / length, dy / length
 
 
 @kernel()
@@ -207,17 +212,48 @@ def shares_near_roads(
 
     Points count by `weights` (S,), at least one of them more than 0; the rest is as in `forward_distances`.
     """
-    out = np.empty(points.shape[0])
     total = 0.0
+    shares[:] = 0.0
     for i in range(points.shape[0]):
         total += weights[i]
+        ahead, x, y, dx, dy = _carry(matrix, points[i, 0], points[i, 1], directions[i, 0], directions[i, 1])
+        if not ahead:
+            continue
+        for m in range(shifts.shape[0]):
+            if _meets_road(x + shifts[m, 0], y + shifts[m, 1], dx, dy, radius, min_cos, roads):
+                shares[m] += weights[i]
     for m in range(shifts.shape[0]):
-        forward_distances(matrix, points, directions, radius, min_cos, shifts[m, 0], shifts[m, 1], roads, out)
-        near = 0.0
-        for i in range(points.shape[0]):
-            if out[i] < np.inf:
-                near += weights[i]
-        shares[m] = near / total if total > 0.0 else 0.0
+        shares[m] = shares[m] / total if total > 0.0 else 0.0
+
+
+@kernel(forceinline=True)
+def _meets_road(x: float, y: float, dx: float, dy: float, radius: float, min_cos: float, roads: RoadBuckets) -> bool:
+    """Whether `nearest_road` would find one: the first that is met is enough."""
+    segments, starts, ids, grid, shape = roads
+    if not abs(x) + abs(y) < 1e15:  # infinite or NaN: no bucket has such a number
+        return False
+    c0 = max(int(np.floor((x - radius - grid[0]) / grid[2])), 0)
+    c1 = min(int(np.floor((x + radius - grid[0]) / grid[2])), shape[0] - 1)
+    r0 = max(int(np.floor((y - radius - grid[1]) / grid[2])), 0)
+    r1 = min(int(np.floor((y + radius - grid[1]) / grid[2])), shape[1] - 1)
+    for r in range(r0, r1 + 1):
+        for c in range(c0, c1 + 1):
+            bucket = r * shape[0] + c
+            for e in range(starts[bucket], starts[bucket + 1]):
+                s = ids[e]
+                ax, ay = segments[s, 0], segments[s, 1]
+                sx, sy = segments[s, 2] - ax, segments[s, 3] - ay
+                square = sx * sx + sy * sy
+                across = (x - ax) * sy - (y - ay) * sx
+                if across * across > radius * radius * square or square == 0.0:
+                    continue
+                if abs(sx * dx + sy * dy) < min_cos * math.sqrt(square):
+                    continue
+                t = min(max(((x - ax) * sx + (y - ay) * sy) / square, 0.0), 1.0)
+                ex, ey = ax + t * sx - x, ay + t * sy - y
+                if ex * ex + ey * ey < radius * radius:
+                    return True
+    return False
 
 
 @kernel()

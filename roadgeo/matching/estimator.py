@@ -14,7 +14,7 @@ from roadgeo.geometry.areas import Box, lies_in
 from roadgeo.geometry.camera import CameraFault, CameraOptions, judge, sampling
 from roadgeo.geometry.homography import Homography
 from roadgeo.geometry.projection import to_lonlat
-from roadgeo.matching.exactness import exact_log10_odds, may_stand
+from roadgeo.matching.exactness import exact_log10_odds, is_plain, may_stand
 from roadgeo.matching.growing import PATIENT, GrowOptions, grow_proposals, screen_proposals
 from roadgeo.matching.hypothesis import MINIMAL, Hypothesis, Lead
 from roadgeo.matching.index import ReferenceIndex
@@ -347,20 +347,20 @@ class TripleEstimator:
 
     def _verify(self, model: Hypothesis) -> float:
         self.n_verified += 1
-        scene, index, options = self.scene, self.index, self.options
+        scene, index, verify = self.scene, self.index, self.options.verify
         # What a wrong place reaches is soon seen; only promising ones are worth all points and all of a null model.
         chance = least_chance(self.chances)
         for n_points, every in ((150, 0), (300, 6), (None, 1)):
+            if every > 1 and is_plain(model, self.n_verified, verify):
+                continue
             if not self._converge(model, n_points):
                 return -np.inf
             if every:
-                model.chance = chance_agreement(
-                    model.matrix, scene, index, model.gsd_m, options.verify, every, near=self.near
-                )
+                model.chance = chance_agreement(model.matrix, scene, index, model.gsd_m, verify, every, near=self.near)
                 chance = np.array(model.chance)
                 self.chances += [chance] * (every > 1)
             model.log10_odds = self._odds(model, chance)
-            if not may_stand(model, options.verify):
+            if not may_stand(model, verify):
                 return model.log10_odds
         self.n_nulls += 1
         return model.log10_odds

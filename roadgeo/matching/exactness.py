@@ -12,8 +12,10 @@ from roadgeo.matching.index import ReferenceIndex
 from roadgeo.matching.scene import Scene
 from roadgeo.matching.verification import Agreement, VerifyOptions, agreement, chance_agreement, log10_odds
 
-__all__ = ["exact_log10_odds", "may_stand"]
+__all__ = ["exact_log10_odds", "is_plain", "may_stand"]
 
+#: In a lattice many wrong places look plain, but seldom before the right one.
+_FIRST = 4
 #: Masks are whole as often as not, as far as is known: each kind is charged for the other.
 _TWO_KINDS = math.log10(2.0)
 
@@ -23,6 +25,12 @@ def may_stand(model: Hypothesis, options: VerifyOptions) -> bool:
     if model.found is None or not math.isfinite(model.log10_odds):
         return False
     return _is_whole(model.found, options) or model.log10_odds >= options.promising - options.most_raised
+
+
+def is_plain(model: Hypothesis, n_verified: int, options: VerifyOptions) -> bool:
+    """Whether so much agrees at one of the first places that are verified that it is probably right."""
+    found = model.found
+    return n_verified <= _FIRST and found is not None and min(found.forward, found.backward) >= options.plain
 
 
 def exact_log10_odds(

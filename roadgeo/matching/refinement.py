@@ -9,7 +9,7 @@ import numpy as np
 
 from roadgeo._arrays import FloatArray, IntArray
 from roadgeo.geometry.homography import Homography
-from roadgeo.kernels.adjustment import adjust, point_row
+from roadgeo.kernels.adjustment import adjust
 from roadgeo.kernels.structs import AdjustLimits, Held, Plane, PointPairs, RoadSamples
 from roadgeo.matching.index import ReferenceIndex
 from roadgeo.matching.merged_roads import without_merged
@@ -149,20 +149,12 @@ def _cells(uv: FloatArray, options: RefineOptions) -> IntArray:
     return np.asarray(columns[:, 1] * n + columns[:, 0])
 
 
-def _corner_rows(p: FloatArray, uv: FloatArray) -> FloatArray:
-    """Return the derivatives (M, 2, 8) of predicted points at normalised query points (M, 2)."""
-    rows = np.empty((len(uv), 2, 8))
-    for i, (u, v) in enumerate(uv):
-        point_row(p, u, v, 1.0, 0.0, rows[i, 0])
-        point_row(p, u, v, 0.0, 1.0, rows[i, 1])
-    return rows
-
-
 def corner_covariance(
     p: FloatArray, covariance: FloatArray, scene: Scene, unit: float, options: RefineOptions
 ) -> FloatArray:
     """Return the covariance (8, 8) of the frame's corners, square metres (see `Refined`), from that of `p` (8, 8)."""
-    derivatives = _corner_rows(p, (scene.corners - scene.center) / scene.half_size).reshape(8, 8)
+    homography = Homography(np.append(p, 1.0).reshape(3, 3))
+    derivatives = homography.by_elements((scene.corners - scene.center) / scene.half_size).reshape(8, 8)
     floor = options.sigma_floor_m**2 + (options.sigma_floor_px * unit / scene.half_size) ** 2
     return np.asarray(derivatives @ covariance @ derivatives.T * unit**2 + 0.5 * floor * np.eye(8))
 

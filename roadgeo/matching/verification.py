@@ -72,6 +72,8 @@ class VerifyOptions:
         Log10 odds that a place must reach against the least chance seen so far, raised as far as they may be, before a
         null of its own is measured.
         They are an upper bound: below 1 a place is neither located (3.5) nor within the margin (2.0) of one that is.
+    plain : float
+        Where so much of the query's roads and of the map's agrees at first sight, chance is measured wholly at once.
     finer : tuple of float
         Shares of the tolerance within which roads and intersections are compared as well (see `exactness`).
     most_raised : float
@@ -104,6 +106,7 @@ class VerifyOptions:
     least_rates: tuple[float, float, float] = (0.2, 0.5, 0.5)
     least_won: float = 0.5
     promising: float = 1.0
+    plain: float = 0.8
     finer: tuple[float, ...] = (0.6, 0.35)
     most_raised: float = 1.5
     whole_rates: tuple[float, float, float] = (0.2, 0.85, 0.85)

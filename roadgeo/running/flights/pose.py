@@ -15,7 +15,6 @@ from roadgeo._arrays import FloatArray
 from roadgeo.geometry.frame import Frame
 from roadgeo.geometry.homography import Homography
 from roadgeo.geometry.mask import PIXEL_TO_PLANE
-from roadgeo.kernels.adjustment import point_row
 from roadgeo.kernels.road_equations import road_equations
 from roadgeo.kernels.structs import RoadBuckets
 from roadgeo.matching.scene import Scene
@@ -142,11 +141,7 @@ class _Local:
 
     def derivative(self, p: FloatArray, uv: FloatArray) -> FloatArray:
         """Return the derivative (2N, 8) of places, metres, by p."""
-        rows = np.empty((len(uv), 2, 8))
-        for i, (u, v) in enumerate(uv):
-            point_row(p, u, v, 1.0, 0.0, rows[i, 0])
-            point_row(p, u, v, 0.0, 1.0, rows[i, 1])
-        return np.asarray(self.unit * rows.reshape(-1, 8))
+        return np.asarray(self.unit * Homography(np.append(p, 1.0).reshape(3, 3)).by_elements(uv).reshape(-1, 8))
 
 
 def _rows(local: _Local, corners: FloatArray, uv: FloatArray) -> FloatArray:
