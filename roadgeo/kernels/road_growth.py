@@ -14,7 +14,7 @@ from roadgeo.kernels.adjustment import add_row, carry, point_row
 from roadgeo.kernels.arrays import Floats1, Floats2
 from roadgeo.kernels.compilation import kernel
 from roadgeo.kernels.homography_fit import cholesky, solve_cholesky
-from roadgeo.kernels.roads import nearest_road
+from roadgeo.kernels.roads import meets_road, nearest_road
 from roadgeo.kernels.structs import RoadBuckets
 
 __all__ = ["Stages", "fit_to_roads", "grow_by_roads", "share_on_roads"]
@@ -27,6 +27,8 @@ _FIRST_RADII, _RADII = (25.0, 18.0, 12.0), (18.0, 12.0, 12.0)
 _LINEAR_SIGMA, _PLACE_SIGMA_M = 0.08, 10.0
 _POINT_SIGMA_M = 12.0
 _FEWEST = 6
+#: Points whose denominator is less lie at the horizon.
+_LEAST_W = 0.05
 
 
 class Stages(NamedTuple):
@@ -60,7 +62,7 @@ def _nearest(
     Without a road within `radius` metres the distance is inf.
     """
     x, y, w, dx, dy, length = carry(p, point[0], point[1], direction[0], direction[1])
-    if w < 0.05 or length == 0.0:
+    if w < _LEAST_W or length == 0.0:
         return np.inf, 0.0, 0.0, w
     gx, gy = origin[0] + unit * x, origin[1] + unit * y
     d, fx, fy, rx, ry = nearest_road(
@@ -107,7 +109,7 @@ def fit_to_roads(
     met = 0
     for i in range(points.shape[0]):
         away, rx, ry, w = _nearest(p, unit, origin, points[i], directions[i], radius, min_cos, roads)
-        if w < 0.05:
+        if w < _LEAST_W:
             return False
         if away == np.inf:
             continue
@@ -138,7 +140,11 @@ def share_on_roads(
     """Return which share of the points lies within `radius` metres of roads that run their way (see `fit_to_roads`)."""
     met = 0
     for i in range(points.shape[0]):
-        if _nearest(p, unit, origin, points[i], directions[i], radius, min_cos, roads)[0] < np.inf:
+        x, y, w, dx, dy, length = carry(p, points[i, 0], points[i, 1], directions[i, 0], directions[i, 1])
+        if w < _LEAST_W or length == 0.0:
+            continue
+        gx, gy = origin[0] + unit * x, origin[1] + unit * y
+        if meets_road(gx, gy, dx / length, dy / length, radius, min_cos, roads):
             met += 1
     return float(met / max(points.shape[0], 1))
 

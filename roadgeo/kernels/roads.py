@@ -13,7 +13,15 @@ from roadgeo.kernels.arrays import Bools2, Floats1, Floats2, Int32s1, Ints1, Sin
 from roadgeo.kernels.compilation import kernel
 from roadgeo.kernels.structs import RoadBuckets
 
-__all__ = ["backward_agreement", "bin_segments", "forward_distances", "nearest_road", "screen", "shares_near_roads"]
+__all__ = [
+    "backward_agreement",
+    "bin_segments",
+    "forward_distances",
+    "meets_road",
+    "nearest_road",
+    "screen",
+    "shares_near_roads",
+]
 
 
 @kernel()
@@ -220,14 +228,14 @@ def shares_near_roads(
         if not ahead:
             continue
         for m in range(shifts.shape[0]):
-            if _meets_road(x + shifts[m, 0], y + shifts[m, 1], dx, dy, radius, min_cos, roads):
+            if meets_road(x + shifts[m, 0], y + shifts[m, 1], dx, dy, radius, min_cos, roads):
                 shares[m] += weights[i]
     for m in range(shifts.shape[0]):
         shares[m] = shares[m] / total if total > 0.0 else 0.0
 
 
-@kernel(forceinline=True)
-def _meets_road(x: float, y: float, dx: float, dy: float, radius: float, min_cos: float, roads: RoadBuckets) -> bool:
+@kernel()
+def meets_road(x: float, y: float, dx: float, dy: float, radius: float, min_cos: float, roads: RoadBuckets) -> bool:
     """Whether `nearest_road` would find one: the first that is met is enough."""
     segments, starts, ids, grid, shape = roads
     if not abs(x) + abs(y) < 1e15:  # infinite or NaN: no bucket has such a number
@@ -374,7 +382,6 @@ def screen(
     shares : (M,) float64
         Filled; 1 where there are no points, for then nothing speaks against a proposal.
     """
-    segments, starts, ids, grid, shape = roads
     n = points.shape[0]
     for m in range(references.shape[0]):
         x0, y0 = ref_xy[references[m], 0], ref_xy[references[m], 1]
@@ -386,11 +393,8 @@ def screen(
             dx = j00 * directions[i, 0] + j01 * directions[i, 1]
             dy = j10 * directions[i, 0] + j11 * directions[i, 1]
             length = math.sqrt(dx * dx + dy * dy)
-            d = nearest_road(
-                x0 + j00 * u + j01 * v, y0 + j10 * u + j11 * v, dx / length, dy / length, reach, min_cos,
-                segments, starts, ids, grid, shape,
-            )[0]  # fmt: skip
-            if d < np.inf:
+            x, y = x0 + j00 * u + j01 * v, y0 + j10 * u + j11 * v
+            if meets_road(x, y, dx / length, dy / length, reach, min_cos, roads):
                 hits += 1
             else:
                 misses += 1

@@ -8,6 +8,7 @@ from roadgeo.kernels.roads import (
     backward_agreement,
     bin_segments,
     forward_distances,
+    meets_road,
     nearest_road,
     screen,
     shares_near_roads,
@@ -90,6 +91,26 @@ class TestNearestRoad:
     @pytest.mark.parametrize("place", [(np.nan, 0.0), (1e300, 0.0), (-1e300, 1e300), (np.inf, 100.0)])
     def test_places_that_are_none(self, place):
         assert nearest_road(*place, 1.0, 0.0, 50.0, 0.0, *town())[0] == np.inf
+
+
+class TestMeetsRoad:
+    @pytest.mark.parametrize("radius", [5.0, 30.0, 120.0])
+    def test_like_the_twin(self, radius):
+        roads = town(3)
+        rng = np.random.default_rng(8)
+        places, along = rng.uniform(-50, 650, (80, 2)), directions(rng, 80)
+        met = [meets_road(*place, *way, radius, MIN_COS, roads) for place, way in zip(places, along, strict=True)]
+        expected = [
+            naive.meets_road(*place, *way, radius, MIN_COS, roads.segments)
+            for place, way in zip(places, along, strict=True)
+        ]
+        assert met == expected
+        assert 0 < sum(met) < len(met)
+
+    def test_no_roads_roads_of_no_length_and_places_that_are_none(self):
+        assert not meets_road(0.0, 0.0, 1.0, 0.0, 50.0, 0.0, binned(np.empty((0, 4))))
+        assert not meets_road(100.0, 100.0, 1.0, 0.0, 50.0, 0.0, binned([[100, 100, 100, 100]]))
+        assert not meets_road(np.nan, 0.0, 1.0, 0.0, 50.0, 0.0, town())
 
 
 TILTED = np.array([[0.9, -0.3, 260.0], [0.25, 1.1, 420.0], [2e-4, -3e-4, 1.0]])

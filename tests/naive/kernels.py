@@ -72,6 +72,10 @@ def nearest_road(x, y, dx, dy, radius, min_cos, segments):
     return best
 
 
+def meets_road(x, y, dx, dy, radius, min_cos, segments):
+    return bool(np.isfinite(nearest_road(x, y, dx, dy, radius, min_cos, segments)[0]))
+
+
 def transform(matrix, xy):
     """A point under a homography, or None beyond the horizon."""
     x, y, w = matrix @ (*xy, 1.0)
