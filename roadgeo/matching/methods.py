@@ -27,6 +27,7 @@ from roadgeo.matching.paper.quality import well_fitted
 from roadgeo.matching.paper.search import match_pairs
 from roadgeo.matching.paper.tuples import PairIndex, PairOptions, build_pair_index
 from roadgeo.matching.parts import Part, Whole, same_within_m
+from roadgeo.matching.proof import Proof, Prover
 from roadgeo.matching.query import Query
 from roadgeo.matching.refinement import Refined
 from roadgeo.matching.road_search import COARSE_PIXEL_M
@@ -35,6 +36,7 @@ from roadgeo.matching.search import Search, SearchResult, search_together
 from roadgeo.matching.shared_sweeps import SharedSweeps
 from roadgeo.matching.trace import NO_TRACE, Trace
 from roadgeo.matching.triples import larger
+from roadgeo.matching.twins import Twin
 from roadgeo.matching.verification import agreement
 from roadgeo.roads.intersections import Intersections
 from roadgeo.storage.memory import let_pages_go
@@ -71,6 +73,8 @@ class Fit:
         As of `Refined`.
     agreement : float
         Mean of the shares of intersections, of the query's roads and of the map's roads that agree.
+    by_twins, twin : bool, Twin or None
+        Whether the odds are those by which it leads its twins, and the best of these.
     """
 
     index: ReferenceIndex
@@ -83,6 +87,8 @@ class Fit:
     corner_covariance_m2: FloatArray | None = None
     lens_k1: float = 0.0
     agreement: float = math.nan
+    by_twins: bool = False
+    twin: Twin | None = None
 
 
 @dataclass(frozen=True)
@@ -198,9 +204,10 @@ def _search(
 
     scale = larger(sum(one.n_searched for one in opened))
     limits = replace(options.search, time_limit_s=left, work_limit_s=scale * options.search.work_limit_s)
-    search_together(list(estimators), limits, same)
+    prover = Prover(estimators, options, ledger)
+    search_together(list(estimators), limits, same, prover)
     sweeps.end()
-    return [one.found(scale) for one in opened]
+    return [one.found(scale, prover) for one in opened]
 
 
 def _open(parts: Sequence[Part], options: LocateOptions, frame_m: float) -> list[ReferenceIndex]:
@@ -261,16 +268,21 @@ class _Attempt:
         estimator = TripleEstimator(query.scene, part, promising_options(options), near, trace, ledger, sweeps)
         return cls(index, len(part), estimator, Search(estimator), trace)
 
-    def found(self, scale: float) -> Found:
+    def found(self, scale: float, prover: Prover) -> Found:
         """Tell what came of it; work is told for a map `scale` times smaller."""
         estimator = self.estimator
         if self.search is None or estimator is None:
             return Found(self.index, n_searched=self.n_searched, trace=self.trace)
         result, places = _charge_alike(estimator, self.search)
+        proof = prover.proof(self.search) if result.score < prover.options.min_log10_odds else None
+        if proof is not None and proof.log10_odds > result.score:
+            result, places = _put_first(proof, estimator, result, places)
+        else:
+            proof = None
         self.trace.finished(estimator, result)
         return Found(
             self.index,
-            _fits(estimator, result, places),
+            _fits(estimator, result, places, proof),
             result.stopped,
             n_searched=self.n_searched,
             n_tried=estimator.n_screened,
@@ -311,12 +323,31 @@ def _charge_alike(
     return replace(result, best=best, score=score, runner_up=runner_up, runner_up_score=second), places
 
 
+def _put_first(
+    proof: Proof,
+    estimator: TripleEstimator,
+    result: SearchResult[Hypothesis],
+    places: Sequence[tuple[float, Hypothesis]],
+) -> tuple[SearchResult[Hypothesis], list[tuple[float, Hypothesis]]]:
+    """Put the place first that leads its twins, with the odds by which it does."""
+    others = [(score, model) for score, model in places if not estimator.same(model, proof.model)]
+    second, runner_up = others[0] if others else (-math.inf, None)
+    first = replace(result, best=proof.model, score=proof.log10_odds, runner_up=runner_up, runner_up_score=second)
+    return first, [(proof.log10_odds, proof.model), *others]
+
+
 def _fits(
-    estimator: TripleEstimator, result: SearchResult[Hypothesis], places: Sequence[tuple[float, Hypothesis]]
+    estimator: TripleEstimator,
+    result: SearchResult[Hypothesis],
+    places: Sequence[tuple[float, Hypothesis]],
+    proof: Proof | None,
 ) -> tuple[Fit, ...]:
     """Return the best place, the runner-up, and of the other promising ones the one that agrees best."""
     _measure_corners(estimator, result.best)
-    chosen = [_fit(estimator, result.best, result.score), _fit(estimator, result.runner_up, result.runner_up_score)]
+    best = _fit(estimator, result.best, result.score)
+    if best is not None and proof is not None:
+        best = replace(best, by_twins=True, twin=proof.twin)
+    chosen = [best, _fit(estimator, result.runner_up, result.runner_up_score)]
     leaders = [model for model in (result.best, result.runner_up) if model is not None]
     others = [
         _fit(estimator, model, score)

@@ -205,6 +205,13 @@ def search(estimator: Estimator[Model], options: SearchOptions | None = None) ->
     return alone.result()
 
 
+class Proves(Protocol[Model]):
+    """Tells whether an answer that does not stand out by its score is proved otherwise."""
+
+    def __call__(self, one: Search[Model]) -> bool:
+        """Whether an answer of a part is; asked at the end of each stage."""
+
+
 class Same(Protocol[Model]):
     """Tells whether the answers of two parts are one, where parts overlap."""
 
@@ -213,15 +220,19 @@ class Same(Protocol[Model]):
 
 
 def search_together(
-    parts: Sequence[Search[Model]], options: SearchOptions | None = None, same: Same[Model] | None = None
+    parts: Sequence[Search[Model]],
+    options: SearchOptions | None = None,
+    same: Same[Model] | None = None,
+    proves: Proves[Model] | None = None,
 ) -> None:
     """Search many parts until one answer stands out from those of all, they are exhausted, or a limit is reached.
 
     A round of each part in turn, one stage after another. A part whose answer stands out goes on alone until that is
     settled. What led there is tried on all other parts then: if they hold a twin, it is found, and the search goes on.
+    At the end of a stage an answer of the part that has the best one may be proved otherwise.
     """
     options = options or SearchOptions()
-    ended_by = _Together(parts, options, same).run()
+    ended_by = _Together(parts, options, same, proves).run()
     for one in parts:
         if ended_by in ("work", "time") and not one.ended:
             one.stopped = ended_by
@@ -232,8 +243,14 @@ def search_together(
 class _Together(Generic[Model]):
     """The loop over parts; see `search_together`."""
 
-    def __init__(self, parts: Sequence[Search[Model]], options: SearchOptions, same: Same[Model] | None) -> None:
-        self.parts, self.options, self.same = parts, options, same
+    def __init__(
+        self,
+        parts: Sequence[Search[Model]],
+        options: SearchOptions,
+        same: Same[Model] | None,
+        proves: Proves[Model] | None,
+    ) -> None:
+        self.parts, self.options, self.same, self.proves = parts, options, same, proves
         self.budget = _Budget(options)
 
     def run(self) -> str:
@@ -245,6 +262,8 @@ class _Together(Generic[Model]):
                     if ended_by := self._go_on(one):
                         return ended_by
                 here = [one for one in here if one.stage == stage and not one.ended]
+            if self._is_proved():
+                return "accepted"
             stage += 1
         return "exhausted"
 
@@ -265,6 +284,14 @@ class _Together(Generic[Model]):
                 break
             goes_on = one.advance(self.budget) or (not one.ended and one.advance(self.budget))
         return ""
+
+    def _is_proved(self) -> bool:
+        """Whether an answer of the part that has the best one is proved otherwise than by its score."""
+        best = max(self.parts, key=lambda one: one.lead)
+        if self.proves is None or not self.proves(best):
+            return False
+        best.stopped = "accepted"
+        return True
 
     def _try_elsewhere(self, one: Search[Model]) -> None:
         """Try what led to a part's best answer on the others, which may hold its twin."""

@@ -6,7 +6,6 @@ import math
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from time import perf_counter
-from typing import NamedTuple
 
 import numpy as np
 
@@ -19,7 +18,6 @@ from roadgeo.matching.options import LocateOptions
 from roadgeo.matching.parts import same_within_m
 from roadgeo.matching.placing import center_of, place_frame
 from roadgeo.matching.query import Query
-from roadgeo.matching.triples import larger
 from roadgeo.matching.twins import best_twin
 from roadgeo.matching.verification import chance_agreement
 
@@ -52,26 +50,15 @@ def needed_of(options: LocateOptions) -> Needed:
 
 @dataclass(frozen=True)
 class _Candidate:
-    """A place, the reference it lies on, and its odds against all places that were tried on any reference.
-
-    `by_twins`: the odds are those by which it leads its twins.
-    """
+    """A place, the reference it lies on, and its odds against all places that were tried on any reference."""
 
     found: Found
     fit: Fit
     center: Place
-    by_twins: bool = False
 
     @property
     def score(self) -> float:
         return self.fit.log10_odds
-
-
-class _Beside(NamedTuple):
-    """The place that the roads would fit best beside another, and log10 odds by which that leads it."""
-
-    place: Place
-    log10_lead: float
 
 
 def decide(query: Query, found: Sequence[Found], options: LocateOptions) -> Location:
@@ -92,10 +79,7 @@ def _judge(query: Query, found: Sequence[Found], options: LocateOptions) -> Loca
     best = candidates[0] if candidates else None
     rivals = candidates[1:]
     rival = rivals[0] if rivals else None
-    beside = None
     if best is not None:
-        beside = _compare_with_twins(query, best, rivals, options)
-        best = _proved(best, beside, rivals, found, options)
         others = tuple(_seen_from(best, one) for one in rivals)
         location = replace(
             location, log10_odds=best.score, runner_up=others[0] if others else None, alternatives=others
@@ -110,16 +94,20 @@ def _judge(query: Query, found: Sequence[Found], options: LocateOptions) -> Loca
         return replace(placed, status="ambiguous", reason=_alike(best, rival) + cut, reason_code=Reason.TWO_PLACES)
     if rival is not None and best.score - rival.score < options.min_margin:
         return replace(placed, status="ambiguous", reason=_twins(best, rival) + cut, reason_code=Reason.TWO_PLACES)
+    elsewhere = next((one for one in rivals if one.found is not best.found and _are_alike(best, one)), None)
+    if best.fit.by_twins and elsewhere is not None:
+        reason = _alike(best, elsewhere) + cut
+        return replace(placed, status="ambiguous", reason=reason, reason_code=Reason.TWO_PLACES)
     fuller = next((one for one in rivals if _is_fuller(one, best, options)), None)
     if fuller is not None:
         reason = _fuller(best, fuller) + cut
         runner_up = _seen_from(best, fuller)
         return replace(placed, status="ambiguous", reason=reason, reason_code=Reason.TWO_PLACES, runner_up=runner_up)
-    if beside is not None and beside.log10_lead < options.min_margin:
-        twin = replace(beside.place, log10_odds=best.score - beside.log10_lead)
+    twin = _twin(query, best, options)
+    if twin is not None and best.score - twin.log10_odds < options.min_margin:
         reason = _repeated(best, twin) + cut
         return replace(placed, status="ambiguous", reason=reason, reason_code=Reason.TWO_PLACES, runner_up=twin)
-    against = "any other place where these streets repeat" if best.by_twins else "chance"
+    against = "any other place where these streets repeat" if best.fit.by_twins else "chance"
     reason = (
         f"{placed.n_matched} of {placed.n_intersections} intersections and {best.fit.agreeing:.0%} of the roads agree"
         f"; odds 10^{best.score:.1f} against {against}{cut}"
@@ -225,19 +213,15 @@ def _fuller(best: _Candidate, rival: _Candidate) -> str:
     )
 
 
-def _compare_with_twins(
-    query: Query, best: _Candidate, rivals: Sequence[_Candidate], options: LocateOptions
-) -> _Beside | None:
-    """Compare a weak place where streets repeat with its twins, piece by piece; None where it needs no comparison.
+def _twin(query: Query, best: _Candidate, options: LocateOptions) -> Place | None:
+    """Return the place that the roads would fit best beside a weak one where streets repeat, with odds by its lead.
 
     Chance is measured nearby. Where a part of the frame fits a lattice it beats all shifts by whole blocks, as the true
     place does; but that part fits as well wherever blocks have that size (a mask of Portland in Chicago: 10^6, with
-    72 % of the roads). And where all of the frame fits, so do nearly all of the blocks beside: chance is high there.
+    72 % of the roads).
     """
     fit, match, twins = best.fit, options.match, options.twins
     if twins is None or best.score >= twins.certain:
-        return None
-    if best.score < options.min_log10_odds and not fit.agreement >= twins.agreeing:
         return None
     scene = straighten_scene(query.scene, fit.lens_k1) if fit.lens_k1 else query.scene
     chance = chance_agreement(fit.matrix, scene, fit.index, sampling(fit.matrix, scene.size), match.verify)
@@ -247,28 +231,11 @@ def _compare_with_twins(
     if options.near is not None:
         x, y = from_lonlat(fit.index.plane, np.array([options.near[:2]]))[0]
         within = (float(x), float(y), options.near[2])
-    known = [one.fit.matrix for one in rivals if one.found is best.found]
-    twin = best_twin(fit.matrix, scene, fit.index, match, twins, within, known)
-    return None if twin is None else _Beside(center_of(query, replace(fit, matrix=twin.matrix)), twin.log10_lead)
-
-
-def _proved(
-    best: _Candidate,
-    beside: _Beside | None,
-    rivals: Sequence[_Candidate],
-    found: Sequence[Found],
-    options: LocateOptions,
-) -> _Candidate:
-    """Return a place of too low odds with those by which it leads its twins, if these are better.
-
-    Twins are looked for around it; the larger the map, the more other places may lead theirs.
-    """
-    elsewhere = any(one.found is not best.found and _are_alike(best, one) for one in rivals)
-    if beside is None or best.score >= options.min_log10_odds or elsewhere:
-        return best
-    n_searched = sum(one.n_searched for one in found) + options.elsewhere
-    score = beside.log10_lead - 2.0 * math.log10(larger(n_searched))
-    return best if score <= best.score else replace(best, fit=replace(best.fit, log10_odds=score), by_twins=True)
+    twin = fit.twin or best_twin(fit.matrix, scene, fit.index, match, twins, within)
+    if twin is None:
+        return None
+    there = center_of(query, replace(fit, matrix=twin.matrix))
+    return replace(there, log10_odds=best.score - twin.log10_lead)
 
 
 def _repeated(best: _Candidate, twin: Place) -> str:

@@ -147,11 +147,25 @@ class InStages(Toy):
             yield iter([models])
 
 
-def together(*toys, options=None):
+def together(*toys, options=None, proves=None):
     """Search parts together; an answer of one is that of another where their tens agree."""
     parts = [Search(toy) for toy in toys]
-    search_together(parts, options, lambda one, a, other, b: a[0] // 10 == b[0] // 10)
+    search_together(parts, options, lambda one, a, other, b: a[0] // 10 == b[0] // 10, proves)
     return parts
+
+
+def test_an_answer_that_is_proved_ends_the_search_with_its_stage():
+    asked = []
+
+    def proves(one):
+        asked.append(one.leaders[0][1][0])
+        return one.leaders[0][1][0] == 21
+
+    toys = [InStages([[(1, 1.0)], [(2, 1.5)], [(3, 1.0)]]), InStages([[(11, 0.5)], [(21, 2.0)], [(31, 30.0)]])]
+    parts = together(*toys, proves=proves)
+    assert asked == [1, 21]  # once a stage, of the part that has the best answer
+    assert [toy.scored for toy in toys] == [[1, 2], [11, 21]]
+    assert [one.stopped for one in parts] == ["elsewhere", "accepted"]
 
 
 def test_parts_take_turns_and_an_answer_that_stands_out_ends_all():
