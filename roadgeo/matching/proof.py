@@ -17,7 +17,7 @@ from roadgeo.matching.ledger import Ledger
 from roadgeo.matching.options import LocateOptions
 from roadgeo.matching.search import Search
 from roadgeo.matching.triples import larger
-from roadgeo.matching.twins import Twin, TwinOptions, best_twin
+from roadgeo.matching.twins import Twin, TwinOptions, best_twin, loses_part
 
 __all__ = ["Proof", "Prover"]
 
@@ -48,11 +48,13 @@ class Prover:
         return proof is not None and proof.log10_odds >= self.options.min_log10_odds + self.options.min_margin
 
     def proof(self, one: Search[Hypothesis]) -> Proof | None:
-        """Compare the place of a part that agrees best with its twins; None where streets do not repeat.
+        """Compare the place of a part that agrees best with its twins.
+
+        None where streets do not repeat, and where a weak one loses a part of the frame.
 
         Twins are looked for around it; the larger the map, the more other places may lead theirs.
         """
-        compared, twins = self._compared.setdefault(one, []), self.options.twins
+        compared, twins, estimator = self._compared.setdefault(one, []), self.options.twins, self.estimators[one]
         met = [model for _, model in (*one.leaders, *one.promising)] + [model for model, _ in compared]
         fullest = max((model for model in met if _is_measured(model)), key=_agreement, default=None)
         if twins is None or fullest is None or _agreement(fullest) < twins.agreeing:
@@ -60,10 +62,14 @@ class Prover:
         if fullest.chance[1] < twins.repeating or fullest.log10_odds >= twins.certain:
             return None
         if all(model is not fullest for model, _ in compared):
-            compared.append((fullest, self._best_twin(self.estimators[one], fullest, met, twins)))
+            compared.append((fullest, self._best_twin(estimator, fullest, met, twins)))
         twin = next(twin for model, twin in compared if model is fullest)
         if twin is None:
             return None
+        if max(twin.log10_lead, fullest.log10_odds) < twins.weak:
+            scene, match = estimator.scene_of(fullest), self.options.match
+            if loses_part(_laid(fullest), scene, estimator.index, match, twins):
+                return None
         return Proof(fullest, twin, twin.log10_lead - 2.0 * math.log10(larger(self.ledger.n_reference)))
 
     def _best_twin(

@@ -20,12 +20,12 @@ from roadgeo.geometry.homography import Homography
 from roadgeo.matching.estimator import MatchOptions
 from roadgeo.matching.index import ReferenceIndex
 from roadgeo.matching.local_search import LocalSearchOptions, Shift, move_about, search_nearby
-from roadgeo.matching.pieces import Pieces, log10_lead, sample_roads
+from roadgeo.matching.pieces import Pieces, log10_lead, sample_roads, share_won
 from roadgeo.matching.refinement import refine
 from roadgeo.matching.scene import Scene
 from roadgeo.matching.verification import agreement
 
-__all__ = ["Contest", "Twin", "TwinOptions", "best_twin"]
+__all__ = ["Contest", "Twin", "TwinOptions", "best_twin", "loses_part"]
 
 _NO_SEEDS: IntArray = np.array([], np.int64)
 
@@ -45,6 +45,10 @@ class TwinOptions:
         A place of too low odds is compared as well where so much agrees, the mean of the shares of intersections, of
         the query's roads and of the map's: chance nearby is other blocks of a lattice, and its lead may yet prove it.
         Of 315 masks without a place, in seven cities of which most are lattices, none leads by more than 10^0.4.
+    weak, least_won : float
+        Where neither the odds of a place nor its lead reach `weak`, so much of the roads must lie where most of them
+        agree, of the frame cut into 36 pieces: a quarter of Portland is like its own mirror image but for a corner
+        (10^4.5, a lead of 10^6.9, 0.88 won). Of 36 right places of worn masks 2 lose by it, of 63 of other masks none.
     repeating : float
         Nor is one where chance puts less than this share of the mask's roads on roads: streets do not repeat there.
     piece_m : float
@@ -62,6 +66,8 @@ class TwinOptions:
 
     certain: float = MatchOptions.certain
     agreeing: float = 0.7
+    weak: float = 10.0
+    least_won: float = 0.93
     repeating: float = 0.35
     piece_m: float = 60.0
     unseen: float = 0.5
@@ -120,6 +126,13 @@ def best_twin(
         if best is None or lead < best.log10_lead:
             best = Twin(twin, lead)
     return best
+
+
+def loses_part(
+    matrix: FloatArray, scene: Scene, index: ReferenceIndex, match: MatchOptions, options: TwinOptions
+) -> bool:
+    """Whether too much of the roads lies in pieces of the frame where most of them do not agree."""
+    return share_won(matrix, scene, index, sampling(matrix, scene.size), match.verify, n=6) < options.least_won
 
 
 class Contest:

@@ -18,7 +18,8 @@ from roadgeo.matching.options import LocateOptions
 from roadgeo.matching.parts import same_within_m
 from roadgeo.matching.placing import center_of, place_frame
 from roadgeo.matching.query import Query
-from roadgeo.matching.twins import best_twin
+from roadgeo.matching.scene import Scene
+from roadgeo.matching.twins import best_twin, loses_part
 from roadgeo.matching.verification import chance_agreement
 
 __all__ = ["Needed", "decide", "needed_of"]
@@ -97,7 +98,8 @@ def _judge(query: Query, found: Sequence[Found], options: LocateOptions) -> Loca
     elsewhere = next((one for one in rivals if one.found is not best.found and _are_alike(best, one)), None)
     if best.fit.by_twins and elsewhere is not None:
         reason = _alike(best, elsewhere) + cut
-        return replace(placed, status="ambiguous", reason=reason, reason_code=Reason.TWO_PLACES)
+        runner_up = replace(_seen_from(best, elsewhere), log10_odds=best.score)
+        return replace(placed, status="ambiguous", reason=reason, reason_code=Reason.TWO_PLACES, runner_up=runner_up)
     fuller = next((one for one in rivals if _is_fuller(one, best, options)), None)
     if fuller is not None:
         reason = _fuller(best, fuller) + cut
@@ -107,6 +109,13 @@ def _judge(query: Query, found: Sequence[Found], options: LocateOptions) -> Loca
     if twin is not None and best.score - twin.log10_odds < options.min_margin:
         reason = _repeated(best, twin) + cut
         return replace(placed, status="ambiguous", reason=reason, reason_code=Reason.TWO_PLACES, runner_up=twin)
+    if twin is not None and _is_partly_lost(query, best, twin, options):
+        reason = (
+            f"no place on this map stands out: the best has log10 odds {best.score:.1f}, but streets repeat there, and "
+            f"in a part of the frame the roads do not agree{cut}"
+        )
+        lost = replace(_on(location, best.found), log10_odds=0.0)
+        return replace(lost, reason=reason, reason_code=Reason.NOTHING_STANDS_OUT)
     against = "any other place where these streets repeat" if best.fit.by_twins else "chance"
     reason = (
         f"{placed.n_matched} of {placed.n_intersections} intersections and {best.fit.agreeing:.0%} of the roads agree"
@@ -223,7 +232,7 @@ def _twin(query: Query, best: _Candidate, options: LocateOptions) -> Place | Non
     fit, match, twins = best.fit, options.match, options.twins
     if twins is None or best.score >= twins.certain:
         return None
-    scene = straighten_scene(query.scene, fit.lens_k1) if fit.lens_k1 else query.scene
+    scene = _scene_of(query, fit)
     chance = chance_agreement(fit.matrix, scene, fit.index, sampling(fit.matrix, scene.size), match.verify)
     if chance[1] < twins.repeating:
         return None
@@ -236,6 +245,19 @@ def _twin(query: Query, best: _Candidate, options: LocateOptions) -> Place | Non
         return None
     there = center_of(query, replace(fit, matrix=twin.matrix))
     return replace(there, log10_odds=best.score - twin.log10_lead)
+
+
+def _is_partly_lost(query: Query, best: _Candidate, twin: Place, options: LocateOptions) -> bool:
+    """Whether a place of which neither the odds nor its lead over its twin are high loses a part of the frame."""
+    fit, twins = best.fit, options.twins
+    if twins is None or max(best.score, best.score - twin.log10_odds) >= twins.weak:
+        return False
+    return loses_part(fit.matrix, _scene_of(query, fit), fit.index, options.match, twins)
+
+
+def _scene_of(query: Query, fit: Fit) -> Scene:
+    """Return the scene as a pinhole sees it, behind the lens of a fit."""
+    return straighten_scene(query.scene, fit.lens_k1) if fit.lens_k1 else query.scene
 
 
 def _repeated(best: _Candidate, twin: Place) -> str:

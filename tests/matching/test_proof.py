@@ -12,6 +12,7 @@ from roadgeo.matching.options import LocateOptions
 from roadgeo.matching.proof import Prover
 from roadgeo.matching.refinement import Refined
 from roadgeo.matching.search import Search
+from roadgeo.matching.twins import TwinOptions
 from roadgeo.matching.verification import Agreement
 
 
@@ -55,7 +56,9 @@ def test_a_place_of_low_odds_is_proved_by_its_lead_where_streets_repeat(wider):
 
 def test_what_does_not_lead_its_twins_is_not_proved(wider):
     truth, _, among = wider
-    proved, enough = by_lead(wider, [met(wider, beside(truth, among))])
+    places = [met(wider, beside(truth, among))]
+    assert by_lead(wider, places) == (None, False)  # a part of the frame does not agree
+    proved, enough = by_lead(wider, places, twins=TwinOptions(n_places=12, least_won=0.0))
     assert proved.log10_odds == 0.0
     assert not enough
 

@@ -15,7 +15,7 @@ from roadgeo.matching.methods import Fit, Found
 from roadgeo.matching.options import LocateOptions
 from roadgeo.matching.pieces import log10_lead
 from roadgeo.matching.query import Query
-from roadgeo.matching.twins import TwinOptions, best_twin
+from roadgeo.matching.twins import Twin, TwinOptions, best_twin, loses_part
 from roadgeo.matching.verdict import decide
 from roadgeo.roads.graph import RoadGraph
 
@@ -108,6 +108,32 @@ def test_a_place_as_good_on_another_map_keeps_a_lead_from_proving_anything(wider
     alone = decide(query, [Found(index, (fit,))], LocateOptions())
     assert alone.located
     assert "any other place where these streets repeat" in alone.reason
+
+
+@pytest.fixture(scope="module")
+def torn(wider):
+    """Return a scene of which the streets of one corner lie elsewhere."""
+    _, _, among = wider
+    scene, (width, height) = among.scene, among.scene.size
+    points = scene.dense_points.copy()
+    points[(points[:, 0] < 0.45 * width) & (points[:, 1] > -0.45 * height)] += (40.0, 33.0)
+    return replace(scene, dense_points=points)
+
+
+@pytest.mark.parametrize(("odds", "status"), [(6.0, "not_located"), (12.0, "located")])
+def test_a_weak_place_must_agree_all_over_the_frame(wider, torn, odds, status):
+    truth, index, among = wider
+    assert loses_part(truth, torn, index, MatchOptions(), TwinOptions())
+    assert not loses_part(truth, among.scene, index, MatchOptions(), TwinOptions())
+    nobody = np.full(len(torn.intersections), -1)
+    twin = Twin(beside(truth, among), 4.0)
+    fit = Fit(index, truth, nobody, np.zeros(len(nobody)), 0.8, odds, np.ones(4), agreement=0.8, twin=twin)
+    answer = decide(Query("view.png", torn, NOTHING, Seconds()), [Found(index, (fit,))], LocateOptions())
+    assert answer.status == status
+    if status == "not_located":
+        assert answer.log10_odds == 0.0
+        assert answer.reason_code == Reason.NOTHING_STANDS_OUT
+        assert "in a part of the frame the roads do not agree" in answer.reason
 
 
 def test_only_what_the_user_allows_is_a_twin(broken):
