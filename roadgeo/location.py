@@ -271,8 +271,8 @@ class Location:
         What the tilt rests on: the "camera" whose focal length was given, the "homography" where that tells the focal
         length, or a usual lens that is "assumed".
     log10_odds : float or None
-        Of the best place; also where that is not enough to report it. None where no place was verified, or the method
-        knows no odds.
+        Of the best place, against chance, or where streets repeat against any other place if that is more; also where
+        it is not enough to report it. None where no place was verified, or the method knows no odds.
     reason_code : Reason
         The reason for programs.
     corner_covariance_m2 : (8, 8) float64 or None

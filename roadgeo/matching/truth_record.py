@@ -159,9 +159,12 @@ class TruthRecord(Record):
     def _weighed(self, location: Location, needed: Needed) -> tuple[str | None, str]:
         """Tell what became of the truth after it was compared with the map."""
         score = f"the true place reached log10 odds {self.best:.1f}"
+        located = location.located and location.center is not None and self._is_answer(location)
+        if located and self.best < needed.log10_odds:
+            return None, f"{score}, but leads any other place where these streets repeat, and was located"
         if self.best < needed.log10_odds:
             return "odds", f"{score}, {needed.log10_odds:g} are needed"
-        if location.located and location.center is not None and self._is_answer(location):
+        if located:
             return None, f"{score} and was located"
         return "margin", f"{score}, but another place as much, or it was met too late"
 

@@ -70,6 +70,7 @@ def place(x, y):
         (9.0, REFUSED, "margin", "reached log10 odds 9.0, but another place as much"),
         (9.0, place(5000.0, 500.0), "margin", "but another place as much"),
         (9.0, place(520.0, 500.0), None, "reached log10 odds 9.0 and was located"),
+        (-1.0, place(520.0, 500.0), None, "odds -1.0, but leads any other place where these streets repeat"),
     ],
 )
 def test_what_was_measured_is_weighed(estimator, best, answer, lost_at, said):
