@@ -7,6 +7,7 @@ on until all its work is done, though the place was met at its beginning, and th
 from __future__ import annotations
 
 import math
+import time
 from collections.abc import Mapping, Sequence
 from typing import NamedTuple
 
@@ -62,7 +63,9 @@ class Prover:
         if fullest.chance[1] < twins.repeating or fullest.log10_odds >= twins.certain:
             return None
         if all(model is not fullest for model, _ in compared):
+            started = time.perf_counter()
             compared.append((fullest, self._best_twin(estimator, fullest, met, twins)))
+            one.seconds += time.perf_counter() - started
         twin = next(twin for model, twin in compared if model is fullest)
         if twin is None:
             return None

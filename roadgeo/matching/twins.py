@@ -44,7 +44,8 @@ class TwinOptions:
     agreeing : float
         A place of too low odds is compared as well where so much agrees, the mean of the shares of intersections, of
         the query's roads and of the map's: chance nearby is other blocks of a lattice, and its lead may yet prove it.
-        Of 315 masks without a place, in seven cities of which most are lattices, none leads by more than 10^0.4.
+        Of 315 masks without a place, in seven cities of which most are lattices, none leads by more than 10^0.4;
+        another one did (see `least_won`).
     weak, least_won : float
         Where neither the odds of a place nor its lead reach `weak`, so much of the roads must lie where most of them
         agree, of the frame cut into 36 pieces: a quarter of Portland is like its own mirror image but for a corner

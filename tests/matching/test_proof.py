@@ -91,6 +91,7 @@ def test_a_place_is_compared_once_and_remembered(wider, monkeypatch):
     prover = Prover({one: estimator}, LocateOptions(), Ledger(n_reference=866))
     one.leaders = [(-1.0, here)]
     first = prover.proof(one)
+    assert one.seconds > 0.0  # it is part of the search
     monkeypatch.setattr(proof, "best_twin", None)
     one.leaders = [(2.0, met(wider, beside(truth, among), agreeing=0.4, chance=0.2, odds=2.0))]
     assert prover.proof(one) == first
