@@ -77,6 +77,18 @@ def bin_segments(
     return total
 
 
+@kernel(forceinline=True)
+def _buckets_around(
+    x: float, y: float, radius: float, grid: tuple[float, float, float], shape: tuple[int, int]
+) -> tuple[int, int, int, int]:
+    """Return the first and last column, and the first and last row, of the buckets that a circle may touch."""
+    c0 = max(int(np.floor((x - radius - grid[0]) / grid[2])), 0)
+    c1 = min(int(np.floor((x + radius - grid[0]) / grid[2])), shape[0] - 1)
+    r0 = max(int(np.floor((y - radius - grid[1]) / grid[2])), 0)
+    r1 = min(int(np.floor((y + radius - grid[1]) / grid[2])), shape[1] - 1)
+    return c0, c1, r0, r1
+
+
 @kernel()
 def nearest_road(
     x: float,
@@ -112,10 +124,7 @@ def nearest_road(
     found = False
     if not abs(x) + abs(y) < 1e15:  # infinite or NaN: no bucket has such a number
         return np.inf, fx, fy, ux, uy
-    c0 = max(int(np.floor((x - radius - grid[0]) / grid[2])), 0)
-    c1 = min(int(np.floor((x + radius - grid[0]) / grid[2])), shape[0] - 1)
-    r0 = max(int(np.floor((y - radius - grid[1]) / grid[2])), 0)
-    r1 = min(int(np.floor((y + radius - grid[1]) / grid[2])), shape[1] - 1)
+    c0, c1, r0, r1 = _buckets_around(x, y, radius, grid, shape)
     for r in range(r0, r1 + 1):
         for c in range(c0, c1 + 1):
             bucket = r * shape[0] + c
@@ -240,10 +249,7 @@ def meets_road(x: float, y: float, dx: float, dy: float, radius: float, min_cos:
     segments, starts, ids, grid, shape = roads
     if not abs(x) + abs(y) < 1e15:  # infinite or NaN: no bucket has such a number
         return False
-    c0 = max(int(np.floor((x - radius - grid[0]) / grid[2])), 0)
-    c1 = min(int(np.floor((x + radius - grid[0]) / grid[2])), shape[0] - 1)
-    r0 = max(int(np.floor((y - radius - grid[1]) / grid[2])), 0)
-    r1 = min(int(np.floor((y + radius - grid[1]) / grid[2])), shape[1] - 1)
+    c0, c1, r0, r1 = _buckets_around(x, y, radius, grid, shape)
     for r in range(r0, r1 + 1):
         for c in range(c0, c1 + 1):
             bucket = r * shape[0] + c
