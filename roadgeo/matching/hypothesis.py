@@ -64,10 +64,14 @@ class Hypothesis:
     leads: list[Lead] = field(default_factory=list)
     _spot: Spot | None = field(default=None, repr=False)
 
+    @property
+    def laid(self) -> FloatArray:
+        """The homography (3, 3), refined if it was."""
+        return self.matrix if self.refined is None else self.refined.matrix
+
     def spot(self, size: tuple[int, int]) -> Spot:
         """Return where the middle of a frame of that size lies; kept, for in a lattice it is asked for without end."""
-        laid = self.refined.matrix if self.refined is not None else self.matrix
-        kept = self._spot
+        laid, kept = self.laid, self._spot
         if kept is None or kept.matrix is not self.matrix or kept.laid is not laid:
             frame = Frame(*size)
             x, y = Homography(laid).everywhere(frame.plane_center).tolist()

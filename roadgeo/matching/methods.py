@@ -402,7 +402,7 @@ def _fit(estimator: TripleEstimator, model: Hypothesis | None, score: float) -> 
         refined.corner_sigma_m,
         refined.corner_covariance_m2,
         refined.lens_k1,
-        (found.rate + found.forward + found.backward) / 3,
+        found.mean,
     )
 
 

@@ -11,7 +11,6 @@ import time
 from collections.abc import Mapping, Sequence
 from typing import NamedTuple
 
-from roadgeo._arrays import FloatArray
 from roadgeo.matching.estimator import TripleEstimator
 from roadgeo.matching.hypothesis import Hypothesis
 from roadgeo.matching.ledger import Ledger
@@ -71,16 +70,16 @@ class Prover:
             return None
         if max(twin.log10_lead, fullest.log10_odds) < twins.weak:
             scene, match = estimator.scene_of(fullest), self.options.match
-            if loses_part(_laid(fullest), scene, estimator.index, match, twins):
+            if loses_part(fullest.laid, scene, estimator.index, match, twins):
                 return None
         return Proof(fullest, twin, twin.log10_lead - 2.0 * math.log10(larger(self.ledger.n_reference)))
 
     def _best_twin(
         self, estimator: TripleEstimator, model: Hypothesis, met: Sequence[Hypothesis], twins: TwinOptions
     ) -> Twin | None:
-        known = [_laid(other) for other in met if not estimator.same(other, model)]
+        known = [other.laid for other in met if not estimator.same(other, model)]
         scene, match = estimator.scene_of(model), self.options.match
-        return best_twin(_laid(model), scene, estimator.index, match, twins, estimator.near, known)
+        return best_twin(model.laid, scene, estimator.index, match, twins, estimator.near, known)
 
 
 def _is_measured(model: Hypothesis) -> bool:
@@ -89,10 +88,4 @@ def _is_measured(model: Hypothesis) -> bool:
 
 
 def _agreement(model: Hypothesis) -> float:
-    """Return the mean of the shares of intersections, of the query's roads and of the map's that agree."""
-    found = model.found
-    return 0.0 if found is None else (found.rate + found.forward + found.backward) / 3
-
-
-def _laid(model: Hypothesis) -> FloatArray:
-    return model.matrix if model.refined is None else model.refined.matrix
+    return 0.0 if model.found is None else model.found.mean

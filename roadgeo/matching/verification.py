@@ -139,6 +139,11 @@ class Agreement:
         """Share of intersections matched."""
         return self.matched / max(self.tested, 1)
 
+    @property
+    def mean(self) -> float:
+        """Mean of the shares of intersections, of the query's roads and of the map's roads that agree."""
+        return (self.rate + self.forward + self.backward) / 3
+
 
 def tolerance_m(gsd_m: float, options: VerifyOptions) -> float:
     """Three standard deviations of a road's place, map and mask together, in metres."""

@@ -188,7 +188,7 @@ class _Candidate:
         self.fit = Fit(
             self.index, matrix, matched, distance, found.forward, self.proposed,
             refined.corner_sigma_m, refined.corner_covariance_m2,
-            agreement=(found.rate + found.forward + found.backward) / 3,
+            agreement=found.mean,
         )  # fmt: skip
 
     def test(self, fresh: Scene | None, look: Look, locate: LocateOptions, options: CandidateOptions) -> None:
