@@ -98,8 +98,8 @@ def paint_roads(
             if min(away, math.pi - away) <= turn:
                 pattern |= np.uint16(1 << d)
         ux, uy = (x2 - x1) / length, (y2 - y1) / length
-        n = int(length / cell) + 1
-        for k in range(n):  # pieces no longer than a cell: the box around each is small
+        n = int(length / max(2.0 * reach, cell)) + 1
+        for k in range(n):  # pieces about as long as a road is wide: the boxes around them hold few cells in vain
             ax, bx = x1 + (x2 - x1) * k / n, x1 + (x2 - x1) * (k + 1) / n
             ay, by = y1 + (y2 - y1) * k / n, y1 + (y2 - y1) * (k + 1) / n
             for row in range(int((min(ay, by) - reach) / cell), int((max(ay, by) + reach) / cell) + 1):

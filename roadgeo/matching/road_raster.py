@@ -5,6 +5,7 @@ from __future__ import annotations
 import math
 from collections import OrderedDict
 from dataclasses import dataclass
+from weakref import WeakValueDictionary
 
 import numpy as np
 
@@ -72,24 +73,25 @@ class RoadRaster:
         return np.asarray(self.density[tiles[:, 1], tiles[:, 0]], float)
 
 
-#: Rasters that are kept, the one used last at the end, and how many bytes they may take together.
-_drawn: OrderedDict[tuple[ReferenceIndex, RasterOptions], RoadRaster] = OrderedDict()
+#: Rasters in use anywhere; and those that are kept, the one used last at the end, up to so many bytes together.
+_in_use: WeakValueDictionary[tuple[ReferenceIndex, RasterOptions], RoadRaster] = WeakValueDictionary()
+_kept: OrderedDict[tuple[ReferenceIndex, RasterOptions], RoadRaster] = OrderedDict()
 _MOST_BYTES = 500_000_000
 
 
 def make_raster(index: ReferenceIndex, options: RasterOptions) -> RoadRaster:
-    """Return the raster of a reference, drawn anew unless it is kept from before.
+    """Return the raster of a reference, drawn anew unless it is in use or kept from before.
 
     Drawing takes some hundredths of a second, and 13 MB, for a city of 400 km2. Those used last are kept, up to a size:
     many masks are looked for on the same maps, one after the other.
     """
     key = (index, options)
-    if key not in _drawn:
-        _drawn[key] = _draw(index, options)
-        while len(_drawn) > 1 and sum(one.nbytes for one in _drawn.values()) > _MOST_BYTES:
-            _drawn.popitem(last=False)
-    _drawn.move_to_end(key)
-    return _drawn[key]
+    drawn = _in_use.get(key) or _draw(index, options)
+    _in_use[key] = _kept[key] = drawn
+    _kept.move_to_end(key)
+    while len(_kept) > 1 and sum(one.nbytes for one in _kept.values()) > _MOST_BYTES:
+        _kept.popitem(last=False)
+    return drawn
 
 
 def _draw(index: ReferenceIndex, options: RasterOptions) -> RoadRaster:

@@ -20,7 +20,7 @@ from roadgeo.matching.road_votes import VoteOptions, Voter, Votes
 from roadgeo.matching.scene import Scene
 from roadgeo.matching.triples import farthest_first, larger
 
-__all__ = ["COARSE_PIXEL_M", "RoadRound", "RoadSearch", "RoadSearchOptions"]
+__all__ = ["COARSE_PIXEL_M", "RoadRound", "RoadSearch", "RoadSearchOptions", "Turnout"]
 
 #: The smallest pixels that are looked for on a map of coarseness 1; of a coarse map so many times as large.
 COARSE_PIXEL_M = 0.35
@@ -39,7 +39,8 @@ class RoadSearchOptions:
         So many intersections of the query vote, spread over the frame from its middle outwards.
     max_tried, least_anchors : int
         Fewer vote, but at least so many, once so many places and turns were tried on a map of 15,000 intersections, and
-        on a larger one more by the root of the ratio. In a lattice every crossing can be turned four ways.
+        on a larger one more by the root of the ratio; of a map in parts, on all of them together. In a lattice every
+        crossing can be turned four ways.
     max_grown, max_kept : int
         So many of an anchor's proposals grow, and so many of what grew are compared with the map: where streets are
         alike, much grows.
@@ -93,6 +94,36 @@ class RoadSearchOptions:
         return replace(usual, least_share=self.least_share)
 
 
+@dataclass
+class Turnout:
+    """How many intersections of a query vote: as many on each part of a map, until enough was tried on all together.
+
+    Attributes
+    ----------
+    n_map : int
+        Intersections of all parts.
+    n_tried : int
+        Places and turns tried on them so far.
+    last : int or None
+        How many vote in the end, once that is known.
+    """
+
+    options: RoadSearchOptions
+    n_map: int
+    n_tried: int = 0
+    last: int | None = None
+    _asked: int = 0
+
+    def includes(self, n: int) -> bool:
+        """Whether the n-th votes, from 0; the part that comes to it first decides for all."""
+        options = self.options
+        if self.last is None and n >= self._asked:
+            self._asked = n + 1
+            if n >= options.least_anchors and self.n_tried >= options.max_tried * larger(self.n_map):
+                self.last = n
+        return self.last is None or n < self.last
+
+
 class RoadRound(NamedTuple):
     """What came of one query intersection: how many proposals were to grow, and those that did.
 
@@ -122,14 +153,16 @@ class RoadSearch:
         near: tuple[float, float, float] | None = None,
         ahead: Ahead = ALONE,
         voters: IntArray | None = None,
+        turnout: Turnout | None = None,
     ) -> None:
         """`near` = (x, y, radius) in plane metres restricts where the middle of the frame may lie.
 
-        Of the query's intersections only the `voters` propose.
+        Of the query's intersections only the `voters` propose. Parts that are searched together share the `turnout`.
         """
         self.voters = np.arange(len(scene.intersections)) if voters is None else voters
         self.scene, self.options, self.ahead = scene, options, ahead
         self.n_tried = 0
+        self.turnout = turnout or Turnout(options, len(index))
         scale = options.scales(camera, scene.road_width_px)
         max_turn = math.radians(_ROUGHLY_DEG) if camera.north_up else math.pi
         candidates = _within(index, near, scene.half_size * min(scale[1], max(options.far_m, scale[0])))
@@ -143,17 +176,17 @@ class RoadSearch:
 
         `only` names the anchors to try. None is tried twice.
         """
-        xy = self.scene.intersections.xy[self.voters]
-        options, most_tried = self.options, self.options.max_tried * larger(len(self.voter.index))
+        xy, options = self.scene.intersections.xy[self.voters], self.options
         anchors = islice(farthest_first(xy, self.voters), options.max_anchors) if only is None else only
         for n, (anchor, steps) in enumerate(self.ahead.map(self._vote, anchors)):
-            if n >= options.least_anchors and self.n_tried >= most_tried:
+            if only is None and not self.turnout.includes(n):
                 return
             if anchor in self._tried:
                 continue
             self._tried.add(anchor)
             for tried, votes in steps:
                 self.n_tried += tried
+                self.turnout.n_tried += tried
                 if votes is None:
                     yield RoadRound(-1, 0, [])
                     continue

@@ -74,6 +74,8 @@ class RoadViews:
                 on_map, seen_by = replace(on_map, max_anchors=tilted.max_anchors), self.seen_by(view)
                 voters = np.flatnonzero(before(scene.intersections.xy, seen_by, scene, tilted.coarser))
                 scene = rectify(scene, seen_by, tilted.coarser)
-            ahead = self.sweeps.ahead
-            self._searches[view] = RoadSearch(scene, self.index, options.camera, on_map, self.near, ahead, voters)
+            turnout = self.sweeps.turnout(view, self.index.coarseness, on_map)
+            self._searches[view] = RoadSearch(
+                scene, self.index, options.camera, on_map, self.near, self.sweeps.ahead, voters, turnout
+            )
         return self._searches[view]

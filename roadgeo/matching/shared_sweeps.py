@@ -20,6 +20,7 @@ from roadgeo.matching.ahead import ALONE, Ahead
 from roadgeo.matching.growing import GrowOptions
 from roadgeo.matching.hypothesis import Hypothesis
 from roadgeo.matching.index import ReferenceIndex
+from roadgeo.matching.road_search import RoadSearchOptions, Turnout
 from roadgeo.matching.scene import Scene
 from roadgeo.matching.sweeps import Source
 from roadgeo.matching.tilted import TiltOptions, likely_views
@@ -87,6 +88,7 @@ class SharedSweeps(Generic[AnyMember]):
         self._rounds: dict[int, Iterator[_Round]] = {}
         self._done: dict[int, list[_Round]] = {}
         self._views: dict[TiltOptions, list[FloatArray]] = {}
+        self._turnouts: dict[tuple[int, float], Turnout] = {}
 
     def rounds(self, member: AnyMember, stage: Stage) -> Iterator[list[Hypothesis]]:
         """Yield what grew on a part from the proposals of one anchor after another, until enough were screened."""
@@ -112,6 +114,11 @@ class SharedSweeps(Generic[AnyMember]):
         if options not in self._views:
             self._views[options] = likely_views(self.scene, options)
         return self._views[options]
+
+    def turnout(self, view: int, coarseness: float, options: RoadSearchOptions) -> Turnout:
+        """Return how many intersections vote in a view of the scene, on all parts of some coarseness alike."""
+        n_map = sum(len(member.index) for member in self.members if member.index.coarseness == coarseness)
+        return self._turnouts.setdefault((view, coarseness), Turnout(options, n_map))
 
     def end(self) -> None:
         """Let go of the parts: each holds on to this, and a cycle would keep their maps open for a while."""

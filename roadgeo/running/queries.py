@@ -45,6 +45,9 @@ __all__ = ["QueryOptions", "is_model", "locate_query"]
 #: The mask of a larger photograph is reduced, so that time and memory are bounded.
 _MAX_GRID_PIXELS = 64_000_000
 _MAX_SCALES = 3
+
+#: Where the photograph as it is leads nowhere, it is shown to the model turned and turned over as well.
+_MORE_WAYS = 4
 #: Roads of a photograph whose pixels are coarser than a model's are traced on the model's, but of no more than so many
 #: times its own along a side: narrow gaps between roads close on coarse ones.
 _MOST_FINER, _LEAST_FINER = 2.0, 1.25
@@ -187,14 +190,17 @@ def _locate_photograph(
         finer = _how_much_finer(own, scales[0])
         grid = round(finer * own[0]), round(finer * own[1])
 
-    @lru_cache(_MAX_SCALES)
-    def see(scale: float) -> ProbabilityMap:
-        seen = [_see(path, name, scale, grid, query, say) for path in paths for name in query.segmenters or ("",)]
+    @lru_cache(_MAX_SCALES + 1)
+    def see(scale: float, ways: int = 1) -> ProbabilityMap:
+        names = query.segmenters or ("",)
+        seen = [_see(path, name, scale, grid, query, say, ways) for path in paths for name in names]
         maps = [one.resized(grid) for one in seen]
         return maps[0] if len(maps) == 1 else fuse(maps)
 
     at_scales = [_looks_at(partial(see, scale), scale, query) for scale in scales]
     looks = [looks[0] for looks in at_scales] + at_scales[0][1:]
+    if len(plugins) < max(len(query.segmenters), 1):  # a model is shown the photograph
+        looks.insert(1, _look_more_ways(partial(see, scales[0], _MORE_WAYS), scales[0], query))
     options = _on_grid(options, k / finer)
     try:
         return _of_own_pixels(locate_looks(looks, references, options, how), own)
@@ -219,6 +225,12 @@ def _of_own_pixels(sighting: Sighting, own: tuple[int, int]) -> Sighting:
     probability = None if sighting.probability is None else sighting.probability.resized(own)
     location, mask = of_own_pixels(sighting.location, own[::-1]), on_grid(sighting.mask, own)
     return replace(sighting, location=location, mask=mask, probability=probability)
+
+
+def _look_more_ways(see: Callable[[], ProbabilityMap], scale: float, query: QueryOptions) -> Look:
+    """Return a look at a probability map for which the photograph was turned and turned over."""
+    one = _looks_at(see, scale, query)[0]
+    return replace(one, what=f"{one.what}, shown {_MORE_WAYS} ways")
 
 
 def _looks_at(see: Callable[[], ProbabilityMap], scale: float, query: QueryOptions) -> list[Look]:
@@ -253,7 +265,7 @@ def _choose_scales(photograph: Photograph, query: QueryOptions, options: LocateO
 
 
 def _see(
-    path: str, segmenter: str, scale: float, grid: tuple[int, int], query: QueryOptions, say: Say
+    path: str, segmenter: str, scale: float, grid: tuple[int, int], query: QueryOptions, say: Say, ways: int
 ) -> ProbabilityMap:
     """Return what one segmenter sees in one photograph, not much finer than a grid; a mask is sure of itself."""
     if segmenter and not is_model(segmenter):
@@ -263,7 +275,9 @@ def _see(
             return _of_mask(read_mask(path, band=query.band, threshold=query.threshold), "mask")
     with open_photograph(path) as photograph:
         step = max(1, int(map_shape(photograph, scale)[0] / grid[0]))
-        return segment(photograph, _network(segmenter, query.class_name, query.threads), scale, say, step=step)
+        return segment(
+            photograph, _network(segmenter, query.class_name, query.threads), scale, say, step=step, ways=ways
+        )
 
 
 def _of_mask(mask: RoadMask, model: str) -> ProbabilityMap:

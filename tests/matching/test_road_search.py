@@ -8,11 +8,12 @@ import pytest
 from worlds.scenes import Sight, camera, look, mapped, random_network, scene_of
 
 from roadgeo.geometry.camera import CameraOptions
+from roadgeo.matching import road_raster
 from roadgeo.matching.estimator import MatchOptions, TripleEstimator
 from roadgeo.matching.index import build_index
 from roadgeo.matching.road_growth import RoadGrower, RoadGrowOptions
 from roadgeo.matching.road_raster import RasterOptions, make_raster
-from roadgeo.matching.road_search import COARSE_PIXEL_M, RoadSearch, RoadSearchOptions
+from roadgeo.matching.road_search import COARSE_PIXEL_M, RoadSearch, RoadSearchOptions, Turnout
 from roadgeo.matching.road_votes import VoteOptions, Voter
 from roadgeo.matching.search import SearchOptions, search
 
@@ -147,6 +148,36 @@ def test_work_is_bounded(town, broken):
     assert n_anchors() == len(broken.intersections)
     assert n_anchors(max_anchors=5) == 5
     assert n_anchors(max_tried=1, least_anchors=3) == 3
+
+
+def test_parts_share_what_may_be_tried():
+    turnout = Turnout(RoadSearchOptions(max_tried=100, least_anchors=2), n_map=15_000)
+    assert turnout.includes(0)
+    turnout.n_tried = 60
+    assert turnout.includes(1)
+    assert turnout.includes(2)
+    turnout.n_tried = 120  # by another part
+    assert turnout.includes(2)  # decided by the first that came to it
+    assert not turnout.includes(3)
+    turnout.n_tried = 0
+    assert not turnout.includes(3)
+    assert turnout.last == 3
+
+
+def test_more_may_be_tried_on_a_larger_map():
+    larger = Turnout(RoadSearchOptions(max_tried=100, least_anchors=1), n_map=60_000, n_tried=150)
+    assert larger.includes(1)
+    larger.n_tried = 200
+    assert not larger.includes(2)
+
+
+def test_a_raster_in_use_is_not_drawn_again(town, monkeypatch):
+    monkeypatch.setattr(road_raster, "_MOST_BYTES", 0)
+    options = RasterOptions(cell_m=6.0)
+    drawn = make_raster(town[1], options)
+    other = make_raster(town[1], RasterOptions(cell_m=8.0))
+    assert make_raster(town[1], options) is drawn
+    assert drawn is not other
 
 
 def test_the_raster_is_made_once_and_has_a_rim(town):

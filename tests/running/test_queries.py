@@ -1,6 +1,7 @@
 """Photographs are recognised, segmented and located like masks; nobody says how large their pixels are."""
 
 import json
+from dataclasses import replace
 from pathlib import Path
 
 import cv2
@@ -10,10 +11,13 @@ import rasterio
 from worlds.models import brightness_model
 
 from roadgeo.cli import main
-from roadgeo.errors import ModelError, PhotographError
+from roadgeo.errors import MaskError, ModelError, PhotographError
 from roadgeo.evaluation.demo import ROADS, demo_masks
+from roadgeo.geometry.mask import RoadMask
+from roadgeo.matching.options import LocateOptions
+from roadgeo.running import queries
 from roadgeo.running.queries import QueryOptions, _how_much_finer, locate_query
-from roadgeo.sources.segmentation.probability import TAG
+from roadgeo.sources.segmentation.probability import TAG, ProbabilityMap
 from roadgeo.workflows import build_reference
 
 pytestmark = pytest.mark.filterwarnings("ignore::rasterio.errors.NotGeoreferencedWarning")
@@ -59,6 +63,36 @@ def offset(document: dict, size: int = 1) -> float:
     expected = MASK.homography @ [width / 2, height / 2, 1]
     found = np.array(document["homography"]) @ [width / 2, height / 2, 1]
     return float(np.hypot(*(found[:2] / found[2] - expected[:2] / expected[2])))
+
+
+@pytest.mark.parametrize(("segmenters", "ways"), [((), True), (("model",), True), (("plugin",), False)])
+def test_the_second_look_shows_the_photograph_more_ways(
+    segmenters: tuple[str, ...], ways: bool, model: str, photo: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    taken: list[str] = []
+
+    def note(looks, *_):  # type: ignore[no-untyped-def]
+        taken.extend(look.what for look in looks)
+        raise MaskError("that is all")
+
+    nothing = ProbabilityMap(np.zeros((10, 10), np.uint8), 0.5)
+    monkeypatch.setattr(queries, "locate_looks", note)
+    monkeypatch.setattr(queries, "segment", lambda *_, **__: nothing)
+    names = tuple(model if name == "model" else name for name in segmenters)
+    mask = RoadMask(np.zeros((10, 10), np.bool_))
+    monkeypatch.setattr(queries, "_call_segmenter", lambda *_: mask)
+    query = QueryOptions(segment="always", segmenters=names)
+    options = LocateOptions()
+    camera = replace(options.match.camera, gsd_m=(0.9, 1.1))
+    options = replace(options, match=replace(options.match, camera=camera))
+    if ways:
+        locate_query(str(photo), [], options, query)
+    else:
+        with pytest.raises(MaskError):
+            locate_query(str(photo), [], options, query)
+    queries._network.cache_clear()  # another test looks what is said without a model
+    assert (len(taken) > 1 and taken[1].endswith("shown 4 ways")) == ways
+    assert not any("ways" in one for one in taken[:1] + taken[2:])
 
 
 def test_a_photograph_is_located(

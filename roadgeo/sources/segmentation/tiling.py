@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable, Iterator
+from functools import partial
 
 import cv2
 import numpy as np
@@ -20,6 +21,11 @@ __all__ = ["MAX_MAP_PIXELS", "map_shape", "segment"]
 #: A larger map takes hours, and shows nothing that a smaller one of the same ground does not.
 MAX_MAP_PIXELS = 1_000_000_000
 
+#: Steps down and to the right by which a tile is read, in the order in which the ways are taken.
+_WAYS = ((1, 1), (-1, -1), (1, -1), (-1, 1))
+#: No model is surer than this where ways are averaged: one of them would outweigh all others.
+_SURE = np.float32(1e-4)
+
 
 def map_shape(photograph: Photograph, scale: float, step: int = 1) -> tuple[int, int]:
     """Return (H, W) of what a model is shown of a photograph: `scale` pixels for each of its own, along a side.
@@ -31,7 +37,13 @@ def map_shape(photograph: Photograph, scale: float, step: int = 1) -> tuple[int,
 
 
 def segment(
-    photograph: Photograph, network: Network, scale: float = 1.0, say: Say = say_nothing, *, step: int = 1
+    photograph: Photograph,
+    network: Network,
+    scale: float = 1.0,
+    say: Say = say_nothing,
+    *,
+    step: int = 1,
+    ways: int = 1,
 ) -> ProbabilityMap:
     """Find the roads in a photograph.
 
@@ -42,6 +54,9 @@ def segment(
     step : int
         Pixels shown to the model for each pixel of the map, along a side: memory grows with the map, not with the
         photograph.
+    ways : int
+        Each tile is shown to the model in so many ways, at most 4: as it is, turned by half, turned over left to right
+        and top to bottom. The mean counts: roads that are seen one way only are mostly none.
 
     Raises
     ------
@@ -68,7 +83,7 @@ def segment(
     what = f"finding roads in {photograph.name}"
     say(what, 0.0)
     done, rest = 0, np.empty((0, shape[1]), np.float32)
-    for rows in _blend(read, shape, network.card.tile, network.card.overlap, network):
+    for rows in _blend(read, shape, network.card.tile, network.card.overlap, partial(_look, network, ways)):
         rows = np.concatenate([rest, rows])
         n = len(rows) // step
         values[done : done + n] = np.rint(254 * _reduce(rows[: n * step], step))
@@ -76,6 +91,15 @@ def segment(
         say(what, done * step / shape[0])
     values[~ground] = NODATA
     return ProbabilityMap(values, network.card.threshold, photograph.name, network.name)
+
+
+def _look(network: Network, ways: int, tile: AnyArray) -> Float32Array:
+    """Return what a model sees in a tile, shown in some ways: the mean of the logits, as a probability."""
+    if ways == 1:
+        return network(tile)
+    seen = [network(np.ascontiguousarray(tile[::down, ::right]))[::down, ::right] for down, right in _WAYS[:ways]]
+    odds = np.log(np.clip(seen, _SURE, 1 - _SURE) / np.clip(1 - np.array(seen), _SURE, 1 - _SURE)).mean(axis=0)
+    return np.asarray(1 / (1 + np.exp(-odds)), np.float32)
 
 
 def _reduce(rows: Float32Array, step: int) -> Float32Array:

@@ -12,7 +12,7 @@ from roadgeo.errors import MaskError
 from roadgeo.sources.segmentation.network import load_network
 from roadgeo.sources.segmentation.photograph import open_photograph
 from roadgeo.sources.segmentation.probability import NODATA, TAG, ProbabilityMap, fuse
-from roadgeo.sources.segmentation.tiling import _starts, segment
+from roadgeo.sources.segmentation.tiling import _look, _starts, segment
 
 pytestmark = pytest.mark.filterwarnings("ignore::rasterio.errors.NotGeoreferencedWarning")
 
@@ -175,3 +175,23 @@ def test_a_model_of_another_threshold_counts_from_there() -> None:
     sure, shy = np.full((9, 9), 127, np.uint8), np.full((9, 9), 51, np.uint8)
     fused = fuse([ProbabilityMap(sure, 0.5), ProbabilityMap(shy, 0.2)]).values
     np.testing.assert_allclose(fused, 127, atol=2)
+
+
+def test_more_ways_average_what_is_seen(network, photo: Path) -> None:
+    def sees_the_corner(tile: np.ndarray) -> np.ndarray:
+        seen = np.full(tile.shape[:2], 0.1, np.float32)
+        seen[: len(seen) // 2, : seen.shape[1] // 2] = 0.9
+        return seen
+
+    tile = np.zeros((20, 30, 3), np.uint8)
+    np.testing.assert_array_equal(_look(sees_the_corner, 1, tile), sees_the_corner(tile))
+    both = _look(sees_the_corner, 2, tile)
+    assert both[0, 0] == pytest.approx(0.5)
+    assert both[-1, -1] == pytest.approx(0.5)
+    assert both[0, -1] == pytest.approx(0.1)
+    four = _look(sees_the_corner, 4, tile)
+    assert np.ptp(four) < 1e-6
+    assert np.isfinite(_look(lambda tile: np.ones(tile.shape[:2], np.float32), 4, tile)).all()
+    with open_photograph(photo) as opened:  # a model of single pixels sees the same each way
+        one, many = segment(opened, network), segment(opened, network, ways=4)
+    np.testing.assert_array_equal(one.mask(0.5).roads, many.mask(0.5).roads)
