@@ -112,7 +112,7 @@ class Turnout:
     n_map: int
     n_tried: int = 0
     last: int | None = None
-    _asked: int = 0
+    _asked: int = field(default=0, init=False)
 
     def includes(self, n: int) -> bool:
         """Whether the n-th votes, from 0; the part that comes to it first decides for all."""
