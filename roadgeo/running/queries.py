@@ -45,7 +45,6 @@ __all__ = ["QueryOptions", "is_model", "locate_query"]
 #: The mask of a larger photograph is reduced, so that time and memory are bounded.
 _MAX_GRID_PIXELS = 64_000_000
 _MAX_SCALES = 3
-
 #: Where the photograph as it is leads nowhere, it is shown to the model turned and turned over as well.
 _MORE_WAYS = 4
 #: Roads of a photograph whose pixels are coarser than a model's are traced on the model's, but of no more than so many
@@ -189,25 +188,32 @@ def _locate_photograph(
         scales = _choose_scales(photograph, query, options, say)
         finer = _how_much_finer(own, scales[0])
         grid = round(finer * own[0]), round(finer * own[1])
+    names = query.segmenters or ("",)
+    masks = {path: read for path in paths if (read := _fused_mask(path, query)) is not None}
 
     @lru_cache(_MAX_SCALES + 1)
     def see(scale: float, ways: int = 1) -> ProbabilityMap:
-        names = query.segmenters or ("",)
-        seen = [_see(path, name, scale, grid, query, say, ways) for path in paths for name in names]
+        seen = [
+            _of_mask(masks[path], "mask")
+            if path in masks and name not in plugins
+            else _see(path, name, scale, grid, query, say, ways)
+            for path in paths
+            for name in names
+        ]
         maps = [one.resized(grid) for one in seen]
         return maps[0] if len(maps) == 1 else fuse(maps)
 
     at_scales = [_looks_at(partial(see, scale), scale, query) for scale in scales]
     looks = [looks[0] for looks in at_scales] + at_scales[0][1:]
-    if len(plugins) < max(len(query.segmenters), 1):  # a model is shown the photograph
+    if len(plugins) < len(names) and not masks.keys() >= set(paths):  # a model is shown a photograph
         looks.insert(1, _look_more_ways(partial(see, scales[0], _MORE_WAYS), scales[0], query))
     options = _on_grid(options, k / finer)
     try:
         return _of_own_pixels(locate_looks(looks, references, options, how), own)
     except MaskError as error:
-        names = ", ".join(one.name for one in references)
+        where = ", ".join(one.name for one in references)
         reason = f"hardly a road is seen in the photograph ({error})"
-        location = Location(paths[0], "not_located", reason, names, size=(own[1], own[0]), reason_code=Reason.FEW_ROADS)
+        location = Location(paths[0], "not_located", reason, where, size=(own[1], own[0]), reason_code=Reason.FEW_ROADS)
         nothing, seen = RoadMask(np.zeros(own, np.bool_), name=paths[0]), see(scales[0]).resized(own)
         return Sighting(location, nothing, probability=seen)
 
@@ -264,15 +270,20 @@ def _choose_scales(photograph: Photograph, query: QueryOptions, options: LocateO
     return [scale_of(stated, network), *ranked][:_MAX_SCALES]
 
 
+def _fused_mask(path: str, query: QueryOptions) -> RoadMask | None:
+    """Return one of several looks at a frame that is a mask already; None for a photograph."""
+    if query.segment == "auto" and query.fused_with:
+        with suppress(PhotographError):
+            return read_mask(path, band=query.band, threshold=query.threshold)
+    return None
+
+
 def _see(
     path: str, segmenter: str, scale: float, grid: tuple[int, int], query: QueryOptions, say: Say, ways: int
 ) -> ProbabilityMap:
-    """Return what one segmenter sees in one photograph, not much finer than a grid; a mask is sure of itself."""
+    """Return what one segmenter sees in one photograph, not much finer than a grid."""
     if segmenter and not is_model(segmenter):
         return _of_mask(_call_segmenter(segmenter, path, query.threshold), segmenter)
-    if query.segment == "auto" and query.fused_with:
-        with suppress(PhotographError):
-            return _of_mask(read_mask(path, band=query.band, threshold=query.threshold), "mask")
     with open_photograph(path) as photograph:
         step = max(1, int(map_shape(photograph, scale)[0] / grid[0]))
         return segment(

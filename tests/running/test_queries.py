@@ -214,6 +214,22 @@ def test_without_a_model_it_is_said(demo_reference: Path, photo: Path, monkeypat
         locate_query(str(photo), [roadgeo.open_reference(demo_reference)])
 
 
+def test_fused_masks_are_shown_to_no_model(monkeypatch: pytest.MonkeyPatch) -> None:
+    taken: list[str] = []
+
+    def note(looks, *_):  # type: ignore[no-untyped-def]
+        taken.extend(look.what for look in looks)
+        looks[0].make()
+        raise StopIteration
+
+    monkeypatch.setattr(queries, "locate_looks", note)
+    monkeypatch.setattr(queries, "_see", lambda *_: pytest.fail("a mask was shown to a model"))
+    with pytest.raises(StopIteration):
+        locate_query(str(MASK.path), [], query=QueryOptions(fused_with=(str(MASK.path),)))
+    assert taken
+    assert not any("ways" in one for one in taken)
+
+
 def test_two_exposures_are_fused(
     tmp_path: Path, demo_reference: Path, model: str, photo: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:

@@ -98,8 +98,8 @@ def _look(network: Network, ways: int, tile: AnyArray) -> Float32Array:
     if ways == 1:
         return network(tile)
     seen = [network(np.ascontiguousarray(tile[::down, ::right]))[::down, ::right] for down, right in _WAYS[:ways]]
-    odds = np.log(np.clip(seen, _SURE, 1 - _SURE) / np.clip(1 - np.array(seen), _SURE, 1 - _SURE)).mean(axis=0)
-    return np.asarray(1 / (1 + np.exp(-odds)), np.float32)
+    road = np.clip(seen, _SURE, 1 - _SURE)
+    return np.asarray(1 / (1 + np.exp(-np.log(road / (1 - road)).mean(axis=0))), np.float32)
 
 
 def _reduce(rows: Float32Array, step: int) -> Float32Array:
