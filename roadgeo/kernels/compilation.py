@@ -215,6 +215,7 @@ _SEARCH = (
     "road_votes",
     "road_growth",
     "residuals",
+    "lens",
 )
 _left_to_numba: set[str] = set()
 _kept_alive: list[Any] = []

@@ -14,7 +14,7 @@ from roadgeo.kernels.adjustment import add_row, carry, point_row
 from roadgeo.kernels.arrays import Floats1, Floats2
 from roadgeo.kernels.compilation import kernel
 from roadgeo.kernels.homography_fit import cholesky, solve_cholesky
-from roadgeo.kernels.roads import meets_road, nearest_road
+from roadgeo.kernels.roads import nearest_road
 from roadgeo.kernels.structs import RoadBuckets
 
 __all__ = ["Stages", "fit_to_roads", "grow_by_roads", "share_on_roads"]
@@ -34,40 +34,43 @@ _LEAST_W = 0.05
 class Stages(NamedTuple):
     """How growth proceeds.
 
-    `affine_until` in normalised units; a stage fails with fewer than `least_share` of its points within `tolerance`
-    metres of a road; `perspective_sigma` is the prior standard deviation of the two perspective parameters; roads count
-    that turn from a point's direction by less than `min_cos` says.
+    `affine_until` in normalised units; a stage fails with fewer than `least_share` of its points on roads;
+    `perspective_sigma` is the prior standard deviation of the two perspective parameters; roads count that turn from a
+    point's direction by less than `min_cos` says; only `go_on` maps go on after each of the first stages, those whose
+    points lie closest to roads.
     """
 
     affine_until: float
     least_share: float
-    tolerance: float
     perspective_sigma: float
     min_cos: float
+    go_on: tuple[int, int, int]
 
 
-@kernel()
+@kernel(forceinline=True)
 def _nearest(
     p: NDArray[np.float64],
     unit: float,
-    origin: NDArray[np.float64],
-    point: NDArray[np.float64],
-    direction: NDArray[np.float64],
+    origin: tuple[float, float],
+    place: tuple[float, float, float, float],
     radius: float,
     min_cos: float,
-    roads: RoadBuckets,
+    segments: NDArray[np.float32],
+    starts: NDArray[np.int32],
+    ids: NDArray[np.int32],
+    grid: tuple[float, float, float],
+    shape: tuple[int, int],
 ) -> tuple[float, float, float, float]:
     """Return how far the nearest road lies from a mapped point, across the road, the road's direction, and w.
 
-    Without a road within `radius` metres the distance is inf.
+    `place` is the point and its direction. Without a road within `radius` metres the distance is inf.
     """
-    x, y, w, dx, dy, length = carry(p, point[0], point[1], direction[0], direction[1])
+    x, y, w, dx, dy, length = carry(p, place[0], place[1], place[2], place[3])
     if w < _LEAST_W or length == 0.0:
         return np.inf, 0.0, 0.0, w
     gx, gy = origin[0] + unit * x, origin[1] + unit * y
     d, fx, fy, rx, ry = nearest_road(
-        gx, gy, dx / length, dy / length, radius, min_cos,
-        roads.segments, roads.starts, roads.ids, roads.grid, roads.shape,
+        gx, gy, dx / length, dy / length, radius, min_cos, segments, starts, ids, grid, shape,
     )  # fmt: skip
     if d == np.inf:
         return np.inf, 0.0, 0.0, w
@@ -106,9 +109,12 @@ def fit_to_roads(
         Weights that hold each parameter where it is.
     """
     normal, factor, right, row = np.zeros((8, 8)), np.zeros((8, 8)), np.zeros(8), np.empty(8)
+    segments, starts, ids, grid, shape = roads
+    at = origin[0], origin[1]
     met = 0
     for i in range(points.shape[0]):
-        away, rx, ry, w = _nearest(p, unit, origin, points[i], directions[i], radius, min_cos, roads)
+        place = points[i, 0], points[i, 1], directions[i, 0], directions[i, 1]
+        away, rx, ry, w = _nearest(p, unit, at, place, radius, min_cos, segments, starts, ids, grid, shape)
         if w < _LEAST_W:
             return False
         if away == np.inf:
@@ -136,60 +142,104 @@ def share_on_roads(
     radius: float,
     min_cos: float,
     roads: RoadBuckets,
-) -> float:
-    """Return which share of the points lies within `radius` metres of roads that run their way (see `fit_to_roads`)."""
-    met = 0
+) -> tuple[float, float]:
+    """Return which share of the points lies on roads that run their way (see `fit_to_roads`), and their closeness.
+
+    A point lies on a road nearer than `radius` metres; its closeness falls from 1 on the road to 0 there. Of all points
+    the mean is returned.
+    """
+    segments, starts, ids, grid, shape = roads
+    at = origin[0], origin[1]
+    met, closeness = 0, 0.0
     for i in range(points.shape[0]):
-        x, y, w, dx, dy, length = carry(p, points[i, 0], points[i, 1], directions[i, 0], directions[i, 1])
-        if w < _LEAST_W or length == 0.0:
-            continue
-        gx, gy = origin[0] + unit * x, origin[1] + unit * y
-        if meets_road(gx, gy, dx / length, dy / length, radius, min_cos, roads):
+        place = points[i, 0], points[i, 1], directions[i, 0], directions[i, 1]
+        away, _, _, w = _nearest(p, unit, at, place, radius, min_cos, segments, starts, ids, grid, shape)
+        if w >= _LEAST_W and away < np.inf:
             met += 1
-    return float(met / max(points.shape[0], 1))
+            closeness += 1.0 - min(abs(away) / radius, 1.0)
+    n = max(points.shape[0], 1)
+    return met / n, closeness / n
 
 
 @kernel()
 def grow_by_roads(
-    p: Floats1,
-    unit: float,
-    origin: Floats1,
+    ps: Floats2,
+    units: Floats1,
+    origins: Floats2,
+    tolerances: Floats1,
     points: Floats2,
     directions: Floats2,
     stages: Stages,
     roads: RoadBuckets,
-) -> float:
-    """Grow a map from the nearest points outwards; return the share of all points on roads, or -1: given up.
+    closeness: Floats1,
+) -> None:
+    """Grow maps of one query side by side from the nearest points outwards; those that fit worst are given up.
 
-    Each stage fits the map to the nearest points, more of them each time: an affine map first, a homography beyond
+    Each stage fits the maps to the nearest points, more of them each time: affine maps first, homographies beyond
     `affine_until` and over the whole query.
 
     Parameters
     ----------
-    p, unit, origin, points, directions
+    ps, units, origins : (M, 8), (M,), (M, 2) float64
+        As in `fit_to_roads`, of each map. `ps` are adjusted in place.
+    tolerances : (M,) float64
+        Points nearer to a road lie on it, metres.
+    points, directions
         As in `fit_to_roads`; points nearest to (0, 0) first.
+    closeness : (M,) float64
+        Filled with that of all points (see `share_on_roads`), or -1: given up.
     """
     n = points.shape[0]
-    count = min(_FIRST, n)
-    radii = _FIRST_RADII
+    closeness[:] = 0.0 if n > 0 else -1.0
+    count, stage = min(_FIRST, n), 0
+    while count > 0:
+        bent = count == n or math.hypot(points[count - 1, 0], points[count - 1, 1]) > stages.affine_until
+        step = max(1, count // _ENOUGH)
+        some, along = points[:count:step], directions[:count:step]
+        radii = _FIRST_RADII if stage == 0 else _RADII
+        for m in range(closeness.shape[0]):
+            if closeness[m] >= 0.0:
+                place = ps[m], units[m], origins[m]
+                closeness[m] = _fit_stage(place, tolerances[m], some, along, radii, bent, stages, roads)
+        if count == n:
+            break
+        if stage < len(stages.go_on):
+            _give_up_worst(closeness, stages.go_on[stage])
+        count, stage = min(int(count * _MORE) + 1, n), stage + 1
+
+
+@kernel()
+def _fit_stage(
+    place: tuple[NDArray[np.float64], float, NDArray[np.float64]],
+    tolerance: float,
+    points: NDArray[np.float64],
+    directions: NDArray[np.float64],
+    radii: tuple[float, float, float],
+    bent: bool,
+    stages: Stages,
+    roads: RoadBuckets,
+) -> float:
+    """Fit one map, its `place` being p, unit and origin, to a stage's points; return their closeness, or -1."""
+    p, unit, origin = place
     holds = np.empty(8)
     for r in range(6):
         sigma = _PLACE_SIGMA_M / unit if r % 3 == 2 else _LINEAR_SIGMA
         holds[r] = (_POINT_SIGMA_M / unit / sigma) ** 2
-    while count > 0:
-        bent = count == n or math.hypot(points[count - 1, 0], points[count - 1, 1]) > stages.affine_until
-        holds[6] = holds[7] = (_POINT_SIGMA_M / unit / stages.perspective_sigma) ** 2 if bent else 1e9
-        step = max(1, count // _ENOUGH)
-        some, along = points[:count:step], directions[:count:step]
-        for k in range(3):
-            radius = max(radii[k], 1.5 * stages.tolerance)
-            if not fit_to_roads(p, unit, origin, some, along, radius, stages.min_cos, holds, roads):
-                return -1.0
-        share = share_on_roads(p, unit, origin, some, along, stages.tolerance, stages.min_cos, roads)
-        if share < stages.least_share:
+    holds[6] = holds[7] = (_POINT_SIGMA_M / unit / stages.perspective_sigma) ** 2 if bent else 1e9
+    for k in range(3):
+        radius = max(radii[k], 1.5 * tolerance)
+        if not fit_to_roads(p, unit, origin, points, directions, radius, stages.min_cos, holds, roads):
             return -1.0
-        if count == n:
-            return share
-        radii = _RADII
-        count = min(int(count * _MORE) + 1, n)
-    return -1.0
+    share, closeness = share_on_roads(p, unit, origin, points, directions, tolerance, stages.min_cos, roads)
+    return closeness if share >= stages.least_share else -1.0
+
+
+@kernel()
+def _give_up_worst(closeness: NDArray[np.float64], most: int) -> None:
+    """Set to -1 all but the `most` greatest; of equal ones the first stay."""
+    for _ in range((closeness >= 0.0).sum() - most):
+        worst = -1
+        for m in range(closeness.shape[0]):
+            if closeness[m] >= 0.0 and (worst < 0 or closeness[m] <= closeness[worst]):
+                worst = m
+        closeness[worst] = -1.0

@@ -241,7 +241,7 @@ class TripleEstimator:
         seeds = np.array([grown.anchor])
         gsd = sampling(matrix, scene.size)
         _, matched, _ = agreement(matrix, scene, self.index, gsd, seeds, self.options.verify)
-        return Hypothesis(matrix, seeds, grown.share, matched, by_roads=True)
+        return Hypothesis(matrix, seeds, grown.closeness, matched, by_roads=True)
 
     def _is_found_again(self, known: Hypothesis, hypothesis: Hypothesis) -> bool:
         """Whether a verified place that is promising was proposed by another intersection as well."""

@@ -11,7 +11,7 @@ import numpy as np
 from roadgeo._arrays import BoolArray, FloatArray
 from roadgeo.geometry.homography import Homography
 from roadgeo.geometry.lens import Lens
-from roadgeo.kernels.residuals import road_residuals
+from roadgeo.kernels.lens import MeetLimits, lens_rows, meet_roads
 from roadgeo.matching.index import ReferenceIndex
 from roadgeo.matching.refinement import RefineOptions, normalise, spacing_m
 from roadgeo.matching.scene import Scene
@@ -57,19 +57,15 @@ class LensEquations:
         self.max_radius = options.max_radius_m + options.max_radius_px * gsd
         self.weight = min(1.0, spacing_m(scene, self.unit) / options.correlation_m)
         self.min_cos = math.cos(math.radians(options.max_turn_deg))
+        self.points = np.ascontiguousarray((scene.points - scene.center) / scene.half_size)
+        self.directions = np.ascontiguousarray(scene.directions)
+        self.half_side = max(scene.size) / 2 / scene.half_size
 
-    def rows(self, k1: float) -> tuple[FloatArray, FloatArray, FloatArray]:
-        """Return places (S, 2) and unit directions (S, 2) on the map, and derivatives (S, 2, 9) of the places."""
-        scene = self.scene
-        lens = Lens.of(k1, scene.size, y_up=True)
-        turned = lens.straighten_directions(scene.points, scene.directions)
-        homography, uv = self._seen(k1)
-        jacobian = homography.jacobian(uv)
-        along = (jacobian @ turned[:, :, None])[..., 0]
-        rows = np.zeros((len(uv), 2, 9))
-        rows[:, :, :8] = homography.by_elements(uv)
-        rows[:, :, 8] = np.einsum("nij,nj->ni", jacobian, lens.moves(scene.points) / scene.half_size)
-        return homography.everywhere(uv), along / np.linalg.norm(along, axis=1, keepdims=True), rows
+    def rows(self, k1: float) -> tuple[FloatArray, FloatArray]:
+        """Return places (S, 2) on the map, normalised, and their derivatives (S, 2, 9)."""
+        places, rows = np.empty((len(self.points), 2)), np.empty((len(self.points), 2, 9))
+        lens_rows(self.p, k1, self.half_side, self.points, self.directions, places, rows)
+        return places, rows
 
     def held(self, sigmas: FloatArray) -> FloatArray:
         """Return the weights that hold parameters whose standard deviations are `sigmas`."""
@@ -129,31 +125,29 @@ class LensEquations:
 
         With another k1 to `start` from, let the parameters put the points where they did.
         """
-        places, _, rows = self.rows(k1)
+        places, rows = self.rows(k1)
         if start is None or start == k1:
             return rows[core]
         target = places[core]
         for _ in range(_STEPS):
-            places, _, rows = self.rows(start)
+            places, rows = self.rows(start)
             flat = rows[core, :, :8].reshape(-1, 8)
             away = (target - places[core]).ravel()
             self.p = self.p + np.linalg.solve(flat.T @ flat + 1e-4 * np.eye(8), flat.T @ away)
-        return self.rows(start)[2][core]
+        return self.rows(start)[1][core]
 
     def observe(self, k1: float, inverse: FloatArray, slack: float = 1.0) -> Observed:
         """Find the roads near points whose places are sure enough.
 
         How far off a place may be follows from the `inverse` (9, 9) of the normal matrix so far, times `slack`.
         """
-        xy, along, rows = self.rows(k1)
-        spread = ((rows @ inverse) * rows).sum(axis=(1, 2))
-        sigma = self.sigma_m * np.sqrt(1.0 + slack**2 * np.maximum(spread, 0.0))
-        sure = np.isfinite(sigma) & (3.0 * sigma <= self.max_radius)
-        out = np.empty((int(sure.sum()), 3))
-        mapped = np.ascontiguousarray(self.origin + self.unit * xy[sure])
-        road_residuals(mapped, np.ascontiguousarray(along[sure]), 3.0 * sigma[sure], self.min_cos, self.roads, out)
-        met = np.isfinite(out[:, 0])
-        which = sure.copy()
-        which[sure] = met
-        across = np.einsum("nai,na->ni", rows[which], out[met, 1:])
-        return Observed(across, out[met, 0], sigma[which], which)
+        n, (x, y) = len(self.points), self.origin
+        rows, residuals, sigma = np.empty((n, 9)), np.empty(n), np.empty(n)
+        limits = MeetLimits(self.unit, float(x), float(y), self.sigma_m, slack, self.max_radius, self.min_cos)
+        inverse = np.ascontiguousarray(inverse)
+        meet_roads(
+            self.p, k1, self.half_side, self.points, self.directions, inverse, limits, self.roads,
+            rows, residuals, sigma,
+        )  # fmt: skip
+        met = np.isfinite(residuals)
+        return Observed(rows[met], residuals[met], sigma[met], met)

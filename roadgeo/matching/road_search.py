@@ -64,7 +64,7 @@ class RoadSearchOptions:
     max_tried: int = 400_000
     least_anchors: int = 8
     max_grown: int = 40
-    max_kept: int = 4
+    max_kept: int = 2
     scale_slack: float = 1.2
     least_share: float = 0.2
     road_width_m: tuple[float, float] = (2.0, 75.0)
@@ -190,10 +190,10 @@ class RoadSearch:
                 if votes is None:
                     yield RoadRound(-1, 0, [])
                     continue
-                best = list(zip(votes.reference, votes.affine, strict=True))[: options.max_grown]
-                grown = [self.grower.grow(anchor, j, affine) for j, affine in best]
-                some = sorted((one for one in grown if one is not None), key=lambda one: -one.share)
-                yield RoadRound(anchor, len(best), some[: options.max_kept])
+                best = slice(options.max_grown)
+                grown = self.grower.grow(anchor, votes.reference[best], votes.affine[best])
+                some = sorted(grown, key=lambda one: -one.closeness)
+                yield RoadRound(anchor, len(votes.reference[best]), some[: options.max_kept])
 
     def _vote(self, anchor: int) -> tuple[int, Iterable[tuple[int, Votes | None]]]:
         """Return an anchor and its votes, step by step; in threads all of them are there at once."""

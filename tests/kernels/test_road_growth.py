@@ -10,7 +10,8 @@ from roadgeo.matching.index import build_index
 from roadgeo.matching.scene import sample_roads
 
 MIN_COS = np.cos(np.radians(25))
-STAGES = Stages(0.45, 0.3, 8.0, 0.4, MIN_COS)
+STAGES = Stages(0.45, 0.3, 0.4, MIN_COS, (12, 8, 6))
+TOLERANCE = 8.0
 UNIT = 500.0
 ORIGIN = np.array([1000.0, 1000.0])
 NO_HOLDS = np.zeros(8)
@@ -54,6 +55,15 @@ def corner_gap(p, q):
     return np.hypot(*(a[:, :2] / a[:, 2:] - b[:, :2] / b[:, 2:]).T).max() * UNIT
 
 
+def grow(ps, points, along, buckets, origins=ORIGIN, stages=STAGES):
+    """Grow maps (M, 8) in place, from one origin or each from its own; return their closeness."""
+    n = len(ps)
+    units, tolerances, closeness = np.full(n, UNIT), np.full(n, TOLERANCE), np.empty(n)
+    each = np.broadcast_to(origins, (n, 2)).copy()
+    grow_by_roads(ps, units, each, tolerances, points, along, stages, buckets, closeness)
+    return closeness
+
+
 @pytest.mark.parametrize("false", [0.0, 0.3])
 @pytest.mark.parametrize("turn_deg", [0.0, 25.0, 170.0])
 def test_grows_to_the_truth_from_a_rough_start(roads, turn_deg, false):
@@ -62,23 +72,81 @@ def test_grows_to_the_truth_from_a_rough_start(roads, turn_deg, false):
     points, along = seen(network, p, false=false)
     start = np.append(truth(turn_deg + 3.0)[:6] * 1.03, [0.0, 0.0])
     assert corner_gap(start, p) > 40
-    share = grow_by_roads(start, UNIT, ORIGIN, points, along, STAGES, buckets)
-    assert corner_gap(start, p) < 3
-    assert share == pytest.approx(1 - false, abs=0.1)
+    ps = start[None].copy()
+    (closeness,) = grow(ps, points, along, buckets)
+    assert corner_gap(ps[0], p) < 3
+    assert closeness == pytest.approx(1 - false, abs=0.15)
 
 
 def test_gives_up_in_the_wrong_place(roads):
     network, buckets = roads
     points, along = seen(network, truth())
-    for shift in ((130.0, 40.0), (-90.0, 160.0)):
-        p = np.append(truth()[:6], [0.0, 0.0])
-        assert grow_by_roads(p, UNIT, ORIGIN + shift, points, along, STAGES._replace(least_share=0.5), buckets) == -1.0
+    ps = np.tile(np.append(truth()[:6], [0.0, 0.0]), (2, 1))
+    origins = ORIGIN + np.array([(130.0, 40.0), (-90.0, 160.0)])
+    assert (grow(ps, points, along, buckets, origins, STAGES._replace(least_share=0.5)) == -1.0).all()
+
+
+def rough_starts(n, seed=0):
+    """The truth among places up to 300 m away, each a little turned and stretched."""
+    rng = np.random.default_rng(seed)
+    ps = np.tile(np.append(truth()[:6], [0.0, 0.0]), (n, 1))
+    ps[:, [0, 1, 3, 4]] *= rng.uniform(0.97, 1.03, (n, 1))
+    shifts = rng.uniform(-300.0, 300.0, (n, 2))
+    shifts[n // 2] = 0.0
+    return ps, ORIGIN + shifts
+
+
+def test_the_right_one_of_many_goes_on(roads):
+    network, buckets = roads
+    points, along = seen(network, truth(), false=0.3)
+    ps, origins = rough_starts(30)
+    closeness = grow(ps, points, along, buckets, origins, STAGES._replace(least_share=0.0, go_on=(12, 8, 3)))
+    assert (closeness >= 0.0).sum() == 3
+    assert closeness.argmax() == 15
+    assert corner_gap(ps[15], truth()) < 3
+
+
+def test_side_by_side_they_grow_as_alone(roads):
+    network, buckets = roads
+    points, along = seen(network, truth(), false=0.3)
+    ps, origins = rough_starts(6)
+    together = ps.copy()
+    closeness = grow(together, points, along, buckets, origins)
+    for k in range(6):
+        alone = ps[k : k + 1].copy()
+        assert grow(alone, points, along, buckets, origins[k : k + 1]) == closeness[k]
+        assert (alone[0] == together[k]).all()
+
+
+@pytest.mark.slow
+def test_grows_like_the_twin(roads):
+    network, buckets = roads
+    points, along = (array[::8] for array in seen(network, truth(), false=0.3))
+    ps, origins = rough_starts(4)
+    stages = STAGES._replace(least_share=0.0, go_on=(2, 2, 2))
+    grown = ps.copy()
+    closeness = grow(grown, points, along, buckets, origins, stages)
+    expected = naive.grow_by_roads(ps, UNIT, origins, TOLERANCE, points, along, stages, buckets.segments)
+    # In wrong places the last bits decide which road is nearest, and steps that differ follow.
+    assert closeness == pytest.approx(expected, abs=0.03)
+    assert closeness[2] == pytest.approx(expected[2], abs=1e-6)
+    assert (closeness >= 0).sum() == 2
+    assert corner_gap(grown[2], ps[2]) < 0.1
+
+
+@pytest.mark.parametrize("seed", range(5))
+def test_of_equal_ones_the_first_go_on(roads, seed):
+    points, along = seen(roads[0], truth(), false=0.3, seed=seed)
+    ps = np.tile(np.append(truth()[:6], [0.0, 0.0]), (5, 1))
+    closeness = grow(ps, points, along, roads[1], stages=STAGES._replace(go_on=(4, 2, 2)))
+    assert (closeness[:2] > 0.5).all()
+    assert (closeness[2:] == -1.0).all()
 
 
 @pytest.mark.parametrize("n", [0, 5])
 def test_too_few_points(roads, n):
     points, along = seen(roads[0], truth())
-    assert grow_by_roads(truth(), UNIT, ORIGIN, points[:n], along[:n], STAGES, roads[1]) == -1.0
+    assert grow(truth()[None], points[:n], along[:n], roads[1]) == -1.0
 
 
 def test_a_step_from_the_truth_goes_nowhere(roads):
@@ -108,9 +176,9 @@ def test_share_like_the_twin(roads):
     points, along = (array[::10] for array in seen(network, truth(), false=0.3))
     for radius in (4.0, 15.0):
         arguments = truth(), UNIT, ORIGIN, points, along, radius, MIN_COS
-        share = share_on_roads(*arguments, buckets)
-        assert share == pytest.approx(naive.share_on_roads(*arguments, buckets.segments))
-        assert 0 < share < 1
+        share, closeness = share_on_roads(*arguments, buckets)
+        assert (share, closeness) == pytest.approx(naive.share_on_roads(*arguments, buckets.segments))
+        assert 0 < closeness < share < 1
 
 
 def test_a_held_parameter_stays(roads):
@@ -131,9 +199,10 @@ def test_points_beyond_the_horizon_are_refused(roads):
 def test_share_counts_points_on_roads_that_run_their_way(roads):
     network, buckets = roads
     points, along = seen(network, truth())
-    everything = share_on_roads(truth(), UNIT, ORIGIN, points, along, 2.0, MIN_COS, buckets)
+    everything, closeness = share_on_roads(truth(), UNIT, ORIGIN, points, along, 2.0, MIN_COS, buckets)
     assert everything > 0.99
+    assert closeness > 0.9
     across = np.stack([-along[:, 1], along[:, 0]], axis=1)
-    assert share_on_roads(truth(), UNIT, ORIGIN, points, across, 2.0, MIN_COS, buckets) < 0.2
+    assert share_on_roads(truth(), UNIT, ORIGIN, points, across, 2.0, MIN_COS, buckets)[0] < 0.2
     nothing = share_on_roads(truth(), UNIT, ORIGIN, points[:0], along[:0], 2.0, MIN_COS, buckets)
-    assert nothing == 0.0
+    assert nothing == (0.0, 0.0)

@@ -42,7 +42,6 @@ REASONS = {
     "cholesky": "compared with numpy.linalg",
     "count_neighbours": "part of `fill_table`, whose twin lists the neighbours",
     "count_alike": "compared with the decoded table, counted in the test",
-    "grow_by_roads": "a loop over two kernels with twins; tested on known homographies",
     "grow_each": "compared with `grow`, which has a twin",
     "has_both": "a test states its two cases",
     "mark_tiles": "`paint_roads` on what it marks is compared with a twin that knows no tiles",

@@ -100,8 +100,8 @@ def test_a_rough_proposal_grows_to_the_truth(town, broken):
         turn, scale = math.radians(3.0), 1.03  # off by as much as the steps of a vote
         c, s = scale * math.cos(turn), scale * math.sin(turn)
         affine = np.array([[c, -s], [s, c]]) @ ahead.T
-        grown = grower.grow(anchor, j, affine.ravel())
-        gaps.append(np.inf if grown is None else corner_gap(grown.matrix, broken))
+        grown = grower.grow(anchor, np.array([j]), affine.reshape(1, 4))
+        gaps.append(corner_gap(grown[0].matrix, broken) if grown else np.inf)
     assert np.median(gaps) < 8
 
 

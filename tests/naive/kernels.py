@@ -327,14 +327,39 @@ def fit_to_roads(p, unit, origin, points, directions, radius, min_cos, holds, se
 
 
 def share_on_roads(p, unit, origin, points, directions, radius, min_cos, segments):
-    met = [
-        nearest_in_plane(p, unit, origin, *pair, radius, min_cos, segments) is not None
-        for pair in zip(points, directions, strict=True)
-    ]
-    return np.mean(met)
+    """Share of the points nearer than the radius to roads, and the mean of their closeness across the road."""
+    closeness = []
+    for pair in zip(points, directions, strict=True):
+        found = nearest_in_plane(p, unit, origin, *pair, radius, min_cos, segments)
+        if found is not None:
+            place, foot, road = found
+            closeness.append(1.0 - abs(np.array([-road[1], road[0]]) @ (foot - place)) / radius)
+    return len(closeness) / len(points), sum(closeness) / len(points)
 
 
-# adjustment
+def grow_by_roads(ps, unit, origins, tolerance, points, directions, stages, segments):
+    """Grow maps side by side, the worst given up after each of the first stages; `ps` are adjusted in place."""
+    n = len(points)
+    scores = np.zeros(len(ps))
+    counts = [min(60, n)]
+    while counts[-1] < n:
+        counts.append(min(int(counts[-1] * 1.45) + 1, n))
+    for stage, count in enumerate(counts):
+        some, along = (array[: count : max(1, count // 120)] for array in (points, directions))
+        bent = count == n or np.hypot(*points[count - 1]) > stages.affine_until
+        slack = 0.08, 0.08, 10.0 / unit
+        holds = (12.0 / unit / np.array([*slack, *slack, *2 * [stages.perspective_sigma if bent else np.nan]])) ** 2
+        holds = np.nan_to_num(holds, nan=1e9)
+        for m in np.flatnonzero(scores >= 0):
+            for radius in (18.0 if stage else 25.0, 12.0 if stage else 18.0, 12.0):
+                radius = max(radius, 1.5 * tolerance)
+                ps[m] = fit_to_roads(ps[m], unit, origins[m], some, along, radius, stages.min_cos, holds, segments)
+            share, closeness = share_on_roads(ps[m], unit, origins[m], some, along, tolerance, stages.min_cos, segments)
+            scores[m] = closeness if share >= stages.least_share else -1.0
+        if stage < len(stages.go_on) and count < n:
+            best = sorted(np.flatnonzero(scores >= 0), key=lambda m: (-scores[m], m))
+            scores[best[stages.go_on[stage] :]] = -1.0
+    return scores
 
 
 def adjust(
