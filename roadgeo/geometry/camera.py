@@ -108,8 +108,8 @@ class CameraPose:
 
 def sampling(matrix: FloatArray, size: tuple[int, int]) -> float:
     """Return the ground sampling at the middle of the frame, metres per pixel."""
-    jacobian = Homography(matrix).jacobian(Frame(*size).plane_center)
-    return math.sqrt(abs(jacobian[0, 0] * jacobian[1, 1] - jacobian[0, 1] * jacobian[1, 0]))
+    width, height = size
+    return math.sqrt(abs(Homography(matrix).area_scale(width / 2, -height / 2)))
 
 
 @dataclass(frozen=True)
@@ -202,13 +202,14 @@ def judge(matrix: FloatArray, size: tuple[int, int], options: CameraOptions, rou
     """
     if not np.isfinite(matrix).all():
         return CameraFault.DEGENERATE
-    frame, homography = Frame(*size), Homography(matrix)
-    middle = float(homography.w(frame.plane_center))
+    (width, height), homography = size, Homography(matrix)
+    g, h, i = matrix[2].tolist()
+    middle = g * width / 2 - h * height / 2 + i
     if middle == 0.0:
         return CameraFault.DEGENERATE
-    if (homography.w(frame.plane_corners) / middle < 0.05).any():
+    if any((g * x - h * y + i) / middle < 0.05 for x in (0.0, width) for y in (0.0, height)):
         return CameraFault.HORIZON
-    if np.linalg.det(matrix) / middle**3 <= 0:
+    if homography.area_scale(width / 2, -height / 2) <= 0.0:
         return CameraFault.MIRRORED
     slack_deg, slack, further = (15.0, 1.25, 0.2) if rough else (5.0, 1.0, 0.1)
     if not options.gsd_m[0] / slack <= sampling(matrix, size) <= options.gsd_m[1] * slack:
@@ -219,7 +220,7 @@ def judge(matrix: FloatArray, size: tuple[int, int], options: CameraOptions, rou
     if fits.tilt_deg[fits.skew <= fits.skew.min() + further].min() > options.max_tilt_deg + slack_deg:
         return CameraFault.TILT
     if options.north_up:
-        jacobian = homography.jacobian(frame.plane_center)
+        jacobian = homography.jacobian(Frame(*size).plane_center)
         if abs(math.degrees(math.atan2(jacobian[0, 1], jacobian[1, 1]))) > slack_deg:
             return CameraFault.NOT_NORTH_UP
     return None

@@ -5,6 +5,7 @@
 
 from __future__ import annotations
 
+import math
 from dataclasses import dataclass
 
 import numpy as np
@@ -56,6 +57,13 @@ class Homography:
         image = self.everywhere(xy)
         linear = self.matrix[:2, :2] - image[..., :, None] * self.matrix[2, :2]
         return np.asarray(linear / w[..., None, None])
+
+    def area_scale(self, x: float, y: float) -> float:
+        """Return how many times larger areas become around a point, det H / w^3; negative where they are mirrored."""
+        (a, b, c), (d, e, f), (g, h, i) = self.matrix.tolist()
+        w = g * x + h * y + i
+        determinant = a * (e * i - f * h) - b * (d * i - f * g) + c * (d * h - e * g)
+        return float(determinant / w**3) if w else math.inf
 
     def by_elements(self, xy: FloatArray) -> FloatArray:
         """Return the (N, 2, 8) derivative of mapped points by the matrix's elements but the last, at (N, 2) points."""

@@ -10,7 +10,7 @@ from roadgeo.kernels.arrays import Floats1, Floats2, Int8s3, Ints1
 from roadgeo.kernels.compilation import kernel
 from roadgeo.kernels.road_raster import DIRECTIONS, Raster, passes
 
-__all__ = ["Places", "RoadPoints", "Trial", "chance_rates", "find_turns", "improve_votes", "vote"]
+__all__ = ["Places", "RoadPoints", "Trial", "chance_rates", "draw_turns", "find_turns", "improve_votes", "vote"]
 
 #: Turns of one intersection on another at most, and how close two are the same, radians.
 MAX_TURNS = 16
@@ -125,6 +125,38 @@ def _count_met(
         direction = int(points.angles[i] + turned) & (DIRECTIONS - 1)
         met += passes(x + c * u - d * v, y + d * u + c * v, direction, raster)
     return met
+
+
+@kernel()
+def draw_turns(
+    candidates: Ints1, draws: Floats1, rays: Floats1, tolerance: float, places: Places, sample: Ints1, turns: Floats1
+) -> int:
+    """Draw places and turns at random among those that the branches allow, until the sample is full.
+
+    Parameters
+    ----------
+    candidates, draws : (M,)
+        Map intersections in random order, and a number from 0 to 1 for each, which chooses one of its turns.
+    rays, tolerance
+        As in `find_turns`.
+    sample, turns : (K,)
+        Filled: map intersections and a turn of each.
+
+    Returns
+    -------
+    int
+        How many.
+    """
+    room = np.empty(MAX_TURNS)
+    n = 0
+    for m in range(candidates.shape[0]):
+        if n == sample.shape[0]:
+            break
+        k = find_turns(rays, places.branches, candidates[m], tolerance, room)
+        if k > 0:
+            sample[n], turns[n] = candidates[m], room[int(draws[m] * k)]
+            n += 1
+    return n
 
 
 @kernel()

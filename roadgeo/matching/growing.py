@@ -126,10 +126,9 @@ def grow_proposals(
         index.point_buckets, limits, options.min_matched, matched, matrices, ratios,
     )  # fmt: skip
     # A ratio that is not finite marks one that withered; the seeds are the anchor and the neighbours it is made with.
-    best = np.argsort(-ratios, kind="stable")
+    best = np.argsort(-ratios, kind="stable")[: np.isfinite(ratios).sum()]
     seeds = [np.append(neighbours[anchor][partners[m] >= 0], anchor) for m in best]
     return [
         Hypothesis(matrices[m] / matrices[m, 2, 2], made_of, float(ratios[m]), matched[m])
         for m, made_of in zip(best, seeds, strict=True)
-        if np.isfinite(ratios[m])
     ]

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import math
 from dataclasses import dataclass
+from functools import lru_cache
 
 import numpy as np
 
@@ -175,10 +176,16 @@ def corner_sigmas(covariance: FloatArray) -> FloatArray:
     return np.asarray(np.sqrt(np.diag(covariance).reshape(4, 2).sum(axis=1)))
 
 
-def _held_points(p: FloatArray, n: int) -> tuple[FloatArray, FloatArray]:
-    """Return an n x n grid of normalised points over the frame, (n * n, 2), and where `p` puts them."""
+@lru_cache(maxsize=4)
+def _grid(n: int) -> FloatArray:
+    """Return n x n normalised points over the frame, (n * n, 2)."""
     side = np.linspace(-0.7, 0.7, n)
-    uv = np.stack(np.meshgrid(side, side), axis=-1).reshape(-1, 2)
+    return np.stack(np.meshgrid(side, side), axis=-1).reshape(-1, 2)
+
+
+def _held_points(p: FloatArray, n: int) -> tuple[FloatArray, FloatArray]:
+    """Return n x n points over the frame that are held, and where `p` puts them."""
+    uv = _grid(n)
     return uv, Homography(np.append(p, 1.0).reshape(3, 3)).everywhere(uv)
 
 

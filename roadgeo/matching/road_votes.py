@@ -10,7 +10,7 @@ shrinks to a few blocks would crowd out the rest.
 from __future__ import annotations
 
 import math
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterator
 from dataclasses import dataclass, field, replace
 from typing import NamedTuple
 
@@ -19,12 +19,11 @@ import numpy as np
 from roadgeo._arrays import BoolArray, FloatArray, IntArray
 from roadgeo.kernels.road_raster import DIRECTIONS
 from roadgeo.kernels.road_votes import (
-    MAX_TURNS,
     Places,
     RoadPoints,
     Trial,
     chance_rates,
-    find_turns,
+    draw_turns,
     improve_votes,
     vote,
 )
@@ -186,41 +185,42 @@ class Voter:
 
     def _narrow(self, around: _Around) -> RoadPoints:
         """Choose the points that vote at each scale: not those of the intersection's own branches."""
-        options, chosen = self.options, []
-        for s in self.scales:
-            low, near, high = np.searchsorted(
-                around.away, np.array([options.inner_m, options.own_m, options.radius_m]) / s
-            )
-            others = low + np.flatnonzero(~around.radial[low:near])
-            chosen.append(np.concatenate([others, np.arange(max(low, near), high)]))
-        return self._thinned(around, chosen, options.max_points)
+        options = self.options
+        reach = np.array([[options.inner_m], [options.own_m], [options.radius_m]]) / self.scales
+        low, near, high = np.searchsorted(around.away, reach)
+        near = np.maximum(low, near)
+        # Up to `near` only those that run across the way to the intersection, beyond it all.
+        across = np.flatnonzero(~around.radial)
+        first, last = np.searchsorted(across, (low, near))
+        n_across = last - first
+        starts, scale, at = self._spread(n_across + high - near, options.max_points, around.rng)
+        inner = np.append(across, 0)[np.minimum(first[scale] + at, len(across))]
+        taken = np.where(at < n_across[scale], inner, near[scale] + at - n_across[scale])
+        return RoadPoints(self.scales, starts, around.offsets[taken], around.angles[taken])
 
     def _wide(self, around: _Around) -> RoadPoints:
         """Choose the points that judge proposals anew: all, further away."""
         ends = np.searchsorted(around.away, self.options.wide_radius_m / self.scales)
-        return self._thinned(around, [np.arange(n) for n in ends], self.options.wide_points)
-
-    def _thinned(self, around: _Around, usable: Sequence[IntArray], most: int) -> RoadPoints:
-        """Keep at most so many of the usable points of each scale, evenly by distance, in random order."""
-        kept = []
-        for one in usable:
-            n = min(len(one), most)
-            at = around.rng.permutation(np.linspace(0, len(one) - 1, n).astype(np.int64))
-            kept.append(one[at] if n >= self.options.least_points else one[:0])
-        starts = np.concatenate(([0], np.cumsum([len(one) for one in kept])))
-        taken = np.concatenate(kept).astype(np.int64)
+        starts, _, taken = self._spread(ends, self.options.wide_points, around.rng)
         return RoadPoints(self.scales, starts, around.offsets[taken], around.angles[taken])
+
+    def _spread(self, usable: IntArray, most: int, rng: np.random.Generator) -> tuple[IntArray, IntArray, IntArray]:
+        """Choose at most so many of the `usable` points (S,) of each scale, evenly by distance, in random order.
+
+        Returns where the P points of each scale begin (S + 1,), their scales (P,), and their numbers among the usable.
+        """
+        n = np.minimum(usable, most)
+        n[n < self.options.least_points] = 0
+        starts = np.concatenate(([0], np.cumsum(n)))
+        scale = np.repeat(np.arange(len(n)), n)
+        at = (np.arange(len(scale)) - starts[scale]) * (usable[scale] - 1) // np.maximum(n[scale] - 1, 1)
+        return starts, scale, at[np.argsort(scale + rng.random(len(scale)))]
 
     def _chance(self, rays: FloatArray, points: RoadPoints, rng: np.random.Generator) -> FloatArray:
         """Measure the chance rate at each scale, in units of the density at a place, at places drawn at random."""
-        n = self.options.n_chance
-        sample: list[int] = []
-        turns: list[float] = []
-        room = np.empty(MAX_TURNS)
-        for j in rng.choice(self.candidates, min(4 * n, len(self.candidates)), replace=False):
-            if len(sample) < n and (k := find_turns(rays, self.places.branches, j, self.tolerance, room)):
-                sample.append(j)
-                turns.append(room[rng.integers(k)])
-        out = np.empty(len(self.scales))
-        chance_rates(np.array(sample, np.int64), np.array(turns), points, self.places, self.drawn.raster, out)
+        n, out = self.options.n_chance, np.empty(len(self.scales))
+        some = rng.choice(self.candidates, min(4 * n, len(self.candidates)), replace=False)
+        sample, turns = np.empty(n, np.int64), np.empty(n)
+        n = draw_turns(some, rng.random(len(some)), rays, self.tolerance, self.places, sample, turns)
+        chance_rates(sample[:n], turns[:n], points, self.places, self.drawn.raster, out)
         return out

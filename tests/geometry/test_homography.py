@@ -93,3 +93,11 @@ def test_each_maps_its_own_points(A, B):
     points = np.stack([POINTS, POINTS[::-1]])
     mapped = map_each(np.stack([A.matrix, B.matrix]), points)
     assert np.allclose(mapped, [A(points[0]), B(points[1])])
+
+
+def test_areas_become_larger_by_the_determinant_of_the_jacobian():
+    matrix = np.array([[1.5, 0.2, 3.0], [-0.4, 0.8, 1.0], [0.001, -0.002, 1.0]])
+    expected = np.linalg.det(Homography(matrix).jacobian(np.array([40.0, -30.0])))
+    assert Homography(matrix).area_scale(40.0, -30.0) == pytest.approx(expected)
+    assert Homography(matrix @ np.diag([1.0, -1.0, 1.0])).area_scale(40.0, 30.0) == pytest.approx(-expected)
+    assert Homography(np.diag([1.0, 1.0, 0.0])).area_scale(0.0, 0.0) == np.inf

@@ -16,6 +16,7 @@ from roadgeo.kernels.road_votes import (
     RoadPoints,
     Trial,
     chance_rates,
+    draw_turns,
     find_turns,
     improve_votes,
     vote,
@@ -134,6 +135,18 @@ class TestVote:
                     ratios[turn, scale] = naive.ratio(met, was[4], Trial(TRIAL.hit_rate, 1e9), 6)
             assert now[3] == pytest.approx(max(ratios.values()))
             assert ratios[now[1], now[2]] == pytest.approx(now[3])
+
+    @pytest.mark.parametrize("most", [5, 400])
+    def test_draws_like_the_twin(self, most):
+        _, places, _, rays = world(7, 300)
+        rng = np.random.default_rng(1)
+        candidates, draws = rng.permutation(300), rng.random(300)
+        sample, turns = np.empty(most, np.int64), np.empty(most)
+        n = draw_turns(candidates, draws, rays, TOLERANCE, places, sample, turns)
+        expected = naive.draw_turns(candidates, draws, rays, TOLERANCE, places.branches, most)
+        assert n == len(expected) == min(most, n)
+        assert sample[:n].tolist() == [j for j, _ in expected]
+        assert np.allclose(np.cos(turns[:n]), np.cos([turn for _, turn in expected]))
 
     def test_chance_is_the_share_over_the_density(self):
         raster, places, points, _ = world(6)

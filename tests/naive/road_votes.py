@@ -55,6 +55,17 @@ def find_turns(rays, directions, tolerance, same=0.17):
     return turns
 
 
+def draw_turns(candidates, draws, rays, tolerance, branches, most):
+    """Draw pairs of place and turn among those that the branches allow, `most` at most."""
+    pairs = []
+    for j, draw in zip(candidates, draws, strict=True):
+        stored = [math.atan2(y, x) for x, y in branches[j].astype(float) if x or y]
+        turns = find_turns(rays, stored, tolerance)[:16]
+        if turns:
+            pairs.append((j, turns[int(draw * len(turns))]))
+    return pairs[:most]
+
+
 def hits(points, s, x, y, turn, scale, raster):
     """Tell which points of scale number s meet roads."""
     out = []
