@@ -142,7 +142,7 @@ def measure_tiles(raster: Raster, out: Singles2) -> None:
             out[row, column] = total / n
 
 
-@kernel()
+@kernel(forceinline=True)
 def passes(x: float, y: float, direction: int, raster: Raster) -> int:
     """Return 1 if a road of direction range `direction` passes the place (x, y), in cells from the raster's corner.
 

@@ -113,7 +113,7 @@ def _wrapped(angle: float) -> float:
     return angle - 2.0 * math.pi * round(angle / (2.0 * math.pi))
 
 
-@kernel()
+@kernel(forceinline=True)
 def _count_met(
     points: RoadPoints, first: int, last: int, x: float, y: float, turn: float, c: float, d: float, raster: Raster
 ) -> int:
