@@ -39,6 +39,8 @@ __all__ = [
     "unpack_tangents",
 ]
 
+#: Buckets of roads are so many times narrower than those of intersections: roads are looked up some 20 m around.
+_FINER = 2
 #: Seed of the order of the table's entries within a cell.
 _SHUFFLE_SEED = 7
 
@@ -98,8 +100,8 @@ class ReferenceIndex:
         Bucket c owns the intersections `point_starts[c]:point_starts[c + 1]`.
     segments : (S, 4) float32
         Road segments x1, y1, x2, y2.
-    segment_starts : (B + 1,) int32, segment_ids : int32
-        Segments that touch each bucket.
+    segment_starts : (4 B + 1,) int32, segment_ids : int32
+        Segments that touch each bucket of half the width; (B + 1,) of the same width in indexes of earlier versions.
     table_starts : (TABLE + 1,) int32, table_entries : (T,) uint64
         Codes of triples, see `kernels.triple_codes`.
     source : (N,) int32
@@ -168,7 +170,10 @@ class ReferenceIndex:
     @cached_property
     def road_buckets(self) -> RoadBuckets:
         """The roads, as kernels take them."""
-        return RoadBuckets(self.segments, self.segment_starts, self.segment_ids, self.grid, self.shape)
+        (x0, y0, size), (columns, rows) = self.grid, self.shape
+        finer = math.isqrt((len(self.segment_starts) - 1) // (columns * rows))
+        grid = (x0, y0, size / finer), (finer * columns, finer * rows)
+        return RoadBuckets(self.segments, self.segment_starts, self.segment_ids, *grid)
 
     @cached_property
     def point_buckets(self) -> PointBuckets:
@@ -256,6 +261,7 @@ def _check_parts(meta: Mapping[str, Any], arrays: Mapping[str, AnyArray], path: 
     require(grid[2] > 0 and min(shape) > 0 and shape[0] * shape[1] < 2**31, "bad grid")
     n = len(arrays["xy"])
     n_buckets = shape[0] * shape[1]
+    n_road_buckets = n_buckets if len(arrays["segment_starts"]) == n_buckets + 1 else _FINER**2 * n_buckets
     require(arrays["xy"].shape == (n, 2) and n < 2**31 and _lie_on_earth(arrays["xy"]), "bad positions")
     columns = arrays["tangents"].shape[1]
     require(2 <= columns <= MAX_BRANCHES and arrays["tangents"].shape == (n, columns), "bad tangents")
@@ -265,7 +271,7 @@ def _check_parts(meta: Mapping[str, Any], arrays: Mapping[str, AnyArray], path: 
     require(arrays["segments"].shape[1] == 4 and arrays["source"].shape == (n,), "bad segments")
     for starts, total, size in (
         ("point_starts", n, n_buckets),
-        ("segment_starts", len(arrays["segment_ids"]), n_buckets),
+        ("segment_starts", len(arrays["segment_ids"]), n_road_buckets),
         ("table_starts", len(arrays["table_entries"]), TABLE),
     ):
         array = arrays[starts]
@@ -454,11 +460,12 @@ def build_index(network: RoadNetwork, options: IndexOptions | None = None, say: 
     neighbours = nearest_neighbours(xy, point_starts, grid, shape, options.n_neighbours)
 
     say(what, 0.2)
-    counts = np.zeros(shape[0] * shape[1] + 1, np.int64)
-    total = bin_segments(segments, grid, shape, counts, np.empty(0, np.int32))
+    finer = (*grid[:2], grid[2] / _FINER), (_FINER * shape[0], _FINER * shape[1])
+    counts = np.zeros(_FINER**2 * shape[0] * shape[1] + 1, np.int64)
+    total = bin_segments(segments, *finer, counts, np.empty(0, np.int32))
     segment_starts = np.cumsum(counts).astype(np.int32)
     segment_ids = np.empty(total, np.int32)
-    bin_segments(segments, grid, shape, segment_starts.astype(np.int64), segment_ids)
+    bin_segments(segments, *finer, segment_starts.astype(np.int64), segment_ids)
 
     say(what, 0.4)
     branches = np.ascontiguousarray(found.branches()[order])

@@ -12,6 +12,7 @@ from naive import kernels as naive
 from worlds.scenes import PLANE
 
 from roadgeo.errors import IndexFormatError, RoadSourceError
+from roadgeo.kernels.roads import bin_segments
 from roadgeo.kernels.triple_codes import TABLE
 from roadgeo.matching.index import (
     IndexOptions,
@@ -98,10 +99,23 @@ class TestBuildIndex:
     @pytest.mark.slow
     def test_every_segment_is_listed(self, town):
         index = town[1]
-        crossed = naive.bin_segments(index.segments, index.grid, index.shape)
+        roads = index.road_buckets
+        assert roads.grid == pytest.approx((*index.grid[:2], index.grid[2] / 2))
+        crossed = naive.bin_segments(index.segments, roads.grid, roads.shape)
         for bucket, segments in enumerate(crossed):
-            listed = index.segment_ids[index.segment_starts[bucket] : index.segment_starts[bucket + 1]]
+            listed = roads.ids[roads.starts[bucket] : roads.starts[bucket + 1]]
             assert segments <= set(listed.tolist())
+
+    def test_an_index_of_an_earlier_version_has_wider_buckets_of_roads(self, town):
+        index = town[1]
+        counts = np.zeros(index.shape[0] * index.shape[1] + 1, np.int64)
+        total = bin_segments(index.segments, index.grid, index.shape, counts, np.empty(0, np.int32))
+        starts, ids = np.cumsum(counts), np.empty(total, np.int32)
+        bin_segments(index.segments, index.grid, index.shape, starts.copy(), ids)
+        old = index.arrays() | {"segment_starts": starts.astype(np.int32), "segment_ids": ids}
+        roads = ReferenceIndex.from_parts(index.meta, old).road_buckets
+        assert roads.grid == index.grid
+        assert roads.shape == index.shape
 
     def test_table_entries_are_triples_that_exist(self, town):
         index = town[1]
