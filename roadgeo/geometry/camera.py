@@ -16,6 +16,8 @@ from roadgeo.geometry.homography import Homography
 __all__ = ["CameraFault", "CameraOptions", "CameraPose", "judge", "pinholes_around", "pose", "sampling"]
 
 _FOCAL_STEPS = np.geomspace(0.35, 8.0, 25)
+#: What lays pixels on less ground than this, square metres, has shrunk to a point, whatever camera is allowed.
+_LEAST_AREA = 1e-6
 #: Focal length that is taken where none fits better: in halves of the frame's diagonal, that of a usual lens.
 _USUAL_FOCAL = 1.5
 #: How much more skew a usual focal length may leave than one e times as long.
@@ -209,10 +211,13 @@ def judge(matrix: FloatArray, size: tuple[int, int], options: CameraOptions, rou
         return CameraFault.DEGENERATE
     if any((g * x - h * y + i) / middle < 0.05 for x in (0.0, width) for y in (0.0, height)):
         return CameraFault.HORIZON
-    if homography.area_scale(width / 2, -height / 2) <= 0.0:
+    area = homography.area_scale(width / 2, -height / 2)
+    if not abs(area) >= _LEAST_AREA:
+        return CameraFault.DEGENERATE
+    if area < 0.0:
         return CameraFault.MIRRORED
     slack_deg, slack, further = (15.0, 1.25, 0.2) if rough else (5.0, 1.0, 0.1)
-    if not options.gsd_m[0] / slack <= sampling(matrix, size) <= options.gsd_m[1] * slack:
+    if not options.gsd_m[0] / slack <= math.sqrt(area) <= options.gsd_m[1] * slack:
         return CameraFault.SAMPLING
     fits = _pinholes(matrix, size, options.focal_px)
     if not rough and fits.skew.min() > options.max_skew:

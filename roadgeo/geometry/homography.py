@@ -63,7 +63,8 @@ class Homography:
         (a, b, c), (d, e, f), (g, h, i) = self.matrix.tolist()
         w = g * x + h * y + i
         determinant = a * (e * i - f * h) - b * (d * i - f * g) + c * (d * h - e * g)
-        return float(determinant / w**3) if w else math.inf
+        cube = w * w * w
+        return float(determinant / cube) if cube else math.inf
 
     def by_elements(self, xy: FloatArray) -> FloatArray:
         """Return the (N, 2, 8) derivative of mapped points by the matrix's elements but the last, at (N, 2) points."""

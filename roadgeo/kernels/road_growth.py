@@ -37,7 +37,7 @@ class Stages(NamedTuple):
     `affine_until` in normalised units; a stage fails with fewer than `least_share` of its points on roads;
     `perspective_sigma` is the prior standard deviation of the two perspective parameters; roads count that turn from a
     point's direction by less than `min_cos` says; only `go_on` maps go on after each of the first stages, those whose
-    points lie closest to roads.
+    points lie closest to roads, and besides them the first `sure` ones.
     """
 
     affine_until: float
@@ -45,6 +45,7 @@ class Stages(NamedTuple):
     perspective_sigma: float
     min_cos: float
     go_on: tuple[int, int, int]
+    sure: int
 
 
 @kernel(forceinline=True)
@@ -204,7 +205,7 @@ def grow_by_roads(
         if count == n:
             break
         if stage < len(stages.go_on):
-            _give_up_worst(closeness, stages.go_on[stage])
+            _give_up_worst(closeness[stages.sure :], stages.go_on[stage])
         count, stage = min(int(count * _MORE) + 1, n), stage + 1
 
 

@@ -10,7 +10,7 @@ from roadgeo.matching.index import build_index
 from roadgeo.matching.scene import sample_roads
 
 MIN_COS = np.cos(np.radians(25))
-STAGES = Stages(0.45, 0.3, 0.4, MIN_COS, (12, 8, 6))
+STAGES = Stages(0.45, 0.3, 0.4, MIN_COS, (12, 8, 6), 0)
 TOLERANCE = 8.0
 UNIT = 500.0
 ORIGIN = np.array([1000.0, 1000.0])
@@ -104,6 +104,15 @@ def test_the_right_one_of_many_goes_on(roads):
     assert (closeness >= 0.0).sum() == 3
     assert closeness.argmax() == 15
     assert corner_gap(ps[15], truth()) < 3
+
+
+def test_the_first_are_not_given_up_for_others(roads):
+    network, buckets = roads
+    points, along = seen(network, truth(), false=0.3)
+    ps, _ = rough_starts(8)
+    closeness = grow(ps, points, along, buckets, stages=STAGES._replace(go_on=(3, 2, 1), sure=2))
+    assert (closeness[:2] > 0.4).all()
+    assert (closeness[2:] >= 0.0).sum() == 1
 
 
 def test_side_by_side_they_grow_as_alone(roads):

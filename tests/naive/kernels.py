@@ -357,7 +357,8 @@ def grow_by_roads(ps, unit, origins, tolerance, points, directions, stages, segm
             share, closeness = share_on_roads(ps[m], unit, origins[m], some, along, tolerance, stages.min_cos, segments)
             scores[m] = closeness if share >= stages.least_share else -1.0
         if stage < len(stages.go_on) and count < n:
-            best = sorted(np.flatnonzero(scores >= 0), key=lambda m: (-scores[m], m))
+            others = [m for m in np.flatnonzero(scores >= 0) if m >= stages.sure]
+            best = sorted(others, key=lambda m: (-scores[m], m))
             scores[best[stages.go_on[stage] :]] = -1.0
     return scores
 
