@@ -218,6 +218,14 @@ def test_a_middle_on_the_horizon_is_degenerate():
     assert judge(np.array([[1.0, 0, 0], [0, 1, 0], [1, 0, -600]]), SIZE, OPTIONS) is CameraFault.DEGENERATE
 
 
+@pytest.mark.parametrize("rough", [False, True])
+def test_a_frame_that_has_shrunk_to_a_point_is_degenerate_for_every_camera(rough):
+    anything = CameraOptions(gsd_m=(0.0, np.inf), max_tilt_deg=180.0, max_skew=np.inf)
+    point = np.array([[4e-17, 8e-17, -3171.0], [-7e-17, -6e-17, -231.0], [0.0, 0.0, 1.0]])
+    assert judge(point, SIZE, anything, rough) is CameraFault.DEGENERATE
+    assert judge(np.diag([1e-2, 1e-2, 1.0]), SIZE, anything, rough) is None
+
+
 def test_skew_is_the_greater_of_shear_and_stretch():
     assert pose(np.diag([1.0, 2.2, 1.0]), SIZE).skew == pytest.approx(np.log(2.2))
     assert pose(np.diag([2.2, 1.0, 1.0]), SIZE).skew == pytest.approx(np.log(2.2))
