@@ -42,8 +42,8 @@ class RoadSearchOptions:
         on a larger one more by the root of the ratio; of a map in parts, on all of them together. In a lattice every
         crossing can be turned four ways.
     max_grown, max_kept : int
-        So many of an anchor's proposals grow, and so many of what grew are compared with the map: where streets are
-        alike, much grows.
+        So many of an anchor's proposals grow, and so many of what grew are compared with the map, where all anchors
+        vote; where a mask has fewer intersections, more of each (see `each_of`).
     scale_slack : float
         Around an anchor the ground sampling may differ by this factor from that at the middle of the frame.
     least_share : float
@@ -88,6 +88,17 @@ class RoadSearchOptions:
             return low, high
         least, most = (width / road_width_px for width in self.road_width_m)
         return (max(low, least), min(high, most)) if least < high and most > low else (low, high)
+
+    def each_of(self, n_voters: int) -> RoadSearchOptions:
+        """Return them for so many intersections that vote: as many proposals are followed in all as of `max_anchors`.
+
+        Up to five times as many of each: a mask of few intersections has few chances.
+        """
+        more = max(1, min(5, self.max_anchors // max(n_voters, 1)))
+        go_on = tuple(more * n for n in self.grow.go_on)
+        grow = replace(self.grow, go_on=(go_on[0], go_on[1], go_on[2]))
+        votes = replace(self.votes, kept=more * self.votes.kept)
+        return replace(self, votes=votes, grow=grow, max_grown=more * self.max_grown, max_kept=more * self.max_kept)
 
     def refinement(self, usual: RefineOptions) -> RefineOptions:
         """Return how what grew by roads is refined."""
@@ -160,6 +171,7 @@ class RoadSearch:
         Of the query's intersections only the `voters` propose. Parts that are searched together share the `turnout`.
         """
         self.voters = np.arange(len(scene.intersections)) if voters is None else voters
+        options = options.each_of(len(self.voters))
         self.scene, self.options, self.ahead = scene, options, ahead
         self.n_tried = 0
         self.turnout = turnout or Turnout(options, len(index))

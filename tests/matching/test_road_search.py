@@ -82,6 +82,16 @@ def test_on_a_coarse_map_more_of_the_ground_is_looked_at():
     assert coarse.scales(CameraOptions(gsd_m=(0.1, 0.5)), 4.0)[0] > 0.5
 
 
+@pytest.mark.parametrize(("voters", "more"), [(0, 5), (3, 5), (10, 3), (20, 1), (30, 1), (90, 1)])
+def test_of_few_intersections_more_proposals_are_followed(voters, more):
+    usual = RoadSearchOptions()
+    each = usual.each_of(voters)
+    assert (each.max_grown, each.max_kept) == (more * usual.max_grown, more * usual.max_kept)
+    assert each.votes.kept == more * usual.votes.kept >= each.max_grown
+    assert each.grow.go_on == tuple(more * n for n in usual.grow.go_on)
+    assert each.votes.raster == usual.votes.raster
+
+
 def test_an_intersection_far_from_all_roads_has_no_votes(town, broken):
     alone = replace(broken, dense_points=broken.dense_points[:0], dense_directions=broken.dense_directions[:0])
     (votes,) = best_votes(alone, town[1], [0])
