@@ -26,6 +26,7 @@ __all__ = [
     "Singles1",
     "Singles2",
     "TupleKind",
+    "UInt32s2",
     "UInt64s1",
     "Words3",
     "kind_of",
@@ -45,6 +46,7 @@ Int8s2: TypeAlias = Annotated[NDArray[np.int8], 2]
 Int8s3: TypeAlias = Annotated[NDArray[np.int8], 3]
 Bytes1: TypeAlias = Annotated[NDArray[np.uint8], 1]
 Bytes2: TypeAlias = Annotated[NDArray[np.uint8], 2]
+UInt32s2: TypeAlias = Annotated[NDArray[np.uint32], 2]
 UInt64s1: TypeAlias = Annotated[NDArray[np.uint64], 1]
 Words3: TypeAlias = Annotated[NDArray[np.uint16], 3]
 Bools1: TypeAlias = Annotated[NDArray[np.bool_], 1]

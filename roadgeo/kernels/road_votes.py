@@ -6,11 +6,24 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from roadgeo.kernels.arrays import Floats1, Floats2, Int8s3, Ints1
+from roadgeo.kernels.arrays import Floats1, Floats2, Ints1, Singles2, UInt32s2
 from roadgeo.kernels.compilation import kernel
-from roadgeo.kernels.road_raster import DIRECTIONS, Raster, passes
+from roadgeo.kernels.road_raster import DIRECTIONS, Raster, passes, passes_cell
 
-__all__ = ["Places", "RoadPoints", "Trial", "chance_rates", "draw_turns", "find_turns", "improve_votes", "vote"]
+__all__ = [
+    "BLOCK",
+    "TURNS",
+    "LaidPoints",
+    "Places",
+    "RoadPoints",
+    "Trial",
+    "chance_rates",
+    "draw_turns",
+    "find_turns",
+    "improve_votes",
+    "lay_points",
+    "vote",
+]
 
 #: Turns of one intersection on another at most, and how close two are the same, radians.
 MAX_TURNS = 16
@@ -19,17 +32,22 @@ _SAME_TURN = 0.17
 _LEVELS = 128
 _LEAST_RATE = 0.03
 #: Points are looked up so many at a time: without a branch between them, processors overlap them.
-_BLOCK = 6
+BLOCK = 8
+#: Points are turned by one of so many angles: at 200 m from the intersection they lie 5 m off at most.
+TURNS = 128
+#: Where a laid point lies, in eighths of a cell and from so many on, and the bits that this takes.
+_FINE, _MIDDLE, _BITS = 8, 8192, 14
 
 
 class Places(NamedTuple):
-    """Intersections of the map: (N, 2) cells from the raster's corner, (N, R, 2) int8 branches, (N,) density.
+    """Intersections of the map: (N, 2) cells from the raster's corner, (N, R) directions of branches, (N,) density.
 
-    The density is the chance of a point of any direction to meet a road there.
+    Directions are radians, NaN beyond the last. The density is the chance of a point of any direction to meet a road
+    there.
     """
 
     cells: Floats2
-    branches: Int8s3
+    directions: Singles2
     density: Floats1
 
 
@@ -46,6 +64,20 @@ class RoadPoints(NamedTuple):
     angles: Floats1
 
 
+class LaidPoints(NamedTuple):
+    """Road points of the query, turned and scaled to cells of the raster beforehand, as `vote` looks them up.
+
+    `scales` (S,) and `counts` (S,) are the scales and how many points each has. `words` (TURNS, B * S * BLOCK) uint32
+    holds for each turn the first BLOCK points of all scales, then the next ones, and so on: few are looked up beyond
+    the first. The lowest 14 bits of a word are x from the query intersection, the next 14 y, in eighths of a cell from
+    -1024 cells on, the highest 4 the direction.
+    """
+
+    scales: Floats1
+    counts: Ints1
+    words: UInt32s2
+
+
 class Trial(NamedTuple):
     """Of the sequential test: share of points that meet roads in the right place, and the nats lost before it ends."""
 
@@ -54,7 +86,7 @@ class Trial(NamedTuple):
 
 
 @kernel()
-def find_turns(rays: Floats1, branches: Int8s3, j: int, tolerance: float, turns: Floats1) -> int:
+def find_turns(rays: Floats1, directions: Singles2, j: int, tolerance: float, turns: Floats1) -> int:
     """List the turns that lay all branches of a query intersection on branches of map intersection j, or the reverse.
 
     The poorer of the two may lack branches, but not have others.
@@ -63,8 +95,8 @@ def find_turns(rays: Floats1, branches: Int8s3, j: int, tolerance: float, turns:
     ----------
     rays : (R,) float64
         Directions of the query's branches, radians.
-    branches : (M, R', 2) int8
-        The map's (see `kernels.rays`).
+    directions : (M, R') float32
+        Those of the map's, NaN beyond the last.
     tolerance : float
         How far branches may be apart, radians.
     turns : (MAX_TURNS,) float64
@@ -77,19 +109,17 @@ def find_turns(rays: Floats1, branches: Int8s3, j: int, tolerance: float, turns:
         How many.
     """
     n, m = 0, 0
-    directions = np.empty(branches.shape[1])
-    while m < branches.shape[1] and (branches[j, m, 0] != 0 or branches[j, m, 1] != 0):
-        directions[m] = math.atan2(float(branches[j, m, 1]), float(branches[j, m, 0]))
+    while m < directions.shape[1] and not math.isnan(directions[j, m]):
         m += 1
     for i in range(rays.shape[0]):
         for t in range(m):
-            first = directions[t] - rays[i]
+            first = directions[j, t] - rays[i]
             total, agreeing = 0.0, 1
             for k in range(rays.shape[0]):
                 best = tolerance
                 for u in range(m):
                     if k != i and u != t:
-                        away = _wrapped(directions[u] - rays[k] - first)
+                        away = _wrapped(directions[j, u] - rays[k] - first)
                         if abs(away) < abs(best):
                             best = away
                 if best != tolerance:
@@ -127,6 +157,47 @@ def _count_met(
     return met
 
 
+@kernel(forceinline=True)
+def _count_laid(words: UInt32s2, turn: int, first: int, n: int, x: int, y: int, raster: Raster) -> int:
+    """Count the points `first` to `first + n` that meet roads, laid on (x, y), in eighths of a cell from the corner."""
+    met = 0
+    mask = np.uint32((1 << _BITS) - 1)
+    for i in range(np.uint64(first), np.uint64(first + n)):
+        word = words[np.uint64(turn), i]
+        column = np.uint32((x + np.int64(word & mask)) // _FINE)
+        row = np.uint32((y + np.int64((word >> np.uint32(_BITS)) & mask)) // _FINE)
+        met += passes_cell(column, row, word >> np.uint32(2 * _BITS), raster)
+    return met
+
+
+@kernel()
+def lay_points(points: RoadPoints, cell: float, words: UInt32s2) -> None:
+    """Turn and scale road points to cells of a raster.
+
+    Parameters
+    ----------
+    points : RoadPoints
+        None lies further than 1000 cells from the intersection.
+    cell : float
+        Of the raster, metres.
+    words : (TURNS, B * S * BLOCK) uint32
+        Filled, as in `LaidPoints`, where there are points.
+    """
+    n_scales = points.scales.shape[0]
+    for k in range(words.shape[0]):
+        turn = 2.0 * math.pi * k / words.shape[0]
+        turned = turn * (DIRECTIONS / math.pi) + 2.0 * DIRECTIONS
+        for s in range(n_scales):
+            c = math.cos(turn) * points.scales[s] / cell * _FINE
+            d = math.sin(turn) * points.scales[s] / cell * _FINE
+            for i in range(points.starts[s], points.starts[s + 1]):
+                u, v = points.offsets[i, 0], points.offsets[i, 1]
+                x, y = int(c * u - d * v + _MIDDLE + 0.5), int(d * u + c * v + _MIDDLE + 0.5)
+                direction = int(points.angles[i] + turned) & (DIRECTIONS - 1)
+                block, place = divmod(i - points.starts[s], BLOCK)
+                words[k, (block * n_scales + s) * BLOCK + place] = x | (y << _BITS) | (direction << (2 * _BITS))
+
+
 @kernel()
 def draw_turns(
     candidates: Ints1, draws: Floats1, rays: Floats1, tolerance: float, places: Places, sample: Ints1, turns: Floats1
@@ -152,7 +223,7 @@ def draw_turns(
     for m in range(candidates.shape[0]):
         if n == sample.shape[0]:
             break
-        k = find_turns(rays, places.branches, candidates[m], tolerance, room)
+        k = find_turns(rays, places.directions, candidates[m], tolerance, room)
         if k > 0:
             sample[n], turns[n] = candidates[m], room[int(draws[m] * k)]
             n += 1
@@ -195,7 +266,7 @@ def vote(
     rays: Floats1,
     tolerance: float,
     max_turn: float,
-    points: RoadPoints,
+    laid: LaidPoints,
     places: Places,
     raster: Raster,
     chance: Floats1,
@@ -235,10 +306,11 @@ def vote(
         gains[level] = math.log(trial.hit_rate / rates[level])
         losses[level] = math.log((1.0 - trial.hit_rate) / (1.0 - rates[level]))
     tried = 0
+    n_scales, n_turns = laid.scales.shape[0], laid.words.shape[0]
     for index in range(candidates.shape[0]):
         j = candidates[index]
-        x, y = places.cells[j, 0], places.cells[j, 1]
-        for t in range(find_turns(rays, places.branches, j, tolerance, turns)):
+        x, y = int(places.cells[j, 0] * _FINE) - _MIDDLE, int(places.cells[j, 1] * _FINE) - _MIDDLE
+        for t in range(find_turns(rays, places.directions, j, tolerance, turns)):
             turn = turns[t]
             if abs(turn) > max_turn:
                 continue
@@ -247,25 +319,25 @@ def vote(
             # the best scale: points are counted in blocks, and a scale is left when it has lost too much, or when all
             # points that are left would not make it better than another scale and the worst vote that is kept
             least = votes[0, 3] if kept == votes.shape[0] else 0.0
-            cosine, sine = math.cos(turn) / raster.cell, math.sin(turn) / raster.cell
-            for s in range(points.scales.shape[0]):
-                i, last = points.starts[s], points.starts[s + 1]
+            k = round(turn * n_turns / (2.0 * math.pi)) % n_turns
+            for s in range(n_scales):
+                first, left = s * BLOCK, laid.counts[s]
                 level = int(min(chance[s] * places.density[j], 0.99) * _LEVELS)
-                c, d = cosine * points.scales[s], sine * points.scales[s]
                 ratio = 0.0
                 enough = max(best, least)
-                while i < last and ratio >= -trial.patience and ratio + gains[level] * (last - i) > enough:
-                    stop = min(i + _BLOCK, last)
-                    met = _count_met(points, i, stop, x, y, turn, c, d, raster)
-                    ratio += gains[level] * met + losses[level] * (stop - i - met)
-                    i = stop
+                while left > 0 and ratio >= -trial.patience and ratio + gains[level] * left > enough:
+                    n = min(BLOCK, left)
+                    met = _count_laid(laid.words, k, first, n, x, y, raster)
+                    ratio += gains[level] * met + losses[level] * (n - met)
+                    first += n_scales * BLOCK
+                    left -= n
                 if ratio > best:
                     best, where, rate = ratio, s, rates[level]
             # the heap keeps the best votes
             if where >= 0 and (kept < votes.shape[0] or best > votes[0, 3]):
                 row = kept if kept < votes.shape[0] else 0
                 kept = min(kept + 1, votes.shape[0])
-                votes[row, 0], votes[row, 1], votes[row, 2] = j, turn, points.scales[where]
+                votes[row, 0], votes[row, 1], votes[row, 2] = j, turn, laid.scales[where]
                 votes[row, 3], votes[row, 4] = best, rate
                 _sift(votes, row, kept)
     return kept, tried

@@ -17,7 +17,7 @@ from roadgeo.matching.index import ReferenceIndex
 from roadgeo.matching.scene import Scene
 from roadgeo.matching.triples import Proposals
 
-__all__ = ["PATIENT", "GrowOptions", "grow_proposals", "screen_proposals"]
+__all__ = ["GrowOptions", "grow_proposals", "screen_proposals"]
 
 
 @dataclass(frozen=True)
@@ -66,10 +66,6 @@ class GrowOptions:
     max_points: int = 1000
     max_grown: int = 150
     max_verified: int = 3
-
-
-#: How what single triples propose is followed: more is let through, and it may miss more on its way.
-PATIENT = GrowOptions(max_screened=6000, hit_rate=0.35, patience=9.0, min_matched=1, max_verified=6)
 
 
 def screen_proposals(

@@ -38,7 +38,7 @@ from roadgeo.matching.trace import NO_TRACE, Trace
 from roadgeo.matching.triples import larger
 from roadgeo.matching.twins import Twin
 from roadgeo.matching.verification import agreement
-from roadgeo.roads.intersections import Intersections
+from roadgeo.roads.intersections import Intersections, unpack_branches
 from roadgeo.storage.memory import let_pages_go
 
 __all__ = ["Fit", "Found", "search_references"]
@@ -411,7 +411,7 @@ def promising_options(options: LocateOptions) -> MatchOptions:
     least = options.min_log10_odds - options.min_margin
     verify = replace(options.match.verify, promising=min(options.match.verify.promising, least))
     match = replace(options.match, verify=verify)
-    return match if options.effort == "full" else replace(match, last=(), roads=None, sightings=1)
+    return match if options.effort == "full" else replace(match, roads=None, sightings=1)
 
 
 def _near(index: ReferenceIndex, near: tuple[float, float, float] | None) -> tuple[float, float, float] | None:
@@ -487,8 +487,7 @@ def _search_pairs(query: Query, index: ReferenceIndex, options: PairOptions, sha
 def _pair_index(index: ReferenceIndex, options: PairOptions) -> tuple[Intersections, PairIndex]:
     """Build the paper's tables for a reference: too large to store with it, kept for a batch."""
     n = len(index)
-    vectors = index.branches.astype(np.float32)
-    rays = np.where(vectors.any(axis=2), np.arctan2(vectors[..., 1], vectors[..., 0]), np.nan)
+    rays = unpack_branches(index.branches)
     found = Intersections(index.xy, rays, unpack_tangents(index.tangents), np.zeros(n, np.float32), np.arange(n))
     if options.discard_poor:
         found = found.only(np.flatnonzero(well_fitted(index)))

@@ -37,8 +37,8 @@ class LocateOptions:
         For explanations: where the middle of the frame of masks whose names end so really lies. The search does not
         look at it.
     effort : "quick" or "full"
-        Whether single triples, and then roads alone, propose places where the usual search leads nowhere: a second or
-        two on the map of a city.
+        Whether roads alone propose places where triples of intersections lead nowhere: a second or two on the map of a
+        city.
     threads : int
         Of the search for one mask. The answer does not depend on it.
     elsewhere : int

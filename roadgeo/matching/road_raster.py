@@ -31,8 +31,8 @@ class RasterOptions:
         Directions that differ by less from a road's belong to it.
     """
 
-    cell_m: float = 5.0
-    reach_m: float = 7.0
+    cell_m: float = 8.0
+    reach_m: float = 8.0
     turn_deg: float = 20.0
 
 

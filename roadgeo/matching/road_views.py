@@ -40,8 +40,7 @@ class RoadViews:
 
     def stage_of(self, view: int) -> int:
         """Return the number of the stage in which the roads of a view vote."""
-        options = self.options
-        return len(options.sweeps) if view == 0 else len(options.sweeps) + len(options.last) + view
+        return len(self.options.sweeps) + view
 
     def view_of(self, stage: int) -> int | None:
         """Return the view whose roads vote in a stage; None where triples propose."""

@@ -19,17 +19,22 @@ import numpy as np
 from roadgeo._arrays import BoolArray, FloatArray, IntArray
 from roadgeo.kernels.road_raster import DIRECTIONS
 from roadgeo.kernels.road_votes import (
+    BLOCK,
+    TURNS,
+    LaidPoints,
     Places,
     RoadPoints,
     Trial,
     chance_rates,
     draw_turns,
     improve_votes,
+    lay_points,
     vote,
 )
 from roadgeo.matching.index import ReferenceIndex
 from roadgeo.matching.road_raster import RasterOptions, RoadRaster, make_raster
 from roadgeo.matching.scene import Scene
+from roadgeo.roads.intersections import unpack_branches
 
 __all__ = ["VoteOptions", "Voter", "Votes"]
 
@@ -67,7 +72,7 @@ class VoteOptions:
 
     raster: RasterOptions = field(default_factory=RasterOptions)
     branch_tolerance_deg: float = 20.0
-    scale_step: float = 1.08
+    scale_step: float = 1.1
     inner_m: float = 15.0
     radius_m: float = 220.0
     max_points: int = 80
@@ -144,7 +149,7 @@ class Voter:
         self.trial = Trial(options.hit_rate, options.patience)
         self.drawn: RoadRaster = make_raster(index, options.raster)
         density = np.maximum(self.drawn.density_at(index.xy), _LEAST_DENSITY)
-        self.places = Places(self.drawn.cells(index.xy), np.asarray(index.branches), density)
+        self.places = Places(self.drawn.cells(index.xy), unpack_branches(index.branches), density)
 
     def votes(self, anchor: int, chunk: int = 20_000) -> Iterator[tuple[int, Votes | None]]:
         """Yield, after each `chunk` of the map's intersections, how many places and turns were tried on it.
@@ -157,10 +162,11 @@ class Voter:
         around = self._around(anchor)
         points = self._narrow(around)
         chance = self._chance(rays, points, around.rng)
+        laid = self._lay(points)
         found, kept, tried = np.empty((options.kept, 5)), 0, 0
         for first in range(0, len(self.candidates), chunk):
             kept, tried = vote(
-                self.candidates[first : first + chunk], rays, self.tolerance, self.max_turn, points, self.places,
+                self.candidates[first : first + chunk], rays, self.tolerance, self.max_turn, laid, self.places,
                 self.drawn.raster, chance, self.trial, found, kept,
             )  # fmt: skip
             if first + chunk < len(self.candidates):
@@ -215,6 +221,14 @@ class Voter:
         scale = np.repeat(np.arange(len(n)), n)
         at = (np.arange(len(scale)) - starts[scale]) * (usable[scale] - 1) // np.maximum(n[scale] - 1, 1)
         return starts, scale, at[np.argsort(scale + rng.random(len(scale)))]
+
+    def _lay(self, points: RoadPoints) -> LaidPoints:
+        """Turn and scale points to cells of the raster."""
+        counts = np.diff(points.starts)
+        n_blocks = -(-int(counts.max(initial=0)) // BLOCK)
+        words = np.empty((TURNS, n_blocks * len(counts) * BLOCK), np.uint32)
+        lay_points(points, self.drawn.raster.cell, words)
+        return LaidPoints(points.scales, counts, words)
 
     def _chance(self, rays: FloatArray, points: RoadPoints, rng: np.random.Generator) -> FloatArray:
         """Measure the chance rate at each scale, in units of the density at a place, at places drawn at random."""

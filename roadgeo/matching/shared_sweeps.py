@@ -53,7 +53,7 @@ class Member(Protocol):
     def follow_up(self, proposals: Proposals, chosen: IntArray, stage: Stage) -> Iterator[Hypothesis]:
         """Yield what grew from the chosen proposals, different places, the best supported first."""
 
-    def enough(self, stage: Stage) -> bool:
+    def enough(self) -> bool:
         """Whether as many places were screened on all parts as are on one map of their size."""
 
     def known_places(self) -> Sequence[Hypothesis]:
@@ -129,11 +129,11 @@ class SharedSweeps(Generic[AnyMember]):
     def _work(self, stage: Stage) -> Iterator[_Round]:
         low, high = self.camera.gsd_m
         scale = (low / stage.grow.max_scale_ratio, high * stage.grow.max_scale_ratio)
-        if self.members[0].enough(stage):
+        if self.members[0].enough():
             return
         indexes = [member.index for member in self.members]
         for proposals in stage.source.proposals(self.scene, indexes, scale, self.camera.min_shape_ratio, self.ahead):
-            if self.members[0].enough(stage):
+            if self.members[0].enough():
                 return
             yield _Round(proposals[0].anchor, self._grow(proposals, stage))
 

@@ -68,14 +68,7 @@ class Sweep:
 _FURTHER = TripleOptions(n_neighbours=12, max_hits=20_000, max_compared=500_000, spread=True)
 
 
-#: The last resort: every triple that is alike, wherever it leads.
-_SINGLE = TripleOptions(spread=True, single=True, max_hits=6000)
-
 #: The sweeps that follow one another until a place stands out.
-USUAL: tuple[Source, ...] = (
-    Sweep(TripleOptions(), 40),
-    Sweep(replace(_FURTHER, angle_tolerance_deg=7.5), 30),
-    Sweep(replace(_FURTHER, angle_tolerance_deg=10.0), 20),
-)
-#: The last resort.
-LAST: tuple[Source, ...] = (Sweep(_SINGLE, 25),)
+USUAL: tuple[Source, ...] = (Sweep(TripleOptions(), 40), Sweep(replace(_FURTHER, angle_tolerance_deg=7.5), 30))
+#: The last resort where roads propose nothing.
+LAST: tuple[Source, ...] = (Sweep(replace(_FURTHER, angle_tolerance_deg=10.0), 20),)

@@ -61,9 +61,6 @@ class TripleOptions:
         Whether anchors come spread over the frame, from its middle outwards, or those first whose triples are rare.
         Rare triples are soon looked up, but often rare because they are wrong: on `noisy` and `hard` training masks 9 %
         of the rarest sixth of the anchors lead to the place, and 44 % of the commonest.
-    single : bool
-        Whether every hit is a proposal, or only what hits of two triples or more agree on. Where the mask lacks every
-        third intersection, triples that share an anchor and are both intact are rare.
     max_weighed : int
         Of more intersections, evenly chosen ones may become anchors: to weigh all would take longer than to use some.
     max_hits, max_compared : int
@@ -78,7 +75,6 @@ class TripleOptions:
     ray_tolerance_deg: float = 25.0
     affine_tolerance: float = 0.3
     spread: bool = False
-    single: bool = False
     max_weighed: int = 1000
     max_hits: int = 12_000
     max_compared: int = 400_000
@@ -229,8 +225,6 @@ def _look_up(
     ids, affine = hits = Hits(hits.ids[:max_hits], hits.affine[:max_hits])
     n_hits, n_compared = look_up_each(seen, anchor, slots, max_compared, index.triple_map, limits, hits)
     k = seen.neighbours.shape[1]
-    if options.single:
-        return _each_hit(anchor, ids[:n_hits], affine[:n_hits].copy(), k, len(slots), n_compared)
     # hits on one intersection of the map that agree make one proposal: most neighbours placed first
     out_ids = np.empty((max(n_hits // 2, 1), k + 1), np.int64)
     out_affine = np.empty((len(out_ids), 4))
@@ -242,18 +236,6 @@ def _look_up(
         anchor, out_ids[best, 0], out_ids[best, 1:], out_affine[best], out_placed[best],
         len(slots), n_compared, n_hits,
     )  # fmt: skip
-
-
-def _each_hit(
-    anchor: int, ids: IntArray, affine: FloatArray, n_slots: int, n_tuples: int, n_compared: int
-) -> Proposals:
-    """Make a proposal of every hit (see `kernels.triples.look_up_each`): it places two neighbours."""
-    rows = np.arange(len(ids))
-    partners = np.full((len(ids), n_slots), -1, np.int64)
-    partners[rows, ids[:, 1]] = ids[:, 2]
-    partners[rows, ids[:, 3]] = ids[:, 4]
-    placed = np.full(len(ids), 2, np.int64)
-    return Proposals(anchor, ids[:, 0].copy(), partners, affine, placed, n_tuples, n_compared, len(ids))
 
 
 def _scattered(numbers: IntArray) -> IntArray:

@@ -10,7 +10,7 @@ from roadgeo._arrays import AnyArray, Float32Array, FloatArray, IntArray
 from roadgeo.kernels import intersections as kernels
 from roadgeo.roads.graph import RoadGraph
 
-__all__ = ["IntersectionOptions", "Intersections", "find_intersections"]
+__all__ = ["IntersectionOptions", "Intersections", "find_intersections", "unpack_branches"]
 
 #: Columns of `Intersections.rays` and `.tangents`: more branches than this at one place are kept as the first eight.
 MAX_BRANCHES = 8
@@ -93,6 +93,13 @@ class Intersections:
     def n_tangents(self) -> IntArray:
         """(N,) N_q, the number of distinct tangent lines."""
         return np.asarray(np.isfinite(self.tangents).sum(axis=1))
+
+
+def unpack_branches(branches: AnyArray) -> Float32Array:
+    """Undo `Intersections.branches`: (N, R) float32 radians, NaN beyond the last."""
+    vectors = np.asarray(branches, np.float32)
+    rays = np.where(vectors.any(axis=2), np.arctan2(vectors[..., 1], vectors[..., 0]), np.float32(np.nan))
+    return np.ascontiguousarray(rays)
 
 
 def find_intersections(graph: RoadGraph, options: IntersectionOptions | None = None) -> Intersections:

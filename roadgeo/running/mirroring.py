@@ -20,7 +20,7 @@ from roadgeo.workflows import locate
 
 __all__ = ["ask_mirrored"]
 
-#: What a try may take; a mask that is merely turned over is found at once.
+#: What a try may take, of the first sweep alone: a mask that is merely turned over is found at once.
 _WORK_LIMIT_S = 2.0
 _WORTH_A_TRY = {Reason.NOTHING_STANDS_OUT, Reason.TIME_LIMIT}
 
@@ -39,7 +39,8 @@ def ask_mirrored(
     turned = sighting.mask.mirrored()
     if not allowed:
         search = replace(options.search, work_limit_s=min(_WORK_LIMIT_S, options.search.work_limit_s))
-        options = replace(options, effort="quick", search=search)
+        match = replace(options.match, sweeps=options.match.sweeps[:1], last=())
+        options = replace(options, effort="quick", search=search, match=match)
     found = locate(turned, references, options)
     if allowed and found.located:
         return replace(sighting, location=_turned_back(found, sighting.location))

@@ -8,10 +8,12 @@ from hypothesis import given
 from hypothesis import strategies as st
 from naive import road_votes as naive
 
-from roadgeo.kernels import road_votes as kernels
 from roadgeo.kernels.road_raster import DIRECTIONS, TILE, Raster
 from roadgeo.kernels.road_votes import (
+    BLOCK,
     MAX_TURNS,
+    TURNS,
+    LaidPoints,
     Places,
     RoadPoints,
     Trial,
@@ -19,8 +21,10 @@ from roadgeo.kernels.road_votes import (
     draw_turns,
     find_turns,
     improve_votes,
+    lay_points,
     vote,
 )
+from roadgeo.roads.intersections import unpack_branches
 
 TOLERANCE = math.radians(20)
 TRIAL = Trial(0.6, 3.0)
@@ -28,25 +32,24 @@ angles = st.lists(st.floats(-math.pi, math.pi), min_size=2, max_size=5)
 
 
 def packed(directions, columns=8):
-    """Branches as an index stores them, (1, columns, 2) int8."""
+    """Directions of the branches of one intersection as an index keeps them, (1, columns) float32."""
     out = np.zeros((1, columns, 2), np.int8)
     for i, a in enumerate(directions):
         out[0, i] = round(127 * math.cos(a)), round(127 * math.sin(a))
-    return out
+    return unpack_branches(out)
 
 
-def turns_of(rays, branches):
+def turns_of(rays, stored):
     room = np.full(MAX_TURNS, np.nan)
-    return room[: find_turns(np.asarray(rays, float), branches, 0, TOLERANCE, room)]
+    return room[: find_turns(np.asarray(rays, float), stored, 0, TOLERANCE, room)]
 
 
 class TestFindTurns:
     @given(angles, angles)
     def test_like_the_twin(self, rays, directions):
-        branches = packed(directions)
-        stored = [math.atan2(y, x) for x, y in branches[0, : len(directions)].astype(float)]
-        expected = naive.find_turns(rays, stored, TOLERANCE)[:MAX_TURNS]
-        found = turns_of(rays, branches)
+        stored = packed(directions)
+        expected = naive.find_turns(rays, stored[0, : len(directions)].astype(float), TOLERANCE)[:MAX_TURNS]
+        found = turns_of(rays, stored)
         assert len(found) == len(expected)
         assert np.allclose(np.cos(found), np.cos(expected))
         assert np.allclose(np.sin(found), np.sin(expected))
@@ -71,26 +74,34 @@ def world(seed, n_places=30):
     words = rng.integers(0, 2**16, (5, TILE, TILE), np.uint16)  # half of all bits: many places have a vote
     words[0] = 0
     tile_of = np.array([[0, 1, 2], [3, 4, 0], [1, 0, 2]], np.int32)
-    branches = np.concatenate([packed(rng.uniform(-3, 3, 3)) for _ in range(n_places)])
-    places = Places(rng.uniform(60, 130, (n_places, 2)), branches, rng.uniform(0.05, 0.2, n_places))
+    directions = np.concatenate([packed(rng.uniform(-3, 3, 3)) for _ in range(n_places)])
+    places = Places(rng.uniform(60, 130, (n_places, 2)), directions, rng.uniform(0.05, 0.2, n_places))
     offsets = rng.uniform(-60, 60, (90, 2))
     scales = np.array([1.0, 2.0, 3.0])
     points = RoadPoints(scales, np.array([0, 40, 40, 90]), offsets, rng.uniform(0, 2 * DIRECTIONS, 90))
     return Raster(tile_of, words, 5.0), places, points, rng.uniform(-3, 3, 3)
 
 
+def laid(points, cell):
+    """The points, turned and scaled beforehand."""
+    counts = np.diff(points.starts)
+    words = np.zeros((TURNS, -(-counts.max() // BLOCK) * len(counts) * BLOCK), np.uint32)
+    lay_points(points, cell, words)
+    return LaidPoints(points.scales, counts, words)
+
+
 def expected_votes(raster, places, points, rays, chance, max_turn=9.0):
     out = []
     for j, (x, y) in enumerate(places.cells):
         room = np.empty(MAX_TURNS)
-        for turn in room[: find_turns(rays, places.branches, j, TOLERANCE, room)]:
+        for turn in room[: find_turns(rays, places.directions, j, TOLERANCE, room)]:
             best = (0.0, None)
             for s, scale in enumerate(points.scales):
                 level = int(min(chance[s] * places.density[j], 0.99) * 128)
                 rate = min(max((level + 0.5) / 128, 0.03), 0.8 * TRIAL.hit_rate)
-                met = naive.hits(points, s, x, y, turn, scale, raster)
+                met = naive.laid_hits(points, s, x, y, turn, raster, TURNS)
                 if met and abs(turn) <= max_turn:
-                    best = max(best, (naive.ratio(met, rate, TRIAL, kernels._BLOCK), scale))
+                    best = max(best, (naive.ratio(met, rate, TRIAL, BLOCK), scale))
             if best[1] is not None:
                 out.append((best[0], j, turn, best[1]))
     return sorted(out, reverse=True)
@@ -106,18 +117,31 @@ class TestVote:
         assert len(expected) > 6  # more than are kept
         found = np.empty((len(expected) // 2 + 1, 5))
         everywhere = np.arange(len(places.cells))
-        kept = tried = 0
+        kept, tried, ready = 0, 0, laid(points, raster.cell)
         for some in (everywhere[:11], everywhere[11:]):  # a part of the map after the other
-            kept, n = vote(some, rays, TOLERANCE, max_turn, points, places, raster, chance, TRIAL, found, kept)
+            kept, n = vote(some, rays, TOLERANCE, max_turn, ready, places, raster, chance, TRIAL, found, kept)
             tried += n
         assert kept == min(len(found), len(expected))
         assert tried >= len(expected)
-        assert max_turn < 3 or tried == sum(len(turns_of(rays, places.branches[j : j + 1])) for j in everywhere)
+        assert max_turn < 3 or tried == sum(len(turns_of(rays, places.directions[j : j + 1])) for j in everywhere)
         best = found[np.argsort(-found[:kept, 3])]
         assert np.allclose(best[:, 3], [e[0] for e in expected[:kept]])
         known = {(j, round(turn, 9)): (ratio, scale) for ratio, j, turn, scale in expected}
         for j, turn, scale, ratio, _ in best:
             assert (ratio, scale) == pytest.approx(known[int(j), round(turn, 9)])
+
+    def test_points_are_laid_where_they_lie(self):
+        """Within the steps of the turn and of a place: half of 1/128 of a turn, half of 1/8 of a cell."""
+        raster, _, points, _ = world(8)
+        ready = laid(points, raster.cell)
+        for k, turn in enumerate(2 * math.pi * np.arange(TURNS) / TURNS):
+            for s, scale in enumerate(points.scales):
+                for q, i in enumerate(range(points.starts[s], points.starts[s + 1])):
+                    word = int(ready.words[k, (q // BLOCK * len(points.scales) + s) * BLOCK + q % BLOCK])
+                    at = np.array([word & 16383, word >> 14 & 16383]) / 8 - 1024
+                    turned = np.array([[math.cos(turn), -math.sin(turn)], [math.sin(turn), math.cos(turn)]])
+                    assert np.abs(at - turned @ points.offsets[i] * scale / raster.cell).max() < 0.063
+                    assert word >> 28 == math.floor(points.angles[i] + turn * DIRECTIONS / math.pi) % DIRECTIONS
 
     def test_improving_looks_at_all_steps(self):
         raster, places, points, _ = world(5)
@@ -143,7 +167,7 @@ class TestVote:
         candidates, draws = rng.permutation(300), rng.random(300)
         sample, turns = np.empty(most, np.int64), np.empty(most)
         n = draw_turns(candidates, draws, rays, TOLERANCE, places, sample, turns)
-        expected = naive.draw_turns(candidates, draws, rays, TOLERANCE, places.branches, most)
+        expected = naive.draw_turns(candidates, draws, rays, TOLERANCE, places.directions, most)
         assert n == len(expected) == min(most, n)
         assert sample[:n].tolist() == [j for j, _ in expected]
         assert np.allclose(np.cos(turns[:n]), np.cos([turn for _, turn in expected]))

@@ -38,7 +38,7 @@ class Part:
         for one in proposals.placed[chosen]:
             yield Hypothesis(np.eye(3), chosen[:1], float(one), chosen)
 
-    def enough(self, stage):
+    def enough(self):
         return False
 
     def known_places(self):

@@ -55,12 +55,12 @@ def find_turns(rays, directions, tolerance, same=0.17):
     return turns
 
 
-def draw_turns(candidates, draws, rays, tolerance, branches, most):
+def draw_turns(candidates, draws, rays, tolerance, directions, most):
     """Draw pairs of place and turn among those that the branches allow, `most` at most."""
     pairs = []
     for j, draw in zip(candidates, draws, strict=True):
-        stored = [math.atan2(y, x) for x, y in branches[j].astype(float) if x or y]
-        turns = find_turns(rays, stored, tolerance)[:16]
+        stored = directions[j].astype(float)
+        turns = find_turns(rays, stored[~np.isnan(stored)], tolerance)[:16]
         if turns:
             pairs.append((j, turns[int(draw * len(turns))]))
     return pairs[:most]
@@ -73,6 +73,20 @@ def hits(points, s, x, y, turn, scale, raster):
         u, v = points.offsets[i] * scale / raster.cell
         column = math.floor(x + math.cos(turn) * u - math.sin(turn) * v)
         row = math.floor(y + math.sin(turn) * u + math.cos(turn) * v)
+        direction = math.floor(points.angles[i] + turn * DIRECTIONS / math.pi) % DIRECTIONS
+        out.append(bool(word_at(row, column, raster.tile_of, raster.bits) >> direction & 1))
+    return out
+
+
+def laid_hits(points, s, x, y, turn, raster, n_turns):
+    """Tell the same of points turned by the nearest of `n_turns` angles and moved by eighths of a cell."""
+    turn = 2 * math.pi * (round(turn * n_turns / (2 * math.pi)) % n_turns) / n_turns
+    out = []
+    for i in range(points.starts[s], points.starts[s + 1]):
+        u, v = points.offsets[i] * points.scales[s] / raster.cell
+        right = math.floor(8 * (math.cos(turn) * u - math.sin(turn) * v) + 0.5)
+        up = math.floor(8 * (math.sin(turn) * u + math.cos(turn) * v) + 0.5)
+        column, row = (math.floor(8 * x) + right) // 8, (math.floor(8 * y) + up) // 8
         direction = math.floor(points.angles[i] + turn * DIRECTIONS / math.pi) % DIRECTIONS
         out.append(bool(word_at(row, column, raster.tile_of, raster.bits) >> direction & 1))
     return out
