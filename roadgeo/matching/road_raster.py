@@ -31,7 +31,7 @@ class RasterOptions:
         Directions that differ by less from a road's belong to it.
     """
 
-    cell_m: float = 8.0
+    cell_m: float = 6.0
     reach_m: float = 8.0
     turn_deg: float = 20.0
 

@@ -72,7 +72,7 @@ class VoteOptions:
 
     raster: RasterOptions = field(default_factory=RasterOptions)
     branch_tolerance_deg: float = 20.0
-    scale_step: float = 1.1
+    scale_step: float = 1.08
     inner_m: float = 15.0
     radius_m: float = 220.0
     max_points: int = 80
