@@ -246,7 +246,7 @@ class TripleEstimator:
     def enough(self) -> bool:
         """Whether as many places were screened as on one map of all parts' size."""
         larger_by = larger(max(self.ledger.n_reference, len(self.index)))
-        return self.ledger.n_screened >= int(self.options.max_places * larger_by)
+        return self.ledger.n_by_triples >= int(self.options.max_places * larger_by)
 
     def screen(self, proposals: Proposals, allowed: BoolArray, most: int, stage: Stage) -> IntArray:
         """Return the proposals that are allowed and lie on roads, the best placed first."""
@@ -255,7 +255,7 @@ class TripleEstimator:
         self.n_candidates += proposals.n_hits
         looked_at = np.flatnonzero(allowed)[:most]
         self._count(len(looked_at), stage.number)
-        self.ledger.n_screened += len(looked_at)
+        self.ledger.n_by_triples += len(looked_at)
         kept = screen_proposals(self.scene, self.index, proposals, looked_at, stage.grow)
         self.trace.screened(proposals, allowed, kept)
         return kept

@@ -19,12 +19,12 @@ class Ledger:
         Those, and how many are tried on the whole map for each that is tried here (see `LocateOptions.elsewhere`).
     tried_by : dict of int to int
         As many had been tried when a stage, by its number, was last at work.
-    n_screened : int
+    n_by_triples : int
         Those that triples proposed.
     """
 
     n_reference: int = 0
     n_tried: int = 0
     tried_by: dict[int, int] = field(default_factory=dict)
-    n_screened: int = 0
+    n_by_triples: int = 0
     beside: float = 1.0

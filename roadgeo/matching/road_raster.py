@@ -82,7 +82,7 @@ _MOST_BYTES = 500_000_000
 def make_raster(index: ReferenceIndex, options: RasterOptions) -> RoadRaster:
     """Return the raster of a reference, drawn anew unless it is in use or kept from before.
 
-    Drawing takes some hundredths of a second, and 13 MB, for a city of 400 km2. Those used last are kept, up to a size:
+    Drawing takes some hundredths of a second, and 9 MB, for a city of 400 km2. Those used last are kept, up to a size:
     many masks are looked for on the same maps, one after the other.
     """
     key = (index, options)
