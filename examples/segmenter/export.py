@@ -1,8 +1,10 @@
 """Trained networks as ONNX, with the metadata that QGIS Deepness and GeoDeep read.
 
-    python export.py plain/roads.onnx pretrained/roads.onnx roads.onnx    # two that were exported, as one
+    python export.py one/roads.onnx other/roads.onnx roads.onnx    # two that were exported, as one
+    python export.py one/roads.onnx one/roads.onnx roads.onnx      # one, shown each picture twice
 
-The joined network gives the mean of the logits of the two: they err in different places.
+The joined network gives the mean of the logits of the two, of which the second is shown the picture turned by half:
+they err in different places.
 """
 
 from __future__ import annotations
@@ -51,22 +53,44 @@ def export(network: AnyRoadNet, path: Path) -> Path:
 
 
 def join(parts: list[Path], path: Path) -> Path:
-    """Write exported networks as one that gives the mean of their logits as a probability."""
-    nodes, weights, logits = [], [], []
+    """Write exported networks as one that gives the mean of their logits as a probability.
+
+    Every second one is shown the picture turned by half. One that is given twice keeps its weights once.
+    """
+    nodes, weights, logits = [*_turn_by_half("image", "turned")], {}, []
     for k, part in enumerate(parts):
-        model = compose.add_prefix(_simplified(part), f"{k}_", rename_inputs=False, rename_outputs=False)
-        (last,) = (node for node in model.graph.node if "road" in node.output)
+        first, turned = parts.index(part), k % 2 == 1
+        graph = compose.add_prefix(_simplified(part), f"{k}_", rename_inputs=False, rename_outputs=False).graph
+        shared = {weight.name: weight.name.replace(f"{k}_", f"{first}_", 1) for weight in graph.initializer}
+        (last,) = (node for node in graph.node if "road" in node.output)
         if last.op_type != "Sigmoid":
             raise SystemExit(f"{part}: gives no probability; expected a model that train.py wrote")
-        logits.append(last.input[0])
-        nodes += [node for node in model.graph.node if node is not last]
-        weights += model.graph.initializer
+        for node in graph.node:
+            node.input[:] = [shared.get(name, "turned" if turned and name == "image" else name) for name in node.input]
+        nodes += [node for node in graph.node if node is not last]
+        nodes += _turn_by_half(last.input[0], f"logit_{k}") if turned else []
+        logits.append(f"logit_{k}" if turned else last.input[0])
+        for weight in graph.initializer:
+            weight.name = shared[weight.name]
+            weights[weight.name] = weight
     nodes += [
         helper.make_node("Mean", logits, ["logit"]),
         helper.make_node("Sigmoid", ["logit"], ["road"]),
     ]
     ports = [helper.make_tensor_value_info(name, onnx.TensorProto.FLOAT, None) for name in ("image", "road")]
-    return _write(helper.make_graph(nodes, "roads", ports[:1], ports[1:], weights), path)
+    return _write(helper.make_graph(nodes, "roads", ports[:1], ports[1:], list(weights.values())), path)
+
+
+def _turn_by_half(before: str, after: str) -> list[onnx.NodeProto]:
+    """Return nodes that turn (N, C, H, W) by half: rows and columns the other way round."""
+    end = np.iinfo(np.int64).min
+    values = {"starts": [-1, -1], "ends": [end, end], "axes": [2, 3], "steps": [-1, -1]}
+    names = [f"{after}_{name}" for name in values]
+    constants = [
+        helper.make_node("Constant", [], [name], value=numpy_helper.from_array(np.array(value, np.int64)))
+        for name, value in zip(names, values.values(), strict=True)
+    ]
+    return [*constants, helper.make_node("Slice", [before, *names], [after])]
 
 
 def _simplified(path: Path) -> onnx.ModelProto:

@@ -64,7 +64,7 @@ def test_the_recipe_runs_goes_on_and_exports(data: Path, tmp_path: Path) -> None
     not all(importlib.util.find_spec(name) for name in ("torch", "onnx", "onnxruntime", "skimage")),
     reason="the recipe needs torch, onnx, onnxruntime and scikit-image",
 )
-def test_two_networks_become_one_that_gives_the_mean_of_their_logits(data: Path, tmp_path: Path) -> None:
+def test_two_networks_become_one_the_second_turned_by_half(data: Path, tmp_path: Path) -> None:
     import onnxruntime
 
     paths = [tmp_path / str(seed) / "roads.onnx" for seed in (0, 1)]
@@ -72,14 +72,24 @@ def test_two_networks_become_one_that_gives_the_mean_of_their_logits(data: Path,
         command = [sys.executable, str(RECIPE / "train.py"), str(data), "--out", str(path.parent), "--quick"]
         command += ["--only", "all", "--network", "plain", "--seed", str(seed)]
         subprocess.run(command, capture_output=True, check=True)
-    paths.append(tmp_path / "both.onnx")
-    subprocess.run([sys.executable, str(RECIPE / "export.py"), *map(str, paths)], capture_output=True, check=True)
+    for pair, name in ((paths[:2], "both.onnx"), ([paths[0]] * 2, "twice.onnx")):
+        paths.append(tmp_path / name)
+        command = [sys.executable, str(RECIPE / "export.py"), *map(str, pair), str(paths[-1])]
+        subprocess.run(command, capture_output=True, check=True)
     image = np.random.default_rng(0).random((1, 3, 800, 800), np.float32)
     sessions = [onnxruntime.InferenceSession(str(path), providers=["CPUExecutionProvider"]) for path in paths]
-    first, second, both = (session.run(["road"], {"image": image})[0] for session in sessions)
-    logits = [np.log(p / (1 - p)) for p in (first, second)]
-    assert not np.allclose(first, second, atol=1e-3)
+    turned = np.ascontiguousarray(image[..., ::-1, ::-1])
+    shown = (image, turned, image, image)
+    first, second, both, twice = (
+        session.run(["road"], {"image": picture})[0] for session, picture in zip(sessions, shown, strict=True)
+    )
+    logits = [np.log(p / (1 - p)) for p in (first, second[..., ::-1, ::-1])]
+    assert not np.allclose(first, second[..., ::-1, ::-1], atol=1e-3)
     assert np.allclose(both, 1 / (1 + np.exp(-np.mean(logits, axis=0))), atol=2e-3)
+    logits[1] = np.log(sessions[0].run(["road"], {"image": turned})[0][..., ::-1, ::-1])
+    logits[1] -= np.log1p(-np.exp(logits[1]))
+    assert np.allclose(twice, 1 / (1 + np.exp(-np.mean(logits, axis=0))), atol=2e-3)
+    assert paths[3].stat().st_size < 1.1 * paths[0].stat().st_size  # its weights are kept once
 
 
 def test_the_model_that_ships_is_small_and_has_a_card() -> None:
