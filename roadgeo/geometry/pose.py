@@ -17,7 +17,7 @@ with its top to the north.
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Sequence
+from collections.abc import Callable
 from dataclasses import dataclass, replace
 from typing import Literal
 
@@ -27,14 +27,10 @@ from roadgeo._arrays import FloatArray
 from roadgeo.geometry.frame import Frame
 from roadgeo.geometry.homography import Homography
 from roadgeo.geometry.whitening import whitener
+from roadgeo.kernels.pinhole_fit import SeenCorners, fit_pinhole, place_pinholes
 
 #: Focal lengths that an adjustment may start from, in usual ones.
 _FACTORS = (0.35, 0.5, 0.7, 1.0, 1.4, 2.0, 3.0)
-
-#: `v @ _CROSS` is the matrix that takes the cross product with v.
-_CROSS = np.zeros((3, 3, 3))
-_CROSS[0, 2, 1] = _CROSS[1, 0, 2] = _CROSS[2, 1, 0] = 1.0
-_CROSS[0, 1, 2] = _CROSS[1, 2, 0] = _CROSS[2, 0, 1] = -1.0
 
 __all__ = ["Pose", "PoseOptions", "find_pose", "omega_phi_kappa", "quaternion", "turned"]
 
@@ -123,13 +119,13 @@ def find_pose(
     usual = options.usual_focal * frame.half_diagonal
     tried = [options.focal_px] if options.focal_px else [usual * factor for factor in _FACTORS]
     prior = math.log(options.focal_px or usual), 1e-6 if options.focal_px else options.usual_sigma
-    problem = _Problem(frame, corners, whitener(corner_covariance), *prior)
-
-    starts = problem.starts(homography, tried)
-    found = None if not starts else _fit(problem.nearest(starts), problem, options.n_iterations)
-    if found is None:
+    weights = np.ascontiguousarray(whitener(corner_covariance))
+    seen = SeenCorners((frame.corners - frame.center) * (1.0, -1.0), corners, weights, *prior)
+    p, covariance = np.empty(7), np.empty((7, 7))
+    starts = _starts(homography, frame, np.array(tried), seen.log_focal)
+    if not fit_pinhole(starts, seen, options.n_iterations, p, covariance):
         return None
-    pose = _describe(*found, problem, options)
+    pose = _describe(p, covariance, seen.log_focal, options)
     return replace(pose, position=pose.position + origin)
 
 
@@ -138,67 +134,24 @@ def _moved_to(origin: FloatArray, homography: FloatArray) -> FloatArray:
     return np.array([[1.0, 0.0, -origin[0]], [0.0, 1.0, -origin[1]], [0.0, 0.0, 1.0]]) @ homography
 
 
-@dataclass(frozen=True)
-class _Problem:
-    """Corners (4, 2) to be seen by a pinhole of seven parameters, (..., 7).
+def _starts(homography: FloatArray, frame: Frame, focals: FloatArray, log_focal: float) -> FloatArray:
+    """Return parameters (S, 7) of pinholes of some focal lengths that nearly see a homography, above the ground.
 
-    They are x and y where its axis meets the ground, log metres per pixel there, its heading, its tilt about two axes
-    were its focal length that of `log_focal`, and the log of its focal length, with which the tilt grows in proportion.
+    They are as in `kernels.pinhole_fit`.
     """
-
-    frame: Frame
-    corners: FloatArray
-    weights: FloatArray
-    log_focal: float
-    log_focal_sigma: float
-
-    def starts(self, homography: FloatArray, focals: Sequence[float]) -> list[FloatArray]:
-        """Return pinholes of some focal lengths that nearly see a homography, if they are above the ground."""
-        middle = self.frame.center
-        to_middle = np.array([[1.0, 0.0, -middle[0]], [0.0, -1.0, middle[1]], [0.0, 0.0, 1.0]])
-        seen_by = to_middle @ Homography(homography).facing(middle).inverse().matrix
-        rotations, positions = _take_apart(seen_by, np.asarray(focals, float))
-        found = map(self._start, rotations, positions, focals)
-        return [one for one in found if one is not None]
-
-    def _start(self, rotation: FloatArray, position: FloatArray, focal: float) -> FloatArray | None:
-        """Return the parameters of a camera above the ground."""
-        up = rotation[:, 2]
-        if position[2] <= 0.0 or up[2] <= 1e-3:
-            return None
-        reach = position[2] / up[2]
-        tilt = _tilt_to(up)
-        right = (_rotation(np.append(tilt, 0.0)).T @ rotation)[:, 0]
-        lean = tilt / math.exp(math.log(focal) - self.log_focal)
-        ground = position - reach * up
-        return np.array([*ground[:2], math.log(reach / focal), math.atan2(right[1], right[0]), *lean, math.log(focal)])
-
-    def camera(self, p: FloatArray) -> tuple[FloatArray, FloatArray]:
-        """Return positions (..., 3) and rotations (..., 3, 3)."""
-        tilt = np.concatenate((p[..., 4:6] * np.exp(p[..., 6:] - self.log_focal), np.zeros_like(p[..., :1])), axis=-1)
-        cos, sin, one, none = np.cos(p[..., 3]), np.sin(p[..., 3]), np.ones_like(p[..., 3]), np.zeros_like(p[..., 3])
-        heading = np.stack((cos, -sin, none, sin, cos, none, none, none, one), axis=-1).reshape(*p.shape[:-1], 3, 3)
-        rotation = _rotation(tilt) @ heading
-        ground = np.concatenate((p[..., :2], np.zeros_like(p[..., :1])), axis=-1)
-        return ground + np.exp(p[..., 2:3] + p[..., 6:]) * rotation[..., 2], rotation
-
-    def residuals(self, p: FloatArray) -> FloatArray:
-        """Return the corners' distances from where they are seen, whitened, and the focal length's from usual ones."""
-        position, rotation = self.camera(p)
-        rays = np.empty((*p.shape[:-1], 4, 3))
-        rays[..., :2] = (self.frame.corners - self.frame.center) * (1.0, -1.0)
-        rays[..., 2] = -np.exp(p[..., 6:])
-        rays = rays @ np.swapaxes(rotation, -1, -2)
-        with np.errstate(divide="ignore", invalid="ignore"):  # above the horizon
-            reach = np.where(rays[..., 2] < 0, -position[..., 2:] / rays[..., 2], np.nan)
-        seen = position[..., None, :2] + rays[..., :2] * reach[..., None]
-        away = (seen - self.corners).reshape(*p.shape[:-1], 8) @ self.weights.T
-        return np.concatenate((away, (p[..., 6:] - self.log_focal) / self.log_focal_sigma), axis=-1)
-
-    def nearest(self, starts: Sequence[FloatArray]) -> FloatArray:
-        """Return the parameters whose sum of squares is least: it has none where a corner lies above the horizon."""
-        squares = (self.residuals(np.stack(starts)) ** 2).sum(axis=1)
-        return starts[int(np.argmin(np.nan_to_num(squares, nan=np.inf)))]
+    middle = frame.center
+    to_middle = np.array([[1.0, 0.0, -middle[0]], [0.0, -1.0, middle[1]], [0.0, 0.0, 1.0]])
+    seen_by = to_middle @ Homography(homography).facing(middle).inverse().matrix
+    rotations, positions = _take_apart(seen_by, focals)
+    above = (positions[:, 2] > 0.0) & (rotations[:, 2, 2] > 1e-3)
+    rotations, positions, focals = rotations[above], positions[above], focals[above]
+    up = rotations[:, :, 2]
+    reach = positions[:, 2:] / up[:, 2:]
+    tilt = _tilts_to(up)
+    right = (np.swapaxes(_rotation(tilt), 1, 2) @ rotations)[:, :, 0]
+    ground, lean = (positions - reach * up)[:, :2], tilt[:, :2] / np.exp(np.log(focals) - log_focal)[:, None]
+    logs, heading = np.log(reach[:, 0] / focals), np.arctan2(right[:, 1], right[:, 0])
+    return np.column_stack([ground, logs, heading, lean, np.log(focals)])
 
 
 def _take_apart(seen_by: FloatArray, focals: FloatArray) -> tuple[FloatArray, FloatArray]:
@@ -219,33 +172,6 @@ def _take_apart(seen_by: FloatArray, focals: FloatArray) -> tuple[FloatArray, Fl
     return rotations, -np.einsum("fij,fj->fi", rotations, m[:, :, 2])
 
 
-def _fit(start: FloatArray, problem: _Problem, n_iterations: int) -> tuple[FloatArray, FloatArray] | None:
-    """Adjust parameters by Levenberg and Marquardt; return them and their covariance."""
-    p, damping = start, 1e-3
-    reach = math.exp(start[2] + start[6])
-    scale = np.array([reach, reach] + [1.0] * 5)
-    r = problem.residuals(p)
-    for _ in range(n_iterations):
-        jacobian = _differentiate(problem.residuals, p, scale)
-        normal = jacobian.T @ jacobian
-        step = np.linalg.solve(normal + damping * np.diag(np.diag(normal)), -jacobian.T @ r)
-        step = step / max(1.0, float(np.abs(step / scale).max()))  # no further than by its height, or a radian
-        tried = problem.residuals(p + step)
-        if not np.isfinite(tried).all() or tried @ tried > r @ r:
-            if np.abs(step / scale).max() < 1e-9:
-                break
-            damping *= 10.0
-            continue
-        done = float(r @ r - tried @ tried) < 1e-9 * float(r @ r) + 1e-12
-        p, r, damping = p + step, tried, damping / 10.0
-        if done:
-            break
-    if not np.isfinite(r).all() or problem.camera(p)[0][2] <= 0.0:
-        return None
-    jacobian = _differentiate(problem.residuals, p, scale)
-    return p, np.asarray(np.linalg.inv(jacobian.T @ jacobian))
-
-
 def _differentiate(function: Callable[[FloatArray], FloatArray], p: FloatArray, scale: FloatArray) -> FloatArray:
     """Differentiate a vector of values by the parameters, from both sides; the function takes many at once."""
     steps = np.diag(1e-6 * scale)
@@ -253,12 +179,20 @@ def _differentiate(function: Callable[[FloatArray], FloatArray], p: FloatArray, 
     return np.asarray((after - before).T / (2e-6 * scale))
 
 
-def _describe(p: FloatArray, covariance: FloatArray, problem: _Problem, options: PoseOptions) -> Pose:
+def _place(parameters: FloatArray, log_focal: float) -> tuple[FloatArray, FloatArray]:
+    """Return positions (..., 3) and rotations (..., 3, 3) of pinholes (..., 7)."""
+    rows = np.ascontiguousarray(parameters.reshape(-1, 7))
+    positions, rotations = np.empty((len(rows), 3)), np.empty((len(rows), 3, 3))
+    place_pinholes(rows, log_focal, positions, rotations)
+    return positions.reshape(*parameters.shape[:-1], 3), rotations.reshape(*parameters.shape[:-1], 3, 3)
+
+
+def _describe(p: FloatArray, covariance: FloatArray, log_focal: float, options: PoseOptions) -> Pose:
     """Take parameters and their covariance to those of position and angles."""
-    position, rotation = problem.camera(p)
+    position, rotation = _place(p, log_focal)
 
     def placed(parameters: FloatArray) -> FloatArray:
-        positions, rotations = problem.camera(parameters)
+        positions, rotations = _place(parameters, log_focal)
         away = (_angles(rotations) - _angles(rotation) + 180.0) % 360.0 - 180.0
         return np.concatenate((positions, away), axis=-1)
 
@@ -277,16 +211,18 @@ def _describe(p: FloatArray, covariance: FloatArray, problem: _Problem, options:
 def _rotation(vector: FloatArray) -> FloatArray:
     """Return the rotations (..., 3, 3) about vectors (..., 3) by their length, radians (Rodrigues)."""
     angle = np.linalg.norm(vector, axis=-1)[..., None, None]
-    cross = np.tensordot(vector, _CROSS, axes=1)
+    x, y, z = np.moveaxis(vector, -1, 0)
+    none = np.zeros_like(x)
+    cross = np.stack((none, -z, y, z, none, -x, -y, x, none), axis=-1).reshape(*vector.shape[:-1], 3, 3)
     half = 0.5 * np.sinc(angle / (2.0 * math.pi)) ** 2  # (1 - cos) / angle^2, also where that is 0 / 0
     return np.asarray(np.eye(3) + np.sinc(angle / math.pi) * cross + half * (cross @ cross))
 
 
-def _tilt_to(up: FloatArray) -> FloatArray:
-    """Return the level vector (2,), a turn by its length, radians, that takes (0, 0, 1) to a direction (3,)."""
-    level = math.hypot(up[0], up[1])
-    angle = math.atan2(level, up[2])
-    return np.array([-up[1], up[0]]) * (angle / level if level > 0.0 else 0.0)
+def _tilts_to(up: FloatArray) -> FloatArray:
+    """Return the level vectors (S, 3), turns by their length, radians, that take (0, 0, 1) to directions (S, 3)."""
+    level = np.hypot(up[:, 0], up[:, 1])
+    by = np.divide(np.arctan2(level, up[:, 2]), level, out=np.zeros_like(level), where=level > 0.0)
+    return np.column_stack([-up[:, 1] * by, up[:, 0] * by, np.zeros_like(by)])
 
 
 def _angles(rotation: FloatArray) -> FloatArray:
