@@ -214,6 +214,7 @@ _SEARCH = (
     "road_raster",
     "road_votes",
     "road_growth",
+    "pinhole_fit",
     "residuals",
     "lens",
 )

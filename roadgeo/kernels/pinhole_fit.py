@@ -134,6 +134,12 @@ def _squares(values: Floats1) -> float:
 
 
 @kernel()
+def _copy(source: Floats1, to: Floats1) -> None:
+    for k in range(to.shape[0]):
+        to[k] = source[k]
+
+
+@kernel()
 def fit_pinhole(starts: Floats2, corners: SeenCorners, n_iterations: int, p: Floats1, covariance: Floats2) -> bool:
     """Fit a pinhole by Levenberg and Marquardt, from the start that is nearest; return whether that worked.
 
@@ -150,7 +156,8 @@ def fit_pinhole(starts: Floats2, corners: SeenCorners, n_iterations: int, p: Flo
     for s in range(starts.shape[0]):
         if pinhole_residuals(starts[s], corners, tried) and _squares(tried) < least:
             least = _squares(tried)
-            p[:], r[:] = starts[s], tried
+            _copy(starts[s], p)
+            _copy(tried, r)
     if not least < np.inf:
         return False
     scale, normal, gradient = np.ones(N_PARAMETERS), np.empty((N_PARAMETERS, N_PARAMETERS)), np.empty(N_PARAMETERS)
@@ -160,17 +167,18 @@ def fit_pinhole(starts: Floats2, corners: SeenCorners, n_iterations: int, p: Flo
     for _ in range(n_iterations):
         if not _normal_equations(p, r, scale, corners, normal, gradient):
             return False
-        damped[:] = normal
         for k in range(N_PARAMETERS):
+            _copy(normal[k], damped[k])
             damped[k, k] *= 1.0 + damping
             step[k] = -gradient[k]
         if not cholesky(damped, factor):
             return False
         solve_cholesky(factor, step)
-        longest = np.max(np.abs(step / scale))
-        if longest > 1.0:  # no further than by its height, or a radian
-            step /= longest
-        moved[:] = p + step
+        longest = 0.0
+        for k in range(N_PARAMETERS):
+            longest = max(longest, abs(step[k] / scale[k]))
+        for k in range(N_PARAMETERS):
+            moved[k] = p[k] + step[k] / max(longest, 1.0)  # no further than by its height, or a radian
         now = _squares(tried) if pinhole_residuals(moved, corners, tried) else np.inf
         if not now <= least:
             if longest < 1e-9:
@@ -178,16 +186,17 @@ def fit_pinhole(starts: Floats2, corners: SeenCorners, n_iterations: int, p: Flo
             damping *= 10.0
             continue
         done = least - now < 1e-9 * least + 1e-12
-        p[:], r[:], least, damping = moved, tried, now, damping / 10.0
+        _copy(moved, p)
+        _copy(tried, r)
+        least, damping = now, damping / 10.0
         if done:
             break
     if not (_normal_equations(p, r, scale, corners, normal, gradient) and cholesky(normal, factor)):
         return False
     for k in range(N_PARAMETERS):
-        step[:] = 0.0
-        step[k] = 1.0
-        solve_cholesky(factor, step)
-        covariance[k] = step
+        for i in range(N_PARAMETERS):
+            covariance[k, i] = 1.0 if i == k else 0.0
+        solve_cholesky(factor, covariance[k])
     position, rotation = np.empty(3), np.empty((3, 3))
     _place(p, corners.log_focal, position, rotation)
     return bool(position[2] > 0.0)
