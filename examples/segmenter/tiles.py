@@ -34,12 +34,12 @@ class Tile:
         return self.truth[..., 0] > 127
 
 
-def read_tiles(folder: Path, limit: int | None = None, masks: Path | None = None) -> list[Tile]:
-    """Read `images/NAME.jpg` (or .tif, .png) with `masks/NAME.png`, in order of name; or with masks of elsewhere."""
+def read_tiles(folder: Path, limit: int | None = None) -> list[Tile]:
+    """Read `images/NAME.jpg` (or .tif, .png) with `masks/NAME.png`, in order of name."""
     photos = sorted(p for p in (folder / "images").iterdir() if p.suffix.lower() in {".jpg", ".jpeg", ".png", ".tif"})
     if not photos:
         raise SystemExit(f"{folder}/images: holds no photographs; expected NAME.jpg, .png or .tif")
-    return [_read(path, (masks or folder / "masks") / f"{path.stem}.png") for path in photos[:limit]]
+    return [_read(path, folder / "masks" / f"{path.stem}.png") for path in photos[:limit]]
 
 
 def fold_of(index: int, folds: int) -> int:

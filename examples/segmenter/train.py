@@ -30,7 +30,7 @@ RUN_AT = 1.0  # metres per pixel at which the network sees them
 def main(arguments: list[str] | None = None) -> None:
     options = _parse(arguments)
     torch.set_num_threads(options.threads)
-    tiles = read_tiles(options.data, limit=4 if options.quick else None, masks=options.masks)
+    tiles = read_tiles(options.data, limit=4 if options.quick else None)
     training = TrainingOptions(
         steps=options.steps,
         batch=options.batch,
@@ -91,7 +91,6 @@ def _parse(arguments: list[str] | None) -> argparse.Namespace:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("data", type=Path, help="folder with images/ and masks/")
     parser.add_argument("--out", type=Path, required=True, help="folder for checkpoints, maps and the model")
-    parser.add_argument("--masks", type=Path, help="folder of masks to learn from, as align.py moves them")
     parser.add_argument("--only", help="one run: the number of a fold, or all")
     parser.add_argument("--folds", type=int, default=3)
     parser.add_argument("--network", choices=sorted(RECIPES), default="pretrained", help="what is trained")

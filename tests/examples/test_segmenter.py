@@ -92,32 +92,6 @@ def test_two_networks_become_one_the_second_turned_by_half(data: Path, tmp_path:
     assert paths[3].stat().st_size < 1.1 * paths[0].stat().st_size  # its weights are kept once
 
 
-@pytest.mark.skipif(importlib.util.find_spec("skimage") is None, reason="the recipe needs scikit-image")
-def test_masks_are_moved_to_where_roads_are_seen(data: Path, tmp_path: Path) -> None:
-    maps, moved = tmp_path / "maps", tmp_path / "moved"
-    maps.mkdir()
-    off = {"t0": (0, 0), "t1": (4, -3), "t2": (-6, 2), "t3": (5, 5)}  # x, y; of t3 half is not observed
-    seen = {}
-    for name, (x, y) in off.items():
-        mask = cv2.imread(str(data / "masks" / f"{name}.png"), cv2.IMREAD_GRAYSCALE)
-        mask[:60] = mask[:, 280:] = 0  # not the same in every direction
-        cv2.imwrite(str(data / "masks" / f"{name}.png"), mask)
-        seen[name] = np.roll(mask, (y, x), (0, 1))
-        cv2.imwrite(str(maps / f"{name}.png"), np.dstack([seen[name]] * 3 + [np.full_like(mask, 255)]))
-    command = [sys.executable, str(RECIPE / "align.py"), str(data), str(maps), str(moved)]
-    done = subprocess.run(command, capture_output=True, text=True, check=True)
-    assert "t1: moved by 5.0 px in the mean, 5.0 at most" in done.stdout
-    for name in off:
-        mask = cv2.imread(str(moved / f"{name}.png"), cv2.IMREAD_GRAYSCALE)
-        both, either = ((mask > 127) & (seen[name] > 127)), ((mask > 127) | (seen[name] > 127))
-        inside = np.s_[20:300, 170:300] if name == "t3" else np.s_[20:300, 20:300]
-        assert both[inside].sum() > 0.97 * either[inside].sum()
-    (maps / "t2.png").unlink()
-    done = subprocess.run(command, capture_output=True, text=True, check=False)
-    assert done.returncode == 1
-    assert "no map of t2 at 1 m; expected one of every photograph" in done.stderr
-
-
 def test_the_model_that_ships_is_small_and_has_a_card() -> None:
     assert 1e6 < MODEL.stat().st_size <= 10e6
     card = MODEL.with_suffix(".md").read_text()
