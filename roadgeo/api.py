@@ -254,7 +254,7 @@ def _told(options: LocateOptions) -> dict[str, Any]:
     from roadgeo.running.batch import changed_options
 
     plain: dict[str, Any] = json.loads(
-        json.dumps(changed_options(replace(options, truths=(), threads=1), LocateOptions()))
+        json.dumps(changed_options(replace(options, truths=(), threads=1), LocateOptions()), default=repr)
     )
     return plain
 

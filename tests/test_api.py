@@ -1,6 +1,7 @@
 """What Python programs call, with all that they may have at hand."""
 
 import json
+from dataclasses import replace
 from pathlib import Path
 
 import cv2
@@ -12,6 +13,8 @@ import roadgeo
 from roadgeo.errors import MaskError, NotLocatedError
 from roadgeo.evaluation.demo import PHOTO, ROADS, demo_masks
 from roadgeo.matching.options import LocateOptions
+from roadgeo.matching.sweeps import Sweep
+from roadgeo.matching.triples import TripleOptions
 from roadgeo.reference.inspection import reference_digest
 from roadgeo.sources.roads import read_roads
 
@@ -92,6 +95,13 @@ def test_an_answer_says_what_was_asked_and_of_which_map(porto: roadgeo.Reference
         assert len(repr(one)) < 200
     (written,) = (path for path in found.write(tmp_path) if path.suffix == ".json")
     assert json.loads(written.read_text())["reference_digest"] == found.reference_digest
+
+
+def test_an_answer_tells_of_options_within_options(porto: roadgeo.Reference) -> None:
+    match = replace(QUICK.match, sweeps=(Sweep(TripleOptions(n_neighbours=9), 7),))
+    said = roadgeo.locate(DRONE, porto, replace(QUICK, match=match)).options
+    (sweep,) = said["match"]["sweeps"]
+    assert (sweep["max_anchors"], sweep["triples"]["n_neighbours"]) == (7, 9)
 
 
 def test_what_is_known_narrows_the_search(porto: roadgeo.Reference) -> None:

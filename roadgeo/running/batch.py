@@ -348,13 +348,23 @@ class Asked:
 
 
 def changed_options(options: Any, usual: Any) -> dict[str, Any]:
-    """Return the fields of options that differ from the usual ones; of nested ones likewise."""
+    """Return the fields of options that differ from the usual ones, as JSON holds them; of nested ones likewise."""
     changed = {}
     for one in dataclasses.fields(options):
         value, default = getattr(options, one.name), getattr(usual, one.name)
         if value != default:
-            changed[one.name] = changed_options(value, default) if dataclasses.is_dataclass(value) else value
+            alike = dataclasses.is_dataclass(value) and type(value) is type(default)
+            changed[one.name] = changed_options(value, default) if alike else _as_json(value)
     return changed
+
+
+def _as_json(value: Any) -> Any:
+    """Return a value of an option with all options within it, as JSON holds it."""
+    if dataclasses.is_dataclass(value) and not isinstance(value, type):
+        return {one.name: _as_json(getattr(value, one.name)) for one in dataclasses.fields(value)}
+    if isinstance(value, tuple | list):
+        return [_as_json(one) for one in value]
+    return value
 
 
 #: What each kind of error means to programs: names in `location.Reason`.
