@@ -36,7 +36,7 @@ from roadgeo.matching.road_search import RoadSearchOptions
 from roadgeo.matching.road_views import RoadViews
 from roadgeo.matching.scene import Scene
 from roadgeo.matching.shared_sweeps import SharedSweeps, Stage
-from roadgeo.matching.sweeps import LAST, USUAL, Source, Sweep
+from roadgeo.matching.sweeps import BEFORE_ROADS, WITHOUT_ROADS, Source, Sweep
 from roadgeo.matching.tilted import TiltOptions
 from roadgeo.matching.trace import NO_TRACE, Trace
 from roadgeo.matching.triples import Proposals, larger
@@ -57,18 +57,18 @@ _ROUGHLY_DEG = 25.0
 class MatchOptions:
     """Options of all stages of matching, nested.
 
-    The sweeps follow one another until a place stands out; where they lead nowhere, roads propose, or, where these are
-    left out, the `last` sweeps. Of 384 broken masks of four cities the sweeps and roads found 338; the last sweep, and
-    single triples that followed it then, found one more.
+    The sweeps follow one another until a place stands out; where they lead nowhere, roads propose.
 
     Attributes
     ----------
+    sweeps, without_roads : tuple of Source
+        The sweeps where roads propose after them, and where these are left out: they go on for longer then.
     sightings : int
         Anchors that must lead to a place before it ends the search: a map may hold its twin.
     certain : float
         A place with these log10 odds needs no twins to be looked for among streets that repeat.
     roads : RoadSearchOptions or None
-        What follows where no triple leads to a place: None for the `last` sweeps.
+        What follows where no triple leads to a place: None for more sweeps.
     lens : LensOptions or None
         Of a lens that is looked for behind promising places, and behind others that roads led to: None for a pinhole.
     tilted : TiltOptions or None
@@ -81,8 +81,8 @@ class MatchOptions:
         Degrees: the middle of the frame is known to lie there (see `geometry.areas`).
     """
 
-    sweeps: tuple[Source, ...] = USUAL
-    last: tuple[Source, ...] = LAST
+    sweeps: tuple[Source, ...] = BEFORE_ROADS
+    without_roads: tuple[Source, ...] = WITHOUT_ROADS
     grow: GrowOptions = field(default_factory=GrowOptions)
     verify: VerifyOptions = field(default_factory=VerifyOptions)
     refine: RefineOptions = field(default_factory=RefineOptions)
@@ -143,7 +143,7 @@ class TripleEstimator:
         On a coarse map roads come first: an intersection is seldom merged there as a mask shows it.
         """
         options, by_roads = self.options, self.options.roads is not None and len(self.scene.intersections) > 0
-        sources = options.sweeps if by_roads else options.sweeps + options.last
+        sources = options.sweeps if by_roads else options.without_roads
         sweeps = [self.sweeps.rounds(self, Stage(stage, source, options.grow)) for stage, source in enumerate(sources)]
         if not by_roads:
             yield from sweeps

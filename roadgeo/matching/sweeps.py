@@ -12,7 +12,7 @@ from roadgeo.matching.index import ReferenceIndex
 from roadgeo.matching.scene import Scene
 from roadgeo.matching.triples import Proposals, TripleOptions, propose, smaller
 
-__all__ = ["LAST", "USUAL", "Source", "Sweep"]
+__all__ = ["BEFORE_ROADS", "WITHOUT_ROADS", "Source", "Sweep"]
 
 
 class Source(Protocol):
@@ -68,7 +68,11 @@ class Sweep:
 _FURTHER = TripleOptions(n_neighbours=12, max_hits=20_000, max_compared=500_000, spread=True)
 
 
-#: The sweeps that follow one another until a place stands out.
-USUAL: tuple[Source, ...] = (Sweep(TripleOptions(), 40), Sweep(replace(_FURTHER, angle_tolerance_deg=7.5), 30))
-#: The last resort where roads propose nothing.
-LAST: tuple[Source, ...] = (Sweep(replace(_FURTHER, angle_tolerance_deg=10.0), 20),)
+#: The sweeps that follow one another where roads propose after them: of the rarest triples few intersections suffice.
+BEFORE_ROADS: tuple[Source, ...] = (Sweep(TripleOptions(), 12), Sweep(replace(_FURTHER, angle_tolerance_deg=7.5), 30))
+#: Those where roads propose nothing.
+WITHOUT_ROADS: tuple[Source, ...] = (
+    Sweep(TripleOptions(), 40),
+    Sweep(replace(_FURTHER, angle_tolerance_deg=7.5), 30),
+    Sweep(replace(_FURTHER, angle_tolerance_deg=10.0), 20),
+)

@@ -13,6 +13,7 @@ from roadgeo.matching.index import build_index
 from roadgeo.matching.ledger import Ledger
 from roadgeo.matching.scene import query_neighbours
 from roadgeo.matching.search import Search, SearchOptions, search, search_together
+from roadgeo.matching.sweeps import WITHOUT_ROADS
 from roadgeo.matching.triples import TripleOptions
 from roadgeo.reference.reference import build_network
 
@@ -129,7 +130,7 @@ def test_little_to_see(town, scene, n):
     few = replace(found, xy=found.xy[:n], rays=found.rays[:n], tangents=found.tangents[:n])
     neighbours = query_neighbours(few.xy, 8) if n else np.empty((0, 8), np.int32)
     little = replace(scene, intersections=few, branches=scene.branches[:n], neighbours=neighbours)
-    result, _ = locate(little, town[1], MatchOptions(last=(), roads=None))
+    result, _ = locate(little, town[1], MatchOptions(without_roads=WITHOUT_ROADS[:2], roads=None))
     assert result.score < 6
     by_roads, _ = locate(little, town[1])
     assert (by_roads.score > 6) == (n > 0)  # one intersection and all the roads are enough
@@ -144,7 +145,7 @@ def test_road_points_far_from_the_anchor(town, scene):
 @pytest.mark.parametrize("most", [0, 300])
 def test_places_are_bounded(town, most):
     stranger = scene_of(look(random_network(3, 2000.0), camera((1000, 1000)), sight=Sight(0.5)))
-    options = MatchOptions(max_places=most, last=(), roads=None)
+    options = MatchOptions(max_places=most, without_roads=WITHOUT_ROADS[:2], roads=None)
     result, estimator = locate(stranger, town[1], options)
     assert result.stopped == "exhausted"
     assert estimator.n_screened <= most + options.grow.max_screened
@@ -152,7 +153,10 @@ def test_places_are_bounded(town, most):
 
 def test_places_on_many_maps_are_bounded_as_on_one(town):
     stranger = scene_of(look(random_network(3, 2000.0), camera((1000, 1000)), sight=Sight(0.5)))
-    options, ledger = MatchOptions(max_places=40, last=(), roads=None), Ledger(n_reference=3 * len(town[1]))
+    options, ledger = (
+        MatchOptions(max_places=40, without_roads=WITHOUT_ROADS[:2], roads=None),
+        Ledger(n_reference=3 * len(town[1])),
+    )
     parts = [TripleEstimator(stranger, town[1], options, ledger=ledger) for _ in range(3)]
     search_together([Search(one) for one in parts], SearchOptions(time_limit_s=60.0))
     assert ledger.n_tried == ledger.n_by_triples == sum(one.n_screened for one in parts)

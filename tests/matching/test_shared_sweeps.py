@@ -14,7 +14,7 @@ from roadgeo.matching.index import build_index
 from roadgeo.matching.ledger import Ledger
 from roadgeo.matching.search import Search, SearchOptions, search_together
 from roadgeo.matching.shared_sweeps import SharedSweeps, Stage
-from roadgeo.matching.sweeps import Sweep
+from roadgeo.matching.sweeps import WITHOUT_ROADS, Sweep
 from roadgeo.matching.triples import Proposals, TripleOptions
 
 
@@ -145,7 +145,11 @@ def test_a_place_is_found_on_any_of_many_towns(towns):
 @pytest.mark.slow
 def test_a_twin_on_another_part_is_met(towns):
     networks, indexes = towns
-    parts = search_all(scene_of(look(networks[1], TRUTH)), [*indexes, indexes[1]], MatchOptions(last=(), roads=None))
+    parts = search_all(
+        scene_of(look(networks[1], TRUTH)),
+        [*indexes, indexes[1]],
+        MatchOptions(without_roads=WITHOUT_ROADS[:2], roads=None),
+    )
     assert "accepted" not in [one.stopped for one in parts]
     assert min(parts[1].lead, parts[4].lead) > 8.0
 
@@ -154,7 +158,7 @@ def test_many_parts_take_as_many_places_as_one(towns):
     """Of one anchor's proposals on all parts as many are screened and verified as on one map."""
     _, indexes = towns
     stranger = scene_of(look(random_network(3, 2000.0), TRUTH))
-    options = MatchOptions(sweeps=(Sweep(TripleOptions(), 1),), last=(), roads=None, grow=GrowOptions(max_screened=50))
+    options = MatchOptions(without_roads=(Sweep(TripleOptions(), 1),), roads=None, grow=GrowOptions(max_screened=50))
     parts = search_all(stranger, indexes, options)
     assert sum(one.estimator.n_screened for one in parts) <= 3 * 50
     assert sum(one.n_scored for one in parts) <= 3 * options.grow.max_verified
