@@ -39,7 +39,7 @@ def ask_mirrored(
     turned = sighting.mask.mirrored()
     if not allowed:
         search = replace(options.search, work_limit_s=min(_WORK_LIMIT_S, options.search.work_limit_s))
-        match = replace(options.match, without_roads=options.match.sweeps[:1])
+        match = replace(options.match, without_roads=options.match.without_roads[:1])
         options = replace(options, effort="quick", search=search, match=match)
     found = locate(turned, references, options)
     if allowed and found.located:
