@@ -65,14 +65,15 @@ class Sweep:
 
 
 #: Where the rarest triples lead nowhere, more neighbours are taken, all over the frame.
-_FURTHER = TripleOptions(n_neighbours=12, max_hits=20_000, max_compared=500_000, spread=True)
+_FURTHER = TripleOptions(n_neighbours=12, max_hits=20_000, max_compared=500_000, spread=True, angle_tolerance_deg=7.5)
+_SECOND = Sweep(_FURTHER, 30)
 
 
 #: The sweeps that follow one another where roads propose after them: of the rarest triples few intersections suffice.
-BEFORE_ROADS: tuple[Source, ...] = (Sweep(TripleOptions(), 12), Sweep(replace(_FURTHER, angle_tolerance_deg=7.5), 30))
+BEFORE_ROADS: tuple[Source, ...] = (Sweep(TripleOptions(), 12), _SECOND)
 #: Those where roads propose nothing.
 WITHOUT_ROADS: tuple[Source, ...] = (
     Sweep(TripleOptions(), 40),
-    Sweep(replace(_FURTHER, angle_tolerance_deg=7.5), 30),
+    _SECOND,
     Sweep(replace(_FURTHER, angle_tolerance_deg=10.0), 20),
 )

@@ -359,12 +359,10 @@ def changed_options(options: Any, usual: Any) -> dict[str, Any]:
 
 
 def _as_json(value: Any) -> Any:
-    """Return a value of an option with all options within it, as JSON holds it."""
-    if dataclasses.is_dataclass(value) and not isinstance(value, type):
-        return {one.name: _as_json(getattr(value, one.name)) for one in dataclasses.fields(value)}
-    if isinstance(value, tuple | list):
+    """Return an option's value, with the options within it, as JSON holds it."""
+    if isinstance(value, tuple):
         return [_as_json(one) for one in value]
-    return value
+    return dataclasses.asdict(value) if dataclasses.is_dataclass(value) and not isinstance(value, type) else value
 
 
 #: What each kind of error means to programs: names in `location.Reason`.

@@ -153,10 +153,8 @@ def test_places_are_bounded(town, most):
 
 def test_places_on_many_maps_are_bounded_as_on_one(town):
     stranger = scene_of(look(random_network(3, 2000.0), camera((1000, 1000)), sight=Sight(0.5)))
-    options, ledger = (
-        MatchOptions(max_places=40, without_roads=WITHOUT_ROADS[:2], roads=None),
-        Ledger(n_reference=3 * len(town[1])),
-    )
+    options = MatchOptions(max_places=40, without_roads=WITHOUT_ROADS[:2], roads=None)
+    ledger = Ledger(n_reference=3 * len(town[1]))
     parts = [TripleEstimator(stranger, town[1], options, ledger=ledger) for _ in range(3)]
     search_together([Search(one) for one in parts], SearchOptions(time_limit_s=60.0))
     assert ledger.n_tried == ledger.n_by_triples == sum(one.n_screened for one in parts)
