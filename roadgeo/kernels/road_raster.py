@@ -14,7 +14,7 @@ import numpy as np
 from roadgeo.kernels.arrays import Int32s2, Singles2, Words3
 from roadgeo.kernels.compilation import kernel
 
-__all__ = ["DIRECTIONS", "TILE", "Raster", "mark_tiles", "measure_tiles", "paint_roads", "passes", "passes_cell"]
+__all__ = ["DIRECTIONS", "TILE", "Raster", "mark_tiles", "measure_tiles", "paint_roads", "passes"]
 
 #: Ranges of direction, and cells along a tile's side (a power of two).
 DIRECTIONS = 16
@@ -148,12 +148,7 @@ def passes(x: float, y: float, direction: int, raster: Raster) -> int:
 
     The place must lie inside the raster.
     """
-    return passes_cell(np.uint32(x), np.uint32(y), np.uint32(direction), raster)
-
-
-@kernel(forceinline=True)
-def passes_cell(column: np.uint32, row: np.uint32, direction: np.uint32, raster: Raster) -> int:
-    """Return 1 if a road of direction range `direction` passes a cell of the raster."""
+    column, row = np.uint32(x), np.uint32(y)
     tile = np.uint32(raster.tile_of[row >> np.uint32(_SHIFT), column >> np.uint32(_SHIFT)])
     word = raster.bits[tile, row & np.uint32(TILE - 1), column & np.uint32(TILE - 1)]
-    return int(np.int64((np.uint32(word) >> direction) & np.uint32(1)))  # signed, as the sums it goes into
+    return int(np.int64((np.uint32(word) >> np.uint32(direction)) & np.uint32(1)))  # signed, as the sums it goes into

@@ -6,12 +6,13 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from roadgeo.kernels.arrays import Floats1, Floats2, Ints1, Singles2, UInt32s2
+from roadgeo.kernels.arrays import Floats1, Floats2, Int32s2, Ints1, Singles2, UInt32s2, UInt64s1, Words1
 from roadgeo.kernels.compilation import kernel
-from roadgeo.kernels.road_raster import DIRECTIONS, Raster, passes, passes_cell
+from roadgeo.kernels.road_raster import DIRECTIONS, TILE, Raster, passes
 
 __all__ = [
     "BLOCK",
+    "NOWHERE",
     "TURNS",
     "LaidPoints",
     "Places",
@@ -35,8 +36,13 @@ _LEAST_RATE = 0.03
 BLOCK = 8
 #: Points are turned by one of so many angles: at 200 m from the intersection they lie 5 m off at most.
 TURNS = 128
-#: Where a laid point lies, in eighths of a cell and from so many on, and the bits that this takes.
-_FINE, _MIDDLE, _BITS = 8, 8192, 14
+#: A laid point lies so many eighths of a cell east and north of the tile's corner that is one tile west and south of an
+#: intersection's. Of the bits of each the lowest 3 are eighths, the next 6 cells, and the last 2 tiles, of which the
+#: fourth is empty.
+_FINE, _BITS = 8, 11
+_MIDDLE = TILE * _FINE
+#: A point that meets no road.
+NOWHERE = 3 * TILE * _FINE
 
 
 class Places(NamedTuple):
@@ -69,8 +75,8 @@ class LaidPoints(NamedTuple):
 
     `scales` (S,) and `counts` (S,) are the scales and how many points each has. `words` (TURNS, B * S * BLOCK) uint32
     holds for each turn the first BLOCK points of all scales, then the next ones, and so on: few are looked up beyond
-    the first. The lowest 14 bits of a word are x from the query intersection, the next 14 y, in eighths of a cell from
-    -1024 cells on, the highest 4 the direction.
+    the first. The lowest 11 bits of a word are x from the query intersection, the next 11 y, in eighths of a cell from
+    -64 cells, a tile, on, and 4 more the direction. Where a scale has no point the word is NOWHERE.
     """
 
     scales: Floats1
@@ -111,21 +117,27 @@ def find_turns(rays: Floats1, directions: Singles2, j: int, tolerance: float, tu
     n, m = 0, 0
     while m < directions.shape[1] and not math.isnan(directions[j, m]):
         m += 1
+    least = max(2, min(rays.shape[0], m))
     for i in range(rays.shape[0]):
         for t in range(m):
             first = directions[j, t] - rays[i]
-            total, agreeing = 0.0, 1
+            total, agreeing, left = 0.0, 1, rays.shape[0] - 1
             for k in range(rays.shape[0]):
+                if k == i:
+                    continue
+                if agreeing + left < least:
+                    break
+                left -= 1
                 best = tolerance
                 for u in range(m):
-                    if k != i and u != t:
+                    if u != t:
                         away = _wrapped(directions[j, u] - rays[k] - first)
                         if abs(away) < abs(best):
                             best = away
                 if best != tolerance:
                     total += best
                     agreeing += 1
-            if agreeing < max(2, min(rays.shape[0], m)):
+            if agreeing < least:
                 continue
             turn = _wrapped(first + total / agreeing)
             new = n < turns.shape[0]
@@ -158,16 +170,27 @@ def _count_met(
 
 
 @kernel(forceinline=True)
-def _count_laid(words: UInt32s2, turn: int, first: int, n: int, x: int, y: int, raster: Raster) -> int:
-    """Count the points `first` to `first + n` that meet roads, laid on (x, y), in eighths of a cell from the corner."""
+def _count_laid(words: UInt32s2, turn: int, first: int, place: np.uint32, around: UInt64s1, bits: Words1) -> int:
+    """Count the points of a block, from word `first` on, that meet roads when they are laid on a place.
+
+    `around` says where the cells of each tile begin, four a row; see `LaidPoints` for `place`, which is no direction.
+    """
     met = 0
-    mask = np.uint32((1 << _BITS) - 1)
-    for i in range(np.uint64(first), np.uint64(first + n)):
-        word = words[np.uint64(turn), i]
-        column = np.uint32((x + np.int64(word & mask)) // _FINE)
-        row = np.uint32((y + np.int64((word >> np.uint32(_BITS)) & mask)) // _FINE)
-        met += passes_cell(column, row, word >> np.uint32(2 * _BITS), raster)
+    for i in range(BLOCK):
+        word = np.uint32(words[np.uint64(turn), np.uint64(first + i)] + place)
+        tile = ((word >> np.uint32(9)) & np.uint32(3)) | ((word >> np.uint32(18)) & np.uint32(12))
+        cell = ((word >> np.uint32(3)) & np.uint32(0x3F)) | ((word >> np.uint32(8)) & np.uint32(0xFC0))
+        directions = np.uint32(bits[around[tile] + np.uint64(cell)])
+        met += int(np.int64((directions >> (word >> np.uint32(2 * _BITS))) & np.uint32(1)))
     return met
+
+
+@kernel(forceinline=True)
+def _find_tiles(row: int, column: int, tile_of: Int32s2, around: UInt64s1) -> None:
+    """Fill in where the cells of a tile and of its neighbours begin, four a row, of which the last is empty."""
+    for i in range(3):
+        for k in range(3):
+            around[4 * i + k] = np.uint64(tile_of[row + i - 1, column + k - 1]) * np.uint64(TILE * TILE)
 
 
 @kernel()
@@ -177,7 +200,7 @@ def lay_points(points: RoadPoints, cell: float, words: UInt32s2) -> None:
     Parameters
     ----------
     points : RoadPoints
-        None lies further than 1000 cells from the intersection.
+        All lie less than TILE - 1 cells from the intersection.
     cell : float
         Of the raster, metres.
     words : (TURNS, B * S * BLOCK) uint32
@@ -300,47 +323,63 @@ def vote(
     """
     turns = np.empty(MAX_TURNS)
     rates, gains, losses = np.empty(_LEVELS), np.empty(_LEVELS), np.empty(_LEVELS)
-    # what a hit and a miss weigh, by the chance rate
-    for level in range(_LEVELS):
-        rates[level] = min(max((level + 0.5) / _LEVELS, _LEAST_RATE), 0.8 * trial.hit_rate)
-        gains[level] = math.log(trial.hit_rate / rates[level])
-        losses[level] = math.log((1.0 - trial.hit_rate) / (1.0 - rates[level]))
+    _weigh(trial, rates, gains, losses)
     tried = 0
     n_scales, n_turns = laid.scales.shape[0], laid.words.shape[0]
+    bits, around, met_first = raster.bits.reshape(-1), np.zeros(16, np.uint64), np.empty(n_scales, np.int64)
+    row, column = -1, -1
     for index in range(candidates.shape[0]):
         j = candidates[index]
-        x, y = int(places.cells[j, 0] * _FINE) - _MIDDLE, int(places.cells[j, 1] * _FINE) - _MIDDLE
+        x, y = int(places.cells[j, 0] * _FINE), int(places.cells[j, 1] * _FINE)
+        if y // _MIDDLE != row or x // _MIDDLE != column:
+            row, column = y // _MIDDLE, x // _MIDDLE
+            _find_tiles(row, column, raster.tile_of, around)
+        place = np.uint32((x % _MIDDLE) | ((y % _MIDDLE) << _BITS))
         for t in range(find_turns(rays, places.directions, j, tolerance, turns)):
             turn = turns[t]
             if abs(turn) > max_turn:
                 continue
             tried += 1
-            best, where, rate = 0.0, -1, 0.0
+            k = round(turn * n_turns / (2.0 * math.pi)) % n_turns
+            # the first block of all scales, without a branch: processors overlap them
+            for s in range(n_scales):
+                met_first[s] = _count_laid(laid.words, k, s * BLOCK, place, around, bits)
             # the best scale: points are counted in blocks, and a scale is left when it has lost too much, or when all
             # points that are left would not make it better than another scale and the worst vote that is kept
+            best, where, rate = 0.0, -1, 0.0
             least = votes[0, 3] if kept == votes.shape[0] else 0.0
-            k = round(turn * n_turns / (2.0 * math.pi)) % n_turns
             for s in range(n_scales):
-                first, left = s * BLOCK, laid.counts[s]
                 level = int(min(chance[s] * places.density[j], 0.99) * _LEVELS)
-                ratio = 0.0
-                enough = max(best, least)
+                left, enough = laid.counts[s], max(best, least)
+                if gains[level] * left <= enough:
+                    continue
+                n, first = min(BLOCK, left), (n_scales + s) * BLOCK
+                ratio = gains[level] * met_first[s] + losses[level] * (n - met_first[s])
+                left -= n
                 while left > 0 and ratio >= -trial.patience and ratio + gains[level] * left > enough:
                     n = min(BLOCK, left)
-                    met = _count_laid(laid.words, k, first, n, x, y, raster)
+                    met = _count_laid(laid.words, k, first, place, around, bits)
                     ratio += gains[level] * met + losses[level] * (n - met)
                     first += n_scales * BLOCK
                     left -= n
                 if ratio > best:
                     best, where, rate = ratio, s, rates[level]
-            # the heap keeps the best votes
             if where >= 0 and (kept < votes.shape[0] or best > votes[0, 3]):
-                row = kept if kept < votes.shape[0] else 0
+                slot = kept if kept < votes.shape[0] else 0  # the last, or that of the worst vote
                 kept = min(kept + 1, votes.shape[0])
-                votes[row, 0], votes[row, 1], votes[row, 2] = j, turn, laid.scales[where]
-                votes[row, 3], votes[row, 4] = best, rate
-                _sift(votes, row, kept)
+                votes[slot, 0], votes[slot, 1], votes[slot, 2] = j, turn, laid.scales[where]
+                votes[slot, 3], votes[slot, 4] = best, rate
+                _sift(votes, slot, kept)
     return kept, tried
+
+
+@kernel()
+def _weigh(trial: Trial, rates: Floats1, gains: Floats1, losses: Floats1) -> None:
+    """Fill in chance rates, and what a hit and a miss weigh against each of them."""
+    for level in range(rates.shape[0]):
+        rates[level] = min(max((level + 0.5) / rates.shape[0], _LEAST_RATE), 0.8 * trial.hit_rate)
+        gains[level] = math.log(trial.hit_rate / rates[level])
+        losses[level] = math.log((1.0 - trial.hit_rate) / (1.0 - rates[level]))
 
 
 @kernel()

@@ -20,6 +20,7 @@ from roadgeo._arrays import BoolArray, FloatArray, IntArray
 from roadgeo.kernels.road_raster import DIRECTIONS
 from roadgeo.kernels.road_votes import (
     BLOCK,
+    NOWHERE,
     TURNS,
     LaidPoints,
     Places,
@@ -226,7 +227,7 @@ class Voter:
         """Turn and scale points to cells of the raster."""
         counts = np.diff(points.starts)
         n_blocks = -(-int(counts.max(initial=0)) // BLOCK)
-        words = np.empty((TURNS, n_blocks * len(counts) * BLOCK), np.uint32)
+        words = np.full((TURNS, n_blocks * len(counts) * BLOCK), NOWHERE, np.uint32)
         lay_points(points, self.drawn.raster.cell, words)
         return LaidPoints(points.scales, counts, words)
 

@@ -14,7 +14,6 @@ from roadgeo.kernels.road_raster import (
     measure_tiles,
     paint_roads,
     passes,
-    passes_cell,
 )
 
 X0, Y0, CELL, REACH, TURN = -700.0, 300.0, 5.0, 7.0, math.radians(20)
@@ -47,7 +46,6 @@ def test_cells_near_a_road_hold_its_direction(seed):
         assert naive.word_at(row, column, raster.tile_of, raster.bits) == expected
         for d in range(DIRECTIONS):
             assert passes(column + 0.3, row + 0.9, d, raster) == expected >> d & 1
-            assert passes_cell(np.uint32(column), np.uint32(row), np.uint32(d), raster) == expected >> d & 1
 
 
 def test_only_tiles_with_roads_are_stored():

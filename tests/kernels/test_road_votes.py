@@ -12,6 +12,7 @@ from roadgeo.kernels.road_raster import DIRECTIONS, TILE, Raster
 from roadgeo.kernels.road_votes import (
     BLOCK,
     MAX_TURNS,
+    NOWHERE,
     TURNS,
     LaidPoints,
     Places,
@@ -73,9 +74,9 @@ def world(seed, n_places=30):
     rng = np.random.default_rng(seed)
     words = rng.integers(0, 2**16, (5, TILE, TILE), np.uint16)  # half of all bits: many places have a vote
     words[0] = 0
-    tile_of = np.array([[0, 1, 2], [3, 4, 0], [1, 0, 2]], np.int32)
+    tile_of = np.array([[0, 1, 2, 0], [3, 4, 0, 1], [1, 2, 3, 4], [0, 1, 4, 2]], np.int32)
     directions = np.concatenate([packed(rng.uniform(-3, 3, 3)) for _ in range(n_places)])
-    places = Places(rng.uniform(60, 130, (n_places, 2)), directions, rng.uniform(0.05, 0.2, n_places))
+    places = Places(rng.uniform(64, 192, (n_places, 2)), directions, rng.uniform(0.05, 0.2, n_places))
     offsets = rng.uniform(-60, 60, (90, 2))
     scales = np.array([1.0, 2.0, 3.0])
     points = RoadPoints(scales, np.array([0, 40, 40, 90]), offsets, rng.uniform(0, 2 * DIRECTIONS, 90))
@@ -85,7 +86,7 @@ def world(seed, n_places=30):
 def laid(points, cell):
     """The points, turned and scaled beforehand."""
     counts = np.diff(points.starts)
-    words = np.zeros((TURNS, -(-counts.max() // BLOCK) * len(counts) * BLOCK), np.uint32)
+    words = np.full((TURNS, -(-counts.max() // BLOCK) * len(counts) * BLOCK), NOWHERE, np.uint32)
     lay_points(points, cell, words)
     return LaidPoints(points.scales, counts, words)
 
@@ -138,10 +139,10 @@ class TestVote:
             for s, scale in enumerate(points.scales):
                 for q, i in enumerate(range(points.starts[s], points.starts[s + 1])):
                     word = int(ready.words[k, (q // BLOCK * len(points.scales) + s) * BLOCK + q % BLOCK])
-                    at = np.array([word & 16383, word >> 14 & 16383]) / 8 - 1024
+                    at = np.array([word & 2047, word >> 11 & 2047]) / 8 - TILE
                     turned = np.array([[math.cos(turn), -math.sin(turn)], [math.sin(turn), math.cos(turn)]])
                     assert np.abs(at - turned @ points.offsets[i] * scale / raster.cell).max() < 0.063
-                    assert word >> 28 == math.floor(points.angles[i] + turn * DIRECTIONS / math.pi) % DIRECTIONS
+                    assert word >> 22 == math.floor(points.angles[i] + turn * DIRECTIONS / math.pi) % DIRECTIONS
 
     def test_improving_looks_at_all_steps(self):
         raster, places, points, _ = world(5)

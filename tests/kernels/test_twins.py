@@ -27,7 +27,6 @@ TWINS = {
     "smooth_chains": "smooth_chain",
     "tie_runs": "runs",
     "vertex_probes": "alike",
-    "passes_cell": "word_at",
     "vote": "ratio",
     "lay_points": "laid_hits",
     "improve_votes": "hits",
