@@ -1,10 +1,11 @@
 """Trained networks as ONNX, with the metadata that QGIS Deepness and GeoDeep read.
 
-    python export.py one/roads.onnx other/roads.onnx roads.onnx    # two that were exported, as one
-    python export.py one/roads.onnx one/roads.onnx roads.onnx      # one, shown each picture twice
+    python export.py one/roads.onnx other/roads.onnx roads.onnx        # two that were exported, as one
+    python export.py one/roads.onnx one/roads.onnx roads.onnx          # one, shown each picture twice
+    python export.py one/roads.onnx@640 other/roads.onnx roads.onnx    # the first is shown tiles of 640 x 640 px, not 800
 
 The joined network gives the mean of the logits of the two, of which the second is shown the picture turned by half:
-they err in different places.
+they err in different places. Of a smaller picture a network takes less time, and sees further.
 """
 
 from __future__ import annotations
@@ -18,7 +19,7 @@ import numpy as np
 import onnx
 import onnxruntime
 import torch
-from network import AnyRoadNet, Roads
+from network import STRIDE, AnyRoadNet, Roads
 from onnx import compose, helper, numpy_helper
 
 __all__ = ["METADATA", "TILE", "export", "join"]
@@ -52,24 +53,28 @@ def export(network: AnyRoadNet, path: Path) -> Path:
     return _write(_simplified(path).graph, path)
 
 
-def join(parts: list[Path], path: Path) -> Path:
+def join(parts: list[tuple[Path, int]], path: Path) -> Path:
     """Write exported networks as one that gives the mean of their logits as a probability.
 
-    Every second one is shown the picture turned by half. One that is given twice keeps its weights once.
+    Each comes with the side, in pixels, of the tiles that it is shown, a multiple of 32; every second one is shown them
+    turned by half. One that is given twice keeps its weights once.
     """
     nodes, weights, logits = [*_turn_by_half("image", "turned")], {}, []
-    for k, part in enumerate(parts):
-        first, turned = parts.index(part), k % 2 == 1
+    paths = [part for part, _ in parts]
+    for k, (part, side) in enumerate(parts):
+        first, seen = paths.index(part), "turned" if k % 2 else "image"
         graph = compose.add_prefix(_simplified(part), f"{k}_", rename_inputs=False, rename_outputs=False).graph
         shared = {weight.name: weight.name.replace(f"{k}_", f"{first}_", 1) for weight in graph.initializer}
         (last,) = (node for node in graph.node if "road" in node.output)
         if last.op_type != "Sigmoid":
             raise SystemExit(f"{part}: gives no probability; expected a model that train.py wrote")
+        nodes += _resize(seen, f"{k}_seen", side, TILE)
         for node in graph.node:
-            node.input[:] = [shared.get(name, "turned" if turned and name == "image" else name) for name in node.input]
+            node.input[:] = [shared.get(name, f"{k}_seen" if name == "image" else name) for name in node.input]
         nodes += [node for node in graph.node if node is not last]
-        nodes += _turn_by_half(last.input[0], f"logit_{k}") if turned else []
-        logits.append(f"logit_{k}" if turned else last.input[0])
+        nodes += _resize(last.input[0], f"{k}_whole", TILE, side)
+        nodes += _turn_by_half(f"{k}_whole", f"{k}_back") if k % 2 else []
+        logits.append(f"{k}_back" if k % 2 else f"{k}_whole")
         for weight in graph.initializer:
             weight.name = shared[weight.name]
             weights[weight.name] = weight
@@ -79,6 +84,15 @@ def join(parts: list[Path], path: Path) -> Path:
     ]
     ports = [helper.make_tensor_value_info(name, onnx.TensorProto.FLOAT, None) for name in ("image", "road")]
     return _write(helper.make_graph(nodes, "roads", ports[:1], ports[1:], list(weights.values())), path)
+
+
+def _resize(before: str, after: str, side: int, side_before: int) -> list[onnx.NodeProto]:
+    """Return nodes that give the tile `before` another size, (1, C, side, side)."""
+    if side == side_before:
+        return [helper.make_node("Identity", [before], [after])]
+    scales = numpy_helper.from_array(np.array([1, 1, side / side_before, side / side_before], np.float32))
+    constant = helper.make_node("Constant", [], [f"{after}_scales"], value=scales)
+    return [constant, helper.make_node("Resize", [before, "", f"{after}_scales"], [after], mode="linear")]
 
 
 def _turn_by_half(before: str, after: str) -> list[onnx.NodeProto]:
@@ -145,8 +159,16 @@ def _shrink(graph: onnx.GraphProto) -> None:
     graph.node.extend(nodes)
 
 
+def _part(text: str) -> tuple[Path, int]:
+    """Read FILE or FILE@SIDE."""
+    name, _, side = text.partition("@")
+    if side and (not side.isdigit() or int(side) % STRIDE or not 0 < int(side) <= TILE):
+        raise SystemExit(f"{text}: the side of a tile is a multiple of {STRIDE} up to {TILE}, such as {name}@640")
+    return Path(name), int(side or TILE)
+
+
 if __name__ == "__main__":
     if len(sys.argv) < 4:
         raise SystemExit(__doc__)
-    *_parts, _joined = map(Path, sys.argv[1:])
-    print("wrote", join(_parts, _joined))
+    *_parts, _joined = sys.argv[1:]
+    print("wrote", join([_part(text) for text in _parts], Path(_joined)))

@@ -72,17 +72,20 @@ def test_two_networks_become_one_the_second_turned_by_half(data: Path, tmp_path:
         command = [sys.executable, str(RECIPE / "train.py"), str(data), "--out", str(path.parent), "--quick"]
         command += ["--only", "all", "--network", "plain", "--seed", str(seed)]
         subprocess.run(command, capture_output=True, check=True)
-    for pair, name in ((paths[:2], "both.onnx"), ([paths[0]] * 2, "twice.onnx")):
-        paths.append(tmp_path / name)
+    joined = {"both": paths[:2], "twice": [paths[0]] * 2, "coarse": [f"{paths[0]}@640", paths[1]]}
+    for name, pair in joined.items():
+        paths.append(tmp_path / f"{name}.onnx")
         command = [sys.executable, str(RECIPE / "export.py"), *map(str, pair), str(paths[-1])]
         subprocess.run(command, capture_output=True, check=True)
     image = np.random.default_rng(0).random((1, 3, 800, 800), np.float32)
     sessions = [onnxruntime.InferenceSession(str(path), providers=["CPUExecutionProvider"]) for path in paths]
     turned = np.ascontiguousarray(image[..., ::-1, ::-1])
-    shown = (image, turned, image, image)
-    first, second, both, twice = (
+    shown = (image, turned, image, image, image)
+    first, second, both, twice, coarse = (
         session.run(["road"], {"image": picture})[0] for session, picture in zip(sessions, shown, strict=True)
     )
+    assert coarse.shape == both.shape
+    assert not np.allclose(coarse, both, atol=1e-3)
     logits = [np.log(p / (1 - p)) for p in (first, second[..., ::-1, ::-1])]
     assert not np.allclose(first, second[..., ::-1, ::-1], atol=1e-3)
     assert np.allclose(both, 1 / (1 + np.exp(-np.mean(logits, axis=0))), atol=2e-3)
