@@ -2,7 +2,7 @@
 
     python export.py one/roads.onnx other/roads.onnx roads.onnx        # two that were exported, as one
     python export.py one/roads.onnx one/roads.onnx roads.onnx          # one, shown each picture twice
-    python export.py one/roads.onnx@640 other/roads.onnx roads.onnx    # the first is shown tiles of 640 x 640 px, not 800
+    python export.py one/roads.onnx@640 other/roads.onnx roads.onnx    # the first is shown tiles of 640 px, not 800
 
 The joined network gives the mean of the logits of the two, of which the second is shown the picture turned by half:
 they err in different places. Of a smaller picture a network takes less time, and sees further.
