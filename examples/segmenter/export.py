@@ -3,6 +3,7 @@
     python export.py one/roads.onnx other/roads.onnx roads.onnx        # two that were exported, as one
     python export.py one/roads.onnx one/roads.onnx roads.onnx          # one, shown each picture twice
     python export.py one/roads.onnx@640 other/roads.onnx roads.onnx    # the first is shown tiles of 640 px, not 800
+    python export.py one/roads.onnx@704 roads.onnx                     # one, shown smaller tiles
 
 The joined network gives the mean of the logits of the two, of which the second is shown the picture turned by half:
 they err in different places. Of a smaller picture a network takes less time, and sees further.
@@ -90,7 +91,8 @@ def _resize(before: str, after: str, side: int, side_before: int) -> list[onnx.N
     """Return nodes that give the tile `before` another size, (1, C, side, side)."""
     if side == side_before:
         return [helper.make_node("Identity", [before], [after])]
-    scales = numpy_helper.from_array(np.array([1, 1, side / side_before, side / side_before], np.float32))
+    scale = np.nextafter(np.float32(side / side_before), np.float32(2))  # sizes are rounded down
+    scales = numpy_helper.from_array(np.array([1, 1, scale, scale], np.float32))
     constant = helper.make_node("Constant", [], [f"{after}_scales"], value=scales)
     return [constant, helper.make_node("Resize", [before, "", f"{after}_scales"], [after], mode="linear")]
 
@@ -168,7 +170,7 @@ def _part(text: str) -> tuple[Path, int]:
 
 
 if __name__ == "__main__":
-    if len(sys.argv) < 4:
+    if len(sys.argv) < 3:
         raise SystemExit(__doc__)
     *_parts, _joined = sys.argv[1:]
     print("wrote", join([_part(text) for text in _parts], Path(_joined)))
