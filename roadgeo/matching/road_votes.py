@@ -17,7 +17,7 @@ from typing import NamedTuple
 import numpy as np
 
 from roadgeo._arrays import BoolArray, FloatArray, IntArray
-from roadgeo.kernels.road_raster import DIRECTIONS
+from roadgeo.kernels.road_raster import DIRECTIONS, TILE
 from roadgeo.kernels.road_votes import (
     BLOCK,
     NOWHERE,
@@ -56,7 +56,8 @@ class VoteOptions:
     scale_step : float
         Ratio of one scale to the next.
     inner_m, radius_m, max_points : float, float, int
-        Road points between these distances from the intersection are tested, at most so many.
+        Road points between these distances from the intersection are tested, at most so many. `radius_m` is less than
+        63 cells of the raster (see `kernels.road_votes.lay_points`).
     own_m, own_cos : float
         Nearer than `own_m`, roads that run straight away from the intersection, with at least this cosine, are left
         out: they are its own branches, which agree by construction. It makes the right place stand out more and wrong
@@ -86,6 +87,10 @@ class VoteOptions:
     wide_radius_m: float = 260.0
     wide_points: int = 160
     n_chance: int = 60
+
+    def __post_init__(self) -> None:
+        if self.radius_m >= (TILE - 1) * self.raster.cell_m:
+            raise ValueError(f"radius_m is {self.radius_m:g}; expected less than {TILE - 1} cells of the raster")
 
     def on(self, coarseness: float) -> VoteOptions:
         """Return them for a coarse map: all lengths are so many times as long."""

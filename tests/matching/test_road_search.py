@@ -217,3 +217,10 @@ def test_wide_roads_leave_out_scales_at_which_they_would_be_no_roads():
     assert options.scales(camera, 3.0) == (0.1, 12.0)
     assert options.scales(camera, 10.0) == pytest.approx((0.2, 7.5))
     assert options.scales(CameraOptions(gsd_m=(9.0, 12.0)), 10.0) == (9.0, 12.0)
+
+
+@pytest.mark.parametrize("coarseness", [1.0, 4.0])
+def test_points_too_far_for_the_raster_are_refused(coarseness):
+    assert VoteOptions(radius_m=370.0).on(coarseness).radius_m == 370.0 * coarseness
+    with pytest.raises(ValueError, match="expected less than 63 cells"):
+        VoteOptions(radius_m=380.0)
