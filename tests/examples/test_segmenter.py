@@ -93,6 +93,11 @@ def test_two_networks_become_one_the_second_turned_by_half(data: Path, tmp_path:
     logits[1] -= np.log1p(-np.exp(logits[1]))
     assert np.allclose(twice, 1 / (1 + np.exp(-np.mean(logits, axis=0))), atol=2e-3)
     assert paths[3].stat().st_size < 1.1 * paths[0].stat().st_size  # its weights are kept once
+    command = [sys.executable, str(RECIPE / "export.py"), f"{paths[0]}@650", str(tmp_path / "none.onnx")]
+    failed = subprocess.run(command, capture_output=True, text=True, check=False)
+    assert failed.returncode != 0
+    assert "multiple of 32" in failed.stderr
+    assert not (tmp_path / "none.onnx").exists()
 
 
 def test_the_model_that_ships_is_small_and_has_a_card() -> None:
