@@ -16,11 +16,12 @@ import numpy as np
 
 from roadgeo._arrays import AnyArray, BoolArray
 from roadgeo._text import visible
-from roadgeo.errors import MaskError
+from roadgeo.errors import MaskError, PhotographError
 from roadgeo.geometry.mask import PROBABILITY_SURE, PROBABILITY_UNKNOWN, RoadMask
 from roadgeo.roads.borders import find_border
 from roadgeo.roads.observed import find_voids
 from roadgeo.roads.vectorization import road_width
+from roadgeo.sources.segmentation.photograph import MAX_SIDE as MAX_PHOTOGRAPH_SIDE
 from roadgeo.sources.thresholds import Sample, find_thresholds, ground_and_road
 from roadgeo.storage.gdal import is_named_remote
 from roadgeo.storage.rasters import image_size, open_raster, require_file, sidecar_nodata
@@ -34,6 +35,7 @@ __all__ = ["MaskSource", "open_mask", "read_mask"]
 _LOG = logging.getLogger(__name__)
 
 MIN_SIDE, MAX_SIDE = 32, 20_000
+_MAX_BANDS = 3  # of a mask, unless one of them is chosen
 _STRIP_PIXELS = 1 << 25  # rows are read and thresholded so many pixels at a time
 _SAMPLE_PIXELS = 1 << 18  # what a mask's values mean is told from about so many
 _MIDDLE_PIXELS = 1 << 22  # and, where neighbours matter, from so many in the middle rows
@@ -54,6 +56,7 @@ class _Raster:
 
     `read(top, bottom, step)` returns every `step`-th value of these rows as (rows, columns, B), and where they are
     valid as (rows, columns) bool, or None for everywhere. `has_alpha`: they are valid where they are not transparent.
+    `n_unread`: bands beyond those that are read.
     """
 
     name: str
@@ -61,6 +64,7 @@ class _Raster:
     n_bands: int
     read: Callable[[int, int, int], tuple[AnyArray, BoolArray | None]]
     has_alpha: bool = False
+    n_unread: int = 0
 
 
 def read_mask(
@@ -158,11 +162,12 @@ def open_mask(
 ) -> Iterator[MaskSource]:
     """Open a road mask or a soft map of roads: parameters and errors as of `read_mask`."""
     with _open(source, band, name) as raster:
-        _require_size(raster.name, *raster.shape)
+        _require_size(raster.name, *raster.shape, MAX_PHOTOGRAPH_SIDE)
+        _require_mask(raster)
         raster = _drawn(raster)
         seen = _sample(raster)
         channel = int(np.argmax(seen.std(axis=0))) if raster.n_bands > 1 else 0
-        sample = Sample(raster.name, seen, channel, lambda: _middle_rows(raster, channel))
+        sample = Sample(raster.name, seen, channel, lambda: _numbers(*_middle(raster), channel))
         thresholds = find_thresholds(sample) if threshold is None else (threshold,)
         levels = ground_and_road(sample, thresholds[0]) if len(thresholds) > 1 else None
         yield MaskSource(thresholds, raster, channel, voids, levels)
@@ -199,12 +204,16 @@ def _sample(raster: _Raster) -> AnyArray:
     return seen
 
 
-def _middle_rows(raster: _Raster, channel: int) -> AnyArray:
-    """Return (rows, columns) values of a band in the middle of a raster; where they are no numbers, the smallest."""
+def _middle(raster: _Raster) -> tuple[AnyArray, BoolArray | None]:
+    """Read the rows in the middle of a raster: (rows, columns, B), and where they are valid."""
     height, width = raster.shape
     rows = min(height, max(_MIDDLE_PIXELS // width, MIN_SIDE))
     top = (height - rows) // 2
-    values, valid = raster.read(top, top + rows, 1)
+    return raster.read(top, top + rows, 1)
+
+
+def _numbers(values: AnyArray, valid: BoolArray | None, channel: int) -> AnyArray:
+    """Return (rows, columns) values of a band; where they are no numbers, the smallest."""
     finite = _finite(values, valid)
     chosen = values[..., channel]
     return chosen if finite.all() else np.where(finite, chosen, chosen[finite].min() if finite.any() else 0)
@@ -322,8 +331,10 @@ def _read_with_opencv(path: str, name: str) -> AnyArray | None:
     """Decode a PNG, JPEG or BMP without side files as it is stored; None where GDAL has to, or can in less memory."""
     size = image_size(Path(path))
     if size is not None:
-        _require_size(name, size[1], size[0])
-    if size is None or size[2] > _MAX_DECODED_BYTES or Path(path + ".aux.xml").exists() or _is_large(path):
+        _require_size(name, size[1], size[0], MAX_PHOTOGRAPH_SIDE)
+    if size is None or max(size[:2]) > MAX_SIDE or size[2] > _MAX_DECODED_BYTES:
+        return None
+    if Path(path + ".aux.xml").exists() or _is_large(path):
         return None
     content = np.fromfile(path, np.uint8)
     is_png = content[: len(_PNG_MAGIC)].tobytes() == _PNG_MAGIC
@@ -347,14 +358,35 @@ def _is_whole_png(content: memoryview) -> bool:
     return False
 
 
-def _require_size(name: str, height: int, width: int) -> None:
+def _require_size(name: str, height: int, width: int, most: int) -> None:
     """Refuse by its header what is too small to show roads, or too large to decode."""
     low, high = min(height, width), max(height, width)
-    if low < MIN_SIDE or high > MAX_SIDE:
+    if low < MIN_SIDE or high > most:
         raise MaskError(
             f"{name}: {width} x {height} pixels; expected {MIN_SIDE} to {MAX_SIDE} on each side: "
             + ("give a larger mask" if low < MIN_SIDE else "reduce it or cut it up")
         )
+
+
+def _require_mask(raster: _Raster) -> None:
+    """Refuse what has more pixels or bands than a mask, as a photograph if its middle rows look like one."""
+    if max(raster.shape) <= MAX_SIDE and raster.n_unread == 0:
+        return
+    values, valid = _middle(raster)
+    seen = _observed(values, valid)
+    many = f"{raster.name}: has {raster.n_bands + raster.n_unread} bands; choose the one that holds the roads"
+    try:
+        if len(seen):
+            channel = int(np.argmax(seen.std(axis=0)))
+            find_thresholds(Sample(raster.name, seen, channel, lambda: _numbers(values, valid, channel)))
+    except PhotographError as error:
+        if raster.n_unread:
+            raise PhotographError(f"{many}, if it is a mask: the first of them look like a photograph") from error
+        raise
+    except MaskError:
+        pass  # what is said below comes first
+    _require_size(raster.name, *raster.shape, MAX_SIDE)
+    raise MaskError(many)
 
 
 def _is_large(path: str) -> bool:
@@ -373,7 +405,9 @@ def _of_array(array: AnyArray, band: int | None, name: str, *, alpha: bool) -> _
     valid = np.asarray(~np.ma.getmaskarray(whole).any(axis=2)) if np.ma.is_masked(whole) else None
     if alpha:
         data, valid = data[..., :-1], data[..., -1] > 0
-    data = data[..., _bands(name, band, data.shape[2])]
+    chosen = _bands(name, band, data.shape[2])
+    n_unread = 0 if band is not None else data.shape[2] - len(chosen)
+    data = data[..., chosen]
     if data.dtype == np.bool_:
         data = data.view(np.uint8)
 
@@ -381,7 +415,7 @@ def _of_array(array: AnyArray, band: int | None, name: str, *, alpha: bool) -> _
         rows = slice(top, bottom, step)
         return data[rows, ::step], None if valid is None else valid[rows, ::step]
 
-    return _Raster(name, (data.shape[0], data.shape[1]), data.shape[2], read, alpha)
+    return _Raster(name, (data.shape[0], data.shape[1]), data.shape[2], read, alpha, n_unread)
 
 
 def _of_dataset(dataset: DatasetReader, band: int | None, name: str, nodata: float | None) -> _Raster:
@@ -411,15 +445,14 @@ def _of_dataset(dataset: DatasetReader, band: int | None, name: str, nodata: flo
         return values, valid
 
     has_alpha = len(colour) < dataset.count
-    return _Raster(name, (dataset.height, dataset.width), len(chosen), read, has_alpha)
+    n_unread = 0 if band is not None else len(colour) - len(chosen)
+    return _Raster(name, (dataset.height, dataset.width), len(chosen), read, has_alpha, n_unread)
 
 
 def _bands(name: str, band: int | None, n_bands: int) -> list[int]:
-    """Return the numbers from 0 of the bands to look at: the chosen one, or up to three."""
+    """Return the numbers from 0 of the bands to look at: the chosen one, or the first three."""
     if band is not None:
         if not 1 <= band <= n_bands:
             raise MaskError(f"{name}: has no band {band}; expected 1 to {n_bands}")
         return [band - 1]
-    if n_bands > 3:
-        raise MaskError(f"{name}: has {n_bands} bands; choose the one that holds the roads")
-    return list(range(n_bands))
+    return list(range(min(n_bands, _MAX_BANDS)))

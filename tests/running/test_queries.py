@@ -112,6 +112,20 @@ def test_a_photograph_is_located(
     assert again["homography"] == document["homography"]
 
 
+def test_a_photograph_with_infrared_is_located(
+    tmp_path: Path, demo_reference: Path, model: str, photo: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    """Nobody says that its fourth band is no mask."""
+    colours = np.moveaxis(cv2.imread(str(photo))[..., ::-1], 2, 0)
+    path = tmp_path / "rgbn.tif"
+    size = {"height": colours.shape[1], "width": colours.shape[2]}
+    with rasterio.open(path, "w", driver="GTiff", count=4, dtype="uint8", photometric="MINISBLACK", **size) as dataset:
+        dataset.write(np.concatenate([colours, 255 - colours[:1]]))
+    document = run(capsys, str(path), "-r", str(demo_reference), "--segmenter", model, "-o", str(tmp_path))
+    assert document["status"] == "located"
+    assert offset(document) < 3.0
+
+
 def test_roads_of_coarse_pixels_are_traced_on_the_models_grid(
     tmp_path: Path, demo_reference: Path, model: str, photo: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:

@@ -189,6 +189,41 @@ def test_a_photograph_is_refused_by_name(tmp_path: Path) -> None:
     assert read_mask(path, threshold=150).roads.any()
 
 
+def ground() -> np.ndarray:
+    """Return (3, H, W) of a photograph."""
+    rng = np.random.default_rng(0)
+    uneven = cv2.GaussianBlur(rng.normal(0, 1, (*SHAPE, 3)), (0, 0), 3)
+    return np.moveaxis(np.clip(110 + 400 * uneven, 0, 255).astype(np.uint8), 2, 0)
+
+
+def test_a_photograph_of_many_bands_is_none_the_less_one(tmp_path: Path, roads: np.ndarray) -> None:
+    """Infrared is a fourth band, and not the mask's."""
+    path = tiff(tmp_path / "rgbn.tif", np.concatenate([ground(), ground()[:1]]), photometric="MINISBLACK")
+    with pytest.raises(PhotographError, match="has 4 bands; choose the one that holds the roads, if it is a mask"):
+        read_mask(path)
+    stack = tiff(tmp_path / "stack.tif", np.stack([roads * np.uint8(255)] * 4), photometric="MINISBLACK")
+    with pytest.raises(MaskError, match=r"has 4 bands; choose the one that holds the roads$") as refused:
+        read_mask(stack)
+    assert not isinstance(refused.value, PhotographError)
+    with pytest.raises(MaskError, match=r"has 4 bands; choose the one that holds the roads$"):
+        read_mask(tiff(tmp_path / "nothing.tif", np.full((4, *SHAPE), np.nan, np.float32)))
+
+
+@pytest.mark.parametrize("suffix", [".tif", ".png"])
+def test_a_photograph_may_be_larger_than_a_mask(
+    tmp_path: Path, roads: np.ndarray, monkeypatch: pytest.MonkeyPatch, suffix: str
+) -> None:
+    monkeypatch.setattr("roadgeo.sources.masks.MAX_SIDE", 90)
+    photo, mask = tmp_path / f"photo{suffix}", tmp_path / f"mask{suffix}"
+    cv2.imwrite(str(photo), np.moveaxis(ground(), 0, 2))
+    cv2.imwrite(str(mask), roads * np.uint8(255))
+    with pytest.raises(PhotographError, match="looks like a photograph"):
+        read_mask(photo)
+    with pytest.raises(MaskError, match="100 x 80 pixels; expected 32 to 90 on each side: reduce") as refused:
+        read_mask(mask)
+    assert not isinstance(refused.value, PhotographError)
+
+
 @pytest.mark.parametrize(
     ("values", "message"),
     [

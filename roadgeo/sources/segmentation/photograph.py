@@ -82,9 +82,10 @@ def _choose_bands(dataset: DatasetReader, name: str) -> list[int]:
     from rasterio.enums import ColorInterp
 
     meaning = dict(zip(dataset.colorinterp, dataset.indexes, strict=True))
-    rgb = [meaning.get(colour) for colour in (ColorInterp.red, ColorInterp.green, ColorInterp.blue)]
-    if all(rgb):
-        return [index for index in rgb if index]
+    named = {str(text).strip().lower(): i for text, i in zip(dataset.descriptions, dataset.indexes, strict=True)}
+    for known in (named, {colour.name: i for colour, i in meaning.items()}):
+        if {"red", "green", "blue"} <= known.keys():
+            return [known["red"], known["green"], known["blue"]]
     shown = [i for i, m in zip(dataset.indexes, dataset.colorinterp, strict=True) if m != ColorInterp.alpha]
     if not shown:
         raise MaskError(f"{name}: holds no band of values; give a photograph")

@@ -47,6 +47,26 @@ def test_tiles_join_without_seams(network, photo: Path) -> None:
     assert found.mask(0.5).observed is None
 
 
+@pytest.mark.parametrize(
+    ("names", "shown"),
+    [
+        (("", "", "", ""), (0, 1, 2)),
+        (("Blue", "Green", "Red", "NIR"), (2, 1, 0)),
+        (("nir", "red", "green", "blue"), (1, 2, 3)),
+        (("red", "", "", ""), (0, 1, 2)),
+    ],
+)
+def test_colours_are_taken_by_their_names(tmp_path: Path, names: tuple[str, ...], shown: tuple[int, ...]) -> None:
+    bands = np.stack([np.full((70, 80), value, np.uint8) for value in (10, 60, 110, 160)])
+    path = tmp_path / "bands.tif"
+    with rasterio.open(path, "w", driver="GTiff", count=4, height=70, width=80, dtype="uint8") as dataset:
+        dataset.write(bands)
+        dataset.descriptions = names
+    with open_photograph(path) as photograph:
+        rgb, _ = photograph.read(0, 0, 80, 70, (70, 80))
+    assert tuple(rgb[0, 0]) == tuple(bands[list(shown), 0, 0])
+
+
 @pytest.mark.parametrize("side", [64, 65, 100, 127, 400])
 @pytest.mark.parametrize("overlap", [0.05, 0.25, 0.5])
 def test_tiles_cover_a_side(side: int, overlap: float) -> None:
