@@ -385,7 +385,7 @@ def describe(outcome: Outcome) -> str:
         where = format_lonlat(found["center"]["lon"], found["center"]["lat"])
         text = f"{query}: {status} at {where} on {visible(found['reference'])}: {visible(found['reason'])}"
     if found.get("stated_offset_m") is not None:
-        text += f"\n  the mask's own georeference puts its middle {found['stated_offset_m']:,.1f} m from there"
+        text += f"\n  its own georeference puts the middle {found['stated_offset_m']:,.1f} m from there"
     if outcome.photo and outcome.photo[0] != found["query"]:
         text += f"\n  drew {visible(outcome.photo[0])}, {outcome.photo[1]:g} times the mask's size"
     if outcome.removed:

@@ -36,6 +36,8 @@ _INTERPOLATION = {
     "lanczos": cv2.INTER_LANCZOS4,
 }
 _BLOCK = 1024  # side of the blocks that are drawn one after another
+_REMAPPED = 4  # bands that OpenCV interpolates at a time
+_BORDER = cv2.BORDER_REPLICATE
 _REACH = 8  # pixels around a block's source that interpolation may look at
 _TILED_BYTES = 1 << 28  # larger pictures that can only be read from the top down are first copied into tiles
 _MAX_SOURCE = 8192  # sides of a block's source beyond which it is read coarser
@@ -379,8 +381,12 @@ def _sample(values: AnyArray, maps: AnyArray, known: AnyArray, plan: _Plan) -> A
 
 def _remap(image: AnyArray, maps: AnyArray, interpolation: int) -> AnyArray:
     """Look up an image (rows, columns[, bands]) at `maps` (h, w, 2); (h, w, bands)."""
-    drawn = cv2.remap(image, maps[..., 0], maps[..., 1], interpolation, borderMode=cv2.BORDER_REPLICATE)
-    return np.asarray(drawn).reshape(*maps.shape[:2], -1)
+    bands = image if image.ndim == 3 else image[..., None]
+    drawn = [
+        cv2.remap(bands[..., i : i + _REMAPPED], maps[..., 0], maps[..., 1], interpolation, borderMode=_BORDER)
+        for i in range(0, bands.shape[2], _REMAPPED)
+    ]
+    return np.concatenate([one.reshape(*maps.shape[:2], -1) for one in drawn], axis=2)
 
 
 def _cast(image: AnyArray, dtype: np.dtype[Any]) -> AnyArray:

@@ -21,6 +21,7 @@ __all__ = ["Sample", "find_thresholds", "ground_and_road"]
 _COLOURED_SHARE = 0.05  # more than this: a photograph
 _GREY_SHARE = 0.25  # more than this is neither dark nor light: a soft map on uneven ground
 _CRISP_SHARE = 0.02  # less than this: a mask
+_MIN_CORRELATION = 0.3  # between the bands of a photograph
 _MAX_CLASS = 32  # whole numbers up to this, three or more of them, are the classes of a map, unless they are faint
 
 #: Values that are not crisp show roads only where (measured on soft maps and on the photographs of the Massachusetts
@@ -87,6 +88,7 @@ def find_thresholds(sample: Sample) -> tuple[float, ...]:
         return _spread(values, _otsu(values))
     _refuse_colours(sample, levels)
     if sample.seen.dtype.kind == "f" and low >= 0 and high <= 1:
+        _refuse_reflectances(sample, values)
         return _spread(values, 0.5 if high > 0.5 else _otsu(values))  # probabilities
     grey = _grey_share(sample, values)
     usual = 127.0 if sample.seen.dtype == np.uint8 and high > 127 and grey <= _GREY_SHARE else _otsu(values)
@@ -146,6 +148,19 @@ def _refuse_colours(sample: Sample, levels: AnyArray) -> None:
         raise MaskError(
             f"{sample.name}: holds {n_colours} colours; expected road and no road: choose a band or give a mask"
         )
+
+
+def _refuse_reflectances(sample: Sample, values: AnyArray) -> None:
+    """Raise where numbers from 0 to 1 are no probability of road: a photograph's colours, or several classes'.
+
+    Colours are light and dark together, classes shut each other out.
+    """
+    seen = sample.seen[:, np.ptp(sample.seen, axis=0) > 0].astype(np.float64)
+    if seen.shape[1] < 2 or np.mean(np.ptp(seen, axis=1) > 0.05 * np.ptp(values)) <= _COLOURED_SHARE:
+        return
+    if np.corrcoef(seen.T).min() > _MIN_CORRELATION:
+        _grey_share(sample, values)
+    raise MaskError(f"{sample.name}: holds {seen.shape[1]} bands that differ; choose the one that holds the roads")
 
 
 def _grey_share(sample: Sample, values: AnyArray) -> float:

@@ -78,11 +78,13 @@ def test_every_pixel_shows_the_ground_where_it_lies(
         (1, "uint8", [ColorInterp.gray, ColorInterp.alpha]),
         (3, "uint8", [ColorInterp.red, ColorInterp.green, ColorInterp.blue, ColorInterp.alpha]),
         (3, "uint16", [ColorInterp.red, ColorInterp.green, ColorInterp.blue, ColorInterp.alpha]),
+        (7, "uint16", [ColorInterp.gray, *[ColorInterp.undefined] * 6, ColorInterp.alpha]),
     ],
 )
 def test_bands_and_depth_are_kept(tmp_path: Path, bands: int, dtype: str, colors: list[ColorInterp]) -> None:
     photometric = {"photometric": "RGB"} if bands == 3 else {}
-    source = write(tmp_path / "a.tif", np.full((bands, 30, 40), 200, dtype), **photometric)
+    levels = np.arange(200, 200 + bands, dtype=dtype)
+    source = write(tmp_path / "a.tif", np.tile(levels[:, None, None], (1, 30, 40)), **photometric)
     homography, _ = image_homography(PLACE, MASK_SIZE, source)
     warp_image(source, tmp_path / "b.tif", PLACE, homography, {"ROADGEO_QUERY": "a"})
     with rasterio.open(tmp_path / "b.tif") as raster:
@@ -91,7 +93,7 @@ def test_bands_and_depth_are_kept(tmp_path: Path, bands: int, dtype: str, colors
         assert raster.tags()["ROADGEO_QUERY"] == "a"
         values = raster.read()
     shown = values[-1] > 0
-    assert (values[:-1, shown] == 200).all()
+    assert (values[:-1, shown] == levels[:, None]).all()
     assert (values[:, ~shown] == 0).all()
 
 

@@ -192,7 +192,7 @@ def test_a_photograph_is_refused_by_name(tmp_path: Path) -> None:
 def ground() -> np.ndarray:
     """Return (3, H, W) of a photograph."""
     rng = np.random.default_rng(0)
-    uneven = cv2.GaussianBlur(rng.normal(0, 1, (*SHAPE, 3)), (0, 0), 3)
+    uneven = cv2.GaussianBlur(rng.normal(0, 0.5, (*SHAPE, 3)) + rng.normal(0, 1, (*SHAPE, 1)), (0, 0), 3)
     return np.moveaxis(np.clip(110 + 400 * uneven, 0, 255).astype(np.uint8), 2, 0)
 
 
@@ -207,6 +207,21 @@ def test_a_photograph_of_many_bands_is_none_the_less_one(tmp_path: Path, roads: 
     assert not isinstance(refused.value, PhotographError)
     with pytest.raises(MaskError, match=r"has 4 bands; choose the one that holds the roads$"):
         read_mask(tiff(tmp_path / "nothing.tif", np.full((4, *SHAPE), np.nan, np.float32)))
+
+
+def test_bands_of_numbers_from_0_to_1(tmp_path: Path, roads: np.ndarray) -> None:
+    """Reflectances are a photograph, classes want to be chosen from, and a soft map is drawn in any colour."""
+    reflected = ground().astype(np.float32) / 255 * np.float32([[[0.3]], [[0.35]], [[0.4]]])
+    with pytest.raises(PhotographError, match="looks like a photograph"):
+        read_mask(np.moveaxis(reflected, 0, 2))
+    soft = np.clip(cv2.GaussianBlur(roads.astype(np.float32), (0, 0), 1.0), 0, 1)
+    classes = np.dstack([0.6 * (1 - soft), 0.4 * (1 - soft), soft])
+    with pytest.raises(MaskError, match="holds 3 bands that differ; choose the one that holds the roads") as refused:
+        read_mask(classes)
+    assert not isinstance(refused.value, PhotographError)
+    np.testing.assert_array_equal(read_mask(classes, band=3).roads, soft > 0.5)
+    np.testing.assert_array_equal(read_mask(soft[..., None] * np.float32([0, 1, 0])).roads, soft > 0.5)
+    np.testing.assert_array_equal(read_mask(np.dstack([soft] * 3)).roads, soft > 0.5)
 
 
 @pytest.mark.parametrize("suffix", [".tif", ".png"])
