@@ -1,4 +1,4 @@
-"""What the user says of photographs: options of `locate`."""
+"""What the user says of photographs: options of `locate`, `verify` and `vectorize`."""
 
 from __future__ import annotations
 
@@ -13,7 +13,7 @@ from roadgeo.cli.parameters import Plugin
 if TYPE_CHECKING:
     from roadgeo.running.options import ReadOptions
 
-__all__ = ["read_options", "segmenting_options"]
+__all__ = ["n_threads", "read_options", "segmenting_options"]
 
 Command = TypeVar("Command", bound=Callable[..., Any])
 
@@ -61,17 +61,22 @@ _OPTIONS = [
     click.option(
         "--class", "class_name", metavar="NAME", help="Class of the model that is road. Default: told by the names."
     ),
-    click.option(
-        "--fuse", is_flag=True, help="All that is given shows one frame (exposures, masks of several models): fuse it."
-    ),
 ]
+_FUSE = click.option(
+    "--fuse", is_flag=True, help="All that is given shows one frame (exposures, masks of several models): fuse it."
+)
 
 
-def segmenting_options(command: Command) -> Command:
-    """Add the options of `_OPTIONS`."""
-    for option in reversed(_OPTIONS):
+def segmenting_options(command: Command, *, fuse: bool = True) -> Command:
+    """Add the options of `_OPTIONS`, and `--fuse`."""
+    for option in reversed([*_OPTIONS, _FUSE] if fuse else _OPTIONS):
         command = option(command)
     return command
+
+
+def n_threads(jobs: int = 1) -> int:
+    """Return how many threads a model gets."""
+    return 1 if jobs > 1 else min(os.cpu_count() or 1, _MAX_THREADS)
 
 
 def read_options(given: Mapping[str, Any], photos: Mapping[str, str], others: Sequence[str], jobs: int) -> ReadOptions:
@@ -87,7 +92,7 @@ def read_options(given: Mapping[str, Any], photos: Mapping[str, str], others: Se
         segmenters=given["segmenters"],
         class_name=given["class_name"],
         fused_with=tuple(others),
-        threads=1 if jobs > 1 else min(os.cpu_count() or 1, _MAX_THREADS),
+        threads=n_threads(jobs),
         dem=given.get("dem") or "",
         allow_mirror=bool(given.get("allow_mirror")),
         units=given.get("units") or "auto",

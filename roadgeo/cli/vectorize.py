@@ -1,60 +1,95 @@
-"""`roadgeo vectorize`: what the program sees in a mask, for a person to look at."""
+"""`roadgeo vectorize`: what the program sees in a mask or a photograph, for a person to look at."""
 
 from __future__ import annotations
+
+from functools import partial
+from typing import TYPE_CHECKING, Any
 
 import click
 
 from roadgeo._text import visible
 from roadgeo.cli import ERROR
 from roadgeo.cli.folders import make_folder
+from roadgeo.cli.hints import hint_options
 from roadgeo.cli.parameters import out_dir_option
+from roadgeo.cli.photographs import n_threads, segmenting_options
 from roadgeo.cli.printing import echo
-from roadgeo.running.tasks import find_masks, name_tasks
+from roadgeo.cli.progress import show_steps
+from roadgeo.running.tasks import Task, find_masks, name_tasks
+
+if TYPE_CHECKING:
+    from roadgeo._progress import Say
+    from roadgeo.running.queries import QueryOptions
 
 __all__ = ["vectorize_command"]
 
 
-@click.command("vectorize", short_help="Show what roads are seen in a mask.")
-@click.argument("masks", metavar="MASK...", nargs=-1, required=True, type=click.Path())
+@click.command("vectorize", short_help="Show what roads are seen in a mask or a photograph.")
+@click.argument("images", metavar="IMAGE...", nargs=-1, required=True, type=click.Path())
 @out_dir_option()
-@click.option("--threshold", metavar="T", type=float, help="Values above T are road. Default: told by the values.")
+@click.option(
+    "--threshold", metavar="T", type=float, help="Values, or probabilities, above T are road. Default: told by them."
+)
 @click.option(
     "--band", metavar="N", type=click.IntRange(1), help="Band that holds the mask. Default: told by the bands."
 )
-def vectorize_command(masks: tuple[str, ...], out_dir: str, threshold: float | None, band: int | None) -> int:
-    """Show what roads and intersections the program sees in MASKs: the first thing to look at when one was not located.
+@hint_options("gsd_m")
+@partial(segmenting_options, fuse=False)
+def vectorize_command(images: tuple[str, ...], out_dir: str, gsd_m: tuple[float, float] | None, **given: Any) -> int:
+    """Show what roads and intersections are seen in IMAGEs: the first thing to look at when one was not located.
 
-    For photo_mask.tif it writes photo_mask_vectorized.gpkg, in pixel coordinates, which lies on the mask when both are
-    opened in QGIS, and photo_mask_vectorized.png.
+    An image is a road mask or a photograph (pip install 'roadgeo[segment]'). For photo.jpg it writes
+    photo_vectorized.gpkg, in pixel coordinates, which lies on the image when both are opened in QGIS,
+    photo_vectorized.png, and of a photograph photo_mask.tif, the probability of road.
 
     \b
     Examples:
       roadgeo vectorize photo_mask.tif
+      roadgeo vectorize photo.jpg --gsd 0.3:0.4
       roadgeo vectorize probability.tif --band 2 --threshold 0.4 --out-dir seen
     """
     from roadgeo.cli.compilation import compile_once
     from roadgeo.errors import RoadgeoError
-    from roadgeo.matching.query import trace_query
-    from roadgeo.outputs.vectorized import write_vectorized
-    from roadgeo.sources.masks import read_mask
+    from roadgeo.running.queries import QueryOptions
 
     make_folder(out_dir)
     compile_once(quiet=False)
+    query = QueryOptions(**given, threads=n_threads())
     status = 0
-    for task in name_tasks(find_masks(masks)):
-        try:
-            mask = read_mask(task.mask, band=band, threshold=threshold)
-            scene, graph = trace_query(mask)
-            files = write_vectorized(out_dir, task.stem, mask, graph, scene.intersections)
-        except RoadgeoError as error:
-            echo(f"Error: {error}", err=True)
-            status = ERROR
-            continue
-        except Exception as error:  # of a library: nothing wrong with one mask stops the others
-            what = visible(f"{task.mask}: {type(error).__name__}: {error}")
-            echo(f"Error: {what}; this is a fault of roadgeo, please report it", err=True)
-            status = ERROR
-            continue
-        seen = f"{len(scene.intersections)} intersections, {graph.n_edges} roads between them"
-        echo(visible(f"{task.mask}: {seen}; wrote {', '.join(map(str, files))}"))
+    with show_steps(quiet=False) as say:
+        for task in name_tasks(find_masks(images)):
+            try:
+                seen = _show(task, out_dir, gsd_m, query, say)
+            except RoadgeoError as error:
+                echo(f"Error: {error}", err=True)
+                status = ERROR
+                continue
+            except Exception as error:  # of a library: nothing wrong with one mask stops the others
+                what = visible(f"{task.mask}: {type(error).__name__}: {error}")
+                echo(f"Error: {what}; this is a fault of roadgeo, please report it", err=True)
+                status = ERROR
+                continue
+            echo(visible(f"{task.mask}: {seen}"))
     return status
+
+
+def _show(task: Task, out_dir: str, gsd_m: tuple[float, float] | None, query: QueryOptions, say: Say) -> str:
+    """Write what is seen in an image; return it in words."""
+    from roadgeo.errors import MaskError
+    from roadgeo.matching.query import trace_query
+    from roadgeo.outputs.paths import output_paths
+    from roadgeo.outputs.vectorized import write_vectorized
+    from roadgeo.running.probability_files import keep_probability
+    from roadgeo.running.queries import look_once
+
+    look = look_once(task.mask, gsd_m, query, say)
+    kept = keep_probability(look.probability, output_paths(out_dir, task.stem))
+    if kept and not look.mask.roads.any():
+        raise MaskError(f"{task.mask}: no road is seen in it that is probable enough; wrote {kept[0]}, to look at")
+    scene, graph = trace_query(look.mask)
+    photo = None if look.probability is None else task.mask
+    files = write_vectorized(
+        out_dir, task.stem, look.mask, graph, scene.intersections, coarser=look.coarser, photo=photo
+    )
+    seen = f"{len(scene.intersections)} intersections, {graph.n_edges} roads between them"
+    return f"{seen}; wrote {', '.join(map(str, files + kept))}"

@@ -23,7 +23,7 @@ from roadgeo.errors import CrsError, MaskError
 from roadgeo.geometry.lens import Lens
 from roadgeo.geometry.warping import MapGrid, Transform, cover, source_pixels
 from roadgeo.outputs.paths import Placement
-from roadgeo.storage.rasters import open_raster, writing_raster
+from roadgeo.storage.rasters import open_raster, read_palette, writing_raster
 
 __all__ = ["ImageOptions", "Target", "choose_target", "image_homography", "read_preview", "warp_image"]
 
@@ -79,7 +79,7 @@ def read_preview(path: str | os.PathLike[str], side: int) -> AnyArray:
     with open_raster(path) as picture:
         factor = min(1.0, side / max(picture.width, picture.height))
         width, height = (max(round(length * factor), 1) for length in (picture.width, picture.height))
-        bands, palette = _value_bands(picture), _palette(picture)
+        bands, palette = _value_bands(picture), read_palette(picture)
         bands = bands[:3] if len(bands) >= 3 else bands[:1]
         averaged = Resampling.average if palette is None else Resampling.nearest
         values = picture.read(bands, out_shape=(len(bands), height, width), resampling=averaged)
@@ -218,13 +218,6 @@ def _value_bands(picture: Any) -> list[int]:
     ]
 
 
-def _palette(picture: Any) -> AnyArray | None:
-    if picture.colorinterp[0] != ColorInterp.palette:
-        return None
-    colors = picture.colormap(1)
-    return np.array([colors.get(i, (0, 0, 0))[:3] for i in range(256)], np.uint8)
-
-
 @dataclass(frozen=True)
 class _Plan:
     """What is drawn, on what."""
@@ -249,7 +242,7 @@ class _Plan:
     @property
     def palette(self) -> AnyArray | None:
         """(256, 3) uint8 colours, where the picture has a palette."""
-        return _palette(self.picture)
+        return read_palette(self.picture)
 
     @property
     def colors(self) -> list[ColorInterp]:

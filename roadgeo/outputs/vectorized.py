@@ -10,6 +10,7 @@ import numpy as np
 from roadgeo._arrays import AnyArray, FloatArray
 from roadgeo.errors import OutputError
 from roadgeo.geometry.mask import RoadMask, plane_to_pixel
+from roadgeo.outputs.orthophoto import read_preview
 from roadgeo.outputs.registry import VECTORIZED
 from roadgeo.roads.graph import RoadGraph
 from roadgeo.roads.intersections import Intersections
@@ -22,12 +23,21 @@ __all__ = ["draw_vectorized", "write_vectorized"]
 _MAX_SIDE = 6000  # of the picture; larger masks are drawn reduced
 
 # Colours as OpenCV orders them: blue, green, red.
+_SEEN = np.array((200, 60, 200))  # over a photograph
+_PALER, _TINT = 0.8, 0.4
 _GROUND, _ROAD, _UNSEEN = (30, 24, 20), (110, 104, 98), (70, 40, 40)
 _LINE, _RAY, _CENTRE = (40, 190, 255), (90, 90, 255), (255, 255, 255)
 
 
 def write_vectorized(
-    out_dir: str | Path, stem: str, mask: RoadMask, graph: RoadGraph, intersections: Intersections
+    out_dir: str | Path,
+    stem: str,
+    mask: RoadMask,
+    graph: RoadGraph,
+    intersections: Intersections,
+    *,
+    coarser: float = 1.0,
+    photo: str | None = None,
 ) -> list[Path]:
     """Write `STEM_vectorized.gpkg` and `STEM_vectorized.png` into a folder, which is made if need be.
 
@@ -45,6 +55,10 @@ def write_vectorized(
         In the query plane (see `geometry.mask`).
     intersections : Intersections
         Found on `graph`.
+    coarser : float
+        Pixels of the image, which the layers are to lie on, for each of the mask.
+    photo : path, optional
+        A photograph of the frame, to draw the roads over.
 
     Returns
     -------
@@ -63,25 +77,26 @@ def write_vectorized(
             f"cannot make the folder {folder}: {error.strerror}; choose one that you may write to"
         ) from error
     package, picture = (folder / f"{stem}{VECTORIZED}{suffix}" for suffix in (".gpkg", ".png"))
-    write_layers(package, _layers(graph, intersections))
-    encoded, content = cv2.imencode(".png", draw_vectorized(mask, graph, intersections))
+    write_layers(package, _layers(graph, intersections, coarser))
+    ground = None if photo is None else read_preview(photo, _MAX_SIDE)[..., 2::-1]
+    encoded, content = cv2.imencode(".png", draw_vectorized(mask, graph, intersections, ground))
     if not encoded:
         raise OutputError(f"cannot encode {picture}")
     write_bytes(picture, content.tobytes())
     return [package, picture]
 
 
-def _layers(graph: RoadGraph, intersections: Intersections) -> list[Layer]:
-    """Return the two layers, styled."""
+def _layers(graph: RoadGraph, intersections: Intersections, coarser: float) -> list[Layer]:
+    """Return the two layers, styled. From a corner of the frame, where both planes have their origin, all is scaled."""
     roads = Layer(
         "roads",
         "LINESTRING",
-        graph.polylines(),
+        [coarser * line for line in graph.polylines()],
         {
             "id": np.arange(graph.n_edges),
             "from_node": graph.edges[:, 0],
             "to_node": graph.edges[:, 1],
-            "length_px": graph.edge_lengths(),
+            "length_px": coarser * graph.edge_lengths(),
         },
         PIXELS,
         draw_line("255,190,40", 0.5),
@@ -90,13 +105,13 @@ def _layers(graph: RoadGraph, intersections: Intersections) -> list[Layer]:
     nodes = Layer(
         "intersections",
         "POINT",
-        intersections.xy,
+        coarser * intersections.xy,
         {
             "id": np.arange(len(intersections)),
             "node": intersections.node,
             "branches": intersections.n_branches,
             "tangents": intersections.n_tangents,
-            "residual_px": intersections.residual.astype(np.float64),
+            "residual_px": coarser * intersections.residual.astype(np.float64),
         },
         PIXELS,
         draw_marker("255,90,90", 2.2),
@@ -105,13 +120,22 @@ def _layers(graph: RoadGraph, intersections: Intersections) -> list[Layer]:
     return [roads, nodes]
 
 
-def draw_vectorized(mask: RoadMask, graph: RoadGraph, intersections: Intersections) -> AnyArray:
-    """Draw roads and intersections over the mask, (H, W, 3) uint8, blue, green, red; reduced if it is large."""
+def draw_vectorized(
+    mask: RoadMask, graph: RoadGraph, intersections: Intersections, ground: AnyArray | None = None
+) -> AnyArray:
+    """Draw roads and intersections over the mask, (H, W, 3) uint8, blue, green, red; reduced if it is large.
+
+    `ground` is a photograph of the frame, of any size, to draw them over instead.
+    """
     scale = min(1.0, _MAX_SIDE / max(mask.shape))
     roads = mask.roads.view(np.uint8) * np.uint8(255)
     size = (max(round(mask.shape[1] * scale), 1), max(round(mask.shape[0] * scale), 1))
     share = cv2.resize(roads, size, interpolation=cv2.INTER_AREA)[..., None] / 255.0
-    picture = np.rint(share * _ROAD + (1.0 - share) * _GROUND).astype(np.uint8)
+    if ground is None:
+        picture = np.rint(share * _ROAD + (1.0 - share) * _GROUND).astype(np.uint8)
+    else:
+        shown = _PALER * cv2.resize(ground, size, interpolation=cv2.INTER_AREA)
+        picture = np.rint(shown + _TINT * share * (_SEEN - shown)).astype(np.uint8)
     if mask.observed is not None:
         seen = cv2.resize(mask.observed.view(np.uint8), size, interpolation=cv2.INTER_NEAREST)
         picture[seen == 0] = _UNSEEN

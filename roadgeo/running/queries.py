@@ -40,7 +40,7 @@ from roadgeo.sources.segmentation.scales import rank_scales, scale_of
 from roadgeo.sources.segmentation.tiling import map_shape, segment
 from roadgeo.workflows import locate
 
-__all__ = ["QueryOptions", "is_model", "locate_query"]
+__all__ = ["FirstLook", "QueryOptions", "is_model", "locate_query", "look_once"]
 
 #: The mask of a larger photograph is reduced, so that time and memory are bounded.
 _MAX_GRID_PIXELS = 64_000_000
@@ -95,6 +95,11 @@ class QueryOptions:
     units: Units = "auto"
     aspect: float | Literal["unknown"] | None = None
 
+    @property
+    def may_be_mask(self) -> bool:
+        """Whether it is looked for a mask first; plugins are shown all that is given."""
+        return self.segment == "never" or (self.segment == "auto" and all(map(is_model, self.segmenters)))
+
 
 def locate_query(
     path: str | AnyArray,
@@ -119,9 +124,7 @@ def locate_query(
     options, query = options or LocateOptions(), query or QueryOptions()
     if isinstance(path, str) and path.lower().endswith(ENDINGS):
         return _locate_lines(path, references, options, query, how)
-    has_plugin = any(not is_model(name) for name in query.segmenters)
-    wants_mask = query.segment == "never" or (query.segment == "auto" and not has_plugin)
-    if wants_mask and not query.fused_with:
+    if query.may_be_mask and not query.fused_with:
         try:
             sighting = _locate_mask(path, references, options, query, how)
             if query.aspect is not None:
@@ -135,6 +138,59 @@ def locate_query(
         raise MaskError("the roads of a photograph are found in files only: save it as GeoTIFF or PNG first")
     sighting = _locate_photograph((path, *query.fused_with), references, options, query, how, say)
     return replace(sighting, of_photograph=True)
+
+
+@dataclass(frozen=True)
+class FirstLook:
+    """What is seen in a query before it is compared with any map.
+
+    Attributes
+    ----------
+    mask : RoadMask
+        Its roads, on the grid that they are traced on; of a photograph there may be none.
+    coarser : float
+        Pixels of the query for each of the mask, along a side: above 1 for a large photograph, below for a coarse one.
+    probability : ProbabilityMap or None
+        Of a photograph, in its own pixels (those of its mask, where it is large).
+    """
+
+    mask: RoadMask
+    coarser: float = 1.0
+    probability: ProbabilityMap | None = None
+
+
+def look_once(path: str, gsd_m: tuple[float, float] | None, query: QueryOptions, say: Say = say_nothing) -> FirstLook:
+    """Read a mask, or find the roads of a photograph, as `locate_query` does at its first look.
+
+    Parameters
+    ----------
+    path : str
+    gsd_m : (2,) or None
+        Metres per pixel, if known: photographs are shown to the model at its own.
+
+    Raises
+    ------
+    MaskError, ModelError, PluginError
+        As of `locate_query`.
+    """
+    if query.may_be_mask:
+        try:
+            with open_mask(path, band=query.band, threshold=query.threshold) as opened:
+                return FirstLook(opened.read(opened.thresholds[0]))
+        except PhotographError:
+            if query.segment == "never":
+                raise
+    plugin = _only_plugin(query)
+    if plugin:
+        return FirstLook(_call_segmenter(plugin, path, query.threshold))
+    camera = CameraOptions() if gsd_m is None else CameraOptions(gsd_m=gsd_m)
+    frame = _open_frame([path], query, camera, say)
+    seen = frame.see(frame.scales[0])
+    try:
+        mask = _looks_at(lambda: seen, frame.scales[0], query)[0].make()
+    except MaskError:  # what was seen is worth a look all the same
+        mask = RoadMask(np.zeros(seen.values.shape, np.bool_), name=path)
+    return FirstLook(mask, frame.coarser, seen.resized(frame.own))
 
 
 def is_model(segmenter: str) -> bool:
@@ -178,17 +234,61 @@ def _locate_photograph(
     say: Say,
 ) -> Sighting:
     """Segment a photograph, or several of one frame, and locate what is seen."""
-    plugins = [name for name in query.segmenters if not is_model(name)]
-    if plugins and len(query.segmenters) == 1 and len(paths) == 1:
-        mask = _call_segmenter(plugins[0], paths[0], query.threshold)
+    plugin = _only_plugin(query)
+    if plugin and len(paths) == 1:
+        mask = _call_segmenter(plugin, paths[0], query.threshold)
         return locate_looks([Look("the segmenter's own threshold", lambda: mask)], references, options, how)
+    frame = _open_frame(paths, query, options.match.camera, say)
+    at_scales = [_looks_at(partial(frame.see, scale), scale, query) for scale in frame.scales]
+    looks = [looks[0] for looks in at_scales] + at_scales[0][1:]
+    if frame.is_shown_to_model:
+        looks.insert(1, _look_more_ways(partial(frame.see, frame.scales[0], _MORE_WAYS), frame.scales[0], query))
+    own, options = frame.own, _on_grid(options, frame.coarser)
+    try:
+        return _of_own_pixels(locate_looks(looks, references, options, how), own)
+    except MaskError as error:
+        where = ", ".join(one.name for one in references)
+        reason = f"hardly a road is seen in the photograph ({error})"
+        location = Location(paths[0], "not_located", reason, where, size=(own[1], own[0]), reason_code=Reason.FEW_ROADS)
+        nothing, seen = RoadMask(np.zeros(own, np.bool_), name=paths[0]), frame.see(frame.scales[0]).resized(own)
+        return Sighting(location, nothing, probability=seen)
+
+
+@dataclass(frozen=True)
+class _Frame:
+    """A photograph, or several of one frame, to be shown to segmenters.
+
+    Attributes
+    ----------
+    own : (H, W)
+        Of the photograph; of its mask, where it is large.
+    coarser : float
+        Pixels of the photograph for each that roads are traced on, along a side.
+    scales : list of float
+        Those worth trying, the most promising first.
+    is_shown_to_model : bool
+        To one at least, not to plugins alone.
+    see : callable
+        `see(scale, ways)` returns the probability of road, on the grid that roads are traced on; kept for another call.
+    """
+
+    own: tuple[int, int]
+    coarser: float
+    scales: list[float]
+    is_shown_to_model: bool
+    see: Callable[..., ProbabilityMap]
+
+
+def _open_frame(paths: Sequence[str], query: QueryOptions, camera: CameraOptions, say: Say) -> _Frame:
+    """Choose the grid and the scales of a photograph, or of several of one frame."""
     with open_photograph(paths[0]) as photograph:
         k = max(1, int(np.ceil(np.sqrt(photograph.width * photograph.height / _MAX_GRID_PIXELS))))
         own = round(photograph.height / k), round(photograph.width / k)
-        scales = _choose_scales(photograph, query, options, say)
-        finer = _how_much_finer(own, scales[0])
-        grid = round(finer * own[0]), round(finer * own[1])
+        scales = _choose_scales(photograph, query, camera, say)
+    finer = _how_much_finer(own, scales[0])
+    grid = round(finer * own[0]), round(finer * own[1])
     names = query.segmenters or ("",)
+    plugins = [name for name in query.segmenters if not is_model(name)]
     masks = {path: read for path in paths if (read := _fused_mask(path, query)) is not None}
 
     @lru_cache(_MAX_SCALES + 1)
@@ -203,19 +303,8 @@ def _locate_photograph(
         maps = [one.resized(grid) for one in seen]
         return maps[0] if len(maps) == 1 else fuse(maps)
 
-    at_scales = [_looks_at(partial(see, scale), scale, query) for scale in scales]
-    looks = [looks[0] for looks in at_scales] + at_scales[0][1:]
-    if len(plugins) < len(names) and not masks.keys() >= set(paths):  # a model is shown a photograph
-        looks.insert(1, _look_more_ways(partial(see, scales[0], _MORE_WAYS), scales[0], query))
-    options = _on_grid(options, k / finer)
-    try:
-        return _of_own_pixels(locate_looks(looks, references, options, how), own)
-    except MaskError as error:
-        where = ", ".join(one.name for one in references)
-        reason = f"hardly a road is seen in the photograph ({error})"
-        location = Location(paths[0], "not_located", reason, where, size=(own[1], own[0]), reason_code=Reason.FEW_ROADS)
-        nothing, seen = RoadMask(np.zeros(own, np.bool_), name=paths[0]), see(scales[0]).resized(own)
-        return Sighting(location, nothing, probability=seen)
+    shown = len(plugins) < len(names) and not masks.keys() >= set(paths)
+    return _Frame(own, k / finer, scales, shown, see)
 
 
 def _how_much_finer(own: tuple[int, int], scale: float) -> float:
@@ -253,13 +342,13 @@ def _looks_at(see: Callable[[], ProbabilityMap], scale: float, query: QueryOptio
     return [look(share) for share in (_THRESHOLDS if query.threshold is None else (0.0,))]
 
 
-def _choose_scales(photograph: Photograph, query: QueryOptions, options: LocateOptions, say: Say) -> list[float]:
+def _choose_scales(photograph: Photograph, query: QueryOptions, camera: CameraOptions, say: Say) -> list[float]:
     """Return the scales to try, the most promising first: one where the size of a pixel is known."""
     models = [name for name in query.segmenters if is_model(name)] or ([] if query.segmenters else [""])
     if not models:
         return [1.0]
     network = _network(models[0], query.class_name, query.threads)
-    low, high = options.match.camera.gsd_m
+    low, high = camera.gsd_m
     if high <= _KNOWN_SPAN * low:
         return [scale_of(float(np.sqrt(low * high)), network)]
     say(f"looking for the scale of {photograph.name}")
@@ -303,6 +392,11 @@ def _of_mask(mask: RoadMask, model: str) -> ProbabilityMap:
 def _network(path: str, class_name: str | None, threads: int) -> Network:
     """Load a model, once for a batch."""
     return load_network(Path(path) if path else DEFAULT_MODEL, class_name=class_name, threads=threads)
+
+
+def _only_plugin(query: QueryOptions) -> str:
+    """Return the name of the plugin that alone finds roads; nothing where there is a model too, or none of both."""
+    return query.segmenters[0] if len(query.segmenters) == 1 and not is_model(query.segmenters[0]) else ""
 
 
 def _call_segmenter(name: str, path: str, threshold: float | None) -> RoadMask:

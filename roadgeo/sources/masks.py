@@ -24,7 +24,7 @@ from roadgeo.roads.vectorization import road_width
 from roadgeo.sources.segmentation.photograph import MAX_SIDE as MAX_PHOTOGRAPH_SIDE
 from roadgeo.sources.thresholds import Sample, find_thresholds, ground_and_road
 from roadgeo.storage.gdal import is_named_remote
-from roadgeo.storage.rasters import image_size, open_raster, require_file, sidecar_nodata
+from roadgeo.storage.rasters import image_size, open_raster, read_palette, require_file, sidecar_nodata
 from roadgeo.storage.silence import silenced
 
 if TYPE_CHECKING:
@@ -35,6 +35,7 @@ __all__ = ["MaskSource", "open_mask", "read_mask"]
 _LOG = logging.getLogger(__name__)
 
 MIN_SIDE, MAX_SIDE = 32, 20_000
+_MAX_CLASSES = 32  # whose colours a palette holds
 _MAX_BANDS = 3  # of a mask, unless one of them is chosen
 _STRIP_PIXELS = 1 << 25  # rows are read and thresholded so many pixels at a time
 _SAMPLE_PIXELS = 1 << 18  # what a mask's values mean is told from about so many
@@ -432,6 +433,7 @@ def _of_dataset(dataset: DatasetReader, band: int | None, name: str, nodata: flo
     kinds = {str(dataset.dtypes[i - 1]) for i in chosen}
     if not all(kind.startswith(("bool", "int", "uint", "float")) for kind in kinds):
         raise MaskError(f"{name}: holds values of type {', '.join(sorted(kinds))}; expected real numbers")
+    palette = _palette_of_picture(dataset) if len(colour) == 1 else None
     all_valid = MaskFlags.all_valid in list(dataset.mask_flag_enums)[chosen[0] - 1]
 
     def read(top: int, bottom: int, step: int) -> tuple[AnyArray, BoolArray | None]:
@@ -442,11 +444,18 @@ def _of_dataset(dataset: DatasetReader, band: int | None, name: str, nodata: flo
         if nodata is not None and dataset.nodata is None:
             known = (values != nodata).all(axis=2)
             valid = known if valid is None else valid & known
-        return values, valid
+        return values if palette is None else palette[values[..., 0]], valid
 
     has_alpha = len(colour) < dataset.count
     n_unread = 0 if band is not None else len(colour) - len(chosen)
-    return _Raster(name, (dataset.height, dataset.width), len(chosen), read, has_alpha, n_unread)
+    n_bands = len(chosen) if palette is None else palette.shape[1]
+    return _Raster(name, (dataset.height, dataset.width), n_bands, read, has_alpha, n_unread)
+
+
+def _palette_of_picture(dataset: DatasetReader) -> AnyArray | None:
+    """Return (256, 3) colours of more kinds than classes have; None where values mean what they are."""
+    palette = read_palette(dataset) if dataset.dtypes[0] == "uint8" else None
+    return palette if palette is not None and len(np.unique(palette, axis=0)) > _MAX_CLASSES else None
 
 
 def _bands(name: str, band: int | None, n_bands: int) -> list[int]:

@@ -17,13 +17,16 @@ from contextlib import contextmanager
 from pathlib import Path
 from typing import TYPE_CHECKING, BinaryIO
 
+import numpy as np
+
+from roadgeo._arrays import AnyArray
 from roadgeo.errors import MaskError, OutputError
 from roadgeo.storage.gdal import CONSENT, NETWORK, SEALED, allowed_drivers, is_named_remote
 
 if TYPE_CHECKING:
     from rasterio import DatasetReader
 
-__all__ = ["image_size", "open_raster", "require_file", "sidecar_nodata", "writing_raster"]
+__all__ = ["image_size", "open_raster", "read_palette", "require_file", "sidecar_nodata", "writing_raster"]
 
 #: First bytes of the formats that are read, and GDAL's names of their drivers.
 _DRIVERS = (
@@ -162,6 +165,14 @@ def _jpeg_size(file: BinaryIO) -> tuple[int, int, int] | None:
             return width, height, width * height * frame[5]
         file.seek(size - 2, os.SEEK_CUR)
     return None
+
+
+def read_palette(dataset: DatasetReader) -> AnyArray | None:
+    """Return the colours that the values of a raster's first band stand for, (256, 3) RGB; None where they do not."""
+    if dataset.colorinterp[0].name != "palette":
+        return None
+    colors = dataset.colormap(1)
+    return np.array([colors.get(i, (0, 0, 0))[:3] for i in range(256)], np.uint8)
 
 
 def sidecar_nodata(path: str | os.PathLike[str]) -> float | None:

@@ -155,4 +155,4 @@ def test_the_place_that_a_mask_states_is_compared(porto: str, capfd: pytest.Capt
     with rasterio.open("stated.tif", "w", **profile, crs=found["crs"], transform=place) as dataset:
         dataset.write(drone(), 1)
     assert locate("stated.tif", porto) == 0
-    assert "georeference puts its middle 120." in capfd.readouterr().out
+    assert "georeference puts the middle 120." in capfd.readouterr().out

@@ -422,6 +422,15 @@ def test_a_mask_is_vectorized(qgis: Qgis) -> None:
     assert done["layers"]["Roads as seen"]["colors"] == ["#ffbe28"]
 
 
+def test_a_photograph_is_vectorized(qgis: Qgis) -> None:
+    photo = MASKS["drone"].path.with_name("drone_photo.jpg")
+    arguments = {"MASK": str(photo), "OUTPUT_FOLDER": str(qgis.folder / "seen"), "GSD_MIN": 0.8, "GSD_MAX": 1.2}
+    (done,), _, _ = qgis.ask(("run", {"algorithm": "roadgeo:vectorizemask", "parameters": arguments}))
+    assert set(done["layers"]) == {"Roads as seen", "Intersections as seen"}
+    assert all(layer["features"] > 30 for layer in done["layers"].values())
+    assert (qgis.folder / "seen" / "drone_photo_mask.tif").exists()
+
+
 def test_where_masks_would_be_located_is_mapped(qgis: Qgis, porto: Path) -> None:
     arguments = {"REFERENCE": str(porto), "OUTPUT_FOLDER": str(qgis.folder / "where"), "COUNT": 4, "NOISE": "clean"}
     (done,), _, _ = qgis.ask(("run", {"algorithm": "roadgeo:maplocalizability", "parameters": arguments}))

@@ -18,6 +18,7 @@ from roadgeo.matching.options import LocateOptions
 from roadgeo.running import queries
 from roadgeo.running.queries import QueryOptions, _how_much_finer, locate_query
 from roadgeo.sources.segmentation.probability import TAG, ProbabilityMap
+from roadgeo.storage.geopackage import read_layer
 from roadgeo.workflows import build_reference
 
 pytestmark = pytest.mark.filterwarnings("ignore::rasterio.errors.NotGeoreferencedWarning")
@@ -177,6 +178,53 @@ def test_what_was_seen_is_told_and_drawn(
     assert page.count('id="probability"') == 1
     assert main(["locate", str(MASK.path), "-r", str(demo_reference), "-o", str(tmp_path), "--report"]) == 0
     assert "probability" not in (tmp_path / "drone_report.html").read_text().split("<script>")[0].split("</style>")[1]
+
+
+def test_what_is_seen_is_shown_without_a_map(
+    tmp_path: Path, model: str, photo: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    """Traced on a finer grid where pixels are coarse; the layers lie on the photograph all the same."""
+    image = cv2.imread(str(photo))
+    cv2.imwrite(str(tmp_path / "coarse.png"), cv2.resize(image, None, fx=0.5, fy=0.5, interpolation=cv2.INTER_AREA))
+    given = ["--segmenter", model, "-o", str(tmp_path / "seen")]
+    assert main(["vectorize", str(photo), *given, "--gsd", "0.6:1"]) == 0
+    assert main(["vectorize", str(tmp_path / "coarse.png"), *given, "--gsd", "1.2:2"]) == 0
+    assert "flight_mask.tif" in capsys.readouterr().out
+    points = {
+        name: read_layer(tmp_path / "seen" / f"{name}_vectorized.gpkg", "intersections")[0]
+        for name in ("flight", "coarse")
+    }
+    assert len(points["coarse"]) > 0.8 * len(points["flight"])
+    fine = np.array(points["flight"]) / 2
+    nearest = np.linalg.norm(np.array(points["coarse"])[:, None] - fine, axis=2).min(axis=1)
+    assert np.median(nearest) < 0.5
+    with rasterio.open(tmp_path / "seen" / "coarse_mask.tif") as kept:
+        assert TAG in kept.tags()
+        assert kept.shape == (image.shape[0] // 2, image.shape[1] // 2)
+    drawn = cv2.imread(str(tmp_path / "seen" / "flight_vectorized.png"))
+    assert drawn.shape == image.shape
+    far = cv2.distanceTransform(np.uint8(image.max(axis=2) < 200), cv2.DIST_L2, 3) > 20
+    assert np.abs(drawn[far] - 0.8 * image[far]).mean() < 3  # the photograph itself
+
+
+def test_what_plugins_and_masks_show(
+    tmp_path: Path, photo: Path, model: str, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    monkeypatch.setattr(queries, "call_plugin", lambda *_: cv2.imread(str(MASK.path), cv2.IMREAD_GRAYSCALE))
+    seen = queries.look_once(str(photo), None, QueryOptions(segmenters=("plugin",)))
+    assert seen.probability is None
+    assert seen.coarser == 1.0
+    np.testing.assert_array_equal(seen.mask.roads, queries.look_once(str(MASK.path), None, QueryOptions()).mask.roads)
+    assert main(["vectorize", str(photo), "--segment", "never", "-o", str(tmp_path)]) == 1
+    assert "looks like a photograph" in capsys.readouterr().err
+    given = ["vectorize", str(photo), "-o", str(tmp_path), "--segmenter", model]
+    assert main([*given, "--segment", "always", "--threshold", "0.999"]) == 1
+    assert "no road is seen in it that is probable enough; wrote" in capsys.readouterr().err
+    assert (tmp_path / "flight_mask.tif").exists()
+    (tmp_path / "flight_mask.tif").write_bytes(b"the user's")
+    assert main(given) == 1
+    assert "was not written by roadgeo" in capsys.readouterr().err
+    assert (tmp_path / "flight_mask.tif").read_bytes() == b"the user's"
 
 
 def test_our_own_probability_map_is_no_further_query(

@@ -117,6 +117,20 @@ def test_a_palette(tmp_path: Path, roads: np.ndarray) -> None:
     np.testing.assert_array_equal(read_mask(path).roads, roads)
 
 
+def test_a_photograph_in_a_palette(tmp_path: Path, roads: np.ndarray) -> None:
+    """Numbers of its colours mean nothing: here they are high on roads, which are no lighter than the ground."""
+    path = tmp_path / "photo.tif"
+    colors = ground().reshape(3, -1).T[::7][:38]
+    numbers = np.random.default_rng(0).integers(0, 19, roads.shape)
+    profile = {"driver": "GTiff", "count": 1, "height": SHAPE[0], "width": SHAPE[1], "dtype": "uint8"}
+    with rasterio.open(path, "w", **profile, photometric="palette") as dataset:
+        dataset.write(np.where(roads, 237 + numbers, numbers).astype(np.uint8), 1)
+        shown = [*range(19), *range(237, 256)]
+        dataset.write_colormap(1, {i: (*map(int, color), 255) for i, color in zip(shown, colors, strict=True)})
+    with pytest.raises(PhotographError, match="looks like a photograph"):
+        read_mask(path)
+
+
 @pytest.mark.parametrize("kind", ["nodata", "nan", "alpha", "alpha png", "masked array", "mask band"])
 def test_what_was_not_observed(tmp_path: Path, roads: np.ndarray, kind: str) -> None:
     seen = np.ones(SHAPE, bool)

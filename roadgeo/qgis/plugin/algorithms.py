@@ -21,10 +21,10 @@ from .parameters import (
     CAMERA,
     ITS_MASK,
     LOCALIZABILITY,
-    MASK,
     MASK_VALUES,
     OUTPUT_FOLDER,
     PICTURE,
+    PIXEL_SIZE,
     QUERY,
     REFERENCE,
     REPORT,
@@ -237,13 +237,13 @@ class LocateMasks(RoadgeoAlgorithm):
 class VectorizeMask(RoadgeoAlgorithm):
     """What the program sees."""
 
-    NAME, TITLE = "vectorizemask", "Vectorize mask"
+    NAME, TITLE = "vectorizemask", "Vectorize mask or photograph"
     TAGS = "skeleton centre lines trace roads intersections"
     HELP = (
-        "Shows what roads and intersections are seen in a road mask: the first thing to look at when one was not "
-        "located. The layers are in pixels and lie on the mask where it has no georeference."
+        "Shows what roads and intersections are seen in a road mask or a photograph: the first thing to look at when "
+        "one was not located. The layers are in pixels and lie on the image where it has no georeference."
     )
-    OPTIONS = (MASK, *MASK_VALUES, OUTPUT_FOLDER)
+    OPTIONS = (QUERY, *MASK_VALUES, *SEGMENT, *PIXEL_SIZE, OUTPUT_FOLDER)
     OUTPUTS: ClassVar[dict[str, tuple[Any, str]]] = {"VECTORIZED": (QgsProcessingOutputVectorLayer, "Roads as seen")}
 
     def work(self, values: Values, session: Session) -> dict[str, Any]:

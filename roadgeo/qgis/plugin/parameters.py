@@ -38,6 +38,7 @@ __all__ = [
     "MASK_VALUES",
     "OUTPUT_FOLDER",
     "PICTURE",
+    "PIXEL_SIZE",
     "QUERY",
     "REFERENCE",
     "REPORT",
@@ -279,7 +280,7 @@ REFERENCE = Option(
     {"extension": "gpkg", "optional": True},
 )
 
-CAMERA = _fold(
+PIXEL_SIZE = _fold(
     Option(
         QgsProcessingParameterNumber,
         "GSD_MIN",
@@ -295,6 +296,9 @@ CAMERA = _fold(
         "See above.",
         settings={"type": QgsProcessingParameterNumber.Type.Double, "defaultValue": 12.0, "minValue": 1e-3},
     ),
+)
+
+CAMERA = PIXEL_SIZE + _fold(
     _number(
         "--max-tilt",
         "MAX_TILT",

@@ -13,7 +13,7 @@ import numpy as np
 
 from roadgeo._arrays import AnyArray, BoolArray
 from roadgeo.errors import MaskError
-from roadgeo.storage.rasters import open_raster
+from roadgeo.storage.rasters import open_raster, read_palette
 
 if TYPE_CHECKING:
     from rasterio import DatasetReader
@@ -109,11 +109,7 @@ def _read(
 
 def _find_stretch(dataset: DatasetReader, bands: list[int], name: str) -> Callable[[AnyArray], AnyArray]:
     """Return what makes (H, W, 3) 8-bit RGB of (H, W, B) values."""
-    palette = None
-    if dataset.count == 1 and dataset.dtypes[0] == "uint8" and dataset.colorinterp[0].name == "palette":
-        palette = np.zeros((256, 3), np.uint8)
-        for index, colour in dataset.colormap(1).items():
-            palette[index] = colour[:3]
+    palette = read_palette(dataset) if dataset.count == 1 and dataset.dtypes[0] == "uint8" else None
     if palette is not None:
         table = palette
         return lambda values: table[values[..., 0]]
