@@ -9,6 +9,7 @@ from __future__ import annotations
 import math
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
+from typing import TypeVar, overload
 
 import numpy as np
 
@@ -20,12 +21,35 @@ from roadgeo.matching.options import LocateOptions
 from roadgeo.reference.reference import AnyReference
 from roadgeo.sources.segmentation.probability import ProbabilityMap
 
-__all__ = ["Locate", "Look", "Sighting", "locate_looks"]
+__all__ = ["Later", "Locate", "Look", "Sighting", "locate_looks"]
 
 #: Share of the work left that a look may take; the last one may take all.
 _SHARE = 0.6
 
 Locate = Callable[[RoadMask, Sequence[AnyReference], LocateOptions], "Location | Explanation"]
+
+
+T = TypeVar("T")
+
+
+class Later(Sequence[T]):
+    """A sequence of known length whose elements are made when they are asked for: most looks are never taken."""
+
+    def __init__(self, makers: Sequence[Callable[[], T]]) -> None:
+        self._makers = makers
+
+    def __len__(self) -> int:
+        return len(self._makers)
+
+    @overload
+    def __getitem__(self, index: int) -> T: ...
+
+    @overload
+    def __getitem__(self, index: slice) -> Later[T]: ...
+
+    def __getitem__(self, index: int | slice) -> T | Later[T]:
+        """Make an element, or leave the others out."""
+        return Later(self._makers[index]) if isinstance(index, slice) else self._makers[index]()
 
 
 @dataclass(frozen=True)

@@ -11,7 +11,7 @@ import os
 from collections.abc import Callable, Sequence
 from contextlib import suppress
 from dataclasses import dataclass, replace
-from functools import lru_cache, partial
+from functools import cache, lru_cache, partial
 from pathlib import Path
 from typing import Literal
 
@@ -26,7 +26,7 @@ from roadgeo.location import Location, Reason
 from roadgeo.matching.options import LocateOptions
 from roadgeo.plugins import SEGMENTERS, call_plugin
 from roadgeo.reference.reference import AnyReference
-from roadgeo.running.looks import Locate, Look, Sighting, locate_looks
+from roadgeo.running.looks import Later, Locate, Look, Sighting, locate_looks
 from roadgeo.running.mirroring import ask_mirrored
 from roadgeo.running.regridding import of_own_pixels, on_grid
 from roadgeo.running.stretching import ask_stretched
@@ -34,9 +34,9 @@ from roadgeo.sources.drawn_roads import ENDINGS, Units, draw_roads
 from roadgeo.sources.exif import estimate_gsd
 from roadgeo.sources.masks import open_mask, read_mask
 from roadgeo.sources.segmentation.network import DEFAULT_MODEL, Network, load_network
-from roadgeo.sources.segmentation.photograph import Photograph, open_photograph
+from roadgeo.sources.segmentation.photograph import open_photograph
 from roadgeo.sources.segmentation.probability import NODATA, ProbabilityMap, fuse
-from roadgeo.sources.segmentation.scales import rank_scales, scale_of
+from roadgeo.sources.segmentation.scales import rank_scales, scale_of, try_scales
 from roadgeo.sources.segmentation.tiling import map_shape, segment
 from roadgeo.workflows import locate
 
@@ -53,7 +53,7 @@ _MOST_FINER, _LEAST_FINER = 2.0, 1.25
 _KNOWN_SPAN = 1.7  # a range of pixel sizes narrower than this is one scale
 
 #: Further thresholds of a probability map, as shares of the way from the model's own to 0 (below 0) and to 1.
-_THRESHOLDS = (0.0, -0.5, 0.4)
+_FURTHER_THRESHOLDS = (-0.5, 0.4)
 
 
 @dataclass(frozen=True)
@@ -187,7 +187,7 @@ def look_once(path: str, gsd_m: tuple[float, float] | None, query: QueryOptions,
     frame = _open_frame([path], query, camera, say)
     seen = frame.see(frame.scales[0])
     try:
-        mask = _looks_at(lambda: seen, frame.scales[0], query)[0].make()
+        mask = _look_at(lambda: seen, frame.scales[0], query).make()
     except MaskError:  # what was seen is worth a look all the same
         mask = RoadMask(np.zeros(seen.values.shape, np.bool_), name=path)
     return FirstLook(mask, frame.coarser, seen.resized(frame.own))
@@ -239,19 +239,33 @@ def _locate_photograph(
         mask = _call_segmenter(plugin, paths[0], query.threshold)
         return locate_looks([Look("the segmenter's own threshold", lambda: mask)], references, options, how)
     frame = _open_frame(paths, query, options.match.camera, say)
-    at_scales = [_looks_at(partial(frame.see, scale), scale, query) for scale in frame.scales]
-    looks = [looks[0] for looks in at_scales] + at_scales[0][1:]
-    if frame.is_shown_to_model:
-        looks.insert(1, _look_more_ways(partial(frame.see, frame.scales[0], _MORE_WAYS), frame.scales[0], query))
     own, options = frame.own, _on_grid(options, frame.coarser)
     try:
-        return _of_own_pixels(locate_looks(looks, references, options, how), own)
+        return _of_own_pixels(locate_looks(_plan_looks(frame, query), references, options, how), own)
     except MaskError as error:
         where = ", ".join(one.name for one in references)
         reason = f"hardly a road is seen in the photograph ({error})"
         location = Location(paths[0], "not_located", reason, where, size=(own[1], own[0]), reason_code=Reason.FEW_ROADS)
         nothing, seen = RoadMask(np.zeros(own, np.bool_), name=paths[0]), frame.see(frame.scales[0]).resized(own)
         return Sighting(location, nothing, probability=seen)
+
+
+def _plan_looks(frame: _Frame, query: QueryOptions) -> Later[Look]:
+    """Return the best scale's look, the photograph turned as well, other scales, and other thresholds at the best."""
+
+    def look(i: int, share: float = 0.0) -> Look:
+        return _look_at(partial(frame.see, frame.scales[i]), frame.scales[i], query, share)
+
+    def look_more_ways() -> Look:
+        one = _look_at(partial(frame.see, frame.scales[0], _MORE_WAYS), frame.scales[0], query)
+        return replace(one, what=f"{one.what}, shown {_MORE_WAYS} ways")
+
+    makers: list[Callable[[], Look]] = [partial(look, i) for i in range(len(frame.scales))]
+    if frame.is_shown_to_model:
+        makers.insert(1, look_more_ways)
+    if query.threshold is None:
+        makers += [partial(look, 0, share) for share in _FURTHER_THRESHOLDS]
+    return Later(makers)
 
 
 @dataclass(frozen=True)
@@ -264,7 +278,7 @@ class _Frame:
         Of the photograph; of its mask, where it is large.
     coarser : float
         Pixels of the photograph for each that roads are traced on, along a side.
-    scales : list of float
+    scales : sequence of float
         Those worth trying, the most promising first.
     is_shown_to_model : bool
         To one at least, not to plugins alone.
@@ -274,7 +288,7 @@ class _Frame:
 
     own: tuple[int, int]
     coarser: float
-    scales: list[float]
+    scales: Sequence[float]
     is_shown_to_model: bool
     see: Callable[..., ProbabilityMap]
 
@@ -284,23 +298,25 @@ def _open_frame(paths: Sequence[str], query: QueryOptions, camera: CameraOptions
     with open_photograph(paths[0]) as photograph:
         k = max(1, int(np.ceil(np.sqrt(photograph.width * photograph.height / _MAX_GRID_PIXELS))))
         own = round(photograph.height / k), round(photograph.width / k)
-        scales = _choose_scales(photograph, query, camera, say)
+    tried: _Tried = {}
+    scales = _choose_scales(paths[0], query, camera, say, tried)
     finer = _how_much_finer(own, scales[0])
     grid = round(finer * own[0]), round(finer * own[1])
     names = query.segmenters or ("",)
     plugins = [name for name in query.segmenters if not is_model(name)]
     masks = {path: read for path in paths if (read := _fused_mask(path, query)) is not None}
 
+    def see_one(path: str, name: str, scale: float, ways: int) -> ProbabilityMap:
+        if path in masks and name not in plugins:
+            return _of_mask(masks[path], "mask")
+        known = tried.get((path, name, scale)) if ways == 1 else None
+        if known is not None and known.values.shape[0] < 2 * grid[0]:
+            return known
+        return _see(path, name, scale, grid, query, say, ways)
+
     @lru_cache(_MAX_SCALES + 1)
     def see(scale: float, ways: int = 1) -> ProbabilityMap:
-        seen = [
-            _of_mask(masks[path], "mask")
-            if path in masks and name not in plugins
-            else _see(path, name, scale, grid, query, say, ways)
-            for path in paths
-            for name in names
-        ]
-        maps = [one.resized(grid) for one in seen]
+        maps = [see_one(path, name, scale, ways).resized(grid) for path in paths for name in names]
         return maps[0] if len(maps) == 1 else fuse(maps)
 
     shown = len(plugins) < len(names) and not masks.keys() >= set(paths)
@@ -322,41 +338,49 @@ def _of_own_pixels(sighting: Sighting, own: tuple[int, int]) -> Sighting:
     return replace(sighting, location=location, mask=mask, probability=probability)
 
 
-def _look_more_ways(see: Callable[[], ProbabilityMap], scale: float, query: QueryOptions) -> Look:
-    """Return a look at a probability map for which the photograph was turned and turned over."""
-    one = _looks_at(see, scale, query)[0]
-    return replace(one, what=f"{one.what}, shown {_MORE_WAYS} ways")
+def _look_at(see: Callable[[], ProbabilityMap], scale: float, query: QueryOptions, share: float = 0.0) -> Look:
+    """Return a look at a probability map, at the model's threshold or a share of the way from there to 0 or 1."""
 
-
-def _looks_at(see: Callable[[], ProbabilityMap], scale: float, query: QueryOptions) -> list[Look]:
-    """Return looks at one probability map, at the model's threshold and others."""
-
-    def threshold(share: float) -> float:
+    def threshold() -> float:
         own = see().threshold if query.threshold is None else query.threshold
         return own + share * (own if share < 0 else 1 - own)
 
-    def look(share: float) -> Look:
-        what = f"scale {scale:.3g}" + (f", threshold {share:+.0%}" if share else "")
-        return Look(what, lambda: see().mask(threshold(share)), see)
-
-    return [look(share) for share in (_THRESHOLDS if query.threshold is None else (0.0,))]
+    what = f"scale {scale:.3g}" + (f", threshold {share:+.0%}" if share else "")
+    return Look(what, lambda: see().mask(threshold()), see)
 
 
-def _choose_scales(photograph: Photograph, query: QueryOptions, camera: CameraOptions, say: Say) -> list[float]:
-    """Return the scales to try, the most promising first: one where the size of a pixel is known."""
+#: What models saw in whole photographs: by photograph, segmenter and scale.
+_Tried = dict[tuple[str, str, float], ProbabilityMap]
+
+
+def _choose_scales(path: str, query: QueryOptions, camera: CameraOptions, say: Say, tried: _Tried) -> Later[float]:
+    """Return the scales to try: one where the size of a pixel is known; else the one that the file states comes first.
+
+    The photograph is shown to the model when one of the others is asked for; what is seen then is put into `tried`.
+    """
     models = [name for name in query.segmenters if is_model(name)] or ([] if query.segmenters else [""])
     if not models:
-        return [1.0]
+        return Later([lambda: 1.0])
     network = _network(models[0], query.class_name, query.threads)
     low, high = camera.gsd_m
     if high <= _KNOWN_SPAN * low:
-        return [scale_of(float(np.sqrt(low * high)), network)]
-    say(f"looking for the scale of {photograph.name}")
-    ranked = rank_scales(photograph, network)[:_MAX_SCALES]
-    stated = estimate_gsd(photograph.name)
-    if stated is None or not low <= stated <= high:
-        return ranked
-    return [scale_of(stated, network), *ranked][:_MAX_SCALES]
+        return Later([partial(scale_of, float(np.sqrt(low * high)), network)])
+
+    @cache
+    def ranked() -> list[float]:
+        say(f"looking for the scale of {path}")
+        with open_photograph(path) as photograph:
+            found = rank_scales(photograph, network, camera.gsd_m)
+        tried.update({(path, models[0], scale): seen for scale, seen in found.items() if seen is not None})
+        return list(found)
+
+    with open_photograph(path) as photograph:
+        n_ranked = len(try_scales(photograph, network, camera.gsd_m))
+    stated = estimate_gsd(path)
+    makers = [partial(lambda i: ranked()[i], i) for i in range(n_ranked)]
+    if stated is not None and low <= stated <= high:
+        makers.insert(0, partial(scale_of, stated, network))
+    return Later(makers[:_MAX_SCALES])
 
 
 def _fused_mask(path: str, query: QueryOptions) -> RoadMask | None:

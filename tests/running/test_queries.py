@@ -10,6 +10,7 @@ import pytest
 import rasterio
 from worlds.models import brightness_model
 
+from roadgeo import open_reference
 from roadgeo.cli import main
 from roadgeo.errors import MaskError, ModelError, PhotographError
 from roadgeo.evaluation.demo import ROADS, demo_masks
@@ -18,6 +19,8 @@ from roadgeo.matching.options import LocateOptions
 from roadgeo.running import queries
 from roadgeo.running.queries import QueryOptions, _how_much_finer, locate_query
 from roadgeo.sources.segmentation.probability import TAG, ProbabilityMap
+from roadgeo.sources.segmentation.scales import rank_scales
+from roadgeo.sources.segmentation.tiling import segment
 from roadgeo.storage.geopackage import read_layer
 from roadgeo.workflows import build_reference
 
@@ -178,6 +181,26 @@ def test_what_was_seen_is_told_and_drawn(
     assert page.count('id="probability"') == 1
     assert main(["locate", str(MASK.path), "-r", str(demo_reference), "-o", str(tmp_path), "--report"]) == 0
     assert "probability" not in (tmp_path / "drone_report.html").read_text().split("<script>")[0].split("</style>")[1]
+
+
+@pytest.mark.parametrize("stated", [None, 0.8])
+def test_no_scale_is_looked_for_in_vain(
+    demo_reference: Path, model: str, photo: Path, monkeypatch: pytest.MonkeyPatch, stated: float | None
+) -> None:
+    """Where the file states one it comes first; where none is known, what was seen on the way is taken."""
+    calls = []
+    monkeypatch.setattr(queries, "estimate_gsd", lambda _: stated)
+    monkeypatch.setattr(queries, "rank_scales", lambda *given: calls.append("ranked") or rank_scales(*given))
+    monkeypatch.setattr(queries, "segment", lambda *given, **told: calls.append("shown") or segment(*given, **told))
+    query = QueryOptions(segmenters=(model,))
+    sighting = locate_query(str(photo), [open_reference(demo_reference)], query=query)
+    assert sighting.location.located
+    assert calls == (["ranked", "shown"] if stated is None else ["shown"])
+    calls.clear()
+    small = cv2.imread(str(photo))[:480, :480]
+    cv2.imwrite(str(photo.with_name("small.png")), small)
+    queries.look_once(str(photo.with_name("small.png")), None, query)
+    assert calls == (["ranked"] if stated is None else ["shown"])
 
 
 def test_what_is_seen_is_shown_without_a_map(

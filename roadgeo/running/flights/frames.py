@@ -195,7 +195,7 @@ def _segment(image: _Image, options: FrameOptions, last: _Last) -> RoadMask:
         if "scale" not in last.scale:
             known = options.gsd_m
             scale = (
-                rank_scales(photograph, network)[0]
+                next(iter(rank_scales(photograph, network)))
                 if known is None
                 else scale_of(float(np.sqrt(np.prod(known))), network)
             )

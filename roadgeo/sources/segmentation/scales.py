@@ -7,6 +7,7 @@ at coarser ones roads run into each other, at finer ones they fall apart and the
 from __future__ import annotations
 
 import math
+from contextlib import suppress
 
 import numpy as np
 
@@ -18,10 +19,11 @@ from roadgeo.sources.segmentation.photograph import Photograph
 from roadgeo.sources.segmentation.probability import NODATA, ProbabilityMap
 from roadgeo.sources.segmentation.tiling import MAX_MAP_PIXELS, map_shape, segment
 
-__all__ = ["PYRAMID", "rank_scales", "scale_of", "score"]
+__all__ = ["PYRAMID", "rank_scales", "scale_of", "score", "try_scales"]
 
 #: Pixels shown to the model for each of the photograph's, along a side; steps that a model of many scales bridges.
 PYRAMID = (1.0, 0.5, 2.0, 0.25, 0.125)
+_BRIDGED = 1.5  # a little more than half a step
 
 _DEFAULT_RESOLUTION_M = 1.0
 _MIN_SIDE, _MAX_ENLARGED = 192, 4096  # pixels at the model's scale
@@ -34,22 +36,44 @@ def scale_of(gsd_m: float, network: Network) -> float:
     return gsd_m / (network.card.resolution_m or _DEFAULT_RESOLUTION_M)
 
 
-def rank_scales(photograph: Photograph, network: Network) -> list[float]:
-    """Return the scales at which anything like roads is seen in the middle of a photograph, the best first."""
-    scored: list[tuple[float, int, float]] = []
-    for scale in PYRAMID:
-        shape = map_shape(photograph, scale)
-        if min(shape) < _MIN_SIDE or math.prod(shape) > MAX_MAP_PIXELS or (scale > 1 and max(shape) > _MAX_ENLARGED):
-            continue
-        try:
-            part = _middle(photograph, network.card.tile, scale)
-            found = score(segment(part, network, scale)) / (part.width * part.height)
-        except MaskError:  # no ground in the middle
-            found = 0.0
-        scored.append((found, -len(scored), scale))
-    if not scored:
-        return [min(1.0, math.sqrt(MAX_MAP_PIXELS / (photograph.width * photograph.height)))]
-    return [scale for _, _, scale in sorted(scored, reverse=True)]
+def try_scales(
+    photograph: Photograph, network: Network, gsd_m: tuple[float, float] = (0.0, math.inf)
+) -> tuple[float, ...]:
+    """Return the scales to try on a photograph of this size, whose pixels cover so many metres, in no order."""
+    low, high = scale_of(gsd_m[0], network) / _BRIDGED, scale_of(gsd_m[1], network) * _BRIDGED
+    fitting = [scale for scale in PYRAMID if _fits(map_shape(photograph, scale), scale)]
+    if not fitting:
+        return (min(1.0, math.sqrt(MAX_MAP_PIXELS / (photograph.width * photograph.height))),)
+    known = tuple(scale for scale in fitting if low <= scale <= high)
+    return known or (min(fitting, key=lambda scale: max(low / scale, scale / high)),)
+
+
+def _fits(shape: tuple[int, int], scale: float) -> bool:
+    too_large = math.prod(shape) > MAX_MAP_PIXELS or (scale > 1 and max(shape) > _MAX_ENLARGED)
+    return min(shape) >= _MIN_SIDE and not too_large
+
+
+def rank_scales(
+    photograph: Photograph, network: Network, gsd_m: tuple[float, float] = (0.0, math.inf)
+) -> dict[float, ProbabilityMap | None]:
+    """Return the scales of `try_scales`, the best first.
+
+    With each comes what the model saw at it, where that is all of the photograph: it need not be shown again.
+    """
+    scales = try_scales(photograph, network, gsd_m)
+    if len(scales) == 1:
+        return {scales[0]: None}
+    seen: dict[float, ProbabilityMap | None] = {}
+    scores = {}
+    for scale in scales:
+        part = _middle(photograph, network.card.tile, scale)
+        seen[scale], scores[scale] = None, 0.0
+        with suppress(MaskError):  # no ground in the middle
+            found = segment(part, network, scale)
+            scores[scale] = score(found) / (part.width * part.height)
+            if (part.width, part.height) == (photograph.width, photograph.height):
+                seen[scale] = found
+    return {scale: seen[scale] for scale in sorted(scales, key=scores.__getitem__, reverse=True)}
 
 
 def score(seen: ProbabilityMap) -> float:

@@ -1,0 +1,67 @@
+"""Scales are tried where nobody says how large pixels are; what was seen on the way is not looked at twice."""
+
+from pathlib import Path
+
+import cv2
+import numpy as np
+import pytest
+from worlds.models import brightness_model
+
+from roadgeo.sources.segmentation.network import load_network
+from roadgeo.sources.segmentation.photograph import open_photograph
+from roadgeo.sources.segmentation.scales import PYRAMID, rank_scales, try_scales
+from roadgeo.sources.segmentation.tiling import segment
+
+pytestmark = pytest.mark.filterwarnings("ignore::rasterio.errors.NotGeoreferencedWarning")
+
+
+@pytest.fixture
+def network(tmp_path: Path):
+    return load_network(brightness_model(tmp_path / "m.onnx", size=256, props={"resolution": 50}))
+
+
+@pytest.fixture
+def photo(tmp_path: Path) -> Path:
+    """900 x 800 px of streets, every 100 px."""
+    image = np.full((800, 900, 3), 60, np.uint8)
+    image[40::100] = image[:, 40::100] = 230
+    for step in range(8):
+        image[40 + step :: 100] = image[:, 40 + step :: 100] = 230
+    path = tmp_path / "photo.png"
+    cv2.imwrite(str(path), image)
+    return path
+
+
+@pytest.mark.parametrize(
+    ("gsd_m", "scales"),
+    [
+        ((0.0, np.inf), {1.0, 0.5, 2.0, 0.25}),  # at an eighth it is too small
+        ((0.1, 12.0), {1.0, 0.5, 2.0, 0.25}),
+        ((0.1, 0.3), {0.5, 0.25}),
+        ((0.4, 0.9), {1.0, 2.0}),
+        ((3.0, 12.0), {2.0}),  # coarser than all: the nearest
+        ((0.01, 0.05), {0.25}),
+    ],
+)
+def test_what_is_known_of_pixels_leaves_scales_out(
+    network, photo: Path, gsd_m: tuple[float, float], scales: set[float]
+) -> None:
+    with open_photograph(photo) as opened:
+        assert set(try_scales(opened, network, gsd_m)) == scales
+        assert set(rank_scales(opened, network, gsd_m)) == scales
+    assert scales < set(PYRAMID)
+
+
+def test_what_was_seen_of_all_of_it_is_kept(network, photo: Path) -> None:
+    with open_photograph(photo) as opened:
+        ranked = rank_scales(opened, network)
+        whole = {scale for scale, seen in ranked.items() if seen is not None}
+        assert whole == {0.5, 0.25}  # the others show its middle
+        for scale in whole:
+            np.testing.assert_array_equal(ranked[scale].values, segment(opened, network, scale).values)
+
+
+def test_one_scale_needs_no_look(network, photo: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(type(network), "__call__", lambda *_: pytest.fail("the photograph was shown to the model"))
+    with open_photograph(photo) as opened:
+        assert rank_scales(opened, network, (3.0, 12.0)) == {2.0: None}
