@@ -21,9 +21,9 @@ from roadgeo.geometry.mask import PROBABILITY_SURE, PROBABILITY_UNKNOWN, RoadMas
 from roadgeo.roads.borders import find_border
 from roadgeo.roads.observed import find_voids
 from roadgeo.roads.vectorization import road_width
-from roadgeo.sources.segmentation.photograph import MAX_SIDE as MAX_PHOTOGRAPH_SIDE
 from roadgeo.sources.thresholds import Sample, find_thresholds, ground_and_road
 from roadgeo.storage.gdal import is_named_remote
+from roadgeo.storage.rasters import MAX_SIDE as MAX_RASTER_SIDE
 from roadgeo.storage.rasters import image_size, open_raster, read_palette, require_file, sidecar_nodata
 from roadgeo.storage.silence import silenced
 
@@ -163,7 +163,7 @@ def open_mask(
 ) -> Iterator[MaskSource]:
     """Open a road mask or a soft map of roads: parameters and errors as of `read_mask`."""
     with _open(source, band, name) as raster:
-        _require_size(raster.name, *raster.shape, MAX_PHOTOGRAPH_SIDE)
+        _require_size(raster.name, *raster.shape, MAX_RASTER_SIDE)
         _require_mask(raster)
         raster = _drawn(raster)
         seen = _sample(raster)
@@ -332,7 +332,7 @@ def _read_with_opencv(path: str, name: str) -> AnyArray | None:
     """Decode a PNG, JPEG or BMP without side files as it is stored; None where GDAL has to, or can in less memory."""
     size = image_size(Path(path))
     if size is not None:
-        _require_size(name, size[1], size[0], MAX_PHOTOGRAPH_SIDE)
+        _require_size(name, size[1], size[0], MAX_RASTER_SIDE)
     if size is None or max(size[:2]) > MAX_SIDE or size[2] > _MAX_DECODED_BYTES:
         return None
     if Path(path + ".aux.xml").exists() or _is_large(path):

@@ -26,7 +26,10 @@ from roadgeo.storage.gdal import CONSENT, NETWORK, SEALED, allowed_drivers, is_n
 if TYPE_CHECKING:
     from rasterio import DatasetReader
 
-__all__ = ["image_size", "open_raster", "read_palette", "require_file", "sidecar_nodata", "writing_raster"]
+__all__ = ["MAX_SIDE", "image_size", "open_raster", "read_palette", "require_file", "sidecar_nodata", "writing_raster"]
+
+#: Pixels, of the largest raster that anything is read of: a photograph.
+MAX_SIDE = 60_000
 
 #: First bytes of the formats that are read, and GDAL's names of their drivers.
 _DRIVERS = (

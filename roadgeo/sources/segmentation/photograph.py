@@ -13,14 +13,14 @@ import numpy as np
 
 from roadgeo._arrays import AnyArray, BoolArray
 from roadgeo.errors import MaskError
-from roadgeo.storage.rasters import open_raster, read_palette
+from roadgeo.storage.rasters import MAX_SIDE, open_raster, read_palette
 
 if TYPE_CHECKING:
     from rasterio import DatasetReader
 
-__all__ = ["MAX_SIDE", "Photograph", "find_ground", "find_voids", "open_photograph"]
+__all__ = ["Photograph", "find_ground", "find_voids", "open_photograph"]
 
-MIN_SIDE, MAX_SIDE = 64, 60_000
+MIN_SIDE = 64
 _STRIP_PIXELS = 1 << 21  # read at a time
 _SAMPLE_SIDE = 1024  # deep values are stretched by what a sample of this size holds
 
