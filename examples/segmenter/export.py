@@ -6,7 +6,8 @@
     python export.py one/roads.onnx@704 roads.onnx                     # one, shown smaller tiles
 
 The joined network gives the mean of the logits of the two, of which the second is shown the picture turned by half:
-they err in different places. Of a smaller picture a network takes less time, and sees further.
+they err in different places. Of a smaller picture a network takes less time, and sees further. What is exported runs in
+eight bits (`quantize.py`).
 """
 
 from __future__ import annotations
@@ -22,12 +23,13 @@ import onnxruntime
 import torch
 from network import STRIDE, AnyRoadNet, Roads
 from onnx import compose, helper, numpy_helper
+from quantize import fold, quantize
+from tiles import Tile
 
-__all__ = ["METADATA", "TILE", "export", "join"]
+__all__ = ["METADATA", "TILE", "export", "in_32_bits", "join"]
 
 TILE = 800  # px: two of them, overlapping by 100, cover 1500; a fixed size, for GeoDeep knows no other
 OPSET = 17
-_SMALL, _LARGE = 256, 60_000  # weights of a layer that are worth 16 bits, and 8
 
 METADATA = {
     "model_type": "Segmentor",
@@ -40,18 +42,35 @@ METADATA = {
     "standardization_mean": [0.0, 0.0, 0.0],  # the network standardizes by itself
     "standardization_std": [1.0, 1.0, 1.0],
     "seg_thresh": 0.5,
-    "version": "4",
+    "ways": 4,  # roadgeo's own key: shown each tile turned by half and turned over as well, the mean counts
+    "version": "5",
     "training_data": "34 photographs of the Massachusetts Roads Dataset (Mnih, 2013), 1 m per pixel; encoder: ImageNet",
     "licence": "weights as the project, encoder Apache 2.0; photographs and masks trained on state no licence",
 }
 
 
-def export(network: AnyRoadNet, path: Path) -> Path:
-    """Write the network as ONNX: (1, 3, 800, 800) RGB, 0..1, to the probability of road, (1, 1, 800, 800)."""
-    image = torch.zeros(1, 3, TILE, TILE)
+def export(network: AnyRoadNet, tiles: list[Tile], path: Path) -> Path:
+    """Write the network as ONNX: (1, 3, 800, 800) RGB, 0..1, to the probability of road, (1, 1, 800, 800).
+
+    What it runs on in 8 bits is measured on the photographs of the tiles.
+    """
+    model = in_32_bits(network)
+    fold(model.graph)
+    return _write(quantize(model, tiles).graph, path)
+
+
+def in_32_bits(network: AnyRoadNet) -> onnx.ModelProto:
+    """Return the network as ONNX, with what is constant computed."""
+    image, roads = torch.zeros(1, 3, TILE, TILE), Roads(network).float().eval()
     names = {"input_names": ["image"], "output_names": ["road"]}
-    torch.onnx.export(Roads(network).float().eval(), (image,), str(path), opset_version=OPSET, dynamo=False, **names)
-    return _write(_simplified(path).graph, path)
+    options = onnxruntime.SessionOptions()
+    options.graph_optimization_level = onnxruntime.GraphOptimizationLevel.ORT_ENABLE_BASIC
+    with tempfile.TemporaryDirectory() as folder:
+        path, simple = str(Path(folder) / "wide.onnx"), str(Path(folder) / "simple.onnx")
+        torch.onnx.export(roads, (image,), path, opset_version=OPSET, dynamo=False, **names)
+        options.optimized_model_filepath = simple
+        onnxruntime.InferenceSession(path, options, providers=["CPUExecutionProvider"])
+        return onnx.load(simple)
 
 
 def join(parts: list[tuple[Path, int]], path: Path) -> Path:
@@ -64,7 +83,7 @@ def join(parts: list[tuple[Path, int]], path: Path) -> Path:
     paths = [part for part, _ in parts]
     for k, (part, side) in enumerate(parts):
         first, seen = paths.index(part), "turned" if k % 2 else "image"
-        graph = compose.add_prefix(_simplified(part), f"{k}_", rename_inputs=False, rename_outputs=False).graph
+        graph = compose.add_prefix(onnx.load(str(part)), f"{k}_", rename_inputs=False, rename_outputs=False).graph
         shared = {weight.name: weight.name.replace(f"{k}_", f"{first}_", 1) for weight in graph.initializer}
         (last,) = (node for node in graph.node if "road" in node.output)
         if last.op_type != "Sigmoid":
@@ -109,19 +128,8 @@ def _turn_by_half(before: str, after: str) -> list[onnx.NodeProto]:
     return [*constants, helper.make_node("Slice", [before, *names], [after])]
 
 
-def _simplified(path: Path) -> onnx.ModelProto:
-    """Compute what is constant, and join what can be one: paddings and normalisations with convolutions."""
-    options = onnxruntime.SessionOptions()
-    options.graph_optimization_level = onnxruntime.GraphOptimizationLevel.ORT_ENABLE_BASIC
-    with tempfile.TemporaryDirectory() as folder:
-        options.optimized_model_filepath = str(Path(folder) / path.name)
-        onnxruntime.InferenceSession(str(path), options, providers=["CPUExecutionProvider"])
-        return onnx.load(options.optimized_model_filepath)
-
-
 def _write(graph: onnx.GraphProto, path: Path) -> Path:
-    """Write a graph of float32 with small weights, its sizes and the metadata."""
-    _shrink(graph)
+    """Write a graph with its sizes and the metadata."""
     for port, channels in ((graph.input[0], 3), (graph.output[0], 1)):
         sizes = helper.make_tensor_type_proto(onnx.TensorProto.FLOAT, (1, channels, TILE, TILE))
         port.type.CopyFrom(sizes)  # the exporter loses them where features are made larger
@@ -130,35 +138,6 @@ def _write(graph: onnx.GraphProto, path: Path) -> Path:
     onnx.checker.check_model(model, full_check=True)
     onnx.save(model, str(path))
     return path
-
-
-def _shrink(graph: onnx.GraphProto) -> None:
-    """Store weights in 16 bits, those of large layers in 8 with a scale for each channel.
-
-    The file's first nodes make them 32 again, once, when it is opened.
-    """
-    first, stored = [], []
-    for weight in graph.initializer:
-        values, name = numpy_helper.to_array(weight), weight.name
-        if values.dtype != np.float32 or values.size < _SMALL:
-            stored.append(weight)
-        elif values.ndim == 4 and values.size >= _LARGE:
-            scale = np.maximum(np.abs(values).max(axis=(1, 2, 3), keepdims=True), 1e-12) / np.float32(127)
-            stored += [
-                numpy_helper.from_array(np.rint(values / scale).astype(np.int8), f"{name}_8"),
-                numpy_helper.from_array(scale.astype(np.float32), f"{name}_scale"),
-            ]
-            first += [
-                helper.make_node("Cast", [f"{name}_8"], [f"{name}_steps"], to=onnx.TensorProto.FLOAT),
-                helper.make_node("Mul", [f"{name}_steps", f"{name}_scale"], [name]),
-            ]
-        else:
-            stored.append(numpy_helper.from_array(values.astype(np.float16), f"{name}_16"))
-            first.append(helper.make_node("Cast", [f"{name}_16"], [name], to=onnx.TensorProto.FLOAT))
-    nodes = [*first, *graph.node]
-    del graph.initializer[:], graph.node[:]
-    graph.initializer.extend(stored)
-    graph.node.extend(nodes)
 
 
 def _part(text: str) -> tuple[Path, int]:

@@ -50,7 +50,7 @@ def main(arguments: list[str] | None = None) -> None:
                 options.out / "all.pt",
                 replace(training, steps=training.steps * (1 if options.quick else options.longer)),
             )
-            print("wrote", export(network.cpu(), options.out / "roads.onnx"))
+            print("wrote", export(network.cpu(), tiles, options.out / "roads.onnx"))
         else:
             _cross_validate(tiles, int(run), options, training)
 

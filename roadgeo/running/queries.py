@@ -33,6 +33,7 @@ from roadgeo.running.stretching import ask_stretched
 from roadgeo.sources.drawn_roads import ENDINGS, Units, draw_roads
 from roadgeo.sources.exif import estimate_gsd
 from roadgeo.sources.masks import open_mask, read_mask
+from roadgeo.sources.segmentation.card import MAX_WAYS
 from roadgeo.sources.segmentation.network import DEFAULT_MODEL, Network, load_network
 from roadgeo.sources.segmentation.photograph import open_photograph
 from roadgeo.sources.segmentation.probability import NODATA, ProbabilityMap, fuse
@@ -45,8 +46,6 @@ __all__ = ["FirstLook", "QueryOptions", "is_model", "locate_query", "look_once"]
 #: The mask of a larger photograph is reduced, so that time and memory are bounded.
 _MAX_GRID_PIXELS = 64_000_000
 _MAX_SCALES = 3
-#: Where the photograph as it is leads nowhere, it is shown to the model turned and turned over as well.
-_MORE_WAYS = 4
 #: Roads of a photograph whose pixels are coarser than a model's are traced on the model's, but of no more than so many
 #: times its own along a side: narrow gaps between roads close on coarse ones.
 _MOST_FINER, _LEAST_FINER = 2.0, 1.25
@@ -251,17 +250,17 @@ def _locate_photograph(
 
 
 def _plan_looks(frame: _Frame, query: QueryOptions) -> Later[Look]:
-    """Return the best scale's look, the photograph turned as well, other scales, and other thresholds at the best."""
+    """Return the best scale's look, the photograph in more ways, other scales, and other thresholds at the best."""
 
     def look(i: int, share: float = 0.0) -> Look:
         return _look_at(partial(frame.see, frame.scales[i]), frame.scales[i], query, share)
 
     def look_more_ways() -> Look:
-        one = _look_at(partial(frame.see, frame.scales[0], _MORE_WAYS), frame.scales[0], query)
-        return replace(one, what=f"{one.what}, shown {_MORE_WAYS} ways")
+        one = _look_at(partial(frame.see, frame.scales[0], MAX_WAYS), frame.scales[0], query)
+        return replace(one, what=f"{one.what}, shown {MAX_WAYS} ways")
 
     makers: list[Callable[[], Look]] = [partial(look, i) for i in range(len(frame.scales))]
-    if frame.is_shown_to_model:
+    if frame.has_more_ways:
         makers.insert(1, look_more_ways)
     if query.threshold is None:
         makers += [partial(look, 0, share) for share in _FURTHER_THRESHOLDS]
@@ -280,16 +279,17 @@ class _Frame:
         Pixels of the photograph for each that roads are traced on, along a side.
     scales : sequence of float
         Those worth trying, the most promising first.
-    is_shown_to_model : bool
-        To one at least, not to plugins alone.
+    has_more_ways : bool
+        A model can be shown the photograph in more ways than it is at first.
     see : callable
         `see(scale, ways)` returns the probability of road, on the grid that roads are traced on; kept for another call.
+        Without `ways` each model is shown it in as many as its card says.
     """
 
     own: tuple[int, int]
     coarser: float
     scales: Sequence[float]
-    is_shown_to_model: bool
+    has_more_ways: bool
     see: Callable[..., ProbabilityMap]
 
 
@@ -303,24 +303,25 @@ def _open_frame(paths: Sequence[str], query: QueryOptions, camera: CameraOptions
     finer = _how_much_finer(own, scales[0])
     grid = round(finer * own[0]), round(finer * own[1])
     names = query.segmenters or ("",)
-    plugins = [name for name in query.segmenters if not is_model(name)]
+    ways_at_first = {name: _network_of(name, query).card.ways for name in names if not _is_plugin(name)}
     masks = {path: read for path in paths if (read := _fused_mask(path, query)) is not None}
 
-    def see_one(path: str, name: str, scale: float, ways: int) -> ProbabilityMap:
-        if path in masks and name not in plugins:
+    def see_one(path: str, name: str, scale: float, ways: int | None) -> ProbabilityMap:
+        if path in masks and not _is_plugin(name):
             return _of_mask(masks[path], "mask")
+        ways = ways or ways_at_first.get(name, 1)
         known = tried.get((path, name, scale)) if ways == 1 else None
         if known is not None and known.values.shape[0] < 2 * grid[0]:
             return known
         return _see(path, name, scale, grid, query, say, ways)
 
     @lru_cache(_MAX_SCALES + 1)
-    def see(scale: float, ways: int = 1) -> ProbabilityMap:
+    def see(scale: float, ways: int | None = None) -> ProbabilityMap:
         maps = [see_one(path, name, scale, ways).resized(grid) for path in paths for name in names]
         return maps[0] if len(maps) == 1 else fuse(maps)
 
-    shown = len(plugins) < len(names) and not masks.keys() >= set(paths)
-    return _Frame(own, k / finer, scales, shown, see)
+    has_more_ways = min(ways_at_first.values(), default=MAX_WAYS) < MAX_WAYS and not masks.keys() >= set(paths)
+    return _Frame(own, k / finer, scales, has_more_ways, see)
 
 
 def _how_much_finer(own: tuple[int, int], scale: float) -> float:
@@ -361,7 +362,7 @@ def _choose_scales(path: str, query: QueryOptions, camera: CameraOptions, say: S
     models = [name for name in query.segmenters if is_model(name)] or ([] if query.segmenters else [""])
     if not models:
         return Later([lambda: 1.0])
-    network = _network(models[0], query.class_name, query.threads)
+    network = _network_of(models[0], query)
     low, high = camera.gsd_m
     if high <= _KNOWN_SPAN * low:
         return Later([partial(scale_of, float(np.sqrt(low * high)), network)])
@@ -395,13 +396,11 @@ def _see(
     path: str, segmenter: str, scale: float, grid: tuple[int, int], query: QueryOptions, say: Say, ways: int
 ) -> ProbabilityMap:
     """Return what one segmenter sees in one photograph, not much finer than a grid."""
-    if segmenter and not is_model(segmenter):
+    if _is_plugin(segmenter):
         return _of_mask(_call_segmenter(segmenter, path, query.threshold), segmenter)
     with open_photograph(path) as photograph:
         step = max(1, int(map_shape(photograph, scale)[0] / grid[0]))
-        return segment(
-            photograph, _network(segmenter, query.class_name, query.threads), scale, say, step=step, ways=ways
-        )
+        return segment(photograph, _network_of(segmenter, query), scale, say, step=step, ways=ways)
 
 
 def _of_mask(mask: RoadMask, model: str) -> ProbabilityMap:
@@ -410,6 +409,15 @@ def _of_mask(mask: RoadMask, model: str) -> ProbabilityMap:
     if mask.observed is not None:
         values[~mask.observed] = NODATA
     return ProbabilityMap(values, 0.5, mask.name, model)
+
+
+def _is_plugin(segmenter: str) -> bool:
+    """Whether a segmenter is the name of a plugin: neither the file of a model, nor "", the model that ships."""
+    return bool(segmenter) and not is_model(segmenter)
+
+
+def _network_of(segmenter: str, query: QueryOptions) -> Network:
+    return _network(segmenter, query.class_name, query.threads)
 
 
 @lru_cache(maxsize=4)

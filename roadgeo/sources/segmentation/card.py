@@ -18,7 +18,10 @@ from typing import Any
 from roadgeo.errors import ModelError
 from roadgeo.sources.segmentation.onnx_file import OnnxFile, Port
 
-__all__ = ["ModelCard", "read_card"]
+__all__ = ["MAX_WAYS", "ModelCard", "read_card"]
+
+#: A tile can be shown to a model in so many ways.
+MAX_WAYS = 4
 
 _ROAD, _NOT = {"road", "roads", "street", "streets", "highway", "highways"}, {"not", "no", "non", "without"}
 _DEFAULT_TILE, _MAX_TILE = 512, 4096
@@ -42,6 +45,8 @@ class ModelCard:
         Subtracted from, and divided out of RGB values between 0 and 1.
     threshold : float
         Probabilities above it are road.
+    ways : int
+        In so many it is shown each tile at the first look, see `tiling.segment`: more than one, where it is quick.
     output : str
         The output that shows roads.
     channels : tuple of int
@@ -56,6 +61,7 @@ class ModelCard:
     mean: tuple[float, float, float]
     std: tuple[float, float, float]
     threshold: float
+    ways: int
     output: str
     channels: tuple[int, ...]
     is_probability: bool | None
@@ -105,6 +111,7 @@ def _make_card(model: OnnxFile, told: dict[str, Any], class_name: str | None) ->
         mean=_triple(told.get("mean", 0.0), "mean"),
         std=_triple(told.get("std", 1.0), "standard deviation"),
         threshold=_within(told.get("threshold", 0.5), 0.0, 1.0, "threshold"),
+        ways=int(_within(told.get("ways", 1), 1, MAX_WAYS, "ways")),
         output=output.name,
         channels=channels,
         is_probability=True if model.last.get(output.name) in ("Sigmoid", "HardSigmoid", "Softmax") else None,
@@ -189,6 +196,8 @@ def _read_metadata(props: dict[str, str]) -> dict[str, Any]:
         told["overlap"] = float(_value(props["tiles_overlap"])) / 100.0
     if "seg_thresh" in props:
         told["threshold"] = float(_value(props["seg_thresh"]))
+    if "ways" in props:  # roadgeo's own
+        told["ways"] = int(_value(props["ways"]))
     return told
 
 

@@ -22,7 +22,7 @@ __all__ = ["MAX_MAP_PIXELS", "map_shape", "segment"]
 MAX_MAP_PIXELS = 1_000_000_000
 
 #: Steps down and to the right by which a tile is read, in the order in which the ways are taken.
-_WAYS = ((1, 1), (-1, -1), (1, -1), (-1, 1))
+_WAYS = ((1, 1), (-1, -1), (1, -1), (-1, 1))  # MAX_WAYS of them
 #: No model is surer than this where ways are averaged: one of them would outweigh all others.
 _SURE = np.float32(1e-4)
 

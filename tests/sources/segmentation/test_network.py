@@ -129,6 +129,7 @@ def test_a_stac_item_beside_the_model(tmp_path: Path, picture: np.ndarray) -> No
         ({"props": {"tiles_overlap": 200}}, "make no sense"),
         ({"props": {"class_names": 7}}, "make no sense"),
         ({"raw_props": {"seg_thresh": "["}}, "make no sense"),
+        ({"raw_props": {"ways": "5"}}, "ways 5, expected 1 to 4"),
         ({"size": 8}, "tiles of 8 x 8"),
         ({"size": None, "props": {"tile_size": 100_000}}, "tiles of"),
     ],
