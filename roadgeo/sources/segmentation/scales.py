@@ -1,18 +1,24 @@
 """At which scale a photograph is shown to a model, where nobody says how large its pixels are.
 
-A few scales are tried on the middle of the photograph. At the right one many intersections are seen with confidence;
-at coarser ones roads run into each other, at finer ones they fall apart and the model is in doubt.
+At the right scale many intersections are seen with confidence; where a photograph is shown too small roads run into
+each other, too large they fall apart and the model is in doubt. The larger it is shown, the less of it: from scale to
+scale the part where most roads were seen before, and what is seen of the same ground is compared.
 """
 
 from __future__ import annotations
 
 import math
+from collections.abc import Sequence
 from contextlib import suppress
+from dataclasses import replace
+from typing import NamedTuple
 
+import cv2
 import numpy as np
 
 from roadgeo._arrays import AnyArray, BoolArray
 from roadgeo.errors import MaskError
+from roadgeo.geometry.mask import PROBABILITY_SURE
 from roadgeo.roads.vectorization import vectorize
 from roadgeo.sources.segmentation.network import Network
 from roadgeo.sources.segmentation.photograph import Photograph
@@ -29,6 +35,8 @@ _DEFAULT_RESOLUTION_M = 1.0
 _MIN_SIDE, _MAX_ENLARGED = 192, 4096  # pixels at the model's scale
 _TRIED_TILES = 1.9  # side of the part that is tried, tiles: 2 x 2 of them cover it
 _DOUBT = 4  # power of the share of probability that lies on roads
+#: A search takes as long as showing a model so many pixels: a scale at which it is shown more must promise more.
+_COST_OF_SEARCH = 2_000_000
 
 
 def scale_of(gsd_m: float, network: Network) -> float:
@@ -56,28 +64,35 @@ def _fits(shape: tuple[int, int], scale: float) -> bool:
 def rank_scales(
     photograph: Photograph, network: Network, gsd_m: tuple[float, float] = (0.0, math.inf)
 ) -> dict[float, ProbabilityMap | None]:
-    """Return the scales of `try_scales`, the best first.
+    """Return the scales of `try_scales`, the most promising first.
 
     With each comes what the model saw at it, where that is all of the photograph: it need not be shown again.
     """
-    scales = try_scales(photograph, network, gsd_m)
+    scales = sorted(try_scales(photograph, network, gsd_m))
     if len(scales) == 1:
         return {scales[0]: None}
-    seen: dict[float, ProbabilityMap | None] = {}
-    scores = {}
+    found: dict[float, ProbabilityMap | None] = {}
+    worth: dict[float, float] = {}
+    part, before, promise = _Part(0, 0, photograph.width, photograph.height), None, 1.0
     for scale in scales:
-        part = _middle(photograph, network.card.tile, scale)
-        seen[scale], scores[scale] = None, 0.0
-        with suppress(MaskError):  # no ground in the middle
-            found = segment(part, network, scale)
-            scores[scale] = score(found) / (part.width * part.height)
-            if (part.width, part.height) == (photograph.width, photograph.height):
-                seen[scale] = found
-    return {scale: seen[scale] for scale in sorted(scales, key=scores.__getitem__, reverse=True)}
+        part, same_ground = _most_roads(
+            part, before, [round(_TRIED_TILES * side / scale) for side in network.card.tile]
+        )
+        before, shown = None, _cut(photograph, part)
+        with suppress(MaskError):  # no ground
+            before = segment(shown, network, scale)
+        promise *= (score(before) + 1.0) / (score(same_ground) + 1.0)
+        cost = _COST_OF_SEARCH + math.prod(map_shape(photograph, scale))
+        worth[scale] = promise / math.sqrt(cost)
+        is_whole = (part.height, part.width) == (photograph.height, photograph.width)
+        found[scale] = before if is_whole else None
+    return {scale: found[scale] for scale in sorted(scales, key=worth.__getitem__, reverse=True)}
 
 
-def score(seen: ProbabilityMap) -> float:
+def score(seen: ProbabilityMap | None) -> float:
     """Say how much a map looks like roads: its intersections, weighted down where the model is in doubt."""
+    if seen is None:
+        return 0.0
     known = seen.values != NODATA
     p = np.where(known, seen.values, 0).astype(np.float32) / 254
     try:
@@ -89,13 +104,36 @@ def score(seen: ProbabilityMap) -> float:
     return float(np.count_nonzero(degrees >= 3)) * sure**_DOUBT
 
 
-def _middle(photograph: Photograph, tile: tuple[int, int], scale: float) -> Photograph:
-    """Return the part in the middle of a photograph that fills a few tiles at a scale."""
-    width = min(photograph.width, max(1, round(_TRIED_TILES * tile[1] / scale)))
-    height = min(photograph.height, max(1, round(_TRIED_TILES * tile[0] / scale)))
-    left, top = (photograph.width - width) // 2, (photograph.height - height) // 2
+class _Part(NamedTuple):
+    """A part of a photograph, pixels."""
 
+    left: int
+    top: int
+    width: int
+    height: int
+
+
+def _most_roads(part: _Part, seen: ProbabilityMap | None, size: Sequence[int]) -> tuple[_Part, ProbabilityMap | None]:
+    """Return the (height, width) at most of a part where most roads were seen, and what was seen there."""
+    height, width = (min(side, most) for side, most in zip((part.height, part.width), size, strict=True))
+    if seen is None or (height, width) == (part.height, part.width):
+        left, top = part.left + (part.width - width) // 2, part.top + (part.height - height) // 2
+        return _Part(left, top, width, height), seen
+    rows, columns = seen.values.shape
+    y_scale, x_scale = rows / part.height, columns / part.width
+    h, w = max(1, round(height * y_scale)), max(1, round(width * x_scale))
+    roads = (seen.values != NODATA) & (seen.values > PROBABILITY_SURE * seen.threshold)
+    sums = cv2.integral(roads.view(np.uint8))
+    inside = sums[h:, w:] - sums[:-h, w:] - sums[h:, :-w] + sums[:-h, :-w]
+    y, x = np.unravel_index(int(inside.argmax()), inside.shape)
+    left = part.left + min(round(float(x) / x_scale), part.width - width)
+    top = part.top + min(round(float(y) / y_scale), part.height - height)
+    values = np.ascontiguousarray(seen.values[y : y + h, x : x + w])
+    return _Part(left, top, width, height), replace(seen, values=values)
+
+
+def _cut(photograph: Photograph, part: _Part) -> Photograph:
     def read(x: float, y: float, w: float, h: float, shape: tuple[int, int]) -> tuple[AnyArray, BoolArray]:
-        return photograph.read(left + x, top + y, w, h, shape)
+        return photograph.read(part.left + x, part.top + y, w, h, shape)
 
-    return Photograph(photograph.name, width, height, read)
+    return Photograph(photograph.name, part.width, part.height, read)

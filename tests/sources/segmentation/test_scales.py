@@ -1,5 +1,6 @@
 """Scales are tried where nobody says how large pixels are; what was seen on the way is not looked at twice."""
 
+from dataclasses import replace
 from pathlib import Path
 
 import cv2
@@ -65,3 +66,30 @@ def test_one_scale_needs_no_look(network, photo: Path, monkeypatch: pytest.Monke
     monkeypatch.setattr(type(network), "__call__", lambda *_: pytest.fail("the photograph was shown to the model"))
     with open_photograph(photo) as opened:
         assert rank_scales(opened, network, (3.0, 12.0)) == {2.0: None}
+
+
+def test_scales_are_compared_on_the_same_ground_where_most_roads_are(network, tmp_path: Path) -> None:
+    image = np.full((1800, 1800, 3), 60, np.uint8)
+    image[1300:1308, 1200:] = image[1500:1508, 1200:] = 230  # streets in a corner, nothing in the middle
+    image[1200:, 1300:1308] = image[1200:, 1500:1508] = 230
+    path = tmp_path / "corner.png"
+    cv2.imwrite(str(path), image)
+    shown: list[tuple[float, float, float, float]] = []
+    with open_photograph(path) as opened:
+
+        def read(*part):  # type: ignore[no-untyped-def]
+            shown.append(part[:4])
+            return opened.read(*part)
+
+        ranked = rank_scales(replace(opened, read=read), network)
+    assert list(ranked) == [0.125, 0.25, 0.5, 1.0, 2.0]  # all see the same: what costs less comes first
+    left, top, width, height = shown[-1]
+    assert min(left, top) > 1100
+    assert width == height == 243
+
+
+def test_roads_in_no_part_are_no_reason_to_fail(network, tmp_path: Path) -> None:
+    path = tmp_path / "plain.png"
+    cv2.imwrite(str(path), np.random.default_rng(0).integers(40, 60, (900, 900, 3)).astype(np.uint8))
+    with open_photograph(path) as opened:
+        assert set(rank_scales(opened, network)) == {0.25, 0.5, 1.0, 2.0}
