@@ -184,7 +184,7 @@ def look_once(path: str, gsd_m: tuple[float, float] | None, query: QueryOptions,
         return FirstLook(_call_segmenter(plugin, path, query.threshold))
     camera = CameraOptions() if gsd_m is None else CameraOptions(gsd_m=gsd_m)
     frame = _open_frame([path], query, camera, say)
-    seen = frame.see(frame.scales[0])
+    seen = frame.see(frame.scales[0], None)
     try:
         mask = _look_at(lambda: seen, frame.scales[0], query).make()
     except MaskError:  # what was seen is worth a look all the same
@@ -245,25 +245,29 @@ def _locate_photograph(
         where = ", ".join(one.name for one in references)
         reason = f"hardly a road is seen in the photograph ({error})"
         location = Location(paths[0], "not_located", reason, where, size=(own[1], own[0]), reason_code=Reason.FEW_ROADS)
-        nothing, seen = RoadMask(np.zeros(own, np.bool_), name=paths[0]), frame.see(frame.scales[0]).resized(own)
+        nothing, seen = RoadMask(np.zeros(own, np.bool_), name=paths[0]), frame.see(frame.scales[0], None).resized(own)
         return Sighting(location, nothing, probability=seen)
 
 
-def _plan_looks(frame: _Frame, query: QueryOptions) -> Later[Look]:
+def _plan_looks(frame: _Frame, query: QueryOptions) -> Later[Look | None]:
     """Return the best scale's look, the photograph in more ways, other scales, and other thresholds at the best."""
 
-    def look(i: int, share: float = 0.0) -> Look:
-        return _look_at(partial(frame.see, frame.scales[i]), frame.scales[i], query, share)
+    def look(i: int, ways: int | None = None, share: float = 0.0) -> Look:
+        return _look_at(partial(frame.see, frame.scales[i], ways), frame.scales[i], query, share)
 
-    def look_more_ways() -> Look:
-        one = _look_at(partial(frame.see, frame.scales[0], MAX_WAYS), frame.scales[0], query)
+    def look_first() -> Look:
+        return look(0, 1 if frame.has_seen(frame.scales[0]) else None)
+
+    def look_more_ways() -> Look | None:
+        if frame.least_ways == MAX_WAYS and not frame.has_seen(frame.scales[0]):
+            return None
+        one = look(0, MAX_WAYS)
         return replace(one, what=f"{one.what}, shown {MAX_WAYS} ways")
 
-    makers: list[Callable[[], Look]] = [partial(look, i) for i in range(len(frame.scales))]
-    if frame.has_more_ways:
-        makers.insert(1, look_more_ways)
+    makers: list[Callable[[], Look | None]] = [look_first, look_more_ways]
+    makers += [partial(look, i) for i in range(1, len(frame.scales))]
     if query.threshold is None:
-        makers += [partial(look, 0, share) for share in _FURTHER_THRESHOLDS]
+        makers += [partial(look, 0, MAX_WAYS, share) for share in _FURTHER_THRESHOLDS]
     return Later(makers)
 
 
@@ -279,18 +283,21 @@ class _Frame:
         Pixels of the photograph for each that roads are traced on, along a side.
     scales : sequence of float
         Those worth trying, the most promising first.
-    has_more_ways : bool
-        A model can be shown the photograph in more ways than it is at first.
+    least_ways : int
+        In which a model is shown the photograph, by its card; as many as there are, where there is no model.
+    has_seen : callable
+        `has_seen(scale)`: whether a model was shown all of the photograph in one way already.
     see : callable
         `see(scale, ways)` returns the probability of road, on the grid that roads are traced on; kept for another call.
-        Without `ways` each model is shown it in as many as its card says.
+        Where `ways` is None each model is shown it in as many as its card says.
     """
 
     own: tuple[int, int]
     coarser: float
     scales: Sequence[float]
-    has_more_ways: bool
-    see: Callable[..., ProbabilityMap]
+    least_ways: int
+    has_seen: Callable[[float], bool]
+    see: Callable[[float, int | None], ProbabilityMap]
 
 
 def _open_frame(paths: Sequence[str], query: QueryOptions, camera: CameraOptions, say: Say) -> _Frame:
@@ -303,25 +310,33 @@ def _open_frame(paths: Sequence[str], query: QueryOptions, camera: CameraOptions
     finer = _how_much_finer(own, scales[0])
     grid = round(finer * own[0]), round(finer * own[1])
     names = query.segmenters or ("",)
-    ways_at_first = {name: _network_of(name, query).card.ways for name in names if not _is_plugin(name)}
+    ways_by_card = {name: _network_of(name, query).card.ways for name in names if not _is_plugin(name)}
     masks = {path: read for path in paths if (read := _fused_mask(path, query)) is not None}
 
     def see_one(path: str, name: str, scale: float, ways: int | None) -> ProbabilityMap:
         if path in masks and not _is_plugin(name):
             return _of_mask(masks[path], "mask")
-        ways = ways or ways_at_first.get(name, 1)
+        ways = ways or ways_by_card.get(name, 1)
         known = tried.get((path, name, scale)) if ways == 1 else None
         if known is not None and known.values.shape[0] < 2 * grid[0]:
             return known
         return _see(path, name, scale, grid, query, say, ways)
 
     @lru_cache(_MAX_SCALES + 1)
-    def see(scale: float, ways: int | None = None) -> ProbabilityMap:
+    def see_all(scale: float, ways: int | None) -> ProbabilityMap:
         maps = [see_one(path, name, scale, ways).resized(grid) for path in paths for name in names]
         return maps[0] if len(maps) == 1 else fuse(maps)
 
-    has_more_ways = min(ways_at_first.values(), default=MAX_WAYS) < MAX_WAYS and not masks.keys() >= set(paths)
-    return _Frame(own, k / finer, scales, has_more_ways, see)
+    only_masks = masks.keys() >= set(paths)
+    least_ways = MAX_WAYS if only_masks else min(ways_by_card.values(), default=MAX_WAYS)
+
+    def see(scale: float, ways: int | None) -> ProbabilityMap:
+        return see_all(scale, MAX_WAYS if ways is None and least_ways == MAX_WAYS else ways)
+
+    def has_seen(scale: float) -> bool:
+        return not only_masks and any(scale == one for *_, one in tried)
+
+    return _Frame(own, k / finer, scales, least_ways, has_seen, see)
 
 
 def _how_much_finer(own: tuple[int, int], scale: float) -> float:

@@ -77,7 +77,7 @@ def test_the_second_look_shows_the_photograph_more_ways_where_the_first_did_not(
     taken: list[str] = []
 
     def note(looks, *_):  # type: ignore[no-untyped-def]
-        taken.extend(look.what for look in looks)
+        taken.extend(look.what for look in looks if look is not None)
         raise MaskError("that is all")
 
     nothing = ProbabilityMap(np.zeros((10, 10), np.uint8), 0.5)
@@ -112,6 +112,37 @@ def test_the_first_look_shows_the_photograph_in_as_many_ways_as_the_model_says(
     monkeypatch.setattr(queries, "segment", note)
     queries.look_once(str(photo), (0.9, 1.1), QueryOptions(segment="always", segmenters=(str(model),)))
     assert shown == [ways]
+
+
+def test_what_was_seen_while_scales_were_ranked_is_looked_at_first(
+    tmp_path: Path, photo: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    props = {"class_names": {0: "ground", 1: "road"}, "ways": 4}
+    model = brightness_model(tmp_path / "light.onnx", size=256, props=props)
+    shown: list[tuple[float, int]] = []
+    taken: list[str] = []
+    nothing = ProbabilityMap(np.zeros((10, 10), np.uint8), 0.5)
+
+    def note(
+        _photograph: object, _network: object, scale: float, *_: object, ways: int, **__: object
+    ) -> ProbabilityMap:
+        shown.append((scale, ways))
+        return nothing
+
+    def take(looks, *_):  # type: ignore[no-untyped-def]
+        for look in looks:
+            if look is not None:
+                taken.append(look.what)
+                with suppress(MaskError):
+                    look.make()
+        raise MaskError("that is all")
+
+    monkeypatch.setattr(queries, "segment", note)
+    monkeypatch.setattr(queries, "locate_looks", take)
+    monkeypatch.setattr(queries, "rank_scales", lambda *_: {0.5: nothing, 1.0: None, 2.0: None})
+    locate_query(str(photo), [], LocateOptions(), QueryOptions(segment="always", segmenters=(str(model),)))
+    assert taken[:4] == ["scale 0.5", "scale 0.5, shown 4 ways", "scale 1", "scale 2"]
+    assert shown == [(0.5, 4), (1.0, 4), (2.0, 4)]  # for other thresholds nothing is shown again
 
 
 def test_a_photograph_is_located(
@@ -189,7 +220,7 @@ def test_what_was_seen_is_told_and_drawn(
     given = [str(photo), "-r", str(demo_reference), "--segmenter", model, "-o", str(tmp_path), "--report"]
     assert main(["locate", *given]) == 0
     told = capsys.readouterr()
-    assert "finding roads in" in told.err
+    assert "looking for the scale of" in told.err
     assert "times the mask's size" not in told.out
     page = (tmp_path / "flight_report.html").read_text()
     assert "Roads seen in it" in page
@@ -210,7 +241,7 @@ def test_no_scale_is_looked_for_in_vain(
     query = QueryOptions(segmenters=(model,))
     sighting = locate_query(str(photo), [open_reference(demo_reference)], query=query)
     assert sighting.location.located
-    assert calls == (["ranked", "shown"] if stated is None else ["shown"])
+    assert calls == ["ranked" if stated is None else "shown"]
     calls.clear()
     small = cv2.imread(str(photo))[:480, :480]
     cv2.imwrite(str(photo.with_name("small.png")), small)
@@ -318,7 +349,7 @@ def test_fused_masks_are_shown_to_no_model(monkeypatch: pytest.MonkeyPatch) -> N
     taken: list[str] = []
 
     def note(looks, *_):  # type: ignore[no-untyped-def]
-        taken.extend(look.what for look in looks)
+        taken.extend(look.what for look in looks if look is not None)
         looks[0].make()
         raise StopIteration
 

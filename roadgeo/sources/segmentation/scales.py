@@ -35,7 +35,8 @@ _DEFAULT_RESOLUTION_M = 1.0
 _MIN_SIDE, _MAX_ENLARGED = 192, 4096  # pixels at the model's scale
 _TRIED_TILES = 1.9  # side of the part that is tried, tiles: 2 x 2 of them cover it
 _DOUBT = 4  # power of the share of probability that lies on roads
-#: A search takes as long as showing a model so many pixels: a scale at which it is shown more must promise more.
+#: A search takes as long as showing a model so many pixels. A scale at which it is still to be shown all of the
+#: photograph must promise more.
 _COST_OF_SEARCH = 2_000_000
 
 
@@ -82,10 +83,10 @@ def rank_scales(
         with suppress(MaskError):  # no ground
             before = segment(shown, network, scale)
         promise *= (score(before) + 1.0) / (score(same_ground) + 1.0)
-        cost = _COST_OF_SEARCH + math.prod(map_shape(photograph, scale))
-        worth[scale] = promise / math.sqrt(cost)
         is_whole = (part.height, part.width) == (photograph.height, photograph.width)
         found[scale] = before if is_whole else None
+        cost = _COST_OF_SEARCH + (0 if is_whole else math.prod(map_shape(photograph, scale)))
+        worth[scale] = promise / math.sqrt(cost)
     return {scale: found[scale] for scale in sorted(scales, key=worth.__getitem__, reverse=True)}
 
 
