@@ -65,7 +65,7 @@ def _fits(shape: tuple[int, int], scale: float) -> bool:
 def rank_scales(
     photograph: Photograph, network: Network, gsd_m: tuple[float, float] = (0.0, math.inf)
 ) -> dict[float, ProbabilityMap | None]:
-    """Return the scales of `try_scales`, the most promising first.
+    """Return the scales of `try_scales`, those most worth a look first.
 
     With each comes what the model saw at it, where that is all of the photograph: it need not be shown again.
     """
@@ -126,7 +126,7 @@ def _most_roads(part: _Part, seen: ProbabilityMap | None, size: Sequence[int]) -
     roads = (seen.values != NODATA) & (seen.values > PROBABILITY_SURE * seen.threshold)
     sums = cv2.integral(roads.view(np.uint8))
     inside = sums[h:, w:] - sums[:-h, w:] - sums[h:, :-w] + sums[:-h, :-w]
-    y, x = np.unravel_index(int(inside.argmax()), inside.shape)
+    y, x = np.unravel_index(inside.argmax(), inside.shape) if inside.any() else (n // 2 for n in inside.shape)
     left = part.left + min(round(float(x) / x_scale), part.width - width)
     top = part.top + min(round(float(y) / y_scale), part.height - height)
     values = np.ascontiguousarray(seen.values[y : y + h, x : x + w])
