@@ -42,7 +42,7 @@ METADATA = {
     "standardization_mean": [0.0, 0.0, 0.0],  # the network standardizes by itself
     "standardization_std": [1.0, 1.0, 1.0],
     "seg_thresh": 0.5,
-    "ways": 4,  # roadgeo's own key: shown each tile turned by half and turned over as well, the mean counts
+    "ways": 2,  # roadgeo's own key: shown each tile turned by half as well, the mean counts
     "version": "5",
     "training_data": "34 photographs of the Massachusetts Roads Dataset (Mnih, 2013), 1 m per pixel; encoder: ImageNet",
     "licence": "weights as the project, encoder Apache 2.0; photographs and masks trained on state no licence",
