@@ -70,7 +70,7 @@ def offset(document: dict, size: int = 1) -> float:
     return float(np.hypot(*(found[:2] / found[2] - expected[:2] / expected[2])))
 
 
-@pytest.mark.parametrize(("segmenters", "ways"), [((), False), (("model",), True), (("plugin",), False)])
+@pytest.mark.parametrize(("segmenters", "ways"), [((), True), (("model",), True), (("plugin",), False)])
 def test_the_second_look_shows_the_photograph_more_ways_where_the_first_did_not(
     segmenters: tuple[str, ...], ways: bool, model: str, photo: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:

