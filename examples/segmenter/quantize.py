@@ -121,13 +121,12 @@ class _Layers:
 
     def _scale(self, conv: onnx.NodeProto, factor: NDArray[np.float32], bias: NDArray[np.float32]) -> None:
         """Multiply what a convolution without a bias gives by a factor for each channel, and add a bias."""
+        if len(conv.input) > 2:
+            raise SystemExit(f"{conv.name}: has a bias; expected none before a normalisation")
         weight, bias_name = conv.input[1], f"{conv.input[1]}_bias"
         values = self.value(weight) * factor[:, None, None, None]
         self.weights[weight].CopyFrom(numpy_helper.from_array(values, weight))
         self.graph.initializer.append(numpy_helper.from_array(bias, bias_name))
-        (before,) = conv.input[2:] or ("",)
-        if before:
-            raise SystemExit(f"{conv.name}: has a bias; expected none before a normalisation")
         conv.input.append(bias_name)
 
     def _replace(self, gone: onnx.NodeProto) -> list[onnx.NodeProto]:

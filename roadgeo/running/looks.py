@@ -83,9 +83,9 @@ class Sighting:
 
 
 def locate_looks(
-    looks: Sequence[Look | None], references: Sequence[AnyReference], options: LocateOptions, how: Locate
+    looks: Sequence[Look], references: Sequence[AnyReference], options: LocateOptions, how: Locate
 ) -> Sighting:
-    """Take one look after another until one is located, within the limits of one search; None is no look.
+    """Take one look after another until one is located, within the limits of one search.
 
     Raises
     ------
@@ -95,14 +95,10 @@ def locate_looks(
     sightings: list[Sighting] = []
     failure: MaskError | None = None
     work_left, time_left = options.search.work_limit_s, options.search.time_limit_s
-    tried = 0
-    for i, look in enumerate(looks, 1):
-        if look is None:
-            continue
-        tried += 1
+    for tried, look in enumerate(looks, 1):
         if tried > 1 and (work_left <= 0.05 * options.search.work_limit_s or time_left <= 0.0):
             break
-        share = 1.0 if i == len(looks) else _SHARE
+        share = 1.0 if tried == len(looks) else _SHARE
         try:
             sighting = _take(look, references, _limited(options, share * work_left, time_left), how)
         except MaskError as error:

@@ -159,7 +159,7 @@ class FirstLook:
 
 
 def look_once(path: str, gsd_m: tuple[float, float] | None, query: QueryOptions, say: Say = say_nothing) -> FirstLook:
-    """Read a mask, or find the roads of a photograph, as `locate_query` does at its first look.
+    """Read a mask, or find the roads of a photograph, as `locate_query` does, in as many ways as the model's card says.
 
     Parameters
     ----------
@@ -245,29 +245,25 @@ def _locate_photograph(
         where = ", ".join(one.name for one in references)
         reason = f"hardly a road is seen in the photograph ({error})"
         location = Location(paths[0], "not_located", reason, where, size=(own[1], own[0]), reason_code=Reason.FEW_ROADS)
-        nothing, seen = RoadMask(np.zeros(own, np.bool_), name=paths[0]), frame.see(frame.scales[0], None).resized(own)
-        return Sighting(location, nothing, probability=seen)
+        seen = frame.see(frame.scales[0], frame.most_ways).resized(own)
+        return Sighting(location, RoadMask(np.zeros(own, np.bool_), name=paths[0]), probability=seen)
 
 
-def _plan_looks(frame: _Frame, query: QueryOptions) -> Later[Look | None]:
+def _plan_looks(frame: _Frame, query: QueryOptions) -> Later[Look]:
     """Return the best scale's look, the photograph in more ways, other scales, and other thresholds at the best."""
 
     def look(i: int, ways: int | None = None, share: float = 0.0) -> Look:
         return _look_at(partial(frame.see, frame.scales[i], ways), frame.scales[i], query, share)
 
-    def look_first() -> Look:
-        return look(0, 1 if frame.has_seen(frame.scales[0]) else None)
+    def look_more_ways() -> Look:
+        one = look(0, frame.most_ways)
+        return replace(one, what=f"{one.what}, shown {frame.most_ways} ways")
 
-    def look_more_ways() -> Look | None:
-        if frame.least_ways == MAX_WAYS and not frame.has_seen(frame.scales[0]):
-            return None
-        one = look(0, MAX_WAYS)
-        return replace(one, what=f"{one.what}, shown {MAX_WAYS} ways")
-
-    makers: list[Callable[[], Look | None]] = [look_first, look_more_ways]
+    makers: list[Callable[[], Look]] = [partial(look, 0, frame.first_ways)]
+    makers += [look_more_ways] if frame.most_ways else []
     makers += [partial(look, i) for i in range(1, len(frame.scales))]
     if query.threshold is None:
-        makers += [partial(look, 0, MAX_WAYS, share) for share in _FURTHER_THRESHOLDS]
+        makers += [partial(look, 0, frame.most_ways, share) for share in _FURTHER_THRESHOLDS]
     return Later(makers)
 
 
@@ -283,10 +279,9 @@ class _Frame:
         Pixels of the photograph for each that roads are traced on, along a side.
     scales : sequence of float
         Those worth trying, the most promising first.
-    least_ways : int
-        In which a model is shown the photograph, by its card; as many as there are, where there is no model.
-    has_seen : callable
-        `has_seen(scale)`: whether a model was shown all of the photograph in one way already.
+    first_ways, most_ways : int or None
+        How many ways of showing a model the photograph at the best scale come first, and which are the most (see `see`).
+        The first is 1 where that was seen already; the most are None where they are no more than the first.
     see : callable
         `see(scale, ways)` returns the probability of road, on the grid that roads are traced on; kept for another call.
         Where `ways` is None each model is shown it in as many as its card says.
@@ -295,8 +290,8 @@ class _Frame:
     own: tuple[int, int]
     coarser: float
     scales: Sequence[float]
-    least_ways: int
-    has_seen: Callable[[float], bool]
+    first_ways: int | None
+    most_ways: int | None
     see: Callable[[float, int | None], ProbabilityMap]
 
 
@@ -323,20 +318,14 @@ def _open_frame(paths: Sequence[str], query: QueryOptions, camera: CameraOptions
         return _see(path, name, scale, grid, query, say, ways)
 
     @lru_cache(_MAX_SCALES + 1)
-    def see_all(scale: float, ways: int | None) -> ProbabilityMap:
+    def see(scale: float, ways: int | None) -> ProbabilityMap:
         maps = [see_one(path, name, scale, ways).resized(grid) for path in paths for name in names]
         return maps[0] if len(maps) == 1 else fuse(maps)
 
     only_masks = masks.keys() >= set(paths)
-    least_ways = MAX_WAYS if only_masks else min(ways_by_card.values(), default=MAX_WAYS)
-
-    def see(scale: float, ways: int | None) -> ProbabilityMap:
-        return see_all(scale, MAX_WAYS if ways is None and least_ways == MAX_WAYS else ways)
-
-    def has_seen(scale: float) -> bool:
-        return not only_masks and any(scale == one for *_, one in tried)
-
-    return _Frame(own, k / finer, scales, least_ways, has_seen, see)
+    is_seen = not only_masks and any(scale == scales[0] for *_, scale in tried)
+    has_more = not only_masks and (is_seen or min(ways_by_card.values(), default=MAX_WAYS) < MAX_WAYS)
+    return _Frame(own, k / finer, scales, 1 if is_seen else None, MAX_WAYS if has_more else None, see)
 
 
 def _how_much_finer(own: tuple[int, int], scale: float) -> float:

@@ -116,7 +116,7 @@ for module in network.modules():
         torch.nn.init.normal_(module.bias, 0.0, 0.3)
 for _ in range(30):
     network.train()(image)  # normalisations learn what they meet
-road = torch.nn.init.normal_(network.heads.road[0].weight, 0.0, 0.3)
+torch.nn.init.normal_(network.heads.road[0].weight, 0.0, 0.3)
 tiles, whole = read_tiles(Path(sys.argv[1])), in_32_bits(network)
 tile = np.zeros((1, 3, TILE, TILE), np.float32)
 photo = tiles[0].photo.transpose(2, 0, 1) / np.float32(255)
