@@ -280,8 +280,8 @@ class _Frame:
     scales : sequence of float
         Those worth trying, the most promising first.
     first_ways, most_ways : int or None
-        How many ways of showing a model the photograph at the best scale come first, and which are the most (see `see`).
-        The first is 1 where that was seen already; the most are None where they are no more than the first.
+        In how many ways a model is shown the photograph at the best scale, first and at most (see `see`): first in 1
+        where that was seen already; `most_ways` is None where there are no more.
     see : callable
         `see(scale, ways)` returns the probability of road, on the grid that roads are traced on; kept for another call.
         Where `ways` is None each model is shown it in as many as its card says.
