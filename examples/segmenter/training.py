@@ -14,6 +14,7 @@ import cv2
 import numpy as np
 import torch
 from augmentation import Crops
+from encoder import ENCODERS
 from losses import LossOptions, loss
 from muon import Muon
 from network import STRIDE, AnyRoadNet, PretrainedRoadNet, RoadNet
@@ -30,7 +31,7 @@ Optimizers = tuple[torch.optim.Optimizer, ...]
 class TrainingOptions:
     """How long and how fast."""
 
-    network: str = "pretrained"  # or "plain"
+    network: str = "lite2"  # of `RECIPES`
     steps: int = 3800
     batch: int = 4
     size: int = 384  # px of a crop
@@ -53,12 +54,13 @@ class Recipe:
 
 
 #: An encoder that knows pictures learns roads slowly, or it forgets them.
-RECIPES = {"plain": Recipe((1.1, 2.0), 0.6, 1.0), "pretrained": Recipe((0.8, 1.6), 0.2, 0.25)}
+_PRETRAINED = Recipe((0.8, 1.6), 0.2, 0.25)
+RECIPES = {"plain": Recipe((1.1, 2.0), 0.6, 1.0), **dict.fromkeys(ENCODERS, _PRETRAINED)}
 
 
 def make_network(kind: str) -> AnyRoadNet:
     """Return a network that knows nothing."""
-    return PretrainedRoadNet() if kind == "pretrained" else RoadNet()
+    return PretrainedRoadNet(kind) if kind in ENCODERS else RoadNet()
 
 
 def train(tiles: list[Tile], checkpoint: Path, options: TrainingOptions) -> AnyRoadNet:

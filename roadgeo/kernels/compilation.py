@@ -212,6 +212,7 @@ _SEARCH = (
     "growth",
     "adjustment",
     "road_raster",
+    "road_rings",
     "road_votes",
     "road_growth",
     "pinhole_fit",

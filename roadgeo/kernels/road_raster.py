@@ -14,7 +14,7 @@ import numpy as np
 from roadgeo.kernels.arrays import Int32s2, Singles2, Words3
 from roadgeo.kernels.compilation import kernel
 
-__all__ = ["DIRECTIONS", "TILE", "Raster", "mark_tiles", "measure_tiles", "paint_roads", "passes"]
+__all__ = ["DIRECTIONS", "TILE", "Raster", "mark_tiles", "measure_tiles", "paint_roads", "passes", "passing"]
 
 #: Ranges of direction, and cells along a tile's side (a power of two).
 DIRECTIONS = 16
@@ -143,12 +143,18 @@ def measure_tiles(raster: Raster, out: Singles2) -> None:
 
 
 @kernel(forceinline=True)
-def passes(x: float, y: float, direction: int, raster: Raster) -> int:
-    """Return 1 if a road of direction range `direction` passes the place (x, y), in cells from the raster's corner.
+def passing(x: float, y: float, raster: Raster) -> np.uint32:
+    """Return the direction bits of the roads that pass the place (x, y), in cells from the raster's corner.
 
     The place must lie inside the raster.
     """
     column, row = np.uint32(x), np.uint32(y)
     tile = np.uint32(raster.tile_of[row >> np.uint32(_SHIFT), column >> np.uint32(_SHIFT)])
-    word = raster.bits[tile, row & np.uint32(TILE - 1), column & np.uint32(TILE - 1)]
-    return int(np.int64((np.uint32(word) >> np.uint32(direction)) & np.uint32(1)))  # signed, as the sums it goes into
+    return np.uint32(raster.bits[tile, row & np.uint32(TILE - 1), column & np.uint32(TILE - 1)])
+
+
+@kernel(forceinline=True)
+def passes(x: float, y: float, direction: int, raster: Raster) -> int:
+    """Return 1 if a road of direction range `direction` passes the place (x, y), as `passing`."""
+    # signed, as the sums it goes into
+    return int(np.int64((passing(x, y, raster) >> np.uint32(direction)) & np.uint32(1)))

@@ -34,8 +34,8 @@ class RoadGrowOptions:
         Prior standard deviation of the two perspective parameters.
     go_on, sure : (int, int, int), int
         After each of the first stages so many of an intersection's proposals go on, those that lie closest to roads,
-        and the `sure` ones that had most votes. Of 396 intersections whose 40 proposals led to the place of a broken
-        mask 395 do so still, at half the time; in lattices 255 of 266, at a quarter.
+        and the `sure` ones that had most votes. Of 396 intersections of which one of 40 proposals led to the place of a
+        broken mask 395 do so still, at half the time; in lattices 255 of 266, at a quarter.
     """
 
     max_points: int = 700

@@ -63,7 +63,7 @@ class RoadSearchOptions:
     max_anchors: int = 30
     max_tried: int = 400_000
     least_anchors: int = 8
-    max_grown: int = 40
+    max_grown: int = 20
     max_kept: int = 2
     scale_slack: float = 1.2
     least_share: float = 0.2

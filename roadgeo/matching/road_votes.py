@@ -2,9 +2,9 @@
 
 Triples of intersections need three neighbours that are all intact. Where roads are missing, false or few, one intact
 intersection and the roads about it still say where they lie: turned so that two branches agree, at each of many scales,
-most road points fall on roads of the map in the right place, and few elsewhere. How many would by chance is measured
-for each scale, and depends on how dense the map's roads are at the place: without that, scales at which the query
-shrinks to a few blocks would crowd out the rest.
+most road points fall on roads of the map in the right place, and few elsewhere. How many would by chance depends on the
+scale and on how dense the map's roads are at the place: without that, scales at which the query shrinks to a few blocks
+would crowd out the rest.
 """
 
 from __future__ import annotations
@@ -16,22 +16,10 @@ from typing import NamedTuple
 
 import numpy as np
 
-from roadgeo._arrays import BoolArray, FloatArray, IntArray
-from roadgeo.kernels.road_raster import DIRECTIONS, TILE
-from roadgeo.kernels.road_votes import (
-    BLOCK,
-    NOWHERE,
-    TURNS,
-    LaidPoints,
-    Places,
-    RoadPoints,
-    Trial,
-    chance_rates,
-    draw_turns,
-    improve_votes,
-    lay_points,
-    vote,
-)
+from roadgeo._arrays import AnyArray, BoolArray, FloatArray, IntArray
+from roadgeo.kernels.road_raster import DIRECTIONS
+from roadgeo.kernels.road_rings import WORDS, mark_rings
+from roadgeo.kernels.road_votes import WHOLE_TURN, Places, RoadPoints, Trial, improve_votes, vote
 from roadgeo.matching.index import ReferenceIndex
 from roadgeo.matching.road_raster import RasterOptions, RoadRaster, make_raster
 from roadgeo.matching.scene import Scene
@@ -41,6 +29,7 @@ __all__ = ["VoteOptions", "Voter", "Votes"]
 
 #: Where the map has hardly a road, chance is not less than this.
 _LEAST_DENSITY = 0.005
+_PER_RADIAN = WHOLE_TURN / (2.0 * math.pi)
 _TURN_STEPS = np.radians([-6.0, -3.0, 0.0, 3.0, 6.0])
 _SCALE_STEPS = np.array([0.96, 1.0, 1.04])
 
@@ -51,52 +40,37 @@ class VoteOptions:
 
     Attributes
     ----------
+    raster : RasterOptions
+        Road points in its rings vote, at scales that are a ring apart.
     branch_tolerance_deg : float
-        How far the two branches that agree may be apart.
-    scale_step : float
-        Ratio of one scale to the next.
-    inner_m, radius_m, max_points : float, float, int
-        Road points between these distances from the intersection are tested, at most so many. `radius_m` is less than
-        63 cells of the raster (see `kernels.road_votes.lay_points`).
+        How far branches that agree may be apart.
     own_m, own_cos : float
         Nearer than `own_m`, roads that run straight away from the intersection, with at least this cosine, are left
-        out: they are its own branches, which agree by construction. It makes the right place stand out more and wrong
-        ones fail sooner.
+        out: they are its own branches, which agree by construction. It makes the right place stand out more.
     least_points : int
         A scale at which fewer points are in reach is not tried.
-    hit_rate, patience : float
-        Of the sequential test: share of points that meet roads in the right place, and the nats lost before it ends.
     kept : int
-        The best so many are judged anew, with points as far as `wide_radius_m`.
-    n_chance : int
-        Places at which chance is measured.
+        The best so many are judged anew, with at most `wide_points` road points as far as `wide_radius_m`.
+    hit_rate, chance : float
+        Share of those that meet roads in the right place, and by chance, in units of the density of roads there: they
+        crowd around intersections.
     """
 
     raster: RasterOptions = field(default_factory=RasterOptions)
     branch_tolerance_deg: float = 20.0
-    scale_step: float = 1.08
-    inner_m: float = 15.0
-    radius_m: float = 220.0
-    max_points: int = 80
     own_m: float = 150.0
     own_cos: float = 0.95
     least_points: int = 15
-    hit_rate: float = 0.55
-    patience: float = 3.0
     kept: int = 100
     wide_radius_m: float = 260.0
     wide_points: int = 160
-    n_chance: int = 60
-
-    def __post_init__(self) -> None:
-        if self.radius_m >= (TILE - 1) * self.raster.cell_m:
-            raise ValueError(f"radius_m is {self.radius_m:g}; expected less than {TILE - 1} cells of the raster")
+    hit_rate: float = 0.55
+    chance: float = 1.5
 
     def on(self, coarseness: float) -> VoteOptions:
         """Return them for a coarse map: all lengths are so many times as long."""
-        raster = replace(self.raster, cell_m=coarseness * self.raster.cell_m, reach_m=coarseness * self.raster.reach_m)
-        lengths = ("inner_m", "radius_m", "own_m", "wide_radius_m")
-        return replace(self, raster=raster, **{name: coarseness * getattr(self, name) for name in lengths})
+        lengths = {name: coarseness * getattr(self, name) for name in ("own_m", "wide_radius_m")}
+        return replace(self, raster=self.raster.on(coarseness), **lengths)
 
 
 @dataclass(frozen=True)
@@ -131,7 +105,6 @@ class _Around(NamedTuple):
     away: FloatArray
     angles: FloatArray
     radial: BoolArray
-    rng: np.random.Generator
 
 
 class Voter:
@@ -149,13 +122,17 @@ class Voter:
         """`scale` in metres per pixel, `max_turn` of the image's up from north in radians, `candidates` on the map."""
         self.scene, self.index, self.options = scene, index, options
         self.max_turn, self.candidates = max_turn, candidates
-        n = math.ceil(math.log(scale[1] / scale[0]) / math.log(options.scale_step)) + 1
-        self.scales = np.geomspace(*scale, n)
-        self.tolerance = math.radians(options.branch_tolerance_deg)
-        self.trial = Trial(options.hit_rate, options.patience)
+        step = options.raster.ring_step
+        n = int(math.log(scale[1] / scale[0]) / math.log(step)) + 1  # between the limits, half a step from them at most
+        self.scales = np.asarray(math.sqrt(scale[0] * scale[1]) * step ** (np.arange(n) - (n - 1) / 2))
+        self.tolerance = round(math.radians(options.branch_tolerance_deg) * _PER_RADIAN)
+        self.trial = Trial(options.hit_rate, options.chance)
         self.drawn: RoadRaster = make_raster(index, options.raster)
+        cells, rays = self.drawn.cells(index.xy), unpack_branches(index.branches)
+        self.drawn.draw_rings_of(cells, candidates)
         density = np.maximum(self.drawn.density_at(index.xy), _LEAST_DENSITY)
-        self.places = Places(self.drawn.cells(index.xy), unpack_branches(index.branches), density)
+        counts = np.isfinite(rays).sum(axis=1)
+        self.places = Places(cells, _whole(rays).astype(np.int32), counts, density, self.drawn.rings)
 
     def votes(self, anchor: int, chunk: int = 20_000) -> Iterator[tuple[int, Votes | None]]:
         """Yield, after each `chunk` of the map's intersections, how many places and turns were tried on it.
@@ -164,16 +141,15 @@ class Voter:
         """
         options = self.options
         rays = self.scene.intersections.rays[anchor]
-        rays = rays[np.isfinite(rays)].astype(float)
+        rays = _whole(rays[np.isfinite(rays)])
         around = self._around(anchor)
-        points = self._narrow(around)
-        chance = self._chance(rays, points, around.rng)
-        laid = self._lay(points)
-        found, kept, tried = np.empty((options.kept, 5)), 0, 0
+        points = self._mark(around)
+        max_turn = round(self.max_turn * _PER_RADIAN)
+        found, kept, tried = np.empty((options.kept, 4)), 0, 0
         for first in range(0, len(self.candidates), chunk):
             kept, tried = vote(
-                self.candidates[first : first + chunk], rays, self.tolerance, self.max_turn, laid, self.places,
-                self.drawn.raster, chance, self.trial, found, kept,
+                self.candidates[first : first + chunk], rays, self.tolerance, max_turn, self.scales, points,
+                options.least_points, self.places, found, kept,
             )  # fmt: skip
             if first + chunk < len(self.candidates):
                 yield tried, None
@@ -193,54 +169,30 @@ class Voter:
         offsets, away, directions = offsets[order], away[order], scene.dense_directions[order]
         angles = np.arctan2(directions[:, 1], directions[:, 0]) * (DIRECTIONS / math.pi) + DIRECTIONS
         radial = np.abs((offsets * directions).sum(axis=1)) > self.options.own_cos * away
-        return _Around(offsets, away, angles, radial, np.random.default_rng(anchor))
+        return _Around(offsets, away, angles, radial)
 
-    def _narrow(self, around: _Around) -> RoadPoints:
-        """Choose the points that vote at each scale: not those of the intersection's own branches."""
-        options = self.options
-        reach = np.array([[options.inner_m], [options.own_m], [options.radius_m]]) / self.scales
-        low, near, high = np.searchsorted(around.away, reach)
-        near = np.maximum(low, near)
-        # Up to `near` only those that run across the way to the intersection, beyond it all.
-        across = np.flatnonzero(~around.radial)
-        first, last = np.searchsorted(across, (low, near))
-        n_across = last - first
-        starts, scale, at = self._spread(n_across + high - near, options.max_points, around.rng)
-        inner = np.append(across, 0)[np.minimum(first[scale] + at, len(across))]
-        taken = np.where(at < n_across[scale], inner, near[scale] + at - n_across[scale])
-        return RoadPoints(self.scales, starts, around.offsets[taken], around.angles[taken])
+    def _mark(self, around: _Around) -> AnyArray:
+        """Return the rings of the query at each scale, (S, WORDS)."""
+        raster = self.options.raster
+        bearings = np.arctan2(around.offsets[:, 1], around.offsets[:, 0])
+        across = np.abs(np.sin(around.angles * (math.pi / DIRECTIONS) - bearings)) > math.sqrt(0.5)
+        words = np.zeros((len(self.scales), WORDS), np.uint64)
+        rings, own = raster.ring_of(around.away * self.scales[0]), around.radial.astype(np.int64)
+        mark_rings(rings, bearings, 1 - across, own, int(raster.ring_of(self.options.own_m)), words)
+        return words
 
     def _wide(self, around: _Around) -> RoadPoints:
-        """Choose the points that judge proposals anew: all, further away."""
-        ends = np.searchsorted(around.away, self.options.wide_radius_m / self.scales)
-        starts, _, taken = self._spread(ends, self.options.wide_points, around.rng)
-        return RoadPoints(self.scales, starts, around.offsets[taken], around.angles[taken])
-
-    def _spread(self, usable: IntArray, most: int, rng: np.random.Generator) -> tuple[IntArray, IntArray, IntArray]:
-        """Choose at most so many of the `usable` points (S,) of each scale, evenly by distance, in random order.
-
-        Returns where the P points of each scale begin (S + 1,), their scales (P,), and their numbers among the usable.
-        """
-        n = np.minimum(usable, most)
-        n[n < self.options.least_points] = 0
+        """Choose the points that judge proposals anew at each scale, evenly by distance."""
+        usable = np.searchsorted(around.away, self.options.wide_radius_m / self.scales)
+        n = np.minimum(usable, self.options.wide_points)
         starts = np.concatenate(([0], np.cumsum(n)))
         scale = np.repeat(np.arange(len(n)), n)
-        at = (np.arange(len(scale)) - starts[scale]) * (usable[scale] - 1) // np.maximum(n[scale] - 1, 1)
-        return starts, scale, at[np.argsort(scale + rng.random(len(scale)))]
+        taken = (np.arange(len(scale)) - starts[scale]) * (usable[scale] - 1) // np.maximum(n[scale] - 1, 1)
+        return RoadPoints(self.scales, starts, around.offsets[taken], around.angles[taken])
 
-    def _lay(self, points: RoadPoints) -> LaidPoints:
-        """Turn and scale points to cells of the raster."""
-        counts = np.diff(points.starts)
-        n_blocks = -(-int(counts.max(initial=0)) // BLOCK)
-        words = np.full((TURNS, n_blocks * len(counts) * BLOCK), NOWHERE, np.uint32)
-        lay_points(points, self.drawn.raster.cell, words)
-        return LaidPoints(points.scales, counts, words)
 
-    def _chance(self, rays: FloatArray, points: RoadPoints, rng: np.random.Generator) -> FloatArray:
-        """Measure the chance rate at each scale, in units of the density at a place, at places drawn at random."""
-        n, out = self.options.n_chance, np.empty(len(self.scales))
-        some = rng.choice(self.candidates, min(4 * n, len(self.candidates)), replace=False)
-        sample, turns = np.empty(n, np.int64), np.empty(n)
-        n = draw_turns(some, rng.random(len(some)), rays, self.tolerance, self.places, sample, turns)
-        chance_rates(sample[:n], turns[:n], points, self.places, self.drawn.raster, out)
-        return out
+def _whole(angles: AnyArray) -> IntArray:
+    """Return radians as whole numbers (see `kernels.road_votes.WHOLE_TURN`); NaN becomes 0."""
+    turns = np.nan_to_num(np.asarray(angles, float)) * _PER_RADIAN
+    whole: IntArray = np.round(turns).astype(np.int64)
+    return whole.clip(-WHOLE_TURN // 2, WHOLE_TURN // 2 - 1)

@@ -77,7 +77,8 @@ def test_on_a_coarse_map_more_of_the_ground_is_looked_at():
     usual = RoadSearchOptions()
     assert usual.on(1.0) is usual
     coarse = usual.on(6.0)
-    assert coarse.votes.radius_m == 6.0 * usual.votes.radius_m
+    assert coarse.votes.wide_radius_m == 6.0 * usual.votes.wide_radius_m
+    assert coarse.votes.raster.radius_m == 6.0 * usual.votes.raster.radius_m
     assert coarse.votes.raster.cell_m == 6.0 * usual.votes.raster.cell_m
     assert coarse.scales(CameraOptions(gsd_m=(0.1, 12.0)), 4.0) == (6.0 * COARSE_PIXEL_M, 12.0 * usual.scale_slack)
     assert coarse.scales(CameraOptions(gsd_m=(0.1, 0.5)), 4.0)[0] > 0.5
@@ -205,6 +206,29 @@ def test_the_raster_is_made_once_and_has_a_rim(town):
     assert not drawn.raster.bits[0].any()
 
 
+def test_rings_are_drawn_where_they_are_asked_for(town):
+    drawn = make_raster(town[1], RasterOptions(cell_m=6.5))
+    cells = drawn.cells(town[1].xy)
+    drawn.draw_rings_of(cells, np.array([3, 1]))
+    assert np.flatnonzero(drawn.drawn).tolist() == [1, 3]
+    first = drawn.rings[[1, 3]].copy()
+    assert first.any()
+    drawn.rings[1] = 0  # what is there is not drawn again
+    drawn.draw_rings_of(cells, np.arange(5))
+    assert not drawn.rings[1].any()
+    assert (drawn.rings[3] == first[1]).all()
+    assert drawn.drawn[:5].all()
+
+
+def test_distances_lie_in_rings():
+    options = RasterOptions()
+    edges = options.inner_m * options.ring_step ** np.arange(33)
+    assert edges[-1] == pytest.approx(options.radius_m)
+    assert options.ring_of(edges[:-1] * 1.01).tolist() == list(range(32))
+    assert options.ring_of(np.array([0.0, 0.99 * edges[0], 1.01 * edges[-1]])).tolist()[1:] == [-1, 32]
+    assert options.ring_of(0.0) < 0
+
+
 def test_a_map_of_few_roads(broken):
     index = build_index(random_network(7, 400.0))
     result = search(TripleEstimator(broken, index, MatchOptions()), SearchOptions(time_limit_s=60.0))
@@ -221,6 +245,6 @@ def test_wide_roads_leave_out_scales_at_which_they_would_be_no_roads():
 
 @pytest.mark.parametrize("coarseness", [1.0, 4.0])
 def test_points_too_far_for_the_raster_are_refused(coarseness):
-    assert VoteOptions(radius_m=370.0).on(coarseness).radius_m == 370.0 * coarseness
+    assert RasterOptions(radius_m=370.0).on(coarseness).radius_m == 370.0 * coarseness
     with pytest.raises(ValueError, match="expected less than 63 cells"):
-        VoteOptions(radius_m=380.0)
+        RasterOptions(radius_m=380.0)

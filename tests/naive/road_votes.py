@@ -1,4 +1,4 @@
-"""Slow twins of `kernels.road_raster` and `kernels.road_votes`."""
+"""Slow twins of `kernels.road_raster`, `kernels.road_rings` and `kernels.road_votes`."""
 
 import math
 
@@ -55,17 +55,6 @@ def find_turns(rays, directions, tolerance, same=0.17):
     return turns
 
 
-def draw_turns(candidates, draws, rays, tolerance, directions, most):
-    """Draw pairs of place and turn among those that the branches allow, `most` at most."""
-    pairs = []
-    for j, draw in zip(candidates, draws, strict=True):
-        stored = directions[j].astype(float)
-        turns = find_turns(rays, stored[~np.isnan(stored)], tolerance)[:16]
-        if turns:
-            pairs.append((j, turns[int(draw * len(turns))]))
-    return pairs[:most]
-
-
 def hits(points, s, x, y, turn, scale, raster):
     """Tell which points of scale number s meet roads."""
     out = []
@@ -78,26 +67,33 @@ def hits(points, s, x, y, turn, scale, raster):
     return out
 
 
-def laid_hits(points, s, x, y, turn, raster, n_turns):
-    """Tell the same of points turned by the nearest of `n_turns` angles and moved by eighths of a cell."""
-    turn = 2 * math.pi * (round(turn * n_turns / (2 * math.pi)) % n_turns) / n_turns
-    out = []
-    for i in range(points.starts[s], points.starts[s + 1]):
-        u, v = points.offsets[i] * points.scales[s] / raster.cell
-        right = math.floor(8 * (math.cos(turn) * u - math.sin(turn) * v) + 0.5)
-        up = math.floor(8 * (math.sin(turn) * u + math.cos(turn) * v) + 0.5)
-        column, row = (math.floor(8 * x) + right) // 8, (math.floor(8 * y) + up) // 8
-        direction = math.floor(points.angles[i] + turn * DIRECTIONS / math.pi) % DIRECTIONS
-        out.append(bool(word_at(row, column, raster.tile_of, raster.bits) >> direction & 1))
-    return out
+def rings_around(x, y, radii, raster, bearings=64):
+    """Bits of all rings around a place: {(across, ring, bearing)}."""
+    found = set()
+    for r, radius in enumerate(radii):
+        for b in range(bearings):
+            bearing = 2 * math.pi * (b + 0.5) / bearings
+            word = word_at(
+                math.floor(y + radius * math.sin(bearing)), math.floor(x + radius * math.cos(bearing)),
+                raster.tile_of, raster.bits,
+            )  # fmt: skip
+            for d in range(DIRECTIONS):
+                away = abs(wrapped(2 * ((d + 0.5) * math.pi / DIRECTIONS - bearing))) / 2
+                if word >> d & 1:
+                    found.add((away >= math.pi / 4, r, b))
+    return found
 
 
-def ratio(met, rate, trial, block):
-    """Return the log-likelihood ratio, looked at after each block, and where it ended."""
-    total = 0.0
-    for first in range(0, len(met), block):
-        for one in met[first : first + block]:
-            total += math.log(trial.hit_rate / rate) if one else math.log((1 - trial.hit_rate) / (1 - rate))
-        if total < -trial.patience:
-            break
-    return total
+def beyond_chance(points, roads, turn, bearings=64):
+    """How many points meet roads when they are turned, beyond those of all turns, in standard deviations."""
+    met = len({(across, r, (b + turn) % bearings) for across, r, b in points} & roads)
+    dense = {}
+    for across, r, _ in roads:
+        dense[across, r] = dense.get((across, r), 0) + 1 / bearings
+    expected = sum(dense.get((across, r), 0) for across, r, _ in points)
+    return (met - expected) / math.sqrt(max(expected * (1 - expected / len(points)), 1))
+
+
+def ratio(met, hit_rate, rate):
+    """Return the log-likelihood ratio of points that meet roads or not."""
+    return sum(math.log(hit_rate / rate) if one else math.log((1 - hit_rate) / (1 - rate)) for one in met)
