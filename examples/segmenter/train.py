@@ -93,7 +93,7 @@ def _parse(arguments: list[str] | None) -> argparse.Namespace:
     parser.add_argument("--out", type=Path, required=True, help="folder for checkpoints, maps and the model")
     parser.add_argument("--only", help="one run: the number of a fold, or all")
     parser.add_argument("--folds", type=int, default=3)
-    parser.add_argument("--network", choices=sorted(RECIPES), default="lite2", help="what is trained")
+    parser.add_argument("--network", choices=sorted(RECIPES), default="pretrained", help="what is trained")
     parser.add_argument("--steps", type=int, default=3800, help="of each fold")
     parser.add_argument(
         "--longer", type=int, default=1, help="how many times longer the model on all photographs trains"
