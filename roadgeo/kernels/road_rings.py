@@ -14,7 +14,7 @@ from roadgeo.kernels.arrays import Floats1, Floats2, Ints1, UInt64s2
 from roadgeo.kernels.compilation import kernel
 from roadgeo.kernels.road_raster import DIRECTIONS, Raster, passing
 
-__all__ = ["BEARINGS", "RINGS", "WORDS", "count_bits", "draw_rings", "mark_rings", "turned"]
+__all__ = ["BEARINGS", "RINGS", "WORDS", "count_bits", "draw_rings", "mark_rings", "turn_bits"]
 
 BEARINGS = 64
 RINGS = 32  # loops over a multiple of 8 words are quicker than over fewer
@@ -94,7 +94,7 @@ def count_bits(word: np.uint64) -> np.uint64:
 
 
 @kernel(forceinline=True)
-def turned(word: np.uint64, n: int) -> np.uint64:
+def turn_bits(word: np.uint64, n: int) -> np.uint64:
     """Turn a ring counterclockwise by n bearings."""
     left = np.uint64(n & (BEARINGS - 1))
     return (word << left) | (word >> ((np.uint64(BEARINGS) - left) & np.uint64(BEARINGS - 1)))

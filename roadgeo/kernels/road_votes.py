@@ -9,7 +9,7 @@ from numpy.typing import NDArray
 from roadgeo.kernels.arrays import Floats1, Floats2, Int32s2, Ints1, UInt64s2
 from roadgeo.kernels.compilation import kernel
 from roadgeo.kernels.road_raster import DIRECTIONS, Raster, passes
-from roadgeo.kernels.road_rings import BEARINGS, WORDS, count_bits, turned
+from roadgeo.kernels.road_rings import BEARINGS, WORDS, count_bits, turn_bits
 
 __all__ = ["MAX_TURNS", "WHOLE_TURN", "Places", "RoadPoints", "Trial", "find_turns", "improve_votes", "vote"]
 
@@ -80,11 +80,11 @@ def _turns_allowed(rays: Ints1, directions: Int32s2, m: int, j: int, tolerance: 
         branches |= np.uint64(1) << np.uint64(_bearing(int(directions[j, t])))
     # two angles and the turn are rounded: what agrees lies up to one and a half bearings further apart than it is
     for _ in range((tolerance >> _BITS) + 2):
-        branches |= turned(branches, 1) | turned(branches, -1)
+        branches |= turn_bits(branches, 1) | turn_bits(branches, -1)
     # turns at which no ray lacks a branch, one does, and two or more do
     none, one, more = ~np.uint64(0), np.uint64(0), np.uint64(0)
     for k in range(rays.shape[0]):
-        near = turned(branches, -_bearing(rays[k]))
+        near = turn_bits(branches, -_bearing(rays[k]))
         more |= one & ~near
         one = (one & near) | (none & ~near)
         none &= near
@@ -234,7 +234,7 @@ def vote(
             tried += 1
             back = -_bearing(turns[t] + (1 << (_BITS - 1)))
             for w in range(WORDS):
-                here[w] = turned(places.rings[j, w], back)
+                here[w] = turn_bits(places.rings[j, w], back)
             best, where = votes[0, 3] if kept == votes.shape[0] else 0.0, -1
             for s in range(n_scales):
                 met = np.uint64(0)

@@ -14,6 +14,7 @@ from roadgeo.kernels.road_raster import (
     measure_tiles,
     paint_roads,
     passes,
+    passing,
 )
 
 X0, Y0, CELL, REACH, TURN = -700.0, 300.0, 5.0, 7.0, math.radians(20)
@@ -44,6 +45,7 @@ def test_cells_near_a_road_hold_its_direction(seed):
     for column, row in cells:
         expected = naive.bits_at(row, column, segments, X0, Y0, CELL, REACH, TURN)
         assert naive.word_at(row, column, raster.tile_of, raster.bits) == expected
+        assert passing(column + 0.3, row + 0.9, raster) == expected
         for d in range(DIRECTIONS):
             assert passes(column + 0.3, row + 0.9, d, raster) == expected >> d & 1
 

@@ -27,10 +27,11 @@ TWINS = {
     "smooth_chains": "smooth_chain",
     "tie_runs": "runs",
     "vertex_probes": "alike",
-    "vote": "ratio",
-    "lay_points": "laid_hits",
+    "vote": "beyond_chance",
     "improve_votes": "hits",
-    "chance_rates": "hits",
+    "draw_rings": "rings_around",
+    "mark_rings": "marks_of",
+    "passing": "word_at",
 }
 
 #: What a test calls instead of a kernel that it compares.
@@ -41,6 +42,7 @@ REASONS = {
     "add_row": "compared with A^T W A, one line of numpy",
     "carry": "compared with the twins of `predict` and of the Jacobian",
     "cholesky": "compared with numpy.linalg",
+    "count_bits": "compared with Python's count of bits",
     "count_neighbours": "part of `fill_table`, whose twin lists the neighbours",
     "count_alike": "compared with the decoded table, counted in the test",
     "grow_each": "compared with `grow`, which has a twin",
@@ -60,6 +62,7 @@ REASONS = {
     "sort_few": "part of `describe_intersections`; rays are tested to ascend",
     "touches_solid": "part of thinning and tracing, whose twins use rows and columns",
     "triple_codes": "three calls of `vertex_codes`, which has a twin",
+    "turn_bits": "a test follows every bit",
     "turned": "part of `vertex_codes`, which has a twin",
 }
 

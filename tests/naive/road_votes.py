@@ -84,6 +84,15 @@ def rings_around(x, y, radii, raster, bearings=64):
     return found
 
 
+def marks_of(rings, bearings, along, own, first_own, n_rings, n_bearings=64):
+    """Bits of road points around an intersection: {(across, ring, bearing)}."""
+    found = set()
+    for r, bearing, runs_along, branch in zip(rings, bearings, along, own, strict=True):
+        if 0 <= r < n_rings and not (branch and r < first_own):
+            found.add((not runs_along, int(r), math.floor(bearing / (2 * math.pi) * n_bearings) % n_bearings))
+    return found
+
+
 def beyond_chance(points, roads, turn, bearings=64):
     """How many points meet roads when they are turned, beyond those of all turns, in standard deviations."""
     met = len({(across, r, (b + turn) % bearings) for across, r, b in points} & roads)
