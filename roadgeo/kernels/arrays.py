@@ -26,10 +26,8 @@ __all__ = [
     "Singles1",
     "Singles2",
     "TupleKind",
-    "UInt32s2",
     "UInt64s1",
     "UInt64s2",
-    "Words1",
     "Words3",
     "kind_of",
 ]
@@ -48,10 +46,8 @@ Int8s2: TypeAlias = Annotated[NDArray[np.int8], 2]
 Int8s3: TypeAlias = Annotated[NDArray[np.int8], 3]
 Bytes1: TypeAlias = Annotated[NDArray[np.uint8], 1]
 Bytes2: TypeAlias = Annotated[NDArray[np.uint8], 2]
-UInt32s2: TypeAlias = Annotated[NDArray[np.uint32], 2]
 UInt64s1: TypeAlias = Annotated[NDArray[np.uint64], 1]
 UInt64s2: TypeAlias = Annotated[NDArray[np.uint64], 2]
-Words1: TypeAlias = Annotated[NDArray[np.uint16], 1]
 Words3: TypeAlias = Annotated[NDArray[np.uint16], 3]
 Bools1: TypeAlias = Annotated[NDArray[np.bool_], 1]
 Bools2: TypeAlias = Annotated[NDArray[np.bool_], 2]
