@@ -71,7 +71,7 @@ class RoadRaster:
     density : (R, C) float32
         Chance of a point of any direction to meet a road in a tile or those beside it.
     rings : (N, WORDS) uint64
-        Around each intersection of the reference, as far as `drawn` (N,) says (see `draw_rings_of`).
+        Around each intersection of the reference, as far as `has_rings` (N,) says (see `draw_rings_of`).
     radii : (RINGS,) float64
         Of the middles of the rings, cells.
     """
@@ -80,7 +80,7 @@ class RoadRaster:
     raster: Raster
     density: Float32Array
     rings: AnyArray
-    drawn: BoolArray
+    has_rings: BoolArray
     radii: FloatArray
 
     @property
@@ -104,9 +104,9 @@ class RoadRaster:
 
     def draw_rings_of(self, cells: FloatArray, places: IntArray) -> None:
         """Draw the rings of intersections, (N, 2) cells of all and (M,) numbers, as far as they are not drawn yet."""
-        missing = places[~self.drawn[places]]
+        missing = places[~self.has_rings[places]]
         draw_rings(cells, missing, self.radii, self.raster, self.rings)
-        self.drawn[missing] = True
+        self.has_rings[missing] = True
 
 
 #: Rasters in use anywhere; and those that are kept, the one used last at the end, up to so many bytes together.

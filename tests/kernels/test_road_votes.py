@@ -94,11 +94,6 @@ def world(seed, n_places=30):
     return raster, places, points, rng.uniform(-3, 3, 3)
 
 
-def bits_of(row):
-    bits = {(w, b) for w in range(WORDS) for b in range(BEARINGS) if int(row[w]) >> b & 1}
-    return {(w >= RINGS, w % RINGS, b) for w, b in bits}
-
-
 class TestVote:
     @pytest.mark.parametrize("seed", range(4))
     @pytest.mark.parametrize("max_turn", [math.pi, 0.8])
@@ -118,7 +113,10 @@ class TestVote:
                 if abs(turn) <= max_turn:
                     tried_all += 1
                     back = round(turn / (2 * math.pi) * BEARINGS)
-                    at = {s: naive.beyond_chance(bits_of(marked[s]), bits_of(places.rings[j]), back) for s in (0, 2)}
+                    at = {
+                        s: naive.beyond_chance(naive.bits_of(marked[s]), naive.bits_of(places.rings[j]), back)
+                        for s in (0, 2)
+                    }
                     s = max(at, key=at.get)
                     if at[s] > 0:
                         expected.append((at[s], j, turn, scales[s]))

@@ -210,14 +210,14 @@ def test_rings_are_drawn_where_they_are_asked_for(town):
     drawn = make_raster(town[1], RasterOptions(cell_m=6.5))
     cells = drawn.cells(town[1].xy)
     drawn.draw_rings_of(cells, np.array([3, 1]))
-    assert np.flatnonzero(drawn.drawn).tolist() == [1, 3]
+    assert np.flatnonzero(drawn.has_rings).tolist() == [1, 3]
     first = drawn.rings[[1, 3]].copy()
     assert first.any()
     drawn.rings[1] = 0  # what is there is not drawn again
     drawn.draw_rings_of(cells, np.arange(5))
     assert not drawn.rings[1].any()
     assert (drawn.rings[3] == first[1]).all()
-    assert drawn.drawn[:5].all()
+    assert drawn.has_rings[:5].all()
 
 
 def test_distances_lie_in_rings():

@@ -67,6 +67,12 @@ def hits(points, s, x, y, turn, scale, raster):
     return out
 
 
+def bits_of(words, bearings=64):
+    """Bits of the rings of one place: {(across, ring, bearing)}."""
+    n = len(words) // 2
+    return {(w >= n, w % n, b) for w, word in enumerate(words) for b in range(bearings) if int(word) >> b & 1}
+
+
 def rings_around(x, y, radii, raster, bearings=64):
     """Bits of all rings around a place: {(across, ring, bearing)}."""
     found = set()
