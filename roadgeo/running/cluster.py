@@ -1,8 +1,8 @@
 """Many tasks on a Dask cluster: results in the order of the tasks, as from one process; a worker that dies costs none.
 
 Tasks travel in groups. No more groups are under way than keep all workers busy, so that neither the scheduler nor this
-process holds more than those, whatever the number of tasks. A group whose worker dies is done again on another; one
-that kills every worker is done task by task, and what kills them again is given up.
+process holds more than those, whatever the number of tasks. A group whose worker dies is done again on another; when
+that kills every worker, its tasks are done one by one with nothing beside them, and what kills them again is given up.
 
 Workers read the same files under the same paths. Each has one thread; kernels are compiled on each host once.
 """
@@ -128,6 +128,9 @@ def _local_cluster(workers: int) -> Iterator[Any]:
 class Stream:
     """Sends groups of tasks and takes their results, a bounded number at a time."""
 
+    #: Why a task is given up.
+    died = "the workers that it was given to died, one after another"
+
     def __init__(self, client: Any, work: Any, together: int) -> None:
         self.client, self.work, self.together = client, work, together
         self.made = Made(uuid.uuid4().hex, str(Path.cwd()), pickle.dumps(work))
@@ -142,11 +145,19 @@ class Stream:
                 while groups and len(under_way) < _AHEAD * self._n_workers() + 1:
                     group = groups.popleft()
                     under_way.append((self._send(group), group))
-                future, group = under_way.popleft()
-                yield from self._take(future, group)
+                for found, group in self._next(under_way):
+                    yield from self._one_by_one(group) if found is None else found
         finally:
             with contextlib.suppress(Exception):
                 self.client.cancel([getattr(future, "futures", future) for future, _ in under_way])
+
+    def _next(self, under_way: deque[tuple[Any, Sequence[Any]]]) -> list[tuple[list[Any] | None, Sequence[Any]]]:
+        """Take the next group off; where its workers died, also all others, so that nothing is left under way."""
+        taken: list[tuple[list[Any] | None, Sequence[Any]]] = []
+        while under_way and (not taken or taken[0][0] is None):
+            future, group = under_way.popleft()
+            taken.append((self._wait_for(future), group))
+        return taken
 
     def _n_workers(self) -> int:
         """Return how many workers there are now: they may come and go."""
@@ -155,11 +166,11 @@ class Stream:
     def _send(self, group: Sequence[Any]) -> Any:
         return self.client.submit(_do_group, self.made, list(group), pure=False, retries=RETRIES)
 
-    def _results_of(self, future: Any) -> list[Any]:
+    def _results_of(self, future: Any) -> list[Any] | None:
         return list(future.result())
 
-    def _take(self, future: Any, group: Sequence[Any]) -> list[Any]:
-        """Return the results of a group; one that kills its workers is done task by task."""
+    def _wait_for(self, future: Any) -> list[Any] | None:
+        """Return a group's results; None: worker after worker died of it, or beside it."""
         from concurrent.futures import CancelledError
 
         from distributed.scheduler import KilledWorker
@@ -167,12 +178,15 @@ class Stream:
         try:
             return self._results_of(future)
         except KilledWorker:
-            if len(group) > 1:
-                alone = [(self._send([task]), [task]) for task in group]
-                return [result for one in alone for result in self._take(*one)]
-            return [self.work.give_up(group[0], "the workers that it was given to died, one after another")]
+            return None
         except (CancelledError, OSError) as error:
             raise RoadgeoError("the Dask scheduler went away; the same command with --skip-existing goes on") from error
+
+    def _one_by_one(self, group: Sequence[Any]) -> Iterator[Any]:
+        """Do tasks while nothing else is under way: the scheduler blames all that a dead worker had before it."""
+        for task in group:
+            found = self._wait_for(self._send([task]))
+            yield from [self.work.give_up(task, self.died)] if found is None else found
 
 
 # --- on a worker ------------------------------------------------------------------------------------------------------

@@ -47,8 +47,6 @@ _FIRST_LOOK_S = 0.1
 #: Seconds after which it is looked whether all workers live that a group waits for.
 _LOOK_AGAIN_S = 2.0
 
-_DIED = "the workers that hold parts of the map died, again and again"
-
 
 @dataclass(frozen=True)
 class Vote:
@@ -174,6 +172,8 @@ class _Sent:
 class _DividedStream(Stream):
     """Sends every group of masks to all workers."""
 
+    died = "the workers that hold parts of the map died, again and again"
+
     def _send(self, group: Sequence[Any], again: int = 0) -> Any:
         work: _Division = self.work
         shares = owners(list(work.sizes), sorted(self.client.nthreads()) or [""])
@@ -190,7 +190,7 @@ class _DividedStream(Stream):
         futures = on_each(_finish_all, self.client.submit(_decided, looked, voted, pure=False))
         return _Sent(futures, group, frozenset(shares), again)
 
-    def _results_of(self, future: Any) -> list[Any]:
+    def _results_of(self, future: Any) -> list[Any] | None:
         sent: _Sent = future
         found: dict[int, Outcome] = {}
         left = list(sent.futures)
@@ -204,8 +204,8 @@ class _DividedStream(Stream):
                 # A worker is gone, and nobody else may do what it was to do: all of the group is sent once more.
                 self.client.cancel(sent.futures)
                 if sent.again == RETRIES:
-                    return [self.work.give_up(task, _DIED) for task in sent.group]
-                return self._take(self._send(sent.group, sent.again + 1), sent.group)
+                    return None
+                return self._results_of(self._send(sent.group, sent.again + 1))
         return [found[k] for k in range(len(found))]
 
 

@@ -22,7 +22,7 @@ from roadgeo.errors import RoadgeoError
 from roadgeo.reference.shards import open_shards
 
 pytest.importorskip("distributed")
-from roadgeo.running.cluster import Cluster
+from roadgeo.running.cluster import Cluster, Stream
 
 pytestmark = pytest.mark.slow
 
@@ -107,6 +107,49 @@ def test_killed_workers_lose_nothing_and_what_kills_them_all_is_given_up(schedul
     assert [one for n, one in enumerate(found) if n != 17] == [n * n for n in range(20) if n != 17]
     assert found[17].startswith("17: the workers that it was given to died")
     assert len(found) == 20
+
+
+class Blaming:
+    """A client whose scheduler blames all that was under way for the death of a worker, as Dask's may."""
+
+    def __init__(self, *killers):
+        self.killers, self.under_way = killers, []
+
+    def nthreads(self):
+        return {"tcp://one": 1, "tcp://other": 1}
+
+    def submit(self, do, made, tasks, **_):
+        future = Blamed(self, tasks)
+        self.under_way.append(future)
+        return future
+
+    def cancel(self, futures):
+        assert not futures
+
+
+class Blamed:
+    def __init__(self, client, tasks):
+        self.client, self.tasks = client, tasks
+        self.blamed = False
+
+    def result(self):
+        from distributed.scheduler import KilledWorker
+
+        if any(n in self.client.killers for one in self.client.under_way for n in one.tasks):
+            for one in self.client.under_way:
+                one.blamed = True
+        self.client.under_way.remove(self)
+        if self.blamed:
+            raise KilledWorker("task", None, 1)
+        return [n * n for n in self.tasks]
+
+
+@pytest.mark.parametrize("together", [1, 5])
+def test_nobody_is_given_up_for_what_was_beside_it(together):
+    stream = Stream(Blaming(6, 17), Squares(""), together)
+    found = list(stream.results(range(40)))
+    assert [one for n, one in enumerate(found) if n not in (6, 17)] == [n * n for n in range(40) if n not in (6, 17)]
+    assert (found[6], found[17]) == (f"6: {stream.died}", f"17: {stream.died}")
 
 
 def test_shards_and_masks_come_out_as_from_one_process(scheduler, tmp_path, monkeypatch, capsys):

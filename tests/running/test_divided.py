@@ -194,10 +194,18 @@ class Client:
         assert all(future.found is None for future in futures)
 
 
-@pytest.mark.parametrize(("deaths", "found"), [(0, ["found"]), (2, ["found"]), (9, [f"q: {divided._DIED}"])])
+@pytest.mark.parametrize(("deaths", "found"), [(0, ["found"]), (2, ["found"]), (9, None)])
 def test_what_a_dead_worker_was_to_do_is_sent_once_more(deaths, found, monkeypatch):
     monkeypatch.setattr(divided, "_LOOK_AGAIN_S", 0.01)
     client = Client(deaths)
     stream = divided._DividedStream(client, Work(), 1)
-    assert stream._take(stream._send(["q"]), ["q"]) == found
+    assert stream._wait_for(stream._send(["q"])) == found
     assert client.groups == min(deaths, divided.RETRIES) + 1
+
+
+def test_masks_beside_one_that_kills_all_workers_are_located(monkeypatch):
+    """After the group died they are done one by one; the first dies again."""
+    monkeypatch.setattr(divided, "_LOOK_AGAIN_S", 0.01)
+    client = Client(divided.RETRIES + 1)
+    stream = divided._DividedStream(client, Work(), 2)
+    assert list(stream._one_by_one(["p", "q"])) == [f"p: {stream.died}", "found"]
