@@ -20,8 +20,8 @@ from roadgeo.workflows import locate
 
 __all__ = ["ask_mirrored"]
 
-#: What a try may take, of the first sweep alone: a mask that is merely turned over is found at once.
-_WORK_LIMIT_S = 2.0
+#: What a try may take, of the first sweep alone: a mask that is merely turned over is found in a tenth of it.
+_WORK_LIMIT_S = 0.5
 _WORTH_A_TRY = {Reason.NOTHING_STANDS_OUT, Reason.TIME_LIMIT}
 
 
