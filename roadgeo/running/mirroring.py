@@ -20,8 +20,8 @@ from roadgeo.workflows import locate
 
 __all__ = ["ask_mirrored"]
 
-#: What a try may take, of the first sweep alone: a mask that is merely turned over is found in a tenth of it.
-_WORK_LIMIT_S = 0.5
+#: What a try may take, of the first sweep alone: a mask that is merely turned over is found in a tenth of it, mostly.
+_WORK_LIMIT_S = 1.0
 _WORTH_A_TRY = {Reason.NOTHING_STANDS_OUT, Reason.TIME_LIMIT}
 
 
