@@ -5,7 +5,7 @@ from __future__ import annotations
 import copy
 import math
 import time
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 from functools import cache
 from pathlib import Path
@@ -21,7 +21,7 @@ from numpy.typing import NDArray
 from tiles import Tile
 from torch import Tensor
 
-__all__ = ["RECIPES", "TrainingOptions", "make_network", "probabilities", "train"]
+__all__ = ["RECIPES", "TrainingOptions", "make_network", "mix", "probabilities", "train"]
 
 Optimizers = tuple[torch.optim.Optimizer, ...]
 
@@ -86,6 +86,20 @@ def train(tiles: list[Tile], checkpoint: Path, options: TrainingOptions) -> AnyR
         if (step + 1) % options.save_every == 0 or step + 1 == options.steps:
             _save(checkpoint, network, mean, optimizers, step + 1)
     return mean.eval()
+
+
+@torch.no_grad()
+def mix(network: AnyRoadNet, checkpoints: Sequence[Path]) -> AnyRoadNet:
+    """Give a network the mean of its weights and those of other runs that went on from it, or from where it did.
+
+    (Model soups: Wortsman et al., ICML 2022.)
+    """
+    device = next(network.parameters()).device
+    states = [torch.load(path, map_location=device, weights_only=True)["mean"] for path in checkpoints]
+    for name, value in network.state_dict().items():
+        if value.dtype.is_floating_point:
+            value.copy_(torch.stack([value, *(state[name] for state in states)]).mean(dim=0))
+    return network
 
 
 @torch.no_grad()
