@@ -102,13 +102,7 @@ def _parse(arguments: list[str] | None) -> argparse.Namespace:
     parser.add_argument("--batch", type=int, default=4)
     parser.add_argument("--rate", type=float, default=2e-3, help="largest learning rate")
     parser.add_argument("--start", type=Path, help="checkpoint of another run to begin with, instead of chance")
-    parser.add_argument(
-        "--mix",
-        type=Path,
-        nargs="*",
-        default=[],
-        help="runs that went on from this one: their mean counts",
-    )
+    parser.add_argument("--mix", type=Path, nargs="+", default=[], help="runs that went on from this: the mean counts")
     parser.add_argument("--seed", type=int, default=0)
     parser.add_argument("--threads", type=int, default=torch.get_num_threads())
     parser.add_argument("--device", default="cuda" if torch.cuda.is_available() else "cpu")

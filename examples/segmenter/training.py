@@ -81,24 +81,21 @@ def train(tiles: list[Tile], checkpoint: Path, options: TrainingOptions) -> AnyR
             for group in optimizer.param_groups:
                 group["lr"] = slower * options.rate * _schedule(step / options.steps)
         parts = _step(network, optimizers, next(batches), (step / options.steps, recipe.doubt), options.device)
-        _average(mean, network, min(options.average, (1 + step) / (10 + step)))
+        _average(mean, network.state_dict(), min(options.average, (1 + step) / (10 + step)))
         log.add(step, parts)
         if (step + 1) % options.save_every == 0 or step + 1 == options.steps:
             _save(checkpoint, network, mean, optimizers, step + 1)
     return mean.eval()
 
 
-@torch.no_grad()
 def mix(network: AnyRoadNet, checkpoints: Sequence[Path]) -> AnyRoadNet:
     """Give a network the mean of its weights and those of other runs that went on from it, or from where it did.
 
     (Model soups: Wortsman et al., ICML 2022.)
     """
     device = next(network.parameters()).device
-    states = [torch.load(path, map_location=device, weights_only=True)["mean"] for path in checkpoints]
-    for name, value in network.state_dict().items():
-        if value.dtype.is_floating_point:
-            value.copy_(torch.stack([value, *(state[name] for state in states)]).mean(dim=0))
+    for n, path in enumerate(checkpoints, start=1):
+        _average(network, torch.load(path, map_location=device, weights_only=True)["mean"], n / (n + 1))
     return network
 
 
@@ -191,8 +188,7 @@ def _optimizers(network: AnyRoadNet, options: TrainingOptions) -> Optimizers:
 
 
 @torch.no_grad()
-def _average(mean: AnyRoadNet, network: AnyRoadNet, keep: float) -> None:
-    theirs = network.state_dict()
+def _average(mean: AnyRoadNet, theirs: dict[str, Tensor], keep: float) -> None:
     for name, value in mean.state_dict().items():
         if value.dtype.is_floating_point:
             value.lerp_(theirs[name], 1 - keep)
