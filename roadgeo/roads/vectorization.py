@@ -23,6 +23,11 @@ __all__ = ["Vectorization", "VectorizeOptions", "road_width", "vectorize"]
 #: Bands of rows that `road_width` looks at first, and how many road pixels they must hold.
 _BAND_ROWS, _BAND_STEP, _BAND_MIN_ROAD, _MAX_BAND_PIXELS = 48, 192, 2000, 1 << 24
 
+#: Streets run together where the width by area is so many times that by length, which it usually exceeds by so much.
+_RUN_TOGETHER, _USUALLY_WIDER = 1.5, 1.16
+#: Specks are less deep, pixels.
+_SPECK_DEPTH = 3
+
 _MAX_DEPTH = 1000  # of a road, pixels; deeper ones are not told apart
 _STRIP_PIXELS = 1 << 24  # large masks are gone through so many pixels at a time
 
@@ -173,7 +178,8 @@ def road_width(mask: RoadMask) -> float:
     """Estimate the usual road width of a mask in pixels: four times the mean depth of a road pixel.
 
     Depths within a straight road are spread evenly between 0 and half its width. What is much deeper than the median
-    is no road and counts as little as a road can.
+    is no road and counts as little as a road can. Where wide streets run together over more ground than all that can
+    be told apart, as towards the horizon of a steep view, the width is that of most roads by their length.
 
     Raises
     ------
@@ -192,7 +198,9 @@ def road_width(mask: RoadMask) -> float:
     factor = min(int(width / 8), min(roads.shape) // 16)
     if width <= _BAND_ROWS / 3 or factor < 2:
         return max(width, 1.0)
-    return float(factor) * road_width(RoadMask(_shrink(roads, factor, 0.5).view(np.bool_), name=mask.name))
+    wide = float(factor) * road_width(RoadMask(_shrink(roads, factor, 0.5).view(np.bool_), name=mask.name))
+    by_length = _USUALLY_WIDER * _width_of_half(counts, width)
+    return by_length if wide > _RUN_TOGETHER * by_length else wide
 
 
 def _count_depths(roads: AnyArray, rows: int, step: int) -> IntArray:
@@ -211,6 +219,19 @@ def _width(counts: IntArray) -> float:
     depth = (np.arange(len(counts)) + 0.25) / 8
     median = depth[np.searchsorted(np.cumsum(counts), counts.sum() / 2)]
     return float(4.0 * (counts @ np.minimum(depth, 2.0 * median + 1.0)) / max(counts.sum(), 1))
+
+
+def _width_of_half(counts: IntArray, width: float) -> float:
+    """Return the width that half of all roads have at most, by length; what is much less wide than `width` is no road.
+
+    At a depth there are as many pixels as the roads that reach it are long, twice.
+    """
+    at_depth = counts[: 8 * _MAX_DEPTH].reshape(-1, 8).sum(axis=1)
+    first = min(int(width / 16), _SPECK_DEPTH)
+    half = at_depth[first : first + 2].max() / 2
+    k = first + int(np.argmax(at_depth[first:] < half))
+    before, after = at_depth[max(k - 1, 0)], at_depth[k]
+    return float(2 * k - 1 + 2 * (before - half) / (before - after)) if before > after else width
 
 
 def _reduce(mask: RoadMask, factor: int, share: float) -> AnyArray:

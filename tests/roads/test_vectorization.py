@@ -238,6 +238,23 @@ def test_a_turned_mask_gives_a_turned_graph(turns: int) -> None:
     assert distances.min(axis=0).max() < 1.0
 
 
+@pytest.mark.parametrize("width", [10, 14, 35])
+def test_where_streets_run_together_the_width_is_that_of_the_others(width: int) -> None:
+    """Towards the horizon of a steep view streets make one patch, of more pixels than all that can be told apart."""
+    image = drawn([[(-50, 100 + 150 * k), (1300, 60 + 150 * k)] for k in range(8)], width, 1200)
+    alone = road_width(RoadMask(image.copy()))
+    image[:, :400] = True
+    image[::150, :400] = False  # here and there ground shows through
+    assert alone < road_width(RoadMask(image)) < 1.6 * alone  # by area it is four times that, and more
+
+
+def test_specks_do_not_tell_the_width() -> None:
+    """There are many, and all of them together are longer than the roads."""
+    image = drawn([[(-50, 300), (1300, 340)], [(400, -50), (380, 1300)]], 40, 1200)
+    image |= np.random.default_rng(7).random(image.shape) < 0.02
+    assert road_width(RoadMask(image)) > 20
+
+
 def test_road_width_is_told_from_the_roads_alone() -> None:
     image = drawn([[(-50, 60), (450, 90)], [(80, -50), (110, 450)]], 8, 400)
     assert road_width(RoadMask(image)) == pytest.approx(8, abs=0.6)
