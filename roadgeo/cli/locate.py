@@ -18,7 +18,7 @@ from roadgeo.cli.command_line import said_options
 from roadgeo.cli.folders import make_folder
 from roadgeo.cli.hints import HINTS, hint_options, make_options, refuse_swapped
 from roadgeo.cli.parameters import ASPECT, Plugin, out_dir_option, references_option, verbosity_options
-from roadgeo.cli.photographs import read_options, segmenting_options
+from roadgeo.cli.photographs import mask_options, read_options, segmenting_options
 from roadgeo.cli.printing import echo
 from roadgeo.cli.truths import read_truths
 from roadgeo.outputs.registry import (
@@ -207,10 +207,7 @@ def _drawing_options(command: Command) -> Command:
     type=click.Path(),
     help="Terrain model (GeoTIFF, metres): how high the ground lies, and so how high the camera was above the sea.",
 )
-@click.option("--threshold", metavar="T", type=float, help="Values above T are road. Default: told by the values.")
-@click.option(
-    "--band", metavar="N", type=click.IntRange(1), help="Band that holds the mask. Default: told by the bands."
-)
+@mask_options
 @hint_options()
 @click.option(
     "--method",

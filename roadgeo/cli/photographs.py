@@ -1,4 +1,4 @@
-"""What the user says of photographs: options of `locate`, `verify` and `vectorize`."""
+"""What the user says of images, masks or photographs: options of `locate`, `track`, `verify` and `vectorize`."""
 
 from __future__ import annotations
 
@@ -13,7 +13,7 @@ from roadgeo.cli.parameters import Plugin
 if TYPE_CHECKING:
     from roadgeo.running.options import ReadOptions
 
-__all__ = ["n_threads", "read_options", "segmenting_options"]
+__all__ = ["mask_options", "n_threads", "read_options", "segmenting_options"]
 
 Command = TypeVar("Command", bound=Callable[..., Any])
 
@@ -72,6 +72,14 @@ def segmenting_options(command: Command, *, fuse: bool = True) -> Command:
     for option in reversed([*_OPTIONS, _FUSE] if fuse else _OPTIONS):
         command = option(command)
     return command
+
+
+def mask_options(command: Command) -> Command:
+    """Add `--threshold` and `--band`: which values of an image are road."""
+    told = "Values above T are road; of a photograph (--segment always) probabilities. Default: told by them."
+    threshold = click.option("--threshold", metavar="T", type=float, help=told)
+    held = "Band that holds the mask. Default: told by the bands."
+    return threshold(click.option("--band", metavar="N", type=click.IntRange(1), help=held)(command))
 
 
 def n_threads(jobs: int = 1) -> int:

@@ -17,6 +17,7 @@ from roadgeo.cli import NOT_LOCATED
 from roadgeo.cli.folders import make_folder
 from roadgeo.cli.hints import hint_options, make_options, refuse_swapped
 from roadgeo.cli.parameters import out_dir_option, references_option, verbosity_options
+from roadgeo.cli.photographs import mask_options
 from roadgeo.cli.printing import echo
 
 if TYPE_CHECKING:
@@ -132,8 +133,7 @@ class Moment(click.ParamType):  # type: ignore[type-arg]
 )
 @click.option("--segmenter", "model", metavar="MODEL.onnx", type=click.Path(), default="", help="Who finds them.")
 @click.option("--class", "class_name", metavar="NAME", help="Class of the model that is road.")
-@click.option("--threshold", metavar="T", type=float, help="Values above T are road. Default: told by the values.")
-@click.option("--band", metavar="N", type=click.IntRange(1), help="Band that holds the mask.")
+@mask_options
 @hint_options("gsd_m", "max_tilt_deg", "near", "within")
 @click.option(
     "--camera",

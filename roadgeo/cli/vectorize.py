@@ -12,7 +12,7 @@ from roadgeo.cli import ERROR
 from roadgeo.cli.folders import make_folder
 from roadgeo.cli.hints import hint_options
 from roadgeo.cli.parameters import out_dir_option
-from roadgeo.cli.photographs import n_threads, segmenting_options
+from roadgeo.cli.photographs import mask_options, n_threads, segmenting_options
 from roadgeo.cli.printing import echo
 from roadgeo.cli.progress import show_steps
 from roadgeo.running.tasks import Task, find_masks, name_tasks
@@ -27,12 +27,7 @@ __all__ = ["vectorize_command"]
 @click.command("vectorize", short_help="Show what roads are seen in a mask or a photograph.")
 @click.argument("images", metavar="IMAGE...", nargs=-1, required=True, type=click.Path())
 @out_dir_option()
-@click.option(
-    "--threshold", metavar="T", type=float, help="Values, or probabilities, above T are road. Default: told by them."
-)
-@click.option(
-    "--band", metavar="N", type=click.IntRange(1), help="Band that holds the mask. Default: told by the bands."
-)
+@mask_options
 @hint_options("gsd_m")
 @partial(segmenting_options, fuse=False)
 def vectorize_command(images: tuple[str, ...], out_dir: str, gsd_m: tuple[float, float] | None, **given: Any) -> int:

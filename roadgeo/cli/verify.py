@@ -14,7 +14,7 @@ from roadgeo.cli import ERROR, NOT_LOCATED
 from roadgeo.cli.command_line import made_by
 from roadgeo.cli.folders import make_folder
 from roadgeo.cli.parameters import out_dir_option, references_option, verbosity_options
-from roadgeo.cli.photographs import read_options, segmenting_options
+from roadgeo.cli.photographs import mask_options, read_options, segmenting_options
 from roadgeo.cli.printing import echo
 
 if TYPE_CHECKING:
@@ -69,10 +69,7 @@ _COLORS = {"agrees": "green", "off": "red", "unknown": "yellow"}
 )
 @click.option("--crs", metavar="CRS", help="CRS of images that name none, such as EPSG:25832.")
 @segmenting_options
-@click.option("--threshold", metavar="T", type=float, help="Values above T are road. Default: told by the values.")
-@click.option(
-    "--band", metavar="N", type=click.IntRange(1), help="Band that holds the mask. Default: told by the bands."
-)
+@mask_options
 @click.option("-j", "--jobs", metavar="N", type=click.IntRange(1), default=1, show_default=True, help="Processes.")
 @verbosity_options
 def verify_command(
