@@ -22,6 +22,10 @@ __all__ = ["with_honest_corners"]
 #: lenses that were not found: 0.44 to 0.83, tilted ones 0.87 and more.
 _LEAST_SHARE, _MOST_OF_FRAME, _AS_NEAR = 0.5, 0.85, 1.5
 
+#: What residuals say too much, fitted to the corners of 390 masks of three cities, drawn as a segmenter makes them or
+#: worse: afterwards their errors are, root mean square, 1.04 times what is claimed, before 0.87.
+_OVERSTATED = 0.8
+
 
 def with_honest_corners(
     refined: Refined, scene: Scene, index: ReferenceIndex, agreeing: float, options: RefineOptions, lens: LensOptions
@@ -76,8 +80,9 @@ def with_honest_corners(
 def _scatter(residuals: FloatArray, weights: FloatArray, reach: FloatArray, usual: float) -> FloatArray:
     """Return what each residual (M,) counts as in the covariance of an M-estimate, metres.
 
-    The square of what it is weighted by grows with that of how far a pixel reaches, `reach`. Where residuals are more
-    than `usual` the mask is bent (see `RefineOptions.usual_rms`).
+    The square of what it is weighted by grows with that of how far a pixel reaches, `reach`; far away errors keep their
+    sign over more ground, too. Where residuals are more than `usual` the mask is bent, and they keep it as much further
+    (see `RefineOptions.usual_rms`).
     """
     square, far = (weights * residuals) ** 2, reach**2
     (floor, slope), *_ = np.linalg.lstsq(np.stack([1.0 / far, np.ones_like(far)], axis=1), square / far, rcond=None)
@@ -87,4 +92,5 @@ def _scatter(residuals: FloatArray, weights: FloatArray, reach: FloatArray, usua
         floor, slope = float(square.mean()), 0.0
     rms = robust_rms(residuals, weights)
     by_weights = rms / math.sqrt(max(float(square.mean()), 1e-12))
-    return np.asarray(np.sqrt(floor + slope * far) * by_weights * max(1.0, rms / usual))
+    as_long = math.sqrt(max(1.0, rms / usual)) * np.maximum(1.0, reach / np.median(reach)) ** 0.25
+    return np.asarray(_OVERSTATED * np.sqrt(floor + slope * far) * by_weights * as_long)
