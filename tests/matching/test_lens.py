@@ -116,6 +116,18 @@ def test_corners_that_a_tilted_frame_shows_far_away_are_less_sure(town):
     assert np.argmax(sigma) in np.argsort(corners)[:2]  # a smaller w is further away
 
 
+def test_where_a_mask_is_bent_corners_are_about_as_sure_as_claimed(town):
+    truth, straight = sight_of(town[0], 5, tilt=15, sight=Sight(1.0))
+    ratios = []
+    for phases in np.random.default_rng(4).uniform(0, 2 * np.pi, (12, 2)):
+        bent = straight.points + 3.0 * np.sin(straight.points[:, ::-1] * (2 * np.pi / 300.0) + phases)
+        scene = replace(straight, points=bent)
+        refined = refine(truth, scene, town[1], np.full(len(scene.intersections), -1), held=True)
+        gaps = np.hypot(*(mapped(refined.matrix, scene.corners) - mapped(truth, scene.corners)).T)
+        ratios.append(np.sqrt(np.mean(gaps**2) / np.mean(honest(refined.matrix, scene, town[1], 0.95) ** 2)))
+    assert 0.4 < np.sqrt(np.mean(np.square(ratios))) < 1.4
+
+
 def test_the_unknown_middle_of_a_lens_makes_corners_less_sure(town):
     truth, straight = sight_of(town[0], 5, tilt=15, sight=Sight(0.6))
     scene = through_lens(straight, -0.12)
