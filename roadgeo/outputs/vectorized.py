@@ -21,6 +21,7 @@ from roadgeo.storage.qml import draw_line, draw_marker
 __all__ = ["draw_vectorized", "write_vectorized"]
 
 _MAX_SIDE = 6000  # of the picture; larger masks are drawn reduced
+_STRIP_ROWS = 256
 
 # Colours as OpenCV orders them: blue, green, red.
 _SEEN = np.array((200, 60, 200))  # over a photograph
@@ -130,12 +131,14 @@ def draw_vectorized(
     scale = min(1.0, _MAX_SIDE / max(mask.shape))
     roads = mask.roads.view(np.uint8) * np.uint8(255)
     size = (max(round(mask.shape[1] * scale), 1), max(round(mask.shape[0] * scale), 1))
-    share = cv2.resize(roads, size, interpolation=cv2.INTER_AREA)[..., None] / 255.0
-    if ground is None:
-        picture = np.rint(share * _ROAD + (1.0 - share) * _GROUND).astype(np.uint8)
-    else:
-        shown = _PALER * cv2.resize(ground, size, interpolation=cv2.INTER_AREA)
-        picture = np.rint(shown + _TINT * share * (_SEEN - shown)).astype(np.uint8)
+    share = cv2.resize(roads, size, interpolation=cv2.INTER_AREA)
+    shown = None if ground is None else cv2.resize(ground, size, interpolation=cv2.INTER_AREA)
+    over, tint = (np.array(_ROAD), 1.0) if shown is None else (_SEEN, _TINT)
+    picture = np.empty((*share.shape, 3), np.uint8)
+    for top in range(0, len(share), _STRIP_ROWS):  # floating-point numbers of all of it would take gigabytes
+        strip = slice(top, top + _STRIP_ROWS)
+        below = np.array(_GROUND) if shown is None else _PALER * shown[strip]
+        picture[strip] = np.rint(below + tint * (share[strip, :, None] / 255.0) * (over - below))
     if mask.observed is not None:
         seen = cv2.resize(mask.observed.view(np.uint8), size, interpolation=cv2.INTER_NEAREST)
         picture[seen == 0] = _UNSEEN

@@ -1,5 +1,6 @@
 """What was seen in a mask can be looked at."""
 
+import tracemalloc
 from pathlib import Path
 
 import cv2
@@ -55,6 +56,19 @@ def test_a_large_mask_is_drawn_reduced(mask: RoadMask, monkeypatch: pytest.Monke
     monkeypatch.setattr("roadgeo.outputs.vectorized._MAX_SIDE", 60)
     graph = vectorize(mask).graph
     assert draw_vectorized(mask, graph, find_intersections(graph)).shape == (40, 60, 3)
+
+
+def test_a_large_picture_takes_little_more_memory_than_itself() -> None:
+    roads = np.zeros((2000, 2000), np.bool_)
+    roads[::200], roads[:, ::200] = True, True
+    mask = RoadMask(roads)
+    graph = vectorize(mask).graph
+    ground = np.full((2000, 2000, 3), 90, np.uint8)
+    tracemalloc.start()
+    picture = draw_vectorized(mask, graph, find_intersections(graph), ground)
+    _, peak = tracemalloc.get_traced_memory()
+    tracemalloc.stop()
+    assert peak < 12 * picture.nbytes  # with numbers of eight bytes for all of it, it was 30 times that
 
 
 def test_a_folder_that_cannot_be_made(tmp_path: Path, mask: RoadMask) -> None:
