@@ -18,9 +18,9 @@ from roadgeo.kernels.thinning import GROUND, ROAD, SOLID, rethin, thin
 from roadgeo.kernels.tracing import smooth_chains, trace
 from roadgeo.roads.graph import RoadGraph
 
-__all__ = ["Vectorization", "VectorizeOptions", "road_width", "vectorize"]
+__all__ = ["Vectorization", "VectorizeOptions", "road_width", "vectorize", "width_by_area"]
 
-#: Bands of rows that `road_width` looks at first, and how many road pixels they must hold.
+#: Bands of rows that `width_by_area` looks at first, and how many road pixels they must hold.
 _BAND_ROWS, _BAND_STEP, _BAND_MIN_ROAD, _MAX_BAND_PIXELS = 48, 192, 2000, 1 << 24
 
 #: Streets run together where the width by area is so many times that by length, which it usually exceeds by so much.
@@ -175,17 +175,44 @@ def _refuse_noise(skeleton: _Skeleton, width: float, area: int, name: str, optio
 
 
 def road_width(mask: RoadMask) -> float:
-    """Estimate the usual road width of a mask in pixels: four times the mean depth of a road pixel.
+    """Estimate the usual road width of a mask in pixels: by area (see `width_by_area`).
 
-    Depths within a straight road are spread evenly between 0 and half its width. What is much deeper than the median
-    is no road and counts as little as a road can. Where wide streets run together over more ground than all that can
-    be told apart, as towards the horizon of a steep view, the width is that of most roads by their length.
+    Where wide streets run together over more ground than all that can be told apart, as towards the horizon of a steep
+    view, it is that of most roads by their length.
 
     Raises
     ------
     MaskError
         When the mask shows no road.
     """
+    by_area = width_by_area(mask)
+    if by_area <= _BAND_ROWS / 3:
+        return by_area
+    by_length = _USUALLY_WIDER * _width_of_half(_sample_depths(mask), by_area)
+    return by_length if by_area > _RUN_TOGETHER * by_length else by_area
+
+
+def width_by_area(mask: RoadMask) -> float:
+    """Estimate how wide roads are that make up a mask, in pixels: four times the mean depth of a road pixel.
+
+    Depths within a straight road are spread evenly between 0 and half its width. What is much deeper than the median
+    is no road and counts as little as a road can.
+
+    Raises
+    ------
+    MaskError
+        When the mask shows no road.
+    """
+    roads = mask.roads.view(np.uint8)
+    width = _width(_sample_depths(mask))
+    factor = min(int(width / 8), min(roads.shape) // 16)
+    if width <= _BAND_ROWS / 3 or factor < 2:
+        return max(width, 1.0)
+    return float(factor) * width_by_area(RoadMask(_shrink(roads, factor, 0.5).view(np.bool_), name=mask.name))
+
+
+def _sample_depths(mask: RoadMask) -> IntArray:
+    """Return the depths (see `_count_depths`) of a mask's road pixels in some bands, in all where these hold few."""
     roads = mask.roads.view(np.uint8)
     step = max(_BAND_STEP, _BAND_ROWS * roads.size // _MAX_BAND_PIXELS)
     counts = _count_depths(roads, _BAND_ROWS, step)
@@ -194,13 +221,7 @@ def road_width(mask: RoadMask) -> float:
         counts = _count_depths(roads, rows, rows)
     if counts.sum() == 0:
         raise MaskError(f"{mask.name or 'mask'}: no road pixel; expected a mask with roads as non-zero pixels")
-    width = _width(counts)
-    factor = min(int(width / 8), min(roads.shape) // 16)
-    if width <= _BAND_ROWS / 3 or factor < 2:
-        return max(width, 1.0)
-    wide = float(factor) * road_width(RoadMask(_shrink(roads, factor, 0.5).view(np.bool_), name=mask.name))
-    by_length = _USUALLY_WIDER * _width_of_half(counts, width)
-    return by_length if wide > _RUN_TOGETHER * by_length else wide
+    return counts
 
 
 def _count_depths(roads: AnyArray, rows: int, step: int) -> IntArray:

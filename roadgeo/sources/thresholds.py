@@ -14,7 +14,7 @@ import numpy as np
 from roadgeo._arrays import AnyArray, BoolArray
 from roadgeo.errors import MaskError, PhotographError
 from roadgeo.geometry.mask import RoadMask
-from roadgeo.roads.vectorization import road_width
+from roadgeo.roads.vectorization import width_by_area
 
 __all__ = ["Sample", "find_thresholds", "ground_and_road"]
 
@@ -203,7 +203,7 @@ def _shows_roads(rows: AnyArray, threshold: float) -> bool:
     if np.quantile(depth, 0.9) > _MAX_DEPTH * depth.mean():
         return False
     n_pieces = cv2.connectedComponents(light.view(np.uint8))[0] - 1
-    return bool(n_pieces * road_width(RoadMask(light)) ** 2 <= _MAX_PIECES * n_light)
+    return bool(n_pieces * width_by_area(RoadMask(light)) ** 2 <= _MAX_PIECES * n_light)
 
 
 def _otsu(values: AnyArray) -> float:
