@@ -21,7 +21,7 @@ from export import export
 from network import AnyRoadNet
 from numpy.typing import NDArray
 from tiles import Tile, fold_of, read_tiles
-from training import RECIPES, TrainingOptions, mix, probabilities, train
+from training import RECIPES, TrainingOptions, probabilities, train
 
 SCALES = (1.0, 0.5, 2.0)  # metres per pixel of the held-out photographs that are predicted
 RUN_AT = 1.0  # metres per pixel at which the network sees them
@@ -50,7 +50,6 @@ def main(arguments: list[str] | None = None) -> None:
                 options.out / "all.pt",
                 replace(training, steps=training.steps * (1 if options.quick else options.longer)),
             )
-            network = mix(network, options.mix)
             print("wrote", export(network.cpu(), tiles, options.out / "roads.onnx"))
         else:
             _cross_validate(tiles, int(run), options, training)
@@ -60,7 +59,7 @@ def _cross_validate(tiles: list[Tile], fold: int, options: argparse.Namespace, t
     """Train without a fold's tiles, then write their probability maps: score.py measures them."""
     held_out = [tile for i, tile in enumerate(tiles) if fold_of(i, options.folds) == fold]
     others = [tile for i, tile in enumerate(tiles) if fold_of(i, options.folds) != fold]
-    network = mix(train(others, options.out / f"fold{fold}.pt", training), options.mix)
+    network = train(others, options.out / f"fold{fold}.pt", training)
     for tile in held_out:
         for scale in SCALES:
             _write_map(network, tile, scale, options.out / f"maps_{scale:g}m")
@@ -102,7 +101,6 @@ def _parse(arguments: list[str] | None) -> argparse.Namespace:
     parser.add_argument("--batch", type=int, default=4)
     parser.add_argument("--rate", type=float, default=2e-3, help="largest learning rate")
     parser.add_argument("--start", type=Path, help="checkpoint of another run to begin with, instead of chance")
-    parser.add_argument("--mix", type=Path, nargs="+", default=[], help="runs that went on from this: the mean counts")
     parser.add_argument("--seed", type=int, default=0)
     parser.add_argument("--threads", type=int, default=torch.get_num_threads())
     parser.add_argument("--device", default="cuda" if torch.cuda.is_available() else "cpu")

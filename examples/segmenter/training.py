@@ -5,7 +5,7 @@ from __future__ import annotations
 import copy
 import math
 import time
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterator
 from dataclasses import dataclass
 from functools import cache
 from pathlib import Path
@@ -21,7 +21,7 @@ from numpy.typing import NDArray
 from tiles import Tile
 from torch import Tensor
 
-__all__ = ["RECIPES", "TrainingOptions", "make_network", "mix", "probabilities", "train"]
+__all__ = ["RECIPES", "TrainingOptions", "make_network", "probabilities", "train"]
 
 Optimizers = tuple[torch.optim.Optimizer, ...]
 
@@ -81,22 +81,11 @@ def train(tiles: list[Tile], checkpoint: Path, options: TrainingOptions) -> AnyR
             for group in optimizer.param_groups:
                 group["lr"] = slower * options.rate * _schedule(step / options.steps)
         parts = _step(network, optimizers, next(batches), (step / options.steps, recipe.doubt), options.device)
-        _average(mean, network.state_dict(), min(options.average, (1 + step) / (10 + step)))
+        _average(mean, network, min(options.average, (1 + step) / (10 + step)))
         log.add(step, parts)
         if (step + 1) % options.save_every == 0 or step + 1 == options.steps:
             _save(checkpoint, network, mean, optimizers, step + 1)
     return mean.eval()
-
-
-def mix(network: AnyRoadNet, checkpoints: Sequence[Path]) -> AnyRoadNet:
-    """Give a network the mean of its weights and those of other runs that went on from it, or from where it did.
-
-    (Model soups: Wortsman et al., ICML 2022.)
-    """
-    device = next(network.parameters()).device
-    for n, path in enumerate(checkpoints, start=1):
-        _average(network, torch.load(path, map_location=device, weights_only=True)["mean"], n / (n + 1))
-    return network
 
 
 @torch.no_grad()
@@ -188,7 +177,8 @@ def _optimizers(network: AnyRoadNet, options: TrainingOptions) -> Optimizers:
 
 
 @torch.no_grad()
-def _average(mean: AnyRoadNet, theirs: dict[str, Tensor], keep: float) -> None:
+def _average(mean: AnyRoadNet, network: AnyRoadNet, keep: float) -> None:
+    theirs = network.state_dict()
     for name, value in mean.state_dict().items():
         if value.dtype.is_floating_point:
             value.lerp_(theirs[name], 1 - keep)

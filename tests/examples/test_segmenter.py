@@ -58,13 +58,11 @@ def test_the_recipe_runs_goes_on_and_exports(data: Path, tmp_path: Path) -> None
     again = subprocess.run(command, capture_output=True, text=True, check=True)
     assert "step" not in again.stdout  # nothing was left to train
     assert (tmp_path / "runs" / "roads.onnx").stat().st_size < 10e6
-    # One that went on from it, and the mean of the two.
-    before, out = (tmp_path / "runs" / "maps_1m" / "t0.png").read_bytes(), str(tmp_path / "more")
-    on = ["--only", "0", "--start", str(tmp_path / "runs" / "fold0.pt"), "--seed", "1"]
-    subprocess.run([*command, "--out", out, *on], capture_output=True, check=True)
-    subprocess.run([*command, "--only", "0", "--mix", f"{out}/fold0.pt"], capture_output=True, check=True)
-    mixed = (tmp_path / "runs" / "maps_1m" / "t0.png").read_bytes()
-    assert len({before, mixed, (tmp_path / "more" / "maps_1m" / "t0.png").read_bytes()}) == 3
+    # One that goes on from it.
+    on = ["--out", str(tmp_path / "more"), "--only", "0", "--start", str(tmp_path / "runs" / "fold0.pt"), "--seed", "1"]
+    subprocess.run([*command, *on], capture_output=True, check=True)
+    before, after = ((tmp_path / run / "maps_1m" / "t0.png").read_bytes() for run in ("runs", "more"))
+    assert before != after
 
 
 @pytest.mark.skipif(
