@@ -185,10 +185,11 @@ def road_width(mask: RoadMask) -> float:
     MaskError
         When the mask shows no road.
     """
-    by_area = width_by_area(mask)
+    depths = _sample_depths(mask)
+    by_area = _width_by_area(mask, depths)
     if by_area <= _BAND_ROWS / 3:
         return by_area
-    by_length = _USUALLY_WIDER * _width_of_half(_sample_depths(mask), by_area)
+    by_length = _USUALLY_WIDER * _width_of_half(depths, by_area)
     return by_length if by_area > _RUN_TOGETHER * by_length else by_area
 
 
@@ -203,8 +204,12 @@ def width_by_area(mask: RoadMask) -> float:
     MaskError
         When the mask shows no road.
     """
-    roads = mask.roads.view(np.uint8)
-    width = _width(_sample_depths(mask))
+    return _width_by_area(mask, _sample_depths(mask))
+
+
+def _width_by_area(mask: RoadMask, depths: IntArray) -> float:
+    """Return that of `width_by_area`, given the mask's depths; wide roads are looked at again in a smaller picture."""
+    roads, width = mask.roads.view(np.uint8), _width(depths)
     factor = min(int(width / 8), min(roads.shape) // 16)
     if width <= _BAND_ROWS / 3 or factor < 2:
         return max(width, 1.0)
