@@ -81,6 +81,18 @@ def carry(p: Floats1, u: float, v: float, du: float, dv: float) -> tuple[float, 
     return x, y, w, dx, dy, math.sqrt(dx * dx + dy * dy)
 
 
+@kernel(forceinline=True)
+def _determinant(p: Floats1) -> float:
+    """Return the determinant of a homography: areas become larger by |it| / w^3."""
+    return float(p[0] * (p[4] - p[5] * p[7]) - p[1] * (p[3] - p[5] * p[6]) + p[2] * (p[3] * p[7] - p[4] * p[6]))
+
+
+@kernel(forceinline=True)
+def _own_sigma(reach: float, unit: float, limits: AdjustLimits) -> float:
+    """Return how many times less sure than in the middle of the frame a point is where a step of 1 reaches so far."""
+    return math.hypot(limits.map_sigma_m, limits.mask_sigma * reach * unit) / limits.sigma_m
+
+
 class _System(NamedTuple):
     """Normal equations, (8, 8) and (8,), and the Cholesky factor of those before."""
 
@@ -98,6 +110,7 @@ class _Met(NamedTuple):
     normals: Floats2  # unit vectors across the road
     residuals: Floats1  # metres across it
     sigmas: Floats1
+    own: Floats1  # standard deviation of it where the fit is sure, in those of the middle of the frame
     searched: Floats1
     hits: Floats1
     shares: Floats1
@@ -125,6 +138,7 @@ def _add_pairs(
     system: _System,
 ) -> bool:
     """Add matched intersections; False: one lies at the horizon."""
+    area = abs(_determinant(p))
     for i in range(pairs.query.shape[0]):
         if shares[pairs.cells[i]] < limits.least_share:
             continue
@@ -136,7 +150,8 @@ def _add_pairs(
             far = math.sqrt(dx * dx + dy * dy) * unit
             if far > limits.max_radius:
                 continue
-            weight = pairs.weight / (1.0 + (far / (2.0 * limits.sigma_m)) ** 2)
+            own = _own_sigma(math.sqrt(area / w**3), unit, limits)
+            weight = pairs.weight / (own**2 + (far / (2.0 * limits.sigma_m)) ** 2)
             add_row(system.normal, system.right, system.row, weight, dx if axis == 0 else dy)
     return True
 
@@ -180,8 +195,9 @@ def _search_roads(
     """Find each road point's road, and which share of each cell's points met one; False: one lies at the horizon."""
     xy, directions, cells, _ = points
     segments, starts, ids, grid, shape = roads
-    met, normals, residuals, sigmas, searched, hits, shares = found
+    met, normals, residuals, sigmas, own, searched, hits, shares = found
     factor, row, work = system.factor, system.row, system.work
+    area = abs(_determinant(p))
     searched[:] = 0.0
     hits[:] = 0.0
     for i in range(xy.shape[0]):
@@ -196,8 +212,9 @@ def _search_roads(
         dy /= length
         # How far the road may lie follows from how sure the fit is here.
         point_row(p, u, v, -dy, dx, row)
-        sigma = limits.sigma_m * math.sqrt(1.0 + _spread(row, factor, work))
-        if 3.0 * sigma > limits.max_radius:
+        own[i] = _own_sigma(area / (w * w * length), plane.unit, limits)
+        sigma = limits.sigma_m * math.sqrt(own[i] ** 2 + _spread(row, factor, work))
+        if 3.0 * sigma > limits.max_radius * max(1.0, own[i]):
             continue
         searched[cells[i]] += 1.0
         gx, gy = plane.x + plane.unit * x, plane.y + plane.unit * y
@@ -221,8 +238,8 @@ def _add_roads(
     p: NDArray[np.float64], unit: float, points: RoadSamples, least_share: float, system: _System, found: _Met
 ) -> tuple[int, float]:
     """Add the road points that met a road; return how many, and the scale of their residuals (see `adjust`)."""
-    xy, _, cells, own = points
-    met, normals, residuals, sigmas, _, _, shares = found
+    xy, _, cells, usual = points
+    met, normals, residuals, sigmas, own, _, _, shares = found
     normal, right, row = system.normal, system.right, system.row
     used, weights, slopes, squares = 0, 0.0, 0.0, 0.0
     for i in range(xy.shape[0]):
@@ -230,11 +247,11 @@ def _add_roads(
             continue
         point_row(p, xy[i, 0], xy[i, 1], normals[i, 0], normals[i, 1], row)
         weight = 1.0 / (1.0 + (residuals[i] / sigmas[i]) ** 2)
-        add_row(normal, right, row, own * weight, residuals[i] / unit)
+        add_row(normal, right, row, usual / own[i] ** 2 * weight, residuals[i] / unit)
         used += 1
         weights += weight
         slopes += weight * (2.0 * weight - 1.0)  # of the influence, by the residual
-        squares += (weight * residuals[i]) ** 2
+        squares += (weight * residuals[i] / own[i]) ** 2
     if weights > 0.0:
         return used, math.sqrt(squares * weights) / max(slopes, 0.1 * weights)
     return used, np.inf
@@ -292,7 +309,7 @@ def adjust(
     n = points.xy.shape[0]
     system = _System(normal, np.empty(8), np.zeros((8, 8)), np.empty(8), np.empty(8))
     found = _Met(
-        np.empty(n, np.bool_), np.empty((n, 2)), np.empty(n), np.empty(n),
+        np.empty(n, np.bool_), np.empty((n, 2)), np.empty(n), np.empty(n), np.empty(n),
         np.empty(limits.n_cells), np.empty(limits.n_cells), np.ones(limits.n_cells),
     )  # fmt: skip
     previous = -1

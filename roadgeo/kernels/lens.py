@@ -30,23 +30,21 @@ class MeetLimits(NamedTuple):
     ----------
     unit, x, y : float
         Metres per normalised unit of the reference plane, and where its (0, 0) lies.
-    sigma_m : float
-        Standard deviation of a road point across the road, where its place is known.
     slack : float
         Places may be so many times further off than the parameters' covariance says.
-    max_radius : float
-        Points whose place is less sure than a third of this take no part, metres.
-    min_cos
-        As in `kernels.roads.nearest_road`.
+    max_radius, min_cos, sigma_m, map_sigma_m, mask_sigma
+        As in `kernels.structs.AdjustLimits`.
     """
 
     unit: float
     x: float
     y: float
-    sigma_m: float
     slack: float
     max_radius: float
     min_cos: float
+    sigma_m: float
+    map_sigma_m: float
+    mask_sigma: float
 
 
 @kernel()
@@ -70,10 +68,11 @@ def _see(
     half_side: float,
     place: tuple[float, float, float, float],
     row: NDArray[np.float64],
-) -> tuple[float, float, float, float]:
+) -> tuple[float, float, float, float, float]:
     """Map a point and the direction of its road; fill `row` (2, 9) with the derivatives of where it comes to lie.
 
-    `place` is the normalised point and the unit vector, as the lens shows them. Near the horizon NaN is returned.
+    `place` is the normalised point and the unit vector, as the lens shows them. How far across the road a step of 1
+    reaches comes last. Near the horizon NaN is returned.
     """
     # Lens: the point and its road as a pinhole would have shown them, and how the point moves with k1.
     ou, ov = place[0] / half_side, place[1] / half_side
@@ -89,7 +88,7 @@ def _see(
     # Homography.
     w = 1.0 + p[6] * u + p[7] * v
     if not w >= _LEAST_W:
-        return np.nan, np.nan, np.nan, np.nan
+        return np.nan, np.nan, np.nan, np.nan, np.nan
     x, y = (p[0] * u + p[1] * v + p[2]) / w, (p[3] * u + p[4] * v + p[5]) / w
     row[:] = 0.0
     row[0, 0] = row[1, 3] = u / w
@@ -101,7 +100,7 @@ def _see(
     row[0, 8], row[1, 8] = xu * mu + xv * mv, yu * mu + yv * mv
     dx, dy = xu * du + xv * dv, yu * du + yv * dv
     length = math.sqrt(dx * dx + dy * dy)
-    return x, y, dx / length, dy / length
+    return x, y, dx / length, dy / length, abs(xu * yv - xv * yu) * outwards * across / length
 
 
 @kernel()
@@ -124,7 +123,7 @@ def lens_rows(
     """
     for i in range(points.shape[0]):
         place = points[i, 0], points[i, 1], directions[i, 0], directions[i, 1]
-        places[i, 0], places[i, 1], _, _ = _see(p, k1, half_side, place, rows[i])
+        places[i, 0], places[i, 1], _, _, _ = _see(p, k1, half_side, place, rows[i])
         if math.isnan(places[i, 0]):
             rows[i] = np.nan
 
@@ -142,6 +141,7 @@ def meet_roads(
     rows: Floats2,
     residuals: Floats1,
     sigmas: Floats1,
+    own: Floats1,
 ) -> int:
     """Find the roads near points whose places are sure enough.
 
@@ -157,6 +157,8 @@ def meet_roads(
         Filled: the way across to the road, metres; NaN where none is met.
     sigmas : (S,) float64
         Filled for points that meet a road: the standard deviation of that, metres.
+    own : (S,) float64
+        Filled likewise: what it would be if the place were known, in that of the middle of the frame.
 
     Returns
     -------
@@ -169,7 +171,7 @@ def meet_roads(
     for i in range(points.shape[0]):
         residuals[i] = np.nan
         place = points[i, 0], points[i, 1], directions[i, 0], directions[i, 1]
-        x, y, dx, dy = _see(p, k1, half_side, place, row)
+        x, y, dx, dy, reach = _see(p, k1, half_side, place, row)
         if math.isnan(x) or math.isnan(dx):
             continue
         spread = 0.0
@@ -177,8 +179,9 @@ def meet_roads(
             for r in range(9):
                 for c in range(9):
                     spread += row[axis, r] * inverse[r, c] * row[axis, c]
-        sigma = limits.sigma_m * math.sqrt(1.0 + limits.slack**2 * max(spread, 0.0))
-        if not 3.0 * sigma <= limits.max_radius:  # NaN neither
+        known = math.hypot(limits.map_sigma_m, limits.mask_sigma * reach * limits.unit) / limits.sigma_m
+        sigma = limits.sigma_m * math.sqrt(known**2 + limits.slack**2 * max(spread, 0.0))
+        if not 3.0 * sigma <= limits.max_radius * max(1.0, known):  # NaN neither
             continue
         gx, gy = limits.x + limits.unit * x, limits.y + limits.unit * y
         d, fx, fy, rx, ry = nearest_road(
@@ -186,7 +189,7 @@ def meet_roads(
         )
         if d == np.inf:
             continue
-        residuals[i], sigmas[i] = (fy - gy) * rx - (fx - gx) * ry, sigma
+        residuals[i], sigmas[i], own[i] = (fy - gy) * rx - (fx - gx) * ry, sigma, known
         for c in range(9):
             rows[i, c] = row[1, c] * rx - row[0, c] * ry
         n_met += 1

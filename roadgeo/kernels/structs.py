@@ -152,13 +152,17 @@ class AdjustLimits(NamedTuple):
 
     Where fewer than `least_share` of a cell's searched points meet a road, what does meet one is chance, and the cell
     waits. The iteration ends when no parameter moves by more than `tolerance_m`.
+
+    A pixel that reaches further on the ground says less of it: in a tilted frame standard deviations grow with it.
     """
 
     n_cells: int
     least_share: float
-    max_radius: float  # metres
+    max_radius: float  # metres, where a pixel reaches no further than in the middle of the frame
     min_cos: float  # as in `nearest_road`
-    sigma_m: float
+    sigma_m: float  # standard deviation of a road point across the road in the middle of the frame
+    map_sigma_m: float  # the map's part of it
+    mask_sigma: float  # and the mask's, normalised units of the query
     prior: float  # weight that holds the two perspective parameters near zero
     n_iterations: int
     tolerance_m: float

@@ -5,36 +5,52 @@ from __future__ import annotations
 import math
 from dataclasses import replace
 
+import cv2
 import numpy as np
 
-from roadgeo._arrays import FloatArray
+from roadgeo._arrays import BoolArray, FloatArray
+from roadgeo.geometry.camera import sampling
 from roadgeo.matching.index import ReferenceIndex
-from roadgeo.matching.lens import LensOptions
+from roadgeo.matching.lens import LensOptions, straighten_scene
 from roadgeo.matching.lens_equations import LensEquations
-from roadgeo.matching.refinement import Refined, RefineOptions, corner_covariance, corner_sigmas, robust_rms
+from roadgeo.matching.refinement import Refined, RefineOptions, corner_covariance, corner_sigmas
 from roadgeo.matching.scene import Scene
+from roadgeo.matching.verification import VerifyOptions, map_agreement
 
 __all__ = ["with_honest_corners"]
 
 #: Cells of the frame agree where they have this part of the best one's share of road points on roads; and where those
-#: hold less than this share of all points, only a part of the frame agrees. Points count where a pixel reaches up to so
-#: many times further than usual: what a tilted frame shows far away cannot be traced. Training masks seen through
-#: lenses that were not found: 0.44 to 0.83, tilted ones 0.87 and more.
+#: hold less than this share of all points, only a part of the frame may agree. Points count where a pixel reaches up to
+#: so many times further than usual: what a tilted frame shows far away cannot be traced.
 _LEAST_SHARE, _MOST_OF_FRAME, _AS_NEAR = 0.5, 0.85, 1.5
+#: It does where the mask shows less than this part, of the map's roads elsewhere, of what it shows of those there.
+#: Training masks seen through lenses that were not found: 0.27 to 0.46; with many false roads and many gone: 0.65 and
+#: more, which look alike from the mask's side.
+_LEAST_SHOWN = 0.55
 
-#: What residuals say too much where no lens was found; fitted to the corners of 390 masks, good ones and bad ones.
-_OVERSTATED = 0.9
+#: How errors add up, fitted to the corners of 920 masks, good ones and bad ones. What residuals say too much, where no
+#: lens was found; over how much more ground errors keep their sign far away, by how far a pixel reaches; likewise where
+#: a mask is bent, by how much greater they are than usual; and the part of their rms that no number of points improves,
+#: beside the accuracy of the map as a whole, metres.
+_OVERSTATED, _FAR, _BENT, _FLOOR, _MAP_M = 0.65, 0.6, 0.25, 0.25, 0.05
+#: Residuals end at three standard deviations. Those beyond so many are near the end.
+_NEAR_END, _PULL_AT_END = 2.0, 0.35
 
 
 def with_honest_corners(
-    refined: Refined, scene: Scene, index: ReferenceIndex, agreeing: float, options: RefineOptions, lens: LensOptions
+    refined: Refined,
+    scene: Scene,
+    index: ReferenceIndex,
+    agreeing: float,
+    options: RefineOptions,
+    lens: LensOptions,
+    verify: VerifyOptions,
 ) -> Refined:
     """Return a refined homography with the covariance of its corners measured anew.
 
-    The fit takes all residuals for equally uncertain. But a pixel far out in a tilted frame, or near a lens's edge,
-    reaches further on the ground: how residuals grow with it is measured. The middle of a lens is not known exactly.
-    And where only one part of the frame agrees, the rest may be seen through a lens that was not found,
-    or not rightly.
+    The fit takes all residuals for equally uncertain but for how far a pixel reaches. But far away errors keep their
+    sign over more ground, and so they do where a mask is bent. The middle of a lens is not known exactly. And where
+    only one part of the frame agrees, the rest may be seen through a lens that was not found, or not rightly.
 
     The matrix stays as it is, and so does the covariance where too few roads are met.
     """
@@ -46,22 +62,24 @@ def with_honest_corners(
     used = np.ones(len(seen.rows), bool)
     partly = False
     if agreeing < lens.enough:
-        _, inside = equations.core(k1, lens.n_cells, _LEAST_SHARE)
-        if partly := bool(inside[reach < _AS_NEAR * np.median(reach[seen.which])].mean() < _MOST_OF_FRAME):
-            used = inside[seen.which]
+        _, cells = equations.cells(k1, lens.n_cells, _LEAST_SHARE)
+        inside = cells[equations.cell_of(lens.n_cells)]
+        near = reach < _AS_NEAR * np.median(reach[seen.which])
+        if inside[near].mean() < _MOST_OF_FRAME and _only_there(refined, scene, index, cells, verify):
+            partly, used = True, inside[seen.which]
     if used.sum() < lens.fewest:
         return refined
     reach, by_center = reach[seen.which][used], by_center[seen.which][used]
-    everything, residuals, sigma = seen.rows[used], seen.residuals[used], seen.sigma[used]
+    everything, cauchy = seen.rows[used], seen.cauchy[used]
     free = 9 if k1 or partly else 8
-    rows = everything[:, :free]
-    # sandwich estimate of an M-estimator's covariance (Huber 1981, 6.3)
-    weights = 1.0 / (1.0 + (residuals / sigma) ** 2)
-    scaled = equations.weight * weights[:, None] * rows
+    rows, weights = everything[:, :free], equations.weight * cauchy / seen.own[used] ** 2
+    scaled = weights[:, None] * rows
     inverse = np.linalg.pinv(scaled.T @ rows + np.diag(equations.prior(lens.sigma)[:free]), hermitian=True)
-    scatter = _scatter(residuals, weights, reach, options.usual_rms * equations.sigma_m) / equations.unit
-    scatter *= 1.0 if k1 else _OVERSTATED
-    covariance = inverse @ ((rows * (equations.weight * scatter**2)[:, None]).T @ rows) @ inverse
+    rms = _scale(seen.scaled[used], cauchy, (seen.residuals / seen.sigma)[used])
+    scatter = rms * max(1.0, rms / (options.usual_rms * equations.sigma_m)) ** _BENT / equations.unit
+    as_long = (1.0 if k1 or partly else _OVERSTATED) * np.maximum(1.0, reach / np.median(reach)) ** _FAR
+    # sandwich estimate of an M-estimator's covariance (Huber 1981, 6.3)
+    covariance = scatter**2 * inverse @ (scaled.T * as_long**2 @ rows) @ inverse
     if partly:  # a lens that is told from none where k1 is so many times its deviation may be anything below that
         unseen = min(lens.sigma, lens.significance / math.sqrt(3.0) * math.sqrt(covariance[8, 8]))
         by_k1 = covariance[:, 8] / covariance[8, 8]
@@ -71,26 +89,33 @@ def with_honest_corners(
         unknown = lens.center_sigma_px * np.einsum("ni,nij->nj", across, by_center)
         moved = inverse @ (scaled.T @ unknown)
         covariance = covariance + moved @ moved.T
+    options = replace(options, sigma_floor_m=math.hypot(_MAP_M, _FLOOR * rms), sigma_floor_px=0.0)
     corners = corner_covariance(equations.p, covariance[:8, :8], scene, equations.unit, options)
     if not np.isfinite(corners).all():
         return refined
     return replace(refined, corner_sigma_m=corner_sigmas(corners), corner_covariance_m2=corners)
 
 
-def _scatter(residuals: FloatArray, weights: FloatArray, reach: FloatArray, usual: float) -> FloatArray:
-    """Return what each residual (M,) counts as in the covariance of an M-estimate, metres.
+def _only_there(refined: Refined, scene: Scene, index: ReferenceIndex, cells: BoolArray, verify: VerifyOptions) -> bool:
+    """Whether the mask shows the map's roads in the given cells (n, n) of the frame, and not elsewhere."""
+    there = cv2.resize(cells.astype(np.uint8), scene.observed.shape[::-1], interpolation=cv2.INTER_NEAREST) > 0
+    gsd, k1, shares = sampling(refined.matrix, scene.size), refined.lens_k1, []
+    for part in (there, ~there):
+        visible = replace(scene, observed=scene.observed & part)
+        visible = straighten_scene(visible, k1) if k1 else visible
+        n_seen, n_shown = map_agreement(refined.matrix, visible, index, gsd, verify)
+        shares.append(n_shown / max(n_seen, 1))
+    return shares[1] < _LEAST_SHOWN * shares[0]
 
-    The square of what it is weighted by grows with that of how far a pixel reaches, `reach`; far away errors keep their
-    sign over more ground, too. Where residuals are more than `usual` the mask is bent, and they keep it as much further
-    (see `RefineOptions.usual_rms`).
+
+def _scale(residuals: FloatArray, weights: FloatArray, deviations: FloatArray) -> float:
+    """Return the scale of residuals (M,) with Cauchy weights, as `robust_rms`, where they may end too soon.
+
+    Roads further off than three standard deviations do not pull. Of a bent mask many are: then the fit is held less
+    firmly than the slope of its pull says, which falls to nothing there. `deviations` are residuals in their standard
+    deviations.
     """
-    square, far = (weights * residuals) ** 2, reach**2
-    (floor, slope), *_ = np.linalg.lstsq(np.stack([1.0 / far, np.ones_like(far)], axis=1), square / far, rcond=None)
-    if floor < 0.0:
-        floor, slope = 0.0, float((square / far).mean())
-    elif slope < 0.0:
-        floor, slope = float(square.mean()), 0.0
-    rms = robust_rms(residuals, weights)
-    by_weights = rms / math.sqrt(max(float(square.mean()), 1e-12))
-    as_long = math.sqrt(max(1.0, rms / usual)) * np.maximum(1.0, reach / np.median(reach)) ** 0.25
-    return np.asarray(np.sqrt(floor + slope * far) * by_weights * as_long)
+    at_end = _PULL_AT_END * float((np.abs(deviations) > _NEAR_END).sum())
+    slopes = float((weights * (2.0 * weights - 1.0)).sum()) - at_end
+    slopes = max(slopes, 0.1 * float(weights.sum()))
+    return math.sqrt(float(((weights * residuals) ** 2).sum()) * float(weights.sum())) / slopes

@@ -20,7 +20,7 @@ from roadgeo.matching.merged_roads import nearest_of, points_on_map
 from roadgeo.matching.refinement import Refined, RefineOptions, refine
 from roadgeo.matching.scene import Scene
 
-__all__ = ["between_carriageways", "refine_between"]
+__all__ = ["between_carriageways", "refine_between", "weight_on_roads"]
 
 #: Roads so far apart, metres, may be one on the map, if it has one road for both: nearest points, seen from the two,
 #: that lie within this part of how far they are apart.
@@ -52,7 +52,9 @@ def refine_between(
         if again is None:
             return refined, scene
         found, seen = again, moved
-    better = _on_roads(found.matrix, seen, index, options) >= _on_roads(refined.matrix, scene, index, options)
+    better = weight_on_roads(found.matrix, seen, index, options) >= weight_on_roads(
+        refined.matrix, scene, index, options
+    )
     return (found, seen) if better else (refined, scene)
 
 
@@ -81,7 +83,7 @@ def between_carriageways(
     return replace(scene, points=points), np.where(there, -1, matched)
 
 
-def _on_roads(matrix: FloatArray, scene: Scene, index: ReferenceIndex, options: RefineOptions) -> float:
+def weight_on_roads(matrix: FloatArray, scene: Scene, index: ReferenceIndex, options: RefineOptions) -> float:
     """Return the sum of the road points' weights in a fit."""
     at, along, gsd = points_on_map(matrix, scene)
     sigma = math.hypot(options.sigma_m, options.sigma_px * float(np.median(gsd)))

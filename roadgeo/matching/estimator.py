@@ -25,6 +25,7 @@ from roadgeo.matching.lens import (
     LensOptions,
     core_excess,
     find_lens,
+    grow_whole,
     is_significant,
     regrow,
     straighten_scene,
@@ -360,7 +361,8 @@ class TripleEstimator:
         if any(share > agreeing.forward - _BETTER and self.same(other, model) for other, share in self._looked):
             return
         self._looked.append((model, agreeing.forward))
-        lens = find_lens(refined.matrix, self.scene, index, agreeing.forward, self.refine_options, options.lens)
+        given = (refined.matrix, self.scene, index, agreeing.forward, self.refine_options, options.lens)
+        lens = find_lens(*given) or grow_whole(*given)
         if lens is None or self.judge(lens.matrix) is not None or self._is_far(lens.matrix):
             return
         seen = replace(model)

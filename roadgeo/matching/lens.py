@@ -30,6 +30,7 @@ __all__ = [
     "core_excess",
     "find_lens",
     "fit_lens",
+    "grow_whole",
     "is_significant",
     "regrow",
     "straighten_scene",
@@ -37,6 +38,10 @@ __all__ = [
 
 #: A fit that puts so much more of the roads on roads is worth another one.
 _MORE = 0.01
+#: And where a fit has grown over more of the frame, so much more.
+_BETTER = 0.02
+#: Standard deviation of the k1 of a pinhole.
+_NO_LENS = 1e-6
 
 
 @dataclass(frozen=True)
@@ -130,6 +135,7 @@ def fit_lens(
     refinement: RefineOptions | None = None,
     options: LensOptions | None = None,
     start: float | None = None,
+    held: bool = False,
 ) -> LensFit | None:
     """Adjust a homography and k1 to the roads of the map by Gauss-Newton with Cauchy weights; None where that fails.
 
@@ -143,38 +149,39 @@ def fit_lens(
         of the frame.
     start : float, optional
         Value of k1 to begin with, other than `k1`.
+    held : bool
+        Hold k1 near 0: the camera is a pinhole.
     """
     options, refinement = options or LensOptions(), refinement or RefineOptions()
     equations = LensEquations(matrix, scene, index, refinement)
     core, _ = equations.core(k1, options.n_cells, options.core_share)
     if core.sum() < options.fewest:
         return None
-    prior = equations.prior(options.sigma)
+    prior = equations.prior(_NO_LENS if held else options.sigma)
     rows = equations.begin(k1, start, core)
     k1 = k1 if start is None else start
     inverse = _inverse(rows.reshape(-1, 9), np.full(2 * len(rows), 0.5 * equations.weight), prior)
     rms, n_met, slack = math.inf, 0, options.slack
     for iteration in range(options.n_iterations):
         # Points further out take part as soon as the fit so far says where they lie.
-        rows, residuals, sigma, _ = equations.observe(k1, inverse, slack)
-        if len(rows) < options.fewest or (
-            iteration > options.soon and len(rows) < options.hopeless * len(scene.points)
-        ):
+        seen = equations.observe(k1, inverse, slack)
+        rows, cauchy, n_seen = seen.rows, seen.cauchy, len(seen.rows)
+        if n_seen < options.fewest or (iteration > options.soon and n_seen < options.hopeless * len(scene.points)):
             return None
-        weights = 1.0 / (1.0 + (residuals / sigma) ** 2)
-        inverse = _inverse(rows, equations.weight * weights, prior)
-        right = equations.weight * (rows * weights[:, None]).T @ (residuals / equations.unit)
+        weights = equations.weight * cauchy / seen.own**2
+        inverse = _inverse(rows, weights, prior)
+        right = (rows * weights[:, None]).T @ (seen.residuals / equations.unit)
         right[6:] -= prior[6:] * np.append(equations.p[6:8], k1)
         step = inverse @ right
         equations.p, k1 = equations.p + step[:8], float(np.clip(k1 + step[8], -0.5, 0.5))
         if not np.isfinite(step).all():
             return None
-        rms = robust_rms(residuals, weights)
-        if len(rows) <= n_met and np.abs(step[:8]).max() * equations.unit < refinement.tolerance_m:
+        rms = robust_rms(seen.scaled, cauchy)
+        if n_seen <= n_met and np.abs(step[:8]).max() * equations.unit < refinement.tolerance_m:
             if slack == 1.0:
                 break
             slack = 1.0
-        n_met = len(rows)
+        n_met = n_seen
     covariance = inverse * (scatter_m(rms, equations.sigma_m, refinement) / equations.unit) ** 2
     found = denormalise(equations.p, scene.center, scene.half_size, equations.origin, equations.unit)
     corners = corner_covariance(equations.p, covariance[:8, :8], scene, equations.unit, refinement)
@@ -209,6 +216,26 @@ def find_lens(
         return None
     found = _improved(rough, scene, index, refinement, options)
     return found if is_significant(found, scene, options) else None
+
+
+def grow_whole(
+    matrix: FloatArray,
+    scene: Scene,
+    index: ReferenceIndex,
+    agreeing: float,
+    refinement: RefineOptions,
+    options: LensOptions,
+) -> LensFit | None:
+    """Grow a homography anew from the part of the frame that it lays on roads, without a lens.
+
+    It may have settled where only that part agrees. None where more than `options.enough` do, or hardly more come to.
+    """
+    if agreeing >= options.enough:
+        return None
+    before = LensEquations(matrix, scene, index, refinement).observe(0.0, np.zeros((9, 9)))
+    found = fit_lens(matrix, scene, index, 0.0, refinement, options, held=True)
+    better = found is not None and found.share > len(before.rows) / len(scene.points) + _BETTER
+    return found if better else None
 
 
 def is_significant(found: LensFit, scene: Scene, options: LensOptions) -> bool:
@@ -281,14 +308,13 @@ def _improved(
 
 def _hints_at_lens(problem: LensEquations, options: LensOptions) -> bool:
     """Whether one step from a pinhole would make k1 significant."""
-    rows, residuals, sigma, _ = problem.observe(0.0, np.zeros((9, 9)))
-    if len(rows) < 12:
+    seen = problem.observe(0.0, np.zeros((9, 9)))
+    if len(seen.rows) < 12:
         return False
-    weights = 1.0 / (1.0 + (residuals / sigma) ** 2)
-    scaled = problem.weight * weights[:, None] * rows
-    inverse = np.linalg.pinv(scaled.T @ rows)
-    step = inverse @ (scaled.T @ (residuals / problem.unit))
-    rms = math.sqrt(float(np.average(residuals**2, weights=weights)))
+    scaled = (problem.weight * seen.cauchy / seen.own**2)[:, None] * seen.rows
+    inverse = np.linalg.pinv(scaled.T @ seen.rows)
+    step = inverse @ (scaled.T @ (seen.residuals / problem.unit))
+    rms = math.sqrt(float(np.average(seen.scaled**2, weights=seen.cauchy)))
     return bool(abs(step[8]) > 0.5 * options.significance * rms / problem.unit * math.sqrt(max(inverse[8, 8], 0.0)))
 
 

@@ -8,7 +8,7 @@ from typing import NamedTuple
 import cv2
 import numpy as np
 
-from roadgeo._arrays import BoolArray, FloatArray
+from roadgeo._arrays import BoolArray, FloatArray, IntArray
 from roadgeo.geometry.homography import Homography
 from roadgeo.geometry.lens import Lens
 from roadgeo.kernels.lens import MeetLimits, lens_rows, meet_roads
@@ -35,6 +35,8 @@ class Observed(NamedTuple):
         Derivatives of the points' places across the roads, normalised.
     residuals, sigma : (M,) float64
         Ways to the roads and their standard deviations, metres.
+    own : (M,) float64
+        These where the places are known, in that of the middle of the frame: a pixel may reach further.
     which : (S,) bool
         The points.
     """
@@ -42,7 +44,18 @@ class Observed(NamedTuple):
     rows: FloatArray
     residuals: FloatArray
     sigma: FloatArray
+    own: FloatArray
     which: BoolArray
+
+    @property
+    def cauchy(self) -> FloatArray:
+        """Weights (M,) that keep outliers from a fit."""
+        return np.asarray(1.0 / (1.0 + (self.residuals / self.sigma) ** 2))
+
+    @property
+    def scaled(self) -> FloatArray:
+        """Residuals (M,) as if each pixel reached as far as in the middle of the frame, metres."""
+        return np.asarray(self.residuals / self.own)
 
 
 class LensEquations:
@@ -106,8 +119,14 @@ class LensEquations:
         It is made of those of the frame's `n_cells` x `n_cells` cells, around the best one, in which at least the part
         `least` of its share of points lies on roads.
         """
+        met, cells = self.cells(k1, n_cells, least)
+        inside = cells[self.cell_of(n_cells)]
+        return met & inside, inside
+
+    def cells(self, k1: float, n_cells: int, least: float) -> tuple[BoolArray, BoolArray]:
+        """Return which points (S,) lie on roads, and the cells (n_cells, n_cells), rows first, of the core."""
         met, n = self.observe(k1, np.zeros((9, 9))).which, n_cells
-        column, row = np.clip((self.scene.points / self.scene.size * (n, -n)).astype(int), 0, n - 1).T
+        row, column = self.cell_of(n)
         counts = np.zeros((2, n, n))
         np.add.at(counts[0], (row, column), met)
         np.add.at(counts[1], (row, column), 1.0)
@@ -117,8 +136,12 @@ class LensEquations:
         best = np.unravel_index(shares.argmax(), shares.shape)
         good = shares >= least * shares.max()
         _, parts = cv2.connectedComponents(good.astype(np.uint8), connectivity=4)
-        inside = np.asarray(parts[row, column] == parts[best])
-        return met & inside, inside
+        return met, np.asarray(parts == parts[best])
+
+    def cell_of(self, n: int) -> tuple[IntArray, IntArray]:
+        """Return the row and the column (S,) of the cell that each point lies in, of n x n."""
+        column, row = np.clip((self.scene.points / self.scene.size * (n, -n)).astype(int), 0, n - 1).T
+        return row, column
 
     def begin(self, k1: float, start: float | None, core: BoolArray) -> FloatArray:
         """Return the derivatives (C, 2, 9) of core points' places.
@@ -142,12 +165,15 @@ class LensEquations:
         How far off a place may be follows from the `inverse` (9, 9) of the normal matrix so far, times `slack`.
         """
         n, (x, y) = len(self.points), self.origin
-        rows, residuals, sigma = np.empty((n, 9)), np.empty(n), np.empty(n)
-        limits = MeetLimits(self.unit, float(x), float(y), self.sigma_m, slack, self.max_radius, self.min_cos)
+        rows, residuals, sigma, own = np.empty((n, 9)), np.empty(n), np.empty(n), np.empty(n)
+        limits = MeetLimits(
+            self.unit, float(x), float(y), slack, self.max_radius, self.min_cos,
+            self.sigma_m, self.options.sigma_m, self.options.sigma_px / self.scene.half_size,
+        )  # fmt: skip
         inverse = np.ascontiguousarray(inverse)
         meet_roads(
             self.p, k1, self.half_side, self.points, self.directions, inverse, limits, self.roads,
-            rows, residuals, sigma,
+            rows, residuals, sigma, own,
         )  # fmt: skip
         met = np.isfinite(residuals)
-        return Observed(rows[met], residuals[met], sigma[met], met)
+        return Observed(rows[met], residuals[met], sigma[met], own[met], met)

@@ -11,15 +11,13 @@ from functools import lru_cache
 import numpy as np
 
 from roadgeo._arrays import FloatArray, IntArray
-from roadgeo.geometry.camera import sampling
 from roadgeo.geometry.homography import Homography
 from roadgeo.geometry.projection import from_lonlat, metres_apart, to_lonlat
 from roadgeo.location import Stats
-from roadgeo.matching.accuracy import with_honest_corners
 from roadgeo.matching.ahead import Ahead
-from roadgeo.matching.carriageways import refine_between
 from roadgeo.matching.estimator import MatchOptions, TripleEstimator
-from roadgeo.matching.hypothesis import MINIMAL, Hypothesis
+from roadgeo.matching.finishing import measure_corners
+from roadgeo.matching.hypothesis import Hypothesis
 from roadgeo.matching.index import ReferenceIndex, crop, unpack_tangents
 from roadgeo.matching.ledger import Ledger
 from roadgeo.matching.options import LocateOptions
@@ -29,15 +27,12 @@ from roadgeo.matching.paper.tuples import PairIndex, PairOptions, build_pair_ind
 from roadgeo.matching.parts import Part, Whole, same_within_m
 from roadgeo.matching.proof import Proof, Prover
 from roadgeo.matching.query import Query
-from roadgeo.matching.refinement import Refined
 from roadgeo.matching.road_search import COARSE_PIXEL_M
-from roadgeo.matching.scene import Scene
 from roadgeo.matching.search import Search, SearchResult, search_together
 from roadgeo.matching.shared_sweeps import SharedSweeps
 from roadgeo.matching.trace import NO_TRACE, Trace
 from roadgeo.matching.triples import larger
 from roadgeo.matching.twins import Twin
-from roadgeo.matching.verification import agreement
 from roadgeo.roads.intersections import Intersections, unpack_branches
 from roadgeo.storage.memory import let_pages_go
 
@@ -343,7 +338,7 @@ def _fits(
     proof: Proof | None,
 ) -> tuple[Fit, ...]:
     """Return the best place, the runner-up, and of the other promising ones the one that agrees best."""
-    _measure_corners(estimator, result.best)
+    measure_corners(estimator, result.best)
     best = _fit(estimator, result.best, result.score)
     if best is not None and proof is not None:
         best = replace(best, by_twins=True, twin=proof.twin)
@@ -356,33 +351,6 @@ def _fits(
     ]
     chosen.append(max(filter(None, others), key=lambda fit: fit.agreement, default=None))
     return tuple(filter(None, chosen))
-
-
-def _measure_corners(estimator: TripleEstimator, best: Hypothesis | None) -> None:
-    """Refine a place that may be reported for the last time, and measure how sure its corners are."""
-    lens = estimator.options.lens
-    if best is None or best.refined is None or best.found is None or lens is None:
-        return
-    scene = estimator.scene
-    if best.refined.lens_k1 == 0.0:
-        scene = _lay_between_carriageways(estimator, best, best.refined)
-    agreeing, options = best.found.forward, estimator.refine_options
-    best.refined = with_honest_corners(best.refined, scene, estimator.index, agreeing, options, lens)
-
-
-def _lay_between_carriageways(estimator: TripleEstimator, best: Hypothesis, refined: Refined) -> Scene:
-    """Lay the middle of a mask's two roads on the map's one; return the scene with road points there.
-
-    What was found before stands: the odds rest on it.
-    """
-    scene, index, verify = estimator.scene, estimator.index, estimator.options.verify
-    found, seen = refine_between(refined, scene, index, best.matched, estimator.refinement(best))
-    if seen is scene or estimator.judge(found.matrix) is not None:
-        return scene
-    gsd, seeds = sampling(found.matrix, scene.size), best.seeds[-MINIMAL:]
-    best.refined, best.matrix, best.gsd_m = found, found.matrix, gsd
-    _, best.matched, best.distance = agreement(found.matrix, scene, index, gsd, seeds, verify)
-    return seen
 
 
 def _fit(estimator: TripleEstimator, model: Hypothesis | None, score: float) -> Fit | None:

@@ -254,7 +254,7 @@ def _adjusted(
     normal = np.empty((8, 8))
     limits = AdjustLimits(
         options.n_cells**2, options.least_share, options.max_radius_m + options.max_radius_px * gsd,
-        float(np.cos(np.radians(options.max_turn_deg))), sigma_m,
+        float(np.cos(np.radians(options.max_turn_deg))), sigma_m, options.sigma_m, options.sigma_px / half_size,
         (sigma_m / unit / options.perspective_sigma) ** 2, options.n_iterations, options.tolerance_m,
     )  # fmt: skip
     directions = np.ascontiguousarray(scene.directions[::step])

@@ -29,6 +29,7 @@ __all__ = [
     "chance_agreement",
     "least_chance",
     "log10_odds",
+    "map_agreement",
     "tolerance_m",
 ]
 
@@ -190,15 +191,22 @@ def agreement(
     roads = index.road_buckets
     forward_distances(matrix, scene.points, scene.directions, tolerance, min_cos, 0.0, 0.0, roads, out)
     forward = float(np.average(np.isfinite(out), weights=scene.weights)) if scene.weights.any() else 0.0
-    seen, shown = backward_agreement(
-        np.asarray(np.linalg.inv(matrix), float), _bounds(matrix, scene), options.backward_step_m, tolerance, 0.0, 0.0,
-        roads, scene.field, scene.field_scale, scene.observed,
-    )  # fmt: skip
+    seen, shown = map_agreement(matrix, scene, index, gsd_m, options)
     result = Agreement(
         int((matched[counted] >= 0).sum()), int(counted.sum()),
         forward, shown / max(seen, 1), seen,
     )  # fmt: skip
     return result, matched, distance
+
+
+def map_agreement(
+    matrix: FloatArray, scene: Scene, index: ReferenceIndex, gsd_m: float, options: VerifyOptions
+) -> tuple[int, int]:
+    """Return how many points of the map's roads lie where the scene is observed, and how many of them it shows."""
+    return backward_agreement(
+        np.asarray(np.linalg.inv(matrix), float), _bounds(matrix, scene), options.backward_step_m,
+        tolerance_m(gsd_m, options), 0.0, 0.0, index.road_buckets, scene.field, scene.field_scale, scene.observed,
+    )  # fmt: skip
 
 
 def chance_agreement(

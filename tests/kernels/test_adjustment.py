@@ -60,8 +60,8 @@ class Town:
     def arguments(self, held_at=None, **changes):
         values = {
             "point_weight": 0.8, "pair_weight": 0.3, "n_cells": N_CELLS, "least_share": 0.5, "max_radius": 30.0,
-            "min_cos": float(np.cos(np.radians(25))), "sigma_m": 2.0, "prior": 1e-4, "n_iterations": 12,
-            "tolerance_m": 1e-4, **changes,
+            "min_cos": float(np.cos(np.radians(25))), "sigma_m": 2.0, "map_sigma_m": 1.6, "mask_sigma": 0.003,
+            "prior": 1e-4, "n_iterations": 12, "tolerance_m": 1e-4, **changes,
         }  # fmt: skip
         scalars = list(values.values())
         observations = (self.points, self.directions, self.cells(self.points), scalars[0])

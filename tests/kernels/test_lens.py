@@ -9,7 +9,7 @@ from roadgeo.kernels.lens import MeetLimits, lens_rows, meet_roads
 
 HALF_SIDE = 0.8
 P = np.array([0.9, -0.3, 0.01, 0.35, 1.1, 0.02, 0.2, -0.3])
-LIMITS = MeetLimits(240.0, 350.0, 320.0, 6.0, 1.5, 40.0, MIN_COS)
+LIMITS = MeetLimits(240.0, 350.0, 320.0, 1.5, 40.0, MIN_COS, 6.0, 5.0, 0.02)
 LENSES = [0.0, -0.12, -0.45, 0.1]
 
 
@@ -49,18 +49,18 @@ def test_derivatives_are_those_of_the_places(k1):
 
 def met(k1, inverse, limits=LIMITS, p=P):
     uv, along = points(2)
-    rows, residuals, sigmas = np.empty((60, 9)), np.empty(60), np.empty(60)
+    rows, residuals, sigmas, own = np.empty((60, 9)), np.empty(60), np.empty(60), np.empty(60)
     roads = town(3)
-    n = meet_roads(p, k1, HALF_SIDE, uv, along, inverse, limits, roads, rows, residuals, sigmas)
+    n = meet_roads(p, k1, HALF_SIDE, uv, along, inverse, limits, roads, rows, residuals, sigmas, own)
     expected = naive.meet_roads(p, k1, HALF_SIDE, uv, along, inverse, limits, roads.segments)
-    return n, rows, residuals, sigmas, expected
+    return n, rows, residuals, (sigmas, own), expected
 
 
 @pytest.mark.parametrize("k1", LENSES)
 @pytest.mark.parametrize("spread", [0.0, 0.1])
 def test_roads_like_the_twin(k1, spread):
     inverse = spread * np.eye(9) + 0.01 * spread
-    n, rows, residuals, sigmas, expected = met(k1, inverse)
+    n, rows, residuals, (sigmas, own), expected = met(k1, inverse)
     assert n == sum(one is not None for one in expected)
     assert 5 < n < 60
     for i, one in enumerate(expected):
@@ -68,7 +68,8 @@ def test_roads_like_the_twin(k1, spread):
         if one is not None:
             assert np.allclose(rows[i], one[0], atol=1e-9)
             assert residuals[i] == pytest.approx(one[1], abs=2e-3)
-            assert sigmas[i] == pytest.approx(one[2])
+            assert sigmas[i] == pytest.approx(one[2], rel=1e-5)
+            assert own[i] == pytest.approx(one[3], rel=1e-5)
 
 
 def test_points_that_are_unsure_or_beyond_the_horizon_meet_nothing():

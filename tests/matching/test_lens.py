@@ -10,10 +10,11 @@ from roadgeo.geometry.lens import Lens
 from roadgeo.matching.accuracy import with_honest_corners
 from roadgeo.matching.estimator import TripleEstimator
 from roadgeo.matching.hypothesis import Hypothesis
-from roadgeo.matching.lens import LensOptions, core_excess, find_lens, fit_lens, regrow, straighten_scene
+from roadgeo.matching.lens import LensOptions, core_excess, find_lens, fit_lens, grow_whole, regrow, straighten_scene
 from roadgeo.matching.refinement import Refined, RefineOptions, refine
 from roadgeo.matching.search import SearchOptions, search
 from roadgeo.matching.trace import NoTrace
+from roadgeo.matching.verification import VerifyOptions
 
 
 def through_lens(scene, k1):
@@ -76,6 +77,19 @@ def test_what_fits_in_one_part_of_the_frame_grows_over_all_of_it_behind_a_lens(t
     assert np.hypot(*(mapped(found.matrix, scene.corners) - corners).T).max() < 2.0
 
 
+def test_what_fits_in_one_part_of_the_frame_grows_over_all_of_it_without_a_lens(town):
+    truth, scene = sight_of(town[0], 5, tilt=35, sight=Sight(0.6))
+    start = bent_start(truth, scene, 0.0)
+    corners = mapped(truth, scene.corners)
+    assert np.hypot(*(mapped(start, scene.corners) - corners).T).max() > 60.0  # metres
+    given = (scene, town[1], 0.5, RefineOptions(), LensOptions())
+    found = grow_whole(start, *given)
+    assert found.k1 == pytest.approx(0.0, abs=1e-4)
+    assert np.hypot(*(mapped(found.matrix, scene.corners) - corners).T).max() < 2.0
+    assert grow_whole(truth, *given) is None  # nothing is gained
+    assert grow_whole(start, scene, town[1], 0.9, RefineOptions(), LensOptions()) is None
+
+
 def test_a_wrong_place_does_not_grow_and_its_core_is_chance(town):
     truth, scene = sight_of(town[0], 5, tilt=15, sight=Sight(0.6))
     wrong = np.array([[1.0, 0, 137.0], [0, 1.0, 211.0], [0, 0, 1]]) @ truth
@@ -87,17 +101,30 @@ def test_a_wrong_place_does_not_grow_and_its_core_is_chance(town):
 def honest(matrix, scene, index, agreeing, k1=0.0):
     """The deviations of the corners that are claimed for a homography."""
     claimed = Refined(matrix, np.ones(4), 1.0, np.eye(8), k1)
-    return with_honest_corners(claimed, scene, index, agreeing, RefineOptions(), LensOptions()).corner_sigma_m
+    return with_honest_corners(
+        claimed, scene, index, agreeing, RefineOptions(), LensOptions(), VerifyOptions()
+    ).corner_sigma_m
 
 
 def test_corners_are_unsure_where_only_the_middle_of_a_frame_agrees(town):
     truth, straight = sight_of(town[0], 5, tilt=15, sight=Sight(0.6))
     inside = np.abs(straight.points - straight.center).max(axis=1) < 0.3 * straight.half_size
     astray = np.where(inside[:, None], straight.points, straight.points + np.array([47.0, 31.0]))
-    middle = replace(straight, points=astray)
+    rows, columns = straight.field.shape
+    shown = np.zeros((rows, columns), bool)
+    shown[3 * rows // 10 : 7 * rows // 10, 3 * columns // 10 : 7 * columns // 10] = True
+    middle = replace(straight, points=astray, field=np.where(shown, straight.field, 99.0).astype(np.float32))
     assert (honest(truth, straight, town[1], 0.95) < 2.0).all()
     assert (honest(truth, middle, town[1], 0.4) > 2.0).all()
     assert honest(truth, middle, town[1], 0.4).max() > 15.0
+
+
+def test_false_roads_do_not_look_like_a_lens(town):
+    truth, straight = sight_of(town[0], 5, tilt=15, sight=Sight(0.6))
+    inside = np.abs(straight.points - straight.center).max(axis=1) < 0.3 * straight.half_size
+    astray = np.where(inside[:, None], straight.points, straight.points + np.array([47.0, 31.0]))
+    # All that the map has is shown in the rest of the frame too, among other things.
+    assert (honest(truth, replace(straight, points=astray), town[1], 0.4) < 5.0).all()
 
 
 def test_where_the_map_lacks_a_part_of_the_frame_the_rest_says_what_a_lens_could_do_at_most(town):
@@ -133,7 +160,9 @@ def test_the_unknown_middle_of_a_lens_makes_corners_less_sure(town):
     scene = through_lens(straight, -0.12)
     claimed = Refined(truth, np.ones(4), 1.0, np.eye(8), -0.12)
     known, unknown = (
-        with_honest_corners(claimed, scene, town[1], 0.95, RefineOptions(), LensOptions(center_sigma_px=sigma))
+        with_honest_corners(
+            claimed, scene, town[1], 0.95, RefineOptions(), LensOptions(center_sigma_px=sigma), VerifyOptions()
+        )
         for sigma in (0.0, 2.0)
     )
     assert (unknown.corner_sigma_m > 1.2 * known.corner_sigma_m).all()

@@ -365,8 +365,8 @@ def grow_by_roads(ps, unit, origins, tolerance, points, directions, stages, segm
 
 def adjust(
     p, unit, origin, points, directions, point_cells, point_weight, pairs, targets, pair_cells, pair_weight,
-    held, held_targets, held_weight, n_cells, least_share, max_radius, min_cos, sigma_m, prior, n_iterations,
-    tolerance_m, segments,
+    held, held_targets, held_weight, n_cells, least_share, max_radius, min_cos, sigma_m, map_sigma_m, mask_sigma,
+    prior, n_iterations, tolerance_m, segments,
 ):  # fmt: skip
     """(p, road points used, rms, normal matrix) of Gauss-Newton steps with Cauchy weights."""
     shares = np.ones(n_cells)
@@ -377,7 +377,9 @@ def adjust(
         for pair, target, cell in zip(pairs, targets, pair_cells, strict=True):
             gap = target - predict(p, *pair)
             if shares[cell] >= least_share and np.hypot(*gap) * unit <= max_radius:
-                weight = pair_weight / (1 + (np.hypot(*gap) * unit / (2 * sigma_m)) ** 2)
+                reach = unit * np.sqrt(abs(np.linalg.det(jacobian(np.append(p, 1.0).reshape(3, 3), pair))))
+                own = np.hypot(map_sigma_m, mask_sigma * reach) / sigma_m
+                weight = pair_weight / (own**2 + (np.hypot(*gap) * unit / (2 * sigma_m)) ** 2)
                 rows += list(predict_rows(p, *pair))
                 weights += [weight, weight]
                 residuals += list(gap)
@@ -390,11 +392,14 @@ def adjust(
         if iteration > 0:
             searched, hits = np.zeros(n_cells), np.zeros(n_cells)
             for i, (point, direction) in enumerate(zip(points, directions, strict=True)):
-                along = jacobian(np.append(p, 1.0).reshape(3, 3), point) @ direction
+                local = jacobian(np.append(p, 1.0).reshape(3, 3), point)
+                along = local @ direction
+                reach = unit * abs(np.linalg.det(local)) / np.hypot(*along)
                 along /= np.hypot(*along)
                 row = np.array([-along[1], along[0]]) @ predict_rows(p, *point)
-                sigma = sigma_m * np.sqrt(1 + row @ np.linalg.inv(normal) @ row)
-                if 3 * sigma > max_radius:
+                own = np.hypot(map_sigma_m, mask_sigma * reach) / sigma_m
+                sigma = sigma_m * np.sqrt(own**2 + row @ np.linalg.inv(normal) @ row)
+                if 3 * sigma > max_radius * max(1.0, own):
                     continue
                 searched[point_cells[i]] += 1
                 place = origin + unit * predict(p, *point)
@@ -402,18 +407,18 @@ def adjust(
                 if distance < np.inf:
                     hits[point_cells[i]] += 1
                     across = np.array([-road[1], road[0]])
-                    met.append((point_cells[i], across @ predict_rows(p, *point), across @ (foot - place), sigma))
+                    met.append((point_cells[i], across @ predict_rows(p, *point), across @ (foot - place), sigma, own))
             shares = np.where(searched > 0, hits / np.maximum(searched, 1), 1.0)
             met = [m[1:] for m in met if shares[m[0]] >= least_share]
-            for row, residual, sigma in met:
+            for row, residual, sigma, own in met:
                 rows.append(row)
-                weights.append(point_weight / (1 + (residual / sigma) ** 2))
+                weights.append(point_weight / own**2 / (1 + (residual / sigma) ** 2))
                 residuals.append(residual / unit)
             if met:
-                r, s = np.array([m[1:] for m in met]).T
+                r, s, own = np.array([m[1:] for m in met]).T
                 cauchy = 1 / (1 + (r / s) ** 2)
                 slope = (1 - (r / s) ** 2) * cauchy**2  # of the influence r * cauchy
-                rms = np.sqrt(np.mean((cauchy * r) ** 2) * cauchy.mean()) / max(slope.mean(), 0.1 * cauchy.mean())
+                rms = np.sqrt(np.mean((cauchy * r / own) ** 2) * cauchy.mean()) / max(slope.mean(), 0.1 * cauchy.mean())
         A, W = np.array(rows).reshape(-1, 8), np.array(weights)
         hold = np.diag([0.0] * 6 + [prior] * 2)
         normal = A.T @ (W[:, None] * A) + hold + 1e-9 * np.eye(8)

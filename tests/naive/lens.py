@@ -19,17 +19,26 @@ def lens_rows(p, k1, half_side, points, directions):
     return homography.everywhere(straight), along / np.linalg.norm(along, axis=1, keepdims=True), rows
 
 
+def reach(p, k1, half_side, points, directions):
+    """How far across its road a step of 1 reaches at each point (S,)."""
+    lens, homography = Lens(k1, (0.0, 0.0), half_side), Homography(np.append(p, 1.0).reshape(3, 3))
+    whole = homography.jacobian(lens.straighten(points)) @ lens.stretch(points)
+    return abs(np.linalg.det(whole)) / np.linalg.norm(np.einsum("nij,nj->ni", whole, directions), axis=1)
+
+
 def meet_roads(p, k1, half_side, points, directions, inverse, limits, segments):
-    """(row across the road, residual, sigma) of each point that meets a road, None for the others."""
+    """(row across the road, residual, sigma, own) of each point that meets a road, None for the others."""
     found = []
-    for place, along, row in zip(*lens_rows(p, k1, half_side, points, directions), strict=True):
+    reaches = reach(p, k1, half_side, points, directions)
+    for place, along, row, far in zip(*lens_rows(p, k1, half_side, points, directions), reaches, strict=True):
         spread = np.trace(row @ inverse @ row.T)
-        sigma = limits.sigma_m * np.sqrt(1.0 + limits.slack**2 * max(spread, 0.0))
+        own = np.hypot(limits.map_sigma_m, limits.mask_sigma * limits.unit * far) / limits.sigma_m
+        sigma = limits.sigma_m * np.sqrt(own**2 + limits.slack**2 * max(spread, 0.0))
         here = limits.unit * place + (limits.x, limits.y)
-        if not 3.0 * sigma <= limits.max_radius or np.isnan(here).any():
+        if not 3.0 * sigma <= limits.max_radius * max(1.0, own) or np.isnan(here).any():
             found.append(None)
             continue
         distance, foot, road = nearest_road(*here, *along, 3.0 * sigma, limits.min_cos, segments)
         across = np.array([-road[1], road[0]]) if distance < np.inf else None
-        found.append(None if across is None else (across @ row, across @ (foot - here), sigma))
+        found.append(None if across is None else (across @ row, across @ (foot - here), sigma, own))
     return found

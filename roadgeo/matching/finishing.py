@@ -1,0 +1,134 @@
+"""The last fit of a place that may be reported: to the whole frame, and not beside where it belongs.
+
+While places are looked for, cells of the frame where few roads are met wait: what is met there may be chance. At the
+right place it is none. And a part of the frame may have settled on the next street, or on the other carriageway: then
+the fit is too sure of itself, for nothing in it knows of that.
+"""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import cv2
+import numpy as np
+
+from roadgeo._arrays import FloatArray
+from roadgeo.geometry.camera import sampling
+from roadgeo.geometry.homography import Homography
+from roadgeo.matching.accuracy import with_honest_corners
+from roadgeo.matching.carriageways import refine_between, weight_on_roads
+from roadgeo.matching.estimator import TripleEstimator
+from roadgeo.matching.hypothesis import MINIMAL, Hypothesis
+from roadgeo.matching.index import ReferenceIndex
+from roadgeo.matching.refinement import Refined, RefineOptions, refine
+from roadgeo.matching.scene import Scene
+from roadgeo.matching.verification import agreement
+
+__all__ = ["measure_corners", "refine_beside"]
+
+#: Where so much of the mask's roads agrees, no cell of the frame was left out; a fit to all loses hardly any.
+_WHOLE, _LEAST_LOST = 0.9, 0.03
+#: Where so much of the mask's roads agrees, nothing has settled beside where it belongs.
+_SETTLED = 0.85
+#: How far corners are moved, one by one, to see whether the fit comes back: metres, pixels, and road points to see by.
+_BESIDE_M, _BESIDE_PX, _N_POINTS = 12.0, 8.0, 200
+_WAYS = np.array([(1.0, 0.0), (-1.0, 0.0), (0.0, 1.0), (0.0, -1.0)])
+#: Another fit is better where so much more of the road points lies on roads. Training masks: three of five hundred.
+_BETTER = 0.006
+
+
+def measure_corners(estimator: TripleEstimator, best: Hypothesis | None) -> None:
+    """Refine a place that may be reported for the last time, and measure how sure its corners are."""
+    lens = estimator.options.lens
+    if best is None or best.refined is None or best.found is None or lens is None:
+        return
+    scene = estimator.scene
+    if best.refined.lens_k1 == 0.0:
+        _fit_whole_frame(estimator, best, best.refined)
+        scene = _lay_between_carriageways(estimator, best, best.refined)
+        _look_beside(estimator, best, best.refined, scene)
+    agreeing, options = best.found.forward, estimator.refine_options
+    best.refined = with_honest_corners(
+        best.refined, scene, estimator.index, agreeing, options, lens, estimator.options.verify
+    )
+
+
+def _fit_whole_frame(estimator: TripleEstimator, best: Hypothesis, refined: Refined) -> None:
+    """Refine a place with all cells of the frame, now that it is known."""
+    agreeing = 0.0 if best.found is None else best.found.forward
+    if agreeing >= _WHOLE:
+        return
+    options = replace(estimator.refinement(best), least_share=0.0)
+    found = refine(refined.matrix, estimator.scene, estimator.index, best.matched, options, held=True)
+    if found is not None and estimator.judge(found.matrix) is None:
+        _take(estimator, best, found, agreeing - _LEAST_LOST)
+
+
+def _look_beside(estimator: TripleEstimator, best: Hypothesis, refined: Refined, scene: Scene) -> None:
+    """Where a part of the frame may have settled beside where it belongs, find that."""
+    if best.found is None or best.found.forward >= _SETTLED:
+        return
+    found = refine_beside(refined, scene, estimator.index, estimator.refinement(best))
+    if found is not None and estimator.judge(found.matrix) is None:
+        _take(estimator, best, found)
+
+
+def _take(estimator: TripleEstimator, best: Hypothesis, refined: Refined, least: float = 0.0) -> bool:
+    """Take a new fit for a place, if at least so much of the mask's roads agrees.
+
+    What was found before stands: the odds rest on it.
+    """
+    scene, seeds = estimator.scene, best.seeds[-MINIMAL:]
+    gsd = sampling(refined.matrix, scene.size)
+    found, matched, distance = agreement(refined.matrix, scene, estimator.index, gsd, seeds, estimator.options.verify)
+    if found.forward < least:
+        return False
+    best.refined, best.matrix, best.gsd_m = refined, refined.matrix, gsd
+    best.matched, best.distance = matched, distance
+    return True
+
+
+def _lay_between_carriageways(estimator: TripleEstimator, best: Hypothesis, refined: Refined) -> Scene:
+    """Lay the middle of a mask's two roads on the map's one; return the scene with road points there."""
+    scene, index = estimator.scene, estimator.index
+    found, seen = refine_between(refined, scene, index, best.matched, estimator.refinement(best))
+    if seen is scene or estimator.judge(found.matrix) is not None:
+        return scene
+    _take(estimator, best, found)
+    return seen
+
+
+def refine_beside(refined: Refined, scene: Scene, index: ReferenceIndex, options: RefineOptions) -> Refined | None:
+    """Find a homography beside a refined one that lays more of the roads on roads; None where there is none.
+
+    Each corner of the frame in turn is put elsewhere, the others stay; where the fit does not come back, it may have
+    found something better.
+    """
+    options, nothing = replace(options, least_share=0.0), np.full(len(scene.intersections), -1)
+
+    def weight(one: Refined) -> float:
+        return weight_on_roads(one.matrix, scene, index, options)
+
+    starts = _beside(refined.matrix, scene)
+    tried = [refine(start, scene, index, nothing, options, _N_POINTS, held=True) for start in starts]
+    best = max((one for one in tried if one is not None), key=weight, default=None)
+    found = None if best is None else refine(best.matrix, scene, index, nothing, options, held=True)
+    if found is None or weight(found) <= weight(refined) + _BETTER * len(scene.points):
+        return None
+    return found
+
+
+def _beside(matrix: FloatArray, scene: Scene) -> list[FloatArray]:
+    """Return 16 homographies (3, 3) that put one corner of the frame elsewhere, and the others where `matrix` does."""
+    corners = scene.corners.astype(np.float32)
+    places = Homography(matrix).everywhere(scene.corners)
+    middle = places.mean(axis=0)
+    step = max(_BESIDE_M, _BESIDE_PX * sampling(matrix, scene.size))
+    back = np.array([[1.0, 0.0, middle[0]], [0.0, 1.0, middle[1]], [0.0, 0.0, 1.0]])
+    found = []
+    for k in range(4):
+        for way in _WAYS:
+            there = places - middle
+            there[k] += step * way
+            found.append(np.asarray(back @ cv2.getPerspectiveTransform(corners, there.astype(np.float32)), float))
+    return found
