@@ -40,8 +40,8 @@ __all__ = [
 _MORE = 0.01
 #: And where a fit has grown over more of the frame, so much more.
 _BETTER = 0.02
-#: Standard deviation of the k1 of a pinhole.
-_NO_LENS = 1e-6
+#: Standard deviation of a k1 that is held.
+_HELD = 1e-6
 
 
 @dataclass(frozen=True)
@@ -150,14 +150,14 @@ def fit_lens(
     start : float, optional
         Value of k1 to begin with, other than `k1`.
     held : bool
-        Hold k1 near 0: the camera is a pinhole.
+        Hold k1 where it begins, at 0 for a pinhole.
     """
     options, refinement = options or LensOptions(), refinement or RefineOptions()
     equations = LensEquations(matrix, scene, index, refinement)
     core, _ = equations.core(k1, options.n_cells, options.core_share)
     if core.sum() < options.fewest:
         return None
-    prior = equations.prior(_NO_LENS if held else options.sigma)
+    prior = equations.prior(_HELD if held else options.sigma)
     rows = equations.begin(k1, start, core)
     k1 = k1 if start is None else start
     inverse = _inverse(rows.reshape(-1, 9), np.full(2 * len(rows), 0.5 * equations.weight), prior)
@@ -173,7 +173,8 @@ def fit_lens(
         right = (rows * weights[:, None]).T @ (seen.residuals / equations.unit)
         right[6:] -= prior[6:] * np.append(equations.p[6:8], k1)
         step = inverse @ right
-        equations.p, k1 = equations.p + step[:8], float(np.clip(k1 + step[8], -0.5, 0.5))
+        equations.p = equations.p + step[:8]
+        k1 = k1 if held else float(np.clip(k1 + step[8], -0.5, 0.5))
         if not np.isfinite(step).all():
             return None
         rms = robust_rms(seen.scaled, cauchy)
