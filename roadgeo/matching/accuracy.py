@@ -28,13 +28,12 @@ _LEAST_SHARE, _MOST_OF_FRAME, _AS_NEAR = 0.5, 0.85, 1.5
 #: more, which look alike from the mask's side.
 _LEAST_SHOWN = 0.55
 
-#: How errors add up, fitted to the corners of 920 masks, good ones and bad ones. What residuals say too much, where no
-#: lens was found; over how much more ground errors keep their sign far away, by how far a pixel reaches; likewise where
-#: a mask is bent, by how much greater they are than usual; and the part of their rms that no number of points improves,
-#: beside the accuracy of the map as a whole, metres.
-_OVERSTATED, _FAR, _BENT, _FLOOR, _MAP_M = 0.65, 0.6, 0.25, 0.25, 0.05
+#: How errors add up, fitted to the corners of 900 masks, good and bad ones. What residuals say too much, where no
+#: lens was found; over how much more ground errors keep their sign far away, by how far a pixel reaches; and the part
+#: of their rms that no number of points improves, beside the accuracy of the map as a whole, metres.
+_OVERSTATED, _FAR, _FLOOR, _MAP_M = 0.7, 0.5, 0.25, 0.05
 #: Residuals end at three standard deviations. Those beyond so many are near the end.
-_NEAR_END, _PULL_AT_END = 2.0, 0.35
+_NEAR_END, _PULL_AT_END = 2.0, 0.45
 
 
 def with_honest_corners(
@@ -49,7 +48,7 @@ def with_honest_corners(
     """Return a refined homography with the covariance of its corners measured anew.
 
     The fit takes all residuals for equally uncertain but for how far a pixel reaches. But far away errors keep their
-    sign over more ground, and so they do where a mask is bent. The middle of a lens is not known exactly. And where
+    sign over more ground. The middle of a lens is not known exactly. And where
     only one part of the frame agrees, the rest may be seen through a lens that was not found, or not rightly.
 
     The matrix stays as it is, and so does the covariance where too few roads are met.
@@ -76,7 +75,7 @@ def with_honest_corners(
     scaled = weights[:, None] * rows
     inverse = np.linalg.pinv(scaled.T @ rows + np.diag(equations.prior(lens.sigma)[:free]), hermitian=True)
     rms = _scale(seen.scaled[used], cauchy, (seen.residuals / seen.sigma)[used])
-    scatter = rms * max(1.0, rms / (options.usual_rms * equations.sigma_m)) ** _BENT / equations.unit
+    scatter = rms / equations.unit
     as_long = (1.0 if k1 or partly else _OVERSTATED) * np.maximum(1.0, reach / np.median(reach)) ** _FAR
     # sandwich estimate of an M-estimator's covariance (Huber 1981, 6.3)
     covariance = scatter**2 * inverse @ (scaled.T * as_long**2 @ rows) @ inverse

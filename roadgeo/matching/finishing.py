@@ -26,12 +26,12 @@ from roadgeo.matching.verification import agreement
 
 __all__ = ["measure_corners", "refine_beside"]
 
-#: Where so much of the mask's roads agrees, no cell of the frame was left out; a fit to all loses hardly any.
+#: Where so much of the mask's roads agrees, no cell of the frame was left out, and nothing has settled beside where it
+#: belongs; a fit to all cells loses hardly any of them.
 _WHOLE, _LEAST_LOST = 0.9, 0.03
-#: Where so much of the mask's roads agrees, nothing has settled beside where it belongs.
-_SETTLED = 0.85
-#: How far corners are moved, one by one, to see whether the fit comes back: metres, pixels, and road points to see by.
-_BESIDE_M, _BESIDE_PX, _N_POINTS = 12.0, 8.0, 200
+#: How far corners are moved, one by one, to see whether the fit comes back, as carriageways are apart: metres, and
+#: pixels at least; and road points to see by.
+_BESIDE_M, _BESIDE_PX, _N_POINTS = (12.0, 24.0), 8.0, 200
 _WAYS = np.array([(1.0, 0.0), (-1.0, 0.0), (0.0, 1.0), (0.0, -1.0)])
 #: Another fit is better where so much more of the road points lies on roads. Training masks: three of five hundred.
 _BETTER = 0.006
@@ -66,7 +66,7 @@ def _fit_whole_frame(estimator: TripleEstimator, best: Hypothesis, refined: Refi
 
 def _look_beside(estimator: TripleEstimator, best: Hypothesis, refined: Refined, scene: Scene) -> None:
     """Where a part of the frame may have settled beside where it belongs, find that."""
-    if best.found is None or best.found.forward >= _SETTLED:
+    if best.found is None or best.found.forward >= _WHOLE:
         return
     found = refine_beside(refined, scene, estimator.index, estimator.refinement(best))
     if found is not None and estimator.judge(found.matrix) is None:
@@ -119,16 +119,16 @@ def refine_beside(refined: Refined, scene: Scene, index: ReferenceIndex, options
 
 
 def _beside(matrix: FloatArray, scene: Scene) -> list[FloatArray]:
-    """Return 16 homographies (3, 3) that put one corner of the frame elsewhere, and the others where `matrix` does."""
+    """Return homographies (3, 3) that put one corner of the frame elsewhere, and the others where `matrix` does."""
     corners = scene.corners.astype(np.float32)
     places = Homography(matrix).everywhere(scene.corners)
     middle = places.mean(axis=0)
-    step = max(_BESIDE_M, _BESIDE_PX * sampling(matrix, scene.size))
+    least = _BESIDE_PX * sampling(matrix, scene.size)
     back = np.array([[1.0, 0.0, middle[0]], [0.0, 1.0, middle[1]], [0.0, 0.0, 1.0]])
     found = []
     for k in range(4):
-        for way in _WAYS:
+        for step in (max(one, least) * way for one in _BESIDE_M for way in _WAYS):
             there = places - middle
-            there[k] += step * way
+            there[k] += step
             found.append(np.asarray(back @ cv2.getPerspectiveTransform(corners, there.astype(np.float32)), float))
     return found
