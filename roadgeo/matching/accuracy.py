@@ -28,10 +28,11 @@ _LEAST_SHARE, _MOST_OF_FRAME, _AS_NEAR = 0.5, 0.85, 1.5
 #: more, which look alike from the mask's side.
 _LEAST_SHOWN = 0.55
 
-#: How errors add up, fitted to the corners of 900 masks, good and bad ones. What residuals say too much, where no
-#: lens was found; over how much more ground errors keep their sign far away, by how far a pixel reaches; and the part
-#: of their rms that no number of points improves, beside the accuracy of the map as a whole, metres.
-_OVERSTATED, _FAR, _FLOOR, _MAP_M = 0.7, 0.5, 0.25, 0.05
+#: How errors add up, fitted to the corners of 900 masks, good and bad ones, and of 34 of a real city. What residuals say
+#: too much, where no lens was found; over how much more ground errors keep their sign far away, by how far a pixel
+#: reaches; and what no number of points improves: a part of the residuals' rms, and the mask's accuracy, pixels,
+#: beside that of the map (`RefineOptions.sigma_floor_m`).
+_OVERSTATED, _FAR, _FLOOR, _FLOOR_PX = 0.7, 0.5, 0.15, 0.1
 #: Residuals end at three standard deviations. Those beyond so many are near the end.
 _NEAR_END, _PULL_AT_END = 2.0, 0.45
 
@@ -88,7 +89,8 @@ def with_honest_corners(
         unknown = lens.center_sigma_px * np.einsum("ni,nij->nj", across, by_center)
         moved = inverse @ (scaled.T @ unknown)
         covariance = covariance + moved @ moved.T
-    options = replace(options, sigma_floor_m=math.hypot(_MAP_M, _FLOOR * rms), sigma_floor_px=0.0)
+    floor_m = math.hypot(options.sigma_floor_m, _FLOOR * rms)
+    options = replace(options, sigma_floor_m=floor_m, sigma_floor_px=_FLOOR_PX)
     corners = corner_covariance(equations.p, covariance[:8, :8], scene, equations.unit, options)
     if not np.isfinite(corners).all():
         return refined
