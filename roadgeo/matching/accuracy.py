@@ -28,7 +28,7 @@ _LEAST_SHARE, _MOST_OF_FRAME, _AS_NEAR = 0.5, 0.85, 1.5
 #: more, which look alike from the mask's side.
 _LEAST_SHOWN = 0.55
 
-#: How errors add up, fitted to the corners of 900 masks, good and bad ones, and of 34 of a real city. What residuals say
+#: How errors add up, fitted to the corners of 900 masks, good and bad, and of 34 of a real city. What residuals say
 #: too much, where no lens was found; over how much more ground errors keep their sign far away, by how far a pixel
 #: reaches; and what no number of points improves: a part of the residuals' rms, and the mask's accuracy, pixels,
 #: beside that of the map (`RefineOptions.sigma_floor_m`).
