@@ -33,8 +33,9 @@ _LEAST_SHOWN = 0.55
 #: reaches; and what no number of points improves: a part of the residuals' rms, and the mask's accuracy, pixels,
 #: beside that of the map (`RefineOptions.sigma_floor_m`).
 _OVERSTATED, _FAR, _FLOOR, _FLOOR_PX = 0.7, 0.5, 0.15, 0.1
-#: Residuals end at three standard deviations. Those beyond so many are near the end.
-_NEAR_END, _PULL_AT_END = 2.0, 0.45
+#: Residuals end at three standard deviations. Those beyond so many are near the end, and take so much off the slope of
+#: the pull: by their number and the pull there it would be 0.6, fitted it is more.
+_NEAR_END, _PULL_AT_END = 2.5, 1.1
 
 
 def with_honest_corners(
