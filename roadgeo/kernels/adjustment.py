@@ -21,7 +21,7 @@ _HELD_STEPS = 6
 #: Points nearer to the horizon than this w make the adjustment fail.
 _LEAST_W = 0.02
 
-__all__ = ["add_row", "adjust", "carry", "point_row"]
+__all__ = ["add_row", "adjust", "carry", "own_sigma", "point_row"]
 
 
 @kernel()
@@ -88,9 +88,12 @@ def _determinant(p: Floats1) -> float:
 
 
 @kernel(forceinline=True)
-def _own_sigma(reach: float, unit: float, limits: AdjustLimits) -> float:
-    """Return how many times less sure than in the middle of the frame a point is where a step of 1 reaches so far."""
-    return math.hypot(limits.map_sigma_m, limits.mask_sigma * reach * unit) / limits.sigma_m
+def own_sigma(reach_m: float, sigma_m: float, map_sigma_m: float, mask_sigma: float) -> float:
+    """Return how many times less sure than in the middle of the frame a point is where a step of 1 reaches so far.
+
+    The other arguments are as in `structs.AdjustLimits`.
+    """
+    return math.hypot(map_sigma_m, mask_sigma * reach_m) / sigma_m
 
 
 class _System(NamedTuple):
@@ -150,7 +153,8 @@ def _add_pairs(
             far = math.sqrt(dx * dx + dy * dy) * unit
             if far > limits.max_radius:
                 continue
-            own = _own_sigma(math.sqrt(area / w**3), unit, limits)
+            reach_m = unit * math.sqrt(area / w**3)
+            own = own_sigma(reach_m, limits.sigma_m, limits.map_sigma_m, limits.mask_sigma)
             weight = pairs.weight / (own**2 + (far / (2.0 * limits.sigma_m)) ** 2)
             add_row(system.normal, system.right, system.row, weight, dx if axis == 0 else dy)
     return True
@@ -212,7 +216,8 @@ def _search_roads(
         dy /= length
         # How far the road may lie follows from how sure the fit is here.
         point_row(p, u, v, -dy, dx, row)
-        own[i] = _own_sigma(area / (w * w * length), plane.unit, limits)
+        reach_m = plane.unit * area / (w * w * length)
+        own[i] = own_sigma(reach_m, limits.sigma_m, limits.map_sigma_m, limits.mask_sigma)
         sigma = limits.sigma_m * math.sqrt(own[i] ** 2 + _spread(row, factor, work))
         if 3.0 * sigma > limits.max_radius * max(1.0, own[i]):
             continue

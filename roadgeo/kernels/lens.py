@@ -9,6 +9,7 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
+from roadgeo.kernels.adjustment import own_sigma
 from roadgeo.kernels.arrays import Floats1, Floats2, Floats3
 from roadgeo.kernels.compilation import kernel
 from roadgeo.kernels.roads import nearest_road
@@ -179,7 +180,7 @@ def meet_roads(
             for r in range(9):
                 for c in range(9):
                     spread += row[axis, r] * inverse[r, c] * row[axis, c]
-        known = math.hypot(limits.map_sigma_m, limits.mask_sigma * reach * limits.unit) / limits.sigma_m
+        known = own_sigma(limits.unit * reach, limits.sigma_m, limits.map_sigma_m, limits.mask_sigma)
         sigma = limits.sigma_m * math.sqrt(known**2 + limits.slack**2 * max(spread, 0.0))
         if not 3.0 * sigma <= limits.max_radius * max(1.0, known):  # NaN neither
             continue

@@ -8,12 +8,12 @@ from dataclasses import replace
 import cv2
 import numpy as np
 
-from roadgeo._arrays import BoolArray, FloatArray
+from roadgeo._arrays import BoolArray
 from roadgeo.geometry.camera import sampling
 from roadgeo.matching.index import ReferenceIndex
 from roadgeo.matching.lens import LensOptions, straighten_scene
 from roadgeo.matching.lens_equations import LensEquations
-from roadgeo.matching.refinement import Refined, RefineOptions, corner_covariance, corner_sigmas
+from roadgeo.matching.refinement import Refined, RefineOptions, corner_covariance, corner_sigmas, robust_rms
 from roadgeo.matching.scene import Scene
 from roadgeo.matching.verification import VerifyOptions, map_agreement
 
@@ -33,8 +33,9 @@ _LEAST_SHOWN = 0.55
 #: reaches; and what no number of points improves: a part of the residuals' rms, and the mask's accuracy, pixels,
 #: beside that of the map (`RefineOptions.sigma_floor_m`).
 _OVERSTATED, _FAR, _FLOOR, _FLOOR_PX = 0.7, 0.5, 0.15, 0.1
-#: Residuals end at three standard deviations. Those beyond so many are near the end, and take so much off the slope of
-#: the pull: by their number and the pull there it would be 0.6, fitted it is more.
+#: Residuals end at three standard deviations: roads further off do not pull. Those beyond so many are near the end,
+#: many of them where a mask is bent. There the pull falls to nothing, and the fit is held less firmly: each takes so
+#: much off the slope of the pull. By their number and the pull there it would be 0.6, fitted it is more.
 _NEAR_END, _PULL_AT_END = 2.5, 1.1
 
 
@@ -50,8 +51,8 @@ def with_honest_corners(
     """Return a refined homography with the covariance of its corners measured anew.
 
     The fit takes all residuals for equally uncertain but for how far a pixel reaches. But far away errors keep their
-    sign over more ground. The middle of a lens is not known exactly. And where
-    only one part of the frame agrees, the rest may be seen through a lens that was not found, or not rightly.
+    sign over more ground. The middle of a lens is not known exactly. And where only one part of the frame agrees, the
+    rest may be seen through a lens that was not found, or not rightly.
 
     The matrix stays as it is, and so does the covariance where too few roads are met.
     """
@@ -63,7 +64,7 @@ def with_honest_corners(
     used = np.ones(len(seen.rows), bool)
     partly = False
     if agreeing < lens.enough:
-        _, cells = equations.cells(k1, lens.n_cells, _LEAST_SHARE)
+        cells = equations.cells(seen.which, lens.n_cells, _LEAST_SHARE)
         inside = cells[equations.cell_of(lens.n_cells)]
         near = reach < _AS_NEAR * np.median(reach[seen.which])
         if inside[near].mean() < _MOST_OF_FRAME and _only_there(refined, scene, index, cells, verify):
@@ -76,7 +77,8 @@ def with_honest_corners(
     rows, weights = everything[:, :free], equations.weight * cauchy / seen.own[used] ** 2
     scaled = weights[:, None] * rows
     inverse = np.linalg.pinv(scaled.T @ rows + np.diag(equations.prior(lens.sigma)[:free]), hermitian=True)
-    rms = _scale(seen.scaled[used], cauchy, (seen.residuals / seen.sigma)[used])
+    near_end = np.abs(seen.residuals / seen.sigma)[used] > _NEAR_END
+    rms = robust_rms(seen.scaled[used], cauchy, _PULL_AT_END * float(near_end.sum()))
     scatter = rms / equations.unit
     as_long = (1.0 if k1 or partly else _OVERSTATED) * np.maximum(1.0, reach / np.median(reach)) ** _FAR
     # sandwich estimate of an M-estimator's covariance (Huber 1981, 6.3)
@@ -108,16 +110,3 @@ def _only_there(refined: Refined, scene: Scene, index: ReferenceIndex, cells: Bo
         n_seen, n_shown = map_agreement(refined.matrix, visible, index, gsd, verify)
         shares.append(n_shown / max(n_seen, 1))
     return shares[1] < _LEAST_SHOWN * shares[0]
-
-
-def _scale(residuals: FloatArray, weights: FloatArray, deviations: FloatArray) -> float:
-    """Return the scale of residuals (M,) with Cauchy weights, as `robust_rms`, where they may end too soon.
-
-    Roads further off than three standard deviations do not pull. Of a bent mask many are: then the fit is held less
-    firmly than the slope of its pull says, which falls to nothing there. `deviations` are residuals in their standard
-    deviations.
-    """
-    at_end = _PULL_AT_END * float((np.abs(deviations) > _NEAR_END).sum())
-    slopes = float((weights * (2.0 * weights - 1.0)).sum()) - at_end
-    slopes = max(slopes, 0.1 * float(weights.sum()))
-    return math.sqrt(float(((weights * residuals) ** 2).sum()) * float(weights.sum())) / slopes

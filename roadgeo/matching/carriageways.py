@@ -52,9 +52,8 @@ def refine_between(
         if again is None:
             return refined, scene
         found, seen = again, moved
-    better = weight_on_roads(found.matrix, seen, index, options) >= weight_on_roads(
-        refined.matrix, scene, index, options
-    )
+    before = weight_on_roads(refined.matrix, scene, index, options)
+    better = weight_on_roads(found.matrix, seen, index, options) >= before
     return (found, seen) if better else (refined, scene)
 
 
@@ -84,7 +83,7 @@ def between_carriageways(
 
 
 def weight_on_roads(matrix: FloatArray, scene: Scene, index: ReferenceIndex, options: RefineOptions) -> float:
-    """Return the sum of the road points' weights in a fit."""
+    """Return the sum of the road points' weights in a fit of a view from straight above."""
     at, along, gsd = points_on_map(matrix, scene)
     sigma = math.hypot(options.sigma_m, options.sigma_px * float(np.median(gsd)))
     found = np.empty((len(at), 3))

@@ -361,8 +361,9 @@ class TripleEstimator:
         if any(share > agreeing.forward - _BETTER and self.same(other, model) for other, share in self._looked):
             return
         self._looked.append((model, agreeing.forward))
-        given = (refined.matrix, self.scene, index, agreeing.forward, self.refine_options, options.lens)
-        lens = find_lens(*given) or grow_whole(*given)
+        lens = find_lens(refined.matrix, self.scene, index, agreeing.forward, self.refine_options, options.lens)
+        if lens is None and agreeing.forward < options.lens.enough:
+            lens = grow_whole(refined.matrix, self.scene, index, self.refine_options, options.lens)
         if lens is None or self.judge(lens.matrix) is not None or self._is_far(lens.matrix):
             return
         seen = replace(model)

@@ -37,27 +37,28 @@ _WAYS = np.array([(1.0, 0.0), (-1.0, 0.0), (0.0, 1.0), (0.0, -1.0)])
 _BETTER = 0.006
 
 
-def measure_corners(estimator: TripleEstimator, best: Hypothesis | None) -> None:
-    """Refine a place that may be reported for the last time, and measure how sure its corners are."""
-    lens = estimator.options.lens
+def measure_corners(estimator: TripleEstimator, best: Hypothesis | None, score: float) -> None:
+    """Refine the best place of a map for the last time, and measure how sure its corners are.
+
+    Only one whose `score` may be reported is worth a fit to the whole frame: every part of a map has a best place.
+    """
+    lens, verify = estimator.options.lens, estimator.options.verify
     if best is None or best.refined is None or best.found is None or lens is None:
         return
-    scene = estimator.scene
+    scene, agreeing = estimator.scene, best.found.forward
     if best.refined.lens_k1 == 0.0:
-        _fit_whole_frame(estimator, best, best.refined)
+        doubtful = agreeing < _WHOLE and score >= verify.promising
+        if doubtful:
+            _fit_whole_frame(estimator, best, best.refined, agreeing)
         scene = _lay_between_carriageways(estimator, best, best.refined)
-        _look_beside(estimator, best, best.refined, scene)
-    agreeing, options = best.found.forward, estimator.refine_options
-    best.refined = with_honest_corners(
-        best.refined, scene, estimator.index, agreeing, options, lens, estimator.options.verify
-    )
+        if doubtful:
+            _look_beside(estimator, best, best.refined, scene)
+    options = estimator.refine_options
+    best.refined = with_honest_corners(best.refined, scene, estimator.index, agreeing, options, lens, verify)
 
 
-def _fit_whole_frame(estimator: TripleEstimator, best: Hypothesis, refined: Refined) -> None:
+def _fit_whole_frame(estimator: TripleEstimator, best: Hypothesis, refined: Refined, agreeing: float) -> None:
     """Refine a place with all cells of the frame, now that it is known."""
-    agreeing = 0.0 if best.found is None else best.found.forward
-    if agreeing >= _WHOLE:
-        return
     options = replace(estimator.refinement(best), least_share=0.0)
     found = refine(refined.matrix, estimator.scene, estimator.index, best.matched, options, held=True)
     if found is not None and estimator.judge(found.matrix) is None:
@@ -65,15 +66,13 @@ def _fit_whole_frame(estimator: TripleEstimator, best: Hypothesis, refined: Refi
 
 
 def _look_beside(estimator: TripleEstimator, best: Hypothesis, refined: Refined, scene: Scene) -> None:
-    """Where a part of the frame may have settled beside where it belongs, find that."""
-    if best.found is None or best.found.forward >= _WHOLE:
-        return
+    """Where a part of the frame has settled beside where it belongs, find that."""
     found = refine_beside(refined, scene, estimator.index, estimator.refinement(best))
     if found is not None and estimator.judge(found.matrix) is None:
         _take(estimator, best, found)
 
 
-def _take(estimator: TripleEstimator, best: Hypothesis, refined: Refined, least: float = 0.0) -> bool:
+def _take(estimator: TripleEstimator, best: Hypothesis, refined: Refined, least: float = 0.0) -> None:
     """Take a new fit for a place, if at least so much of the mask's roads agrees.
 
     What was found before stands: the odds rest on it.
@@ -82,10 +81,9 @@ def _take(estimator: TripleEstimator, best: Hypothesis, refined: Refined, least:
     gsd = sampling(refined.matrix, scene.size)
     found, matched, distance = agreement(refined.matrix, scene, estimator.index, gsd, seeds, estimator.options.verify)
     if found.forward < least:
-        return False
+        return
     best.refined, best.matrix, best.gsd_m = refined, refined.matrix, gsd
     best.matched, best.distance = matched, distance
-    return True
 
 
 def _lay_between_carriageways(estimator: TripleEstimator, best: Hypothesis, refined: Refined) -> Scene:

@@ -220,19 +220,12 @@ def find_lens(
 
 
 def grow_whole(
-    matrix: FloatArray,
-    scene: Scene,
-    index: ReferenceIndex,
-    agreeing: float,
-    refinement: RefineOptions,
-    options: LensOptions,
+    matrix: FloatArray, scene: Scene, index: ReferenceIndex, refinement: RefineOptions, options: LensOptions
 ) -> LensFit | None:
     """Grow a homography anew from the part of the frame that it lays on roads, without a lens.
 
-    It may have settled where only that part agrees. None where more than `options.enough` do, or hardly more come to.
+    It may have settled where only that part agrees. None where hardly more of the roads come to lie on roads.
     """
-    if agreeing >= options.enough:
-        return None
     before = LensEquations(matrix, scene, index, refinement).observe(0.0, np.zeros((9, 9)))
     found = fit_lens(matrix, scene, index, 0.0, refinement, options, held=True)
     better = found is not None and found.share > len(before.rows) / len(scene.points) + _BETTER

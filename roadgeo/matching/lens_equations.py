@@ -119,13 +119,12 @@ class LensEquations:
         It is made of those of the frame's `n_cells` x `n_cells` cells, around the best one, in which at least the part
         `least` of its share of points lies on roads.
         """
-        met, cells = self.cells(k1, n_cells, least)
-        inside = cells[self.cell_of(n_cells)]
+        met = self.observe(k1, np.zeros((9, 9))).which
+        inside = self.cells(met, n_cells, least)[self.cell_of(n_cells)]
         return met & inside, inside
 
-    def cells(self, k1: float, n_cells: int, least: float) -> tuple[BoolArray, BoolArray]:
-        """Return which points (S,) lie on roads, and the cells (n_cells, n_cells), rows first, of the core."""
-        met, n = self.observe(k1, np.zeros((9, 9))).which, n_cells
+    def cells(self, met: BoolArray, n: int, least: float) -> BoolArray:
+        """Return the cells (n, n), rows first, of the core, given which points (S,) lie on roads."""
         row, column = self.cell_of(n)
         counts = np.zeros((2, n, n))
         np.add.at(counts[0], (row, column), met)
@@ -136,7 +135,7 @@ class LensEquations:
         best = np.unravel_index(shares.argmax(), shares.shape)
         good = shares >= least * shares.max()
         _, parts = cv2.connectedComponents(good.astype(np.uint8), connectivity=4)
-        return met, np.asarray(parts == parts[best])
+        return np.asarray(parts == parts[best])
 
     def cell_of(self, n: int) -> tuple[IntArray, IntArray]:
         """Return the row and the column (S,) of the cell that each point lies in, of n x n."""

@@ -338,7 +338,7 @@ def _fits(
     proof: Proof | None,
 ) -> tuple[Fit, ...]:
     """Return the best place, the runner-up, and of the other promising ones the one that agrees best."""
-    measure_corners(estimator, result.best)
+    measure_corners(estimator, result.best, result.score)
     best = _fit(estimator, result.best, result.score)
     if best is not None and proof is not None:
         best = replace(best, by_twins=True, twin=proof.twin)

@@ -5,7 +5,7 @@ import pytest
 from kernels.test_roads import binned
 from naive import kernels as naive
 
-from roadgeo.kernels.adjustment import add_row, adjust, carry, point_row
+from roadgeo.kernels.adjustment import add_row, adjust, carry, own_sigma, point_row
 from roadgeo.kernels.structs import AdjustLimits, Held, Plane, PointPairs, RoadSamples
 
 P = np.array([0.9, -0.2, 0.05, 0.25, 1.1, -0.02, 0.12, -0.08])
@@ -99,6 +99,12 @@ def test_carry_maps_a_point_and_a_direction(uv):
     ahead = naive.jacobian(np.append(P, 1.0).reshape(3, 3), np.array(uv)) @ (0.6, -0.8)
     assert np.array([dx, dy]) / w == pytest.approx(ahead, abs=1e-6)
     assert length == pytest.approx(np.hypot(dx, dy))
+
+
+def test_a_point_is_less_sure_where_a_pixel_reaches_further():
+    usual = np.hypot(1.6, 0.003 * UNIT)  # the map's and the mask's part, metres
+    assert own_sigma(UNIT, usual, 1.6, 0.003) == pytest.approx(1.0)
+    assert own_sigma(5 * UNIT, usual, 1.6, 0.003) == pytest.approx(np.hypot(1.6, 5 * 0.003 * UNIT) / usual)
 
 
 def test_beyond_the_horizon_nothing_is_carried():

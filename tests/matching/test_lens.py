@@ -82,12 +82,11 @@ def test_what_fits_in_one_part_of_the_frame_grows_over_all_of_it_without_a_lens(
     start = bent_start(truth, scene, 0.0)
     corners = mapped(truth, scene.corners)
     assert np.hypot(*(mapped(start, scene.corners) - corners).T).max() > 60.0  # metres
-    given = (scene, town[1], 0.5, RefineOptions(), LensOptions())
+    given = (scene, town[1], RefineOptions(), LensOptions())
     found = grow_whole(start, *given)
     assert found.k1 == 0.0  # else it would be taken for one behind a lens
     assert np.hypot(*(mapped(found.matrix, scene.corners) - corners).T).max() < 2.0
     assert grow_whole(truth, *given) is None  # nothing is gained
-    assert grow_whole(start, scene, town[1], 0.9, RefineOptions(), LensOptions()) is None
 
 
 def test_a_wrong_place_does_not_grow_and_its_core_is_chance(town):
