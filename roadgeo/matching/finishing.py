@@ -33,6 +33,8 @@ _WHOLE, _LEAST_LOST = 0.9, 0.03
 #: pixels at least; and road points to see by.
 _BESIDE_M, _BESIDE_PX, _N_POINTS = (12.0, 24.0), 8.0, 200
 _WAYS = np.array([(1.0, 0.0), (-1.0, 0.0), (0.0, 1.0), (0.0, -1.0)])
+#: A fit has come back that puts no corner further off than this part of the least step.
+_BACK = 0.25
 #: Another fit is better where so much more of the road points lies on roads. Training masks: three of five hundred.
 _BETTER = 0.006
 
@@ -103,17 +105,28 @@ def refine_beside(refined: Refined, scene: Scene, index: ReferenceIndex, options
     found something better.
     """
     options, nothing = replace(options, least_share=0.0), np.full(len(scene.intersections), -1)
+    places = Homography(refined.matrix).everywhere(scene.corners)
+    back_m = _BACK * _step_m(refined.matrix, scene, _BESIDE_M[0])
 
     def weight(one: Refined) -> float:
         return weight_on_roads(one.matrix, scene, index, options)
 
-    starts = _beside(refined.matrix, scene)
-    tried = [refine(start, scene, index, nothing, options, _N_POINTS, held=True) for start in starts]
-    best = max((one for one in tried if one is not None), key=weight, default=None)
-    found = None if best is None else refine(best.matrix, scene, index, nothing, options, held=True)
+    def stays_away(one: Refined) -> bool:
+        return bool(np.hypot(*(Homography(one.matrix).everywhere(scene.corners) - places).T).max() > back_m)
+
+    tried = [
+        refine(start, scene, index, nothing, options, _N_POINTS, held=True) for start in _beside(refined.matrix, scene)
+    ]
+    away = [one for one in tried if one is not None and stays_away(one)]
+    found = refine(max(away, key=weight).matrix, scene, index, nothing, options, held=True) if away else None
     if found is None or weight(found) <= weight(refined) + _BETTER * len(scene.points):
         return None
     return found
+
+
+def _step_m(matrix: FloatArray, scene: Scene, least_m: float) -> float:
+    """Return how far a corner is moved, metres: further than `least_m` where pixels are large."""
+    return max(least_m, _BESIDE_PX * sampling(matrix, scene.size))
 
 
 def _beside(matrix: FloatArray, scene: Scene) -> list[FloatArray]:
@@ -121,11 +134,10 @@ def _beside(matrix: FloatArray, scene: Scene) -> list[FloatArray]:
     corners = scene.corners.astype(np.float32)
     places = Homography(matrix).everywhere(scene.corners)
     middle = places.mean(axis=0)
-    least = _BESIDE_PX * sampling(matrix, scene.size)
     back = np.array([[1.0, 0.0, middle[0]], [0.0, 1.0, middle[1]], [0.0, 0.0, 1.0]])
     found = []
     for k in range(4):
-        for step in (max(one, least) * way for one in _BESIDE_M for way in _WAYS):
+        for step in (_step_m(matrix, scene, one) * way for one in _BESIDE_M for way in _WAYS):
             there = places - middle
             there[k] += step
             found.append(np.asarray(back @ cv2.getPerspectiveTransform(corners, there.astype(np.float32)), float))
