@@ -101,10 +101,12 @@ def test_carry_maps_a_point_and_a_direction(uv):
     assert length == pytest.approx(np.hypot(dx, dy))
 
 
-def test_a_point_is_less_sure_where_a_pixel_reaches_further():
+@pytest.mark.parametrize("times", [0.5, 1.5, 5.0])
+def test_a_point_is_less_sure_where_a_pixel_reaches_further(times):
     usual = np.hypot(1.6, 0.003 * UNIT)  # the map's and the mask's part, metres
-    assert own_sigma(UNIT, usual, 1.6, 0.003) == pytest.approx(1.0)
-    assert own_sigma(5 * UNIT, usual, 1.6, 0.003) == pytest.approx(np.hypot(1.6, 5 * 0.003 * UNIT) / usual)
+    sigma = own_sigma(times * UNIT, usual, 1.6, 0.003)
+    assert sigma == pytest.approx(naive.own_sigma(times * UNIT, usual, 1.6, 0.003))
+    assert (sigma > 1.0) == (times > 1.0)
 
 
 def test_beyond_the_horizon_nothing_is_carried():

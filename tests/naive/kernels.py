@@ -363,6 +363,11 @@ def grow_by_roads(ps, unit, origins, tolerance, points, directions, stages, segm
     return scores
 
 
+def own_sigma(reach_m, sigma_m, map_sigma_m, mask_sigma):
+    """The map's and the mask's part of how unsure a point is, in that of the middle of the frame."""
+    return np.sqrt(map_sigma_m**2 + (mask_sigma * reach_m) ** 2) / sigma_m
+
+
 def adjust(
     p, unit, origin, points, directions, point_cells, point_weight, pairs, targets, pair_cells, pair_weight,
     held, held_targets, held_weight, n_cells, least_share, max_radius, min_cos, sigma_m, map_sigma_m, mask_sigma,
@@ -378,7 +383,7 @@ def adjust(
             gap = target - predict(p, *pair)
             if shares[cell] >= least_share and np.hypot(*gap) * unit <= max_radius:
                 reach = unit * np.sqrt(abs(np.linalg.det(jacobian(np.append(p, 1.0).reshape(3, 3), pair))))
-                own = np.hypot(map_sigma_m, mask_sigma * reach) / sigma_m
+                own = own_sigma(reach, sigma_m, map_sigma_m, mask_sigma)
                 weight = pair_weight / (own**2 + (np.hypot(*gap) * unit / (2 * sigma_m)) ** 2)
                 rows += list(predict_rows(p, *pair))
                 weights += [weight, weight]
@@ -397,7 +402,7 @@ def adjust(
                 reach = unit * abs(np.linalg.det(local)) / np.hypot(*along)
                 along /= np.hypot(*along)
                 row = np.array([-along[1], along[0]]) @ predict_rows(p, *point)
-                own = np.hypot(map_sigma_m, mask_sigma * reach) / sigma_m
+                own = own_sigma(reach, sigma_m, map_sigma_m, mask_sigma)
                 sigma = sigma_m * np.sqrt(own**2 + row @ np.linalg.inv(normal) @ row)
                 if 3 * sigma > max_radius * max(1.0, own):
                     continue

@@ -2,7 +2,7 @@
 
 import numpy as np
 
-from naive.kernels import nearest_road
+from naive.kernels import nearest_road, own_sigma
 from roadgeo.geometry.homography import Homography
 from roadgeo.geometry.lens import Lens
 
@@ -32,7 +32,7 @@ def meet_roads(p, k1, half_side, points, directions, inverse, limits, segments):
     reaches = reach(p, k1, half_side, points, directions)
     for place, along, row, far in zip(*lens_rows(p, k1, half_side, points, directions), reaches, strict=True):
         spread = np.trace(row @ inverse @ row.T)
-        own = np.hypot(limits.map_sigma_m, limits.mask_sigma * limits.unit * far) / limits.sigma_m
+        own = own_sigma(limits.unit * far, limits.sigma_m, limits.map_sigma_m, limits.mask_sigma)
         sigma = limits.sigma_m * np.sqrt(own**2 + limits.slack**2 * max(spread, 0.0))
         here = limits.unit * place + (limits.x, limits.y)
         if not 3.0 * sigma <= limits.max_radius * max(1.0, own) or np.isnan(here).any():
