@@ -13,6 +13,7 @@ from roadgeo.geometry.camera import sampling
 from roadgeo.matching.index import ReferenceIndex
 from roadgeo.matching.lens import LensOptions, straighten_scene
 from roadgeo.matching.lens_equations import LensEquations
+from roadgeo.matching.other_roads import corners_of_doubt
 from roadgeo.matching.refinement import Refined, RefineOptions, corner_covariance, corner_sigmas, robust_rms
 from roadgeo.matching.scene import Scene
 from roadgeo.matching.verification import VerifyOptions, map_agreement
@@ -32,7 +33,7 @@ _LEAST_SHOWN = 0.55
 #: too much, where no lens was found; over how much more ground errors keep their sign far away, by how far a pixel
 #: reaches; and what no number of points improves: a part of the residuals' rms, and the mask's accuracy, pixels,
 #: beside that of the map (`RefineOptions.sigma_floor_m`).
-_OVERSTATED, _FAR, _FLOOR, _FLOOR_PX = 0.7, 0.5, 0.15, 0.1
+_OVERSTATED, _FAR, _FLOOR, _FLOOR_PX = 0.67, 0.5, 0.15, 0.1
 #: Residuals end at three standard deviations: roads further off do not pull. Those beyond so many are near the end,
 #: many of them where a mask is bent. There the pull falls to nothing, and the fit is held less firmly: each takes so
 #: much off the slope of the pull. By their number and the pull there it would be 0.6, fitted it is more.
@@ -76,13 +77,15 @@ def with_honest_corners(
     free = 9 if k1 or partly else 8
     rows, weights = everything[:, :free], equations.weight * cauchy / seen.own[used] ** 2
     scaled = weights[:, None] * rows
-    inverse = np.linalg.pinv(scaled.T @ rows + np.diag(equations.prior(lens.sigma)[:free]), hermitian=True)
+    normal = scaled.T @ rows + np.diag(equations.prior(lens.sigma)[:free])
+    inverse = np.asarray(np.linalg.pinv(normal, hermitian=True), float)
     near_end = np.abs(seen.residuals / seen.sigma)[used] > _NEAR_END
     rms = robust_rms(seen.scaled[used], cauchy, _PULL_AT_END * float(near_end.sum()))
     scatter = rms / equations.unit
     as_long = (1.0 if k1 or partly else _OVERSTATED) * np.maximum(1.0, reach / np.median(reach)) ** _FAR
     # sandwich estimate of an M-estimator's covariance (Huber 1981, 6.3)
     covariance = scatter**2 * inverse @ (scaled.T * as_long**2 @ rows) @ inverse
+    covariance = covariance + corners_of_doubt(equations, k1, seen, used, inverse, rows, weights)
     if partly:  # a lens that is told from none where k1 is so many times its deviation may be anything below that
         unseen = min(lens.sigma, lens.significance / math.sqrt(3.0) * math.sqrt(covariance[8, 8]))
         by_k1 = covariance[:, 8] / covariance[8, 8]

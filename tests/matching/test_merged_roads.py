@@ -104,14 +104,14 @@ def test_thenearest_of_some_points(n, m, away, seed):
             assert number == -1
 
 
-def motorways(network, where, apart_m=14.0):
-    """A network of which each road with its middle where `where` says is two carriageways."""
+def motorways(network, where, apart_m=14.0, sides=(1, -1)):
+    """A network of which each road with its middle where `where` says is two carriageways, or one of them."""
     graph, lines = network.graph, []
     for e in range(graph.n_edges):
         line = graph.coords[graph.offsets[e] : graph.offsets[e + 1]]
         if where(line.mean(axis=0)):
             road = shapely.LineString(line)
-            lines += [np.asarray(road.offset_curve(side * apart_m / 2).coords) for side in (1, -1)]
+            lines += [np.asarray(road.offset_curve(side * apart_m / 2).coords) for side in sides]
         else:
             lines.append(line)
     lines = [line for line in lines if len(line) > 1]

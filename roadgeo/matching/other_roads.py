@@ -1,0 +1,95 @@
+"""Doubt which road was met: where the map has another one beside it, and the mask does not show both.
+
+Of two carriageways a mask may show the other one, or have made one road of them. Where a corner of the frame hangs on
+such a road, it may be off by how far they are apart; the residuals know nothing of that.
+"""
+
+from __future__ import annotations
+
+import math
+
+import numpy as np
+
+from roadgeo._arrays import BoolArray, FloatArray
+from roadgeo.kernels.parallel_roads import points_beside
+from roadgeo.kernels.residuals import road_residuals
+from roadgeo.matching.lens_equations import LensEquations, Observed
+
+__all__ = ["corners_of_doubt"]
+
+#: Another road lies so far beside the one that was met, metres, and runs its way to so many degrees.
+_BESIDE_M, _GIVE_OR_TAKE_M, _MAX_TURN_DEG = 13.0, 9.0, 12.0
+#: The mask shows it where it has a road point within so many metres across, and along: or so many steps between points.
+_SHOWN_M, _ALONG_M, _ALONG_STEPS = 5.0, 8.0, 1.2
+#: Roads are taken to be off together that run the same way, of so many, and have the other road on the same side.
+_WAYS, _FEWEST = 4, 3
+#: How likely such roads are the other ones; less where the rest of the frame stands against it: half as likely where
+#: the sum of its squares would grow by so many. Fitted to the corners of training masks.
+_LIKELY, _AGAINST = 0.1, 50.0
+
+
+def corners_of_doubt(
+    equations: LensEquations,
+    k1: float,
+    seen: Observed,
+    used: BoolArray,
+    inverse: FloatArray,
+    rows: FloatArray,
+    weights: FloatArray,
+) -> FloatArray:
+    """Return what the parameters' covariance (P, P) gains by doubt which roads were met.
+
+    Parameters
+    ----------
+    seen : Observed
+        The roads that were met, of which those `used` (M,) take part.
+    inverse : (P, P)
+        Of the normal matrix.
+    rows, weights : (U, P), (U,)
+        Derivatives of the U points that take part, and their weights.
+    """
+    beside = _unshown(equations, k1, seen)[:, used] / equations.unit
+    normals = _normals(seen)[used]
+    way = np.mod(np.floor(np.mod(np.arctan2(normals[:, 1], normals[:, 0]), np.pi) * (_WAYS / np.pi)), _WAYS)
+    gained = np.zeros_like(inverse)
+    for offsets in beside:
+        for number in range(_WAYS):
+            there = np.isfinite(offsets) & (way == number)
+            if there.sum() < _FEWEST:
+                continue
+            off = np.where(there, offsets, 0.0)
+            pull = rows.T @ (weights * off)
+            moved = inverse @ pull
+            against = (float(weights @ off**2) - float(pull @ moved)) * (equations.unit / equations.sigma_m) ** 2
+            gained += _LIKELY / (1.0 + against / _AGAINST) * np.outer(moved, moved)
+    return gained
+
+
+def _normals(seen: Observed) -> FloatArray:
+    """Return unit vectors (M, 2) across the roads that were met."""
+    across = seen.rows[:, [2, 5]]
+    return np.asarray(across / np.linalg.norm(across, axis=1, keepdims=True))
+
+
+def _unshown(equations: LensEquations, k1: float, seen: Observed) -> FloatArray:
+    """Return how far beside each road that was met lies another one that the mask does not show, (2, M) metres.
+
+    To either side, counted along the normals; NaN where there is none.
+    """
+    scene, (places, _) = equations.scene, equations.rows(k1)
+    shown = places * equations.unit + equations.origin
+    normals, found = _normals(seen), np.empty((2, len(seen.rows)))
+    along = np.ascontiguousarray(normals[:, ::-1] * (1.0, -1.0))
+    feet = shown[seen.which] + seen.residuals[:, None] * normals
+    upwards = np.where(np.arctan2(normals[:, 1], normals[:, 0]) < 0.0, -1.0, 1.0)
+    reach, min_cos = np.full(len(feet), _GIVE_OR_TAKE_M), math.cos(math.radians(_MAX_TURN_DEG))
+    step_m = scene.road_length_px / max(len(scene.points), 1) * equations.unit / scene.half_size
+    way, is_shown = np.empty((len(feet), 3)), np.empty(len(feet), np.bool_)
+    for side, beside in zip((-1.0, 1.0), found, strict=True):
+        start = np.ascontiguousarray(feet + _BESIDE_M * (side * upwards)[:, None] * normals)
+        road_residuals(start, along, reach, min_cos, equations.roads, way)
+        beside[:] = ((start + way[:, :1] * way[:, 1:] - feet) * normals).sum(axis=1)
+        there = shown[seen.which] + beside[:, None] * normals
+        points_beside(there, along, shown, _SHOWN_M, max(_ALONG_M, _ALONG_STEPS * step_m), is_shown)
+        beside[is_shown] = np.nan
+    return found
