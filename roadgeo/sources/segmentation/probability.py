@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import os
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 
 import cv2
@@ -38,12 +38,15 @@ class ProbabilityMap:
         Of the photograph.
     model : str
         What made it.
+    pixel : float
+        Pixels of the photograph for each of these, along a side.
     """
 
     values: AnyArray
     threshold: float = 0.5
     name: str = ""
     model: str = ""
+    pixel: float = 1.0
 
     def mask(self, threshold: float) -> RoadMask:
         """Return where the probability exceeds a threshold.
@@ -70,12 +73,13 @@ class ProbabilityMap:
         if not seen.all():
             known = cv2.resize(seen.view(np.uint8), size, interpolation=cv2.INTER_NEAREST)
             values = np.where(known > 0, np.minimum(values, PROBABILITY_SURE), NODATA).astype(np.uint8)
-        return ProbabilityMap(
-            np.minimum(values, PROBABILITY_SURE) if seen.all() else values, self.threshold, self.name, self.model
-        )
+        values = np.minimum(values, PROBABILITY_SURE) if seen.all() else values
+        return replace(self, values=values, pixel=self.pixel * self.values.shape[1] / shape[1])
 
     def write(self, path: str | os.PathLike[str]) -> None:
         """Write a GeoTIFF on the photograph's pixel grid, with nodata where nothing was observed.
+
+        Of a large photograph on a coarser grid, which lies on the photograph when both are opened in QGIS.
 
         Raises
         ------
@@ -91,6 +95,8 @@ class ProbabilityMap:
 
         height, width = self.values.shape
         profile = {"driver": "GTiff", "count": 1, "dtype": "uint8", "compress": "deflate", "nodata": NODATA}
+        if abs(self.pixel * width - width) > 0.5:
+            profile["transform"] = rasterio.Affine.scale(self.pixel, -self.pixel)
         tags = {TAG: "probability of road, 0 to 254", "MODEL": self.model, "THRESHOLD": f"{self.threshold:g}"}
         with replacing(Path(path), sync=False) as staged, warnings.catch_warnings():
             warnings.simplefilter("ignore", NotGeoreferencedWarning)
@@ -127,7 +133,7 @@ def fuse(maps: Sequence[ProbabilityMap]) -> ProbabilityMap:
     share = 1.0 / (1.0 + np.exp(-total / np.maximum(count, 1)))
     fused = np.where(count > 0, np.rint(254 * share), NODATA).astype(np.uint8)
     models = dict.fromkeys(one.model for one in maps)
-    return ProbabilityMap(fused, 0.5, first.name, " + ".join(models))
+    return ProbabilityMap(fused, 0.5, first.name, " + ".join(models), first.pixel)
 
 
 def _log_odds(values: AnyArray, threshold: float) -> AnyArray:

@@ -90,7 +90,8 @@ def segment(
         done, rest = done + n, rows[n * step :]
         say(what, done * step / shape[0])
     values[~ground] = NODATA
-    return ProbabilityMap(values, network.card.threshold, photograph.name, network.name)
+    pixel = photograph.width / values.shape[1]
+    return ProbabilityMap(values, network.card.threshold, photograph.name, network.name, pixel)
 
 
 def _look(network: Network, ways: int, tile: AnyArray) -> Float32Array:

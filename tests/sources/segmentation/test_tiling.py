@@ -167,6 +167,21 @@ def test_a_map_is_kept_with_nodata(tmp_path: Path) -> None:
         assert dataset.tags()["THRESHOLD"] == "0.4"
 
 
+def test_a_map_of_a_large_photograph_lies_on_it(tmp_path: Path) -> None:
+    """QGIS draws what has no transform from 0, a unit a pixel, downwards; so are the roads that are traced drawn."""
+    seen = ProbabilityMap(np.full((700, 800), 12, np.uint8)).resized((70, 80))
+    seen.write(tmp_path / "photo_mask.tif")
+    with rasterio.open(tmp_path / "photo_mask.tif") as dataset:
+        assert tuple(dataset.bounds) == (0.0, -700.0, 800.0, 0.0)
+        assert dataset.crs is None
+
+
+def test_a_map_on_the_photographs_pixels_has_no_transform(tmp_path: Path) -> None:
+    ProbabilityMap(np.full((71, 83), 12, np.uint8), pixel=1.0001).write(tmp_path / "photo_mask.tif")
+    with rasterio.open(tmp_path / "photo_mask.tif") as dataset:
+        assert dataset.transform.is_identity
+
+
 def test_another_grid_keeps_what_was_not_observed() -> None:
     values = np.full((60, 80), 200, np.uint8)
     values[:, :40] = NODATA
