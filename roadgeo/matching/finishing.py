@@ -30,8 +30,8 @@ __all__ = ["measure_corners", "refine_beside"]
 #: belongs; a fit to all cells loses hardly any of them.
 _WHOLE, _LEAST_LOST = 0.9, 0.03
 #: How far corners are moved, one by one, to see whether the fit comes back, as carriageways are apart: metres, and
-#: pixels at least; and road points to see by.
-_BESIDE_M, _BESIDE_PX, _N_POINTS = (12.0, 24.0), 8.0, 200
+#: pixels at least, as many as that is in the middle of the frame; road points to see by; and how often at most.
+_BESIDE_M, _BESIDE_PX, _N_POINTS, _MOST_ROUNDS = (12.0, 24.0), 8.0, 200, 5
 _WAYS = np.array([(1.0, 0.0), (-1.0, 0.0), (0.0, 1.0), (0.0, -1.0)])
 #: A fit has come back that puts no corner further off than this part of the least step.
 _BACK = 0.25
@@ -54,7 +54,7 @@ def measure_corners(estimator: TripleEstimator, best: Hypothesis | None, score: 
             _fit_whole_frame(estimator, best, best.refined, agreeing)
         scene = _lay_between_carriageways(estimator, best, best.refined)
         if doubtful:
-            _look_beside(estimator, best, best.refined, scene)
+            agreeing = _look_beside(estimator, best, best.refined, scene, agreeing)
     options = estimator.refine_options
     best.refined = with_honest_corners(best.refined, scene, estimator.index, agreeing, options, lens, verify)
 
@@ -67,25 +67,33 @@ def _fit_whole_frame(estimator: TripleEstimator, best: Hypothesis, refined: Refi
         _take(estimator, best, found, agreeing - _LEAST_LOST)
 
 
-def _look_beside(estimator: TripleEstimator, best: Hypothesis, refined: Refined, scene: Scene) -> None:
-    """Where a part of the frame has settled beside where it belongs, find that."""
-    found = refine_beside(refined, scene, estimator.index, estimator.refinement(best))
-    if found is not None and estimator.judge(found.matrix) is None:
-        _take(estimator, best, found)
+def _look_beside(
+    estimator: TripleEstimator, best: Hypothesis, refined: Refined, scene: Scene, agreeing: float
+) -> float:
+    """Where a part of the frame has settled beside where it belongs, find that, and go on from there.
+
+    Return how much of the mask's roads agrees then: as much as before where nothing was found.
+    """
+    for _ in range(_MOST_ROUNDS):
+        found = refine_beside(refined, scene, estimator.index, estimator.refinement(best))
+        if found is None or estimator.judge(found.matrix) is not None:
+            break
+        refined, agreeing = found, _take(estimator, best, found)
+    return agreeing
 
 
-def _take(estimator: TripleEstimator, best: Hypothesis, refined: Refined, least: float = 0.0) -> None:
-    """Take a new fit for a place, if at least so much of the mask's roads agrees.
+def _take(estimator: TripleEstimator, best: Hypothesis, refined: Refined, least: float = 0.0) -> float:
+    """Take a new fit for a place, if at least so much of the mask's roads agrees; return how much does.
 
     What was found before stands: the odds rest on it.
     """
     scene, seeds = estimator.scene, best.seeds[-MINIMAL:]
     gsd = sampling(refined.matrix, scene.size)
     found, matched, distance = agreement(refined.matrix, scene, estimator.index, gsd, seeds, estimator.options.verify)
-    if found.forward < least:
-        return
-    best.refined, best.matrix, best.gsd_m = refined, refined.matrix, gsd
-    best.matched, best.distance = matched, distance
+    if found.forward >= least:
+        best.refined, best.matrix, best.gsd_m = refined, refined.matrix, gsd
+        best.matched, best.distance = matched, distance
+    return found.forward
 
 
 def _lay_between_carriageways(estimator: TripleEstimator, best: Hypothesis, refined: Refined) -> Scene:
@@ -130,15 +138,19 @@ def _step_m(matrix: FloatArray, scene: Scene, least_m: float) -> float:
 
 
 def _beside(matrix: FloatArray, scene: Scene) -> list[FloatArray]:
-    """Return homographies (3, 3) that put one corner of the frame elsewhere, and the others where `matrix` does."""
-    corners = scene.corners.astype(np.float32)
-    places = Homography(matrix).everywhere(scene.corners)
+    """Return homographies (3, 3) that put one corner of the frame elsewhere, and the others where `matrix` does.
+
+    By as many pixels in each corner: what a steep view shows far away may be off by more ground.
+    """
+    corners, gsd = scene.corners.astype(np.float32), sampling(matrix, scene.size)
+    places, by_pixel = Homography(matrix).everywhere(scene.corners), Homography(matrix).jacobian(scene.corners)
     middle = places.mean(axis=0)
     back = np.array([[1.0, 0.0, middle[0]], [0.0, 1.0, middle[1]], [0.0, 0.0, 1.0]])
     found = []
     for k in range(4):
-        for step in (_step_m(matrix, scene, one) * way for one in _BESIDE_M for way in _WAYS):
-            there = places - middle
-            there[k] += step
-            found.append(np.asarray(back @ cv2.getPerspectiveTransform(corners, there.astype(np.float32)), float))
+        for step in (_step_m(matrix, scene, one) for one in _BESIDE_M):
+            for away in step / gsd * _WAYS @ by_pixel[k].T:
+                there = places - middle
+                there[k] += away * max(1.0, step / float(np.hypot(*away)))
+                found.append(np.asarray(back @ cv2.getPerspectiveTransform(corners, there.astype(np.float32)), float))
     return found

@@ -35,6 +35,18 @@ def test_a_corner_beside_where_it_belongs_comes_back(town, corner):
     assert gaps(found.matrix, truth, scene).max() < 1.5
 
 
+@pytest.mark.parametrize(("seed", "missing", "share"), [(7, 0.5, 0.2), (9, 0.7, 0.3), (11, 0.5, 0.3), (13, 0.7, 0.2)])
+def test_the_far_corner_of_a_steep_view_comes_back_from_far_away(town, seed, missing, share):
+    """There a pixel reaches over much ground, and so does what the fit may have settled on."""
+    truth, scene = sight_of(town[0], seed, tilt=45, sight=Sight(1.0, missing, 0.5))
+    way = mapped(truth, scene.corners) - mapped(truth, scene.corners).mean(axis=0)
+    far = int(np.hypot(*way.T).argmax())
+    beside = Refined(moved(truth, scene, far, share * way[far]), np.ones(4), 1.0, np.eye(8))
+    found = refine_beside(beside, scene, town[1], RefineOptions())
+    assert gaps(beside.matrix, truth, scene).max() > 400.0
+    assert gaps(found.matrix, truth, scene).max() < 2.0
+
+
 def test_where_all_belongs_nothing_better_is_found(town):
     truth, scene = sight_of(town[0], 5, tilt=15, sight=Sight(0.6))
     assert refine_beside(Refined(truth, np.ones(4), 1.0, np.eye(8)), scene, town[1], RefineOptions()) is None
