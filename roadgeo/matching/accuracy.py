@@ -13,7 +13,7 @@ from roadgeo.geometry.camera import sampling
 from roadgeo.matching.index import ReferenceIndex
 from roadgeo.matching.lens import LensOptions, straighten_scene
 from roadgeo.matching.lens_equations import LensEquations
-from roadgeo.matching.other_roads import corners_of_doubt
+from roadgeo.matching.other_roads import covariance_of_doubt
 from roadgeo.matching.refinement import Refined, RefineOptions, corner_covariance, corner_sigmas, robust_rms
 from roadgeo.matching.scene import Scene
 from roadgeo.matching.verification import VerifyOptions, map_agreement
@@ -85,7 +85,7 @@ def with_honest_corners(
     as_long = (1.0 if k1 or partly else _OVERSTATED) * np.maximum(1.0, reach / np.median(reach)) ** _FAR
     # sandwich estimate of an M-estimator's covariance (Huber 1981, 6.3)
     covariance = scatter**2 * inverse @ (scaled.T * as_long**2 @ rows) @ inverse
-    covariance = covariance + corners_of_doubt(equations, k1, seen, used, inverse, rows, weights)
+    covariance = covariance + covariance_of_doubt(equations, k1, seen, used, inverse, rows, weights)
     if partly:  # a lens that is told from none where k1 is so many times its deviation may be anything below that
         unseen = min(lens.sigma, lens.significance / math.sqrt(3.0) * math.sqrt(covariance[8, 8]))
         by_k1 = covariance[:, 8] / covariance[8, 8]

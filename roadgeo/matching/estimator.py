@@ -364,7 +364,7 @@ class TripleEstimator:
         lens = find_lens(refined.matrix, self.scene, index, agreeing.forward, self.refine_options, options.lens)
         if lens is None and agreeing.forward < options.lens.enough:
             lens = grow_whole(refined.matrix, self.scene, index, self.refine_options, options.lens)
-        if lens is None or self.judge(lens.matrix) is not None or self._is_far(lens.matrix):
+        if lens is None or not self.may_be(lens.matrix):
             return
         seen = replace(model)
         self._see_through(seen, lens)
@@ -400,7 +400,7 @@ class TripleEstimator:
                 places.append(one)
         for one in places:
             found = regrow(one.matrix, scene, index, refinement, options)
-            if found is None or self.judge(found.matrix) is not None or self._is_far(found.matrix):
+            if found is None or not self.may_be(found.matrix):
                 yield []
             elif is_significant(found, scene, options):
                 self.n_verified += 1
@@ -448,6 +448,10 @@ class TripleEstimator:
     def judge(self, matrix: FloatArray, rough: bool = False) -> CameraFault | None:
         """Return why a homography is not plausible for the camera, or None if it is."""
         return judge(matrix, self.scene.size, self.options.camera, rough)
+
+    def may_be(self, matrix: FloatArray) -> bool:
+        """Whether a homography is plausible for the camera, and puts the frame where the user said that it lies."""
+        return self.judge(matrix) is None and not self._is_far(matrix)
 
     def _is_far(self, matrix: FloatArray) -> bool:
         """Whether the middle of the frame lies outside the circle, or the box, that the user gave."""

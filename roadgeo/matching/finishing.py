@@ -63,7 +63,7 @@ def _fit_whole_frame(estimator: TripleEstimator, best: Hypothesis, refined: Refi
     """Refine a place with all cells of the frame, now that it is known."""
     options = replace(estimator.refinement(best), least_share=0.0)
     found = refine(refined.matrix, estimator.scene, estimator.index, best.matched, options, held=True)
-    if found is not None and estimator.judge(found.matrix) is None:
+    if found is not None and estimator.may_be(found.matrix):
         _take(estimator, best, found, agreeing - _LEAST_LOST)
 
 
@@ -76,7 +76,7 @@ def _look_beside(
     """
     for _ in range(_MOST_ROUNDS):
         found = refine_beside(refined, scene, estimator.index, estimator.refinement(best))
-        if found is None or estimator.judge(found.matrix) is not None:
+        if found is None or not estimator.may_be(found.matrix):
             break
         refined, agreeing = found, _take(estimator, best, found)
     return agreeing
@@ -100,7 +100,7 @@ def _lay_between_carriageways(estimator: TripleEstimator, best: Hypothesis, refi
     """Lay the middle of a mask's two roads on the map's one; return the scene with road points there."""
     scene, index = estimator.scene, estimator.index
     found, seen = refine_between(refined, scene, index, best.matched, estimator.refinement(best))
-    if seen is scene or estimator.judge(found.matrix) is not None:
+    if seen is scene or not estimator.may_be(found.matrix):
         return scene
     _take(estimator, best, found)
     return seen

@@ -15,7 +15,7 @@ from roadgeo.kernels.parallel_roads import points_beside
 from roadgeo.kernels.residuals import road_residuals
 from roadgeo.matching.lens_equations import LensEquations, Observed
 
-__all__ = ["corners_of_doubt"]
+__all__ = ["covariance_of_doubt"]
 
 #: Another road lies so far beside the one that was met, metres, and runs its way to so many degrees.
 _BESIDE_M, _GIVE_OR_TAKE_M, _MAX_TURN_DEG = 13.0, 9.0, 12.0
@@ -28,7 +28,7 @@ _WAYS, _FEWEST = 4, 3
 _LIKELY, _AGAINST = 0.1, 50.0
 
 
-def corners_of_doubt(
+def covariance_of_doubt(
     equations: LensEquations,
     k1: float,
     seen: Observed,

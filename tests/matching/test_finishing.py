@@ -6,7 +6,7 @@ import pytest
 from worlds.scenes import Sight, mapped, sight_of
 
 from roadgeo.geometry.camera import sampling
-from roadgeo.matching.estimator import TripleEstimator
+from roadgeo.matching.estimator import MatchOptions, TripleEstimator
 from roadgeo.matching.finishing import measure_corners, refine_beside
 from roadgeo.matching.hypothesis import Hypothesis
 from roadgeo.matching.refinement import Refined, RefineOptions
@@ -58,14 +58,18 @@ def test_far_from_all_roads_nothing_is_found(town):
     assert refine_beside(Refined(nowhere, np.ones(4), 1.0, np.eye(8)), scene, town[1], RefineOptions()) is None
 
 
-@pytest.mark.parametrize(("score", "agreeing", "mended"), [(10.0, 0.7, True), (10.0, 0.95, False), (0.0, 0.7, False)])
-def test_only_places_that_may_be_reported_are_looked_beside(town, score, agreeing, mended):
+@pytest.mark.parametrize(
+    ("score", "agreeing", "within", "mended"),
+    [(10.0, 0.7, None, True), (10.0, 0.95, None, False), (0.0, 0.7, None, False), (10.0, 0.7, (0, 0, 1, 1), False)],
+    ids=["doubtful", "whole", "weak", "elsewhere"],
+)
+def test_only_places_that_may_be_reported_are_looked_beside(town, score, agreeing, within, mended):
     """Every part of a map has a best place: to look beside all of them would take longer than to search."""
     truth, scene = sight_of(town[0], 5, tilt=15, sight=Sight(0.6))
     matrix, nothing = moved(truth, scene, 1, (14.0, -9.0)), np.full(len(scene.intersections), -1)
     beside, found = Refined(matrix, np.ones(4), 1.0, np.eye(8)), Agreement(0, 10, agreeing, 0.8, 100)
     gsd = sampling(matrix, scene.size)
     best = Hypothesis(matrix, nothing[:0], 1.0, nothing, refined=beside, found=found, gsd_m=gsd)
-    measure_corners(TripleEstimator(scene, town[1]), best, score)
+    measure_corners(TripleEstimator(scene, town[1], MatchOptions(within=within)), best, score)
     assert (gaps(best.refined.matrix, truth, scene).max() < 1.5) == mended
     assert best.found is found  # the odds rest on it

@@ -9,7 +9,7 @@ from roadgeo.matching.accuracy import with_honest_corners
 from roadgeo.matching.index import IndexOptions, build_index
 from roadgeo.matching.lens import LensOptions
 from roadgeo.matching.lens_equations import LensEquations
-from roadgeo.matching.other_roads import corners_of_doubt
+from roadgeo.matching.other_roads import covariance_of_doubt
 from roadgeo.matching.refinement import RefineOptions, refine
 from roadgeo.matching.verification import VerifyOptions
 
@@ -44,7 +44,7 @@ def doubt(scene, index):
     rows, used = seen.rows[:, :8], np.ones(len(seen.rows), bool)
     weights = equations.weight * seen.cauchy / seen.own**2
     inverse = np.linalg.pinv((weights[:, None] * rows).T @ rows + np.diag(equations.prior(0.3)[:8]), hermitian=True)
-    return corners_of_doubt(equations, 0.0, seen, used, inverse, rows, weights)
+    return covariance_of_doubt(equations, 0.0, seen, used, inverse, rows, weights)
 
 
 def claimed(scene, index):
@@ -87,4 +87,4 @@ def test_no_roads_no_doubt(carriageways):
     equations = LensEquations(TRUTH, one.of_points(slice(0)), index, RefineOptions())
     seen = equations.observe(0.0, np.zeros((9, 9)))
     nothing = np.zeros(0, bool)
-    assert not corners_of_doubt(equations, 0.0, seen, nothing, np.eye(8), np.zeros((0, 8)), np.zeros(0)).any()
+    assert not covariance_of_doubt(equations, 0.0, seen, nothing, np.eye(8), np.zeros((0, 8)), np.zeros(0)).any()
