@@ -8,7 +8,7 @@ import math
 import numpy as np
 from numpy.typing import NDArray
 
-from roadgeo.kernels.arrays import Floats1, Floats2, Int32s1, Int32s2, Ints1
+from roadgeo.kernels.arrays import Bools1, Floats1, Floats2, Int32s1, Int32s2, Ints1
 from roadgeo.kernels.compilation import kernel
 
 __all__ = ["find_mates", "fuse_twins", "points_beside", "roads_alongside", "sample_edges", "tie_runs"]
@@ -355,9 +355,7 @@ def roads_alongside(
 
 
 @kernel()
-def points_beside(
-    places: Floats2, along: Floats2, points: Floats2, across: float, ahead: float, out: NDArray[np.bool_]
-) -> None:
+def points_beside(places: Floats2, along: Floats2, points: Floats2, across: float, ahead: float, out: Bools1) -> None:
     """Tell at which places on roads one of some points lies, give or take.
 
     Parameters
