@@ -91,8 +91,7 @@ def with_honest_corners(
         by_k1 = covariance[:, 8] / covariance[8, 8]
         covariance = covariance + max(unseen**2 - covariance[8, 8], 0.0) * np.outer(by_k1, by_k1)
     if k1:  # the middle of the lens, which was not estimated, by what it would do to what was
-        across = everything[:, [2, 5]] / np.linalg.norm(everything[:, [2, 5]], axis=1, keepdims=True)
-        unknown = lens.center_sigma_px * np.einsum("ni,nij->nj", across, by_center)
+        unknown = lens.center_sigma_px * np.einsum("ni,nij->nj", seen.normals[used], by_center)
         moved = inverse @ (scaled.T @ unknown)
         covariance = covariance + moved @ moved.T
     floor_m = math.hypot(options.sigma_floor_m, _FLOOR * rms)

@@ -29,8 +29,8 @@ __all__ = ["measure_corners", "refine_beside"]
 #: Where so much of the mask's roads agrees, no cell of the frame was left out, and nothing has settled beside where it
 #: belongs; a fit to all cells loses hardly any of them.
 _WHOLE, _LEAST_LOST = 0.9, 0.03
-#: How far corners are moved, one by one, to see whether the fit comes back, as carriageways are apart: metres, and
-#: pixels at least, as many as that is in the middle of the frame; road points to see by; and how often at most.
+#: How far corners are moved, one by one, to see whether the fit comes back, as carriageways are apart: metres in the
+#: middle of the frame, of so many pixels at least; road points to see by; and how often at most.
 _BESIDE_M, _BESIDE_PX, _N_POINTS, _MOST_ROUNDS = (12.0, 24.0), 8.0, 200, 5
 _WAYS = np.array([(1.0, 0.0), (-1.0, 0.0), (0.0, 1.0), (0.0, -1.0)])
 #: A fit has come back that puts no corner further off than this part of the least step.
@@ -114,7 +114,7 @@ def refine_beside(refined: Refined, scene: Scene, index: ReferenceIndex, options
     """
     options, nothing = replace(options, least_share=0.0), np.full(len(scene.intersections), -1)
     places = Homography(refined.matrix).everywhere(scene.corners)
-    back_m = _BACK * _step_m(refined.matrix, scene, _BESIDE_M[0])
+    back_m = _BACK * _steps_m(refined.matrix, scene)[0]
 
     def weight(one: Refined) -> float:
         return weight_on_roads(one.matrix, scene, index, options)
@@ -132,15 +132,17 @@ def refine_beside(refined: Refined, scene: Scene, index: ReferenceIndex, options
     return found
 
 
-def _step_m(matrix: FloatArray, scene: Scene, least_m: float) -> float:
-    """Return how far a corner is moved, metres: further than `least_m` where pixels are large."""
-    return max(least_m, _BESIDE_PX * sampling(matrix, scene.size))
+def _steps_m(matrix: FloatArray, scene: Scene) -> list[float]:
+    """Return how far corners are moved, metres in the middle of the frame: further where pixels are large."""
+    least_m = _BESIDE_PX * sampling(matrix, scene.size)
+    return [max(step, least_m) for step in _BESIDE_M]
 
 
 def _beside(matrix: FloatArray, scene: Scene) -> list[FloatArray]:
     """Return homographies (3, 3) that put one corner of the frame elsewhere, and the others where `matrix` does.
 
-    By as many pixels in each corner: what a steep view shows far away may be off by more ground.
+    By as many pixels in each corner, and not by less ground than in the middle of the frame: what a steep view shows
+    far away may be off by more.
     """
     corners, gsd = scene.corners.astype(np.float32), sampling(matrix, scene.size)
     places, by_pixel = Homography(matrix).everywhere(scene.corners), Homography(matrix).jacobian(scene.corners)
@@ -148,7 +150,7 @@ def _beside(matrix: FloatArray, scene: Scene) -> list[FloatArray]:
     back = np.array([[1.0, 0.0, middle[0]], [0.0, 1.0, middle[1]], [0.0, 0.0, 1.0]])
     found = []
     for k in range(4):
-        for step in (_step_m(matrix, scene, one) for one in _BESIDE_M):
+        for step in _steps_m(matrix, scene):
             for away in step / gsd * _WAYS @ by_pixel[k].T:
                 there = places - middle
                 there[k] += away * max(1.0, step / float(np.hypot(*away)))

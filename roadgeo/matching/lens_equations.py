@@ -53,6 +53,12 @@ class Observed(NamedTuple):
         return np.asarray(1.0 / (1.0 + (self.residuals / self.sigma) ** 2))
 
     @property
+    def normals(self) -> FloatArray:
+        """Unit vectors (M, 2) across the roads."""
+        across = self.rows[:, [2, 5]]
+        return np.asarray(across / np.linalg.norm(across, axis=1, keepdims=True))
+
+    @property
     def scaled(self) -> FloatArray:
         """Residuals (M,) as if each pixel reached as far as in the middle of the frame, metres."""
         return np.asarray(self.residuals / self.own)

@@ -14,6 +14,7 @@ from roadgeo._arrays import BoolArray, FloatArray
 from roadgeo.kernels.parallel_roads import points_beside
 from roadgeo.kernels.residuals import road_residuals
 from roadgeo.matching.lens_equations import LensEquations, Observed
+from roadgeo.matching.refinement import spacing_m
 
 __all__ = ["covariance_of_doubt"]
 
@@ -49,7 +50,7 @@ def covariance_of_doubt(
         Derivatives of the U points that take part, and their weights.
     """
     beside = _unshown(equations, k1, seen)[:, used] / equations.unit
-    normals = _normals(seen)[used]
+    normals = seen.normals[used]
     way = np.mod(np.floor(np.mod(np.arctan2(normals[:, 1], normals[:, 0]), np.pi) * (_WAYS / np.pi)), _WAYS)
     gained = np.zeros_like(inverse)
     for offsets in beside:
@@ -65,31 +66,25 @@ def covariance_of_doubt(
     return gained
 
 
-def _normals(seen: Observed) -> FloatArray:
-    """Return unit vectors (M, 2) across the roads that were met."""
-    across = seen.rows[:, [2, 5]]
-    return np.asarray(across / np.linalg.norm(across, axis=1, keepdims=True))
-
-
 def _unshown(equations: LensEquations, k1: float, seen: Observed) -> FloatArray:
     """Return how far beside each road that was met lies another one that the mask does not show, (2, M) metres.
 
     To either side, counted along the normals; NaN where there is none.
     """
-    scene, (places, _) = equations.scene, equations.rows(k1)
+    places, _ = equations.rows(k1)
     shown = places * equations.unit + equations.origin
-    normals, found = _normals(seen), np.empty((2, len(seen.rows)))
+    normals, found = seen.normals, np.empty((2, len(seen.rows)))
     along = np.ascontiguousarray(normals[:, ::-1] * (1.0, -1.0))
     feet = shown[seen.which] + seen.residuals[:, None] * normals
-    upwards = np.where(np.arctan2(normals[:, 1], normals[:, 0]) < 0.0, -1.0, 1.0)
+    upwards = np.where(normals[:, 1] < 0.0, -1.0, 1.0)
     reach, min_cos = np.full(len(feet), _GIVE_OR_TAKE_M), math.cos(math.radians(_MAX_TURN_DEG))
-    step_m = scene.road_length_px / max(len(scene.points), 1) * equations.unit / scene.half_size
+    ahead_m = max(_ALONG_M, _ALONG_STEPS * spacing_m(equations.scene, equations.unit))
     way, is_shown = np.empty((len(feet), 3)), np.empty(len(feet), np.bool_)
     for side, beside in zip((-1.0, 1.0), found, strict=True):
         start = np.ascontiguousarray(feet + _BESIDE_M * (side * upwards)[:, None] * normals)
         road_residuals(start, along, reach, min_cos, equations.roads, way)
         beside[:] = ((start + way[:, :1] * way[:, 1:] - feet) * normals).sum(axis=1)
         there = shown[seen.which] + beside[:, None] * normals
-        points_beside(there, along, shown, _SHOWN_M, max(_ALONG_M, _ALONG_STEPS * step_m), is_shown)
+        points_beside(there, along, shown, _SHOWN_M, ahead_m, is_shown)
         beside[is_shown] = np.nan
     return found
