@@ -1,7 +1,10 @@
 """Shards in an object store or behind a web server: fetched when they are first searched, and kept on this machine.
 
-What fsspec calls a URL names the folder: s3://bucket/atlas.shards, https://host/atlas.shards. Its manifest is fetched
+A URL that the user typed names the folder: s3://bucket/atlas.shards, https://host/atlas.shards. Its manifest is fetched
 each time; a shard is fetched once, whole, checked against the manifest's digest, and then memory-mapped as any other.
+
+A folder that came from elsewhere names no URL: only the user's own cache remembers where shards come from. fsspec
+knows some forty protocols, and joins them ("simplecache::reference://..."); here it is asked for five, one at a time.
 """
 
 from __future__ import annotations
@@ -9,6 +12,7 @@ from __future__ import annotations
 import os
 from collections.abc import Iterator
 from contextlib import contextmanager
+from functools import cache
 from hashlib import blake2b
 from pathlib import Path
 from typing import Any
@@ -22,6 +26,9 @@ __all__ = ["fetch_manifest", "fetch_shard", "is_remote"]
 
 _MANIFEST, _SOURCE = "manifest.json", "source.txt"
 
+#: Protocols that may be fetched from: web servers, and the object stores of Amazon, Google and Microsoft.
+_PROTOCOLS = ("https", "http", "s3", "gs", "az")
+
 
 def is_remote(name: str | os.PathLike[str]) -> bool:
     """Whether a name is a URL."""
@@ -34,13 +41,13 @@ def fetch_manifest(url: str) -> Path:
     Raises
     ------
     IndexFormatError
-        There is none, or it cannot be reached.
+        There is none, it cannot be reached, or the URL is of another protocol.
     OutputError
         It cannot be kept in the user's cache folder.
     """
     url = url.removesuffix(f"/{_MANIFEST}").rstrip("/")
     name = f"{blake2b(url.encode(), digest_size=8).hexdigest()}-{url.rpartition('/')[2]}"
-    folder = cache_dir() / "shards" / name
+    folder = _kept() / name
     with writing(folder):
         folder.mkdir(parents=True, exist_ok=True)
     _fetch(f"{url}/{_MANIFEST}", folder / _MANIFEST)
@@ -49,7 +56,7 @@ def fetch_manifest(url: str) -> Path:
 
 
 def fetch_shard(folder: Path, build: str, name: str) -> bool:
-    """Fetch the index of a shard, if the folder stands for one that lies elsewhere; return whether it does.
+    """Fetch the index of a shard, if the folder is one that `fetch_manifest` returned; return whether it is.
 
     Raises
     ------
@@ -57,7 +64,8 @@ def fetch_shard(folder: Path, build: str, name: str) -> bool:
         It cannot be fetched.
     """
     source = folder / _SOURCE
-    if not source.is_file():
+    # Any other folder may be a stranger's, and so may be what a file in it says.
+    if folder.resolve().parent != _kept().resolve() or not source.is_file():
         return False
     target = folder / build / f"{name}.index"
     with writing(target):
@@ -66,17 +74,46 @@ def fetch_shard(folder: Path, build: str, name: str) -> bool:
     return True
 
 
+def _kept() -> Path:
+    """Return the folder of what was fetched."""
+    return cache_dir() / "shards"
+
+
 def _fetch(url: str, target: Path) -> None:
     """Copy a file here, whole or not at all: others may be fetching or reading it, too."""
+    protocol, _, rest = url.partition("://")
+    if protocol.lower() not in _PROTOCOLS or "::" in rest:
+        raise IndexFormatError(
+            f"{url}: cannot be fetched from; expected a folder of shards at {', '.join(_PROTOCOLS[:-1])} or "
+            f"{_PROTOCOLS[-1]}, such as https://host/porto.shards"
+        )
     with _reaching(url):
-        from fsspec.core import url_to_fs
+        import fsspec
 
-        files, path = url_to_fs(url)
+        told = {"client_kwargs": {"trace_configs": [_redirects()]}} if protocol.lower() in {"http", "https"} else {}
+        files = fsspec.filesystem(protocol.lower(), **told)
     with staging(target) as folder:
         with _reaching(url):
-            files.get_file(path, str(folder / target.name))
+            files.get_file(files._strip_protocol(url), str(folder / target.name))
         with writing(target):
             publish(folder / target.name, target)
+
+
+@cache
+def _redirects() -> Any:
+    """Return what has aiohttp follow a redirect only to https or within one server, never into a network behind it."""
+    import aiohttp
+    from yarl import URL
+
+    async def check(_session: Any, _context: Any, asked: Any) -> None:
+        headers = asked.response.headers
+        target = asked.url.join(URL(headers.get("Location") or headers.get("URI") or ""))
+        if target.scheme != "https" and target.origin() != asked.url.origin():
+            raise OSError(f"redirected to {target}; expected https, or the same server")
+
+    tracing = aiohttp.TraceConfig()
+    tracing.on_request_redirect.append(check)
+    return tracing
 
 
 @contextmanager

@@ -1,5 +1,6 @@
 """Shards in a store: fetched when they are searched, once, checked, and kept."""
 
+import contextlib
 import functools
 import http.server
 import shutil
@@ -11,6 +12,7 @@ from worlds.scenes import random_network
 from roadgeo.errors import IndexFormatError
 from roadgeo.location import Location
 from roadgeo.matching.index import build_index
+from roadgeo.reference import remote
 from roadgeo.reference.files import reference_digest
 from roadgeo.reference.library import resolve_reference
 from roadgeo.reference.network_file import as_stored
@@ -43,7 +45,8 @@ def cache(tmp_path, monkeypatch):
 
 
 @pytest.fixture
-def in_memory(built):
+def in_memory(built, monkeypatch):
+    monkeypatch.setattr(remote, "_PROTOCOLS", (*remote._PROTOCOLS, "memory"))
     files = fsspec.filesystem("memory")
     files.put(str(built), "/bucket/town.shards", recursive=True)
     yield files
@@ -86,24 +89,79 @@ def test_another_shard_in_its_place_is_refused(in_memory, built, tmp_path):
         open_reference(URL).parts[0].open()
 
 
-@pytest.mark.parametrize("url", ["memory://bucket/none.shards", "nothing://at/all"])
-def test_what_is_not_there_is_an_error_on_one_line(url, cache):
+def test_what_is_not_there_is_an_error_on_one_line(in_memory, cache):
     with pytest.raises(IndexFormatError, match="cannot be fetched") as error:
-        open_reference(url)
+        open_reference("memory://bucket/none.shards")
     assert "\n" not in str(error.value)
     assert not list(cache.rglob("manifest.json"))
 
 
+@pytest.mark.parametrize(
+    "url",
+    [
+        "nothing://at/all",
+        "file:///etc/town.shards",
+        "reference://town.shards",
+        "simplecache::https://host/town.shards",
+        "https://host/town.zip::reference://town.shards",
+        "github://someone:town@main/town.shards",
+    ],
+)
+def test_other_protocols_are_refused_before_they_are_asked(url, cache, monkeypatch):
+    monkeypatch.setattr(fsspec, "filesystem", lambda *_, **__: pytest.fail("asked"))
+    with pytest.raises(IndexFormatError, match="expected a folder of shards at https, http, s3, gs or az"):
+        open_reference(url)
+    assert not list(cache.rglob("manifest.json"))
+
+
+def test_a_folder_of_a_stranger_has_nothing_fetched(in_memory, built, tmp_path):
+    theirs = tmp_path / "town.shards"
+    theirs.mkdir()
+    shutil.copy(built / "manifest.json", theirs)
+    (theirs / "source.txt").write_text(URL)
+    with pytest.raises(IndexFormatError, match="no reference"):
+        open_reference(theirs).parts[0].open()
+    assert not list(theirs.rglob("*.index"))
+
+
 def test_a_web_server_will_do(built, tmp_path):
-    pytest.importorskip("aiohttp")
     shutil.copytree(built, tmp_path / "www" / "town.shards")
-    handler = functools.partial(_Quiet, directory=str(tmp_path / "www"))
+    with _serving(functools.partial(_Quiet, directory=str(tmp_path / "www"))) as port:
+        assert len(open_reference(f"http://127.0.0.1:{port}/town.shards").parts[0].open()) > 90
+
+
+def test_a_redirect_within_a_server_is_followed_and_none_to_another(built, tmp_path):
+    shutil.copytree(built, tmp_path / "www" / "town.shards")
+    asked = []
+
+    class Redirecting(_Quiet):
+        def do_GET(self):
+            asked.append(self.path)
+            if not self.path.startswith(("/moved", "/elsewhere")):
+                super().do_GET()
+                return
+            self.send_response(302)
+            host = "127.0.0.1" if self.path.startswith("/moved") else "localhost"
+            self.send_header("Location", f"http://{host}:{self.server.server_port}/town.shards/manifest.json")
+            self.end_headers()
+
+    with _serving(functools.partial(Redirecting, directory=str(tmp_path / "www"))) as port:
+        assert open_reference(f"http://127.0.0.1:{port}/moved").name == "town"
+        asked.clear()
+        with pytest.raises(IndexFormatError, match=r"redirected to http://localhost.*expected https"):
+            open_reference(f"http://127.0.0.1:{port}/elsewhere")
+        assert asked == ["/elsewhere/manifest.json"]
+
+
+@contextlib.contextmanager
+def _serving(handler):
+    """Serve on this machine; yield the port."""
+    pytest.importorskip("aiohttp")
     with http.server.ThreadingHTTPServer(("127.0.0.1", 0), handler) as server:
         thread = threading.Thread(target=server.serve_forever, kwargs={"poll_interval": 0.02}, daemon=True)
         thread.start()
         try:
-            reference = open_reference(f"http://127.0.0.1:{server.server_port}/town.shards")
-            assert len(reference.parts[0].open()) > 90
+            yield server.server_port
         finally:
             server.shutdown()
             thread.join()
