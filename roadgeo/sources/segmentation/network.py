@@ -102,9 +102,17 @@ def load_network(
     return network
 
 
-def _open_session(content: bytes, name: str, threads: int) -> Any:
+def _without_telemetry() -> Any:
+    """Return onnxruntime, told to report nothing: else it keeps an identifier of the device, and sends what it did."""
+    os.environ.setdefault("ORT_DISABLE_TELEMETRY", "1")  # read while it is imported
     import onnxruntime
 
+    onnxruntime.disable_telemetry_events()  # where the program that uses roadgeo has imported it before
+    return onnxruntime
+
+
+def _open_session(content: bytes, name: str, threads: int) -> Any:
+    onnxruntime = _without_telemetry()
     options = onnxruntime.SessionOptions()
     options.intra_op_num_threads, options.inter_op_num_threads = threads, 1
     options.use_deterministic_compute = True

@@ -1,0 +1,98 @@
+"""What a command leaves behind, as the system sees it: no connection, and no file but its outputs and roadgeo's cache."""
+
+import os
+import re
+import shutil
+import subprocess
+import sys
+from pathlib import Path
+
+import pytest
+
+from roadgeo.evaluation.demo import ROADS, demo_masks
+from roadgeo.outputs.registry import ALSO
+from roadgeo.storage.folders import cache_dir
+from roadgeo.workflows import build_reference
+
+DRONE = next(one.path for one in demo_masks() if one.path.stem == "drone")
+
+#: System calls that make, change or move a file.
+_CHANGES = "creat mkdir mkdirat mknod mknodat rename renameat renameat2 link linkat symlink symlinkat truncate".split()
+_TRACE = ["strace", "-f", "-qq", "-y", "--seccomp-bpf", "-s", "4096"]
+
+
+@pytest.fixture(scope="module")
+def porto(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    path = tmp_path_factory.mktemp("reference") / "porto.gpkg"
+    build_reference(ROADS, "porto", path=path)
+    return path
+
+
+@pytest.fixture(scope="module", autouse=True)
+def tracer() -> None:
+    traced = shutil.which("strace") and subprocess.run([*_TRACE, "true"], capture_output=True, check=False)
+    if not traced or traced.returncode:
+        assert not os.environ.get("ROADGEO_REQUIRE_STRACE"), "strace is missing, or must not trace"
+        pytest.skip("strace is missing, or must not trace")
+
+
+def traced(folder: Path, *command: str) -> tuple[list[str], list[Path]]:
+    """Run a command whose home and temporary folder lie apart.
+
+    Returns the system calls that have to do with a network, and the paths of all files made, changed or moved.
+    """
+    for name in ("home", "temporary"):
+        (folder / name).mkdir()
+    environment = {name: value for name, value in os.environ.items() if not name.startswith(("XDG_", "ORT_", "MPL"))}
+    environment |= {"HOME": str(folder / "home"), "TMPDIR": str(folder / "temporary"), "PYTHONDONTWRITEBYTECODE": "1"}
+    environment |= {"ROADGEO_CACHE": str(cache_dir())}  # kernels are there
+    calls = ",".join(["%network", "openat", "open", "chdir", *_CHANGES])
+    program = [*_TRACE, "-o", "trace.txt", "-e", f"trace={calls}", sys.executable, "-m", "roadgeo", *command]
+    done = subprocess.run(program, cwd=folder, env=environment, capture_output=True, text=True, timeout=600, check=False)
+    assert done.returncode == 0, done.stderr
+    lines = [line.split(maxsplit=1)[1] for line in (folder / "trace.txt").read_text("utf-8", "replace").splitlines()]
+    made = [line for line in lines if " = -1 " not in line]
+    opened = [line for line in made if re.search(r"^open.*\bO_(WRONLY|RDWR|CREAT)\b", line)]
+    changed = [line for line in made if line.partition("(")[0] in _CHANGES]
+    assert not [line for line in made if line.startswith("chdir")]  # else relative paths lie elsewhere
+    paths = [path for line in (*opened, *changed) for path in _paths(line, folder)]
+    others = ("open", "chdir", "+++", "---", "<...", *_CHANGES)
+    return [line for line in lines if not line.startswith(others)], paths
+
+
+def _paths(line: str, folder: Path) -> list[Path]:
+    """Return the paths in a call; those given below an open folder are below that."""
+    parts = re.findall(r'(?:(?:AT_FDCWD|\d+)<([^>]*)>, )?"((?:[^"\\]|\\.)*)"', line)
+    return [folder / base / name for base, name in parts]
+
+
+def strays(paths: list[Path], folder: Path) -> list[Path]:
+    """Return the paths that are neither of the outputs nor of the cache."""
+    allowed = (folder / "out", cache_dir(), Path("/dev/null"))
+    return [path for path in paths if not any(path.is_relative_to(one) for one in allowed)]
+
+
+def test_a_photograph_reaches_nobody_and_leaves_only_its_outputs(porto: Path, tmp_path: Path) -> None:
+    pytest.importorskip("onnxruntime")
+    photo = str(DRONE.with_name("drone_photo.jpg"))
+    asked, paths = traced(tmp_path, "locate", photo, "-r", str(porto), "-o", "out", "-q")
+    assert any(path.name.endswith(".json") for path in paths)
+    assert not strays(paths, tmp_path)
+    assert not asked
+
+
+def test_a_map_is_built_offline(tmp_path: Path) -> None:
+    (tmp_path / "out").mkdir()
+    asked, paths = traced(tmp_path, "index", "--roads", str(ROADS), "--out", "out/porto.gpkg", "-q")
+    assert not strays(paths, tmp_path)
+    assert not asked
+
+
+def test_no_output_leaves_more_than_itself(porto: Path, tmp_path: Path) -> None:
+    also = [word for name in ALSO for word in ("--also", name)]
+    asked, paths = traced(
+        tmp_path, "locate", str(DRONE), "-r", str(porto), "-o", "out", "-q", "--plot", "--report", "--explain", *also
+    )
+    assert any(path.name.endswith(".kmz") for path in paths)
+    assert not strays(paths, tmp_path)
+    assert not asked
