@@ -1,4 +1,4 @@
-"""What a command leaves behind, as the system sees it: no connection, and no file but its outputs and roadgeo's cache."""
+"""What a command leaves behind, as the system sees it: no connection, and no file but its outputs and our cache."""
 
 import os
 import re
@@ -17,7 +17,10 @@ from roadgeo.workflows import build_reference
 DRONE = next(one.path for one in demo_masks() if one.path.stem == "drone")
 
 #: System calls that make, change or move a file.
-_CHANGES = "creat mkdir mkdirat mknod mknodat rename renameat renameat2 link linkat symlink symlinkat truncate".split()
+_CHANGES = (
+    *("creat", "mkdir", "mkdirat", "mknod", "mknodat", "rename", "renameat", "renameat2"),
+    *("link", "linkat", "symlink", "symlinkat", "truncate"),
+)
 _TRACE = ["strace", "-f", "-qq", "-y", "--seccomp-bpf", "-s", "4096"]
 
 
@@ -48,8 +51,8 @@ def traced(folder: Path, *command: str) -> tuple[list[str], list[Path]]:
     environment |= {"ROADGEO_CACHE": str(cache_dir())}  # kernels are there
     calls = ",".join(["%network", "openat", "open", "chdir", *_CHANGES])
     program = [*_TRACE, "-o", "trace.txt", "-e", f"trace={calls}", sys.executable, "-m", "roadgeo", *command]
-    done = subprocess.run(program, cwd=folder, env=environment, capture_output=True, text=True, timeout=600, check=False)
-    assert done.returncode == 0, done.stderr
+    done = subprocess.run(program, cwd=folder, env=environment, capture_output=True, timeout=600, check=False)
+    assert done.returncode == 0, done.stderr.decode()
     lines = [line.split(maxsplit=1)[1] for line in (folder / "trace.txt").read_text("utf-8", "replace").splitlines()]
     made = [line for line in lines if " = -1 " not in line]
     opened = [line for line in made if re.search(r"^open.*\bO_(WRONLY|RDWR|CREAT)\b", line)]
