@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import logging
 import os
 import signal
 from functools import partial
@@ -15,7 +16,7 @@ from roadgeo.cli.printing import echo
 
 if TYPE_CHECKING:
     from roadgeo.running.flights.mavlink import MavlinkSender
-    from roadgeo.running.serving.server import ServeOptions
+    from roadgeo.running.serving.options import ServeOptions
 
 __all__ = ["serve_command"]
 
@@ -24,7 +25,9 @@ _HELP = """Keep references open, and answer who posts a mask or a photograph.
 \b
   POST /locate                           an image as the body -> the answer, JSON as of locate --json
   POST /processes/locate/execution       the same by OGC API - Processes, the image in JSON, base64
-  GET  / /api /conformance /processes /processes/locate /jobs
+                                         a form too: curl -F image=@photo.jpg
+  GET  /jobs/ID  /jobs/ID/events         of a request with the header Prefer: respond-async
+  GET  / /api /conformance /processes /processes/locate /jobs /health
 
 \b
 What is known goes into the URL, or beside the image in JSON:
@@ -107,6 +110,8 @@ def serve_command(references: tuple[str, ...], mavlink: str | None, quiet: bool,
     host = f"[{options.host}]" if ":" in options.host else options.host
     echo(f"Listening on http://{host}:{server.server_port}/ for masks of {', '.join(names)}; Ctrl-C ends it.", err=True)
     signal.signal(signal.SIGTERM, signal.default_int_handler)
+    if not quiet:
+        _log_requests()
     try:
         server.serve_forever()
     except KeyboardInterrupt:
@@ -116,6 +121,16 @@ def serve_command(references: tuple[str, ...], mavlink: str | None, quiet: bool,
         if sender is not None:
             sender.close()
     return 0
+
+
+def _log_requests() -> None:
+    """Write a line for each request to stderr: who, what, which status."""
+    shown = logging.StreamHandler()
+    shown.setFormatter(logging.Formatter("%(asctime)s %(message)s"))
+    log = logging.getLogger("uvicorn.access")
+    log.addHandler(shown)
+    log.setLevel(logging.INFO)
+    log.propagate = False
 
 
 def _tell(sender: MavlinkSender, found: dict[str, Any], came_s: float) -> None:
@@ -135,7 +150,7 @@ def _options(given: dict[str, Any]) -> ServeOptions:
     click.UsageError
         Others may ask, and there is no token.
     """
-    from roadgeo.running.serving.server import LOOPBACK, ServeOptions
+    from roadgeo.running.serving.options import LOOPBACK, ServeOptions
 
     token = os.environ.get("ROADGEO_TOKEN", "").strip()
     if given["token_file"] is not None:

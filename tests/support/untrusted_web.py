@@ -1,8 +1,12 @@
 """Bytes that come over HTTP, without a network: answers of OpenStreetMap's servers, and requests to ours."""
 
+import asyncio
 import io
 from collections.abc import Iterator
 from contextlib import contextmanager
+from pathlib import Path
+from tempfile import TemporaryDirectory
+from threading import Semaphore
 from types import SimpleNamespace
 from typing import Any
 from unittest import mock
@@ -10,10 +14,13 @@ from unittest import mock
 import geopandas
 import requests
 import urllib3
+import uvicorn
+from uvicorn.server import ServerState
 
-from roadgeo.running.serving.documents import documents_of
-from roadgeo.running.serving.server import ServeOptions, _Handler
-from roadgeo.running.serving.workers import Answer
+from roadgeo.running.serving.app import Service
+from roadgeo.running.serving.options import ServeOptions
+from roadgeo.running.serving.protocol import protocol_of
+from roadgeo.running.serving.workers import Answer, Place
 
 
 @contextmanager
@@ -33,35 +40,49 @@ def answered(content: bytes) -> Iterator[None]:
         yield
 
 
-class _Wire:
-    """A connection on which everything was sent already."""
+class _Wire(asyncio.Transport):
+    """A connection on which everything is written down."""
 
-    def __init__(self, content: bytes) -> None:
-        self._content, self.sent = io.BytesIO(content), bytearray()
+    def __init__(self) -> None:
+        super().__init__()
+        self.sent, self._is_closing = bytearray(), False
 
-    def recv_into(self, buffer: Any) -> int:
-        return self._content.readinto(buffer)
-
-    def sendall(self, content: bytes) -> None:
+    def write(self, content: Any) -> None:
         self.sent += content
 
-    def makefile(self, *_: Any) -> io.BytesIO:
-        return io.BytesIO()
+    def close(self) -> None:
+        self._is_closing = True
 
-    def settimeout(self, _: float) -> None:
-        """Nothing waits here."""
+    abort = write_eof = resume_reading = pause_reading = close
+
+    def is_closing(self) -> bool:
+        return self._is_closing
+
+    def can_write_eof(self) -> bool:
+        return False
 
 
-_SERVER = SimpleNamespace(
-    options=ServeOptions(),
-    documents=documents_of(["town"]),
-    workers=SimpleNamespace(is_full=lambda: False, ask=lambda asked: Answer(200, {})),
-    told=None,
-)
+_LIMITS = ServeOptions(head_s=0.2, body_s=0.2)
+_WORKERS = SimpleNamespace(take_place=lambda: Place(Semaphore()), ask=lambda *_: Answer(200, {}))
 
 
 def serve_request(content: bytes) -> bytes:
     """Return what the server answers to the bytes of a connection; its workers find nothing."""
-    wire = _Wire(content)
-    _Handler(wire, ("127.0.0.1", 1), _SERVER)  # type: ignore[arg-type]
+    return asyncio.run(_serve(content))
+
+
+async def _serve(content: bytes) -> bytes:
+    wire = _Wire()
+    with TemporaryDirectory() as folder:
+        service = Service(_WORKERS, ["town"], _LIMITS, Path(folder))  # type: ignore[arg-type]
+        config = uvicorn.Config(service.app, ws="none", lifespan="off", log_config=None)
+        connection = protocol_of(_LIMITS)(config, ServerState(), {})
+        connection.connection_made(wire)
+        connection.data_received(content)
+        if not wire.is_closing():
+            connection.eof_received()
+        while connection.tasks:
+            await asyncio.wait(connection.tasks)
+        connection.connection_lost(None)
+        service.close()
     return bytes(wire.sent)

@@ -10,7 +10,7 @@ from roadgeo import __version__
 __all__ = ["DOCUMENTS", "documents_of", "problem"]
 
 _CORE = "http://www.opengis.net/spec/ogcapi-processes-1/1.0/conf"
-_CONFORMS = [f"{_CORE}/{part}" for part in ("core", "ogc-process-description", "json", "oas30")]
+_CONFORMS = [f"{_CORE}/{part}" for part in ("core", "ogc-process-description", "json", "oas30", "dismiss")]
 
 DOCUMENTS = ("/", "/api", "/conformance", "/processes", "/processes/locate", "/jobs")
 
@@ -45,7 +45,7 @@ def documents_of(references: Sequence[str]) -> dict[str, dict[str, Any]]:
         "title": "Locate a road mask or a photograph",
         "description": "Finds where an aerial image was taken from its roads alone, on " + ", ".join(references) + ".",
         "version": __version__,
-        "jobControlOptions": ["sync-execute"],
+        "jobControlOptions": ["sync-execute", "async-execute", "dismiss"],
         "outputTransmission": ["value"],
         "links": [_link("/processes/locate", "self", "this process")],
     }
@@ -68,6 +68,7 @@ def documents_of(references: Sequence[str]) -> dict[str, dict[str, Any]]:
                 _link("/conformance", "http://www.opengis.net/def/rel/ogc/1.0/conformance", "what it conforms to"),
                 _link("/processes", "http://www.opengis.net/def/rel/ogc/1.0/processes", "processes"),
                 _link("/jobs", "http://www.opengis.net/def/rel/ogc/1.0/job-list", "jobs"),
+                _link("/health", "monitor", "whether it answers"),
             ],
         },
         "/conformance": {"conformsTo": _CONFORMS},
@@ -82,7 +83,7 @@ def documents_of(references: Sequence[str]) -> dict[str, dict[str, Any]]:
                 _link("/processes/locate/execution", "http://www.opengis.net/def/rel/ogc/1.0/execute", "run it"),
             ],
         },
-        "/jobs": {"jobs": [], "links": [_link("/jobs", "self", "every request is answered at once: there are none")]},
+        "/jobs": {"jobs": [], "links": [_link("/jobs", "self", "a job is known to who asked for it; none is listed")]},
     }
 
 
@@ -100,21 +101,42 @@ def _api() -> dict[str, Any]:
     answer = {"200": {"description": "the answer", "content": {"application/json": {"schema": {"type": "object"}}}}}
     busy = {"503": {"description": "as many requests as may be are waiting; Retry-After says when to come again"}}
     binary = {"schema": {"type": "string", "format": "binary"}}
-    parameters = [{"name": name, "in": "query", "schema": {"type": "string"}} for name in _HINTS]
-    paths: dict[str, Any] = {path: {"get": {"responses": answer}} for path in DOCUMENTS}
+    parameters: list[dict[str, Any]] = [{"name": name, "in": "query", "schema": {"type": "string"}} for name in _HINTS]
+    prefer = {"name": "Prefer", "in": "header", "schema": {"type": "string", "enum": ["respond-async"]}}
+    created = {"201": {"description": "with Prefer: respond-async, a job; Location says where it stands"}}
+    answers = {**answer, **created, **busy}
+    form = {"type": "object", "properties": {"image": {"type": "string", "format": "binary"}}, "required": ["image"]}
+    paths: dict[str, Any] = {path: {"get": {"responses": answer}} for path in (*DOCUMENTS, "/health")}
     paths["/locate"] = {
         "post": {
-            "summary": "Locate the image that is the body",
-            "parameters": parameters,
-            "requestBody": {"required": True, "content": {"image/*": binary, "application/octet-stream": binary}},
-            "responses": {**answer, **busy},
+            "summary": "Locate the image that is the body, or a file of a form",
+            "parameters": [*parameters, prefer],
+            "requestBody": {
+                "required": True,
+                "content": {
+                    "image/*": binary,
+                    "application/octet-stream": binary,
+                    "multipart/form-data": {"schema": form},
+                },
+            },
+            "responses": answers,
         }
     }
     paths["/processes/locate/execution"] = {
         "post": {
             "summary": "Locate an image",
+            "parameters": [prefer],
             "requestBody": {"required": True, "content": {"application/json": {"schema": {"type": "object"}}}},
-            "responses": {**answer, **busy},
+            "responses": answers,
         }
     }
+    job = [{"name": "jobID", "in": "path", "required": True, "schema": {"type": "string"}}]
+    paths["/jobs/{jobID}"] = {
+        "parameters": job,
+        "get": {"summary": "How far a job is", "responses": answer},
+        "delete": {"summary": "Call it off, and forget it", "responses": answer},
+    }
+    paths["/jobs/{jobID}/results"] = {"parameters": job, "get": {"responses": answer}}
+    stream = {"200": {"description": "its states as they change", "content": {"text/event-stream": {}}}}
+    paths["/jobs/{jobID}/events"] = {"parameters": job, "get": {"responses": stream}}
     return {"openapi": "3.0.3", "info": {"title": "roadgeo", "version": __version__}, "paths": paths}

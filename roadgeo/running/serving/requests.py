@@ -8,11 +8,11 @@ import json
 import math
 from collections.abc import Mapping
 from typing import Any
-from urllib.parse import parse_qs
+from urllib.parse import parse_qsl
 
 from roadgeo.geometry.areas import is_box
 
-__all__ = ["LIMIT", "Refused", "ending_of", "read_execution", "read_hints", "read_query_string"]
+__all__ = ["LIMIT", "Refused", "ending_of", "read_execution", "read_hints", "read_query_string", "read_texts"]
 
 #: How files begin that are read. What refers to other files, as a VRT does, is none of them.
 _MAGIC = {
@@ -64,18 +64,28 @@ def read_query_string(text: str) -> dict[str, Any]:
         A name is not known, or a value is none.
     """
     try:
-        given = parse_qs(text, keep_blank_values=True, strict_parsing=bool(text), max_num_fields=20)
+        return read_texts(dict(parse_qsl(text, True, strict_parsing=bool(text), max_num_fields=20)))
     except ValueError as error:
         raise Refused(400, f"the query of the URL cannot be read: {error}") from error
+
+
+def read_texts(given: Mapping[str, str]) -> dict[str, Any]:
+    """Read hints that are texts, of a URL or of a form.
+
+    Raises
+    ------
+    Refused
+        A name is not known, or a value is none.
+    """
     values: dict[str, Any] = {}
-    for name, texts in given.items():
+    for name, text in given.items():
         if name == "northUp":
-            values[name] = texts[-1].lower() in ("", "1", "true", "yes")
+            values[name] = text.lower() in ("", "1", "true", "yes")
             continue
         try:
-            numbers = [float(part) for part in texts[-1].split(",")]
+            numbers = [float(part) for part in text.split(",")]
         except ValueError as error:
-            raise Refused(400, f"{name[:40]}: got {texts[-1][:40]!r}, expected numbers with commas between") from error
+            raise Refused(400, f"{name[:40]}: got {text[:40]!r}, expected numbers with commas between") from error
         values[name] = numbers if len(numbers) > 1 else numbers[0]
     return read_hints(values)
 
@@ -115,6 +125,9 @@ def read_hints(values: Mapping[str, Any]) -> dict[str, Any]:
     return hints
 
 
+#: In JSON that asks for one image, which has a dozen of each.
+_MOST_NESTED, _MOST_VALUES = 64, 256
+
 #: Under this name a time limit stands among the hints.
 LIMIT = "time_limit_s"
 
@@ -127,6 +140,9 @@ def read_execution(body: bytes) -> tuple[bytes, dict[str, Any]]:
     Refused
         It is none.
     """
+    # A byte of brackets takes thirty once it is parsed; base64 holds none of these signs.
+    if sum(map(body.count, (b"[", b"{"))) > _MOST_NESTED or body.count(b",") > _MOST_VALUES:
+        raise Refused(400, f"JSON of more than {_MOST_NESTED} brackets or {_MOST_VALUES} commas, expected few of both")
     try:
         asked = json.loads(body)
     except (ValueError, RecursionError) as error:

@@ -11,13 +11,17 @@ import multiprocessing
 import queue
 import signal
 import threading
+import time
 from collections.abc import Sequence
 from dataclasses import dataclass
+from functools import partial
 from multiprocessing.connection import Connection
 from pathlib import Path
 from typing import Any
 
-__all__ = ["Answer", "Asked", "Full", "Workers"]
+from roadgeo._progress import Say, say_nothing
+
+__all__ = ["Answer", "Asked", "Full", "Place", "Told", "Workers"]
 
 _LOG = logging.getLogger(__name__)
 
@@ -25,6 +29,8 @@ _LOG = logging.getLogger(__name__)
 _GRACE_S = 15.0
 #: So long it may open its references.
 _START_S = 120.0
+#: So often it is looked whether somebody still waits.
+_GLANCE_S = 0.25
 #: Processes that are given an image, one after another, as long as they break.
 _TRIES = 2
 
@@ -43,12 +49,26 @@ class Asked:
         The file that holds it.
     hints : dict
         `near`, `within`, `gsd_m`, `max_tilt_deg`, `focal_px`, `north_up`, as far as they are known.
+    name : str
+        What the answer calls it.
+    tells : bool
+        Whether progress is told.
     """
 
     path: str
     hints: dict[str, Any]
     time_limit_s: float
     max_pixels: int
+    name: str = ""
+    tells: bool = False
+
+
+@dataclass(frozen=True)
+class Told:
+    """How far a process is with what it was asked: see `Say`."""
+
+    text: str
+    share: float | None = None
 
 
 @dataclass(frozen=True)
@@ -57,6 +77,29 @@ class Answer:
 
     status: int
     document: dict[str, Any]
+
+
+class CalledOff(Exception):  # noqa: N818 (a wish, not a fault)
+    """Nobody waits for an answer any more."""
+
+
+class Place:
+    """The right of one request to wait for a process and to have it."""
+
+    def __init__(self, places: threading.Semaphore) -> None:
+        self._places: threading.Semaphore | None = places
+
+    def __enter__(self) -> Place:
+        return self
+
+    def __exit__(self, *_: object) -> None:
+        self.give_back()
+
+    def give_back(self) -> None:
+        """Let another request have it."""
+        places, self._places = self._places, None
+        if places is not None:
+            places.release()
 
 
 class Workers:
@@ -75,38 +118,44 @@ class Workers:
             worker.wait_until_ready()
             self._idle.put(worker)
 
-    def is_full(self) -> bool:
-        """Whether a request that came now would be refused."""
-        if self._places.acquire(blocking=False):
-            self._places.release()
-            return False
-        return True
-
-    def ask(self, asked: Asked) -> Answer:
-        """Have one process locate, as soon as one is free.
+    def take_place(self) -> Place:
+        """Take the place of one request, until it is given back.
 
         Raises
         ------
         Full
-            Too many wait already.
+            Too many work or wait already.
         """
         if not self._places.acquire(blocking=False):
             raise Full
-        try:
-            worker = self._idle.get()
-            try:
-                return self._ask(worker, asked)
-            finally:
-                self._idle.put(worker)
-        finally:
-            self._places.release()
+        return Place(self._places)
 
-    def _ask(self, worker: _Worker, asked: Asked) -> Answer:
+    def ask(self, asked: Asked, say: Say = say_nothing, called_off: threading.Event | None = None) -> Answer:
+        """Have one process locate, as soon as one is free; who asks holds a place.
+
+        Parameters
+        ----------
+        say
+            Told how far it is.
+        called_off : Event, optional
+            Once it is set nobody waits for the answer any more.
+        """
+        worker = self._idle.get()
+        try:
+            return self._ask(worker, asked, say, called_off or threading.Event())
+        finally:
+            self._idle.put(worker)
+
+    def _ask(self, worker: _Worker, asked: Asked, say: Say, called_off: threading.Event) -> Answer:
         """Ask a process; where it breaks start it anew and ask again, for it may have broken while it was idle."""
         try:
             for _ in range(_TRIES):
+                if called_off.is_set():
+                    break
                 try:
-                    return worker.ask(asked)
+                    return worker.ask(asked, say, called_off)
+                except CalledOff:
+                    self._restart(worker, "nobody waits for its answer any more")
                 except TimeoutError as error:
                     self._restart(worker, f"it took {error}")
                     told = f"it took {error} and was ended; reduce the image, or come again when less is asked"
@@ -115,6 +164,8 @@ class Workers:
                     self._restart(worker, f"it broke ({type(error).__name__})")
         except OSError as error:
             return Answer(503, {"detail": f"no process can be started: {error.strerror or error}; come again"})
+        if called_off.is_set():
+            return Answer(410, {"detail": "it was called off"})
         return Answer(500, {"detail": f"it broke {_TRIES} processes, one after another; send another image"})
 
     def _restart(self, worker: _Worker, why: str) -> None:
@@ -174,21 +225,32 @@ class _Worker:
         if why:
             raise IndexFormatError(why)
 
-    def ask(self, asked: Asked) -> Answer:
+    def ask(self, asked: Asked, say: Say, called_off: threading.Event) -> Answer:
         """Return its answer.
 
         Raises
         ------
         TimeoutError
             It takes too long.
+        CalledOff
+            Nobody waits any more.
         EOFError, OSError
             The process has ended.
         """
         if why := self._open():
             return Answer(503, {"detail": why})
         self._pipe.send(asked)
-        answer: Answer = self._receive(asked.time_limit_s + _GRACE_S)
-        return answer
+        patience_s = asked.time_limit_s + _GRACE_S
+        until = time.monotonic() + patience_s
+        while time.monotonic() < until:
+            if called_off.is_set():
+                raise CalledOff
+            if self._pipe.poll(min(_GLANCE_S, patience_s)):
+                heard = self._pipe.recv()
+                if isinstance(heard, Answer):
+                    return heard
+                say(heard.text, heard.share)
+        raise TimeoutError(f"longer than {patience_s:g} s")
 
     def _open(self) -> str:
         """Wait until a fresh process has opened its references; return why it cannot, "" where it can."""
@@ -230,17 +292,30 @@ def _serve(pipe: Connection, names: list[str]) -> None:
     pipe.send(True)
     try:
         while True:
-            pipe.send(_locate(pipe.recv(), references))
+            asked: Asked = pipe.recv()
+            say = partial(_tell, pipe) if asked.tells else say_nothing
+            pipe.send(_locate(asked, references, say))
     except (EOFError, OSError):
         return
 
 
-def _locate(asked: Asked, references: Sequence[Any]) -> Answer:
+def _tell(pipe: Connection, text: str, share: float | None = None) -> None:
+    pipe.send(Told(text, share))
+
+
+def _locate(asked: Asked, references: Sequence[Any], say: Say = say_nothing) -> Answer:
     from dataclasses import replace
 
     from roadgeo.errors import MaskError, ModelError, RoadgeoError
     from roadgeo.running.queries import locate_query
-    from roadgeo.workflows import LocateOptions
+    from roadgeo.workflows import LocateOptions, locate
+
+    def search(*asked_of: Any) -> Any:
+        say("searching the map")
+        return locate(*asked_of)
+
+    def tell(text: str, share: float | None = None) -> None:
+        say(_without(asked.path, text), share)
 
     try:
         width, height = _size(asked.path)
@@ -251,9 +326,11 @@ def _locate(asked: Asked, references: Sequence[Any]) -> Answer:
         hints = dict(asked.hints)
         near, within = hints.pop("near", None), hints.pop("within", None)
         match = replace(default.match, camera=replace(default.match.camera, **hints), within=within)
-        search = replace(default.search, time_limit_s=asked.time_limit_s)
-        options = replace(default, near=near, match=match, search=search)
-        location = replace(locate_query(asked.path, references, options).location, query="")
+        limits = replace(default.search, time_limit_s=asked.time_limit_s)
+        options = replace(default, near=near, match=match, search=limits)
+        say("reading the image")
+        sighting = locate_query(asked.path, references, options, how=search, say=tell)
+        location = replace(sighting.location, query=asked.name)
         return Answer(200, location.to_dict())
     except MaskError as error:
         return Answer(422, {"detail": _without(asked.path, str(error))})

@@ -63,6 +63,7 @@ def test_an_image_comes_in_json():
 @pytest.mark.parametrize(
     "body",
     [b"", b"{}", b"[" * 100_000, b'{"inputs": 3}', b'{"inputs": {"image": {"href": "http://10.0.0.1/"}}}',
+     b"[" * 50_000_000, b"{}," * 1_000_000,
      b'{"inputs": {"image": "*"}}', b'{"inputs": {"image": 3}}', b'{"inputs": {"image": "", "near": "x"}}',
      b'{"inputs": {"image": "", "near": [1e999, 0, 1]}}', b"\xff\xfe"],
 )  # fmt: skip

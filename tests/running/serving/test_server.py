@@ -9,11 +9,13 @@ import struct
 import threading
 import time
 from contextlib import contextmanager, suppress
+from pathlib import Path
 
 import pytest
 
-from roadgeo.running.serving.server import ServeOptions, Server
-from roadgeo.running.serving.workers import Answer, Full
+from roadgeo.running.serving.options import ServeOptions
+from roadgeo.running.serving.server import Server
+from roadgeo.running.serving.workers import Answer, Full, Place
 
 PNG = b"\x89PNG\r\n\x1a\n" + bytes(40)
 FOUND = {"schema": "roadgeo.location/1", "status": "located", "center": {"lon": 1.0, "lat": 2.0}}
@@ -26,21 +28,18 @@ class Workers:
         self.asked, self.places, self.busy = [], threading.Semaphore(places), threading.Event()
         self.busy.set()
 
-    def is_full(self):
-        free = self.places.acquire(blocking=False)
-        if free:
-            self.places.release()
-        return not free
-
-    def ask(self, asked):
+    def take_place(self):
         if not self.places.acquire(blocking=False):
             raise Full
-        try:
-            self.busy.wait(10.0)
-            self.asked.append(asked)
-            return Answer(200, FOUND)
-        finally:
-            self.places.release()
+        return Place(self.places)
+
+    def ask(self, asked, say=None, called_off=None):
+        if asked.tells:
+            say("finding roads", 0.5)
+        while not self.busy.wait(0.02) and not called_off.is_set():
+            pass
+        self.asked.append(asked)
+        return Answer(200, {**FOUND, "query": asked.name} if asked.name else FOUND)
 
     def close(self):
         pass
@@ -49,14 +48,14 @@ class Workers:
 @contextmanager
 def serving(workers=None, told=None, **options):
     server = Server(workers or Workers(), ["town"], ServeOptions(port=0, **options), told)
-    thread = threading.Thread(target=server.serve_forever, kwargs={"poll_interval": 0.02}, daemon=True)
+    thread = threading.Thread(target=server.serve_forever, daemon=True)
     thread.start()
     try:
         yield server
     finally:
         server.shutdown()
-        server.close()
         thread.join()
+        server.close()
 
 
 def ask(server, method, path, body=None, headers=None):
@@ -123,7 +122,7 @@ def test_it_describes_itself_as_a_process_server():
     ("method", "path", "body", "headers", "status"),
     [
         ("GET", "/nonesuch", None, {}, 404),
-        ("GET", "/locate", None, {}, 404),
+        ("GET", "/locate", None, {}, 405),
         ("POST", "/processes", PNG, {}, 405),
         ("POST", "/nonesuch", PNG, {}, 404),
         ("POST", "/locate", b"<VRTDataset>", {}, 415),
@@ -133,20 +132,18 @@ def test_it_describes_itself_as_a_process_server():
         ("POST", "/locate", PNG, {"Host": "evil.example"}, 403),
         ("POST", "/locate", PNG, {"Origin": "https://evil.example"}, 403),
         ("POST", "/processes/locate/execution", b"{", {}, 400),
-        ("DELETE", "/locate", None, {}, 501),
+        ("DELETE", "/locate", None, {}, 405),
     ],
 )
 def test_what_is_wrong_is_said(method, path, body, headers, status):
     with serving(max_bytes=1000) as server:
-        answer, document = ask(server, method, path, body, headers) if method != "DELETE" else (None, None)
-        if answer is None:
-            assert b" 501 " in send_raw(server, b"DELETE /locate HTTP/1.1\r\nHost: localhost\r\n\r\n", 1.0)[:40]
-            return
+        answer, document = ask(server, method, path, body, headers)
         assert answer.status == status
         assert document["status"] == status
         assert document["detail"]
 
 
+GET = b"GET / HTTP/1.1\r\nHost: localhost\r\n"
 POST = b"POST /locate HTTP/1.1\r\nHost: localhost\r\n"
 
 
@@ -154,23 +151,26 @@ POST = b"POST /locate HTTP/1.1\r\nHost: localhost\r\n"
     ("head", "status"),
     [
         (POST + b"\r\n", b" 411 "),
-        (POST + b"Content-Length: -5\r\n\r\n", b" 411 "),
+        (POST + b"Content-Length: -5\r\n\r\n", b" 400 "),
         (POST + b"Content-Length: 9\r\nContent-Length: 8\r\n\r\n", b" 400 "),
         (POST + b"Content-Length: 9\r\nTransfer-Encoding: chunked\r\n\r\n", b" 400 "),
         (POST + b"Transfer-Encoding: chunked\r\n\r\nxyz\r\n", b" 400 "),
-        (POST + b"Transfer-Encoding: chunked\r\n\r\nfffff\r\n", b" 413 "),
+        (POST + b"Transfer-Encoding: chunked\r\n\r\nfffff\r\n" + bytes(1001), b" 413 "),
+        (POST + b"Transfer-Encoding: chunked\r\n\r\nfffff\r\n", b" 408 "),
         (POST + b"Transfer-Encoding: chunked\r\n\r\n3\r\nabcdef\r\n0\r\n\r\n", b" 400 "),
+        (b"GET / HTTP/1.1\r\n\r\n", b" 400 "),
         (b"GET / HTTP/1.1\r\nHost: [::1\r\n\r\n", b" 403 "),
         (POST + b"Content-Length: 99999\r\nExpect: 100-continue\r\n\r\n", b" 413 "),
-        (b"GET / HTTP/1.1\r\n" + b"".join(b"X-%d: 1\r\n" % k for k in range(200)) + b"\r\n", b" 431 "),
-        (b"GET / HTTP/1.1\r\nX: " + b"a" * 70_000 + b"\r\n\r\n", b" 431 "),
-        (b"GET /" + b"a" * 70_000 + b" HTTP/1.1\r\n\r\n", b" 414 "),
+        (GET + b"".join(b"X-%d: 1\r\n" % k for k in range(200)) + b"\r\n", b" 431 "),
+        (GET + b"X: " + b"a" * 70_000 + b"\r\n\r\n", b" 431 "),
+        (b"GET /" + b"a" * 70_000 + b" HTTP/1.1\r\nHost: localhost\r\n\r\n", b" 414 "),
+        (b"GET /" + b"a" * 400_000, b" 431 "),
         (b"\0\xff\xfe nonsense\r\n\r\n", b" 400 "),
         (b"POST http://[/locate HTTP/1.1\r\nHost: localhost\r\nContent-Length: 0\r\n\r\n", b" 400 "),
         (b"GET http://[/ HTTP/1.1\r\nHost: localhost\r\n\r\n", b" 400 "),
         (b"GET / HTTP/1.1\r\nHost: [\r\n\r\n", b" 403 "),
         (b"GET / HTTP/1.1\r\nHost: localhost\r\nOrigin: http://[\r\n\r\n", b" 403 "),
-        (b"POST /locate HTTP/1.1\r\nHost: evil.example\r\nContent-Length: \xb2\r\n\r\n", b" 403 "),
+        (b"POST /locate HTTP/1.1\r\nHost: evil.example\r\nContent-Length: \xb2\r\n\r\n", b" 400 "),
     ],
 )
 def test_heads_that_are_none_get_an_answer_and_the_next_is_served(head, status):
@@ -210,7 +210,7 @@ def test_a_body_that_ends_before_it_should_is_not_located():
 
 def test_what_workers_refuse_is_a_problem():
     workers = Workers()
-    workers.ask = lambda _: Answer(422, {"detail": "the image: no road in it"})
+    workers.ask = lambda *_: Answer(422, {"detail": "the image: no road in it"})
     with serving(workers) as server:
         answer, document = ask(server, "POST", "/locate", PNG)
     assert answer.status == document["status"] == 422
@@ -233,7 +233,7 @@ def test_it_listens_on_ipv6_too():
 
 def test_a_fault_is_told_and_logged_and_the_next_is_served(caplog):
     workers = Workers()
-    workers.ask = lambda _: {}["nothing"]
+    workers.ask = lambda *_: {}["nothing"]
     with serving(workers) as server:
         answer, document = ask(server, "POST", "/locate", PNG)
         assert (answer.status, document["status"]) == (500, 500)
@@ -247,7 +247,7 @@ def test_a_disk_that_is_full_is_no_fault(monkeypatch):
         raise OSError(errno.ENOSPC, os.strerror(errno.ENOSPC))
 
     with serving() as server:
-        monkeypatch.setattr("pathlib.Path.write_bytes", full)
+        monkeypatch.setattr("pathlib.Path.rename", full)
         answer, document = ask(server, "POST", "/locate", PNG)
         assert (answer.status, answer.headers["Retry-After"]) == (503, "1")
         assert "No space left" in document["detail"]
@@ -263,7 +263,7 @@ def test_who_asked_gets_the_place_though_it_cannot_be_told_to_others():
 
 def test_an_answer_that_takes_too_long_says_when_to_come_again():
     workers = Workers()
-    workers.ask = lambda _: Answer(503, {"detail": "it took longer than 25 s and was ended"})
+    workers.ask = lambda *_: Answer(503, {"detail": "it took longer than 25 s and was ended"})
     with serving(workers) as server:
         answer, document = ask(server, "POST", "/locate", PNG)
         assert (answer.status, answer.headers["Retry-After"]) == (503, "1")
@@ -301,7 +301,7 @@ def test_who_comes_when_it_is_full_is_told_when_to_come_again():
         first = threading.Thread(target=ask, args=(server, "POST", "/locate", PNG))
         first.start()
         for _ in range(200):
-            if workers.is_full():
+            if not workers.places._value:
                 break
             time.sleep(0.01)
         answer, _ = ask(server, "POST", "/locate", PNG)
@@ -337,3 +337,236 @@ def test_it_listens_on_loopback_only():
     assert ServeOptions().host == "127.0.0.1"
     with serving() as server:
         assert server.server_address[0] == "127.0.0.1"
+
+
+# --- bodies that nobody asked for -------------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize("method", [b"GET", b"HEAD", b"DELETE"])
+@pytest.mark.parametrize("path", [b"/processes", b"/nonesuch", b"/jobs/none/events"])
+@pytest.mark.parametrize("coding", ["length", "chunked"])
+def test_a_body_is_never_read_as_the_next_request(method, path, coding):
+    hidden = b"GET /health HTTP/1.1\r\nHost: localhost\r\nX-Hidden: yes\r\n\r\n"
+    framed = b"%x\r\n%b\r\n0\r\n\r\n" % (len(hidden), hidden)
+    told = b"Transfer-Encoding: chunked" if coding == "chunked" else b"Content-Length: %d" % len(hidden)
+    head = b"%b %b HTTP/1.1\r\nHost: localhost\r\n%b\r\n\r\n" % (method, path, told)
+    with serving() as server:
+        answer = send_raw(server, head + (framed if coding == "chunked" else hidden), 0.7)
+    assert answer.count(b"HTTP/1.1 ") == 1
+    assert b"version" not in answer or path == b"/processes"
+
+
+def test_the_next_request_is_answered_after_a_body_that_nobody_read():
+    first = b"GET /processes HTTP/1.1\r\nHost: localhost\r\nContent-Length: 5\r\n\r\nabcde"
+    last = b"GET /health HTTP/1.1\r\nHost: localhost\r\nConnection: close\r\n\r\n"
+    with serving() as server:
+        answer = send_raw(server, first + last)
+    assert answer.count(b"HTTP/1.1 200 ") == 2
+    assert answer.endswith(b"}")
+
+
+def test_who_drips_a_body_after_the_answer_is_cut_off():
+    with serving(head_s=0.3) as server, socket.create_connection(("127.0.0.1", server.server_port), timeout=5) as sock:
+        sock.sendall(b"GET /health HTTP/1.1\r\nHost: localhost\r\nContent-Length: 1000\r\n\r\n")
+        started = time.monotonic()
+        with suppress(OSError):  # reset, or a broken pipe
+            while time.monotonic() - started < 8.0:
+                sock.sendall(b"x")
+                time.sleep(0.05)
+        assert time.monotonic() - started < 5.0
+
+
+def test_who_does_not_read_is_cut_off():
+    asked = b"GET /api HTTP/1.1\r\nHost: localhost\r\n\r\n"
+    with serving(head_s=0.3) as server, socket.socket() as sock:
+        sock.setsockopt(socket.SOL_SOCKET, socket.SO_RCVBUF, 2048)
+        sock.connect(("127.0.0.1", server.server_port))
+        sock.settimeout(0.5)
+        with suppress(OSError):
+            for _ in range(3000):
+                sock.sendall(asked)
+        for _ in range(100):
+            if not server._uvicorn.server_state.connections:
+                break
+            time.sleep(0.05)
+        assert not server._uvicorn.server_state.connections
+        assert ask(server, "GET", "/health")[0].status == 200
+
+
+def test_json_is_bounded_apart_from_images():
+    workers = Workers()
+    with serving(workers, max_json_bytes=2000) as server:
+        where = "/processes/locate/execution"
+        for bomb, status in ((b"[" * 1900, 400), (b"[" + b"0," * 900, 400), (b"[" * 100_000, 413)):
+            answer, document = ask(server, "POST", where, bomb)
+            assert (answer.status, document["status"]) == (status, status)
+        assert ask(server, "POST", "/locate", PNG + bytes(5000))[0].status == 200
+        chunked = b"POST %b HTTP/1.1\r\nHost: localhost\r\nTransfer-Encoding: chunked\r\n\r\n" % where.encode()
+        assert b" 413 " in send_raw(server, chunked + b"1000\r\n" + b"[" * 4096 + b"\r\n", 1.0)[:40]
+    assert len(workers.asked) == 1
+
+
+def test_a_place_is_taken_before_a_body_is_read():
+    with serving(Workers(places=1)) as server:
+        with socket.create_connection(("127.0.0.1", server.server_port), timeout=5) as sock:
+            sock.sendall(POST + b"Content-Length: 1000\r\n\r\nabc")
+            time.sleep(0.3)
+            assert b" 503 " in send_raw(server, POST + b"Content-Length: 1000\r\n\r\n", 1.0)[:40]
+            sock.shutdown(socket.SHUT_RDWR)
+        for _ in range(100):  # and given back
+            if ask(server, "POST", "/locate", PNG)[0].status == 200:
+                break
+            time.sleep(0.02)
+        else:
+            pytest.fail("the place is not given back")
+
+
+# --- forms, jobs, health ----------------------------------------------------------------------------------------------
+
+
+def form(*parts):
+    """The body of a form, and its headers."""
+    lines = []
+    for disposition, content in parts:
+        lines += [b"--sep", b"Content-Disposition: form-data; " + disposition, b"", content]
+    return b"\r\n".join([*lines, b"--sep--", b""]), {"Content-Type": "multipart/form-data; boundary=sep"}
+
+
+def test_a_form_is_taken():
+    workers = Workers()
+    body = form((b'name="gsd"', b"0.5,1"), (b'name="image"; filename="../a/photo.png"', PNG), (b'name="northUp"', b""))
+    with serving(workers) as server:
+        answer, found = ask(server, "POST", "/locate?timeLimit=2", *body)
+    assert (answer.status, found["status"]) == (200, "located")
+    assert workers.asked[0].hints == {"gsd_m": (0.5, 1.0), "north_up": True}
+    assert (workers.asked[0].time_limit_s, workers.asked[0].name) == (2.0, "photo.png")
+
+
+@pytest.mark.parametrize(
+    ("parts", "status"),
+    [
+        ([(b'name="gsd"', b"1,2")], 400),
+        ([(b'name="image"', PNG)], 400),
+        ([(b'name="image"; filename="a.png"', b"<html>")], 415),
+        ([(b'name="image"; filename="a.png"', PNG)] * 2, 400),
+        ([(b'name="colour"', b"red"), (b'name="image"; filename="a.png"', PNG)], 400),
+        ([(b'name="gsd"', b"9" * 5000), (b'name="image"; filename="a.png"', PNG)], 400),
+        ([(b'name="image"; filename="a.png"', PNG + bytes(9000))], 413),
+        ([(b'name="a%d"' % k, b"1") for k in range(60)], 400),
+    ],
+)
+def test_other_forms_are_refused(parts, status):
+    with serving(max_bytes=8000) as server:
+        answer, document = ask(server, "POST", "/locate", *form(*parts))
+        assert (answer.status, document["status"]) == (status, status)
+        torn, headers = form(*parts)
+        assert ask(server, "POST", "/locate", torn[: len(torn) // 2], headers)[0].status in (400, 413)
+        assert ask(server, "POST", "/locate", torn, {"Content-Type": "multipart/form-data"})[0].status in (400, 413)
+
+
+def test_it_says_that_it_lives():
+    with serving(token="open sesame") as server:
+        answer, document = ask(server, "GET", "/health")
+    assert (answer.status, document["status"]) == (200, "ok")
+
+
+LATER = {"Prefer": "respond-async"}
+
+
+def wait_for(server, job, *states):
+    for _ in range(300):
+        document = ask(server, "GET", f"/jobs/{job}")[1]
+        if document["status"] in states:
+            return document
+        time.sleep(0.02)
+    raise AssertionError(document)
+
+
+def test_who_prefers_not_to_wait_gets_a_job():
+    workers = Workers()
+    workers.busy.clear()
+    with serving(workers) as server:
+        answer, job = ask(server, "POST", "/locate?gsd=1,2", PNG, LATER)
+        assert answer.status == 201
+        assert answer.headers["Location"] == f"/jobs/{job['jobID']}"
+        told = wait_for(server, job["jobID"], "running")
+        assert (told["message"], told["progress"], told["processID"]) == ("finding roads", 50, "locate")
+        assert ask(server, "GET", f"/jobs/{job['jobID']}/results")[0].status == 404
+        workers.busy.set()
+        assert wait_for(server, job["jobID"], "successful")["progress"] == 100
+        assert ask(server, "GET", f"/jobs/{job['jobID']}/results")[1] == {"location": FOUND}
+        assert ask(server, "GET", "/jobs")[1]["jobs"] == []
+
+
+def test_progress_is_told_as_it_is_made():
+    workers = Workers()
+    workers.busy.clear()
+    with serving(workers) as server:
+        job = ask(server, "POST", "/locate", PNG, LATER)[1]["jobID"]
+        connection = http.client.HTTPConnection("127.0.0.1", server.server_port, timeout=10)
+        connection.request("GET", f"/jobs/{job}/events")
+        answer = connection.getresponse()
+        assert answer.headers["Content-Type"].startswith("text/event-stream")
+        states, told = [], answer.readline()
+        while told:
+            if told.startswith(b"data: "):
+                states.append(json.loads(told[6:])["status"])
+                if states[-1] == "running":
+                    workers.busy.set()
+            told = answer.readline()
+        connection.close()
+    assert states[-1] == "successful"
+    assert "running" in states
+
+
+def test_a_job_that_fails_says_why():
+    workers = Workers()
+    workers.ask = lambda *_: Answer(422, {"detail": "the image: no road in it"})
+    with serving(workers) as server:
+        job = ask(server, "POST", "/locate", PNG, LATER)[1]["jobID"]
+        assert wait_for(server, job, "failed")["message"] == "the image: no road in it"
+        answer, document = ask(server, "GET", f"/jobs/{job}/results")
+        assert (answer.status, document["detail"]) == (422, "the image: no road in it")
+
+
+def test_a_job_is_called_off_and_forgotten():
+    workers = Workers(places=1)
+    workers.busy.clear()
+    with serving(workers) as server:
+        job = ask(server, "POST", "/locate", PNG, LATER)[1]["jobID"]
+        assert ask(server, "POST", "/locate", PNG)[0].status == 503
+        assert ask(server, "DELETE", f"/jobs/{job}")[1]["status"] == "dismissed"
+        assert ask(server, "GET", f"/jobs/{job}")[0].status == 404
+        for _ in range(100):
+            if workers.places._value:
+                break
+            time.sleep(0.02)
+        workers.busy.set()
+        assert ask(server, "POST", "/locate", PNG)[0].status == 200
+        assert not list(Path(server._folder.name).iterdir())
+
+
+def test_the_latest_answers_are_kept():
+    with serving(kept_jobs=2) as server:
+        jobs = []
+        for _ in range(4):
+            jobs.append(ask(server, "POST", "/locate", PNG, LATER)[1]["jobID"])
+            wait_for(server, jobs[-1], "successful")
+        there = [ask(server, "GET", f"/jobs/{job}")[0].status for job in jobs]
+        assert there == [404, 404, 200, 200]
+        assert len(list(Path(server._folder.name).iterdir())) == 2
+
+
+def test_nothing_of_a_request_is_kept():
+    with serving() as server:
+        for body in (PNG, b"no image", PNG + bytes(100_000)):
+            ask(server, "POST", "/locate", body)
+        assert not list(Path(server._folder.name).iterdir())
+
+
+def test_other_sites_get_nothing():
+    with serving() as server:
+        answer, _ = ask(server, "GET", "/")
+        assert answer.headers["Cross-Origin-Resource-Policy"] == "same-origin"
+        assert "Access-Control-Allow-Origin" not in answer.headers
+        assert "frame-ancestors 'none'" in answer.headers["Content-Security-Policy"]

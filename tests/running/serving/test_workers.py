@@ -132,7 +132,7 @@ def test_what_a_process_answers(place, tmp_path, monkeypatch):
 
 
 def test_a_fault_is_answered_and_not_where_files_lie(place, tmp_path, monkeypatch):
-    def fail(path, *_):
+    def fail(path, *_, **__):
         raise ZeroDivisionError(f"in {path}")
 
     monkeypatch.setattr("roadgeo.running.queries.locate_query", fail)
@@ -186,7 +186,7 @@ def test_a_process_that_breaks_at_work_costs_nobody_an_answer(one_worker):
 
 
 def test_an_image_that_breaks_every_process_is_told_so(one_worker, monkeypatch):
-    def broken(self, asked):
+    def broken(self, *_):
         raise EOFError
 
     workers, asked = one_worker
@@ -208,7 +208,7 @@ def test_what_takes_too_long_is_ended_and_no_fault(one_worker, monkeypatch):
 
 
 def test_a_system_without_room_for_a_process_is_no_fault(one_worker, monkeypatch):
-    def none(*_):
+    def none(*_, **__):
         raise OSError(errno.EAGAIN, os.strerror(errno.EAGAIN))
 
     workers, asked = one_worker
@@ -229,7 +229,7 @@ def test_who_asks_while_the_server_ends_is_told(one_worker):
 
 
 def test_photographs_are_refused_where_there_is_no_model_for_them(monkeypatch):
-    def none(*_):
+    def none(*_, **__):
         raise ModelError("photographs need onnxruntime: pip install 'roadgeo[segment]'")
 
     monkeypatch.setattr("roadgeo.running.serving.workers._size", lambda _: (10, 10))

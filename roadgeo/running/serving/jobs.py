@@ -1,0 +1,166 @@
+"""What is asked without waiting: jobs, how far they are, and their answers, kept for a while."""
+
+from __future__ import annotations
+
+import asyncio
+import secrets
+import shutil
+import threading
+from collections.abc import AsyncIterator
+from contextlib import suppress
+from dataclasses import dataclass, field
+from datetime import UTC, datetime
+from pathlib import Path
+from typing import Any, Literal
+
+from roadgeo.running.serving.options import ServeOptions
+from roadgeo.running.serving.workers import Answer
+
+__all__ = ["Job", "Jobs", "Status"]
+
+#: As OGC API - Processes calls them.
+Status = Literal["accepted", "running", "successful", "failed", "dismissed"]
+
+#: So often a listener hears that the connection still stands.
+_PULSE_S = 10.0
+
+
+@dataclass
+class Job:
+    """One image that is being located, or was; known to whoever knows its name, which cannot be guessed.
+
+    Attributes
+    ----------
+    folder : Path
+        Holds the image, and later what the answer is shown with.
+    image : str
+        The name of its file.
+    name : str
+        What its sender calls it.
+    hints : dict
+        With which it is searched, as `requests.read_hints` gives them.
+    """
+
+    folder: Path
+    image: str
+    name: str
+    hints: dict[str, Any]
+    id: str = field(default_factory=lambda: secrets.token_hex(16))
+    status: Status = "accepted"
+    message: str = "waiting for a free process"
+    progress: int = 0
+    answer: Answer | None = None
+    created: datetime = field(default_factory=lambda: datetime.now(UTC))
+    started: datetime | None = None
+    finished: datetime | None = None
+    called_off: threading.Event = field(default_factory=threading.Event)
+    _changed: asyncio.Event = field(default_factory=asyncio.Event)
+
+    @property
+    def path(self) -> Path:
+        """The file of the image."""
+        return self.folder / self.image
+
+    @property
+    def is_over(self) -> bool:
+        """Whether nothing more will become of it."""
+        return self.status in ("successful", "failed", "dismissed")
+
+    def tell(self, text: str, share: float | None = None) -> None:
+        """Say how far it is."""
+        if self.is_over:
+            return
+        self.status, self.message = "running", text
+        self.started = self.started or datetime.now(UTC)
+        self.progress = 0 if share is None else round(100 * min(max(share, 0.0), 1.0))
+        self._wake()
+
+    def end(self, answer: Answer) -> None:
+        """Keep the answer."""
+        if self.is_over:
+            return
+        found = answer.status == 200
+        self.answer, self.finished, self.progress = answer, datetime.now(UTC), 100
+        self.status = "successful" if found else "failed"
+        self.message = str(answer.document.get("reason" if found else "detail", ""))
+        self._wake()
+
+    def call_off(self) -> None:
+        """Have nobody wait for it any more."""
+        self.called_off.set()
+        if not self.is_over:
+            self.status, self.message, self.finished = "dismissed", "it was called off", datetime.now(UTC)
+        self._wake()
+
+    def to_dict(self) -> dict[str, Any]:
+        """Return its state as OGC API - Processes has it."""
+        times = {"created": self.created, "started": self.started, "finished": self.finished}
+        return {
+            "jobID": self.id,
+            "processID": "locate",
+            "type": "process",
+            "status": self.status,
+            "message": self.message,
+            "progress": self.progress,
+            **{name: time.isoformat(timespec="milliseconds") for name, time in times.items() if time},
+        }
+
+    async def watch(self) -> AsyncIterator[dict[str, Any] | None]:
+        """Yield its state now and whenever that changes, until it is over; None where nothing happened for a while."""
+        while True:
+            changed = self._changed
+            yield self.to_dict()
+            if self.is_over:
+                return
+            while not changed.is_set():
+                try:
+                    await asyncio.wait_for(changed.wait(), _PULSE_S)
+                except TimeoutError:
+                    yield None
+
+    def _wake(self) -> None:
+        old, self._changed = self._changed, asyncio.Event()
+        old.set()
+
+
+class Jobs:
+    """All jobs; of those that are over the latest are kept."""
+
+    def __init__(self, folder: Path, options: ServeOptions) -> None:
+        self._folder, self._options = folder, options
+        self._all: dict[str, Job] = {}
+
+    def make_folder(self) -> Path:
+        """Make the folder of a job that is to come."""
+        folder = self._folder / secrets.token_hex(16)
+        folder.mkdir(mode=0o700)
+        return folder
+
+    def add(self, job: Job) -> None:
+        """Keep a job, and let go of the oldest that are over."""
+        self._all[job.id] = job
+        self.let_go()
+
+    def find(self, name: str) -> Job | None:
+        """Return a job by its name."""
+        return self._all.get(name)
+
+    def remove(self, job: Job) -> None:
+        """Call a job off, and forget it."""
+        job.call_off()
+        self._all.pop(job.id, None)
+        shutil.rmtree(job.folder, ignore_errors=True)
+
+    def let_go(self) -> None:
+        """Forget the oldest that are over, as far as there are too many or they take too much room."""
+        over = [job for job in self._all.values() if job.is_over]
+        sizes = [_size(job.folder) for job in over]
+        while over and (len(over) > self._options.kept_jobs or (sum(sizes) > self._options.kept_bytes and over[1:])):
+            self.remove(over.pop(0))
+            sizes.pop(0)
+
+
+def _size(folder: Path) -> int:
+    with suppress(OSError):
+        return sum(path.stat().st_size for path in folder.iterdir())
+    return 0

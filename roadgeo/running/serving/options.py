@@ -1,0 +1,49 @@
+"""What the server allows."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+__all__ = ["LOOPBACK", "ServeOptions"]
+
+LOOPBACK = ("127.0.0.1", "::1", "localhost")
+
+
+@dataclass(frozen=True)
+class ServeOptions:
+    """What the server allows.
+
+    Attributes
+    ----------
+    token : str
+        Whoever asks must show it; "" for nobody.
+    workers, waiting : int
+        Processes, and requests that may wait for one.
+    max_bytes, max_pixels : int
+        Of an image, as sent and unpacked.
+    max_json_bytes : int
+        Of a body that is JSON, which is held in memory; an image in it counts a third more than its bytes.
+    head_s, body_s : float
+        Time to send a request's head, and its body.
+    time_limit_s : float
+        Of a search; requests may ask for less.
+    connections : int
+        Open at once.
+    kept_jobs, kept_bytes : int
+        Answers that are kept for who asked not to wait, and what they may take on disk.
+    """
+
+    host: str = "127.0.0.1"
+    port: int = 8017
+    token: str = ""
+    workers: int = 1
+    waiting: int = 8
+    max_bytes: int = 64_000_000
+    max_pixels: int = 64_000_000
+    max_json_bytes: int = 16_000_000
+    head_s: float = 10.0
+    body_s: float = 60.0
+    time_limit_s: float = 10.0
+    connections: int = 64
+    kept_jobs: int = 20
+    kept_bytes: int = 2_000_000_000
