@@ -39,7 +39,7 @@ from roadgeo.sources.masks import read_mask
 from roadgeo.sources.overpass import FetchOptions, fetch_lines, find_place
 from roadgeo.sources.roads import read_roads
 from roadgeo.sources.segmentation.card import read_card
-from roadgeo.sources.segmentation.onnx_file import read_onnx
+from roadgeo.sources.segmentation.onnx_file import open_onnx
 from roadgeo.sources.segmentation.photograph import find_ground, open_photograph
 from roadgeo.sources.streams import stream_lines
 from support.untrusted_web import answered, serve_request
@@ -150,7 +150,7 @@ def read_frames(path: Path) -> None:
 
 
 def read_model(path: Path) -> None:
-    read_card(read_onnx(path), path)
+    read_card(open_onnx(path))
 
 
 def read_model_beside(path: Path) -> None:

@@ -11,14 +11,15 @@ from __future__ import annotations
 import ast
 import json
 import re
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
 from roadgeo.errors import ModelError
-from roadgeo.sources.segmentation.onnx_file import OnnxFile, Port
+from roadgeo.sources.segmentation.onnx_file import OnnxModel, Port
 
-__all__ = ["MAX_WAYS", "ModelCard", "read_card"]
+__all__ = ["MAX_WAYS", "ModelCard", "channels_come_last", "read_card", "size_of"]
 
 #: A tile can be shown to a model in so many ways.
 MAX_WAYS = 4
@@ -27,6 +28,11 @@ _ROAD, _NOT = {"road", "roads", "street", "streets", "highway", "highways"}, {"n
 _DEFAULT_TILE, _MAX_TILE = 512, 4096
 _TILE_STEP = 32  # free input sizes are made multiples of this, as encoders with five reductions ask for
 _MAX_SIDECAR = 4 << 20
+
+#: Numbers that a model may take, and those that it may give as probabilities or logits; whole ones may be classes.
+_TAKEN = ("float32", "float16", "float64", "uint8")
+_GIVEN = ("float32", "float16", "float64")
+_WHOLE = ("int64", "int32", "int16", "int8", "uint64", "uint32", "uint16", "uint8", "bool")
 
 
 @dataclass(frozen=True)
@@ -39,6 +45,10 @@ class ModelCard:
         Metres per pixel that it was made for.
     tile : (height, width)
         Of its input, pixels.
+    kind : str
+        Of the numbers that it takes, as NumPy calls it; "uint8": RGB as it is, neither shifted nor scaled.
+    channels_last : bool
+        Whether it takes (1, height, width, 3) instead of (1, 3, height, width).
     overlap : float
         Share of a tile that it has in common with the next.
     mean, std : (3,) tuple
@@ -50,13 +60,17 @@ class ModelCard:
     output : str
         The output that shows roads.
     channels : tuple of int
-        Those that are road: their probabilities are added.
+        Those that are road: their probabilities are added. Of classes those that are; none: all but 0.
+    gives_classes : bool
+        Whether the output is the class of each pixel (argmax).
     is_probability : bool or None
         Whether the output is a probability already; None: told by its values.
     """
 
     resolution_m: float | None
     tile: tuple[int, int]
+    kind: str
+    channels_last: bool
     overlap: float
     mean: tuple[float, float, float]
     std: tuple[float, float, float]
@@ -64,10 +78,11 @@ class ModelCard:
     ways: int
     output: str
     channels: tuple[int, ...]
+    gives_classes: bool
     is_probability: bool | None
 
 
-def read_card(model: OnnxFile, path: Path, class_name: str | None = None) -> ModelCard:
+def read_card(model: OnnxModel, class_name: str | None = None) -> ModelCard:
     """Work out how a model is run.
 
     Parameters
@@ -80,6 +95,7 @@ def read_card(model: OnnxFile, path: Path, class_name: str | None = None) -> Mod
     ModelError
         It takes or gives something else than expected, its metadata contradict it, or no class is a road.
     """
+    path = Path(model.path)
     try:
         told = {**_read_metadata(model.metadata), **_read_sidecar(path.with_suffix(".json"))}
         return _make_card(model, told, class_name)
@@ -93,20 +109,23 @@ class _WrongModelError(Exception):
     """Why a model cannot be run, and what to do."""
 
 
-def _make_card(model: OnnxFile, told: dict[str, Any], class_name: str | None) -> ModelCard:
+def _make_card(model: OnnxModel, told: dict[str, Any], class_name: str | None) -> ModelCard:
     kind = str(told.get("model_type", "Segmentor"))
     if kind.lower() not in ("segmentor", "segmenter", "segmentation", "semantic-segmentation"):
         raise _WrongModelError(f"is a model for {kind}; expected one for segmentation (Segmentor)")
-    tile = _tile_of(model, told)
+    tile, channels_last = _tile_of(model, told)
     names = told.get("classes", {})
     output = _choose_output(model, class_name)
-    channels = _choose_channels(output, names, class_name)
+    gives_classes = output.kind in _WHOLE and _n_channels(output) in (None, 1)
+    channels = (_choose_classes if gives_classes else _choose_channels)(output, names, class_name)
     resolution = told.get("resolution_m")
     if resolution is not None and not 0.01 <= resolution <= 100:
         raise ValueError(f"a resolution of {resolution:g} m per pixel")
     card = ModelCard(
         resolution_m=resolution,
         tile=tile,
+        kind=model.inputs[0].kind,
+        channels_last=channels_last,
         overlap=_within(told.get("overlap", 0.125), 0.0, 0.75, "overlap"),
         mean=_triple(told.get("mean", 0.0), "mean"),
         std=_triple(told.get("std", 1.0), "standard deviation"),
@@ -114,46 +133,70 @@ def _make_card(model: OnnxFile, told: dict[str, Any], class_name: str | None) ->
         ways=int(_within(told.get("ways", 1), 1, MAX_WAYS, "ways")),
         output=output.name,
         channels=channels,
+        gives_classes=gives_classes,
         is_probability=True if model.last.get(output.name) in ("Sigmoid", "HardSigmoid", "Softmax") else None,
     )
     if min(card.std) <= 0:
         raise ValueError(f"standard deviations {card.std}")
+    if card.kind == "uint8" and (any(card.mean) or card.std != (1.0,) * 3):
+        raise ValueError("it takes 8-bit values, and values of another mean and deviation")
     return replace(card, overlap=max(card.overlap, 0.05))
 
 
-def _tile_of(model: OnnxFile, told: dict[str, Any]) -> tuple[int, int]:
-    """Return (height, width) of the input: its own where it is fixed, else as told."""
+def _tile_of(model: OnnxModel, told: dict[str, Any]) -> tuple[tuple[int, int], bool]:
+    """Return (height, width) of the input, its own where it is fixed, else as told; and whether channels come last."""
     if len(model.inputs) != 1:
         raise _WrongModelError(f"takes {len(model.inputs)} inputs; expected one, a picture")
     port = model.inputs[0]
-    sizes = ", ".join("any" if side is None else str(side) for side in port.shape)
-    if not port.is_float or len(port.shape) != 4 or port.shape[0] not in (None, 1) or port.shape[1] not in (None, 3):
-        kind = "32-bit floats" if port.is_float else "other numbers"
-        raise _WrongModelError(f"takes {kind} of shape ({sizes}); expected 32-bit floats (1, 3, height, width), RGB")
+    last = len(port.shape) == 4 and port.shape[3] == 3 != port.shape[1]
+    is_picture = len(port.shape) == 4 and port.shape[0] in (None, 1) and (last or port.shape[1] in (None, 3))
+    if port.kind not in _TAKEN or not is_picture:
+        sizes = ", ".join("any" if side is None else str(side) for side in port.shape)
+        raise _WrongModelError(
+            f"takes {port.kind} of shape ({sizes}); expected {', '.join(_TAKEN)}; (1, 3, height, width) or "
+            "(1, height, width, 3), RGB"
+        )
+    sides = port.shape[1:3] if last else port.shape[2:]
     wanted = int(told.get("tile", _DEFAULT_TILE))
     free = max(_TILE_STEP, round(wanted / _TILE_STEP) * _TILE_STEP)
-    tile = port.shape[2] or free, port.shape[3] or free
+    tile = sides[0] or free, sides[1] or free
     if not all(_TILE_STEP <= side <= _MAX_TILE for side in tile):
         raise _WrongModelError(f"takes tiles of {tile[1]} x {tile[0]} pixels; expected {_TILE_STEP} to {_MAX_TILE}")
-    return tile
+    return tile, last
 
 
-def _choose_output(model: OnnxFile, class_name: str | None) -> Port:
+def _choose_output(model: OnnxModel, class_name: str | None) -> Port:
     """Choose among heads: the one of the class's name, the one named after roads, or the first that is an image."""
-    images = [port for port in model.outputs if port.is_float and len(port.shape) in (0, 3, 4)]
+    images = [port for port in model.outputs if port.kind in _GIVEN + _WHOLE and len(port.shape) in (0, 3, 4)]
     if not images:
-        raise _WrongModelError("gives no image of 32-bit floats; expected (1, classes, height, width)")
+        raise _WrongModelError("gives no image of numbers; expected (1, classes, height, width)")
     named = [port for port in images if port.name == class_name]
     return (named or [port for port in images if _is_road(port.name)] or images)[0]
 
 
+def size_of(output: Port) -> tuple[int, int] | None:
+    """Return (height, width) of an output; None where that is known only when it runs."""
+    sides = output.shape[-3:]
+    height, width = sides[:2] if len(output.shape) == 4 and channels_come_last(sides) else (None, None, *sides)[-2:]
+    return None if height is None or width is None else (height, width)
+
+
+def _n_channels(output: Port) -> int | None:
+    """Return how many channels an output has, as far as is known before it runs."""
+    if len(output.shape) != 4:
+        return 1
+    _, *sides = output.shape
+    return sides[2] if channels_come_last(sides) else sides[0]
+
+
+def channels_come_last(sides: Sequence[int | None]) -> bool:
+    """Tell (height, width, channels) from (channels, height, width): there are fewer channels than pixels."""
+    return sides[2] is not None and all(side is None or side > sides[2] for side in sides[:2])
+
+
 def _choose_channels(output: Port, names: dict[int, str], class_name: str | None) -> tuple[int, ...]:
     """Tell which channels of an output are road."""
-    n = output.shape[1] if len(output.shape) == 4 else 1
-    if class_name is None:
-        wanted = [key for key, name in names.items() if _is_road(name)]
-    else:
-        wanted = [key for key, name in names.items() if class_name in (name, str(key))]
+    n, wanted = _n_channels(output), _wanted(names, class_name)
     if n == 1:
         # A single channel is by convention the last of the classes, told from the others by the threshold.
         if max(names, default=0) in wanted or (not names and class_name in (None, output.name)):
@@ -162,6 +205,25 @@ def _choose_channels(output: Port, names: dict[int, str], class_name: str | None
     if not wanted or (n is not None and max(wanted) >= n):
         raise _WrongModelError(_ask(names, class_name))
     return tuple(wanted)
+
+
+def _choose_classes(output: Port, names: dict[int, str], class_name: str | None) -> tuple[int, ...]:
+    """Tell which values of an output are road; nothing where that is said nowhere: all but 0 then."""
+    wanted = _wanted(names, class_name)
+    if not names and class_name in (None, output.name):
+        return ()
+    if not names and class_name is not None and class_name.isdecimal():
+        wanted = [int(class_name)]
+    if not wanted:
+        raise _WrongModelError(_ask(names, class_name))
+    return tuple(wanted)
+
+
+def _wanted(names: dict[int, str], class_name: str | None) -> list[int]:
+    """Return the numbers of the classes that are road: those of the given name, else those named after roads."""
+    if class_name is None:
+        return [key for key, name in names.items() if _is_road(name)]
+    return [key for key, name in names.items() if class_name in (name, str(key))]
 
 
 def _ask(names: dict[int, str], class_name: str | None) -> str:
@@ -241,8 +303,8 @@ def _read_sidecar(path: Path) -> dict[str, Any]:
     if "gsd" in properties:
         told["resolution_m"] = float(properties["gsd"])
     shape = inputs[0].get("input", {}).get("shape", [])
-    if len(shape) == 4 and shape[-1] > 0:
-        told["tile"] = int(shape[-1])
+    if len(shape) == 4 and min(shape[2:]) > 0:
+        told["tile"] = int(shape[2])
     return told
 
 

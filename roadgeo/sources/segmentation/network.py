@@ -2,24 +2,29 @@
 
 from __future__ import annotations
 
-import importlib.util
+import logging
 import os
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import Any
 
 import cv2
 import numpy as np
 
 from roadgeo._arrays import AnyArray, Float32Array
+from roadgeo._text import visible
 from roadgeo.errors import ModelError
-from roadgeo.sources.segmentation.card import ModelCard, read_card
-from roadgeo.sources.segmentation.onnx_file import read_onnx
+from roadgeo.sources.segmentation.card import ModelCard, channels_come_last, read_card, size_of
+from roadgeo.sources.segmentation.onnx_file import OnnxModel, open_onnx
 
-__all__ = ["DEFAULT_MODEL", "INSTALL", "Network", "load_network"]
+__all__ = ["DEFAULT_MODEL", "Network", "load_network"]
+
+_LOG = logging.getLogger(__name__)
 
 DEFAULT_MODEL = Path(__file__).parent / "model" / "roads.onnx"
-INSTALL = "pip install 'roadgeo[segment]'"
+
+#: Pixels of the input, along a side, that one of the output may stand for.
+_STRIDES = (1, 2, 4, 8, 16, 32)
+_CLEARLY = 0.1  # so much better a correlation outweighs what a size suggests
 
 
 @dataclass
@@ -31,37 +36,65 @@ class Network:
     name : str
         Its file's name.
     card : ModelCard
+    seen : (height, width)
+        The middle of a tile, pixels, that a model tells of: all of it, or less where its output is cropped.
     """
 
     name: str
     card: ModelCard
-    _session: Any = field(repr=False)
-    _input: str = field(repr=False)
-    _is_probability: bool = field(repr=False)
+    seen: tuple[int, int]
+    _model: OnnxModel = field(repr=False)
+    _is_probability: bool = field(default=False, repr=False)
+    _size: tuple[int, int] | None = field(default=None, repr=False)  # of its output
+
+    @property
+    def margin(self) -> tuple[int, int]:
+        """Rows above and columns to the left of what is seen of a tile."""
+        (height, width), (rows, columns) = self.card.tile, self.seen
+        return (height - rows) // 2, (width - columns) // 2
 
     def __call__(self, tile: AnyArray) -> Float32Array:
-        """Return the probability of road, (H, W) float32, of a tile of the model's own size, (H, W, 3) uint8 RGB."""
-        return self._to_probability(self._run(tile), tile.shape[:2])
+        """Return the probability of road in what is seen of a tile.
+
+        Parameters
+        ----------
+        tile : (H, W, 3) uint8
+            RGB, of the model's own size.
+
+        Returns
+        -------
+        (rows, columns) float32
+            Of the size `seen`.
+        """
+        road = self._to_probability(self._run(tile))
+        if road.shape != self._size:
+            raise ModelError(f"{self.name}: gives {road.shape[::-1]} pixels, before {self._size}; expected one size")
+        if road.shape != self.seen:
+            road = np.asarray(cv2.resize(road, self.seen[::-1], interpolation=cv2.INTER_LINEAR), np.float32)
+        return road
 
     def _run(self, tile: AnyArray) -> Float32Array:
         """Return the model's output (C, h, w)."""
         card = self.card
-        scale, shift = np.array(card.std, np.float32) * np.float32(255), np.array(card.mean, np.float32)
-        values = tile / scale - shift / np.array(card.std, np.float32)
-        picture = np.ascontiguousarray(np.moveaxis(values.astype(np.float32), 2, 0)[None])
-        try:
-            (given,) = self._session.run([card.output], {self._input: picture})
-        except Exception as error:  # onnxruntime raises classes of its own, one for each status
-            reason = " ".join(str(error).split())[:300]
-            raise ModelError(f"{self.name}: fails while it runs ({reason}); is it made for RGB pictures?") from error
+        values = tile
+        if card.kind != "uint8":
+            scale, shift = np.array(card.std, np.float32) * np.float32(255), np.array(card.mean, np.float32)
+            values = (tile / scale - shift / np.array(card.std, np.float32)).astype(np.float32)
+        picture = np.ascontiguousarray(values if card.channels_last else np.moveaxis(values, 2, 0), card.kind)
+        given = self._model.run(card.output, picture[None])
         output: Float32Array = np.asarray(given, np.float32)
-        output = output[0] if output.ndim == 4 else output
-        if output.ndim != 3 or min(output.shape) == 0 or max(self.card.channels) >= len(output):
+        output = output[0] if output.shape[:-3] == (1,) else output
+        output = np.moveaxis(output, 2, 0) if output.ndim == 3 and channels_come_last(output.shape) else output
+        n_channels = 1 if card.gives_classes else max(card.channels) + 1
+        if output.ndim != 3 or min(output.shape) == 0 or len(output) < n_channels:
             raise ModelError(f"{self.name}: gives an array of shape {np.shape(given)}; expected (1, classes, h, w)")
         return output
 
-    def _to_probability(self, output: Float32Array, shape: tuple[int, ...]) -> Float32Array:
-        """Turn (C, h, w) probabilities or logits into the probability of road on the tile's own grid."""
+    def _to_probability(self, output: Float32Array) -> Float32Array:
+        """Turn (C, h, w) probabilities, logits or classes into the probability of road (h, w)."""
+        if self.card.gives_classes:
+            return self._of_classes(output[0])
+        road: Float32Array
         if not self._is_probability:
             output = np.clip(output, -60, 60)
             if len(output) == 1:
@@ -69,11 +102,20 @@ class Network:
             else:
                 output = np.exp(output - output.max(axis=0))
                 output /= output.sum(axis=0)
-        road: Float32Array = output[list(self.card.channels)].sum(axis=0).clip(0, 1)
-        road = np.where(np.isfinite(road), road, np.float32(0))
-        if road.shape != shape[:2]:
-            road = np.asarray(cv2.resize(road, (shape[1], shape[0]), interpolation=cv2.INTER_LINEAR), np.float32)
+        road = output[list(self.card.channels)].sum(axis=0).clip(0, 1)
+        road[~np.isfinite(road)] = 0
         return road
+
+    def _of_classes(self, classes: Float32Array) -> Float32Array:
+        """Turn the class of each pixel into 1 where it is road."""
+        roads = self.card.channels
+        if not roads:
+            held = np.unique(classes[classes != 0])
+            if len(held) > 1:
+                listed = ", ".join(f"{one:g}" for one in held[:10])
+                raise ModelError(f"{self.name}: gives the classes {listed}; say which is road: --class NUMBER")
+            return np.asarray(classes != 0, np.float32)
+        return np.asarray(np.isin(classes, roads), np.float32)
 
 
 def load_network(
@@ -81,60 +123,81 @@ def load_network(
 ) -> Network:
     """Check a model and load it: the one that ships, or one of your own.
 
-    The number of threads is fixed, so that results are the same on every run.
-
     Raises
     ------
     ModelError
         onnxruntime is missing, or the file is no model that can be run here.
     """
-    if importlib.util.find_spec("onnxruntime") is None:
-        raise ModelError(f"to find the roads in a photograph onnxruntime is needed: {INSTALL}")
     path = Path(path) if path is not None else DEFAULT_MODEL
     if path == DEFAULT_MODEL and not path.exists():
         raise ModelError("no model is installed with roadgeo; give one that finds roads: --segmenter MODEL.onnx")
-    model = read_onnx(path)
-    card = read_card(model, path, class_name)
-    session = _open_session(model.content, str(path), threads)
-    network = Network(path.name, card, session, model.inputs[0].name, card.is_probability is True)
-    if card.is_probability is None:
+    model = open_onnx(path, threads)
+    card = read_card(model, class_name)
+    network = Network(path.name, card, card.tile, model, card.is_probability is True)
+    if card.is_probability is None and not card.gives_classes:
         network._is_probability = _gives_probability(network)
+    output = next(port for port in model.outputs if port.name == card.output)
+    network._size = size_of(output)
+    if network._size != card.tile:
+        network._size, network.seen = _what_is_seen(network)
     return network
-
-
-def _without_telemetry() -> Any:
-    """Return onnxruntime, told to report nothing: else it keeps an identifier of the device, and sends what it did."""
-    os.environ.setdefault("ORT_DISABLE_TELEMETRY", "1")  # read while it is imported
-    import onnxruntime
-
-    onnxruntime.disable_telemetry_events()  # where the program that uses roadgeo has imported it before
-    return onnxruntime
-
-
-def _open_session(content: bytes, name: str, threads: int) -> Any:
-    onnxruntime = _without_telemetry()
-    options = onnxruntime.SessionOptions()
-    options.intra_op_num_threads, options.inter_op_num_threads = threads, 1
-    options.use_deterministic_compute = True
-    options.log_severity_level = 4  # what goes wrong is raised, and need not be printed too
-    options.enable_mem_pattern = False
-    options.add_session_config_entry("session.intra_op.allow_spinning", "0")  # waiting threads leave the core to others
-    try:
-        return onnxruntime.InferenceSession(content, options, providers=["CPUExecutionProvider"])
-    except Exception as error:  # as above
-        reason = " ".join(str(error).split())[:300]
-        raise ModelError(f"{name}: cannot be loaded ({reason}); is it damaged, or made for a newer version?") from error
 
 
 def _gives_probability(network: Network) -> bool:
     """Tell probabilities from logits by what a model makes of plain and of noisy tiles: logits leave 0 to 1."""
     height, width = network.card.tile
-    rng = np.random.default_rng(0)
-    noise = rng.integers(0, 256, (height, width, 3)).astype(np.uint8)
-    smooth = cv2.GaussianBlur(noise, (0, 0), 9).astype(np.float32)
-    smooth = np.clip(128 + 12 * (smooth - 128), 0, 255).astype(np.uint8)
+    noise, smooth = _noise(height, width)
     for tile in (noise, smooth, np.zeros_like(noise), np.full_like(noise, 255)):
         output = network._run(tile)
         if output.min() < -1e-3 or output.max() > 1 + 1e-3:
             return False
     return True
+
+
+def _noise(height: int, width: int) -> tuple[AnyArray, AnyArray]:
+    """Return two pictures (height, width, 3), of single pixels and of blobs."""
+    noise = np.random.default_rng(0).integers(0, 256, (height, width, 3)).astype(np.uint8)
+    smooth = cv2.GaussianBlur(noise, (0, 0), 9).astype(np.float32)
+    return noise, np.clip(128 + 12 * (smooth - 128), 0, 255).astype(np.uint8)
+
+
+def _what_is_seen(network: Network) -> tuple[tuple[int, int], tuple[int, int]]:
+    """Return the (height, width) of an output, and of the middle of a tile that it shows.
+
+    A whole share of a tile's sides is all of it, in larger pixels; any other the middle, for models without padding
+    leave out the edge. That is held against what a model gives for a picture and for the same moved sideways, which
+    tells the size of its pixels.
+    """
+    height, width = network.card.tile
+    moved = max(width // 2 // _STRIDES[-1], 1) * _STRIDES[-1]
+    _, picture = _noise(height, width + moved)
+    here = network._run(np.ascontiguousarray(picture[:, :width]))
+    rows, columns = here.shape[1:]
+    if (rows, columns) == (height, width):
+        return (height, width), (height, width)
+    there = network._run(np.ascontiguousarray(picture[:, moved:]))
+    stretch = width / columns
+    strides = [k for k in _STRIDES if k * rows <= height and k * columns <= width]
+    is_whole = height * columns == width * rows and stretch in _STRIDES
+    expected = stretch if is_whole or not strides else 1.0
+    likeness = {k: _likeness(here, there, round(moved / k)) for k in {*strides, stretch}}
+    best = max(likeness, key=likeness.__getitem__)
+    stride = best if likeness[best] > likeness[expected] + _CLEARLY else expected
+    if stride == stretch:
+        return (rows, columns), (height, width)
+    _LOG.warning(
+        "%s: gives %d x %d pixels of tiles of %d x %d: taken for their middle",
+        *(visible(network.name), columns, rows, width, height),
+    )
+    return (rows, columns), (round(rows * stride), round(columns * stride))
+
+
+def _likeness(here: Float32Array, there: Float32Array, moved: int) -> float:
+    """Return the correlation of two outputs (C, h, w) where the second shows what lies so many columns to the right."""
+    columns = here.shape[2] - moved
+    if columns < 2:
+        return 0.0
+    with np.errstate(all="ignore"):
+        a, b = (part - part.mean(dtype=float) for part in (here[..., moved:], there[..., :columns]))
+        likeness = float((a * b).sum() / np.sqrt((a**2).sum() * (b**2).sum()))
+    return likeness if np.isfinite(likeness) else 0.0

@@ -76,9 +76,7 @@ def rank_scales(
     worth: dict[float, float] = {}
     part, before, promise = _Part(0, 0, photograph.width, photograph.height), None, 1.0
     for scale in scales:
-        part, same_ground = _most_roads(
-            part, before, [round(_TRIED_TILES * side / scale) for side in network.card.tile]
-        )
+        part, same_ground = _most_roads(part, before, [round(_TRIED_TILES * side / scale) for side in network.seen])
         before, shown = None, _cut(photograph, part)
         with suppress(MaskError):  # no ground
             before = segment(shown, network, scale)

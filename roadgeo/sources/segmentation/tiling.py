@@ -5,6 +5,7 @@ from __future__ import annotations
 import math
 from collections.abc import Callable, Iterator
 from functools import partial
+from typing import NamedTuple
 
 import cv2
 import numpy as np
@@ -80,10 +81,11 @@ def segment(
         y_scale = photograph.height / shape[0]
         return photograph.read(0.0, top * y_scale, float(photograph.width), rows * y_scale, (rows, shape[1]))[0]
 
+    seen = _Seen(network.seen, network.margin, network.card.tile, network.card.overlap)
     what = f"finding roads in {photograph.name}"
     say(what, 0.0)
     done, rest = 0, np.empty((0, shape[1]), np.float32)
-    for rows in _blend(read, shape, network.card.tile, network.card.overlap, partial(_look, network, ways)):
+    for rows in _blend(read, shape, seen, partial(_look, network, ways)):
         rows = np.concatenate([rest, rows])
         n = len(rows) // step
         values[done : done + n] = np.rint(254 * _reduce(rows[: n * step], step))
@@ -111,34 +113,46 @@ def _reduce(rows: Float32Array, step: int) -> Float32Array:
     return np.asarray(cv2.resize(rows, size, interpolation=cv2.INTER_AREA), np.float32)
 
 
+class _Seen(NamedTuple):
+    """What a model tells of a tile: its (height, width), where it begins in the tile, the tile's size, the overlap."""
+
+    size: tuple[int, int]
+    margin: tuple[int, int]
+    tile: tuple[int, int]
+    overlap: float
+
+
 def _blend(
     read: Callable[[int, int], AnyArray],
     shape: tuple[int, int],
-    tile: tuple[int, int],
-    overlap: float,
+    seen: _Seen,
     network: Callable[[AnyArray], Float32Array],
 ) -> Iterator[Float32Array]:
     """Yield the rows of a map from the top down, each when no further tile reaches it."""
     height, width = shape
-    tops, lefts = _starts(height, tile[0], overlap), _starts(width, tile[1], overlap)
-    weight = _weight(tile, overlap)
-    total, weights = np.zeros((tile[0], width), np.float32), np.zeros((tile[0], width), np.float32)
+    size, (above, before) = seen.size, seen.margin
+    tops, lefts = _starts(height, size[0], seen.overlap), _starts(width, size[1], seen.overlap)
+    weight = _weight(size, seen.overlap)
+    total, weights = np.zeros((size[0], width), np.float32), np.zeros((size[0], width), np.float32)
     for top, next_top in zip(tops, [*tops[1:], height], strict=True):
-        rgb = read(top, min(tile[0], height - top))
+        first = max(top - above, 0)
+        rgb = read(first, min(top - above + seen.tile[0], height) - first)
         for left in lefts:
-            part = rgb[:, left : left + tile[1]]
-            rows, columns = part.shape[:2]
+            rows, columns = min(size[0], height - top), min(size[1], width - left)
+            start = max(left - before, 0)
+            part = rgb[:, start : left - before + seen.tile[1]]
             if _is_empty(part):
                 road = np.zeros((rows, columns), np.float32)
             else:
-                road = network(_fill(part, tile))[:rows, :columns]
+                filled = _fill(part, seen.tile, (first - (top - above), start - (left - before)))
+                road = network(filled)[:rows, :columns]
             total[:rows, left : left + columns] += weight[:rows, :columns] * road
             weights[:rows, left : left + columns] += weight[:rows, :columns]
         done = next_top - top
         yield np.divide(total[:done], weights[:done])
         for one in (total, weights):
-            one[: tile[0] - done] = one[done:].copy()
-            one[tile[0] - done :] = 0
+            one[: size[0] - done] = one[done:].copy()
+            one[size[0] - done :] = 0
 
 
 def _starts(length: int, tile: int, overlap: float) -> list[int]:
@@ -160,14 +174,19 @@ def _weight(tile: tuple[int, int], overlap: float) -> Float32Array:
     return weight
 
 
-def _fill(part: AnyArray, tile: tuple[int, int]) -> AnyArray:
-    """Return a part of a photograph at the size of a tile: what is missing is its own reflection."""
+def _fill(part: AnyArray, tile: tuple[int, int], missing: tuple[int, int]) -> AnyArray:
+    """Return a part of a photograph at the size of a tile: what is missing around it is its own reflection.
+
+    `missing`: rows above it and columns to its left; the others lack below and to its right.
+    """
     rows, columns = part.shape[:2]
-    below, right = tile[0] - rows, tile[1] - columns
-    if below == right == 0:
+    above, left = missing
+    below, right = tile[0] - rows - above, tile[1] - columns - left
+    if not any((above, below, left, right)):
         return part
-    border = cv2.BORDER_REFLECT_101 if below < rows and right < columns else cv2.BORDER_REFLECT
-    filled: AnyArray = cv2.copyMakeBorder(np.ascontiguousarray(part), 0, below, 0, right, border)
+    fits = max(above, below) < rows and max(left, right) < columns
+    border = cv2.BORDER_REFLECT_101 if fits else cv2.BORDER_REFLECT
+    filled: AnyArray = cv2.copyMakeBorder(np.ascontiguousarray(part), above, below, left, right, border)
     return filled
 
 

@@ -6,18 +6,18 @@ from typing import Any
 
 import numpy as np
 import pytest
-from onnx import TensorProto, helper
+from onnx import TensorProto, helper, numpy_helper
 from worlds.models import brightness_model, save
 
 from roadgeo.errors import ModelError
 from roadgeo.sources.segmentation.card import ModelCard, read_card
-from roadgeo.sources.segmentation.onnx_file import read_onnx
+from roadgeo.sources.segmentation.onnx_file import open_onnx
 
-FLOAT, BYTES = TensorProto.FLOAT, TensorProto.UINT8
+FLOAT, BYTES, INT64 = TensorProto.FLOAT, TensorProto.UINT8, TensorProto.INT64
 
 
 def card_of(path: Path, class_name: str | None = None) -> ModelCard:
-    return read_card(read_onnx(path), path, class_name)
+    return read_card(open_onnx(path), class_name)
 
 
 def item(**input_: Any) -> dict[str, Any]:
@@ -101,24 +101,71 @@ def test_metadata_of_python(tmp_path: Path) -> None:
     assert card_of(path).channels == (1,)
 
 
+def model_of(path: Path, inputs: list[tuple], output: tuple) -> Path:
+    """A model that gives values of some shape and kind, whatever it takes."""
+    ports = [[helper.make_tensor_value_info(*one) for one in some] for some in (inputs, [output])]
+    name, kind, shape = output
+    constant = numpy_helper.from_array(np.zeros(shape, helper.tensor_dtype_to_np_dtype(kind)))
+    return save(helper.make_graph([helper.make_node("Constant", [], [name], value=constant)], "g", *ports), path)
+
+
 @pytest.mark.parametrize(
-    ("inputs", "outputs", "message"),
+    ("inputs", "output", "message"),
     [
-        ([("a", FLOAT, [1, 3, 64, 64]), ("b", FLOAT, [1, 3, 64, 64])], [], "takes 2 inputs; expected one"),
-        ([("a", BYTES, [1, 3, 64, 64])], [], r"takes other numbers of shape \(1, 3, 64, 64\)"),
-        ([("a", FLOAT, [1, 4, None, 64])], [], r"takes 32-bit floats of shape \(1, 4, any, 64\)"),
-        ([("a", FLOAT, [1, 3, 64])], [], r"shape \(1, 3, 64\)"),
-        ([("a", FLOAT, [8, 3, 64, 64])], [], r"shape \(8, 3, 64, 64\)"),
-        ([("a", FLOAT, [1, 3, 64, 64])], [("b", FLOAT, [1, 7])], "gives no image"),
-        ([("a", FLOAT, [1, 3, 64, 64])], [("b", BYTES, [1, 1, 64, 64])], "gives no image"),
+        ([("a", FLOAT, [1, 3, 64, 64]), ("c", FLOAT, [1, 3, 64, 64])], None, "takes 2 inputs; expected one"),
+        ([("a", INT64, [1, 3, 64, 64])], None, r"takes int64 of shape \(1, 3, 64, 64\); expected float32, float16"),
+        ([("a", FLOAT, [1, 4, None, 64])], None, r"takes float32 of shape \(1, 4, any, 64\)"),
+        ([("a", FLOAT, [1, 3, 64])], None, r"shape \(1, 3, 64\)"),
+        ([("a", FLOAT, [8, 3, 64, 64])], None, r"shape \(8, 3, 64, 64\)"),
+        ([("a", FLOAT, [1, 3, 64, 64])], ("b", FLOAT, [1, 7]), "gives no image"),
     ],
 )
-def test_shapes_that_are_not_those_of_a_segmentation(tmp_path: Path, inputs: list, outputs: list, message: str) -> None:
-    ports = [[helper.make_tensor_value_info(*one) for one in some] for some in (inputs, outputs)]
-    nodes = [helper.make_node("Identity", ["a"], ["b"])]
-    path = save(helper.make_graph(nodes, "g", *ports), tmp_path / "m.onnx")
+def test_shapes_that_are_not_those_of_a_segmentation(
+    tmp_path: Path, inputs: list, output: tuple | None, message: str
+) -> None:
+    path = model_of(tmp_path / "m.onnx", inputs, output or ("b", FLOAT, [1, 1, 64, 64]))
     with pytest.raises(ModelError, match=message):
         card_of(path)
+
+
+@pytest.mark.parametrize(
+    ("taken", "last"), [([1, 3, 64, 96], False), ([None, 64, 96, 3], True), ([1, None, 64, 96], False)]
+)
+@pytest.mark.parametrize("kind", [FLOAT, BYTES, TensorProto.FLOAT16, TensorProto.DOUBLE])
+def test_channels_may_come_last_and_numbers_be_others(tmp_path: Path, taken: list, last: bool, kind: int) -> None:
+    card = card_of(model_of(tmp_path / "m.onnx", [("a", kind, taken)], ("b", FLOAT, [1, 1, 64, 96])))
+    assert (card.tile, card.channels_last) == ((64, 96), last)
+    assert np.dtype(card.kind) == helper.tensor_dtype_to_np_dtype(kind)
+
+
+@pytest.mark.parametrize(
+    ("names", "class_name", "channels"),
+    [
+        (None, None, ()),
+        (None, "4", (4,)),
+        ({0: "sea", 1: "road", 2: "street"}, None, (1, 2)),
+        ({0: "sea", 1: "road", 2: "track"}, "track", (2,)),
+    ],
+)
+@pytest.mark.parametrize("shape", [[1, 1, 64, 64], [1, 64, 64, 1], [1, 64, 64]])
+def test_classes_that_are_road(
+    tmp_path: Path, shape: list[int], names: dict[int, str] | None, class_name: str | None, channels: tuple[int, ...]
+) -> None:
+    path = model_of(tmp_path / "m.onnx", [("a", FLOAT, [1, 3, 64, 64])], ("b", INT64, shape))
+    if names:
+        classes = [{"value": key, "name": name} for key, name in names.items()]
+        beside(path, {"properties": {"mlm:input": [{}], "mlm:output": [{"classification:classes": classes}]}})
+    card = card_of(path, class_name)
+    assert card.gives_classes
+    assert card.channels == channels
+    with pytest.raises(ModelError, match="no class 'house'"):
+        card_of(path, "house")
+
+
+def test_a_model_that_takes_pictures_as_they_are_scales_them_itself(tmp_path: Path) -> None:
+    path = model_of(tmp_path / "m.onnx", [("a", BYTES, [1, 3, 64, 64])], ("b", FLOAT, [1, 1, 64, 64]))
+    with pytest.raises(ModelError, match="takes 8-bit values, and values of another mean"):
+        card_of(beside(path, item(value_scaling=[Z])))
 
 
 def test_too_many_classes(tmp_path: Path) -> None:

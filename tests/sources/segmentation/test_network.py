@@ -3,9 +3,10 @@
 import json
 from pathlib import Path
 
+import cv2
 import numpy as np
 import pytest
-from onnx import TensorProto, helper
+from onnx import TensorProto, helper, numpy_helper
 from worlds.models import brightness_model, save
 
 from roadgeo.errors import ModelError
@@ -149,12 +150,107 @@ def test_the_class_can_be_named(tmp_path: Path) -> None:
         load_network(path, class_name="blue")
 
 
-def one_node(path: Path, operator: str, **attributes: object) -> Path:
+# --- layouts: files of `data/models` hold the same model in the ways in which people export theirs -------------------
+
+MODELS = Path(__file__).parents[2] / "data" / "models"
+
+
+def streets(side: int = 512) -> np.ndarray:
+    """Light streets of some widths on dark, uneven ground."""
+    rng = np.random.default_rng(3)
+    image = cv2.GaussianBlur(rng.integers(20, 90, (side, side, 3)).astype(np.uint8), (0, 0), 2)
+    for at, to in rng.integers(0, side, (14, 2, 2)):
+        cv2.line(image, tuple(map(int, at)), tuple(map(int, to)), (225, 220, 215), int(rng.integers(5, 13)))
+    return image
+
+
+def likeness(a: np.ndarray, b: np.ndarray) -> float:
+    return float(np.corrcoef(a.ravel(), b.ravel())[0, 1])
+
+
+@pytest.mark.parametrize(
+    ("name", "alike"), [("fp16", 0.9999), ("nhwc", 0.9999), ("uint8", 0.9999), ("argmax", 0.95), ("half", 0.95)]
+)
+def test_a_model_is_read_in_every_layout(name: str, alike: float) -> None:
+    base, other = load_network(MODELS / "base.onnx"), load_network(MODELS / f"{name}.onnx")
+    assert other.seen == other.card.tile == (512, 512)
+    assert likeness(base(streets()), other(streets())) > alike
+
+
+def test_a_model_that_crops_its_tiles_is_read_as_their_middle(caplog: pytest.LogCaptureFixture) -> None:
+    base, cropped = load_network(MODELS / "base.onnx"), load_network(MODELS / "crop448.onnx")
+    assert (cropped.seen, cropped.margin) == ((448, 448), (32, 32))
+    np.testing.assert_array_equal(cropped(streets()), base(streets())[32:-32, 32:-32])
+    assert "crop448.onnx: gives 448 x 448 pixels of tiles of 512 x 512: taken for their middle" in caplog.text
+
+
+def resized_model(path: Path, stated: list[int | None], crop: int, stride: int, stretch: int = 0) -> Path:
+    """A model that leaves out `crop` pixels on each side, and gives one for each `stride`, or so many in all."""
+    weight = numpy_helper.from_array(np.full((1, 3, 1, 1), 20 / 3, np.float32), "w")
+    nodes = [helper.make_node("Conv", ["image", "w"], ["seen"])]
+    stored = [weight, numpy_helper.from_array(np.array([crop, crop]), "low")]
+    stored += [
+        numpy_helper.from_array(np.array([256 - crop] * 2), "high"),
+        numpy_helper.from_array(np.array([2, 3]), "axes"),
+        numpy_helper.from_array(np.array([1, 1, stretch or 1, stretch or 1]), "size"),
+    ]
+    nodes += [helper.make_node("Slice", ["seen", "low", "high", "axes"], ["middle"])]
+    if stretch:
+        nodes += [helper.make_node("Resize", ["middle", "", "", "size"], ["road"], mode="linear")]
+    else:
+        sides = {"kernel_shape": [stride] * 2, "strides": [stride] * 2}
+        nodes += [helper.make_node("AveragePool", ["middle"], ["road"], **sides)]
+    ports = (("image", [1, 3, 256, 256]), ("road", [1, 1, *stated]))
+    taken, given = ([helper.make_tensor_value_info(name, TensorProto.FLOAT, shape)] for name, shape in ports)
+    return save(helper.make_graph(nodes, "g", taken, given, stored), path)
+
+
+@pytest.mark.parametrize(
+    ("side", "crop", "stride", "stretch", "seen"),
+    [
+        (256, 0, 1, 0, 256),
+        (64, 0, 4, 0, 256),
+        (216, 20, 1, 0, 216),
+        (108, 20, 2, 0, 216),
+        (128, 64, 1, 0, 128),  # half of the tile, cropped, not in larger pixels
+        (224, 0, 1, 224, 256),  # all of it, in larger pixels
+        (512, 0, 1, 512, 256),
+    ],
+)
+@pytest.mark.parametrize("is_stated", [True, False])
+def test_what_is_seen_of_a_tile_is_told_by_what_moves(
+    tmp_path: Path, side: int, crop: int, stride: int, stretch: int, seen: int, is_stated: bool
+) -> None:
+    stated = [side, side] if is_stated else [None, None]
+    network = load_network(resized_model(tmp_path / "m.onnx", stated, crop, stride, stretch))
+    assert network.seen == (seen, seen)
+    whole = load_network(resized_model(tmp_path / "whole.onnx", [256, 256], 0, 1))(streets(256))
+    edge = (256 - seen) // 2
+    assert likeness(network(streets(256)), whole[edge : edge + seen, edge : edge + seen]) > 0.85
+
+
+def test_classes_without_names(tmp_path: Path) -> None:
+    ports = [
+        [helper.make_tensor_value_info("image", TensorProto.UINT8, [1, 3, 64, 64])],
+        [helper.make_tensor_value_info("classes", TensorProto.INT64, [1, 64, 64])],
+    ]
+    nodes = [helper.make_node("ArgMax", ["image"], ["classes"], axis=1, keepdims=0)]
+    path = save(helper.make_graph(nodes, "g", *ports), tmp_path / "m.onnx")
+    picture = np.zeros((64, 64, 3), np.uint8)
+    picture[:20, :, 1] = picture[40:, :, 2] = 9
+    with pytest.raises(ModelError, match=r"m\.onnx: gives the classes 1, 2; say which is road: --class NUMBER"):
+        load_network(path)(picture)
+    np.testing.assert_array_equal(load_network(path, class_name="2")(picture) > 0.5, picture[..., 2] > 0)
+    picture[:20] = 0
+    np.testing.assert_array_equal(load_network(path)(picture) > 0.5, picture[..., 2] > 0)
+
+
+def one_node(path: Path, operator: str, names: tuple[str, ...] = ("road", "a", "b"), **attributes: object) -> Path:
     """A model of one operator, whose output is said to be an image of a road."""
     shape = [1, 3, 64, 64]
     ports = [[helper.make_tensor_value_info(name, TensorProto.FLOAT, shape)] for name in ("image", "road")]
     graph = helper.make_graph([helper.make_node(operator, ["image"], ["road"], **attributes)], "g", *ports)
-    return save(graph, path, props={"class_names": {0: "road", 1: "a", 2: "b"}})
+    return save(graph, path, props={"class_names": dict(enumerate(names))})
 
 
 def test_values_between_0_and_1_are_taken_for_probabilities(tmp_path: Path) -> None:
@@ -176,7 +272,7 @@ def test_a_model_that_fails_while_it_runs(tmp_path: Path) -> None:
 
 
 def test_a_model_that_gives_no_image(tmp_path: Path) -> None:
-    path = one_node(tmp_path / "m.onnx", "Flatten", axis=2)
+    path = one_node(tmp_path / "m.onnx", "Flatten", ("road",), axis=2)
     with pytest.raises(ModelError, match=r"gives an array of shape \(3, 4096\)"):
         load_network(path)
 

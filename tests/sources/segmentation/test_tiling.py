@@ -14,6 +14,7 @@ from roadgeo.sources.segmentation.photograph import open_photograph
 from roadgeo.sources.segmentation.probability import NODATA, TAG, ProbabilityMap, fuse
 from roadgeo.sources.segmentation.tiling import _look, _starts, segment
 
+MODELS = Path(__file__).parents[2] / "data" / "models"
 pytestmark = pytest.mark.filterwarnings("ignore::rasterio.errors.NotGeoreferencedWarning")
 
 
@@ -90,6 +91,17 @@ def test_small_photographs_are_filled_up_by_reflection(tmp_path: Path, network, 
     assert roads.shape == (round(0.6 * shape[0]), round(0.6 * shape[1]))
     assert roads[:, 14:16].all()
     assert not roads[:, :10].any()
+
+
+@pytest.mark.parametrize("shape", [(700, 900), (400, 500), (512, 2000), (70, 70)])
+def test_a_model_that_crops_its_tiles_sees_the_same_up_to_the_edge(tmp_path: Path, shape: tuple[int, int]) -> None:
+    rng = np.random.default_rng(5)
+    image = cv2.GaussianBlur(rng.integers(0, 256, (*shape, 3)).astype(np.uint8), (0, 0), 2)
+    cv2.imwrite(str(tmp_path / "photo.png"), image)
+    with open_photograph(tmp_path / "photo.png") as opened:
+        base, cropped = (segment(opened, load_network(MODELS / f"{name}.onnx")) for name in ("base", "crop448"))
+    assert np.ptp(base.values.astype(int)) > 20
+    assert np.abs(base.values.astype(int) - cropped.values).max() <= 1
 
 
 def test_voids_are_not_observed(tmp_path: Path, network, photo: Path) -> None:
