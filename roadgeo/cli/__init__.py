@@ -9,6 +9,7 @@ import difflib
 import gc
 import importlib
 import os
+import signal
 import sys
 from collections.abc import Sequence
 
@@ -115,6 +116,8 @@ def main(arguments: Sequence[str] | None = None) -> int:
     """Run the command line and return its exit status; every error is one line on standard error."""
     if arguments is None:  # the process is ours
         gc.set_threshold(_COLLECT_AFTER)
+        if signal.getsignal(signal.SIGTERM) == signal.SIG_DFL:
+            signal.signal(signal.SIGTERM, signal.default_int_handler)  # it cleans up as at Ctrl-C
     skip_drivers()
     forget_missing_proj_data()
     try:

@@ -21,7 +21,7 @@ from pathlib import Path
 from typing import Any, TypeVar
 
 from roadgeo.errors import RoadgeoError
-from roadgeo.running.processes import Work
+from roadgeo.running.processes import Work, without_interrupts
 
 __all__ = ["RETRIES", "Cluster", "Made", "Stream", "connected", "prepared", "run_on_cluster"]
 
@@ -111,17 +111,18 @@ def _local_cluster(workers: int) -> Iterator[Any]:
     from distributed import LocalCluster
 
     told = {"distributed.worker.multiprocessing-method": "spawn", "distributed.logging.distributed": "error"}
-    with (
-        dask.config.set(told),
-        LocalCluster(
-            n_workers=workers,
-            threads_per_worker=1,
-            processes=True,
-            scheduler_kwargs={"dashboard": False, "dashboard_address": "127.0.0.1:0"},  # any port: another may be taken
-            memory_limit=0,
-            silence_logs=50,
-        ) as cluster,
-    ):
+    with contextlib.ExitStack() as stack:
+        stack.enter_context(dask.config.set(told))
+        with without_interrupts():
+            cluster = LocalCluster(
+                n_workers=workers,
+                threads_per_worker=1,
+                processes=True,
+                scheduler_kwargs={"dashboard": False, "dashboard_address": "127.0.0.1:0"},  # any port: one may be taken
+                memory_limit=0,
+                silence_logs=50,
+            )
+            stack.enter_context(cluster)
         yield cluster
 
 

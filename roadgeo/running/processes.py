@@ -4,18 +4,22 @@ from __future__ import annotations
 
 import contextlib
 import multiprocessing
+import multiprocessing.connection
 import os
 import signal
 import sys
+import threading
+import time
 from collections.abc import Callable, Iterator, Sequence
 from concurrent.futures import ProcessPoolExecutor
 from concurrent.futures.process import BrokenProcessPool
+from multiprocessing import resource_tracker
 from pathlib import Path
 from typing import Any, Protocol, TypeVar
 
 from roadgeo.errors import RoadgeoError
 
-__all__ = ["Work", "run"]
+__all__ = ["Work", "end_with_parent", "run", "without_interrupts"]
 
 Task = TypeVar("Task")
 TaskIn = TypeVar("TaskIn", contravariant=True)
@@ -24,6 +28,10 @@ ResultOut = TypeVar("ResultOut", covariant=True)
 
 #: What nearly every task needs: a fork server loads it once for all processes.
 _PRELOAD = ["roadgeo.workflows", "roadgeo.outputs.location_files", "roadgeo.sources.masks"]
+
+
+#: A process whose parent is gone has so long to remove what it has half written.
+_GRACE_S = 5.0
 
 
 class Work(Protocol[TaskIn, ResultOut]):
@@ -89,8 +97,9 @@ def _run_together(tasks: Sequence[Task], work: Work[Task, Result], jobs: int) ->
         context.set_forkserver_preload(_PRELOAD)
     workers = min(jobs, len(tasks))
     with ProcessPoolExecutor(workers, context, initializer=_start_worker, initargs=(work,)) as pool:
-        futures = [pool.submit(_do, task) for task in tasks]
         try:
+            with without_interrupts():
+                futures = [pool.submit(_do, task) for task in tasks]
             for future in futures:
                 yield future.result()
         except BaseException:
@@ -105,12 +114,16 @@ _prepared: list[Callable[[Any], Any]] = []
 
 def _start_worker(work: Work[Any, Any]) -> None:
     """Make a worker ready. Ctrl-C is the parent's to handle: it ends the workers, which clean up as they go."""
-    import cv2
-
-    cv2.setNumThreads(1)  # the processes share the processors already
     signal.signal(signal.SIGINT, signal.SIG_IGN)
     signal.signal(signal.SIGTERM, lambda *_: sys.exit(128 + signal.SIGTERM))
-    _prepared.append(work.prepare())
+    try:
+        end_with_parent()
+        import cv2
+
+        cv2.setNumThreads(1)  # the processes share the processors already
+        _prepared.append(work.prepare())
+    except SystemExit as end:  # the pool would report it as a fault
+        os._exit(int(end.code or 0))
 
 
 def _do(task: Any) -> Any:
@@ -118,3 +131,51 @@ def _do(task: Any) -> Any:
         return _prepared[0](task)
     except SystemExit as end:  # the task has cleaned up; the pool would take this for its result, and go on
         os._exit(int(end.code or 0))
+
+
+def end_with_parent() -> None:
+    """End this process when the one that started it is gone, however it went: nobody waits for its results.
+
+    Its main thread is told to end first (SIGTERM), so that it may remove what it has half written.
+    """
+    parent = multiprocessing.parent_process()
+    if parent is None:
+        return
+
+    def watch() -> None:
+        multiprocessing.connection.wait([parent.sentinel])
+        if hasattr(signal, "pthread_kill"):
+            signal.pthread_kill(main, signal.SIGTERM)
+            time.sleep(_GRACE_S)
+        os._exit(1)
+
+    main = threading.main_thread().ident or 0
+    threading.Thread(target=watch, daemon=True).start()
+
+
+@contextlib.contextmanager
+def without_interrupts() -> Iterator[None]:
+    """Keep Ctrl-C from processes that are started meanwhile: it reaches them before they can say that they ignore it.
+
+    To this process it comes afterwards, and so does SIGTERM: one that is half started is known to nobody who ends it.
+    """
+    if not hasattr(signal, "pthread_sigmask"):  # Windows
+        yield
+        return
+    resource_tracker.ensure_running()  # which every first child starts, and which takes the block away
+    came: list[int] = []
+    kept = {}
+    if threading.current_thread() is threading.main_thread():
+        for number in (signal.SIGINT, signal.SIGTERM):
+            if signal.getsignal(number) is not None:
+                kept[number] = signal.signal(number, lambda number, _: came.append(number))
+    # Children inherit what this thread blocks. Other threads may take the signal all the same, hence the handlers.
+    before = signal.pthread_sigmask(signal.SIG_BLOCK, {signal.SIGINT})
+    try:
+        yield
+    finally:
+        signal.pthread_sigmask(signal.SIG_SETMASK, before)
+        for number, handler in kept.items():
+            signal.signal(number, handler)
+    for each in dict.fromkeys(came):
+        signal.raise_signal(each)

@@ -16,6 +16,7 @@ import numpy as np
 import pyproj
 import pytest
 import rasterio
+from support.groups import is_gone
 from worlds.fenway import write_streets
 
 from roadgeo import __version__
@@ -158,6 +159,26 @@ def test_a_batch_that_was_killed_goes_on_where_it_was(porto: Path, capfd: pytest
     found = [json.loads(Path(f"out/{name}_location.json").read_text()) for name in names]
     assert [one["homography"] for one in found] == [found[0]["homography"]] * 6
     assert all(path.stat().st_mtime_ns == at for path, at in written.items() if "drone_0" in path.name)
+    assert {path.name for path in Path("out").iterdir() if path.name.startswith((".", "tmp"))} == set()
+
+
+@pytest.mark.skipif(os.name == "nt", reason="signals of POSIX")
+def test_a_batch_that_is_told_to_end_cleans_up(porto: Path) -> None:
+    """As at Ctrl-C: a supervisor sends SIGTERM, to the command alone."""
+    for n in range(8):
+        shutil.copy(MASKS["drone"].path, f"drone_{n}.png")
+    given = [*(f"drone_{n}.png" for n in range(8)), "-r", str(porto), "-o", "out", "-q", "-j", "2"]
+    pipe = subprocess.PIPE
+    with subprocess.Popen(
+        [sys.executable, "-m", "roadgeo", "locate", *given], stdout=pipe, stderr=pipe, text=True, start_new_session=True
+    ) as batch:
+        while not Path("out/drone_1_location.json").exists():
+            assert batch.poll() is None
+            time.sleep(0.001)
+        batch.terminate()
+        _, said = batch.communicate(timeout=60)
+        assert (batch.returncode, said.strip()) == (130, "Interrupted.")
+        assert is_gone(batch.pid)
     assert {path.name for path in Path("out").iterdir() if path.name.startswith((".", "tmp"))} == set()
 
 

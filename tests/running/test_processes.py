@@ -1,3 +1,4 @@
+import contextlib
 import os
 import signal
 import subprocess
@@ -8,6 +9,7 @@ from dataclasses import dataclass
 from pathlib import Path
 
 import pytest
+from support.groups import is_gone
 
 from roadgeo.running.processes import run
 
@@ -81,14 +83,65 @@ def test_an_interrupt_ends_the_workers(tmp_path: Path) -> None:
     assert is_gone(process.pid)
 
 
-def is_gone(group: int) -> bool:
-    for _ in range(50):
+_SLOW = """
+import sys, time
+from dataclasses import dataclass
+from roadgeo.running.processes import run
+@dataclass(frozen=True)
+class Slow:
+    def prepare(self): return self.do
+    def do(self, task):
         try:
-            os.killpg(group, 0)
-        except ProcessLookupError:
-            return True
-        time.sleep(0.1)
-    return False
+            time.sleep(0 if task == 'a' else 60)
+        finally:
+            open(task, 'w').close()
+    def give_up(self, task, reason): pass
+if __name__ == '__main__':
+    for _ in run(list('abcdef'), Slow(), 3): print('one', flush=True)
+"""
+
+
+@pytest.mark.skipif(os.name == "nt", reason="signals of POSIX")
+@pytest.mark.parametrize("how", [signal.SIGKILL, signal.SIGTERM])
+def test_workers_do_not_outlive_whoever_started_them(how: signal.Signals, tmp_path: Path) -> None:
+    """Those that work clean up first; those that wait for work end, too."""
+    (tmp_path / "slow.py").write_text(_SLOW)
+    command, quiet = [sys.executable, "slow.py"], subprocess.DEVNULL
+    with subprocess.Popen(
+        command, cwd=tmp_path, stdout=subprocess.PIPE, stderr=quiet, start_new_session=True
+    ) as process:
+        try:
+            process.stdout.readline()
+            time.sleep(0.3)
+            os.kill(process.pid, how)
+            process.wait(timeout=10)
+            assert is_gone(process.pid)
+        finally:
+            with contextlib.suppress(ProcessLookupError):
+                os.killpg(process.pid, signal.SIGKILL)
+    assert (tmp_path / "b").exists()
+    assert not (tmp_path / "f").exists()
+
+
+@pytest.mark.skipif(os.name == "nt", reason="signals of POSIX")
+@pytest.mark.parametrize("after_s", [0.05, 0.4, 1.0])
+def test_an_interrupt_while_workers_start_is_no_traceback(after_s: float, tmp_path: Path) -> None:
+    script = _SLOW.replace("    for _", "    print('starting', flush=True)\n    for _")
+    (tmp_path / "slow.py").write_text(script.replace("list('abcdef')", "list('bcdef')"))
+    with subprocess.Popen(
+        [sys.executable, "slow.py"],
+        cwd=tmp_path,
+        stdout=subprocess.PIPE,
+        stderr=subprocess.PIPE,
+        text=True,
+        start_new_session=True,
+    ) as process:
+        process.stdout.readline()
+        time.sleep(after_s)
+        os.killpg(process.pid, signal.SIGINT)
+        _, err = process.communicate(timeout=20)
+        assert err.count("Traceback") == 1, err  # the script's own, which asks for none to be caught
+        assert is_gone(process.pid)
 
 
 @pytest.mark.parametrize(("guard", "status"), [("", 1), ("if __name__ == '__main__':", 0)])

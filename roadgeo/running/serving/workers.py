@@ -20,6 +20,7 @@ from pathlib import Path
 from typing import Any
 
 from roadgeo._progress import Say, say_nothing
+from roadgeo.running.processes import end_with_parent, without_interrupts
 
 __all__ = ["Answer", "Asked", "Full", "Place", "Told", "Workers"]
 
@@ -203,7 +204,8 @@ class _Worker:
         self._pipe, theirs = self._context.Pipe()
         try:
             process = self._context.Process(target=_serve, args=(theirs, self._references), daemon=True)
-            process.start()
+            with without_interrupts():
+                process.start()
         finally:
             theirs.close()
         self._process = process
@@ -276,6 +278,7 @@ class _Worker:
 def _serve(pipe: Connection, names: list[str]) -> None:
     """Answer until the pipe is closed."""
     signal.signal(signal.SIGINT, signal.SIG_IGN)
+    end_with_parent()
     import cv2
 
     from roadgeo.errors import RoadgeoError

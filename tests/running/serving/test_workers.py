@@ -1,5 +1,6 @@
 """Processes that locate, on a real reference: what is hostile ends in an answer, and the next is located."""
 
+import contextlib
 import errno
 import json
 import multiprocessing
@@ -22,6 +23,7 @@ from dataclasses import replace
 import cv2
 import numpy as np
 import pytest
+from support.groups import is_gone
 from support.mavlink_peer import listening, of_kind
 
 from roadgeo.cli import main
@@ -279,6 +281,21 @@ def test_the_command_serves_until_it_is_interrupted(place):
         assert asked_at - 0.1 < place["time_usec"] / 1e6 < place["heard_at"]
         assert place["time_usec"] + place["processing_time"] <= place["heard_at"] * 1e6
     assert bool(heard) == has_pymavlink()
+
+
+@pytest.mark.skipif(os.name == "nt", reason="signals of POSIX")
+def test_processes_do_not_outlive_the_server(place):
+    program = "import sys; from roadgeo.cli import main; sys.exit(main())"
+    command = [sys.executable, "-c", program, "serve", "-r", str(place[0] / "town.gpkg"), "--port", "0", "-j", "2"]
+    with subprocess.Popen(command, stderr=subprocess.PIPE, text=True, start_new_session=True) as process:
+        try:
+            assert any("Listening" in line for line in process.stderr)
+            process.kill()
+            process.wait(10)
+            assert is_gone(process.pid)
+        finally:
+            with contextlib.suppress(ProcessLookupError):
+                os.killpg(process.pid, signal.SIGKILL)
 
 
 @pytest.mark.parametrize("options", [["--host", "0.0.0.0"], ["--token-file", os.devnull]])
