@@ -8,6 +8,8 @@ from __future__ import annotations
 from collections.abc import Mapping
 from typing import Any
 
+from roadgeo.outputs.names import bare_name, without_folders
+
 __all__ = ["NUMBERS", "WORDS", "attributes"]
 
 #: Columns that every mask has a value in, located or not.
@@ -26,7 +28,7 @@ NUMBERS = (
 
 
 def attributes(document: Mapping[str, Any]) -> dict[str, Any]:
-    """Return the value of every column: plain, None where there is none.
+    """Return the value of every column: plain, None where there is none; files without their folders.
 
     Parameters
     ----------
@@ -34,5 +36,10 @@ def attributes(document: Mapping[str, Any]) -> dict[str, Any]:
         `Location.to_dict`, its JSON read back, or what stands for a mask that failed.
     """
     sigma = document.get("corner_sigma_m")
-    derived = {"max_corner_sigma_m": max(sigma) if sigma else None}
+    query, reason = str(document.get("query") or ""), str(document.get("reason") or "")
+    derived = {
+        "max_corner_sigma_m": max(sigma) if sigma else None,
+        "query": bare_name(query),
+        "reason": without_folders(reason, query),
+    }
     return {name: derived.get(name, document.get(name)) for name in (*WORDS, *NUMBERS)}

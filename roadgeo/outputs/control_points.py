@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import csv
+import os
 import xml.etree.ElementTree as ET
 from pathlib import Path
 from tempfile import TemporaryDirectory
@@ -43,6 +44,9 @@ def write_vrt(path: Path, subject: Subject) -> None:
         rasterio.shutil.copy(source, path, driver="VRT")
     document = ET.parse(path)  # noqa: S314 (GDAL wrote it just now)
     root = document.getroot()
+    for source in root.iter("SourceFilename"):
+        source.text, relative = _from_here(subject.picture, path)
+        source.set("relativeToVRT", relative)
     for name in ("SRS", "GeoTransform", "GCPList"):
         for element in root.findall(name):
             root.remove(element)
@@ -53,6 +57,15 @@ def write_vrt(path: Path, subject: Subject) -> None:
         ET.SubElement(points, "GCP", where)
     root.insert(0, points)
     document.write(path, encoding="unicode")
+
+
+def _from_here(picture: Path, path: Path) -> tuple[str, str]:
+    """Return where a picture lies as seen from a file that names it, and "1"; on another drive its own path and "0"."""
+    there = Path(os.path.realpath(picture.parent), picture.name)
+    try:
+        return os.path.relpath(there, os.path.realpath(path.parent)), "1"
+    except ValueError:
+        return str(there), "0"
 
 
 def write_points(path: Path, subject: Subject) -> None:

@@ -36,6 +36,7 @@ from roadgeo.outputs.canvas import (
     write_png,
     write_text,
 )
+from roadgeo.outputs.names import bare_command, bare_name, without_folders
 from roadgeo.outputs.subject import Subject
 from roadgeo.outputs.wording import format_lonlat
 
@@ -68,7 +69,10 @@ _STAGES = {
 
 def write_explanation(path: Path, subject: Subject) -> None:
     """Write `Explanation.to_dict` as JSON."""
-    told = json.dumps(_explained(subject).to_dict(), indent=2, allow_nan=False)
+    explained = _explained(subject).to_dict()
+    query, reason, command = (str(explained[name]) for name in ("query", "reason", "command"))
+    explained |= {"query": bare_name(query), "reason": without_folders(reason, query), "command": bare_command(command)}
+    told = json.dumps(explained, indent=2, allow_nan=False)
     path.write_text(told + "\n", encoding="utf-8", newline="\n")
 
 

@@ -13,6 +13,7 @@ from roadgeo import __version__
 from roadgeo._arrays import AnyArray
 from roadgeo.geometry.mask import RoadMask
 from roadgeo.geometry.warping import warp
+from roadgeo.outputs.names import bare_name
 from roadgeo.outputs.orthophoto import warp_image
 from roadgeo.outputs.subject import Subject
 from roadgeo.storage.qml import draw_palette
@@ -133,7 +134,7 @@ def _tags(subject: Subject) -> dict[str, str]:
     location = subject.location
     return {
         "TIFFTAG_SOFTWARE": f"roadgeo {__version__}",
-        "ROADGEO_QUERY": location.query,
+        "ROADGEO_QUERY": bare_name(location.query),
         "ROADGEO_REFERENCE": location.reference,
         "ROADGEO_HOMOGRAPHY": json.dumps(subject.homography.tolist()),
         "ROADGEO_LOG10_ODDS": f"{location.log10_odds}",

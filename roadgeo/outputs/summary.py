@@ -12,6 +12,7 @@ import numpy as np
 
 from roadgeo.geometry.antimeridian import cut_ring
 from roadgeo.outputs.columns import NUMBERS, WORDS, attributes
+from roadgeo.outputs.names import bare_names
 from roadgeo.storage.files import write_text
 from roadgeo.storage.geopackage import GeometryType, Layer, write_layers
 from roadgeo.storage.qml import draw_fill
@@ -38,13 +39,18 @@ def write_summary(folder: Path, documents: Sequence[Mapping[str, Any]]) -> list[
     OutputError
         A file cannot be written.
     """
+    names = bare_names([str(document["query"]) for document in documents])
+    documents = [
+        {**document, "query": name, "reason": attributes(document)["reason"]}
+        for document, name in zip(documents, names, strict=True)
+    ]
     located = [document for document in documents if document["status"] == "located"]
     others = [document for document in documents if document["status"] != "located"]
     parts = [cut_ring(np.array(document["footprint_lonlat"], float)) for document in located]
     shapes: tuple[GeometryType, list[Any]] = ("POLYGON", [rings[0] for rings in parts])
     if any(len(rings) > 1 for rings in parts):
         shapes = ("MULTIPOLYGON", parts)
-    rows = [attributes(document) for document in located]
+    rows = [{**attributes(document), "query": document["query"]} for document in located]
     footprints = {name: [row[name] for row in rows] for name in (*WORDS, *NUMBERS)}
     geopackage, table = folder / "roadgeo_summary.gpkg", folder / "roadgeo_summary.csv"
     layers = [
@@ -64,7 +70,7 @@ def _to_csv(documents: Sequence[Mapping[str, Any]]) -> str:
         here = document if document["status"] == "located" else {}
         center = here.get("center") or {}
         position = [center.get("lon"), center.get("lat"), here.get("crs"), center.get("x"), center.get("y")]
-        values = attributes(document)
+        values = {**attributes(document), "query": document["query"]}
         words, numbers = ([values[name] for name in names] for names in (WORDS, NUMBERS))
         writer.writerow([*words, *position, *numbers, _to_wkt(here.get("footprint_lonlat"))])
     return text.getvalue()

@@ -20,6 +20,7 @@ import numpy as np
 
 from roadgeo._text import visible
 from roadgeo.errors import OutputError
+from roadgeo.outputs.names import bare_names, without_folders
 from roadgeo.storage.files import replacing, write_text
 
 if TYPE_CHECKING:
@@ -59,8 +60,10 @@ def write_table(path: Path, documents: Sequence[Mapping[str, Any]]) -> None:
     text = io.StringIO()
     writer = csv.writer(text, lineterminator="\n")
     writer.writerow(_COLUMNS)
-    for document in documents:
-        writer.writerow([_cell(document, name) for name in _COLUMNS])
+    names = bare_names([str(document["image"]) for document in documents])
+    for document, image in zip(documents, names, strict=True):
+        reason = without_folders(str(document.get("reason") or ""), str(document["image"]))
+        writer.writerow([_cell({**document, "image": image, "reason": reason}, name) for name in _COLUMNS])
     write_text(path, text.getvalue())
 
 

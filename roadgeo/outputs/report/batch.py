@@ -14,6 +14,7 @@ from urllib.parse import quote
 import numpy as np
 
 from roadgeo.matching.index import ReferenceIndex
+from roadgeo.outputs.columns import attributes
 from roadgeo.outputs.report.page import STATUS, footer, render_page, section
 from roadgeo.outputs.report.viewer import Layer, draw_viewer, ring_data
 from roadgeo.outputs.report.views import Window, draw_whole_map
@@ -135,6 +136,6 @@ def _item(entry: Entry, with_folder: bool) -> str:
             parts.append(f"corners ± {max(sigma):.1f} m")
         if odds is not None:
             parts.append(f"odds 10<sup>{odds:.1f}</sup>")
-    said = " · ".join(parts) or html.escape(str(document.get("reason", "")))
+    said = " · ".join(parts) or html.escape(str(attributes(document)["reason"]))
     status = f'<span class="status {entry.status}">{STATUS[entry.status]}</span>'
     return f"<li>{entry.wrap(html.escape(name or 'mask'))} {status}<br><small>{said}</small></li>"

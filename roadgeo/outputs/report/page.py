@@ -10,7 +10,7 @@ import html
 import math
 import os
 from collections.abc import Sequence
-from pathlib import Path, PurePath
+from pathlib import Path
 
 import numpy as np
 
@@ -19,6 +19,7 @@ from roadgeo.geometry.mask import RoadMask, plane_to_pixel
 from roadgeo.geometry.pinhole import polygon_area
 from roadgeo.location import Location, Place
 from roadgeo.matching.index import ReferenceIndex
+from roadgeo.outputs.names import bare_command, bare_name, without_folders
 from roadgeo.outputs.paths import Placement
 from roadgeo.outputs.report.place_view import draw_place
 from roadgeo.outputs.report.views import (
@@ -87,10 +88,10 @@ def render_report(
         section("Matched intersections", _matches(subject)),
         f"<details><summary>Everything else</summary>{_table(_details(subject))}</details>",
     ]
-    name = PurePath(location.query).name or "mask"
+    name = bare_name(location.query) or "mask"
     header = (
         f'<h1>{html.escape(name)}</h1><span class="status {location.status}">{STATUS[location.status]}</span>'
-        f"<p>{html.escape(_sentence(location.reason))}</p>"
+        f"<p>{html.escape(_sentence(without_folders(location.reason, location.query)))}</p>"
     )
     return render_page(name, header, f"<main>{views[0]}<aside>{''.join(parts)}{footer(attribution)}</aside></main>")
 
@@ -282,7 +283,7 @@ def _details(subject: Shown) -> list[tuple[str, str]]:
     plain = location.to_dict()
     seconds = ", ".join(f"{step} {value:.3f}" for step, value in plain["seconds"].items())
     stats = ", ".join(f"{value:,} {name.replace('_', ' ')}" for name, value in plain["stats"].items())
-    rows = [("Mask", html.escape(location.query)), ("Map", html.escape(location.reference))]
+    rows = [("Mask", html.escape(bare_name(location.query))), ("Map", html.escape(location.reference))]
     rows += [("Source", html.escape(text)) for text in _sources(subject.index)]
     rows += [("Seconds", seconds), ("Search", stats)]
     if location.crs is not None:
@@ -292,7 +293,7 @@ def _details(subject: Shown) -> list[tuple[str, str]]:
         note = "takes (column, row, 1) to the CRS; the middle of the first pixel is (0.5, 0.5)"
         rows.append(("Homography", f"<pre>{matrix}</pre><small>{note}</small>"))
     if location.command:
-        rows.append(("Made by", f"<code>{html.escape(location.command)}</code>"))
+        rows.append(("Made by", f"<code>{html.escape(bare_command(location.command))}</code>"))
     return rows
 
 

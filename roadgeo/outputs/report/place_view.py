@@ -13,6 +13,7 @@ from roadgeo.geometry.homography import Homography
 from roadgeo.geometry.mask import plane_to_pixel
 from roadgeo.geometry.warping import cover, warp
 from roadgeo.location import Location
+from roadgeo.outputs.names import bare_name
 from roadgeo.outputs.paths import Placement
 from roadgeo.outputs.report.svg import draw_dots, draw_image, draw_lines, join_segments, thin_lines
 from roadgeo.outputs.report.viewer import (
@@ -85,7 +86,7 @@ def draw_place(subject: Shown, place: Placement) -> str:
         "data-arrows": f"{arrows:.4g}",
         "style": f"--u:{per_px:.4g};--k:{max(1.0, arrows * per_px):.4g}",
     }
-    said = f"Map, north up: the footprint of {location.query} over the roads of {location.reference}"
+    said = f"Map, north up: the footprint of {bare_name(location.query)} over the roads of {location.reference}"
     return draw_viewer(said, window.box, layers, attributes, scale=True, enlarged=True, credit=subject.attribution)
 
 

@@ -16,6 +16,7 @@ from roadgeo.location import Evidence, Location, Seen
 from roadgeo.matching.index import ReferenceIndex
 from roadgeo.matching.query import trace_query
 from roadgeo.outputs.canvas import touching
+from roadgeo.outputs.names import bare_name
 from roadgeo.outputs.paths import Placement
 from roadgeo.outputs.report.svg import draw_dots, draw_image, draw_lines, thin_lines
 from roadgeo.outputs.report.viewer import (
@@ -247,7 +248,7 @@ def draw_mask(subject: Shown) -> str:
         Layer("matches", "matched", draw_dots(matched, ("halo", "")), DOT_SIGN),
         Layer("edge", "", f'<path d="{ring_data(subject.mask.corners)}"/>'),
     ]
-    said = f"The mask {subject.location.query}, with the roads and intersections seen in it"
+    said = f"The mask {bare_name(subject.location.query)}, with the roads and intersections seen in it"
     attributes = {"data-frame": "mask", "style": f"--u:{max(width, height) / _MASK_PX:.4g}"}
     return draw_viewer(said, box, layers, attributes)
 
