@@ -165,7 +165,7 @@ def _correct(one: Verified, image: Path, stem: Path, fix: bool, in_place: bool) 
     if fix:
         files = [stem.with_name(f"{stem.name}_fixed{ending}") for ending in (".tif", ".points")]
         write_fixed(image, files[0], one.corrected)
-        write_points(files[1], one.corrected)
+        write_points(files[1], one.corrected.of_stored(image))
     if in_place:
         write_in_place(image, one.corrected)
         files.append(image)

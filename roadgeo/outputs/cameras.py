@@ -10,6 +10,7 @@ from typing import Any
 
 import numpy as np
 
+from roadgeo._arrays import FloatArray
 from roadgeo.errors import OutputError
 from roadgeo.geometry.pose import omega_phi_kappa, quaternion, turned
 from roadgeo.location import Camera
@@ -44,24 +45,26 @@ def write_geopose(path: Path, subject: Subject) -> None:
 def write_orthority(path: Path, subject: Subject) -> None:
     """Write exterior parameters as Orthority reads them (GeoJSON); its axes are those of the CRS, not of true north.
 
+    Orthority takes a picture's pixels as they are stored, also where its EXIF says that it is to be turned.
+
     Its interior parameters stand among the properties: `focal_len` in longer sides of the picture.
     """
     from roadgeo.geometry.projection import LocalPlane, grid_north
 
     camera, place = _camera(subject), subject.place
     at = np.array([camera.x, camera.y])
-    grid = turned(camera.rotation, grid_north(LocalPlane(place.crs, (0.0, 0.0)), at))
+    grid = turned(camera.rotation, grid_north(LocalPlane(place.crs, (0.0, 0.0)), at)) @ _stored_axes(subject)
     height = camera.height_m if camera.altitude_m is None else camera.altitude_m
-    width, height_px = subject.size
-    mask_width = subject.mask.shape[1]
+    longer_side = max(subject.size)
+    focal = camera.focal_px * subject.size[0] / subject.mask.shape[1]
     properties = {
         "filename": subject.picture.name,
         "camera": None,
         "xyz": [camera.x, camera.y, height],
         "opk": list(omega_phi_kappa(grid)),
         "type": "pinhole",
-        "im_size": [width, height_px],
-        "focal_len": camera.focal_px * width / mask_width / max(width, height_px),
+        "im_size": [abs(round(side)) for side in (subject.stored.matrix[:2, :2] @ subject.size).tolist()],
+        "focal_len": focal / longer_side,
     }
     point = {"type": "Point", "coordinates": [camera.lon, camera.lat, height]}
     collection = {
@@ -70,6 +73,16 @@ def write_orthority(path: Path, subject: Subject) -> None:
         "features": [{"type": "Feature", "properties": properties, "geometry": point}],
     }
     path.write_text(json.dumps(collection, indent=2) + "\n", encoding="utf-8")
+
+
+def _stored_axes(subject: Subject) -> FloatArray:
+    """Return (3, 3) the axes of a camera that took a picture as it is stored, in those of one that took it upright."""
+    across = subject.stored.matrix[:2, :2].T * np.array([[1.0, -1.0], [-1.0, 1.0]])  # rows count downwards
+    if np.linalg.det(across) < 0:
+        raise OutputError(f"{subject.picture}: is stored mirrored, as no camera takes it; save it upright")
+    axes = np.eye(3)
+    axes[:2, :2] = across
+    return axes
 
 
 def write_odm_geo(path: Path, subject: Subject) -> None:

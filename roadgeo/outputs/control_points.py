@@ -1,8 +1,12 @@
-"""Control points of a result: the picture's own pixels with points that other programs fit a place through."""
+"""Control points of a result: the picture's own pixels with points that other programs fit a place through.
+
+GDAL, QGIS and OpenDroneMap take a picture's pixels as they are stored, also where EXIF says that it is to be turned.
+"""
 
 from __future__ import annotations
 
 import csv
+import math
 import os
 import xml.etree.ElementTree as ET
 from pathlib import Path
@@ -40,7 +44,7 @@ def write_vrt(path: Path, subject: Subject) -> None:
 
     from roadgeo.storage.rasters import open_raster, writing_raster
 
-    with open_raster(subject.picture.absolute()) as source, writing_raster(path):
+    with open_raster(subject.picture.absolute(), upright=False) as source, writing_raster(path):
         rasterio.shutil.copy(source, path, driver="VRT")
     document = ET.parse(path)  # noqa: S314 (GDAL wrote it just now)
     root = document.getroot()
@@ -52,7 +56,7 @@ def write_vrt(path: Path, subject: Subject) -> None:
             root.remove(element)
     wkt = pyproj.CRS.from_user_input(subject.place.crs).to_wkt("WKT1_GDAL")
     points = ET.Element("GCPList", Projection=wkt)
-    for i, (column, row, x, y) in enumerate(subject.control_points()):
+    for i, (column, row, x, y) in enumerate(subject.stored_control_points()):
         where = {"Id": str(i + 1), "Pixel": repr(column), "Line": repr(row), "X": repr(x), "Y": repr(y)}
         ET.SubElement(points, "GCP", where)
     root.insert(0, points)
@@ -75,7 +79,7 @@ def write_points(path: Path, subject: Subject) -> None:
     wkt = pyproj.CRS.from_user_input(subject.place.crs).to_wkt()
     lines = [f"#CRS: {wkt}", "mapX,mapY,sourceX,sourceY,enable,dX,dY,residual"]
     # QGIS places a picture without georeference below the x axis.
-    lines += [f"{x!r},{y!r},{column!r},{-row!r},1,0,0,0" for column, row, x, y in subject.control_points()]
+    lines += [f"{x!r},{y!r},{column!r},{-row!r},1,0,0,0" for column, row, x, y in subject.stored_control_points()]
     path.write_text("\n".join(lines) + "\n", encoding="utf-8")
 
 
@@ -86,10 +90,11 @@ def write_match_points(path: Path, subject: Subject) -> None:
     wkt = pyproj.CRS.from_user_input(subject.place.crs).to_wkt()
     lines = [f"#CRS: {wkt}", "mapX,mapY,sourceX,sourceY,enable,dX,dY,residual"]
     for one in subject.matches():
+        pixels = np.array([[one.column, one.row], [one.fitted_column, one.fitted_row]])
+        (column, row), (fitted_column, fitted_row) = subject.stored(pixels).tolist()
         # QGIS's residuals are in pixels of the source, from the point to where the transformation has it.
-        dx, dy = one.fitted_column - one.column, one.row - one.fitted_row
-        apart = float(np.hypot(dx, dy))
-        lines.append(f"{one.x!r},{one.y!r},{one.column!r},{-one.row!r},1,{dx!r},{dy!r},{apart!r}")
+        dx, dy = fitted_column - column, row - fitted_row
+        lines.append(f"{one.x!r},{one.y!r},{column!r},{-row!r},1,{dx!r},{dy!r},{math.hypot(dx, dy)!r}")
     path.write_text("\n".join(lines) + "\n", encoding="utf-8")
 
 
@@ -113,9 +118,8 @@ def write_matches(path: Path, subject: Subject) -> None:
 def write_odm(path: Path, subject: Subject) -> None:
     """Write control points as OpenDroneMap's gcp_list.txt; the map knows no heights, so all are 0."""
     lines = [_odm_crs(subject.place.crs)]
-    lines += [
-        f"{x!r} {y!r} 0 {column!r} {row!r} {subject.picture.name}" for column, row, x, y in subject.control_points()
-    ]
+    name = subject.picture.name
+    lines += [f"{x!r} {y!r} 0 {column!r} {row!r} {name}" for column, row, x, y in subject.stored_control_points()]
     path.write_text("\n".join(lines) + "\n", encoding="utf-8")
 
 

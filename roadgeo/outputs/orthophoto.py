@@ -23,7 +23,8 @@ from roadgeo.errors import CrsError, MaskError
 from roadgeo.geometry.lens import Lens
 from roadgeo.geometry.warping import MapGrid, Transform, cover, source_pixels
 from roadgeo.outputs.paths import Placement
-from roadgeo.storage.rasters import open_raster, read_palette, writing_raster
+from roadgeo.storage.orientation import UPRIGHT, read_orientation
+from roadgeo.storage.rasters import open_raster, raster_size, read_palette, writing_raster
 
 __all__ = ["ImageOptions", "Target", "choose_target", "image_homography", "read_preview", "warp_image"]
 
@@ -105,14 +106,17 @@ def image_homography(
     MaskError
         The picture cannot be read, or its sides are in another proportion than the mask's.
     """
-    with open_raster(path) as picture:
-        width, height = picture.width, picture.height
+    width, height = raster_size(path)
     factors = np.array([mask_size[0] / width, mask_size[1] / height])
     # The sides of a reduced picture are rounded, so a pixel's worth of difference is none.
     if abs(factors[0] / factors[1] - 1) > 1.5 / min(*mask_size, width, height):
+        orientation = read_orientation(path)
+        remedy = "crop or pad the picture as the mask was made"
+        if orientation != UPRIGHT:
+            remedy = f"make the mask of the upright picture, which its file turns (EXIF orientation {orientation})"
         raise MaskError(
             f"{path} is {width} x {height} pixels, its mask {mask_size[0]} x {mask_size[1]}: expected the same frame, "
-            "at any scale; crop or pad the picture as the mask was made"
+            f"at any scale; {remedy}"
         )
     return place.homography @ np.diag([*factors, 1.0]), (width, height)
 

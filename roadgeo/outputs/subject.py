@@ -21,6 +21,7 @@ from roadgeo.matching.explanation import Explanation
 from roadgeo.matching.index import ReferenceIndex
 from roadgeo.outputs.orthophoto import ImageOptions, Target, choose_target, image_homography
 from roadgeo.outputs.paths import OutputPaths, Placement
+from roadgeo.storage.orientation import read_orientation, stored_from_upright
 
 __all__ = ["Match", "Subject"]
 
@@ -157,6 +158,16 @@ class Subject:
         """(S, 4) segments x1, y1, x2, y2 of the map's roads, in the place's CRS."""
         ends = self.index.segments.reshape(-1, 2).astype(float)
         return self.index.plane.to_crs(ends).reshape(-1, 4)
+
+    @cached_property
+    def stored(self) -> Homography:
+        """From the picture's pixels to those of its file, where that is to be turned (see `storage.orientation`)."""
+        return Homography(stored_from_upright(read_orientation(self.picture), self.size))
+
+    def stored_control_points(self) -> list[tuple[float, float, float, float]]:
+        """As `control_points`, in the pixels of the picture's file: of programs that do not turn it."""
+        points = np.array(self.control_points())
+        return [tuple(point) for point in np.c_[self.stored(points[:, :2]), points[:, 2:]].tolist()]
 
     def control_points(self) -> list[tuple[float, float, float, float]]:
         """Column, row, x, y of 25 points on a grid over the picture."""

@@ -127,9 +127,9 @@ def write_fixed(image: Path, path: Path, place: Georeference) -> None:
     if path.resolve() == image.resolve():
         raise OutputError(f"{path}: is the image itself; choose another --out-dir, or --in-place to overwrite it")
     with replacing(path) as temporary:
-        with open_raster(image) as source:
+        with open_raster(image, upright=False) as source:
             rasterio.shutil.copy(source, temporary, driver="GTiff", compress="DEFLATE", tiled=True, bigtiff="IF_SAFER")
-        _set_place(temporary, place)
+        _set_place(temporary, place.of_stored(image))
 
 
 def write_in_place(image: Path, place: Georeference) -> None:
@@ -142,11 +142,11 @@ def write_in_place(image: Path, place: Georeference) -> None:
     """
     from roadgeo.storage.rasters import open_raster
 
-    with open_raster(image) as source:
+    with open_raster(image, upright=False) as source:
         driver = source.driver
     if driver != "GTiff":
         raise OutputError(f"{image}: only GeoTIFFs can be corrected in place; use --fix, which writes one")
-    _set_place(image, place)
+    _set_place(image, place.of_stored(image))
 
 
 def _set_place(path: Path, place: Georeference) -> None:

@@ -20,7 +20,7 @@ from roadgeo.outputs.paths import output_paths
 from roadgeo.outputs.registry import FOOTPRINT, MATCH_POINTS, MATCHES, Output, find_outputs
 from roadgeo.outputs.subject import Subject
 from roadgeo.storage.files import replacing
-from roadgeo.storage.rasters import open_raster
+from roadgeo.storage.rasters import raster_size
 
 __all__ = ["apply_location", "read_location"]
 
@@ -192,7 +192,6 @@ def _stretched(location: Location, picture: Path) -> Location:
 
     assert location.size is not None  # noqa: S101
     assert location.homography is not None  # noqa: S101
-    with open_raster(picture) as raster:
-        size = (raster.width, raster.height)
+    size = raster_size(picture)
     scale = np.diag([location.size[0] / size[0], location.size[1] / size[1], 1.0])
     return replace(location, size=size, homography=location.homography @ scale, lens_k1=0.0)

@@ -309,10 +309,9 @@ class Locating:
         if not self.reading.exif:
             return self.options.search
         from roadgeo.sources.exif import read_focal_length
-        from roadgeo.storage.rasters import open_raster
+        from roadgeo.storage.rasters import raster_size
 
-        with open_raster(task.mask) as raster:
-            longer_side = max(raster.shape)
+        longer_side = max(raster_size(task.mask))
         focal_px = read_focal_length(self.reading.images.get(task.mask, task.mask)) * longer_side
         match = self.options.search.match
         return replace(self.options.search, match=replace(match, camera=replace(match.camera, focal_px=focal_px)))
@@ -409,11 +408,9 @@ def _off_stated(mask: str, location: Location) -> float | None:
 
 def _scale(picture: str, mask: RoadMask) -> float:
     """How many times the mask's width a picture's is."""
-    from roadgeo.storage.rasters import open_raster
+    from roadgeo.storage.rasters import raster_size
 
-    with open_raster(picture) as source:
-        width: int = source.width
-    return round(width / mask.shape[1], 3)
+    return round(raster_size(picture)[0] / mask.shape[1], 3)
 
 
 # --- all of them ------------------------------------------------------------------------------------------------------

@@ -10,6 +10,7 @@ import numpy as np
 
 from roadgeo._arrays import AnyArray
 from roadgeo.errors import MaskError
+from roadgeo.storage.orientation import UPRIGHT, turn_upright
 
 __all__ = ["read_picture"]
 
@@ -25,7 +26,7 @@ def read_picture(picture: Any) -> str | AnyArray:
     picture : path, array, PIL image, xarray DataArray or rasterio dataset
         Of an array with three axes the short one (up to 16) holds the bands: first as rasterio has it (C, H, W), or
         last as others do (H, W, C). A dataset that is a file is read as that file. What is transparent, masked or
-        nodata was not observed.
+        nodata was not observed. A PIL image is turned upright, as `PIL.ImageOps.exif_transpose` does.
 
     Raises
     ------
@@ -67,7 +68,9 @@ def _read_pil(image: Any) -> AnyArray:
     if bands[0] == "P":
         image = image.convert("RGBA" if "transparency" in image.info else "RGB")
         bands = image.getbands()
-    values = np.asarray(image)
+    values = np.asarray(image)  # PIL turns TIFFs by itself, and forgets that they were to be
+    orientation = image.getexif().get(274, UPRIGHT)
+    values = turn_upright(values, orientation if orientation in range(1, 9) else UPRIGHT)
     return _transparent(values[..., :-1], values[..., -1]) if bands[-1] == "A" else values
 
 

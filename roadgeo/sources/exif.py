@@ -22,7 +22,7 @@ def read_focal_length(path: str | os.PathLike[str]) -> float:
     MaskError
         The file cannot be read, or says nothing of its focal length.
     """
-    with open_raster(path) as source:
+    with open_raster(path, upright=False) as source:
         tags = {**source.tags(), **source.tags(ns="EXIF")}
     stated = tags.get("EXIF_FocalLengthIn35mmFilm", "").strip("() ")
     focal = _number(stated)
@@ -40,7 +40,7 @@ def estimate_gsd(path: str | os.PathLike[str]) -> float | None:
     The height above the place of take-off, which drones note (XMP "RelativeAltitude"), is better than EXIF
     "GPSAltitude", which counts from the sea. None where either is missing.
     """
-    with open_raster(path) as source:
+    with open_raster(path, upright=False) as source:
         longer_side: int = max(source.shape)
         try:
             tags = {**source.tags(), **source.tags(ns="EXIF")}

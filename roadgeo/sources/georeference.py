@@ -15,6 +15,7 @@ from roadgeo.errors import CrsError, MaskError
 from roadgeo.geometry.frame import Frame
 from roadgeo.geometry.homography import Homography
 from roadgeo.geometry.projection import LocalPlane, to_lonlat, transformer
+from roadgeo.storage.orientation import read_orientation, stored_from_upright
 from roadgeo.storage.rasters import open_raster
 
 if TYPE_CHECKING:
@@ -84,6 +85,12 @@ class Georeference:
         matrix = _fit(pixels, xy, projective=self.source == "control points")
         return Georeference(matrix, self.crs, self.size, self.source)
 
+    def of_stored(self, path: str | os.PathLike[str]) -> Georeference:
+        """Return the same for the pixels of the raster's file as they are stored (see `storage.orientation`)."""
+        turned = stored_from_upright(read_orientation(path), self.size)
+        size = self.size if abs(turned[0, 0]) > 0.5 else self.size[::-1]
+        return Georeference(self.matrix @ np.linalg.inv(turned), self.crs, size, self.source)
+
     def control_points(self) -> tuple[FloatArray, FloatArray]:
         """Return (25, 2) pixel positions all over the raster and where they lie in its CRS."""
         pixels = self._grid()
@@ -118,6 +125,8 @@ def read_georeference(path: str | os.PathLike[str], crs: str | None = None) -> G
     source, matrix = found or ("world file", _of_world_file(Path(path)))
     if matrix is None:
         return None
+    if found is None:  # a world file speaks of pixels as they are stored
+        matrix = matrix @ stored_from_upright(read_orientation(path), size)
     if own is None:
         raise CrsError(f"{os.fspath(path)}: its {source} names no CRS; give it with --crs EPSG:n")
     if not np.isfinite(matrix).all() or abs(np.linalg.det(matrix[:2, :2])) < 1e-20:

@@ -23,6 +23,7 @@ from roadgeo.roads.observed import find_voids
 from roadgeo.roads.vectorization import road_width
 from roadgeo.sources.thresholds import Sample, find_thresholds, ground_and_road
 from roadgeo.storage.gdal import is_named_remote
+from roadgeo.storage.orientation import read_orientation, turn_upright
 from roadgeo.storage.rasters import MAX_SIDE as MAX_RASTER_SIDE
 from roadgeo.storage.rasters import image_size, open_raster, read_palette, require_file, sidecar_nodata
 from roadgeo.storage.silence import silenced
@@ -329,7 +330,7 @@ def _open(source: str | os.PathLike[str] | AnyArray, band: int | None, name: str
 
 
 def _read_with_opencv(path: str, name: str) -> AnyArray | None:
-    """Decode a PNG, JPEG or BMP without side files as it is stored; None where GDAL has to, or can in less memory."""
+    """Decode a PNG, JPEG or BMP without side files; None where GDAL has to, or can in less memory."""
     size = image_size(Path(path))
     if size is not None:
         _require_size(name, size[1], size[0], MAX_RASTER_SIDE)
@@ -342,10 +343,10 @@ def _read_with_opencv(path: str, name: str) -> AnyArray | None:
     image = None
     if not is_png or _is_whole_png(content.data):
         with contextlib.suppress(cv2.error), silenced():
-            image = cv2.imdecode(content, cv2.IMREAD_UNCHANGED)
+            image = cv2.imdecode(content, cv2.IMREAD_UNCHANGED)  # as it is stored
     if is_png and image is None:  # GDAL would read the rest as black
         raise MaskError(f"{name}: a PNG that is damaged or cut short; copy or export it again")
-    return image
+    return None if image is None else np.ascontiguousarray(turn_upright(image, read_orientation(path)))
 
 
 def _is_whole_png(content: memoryview) -> bool:

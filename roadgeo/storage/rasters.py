@@ -2,7 +2,8 @@
 
 The driver follows from the file's first bytes and is the only one that GDAL may use. What lies beside the file, its
 overviews elsewhere, and the network are left alone (`storage.gdal`). A GDAL virtual raster names other files, and is
-opened only where the user allows it. Rasterio is imported only here and late: it takes longer than to read a mask.
+opened only where the user allows it. Pictures that are to be turned are turned here (`storage.orientation`).
+Rasterio is imported only here and late: it takes longer than to read a mask.
 """
 
 from __future__ import annotations
@@ -22,11 +23,21 @@ import numpy as np
 from roadgeo._arrays import AnyArray
 from roadgeo.errors import MaskError, OutputError
 from roadgeo.storage.gdal import CONSENT, NETWORK, SEALED, allowed_drivers, is_named_remote
+from roadgeo.storage.orientation import UPRIGHT, read_orientation, stored_from_upright, turn_upright
 
 if TYPE_CHECKING:
     from rasterio import DatasetReader
 
-__all__ = ["MAX_SIDE", "image_size", "open_raster", "read_palette", "require_file", "sidecar_nodata", "writing_raster"]
+__all__ = [
+    "MAX_SIDE",
+    "image_size",
+    "open_raster",
+    "raster_size",
+    "read_palette",
+    "require_file",
+    "sidecar_nodata",
+    "writing_raster",
+]
 
 #: Pixels, of the largest raster that anything is read of: a photograph.
 MAX_SIDE = 60_000
@@ -49,6 +60,7 @@ _NAMES = "GeoTIFF, PNG, JPEG, JPEG 2000, WebP, BMP, PNM, GIF, Erdas Imagine"
 #: A block is decoded whole: more than this for one is a bomb, or should be tiled.
 _MAX_BLOCK_BYTES = 2 << 30
 _MAX_SIDECAR = 1 << 20
+_MAX_TURNED_BYTES = 1 << 30  # of a decoded picture, which is kept in memory
 _CACHE_BYTES = 256 << 20  # of decoded blocks; GDAL's own is a twentieth of the machine's memory
 _HEAD_BYTES = 8192
 _BOXES_OF_BOXES = (b"jp2h", b"res ", b"asoc", b"jpch", b"jplh")  # of JPEG 2000
@@ -56,11 +68,12 @@ _BOXES_OF_BOXES = (b"jp2h", b"res ", b"asoc", b"jpch", b"jplh")  # of JPEG 2000
 
 @contextmanager
 def open_raster(
-    path: str | os.PathLike[str], name: str | None = None, *, is_ours: bool = False
+    path: str | os.PathLike[str], name: str | None = None, *, is_ours: bool = False, upright: bool = True
 ) -> Iterator[DatasetReader]:
     """Open a raster that may lack a georeference; what goes wrong while it is open is told in the same way.
 
-    What is written meanwhile is written in `writing_raster`.
+    One that is to be turned (see `storage.orientation`) is turned, and its georeference with it: in memory, by another
+    driver. What is written meanwhile is written in `writing_raster`.
 
     Parameters
     ----------
@@ -70,11 +83,14 @@ def open_raster(
         What messages call it.
     is_ours : bool
         We wrote it just now: it may be a virtual raster.
+    upright : bool
+        False: as it is stored.
 
     Raises
     ------
     MaskError
-        It is missing, no regular file, of a format that is not read, damaged, or refers to other files.
+        It is missing, no regular file, of a format that is not read, damaged, too large to be turned, or refers to
+        other files.
     """
     from rasterio._err import CPLE_BaseError
     from rasterio.errors import NotGeoreferencedWarning, RasterioError
@@ -95,7 +111,12 @@ def open_raster(
             # Absolute, for a name may look like the text of a virtual raster, which GDAL takes in place of a path.
             with _opened(os.fspath(path) if remote else str(Path(path).absolute()), drivers, remote) as dataset:
                 _require_plain(dataset, name)
-                yield dataset
+                orientation = _orientation(dataset, path, remote) if upright else UPRIGHT
+                if orientation == UPRIGHT:
+                    yield dataset
+                else:
+                    with _turned(dataset, orientation, name) as turned:
+                        yield turned
         except UnicodeEncodeError as error:
             raise MaskError(f"{name}: its name is no text, GDAL does not take it; rename it") from error
         except UnicodeDecodeError as error:
@@ -103,6 +124,20 @@ def open_raster(
         except (RasterioError, CPLE_BaseError) as error:
             reason = " ".join(str(error.__cause__ or error).split())[:300]  # libtiff's own words, where it has some
             raise MaskError(f"{name}: not a raster that can be read ({reason}); give an image or GeoTIFF") from error
+
+
+def raster_size(path: str | os.PathLike[str]) -> tuple[int, int]:
+    """Return (width, height) of an upright raster, without turning it.
+
+    Raises
+    ------
+    MaskError
+        As of `open_raster`.
+    """
+    with open_raster(path, upright=False) as dataset:
+        orientation = _orientation(dataset, path, is_named_remote(path))
+        width, height = dataset.width, dataset.height
+    return (width, height) if orientation < 5 else (height, width)
 
 
 @contextmanager
@@ -255,6 +290,53 @@ def _opened(path: str, drivers: list[str], remote: bool) -> Iterator[DatasetRead
             with dataset:
                 yield dataset
             return
+
+
+def _orientation(dataset: DatasetReader, path: str | os.PathLike[str], remote: bool) -> int:
+    """Return how a raster is to be turned; of a remote one only GDAL tells, of JPEGs alone."""
+    if not remote:
+        return read_orientation(path)
+    told = dataset.tags().get("EXIF_Orientation", "")
+    return int(told) if told in list("12345678") else UPRIGHT
+
+
+@contextmanager
+def _turned(dataset: DatasetReader, orientation: int, name: str) -> Iterator[DatasetReader]:
+    """Make an upright copy of a raster in memory, with all that it says of itself."""
+    import rasterio
+    from rasterio.control import GroundControlPoint
+    from rasterio.enums import ColorInterp, MaskFlags
+
+    size = dataset.count * dataset.width * dataset.height * max(np.dtype(kind).itemsize for kind in dataset.dtypes)
+    if size > _MAX_TURNED_BYTES:
+        raise MaskError(
+            f"{name}: is to be turned (its orientation is {orientation}), and too large for that, {size / 1e9:.1f} GB: "
+            "save it upright"
+        )
+    height, width = dataset.shape if orientation < 5 else dataset.shape[::-1]
+    matrix = stored_from_upright(orientation, (width, height))
+    profile = {"count": dataset.count, "dtype": np.result_type(*dataset.dtypes), "nodata": dataset.nodata}
+    with rasterio.open("", "w+", driver="MEM", width=width, height=height, **profile) as copy:
+        for band in dataset.indexes:
+            copy.write(turn_upright(dataset.read(band), orientation), band)
+        copy.colorinterp, copy.descriptions = dataset.colorinterp, dataset.descriptions
+        if dataset.colorinterp[0] == ColorInterp.palette:
+            copy.write_colormap(1, dataset.colormap(1))
+        if dataset.mask_flag_enums[0] == [MaskFlags.per_dataset]:
+            copy.write_mask(turn_upright(dataset.read_masks(1), orientation) > 0)
+        for namespace in (None, "EXIF", "xml:XMP"):
+            tags = {key: value for key, value in dataset.tags(ns=namespace).items() if key != "EXIF_Orientation"}
+            copy.update_tags(ns=namespace, **tags)
+        points, crs = dataset.gcps
+        if points:
+            there = (np.array([(p.col, p.row, 1.0) for p in points]) @ np.linalg.inv(matrix).T).tolist()
+            turned = [GroundControlPoint(q[1], q[0], p.x, p.y, p.z) for p, q in zip(points, there, strict=True)]
+            copy.gcps = turned, crs
+        placed = np.array(dataset.transform, float).reshape(3, 3) @ matrix
+        copy.transform = rasterio.Affine(*(np.eye(3) if dataset.transform.is_identity else placed)[:2].ravel())
+        if dataset.crs:
+            copy.crs = dataset.crs
+        yield copy
 
 
 def _require_plain(dataset: DatasetReader, name: str) -> None:

@@ -12,6 +12,7 @@ import numpy as np
 import pyproj
 import pytest
 import rasterio
+from worlds.turned import mark_turned
 
 from roadgeo.cli import main
 from roadgeo.evaluation.demo import ATTRIBUTION, ROADS, demo_masks
@@ -134,6 +135,18 @@ def test_an_image_is_overwritten_only_where_that_is_asked_for(porto: Path, capfd
     assert main(["verify", "a.tif", "-r", str(porto), "--in-place", "-q"]) == 4
     assert main(["verify", "a.tif", "-r", str(porto)]) == 0
     assert "a.tif: agrees" in capfd.readouterr().out
+
+
+def test_a_raster_that_is_to_be_turned_lies_where_its_stored_pixels_do(porto: Path) -> None:
+    with rasterio.open(georeferenced("a.tif", 40, 10)) as raster:
+        before = np.array(raster.transform).reshape(3, 3)
+    mark_turned(Path("a.tif"), 3)
+    assert main(["verify", "a.tif", "-r", str(porto), "--fix", "--in-place", "-q", "-o", "."]) == 4
+    for name in ("a.tif", "a_fixed.tif"):
+        with rasterio.open(name) as raster:
+            moved = np.array(raster.transform).reshape(3, 3) - before
+        assert moved[:2, 2] == pytest.approx((-40.0, -10.0), abs=3.0)
+        assert main(["verify", name, "-r", str(porto), "-q"]) == 0
 
 
 def test_what_has_no_place_or_is_no_image_is_told_in_a_line(porto: Path, capfd: pytest.CaptureFixture[str]) -> None:

@@ -6,11 +6,14 @@ from pathlib import Path
 import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
+from worlds.turned import save_turned
 
 from roadgeo.cli import main
+from roadgeo.errors import OutputError
 from roadgeo.evaluation.demo import ATTRIBUTION, ROADS, demo_masks
 from roadgeo.geometry.homography import Homography
 from roadgeo.geometry.projection import LocalPlane, from_lonlat
+from roadgeo.running.applying import apply_location, read_location
 from roadgeo.sources.roads import read_roads
 from roadgeo.workflows import build_reference
 
@@ -68,6 +71,30 @@ def test_orthority_and_the_homography_see_the_same(folder: Path) -> None:
         ground = Homography(np.array(found["homography"]))(np.array(pixel))
         assert seen(camera, rotation, position, ground) == pytest.approx(pixel, abs=1.5)
     assert properties["focal_len"] == pytest.approx(camera["focal_px"] / 1280)
+
+
+@pytest.mark.parametrize("orientation", [3, 6, 8])
+def test_orthority_takes_a_picture_as_it_is_stored(folder: Path, tmp_path: Path, orientation: int) -> None:
+    photo = save_turned(tmp_path / "photo.jpg", np.zeros((960, 1280, 3), np.uint8), orientation)
+    apply_location(read_location(folder / "drone_location.json"), [str(photo)], tmp_path, products=("orthority",))
+    properties = json.loads((tmp_path / "photo_ext_param.geojson").read_text())["features"][0]["properties"]
+    size = (1280, 960) if orientation == 3 else (960, 1280)
+    assert tuple(properties["im_size"]) == size
+    rotation = Rotation.from_euler("XYZ", properties["opk"]).as_matrix()
+    found, camera = location(folder), location(folder)["camera"]
+    for column, row in ([0.0, 0.0], [1280.0, 0.0], [300.0, 900.0]):
+        xy = Homography(np.array(found["homography"]))(np.array([column, row]))
+        stored = {3: (1280 - column, 960 - row), 6: (row, 1280 - column), 8: (960 - row, column)}[orientation]
+        position = np.array(properties["xyz"]) - (0, 0, camera["altitude_m"] - camera["height_m"])
+        pixel = seen(camera, rotation, position, xy) - (640.0, 480.0) + np.array(size) / 2
+        assert pixel == pytest.approx(stored, abs=1.5)
+
+
+def test_no_camera_takes_a_mirrored_picture(folder: Path, tmp_path: Path) -> None:
+    photo = save_turned(tmp_path / "photo.jpg", np.zeros((960, 1280, 3), np.uint8), 2)
+    with pytest.raises(OutputError, match="stored mirrored"):
+        apply_location(read_location(folder / "drone_location.json"), [str(photo)], tmp_path, products=("orthority",))
+    assert [path.name for path in tmp_path.iterdir()] == ["photo.jpg"]
 
 
 def test_the_geopose_is_about_true_north(folder: Path) -> None:

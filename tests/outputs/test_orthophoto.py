@@ -7,6 +7,7 @@ import pytest
 import rasterio
 from outputs.test_location_files import located
 from rasterio.enums import ColorInterp
+from worlds.turned import save_turned
 
 from roadgeo.errors import CrsError, MaskError
 from roadgeo.geometry.homography import Homography
@@ -70,6 +71,28 @@ def test_every_pixel_shows_the_ground_where_it_lies(
     outside = ((expected < -0.01) | (expected > np.array([400, 300]) * scale + 0.01)).any(axis=-1)
     assert not shown[outside].any()
     assert shown[~outside & ((expected > 0.01) & (expected < np.array([400, 300]) * scale - 0.01)).all(axis=-1)].all()
+
+
+@pytest.mark.parametrize("orientation", range(1, 9))
+def test_a_picture_is_drawn_upright(tmp_path: Path, orientation: int) -> None:
+    picture = np.random.default_rng(4).integers(0, 256, (300, 400, 3)).astype(np.uint8)
+    drawn = []
+    for turn in (1, orientation):
+        source = save_turned(tmp_path / f"{turn}.png", picture, turn)
+        homography, size = image_homography(PLACE, MASK_SIZE, source)
+        assert size == (400, 300)
+        warp_image(source, tmp_path / f"{turn}.tif", PLACE, homography, {})
+        with rasterio.open(tmp_path / f"{turn}.tif") as raster:
+            drawn.append(raster.read())
+        np.testing.assert_array_equal(read_preview(source, 400)[..., :3], picture)
+    np.testing.assert_array_equal(*drawn)
+
+
+def test_a_mask_of_the_stored_pixels_is_told_so(tmp_path: Path) -> None:
+    source = save_turned(tmp_path / "photo.png", np.zeros((400, 300, 3), np.uint8), 6)
+    told = r"is 300 x 400 pixels, its mask 400 x 300: .*make the mask of the upright picture.* \(EXIF orientation 6\)"
+    with pytest.raises(MaskError, match=told):
+        image_homography(PLACE, MASK_SIZE, source)
 
 
 @pytest.mark.parametrize(

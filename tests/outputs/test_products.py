@@ -12,6 +12,7 @@ import pyproj
 import pytest
 import rasterio
 from outputs.test_location_files import located, road_mask
+from worlds.turned import save_turned
 
 from roadgeo.geometry.homography import Homography
 from roadgeo.location import Location
@@ -92,6 +93,46 @@ def test_control_points_for_opendronemap(written: OutputPaths) -> None:
     x, y, z, column, row = np.array([line.split()[:5] for line in rows], float).T
     assert (z == 0).all()
     np.testing.assert_allclose(np.stack([x, y], 1), photo_homography()(np.stack([column, row], 1)), atol=1e-6)
+
+
+#: From (column, row) of the pixels of a file of (width, height) to those of the upright picture.
+UPRIGHT = {
+    3: lambda pixel, size: size - pixel,
+    5: lambda pixel, size: pixel[:, ::-1],
+    6: lambda pixel, size: np.stack([size[1] - pixel[:, 1], pixel[:, 0]], 1),
+}
+
+
+@pytest.mark.parametrize("orientation", UPRIGHT)
+def test_programs_that_do_not_turn_pictures_get_points_of_the_stored_pixels(tmp_path: Path, orientation: int) -> None:
+    picture = np.random.default_rng(1).integers(0, 255, (600, 800, 3)).astype(np.uint8)
+    photo = save_turned(tmp_path / "photo.png", picture, orientation)
+    stored = cv2.imread(str(photo), cv2.IMREAD_UNCHANGED)[..., ::-1]
+    size = np.array(stored.shape[1::-1])
+    paths = output_paths(tmp_path, "mask")
+    products = ("gcps", "vrt", "points", "match-points", "odm", "matches", "iiif")
+    write_location(located(), road_mask(), paths, OutputOptions(products=products), photo)
+
+    def right(column_row: np.ndarray, xy: np.ndarray, atol: float = 1e-6) -> None:
+        upright = UPRIGHT[orientation](column_row, size)
+        np.testing.assert_allclose(photo_homography()(upright), xy, atol=atol)
+
+    for name in ("mask_gcps.tif", "mask_gcps.vrt"):
+        with open_raster(tmp_path / name, is_ours=True) as raster:
+            points, _ = raster.gcps
+            np.testing.assert_array_equal(np.moveaxis(raster.read(), 0, 2), stored)
+        right(np.array([(p.col, p.row) for p in points]), np.array([(p.x, p.y) for p in points]))
+    rows = np.array([line.split()[:5] for line in (tmp_path / "mask_gcp_list.txt").read_text().splitlines()[1:]], float)
+    right(rows[:, 3:5], rows[:, :2])
+    for name in ("photo.png.points", "photo.png_matches.points"):
+        rows = np.array([line.split(",") for line in (tmp_path / name).read_text().splitlines()[2:]], float)
+        fitted = rows[:, 2:4] + rows[:, 5:7]
+        right(fitted * (1, -1), rows[:, :2])
+    with (tmp_path / "mask_matches.csv").open(encoding="utf-8") as file:
+        pixels = [(float(row["column"]), float(row["row"])) for row in csv.DictReader(file)]
+    np.testing.assert_allclose(pixels, 2 * located().evidence.query_xy * (1, -1), atol=1e-6)  # of the upright picture
+    source = json.loads((tmp_path / "mask_iiif.json").read_text())["target"]["source"]
+    assert (source["width"], source["height"]) == (800, 600)
 
 
 def test_the_world_file_is_that_of_the_drawn_raster(written: OutputPaths) -> None:

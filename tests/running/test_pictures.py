@@ -7,8 +7,9 @@ import numpy as np
 import pytest
 import rasterio
 import xarray
-from PIL import Image
+from PIL import Image, ImageOps
 from rasterio.io import MemoryFile
+from worlds.turned import save_turned
 
 from roadgeo.errors import MaskError
 from roadgeo.running.pictures import read_picture
@@ -36,6 +37,16 @@ def test_a_dataset_that_is_a_file_is_that_file(tmp_path: Path) -> None:
         dataset.write(GREY, 1)
     with rasterio.open(path) as dataset:
         assert read_picture(dataset) == str(path)
+
+
+@pytest.mark.parametrize("orientation", range(1, 9))
+@pytest.mark.parametrize("kind", ["jpg", "png", "tif"])
+def test_a_picture_of_pil_is_turned_upright(tmp_path: Path, kind: str, orientation: int) -> None:
+    path = save_turned(tmp_path / f"a.{kind}", RGB, orientation)
+    for image in (Image.open(path), ImageOps.exif_transpose(Image.open(path))):
+        read = read_picture(image)
+        assert read.shape == RGB.shape
+        assert np.abs(read.astype(int) - RGB).mean() < (40 if kind == "jpg" else 1e-9)
 
 
 def paletted(**info: Any) -> Image.Image:

@@ -4,9 +4,11 @@ from pathlib import Path
 
 import cv2
 import numpy as np
+import PIL.Image
 import pytest
 import rasterio
 from rasterio.control import GroundControlPoint
+from worlds.turned import save_turned
 
 from roadgeo.errors import CrsError, MaskError
 from roadgeo.geometry.homography import Homography
@@ -72,6 +74,22 @@ def test_a_world_file_beside_a_picture_is_read(tmp_path: Path) -> None:
     (tmp_path / "scan.pgw").write_text("no numbers here")
     with pytest.raises(MaskError, match="six numbers"):
         read_georeference(path, "EPSG:32619")
+
+
+@pytest.mark.parametrize("orientation", [3, 6, 7])
+def test_a_world_file_speaks_of_stored_pixels(tmp_path: Path, orientation: int) -> None:
+    path = save_turned(tmp_path / "scan.png", np.zeros((60, 80), np.uint8), orientation)
+    with PIL.Image.open(path) as stored_picture:
+        width, height = stored_picture.size
+    (tmp_path / "scan.pgw").write_text("0.5\n0.1\n0.1\n-0.5\n330000.3\n4689999.8\n")
+    found = read_georeference(path, "EPSG:32619")
+    assert found is not None
+    assert found.size == (80, 60)
+    last = {3: (0, 0), 6: (width, 0), 7: (0, 0)}[orientation]  # of the file, where the upright picture ends below right
+    assert Homography(found.matrix)(np.array([80.0, 60.0])) == pytest.approx(at(PLACE, *last), abs=1e-6)
+    stored = found.of_stored(path)
+    assert stored.matrix == pytest.approx(np.array(PLACE).reshape(3, 3), abs=1e-9)
+    assert stored.size == (width, height)
 
 
 def test_a_place_without_an_area_is_refused(tmp_path: Path) -> None:

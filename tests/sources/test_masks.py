@@ -9,6 +9,7 @@ import numpy as np
 import pytest
 import rasterio
 from rasterio.errors import NotGeoreferencedWarning
+from worlds.turned import save_turned
 
 from roadgeo.errors import MaskError, PhotographError
 from roadgeo.sources.masks import open_mask, read_mask
@@ -178,6 +179,20 @@ def test_an_inverted_mask_is_read_and_said_so(roads: np.ndarray, caplog: pytest.
     assert "inverted" in caplog.text
     values = np.ma.masked_array((~roads).astype(np.uint8), np.arange(SHAPE[1]) >= 60 + np.zeros(SHAPE))
     np.testing.assert_array_equal(read_mask(values).roads, roads & ~values.mask)
+
+
+@pytest.mark.parametrize("orientation", range(2, 9))
+@pytest.mark.parametrize("kind", ["jpg", "png", "tif"])
+@pytest.mark.parametrize("is_large", [False, True])
+def test_masks_are_upright(
+    tmp_path: Path, roads: np.ndarray, kind: str, orientation: int, is_large: bool, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    if is_large:
+        monkeypatch.setattr("roadgeo.sources.masks._OPENCV_BYTES", 0)
+    path = save_turned(tmp_path / f"mask.{kind}", (255 * roads).astype(np.uint8)[:, :-9], orientation)
+    found = read_mask(path).roads
+    assert found.shape == roads[:, :-9].shape
+    assert np.mean(found != roads[:, :-9]) < 0.002
 
 
 def test_strips_join(tmp_path: Path, roads: np.ndarray, monkeypatch: pytest.MonkeyPatch) -> None:

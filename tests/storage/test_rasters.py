@@ -11,16 +11,19 @@ from pathlib import Path
 
 import cv2
 import numpy as np
+import PIL.Image
 import pytest
 import rasterio
+import rasterio.control
 from support.loopback import counting_server
+from worlds.turned import mark_turned, save_turned
 
 from roadgeo.errors import MaskError
 from roadgeo.outputs.orthophoto import read_preview
 from roadgeo.sources.exif import read_focal_length
 from roadgeo.sources.masks import read_mask
 from roadgeo.storage.gdal import CONSENT, skip_drivers
-from roadgeo.storage.rasters import image_size, open_raster
+from roadgeo.storage.rasters import image_size, open_raster, raster_size
 
 pytestmark = pytest.mark.filterwarnings("ignore::rasterio.errors.NotGeoreferencedWarning")
 
@@ -326,3 +329,71 @@ def test_names_are_no_text_for_gdal(tmp_path, roads, monkeypatch):
     assert read_mask(name).shape == roads.shape
     with open_raster(name) as raster:
         assert raster.driver == "GTiff"
+
+
+# --- pictures that are to be turned -----------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize("kind", ["jpg", "png", "tif", "webp"])
+@pytest.mark.parametrize("orientation", range(1, 9))
+def test_a_raster_is_upright(tmp_path: Path, roads: np.ndarray, kind: str, orientation: int) -> None:
+    picture = np.repeat(roads[:300, :200, None], 3, axis=2)
+    path = save_turned(tmp_path / f"photo.{kind}", picture, orientation)
+    with open_raster(path) as raster:
+        found = np.moveaxis(raster.read(), 0, 2)
+        assert (raster.width, raster.height) == raster_size(path) == (200, 300)
+        assert np.abs(found.astype(int) - picture).mean() < 2
+        part = raster.read([1, 3], window=((10, 60), (20, 180)), out_shape=(2, 25, 80))
+        assert np.abs(part[1].astype(int) - picture[10:60:2, 20:180:2, 2]).mean() < 60
+        assert "EXIF_Orientation" not in raster.tags() or orientation == 1
+    with open_raster(path, upright=False) as raster:
+        assert raster.shape == ((300, 200) if orientation < 5 else (200, 300))
+
+
+def test_a_georeference_is_turned_with_its_raster(tmp_path: Path, roads: np.ndarray) -> None:
+    stored = roads[:300, :200]
+    transform = rasterio.Affine(2.0, 0.0, 500_000.0, 0.0, -2.0, 4_600_000.0)
+    place = {"transform": transform, "crs": "EPSG:32629", "nodata": 7}
+    path = mark_turned(write_tiff(tmp_path / "map.tif", stored, **place), 6)
+    with open_raster(path) as raster:
+        assert (raster.width, raster.height, raster.nodata, raster.crs.to_epsg()) == (300, 200, 7, 32629)
+        column, row = 120, 30
+        np.testing.assert_array_equal(raster.read(1), np.rot90(stored, -1))
+        there = np.array(raster.transform).reshape(3, 3) @ (column + 0.5, row + 0.5, 1.0)
+    back = np.linalg.inv(np.array(transform).reshape(3, 3)) @ there
+    assert back[:2] == pytest.approx((row + 0.5, 300 - column - 0.5))
+
+
+def test_what_a_raster_says_of_itself_is_kept_where_it_is_turned(tmp_path: Path) -> None:
+    rng = np.random.default_rng(0)
+    rgba = rng.integers(0, 256, (40, 60, 4)).astype(np.uint8)
+    with open_raster(save_turned(tmp_path / "alpha.png", rgba, 5)) as raster:
+        assert [one.name for one in raster.colorinterp] == ["red", "green", "blue", "alpha"]
+        np.testing.assert_array_equal(raster.dataset_mask(), np.where(rgba[..., 3] > 0, rgba[..., 3], 0))
+    classes = PIL.Image.fromarray(rng.integers(0, 3, (40, 60)).astype(np.uint8), "P")
+    classes.putpalette([0, 0, 0, 250, 10, 10, 20, 30, 240])
+    exif = PIL.Image.Exif()
+    exif[274] = 3
+    classes.save(tmp_path / "palette.png", exif=exif.tobytes())
+    with open_raster(tmp_path / "palette.png") as raster:
+        assert raster.colormap(1)[1][:3] == (250, 10, 10)
+        np.testing.assert_array_equal(raster.read(1), np.asarray(classes)[::-1, ::-1])
+
+
+def test_control_points_are_turned(tmp_path: Path, roads: np.ndarray) -> None:
+    points = [rasterio.control.GroundControlPoint(r, c, 10.0 * c, -10.0 * r) for r in (0, 90) for c in (5, 100)]
+    path = mark_turned(write_tiff(tmp_path / "points.tif", roads[:100, :120], gcps=points, crs="EPSG:32629"), 3)
+    with open_raster(path) as raster:
+        found, crs = raster.gcps
+    assert crs.to_epsg() == 32629
+    for before, after in zip(points, found, strict=True):
+        assert (after.x, after.y) == (before.x, before.y)
+        assert (after.col, after.row) == (120 - before.col, 100 - before.row)
+
+
+def test_what_is_too_large_to_be_turned_is_said(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    path = save_turned(tmp_path / "large.png", np.zeros((100, 200, 3), np.uint8), 8)
+    monkeypatch.setattr("roadgeo.storage.rasters._MAX_TURNED_BYTES", 1000)
+    told = r"its orientation is 8.* too large for that.*: save it upright"
+    with pytest.raises(MaskError, match=told), open_raster(path):
+        pass

@@ -5,10 +5,9 @@ Memory holds two frames at a time. How a frame moved is taken from a file, or to
 
 from __future__ import annotations
 
-import os
 import tempfile
 from collections.abc import Iterator, Mapping, Sequence
-from contextlib import ExitStack
+from contextlib import ExitStack, suppress
 from dataclasses import dataclass, field, replace
 from functools import lru_cache
 from pathlib import Path
@@ -172,20 +171,24 @@ def _read(image: _Image, options: FrameOptions, last: _Last) -> tuple[RoadMask, 
             return blank, None
         else:
             return mask, None
-    grey = cv2.imread(image.path, cv2.IMREAD_GRAYSCALE)
-    return _segment(image, options, last), grey
+    return _segment(image, options, last)
 
 
 def _blank(image: _Image) -> RoadMask | None:
     """Return a mask without any road, which a flight may hold, though nobody can locate it; None if it is none."""
-    values = cv2.imread(os.fspath(image.path), cv2.IMREAD_UNCHANGED)
-    if values is None or values.ndim != 2 or values.any():
-        return None
-    return RoadMask(np.zeros(values.shape, np.bool_), name=image.name)
+    from roadgeo.storage.rasters import open_raster
+
+    with suppress(MaskError), open_raster(image.path) as raster:
+        if raster.count == 1 and not raster.read(1).any():
+            return RoadMask(np.zeros(raster.shape, np.bool_), name=image.name)
+    return None
 
 
-def _segment(image: _Image, options: FrameOptions, last: _Last) -> RoadMask:
-    """Find the roads in a photograph, at the scale that its pixels have, or that served the first one best."""
+def _segment(image: _Image, options: FrameOptions, last: _Last) -> tuple[RoadMask, AnyArray]:
+    """Find the roads in a photograph, at the scale that its pixels have, or that served the first one best.
+
+    Also returns the photograph in grey.
+    """
     from roadgeo.sources.segmentation.photograph import open_photograph
     from roadgeo.sources.segmentation.scales import rank_scales, scale_of
     from roadgeo.sources.segmentation.tiling import segment
@@ -200,12 +203,14 @@ def _segment(image: _Image, options: FrameOptions, last: _Last) -> RoadMask:
                 else scale_of(float(np.sqrt(np.prod(known))), network)
             )
             last.scale["scale"] = scale
-        seen = segment(photograph, network, last.scale["scale"]).resized((photograph.height, photograph.width))
+        shape = photograph.height, photograph.width
+        seen = segment(photograph, network, last.scale["scale"]).resized(shape)
+        rgb, _ = photograph.read(0.0, 0.0, float(photograph.width), float(photograph.height), shape)
     try:
         mask = seen.mask(seen.threshold if options.threshold is None else options.threshold)
     except MaskError:
-        mask = RoadMask(np.zeros((photograph.height, photograph.width), np.bool_))
-    return replace(mask, name=image.name)
+        mask = RoadMask(np.zeros(shape, np.bool_))
+    return replace(mask, name=image.name), np.asarray(cv2.cvtColor(rgb, cv2.COLOR_RGB2GRAY))
 
 
 @lru_cache(maxsize=1)

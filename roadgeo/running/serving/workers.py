@@ -350,13 +350,10 @@ def _locate(asked: Asked, references: Sequence[Any], say: Say = say_nothing) -> 
 
 def _size(path: str) -> tuple[int, int]:
     """Return (width, height) of an image without unpacking it."""
-    from roadgeo.storage.rasters import image_size, open_raster
+    from roadgeo.storage.rasters import image_size, raster_size
 
     told = image_size(Path(path))
-    if told is not None:
-        return told[0], told[1]
-    with open_raster(path) as dataset:
-        return int(dataset.width), int(dataset.height)
+    return raster_size(path) if told is None else told[:2]
 
 
 def _without(path: str, message: str) -> str:

@@ -8,6 +8,7 @@ import numpy as np
 import pytest
 from running.flights.test_motion import MOTION, gap, seen, streets
 from worlds.models import brightness_model
+from worlds.turned import save_turned
 
 from roadgeo.errors import MaskError, PhotographError
 from roadgeo.evaluation.demo import PHOTO
@@ -63,6 +64,21 @@ def test_stills_keep_their_picture(model: FrameOptions, photographs: list[str], 
     (_, grey), (_, none) = read_stills([photographs[0], str(tmp_path / "mask.png")], model)
     assert np.array_equal(grey, cv2.imread(photographs[0], cv2.IMREAD_GRAYSCALE))
     assert none is None
+
+
+@pytest.mark.parametrize("kind", ["png", "tif"])
+def test_frames_are_upright(model: FrameOptions, photographs: list[str], tmp_path: Path, kind: str) -> None:
+    turned = [
+        str(save_turned(tmp_path / f"{name}.{kind}", cv2.imread(path)[..., ::-1].copy(), orientation))
+        for name, path, orientation in zip("ab", photographs, (6, 3), strict=True)
+    ]
+    blank = save_turned(tmp_path / f"blank.{kind}", np.zeros((300, 400), np.uint8), 8)
+    first, second, third = read_frames([*turned, str(blank)], model)
+    for frame, path in zip((first, second), photographs, strict=True):
+        (expected,) = read_frames([path], model)
+        np.testing.assert_array_equal(frame.mask.roads, expected.mask.roads)
+    assert gap(second.motion, shift(40.0, 24.0)) < 1.0
+    assert third.mask.shape == (300, 400)
 
 
 def test_photographs_are_refused_where_masks_are_meant(photographs: list[str]) -> None:

@@ -1,0 +1,130 @@
+"""How a picture's file says that it is to be turned: the Orientation tag of EXIF and TIFF.
+
+Viewers, browsers, PIL's `exif_transpose` and `cv2.imread` show a picture upright; GDAL and QGIS show it as stored.
+Here pictures are upright, from `storage.rasters` on; what is written for programs that do not turn them says so.
+https://www.cipa.jp/std/documents/e/DC-008-Translation-2019-E.pdf, 4.6.4, and TIFF 6.0, section 8.
+"""
+
+from __future__ import annotations
+
+import os
+import struct
+from typing import BinaryIO
+
+import numpy as np
+
+from roadgeo._arrays import AnyArray, FloatArray
+
+__all__ = ["UPRIGHT", "read_orientation", "stored_from_upright", "turn_upright"]
+
+UPRIGHT = 1
+
+_TAG, _SHORT = 274, 3
+_MAX_ENTRIES = 1 << 12  # of an IFD
+_MAX_PARTS = 1 << 12  # segments or chunks before the one that holds EXIF
+
+#: What makes a stored picture upright, in this order: rows become columns, rows are taken from the bottom, columns from
+#: the right.
+_STEPS = {
+    1: (False, False, False),
+    2: (False, False, True),
+    3: (False, True, True),
+    4: (False, True, False),
+    5: (True, False, False),
+    6: (True, False, True),
+    7: (True, True, True),
+    8: (True, True, False),
+}
+
+
+def read_orientation(path: str | os.PathLike[str]) -> int:
+    """Return what a JPEG, TIFF, PNG or WebP says of its orientation, 1 to 8; 1, upright, where it says nothing."""
+    try:
+        with open(path, "rb") as file:  # noqa: PTH123 (names may hold what Path refuses)
+            found = _read(file, file.read(12))
+    except (OSError, ValueError, struct.error):
+        return UPRIGHT
+    return found if found in _STEPS else UPRIGHT
+
+
+def turn_upright(array: AnyArray, orientation: int) -> AnyArray:
+    """Return a stored (H, W) or (H, W, bands) array as an upright picture shows it; a view."""
+    transposed, from_bottom, from_right = _STEPS[orientation]
+    turned = np.swapaxes(array, 0, 1) if transposed else array
+    return turned[:: -1 if from_bottom else 1, :: -1 if from_right else 1]
+
+
+def stored_from_upright(orientation: int, size: tuple[int, int]) -> FloatArray:
+    """Return the (3, 3) matrix from pixels of an upright picture of (width, height) to those that are stored.
+
+    Pixel = (column, row), the corner of the first pixel is (0, 0) in both.
+    """
+    transposed, from_bottom, from_right = _STEPS[orientation]
+    width, height = size
+    flipped = np.array(
+        [
+            [-1.0 if from_right else 1.0, 0.0, width if from_right else 0.0],
+            [0.0, -1.0 if from_bottom else 1.0, height if from_bottom else 0.0],
+            [0.0, 0.0, 1.0],
+        ]
+    )
+    return flipped[[1, 0, 2]] if transposed else flipped
+
+
+def _read(file: BinaryIO, head: bytes) -> int:
+    """Find the IFD of TIFF or EXIF in a file of known first bytes, and read its entry."""
+    if head[:4] in (b"II*\0", b"MM\0*", b"II+\0", b"MM\0+"):
+        return _of_tiff(file, 0)
+    if head.startswith(b"\xff\xd8"):
+        return _of_jpeg(file)
+    if head.startswith(b"\x89PNG"):
+        return _of_chunks(file, 8, ">I4s", b"eXIf")
+    if head.startswith(b"RIFF") and head[8:] == b"WEBP":
+        return _of_chunks(file, 12, "<4sI", b"EXIF")
+    return UPRIGHT
+
+
+def _of_jpeg(file: BinaryIO) -> int:
+    """Walk the segments of a JPEG to the one that holds EXIF (APP1)."""
+    at = 2
+    for _ in range(_MAX_PARTS):
+        file.seek(at)
+        fill, marker, size = struct.unpack(">BBH", file.read(4))
+        if fill != 0xFF or marker in (0xD9, 0xDA):
+            break
+        if marker == 0xE1 and file.read(6) == b"Exif\0\0":
+            return _of_tiff(file, at + 10)
+        at += 2 + size
+    return UPRIGHT
+
+
+def _of_chunks(file: BinaryIO, at: int, layout: str, wanted: bytes) -> int:
+    """Walk the chunks of a PNG or WebP to the one that holds EXIF."""
+    is_png = layout.startswith(">")
+    for _ in range(_MAX_PARTS):
+        file.seek(at)
+        size, kind = struct.unpack(layout, file.read(8))[:: 1 if is_png else -1]
+        if kind == wanted:
+            starts_late = file.read(6) == b"Exif\0\0"
+            return _of_tiff(file, at + (14 if starts_late else 8))
+        at += 8 + size + (4 if is_png else size % 2)
+    return UPRIGHT
+
+
+def _of_tiff(file: BinaryIO, start: int) -> int:
+    """Read the entry in the first directory of a TIFF, or BigTIFF, that begins at `start`."""
+    file.seek(start)
+    head = file.read(16)
+    order = "<" if head.startswith(b"II") else ">"
+    is_big = struct.unpack(order + "H", head[2:4])[0] == 43
+    offset = struct.unpack(order + ("Q" if is_big else "I"), head[8:16] if is_big else head[4:8])[0]
+    file.seek(start + offset)
+    n_entries = struct.unpack(order + ("Q" if is_big else "H"), file.read(8 if is_big else 2))[0]
+    length = 20 if is_big else 12
+    for _ in range(min(n_entries, _MAX_ENTRIES)):
+        entry = file.read(length)
+        tag, kind = struct.unpack(order + "HH", entry[:4])
+        if tag == _TAG:
+            value: int = struct.unpack(order + "H", entry[12:14] if is_big else entry[8:10])[0]
+            return value if kind == _SHORT else UPRIGHT
+    return UPRIGHT
