@@ -14,6 +14,7 @@ import numpy as np
 
 from roadgeo._arrays import FloatArray
 from roadgeo.errors import CrsError
+from roadgeo.storage.crs import known_crs
 
 if TYPE_CHECKING:
     from pyproj import Transformer
@@ -114,9 +115,9 @@ def serves_as_plane(crs: str, lonlat: FloatArray) -> bool:
 
     Web Mercator fails by its scale, an equal-area CRS away from its middle by its angles, a CRS in feet by its unit.
     """
-    from pyproj import CRS, Geod
+    from pyproj import Geod
 
-    known = CRS.from_user_input(crs)
+    known = known_crs(crs)
     axes = {(axis.direction, axis.unit_name) for axis in known.axis_info[:2]}
     if not known.is_projected or axes != {("east", "metre"), ("north", "metre")}:
         return False
@@ -193,7 +194,7 @@ def transformer(source: str, target: str) -> Transformer:
     from pyproj.exceptions import ProjError
 
     try:
-        return Transformer.from_crs(source, target, always_xy=True)
+        return Transformer.from_crs(known_crs(source), known_crs(target), always_xy=True)
     except ProjError as error:
         raise CrsError(f"no way from {_short(source)} to {_short(target)}: {error}") from error
 

@@ -16,6 +16,7 @@ import numpy as np
 
 from roadgeo.geometry.projection import to_lonlat
 from roadgeo.outputs.subject import Subject
+from roadgeo.storage.crs import known_crs
 
 __all__ = ["write_gcps", "write_match_points", "write_matches", "write_odm", "write_points", "write_vrt"]
 
@@ -39,7 +40,6 @@ def write_gcps(path: Path, subject: Subject) -> None:
 
 def write_vrt(path: Path, subject: Subject) -> None:
     """Write the control points as a GDAL virtual raster, which refers to the picture where it lies."""
-    import pyproj
     import rasterio.shutil
 
     from roadgeo.storage.rasters import open_raster, writing_raster
@@ -54,7 +54,7 @@ def write_vrt(path: Path, subject: Subject) -> None:
     for name in ("SRS", "GeoTransform", "GCPList"):
         for element in root.findall(name):
             root.remove(element)
-    wkt = pyproj.CRS.from_user_input(subject.place.crs).to_wkt("WKT1_GDAL")
+    wkt = known_crs(subject.place.crs).to_wkt("WKT1_GDAL")
     points = ET.Element("GCPList", Projection=wkt)
     for i, (column, row, x, y) in enumerate(subject.stored_control_points()):
         where = {"Id": str(i + 1), "Pixel": repr(column), "Line": repr(row), "X": repr(x), "Y": repr(y)}
@@ -74,9 +74,7 @@ def _from_here(picture: Path, path: Path) -> tuple[str, str]:
 
 def write_points(path: Path, subject: Subject) -> None:
     """Write control points for the QGIS Georeferencer, whose projective transformation reproduces the homography."""
-    import pyproj
-
-    wkt = pyproj.CRS.from_user_input(subject.place.crs).to_wkt()
+    wkt = known_crs(subject.place.crs).to_wkt()
     lines = [f"#CRS: {wkt}", "mapX,mapY,sourceX,sourceY,enable,dX,dY,residual"]
     # QGIS places a picture without georeference below the x axis.
     lines += [f"{x!r},{y!r},{column!r},{-row!r},1,0,0,0" for column, row, x, y in subject.stored_control_points()]
@@ -85,9 +83,7 @@ def write_points(path: Path, subject: Subject) -> None:
 
 def write_match_points(path: Path, subject: Subject) -> None:
     """Write the matched intersections for the QGIS Georeferencer: what was measured, where `write_points` is exact."""
-    import pyproj
-
-    wkt = pyproj.CRS.from_user_input(subject.place.crs).to_wkt()
+    wkt = known_crs(subject.place.crs).to_wkt()
     lines = [f"#CRS: {wkt}", "mapX,mapY,sourceX,sourceY,enable,dX,dY,residual"]
     for one in subject.matches():
         pixels = np.array([[one.column, one.row], [one.fitted_column, one.fitted_row]])
@@ -127,8 +123,6 @@ def _odm_crs(crs: str) -> str:
     """Return a CRS as OpenDroneMap reads it: an EPSG code, else a PROJ string, for it knows no WKT."""
     import warnings
 
-    import pyproj
-
     with warnings.catch_warnings():
         warnings.simplefilter("ignore")  # a PROJ string lacks names; of our own planes nothing else
-        return crs if crs.upper().startswith("EPSG:") else str(pyproj.CRS.from_user_input(crs).to_proj4())
+        return crs if crs.upper().startswith("EPSG:") else str(known_crs(crs).to_proj4())

@@ -21,6 +21,7 @@ import numpy as np
 from roadgeo._text import visible
 from roadgeo.errors import OutputError
 from roadgeo.outputs.names import bare_names, without_folders
+from roadgeo.storage.crs import known_crs
 from roadgeo.storage.files import replacing, write_text
 
 if TYPE_CHECKING:
@@ -103,9 +104,7 @@ def _plain(name: str) -> str:
 
 def write_points(path: Path, place: Georeference) -> None:
     """Write 25 control points of a corrected place, for the QGIS Georeferencer."""
-    import pyproj
-
-    rows = [f"#CRS: {pyproj.CRS.from_user_input(place.crs).to_wkt()}"]
+    rows = [f"#CRS: {known_crs(place.crs).to_wkt()}"]
     rows.append("mapX,mapY,sourceX,sourceY,enable,dX,dY,residual")
     for (column, row), (x, y) in zip(*(array.tolist() for array in place.control_points()), strict=True):
         rows.append(f"{x!r},{y!r},{column!r},{-row!r},1,0,0,0")

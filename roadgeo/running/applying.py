@@ -19,6 +19,7 @@ from roadgeo.outputs.orthophoto import ImageOptions
 from roadgeo.outputs.paths import output_paths
 from roadgeo.outputs.registry import FOOTPRINT, MATCH_POINTS, MATCHES, Output, find_outputs
 from roadgeo.outputs.subject import Subject
+from roadgeo.storage.crs import known_crs
 from roadgeo.storage.files import replacing
 from roadgeo.storage.rasters import raster_size
 
@@ -97,7 +98,7 @@ def _crs(told: str) -> str:
     import pyproj
 
     try:
-        code = pyproj.CRS.from_user_input(told).to_epsg()
+        code = known_crs(told).to_epsg()
     except pyproj.exceptions.ProjError:
         raise ValueError(f"unknown CRS {told[:60]!r}") from None
     return told if code is None else f"EPSG:{code}"

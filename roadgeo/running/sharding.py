@@ -42,6 +42,7 @@ from roadgeo.sources.lines import RoadLines, list_sources
 from roadgeo.sources.roads import Box, as_text, choose_lines, join_roads, overruled_crs
 from roadgeo.sources.streams import stream_lines
 from roadgeo.storage.atomic import writing
+from roadgeo.storage.crs import known_crs
 from roadgeo.storage.files import write_bytes
 
 if TYPE_CHECKING:
@@ -274,9 +275,7 @@ def _labels(lines: RoadLines) -> Any:
 
 def _metres(crs: str) -> float | None:
     """Return the metres of a unit of a CRS; None for degrees."""
-    from pyproj import CRS
-
-    known = CRS.from_user_input(crs)
+    known = known_crs(crs)
     return float(known.axis_info[0].unit_conversion_factor) if known.is_projected else None
 
 

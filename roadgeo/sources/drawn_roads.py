@@ -16,6 +16,7 @@ import numpy as np
 from roadgeo._arrays import BoolArray, FloatArray, IntArray
 from roadgeo.errors import MaskError, RoadSourceError
 from roadgeo.geometry.mask import RoadMask
+from roadgeo.storage.crs import known_crs
 
 __all__ = ["ENDINGS", "Drawing", "Units", "draw_roads"]
 
@@ -99,9 +100,7 @@ def _tell_units(name: str, coords: FloatArray, crs: str | None) -> Literal["pixe
     """Tell what coordinates are by their CRS and size."""
     low, high = coords.min(axis=0), coords.max(axis=0)
     if crs is not None:
-        from pyproj import CRS
-
-        known = CRS.from_user_input(crs)
+        known = known_crs(crs)
         if not known.is_geographic:
             return "metres"
         fits = bool((np.abs(low) <= (180, 90)).all() and (np.abs(high) <= (180, 90)).all())

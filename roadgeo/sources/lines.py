@@ -17,8 +17,10 @@ import numpy as np
 from roadgeo._arrays import AnyArray, BoolArray
 from roadgeo.errors import RoadSourceError
 from roadgeo.roads.kinds import in_tunnel, names_highways
+from roadgeo.sources.crs_guard import refuse_named_files
 from roadgeo.sources.pbf import osm_head, osm_parts
 from roadgeo.sources.vectors import first_line, list_layers, read_layer, require_file
+from roadgeo.storage.crs import known_crs
 
 __all__ = [
     "COLUMNS",
@@ -276,6 +278,7 @@ def _read_graphml(path: Path) -> RoadLines:
     import networkx as nx
     import osmnx as ox
 
+    refuse_named_files(path)
     try:
         graph = ox.load_graphml(path)
         edges = ox.graph_to_gdfs(graph, nodes=False, fill_edge_geometry=True)
@@ -294,6 +297,7 @@ def _read_parquet(path: Path) -> RoadLines:
 
     try:
         names = pq.read_schema(path).names
+        refuse_named_files(path)
         require_rows(path)
         wanted = [name for name in (*COLUMNS, "subtype") if name in names]
         geometry = geometry_columns(path)
@@ -421,11 +425,10 @@ def crs_name(crs: Any) -> str | None:
     """Return a CRS as "EPSG:n" or WKT2; None where there is none, or one that is bound to no place on Earth."""
     if crs is None:
         return None
-    from pyproj import CRS
     from pyproj.exceptions import CRSError
 
     try:
-        known = CRS.from_user_input(crs)
+        known = known_crs(crs)
     except CRSError:
         return None
     known = known.to_2d() if len(known.axis_info) == 3 else known

@@ -18,6 +18,7 @@ from roadgeo.errors import CrsError, RoadSourceError
 from roadgeo.geometry.projection import LocalPlane, choose_plane, transformer
 from roadgeo.roads.kinds import RoadKind, drives
 from roadgeo.sources.lines import RoadLines, crs_name, list_sources, read_lines, simple_lines
+from roadgeo.storage.crs import known_crs
 
 if TYPE_CHECKING:
     from roadgeo.sources.overpass import FetchOptions
@@ -333,14 +334,12 @@ def _clip(lines: AnyArray, bbox: Box) -> tuple[AnyArray, AnyArray]:
 
 def overruled_crs(own: str | None, given: str, file: Path | str) -> str:
     """Return the CRS that was given, and warn where a file says another."""
-    from pyproj import CRS
-
     known = _known_crs(given)
-    if own is not None and not CRS(own).equals(CRS(known), ignore_axis_order=True):
+    if own is not None and not known_crs(own).equals(known_crs(known), ignore_axis_order=True):
         _LOG.warning(
             "%s: says that its CRS is %s; read as %s, as --crs asks. Leave --crs out if that is wrong",
             visible(str(file)),
-            CRS(own).name if len(own) > len("EPSG:123456") else own,
+            known_crs(own).name if len(own) > len("EPSG:123456") else own,
             given,
         )
     return known

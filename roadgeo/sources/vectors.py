@@ -21,6 +21,7 @@ from typing import NamedTuple
 
 from roadgeo._arrays import AnyArray
 from roadgeo.errors import RoadSourceError
+from roadgeo.sources.crs_guard import refuse_named_files
 from roadgeo.storage.gdal import CONSENT, NETWORK, allowed_drivers
 from roadgeo.storage.sqlite import opened, table_problem
 
@@ -126,6 +127,7 @@ def _guarded(path: Path) -> Iterator[Path]:
     from pyogrio.errors import CRSError, DataLayerError, DataSourceError
 
     require_file(path)
+    refuse_named_files(path)
     _refuse_links(path)
     _require_stored(path)
     try:

@@ -20,6 +20,7 @@ import numpy as np
 
 from roadgeo._arrays import AnyArray, FloatArray
 from roadgeo.errors import CrsError, IndexFormatError, OutputError
+from roadgeo.storage.crs import known_crs
 from roadgeo.storage.files import replacing
 from roadgeo.storage.geopackage_sql import NOW, RTREE_TRIGGERS, SCHEMA, STYLES_SCHEMA
 from roadgeo.storage.rtree import pack_rtree
@@ -239,7 +240,7 @@ def _describe_crs(crs: str) -> tuple[str, int | None, str]:
     import pyproj
 
     try:
-        parsed = pyproj.CRS.from_user_input(crs)
+        parsed = known_crs(crs)
         return parsed.name, parsed.to_epsg(), parsed.to_wkt("WKT1_GDAL")
     except pyproj.exceptions.CRSError as error:
         raise CrsError(f"unknown CRS {crs[:60]!r}; give an EPSG code such as EPSG:32619") from error

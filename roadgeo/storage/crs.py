@@ -1,0 +1,96 @@
+"""What PROJ may do with a CRS that a stranger's file tells: it opens no file but its own grids.
+
+A CRS may name grids to shift by (`+nadgrids=`, `PARAMETERFILE`, `EXTENSION["PROJ4_GRIDS", ...]`), or a file that
+defines it (`+init=`), by any path: PROJ then opens that, be it a pipe that nobody writes to. Names without folders are
+looked for among PROJ's own, and are allowed.
+"""
+
+from __future__ import annotations
+
+import json
+import re
+from collections.abc import Iterator
+from functools import lru_cache
+from typing import TYPE_CHECKING, Any
+
+from roadgeo.errors import CrsError
+
+if TYPE_CHECKING:
+    from pyproj import CRS
+
+__all__ = ["all_text", "known_crs", "named_file"]
+
+#: What PROJ's strings say behind a key that takes files, and what WKT and PROJJSON say of files.
+_KEYS = re.compile(r"(?:grids|file|model)\s*=\s*(\"[^\"]*|[^\s\"]*)", re.IGNORECASE)
+_INIT = re.compile(r"init\s*=\s*(\"[^\"]*|[^\s\"]*)", re.IGNORECASE)
+_JSON = re.compile(r'"value"\s*:\s*"((?:[^"\\]|\\.)*)"')
+_WKT = re.compile(
+    r'(?:PARAMETERFILE\s*[\[(]\s*"(?:[^"]|"")*"|EXTENSION\s*[\[(]\s*"PROJ4_GRIDS")\s*,\s*"((?:[^"]|"")*)"',
+    re.IGNORECASE,
+)
+
+
+def known_crs(crs: Any) -> CRS:
+    """Return a CRS as pyproj knows it, of whatever pyproj takes for one.
+
+    Raises
+    ------
+    CrsError
+        It names a file that is none of PROJ's own.
+    pyproj.exceptions.CRSError
+        It is none.
+    """
+    return _known(crs) if isinstance(crs, str) else _checked(crs)
+
+
+@lru_cache(maxsize=64)
+def _known(crs: str) -> CRS:
+    return _checked(crs)
+
+
+def _checked(crs: Any) -> CRS:
+    import pyproj
+
+    _refuse(crs if isinstance(crs, str) else json.dumps(crs, default=str), crs)
+    known = pyproj.CRS.from_user_input(crs)  # opens what `init` names; grids are opened on the way to another CRS
+    told = known.to_json_dict()
+    _refuse("\n".join(all_text(told)), crs)
+    for name in _parameter_files(told):
+        _refuse(f"grids={name}", crs)
+    return known
+
+
+def _refuse(text: str, crs: Any) -> None:
+    found = named_file(text)
+    if found:
+        raise CrsError(
+            f"the CRS {str(crs)[:60]!r} names the file {found[:60]!r}, which is not opened; expected a grid's name "
+            "without folders, which PROJ finds among its own"
+        )
+
+
+def named_file(text: str) -> str:
+    """Return the first file that a text in any language of CRS names, other than by a bare name; "" for none."""
+    named = [name.strip('"') for name in (*_KEYS.findall(text), *_WKT.findall(text), *_JSON.findall(text))]
+    defined = [name.strip('"').rsplit(":", 1)[0] for name in _INIT.findall(text)]
+    return next((name for name in (*named, *defined) if re.search(r"[/\\:]", name)), "")
+
+
+def all_text(value: Any) -> Iterator[str]:
+    """Yield all text in a value as JSON has them."""
+    if isinstance(value, str):
+        yield value
+    elif isinstance(value, dict | list):
+        for each in value.values() if isinstance(value, dict) else value:
+            yield from all_text(each)
+
+
+def _parameter_files(value: Any) -> Iterator[str]:
+    """Yield the text that is the value of a parameter in PROJJSON: of those it is the name of a file."""
+    if isinstance(value, dict):
+        if isinstance(value.get("value"), str):
+            yield value["value"]
+        value = list(value.values())
+    if isinstance(value, list):
+        for each in value:
+            yield from _parameter_files(each)
