@@ -14,6 +14,7 @@ from roadgeo._arrays import FloatArray
 from roadgeo.errors import OutputError
 from roadgeo.geometry.pose import omega_phi_kappa, quaternion, turned
 from roadgeo.location import Camera
+from roadgeo.outputs.names import name_for_odm
 from roadgeo.outputs.subject import Subject
 from roadgeo.storage.files import write_text
 
@@ -113,5 +114,7 @@ def _odm_lines(documents: Sequence[Mapping[str, Any]]) -> str:
         height = camera["height_m"] if altitude is None else altitude
         flat = math.hypot(sigma["x_m"], sigma["y_m"])
         position = f"{camera['lon']:.9f} {camera['lat']:.9f} {height:.3f}"
-        lines.append(f"{Path(document['query']).name} {position} 0 0 0 {flat:.3f} {sigma['height_m']:.3f}")
+        lines.append(
+            f"{name_for_odm(Path(document['query']).name)} {position} 0 0 0 {flat:.3f} {sigma['height_m']:.3f}"
+        )
     return "\n".join(lines) + "\n"

@@ -15,6 +15,7 @@ from tempfile import TemporaryDirectory
 import numpy as np
 
 from roadgeo.geometry.projection import to_lonlat
+from roadgeo.outputs.names import name_for_odm
 from roadgeo.outputs.subject import Subject
 from roadgeo.storage.crs import known_crs
 
@@ -114,7 +115,7 @@ def write_matches(path: Path, subject: Subject) -> None:
 def write_odm(path: Path, subject: Subject) -> None:
     """Write control points as OpenDroneMap's gcp_list.txt; the map knows no heights, so all are 0."""
     lines = [_odm_crs(subject.place.crs)]
-    name = subject.picture.name
+    name = name_for_odm(subject.picture.name)
     lines += [f"{x!r} {y!r} 0 {column!r} {row!r} {name}" for column, row, x, y in subject.stored_control_points()]
     path.write_text("\n".join(lines) + "\n", encoding="utf-8")
 

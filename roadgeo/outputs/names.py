@@ -5,13 +5,19 @@ Paths as they were typed stand in `*_location.json` alone, and on the terminal.
 
 from __future__ import annotations
 
+import logging
 import os.path
 import re
 import shlex
 from collections import Counter
 from collections.abc import Sequence
+from functools import lru_cache
 
-__all__ = ["bare_command", "bare_name", "bare_names", "without_folders"]
+from roadgeo._text import visible
+
+__all__ = ["bare_command", "bare_name", "bare_names", "name_for_odm", "without_folders"]
+
+_LOG = logging.getLogger(__name__)
 
 #: The folders of a path from the root on, of Windows too; not those of a URL.
 _FOLDERS = re.compile(r"(?<![\w.:/\\])(?:[A-Za-z]:)?[/\\]+(?:[^/\\\s:;,'\"]+[/\\])+")
@@ -31,6 +37,16 @@ def bare_names(paths: Sequence[str]) -> list[str]:
     except ValueError:  # some from the root on and others not, or on several drives
         return list(map(bare_name, paths))
     return [os.path.relpath(path, common or ".") if shared[bare_name(path)] > 1 else bare_name(path) for path in paths]
+
+
+@lru_cache(maxsize=1024)  # warned of once
+def name_for_odm(name: str) -> str:
+    """Return a picture's name for OpenDroneMap's tables, and warn of spaces: they part columns there, without quotes."""
+    if re.search(r"\s", name):
+        _LOG.warning(
+            "%s: OpenDroneMap takes no names with spaces: rename the picture, and in what is written", visible(name)
+        )
+    return visible(name)
 
 
 def without_folders(text: str, path: str = "") -> str:

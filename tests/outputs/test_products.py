@@ -16,6 +16,7 @@ from worlds.turned import save_turned
 
 from roadgeo.geometry.homography import Homography
 from roadgeo.location import Location
+from roadgeo.outputs.cameras import write_odm_geos
 from roadgeo.outputs.kmz import write_kmz
 from roadgeo.outputs.location_files import OutputOptions, write_location
 from roadgeo.outputs.outlines import write_geojson
@@ -23,6 +24,14 @@ from roadgeo.outputs.paths import OutputPaths, output_paths
 from roadgeo.outputs.registry import ALSO
 from roadgeo.outputs.subject import Subject
 from roadgeo.storage.rasters import open_raster
+
+CAMERA = {
+    "sigma": {"x_m": 1.0, "y_m": 1.0, "height_m": 2.0},
+    "altitude_m": 90.0,
+    "height_m": 80.0,
+    "lon": -8.6,
+    "lat": 41.1,
+}
 
 
 @pytest.fixture(scope="module")
@@ -133,6 +142,17 @@ def test_programs_that_do_not_turn_pictures_get_points_of_the_stored_pixels(tmp_
     np.testing.assert_allclose(pixels, 2 * located().evidence.query_xy * (1, -1), atol=1e-6)  # of the upright picture
     source = json.loads((tmp_path / "mask_iiif.json").read_text())["target"]["source"]
     assert (source["width"], source["height"]) == (800, 600)
+
+
+def test_names_that_opendronemap_does_not_take_are_told(tmp_path: Path, caplog: pytest.LogCaptureFixture) -> None:
+    photo = tmp_path / "My Photo 1.png"
+    cv2.imwrite(str(photo), np.zeros((300, 400, 3), np.uint8))
+    write_location(located(), road_mask(), output_paths(tmp_path, "a"), OutputOptions(products=("odm",)), photo)
+    document = {"status": "located", "query": "My Photo 2.png", "camera": CAMERA}
+    write_odm_geos(tmp_path / "geo.txt", [document, {**document, "query": "plain.png"}])
+    told = "{}: OpenDroneMap takes no names with spaces: rename the picture, and in what is written"
+    assert [record.getMessage() for record in caplog.records] == [told.format(f"My Photo {k}.png") for k in (1, 2)]
+    assert "My Photo 1.png" in (tmp_path / "a_gcp_list.txt").read_text()
 
 
 def test_the_world_file_is_that_of_the_drawn_raster(written: OutputPaths) -> None:
