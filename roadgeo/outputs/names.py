@@ -41,11 +41,10 @@ def bare_names(paths: Sequence[str]) -> list[str]:
 
 @lru_cache(maxsize=1024)  # warned of once
 def name_for_odm(name: str) -> str:
-    """Return a picture's name for OpenDroneMap's tables, and warn of spaces: they part columns there, without quotes."""
+    """Return a picture's name for OpenDroneMap's tables, and warn of spaces, which part columns there."""
     if re.search(r"\s", name):
-        _LOG.warning(
-            "%s: OpenDroneMap takes no names with spaces: rename the picture, and in what is written", visible(name)
-        )
+        told = "%s: OpenDroneMap takes no names with spaces: rename the picture, and in what is written"
+        _LOG.warning(told, visible(name))
     return visible(name)
 
 
