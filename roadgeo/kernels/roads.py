@@ -16,6 +16,7 @@ from roadgeo.kernels.structs import RoadBuckets
 __all__ = [
     "backward_agreement",
     "bin_segments",
+    "count_residuals",
     "forward_distances",
     "meets_road",
     "nearest_road",
@@ -350,6 +351,93 @@ def backward_agreement(
                     if field[row, column] * field_scale <= tolerance_m * scale + 0.7 * field_scale:
                         n_near += 1
     return n_seen, n_near
+
+
+@kernel()
+def count_residuals(
+    matrix: Floats2,
+    inverse: Floats2,
+    bounds: Floats1,
+    points: Floats2,
+    directions: Floats2,
+    weights: Floats1,
+    radius: float,
+    min_cos: float,
+    step: float,
+    roads: RoadBuckets,
+    field: Singles2,
+    field_scale: float,
+    observed: Bools2,
+    forward: Floats1,
+    backward: Floats1,
+) -> None:
+    """Fill histograms of how far the query's roads lie from roads of the map, and the map's from those of the query.
+
+    Parameters
+    ----------
+    matrix, inverse : (3, 3) float64
+        Query plane to reference plane, and back.
+    bounds : (4,) float64
+        x0, y0, x1, y1 of the footprint: only buckets that meet it are looked at.
+    points, directions, weights : (S, 2), (S, 2), (S,) float64
+        Road points of the query, unit vectors along the road, and what each counts.
+    radius, min_cos
+        As in `nearest_road`: metres.
+    step : float
+        The map is sampled once in so many metres of road.
+    field, field_scale, observed
+        As in `backward_agreement`.
+    forward, backward : (B + 1,) float64
+        B bins of equal width up to `radius`, and what has no road nearer. The first counts weights, the second pixels
+        of road.
+    """
+    segments, starts, ids, grid, shape = roads
+    n = forward.shape[0] - 1
+    forward[:] = 0.0
+    backward[:] = 0.0
+    for i in range(points.shape[0]):
+        ahead, x, y, dx, dy = _carry(matrix, points[i, 0], points[i, 1], directions[i, 0], directions[i, 1])
+        away = np.inf
+        if ahead:
+            away = nearest_road(x, y, dx, dy, radius, min_cos, segments, starts, ids, grid, shape)[0]
+        forward[min(int(n * away / radius), n) if away < radius else n] += weights[i]
+    c0 = max(int(np.floor((bounds[0] - grid[0]) / grid[2])), 0)
+    c1 = min(int(np.floor((bounds[2] - grid[0]) / grid[2])), shape[0] - 1)
+    r0 = max(int(np.floor((bounds[1] - grid[1]) / grid[2])), 0)
+    r1 = min(int(np.floor((bounds[3] - grid[1]) / grid[2])), shape[1] - 1)
+    det = (
+        inverse[0, 0] * (inverse[1, 1] * inverse[2, 2] - inverse[1, 2] * inverse[2, 1])
+        - inverse[0, 1] * (inverse[1, 0] * inverse[2, 2] - inverse[1, 2] * inverse[2, 0])
+        + inverse[0, 2] * (inverse[1, 0] * inverse[2, 1] - inverse[1, 1] * inverse[2, 0])
+    )
+    for r in range(r0, r1 + 1):
+        for c in range(c0, c1 + 1):
+            bucket = r * shape[0] + c
+            for e in range(starts[bucket], starts[bucket + 1]):
+                s = ids[e]
+                ax, ay = segments[s, 0], segments[s, 1]
+                sx, sy = segments[s, 2] - ax, segments[s, 3] - ay
+                length = math.sqrt(sx * sx + sy * sy)
+                count = int(length / step + ((s * 0.6180339887) % 1.0))
+                for k in range(count):
+                    t = (k + 0.5) / count
+                    x, y = ax + t * sx, ay + t * sy
+                    # A segment may be listed in several buckets: each sample counts in its own.
+                    if int(np.floor((x - grid[0]) / grid[2])) != c or int(np.floor((y - grid[1]) / grid[2])) != r:
+                        continue
+                    w = inverse[2, 0] * x + inverse[2, 1] * y + inverse[2, 2]
+                    if w <= 0.0:
+                        continue
+                    across = (inverse[0, 0] * x + inverse[0, 1] * y + inverse[0, 2]) / w / field_scale
+                    down = -(inverse[1, 0] * x + inverse[1, 1] * y + inverse[1, 2]) / w / field_scale
+                    if not (0.0 <= across < field.shape[1] and 0.0 <= down < field.shape[0]):
+                        continue
+                    column, row = int(across), int(down)
+                    if not observed[row, column]:
+                        continue
+                    scale = math.sqrt(abs(det) / (w * w * w))  # pixels per metre
+                    away = max(field[row, column] - 0.5, 0.0) * field_scale / scale
+                    backward[min(int(n * away / radius), n) if away < radius else n] += length / count * scale
 
 
 @kernel()

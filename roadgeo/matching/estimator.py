@@ -14,11 +14,10 @@ from roadgeo.geometry.areas import Box, lies_in
 from roadgeo.geometry.camera import CameraFault, CameraOptions, judge, sampling
 from roadgeo.geometry.homography import Homography
 from roadgeo.geometry.projection import to_lonlat
-from roadgeo.matching.exactness import exact_log10_odds, is_plain, may_stand
+from roadgeo.matching.evidence import Evidence, EvidenceOptions
 from roadgeo.matching.growing import GrowOptions, grow_proposals, screen_proposals
 from roadgeo.matching.hypothesis import MINIMAL, Hypothesis, Lead
 from roadgeo.matching.index import ReferenceIndex
-from roadgeo.matching.leaning import lean_as_a_camera
 from roadgeo.matching.ledger import Ledger
 from roadgeo.matching.lens import (
     LensFit,
@@ -30,18 +29,15 @@ from roadgeo.matching.lens import (
     regrow,
     straighten_scene,
 )
-from roadgeo.matching.pieces import share_won
 from roadgeo.matching.refinement import RefineOptions, refine
 from roadgeo.matching.road_growth import Grown
-from roadgeo.matching.road_search import RoadSearchOptions
-from roadgeo.matching.road_views import RoadViews
+from roadgeo.matching.road_search import RoadSearch, RoadSearchOptions
 from roadgeo.matching.scene import Scene
 from roadgeo.matching.shared_sweeps import SharedSweeps, Stage
 from roadgeo.matching.sweeps import BEFORE_ROADS, WITHOUT_ROADS, Source, Sweep
-from roadgeo.matching.tilted import TiltOptions
 from roadgeo.matching.trace import NO_TRACE, Trace
 from roadgeo.matching.triples import Proposals, larger
-from roadgeo.matching.verification import VerifyOptions, agreement, chance_agreement, least_chance, log10_odds
+from roadgeo.matching.verification import VerifyOptions, agreement
 from roadgeo.matching.work import Work
 
 __all__ = ["Ledger", "MatchOptions", "Source", "Sweep", "TripleEstimator"]
@@ -50,6 +46,9 @@ __all__ = ["Ledger", "MatchOptions", "Source", "Sweep", "TripleEstimator"]
 _BETTER = 0.05
 #: A place that so many intersections of the query propose by roads is settled: each looked at the whole map.
 _OFTEN_ENOUGH = 2
+#: A place that explains less, in powers of ten, or, laid roughly and less roughly, less than these parts of what the
+#: best one does, is looked at no more.
+_LEAST_LIKELY, _NO_RIVAL, _BEHIND = 0.7, 0.4, 0.7
 #: How far a proposal, made of three intersections, may turn the image's up from where it points.
 _ROUGHLY_DEG = 25.0
 
@@ -66,14 +65,12 @@ class MatchOptions:
         The sweeps where roads propose after them, and where these are left out: they go on for longer then.
     sightings : int
         Anchors that must lead to a place before it ends the search: a map may hold its twin.
-    certain : float
-        A place with these log10 odds needs no twins to be looked for among streets that repeat.
+    promising : float
+        Log10 odds from which a place is looked at through a lens.
     roads : RoadSearchOptions or None
         What follows where no triple leads to a place: None for more sweeps.
     lens : LensOptions or None
         Of a lens that is looked for behind promising places, and behind others that roads led to: None for a pinhole.
-    tilted : TiltOptions or None
-        Of steep views, which are looked for last: None for none.
     max_places : int
         The sweeps end too when so many places were screened on a map of 15,000 intersections, and on a larger one more
         by the root of the ratio. Where streets are alike, proposals abound, and late ones are seldom right: of 31 masks
@@ -86,14 +83,14 @@ class MatchOptions:
     without_roads: tuple[Source, ...] = WITHOUT_ROADS
     grow: GrowOptions = field(default_factory=GrowOptions)
     verify: VerifyOptions = field(default_factory=VerifyOptions)
+    evidence: EvidenceOptions = field(default_factory=EvidenceOptions)
     refine: RefineOptions = field(default_factory=RefineOptions)
     camera: CameraOptions = field(default_factory=CameraOptions)
     roads: RoadSearchOptions | None = field(default_factory=RoadSearchOptions)
     lens: LensOptions | None = field(default_factory=LensOptions)
-    tilted: TiltOptions | None = field(default_factory=TiltOptions)
     max_places: int = 12_000
     sightings: int = 2
-    certain: float = 20.0
+    promising: float = 1.0
     within: Box | None = None
 
 
@@ -118,8 +115,8 @@ class TripleEstimator:
         self.ledger = ledger or Ledger()
         self.trace = trace
         self.refine_s = 0.0
-        self.chances: list[FloatArray] = []  # at the places verified so far, quickly measured
         self.n_nulls = 0
+        self.verified: list[Hypothesis] = []
         self._dropped: list[Hypothesis] = []
         self._looked: list[tuple[Hypothesis, float]] = []  # through a lens, and which share of roads agreed without
         self._whole: list[Hypothesis] = []  # verified, and no better version of them is to be expected
@@ -133,13 +130,13 @@ class TripleEstimator:
         self._grown_by_roads: list[Hypothesis] = []
         self.sweeps = sweeps or SharedSweeps(scene, camera)
         self.sweeps.members.append(self)
-        self._views = RoadViews(scene, index, self.options, near, self.sweeps)
+        self._road_search: RoadSearch | None = None
         trace.began(self)
 
     def stages(self) -> Iterator[Iterator[list[Hypothesis]]]:
         """Yield, for one anchor after another, the hypotheses that grew.
 
-        Triples propose them, then roads, and roads of the scene as it may look from above.
+        Triples propose them, then roads, then what was dropped grows anew behind a lens.
 
         On a coarse map roads come first: an intersection is seldom merged there as a mask shows it.
         """
@@ -151,10 +148,6 @@ class TripleEstimator:
             return
         roads = [self._rounds_of_roads()]
         yield from sweeps + roads if self.index.coarseness == 1.0 else roads + sweeps
-        if options.lens is not None:
-            yield self._rounds_of_lenses(options.lens)
-        for view in self._views.tilted():
-            yield self._rounds_of_roads(view)
         if options.lens is not None:
             yield self._rounds_of_lenses(options.lens)
 
@@ -176,11 +169,10 @@ class TripleEstimator:
     def follow(self, leads: Sequence[Lead]) -> Iterator[list[Hypothesis]]:
         """Yield what grew from anchors that led to a place on another part (see `search.Estimator`)."""
         for stage, anchor in leads:
-            view = self._views.view_of(stage)
-            if view is None:
+            if self.options.roads is None or stage < self._stage_of_roads:
                 yield self.sweeps.pending(self, stage, anchor)
             else:
-                yield from self._rounds_of_roads(view, [anchor])
+                yield from self._rounds_of_roads([anchor])
 
     @property
     def n_anchors(self) -> int:
@@ -193,9 +185,25 @@ class TripleEstimator:
         self.ledger.n_tried += round(self.ledger.beside * n_places)
         self.ledger.tried_by[stage] = self.ledger.n_tried
 
-    def _rounds_of_roads(self, view: int = 0, only: Sequence[int] | None = None) -> Iterator[list[Hypothesis]]:
+    @property
+    def _stage_of_roads(self) -> int:
+        """Number of the stage in which roads propose."""
+        return len(self.options.sweeps)
+
+    def _search_by_roads(self) -> RoadSearch:
+        """Return the search by roads, which is made when it is needed."""
+        if self._road_search is None:
+            options = self.options.roads or RoadSearchOptions()
+            on_map, coarseness = options.on(self.index.coarseness), self.index.coarseness
+            turnout = self.sweeps.turnout(coarseness, on_map)
+            self._road_search = RoadSearch(
+                self.scene, self.index, self.options.camera, on_map, self.near, self.sweeps.ahead, turnout
+            )
+        return self._road_search
+
+    def _rounds_of_roads(self, only: Sequence[int] | None = None) -> Iterator[list[Hypothesis]]:
         """Yield what grew by roads and is not known yet; a place found again counts as found once more."""
-        roads, known, stage = self._views.search(view), self._grown_by_roads, self._views.stage_of(view)
+        roads, known, stage = self._search_by_roads(), self._grown_by_roads, self._stage_of_roads
         tried = roads.n_tried
         for anchor, n_proposed, grown in roads.rounds(only):
             self._count(roads.n_tried - tried, stage)
@@ -206,7 +214,7 @@ class TripleEstimator:
                 self.trace.voted(anchor, n_proposed)
             fresh: list[Hypothesis] = []
             again: list[Hypothesis] = []
-            for hypothesis in (self._of_roads(one, view) for one in grown):
+            for hypothesis in map(self._of_roads, grown):
                 twins = [one for one in known if self._is_found_again(one, hypothesis)]
                 if twins or any(self.same(one, hypothesis) for one in fresh):
                     again += twins[:1]
@@ -227,10 +235,9 @@ class TripleEstimator:
             self.trace.refused(hypothesis.fault, hypothesis.matrix)
         return hypothesis.fault is None
 
-    def _of_roads(self, grown: Grown, view: int) -> Hypothesis:
+    def _of_roads(self, grown: Grown) -> Hypothesis:
         """Make a hypothesis of what grew by roads, with the intersections that match."""
-        scene, matrix = self.scene, grown.matrix @ self._views.seen_by(view)
-        matrix = matrix / matrix[2, 2]
+        scene, matrix = self.scene, grown.matrix / grown.matrix[2, 2]
         seeds = np.array([grown.anchor])
         gsd = sampling(matrix, scene.size)
         _, matched, _ = agreement(matrix, scene, self.index, gsd, seeds, self.options.verify)
@@ -238,7 +245,7 @@ class TripleEstimator:
 
     def _is_found_again(self, known: Hypothesis, hypothesis: Hypothesis) -> bool:
         """Whether a verified place that is promising was proposed by another intersection as well."""
-        return known.log10_odds >= self.options.verify.promising and self.same(known, hypothesis)
+        return known.log10_odds >= self.options.promising and self.same(known, hypothesis)
 
     def known_places(self) -> list[Hypothesis]:
         """Return what was verified and fits (see `shared_sweeps.Member`)."""
@@ -295,34 +302,24 @@ class TripleEstimator:
                 yield h
 
     def score(self, model: Hypothesis) -> float:
-        """Refine a hypothesis and return its log10 odds."""
+        """Refine a hypothesis and return its log10 odds: what it explains, more than the best place nearby does."""
         started, options = time.perf_counter(), self.options
-        if model.lens is None:
-            leans = lean_as_a_camera(model, self.scene, self.index, options.camera, options.verify)
-            model.log10_odds = self._verify(model) if leans else -math.inf
+        self.n_verified += 1
         if model.lens is not None:
             self._see_through(model, model.lens)
-        elif model.log10_odds >= options.verify.promising:
-            self._look_through_lens(model)
-        elif model.refined is not None:
-            self._dropped.append(model)
-        scene, tried, certain = self.scene_of(model), self.ledger.n_tried, options.certain
-        model.log10_odds = exact_log10_odds(model, scene, self.index, tried, options.verify, certain, self.near)
-        if model.log10_odds > 0.0 and self._loses(model):
-            model.log10_odds = 0.0
-        model.n_tried = self.ledger.n_tried
+        else:
+            self._verify(model)
+            if model.log10_odds >= options.promising:
+                self._look_through_lens(model)
+            elif model.refined is not None:
+                self._dropped.append(model)
+        if math.isfinite(model.log10_odds):
+            self.verified.append(model)
         self.refine_s += time.perf_counter() - started
         self.trace.scored(model)
         if not model.by_roads and self._fits_whole(model):
             self._whole.append(model)
         return model.log10_odds
-
-    def _loses(self, model: Hypothesis) -> bool:
-        """Whether only a piece of the frame fits, as a quarter of Porto Alegre fits that is its own mirror image."""
-        verify, found = self.options.verify, model.found
-        if found is None or found.forward >= verify.least_rates[1]:
-            return False
-        return share_won(model.matrix, self.scene_of(model), self.index, model.gsd_m, verify) < verify.least_won
 
     def evidence(self, model: Hypothesis) -> float:
         """Return the log10 odds of a hypothesis without what is charged for the places tried."""
@@ -333,25 +330,39 @@ class TripleEstimator:
         ended = [self.ledger.tried_by.get(stage, 0) for stage, _ in model.leads[:1]]
         return math.log10(max(model.n_tried, *ended, 1))
 
-    def _verify(self, model: Hypothesis) -> float:
-        self.n_verified += 1
-        scene, index, verify = self.scene, self.index, self.options.verify
-        # What a wrong place reaches is soon seen; only promising ones are worth all points and all of a null model.
-        chance = least_chance(self.chances)
-        for n_points, every in ((150, 0), (300, 6), (None, 1)):
-            if every > 1 and is_plain(model, self.n_verified, verify):
-                continue
+    def _verify(self, model: Hypothesis) -> None:
+        """Refine a hypothesis by more and more points, as long as it may be the best place, or its rival."""
+        best = max((one.log10_likelihood for one in self.verified), default=0.0)
+        for n_points, least in ((150, _NO_RIVAL * best), (300, _BEHIND * best), (None, 0.0)):
             if not self._converge(model, n_points):
-                return -np.inf
-            if every:
-                model.chance = chance_agreement(model.matrix, scene, index, model.gsd_m, verify, every, near=self.near)
-                chance = np.array(model.chance)
-                self.chances += [chance] * (every > 1)
-            model.log10_odds = self._odds(model, chance)
-            if not may_stand(model, verify):
-                return model.log10_odds
-        self.n_nulls += 1
-        return model.log10_odds
+                model.log10_odds = -math.inf
+                return
+            evidence = Evidence(self.scene, self.index, model.gsd_m, self.options.evidence)
+            model.log10_likelihood = evidence.weigh(model.matrix)
+            if model.log10_likelihood < max(_LEAST_LIKELY, least):
+                self._charge(model)
+                return
+        self._weigh(model)
+
+    def _weigh(self, model: Hypothesis) -> None:
+        """Weigh a hypothesis, and the best place nearby where it explains more than any other that was met."""
+        evidence = Evidence(self.scene_of(model), self.index, model.gsd_m, self.options.evidence)
+        model.log10_likelihood = evidence.weigh(model.matrix)
+        if model.log10_likelihood > self._most_elsewhere(model):
+            model.nearby = evidence.nearby(model.matrix, self.near)
+            self.n_nulls += 1
+        self._charge(model)
+
+    def _charge(self, model: Hypothesis) -> None:
+        """Give a hypothesis its odds: by how much it explains more than others do, less the places tried."""
+        model.n_tried = self.ledger.n_tried
+        most = max(model.nearby, self._most_elsewhere(model), 0.0)
+        model.log10_odds = model.log10_likelihood - most - math.log10(max(model.n_tried, 1))
+
+    def _most_elsewhere(self, model: Hypothesis) -> float:
+        """Return what the likeliest other place that was met explains, as log10."""
+        likely = sorted(self.verified, key=lambda one: -one.log10_likelihood)
+        return next((one.log10_likelihood for one in likely if not self.same(one, model)), 0.0)
 
     def _look_through_lens(self, model: Hypothesis) -> None:
         """Take a lens into a promising place where one explains it better."""
@@ -371,7 +382,8 @@ class TripleEstimator:
         if seen.found is None or seen.log10_odds < model.log10_odds or seen.found.forward < agreeing.forward:
             return
         model.refined, model.matrix, model.gsd_m = seen.refined, seen.matrix, seen.gsd_m
-        model.found, model.chance, model.log10_odds = seen.found, seen.chance, seen.log10_odds
+        model.found, model.nearby, model.log10_odds = seen.found, seen.nearby, seen.log10_odds
+        model.log10_likelihood = seen.log10_likelihood
         model.matched, model.distance = seen.matched, seen.distance
 
     def _see_through(self, model: Hypothesis, lens: LensFit) -> None:
@@ -382,8 +394,7 @@ class TripleEstimator:
         model.gsd_m = gsd = sampling(lens.matrix, scene.size)
         seeds = model.seeds[-MINIMAL:]
         model.found, model.matched, model.distance = agreement(lens.matrix, scene, index, gsd, seeds, verify)
-        model.chance = chance_agreement(lens.matrix, scene, index, gsd, verify, near=self.near)
-        model.log10_odds = log10_odds(model.found, model.chance, scene.n_statements, self.ledger.n_tried, verify)
+        self._weigh(model)
 
     def _rounds_of_lenses(self, options: LensOptions) -> Iterator[list[Hypothesis]]:
         """Yield places that were dropped and that fit after all when grown anew, behind a lens."""
@@ -403,7 +414,6 @@ class TripleEstimator:
             if found is None or not self.may_be(found.matrix):
                 yield []
             elif is_significant(found, scene, options):
-                self.n_verified += 1
                 yield [replace(one, lens=found)]
             else:  # no lens: it had not grown over the whole frame
                 yield [replace(one, matrix=found.matrix, refined=None, by_roads=True)]
@@ -412,12 +422,6 @@ class TripleEstimator:
         """Return the scene as a pinhole sees it, behind the lens that a hypothesis found."""
         lens_k1 = 0.0 if model.refined is None else model.refined.lens_k1
         return straighten_scene(self.scene, lens_k1) if lens_k1 else self.scene
-
-    def _odds(self, model: Hypothesis, chance: FloatArray) -> float:
-        found = model.found
-        if found is None:
-            return -math.inf
-        return log10_odds(found, chance, self.scene.n_statements, self.ledger.n_tried, self.options.verify)
 
     def _converge(self, model: Hypothesis, n_points: int | None) -> bool:
         """Refine until nothing more agrees: more matches make a better fit, and that finds more matches."""
@@ -466,11 +470,9 @@ class TripleEstimator:
         """Whether a hypothesis fits the whole frame and was found often enough for a twin to have been found beside it.
 
         Each anchor that leads to a place would as soon lead to its twin: what several led to, and to nothing else that
-        fits, has none. Where half of the roads would agree after a shift, streets form a lattice: it may have many,
-        unless it is certain.
+        fits, has none.
         """
-        repeats = model.chance[1] >= 0.5
-        if model.found is None or model.refined is None or (repeats and model.log10_odds < self.options.certain):
+        if model.found is None or model.refined is None:
             return False
         if model.by_roads:
             return model.n_found >= _OFTEN_ENOUGH

@@ -17,7 +17,7 @@ searches      one for each reference, in the order in which they were searched:
               mask looked up, `candidates` (tuples of the map like them), `proposals` (places on which several agree),
               `on_roads` (those that put the roads around the anchor on roads), `grown` (followed outwards), `survived`
               (not given up on the way), `verified` (different ones, refined and compared with the map), `measured`
-              (promising ones for which chance was measured on the spot)
+              (likely ones that were compared with all places nearby)
 
               `camera_refusals`: how often which reason kept a place that had grown from being verified
 
@@ -55,7 +55,7 @@ from roadgeo.matching.record import Record, Scored, without_limits
 from roadgeo.matching.scene import Scene
 from roadgeo.matching.search import SearchResult
 from roadgeo.matching.verdict import Needed
-from roadgeo.matching.verification import Agreement, least_chance, tolerance_m
+from roadgeo.matching.verification import Agreement, tolerance_m
 from roadgeo.roads.graph import RoadGraph
 
 if TYPE_CHECKING:
@@ -100,10 +100,8 @@ class RejectedPlace:
         Corners TL, TR, BR, BL, plane metres and longitude, latitude.
     agreement : Agreement or None
         None where the fit failed before anything could be compared.
-    chance : tuple of 3 floats
-        Shares that the best shifted copies reach: of intersections, of the mask's roads, of the map's roads.
-    chance_measured : bool
-        At this place; otherwise the least of the places where it was.
+    log10_likelihood, nearby : float
+        What it explains, and what the best place nearby does (see `evidence`).
     agrees : (S,) bool
         Which of the scene's road points lie on roads of the map that run their way.
     fault : CameraFault or None
@@ -119,8 +117,8 @@ class RejectedPlace:
     rotation_deg: float
     tilt_deg: float
     agreement: Agreement | None
-    chance: tuple[float, float, float]
-    chance_measured: bool
+    log10_likelihood: float
+    nearby: float
     agrees: BoolArray
     why: str
     fault: CameraFault | None = None
@@ -128,7 +126,6 @@ class RejectedPlace:
     def to_dict(self) -> dict[str, Any]:
         """Plain values, ready for `json.dumps`."""
         found = self.agreement
-        by_chance = dict(zip(("intersections", "roads_of_mask", "roads_of_map"), self.chance, strict=True))
         return {
             "why": self.why,
             "log10_odds": self.log10_odds if math.isfinite(self.log10_odds) else None,
@@ -145,8 +142,8 @@ class RejectedPlace:
                 "roads_of_mask": found.forward,
                 "roads_of_map": found.backward,
             },
-            "chance": by_chance,
-            "chance_measured": self.chance_measured,
+            "log10_likelihood": self.log10_likelihood if math.isfinite(self.log10_likelihood) else None,
+            "nearby": self.nearby,
         }
 
 
@@ -285,9 +282,6 @@ def _describe(
     model, scene, index = entry.model, search.scene_of(entry.model), search.index
     verify = search.options.verify
     camera = pose(model.matrix, scene.size)
-    # chance at the place, or the least seen elsewhere where it was not worth measuring
-    measured = model.chance != (1.0, 1.0, 1.0)
-    chance = model.chance if measured else tuple(float(share) for share in least_chance(search.chances))
     # where it lies
     ground = Homography(model.matrix).everywhere(np.vstack([scene.corners, scene.center]))
     in_crs = index.plane.to_crs(ground)
@@ -310,8 +304,8 @@ def _describe(
         rotation_deg=camera.rotation_deg,
         tilt_deg=camera.tilt_deg,
         agreement=model.found,
-        chance=(chance[0], chance[1], chance[2]),
-        chance_measured=measured,
+        log10_likelihood=model.log10_likelihood,
+        nearby=model.nearby,
         agrees=np.isfinite(distance),
         why="",
         fault=entry.fault,
@@ -354,17 +348,10 @@ def _objection(place: RejectedPlace, fault: CameraFault) -> str:
 
 
 def _weakest(place: RejectedPlace) -> str:
-    """Say which of the three kinds of evidence exceeds chance the least."""
-    found = place.agreement
-    if found is None:
+    """Say what a place explains, and the best one nearby."""
+    if place.agreement is None:
         return "nothing could be compared"
-    kinds = [
-        (found.rate, place.chance[0], "of the intersections"),
-        (found.forward, place.chance[1], "of the mask's roads"),
-        (found.backward, place.chance[2], "of the map's roads"),
-    ]
-    rate, chance, name = min(kinds, key=lambda kind: kind[0] - kind[1])
-    return f"{rate:.0%} {name} agree, by chance {chance:.0%}"
+    return f"its roads explain 10^{_number(place.log10_likelihood)}, those of a place nearby 10^{_number(place.nearby)}"
 
 
 def _starved(funnel: Funnel, record: Record, result: SearchResult[Hypothesis], needed: Needed) -> str:
@@ -423,8 +410,8 @@ def _missing(
             f"intersections: {len(scene.intersections)} are seen; masks with fewer than {_USUAL_INTERSECTIONS} are"
             " seldom located"
         )
-    if best is not None and best.chance[1] > 0.5:
-        told.append(f"variety: streets here are so alike that shifted copies meet {best.chance[1]:.0%} of the roads")
+    if best is not None and best.nearby > 0.5 * best.log10_likelihood > 0.0:
+        told.append("variety: streets here are so alike that a shifted copy explains half as much and more")
     if search.near is not None and not places:
         told.append("perhaps the circle given is wrong: nothing outside it was tried")
     return told or ["agreement: nothing on this map is like the mask; another map may be needed"]

@@ -43,7 +43,8 @@ class Hypothesis:
     """A grown hypothesis and what came of it.
 
     `by_roads`: it grew by roads over the whole frame; `leads`: the intersections of the query that proposed it, each
-    with the number of the stage in which it did; `n_tried`: places tried when it was scored; `fault`: the camera's last
+    with the number of the stage in which it did; `log10_likelihood`, `nearby`: what it explains, and what the best
+    place nearby does (see `evidence`); `n_tried`: places tried when it was scored; `fault`: the camera's last
     objection, None where it had none; `lens`: how it fits when it is grown anew behind a lens.
     """
 
@@ -53,7 +54,8 @@ class Hypothesis:
     matched: IntArray
     refined: Refined | None = None
     found: Agreement | None = None
-    chance: tuple[float, float, float] = (1.0, 1.0, 1.0)
+    log10_likelihood: float = -np.inf
+    nearby: float = 0.0
     distance: FloatArray | None = None
     gsd_m: float = np.nan
     log10_odds: float = -np.inf

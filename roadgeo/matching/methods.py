@@ -11,6 +11,7 @@ from functools import lru_cache
 import numpy as np
 
 from roadgeo._arrays import FloatArray, IntArray
+from roadgeo.geometry.camera import sampling
 from roadgeo.geometry.homography import Homography
 from roadgeo.geometry.projection import from_lonlat, metres_apart, to_lonlat
 from roadgeo.location import Stats
@@ -25,14 +26,14 @@ from roadgeo.matching.paper.quality import well_fitted
 from roadgeo.matching.paper.search import match_pairs
 from roadgeo.matching.paper.tuples import PairIndex, PairOptions, build_pair_index
 from roadgeo.matching.parts import Part, Whole, same_within_m
-from roadgeo.matching.proof import Proof, Prover
 from roadgeo.matching.query import Query
+from roadgeo.matching.rivals import Rivals, Standing
 from roadgeo.matching.road_search import COARSE_PIXEL_M
-from roadgeo.matching.search import Search, SearchResult, search_together
+from roadgeo.matching.search import Search, search_together
 from roadgeo.matching.shared_sweeps import SharedSweeps
 from roadgeo.matching.trace import NO_TRACE, Trace
 from roadgeo.matching.triples import larger
-from roadgeo.matching.twins import Twin
+from roadgeo.matching.verification import agreement
 from roadgeo.roads.intersections import Intersections, unpack_branches
 from roadgeo.storage.memory import let_pages_go
 
@@ -60,7 +61,9 @@ class Fit:
     agreeing : float
         Share of the query's roads that agree.
     log10_odds : float
-        NaN where the method knows none.
+        By which the place leads any other; NaN where the method knows none.
+    log10_likelihood : float
+        What it explains (see `evidence`).
     corner_sigma_m : (4,) float64 or None
     corner_covariance_m2 : (8, 8) float64 or None
         As in `Refined`.
@@ -68,8 +71,6 @@ class Fit:
         As of `Refined`.
     agreement : float
         Mean of the shares of intersections, of the query's roads and of the map's roads that agree.
-    by_twins, twin : bool, Twin or None
-        Whether the odds are those by which it leads its twins, and the best of these.
     """
 
     index: ReferenceIndex
@@ -78,12 +79,11 @@ class Fit:
     distance: FloatArray
     agreeing: float = math.nan
     log10_odds: float = math.nan
+    log10_likelihood: float = -math.inf
     corner_sigma_m: FloatArray | None = None
     corner_covariance_m2: FloatArray | None = None
     lens_k1: float = 0.0
     agreement: float = math.nan
-    by_twins: bool = False
-    twin: Twin | None = None
 
 
 @dataclass(frozen=True)
@@ -95,7 +95,7 @@ class Found:
     index : ReferenceIndex
         The whole reference.
     fits : tuple of Fit
-        The best place, the best other one, and of the rest the one that agrees best, as far as there are any.
+        The likeliest place, and the best other one, as far as there are any.
     stopped : str
         As in `SearchResult`; "" where nothing was searched.
     said : str
@@ -199,10 +199,10 @@ def _search(
 
     scale = larger(sum(one.n_searched for one in opened))
     limits = replace(options.search, time_limit_s=left, work_limit_s=scale * options.search.work_limit_s)
-    prover = Prover(estimators, options, ledger)
-    search_together(list(estimators), limits, same, prover)
+    rivals = Rivals(estimators, options.rivals, ledger, options.min_log10_odds)
+    search_together(list(estimators), limits, same, rivals)
     sweeps.end()
-    return [one.found(scale, prover) for one in opened]
+    return [one.found(scale, rivals) for one in opened]
 
 
 def _open(parts: Sequence[Part], options: LocateOptions, frame_m: float) -> list[ReferenceIndex]:
@@ -260,24 +260,19 @@ class _Attempt:
             part = _part(index, near[:2], reach)
             if len(part) < options.min_intersections:
                 return cls(index, len(part), trace=trace)
-        estimator = TripleEstimator(query.scene, part, promising_options(options), near, trace, ledger, sweeps)
+        estimator = TripleEstimator(query.scene, part, _of_effort(options), near, trace, ledger, sweeps)
         return cls(index, len(part), estimator, Search(estimator), trace)
 
-    def found(self, scale: float, prover: Prover) -> Found:
+    def found(self, scale: float, rivals: Rivals) -> Found:
         """Tell what came of it; work is told for a map `scale` times smaller."""
         estimator = self.estimator
         if self.search is None or estimator is None:
             return Found(self.index, n_searched=self.n_searched, trace=self.trace)
-        result, places = _charge_alike(estimator, self.search)
-        proof = prover.proof(self.search) if result.score < prover.options.min_log10_odds else None
-        if proof is not None and proof.log10_odds > result.score:
-            result, places = _put_first(proof, estimator, result, places)
-        else:
-            proof = None
+        result, standing = self.search.result(), rivals.standing(self.search)
         self.trace.finished(estimator, result)
         return Found(
             self.index,
-            _fits(estimator, result, places, proof),
+            () if standing is None else _fits(estimator, standing),
             result.stopped,
             n_searched=self.n_searched,
             n_tried=estimator.n_screened,
@@ -295,69 +290,19 @@ class _Attempt:
         )
 
 
-def _charge_alike(
-    estimator: TripleEstimator, search: Search[Hypothesis]
-) -> tuple[SearchResult[Hypothesis], list[tuple[float, Hypothesis]]]:
-    """Charge all places alike, for what was tried until the stage ended that led to the best; return them in order.
-
-    In the search each is charged for what was tried before it; so it would lead its twin by having been met first.
-    """
-    result = search.result()
-    met = {
-        id(model): model for model in (result.best, result.runner_up, *(one for _, one in search.promising)) if model
-    }
-    ranked = sorted(met.values(), key=lambda model: -estimator.evidence(model))
-    if not ranked:
-        return result, []
-    versions = [model for model in ranked if estimator.same(model, ranked[0])]
-    # Of a place that was met in an early stage and better in a late one the early one counts, if that is more.
-    charge = estimator.evidence(ranked[0]) - max(estimator.evidence(one) - estimator.charge(one) for one in versions)
-    places = [(estimator.evidence(model) - charge, model) for model in ranked]
-    (score, best), *rest = places
-    second, runner_up = next((one for one in rest if not estimator.same(one[1], best)), (-math.inf, None))
-    return replace(result, best=best, score=score, runner_up=runner_up, runner_up_score=second), places
+def _fits(estimator: TripleEstimator, standing: Standing) -> tuple[Fit, ...]:
+    """Return the likeliest place, and the best other one."""
+    model, lead = standing.model, standing.log10_lead
+    measure_corners(estimator, model, lead)
+    fits = [_fit(estimator, model, lead)]
+    if standing.rival is not None:
+        fits.append(_fit_of_rival(estimator, standing.rival, -lead))
+    return tuple(filter(None, fits))
 
 
-def _put_first(
-    proof: Proof,
-    estimator: TripleEstimator,
-    result: SearchResult[Hypothesis],
-    places: Sequence[tuple[float, Hypothesis]],
-) -> tuple[SearchResult[Hypothesis], list[tuple[float, Hypothesis]]]:
-    """Put the place first that leads its twins, with the odds by which it does."""
-    others = [(score, model) for score, model in places if not estimator.same(model, proof.model)]
-    second, runner_up = others[0] if others else (-math.inf, None)
-    first = replace(result, best=proof.model, score=proof.log10_odds, runner_up=runner_up, runner_up_score=second)
-    return first, [(proof.log10_odds, proof.model), *others]
-
-
-def _fits(
-    estimator: TripleEstimator,
-    result: SearchResult[Hypothesis],
-    places: Sequence[tuple[float, Hypothesis]],
-    proof: Proof | None,
-) -> tuple[Fit, ...]:
-    """Return the best place, the runner-up, and of the other promising ones the one that agrees best."""
-    measure_corners(estimator, result.best, result.score)
-    best = _fit(estimator, result.best, result.score)
-    if best is not None and proof is not None:
-        best = replace(best, by_twins=True, twin=proof.twin)
-    chosen = [best, _fit(estimator, result.runner_up, result.runner_up_score)]
-    leaders = [model for model in (result.best, result.runner_up) if model is not None]
-    others = [
-        _fit(estimator, model, score)
-        for score, model in places
-        if not any(estimator.same(model, leader) for leader in leaders)
-    ]
-    chosen.append(max(filter(None, others), key=lambda fit: fit.agreement, default=None))
-    return tuple(filter(None, chosen))
-
-
-def _fit(estimator: TripleEstimator, model: Hypothesis | None, score: float) -> Fit | None:
+def _fit(estimator: TripleEstimator, model: Hypothesis, lead: float) -> Fit | None:
     """Return a place that was verified."""
-    if model is None or model.refined is None or model.found is None or model.distance is None:
-        return None
-    if not math.isfinite(score):
+    if model.refined is None or model.found is None or model.distance is None:
         return None
     found, refined = model.found, model.refined
     return Fit(
@@ -366,7 +311,8 @@ def _fit(estimator: TripleEstimator, model: Hypothesis | None, score: float) -> 
         model.matched,
         model.distance,
         found.forward,
-        score,
+        lead,
+        model.log10_likelihood,
         refined.corner_sigma_m,
         refined.corner_covariance_m2,
         refined.lens_k1,
@@ -374,11 +320,17 @@ def _fit(estimator: TripleEstimator, model: Hypothesis | None, score: float) -> 
     )
 
 
-def promising_options(options: LocateOptions) -> MatchOptions:
-    """Call every place promising that may be reported, or come within the margin of one that is; heed the effort."""
-    least = options.min_log10_odds - options.min_margin
-    verify = replace(options.match.verify, promising=min(options.match.verify.promising, least))
-    match = replace(options.match, verify=verify)
+def _fit_of_rival(estimator: TripleEstimator, matrix: FloatArray, lead: float) -> Fit:
+    """Return the best other place."""
+    scene, index, verify = estimator.scene, estimator.index, estimator.options.verify
+    gsd, seeds = sampling(matrix, scene.size), np.empty(0, np.int64)
+    found, matched, distance = agreement(matrix, scene, index, gsd, seeds, verify)
+    return Fit(index, matrix, matched, distance, found.forward, lead, agreement=found.mean)
+
+
+def _of_effort(options: LocateOptions) -> MatchOptions:
+    """Return the options of matching; where effort is low roads do not propose, and one anchor is enough."""
+    match = options.match
     return match if options.effort == "full" else replace(match, roads=None, sightings=1)
 
 

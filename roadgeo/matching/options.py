@@ -8,8 +8,8 @@ from typing import Literal
 from roadgeo.matching.estimator import MatchOptions
 from roadgeo.matching.paper.tuples import PairOptions
 from roadgeo.matching.query import QueryOptions
+from roadgeo.matching.rivals import RivalOptions
 from roadgeo.matching.search import SearchOptions
-from roadgeo.matching.twins import TwinOptions
 
 __all__ = ["LocateOptions"]
 
@@ -25,14 +25,11 @@ class LocateOptions:
     near : (lon, lat, radius in metres) or None
         The middle of the frame is known to lie there.
     min_log10_odds : float
-        Places with less are not reported as located.
+        Powers of ten by which a place must explain more than any other place to be reported as located.
     min_margin : float
-        Log10 odds by which the best place must lead any other; otherwise the answer is "ambiguous".
+        The same, against a place on another reference, or that another look at the scene found.
     min_intersections : int
         Masks with fewer are not searched.
-    twins : TwinOptions or None
-        Whether and how a weak place among streets that repeat is compared with its twins around, piece by piece: one
-        that does not lead them is ambiguous, and one that leads them clearly needs no better odds against chance.
     truths : tuple of (str, lon, lat)
         For explanations: where the middle of the frame of masks whose names end so really lies. The search does not
         look at it.
@@ -51,11 +48,11 @@ class LocateOptions:
     min_log10_odds: float = 3.5
     min_margin: float = 2.0
     min_intersections: int = 1
-    twins: TwinOptions | None = field(default_factory=lambda: TwinOptions.nearby(4000.0, n_places=40))
     truths: tuple[tuple[str, float, float], ...] = ()
     threads: int = 1
     elsewhere: int = 0
     query: QueryOptions = field(default_factory=QueryOptions)
     match: MatchOptions = field(default_factory=MatchOptions)
+    rivals: RivalOptions = field(default_factory=RivalOptions)
     search: SearchOptions = field(default_factory=SearchOptions)
     pair: PairOptions = field(default_factory=PairOptions)

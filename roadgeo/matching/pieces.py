@@ -20,7 +20,7 @@ from roadgeo.matching.index import ReferenceIndex
 from roadgeo.matching.scene import Scene
 from roadgeo.matching.verification import VerifyOptions, tolerance_m
 
-__all__ = ["PieceCounts", "Pieces", "log10_lead", "sample_roads", "share_won"]
+__all__ = ["PieceCounts", "Pieces", "log10_lead", "sample_roads"]
 
 
 class PieceCounts(NamedTuple):
@@ -44,10 +44,6 @@ class PieceCounts(NamedTuple):
         """Share of the roads that agree; a half where there are none."""
         there = self.drawn + self.mapped
         return np.asarray(np.where(there > 0, (self.agreeing + self.shown) / np.maximum(there, 1e-9), 0.5))
-
-    def worth(self, unseen: float) -> FloatArray:
-        """Return the metres of the query's roads that agree, less `unseen` times those of the map that it lacks."""
-        return self.agreeing - unseen * (self.mapped - self.shown)
 
 
 @dataclass(frozen=True, eq=False)
@@ -152,20 +148,6 @@ def sample_roads(index: ReferenceIndex, low: FloatArray, high: FloatArray, step_
     segment = np.minimum(np.searchsorted(along, at, side="right") - 1, len(a) - 1)
     share = (at - along[segment]) / np.maximum(np.diff(along)[segment], 1e-9)
     return np.asarray(a[segment] + share[:, None] * (b - a)[segment])
-
-
-def share_won(
-    matrix: FloatArray, scene: Scene, index: ReferenceIndex, gsd_m: float, verify: VerifyOptions, n: int = 4
-) -> float:
-    """Return which share of the roads lies where most of them agree, of a frame cut into n x n pieces.
-
-    Where either the query or the map has no roads nothing is won or lost.
-    """
-    ground = Homography(matrix).everywhere(scene.corners)
-    pieces = Pieces(scene, index, gsd_m, max(scene.size) * gsd_m / n, verify)
-    counted = pieces.count(matrix, sample_roads(index, ground.min(axis=0), ground.max(axis=0), pieces.step_m))
-    weight = np.minimum(counted.drawn, counted.mapped)
-    return float(weight[counted.shares >= 0.5].sum() / weight.sum()) if weight.any() else 1.0
 
 
 #: Weighted sums of random signs exceed their standard deviation times z at most so many times as often as a normal

@@ -87,14 +87,6 @@ class Record:
     def finished(self, estimator: TripleEstimator, result: SearchResult[Hypothesis]) -> None:
         """Keep the result, and grow what points elsewhere than a camera may: to tell that it would fit."""
         self.estimator, self.result = estimator, result
-        if result.best is not None:
-            charge = estimator.evidence(result.best) - result.score
-            self.models = [
-                replace(one, log10_odds=estimator.evidence(one.model) - charge)
-                if math.isfinite(one.log10_odds)
-                else one
-                for one in self.models
-            ]
         for proposals in self.elsewhere:
             for hypothesis in estimator.grow(proposals, np.arange(len(proposals.reference)))[:_MAX_RETRIED]:
                 fault = estimator.judge(hypothesis.matrix, rough=True)
@@ -107,7 +99,6 @@ def without_limits(record: Record, estimator: TripleEstimator) -> list[Scored]:
     scene, index, options = estimator.scene, estimator.index, estimator.options
     camera = CameraOptions(gsd_m=(0.0, math.inf), max_tilt_deg=180.0, max_skew=math.inf)
     free = TripleEstimator(scene, index, replace(options, camera=camera), ledger=estimator.ledger)
-    free.chances = list(estimator.chances)
     nobody = np.empty(0, np.int64)
     compared = []
     for fault, unscaled in record.unscaled:

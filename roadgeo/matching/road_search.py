@@ -163,15 +163,13 @@ class RoadSearch:
         options: RoadSearchOptions,
         near: tuple[float, float, float] | None = None,
         ahead: Ahead = ALONE,
-        voters: IntArray | None = None,
         turnout: Turnout | None = None,
     ) -> None:
         """`near` = (x, y, radius) in plane metres restricts where the middle of the frame may lie.
 
-        Of the query's intersections only the `voters` propose. Parts that are searched together share the `turnout`.
+        Parts that are searched together share the `turnout`.
         """
-        self.voters = np.arange(len(scene.intersections)) if voters is None else voters
-        options = options.each_of(len(self.voters))
+        options = options.each_of(len(scene.intersections))
         self.scene, self.options, self.ahead = scene, options, ahead
         self.n_tried = 0
         self.turnout = turnout or Turnout(options, len(index))
@@ -188,8 +186,8 @@ class RoadSearch:
 
         `only` names the anchors to try. None is tried twice.
         """
-        xy, options = self.scene.intersections.xy[self.voters], self.options
-        anchors = islice(farthest_first(xy, self.voters), options.max_anchors) if only is None else only
+        xy, options = self.scene.intersections.xy, self.options
+        anchors = islice(farthest_first(xy, np.arange(len(xy))), options.max_anchors) if only is None else only
         for n, (anchor, steps) in enumerate(self.ahead.map(self._vote, anchors)):
             if only is None and not self.turnout.includes(n):
                 return

@@ -206,10 +206,10 @@ def search(estimator: Estimator[Model], options: SearchOptions | None = None) ->
 
 
 class Proves(Protocol[Model]):
-    """Tells whether an answer that does not stand out by its score is proved otherwise."""
+    """Finds an answer that does not stand out by its score, and is proved otherwise."""
 
-    def __call__(self, one: Search[Model]) -> bool:
-        """Whether an answer of a part is; asked at the end of each stage."""
+    def __call__(self, parts: Sequence[Search[Model]]) -> Search[Model] | None:
+        """Return the part that holds it, if any does; asked at the end of each stage."""
 
 
 class Same(Protocol[Model]):
@@ -229,7 +229,7 @@ def search_together(
 
     A round of each part in turn, one stage after another. A part whose answer stands out goes on alone until that is
     settled. What led there is tried on all other parts then: if they hold a twin, it is found, and the search goes on.
-    At the end of a stage an answer of the part that has the best one may be proved otherwise.
+    At the end of a stage an answer may be proved otherwise.
     """
     options = options or SearchOptions()
     ended_by = _Together(parts, options, same, proves).run()
@@ -286,11 +286,11 @@ class _Together(Generic[Model]):
         return ""
 
     def _is_proved(self) -> bool:
-        """Whether an answer of the part that has the best one is proved otherwise than by its score."""
-        best = max(self.parts, key=lambda one: one.lead)
-        if self.proves is None or not self.proves(best):
+        """Whether an answer is proved otherwise than by its score."""
+        proved = None if self.proves is None else self.proves(self.parts)
+        if proved is None:
             return False
-        best.stopped = "accepted"
+        proved.stopped = "accepted"
         return True
 
     def _try_elsewhere(self, one: Search[Model]) -> None:

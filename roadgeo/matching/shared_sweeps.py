@@ -14,7 +14,7 @@ from typing import Generic, NamedTuple, Protocol, TypeAlias, TypeVar
 
 import numpy as np
 
-from roadgeo._arrays import BoolArray, FloatArray, IntArray
+from roadgeo._arrays import BoolArray, IntArray
 from roadgeo.geometry.camera import CameraOptions
 from roadgeo.matching.ahead import ALONE, Ahead
 from roadgeo.matching.growing import GrowOptions
@@ -23,7 +23,6 @@ from roadgeo.matching.index import ReferenceIndex
 from roadgeo.matching.road_search import RoadSearchOptions, Turnout
 from roadgeo.matching.scene import Scene
 from roadgeo.matching.sweeps import Source
-from roadgeo.matching.tilted import TiltOptions, likely_views
 from roadgeo.matching.triples import Proposals
 
 __all__ = ["Member", "SharedSweeps", "Stage"]
@@ -87,8 +86,7 @@ class SharedSweeps(Generic[AnyMember]):
         self.members: list[AnyMember] = []
         self._rounds: dict[int, Iterator[_Round]] = {}
         self._done: dict[int, list[_Round]] = {}
-        self._views: dict[TiltOptions, list[FloatArray]] = {}
-        self._turnouts: dict[tuple[int, float], Turnout] = {}
+        self._turnouts: dict[float, Turnout] = {}
 
     def rounds(self, member: AnyMember, stage: Stage) -> Iterator[list[Hypothesis]]:
         """Yield what grew on a part from the proposals of one anchor after another, until enough were screened."""
@@ -109,16 +107,10 @@ class SharedSweeps(Generic[AnyMember]):
         found = (one.grown.pop(id(member), []) for one in self._done.get(stage, []) if one.anchor == anchor)
         return next(found, [])
 
-    def views(self, options: TiltOptions) -> list[FloatArray]:
-        """Return how the scene may look from above (see `tilted.likely_views`), for all parts alike."""
-        if options not in self._views:
-            self._views[options] = likely_views(self.scene, options)
-        return self._views[options]
-
-    def turnout(self, view: int, coarseness: float, options: RoadSearchOptions) -> Turnout:
-        """Return how many intersections vote in a view of the scene, on all parts of some coarseness alike."""
+    def turnout(self, coarseness: float, options: RoadSearchOptions) -> Turnout:
+        """Return how many intersections of the scene vote, on all parts of some coarseness alike."""
         n_map = sum(len(member.index) for member in self.members if member.index.coarseness == coarseness)
-        return self._turnouts.setdefault((view, coarseness), Turnout(options, n_map))
+        return self._turnouts.setdefault(coarseness, Turnout(options, n_map))
 
     def end(self) -> None:
         """Let go of the parts: each holds on to this, and a cycle would keep their maps open for a while."""

@@ -9,27 +9,20 @@ from time import perf_counter
 
 import numpy as np
 
-from roadgeo.geometry.camera import CameraOptions, sampling
+from roadgeo.geometry.camera import CameraOptions
 from roadgeo.geometry.projection import from_lonlat, metres_apart
 from roadgeo.location import Location, Place, Reason, Seen, Stats
-from roadgeo.matching.lens import straighten_scene
 from roadgeo.matching.methods import Fit, Found
 from roadgeo.matching.options import LocateOptions
 from roadgeo.matching.parts import same_within_m
 from roadgeo.matching.placing import center_of, place_frame
 from roadgeo.matching.query import Query
-from roadgeo.matching.scene import Scene
-from roadgeo.matching.twins import best_twin, loses_part
-from roadgeo.matching.verification import chance_agreement
 
 __all__ = ["Needed", "decide", "needed_of"]
 
 
 #: What is said where the clock ended a search: the one case in which an answer depends on the machine and its load.
 _CUT_SHORT = "so that another run may tell otherwise"
-
-#: A rival whose intersections and roads agree by so much more, as a share, makes the best place ambiguous.
-_FULLER = 0.05
 
 #: Mean share of intersections and roads that agree as at the true place of a good mask.
 _LIKE_THE_TRUTH = 0.85
@@ -90,36 +83,12 @@ def _judge(query: Query, found: Sequence[Found], options: LocateOptions) -> Loca
         return _refuse(location, query, found, best, options)
     placed = place_frame(_on(location, best.found), query, best.fit, options.match)
     cut = f"; stopped at the time limit, {_CUT_SHORT}" if location.stopped == "time" else ""
-    # It has a place: the answer, unless another place is as good.
-    if rival is not None and best.score < options.min_log10_odds:
-        return replace(placed, status="ambiguous", reason=_alike(best, rival) + cut, reason_code=Reason.TWO_PLACES)
-    if rival is not None and best.score - rival.score < options.min_margin:
-        return replace(placed, status="ambiguous", reason=_twins(best, rival) + cut, reason_code=Reason.TWO_PLACES)
-    elsewhere = next((one for one in rivals if one.found is not best.found and _are_alike(best, one)), None)
-    if best.fit.by_twins and elsewhere is not None:
-        reason = _alike(best, elsewhere) + cut
-        runner_up = replace(_seen_from(best, elsewhere), log10_odds=best.score)
-        return replace(placed, status="ambiguous", reason=reason, reason_code=Reason.TWO_PLACES, runner_up=runner_up)
-    fuller = next((one for one in rivals if _is_fuller(one, best, options)), None)
-    if fuller is not None:
-        reason = _fuller(best, fuller) + cut
-        runner_up = _seen_from(best, fuller)
-        return replace(placed, status="ambiguous", reason=reason, reason_code=Reason.TWO_PLACES, runner_up=runner_up)
-    twin = _twin(query, best, options)
-    if twin is not None and best.score - twin.log10_odds < options.min_margin:
-        reason = _repeated(best, twin) + cut
-        return replace(placed, status="ambiguous", reason=reason, reason_code=Reason.TWO_PLACES, runner_up=twin)
-    if twin is not None and _is_partly_lost(query, best, twin, options):
-        reason = (
-            f"no place on this map stands out: the best has log10 odds {best.score:.1f}, but streets repeat there, and "
-            f"in a part of the frame the roads do not agree{cut}"
-        )
-        lost = replace(_on(location, best.found), log10_odds=0.0)
-        return replace(lost, reason=reason, reason_code=Reason.NOTHING_STANDS_OUT)
-    against = "any other place where these streets repeat" if best.fit.by_twins else "chance"
+    if rival is not None and (best.score < options.min_log10_odds or _is_close(best, rival, options)):
+        reason = _two_places(best, rival) + cut
+        return replace(placed, status="ambiguous", reason=reason, reason_code=Reason.TWO_PLACES)
     reason = (
         f"{placed.n_matched} of {placed.n_intersections} intersections and {best.fit.agreeing:.0%} of the roads agree"
-        f"; odds 10^{best.score:.1f} against {against}{cut}"
+        f"; odds 10^{best.score:.1f} against any other place{cut}"
     )
     return replace(placed, status="located", reason=reason, reason_code=Reason.LOCATED)
 
@@ -161,10 +130,13 @@ def _on(location: Location, found: Found) -> Location:
 
 
 def _pool(query: Query, found: Sequence[Found]) -> list[_Candidate]:
-    """Return the places of all references, the best first; where parts overlap, each once."""
+    """Return the places of all references, the best first; where parts overlap, each once.
+
+    Of places on different references the likelier one is the best; it leads the other by the difference at most.
+    """
     pool = [_Candidate(one, fit, center_of(query, fit)) for one in found for fit in one.fits]
     distinct: list[_Candidate] = []
-    for candidate in sorted(pool, key=lambda candidate: -candidate.score):
+    for candidate in sorted(pool, key=lambda one: (-one.fit.log10_likelihood, -one.score)):
         if all(_differ(query, one, candidate) for one in distinct):
             distinct.append(candidate)
     return distinct
@@ -187,11 +159,11 @@ def _seen_from(best: _Candidate, rival: _Candidate) -> Place:
     return replace(rival.center, x=float(x), y=float(y))
 
 
-def _twins(best: _Candidate, rival: _Candidate) -> str:
-    on = ("", "")
-    if best.found.index.name != rival.found.index.name:
-        on = (f" on {best.found.index.name}", f" on {rival.found.index.name}")
-    return f"two places fit almost equally: log10 odds {best.score:.1f}{on[0]} and {rival.score:.1f}{on[1]}"
+def _is_close(best: _Candidate, rival: _Candidate, options: LocateOptions) -> bool:
+    """Whether a place on another reference explains almost as much."""
+    if rival.found is best.found:
+        return False
+    return best.fit.log10_likelihood - rival.fit.log10_likelihood < options.min_margin
 
 
 def _are_alike(best: _Candidate, rival: _Candidate) -> bool:
@@ -199,72 +171,13 @@ def _are_alike(best: _Candidate, rival: _Candidate) -> bool:
     return min(best.fit.agreement, rival.fit.agreement) >= _LIKE_THE_TRUTH
 
 
-def _alike(best: _Candidate, rival: _Candidate) -> str:
+def _two_places(best: _Candidate, rival: _Candidate) -> str:
+    on = ("", "")
+    if best.found.index.name != rival.found.index.name:
+        on = (f" on {best.found.index.name}", f" on {rival.found.index.name}")
     return (
-        f"two places fit almost equally, for streets repeat there: {best.fit.agreement:.0%} agrees at one, "
-        f"{rival.fit.agreement:.0%} at another"
-    )
-
-
-def _is_fuller(rival: _Candidate, best: _Candidate, options: LocateOptions) -> bool:
-    """Whether a rival that would do by itself agrees clearly better than the best place.
-
-    Chance is measured around each place. Where streets form a lattice it is high, so that the true place may score less
-    than a worse one where they do not (Chicago: 10^6 with 89 % against 10^13 with 74 %).
-    """
-    return rival.score >= options.min_log10_odds and rival.fit.agreement > best.fit.agreement + _FULLER
-
-
-def _fuller(best: _Candidate, rival: _Candidate) -> str:
-    return (
-        f"two places fit: one with log10 odds {best.score:.1f} agrees in {best.fit.agreement:.0%}, "
-        f"one with {rival.score:.1f} in {rival.fit.agreement:.0%}"
-    )
-
-
-def _twin(query: Query, best: _Candidate, options: LocateOptions) -> Place | None:
-    """Return the place that the roads would fit best beside a weak one where streets repeat, with odds by its lead.
-
-    Chance is measured nearby. Where a part of the frame fits a lattice it beats all shifts by whole blocks, as the true
-    place does; but that part fits as well wherever blocks have that size (a mask of Portland in Chicago: 10^6, with
-    72 % of the roads).
-    """
-    fit, match, twins = best.fit, options.match, options.twins
-    if twins is None or best.score >= twins.certain:
-        return None
-    scene = _scene_of(query, fit)
-    chance = chance_agreement(fit.matrix, scene, fit.index, sampling(fit.matrix, scene.size), match.verify)
-    if chance[1] < twins.repeating:
-        return None
-    within = None
-    if options.near is not None:
-        x, y = from_lonlat(fit.index.plane, np.array([options.near[:2]]))[0]
-        within = (float(x), float(y), options.near[2])
-    twin = fit.twin or best_twin(fit.matrix, scene, fit.index, match, twins, within)
-    if twin is None:
-        return None
-    there = center_of(query, replace(fit, matrix=twin.matrix))
-    return replace(there, log10_odds=best.score - twin.log10_lead)
-
-
-def _is_partly_lost(query: Query, best: _Candidate, twin: Place, options: LocateOptions) -> bool:
-    """Whether a place of which neither the odds nor its lead over its twin are high loses a part of the frame."""
-    fit, twins = best.fit, options.twins
-    if twins is None or max(best.score, best.score - twin.log10_odds) >= twins.weak:
-        return False
-    return loses_part(fit.matrix, _scene_of(query, fit), fit.index, options.match, twins)
-
-
-def _scene_of(query: Query, fit: Fit) -> Scene:
-    """Return the scene as a pinhole sees it, behind the lens of a fit."""
-    return straighten_scene(query.scene, fit.lens_k1) if fit.lens_k1 else query.scene
-
-
-def _repeated(best: _Candidate, twin: Place) -> str:
-    away = math.hypot(best.center.x - twin.x, best.center.y - twin.y)
-    return (
-        f"streets repeat: {away:.0f} m away they agree almost as well, piece by piece, as where the odds are "
-        f"10^{best.score:.1f} against chance"
+        f"two places fit almost equally, for streets repeat there: {best.fit.agreement:.0%} agrees at one{on[0]}, "
+        f"{rival.fit.agreement:.0%} at another{on[1]}"
     )
 
 

@@ -18,7 +18,7 @@ from roadgeo.geometry.frame import Frame
 from roadgeo.geometry.homography import Homography
 from roadgeo.geometry.mask import RoadMask
 
-__all__ = ["Mosaic", "MosaicOptions", "chain", "lay_down", "lay_together", "level", "unseen_before"]
+__all__ = ["Mosaic", "MosaicOptions", "chain", "lay_down", "lay_together", "level"]
 
 
 @dataclass(frozen=True)
@@ -132,16 +132,6 @@ def lay_down(
     columns, rows = np.ceil((high - low) * scale).astype(int) + 1
     shown, seen = _paint_all(masks, to_mosaic, (rows, columns), options)
     return Mosaic(RoadMask(shown, seen, masks[0].name), to_mosaic)
-
-
-def unseen_before(
-    masks: Sequence[RoadMask], mosaic: Mosaic, count: int, options: MosaicOptions | None = None
-) -> RoadMask:
-    """Return what a mosaic of these masks shows where none of its first `count` frames saw anything."""
-    options, shape = options or MosaicOptions(), mosaic.mask.shape
-    shown, seen = _paint_all(masks[count:], mosaic.to_mosaic[count:], shape, options)
-    fresh = seen & ~_paint_all(masks[:count], mosaic.to_mosaic[:count], shape, options)[1]
-    return RoadMask(shown & fresh, fresh, mosaic.mask.name)
 
 
 def _paint_all(

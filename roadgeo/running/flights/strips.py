@@ -19,7 +19,7 @@ from roadgeo._arrays import AnyArray, FloatArray
 from roadgeo.geometry.frame import Frame
 from roadgeo.geometry.homography import Homography, map_each
 from roadgeo.geometry.mask import PIXEL_TO_PLANE, RoadMask
-from roadgeo.matching.checking import check_place
+from roadgeo.matching.checking import CheckOptions, check_place
 from roadgeo.matching.query import trace_query
 from roadgeo.reference.reference import Reference
 from roadgeo.roads.vectorization import road_width
@@ -165,8 +165,12 @@ class _Net:
             return False
         scene = trace_query(one.frame.mask, self.options.locate.query)[0]
         start = one.pose.homography.matrix @ PIXEL_TO_PLANE
-        checked = check_place(start / start[2, 2], scene, one.reference.index, self.options.candidates.check)
+        checked = check_place(start / start[2, 2], scene, one.reference.index, _CHECK)
         return checked.verdict == "agrees"
+
+
+#: A frame is where it was put, as against a block beside.
+_CHECK = CheckOptions(tolerance_m=20.0, max_sigma_m=10.0)
 
 
 def _road_px(masks: Sequence[RoadMask]) -> float:

@@ -24,10 +24,10 @@ from roadgeo.geometry.mask import PIXEL_TO_PLANE, RoadMask
 from roadgeo.kernels.compilation import load
 from roadgeo.kernels.warmup import warm_up
 from roadgeo.location import Location
+from roadgeo.matching.evidence import Evidence
 from roadgeo.matching.options import LocateOptions
 from roadgeo.matching.query import Query, read_query, trace_query
 from roadgeo.matching.scene import Scene
-from roadgeo.matching.verification import agreement, chance_agreement, log10_odds
 from roadgeo.reference.reference import Reference
 from roadgeo.roads.vectorization import road_width
 from roadgeo.running.flights.candidates import CandidateOptions, Candidates, Look
@@ -36,8 +36,8 @@ from roadgeo.running.flights.pose import FilterOptions, Pose, correct, predict, 
 
 __all__ = ["Fix", "FlightFrame", "FrameStatus", "TrackOptions", "Tracked", "Tracker", "follow", "track"]
 
-#: Of a tracked frame chance is what the best so many of every n-th shift reach on average.
-_EVERY, _RIVALS = 6, 8
+#: A tracked frame is compared with so many places nearby.
+_N_SHIFTS = 25
 
 FrameStatus = Literal["located", "tracked", "predicted", "lost"]
 
@@ -258,7 +258,7 @@ class Tracker:
         return [Tracked(one.frame, "lost", why, known_at) for one in doubtful]
 
     def _no_candidates(self) -> Candidates:
-        return Candidates(self.references, self.options.candidates, self.options.mosaic)
+        return Candidates(self.references, self.options.candidates)
 
     def _forget(self) -> None:
         """Forget what earlier frames proposed."""
@@ -290,7 +290,7 @@ class Tracker:
         searched = n_seen >= least or self._waited >= self.options.more_frames
         if searched:
             self._looked_at, self._waited = n_seen, 0
-        look = Look(query, mosaic, [one.frame.number for one in self._window], masks, searched)
+        look = Look(query, mosaic, [one.frame.number for one in self._window], searched)
         location = self._candidates.look(look, self.look_options(mosaic, masks))
         if not location.located:
             return [Tracked(frame, "lost", f"{len(masks)} frames: {location.reason}", frame.number)]
@@ -423,11 +423,9 @@ def _scale(matrix: FloatArray, frame: Frame) -> float:
 def _odds(pose: Pose, scene: Scene, reference: Reference, options: LocateOptions) -> float:
     """Return the log10 odds of a frame at its place against chance nearby."""
     matrix = pose.homography.matrix @ PIXEL_TO_PLANE
-    nobody = np.empty(0, np.int64)
-    verify, index, gsd = options.match.verify, reference.index, pose.gsd_m
-    found, _, _ = agreement(matrix, scene, index, gsd, nobody, verify)
     # The frame was followed here, so that where streets are alike a block beside it, by which a search is judged, is no
-    # rival: shifts that meet whole blocks are left out, and what it would agree in elsewhere several of the best tell.
-    nearby = replace(verify, n_anchors=0)
-    chance = chance_agreement(matrix, scene, index, gsd, nearby, _EVERY, _RIVALS)
-    return log10_odds(found, chance, scene.n_statements, 1, verify)
+    # rival: shifts that meet whole blocks are left out.
+    evidence = Evidence(
+        scene, reference.index, pose.gsd_m, replace(options.match.evidence, n_anchors=0, n_shifts=_N_SHIFTS)
+    )
+    return evidence.weigh(matrix) - max(evidence.nearby(matrix), 0.0)

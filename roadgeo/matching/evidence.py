@@ -1,0 +1,195 @@
+"""One likelihood: how well a place explains what the query shows, and what the map shows there.
+
+Each piece of the query's roads either lies on a road of the map, off it by a residual, or is false; each piece of the
+map's roads in the frame either is seen, off by a residual, or is missing. Under a place H
+
+    log L(H) = sum over the query's roads  log[ (1 - f) g(r; sigma) / b + f ]
+             + sum over the map's roads    log[ (1 - m) g(r; sigma) / b + m ]
+
+with r the residual, g half a normal density, b the density of residuals where roads lie anyhow, f the share of false
+roads and m that of missing ones. How false, how patchy and how inexact a query is nobody knows: sigma, m and f are
+marginalised over a small grid. Neighbouring pieces agree together, so that `statement_m` metres of road count once.
+
+What a place is worth is its lead over the best other one (see `rivals`); by itself log L says little where streets
+repeat.
+"""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass
+
+import numpy as np
+
+from roadgeo._arrays import FloatArray
+from roadgeo.geometry.homography import Homography
+from roadgeo.kernels.roads import count_residuals, shares_near_roads
+from roadgeo.matching.index import ReferenceIndex
+from roadgeo.matching.scene import Scene
+
+__all__ = ["Evidence", "EvidenceOptions"]
+
+#: Grid of what is marginalised: residuals' deviation, in units of what is usual; shares of missing, and of false roads.
+_SIGMAS = np.array([0.25, 0.4, 0.65, 1.0, 1.6])
+_SHARES = np.array([0.03, 0.1, 0.25, 0.5, 0.75])
+#: Residuals are looked at up to so many usual deviations, in so many bins.
+_REACH, _BINS = 4.0, 24
+#: Share of road pieces that have a road so near, and along, anyhow: of the query's, and of the map's, whose directions
+#: are not compared.
+_ANYHOW = (0.1, 0.25)
+#: The distance to the query's roads is known to so many cells of its raster.
+_BLUR_CELLS = 0.35
+
+
+@dataclass(frozen=True)
+class EvidenceOptions:
+    """What residuals are usual, and how much road is one statement.
+
+    Attributes
+    ----------
+    map_sigma_m, pixel_sigma_px : float
+        Usual distance between a mapped road and the road, and usual error of a traced one.
+    statement_m : float
+        So much road, of the query and of the map together, counts as one independent statement. It is calibrated: the
+        lead of a wrong place over the best other one then exceeds x powers of ten about once in 10^x searches.
+    step_m : float
+        The map's roads are sampled once in so many metres.
+    max_turn_deg : float
+        Roads agree whose directions differ by less.
+    shift_m, n_shifts, n_anchors, n_points : (float, float), int, int, int
+        Places nearby: shifts of these lengths, spread evenly, and those that lay one of `n_anchors` intersections of
+        the map near the middle on others around it; they are compared by so many road points first.
+    """
+
+    map_sigma_m: float = 1.8
+    pixel_sigma_px: float = 1.0
+    statement_m: float = 480.0
+    step_m: float = 6.0
+    max_turn_deg: float = 25.0
+    shift_m: tuple[float, float] = (30.0, 320.0)
+    n_shifts: int = 150
+    n_anchors: int = 3
+    n_points: int = 150
+
+    @property
+    def min_cos(self) -> float:
+        """Cosine of the angle within which roads agree."""
+        return math.cos(math.radians(self.max_turn_deg))
+
+
+class Evidence:
+    """Weighs places of one scene on one map, all with the same yardstick.
+
+    Attributes
+    ----------
+    gsd_m : float
+        Metres per pixel by which roads are measured. A place at another scale is compared within as many pixels: within
+        as many metres roads would agree anyhow wherever the frame is laid small.
+    """
+
+    def __init__(
+        self, scene: Scene, index: ReferenceIndex, gsd_m: float, options: EvidenceOptions | None = None
+    ) -> None:
+        self.scene, self.index, self.gsd_m, self.options = scene, index, gsd_m, options or EvidenceOptions()
+        self._sigma_m = math.hypot(self.options.map_sigma_m, self.options.pixel_sigma_px * gsd_m)
+        blur = _BLUR_CELLS * scene.field_scale * gsd_m / self._sigma_m
+        self._of_query = _log_ratios(_SIGMAS, _ANYHOW[0])
+        self._of_map = _log_ratios(np.hypot(_SIGMAS, blur), _ANYHOW[1])
+        self._counts = np.empty(_BINS + 1), np.empty(_BINS + 1)
+
+    def weigh(self, matrix: FloatArray) -> float:
+        """Return log10 L of a place, query plane to reference plane (3, 3)."""
+        scene, index, options = self.scene, self.index, self.options
+        scale = _sampling(matrix, scene) / self.gsd_m
+        ground = Homography(matrix).everywhere(scene.corners)
+        seen, mapped = self._counts
+        count_residuals(
+            matrix, np.asarray(np.linalg.inv(matrix), float), np.concatenate([ground.min(axis=0), ground.max(axis=0)]),
+            scene.points, scene.directions, scene.weights, _REACH * self._sigma_m * scale, options.min_cos,
+            options.step_m, index.road_buckets, scene.field, scene.field_scale, scene.observed, seen, mapped,
+        )  # fmt: skip
+        spacing_px = scene.road_length_px / max(len(scene.points), 1)
+        by_query = self._of_query @ (seen * spacing_px)  # (sigma, false)
+        by_map = self._of_map @ mapped  # (sigma, missing)
+        nats = (by_query[:, :, None] + by_map[:, None, :]) * (self.gsd_m / options.statement_m)
+        most = float(nats.max())
+        return (most + math.log(float(np.exp(nats - most).mean()))) / math.log(10.0)
+
+    def nearby(self, matrix: FloatArray, near: tuple[float, float, float] | None = None) -> float:
+        """Return log10 L of the best place that a shift leads to.
+
+        Shifts lie on a sunflower spiral, so that all directions and distances are met evenly, and where intersections
+        of the map come to lie on others, unless that takes the middle of the frame out of the circle `near` =
+        (x, y, radius), plane metres.
+        """
+        scene, options = self.scene, self.options
+        reach_m = 2.0 * self._sigma_m * _sampling(matrix, scene) / self.gsd_m
+        shifts = np.concatenate((self._spiral(reach_m), self._onto_neighbours(matrix, reach_m, near)))
+        shares = np.empty(len(shifts))
+        thin = max(1, len(scene.points) // options.n_points)
+        points, directions, weights = (
+            np.ascontiguousarray(array[::thin]) for array in (scene.points, scene.directions, scene.weights)
+        )
+        shares_near_roads(
+            matrix, points, directions, weights, reach_m, options.min_cos, shifts, self.index.road_buckets, shares
+        )
+        best = np.argsort(-shares, kind="stable")[:_WEIGHED]
+        return max((self.weigh(_shifted(matrix, shifts[k])) for k in best), default=0.0)
+
+    def _least_shift(self, reach_m: float) -> float:
+        """Shifts no shorter than three times what roads may be apart, and agree: nearer is the place itself."""
+        return max(1.0, 4.5 * reach_m / self.options.shift_m[0])
+
+    def _spiral(self, reach_m: float) -> FloatArray:
+        """Return shifts (n_shifts, 2) in metres on a sunflower spiral."""
+        k, wider = np.arange(self.options.n_shifts), self._least_shift(reach_m)
+        low, high = (wider * end for end in self.options.shift_m)
+        radius = np.sqrt(low**2 + (high**2 - low**2) * (k + 0.5) / len(k))
+        angle = k * math.pi * (3.0 - math.sqrt(5.0))
+        return np.stack((radius * np.cos(angle), radius * np.sin(angle)), axis=1)
+
+    def _onto_neighbours(
+        self, matrix: FloatArray, reach_m: float, within: tuple[float, float, float] | None
+    ) -> FloatArray:
+        """Return shifts (M, 2) in metres that lay an intersection of the map near the frame's middle on others."""
+        options, wider = self.options, self._least_shift(reach_m)
+        low, high = (wider * end for end in options.shift_m)
+        middle = Homography(matrix)(self.scene.center)
+        near = self.index.within(middle, 2.0 * high)
+        if not len(near):
+            return np.empty((0, 2))
+        anchors = near[np.argsort(((near - middle) ** 2).sum(axis=1))[: options.n_anchors]]
+        shifts = (near - anchors[:, None]).reshape(-1, 2)
+        length = np.hypot(*shifts.T)
+        possible = (length > low) & (length < high)
+        if within is not None:
+            possible &= np.hypot(*(middle + shifts - within[:2]).T) <= within[2]
+        shifts, length = shifts[possible], length[possible]
+        return np.asarray(shifts[np.argsort(length)[: options.n_shifts]])
+
+
+#: So many of the shifts that lay most road points on roads are weighed.
+_WEIGHED = 12
+
+
+def _sampling(matrix: FloatArray, scene: Scene) -> float:
+    width, height = scene.size
+    return math.sqrt(abs(Homography(matrix).area_scale(width / 2, -height / 2)))
+
+
+def _shifted(matrix: FloatArray, shift: FloatArray) -> FloatArray:
+    """Return a place (3, 3) moved by a shift (2,) in metres."""
+    moved = matrix.copy()
+    moved[:2] += np.outer(shift, matrix[2])
+    return moved
+
+
+def _log_ratios(sigmas: FloatArray, anyhow: float) -> FloatArray:
+    """Return log likelihood ratios (sigma, share, bin) of a residual, against a road that lies there anyhow.
+
+    `sigmas` and residuals count usual deviations; the last bin is no road within reach.
+    """
+    residual = (np.arange(_BINS) + 0.5) * (_REACH / _BINS)
+    density = math.sqrt(2.0 / math.pi) / sigmas[:, None] * np.exp(-0.5 * (residual / sigmas[:, None]) ** 2)
+    ratio = np.concatenate((density * (_REACH / anyhow), np.zeros((len(sigmas), 1))), axis=1)
+    return np.asarray(np.log((1.0 - _SHARES)[None, :, None] * ratio[:, None, :] + _SHARES[None, :, None]))

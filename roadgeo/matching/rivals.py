@@ -1,0 +1,187 @@
+"""The best other place: always looked for, and compared with the best place by one likelihood.
+
+A place is worth its lead over the best other one. Where streets form a lattice other places explain a query almost as
+well: what both explain tells nothing, and what only one explains speaks for that one. Others are those that the search
+met, and those that shifts and turns of the place lead to, on the map around it. Where one of them explains more, it is
+the best place, and is compared in its turn.
+"""
+
+from __future__ import annotations
+
+import math
+import time
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, field
+from typing import NamedTuple
+
+import numpy as np
+
+from roadgeo._arrays import FloatArray, IntArray
+from roadgeo.geometry.camera import judge, sampling
+from roadgeo.geometry.homography import Homography
+from roadgeo.matching.estimator import MatchOptions, TripleEstimator
+from roadgeo.matching.evidence import Evidence
+from roadgeo.matching.hypothesis import Hypothesis
+from roadgeo.matching.index import ReferenceIndex
+from roadgeo.matching.ledger import Ledger
+from roadgeo.matching.local_search import LocalSearchOptions, Shift, move_about, search_nearby
+from roadgeo.matching.refinement import refine
+from roadgeo.matching.scene import Scene
+from roadgeo.matching.search import Search
+from roadgeo.matching.triples import larger
+from roadgeo.matching.verification import agreement
+
+__all__ = ["RivalOptions", "Rivals", "Standing", "similar_places"]
+
+_NO_SEEDS: IntArray = np.array([], np.int64)
+
+#: Streets that cross at right angles fit themselves when they are turned by one.
+_TURNS_DEG = (0.0, 90.0, 180.0, 270.0)
+#: So often another place may turn out to be the better one.
+_MOST_TURNS = 4
+
+
+@dataclass(frozen=True)
+class RivalOptions:
+    """Where other places are looked for.
+
+    Attributes
+    ----------
+    certain : float
+        A place that leads all places nearby by so many powers of ten is not compared further. Of wrong places none led
+        by more than half of that.
+    n_known : int
+        So many of the places that the search met are compared, the likeliest.
+    n_places, n_laid : int
+        So many places that most road points fit are laid roughly, and so many of them, the likeliest, finely.
+    n_points : int
+        Road points that each is laid by roughly.
+    apart : float
+        Middles of two places lie further from each other than this share of half the frame's diagonal.
+    """
+
+    certain: float = 12.0
+    n_known: int = 12
+    n_places: int = 40
+    n_laid: int = 8
+    n_points: int = 200
+    apart: float = 0.04
+    search: LocalSearchOptions = field(
+        default_factory=lambda: LocalSearchOptions(
+            reach_m=4000.0, turn_deg=0.0, cell_m=10.0, road_m=20.0, max_points=200, n_places=40
+        )
+    )
+
+
+class Standing(NamedTuple):
+    """A place, the best other one (3, 3) if there is any, and by how many powers of ten the place leads it."""
+
+    model: Hypothesis
+    rival: FloatArray | None
+    log10_lead: float
+
+
+class Rivals:
+    """Compares the likeliest place of each part of a map with the best other one; each place once."""
+
+    def __init__(
+        self,
+        estimators: Mapping[Search[Hypothesis], TripleEstimator],
+        options: RivalOptions,
+        ledger: Ledger,
+        needed: float,
+    ) -> None:
+        """Places of fewer powers of ten than `needed` are not compared."""
+        self.estimators, self.options, self.ledger, self.needed = estimators, options, ledger, needed
+        self._known: dict[int, Standing] = {}
+
+    def __call__(self, parts: Sequence[Search[Hypothesis]]) -> Search[Hypothesis] | None:
+        """Return the part whose likeliest place leads all others by twice what is needed, if there is one."""
+        best = max(parts, key=self._likelihood)
+        if max((model.log10_odds for model in self.estimators[best].verified), default=-math.inf) < self.needed:
+            return None  # a place that was met is too good a rival already
+        standing = self.standing(best)
+        return best if standing is not None and standing.log10_lead >= 2.0 * self.needed else None
+
+    def _likelihood(self, one: Search[Hypothesis]) -> float:
+        return max((model.log10_likelihood for model in self.estimators[one].verified), default=-math.inf)
+
+    def standing(self, one: Search[Hypothesis]) -> Standing | None:
+        """Compare the likeliest place of a part with the best other one; None where nothing was verified."""
+        estimator = self.estimators[one]
+        ranked = sorted(estimator.verified, key=lambda model: -model.log10_likelihood)
+        if not ranked:
+            return None
+        started = time.perf_counter()
+        best = ranked[0]
+        for _ in range(_MOST_TURNS):
+            standing = self._known.get(id(best)) or self._compare(estimator, best, ranked)
+            self._known[id(best)] = standing
+            if standing.rival is None or standing.log10_lead > 0.0:
+                break
+            best = self._take(estimator, standing.rival, ranked)
+        one.seconds += time.perf_counter() - started
+        return standing
+
+    def _compare(self, estimator: TripleEstimator, best: Hypothesis, ranked: Sequence[Hypothesis]) -> Standing:
+        scene, index, options, matrix = estimator.scene_of(best), estimator.index, self.options, best.laid
+        if best.log10_likelihood < self.needed or best.log10_odds >= options.certain:
+            return Standing(best, None, best.log10_odds)
+        evidence = Evidence(scene, index, sampling(matrix, scene.size), estimator.options.evidence)
+        worth, middle = evidence.weigh(matrix), Homography(matrix).everywhere(scene.center)
+        apart_m = options.apart * scene.half_size * evidence.gsd_m
+        known = [model.laid for model in ranked[1 : 1 + options.n_known]]
+        rival, most = None, 0.0
+        for other in [*known, *similar_places(matrix, evidence, estimator.options, options)]:
+            there = Homography(other).everywhere(scene.center)
+            if not np.hypot(*(there - middle)) > apart_m or not estimator.may_be(other):
+                continue
+            likelihood = evidence.weigh(other)
+            if likelihood > most:
+                rival, most = other, likelihood
+        # The larger the map, the more places may lead all that lie around them.
+        paid = 2.0 * math.log10(larger(self.ledger.n_reference))
+        lead = worth - max(most, evidence.nearby(matrix, estimator.near))
+        return Standing(best, rival, lead - paid if lead > 0.0 else min(lead, 0.0))
+
+    def _take(self, estimator: TripleEstimator, matrix: FloatArray, ranked: Sequence[Hypothesis]) -> Hypothesis:
+        """Return the hypothesis of a place that explains more than the likeliest: one that was met, or a new one."""
+        known = next((model for model in ranked if model.laid is matrix), None)
+        if known is not None:
+            return known
+        scene, index, options = estimator.scene, estimator.index, estimator.options
+        _, matched, _ = agreement(matrix, scene, index, sampling(matrix, scene.size), _NO_SEEDS, options.verify)
+        model = Hypothesis(matrix, _NO_SEEDS, 1.0, matched, by_roads=True)
+        estimator.score(model)
+        return model
+
+
+def similar_places(
+    matrix: FloatArray, evidence: Evidence, match: MatchOptions, options: RivalOptions
+) -> list[FloatArray]:
+    """Return other places (3, 3) around one that most of the roads would fit, each laid as well as it can be."""
+    scene, index = evidence.scene, evidence.index
+    center = Homography(matrix).everywhere(scene.center)
+    found: list[tuple[float, FloatArray]] = []
+    for turn in _TURNS_DEG:
+        turned = move_about(center, Shift(0.0, 0.0, turn, 1.0, 0.0)) @ matrix
+        shifts = search_nearby(turned, scene, index, options.search)
+        found += [(shift.share, move_about(center, shift) @ turned) for shift in shifts]
+    found.sort(key=lambda one: -one[0])
+    roughly = [_lay(start, scene, index, match, options.n_points) for _, start in found[: options.n_places]]
+    roughly.sort(key=evidence.weigh, reverse=True)
+    return [_lay(start, scene, index, match, None) for start in roughly[: options.n_laid]]
+
+
+def _lay(
+    start: FloatArray, scene: Scene, index: ReferenceIndex, match: MatchOptions, n_points: int | None
+) -> FloatArray:
+    """Refine a place; where it loses its way, it stays as it is."""
+    gsd = sampling(start, scene.size)
+    _, matched, _ = agreement(start, scene, index, gsd, _NO_SEEDS, match.verify)
+    refined = refine(start, scene, index, matched, match.refine, n_points, held=True)
+    if refined is None or judge(refined.matrix, scene.size, match.camera) is not None:
+        return start
+    if abs(math.log(sampling(refined.matrix, scene.size) / gsd)) > math.log(1.1):
+        return start
+    return refined.matrix
