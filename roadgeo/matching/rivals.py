@@ -47,9 +47,9 @@ class RivalOptions:
 
     Attributes
     ----------
-    certain : float
-        A place that leads all places nearby by so many powers of ten is not compared further. Of wrong places none led
-        by more than half of that.
+    certain, repeating : float
+        A place that leads all places nearby by so many powers of ten is not compared further, where the best of them
+        explains less than such a part of what the place does: streets do not repeat there.
     n_known : int
         So many of the places that the search met are compared, the likeliest.
     n_places, n_laid : int
@@ -61,6 +61,7 @@ class RivalOptions:
     """
 
     certain: float = 12.0
+    repeating: float = 0.35
     n_known: int = 12
     n_places: int = 40
     n_laid: int = 8
@@ -125,7 +126,8 @@ class Rivals:
 
     def _compare(self, estimator: TripleEstimator, best: Hypothesis, ranked: Sequence[Hypothesis]) -> Standing:
         scene, index, options, matrix = estimator.scene_of(best), estimator.index, self.options, best.laid
-        if best.log10_likelihood < self.needed or best.log10_odds >= options.certain:
+        alone = best.nearby < options.repeating * best.log10_likelihood
+        if best.log10_likelihood < self.needed or (best.log10_odds >= options.certain and alone):
             return Standing(best, None, best.log10_odds)
         evidence = Evidence(scene, index, sampling(matrix, scene.size), estimator.options.evidence)
         worth, middle = evidence.weigh(matrix), Homography(matrix).everywhere(scene.center)

@@ -14,7 +14,7 @@ import roadgeo
 from roadgeo.geometry.homography import Homography
 from roadgeo.matching.local_search import Shift, move_about
 from roadgeo.matching.options import LocateOptions
-from roadgeo.matching.pieces import PieceCounts, Pieces, log10_lead, sample_roads, share_won
+from roadgeo.matching.pieces import Pieces, log10_lead, sample_roads
 from roadgeo.matching.verification import VerifyOptions
 from roadgeo.reference.reference import Reference
 
