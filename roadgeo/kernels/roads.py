@@ -368,10 +368,14 @@ def count_residuals(
     field: Singles2,
     field_scale: float,
     observed: Bools2,
-    forward: Floats1,
-    backward: Floats1,
+    piece_px: float,
+    columns: int,
+    forward: Floats2,
+    backward: Floats2,
 ) -> None:
     """Fill histograms of how far the query's roads lie from roads of the map, and the map's from those of the query.
+
+    One for each piece of the frame.
 
     Parameters
     ----------
@@ -387,12 +391,15 @@ def count_residuals(
         The map is sampled once in so many metres of road.
     field, field_scale, observed
         As in `backward_agreement`.
-    forward, backward : (B + 1,) float64
-        B bins of equal width up to `radius`, and what has no road nearer. The first counts weights, the second pixels
-        of road.
+    piece_px, columns : float, int
+        Width of the frame's pieces, and how many of them are side by side.
+    forward, backward : (P, B + 1) float64
+        P pieces, row by row; B bins of equal width up to `radius`, and what has no road nearer. The first counts
+        weights, the second pixels of road.
     """
     segments, starts, ids, grid, shape = roads
-    n = forward.shape[0] - 1
+    n = forward.shape[1] - 1
+    last_row = forward.shape[0] // columns - 1
     forward[:] = 0.0
     backward[:] = 0.0
     for i in range(points.shape[0]):
@@ -400,7 +407,9 @@ def count_residuals(
         away = np.inf
         if ahead:
             away = nearest_road(x, y, dx, dy, radius, min_cos, segments, starts, ids, grid, shape)[0]
-        forward[min(int(n * away / radius), n) if away < radius else n] += weights[i]
+        row = min(max(int(-points[i, 1] / piece_px), 0), last_row)
+        column = min(max(int(points[i, 0] / piece_px), 0), columns - 1)
+        forward[row * columns + column, min(int(n * away / radius), n) if away < radius else n] += weights[i]
     c0 = max(int(np.floor((bounds[0] - grid[0]) / grid[2])), 0)
     c1 = min(int(np.floor((bounds[2] - grid[0]) / grid[2])), shape[0] - 1)
     r0 = max(int(np.floor((bounds[1] - grid[1]) / grid[2])), 0)
@@ -432,12 +441,14 @@ def count_residuals(
                     down = -(inverse[1, 0] * x + inverse[1, 1] * y + inverse[1, 2]) / w / field_scale
                     if not (0.0 <= across < field.shape[1] and 0.0 <= down < field.shape[0]):
                         continue
-                    column, row = int(across), int(down)
-                    if not observed[row, column]:
+                    if not observed[int(down), int(across)]:
                         continue
                     scale = math.sqrt(abs(det) / (w * w * w))  # pixels per metre
-                    away = max(field[row, column] - 0.5, 0.0) * field_scale / scale
-                    backward[min(int(n * away / radius), n) if away < radius else n] += length / count * scale
+                    away = max(field[int(down), int(across)] - 0.5, 0.0) * field_scale / scale
+                    row = min(int(down * field_scale / piece_px), last_row)
+                    column = min(int(across * field_scale / piece_px), columns - 1)
+                    bin_ = min(int(n * away / radius), n) if away < radius else n
+                    backward[row * columns + column, bin_] += length / count * scale
 
 
 @kernel()

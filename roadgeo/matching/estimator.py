@@ -49,6 +49,8 @@ _OFTEN_ENOUGH = 2
 #: A place that explains less, in powers of ten, or, laid roughly and less roughly, less than these parts of what the
 #: best one does, is looked at no more.
 _LEAST_LIKELY, _NO_RIVAL, _BEHIND = 0.7, 0.4, 0.7
+#: One that explains as much as the likeliest other place, but for a part, is looked at through a lens.
+_NEARLY = 0.8
 #: How far a proposal, made of three intersections, may turn the image's up from where it points.
 _ROUGHLY_DEG = 25.0
 
@@ -65,8 +67,6 @@ class MatchOptions:
         The sweeps where roads propose after them, and where these are left out: they go on for longer then.
     sightings : int
         Anchors that must lead to a place before it ends the search: a map may hold its twin.
-    promising : float
-        Log10 odds from which a place is looked at through a lens.
     roads : RoadSearchOptions or None
         What follows where no triple leads to a place: None for more sweeps.
     lens : LensOptions or None
@@ -90,7 +90,6 @@ class MatchOptions:
     lens: LensOptions | None = field(default_factory=LensOptions)
     max_places: int = 12_000
     sightings: int = 2
-    promising: float = 1.0
     within: Box | None = None
 
 
@@ -245,7 +244,7 @@ class TripleEstimator:
 
     def _is_found_again(self, known: Hypothesis, hypothesis: Hypothesis) -> bool:
         """Whether a verified place that is promising was proposed by another intersection as well."""
-        return known.log10_odds >= self.options.promising and self.same(known, hypothesis)
+        return known.log10_likelihood >= _LEAST_LIKELY and self.same(known, hypothesis)
 
     def known_places(self) -> list[Hypothesis]:
         """Return what was verified and fits (see `shared_sweeps.Member`)."""
@@ -303,13 +302,13 @@ class TripleEstimator:
 
     def score(self, model: Hypothesis) -> float:
         """Refine a hypothesis and return its log10 odds: what it explains, more than the best place nearby does."""
-        started, options = time.perf_counter(), self.options
+        started = time.perf_counter()
         self.n_verified += 1
         if model.lens is not None:
             self._see_through(model, model.lens)
         else:
             self._verify(model)
-            if model.log10_odds >= options.promising:
+            if model.log10_likelihood >= max(_LEAST_LIKELY, _NEARLY * self._most_elsewhere(model)):
                 self._look_through_lens(model)
             elif model.refined is not None:
                 self._dropped.append(model)

@@ -10,14 +10,17 @@ with r the residual, g half a normal density, b the density of residuals where r
 roads and m that of missing ones. How false, how patchy and how inexact a query is nobody knows: sigma, m and f are
 marginalised over a small grid. Neighbouring pieces agree together, so that `statement_m` metres of road count once.
 
-What a place is worth is its lead over the best other one (see `rivals`); by itself log L says little where streets
-repeat.
+By itself log L says little where streets repeat. What a place is worth is its lead over the best other one (see
+`rivals`), and that is measured piece by piece: were two places alike, each piece of the frame would speak for either
+with the same probability.
 """
 
 from __future__ import annotations
 
 import math
+from collections.abc import Sequence
 from dataclasses import dataclass
+from functools import lru_cache
 
 import numpy as np
 
@@ -25,6 +28,7 @@ from roadgeo._arrays import FloatArray
 from roadgeo.geometry.homography import Homography
 from roadgeo.kernels.roads import count_residuals, shares_near_roads
 from roadgeo.matching.index import ReferenceIndex
+from roadgeo.matching.pieces import log10_lead
 from roadgeo.matching.scene import Scene
 
 __all__ = ["Evidence", "EvidenceOptions"]
@@ -34,9 +38,9 @@ _SIGMAS = np.array([0.25, 0.4, 0.65, 1.0, 1.6])
 _SHARES = np.array([0.03, 0.1, 0.25, 0.5, 0.75])
 #: Residuals are looked at up to so many usual deviations, in so many bins.
 _REACH, _BINS = 4.0, 24
-#: Share of road pieces that have a road so near, and along, anyhow: of the query's, and of the map's, whose directions
-#: are not compared.
-_ANYHOW = (0.1, 0.25)
+#: Of roads that lie anywhere so many run along a road piece, as streets go; the directions of the map's roads are not
+#: compared with those of the query. Shares of pieces that have a road so near anyhow are rounded to a ladder.
+_ALONG, _STEP, _STEPS = 0.42, 0.8, 14
 #: The distance to the query's roads is known to so many cells of its raster.
 _BLUR_CELLS = 0.35
 
@@ -50,8 +54,13 @@ class EvidenceOptions:
     map_sigma_m, pixel_sigma_px : float
         Usual distance between a mapped road and the road, and usual error of a traced one.
     statement_m : float
-        So much road, of the query and of the map together, counts as one independent statement. It is calibrated: the
-        lead of a wrong place over the best other one then exceeds x powers of ten about once in 10^x searches.
+        So much road, of the query and of the map together, counts as one independent statement; never less than
+        `statement_px`, for what a pixel cannot show is no statement.
+    piece_m, piece_px : float
+        Width of the frame's pieces, by which two places are compared; the greater one.
+    n_regions, far : int, float
+        Regions of the longer side of the frame, in which a place may be contradicted, and how many times coarser pixels
+        are than in its middle where it is too far away for that.
     step_m : float
         The map's roads are sampled once in so many metres.
     max_turn_deg : float
@@ -64,6 +73,11 @@ class EvidenceOptions:
     map_sigma_m: float = 1.8
     pixel_sigma_px: float = 1.0
     statement_m: float = 480.0
+    statement_px: float = 96.0
+    piece_m: float = 60.0
+    piece_px: float = 12.0
+    n_regions: int = 6
+    far: float = 1.6
     step_m: float = 6.0
     max_turn_deg: float = 25.0
     shift_m: tuple[float, float] = (30.0, 320.0)
@@ -91,29 +105,89 @@ class Evidence:
         self, scene: Scene, index: ReferenceIndex, gsd_m: float, options: EvidenceOptions | None = None
     ) -> None:
         self.scene, self.index, self.gsd_m, self.options = scene, index, gsd_m, options or EvidenceOptions()
-        self._sigma_m = math.hypot(self.options.map_sigma_m, self.options.pixel_sigma_px * gsd_m)
-        blur = _BLUR_CELLS * scene.field_scale * gsd_m / self._sigma_m
-        self._of_query = _log_ratios(_SIGMAS, _ANYHOW[0])
-        self._of_map = _log_ratios(np.hypot(_SIGMAS, blur), _ANYHOW[1])
-        self._counts = np.empty(_BINS + 1), np.empty(_BINS + 1)
+        usual = self.options
+        self._sigma_m = math.hypot(usual.map_sigma_m, usual.pixel_sigma_px * gsd_m)
+        self._statement_px = max(usual.statement_m / gsd_m, usual.statement_px)
+        self._piece_px = max(usual.piece_m / gsd_m, usual.piece_px)
+        width, height = scene.size
+        self._shape = math.ceil(height / self._piece_px), math.ceil(width / self._piece_px)
+        self._observed_px = float(scene.observed.sum()) * scene.field_scale**2
+        self._blur = round(_BLUR_CELLS * scene.field_scale * gsd_m / self._sigma_m, 1)
 
     def weigh(self, matrix: FloatArray) -> float:
         """Return log10 L of a place, query plane to reference plane (3, 3)."""
+        seen, mapped = self._count(matrix, math.inf, (1, 1))
+        nats = self._nats(*self._ratios(mapped), seen[0], mapped[0])
+        most = float(nats.max())
+        return (most + math.log(float(np.exp(nats - most).mean()))) / math.log(10.0)
+
+    def lead(self, matrix: FloatArray, others: Sequence[FloatArray]) -> float:
+        """Return by how many powers of ten a place leads the best of others, piece by piece; inf where there is none.
+
+        All are compared by the deviation and the shares that explain the place best.
+        """
+        seen, mapped = self._count(matrix, self._piece_px, self._shape)
+        of_query, of_map = self._ratios(mapped)
+        nats = self._nats(of_query, of_map, seen.sum(axis=0), mapped.sum(axis=0))
+        sigma, missing, false = np.unravel_index(int(nats.argmax()), nats.shape)
+        by_query, by_map = of_query[sigma, false], of_map[sigma, missing]
+        here = seen @ by_query + mapped @ by_map
+        leads = []
+        for other in others:
+            seen, mapped = self._count(other, self._piece_px, self._shape)
+            leads.append(log10_lead(here - (seen @ by_query + mapped @ by_map)))
+        return min(leads, default=math.inf)
+
+    def contradicted(self, matrix: FloatArray) -> float:
+        """Return which share of the roads lies in regions of the frame where the place explains less than chance.
+
+        There the query and the map both show roads, and others: what looks like the place in part, as a city laid out
+        like its own mirror image does, is not it. Where only one of them shows roads nothing is contradicted. Far
+        ground of a steep view, which cannot be traced, does not count.
+        """
+        scene, options = self.scene, self.options
+        side = max(scene.size) / options.n_regions
+        columns, rows = (max(round(length / side), 1) for length in scene.size)
+        seen, mapped = self._count(matrix, side, (rows, columns))
+        of_query, of_map = self._ratios(mapped)
+        nats = self._nats(of_query, of_map, seen.sum(axis=0), mapped.sum(axis=0))
+        sigma, missing, false = np.unravel_index(int(nats.argmax()), nats.shape)
+        worth = seen @ of_query[sigma, false] + mapped @ of_map[sigma, missing]
+        row, column = np.divmod(np.arange(rows * columns), columns)
+        middles = np.stack(((column + 0.5) * side, -(row + 0.5) * side), axis=1)
+        scales = np.sqrt(np.abs(np.linalg.det(Homography(matrix).jacobian(middles)))) / _sampling(matrix, scene)
+        near = np.nan_to_num(scales, nan=math.inf) < options.far
+        both = np.minimum(seen.sum(axis=1), mapped.sum(axis=1)) * near
+        return float(both[worth < 0.0].sum() / both.sum()) if both.any() else 0.0
+
+    def _count(self, matrix: FloatArray, piece_px: float, shape: tuple[int, int]) -> tuple[FloatArray, FloatArray]:
+        """Return histograms of the residuals of the query's roads and of the map's, pixels of road, (P, bins) each."""
         scene, index, options = self.scene, self.index, self.options
         scale = _sampling(matrix, scene) / self.gsd_m
         ground = Homography(matrix).everywhere(scene.corners)
-        seen, mapped = self._counts
+        seen, mapped = (np.empty((shape[0] * shape[1], _BINS + 1)) for _ in range(2))
         count_residuals(
             matrix, np.asarray(np.linalg.inv(matrix), float), np.concatenate([ground.min(axis=0), ground.max(axis=0)]),
             scene.points, scene.directions, scene.weights, _REACH * self._sigma_m * scale, options.min_cos,
-            options.step_m, index.road_buckets, scene.field, scene.field_scale, scene.observed, seen, mapped,
+            options.step_m, index.road_buckets, scene.field, scene.field_scale, scene.observed, piece_px, shape[1],
+            seen, mapped,
         )  # fmt: skip
-        spacing_px = scene.road_length_px / max(len(scene.points), 1)
-        by_query = self._of_query @ (seen * spacing_px)  # (sigma, false)
-        by_map = self._of_map @ mapped  # (sigma, missing)
-        nats = (by_query[:, :, None] + by_map[:, None, :]) * (self.gsd_m / options.statement_m)
-        most = float(nats.max())
-        return (most + math.log(float(np.exp(nats - most).mean()))) / math.log(10.0)
+        seen *= scene.road_length_px / max(len(scene.points), 1)
+        return seen, mapped
+
+    def _ratios(self, mapped: FloatArray) -> tuple[FloatArray, FloatArray]:
+        """Return log likelihood ratios of residuals of the query's roads and of the map's (sigma, share, bin).
+
+        The more roads there are in the frame, the more of the others have one near anyhow.
+        """
+        reach = 2.0 * _REACH * self._sigma_m / self.gsd_m / max(self._observed_px, 1.0)
+        of_query = _anyhow(_ALONG * reach * float(mapped.sum()))
+        of_map = _anyhow(reach * self.scene.road_length_px)
+        return _log_ratios(of_query, 0.0), _log_ratios(of_map, self._blur)
+
+    def _nats(self, of_query: FloatArray, of_map: FloatArray, seen: FloatArray, mapped: FloatArray) -> FloatArray:
+        """Return log L by (sigma, missing, false)."""
+        return np.asarray(((of_query @ seen)[:, None, :] + (of_map @ mapped)[:, :, None]) / self._statement_px)
 
     def nearby(self, matrix: FloatArray, near: tuple[float, float, float] | None = None) -> float:
         """Return log10 L of the best place that a shift leads to.
@@ -184,12 +258,20 @@ def _shifted(matrix: FloatArray, shift: FloatArray) -> FloatArray:
     return moved
 
 
-def _log_ratios(sigmas: FloatArray, anyhow: float) -> FloatArray:
+def _anyhow(expected: float) -> int:
+    """Return the share of pieces that have one of so many expected roads near, as a step of the ladder."""
+    share = 1.0 - math.exp(-expected)
+    return min(max(round(math.log(max(share, 1e-9)) / math.log(_STEP)), 0), _STEPS)
+
+
+@lru_cache(maxsize=256)
+def _log_ratios(anyhow: int, blur: float) -> FloatArray:
     """Return log likelihood ratios (sigma, share, bin) of a residual, against a road that lies there anyhow.
 
-    `sigmas` and residuals count usual deviations; the last bin is no road within reach.
+    Deviations and residuals count usual deviations, and so does the `blur`; the last bin is no road within reach.
     """
+    sigmas = np.hypot(_SIGMAS, blur)[:, None]
     residual = (np.arange(_BINS) + 0.5) * (_REACH / _BINS)
-    density = math.sqrt(2.0 / math.pi) / sigmas[:, None] * np.exp(-0.5 * (residual / sigmas[:, None]) ** 2)
-    ratio = np.concatenate((density * (_REACH / anyhow), np.zeros((len(sigmas), 1))), axis=1)
+    density = math.sqrt(2.0 / math.pi) / sigmas * np.exp(-0.5 * (residual / sigmas) ** 2)
+    ratio = np.concatenate((density * (_REACH / _STEP**anyhow), np.zeros((len(sigmas), 1))), axis=1)
     return np.asarray(np.log((1.0 - _SHARES)[None, :, None] * ratio[:, None, :] + _SHARES[None, :, None]))

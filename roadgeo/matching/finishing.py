@@ -49,7 +49,7 @@ def measure_corners(estimator: TripleEstimator, best: Hypothesis | None, score: 
         return
     scene, agreeing = estimator.scene, best.found.forward
     if best.refined.lens_k1 == 0.0:
-        doubtful = agreeing < _WHOLE and score >= estimator.options.promising
+        doubtful = agreeing < _WHOLE and score > 0.0
         if doubtful:
             _fit_whole_frame(estimator, best, best.refined, agreeing)
         scene = _lay_between_carriageways(estimator, best, best.refined)

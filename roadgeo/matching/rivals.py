@@ -50,22 +50,29 @@ class RivalOptions:
     certain, repeating : float
         A place that leads all places nearby by so many powers of ten is not compared further, where the best of them
         explains less than such a part of what the place does: streets do not repeat there.
+    most_contradicted : float
+        Where more of the roads is contradicted it is none (see `Evidence.contradicted`). Of right places, of which up
+        to half is gone, false, stale or bent, 0.03; of the best wrong ones of masks turned over 0.15 and more.
     n_known : int
         So many of the places that the search met are compared, the likeliest.
     n_places, n_laid : int
         So many places that most road points fit are laid roughly, and so many of them, the likeliest, finely.
     n_points : int
         Road points that each is laid by roughly.
+    n_compared : int
+        So many of all that were met or laid are compared piece by piece, the likeliest.
     apart : float
         Middles of two places lie further from each other than this share of half the frame's diagonal.
     """
 
     certain: float = 12.0
     repeating: float = 0.35
+    most_contradicted: float = 0.1
     n_known: int = 12
     n_places: int = 40
     n_laid: int = 8
     n_points: int = 200
+    n_compared: int = 6
     apart: float = 0.04
     search: LocalSearchOptions = field(
         default_factory=lambda: LocalSearchOptions(
@@ -75,11 +82,15 @@ class RivalOptions:
 
 
 class Standing(NamedTuple):
-    """A place, the best other one (3, 3) if there is any, and by how many powers of ten the place leads it."""
+    """A place, the best other one (3, 3) if there is any, and by how many powers of ten the place leads it.
+
+    `beaten`: the other one explains more.
+    """
 
     model: Hypothesis
     rival: FloatArray | None
     log10_lead: float
+    beaten: bool = False
 
 
 class Rivals:
@@ -95,6 +106,7 @@ class Rivals:
         """Places of fewer powers of ten than `needed` are not compared."""
         self.estimators, self.options, self.ledger, self.needed = estimators, options, ledger, needed
         self._known: dict[int, Standing] = {}
+        self._contradicted: dict[int, bool] = {}
 
     def __call__(self, parts: Sequence[Search[Hypothesis]]) -> Search[Hypothesis] | None:
         """Return the part whose likeliest place leads all others by twice what is needed, if there is one."""
@@ -114,37 +126,53 @@ class Rivals:
         if not ranked:
             return None
         started = time.perf_counter()
-        best = ranked[0]
+        sound = (model for model in ranked[: self.options.n_known] if not self._is_contradicted(estimator, model))
+        best = next(sound, None)
+        if best is None:
+            return Standing(ranked[0], None, min(ranked[0].log10_odds, 0.0))
         for _ in range(_MOST_TURNS):
             standing = self._known.get(id(best)) or self._compare(estimator, best, ranked)
             self._known[id(best)] = standing
-            if standing.rival is None or standing.log10_lead > 0.0:
+            if standing.rival is None or not standing.beaten:
                 break
-            best = self._take(estimator, standing.rival, ranked)
+            other = self._take(estimator, standing.rival, ranked)
+            if self._is_contradicted(estimator, other):
+                break
+            best = other
         one.seconds += time.perf_counter() - started
         return standing
 
     def _compare(self, estimator: TripleEstimator, best: Hypothesis, ranked: Sequence[Hypothesis]) -> Standing:
         scene, index, options, matrix = estimator.scene_of(best), estimator.index, self.options, best.laid
-        alone = best.nearby < options.repeating * best.log10_likelihood
-        if best.log10_likelihood < self.needed or (best.log10_odds >= options.certain and alone):
+        if best.log10_likelihood < self.needed:
+            return Standing(best, None, best.log10_odds)
+        if best.log10_odds >= options.certain and best.nearby < options.repeating * best.log10_likelihood:
             return Standing(best, None, best.log10_odds)
         evidence = Evidence(scene, index, sampling(matrix, scene.size), estimator.options.evidence)
         worth, middle = evidence.weigh(matrix), Homography(matrix).everywhere(scene.center)
         apart_m = options.apart * scene.half_size * evidence.gsd_m
+        others: list[tuple[float, FloatArray]] = []
         known = [model.laid for model in ranked[1 : 1 + options.n_known]]
-        rival, most = None, 0.0
         for other in [*known, *similar_places(matrix, evidence, estimator.options, options)]:
             there = Homography(other).everywhere(scene.center)
-            if not np.hypot(*(there - middle)) > apart_m or not estimator.may_be(other):
-                continue
-            likelihood = evidence.weigh(other)
-            if likelihood > most:
-                rival, most = other, likelihood
+            if np.hypot(*(there - middle)) > apart_m and estimator.may_be(other):
+                others.append((evidence.weigh(other), other))
+        others.sort(key=lambda one: -one[0])
+        if others and others[0][0] > worth:
+            return Standing(best, others[0][1], worth - others[0][0], beaten=True)
+        lead = evidence.lead(matrix, [other for _, other in others[: options.n_compared]])
         # The larger the map, the more places may lead all that lie around them.
         paid = 2.0 * math.log10(larger(self.ledger.n_reference))
-        lead = worth - max(most, evidence.nearby(matrix, estimator.near))
-        return Standing(best, rival, lead - paid if lead > 0.0 else min(lead, 0.0))
+        return Standing(best, others[0][1] if others else None, min(lead, worth) - paid)
+
+    def _is_contradicted(self, estimator: TripleEstimator, model: Hypothesis) -> bool:
+        """Whether a place is none for what it contradicts; asked once of each."""
+        if id(model) not in self._contradicted:
+            scene, matrix = estimator.scene_of(model), model.laid
+            gsd = sampling(matrix, scene.size)
+            share = Evidence(scene, estimator.index, gsd, estimator.options.evidence).contradicted(matrix)
+            self._contradicted[id(model)] = share > self.options.most_contradicted
+        return self._contradicted[id(model)]
 
     def _take(self, estimator: TripleEstimator, matrix: FloatArray, ranked: Sequence[Hypothesis]) -> Hypothesis:
         """Return the hypothesis of a place that explains more than the likeliest: one that was met, or a new one."""
