@@ -184,6 +184,7 @@ def locate(
     within: str | Box | None = None,
     max_tilt: float | None = None,
     north_up: bool | None = None,
+    heading: float | tuple[float, float] | None = None,
     focal: float | None = None,
 ) -> Answer:
     """Find where a road mask, or a photograph, lies on a map. Nothing is written.
@@ -212,6 +213,8 @@ def locate(
         Greatest angle of the camera from the vertical, degrees.
     north_up : bool
         The image's up is grid north of the reference, within 5 degrees.
+    heading : float or (float, float)
+        Direction of the image's up, degrees clockwise from north, and by how much it may be off (default 10).
     focal : float
         Focal length in pixels of the mask.
 
@@ -231,6 +234,8 @@ def locate(
 
     references = _open(reference)
     hints = {"gsd_m": _range(gsd), "max_tilt_deg": max_tilt, "north_up": north_up, "focal_px": focal}
+    if heading is not None:
+        hints["heading_deg"] = heading if isinstance(heading, tuple) else (float(heading), 10.0)
     meant = None if near is None else swapped_near(near, references)
     if meant is not None:
         raise ValueError(f"near={near} lies on none of the maps; longitude comes first: did you mean near={meant}?")

@@ -7,7 +7,7 @@ from typing import TYPE_CHECKING, Any, Literal, TypeVar
 
 import click
 
-from roadgeo.cli.parameters import CAMERA, NEAR, RANGE, WITHIN
+from roadgeo.cli.parameters import CAMERA, HEADING, NEAR, RANGE, WITHIN
 
 if TYPE_CHECKING:
     from roadgeo.reference.reference import AnyReference
@@ -55,6 +55,14 @@ HINTS: dict[str, tuple[str, dict[str, Any]]] = {
             "metavar": "AREA",
             "type": WITHIN,
             "help": "The middle lies in this country or state, or within WEST,SOUTH,EAST,NORTH in degrees.",
+        },
+    ),
+    "heading_deg": (
+        "--heading",
+        {
+            "metavar": "DEG[+-DEG]",
+            "type": HEADING,
+            "help": "Direction of the image's up, clockwise from north: 90+-10. Default of the second number: 10.",
         },
     ),
     "north_up": (
@@ -117,7 +125,7 @@ def make_options(
     known = {name: value for name, value in hints.items() if value is not None and value is not False}
     if method == "pair" and known:
         raise click.UsageError(
-            "--method pair knows no --camera, --gsd, --max-tilt, --near, --within or --north-up: leave them out."
+            "--method pair knows no --camera, --gsd, --heading, --max-tilt, --near, --within or --north-up: leave them out."
         )
     default = LocateOptions()
     near, within = known.pop("near", None), known.pop("within", None)

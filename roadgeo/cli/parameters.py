@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Callable, Sequence
 from pathlib import Path
 from typing import Any, TypeVar
@@ -12,6 +13,7 @@ __all__ = [
     "ASPECT",
     "BOX",
     "CAMERA",
+    "HEADING",
     "NEAR",
     "RANGE",
     "WITHIN",
@@ -21,6 +23,9 @@ __all__ = [
     "references_option",
     "verbosity_options",
 ]
+
+#: By how much a heading may be off where nobody says so, degrees.
+_HEADING_OFF_DEG = 10.0
 
 Command = TypeVar("Command", bound=Callable[..., Any])
 
@@ -133,6 +138,31 @@ class Focal(click.ParamType):  # type: ignore[type-arg]
         return focal
 
 
+class Heading(click.ParamType):  # type: ignore[type-arg]
+    """A direction in degrees clockwise from north, and by how much it may be off: "90", "90+-10"."""
+
+    name = "heading"
+
+    def convert(self, value: Any, param: click.Parameter | None, ctx: click.Context | None) -> tuple[float, float]:
+        """Parse the text.
+
+        Raises
+        ------
+        click.BadParameter
+            No such numbers.
+        """
+        if isinstance(value, tuple):
+            return value
+        center, _, off = str(value).replace("±", "+-").partition("+-")
+        try:
+            heading = float(center), float(off or _HEADING_OFF_DEG)
+        except ValueError:
+            heading = math.nan, math.nan
+        if not (-360.0 <= heading[0] <= 360.0 and 0.0 < heading[1] <= 180.0):
+            self.fail(f"got {value!r}, expected degrees clockwise from north, as 90 or 90+-10", param, ctx)
+        return heading
+
+
 class Area(click.ParamType):  # type: ignore[type-arg]
     """A country, a state, or bounds in degrees."""
 
@@ -190,6 +220,7 @@ RANGE = Numbers("range", ("LO", "HI"), ":", _wrong_range)
 #: A place in degrees and a distance in metres.
 NEAR = Numbers("place", ("LON", "LAT", "RADIUS"), ",", _wrong_place)
 #: A focal length in pixels, or where to find it.
+HEADING = Heading()
 CAMERA = Focal()
 #: A country or state, or bounds in degrees.
 WITHIN = Area()

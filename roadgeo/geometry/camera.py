@@ -13,7 +13,7 @@ from roadgeo._arrays import FloatArray
 from roadgeo.geometry.frame import Frame
 from roadgeo.geometry.homography import Homography
 
-__all__ = ["CameraFault", "CameraOptions", "CameraPose", "judge", "pinholes_around", "pose", "sampling"]
+__all__ = ["CameraFault", "CameraOptions", "CameraPose", "judge", "pose", "sampling"]
 
 _FOCAL_STEPS = np.geomspace(0.35, 8.0, 25)
 #: What lays pixels on less ground than this, square metres, has shrunk to a point, whatever camera is allowed.
@@ -36,7 +36,7 @@ class CameraFault(Enum):
     SAMPLING = "ground sampling out of range"
     SKEW = "no camera sees a plane so"
     TILT = "tilt out of range"
-    NOT_NORTH_UP = "not north up"
+    HEADING = "heading out of range"
 
 
 @dataclass(frozen=True)
@@ -57,6 +57,8 @@ class CameraOptions:
         their lengths' ratio. A crop or a lens's distortion moves it from 0.
     north_up : bool
         The image's up is north, within 5 degrees.
+    heading_deg : (float, float) or None
+        Direction of the image's up, clockwise from grid north, and by how much it may be off.
     """
 
     gsd_m: tuple[float, float] = (0.1, 12.0)
@@ -64,6 +66,19 @@ class CameraOptions:
     focal_px: float | None = None
     max_skew: float = 0.35
     north_up: bool = False
+    heading_deg: tuple[float, float] | None = None
+
+    @property
+    def heading(self) -> tuple[float, float] | None:
+        """Direction of the image's up, and by how much it may be off, degrees; None where it is not known."""
+        return self.heading_deg or ((0.0, 0.0) if self.north_up else None)
+
+    def turned_off(self, east: FloatArray, north: FloatArray) -> FloatArray:
+        """Return by how many degrees more than it may be the image's up is turned; its direction is east, north."""
+        if self.heading is None:
+            return np.zeros_like(np.asarray(east, float))
+        turn = np.degrees(np.arctan2(east, north)) - self.heading[0]
+        return np.asarray(np.abs((turn + 180.0) % 360.0 - 180.0) - self.heading[1])
 
     @property
     def min_shape_ratio(self) -> float:
@@ -162,39 +177,6 @@ def pose(matrix: FloatArray, size: tuple[int, int], focal_px: float | None = Non
     return CameraPose(gsd, rotation, tilt, focal, skew, source)
 
 
-def pinholes_around(
-    matrix: FloatArray, size: tuple[int, int], at: FloatArray, focal_px: float | None = None
-) -> list[FloatArray]:
-    """Return the homographies (3, 3) of pinholes that see the ground around a point as a homography does; up to two.
-
-    A pinhole whose axis meets the point sees the plane there as an affine map J, and J^T J is proportional to
-    I + g g^T, where g / f is the gradient of the logarithm of depth. J does not tell g from -g: which way the camera
-    leans. The point is `at` (2,) in the query plane; without a focal length that of a usual lens is taken.
-    """
-    center, focal = Frame(*size).plane_center, focal_px or _USUAL_FOCAL * math.hypot(*size) / 2.0
-    local, place = Homography(matrix).jacobian(at), Homography(matrix).everywhere(at)
-    # Turn the camera about its centre until its axis meets the point (Rodrigues' formula).
-    ray = np.append((at - center) / focal, 1.0)
-    x, y, cosine = ray / np.linalg.norm(ray)
-    cross = np.array([[0.0, 0.0, -x], [0.0, 0.0, -y], [x, y, 0.0]])
-    turn = np.eye(3) + cross + cross @ cross / (1.0 + cosine)
-    lens = np.diag([focal, focal, 1.0])
-    turned = lens @ turn @ np.linalg.inv(lens) @ np.array([[1.0, 0.0, -center[0]], [0.0, 1.0, -center[1]], [0, 0, 1]])
-    affine = local @ np.linalg.inv(Homography(turned).jacobian(at))
-    (least, most), axes = np.linalg.eigh(affine.T @ affine)
-    gradient = math.sqrt(max(most / max(least, 1e-300) - 1.0, 0.0)) * axes[:, 1] / focal
-    found = []
-    for leaning in (gradient, -gradient):
-        plane = np.eye(3)
-        plane[:2, :2], plane[2, :2] = affine, -leaning
-        plane[:2] += np.outer(place, plane[2])
-        seen = plane @ turned
-        middle = float(seen[2] @ np.append(center, 1.0))
-        if middle > 0.0:
-            found.append(np.asarray(seen / middle))
-    return found
-
-
 def judge(matrix: FloatArray, size: tuple[int, int], options: CameraOptions, rough: bool = False) -> CameraFault | None:
     """Return why a homography is not plausible, or None if it is.
 
@@ -224,8 +206,8 @@ def judge(matrix: FloatArray, size: tuple[int, int], options: CameraOptions, rou
         return CameraFault.SKEW
     if fits.tilt_deg[fits.skew <= fits.skew.min() + further].min() > options.max_tilt_deg + slack_deg:
         return CameraFault.TILT
-    if options.north_up:
+    if options.heading is not None:
         jacobian = homography.jacobian(Frame(*size).plane_center)
-        if abs(math.degrees(math.atan2(jacobian[0, 1], jacobian[1, 1]))) > slack_deg:
-            return CameraFault.NOT_NORTH_UP
+        if options.turned_off(jacobian[0, 1], jacobian[1, 1]) > slack_deg:
+            return CameraFault.HEADING
     return None

@@ -15,6 +15,7 @@ from roadgeo.geometry.camera import CameraFault, CameraOptions, judge, sampling
 from roadgeo.geometry.homography import Homography
 from roadgeo.geometry.projection import to_lonlat
 from roadgeo.matching.evidence import Evidence, EvidenceOptions
+from roadgeo.matching.exhaustive import ExhaustiveOptions, is_told, propose_everywhere
 from roadgeo.matching.growing import GrowOptions, grow_proposals, screen_proposals
 from roadgeo.matching.hypothesis import MINIMAL, Hypothesis, Lead
 from roadgeo.matching.index import ReferenceIndex
@@ -69,6 +70,8 @@ class MatchOptions:
         Anchors that must lead to a place before it ends the search: a map may hold its twin.
     roads : RoadSearchOptions or None
         What follows where no triple leads to a place: None for more sweeps.
+    everywhere : ExhaustiveOptions
+        Where heading and scale are told, of laying the roads everywhere on the map instead.
     lens : LensOptions or None
         Of a lens that is looked for behind promising places, and behind others that roads led to: None for a pinhole.
     max_places : int
@@ -87,6 +90,7 @@ class MatchOptions:
     refine: RefineOptions = field(default_factory=RefineOptions)
     camera: CameraOptions = field(default_factory=CameraOptions)
     roads: RoadSearchOptions | None = field(default_factory=RoadSearchOptions)
+    everywhere: ExhaustiveOptions = field(default_factory=ExhaustiveOptions)
     lens: LensOptions | None = field(default_factory=LensOptions)
     max_places: int = 12_000
     sightings: int = 2
@@ -130,6 +134,7 @@ class TripleEstimator:
         self.sweeps = sweeps or SharedSweeps(scene, camera)
         self.sweeps.members.append(self)
         self._road_search: RoadSearch | None = None
+        self._is_everywhere = False  # whether the roads were laid everywhere on the map
         trace.began(self)
 
     def stages(self) -> Iterator[Iterator[list[Hypothesis]]]:
@@ -142,6 +147,11 @@ class TripleEstimator:
         options, by_roads = self.options, self.options.roads is not None and len(self.scene.intersections) > 0
         sources = options.sweeps if by_roads else options.without_roads
         sweeps = [self.sweeps.rounds(self, Stage(stage, source, options.grow)) for stage, source in enumerate(sources)]
+        if is_told(options.camera, options.everywhere):
+            yield sweeps.pop(0)
+            yield self._rounds_everywhere()
+            if self._is_everywhere:
+                return
         if not by_roads:
             yield from sweeps
             return
@@ -149,6 +159,17 @@ class TripleEstimator:
         yield from sweeps + roads if self.index.coarseness == 1.0 else roads + sweeps
         if options.lens is not None:
             yield self._rounds_of_lenses(options.lens)
+
+    def _rounds_everywhere(self) -> Iterator[list[Hypothesis]]:
+        """Yield the places that agree best of all, where heading and scale are told."""
+        scene, index, options, nobody = self.scene, self.index, self.options, np.empty(0, np.int64)
+        for matrix in propose_everywhere(scene, index, options.camera, options.everywhere, self.near):
+            self._is_everywhere = True
+            self.n_hypotheses += 1
+            _, matched, _ = agreement(matrix, scene, index, sampling(matrix, scene.size), nobody, options.verify)
+            hypothesis = Hypothesis(matrix, nobody, 1.0, matched, by_roads=True)
+            self.trace.grown([hypothesis])
+            yield [hypothesis] if self._is_plausible(hypothesis) else []
 
     @property
     def work(self) -> float:
@@ -275,9 +296,7 @@ class TripleEstimator:
             frame = 2.0 * self.scene.half_size * np.sqrt(np.maximum(j00 * j11 - j01 * j10, 0.0))
             away_m = np.hypot(*(self.index.xy[proposals.reference] - self.near[:2]).T)
             allowed &= away_m < self.near[2] + frame
-        if self.options.camera.north_up:
-            allowed &= np.abs(np.arctan2(j01, j11)) < math.radians(_ROUGHLY_DEG)
-        return allowed
+        return allowed & (self.options.camera.turned_off(j01, j11) < _ROUGHLY_DEG)
 
     def grow(self, proposals: Proposals, chosen: IntArray, options: GrowOptions | None = None) -> list[Hypothesis]:
         """Grow the chosen proposals of one anchor; return those that did not wither, the best supported first."""

@@ -58,9 +58,9 @@ class EvidenceOptions:
         `statement_px`, for what a pixel cannot show is no statement.
     piece_m, piece_px : float
         Width of the frame's pieces, by which two places are compared; the greater one.
-    n_regions, far : int, float
-        Regions of the longer side of the frame, in which a place may be contradicted, and how many times coarser pixels
-        are than in its middle where it is too far away for that.
+    n_regions, region_m, far : int, float, float
+        Regions of the longer side of the frame, at most, in which a place may be contradicted, their least width, and
+        how many times coarser pixels are than in its middle where it is too far away for that.
     step_m : float
         The map's roads are sampled once in so many metres.
     max_turn_deg : float
@@ -77,6 +77,7 @@ class EvidenceOptions:
     piece_m: float = 60.0
     piece_px: float = 12.0
     n_regions: int = 6
+    region_m: float = 170.0
     far: float = 1.6
     step_m: float = 6.0
     max_turn_deg: float = 25.0
@@ -146,7 +147,7 @@ class Evidence:
         ground of a steep view, which cannot be traced, does not count.
         """
         scene, options = self.scene, self.options
-        side = max(scene.size) / options.n_regions
+        side = max(max(scene.size) / options.n_regions, options.region_m / self.gsd_m)
         columns, rows = (max(round(length / side), 1) for length in scene.size)
         seen, mapped = self._count(matrix, side, (rows, columns))
         of_query, of_map = self._ratios(mapped)

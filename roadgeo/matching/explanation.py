@@ -340,7 +340,7 @@ def _objection(place: RejectedPlace, fault: CameraFault) -> str:
     values = {
         CameraFault.SAMPLING: f" ({place.gsd_m:.2f} m per pixel)",
         CameraFault.TILT: f" ({place.tilt_deg:.0f} degrees)",
-        CameraFault.NOT_NORTH_UP: f" (up is {place.rotation_deg % 360:.0f} degrees)",
+        CameraFault.HEADING: f" (up is {place.rotation_deg % 360:.0f} degrees)",
     }
     known = math.isfinite(place.log10_odds)
     odds = f"; without that its log10 odds were {_number(place.log10_odds)}" if known else ""

@@ -23,7 +23,7 @@ __all__ = ["Record", "Scored", "without_limits"]
 _MAX_RETRIED, _MAX_REFUSED, _MAX_ELSEWHERE = 6, 200, 20
 
 #: Limits that a user may have set too narrow; other faults hold for every camera.
-_NEGOTIABLE = (CameraFault.SAMPLING, CameraFault.SKEW, CameraFault.TILT, CameraFault.NOT_NORTH_UP)
+_NEGOTIABLE = (CameraFault.SAMPLING, CameraFault.SKEW, CameraFault.TILT, CameraFault.HEADING)
 
 
 @dataclass(frozen=True)

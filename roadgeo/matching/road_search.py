@@ -174,7 +174,8 @@ class RoadSearch:
         self.n_tried = 0
         self.turnout = turnout or Turnout(options, len(index))
         scale = options.scales(camera, scene.road_width_px)
-        max_turn = math.radians(_ROUGHLY_DEG) if camera.north_up else math.pi
+        center, off = camera.heading or (0.0, 180.0)
+        max_turn = min(math.radians(abs(center) + off + _ROUGHLY_DEG), math.pi)
         candidates = _within(index, near, scene.half_size * min(scale[1], max(options.far_m, scale[0])))
         self.voter = Voter(scene, index, scale, max_turn, candidates, options.votes)
         self._tried: set[int] = set()

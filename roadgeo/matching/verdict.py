@@ -274,7 +274,9 @@ def searched_within(options: LocateOptions) -> str:
         limits.append(f"at {camera.gsd_m[0]:g} to {camera.gsd_m[1]:g} m per pixel")
     if camera.max_tilt_deg != usual.max_tilt_deg:
         limits.append(f"tilted by up to {camera.max_tilt_deg:g} degrees")
-    if camera.north_up:
+    if camera.heading_deg is not None:
+        limits.append("with the image's up at {0:g} degrees from north, give or take {1:g}".format(*camera.heading_deg))
+    elif camera.north_up:
         limits.append("north up")
     if camera.focal_px is not None:
         limits.append(f"with a focal length of {camera.focal_px:.5g} pixels")

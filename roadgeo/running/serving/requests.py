@@ -28,7 +28,7 @@ _MAGIC = {
     b"\0\0\0\x0cjP  ": ".jp2",
 }
 
-_NAMES = ("near", "within", "gsd", "maxTilt", "focal", "northUp", "timeLimit")
+_NAMES = ("near", "within", "gsd", "maxTilt", "focal", "heading", "northUp", "timeLimit")
 
 
 class Refused(Exception):  # noqa: N818 (an answer, not a fault)
@@ -122,6 +122,10 @@ def read_hints(values: Mapping[str, Any]) -> dict[str, Any]:
     if "northUp" in values:
         _require(isinstance(values["northUp"], bool), "northUp", "true or false")
         hints["north_up"] = values["northUp"]
+    if "heading" in values:
+        center, off = _numbers(values, "heading", 2)
+        _require(-360 <= center <= 360 and 0 < off <= 180, "heading", "DEG,DEG: clockwise from north, give or take")
+        hints["heading_deg"] = (center, off)
     return hints
 
 

@@ -1,0 +1,188 @@
+"""Proposals where heading and scale are roughly known: the roads seen are laid everywhere on the map.
+
+Query and map are drawn on a coarse raster, and correlated by FFT, for each of a few turns and scales: no intersection
+need be intact. How well they agree is told by the Dice coefficient of what both show, 2 |A and B| / (|A| + |B|), on the
+ground that the query observed; roads count by the squared cosine between their directions.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Iterator
+from dataclasses import dataclass
+
+import cv2
+import numpy as np
+from scipy import fft
+
+from roadgeo._arrays import AnyArray, FloatArray
+from roadgeo.geometry.camera import CameraOptions
+from roadgeo.geometry.frame import Frame
+from roadgeo.matching.index import ReferenceIndex
+from roadgeo.matching.scene import Scene
+
+__all__ = ["ExhaustiveOptions", "is_told", "propose_everywhere"]
+
+
+@dataclass(frozen=True)
+class ExhaustiveOptions:
+    """How finely is looked, and how much.
+
+    Attributes
+    ----------
+    most_scale, most_turn_deg : float
+        Scales from least to greatest, and turns either way, that are few enough to try them all.
+    cell_m : float
+        Side of the raster's cells; a step of turn or scale moves a corner of the frame by `step_cells` of them.
+    road_m : float
+        Width of the map's roads.
+    most_cells : float
+        Cells times turns and scales that are few enough: a larger map is not looked at.
+    n_kept : int
+        So many places are followed.
+    apart_m : float
+        Places nearer than this to a better one are the same.
+    """
+
+    most_scale: float = 1.6
+    most_turn_deg: float = 20.0
+    cell_m: float = 12.0
+    step_cells: float = 2.5
+    road_m: float = 36.0
+    most_cells: float = 1.5e9
+    n_kept: int = 40
+    apart_m: float = 40.0
+
+
+def is_told(camera: CameraOptions, options: ExhaustiveOptions) -> bool:
+    """Whether heading and scale are known well enough."""
+    low, high = camera.gsd_m
+    return (
+        high <= options.most_scale * low and camera.heading is not None and camera.heading[1] <= options.most_turn_deg
+    )
+
+
+def propose_everywhere(
+    scene: Scene,
+    index: ReferenceIndex,
+    camera: CameraOptions,
+    options: ExhaustiveOptions,
+    near: tuple[float, float, float] | None = None,
+) -> Iterator[FloatArray]:
+    """Yield homographies (3, 3), query plane to reference plane, of the places that agree best, the best first.
+
+    None where the map is too large; `near` = (x, y, radius) restricts where the middle of the frame may lie.
+    """
+    center, off = camera.heading or (0.0, 180.0)
+    cell, half_m = options.cell_m, scene.half_size * math.sqrt(camera.gsd_m[0] * camera.gsd_m[1])
+    step = options.step_cells * cell / half_m
+    turns = _spread(center, off + 1.0, math.degrees(step))
+    scales = np.exp(
+        _spread(
+            0.5 * math.log(camera.gsd_m[0] * camera.gsd_m[1]), 0.5 * math.log(camera.gsd_m[1] / camera.gsd_m[0]), step
+        )
+    )
+    low, high = index.bounds
+    if near is not None:
+        reach = near[2] + half_m
+        low, high = np.maximum(low, np.subtract(near[:2], reach)), np.minimum(high, np.add(near[:2], reach))
+    low, high = low - half_m, high + half_m
+    columns, rows = (max(int(n), 1) for n in np.ceil((high - low) / cell))
+    if (high <= low).any() or columns * rows * len(turns) * len(scales) > options.most_cells:
+        return
+    shape = fft.next_fast_len(rows, real=True), fft.next_fast_len(columns, real=True)
+    drawn, along = _draw_map(index, low, (rows, columns), options)
+    mapped = fft.rfft2(drawn, shape)
+    mapped_along = fft.rfft2(drawn * along.real, shape), fft.rfft2(drawn * along.imag, shape)
+    found: list[tuple[float, float, float, float, float]] = []
+    for scale in scales:
+        for turn in turns:
+            found += _best(scene, scale, math.radians(turn), mapped, mapped_along, shape, (rows, columns), low, options)
+    found.sort(key=lambda one: -one[0])
+    kept: list[tuple[float, float]] = []
+    for _, x, y, scale, turn in found:
+        if all(math.hypot(x - u, y - v) >= options.apart_m for u, v in kept):
+            kept.append((x, y))
+            yield _similarity(scene, x, y, scale, turn)
+        if len(kept) == options.n_kept:
+            return
+
+
+def _spread(center: float, off: float, step: float) -> FloatArray:
+    """Return values around a center, both ends included, no further than a step apart."""
+    return np.asarray(np.linspace(center - off, center + off, 2 * math.ceil(off / step) + 1 if off > step / 2 else 1))
+
+
+def _similarity(scene: Scene, x: float, y: float, scale: float, turn: float) -> FloatArray:
+    """Return the homography (3, 3) that lays the frame's middle on x, y, its up turned clockwise by so many radians."""
+    c, s = scale * math.cos(turn), scale * math.sin(turn)
+    linear = np.array([[c, s], [-s, c]])
+    return np.vstack((np.column_stack((linear, (x, y) - linear @ scene.center)), (0.0, 0.0, 1.0)))
+
+
+def _draw_map(
+    index: ReferenceIndex, low: FloatArray, shape: tuple[int, int], options: ExhaustiveOptions
+) -> tuple[AnyArray, AnyArray]:
+    """Draw the map's roads, rows upwards: (rows, columns) float32 0 to 1, and exp(2 i direction) of the last drawn."""
+    a, b = index.segments[:, :2] - low, index.segments[:, 2:] - low
+    lines = np.round(np.stack((a, b), axis=1) / options.cell_m * 16.0 - 8.0).astype(np.int32)
+    sector = np.floor(np.mod(np.arctan2(*(b - a).T[::-1]), np.pi) / np.pi * 16.0).astype(int) % 16
+    drawn, along = np.zeros(shape, np.uint8), np.zeros(shape, np.complex64)
+    for k in range(16):
+        layer = np.zeros(shape, np.uint8)
+        cv2.polylines(
+            layer, list(lines[sector == k]), False, 1, max(1, round(options.road_m / options.cell_m)), cv2.LINE_8, 4
+        )
+        along += layer * np.exp(2j * np.pi * (k + 0.5) / 16.0).astype(np.complex64)
+        drawn |= layer
+    return drawn.astype(np.float32), along / np.maximum(np.abs(along), 1e-6)
+
+
+def _best(
+    scene: Scene,
+    scale: float,
+    turn: float,
+    mapped: AnyArray,
+    mapped_along: tuple[AnyArray, AnyArray],
+    shape: tuple[int, int],
+    inside: tuple[int, int],
+    low: FloatArray,
+    options: ExhaustiveOptions,
+) -> list[tuple[float, float, float, float, float]]:
+    """Return (agreement, x, y, scale, turn) of the best places for one scale and turn."""
+    matrix = _similarity(scene, 0.0, 0.0, scale, turn)
+    points = scene.dense_points @ matrix[:2, :2].T + matrix[:2, 2]
+    ways = scene.dense_directions @ matrix[:2, :2].T
+    frame = Frame(*scene.size).plane_corners @ matrix[:2, :2].T + matrix[:2, 2]
+    half = np.ceil(np.abs(frame).max(axis=0) / options.cell_m).astype(int) + 1
+    cells = np.floor(points / options.cell_m).astype(int) + half
+    size = 2 * half[1] + 1, 2 * half[0] + 1
+    seen, along = np.zeros(size, np.float32), np.zeros(size, np.complex64)
+    seen[cells[:, 1], cells[:, 0]] = 1.0
+    np.add.at(along, (cells[:, 1], cells[:, 0]), np.exp(2j * np.arctan2(ways[:, 1], ways[:, 0])).astype(np.complex64))
+    along /= np.maximum(np.abs(along), 1e-6)
+    window = _observed(scene, matrix, half, size, options.cell_m)
+
+    def spectrum(template: AnyArray) -> AnyArray:
+        return np.conj(fft.rfft2(template, shape))
+
+    alike = mapped * spectrum(seen)
+    alike += mapped_along[0] * spectrum(seen * along.real) + mapped_along[1] * spectrum(seen * along.imag)
+    both = fft.irfft2(0.5 * alike, shape)[: inside[0], : inside[1]]
+    shown = fft.irfft2(mapped * spectrum(window), shape)[: inside[0], : inside[1]]
+    wide = options.road_m / options.cell_m
+    dice = 2.0 * both / (float(seen.sum()) + np.maximum(shown, 0.0) / wide)
+    peaks = (dice >= cv2.dilate(dice, np.ones((5, 5), np.uint8))) & (dice > 0.2)
+    r, c = np.nonzero(peaks)
+    order = np.argsort(-dice[r, c], kind="stable")[: options.n_kept]
+    return [
+        (float(dice[i, j]), *(low + (np.array([j, i]) + half + 0.5) * options.cell_m).tolist(), scale, turn)
+        for i, j in zip(r[order].tolist(), c[order].tolist(), strict=True)
+    ]
+
+
+def _observed(scene: Scene, matrix: FloatArray, half: AnyArray, size: tuple[int, int], cell_m: float) -> AnyArray:
+    """Return the ground that the query observed, on the raster around the middle of the frame: 1 there, else 0."""
+    to_cells = np.array([[1.0 / cell_m, 0.0, half[0]], [0.0, 1.0 / cell_m, half[1]], [0.0, 0.0, 1.0]]) @ matrix
+    flip = np.array([[scene.field_scale, 0.0, 0.0], [0.0, -scene.field_scale, 0.0], [0.0, 0.0, 1.0]])
+    return cv2.warpPerspective(scene.observed.astype(np.float32), to_cells @ flip, size[::-1], flags=cv2.INTER_NEAREST)
