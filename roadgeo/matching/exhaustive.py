@@ -9,7 +9,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Iterator
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 
 import cv2
 import numpy as np
@@ -18,7 +18,9 @@ from scipy import fft
 from roadgeo._arrays import AnyArray, FloatArray
 from roadgeo.geometry.camera import CameraOptions
 from roadgeo.geometry.frame import Frame
+from roadgeo.geometry.homography import Homography
 from roadgeo.matching.index import ReferenceIndex
+from roadgeo.matching.local_search import LocalSearchOptions, move_about, search_nearby
 from roadgeo.matching.scene import Scene
 
 __all__ = ["ExhaustiveOptions", "is_told", "propose_everywhere"]
@@ -52,14 +54,17 @@ class ExhaustiveOptions:
     most_cells: float = 1.5e9
     n_kept: int = 40
     apart_m: float = 40.0
+    nearer: LocalSearchOptions = field(
+        default_factory=lambda: LocalSearchOptions(
+            reach_m=36.0, turn_deg=3.0, scales=(0.96, 1.0, 1.04), max_points=120, n_places=1
+        )
+    )
 
 
 def is_told(camera: CameraOptions, options: ExhaustiveOptions) -> bool:
     """Whether heading and scale are known well enough."""
-    low, high = camera.gsd_m
-    return (
-        high <= options.most_scale * low and camera.heading is not None and camera.heading[1] <= options.most_turn_deg
-    )
+    (low, high), heading = camera.gsd_m, camera.heading
+    return high <= options.most_scale * low and heading is not None and heading[1] <= options.most_turn_deg
 
 
 def propose_everywhere(
@@ -77,11 +82,8 @@ def propose_everywhere(
     cell, half_m = options.cell_m, scene.half_size * math.sqrt(camera.gsd_m[0] * camera.gsd_m[1])
     step = options.step_cells * cell / half_m
     turns = _spread(center, off + 1.0, math.degrees(step))
-    scales = np.exp(
-        _spread(
-            0.5 * math.log(camera.gsd_m[0] * camera.gsd_m[1]), 0.5 * math.log(camera.gsd_m[1] / camera.gsd_m[0]), step
-        )
-    )
+    least, most = np.log(camera.gsd_m)
+    scales = np.exp(_spread((least + most) / 2.0, (most - least) / 2.0, step))
     low, high = index.bounds
     if near is not None:
         reach = near[2] + half_m
@@ -103,9 +105,15 @@ def propose_everywhere(
     for _, x, y, scale, turn in found:
         if all(math.hypot(x - u, y - v) >= options.apart_m for u, v in kept):
             kept.append((x, y))
-            yield _similarity(scene, x, y, scale, turn)
+            yield _nearer(_similarity(scene, x, y, scale, turn), scene, index, options)
         if len(kept) == options.n_kept:
             return
+
+
+def _nearer(start: FloatArray, scene: Scene, index: ReferenceIndex, options: ExhaustiveOptions) -> FloatArray:
+    """Return the place near a start, within a step, that lays most road points on roads."""
+    best = next(iter(search_nearby(start, scene, index, options.nearer)), None)
+    return start if best is None else move_about(Homography(start).everywhere(scene.center), best) @ start
 
 
 def _spread(center: float, off: float, step: float) -> FloatArray:
@@ -130,9 +138,7 @@ def _draw_map(
     drawn, along = np.zeros(shape, np.uint8), np.zeros(shape, np.complex64)
     for k in range(16):
         layer = np.zeros(shape, np.uint8)
-        cv2.polylines(
-            layer, list(lines[sector == k]), False, 1, max(1, round(options.road_m / options.cell_m)), cv2.LINE_8, 4
-        )
+        cv2.polylines(layer, list(lines[sector == k]), False, 1, round(options.road_m / options.cell_m), cv2.LINE_8, 4)
         along += layer * np.exp(2j * np.pi * (k + 0.5) / 16.0).astype(np.complex64)
         drawn |= layer
     return drawn.astype(np.float32), along / np.maximum(np.abs(along), 1e-6)
@@ -185,4 +191,5 @@ def _observed(scene: Scene, matrix: FloatArray, half: AnyArray, size: tuple[int,
     """Return the ground that the query observed, on the raster around the middle of the frame: 1 there, else 0."""
     to_cells = np.array([[1.0 / cell_m, 0.0, half[0]], [0.0, 1.0 / cell_m, half[1]], [0.0, 0.0, 1.0]]) @ matrix
     flip = np.array([[scene.field_scale, 0.0, 0.0], [0.0, -scene.field_scale, 0.0], [0.0, 0.0, 1.0]])
-    return cv2.warpPerspective(scene.observed.astype(np.float32), to_cells @ flip, size[::-1], flags=cv2.INTER_NEAREST)
+    seen = scene.observed.astype(np.float32)
+    return np.asarray(cv2.warpPerspective(seen, to_cells @ flip, size[::-1], flags=cv2.INTER_NEAREST))

@@ -275,7 +275,8 @@ def searched_within(options: LocateOptions) -> str:
     if camera.max_tilt_deg != usual.max_tilt_deg:
         limits.append(f"tilted by up to {camera.max_tilt_deg:g} degrees")
     if camera.heading_deg is not None:
-        limits.append("with the image's up at {0:g} degrees from north, give or take {1:g}".format(*camera.heading_deg))
+        center, off = camera.heading_deg
+        limits.append(f"with the image's up at {center:g} degrees from north, give or take {off:g}")
     elif camera.north_up:
         limits.append("north up")
     if camera.focal_px is not None:
