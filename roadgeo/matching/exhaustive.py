@@ -170,7 +170,7 @@ def _best(
     window = _observed(scene, matrix, half, size, options.cell_m)
 
     def spectrum(template: AnyArray) -> AnyArray:
-        return np.conj(fft.rfft2(template, shape))
+        return np.asarray(np.conj(fft.rfft2(template, shape)))
 
     alike = mapped * spectrum(seen)
     alike += mapped_along[0] * spectrum(seen * along.real) + mapped_along[1] * spectrum(seen * along.imag)
