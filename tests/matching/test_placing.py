@@ -18,7 +18,7 @@ def placed(town, tilt: float, sigma_m: float, shaken_m: float = 0.0) -> tuple[Lo
     nobody = np.full(len(scene.intersections), -1)
     bent = truth + shaken_m * 1e-5 * np.array([[1.0, -2.0, 0.0], [1.5, 1.0, 0.0], [0.0, 0.0, 0.0]])
     sigmas, covariance = np.full(4, np.sqrt(2) * sigma_m), sigma_m**2 * np.eye(8)
-    fit = Fit(index, bent, nobody, np.full(len(nobody), np.inf), 0.9, 20.0, sigmas, covariance)
+    fit = Fit(index, bent, nobody, np.full(len(nobody), np.inf), 0.9, 20.0, 40.0, sigmas, covariance)
     query = Query("q", scene, look(network, truth), Seconds())
     corners = np.c_[scene.corners, np.ones(4)] @ truth.T
     return place_frame(Location("q", "located", ""), query, fit, MatchOptions()), index.plane.to_crs(

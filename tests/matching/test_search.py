@@ -157,13 +157,14 @@ def together(*toys, options=None, proves=None):
 def test_an_answer_that_is_proved_ends_the_search_with_its_stage():
     asked = []
 
-    def proves(one):
-        asked.append(one.leaders[0][1][0])
-        return one.leaders[0][1][0] == 21
+    def proves(parts):
+        best = max(parts, key=lambda one: one.lead)
+        asked.append(best.leaders[0][1][0])
+        return best if asked[-1] == 21 else None
 
     toys = [InStages([[(1, 1.0)], [(2, 1.5)], [(3, 1.0)]]), InStages([[(11, 0.5)], [(21, 2.0)], [(31, 30.0)]])]
     parts = together(*toys, proves=proves)
-    assert asked == [1, 21]  # once a stage, of the part that has the best answer
+    assert asked == [1, 21]  # once a stage, of all parts
     assert [toy.scored for toy in toys] == [[1, 2], [11, 21]]
     assert [one.stopped for one in parts] == ["elsewhere", "accepted"]
 

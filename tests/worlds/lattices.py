@@ -5,10 +5,9 @@ import shapely
 
 from roadgeo.geometry.homography import Homography
 from roadgeo.geometry.projection import LocalPlane
-from roadgeo.matching.estimator import MatchOptions
+from roadgeo.matching.evidence import Evidence
 from roadgeo.matching.index import build_index
 from roadgeo.matching.local_search import Shift, move_about
-from roadgeo.matching.twins import Contest
 from roadgeo.workflows import build_network
 from worlds.scenes import Sight, camera, look, scene_of
 
@@ -31,12 +30,12 @@ def lattice(kept: float):
 
 
 def contest(kept: float, size: tuple[int, int] = SIZE):
-    """Return the true place, the map, and places of a view of it that are compared."""
+    """Return the true place of a view, the map, and what weighs places of it."""
     network, index = lattice(kept)
     low, high = network.graph.xy.min(axis=0), network.graph.xy.max(axis=0)
     truth = camera(tuple(((low + high) / 2).tolist()), size, 1.0, heading_deg=15.0)
     scene = scene_of(look(network, truth, size, Sight(sigma_m=1.0, missing=0.15, false=0.05), 2), size)
-    return truth, index, Contest(scene, 1.0, MatchOptions())
+    return truth, index, Evidence(scene, index, 1.0)
 
 
 def beside(truth, among):
