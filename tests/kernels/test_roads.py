@@ -7,6 +7,7 @@ from naive import kernels as naive
 from roadgeo.kernels.roads import (
     backward_agreement,
     bin_segments,
+    count_residuals,
     forward_distances,
     meets_road,
     nearest_road,
@@ -192,6 +193,100 @@ class TestBackwardAgreement:
         field, observed = np.zeros((10, 10), np.float32), np.ones((10, 10), bool)
         bounds = np.array([-1e4, -1e4, 1e4, 1e4])
         assert backward_agreement(inverse, bounds, 1.0, 5.0, 0.0, 0.0, town(), field, 20.0, observed) == (0, 0)
+
+
+class TestCountResiduals:
+    RADIUS, BINS = 30.0, 12
+    CORNERS = np.array([[0.0, 0.0], [300.0, 0.0], [300.0, -250.0], [0.0, -250.0]])
+
+    def count(self, roads, matrix, points, along, weights, field, scale, observed, bounds=(-1e4, -1e4, 1e4, 1e4)):
+        forward, backward = np.full((2, self.BINS + 1), 7.0)  # what is left of the last call
+        inverse, bounds = np.linalg.inv(matrix), np.array(bounds)
+        count_residuals(
+            matrix, inverse, bounds, points, along, weights, self.RADIUS, MIN_COS, 4.0, roads, field, scale, observed,
+            forward, backward,
+        )  # fmt: skip
+        return forward, backward
+
+    def scene(self, scale=1.0, n=60):
+        rng = np.random.default_rng(4)
+        points, along = rng.uniform((0, -250), (300, 0), (n, 2)), directions(rng, n)
+        cells = (int(250 / scale), int(300 / scale))
+        field = rng.uniform(0, 60 / scale, cells).astype(np.float32)
+        return points, along, rng.uniform(size=n), field, scale, rng.uniform(size=cells) < 0.7
+
+    @pytest.mark.parametrize("matrix", [TILTED, np.array([[1.1, 0.2, 250.0], [-0.2, 1.1, 400.0], [0, 0, 1]])])
+    @pytest.mark.parametrize("scale", [1.0, 2.5])
+    def test_like_the_twin(self, matrix, scale):
+        roads, (*points, field, _, observed) = town(5), self.scene(scale)
+        corners = np.c_[self.CORNERS, np.ones(4)] @ matrix.T
+        corners = corners[:, :2] / corners[:, 2:]
+        bounds = np.concatenate([corners.min(axis=0), corners.max(axis=0)])
+        forward, backward = self.count(roads, matrix, *points, field, scale, observed, bounds)
+
+        def inside(x, y):
+            return GRID[0] <= x < GRID[0] + 800 and GRID[1] <= y < GRID[1] + 600
+
+        expected = naive.count_residuals(
+            matrix, *points, self.RADIUS, MIN_COS, 4.0, roads.segments, inside, field, scale, observed, self.BINS
+        )
+        np.testing.assert_allclose(forward, expected[0], atol=1e-9)
+        assert forward.sum() == pytest.approx(points[2].sum())
+        assert (forward[:-1] > 0).sum() > 5
+        np.testing.assert_allclose(backward, expected[1], atol=10.0)  # a sample may lie on the border of two cells
+        assert backward.sum() == pytest.approx(expected[1].sum(), rel=0.01)
+        assert expected[1].min() > 20.0
+
+    def test_the_map_is_counted_in_pixels_of_road_wherever_it_is_observed(self):
+        """One road of 100 m across the frame, at half a metre per pixel, of which a quarter is not observed."""
+        roads, matrix = binned([[100, 200, 200, 200]]), np.array([[0.5, 0, 100], [0, 0.5, 250], [0, 0, 1]])
+        field, observed = np.full((20, 20), 3.5, np.float32), np.ones((20, 20), bool)
+        observed[:, :5] = False
+        nothing = np.empty((0, 2)), np.empty((0, 2)), np.empty(0)
+        forward, backward = self.count(roads, matrix, *nothing, field, 10.0, observed)
+        assert not forward.any()
+        # three cells of 10 pixels, each half a metre: 15 m off
+        assert backward[int(self.BINS * 15.0 / self.RADIUS)] == pytest.approx(150.0, abs=8.0)
+        assert np.count_nonzero(backward) == 1
+
+    def test_no_roads(self):
+        *points, field, scale, observed = self.scene()
+        forward, backward = self.count(binned(np.empty((0, 4))), TILTED, *points, field, scale, observed)
+        assert forward[-1] == pytest.approx(points[2].sum())
+        assert not forward[:-1].any()
+        assert not backward.any()
+
+    def test_nothing_seen_counts_for_nothing(self):
+        *points, field, scale, observed = self.scene()
+        assert not self.count(town(5), TILTED, *points, field, scale, np.zeros_like(observed))[1].any()
+
+    def test_roads_and_points_beyond_the_horizon(self):
+        horizon = np.array([[1.0, 0, 300], [0, 1.0, 300], [0, -0.1, 1.0]])
+        points, along = np.array([[0.0, 20.0], [0.0, 10.0]]), np.array([[1.0, 0], [0, 1]])  # w = -1, 0
+        field, observed = np.zeros((10, 10), np.float32), np.ones((10, 10), bool)
+        forward, _ = self.count(town(5), horizon, points, along, np.ones(2), field, 20.0, observed)
+        assert forward.tolist() == [0.0] * self.BINS + [2.0]
+        behind = -np.array([[1.0, 0, -100], [0, 1, -400], [0, 0, 1]])  # the map is behind the camera
+        assert not self.count(town(5), behind, points, along, np.ones(2), field, 20.0, observed)[1].any()
+
+    @pytest.mark.parametrize("value", [np.nan, np.inf, 1e300])
+    def test_places_that_are_none(self, value):
+        *points, field, scale, observed = self.scene()
+        points[0][:] = value
+        with np.errstate(invalid="ignore"):  # as plain Python numpy tells that infinity less infinity is no number
+            forward, _ = self.count(town(5), TILTED, *points, field, scale, observed)
+        assert forward[-1] == pytest.approx(points[2].sum())
+
+    @pytest.mark.parametrize("w", [1e-300, np.nan])
+    def test_pixels_at_infinity_are_outside(self, w):
+        roads, field, observed = town(5), np.zeros((10, 10), np.float32), np.ones((10, 10), bool)
+        inverse, bounds = np.array([[1.0, 0, 0], [0, -1.0, 0], [0, 0, w]]), np.array([-1e4, -1e4, 1e4, 1e4])
+        nothing, forward, backward = np.empty((0, 2)), np.empty(self.BINS + 1), np.empty(self.BINS + 1)
+        count_residuals(
+            TILTED, inverse, bounds, nothing, nothing, np.empty(0), self.RADIUS, MIN_COS, 4.0, roads, field, 20.0,
+            observed, forward, backward,
+        )  # fmt: skip
+        assert not backward.any()
 
 
 class TestScreen:

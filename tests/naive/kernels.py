@@ -124,6 +124,35 @@ def backward_agreement(inverse, step, tolerance_m, shift, segments, inside, fiel
     return seen, shown
 
 
+def count_residuals(
+    matrix, points, directions, weights, radius, min_cos, step, segments, inside, field, field_scale, observed, n
+):
+    """Weights of points, and pixels of the map's road, by the distance of the other: `n` bins, and none so near."""
+    forward, backward = np.zeros(n + 1), np.zeros(n + 1)
+    edges = np.linspace(0.0, radius, n + 1)
+    distances = forward_distances(matrix, points, directions, radius, min_cos, np.zeros(2), segments)
+    for distance, weight in zip(distances, weights, strict=True):
+        forward[np.searchsorted(edges, distance, side="right") - 1 if distance < radius else n] += weight
+    inverse = np.linalg.inv(matrix)
+    for s, (x1, y1, x2, y2) in enumerate(segments.astype(float)):
+        length = np.hypot(x2 - x1, y2 - y1)
+        count = int(length / step + (s * 0.6180339887) % 1.0)
+        for k in range(count):
+            place = np.array([x1, y1]) + (k + 0.5) / count * np.array([x2 - x1, y2 - y1])
+            pixel = transform(inverse, place)
+            if not inside(*place) or pixel is None:
+                continue
+            column, row = np.floor(pixel * (1, -1) / field_scale).astype(int)
+            if not (0 <= row < field.shape[0] and 0 <= column < field.shape[1]) or not observed[row, column]:
+                continue
+            scale = np.sqrt(abs(np.linalg.det(jacobian(inverse, place))))
+            distance = max(field[row, column] - 0.5, 0.0) * field_scale / scale  # field: a road's own cell has 0 or 1
+            backward[np.searchsorted(edges, distance, side="right") - 1 if distance < radius else n] += (
+                length / count * scale
+            )
+    return forward, backward
+
+
 def screen(references, affines, anchor_xy, ref_xy, points, directions, radius, radius_px, min_cos, least, segments):
     shares = []
     for reference, affine in zip(references, affines, strict=True):
