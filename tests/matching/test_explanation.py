@@ -144,7 +144,7 @@ def test_blocks_like_one_another(lattice):
     search = check(explanation)
     assert explanation.location.status != "located"
     assert search["starved_at"] in {"odds", "margin"}
-    assert search["places"][0]["chance"]["roads_of_mask"] > 0.5
+    assert search["places"][0]["nearby"] > 0.5 * search["places"][0]["log10_likelihood"]
     assert any(sentence.startswith(("variety", "difference")) for sentence in search["missing"])
 
 

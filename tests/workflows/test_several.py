@@ -30,15 +30,25 @@ def town():
 
 @pytest.fixture
 def searched(query, town):
-    """Return what a search of a reference of that name found, at these odds and eastings in metres."""
+    """Return what a search of a reference of that name found, at these odds and eastings in metres.
 
-    def found(name: str, *places: tuple[float, float], tried: int = 100, **told) -> Found:
+    The first explains `likelihood`, as much as its odds unless that is given; of the others none knows.
+    """
+
+    def found(
+        name: str, *places: tuple[float, float], tried: int = 100, likelihood: float | None = None, **told
+    ) -> Found:
         index = replace(town, meta={**town.meta, "name": name, "attribution": "© all"})
         nobody = np.full(len(query.scene.intersections), -1)
         fits = [
-            Fit(index, camera((east, 0.0), SIZE), nobody, np.zeros(len(nobody)), 0.9, odds, np.ones(4))
+            Fit(
+                index, camera((east, 0.0), SIZE), nobody, np.zeros(len(nobody)), 0.9, odds, -np.inf, np.ones(4),
+                agreement=0.8,
+            )
             for odds, east in places
-        ]
+        ]  # fmt: skip
+        if fits:
+            fits[0] = replace(fits[0], log10_likelihood=fits[0].log10_odds if likelihood is None else likelihood)
         told = {"stopped": "exhausted", "match_s": 1.0, "refine_s": 0.5, **told}
         return Found(index, tuple(fits), n_tried=tried, n_searched=len(index), **told)
 
@@ -71,7 +81,7 @@ def test_a_quick_refusal_says_that_more_can_be_done(query, searched):
 def test_two_places_far_apart_that_are_equally_sure_are_ambiguous(query, searched):
     best = judge(query, searched("b", (20.0, 0.0)), searched("c", (19.0, 30_000.0)))
     assert (best.status, best.reference) == ("ambiguous", "b")
-    assert "20.0 on b and 19.0 on c" in best.reason
+    assert "80% agrees at one on b, 80% at another on c" in best.reason
     assert best.runner_up.x == pytest.approx(PLANE.origin[0] + 30_000.0, abs=1.0)
 
 
@@ -80,26 +90,26 @@ def test_overlapping_maps_may_agree(query, searched):
     assert best.status == "located"
 
 
-def test_a_weak_place_does_not_beat_a_pair_of_far_surer_ones(query, searched):
-    """Two places of one map at 10^30 are ambiguous, whatever another map holds at 10^4."""
-    best = judge(query, searched("a", (4.0, 0.0)), searched("b", (30.0, 0.0), (29.5, 5000.0)))
-    assert (best.status, best.reference) == ("ambiguous", "b")
-    assert best.log10_odds == 30.0
+def test_a_weak_place_does_not_beat_one_that_explains_more(query, searched):
+    """Two places of one map that explain 10^30 are no answer, whatever another map holds at 10^4."""
+    best = judge(query, searched("a", (4.0, 30_000.0)), searched("b", (0.5, 0.0), (-0.5, 5000.0), likelihood=30.0))
+    assert best.status != "located"
+    assert best.log10_odds == 0.5
+    assert best.reason.startswith("no place on this map stands out: the best has log10 odds 0.5")
 
 
-@pytest.mark.parametrize(
-    ("agreement", "odds", "status"), [(0.89, 6.2, "ambiguous"), (0.89, 2.9, "located"), (0.75, 6.2, "located")]
-)
-def test_a_rival_that_agrees_better_is_heard(query, searched, agreement: float, odds: float, status: str) -> None:
-    """In a lattice the true place scores little, for chance is high there: a worse one must not pass for it."""
-    found = searched("a", (13.0, 0.0), (7.1, 5000.0), (odds, 30_000.0))
-    rates = [0.73, 0.65, agreement]
-    fits = tuple(replace(fit, agreement=rate) for fit, rate in zip(found.fits, rates, strict=True))
-    best = judge(query, replace(found, fits=fits))
-    assert best.status == status
-    if status == "ambiguous":
-        assert "agrees in 73%, one with 6.2 in 89%" in best.reason
-        assert best.runner_up.x == pytest.approx(PLANE.origin[0] + 30_000.0, abs=1.0)
+@pytest.mark.xfail(strict=True, reason="only the likeliest place of another map is asked whether it is alike")
+def test_places_that_repeat_are_told_whatever_another_map_holds(query, searched):
+    pair = searched("b", (0.5, 0.0), (-0.5, 5000.0), likelihood=30.0)
+    pair = replace(pair, fits=tuple(replace(fit, agreement=0.95) for fit in pair.fits))
+    assert judge(query, pair).status == "ambiguous"
+    assert judge(query, searched("a", (-3.0, 30_000.0), likelihood=1.0), pair).status == "ambiguous"
+
+
+@pytest.mark.xfail(strict=True, reason="the odds do not heed what a place on another map explains")
+def test_odds_against_any_other_place_heed_those_on_other_maps(query, searched):
+    best = judge(query, searched("a", (20.0, 0.0), likelihood=30.0), searched("b", (19.0, 30_000.0), likelihood=27.0))
+    assert best.log10_odds <= 3.0
 
 
 def test_a_place_that_is_refused_alone_is_a_rival_all_the_same(query, searched):
@@ -111,7 +121,7 @@ def test_a_place_that_is_refused_alone_is_a_rival_all_the_same(query, searched):
 
 @pytest.mark.parametrize(("agreements", "status"), [((0.95, 0.9), "ambiguous"), ((0.95, 0.6), "not_located")])
 def test_where_streets_repeat_both_places_are_told(query, searched, agreements, status: str) -> None:
-    """Chance is as good there as the places are, so that neither has odds."""
+    """Neither explains more than the other, so that neither has odds."""
     found = searched("a", (-2.0, 0.0), (-2.1, 5000.0))
     fits = tuple(replace(fit, agreement=rate) for fit, rate in zip(found.fits, agreements, strict=True))
     best = judge(query, replace(found, fits=fits))
@@ -137,7 +147,7 @@ def test_a_given_focal_length_is_used_for_the_tilt(query, town):
     truth = camera((1000.0, 1000.0), SIZE, 1.0, tilt_deg=24.0, azimuth_deg=70.0, focal_px=900.0)
     nobody = np.full(len(query.scene.intersections), -1)
     found = Found(
-        town, (Fit(town, truth, nobody, np.zeros(len(nobody)), 0.9, 20.0, np.ones(4)),), "accepted", n_tried=1
+        town, (Fit(town, truth, nobody, np.zeros(len(nobody)), 0.9, 20.0, 40.0, np.ones(4)),), "accepted", n_tried=1
     )
     match = LocateOptions().match
     known = replace(match, camera=CameraOptions(focal_px=900.0))

@@ -79,12 +79,10 @@ def test_no_more_than_so_many_places_are_kept_those_that_explain_most(flown):
 
 
 def test_the_best_place_is_compared_with_all_others(flown):
-    """Its odds are those by which it leads any of them; the best of them is told beside it."""
+    """Its odds are those by which it leads any of them, and those around it."""
     candidates, look = Candidates([flown[2]]), look_at(flown, 8, True)
     location = candidates.look(look, LocateOptions())
     assert location.located
-    assert location.runner_up is not None
-    assert location.runner_up.log10_odds == pytest.approx(-location.log10_odds)
     worth = sorted((one.fit.log10_likelihood for one in candidates._kept), reverse=True)
     assert location.log10_odds < worth[0]
 
