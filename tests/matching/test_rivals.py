@@ -1,0 +1,225 @@
+"""The best other place, on a lattice: a block beside explains nearly as much, and what is missing there decides."""
+
+import cv2
+import numpy as np
+import pytest
+from worlds.lattices import beside, contest
+from worlds.scenes import Sight, camera, look, scene_of
+
+from roadgeo.geometry.camera import CameraOptions, sampling
+from roadgeo.geometry.homography import Homography
+from roadgeo.location import Reason
+from roadgeo.matching import rivals
+from roadgeo.matching.estimator import MatchOptions, TripleEstimator
+from roadgeo.matching.evidence import Evidence
+from roadgeo.matching.hypothesis import Hypothesis
+from roadgeo.matching.ledger import Ledger
+from roadgeo.matching.local_search import Shift, move_about
+from roadgeo.matching.options import LocateOptions
+from roadgeo.matching.rivals import RivalOptions, Rivals, similar_places
+from roadgeo.matching.search import Search
+from roadgeo.matching.triples import larger
+from roadgeo.matching.verification import agreement
+from roadgeo.reference.reference import Reference
+from roadgeo.workflows import locate
+
+NEEDED = LocateOptions().min_log10_odds
+NO_SEEDS = np.array([], np.int64)
+
+
+@pytest.fixture(scope="module")
+def broken():
+    """A view of the lattice, some blocks of which are not parted by a street."""
+    return contest(0.8, (900, 700))
+
+
+@pytest.fixture(scope="module")
+def even():
+    """The same, all blocks equal."""
+    return contest(1.0)
+
+
+def search_of(world, *matrices, near=None, match=None):
+    """A search that met these places, and its estimator."""
+    _, index, evidence = world
+    estimator = TripleEstimator(evidence.scene, index, match, near)
+    for matrix in matrices:
+        gsd = sampling(matrix, evidence.scene.size)
+        _, matched, _ = agreement(matrix, evidence.scene, index, gsd, NO_SEEDS, estimator.options.verify)
+        estimator.score(Hypothesis(matrix, NO_SEEDS, 1.0, matched, by_roads=True))
+    return Search(estimator), estimator
+
+
+def stand(world, *matrices, n_reference=866, options=None, **told):
+    """Compare the likeliest of some places with the best other one."""
+    one, estimator = search_of(world, *matrices, **told)
+    return Rivals({one: estimator}, options or RivalOptions(), Ledger(n_reference=n_reference), NEEDED).standing(one)
+
+
+def apart(world, matrix, other=None):
+    """Metres between the middles of two places, the second the true one unless it is given."""
+    truth, _, evidence = world
+    middle = Homography(truth if other is None else other)(evidence.scene.center)
+    return float(np.hypot(*(Homography(matrix)(evidence.scene.center) - middle)))
+
+
+@pytest.mark.slow
+def test_the_place_leads_all_others_by_the_streets_that_are_missing_there(broken):
+    standing = stand(broken, broken[0])
+    assert apart(broken, standing.model.laid) < 2.0
+    assert apart(broken, standing.rival) > 50.0
+    assert standing.log10_lead > NEEDED
+    # The best other place lies further away than those nearby, by which the search judged.
+    assert standing.log10_lead < standing.model.log10_odds
+
+
+@pytest.mark.slow
+def test_a_rival_that_explains_more_takes_over(broken):
+    """The search met a block beside only: that leads nothing, and what leads it is the place."""
+    truth, _, evidence = broken
+    standing, direct = stand(broken, beside(truth, evidence)), stand(broken, truth)
+    assert apart(broken, standing.model.laid) < 2.0
+    assert standing.model.refined is not None  # and it can be told like any that the search met
+    assert standing.log10_lead == pytest.approx(direct.log10_lead, abs=0.5)
+
+
+@pytest.mark.slow
+def test_where_all_blocks_are_equal_nothing_leads(even):
+    assert stand(even, even[0]).log10_lead < 0.5
+    assert stand(even, even[0], beside(even[0], even[2])).log10_lead < 0.5
+
+
+@pytest.mark.slow
+def test_an_even_lattice_is_never_located_and_a_broken_one_at_its_place(broken, even):
+    for world, located in ((broken, True), (even, False)):
+        truth, index, evidence = world
+        answer = locate(drawn(index, truth, evidence.scene.size), Reference(index))
+        assert answer.located == located
+        if located:
+            there = index.plane.to_crs(Homography(truth)(evidence.scene.corners))
+            assert np.hypot(*(answer.footprint - there).T).max() < 10.0
+        else:
+            assert answer.reason_code in {Reason.TWO_PLACES, Reason.NOTHING_STANDS_OUT}
+            assert answer.log10_odds < 1.0
+
+
+def drawn(index, matrix, size):
+    """Draw all streets of the map that a camera sees, 7 pixels wide."""
+    mask = np.zeros(size[::-1], np.uint8)
+    ends = Homography(np.linalg.inv(matrix))(index.segments.reshape(-1, 2).astype(float)) * (1, -1)
+    for line in ends.reshape(-1, 2, 2):
+        if (np.abs(line) < 5000.0).all():
+            cv2.polylines(mask, [np.round(line).astype(np.int32)], False, 255, 7)
+    return mask
+
+
+@pytest.mark.slow
+def test_a_place_known_to_the_search_is_a_rival_wherever_it_lies(broken):
+    """Also where nothing around the best place is looked at."""
+    truth, _, evidence = broken
+    nothing_else = RivalOptions(n_places=0, n_laid=0)
+    far = move_about(Homography(truth)(evidence.scene.center), Shift(-550.0, 450.0, 0.0, 1.0, 0.0)) @ truth
+    alone = stand(broken, truth, options=nothing_else)
+    both = stand(broken, truth, far, options=nothing_else)
+    assert alone.rival is None
+    assert apart(broken, both.rival, far) < 5.0
+    assert both.log10_lead <= alone.log10_lead
+
+
+@pytest.mark.slow
+def test_on_a_large_map_a_lead_is_worth_less(broken):
+    n = 15_000 * 10**4
+    small, large = (stand(broken, broken[0], n_reference=count) for count in (866, n))
+    assert small.log10_lead - large.log10_lead == pytest.approx(2.0 * np.log10(larger(n)))
+
+
+@pytest.mark.slow
+def test_only_what_the_user_allows_is_a_rival(broken):
+    truth, _, evidence = broken
+    middle = Homography(truth)(evidence.scene.center)
+    anywhere, here = stand(broken, truth), stand(broken, truth, near=(*middle, 30.0))
+    assert here.rival is None
+    assert here.log10_lead >= anywhere.log10_lead
+    upright = camera(tuple(middle.tolist()), evidence.scene.size, 1.0)
+    north = MatchOptions(camera=CameraOptions(north_up=True))
+    _, estimator = search_of(broken, match=north)
+    turned = move_about(middle, Shift(0.0, 0.0, 180.0, 1.0, 0.0)) @ upright
+    assert estimator.may_be(upright)
+    assert not estimator.may_be(turned)
+
+
+@pytest.mark.slow
+def test_similar_places_lie_on_the_streets_around_as_large_as_the_place_and_not_mirrored(broken):
+    truth, _, evidence = broken
+    wrong = beside(truth, evidence)
+    places = similar_places(wrong, evidence, MatchOptions(), RivalOptions())
+    assert 0 < len(places) <= RivalOptions().n_laid
+    assert min(apart(broken, one) for one in places) < 3.0  # the place itself is among them
+    assert sum(apart(broken, one, wrong) > 500.0 for one in places) > 1
+    size = evidence.scene.size
+    for one in places:
+        assert np.linalg.det(one) > 0.0
+        assert sampling(one, size) == pytest.approx(sampling(wrong, size), rel=0.1)
+        assert evidence.weigh(one) > 0.0
+
+
+# --- streets that do not repeat ---------------------------------------------------------------------------------------
+
+
+@pytest.fixture(scope="module")
+def plain(town):
+    truth = camera((2000.0, 1900.0), (900, 700), 1.0, heading_deg=15.0)
+    scene = scene_of(look(town[0], truth, (900, 700), Sight(1.0, missing=0.1, false=0.05)), (900, 700))
+    return truth, town[1], Evidence(scene, town[1], 1.0)
+
+
+def test_a_place_beyond_doubt_is_not_compared_further(plain, monkeypatch):
+    monkeypatch.setattr(rivals, "similar_places", None)
+    standing = stand(plain, plain[0])
+    assert standing.rival is None
+    assert standing.log10_lead == standing.model.log10_odds > RivalOptions().certain
+
+
+def test_what_explains_less_than_is_needed_is_not_compared(plain, monkeypatch):
+    truth, _, evidence = plain
+    monkeypatch.setattr(rivals, "similar_places", None)
+    wrong = move_about(Homography(truth)(evidence.scene.center), Shift(700.0, 300.0, 50.0, 1.0, 0.0)) @ truth
+    one, estimator = search_of(plain, wrong)
+    asked = Rivals({one: estimator}, RivalOptions(), Ledger(), NEEDED)
+    standing = asked.standing(one)
+    assert standing is None or standing.log10_lead < NEEDED
+    assert asked([one]) is None
+
+
+@pytest.mark.slow
+def test_where_it_is_compared_it_leads_as_clearly(plain):
+    standing = stand(plain, plain[0], options=RivalOptions(certain=np.inf))
+    assert apart(plain, standing.model.laid) < 2.0
+    assert standing.log10_lead > RivalOptions().certain
+
+
+def test_nothing_met_has_no_standing(plain):
+    one, estimator = search_of(plain)
+    asked = Rivals({one: estimator}, RivalOptions(), Ledger(), NEEDED)
+    assert asked.standing(one) is None
+    assert asked([one]) is None
+
+
+@pytest.mark.slow
+def test_a_search_ends_where_a_place_leads_by_twice_what_is_needed(broken):
+    one, estimator = search_of(broken, broken[0])
+    empty, other = search_of(broken)
+    both = {empty: other, one: estimator}
+    assert Rivals(both, RivalOptions(), Ledger(n_reference=866), NEEDED)([empty, one]) is one
+    assert Rivals(both, RivalOptions(), Ledger(n_reference=15_000 * 10**4), NEEDED)([empty, one]) is None
+    assert Rivals(both, RivalOptions(), Ledger(n_reference=866), 2.0 * NEEDED)([empty, one]) is None
+
+
+@pytest.mark.slow
+def test_a_place_is_compared_once_and_remembered(broken, monkeypatch):
+    one, estimator = search_of(broken, broken[0])
+    asked = Rivals({one: estimator}, RivalOptions(), Ledger(n_reference=866), NEEDED)
+    first, spent = asked.standing(one), one.seconds
+    assert spent > 0.0  # it is part of the search
+    monkeypatch.setattr(rivals, "similar_places", None)
+    assert asked.standing(one) is first
