@@ -33,7 +33,7 @@ from roadgeo.evaluation.noise import NOISE_MODELS
 from roadgeo.evaluation.simulation import SimulationOptions, ViewOptions, simulate_query
 from roadgeo.reference.reference import Reference
 from roadgeo.running.flights.mavlink import has_pymavlink
-from roadgeo.running.serving.workers import Asked, Workers, _locate, _serve
+from roadgeo.running.serving.workers import Asked, Workers, _answer, _serve
 
 pytestmark = pytest.mark.slow
 
@@ -236,7 +236,7 @@ def test_photographs_are_refused_where_there_is_no_model_for_them(monkeypatch):
 
     monkeypatch.setattr("roadgeo.running.serving.workers._size", lambda _: (10, 10))
     monkeypatch.setattr("roadgeo.running.queries.locate_query", none)
-    answer = _locate(Asked("photo.jpg", {}, 1.0, 1000), [])
+    answer = _answer(Asked("photo.jpg", {}, 1.0, 1000), [])
     assert answer.status == 415
     assert "onnxruntime" in answer.document["detail"]
 
