@@ -10,7 +10,7 @@ import click
 
 from roadgeo._progress import Say
 from roadgeo.cli.clusters import cluster_options, make_cluster
-from roadgeo.cli.parameters import BOX, NEAR, Plugin, verbosity_options
+from roadgeo.cli.parameters import BOX, CRS, NEAR, Plugin, verbosity_options
 from roadgeo.cli.printing import echo
 from roadgeo.cli.shards import build_in_shards, shard_options
 from roadgeo.errors import RoadSourceError
@@ -46,7 +46,7 @@ __all__ = ["index_command"]
     help="Take roads from a plugin; `roadgeo info --plugins` lists them.",
 )
 @click.option("--layer", metavar="NAME", help="Layer of --roads, where there are several.")
-@click.option("--crs", metavar="CRS", help="CRS of --roads, where the file does not say, such as EPSG:26986.")
+@click.option("--crs", metavar="CRS", type=CRS, help="CRS of --roads, where the file does not say, such as EPSG:26986.")
 @click.option(
     "--kinds",
     type=click.Choice(["main", "drivable", "vehicles", "all"]),

@@ -12,6 +12,7 @@ __all__ = [
     "ASPECT",
     "BOX",
     "CAMERA",
+    "CRS",
     "NEAR",
     "RANGE",
     "WITHIN",
@@ -109,6 +110,28 @@ class Plugin(click.ParamType):  # type: ignore[type-arg]
         return [CompletionItem(name) for name in self._known() if name.startswith(incomplete)]
 
 
+class Crs(click.ParamType):  # type: ignore[type-arg]
+    """A coordinate reference system in any words that PROJ knows; "EPSG:n" or WKT2."""
+
+    name = "CRS"
+
+    def convert(self, value: Any, param: click.Parameter | None, ctx: click.Context | None) -> str:
+        """Look it up.
+
+        Raises
+        ------
+        click.BadParameter
+            Nobody knows it, or it has no places on a map.
+        """
+        from roadgeo.errors import CrsError
+        from roadgeo.storage.crs import name_crs
+
+        try:
+            return name_crs(value)
+        except CrsError as error:
+            self.fail(str(error), param, ctx)
+
+
 class Focal(click.ParamType):  # type: ignore[type-arg]
     """A focal length in pixels, or the word "exif"."""
 
@@ -191,6 +214,7 @@ RANGE = Numbers("range", ("LO", "HI"), ":", _wrong_range)
 NEAR = Numbers("place", ("LON", "LAT", "RADIUS"), ",", _wrong_place)
 #: A focal length in pixels, or where to find it.
 CAMERA = Focal()
+CRS = Crs()
 #: A country or state, or bounds in degrees.
 WITHIN = Area()
 
