@@ -5,6 +5,7 @@ from __future__ import annotations
 import logging
 import os
 import re
+import select
 import signal
 import sys
 import threading
@@ -154,8 +155,7 @@ def serve_command(
     if not no_browser and _has_screen():
         threading.Timer(0.5, webbrowser.open, [address]).start()
     signal.signal(signal.SIGTERM, signal.default_int_handler)
-    if not quiet:
-        _log_requests()
+    _log(quiet)
     try:
         server.serve_forever()
     except KeyboardInterrupt:
@@ -173,14 +173,27 @@ def _has_screen() -> bool:
     return sys.stderr.isatty() and has_display
 
 
-def _log_requests() -> None:
-    """Write a line for each request to stderr: who, what, which status."""
-    shown = logging.StreamHandler()
-    shown.setFormatter(logging.Formatter("%(asctime)s %(message)s"))
-    log = logging.getLogger("uvicorn.access")
-    log.addHandler(shown)
-    log.setLevel(logging.INFO)
-    log.propagate = False
+class _Log(logging.Handler):
+    """Writes lines to stderr as far as somebody takes them: who leaves a pipe unread does not stop the server."""
+
+    def emit(self, record: logging.LogRecord) -> None:
+        """Write a line, or leave it out."""
+        text = f"{self.format(record)}\n".encode(errors="backslashreplace")
+        try:
+            where, most = sys.stderr.fileno(), getattr(select, "PIPE_BUF", len(text))
+            while text and (sys.platform == "win32" or select.select([], [where], [], 0)[1]):
+                text = text[os.write(where, text[:most]) :]
+        except (OSError, ValueError):  # stderr is closed
+            return
+
+
+def _log(quiet: bool) -> None:
+    """Have faults written to stderr, and unless `quiet` a line for each request: who, what, which status."""
+    log = _Log()
+    log.setFormatter(logging.Formatter("%(asctime)s %(message)s"))
+    logging.getLogger().addHandler(log)
+    if not quiet:
+        logging.getLogger("uvicorn.access").setLevel(logging.INFO)
 
 
 def _tell(sender: MavlinkSender, found: dict[str, Any], came_s: float) -> None:

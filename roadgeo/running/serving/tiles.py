@@ -60,11 +60,9 @@ class Tiles:
         corners = np.array([(west - side / 32, north - side * 33 / 32), (west + side * 33 / 32, north + side / 32)])
         box = to_lonlat("EPSG:3857", corners)
         (box_west, box_south), (box_east, box_north) = box.tolist()
-        lines: list[FloatArray] = []
-        for index in _indexes(reference, (box_west, box_south, box_east, box_north), zoom):
-            ends = _web(index, _segments(index, box))
-            lines += _draw((ends - (west, north)) * (_EXTENT / side, -_EXTENT / side), zoom)
-        return _encode(lines)
+        indexes = _indexes(reference, (box_west, box_south, box_east, box_north), zoom)
+        ends = np.concatenate([np.empty((0, 2, 2)), *(_web(index, _segments(index, box)) for index in indexes)])
+        return _encode(_draw((ends - (west, north)) * (_EXTENT / side, -_EXTENT / side), zoom))
 
 
 def _indexes(reference: AnyReference, box: Box, zoom: int) -> list[ReferenceIndex]:
@@ -113,11 +111,13 @@ def _draw(ends: FloatArray, zoom: int) -> list[FloatArray]:
     ends = ends[
         np.isfinite(ends).all(axis=(1, 2)) & (high > -margin).all(axis=1) & (low < _EXTENT + margin).all(axis=1)
     ]
-    step = 1 if zoom > 12 else _EXTENT // _COARSE
+    step = 1 if zoom > 12 else _EXTENT // (_COARSE if zoom > 10 else _COARSE // 2)
     drawn = np.rint(ends / step) * step
     drawn = drawn[(drawn[:, 0] != drawn[:, 1]).any(axis=1)]
     if step > 1 and len(drawn):  # what falls together is drawn once
-        _, first = np.unique(drawn.reshape(-1, 4), axis=0, return_index=True)
+        turned = (drawn[:, 0] > drawn[:, 1]).any(axis=1) & (drawn[:, 0, 0] >= drawn[:, 1, 0])
+        alike = np.where(turned[:, None, None], drawn[:, ::-1], drawn).reshape(-1, 4)
+        _, first = np.unique(alike @ (1.0, 1e4, 1e8, 1e12), return_index=True)
         drawn = drawn[np.sort(first)]
     if len(drawn) > _MOST_SEGMENTS:
         longest = np.argsort(-np.abs(drawn[:, 1] - drawn[:, 0]).sum(axis=1), kind="stable")[:_MOST_SEGMENTS]

@@ -349,6 +349,33 @@ def test_it_is_all_done_by_keys(page, served, hard):
     wait_for(page, "Located")
 
 
+def test_points_are_chosen_by_keys(page, served, hard):
+    _, workers, mask, lonlat = served
+    give(page, mask, "hard.png")
+    wait_for(page, "Not located")
+    page.focus("#pick")
+    page.keyboard.press("Enter")
+    place = locate(str(mask), workers.references)
+    for key, pixel in {"ArrowLeft": (405.0, 450.0), "ArrowUp": (405.0, 405.0)}.items():
+        page.focus("#photo")
+        page.keyboard.press(f"Shift+{key}")
+        page.keyboard.press("Enter")
+        assert page.evaluate("document.activeElement.className").startswith("maplibregl-canvas")
+        look_at(page, to_lonlat(place.crs, place.pixel_to_map(np.array([pixel])))[0], 17)
+        page.focus("#take-middle")
+        page.keyboard.press("Enter")
+    wait_for(page, "Located")
+    assert workers.asked[-1].hints["near"][:2] == pytest.approx(tuple(lonlat), abs=2e-4)
+
+
+def test_a_file_that_is_too_large_is_not_sent(served, chromium, tmp_path):
+    (tmp_path / "large.png").write_bytes(served[2].read_bytes() + bytes(3_000_000))
+    with serving(served[1], max_bytes=2_000_000) as server, opened(chromium, server) as page:
+        page.set_input_files("#files", str(tmp_path / "large.png"))
+        wait_for(page, "Failed")
+        expect(page.locator("#reason")).to_have_text("The file has 3 MB, this server takes 2 MB: reduce it.")
+
+
 def test_several_are_taken_and_kept_for_the_session(page, served, hard):
     mask = served[2]
     names = [f"mask {k}.png" for k in range(4)]  # more than there are places

@@ -270,6 +270,9 @@ def test_the_command_serves_until_it_is_interrupted(place):
                 urllib.request.urlopen(address + "locate", b"no image", timeout=60)
             assert refused.value.code == 415
             refused.value.close()
+            for _ in range(30):  # more than fits into a pipe: nobody reads what is logged
+                with urllib.request.urlopen(f"{address}health?{'a' * 6000}", timeout=60) as answer:
+                    assert json.load(answer)["status"] == "ok"
         finally:
             process.send_signal(signal.SIGINT)
         assert process.wait(20) == 0

@@ -6,7 +6,7 @@ const $ = (id) => document.getElementById(id);
 const WORDS = { located: "Located", ambiguous: "Two places", not_located: "Not located", failed: "Failed", running: "Working", dismissed: "Cancelled" };
 const KEPT = "roadgeo.session";
 const answers = [];  // latest first: { id, base, name, status, message, progress, document, view, hints }
-let current = null, kept = 20, hasMap = false;
+let current = null, kept = 20, maxBytes = Infinity, hasMap = false;
 
 const make = (tag, properties = {}, ...children) => {
   const one = Object.assign(document.createElement(tag), properties);
@@ -51,9 +51,14 @@ async function askUntilFree(path, options, entry) {
 // --- answers ----------------------------------------------------------------------------------------------------------
 
 async function takeFiles(files) {
+  complain("");
   const entries = [...files].reverse().map((file) => add({ name: file.name, message: "sending", file, preview: URL.createObjectURL(file) }));
   if (entries.length) choose(entries.at(-1));
   for (const entry of entries.reverse()) {  // the first one is sent first, and stands on top
+    if (entry.file.size > 0.99 * maxBytes) {
+      update(entry, { status: "failed", message: `the file has ${megabytes(entry.file.size)}, this server takes ${megabytes(maxBytes)}: reduce it` });
+      continue;
+    }
     const body = new FormData();
     body.append("image", entry.file, entry.name);
     await start(entry, "/locate", { method: "POST", body, headers: { Prefer: "respond-async" } });
@@ -222,6 +227,7 @@ function layPins() {
   showPairs();
 }
 
+const megabytes = (bytes) => `${(bytes / 1e6).toFixed(0)} MB`;
 const sentence = (text) => (text ? text[0].toUpperCase() + text.slice(1) + (/[.!?]$/.test(text) ? "" : ".") : "");
 const degrees = ({ lat, lon }) => `${lat.toFixed(6)}, ${lon.toFixed(6)}`;
 const length = (m) => (m < 1 ? `${(m * 100).toPrecision(2)} cm` : m < 10 ? `${m.toFixed(1)} m` : m < 1000 ? `${m.toFixed(0)} m` : `${(m / 1000).toFixed(1)} km`);
@@ -408,6 +414,8 @@ function setPicking(on) {
   waiting = null;
   $("pick").setAttribute("aria-pressed", String(picking));
   $("picture").classList.toggle("picks", picking);
+  $("photo").tabIndex = picking ? 0 : -1;
+  $("aim").hidden = $("take-middle").hidden = true;
   if (hasMap) view.onClick(null);
   tell(picking ? "Click a crossing in the picture" : "");
   if (picking) $("picture").scrollIntoView({ block: "nearest" });
@@ -424,12 +432,14 @@ function pickPixel(pixel) {
   waiting = pixel;
   showPairs();
   tell(`Now click the same crossing on the map (${pairs.length + 1})`);
+  $("take-middle").hidden = false;
   if (innerWidth <= 760) scrollTo({ top: 0 });
   view.onClick(setPlace);
 }
 
 function setPlace(lonlat) {
   view.onClick(null);
+  $("take-middle").hidden = true;
   pairs.push({ pixel: waiting, lonlat });
   waiting = null;
   showPairs();
@@ -441,7 +451,7 @@ function showPairs() {
   if (!current?.view) return;
   const [width, height] = current.view.size;
   const all = [...pairs.map((one) => one.pixel), ...(waiting ? [waiting] : [])];
-  $("pins").replaceChildren(...all.map(([column, row], i) => {
+  $("points").replaceChildren(...all.map(([column, row], i) => {
     const pin = make("button", { type: "button", className: "pin", textContent: i + 1 });
     pin.setAttribute("aria-label", `Point ${i + 1} in the picture`);
     Object.assign(pin.style, { left: `${100 * column / width}%`, top: `${100 * row / height}%` });
@@ -460,6 +470,21 @@ function showPairs() {
       if (pairs.length >= 2) searchAgain();
     });
   });
+}
+
+let aim = [0.5, 0.5];
+/** Choose a point by keys: arrows move a cross over the picture, Enter takes it; then the map is moved likewise. */
+function aimByKeys(event) {
+  const step = { ArrowLeft: [-1, 0], ArrowRight: [1, 0], ArrowUp: [0, -1], ArrowDown: [0, 1] }[event.key];
+  if (!picking || !(step || event.key === "Enter")) return;
+  event.preventDefault();
+  if (step) aim = aim.map((share, k) => Math.min(Math.max(share + step[k] * (event.shiftKey ? 0.05 : 0.005), 0), 1));
+  Object.assign($("aim").style, { left: `${100 * aim[0]}%`, top: `${100 * aim[1]}%` });
+  $("aim").hidden = false;
+  if (step) return;
+  $("aim").hidden = true;
+  pickPixel(current.view.size.map((side, k) => side * aim[k]));
+  view.theMap().getCanvas().focus();
 }
 
 /** Carry a point from the picture over to the map. */
@@ -553,6 +578,8 @@ function listen() {
     setPicking(picking);
   };
   $("photo").onclick = (event) => picking && pickPixel(pixelAt(event));
+  $("photo").onkeydown = aimByKeys;
+  $("take-middle").onclick = () => waiting && setPlace(view.middle());
   $("larger").onclick = () => {
     const on = $("panel").classList.toggle("large");
     $("larger").setAttribute("aria-pressed", String(on));
@@ -604,6 +631,7 @@ async function begin() {
     return;
   }
   kept = told.kept;
+  maxBytes = told.max_bytes;
   $("work").hidden = false;
   hasMap = view.makeMap(told);
   if (!hasMap) complain("This browser cannot draw the map (it has no WebGL). Places are told all the same.");
