@@ -111,7 +111,7 @@ def _draw(ends: FloatArray, zoom: int) -> list[FloatArray]:
     ends = ends[
         np.isfinite(ends).all(axis=(1, 2)) & (high > -margin).all(axis=1) & (low < _EXTENT + margin).all(axis=1)
     ]
-    step = 1 if zoom > 12 else _EXTENT // (_COARSE if zoom > 10 else _COARSE // 2)
+    step = 1 if zoom > 12 else _EXTENT // _COARSE
     drawn = np.rint(ends / step) * step
     drawn = drawn[(drawn[:, 0] != drawn[:, 1]).any(axis=1)]
     if step > 1 and len(drawn):  # what falls together is drawn once

@@ -28,6 +28,8 @@ _LOG = logging.getLogger(__name__)
 
 #: A process that has not answered so long after its time limit is ended.
 _GRACE_S = 15.0
+#: Where progress is told, and who waits may call it off, it may take so much longer: a busy machine is no fault.
+_PATIENT_S = 90.0
 #: So long it may open its references.
 _START_S = 120.0
 #: So often it is looked whether somebody still waits.
@@ -245,7 +247,7 @@ class _Worker:
         if why := self._open():
             return Answer(503, {"detail": why})
         self._pipe.send(asked)
-        patience_s = asked.time_limit_s + _GRACE_S
+        patience_s = asked.time_limit_s + (_PATIENT_S if asked.keeps else _GRACE_S)
         until = time.monotonic() + patience_s
         while time.monotonic() < until:
             if called_off.is_set():

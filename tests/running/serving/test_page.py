@@ -507,3 +507,29 @@ def test_a_token_is_asked_for_once(served, chromium):
             assert "sesame" not in cookie["value"]
         finally:
             context.close()
+
+
+def test_a_browser_that_draws_no_map_tells_places(served, chromium):
+    flags = [*(flag for flag in FLAGS if "swiftshader" not in flag), "--disable-3d-apis"]
+    with chromium.browser_type.launch(executable_path=find_chromium(), args=flags) as browser:
+        page = browser.new_page()
+        page.goto(f"http://127.0.0.1:{served[0].server_port}/")
+        expect(page.locator("#trouble")).to_contain_text("cannot draw the map")
+        give(page, served[2])
+        wait_for(page, "Located")
+        expect(page.locator("#facts")).to_contain_text("Middle")
+
+
+def test_a_basemap_is_asked_where_the_user_said(served, chromium):
+    workers, asked = served[1], []
+    with serving(workers, basemap="http://127.0.0.1:9/{z}/{x}/{y}.png", basemap_attribution="<b>Me</b>") as server:
+        context = chromium.new_context()
+        page = context.new_page()
+        page.on("request", lambda request: asked.append(request.url))
+        page.goto(f"http://127.0.0.1:{server.server_port}/")
+        expect(page.locator(".maplibregl-ctrl-attrib")).to_contain_text("<b>Me</b>")
+        page.wait_for_timeout(500)
+        context.close()
+    elsewhere = [url for url in asked if f":{server.server_port}/" not in url and url.startswith("http")]
+    assert elsewhere
+    assert all(url.startswith("http://127.0.0.1:9/") for url in elsewhere)

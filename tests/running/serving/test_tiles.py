@@ -40,7 +40,7 @@ def test_a_tile_holds_the_roads_where_they_lie(tiles, zoom):
     column, row = tile_of(lon, lat, zoom)
     found = to_lonlat("EPSG:3857", points_of(made.tile(0, zoom, column, row), zoom, column, row))
     known = to_lonlat(index.plane.crs, ends)
-    step_m = WORLD_M / 2**zoom / (4096 if zoom > 12 else 256)
+    step_m = WORLD_M / 2**zoom / (4096 if zoom > 12 else 512)
     scale = 111195 * np.array([math.cos(math.radians(lat)), 1.0])
     for point in found[:: max(len(found) // 50, 1)]:
         assert np.hypot(*((known - point) * scale).T).min() < 2 * step_m

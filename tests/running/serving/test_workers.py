@@ -310,3 +310,11 @@ def test_others_may_ask_with_a_token_only(options):
     )
     assert done.returncode == 2
     assert "token" in done.stderr
+
+
+@pytest.mark.parametrize(
+    "url", ["ftp://a/{z}/{x}/{y}", "https://a.example/{z}/{x}.png", "https://a; script-src */{z}/{x}/{y}"]
+)
+def test_a_basemap_is_an_address_of_tiles(url, capsys):
+    assert main(["serve", "--basemap", url]) == 2
+    assert "{z}/{x}/{y}" in capsys.readouterr().err
