@@ -225,6 +225,12 @@ def test_a_place_is_looked_at_from_all_sides(page, served):
     page.mouse.move(900, 400, steps=3)
     page.mouse.up()
     expect(page.locator("#swipe")).to_have_attribute("aria-valuenow", "70")
+    # A matched crossing tells its residual.
+    page.uncheck("#show-swipe")
+    where = page.locator("#photo").get_attribute("src").replace("picture.jpg", "view.json")
+    first = page.evaluate("(where) => fetch(where).then((answer) => answer.json())", where)
+    page.mouse.click(*on_map(page, first["place"]["matches"][0]["map"]))
+    expect(page.locator(".maplibregl-popup")).to_contain_text(f"{first['place']['matches'][0]['residual_m']:.1f} m")
 
 
 def test_every_output_may_be_had(page, served):
@@ -298,10 +304,19 @@ def test_two_points_tell_where_it_is_and_how_large_a_pixel(page, served, hard):
     page.click("#pick")
     box, pixels = page.locator("#photo").bounding_box(), np.array([(250.0, 300.0), (700.0, 500.0)])
     place = locate(str(mask), workers.references)
-    for (column, row), there in zip(pixels, to_lonlat(place.crs, place.pixel_to_map(pixels)), strict=True):
-        page.mouse.click(box["x"] + column / 900 * box["width"], box["y"] + row / 900 * box["height"])
-        expect(page.locator("#asks")).to_contain_text("on the map")
-        page.mouse.click(*on_map(page, there))
+    first, second = to_lonlat(place.crs, place.pixel_to_map(pixels))
+    (x, y), (u, v) = (box["x"], box["y"]) + pixels / 900 * (box["width"], box["height"])
+    page.mouse.click(x, y)
+    expect(page.locator("#asks")).to_contain_text("on the map")
+    page.mouse.click(*on_map(page, first))
+    # The other is carried over.
+    page.mouse.click(u, v)
+    expect(page.locator("#points .pin")).to_have_count(2)
+    page.mouse.move(u, v)
+    page.mouse.down()
+    page.mouse.move(u + 200, v, steps=3)
+    page.mouse.move(*on_map(page, second), steps=3)
+    page.mouse.up()
     wait_for(page, "Located")
     hints = workers.asked[-1].hints
     assert hints["near"][:2] == pytest.approx(tuple(lonlat), abs=2e-4)

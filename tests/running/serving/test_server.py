@@ -334,6 +334,35 @@ def test_with_a_token_nobody_else_is_answered():
         assert ask(server, "POST", "/locate", PNG, right)[0].status == 200
 
 
+@pytest.mark.parametrize("coding", ["utf-8", "latin-1"])
+@pytest.mark.parametrize("scheme", ["Bearer", "bearer", "BEARER"])
+def test_tokens_may_hold_any_letters(coding, scheme):
+    with serving(token="schlüssel") as server:
+        shown = {"Authorization": f"{scheme} schlüssel".encode(coding)}
+        assert ask(server, "GET", "/processes", headers=shown)[0].status == 200
+
+
+def test_who_waits_while_the_server_ends_is_told():
+    workers, ended, answers = Workers(), threading.Event(), []
+
+    def ask_until_end(*_):
+        ended.wait(10.0)
+        return Answer(503, {"detail": "the server is ending; come again"})
+
+    workers.ask, workers.close = ask_until_end, ended.set
+    with serving(workers) as server:
+        asking = threading.Thread(target=lambda: answers.append(ask(server, "POST", "/locate", PNG)))
+        asking.start()
+        for _ in range(200):
+            if workers.places._value < 4:
+                break
+            time.sleep(0.01)
+        time.sleep(0.1)
+        server.shutdown()
+        asking.join(10.0)
+    assert [answer.status for answer, _ in answers] == [503]
+
+
 def test_it_listens_on_loopback_only():
     assert ServeOptions().host == "127.0.0.1"
     with serving() as server:

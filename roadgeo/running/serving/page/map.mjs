@@ -7,6 +7,7 @@ const feature = (type, coordinates, properties = {}) => ({ type: "Feature", prop
 const collection = (features) => ({ type: "FeatureCollection", features });
 
 let map, over, shown = null;
+const popup = new maplibre.Popup({ closeButton: false });
 const markers = [];
 
 /** Metres east and north from one place to another, [longitude, latitude] each. */
@@ -83,6 +84,11 @@ export function makeMap(told) {
   map.on("move", follow);
   over.once("load", follow);
   map.on("resize", () => over.resize());
+  map.on("click", ({ point, lngLat }) => {
+    const reach = [[point.x - 6, point.y - 6], [point.x + 6, point.y + 6]];
+    const [hit] = over.isStyleLoaded() ? over.queryRenderedFeatures(reach, { layers: ["ends"] }) : [];
+    if (hit) popup.setLngLat(lngLat).setText(`Residual ${hit.properties.residual.toFixed(1)} m`).addTo(map);
+  });
   map.getCanvas().setAttribute("aria-label", "Map: arrow keys move it, plus and minus enlarge and reduce it");
   return true;
 }
@@ -169,6 +175,7 @@ export function addMarker(lonlat, text, label, kind, options = {}) {
 }
 
 export function clearMarkers() {
+  popup.remove();
   markers.splice(0).forEach((one) => one.remove());
 }
 
