@@ -13,7 +13,6 @@ from roadgeo.cli.clusters import cluster_options, make_cluster
 from roadgeo.cli.parameters import BOX, CRS, NEAR, Plugin, verbosity_options
 from roadgeo.cli.printing import echo
 from roadgeo.cli.shards import build_in_shards, shard_options
-from roadgeo.errors import RoadSourceError
 
 if TYPE_CHECKING:
     from roadgeo.sources.roads import Roads
@@ -160,10 +159,7 @@ def index_command(
     read = {"roads": _read, "plugin": _read_plugin}.get(given, _fetch)
     compile_once(quiet)
     with show_steps(quiet) as say:
-        try:
-            roads = read(source, given, say)
-        except RoadSourceError as error:
-            raise RoadSourceError(f"{error}{_ask_about_box(source['bbox'])}") from error
+        roads = read(source, given, say)
         if update:
             reference = update_reference(path, roads, say)
         else:
@@ -199,15 +195,6 @@ def _require_geopackage(out: str | None) -> None:
             f"--out {out}: a reference is a GeoPackage with its index beside it; did you mean"
             f" {Path(out).with_suffix('.gpkg')}?"
         )
-
-
-def _ask_about_box(box: tuple[float, float, float, float] | None) -> str:
-    """Ask whether longitudes and latitudes of a box without roads were exchanged, where they may have been."""
-    if box is None:
-        return ""
-    south, west, north, east = box  # if so
-    sound = -90 <= south < north <= 90 and -180 <= west < east <= 180
-    return f" (longitude comes first: did you mean --bbox={west:g},{south:g},{east:g},{north:g}?)" if sound else ""
 
 
 def _rebuild(name: str, quiet: bool) -> None:

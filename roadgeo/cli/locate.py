@@ -192,6 +192,7 @@ def _drawing_options(command: Command) -> Command:
     show_default=True,
     help="What the coordinates are of roads that come as lines (GeoJSON, GeoPackage ...). auto: told by the CRS.",
 )
+@click.option("--layer", metavar="NAME", help="Layer of roads that come as lines, where there are several.")
 @click.option(
     "--allow-mirror",
     is_flag=True,

@@ -227,7 +227,7 @@ def read_nominatim(path: Path) -> None:
 
 def read_map(path: Path) -> None:
     """Read roads onto a plane."""
-    read_roads(path, which="all", crs="EPSG:4326" if path.suffix == ".csv" else None)
+    read_roads(path, which="all", crs="EPSG:4326" if path.suffix in (".csv", ".dxf") else None)
 
 
 def read_in_parts(path: Path) -> None:
@@ -273,6 +273,9 @@ READERS = {
     "parts": Reader(read_in_parts, "roads.geojson"),
     "geojsonl": Reader(read_map, "roads.geojsonl"),
     "csv": Reader(read_map, "roads.csv"),
+    "dxf": Reader(read_map, "roads.dxf"),
+    "zip": Reader(read_map, "roads.zip"),
+    "osm_json": Reader(read_map, "roads.json"),
     "gml": Reader(read_map, "roads.gml"),
     "kml": Reader(read_map, "roads.kml"),
     "gpx": Reader(read_map, "roads.gpx"),
