@@ -162,6 +162,7 @@ def _guarded(path: Path, layer: str | None = None) -> Iterator[Path]:
     _require_stored(path)
     if layer is not None:
         _require_stored(path, layer)
+    file = path
     try:
         with _few_drivers(), _offline(), _aside(path) as file, warnings.catch_warnings():
             warnings.simplefilter("ignore")
@@ -170,6 +171,7 @@ def _guarded(path: Path, layer: str | None = None) -> Iterator[Path]:
         raise RoadSourceError(f"{path}: names a CRS that is none: {first_line(error)}") from error
     except (DataSourceError, DataLayerError, UnicodeDecodeError) as error:
         told = "of a format that is not read here" if "not recognized" in str(error) else first_line(error)
+        told = told.replace(str(file), str(path))
         hint = f"; save it as GeoPackage, or allow GDAL's driver with {CONSENT}" if told.startswith("of") else ""
         raise RoadSourceError(f"{path}: not readable as a map of roads: {told}{hint}") from error
 

@@ -182,3 +182,13 @@ def test_what_is_no_regular_file(tmp_path):
             read(tmp_path / "roads.gpkg")
         with pytest.raises(RoadSourceError, match="no regular file"):
             read(Path("/dev/zero"))
+
+
+def test_a_pipe_or_a_broken_map_is_told_of_by_the_name_that_was_given(tmp_path: Path) -> None:
+    """A link in a passing folder is what GDAL opens."""
+    (tmp_path / "roads.gml").write_text(
+        '<?xml version="1.0"?><gml:FeatureCollection xmlns:gml="http://www.opengis.net/gml">'
+    )
+    with pytest.raises(RoadSourceError) as error:
+        read_lines(tmp_path / "roads.gml")
+    assert "/roadgeo-" not in str(error.value)

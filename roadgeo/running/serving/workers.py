@@ -9,7 +9,9 @@ from __future__ import annotations
 import logging
 import multiprocessing
 import queue
+import shutil
 import signal
+import tempfile
 import threading
 import time
 from collections.abc import Sequence
@@ -283,7 +285,8 @@ class _Worker:
 def _serve(pipe: Connection, names: list[str]) -> None:
     """Answer until the pipe is closed."""
     signal.signal(signal.SIGINT, signal.SIG_IGN)
-    end_with_parent()
+    folders: set[Path] = set()
+    end_with_parent(lambda: _remove_all(folders))
     import cv2
 
     from roadgeo.errors import RoadgeoError
@@ -301,10 +304,26 @@ def _serve(pipe: Connection, names: list[str]) -> None:
     try:
         while True:
             asked: Asked = pipe.recv()
+            folders.update(_folder_of(asked.path))
             say = partial(_tell, pipe) if asked.keeps else say_nothing
             pipe.send(_answer(asked, references, say))
     except (EOFError, OSError):
         return
+
+
+def _folder_of(path: str) -> list[Path]:
+    """Return the temporary folder of the server in which a file lies, if it is one."""
+    return [
+        folder
+        for folder in Path(path).parents
+        if folder.parent == Path(tempfile.gettempdir()) and folder.name.startswith("roadgeo-")
+    ]
+
+
+def _remove_all(folders: set[Path]) -> None:
+    """Remove the images that a server which was killed has left."""
+    for folder in folders:
+        shutil.rmtree(folder, ignore_errors=True)
 
 
 def _tell(pipe: Connection, text: str, share: float | None = None) -> None:
@@ -357,6 +376,7 @@ def _locate(asked: Asked, references: Sequence[Any], say: Say) -> Answer:
     say("reading the image")
     sighting = locate_query(asked.path, references, options, how=search, say=tell)
     location = replace(sighting.location, query=asked.name)
+    location = replace(location, reason=_without(asked.path, location.reason))
     if asked.keeps:
         say("drawing the answer")
         write_view(Path(asked.path), replace(sighting, location=location), references)

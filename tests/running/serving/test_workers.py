@@ -11,6 +11,7 @@ import socket
 import struct
 import subprocess
 import sys
+import tempfile
 import threading
 import time
 import urllib.error
@@ -33,7 +34,7 @@ from roadgeo.evaluation.noise import NOISE_MODELS
 from roadgeo.evaluation.simulation import SimulationOptions, ViewOptions, simulate_query
 from roadgeo.reference.reference import Reference
 from roadgeo.running.flights.mavlink import has_pymavlink
-from roadgeo.running.serving.workers import Asked, Workers, _answer, _serve
+from roadgeo.running.serving.workers import Asked, Workers, _answer, _folder_of, _remove_all, _serve
 
 pytestmark = pytest.mark.slow
 
@@ -284,6 +285,19 @@ def test_the_command_serves_until_it_is_interrupted(place):
         assert asked_at - 0.1 < place["time_usec"] / 1e6 < place["heard_at"]
         assert place["time_usec"] + place["processing_time"] <= place["heard_at"] * 1e6
     assert bool(heard) == has_pymavlink()
+
+
+@pytest.mark.skipif(os.name == "nt", reason="signals of POSIX")
+def test_images_of_a_server_that_was_killed_are_removed(tmp_path, monkeypatch):
+    monkeypatch.setattr(tempfile, "tempdir", str(tmp_path))
+    images = tmp_path / "roadgeo-x" / "job"
+    images.mkdir(parents=True)
+    (images / "image.png").touch()
+    folders = set(_folder_of(str(images / "image.png")))
+    assert folders == {tmp_path / "roadgeo-x"}
+    assert not _folder_of(str(tmp_path / "mine" / "image.png"))
+    _remove_all(folders)
+    assert not list(tmp_path.iterdir())
 
 
 @pytest.mark.skipif(os.name == "nt", reason="signals of POSIX")
