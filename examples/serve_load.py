@@ -34,7 +34,7 @@ def post(port: int, body: bytes, path: str = "/locate", timeout: float = 90.0) -
 
 def send(port: int, data: bytes, timeout: float) -> tuple[int, float, bool]:
     answer, seconds = ask(port, data, timeout)
-    return status_of(answer), seconds, b"Retry-After" in answer
+    return status_of(answer), seconds, b"\r\nretry-after:" in answer.lower()
 
 
 def ask(port: int, data: bytes, timeout: float) -> tuple[bytes, float]:
@@ -138,7 +138,8 @@ def main() -> None:
     given = parser.parse_args()
     mask = given.mask.read_bytes()
     program = "import sys; from roadgeo.cli import main; sys.exit(main())"
-    command = [sys.executable, "-c", program, "serve", "-r", given.reference, "--port", "0", "--jobs", str(given.jobs)]
+    command = [sys.executable, "-c", program, "serve", "--quiet", "-r", given.reference]
+    command += ["--port", "0", "--jobs", str(given.jobs)]
     with subprocess.Popen(command, stderr=subprocess.PIPE, text=True) as server:
         try:
             line = next(line for line in server.stderr or [] if "Listening" in line)

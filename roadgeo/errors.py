@@ -11,6 +11,7 @@ __all__ = [
     "IndexFormatError",
     "MaskError",
     "ModelError",
+    "NoRoadsError",
     "NotLocatedError",
     "OutputError",
     "PhotographError",
@@ -30,6 +31,10 @@ class RoadgeoError(Exception):
 
 class RoadSourceError(RoadgeoError):
     """Roads could not be read, fetched, or are of no use (no lines, empty, unknown place, no network)."""
+
+
+class NoRoadsError(RoadSourceError):
+    """A source can be read and holds no roads."""
 
 
 class CrsError(RoadgeoError):

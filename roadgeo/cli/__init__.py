@@ -36,7 +36,7 @@ COMMANDS = {
     "verify": ("roadgeo.cli.verify", "Check whether georeferenced images are where they say."),
     "track": ("roadgeo.cli.track", "Follow a flight over the map, frame by frame."),
     "apply": ("roadgeo.cli.apply", "Put another picture of a located frame on the map."),
-    "serve": ("roadgeo.cli.serve", "Answer over HTTP where masks and photographs lie."),
+    "serve": ("roadgeo.cli.serve", "A page to drop photographs on; answers over HTTP."),
     "vectorize": ("roadgeo.cli.vectorize", "Show what roads are seen in a mask."),
     "info": ("roadgeo.cli.references", "Describe a reference."),
     "check": ("roadgeo.cli.references", "Verify every byte and number of a reference."),

@@ -7,7 +7,7 @@ from typing import Any
 import click
 
 from roadgeo.cli.folders import make_folder
-from roadgeo.cli.parameters import Plugin, out_dir_option
+from roadgeo.cli.parameters import CRS, Plugin, out_dir_option
 from roadgeo.cli.printing import echo
 from roadgeo.outputs.registry import offered
 
@@ -32,7 +32,9 @@ __all__ = ["apply_command"]
     multiple=True,
     help="Write a further form, as of `roadgeo locate`: points, gcps, iiif, geojson, kmz ... Repeatable.",
 )
-@click.option("--crs", metavar="CRS", help="CRS of what is drawn, such as EPSG:3857. Default: the location's own.")
+@click.option(
+    "--crs", metavar="CRS", type=CRS, help="CRS of what is drawn, such as EPSG:3857. Default: the location's own."
+)
 @click.option(
     "--resolution",
     metavar="SIZE",

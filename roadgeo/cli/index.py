@@ -10,10 +10,9 @@ import click
 
 from roadgeo._progress import Say
 from roadgeo.cli.clusters import cluster_options, make_cluster
-from roadgeo.cli.parameters import BOX, NEAR, Plugin, verbosity_options
+from roadgeo.cli.parameters import BOX, CRS, NEAR, Plugin, verbosity_options
 from roadgeo.cli.printing import echo
 from roadgeo.cli.shards import build_in_shards, shard_options
-from roadgeo.errors import RoadSourceError
 
 if TYPE_CHECKING:
     from roadgeo.sources.roads import Roads
@@ -46,7 +45,7 @@ __all__ = ["index_command"]
     help="Take roads from a plugin; `roadgeo info --plugins` lists them.",
 )
 @click.option("--layer", metavar="NAME", help="Layer of --roads, where there are several.")
-@click.option("--crs", metavar="CRS", help="CRS of --roads, where the file does not say, such as EPSG:26986.")
+@click.option("--crs", metavar="CRS", type=CRS, help="CRS of --roads, where the file does not say, such as EPSG:26986.")
 @click.option(
     "--kinds",
     type=click.Choice(["main", "drivable", "vehicles", "all"]),
@@ -160,10 +159,7 @@ def index_command(
     read = {"roads": _read, "plugin": _read_plugin}.get(given, _fetch)
     compile_once(quiet)
     with show_steps(quiet) as say:
-        try:
-            roads = read(source, given, say)
-        except RoadSourceError as error:
-            raise RoadSourceError(f"{error}{_ask_about_box(source['bbox'])}") from error
+        roads = read(source, given, say)
         if update:
             reference = update_reference(path, roads, say)
         else:
@@ -199,15 +195,6 @@ def _require_geopackage(out: str | None) -> None:
             f"--out {out}: a reference is a GeoPackage with its index beside it; did you mean"
             f" {Path(out).with_suffix('.gpkg')}?"
         )
-
-
-def _ask_about_box(box: tuple[float, float, float, float] | None) -> str:
-    """Ask whether longitudes and latitudes of a box without roads were exchanged, where they may have been."""
-    if box is None:
-        return ""
-    south, west, north, east = box  # if so
-    sound = -90 <= south < north <= 90 and -180 <= west < east <= 180
-    return f" (longitude comes first: did you mean --bbox={west:g},{south:g},{east:g},{north:g}?)" if sound else ""
 
 
 def _rebuild(name: str, quiet: bool) -> None:

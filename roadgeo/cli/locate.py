@@ -17,7 +17,7 @@ from roadgeo.cli.clusters import cluster_options, make_cluster
 from roadgeo.cli.command_line import said_options
 from roadgeo.cli.folders import make_folder
 from roadgeo.cli.hints import HINTS, hint_options, make_options, refuse_swapped
-from roadgeo.cli.parameters import ASPECT, Plugin, out_dir_option, references_option, verbosity_options
+from roadgeo.cli.parameters import ASPECT, CRS, Plugin, out_dir_option, references_option, verbosity_options
 from roadgeo.cli.photographs import mask_options, read_options, segmenting_options
 from roadgeo.cli.printing import echo
 from roadgeo.cli.truths import read_truths
@@ -142,7 +142,10 @@ _DRAWING = [
     ),
     click.option("--gcps", is_flag=True, help=f"The same as --also gcps: {GCPS.summary}."),
     click.option(
-        "--crs", metavar="CRS", help="CRS of what is drawn, such as EPSG:3857. Default: the reference's, metric."
+        "--crs",
+        metavar="CRS",
+        type=CRS,
+        help="CRS of what is drawn, such as EPSG:3857. Default: the reference's, metric.",
     ),
     click.option(
         "--resolution",
@@ -189,6 +192,7 @@ def _drawing_options(command: Command) -> Command:
     show_default=True,
     help="What the coordinates are of roads that come as lines (GeoJSON, GeoPackage ...). auto: told by the CRS.",
 )
+@click.option("--layer", metavar="NAME", help="Layer of roads that come as lines, where there are several.")
 @click.option(
     "--allow-mirror",
     is_flag=True,

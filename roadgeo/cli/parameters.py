@@ -13,6 +13,7 @@ __all__ = [
     "ASPECT",
     "BOX",
     "CAMERA",
+    "CRS",
     "HEADING",
     "NEAR",
     "RANGE",
@@ -112,6 +113,28 @@ class Plugin(click.ParamType):  # type: ignore[type-arg]
         from click.shell_completion import CompletionItem
 
         return [CompletionItem(name) for name in self._known() if name.startswith(incomplete)]
+
+
+class Crs(click.ParamType):  # type: ignore[type-arg]
+    """A coordinate reference system in any words that PROJ knows; "EPSG:n" or WKT2."""
+
+    name = "CRS"
+
+    def convert(self, value: Any, param: click.Parameter | None, ctx: click.Context | None) -> str:
+        """Look it up.
+
+        Raises
+        ------
+        click.BadParameter
+            Nobody knows it, or it has no places on a map.
+        """
+        from roadgeo.errors import CrsError
+        from roadgeo.storage.crs import name_crs
+
+        try:
+            return name_crs(value)
+        except CrsError as error:
+            self.fail(str(error), param, ctx)
 
 
 class Focal(click.ParamType):  # type: ignore[type-arg]
@@ -219,9 +242,11 @@ def _wrong_box(west: float, south: float, east: float, north: float) -> str:
 RANGE = Numbers("range", ("LO", "HI"), ":", _wrong_range)
 #: A place in degrees and a distance in metres.
 NEAR = Numbers("place", ("LON", "LAT", "RADIUS"), ",", _wrong_place)
-#: A focal length in pixels, or where to find it.
+#: A direction, and by how much it may be off.
 HEADING = Heading()
+#: A focal length in pixels, or where to find it.
 CAMERA = Focal()
+CRS = Crs()
 #: A country or state, or bounds in degrees.
 WITHIN = Area()
 

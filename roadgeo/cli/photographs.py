@@ -104,5 +104,6 @@ def read_options(given: Mapping[str, Any], photos: Mapping[str, str], others: Se
         dem=given.get("dem") or "",
         allow_mirror=bool(given.get("allow_mirror")),
         units=given.get("units") or "auto",
+        layer=given.get("layer"),
         aspect=given.get("aspect"),
     )

@@ -177,8 +177,22 @@ def _lines(described: dict[str, Any]) -> list[tuple[str, str]]:
     if types:
         commonest = ", ".join(f"{entry['d_b']} {entry['tuples']:,}" for entry in types[:4])
         lines.append(("tuple types", f"{len(types)}, the commonest: {commonest}"))
-    told = [(key, value) for key, value in meta.items() if isinstance(value, str) and key != "name"]
-    return lines + [("kinds" if key == "roads" else key, value) for key, value in told]
+    told = {key: value for key, value in meta.items() if isinstance(value, str) and key != "name"}
+    if "roads" in told:
+        told["roads"] = _kinds_text(told["roads"], meta.get("sources") or [])
+    return lines + [("kinds" if key == "roads" else key, value) for key, value in told.items()]
+
+
+def _kinds_text(kinds: str, sources: Any) -> str:
+    """Return which kinds were taken, and of which sources all lines were, for they do not tell kinds of roads."""
+    told = [one for one in sources if isinstance(one, dict) and "kinds_known" in one]
+    unknown = [visible(str(one.get("name"))) for one in told if one["kinds_known"] is False]
+    if not unknown:
+        return kinds
+    names = ", ".join(unknown)
+    return (
+        f"not known, all lines of {names} were taken" if len(unknown) == len(told) else f"{kinds}; of {names} all lines"
+    )
 
 
 _STATES = {

@@ -4,7 +4,12 @@ from __future__ import annotations
 
 import logging
 import os
+import re
+import select
 import signal
+import sys
+import threading
+import webbrowser
 from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -20,7 +25,10 @@ if TYPE_CHECKING:
 
 __all__ = ["serve_command"]
 
-_HELP = """Keep references open, and answer who posts a mask or a photograph.
+_HELP = """Keep references open: a page to drop photographs and masks on, and answers over HTTP.
+
+The page shows each on the map. Where one is refused it takes what you know (here, so large, these crossings), and
+searches again. It opens in your browser; nothing leaves this machine.
 
 \b
   POST /locate                           an image as the body -> the answer, JSON as of locate --json
@@ -56,7 +64,25 @@ Exit status: 0 ended, 1 error, 2 usage.
 """
 
 
-@click.command("serve", short_help="Answer over HTTP where masks and photographs lie.", help=_HELP)
+def _read_basemap(_: click.Context, __: click.Parameter, url: str | None) -> str:
+    """Check the address of a basemap's tiles: it goes into the page's policy.
+
+    Raises
+    ------
+    click.BadParameter
+        It is none.
+    """
+    if url is None:
+        return ""
+    fits = re.fullmatch(r"https?://[\w.-]+(:\d+)?/[^\s;,\"'<>\\]*", url) and all(f"{{{axis}}}" in url for axis in "zxy")
+    if not fits:
+        raise click.BadParameter(
+            f"got {url!r}, expected an address such as https://tiles.example/{{z}}/{{x}}/{{y}}.png"
+        )
+    return url
+
+
+@click.command("serve", short_help="A page to drop photographs on; answers over HTTP.", help=_HELP)
 @references_option()
 @click.option("--host", metavar="ADDRESS", help="Listen there, and ask for a token. Default: 127.0.0.1, without one.")
 @click.option("--port", type=click.IntRange(0, 65535), default=8017, show_default=True, help="0: any that is free.")
@@ -80,8 +106,23 @@ Exit status: 0 ended, 1 error, 2 usage.
     help="Of a search; requests may ask for less.",
 )
 @click.option("--mavlink", metavar="URL", help="Also send places to an autopilot, to such as udpout:127.0.0.1:14550.")
+@click.option(
+    "--basemap",
+    metavar="URL",
+    callback=_read_basemap,
+    help="Tiles that the page shows below the roads: https://.../{z}/{x}/{y}.png.",
+)
+@click.option("--basemap-attribution", metavar="TEXT", default="", help="Whom their owner asks to name.")
+@click.option("--no-browser", is_flag=True, help="Do not open the page in a browser.")
 @verbosity_options
-def serve_command(references: tuple[str, ...], mavlink: str | None, quiet: bool, verbose: bool, **given: Any) -> int:  # noqa: ARG001
+def serve_command(
+    references: tuple[str, ...],
+    mavlink: str | None,
+    no_browser: bool,
+    quiet: bool,
+    verbose: bool,  # noqa: ARG001
+    **given: Any,
+) -> int:
     """Keep references open, and answer; for the help see above."""
     from roadgeo.cli.compilation import compile_once
     from roadgeo.cli.progress import print_steps
@@ -94,11 +135,11 @@ def serve_command(references: tuple[str, ...], mavlink: str | None, quiet: bool,
     # Compiled and opened here first: what is wrong with the references is said before anything listens.
     options = _options(given)
     compile_once(quiet)
-    names = [one.name for one in open_references(references, print_steps(quiet))]
+    maps = open_references(references, print_steps(quiet))
     workers = Workers(references, options.workers, options.waiting)
     try:
         sender = None if mavlink is None else MavlinkSender(mavlink)
-        server = Server(workers, names, options, None if sender is None else partial(_tell, sender))
+        server = Server(workers, maps, options, None if sender is None else partial(_tell, sender))
     except RoadgeoError:
         workers.close()
         raise
@@ -108,10 +149,13 @@ def serve_command(references: tuple[str, ...], mavlink: str | None, quiet: bool,
         raise OutputError(f"cannot listen on {where}: {error.strerror or error}; choose another --port") from error
     # Listen until Ctrl-C, or until a supervisor ends it.
     host = f"[{options.host}]" if ":" in options.host else options.host
-    echo(f"Listening on http://{host}:{server.server_port}/ for masks of {', '.join(names)}; Ctrl-C ends it.", err=True)
+    address = f"http://{host}:{server.server_port}/"
+    names = ", ".join(one.name for one in maps)
+    echo(f"Listening on {address} for photographs and masks of {names}; Ctrl-C ends it.", err=True)
+    if not no_browser and _has_screen():
+        threading.Timer(0.5, webbrowser.open, [address]).start()
     signal.signal(signal.SIGTERM, signal.default_int_handler)
-    if not quiet:
-        _log_requests()
+    _log(quiet)
     try:
         server.serve_forever()
     except KeyboardInterrupt:
@@ -123,14 +167,33 @@ def serve_command(references: tuple[str, ...], mavlink: str | None, quiet: bool,
     return 0
 
 
-def _log_requests() -> None:
-    """Write a line for each request to stderr: who, what, which status."""
-    shown = logging.StreamHandler()
-    shown.setFormatter(logging.Formatter("%(asctime)s %(message)s"))
-    log = logging.getLogger("uvicorn.access")
-    log.addHandler(shown)
-    log.setLevel(logging.INFO)
-    log.propagate = False
+def _has_screen() -> bool:
+    """Whether somebody sits before this, who can be shown a page."""
+    has_display = sys.platform in ("darwin", "win32") or any(map(os.environ.get, ("DISPLAY", "WAYLAND_DISPLAY")))
+    return sys.stderr.isatty() and has_display
+
+
+class _Log(logging.Handler):
+    """Writes lines to stderr as far as somebody takes them: who leaves a pipe unread does not stop the server."""
+
+    def emit(self, record: logging.LogRecord) -> None:
+        """Write a line, or leave it out."""
+        text = f"{self.format(record)}\n".encode(errors="backslashreplace")
+        try:
+            where, most = sys.stderr.fileno(), getattr(select, "PIPE_BUF", len(text))
+            while text and (sys.platform == "win32" or select.select([], [where], [], 0)[1]):
+                text = text[os.write(where, text[:most]) :]
+        except (OSError, ValueError):  # stderr is closed
+            return
+
+
+def _log(quiet: bool) -> None:
+    """Have faults written to stderr, and unless `quiet` a line for each request: who, what, which status."""
+    log = _Log()
+    log.setFormatter(logging.Formatter("%(asctime)s %(message)s"))
+    logging.getLogger().addHandler(log)
+    if not quiet:
+        logging.getLogger("uvicorn.access").setLevel(logging.INFO)
 
 
 def _tell(sender: MavlinkSender, found: dict[str, Any], came_s: float) -> None:
@@ -173,4 +236,6 @@ def _options(given: dict[str, Any]) -> ServeOptions:
         max_pixels=given["max_pixels"],
         time_limit_s=given["time_limit"],
         connections=given["jobs"] + given["waiting"] + 64,
+        basemap=given["basemap"],
+        basemap_attribution=given["basemap_attribution"],
     )

@@ -13,7 +13,7 @@ import click
 from roadgeo.cli import ERROR, NOT_LOCATED
 from roadgeo.cli.command_line import made_by
 from roadgeo.cli.folders import make_folder
-from roadgeo.cli.parameters import out_dir_option, references_option, verbosity_options
+from roadgeo.cli.parameters import CRS, out_dir_option, references_option, verbosity_options
 from roadgeo.cli.photographs import mask_options, read_options, segmenting_options
 from roadgeo.cli.printing import echo
 
@@ -67,7 +67,7 @@ _COLORS = {"agrees": "green", "off": "red", "unknown": "yellow"}
     show_default=True,
     help="By how much it may be turned.",
 )
-@click.option("--crs", metavar="CRS", help="CRS of images that name none, such as EPSG:25832.")
+@click.option("--crs", metavar="CRS", type=CRS, help="CRS of images that name none, such as EPSG:25832.")
 @segmenting_options
 @mask_options
 @click.option("-j", "--jobs", metavar="N", type=click.IntRange(1), default=1, show_default=True, help="Processes.")

@@ -132,7 +132,7 @@ def read_truth(path: str | os.PathLike[str], crs: str | None = None) -> list[Tru
         if "centre_e" in columns:
             return [_from_local(row, crs or _crs_beside(source)) for row in rows]
         return [_from_row(row, crs) for row in rows]
-    except (KeyError, ValueError, TypeError, AttributeError, RecursionError) as error:
+    except (KeyError, ValueError, TypeError, AttributeError, RecursionError, csv.Error) as error:
         raise RoadSourceError(
             f"{source} is no table of truths ({type(error).__name__}: {error}); expected the columns"
             f" {', '.join(_REQUIRED)}, h00 ... h22, or schema {SCHEMA}"

@@ -92,7 +92,9 @@ def choose_plane(lonlat: FloatArray, own_crs: str | None = None) -> LocalPlane:
     points = np.asarray(lonlat, float).reshape(-1, 2)
     if len(points) == 0:
         raise CrsError("no coordinates to choose a metric CRS for")
-    reach = float(np.abs(points).max()) if np.isfinite(points).all() else np.inf
+    if np.isnan(points).any():
+        raise CrsError(f"{int(np.isnan(points).any(axis=1).sum())} of {len(points)} coordinates are NaN; mend them")
+    reach = float(np.abs(points).max())
     if not reach <= 360.0 or np.abs(points[:, 1]).max() > 90.0:
         raise CrsError(
             f"coordinates reach {reach:.6g}, expected degrees of longitude and latitude; "

@@ -24,7 +24,7 @@ _LEAST_W = 0.02
 __all__ = ["add_row", "adjust", "carry", "own_sigma", "point_row"]
 
 
-@kernel()
+@kernel(writes=("row",))
 def point_row(p: Floats1, u: float, v: float, axis_x: float, axis_y: float, row: Floats1) -> tuple[float, float, float]:
     """Differentiate a predicted point's component along (axis_x, axis_y) by the parameters `p` (8,).
 
@@ -278,7 +278,7 @@ def _step(p: NDArray[np.float64], system: _System) -> float:
     return largest
 
 
-@kernel()
+@kernel(writes=("p", "normal"))
 def adjust(
     p: Floats1,
     plane: Plane,

@@ -55,10 +55,11 @@ Bools2: TypeAlias = Annotated[NDArray[np.bool_], 2]
 
 @dataclass(frozen=True)
 class ArrayKind:
-    """A C-contiguous array."""
+    """A C-contiguous array, which a kernel writes to or only reads."""
 
     dtype: np.dtype[Any]
     ndim: int
+    written: bool = False
 
     def __str__(self) -> str:
         return f"{self.dtype} array of {self.ndim} dimensions"

@@ -10,15 +10,21 @@ Kernels without such annotations are parts of others, or are left to numba whole
 
 from __future__ import annotations
 
+import contextlib
 import ctypes
 import functools
 import hashlib
 import importlib
+import importlib.util
+import logging
 import os
 import platform
+import re
 import struct
+import sys
 import threading
 from collections.abc import Callable, Iterator, Sequence
+from dataclasses import replace
 from functools import cached_property, lru_cache
 from pathlib import Path
 from typing import Any, NamedTuple, TypeVar, cast
@@ -27,7 +33,7 @@ import numpy as np
 
 from roadgeo import __version__
 from roadgeo.kernels.arrays import ArrayKind, Kind, TupleKind, kind_of
-from roadgeo.storage.folders import cache_dir, private_temporary_dir, writable
+from roadgeo.storage.folders import cache_dir, is_private, private_temporary_dir, writable
 
 __all__ = ["Kernel", "compiled", "entries", "kernel", "kernel_folder", "load", "modules_of_the_search"]
 
@@ -35,11 +41,19 @@ _Function = TypeVar("_Function", bound=Callable[..., Any])
 #: Told how many kernels are compiled, and of how many.
 Progress = Callable[[int, int], None]
 
+_LOG = logging.getLogger(__name__)
+
+#: The newest numba whose private parts `machine_code` was tried with; kernels of later ones are left to numba whole.
+_NEWEST_NUMBA = (0, 68)
+
 _lock = threading.RLock()
 
 
-def kernel(**options: Any) -> Callable[[_Function], _Function]:
+def kernel(*, writes: tuple[str, ...] = (), **options: Any) -> Callable[[_Function], _Function]:
     """Make a kernel of a function; `options` are those of numba's `njit`.
+
+    A kernel that is called from Python names the arguments whose arrays it `writes` to. Numba refuses to compile one
+    that writes to others; arrays that are read-only, which may lie in a file, are refused when it is called.
 
     What runs in the inner loops takes the arrays that it needs, not NamedTuples of many: a call counts references to
     all members, which made growth take 1.7 times as long. Stages that are called once are inlined (`forceinline`), so
@@ -47,7 +61,7 @@ def kernel(**options: Any) -> Callable[[_Function], _Function]:
     """
 
     def decorate(function: _Function) -> _Function:
-        return cast("_Function", Kernel(function, options))
+        return cast("_Function", Kernel(function, options, writes))
 
     return decorate
 
@@ -64,11 +78,11 @@ class Kernel:
     result : Kind
     """
 
-    def __init__(self, function: Callable[..., Any], options: dict[str, Any]) -> None:
+    def __init__(self, function: Callable[..., Any], options: dict[str, Any], writes: tuple[str, ...] = ()) -> None:
         functools.update_wrapper(self, function)
         self.function, self.options = function, options
         self.name, self.module = function.__name__, function.__module__
-        self.arguments, self.result = _kinds(function)
+        self.arguments, self.result = _kinds(function, writes)
         self._run: Callable[..., Any] | None = None
 
     def __call__(self, *args: Any) -> Any:
@@ -80,8 +94,7 @@ class Kernel:
         """What numba compiles into other kernels."""
         import numba
 
-        from roadgeo.kernels import machine_code  # noqa: F401 (teaches numba what a `Kernel` is)
-
+        _teach_numba()
         njit: Any = numba.njit
         return njit(no_cpython_wrapper=True, no_cfunc_wrapper=True, **self.options)(self.function)
 
@@ -90,8 +103,7 @@ class Kernel:
         """The kernel as numba itself would keep and call it."""
         import numba
 
-        from roadgeo.kernels import machine_code  # noqa: F401
-
+        _teach_numba()
         # The setting is read when a function is decorated; it is put back, for it is everyone's.
         config: Any = numba.config
         kept = config.CACHE_DIR
@@ -117,6 +129,15 @@ class Kernel:
         self._run = _Call(self, code, release)
 
 
+@lru_cache(maxsize=1)
+def _teach_numba() -> None:
+    """Let kernels call kernels."""
+    from numba import types
+    from numba.extending import typeof_impl
+
+    typeof_impl.register(Kernel)(lambda value, _: types.Dispatcher(value.part))
+
+
 class _Call:
     """Calls machine code: arguments packed into one buffer, results unpacked from another, 8 bytes for each number.
 
@@ -132,7 +153,7 @@ class _Call:
 
     def __call__(self, *args: Any) -> Any:
         slots: list[Any] = []
-        if not _fill(slots, args, self.arguments):
+        if not _fill(slots, args, self.arguments, self.name):
             return self.kernel.by_numba(*args)
         room = self.room()
         if self.code(self.pack(*slots), room):
@@ -151,15 +172,17 @@ class _Call:
         return bool(next(slots)) if kind is bool else next(slots)
 
 
-def _fill(slots: list[Any], values: Sequence[Any], kinds: tuple[Kind, ...]) -> bool:
+def _fill(slots: list[Any], values: Sequence[Any], kinds: tuple[Kind, ...], name: str) -> bool:
     """Add what machine code is told of values; False: an array is not what it expects."""
     for value, kind in zip(values, kinds, strict=True):
         if type(kind) is ArrayKind:
             if value.dtype != kind.dtype or value.ndim != kind.ndim or not value.flags.c_contiguous:
                 return False
+            if kind.written and not value.flags.writeable:
+                raise ValueError(f"kernel {name} writes to an array that is read-only")
             slots.append(id(value))
         elif type(kind) is TupleKind:
-            if not _fill(slots, value, kind.members):
+            if not _fill(slots, value, kind.members, name):
                 return False
         else:
             slots.append(value)
@@ -182,17 +205,23 @@ def _result_format(kind: Kind) -> str:
     return "d" if kind is float else "q"
 
 
-def _kinds(function: Callable[..., Any]) -> tuple[tuple[Kind, ...] | None, Kind]:
+def _kinds(function: Callable[..., Any], writes: tuple[str, ...]) -> tuple[tuple[Kind, ...] | None, Kind]:
     """Read the kinds of a function's arguments and of its result from its annotations."""
     names = function.__code__.co_varnames[: function.__code__.co_argcount]
     try:
-        arguments = tuple(kind_of(function.__annotations__[name]) for name in names)
-        result = kind_of(function.__annotations__["return"])
+        arguments = tuple(_written(kind_of(function.__annotations__[name]), name in writes) for name in names)
+        result = _written(kind_of(function.__annotations__["return"]), True)
     except (KeyError, TypeError):
         return None, None
     # With numbers alone, or a private name, it is a part of others.
     known = any(isinstance(kind, ArrayKind | TupleKind) for kind in arguments) and not function.__name__.startswith("_")
     return (arguments, result) if known else (None, None)
+
+
+def _written(kind: Kind, is_written: bool) -> Kind:
+    if isinstance(kind, TupleKind):
+        return replace(kind, members=tuple(_written(member, is_written) for member in kind.members))
+    return replace(kind, written=is_written) if isinstance(kind, ArrayKind) else kind
 
 
 # --- machine code kept ------------------------------------------------------------------------------------------------
@@ -261,9 +290,10 @@ def _engine() -> _Engine:
 def kernel_folder() -> Path:
     """Return the folder of the kernels' machine code, a temporary one where the user's cache folder cannot be written.
 
-    It is named after all that the code depends on.
+    It is named after all that the code depends on. What lies there is executed, so nobody else may write to it.
     """
-    known = (__version__, _engine().name, platform.machine(), platform.python_version(), np.__version__)
+    python = f"{platform.python_version()}{getattr(sys, 'abiflags', '')} {sys.implementation.cache_tag}"
+    known = (__version__, _engine().name, platform.machine(), python, np.__version__, _numba_version())
     digest = hashlib.sha256(" ".join(known).encode())
     for source in sorted(Path(__file__).parent.glob("*.py")):
         digest.update(source.read_bytes())
@@ -272,7 +302,20 @@ def kernel_folder() -> Path:
         folder = cache_dir() / name
     except RuntimeError:  # no home
         return private_temporary_dir() / name
-    return folder if writable(folder) else private_temporary_dir() / name
+    return folder if writable(folder) and is_private(folder) else private_temporary_dir() / name
+
+
+def _numba_version() -> str:
+    """Return numba's version, out of its file: to import it, or to ask the package's metadata, takes too long."""
+    spec = importlib.util.find_spec("numba")
+    if spec is not None and spec.origin is not None:
+        with contextlib.suppress(OSError):
+            told = re.search(r'"version": "([^"]+)"', Path(spec.origin).with_name("_version.py").read_text("utf-8"))
+            if told:
+                return told[1]
+    from importlib.metadata import version
+
+    return version("numba")
 
 
 def compiled(modules: Sequence[str] | None = None) -> bool:
@@ -297,12 +340,14 @@ def _file(module: str) -> Path:
 
 def _compile(module: str, progress: Callable[[int], None]) -> None:
     """Compile a module's kernels and keep their code; what this machine cannot keep is left to numba."""
-    from roadgeo.kernels.machine_code import CannotKeep, compile_kernels
-
     try:
+        _require_known_numba()
+        from roadgeo.kernels.machine_code import compile_kernels
+
         code = compile_kernels(entries(module), _engine().llvm, _engine().machine, progress)
         _bind(module, code)
-    except CannotKeep:
+    except Exception as error:  # of private parts of numba, which other versions may have otherwise, or not at all
+        _LOG.warning("kernels take longer to load, for numba keeps them: %s: %s", type(error).__name__, error)
         _left_to_numba.add(module)
         return
     path = _file(module)
@@ -313,6 +358,13 @@ def _compile(module: str, progress: Callable[[int], None]) -> None:
         temporary.replace(path)  # several processes may do so at once: each file is whole
     except OSError:
         temporary.unlink(missing_ok=True)  # the disk is full: the next process compiles again
+
+
+def _require_known_numba() -> None:
+    """Raise `ImportError` where numba is newer than what was tried."""
+    found = _numba_version()
+    if tuple(map(int, re.findall(r"\d+", found)[:2])) > _NEWEST_NUMBA:
+        raise ImportError(f"numba {found} is newer than {'.'.join(map(str, _NEWEST_NUMBA))}")
 
 
 def _load(module: str) -> bool:

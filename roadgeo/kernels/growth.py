@@ -301,7 +301,7 @@ def grow(
     return n_matched, n_tested, ratio
 
 
-@kernel()
+@kernel(writes=("matched", "matrices", "ratios"))
 def grow_each(
     query: GrowthQuery,
     references: Ints1,

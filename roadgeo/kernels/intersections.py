@@ -152,7 +152,7 @@ def _merge_tangents(angle: NDArray[np.float64], count: int, merge_angle: float, 
     sort_few(tangents, n_lines)
 
 
-@kernel()
+@kernel(writes=("xy", "rays", "tangents", "residual"))
 def describe_intersections(
     node_xy: Floats2,
     starts: Ints1,

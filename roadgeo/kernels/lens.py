@@ -104,7 +104,7 @@ def _see(
     return x, y, dx / length, dy / length, abs(xu * yv - xv * yu) * outwards * across / length
 
 
-@kernel()
+@kernel(writes=("places", "rows"))
 def lens_rows(
     p: Floats1, k1: float, half_side: float, points: Floats2, directions: Floats2, places: Floats2, rows: Floats3
 ) -> None:
@@ -129,7 +129,7 @@ def lens_rows(
             rows[i] = np.nan
 
 
-@kernel()
+@kernel(writes=("rows", "residuals", "sigmas", "own"))
 def meet_roads(
     p: Floats1,
     k1: float,

@@ -16,7 +16,6 @@ import numpy as np
 from numba import types
 from numba.core import cgutils
 from numba.core.registry import cpu_target
-from numba.extending import typeof_impl
 from numba.np.arrayobj import populate_array
 
 from roadgeo.kernels.arrays import ArrayKind, Kind, TupleKind
@@ -36,12 +35,6 @@ _IN_EVERY_PROCESS = _C | {*_MATH, *(f"{name}f" for name in _MATH)}
 
 class CannotKeep(Exception):  # noqa: N818
     """Machine code that would not run without numba."""
-
-
-@typeof_impl.register(Kernel)
-def _typeof_kernel(value: Kernel, context: Any) -> Any:  # noqa: ARG001 (numba's signature)
-    """Let kernels call kernels."""
-    return types.Dispatcher(value.part)
 
 
 def compile_kernels(kernels: Sequence[Kernel], llvm: Any, machine: Any, progress: Callable[[int], None]) -> bytes:
@@ -81,7 +74,7 @@ def _arrays_look_as_expected() -> bool:
 
 def _numba_type(kind: Kind) -> Any:
     if isinstance(kind, ArrayKind):
-        return types.Array(numba.from_dtype(kind.dtype), kind.ndim, "C")
+        return types.Array(numba.from_dtype(kind.dtype), kind.ndim, "C", readonly=not kind.written)
     if isinstance(kind, TupleKind):
         members = [_numba_type(member) for member in kind.members]
         if kind.named is None:

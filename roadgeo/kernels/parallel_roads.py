@@ -120,7 +120,7 @@ def fuse_twins(
     return out_edges, out, out_offsets
 
 
-@kernel()
+@kernel(writes=("xy", "direction"))
 def sample_edges(
     offsets: Ints1,
     coords: Floats2,
@@ -313,7 +313,7 @@ def tie_runs(
     return ties[:size].copy()
 
 
-@kernel()
+@kernel(writes=("out",))
 def roads_alongside(
     xy: Floats2, along: Floats2, reach: Floats1, least: float, most: float, min_cos: float, out: Floats2
 ) -> None:
@@ -354,7 +354,7 @@ def roads_alongside(
                 out[i, 1] = across * east
 
 
-@kernel()
+@kernel(writes=("out",))
 def points_beside(places: Floats2, along: Floats2, points: Floats2, across: float, ahead: float, out: Bools1) -> None:
     """Tell at which places on roads one of some points lies, give or take.
 

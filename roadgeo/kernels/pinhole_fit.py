@@ -55,7 +55,7 @@ def _place(p: Floats1, log_focal: float, position: Floats1, rotation: Floats2) -
         position[k] = reach * z + (p[k] if k < 2 else 0.0)
 
 
-@kernel()
+@kernel(writes=("positions", "rotations"))
 def place_pinholes(parameters: Floats2, log_focal: float, positions: Floats2, rotations: Floats3) -> None:
     """Tell where pinholes are and how they point.
 
@@ -71,7 +71,7 @@ def place_pinholes(parameters: Floats2, log_focal: float, positions: Floats2, ro
         _place(parameters[n], log_focal, positions[n], rotations[n])
 
 
-@kernel()
+@kernel(writes=("out",))
 def pinhole_residuals(p: Floats1, corners: SeenCorners, out: Floats1) -> bool:
     """Fill how far the corners are from where they are seen, whitened, and the focal length from usual ones, (9,).
 
@@ -139,7 +139,7 @@ def _copy(source: Floats1, to: Floats1) -> None:
         to[k] = source[k]
 
 
-@kernel()
+@kernel(writes=("p", "covariance"))
 def fit_pinhole(starts: Floats2, corners: SeenCorners, n_iterations: int, p: Floats1, covariance: Floats2) -> bool:
     """Fit a pinhole by Levenberg and Marquardt, from the start that is nearest; return whether that worked.
 

@@ -93,7 +93,7 @@ def keep_nearest(matched: NDArray[np.int64], distance: NDArray[np.float64]) -> i
     return count
 
 
-@kernel()
+@kernel(writes=("matched", "distance"))
 def match_all(
     matrix: Floats2,
     xy: Floats2,
@@ -157,7 +157,7 @@ def match_all(
     return keep_nearest(matched, distance) if one_to_one else count
 
 
-@kernel()
+@kernel(writes=("counts",))
 def count_matches(
     matrix: Floats2,
     xy: Floats2,

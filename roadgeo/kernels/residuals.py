@@ -12,7 +12,7 @@ from roadgeo.kernels.structs import RoadBuckets
 __all__ = ["road_residuals"]
 
 
-@kernel()
+@kernel(writes=("out",))
 def road_residuals(
     mapped: Floats2, along: Floats2, radii: Floats1, min_cos: float, roads: RoadBuckets, out: Floats2
 ) -> int:

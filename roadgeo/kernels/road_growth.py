@@ -162,7 +162,7 @@ def share_on_roads(
     return met / n, closeness / n
 
 
-@kernel()
+@kernel(writes=("ps", "closeness"))
 def grow_by_roads(
     ps: Floats2,
     units: Floats1,

@@ -30,7 +30,7 @@ class Raster(NamedTuple):
     cell: float
 
 
-@kernel()
+@kernel(writes=("tile_of",))
 def mark_tiles(segments: Singles2, x0: float, y0: float, cell: float, reach: float, tile_of: Int32s2) -> int:
     """Give numbers to the tiles that roads of half width `reach` may touch; return how many there are.
 
@@ -63,7 +63,7 @@ def mark_tiles(segments: Singles2, x0: float, y0: float, cell: float, reach: flo
     return count
 
 
-@kernel()
+@kernel(writes=("bits",))
 def paint_roads(
     segments: Singles2,
     x0: float,
@@ -111,7 +111,7 @@ def paint_roads(
                         bits[tile, row & (TILE - 1), column & (TILE - 1)] |= pattern
 
 
-@kernel()
+@kernel(writes=("out",))
 def measure_tiles(raster: Raster, out: Singles2) -> None:
     """Find the share of (cell, direction) pairs that roads set, in each tile and its eight neighbours together.
 

@@ -22,7 +22,7 @@ RINGS = 32  # loops over a multiple of 8 words are quicker than over fewer
 WORDS = 2 * RINGS
 
 
-@kernel()
+@kernel(writes=("words",))
 def draw_rings(cells: Floats2, places: Ints1, radii: Floats1, raster: Raster, words: UInt64s2) -> None:
     """Say where roads pass around places.
 
@@ -58,7 +58,7 @@ def draw_rings(cells: Floats2, places: Ints1, radii: Floats1, raster: Raster, wo
             words[j, r], words[j, RINGS + r] = first, second
 
 
-@kernel()
+@kernel(writes=("words",))
 def mark_rings(rings: Ints1, bearings: Floats1, along: Ints1, own: Ints1, first_own: int, words: UInt64s2) -> None:
     """Say where road points of the query lie around one of its intersections, at each of S scales.
 

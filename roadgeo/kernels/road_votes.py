@@ -92,7 +92,7 @@ def _turns_allowed(rays: Ints1, directions: Int32s2, m: int, j: int, tolerance: 
     return none if lacking <= 0 else none | one if lacking == 1 else none | one | more
 
 
-@kernel()
+@kernel(writes=("turns",))
 def find_turns(rays: Ints1, directions: Int32s2, counts: Ints1, j: int, tolerance: int, turns: Ints1) -> int:
     """List the turns that lay all branches of a query intersection on branches of map intersection j, or the reverse.
 
@@ -166,7 +166,7 @@ def _count_met(
     return met
 
 
-@kernel()
+@kernel(writes=("votes",))
 def vote(
     candidates: Ints1,
     rays: Ints1,
@@ -277,7 +277,7 @@ def _swap(heap: NDArray[np.float64], a: int, b: int) -> None:
         heap[a, k], heap[b, k] = heap[b, k], heap[a, k]
 
 
-@kernel()
+@kernel(writes=("votes",))
 def improve_votes(
     votes: Floats2,
     turns: Floats1,

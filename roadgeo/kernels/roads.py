@@ -25,7 +25,7 @@ __all__ = [
 ]
 
 
-@kernel()
+@kernel(writes=("starts", "ids"))
 def bin_segments(
     segments: Singles2,
     grid: tuple[float, float, float],
@@ -153,7 +153,7 @@ def nearest_road(
     return math.sqrt(best), fx, fy, ux, uy
 
 
-@kernel()
+@kernel(writes=("out",))
 def forward_distances(
     matrix: Floats2,
     points: Floats2,
@@ -214,7 +214,7 @@ def _carry(matrix: Floats2, u: float, v: float, du: float, dv: float) -> tuple[b
     return True, x, y, dx / length, dy / length
 
 
-@kernel()
+@kernel(writes=("shares",))
 def shares_near_roads(
     matrix: Floats2,
     points: Floats2,
@@ -353,7 +353,7 @@ def backward_agreement(
     return n_seen, n_near
 
 
-@kernel()
+@kernel(writes=("forward", "backward"))
 def count_residuals(
     matrix: Floats2,
     inverse: Floats2,
@@ -451,7 +451,7 @@ def count_residuals(
                     backward[row * columns + column, bin_] += length / count * scale
 
 
-@kernel()
+@kernel(writes=("shares",))
 def screen(
     references: Ints1,
     affines: Floats2,

@@ -87,7 +87,7 @@ def _is_ridge(
     return True
 
 
-@kernel()
+@kernel(writes=("states",))
 def rethin(
     states: Bytes2,
     distance: Singles2,
@@ -158,7 +158,7 @@ def rethin(
     return left[:n].copy()
 
 
-@kernel()
+@kernel(writes=("states",))
 def thin(states: Bytes2, distance: Singles2, min_end_depth: float) -> Int32s1:
     """Thin the ROAD pixels to lines, in place, the shallow ones first; return the pixels left.
 

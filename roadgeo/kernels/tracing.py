@@ -86,7 +86,7 @@ def _mean_places(members: Int32s1, first: Ints1, n_nodes: int, width: int) -> Fl
     return xy
 
 
-@kernel()
+@kernel(writes=("node_of",))
 def trace(states: Bytes2, pixels: Int32s1, node_of: Int32s1) -> tuple[Floats2, Bools1, Int32s2, Int32s1, Ints1]:
     """Split a skeleton into nodes and chains.
 

@@ -48,7 +48,7 @@ def vertex_angle(e1x: float, e1y: float, e2x: float, e2y: float, tangent: float)
     return angle % (2 * UNITS)
 
 
-@kernel()
+@kernel(writes=("sides",))
 def find_sides(tangents: Singles2, branches: Int8s3, sides: Int8s2) -> None:
     """Find on which sides branches run along each tangent.
 
@@ -195,7 +195,7 @@ def triple_codes(
     n[2] = vertex_codes(xy, tangents, sides, c, a, b, limit, codes[2])
 
 
-@kernel()
+@kernel(writes=("starts", "entries"))
 def fill_table(
     xy: Floats2,
     tangents: Singles2,

@@ -78,7 +78,7 @@ def vertex_probes(code: NDArray[np.int64], tolerance: int, probes: NDArray[np.in
     return n
 
 
-@kernel()
+@kernel(writes=("costs",))
 def count_alike(
     xy: Floats2,
     tangents: Singles2,
@@ -370,7 +370,7 @@ def _look_up(
     return n_hits, compared
 
 
-@kernel()
+@kernel(writes=("hits",))
 def look_up_each(
     query: TripleQuery,
     a: int,
@@ -396,7 +396,7 @@ def look_up_each(
     return n_hits, n_compared
 
 
-@kernel()
+@kernel(writes=("hit_ids", "out_ids", "out_affine", "out_score"))
 def gather(
     hit_ids: Ints2,
     hit_affine: Floats2,

@@ -48,7 +48,7 @@ def _draw_in_degrees(subject: Subject, folder: Path) -> tuple[bytes, MapGrid]:
         source = folder / "mask.png"
         drawn = np.zeros((*subject.mask.shape, 4), np.uint8)
         drawn[subject.mask.roads] = (*_ROAD[::-1], 255)
-        cv2.imwrite(str(source), drawn)
+        source.write_bytes(_png(drawn))
     middle = float(unwrap_ring(subject.outline())[:-1, 0].mean())
     crs = f"+proj=longlat +datum=WGS84 +lon_wrap={middle:.6f} +no_defs"
     warped = folder / "degrees.tif"
@@ -59,7 +59,14 @@ def _draw_in_degrees(subject: Subject, folder: Path) -> tuple[bytes, MapGrid]:
         colors = bands[: raster.count - 1] if raster.dtypes[0] in {"uint8", "uint16"} else bands
     colors = _to_bytes(colors[[0, 0, 0] if len(colors) < 3 else [0, 1, 2]], known)
     picture = np.concatenate([colors[::-1], known[None]]).transpose(1, 2, 0)
-    return cv2.imencode(".png", np.ascontiguousarray(picture))[1].tobytes(), grid
+    return _png(np.ascontiguousarray(picture)), grid
+
+
+def _png(picture: AnyArray) -> bytes:
+    encoded, content = cv2.imencode(".png", picture)
+    if not encoded:
+        raise OutputError("OpenCV did not encode the picture of the KMZ; use a smaller one")
+    return content.tobytes()
 
 
 def _to_bytes(colors: AnyArray, known: AnyArray) -> AnyArray:

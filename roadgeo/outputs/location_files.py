@@ -11,7 +11,7 @@ from pathlib import Path
 from time import perf_counter
 from typing import NamedTuple
 
-from roadgeo.errors import OutputError
+from roadgeo.errors import CrsError, MaskError, OutputError
 from roadgeo.geometry.mask import RoadMask
 from roadgeo.location import Location
 from roadgeo.matching.explanation import Explanation
@@ -79,7 +79,7 @@ def write_location(
     indexes: Sequence[ReferenceIndex] = (),
     explanation: Explanation | None = None,
 ) -> Written:
-    """Write what a location asks for, all files or none.
+    """Write what a location asks for, all files or none; where a picture cannot be drawn, the JSON alone.
 
     Files of an earlier run under these names that show a place are removed where there is none now, so that stale
     results are not mistaken for this run's.
@@ -98,9 +98,9 @@ def write_location(
     OutputError
         A file cannot be written; then none is.
     MaskError
-        The picture cannot be read or shows another frame than the mask.
+        The picture cannot be read or shows another frame than the mask; the place is written all the same.
     CrsError
-        The target CRS is unknown or not made for this place.
+        The target CRS is unknown or not made for this place; the place is written all the same.
     PluginError
         There is no such output.
     """
@@ -110,16 +110,23 @@ def write_location(
     subject = Subject(location, mask, paths, options.image, photo, indexes, explanation)
     wanted = wanted_outputs(options.products, location.located, photo is not None, location.camera is not None)
     targets = {output: paths.of(output, subject.picture.name) for output in wanted}
-    with ExitStack() as files:
-        # Entered first, renamed last: whoever sees the JSON finds the other files whole.
-        report = files.enter_context(replacing(targets.pop(JSON), sync=False))
-        for output, path in targets.items():
-            output.write(files.enter_context(replacing(path, sync=False)), subject)
-        removed = list(_remove(_stale(subject, wanted, options.products)))
-        if photo is not None:  # an earlier mask's style would colour the photograph
-            removed += _remove([paths.of(STYLE)])
-        location = replace(location, seconds=replace(location.seconds, write=perf_counter() - started))
-        write_json(report, replace(subject, location=location))
+    try:
+        with ExitStack() as files:
+            # Entered first, renamed last: whoever sees the JSON finds the other files whole.
+            report = files.enter_context(replacing(targets.pop(JSON), sync=False))
+            for output, path in targets.items():
+                output.write(files.enter_context(replacing(path, sync=False)), subject)
+            removed = list(_remove(_stale(subject, wanted, options.products)))
+            if photo is not None:  # an earlier mask's style would colour the photograph
+                removed += _remove([paths.of(STYLE)])
+            location = replace(location, seconds=replace(location.seconds, write=perf_counter() - started))
+            write_json(report, replace(subject, location=location))
+    except (CrsError, MaskError) as error:
+        outdated = {*REGISTRY.values(), *wanted} - {JSON}
+        list(_remove([subject.paths.of(output, subject.picture.name) for output in outdated]))
+        with replacing(paths.json, sync=False) as report:
+            write_json(report, subject)
+        raise type(error)(f"{error}; what was found is in {paths.json}") from error
     return Written(location, [paths.json, *targets.values()], removed)
 
 

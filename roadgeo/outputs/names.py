@@ -15,7 +15,7 @@ from functools import lru_cache
 
 from roadgeo._text import visible
 
-__all__ = ["bare_command", "bare_name", "bare_names", "name_for_odm", "without_folders"]
+__all__ = ["bare_command", "bare_name", "bare_names", "name_for_odm", "table_cell", "without_folders"]
 
 _LOG = logging.getLogger(__name__)
 
@@ -46,6 +46,11 @@ def name_for_odm(name: str) -> str:
         told = "%s: OpenDroneMap takes no names with spaces: rename the picture, and in what is written"
         _LOG.warning(told, visible(name))
     return visible(name)
+
+
+def table_cell(text: str) -> str:
+    """Return text for a cell of a table: behind an apostrophe where a spreadsheet would compute it as a formula."""
+    return f"'{text}" if text.startswith(("=", "+", "-", "@", "\t", "\r")) else text
 
 
 def without_folders(text: str, path: str = "") -> str:

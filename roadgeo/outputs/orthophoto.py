@@ -23,6 +23,7 @@ from roadgeo.errors import CrsError, MaskError
 from roadgeo.geometry.lens import Lens
 from roadgeo.geometry.warping import MapGrid, Transform, cover, source_pixels
 from roadgeo.outputs.paths import Placement
+from roadgeo.storage.crs import name_crs
 from roadgeo.storage.orientation import UPRIGHT, read_orientation
 from roadgeo.storage.rasters import open_raster, raster_size, read_palette, writing_raster
 
@@ -52,7 +53,7 @@ class ImageOptions:
     Attributes
     ----------
     crs : str or None
-        Target CRS; None: the location's own, metric one.
+        Target CRS, as pyproj takes it; None: the location's own, metric one.
     resolution : float or None
         Pixel size in units of the target CRS; None: the picture's own at its centre.
     resampling : {"nearest", "bilinear", "cubic", "lanczos"}
@@ -137,11 +138,12 @@ def choose_target(place: Placement, options: ImageOptions) -> Target:
     CrsError
         It is unknown.
     """
-    if options.crs is None or options.crs == place.crs:
-        return Target(place.crs, None, None)
+    crs = place.crs if options.crs is None else name_crs(options.crs)
+    if crs == place.crs:
+        return Target(crs, None, None)
     from roadgeo.geometry.projection import transformer
 
-    there, back = (transformer(*pair) for pair in ((place.crs, options.crs), (options.crs, place.crs)))
+    there, back = (transformer(*pair) for pair in ((place.crs, crs), (crs, place.crs)))
 
     def to_target(xy: FloatArray) -> FloatArray:
         return np.stack(there.transform(xy[..., 0], xy[..., 1]), axis=-1)
@@ -149,7 +151,7 @@ def choose_target(place: Placement, options: ImageOptions) -> Target:
     def to_place(xy: FloatArray) -> FloatArray:
         return np.stack(back.transform(xy[..., 0], xy[..., 1]), axis=-1)
 
-    return Target(options.crs, to_target, to_place)
+    return Target(crs, to_target, to_place)
 
 
 def warp_image(

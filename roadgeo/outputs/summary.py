@@ -12,7 +12,7 @@ import numpy as np
 
 from roadgeo.geometry.antimeridian import cut_ring
 from roadgeo.outputs.columns import NUMBERS, WORDS, attributes
-from roadgeo.outputs.names import bare_names
+from roadgeo.outputs.names import bare_names, table_cell
 from roadgeo.storage.files import write_text
 from roadgeo.storage.geopackage import GeometryType, Layer, write_layers
 from roadgeo.storage.qml import draw_fill
@@ -72,6 +72,7 @@ def _to_csv(documents: Sequence[Mapping[str, Any]]) -> str:
         position = [center.get("lon"), center.get("lat"), here.get("crs"), center.get("x"), center.get("y")]
         values = {**attributes(document), "query": document["query"]}
         words, numbers = ([values[name] for name in names] for names in (WORDS, NUMBERS))
+        words = [table_cell(str(word or "")) for word in words]
         writer.writerow([*words, *position, *numbers, _to_wkt(here.get("footprint_lonlat"))])
     return text.getvalue()
 

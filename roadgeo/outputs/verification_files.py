@@ -20,7 +20,7 @@ import numpy as np
 
 from roadgeo._text import visible
 from roadgeo.errors import OutputError
-from roadgeo.outputs.names import bare_names, without_folders
+from roadgeo.outputs.names import bare_names, table_cell, without_folders
 from roadgeo.storage.crs import known_crs
 from roadgeo.storage.files import replacing, write_text
 
@@ -70,7 +70,8 @@ def write_table(path: Path, documents: Sequence[Mapping[str, Any]]) -> None:
 
 def _cell(document: Mapping[str, Any], name: str) -> Any:
     parts = (document, document.get("displacement") or {}, document.get("editors") or {}, document.get("center") or {})
-    return next((part[name] for part in parts if part.get(name) is not None), "")
+    found = next((part[name] for part in parts if part.get(name) is not None), "")
+    return table_cell(found) if isinstance(found, str) else found
 
 
 def write_josm(path: Path, documents: Sequence[Mapping[str, Any]]) -> None:

@@ -46,7 +46,9 @@ def install_plugin(profile: Path) -> Path:
     """
     target = profile / "python" / "plugins" / NAME
     with writing(target):
-        if target.exists():
+        if target.is_symlink():
+            target.unlink()  # the link, not what it leads to
+        elif target.exists():
             shutil.rmtree(target)
         for file, content in _contents().items():
             (target / file).parent.mkdir(parents=True, exist_ok=True)

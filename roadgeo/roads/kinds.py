@@ -10,7 +10,17 @@ import numpy as np
 
 from roadgeo._arrays import AnyArray, BoolArray, IntArray
 
-__all__ = ["MAIN_CLASSES", "ROAD_KINDS", "RoadKind", "drives", "highways", "in_tunnel", "main_ranks", "names_highways"]
+__all__ = [
+    "KNOWN_HIGHWAYS",
+    "MAIN_CLASSES",
+    "NO_ROADS",
+    "ROAD_KINDS",
+    "RoadKind",
+    "drives",
+    "highways",
+    "in_tunnel",
+    "main_ranks",
+]
 
 #: From few roads to many. "main": motorways to tertiary roads. "drivable": with residential and other public streets.
 #: "vehicles": with service roads and tracks. "all": with footways, cycleways, steps; whatever is a line.
@@ -26,10 +36,10 @@ _VEHICLES = _DRIVABLE | {"service", "track", "track_grade1", "track_grade2", "tr
 _VEHICLES |= {"track_grade5", "busway", "bus_guideway", "raceway", "escape"}
 _PATHS = {"pedestrian", "footway", "cycleway", "path", "bridleway", "steps", "crossing", "via_ferrata", "unknown"}
 _MEMBERS: dict[RoadKind, set[str]] = {"main": _MAIN, "drivable": _DRIVABLE, "vehicles": _VEHICLES}
-_KNOWN = _VEHICLES | _PATHS
+KNOWN_HIGHWAYS = _VEHICLES | _PATHS
 
 #: Lines that carry a `highway` tag and are no road, or none yet.
-_NO_ROADS = {
+NO_ROADS = {
     "abandoned", "bus_stop", "construction", "corridor", "demolished", "disused", "elevator", "no", "none", "planned",
     "platform", "proposed", "razed", "rest_area", "services",
 }  # fmt: skip
@@ -57,7 +67,7 @@ def drives(values: AnyArray, kind: RoadKind) -> BoolArray:
     (L,) bool
     """
     if kind == "all":
-        return _each(values, lambda names: not names or bool(names - _NO_ROADS))
+        return _each(values, lambda names: not names or bool(names - NO_ROADS))
     members = _MEMBERS[kind]
     return _each(values, lambda names: bool(names & members) if names else kind != "main")
 
@@ -68,13 +78,6 @@ def main_ranks(values: AnyArray) -> IntArray:
     for rank, name in reversed(list(enumerate(MAIN_CLASSES))):
         ranks[_each(values, lambda names, name=name: bool(names & {name, f"{name}_link"}))] = rank
     return ranks
-
-
-def names_highways(values: AnyArray) -> bool:
-    """Say whether a column holds `highway` values at all: most of what is filled in is known."""
-    filled = _each(values, bool)
-    known = _each(values, lambda names: bool(names & (_KNOWN | _NO_ROADS)))
-    return bool(filled.any()) and int(known.sum()) * 2 > int(filled.sum())
 
 
 def in_tunnel(values: AnyArray) -> BoolArray:

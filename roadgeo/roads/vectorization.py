@@ -132,7 +132,8 @@ def vectorize(mask: RoadMask, options: VectorizeOptions | None = None) -> Vector
     options = options or VectorizeOptions()
     width_px = road_width(mask)
     crowded = np.ceil(np.sqrt(mask.roads.size / options.max_working_pixels))
-    factor = int(max(round(width_px / options.working_width_px), crowded, 1))
+    # What is wider than the frame is no road; a grid much coarser than the frame would be filled up to whole cells.
+    factor = int(max(min(round(width_px / options.working_width_px), *mask.shape), crowded, 1))
     width = max(width_px / factor, 1.0)
     states = _reduce(mask, factor, min(0.5, 0.45 * width_px / factor))
     _refuse_corners(states, mask.name or "mask", options)

@@ -12,14 +12,14 @@ from typing import Any
 import numpy as np
 
 from roadgeo._arrays import FloatArray
-from roadgeo.errors import MaskError, NotLocatedError, OutputError
+from roadgeo.errors import CrsError, MaskError, NotLocatedError, OutputError
 from roadgeo.geometry.mask import RoadMask
 from roadgeo.location import SCHEMA, Camera, Location, Place
 from roadgeo.outputs.orthophoto import ImageOptions
 from roadgeo.outputs.paths import output_paths
 from roadgeo.outputs.registry import FOOTPRINT, MATCH_POINTS, MATCHES, Output, find_outputs
 from roadgeo.outputs.subject import Subject
-from roadgeo.storage.crs import known_crs
+from roadgeo.storage.crs import name_crs
 from roadgeo.storage.files import replacing
 from roadgeo.storage.rasters import raster_size
 
@@ -95,13 +95,10 @@ def _from_document(document: dict[str, Any]) -> Location:
 
 def _crs(told: str) -> str:
     """Return a CRS as every library reads it."""
-    import pyproj
-
     try:
-        code = known_crs(told).to_epsg()
-    except pyproj.exceptions.ProjError:
-        raise ValueError(f"unknown CRS {told[:60]!r}") from None
-    return told if code is None else f"EPSG:{code}"
+        return name_crs(told)
+    except CrsError as error:
+        raise ValueError(str(error)) from error
 
 
 def _place(document: dict[str, Any]) -> Place:

@@ -12,7 +12,6 @@ from __future__ import annotations
 import contextlib
 import os
 import pickle
-import tempfile
 import uuid
 from collections import deque
 from collections.abc import Iterator, Sequence
@@ -22,6 +21,7 @@ from typing import Any, TypeVar
 
 from roadgeo.errors import RoadgeoError
 from roadgeo.running.processes import Work, without_interrupts
+from roadgeo.storage.folders import private_temporary_dir
 
 __all__ = ["RETRIES", "Cluster", "Made", "Stream", "connected", "prepared", "run_on_cluster"]
 
@@ -234,7 +234,6 @@ def _one_of_host() -> Iterator[None]:
     except ImportError:  # Windows
         yield
         return
-    path = Path(tempfile.gettempdir()) / f"roadgeo-compiling-{os.getuid()}.lock"
-    with path.open("ab") as lock:
+    with (private_temporary_dir() / "compiling.lock").open("ab") as lock:  # where nobody else can take it
         fcntl.flock(lock, fcntl.LOCK_EX)
         yield

@@ -35,6 +35,8 @@ class ReadOptions:
         Masks that were mirrored have the place that they have turned over.
     units : "auto", "pixels" or "metres"
         Of roads that come as lines.
+    layer : str or None
+        Of a file of such roads that has several.
     aspect : float, "unknown" or None
         How many times a pixel is as wide as high; None: once.
     """
@@ -51,6 +53,7 @@ class ReadOptions:
     dem: str = ""
     allow_mirror: bool = False
     units: Literal["auto", "pixels", "metres"] = "auto"
+    layer: str | None = None
     aspect: float | Literal["unknown"] | None = None
 
     def photo(self, task: Task, of_photograph: bool) -> str | None:
@@ -63,7 +66,7 @@ class ReadOptions:
 
         return QueryOptions(
             self.threshold, self.band, self.segment, self.segmenters, self.class_name, self.fused_with, self.threads,
-            "allow" if self.allow_mirror else "tell", self.units, self.aspect,
+            "allow" if self.allow_mirror else "tell", self.units, self.layer, self.aspect,
         )  # fmt: skip
 
 

@@ -10,6 +10,7 @@ import numpy as np
 
 from roadgeo._arrays import AnyArray
 from roadgeo.errors import MaskError
+from roadgeo.sources.thresholds import are_labels
 from roadgeo.storage.orientation import UPRIGHT, turn_upright
 
 __all__ = ["read_picture"]
@@ -65,7 +66,7 @@ def _transparent(values: AnyArray, alpha: AnyArray) -> AnyArray:
 
 def _read_pil(image: Any) -> AnyArray:
     bands = image.getbands()
-    if bands[0] == "P":
+    if bands[0] == "P" and not are_labels(np.asarray(image)):
         image = image.convert("RGBA" if "transparency" in image.info else "RGB")
         bands = image.getbands()
     values = np.asarray(image)  # PIL turns TIFFs by itself, and forgets that they were to be

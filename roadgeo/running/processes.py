@@ -133,10 +133,11 @@ def _do(task: Any) -> Any:
         os._exit(int(end.code or 0))
 
 
-def end_with_parent() -> None:
+def end_with_parent(clean: Callable[[], None] = lambda: None) -> None:
     """End this process when the one that started it is gone, however it went: nobody waits for its results.
 
-    Its main thread is told to end first (SIGTERM), so that it may remove what it has half written.
+    It does what the parent cannot do any more (`clean`), and its main thread is told to end first (SIGTERM), so that it
+    may remove what it has half written.
     """
     parent = multiprocessing.parent_process()
     if parent is None:
@@ -144,6 +145,7 @@ def end_with_parent() -> None:
 
     def watch() -> None:
         multiprocessing.connection.wait([parent.sentinel])
+        clean()
         if hasattr(signal, "pthread_kill"):
             signal.pthread_kill(main, signal.SIGTERM)
             time.sleep(_GRACE_S)

@@ -30,7 +30,7 @@ from roadgeo.running.looks import Later, Locate, Look, Sighting, locate_looks
 from roadgeo.running.mirroring import ask_mirrored
 from roadgeo.running.regridding import of_own_pixels, on_grid
 from roadgeo.running.stretching import ask_stretched
-from roadgeo.sources.drawn_roads import ENDINGS, Units, draw_roads
+from roadgeo.sources.drawn_roads import Units, draw_roads
 from roadgeo.sources.exif import estimate_gsd
 from roadgeo.sources.masks import open_mask, read_mask
 from roadgeo.sources.segmentation.card import MAX_WAYS
@@ -39,6 +39,7 @@ from roadgeo.sources.segmentation.photograph import open_photograph
 from roadgeo.sources.segmentation.probability import NODATA, ProbabilityMap, fuse
 from roadgeo.sources.segmentation.scales import rank_scales, scale_of, try_scales
 from roadgeo.sources.segmentation.tiling import map_shape, segment
+from roadgeo.sources.streams import QUERY_ENDINGS
 from roadgeo.workflows import locate
 
 __all__ = ["FirstLook", "QueryOptions", "is_model", "locate_query", "look_once"]
@@ -79,6 +80,8 @@ class QueryOptions:
         Of a mask that is refused, and would be located turned over: whether that is said, not asked, or the answer.
     units : "auto", "pixels" or "metres"
         Of roads that come as lines (see `sources.drawn_roads`).
+    layer : str or None
+        Of a file of such roads that has several.
     aspect : float, "unknown" or None
         How many times a pixel of a mask is as wide as high; None: once.
     """
@@ -92,6 +95,7 @@ class QueryOptions:
     threads: int = 1
     mirror: Literal["tell", "never", "allow"] = "tell"
     units: Units = "auto"
+    layer: str | None = None
     aspect: float | Literal["unknown"] | None = None
 
     @property
@@ -121,7 +125,7 @@ def locate_query(
         A segmenter fails.
     """
     options, query = options or LocateOptions(), query or QueryOptions()
-    if isinstance(path, str) and path.lower().endswith(ENDINGS):
+    if isinstance(path, str) and path.lower().endswith(QUERY_ENDINGS):
         return _locate_lines(path, references, options, query, how)
     if query.may_be_mask and not query.fused_with:
         try:
@@ -201,7 +205,7 @@ def _locate_lines(
     path: str, references: Sequence[AnyReference], options: LocateOptions, query: QueryOptions, how: Locate
 ) -> Sighting:
     """Locate roads that come as lines; what their units tell of scale and north is heeded unless the user said more."""
-    drawing, camera = draw_roads(path, query.units), options.match.camera
+    drawing, camera = draw_roads(path, query.units, query.layer), options.match.camera
     if drawing.unit_m is not None and camera.gsd_m == CameraOptions().gsd_m:
         known = (drawing.unit_m / 1.05, drawing.unit_m * 1.05)
         tilt = min(camera.max_tilt_deg, 10.0)  # they were measured on the ground, or on a map

@@ -13,6 +13,7 @@ import math
 import shutil
 from collections.abc import Callable, Sequence
 from dataclasses import asdict, dataclass, field, replace
+from functools import cached_property
 from hashlib import blake2b
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -38,9 +39,9 @@ from roadgeo.reference.spool import Bounds, Spool
 from roadgeo.roads.kinds import MAIN_CLASSES, RoadKind, main_ranks
 from roadgeo.roads.labels import label_roads
 from roadgeo.running.processes import run
-from roadgeo.sources.lines import RoadLines, list_sources
+from roadgeo.sources.lines import RoadLines
 from roadgeo.sources.roads import Box, as_text, choose_lines, join_roads, overruled_crs
-from roadgeo.sources.streams import stream_lines
+from roadgeo.sources.streams import list_sources, stream_lines, tell_source
 from roadgeo.storage.atomic import writing
 from roadgeo.storage.crs import known_crs
 from roadgeo.storage.files import write_bytes
@@ -77,7 +78,7 @@ class RoadFiles:
     bbox: Box | None = None
     attribution: str | None = None
 
-    @property
+    @cached_property
     def files(self) -> list[Path]:
         """The files; a folder stands for those in it."""
         return [file for path in self.paths for file in list_sources(path)]
@@ -227,6 +228,7 @@ def _stream(roads: RoadFiles, folder: Path, options: ShardOptions, crs: str | No
                 return None
             with writing(folder):
                 spool.add(_to(chosen, str(crs)), _labels(chosen))
+        tell_source(file.name, told)
         sources.append(told)
     calls = dict.fromkeys(one["attribution"] for one in sources if one.get("attribution"))
     meta = {

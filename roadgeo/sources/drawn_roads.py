@@ -18,12 +18,9 @@ from roadgeo.errors import MaskError, RoadSourceError
 from roadgeo.geometry.mask import RoadMask
 from roadgeo.storage.crs import known_crs
 
-__all__ = ["ENDINGS", "Drawing", "Units", "draw_roads"]
+__all__ = ["Drawing", "Units", "draw_roads"]
 
 Units = Literal["auto", "pixels", "metres"]
-
-#: Names of files that hold lines, not pixels.
-ENDINGS = (".geojson", ".gpkg", ".fgb", ".shp", ".gpx", ".kml", ".parquet")
 
 _MOST_PX, _LEAST_PX, _MARGIN_PX = 4000, 400, 24
 _ROAD_M, _ROAD_PX = 8.0, 6.0
@@ -50,11 +47,13 @@ class Drawing:
     north_up: bool
 
 
-def draw_roads(path: str | os.PathLike[str], units: Units = "auto") -> Drawing:
-    """Read the lines of a file and draw them.
+def draw_roads(path: str | os.PathLike[str], units: Units = "auto", layer: str | None = None) -> Drawing:
+    """Read the roads of a file as `read_roads` does and draw them: lines, or where there are none polygons.
 
     Parameters
     ----------
+    layer : str, optional
+        Of a file with several.
     units : "auto", "pixels" or "metres"
         What their coordinates are. By default degrees or metres where the file names a CRS that they fit, and pixels of
         a picture where all lie below the x axis, as QGIS digitises on one. Pixels above it are rows, downwards.
@@ -64,16 +63,18 @@ def draw_roads(path: str | os.PathLike[str], units: Units = "auto") -> Drawing:
     MaskError
         The file holds no lines, or does not tell its units.
     """
-    from roadgeo.sources.lines import read_lines
+    from roadgeo.sources.streams import read_lines
 
     name = os.fspath(path)
     try:
-        read = read_lines(Path(path))
+        read = read_lines(Path(path), layer, areas=True)
     except RoadSourceError as error:
         raise MaskError(str(error)) from error
     import shapely
 
-    coords, owner = shapely.get_coordinates(read.lines, return_index=True)
+    rings = np.asarray(shapely.get_parts(shapely.boundary(read.areas)))  # of a hole as of an outline
+    is_drawn = len(read.lines) > 0
+    coords, owner = shapely.get_coordinates(read.lines if is_drawn else rings, return_index=True)
     kind = _tell_units(name, coords, read.crs) if units == "auto" else units
     degrees = kind == "degrees"
     if degrees:
@@ -91,7 +92,8 @@ def draw_roads(path: str | os.PathLike[str], units: Units = "auto") -> Drawing:
     to_pixel = shift @ np.diag([1.0 / unit, 1.0 / unit, 1.0]) @ flip
     width, height = np.ceil((high - low) / unit).astype(int) + 2 * _MARGIN_PX
     road = _ROAD_PX if kind == "pixels" else float(np.clip(_ROAD_M / unit, 4.0, 12.0))
-    roads = _draw(coords @ to_pixel[:2, :2].T + to_pixel[:2, 2], owner, (int(width), int(height)), round(road))
+    pixels, size = coords @ to_pixel[:2, :2].T + to_pixel[:2, 2], (int(width), int(height))
+    roads = _draw(pixels, owner, size, round(road)) if is_drawn else _fill(pixels, owner, size)
     mask = RoadMask(roads, name=name)
     return Drawing(mask, None if degrees else to_pixel, None if kind == "pixels" else unit, degrees)
 
@@ -121,7 +123,21 @@ def _to_metres(lonlat: FloatArray) -> FloatArray:
 def _draw(pixels: FloatArray, owner: IntArray, size: tuple[int, int], width: int) -> BoolArray:
     """Draw lines (corner convention; `owner` numbers them) as (H, W) bool."""
     canvas = np.zeros(size[::-1], np.uint8)
-    fixed = np.round((pixels - 0.5) * 16.0).astype(np.int32)
-    lines = np.split(fixed, np.flatnonzero(np.diff(owner)) + 1)
-    cv2.polylines(canvas, lines, False, 255, max(width, 1), cv2.LINE_8, 4)
+    cv2.polylines(canvas, _each_line(pixels, owner), False, 255, max(width, 1), cv2.LINE_8, 4)
     return np.asarray(canvas > 0)
+
+
+def _fill(pixels: FloatArray, owner: IntArray, size: tuple[int, int]) -> BoolArray:
+    """Fill what lies within an odd number of rings (corner convention; `owner` numbers them) as (H, W) bool."""
+    canvas = np.zeros(size[::-1], np.uint8)
+    for ring in _each_line(pixels, owner):
+        one = np.zeros_like(canvas)
+        cv2.fillPoly(one, [ring], 255, cv2.LINE_8, 4)
+        canvas ^= one
+    return np.asarray(canvas > 0)
+
+
+def _each_line(pixels: FloatArray, owner: IntArray) -> list[IntArray]:
+    """Return lines as OpenCV takes them, in sixteenths of a pixel."""
+    fixed = np.round((pixels - 0.5) * 16.0).astype(np.int32)
+    return np.split(fixed, np.flatnonzero(np.diff(owner)) + 1)

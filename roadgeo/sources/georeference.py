@@ -15,6 +15,7 @@ from roadgeo.errors import CrsError, MaskError
 from roadgeo.geometry.frame import Frame
 from roadgeo.geometry.homography import Homography
 from roadgeo.geometry.projection import LocalPlane, to_lonlat, transformer
+from roadgeo.storage.crs import name_crs
 from roadgeo.storage.orientation import read_orientation, stored_from_upright
 from roadgeo.storage.rasters import open_raster
 
@@ -23,7 +24,7 @@ if TYPE_CHECKING:
 
 __all__ = ["Georeference", "read_georeference", "read_stated_middle"]
 
-_WORLD_FILE_BYTES = 4096
+_WORLD_FILE_BYTES, _PRJ_BYTES = 4096, 1 << 16
 #: Formats that hold a place, by the first bytes of a file: TIFF, and the others that GDAL reads one from.
 _HOLD_A_PLACE = (b"II", b"MM", b"EHFA", b"\0\0\0\x0cjP", b"\xff\x4f\xff\x51")
 #: Side of the grid of points that a georeference is taken to another CRS by.
@@ -109,7 +110,7 @@ def read_georeference(path: str | os.PathLike[str], crs: str | None = None) -> G
     Parameters
     ----------
     crs : str, optional
-        Of a world file, or in place of what the raster says.
+        Of a world file, as pyproj takes it, or in place of what the raster, or a `.prj` beside it, says.
 
     Raises
     ------
@@ -120,15 +121,18 @@ def read_georeference(path: str | os.PathLike[str], crs: str | None = None) -> G
     """
     with open_raster(path) as raster:
         size = (raster.width, raster.height)
-        own = crs or _crs_of(raster)
+        own = _crs_of(raster) if crs is None else name_crs(crs)
         found = _of_raster(raster)
     source, matrix = found or ("world file", _of_world_file(Path(path)))
     if matrix is None:
         return None
     if found is None:  # a world file speaks of pixels as they are stored
         matrix = matrix @ stored_from_upright(read_orientation(path), size)
+    own = own or _crs_beside(Path(path))
     if own is None:
-        raise CrsError(f"{os.fspath(path)}: its {source} names no CRS; give it with --crs EPSG:n")
+        raise CrsError(
+            f"{os.fspath(path)}: its {source} names no CRS; give it with --crs EPSG:n, or in a .prj beside it"
+        )
     if not np.isfinite(matrix).all() or abs(np.linalg.det(matrix[:2, :2])) < 1e-20:
         raise MaskError(f"{os.fspath(path)}: its {source} maps all pixels to a line; expected a place with an area")
     return Georeference(matrix, own, size, source)
@@ -160,6 +164,18 @@ def _crs_of(raster: DatasetReader) -> str | None:
         return None
     code = crs.to_epsg()
     return f"EPSG:{code}" if code else str(crs.to_wkt())
+
+
+def _crs_beside(path: Path) -> str | None:
+    """Read the CRS in the `.prj` beside a picture."""
+    for suffix in (".prj", ".PRJ"):
+        beside = path.with_suffix(suffix)
+        if beside.is_file() and beside.stat().st_size <= _PRJ_BYTES:
+            try:
+                return name_crs(beside.read_text("utf-8", "replace").strip())
+            except CrsError as error:
+                raise CrsError(f"{beside}: {error}") from error
+    return None
 
 
 def _of_raster(raster: DatasetReader) -> tuple[str, FloatArray] | None:

@@ -12,13 +12,16 @@ from roadgeo._arrays import AnyArray
 from roadgeo._progress import Say, say_nothing
 from roadgeo.errors import CrsError, RoadSourceError
 from roadgeo.roads.kinds import RoadKind
-from roadgeo.sources.lines import RoadLines, crs_name, from_columns, table_lines
+from roadgeo.sources.containers import graph_table
+from roadgeo.sources.lines import RoadLines, RoadTable, crs_name
 from roadgeo.sources.roads import Roads, choose_lines, join_roads, overruled_crs, read_roads
+from roadgeo.sources.schemas import recognise
+from roadgeo.sources.streams import tell_source
 
 __all__ = ["choose_roads"]
 
 _EXPECTED = (
-    "expected a path, a GeoDataFrame, a GeoSeries, a graph of osmnx, shapely lines, "
+    "expected a path, a GeoDataFrame, a GeoSeries, a graph of osmnx or momepy, shapely lines, "
     "or arrays of coordinates of shape (N, 2)"
 )
 
@@ -35,7 +38,7 @@ def choose_roads(
 
     Parameters
     ----------
-    roads : Roads, path or paths, GeoDataFrame, GeoSeries, networkx graph of osmnx, shapely lines, arrays
+    roads : Roads, path or paths, GeoDataFrame, GeoSeries, networkx graph with places, shapely lines, arrays
         Arrays of coordinates (N, 2) or (N, 3), x first, are a line each; of a single one, rows that are not finite part
         the lines.
     crs : anything that pyproj knows, optional
@@ -59,6 +62,7 @@ def choose_roads(
     if source.crs is None:
         raise CrsError("the roads have no CRS; name it, for example crs='EPSG:26986'")
     chosen = choose_lines(source, "the roads", which, tunnels, None)
+    tell_source("the roads", chosen.meta)
     return join_roads([chosen], {"roads": which, "tunnels": tunnels, "bbox": None}, attribution)
 
 
@@ -78,13 +82,13 @@ def _named(crs: Any) -> str:
 def _lines_of(roads: Any) -> RoadLines:
     """Return the lines of a table, a graph, a series or of shapes and coordinates."""
     if hasattr(roads, "edges") and hasattr(roads, "graph"):  # networkx
-        from osmnx.convert import graph_to_gdfs
-
-        roads = graph_to_gdfs(roads, nodes=False)
-    if hasattr(roads, "columns") and hasattr(roads, "geometry"):
-        return table_lines(roads, "the roads")
-    own = crs_name(getattr(roads, "crs", None))
-    return from_columns(_shapes(roads), own, {}, {"name": "the roads"})
+        table = graph_table(roads)
+    elif hasattr(roads, "columns") and hasattr(roads, "geometry"):
+        columns = {str(name): roads[name].to_numpy(object) for name in roads.columns if name != roads.geometry.name}
+        table = RoadTable(roads.geometry.to_numpy(object), crs_name(roads.crs), columns)
+    else:
+        table = RoadTable(_shapes(roads), crs_name(getattr(roads, "crs", None)))
+    return recognise(table).adapt(table)
 
 
 def _shapes(roads: Any) -> AnyArray:

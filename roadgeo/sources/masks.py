@@ -7,7 +7,7 @@ import logging
 import os
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import TYPE_CHECKING
 
@@ -21,7 +21,7 @@ from roadgeo.geometry.mask import PROBABILITY_SURE, PROBABILITY_UNKNOWN, RoadMas
 from roadgeo.roads.borders import find_border
 from roadgeo.roads.observed import find_voids
 from roadgeo.roads.vectorization import road_width
-from roadgeo.sources.thresholds import Sample, find_thresholds, ground_and_road
+from roadgeo.sources.thresholds import Sample, are_labels, find_thresholds, find_unlabelled, ground_and_road
 from roadgeo.storage.gdal import is_named_remote
 from roadgeo.storage.orientation import read_orientation, turn_upright
 from roadgeo.storage.rasters import MAX_SIDE as MAX_RASTER_SIDE
@@ -47,6 +47,7 @@ _MAX_ROAD_SHARE = 0.35  # of a frame
 #: OpenCV reads what is no larger than this when decoded: importing rasterio would take longer than reading the mask.
 _MAX_DECODED_BYTES = 1 << 29
 _PNG_MAGIC, _PNG_END = b"\x89PNG\r\n\x1a\n", b"IEND"
+_PNG_COLOURS, _PALETTE = 25, 3  # where a PNG says what its values are, and what it says of a palette's
 
 #: What is larger, whatever its sign, stands for no value: the least number of a type is often written for nodata.
 _MAX_VALUE = 1e30
@@ -170,6 +171,8 @@ def open_mask(
         seen = _sample(raster)
         channel = int(np.argmax(seen.std(axis=0))) if raster.n_bands > 1 else 0
         sample = Sample(raster.name, seen, channel, lambda: _numbers(*_middle(raster), channel))
+        if threshold is None:
+            raster, sample = _without_unlabelled(raster, sample)
         thresholds = find_thresholds(sample) if threshold is None else (threshold,)
         levels = ground_and_road(sample, thresholds[0]) if len(thresholds) > 1 else None
         yield MaskSource(thresholds, raster, channel, voids, levels)
@@ -190,6 +193,24 @@ def _drawn(raster: _Raster) -> _Raster:
         return _finite(*raster.read(top, bottom, step)).view(np.uint8)[..., None], None
 
     return _Raster(raster.name, raster.shape, 1, read)
+
+
+def _without_unlabelled(raster: _Raster, sample: Sample) -> tuple[_Raster, Sample]:
+    """Leave out what has no label in a map of labels, and say what was taken for what."""
+    unlabelled, told = find_unlabelled(sample)
+    if told:
+        _LOG.warning("%s: %s; another --threshold tells them apart otherwise", visible(raster.name), told)
+    if unlabelled is None:
+        return raster, sample
+
+    def read(top: int, bottom: int, step: int) -> tuple[AnyArray, BoolArray | None]:
+        values, valid = raster.read(top, bottom, step)
+        labelled = values[..., sample.channel] != unlabelled
+        return values, labelled if valid is None else labelled & valid
+
+    labelled = replace(raster, read=read)
+    seen = sample.seen[sample.seen[:, sample.channel] != unlabelled]
+    return labelled, replace(sample, seen=seen, read_rows=lambda: _numbers(*_middle(labelled), sample.channel))
 
 
 def _sample_step(raster: _Raster) -> int:
@@ -346,7 +367,19 @@ def _read_with_opencv(path: str, name: str) -> AnyArray | None:
             image = cv2.imdecode(content, cv2.IMREAD_UNCHANGED)  # as it is stored
     if is_png and image is None:  # GDAL would read the rest as black
         raise MaskError(f"{name}: a PNG that is damaged or cut short; copy or export it again")
-    return None if image is None else np.ascontiguousarray(turn_upright(image, read_orientation(path)))
+    if image is None:
+        return None
+    if is_png and content[_PNG_COLOURS] == _PALETTE and image.shape[2:] == (3,) and _n_colours(image) == 3:
+        with open_raster(path, name) as dataset:  # OpenCV does not tell which colour is which
+            labels: AnyArray = dataset.read(1)
+        return labels if are_labels(labels) else image
+    return np.ascontiguousarray(turn_upright(image, read_orientation(path)))
+
+
+def _n_colours(image: AnyArray) -> int:
+    """Count the colours of an (H, W, 3) image of 8 bits, in some of its rows."""
+    numbers = image.astype(np.uint32) @ np.array([1 << 16, 1 << 8, 1], np.uint32)
+    return len(np.unique(numbers[:: max(1, len(numbers) // 512)]))
 
 
 def _is_whole_png(content: memoryview) -> bool:
@@ -435,6 +468,8 @@ def _of_dataset(dataset: DatasetReader, band: int | None, name: str, nodata: flo
     if not all(kind.startswith(("bool", "int", "uint", "float")) for kind in kinds):
         raise MaskError(f"{name}: holds values of type {', '.join(sorted(kinds))}; expected real numbers")
     palette = _palette_of_picture(dataset) if len(colour) == 1 else None
+    if palette is not None and are_labels(dataset.read(colour[0])):
+        palette = None
     all_valid = MaskFlags.all_valid in list(dataset.mask_flag_enums)[chosen[0] - 1]
 
     def read(top: int, bottom: int, step: int) -> tuple[AnyArray, BoolArray | None]:

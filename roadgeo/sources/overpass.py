@@ -108,10 +108,17 @@ def fetch_lines(
     tunnels: bool,
     options: FetchOptions,
     say: Say = say_nothing,
+    *,
+    hint: str = "",
 ) -> RoadLines:
     """Ask Overpass for the roads of an area in degrees; ways are given in pieces between two of their nodes.
 
     A large area is asked for in parts, each of which is kept as it comes: a later call fetches only what is missing.
+
+    Parameters
+    ----------
+    hint : str
+        Added to what is said where there are no roads.
 
     Raises
     ------
@@ -131,7 +138,9 @@ def fetch_lines(
         pieces = [_edges(graph) for graph in graphs if graph is not None]
         if not pieces:
             shutil.rmtree(folder, ignore_errors=True)
-            raise RoadSourceError(f"OpenStreetMap has no {which} roads there; check the area or try another --kinds")
+            raise RoadSourceError(
+                f"OpenStreetMap has no {which} roads there; check the area or try another --kinds{hint}"
+            )
         timestamp = _timestamp(folder)
     ends, highway, tunnel, called = (np.concatenate(column) for column in zip(*pieces, strict=True))
     meta = {"format": "OpenStreetMap", "features": len(ends), "attribution": OSM_ATTRIBUTION}
@@ -263,7 +272,7 @@ def _asking(options: FetchOptions, query: str, say: Say, n_parts: int = 1) -> It
     settings = {
         "overpass_url": options.overpass_url,
         "nominatim_url": options.nominatim_url,
-        "overpass_rate_limit": options.overpass_url == OVERPASS_URL,  # others have no slots to ask about
+        "overpass_rate_limit": False,  # where it cannot ask, osmnx waits for a minute in silence; `_Patience` waits
         "overpass_settings": "[out:json][timeout:{timeout}]{maxsize}" + _date_setting(options.date),
         "requests_timeout": options.timeout_s,
         "doh_url_template": None,
@@ -286,7 +295,10 @@ def _asking(options: FetchOptions, query: str, say: Say, n_parts: int = 1) -> It
         except requests.exceptions.Timeout as error:
             raise RoadSourceError(f"{host} did not answer within {options.timeout_s:g} s; try again later") from error
         except requests.exceptions.RequestException as error:
-            raise RoadSourceError(f"{host} cannot be reached or broke off; is there a network connection?") from error
+            raise RoadSourceError(
+                f"{host} cannot be reached or broke off; is there a network connection? Without one give --roads FILE: "
+                "extracts are at download.geofabrik.de and extract.bbbike.org"
+            ) from error
         except (ValueError, LookupError, TypeError, AttributeError, ArithmeticError, RecursionError) as error:
             # JSON of any shape: what it makes osmnx raise is osmnx's to know.
             shutil.rmtree(folder, ignore_errors=True)

@@ -17,7 +17,8 @@ from roadgeo._text import visible
 from roadgeo.errors import CrsError, RoadSourceError
 from roadgeo.geometry.projection import LocalPlane, choose_plane, transformer
 from roadgeo.roads.kinds import RoadKind, drives
-from roadgeo.sources.lines import RoadLines, crs_name, list_sources, read_lines, simple_lines
+from roadgeo.sources.lines import RoadLines, crs_name, simple_lines
+from roadgeo.sources.streams import list_sources, read_lines, tell_source
 from roadgeo.storage.crs import known_crs
 
 if TYPE_CHECKING:
@@ -40,8 +41,8 @@ _LOG = logging.getLogger(__name__)
 #: West, south, east, north in degrees; west > east where it lies astride 180 degrees.
 Box = tuple[float, float, float, float]
 
-#: Vertices looked at to choose a plane; the ends of every line's bounding box are always among them.
-_SAMPLE = 100_000
+#: Of lines that lie beyond the Earth in their CRS so many, as a share, may be left out; of more the CRS is wrong.
+_MOST_ASTRAY = 0.1
 
 
 @dataclass(frozen=True)
@@ -101,7 +102,7 @@ def read_roads(
         CRS of the coordinates, whatever the files say. Needed where a file says nothing, as a shapefile without its
         .prj. OpenStreetMap files are always in degrees.
     which : RoadKind
-        Kinds of road to take, where the file tells them apart (`highway`, `fclass` or `class`); otherwise all.
+        Kinds of road to take, where the file tells them apart (see `sources.schemas`); otherwise all, and that is said.
     tunnels : bool
         Take tunnels too: a mask does not show them.
     bbox : (west, south, east, north), optional
@@ -122,7 +123,7 @@ def read_roads(
 
     given = [path] if isinstance(path, str | os.PathLike) else list(path)
     files = [file for one in given for file in list_sources(Path(one))]
-    sources = []
+    sources, elsewhere = [], []
     for n, file in enumerate(files, 1):
         what = f"reading {file.name}" + (f", {n} of {len(files)}" if len(files) > 1 else "")
         say(what)
@@ -131,7 +132,13 @@ def read_roads(
             source = replace(source, crs=overruled_crs(source.crs, crs, file))
         if source.crs is None:
             raise CrsError(f"{file}: says nothing of its CRS; name it, for example --crs EPSG:26986")
-        sources.append(choose_lines(source, file.name, which, tunnels, bbox))
+        chosen = choose_lines(source, file.name, which, tunnels, bbox)
+        tell_source(file.name, chosen.meta)
+        if not len(chosen.lines):
+            elsewhere.append(source)
+        sources.append(chosen)
+    if len(elsewhere) == len(sources):
+        raise _no_roads(sources, _ask_exchanged(bbox, elsewhere))
     roads = join_roads(sources, {"roads": which, "tunnels": tunnels, "bbox": _plain(bbox)}, attribution)
     return roads if bbox is None else replace(roads, area=box_area(bbox))
 
@@ -187,7 +194,7 @@ def fetch_roads(
         area, name = square(*around), "{:g},{:g} within {:g} m".format(*around)
     else:
         area, name = read_area(polygon)
-    source = fetch_lines(area, which, tunnels, options, say)
+    source = fetch_lines(area, which, tunnels, options, say, hint=_ask_exchanged(bbox))
     chosen = choose_lines(source, name, which, tunnels, None)
     return replace(join_roads([chosen], {"roads": which, "tunnels": tunnels, "bbox": _plain(bbox)}, None), area=area)
 
@@ -235,12 +242,12 @@ def choose_lines(source: RoadLines, name: str, which: RoadKind, tunnels: bool, b
 
 def join_roads(sources: Sequence[RoadLines], meta: dict[str, Any], attribution: str | None) -> Roads:
     """Take the lines of all sources to one plane."""
-    filled = [source for source in sources if len(source.lines)]
+    filled = [_on_earth(source) for source in sources if len(source.lines)]
     if not filled:
-        raise RoadSourceError(f"{_names(sources)}: no roads of the kind asked for; try another --kinds or area")
+        raise _no_roads(sources)
     shared = {source.crs for source in filled}
     own_crs = shared.pop() if len(shared) == 1 else None
-    plane = choose_plane(np.concatenate([_spread(source) for source in filled]), own_crs)
+    plane = choose_plane(np.concatenate([_corners(source) for source in filled]), own_crs)
     lines = np.concatenate([_to_plane(source, plane) for source in filled])
     calls = dict.fromkeys(source.meta["attribution"] for source in filled if source.meta.get("attribution"))
     return Roads(
@@ -273,21 +280,49 @@ def as_text(columns: Sequence[AnyArray | None], sources: Sequence[RoadLines]) ->
     return text
 
 
-def _spread(source: RoadLines) -> FloatArray:
-    """Return longitudes and latitudes of points spread over a source; (N, 2)."""
+def _corners(source: RoadLines) -> FloatArray:
+    """Return longitudes and latitudes of the corners of each line's bounding box; (2 L, 2)."""
     import shapely
 
-    coords = shapely.get_coordinates(source.lines)
-    sides = np.concatenate((coords.argmin(axis=0), coords.argmax(axis=0)))
-    points = np.concatenate((coords[:: max(len(coords) // _SAMPLE, 1)], coords[sides]))
-    degrees = transformer(_crs_of(source), "EPSG:4326").transform(points[:, 0], points[:, 1])
-    lonlat = np.stack(degrees, axis=1)
-    if not np.isfinite(lonlat).all() or np.abs(lonlat).max() > 360.0 or np.abs(lonlat[:, 1]).max() > 90.0:
+    bounds = shapely.bounds(source.lines)
+    points = np.concatenate((bounds[:, :2], bounds[:, 2:]))
+    return np.stack(transformer(_crs_of(source), "EPSG:4326").transform(points[:, 0], points[:, 1]), axis=1)
+
+
+def _on_earth(source: RoadLines) -> RoadLines:
+    """Return a source without the few lines that lie beyond the Earth, which one wrong value makes."""
+    import shapely
+
+    lonlat = _corners(source)
+    sound = np.asarray(np.isfinite(lonlat).all(axis=1) & (np.abs(lonlat) <= (360.0, 90.0)).all(axis=1))
+    kept = sound[: len(source.lines)] & sound[len(source.lines) :]
+    if kept.all():
+        return source
+    n_astray = int((~kept).sum())
+    if n_astray > _MOST_ASTRAY * len(kept):
+        reach = np.abs(shapely.total_bounds(source.lines)).max()
         raise CrsError(
-            f"{source.meta['name']}: coordinates reach {np.abs(points).max():.6g} and do not fit its CRS, "
-            f"{_crs_of(source)[:40]}; give the right one with --crs"
+            f"{source.meta['name']}: coordinates reach {reach:.6g} and do not fit its CRS, {_crs_of(source)[:40]}; "
+            "give the right one with --crs"
         )
-    return lonlat
+    _LOG.warning("%s: left out %s lines that lie beyond the Earth", source.meta["name"], f"{n_astray:,}")
+    highway, name = (None if one is None else one[kept] for one in (source.highway, source.name))
+    return replace(source, lines=source.lines[kept], highway=highway, name=name, tunnel=None)
+
+
+def _ask_exchanged(bbox: Box | None, sources: Sequence[RoadLines] | None = None) -> str:
+    """Ask whether longitudes and latitudes of a box without roads were exchanged, if there are roads in it then."""
+    import shapely
+
+    if bbox is None:
+        return ""
+    south, west, north, east = bbox  # if so
+    sound = -90 <= south < north <= 90 and -180 <= west < east <= 180
+    if sound and sources is not None:
+        sound = any(
+            shapely.box(west, south, east, north).intersects(shapely.multipoints(_corners(one))) for one in sources
+        )
+    return f" (longitude comes first: did you mean --bbox={west:g},{south:g},{east:g},{north:g}?)" if sound else ""
 
 
 def _to_plane(source: RoadLines, plane: LocalPlane) -> AnyArray:
@@ -365,8 +400,9 @@ def _crs_of(source: RoadLines) -> str:
     return source.crs
 
 
-def _names(sources: Sequence[RoadLines]) -> str:
-    return ", ".join(str(source.meta["name"]) for source in sources) or "no source"
+def _no_roads(sources: Sequence[RoadLines], hint: str = "") -> RoadSourceError:
+    names = ", ".join(str(source.meta["name"]) for source in sources) or "no source"
+    return RoadSourceError(f"{names}: no roads of the kind asked for; try another --kinds or area{hint}")
 
 
 def _plain(bbox: Box | None) -> list[float] | None:

@@ -1,142 +1,213 @@
-"""Lines out of road files part by part, so that a file of any size is read within a bounded memory."""
+"""The straight line of a road file: container, table, adapter, lines; of a folder those of its files that are roads."""
 
 from __future__ import annotations
 
+import logging
 import tempfile
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from contextlib import contextmanager
 from pathlib import Path
 from typing import Any
 
-from roadgeo.errors import RoadSourceError
-from roadgeo.sources.lines import (
-    COLUMNS,
-    GRAPH_ENDINGS,
-    OSM_ENDINGS,
-    PARQUET_ENDINGS,
-    RoadLines,
-    choose_layer,
-    crs_name,
-    from_columns,
-    from_frame,
-    geometry_columns,
-    read_lines,
-    reading,
-    require_rows,
-    stream_osm,
-)
-from roadgeo.sources.vectors import count_features, first_line, read_layer
+from roadgeo._text import visible
+from roadgeo.errors import NoRoadsError, RoadgeoError, RoadSourceError
+from roadgeo.sources.containers import ENDINGS, stream_tables
+from roadgeo.sources.lines import RoadLines, join_lines
+from roadgeo.sources.osm_files import OSM_ENDINGS
+from roadgeo.sources.schemas import recognise
+from roadgeo.sources.unpacking import PACKED, unpack
+from roadgeo.sources.vectors import first_line, require_file
+from roadgeo.storage.geopackage import layer_names
 
-__all__ = ["stream_lines"]
+__all__ = ["QUERY_ENDINGS", "list_sources", "read_lines", "reading", "stream_lines", "tell_source"]
 
-#: Places of nodes are kept in memory up to this size of a PBF file (about 16 bytes a node, 8 times its size), else on
-#: disk in the folder of temporary files.
-_NODES_IN_MEMORY = 100_000_000
+_LOG = logging.getLogger(__name__)
+
+#: Files that hold lines, not pixels, by their names.
+QUERY_ENDINGS = (*ENDINGS, ".json", *(ending + packed for ending in ENDINGS for packed in PACKED), ".zip")
+
+#: Features that are looked at to tell whether a file of a folder holds roads.
+_LOOK = 20_000
+_WHOLE = 1 << 30
 
 
-def stream_lines(
-    path: Path, layer: str | None = None, most: int = 100_000, advance: Callable[[float], None] = lambda _: None
-) -> Iterator[RoadLines]:
-    """Yield the lines of a road file as `lines.read_lines` gives them, of at most so many features at a time.
+def list_sources(path: Path) -> list[Path]:
+    """Return the files of a folder (not of folders in it) that hold roads, by name, or the path itself.
+
+    Passed over, with a word, are results and references of roadgeo, what holds no lines or other lines than roads, and,
+    where other files tell kinds of roads, those that do not.
+
+    Raises
+    ------
+    RoadSourceError
+        Nothing is there, or a folder holds no road file.
+    """
+    if not path.exists():
+        raise RoadSourceError(f"{path}: no such file or folder")
+    if not path.is_dir() or path.suffix.lower() == ".gdb":
+        return [path]
+    return _roads_among(path, sorted(path.iterdir()))
+
+
+def _roads_among(folder: Path, files: Sequence[Path]) -> list[Path]:
+    found = [file for file in files if file.name.lower().endswith(ENDINGS)]
+    if not found:
+        raise RoadSourceError(f"{folder}: no road file in this folder; expected names like *.gpkg, *.shp or *.osm.pbf")
+    if len(found) == 1:
+        return found
+    why: dict[Path, str] = {}
+    tells: dict[Path, bool] = {}
+    for file in found:
+        if _is_own(file):
+            why[file] = "a result or a reference of roadgeo"
+            continue
+        try:
+            tells[file] = file.name.lower().endswith(OSM_ENDINGS) or _tells_kinds(file)
+        except NoRoadsError as error:
+            why[file] = str(error).removeprefix(f"{file}: ")
+    if any(tells.values()):
+        why |= {
+            file: "it does not tell roads from other lines, as others do" for file, told in tells.items() if not told
+        }
+    for file, reason in why.items():
+        _LOG.warning(
+            "%s: passed over: %s; to take it all the same give it by its name", visible(str(file)), visible(reason)
+        )
+    kept = [file for file in found if file not in why]
+    if not kept:
+        raise RoadSourceError(f"{folder}: none of its {len(found)} files holds roads; name the file that does")
+    return kept
+
+
+def _is_own(file: Path) -> bool:
+    """Whether a GeoPackage is a result or a reference of roadgeo."""
+    if file.suffix.lower() != ".gpkg":
+        return False
+    try:
+        layers = set(layer_names(file))
+    except RoadgeoError:
+        return False
+    return "query_roads" in layers or layers >= {"intersections", "tangents", "roadgeo_meta"}
+
+
+def _tells_kinds(file: Path) -> bool:
+    """Whether a file tells what kind of road its lines are.
+
+    Raises
+    ------
+    NoRoadsError
+        It holds no lines, or none that are roads.
+    """
+    first = next(stream_lines(file, most=_LOOK))
+    if len(first.lines) == 0:
+        raise NoRoadsError("no roads in it")
+    return first.highway is not None
+
+
+def read_lines(
+    path: Path, layer: str | None = None, advance: Callable[[float], None] = lambda _: None, *, areas: bool = False
+) -> RoadLines:
+    """Read the lines of a road file that are roads, or may be.
 
     Parameters
     ----------
+    path : Path
+    layer : str, optional
+        Of a file with several; the one with lines by default.
     advance : callable, optional
         Told which share of the file is read.
+    areas : bool
+        Roads drawn as polygons will do where there are no lines.
 
     Raises
     ------
     RoadSourceError
         The file is missing, unreadable, empty or holds no lines.
     """
-    n = 0
-    with reading(path):
-        for part in _stream(path, layer, most, advance):
-            n += len(part.lines)
-            yield part
+    parts = list(stream_lines(path, layer, _WHOLE, advance, areas=areas))
+    if len({part.crs for part in parts}) > 1:
+        raise RoadSourceError(f"{path}: its files are in different CRS; unpack it, and name them one by one")
+    return join_lines(parts)
+
+
+def stream_lines(
+    path: Path,
+    layer: str | None = None,
+    most: int = 100_000,
+    advance: Callable[[float], None] = lambda _: None,
+    *,
+    areas: bool = False,
+) -> Iterator[RoadLines]:
+    """Yield the lines of a road file as `read_lines` gives them, of at most so many features at a time.
+
+    Raises
+    ------
+    RoadSourceError
+        The file is missing, unreadable, empty or holds no lines.
+    """
+    n, told = 0, {"no_roads": 0, "without_places": 0}
+    with reading(path), tempfile.TemporaryDirectory(prefix="roadgeo-") as folder:
+        for file in _unpacked(path, Path(folder)):
+            schema = None
+            for table in stream_tables(file, layer, most, advance, Path(folder), areas=areas):
+                schema = schema or recognise(table)
+                part = schema.adapt(table)
+                n += len(part.lines) + (len(part.areas) if areas else 0)
+                told = {key: value + part.meta.get(key, 0) for key, value in told.items()}
+                yield part
     if n == 0:
-        raise RoadSourceError(f"{path}: no lines in it, expected the centre lines of roads")
+        why = "expected the centre lines of roads"
+        if told["without_places"]:
+            why = "for the nodes of its ways are not in it: export them too (of Overpass: out body; >; out skel qt;)"
+        elif told["no_roads"]:
+            why = f"for its {told['no_roads']:,} features are something else, such as streams, railways or fences"
+        raise NoRoadsError(f"{path}: no {'roads' if told['no_roads'] else 'lines'} in it, {why}")
 
 
-def _stream(path: Path, layer: str | None, most: int, advance: Callable[[float], None]) -> Iterator[RoadLines]:
+def _unpacked(path: Path, folder: Path) -> list[Path]:
+    """Return the road files that a file stands for: itself, or what is packed in it."""
     name = path.name.lower()
-    if name.endswith(OSM_ENDINGS):
-        yield from _stream_osm(path, most, advance)
-    elif name.endswith(GRAPH_ENDINGS) or (name.endswith(PARQUET_ENDINGS) and not _is_wkb(path)):
-        yield read_lines(path, layer)
-    elif name.endswith(PARQUET_ENDINGS):
-        yield from _stream_parquet(path, most, advance)
-    else:
-        yield from _stream_gdal(path, layer, most, advance)
+    if name.endswith(OSM_ENDINGS) or not name.endswith(PACKED):
+        return [path]
+    unpacked = unpack(path, folder)
+    if unpacked.is_file():
+        return [unpacked]
+    geodatabases = [found for found in unpacked.rglob("*.[gG][dD][bB]") if found.is_dir()]
+    return geodatabases or _roads_among(path, sorted(file for file in unpacked.rglob("*") if file.is_file()))
 
 
-def _stream_osm(path: Path, most: int, advance: Callable[[float], None]) -> Iterator[RoadLines]:
-    if path.stat().st_size <= _NODES_IN_MEMORY:
-        yield from stream_osm(path, most, advance)
-        return
-    with tempfile.TemporaryDirectory(prefix="roadgeo-nodes-") as folder:
-        yield from stream_osm(path, most, advance, f"sparse_file_array,{folder}/nodes")
+def tell_source(name: str, meta: Mapping[str, Any]) -> None:
+    """Say what of a source was left out, or is not known."""
+    counts = {
+        "no_roads": "are no roads but streams, railways, fences or the like",
+        "broken": "have a vertex that is not finite",
+        "without_places": "are ways whose nodes are not in the file",
+    }
+    for key, what in counts.items():
+        if meta.get(key):
+            _LOG.warning(
+                "%s: left out %s of %s features, which %s", name, f"{meta[key]:,}", f"{meta['features']:,}", what
+            )
+    if "encoding" in meta:
+        _LOG.warning("%s: its text is not in the encoding that it names; read as Latin-1, names may be garbled", name)
+    if not meta["kinds_known"]:
+        _LOG.warning(
+            "%s: no column tells what kind of road a line is (as highway, fclass or class do): all %s lines are taken, "
+            "paths too, and --kinds does nothing",
+            name,
+            f"{meta['kept']:,}",
+        )
 
 
-def _stream_parquet(path: Path, most: int, advance: Callable[[float], None]) -> Iterator[RoadLines]:
-    """Stream GeoParquet by batches of its row groups."""
-    import geopandas as gpd
-    import pyarrow as pa
-    import pyarrow.parquet as pq
-    import shapely
+@contextmanager
+def reading(path: Path) -> Iterator[None]:
+    """Turn what goes wrong with a road file into a `RoadSourceError`."""
+    from pyproj.exceptions import ProjError
+    from shapely.errors import ShapelyError
 
+    require_file(path)
     try:
-        require_rows(path)
-        geometry, crs = geometry_columns(path)[0], crs_name(_parquet_crs(path))
-        with pq.ParquetFile(path) as file:
-            names = file.schema_arrow.names
-            wanted = [name for name in (*COLUMNS, "subtype") if name in names]
-            done = 0
-            for batch in file.iter_batches(most, columns=[geometry, *wanted]):
-                table = batch.to_pandas()
-                shapes = shapely.from_wkb(table.pop(geometry).to_numpy(object))
-                yield from_frame(gpd.GeoDataFrame(table, geometry=shapes, crs=crs), wanted)
-                done += len(batch)
-                advance(done / file.metadata.num_rows)
-    except (pa.ArrowException, ValueError, OSError) as error:
-        raise RoadSourceError(f"{path}: not readable as GeoParquet: {first_line(error)}") from error
-
-
-def _geometry_meta(path: Path) -> dict[str, Any]:
-    """Return what a GeoParquet file says of its primary geometry column."""
-    import json
-
-    import pyarrow.parquet as pq
-
-    column = geometry_columns(path)[0]
-    told: dict[str, Any] = json.loads((pq.read_schema(path).metadata or {})[b"geo"])["columns"][column]
-    return told
-
-
-def _is_wkb(path: Path) -> bool:
-    """Whether a file keeps its geometries as WKB; others are read whole."""
-    import pyarrow as pa
-
-    try:
-        return str(_geometry_meta(path).get("encoding")).upper() == "WKB"
-    except (ValueError, LookupError, TypeError, OSError, pa.ArrowException):
-        return False  # read whole, which says what is wrong
-
-
-def _parquet_crs(path: Path) -> Any:
-    """Return the CRS of a GeoParquet file: degrees where it does not say, None where it says that it is unknown."""
-    return _geometry_meta(path).get("crs", "EPSG:4326")
-
-
-def _stream_gdal(path: Path, layer: str | None, most: int, advance: Callable[[float], None]) -> Iterator[RoadLines]:
-    """Stream what GDAL reads."""
-    import shapely
-
-    layer = choose_layer(path, layer)
-    total = max(count_features(path, layer), 1)
-    for skip in range(0, total, most):
-        found = read_layer(path, layer, COLUMNS, skip, most)
-        if found.shapes is None:
-            raise RoadSourceError(f"{path}: layer {layer!r} has no geometry, expected lines")
-        shapes = shapely.from_wkb(found.shapes, on_invalid="ignore")
-        yield from_columns(shapes, crs_name(found.crs), found.columns, {"format": found.driver, "layer": layer})
-        advance(min(skip + most, total) / total)
+        yield
+    except (ProjError, ShapelyError, RuntimeError, ValueError, LookupError, ArithmeticError, OSError) as error:
+        # Many libraries read such files, and what a damaged one makes them raise is theirs to know.
+        raise RoadSourceError(f"{path}: damaged, or not what its name says: {first_line(error)}") from error

@@ -6,7 +6,7 @@ Values are judged from a sample of pixels spread over the raster and, where neig
 from __future__ import annotations
 
 from collections.abc import Callable
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import cv2
 import numpy as np
@@ -16,7 +16,7 @@ from roadgeo.errors import MaskError, PhotographError
 from roadgeo.geometry.mask import RoadMask
 from roadgeo.roads.vectorization import width_by_area
 
-__all__ = ["Sample", "find_thresholds", "ground_and_road"]
+__all__ = ["Sample", "are_labels", "find_thresholds", "find_unlabelled", "ground_and_road"]
 
 _COLOURED_SHARE = 0.05  # more than this: a photograph
 _GREY_SHARE = 0.25  # more than this is neither dark nor light: a soft map on uneven ground
@@ -93,6 +93,44 @@ def find_thresholds(sample: Sample) -> tuple[float, ...]:
     grey = _grey_share(sample, values)
     usual = 127.0 if sample.seen.dtype == np.uint8 and high > 127 and grey <= _GREY_SHARE else _otsu(values)
     return (usual,) if grey <= _CRISP_SHARE else _spread(values, usual)
+
+
+def find_unlabelled(sample: Sample) -> tuple[float | None, str]:
+    """Find the value of pixels that have no label in a map of labels, and say what was taken for what.
+
+    Maps for training have 0 for the ground, 1 for road and a third value for what counts for nothing: 255 in PASCAL VOC
+    and mmsegmentation, -1, or the largest of a type. In other rasters such a third value is the road, and the 1 noise.
+
+    Returns
+    -------
+    value : float or None
+        None where there is no such value.
+    told : str
+        "" where there is nothing to tell.
+    """
+    values = sample.seen[:, sample.channel]
+    levels = np.unique(values)
+    others = levels[(levels < 0) | (levels > _MAX_CLASS)]
+    classes = levels[(levels >= 0) & (levels <= _MAX_CLASS)]
+    if len(others) != 1 or len(classes) < 2 or len(levels) < 3 or np.any(levels != np.round(levels)):
+        return None, ""
+    other, are_two = float(others[0]), classes.tolist() == [0, 1]
+    rows = sample.read_rows()
+    ones_are_roads, others_are = (_are_roads(rows == value) for value in (1, other))
+    listed = ", ".join(f"{level:g}" for level in (*classes, other))
+    if other > 0 and others_are and not (are_two and ones_are_roads):
+        return None, f"holds the values {listed}: {other:g} is taken for road"
+    if are_two:
+        return other, f"holds the values {listed}: 1 is taken for road, {other:g} for not observed"
+    if other > 0 and sample.seen.dtype.kind in "iu":
+        _refuse_classes(replace(sample, seen=sample.seen[values != other]), classes)
+    return None, ""
+
+
+def are_labels(values: AnyArray) -> bool:
+    """Whether whole numbers are the labels that `find_unlabelled` knows: 0, 1 and another."""
+    levels = np.unique(values)
+    return len(levels) == 3 and levels[:2].tolist() == [0, 1] and bool(levels[2] > _MAX_CLASS)
 
 
 def ground_and_road(sample: Sample, threshold: float) -> tuple[float, float]:
@@ -204,6 +242,11 @@ def _shows_roads(rows: AnyArray, threshold: float) -> bool:
         return False
     n_pieces = cv2.connectedComponents(light.view(np.uint8))[0] - 1
     return bool(n_pieces * width_by_area(RoadMask(light)) ** 2 <= _MAX_PIECES * n_light)
+
+
+def _are_roads(shown: BoolArray) -> bool:
+    """Whether some of (rows, columns) look like roads."""
+    return bool(0 < shown.mean() <= _MAX_LIGHT) and _shows_roads(shown.astype(np.float64), 0.5)
 
 
 def _otsu(values: AnyArray) -> float:

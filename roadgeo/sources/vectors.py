@@ -25,11 +25,19 @@ from roadgeo.sources.crs_guard import refuse_named_files
 from roadgeo.storage.gdal import CONSENT, NETWORK, allowed_drivers
 from roadgeo.storage.sqlite import opened, table_problem
 
-__all__ = ["VectorLayer", "count_features", "first_line", "list_layers", "read_layer", "require_file"]
+__all__ = [
+    "VectorLayer",
+    "count_features",
+    "first_line",
+    "list_fields",
+    "list_layers",
+    "read_layer",
+    "require_file",
+]
 
 #: GDAL's names of the drivers that may read; they read the file, and those beside it that belong to it.
 _DRIVERS = {
-    *("CSV", "ESRI Shapefile", "ESRIJSON", "FlatGeobuf", "GML", "GPKG", "GPX", "GeoJSON", "GeoJSONSeq", "KML"),
+    *("CSV", "DXF", "ESRI Shapefile", "ESRIJSON", "FlatGeobuf", "GML", "GPKG", "GPX", "GeoJSON", "GeoJSONSeq", "KML"),
     *("LIBKML", "MapInfo File", "OpenFileGDB", "SQLite", "TopoJSON"),
 }
 
@@ -52,12 +60,15 @@ class VectorLayer(NamedTuple):
     columns : (N,) object each, by name
     crs : str or None
     driver : str
+    told : dict
+        `encoding`, where text was not in the encoding that the file names.
     """
 
     shapes: AnyArray | None
     columns: dict[str, AnyArray]
     crs: str | None
     driver: str
+    told: dict[str, str]
 
 
 def list_layers(path: Path) -> list[tuple[str, str]]:
@@ -84,16 +95,31 @@ def count_features(path: Path, layer: str) -> int:
     """
     import pyogrio
 
-    with _guarded(path) as file:
+    with _guarded(path, layer) as file:
         return int(pyogrio.read_info(file, layer=layer, force_feature_count=True)["features"])
+
+
+def list_fields(path: Path, layer: str) -> list[str]:
+    """Return the names of a layer's columns.
+
+    Raises
+    ------
+    RoadSourceError
+        As `list_layers`.
+    """
+    import pyogrio
+
+    with _guarded(path, layer) as file:
+        return [str(name) for name in pyogrio.read_info(file, layer=layer)["fields"]]
 
 
 def read_layer(
     path: Path, layer: str | None, columns: Sequence[str], skip: int = 0, most: int | None = None
 ) -> VectorLayer:
-    """Read a layer (the first by default), with those of the named columns (in lower case) that it has.
+    """Read a layer (the first by default), with those of the named columns that it has.
 
-    Some features are left out before, and at most so many are read.
+    Some features are left out before, and at most so many are read. Text that is not in the encoding that the file
+    names is read as Latin-1, which may garble it, and that is told.
 
     Raises
     ------
@@ -106,11 +132,15 @@ def read_layer(
         layer = layer or str(pyogrio.list_layers(file)[0][0])
         _require_stored(path, layer)
         info = pyogrio.read_info(file, layer=layer)
-        wanted = [name for name in info["fields"] if name.lower() in columns]
-        part = {"skip_features": skip, "max_features": most}
-        meta, _, shapes, values = pyogrio.raw.read(file, layer=layer, columns=wanted, force_2d=True, **part)
+        part = {"skip_features": skip, "max_features": most, "columns": list(columns), "force_2d": True}
+        told = {}
+        try:
+            meta, _, shapes, values = pyogrio.raw.read(file, layer=layer, **part)
+        except UnicodeDecodeError:
+            meta, _, shapes, values = pyogrio.raw.read(file, layer=layer, encoding="ISO-8859-1", **part)
+            told["encoding"] = "Latin-1"
     named = {name.lower(): column for name, column in zip(meta["fields"], values, strict=True)}
-    return VectorLayer(shapes, named, meta["crs"], info["driver"])
+    return VectorLayer(shapes, named, meta["crs"], info["driver"], told)
 
 
 def require_file(path: Path) -> None:
@@ -122,7 +152,7 @@ def require_file(path: Path) -> None:
 
 
 @contextmanager
-def _guarded(path: Path) -> Iterator[Path]:
+def _guarded(path: Path, layer: str | None = None) -> Iterator[Path]:
     """Check what can be checked without GDAL, then read with as little of it as is needed; yield what to open."""
     from pyogrio.errors import CRSError, DataLayerError, DataSourceError
 
@@ -130,6 +160,9 @@ def _guarded(path: Path) -> Iterator[Path]:
     refuse_named_files(path)
     _refuse_links(path)
     _require_stored(path)
+    if layer is not None:
+        _require_stored(path, layer)
+    file = path
     try:
         with _few_drivers(), _offline(), _aside(path) as file, warnings.catch_warnings():
             warnings.simplefilter("ignore")
@@ -138,6 +171,7 @@ def _guarded(path: Path) -> Iterator[Path]:
         raise RoadSourceError(f"{path}: names a CRS that is none: {first_line(error)}") from error
     except (DataSourceError, DataLayerError, UnicodeDecodeError) as error:
         told = "of a format that is not read here" if "not recognized" in str(error) else first_line(error)
+        told = told.replace(str(file), str(path))
         hint = f"; save it as GeoPackage, or allow GDAL's driver with {CONSENT}" if told.startswith("of") else ""
         raise RoadSourceError(f"{path}: not readable as a map of roads: {told}{hint}") from error
 
@@ -187,7 +221,7 @@ def _offline() -> Iterator[None]:
     """Let no request of pyogrio's GDAL reach anything."""
     import pyogrio
 
-    options = {**NETWORK, "GML_DOWNLOAD_SCHEMA": "NO"}
+    options = {**NETWORK, "GML_DOWNLOAD_SCHEMA": "NO", "DXF_INLINE_BLOCKS": "NO"}  # blocks within blocks have no end
     before = {name: pyogrio.get_gdal_config_option(name) for name in options}
     exempt = {name: os.environ.pop(name) for name in ("no_proxy", "NO_PROXY") if name in os.environ}
     pyogrio.set_gdal_config_options(options)

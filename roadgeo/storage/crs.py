@@ -18,7 +18,7 @@ from roadgeo.errors import CrsError
 if TYPE_CHECKING:
     from pyproj import CRS
 
-__all__ = ["all_text", "known_crs", "named_file"]
+__all__ = ["all_text", "known_crs", "name_crs", "named_file"]
 
 #: What PROJ's strings say behind a key that takes files, and what WKT and PROJJSON say of files.
 _KEYS = re.compile(r"(?:grids|file|model)\s*=\s*(\"[^\"]*|[^\s\"]*)", re.IGNORECASE)
@@ -41,6 +41,31 @@ def known_crs(crs: Any) -> CRS:
         It is none.
     """
     return _known(crs) if isinstance(crs, str) else _checked(crs)
+
+
+def name_crs(crs: Any) -> str:
+    """Return a CRS as all libraries read it, "EPSG:n" or else WKT2, of whatever pyproj takes for one.
+
+    That is a code (3857, "EPSG:3857", "ESRI:102003"), a name ("OSGB36 / British National Grid"), WKT, PROJJSON ...
+
+    Raises
+    ------
+    CrsError
+        It is none, or none of places on a map.
+    """
+    from pyproj.exceptions import CRSError
+
+    told = f"{str(crs)[:60]!r}"
+    expected = "expected for example EPSG:3857, 3857, a name such as 'WGS 84 / UTM zone 29N', or WKT"
+    try:
+        known = known_crs(crs)
+    except CRSError as error:
+        raise CrsError(f"{told} is no CRS that PROJ knows; {expected}") from error
+    known = known.to_2d() if len(known.axis_info) == 3 else known
+    if not (known.is_geographic or known.is_projected):
+        raise CrsError(f"{told} is no CRS of places on Earth, but {known.type_name}; {expected}")
+    code = known.to_epsg(min_confidence=100)
+    return f"EPSG:{code}" if code else known.to_wkt("WKT2_2019")
 
 
 @lru_cache(maxsize=64)

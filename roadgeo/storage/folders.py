@@ -2,13 +2,17 @@
 
 from __future__ import annotations
 
+import contextlib
 import os
 import stat
 import sys
 import tempfile
 from pathlib import Path
 
-__all__ = ["cache_dir", "private_temporary_dir", "writable"]
+__all__ = ["cache_dir", "is_private", "private_temporary_dir", "writable"]
+
+#: So many names of a temporary folder are tried before one is made that no other process will find.
+_NAMES = 16
 
 
 def cache_dir() -> Path:
@@ -41,18 +45,34 @@ def private_temporary_dir() -> Path:
     """
     if not hasattr(os, "getuid"):  # Windows: the temporary folder is the user's own
         return Path(tempfile.gettempdir()) / "roadgeo"
-    path = Path(tempfile.gettempdir()) / f"roadgeo-{os.getuid()}"
-    path.mkdir(mode=0o700, exist_ok=True)
-    found = path.lstat()
-    if not stat.S_ISDIR(found.st_mode) or found.st_uid != os.getuid() or found.st_mode & 0o022:
-        return Path(tempfile.mkdtemp(prefix="roadgeo-"))  # someone else took the name
-    return path
+    for n in range(_NAMES):  # someone else may have taken the name
+        path = Path(tempfile.gettempdir()) / (f"roadgeo-{os.getuid()}" + (f"-{n}" if n else ""))
+        with contextlib.suppress(FileExistsError):
+            path.mkdir(mode=0o700)
+        if is_private(path):
+            return path
+    return Path(tempfile.mkdtemp(prefix="roadgeo-"))
+
+
+def is_private(folder: Path) -> bool:
+    """Whether a folder is this user's, and only they may write to it: what lies in it may be executed.
+
+    Its parent may be a group's, but not everybody's, unless only owners may rename what lies there.
+    """
+    if not hasattr(os, "getuid"):  # Windows: the folders of a user are their own
+        return folder.is_dir()
+    try:
+        found, around = folder.lstat(), folder.parent.stat()
+    except OSError:
+        return False
+    mine = stat.S_ISDIR(found.st_mode) and found.st_uid == os.getuid() and not found.st_mode & 0o022
+    return mine and (not around.st_mode & 0o002 or bool(around.st_mode & stat.S_ISVTX))
 
 
 def writable(folder: Path) -> bool:
-    """Make a folder unless it is there; return whether files can be written to it."""
+    """Make a folder unless it is there, for this user alone; return whether files can be written to it."""
     try:
-        folder.mkdir(parents=True, exist_ok=True)
+        folder.mkdir(mode=0o700, parents=True, exist_ok=True)
         with tempfile.TemporaryFile(dir=folder):  # permission bits say nothing of read-only file systems
             return True
     except OSError:

@@ -8,8 +8,10 @@ Rasterio is imported only here and late: it takes longer than to read a mask.
 
 from __future__ import annotations
 
+import contextlib
 import os
 import re
+import shutil
 import stat
 import struct
 import warnings
@@ -63,6 +65,7 @@ _MAX_SIDECAR = 1 << 20
 _MAX_TURNED_BYTES = 1 << 30  # of a decoded picture, which is kept in memory
 _CACHE_BYTES = 256 << 20  # of decoded blocks; GDAL's own is a twentieth of the machine's memory
 _HEAD_BYTES = 8192
+_LITTLE_SPACE = 8 << 20
 _BOXES_OF_BOXES = (b"jp2h", b"res ", b"asoc", b"jpch", b"jplh")  # of JPEG 2000
 
 
@@ -156,10 +159,22 @@ def writing_raster(path: str | os.PathLike[str]) -> Iterator[None]:
         yield
     except (RasterioError, CPLE_BaseError, CRSError) as error:
         reason = " ".join(str(error.__cause__ or error).split())[:300]
-        doubt = "is the disk full, or the picture damaged?"
-        if "proj.db" in reason:
-            doubt = "PROJ's data are missing: unset PROJ_DATA and PROJ_LIB, or install rasterio again"
-        raise OutputError(f"cannot write {os.fspath(path)}: {reason}; {doubt}") from error
+        raise OutputError(f"cannot write {os.fspath(path)}: {reason}{_doubt(reason, Path(path))}") from error
+
+
+def _doubt(reason: str, path: Path) -> str:
+    """Say what may be behind an error of GDAL's, as far as something speaks for it."""
+    if "proj.db" in reason:
+        return "; PROJ's data are missing: unset PROJ_DATA and PROJ_LIB, or install rasterio again"
+    with contextlib.suppress(OSError):
+        free = shutil.disk_usage(path.parent).free
+        if free < _LITTLE_SPACE:
+            return f"; the disk is full: {free / 1e6:.0f} MB are left"
+    if re.search(r"read|decod|corrupt|premature|truncat", reason, re.IGNORECASE):
+        return "; is the picture damaged?"
+    if re.search(r"\bwrit|space|quota|file too large", reason, re.IGNORECASE):
+        return "; is the disk full?"
+    return ""
 
 
 def require_file(path: str | os.PathLike[str], name: str) -> None:

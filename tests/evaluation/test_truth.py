@@ -89,7 +89,16 @@ def test_tiles_are_north_up_around_their_centres(tmp_path):
 
 
 @pytest.mark.parametrize(
-    "text", ["a,b\n1,2\n", "{}", '{"queries": [{}]}', '{"queries": 3}', "file,kind\nx,y\n", "\x00"]
+    "text",
+    [
+        "a,b\n1,2\n",
+        "{}",
+        '{"queries": [{}]}',
+        '{"queries": 3}',
+        "file,kind\nx,y\n",
+        "\x00",
+        f"file,kind\n{'x' * 200_000},y\n",
+    ],
 )
 def test_other_tables_are_refused(text, tmp_path):
     (tmp_path / "truth.csv").write_text(text)

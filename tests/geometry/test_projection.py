@@ -64,7 +64,8 @@ def test_data_a_little_wider_than_a_zone_stays_in_utm():
         (np.empty((0, 2)), "no coordinates"),
         ([[236000.0, 900000.0]], "coordinates reach 900000, expected degrees"),
         ([[10.0, 91.0]], "expected degrees"),
-        ([[np.nan, 10.0]], "expected degrees"),
+        ([[np.nan, 10.0], [3.0, 4.0]], "1 of 2 coordinates are NaN; mend them"),
+        ([[np.inf, 10.0]], "coordinates reach inf, expected degrees"),
     ],
 )
 def test_what_is_not_degrees_is_refused(lonlat, message):

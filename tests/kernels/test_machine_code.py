@@ -1,6 +1,8 @@
 """Kernels are compiled once, kept and loaded, and give what Python gives, whatever they take and return."""
 
 import os
+import sys
+import tempfile
 from pathlib import Path
 
 import numpy as np
@@ -91,6 +93,27 @@ def test_a_failure_is_named() -> None:
         toys.share(VALUES[0], 0)
 
 
+@pytest.mark.usefixtures("folder", "no_compiler")
+def test_an_array_that_is_read_only_is_not_written_to(tmp_path: Path) -> None:
+    """One that lies in a file ended the process."""
+    np.zeros(3).tofile(tmp_path / "zeros")
+    out = np.memmap(tmp_path / "zeros", mode="r")
+    with pytest.raises(ValueError, match="kernel walk writes to an array that is read-only"):
+        toys.walk(toys.Line(0.5, STEPS), out.view(np.float64))
+    STEPS.flags.writeable = False  # what is only read may be
+    check_values()
+
+
+def test_a_kernel_that_writes_to_what_it_does_not_name_is_not_compiled() -> None:
+    from numba.core.errors import TypingError
+
+    from roadgeo.kernels.compilation import Kernel, _engine
+    from roadgeo.kernels.machine_code import compile_kernels
+
+    with pytest.raises(TypingError, match="readonly"):
+        compile_kernels([Kernel(toys.walk.function, {})], _engine().llvm, _engine().machine, lambda _: None)
+
+
 @pytest.mark.parametrize("damage", [b"", b"nonsense", None])
 def test_damaged_machine_code_is_made_again(folder: Path, kept: bytes, damage: bytes | None) -> None:
     (folder / "toy_kernels.o").write_bytes(kept[:-1] if damage is None else damage)
@@ -109,9 +132,54 @@ def test_where_nothing_can_be_kept_kernels_run_all_the_same(folder: Path, monkey
     assert not list(folder.iterdir())
 
 
-def test_what_cannot_be_kept_is_left_to_numba(folder: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+@pytest.mark.parametrize("why", ["arrays look otherwise", "private parts are gone", "numba is newer"])
+def test_what_cannot_be_kept_is_left_to_numba(
+    why: str, folder: Path, monkeypatch: pytest.MonkeyPatch, caplog: pytest.LogCaptureFixture
+) -> None:
     (folder / "toy_kernels.o").unlink()
-    monkeypatch.setattr("roadgeo.kernels.machine_code._arrays_look_as_expected", lambda: False)
+    if why == "arrays look otherwise":
+        monkeypatch.setattr("roadgeo.kernels.machine_code._arrays_look_as_expected", lambda: False)
+    elif why == "private parts are gone":
+        monkeypatch.setitem(sys.modules, "roadgeo.kernels.machine_code", None)
+    else:
+        monkeypatch.setattr(compilation, "_numba_version", lambda: "99.1.0rc2")
     check_values()
     assert {MODULE} == compilation._left_to_numba
     assert not (folder / "toy_kernels.o").exists()
+    assert "take longer to load" in caplog.text
+
+
+def test_what_is_kept_is_of_one_numba_python_and_processor(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
+    monkeypatch.setenv("ROADGEO_CACHE", str(tmp_path))
+    of = compilation.kernel_folder.__wrapped__
+    kept = {of()}
+    assert kept == {of()}
+    with monkeypatch.context() as patch:
+        patch.setattr(compilation, "_numba_version", lambda: "0.61.0")
+        kept.add(of())
+    with monkeypatch.context() as patch:
+        patch.setattr(sys, "abiflags", "t", raising=False)
+        kept.add(of())
+    with monkeypatch.context() as patch:
+        engine = compilation._engine()
+        patch.setattr(compilation, "_engine", lambda: engine._replace(name=f"{engine.name},-avx2"))
+        kept.add(of())
+    assert len(kept) == 4
+
+
+@pytest.mark.skipif(not hasattr(os, "getuid"), reason="permission bits of POSIX")
+def test_a_cache_that_others_may_write_to_is_not_used(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
+    """What lies there is executed: anybody might have planted it."""
+    monkeypatch.setenv("ROADGEO_CACHE", str(tmp_path / "cache"))
+    monkeypatch.setattr(tempfile, "tempdir", str(tmp_path))
+    of = compilation.kernel_folder.__wrapped__
+    folder = of()
+    assert (folder.parent, folder.stat().st_mode & 0o777) == (tmp_path / "cache", 0o700)
+    for path, mode in ((folder, 0o770), (folder, 0o707), (folder.parent, 0o777)):
+        before = path.stat().st_mode
+        path.chmod(mode)
+        assert not of().is_relative_to(tmp_path / "cache")
+        path.chmod(before)
+        assert of() == folder
+    monkeypatch.setattr(os, "getuid", lambda: 4242)  # somebody else's
+    assert not of().is_relative_to(tmp_path / "cache")

@@ -2,11 +2,12 @@ import json
 from dataclasses import replace
 from pathlib import Path
 
+import cv2
 import numpy as np
 import pytest
 import rasterio
 
-from roadgeo.errors import OutputError
+from roadgeo.errors import CrsError, MaskError, OutputError
 from roadgeo.geometry.homography import Homography
 from roadgeo.geometry.mask import RoadMask, pixel_to_plane
 from roadgeo.location import Evidence, Location, Place
@@ -199,6 +200,26 @@ def test_all_files_or_none(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> N
     with pytest.raises(OutputError, match="disk full"):
         write_location(located(), road_mask(), output_paths(tmp_path, "a"))
     assert list(tmp_path.iterdir()) == []
+
+
+@pytest.mark.parametrize(
+    ("image", "photo", "message"),
+    [
+        (ImageOptions("+proj=ortho +lat_0=-41 +lon_0=171"), None, "lies outside"),
+        (ImageOptions(), (80, 90), "its mask 400 x 300"),
+    ],
+)
+def test_where_nothing_can_be_drawn_the_place_is_written(
+    tmp_path: Path, image: ImageOptions, photo: tuple[int, int] | None, message: str
+) -> None:
+    paths, picture = output_paths(tmp_path / "out", "a"), tmp_path / "photo.png"
+    paths.folder.mkdir()
+    cv2.imwrite(str(picture), np.zeros((photo or (300, 400)), np.uint8))
+    write_location(located(), road_mask(), paths)  # an earlier run
+    with pytest.raises((CrsError, MaskError), match=f"{message}.*what was found is in .*a_location.json"):
+        write_location(located(), road_mask(), paths, OutputOptions(image), picture)
+    assert [path.name for path in paths.folder.iterdir()] == ["a_location.json"]
+    assert json.loads(paths.json.read_text())["footprint_lonlat"]
 
 
 def test_what_cannot_be_written_is_named(tmp_path: Path) -> None:

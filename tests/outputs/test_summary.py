@@ -18,6 +18,15 @@ from roadgeo.storage.geopackage import read_layer
 RING = [[-8.61, 41.16], [-8.60, 41.16], [-8.60, 41.15], [-8.61, 41.15]]
 
 
+def test_no_cell_of_the_table_is_a_formula(tmp_path: Path) -> None:
+    """A name, or the attribution of a map of somebody else, would be computed by a spreadsheet."""
+    found = {**located().to_dict(), "footprint_lonlat": RING, "query": "=HYPERLINK(0).png", "attribution": "@SUM(A1)"}
+    with write_summary(tmp_path, [found])[1].open(newline="") as lines:
+        (row,) = csv.DictReader(lines)
+    assert (row["query"], row["attribution"]) == ("'=HYPERLINK(0).png", "'@SUM(A1)")
+    assert float(row["lon"]) < 0
+
+
 def test_all_footprints_in_one_geopackage_and_one_table(tmp_path: Path) -> None:
     found = {**located().to_dict(), "footprint_lonlat": RING}
     refused = Location("b.png", "not_located", "nothing, like this, fits", "porto").to_dict()

@@ -1,7 +1,7 @@
 import numpy as np
 import pytest
 
-from roadgeo.roads.kinds import ROAD_KINDS, drives, highways, in_tunnel, main_ranks, names_highways
+from roadgeo.roads.kinds import ROAD_KINDS, drives, highways, in_tunnel, main_ranks
 
 
 def column(*values):
@@ -64,20 +64,6 @@ def test_tunnels(value, tunnel):
     assert in_tunnel(column(value))[0] == tunnel
 
 
-@pytest.mark.parametrize(
-    ("values", "expected"),
-    [
-        (["residential", "service", None], True),
-        (["Main Street", "Elm Street", "residential"], False),
-        ([None, None], False),
-        ([], False),
-        ([1, 2, 3], False),
-    ],
-)
-def test_columns_of_highways_are_told_from_others(values, expected):
-    assert names_highways(column(*values)) == expected
-
-
 def test_main_roads_have_ranks():
     values = column("motorway_link", "trunk", "residential", None, "tertiary;primary", ["secondary"], "", "motorway")
     assert main_ranks(values).tolist() == [0, 1, -1, -1, 2, 3, -1, 0]
@@ -88,4 +74,3 @@ def test_values_of_any_type_are_no_fault(value):
     """Tables of strangers hold what they like: a column of yes and no was one that no test had."""
     kinds = np.array([value, None], object)
     assert drives(kinds, "all").shape == in_tunnel(kinds).shape == (2,)
-    assert names_highways(kinds) == (value == "primary")

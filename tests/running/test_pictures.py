@@ -64,6 +64,14 @@ def test_a_palette_stands_for_its_colours() -> None:
     assert read[0, 0].tolist() == [90, 10, 10]
 
 
+def test_labels_in_a_palette_stay_labels() -> None:
+    labels = (GREY > 100).astype(np.uint8)
+    labels[:5] = 255
+    image = Image.fromarray(labels, "P")
+    image.putpalette([0, 0, 0, 128, 0, 0, *[9] * 759, 224, 224, 192])
+    np.testing.assert_array_equal(read_picture(image), labels)
+
+
 def test_a_transparent_colour_of_a_palette_was_not_observed() -> None:
     read = read_picture(paletted(transparency=0))
     assert np.array_equal(np.ma.getmaskarray(read)[..., 0], GREY <= 100)

@@ -5,6 +5,7 @@ from pathlib import Path
 import cv2
 import numpy as np
 import PIL.Image
+import pyproj
 import pytest
 import rasterio
 from rasterio.control import GroundControlPoint
@@ -74,6 +75,21 @@ def test_a_world_file_beside_a_picture_is_read(tmp_path: Path) -> None:
     (tmp_path / "scan.pgw").write_text("no numbers here")
     with pytest.raises(MaskError, match="six numbers"):
         read_georeference(path, "EPSG:32619")
+
+
+@pytest.mark.parametrize("version", ["WKT1_ESRI", "WKT2_2019"])
+def test_a_prj_beside_a_world_file_names_its_crs(tmp_path: Path, version: str) -> None:
+    path = tmp_path / "scan.png"
+    cv2.imwrite(str(path), np.zeros((60, 80), np.uint8))
+    path.with_suffix(".pgw").write_text("0.5\n0.1\n0.1\n-0.5\n330000.3\n4689999.8\n")
+    path.with_suffix(".prj").write_text(pyproj.CRS(32619).to_wkt(version))
+    found = read_georeference(path)
+    assert found is not None
+    assert found.crs == "EPSG:32619"
+    assert read_georeference(path, "WGS 84 / UTM zone 20N").crs == "EPSG:32620"
+    path.with_suffix(".prj").write_text("EPSG:nowhere")
+    with pytest.raises(CrsError, match=r"scan.prj: 'EPSG:nowhere' is no CRS that PROJ knows"):
+        read_georeference(path)
 
 
 @pytest.mark.parametrize("orientation", [3, 6, 7])

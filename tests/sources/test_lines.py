@@ -14,7 +14,8 @@ from shapely.geometry import (
 from worlds.fenway import streets, write_streets, write_vector
 
 from roadgeo.errors import RoadSourceError
-from roadgeo.sources.lines import OSM_ATTRIBUTION, list_sources, read_lines, simple_lines
+from roadgeo.sources.lines import OSM_ATTRIBUTION, simple_lines
+from roadgeo.sources.streams import list_sources, read_lines
 
 FORMATS = [
     "streets.gpkg",
@@ -56,7 +57,7 @@ def test_graphml_of_osmnx(tmp_path):
     read = read_lines(tmp_path / "streets.graphml")
     assert read.crs == "EPSG:4326"
     assert [line.coords[0] for line in read.lines] == [(-71.09, 42.35), (-71.08, 42.35)]
-    assert read.highway.tolist() == [["residential", "tertiary"], "footway"]
+    assert read.highway.tolist() == ["residential;tertiary", "footway"]
     assert read.tunnel.tolist() == [False, True]
 
 
@@ -132,7 +133,7 @@ def test_measured_and_raised_lines_lose_the_rest(tmp_path):
 @pytest.mark.parametrize(
     ("kinds", "expected"),
     [
-        ({"highway": ["residential", None, "service"]}, ["residential", None, "service"]),
+        ({"highway": ["residential", None, "service"]}, ["residential", "service"]),
         ({"fclass": ["residential", "primary", "service"]}, ["residential", "primary", "service"]),
         ({"HIGHWAY": ["residential", "primary", "service"]}, ["residential", "primary", "service"]),
         ({"class": ["A", "B", "C"]}, None),
@@ -193,14 +194,14 @@ def test_nonsense_is_refused_on_one_line(tmp_path, name):
 def test_pbf_files_are_read_in_parts_and_progress_is_told(tmp_path, monkeypatch, part_size):
     file = write_streets(tmp_path / "a.osm.pbf")
     whole = read_lines(file)
-    monkeypatch.setattr("roadgeo.sources.pbf._PART", part_size)
+    monkeypatch.setattr("roadgeo.sources.osm_files._PART", part_size)
     told = []
     read = read_lines(file, advance=told.append)
     assert shapely.equals(read.lines, whole.lines).all()
     assert read.highway.tolist() == whole.highway.tolist()
     assert told == sorted(told)
     assert told[-1] == 1.0
-    assert len(told) == 1 if part_size > file.stat().st_size else len(told) > 1
+    assert len(told) == 2 if part_size > file.stat().st_size else len(told) > 2  # nodes, then ways
 
 
 @pytest.mark.parametrize("at", [300, -500, -1])
@@ -243,14 +244,150 @@ def test_a_plain_parquet_table_is_refused(tmp_path):
         read_lines(tmp_path / "x.parquet")
 
 
+@pytest.mark.parametrize("encode", [shapely.to_wkb, shapely.to_wkt], ids=["wkb", "wkt"])
+@pytest.mark.parametrize("name", ["geometry", "geom", "WKB_GEOMETRY"])
+def test_parquet_that_says_nothing_of_its_shapes(tmp_path, encode, name):
+    import pandas as pd
+
+    lines, highway, _ = streets()
+    pd.DataFrame({"highway": highway, name: encode(lines), "id": b"1"}).to_parquet(tmp_path / "x.parquet")
+    read = read_lines(tmp_path / "x.parquet")
+    assert read.highway.tolist() == highway
+    assert shapely.equals_exact(read.lines, lines, 1e-5).all()
+    assert read.crs is None
+
+
+def test_native_encodings_of_geoparquet(tmp_path):
+    import geopandas as gpd
+
+    lines, highway, _ = streets()
+    frame = gpd.GeoDataFrame({"highway": highway}, geometry=lines, crs=32629)
+    frame.to_parquet(tmp_path / "x.parquet", geometry_encoding="geoarrow")
+    read = read_lines(tmp_path / "x.parquet")
+    assert shapely.equals(read.lines, lines).all()
+    assert (read.crs, read.highway.tolist()) == ("EPSG:32629", highway)
+
+
 def test_folders(tmp_path):
     with pytest.raises(RoadSourceError, match="no road file in this folder"):
         list_sources(tmp_path)
-    for name in ("b.gpkg", "a.osm.pbf", "c.SHP", "c.dbf", "notes.txt"):
-        (tmp_path / name).touch()
+    for name in ("b.gpkg", "a.osm.pbf", "c.shp"):
+        write_streets(tmp_path / name)
+    (tmp_path / "notes.txt").touch()
+    (tmp_path / "c.shp").rename(tmp_path / "c.SHP")
     assert [file.name for file in list_sources(tmp_path)] == ["a.osm.pbf", "b.gpkg", "c.SHP"]
     assert list_sources(tmp_path / "b.gpkg") == [tmp_path / "b.gpkg"]
     with pytest.raises(RoadSourceError, match="no such file or folder"):
         list_sources(tmp_path / "d")
     with pytest.raises(RoadSourceError, match="no such file"):
         read_lines(tmp_path / "d.gpkg")
+
+
+# --- containers -------------------------------------------------------------------------------------------------------
+
+
+def kml(*layers):
+    """KML with a folder for each list of lines."""
+
+    def folder(n, lines):
+        spots = ["".join(f"{x},{y} " for x, y in line.coords) for line in lines]
+        marks = "".join(
+            f"<Placemark><LineString><coordinates>{s}</coordinates></LineString></Placemark>" for s in spots
+        )
+        return f"<Folder><name>layer {n}</name>{marks}</Folder>"
+
+    inner = "".join(folder(n, lines) for n, lines in enumerate(layers))
+    return f'<kml xmlns="http://www.opengis.net/kml/2.2"><Document>{inner}</Document></kml>'
+
+
+def gpx(*kinds):
+    """GPX with the streets cut into as many parts as kinds of tracks are named."""
+    lines, rows = streets()[0], []
+    for kind, part in zip(kinds, np.array_split(lines, len(kinds)), strict=True):
+        tag, point = {"tracks": ("trk", "trkpt"), "routes": ("rte", "rtept")}[kind]
+        for line in part:
+            spots = "".join(f'<{point} lat="{y}" lon="{x}"/>' for x, y in line.coords)
+            rows.append(f"<{tag}>{spots if tag == 'rte' else f'<trkseg>{spots}</trkseg>'}</{tag}>")
+    return f'<gpx version="1.1" creator="x" xmlns="http://www.topografix.com/GPX/1/1">{"".join(rows)}</gpx>'
+
+
+@pytest.mark.parametrize("kinds", [["tracks"], ["routes"], ["routes", "tracks"]])
+def test_gpx_is_read_whole(tmp_path, kinds):
+    (tmp_path / "walk.gpx").write_text(gpx(*kinds))
+    read = read_lines(tmp_path / "walk.gpx")
+    assert len(read.lines) == len(streets()[0])
+    assert read.meta["layer"] == ", ".join(kinds)
+    assert len(read_lines(tmp_path / "walk.gpx", kinds[0]).lines) == -(-len(streets()[0]) // len(kinds))
+
+
+def test_folders_of_kml_are_one_drawing(tmp_path):
+    lines = streets()[0]
+    (tmp_path / "sketch.kml").write_text(kml(lines[:5], [], lines[5:]))
+    assert len(read_lines(tmp_path / "sketch.kml").lines) == len(lines)
+
+
+def test_an_empty_layer_is_passed_over(tmp_path):
+    file = tmp_path / "map.gpkg"
+    write_vector(file, [], layer="rivers", highway=[])
+    write_vector(file, [LineString([(0, 0), (1, 1)])], layer="streets", append=True)
+    assert read_lines(file).meta["layer"] == "streets"
+
+
+@pytest.mark.filterwarnings("ignore:'crs' was not provided")
+def test_dxf(tmp_path):
+    write_vector(tmp_path / "plan.dxf", streets()[0], crs=None)
+    read = read_lines(tmp_path / "plan.dxf")
+    assert len(read.lines) == len(streets()[0])
+    assert read.crs is None
+
+
+@pytest.mark.parametrize("name", ["map.ZIP", "map.shp.zip", "map.zip"])
+def test_archives(tmp_path, name):
+    import zipfile
+
+    (tmp_path / "deep").mkdir()
+    write_streets(tmp_path / "deep" / "streets.shp")
+    with zipfile.ZipFile(tmp_path / name, "w") as archive:
+        for file in (tmp_path / "deep").iterdir():
+            archive.write(file, f"a/b/{file.name}")
+    assert len(read_lines(tmp_path / name).lines) == len(streets()[0])
+
+
+@pytest.mark.parametrize("suffix", [".geojson", ".shp", ".csv"])
+def test_text_that_is_not_in_the_encoding_that_a_file_names(tmp_path, suffix):
+    line = LineString([(0, 0), (0.01, 0.01)])
+    if suffix == ".csv":
+        file = tmp_path / "a.csv"
+        file.write_bytes(f'WKT,highway,name\n"{line.wkt}",primary,Concei\xe7\xe3o\n'.encode("latin-1"))
+    else:
+        file = write_vector(tmp_path / f"a{suffix}", [line], highway=["primary"], name=["ConceiXXo"])
+        part = file.with_suffix(".dbf") if suffix == ".shp" else file
+        part.write_bytes(part.read_bytes().replace(b"XX", b"\xe7\xe3"))
+        if suffix == ".shp":
+            file.with_suffix(".cpg").write_text("UTF-8")
+    read = read_lines(file)
+    assert read.highway.tolist() == ["primary"]
+    assert read.name.tolist() == ["Conceição"]
+    assert read.meta["encoding"] == "Latin-1"
+
+
+def test_results_in_a_folder_are_no_roads(tmp_path, caplog):
+    from roadgeo.api import build_reference
+    from roadgeo.sources.roads import read_roads
+
+    write_streets(tmp_path / "streets.gpkg")
+    build_reference(tmp_path / "streets.gpkg", path=tmp_path / "city.gpkg")
+    write_vector(tmp_path / "a_location.gpkg", streets()[0], layer="query_roads")
+    assert list_sources(tmp_path) == [tmp_path / "streets.gpkg"]
+    assert "city.gpkg: passed over: a result or a reference of roadgeo" in caplog.text
+    assert len(read_roads(tmp_path / "city.gpkg")) > 0  # by its name
+
+
+def test_a_folder_without_roads(tmp_path):
+    write_vector(tmp_path / "a.gpkg", [LineString([(0, 0), (1, 1)])], fclass=["stream"])
+    write_vector(tmp_path / "b.gpkg", [Point(0, 0)])
+    with pytest.raises(RoadSourceError, match="none of its 2 files holds roads"):
+        list_sources(tmp_path)
+    (tmp_path / "c.gpkg").write_bytes(b"nonsense")
+    with pytest.raises(RoadSourceError, match=r"c\.gpkg: not readable"):
+        list_sources(tmp_path)

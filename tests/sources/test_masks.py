@@ -6,6 +6,7 @@ from pathlib import Path
 
 import cv2
 import numpy as np
+import PIL.Image
 import pytest
 import rasterio
 from rasterio.errors import NotGeoreferencedWarning
@@ -179,6 +180,80 @@ def test_an_inverted_mask_is_read_and_said_so(roads: np.ndarray, caplog: pytest.
     assert "inverted" in caplog.text
     values = np.ma.masked_array((~roads).astype(np.uint8), np.arange(SHAPE[1]) >= 60 + np.zeros(SHAPE))
     np.testing.assert_array_equal(read_mask(values).roads, roads & ~values.mask)
+
+
+VOC = [0, 0, 0, 128, 0, 0, *[9] * 759, 224, 224, 192]  # colours of the classes 0, 1 and 255
+
+
+def write_labels(path: Path, labels: np.ndarray, kind: str) -> Path:
+    """Write 0, 1 and 255 as tools for training do."""
+    if kind == "palette.png":
+        image = PIL.Image.fromarray(labels, "P")
+        image.putpalette(VOC)
+        image.save(path)
+    elif kind == "palette.tif":
+        profile = {"driver": "GTiff", "count": 1, "height": SHAPE[0], "width": SHAPE[1], "dtype": "uint8"}
+        with rasterio.open(path, "w", **profile, photometric="palette") as dataset:
+            dataset.write(labels, 1)
+            dataset.write_colormap(1, {i: (*VOC[3 * i : 3 * i + 3], 255) for i in range(256)})
+    elif kind == "float.tif":
+        cv2.imwrite(str(path), labels.astype(np.float32))
+    else:
+        cv2.imwrite(str(path), labels if kind == "grey.png" else np.repeat(labels[..., None], 3, axis=2))
+    return path
+
+
+@pytest.mark.parametrize("kind", ["grey.png", "colours.png", "palette.png", "palette.tif", "float.tif"])
+def test_labels_with_a_value_for_none(
+    tmp_path: Path, roads: np.ndarray, kind: str, caplog: pytest.LogCaptureFixture
+) -> None:
+    labels = roads.astype(np.uint8)
+    labels[:30, 70:] = labels[60:, :15] = 255
+    found = read_mask(write_labels(tmp_path / kind, labels, kind))
+    np.testing.assert_array_equal(found.roads, labels == 1)
+    np.testing.assert_array_equal(found.observed, labels != 255)
+    assert "holds the values 0, 1, 255: 1 is taken for road, 255 for not observed" in caplog.text
+
+
+@pytest.mark.parametrize(("dtype", "none"), [(np.int8, -1), (np.int16, -9999), (np.uint16, 65535), (np.int64, 100)])
+def test_other_values_for_no_label(roads: np.ndarray, dtype: type, none: int) -> None:
+    labels = roads.astype(dtype)
+    labels[:30, 70:] = none
+    found = read_mask(labels)
+    np.testing.assert_array_equal(found.roads, labels == 1)
+    np.testing.assert_array_equal(found.observed, labels != none)
+
+
+def test_where_255_is_the_road_1_is_noise_or_ground(roads: np.ndarray, caplog: pytest.LogCaptureFixture) -> None:
+    rng = np.random.default_rng(0)
+    noisy = np.where(roads, 255, rng.random(roads.shape) < 0.02).astype(np.uint8)
+    np.testing.assert_array_equal(read_mask(noisy).roads, roads)
+    assert "0, 1, 255: 255 is taken for road" in caplog.text
+    inside = np.where(roads, 255, 1).astype(np.uint8)
+    inside[:, :10] = 0  # what a warped image leaves in its frame
+    np.testing.assert_array_equal(read_mask(inside, voids=False).roads, inside == 255)
+
+
+def test_a_threshold_says_what_labels_are_road(roads: np.ndarray) -> None:
+    labels = roads.astype(np.uint8)
+    labels[:30, 70:] = 255
+    np.testing.assert_array_equal(read_mask(labels, threshold=0.5, voids=False).roads, labels > 0)
+
+
+def test_classes_beside_pixels_without_one_are_classes(roads: np.ndarray) -> None:
+    labels = roads.astype(np.uint8)
+    labels[40:, 50:] = 3
+    labels[:30, 70:] = 255
+    with pytest.raises(MaskError, match=r"holds the classes 0, 1, 3; expected road and no road"):
+        read_mask(labels)
+
+
+def test_a_palette_of_three_greys_is_a_soft_map(tmp_path: Path, roads: np.ndarray) -> None:
+    image = PIL.Image.fromarray(roads.astype(np.uint8), "P")
+    image.putpixel((3, 3), 2)
+    image.putpalette([10, 10, 10, 250, 250, 250, 120, 120, 120])
+    image.save(tmp_path / "grey.png")
+    np.testing.assert_array_equal(read_mask(tmp_path / "grey.png").roads, roads)
 
 
 @pytest.mark.parametrize("orientation", range(2, 9))

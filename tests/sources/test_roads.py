@@ -172,9 +172,11 @@ def test_progress_is_told(tmp_path):
     said = []
     files = write_streets(tmp_path / "a.gpkg"), write_streets(tmp_path / "b.osm.pbf")
     read_roads(files, say=lambda *step: said.append(step))
-    assert said == [("reading a.gpkg, 1 of 2",), ("reading b.osm.pbf, 2 of 2",), ("reading b.osm.pbf, 2 of 2", 1.0)]
+    assert said[:3] == [("reading a.gpkg, 1 of 2",), ("reading a.gpkg, 1 of 2", 1.0), ("reading b.osm.pbf, 2 of 2",)]
+    assert said[3:] == [("reading b.osm.pbf, 2 of 2", 0.5), ("reading b.osm.pbf, 2 of 2", 1.0)]
+    said.clear()
     read_roads(files[0], say=lambda *step: said.append(step))
-    assert said[3:] == [("reading a.gpkg",)]
+    assert said == [("reading a.gpkg",), ("reading a.gpkg", 1.0)]
 
 
 def test_lines_from_memory():

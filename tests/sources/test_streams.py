@@ -6,9 +6,8 @@ import shapely
 from worlds.fenway import streets, write_streets
 
 from roadgeo.errors import RoadSourceError
-from roadgeo.sources import streams
-from roadgeo.sources.lines import read_lines
-from roadgeo.sources.streams import stream_lines
+from roadgeo.sources import osm_files
+from roadgeo.sources.streams import read_lines, stream_lines
 
 FORMATS = ["streets.gpkg", "streets.shp", "streets.geojson", "streets.parquet", "streets.osm.gz", "streets.osm.pbf"]
 
@@ -32,7 +31,7 @@ def test_parts_together_are_the_whole(tmp_path, name):
 
 def test_nodes_of_a_large_file_are_kept_on_disk(tmp_path, monkeypatch):
     path = write_streets(tmp_path / "streets.osm.pbf")
-    monkeypatch.setattr(streams, "_NODES_IN_MEMORY", 0)
+    monkeypatch.setattr(osm_files, "_NODES_IN_MEMORY", 0)
     lines = np.concatenate([part.lines for part in stream_lines(path, most=4)])
     assert shapely.equals_exact(lines, read_lines(path).lines, 0.0).all()
 

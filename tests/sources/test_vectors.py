@@ -18,8 +18,8 @@ import shapely
 from support.loopback import counting_server
 
 from roadgeo.errors import RoadSourceError
-from roadgeo.sources.lines import read_lines
 from roadgeo.sources.overpass import read_area
+from roadgeo.sources.streams import read_lines
 from roadgeo.storage.gdal import CONSENT
 
 LINE = {"type": "LineString", "coordinates": [[11.0, 48.0], [11.1, 48.1]]}
@@ -157,7 +157,7 @@ class TestDatabases:
 class TestBombs:
     @pytest.mark.parametrize("suffix", [".gz", ".bz2"])
     def test_compressed(self, tmp_path, suffix, monkeypatch):
-        monkeypatch.setattr("roadgeo.sources.lines._UNPACKED_FREE", 1 << 20)
+        monkeypatch.setattr("roadgeo.sources.unpacking._FREE", 1 << 20)
         path = tmp_path / f"roads.osm{suffix}"
         blank = b"<osm version='0.6'>" + b" " * (20 << 20) + b"</osm>"
         path.write_bytes(gzip.compress(blank) if suffix == ".gz" else bz2.compress(blank))
@@ -182,3 +182,13 @@ def test_what_is_no_regular_file(tmp_path):
             read(tmp_path / "roads.gpkg")
         with pytest.raises(RoadSourceError, match="no regular file"):
             read(Path("/dev/zero"))
+
+
+def test_a_pipe_or_a_broken_map_is_told_of_by_the_name_that_was_given(tmp_path: Path) -> None:
+    """A link in a passing folder is what GDAL opens."""
+    (tmp_path / "roads.gml").write_text(
+        '<?xml version="1.0"?><gml:FeatureCollection xmlns:gml="http://www.opengis.net/gml">'
+    )
+    with pytest.raises(RoadSourceError) as error:
+        read_lines(tmp_path / "roads.gml")
+    assert "/roadgeo-" not in str(error.value)

@@ -5,10 +5,11 @@ import json
 import numpy as np
 import pyproj
 import pytest
+import rasterio
 
 from roadgeo.errors import CrsError
 from roadgeo.geometry.projection import to_lonlat
-from roadgeo.storage.crs import known_crs
+from roadgeo.storage.crs import known_crs, name_crs
 
 GEOGCS = (
     'GEOGCS["x",DATUM["y",SPHEROID["GRS 1980",6378137,298.257222101]{}],PRIMEM["Greenwich",0],'
@@ -71,3 +72,53 @@ def test_no_file_is_opened(way: int, file: str) -> None:
 )
 def test_what_names_no_file_is_as_pyproj_has_it(crs: str) -> None:
     assert known_crs(crs) == pyproj.CRS(crs)
+
+
+# --- words for one CRS ------------------------------------------------------------------------------------------------
+
+UTM = "EPSG:32629"
+
+
+@pytest.mark.parametrize(
+    ("given", "expected"),
+    [
+        (32629, UTM),
+        ("32629", UTM),
+        ("EPSG:32629", UTM),
+        ("epsg:32629", UTM),
+        ("urn:ogc:def:crs:EPSG::32629", UTM),
+        ("WGS 84 / UTM zone 29N", UTM),
+        ("OSGB36 / British National Grid", "EPSG:27700"),
+        (pyproj.CRS(32629), UTM),
+        (pyproj.CRS(32629).to_wkt("WKT1_GDAL"), UTM),
+        (pyproj.CRS(32629).to_json(), UTM),
+        ("EPSG:4979", "EPSG:4326"),
+    ],
+)
+def test_one_crs_in_many_words(given: object, expected: str) -> None:
+    assert name_crs(given) == expected
+
+
+@pytest.mark.parametrize("given", ["ESRI:102003", "+proj=laea +lat_0=41 +lon_0=-8", "EPSG:7415"])
+def test_what_has_no_code_is_wkt_that_gdal_reads_too(given: str) -> None:
+    told = name_crs(given)
+    assert rasterio.CRS.from_user_input(told).to_wkt()
+    assert pyproj.CRS(told).equals(pyproj.CRS(given).to_2d(), ignore_axis_order=True)
+
+
+@pytest.mark.parametrize(
+    ("given", "message"),
+    [
+        ("nonsense", "'nonsense' is no CRS that PROJ knows; expected for example EPSG:3857, 3857, a name such as"),
+        ("EPSG:999999", "no CRS that PROJ knows"),
+        (999999, "no CRS that PROJ knows"),
+        ("", "no CRS that PROJ knows"),
+        ("EPSG:4978", "no CRS of places on Earth, but Geocentric CRS"),
+        ("EPSG:5701", "no CRS of places on Earth, but Vertical CRS"),
+        ('ENGCRS["a sheet",EDATUM["it"],CS[Cartesian,2],AXIS["x",east],AXIS["y",north],UNIT["m",1]]', "no CRS of"),
+    ],
+)
+def test_what_is_no_crs_is_said(given: object, message: str) -> None:
+    with pytest.raises(CrsError, match=message) as raised:
+        name_crs(given)
+    assert "\n" not in str(raised.value)

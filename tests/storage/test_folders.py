@@ -57,6 +57,17 @@ class TestPrivateTemporaryDir:
         assert folder != taken
         assert folder.stat().st_mode & 0o777 == 0o700
 
+    def test_a_file_in_its_place_is_no_fault(self, temporary: Path) -> None:
+        """Another user may have put it there; the next name is taken, and found again."""
+        (temporary / f"roadgeo-{os.getuid()}").touch()
+        folder = private_temporary_dir()
+        assert folder == private_temporary_dir() == temporary / f"roadgeo-{os.getuid()}-1"
+
+    def test_where_all_names_are_taken_another_is_made(self, temporary: Path) -> None:
+        for ending in ["", *(f"-{n}" for n in range(1, 16))]:
+            (temporary / f"roadgeo-{os.getuid()}{ending}").touch()
+        assert private_temporary_dir().stat().st_mode & 0o777 == 0o700
+
     def test_a_link_is_not_followed(self, temporary: Path) -> None:
         (temporary / "elsewhere").mkdir(mode=0o700)
         (temporary / f"roadgeo-{os.getuid()}").symlink_to(temporary / "elsewhere")

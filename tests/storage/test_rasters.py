@@ -18,12 +18,12 @@ import rasterio.control
 from support.loopback import counting_server
 from worlds.turned import mark_turned, save_turned
 
-from roadgeo.errors import MaskError
+from roadgeo.errors import MaskError, OutputError
 from roadgeo.outputs.orthophoto import read_preview
 from roadgeo.sources.exif import read_focal_length
 from roadgeo.sources.masks import read_mask
 from roadgeo.storage.gdal import CONSENT, skip_drivers
-from roadgeo.storage.rasters import image_size, open_raster, raster_size
+from roadgeo.storage.rasters import image_size, open_raster, raster_size, writing_raster
 
 pytestmark = pytest.mark.filterwarnings("ignore::rasterio.errors.NotGeoreferencedWarning")
 
@@ -397,3 +397,26 @@ def test_what_is_too_large_to_be_turned_is_said(tmp_path: Path, monkeypatch: pyt
     told = r"its orientation is 8.* too large for that.*: save it upright"
     with pytest.raises(MaskError, match=told), open_raster(path):
         pass
+
+
+# --- what may be behind an error -------------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize(
+    ("reason", "free", "doubt"),
+    [
+        ("The WKT could not be parsed. OGR Error code 5", 1 << 40, ""),
+        ("TIFFAppendToStrip:Write error at scanline 3", 1 << 40, "is the disk full?"),
+        ("Compression failed", 1 << 20, "the disk is full: 1 MB are left"),
+        ("band 1: IReadBlock failed at X offset 0", 1 << 40, "is the picture damaged?"),
+        ("Cannot find proj.db", 1 << 40, "PROJ's data are missing: unset PROJ_DATA and PROJ_LIB"),
+    ],
+)
+def test_a_cause_is_named_where_something_speaks_for_it(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, reason: str, free: int, doubt: str
+) -> None:
+    monkeypatch.setattr("shutil.disk_usage", lambda _: shutil._ntuple_diskusage(1 << 41, 0, free))
+    with pytest.raises(OutputError) as raised, writing_raster(tmp_path / "a.tif"):
+        raise rasterio.errors.RasterioError(reason)
+    told = str(raised.value)
+    assert f"{reason}; {doubt}" in told if doubt else told.endswith(reason)

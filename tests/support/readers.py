@@ -16,6 +16,7 @@ from typing import NamedTuple
 
 import click
 import numpy as np
+import pyproj
 import shapely
 
 from roadgeo.cli.parameters import ASPECT, BOX, CAMERA, NEAR, RANGE
@@ -23,7 +24,7 @@ from roadgeo.cli.track import Moment
 from roadgeo.cli.truths import read_truths
 from roadgeo.errors import RoadgeoError
 from roadgeo.evaluation.truth import read_truth
-from roadgeo.geometry.projection import LocalPlane
+from roadgeo.geometry.projection import LocalPlane, serves_as_plane, to_lonlat
 from roadgeo.reference.index_file import read_index
 from roadgeo.reference.network_file import read_network
 from roadgeo.reference.shards import describe_shards, open_shards
@@ -35,6 +36,7 @@ from roadgeo.sources import vectors
 from roadgeo.sources.elevation import ground_heights
 from roadgeo.sources.exif import estimate_gsd, read_focal_length
 from roadgeo.sources.georeference import read_georeference, read_stated_middle
+from roadgeo.sources.lines import crs_name
 from roadgeo.sources.masks import read_mask
 from roadgeo.sources.overpass import FetchOptions, fetch_lines, find_place
 from roadgeo.sources.roads import read_roads
@@ -146,6 +148,15 @@ def read_frames(path: Path) -> None:
         list(islice(_video(str(path), FrameOptions(), stack), 3))
 
 
+def read_crs(path: Path) -> None:
+    """Read a CRS and go to degrees, as it is done with one out of any file."""
+    with contextlib.suppress(pyproj.exceptions.ProjError):
+        name = crs_name(path.read_bytes().decode("utf-8", "replace").replace("\0", ""))
+        if name is not None:
+            to_lonlat(name, np.array([[5e5, 4.5e6], [-8.6, 41.1]]))
+            serves_as_plane(name, np.array([[-8.6, 41.1]]))
+
+
 # --- documents --------------------------------------------------------------------------------------------------------
 
 
@@ -227,7 +238,7 @@ def read_nominatim(path: Path) -> None:
 
 def read_map(path: Path) -> None:
     """Read roads onto a plane."""
-    read_roads(path, which="all", crs="EPSG:4326" if path.suffix == ".csv" else None)
+    read_roads(path, which="all", crs="EPSG:4326" if path.suffix in (".csv", ".dxf") else None)
 
 
 def read_in_parts(path: Path) -> None:
@@ -237,6 +248,10 @@ def read_in_parts(path: Path) -> None:
 
 def read_shapes(path: Path) -> None:
     read_roads(path.with_suffix(".shp"), crs="EPSG:32629")
+
+
+def read_prj(path: Path) -> None:
+    read_roads(path.with_suffix(".shp"))
 
 
 _SHAPES = ("roads.shp", "roads.shx", "roads.dbf")
@@ -260,6 +275,7 @@ READERS = {
     "index": Reader(read_index, "a.index"),
     "reference": Reader(read_network, "a.gpkg"),
     "shards": Reader(read_shards, "manifest.json"),
+    "crs": Reader(read_crs, "crs.txt"),
     "truth": Reader(read_truth, "truth.csv"),
     "truth_crs": Reader(read_truth_beside, "meta.json", ("local.csv",)),
     "location": Reader(apply, "mask_location.json", ("mask.png",)),
@@ -273,6 +289,9 @@ READERS = {
     "parts": Reader(read_in_parts, "roads.geojson"),
     "geojsonl": Reader(read_map, "roads.geojsonl"),
     "csv": Reader(read_map, "roads.csv"),
+    "dxf": Reader(read_map, "roads.dxf"),
+    "zip": Reader(read_map, "roads.zip"),
+    "osm_json": Reader(read_map, "roads.json"),
     "gml": Reader(read_map, "roads.gml"),
     "kml": Reader(read_map, "roads.kml"),
     "gpx": Reader(read_map, "roads.gpx"),
@@ -288,6 +307,7 @@ READERS = {
     "graphml": Reader(read_map, "roads.graphml"),
     "parquet": Reader(read_map, "roads.parquet"),
     "shp": Reader(read_shapes, "roads.shp", _SHAPES),
+    "prj": Reader(read_prj, "roads.prj", _SHAPES),
     "shx": Reader(read_shapes, "roads.shx", _SHAPES),
     "dbf": Reader(read_shapes, "roads.dbf", _SHAPES),
 }

@@ -25,7 +25,7 @@ def weigh(values: Floats2, factor: float, double: bool, power: int) -> float:
     return total * factor * (2.0 if double else 1.0)
 
 
-@kernel()
+@kernel(writes=("out",))
 def walk(line: Line, out: Floats1) -> None:
     """Fill in where steps lead."""
     at = line.start

@@ -74,7 +74,7 @@ def serve_request(content: bytes) -> bytes:
 async def _serve(content: bytes) -> bytes:
     wire = _Wire()
     with TemporaryDirectory() as folder:
-        service = Service(_WORKERS, ["town"], _LIMITS, Path(folder))  # type: ignore[arg-type]
+        service = Service(_WORKERS, [SimpleNamespace(name="town")], _LIMITS, Path(folder))  # type: ignore[arg-type, list-item]
         config = uvicorn.Config(service.app, ws="none", lifespan="off", log_config=None)
         connection = protocol_of(_LIMITS)(config, ServerState(), {})
         connection.connection_made(wire)

@@ -74,7 +74,7 @@ def read_points(path: str | Path) -> tuple[str, list[Match]]:
             Match(float(r["sourceX"]), -float(r["sourceY"]), float(r["mapX"]), float(r["mapY"]), r["enable"] != "0")
             for r in rows
         ]
-    except (KeyError, TypeError, ValueError) as error:
+    except (KeyError, TypeError, ValueError, csv.Error) as error:
         raise ValueError(f"{path} is no file of control points: expected the columns {_COLUMNS}") from error
     if not all(math.isfinite(v) for one in matches for v in (one.column, one.row, one.x, one.y)):
         raise ValueError(f"{path} holds a control point that is no number")

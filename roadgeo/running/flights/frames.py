@@ -23,6 +23,7 @@ from roadgeo.running.flights.motion import Odometer, between_images
 from roadgeo.running.flights.tracker import FlightFrame
 from roadgeo.running.tasks import find_masks
 from roadgeo.sources.masks import read_mask
+from roadgeo.storage.atomic import writing
 
 __all__ = ["VIDEOS", "FrameOptions", "read_frames", "read_stills"]
 
@@ -149,7 +150,8 @@ def _video(path: str, options: FrameOptions, stack: ExitStack) -> Iterator[_Imag
         if not good:
             continue
         target = str(Path(folder) / "frame.png")
-        cv2.imwrite(target, picture)
+        with writing(target):  # OpenCV would not tell of a full disk
+            Path(target).write_bytes(cv2.imencode(".png", picture)[1].tobytes())
         taken += 1
         yield _Image(target, f"{Path(path).stem}_{k:06d}", k / rate)
     if not taken:

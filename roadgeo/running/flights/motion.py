@@ -78,7 +78,7 @@ def read_motion(path: str | os.PathLike[str]) -> dict[str, FloatArray]:
     try:
         rows = list(csv.DictReader(io.StringIO(text)))
         found = {row["frame"]: np.array([float(row[name]) for name in _COLUMNS]).reshape(3, 3) for row in rows}
-    except (KeyError, ValueError, TypeError) as error:
+    except (KeyError, ValueError, TypeError, csv.Error) as error:
         raise RoadSourceError(
             f"{path} is no table of motions ({type(error).__name__}: {error}); expected the columns frame, h00 ... h22"
         ) from error

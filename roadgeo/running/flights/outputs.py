@@ -14,6 +14,7 @@ from typing import Any
 import numpy as np
 
 from roadgeo import __version__
+from roadgeo.outputs.names import table_cell
 from roadgeo.running.flights.rows import Row
 from roadgeo.storage.files import write_text
 from roadgeo.storage.geopackage import Layer, write_layers
@@ -44,7 +45,7 @@ def to_csv(rows: Sequence[Row]) -> str:
         table.writerow(
             [
                 row.number,
-                row.name,
+                table_cell(row.name),
                 f"{row.time_s:.3f}",
                 stamp,
                 row.status,
@@ -53,7 +54,7 @@ def to_csv(rows: Sequence[Row]) -> str:
                 *told,
                 *_sensor(row),
                 row.known_at,
-                row.reason,
+                table_cell(row.reason),
             ]
         )
     return text.getvalue()

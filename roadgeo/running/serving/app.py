@@ -7,7 +7,7 @@ import json
 import logging
 import shutil
 import time
-from collections.abc import AsyncGenerator, AsyncIterator, Awaitable, Callable
+from collections.abc import AsyncGenerator, AsyncIterator, Awaitable, Callable, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from contextlib import suppress
 from functools import partial
@@ -20,14 +20,16 @@ from starlette.exceptions import HTTPException
 from starlette.formparsers import MultiPartException, MultiPartParser
 from starlette.middleware import Middleware
 from starlette.requests import Request
-from starlette.responses import JSONResponse, Response, StreamingResponse
+from starlette.responses import FileResponse, HTMLResponse, JSONResponse, Response, StreamingResponse
 from starlette.routing import Route
 
 from roadgeo import __version__
-from roadgeo.running.serving.documents import DOCUMENTS, documents_of
-from roadgeo.running.serving.guard import Guard, refusal, require_body
+from roadgeo.reference.reference import AnyReference
+from roadgeo.running.serving.documents import documents_of
+from roadgeo.running.serving.guard import COOKIE, Guard, is_same, pass_of, refusal, require_body
 from roadgeo.running.serving.jobs import Job, Jobs
 from roadgeo.running.serving.options import ServeOptions
+from roadgeo.running.serving.page import page_file, page_text, policy_of
 from roadgeo.running.serving.requests import (
     LIMIT,
     Refused,
@@ -36,6 +38,8 @@ from roadgeo.running.serving.requests import (
     read_query_string,
     read_texts,
 )
+from roadgeo.running.serving.tiles import MAX_ZOOM, Tiles
+from roadgeo.running.serving.view import OFFERED, PICTURE, VIEW, WARPED, safe_stem
 from roadgeo.running.serving.workers import Answer, Asked, Place, Workers
 
 __all__ = ["Service"]
@@ -43,6 +47,12 @@ __all__ = ["Service"]
 _LOG = logging.getLogger(__name__)
 
 _CHUNK = 1 << 16
+#: A file of an answer may take so long to be made; a token is no longer.
+_WRITE_S, _MOST_TOKEN = 60.0, 4096
+
+#: What never changes under its address, and what changes with roadgeo itself.
+_FOR_EVER = {"Cache-Control": "private, max-age=86400, immutable"}
+_AS_IT_IS = {"Cache-Control": "no-cache"}
 
 #: Hears of each place that is found: of its document, and when its request came.
 Told = Callable[[dict[str, Any], float], None]
@@ -58,15 +68,22 @@ class Service:
     """
 
     def __init__(
-        self, workers: Workers, references: list[str], options: ServeOptions, folder: Path, told: Told | None = None
+        self,
+        workers: Workers,
+        references: Sequence[AnyReference],
+        options: ServeOptions,
+        folder: Path,
+        told: Told | None = None,
     ) -> None:
         """Make the routes; images, and answers that are kept, lie in `folder`."""
         self._workers, self._options, self._told = workers, options, told
-        self._jobs, self._folder = Jobs(folder, options), folder
+        self._jobs, self._tiles = Jobs(folder, options), Tiles(references)
         self._threads = ThreadPoolExecutor(options.workers + options.waiting + 4)
+        self._drawing = ThreadPoolExecutor(1)  # whatever maps are looked at, the rest of the machine searches
+        self._documents, self._policy = documents_of([one.name for one in references]), policy_of(options)
         self._tasks: set[asyncio.Task[None]] = set()
         self.app = Starlette(
-            routes=[*_documents(references), *self._routes()],
+            routes=[*self._routes(), *_document_routes(self._documents)],
             middleware=[Middleware(Guard, options=options)],
             exception_handlers={HTTPException: _no_route},
         )
@@ -74,6 +91,11 @@ class Service:
     def _routes(self) -> list[Route]:
         job = "/jobs/{job}"
         return [
+            Route("/", self._landing),
+            Route("/page/{name}", self._page),
+            Route("/session", self._open_session, methods=["POST"]),
+            Route("/references", self._references),
+            Route("/tiles/{reference:int}/{zoom:int}/{column:int}/{row:int}.mvt", self._tile),
             Route("/health", self._health),
             Route("/locate", self._locate, methods=["POST"]),
             Route("/processes/locate/execution", self._execute, methods=["POST"]),
@@ -81,6 +103,10 @@ class Service:
             Route(job, self._dismiss, methods=["DELETE"]),
             Route(f"{job}/results", self._results),
             Route(f"{job}/events", self._events),
+            Route(f"{job}/again", self._again, methods=["POST"]),
+            Route(f"{job}/files", self._files),
+            Route(f"{job}/files/{{name}}", self._file),
+            *(Route(f"{job}/{name}", self._shown) for name in (PICTURE, WARPED, VIEW)),
         ]
 
     # --- what is asked ------------------------------------------------------------------------------------------------
@@ -178,11 +204,11 @@ class Service:
 
     # --- how it is located --------------------------------------------------------------------------------------------
 
-    async def _ask(self, job: Job, came: float, tells: bool = False) -> Answer:
+    async def _ask(self, job: Job, came: float, keeps: bool = False) -> Answer:
         """Have a process locate an image, and tell others of its place."""
         loop, hints = asyncio.get_running_loop(), dict(job.hints)
         limit = min(hints.pop(LIMIT, self._options.time_limit_s), self._options.time_limit_s)
-        asked = Asked(str(job.path), hints, limit, self._options.max_pixels, job.name, tells)
+        asked = Asked(str(job.path), hints, limit, self._options.max_pixels, job.name, keeps)
 
         def say(text: str, share: float | None = None) -> None:
             with suppress(RuntimeError):  # the loop has ended
@@ -206,7 +232,7 @@ class Service:
 
         async def work() -> None:
             try:
-                job.end(await self._ask(job, came, tells=True))
+                job.end(await self._ask(job, came, keeps=True))
             except Exception:
                 _LOG.exception("a fault of the server at a job")
                 job.end(Answer(500, {"detail": "a fault of roadgeo: its log tells which"}))
@@ -251,21 +277,125 @@ class Service:
 
         return StreamingResponse(tell(), headers={"Cache-Control": "no-store"}, media_type="text/event-stream")
 
+    async def _again(self, request: Request) -> Response:
+        """Search for an image again, with other hints, as another job."""
+        old, came = self._find(request), time.time()
+        hints = read_query_string(request.url.query)
+        place, folder = self._workers.take_place(), self._make_folder()
+        try:
+            await asyncio.to_thread(_link, old.path, folder / old.image)
+        except OSError as error:
+            place.give_back()
+            shutil.rmtree(folder, ignore_errors=True)
+            raise Refused(503, f"the image cannot be kept: {error.strerror or error}; come again", 1) from error
+        job = Job(folder, old.image, old.name, hints)
+        self._start(job, place, came)
+        return _created(job)
+
+    async def _shown(self, request: Request) -> Response:
+        """Return what the page shows of an answer."""
+        job, name = self._find(request), request.url.path.rpartition("/")[2]
+        path = job.folder / name
+        if job.status != "successful" or not path.is_file():
+            raise Refused(404, f"the job is {job.status}: there is nothing to show")
+        return FileResponse(path, headers=_FOR_EVER)
+
+    async def _files(self, request: Request) -> Response:
+        """List the files that may be had of an answer."""
+        job = self._find(request)
+        document = job.answer.document if job.answer is not None and job.status == "successful" else {}
+        located, camera = document.get("status") == "located", document.get("camera") is not None
+        offered = [
+            {"name": one.name, "summary": one.summary, "href": f"/jobs/{job.id}/files/{one.name}"}
+            for one in OFFERED.values()
+            if document and (located or not one.needs_place) and (camera or not one.needs_camera)
+        ]
+        return JSONResponse({"files": offered})
+
+    async def _file(self, request: Request) -> Response:
+        """Return one of them, made when it is first asked for."""
+        job, name = self._find(request), request.path_params["name"]
+        if name not in OFFERED or job.status != "successful":
+            raise Refused(404, f"there is no such file; {', '.join(OFFERED)} may be had of what was located")
+        asked = Asked(str(job.path), {}, _WRITE_S, self._options.max_pixels, wanted=name)
+        with self._workers.take_place():
+            ask = partial(self._workers.ask, asked)
+            answer = await asyncio.get_running_loop().run_in_executor(self._threads, ask)
+        if answer.status >= 400:
+            return _said(answer, dict)
+        path = job.folder / answer.document["file"]
+        return FileResponse(path, media_type="application/octet-stream", filename=path.name)
+
+    # --- the page -----------------------------------------------------------------------------------------------------
+
+    async def _landing(self, request: Request) -> Response:
+        """Return the page to people, to programs what it is."""
+        if "text/html" not in request.headers.get("accept", ""):
+            return JSONResponse(self._documents["/"])
+        return HTMLResponse(page_text("index.html"), headers={"Content-Security-Policy": self._policy, **_AS_IT_IS})
+
+    async def _page(self, request: Request) -> Response:
+        path = page_file(request.path_params["name"])
+        if path is None:
+            raise Refused(404, "there is nothing of that name; begin at /")
+        kind = {".mjs": "text/javascript", ".js": "text/javascript"}.get(path.suffix)
+        return FileResponse(path, media_type=kind, headers={"Content-Security-Policy": self._policy, **_AS_IT_IS})
+
+    async def _open_session(self, request: Request) -> Response:
+        """Give a browser a pass for the token that its user typed, once."""
+        body = bytearray()
+        async for chunk in request.stream():
+            body += chunk
+            if len(body) > _MOST_TOKEN:
+                raise Refused(413, "expected a token")
+        given = body.decode("utf-8", "replace").strip()
+        if self._options.token and not is_same(given, self._options.token):
+            raise Refused(401, "this is not the token")
+        response = JSONResponse({"status": "ok"})
+        if self._options.token:
+            response.set_cookie(COOKIE, pass_of(self._options.token), httponly=True, samesite="strict")
+        return response
+
+    async def _references(self, _: Request) -> Response:
+        loop = asyncio.get_running_loop()
+        told = await loop.run_in_executor(self._drawing, self._tiles.describe)
+        limits = {"max_bytes": self._options.max_bytes, "kept": self._options.kept_jobs}
+        shown = {"references": told, "max_zoom": MAX_ZOOM, "basemap": self._options.basemap}
+        return JSONResponse({**shown, "basemap_attribution": self._options.basemap_attribution, **limits})
+
+    async def _tile(self, request: Request) -> Response:
+        """Return the roads of a map as a vector tile."""
+        asked = request.path_params
+        where = (asked["reference"], asked["zoom"], asked["column"], asked["row"])
+        try:
+            tile = await asyncio.get_running_loop().run_in_executor(self._drawing, self._tiles.tile, *where)
+        except KeyError as error:
+            raise Refused(404, "there is no such tile") from error
+        headers = {"Cache-Control": "private, max-age=3600"}
+        return Response(tile, media_type="application/vnd.mapbox-vector-tile", headers=headers)
+
     def close(self) -> None:
         """Wait for nobody any more."""
-        self._threads.shutdown(wait=False, cancel_futures=True)
+        for pool in (self._threads, self._drawing):
+            pool.shutdown(wait=False, cancel_futures=True)
 
 
-def _documents(references: list[str]) -> list[Route]:
-    documents = documents_of(references)
-
+def _document_routes(documents: dict[str, dict[str, Any]]) -> list[Route]:
     def route(path: str) -> Route:
         async def answer(_: Request) -> Response:
             return JSONResponse(documents[path])
 
         return Route(path, answer)
 
-    return [route(path) for path in DOCUMENTS]
+    return [route(path) for path in documents if path != "/"]
+
+
+def _link(old: Path, new: Path) -> None:
+    """Have an image lie in another folder, too."""
+    try:
+        new.hardlink_to(old)
+    except OSError:  # of file systems that know none
+        shutil.copyfile(old, new)
 
 
 async def _keep_body(request: Request, folder: Path) -> Path:
@@ -281,7 +411,7 @@ def _job_of(folder: Path, part: Path, name: str, hints: dict[str, Any]) -> Job:
     """Return the job of an image that has come, under a name that says what it is."""
     with part.open("rb") as file:
         ending = ending_of(file.read(16))
-    image = part.rename(folder / f"image{ending}")
+    image = part.rename(folder / f"{safe_stem(name)}{ending}")
     return Job(folder, image.name, Path(name.replace("\\", "/")).name[:200], hints)
 
 

@@ -23,7 +23,7 @@ from roadgeo.running.serving.protocol import MAX_HEAD_BYTES
 from roadgeo.running.serving.requests import Refused
 from roadgeo.running.serving.workers import Full
 
-__all__ = ["COOKIE", "Guard", "refusal", "require_body"]
+__all__ = ["COOKIE", "Guard", "is_same", "pass_of", "refusal", "require_body"]
 
 _LOG = logging.getLogger(__name__)
 
@@ -126,7 +126,7 @@ class Guard:
         """Refuse who may not ask."""
         headers = Headers(scope=scope)
         if self._options.token:
-            if not is_open(scope["path"]) and not self._shows_token(headers):
+            if not is_open(scope["path"], headers) and not self._shows_token(headers):
                 raise Refused(401, "expected the header Authorization: Bearer TOKEN")
         # Other names may be tricks of a page in a browser.
         elif _host_of("//" + headers.get("host", "localhost")) not in LOOPBACK:
@@ -137,13 +137,13 @@ class Guard:
 
     def _shows_token(self, headers: Headers) -> bool:
         shown = headers.get("authorization", "")
-        if shown[:7].lower() == "bearer " and _same(shown[7:].strip(), self._options.token):
+        if shown[:7].lower() == "bearer " and is_same(shown[7:].strip(), self._options.token):
             return True
         try:
             cookie = SimpleCookie(headers.get("cookie", "")).get(COOKIE)
         except CookieError:
             return False
-        return cookie is not None and _same(cookie.value, pass_of(self._options.token))
+        return cookie is not None and is_same(cookie.value, pass_of(self._options.token))
 
     def _is_own(self, origin: str, host: str) -> bool:
         """Whether a page is one of ours: those of this machine, and with a token those of this server's own name."""
@@ -151,9 +151,10 @@ class Guard:
         return name in LOOPBACK or (bool(self._options.token) and name is not None and name == _host_of("//" + host))
 
 
-def is_open(path: str) -> bool:
-    """Whether a path is answered without a token: what tells nothing of anybody."""
-    return path in ("/health", "/session") or path.startswith("/page/")
+def is_open(path: str, headers: Headers) -> bool:
+    """Whether a path is answered without a token: what tells nothing of anybody, and the page, which asks for it."""
+    is_page = path == "/" and "text/html" in headers.get("accept", "")
+    return is_page or path in ("/health", "/session") or path.startswith("/page/")
 
 
 def pass_of(token: str) -> str:
@@ -161,7 +162,7 @@ def pass_of(token: str) -> str:
     return hmac.new(token.encode(), b"roadgeo serve", hashlib.sha256).hexdigest()
 
 
-def _same(shown: str, secret: str) -> bool:
+def is_same(shown: str, secret: str) -> bool:
     """Compare in a time that does not tell how much is right; headers come as Latin-1, whatever was meant."""
     given = shown.encode("latin-1", "replace")
     return hmac.compare_digest(given, secret.encode()) or hmac.compare_digest(shown.encode(), secret.encode())

@@ -31,6 +31,8 @@ class ServeOptions:
         Open at once.
     kept_jobs, kept_bytes : int
         Answers that are kept for who asked not to wait, and what they may take on disk.
+    basemap, basemap_attribution : str
+        Address of the tiles of a map that the page shows below the roads, with {z}, {x} and {y}; "" for none.
     """
 
     host: str = "127.0.0.1"
@@ -47,3 +49,5 @@ class ServeOptions:
     connections: int = 64
     kept_jobs: int = 20
     kept_bytes: int = 2_000_000_000
+    basemap: str = ""
+    basemap_attribution: str = ""

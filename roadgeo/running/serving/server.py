@@ -8,12 +8,14 @@ from __future__ import annotations
 
 import asyncio
 import socket
+from collections.abc import Sequence
 from pathlib import Path
 from tempfile import TemporaryDirectory
 
 import uvicorn
 
 from roadgeo import __version__
+from roadgeo.reference.reference import AnyReference
 from roadgeo.running.serving.app import Service, Told
 from roadgeo.running.serving.options import ServeOptions
 from roadgeo.running.serving.protocol import MAX_HEAD_BYTES, protocol_of
@@ -35,7 +37,7 @@ class Server:
     """
 
     def __init__(
-        self, workers: Workers, references: list[str], options: ServeOptions, told: Told | None = None
+        self, workers: Workers, references: Sequence[AnyReference], options: ServeOptions, told: Told | None = None
     ) -> None:
         """Listen; `told` hears of each place that is found: of its document, and when its request came.
 

@@ -9,7 +9,9 @@ from __future__ import annotations
 import logging
 import multiprocessing
 import queue
+import shutil
 import signal
+import tempfile
 import threading
 import time
 from collections.abc import Sequence
@@ -28,6 +30,8 @@ _LOG = logging.getLogger(__name__)
 
 #: A process that has not answered so long after its time limit is ended.
 _GRACE_S = 15.0
+#: Where progress is told, and who waits may call it off, it may take so much longer: a busy machine is no fault.
+_PATIENT_S = 90.0
 #: So long it may open its references.
 _START_S = 120.0
 #: So often it is looked whether somebody still waits.
@@ -52,8 +56,10 @@ class Asked:
         `near`, `within`, `gsd_m`, `max_tilt_deg`, `focal_px`, `north_up`, as far as they are known.
     name : str
         What the answer calls it.
-    tells : bool
-        Whether progress is told.
+    keeps : bool
+        Whether progress is told, and what the page shows is kept beside the file (see `view`).
+    wanted : str
+        The name of an output of an answer that was kept so, which is asked for instead of a place.
     """
 
     path: str
@@ -61,7 +67,8 @@ class Asked:
     time_limit_s: float
     max_pixels: int
     name: str = ""
-    tells: bool = False
+    keeps: bool = False
+    wanted: str = ""
 
 
 @dataclass(frozen=True)
@@ -242,7 +249,7 @@ class _Worker:
         if why := self._open():
             return Answer(503, {"detail": why})
         self._pipe.send(asked)
-        patience_s = asked.time_limit_s + _GRACE_S
+        patience_s = asked.time_limit_s + (_PATIENT_S if asked.keeps else _GRACE_S)
         until = time.monotonic() + patience_s
         while time.monotonic() < until:
             if called_off.is_set():
@@ -278,7 +285,8 @@ class _Worker:
 def _serve(pipe: Connection, names: list[str]) -> None:
     """Answer until the pipe is closed."""
     signal.signal(signal.SIGINT, signal.SIG_IGN)
-    end_with_parent()
+    folders: set[Path] = set()
+    end_with_parent(lambda: _remove_all(folders))
     import cv2
 
     from roadgeo.errors import RoadgeoError
@@ -296,46 +304,39 @@ def _serve(pipe: Connection, names: list[str]) -> None:
     try:
         while True:
             asked: Asked = pipe.recv()
-            say = partial(_tell, pipe) if asked.tells else say_nothing
-            pipe.send(_locate(asked, references, say))
+            folders.update(_folder_of(asked.path))
+            say = partial(_tell, pipe) if asked.keeps else say_nothing
+            pipe.send(_answer(asked, references, say))
     except (EOFError, OSError):
         return
+
+
+def _folder_of(path: str) -> list[Path]:
+    """Return the temporary folder of the server in which a file lies, if it is one."""
+    return [
+        folder
+        for folder in Path(path).parents
+        if folder.parent == Path(tempfile.gettempdir()) and folder.name.startswith("roadgeo-")
+    ]
+
+
+def _remove_all(folders: set[Path]) -> None:
+    """Remove the images that a server which was killed has left."""
+    for folder in folders:
+        shutil.rmtree(folder, ignore_errors=True)
 
 
 def _tell(pipe: Connection, text: str, share: float | None = None) -> None:
     pipe.send(Told(text, share))
 
 
-def _locate(asked: Asked, references: Sequence[Any], say: Say = say_nothing) -> Answer:
-    from dataclasses import replace
-
-    from roadgeo.errors import MaskError, ModelError, RoadgeoError
-    from roadgeo.running.queries import locate_query
-    from roadgeo.workflows import LocateOptions, locate
-
-    def search(*asked_of: Any) -> Any:
-        say("searching the map")
-        return locate(*asked_of)
-
-    def tell(text: str, share: float | None = None) -> None:
-        say(_without(asked.path, text), share)
+def _answer(asked: Asked, references: Sequence[Any], say: Say = say_nothing) -> Answer:
+    """Do what is asked; the one place where what goes wrong with an image is caught."""
+    from roadgeo.errors import MaskError, ModelError, OutputError, RoadgeoError
 
     try:
-        width, height = _size(asked.path)
-        if width * height > asked.max_pixels:
-            told = f"{width} x {height} pixels, expected at most {asked.max_pixels:,} in all: reduce it"
-            return Answer(413, {"detail": told})
-        default = LocateOptions()
-        hints = dict(asked.hints)
-        near, within = hints.pop("near", None), hints.pop("within", None)
-        match = replace(default.match, camera=replace(default.match.camera, **hints), within=within)
-        limits = replace(default.search, time_limit_s=asked.time_limit_s)
-        options = replace(default, near=near, match=match, search=limits)
-        say("reading the image")
-        sighting = locate_query(asked.path, references, options, how=search, say=tell)
-        location = replace(sighting.location, query=asked.name)
-        return Answer(200, location.to_dict())
-    except MaskError as error:
+        return _write(asked, references) if asked.wanted else _locate(asked, references, say)
+    except (MaskError, OutputError) as error:
         return Answer(422, {"detail": _without(asked.path, str(error))})
     except ModelError as error:  # the image is a photograph, and none are read here
         return Answer(415, {"detail": _without(asked.path, str(error))})
@@ -346,6 +347,46 @@ def _locate(asked: Asked, references: Sequence[Any], say: Say = say_nothing) -> 
         return Answer(
             500, {"detail": f"a fault of roadgeo: {type(error).__name__}: {_without(asked.path, str(error))}"}
         )
+
+
+def _locate(asked: Asked, references: Sequence[Any], say: Say) -> Answer:
+    from dataclasses import replace
+
+    from roadgeo.running.queries import locate_query
+    from roadgeo.running.serving.view import write_view
+    from roadgeo.workflows import LocateOptions, locate
+
+    def search(*asked_of: Any) -> Any:
+        say("searching the map")
+        return locate(*asked_of)
+
+    def tell(text: str, share: float | None = None) -> None:
+        say(_without(asked.path, text), share)
+
+    width, height = _size(asked.path)
+    if width * height > asked.max_pixels:
+        told = f"{width} x {height} pixels, expected at most {asked.max_pixels:,} in all: reduce it"
+        return Answer(413, {"detail": told})
+    default = LocateOptions()
+    hints = dict(asked.hints)
+    near, within = hints.pop("near", None), hints.pop("within", None)
+    match = replace(default.match, camera=replace(default.match.camera, **hints), within=within)
+    limits = replace(default.search, time_limit_s=asked.time_limit_s)
+    options = replace(default, near=near, match=match, search=limits)
+    say("reading the image")
+    sighting = locate_query(asked.path, references, options, how=search, say=tell)
+    location = replace(sighting.location, query=asked.name)
+    location = replace(location, reason=_without(asked.path, location.reason))
+    if asked.keeps:
+        say("drawing the answer")
+        write_view(Path(asked.path), replace(sighting, location=location), references)
+    return Answer(200, location.to_dict())
+
+
+def _write(asked: Asked, references: Sequence[Any]) -> Answer:
+    from roadgeo.running.serving.view import write_output
+
+    return Answer(200, {"file": write_output(Path(asked.path), asked.wanted, references).name})
 
 
 def _size(path: str) -> tuple[int, int]:

@@ -126,7 +126,14 @@ def test_a_file_is_read_as_it_was_written(tmp_path):
 
 
 @pytest.mark.parametrize(
-    "text", ["", "frame,h00\na,1\n", "frame,h00,h01,h02,h10,h11,h12,h20,h21,h22\na,0,0,0,0,0,0,0,0,0\n", "\0\xff"]
+    "text",
+    [
+        "",
+        f"frame,h00\n{'x' * 200_000},1\n",
+        "frame,h00\na,1\n",
+        "frame,h00,h01,h02,h10,h11,h12,h20,h21,h22\na,0,0,0,0,0,0,0,0,0\n",
+        "\0\xff",
+    ],
 )
 def test_other_files_are_refused(tmp_path, text):
     path = tmp_path / "motion.csv"

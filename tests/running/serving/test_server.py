@@ -10,6 +10,7 @@ import threading
 import time
 from contextlib import contextmanager, suppress
 from pathlib import Path
+from types import SimpleNamespace
 
 import pytest
 
@@ -34,7 +35,7 @@ class Workers:
         return Place(self.places)
 
     def ask(self, asked, say=None, called_off=None):
-        if asked.tells:
+        if asked.keeps:
             say("finding roads", 0.5)
         while not self.busy.wait(0.02) and not called_off.is_set():
             pass
@@ -47,7 +48,7 @@ class Workers:
 
 @contextmanager
 def serving(workers=None, told=None, **options):
-    server = Server(workers or Workers(), ["town"], ServeOptions(port=0, **options), told)
+    server = Server(workers or Workers(), [SimpleNamespace(name="town")], ServeOptions(port=0, **options), told)
     thread = threading.Thread(target=server.serve_forever, daemon=True)
     thread.start()
     try:
@@ -333,6 +334,35 @@ def test_with_a_token_nobody_else_is_answered():
         assert ask(server, "POST", "/locate", PNG, right)[0].status == 200
 
 
+@pytest.mark.parametrize("coding", ["utf-8", "latin-1"])
+@pytest.mark.parametrize("scheme", ["Bearer", "bearer", "BEARER"])
+def test_tokens_may_hold_any_letters(coding, scheme):
+    with serving(token="schlüssel") as server:
+        shown = {"Authorization": f"{scheme} schlüssel".encode(coding)}
+        assert ask(server, "GET", "/processes", headers=shown)[0].status == 200
+
+
+def test_who_waits_while_the_server_ends_is_told():
+    workers, ended, answers = Workers(), threading.Event(), []
+
+    def ask_until_end(*_):
+        ended.wait(10.0)
+        return Answer(503, {"detail": "the server is ending; come again"})
+
+    workers.ask, workers.close = ask_until_end, ended.set
+    with serving(workers) as server:
+        asking = threading.Thread(target=lambda: answers.append(ask(server, "POST", "/locate", PNG)))
+        asking.start()
+        for _ in range(200):
+            if workers.places._value < 4:
+                break
+            time.sleep(0.01)
+        time.sleep(0.1)
+        server.shutdown()
+        asking.join(10.0)
+    assert [answer.status for answer, _ in answers] == [503]
+
+
 def test_it_listens_on_loopback_only():
     assert ServeOptions().host == "127.0.0.1"
     with serving() as server:
@@ -570,3 +600,99 @@ def test_other_sites_get_nothing():
         assert answer.headers["Cross-Origin-Resource-Policy"] == "same-origin"
         assert "Access-Control-Allow-Origin" not in answer.headers
         assert "frame-ancestors 'none'" in answer.headers["Content-Security-Policy"]
+
+
+# --- the page ---------------------------------------------------------------------------------------------------------
+
+HTML = {"Accept": "text/html,*/*"}
+
+
+def get(server, path, headers=None):
+    connection = http.client.HTTPConnection("127.0.0.1", server.server_port, timeout=10)
+    connection.request("GET", path, headers=headers or {})
+    answer = connection.getresponse()
+    content = answer.read()
+    connection.close()
+    return answer, content
+
+
+def test_people_get_a_page_and_programs_a_document():
+    with serving() as server:
+        answer, content = get(server, "/", HTML)
+        assert answer.headers["Content-Type"].startswith("text/html")
+        policy = answer.headers["Content-Security-Policy"]
+        assert "default-src 'none'" in policy
+        assert "unsafe" not in policy
+        assert b"<script>" not in content
+        assert b"style=" not in content
+        assert ask(server, "GET", "/")[1]["title"] == "roadgeo"
+        for name in ("page.mjs", "map.mjs", "points.mjs", "page.css", "maplibre-gl.mjs", "maplibre-gl-worker.mjs"):
+            answer, content = get(server, f"/page/{name}")
+            assert (answer.status, bool(content)) == (200, True)
+            assert answer.headers["Content-Type"].split(";")[0] in ("text/javascript", "text/css")
+
+
+@pytest.mark.parametrize("name", ["LICENSE.txt", "__init__.py", "..%2fapp.py", "%2e%2e%2fapp.py", "maplibre", ""])
+def test_nothing_else_lies_beside_the_page(name):
+    with serving() as server:
+        assert get(server, f"/page/{name}")[0].status == 404
+
+
+def test_the_page_asks_for_the_token_and_takes_it_once():
+    with serving(token="open sesame") as server:
+        assert get(server, "/", HTML)[0].status == 200
+        assert get(server, "/references", HTML)[0].status == 401
+        assert ask(server, "POST", "/session", b"guess")[0].status == 401
+        assert ask(server, "POST", "/session", b"x" * 5000)[0].status == 413
+        assert ask(server, "POST", "/session", b"open sesame", {"Origin": "https://evil.example"})[0].status == 403
+        answer, _ = ask(server, "POST", "/session", b"open sesame")
+        cookie = answer.headers["Set-Cookie"]
+        assert "HttpOnly" in cookie
+        assert "SameSite=strict" in cookie
+        shown = {"Cookie": cookie.split(";")[0]}
+        assert ask(server, "GET", "/processes", headers=shown)[0].status == 200
+        for wrong in ("roadgeo=", "roadgeo=open sesame", "roadgeo=0", "a" * 300, 'roadgeo="'):
+            assert ask(server, "GET", "/processes", headers={"Cookie": wrong})[0].status == 401
+
+
+def test_an_image_is_searched_again_with_other_hints():
+    workers = Workers()
+    with serving(workers) as server:
+        body, headers = form((b'name="image"; filename="a.png"', PNG))
+        first = ask(server, "POST", "/locate", body, {**headers, **LATER})[1]["jobID"]
+        wait_for(server, first, "successful")
+        answer, job = ask(server, "POST", f"/jobs/{first}/again?near=1,2,300", b"")
+        assert answer.status == 201
+        wait_for(server, job["jobID"], "successful")
+        assert workers.asked[-1].hints == {"near": (1.0, 2.0, 300.0)}
+        assert workers.asked[-1].name == "a.png"
+        ask(server, "DELETE", f"/jobs/{first}")
+        assert Path(workers.asked[-1].path).read_bytes() == PNG
+        assert ask(server, "POST", f"/jobs/{first}/again", b"")[0].status == 404
+        assert ask(server, "POST", f"/jobs/{job['jobID']}/again?colour=red", b"")[0].status == 400
+
+
+def test_only_files_that_are_offered_may_be_had():
+    workers = Workers()
+    with serving(workers) as server:
+        job = ask(server, "POST", "/locate", PNG, LATER)[1]["jobID"]
+        wait_for(server, job, "successful")
+        offered = [one["name"] for one in ask(server, "GET", f"/jobs/{job}/files")[1]["files"]]
+        assert {"json", "footprint", "report"} <= set(offered)
+        assert "vrt" not in offered
+        for name in ("nonesuch", "vrt", "..%2f..%2fetc%2fpasswd", "kept.pickle.gz", "image.png"):
+            assert get(server, f"/jobs/{job}/files/{name}")[0].status == 404
+        for name in ("picture.jpg", "view.json", "kept.pickle.gz"):
+            assert get(server, f"/jobs/{job}/{name}")[0].status == 404
+
+
+@pytest.mark.parametrize(
+    "name", ["../../x.png", "..\\..\\x.png", "/etc/passwd", ".htaccess", "a" * 400 + ".png", "\u202egnp.x"]
+)
+def test_names_of_senders_lead_nowhere(name):
+    workers = Workers()
+    body, headers = form((b'name="image"; filename="%b"' % name.encode(), PNG))
+    with serving(workers) as server:
+        assert ask(server, "POST", "/locate", body, headers)[0].status == 200
+        assert Path(workers.asked[0].path).parent.parent == Path(server._folder.name)
+        assert len(Path(workers.asked[0].path).name) < 60

@@ -11,6 +11,7 @@ import socket
 import struct
 import subprocess
 import sys
+import tempfile
 import threading
 import time
 import urllib.error
@@ -33,7 +34,7 @@ from roadgeo.evaluation.noise import NOISE_MODELS
 from roadgeo.evaluation.simulation import SimulationOptions, ViewOptions, simulate_query
 from roadgeo.reference.reference import Reference
 from roadgeo.running.flights.mavlink import has_pymavlink
-from roadgeo.running.serving.workers import Asked, Workers, _locate, _serve
+from roadgeo.running.serving.workers import Asked, Workers, _answer, _folder_of, _remove_all, _serve
 
 pytestmark = pytest.mark.slow
 
@@ -236,7 +237,7 @@ def test_photographs_are_refused_where_there_is_no_model_for_them(monkeypatch):
 
     monkeypatch.setattr("roadgeo.running.serving.workers._size", lambda _: (10, 10))
     monkeypatch.setattr("roadgeo.running.queries.locate_query", none)
-    answer = _locate(Asked("photo.jpg", {}, 1.0, 1000), [])
+    answer = _answer(Asked("photo.jpg", {}, 1.0, 1000), [])
     assert answer.status == 415
     assert "onnxruntime" in answer.document["detail"]
 
@@ -270,6 +271,9 @@ def test_the_command_serves_until_it_is_interrupted(place):
                 urllib.request.urlopen(address + "locate", b"no image", timeout=60)
             assert refused.value.code == 415
             refused.value.close()
+            for _ in range(30):  # more than fits into a pipe: nobody reads what is logged
+                with urllib.request.urlopen(f"{address}health?{'a' * 6000}", timeout=60) as answer:
+                    assert json.load(answer)["status"] == "ok"
         finally:
             process.send_signal(signal.SIGINT)
         assert process.wait(20) == 0
@@ -281,6 +285,19 @@ def test_the_command_serves_until_it_is_interrupted(place):
         assert asked_at - 0.1 < place["time_usec"] / 1e6 < place["heard_at"]
         assert place["time_usec"] + place["processing_time"] <= place["heard_at"] * 1e6
     assert bool(heard) == has_pymavlink()
+
+
+@pytest.mark.skipif(os.name == "nt", reason="signals of POSIX")
+def test_images_of_a_server_that_was_killed_are_removed(tmp_path, monkeypatch):
+    monkeypatch.setattr(tempfile, "tempdir", str(tmp_path))
+    images = tmp_path / "roadgeo-x" / "job"
+    images.mkdir(parents=True)
+    (images / "image.png").touch()
+    folders = set(_folder_of(str(images / "image.png")))
+    assert folders == {tmp_path / "roadgeo-x"}
+    assert not _folder_of(str(tmp_path / "mine" / "image.png"))
+    _remove_all(folders)
+    assert not list(tmp_path.iterdir())
 
 
 @pytest.mark.skipif(os.name == "nt", reason="signals of POSIX")
@@ -307,3 +324,11 @@ def test_others_may_ask_with_a_token_only(options):
     )
     assert done.returncode == 2
     assert "token" in done.stderr
+
+
+@pytest.mark.parametrize(
+    "url", ["ftp://a/{z}/{x}/{y}", "https://a.example/{z}/{x}.png", "https://a; script-src */{z}/{x}/{y}"]
+)
+def test_a_basemap_is_an_address_of_tiles(url, capsys):
+    assert main(["serve", "--basemap", url]) == 2
+    assert "{z}/{x}/{y}" in capsys.readouterr().err

@@ -1,0 +1,42 @@
+"""The page that people see: its files as they are sent, and what a browser may load beside them."""
+
+from __future__ import annotations
+
+from functools import cache
+from pathlib import Path
+from urllib.parse import urlsplit
+
+from roadgeo.running.serving.options import ServeOptions
+
+__all__ = ["page_file", "page_text", "policy_of"]
+
+_FOLDERS = (Path(__file__).parent, Path(__file__).parent / "maplibre")
+_KINDS = (".html", ".css", ".js", ".mjs")
+
+
+@cache
+def _files() -> dict[str, Path]:
+    return {path.name: path for folder in _FOLDERS for path in folder.iterdir() if path.suffix in _KINDS}
+
+
+def page_file(name: str) -> Path | None:
+    """Return a file of the page by its name; None where there is none."""
+    return _files().get(name)
+
+
+def page_text(name: str) -> str:
+    """Return a file of the page as text."""
+    return _files()[name].read_text(encoding="utf-8")
+
+
+def policy_of(options: ServeOptions) -> str:
+    """Return what the page may load: what this server sends, and the tiles of a basemap that the user named."""
+    basemap = ""
+    if options.basemap:
+        parts = urlsplit(options.basemap)
+        basemap = f" {parts.scheme}://{parts.netloc}"
+    return (
+        "default-src 'none'; script-src 'self'; worker-src 'self'; style-src 'self'; "
+        f"img-src 'self' data: blob:{basemap}; connect-src 'self'{basemap}; form-action 'none'; base-uri 'none'; "
+        "frame-ancestors 'none'"
+    )

@@ -1,0 +1,272 @@
+// The map: the reference's roads, and what an answer looks like on them.
+import * as maplibre from "/page/maplibre-gl.mjs";
+
+const EARTH_M = 6371000, RAD = Math.PI / 180;
+const EMPTY = { type: "FeatureCollection", features: [] };
+const feature = (type, coordinates, properties = {}) => ({ type: "Feature", properties, geometry: { type, coordinates } });
+const collection = (features) => ({ type: "FeatureCollection", features });
+
+let map, over, shown = null;
+const popup = new maplibre.Popup({ closeButton: false });
+const markers = [];
+
+/** Metres east and north from one place to another, [longitude, latitude] each. */
+export function metres(from, to) {
+  return [(to[0] - from[0]) * RAD * EARTH_M * Math.cos(from[1] * RAD), (to[1] - from[1]) * RAD * EARTH_M];
+}
+
+/** The place so many metres east and north of another. */
+export function offset(from, [east, north]) {
+  return [from[0] + east / (RAD * EARTH_M * Math.cos(from[1] * RAD)), from[1] + north / (RAD * EARTH_M)];
+}
+
+/** Make the map of what the server searches; false where the browser cannot draw it. */
+export function makeMap(told) {
+  const sources = {}, roads = [];
+  if (told.basemap) {
+    sources.basemap = { type: "raster", tiles: [told.basemap], tileSize: 256, attribution: escapeHtml(told.basemap_attribution) };
+    roads.push({ id: "basemap", type: "raster", source: "basemap" });
+  }
+  told.references.forEach((one, i) => {
+    sources[`roads-${i}`] = {
+      type: "vector", tiles: [`${location.origin}/tiles/${i}/{z}/{x}/{y}.mvt`], maxzoom: told.max_zoom, bounds: one.bounds,
+      attribution: escapeHtml(one.attribution),
+    };
+    const width = (a, b, c) => ["interpolate", ["exponential", 1.5], ["zoom"], 8, a, 13, b, 18, c];
+    const line = { type: "line", source: `roads-${i}`, "source-layer": "roads", layout: { "line-cap": "round", "line-join": "round" } };
+    roads.push({ ...line, id: `case-${i}`, minzoom: 12, paint: { "line-color": "#ffffff", "line-width": width(1, 3.4, 22) } });
+    roads.push({ ...line, id: `road-${i}`, paint: { "line-color": "#8c949e", "line-width": width(0.5, 1.4, 14) } });
+  });
+  const data = { type: "geojson", data: EMPTY };
+  Object.assign(sources, { area: data, outline: data });
+  const bounds = told.references.reduce((all, { bounds: [w, s, e, n] }) => all.extend([w, s]).extend([e, n]), new maplibre.LngLatBounds());
+  const common = { attributionControl: false, fadeDuration: 0, maxPitch: 0, dragRotate: false, maxZoom: 21 };
+  try {
+    map = new maplibre.Map({
+      ...common, container: "map", bounds, fitBoundsOptions: { padding: padding() },
+      style: {
+        version: 8, sources, layers: [
+          { id: "ground", type: "background", paint: { "background-color": "#f3f1ec" } }, ...roads,
+          { id: "area", type: "fill", source: "area", paint: { "fill-color": "#1a5fa5", "fill-opacity": 0.12 } },
+          { id: "area-edge", type: "line", source: "area", paint: { "line-color": "#1a5fa5", "line-width": 2, "line-dasharray": [2, 1] } },
+          { id: "outline-case", type: "line", source: "outline", paint: { "line-color": "#ffffff", "line-width": 6 } },
+          { id: "outline", type: "line", source: "outline", paint: { "line-color": "#1a5fa5", "line-width": 3 } },
+        ],
+      },
+    });
+  } catch (error) {
+    console.warn(error.message);
+    return false;
+  }
+  map.touchZoomRotate.disableRotation();
+  map.keyboard.disableRotation();
+  map.addControl(new maplibre.NavigationControl({ showCompass: false }), "top-right");
+  map.addControl(new maplibre.ScaleControl(), "bottom-right");
+  map.addControl(new maplibre.AttributionControl({ compact: false }), "bottom-right");
+  // A second map above it holds the photograph, so that the style sheet alone can fade it and cut it off.
+  const above = document.createElement("div");
+  above.id = "over";
+  map.getContainer().insertBefore(above, map.getContainer().querySelector(".maplibregl-control-container"));
+  over = new maplibre.Map({
+    ...common, container: above, interactive: false, center: map.getCenter(), zoom: map.getZoom(),
+    style: {
+      version: 8, sources: { roads: data, matches: data, ends: data }, layers: [
+        { id: "roads-case", type: "line", source: "roads", paint: { "line-color": "#ffffff", "line-width": 5, "line-opacity": 0.75 } },
+        { id: "roads", type: "line", source: "roads", paint: { "line-color": "#e4572e", "line-width": 2.4 } },
+        { id: "matches", type: "line", source: "matches", layout: { visibility: "none" }, paint: { "line-color": "#6a1b9a", "line-width": 3 } },
+        { id: "ends", type: "circle", source: "ends", layout: { visibility: "none" },
+          paint: { "circle-radius": 4.5, "circle-color": "#1b263b", "circle-stroke-color": "#ffffff", "circle-stroke-width": 1.5 } },
+      ],
+    },
+  });
+  over.getCanvas().setAttribute("aria-hidden", "true");
+  over.getCanvas().tabIndex = -1;
+  map.on("move", follow);
+  over.once("load", follow);
+  map.on("resize", () => over.resize());
+  map.on("click", ({ point, lngLat }) => {
+    const reach = [[point.x - 6, point.y - 6], [point.x + 6, point.y + 6]];
+    const [hit] = over.isStyleLoaded() ? over.queryRenderedFeatures(reach, { layers: ["ends"] }) : [];
+    if (hit) popup.setLngLat(lngLat).setText(`Residual ${hit.properties.residual.toFixed(1)} m`).addTo(map);
+  });
+  map.getCanvas().setAttribute("aria-label", "Map: arrow keys move it, plus and minus enlarge and reduce it");
+  return true;
+}
+
+function follow() {
+  over.jumpTo({ center: map.getCenter(), zoom: map.getZoom(), bearing: map.getBearing(), pitch: map.getPitch() });
+}
+
+/** Room that the panel takes, so that what matters lies beside it. */
+function padding() {
+  const beside = innerWidth > 760;
+  return { top: 50, bottom: 50, right: 50, left: beside ? document.getElementById("panel").offsetWidth + 60 : 50 };
+}
+
+function escapeHtml(text) {
+  const holder = document.createElement("p");
+  holder.textContent = text || "";
+  return holder.innerHTML;
+}
+
+const ready = (one) => new Promise((done) => (one.isStyleLoaded() ? done() : one.once("load", done)));
+
+/** Show an answer: its view as the server tells it, and its document; nothing for null. */
+export async function showAnswer(base, view, found) {
+  if (!map) return;
+  shown = base;
+  await Promise.all([ready(map), ready(over)]);
+  if (shown !== base) return;
+  clearMarkers();
+  if (over.getLayer("photo")) over.removeLayer("photo");
+  if (over.getSource("photo")) over.removeSource("photo");
+  const place = view?.place;
+  set(map, "outline", place ? [feature("LineString", place.outline)] : []);
+  set(over, "roads", place ? [feature("MultiLineString", place.roads)] : []);
+  set(over, "matches", (place?.matches ?? []).map((one) => feature("LineString", [one.map, one.seen])));
+  set(over, "ends", (place?.matches ?? []).map((one) => feature("Point", one.map, { residual: one.residual_m })));
+  if (!place) return;
+  if (place.warped) {
+    over.addSource("photo", { type: "image", url: `${location.origin}${base}/warped.webp`, coordinates: place.warped });
+    over.addLayer({ id: "photo", type: "raster", source: "photo", paint: { "raster-opacity": 1, "raster-fade-duration": 0 } }, "roads-case");
+  }
+  setOpacity(opacity);
+  const box = place.outline.reduce((all, one) => all.extend(one), new maplibre.LngLatBounds());
+  if (found.status === "ambiguous") (found.alternatives ?? []).forEach(({ center }) => box.extend([center.lon, center.lat]));
+  fit(box);
+}
+
+function set(one, source, features) {
+  one.getSource(source).setData(collection(features));
+}
+
+export function fit(box) {
+  map.fitBounds(box, { padding: padding(), maxZoom: 18, duration: matchMedia("(prefers-reduced-motion: reduce)").matches ? 0 : 700 });
+}
+
+let opacity = 0.85;
+/** Fade the photograph, not the roads above it. */
+export function setOpacity(value) {
+  opacity = value;
+  if (over?.getLayer("photo")) over.setPaintProperty("photo", "raster-opacity", value);
+}
+
+/** Cut what lies above the map off left of a share of the window's width; null: nowhere. */
+export function cut(share) {
+  const above = document.getElementById("over");
+  if (above) above.style.clipPath = share === null ? "" : `inset(0 0 0 ${(share * 100).toFixed(2)}%)`;
+}
+
+export function showLayers(names, visible) {
+  if (!over) return;
+  ready(over).then(() => names.forEach((name) => over.setLayoutProperty(name, "visibility", visible ? "visible" : "none")));
+}
+
+/** Put a button on the map. */
+export function addMarker(lonlat, text, label, kind, options = {}) {
+  const pin = document.createElement("button");
+  pin.type = "button";
+  pin.className = `pin ${kind}`;
+  pin.textContent = text;
+  pin.setAttribute("aria-label", label);
+  const marker = new maplibre.Marker({ element: pin, ...options }).setLngLat(lonlat).addTo(map);
+  markers.push(marker);
+  return marker;
+}
+
+export function clearMarkers() {
+  popup.remove();
+  markers.splice(0).forEach((one) => one.remove());
+}
+
+export function middle() {
+  const { lng, lat } = map.getCenter();
+  return [lng, lat];
+}
+
+/** The place under a point of the window; null where that is not on the map. */
+export function placeAt(x, y) {
+  const box = map.getContainer().getBoundingClientRect();
+  const over = document.elementFromPoint(x, y);
+  if (!over || !map.getContainer().contains(over)) return null;
+  const { lng, lat } = map.unproject([x - box.left, y - box.top]);
+  return [lng, lat];
+}
+
+/** Show where it is said to lie: near [lon, lat, metres], or within [w, s, e, n]. */
+export function showArea(near, within) {
+  if (!map) return;
+  let ring = [];
+  if (near) ring = Array.from({ length: 65 }, (_, i) => offset(near, [near[2] * Math.cos(i * Math.PI / 32), near[2] * Math.sin(i * Math.PI / 32)]));
+  if (within) {
+    const [w, s, e, n] = within;
+    ring = [[w, s], [e, s], [e, n], [w, n], [w, s]];
+  }
+  ready(map).then(() => set(map, "area", ring.length ? [feature("Polygon", [ring])] : []));
+}
+
+let stop = null;
+/** Have a circle or a box drawn: `done` gets near or within; drawing anew or `stopDrawing` ends it. */
+export function draw(kind, done) {
+  stopDrawing();
+  const box = map.getContainer(), canvas = map.getCanvasContainer();
+  box.classList.add("draws");
+  map.dragPan.disable();
+  map.boxZoom.disable();
+  let from = null, start = null;
+  const at = (event) => {
+    const edge = box.getBoundingClientRect(), { lng, lat } = map.unproject([event.clientX - edge.left, event.clientY - edge.top]);
+    return [lng, lat];
+  };
+  const made = (to) => {
+    if (kind === "circle") return [[...from, Math.max(Math.hypot(...metres(from, to)), 1)], null];
+    return [null, [Math.min(from[0], to[0]), Math.min(from[1], to[1]), Math.max(from[0], to[0]), Math.max(from[1], to[1])]];
+  };
+  const down = (event) => {
+    if (event.button) return;
+    event.preventDefault();
+    canvas.setPointerCapture(event.pointerId);
+    from = at(event);
+    start = [event.clientX, event.clientY];
+  };
+  const move = (event) => from && showArea(...made(at(event)));
+  const up = (event) => {
+    if (!from) return;
+    let to = at(event);
+    if (Math.hypot(event.clientX - start[0], event.clientY - start[1]) < 6) {  // a click: a fifth of what is seen
+      const { lng, lat } = map.unproject([start[0] + innerWidth / 10, start[1] - innerHeight / 10]);
+      const edge = map.unproject([start[0], start[1]]);
+      to = [from[0] + lng - edge.lng, from[1] + lat - edge.lat];
+    }
+    const [near, within] = made(to);
+    stopDrawing();
+    showArea(near, within);
+    done(near, within);
+  };
+  canvas.style.touchAction = "none";
+  const heard = { pointerdown: down, pointermove: move, pointerup: up };
+  Object.entries(heard).forEach(([name, what]) => canvas.addEventListener(name, what, true));
+  stop = () => {
+    Object.entries(heard).forEach(([name, what]) => canvas.removeEventListener(name, what, true));
+    canvas.style.touchAction = "";
+    box.classList.remove("draws");
+    map.dragPan.enable();
+    map.boxZoom.enable();
+  };
+}
+
+export function stopDrawing() {
+  stop?.();
+  stop = null;
+}
+
+let clicked = null;
+/** Hear of the next click on the map; null: of none. */
+export function onClick(what) {
+  if (clicked) map.off("click", clicked);
+  clicked = what && ((event) => what([event.lngLat.lng, event.lngLat.lat]));
+  if (clicked) map.on("click", clicked);
+  map.getContainer().classList.toggle("draws", Boolean(what));
+}
+
+export const theMap = () => map;

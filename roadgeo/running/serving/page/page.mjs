@@ -1,0 +1,643 @@
+// The page: takes pictures, shows how far they are and where they lie, and asks for help where they were refused.
+import * as view from "/page/map.mjs";
+import { hintsOf } from "/page/points.mjs";
+
+const $ = (id) => document.getElementById(id);
+const WORDS = { located: "Located", ambiguous: "Two places", not_located: "Not located", failed: "Failed", running: "Working", dismissed: "Cancelled" };
+const KEPT = "roadgeo.session";
+const answers = [];  // latest first: { id, base, name, status, message, progress, document, view, hints }
+let current = null, kept = 20, maxBytes = Infinity, hasMap = false;
+
+const make = (tag, properties = {}, ...children) => {
+  const one = Object.assign(document.createElement(tag), properties);
+  one.append(...children);
+  return one;
+};
+
+// --- the server -------------------------------------------------------------------------------------------------------
+
+class Problem extends Error {
+  constructor(status, detail, again) {
+    super(detail);
+    Object.assign(this, { status, again });
+  }
+}
+
+async function ask(path, options) {
+  let answer;
+  try {
+    answer = await fetch(path, options);
+  } catch {
+    throw new Problem(0, "The server does not answer. Is roadgeo serve still running?");
+  }
+  const told = await answer.json().catch(() => ({}));
+  if (!answer.ok) throw new Problem(answer.status, told.detail ?? `The server answered ${answer.status}.`, Number(answer.headers.get("Retry-After")));
+  return told;
+}
+
+/** Ask until there is a free place. */
+async function askUntilFree(path, options, entry) {
+  for (;;) {
+    try {
+      return await ask(path, options);
+    } catch (problem) {
+      if (problem.status !== 503 || !problem.again || entry.status === "dismissed") throw problem;
+      update(entry, { message: "waiting for a free place" });
+      await new Promise((done) => setTimeout(done, 1000 * problem.again));
+    }
+  }
+}
+
+// --- answers ----------------------------------------------------------------------------------------------------------
+
+async function takeFiles(files) {
+  complain("");
+  const entries = [...files].reverse().map((file) => add({ name: file.name, message: "sending", file, preview: URL.createObjectURL(file) }));
+  if (entries.length) choose(entries.at(-1));
+  for (const entry of entries.reverse()) {  // the first one is sent first, and stands on top
+    if (entry.file.size > 0.99 * maxBytes) {
+      update(entry, { status: "failed", message: `the file has ${megabytes(entry.file.size)}, this server takes ${megabytes(maxBytes)}: reduce it` });
+      continue;
+    }
+    const body = new FormData();
+    body.append("image", entry.file, entry.name);
+    await start(entry, "/locate", { method: "POST", body, headers: { Prefer: "respond-async" } });
+  }
+}
+
+function add(entry) {
+  const whole = { id: null, base: null, status: "running", progress: 0, hints: {}, since: Date.now(), ...entry };
+  answers.unshift(whole);
+  for (const old of answers.splice(kept)) {
+    if (old.base) ask(old.base, { method: "DELETE" }).catch(() => {});
+    if (old.preview) URL.revokeObjectURL(old.preview);
+  }
+  return whole;
+}
+
+async function start(entry, path, options) {
+  try {
+    const job = await askUntilFree(path, options, entry);
+    Object.assign(entry, { id: job.jobID, base: `/jobs/${job.jobID}`, file: null });
+    if (entry.status === "dismissed") {
+      await ask(entry.base, { method: "DELETE" });
+      return;
+    }
+    watch(entry);
+  } catch (problem) {
+    update(entry, { status: "failed", message: problem.message });
+  }
+  keep();
+}
+
+function watch(entry) {
+  const events = new EventSource(`${entry.base}/events`);
+  events.onmessage = ({ data }) => {
+    const told = JSON.parse(data);
+    if (told.status === "accepted" || told.status === "running") {
+      update(entry, { message: told.message, progress: told.progress });
+      return;
+    }
+    events.close();
+    finish(entry, told);
+  };
+  events.onerror = () => {
+    if (events.readyState === EventSource.CLOSED) update(entry, { status: "failed", message: "the server has forgotten it" });
+  };
+}
+
+async function finish(entry, told) {
+  if (told.status !== "successful") {
+    update(entry, { status: told.status === "dismissed" ? "dismissed" : "failed", message: told.message });
+    return;
+  }
+  try {
+    const [{ location }, seen] = await Promise.all([ask(`${entry.base}/results`), ask(`${entry.base}/view.json`)]);
+    update(entry, { document: location, view: seen, status: location.status, message: location.reason });
+  } catch (problem) {
+    update(entry, { status: "failed", message: problem.message });
+  }
+}
+
+function update(entry, change) {
+  const before = entry.status;
+  Object.assign(entry, change);
+  if (entry.status !== before && entry.status !== "running") {
+    $("said").textContent = `${entry.name}: ${WORDS[entry.status]}. ${entry.message}`;
+    if (entry === current) show(entry);
+  } else if (entry === current) {
+    showProgress(entry);
+  }
+  showSession();
+}
+
+function keep() {
+  const told = answers.filter((one) => one.id).map(({ id, name, hints }) => ({ id, name, hints }));
+  sessionStorage.setItem(KEPT, JSON.stringify(told));
+}
+
+/** What the page knew before it was loaded again. */
+async function recall() {
+  const told = JSON.parse(sessionStorage.getItem(KEPT) ?? "[]");
+  for (const { id, name, hints } of told.slice(0, kept)) {
+    const base = `/jobs/${id}`;
+    try {
+      const job = await ask(base);
+      const entry = { id, base, name, hints, status: "running", message: job.message, progress: job.progress, since: Date.now() };
+      answers.push(entry);
+      if (job.status === "accepted" || job.status === "running") watch(entry);
+      else await finish(entry, job);
+    } catch {
+      continue;  // the server has been started anew, or keeps later ones
+    }
+  }
+  if (answers.length) choose(answers[0]);
+  keep();
+}
+
+// --- showing one ------------------------------------------------------------------------------------------------------
+
+function choose(entry) {
+  current = entry;
+  resetHelp(entry);
+  show(entry);
+  showSession();
+}
+
+function show(entry) {
+  const { document: found, view: seen, status } = entry;
+  const over = status !== "running", placed = Boolean(seen?.place), sure = status === "located";
+  document.body.classList.add("has-answers");
+  $("answer").hidden = false;
+  $("answer-name").textContent = entry.name;
+  $("status").className = `status ${status}`;
+  $("status").textContent = WORDS[status];
+  $("progress").hidden = over;
+  $("reason").textContent = over ? sentence(entry.message) : "";
+  showProgress(entry);
+  showPicture(entry);
+  $("facts").replaceChildren(...(placed && sure ? facts(found, seen) : []).flatMap(([name, value]) => [make("dt", { textContent: name }), make("dd", {}, value)]));
+  $("layers").hidden = !placed;
+  $("layers").querySelector(".slide").firstChild.textContent = seen?.is_photograph === false ? "Mask " : "Photograph ";
+  $("help").hidden = !over || !entry.base || status === "failed" && !seen;
+  $("help").open = over && (status === "not_located" || status === "ambiguous");
+  $("files-of").hidden = !over || !found;
+  $("files-of").open = false;
+  if (hasMap) {
+    view.showAnswer(entry.base, seen, found).then(() => entry === current && showPlaces(entry));
+    view.showArea(...(sure ? [null, null] : [entry.hints.near ?? null, entry.hints.within ?? null]));
+  }
+  setSwipe(placed && $("show-swipe").checked);
+  $("places").hidden = status !== "ambiguous" || !placed;
+  if (sure) showFiles(entry);
+}
+
+function showProgress(entry) {
+  const bar = $("progress").firstElementChild;
+  if (entry.progress > 0) bar.value = entry.progress;
+  else bar.removeAttribute("value");
+  $("step").textContent = sentence(entry.message);
+}
+
+function showPicture(entry) {
+  const { view: seen, preview } = entry;
+  $("picture").classList.toggle("there", Boolean(seen || preview));
+  $("seen").replaceChildren();
+  $("larger").hidden = !seen;
+  if (!seen) {
+    if (preview) Object.assign($("photo"), { src: preview, alt: entry.name, onload: null, onerror: () => $("picture").classList.remove("there") });
+    showPairs();
+    return;
+  }
+  const [width, height] = seen.size, photo = $("photo"), drawn = $("seen");
+  photo.src = `${seen.of ?? entry.base}/picture.jpg`;
+  photo.alt = `${entry.name}, with ${seen.roads.length} roads that were seen in it`;
+  drawn.setAttribute("viewBox", `0 0 ${width} ${height}`);
+  const path = document.createElementNS("http://www.w3.org/2000/svg", "path");
+  path.setAttribute("d", seen.roads.map((line) => `M${line.map((point) => point.join(" ")).join("L")}`).join(""));
+  drawn.replaceChildren(path);
+  Object.assign(photo, { onload: layPins, onerror: null });
+  layPins();
+}
+
+/** Lay what is drawn on the picture exactly over it. */
+function layPins() {
+  const { offsetWidth: width, offsetHeight: height } = $("photo");
+  for (const one of [$("seen"), $("pins")]) Object.assign(one.style, { width: `${width}px`, height: `${height}px` });
+  showPairs();
+}
+
+const megabytes = (bytes) => `${(bytes / 1e6).toFixed(0)} MB`;
+const sentence = (text) => (text ? text[0].toUpperCase() + text.slice(1) + (/[.!?]$/.test(text) ? "" : ".") : "");
+const degrees = ({ lat, lon }) => `${lat.toFixed(6)}, ${lon.toFixed(6)}`;
+const length = (m) => (m < 1 ? `${(m * 100).toPrecision(2)} cm` : m < 10 ? `${m.toFixed(1)} m` : m < 1000 ? `${m.toFixed(0)} m` : `${(m / 1000).toFixed(1)} km`);
+const WINDS = ["north", "north-east", "east", "south-east", "south", "south-west", "west", "north-west"];
+
+function facts(found, { place: { matches } }) {
+  const copy = make("button", { type: "button", className: "link", textContent: degrees(found.center), title: "Copy" });
+  copy.setAttribute("aria-label", `Middle ${degrees(found.center)}: copy`);
+  copy.onclick = () => navigator.clipboard?.writeText(degrees(found.center)).then(() => { $("said").textContent = "Copied"; });
+  const turn = ((found.rotation_deg % 360) + 360) % 360, rows = [["Middle", copy]];
+  rows.push(["Pixel", `${found.gsd_m.toPrecision(3)} m`]);
+  rows.push(["Up is", `${WINDS[Math.round(turn / 45) % 8]}, ${turn.toFixed(0)}°`]);
+  if (found.tilt_deg > 2) rows.push(["Tilt", `${found.tilt_deg.toFixed(0)}°`]);
+  if (found.corner_sigma_m) rows.push(["Corners", `within about ${length(2 * Math.max(...found.corner_sigma_m))}`]);
+  if (found.camera) rows.push(["Camera", `${length(found.camera.height_m)} above the ground`]);
+  rows.push(["Roads", `${found.n_matched} of ${found.n_intersections} crossings matched`]);
+  if (matches.length) {  // the largest come first
+    rows.push(["Residuals", `${length(matches[matches.length >> 1].residual_m)} in the middle, ${length(matches[0].residual_m)} at most`]);
+  }
+  if (found.reference) rows.push(["Map", found.reference]);
+  return rows;
+}
+
+async function showFiles(entry) {
+  try {
+    const { files } = entry.files ?? await ask(`${entry.base}/files`);
+    entry.files = { files };
+    if (entry !== current) return;
+    $("files-of").querySelector("ul").replaceChildren(...files.map(({ name, summary, href }) =>
+      make("li", {}, make("a", { href, download: "" }, name, make("small", { textContent: summary })))));
+  } catch (problem) {
+    complain(problem.message);
+  }
+}
+
+function showPlaces(entry) {
+  const { status, document: found } = entry;
+  if (status !== "ambiguous") return;
+  const side = found.gsd_m * Math.max(...found.size);
+  const places = [found.center, ...found.alternatives.map((one) => one.center)].slice(0, 6);
+  $("places").querySelector("ol").replaceChildren(...places.map((place, i) => {
+    const letter = "ABCDEF"[i], lonlat = [place.lon, place.lat];
+    const take = () => again(entry, { ...entry.hints, within: undefined, near: [...lonlat, radius(lonlat, places, side)] });
+    view.addMarker(lonlat, letter, `Place ${letter}: it is this one`, "place").getElement().addEventListener("click", take);
+    const there = make("button", { type: "button", onclick: take }, make("b", { textContent: letter }), `It is this one: ${degrees(place)}`);
+    return make("li", {}, there);
+  }));
+}
+
+/** A circle around one place that holds none of the others. */
+function radius(lonlat, places, side) {
+  const apart = places.map(({ lon, lat }) => Math.hypot(...view.metres(lonlat, [lon, lat]))).filter((m) => m > 1);
+  return Math.min(0.4 * side, 0.45 * Math.min(...apart));
+}
+
+function showSession() {
+  $("session").hidden = answers.length < 2;
+  $("session").querySelector("ol").replaceChildren(...answers.map((entry) => {
+    const picture = entry.view ? make("img", { src: `${entry.view.of ?? entry.base}/picture.jpg`, alt: "" }) : make("i");
+    const row = make("button", { type: "button", onclick: () => choose(entry) }, picture, make("span", { textContent: entry.name }),
+      make("small", { textContent: WORDS[entry.status], className: entry.status }));
+    if (entry === current) row.setAttribute("aria-current", "true");
+    return make("li", {}, row);
+  }));
+}
+
+function complain(text) {
+  $("trouble").textContent = text;
+  $("trouble").hidden = !text;
+}
+
+// --- helping ----------------------------------------------------------------------------------------------------------
+
+let pairs = [], waiting = null, picking = false;  // { pixel, lonlat }; a pixel that waits for its place
+
+function resetHelp(entry) {
+  const { near, within, gsd, maxTilt, northUp } = entry.hints;
+  const put = (id, value) => { $(id).value = value ?? ""; };
+  setNear(near);
+  setWithin(within);
+  put("gsd-low", gsd && round(gsd[0]));
+  put("gsd-high", gsd && round(gsd[1]));
+  put("tilt", maxTilt);
+  put("height");
+  put("lens");
+  $("north").checked = Boolean(northUp);
+  pairs = entry.pairs ?? [];
+  setPicking(false);
+  stopDrawing();
+}
+
+const round = (value) => Number(value.toPrecision(6));
+function setNear(near) {
+  [["near-lon", near?.[0]], ["near-lat", near?.[1]], ["near-km", near && near[2] / 1000]].forEach(([id, value]) => { $(id).value = value === undefined ? "" : Number(value.toPrecision(8)); });
+}
+
+let box = null;
+function setWithin(within) {
+  box = within ?? null;
+  $("within").hidden = !box;
+  if (box) $("within").firstElementChild.textContent = `Box ${box.map((side) => side.toFixed(3)).join(", ")}`;
+}
+
+/** What is known, from the form. */
+function readHints(size) {
+  const number = (id) => ($(id).value === "" ? undefined : Number($(id).value));
+  const hints = {}, [lat, lon, km] = ["near-lat", "near-lon", "near-km"].map(number);
+  const told = [lat, lon, km].filter((one) => one !== undefined).length;
+  if (told && told < 3) throw new Error("Of a place give latitude, longitude and how far around.");
+  if (told) hints.near = [lon, lat, km * 1000];
+  if (box) hints.within = box;
+  const [low, high, height, lens] = ["gsd-low", "gsd-high", "height", "lens"].map(number);
+  if (low !== undefined || high !== undefined) hints.gsd = [low ?? high / 1.25, high ?? low * 1.25];
+  else if (height !== undefined && lens !== undefined) {
+    const focal = lens / 36 * Math.max(...size);  // film of 35 mm is 36 mm wide
+    hints.focal = round(focal);
+    hints.gsd = [round(height / focal / 1.25), round(height / focal * 1.25)];
+  } else if (height !== undefined || lens !== undefined) throw new Error("Give both the height and the lens.");
+  if (hints.gsd && !(hints.gsd[0] > 0 && hints.gsd[0] <= hints.gsd[1])) throw new Error("Pixel size: the first must not exceed the second.");
+  if (number("tilt") !== undefined) hints.maxTilt = number("tilt");
+  if ($("north").checked) hints.northUp = true;
+  return hints;
+}
+
+function again(entry, hints) {
+  const known = Object.fromEntries(Object.entries(hints).filter(([, value]) => value !== undefined));
+  const query = Object.entries(known).map(([name, value]) => `${name}=${Array.isArray(value) ? value.join(",") : value}`).join("&");
+  const next = add({ name: entry.name, hints: known, message: "searching again", pairs, view: entry.view && { ...entry.view, place: null, of: entry.base } });
+  choose(next);
+  scrollUp();
+  return start(next, `${entry.base}/again?${query}`, { method: "POST" });
+}
+
+function scrollUp() {
+  $("panel").scrollTo({ top: 0 });
+  if (innerWidth <= 760) scrollTo({ top: 0 });
+}
+
+function searchAgain() {
+  $("hint-trouble").textContent = "";
+  const entry = current;
+  try {
+    const hints = readHints(entry.view.size);
+    const told = hintsOf(pairs, entry.view.size);
+    if (told) Object.assign(hints, told, { within: undefined });
+    return again(entry, hints);
+  } catch (error) {
+    $("hint-trouble").textContent = error.message;
+    return null;
+  }
+}
+
+function startDrawing(kind, button) {
+  const on = button.getAttribute("aria-pressed") === "true";
+  stopDrawing();
+  if (on || !hasMap) return;
+  setPicking(false);
+  button.setAttribute("aria-pressed", "true");
+  tell(kind === "circle" ? "Press in the middle, and draw the circle outwards" : "Press in a corner, and draw the box");
+  if (innerWidth <= 760) scrollTo({ top: 0 });
+  view.draw(kind, (near, within) => {
+    stopDrawing();
+    setNear(near ?? undefined);
+    setWithin(within);
+    searchAgain();
+  });
+}
+
+function stopDrawing() {
+  for (const id of ["draw-circle", "draw-box"]) $(id).setAttribute("aria-pressed", "false");
+  if (hasMap) view.stopDrawing();
+  tell("");
+}
+
+function tell(text) {
+  $("asks").textContent = text;
+  $("asks").hidden = !text;
+}
+
+// --- points -----------------------------------------------------------------------------------------------------------
+
+function setPicking(on) {
+  picking = on && hasMap;
+  waiting = null;
+  $("pick").setAttribute("aria-pressed", String(picking));
+  $("picture").classList.toggle("picks", picking);
+  $("photo").tabIndex = picking ? 0 : -1;
+  $("aim").hidden = $("take-middle").hidden = true;
+  if (hasMap) view.onClick(null);
+  tell(picking ? "Click a crossing in the picture" : "");
+  if (picking) $("picture").scrollIntoView({ block: "nearest" });
+  showPairs();
+}
+
+function pixelAt({ clientX, clientY }) {
+  const edge = $("photo").getBoundingClientRect(), [width, height] = current.view.size;
+  return [(clientX - edge.left) / edge.width * width, (clientY - edge.top) / edge.height * height];
+}
+
+function pickPixel(pixel) {
+  if (pairs.length >= 3) return;
+  waiting = pixel;
+  showPairs();
+  tell(`Now click the same crossing on the map (${pairs.length + 1})`);
+  $("take-middle").hidden = false;
+  if (innerWidth <= 760) scrollTo({ top: 0 });
+  view.onClick(setPlace);
+}
+
+function setPlace(lonlat) {
+  view.onClick(null);
+  $("take-middle").hidden = true;
+  pairs.push({ pixel: waiting, lonlat });
+  waiting = null;
+  showPairs();
+  tell(pairs.length < 2 ? "One more: click another crossing in the picture" : "");
+  if (pairs.length >= 2) searchAgain();
+}
+
+function showPairs() {
+  if (!current?.view) return;
+  const [width, height] = current.view.size;
+  const all = [...pairs.map((one) => one.pixel), ...(waiting ? [waiting] : [])];
+  $("points").replaceChildren(...all.map(([column, row], i) => {
+    const pin = make("button", { type: "button", className: "pin", textContent: i + 1 });
+    pin.setAttribute("aria-label", `Point ${i + 1} in the picture`);
+    Object.assign(pin.style, { left: `${100 * column / width}%`, top: `${100 * row / height}%` });
+    if (i >= pairs.length) pin.addEventListener("pointerdown", dragToMap);
+    return pin;
+  }));
+  $("pairs").replaceChildren(...pairs.map(({ lonlat: [lon, lat] }) => make("li", { textContent: degrees({ lat, lon }) })));
+  $("unpick").hidden = !all.length;
+  if (!hasMap || current.status === "ambiguous") return;
+  view.clearMarkers();
+  pairs.forEach(({ lonlat }, i) => {
+    const marker = view.addMarker(lonlat, i + 1, `Point ${i + 1} on the map`, "mapped", { draggable: true });
+    marker.on("dragend", () => {
+      const { lng, lat } = marker.getLngLat();
+      pairs[i] = { ...pairs[i], lonlat: [lng, lat] };
+      if (pairs.length >= 2) searchAgain();
+    });
+  });
+}
+
+let aim = [0.5, 0.5];
+/** Choose a point by keys: arrows move a cross over the picture, Enter takes it; then the map is moved likewise. */
+function aimByKeys(event) {
+  const step = { ArrowLeft: [-1, 0], ArrowRight: [1, 0], ArrowUp: [0, -1], ArrowDown: [0, 1] }[event.key];
+  if (!picking || !(step || event.key === "Enter")) return;
+  event.preventDefault();
+  if (step) aim = aim.map((share, k) => Math.min(Math.max(share + step[k] * (event.shiftKey ? 0.05 : 0.005), 0), 1));
+  Object.assign($("aim").style, { left: `${100 * aim[0]}%`, top: `${100 * aim[1]}%` });
+  $("aim").hidden = false;
+  if (step) return;
+  $("aim").hidden = true;
+  pickPixel(current.view.size.map((side, k) => side * aim[k]));
+  view.theMap().getCanvas().focus();
+}
+
+/** Carry a point from the picture over to the map. */
+function dragToMap(event) {
+  event.preventDefault();
+  event.stopPropagation();
+  const ghost = event.target.cloneNode(true);
+  ghost.classList.add("ghost");
+  const move = ({ clientX, clientY }) => Object.assign(ghost.style, { left: `${clientX}px`, top: `${clientY}px` });
+  const drop = ({ clientX, clientY }) => {
+    removeEventListener("pointermove", move);
+    removeEventListener("pointerup", drop);
+    ghost.remove();
+    const lonlat = view.placeAt(clientX, clientY);
+    if (lonlat && waiting) setPlace(lonlat);
+  };
+  document.body.append(ghost);
+  move(event);
+  addEventListener("pointermove", move);
+  addEventListener("pointerup", drop);
+}
+
+// --- the swipe --------------------------------------------------------------------------------------------------------
+
+let edge = 0.5;
+function setSwipe(on) {
+  $("swipe").hidden = !on;
+  if (!on) {
+    view.cut(null);
+    return;
+  }
+  moveSwipe(edge);
+}
+
+function moveSwipe(share) {
+  edge = Math.min(Math.max(share, 0.02), 0.98);
+  $("swipe").style.left = `${100 * edge}%`;
+  $("swipe").setAttribute("aria-valuenow", Math.round(100 * edge));
+  view.cut(edge);
+}
+
+// --- begin ------------------------------------------------------------------------------------------------------------
+
+function listen() {
+  const hasFiles = (event) => event.dataTransfer?.types.includes("Files");
+  $("files").addEventListener("change", () => {
+    takeFiles($("files").files);
+    $("files").value = "";
+  });
+  addEventListener("dragover", (event) => {
+    if (!hasFiles(event)) return;
+    event.preventDefault();
+    $("drag").hidden = false;
+  });
+  addEventListener("dragleave", (event) => { if (!event.relatedTarget) $("drag").hidden = true; });
+  addEventListener("drop", (event) => {
+    if (!hasFiles(event)) return;
+    event.preventDefault();
+    $("drag").hidden = true;
+    takeFiles(event.dataTransfer.files);
+  });
+  addEventListener("paste", (event) => event.clipboardData?.files.length && takeFiles(event.clipboardData.files));
+  $("cancel").onclick = () => {
+    const entry = current;
+    update(entry, { status: "dismissed", message: "it was cancelled" });
+    if (entry.base) ask(entry.base, { method: "DELETE" }).catch(() => {});
+  };
+  $("opacity").oninput = () => view.setOpacity($("opacity").value / 100);
+  $("show-swipe").onchange = () => setSwipe($("show-swipe").checked);
+  $("show-roads").onchange = () => view.showLayers(["roads", "roads-case"], $("show-roads").checked);
+  $("show-matches").onchange = () => view.showLayers(["matches", "ends"], $("show-matches").checked);
+  $("files-of").ontoggle = () => $("files-of").open && current?.document && showFiles(current);
+  $("draw-circle").onclick = () => startDrawing("circle", $("draw-circle"));
+  $("draw-box").onclick = () => startDrawing("box", $("draw-box"));
+  $("within").lastElementChild.onclick = () => {
+    setWithin(null);
+    view.showArea(null, null);
+  };
+  $("near-middle").onclick = () => {
+    if (hasMap) setNear([...view.middle(), 1000 * (Number($("near-km").value) || 3)]);
+    showTyped();
+  };
+  for (const id of ["near-lat", "near-lon", "near-km"]) $(id).onchange = showTyped;
+  $("hints").onsubmit = (event) => {
+    event.preventDefault();
+    searchAgain();
+  };
+  $("pick").onclick = () => setPicking(!picking);
+  $("unpick").onclick = () => {
+    pairs = [];
+    setPicking(picking);
+  };
+  $("photo").onclick = (event) => picking && pickPixel(pixelAt(event));
+  $("photo").onkeydown = aimByKeys;
+  $("take-middle").onclick = () => waiting && setPlace(view.middle());
+  $("larger").onclick = () => {
+    const on = $("panel").classList.toggle("large");
+    $("larger").setAttribute("aria-pressed", String(on));
+    $("larger").textContent = on ? "Smaller" : "Larger";
+    layPins();
+  };
+  addEventListener("resize", layPins);
+  addEventListener("keydown", (event) => {
+    if (event.key !== "Escape") return;
+    stopDrawing();
+    setPicking(false);
+  });
+  const swipe = $("swipe");
+  swipe.onpointerdown = (event) => swipe.setPointerCapture(event.pointerId);
+  swipe.onpointermove = (event) => swipe.hasPointerCapture(event.pointerId) && moveSwipe(event.clientX / innerWidth);
+  swipe.onkeydown = ({ key }) => {
+    const step = { ArrowLeft: -0.05, ArrowRight: 0.05 }[key];
+    if (step) moveSwipe(edge + step);
+  };
+}
+
+function showTyped() {
+  const [lat, lon, km] = ["near-lat", "near-lon", "near-km"].map((id) => ($(id).value === "" ? NaN : Number($(id).value)));
+  view.showArea([lat, lon, km].every(Number.isFinite) && km > 0 ? [lon, lat, km * 1000] : null, null);
+}
+
+function askToken() {
+  $("token").hidden = false;
+  $("token-text").focus();
+  $("token").onsubmit = async (event) => {
+    event.preventDefault();
+    try {
+      await ask("/session", { method: "POST", body: $("token-text").value });
+      location.reload();
+    } catch (problem) {
+      $("token").querySelector(".bad").textContent = sentence(problem.message);
+    }
+  };
+}
+
+async function begin() {
+  let told;
+  try {
+    told = await ask("/references");
+  } catch (problem) {
+    if (problem.status === 401) askToken();
+    else complain(problem.message);
+    $("work").hidden = problem.status === 401;
+    return;
+  }
+  kept = told.kept;
+  maxBytes = told.max_bytes;
+  $("work").hidden = false;
+  hasMap = view.makeMap(told);
+  if (!hasMap) complain("This browser cannot draw the map (it has no WebGL). Places are told all the same.");
+  $("credit").textContent = `Searching ${told.references.map((one) => one.name).join(", ")}. Nothing leaves this server${told.basemap ? " but what the basemap shows" : ""}.`;
+  listen();
+  await recall();
+}
+
+begin();

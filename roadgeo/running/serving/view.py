@@ -1,0 +1,161 @@
+"""What the page shows of an answer, and the files that it offers: made by the process that located, kept beside it."""
+
+from __future__ import annotations
+
+import gzip
+import json
+import pickle
+import re
+from collections.abc import Sequence
+from itertools import pairwise
+from pathlib import Path
+from typing import Any
+
+import cv2
+import numpy as np
+
+from roadgeo._arrays import AnyArray, FloatArray
+from roadgeo.errors import MaskError, OutputError
+from roadgeo.geometry.homography import Homography
+from roadgeo.geometry.mask import plane_to_pixel
+from roadgeo.geometry.projection import to_lonlat
+from roadgeo.geometry.warping import cover, warp
+from roadgeo.location import Location
+from roadgeo.outputs.orthophoto import ImageOptions, choose_target, read_preview
+from roadgeo.outputs.paths import Placement, output_paths
+from roadgeo.outputs.registry import ALSO, FOOTPRINT, GEOPACKAGE, JSON, OVERLAY, REPORT, VRT, Output
+from roadgeo.outputs.report.views import ReportOptions, Shown
+from roadgeo.outputs.subject import Subject
+from roadgeo.reference.reference import AnyReference
+from roadgeo.running.looks import Sighting
+from roadgeo.storage.files import replacing
+
+__all__ = ["OFFERED", "PICTURE", "VIEW", "WARPED", "safe_stem", "write_output", "write_view"]
+
+#: Names of files beside an image that was located: the picture reduced, the same on the map, all else that is shown.
+PICTURE, WARPED, VIEW = "picture.jpg", "warped.webp", "view.json"
+_KEPT = "kept.pickle.gz"
+
+#: What may be had of an answer. A virtual raster would lead to a file that its reader has not.
+OFFERED: dict[str, Output] = {
+    one.name: one for one in (FOOTPRINT, GEOPACKAGE, JSON, REPORT, OVERLAY, *ALSO.values()) if one is not VRT
+}
+
+#: Longer side of the picture, and on the map, pixels; their quality; side of the CRS in which web maps draw, metres.
+_SIDE, _MAP_SIDE, _QUALITY, _WORLD_M = 1600, 1280, 82, 2 * 20037508.342789244
+_WEB = "EPSG:3857"
+_MASK_COLOR = (228, 87, 46)
+
+
+def safe_stem(name: str) -> str:
+    """Return what may stand in a file's name of what a sender calls a file."""
+    stem = re.sub(r"[^\w-]+", "_", Path(name.replace("\\", "/")).stem)[:50].strip("_")
+    return stem or "image"
+
+
+def write_view(path: Path, sighting: Sighting, references: Sequence[AnyReference]) -> None:
+    """Write what the page shows of an answer, beside the image at `path`, and keep what its files are made of."""
+    location, folder = sighting.location, path.parent
+    indexes = [one.index_of(location) for one in references]
+    photo = path if sighting.of_photograph else None
+    try:
+        shown: Shown | None = Shown.of(location, sighting.mask, indexes[0], photo, ReportOptions(picture_px=_SIDE), "")
+    except MaskError:  # there is not a road in it
+        shown = None
+    _write_picture(folder / PICTURE, read_preview(path, _SIDE)[..., :3])
+    view: dict[str, Any] = {"size": sighting.mask.shape[::-1], "roads": [], "place": None}
+    view["is_photograph"] = sighting.of_photograph
+    if shown is not None:
+        view["roads"] = [_rounded(line, 1) for line in shown.lines]
+        view["place"] = None if shown.place is None else _show_place(folder, shown, shown.place)
+    (folder / VIEW).write_text(json.dumps(view, allow_nan=False), encoding="utf-8")
+    kept = (location, sighting.mask, sighting.of_photograph)
+    with gzip.open(folder / _KEPT, "wb", compresslevel=1) as file:
+        pickle.dump(kept, file)
+
+
+def write_output(path: Path, name: str, references: Sequence[AnyReference]) -> Path:
+    """Write one of the files that are offered of the answer for the image at `path`; return where it lies.
+
+    Raises
+    ------
+    OutputError, MaskError, CrsError
+        It cannot be made.
+    """
+    location: Location
+    with gzip.open(path.parent / _KEPT, "rb") as file:  # our own, in a folder that is ours alone
+        location, mask, of_photograph = pickle.load(file)  # noqa: S301
+    output, paths = OFFERED[name], output_paths(path.parent, path.stem)
+    if output.needs_place and not location.located:
+        raise OutputError("there is no place on the map to show")
+    if output.needs_camera and location.camera is None:
+        raise OutputError("no camera above the ground would see the frame so")
+    indexes = [one.index_of(location) for one in references]
+    subject = Subject(
+        location, mask, paths, ImageOptions(max_pixels=64_000_000), path if of_photograph else None, indexes
+    )
+    target = paths.of(output, path.name)
+    with replacing(target, sync=False) as written:
+        output.write(written, subject)
+    return target
+
+
+# --- the place --------------------------------------------------------------------------------------------------------
+
+
+def _show_place(folder: Path, shown: Shown, place: Placement) -> dict[str, Any]:
+    """Return what lies on the map, in longitude and latitude, and draw the picture there."""
+
+    def lay(pixels: FloatArray) -> FloatArray:
+        return to_lonlat(place.crs, place.to_crs(pixels))
+
+    roads = [line for line in (lay(one) for one in shown.lines) if np.isfinite(line).all()]
+    matches, told = shown.matches(), []
+    if matches is not None:
+        seen, there = lay(plane_to_pixel(matches.query_xy)), to_lonlat(place.crs, matches.reference_xy)
+        told = [
+            {"seen": _rounded(a, 7), "map": _rounded(b, 7), "residual_m": round(float(residual), 2)}
+            for a, b, residual in zip(seen, there, matches.residual_m, strict=True)
+            if np.isfinite([*a, *b]).all()
+        ]
+    return {
+        "outline": _rounded(lay(_outline(shown.size)), 7),
+        "warped": _draw_on_map(folder / WARPED, shown, place),
+        "roads": [_rounded(line, 7) for line in roads],
+        "matches": told,
+    }
+
+
+def _outline(size: tuple[int, int]) -> FloatArray:
+    """Return (33, 2) pixels along the frame's sides, from its top left and back."""
+    corners = np.array([(0, 0), (1, 0), (1, 1), (0, 1), (0, 0)], float) * size
+    sides = [np.linspace(a, b, 8, endpoint=False) for a, b in pairwise(corners)]
+    return np.concatenate([*sides, corners[:1]])
+
+
+def _draw_on_map(path: Path, shown: Shown, place: Placement) -> list[list[float]] | None:
+    """Draw the picture as web maps are drawn; return where its corners lie, from the top left; None where nowhere."""
+    image = shown.draw_picture(_MASK_COLOR)
+    size = image.shape[1], image.shape[0]
+    to_crs = place.homography @ np.diag([shown.size[0] / size[0], shown.size[1] / size[1], 1.0])
+    target = choose_target(place, ImageOptions(crs=_WEB))
+    grid = cover(size, to_crs, None, _MAP_SIDE**2, target.to_target)
+    if grid.width == 0 or grid.width * grid.resolution > _WORLD_M / 4:
+        return None
+    smooth = cv2.INTER_LINEAR if shown.photograph is not None else cv2.INTER_NEAREST
+    _write_picture(path, warp(image, to_crs, grid, target.to_place, smooth, place.lens(size)))
+    box = np.array([(0, 0), (grid.width, 0), (grid.width, grid.height), (0, grid.height)], float)
+    corners: list[list[float]] = _rounded(to_lonlat(_WEB, Homography(grid.to_crs_matrix())(box)), 8)
+    return corners
+
+
+def _write_picture(path: Path, image: AnyArray) -> None:
+    """Write (h, w, 3) or, with opacity, (h, w, 4) uint8 as what the path's suffix says."""
+    turned = cv2.COLOR_RGBA2BGRA if image.shape[2] == 4 else cv2.COLOR_RGB2BGR
+    key = cv2.IMWRITE_WEBP_QUALITY if path.suffix == ".webp" else cv2.IMWRITE_JPEG_QUALITY
+    encoded = cv2.imencode(path.suffix, cv2.cvtColor(np.ascontiguousarray(image), turned), [key, _QUALITY])[1]
+    path.write_bytes(encoded.tobytes())
+
+
+def _rounded(values: FloatArray, digits: int) -> Any:
+    return np.round(values, digits).tolist()

@@ -1,0 +1,325 @@
+"""Tables out of road files of every kind, part by part, so that a file of any size is read in a bounded memory.
+
+Formats are told by the file's name: OpenStreetMap data through osmium, answers of Overpass, osmnx's `.graphml`,
+(Geo)Parquet, and everything else that GDAL reads (GeoPackage, Shapefile, GeoJSON, FlatGeobuf, GPX, KML, DXF ...).
+"""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from roadgeo._arrays import AnyArray
+from roadgeo.errors import NoRoadsError, RoadSourceError
+from roadgeo.sources.crs_guard import refuse_named_files
+from roadgeo.sources.lines import OSM_ATTRIBUTION, RoadTable, crs_name
+from roadgeo.sources.osm_files import OSM_ENDINGS, stream_ways
+from roadgeo.sources.schemas import is_known_column, names_kinds
+from roadgeo.sources.unpacking import require_bounded
+from roadgeo.sources.vectors import count_features, first_line, list_fields, list_layers, read_layer
+
+__all__ = ["ENDINGS", "graph_table", "stream_tables"]
+
+_PARQUET = (".parquet", ".geoparquet", ".pq")
+_GRAPHS = (".graphml",)
+_GDAL = (
+    ".gpkg", ".shp", ".geojson", ".geojsonl", ".geojsons", ".fgb", ".gml", ".kml", ".gpx", ".sqlite", ".tab", ".mif",
+    ".shz", ".dxf", ".gdb",
+)  # fmt: skip
+#: Names of road files.
+ENDINGS = OSM_ENDINGS + _PARQUET + _GRAPHS + _GDAL
+
+#: Layers to prefer where a file has several with lines, and drivers whose layers are parts of one drawing.
+_LAYERS = ("roads", "edges", "lines", "entities")
+_DRAWINGS = (".gpx", ".kml", ".kmz")
+#: Names of columns that hold shapes in a Parquet file that does not say so.
+_SHAPES = ("geometry", "geom", "wkb_geometry", "wkb", "the_geom", "shape", "wkt")
+_PEEK = 1000
+
+
+def stream_tables(
+    path: Path, layer: str | None, most: int, advance: Callable[[float], None], folder: Path, *, areas: bool = False
+) -> Iterator[RoadTable]:
+    """Yield what a file holds, at most so many features at a time.
+
+    Parameters
+    ----------
+    layer : str, optional
+        Of a file with several; the one with lines by default, all of a GPX or KML file.
+    advance : callable
+        Told which share of the file is read.
+    folder : Path
+        For what is put aside while the file is read.
+    areas : bool
+        Polygons will do where there are no lines.
+
+    Raises
+    ------
+    RoadSourceError
+        The file is unreadable, or which of its layers is meant is not known.
+    """
+    name = path.name.lower()
+    if name.endswith(OSM_ENDINGS):
+        yield from stream_ways(path, most, advance, folder)
+    elif name.endswith(_GRAPHS):
+        yield _read_graphml(path)
+    elif name.endswith(_PARQUET):
+        yield from _stream_parquet(path, most, advance)
+    elif name.endswith(".json") and (elements := _overpass_elements(path)) is not None:
+        yield _overpass_table(elements)
+    else:
+        yield from _stream_gdal(path, layer, most, advance, areas=areas)
+
+
+# --- GDAL -------------------------------------------------------------------------------------------------------------
+
+
+def _stream_gdal(
+    path: Path, layer: str | None, most: int, advance: Callable[[float], None], *, areas: bool
+) -> Iterator[RoadTable]:
+    import shapely
+
+    layers = _choose_layers(path, layer, areas=areas)
+    for n, one in enumerate(layers):
+        columns = _choose_columns(path, one)
+        total = max(count_features(path, one), 1)
+        for skip in range(0, total, most):
+            found = read_layer(path, one, columns, skip, most if total > most else None)
+            if found.shapes is None:
+                raise NoRoadsError(f"{path}: layer {one!r} has no geometry, expected lines")
+            shapes = shapely.from_wkb(found.shapes, on_invalid="ignore")
+            meta = {"format": found.driver, "layer": ", ".join(layers), **found.told}
+            yield RoadTable(shapes, crs_name(found.crs), found.columns, meta)
+            advance((n + min(skip + most, total) / total) / len(layers))
+
+
+def _choose_layers(path: Path, layer: str | None, *, areas: bool) -> list[str]:
+    """Return the layers to read: the one asked for, or those with lines (or with polygons, where they will do)."""
+    layers = list_layers(path)
+    names = [name for name, _ in layers]
+    if layer is not None:
+        if layer not in names:
+            raise RoadSourceError(f"{path}: no layer {layer!r}; it has {_listed(names)}: choose with --layer")
+        return [layer]
+    drawn = [name for name, kind in layers if kind in {"None", "Unknown"} or "Line" in kind or "Collection" in kind]
+    if not drawn and areas:
+        drawn = [name for name, kind in layers if "Polygon" in kind]
+    if not drawn:
+        kinds = sorted({kind for _, kind in layers}) or ["nothing"]
+        raise NoRoadsError(f"{path}: holds {_listed(kinds)}, expected lines: the centre lines of roads")
+    if len(drawn) > 1:
+        drawn = [name for name in drawn if _is_filled(path, name)] or drawn[:1]
+    preferred = [name for name in _LAYERS if name in drawn]
+    if len(drawn) == 1 or path.name.lower().endswith(_DRAWINGS):
+        return drawn
+    if not preferred:
+        raise RoadSourceError(f"{path}: several layers hold lines, {_listed(drawn)}: choose one with --layer")
+    return preferred[:1]
+
+
+def _is_filled(path: Path, layer: str) -> bool:
+    try:
+        return count_features(path, layer) > 0
+    except RoadSourceError:  # a view, which is refused only if it is the one to read
+        return True
+
+
+def _choose_columns(path: Path, layer: str) -> list[str]:
+    """Return the columns of a layer that may tell something of a road: by their names, else by their values."""
+    fields = list_fields(path, layer)
+    known = [name for name in fields if is_known_column(name)]
+    if not fields or {"highway", "fclass"} & {name.lower() for name in known}:
+        return known
+    head = read_layer(path, layer, fields, 0, _PEEK).columns
+    return known + [name for name, values in head.items() if name not in known and names_kinds(values)]
+
+
+def _listed(names: Sequence[str]) -> str:
+    """Join names for a message, at most eight."""
+    shown = ", ".join(names[:8])
+    return shown if len(names) <= 8 else f"{shown} and {len(names) - 8} more"
+
+
+# --- Parquet ----------------------------------------------------------------------------------------------------------
+
+
+def _stream_parquet(path: Path, most: int, advance: Callable[[float], None]) -> Iterator[RoadTable]:
+    """Stream Parquet by batches of its row groups, with or without the metadata of GeoParquet."""
+    import pyarrow as pa
+    import pyarrow.parquet as pq
+
+    refuse_named_files(path)
+    try:
+        _require_rows(path)
+        with pq.ParquetFile(path) as file:
+            shape_column, crs, encoding = _geometry_of(file)
+            names = [name for name in file.schema_arrow.names if name != shape_column]
+            known = [name for name in names if is_known_column(name)]
+            wanted, done = known or names, 0
+            for batch in file.iter_batches(most, columns=[shape_column, *wanted]):
+                columns = {name: _objects(batch[name]) for name in wanted}
+                yield RoadTable(_shapes(batch, shape_column, encoding), crs, columns, {"format": "Parquet"})
+                done += len(batch)
+                advance(done / file.metadata.num_rows)
+    except (ValueError, TypeError, LookupError, pa.ArrowException, OSError) as error:  # of its text, when looked at
+        raise RoadSourceError(f"{path}: not readable as GeoParquet: {first_line(error)}") from error
+
+
+def _geometry_of(file: Any) -> tuple[str, str | None, str]:
+    """Return the geometry column of a Parquet file, its CRS and its encoding."""
+    import pyarrow as pa
+
+    stored = file.schema_arrow.metadata or {}
+    if b"geo" in stored:
+        geo = json.loads(stored[b"geo"])
+        told = geo["columns"][geo["primary_column"]]
+        return geo["primary_column"], crs_name(told.get("crs", "EPSG:4326")), str(told.get("encoding"))
+    schema = file.schema_arrow
+    for name in sorted(schema.names, key=lambda name: (name.lower() not in _SHAPES, name)):
+        kind = schema.field(name).type
+        kind = getattr(kind, "storage_type", kind)
+        if name.lower() in _SHAPES and (pa.types.is_binary(kind) or pa.types.is_large_binary(kind)):
+            return name, None, "WKB"
+        if name.lower() in _SHAPES and (pa.types.is_string(kind) or pa.types.is_large_string(kind)):
+            return name, None, "WKT"
+    raise ValueError(f"it says nothing of a geometry column, and has none named {', '.join(_SHAPES[:3])} ...")
+
+
+def _shapes(batch: Any, column: str, encoding: str) -> AnyArray:
+    import geopandas as gpd
+    import pyarrow as pa
+    import shapely
+
+    if encoding.upper() == "WKB":
+        return np.asarray(shapely.from_wkb(_objects(batch[column]), on_invalid="ignore"))
+    if encoding == "WKT":
+        return np.asarray(shapely.from_wkt(_objects(batch[column]), on_invalid="ignore"))
+    named = pa.field(column, batch.schema.field(column).type, metadata={"ARROW:extension:name": f"geoarrow.{encoding}"})
+    table = pa.Table.from_arrays([batch[column]], schema=pa.schema([named]))
+    return np.asarray(gpd.GeoDataFrame.from_arrow(table, geometry=column).geometry.to_numpy())
+
+
+def _objects(column: Any) -> AnyArray:
+    found = np.empty(len(column), object)
+    found[:] = column.to_pylist()
+    return found
+
+
+def _require_rows(path: Path) -> None:
+    """Refuse what says to hold more rows than bytes: a few bytes may stand for billions of equal rows."""
+    import pyarrow.parquet as pq
+
+    meta = pq.read_metadata(path)
+    unpacked = sum(meta.row_group(i).total_byte_size for i in range(meta.num_row_groups))
+    if meta.num_rows > (size := path.stat().st_size):
+        raise ValueError(f"its {size:,} bytes say to hold {meta.num_rows:,} rows and {unpacked:,} bytes")
+    require_bounded(path, unpacked)
+
+
+# --- graphs, and answers of Overpass ----------------------------------------------------------------------------------
+
+
+def _read_graphml(path: Path) -> RoadTable:
+    """Read a street network that osmnx saved."""
+    import xml.etree.ElementTree as ET
+
+    import networkx as nx
+    import osmnx as ox
+
+    refuse_named_files(path)
+    try:
+        table = graph_table(ox.load_graphml(path))
+    except (ET.ParseError, nx.NetworkXError, KeyError, ValueError, TypeError, AttributeError) as error:
+        raise RoadSourceError(f"{path}: not a street network saved by osmnx: {first_line(error)}") from error
+    return RoadTable(table.shapes, table.crs, table.columns, {"format": "GraphML", "attribution": OSM_ATTRIBUTION})
+
+
+def graph_table(graph: Any) -> RoadTable:
+    """Return the edges of a networkx graph as a table: of osmnx, momepy, or with `geometry` or nodes that have x and y.
+
+    Raises
+    ------
+    RoadSourceError
+        Its edges and nodes do not tell where they lie.
+    """
+    import shapely
+
+    shapes, rows = [], []
+    for start, end, data in graph.edges(data=True):
+        shape = data.get("geometry")
+        if isinstance(shape, str):
+            shape = shapely.from_wkt(shape, on_invalid="ignore")
+        if not isinstance(shape, shapely.Geometry):
+            ends = [_node_place(graph, node) for node in (start, end)]
+            if None in ends:
+                raise RoadSourceError(
+                    "the edges of the graph do not tell where they lie: expected `geometry`, or nodes with `x` and "
+                    "`y`, as osmnx and momepy have them; of a skeleton of pixels locate the mask that it was drawn from"
+                )
+            shape = shapely.LineString(ends)
+        shapes.append(shape)
+        rows.append(data)
+    names = [str(name) for name in dict.fromkeys(name for row in rows for name in row) if is_known_column(str(name))]
+    columns = {name: np.array([None, *(row.get(name) for row in rows)], object)[1:] for name in names}
+    found = np.empty(len(shapes), object)
+    found[:] = shapes
+    return RoadTable(found, crs_name(graph.graph.get("crs")), columns)
+
+
+def _node_place(graph: Any, node: Any) -> tuple[float, float] | None:
+    data = graph.nodes[node]
+    place = (data["x"], data["y"]) if {"x", "y"} <= data.keys() else node
+    try:
+        x, y = map(float, place if isinstance(place, tuple) else ())
+    except (TypeError, ValueError):
+        return None
+    return x, y
+
+
+def _overpass_elements(path: Path) -> list[Any] | None:
+    """Return the elements of an answer of Overpass as JSON; None: it is another file."""
+    with path.open("rb") as file:
+        if b'"elements"' not in file.read(1 << 16):
+            return None
+    try:
+        answer = json.loads(path.read_bytes())
+    except (ValueError, RecursionError) as error:
+        raise RoadSourceError(f"{path}: not readable as an answer of Overpass: {first_line(error)}") from error
+    elements = answer.get("elements") if isinstance(answer, dict) else None
+    return elements if isinstance(elements, list) else None
+
+
+def _overpass_table(elements: Sequence[Any]) -> RoadTable:
+    """Return the ways with a `highway` tag, whose places stand in them or in nodes anywhere."""
+    import shapely
+
+    known = [one for one in elements if isinstance(one, Mapping)]
+    nodes = {one["id"]: one for one in known if one.get("type") == "node" and isinstance(one.get("id"), int)}
+    shapes: list[Any] = []
+    tags: list[Mapping[str, Any]] = []
+    n_lost = 0
+    for way in known:
+        told = way.get("tags")
+        if not isinstance(told, Mapping) or "highway" not in told or told.get("area") == "yes":
+            continue
+        if way.get("type") != "way":
+            continue
+        try:
+            ends = way.get("geometry") or [nodes.get(node) for node in way.get("nodes") or ()]
+            places = [(float(end["lon"]), float(end["lat"])) for end in ends if end]
+        except (LookupError, TypeError, ValueError, OverflowError):
+            places = []
+        n_lost += len(places) < 2
+        shapes.append(shapely.LineString(places) if len(places) > 1 else None)
+        tags.append(told)
+    columns = {
+        name: np.array([None, *(one.get(name) for one in tags)], object)[1:] for name in ("highway", "tunnel", "name")
+    }
+    found = np.empty(len(shapes), object)
+    found[:] = shapes
+    meta = {"format": "OpenStreetMap", "attribution": OSM_ATTRIBUTION} | ({"without_places": n_lost} if n_lost else {})
+    return RoadTable(found, "EPSG:4326", columns, meta)

@@ -1,0 +1,295 @@
+"""OpenStreetMap's own files, whatever their order, the sign of their ids and their number of versions.
+
+osmium reads them. A PBF file is cut between its blobs, to be looked at before, and to tell how much of it is read.
+"""
+
+from __future__ import annotations
+
+import re
+import zlib
+from array import array
+from collections.abc import Callable, Iterator, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any, BinaryIO
+
+import numpy as np
+
+from roadgeo._arrays import AnyArray, FloatArray, IntArray
+from roadgeo.errors import RoadSourceError
+from roadgeo.sources.lines import OSM_ATTRIBUTION, RoadTable
+from roadgeo.sources.protobuf import WireError, fields
+from roadgeo.sources.unpacking import read_chunks
+from roadgeo.sources.vectors import first_line
+
+__all__ = ["OSM_ENDINGS", "stream_ways"]
+
+OSM_ENDINGS = (".osm.pbf", ".pbf", ".osm", ".osm.gz", ".osm.bz2", ".osm.xml", ".osh", ".osh.gz", ".osh.bz2")
+
+#: PBF files are read in parts of about this size; what may stand in them at most, as their specification says.
+_PART, _MAX_BLOB, _MAX_BLOB_HEADER = 1 << 20, 32 << 20, 64 << 10
+#: Places of nodes are kept in memory up to this size of a PBF file (8 times its size), else on disk.
+_NODES_IN_MEMORY = 100_000_000
+#: An object that JOSM's user has deleted stays in its file.
+_DELETED = re.compile(rb"<way\b(?=[^>]*\baction=[\"']delete)[^>]*\bid=[\"'](-?\d{1,18})[\"']")
+_MOST_TAG = 4096
+
+_Way = tuple[Any, str, str | None, str | None]  # line, highway, tunnel, name
+
+
+def stream_ways(path: Path, most: int, advance: Callable[[float], None], folder: Path) -> Iterator[RoadTable]:
+    """Yield the ways with a `highway` tag that exist, in their newest versions, at most so many at a time.
+
+    Nodes may stand behind ways or be left out where ways bring their places along. Of a way cut off by an extract it is
+    the part whose nodes are there; ways without any are counted.
+
+    Parameters
+    ----------
+    advance : callable
+        Told which share of the file is read.
+    folder : Path
+        Where the places of the nodes of a large file may be kept.
+
+    Raises
+    ------
+    RoadSourceError
+        It is no OpenStreetMap data, is damaged, or unpacks to far more than any map.
+    """
+    import osmium
+
+    try:
+        deleted = set() if _is_pbf(path) else _deleted_ways(path)
+        with osmium.io.Reader(_head(path), osmium.osm.NOTHING) as reader:
+            header = reader.header()
+        stamp = header.get("osmosis_replication_timestamp") or header.get("timestamp")
+        meta = {"format": "OpenStreetMap", "attribution": OSM_ATTRIBUTION} | ({"osm_timestamp": stamp} if stamp else {})
+        ways: list[_Way] = []
+        n_read = n_lost = 0
+        for way, line in _highways(path, header, advance, folder):
+            if way.tags.get("area") == "yes" or not way.visible or way.id in deleted:
+                continue
+            n_read += 1
+            if line is None:
+                n_lost += 1
+                continue
+            tags = way.tags
+            ways.append((line, tags["highway"], tags.get("tunnel"), tags.get("name") or tags.get("ref")))
+            if len(ways) == most:
+                yield _table(ways, n_read, n_lost, meta)
+                ways, n_read, n_lost = [], 0, 0
+        yield _table(ways, n_read, n_lost, meta)
+    except (RuntimeError, OSError, ValueError, MemoryError, osmium.InvalidLocationError) as error:
+        raise RoadSourceError(f"{path}: not readable as OpenStreetMap data: {first_line(error)}") from error
+
+
+def _table(ways: Sequence[_Way], n_read: int, n_lost: int, meta: dict[str, Any]) -> RoadTable:
+    """Make a table of ways, of which some more were read, and some lost for want of places."""
+    import shapely
+
+    shapes, *columns = np.array([*ways, (None,) * 4], object)[:-1].T
+    named = dict(zip(("highway", "tunnel", "name"), columns, strict=True))
+    counts = {"features": n_read} | ({"without_places": n_lost} if n_lost else {})
+    return RoadTable(np.asarray(shapely.from_wkb(shapes)), "EPSG:4326", named, meta | counts)
+
+
+def _highways(path: Path, header: Any, advance: Callable[[float], None], folder: Path) -> Iterator[tuple[Any, Any]]:
+    """Yield each way with a `highway` tag in its newest version, and its line as WKB, or None.
+
+    osmium knows places of nodes by ids above zero, and of any version. Where that will not do there is a census.
+    """
+    import osmium
+
+    kept = "flex_mem" if path.stat().st_size <= _NODES_IN_MEMORY else f"sparse_file_array,{folder}/nodes"
+    places = osmium.NodeLocationsForWays(osmium.index.create_map(kept))
+    places.ignore_errors()
+    pool, factory = osmium.io.ThreadPool(), osmium.geom.WKBFactory()
+    # What is handed to osmium is kept alive here: its iterators do not do so.
+    filters = osmium.filter.EntityFilter(osmium.osm.WAY), osmium.filter.KeyFilter("highway")
+    features = {header.get(f"pbf_optional_feature_{n}") for n in range(4)}
+    is_plain = _is_pbf(path) and not header.has_multiple_object_versions and "LocationsOnWays" not in features
+    census = None if is_plain else _Census.of(path, pool)
+    if is_plain:
+        for part, share in _parts(path):
+            with osmium.io.Reader(part, osmium.osm.NODE, thread_pool=pool) as reader:
+                osmium.apply(reader, places)
+            advance(share / 2)
+    for part, share in _parts(path):
+        with osmium.io.Reader(part, osmium.osm.WAY, thread_pool=pool) as reader:
+            way: Any
+            for way in osmium.OsmFileIterator(reader, *filters, *([places] if is_plain else [])):
+                if census is None and any(node.ref < 0 for node in way.nodes):
+                    census = _Census.of(path, pool)
+                if census is None or (way.id, way.version) not in census.old_ways:
+                    yield way, _way_shape(way, factory, census)
+        advance((1 + share) / 2)
+
+
+def _way_shape(way: Any, factory: Any, census: _Census | None) -> Any:
+    """Return a way as WKB, of the nodes whose places are known; None where these are fewer than two different ones."""
+    import osmium
+    import shapely
+
+    try:
+        return factory.create_linestring(way)
+    except (RuntimeError, osmium.InvalidLocationError):  # fewer than two different nodes, or some without a place
+        nodes = list(way.nodes)
+    own = [node.location.valid() for node in nodes]
+    found = census.places([node.ref for node in nodes]) if census else np.full((len(nodes), 2), np.nan)
+    for k in np.flatnonzero(own):
+        found[k] = nodes[k].location.lon, nodes[k].location.lat
+    known = found[np.isfinite(found).all(axis=1)]
+    return shapely.to_wkb(shapely.LineString(known)) if len(np.unique(known, axis=0)) > 1 else None
+
+
+@dataclass(frozen=True)
+class _Census:
+    """Where all nodes of a file lie in their newest versions, and which versions of ways are no longer true.
+
+    Attributes
+    ----------
+    ids : (N,) int64, ascending
+    xy : (N, 2) int32, degrees times ten million
+    old_ways : set of (id, version)
+    """
+
+    ids: IntArray
+    xy: AnyArray
+    old_ways: set[tuple[int, int]]
+
+    @classmethod
+    def of(cls, path: Path, pool: Any) -> _Census:
+        """Go through a file once."""
+        import osmium
+
+        nodes, xy, ways = array("q"), array("i"), array("q")
+        for part, _ in _parts(path):
+            one: Any
+            for one in osmium.FileProcessor(part, osmium.osm.NODE | osmium.osm.WAY, pool):
+                if one.is_way():
+                    ways.extend((one.id, one.version))
+                else:
+                    nodes.extend((one.id, one.version))
+                    xy.extend((one.location.x, one.location.y))
+        kept, _ = _newest(nodes)
+        _, old = _newest(ways)
+        ids = np.frombuffer(nodes, np.int64).reshape(-1, 2)[kept, 0] if nodes else np.empty(0, np.int64)
+        places = np.frombuffer(xy, np.int32).reshape(-1, 2)[kept] if xy else np.empty((0, 2), np.int32)
+        return cls(ids, places, old)
+
+    def places(self, refs: Sequence[int]) -> FloatArray:
+        """Return longitudes and latitudes of nodes; (n, 2), NaN where they are not known."""
+        found = np.full((len(refs), 2), np.nan)
+        if len(self.ids):
+            at = np.minimum(np.searchsorted(self.ids, refs), len(self.ids) - 1)
+            known = (self.ids[at] == refs) & (np.abs(self.xy[at]) <= (1_800_000_000, 900_000_000)).all(axis=1)
+            found[known] = self.xy[at[known]] / 1e7
+        return found
+
+
+def _newest(objects: array[int]) -> tuple[IntArray, set[tuple[int, int]]]:
+    """Return of pairs (id, version) the place of the newest of each id, by id, and the pairs that are older."""
+    pairs = np.frombuffer(objects, np.int64).reshape(-1, 2) if objects else np.empty((0, 2), np.int64)
+    order = np.lexsort((pairs[:, 1], pairs[:, 0]))
+    ids, versions = pairs[order].T
+    last = np.append(ids[1:] != ids[:-1], True)[: len(ids)]
+    older = np.flatnonzero(~last)
+    older = older[versions[older] < versions[np.searchsorted(ids, ids[older], side="right") - 1]]
+    return order[last], set(map(tuple, pairs[order[older]].tolist()))
+
+
+def _deleted_ways(path: Path) -> set[int]:
+    """Return the ids of the ways that JOSM's user has deleted: they stay in its files. And bound what is unpacked."""
+    found, tail = set(), b""
+    for chunk in read_chunks(path):
+        text = tail + chunk
+        if b"delete" in text:
+            found |= {int(number) for number in _DELETED.findall(text)}
+        tail = text[-_MOST_TAG:]
+    return found
+
+
+# --- PBF --------------------------------------------------------------------------------------------------------------
+
+
+def _is_pbf(path: Path) -> bool:
+    return path.name.lower().endswith(".pbf")
+
+
+def _head(path: Path) -> Any:
+    """Return what osmium is to read for a file's header: of a damaged PBF file on disk it forgets to close it."""
+    import osmium
+
+    if not _is_pbf(path):
+        return str(path)
+    with path.open("rb") as file:
+        return osmium.io.FileBuffer(_read_blob(file), "pbf")
+
+
+def _parts(path: Path) -> Iterator[tuple[Any, float]]:
+    """Yield what osmium is to read one after another, and the share of the file that is read then.
+
+    A PBF file is a row of blobs, the first of them a header, each with a header of its own. It is cut between them,
+    for osmium does not tell how far it is. Other files are left whole.
+    """
+    import osmium
+
+    if not _is_pbf(path):
+        yield str(path), 1.0
+        return
+    size = path.stat().st_size
+    with path.open("rb") as file:
+        header = _read_blob(file)
+        while file.tell() < size:
+            part = bytearray()
+            while len(part) < _PART and file.tell() < size:
+                part += _read_blob(file)
+            yield osmium.io.FileBuffer(header + part, "pbf"), file.tell() / size
+
+
+def _read_blob(file: BinaryIO) -> bytes:
+    """Read one blob of a PBF file, the header before it, and the size of that before both.
+
+    Raises
+    ------
+    RuntimeError
+        As osmium does: it is cut off, or there is none.
+    """
+    prefix = file.read(4)
+    header = file.read(min(int.from_bytes(prefix, "big"), _MAX_BLOB_HEADER))
+    try:
+        sizes = [value for field, value in fields(memoryview(header)) if field == 3 and isinstance(value, int)]
+        blob = file.read(sizes[0]) if len(sizes) == 1 and sizes[0] <= _MAX_BLOB else b""
+        if len(prefix) < 4 or len(header) != int.from_bytes(prefix, "big") or sizes != [len(blob)]:
+            raise RuntimeError("it is cut off, damaged or no PBF file")
+        _require_text(blob)
+    except WireError as error:
+        raise RuntimeError("it is cut off, damaged or no PBF file") from error
+    return prefix + header + blob
+
+
+def _require_text(blob: bytes) -> None:
+    """Refuse a blob with a zero byte in a text: osmium takes it for the end of that, and reads on beyond all texts.
+
+    Raises
+    ------
+    RuntimeError, WireError
+        There is one; or the blob is compressed in another way than with zlib, so that it cannot be looked at.
+    """
+    for field, table in fields(memoryview(_unpacked(blob))):
+        # Zero bytes are rare, but for the length of the empty text that every table begins with.
+        if field == 1 and not isinstance(table, int) and table[2:].tobytes().count(0):
+            for _, text in fields(table):
+                if not isinstance(text, int) and text.tobytes().count(0):
+                    raise RuntimeError("it is damaged: a text in it holds a zero byte")
+
+
+def _unpacked(blob: bytes) -> bytes:
+    """Return what is in a blob: of its fields 1 is that as it is, 3 what zlib made of it; there is but one."""
+    contents = [(field, content) for field, content in fields(memoryview(blob)) if not isinstance(content, int)]
+    if len(contents) != 1 or contents[0][0] not in {1, 3}:
+        raise RuntimeError("a part of it is not compressed by zlib; write it with that, as osmium does by default")
+    ((field, content),) = contents
+    try:
+        return content.tobytes() if field == 1 else zlib.decompressobj().decompress(content, _MAX_BLOB + 1)
+    except zlib.error as error:
+        raise RuntimeError("it is damaged: a part of it cannot be unpacked") from error

@@ -1,0 +1,550 @@
+"""The page in Chromium: pictures are dropped and located, refusals are helped, by mouse, by keys and on a phone."""
+
+import json
+import threading
+from contextlib import contextmanager
+from dataclasses import replace
+from pathlib import Path
+
+import cv2
+import numpy as np
+import pytest
+from playwright.sync_api import expect, sync_playwright
+from support.browser import find_chromium
+
+from roadgeo.evaluation.landscape import Landscape
+from roadgeo.evaluation.noise import NOISE_MODELS
+from roadgeo.evaluation.simulation import SimulationOptions, ViewOptions, simulate_query
+from roadgeo.geometry.projection import to_lonlat
+from roadgeo.location import Location, Place, Reason
+from roadgeo.reference.reference import Reference
+from roadgeo.running.serving.options import ServeOptions
+from roadgeo.running.serving.server import Server
+from roadgeo.running.serving.workers import Full, _answer
+from roadgeo.running.serving.workers import Place as Seat
+from roadgeo.workflows import locate
+
+VIEW = ViewOptions(size_px=(900, 900), gsd_m=(1.0, 1.0), heading_deg=(0.0, 360.0), intersections=(25, 1000))
+FLAGS = [
+    "--headless", "--no-sandbox", "--disable-gpu", "--disable-background-networking", "--disable-component-update",
+    "--disable-sync", "--no-first-run", "--disable-dev-shm-usage", "--enable-unsafe-swiftshader",
+]  # fmt: skip
+PATIENCE_MS = 60_000
+
+
+class Direct:
+    """Answers as processes do, in the thread that asks: a name that holds "hard" is located with a hint only."""
+
+    def __init__(self, references):
+        self.references, self.asked = references, []
+        self.places, self.goes_on = threading.Semaphore(3), threading.Event()
+        self.goes_on.set()
+
+    def take_place(self):
+        if not self.places.acquire(blocking=False):
+            raise Full
+        return Seat(self.places)
+
+    def ask(self, asked, say=None, called_off=None):
+        self.asked.append(asked)
+        if asked.wanted:
+            return _answer(asked, self.references)
+        say("finding roads", 0.5)
+        while not self.goes_on.wait(0.02) and not called_off.is_set():
+            pass
+        return _answer(asked, self.references, say)
+
+    def close(self):
+        pass
+
+
+@pytest.fixture(scope="module")
+def served(town, tmp_path_factory):
+    """A server of a town, its workers, a mask of it, and where that lies."""
+    network, index = town
+    query = simulate_query(Landscape.from_network(network), SimulationOptions(VIEW, NOISE_MODELS["clean"]), 0)
+    mask = tmp_path_factory.mktemp("page") / "mask.png"
+    cv2.imwrite(str(mask), query.mask)
+    workers = Direct([Reference(index, network)])
+    lonlat = to_lonlat(index.plane.crs, np.array([query.truth.center]))[0]
+    with serving(workers) as server:
+        yield server, workers, mask, lonlat
+
+
+@contextmanager
+def serving(workers, **options):
+    server = Server(workers, workers.references, ServeOptions(port=0, workers=2, waiting=4, **options))
+    thread = threading.Thread(target=server.serve_forever, daemon=True)
+    thread.start()
+    try:
+        yield server
+    finally:
+        server.shutdown()
+        thread.join()
+        server.close()
+
+
+@pytest.fixture(scope="module")
+def chromium():
+    executable = find_chromium()
+    with sync_playwright() as started, started.chromium.launch(executable_path=executable, args=FLAGS) as browser:
+        yield browser
+
+
+@contextmanager
+def opened(chromium, server, *, width=1280, height=800, phone=False):
+    """The page in a session of its own; nothing may have complained in the end, and nothing been asked elsewhere."""
+    viewport = {"width": width, "height": height}
+    context = chromium.new_context(viewport=viewport, has_touch=phone, is_mobile=phone, reduced_motion="reduce")
+    page, said, asked = context.new_page(), [], []
+    context.set_default_timeout(PATIENCE_MS)
+    page.on("console", lambda told: said.append(told.text) if told.type == "error" else None)
+    page.on("pageerror", lambda error: said.append(str(error)))
+    page.on("dialog", lambda dialog: (said.append(dialog.message), dialog.dismiss()))
+    page.on("request", lambda request: asked.append(request.url))
+    try:
+        page.goto(f"http://127.0.0.1:{server.server_port}/")
+        page.wait_for_selector("#drop, #token:not([hidden])")
+        yield page
+        assert [text for text in said if "status of 503" not in text] == []  # to come again is no fault
+        assert {url.split("/")[2] for url in asked if url.startswith("http")} == {f"127.0.0.1:{server.server_port}"}
+    finally:
+        context.close()
+
+
+@pytest.fixture
+def page(served, chromium):
+    server, workers, _, _ = served
+    workers.asked.clear()
+    workers.goes_on.set()
+    with opened(chromium, server) as page:
+        yield page
+
+
+@pytest.fixture
+def phone(served, chromium):
+    with opened(chromium, served[0], width=390, height=844, phone=True) as page:
+        yield page
+
+
+@pytest.fixture
+def hard(monkeypatch):
+    """Masks that are called hard are refused without a hint, and those that are called twins lie at two places."""
+
+    def judge(mask, references, options):
+        found = locate(mask, references, options)
+        if options.near is not None or options.match.within is not None:
+            return found
+        if "hard" in mask.name:
+            refused = Location(mask.name, "not_located", "no place stands out", "town", seen=found.seen)
+            return replace(refused, size=found.size, reason_code=Reason.NOTHING_STANDS_OUT)
+        if "twins" in mask.name:
+            twin = Place(found.center.x + 900, found.center.y, found.center.lon + 0.01, found.center.lat, 5.0)
+            return replace(found, status="ambiguous", reason="two places fit", runner_up=twin, alternatives=(twin,))
+        return found
+
+    monkeypatch.setattr("roadgeo.workflows.locate", judge)
+
+
+def give(page, path, name=None):
+    page.set_input_files("#files", {"name": name or path.name, "mimeType": "image/png", "buffer": path.read_bytes()})
+
+
+def wait_for(page, word):
+    expect(page.locator("#status")).to_have_text(word, timeout=PATIENCE_MS)
+
+
+def look_at(page, lonlat, zoom=15):
+    """Move the map; the page's own module tells which it is."""
+    page.evaluate(
+        "([center, zoom]) => import('/page/map.mjs').then((map) => { map.theMap().jumpTo({ center, zoom }); })",
+        [[float(value) for value in lonlat], zoom],
+    )
+
+
+def on_map(page, lonlat):
+    """Where a place is in the window."""
+    return page.evaluate(
+        """(place) => import('/page/map.mjs').then((map) => {
+            const { x, y } = map.theMap().project(place);
+            return [x, y];
+        })""",
+        [float(value) for value in lonlat],
+    )
+
+
+def test_what_is_dropped_is_located_and_shown(page, served):
+    _, workers, mask, lonlat = served
+    workers.goes_on.clear()
+    dropped = page.evaluate_handle(
+        """(bytes) => {
+            const held = new DataTransfer();
+            held.items.add(new File([new Uint8Array(bytes)], "mask.png", { type: "image/png" }));
+            return held;
+        }""",
+        list(mask.read_bytes()),
+    )
+    page.dispatch_event("#map", "dragover", {"dataTransfer": dropped})
+    expect(page.locator("#drag")).to_be_visible()
+    page.dispatch_event("#map", "drop", {"dataTransfer": dropped})
+    wait_for(page, "Working")
+    expect(page.locator("#step")).to_have_text("Finding roads.")
+    assert page.locator("progress").get_attribute("value") == "50"
+    workers.goes_on.set()
+    wait_for(page, "Located")
+    told = [float(number) for number in page.locator("#facts button").inner_text().split(",")]
+    assert told == pytest.approx([lonlat[1], lonlat[0]], abs=1e-4)
+    expect(page.locator("#said")).to_contain_text("mask.png: Located.")
+    # On the map: the picture, its outline, the roads.
+    shown = """import('/page/map.mjs').then(async (module) => {
+        const map = module.theMap();
+        while (!map.loaded()) await new Promise((done) => setTimeout(done, 50));
+        const drawn = (layer) => map.queryRenderedFeatures({ layers: [layer] }).length > 0;
+        return [drawn('road-0'), drawn('outline'), map.getBounds().toArray()];
+    })"""
+    roads, outline, ((west, south), (east, north)) = page.evaluate(shown)
+    assert roads
+    assert outline
+    assert west < lonlat[0] < east
+    assert south < lonlat[1] < north
+
+
+def test_a_place_is_looked_at_from_all_sides(page, served):
+    give(page, served[2])
+    wait_for(page, "Located")
+    page.locator("#opacity").fill("30")
+    page.uncheck("#show-roads")
+    page.check("#show-matches")
+    page.check("#show-swipe")
+    page.focus("#swipe")
+    page.keyboard.press("ArrowRight")
+    expect(page.locator("#swipe")).to_have_attribute("aria-valuenow", "55")
+    assert "55%" in page.evaluate("document.getElementById('over').style.clipPath")
+    page.mouse.move(1280 * 0.55, 400)
+    page.mouse.down()
+    page.mouse.move(900, 400, steps=3)
+    page.mouse.up()
+    expect(page.locator("#swipe")).to_have_attribute("aria-valuenow", "70")
+    # A matched crossing tells its residual.
+    page.uncheck("#show-swipe")
+    where = page.locator("#photo").get_attribute("src").replace("picture.jpg", "view.json")
+    first = page.evaluate("(where) => fetch(where).then((answer) => answer.json())", where)
+    page.mouse.click(*on_map(page, first["place"]["matches"][0]["map"]))
+    expect(page.locator(".maplibregl-popup")).to_contain_text(f"{first['place']['matches'][0]['residual_m']:.1f} m")
+
+
+def test_every_output_may_be_had(page, served):
+    give(page, served[2], "My mask (1).png")
+    wait_for(page, "Located")
+    page.click("#files-of summary")
+    links = page.locator("#files-of a")
+    expect(links.nth(0)).to_be_visible()
+    names = {}
+    for k in range(links.count()):
+        with page.expect_download() as download:
+            links.nth(k).click()
+        names[links.nth(k).inner_text().split("\n")[0]] = download.value
+    assert names["footprint"].suggested_filename == "My_mask_1_footprint.tif"
+    assert {"geopackage", "json", "report", "geojson", "kmz", "gcps"} <= set(names)
+    document = json.loads(Path(names["json"].path()).read_text())
+    assert (document["status"], document["query"]) == ("located", "My mask (1).png")
+    assert Path(names["footprint"].path()).read_bytes()[:2] == b"II"
+
+
+def test_a_refusal_is_helped_by_a_circle(page, served, hard):
+    _, workers, mask, lonlat = served
+    give(page, mask, "hard.png")
+    wait_for(page, "Not located")
+    expect(page.locator("#hints")).to_be_visible()
+    look_at(page, lonlat)
+    page.click("#draw-circle")
+    x, y = on_map(page, lonlat)
+    page.mouse.move(x, y)
+    page.mouse.down()
+    page.mouse.move(x + 60, y, steps=3)
+    page.mouse.up()
+    wait_for(page, "Located")
+    assert workers.asked[-1].hints["near"][:2] == pytest.approx(tuple(lonlat), abs=1e-4)
+    assert 50 < workers.asked[-1].hints["near"][2] < 1000
+
+
+def test_a_refusal_is_helped_by_a_box(page, served, hard):
+    _, workers, mask, lonlat = served
+    give(page, mask, "hard.png")
+    wait_for(page, "Not located")
+    look_at(page, lonlat)
+    page.click("#draw-box")
+    x, y = on_map(page, lonlat)
+    page.mouse.move(x - 80, y + 80)
+    page.mouse.down()
+    page.mouse.move(x + 80, y - 80, steps=3)
+    page.mouse.up()
+    wait_for(page, "Located")
+    west, south, east, north = workers.asked[-1].hints["within"]
+    assert west < lonlat[0] < east
+    assert south < lonlat[1] < north
+
+
+def test_one_of_two_places_is_chosen(page, served, hard):
+    _, workers, mask, lonlat = served
+    give(page, mask, "twins.png")
+    wait_for(page, "Two places")
+    expect(page.locator("#map .pin.place")).to_have_count(2)
+    page.click("#places li:first-child button")
+    wait_for(page, "Located")
+    assert workers.asked[-1].hints["near"][:2] == pytest.approx(tuple(lonlat), abs=1e-4)
+    assert workers.asked[-1].hints["near"][2] < 450
+
+
+def test_two_points_tell_where_it_is_and_how_large_a_pixel(page, served, hard):
+    _, workers, mask, lonlat = served
+    give(page, mask, "hard.png")
+    wait_for(page, "Not located")
+    look_at(page, lonlat)
+    page.click("#pick")
+    box, pixels = page.locator("#photo").bounding_box(), np.array([(250.0, 300.0), (700.0, 500.0)])
+    place = locate(str(mask), workers.references)
+    first, second = to_lonlat(place.crs, place.pixel_to_map(pixels))
+    (x, y), (u, v) = (box["x"], box["y"]) + pixels / 900 * (box["width"], box["height"])
+    page.mouse.click(x, y)
+    expect(page.locator("#asks")).to_contain_text("on the map")
+    page.mouse.click(*on_map(page, first))
+    # The other is carried over.
+    page.mouse.click(u, v)
+    expect(page.locator("#points .pin")).to_have_count(2)
+    page.mouse.move(u, v)
+    page.mouse.down()
+    page.mouse.move(u + 200, v, steps=3)
+    page.mouse.move(*on_map(page, second), steps=3)
+    page.mouse.up()
+    wait_for(page, "Located")
+    hints = workers.asked[-1].hints
+    assert hints["near"][:2] == pytest.approx(tuple(lonlat), abs=2e-4)
+    assert hints["gsd_m"][0] < 1.0 < hints["gsd_m"][1]
+    expect(page.locator("#map .pin.mapped")).to_have_count(2)
+
+
+def test_what_is_known_of_the_camera_is_asked_with(page, served, hard):
+    _, workers, mask, lonlat = served
+    give(page, mask, "hard.png")
+    wait_for(page, "Not located")
+    page.fill("#height", "900")
+    page.click("#again")
+    expect(page.locator("#hint-trouble")).to_have_text("Give both the height and the lens.")
+    for field, value in {
+        "lens": "36",
+        "tilt": "20",
+        "near-lat": lonlat[1],
+        "near-lon": lonlat[0],
+        "near-km": 3,
+    }.items():
+        page.fill(f"#{field}", str(value))
+    page.click("#again")
+    wait_for(page, "Located")
+    hints = workers.asked[-1].hints
+    assert (hints["focal_px"], hints["max_tilt_deg"], hints["near"][2]) == (900.0, 20.0, 3000.0)
+    assert hints["gsd_m"] == pytest.approx((0.8, 1.25))
+
+
+def test_it_is_all_done_by_keys(page, served, hard):
+    _, _, mask, lonlat = served
+    page.keyboard.press("Tab")
+    assert page.evaluate("document.activeElement.className") == "skip"
+    page.keyboard.press("Enter")
+    page.keyboard.press("Tab")
+    assert page.evaluate("document.activeElement.id") == "files"
+    give(page, mask, "hard.png")
+    wait_for(page, "Not located")
+    page.focus("#near-lat")
+    for value in (lonlat[1], lonlat[0], 2):
+        page.keyboard.type(str(value))
+        page.keyboard.press("Tab")
+    page.keyboard.press("Shift+Tab")
+    page.keyboard.press("Enter")
+    wait_for(page, "Located")
+
+
+def test_points_are_chosen_by_keys(page, served, hard):
+    _, workers, mask, lonlat = served
+    give(page, mask, "hard.png")
+    wait_for(page, "Not located")
+    page.focus("#pick")
+    page.keyboard.press("Enter")
+    place = locate(str(mask), workers.references)
+    for key, pixel in {"ArrowLeft": (405.0, 450.0), "ArrowUp": (405.0, 405.0)}.items():
+        page.focus("#photo")
+        page.keyboard.press(f"Shift+{key}")
+        page.keyboard.press("Enter")
+        assert page.evaluate("document.activeElement.className").startswith("maplibregl-canvas")
+        look_at(page, to_lonlat(place.crs, place.pixel_to_map(np.array([pixel])))[0], 17)
+        page.focus("#take-middle")
+        page.keyboard.press("Enter")
+    wait_for(page, "Located")
+    assert workers.asked[-1].hints["near"][:2] == pytest.approx(tuple(lonlat), abs=2e-4)
+
+
+def test_a_file_that_is_too_large_is_not_sent(served, chromium, tmp_path):
+    (tmp_path / "large.png").write_bytes(served[2].read_bytes() + bytes(3_000_000))
+    with serving(served[1], max_bytes=2_000_000) as server, opened(chromium, server) as page:
+        page.set_input_files("#files", str(tmp_path / "large.png"))
+        wait_for(page, "Failed")
+        expect(page.locator("#reason")).to_have_text("The file has 3 MB, this server takes 2 MB: reduce it.")
+
+
+def test_several_are_taken_and_kept_for_the_session(page, served, hard):
+    mask = served[2]
+    names = [f"mask {k}.png" for k in range(4)]  # more than there are places
+    page.set_input_files(
+        "#files", [{"name": name, "mimeType": "image/png", "buffer": mask.read_bytes()} for name in names]
+    )
+    expect(page.locator("#session small.located")).to_have_count(4, timeout=PATIENCE_MS)
+    page.reload()
+    expect(page.locator("#session small.located")).to_have_count(4, timeout=PATIENCE_MS)
+    page.click("#session li:last-child button")
+    expect(page.locator("#answer-name")).to_have_text("mask 3.png")
+
+
+def test_a_search_is_called_off(page, served):
+    _, workers, mask, _ = served
+    workers.goes_on.clear()
+    give(page, mask)
+    expect(page.locator("#step")).to_have_text("Finding roads.")
+    page.click("#cancel")
+    wait_for(page, "Cancelled")
+    workers.goes_on.set()
+
+
+def test_names_are_text_and_faults_are_said(page, served, tmp_path):
+    picture = tmp_path / "black.png"
+    cv2.imwrite(str(picture), np.zeros((50, 50), np.uint8))
+    name = "<img src=x onerror=alert(1)>.png"
+    give(page, picture, name)
+    wait_for(page, "Failed")
+    assert page.locator("#answer-name").inner_text() == name
+    assert page.locator("#reason").inner_text()
+    assert page.locator("#answer img[src=x]").count() == 0
+
+
+NAMELESS = """() => [...document.querySelectorAll('button, a, input, img, [role=slider], progress')]
+    .filter((one) => one.checkVisibility() && !one.closest('[aria-hidden=true], .maplibregl-ctrl-attrib'))
+    .filter((one) => !one.getAttribute('aria-label') && !one.title && !one.innerText && !one.labels?.length)
+    .filter((one) => one.alt == null)
+    .map((one) => one.outerHTML)"""
+
+FAINT = """() => {
+    const parse = (text) => text.match(/[\\d.]+/g).map(Number);
+    const light = ([r, g, b]) => [r, g, b].map((v) => v / 255)
+        .map((v) => (v <= 0.03928 ? v / 12.92 : ((v + 0.055) / 1.055) ** 2.4))
+        .reduce((sum, v, i) => sum + v * [0.2126, 0.7152, 0.0722][i], 0);
+    const ground = (one) => {
+        for (let at = one; at; at = at.parentElement) {
+            const color = parse(getComputedStyle(at).backgroundColor);
+            if (color.length < 4 || color[3] > 0.8) return color;
+        }
+        return [255, 255, 255];
+    };
+    return [...document.querySelectorAll('#panel *')]
+        .filter((one) => one.checkVisibility())
+        .filter((one) => [...one.childNodes].some((node) => node.nodeType === 3 && node.data.trim()))
+        .map((one) => {
+            const [a, b] = [light(parse(getComputedStyle(one).color)), light(ground(one))];
+            return [one.outerHTML.slice(0, 80), (Math.max(a, b) + 0.05) / (Math.min(a, b) + 0.05)];
+        }).filter(([, ratio]) => ratio < 4.5);
+}"""
+
+
+def require_usable(page):
+    assert page.evaluate(NAMELESS) == []
+    assert page.evaluate(FAINT) == []
+
+
+def test_everything_has_a_name_and_can_be_read(page, served, hard):
+    mask = served[2]
+    require_usable(page)
+    give(page, mask)
+    wait_for(page, "Located")
+    page.click("#help summary")
+    page.click("#files-of summary")
+    page.check("#show-swipe")
+    require_usable(page)
+    give(page, mask, "twins.png")
+    wait_for(page, "Two places")
+    require_usable(page)
+    # What a screen reader is told.
+    expect(page.locator("#panel")).to_match_aria_snapshot("""
+      - heading "roadgeo" [level=1]
+      - article "twins.png":
+        - heading "twins.png" [level=2]
+        - region "Places that fit"
+        - group "On the map":
+          - slider "Opacity of the photograph"
+          - checkbox "Swipe"
+          - checkbox "Roads seen" [checked]
+    """)
+
+
+def test_it_serves_on_a_phone(phone, served, hard):
+    _, workers, mask, lonlat = served
+    workers.goes_on.set()
+    give(phone, mask, "hard.png")
+    wait_for(phone, "Not located")
+    assert phone.evaluate("document.documentElement.scrollWidth") <= 390
+    small = """() => [...document.querySelectorAll('#panel button, #panel input:not([type=file]), summary')]
+        .filter((one) => one.checkVisibility()).map((one) => [one.id, one.getBoundingClientRect().height])
+        .filter(([id, height]) => height < 16)"""
+    assert phone.evaluate(small) == []
+    require_usable(phone)
+    look_at(phone, lonlat, 14)
+    phone.locator("#draw-circle").tap()
+    phone.wait_for_timeout(200)
+    phone.touchscreen.tap(*on_map(phone, lonlat))  # a touch without a movement takes a fifth of what is seen
+    wait_for(phone, "Located")
+    assert phone.locator("#map").bounding_box()["height"] > 400
+
+
+def test_a_token_is_asked_for_once(served, chromium):
+    workers = served[1]
+    with serving(workers, token="open sesame") as server:
+        context = chromium.new_context()
+        try:
+            page = context.new_page()
+            page.goto(f"http://127.0.0.1:{server.server_port}/")
+            page.fill("#token-text", "guess")
+            page.press("#token-text", "Enter")
+            expect(page.locator("#token .bad")).to_have_text("This is not the token.")
+            page.fill("#token-text", "open sesame")
+            page.press("#token-text", "Enter")
+            page.wait_for_selector("#drop")
+            give(page, served[2])
+            wait_for(page, "Located")
+            (cookie,) = context.cookies()
+            assert (cookie["httpOnly"], cookie["sameSite"]) == (True, "Strict")
+            assert "sesame" not in cookie["value"]
+        finally:
+            context.close()
+
+
+def test_a_browser_that_draws_no_map_tells_places(served, chromium):
+    flags = [*(flag for flag in FLAGS if "swiftshader" not in flag), "--disable-3d-apis"]
+    with chromium.browser_type.launch(executable_path=find_chromium(), args=flags) as browser:
+        page = browser.new_page()
+        page.goto(f"http://127.0.0.1:{served[0].server_port}/")
+        expect(page.locator("#trouble")).to_contain_text("cannot draw the map")
+        give(page, served[2])
+        wait_for(page, "Located")
+        expect(page.locator("#facts")).to_contain_text("Middle")
+
+
+def test_a_basemap_is_asked_where_the_user_said(served, chromium):
+    workers, asked = served[1], []
+    with serving(workers, basemap="http://127.0.0.1:9/{z}/{x}/{y}.png", basemap_attribution="<b>Me</b>") as server:
+        context = chromium.new_context()
+        page = context.new_page()
+        page.on("request", lambda request: asked.append(request.url))
+        page.goto(f"http://127.0.0.1:{server.server_port}/")
+        expect(page.locator(".maplibregl-ctrl-attrib")).to_contain_text("<b>Me</b>")
+        page.wait_for_timeout(500)
+        context.close()
+    elsewhere = [url for url in asked if f":{server.server_port}/" not in url and url.startswith("http")]
+    assert elsewhere
+    assert all(url.startswith("http://127.0.0.1:9/") for url in elsewhere)

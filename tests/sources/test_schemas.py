@@ -1,0 +1,167 @@
+"""Tables of all schemas, in all containers, give the same roads."""
+
+import logging
+
+import numpy as np
+import pytest
+import shapely
+from worlds.fenway import write_vector
+from worlds.schemas import SCHEMAS, expected, frame, table
+
+from roadgeo.errors import NoRoadsError, RoadSourceError
+from roadgeo.geometry.projection import from_lonlat
+from roadgeo.sources.held_roads import choose_roads
+from roadgeo.sources.lines import OSM_ATTRIBUTION, RoadTable
+from roadgeo.sources.roads import read_roads
+from roadgeo.sources.schemas import recognise
+
+CONTAINERS = ["gpkg", "shp", "geojson", "fgb", "parquet", "frame", "folder", "zip", "geojson.gz"]
+
+
+def column(*values):
+    array = np.empty(len(values), object)
+    array[:] = values
+    return array
+
+
+def roads_of(schema, container, folder, **options):
+    """Write a table, and read its roads."""
+    shapes, columns = table(schema)
+    if container == "frame":
+        return choose_roads(frame(schema), **options)
+    if container == "parquet":
+        frame(schema).to_parquet(folder / "roads.parquet")
+        return read_roads(folder / "roads.parquet", **options)
+    if container == "geojson.gz":
+        import gzip
+
+        write_vector(folder / "roads.geojson", shapes, **columns)
+        (folder / "roads.geojson.gz").write_bytes(gzip.compress((folder / "roads.geojson").read_bytes()))
+        return read_roads(folder / "roads.geojson.gz", **options)
+    if container in ("folder", "zip"):
+        (folder / "map").mkdir()
+        write_vector(folder / "map" / "roads.shp", shapes, **columns)
+        write_vector(folder / "map" / "houses.shp", [shapely.box(0, 0, 1, 1)], type=["house"])
+        write_vector(folder / "map" / "fences.shp", shapes[-1:], height=[2])
+        if container == "folder":
+            return read_roads(folder / "map", **options)
+        import shutil
+
+        return read_roads(shutil.make_archive(str(folder / "a"), "zip", folder / "map"), **options)
+    return read_roads(write_vector(folder / f"roads.{container}", shapes, **columns), **options)
+
+
+@pytest.mark.filterwarnings("ignore:Normalized")
+@pytest.mark.parametrize("container", CONTAINERS)
+@pytest.mark.parametrize("schema", SCHEMAS)
+def test_every_table_in_every_container_gives_the_same_roads(tmp_path, schema, container):
+    found = roads_of(schema, container, tmp_path)
+    right = [shapely.transform(line, lambda xy: from_lonlat(found.plane, xy)) for line in expected(schema)]
+    assert len(found) == len(right)
+    tree = shapely.STRtree(right)
+    at, _ = tree.query_nearest(found.lines, max_distance=0.01, all_matches=False)
+    assert len(at) == len(right)
+    assert shapely.length(found.lines).sum() == pytest.approx(shapely.length(right).sum(), rel=1e-6)
+    (source,) = found.meta["sources"]
+    assert source["kinds_known"]
+
+
+def test_main_roads_of_every_schema(tmp_path):
+    for schema in SCHEMAS:
+        main = {"tiger": ("primary",), "nvdb": ("primary", "secondary")}.get(
+            schema, ("primary", "secondary", "tertiary")
+        )
+        assert len(choose_roads(frame(schema), "main")) == len(expected(schema, main)), schema
+
+
+@pytest.mark.parametrize(
+    ("columns", "attribution"),
+    [
+        ({"highway": ["residential"]}, ""),
+        ({"highway": ["residential"], "osm_id": ["1"]}, OSM_ATTRIBUTION),
+        ({"fclass": ["residential"], "osm_id": ["1"]}, OSM_ATTRIBUTION),
+        (
+            {"class": ["residential"], "subtype": ["road"]},
+            "© OpenStreetMap contributors, Overture Maps Foundation, ODbL 1.0",
+        ),
+        ({"MTFCC": ["S1400"]}, "U.S. Census Bureau, TIGER/Line"),
+        ({"nature": ["Sentier"]}, "© IGN, Licence Ouverte 2.0"),
+        ({"width": ["4"]}, ""),
+    ],
+)
+def test_whom_to_name(columns, attribution):
+    shapes = column(shapely.LineString([(0, 0), (1, 1)]))
+    made = RoadTable(shapes, None, {name: column(*values) for name, values in columns.items()})
+    assert recognise(made).adapt(made).meta.get("attribution", "") == attribution
+
+
+@pytest.mark.parametrize(
+    ("columns", "kinds"),
+    [
+        ({"road_kind": ["residential", "footway", None]}, ["residential", "footway", None]),  # a column of any name
+        ({"surface": ["asphalt", "gravel", "residential"]}, None),
+        ({"type": ["A", "B", "residential"]}, None),
+        ({"highway": ["something_new", "residential", "residential"]}, ["something_new", "residential", "residential"]),
+        ({"highway": ["construction", "residential", "service"]}, ["residential", "service"]),
+        ({"highway": ["residential", None, ""], "name": ["a", "b", "c"]}, ["residential"]),
+        ({"railway": ["rail", None, "no"]}, None),
+        ({"highway": [None, None, None], "waterway": ["river", None, None]}, []),
+        (
+            {"highway": ["residential", "service", "pedestrian"], "area": [None, "no", "yes"]},
+            ["residential", "service"],
+        ),
+        ({"tags": [{"highway": "residential"}, {"highway": "steps"}, {"barrier": "wall"}]}, ["residential", "steps"]),
+        ({"class": [float("nan"), 3, True]}, None),
+        ({"fclass": [["residential", "tertiary"], "['primary', 'service']", "primary;steps"]}, None),
+    ],
+)
+def test_what_tells_the_kind(columns, kinds):
+    shapes = column(*(shapely.LineString([(k, 0), (k, 1)]) for k in range(3)))
+    made = RoadTable(shapes, None, {name: column(*values) for name, values in columns.items()})
+    read = recognise(made).adapt(made)
+    if "fclass" in columns:
+        kinds = ["residential;tertiary", "primary;service", "primary;steps"]
+    assert (None if read.highway is None else read.highway.tolist()) == kinds
+    assert len(read.lines) == (len(kinds) if kinds is not None else 2 if "railway" in columns else 3)
+
+
+@pytest.mark.parametrize("value", [np.True_, np.int64(3), np.float64("nan"), np.str_("x"), b"primary", 1j, {"a": 1}])
+def test_values_of_any_type_are_no_fault(value):
+    made = RoadTable(column(shapely.LineString([(0, 0), (1, 1)])), None)
+    for name in ("highway", "class", "importance", "road_flags", "names", "other_tags", "position_p", "odd"):
+        one = RoadTable(made.shapes, None, {name: column(value)})
+        assert len(recognise(one).adapt(one).lines) == 1
+
+
+def test_names_of_all_schemas():
+    assert choose_roads(frame("overture")).names[0] == "Rua 0"
+    assert choose_roads(frame("tiger")).names[0] == "Main St"
+
+
+@pytest.mark.filterwarnings("ignore:invalid value")
+def test_lines_that_are_broken_are_left_out_and_counted(caplog):
+    lines = [shapely.LineString([(0, 0.001 * k), (0.01, 0.001 * k)]) for k in range(20)]
+    lines[3] = shapely.LineString([(0, 0), (np.nan, 1)])
+    lines[5] = shapely.LineString([(0, 0), (np.inf, 1)])
+    lines[7] = shapely.LineString([(0, 0), (1, 1e9)])
+    with caplog.at_level(logging.WARNING):
+        roads = choose_roads(column(*lines), crs="EPSG:4326")
+    assert len(roads) == 17
+    assert "left out 2 of 20 features, which have a vertex that is not finite" in caplog.text
+    assert "left out 1 lines that lie beyond the Earth" in caplog.text
+
+
+def test_unknown_kinds_are_told(tmp_path, caplog):
+    file = write_vector(tmp_path / "a.gpkg", [shapely.LineString([(0, 0), (0.01, 0.01)])], width=["4"])
+    with caplog.at_level(logging.WARNING):
+        read_roads(file)
+    assert "a.gpkg: no column tells what kind of road a line is" in caplog.text
+    assert "all 1 lines are taken" in caplog.text
+
+
+def test_lines_of_something_else_are_no_roads(tmp_path):
+    file = write_vector(tmp_path / "a.gpkg", [shapely.LineString([(0, 0), (0.01, 0.01)])], fclass=["stream"])
+    with pytest.raises(NoRoadsError, match="no roads in it, for its 1 features are something else, such as streams"):
+        read_roads(file)
+    with pytest.raises(RoadSourceError):
+        read_roads(file, which="all")
