@@ -10,7 +10,7 @@ from roadgeo.kernels.compilation import kernel
 from roadgeo.kernels.rays import rays_agree
 from roadgeo.kernels.structs import PointBuckets
 
-__all__ = ["count_matches", "keep_nearest", "match_all", "nearest_alike"]
+__all__ = ["keep_nearest", "match_all", "nearest_alike"]
 
 
 @kernel()
@@ -155,24 +155,3 @@ def match_all(
         if matched[i] >= 0:
             count += 1
     return keep_nearest(matched, distance) if one_to_one else count
-
-
-@kernel(writes=("counts",))
-def count_matches(
-    matrix: Floats2,
-    xy: Floats2,
-    branches: Int8s3,
-    radius: float,
-    min_cos: float,
-    shifts: Floats2,
-    points: PointBuckets,
-    counts: Ints1,
-) -> None:
-    """Fill `counts` (M,) with the number of matches under each of `shifts` (M, 2), metres (see `match_all`)."""
-    matched = np.empty(xy.shape[0], np.int64)
-    distance = np.empty(xy.shape[0])
-    for m in range(shifts.shape[0]):
-        counts[m] = match_all(
-            matrix, xy, branches, radius, min_cos, shifts[m, 0], shifts[m, 1], False,
-            points, matched, distance,
-        )  # fmt: skip

@@ -124,25 +124,6 @@ class Scene:
             merged_at=None if self.merged_at is None else number[self.merged_at],
         )
 
-    @property
-    def n_statements(self) -> float:
-        """About how many independent statements the roads make: their number, and fewer where few of them count.
-
-        That many of equal weight would be as sure a mean (Kish, Survey Sampling, 1965, 11.7).
-        """
-        return self.n_edges * self._counting
-
-    @property
-    def counting_length_px(self) -> float:
-        """Length of the roads in pixels, less where few of them count, as `n_statements`."""
-        return self.road_length_px * self._counting
-
-    @property
-    def _counting(self) -> float:
-        """Share of the roads that would be as sure a mean if all counted alike."""
-        squares = len(self.weights) * float((self.weights**2).sum())
-        return float(self.weights.sum()) ** 2 / squares if squares > 0.0 else 0.0
-
 
 def query_neighbours(xy: FloatArray, k: int) -> Int32Array:
     """(N, k) nearest neighbours of each point, in the points' own order."""

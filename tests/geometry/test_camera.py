@@ -4,13 +4,11 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
-from hypothesis import assume, given
+from hypothesis import given
 from hypothesis import strategies as st
 from worlds.scenes import camera
 
-from roadgeo.geometry.camera import _USUAL_FOCAL, CameraFault, CameraOptions, judge, pinholes_around, pose, sampling
-from roadgeo.geometry.frame import Frame
-from roadgeo.geometry.homography import Homography
+from roadgeo.geometry.camera import _USUAL_FOCAL, CameraFault, CameraOptions, judge, pose, sampling
 
 SIZE = (1200, 900)
 OPTIONS = CameraOptions()
@@ -169,30 +167,6 @@ def test_limits_are_where_they_are_said_to_be(rough, slack_deg, slack):
         assert fault(camera((0, 0), SIZE, 1.0, 0.0, 0.0, -heading), north_up=True) is expected
     for stretch, expected in [(0.34, None), (0.36, None if rough else CameraFault.SKEW)]:
         assert fault(np.diag([1.0, np.exp(stretch), 1.0])) is expected
-
-
-@given(
-    tilt=tilts, azimuth=turns, heading=turns, focal=st.floats(700, 4000), at=st.tuples(st.floats(0, 1), st.floats(0, 1))
-)
-def test_what_a_pinhole_sees_around_a_point_tells_the_rest_but_for_the_way_it_leans(tilt, azimuth, heading, focal, at):
-    seen = camera((500, 700), SIZE, 1.2, tilt, azimuth, heading, focal)
-    seen = seen / (seen[2] @ [SIZE[0] / 2, -SIZE[1] / 2, 1.0])
-    point = np.array([at[0] * SIZE[0], -at[1] * SIZE[1]])
-    corners = Frame(*SIZE).plane_corners
-    assume(Homography(seen).ahead(corners).all())  # no corner looks beyond the horizon
-    found = pinholes_around(seen, SIZE, point, focal)
-    apart = [np.abs(Homography(one)(corners) - Homography(seen)(corners)).max() for one in found]
-    assert np.nanmin(apart) < 1e-3  # the other may put a corner beyond the horizon
-    for one in found:
-        assert np.allclose(Homography(one)(point[None]), Homography(seen)(point[None]))
-        assert np.allclose(Homography(one).jacobian(point), Homography(seen).jacobian(point), rtol=1e-5, atol=1e-7)
-
-
-def test_a_usual_lens_is_taken_where_none_is_known():
-    usual = _USUAL_FOCAL * np.hypot(*SIZE) / 2
-    seen = camera((500, 700), SIZE, 1.2, 40.0, 30.0, 60.0, usual)
-    found = pinholes_around(seen, SIZE, np.array([300.0, -500.0]))
-    assert min(np.abs(one - seen / (seen[2] @ [600.0, -450.0, 1.0])).max() for one in found) < 1e-6
 
 
 @pytest.mark.parametrize("side", [-1.0, 1.0])

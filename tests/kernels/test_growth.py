@@ -14,7 +14,7 @@ from roadgeo.kernels.homography_fit import (
     prediction_variance,
     solve_cholesky,
 )
-from roadgeo.kernels.point_matching import count_matches, keep_nearest, match_all, nearest_alike
+from roadgeo.kernels.point_matching import keep_nearest, match_all, nearest_alike
 from roadgeo.kernels.structs import GrowthLimits, GrowthQuery, PointBuckets
 from roadgeo.matching.index import neighbour_grid, sort_by_bucket
 
@@ -207,19 +207,6 @@ class TestMatchAll:
         match_all(TRUTH, world.xy, world.branches, 5.0, MIN_COS, 0.0, 0.0, True, world.reference, matched, distance)
         assert np.array_equal(matched[world.truth >= 0], world.truth[world.truth >= 0])
         assert (distance[world.truth >= 0] < 3).all()
-
-    def test_counts_like_the_twin(self, world):
-        shifts = np.array([(0.0, 0.0), (60.0, -35.0), (-150.0, 90.0)])
-        counts = np.empty(3, np.int64)
-        count_matches(TRUTH, world.xy, world.branches, 90.0, MIN_COS, shifts, world.reference, counts)
-        seen = TRUTH, world.xy, world.branches, 90.0
-        few, many = (
-            naive.count_matches(*seen, t, shifts, world.ref_xy, world.ref_branches)
-            for t in (TOLERANCE - 0.02, TOLERANCE + 0.02)  # branches are compared to a degree
-        )
-        assert (np.array(few) <= counts).all()
-        assert (counts <= np.array(many)).all()
-        assert counts.min() > 0
 
     def test_no_query(self, world):
         nothing = np.empty((0, 2)), np.empty((0, 8, 2), np.int8), 5.0, MIN_COS, 0.0, 0.0, True

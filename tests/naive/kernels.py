@@ -248,11 +248,6 @@ def match_all(matrix, xy, branches, radius, tolerance, shift, one_to_one, ref_xy
     return keep_nearest(matched, distance) if one_to_one else matched, distance
 
 
-def count_matches(matrix, xy, branches, radius, tolerance, shifts, ref_xy, ref_branches):
-    found = (match_all(matrix, xy, branches, radius, tolerance, shift, False, ref_xy, ref_branches) for shift in shifts)
-    return [(matched >= 0).sum() for matched, _ in found]
-
-
 def grow(
     xy, branches, order, half_size, anchor, ref_anchor, affine, neighbours, partners, ref_xy, ref_branches,
     sigma_m, radius_m, tolerance, perspective_sigma, hit_rate, chance_rate, patience,

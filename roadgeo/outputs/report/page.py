@@ -220,7 +220,7 @@ def _numbers(subject: Shown) -> list[tuple[str, str]]:
         middle, worst = np.percentile(location.evidence.residual_m, (50, 100))
         rows.append(("Residuals", f"median {middle:.1f} m, largest {worst:.1f} m"))
     if location.log10_odds is not None:
-        rows.append(("Odds", f"10<sup>{location.log10_odds:.1f}</sup> : 1 against chance"))
+        rows.append(("Odds", f"10<sup>{location.log10_odds:.1f}</sup> : 1 against any other place"))
     if location.runner_up is not None:
         rows.append(
             ("Runner-up", f"10<sup>{location.runner_up.log10_odds:.1f}</sup> : 1<br>{_link(location.runner_up)}")
