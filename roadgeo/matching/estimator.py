@@ -199,11 +199,10 @@ class TripleEstimator:
         """Intersections of the query that were looked for."""
         return len({anchor for _, anchor in self._tried})
 
-    def _count(self, n_places: int, stage: int) -> None:
-        """Note that a stage tried so many more places."""
+    def _count(self, n_places: int) -> None:
+        """Note that so many more places were tried."""
         self.n_screened += n_places
         self.ledger.n_tried += round(self.ledger.beside * n_places)
-        self.ledger.tried_by[stage] = self.ledger.n_tried
 
     @property
     def _stage_of_roads(self) -> int:
@@ -226,7 +225,7 @@ class TripleEstimator:
         roads, known, stage = self._search_by_roads(), self._grown_by_roads, self._stage_of_roads
         tried = roads.n_tried
         for anchor, n_proposed, grown in roads.rounds(only):
-            self._count(roads.n_tried - tried, stage)
+            self._count(roads.n_tried - tried)
             tried = roads.n_tried
             self.n_hypotheses += n_proposed
             if anchor >= 0:
@@ -282,7 +281,7 @@ class TripleEstimator:
         self.n_tuples += proposals.n_tuples
         self.n_candidates += proposals.n_hits
         looked_at = np.flatnonzero(allowed)[:most]
-        self._count(len(looked_at), stage.number)
+        self._count(len(looked_at))
         self.ledger.n_by_triples += len(looked_at)
         kept = screen_proposals(self.scene, self.index, proposals, looked_at, stage.grow)
         self.trace.screened(proposals, allowed, kept)
@@ -338,15 +337,6 @@ class TripleEstimator:
         if not model.by_roads and self._fits_whole(model):
             self._whole.append(model)
         return model.log10_odds
-
-    def evidence(self, model: Hypothesis) -> float:
-        """Return the log10 odds of a hypothesis without what is charged for the places tried."""
-        return model.log10_odds + math.log10(max(model.n_tried, 1))
-
-    def charge(self, model: Hypothesis) -> float:
-        """Return what is charged for the places tried until the stage ended that led to a hypothesis, as log10."""
-        ended = [self.ledger.tried_by.get(stage, 0) for stage, _ in model.leads[:1]]
-        return math.log10(max(model.n_tried, *ended, 1))
 
     def _verify(self, model: Hypothesis) -> None:
         """Refine a hypothesis by more and more points, as long as it may be the best place, or its rival."""

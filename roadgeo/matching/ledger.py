@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass, field
+from dataclasses import dataclass
 
 __all__ = ["Ledger"]
 
@@ -17,14 +17,11 @@ class Ledger:
         Intersections of all parts: what is tried on them is bounded as on one map of that size.
     n_tried, beside : int, float
         Those, and how many are tried on the whole map for each that is tried here (see `LocateOptions.elsewhere`).
-    tried_by : dict of int to int
-        As many had been tried when a stage, by its number, was last at work.
     n_by_triples : int
         Those that triples proposed.
     """
 
     n_reference: int = 0
     n_tried: int = 0
-    tried_by: dict[int, int] = field(default_factory=dict)
     n_by_triples: int = 0
     beside: float = 1.0

@@ -199,7 +199,7 @@ def _search(
 
     scale = larger(sum(one.n_searched for one in opened))
     limits = replace(options.search, time_limit_s=left, work_limit_s=scale * options.search.work_limit_s)
-    rivals = Rivals(estimators, options.rivals, ledger, options.min_log10_odds)
+    rivals = Rivals(estimators, options.rivals, ledger, options.min_log10_odds, left)
     search_together(list(estimators), limits, same, rivals)
     sweeps.end()
     return [one.found(scale, rivals) for one in opened]
@@ -296,7 +296,7 @@ def _fits(estimator: TripleEstimator, standing: Standing) -> tuple[Fit, ...]:
     measure_corners(estimator, model, lead)
     fits = [_fit(estimator, model, lead)]
     if standing.rival is not None:
-        fits.append(_fit_of_rival(estimator, standing.rival, -lead))
+        fits.append(_fit_of_rival(estimator, standing.rival, min(-lead, 0.0), standing.rival_likelihood))
     return tuple(filter(None, fits))
 
 
@@ -320,12 +320,12 @@ def _fit(estimator: TripleEstimator, model: Hypothesis, lead: float) -> Fit | No
     )
 
 
-def _fit_of_rival(estimator: TripleEstimator, matrix: FloatArray, lead: float) -> Fit:
+def _fit_of_rival(estimator: TripleEstimator, matrix: FloatArray, lead: float, likelihood: float) -> Fit:
     """Return the best other place."""
     scene, index, verify = estimator.scene, estimator.index, estimator.options.verify
     gsd, seeds = sampling(matrix, scene.size), np.empty(0, np.int64)
     found, matched, distance = agreement(matrix, scene, index, gsd, seeds, verify)
-    return Fit(index, matrix, matched, distance, found.forward, lead, agreement=found.mean)
+    return Fit(index, matrix, matched, distance, found.forward, lead, likelihood, agreement=found.mean)
 
 
 def _of_effort(options: LocateOptions) -> MatchOptions:

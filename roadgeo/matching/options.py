@@ -27,7 +27,7 @@ class LocateOptions:
     min_log10_odds : float
         Powers of ten by which a place must explain more than any other place to be reported as located.
     min_margin : float
-        The same, against a place on another reference, or that another look at the scene found.
+        The same, against a place that another look at the scene found.
     min_intersections : int
         Masks with fewer are not searched.
     truths : tuple of (str, lon, lat)

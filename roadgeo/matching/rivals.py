@@ -84,13 +84,19 @@ class RivalOptions:
 class Standing(NamedTuple):
     """A place, the best other one (3, 3) if there is any, and by how many powers of ten the place leads it.
 
-    `beaten`: the other one explains more.
+    `log10_likelihood`, `rival_likelihood`: what each of them explains, by the same yardstick.
     """
 
     model: Hypothesis
     rival: FloatArray | None
     log10_lead: float
-    beaten: bool = False
+    log10_likelihood: float = -math.inf
+    rival_likelihood: float = -math.inf
+
+    @property
+    def is_beaten(self) -> bool:
+        """Whether the other one explains more."""
+        return self.rival is not None and self.rival_likelihood > self.log10_likelihood
 
 
 class Rivals:
@@ -102,9 +108,11 @@ class Rivals:
         options: RivalOptions,
         ledger: Ledger,
         needed: float,
+        time_limit_s: float = math.inf,
     ) -> None:
-        """Places of fewer powers of ten than `needed` are not compared."""
+        """Places of fewer powers of ten than `needed` are not compared, and none after the time limit."""
         self.estimators, self.options, self.ledger, self.needed = estimators, options, ledger, needed
+        self._deadline = time.perf_counter() + time_limit_s
         self._known: dict[int, Standing] = {}
         self._contradicted: dict[int, bool] = {}
 
@@ -133,7 +141,7 @@ class Rivals:
         for _ in range(_MOST_TURNS):
             standing = self._known.get(id(best)) or self._compare(estimator, best, ranked)
             self._known[id(best)] = standing
-            if standing.rival is None or not standing.beaten:
+            if standing.rival is None or not standing.is_beaten:
                 break
             other = self._take(estimator, standing.rival, ranked)
             if self._is_contradicted(estimator, other):
@@ -146,8 +154,12 @@ class Rivals:
         scene, index, options, matrix = estimator.scene_of(best), estimator.index, self.options, best.laid
         if best.log10_likelihood < self.needed:
             return Standing(best, None, best.log10_odds)
-        if best.log10_odds >= options.certain and best.nearby < options.repeating * best.log10_likelihood:
-            return Standing(best, None, best.log10_odds)
+        likeliest = next((m.log10_likelihood for m in ranked if not estimator.same(m, best)), 0.0)
+        odds = min(best.log10_odds, best.log10_likelihood - max(likeliest, 0.0))
+        if odds >= options.certain and max(likeliest, best.nearby) < options.repeating * best.log10_likelihood:
+            return Standing(best, None, odds, best.log10_likelihood)
+        if time.perf_counter() > self._deadline:
+            return Standing(best, None, min(odds, 0.0), best.log10_likelihood)
         evidence = Evidence(scene, index, sampling(matrix, scene.size), estimator.options.evidence)
         worth, middle = evidence.weigh(matrix), Homography(matrix).everywhere(scene.center)
         apart_m = options.apart * scene.half_size * evidence.gsd_m
@@ -159,11 +171,12 @@ class Rivals:
                 others.append((evidence.weigh(other), other))
         others.sort(key=lambda one: -one[0])
         if others and others[0][0] > worth:
-            return Standing(best, others[0][1], worth - others[0][0], beaten=True)
+            return Standing(best, others[0][1], worth - others[0][0], worth, others[0][0])
         lead = evidence.lead(matrix, [other for _, other in others[: options.n_compared]])
         # The larger the map, the more places may lead all that lie around them.
         paid = 2.0 * math.log10(larger(self.ledger.n_reference))
-        return Standing(best, others[0][1] if others else None, min(lead, worth) - paid)
+        likelihood, rival = others[0] if others else (-math.inf, None)
+        return Standing(best, rival, min(lead, worth) - paid, worth, likelihood)
 
     def _is_contradicted(self, estimator: TripleEstimator, model: Hypothesis) -> bool:
         """Whether a place is none for what it contradicts; asked once of each."""

@@ -83,7 +83,7 @@ def _judge(query: Query, found: Sequence[Found], options: LocateOptions) -> Loca
         return _refuse(location, query, found, best, options)
     placed = place_frame(_on(location, best.found), query, best.fit, options.match)
     cut = f"; stopped at the time limit, {_CUT_SHORT}" if location.stopped == "time" else ""
-    if rival is not None and (best.score < options.min_log10_odds or _is_close(best, rival, options)):
+    if rival is not None and best.score < options.min_log10_odds:
         reason = _two_places(best, rival) + cut
         return replace(placed, status="ambiguous", reason=reason, reason_code=Reason.TWO_PLACES)
     reason = (
@@ -139,7 +139,13 @@ def _pool(query: Query, found: Sequence[Found]) -> list[_Candidate]:
     for candidate in sorted(pool, key=lambda one: (-one.fit.log10_likelihood, -one.score)):
         if all(_differ(query, one, candidate) for one in distinct):
             distinct.append(candidate)
-    return distinct
+    elsewhere = [one.fit.log10_likelihood for one in distinct[1:] if one.found is not distinct[0].found]
+    if not elsewhere:
+        return distinct
+    best, *others = distinct
+    odds = min(best.score, best.fit.log10_likelihood - max(elsewhere))
+    fit = replace(best.fit, log10_odds=odds)
+    return [replace(best, fit=fit, center=replace(best.center, log10_odds=odds)), *others]
 
 
 def _differ(query: Query, a: _Candidate, b: _Candidate) -> bool:
@@ -157,13 +163,6 @@ def _seen_from(best: _Candidate, rival: _Candidate) -> Place:
     plane = best.fit.index.plane
     x, y = plane.to_crs(from_lonlat(plane, np.array([[rival.center.lon, rival.center.lat]])))[0]
     return replace(rival.center, x=float(x), y=float(y))
-
-
-def _is_close(best: _Candidate, rival: _Candidate, options: LocateOptions) -> bool:
-    """Whether a place on another reference explains almost as much."""
-    if rival.found is best.found:
-        return False
-    return best.fit.log10_likelihood - rival.fit.log10_likelihood < options.min_margin
 
 
 def _are_alike(best: _Candidate, rival: _Candidate) -> bool:

@@ -1,5 +1,7 @@
 """Roads in buckets against roads searched one by one."""
 
+import math
+
 import numpy as np
 import pytest
 from naive import kernels as naive
@@ -200,13 +202,27 @@ class TestCountResiduals:
     CORNERS = np.array([[0.0, 0.0], [300.0, 0.0], [300.0, -250.0], [0.0, -250.0]])
 
     def count(self, roads, matrix, points, along, weights, field, scale, observed, bounds=(-1e4, -1e4, 1e4, 1e4)):
-        forward, backward = np.full((2, self.BINS + 1), 7.0)  # what is left of the last call
         inverse, bounds = np.linalg.inv(matrix), np.array(bounds)
+        for piece_px, columns, pieces in ((40.0, 8, 56), (math.inf, 1, 1)):
+            forward, backward = np.full((2, pieces, self.BINS + 1), 7.0)  # what is left of the last call
+            count_residuals(
+                matrix, inverse, bounds, points, along, weights, self.RADIUS, MIN_COS, 4.0, roads, field, scale,
+                observed, piece_px, columns, forward, backward,
+            )  # fmt: skip
+            if pieces > 1:
+                by_piece = forward.sum(axis=0), backward.sum(axis=0)
+        np.testing.assert_allclose(by_piece, (forward[0], backward[0]))  # together the pieces are the frame
+        return forward[0], backward[0]
+
+    def test_a_road_counts_in_the_piece_of_the_frame_where_it_lies(self):
+        points, along = np.array([[10.0, -10.0], [130.0, -10.0], [10.0, -130.0]]), np.array([[1.0, 0.0]] * 3)
+        forward, backward = np.empty((2, 4, 2))
+        empty, seen = np.zeros((10, 10), np.float32), np.ones((10, 10), bool)
         count_residuals(
-            matrix, inverse, bounds, points, along, weights, self.RADIUS, MIN_COS, 4.0, roads, field, scale, observed,
-            forward, backward,
+            np.eye(3), np.eye(3), np.zeros(4), points, along, np.array([1.0, 2.0, 3.0]), 5.0, MIN_COS, 4.0, binned([]),
+            empty, 20.0, seen, 100.0, 2, forward, backward,
         )  # fmt: skip
-        return forward, backward
+        assert forward[:, 1].tolist() == [1.0, 2.0, 3.0, 0.0]
 
     def scene(self, scale=1.0, n=60):
         rng = np.random.default_rng(4)
