@@ -381,7 +381,7 @@ def _locate(asked: Asked, references: Sequence[Any], say: Say) -> Answer:
     sighting = locate_query(str(seen) if is_known else asked.path, references, options, how=search, say=tell)
     sighting = replace(sighting, of_photograph=sighting.of_photograph or is_known)
     location = replace(sighting.location, query=asked.name)
-    location = replace(location, reason=_without(asked.path, location.reason))
+    location = replace(location, reason=_without(asked.path, _without(str(seen), location.reason)))
     if asked.keeps:
         say("drawing the answer")
         write_view(Path(asked.path), replace(sighting, location=location), references)
