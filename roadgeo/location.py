@@ -260,6 +260,9 @@ class Location:
         "similarity" where the camera looked straight down, as far as the roads tell, else "homography".
     corner_sigma_m : (4,) float64
         Standard deviations of those corners' positions: root mean squares of their distances from the truth.
+    lonlat_accuracy_m : float
+        How exactly PROJ takes the CRS to longitude and latitude here (see `geometry.transformation`): 0 where both have
+        one datum, NaN where it does not know.
     lens_k1 : float
         Radial distortion by the lens (see `geometry.lens`), estimated where the mask shows one, else 0. The
         homography, footprint and corners are those of the frame as a pinhole would have seen it.
@@ -316,6 +319,7 @@ class Location:
     fitted: str | None = None
     lens_k1: float = 0.0
     corner_sigma_m: FloatArray | None = None
+    lonlat_accuracy_m: float = 0.0
     n_intersections: int = 0
     n_matched: int = 0
     inlier_ratio: float = 0.0
@@ -341,6 +345,13 @@ class Location:
     def located(self) -> bool:
         """Whether one place was found."""
         return self.status == "located"
+
+    @property
+    def lonlat_sigma_m(self) -> FloatArray | None:
+        """Standard deviations (4,) of the corners' longitude and latitude, in metres; None where they are not known."""
+        if self.corner_sigma_m is None or np.isnan(self.lonlat_accuracy_m):
+            return None
+        return np.hypot(self.corner_sigma_m, self.lonlat_accuracy_m)
 
     @property
     def error_rate(self) -> ErrorRate | None:
@@ -471,6 +482,8 @@ class Location:
             "lens_k1": None if center is None else self.lens_k1,
             "corner_sigma_m": rows(self.corner_sigma_m),
             "corner_covariance_m2": rows(self.corner_covariance_m2),
+            "lonlat_sigma_m": rows(self.lonlat_sigma_m),
+            "lonlat_accuracy_m": None if center is None or np.isnan(self.lonlat_accuracy_m) else self.lonlat_accuracy_m,
             "camera": None if self.camera is None else self.camera.to_dict(),
             "mirrored": self.mirrored,
             "query_to_pixel": rows(self.query_to_pixel),

@@ -27,6 +27,16 @@ LOCATED = replace(
 )
 
 
+def test_longitude_and_latitude_are_as_unsure_as_the_way_to_them():
+    assert LOCATED.lonlat_sigma_m == pytest.approx(LOCATED.corner_sigma_m)
+    document = replace(LOCATED, lonlat_accuracy_m=2.4).to_dict()
+    assert document["lonlat_sigma_m"] == pytest.approx([2.5] * 4)
+    assert document["corner_sigma_m"] == pytest.approx([0.7] * 4)
+    assert document["lonlat_accuracy_m"] == 2.4
+    unknown = replace(LOCATED, lonlat_accuracy_m=np.nan).to_dict()
+    assert unknown["lonlat_sigma_m"] is unknown["lonlat_accuracy_m"] is None
+
+
 def test_a_location_says_the_answer_in_one_line():
     assert repr(REFUSED) == "<Location 'field.png': not_located, only 3 intersections are seen, at least 6 are needed>"
     expected = "<Location 'field.png': located at 42.342283, -71.047570 on boston <&>, log10 odds 12.5>"

@@ -6,6 +6,7 @@ from typing import Any
 
 import click
 
+from roadgeo.cli.accuracy import tell_accuracy
 from roadgeo.cli.folders import make_folder
 from roadgeo.cli.parameters import CRS, Plugin, out_dir_option
 from roadgeo.cli.printing import echo
@@ -79,4 +80,6 @@ def apply_command(location: str, pictures: tuple[str, ...], out_dir: str, quiet:
     for path in apply_location(place, pictures, out_dir, image, given["products"], given["stretch"]):
         if not quiet:
             echo(f"wrote {path}")
+    if not quiet:
+        tell_accuracy([place.to_dict()], given["crs"])
     return 0

@@ -13,6 +13,7 @@ import click
 
 from roadgeo._text import visible
 from roadgeo.cli import ERROR, NOT_LOCATED
+from roadgeo.cli.accuracy import tell_accuracy
 from roadgeo.cli.clusters import cluster_options, make_cluster
 from roadgeo.cli.command_line import said_options
 from roadgeo.cli.folders import make_folder
@@ -313,6 +314,8 @@ def locate_command(
             outcomes.append(outcome)
             count(outcome.status)
             _report(outcome, as_json, quiet, verbose, single=one)
+    if not quiet:
+        tell_accuracy((outcome.document for outcome in outcomes), given["crs"])
     counts = Counter[str](outcome.status for outcome in outcomes)
     if len(tasks) > 1:
         files = write_overview(out_dir, tasks, outcomes, opened if given["report"] else None, given["products"])

@@ -32,8 +32,8 @@ searches again. It opens in your browser; nothing leaves this machine.
 
 \b
   POST /locate                           an image as the body -> the answer, JSON as of locate --json
-  POST /processes/locate/execution       the same by OGC API - Processes, the image in JSON, base64
                                          a form too: curl -F image=@photo.jpg
+  POST /processes/locate/execution       the same by OGC API - Processes, the image in JSON, base64
   GET  /jobs/ID  /jobs/ID/events         of a request with the header Prefer: respond-async
   GET  / /api /conformance /processes /processes/locate /jobs /health
 

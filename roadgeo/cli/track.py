@@ -14,6 +14,7 @@ from typing import TYPE_CHECKING, Any
 import click
 
 from roadgeo.cli import NOT_LOCATED
+from roadgeo.cli.accuracy import tell_accuracy
 from roadgeo.cli.folders import make_folder
 from roadgeo.cli.hints import hint_options, make_options, refuse_swapped
 from roadgeo.cli.parameters import out_dir_option, references_option, verbosity_options
@@ -199,6 +200,7 @@ def track_command(
     files = _write(Path(out_dir), name, tracked, rows, pictures)
     counts = Counter(row.status for row in rows)
     if not quiet:
+        tell_accuracy(row.to_dict() for row in rows)
         told = ", ".join(f"{n} {status}" for status, n in counts.items())
         echo(f"{len(rows)} frames: {told}; wrote {', '.join(files)}", err=True)
     return NOT_LOCATED if counts["lost"] else 0

@@ -5,6 +5,7 @@ Longitude comes before latitude everywhere. pyproj is imported on first use.
 
 from __future__ import annotations
 
+import logging
 import math
 from dataclasses import dataclass
 from functools import lru_cache
@@ -14,6 +15,7 @@ import numpy as np
 
 from roadgeo._arrays import FloatArray
 from roadgeo.errors import CrsError
+from roadgeo.geometry.transformation import exactness
 from roadgeo.storage.crs import known_crs
 
 if TYPE_CHECKING:
@@ -29,6 +31,8 @@ __all__ = [
     "to_lonlat",
     "transformer",
 ]
+
+_LOG = logging.getLogger(__name__)
 
 _EARTH_RADIUS_M = 6.371e6
 
@@ -101,6 +105,10 @@ def choose_plane(lonlat: FloatArray, own_crs: str | None = None) -> LocalPlane:
             "the data's CRS is not what it says: give the right one with --crs"
         )
     crs = own_crs if own_crs and serves_as_plane(own_crs, points) else _conformal_crs(points)
+    if own_crs and crs != own_crs:
+        way = exactness(own_crs, crs, points.mean(axis=0).tolist())
+        if way.grids:
+            _LOG.warning("%s", way.told(f"places of {_short(own_crs)} in {_short(crs)}"))
     en = np.stack(transformer("EPSG:4326", crs).transform(points[:, 0], points[:, 1]), axis=1)
     if not np.isfinite(en).all():
         west, east = _longitudes(points[:, 0])

@@ -15,6 +15,7 @@ from roadgeo.geometry.mask import PIXEL_TO_PLANE
 from roadgeo.geometry.pose import PoseOptions, find_pose, turned
 from roadgeo.geometry.projection import grid_north, to_lonlat
 from roadgeo.geometry.similarity import find_similarity
+from roadgeo.geometry.transformation import LONLAT, exactness
 from roadgeo.location import Camera, Evidence, Location, Place
 from roadgeo.matching.estimator import MatchOptions
 from roadgeo.matching.methods import Fit
@@ -57,6 +58,7 @@ def place_frame(location: Location, query: Query, fit: Fit, options: MatchOption
         lens_k1=fit.lens_k1,
         corner_sigma_m=level.corner_sigma_m,
         corner_covariance_m2=level.corner_covariance_m2,
+        lonlat_accuracy_m=exactness(plane.crs, LONLAT, lonlat[4].tolist()).sigma_m,
         gsd_m=camera.gsd_m,
         rotation_deg=(camera.rotation_deg + north + 180.0) % 360.0 - 180.0,
         tilt_deg=camera.tilt_deg if seat is None else seat.tilt_deg,

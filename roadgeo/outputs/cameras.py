@@ -112,7 +112,7 @@ def _odm_lines(documents: Sequence[Mapping[str, Any]]) -> str:
             continue
         sigma, altitude = camera["sigma"], camera["altitude_m"]
         height = camera["height_m"] if altitude is None else altitude
-        flat = math.hypot(sigma["x_m"], sigma["y_m"])
+        flat = math.hypot(sigma["x_m"], sigma["y_m"], document.get("lonlat_accuracy_m") or 0.0)
         position = f"{camera['lon']:.9f} {camera['lat']:.9f} {height:.3f}"
         lines.append(
             f"{name_for_odm(Path(document['query']).name)} {position} 0 0 0 {flat:.3f} {sigma['height_m']:.3f}"

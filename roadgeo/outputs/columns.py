@@ -24,6 +24,7 @@ NUMBERS = (
     "inlier_ratio",
     "log10_odds",
     "max_corner_sigma_m",
+    "max_lonlat_sigma_m",
 )
 
 
@@ -35,10 +36,11 @@ def attributes(document: Mapping[str, Any]) -> dict[str, Any]:
     document : mapping
         `Location.to_dict`, its JSON read back, or what stands for a mask that failed.
     """
-    sigma = document.get("corner_sigma_m")
+    sigma, lonlat_sigma = document.get("corner_sigma_m"), document.get("lonlat_sigma_m")
     query, reason = str(document.get("query") or ""), str(document.get("reason") or "")
     derived = {
         "max_corner_sigma_m": max(sigma) if sigma else None,
+        "max_lonlat_sigma_m": max(lonlat_sigma) if lonlat_sigma else None,
         "query": bare_name(query),
         "reason": without_folders(reason, query),
     }

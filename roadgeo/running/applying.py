@@ -14,6 +14,7 @@ import numpy as np
 from roadgeo._arrays import FloatArray
 from roadgeo.errors import CrsError, MaskError, NotLocatedError, OutputError
 from roadgeo.geometry.mask import RoadMask
+from roadgeo.geometry.transformation import LONLAT, exactness
 from roadgeo.location import SCHEMA, Camera, Location, Place
 from roadgeo.outputs.orthophoto import ImageOptions
 from roadgeo.outputs.paths import output_paths
@@ -69,6 +70,7 @@ def _from_document(document: dict[str, Any]) -> Location:
     homography = _array(document["homography"], (3, 3))
     if abs(np.linalg.det(homography)) < 1e-300:
         raise ValueError("a homography that cannot be inverted")
+    crs, place = _crs(str(document["crs"])), _place(document)
     sigma, covariance = document.get("corner_sigma_m"), document.get("corner_covariance_m2")
     return Location(
         str(document["query"]),
@@ -76,15 +78,16 @@ def _from_document(document: dict[str, Any]) -> Location:
         str(document["reason"]),
         str(document.get("reference") or ""),
         str(document.get("attribution") or ""),
-        _crs(str(document["crs"])),
+        crs,
         (width, height),
         homography,
         _array(document["footprint"], (4, 2)),
         _array(document["footprint_lonlat"], (4, 2)),
-        _place(document),
+        place,
         gsd_m=float(document["gsd_m"]),
         rotation_deg=float(document["rotation_deg"]),
         lens_k1=float(document.get("lens_k1") or 0.0),
+        lonlat_accuracy_m=exactness(crs, LONLAT, (place.lon, place.lat)).sigma_m,
         corner_sigma_m=None if sigma is None else _array(sigma, (4,)),
         corner_covariance_m2=None if covariance is None else _array(covariance, (8, 8)),
         log10_odds=document.get("log10_odds"),

@@ -18,6 +18,7 @@ from roadgeo.geometry.frame import Frame
 from roadgeo.geometry.homography import Homography
 from roadgeo.geometry.mask import PIXEL_TO_PLANE, RoadMask
 from roadgeo.geometry.projection import LocalPlane, grid_north, to_lonlat
+from roadgeo.geometry.transformation import exactness
 from roadgeo.location import Location
 from roadgeo.matching.checking import Checked, CheckOptions, check_place
 from roadgeo.matching.options import LocateOptions
@@ -111,12 +112,31 @@ def _best(image: _Image, references: Sequence[Reference]) -> Verified:
             _document(image.name, Checked("unknown", f"it lies on none of the maps ({names})"), image.place)
         )
     start = image.place.on_plane(reference.index.plane)
-    checked = _look(image, reference, start)
+    checked = _allow_for_crs(_look(image, reference, start), image, reference)
     found = checked.displacement
     if found is None or checked.verdict != "off":
         return Verified(_document(image.name, checked, image.place, reference))
     corrected = image.place.moved(found.matrix @ start, reference.index.plane)
     return Verified(_document(image.name, checked, image.place, reference, corrected), corrected)
+
+
+def _inexact(place: Georeference, reference: Reference) -> float:
+    """Return how exactly PROJ takes an image's CRS to a map's, metres; 0 where it does not know."""
+    found = exactness(place.crs, reference.index.plane.crs, place.middle()).sigma_m
+    return 0.0 if math.isnan(found) else found
+
+
+def _allow_for_crs(checked: Checked, image: _Image, reference: Reference) -> Checked:
+    """Judge nothing to be off by what may be the way from an image's CRS to the map's."""
+    inexact, found = _inexact(image.place, reference), checked.displacement
+    if checked.verdict != "off" or found is None or inexact == 0.0:
+        return checked
+    corners = _frame_of(image.place, reference)
+    if found.over(corners) - math.hypot(found.sigma_over(corners), inexact) > image.settings.options.tolerance_m:
+        return checked
+    crs = image.place.crs if len(image.place.crs) < 20 else "the image's CRS"
+    reason = f"{checked.reason}: that may be the way from {crs} to the map's, which PROJ knows to {inexact:g} m only"
+    return replace(checked, verdict="unknown", reason=reason)
 
 
 def _count_inside(place: Georeference, reference: Reference) -> int:
@@ -198,7 +218,7 @@ def _document(
         plane, lat = reference.index.plane, document["center"]["lat"]
         known, rival = checked.displacement, checked.rival
         frame = None if known is None else _frame_of(place, reference)
-        document["displacement"] = None if known is None else _told(known, plane, frame)
+        document["displacement"] = None if known is None else _told(known, plane, frame, _inexact(place, reference))
         document["rival"] = None if rival is None else _told(rival, plane, None)
         if checked.verdict == "off":
             shift = document["displacement"]
@@ -216,8 +236,11 @@ def _frame_of(place: Georeference, reference: Reference) -> FloatArray:
     return Homography(place.on_plane(reference.index.plane)).facing(frame.center)(frame.corners)
 
 
-def _told(found: Displacement, plane: LocalPlane, corners: FloatArray | None) -> dict[str, float]:
-    """Give a displacement as plain values, east and north as they are on Earth, not on the plane's grid."""
+def _told(found: Displacement, plane: LocalPlane, corners: FloatArray | None, inexact: float = 0.0) -> dict[str, float]:
+    """Give a displacement as plain values, east and north as they are on Earth, not on the plane's grid.
+
+    `inexact`: metres to which the image's CRS is taken to the plane's.
+    """
     turn = math.radians(grid_north(plane, plane.to_crs(found.about)))
     east = found.east_m * math.cos(turn) + found.north_m * math.sin(turn)
     north = found.north_m * math.cos(turn) - found.east_m * math.sin(turn)
@@ -227,11 +250,11 @@ def _told(found: Displacement, plane: LocalPlane, corners: FloatArray | None) ->
     sigma = np.sqrt(np.diag(found.covariance))
     return {
         **told,
-        "sigma_east_m": float(sigma[0]),
-        "sigma_north_m": float(sigma[1]),
+        "sigma_east_m": math.hypot(float(sigma[0]), inexact / math.sqrt(2.0)),
+        "sigma_north_m": math.hypot(float(sigma[1]), inexact / math.sqrt(2.0)),
         "sigma_turn_deg": math.degrees(float(sigma[2])),
         "sigma_scale": float(sigma[3]),
         "off_m": found.over(corners),
-        "sigma_m": found.sigma_over(corners),
+        "sigma_m": math.hypot(found.sigma_over(corners), inexact),
         "residual_m": found.residual_m,
     }

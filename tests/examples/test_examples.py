@@ -1,3 +1,5 @@
+import json
+import shutil
 import subprocess
 import sys
 from pathlib import Path
@@ -24,34 +26,20 @@ def test_an_example_runs_as_it_stands(name: str, expected: list[str], tmp_path: 
         assert text in done.stdout
 
 
-def test_the_benchmark_measures_everything_and_goes_on_where_it_stopped(tmp_path: Path) -> None:
-    command = [sys.executable, str(EXAMPLES / "benchmark.py"), str(ROADS), "-n", "1", "-o", "out", "--methods", "auto"]
-    options = ["--kinds", "clean", "mild", "hard", "--elsewhere", "2", "--profile", "1"]
+def test_the_bench_compares_two_checkouts_and_goes_on_where_it_stopped(tmp_path: Path) -> None:
+    shutil.copytree(EXAMPLES.parent / "roadgeo", tmp_path / "other" / "roadgeo")
+    command = [sys.executable, str(EXAMPLES / "bench.py"), "--cities", str(ROADS), "-n", "1", "-j", "1", "--out", "out"]
+    options = ["--kinds", "base", "clean", "--against", "other"]
     for _ in range(2):
         done = subprocess.run([*command, *options], capture_output=True, text=True, cwd=tmp_path, check=True)
-    told = ("porto_roads  clean", "turned over     2", "10^3", "right masks", "look up", "ms each under", "adjustment.")
-    for text in told:
-        assert text in done.stdout
-    assert (tmp_path / "out" / "benchmark.txt").read_text() == done.stdout
-    assert len((tmp_path / "out" / "porto_roads_auto.jsonl").read_text().splitlines()) == 4
-    refused = subprocess.run([*command, "--seed", "5"], capture_output=True, text=True, cwd=tmp_path, check=False)
+        for text in ("base", "turned over", "highest log10 odds", "the same to the last bit, times aside: 3 of 3"):
+            assert text in done.stdout
+    assert (tmp_path / "out" / "bench.txt").read_text() == done.stdout
+    run, _ = json.loads((tmp_path / "out" / "bench.json").read_text()).values()
+    assert run["all"]["masks"] == 2
+    assert run["all"]["wrong"] == run["turned over"]["wrong"] == 0
+    refused = subprocess.run(
+        [*command, "--against", "no such"], capture_output=True, text=True, cwd=tmp_path, check=False
+    )
     assert refused.returncode == 1
-    assert "holds trials of another run" in refused.stderr
-
-
-def test_results_are_compared_to_the_last_bit(tmp_path: Path) -> None:
-    line = '{"query": "a.png", "status": "located", "center": {"x": 1.5}, "seconds": {"total": %s}}\n'
-    for folder, seconds, x in (("before", 1, 1.5), ("same", 2, 1.5), ("after", 1, 1.5000001)):
-        (tmp_path / folder).mkdir()
-        (tmp_path / folder / "r.jsonl").write_text((line % seconds).replace("1.5}", f"{x}}}"))
-
-    def compare(*options: str) -> tuple[int, str]:
-        command = [sys.executable, str(EXAMPLES / "compare_results.py"), *options]
-        done = subprocess.run(command, capture_output=True, text=True, cwd=tmp_path, check=False)
-        return done.returncode, done.stdout
-
-    assert compare("before", "same")[0] == 0
-    status, told = compare("before", "after")
-    assert status == 1
-    assert "center.x: 1\n    a.png: 1.5 -> 1.5000001" in told
-    assert compare("before", "after", "--tolerance", "1e-6")[0] == 0
+    assert "neither a folder nor a commit" in refused.stderr

@@ -1,5 +1,7 @@
 """What follows from a fit: a view straight down is levelled, others are not, however unsure their corners are."""
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 from worlds.scenes import Sight, look, sight_of
@@ -33,6 +35,16 @@ def test_a_view_straight_down_is_levelled_and_its_corners_are_surer(town):
     assert location.tilt_deg == pytest.approx(0.0, abs=1e-3)
     assert np.hypot(*(location.footprint - corners).T).max() < 2.0
     assert np.isfinite(location.camera.covariance).all()
+
+
+def test_on_another_datum_degrees_are_less_sure_than_metres(town):
+    network, index = town
+    meta = {**index.meta, "crs": "EPSG:27700", "origin": [624_000.0, 308_000.0]}
+    location, _ = placed((network, replace(index, meta=meta)), 15.0, 1.0)
+    assert location.center.lon == pytest.approx(1.3, abs=0.1)
+    assert location.lonlat_accuracy_m >= 1.0
+    assert location.lonlat_sigma_m == pytest.approx(np.hypot(np.sqrt(2), location.lonlat_accuracy_m))
+    assert placed(town, 15.0, 1.0)[0].lonlat_accuracy_m == 0.0
 
 
 @pytest.mark.slow

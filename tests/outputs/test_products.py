@@ -151,8 +151,9 @@ def test_names_that_opendronemap_does_not_take_are_told(tmp_path: Path, caplog: 
     photo = tmp_path / "My Photo 1.png"
     cv2.imwrite(str(photo), np.zeros((300, 400, 3), np.uint8))
     write_location(located(), road_mask(), output_paths(tmp_path, "a"), OutputOptions(products=("odm",)), photo)
-    document = {"status": "located", "query": "My Photo 2.png", "camera": CAMERA}
+    document = {"status": "located", "query": "My Photo 2.png", "camera": CAMERA, "lonlat_accuracy_m": 2.0}
     write_odm_geos(tmp_path / "geo.txt", [document, {**document, "query": "plain.png"}])
+    assert (tmp_path / "geo.txt").read_text().splitlines()[2].split()[7] == f"{np.sqrt(1 + 1 + 4):.3f}"
     told = "{}: OpenDroneMap takes no names with spaces: rename the picture, and in what is written"
     assert [record.getMessage() for record in caplog.records] == [told.format(f"My Photo {k}.png") for k in (1, 2)]
     assert "My Photo 1.png" in (tmp_path / "a_gcp_list.txt").read_text()

@@ -80,13 +80,14 @@ def fix_of(found: Mapping[str, Any], taken_s: float) -> PositionFix | None:
     camera = found.get("camera")
     if camera and camera.get("source", "camera") == "camera":
         told = camera.get("sigma")
-        sigma = camera["sigma_m"] if told is None else math.hypot(told["x_m"], told["y_m"])
+        known = found.get("lonlat_accuracy_m") or 0.0
+        sigma = camera["sigma_m"] if told is None else math.hypot(told["x_m"], told["y_m"], known)
         return PositionFix(camera["lon"], camera["lat"], sigma, taken_s)
     if found.get("center") is None or found.get("status") == "ambiguous":
         return None
     sigma = found.get("sigma_m")
     if sigma is None:
-        sigma = max(found.get("corner_sigma_m") or [math.nan])
+        sigma = max(found.get("lonlat_sigma_m") or found.get("corner_sigma_m") or [math.nan])
     return PositionFix(found["center"]["lon"], found["center"]["lat"], sigma, taken_s)
 
 

@@ -13,6 +13,7 @@ import numpy as np
 from roadgeo._arrays import FloatArray
 from roadgeo.geometry.pose import PoseOptions, find_pose
 from roadgeo.geometry.projection import LocalPlane, grid_north, to_lonlat
+from roadgeo.geometry.transformation import LONLAT, exactness
 from roadgeo.running.flights.pose import Pose
 from roadgeo.running.flights.tracker import Tracked
 
@@ -41,7 +42,7 @@ class Row:
     footprint : (4, 2) float64 or None
         Corners TL, TR, BR, BL as longitude and latitude.
     sigma_m : float
-        Standard deviation of the centre's place.
+        Standard deviation of the centre's longitude and latitude.
     heading_deg : float
         Direction of the image's up, clockwise from true north.
     homography : (3, 3) float64 or None
@@ -112,13 +113,14 @@ def _row(one: Tracked, begun: datetime | None, focal_px: float | None) -> Row:
     lonlat = to_lonlat(plane.crs, ground)
     up = pose.homography.jacobian(pose.frame.center) @ (0.0, -1.0)
     heading = math.degrees(math.atan2(up[0], up[1])) + grid_north(plane, ground[4])
+    inexact = exactness(plane.crs, LONLAT, lonlat[4].tolist()).sigma_m
     matrix = plane.to_crs_matrix() @ pose.homography.matrix
     return Row(
         *bare,
         one.reference.name,
         (float(lonlat[4, 0]), float(lonlat[4, 1])),
         lonlat[:4],
-        pose.sigma_m,
+        math.hypot(pose.sigma_m, inexact),
         pose.gsd_m,
         heading % 360.0,
         one.log10_odds,
@@ -135,5 +137,6 @@ def _camera(pose: Pose, plane: LocalPlane, focal_px: float) -> CameraPlace | Non
     if found is None:
         return None
     lon, lat = to_lonlat(plane.crs, plane.to_crs(found.position[None, :2]))[0]
-    sigma = math.sqrt(float(np.trace(found.covariance[:2, :2])))
+    inexact = exactness(plane.crs, LONLAT, (lon, lat)).sigma_m
+    sigma = math.hypot(math.sqrt(float(np.trace(found.covariance[:2, :2]))), inexact)
     return CameraPlace(float(lon), float(lat), float(found.position[2]), sigma)

@@ -39,7 +39,7 @@ from roadgeo.running.serving.requests import (
     read_texts,
 )
 from roadgeo.running.serving.tiles import MAX_ZOOM, Tiles
-from roadgeo.running.serving.view import OFFERED, PICTURE, VIEW, WARPED, safe_stem
+from roadgeo.running.serving.view import OFFERED, PICTURE, SEEN, VIEW, WARPED, safe_stem
 from roadgeo.running.serving.workers import Answer, Asked, Place, Workers
 
 __all__ = ["Service"]
@@ -283,7 +283,8 @@ class Service:
         hints = read_query_string(request.url.query)
         place, folder = self._workers.take_place(), self._make_folder()
         try:
-            await asyncio.to_thread(_link, old.path, folder / old.image)
+            for name in (old.image, SEEN):
+                await asyncio.to_thread(_link, old.folder / name, folder / name)
         except OSError as error:
             place.give_back()
             shutil.rmtree(folder, ignore_errors=True)
@@ -391,7 +392,9 @@ def _document_routes(documents: dict[str, dict[str, Any]]) -> list[Route]:
 
 
 def _link(old: Path, new: Path) -> None:
-    """Have an image lie in another folder, too."""
+    """Have a file lie in another folder, too, if it is there."""
+    if not old.is_file():
+        return
     try:
         new.hardlink_to(old)
     except OSError:  # of file systems that know none

@@ -30,10 +30,11 @@ from roadgeo.reference.reference import AnyReference
 from roadgeo.running.looks import Sighting
 from roadgeo.storage.files import replacing
 
-__all__ = ["OFFERED", "PICTURE", "VIEW", "WARPED", "safe_stem", "write_output", "write_view"]
+__all__ = ["OFFERED", "PICTURE", "SEEN", "VIEW", "WARPED", "safe_stem", "write_output", "write_view"]
 
-#: Names of files beside an image that was located: the picture reduced, the same on the map, all else that is shown.
-PICTURE, WARPED, VIEW = "picture.jpg", "warped.webp", "view.json"
+#: Names of files beside an image that was located: the picture reduced, the same on the map, all else that is shown,
+#: and of a photograph the probability of road.
+PICTURE, WARPED, VIEW, SEEN = "picture.jpg", "warped.webp", "view.json", "seen.tif"
 _KEPT = "kept.pickle.gz"
 
 #: What may be had of an answer. A virtual raster would lead to a file that its reader has not.
@@ -68,6 +69,8 @@ def write_view(path: Path, sighting: Sighting, references: Sequence[AnyReference
     if shown is not None:
         view["roads"] = [_rounded(line, 1) for line in shown.lines]
         view["place"] = None if shown.place is None else _show_place(folder, shown, shown.place)
+    if sighting.probability is not None:
+        sighting.probability.write(folder / SEEN)
     (folder / VIEW).write_text(json.dumps(view, allow_nan=False), encoding="utf-8")
     kept = (location, sighting.mask, sighting.of_photograph)
     with gzip.open(folder / _KEPT, "wb", compresslevel=1) as file:

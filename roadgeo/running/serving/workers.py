@@ -353,7 +353,7 @@ def _locate(asked: Asked, references: Sequence[Any], say: Say) -> Answer:
     from dataclasses import replace
 
     from roadgeo.running.queries import locate_query
-    from roadgeo.running.serving.view import write_view
+    from roadgeo.running.serving.view import SEEN, write_view
     from roadgeo.workflows import LocateOptions, locate
 
     def search(*asked_of: Any) -> Any:
@@ -373,10 +373,15 @@ def _locate(asked: Asked, references: Sequence[Any], say: Say) -> Answer:
     match = replace(default.match, camera=replace(default.match.camera, **hints), within=within)
     limits = replace(default.search, time_limit_s=asked.time_limit_s)
     options = replace(default, near=near, match=match, search=limits)
+    # Which roads a photograph shows does not depend on where it lies: found once, they are not looked for again. How
+    # large its pixels are would change what the network is shown.
+    seen = Path(asked.path).with_name(SEEN)
+    is_known = seen.is_file() and not asked.hints.keys() & {"gsd_m", "focal_px"}
     say("reading the image")
-    sighting = locate_query(asked.path, references, options, how=search, say=tell)
+    sighting = locate_query(str(seen) if is_known else asked.path, references, options, how=search, say=tell)
+    sighting = replace(sighting, of_photograph=sighting.of_photograph or is_known)
     location = replace(sighting.location, query=asked.name)
-    location = replace(location, reason=_without(asked.path, location.reason))
+    location = replace(location, reason=_without(asked.path, _without(str(seen), location.reason)))
     if asked.keeps:
         say("drawing the answer")
         write_view(Path(asked.path), replace(sighting, location=location), references)

@@ -20,6 +20,7 @@ import zlib
 from concurrent.futures import ThreadPoolExecutor
 from contextlib import contextmanager, nullcontext
 from dataclasses import replace
+from pathlib import Path
 
 import cv2
 import numpy as np
@@ -32,9 +33,13 @@ from roadgeo.errors import IndexFormatError, ModelError
 from roadgeo.evaluation.landscape import Landscape
 from roadgeo.evaluation.noise import NOISE_MODELS
 from roadgeo.evaluation.simulation import SimulationOptions, ViewOptions, simulate_query
+from roadgeo.geometry.mask import RoadMask
+from roadgeo.location import Location
 from roadgeo.reference.reference import Reference
 from roadgeo.running.flights.mavlink import has_pymavlink
+from roadgeo.running.looks import Sighting
 from roadgeo.running.serving.workers import Asked, Workers, _answer, _folder_of, _remove_all, _serve
+from roadgeo.sources.segmentation.probability import ProbabilityMap
 
 pytestmark = pytest.mark.slow
 
@@ -240,6 +245,25 @@ def test_photographs_are_refused_where_there_is_no_model_for_them(monkeypatch):
     answer = _answer(Asked("photo.jpg", {}, 1.0, 1000), [])
     assert answer.status == 415
     assert "onnxruntime" in answer.document["detail"]
+
+
+def test_the_roads_of_a_photograph_are_found_once(tmp_path, town, monkeypatch):
+    asked_of = []
+
+    def locate_query(path, *_, **__):
+        asked_of.append(Path(path).name)
+        seen = ProbabilityMap(np.full((40, 60), 9, np.uint8))
+        refused = Location("photo.png", "not_located", "hardly a road", size=(60, 40))
+        return Sighting(refused, RoadMask(np.zeros((40, 60), bool)), probability=seen, of_photograph=True)
+
+    monkeypatch.setattr("roadgeo.running.queries.locate_query", locate_query)
+    network, index = town
+    cv2.imwrite(str(tmp_path / "photo.png"), np.full((40, 60, 3), 99, np.uint8))
+    for hints in ({}, {"near": (0.0, 0.0, 9.0)}, {"gsd_m": (1.0, 2.0)}):
+        asked = Asked(str(tmp_path / "photo.png"), hints, 1.0, 10_000, keeps=True)
+        assert _answer(asked, [Reference(index, network)]).status == 200
+        assert json.loads((tmp_path / "view.json").read_text())["is_photograph"] is True
+    assert asked_of == ["photo.png", "seen.tif", "photo.png"]
 
 
 def test_a_missing_reference_is_said(tmp_path):
