@@ -297,10 +297,10 @@ class TestCountResiduals:
     def test_pixels_at_infinity_are_outside(self, w):
         roads, field, observed = town(5), np.zeros((10, 10), np.float32), np.ones((10, 10), bool)
         inverse, bounds = np.array([[1.0, 0, 0], [0, -1.0, 0], [0, 0, w]]), np.array([-1e4, -1e4, 1e4, 1e4])
-        nothing, forward, backward = np.empty((0, 2)), np.empty(self.BINS + 1), np.empty(self.BINS + 1)
+        nothing, (forward, backward) = np.empty((0, 2)), np.empty((2, 1, self.BINS + 1))
         count_residuals(
             TILTED, inverse, bounds, nothing, nothing, np.empty(0), self.RADIUS, MIN_COS, 4.0, roads, field, 20.0,
-            observed, forward, backward,
+            observed, math.inf, 1, forward, backward,
         )  # fmt: skip
         assert not backward.any()
 
