@@ -192,19 +192,23 @@ class TestArithmetic:
             lambda x, y: True, scene.field, scene.field_scale, scene.observed, 24,
         )  # fmt: skip
         metres = counted[0] * scene.road_length_px / len(scene.points) * gsd, counted[1] * gsd
+        # so many roads per pixel, so wide to either side, are near anyhow; in steps of a ladder
+        near = 2.0 * 4.0 * sigma_m / gsd / (scene.observed.sum() * scene.field_scale**2)
+        expected = 0.42 * near * counted[1].sum(), near * scene.road_length_px
+        anyhow = [0.8 ** round(math.log(1.0 - math.exp(-n)) / math.log(0.8)) for n in expected]
         likelihoods = []
         for sigma in (0.25, 0.4, 0.65, 1.0, 1.6):
             for false in (0.03, 0.1, 0.25, 0.5, 0.75):
                 for missing in (0.03, 0.1, 0.25, 0.5, 0.75):
                     nats = 0.0
                     for k in range(25):
-                        for length, s, share, anyhow in (
-                            (metres[0][k], sigma, false, 0.1),
-                            (metres[1][k], math.hypot(sigma, blur), missing, 0.25),
+                        for length, s, share, density in (
+                            (metres[0][k], sigma, false, anyhow[0]),
+                            (metres[1][k], math.hypot(sigma, round(blur, 1)), missing, anyhow[1]),
                         ):
                             r = (k + 0.5) * 4.0 / 24
                             g = math.sqrt(2 / math.pi) / s * math.exp(-0.5 * (r / s) ** 2) if k < 24 else 0.0
-                            b = anyhow / 4.0  # evenly, up to the reach
+                            b = density / 4.0  # evenly, up to the reach
                             nats += length / o.statement_m * math.log((1 - share) * g / b + share)
                     likelihoods.append(nats)
         most = max(likelihoods)
