@@ -55,7 +55,7 @@ class Reason(StrEnum):
     FEW_NEAR = "few_near"
     #: Stopped before everything was tried.
     TIME_LIMIT = "time_limit"
-    #: Nothing fits better than chance would.
+    #: No place explains clearly more than others do.
     NOTHING_STANDS_OUT = "nothing_stands_out"
     #: Something did, but not by enough for all the looks that were taken.
     TOO_MANY_LOOKS = "too_many_looks"
@@ -274,8 +274,8 @@ class Location:
         What the tilt rests on: the "camera" whose focal length was given, the "homography" where that tells the focal
         length, or a usual lens that is "assumed".
     log10_odds : float or None
-        Of the best place, against chance, or where streets repeat against any other place if that is more; also where
-        it is not enough to report it. None where no place was verified, or the method knows no odds.
+        By how many powers of ten the best place explains more than any other; also where it is not enough to report
+        it. None where no place was verified, or the method knows no odds.
     reason_code : Reason
         The reason for programs.
     corner_covariance_m2 : (8, 8) float64 or None

@@ -32,7 +32,7 @@ class Estimator(Protocol[Model]):
         """What was done so far, in seconds of a usual machine; told by counts, not by a clock."""
 
     def score(self, model: Model) -> float:
-        """Return the log10 odds of a model against chance."""
+        """Return the log10 odds of a model."""
 
     def settled(self, model: Model) -> bool:
         """Whether a model is complete, so that no better version of the same answer is to be expected."""

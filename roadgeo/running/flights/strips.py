@@ -42,7 +42,7 @@ class StripOptions:
     link_px : float
         Standard deviation of where a link puts a corner.
     least_odds : float
-        Log10 odds against chance by which a frame agrees with the map.
+        Log10 odds against places nearby by which a frame agrees with the map.
     most_gap : float
         A link that puts a frame's corners this share of its half diagonal off where the others put them is none.
     """

@@ -2,7 +2,7 @@
 
 While nothing is known, each frame is laid to those before, and the mosaic is located like any mask: the evidence is
 that of the engine, and each further look takes its share off. From there on a frame is predicted by its motion, laid on
-the roads nearby, and checked against chance. Frames that do not agree are taken for predicted; where several in a row
+the roads nearby, and compared with places nearby. Frames that do not agree are taken for predicted; where several in a row
 do not, the flight is lost, and the search begins anew with them.
 """
 
@@ -58,7 +58,7 @@ class TrackOptions:
     start_sigma_m : float
         Standard deviation of a located mosaic.
     least_odds : float
-        Log10 odds against chance by which a tracked frame agrees with the map. Of 351 simulated frames in place 99 %
+        Log10 odds against places nearby by which a tracked frame agrees with the map. Of 351 simulated frames in place 99 %
         had 0.66 and more; of 351 from elsewhere 278 could not be laid at all, and of the others at most one in 40 had
         as much.
     max_skew : float
@@ -127,7 +127,7 @@ class Tracked:
         None where it is lost.
     reference : Reference or None
     log10_odds : float
-        Against chance at this place, of this frame alone; NaN where it was not compared.
+        Against places nearby, of this frame alone; NaN where it was not compared.
     known_at : int
         Number of the frame at which this was known: a frame that waited in a mosaic was placed later.
     reason : str
@@ -232,9 +232,9 @@ class Tracker:
             odds = _odds(corrected, scene, reference, self.options.locate)
             if odds >= self.options.least_odds:
                 self._pose = corrected
-                why = f"its roads agree; log10 odds {odds:.1f} against chance here"
+                why = f"its roads agree; log10 odds {odds:.1f} against places nearby"
                 return Tracked(frame, status, why, known_at, corrected, reference, odds)
-            why = f"its roads do not agree (log10 odds {odds:.1f} against chance here); placed by its motion"
+            why = f"its roads do not agree (log10 odds {odds:.1f} against places nearby); placed by its motion"
         frame_m = predicted.frame.half_diagonal * 2.0 * predicted.gsd_m
         if predicted.sigma_m > self.options.lost_frames * frame_m:
             return Tracked(frame, "lost", "no road has agreed for too long", known_at)
@@ -421,7 +421,7 @@ def _scale(matrix: FloatArray, frame: Frame) -> float:
 
 
 def _odds(pose: Pose, scene: Scene, reference: Reference, options: LocateOptions) -> float:
-    """Return the log10 odds of a frame at its place against chance nearby."""
+    """Return the log10 odds of a frame at its place against places nearby."""
     matrix = pose.homography.matrix @ PIXEL_TO_PLANE
     # The frame was followed here, so that where streets are alike a block beside it, by which a search is judged, is no
     # rival: shifts that meet whole blocks are left out.
