@@ -125,8 +125,8 @@ def make_options(
     known = {name: value for name, value in hints.items() if value is not None and value is not False}
     if method == "pair" and known:
         raise click.UsageError(
-            "--method pair knows no hints: leave out --camera, --gsd, --heading,"
-            " --max-tilt, --near, --north-up and --within."
+            "--method pair knows no --camera, --gsd, --heading, --max-tilt, --near, --north-up or --within:"
+            " leave them out."
         )
     default = LocateOptions()
     near, within = known.pop("near", None), known.pop("within", None)

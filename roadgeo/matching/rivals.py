@@ -50,9 +50,11 @@ class RivalOptions:
     certain, repeating : float
         A place that leads all places nearby by so many powers of ten is not compared further, where the best of them
         explains less than such a part of what the place does: streets do not repeat there.
-    most_contradicted : float
-        Where more of the roads is contradicted it is none (see `Evidence.contradicted`). Of right places, of which up
-        to half is gone, false, stale or bent, 0.03; of the best wrong ones of masks turned over 0.15 and more.
+    doubt, usually_contradicted : float
+        Powers of ten that a place loses where all of the roads are contradicted (see `Evidence.contradicted`), in
+        proportion, beyond the usual share. At right places of masks of which up to half is gone, false, stale or bent
+        it is 0.03; at the best wrong ones of masks turned over 0.15 and more, where a city was laid out like its own
+        mirror image.
     n_known : int
         So many of the places that the search met are compared, the likeliest.
     n_places, n_laid : int
@@ -67,7 +69,8 @@ class RivalOptions:
 
     certain: float = 12.0
     repeating: float = 0.35
-    most_contradicted: float = 0.1
+    doubt: float = 100.0
+    usually_contradicted: float = 0.03
     n_known: int = 12
     n_places: int = 40
     n_laid: int = 8
@@ -114,7 +117,7 @@ class Rivals:
         self.estimators, self.options, self.ledger, self.needed = estimators, options, ledger, needed
         self._deadline = time.perf_counter() + time_limit_s
         self._known: dict[int, Standing] = {}
-        self._contradicted: dict[int, bool] = {}
+        self._doubts: dict[int, float] = {}
 
     def __call__(self, parts: Sequence[Search[Hypothesis]]) -> Search[Hypothesis] | None:
         """Return the part whose likeliest place leads all others by twice what is needed, if there is one."""
@@ -134,19 +137,13 @@ class Rivals:
         if not ranked:
             return None
         started = time.perf_counter()
-        sound = (model for model in ranked[: self.options.n_known] if not self._is_contradicted(estimator, model))
-        best = next(sound, None)
-        if best is None:
-            return Standing(ranked[0], None, min(ranked[0].log10_odds, 0.0))
+        best = max(ranked[: self.options.n_known], key=lambda one: one.log10_likelihood - self._doubt(estimator, one))
         for _ in range(_MOST_TURNS):
             standing = self._known.get(id(best)) or self._compare(estimator, best, ranked)
             self._known[id(best)] = standing
             if standing.rival is None or not standing.is_beaten:
                 break
-            other = self._take(estimator, standing.rival, ranked)
-            if self._is_contradicted(estimator, other):
-                break
-            best = other
+            best = self._take(estimator, standing.rival, ranked)
         one.seconds += time.perf_counter() - started
         return standing
 
@@ -154,10 +151,11 @@ class Rivals:
         scene, index, options, matrix = estimator.scene_of(best), estimator.index, self.options, best.laid
         if best.log10_likelihood < self.needed:
             return Standing(best, None, best.log10_odds)
+        doubt = self._doubt(estimator, best)
         likeliest = next((m.log10_likelihood for m in ranked if not estimator.same(m, best)), 0.0)
         odds = min(best.log10_odds, best.log10_likelihood - max(likeliest, 0.0))
         if odds >= options.certain and max(likeliest, best.nearby) < options.repeating * best.log10_likelihood:
-            return Standing(best, None, odds, best.log10_likelihood)
+            return Standing(best, None, odds - doubt, best.log10_likelihood)
         if time.perf_counter() > self._deadline:
             return Standing(best, None, min(odds, 0.0), best.log10_likelihood)
         evidence = Evidence(scene, index, sampling(matrix, scene.size), estimator.options.evidence)
@@ -176,16 +174,16 @@ class Rivals:
         # The larger the map, the more places may lead all that lie around them.
         paid = 2.0 * math.log10(larger(self.ledger.n_reference))
         likelihood, rival = others[0] if others else (-math.inf, None)
-        return Standing(best, rival, min(lead, worth) - paid, worth, likelihood)
+        return Standing(best, rival, min(lead, worth) - paid - doubt, worth, likelihood)
 
-    def _is_contradicted(self, estimator: TripleEstimator, model: Hypothesis) -> bool:
-        """Whether a place is none for what it contradicts; asked once of each."""
-        if id(model) not in self._contradicted:
-            scene, matrix = estimator.scene_of(model), model.laid
-            gsd = sampling(matrix, scene.size)
-            share = Evidence(scene, estimator.index, gsd, estimator.options.evidence).contradicted(matrix)
-            self._contradicted[id(model)] = share > self.options.most_contradicted
-        return self._contradicted[id(model)]
+    def _doubt(self, estimator: TripleEstimator, model: Hypothesis) -> float:
+        """Return what speaks against a place, in powers of ten, for what it contradicts; asked once of each."""
+        if id(model) not in self._doubts:
+            scene, matrix, options = estimator.scene_of(model), model.laid, self.options
+            evidence = Evidence(scene, estimator.index, sampling(matrix, scene.size), estimator.options.evidence)
+            share = evidence.contradicted(matrix) - options.usually_contradicted
+            self._doubts[id(model)] = options.doubt * max(share, 0.0)
+        return self._doubts[id(model)]
 
     def _take(self, estimator: TripleEstimator, matrix: FloatArray, ranked: Sequence[Hypothesis]) -> Hypothesis:
         """Return the hypothesis of a place that explains more than the likeliest: one that was met, or a new one."""
