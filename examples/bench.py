@@ -51,11 +51,12 @@ COUNT, LONG_COUNT = 6, 40
 
 @dataclass(frozen=True)
 class Kind:
-    """How a kind differs from a usual view: of `ViewOptions`, of `NoiseModel`, and half of the frame black."""
+    """How a kind differs from a usual view: of `ViewOptions`, of `NoiseModel`, half of the frame black, a lens."""
 
     view: dict[str, Any]
     noise: dict[str, Any]
     half_black: bool = False
+    lens_k1: float = 0.0
 
 
 _FRAME = {"size_px": (1024, 1024), "gsd_m": (0.45, 0.55), "tilt_deg": (0.0, 5.0), "intersections": (12, 1_000_000)}
@@ -72,7 +73,7 @@ KINDS = {
     "false60": Kind({}, {"false_roads": (0.6, 0.6)}),
     "tilt50_60": Kind({"tilt_deg": (50.0, 60.0)}, {}),
     "warp6": Kind({}, {"warp_px": 6.0}),
-    "lens": Kind({}, {"distortion": (0.12, 0.2)}),
+    "lens": Kind({}, {}, lens_k1=-0.08),
     "stale40": Kind(_LOST, {"outdated": (0.4, 0.4)}),
     "void_half": Kind({}, {}, half_black=True),
 }
@@ -187,12 +188,30 @@ def draw(landscape: Any, path: Path, kind: str, how: str, k: int) -> dict[str, A
     except RoadSourceError:
         return None
     mask = query.mask
+    if chosen.lens_k1:
+        mask = bend(mask, chosen.lens_k1)
     if chosen.half_black:
         angle = np.random.default_rng([SEED, k]).uniform(0.0, 2 * np.pi)
         y, x = np.mgrid[: mask.shape[0], : mask.shape[1]] - np.reshape(mask.shape, (2, 1, 1)) / 2
         mask = np.where(x * math.cos(angle) + y * math.sin(angle) > 0, np.uint8(0), mask)
     cv2.imwrite(str(path), mask, [cv2.IMWRITE_PNG_BILEVEL, 1])
     return truth_to_record(replace(query.truth, file=path.name, kind=how or kind, on_map=not how))
+
+
+def bend(mask: Any, k1: float) -> Any:
+    """See a mask through a lens that moves a pixel at r, in halves of the longer side, to r (1 + k1 r^2)."""
+    height, width = mask.shape
+    half = max(height, width) / 2
+    row, column = np.mgrid[:height, :width] + 0.5
+    x, y = (column - width / 2) / half, (row - height / 2) / half
+    bent = np.hypot(x, y)
+    plain = bent.copy()
+    for _ in range(50):  # what lies beyond the frame stays black
+        plain = np.minimum(bent / np.maximum(1.0 + k1 * plain**2, 0.5), 3.0)
+    scale = half * plain / np.maximum(bent, 1e-9)
+    sources = [(width / 2 + scale * x - 0.5).astype(np.float32), (height / 2 + scale * y - 0.5).astype(np.float32)]
+    seen = cv2.remap(mask, sources[0], sources[1], cv2.INTER_LINEAR)
+    return np.where(np.asarray(seen) > 127, np.uint8(255), np.uint8(0))
 
 
 # --- locating, in processes of their own ------------------------------------------------------------------------------

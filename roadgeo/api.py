@@ -153,7 +153,7 @@ def build_reference(
     path : path, optional
         Write it there, REF.gpkg and REF.index, and open it from there. Default: nothing is written.
     kinds : "main", "drivable", "vehicles" or "all"
-        Which roads are taken, where they tell their kind (`highway`, `fclass` or `class`).
+        Which roads are taken, where they tell their kind (see `roadgeo.sources.schemas`).
     tunnels : bool
         Take tunnels too, which a mask does not show.
     attribution : str, optional

@@ -18,7 +18,15 @@ from roadgeo.cli.clusters import cluster_options, make_cluster
 from roadgeo.cli.command_line import said_options
 from roadgeo.cli.folders import make_folder
 from roadgeo.cli.hints import HINTS, hint_options, make_options, refuse_swapped
-from roadgeo.cli.parameters import ASPECT, CRS, Plugin, out_dir_option, references_option, verbosity_options
+from roadgeo.cli.parameters import (
+    ASPECT,
+    CRS,
+    Plugin,
+    out_dir_option,
+    recursive_option,
+    references_option,
+    verbosity_options,
+)
 from roadgeo.cli.photographs import mask_options, read_options, segmenting_options
 from roadgeo.cli.printing import echo
 from roadgeo.cli.truths import read_truths
@@ -47,7 +55,10 @@ __all__ = ["describe", "locate_command", "pair_images"]
 Command = TypeVar("Command", bound=Callable[..., Any])
 
 #: Options that change nothing of a result, or that are said mask by mask.
-_OF_NO_ACCOUNT = {"as_json", "divide_map", "engine", "images", "jobs", "quiet", "scheduler", "skip_existing", "verbose"}
+_OF_NO_ACCOUNT = {
+    *("as_json", "divide_map", "engine", "images", "jobs", "quiet", "recursive", "scheduler", "skip_existing"),
+    "verbose",
+}
 
 _HELP = """Find where road MASKs lie on a map, and draw them there.
 
@@ -255,6 +266,7 @@ def _drawing_options(command: Command) -> Command:
     help="On a Dask cluster: each worker keeps and searches a share of the map's shards, for all masks: for maps that"
     " no machine holds.",
 )
+@recursive_option
 @verbosity_options
 def locate_command(
     masks: tuple[str, ...],
@@ -280,7 +292,7 @@ def locate_command(
     options = make_options(method, time_limit, {name: given[name] for name in HINTS}, effort)
     options = replace(options, truths=read_truths(given["truth"], explain=given["explain"]))
     outputs = _output_options(given)
-    found = find_masks(masks)
+    found = find_masks(masks, given["recursive"])
     if not found:
         raise click.UsageError(f"No images in {', '.join(masks)}.")
     others = found[1:] if given["fuse"] else []

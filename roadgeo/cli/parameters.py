@@ -11,6 +11,7 @@ import click
 
 __all__ = [
     "ASPECT",
+    "BANDS",
     "BOX",
     "CAMERA",
     "CRS",
@@ -21,6 +22,7 @@ __all__ = [
     "Numbers",
     "Plugin",
     "out_dir_option",
+    "recursive_option",
     "references_option",
     "verbosity_options",
 ]
@@ -113,6 +115,27 @@ class Plugin(click.ParamType):  # type: ignore[type-arg]
         from click.shell_completion import CompletionItem
 
         return [CompletionItem(name) for name in self._known() if name.startswith(incomplete)]
+
+
+class BandNumbers(click.ParamType):  # type: ignore[type-arg]
+    """Numbers of three bands, from 1."""
+
+    name = "bands"
+
+    def convert(self, value: Any, param: click.Parameter | None, ctx: click.Context | None) -> tuple[int, int, int]:
+        """Parse the text.
+
+        Raises
+        ------
+        click.BadParameter
+            It is none such.
+        """
+        if isinstance(value, tuple):
+            return value
+        numbers = [int(part) if part.strip().isdecimal() else 0 for part in str(value).split(",")]
+        if len(numbers) != 3 or min(numbers) < 1:
+            self.fail(f"got {value!r}, expected R,G,B: three numbers from 1", param, ctx)
+        return numbers[0], numbers[1], numbers[2]
 
 
 class Crs(click.ParamType):  # type: ignore[type-arg]
@@ -277,6 +300,7 @@ class Aspect(click.ParamType):  # type: ignore[type-arg]
 
 ASPECT = Aspect()
 #: A box in degrees; west may exceed east, across the 180th meridian.
+BANDS = BandNumbers()
 BOX = Numbers("box", ("W", "S", "E", "N"), ",", _wrong_box)
 
 
@@ -285,6 +309,12 @@ def verbosity_options(command: Command) -> Command:
     verbose = click.option("-v", "--verbose", is_flag=True, help="Say more: times, counts, files read.")
     quiet = click.option("-q", "--quiet", is_flag=True, help="Say nothing but errors, and what --json prints.")
     return verbose(quiet(command))
+
+
+def recursive_option(command: Command) -> Command:
+    """Add --recursive."""
+    told = "Of folders also the images in all folders within them, as cameras keep theirs (DCIM)."
+    return click.option("--recursive", is_flag=True, help=told)(command)
 
 
 def references_option(purpose: str = "Reference to search") -> Callable[[Command], Command]:

@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING, Any, TypeVar
 
 import click
 
-from roadgeo.cli.parameters import Plugin
+from roadgeo.cli.parameters import BANDS, Plugin
 
 if TYPE_CHECKING:
     from roadgeo.running.options import ReadOptions
@@ -79,7 +79,9 @@ def mask_options(command: Command) -> Command:
     told = "Values above T are road; of a photograph (--segment always) probabilities. Default: told by them."
     threshold = click.option("--threshold", metavar="T", type=float, help=told)
     held = "Band that holds the mask. Default: told by the bands."
-    return threshold(click.option("--band", metavar="N", type=click.IntRange(1), help=held)(command))
+    band = click.option("--band", metavar="N", type=click.IntRange(1), help=held)
+    seen = "Red, green and blue band of photographs, such as 3,2,1. Default: told by their names, or the first three."
+    return threshold(band(click.option("--bands", metavar="R,G,B", type=BANDS, help=seen)(command)))
 
 
 def n_threads(jobs: int = 1) -> int:
@@ -106,4 +108,5 @@ def read_options(given: Mapping[str, Any], photos: Mapping[str, str], others: Se
         units=given.get("units") or "auto",
         layer=given.get("layer"),
         aspect=given.get("aspect"),
+        bands=given["bands"],
     )

@@ -17,7 +17,7 @@ from roadgeo.cli import NOT_LOCATED
 from roadgeo.cli.accuracy import tell_accuracy
 from roadgeo.cli.folders import make_folder
 from roadgeo.cli.hints import hint_options, make_options, refuse_swapped
-from roadgeo.cli.parameters import out_dir_option, references_option, verbosity_options
+from roadgeo.cli.parameters import out_dir_option, recursive_option, references_option, verbosity_options
 from roadgeo.cli.photographs import mask_options
 from roadgeo.cli.printing import echo
 
@@ -152,6 +152,7 @@ class Moment(click.ParamType):  # type: ignore[type-arg]
     show_default=True,
     help="Of one search.",
 )
+@recursive_option
 @verbosity_options
 def track_command(
     frames: tuple[str, ...],

@@ -11,7 +11,7 @@ from roadgeo._text import visible
 from roadgeo.cli import ERROR
 from roadgeo.cli.folders import make_folder
 from roadgeo.cli.hints import hint_options
-from roadgeo.cli.parameters import out_dir_option
+from roadgeo.cli.parameters import out_dir_option, recursive_option
 from roadgeo.cli.photographs import mask_options, n_threads, segmenting_options
 from roadgeo.cli.printing import echo
 from roadgeo.cli.progress import show_steps
@@ -30,7 +30,10 @@ __all__ = ["vectorize_command"]
 @mask_options
 @hint_options("gsd_m")
 @partial(segmenting_options, fuse=False)
-def vectorize_command(images: tuple[str, ...], out_dir: str, gsd_m: tuple[float, float] | None, **given: Any) -> int:
+@recursive_option
+def vectorize_command(
+    images: tuple[str, ...], out_dir: str, gsd_m: tuple[float, float] | None, recursive: bool, **given: Any
+) -> int:
     """Show what roads and intersections are seen in IMAGEs: the first thing to look at when one was not located.
 
     An image is a road mask or a photograph (pip install 'roadgeo[segment]'). For photo.jpg it writes
@@ -52,7 +55,7 @@ def vectorize_command(images: tuple[str, ...], out_dir: str, gsd_m: tuple[float,
     query = QueryOptions(**given, threads=n_threads())
     status = 0
     with show_steps(quiet=False) as say:
-        for task in name_tasks(find_masks(images)):
+        for task in name_tasks(find_masks(images, recursive)):
             try:
                 seen = _show(task, out_dir, gsd_m, query, say)
             except RoadgeoError as error:

@@ -13,7 +13,7 @@ import click
 from roadgeo.cli import ERROR, NOT_LOCATED
 from roadgeo.cli.command_line import made_by
 from roadgeo.cli.folders import make_folder
-from roadgeo.cli.parameters import CRS, out_dir_option, references_option, verbosity_options
+from roadgeo.cli.parameters import CRS, out_dir_option, recursive_option, references_option, verbosity_options
 from roadgeo.cli.photographs import mask_options, read_options, segmenting_options
 from roadgeo.cli.printing import echo
 
@@ -71,6 +71,7 @@ _COLORS = {"agrees": "green", "off": "red", "unknown": "yellow"}
 @segmenting_options
 @mask_options
 @click.option("-j", "--jobs", metavar="N", type=click.IntRange(1), default=1, show_default=True, help="Processes.")
+@recursive_option
 @verbosity_options
 def verify_command(
     images: tuple[str, ...],
@@ -115,7 +116,7 @@ def verify_command(
     from roadgeo.running.tasks import find_masks, name_tasks
     from roadgeo.running.verifying import verify_images
 
-    found = find_masks(images)
+    found = find_masks(images, given["recursive"])
     if not found:
         raise click.UsageError(f"No images in {', '.join(images)}.")
     tasks = name_tasks(found[:1] if given["fuse"] else found)

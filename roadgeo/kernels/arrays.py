@@ -89,7 +89,8 @@ def kind_of(annotation: Any) -> Kind:
         return annotation  # type: ignore[no-any-return]
     if get_origin(annotation) is Annotated:
         array, ndim = get_args(annotation)
-        return ArrayKind(np.dtype(get_args(get_args(array)[1])[0]), ndim)
+        told = get_args(array)  # of the alias `NDArray[scalar]`, or, before NumPy made it one, of what it stands for
+        return ArrayKind(np.dtype(told[0] if len(told) == 1 else get_args(told[1])[0]), ndim)
     if get_origin(annotation) is tuple:
         return TupleKind(tuple(map(kind_of, get_args(annotation))))
     if hasattr(annotation, "_fields"):

@@ -347,7 +347,9 @@ def _compile(module: str, progress: Callable[[int], None]) -> None:
         code = compile_kernels(entries(module), _engine().llvm, _engine().machine, progress)
         _bind(module, code)
     except Exception as error:  # of private parts of numba, which other versions may have otherwise, or not at all
-        _LOG.warning("kernels take longer to load, for numba keeps them: %s: %s", type(error).__name__, error)
+        why = next(iter(str(error).splitlines()), "")
+        kind = type(error).__name__
+        _LOG.warning("kernels of %s take longer to load, for numba keeps them: %s: %s", module, kind, why)
         _left_to_numba.add(module)
         return
     path = _file(module)

@@ -17,7 +17,7 @@ from roadgeo.kernels.structs import RoadBuckets
 __all__ = ["road_equations"]
 
 
-@kernel()
+@kernel(writes=("normal", "right"))
 def road_equations(
     p: Floats1,
     unit: float,

@@ -70,20 +70,22 @@ def _judge(query: Query, found: Sequence[Found], options: LocateOptions) -> Loca
         return _decide_pairs(location, query, found, options)
     # The best place of all references, and the others.
     candidates = _pool(query, found)
-    best = candidates[0] if candidates else None
-    rivals = candidates[1:]
-    rival = rivals[0] if rivals else None
+    best, rivals = (candidates[0] if candidates else None), candidates[1:]
     if best is not None:
         others = tuple(_seen_from(best, one) for one in rivals)
         location = replace(
             location, log10_odds=best.score, runner_up=others[0] if others else None, alternatives=others
         )
-    alike = best is not None and rival is not None and _are_alike(best, rival)
-    if best is None or (best.score < options.min_log10_odds and not alike):
+    needed = options.min_log10_odds
+    rival = None if best is None else _equal(best, rivals, needed)
+    if best is None or (best.score < needed and rival is None):
         return _refuse(location, query, found, best, options)
+    best = _against(best, rivals)
     placed = place_frame(_on(location, best.found), query, best.fit, options.match)
     cut = f"; stopped at the time limit, {_CUT_SHORT}" if location.stopped == "time" else ""
-    if rival is not None and best.score < options.min_log10_odds:
+    if rival is not None:
+        runner_up = _seen_from(best, rival)
+        placed = replace(placed, runner_up=runner_up)
         reason = _two_places(best, rival) + cut
         return replace(placed, status="ambiguous", reason=reason, reason_code=Reason.TWO_PLACES)
     reason = (
@@ -132,20 +134,14 @@ def _on(location: Location, found: Found) -> Location:
 def _pool(query: Query, found: Sequence[Found]) -> list[_Candidate]:
     """Return the places of all references, the best first; where parts overlap, each once.
 
-    Of places on different references the likelier one is the best; it leads the other by the difference at most.
+    Of places on different references the likelier one is the best.
     """
     pool = [_Candidate(one, fit, center_of(query, fit)) for one in found for fit in one.fits]
     distinct: list[_Candidate] = []
     for candidate in sorted(pool, key=lambda one: (-one.fit.log10_likelihood, -one.score)):
         if all(_differ(query, one, candidate) for one in distinct):
             distinct.append(candidate)
-    elsewhere = [one.fit.log10_likelihood for one in distinct[1:] if one.found is not distinct[0].found]
-    if not elsewhere:
-        return distinct
-    best, *others = distinct
-    odds = min(best.score, best.fit.log10_likelihood - max(elsewhere))
-    fit = replace(best.fit, log10_odds=odds)
-    return [replace(best, fit=fit, center=replace(best.center, log10_odds=odds)), *others]
+    return distinct
 
 
 def _differ(query: Query, a: _Candidate, b: _Candidate) -> bool:
@@ -163,6 +159,24 @@ def _seen_from(best: _Candidate, rival: _Candidate) -> Place:
     plane = best.fit.index.plane
     x, y = plane.to_crs(from_lonlat(plane, np.array([[rival.center.lon, rival.center.lat]])))[0]
     return replace(rival.center, x=float(x), y=float(y))
+
+
+def _against(best: _Candidate, rivals: Sequence[_Candidate]) -> _Candidate:
+    """Return a place with the odds by which it leads also those on other references."""
+    elsewhere = [one.fit.log10_likelihood for one in rivals if one.found is not best.found]
+    odds = min([best.score, *(best.fit.log10_likelihood - likelihood for likelihood in elsewhere)])
+    return replace(best, fit=replace(best.fit, log10_odds=odds), center=replace(best.center, log10_odds=odds))
+
+
+def _equal(best: _Candidate, rivals: Sequence[_Candidate], needed: float) -> _Candidate | None:
+    """Return a rival that makes the best place ambiguous, if there is one.
+
+    On its own map that is one that agrees so well, as the best does, that only streets that repeat explain it; on
+    another, one that the best place would be reported without.
+    """
+    if best.score < needed:
+        return next((one for one in rivals if _are_alike(best, one)), None)
+    return next((one for one in rivals if _against(best, [one]).score < needed), None)
 
 
 def _are_alike(best: _Candidate, rival: _Candidate) -> bool:

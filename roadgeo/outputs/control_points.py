@@ -14,6 +14,7 @@ from tempfile import TemporaryDirectory
 
 import numpy as np
 
+from roadgeo.errors import OutputError
 from roadgeo.geometry.projection import to_lonlat
 from roadgeo.outputs.names import name_for_odm
 from roadgeo.outputs.subject import Subject
@@ -45,6 +46,9 @@ def write_vrt(path: Path, subject: Subject) -> None:
 
     from roadgeo.storage.rasters import open_raster, writing_raster
 
+    with open_raster(subject.picture.absolute(), upright=False) as source:
+        if source.driver == "MEM":
+            raise OutputError(f"{subject.picture}: GDAL does not read it where it lies; save it as GeoTIFF")
     with open_raster(subject.picture.absolute(), upright=False) as source, writing_raster(path):
         rasterio.shutil.copy(source, path, driver="VRT")
     document = ET.parse(path)  # noqa: S314 (GDAL wrote it just now)

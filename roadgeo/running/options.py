@@ -39,6 +39,8 @@ class ReadOptions:
         Of a file of such roads that has several.
     aspect : float, "unknown" or None
         How many times a pixel is as wide as high; None: once.
+    bands : (3,) tuple of int, or None
+        The red, green and blue band of photographs, counted from 1.
     """
 
     threshold: float | None = None
@@ -55,6 +57,7 @@ class ReadOptions:
     units: Literal["auto", "pixels", "metres"] = "auto"
     layer: str | None = None
     aspect: float | Literal["unknown"] | None = None
+    bands: tuple[int, int, int] | None = None
 
     def photo(self, task: Task, of_photograph: bool) -> str | None:
         """Return the photograph that is drawn, if any: one that was given, or the query itself."""
@@ -66,7 +69,7 @@ class ReadOptions:
 
         return QueryOptions(
             self.threshold, self.band, self.segment, self.segmenters, self.class_name, self.fused_with, self.threads,
-            "allow" if self.allow_mirror else "tell", self.units, self.layer, self.aspect,
+            "allow" if self.allow_mirror else "tell", self.units, self.layer, self.aspect, self.bands,
         )  # fmt: skip
 
 

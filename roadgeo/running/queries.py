@@ -84,6 +84,8 @@ class QueryOptions:
         Of a file of such roads that has several.
     aspect : float, "unknown" or None
         How many times a pixel of a mask is as wide as high; None: once.
+    bands : (3,) tuple of int, or None
+        The red, green and blue band of a photograph, counted from 1. Default: told by their names, or the first three.
     """
 
     threshold: float | None = None
@@ -97,6 +99,7 @@ class QueryOptions:
     units: Units = "auto"
     layer: str | None = None
     aspect: float | Literal["unknown"] | None = None
+    bands: tuple[int, int, int] | None = None
 
     @property
     def may_be_mask(self) -> bool:
@@ -301,7 +304,7 @@ class _Frame:
 
 def _open_frame(paths: Sequence[str], query: QueryOptions, camera: CameraOptions, say: Say) -> _Frame:
     """Choose the grid and the scales of a photograph, or of several of one frame."""
-    with open_photograph(paths[0]) as photograph:
+    with open_photograph(paths[0], query.bands) as photograph:
         k = max(1, int(np.ceil(np.sqrt(photograph.width * photograph.height / _MAX_GRID_PIXELS))))
         own = round(photograph.height / k), round(photograph.width / k)
     tried: _Tried = {}
@@ -378,12 +381,12 @@ def _choose_scales(path: str, query: QueryOptions, camera: CameraOptions, say: S
     @cache
     def ranked() -> list[float]:
         say(f"looking for the scale of {path}")
-        with open_photograph(path) as photograph:
+        with open_photograph(path, query.bands) as photograph:
             found = rank_scales(photograph, network, camera.gsd_m)
         tried.update({(path, models[0], scale): seen for scale, seen in found.items() if seen is not None})
         return list(found)
 
-    with open_photograph(path) as photograph:
+    with open_photograph(path, query.bands) as photograph:
         n_ranked = len(try_scales(photograph, network, camera.gsd_m))
     stated = estimate_gsd(path)
     makers = [partial(lambda i: ranked()[i], i) for i in range(n_ranked)]
@@ -406,7 +409,7 @@ def _see(
     """Return what one segmenter sees in one photograph, not much finer than a grid."""
     if _is_plugin(segmenter):
         return _of_mask(_call_segmenter(segmenter, path, query.threshold), segmenter)
-    with open_photograph(path) as photograph:
+    with open_photograph(path, query.bands) as photograph:
         step = max(1, int(map_shape(photograph, scale)[0] / grid[0]))
         return segment(photograph, _network_of(segmenter, query), scale, say, step=step, ways=ways)
 

@@ -4,9 +4,10 @@ from __future__ import annotations
 
 import glob
 import hashlib
+import logging
 import os
 from collections import Counter
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -15,6 +16,8 @@ from roadgeo.outputs.registry import is_result
 from roadgeo.running.probability_files import ENDING, is_ours
 
 __all__ = ["SUFFIXES", "Task", "find_masks", "name_tasks"]
+
+_LOG = logging.getLogger(__name__)
 
 #: What a folder is searched for.
 SUFFIXES = (".tif", ".tiff", ".png", ".jpg", ".jpeg", ".jp2", ".bmp", ".pgm", ".webp", ".vrt", ".img", ".npy")
@@ -37,17 +40,39 @@ class Task:
         return os.fsencode(self.mask).decode(errors="backslashreplace")
 
 
-def find_masks(arguments: Sequence[str]) -> list[str]:
-    """Expand folders (their images, not our own results) and patterns, which not every shell expands; keep the rest."""
+def find_masks(arguments: Sequence[str], recursive: bool = False) -> list[str]:
+    """Expand folders (their images, not our own results) and patterns, which not every shell expands; keep the rest.
+
+    Images in folders within folders are found where that is asked for; else it is said that there are some.
+    """
     found: list[str] = []
     for argument in arguments:
         if Path(argument).is_dir():
-            found += sorted(str(path) for path in Path(argument).iterdir() if _is_mask(path))
+            found += sorted(str(path) for path in _images_in(Path(argument), recursive))
+            if not recursive:
+                _tell_passed_over(Path(argument))
         elif glob.has_magic(argument) and not Path(argument).exists():
             found += sorted(glob.glob(argument, recursive=True)) or [argument]  # noqa: PTH207 (patterns may be absolute)
         else:
             found.append(argument)
     return found
+
+
+def _images_in(folder: Path, recursive: bool) -> Iterator[Path]:
+    """Yield the images of a folder, and of all within it."""
+    for root, folders, names in os.walk(folder):
+        folders[:] = [name for name in sorted(folders) if recursive and not name.startswith(".")]
+        yield from (path for path in (Path(root, name) for name in sorted(names)) if _is_mask(path))
+
+
+def _tell_passed_over(folder: Path) -> None:
+    """Say that there are images in folders within a folder."""
+    first = next((path for path in _images_in(folder, recursive=True) if path.parent != folder), None)
+    if first is not None:
+        _LOG.warning(
+            "%s: images in folders within it, such as %s, are passed over; --recursive takes them too",
+            *(visible(str(one)) for one in (folder, first.relative_to(folder))),
+        )
 
 
 def _is_mask(path: Path) -> bool:

@@ -72,7 +72,7 @@ def draw_roads(path: str | os.PathLike[str], units: Units = "auto", layer: str |
         raise MaskError(str(error)) from error
     import shapely
 
-    rings = np.asarray(shapely.get_parts(shapely.boundary(read.areas)))  # of a hole as of an outline
+    rings, area = shapely.get_parts(shapely.boundary(read.areas), return_index=True)  # outlines and holes
     is_drawn = len(read.lines) > 0
     coords, owner = shapely.get_coordinates(read.lines if is_drawn else rings, return_index=True)
     kind = _tell_units(name, coords, read.crs) if units == "auto" else units
@@ -93,7 +93,7 @@ def draw_roads(path: str | os.PathLike[str], units: Units = "auto", layer: str |
     width, height = np.ceil((high - low) / unit).astype(int) + 2 * _MARGIN_PX
     road = _ROAD_PX if kind == "pixels" else float(np.clip(_ROAD_M / unit, 4.0, 12.0))
     pixels, size = coords @ to_pixel[:2, :2].T + to_pixel[:2, 2], (int(width), int(height))
-    roads = _draw(pixels, owner, size, round(road)) if is_drawn else _fill(pixels, owner, size)
+    roads = _draw(pixels, owner, size, round(road)) if is_drawn else _fill(pixels, owner, area, size)
     mask = RoadMask(roads, name=name)
     return Drawing(mask, None if degrees else to_pixel, None if kind == "pixels" else unit, degrees)
 
@@ -127,13 +127,12 @@ def _draw(pixels: FloatArray, owner: IntArray, size: tuple[int, int], width: int
     return np.asarray(canvas > 0)
 
 
-def _fill(pixels: FloatArray, owner: IntArray, size: tuple[int, int]) -> BoolArray:
-    """Fill what lies within an odd number of rings (corner convention; `owner` numbers them) as (H, W) bool."""
+def _fill(pixels: FloatArray, owner: IntArray, area: IntArray, size: tuple[int, int]) -> BoolArray:
+    """Fill polygons but for their holes (corner convention; `owner` numbers rings, `area` is theirs) as (H, W) bool."""
     canvas = np.zeros(size[::-1], np.uint8)
-    for ring in _each_line(pixels, owner):
-        one = np.zeros_like(canvas)
-        cv2.fillPoly(one, [ring], 255, cv2.LINE_8, 4)
-        canvas ^= one
+    rings = _each_line(pixels, owner)
+    for first, last in zip(*(np.searchsorted(area, np.unique(area), side) for side in ("left", "right")), strict=True):
+        cv2.fillPoly(canvas, rings[first:last], 255, cv2.LINE_8, 4)
     return np.asarray(canvas > 0)
 
 

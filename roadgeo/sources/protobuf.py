@@ -1,7 +1,6 @@
 """The wire format of Protocol Buffers: fields of a message, read without its schema.
 
-Enough to look at an ONNX file before anything executes it, and at the text of a PBF file before osmium does. The `onnx`
-package would bring 15 MB and protobuf with it; here a message is walked in place, and large fields are never copied.
+Enough to look at the text of a PBF file before osmium does: a message is walked in place, and fields are never copied.
 https://protobuf.dev/programming-guides/encoding/
 """
 
@@ -9,7 +8,7 @@ from __future__ import annotations
 
 from collections.abc import Iterator
 
-__all__ = ["Field", "WireError", "fields", "integers"]
+__all__ = ["Field", "WireError", "fields"]
 
 #: A field: its number, and a varint's value or the bytes of a nested message, string or packed list.
 Field = tuple[int, "int | memoryview"]
@@ -47,27 +46,6 @@ def fields(message: memoryview) -> Iterator[Field]:
             raise WireError(f"field {number} reaches beyond its message")
         yield number, message[at : at + size]
         at += size
-
-
-def integers(value: int | memoryview) -> list[int]:
-    """Return the signed integers of a repeated field's entry: one, or a packed list.
-
-    Raises
-    ------
-    WireError
-        The list is cut short.
-    """
-    if isinstance(value, int):
-        return [_signed(value)]
-    found, at = [], 0
-    while at < len(value):
-        number, at = _varint(value, at)
-        found.append(_signed(number))
-    return found
-
-
-def _signed(value: int) -> int:
-    return value - (1 << 64) if value >> 63 else value
 
 
 def _varint(message: memoryview, at: int) -> tuple[int, int]:

@@ -179,7 +179,7 @@ def _unpacked(path: Path, folder: Path) -> list[Path]:
 def tell_source(name: str, meta: Mapping[str, Any]) -> None:
     """Say what of a source was left out, or is not known."""
     counts = {
-        "no_roads": "are no roads but streams, railways, fences or the like",
+        "no_roads": "are no roads: streams, railways, fences, or not built",
         "broken": "have a vertex that is not finite",
         "without_places": "are ways whose nodes are not in the file",
     }

@@ -44,6 +44,9 @@ __all__ = [
 #: Pixels, of the largest raster that anything is read of: a photograph.
 MAX_SIDE = 60_000
 
+#: An axis of an array no longer than this holds bands: a mask has at least 32 rows and columns.
+_MAX_BANDS = 16
+
 #: First bytes of the formats that are read, and GDAL's names of their drivers.
 _DRIVERS = (
     (rb"II[*+]\0|MM\0[*+]", "GTiff"),
@@ -57,12 +60,13 @@ _DRIVERS = (
     (rb"EHFA_HEADER_TAG", "HFA"),
     (rb"\s*(<\?xml[^>]*>\s*)?<VRTDataset", "VRT"),
 )
-_NAMES = "GeoTIFF, PNG, JPEG, JPEG 2000, WebP, BMP, PNM, GIF, Erdas Imagine"
+_NAMES = "GeoTIFF, PNG, JPEG, JPEG 2000, WebP, BMP, PNM, GIF, Erdas Imagine, .npy"
 
 #: A block is decoded whole: more than this for one is a bomb, or should be tiled.
 _MAX_BLOCK_BYTES = 2 << 30
 _MAX_SIDECAR = 1 << 20
 _MAX_TURNED_BYTES = 1 << 30  # of a decoded picture, which is kept in memory
+_ARRAY = b"\x93NUMPY"
 _CACHE_BYTES = 256 << 20  # of decoded blocks; GDAL's own is a twentieth of the machine's memory
 _HEAD_BYTES = 8192
 _LITTLE_SPACE = 8 << 20
@@ -102,6 +106,10 @@ def open_raster(
     remote = is_named_remote(path)
     if not remote:
         require_file(path, name)
+        if _is_array(path):
+            with warnings.catch_warnings(), _opened_array(path, name) as dataset:
+                yield dataset
+            return
     if remote:
         drivers = allowed_drivers() + [driver for _, driver in _DRIVERS[:-1]]
     else:
@@ -305,6 +313,47 @@ def _opened(path: str, drivers: list[str], remote: bool) -> Iterator[DatasetRead
             with dataset:
                 yield dataset
             return
+
+
+def _is_array(path: str | os.PathLike[str]) -> bool:
+    with open(path, "rb") as file:  # noqa: PTH123 (names may hold what Path refuses)
+        return file.read(len(_ARRAY)) == _ARRAY
+
+
+@contextmanager
+def _opened_array(path: str | os.PathLike[str], name: str) -> Iterator[DatasetReader]:
+    """Copy an array that NumPy saved into memory as a raster: (H, W), or with bands first or last."""
+    import rasterio
+    from rasterio.errors import NotGeoreferencedWarning
+
+    try:
+        array = _bands_first(np.lib.format.open_memmap(path, mode="r"))  # unpickles nothing
+    except (ValueError, OSError, OverflowError, SyntaxError, TypeError, EOFError) as error:
+        reason = " ".join(str(error).split())[:200]
+        raise MaskError(f"{name}: no array that can be read ({reason}); expected numbers, by numpy.save") from error
+    if array is None or array.dtype.kind not in "biuf":
+        told = "" if array is None else f" of {array.dtype}"
+        raise MaskError(f"{name}: holds an array{told}; expected (rows, columns) of real numbers, bands first or last")
+    if max(array.shape[1:]) > MAX_SIDE or array.nbytes > _MAX_TURNED_BYTES:
+        raise MaskError(f"{name}: an array of {array.shape}, {array.nbytes / 1e9:.1f} GB; save it as GeoTIFF")
+    kind = "uint8" if array.dtype.kind == "b" else "float32" if array.dtype == np.float16 else array.dtype.name
+    kind = "float64" if array.dtype.kind == "f" and array.dtype.itemsize > 8 else kind
+    count, height, width = array.shape
+    warnings.simplefilter("ignore", NotGeoreferencedWarning)
+    with rasterio.open("", "w+", driver="MEM", count=count, height=height, width=width, dtype=kind) as raster:
+        for band in range(count):
+            raster.write(np.asarray(array[band], kind), band + 1)
+        raster.transform = rasterio.Affine.identity()
+        yield raster
+
+
+def _bands_first(array: AnyArray) -> AnyArray | None:
+    """Return an array as (bands, H, W), of which the short axis holds the bands; None of another shape."""
+    if array.ndim == 2 and array.size:
+        return array[None]
+    if array.ndim != 3 or not array.size:
+        return None
+    return array if array.shape[0] <= _MAX_BANDS < array.shape[2] or array.shape[0] == 1 else np.moveaxis(array, 2, 0)
 
 
 def _orientation(dataset: DatasetReader, path: str | os.PathLike[str], remote: bool) -> int:

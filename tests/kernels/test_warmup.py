@@ -8,7 +8,8 @@ from pathlib import Path
 
 import pytest
 
-from roadgeo.kernels.compilation import compiled, entries, modules_of_the_search
+from roadgeo.kernels import compilation
+from roadgeo.kernels.compilation import compiled, entries, load, modules_of_the_search
 from roadgeo.kernels.warmup import remove_unused, warm_up
 
 #: Every array on the way from roads and mask to a place must be what the kernels expect, or numba is asked for help.
@@ -30,6 +31,16 @@ def test_all_kernels_of_the_search_are_kept_as_machine_code() -> None:
     assert told == [] or (told[0] == 0.0 and told[-1] == 1.0)
     kept = [one for module in modules_of_the_search() for one in entries(module)]
     assert len(kept) > 25
+
+
+def test_all_other_kernels_are_kept_too() -> None:
+    """Each names the arguments that it writes to, and returns what it is annotated with."""
+    folder = Path(compilation.__file__).parent
+    modules = [f"roadgeo.kernels.{path.stem}" for path in sorted(folder.glob("*.py"))]
+    modules = [module for module in modules if entries(module)]
+    load(modules)
+    assert compiled(modules)
+    assert not compilation._left_to_numba & set(modules)
 
 
 @pytest.mark.slow

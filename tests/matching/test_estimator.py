@@ -80,7 +80,6 @@ def test_a_mirrored_view_is_refused(town):
 
 
 @pytest.mark.slow
-@pytest.mark.xfail(strict=True, reason="a place that was beyond doubt when it was met heeds no twin that is met later")
 def test_twins_leave_no_margin():
     centre = random_lines(5, 1500.0)
     lines = [shapely.affinity.translate(line, dx, dy) for dx, dy in [(0, 0), (4000, 700)] for line in centre]

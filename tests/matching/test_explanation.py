@@ -107,7 +107,7 @@ def test_watching_changes_nothing(town, mask):
     ("limits", "fault", "value"),
     [
         ({"gsd_m": (0.3, 0.7)}, "ground sampling out of range", "(1.0"),
-        ({"north_up": True}, "not north up", "(up is 2"),
+        ({"north_up": True}, "heading out of range", "(up is 2"),
     ],
 )
 def test_limits_that_are_too_narrow_are_named(town, mask, limits, fault, value):

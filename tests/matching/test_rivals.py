@@ -210,9 +210,11 @@ def test_a_search_ends_where_a_place_leads_by_twice_what_is_needed(broken):
     one, estimator = search_of(broken, broken[0])
     empty, other = search_of(broken)
     both = {empty: other, one: estimator}
-    assert Rivals(both, RivalOptions(), Ledger(n_reference=866), NEEDED)([empty, one]) is one
-    assert Rivals(both, RivalOptions(), Ledger(n_reference=15_000 * 10**4), NEEDED)([empty, one]) is None
-    assert Rivals(both, RivalOptions(), Ledger(n_reference=866), 2.0 * NEEDED)([empty, one]) is None
+    standing = Rivals(both, RivalOptions(), Ledger(n_reference=866), 1.0).standing(one)
+    half = 0.49 * standing.log10_lead
+    assert Rivals(both, RivalOptions(), Ledger(n_reference=866), half)([empty, one]) is one
+    assert Rivals(both, RivalOptions(), Ledger(n_reference=15_000 * 10**4), half)([empty, one]) is None
+    assert Rivals(both, RivalOptions(), Ledger(n_reference=866), 1.1 * half)([empty, one]) is None
 
 
 @pytest.mark.slow

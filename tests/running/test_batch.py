@@ -32,6 +32,23 @@ def test_folders_and_patterns_are_expanded(tmp_path: Path, monkeypatch: pytest.M
     assert find_masks(["none*.png"]) == ["none*.png"]
 
 
+def test_folders_within_folders_are_taken_where_asked_for_and_told_of_else(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, caplog: pytest.LogCaptureFixture
+) -> None:
+    monkeypatch.chdir(tmp_path)
+    for name in ("DCIM/100/b.jpg", "DCIM/101/a.png", "DCIM/.trash/c.jpg", "DCIM/101/notes.txt", "flat/d.png"):
+        Path(name).parent.mkdir(parents=True, exist_ok=True)
+        Path(name).touch()
+    assert find_masks(["flat"]) == [str(Path("flat", "d.png"))]
+    assert not caplog.records
+    assert find_masks(["DCIM"]) == []
+    told = "DCIM: images in folders within it, such as {}, are passed over; --recursive takes them too"
+    assert [one.getMessage() for one in caplog.records] == [told.format(Path("100", "b.jpg"))]
+    assert find_masks(["DCIM"], recursive=True) == [
+        str(Path("DCIM", *one)) for one in (("100", "b.jpg"), ("101", "a.png"))
+    ]
+
+
 def test_results_never_share_a_name() -> None:
     tasks = name_tasks(["x/q.png", "y/q.png", "y/q.tif", "y/r.png"])
     assert [task.stem for task in tasks] == ["x_q", "y_q_png", "y_q_tif", "r"]

@@ -219,9 +219,21 @@ def test_no_network(pauses, tmp_path, monkeypatch):
             fetch_lines(OUTLINE, "drivable", False, options)
 
 
-def test_the_slots_of_the_public_server_are_asked_for(osm, pauses, monkeypatch):
-    monkeypatch.setattr("roadgeo.sources.overpass.OVERPASS_URL", f"{osm.url}/api")
-    assert len(fetch_roads(bbox=OUTLINE.bounds, options=ask(osm))) > 0
+def test_out_of_reach_is_said_at_once_and_names_the_way_out(pauses, monkeypatch, tmp_path):
+    """osmnx would wait for a minute where it cannot ask the public server for its slots."""
+    monkeypatch.setenv("ROADGEO_CACHE", str(tmp_path))
+    monkeypatch.setenv("HTTPS_PROXY", "http://127.0.0.1:9")
+    monkeypatch.delenv("NO_PROXY", raising=False)
+    with pytest.raises(RoadSourceError, match=r"Without one give --roads FILE: extracts are at .*geofabrik") as caught:
+        fetch_roads(bbox=(-8.62, 41.15, -8.61, 41.16))
+    assert "did you mean" not in str(caught.value)
+    assert sum(pauses) == 0
+
+
+def test_an_exchanged_box_is_suspected_where_there_are_no_roads(osm, pauses):
+    osm.roads = EMPTY
+    with pytest.raises(RoadSourceError, match=r"did you mean --bbox=-8\.62,41\.15,-8\.61,41\.16\?"):
+        fetch_roads(bbox=(41.15, -8.62, 41.16, -8.61), options=ask(osm))
 
 
 @pytest.mark.parametrize(

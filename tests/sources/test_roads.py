@@ -106,6 +106,14 @@ def test_a_box_cuts(tmp_path):
         read_roads(tmp_path / "a.gpkg", bbox=(0, 0, 1, 1))
 
 
+def test_an_exchanged_box_is_suspected_only_where_roads_are(tmp_path):
+    file = write(tmp_path / "a.gpkg", HERE)
+    with pytest.raises(RoadSourceError, match=r"did you mean --bbox=-71\.2,42\.3,-71,42\.4\?"):
+        read_roads(file, bbox=(42.3, -71.2, 42.4, -71.0))
+    with pytest.raises(RoadSourceError, match=r"try another --kinds or area$"):
+        read_roads(file, bbox=(10, 20, 11, 21))
+
+
 def test_a_box_astride_180_degrees(tmp_path):
     lines = [LineString([(179.5, -17), (179.999, -17)]), LineString([(-179.999, -17), (-179.5, -17)])]
     roads = read_roads(write_vector(tmp_path / "fiji.gpkg", lines), bbox=(179.9, -18, -179.9, -16))

@@ -399,6 +399,46 @@ def test_what_is_too_large_to_be_turned_is_said(tmp_path: Path, monkeypatch: pyt
         pass
 
 
+# --- arrays that NumPy saved ------------------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize("dtype", ["bool", "uint8", "int64", "float16", "float32", ">f8"])
+@pytest.mark.parametrize("bands", ["none", "first", "last"])
+def test_an_array_is_a_raster(tmp_path: Path, dtype: str, bands: str) -> None:
+    values = np.random.default_rng(0).integers(0, 2, (40, 60)).astype(dtype)
+    shaped = {"none": values, "first": values[None], "last": np.stack([values, values], 2)}[bands]
+    np.save(tmp_path / "mask.npy", shaped)
+    with open_raster(tmp_path / "mask.npy") as raster:
+        assert (raster.shape, raster.count) == ((40, 60), 2 if bands == "last" else 1)
+        np.testing.assert_array_equal(raster.read(1), values)
+        assert raster.transform.is_identity
+
+
+@pytest.mark.parametrize(
+    ("content", "message"),
+    [
+        (np.array([{"a": 1}]), "no array that can be read"),
+        (np.array(["road"] * 3), "expected .rows, columns. of real numbers"),
+        (np.zeros((40, 60), complex), "array of complex128"),
+        (np.zeros((2, 40, 60, 3)), "bands first or last"),
+        (np.zeros((0, 60)), "no array that can be read|bands first"),
+    ],
+)
+def test_what_is_no_array_of_numbers_is_said(tmp_path: Path, content: np.ndarray, message: str) -> None:
+    np.save(tmp_path / "a.npy", content, allow_pickle=True)
+    with pytest.raises(MaskError, match=message) as raised, open_raster(tmp_path / "a.npy"):
+        pass
+    assert "\n" not in str(raised.value)
+
+
+@pytest.mark.parametrize("kept", [7, 20, 100, 1000])
+def test_an_array_that_is_cut_short_is_said(tmp_path: Path, kept: int) -> None:
+    np.save(tmp_path / "a.npy", np.zeros((40, 60), np.uint8))
+    (tmp_path / "a.npy").write_bytes((tmp_path / "a.npy").read_bytes()[:kept])
+    with pytest.raises(MaskError, match="no array that can be read"), open_raster(tmp_path / "a.npy"):
+        pass
+
+
 # --- what may be behind an error -------------------------------------------------------------------------------------
 
 

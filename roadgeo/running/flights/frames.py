@@ -37,7 +37,7 @@ class FrameOptions:
 
     Attributes
     ----------
-    threshold, band, segment
+    threshold, band, segment, bands
         As for `running.queries.QueryOptions`.
     model : str
         File of the network that finds roads in photographs; "": the one that ships.
@@ -51,6 +51,8 @@ class FrameOptions:
         Of a video, the time between the frames taken; 0: all.
     interval_s : float
         Time between images, which say nothing of it.
+    recursive : bool
+        Whether folders stand for the images in all folders within them, too.
     """
 
     threshold: float | None = None
@@ -64,6 +66,8 @@ class FrameOptions:
     every_s: float = 1.0
     interval_s: float = 1.0
     threads: int = 1
+    bands: tuple[int, int, int] | None = None
+    recursive: bool = False
 
 
 class _Image(NamedTuple):
@@ -126,7 +130,7 @@ def _images(arguments: Sequence[str], options: FrameOptions, stack: ExitStack) -
         if Path(argument).suffix.lower() in VIDEOS and Path(argument).is_file():
             yield from _video(argument, options, stack)
             continue
-        for path in find_masks([argument]):
+        for path in find_masks([argument], options.recursive):
             yield _Image(path, Path(path).name, number * options.interval_s)
             number += 1
 
@@ -196,7 +200,7 @@ def _segment(image: _Image, options: FrameOptions, last: _Last) -> tuple[RoadMas
     from roadgeo.sources.segmentation.tiling import segment
 
     network = _network(options.model, options.class_name, options.threads)
-    with open_photograph(image.path) as photograph:
+    with open_photograph(image.path, options.bands) as photograph:
         if "scale" not in last.scale:
             known = options.gsd_m
             scale = (

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import os
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass
 from typing import TYPE_CHECKING
@@ -51,8 +51,13 @@ class Photograph:
 
 
 @contextmanager
-def open_photograph(path: str | os.PathLike[str]) -> Iterator[Photograph]:
+def open_photograph(path: str | os.PathLike[str], bands: tuple[int, int, int] | None = None) -> Iterator[Photograph]:
     """Open a photograph.
+
+    Parameters
+    ----------
+    bands : (3,) tuple of int, optional
+        Numbers from 1 of the red, green and blue band. Default: told by their names, or else the first three.
 
     Raises
     ------
@@ -65,13 +70,13 @@ def open_photograph(path: str | os.PathLike[str]) -> Iterator[Photograph]:
             raise MaskError(
                 f"{name}: {dataset.width} x {dataset.height} pixels; expected {MIN_SIDE} to {MAX_SIDE} on each side"
             )
-        bands = _choose_bands(dataset, name)
-        stretch = _find_stretch(dataset, bands, name)
+        chosen = _choose_bands(dataset, name) if bands is None else _require_bands(dataset, name, bands)
+        stretch = _find_stretch(dataset, chosen, name)
 
         def read(
             left: float, top: float, width: float, height: float, shape: tuple[int, int]
         ) -> tuple[AnyArray, BoolArray]:
-            values, valid = _read(dataset, bands, (left, top, width, height), shape)
+            values, valid = _read(dataset, chosen, (left, top, width, height), shape)
             return stretch(values), valid
 
         yield Photograph(name, dataset.width, dataset.height, read)
@@ -90,6 +95,14 @@ def _choose_bands(dataset: DatasetReader, name: str) -> list[int]:
     if not shown:
         raise MaskError(f"{name}: holds no band of values; give a photograph")
     return shown[:3] if len(shown) >= 3 else shown[:1]
+
+
+def _require_bands(dataset: DatasetReader, name: str, bands: Sequence[int]) -> list[int]:
+    """Return the bands that were asked for, if there are such."""
+    missing = next((band for band in bands if not 1 <= band <= dataset.count), None)
+    if missing is not None:
+        raise MaskError(f"{name}: has no band {missing}; expected 1 to {dataset.count}")
+    return list(bands)
 
 
 def _read(

@@ -68,6 +68,18 @@ def test_colours_are_taken_by_their_names(tmp_path: Path, names: tuple[str, ...]
     assert tuple(rgb[0, 0]) == tuple(bands[list(shown), 0, 0])
 
 
+def test_bands_are_taken_in_the_order_asked_for(tmp_path: Path) -> None:
+    values = np.array([10, 60, 110, 160], np.uint8)
+    path = tmp_path / "bgrn.tif"
+    with rasterio.open(path, "w", driver="GTiff", count=4, height=70, width=80, dtype="uint8") as dataset:
+        dataset.write(np.tile(values[:, None, None], (1, 70, 80)))
+    with open_photograph(path, (3, 2, 1)) as photograph:
+        rgb, _ = photograph.read(0, 0, 80, 70, (70, 80))
+    assert rgb[0, 0].tolist() == [110, 60, 10]
+    with pytest.raises(MaskError, match="has no band 5; expected 1 to 4"), open_photograph(path, (5, 2, 1)):
+        pass
+
+
 @pytest.mark.parametrize("side", [64, 65, 100, 127, 400])
 @pytest.mark.parametrize("overlap", [0.05, 0.25, 0.5])
 def test_tiles_cover_a_side(side: int, overlap: float) -> None:

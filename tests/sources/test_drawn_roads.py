@@ -1,0 +1,55 @@
+"""Roads as lines or surfaces in place of a mask are read as for a reference."""
+
+import numpy as np
+import pytest
+import shapely
+from worlds.fenway import streets, write_streets, write_vector
+
+from roadgeo.errors import MaskError
+from roadgeo.sources.drawn_roads import draw_roads
+
+
+@pytest.fixture(scope="module")
+def mask(tmp_path_factory):
+    """Of the streets as a GeoPackage."""
+    return draw_roads(write_streets(tmp_path_factory.mktemp("lines") / "streets.gpkg")).mask.roads
+
+
+@pytest.mark.parametrize("name", ["a.osm", "a.osm.pbf", "a.parquet", "a.shp", "a.geojson", "a.fgb"])
+def test_files_of_every_format_are_drawn_alike(tmp_path, name, mask):
+    drawing = draw_roads(write_streets(tmp_path / name))
+    assert drawing.north_up
+    assert drawing.mask.roads.shape == mask.shape
+    assert (drawing.mask.roads != mask).mean() < 1e-3
+
+
+def test_a_layer_is_chosen(tmp_path, mask):
+    file = tmp_path / "map.gpkg"
+    write_vector(file, [shapely.LineString([(0, 0), (1, 1)])], layer="rivers")
+    write_vector(file, streets()[0], layer="streets", append=True)
+    with pytest.raises(MaskError, match="several layers hold lines, rivers, streets: choose one with --layer"):
+        draw_roads(file)
+    assert (draw_roads(file, layer="streets").mask.roads == mask).all()
+
+
+def test_streams_are_not_drawn(tmp_path, mask):
+    lines, highway, _ = streets()
+    file = write_vector(tmp_path / "a.gpkg", [*lines, lines[0].buffer(0.001).boundary], highway=[*highway, None])
+    assert (draw_roads(file).mask.roads == mask).all()
+
+
+def test_surfaces_are_filled_with_their_holes(tmp_path):
+    """As a network's outlines of roads are saved: a ring road, as one polygon with a hole, and a street."""
+    ring = shapely.Point(300, -300).buffer(200).difference(shapely.Point(300, -300).buffer(190))
+    street = shapely.box(0, -304, 600, -296)
+    file = write_vector(tmp_path / "roads.gpkg", [shapely.union(ring, street)], crs="EPSG:32629")
+    drawing = draw_roads(file)
+    area = float(drawing.mask.roads.sum()) * drawing.unit_m**2
+    assert area == pytest.approx(shapely.union(ring, street).area, rel=0.15)  # and the pixels that outlines touch
+    column, row = np.round((drawing.to_pixel @ (300, -250, 1))[:2]).astype(int)
+    assert not drawing.mask.roads[row, column]
+
+
+def test_points_are_none(tmp_path):
+    with pytest.raises(MaskError, match="holds Point, expected lines"):
+        draw_roads(write_vector(tmp_path / "a.gpkg", [shapely.Point(0, 0)]))

@@ -1,0 +1,90 @@
+"""Roads that a program holds: graphs of several libraries, series, shapes."""
+
+import logging
+
+import geopandas as gpd
+import networkx as nx
+import numpy as np
+import pytest
+import shapely
+from worlds.fenway import streets
+
+from roadgeo.errors import RoadSourceError
+from roadgeo.sources.held_roads import choose_roads
+
+CRS = "EPSG:4326"
+
+
+def osmnx_graph(kind=nx.MultiDiGraph):
+    """As osmnx has them: nodes with x and y, edges some of which have a shape."""
+    graph = kind(crs=CRS)
+    for n, line in enumerate(streets()[0]):
+        (x0, y0), *_, (x1, y1) = line.coords
+        graph.add_node((n, 0), x=x0, y=y0)
+        graph.add_node((n, 1), x=x1, y=y1)
+        more = {} if len(line.coords) == 2 else {"geometry": line}
+        graph.add_edge((n, 0), (n, 1), highway=streets()[1][n], tunnel=streets()[2][n], osmid=n, **more)
+    return graph
+
+
+def momepy_graph():
+    """As `momepy.gdf_to_nx` makes them: nodes are coordinates, edges have shapes, the graph a CRS."""
+    graph = nx.MultiGraph(crs=gpd.GeoSeries([], crs=CRS).crs, approach="primal")
+    for line, highway, tunnel in zip(*streets(), strict=True):
+        graph.add_edge(
+            line.coords[0], line.coords[-1], geometry=line, highway=highway, tunnel=tunnel, mm_len=line.length
+        )
+    return graph
+
+
+GRAPHS = {
+    "osmnx": osmnx_graph,
+    "to_digraph": lambda: osmnx_graph(nx.DiGraph),
+    "to_undirected": lambda: osmnx_graph(nx.MultiGraph),
+    "momepy": momepy_graph,
+    "text": lambda: nx.parse_graphml("\n".join(nx.generate_graphml(_as_text(momepy_graph())))),
+}
+
+
+def _as_text(graph):
+    plain = nx.MultiGraph(crs=CRS)
+    for n, (start, end, data) in enumerate(graph.edges(data=True)):
+        plain.add_edge(f"{n}a {start}", f"{n}b {end}", geometry=data["geometry"].wkt, highway=data["highway"],
+                       tunnel=data["tunnel"] or "no")  # fmt: skip
+    return plain
+
+
+@pytest.mark.parametrize("name", GRAPHS)
+def test_graphs_of_every_library_give_the_same_roads(name):
+    table = gpd.GeoDataFrame({"highway": streets()[1], "tunnel": streets()[2]}, geometry=streets()[0], crs=CRS)
+    right = choose_roads(table)
+    found = choose_roads(GRAPHS[name](), crs=CRS)
+    assert found.plane.crs == right.plane.crs
+    lengths = [np.sort(shapely.length(one.lines)) for one in (found, right)]
+    np.testing.assert_allclose(*lengths, atol=0.01)
+    assert sorted(found.kinds) == sorted(right.kinds)
+
+
+def test_a_skeleton_of_pixels_says_that_it_lies_nowhere():
+    graph = nx.Graph()  # as sknw makes them: nodes are numbers, and all is rows and columns
+    graph.add_node(0, pts=np.array([[3, 4]]), o=np.array([3.0, 4.0]))
+    graph.add_node(1, pts=np.array([[9, 4]]), o=np.array([9.0, 4.0]))
+    graph.add_edge(0, 1, pts=np.array([[4, 4], [5, 4]]), weight=2.0)
+    with pytest.raises(RoadSourceError, match="do not tell where they lie: expected `geometry`, or nodes with"):
+        choose_roads(graph, crs=CRS)
+
+
+@pytest.mark.parametrize(
+    "graph", [nx.Graph([("ab", "12")]), nx.Graph([(None.__class__, 3)]), nx.Graph([((1, 2, 3), (4, 5, 6))]), nx.Graph()]
+)
+def test_other_graphs_are_refused(graph):
+    with pytest.raises(RoadSourceError):
+        choose_roads(graph, crs=CRS)
+
+
+def test_a_series_says_that_it_tells_no_kinds(caplog):
+    with caplog.at_level(logging.WARNING):
+        roads = choose_roads(gpd.GeoSeries(streets()[0], crs=CRS))
+    assert len(roads) == len(streets()[0])
+    assert "the roads: no column tells what kind of road a line is" in caplog.text
+    assert roads.meta["sources"][0]["kinds_known"] is False
