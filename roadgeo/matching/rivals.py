@@ -69,8 +69,8 @@ class RivalOptions:
 
     certain: float = 12.0
     repeating: float = 0.35
-    doubt: float = 100.0
-    usually_contradicted: float = 0.03
+    doubt: float = 130.0
+    usually_contradicted: float = 0.02
     n_known: int = 12
     n_places: int = 40
     n_laid: int = 8
