@@ -28,12 +28,12 @@ class LossOptions:
 def loss(output: dict[str, Tensor], truth: Tensor, doubt: float, options: LossOptions) -> dict[str, Tensor]:
     """Return the parts of the loss, weighted; their sum is to be minimised.
 
-    `truth` is (N, 4, H, W) as in `Tile.truth`, 0..1. `doubt` grows from 0 to 1 in training.
+    `truth` is (N, 5, H, W) as in `Tile.truth`, 0..1. `doubt` grows from 0 to 1 in training.
     """
-    road, observed, centre, near = truth.float().split(1, dim=1)
-    observed = (observed > 0.9).float()
+    road, observed, centre, near, known = truth.float().split(1, dim=1)
+    observed, known = (observed > 0.9).float(), (known > 0.9).float()
     road, centre, near = road * observed, centre * observed, near * observed
-    seen = observed + options.void * (1 - observed)
+    seen = known * (observed + options.void * (1 - observed))
     logits = output["road"].float()
     chance = logits.sigmoid()
     weight = seen * _trust(chance.detach(), road, options.edge, doubt * options.doubt)
@@ -42,7 +42,7 @@ def loss(output: dict[str, Tensor], truth: Tensor, doubt: float, options: LossOp
         "dice": options.dice * _dice(chance, road, weight),
         "centre": options.centre * (1 - (chance * centre).sum() / (centre.sum() + 100)),
     }
-    return parts | _auxiliary(output, (road, observed, near), options)
+    return parts | _auxiliary(output, (road, observed * known, near), options)
 
 
 def heading_of(road: Tensor) -> tuple[Tensor, Tensor]:

@@ -1,18 +1,13 @@
-"""Two networks, U-Nets whose deep stages look far, for roads are told by where they lead.
-
-They err in different places: one knows nothing but roads, the other has an encoder that has seen pictures of all sorts.
-"""
+"""The network: a U-Net on an encoder that knows pictures, whose deep stages look far."""
 
 from __future__ import annotations
-
-from typing import TypeAlias
 
 import torch
 from encoder import WIDTHS, Encoder
 from torch import Tensor, nn
 from torch.nn import functional
 
-__all__ = ["STRIDE", "AnyRoadNet", "PretrainedRoadNet", "RoadNet", "Roads"]
+__all__ = ["STRIDE", "RoadNet", "Roads"]
 
 STRIDE = 32  # height and width must be multiples of this
 
@@ -85,63 +80,27 @@ class Heads(nn.Module):
 
 
 class RoadNet(nn.Module):
-    """RGB (N, 3, H, W), 0..1, to logits (see `Heads`); H and W multiples of 16.
+    """RGB (N, 3, H, W), 0..1, to logits (see `Heads`); H and W multiples of 32.
 
-    Most of the arithmetic is done at 1/4 to 1/16 of the photograph's size, where it is cheap. Dilated convolutions at
-    1/16 see about 1 km at 1 m per pixel: enough to carry a road through trees and shadows.
+    Features are kept at half the size and coarser. Dilated convolutions at 1/16 see about 1 km at 1 m per pixel: enough
+    to carry a road through trees and shadows.
     """
 
-    MEAN, STD = (0.35, 0.36, 0.33), (0.2, 0.2, 0.2)
-
-    def __init__(self, widths: tuple[int, int, int, int] = (24, 48, 96, 160)) -> None:
+    def __init__(self, widths: tuple[int, int, int, int] = (32, 64, 96, 160)) -> None:
         super().__init__()
         half, quarter, eighth, sixteenth = widths
-        self.register_buffer("mean", torch.tensor(self.MEAN).view(1, 3, 1, 1), persistent=False)
-        self.register_buffer("std", torch.tensor(self.STD).view(1, 3, 1, 1), persistent=False)
-        self.stem = convolution(3, half, size=5, stride=2)
-        self.quarter = nn.Sequential(convolution(half, quarter, stride=2), Residual(quarter), Residual(quarter))
-        self.eighth = nn.Sequential(convolution(quarter, eighth, stride=2), Residual(eighth), Residual(eighth))
-        self.sixteenth = nn.Sequential(
-            convolution(eighth, sixteenth, stride=2),
+        self.encoder = Encoder()
+        self.up_sixteenth = Up(WIDTHS[4], WIDTHS[3], sixteenth)
+        self.far = nn.Sequential(
             nn.Dropout2d(0.1),
             Residual(sixteenth, (1, 2)),
             Residual(sixteenth, (4, 8)),
             Residual(sixteenth, (2, 1)),
         )
-        self.up_eighth, self.up_quarter = Up(sixteenth, eighth, eighth), Up(eighth, quarter, quarter)
-        self.heads = Heads(quarter, quarter, eighth, 4)
-
-    @property
-    def first(self) -> nn.Module:
-        """What comes before the layers that Muon trains."""
-        return self.stem
-
-    def forward(self, image: Tensor) -> dict[str, Tensor]:
-        quarter = self.quarter(self.stem((image - self.mean) / self.std))
-        eighth = self.eighth(quarter)
-        eighth = self.up_eighth(self.sixteenth(eighth), eighth)
-        quarter = self.up_quarter(eighth, quarter)
-        return self.heads(quarter, quarter, eighth)
-
-
-class PretrainedRoadNet(nn.Module):
-    """As `RoadNet`, on an encoder that is begun with weights from ImageNet, and with features at half the size."""
-
-    def __init__(self, widths: tuple[int, int, int, int] = (24, 48, 64, 96)) -> None:
-        super().__init__()
-        half, quarter, eighth, sixteenth = widths
-        self.encoder = Encoder()
-        self.up_sixteenth = Up(WIDTHS[4], WIDTHS[3], sixteenth)
-        self.far = nn.Sequential(nn.Dropout2d(0.1), Residual(sixteenth, (2, 4)))
         self.up_eighth = Up(sixteenth, WIDTHS[2], eighth)
         self.up_quarter = Up(eighth, WIDTHS[1], quarter)
         self.up_half = Up(quarter, WIDTHS[0], half)
         self.heads = Heads(half, quarter, eighth, 2)
-
-    @property
-    def first(self) -> nn.Module:
-        """What comes before the layers that Muon trains: the encoder, which is not begun from chance."""
-        return self.encoder
 
     def forward(self, image: Tensor) -> dict[str, Tensor]:
         halves, quarters, eighths, sixteenths, deep = self.encoder(2 * image - 1)
@@ -150,13 +109,10 @@ class PretrainedRoadNet(nn.Module):
         return self.heads(self.up_half(quarter, halves), quarter, eighth)
 
 
-AnyRoadNet: TypeAlias = RoadNet | PretrainedRoadNet
-
-
 class Roads(nn.Module):
     """What is exported: RGB to the probability of road, (N, 1, H, W)."""
 
-    def __init__(self, network: AnyRoadNet) -> None:
+    def __init__(self, network: RoadNet) -> None:
         super().__init__()
         self.network = network
 

@@ -10,9 +10,10 @@ import numpy as np
 from numpy.typing import NDArray
 from skimage.morphology import skeletonize
 
-__all__ = ["Tile", "fold_of", "half_size", "read_tiles", "unobserved"]
+__all__ = ["Bytes", "Floats", "Tile", "fold_of", "read_tiles", "truth_of", "unobserved"]
 
 Bytes = NDArray[np.uint8]
+Floats = NDArray[np.float32]
 
 
 @dataclass(frozen=True)
@@ -21,7 +22,7 @@ class Tile:
 
     name: str
     photo: Bytes  # (H, W, 3) RGB
-    truth: Bytes  # (H, W, 4), 0 or 255: road, observed, centre lines, and (0 to 255) nearness to an intersection
+    truth: Bytes  # (H, W, 5), 0 to 255: see `truth_of`
 
     @property
     def observed(self) -> NDArray[np.bool_]:
@@ -47,10 +48,15 @@ def fold_of(index: int, folds: int) -> int:
     return index % folds
 
 
-def half_size(tile: Tile) -> Tile:
-    """Return the tile at half its size, each pixel the mean of four: what crops of coarse scale are drawn from."""
-    halve = {"fx": 0.5, "fy": 0.5, "interpolation": cv2.INTER_AREA}
-    return Tile(tile.name, cv2.resize(tile.photo, None, **halve), cv2.resize(tile.truth, None, **halve))
+def truth_of(road: NDArray[np.bool_], observed: NDArray[np.bool_], known: NDArray[np.bool_]) -> Bytes:
+    """Return (H, W, 5), 0 or 255: road, observed, centre lines, nearness to an intersection (0 to 255), and known.
+
+    Where it is not known whether there is a road, nothing is learnt.
+    """
+    centre = skeletonize(road)
+    thick = cv2.dilate(centre.astype(np.uint8), np.ones((3, 3), np.uint8))
+    layers = [road * 255, observed * 255, thick * 255, _near_intersections(centre), known * 255]
+    return np.dstack(layers).astype(np.uint8)
 
 
 def unobserved(photo: Bytes, least_area: int = 20_000) -> NDArray[np.bool_]:
@@ -70,14 +76,7 @@ def _read(photo_path: Path, mask_path: Path) -> Tile:
     photo = cv2.cvtColor(photo, cv2.COLOR_BGR2RGB)
     # JPEG smears the edge of the void over a few pixels.
     observed = ~cv2.dilate(unobserved(photo).astype(np.uint8), np.ones((9, 9), np.uint8)).astype(bool)
-    road = mask > 127
-    centre = skeletonize(road)
-    thick = cv2.dilate(centre.astype(np.uint8), np.ones((3, 3), np.uint8))
-    return Tile(
-        photo_path.stem,
-        photo,
-        np.dstack([road * 255, observed * 255, thick * 255, _near_intersections(centre)]).astype(np.uint8),
-    )
+    return Tile(photo_path.stem, photo, truth_of(mask > 127, observed, np.ones_like(observed)))
 
 
 def _near_intersections(centre: NDArray[np.bool_], sigma: float = 5.0) -> NDArray[np.float32]:
@@ -88,5 +87,5 @@ def _near_intersections(centre: NDArray[np.bool_], sigma: float = 5.0) -> NDArra
     elsewhere = np.full(centre.shape, 255, np.uint8)
     for x, y in np.rint(centroids[1:]).astype(int):
         elsewhere[y, x] = 0
-    distance = cv2.distanceTransform(elsewhere, cv2.DIST_L2, 5)
+    distance = np.minimum(cv2.distanceTransform(elsewhere, cv2.DIST_L2, 5), 10 * sigma)  # far where there is none
     return 255 * np.exp(-0.5 * (distance / sigma) ** 2)

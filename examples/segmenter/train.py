@@ -1,11 +1,10 @@
-"""Train the default segmenter: cross-validation on held-out photographs, then the model on all, as ONNX.
+"""Train the road segmenter on photographs and painted scenes: on all, or without a fold that is held out.
 
-    python train.py DATA --out runs              # all of it
-    python train.py DATA --out runs --quick      # the same in a minute, to see that it runs
-    python train.py DATA --out runs --only 0     # one fold; --only all: the model on all photographs
+    python train.py DATA --streets streets.npz --out runs --only all     # the network that ships: runs/all.pt
+    python train.py DATA --streets streets.npz --out runs --only 0       # without every third photograph; their maps
+    python train.py DATA --out runs --quick --only 0                     # in a minute, to see that it runs
 
-DATA holds `images/NAME.jpg` and `masks/NAME.png` of the same size. A run that was cut
-short goes on from its checkpoint.
+DATA holds `images/NAME.jpg` and `masks/NAME.png` of the same size; streets.npz comes from `cut_streets.py`.
 """
 
 from __future__ import annotations
@@ -17,11 +16,11 @@ from pathlib import Path
 import cv2
 import numpy as np
 import torch
-from export import export
-from network import AnyRoadNet
+from network import RoadNet
 from numpy.typing import NDArray
+from painting import Streets
 from tiles import Tile, fold_of, read_tiles
-from training import RECIPES, TrainingOptions, probabilities, train
+from training import TrainingOptions, probabilities, train
 
 SCALES = (1.0, 0.5, 2.0)  # metres per pixel of the held-out photographs that are predicted
 RUN_AT = 1.0  # metres per pixel at which the network sees them
@@ -29,43 +28,32 @@ RUN_AT = 1.0  # metres per pixel at which the network sees them
 
 def main(arguments: list[str] | None = None) -> None:
     options = _parse(arguments)
+    cv2.setNumThreads(1)  # before anything is read: processes that paint are forked, and would wait for its threads
     torch.set_num_threads(options.threads)
     tiles = read_tiles(options.data, limit=4 if options.quick else None)
+    streets = Streets.read(options.streets) if options.streets else None
     training = TrainingOptions(
-        steps=options.steps,
+        minutes=options.minutes,
         batch=options.batch,
         rate=options.rate,
         seed=options.seed,
         device=options.device,
-        start=options.start,
-        network=options.network,
+        workers=options.workers,
+        marks=tuple(options.marks),
     )
     if options.quick:
-        training = replace(training, steps=8, batch=2, size=128)
-    runs = [str(fold) for fold in range(options.folds)] + ["all"]
-    for run in [options.only] if options.only else runs:
-        if run == "all":
-            network = train(
-                tiles,
-                options.out / "all.pt",
-                replace(training, steps=training.steps * (1 if options.quick else options.longer)),
-            )
-            print("wrote", export(network.cpu(), tiles, options.out / "roads.onnx"))
-        else:
-            _cross_validate(tiles, int(run), options, training)
+        training = replace(training, steps=8, batch=2, size=128, scenes=4)
+    for run in options.only.split(","):
+        fold = None if run == "all" else int(run)
+        learnt = [tile for i, tile in enumerate(tiles) if fold_of(i, options.folds) != fold]
+        network = train(learnt, streets, options.out / ("all.pt" if fold is None else f"fold{fold}.pt"), training)
+        held_out = [tile for i, tile in enumerate(tiles) if fold_of(i, options.folds) == fold]
+        for tile in held_out if options.maps else ():
+            for scale in SCALES:
+                _write_map(network, tile, scale, options.out / f"maps_{scale:g}m")
 
 
-def _cross_validate(tiles: list[Tile], fold: int, options: argparse.Namespace, training: TrainingOptions) -> None:
-    """Train without a fold's tiles, then write their probability maps: score.py measures them."""
-    held_out = [tile for i, tile in enumerate(tiles) if fold_of(i, options.folds) == fold]
-    others = [tile for i, tile in enumerate(tiles) if fold_of(i, options.folds) != fold]
-    network = train(others, options.out / f"fold{fold}.pt", training)
-    for tile in held_out:
-        for scale in SCALES:
-            _write_map(network, tile, scale, options.out / f"maps_{scale:g}m")
-
-
-def _write_map(network: AnyRoadNet, tile: Tile, scale: float, folder: Path) -> None:
+def _write_map(network: RoadNet, tile: Tile, scale: float, folder: Path) -> None:
     """Write TILE.png: the probability of road as grey (0 to 255) and what was observed as alpha."""
     folder.mkdir(parents=True, exist_ok=True)
     photo, observed = resample(tile.photo, scale), resample(tile.truth[..., 1], scale)
@@ -73,7 +61,7 @@ def _write_map(network: AnyRoadNet, tile: Tile, scale: float, folder: Path) -> N
     cv2.imwrite(str(folder / f"{tile.name}.png"), np.dstack([road, road, road, (observed > 127) * np.uint8(255)]))
 
 
-def predict(network: AnyRoadNet, photo: NDArray[np.uint8], scale: float) -> NDArray[np.float32]:
+def predict(network: RoadNet, photo: NDArray[np.uint8], scale: float) -> NDArray[np.float32]:
     """Return the probability of road in a photograph of `scale` metres per pixel: (H, W), as the photograph."""
     h, w = photo.shape[:2]
     kind = cv2.INTER_AREA if scale < RUN_AT else cv2.INTER_CUBIC
@@ -90,18 +78,17 @@ def resample(image: NDArray[np.uint8], scale: float) -> NDArray[np.uint8]:
 def _parse(arguments: list[str] | None) -> argparse.Namespace:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("data", type=Path, help="folder with images/ and masks/")
-    parser.add_argument("--out", type=Path, required=True, help="folder for checkpoints, maps and the model")
-    parser.add_argument("--only", help="one run: the number of a fold, or all")
+    parser.add_argument("--streets", type=Path, help="streets of painted scenes; default: none are painted whole")
+    parser.add_argument("--out", type=Path, required=True, help="folder for checkpoints and maps")
+    parser.add_argument("--only", default="0,1,2,all", help="runs: numbers of folds that are held out, and all")
     parser.add_argument("--folds", type=int, default=3)
-    parser.add_argument("--network", choices=sorted(RECIPES), default="pretrained", help="what is trained")
-    parser.add_argument("--steps", type=int, default=3800, help="of each fold")
-    parser.add_argument(
-        "--longer", type=int, default=1, help="how many times longer the model on all photographs trains"
-    )
-    parser.add_argument("--batch", type=int, default=4)
+    parser.add_argument("--minutes", type=float, default=9.0, help="of each run")
+    parser.add_argument("--batch", type=int, default=64)
     parser.add_argument("--rate", type=float, default=2e-3, help="largest learning rate")
-    parser.add_argument("--start", type=Path, help="checkpoint of another run to begin with, instead of chance")
     parser.add_argument("--seed", type=int, default=0)
+    parser.add_argument("--workers", type=int, default=0, help="processes that paint")
+    parser.add_argument("--marks", type=float, nargs="+", default=[1.0], help="shares of the time to keep weights at")
+    parser.add_argument("--no-maps", dest="maps", action="store_false", help="no maps of the held-out photographs")
     parser.add_argument("--threads", type=int, default=torch.get_num_threads())
     parser.add_argument("--device", default="cuda" if torch.cuda.is_available() else "cpu")
     parser.add_argument("--quick", action="store_true", help="a minute, on four photographs, to see that it runs")

@@ -1,4 +1,4 @@
-"""Training: fixed seeds, a moving average of the weights, checkpoints to go on from."""
+"""Training for so many minutes: a moving average of the weights, checkpoints on the way."""
 
 from __future__ import annotations
 
@@ -6,8 +6,9 @@ import copy
 import math
 import time
 from collections.abc import Iterator
+from contextlib import contextmanager
 from dataclasses import dataclass
-from functools import cache
+from functools import cache, cached_property
 from pathlib import Path
 
 import cv2
@@ -16,12 +17,13 @@ import torch
 from augmentation import Crops
 from losses import LossOptions, loss
 from muon import Muon
-from network import STRIDE, AnyRoadNet, PretrainedRoadNet, RoadNet
+from network import STRIDE, RoadNet
 from numpy.typing import NDArray
+from painting import Painter, Streets, painted
 from tiles import Tile
 from torch import Tensor
 
-__all__ = ["RECIPES", "TrainingOptions", "make_network", "probabilities", "train"]
+__all__ = ["Training", "TrainingOptions", "begin", "load", "probabilities", "train"]
 
 Optimizers = tuple[torch.optim.Optimizer, ...]
 
@@ -30,66 +32,113 @@ Optimizers = tuple[torch.optim.Optimizer, ...]
 class TrainingOptions:
     """How long and how fast."""
 
-    network: str = "pretrained"  # or "plain"
-    steps: int = 3800
-    batch: int = 4
+    minutes: float = 9.0
+    steps: int | None = None  # so many instead
+    batch: int = 64
     size: int = 384  # px of a crop
     rate: float = 2e-3
-    decay: float = 0.02
-    seed: int = 0
+    gently: float = 0.25  # how much slower the encoder learns, or it forgets pictures
+    decay: float = 0.05
+    doubt: float = 0.3  # see `LossOptions`
     average: float = 0.998
+    seed: int = 0
     device: str = "cpu"
-    start: Path | None = None  # a checkpoint whose averaged weights are begun with
-    save_every: int = 50
+    painted: float = 0.6  # share of crops that are painted, wholly or in part
+    scenes: int = 1024  # held at a time
+    workers: int = 0  # processes that paint
+    marks: tuple[float, ...] = (1.0,)  # shares of the time at which a checkpoint is kept
 
 
-@dataclass(frozen=True)
-class Recipe:
-    """How a network is trained best, as far as it was tried."""
-
-    scales: tuple[float, float]  # metres per pixel of most crops
-    doubt: float  # see `LossOptions`
-    gently: float  # how much slower the first layers learn
-
-
-#: An encoder that knows pictures learns roads slowly, or it forgets them.
-RECIPES = {"plain": Recipe((1.1, 2.0), 0.6, 1.0), "pretrained": Recipe((0.8, 1.6), 0.2, 0.25)}
+def train(tiles: list[Tile], streets: Streets | None, checkpoint: Path, options: TrainingOptions) -> RoadNet:
+    """Train on `tiles` and painted scenes; return the network of averaged weights, ready to predict."""
+    with begin(tiles, streets, checkpoint, options) as training:
+        while training.clock.done < 1:
+            training.step()
+    return training.mean.eval()
 
 
-def make_network(kind: str) -> AnyRoadNet:
-    """Return a network that knows nothing."""
-    return PretrainedRoadNet() if kind == "pretrained" else RoadNet()
+@contextmanager
+def begin(tiles: list[Tile], streets: Streets | None, checkpoint: Path, options: TrainingOptions) -> Iterator[Training]:
+    """Yield a training that is stepped by hand; two that take turns share a device well."""
+    cv2.setNumThreads(1)  # or processes that paint would wait for threads that they do not have
+    size = min(768, *(min(tile.photo.shape[:2]) for tile in tiles))
+    with painted(Painter(streets, tiles, size), options.workers, options.seed) as pictures:
+        yield Training(tiles, pictures, size, checkpoint, options)
 
 
-def train(tiles: list[Tile], checkpoint: Path, options: TrainingOptions) -> AnyRoadNet:
-    """Train on `tiles`, or go on from `checkpoint`; return the network of averaged weights, ready to predict."""
-    torch.manual_seed(options.seed)
-    cv2.setNumThreads(1)
-    recipe, network = RECIPES[options.network], make_network(options.network)
-    if isinstance(network, PretrainedRoadNet) and not (checkpoint.exists() or options.start):
+class Training:
+    """A network that learns, and the mean of its weights on the way."""
+
+    def __init__(
+        self,
+        tiles: list[Tile],
+        pictures: Iterator[NDArray[np.uint8] | None],
+        scene_size: int,
+        checkpoint: Path,
+        options: TrainingOptions,
+    ) -> None:
+        self.tiles, self.pictures, self.scene_size = tiles, pictures, scene_size
+        self.checkpoint, self.options = checkpoint, options
+        self.clock = _Clock(options, checkpoint)
+
+    @cached_property
+    def network(self) -> RoadNet:
+        torch.manual_seed(self.options.seed)
+        network = RoadNet()
         network.encoder.begin_with_imagenet()
-    network = network.to(options.device, memory_format=torch.channels_last)
-    if options.start:
-        network.load_state_dict(torch.load(options.start, map_location=options.device, weights_only=True)["mean"])
-    mean = copy.deepcopy(network).eval()
-    optimizers = _optimizers(network, options)
-    first = _resume(checkpoint, network, mean, optimizers, options)
-    batches, log = _batches(tiles, first, options), _Log(checkpoint.with_suffix(".log"), options.steps)
-    for step in range(first, options.steps):
-        for i, optimizer in enumerate(optimizers):
-            slower = recipe.gently if i == 0 else 1.0
+        return network.to(self.options.device, memory_format=torch.channels_last)
+
+    @cached_property
+    def mean(self) -> RoadNet:
+        return copy.deepcopy(self.network).eval()
+
+    @cached_property
+    def crops(self) -> Crops:
+        options = self.options
+        torch.backends.cudnn.benchmark = True
+        return Crops(
+            self.tiles,
+            options.size,
+            scenes=options.scenes,
+            scene_size=self.scene_size,
+            device=options.device,
+            seed=options.seed,
+        )
+
+    @cached_property
+    def optimizers(self) -> Optimizers:
+        return _optimizers(self.network, self.options)
+
+    def step(self) -> None:
+        """Learn from a batch; keep the weights where that is due."""
+        options, clock = self.options, self.clock
+        for picture in self.pictures:
+            if picture is not None:
+                self.crops.put(picture)
+            if picture is None or not options.workers:
+                break
+        batch, mean = self.crops.draw(options.batch, options.painted), self.mean
+        for i, optimizer in enumerate(self.optimizers):
             for group in optimizer.param_groups:
-                group["lr"] = slower * options.rate * _schedule(step / options.steps)
-        parts = _step(network, optimizers, next(batches), (step / options.steps, recipe.doubt), options.device)
-        _average(mean, network, min(options.average, (1 + step) / (10 + step)))
-        log.add(step, parts)
-        if (step + 1) % options.save_every == 0 or step + 1 == options.steps:
-            _save(checkpoint, network, mean, optimizers, step + 1)
-    return mean.eval()
+                group["lr"] = (options.gently if i == 0 else 1.0) * options.rate * _schedule(clock.done)
+        parts = _step(self.network, self.optimizers, batch, clock.done, options)
+        _average(mean, self.network, min(options.average, (1 + clock.step) / (10 + clock.step)))
+        for mark in clock.tick(parts, self.crops.n_put):
+            last = mark == max(options.marks)
+            name = self.checkpoint.name if last else f"{self.checkpoint.stem}_{round(100 * mark)}.pt"
+            _save(self.checkpoint.with_name(name), mean)
+
+
+def load(checkpoint: Path, device: str = "cpu") -> RoadNet:
+    """Return the network that a checkpoint holds."""
+    network = RoadNet()
+    state = torch.load(checkpoint, map_location="cpu", weights_only=True)
+    network.load_state_dict({name: value.float() for name, value in state.items()})
+    return network.eval().to(device, memory_format=torch.channels_last)
 
 
 @torch.no_grad()
-def probabilities(network: AnyRoadNet, photo: NDArray[np.uint8]) -> NDArray[np.float32]:
+def probabilities(network: RoadNet, photo: NDArray[np.uint8]) -> NDArray[np.float32]:
     """Return the probability of road, (H, W), of a whole photograph (H, W, 3); its border is mirrored to fill up."""
     h, w = photo.shape[:2]
     margins = ((0, -h % STRIDE), (0, -w % STRIDE), (0, 0))
@@ -102,20 +151,20 @@ def probabilities(network: AnyRoadNet, photo: NDArray[np.uint8]) -> NDArray[np.f
 
 
 def _step(
-    network: AnyRoadNet, optimizers: Optimizers, batch: tuple[Tensor, Tensor], doubted: tuple[float, float], device: str
-) -> dict[str, float]:
-    photo, truth = (t.to(device) for t in batch)
-    with torch.autocast(device, torch.bfloat16, enabled=_quick_in_16_bits(device)):
-        output = network.train()(photo)
+    network: RoadNet, optimizers: Optimizers, batch: tuple[Tensor, Tensor], done: float, options: TrainingOptions
+) -> dict[str, Tensor]:
+    photo, truth = batch
+    with torch.autocast(options.device, torch.bfloat16, enabled=_quick_in_16_bits(options.device)):
+        output = network.train()(photo.to(memory_format=torch.channels_last))
     # A map without a road is doubted only by a network that has learnt what roads are.
-    done, doubt = doubted
-    parts = loss(output, truth, doubt=min(max((done - 0.3) / 0.3, 0.0), 1.0), options=LossOptions(doubt=doubt))
+    doubt = min(max((done - 0.3) / 0.3, 0.0), 1.0)
+    parts = loss(output, truth, doubt=doubt, options=LossOptions(doubt=options.doubt))
     network.zero_grad(set_to_none=True)
     sum(parts.values()).backward()
     torch.nn.utils.clip_grad_norm_(network.parameters(), 2.0)
     for optimizer in optimizers:
         optimizer.step()
-    return {name: float(part.detach()) for name, part in parts.items()}
+    return {name: part.detach() for name, part in parts.items()}
 
 
 @cache
@@ -135,95 +184,78 @@ def _quick_in_16_bits(device: str) -> bool:
     return took[torch.bfloat16] < 0.8 * took[torch.float32]
 
 
-def _batches(tiles: list[Tile], first: int, options: TrainingOptions) -> Iterator[tuple[Tensor, Tensor]]:
-    """Yield photographs (N, 3, S, S) and truths (N, 4, S, S).
-
-    Step n draws the same crops whether or not training was interrupted.
-    """
-    crops = Crops(tiles, options.size, RECIPES[options.network].scales)
-    step = first
-    while True:
-        rng = np.random.default_rng((options.seed, step))
-        photos, truths = zip(*(crops.draw(rng) for _ in range(options.batch)), strict=True)
-        yield (
-            torch.from_numpy(np.stack(photos)).permute(0, 3, 1, 2),
-            torch.from_numpy(np.stack(truths)).permute(0, 3, 1, 2).contiguous(),
-        )
-        step += 1
-
-
-def _schedule(done: float, warmup: float = 0.03, fall: float = 0.65) -> float:
-    """Return the learning rate as a share of the largest: up, level, and from `fall` on down to nothing.
-
-    The level middle lets a run that was cut short go on with fewer or more steps than it was begun with.
-    """
+def _schedule(done: float, warmup: float = 0.03, fall: float = 0.4) -> float:
+    """Return the learning rate as a share of the largest: up, level, and from `fall` on down to nothing."""
     if done < warmup:
         return done / warmup + 1e-3
     return 1.0 if done < fall else 0.5 * (1 + math.cos(math.pi * (done - fall) / (1 - fall)))
 
 
-def _optimizers(network: AnyRoadNet, options: TrainingOptions) -> Optimizers:
-    """Return Adam for the first layers, Muon for the kernels between them and the last layers, Adam for all else."""
-    first = list(network.first.parameters())
-    ends = {id(p) for part in (network.first, network.heads) for p in part.parameters()}
+def _optimizers(network: RoadNet, options: TrainingOptions) -> Optimizers:
+    """Return Adam for the encoder, Muon for the kernels between it and the last layers, Adam for all else."""
+    first = list(network.encoder.parameters())
+    ends = {id(p) for part in (network.encoder, network.heads) for p in part.parameters()}
     inner = [p for p in network.parameters() if p.ndim == 4 and id(p) not in ends]
     known = {id(p) for p in (*first, *inner)}
     others = [p for p in network.parameters() if id(p) not in known]
+    fused = options.device != "cpu"
     return (
-        torch.optim.AdamW(first, options.rate, weight_decay=options.decay),
+        torch.optim.AdamW(first, options.rate, weight_decay=options.decay, fused=fused),
         Muon(inner, options.rate, options.decay),
-        torch.optim.AdamW(others, options.rate, weight_decay=0.0),
+        torch.optim.AdamW(others, options.rate, weight_decay=0.0, fused=fused),
     )
 
 
 @torch.no_grad()
-def _average(mean: AnyRoadNet, network: AnyRoadNet, keep: float) -> None:
-    theirs = network.state_dict()
-    for name, value in mean.state_dict().items():
-        if value.dtype.is_floating_point:
-            value.lerp_(theirs[name], 1 - keep)
+def _average(mean: RoadNet, network: RoadNet, keep: float) -> None:
+    pairs = zip(mean.state_dict().values(), network.state_dict().values(), strict=True)
+    ours, theirs = zip(*(pair for pair in pairs if pair[0].dtype.is_floating_point), strict=True)
+    torch._foreach_lerp_(ours, theirs, 1 - keep)
 
 
-def _save(path: Path, network: AnyRoadNet, mean: AnyRoadNet, optimizers: Optimizers, step: int) -> None:
+def _save(path: Path, network: RoadNet) -> None:
+    """Keep the weights, those of the kernels in 16 bits."""
     path.parent.mkdir(parents=True, exist_ok=True)
-    state = {
-        "network": network.state_dict(),
-        "mean": mean.state_dict(),
-        "optimizers": [o.state_dict() for o in optimizers],
-        "step": step,
-    }
+    state = {name: value.half() if value.ndim == 4 else value for name, value in network.state_dict().items()}
     partial = path.with_suffix(".part")
     torch.save(state, partial)
     partial.replace(path)
 
 
-def _resume(path: Path, network: AnyRoadNet, mean: AnyRoadNet, optimizers: Optimizers, options: TrainingOptions) -> int:
-    if not path.exists():
-        return 0
-    state = torch.load(path, map_location=options.device, weights_only=True)
-    network.load_state_dict(state["network"])
-    mean.load_state_dict(state["mean"])
-    for optimizer, saved in zip(optimizers, state["optimizers"], strict=True):
-        optimizer.load_state_dict(saved)
-    return int(state["step"])
+class _Clock:
+    """Says how much of the training is done, prints the parts of the loss, and when a checkpoint is due."""
 
+    def __init__(self, options: TrainingOptions, checkpoint: Path, every: int = 100) -> None:
+        self.options, self.every, self.path = options, every, checkpoint.with_suffix(".log")
+        self.step, self.done, self.counted, self.sums = 0, 0.0, 0, torch.zeros(1)
+        self.started = self.last = time.monotonic()
+        self.end = self.started + 60 * options.minutes
+        self.due = sorted(options.marks)
 
-class _Log:
-    """Prints the mean of the parts of the loss every 50 steps."""
+    def tick(self, parts: dict[str, Tensor], scenes: int) -> list[float]:
+        """Count a step; return the marks that were passed."""
+        values = torch.stack(list(parts.values()))
+        self.sums, self.step, self.counted = self.sums.to(values.device) + values, self.step + 1, self.counted + 1
+        if values.device.type != "cpu" and self.step % 10 == 3:
+            torch.cuda.synchronize()  # or steps would be begun that nobody waits for
+        now = time.monotonic()
+        if self.step == 3:
+            self.started = now  # the first steps take long: a device chooses its algorithms
+        steps = self.options.steps
+        self.done = self.step / steps if steps else (now - self.started) / (self.end - self.started)
+        if self.step % self.every == 0 or self.done >= 1:
+            self._print(list(parts), scenes, now)
+        passed = [mark for mark in self.due if self.done >= mark]
+        self.due = self.due[len(passed) :]
+        return passed
 
-    def __init__(self, path: Path, steps: int) -> None:
-        self.path, self.steps, self.sums, self.n, self.started = path, steps, {}, 0, time.monotonic()
-
-    def add(self, step: int, parts: dict[str, float]) -> None:
-        for name, value in parts.items():
-            self.sums[name] = self.sums.get(name, 0.0) + value
-        self.n += 1
-        if (step + 1) % 50 and step + 1 != self.steps:
-            return
-        text = "  ".join(f"{name} {value / self.n:.3f}" for name, value in self.sums.items())
-        line = f"step {step + 1}/{self.steps}  {(time.monotonic() - self.started) / self.n:.2f} s/step  {text}"
+    def _print(self, names: list[str], scenes: int, now: float) -> None:
+        means = zip(names, (self.sums / self.counted).tolist(), strict=True)
+        text = "  ".join(f"{name} {value:.3f}" for name, value in means)
+        pace = (now - self.last) / self.counted
+        line = f"step {self.step}  {self.done:.0%}  {pace:.3f} s/step  {scenes} scenes  {text}"
         print(line, flush=True)
         self.path.parent.mkdir(parents=True, exist_ok=True)
         with self.path.open("a") as out:
             out.write(line + "\n")
-        self.sums, self.n, self.started = {}, 0, time.monotonic()
+        self.sums, self.counted, self.last = torch.zeros(1), 0, now
