@@ -161,12 +161,13 @@ class Rivals:
         evidence = Evidence(scene, index, sampling(matrix, scene.size), estimator.options.evidence)
         worth, middle = evidence.weigh(matrix), Homography(matrix).everywhere(scene.center)
         apart_m = options.apart * scene.half_size * evidence.gsd_m
+        met = [(model.laid, self._doubt(estimator, model)) for model in ranked[: 1 + options.n_known]]
+        around = [(other, 0.0) for other in similar_places(matrix, evidence, estimator.options, options)]
         others: list[tuple[float, FloatArray]] = []
-        known = [model.laid for model in ranked[1 : 1 + options.n_known]]
-        for other in [*known, *similar_places(matrix, evidence, estimator.options, options)]:
+        for other, against in [*met, *around]:
             there = Homography(other).everywhere(scene.center)
             if np.hypot(*(there - middle)) > apart_m and estimator.may_be(other):
-                others.append((evidence.weigh(other), other))
+                others.append((evidence.weigh(other) - against, other))
         others.sort(key=lambda one: -one[0])
         if others and others[0][0] > worth:
             return Standing(best, others[0][1], worth - others[0][0], worth, others[0][0])

@@ -108,7 +108,7 @@ def test_what_is_no_homography(value):
 
 @pytest.mark.parametrize(
     ("heading", "reason"),
-    [(0, None), (4, None), (-4, None), (356, None), (90, CameraFault.NOT_NORTH_UP), (180, CameraFault.NOT_NORTH_UP)],
+    [(0, None), (4, None), (-4, None), (356, None), (90, CameraFault.HEADING), (180, CameraFault.HEADING)],
 )
 def test_north_up(heading, reason):
     matrix = camera((0, 0), SIZE, 1.0, 0.0, 0.0, heading)
@@ -162,7 +162,7 @@ def test_limits_are_where_they_are_said_to_be(rough, slack_deg, slack):
         assert fault(camera((0, 0), SIZE, gsd), gsd_m=(0.5, 1.5)) is CameraFault.SAMPLING
     for gsd in (0.5 / slack * 1.01, 1.5 * slack * 0.99):
         assert fault(camera((0, 0), SIZE, gsd), gsd_m=(0.5, 1.5)) is None
-    for heading, expected in [(slack_deg - 0.1, None), (slack_deg + 0.1, CameraFault.NOT_NORTH_UP)]:
+    for heading, expected in [(slack_deg - 0.1, None), (slack_deg + 0.1, CameraFault.HEADING)]:
         assert fault(camera((0, 0), SIZE, 1.0, 0.0, 0.0, heading), north_up=True) is expected
         assert fault(camera((0, 0), SIZE, 1.0, 0.0, 0.0, -heading), north_up=True) is expected
     for stretch, expected in [(0.34, None), (0.36, None if rough else CameraFault.SKEW)]:
