@@ -147,7 +147,7 @@ class TripleEstimator:
         options, by_roads = self.options, self.options.roads is not None and len(self.scene.intersections) > 0
         sources = options.sweeps if by_roads else options.without_roads
         sweeps = [self.sweeps.rounds(self, Stage(stage, source, options.grow)) for stage, source in enumerate(sources)]
-        if is_told(options.camera, options.everywhere):
+        if by_roads and is_told(options.camera, options.everywhere):
             yield sweeps.pop(0)
             yield self._rounds_everywhere()
             if self._is_everywhere:

@@ -63,7 +63,9 @@ def test_an_empty_library_says_how_it_is_filled(
     assert capsys.readouterr() == ("", f"The library in {tmp_path} is empty; `roadgeo index` adds to it.\n")
 
 
-def test_kinds_that_no_column_tells_are_not_claimed(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+def test_kinds_that_no_column_tells_are_not_claimed(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str], caplog: pytest.LogCaptureFixture
+) -> None:
     bare, known = (
         write_vector(tmp_path / "bare.gpkg", streets()[0], width=["4"] * len(streets()[0])),
         tmp_path / "a.gpkg",
@@ -72,8 +74,9 @@ def test_kinds_that_no_column_tells_are_not_claimed(tmp_path: Path, capsys: pyte
     for files, told in (([bare], "not known, all lines of bare.gpkg were taken"), ([bare, known], "drivable; of bare")):
         named = [part for file in files for part in ("--roads", str(file))]
         assert main(["index", *named, "--out", str(tmp_path / "ref.gpkg")]) == 0
-        said = capsys.readouterr().err
-        assert said.count("bare.gpkg: no column tells what kind of road a line is") == 1
+        capsys.readouterr()
+        assert caplog.text.count("bare.gpkg: no column tells what kind of road a line is") == 1
+        caplog.clear()
         assert main(["info", str(tmp_path / "ref.gpkg")]) == 0
         (line,) = [line for line in capsys.readouterr().out.splitlines() if line.startswith("kinds")]
         assert told in line

@@ -70,8 +70,9 @@ def _paths(line: str, folder: Path) -> list[Path]:
 
 
 def strays(paths: list[Path], folder: Path) -> list[Path]:
-    """Return the paths that are neither of the outputs nor of the cache."""
-    allowed = (folder / "out", cache_dir(), Path("/dev/null"))
+    """Return the paths that are neither of the outputs nor of the cache, nor temporary and gone."""
+    assert not [*(folder / "temporary").iterdir()]
+    allowed = (folder / "out", folder / "temporary", cache_dir(), Path("/dev/null"))
     return [path for path in paths if not any(path.is_relative_to(one) for one in allowed)]
 
 
