@@ -407,8 +407,10 @@ def count_residuals(
         away = np.inf
         if ahead:
             away = nearest_road(x, y, dx, dy, radius, min_cos, segments, starts, ids, grid, shape)[0]
-        row = min(max(int(-points[i, 1] / piece_px), 0), last_row)
-        column = min(max(int(points[i, 0] / piece_px), 0), columns - 1)
+        row, column = 0, 0
+        if abs(points[i, 0]) + abs(points[i, 1]) < 1e15:  # infinite or NaN: no piece has such a number
+            row = min(max(int(-points[i, 1] / piece_px), 0), last_row)
+            column = min(max(int(points[i, 0] / piece_px), 0), columns - 1)
         forward[row * columns + column, min(int(n * away / radius), n) if away < radius else n] += weights[i]
     c0 = max(int(np.floor((bounds[0] - grid[0]) / grid[2])), 0)
     c1 = min(int(np.floor((bounds[2] - grid[0]) / grid[2])), shape[0] - 1)
