@@ -53,8 +53,8 @@ class CameraOptions:
         Focal length, where it is known.
     max_skew : float
         How far the homography may be from that of any pinhole with square pixels whose axis meets the middle of the
-        frame: the greater of |cos| of the angle between the images of two perpendicular unit vectors and the log of
-        their lengths' ratio. A crop or a lens's distortion moves it from 0.
+        frame: the greater of the absolute cosine of the angle between the images of two perpendicular unit vectors and
+        the logarithm of the ratio of their lengths. A crop or lens distortion moves it from 0.
     north_up : bool
         The image's up is north, within 5 degrees.
     heading_deg : (float, float) or None
