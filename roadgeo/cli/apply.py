@@ -49,6 +49,13 @@ __all__ = ["apply_command"]
     show_default=True,
     help="How values between pixels are found; nearest for classes.",
 )
+@click.option(
+    "--compression",
+    type=click.Choice(["deflate", "zstd", "jpeg", "webp"]),
+    default="deflate",
+    show_default=True,
+    help="Of what is drawn; jpeg and webp make photographs of 8 bits five times smaller, and lose some detail.",
+)
 @click.option("-q", "--quiet", is_flag=True, help="Say nothing but errors.")
 def apply_command(location: str, pictures: tuple[str, ...], out_dir: str, quiet: bool, **given: Any) -> int:
     """Put PICTUREs on the map by the place that one of their frame was found at.
@@ -76,7 +83,7 @@ def apply_command(location: str, pictures: tuple[str, ...], out_dir: str, quiet:
         echo(str(error), err=True)
         return NOT_LOCATED
     make_folder(out_dir)
-    image = ImageOptions(given["crs"], given["resolution"], given["resampling"])
+    image = ImageOptions(given["crs"], given["resolution"], given["resampling"], compression=given["compression"])
     for path in apply_location(place, pictures, out_dir, image, given["products"], given["stretch"]):
         if not quiet:
             echo(f"wrote {path}")

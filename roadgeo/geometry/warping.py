@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Callable
 from dataclasses import dataclass
 from typing import TypeAlias
@@ -21,7 +22,8 @@ Transform: TypeAlias = Callable[[FloatArray], FloatArray] | None
 
 #: OpenCV addresses pixels with 16-bit integers while warping, so an image is drawn in blocks of this size.
 BLOCK = 8192
-_NODE_STEP = 64  # CRS transformations are computed at every 64th pixel and interpolated between
+#: Where an image lies is computed at every so many pixels, the first at which values between are as good as exact.
+_NODE_STEPS, _NODE_ERROR_PX = (64, 16, 4), 0.005
 _PER_SIDE = 33  # points on each side of an image's outline
 
 
@@ -121,32 +123,52 @@ def warp(
                 source = to_center @ crs_to_pixel @ grid.to_crs_matrix(column, row) @ to_corner
                 block[...] = cv2.warpPerspective(image, source, size, flags=interpolation | cv2.WARP_INVERSE_MAP)
             else:
-                pixels = source_pixels(pixel_to_crs, grid, column, row, size, to_place)
-                seen = pixels if lens is None else lens.bend(pixels)
-                maps = np.nan_to_num(seen - 0.5, nan=-9.0).astype(np.float32)
-                block[...] = cv2.remap(image, maps[..., 0], maps[..., 1], interpolation)
+                picture = image.shape[1], image.shape[0]
+                seen = source_pixels(pixel_to_crs, grid, column, row, size, picture, to_place, lens)
+                columns, rows = np.nan_to_num(seen - 0.5, nan=-9.0).astype(np.float32)
+                block[...] = cv2.remap(image, columns, rows, interpolation)
     return drawn
 
 
 def source_pixels(
-    pixel_to_crs: FloatArray, grid: MapGrid, column: int, row: int, size: tuple[int, int], to_place: Transform = None
+    pixel_to_crs: FloatArray,
+    grid: MapGrid,
+    column: int,
+    row: int,
+    size: tuple[int, int],
+    picture: tuple[int, int],
+    to_place: Transform = None,
+    lens: Lens | None = None,
 ) -> FloatArray:
-    """Image pixels (rows, columns, 2; corner convention) that lie at the centres of a block of a grid; NaN if nowhere.
+    """Image pixels (2, rows, columns; corner convention) that lie at the centres of a block of a grid; NaN if nowhere.
 
-    The block begins at `column`, `row` and has `size` (width, height).
+    The block begins at `column`, `row` and has `size` (width, height); the image has `picture` (width, height) pixels.
+    They are exact at some nodes and bilinear between, nowhere further off than `_NODE_ERROR_PX` in the image.
     """
-    width, height = size
-    to_pixel = Homography(pixel_to_crs).inverse()
-    to_crs = Homography(grid.to_crs_matrix(column, row))
-    if to_place is None:
-        columns, rows = np.meshgrid(np.arange(width) + 0.5, np.arange(height) + 0.5)
-        return (to_pixel @ to_crs)(np.stack([columns, rows], axis=2))
-    # Between nodes that reach to the block's outer edges, a CRS transformation is as good as bilinear.
-    columns, rows = (np.linspace(0, side, side // _NODE_STEP + 2) for side in size)
-    nodes = to_place(to_crs(np.stack(np.meshgrid(columns, rows), axis=2)))
-    origin = nodes[0, 0]
-    fine = []
-    for values in np.moveaxis(nodes - origin, 2, 0):
-        lines = np.array([np.interp(np.arange(width) + 0.5, columns, line) for line in values])
-        fine.append(np.array([np.interp(np.arange(height) + 0.5, rows, line) for line in lines.T]).T)
-    return to_pixel(np.stack(fine, axis=2) + origin)
+    to_pixel, to_crs = Homography(pixel_to_crs).inverse(), Homography(grid.to_crs_matrix(column, row))
+
+    def look_up(across: FloatArray, along: FloatArray) -> FloatArray:
+        points = to_crs(np.stack(np.meshgrid(across, along), axis=2))
+        pixels = to_pixel(points if to_place is None else to_place(points))
+        return pixels if lens is None else lens.bend(pixels)
+
+    for step in _NODE_STEPS:
+        if 4 * step > min(size):
+            continue
+        cells = [math.ceil(side / step) for side in size]
+        nodes = look_up(*(_every(step, n + 2) - 0.5 * step for n in cells))
+        middles = look_up(*(_every(step, n + 1) for n in cells))
+        between = (nodes[1:, 1:] + nodes[1:, :-1] + nodes[:-1, 1:] + nodes[:-1, :-1]) / 4.0
+        near = (np.abs(middles / picture - 0.5) < 0.75).all(axis=2)
+        if np.abs(between - middles)[near].max(initial=0.0) < _NODE_ERROR_PX:
+            found = np.empty((2, size[1], size[0]))
+            for axis in (0, 1):
+                fine = cv2.resize(nodes[..., axis], None, fx=step, fy=step, interpolation=cv2.INTER_LINEAR)
+                found[axis] = fine[step : step + size[1], step : step + size[0]]
+            return found
+    return np.moveaxis(look_up(*(_every(1, side) + 0.5 for side in size)), 2, 0)
+
+
+def _every(step: int, n: int) -> FloatArray:
+    """Return the first n multiples of a step."""
+    return np.arange(n, dtype=np.float64) * step

@@ -52,7 +52,7 @@ def _draw_in_degrees(subject: Subject, folder: Path) -> tuple[bytes, MapGrid]:
     middle = float(unwrap_ring(subject.outline())[:-1, 0].mean())
     crs = f"+proj=longlat +datum=WGS84 +lon_wrap={middle:.6f} +no_defs"
     warped = folder / "degrees.tif"
-    options = ImageOptions(crs, resampling="bilinear", max_pixels=_PIXELS)
+    options = ImageOptions(crs, resampling="bilinear", max_pixels=_PIXELS, compression="zstd")
     grid = warp_image(source, warped, subject.place, subject.homography, {}, options)
     with rasterio.open(warped) as raster:
         bands, known = raster.read(), raster.dataset_mask()

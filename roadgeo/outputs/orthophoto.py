@@ -4,9 +4,12 @@ from __future__ import annotations
 
 import math
 import os
+from collections import deque
 from collections.abc import Iterator, Mapping
+from concurrent.futures import Future, ThreadPoolExecutor
 from contextlib import ExitStack
 from dataclasses import dataclass
+from functools import cached_property
 from pathlib import Path
 from tempfile import TemporaryDirectory
 from typing import Any, Literal, NamedTuple
@@ -15,10 +18,10 @@ import cv2
 import numpy as np
 import rasterio
 import rasterio.shutil
-from rasterio.enums import ColorInterp, Resampling
+from rasterio.enums import ColorInterp, MaskFlags, Resampling
 from rasterio.windows import Window
 
-from roadgeo._arrays import AnyArray, FloatArray
+from roadgeo._arrays import AnyArray, BoolArray, FloatArray
 from roadgeo.errors import CrsError, MaskError
 from roadgeo.geometry.lens import Lens
 from roadgeo.geometry.warping import MapGrid, Transform, cover, source_pixels
@@ -27,9 +30,18 @@ from roadgeo.storage.crs import name_crs
 from roadgeo.storage.orientation import UPRIGHT, read_orientation
 from roadgeo.storage.rasters import open_raster, raster_size, read_palette, writing_raster
 
-__all__ = ["ImageOptions", "Target", "choose_target", "image_homography", "read_preview", "warp_image"]
+__all__ = [
+    "CompressionName",
+    "ImageOptions",
+    "Target",
+    "choose_target",
+    "image_homography",
+    "read_preview",
+    "warp_image",
+]
 
 ResamplingName = Literal["nearest", "bilinear", "cubic", "lanczos"]
+CompressionName = Literal["deflate", "zstd", "jpeg", "webp"]
 
 _INTERPOLATION = {
     "nearest": cv2.INTER_NEAREST,
@@ -37,12 +49,19 @@ _INTERPOLATION = {
     "cubic": cv2.INTER_CUBIC,
     "lanczos": cv2.INTER_LANCZOS4,
 }
-_BLOCK = 1024  # side of the blocks that are drawn one after another
-_REMAPPED = 4  # bands that OpenCV interpolates at a time
+_BLOCK = 512  # side of the blocks that are drawn one after another
 _BORDER = cv2.BORDER_REPLICATE
 _REACH = 8  # pixels around a block's source that interpolation may look at
 _TILED_BYTES = 1 << 28  # larger pictures that can only be read from the top down are first copied into tiles
 _MAX_SOURCE = 8192  # sides of a block's source beyond which it is read coarser
+_OVERVIEW_SIDE = 512  # the smallest overview has no longer side
+#: How results are compressed. Deflate is read everywhere; above level 1 it saves 2 % of a photograph in twice the time.
+_COMPRESSION: dict[str, dict[str, Any]] = {
+    "deflate": {"compress": "DEFLATE", "predictor": "YES", "level": 1},
+    "zstd": {"compress": "ZSTD", "predictor": "YES", "level": 1},
+    "jpeg": {"compress": "JPEG", "quality": 90},
+    "webp": {"compress": "WEBP", "quality": 90},
+}
 _DRAWABLE = tuple(np.dtype(name) for name in ("uint8", "uint16", "int16", "float32", "float64"))  # by OpenCV
 
 
@@ -60,12 +79,15 @@ class ImageOptions:
         How values between pixels are found.
     max_pixels : int
         A larger result is made coarser.
+    compression : {"deflate", "zstd", "jpeg", "webp"}
+        Of the file; the last two are lossy, for pictures of 8 bits and one or three bands.
     """
 
     crs: str | None = None
     resolution: float | None = None
     resampling: ResamplingName = "cubic"
     max_pixels: int = 400_000_000
+    compression: CompressionName = "deflate"
 
 
 def read_preview(path: str | os.PathLike[str], side: int) -> AnyArray:
@@ -194,6 +216,7 @@ def warp_image(
             raise CrsError(f"the footprint lies outside what {crs} is made for; choose another --crs")
         interpolation, lens = _INTERPOLATION[options.resampling], place.lens(size)
         plan = _Plan(picture, homography, to_place, grid, interpolation, lens)
+        _require_compressible(plan, options.compression)
         drawn = folder / "drawn.tif"
         with writing_raster(target):
             _draw(plan, drawn, crs, tags)
@@ -240,12 +263,12 @@ class _Plan:
         """Width and height of the picture."""
         return self.picture.width, self.picture.height
 
-    @property
+    @cached_property
     def bands(self) -> list[int]:
         """Bands that are read: all but alpha, which is drawn anew."""
         return _value_bands(self.picture)
 
-    @property
+    @cached_property
     def palette(self) -> AnyArray | None:
         """(256, 3) uint8 colours, where the picture has a palette."""
         return read_palette(self.picture)
@@ -270,6 +293,13 @@ class _Plan:
         """Whether the result has an alpha band, else a nodata value."""
         return self.dtype in (np.dtype("uint8"), np.dtype("uint16"))
 
+    def known(self, window: Window, shape: tuple[int, int]) -> BoolArray | None:
+        """Return where the picture knows its values in a window, read as (rows, columns); None: everywhere."""
+        if all(MaskFlags.all_valid in flags for flags in self.picture.mask_flag_enums):
+            return None
+        known = self.picture.dataset_mask(window=window, out_shape=shape, resampling=Resampling.nearest) > 0
+        return None if known.all() else np.asarray(known, bool)
+
     @property
     def nodata(self) -> float | None:
         """Value of unknown ground where there is no alpha band."""
@@ -284,82 +314,154 @@ class _Plan:
 
 
 def _draw(plan: _Plan, path: Path, crs: str, tags: Mapping[str, str]) -> None:
+    """Draw a GeoTIFF, and its overviews beside it where there is an alpha band: far quicker than GDAL makes them."""
+    with ExitStack() as stack:
+        sinks = [stack.enter_context(rasterio.open(path, "w", **_profile(plan, crs)))]
+        sinks[0].colorinterp = plan.colors
+        sinks[0].update_tags(**tags)
+        while plan.has_alpha and max(sinks[-1].shape) > _OVERVIEW_SIDE and 1 << len(sinks) <= _BLOCK:
+            path = path.with_name(f"{path.name}.ovr")
+            height, width = (math.ceil(side / 2) for side in sinks[-1].shape)
+            sinks.append(stack.enter_context(rasterio.open(path, "w", **_profile(plan, None, (width, height)))))
+        for column, row, block in _blocks(plan):
+            for level, sink in enumerate(sinks):
+                block = _halve(block, plan) if level else block
+                sink.write(block, window=Window(column >> level, row >> level, block.shape[2], block.shape[1]))
+
+
+def _profile(plan: _Plan, crs: str | None, size: tuple[int, int] | None = None) -> dict[str, Any]:
+    """Return what a GeoTIFF in the making is written with; one without CRS is an overview of `size` (width, height)."""
     grid = plan.grid
-    profile = {
+    width, height = size or (grid.width, grid.height)
+    profile: dict[str, Any] = {
         "driver": "GTiff",
-        "width": grid.width,
-        "height": grid.height,
+        "width": width,
+        "height": height,
         "count": len(plan.colors),
         "dtype": plan.dtype.name,
-        "nodata": plan.nodata,
-        "crs": crs,
-        "transform": rasterio.Affine(grid.resolution, 0.0, grid.west, 0.0, -grid.resolution, grid.north),
         "tiled": True,
         "blockxsize": 512,
         "blockysize": 512,
-        "compress": "LZW",
+        "interleave": "pixel",
+        "sparse_ok": True,
         "bigtiff": "IF_SAFER",
     }
-    with rasterio.open(path, "w", **profile) as sink:
-        sink.colorinterp = plan.colors
-        sink.update_tags(**tags)
-        for window, block in _blocks(plan):
-            sink.write(block, window=window)
+    if crs is not None:
+        transform = rasterio.Affine(grid.resolution, 0.0, grid.west, 0.0, -grid.resolution, grid.north)
+        profile |= {"crs": crs, "transform": transform, "nodata": plan.nodata}
+    return profile
+
+
+def _halve(block: AnyArray, plan: _Plan) -> AnyArray:
+    """Return a block (bands, rows, columns) of half the size; what is transparent does not darken what is not."""
+    if plan.interpolation == cv2.INTER_NEAREST:
+        return np.ascontiguousarray(block[:, ::2, ::2])
+    opaque = np.iinfo(plan.dtype).max
+    even = np.pad(block, ((0, 0), (0, block.shape[1] % 2), (0, block.shape[2] % 2)), mode="edge")
+    size = even.shape[2] // 2, even.shape[1] // 2
+    half = np.stack([cv2.resize(band, size, interpolation=cv2.INTER_AREA) for band in even])
+    at_edge = (half[-1] > 0) & (half[-1] < opaque)
+    if at_edge.any():
+        half[:-1, at_edge] = _cast(half[:-1, at_edge] * (opaque / half[-1, at_edge]), plan.dtype)
+        half[-1, at_edge] = opaque
+    return half
+
+
+def _require_compressible(plan: _Plan, compression: str) -> None:
+    """Raise where a picture has other values than a lossy compression holds."""
+    n_bands = len(plan.colors) - plan.has_alpha
+    fits = plan.dtype == np.uint8 and n_bands in ((1, 3) if compression == "jpeg" else (3,))
+    if compression in ("jpeg", "webp") and not fits:
+        expected = "one band or three of 8 bits" if compression == "jpeg" else "three bands of 8 bits"
+        raise MaskError(
+            f"{compression} holds {expected}; the picture has {n_bands} of {plan.dtype.name}: choose deflate or zstd"
+        )
 
 
 def _optimize(drawn: Path, target: str | os.PathLike[str], options: ImageOptions) -> None:
-    rasterio.shutil.copy(
-        drawn,
-        target,
-        driver="COG",
-        compress="DEFLATE",
-        predictor="YES",
-        bigtiff="IF_SAFER",
-        overview_resampling="nearest" if options.resampling == "nearest" else "average",
-    )
+    nearest = options.resampling == "nearest"
+    with rasterio.Env(GDAL_DISABLE_READDIR_ON_OPEN="FALSE"):  # the overviews lie beside it
+        rasterio.shutil.copy(
+            drawn,
+            target,
+            driver="COG",
+            num_threads="ALL_CPUS",
+            bigtiff="IF_SAFER",
+            overview_resampling="nearest" if nearest else "average",
+            **_COMPRESSION[options.compression],
+        )
 
 
-def _blocks(plan: _Plan) -> Iterator[tuple[Window, AnyArray]]:
-    """Draw block after block, (bands, rows, columns); where there is alpha, blocks that show nothing are left out."""
-    for row in range(0, plan.grid.height, _BLOCK):
-        for column in range(0, plan.grid.width, _BLOCK):
-            size = min(_BLOCK, plan.grid.width - column), min(_BLOCK, plan.grid.height - row)
-            pixels = source_pixels(plan.homography, plan.grid, column, row, size, plan.to_place)
-            pixels = pixels if plan.lens is None else plan.lens.bend(pixels)
-            inside = np.all((pixels > 0) & (pixels < plan.size), axis=2)
-            window = Window(column, row, *size)
+def _blocks(plan: _Plan) -> Iterator[tuple[int, int, AnyArray]]:
+    """Draw block after block: column, row, and (bands, rows, columns); transparent ones are left out.
+
+    All reading is done here, for GDAL's settings are those of a thread; a few blocks are drawn at a time.
+    """
+    n_threads = os.cpu_count() or 1
+    with ThreadPoolExecutor(n_threads) as pool:
+        begun: deque[tuple[int, int, Future[AnyArray]]] = deque()
+        for column, row, size in _cut_up(plan.grid):
+            pixels = source_pixels(plan.homography, plan.grid, column, row, size, plan.size, plan.to_place, plan.lens)
+            inside = (pixels[0] > 0) & (pixels[0] < plan.size[0]) & (pixels[1] > 0) & (pixels[1] < plan.size[1])
             if inside.any():
-                yield window, _draw_block(plan, pixels, inside)
+                part = _read_part(plan, pixels, inside)
+                begun.append((column, row, pool.submit(_draw_block, plan, part, pixels, inside)))
             elif not plan.has_alpha:
-                yield window, np.full((len(plan.bands), *size[::-1]), plan.nodata, plan.dtype)
+                empty = (len(plan.bands), *size[::-1])
+                begun.append((column, row, pool.submit(np.full, empty, plan.nodata, plan.dtype)))
+            while len(begun) > 2 * n_threads:
+                column, row, block = begun.popleft()
+                yield column, row, block.result()
+        yield from ((column, row, block.result()) for column, row, block in begun)
 
 
-def _draw_block(plan: _Plan, pixels: FloatArray, inside: AnyArray) -> AnyArray:
-    window, source = _source_window(plan, pixels, inside)
-    shape = _reduced_shape(plan, window)
-    palette = plan.palette
+def _cut_up(grid: MapGrid) -> Iterator[tuple[int, int, tuple[int, int]]]:
+    """Return column, row, and size (width, height) of the blocks of a grid."""
+    for row in range(0, grid.height, _BLOCK):
+        for column in range(0, grid.width, _BLOCK):
+            yield column, row, (min(_BLOCK, grid.width - column), min(_BLOCK, grid.height - row))
+
+
+class _Part(NamedTuple):
+    """What was read of a window of a picture: (bands, rows, columns), and where they are known; None: everywhere."""
+
+    window: Window
+    values: AnyArray
+    known: BoolArray | None
+
+
+def _read_part(plan: _Plan, pixels: FloatArray, inside: BoolArray) -> _Part:
+    """Read what a block needs."""
+    window = _source_window(plan, pixels, inside)
+    shape, palette = _reduced_shape(plan, window), plan.palette
     averaged = Resampling.average if palette is None else Resampling.nearest
-    values = np.moveaxis(plan.picture.read(plan.bands, window=window, out_shape=shape, resampling=averaged), 0, 2)
-    known = plan.picture.dataset_mask(window=window, out_shape=shape[1:], resampling=Resampling.nearest) > 0
+    values = plan.picture.read(plan.bands, window=window, out_shape=shape, resampling=averaged)
     if palette is not None:
-        values = palette[values[..., 0]]
-    maps = (source * (np.array(shape[:0:-1]) / (window.width, window.height)) - 0.5).astype(np.float32)
-    image = np.moveaxis(_sample(values, maps, known, plan), 2, 0)
-    seen = inside & (_remap(known.astype(np.uint8), maps, cv2.INTER_NEAREST)[..., 0] > 0)
-    if plan.has_alpha:
-        image[:, ~seen] = 0
-        opaque = np.where(seen, plan.dtype.type(np.iinfo(plan.dtype).max), plan.dtype.type(0))
-        return np.concatenate([image, opaque[None]])
-    image[:, ~seen] = plan.nodata
-    return image
+        values = np.moveaxis(palette[values[0]], 2, 0)
+    return _Part(window, values, plan.known(window, shape[1:]))
 
 
-def _source_window(plan: _Plan, pixels: FloatArray, inside: AnyArray) -> tuple[Window, FloatArray]:
-    """Return the part of the picture that a block needs, and the block's pixels counted from that part's corner."""
-    low = np.maximum(np.floor(pixels[inside].min(axis=0)) - _REACH, 0).astype(int)
-    high = np.minimum(np.ceil(pixels[inside].max(axis=0)) + _REACH, plan.size).astype(int)
-    window = Window(int(low[0]), int(low[1]), int(high[0] - low[0]), int(high[1] - low[1]))
-    return window, np.where(inside[..., None], pixels - low, 0.0)
+def _draw_block(plan: _Plan, part: _Part, pixels: FloatArray, inside: BoolArray) -> AnyArray:
+    window, values, known = part
+    corner = np.array([window.col_off, window.row_off])[:, None, None]
+    factors = np.array([values.shape[2] / window.width, values.shape[1] / window.height])[:, None, None]
+    maps = ((pixels - corner) * factors - 0.5).astype(np.float32)
+    image = _sample(values, maps, known, plan)
+    seen = inside if known is None else inside & (_remap(known.view(np.uint8)[None], maps, cv2.INTER_NEAREST)[0] > 0)
+    if not plan.has_alpha:
+        image[:, ~seen] = plan.nodata
+        return image
+    image *= seen
+    opaque = seen * plan.dtype.type(np.iinfo(plan.dtype).max)
+    return np.concatenate([image, opaque[None]])
+
+
+def _source_window(plan: _Plan, pixels: FloatArray, inside: BoolArray) -> Window:
+    """Return the part of the picture that a block needs."""
+    ends = [cv2.minMaxLoc(one, inside.view(np.uint8))[:2] for one in pixels]
+    left, top = (max(math.floor(low) - _REACH, 0) for low, _ in ends)
+    right, bottom = (min(math.ceil(high) + _REACH, side) for (_, high), side in zip(ends, plan.size, strict=True))
+    return Window(left, top, right - left, bottom - top)
 
 
 def _reduced_shape(plan: _Plan, window: Window) -> tuple[int, int, int]:
@@ -368,24 +470,22 @@ def _reduced_shape(plan: _Plan, window: Window) -> tuple[int, int, int]:
     return len(plan.bands), max(round(window.height / factor), 1), max(round(window.width / factor), 1)
 
 
-def _sample(values: AnyArray, maps: AnyArray, known: AnyArray, plan: _Plan) -> AnyArray:
-    """Interpolate (rows, columns, bands); unknown pixels have no weight, so that they do not bleed into others."""
+def _sample(values: AnyArray, maps: AnyArray, known: BoolArray | None, plan: _Plan) -> AnyArray:
+    """Interpolate (bands, rows, columns); unknown pixels have no weight, so that they do not bleed into others."""
     drawable = values if values.dtype in _DRAWABLE else values.astype(np.float64)
-    if known.all() or plan.interpolation == cv2.INTER_NEAREST:
+    if known is None or plan.interpolation == cv2.INTER_NEAREST:
         return _cast(_remap(drawable, maps, plan.interpolation), plan.dtype)
-    weights = _remap(known.astype(np.float32), maps, plan.interpolation)
-    weighted = _remap(np.where(known[..., None], drawable, 0).astype(np.float32), maps, plan.interpolation)
+    weights = _remap(known.astype(np.float32)[None], maps, plan.interpolation)
+    weighted = _remap(np.where(known, drawable, 0).astype(np.float32), maps, plan.interpolation)
     return _cast(weighted / np.maximum(weights, 1e-3), plan.dtype)
 
 
 def _remap(image: AnyArray, maps: AnyArray, interpolation: int) -> AnyArray:
-    """Look up an image (rows, columns[, bands]) at `maps` (h, w, 2); (h, w, bands)."""
-    bands = image if image.ndim == 3 else image[..., None]
-    drawn = [
-        cv2.remap(bands[..., i : i + _REMAPPED], maps[..., 0], maps[..., 1], interpolation, borderMode=_BORDER)
-        for i in range(0, bands.shape[2], _REMAPPED)
-    ]
-    return np.concatenate([one.reshape(*maps.shape[:2], -1) for one in drawn], axis=2)
+    """Look up an image (bands, rows, columns) at `maps` (2, h, w); (bands, h, w)."""
+    columns, rows = maps
+    return np.stack(
+        [cv2.remap(np.ascontiguousarray(band), columns, rows, interpolation, borderMode=_BORDER) for band in image]
+    )
 
 
 def _cast(image: AnyArray, dtype: np.dtype[Any]) -> AnyArray:

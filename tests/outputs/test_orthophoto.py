@@ -1,4 +1,5 @@
 import warnings
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -11,8 +12,16 @@ from worlds.turned import save_turned
 
 from roadgeo.errors import CrsError, MaskError
 from roadgeo.geometry.homography import Homography
+from roadgeo.geometry.warping import cover, source_pixels
 from roadgeo.outputs import orthophoto
-from roadgeo.outputs.orthophoto import ImageOptions, image_homography, read_preview, warp_image
+from roadgeo.outputs.orthophoto import (
+    CompressionName,
+    ImageOptions,
+    choose_target,
+    image_homography,
+    read_preview,
+    warp_image,
+)
 from roadgeo.outputs.paths import Placement
 
 PLACE = Placement.of(located())
@@ -212,3 +221,70 @@ def test_a_preview_of_a_palette_shows_its_colours(tmp_path: Path) -> None:
     preview = read_preview(path, 1000)
     assert preview[5, 5].tolist() == [10, 20, 30, 255]
     assert preview[5, 35].tolist() == [200, 100, 50, 255]
+
+
+def blobs(height: int, width: int) -> np.ndarray:
+    """Smooth colours (3, rows, columns)."""
+    rows, columns = np.indices((height, width))
+    waves = [np.sin(columns / 17 + k) * np.cos(rows / (13 + k)) for k in range(3)]
+    return np.asarray(128 + 100 * np.stack(waves), np.uint8)
+
+
+@pytest.mark.parametrize("compression", ["deflate", "zstd", "jpeg", "webp"])
+def test_a_result_is_compressed_as_asked_for(tmp_path: Path, compression: CompressionName) -> None:
+    source = write(tmp_path / "a.tif", blobs(300, 400), photometric="RGB")
+    homography, _ = image_homography(PLACE, MASK_SIZE, source)
+    drawn = []
+    for name in ("deflate", compression):
+        warp_image(source, tmp_path / "b.tif", PLACE, homography, {}, ImageOptions(compression=name))
+        with rasterio.open(tmp_path / "b.tif") as raster:
+            assert raster.tags(ns="IMAGE_STRUCTURE")["LAYOUT"] == "COG"
+            assert name in str(raster.compression.value).lower() or name == "jpeg"
+            drawn.append((raster.read((1, 2, 3)).astype(int), raster.dataset_mask() > 0))
+    (exact, shown), (kept, also_shown) = drawn
+    assert (shown == also_shown).all()
+    assert np.abs(kept - exact)[:, shown].mean() <= (3 if compression in ("jpeg", "webp") else 0)
+
+
+@pytest.mark.parametrize(("compression", "bands"), [("jpeg", 2), ("webp", 1), ("jpeg", 7)])
+def test_a_compression_that_cannot_hold_a_picture_is_refused(
+    tmp_path: Path, compression: CompressionName, bands: int
+) -> None:
+    source = write(tmp_path / "a.tif", np.full((bands, 300, 400), 7, "uint8"))
+    with pytest.raises(MaskError, match=rf"{compression} holds .*; the picture has {bands} of uint8: choose deflate"):
+        warp_image(source, tmp_path / "b.tif", PLACE, PLACE.homography, {}, ImageOptions(compression=compression))
+    assert [path.name for path in tmp_path.iterdir()] == ["a.tif"]
+
+
+@pytest.mark.parametrize("dtype", ["uint8", "uint16"])
+def test_overviews_show_the_same_ground_and_no_dark_edge(tmp_path: Path, dtype: str) -> None:
+    source = write(tmp_path / "a.tif", np.full((1, 900, 1200), 200, dtype))
+    homography, _ = image_homography(PLACE, MASK_SIZE, source)
+    warp_image(source, tmp_path / "b.tif", PLACE, homography, {})
+    with rasterio.open(tmp_path / "b.tif") as raster:
+        factors, shown = raster.overviews(1), (raster.dataset_mask() > 0).mean()
+    assert factors[:1] == [2]
+    for level in range(len(factors)):
+        with rasterio.open(tmp_path / "b.tif", overview_level=level) as raster:
+            values, alpha = raster.read()
+        assert (np.abs(values[alpha > 0].astype(int) - 200) <= 4).all()  # eight bits of an edge
+        assert (values[alpha == 0] == 0).all()
+        assert (alpha > 0).mean() == pytest.approx(shown, abs=0.02)
+
+
+@pytest.mark.parametrize("k1", [0.0, -0.08])
+@pytest.mark.parametrize("crs", [None, "EPSG:4326"])
+def test_where_pixels_come_from_is_as_good_as_exact(k1: float, crs: str | None) -> None:
+    place = replace(PLACE, homography=PLACE.homography @ np.array([[1, 0, 0], [0, 1, 0], [4e-4, -3e-4, 1]]), lens_k1=k1)
+    target = choose_target(place, ImageOptions(crs))
+    grid = cover((1600, 1200), place.homography, None, 4_000_000, target.to_target)
+    size, lens = (grid.width, grid.height), place.lens((1600, 1200))
+    found = source_pixels(place.homography, grid, 0, 0, size, (1600, 1200), target.to_place, lens)
+    columns, rows = (np.linspace(0, side - 1, 40).astype(int) for side in size)
+    centers = Homography(grid.to_crs_matrix())(np.stack(np.meshgrid(columns + 0.5, rows + 0.5), axis=2))
+    exact = Homography(place.homography).inverse()(centers if target.to_place is None else target.to_place(centers))
+    exact = exact if lens is None else lens.bend(exact)
+    inside = ((exact > 0) & (exact < (1600, 1200))).all(axis=2)
+    assert inside.any()
+    off = np.moveaxis(found[:, rows][:, :, columns], 0, 2) - exact
+    assert np.abs(off[inside]).max() < 0.01
