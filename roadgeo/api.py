@@ -11,7 +11,7 @@ from typing import TYPE_CHECKING, Any, TypeAlias
 
 import numpy as np
 
-from roadgeo.errors import NotLocatedError, OutputError
+from roadgeo.errors import NotLocatedError, OutputError, name_extra
 from roadgeo.geometry.areas import Box, find_area, is_box
 from roadgeo.geometry.mask import RoadMask
 from roadgeo.location import Location
@@ -165,13 +165,18 @@ def build_reference(
         No CRS; no lines; fewer than three intersections.
     OutputError
         It cannot be written.
+    MissingPackageError
+        A package of the extra `maps` is not installed.
     """
     from roadgeo.sources.held_roads import choose_roads
     from roadgeo.workflows import build_reference as build
 
-    chosen = choose_roads(roads, kinds, tunnels, attribution, crs=crs)
     where = None if path is None else Path(path)
-    return build(chosen, name or (where.stem if where else ""), options, path=where)
+    try:
+        chosen = choose_roads(roads, kinds, tunnels, attribution, crs=crs)
+        return build(chosen, name or (where.stem if where else ""), options, path=where)
+    except ModuleNotFoundError as error:
+        raise name_extra(error) or error from error
 
 
 def locate(

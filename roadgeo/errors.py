@@ -10,6 +10,7 @@ __all__ = [
     "CrsError",
     "IndexFormatError",
     "MaskError",
+    "MissingPackageError",
     "ModelError",
     "NoRoadsError",
     "NotLocatedError",
@@ -18,7 +19,28 @@ __all__ = [
     "PluginError",
     "RoadSourceError",
     "RoadgeoError",
+    "name_extra",
 ]
+
+#: Packages that come with an extra, and which: the core locates masks on references that were built elsewhere.
+_EXTRAS = {
+    "geopandas": "maps",
+    "mapbox_vector_tile": "serve",
+    "matplotlib": "plot",
+    "networkx": "maps",
+    "onnxruntime": "segment",
+    "osmium": "maps",
+    "osmnx": "maps",
+    "pandas": "maps",
+    "pyarrow": "maps",
+    "pymavlink": "mavlink",
+    "pyogrio": "maps",
+    "python_multipart": "serve",
+    "scipy": "track",
+    "shapely": "maps",
+    "starlette": "serve",
+    "uvicorn": "serve",
+}
 
 
 class RoadgeoError(Exception):
@@ -61,9 +83,23 @@ class NotLocatedError(RoadgeoError):
     """A place was asked of a mask that was not located."""
 
 
+class MissingPackageError(RoadgeoError):
+    """A package of an extra is not installed."""
+
+
 class OutputError(RoadgeoError):
     """A result could not be written."""
 
 
 class PluginError(RoadgeoError):
     """A plugin is missing, cannot be loaded, or does not do what is asked of its kind."""
+
+
+def name_extra(error: ModuleNotFoundError) -> MissingPackageError | None:
+    """Return the error that names the extra of a package that is not installed; None if it is of no extra."""
+    package = (error.name or "").partition(".")[0]
+    if package not in _EXTRAS:
+        return None
+    return MissingPackageError(
+        f"this needs {package}, which is not installed: pip install 'roadgeo[{_EXTRAS[package]}]'"
+    )

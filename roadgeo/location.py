@@ -11,7 +11,7 @@ import numpy as np
 
 from roadgeo import __version__
 from roadgeo._arrays import FloatArray
-from roadgeo.errors import NotLocatedError
+from roadgeo.errors import NotLocatedError, name_extra
 from roadgeo.geometry.frame import Frame
 from roadgeo.geometry.homography import Homography
 from roadgeo.geometry.lens import Lens
@@ -400,8 +400,17 @@ class Location:
         return {"type": "Feature", "geometry": closed, "properties": told}
 
     def to_geodataframe(self) -> gpd.GeoDataFrame:
-        """Return the footprint and its attributes as a table of one row, in the location's CRS (WGS 84 without one)."""
-        import geopandas as gpd
+        """Return the footprint and its attributes as a table of one row, in the location's CRS (WGS 84 without one).
+
+        Raises
+        ------
+        MissingPackageError
+            geopandas is not installed.
+        """
+        try:
+            import geopandas as gpd
+        except ModuleNotFoundError as error:
+            raise name_extra(error) or error from error
 
         frame = gpd.GeoDataFrame.from_features([self.__geo_interface__], crs="EPSG:4326")
         return frame if self.crs is None else frame.to_crs(self.crs)

@@ -1,10 +1,16 @@
 """What stands beside the package agrees with it."""
 
 import re
+import subprocess
+import sys
 import tomllib
 from pathlib import Path
 
+import pytest
+
 import roadgeo
+from roadgeo.errors import name_extra
+from roadgeo.evaluation.demo import ROADS, demo_masks
 
 ROOT = Path(__file__).parents[1]
 PROJECT = tomllib.loads((ROOT / "pyproject.toml").read_text("utf-8"))["project"]
@@ -26,9 +32,63 @@ def test_the_conda_recipe_is_of_this_version_and_needs_the_same() -> None:
     assert f"homepage: {PROJECT['urls']['Homepage']}" in recipe
     needed = recipe.split("  run:\n")[1].split("\n\n")[0]
     listed = re.findall(r"- ([\w-]+) (>=[\d.]+)", needed)
-    asked = [re.fullmatch(r"([\w-]+)(>=[\d.]+)", one).groups() for one in PROJECT["dependencies"]]
-    expected = [(ON_CONDA.get(name, name), version) for name, version in asked]
-    assert listed == [("python", PROJECT["requires-python"]), *expected]
+    extras = PROJECT["optional-dependencies"]
+    every = {*PROJECT["dependencies"], *extras["maps"], *extras["track"], *extras["serve"]}
+    asked = [re.fullmatch(r"([\w-]+)(>=[\d.]+)", one).groups() for one in every]
+    expected = {(ON_CONDA.get(name, name), version) for name, version in asked}
+    assert set(listed) == {("python", PROJECT["requires-python"]), *expected}
+
+
+def test_a_missing_package_is_named_with_the_extra_that_brings_it() -> None:
+    extras = PROJECT["optional-dependencies"]
+    brought = {"geopandas": ("geopandas", "pandas", "pyogrio"), "protobuf": ()}
+    for extra in ("maps", "track", "serve", "segment", "plot", "mavlink"):
+        for package in (re.match(r"[\w-]+", one)[0] for one in extras[extra]):
+            for name in brought.get(package, (package.replace("-", "_"),)):
+                told = str(name_extra(ModuleNotFoundError(name=f"{name}.part")))
+                named = re.fullmatch(
+                    rf"this needs {name}, which is not installed: pip install 'roadgeo\[(\w+)\]'", told
+                )
+                assert any(one.startswith(package) for one in extras[named[1]])
+    assert name_extra(ModuleNotFoundError(name="another")) is None
+
+
+WITHOUT_EXTRAS = """
+import sys
+for name in ("scipy", "geopandas", "pandas", "pyogrio", "pyarrow", "shapely", "osmnx", "networkx", "osmium",
+             "starlette", "uvicorn", "matplotlib", "mapbox_vector_tile", "python_multipart", "dask"):
+    sys.modules[name] = None
+from roadgeo.cli import main
+sys.exit(main(sys.argv[1:]))
+"""
+
+
+@pytest.mark.slow
+def test_the_core_locates_and_names_the_extra_that_is_missing(tmp_path: Path) -> None:
+    """As on board of a drone: a reference that was built elsewhere, and no extra."""
+    reference = tmp_path / "porto.gpkg"
+    roadgeo.build_reference(ROADS, path=reference)
+    drone = next(mask.path for mask in demo_masks() if mask.path.stem == "drone")
+
+    def run(*arguments: object) -> subprocess.CompletedProcess[str]:
+        command = [sys.executable, "-c", WITHOUT_EXTRAS, *map(str, arguments)]
+        return subprocess.run(command, capture_output=True, text=True, check=False, cwd=tmp_path)
+
+    for arguments in (
+        ["locate", drone, "-r", reference, "--out-dir", tmp_path / "out", "--report", "--plot", "--also", "stac"],
+        ["locate", drone, "-r", reference, "--out-dir", tmp_path / "told", "--heading", "128+-5", "--gsd", "0.8:1.25"],
+        ["vectorize", drone],
+        ["info", reference],
+    ):
+        done = run(*arguments)
+        assert done.returncode == 0, done.stderr
+    for extra, arguments in (
+        ("maps", ["index", "--roads", ROADS, "--out", "a.gpkg"]),
+        ("serve", ["serve", "-r", reference]),
+    ):
+        done = run(*arguments)
+        assert done.returncode == 1
+        assert done.stderr.splitlines()[-1].endswith(f"pip install 'roadgeo[{extra}]'"), done.stderr
 
 
 def test_placeholder_addresses_stand_in_one_place() -> None:

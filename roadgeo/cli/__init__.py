@@ -17,7 +17,7 @@ import click
 
 from roadgeo import __version__
 from roadgeo.cli.printing import echo
-from roadgeo.errors import RoadgeoError
+from roadgeo.errors import RoadgeoError, name_extra
 from roadgeo.storage.gdal import forget_missing_proj_data, skip_drivers
 
 __all__ = ["COMMANDS", "ERROR", "INTERRUPTED", "NOT_LOCATED", "cli", "main"]
@@ -135,6 +135,11 @@ def main(arguments: Sequence[str] | None = None) -> int:
         return INTERRUPTED
     except RoadgeoError as error:
         return _fail(str(error), ERROR)
+    except ModuleNotFoundError as error:
+        missing = name_extra(error)
+        if missing is None:
+            raise
+        return _fail(str(missing), ERROR)
     except BrokenPipeError:
         # Whoever read our output has gone; what Python still holds for it must not raise at exit.
         os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())

@@ -10,10 +10,10 @@ from __future__ import annotations
 import math
 from collections.abc import Iterator
 from dataclasses import dataclass, field
+from typing import Any
 
 import cv2
 import numpy as np
-from scipy import fft
 
 from roadgeo._arrays import AnyArray, FloatArray
 from roadgeo.geometry.camera import CameraOptions
@@ -92,7 +92,8 @@ def propose_everywhere(
     columns, rows = (max(int(n), 1) for n in np.ceil((high - low) / cell))
     if (high <= low).any() or columns * rows * len(turns) * len(scales) > options.most_cells:
         return
-    shape = fft.next_fast_len(rows, real=True), fft.next_fast_len(columns, real=True)
+    fft = _transforms()
+    shape = cv2.getOptimalDFTSize(rows), cv2.getOptimalDFTSize(columns)
     drawn, along = _draw_map(index, low, (rows, columns), options)
     mapped = fft.rfft2(drawn, shape)
     mapped_along = fft.rfft2(drawn * along.real, shape), fft.rfft2(drawn * along.imag, shape)
@@ -144,6 +145,15 @@ def _draw_map(
     return drawn.astype(np.float32), along / np.maximum(np.abs(along), 1e-6)
 
 
+def _transforms() -> Any:
+    """Return the module of Fourier transforms: scipy's, or numpy's, five times slower, where scipy is not installed."""
+    try:
+        from scipy import fft
+    except ModuleNotFoundError:
+        from numpy import fft
+    return fft
+
+
 def _best(
     scene: Scene,
     scale: float,
@@ -168,6 +178,7 @@ def _best(
     np.add.at(along, (cells[:, 1], cells[:, 0]), np.exp(2j * np.arctan2(ways[:, 1], ways[:, 0])).astype(np.complex64))
     along /= np.maximum(np.abs(along), 1e-6)
     window = _observed(scene, matrix, half, size, options.cell_m)
+    fft = _transforms()
 
     def spectrum(template: AnyArray) -> AnyArray:
         return np.asarray(np.conj(fft.rfft2(template, shape)))

@@ -11,7 +11,6 @@ from dataclasses import dataclass
 
 import cv2
 import numpy as np
-from scipy.optimize import least_squares
 
 from roadgeo._arrays import AnyArray, BoolArray, FloatArray
 from roadgeo.geometry.frame import Frame
@@ -91,6 +90,8 @@ def level(chained: FloatArray, frame: Frame, options: MosaicOptions | None = Non
         w = local[:, 2, 2] + local[:, :2, 2] @ line
         size = -1.5 * np.log(np.maximum(w, 1e-6))
         return np.concatenate(((size - size.mean()) / 2.0 / options.height_sigma, line / options.tilt_sigma))
+
+    from scipy.optimize import least_squares
 
     line = least_squares(residuals, np.zeros(2), max_nfev=40).x if len(local) > 1 else np.zeros(2)
     levelled = np.array([[1.0, 0.0, 0.0], [0.0, 1.0, 0.0], [line[0], line[1], 1.0]]) @ local @ to_unit

@@ -13,7 +13,6 @@ from dataclasses import dataclass, replace
 from itertools import combinations
 
 import numpy as np
-from scipy.optimize import least_squares
 
 from roadgeo._arrays import AnyArray, FloatArray
 from roadgeo.geometry.frame import Frame
@@ -261,6 +260,8 @@ def adjust(start: Sequence[FloatArray], frame: Frame, links: Sequence[Link]) -> 
         return np.asarray((weight * gap).ravel())
 
     step = np.array([1.0, 1.0, 1.0, 1.0, 1.0, 1.0, 1.0 / scale, 1.0 / scale]) * scale
+    from scipy.optimize import least_squares
+
     free = least_squares(residuals, np.zeros(8 * (len(local) - 1)), loss="soft_l1", f_scale=0.02, max_nfev=30).x
     local[1:].reshape(-1, 9)[:, :8] += free.reshape(-1, 8) * step
     return np.asarray(local @ np.linalg.inv(to_pixel))
