@@ -123,7 +123,7 @@ class PairLocator:
         query, options = scene.intersections, self.options
         if self.n_r is not None:
             query, options = subset(query, self.n_r), replace(options, min_intersections=min(self.n_r, len(query)))
-        match = match_pairs(query, network.intersections, table, scene.corners, options)
+        match = match_pairs(query, table, scene.corners, options)
         answer = {
             "status": "not_located" if match.homography is None else "located",
             "reason": match.reason,

@@ -23,12 +23,13 @@ def main() -> None:
     options = parser.parse_args()
     area = paper.search_area(options.reference, options.out)
     table = build_pair_index(paper.read_network(area).intersections, paper.PAIR)
-    counts = np.diff(table.offsets)
+    keys = list(table.tuples)
+    counts = np.array([len(one.pairs) for one in table.tuples.values()])
     order = np.argsort(-counts)
     shares = np.cumsum(counts[order]) / counts.sum()
     print(f"{len(table):,} tuples of {len(counts)} types; the commonest:")
     for t in order[:8]:
-        print(f"  {table.types[t].tolist()}  {counts[t]:>9,}  {100 * counts[t] / counts.sum():.1f} %")
+        print(f"  {_type(keys[t])}  {counts[t]:>9,}  {100 * counts[t] / counts.sum():.1f} %")
     print(
         f"{np.searchsorted(shares, 0.9) + 1} types hold 90 % of them; {np.sum(counts < 100)} types have fewer than 100"
     )
@@ -49,10 +50,16 @@ def main() -> None:
                     **paper.point(found),
                 }
             )
-    types = [{"type": table.types[t].tolist(), "tuples": int(counts[t])} for t in order]
+    types = [{"type": _type(keys[t]), "tuples": int(counts[t])} for t in order]
     paper.save(options.out, "figure7", {"reference": area.stem, "types": types, "rarest_first": results})
 
     draw(area.stem, counts[order], results, options.out)
+
+
+def _type(key: int) -> list[int]:
+    """Return the branch descriptor [N_B(P1), N_B(P2), N_q(P1), N_q(P2)] of a type (see `PairIndex.tuples`)."""
+    first, second = divmod(key, 256)
+    return [first // 16, second // 16, first % 16, second % 16]
 
 
 def draw(area: str, counts: np.ndarray, results: list[dict[str, Any]], out: paper.Path) -> None:

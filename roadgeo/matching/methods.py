@@ -22,9 +22,8 @@ from roadgeo.matching.hypothesis import Hypothesis
 from roadgeo.matching.index import ReferenceIndex, crop, unpack_tangents
 from roadgeo.matching.ledger import Ledger
 from roadgeo.matching.options import LocateOptions
-from roadgeo.matching.paper.quality import well_fitted
 from roadgeo.matching.paper.search import match_pairs
-from roadgeo.matching.paper.tuples import PairIndex, PairOptions, build_pair_index
+from roadgeo.matching.paper.tuples import PairIndex, PairOptions, build_pair_index, well_fitted
 from roadgeo.matching.parts import Part, Whole, same_within_m
 from roadgeo.matching.query import Query
 from roadgeo.matching.rivals import Rivals, Standing
@@ -382,8 +381,8 @@ def _search_pairs_in_turn(query: Query, indexes: Sequence[ReferenceIndex], optio
 def _search_pairs(query: Query, index: ReferenceIndex, options: PairOptions, share: PairOptions) -> Found:
     """Run the paper's method, within a share of its limits: what it finds has no odds, for it knows none."""
     scene = query.scene
-    reference, table = _pair_index(index, options)
-    match = match_pairs(scene.intersections, reference, table, scene.corners, share)
+    table = _pair_index(index, options)
+    match = match_pairs(scene.intersections, table, scene.corners, share)
     found = Found(
         index,
         stopped=match.stopped,
@@ -395,7 +394,7 @@ def _search_pairs(query: Query, index: ReferenceIndex, options: PairOptions, sha
     if match.homography is None:
         return found
     matched = np.full(len(scene.intersections), -1, np.int64)
-    matched[match.matches[:, 0]] = reference.node[match.matches[:, 1]]
+    matched[match.matches[:, 0]] = table.reference.node[match.matches[:, 1]]
     chosen = matched >= 0
     gap = Homography(match.homography)(scene.intersections.xy[chosen]) - index.xy[matched[chosen]]
     distance = np.zeros(len(matched))
@@ -404,11 +403,9 @@ def _search_pairs(query: Query, index: ReferenceIndex, options: PairOptions, sha
 
 
 @lru_cache(maxsize=4)
-def _pair_index(index: ReferenceIndex, options: PairOptions) -> tuple[Intersections, PairIndex]:
+def _pair_index(index: ReferenceIndex, options: PairOptions) -> PairIndex:
     """Build the paper's tables for a reference: too large to store with it, kept for a batch."""
     n = len(index)
     rays = unpack_branches(index.branches)
     found = Intersections(index.xy, rays, unpack_tangents(index.tangents), np.zeros(n, np.float32), np.arange(n))
-    if options.discard_poor:
-        found = found.only(np.flatnonzero(well_fitted(index)))
-    return found, build_pair_index(found, options)
+    return build_pair_index(found.only(np.flatnonzero(well_fitted(index))), options)

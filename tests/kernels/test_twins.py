@@ -14,7 +14,6 @@ from roadgeo.kernels.compilation import Kernel
 
 #: Twins of other names: of one item where the kernel does all, or of what the kernel's result is made of.
 TWINS = {
-    "cross_ratios": "describe_pairs",
     "cut_edges": "cut_edge",
     "describe_intersections": "merge_lines",
     "find_sides": "sides_of",
@@ -53,7 +52,6 @@ REASONS = {
     "neighbour_pair": "`orient`, which has a twin, and two columns exchanged by it; part of `fill_table`",
     "neighbour_steps": "part of thinning and tracing, whose twins use rows and columns",
     "neighbours": "part of thinning and tracing, whose twins use rows and columns",
-    "order_tree": "`search_tree` on its result is compared with a twin that knows no tree",
     "pair_id": "compared with the numbers it counts through, all of them",
     "rethin": "the second half of `thin`, which has a twin",
     "road_equations": "its twin stands beside its test",

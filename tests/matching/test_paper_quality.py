@@ -6,7 +6,8 @@ from shapely import LineString
 from worlds.scenes import PLANE
 
 from roadgeo.matching.index import build_index
-from roadgeo.matching.paper.quality import QualityOptions, well_fitted
+from roadgeo.matching.paper import tuples
+from roadgeo.matching.paper.tuples import well_fitted
 from roadgeo.reference.reference import build_network
 
 
@@ -28,5 +29,6 @@ def test_bent_branches_are_discarded_and_straight_ones_kept(index):
     assert good[inside & ~bent].all()
 
 
-def test_branches_too_short_to_fit_are_discarded(index):
-    assert not well_fitted(index, QualityOptions(length_m=3000.0)).any()
+def test_branches_too_short_to_fit_are_discarded(index, monkeypatch):
+    monkeypatch.setattr(tuples, "_LENGTH_M", 3000.0)
+    assert not well_fitted(index).any()

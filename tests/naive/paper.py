@@ -1,4 +1,4 @@
-"""Slow, obvious twins of `roadgeo.kernels.pairs`."""
+"""Slow, obvious twins of the paper's method."""
 
 from itertools import combinations
 
@@ -35,11 +35,6 @@ def describe_pairs(pairs, xy, tangents):
         phi = np.arctan2(*(xy[j] - xy[i])[::-1])
         rows.append([c for k in (i, j) for c in cross_ratios(relative_angles(tangents[k], phi))])
     return np.array(rows)
-
-
-def search_tree(values, low, high):
-    """Rows strictly inside a box."""
-    return np.flatnonzero(((values > low) & (values < high)).all(axis=1))
 
 
 def nearest_of_type(xy, codes, reference_xy, reference_codes, radius):

@@ -25,27 +25,28 @@ from typing import NamedTuple
 
 import numpy as np
 
-from roadgeo._arrays import Float32Array, FloatArray, Int32Array, IntArray
+from roadgeo._arrays import FloatArray, IntArray
 from roadgeo.geometry.homography import Homography
 from roadgeo.kernels import pairs as kernels
-from roadgeo.matching.paper.homographies import fit_points, pair_homography, to_pair_frame
 from roadgeo.matching.paper.tuples import (
     PairIndex,
     PairOptions,
-    fixed,
-    line_subsets,
+    cotangents,
+    cross_ratios,
     list_pairs,
     type_codes,
     type_keys,
-    type_table,
 )
-from roadgeo.matching.work import PairWork
+from roadgeo.matching.refinement import denormalise, normalise
 from roadgeo.roads.intersections import Intersections
 
 __all__ = ["PairMatch", "match_pairs", "query_draws", "reference_draws"]
 
 #: Intersections tested in one kernel call, about a tenth of a second: the grain of the limits.
 _TESTS_PER_CALL = 5_000_000
+#: Seconds of a usual machine, on masks of Liège: of a query tuple, of a candidate, and of an intersection by which a
+#: hypothesis is judged, which is given up as soon as too many miss.
+_SAMPLE_S, _TESTED_S, _COUNTED_S = 0.35e-3, 0.1e-6, 0.04e-6
 
 
 @dataclass(frozen=True)
@@ -70,12 +71,10 @@ class PairMatch:
         Homographies whose inliers were counted.
     confidence : float
         Probability that the search, as far as it got, finds a place that is there: 1 - P_fail-sum (eq. 12).
-    reason : str
     stopped : str
         What ended the search: "accepted", "exhausted", or a limit, "work" or "time"; "" where there was none.
     work_s : float
-        What was done, in seconds of a usual machine (see `work.PairWork`).
-    seconds : float
+        What was done, in seconds of a usual machine.
     """
 
     homography: FloatArray | None
@@ -105,12 +104,7 @@ def reference_draws(n_match: int, lambda_1: float) -> int:
 
 
 def match_pairs(
-    query: Intersections,
-    reference: Intersections,
-    index: PairIndex,
-    frame: FloatArray,
-    options: PairOptions | None = None,
-    seed: int = 0,
+    query: Intersections, index: PairIndex, frame: FloatArray, options: PairOptions | None = None, seed: int = 0
 ) -> PairMatch:
     """Find the query on the reference (Algorithm 1).
 
@@ -118,33 +112,21 @@ def match_pairs(
     ----------
     query : Intersections
         Query plane, pixels.
-    reference : Intersections
-        Reference plane, metres: those that `index` was built from.
     index : PairIndex
     frame : (4, 2) float64
         The image's corners in the query plane.
     options : PairOptions
     seed : int
         Of the random draws.
-
-    Raises
-    ------
-    ValueError
-        If `index` was built from another number of intersections.
     """
-    if len(reference) != len(index.codes):
-        raise ValueError(
-            f"the index holds {len(index.codes)} intersections, the reference {len(reference)}: rebuild it"
-        )
     options = options or PairOptions()
-    search = _Search(query, reference, index, np.asarray(frame, float), options, np.random.default_rng(seed))
+    search = _Search(query, index, np.asarray(frame, float), options, np.random.default_rng(seed))
     if len(query) < options.min_intersections:
         return search.not_located(f"only {len(query)} intersections, {options.min_intersections} are needed")
-    drawn, types = _draw_query_tuples(search)
-    for (a, b), t in zip(drawn.tolist(), types.tolist(), strict=True):
-        search.test(a, b, t)
-        if search.is_located:
-            return search.located()
+    for (a, b), key in search.draw_query_tuples():
+        search.test(a, b, key)
+        if search.homography is not None:
+            return search.located(search.homography)
         if search.spent:
             return search.cut_short(search.spent)
     return search.not_located(
@@ -159,20 +141,17 @@ class _Correspondence(NamedTuple):
 
     Attributes
     ----------
-    ends : (int, int)
+    ends : (2,) int64
         Query intersections that become P1 and P2.
     cotangents : two (N_q,) arrays
         Of their tangents, relative to the connecting line, in the order in which they correspond.
-    rows : (C,) int32
-        Candidates among the tuples of the type; empty: all of them (where there is no cross ratio to tell them apart).
-    n_match : int
-        Number of candidates.
+    candidates : (C, 2) int64
+        Reference tuples with like cross ratios.
     """
 
-    ends: tuple[int, int]
+    ends: IntArray
     cotangents: tuple[FloatArray, FloatArray]
-    rows: Int32Array
-    n_match: int
+    candidates: IntArray
 
 
 class _Search:
@@ -181,7 +160,6 @@ class _Search:
     def __init__(
         self,
         query: Intersections,
-        reference: Intersections,
         index: PairIndex,
         frame: FloatArray,
         options: PairOptions,
@@ -190,20 +168,8 @@ class _Search:
         self.begin = time.perf_counter()
         self.query, self.index, self.frame, self.options, self.rng = query, index, frame, options, rng
         self.codes = type_codes(query)
-        self.xy, self.tangents = fixed(reference.xy, np.float64), fixed(reference.tangents, np.float32)
-        self.buckets = kernels.PairBuckets(
-            index.grid[:2],
-            float(index.grid[2]),
-            int(index.shape[0]),
-            int(index.shape[1]),
-            index.starts,
-            index.items,
-            fixed(reference.xy[index.items], np.float64),
-            fixed(index.codes[index.items], np.uint8),
-        )
         # Rare types miss most often where a hypothesis is wrong: they judge first.
-        frequency = np.bincount(index.codes, minlength=256)
-        self.judges = np.argsort(frequency[self.codes], kind="stable")
+        self.judges = np.argsort(np.bincount(index.codes, minlength=256)[self.codes], kind="stable")
         self.best = math.floor(options.delta_inlier * len(query))
         self.homography: FloatArray | None = None
         self.n_samples = self.n_sum = self.candidates = self.tested = self.hypotheses = 0
@@ -211,7 +177,8 @@ class _Search:
 
     @property
     def work_s(self) -> float:
-        return PairWork(self.n_samples, self.tested, self.hypotheses, len(self.query)).seconds
+        counted = len(self.query) * self.hypotheses
+        return _SAMPLE_S * self.n_samples + _TESTED_S * self.tested + _COUNTED_S * counted
 
     @property
     def spent(self) -> str:
@@ -221,111 +188,124 @@ class _Search:
         return "time" if time.perf_counter() - self.begin > self.options.time_limit_s else ""
 
     @property
-    def is_located(self) -> bool:
-        return self.homography is not None
-
-    @property
     def confidence(self) -> float:
         return -math.expm1(self.log_p_fail)
 
-    def test(self, a: int, b: int, t: int) -> None:
-        """Draw candidates for the query tuple (a, b) of type `t` and test them, within the limits."""
-        correspondences = _correspondences(self.query, a, b, t, self.index, self.options)
-        n_match = sum(c.n_match for c in correspondences)
+    def draw_query_tuples(self) -> list[tuple[list[int], int]]:
+        """Draw l query tuples with their types, those rare in the reference first, at random within a type."""
+        options, rng, tuples = self.options, self.rng, self.index.tuples
+        chosen = np.arange(len(self.query))
+        if len(chosen) > options.max_tuple_intersections:
+            chosen = rng.choice(chosen, options.max_tuple_intersections, replace=False)
+        pairs = list_pairs(self.query, chosen, np.inf, options)
+        keys = type_keys(self.codes, pairs)
+        order = rng.permutation(np.flatnonzero(np.isin(keys, list(tuples))))
+        if options.rarest_first:
+            order = order[np.argsort([len(tuples[key].pairs) for key in keys[order].tolist()], kind="stable")]
+        drawn = order[: query_draws(options.lambda_, options.lambda_1, options.p_query)]
+        return list(zip(pairs[drawn].tolist(), keys[drawn].tolist(), strict=True))
+
+    def correspondences(self, a: int, b: int, key: int) -> list[_Correspondence]:
+        """Find the candidates of the query tuple (a, b) by the matching rules (section 3.2, eq. 6)."""
+        options, (pairs, tree) = self.options, self.index.tuples[key]
+        low, high = math.log1p(-options.delta_cross_ratio), math.log1p(options.delta_cross_ratio)
+        found = []
+        for ends in np.array([(a, b), (b, a)] if self.codes[a] == self.codes[b] else [(a, b)]):
+            step = self.query.xy[ends[1]] - self.query.xy[ends[0]]
+            falling = [cotangents(self.query, ends[k : k + 1], step[:1], step[1:])[0] for k in (0, 1)]
+            for signs in [(1, 1)] if options.tangent_orders == "++" else [(1, 1), (1, -1), (-1, 1), (-1, -1)]:
+                # Clockwise, angles count the other way round: cotangents change sign and, to fall again, order.
+                first, second = (sign * cot[::sign] for sign, cot in zip(signs, falling, strict=True))
+                candidates = pairs
+                if tree is not None:
+                    d_c = np.log(np.concatenate((cross_ratios(first[None]), cross_ratios(second[None])), axis=1))[0]
+                    rows = tree.query_ball_point(d_c + (low + high) / 2.0, (high - low) / 2.0, p=np.inf)
+                    candidates = pairs[np.sort(np.array(rows, np.int64))]
+                found.append(_Correspondence(ends, (first * signs[0], second * signs[1]), candidates))
+        return found
+
+    def test(self, a: int, b: int, key: int) -> None:
+        """Draw candidates for the query tuple (a, b) of type `key` and test them, within the limits."""
+        correspondences = self.correspondences(a, b, key)
+        n_match = sum(len(one.candidates) for one in correspondences)
         k = reference_draws(n_match, self.options.lambda_1)
         tested = 0
-        for correspondence in correspondences:
-            share = min(correspondence.n_match, math.ceil(k * correspondence.n_match / max(n_match, 1)))
-            tested += self._test_correspondence(correspondence, t, share)
+        for one in correspondences:
+            n = len(one.candidates)
+            tested += self._test(one, min(n, math.ceil(k * n / max(n_match, 1))))
         self.n_samples += 1
         self.n_sum += k
         self.candidates += n_match
-        p_fail_reference = 1.0 - tested / n_match if n_match else 0.0
-        p_query = self.options.p_query
-        self.log_p_fail += math.log1p(-p_query * (1.0 - p_fail_reference))
+        self.log_p_fail += math.log1p(-self.options.p_query * (tested / n_match if n_match else 1.0))
 
-    def _test_correspondence(self, correspondence: _Correspondence, t: int, n_draws: int) -> int:
+    def _test(self, one: _Correspondence, n_draws: int) -> int:
         """Test `n_draws` candidates in random order; return how many the limits allowed."""
-        if n_draws == 0:
-            return 0
-        first, second = self.query.xy[list(correspondence.ends)]
-        uv = to_pair_frame(self.query.xy[self.judges], first, second)
-        corners = to_pair_frame(self.frame, first, second)
-        query = kernels.PairQuery(uv, self.codes[self.judges], corners, *correspondence.cotangents)
-        start, stride = _permutation(correspondence.n_match, self.rng)
-        stamps = np.full(len(self.index.codes) if self.options.one_to_one else 0, -1, np.int64)
-        model = np.empty(8)
+        first, second = self.query.xy[one.ends]
+        seen = kernels.PairQuery(
+            to_pair_frame(self.query.xy[self.judges], first, second),
+            self.codes[self.judges],
+            to_pair_frame(self.frame, first, second),
+            *one.cotangents,
+        )
+        model, drawn = np.empty(8), self.rng.permutation(len(one.candidates))[:n_draws]
         # The kernel comes back now and then, for a look at the limits.
-        per_call = max(1, _TESTS_PER_CALL // len(uv))
-        done = 0
+        per_call, done = max(1, _TESTS_PER_CALL // len(seen.uv)), 0
         while done < n_draws and not self.spent:
-            until = min(done + per_call, n_draws)
+            some = one.candidates[drawn[done : done + per_call]]
             best, n_models = kernels.evaluate_pairs(
-                query,
-                self.index.tuples(t),
-                correspondence.rows,
-                np.array([done, until, start, stride]),
-                self.xy,
-                self.tangents,
-                self.buckets,
-                self.options.inlier_distance_m,
-                self.options.tangent_orders == "++",
-                self.best,
-                model,
-                stamps,
-            )
+                seen, some, self.index.reference.xy, self.index.reference.tangents, self.index.buckets,
+                self.options.inlier_distance_m, self.options.tangent_orders == "++", self.options.one_to_one,
+                self.best, model,
+            )  # fmt: skip
             if best > self.best:
-                self.best = best
-                self.homography = pair_homography(model, first, second)
+                self.best, self.homography = best, pair_homography(model, first, second)
             self.hypotheses += n_models
-            self.tested += until - done
-            done = until
+            self.tested += len(some)
+            done += len(some)
         return done
 
     def matches(self, homography: FloatArray) -> IntArray:
         """Return the (M, 2) matching pairs MP under a homography (eq. 10)."""
+        from scipy.spatial import cKDTree
+
+        reference, codes = self.index.reference, self.index.codes
         with np.errstate(divide="ignore", invalid="ignore"):
-            xy = Homography(homography).everywhere(self.query.xy)
-        nearest = np.empty(len(xy), np.int32)
-        kernels.nearest_of_type(xy, self.codes, self.buckets, self.options.inlier_distance_m, nearest)
+            xy = np.nan_to_num(Homography(homography).everywhere(self.query.xy), nan=1e300, posinf=1e300, neginf=1e300)
+        nearest, distance = np.full(len(xy), -1), np.full(len(xy), np.inf)
+        for code in np.unique(self.codes):
+            here, there = np.flatnonzero(self.codes == code), np.flatnonzero(codes == code)
+            if len(there):
+                away, found = cKDTree(reference.xy[there]).query(
+                    xy[here], distance_upper_bound=self.options.inlier_distance_m
+                )
+                near = np.isfinite(away)
+                nearest[here[near]], distance[here[near]] = there[found[near]], away[near]
         found = np.flatnonzero(nearest >= 0)
         if self.options.one_to_one:
-            distance = np.hypot(*(xy[found] - self.xy[nearest[found]]).T)
-            closest_first = found[np.argsort(distance, kind="stable")]
+            closest_first = found[np.argsort(distance[found], kind="stable")]
             found = np.sort(closest_first[np.unique(nearest[closest_first], return_index=True)[1]])
         return np.column_stack([found, nearest[found]])
 
-    def located(self) -> PairMatch:
-        """Refine the best homography on its matches and report it."""
-        assert self.homography is not None  # noqa: S101
-        homography, matches = self._refine(self.homography)
-        ratio = len(matches) / len(self.query)
-        reason = (
-            f"{len(matches)} of {len(self.query)} intersections ({ratio:.0%}) match, after {self.n_samples} "
-            f"query tuples and {self.hypotheses} hypotheses"
-        )
-        facing = Homography(homography).facing(self.frame.mean(axis=0)).matrix
-        facing = facing / (facing[2] @ [*self.frame.mean(axis=0), 1.0])
-        return self._report(facing, matches, ratio, reason, "accepted")
-
-    def _refine(self, homography: FloatArray) -> tuple[FloatArray, IntArray]:
-        """Alternate between the gold-standard fit and matching, as long as that matches more."""
+    def located(self, homography: FloatArray) -> PairMatch:
+        """Refine the best homography on its matches, as long as that matches more, and report it."""
         matches = self.matches(homography)
         for _ in range(5):
-            refined = fit_points(homography, self.query.xy[matches[:, 0]], self.xy[matches[:, 1]])
+            refined = fit_points(homography, self.query.xy[matches[:, 0]], self.index.reference.xy[matches[:, 1]])
             rematched = self.matches(refined)
-            if len(rematched) < len(matches) or not self._is_allowed(refined):
+            w = Homography(refined).w(self.frame)
+            is_allowed = self.options.tangent_orders == "all" or bool(np.all(w * w[0] > 0))
+            if len(rematched) < len(matches) or not is_allowed:
                 break
             is_stable = np.array_equal(rematched, matches)
             homography, matches = refined, rematched
             if is_stable:
                 break
-        return homography, matches
-
-    def _is_allowed(self, homography: FloatArray) -> bool:
-        """Say whether the horizon stays out of the frame, where that is asked for."""
-        w = self.frame @ homography[2, :2] + homography[2, 2]
-        return self.options.tangent_orders == "all" or bool(np.all(w * w[0] > 0))
+        ratio, middle = len(matches) / len(self.query), self.frame.mean(axis=0)
+        reason = (
+            f"{len(matches)} of {len(self.query)} intersections ({ratio:.0%}) match, after {self.n_samples} "
+            f"query tuples and {self.hypotheses} hypotheses"
+        )
+        return self._report(homography / Homography(homography).w(middle), matches, reason, "accepted")
 
     def cut_short(self, limit: str) -> PairMatch:
         """Report that no place was found before a limit was reached."""
@@ -341,89 +321,48 @@ class _Search:
 
     def not_located(self, reason: str, stopped: str = "") -> PairMatch:
         """Report that no place was found."""
-        return self._report(None, np.empty((0, 2), np.int64), 0.0, reason, stopped)
+        return self._report(None, np.empty((0, 2), np.int64), reason, stopped)
 
-    def _report(
-        self, homography: FloatArray | None, matches: IntArray, ratio: float, reason: str, stopped: str
-    ) -> PairMatch:
-        return PairMatch(
-            homography,
-            matches,
-            ratio,
-            self.n_samples,
-            self.n_sum,
-            self.candidates,
-            self.hypotheses,
-            self.confidence,
-            reason,
-            stopped,
-            self.work_s,
-            time.perf_counter() - self.begin,
-        )
+    def _report(self, homography: FloatArray | None, matches: IntArray, reason: str, stopped: str) -> PairMatch:
+        ratio, seconds = len(matches) / max(len(self.query), 1), time.perf_counter() - self.begin
+        counts = self.n_samples, self.n_sum, self.candidates, self.hypotheses, self.confidence
+        return PairMatch(homography, matches, ratio, *counts, reason, stopped, self.work_s, seconds)
 
 
-def _draw_query_tuples(search: _Search) -> tuple[Int32Array, IntArray]:
-    """Draw l query tuples, those of types rare in the reference first, at random within a type.
+# --- homographies -----------------------------------------------------------------------------------------------------
 
-    Returns
-    -------
-    tuples : (l, 2) int32
-    types : (l,) int64
-        Of the reference's types.
+
+def to_pair_frame(xy: FloatArray, first: FloatArray, second: FloatArray) -> FloatArray:
+    """Take (N, 2) points to the frame where `first` is (0, 0) and `second` is (1, 0), turned and scaled alike."""
+    dx, dy = (second - first) / np.sum((second - first) ** 2)
+    return np.asarray((xy - first) @ np.array([[dx, -dy], [dy, dx]]))
+
+
+def pair_homography(model: FloatArray, first: FloatArray, second: FloatArray) -> FloatArray:
+    """Return the (3, 3) homography of a hypothesis (see `kernels.pairs.evaluate_pairs`) on the query plane."""
+    alpha_1, beta_1, alpha_2, beta_2, x, y, dx, dy = model
+    from_pair_frame = np.array([[dx, -dy, x], [dy, dx, y], [0.0, 0.0, 1.0]])
+    in_pair_frame = np.array([[alpha_1, beta_1, 0.0], [0.0, 1.0, 0.0], [alpha_1 - alpha_2, beta_1 - beta_2, alpha_2]])
+    (ex, ey), (x, y) = (second - first) / np.sum((second - first) ** 2), first
+    into_pair_frame = np.array([[ex, ey, -ex * x - ey * y], [-ey, ex, ey * x - ex * y], [0.0, 0.0, 1.0]])
+    return np.asarray(from_pair_frame @ in_pair_frame @ into_pair_frame)
+
+
+def fit_points(homography: FloatArray, query_xy: FloatArray, reference_xy: FloatArray) -> FloatArray:
+    """Minimise the squared distances |H x - x'| over all pairs of points, from a given homography.
+
+    Gold standard for errors in the reference plane only (Hartley & Zisserman, section 4.2). Returns the given
+    homography where the points cannot carry eight parameters.
     """
-    options, rng = search.options, search.rng
-    chosen = np.arange(len(search.query))
-    if len(chosen) > options.max_tuple_intersections:
-        chosen = rng.choice(chosen, options.max_tuple_intersections, replace=False)
-    d_max = np.inf if options.d_max_px is None else options.d_max_px
-    pairs = list_pairs(search.query, search.codes, d_max, options, chosen)
-    types = type_table(search.index.types)[type_keys(search.codes, pairs)]
-    known = rng.permutation(np.flatnonzero(types >= 0))
-    frequency = np.diff(search.index.offsets)[types[known]]
-    n = query_draws(options.lambda_, options.lambda_1, options.p_query)
-    drawn = (known[np.argsort(frequency, kind="stable")] if options.rarest_first else known)[:n]
-    return pairs[drawn], types[drawn]
+    from scipy.optimize import least_squares
 
+    if len(query_xy) < 4:
+        return homography
+    middle, spread = query_xy.mean(axis=0), float(query_xy.std()) or 1.0
+    p, origin, unit = normalise(homography, middle, spread)
+    uv, places = (query_xy - middle) / spread, (reference_xy - origin) / unit
 
-def _correspondences(
-    query: Intersections, a: int, b: int, t: int, index: PairIndex, options: PairOptions
-) -> list[_Correspondence]:
-    """Find the candidates of the query tuple (a, b) by the matching rules (section 3.2, eq. 6)."""
-    branches_1, branches_2, tangents_1, tangents_2 = index.types[t].tolist()
-    is_symmetric = (branches_1, tangents_1) == (branches_2, tangents_2)
-    subsets, n_first = line_subsets(tangents_1, tangents_2)
-    tree = index.tree(t)
-    found = []
-    for ends in [(a, b), (b, a)] if is_symmetric else [(a, b)]:
-        dx, dy = query.xy[ends[1]] - query.xy[ends[0]]
-        falling = [_cotangents(query.tangents[i], math.atan2(dy, dx)) for i in ends]
-        for signs in [(1, 1)] if options.tangent_orders == "++" else [(1, 1), (1, -1), (-1, 1), (-1, -1)]:
-            # Clockwise, angles count the other way round: cotangents change sign and, to fall again, order.
-            first, second = (sign * cot[::sign] for sign, cot in zip(signs, falling, strict=True))
-            rows = np.empty(0, np.int32)
-            n_match = len(tree)
-            if len(subsets):
-                d_c = np.empty(len(subsets))
-                kernels.cross_ratios(first, subsets[:n_first], d_c[:n_first])
-                kernels.cross_ratios(second, subsets[n_first:], d_c[n_first:])
-                rows = np.empty(len(tree), np.int32)
-                error = options.delta_cross_ratio * d_c
-                n_match = kernels.search_tree(tree, d_c - error, d_c + error, rows)
-                rows = rows[:n_match]
-            cotangents = (first * signs[0], second * signs[1])
-            found.append(_Correspondence(ends, cotangents, rows, n_match))
-    return found
+    def off(p: FloatArray) -> FloatArray:
+        return np.asarray((Homography(np.append(p, 1.0).reshape(3, 3)).everywhere(uv) - places).ravel())
 
-
-def _cotangents(tangents: Float32Array, phi: float) -> FloatArray:
-    """Return the (N_q,) cotangents of an intersection's tangents relative to a line of direction `phi`, falling."""
-    finite = tangents[np.isfinite(tangents)].astype(np.float64)
-    return np.sort(1.0 / np.tan(finite - phi))[::-1]
-
-
-def _permutation(n: int, rng: np.random.Generator) -> tuple[int, int]:
-    """Return start and stride of a pseudo-random walk j -> (start + j stride) mod n that meets all of 0..n-1 once."""
-    stride = int(rng.integers(1, n)) if n > 1 else 1
-    while math.gcd(stride, n) != 1:
-        stride = stride % n + 1
-    return int(rng.integers(n)), stride
+    return denormalise(least_squares(off, p, method="lm", xtol=1e-12, ftol=1e-12).x, middle, spread, origin, unit)

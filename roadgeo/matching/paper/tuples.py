@@ -1,35 +1,38 @@
-"""The paper's tuples of two intersections, hashed by type, with their cross ratios in search trees (section 3.3)."""
+"""The paper's tuples of two intersections, hashed by type, with their cross ratios in search trees (section 3.3).
+
+At each end of a tuple every tangent has an angle in (0, pi), counterclockwise from the connecting line; its cotangent
+falls as the angle grows, so "in one rotational sense, starting from the line" is "falling cotangents". Cross ratios of
+lines in that order are greater than 1, so that a relative error (eq. 6) makes sense; trees hold their logarithms.
+"""
 
 from __future__ import annotations
 
 import math
+from collections.abc import Mapping
 from dataclasses import dataclass
 from functools import cache
 from itertools import combinations
-from typing import Literal
+from typing import Any, Literal, NamedTuple
 
 import numpy as np
 
-from roadgeo._arrays import AnyArray, Float32Array, FloatArray, Int32Array, IntArray
+from roadgeo._arrays import BoolArray, FloatArray, IntArray
 from roadgeo.errors import IndexFormatError
-from roadgeo.kernels import pairs as kernels
+from roadgeo.kernels.pairs import PairBuckets
+from roadgeo.kernels.residuals import road_residuals
+from roadgeo.matching.index import ReferenceIndex, neighbour_grid, sort_by_bucket
 from roadgeo.roads.intersections import Intersections
 
-__all__ = [
-    "PairIndex",
-    "PairOptions",
-    "build_pair_index",
-    "fixed",
-    "line_subsets",
-    "list_pairs",
-    "type_codes",
-    "type_keys",
-    "type_table",
-]
+__all__ = ["PairIndex", "PairOptions", "Tuples", "build_pair_index", "cotangents", "cross_ratios", "well_fitted"]
 
-
-#: A dense city of 15,000 intersections has some millions; each takes about 50 bytes while the tables are built.
-_MAX_TUPLES = 50_000_000
+#: A dense city of 15,000 intersections has some millions; each takes about 100 bytes while the tables are built.
+_MAX_TUPLES = 30_000_000
+#: The buckets of intersections are not smaller, metres.
+_LEAST_BUCKET_M = 10.0
+#: Section 4.2 asks for 15 pixels, of 1 m, of every branch, and an average distance of half a pixel from the tangent.
+#: Branches begin `_SKIP_M` from the intersection (see `IntersectionOptions`), and are looked at in such steps; roads
+#: further off, or turned from the branch by more, are others.
+_LENGTH_M, _MAX_ERROR_M, _SKIP_M, _STEP_M, _REACH_M, _MIN_COS = 15.0, 0.5, 8.0, 3.0, 6.0, math.cos(math.radians(25.0))
 
 
 @dataclass(frozen=True)
@@ -40,8 +43,6 @@ class PairOptions:
     ----------
     d_max_m : float
         Greatest distance between the two intersections of a reference tuple (eq. 8).
-    d_max_px : float or None
-        The same on the query, where its ground sampling is known. None: any two of its intersections form a tuple.
     min_line_angle_deg : float
         Least angle between a tangent and the connecting line (eq. 7).
     delta_cross_ratio : float
@@ -65,9 +66,6 @@ class PairOptions:
         Draw query tuples of types rare in the reference first (section 3.3). False: all types alike.
     max_tuple_intersections : int
         Of larger queries, this many intersections at random form the tuples; all of them still judge.
-    discard_poor : bool
-        Leave out intersections of the reference whose branches are too short or fit their tangents badly, as section
-        4.2 does (see `quality.well_fitted`).
     work_limit_s : float
         The search stops after so much work: seconds of a usual machine, counted, not measured.
     time_limit_s : float
@@ -75,7 +73,6 @@ class PairOptions:
     """
 
     d_max_m: float = 1000.0
-    d_max_px: float | None = None
     min_line_angle_deg: float = 15.0
     delta_cross_ratio: float = 0.3
     tangent_orders: Literal["++", "all"] = "++"
@@ -88,65 +85,39 @@ class PairOptions:
     min_intersections: int = 30
     rarest_first: bool = True
     max_tuple_intersections: int = 1000
-    discard_poor: bool = True
     work_limit_s: float = 10.0
     time_limit_s: float = 60.0
 
 
-@dataclass(frozen=True)
+class Tuples(NamedTuple):
+    """Tuples of one type: (P, 2) intersections, and a `scipy` tree of their D cross ratios, None where D = 0."""
+
+    pairs: IntArray
+    tree: Any
+
+
+@dataclass(frozen=True, eq=False)
 class PairIndex:
     """Reference tuples hashed by type, with one search tree of cross ratios for each type.
 
-    Dimensions: N intersections, T tuple types, P tuples, C buckets.
-
     Attributes
     ----------
-    types : (T, 4) uint8
-        Branch descriptors d_b = [N_B(P1), N_B(P2), N_q(P1), N_q(P2)], ascending by (N_B, N_q) of the first end, then
-        of the second; the first end is never the greater.
-    offsets : (T + 1,) int64
-        Type t owns `pairs[offsets[t]:offsets[t + 1]]`.
-    pairs : (P, 2) int32
-        The intersections of each tuple; within a type in the order of an implicit k-d tree
-        (`kernels.pairs.order_tree`).
-    descriptors : float32
-        Cross ratios d_c of all tuples, one row for each, type after type (eq. 4).
-    codes : (N,) uint8
+    reference : Intersections
+    codes : (N,) int64
         Types of the intersections, 16 N_B + N_q.
-    grid : (3,) float64
-        Buckets of the intersections: x and y of the lower left corner, side of a cell; metres.
-    shape : (2,) int64
-        Rows and columns of buckets.
-    starts : (C + 1,) int32
-        Bucket c, row by row, owns `items[starts[c]:starts[c + 1]]`.
-    items : (N,) int32
-        Intersections.
+    tuples : mapping of int to Tuples
+        By type, 256 times the code of the first end and that of the second; the first is never the greater.
+    buckets : PairBuckets
     """
 
-    types: AnyArray
-    offsets: IntArray
-    pairs: Int32Array
-    descriptors: Float32Array
-    codes: AnyArray
-    grid: FloatArray
-    shape: IntArray
-    starts: Int32Array
-    items: Int32Array
+    reference: Intersections
+    codes: IntArray
+    tuples: Mapping[int, Tuples]
+    buckets: PairBuckets
 
     def __len__(self) -> int:
-        """P."""
-        return len(self.pairs)
-
-    def tuples(self, t: int) -> Int32Array:
-        """Tuples of type `t`, (P_t, 2), a view."""
-        return self.pairs[self.offsets[t] : self.offsets[t + 1]]
-
-    def tree(self, t: int) -> Float32Array:
-        """Descriptors of type `t`, (P_t, D_t), a view; D_t = 0 where both ends have two tangents."""
-        widths = _descriptor_widths(self.types)
-        begin = int(np.dot(np.diff(self.offsets[: t + 1]), widths[:t]))
-        n = int(self.offsets[t + 1] - self.offsets[t])
-        return self.descriptors[begin : begin + n * widths[t]].reshape(n, widths[t])
+        """Return the number of all tuples."""
+        return sum(len(one.pairs) for one in self.tuples.values())
 
 
 def build_pair_index(intersections: Intersections, options: PairOptions | None = None) -> PairIndex:
@@ -164,132 +135,109 @@ def build_pair_index(intersections: Intersections, options: PairOptions | None =
     IndexFormatError
         More intersections lie close to each other than on any map.
     """
-    options = options or PairOptions()
-    _require_few(intersections.xy, options.d_max_m)
-    codes = type_codes(intersections)
-    pairs = list_pairs(intersections, codes, options.d_max_m, options)
-    # tuples of one type side by side
-    keys = type_keys(codes, pairs)
-    order = np.argsort(keys, kind="stable")
-    found, sizes = np.unique(keys, return_counts=True)
-    types = types_of_keys(found)
-    offsets = np.concatenate(([0], np.cumsum(sizes, dtype=np.int64)))
-    xy, tangents = fixed(intersections.xy, np.float64), fixed(intersections.tangents, np.float32)
-    sorted_pairs, trees = [], []
-    for t, d_b in enumerate(types.tolist()):
-        of_type = pairs[order[offsets[t] : offsets[t + 1]]]
-        subsets, n_first = line_subsets(d_b[2], d_b[3])
-        # of each type a tree over the cross ratios of its lines
-        tree = np.empty((len(of_type), len(subsets)), np.float32)
-        if len(subsets):
-            kernels.describe_pairs(of_type, xy, tangents, fixed(codes, np.uint8), subsets, n_first, tree)
-            in_tree = np.arange(len(of_type), dtype=np.int32)
-            kernels.order_tree(tree, in_tree)
-            of_type, tree = of_type[in_tree], tree[in_tree]
-        sorted_pairs.append(of_type)
-        trees.append(tree.ravel())
-    grid, shape, starts, items = _bucket(intersections.xy)
-    return PairIndex(
-        types=fixed(types, np.uint8),
-        offsets=fixed(offsets, np.int64),
-        pairs=fixed(np.concatenate([np.empty((0, 2), np.int32), *sorted_pairs]), np.int32),
-        descriptors=fixed(np.concatenate([np.empty(0, np.float32), *trees]), np.float32),
-        codes=fixed(codes, np.uint8),
-        grid=fixed(grid, np.float64),
-        shape=fixed(shape, np.int64),
-        starts=fixed(starts, np.int32),
-        items=fixed(items, np.int32),
-    )
-
-
-def _require_few(xy: FloatArray, d_max_m: float) -> None:
-    """Refuse a map whose tuples would fill the memory, before they are listed."""
     from scipy.spatial import cKDTree
 
-    if len(xy) ** 2 <= _MAX_TUPLES:
-        return
-    tree = cKDTree(xy)
-    count = (int(tree.count_neighbors(tree, d_max_m)) - len(xy)) // 2
-    if count > _MAX_TUPLES:
-        raise IndexFormatError(
-            f"the map has {count:,} pairs of intersections nearer than {d_max_m:g} m, expected at most {_MAX_TUPLES:,};"
-            " the paper's method does not fit it: use the usual one"
-        )
+    options, xy = options or PairOptions(), intersections.xy
+    codes = type_codes(intersections)
+    pairs = list_pairs(intersections, np.arange(len(xy)), options.d_max_m, options)
+    keys = type_keys(codes, pairs)
+    order = np.argsort(keys, kind="stable")
+    tuples = {}
+    for of_type in np.split(pairs[order], np.flatnonzero(np.diff(keys[order])) + 1) if len(pairs) else []:
+        ratios = [
+            cross_ratios(cotangents(intersections, of_type[:, end], *(xy[of_type[:, 1]] - xy[of_type[:, 0]]).T))
+            for end in (0, 1)
+        ]
+        logs = np.log(np.concatenate(ratios, axis=1))
+        tree = cKDTree(logs, balanced_tree=False, compact_nodes=False) if logs.shape[1] else None
+        tuples[int(type_keys(codes, of_type[:1])[0])] = Tuples(of_type, tree)
+    grid, shape = neighbour_grid(xy, _LEAST_BUCKET_M) if len(xy) else ((0.0, 0.0, 1.0), (1, 1))
+    items, starts = sort_by_bucket(xy, grid, shape)
+    return PairIndex(intersections, codes, tuples, PairBuckets(xy[items], codes[items], starts, grid, shape))
 
 
-def type_codes(intersections: Intersections) -> AnyArray:
-    """Return the (N,) uint8 types of intersections, 16 N_B + N_q."""
-    return (16 * intersections.n_branches + intersections.n_tangents).astype(np.uint8)
+def list_pairs(found: Intersections, chosen: IntArray, d_max: float, options: PairOptions) -> IntArray:
+    """Return the (P, 2) tuples of (chosen) intersections that pass eq. 7-8, the end of lesser code first.
+
+    Raises
+    ------
+    IndexFormatError
+        They would fill the memory.
+    """
+    from scipy.spatial import cKDTree
+
+    tree = cKDTree(found.xy[chosen])
+    if len(chosen) ** 2 > _MAX_TUPLES:
+        count = (int(tree.count_neighbors(tree, d_max)) - len(chosen)) // 2
+        if count > _MAX_TUPLES:
+            raise IndexFormatError(
+                f"the map has {count:,} pairs of intersections nearer than {d_max:g} m, expected at most"
+                f" {_MAX_TUPLES:,}; the paper's method does not fit it: use the usual one"
+            )
+    pairs = chosen[tree.query_pairs(d_max, output_type="ndarray").reshape(-1, 2)]
+    dx, dy = (found.xy[pairs[:, 1]] - found.xy[pairs[:, 0]]).T
+    phi, least = np.arctan2(dy, dx), math.sin(math.radians(options.min_line_angle_deg))
+    passes = (dx != 0.0) | (dy != 0.0)
+    for end in (0, 1):
+        passes &= found.n_tangents[pairs[:, end]] >= 2  # fewer cannot carry a homography (eq. 9)
+        for column in range(found.tangents.shape[1]):
+            passes &= ~(np.abs(np.sin(found.tangents[pairs[:, end], column] - phi)) <= least)  # NaN: there is none
+    pairs, codes = np.sort(pairs[passes], axis=1), type_codes(found)
+    swapped = codes[pairs[:, 0]] > codes[pairs[:, 1]]
+    pairs[swapped] = pairs[swapped, ::-1]
+    return np.asarray(pairs)
 
 
-def type_keys(codes: AnyArray, pairs: Int32Array) -> AnyArray:
-    """Return the (P,) uint16 hash keys of tuples: the codes of both ends."""
-    ends = codes[pairs].astype(np.uint16)
-    return ends[:, 0] * np.uint16(256) + ends[:, 1]
+def type_codes(intersections: Intersections) -> IntArray:
+    """Return the (N,) types of intersections, 16 N_B + N_q."""
+    return (16 * intersections.n_branches + intersections.n_tangents).astype(np.int64)
 
 
-def types_of_keys(keys: AnyArray) -> AnyArray:
-    """Return the (T, 4) branch descriptors d_b of hash keys."""
-    first, second = keys >> 8, keys & 255
-    return np.column_stack([first >> 4, second >> 4, first & 15, second & 15]).astype(np.uint8)
+def type_keys(codes: IntArray, pairs: IntArray) -> IntArray:
+    """Return the (P,) types of tuples (see `PairIndex.tuples`)."""
+    return np.asarray(256 * codes[pairs[:, 0]] + codes[pairs[:, 1]])
 
 
-def type_table(types: AnyArray) -> IntArray:
-    """Return the (65536,) hash table from keys to types, -1 where the reference has none."""
-    d_b = types.astype(np.int64)
-    table = np.full(1 << 16, -1, np.int64)
-    table[(16 * d_b[:, 0] + d_b[:, 2]) * 256 + 16 * d_b[:, 1] + d_b[:, 3]] = np.arange(len(types))
-    return table
+def cotangents(found: Intersections, ends: IntArray, dx: FloatArray, dy: FloatArray) -> FloatArray:
+    """Return the (P, N_q) cotangents, falling, of the tangents of `ends` (P,), all of one N_q, relative to lines."""
+    tangents = found.tangents[ends, : int(found.n_tangents[ends[0]])].astype(float)
+    return np.asarray(-np.sort(-1.0 / np.tan(tangents - np.arctan2(dy, dx)[:, None]), axis=1))
+
+
+def cross_ratios(cot: FloatArray) -> FloatArray:
+    """Return (P, D) cross ratios (a, b; c, d) = sin(ac) sin(bd) / (sin(bc) sin(ad)) of fours of lines (eq. 4).
+
+    They are concurrent: the tangents and the connecting line, whose cotangent is infinite, so that two factors cancel.
+    """
+    by_line, others = _fours(cot.shape[1])
+    b, c, d = cot[:, by_line].transpose(2, 0, 1)
+    first = (b - d) / (b - c)
+    a, b, c, d = cot[:, others].transpose(2, 0, 1)
+    return np.concatenate((first, (a - c) * (b - d) / ((b - c) * (a - d))), axis=1)
 
 
 @cache
-def line_subsets(n_first: int, n_second: int) -> tuple[AnyArray, int]:
-    """Return the (D, 4) lines of each cross ratio for two N_q (eq. 4), and how many rows are the first end's."""
-    groups = [list(combinations(range(n + 1), 4)) for n in (n_first, n_second)]
-    subsets = np.array([*groups[0], *groups[1]], np.uint8).reshape(-1, 4)
-    return subsets, len(groups[0])
+def _fours(n: int) -> tuple[IntArray, IntArray]:
+    """Return threes of n tangents, which make fours with the connecting line, and fours of them."""
+    three, four = (np.array(list(combinations(range(n), k)), np.int64).reshape(-1, k) for k in (3, 4))
+    return three, four
 
 
-def _descriptor_widths(types: AnyArray) -> IntArray:
-    """Return the (T,) dimensions D_t of the cross-ratio descriptors."""
-    return np.array([math.comb(n + 1, 4) + math.comb(m + 1, 4) for _, _, n, m in types.tolist()], np.int64)
-
-
-def list_pairs(
-    intersections: Intersections, codes: AnyArray, d_max: float, options: PairOptions, chosen: IntArray | None = None
-) -> Int32Array:
-    """Return the (P, 2) tuples of (chosen) intersections that pass eq. 7-8, canonical end first."""
-    xy = fixed(intersections.xy, np.float64)
-    tangents = intersections.tangents.astype(np.float64)
-    directions = np.stack([np.cos(tangents), np.sin(tangents)], axis=-1)
-    chosen = np.arange(len(xy)) if chosen is None else chosen
-    by_x = chosen[np.argsort(xy[chosen, 0], kind="stable")].astype(np.int64)
-    arguments = (xy, directions, codes, by_x, float(d_max), math.sin(math.radians(options.min_line_angle_deg)))
-    pairs = np.empty((kernels.list_pairs(*arguments, np.empty((0, 2), np.int32)), 2), np.int32)
-    kernels.list_pairs(*arguments, pairs)
-    return pairs
-
-
-def _bucket(xy: FloatArray) -> tuple[FloatArray, IntArray, Int32Array, Int32Array]:
-    """Sort intersections into square buckets, about sixteen for each: `grid`, `shape`, `starts`, `items`."""
-    if len(xy) == 0:
-        return np.array([0.0, 0.0, 1.0]), np.array([1, 1]), np.zeros(2, np.int32), np.empty(0, np.int32)
-    low, extent = xy.min(axis=0), np.ptp(xy, axis=0)
-    cell = max(math.sqrt(extent[0] * extent[1] / (16 * len(xy))), float(extent.max()) / (16 * len(xy)), 1.0)
-    n_cols, n_rows = (extent // cell).astype(np.int64) + 1
-    cols, rows = ((xy - low) // cell).astype(np.int64).T
-    buckets = rows * n_cols + cols
-    starts = np.searchsorted(np.sort(buckets), np.arange(n_rows * n_cols + 1))
-    return (
-        np.array([low[0], low[1], cell]),
-        np.array([n_rows, n_cols]),
-        starts.astype(np.int32),
-        np.argsort(buckets, kind="stable").astype(np.int32),
-    )
-
-
-def fixed(array: AnyArray, dtype: type) -> AnyArray:
-    """Return a contiguous read-only array, so that built, given and memory-mapped arrays share one compiled kernel."""
-    fixed = np.ascontiguousarray(array, dtype).view(np.ndarray)
-    fixed.setflags(write=False)
-    return fixed
+def well_fitted(index: ReferenceIndex) -> BoolArray:
+    """Tell which intersections (N,) have branches that are all long and straight enough (section 4.2)."""
+    vectors = index.branches.astype(float) / 127.0
+    at, column = np.nonzero(vectors.any(axis=2))
+    ahead = vectors[at, column]
+    ahead /= np.linalg.norm(ahead, axis=1, keepdims=True)
+    steps = _SKIP_M + np.arange(0.0, _LENGTH_M + 1e-9, _STEP_M)
+    points = (index.xy[at, None] + steps[:, None] * ahead[:, None]).reshape(-1, 2)
+    along, out = np.repeat(ahead, len(steps), axis=0), np.empty((len(points), 3))
+    road_residuals(points, along, np.full(len(points), _REACH_M), _MIN_COS, index.road_buckets, out)
+    across = np.column_stack([-along[:, 1], along[:, 0]])
+    offsets = (out[:, 0] * (out[:, 1:] * across).sum(axis=1)).reshape(-1, len(steps))
+    # What is left beside the line fitted to a branch, which need not meet the intersection; NaN: it is too short.
+    basis = np.linalg.qr(np.column_stack([np.ones(len(steps)), steps]))[0]
+    error = np.abs(offsets - offsets @ basis @ basis.T).mean(axis=1)
+    good = np.ones(len(index), bool)
+    good[at[~(error <= _MAX_ERROR_M)]] = False
+    return good
