@@ -336,11 +336,14 @@ class Service:
         return HTMLResponse(page_text("index.html"), headers={"Content-Security-Policy": self._policy, **_AS_IT_IS})
 
     async def _page(self, request: Request) -> Response:
-        path = page_file(request.path_params["name"])
+        name = request.path_params["name"]
+        path = page_file(name)
         if path is None:
             raise Refused(404, "there is nothing of that name; begin at /")
-        kind = {".mjs": "text/javascript", ".js": "text/javascript"}.get(path.suffix)
-        return FileResponse(path, media_type=kind, headers={"Content-Security-Policy": self._policy, **_AS_IT_IS})
+        kind = {".css": "text/css", ".html": "text/html"}.get(Path(name).suffix, "text/javascript")
+        packed = {"Content-Encoding": "gzip"} if path.suffix == ".gz" else {}
+        headers = {"Content-Security-Policy": self._policy, **_AS_IT_IS, **packed}
+        return FileResponse(path, media_type=kind, headers=headers)
 
     async def _open_session(self, request: Request) -> Response:
         """Give a browser a pass for the token that its user typed, once."""

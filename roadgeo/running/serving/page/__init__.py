@@ -16,11 +16,12 @@ _KINDS = (".html", ".css", ".js", ".mjs")
 
 @cache
 def _files() -> dict[str, Path]:
-    return {path.name: path for folder in _FOLDERS for path in folder.iterdir() if path.suffix in _KINDS}
+    paths = {path.name.removesuffix(".gz"): path for folder in _FOLDERS for path in folder.iterdir()}
+    return {name: path for name, path in paths.items() if name.endswith(_KINDS)}
 
 
 def page_file(name: str) -> Path | None:
-    """Return a file of the page by its name; None where there is none."""
+    """Return a file of the page by its name, compressed if its own name ends in `.gz`; None where there is none."""
     return _files().get(name)
 
 
