@@ -1,6 +1,6 @@
 """Flights whose way is known: overlapping frames of one camera, as road masks, and how each follows from the last.
 
-Frames are views of a road map with what goes wrong in real masks (`noise`). Some roads are hidden in all frames of a
+Frames are views of a road map with the faults of real masks (`noise`). Some roads are hidden in all frames of a
 flight, as trees hide them; others are missed in one frame and seen in the next. All is drawn from seeds, flight by
 flight.
 """
@@ -29,7 +29,7 @@ __all__ = ["FLIGHT_NOISE", "Flight", "FlightOptions", "simulate_flight"]
 #: Draws of a flight before it is given up.
 MAX_TRIES = 3000
 
-#: What is wrong in one frame; what is wrong in all of them is `FlightOptions.hidden`.
+#: Faults of one frame; `FlightOptions.hidden` holds those of all frames.
 FLIGHT_NOISE = NoiseModel(
     missing=(0.10, 0.15),
     false_roads=(0.02, 0.06),
@@ -62,7 +62,7 @@ class FlightOptions:
     intersections : (int, int)
         Nine of ten frames show as many intersections as this.
     hidden : range
-        Share of the streets that all frames miss; what each misses besides is in `noise`.
+        Share of the streets that all frames miss; `noise` adds those that a single frame misses.
     motion_px : float
         Error of the given motion: standard deviation of a corner's place in the frame before.
     """
@@ -91,7 +91,7 @@ class Flight:
     views : tuple of View
         Where each was taken, on the landscape's plane.
     motion : (K, 3, 3) float64
-        What is known of the motion: pixel of a frame to pixel of the frame before; the identity for the first.
+        Measured motion: pixel of a frame to pixel of the frame before; the identity for the first.
     """
 
     landscape: Landscape
@@ -176,7 +176,7 @@ def _draw_views(landscape: Landscape, options: FlightOptions, rng: np.random.Gen
 
 
 def _motion(views: tuple[View, ...], error_px: float, rng: np.random.Generator) -> FloatArray:
-    """Return what a measurement of the motion gives, (K, 3, 3): each corner of a frame is placed with an error."""
+    """Return a measurement of the motion, (K, 3, 3): each corner of a frame is placed with an error."""
     motion = [np.eye(3)]
     for before, view in pairwise(views):
         corners = Frame(*view.size_px).corners

@@ -1,9 +1,9 @@
 """Where on a map would masks be located? A map of the odds, learnt from masks tried at random places of it.
 
-What decides is how many intersections a mask shows, how many of them stand clear of others (those of interchanges melt
-into one another), how much their streets differ in direction (a lattice has few directions and looks alike everywhere),
-and how well this reference, this camera and this quality of masks go together. All but the last is known at every place
-of the map; how it decides is fitted to the trials by logistic regression.
+The odds depend on how many intersections a mask shows, how many of them stand clear of others (those of interchanges
+merge), how much their streets differ in direction (a lattice has few directions and looks alike everywhere), and how
+well this reference, this camera and this quality of masks go together. All but the last is known at every place of the
+map; the weights are fitted to the trials by logistic regression.
 """
 
 from __future__ import annotations
@@ -83,7 +83,7 @@ class LocalizabilityOptions:
 
 @dataclass(frozen=True)
 class PlaceGrid:
-    """Places of a map and what is known of them without trying. Dimensions: R rows from north, C columns from west.
+    """Places of a map and their properties. Dimensions: R rows from north, C columns from west.
 
     Attributes
     ----------
@@ -118,7 +118,7 @@ class PlaceGrid:
 
 @dataclass(frozen=True)
 class LocalizabilityMap:
-    """What masks centred in the cells of a grid (R, C) would come to.
+    """Expected results of masks centred in the cells of a grid (R, C).
 
     Attributes
     ----------
@@ -145,7 +145,7 @@ class LocalizabilityMap:
 
 
 def lay_grid(network: RoadNetwork, footprint_m2: float, options: LocalizabilityOptions | None = None) -> PlaceGrid:
-    """Describe every place of a map for masks that show so much ground."""
+    """Describe every place of a map for masks of this area on the ground."""
     options = options or LocalizabilityOptions()
     coords = network.graph.coords
     (west, south), (east, north) = coords.min(axis=0), coords.max(axis=0)
@@ -159,7 +159,7 @@ def lay_grid(network: RoadNetwork, footprint_m2: float, options: LocalizabilityO
 def map_localizability(
     grid: PlaceGrid, places: FloatArray, located: BoolArray, options: LocalizabilityOptions | None = None
 ) -> LocalizabilityMap:
-    """Learn from trials where masks are located, and tell it for the whole map.
+    """Learn from trials where masks are located, and predict it for the whole map.
 
     Parameters
     ----------

@@ -1,4 +1,4 @@
-"""Drawing the mask of a view, and what goes wrong in real masks."""
+"""Drawing the mask of a view with the faults of real masks."""
 
 from __future__ import annotations
 
@@ -19,7 +19,7 @@ Range = tuple[float, float]
 
 @dataclass(frozen=True)
 class NoiseModel:
-    """What is wrong with a mask. A range (low, high) is drawn from anew for each query; shares are of the road length.
+    """Faults of a mask. A range (low, high) is drawn from anew for each query; shares are of the road length.
 
     Attributes
     ----------
@@ -88,7 +88,7 @@ def draw_mask(
     rng: np.random.Generator,
     in_pixels: bool = False,
 ) -> tuple[AnyArray, dict[str, Any]]:
-    """Draw what a camera sees, and what a segmenter makes of it.
+    """Draw the view of a camera as a segmenter would return it.
 
     Parameters
     ----------
@@ -128,7 +128,7 @@ def draw_mask(
 
 @dataclass(frozen=True)
 class _Canvas:
-    """A mask in the making, (H, W) uint8, and what its drawing needs."""
+    """A mask in the making, (H, W) uint8, and the inputs of its drawing."""
 
     mask: AnyArray
     view: View
@@ -226,7 +226,7 @@ def _draw_false_roads(canvas: _Canvas, wanted_px: float) -> float:
 
 
 def _draw_patches(canvas: _Canvas, noise: NoiseModel) -> None:
-    """Draw false blobs near the roads, holes in them, and what hides them altogether."""
+    """Draw false blobs near the roads, holes in them, and regions that hide them altogether."""
     rng = canvas.rng
 
     def ellipses(per_megapixel: Range, radius_px: Range, on_road: float, spread_px: float, value: int) -> None:

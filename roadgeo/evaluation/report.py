@@ -191,7 +191,7 @@ _WIDTH, _HEIGHT, _LEFT, _RIGHT, _TOP, _BOTTOM = 460, 300, 52, 12, 24, 46
 
 @dataclass(frozen=True)
 class _Plane:
-    """A chart's frame: its ranges, and the SVG made so far is put between `open` and `close`."""
+    """A chart's frame: its ranges; the SVG drawn before is put between `open` and `close`."""
 
     x: tuple[float, float]
     y: tuple[float, float]

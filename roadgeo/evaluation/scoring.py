@@ -1,4 +1,4 @@
-"""Scoring: were masks located where they lie, and do reported odds and standard deviations mean what they say.
+"""Scoring: whether masks were located where they lie, and whether reported odds and standard deviations are calibrated.
 
 A mask counts as right when it was reported "located" and the middle of its frame lies within a radius of the truth.
 precision = right / located, recall = right / masks that have a place on the map. A mask that has none counts against
@@ -38,7 +38,7 @@ __all__ = [
     "summarize",
 ]
 
-#: Right is what lies within this many metres of the truth, if nothing else is said.
+#: Distance from the truth within which a location is right by default, metres.
 RADIUS_M = 20.0
 
 #: Property of a query: lower bounds of the classes that tables are broken down by.
@@ -269,7 +269,7 @@ def calibrate_odds(
 
 @dataclass(frozen=True)
 class Calibration:
-    """Errors of corners in units of what was claimed: error / sigma, sigma being the rms distance from the truth.
+    """Errors of corners over their claims: error / sigma, sigma being the rms distance from the truth.
 
     Attributes
     ----------
@@ -310,7 +310,7 @@ class Evaluation:
     Attributes
     ----------
     settings : dict
-        Plain values: what was evaluated, and how.
+        Plain values: input and options of the evaluation.
     breakdowns : dict of lists of Summary
         By "kind" and by each property of `BREAKDOWNS` that the queries have in more than one class.
     """

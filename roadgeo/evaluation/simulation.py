@@ -1,4 +1,4 @@
-"""Query masks whose place is known: views of a road map by a pinhole camera, drawn with what goes wrong in real masks.
+"""Query masks whose place is known: views of a road map by a pinhole camera, drawn with the faults of real masks.
 
 Everything is drawn from seeds, query by query: the k-th mask does not depend on how many are drawn, nor by whom.
 """
@@ -79,7 +79,7 @@ class SimulationOptions:
     Attributes
     ----------
     kind : str
-        What the queries are called in tables and files.
+        Names of the queries in tables and files.
     mirrored : bool
         Turn each mask over. A camera above the ground never shows that, so such a mask has no place on any map, and yet
         looks like one that has: locating it is an error.

@@ -1,4 +1,4 @@
-"""Where on a reference masks would be located: masks are tried all over it, and what is learnt is drawn as a map."""
+"""Where on a reference masks would be located: trials all over it, and a map learnt from them."""
 
 from __future__ import annotations
 
@@ -31,13 +31,13 @@ from roadgeo.storage.files import write_bytes, write_text
 
 __all__ = ["ANY", "Survey", "write_survey"]
 
-#: No number of intersections is asked for: how many a place shows is what matters.
+#: Any number of intersections is allowed: the map shows its effect.
 ANY = (0, 1_000_000)
 
 
 @dataclass(frozen=True)
 class Survey:
-    """What a map of localizability is made with.
+    """Options of a map of localizability.
 
     Attributes
     ----------
@@ -48,7 +48,7 @@ class Survey:
     jobs : int
         Processes.
     settings : mapping
-        Plain values that tell these masks and this locator from others.
+        Plain values that identify these masks and this locator.
     out_dir : Path or None
         Where every trial is kept, so that the same survey goes on from there. None: nowhere.
     counting : Counting
@@ -66,13 +66,13 @@ class Survey:
     counting: Counting = count_nothing
 
     def learn(self, network: RoadNetwork) -> LocalizabilityMap:
-        """Try masks all over the map of a network, and draw what that teaches."""
+        """Try masks all over the map of a network, and learn a map from them."""
         grid = lay_grid(network, footprint_area(self.simulation.view))
         rng = np.random.default_rng(self.simulation.seed)
         hope = grid.counts >= 3
         quarter = self.trials // 4
         places, located = np.empty((0, 2)), np.empty(0, bool)
-        # The surer a class of places is to be, the more trials it takes to tell.
+        # Classes of higher probability need more trials.
         rounds = (quarter, 0.5), (quarter, 0.85), (self.trials - 2 * quarter, 1.0)
         for number, (count, least) in enumerate(rounds, 1):
             centers = grid.draw(count, hope, rng)
@@ -98,7 +98,7 @@ class Survey:
             )
 
     def summarize(self, found: LocalizabilityMap) -> dict[str, Any]:
-        """Say how much ground is in each class, and how many of the masks held against it were located there."""
+        """Return the area of each class, and how many of the test masks were located there."""
         summary: dict[str, Any] = {"schema": "roadgeo.localizability/1", "trials": self.trials, "classes": []}
         checked, located = np.empty(0, np.uint8), np.empty(0, bool)
         if self.check:
@@ -128,7 +128,7 @@ def write_survey(
     Parameters
     ----------
     told : mapping, optional
-        Plain values that the figures are to say besides: version, command and so on.
+        Further plain values for the figures: version, command and so on.
 
     Returns
     -------

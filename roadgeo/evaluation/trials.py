@@ -79,7 +79,7 @@ class MaskFiles:
 
 
 def count_elsewhere(truths: Sequence[Truth], reference: Path) -> int:
-    """Count masks whose place lies beyond the bounds of a reference, though its truth does not say so."""
+    """Count masks whose place lies beyond the bounds of a reference, although their truth claims otherwise."""
     network = read_network(reference)
     low, high = network.graph.coords.min(axis=0), network.graph.coords.max(axis=0)
     count = 0
@@ -198,7 +198,7 @@ class ReferenceLocator:
 
 @dataclass(frozen=True)
 class Trial:
-    """One query's truth and what the locator answered."""
+    """The truth and the answer of one query."""
 
     truth: Truth
     answer: Answer
@@ -222,7 +222,7 @@ def run_trials(
         JSON lines file that gets every trial as it ends. Trials that it holds already, from a run with the same
         settings, are not repeated.
     settings : mapping, optional
-        Plain values that tell this run from others.
+        Plain values that identify this run.
     progress : callable, optional
         Called with every trial, the recorded ones too, in order.
 
@@ -250,7 +250,7 @@ def run_trials(
 
 @dataclass(frozen=True)
 class _Trying:
-    """What is done with the number of every query; travels to other processes."""
+    """The work done for each query; travels to other processes."""
 
     queries: QuerySet
     locator: Locator

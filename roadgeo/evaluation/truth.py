@@ -87,7 +87,7 @@ class Truth:
 
 
 def write_truth(folder: str | os.PathLike[str], truths: Sequence[Truth], told: Mapping[str, Any] | None = None) -> None:
-    """Write `truth.csv`, `truth.json` and `footprints.gpkg` into a folder; `told` are further values for the JSON.
+    """Write `truth.csv`, `truth.json` and `footprints.gpkg` into a folder; `told` holds further values for the JSON.
 
     Raises
     ------

@@ -46,7 +46,7 @@ def write_geopose(path: Path, subject: Subject) -> None:
 def write_orthority(path: Path, subject: Subject) -> None:
     """Write exterior parameters as Orthority reads them (GeoJSON); its axes are those of the CRS, not of true north.
 
-    Orthority takes a picture's pixels as they are stored, also where its EXIF says that it is to be turned.
+    Orthority reads pixels in their stored order, even if EXIF gives another orientation.
 
     Its interior parameters stand among the properties: `focal_len` in longer sides of the picture.
     """
@@ -104,7 +104,7 @@ def write_odm_geos(path: Path, documents: Sequence[Mapping[str, Any]]) -> None:
 
 
 def _odm_lines(documents: Sequence[Mapping[str, Any]]) -> str:
-    """Return the lines: longitude, latitude, height, no angles (0, as its manual says), and accuracies."""
+    """Return the lines: longitude, latitude, height, no angles (0, as its manual asks), and accuracies."""
     lines = ["EPSG:4326"]
     for document in documents:
         camera = document.get("camera")

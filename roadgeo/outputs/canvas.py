@@ -1,4 +1,4 @@
-"""What all pictures are drawn with: colours, dots, outlines of footprints, text, PNG (by OpenCV, red green blue)."""
+"""Drawing shared by all pictures: colours, dots, outlines of footprints, text, PNG (by OpenCV, red green blue)."""
 
 from __future__ import annotations
 
@@ -65,7 +65,7 @@ def fixed_point(pixels: AnyArray) -> AnyArray:
 
 
 def touching(ends: AnyArray, low: FloatArray, high: FloatArray) -> BoolArray:
-    """Tell which segments, by their ends (S, 2, 2), may touch the box between two of its corners."""
+    """Return which segments, given by their ends (S, 2, 2), may touch the box between two of its corners."""
     return np.asarray((ends.max(axis=1) >= low).all(axis=1) & (ends.min(axis=1) <= high).all(axis=1))
 
 

@@ -14,7 +14,7 @@ __all__ = ["NUMBERS", "WORDS", "attributes"]
 
 #: Columns that every mask has a value in, located or not.
 WORDS = ("query", "status", "reason", "reference", "attribution")
-#: Columns of what was measured; empty where there is no place.
+#: Columns of measured values; empty where there is no place.
 NUMBERS = (
     "gsd_m",
     "rotation_deg",

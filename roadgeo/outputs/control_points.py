@@ -1,6 +1,6 @@
 """Control points of a result: the picture's own pixels with points that other programs fit a place through.
 
-GDAL, QGIS and OpenDroneMap take a picture's pixels as they are stored, also where EXIF says that it is to be turned.
+GDAL, QGIS and OpenDroneMap read pixels in their stored order, even if EXIF gives another orientation.
 """
 
 from __future__ import annotations
@@ -87,7 +87,7 @@ def write_points(path: Path, subject: Subject) -> None:
 
 
 def write_match_points(path: Path, subject: Subject) -> None:
-    """Write the matched intersections for the QGIS Georeferencer: what was measured, where `write_points` is exact."""
+    """Write the matched intersections as measured, for the QGIS Georeferencer; those of `write_points` are exact."""
     wkt = known_crs(subject.place.crs).to_wkt()
     lines = [f"#CRS: {wkt}", "mapX,mapY,sourceX,sourceY,enable,dX,dY,residual"]
     for one in subject.matches():

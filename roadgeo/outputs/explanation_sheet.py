@@ -1,4 +1,4 @@
-"""A picture of an explanation: the mask with what was seen in it, the best places on the map, and what was missing."""
+"""A picture of an explanation: the roads seen in the mask, the best places on the map, and the stage that failed."""
 
 from __future__ import annotations
 
@@ -50,9 +50,9 @@ STARVED: Color = (200, 66, 40)
 
 _WIDTH, _MARGIN, _HEAD = 2000, 30, 96
 _MASK = 840  # side of the panel that shows the mask
-_CAPTION = 132  # height of what is written below a place
+_CAPTION = 132  # height of the text below a place
 
-#: What the stages of `Funnel` are called in the picture.
+#: Names of the stages of `Funnel` in the picture.
 _STAGES = {
     "intersections": "intersections seen",
     "anchors": "tried as anchors",
@@ -94,7 +94,7 @@ def draw_explanation(explanation: Explanation, mask: RoadMask, index: ReferenceI
     Parameters
     ----------
     index : ReferenceIndex
-        One of those that were searched: its story is told.
+        The hypothesis that the picture explains.
 
     Returns
     -------
@@ -155,7 +155,7 @@ def _draw_seen(scene: Scene, mask: RoadMask, lines: Sequence[FloatArray]) -> Any
 
 
 def _draw_funnel(story: Story) -> AnyArray:
-    """Draw a bar for each stage, its length by the logarithm of what was left."""
+    """Draw a bar for each stage; its length is the logarithm of the number of candidates left."""
     stages = [field.name for field in fields(Funnel)]
     panel = np.full((40 + 29 * len(stages), _MASK, 3), LIT, np.uint8)
     write_text(panel, "How far the search got", (0, 24), 21, INK, bold=True)
@@ -248,7 +248,7 @@ def _caption(panel: AnyArray, origin: tuple[int, int], side: int, number: int, p
 
 
 def _draw_notes(story: Story) -> AnyArray:
-    """Write what was missing, and what the colours mean."""
+    """Write the stage that failed, and the meaning of the colours."""
     width = _WIDTH - _MASK - 3 * _MARGIN
     lines = [line for note in story.missing for line in _bullet(note, width // 10)]
     panel = np.full((114 + 27 * len(lines), width, 3), LIT, np.uint8)

@@ -32,7 +32,7 @@ class FigureOptions:
     width_in : float
         Inches: 7 is a page of two columns.
     dpi : int
-        Of what is no line: the mask, and all of a PNG.
+        Resolution of rasters: the mask, and all of a PNG.
     margin : float
         Ground shown around the footprint, in lengths of its longer side.
     """
@@ -48,7 +48,7 @@ def has_matplotlib() -> bool:
 
 
 def write_figure(path: Path, subject: Subject) -> None:
-    """Write `draw_figure`; the suffix tells the format.
+    """Write `draw_figure`; the suffix determines the format.
 
     Raises
     ------
@@ -109,7 +109,7 @@ def _draw_map(axes: Any, location: Location, place: Placement, roads: FloatArray
     low, high = low - around, high + around
     ends = roads.reshape(-1, 2, 2)
     near = touching(ends, low, high)
-    # Kilometres from the corner: eastings and northings of seven digits say little on an axis.
+    # Kilometres from the corner: eastings and northings of seven digits are hard to read on an axis.
     axes.add_collection(LineCollection((ends[near] - low) / 1e3, colors=[_rgb(MAP_ROAD)], linewidths=1.6, label="map"))
     if location.evidence is not None:
         lines = [(line - low) / 1e3 for line in place.map_roads(location.evidence.query_graph)]

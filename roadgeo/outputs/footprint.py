@@ -92,7 +92,7 @@ def _write_mask(path: Path, subject: Subject) -> None:
         # Reduced in memory: left to the COG driver, they are written, compressed and read again on the way.
         plain.build_overviews(_reductions(max(grid.width, grid.height)), Resampling.nearest)
         rasterio.shutil.copy(plain, optimized.name, driver="COG", compress=_compression(), level=1, blocksize=_BLOCK)
-        path.write_bytes(optimized.read())  # by ourselves: a full disk is an OSError that says so
+        path.write_bytes(optimized.read())  # written by Python: a full disk raises an OSError
 
 
 @lru_cache(maxsize=1)
@@ -130,7 +130,7 @@ def _rgba(color: str) -> tuple[int, int, int, int]:
 
 
 def _tags(subject: Subject) -> dict[str, str]:
-    """Say where it comes from, for `gdalinfo`; the homography is that of what is drawn."""
+    """Add the source as metadata, for `gdalinfo`; the homography is that of the drawn image."""
     location = subject.location
     return {
         "TIFFTAG_SOFTWARE": f"roadgeo {__version__}",

@@ -1,4 +1,4 @@
-"""A result as an IIIF Georeference Annotation (Georeference Extension 1.0): what Allmaps and library viewers read."""
+"""A result as an IIIF Georeference Annotation (Georeference Extension 1.0), for Allmaps and library viewers."""
 
 from __future__ import annotations
 

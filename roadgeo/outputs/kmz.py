@@ -85,7 +85,7 @@ _KML_POLYGON = """<Polygon><tessellate>1</tessellate>
 
 def _kml(subject: Subject, grid: MapGrid) -> str:
     west = (grid.west + 180.0) % 360.0 - 180.0
-    east = west + grid.width * grid.resolution  # beyond 180, as KML wants it of what lies astride
+    east = west + grid.width * grid.resolution  # beyond 180, as KML requires across the antimeridian
     south = grid.north - grid.height * grid.resolution
     rings = [" ".join(f"{lon:.7f},{lat:.7f},0" for lon, lat in ring) for ring in cut_ring(subject.outline())]
     polygons = "\n".join(map(_KML_POLYGON.format, rings))

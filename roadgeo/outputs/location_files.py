@@ -27,14 +27,14 @@ __all__ = ["OutputOptions", "Written", "wanted_outputs", "write_json", "write_lo
 
 @dataclass(frozen=True)
 class OutputOptions:
-    """What is written for a mask.
+    """The files to write for a mask.
 
     Attributes
     ----------
     image : ImageOptions
         How the picture, or without one the mask, is drawn on the map; masks always with the nearest value.
     products : tuple of str
-        What is written besides, by name: those of `outputs.registry` and of plugins.
+        Further outputs by name: those of `outputs.registry` and of plugins.
     """
 
     image: ImageOptions = field(default_factory=ImageOptions)
@@ -42,14 +42,14 @@ class OutputOptions:
 
 
 class Written(NamedTuple):
-    """What `write_location` did.
+    """The result of `write_location`.
 
     Attributes
     ----------
     location : Location
         With `seconds.write` set.
     files, removed : list of Path
-        What there is now, the JSON first, and what an earlier run had left that no longer holds.
+        Files of this run, the JSON first, and outdated files of an earlier run.
     """
 
     location: Location
@@ -58,7 +58,7 @@ class Written(NamedTuple):
 
 
 def wanted_outputs(names: Iterable[str], located: bool, has_photo: bool, has_camera: bool = True) -> list[Output]:
-    """Return what is written for a mask: what always is, then what is asked for, as far as there is what it needs.
+    """Return the outputs of a mask: the usual ones, then those asked for, where their requirements are met.
 
     Raises
     ------
@@ -79,7 +79,7 @@ def write_location(
     indexes: Sequence[ReferenceIndex] = (),
     explanation: Explanation | None = None,
 ) -> Written:
-    """Write what a location asks for, all files or none; where a picture cannot be drawn, the JSON alone.
+    """Write the outputs of a location, all files or none; if a picture cannot be drawn, the JSON alone.
 
     Files of an earlier run under these names that show a place are removed where there is none now, so that stale
     results are not mistaken for this run's.
@@ -136,7 +136,7 @@ def write_json(path: Path, subject: Subject) -> None:
 
 
 def _stale(subject: Subject, written: Sequence[Output], names: Iterable[str]) -> list[Path]:
-    """Name what an earlier run may have left of a place or a camera that no longer holds."""
+    """List outdated files of an earlier run, which show a place or a camera."""
     outputs = dict.fromkeys([*REGISTRY.values(), *find_outputs(names)])
     if subject.location.located:
         outputs = dict.fromkeys(one for one in outputs if one.needs_camera and subject.location.camera is None)
@@ -144,7 +144,7 @@ def _stale(subject: Subject, written: Sequence[Output], names: Iterable[str]) ->
 
 
 def _remove(paths: Iterable[Path]) -> Iterator[Path]:
-    """Delete files, and tell which there were."""
+    """Delete files, and return those that existed."""
     for path in paths:
         try:
             path.unlink()

@@ -26,7 +26,7 @@ _CORNERS_STYLE = draw_marker("31,111,180", 1.8)
 _ALTERNATIVES_STYLE = draw_marker("240,180,41", 3.0)
 
 _CORNERS = ("top left", "top right", "bottom right", "bottom left")
-#: A residual is drawn so many times as long as it is: metres cannot be seen on a footprint of a kilometre.
+#: Factor by which residuals are enlarged: metres cannot be seen on a footprint of a kilometre.
 _EXAGGERATION = 20.0
 
 

@@ -1,4 +1,4 @@
-"""Names of files as they are published: what is given away does not show the folders of whoever made it.
+"""Names of files as they are published, without the folders of their author.
 
 Paths as they were typed stand in `*_location.json` alone, and on the terminal.
 """

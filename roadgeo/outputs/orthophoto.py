@@ -145,7 +145,7 @@ def image_homography(
 
 
 class Target(NamedTuple):
-    """A CRS to draw in, what takes the place's CRS to it, and what takes it back; None where the two are one."""
+    """The CRS of the drawing and the transforms from and to the place's CRS; None where the two are one."""
 
     crs: str
     to_target: Transform
@@ -228,7 +228,7 @@ def warp_image(
 
 
 def _tile(path: str | os.PathLike[str], folder: Path) -> str | os.PathLike[str]:
-    """Copy a large picture that can only be read from the top down into tiles; return what to read."""
+    """Copy a large picture that is stored line by line into tiles; return the path to read."""
     with open_raster(path) as picture:
         size = picture.width * picture.height * picture.count * np.dtype(picture.dtypes[0]).itemsize
         if size < _TILED_BYTES or picture.block_shapes[0][1] != picture.width:
@@ -249,7 +249,7 @@ def _value_bands(picture: Any) -> list[int]:
 
 @dataclass(frozen=True)
 class _Plan:
-    """What is drawn, on what."""
+    """A picture and its placement on the output grid."""
 
     picture: Any
     homography: FloatArray
@@ -330,7 +330,7 @@ def _draw(plan: _Plan, path: Path, crs: str, tags: Mapping[str, str]) -> None:
 
 
 def _profile(plan: _Plan, crs: str | None, size: tuple[int, int] | None = None) -> dict[str, Any]:
-    """Return what a GeoTIFF in the making is written with; one without CRS is an overview of `size` (width, height)."""
+    """Return the creation options of a GeoTIFF; one without CRS is an overview of `size` (width, height)."""
     grid = plan.grid
     width, height = size or (grid.width, grid.height)
     profile: dict[str, Any] = {
@@ -353,7 +353,7 @@ def _profile(plan: _Plan, crs: str | None, size: tuple[int, int] | None = None) 
 
 
 def _halve(block: AnyArray, plan: _Plan) -> AnyArray:
-    """Return a block (bands, rows, columns) of half the size; what is transparent does not darken what is not."""
+    """Return a block (bands, rows, columns) at half the size; transparent pixels do not darken their neighbours."""
     if plan.interpolation == cv2.INTER_NEAREST:
         return np.ascontiguousarray(block[:, ::2, ::2])
     opaque = np.iinfo(plan.dtype).max
@@ -423,7 +423,7 @@ def _cut_up(grid: MapGrid) -> Iterator[tuple[int, int, tuple[int, int]]]:
 
 
 class _Part(NamedTuple):
-    """What was read of a window of a picture: (bands, rows, columns), and where they are known; None: everywhere."""
+    """A window of a picture: (bands, rows, columns), and where they are known; None: everywhere."""
 
     window: Window
     values: AnyArray

@@ -16,7 +16,7 @@ from roadgeo.outputs.subject import Subject
 
 __all__ = ["write_geojson", "write_stac"]
 
-#: No photograph from the air is older: what stands for an unknown date.
+#: Stands for an unknown date: no photograph from the air is older.
 _FIRST_AERIAL_PHOTOGRAPH = "1858-01-01T00:00:00Z"
 
 
@@ -46,7 +46,7 @@ def write_stac(path: Path, subject: Subject) -> None:
         "bbox": _bounds(subject.outline()),
         "geometry": _geometry(subject.outline()),
         "properties": {
-            # When it was taken nobody told: some time before the file was last written.
+            # Without a date: some time before the file was last written.
             "datetime": None,
             "start_datetime": _FIRST_AERIAL_PHOTOGRAPH,
             "end_datetime": taken.strftime("%Y-%m-%dT%H:%M:%SZ"),

@@ -1,4 +1,4 @@
-"""What a result looks like on the map and on disk: the place that a located mask surely has, and names of its files."""
+"""Place and paths of a result: the fields that every located mask has, and the names of its files."""
 
 from __future__ import annotations
 
@@ -22,7 +22,7 @@ __all__ = ["OutputPaths", "Placement", "output_paths"]
 
 @dataclass(frozen=True)
 class Placement:
-    """What a located `Location` surely has; see there for shapes and frames."""
+    """The fields that every located `Location` has; see there for shapes and frames."""
 
     crs: str
     homography: FloatArray
@@ -69,7 +69,7 @@ class Placement:
 
 @dataclass(frozen=True)
 class OutputPaths:
-    """Where the files of one result go; `stem` is what their names begin with."""
+    """Paths of the files of one result; their names begin with `stem`."""
 
     folder: Path
     stem: str

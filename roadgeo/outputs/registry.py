@@ -1,8 +1,8 @@
-"""Every file that a result becomes: its name, how its file is called, what writes it, what it is for.
+"""All outputs of a result: name, file name, writer, purpose.
 
-One list, from which everything else follows: what is written and what an earlier run left that no longer holds, which
-files of a folder are results and no masks, the help texts, the choices in QGIS. To add an output, write a function that
-takes a path and a `Subject`, and list it here. Other packages offer theirs as entry points (see `roadgeo.plugins`).
+One list determines the rest: the files of a run and the outdated files of an earlier one, which files of a folder are
+results and not masks, the help texts, the choices in QGIS. To add an output, write a function that takes a path and a
+`Subject`, and list it here. Other packages offer theirs as entry points (see `roadgeo.plugins`).
 
 The modules that write are imported when something is written, so that `--help` need not load them.
 """
@@ -33,7 +33,7 @@ __all__ = [
     "offered",
 ]
 
-#: What the names of further results end with, before their suffixes: those of `vectorize` and of `evaluate --map`.
+#: Endings of the names of further results, before their suffixes: those of `vectorize` and of `evaluate --map`.
 VECTORIZED, LOCALIZABILITY = "_vectorized", "_localizability"
 
 
@@ -44,19 +44,19 @@ class Output:
     Attributes
     ----------
     name : str
-        What it is asked for by; for plugins the name of their entry point counts.
+        Name on the command line; a plugin's is that of its entry point.
     ending : str
-        What the file's name ends with, after the result's stem; "{picture}" stands for the picture's own name instead.
+        End of the file's name, after the result's stem; "{picture}" stands for the picture's own name instead.
     write : callable
         Writes the file.
     summary : str
-        What it is for.
+        Its purpose.
     needs_place : bool
         Whether only a located mask has it.
     needs_camera : bool
         Whether only a mask has it that a camera above the ground may have taken.
     option : str
-        What asks for it on the command line; "" where nobody need ask.
+        Option that asks for it on the command line; "" where none is needed.
     """
 
     name: str
@@ -73,7 +73,7 @@ class Output:
 
 
 def _by(module: str, function: str) -> Callable[[Path, Subject], None]:
-    """Return what imports a module of this package when it is first called."""
+    """Return a writer that imports its module of this package at its first call."""
 
     def write(path: Path, subject: Subject) -> None:
         getattr(importlib.import_module(f"roadgeo.outputs.{module}"), function)(path, subject)

@@ -1,4 +1,4 @@
-"""What outputs show: a location with all that is at hand for drawing it."""
+"""The input of all outputs: a location with everything at hand for drawing it."""
 
 from __future__ import annotations
 
@@ -25,7 +25,7 @@ from roadgeo.storage.orientation import read_orientation, stored_from_upright
 
 __all__ = ["Match", "Subject"]
 
-#: Control points lie on a grid of so many rows and columns, from corner to corner.
+#: Rows and columns of the grid of control points, from corner to corner.
 _GRID = 5
 
 #: A warped mask is drawn in memory, so it is made coarser beyond this.
@@ -42,7 +42,7 @@ class Match(NamedTuple):
     x, y : float
         Where the map has it, in the place's CRS.
     fitted_column, fitted_row : float
-        Where the homography says that the picture should show it.
+        Where the homography places it in the picture.
     dx_m, dy_m : float
         From where the homography puts the picture's to the map's.
     """
@@ -59,7 +59,7 @@ class Match(NamedTuple):
 
 @dataclass(frozen=True)
 class Subject:
-    """What the outputs show. What needs a place raises an `OutputError` where there is none.
+    """The input of the outputs. Members that need a place raise an `OutputError` where there is none.
 
     Attributes
     ----------
@@ -185,7 +185,7 @@ class Subject:
         Raises
         ------
         OutputError
-            There is no place, or nothing is known of what it rests on.
+            There is no place, or its map is not at hand.
         """
         evidence, place = self.location.evidence, self.place
         if evidence is None:

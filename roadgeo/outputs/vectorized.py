@@ -1,4 +1,4 @@
-"""What roadgeo saw in a mask, for a person to look at: a GeoPackage in pixel coordinates, and a picture."""
+"""The roads that roadgeo sees in a mask, for inspection: a GeoPackage in pixel coordinates, and a picture."""
 
 from __future__ import annotations
 
@@ -50,7 +50,7 @@ def write_vectorized(
     ----------
     out_dir : path
     stem : str
-        What the names of the files begin with.
+        Start of the files' names.
     mask : RoadMask
     graph : RoadGraph
         In the query plane (see `geometry.mask`).

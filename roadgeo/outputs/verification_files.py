@@ -1,4 +1,4 @@
-"""What `roadgeo verify` writes: corrected copies, control points, one table of all, and offsets for map editors.
+"""Outputs of `roadgeo verify`: corrected copies, control points, one table of all, and offsets for map editors.
 
 Editors of OpenStreetMap move imagery by metres of the Mercator map, which are longer than those on the ground by about
 1 / cos(latitude): JOSM as bookmarks in its preferences (`imagery.offsetbookmarks`, in EPSG:3857), which it imports from
@@ -99,7 +99,7 @@ def write_josm(path: Path, documents: Sequence[Mapping[str, Any]]) -> None:
 
 
 def _plain(name: str) -> str:
-    """Return a name as JOSM may read it: what stands in ${} it would run as a program, and XML has no control signs."""
+    """Return a name that is safe in JOSM, which runs text in ${} as a program; XML has no control characters."""
     return visible(name).replace("${", "$(")
 
 
@@ -150,7 +150,7 @@ def write_in_place(image: Path, place: Georeference) -> None:
 
 
 def _set_place(path: Path, place: Georeference) -> None:
-    """Replace what a GeoTIFF says of its place."""
+    """Replace the georeference of a GeoTIFF."""
     import rasterio
     from rasterio.control import GroundControlPoint
     from rasterio.errors import RasterioError

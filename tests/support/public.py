@@ -1,4 +1,4 @@
-"""The promise of stability: python tests/support/public.py writes what is promised from now on into tests/data/public.json.
+"""The promise of stability: python tests/support/public.py writes into tests/data/public.json what is promised now.
 
 Promised are the names that `roadgeo` offers, the parameters of its functions and methods, the fields of its values, and
 the keys of every JSON document. Between major versions they may grow; nothing of them goes. Not promised are the fields

@@ -19,7 +19,7 @@ _DATA = Path(__file__).parent / "data"
 
 #: Roads around the centre of Porto, as OpenStreetMap has them.
 ROADS = _DATA / "porto_roads.gpkg"
-#: What the mask `drone.png` was made of: painted, see `examples/demo`.
+#: The painted photograph from which the mask `drone.png` was made, see `examples/demo`.
 PHOTO = _DATA / "drone_photo.jpg"
 ATTRIBUTION = "© OpenStreetMap contributors, ODbL 1.0"
 
@@ -31,7 +31,7 @@ class DemoMask:
     Attributes
     ----------
     title : str
-        What it shows, for people.
+        Description for people.
     in_map : bool
         Whether its place is on the map; if not it must be refused.
     homography : (3, 3) float64

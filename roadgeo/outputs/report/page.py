@@ -41,7 +41,7 @@ STATUS = {"located": "✓ located", "ambiguous": "≈ ambiguous", "not_located":
 _CORNERS = ("top left", "top right", "bottom right", "bottom left")
 _WINDS = ("north", "north-east", "east", "south-east", "south", "south-west", "west", "north-west")
 
-#: Masks with fewer intersections are told that more would help.
+#: Below this number of intersections a report recommends a larger frame.
 _FEW = 12
 
 
@@ -138,7 +138,7 @@ def footer(attribution: str) -> str:
 
 
 def _explain(location: Location) -> str:
-    """Say what the answer means, and what can be done where there is none."""
+    """Return the meaning of the answer, and the advice where there is no place."""
     if location.status == "located":
         texts = [_rival(location)]
     elif location.status == "ambiguous":
@@ -162,7 +162,7 @@ def _explain(location: Location) -> str:
 
 
 def _rival(location: Location) -> str:
-    """Tell of the best other place, where odds were computed."""
+    """Describe the best other place, where odds were computed."""
     other, center = location.runner_up, location.center
     if location.log10_odds is None or center is None:
         return ""
@@ -173,7 +173,7 @@ def _rival(location: Location) -> str:
 
 
 def _way(here: Place, there: Place) -> str:
-    """Say how far and in which direction: 1.3 km to the north-east."""
+    """Return distance and direction: 1.3 km to the north-east."""
     dx, dy = there.x - here.x, there.y - here.y
     wind = _WINDS[round(math.degrees(math.atan2(dx, dy)) / 45.0) % 8]
     distance = math.hypot(dx, dy)
@@ -193,7 +193,7 @@ def _table(rows: Sequence[tuple[str, str]]) -> str:
 
 
 def _numbers(subject: Shown) -> list[tuple[str, str]]:
-    """Label and value (HTML) of what people ask for first."""
+    """Label and value (HTML) of the main results."""
     # The place and the camera, where they are known.
     location, place = subject.location, subject.place
     width, height = subject.size
@@ -213,7 +213,7 @@ def _numbers(subject: Shown) -> list[tuple[str, str]]:
     if sigma is not None and np.isfinite(sigma).all():
         low, high = sigma.min(), sigma.max()
         rows.append(("Corners", f"± {low:.1f} to {high:.1f} m <small>(standard deviation)</small>"))
-    # What speaks for it.
+    # Support.
     matched = f"{location.n_matched} of {location.n_intersections} matched"
     rows.append(("Intersections", matched if place else f"{location.n_intersections} seen"))
     if location.evidence is not None and len(location.evidence.residual_m):
@@ -298,7 +298,7 @@ def _details(subject: Shown) -> list[tuple[str, str]]:
 
 
 def _sources(index: ReferenceIndex) -> list[str]:
-    """Name what the map was made of, and its date where that is known."""
+    """Name the sources of the map, and its date where that is known."""
     sources = [source for source in index.meta.get("sources", []) if isinstance(source, dict)]
     names = [(str(source.get("name", "")), str(source.get("osm_timestamp", ""))) for source in sources[:20]]
     return [f"{name}, as of {time}" if time else name for name, time in names if name]

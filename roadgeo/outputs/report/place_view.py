@@ -1,4 +1,4 @@
-"""The view of a place: the map around a footprint, and what lies on it."""
+"""The view of a place: the map around a footprint, and the footprint on it."""
 
 from __future__ import annotations
 
@@ -43,8 +43,8 @@ _QUERY_COLOR = (228, 87, 46)
 
 
 def draw_place(subject: Shown, place: Placement) -> str:
-    """Draw the map around a footprint, with what lies on it: an HTML figure."""
-    # What there is to draw, in metres from the window's corner.
+    """Draw the map around a footprint, and the footprint on it: an HTML figure."""
+    # Geometries in metres from the window's corner.
     location = subject.location
     window = Window.around(subject, place, subject.options.margin)
     wide = Window.around(subject, place, subject.options.reach)
@@ -76,7 +76,7 @@ def draw_place(subject: Shown, place: Placement) -> str:
     if other is not None and window.holds(other):
         cross = pin(window.to_svg(other), '<path d="M-9-9L9 9M-9 9L9-9"/>', "runner-up")
         layers.append(Layer("runner-up", "runner-up", cross, '<path d="M8 2l10 10m0-10l-10 10"/>'))
-    # What the page's script needs to keep widths and arrows legible at every scale.
+    # Values for the page's script, which keeps widths and arrows legible at every scale.
     arrows, per_px = _arrow_scale(location), window.width / _PLACE_PX
     attributes = {
         "data-frame": "map",

@@ -1,4 +1,4 @@
-"""What the views of a report share: layers of SVG that can be switched, moved about in and zoomed into."""
+"""Common parts of a report's views: layers of SVG that can be switched, moved about in and zoomed into."""
 
 from __future__ import annotations
 
@@ -54,7 +54,7 @@ def draw_viewer(
     scale : bool
         Show a scale bar: the units are metres.
     enlarged : bool
-        Say how much residuals and circles are enlarged.
+        Show the factor by which residuals and circles are enlarged.
     credit : str
         Stands in a corner.
     """

@@ -1,4 +1,4 @@
-"""What a report shows of a result, and its views of the mask and of the whole map (its place: see `place_view`)."""
+"""Contents of a report: the views of the mask and of the whole map (for the view of the place see `place_view`)."""
 
 from __future__ import annotations
 
@@ -48,7 +48,7 @@ _UNKNOWN = 255  # in a map of probabilities
 
 @dataclass(frozen=True)
 class ReportOptions:
-    """What is drawn, and how large the file may become.
+    """Layers of a report, and the largest size of its file.
 
     Attributes
     ----------
@@ -77,7 +77,7 @@ class ReportOptions:
 
 @dataclass(frozen=True)
 class Shown:
-    """A result and what is drawn of it.
+    """A result and its pictures.
 
     Attributes
     ----------
@@ -111,7 +111,7 @@ class Shown:
         options: ReportOptions,
         attribution: str,
     ) -> Shown:
-        """Take what was seen in the mask, or look at it anew, and read the picture."""
+        """Take the roads of the mask, or trace them again, and read the picture."""
         seen = location.seen
         if seen is None:
             scene, graph = trace_query(mask)
@@ -160,7 +160,7 @@ class Shown:
         return image
 
     def draw_probability(self) -> AnyArray | None:
-        """Draw what a segmenter saw, the surer the denser: (h, w, 4) uint8, or None where there was none."""
+        """Draw a segmenter's probability, darker where higher: (h, w, 4) uint8, or None without one."""
         seen = self.mask.probability
         if seen is None:
             return None
@@ -254,7 +254,7 @@ def draw_mask(subject: Shown) -> str:
 
 
 def draw_probability(subject: Shown) -> str:
-    """Draw what a segmenter saw, on its own: an SVG, or nothing. The layer of `draw_mask` shows the same picture."""
+    """Draw a segmenter's probability alone: an SVG, or nothing. The layer of `draw_mask` shows the same picture."""
     probable = subject.draw_probability()
     if probable is None:
         return ""
@@ -294,7 +294,7 @@ def draw_overview(subject: Shown) -> str:
 
 
 def draw_whole_map(index: ReferenceIndex, limit: int, width_px: int) -> tuple[str, Window]:
-    """Draw all roads of a reference as an SVG image of at most `limit` bytes, and say which window it fills."""
+    """Draw all roads of a reference as an SVG image of at most `limit` bytes, and return its window."""
     x0, y0, size = index.grid
     columns, rows = index.shape
     west, south = index.plane.to_crs(np.array([x0, y0])).tolist()

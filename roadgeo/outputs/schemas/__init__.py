@@ -11,7 +11,7 @@ __all__ = ["NAMES", "read_schema"]
 _FOLDER = Path(__file__).parent
 _ENDING = ".schema.json"
 
-#: What there are schemas of: "location", "explanation", "evaluation" and so on.
+#: Names of the schemas: "location", "explanation", "evaluation" and others.
 NAMES = tuple(sorted(path.name.removesuffix(_ENDING) for path in _FOLDER.glob(f"*{_ENDING}")))
 
 
