@@ -1,4 +1,4 @@
-"""Progress call-backs: what long steps call, and what the command line and QGIS show."""
+"""Progress call-backs of long steps, shown by the command line and QGIS."""
 
 from __future__ import annotations
 
@@ -23,7 +23,7 @@ def say_nothing(text: str, share: float | None = None) -> None:
     """Ignore progress reports."""
 
 
-#: Given how many there are to do, shows how many are done; what it yields counts one more of a sort ("located").
+#: Called with the number of items, shows how many are done; yields a function that counts one more of a sort ("located").
 Counting: TypeAlias = Callable[[int], AbstractContextManager[Callable[[str], None]]]
 
 

@@ -8,7 +8,7 @@ __all__ = ["visible"]
 
 #: Control characters; those that turn the direction of text; line separators; bytes of names that are no text.
 _UNSEEN = re.compile("[\x00-\x1f\x7f-\x9f\u061c\u200e\u200f\u2028-\u202e\u2066-\u2069\ud800-\udfff]")
-#: What `click.style` writes, and line ends.
+#: Sequences that `click.style` writes, and line ends.
 _OURS = re.compile("(\x1b\\[(?:0|1|3[1-7])m|[\n\t])")
 
 

@@ -1,6 +1,6 @@
 """Errors, named by what failed.
 
-A message says what was wrong, what was got, what was expected and what to do, on one line. A mask that merely is not
+A message holds what was wrong, what was got, what was expected and what to do, on one line. A mask that merely is not
 found on the map is no error: it is a `Location` with a reason.
 """
 
@@ -47,7 +47,7 @@ class RoadgeoError(Exception):
     """Base of every error that roadgeo raises on purpose."""
 
     def __str__(self) -> str:
-        """Tell it in one line, whatever names and files it quotes."""
+        """Return the message in one line, whatever names and files it quotes."""
         return visible(super().__str__())
 
 

@@ -42,7 +42,7 @@ Status = Literal["located", "ambiguous", "not_located", "error"]
 
 
 class Reason(StrEnum):
-    """Why a mask was located, or not: what programs go by, where people read the sentence beside it."""
+    """Why a mask was located, or not: a code for programs, beside the sentence for people."""
 
     LOCATED = "located"
     #: Two places fit almost equally; or two looks at one scene find two.
@@ -128,7 +128,7 @@ class Camera:
     focal_px, focal_sigma_px : float
         Focal length in pixels of the mask, and its standard deviation: 0 where it was given.
     source : str
-        What the focal length rests on, as in `Location.tilt_source`.
+        Origin of the focal length, as in `Location.tilt_source`.
     covariance : (6, 6) float64
         Of x, y and height, metres, and of the three angles, degrees.
     rotation : (3, 3) float64
@@ -200,7 +200,7 @@ class Seconds:
 
 @dataclass(frozen=True)
 class Stats:
-    """How much work the search did: counts, and what they would take one core of a usual machine, in milliseconds.
+    """Work done by the search: counts, and the time they would take one core of a usual machine, in milliseconds.
 
     Of a larger map more is allowed, and counts as less (see `matching.search.SearchOptions`).
     """
@@ -214,7 +214,7 @@ class Stats:
 
 @dataclass(frozen=True)
 class Seen:
-    """What the mask shows, in the query plane, pixels (see `geometry.mask`): roads, and (N, 2) intersections."""
+    """Contents of the mask in the query plane, pixels (see `geometry.mask`): roads, and (N, 2) intersections."""
 
     graph: RoadGraph
     xy: FloatArray
@@ -222,7 +222,7 @@ class Seen:
 
 @dataclass(frozen=True)
 class Evidence:
-    """What the answer rests on, for drawing it. Dimensions: M matched intersections.
+    """The matches behind the answer, for drawing it. Dimensions: M matched intersections.
 
     Attributes
     ----------
@@ -257,7 +257,7 @@ class Location:
     footprint, footprint_lonlat : (4, 2) float64
         Corners TL, TR, BR, BL of the frame in the CRS, and as longitude, latitude.
     fitted : str or None
-        "similarity" where the camera looked straight down, as far as the roads tell, else "homography".
+        "similarity" where the roads are consistent with a camera that looked straight down, else "homography".
     corner_sigma_m : (4,) float64
         Standard deviations of those corners' positions: root mean squares of their distances from the truth.
     lonlat_accuracy_m : float
@@ -271,8 +271,8 @@ class Location:
     tilt_deg : float or None
         Of the camera from the vertical.
     tilt_source : str or None
-        What the tilt rests on: the "camera" whose focal length was given, the "homography" where that tells the focal
-        length, or a usual lens that is "assumed".
+        Origin of the focal length: the given "camera", the "homography" where that determines it, or a usual lens
+        that is "assumed".
     log10_odds : float or None
         By how many powers of ten the best place explains more than any other; also where it is not enough to report
         it. None where no place was verified, or the method knows no odds.
@@ -285,10 +285,10 @@ class Location:
     alternatives : tuple of Place
         The best other places on any of the references, best first, in the CRS of the best one.
     stopped : str
-        What ended the search: "accepted", an answer that stands out; "exhausted", nothing was left to try; "work" or
+        Why the search ended: "accepted", an answer that stands out; "exhausted", nothing was left to try; "work" or
         "time", a limit. Only with "time" may the answer depend on the machine and its load. "" where none was needed.
     options : dict or None
-        What was asked, as far as it differs from the usual, in plain values; None: not told.
+        Options that differ from the defaults, in plain values; None: not recorded.
     query_to_pixel : (3, 3) float64 or None
         Of roads that came as lines: their coordinates to pixels of the mask that was drawn of them.
     mirrored : bool
@@ -416,7 +416,7 @@ class Location:
         return frame if self.crs is None else frame.to_crs(self.crs)
 
     def __repr__(self) -> str:
-        """Say the answer in one line."""
+        """Describe the answer in one line."""
         if self.center is None:
             return f"<Location {self.query!r}: {self.status}, {self.reason}>"
         place = f"{self.center.lat:.6f}, {self.center.lon:.6f}" + (f" on {self.reference}" if self.reference else "")
@@ -453,7 +453,7 @@ class Location:
         return (metres, px) if np.isfinite([metres, px]).all() else None
 
     def to_dict(self) -> dict[str, Any]:
-        """Plain values in the order of the schema, ready for `json.dumps`; evidence and what was seen are left out."""
+        """Plain values in the order of the schema, ready for `json.dumps`; without evidence and the mask's contents."""
 
         def rows(array: FloatArray | None) -> list[Any] | None:
             return None if array is None else array.tolist()
@@ -464,7 +464,7 @@ class Location:
 
         center = self.center
         rmse_m, rmse_px = self.rmse() or (None, None)
-        # The order in which people read it: what was asked, where it lies, how sure that is, what it took.
+        # The order in which people read it: the query, the place, its certainty, the cost.
         return {
             "schema": SCHEMA,
             "version": __version__,

@@ -1,6 +1,6 @@
 """Road sources, segmenters and outputs that installed packages offer as entry points; roadgeo's own are found so too.
 
-A source takes where to look and `say`, which it may tell what it waits for, and returns `roadgeo.sources.roads.Roads`.
+A source takes a location and `say`, which it may call while it waits, and returns `roadgeo.sources.roads.Roads`.
 A segmenter takes the path of a photograph and returns a `roadgeo.RoadMask`, or an array that
 `roadgeo.sources.masks.read_mask` takes. An output is a `roadgeo.outputs.registry.Output`. `examples/plugin` has one of
 each.
@@ -19,7 +19,7 @@ GROUPS = SOURCES, SEGMENTERS, OUTPUTS = "roadgeo.sources", "roadgeo.segmenters",
 
 
 def find_plugins(group: str) -> dict[str, EntryPoint]:
-    """Find what is offered in a group, by name; nothing is imported. Where names clash, our own comes first."""
+    """Find the plugins of a group, by name; nothing is imported. Where names clash, our own comes first."""
     offered = sorted(entry_points(group=group), key=lambda one: (package_of(one) != "roadgeo", package_of(one)))
     return {one.name: one for one in reversed(offered)}
 

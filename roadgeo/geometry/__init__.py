@@ -1,1 +1,1 @@
-"""Planes, frames and cameras: what a homography is, and what a camera can see."""
+"""Planes, frames and cameras: homographies, and the views that a camera can have."""

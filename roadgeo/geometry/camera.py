@@ -16,14 +16,14 @@ from roadgeo.geometry.homography import Homography
 __all__ = ["CameraFault", "CameraOptions", "CameraPose", "judge", "pose", "sampling"]
 
 _FOCAL_STEPS = np.geomspace(0.35, 8.0, 25)
-#: What lays pixels on less ground than this, square metres, has shrunk to a point, whatever camera is allowed.
+#: A frame that covers less ground than this, square metres, has shrunk to a point, whatever camera is allowed.
 _LEAST_AREA = 1e-6
 #: Focal length that is taken where none fits better: in halves of the frame's diagonal, that of a usual lens.
 _USUAL_FOCAL = 1.5
 #: How much more skew a usual focal length may leave than one e times as long.
 _FOCAL_PRIOR = 0.01
-#: Focal lengths whose skews differ by less than the errors of homographies are not told apart; where the longest of
-#: them is so many times the shortest, the homography says nothing of the lens.
+#: Focal lengths whose skews differ by less than the errors of homographies are indistinguishable; where the longest
+#: of them exceeds the shortest by this factor, the homography does not determine the lens.
 _TOLD_APART, _ALIKE = 0.02, 4.0
 
 
@@ -41,7 +41,7 @@ class CameraFault(Enum):
 
 @dataclass(frozen=True)
 class CameraOptions:
-    """What is known of the camera.
+    """Prior knowledge of the camera.
 
     Attributes
     ----------
@@ -91,14 +91,14 @@ class CameraOptions:
     def perspective_sigma(self, usual: float) -> float:
         """Return the prior standard deviation of the perspective parameters, in units of 1 / half the frame's diagonal.
 
-        It is `usual` unless so little tilt is allowed that they must be less.
+        It is `usual` unless the greatest tilt allowed requires less.
         """
         return min(usual, 0.03 + 0.7 * math.tan(math.radians(min(self.max_tilt_deg, 80.0))))
 
 
 @dataclass(frozen=True)
 class CameraPose:
-    """What a homography says of the camera.
+    """The camera as estimated from a homography.
 
     Attributes
     ----------
@@ -109,8 +109,8 @@ class CameraPose:
     tilt_deg, focal_px : float
         Of the pinhole that fits best: the angle of its axis from the vertical. Ill determined near the nadir.
     source : str
-        What says so: the "camera" whose focal length is given, the "homography", or a lens "assumed" where so many fit
-        about as well that the homography cannot tell them apart.
+        Origin of the focal length: the given "camera", the "homography", or a usual lens "assumed" where the homography
+        fits too wide a range of focal lengths about as well.
     skew : float
         How badly even that one fits (see `CameraOptions.max_skew`).
     """

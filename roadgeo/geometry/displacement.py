@@ -29,7 +29,7 @@ class Displacement:
     covariance : (4, 4) float64
         Of east and north (metres), of the turn counter-clockwise (radians) and of the scale.
     residual_m : float
-        Root mean square of what it leaves over the corners: a distortion that is no similarity.
+        Root mean square of its residuals at the corners: a distortion that is no similarity.
     """
 
     about: FloatArray
@@ -54,7 +54,7 @@ class Displacement:
         return math.sqrt(self._squares(corners) @ self._parameters**2)
 
     def sigma_over(self, corners: FloatArray) -> float:
-        """Return the standard deviation of what its errors move points of such a frame by, metres."""
+        """Return the standard deviation of the displacement of points of such a frame due to its errors, metres."""
         return math.sqrt(self._squares(corners) @ np.diag(self.covariance))
 
     @property
@@ -75,8 +75,8 @@ class Displacement:
 def measure(start: FloatArray, end: FloatArray, end_covariance: FloatArray) -> Displacement:
     """Fit the similarity that takes the corners (4, 2) of a frame from `start` to `end`.
 
-    By least squares that heed the corners' errors: what the roads of a frame hardly determine, such as the far corner
-    of one that shows roads on one side only, hardly counts.
+    By least squares weighted by the corners' errors: a corner that the roads hardly determine, such as the far one
+    of a frame with roads on one side only, hardly counts.
 
     Parameters
     ----------

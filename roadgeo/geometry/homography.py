@@ -32,11 +32,11 @@ class Homography:
         return np.asarray(mapped[..., :2] / mapped[..., 2:])
 
     def ahead(self, xy: FloatArray) -> BoolArray:
-        """Tell which of (..., 2) points lie on this side of the horizon."""
+        """Return which of (..., 2) points lie on this side of the horizon."""
         return np.asarray(self.w(xy) > 0)
 
     def w(self, xy: FloatArray) -> FloatArray:
-        """Return what the coordinates of where (..., 2) points come to lie are divided by, (...,)."""
+        """Return the denominators w of the images of (..., 2) points, (...,)."""
         return np.asarray(self._homogeneous(xy)[..., 2])
 
     def _homogeneous(self, xy: FloatArray) -> FloatArray:

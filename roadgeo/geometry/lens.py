@@ -1,7 +1,7 @@
 """Radial distortion by a lens: where a pinhole camera would have put what a lens shows.
 
-One parameter, k1: what a pinhole puts at distance r from the middle of the frame, in halves of its longer side, a lens
-puts at r (1 + k1 r^2) in the same direction. k1 < 0 is a barrel, k1 > 0 a pincushion.
+One parameter, k1: the image of a pinhole at distance r from the middle of the frame, in halves of its longer side,
+moves to r (1 + k1 r^2) in the same direction. k1 < 0 is a barrel, k1 > 0 a pincushion.
 """
 
 from __future__ import annotations
@@ -15,7 +15,7 @@ from roadgeo._arrays import FloatArray
 
 __all__ = ["Lens"]
 
-#: A barrel folds over where r (1 + k1 r^2) no longer grows; nothing is seen so far out.
+#: A barrel folds over where r (1 + k1 r^2) no longer grows; nothing is visible beyond.
 _UNFOLDED = 0.98
 _NEWTON_STEPS = 8
 

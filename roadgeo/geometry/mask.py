@@ -47,7 +47,7 @@ class RoadMask:
     observed : (H, W) bool or None
         False where nothing is known (nodata, alpha 0, the black corners of a warped image). None: all observed.
     name : str
-        What the user calls it (the path as given).
+        Name for messages (the path as given).
     probability : (H, W) uint8 or None
         254 times the probability of road, where the mask was made of that; 255 where nothing is known.
     """
@@ -58,7 +58,7 @@ class RoadMask:
     probability: AnyArray | None = None
 
     def __repr__(self) -> str:
-        """Say in one line what it is."""
+        """Describe the mask in one line."""
         height, width = self.roads.shape
         return f"<RoadMask {self.name!r}: {width} x {height} pixels, {self.roads.mean():.1%} road>"
 

@@ -1,4 +1,4 @@
-"""What a pinhole camera above a plane sees of it."""
+"""The view of a pinhole camera above a plane."""
 
 from __future__ import annotations
 

@@ -1,12 +1,12 @@
 """Where the camera was and how it pointed, from where the corners of its frame lie on the ground, with covariance.
 
-Four points determine a homography, so the corners of a frame and their covariance hold all that it says of the camera.
+Four points determine a homography, so the corners of a frame and their covariance hold all information on the camera.
 A pinhole with square pixels whose axis meets the middle of the frame, above level ground, has six unknowns, or seven
 with its focal length. They are fitted to the corners by least squares, each corner weighed as its errors demand.
 
 Looking straight down, focal length and height cannot be told apart: a lens half as long at half the height sees the
-same. So an unknown focal length has a prior, that of usual lenses; what the homography does not tell keeps the prior's
-width, and so does the height. What is adjusted is chosen so that the focal length, where the view hardly tells it,
+same. So an unknown focal length has a prior, that of usual lenses; where the homography does not determine it, it keeps
+the prior's width, and so does the height. The parameters are chosen so that a focal length that is hardly determined
 changes without the others: where the axis meets the ground, metres per pixel there, and tilt per focal length. With
 position and angles themselves the sum of squares has a long, bent valley, in which an adjustment hardly moves.
 
@@ -37,7 +37,7 @@ __all__ = ["Pose", "PoseOptions", "find_pose", "omega_phi_kappa", "quaternion", 
 
 @dataclass(frozen=True)
 class PoseOptions:
-    """What is known of the lens.
+    """Prior knowledge of the lens.
 
     Attributes
     ----------
@@ -48,7 +48,7 @@ class PoseOptions:
     usual_sigma : float
         Standard deviation of the log of a usual focal length: between 35 and 85 degrees across the diagonal.
     told_sigma : float
-        The homography tells the focal length where its log is as sure as that.
+        The homography counts as determining the focal length if its log has this standard deviation or less.
     """
 
     focal_px: float | None = None
@@ -73,7 +73,7 @@ class Pose:
     focal_px, focal_sigma_px : float
         Focal length and its standard deviation: 0 where it was given.
     source : str
-        What it rests on: a "camera" that was given, the "homography", or a usual lens that is "assumed".
+        Origin of the focal length: the given "camera", the "homography", or a usual lens that is "assumed".
     """
 
     position: FloatArray
@@ -234,7 +234,7 @@ def _angles(rotation: FloatArray) -> FloatArray:
 
 
 def turned(rotation: FloatArray, clockwise_deg: float) -> FloatArray:
-    """Return a rotation counted from a north that lies so far clockwise of the plane's y axis."""
+    """Return a rotation counted from a north that lies this angle clockwise of the plane's y axis."""
     return _rotation(np.array([0.0, 0.0, math.radians(clockwise_deg)])) @ rotation
 
 

@@ -43,7 +43,7 @@ _UPS_NORTH, _UPS_SOUTH = 84.0, -80.0
 _UTM_HALF_WIDTH_DEG = 4.5
 
 #: A source's own CRS is kept up to these: UTM at 4.5 degrees reaches 0.27 %, national grids 0.1-0.4 %. A degree of
-#: angular distortion is what tangents measure at best; half of it is not noticed.
+#: Angular distortion as small as the best tangents measure; half of it goes unnoticed.
 _MOST_SCALE_ERROR, _MOST_ANGLE_DEG = 0.004, 0.5
 
 
@@ -131,7 +131,7 @@ def serves_as_plane(crs: str, lonlat: FloatArray) -> bool:
     axes = {(axis.direction, axis.unit_name) for axis in known.axis_info[:2]}
     if not known.is_projected or axes != {("east", "metre"), ("north", "metre")}:
         return False
-    # Steps of 100 m on the ellipsoid, measured in the CRS: this needs no trust in what a projection says of itself.
+    # Steps of 100 m on the ellipsoid, measured in the CRS: independent of the metadata of the projection.
     some = lonlat[:: max(len(lonlat) // 200, 1)]
     lon, lat = np.concatenate((some, lonlat[lonlat.argmin(axis=0)], lonlat[lonlat.argmax(axis=0)])).T
     steps = []

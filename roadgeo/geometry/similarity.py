@@ -1,8 +1,8 @@
 """Did the camera look straight down? Then it saw the ground turned, scaled and moved, and nothing else.
 
 A homography has eight parameters, a similarity four. Where an image shows few roads, the other four are noise, and
-where it shows none they bend the frame by metres. They are kept only if the corners' covariance says that they are
-there. Where it nearly says so, what was set aside may be there for all that, and the result is as unsure.
+where it shows none they bend the frame by metres. They are kept only if they are significant by the corners'
+covariance. Where they nearly are, they may be real even so, and the uncertainty of the result includes them.
 """
 
 from __future__ import annotations
@@ -26,7 +26,7 @@ _MOST = 13.28
 class Similarity(NamedTuple):
     """A similarity as a homography (3, 3), and the covariance (8, 8) of where it puts the corners.
 
-    `doubt` (8, 8) is to be added to that where nobody knows that the camera looked straight down: what was set aside
+    `doubt` (8, 8) is added to that where the camera may not have looked straight down: the parameters set aside
     counts as an error, weighed by the share of level views of which less has to be. Of 958 frames tilted by up to 60
     degrees five were taken for level, and without it were off by two to ten times what was claimed.
     """
@@ -37,9 +37,9 @@ class Similarity(NamedTuple):
 
 
 def find_similarity(homography: FloatArray, corners: FloatArray, corner_covariance: FloatArray) -> Similarity | None:
-    """Return the similarity that a homography cannot be told from; None where it can.
+    """Return the similarity that is consistent with a homography; None where there is none.
 
-    Generalised least squares of the corners' places on the four parameters; the weighted sum of what remains is
+    Generalised least squares of the corners' places on the four parameters; the weighted sum of squared residuals is
     chi-squared with four degrees of freedom if the camera looked straight down.
 
     Parameters

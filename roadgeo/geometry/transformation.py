@@ -1,6 +1,6 @@
-"""How exactly positions are taken from one CRS to another: a change of datum is an estimate, good to what PROJ says.
+"""Accuracy of transformations between CRS: a change of datum is an estimate, with an accuracy that PROJ states.
 
-The best ways need grids, which pyproj's wheels do not bring. Without them PROJ takes a coarser way, and says nothing.
+The best transformations need grids, which pyproj's wheels do not bring. Without them PROJ silently uses a coarser one.
 """
 
 from __future__ import annotations
@@ -40,7 +40,7 @@ class Exactness(NamedTuple):
     better_m: float = math.nan
 
     def told(self, what: str) -> str:
-        """Say how exact `what` are, and how to better that; "" where nothing is missing."""
+        """Return a sentence on the accuracy of `what`, and the remedy; "" where nothing is missing."""
         if not self.grids:
             return f"{what} are not known how exact: PROJ knows no way from datum to datum" * math.isnan(self.sigma_m)
         named, one = " and ".join(self.grids), len(self.grids) == 1
@@ -75,7 +75,7 @@ def _exactness(source: str, target: str, lon: float, lat: float) -> Exactness:
 
     south, north = max(lat - _AROUND_DEG, -90.0), min(lat + _AROUND_DEG, 90.0)
     around = AreaOfInterest(lon - _AROUND_DEG, south, lon + _AROUND_DEG, north)
-    with warnings.catch_warnings(action="ignore"):  # that the best way is missing is told better here
+    with warnings.catch_warnings(action="ignore"):  # our own message on the missing grid is clearer
         group = TransformerGroup(one, other, always_xy=True, area_of_interest=around)
     best = group.transformers[0].accuracy if group.transformers else -1.0
     sigma = best if best >= 0.0 else math.nan

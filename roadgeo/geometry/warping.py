@@ -22,7 +22,7 @@ Transform: TypeAlias = Callable[[FloatArray], FloatArray] | None
 
 #: OpenCV addresses pixels with 16-bit integers while warping, so an image is drawn in blocks of this size.
 BLOCK = 8192
-#: Where an image lies is computed at every so many pixels, the first at which values between are as good as exact.
+#: Step in pixels between exact positions of an image: the largest whose interpolation is as good as exact.
 _NODE_STEPS, _NODE_ERROR_PX = (64, 16, 4), 0.005
 _PER_SIDE = 33  # points on each side of an image's outline
 

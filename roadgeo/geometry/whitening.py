@@ -8,14 +8,14 @@ from roadgeo._arrays import FloatArray
 
 __all__ = ["whitener"]
 
-#: Variances less than this part of the greatest cannot be told from errors of rounding.
+#: Variances below this part of the greatest are errors of rounding.
 _LEAST = 1e-14
 
 
 def whitener(covariance: FloatArray) -> FloatArray:
     """Return W (N, N) that makes errors of a covariance (N, N) independent, each of variance 1: W' W is its inverse.
 
-    Of corners seen towards the horizon, variances differ by so much that rounding makes some negative; they are raised.
+    Variances of corners towards the horizon differ by orders of magnitude; those that rounding made negative are raised.
     """
     variances, directions = np.linalg.eigh(covariance)
     return np.asarray((directions / np.sqrt(np.maximum(variances, _LEAST * variances[-1]))).T)

@@ -54,7 +54,7 @@ __all__ = [
     "write_reference",
 ]
 
-#: What an index file holds: plain values, and arrays by name.
+#: Content of an index file: plain values, and arrays by name.
 IndexParts: TypeAlias = tuple[Mapping[str, Any], Mapping[str, AnyArray]]
 
 #: "no GeoPackage": an index alone, which serves as well. "old format": an index of an earlier roadgeo, and a GeoPackage
@@ -101,7 +101,7 @@ def write_reference(
     parts : (meta, arrays)
         The index of that network.
     say : Say
-        Told how much of the GeoPackage is written.
+        Called with the share of the GeoPackage that is written.
 
     Raises
     ------
@@ -155,7 +155,7 @@ def open_reference(
         try:
             return _open(paths, rebuild)
         except IndexFormatError as error:
-            # Another process may have replaced the reference meanwhile: what we saw was half the old one, half the new.
+            # Another process may have replaced the reference meanwhile: half the old one was read, half the new.
             # Equal files before and after are no proof, for an index may have come and gone between; twice is.
             if _identities(paths) == before == failed:
                 # But a third may have built the old index beside the new GeoPackage, which a busy writer will replace.
@@ -200,7 +200,7 @@ def rebuild_index(path: str | os.PathLike[str], build: Callable[[RoadNetwork], I
 
 
 def reference_freshness(path: str | os.PathLike[str]) -> Freshness:
-    """Tell whether the index is that of the GeoPackage beside it.
+    """Return whether the index is that of the GeoPackage beside it.
 
     Raises
     ------
@@ -310,7 +310,7 @@ def _rebuild(paths: ReferencePaths, rebuild: Callable[[RoadNetwork], IndexParts]
 
 
 def _identities(paths: ReferencePaths) -> list[tuple[int, int] | None]:
-    """Return what tells each file from one that replaces it; None where there is none."""
+    """Return an identity of each file, which changes when it is replaced; None where there is none."""
     found: list[tuple[int, int] | None] = []
     for path in (paths.geopackage, paths.index):
         try:
@@ -370,7 +370,7 @@ def _row_counts(path: Path) -> dict[str, int]:
 
 
 def _check_geopackage(path: Path) -> tuple[RoadNetwork | None, list[str]]:
-    """Read all of a GeoPackage; the network, if it is one, and what is wrong with it."""
+    """Read all of a GeoPackage; return the network, if it is one, and the fault, if there is one."""
     try:
         with open_read_only(path) as database:
             notes = [note for (note,) in database.execute("PRAGMA integrity_check")]
@@ -389,7 +389,7 @@ def _check_geopackage(path: Path) -> tuple[RoadNetwork | None, list[str]]:
 
 
 def _check_content(path: Path, network: RoadNetwork | None) -> list[str]:
-    """Check that an undamaged index is one that the search can use, and what its GeoPackage gives."""
+    """Check that the search can use an undamaged index, and compare it with its GeoPackage."""
     from roadgeo.matching.index import IndexOptions, ReferenceIndex, build_index, check_table
 
     def are_options(stored: Any) -> bool:

@@ -3,18 +3,18 @@
 Layout, all numbers little-endian::
 
     64 bytes      magic, format version, manifest size, digest of those and the manifest
-    manifest      JSON: what the file is and where everything lies; enough for `info`, which unpickles nothing
+    manifest      JSON: kind of file and all offsets; enough for `info`, which unpickles nothing
     data section  (starts at the next multiple of 64, offsets count from here)
         pickle    protocol 5, plain dict/list/str/int/float/bool/None only
         arrays    one after another, each at a multiple of 64
 
-What is trusted: nothing. A file is refused (`IndexFormatError`) unless its sizes agree, every range lies inside it,
+Trust: none. A file is refused (`IndexFormatError`) unless its sizes agree, every range lies inside it,
 nothing overlaps, types are known, and the digests of header and pickle and the checksums of all arrays agree. That
 finds damage. A forger can make digests agree, so against hostility the unpickler knows no names and is shown only
 opcodes that can neither call nor refer back, and the owner of the arrays checks their integer references before a
 kernel follows them.
 
-How it is upgraded: never. The GeoPackage beside an index is what lasts: its schema ("roadgeo.reference/1") is read by
+Upgrades: none. The GeoPackage beside an index lasts: its schema ("roadgeo.reference/1") is read by
 every later roadgeo, and holds the roads, the intersections and the options that the index is built from, in seconds. So
 `FORMAT_VERSION` goes up whenever the file or the arrays in it change, and a reader refuses every version but its own:
 
@@ -56,7 +56,7 @@ __all__ = [
     "write_index",
 ]
 
-#: See the module's docstring for when it goes up, and what becomes of other versions.
+#: See the module's docstring for when it goes up, and how other versions are handled.
 FORMAT_VERSION = 4
 
 _MAGIC = b"\x89roadgeo index\r\n"
@@ -84,7 +84,7 @@ def write_index(
     Parameters
     ----------
     path : path
-        Replaced when it exists; readers that have it open keep what they have.
+        Replaced when it exists; readers keep the old file that they have open.
     meta : dict
         Plain values (dict with str keys, list, str, 64-bit int, float, bool, None) that the arrays' owner needs back.
     arrays : mapping of str to ndarray
@@ -146,7 +146,7 @@ def read_format_version(path: str | os.PathLike[str]) -> int:
 
 
 def read_manifest(path: str | os.PathLike[str]) -> dict[str, Any]:
-    """Read what an index file says of itself; nothing is unpickled and no array is touched.
+    """Read the manifest of an index file; nothing is unpickled and no array is touched.
 
     Returns
     -------
@@ -231,7 +231,7 @@ def _refuse(path: str | os.PathLike[str], what: str, cause: Exception | None = N
 
 
 def remedy(path: str | os.PathLike[str]) -> str:
-    """Say how an index that cannot be used is had again: what to type where its GeoPackage lies beside it."""
+    """Return how to replace an index that cannot be used: the command, where its GeoPackage lies beside it."""
     geopackage = Path(path).with_suffix(".gpkg")
     if geopackage.is_file():
         return f"build it again from its GeoPackage: roadgeo index --rebuild {shlex.quote(os.fspath(geopackage))}"
@@ -303,7 +303,7 @@ def _parse_version(data: mmap.mmap, path: str | os.PathLike[str]) -> int:
 
 
 def _parse_manifest(data: mmap.mmap, path: str | os.PathLike[str]) -> tuple[dict[str, Any], int]:
-    """Validate everything the file says of itself; the manifest and where the data section starts."""
+    """Validate the header and the manifest; return the manifest and the start of the data section."""
     version = _parse_version(data, path)
     _, _, size, digest = _PREAMBLE.unpack_from(data)
     if version != FORMAT_VERSION:
@@ -331,7 +331,7 @@ def _is_count(value: object) -> TypeGuard[int]:
 
 
 def _manifest_problem(manifest: Any, size: int) -> str:
-    """Tell what is wrong with a parsed manifest of a file whose data section has `size` bytes; '' when nothing is."""
+    """Return the fault of a parsed manifest of a file whose data section has `size` bytes; '' when there is none."""
     expected = {"format": int, "roadgeo": str, "about": dict, "size": int, "pickle": dict, "arrays": list}
     if type(manifest) is not dict or any(type(manifest.get(key)) is not kind for key, kind in expected.items()):
         return f"expected an object with {', '.join(expected)}"
@@ -348,7 +348,7 @@ def _manifest_problem(manifest: Any, size: int) -> str:
 
 
 def _arrays_problem(entries: list[Any], end: int, size: int) -> str:
-    """Tell what is wrong with the array entries, which must follow each other from `end` to `size`; '' if nothing."""
+    """Return the fault of the array entries, which must follow each other from `end` to `size`; '' if there is none."""
     if len(entries) > _MAX_ARRAYS:
         return f"expected at most {_MAX_ARRAYS} arrays, got {len(entries)}"
     names = set()

@@ -1,4 +1,4 @@
-"""What is known of a reference and whether it is sound, be it one piece or in shards."""
+"""Description and verification of a reference, in one piece or in shards."""
 
 from __future__ import annotations
 

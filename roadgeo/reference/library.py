@@ -1,4 +1,4 @@
-"""The reference library: references by name, in the user's data folder (or where `ROADGEO_LIBRARY` says)."""
+"""The reference library: references by name, in the user's data folder (or that of `ROADGEO_LIBRARY`)."""
 
 from __future__ import annotations
 

@@ -1,6 +1,6 @@
 """A road network as an OGC GeoPackage: `REF.gpkg`, styled for QGIS, and back.
 
-Layers: `intersections` (what the index is built from), `tangents` (short lines, to look at), `roads` (the noded
+Layers: `intersections` (the input of the index), `tangents` (short lines, to look at), `roads` (the noded
 network), `coverage` (where the map knows roads at all), and the table `roadgeo_meta`: JSON values by key, those of the
 program itself under `roadgeo.`. Angles are stored in degrees, counterclockwise from east.
 """
@@ -96,7 +96,7 @@ BEGIN
 END;
 """
 
-# The standard's metadata extension (clause 2.4): what GDAL and QGIS show as the file's provenance.
+# The standard's metadata extension (clause 2.4): GDAL and QGIS show it as the file's provenance.
 _METADATA_SCHEMA = """
 CREATE TABLE gpkg_metadata (
     id INTEGER CONSTRAINT m_pk PRIMARY KEY ASC NOT NULL, md_scope TEXT NOT NULL DEFAULT 'dataset',
@@ -114,7 +114,7 @@ INSERT INTO gpkg_extensions VALUES
 
 
 def as_stored(network: RoadNetwork) -> RoadNetwork:
-    """Round positions to what the GeoPackage gives back, at most some nanometres away.
+    """Round positions to the resolution of the GeoPackage, at most some nanometres away.
 
     An index built from the result is identical to one built from the file later.
     """
@@ -197,7 +197,7 @@ def read_network(path: str | os.PathLike[str]) -> RoadNetwork:
 
 
 def not_a_reference(path: str | os.PathLike[str]) -> IndexFormatError:
-    """Return the error for a file that is something else, roads perhaps: it says how to build a reference of them."""
+    """Return the error for another kind of file, roads perhaps: it explains how to build a reference of them."""
     reference = Path(path).with_name(f"{Path(path).name.split('.')[0]}_reference.gpkg")
     return IndexFormatError(
         f"{os.fspath(path)} is no reference; if it holds roads, build one: "
@@ -283,7 +283,7 @@ def ring_area(ring: FloatArray) -> float:
 def _map_layers(network: RoadNetwork) -> list[Layer]:
     """Layers in the order in which they are drawn, the lowest first."""
     graph, found, plane = network.graph, network.intersections, network.plane
-    # Each: name, kind of geometry, geometries, columns, CRS, style, what it is.
+    # Each: name, kind of geometry, geometries, columns, CRS, style, description.
     return [
         Layer(
             "coverage",
@@ -329,7 +329,7 @@ def _map_layers(network: RoadNetwork) -> list[Layer]:
 
 
 def _labels(network: RoadNetwork) -> dict[str, list[str | None]]:
-    """Columns of what is known of the streets; text, NULL where nothing is."""
+    """Columns of names and kinds of the streets; text, NULL where there is none."""
     known = {"name": network.names, "highway": network.kinds}
     return {key: [text or None for text in column.tolist()] for key, column in known.items() if column is not None}
 
@@ -403,7 +403,7 @@ def _plane(path: str | os.PathLike[str], meta: Mapping[str, Any]) -> LocalPlane:
 
 
 def _texts(table: Mapping[str, Sequence[Any]], name: str) -> AnyArray | None:
-    """One column of text, "" for what is none; None where there is no such column."""
+    """One column of text, "" for any other value; None where there is no such column."""
     if name not in table:
         return None
     return np.array([value if isinstance(value, str) else "" for value in table[name]], object)

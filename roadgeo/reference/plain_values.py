@@ -15,7 +15,7 @@ __all__ = ["MAX_PICKLE", "PlainUnpickler", "dump_plain", "load_plain", "require_
 MAX_PICKLE = 1 << 20
 _MAX_DEPTH = 16
 
-# Opcodes of a protocol-5 pickle of plain values, written without a memo, by the size of what follows them. None looks
+# Opcodes of a protocol-5 pickle of plain values, written without a memo, by the size of their arguments. None looks
 # up a name, calls, or refers back; and without back references what comes out is a tree in proportion to the pickle.
 _OPCODES = {
     pickle.PROTO: 1,

@@ -1,4 +1,4 @@
-"""References: what they are built of and with, and how they are opened and built again."""
+"""References: how they are built, opened and built again."""
 
 from __future__ import annotations
 
@@ -58,18 +58,18 @@ class Reference:
     network: RoadNetwork | None = None
 
     def __repr__(self) -> str:
-        """Say in one line what it is."""
+        """Describe the reference in one line."""
         lies = self.index.path or "not written"
         return f"<Reference {self.name!r}: {len(self.index):,} intersections, {self.index.meta['crs']}, {lies}>"
 
     @property
     def name(self) -> str:
-        """What the user calls it."""
+        """Its name for the user."""
         return self.index.name
 
     @property
     def parts(self) -> tuple[Part, ...]:
-        """What is searched: itself."""
+        """The references to search: itself."""
         return (Whole(self.index),)
 
     def index_of(self, location: Location) -> ReferenceIndex:  # noqa: ARG002 (that of the one piece there is)
@@ -132,12 +132,12 @@ def build_network(
 
 
 def stored_options(network: RoadNetwork) -> BuildOptions:
-    """Return the options that a network was built with; the defaults for those that it does not tell.
+    """Return the options that a network was built with; the defaults for those that are not stored.
 
     Raises
     ------
     IndexFormatError
-        It tells what cannot be: its file was made elsewhere, or changed.
+        A stored value is impossible: the file was made elsewhere, or changed.
     """
     stored = network.meta.get("options", {})
     return BuildOptions(
@@ -216,7 +216,7 @@ def rebuild_reference(path: str | Path, say: Say = say_nothing) -> Reference:
 
 
 def _index_builder(path: str | Path, say: Say) -> Callable[[RoadNetwork], tuple[dict[str, Any], dict[str, AnyArray]]]:
-    """Return what builds the index of a reference's network with the options that are stored in that."""
+    """Return the function that builds the index of a network with the options that are stored in it."""
 
     def build(network: RoadNetwork) -> tuple[dict[str, Any], dict[str, AnyArray]]:
         what = f"building the index of {Path(path).stem} again"

@@ -64,7 +64,7 @@ def fetch_shard(folder: Path, build: str, name: str) -> bool:
         It cannot be fetched.
     """
     source = folder / _SOURCE
-    # Any other folder may be a stranger's, and so may be what a file in it says.
+    # Any other folder may be a stranger's, and so may the URLs in its files.
     if folder.resolve().parent != _kept().resolve() or not source.is_file():
         return False
     target = folder / build / f"{name}.index"
@@ -75,7 +75,7 @@ def fetch_shard(folder: Path, build: str, name: str) -> bool:
 
 
 def _kept() -> Path:
-    """Return the folder of what was fetched."""
+    """Return the folder of fetched files."""
     return cache_dir() / "shards"
 
 
@@ -101,7 +101,7 @@ def _fetch(url: str, target: Path) -> None:
 
 @cache
 def _redirects() -> Any:
-    """Return what has aiohttp follow a redirect only to https or within one server, never into a network behind it."""
+    """Return options by which aiohttp follows a redirect only to https or within one server, never into its network."""
     import aiohttp
     from yarl import URL
 

@@ -30,7 +30,7 @@ class ShardBox:
 
 
 def plan_shards(n_segments: Mapping[Cell, int], size: float, most: float, least_cells: int = 1) -> list[ShardBox]:
-    """Cut the ground into boxes with at most about so many segments each; one without roads is left out.
+    """Cut the ground into boxes with at most about `most` segments each; one without roads is left out.
 
     Parameters
     ----------
@@ -41,7 +41,7 @@ def plan_shards(n_segments: Mapping[Cell, int], size: float, most: float, least_
     most : float
         Segments in a box, unless it is a single cell.
     least_cells : int
-        No box is cut into narrower ones than so many cells.
+        Least width of a box, in cells.
     """
     cells = np.array(sorted(n_segments), np.int64).reshape(-1, 2)
     counts = np.array([n_segments[x, y] for x, y in cells.tolist()], np.int64)

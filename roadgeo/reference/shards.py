@@ -7,8 +7,8 @@ Layout of `NAME.shards`::
     BUILD/coarse.gpkg  and coarse.index: the main roads of all the ground in one piece, drawn as large pixels show them
 
 Each shard has ground of its own and, around it, a margin that its neighbours have, too: a frame whose middle lies on
-its own ground lies on it wholly, as long as half of the frame's diagonal is no longer than the margin. What the
-manifest says of a shard is enough not to open it.
+its own ground lies on it wholly, as long as half of the frame's diagonal is no longer than the margin. The
+manifest describes a shard well enough to decide whether it must be opened.
 """
 
 from __future__ import annotations
@@ -59,13 +59,13 @@ ENDING = ".shards"
 _MANIFEST = "manifest.json"
 _MAX_MANIFEST = 256 << 20
 
-#: What a folder or a shard may be called: nothing that leads elsewhere.
+#: Names that a folder or a shard may have: none leads elsewhere.
 _NAME = re.compile(r"[\w-]{1,80}")
 
 
 @dataclass(frozen=True)
 class ShardEntry:
-    """What a manifest says of a shard.
+    """A shard as its manifest describes it.
 
     Attributes
     ----------
@@ -122,12 +122,12 @@ def _is_number(value: object) -> bool:
 
 @dataclass(frozen=True)
 class Manifest:
-    """What a sharded reference is made of.
+    """The manifest of a sharded reference.
 
     Attributes
     ----------
     build : str
-        Name of the folder of its shards: a digest of what they were built from, and how.
+        Name of the folder of its shards: a digest of their sources and options.
     crs : str
         That the roads came in.
     margin_m : float
@@ -286,12 +286,12 @@ class ShardedReference:
 
     @property
     def parts(self) -> tuple[Shard, ...]:
-        """What is searched: the coarse map, if there is one, and the shards."""
+        """The references to search: the coarse map, if there is one, and the shards."""
         return self.shards if self.coarse is None else (self.coarse, *self.shards)
 
     @property
     def name(self) -> str:
-        """What the user calls it."""
+        """Its name for the user."""
         return self.manifest.name
 
     def only(self, names: Collection[str]) -> ShardedReference:

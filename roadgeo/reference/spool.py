@@ -1,7 +1,7 @@
 """Road lines on disk by cells of a grid: written as they come from sources of any size, read for any box.
 
 A cell has one file, a row of blocks: number of lines, of coordinates and of bytes of text, the lines' numbers, how many
-coordinates each has, those, and what each is called and its kind as JSON. A line is stored in every cell that it
+coordinates each has, those, and the name and kind of each as JSON. A line is stored in every cell that it
 touches, and read once.
 """
 
@@ -42,7 +42,7 @@ class Spool:
     Attributes
     ----------
     n_segments : dict of cell to int
-        Straight pieces of lines that begin there: what roads there are.
+        Straight pieces of lines that begin there: the amount of roads.
     """
 
     def __init__(self, folder: Path, size: float) -> None:

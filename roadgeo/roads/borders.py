@@ -1,4 +1,4 @@
-"""What a scan shows besides its map: solid margins, the line around the map, and captions beyond it.
+"""Parts of a scan beyond its map: solid margins, the line around the map, and captions outside it.
 
 All of it would be taken for roads. A margin is solid along a whole side. The line around a map (its neat line) is
 straight over most of the sheet, on three sides at least, and no road crosses it: a street as straight has others that
@@ -34,9 +34,9 @@ class BorderOptions:
     most_crossed : float
         Share of it where there may be road just beyond it.
     least_sides : int
-        So many sides must have a line.
+        Number of sides that must have a line.
     least_marks : int
-        A caption has so many marks.
+        Number of marks in a caption.
     max_mark : float
         Each is no wider than this share of the sheet.
     max_side : int
@@ -63,7 +63,7 @@ class _Line:
 
 
 def find_border(roads: BoolArray, road_width_px: float, options: BorderOptions | None = None) -> BoolArray | None:
-    """Return which pixels of a sheet lie on its map, (H, W) bool; None where nothing tells that some do not.
+    """Return which pixels of a sheet lie on its map, (H, W) bool; None where all of them may.
 
     Parameters
     ----------

@@ -1,4 +1,4 @@
-"""Road intersections with their branches and tangents: what the matcher sees of a road network."""
+"""Road intersections with their branches and tangents: the matcher's view of a road network."""
 
 from __future__ import annotations
 

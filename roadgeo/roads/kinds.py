@@ -1,4 +1,4 @@
-"""Which roads a mask would show: kinds of road by OpenStreetMap's `highway` tag and what other maps make of it."""
+"""Roads that a mask would show: kinds by OpenStreetMap's `highway` tag and the equivalents of other maps."""
 
 from __future__ import annotations
 
@@ -53,7 +53,7 @@ def highways(kind: RoadKind) -> list[str] | None:
 
 
 def drives(values: AnyArray, kind: RoadKind) -> BoolArray:
-    """Say which lines are roads of a kind.
+    """Return which lines are roads of a kind.
 
     Parameters
     ----------
@@ -81,7 +81,7 @@ def main_ranks(values: AnyArray) -> IntArray:
 
 
 def in_tunnel(values: AnyArray) -> BoolArray:
-    """Say which lines run in a tunnel all the way, by values of `tunnel`, as in `drives`; (L,) bool."""
+    """Return which lines run in a tunnel all the way, by values of `tunnel`, as in `drives`; (L,) bool."""
     return _each(values, lambda names: bool(names) and names <= _TUNNELS)
 
 

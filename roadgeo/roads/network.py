@@ -30,7 +30,7 @@ class RoadNetwork:
     meta : dict
         Plain values: name, sources, attribution, options, versions.
     names, kinds : (E,) object or None
-        What the street of each road is called, and its `highway`: text, "" where that is not known; to look at.
+        Name of each road's street, and its `highway`: text, "" where that is not known; for display.
     """
 
     graph: RoadGraph

@@ -1,6 +1,6 @@
 """Ground that a mask cannot show: the black corners that a warped image leaves in its frame.
 
-A mask is black where no road is, too. What gives a warped frame away is its straight sides: beyond them lies no road
+A mask is black where no road is, too. A warped frame is recognised by its straight sides: beyond them lies no road
 at all, and along them road after road ends on the same line.
 """
 
@@ -31,10 +31,10 @@ class VoidOptions:
     min_length
         Of the line between the outermost ends, as a share of the frame's shorter side.
     wide
-        Beyond a line with so much of the frame, fewer roads need end on it: of 360 masks without a void 31 had a line
+        Beyond a line with this share of the frame, fewer roads need end on it: of 360 masks without a void 31 had one
         on which 3 roads end, and at most 0.07 of the frame lay beyond any of them.
     wide_ends
-        So many. One of 55 real masks had a line with 3 ends beside a wood, 0.33 of the frame's side long.
+        Number of those. One of 55 real masks had a line with 3 ends beside a wood, 0.33 of the frame's side long.
     wide_length
         As `min_length`, of a line with fewer than `least_ends`.
     max_cut
@@ -63,7 +63,7 @@ class _Side:
 
 
 def find_voids(roads: BoolArray, road_width_px: float, options: VoidOptions | None = None) -> BoolArray | None:
-    """Return which pixels were observed, or None where nothing says that some were not.
+    """Return which pixels were observed, or None where all of them may have been.
 
     Parameters
     ----------
@@ -158,7 +158,7 @@ def _side(points: FloatArray) -> _Side:
 
 
 def _on_frame(side: _Side, shape: tuple[int, ...]) -> bool:
-    """Tell whether a side lies along the frame, within 2 px."""
+    """Return whether a side lies along the frame, within 2 px."""
     ends = np.stack((side.start, side.start + side.length * side.along))
     gaps = np.concatenate((ends, np.array(shape[::-1]) - ends), axis=1)
     return bool((gaps.max(axis=0) < 2.5).any())

@@ -2,7 +2,7 @@
 
 Ways of a map are not split where they cross, a bridge looks like a crossing from above, two carriageways melt into one
 stripe and a roundabout into a blob. `planarize` nodes a map's lines at every crossing; `simplify` does, on a map as on
-the skeleton of a mask, what the width of the roads does to both.
+the skeleton of a mask, the merging that the width of the roads causes in both.
 """
 
 from __future__ import annotations
@@ -31,7 +31,7 @@ _PARALLEL_COS = float(np.cos(np.radians(25.0)))
 #: Of a map with more, memory that one step has freed is given back before the next needs its own.
 _MANY_EDGES = 100_000
 
-#: What lines may hold, far above any map that can be indexed: beyond it they would fill the memory.
+#: Limits on lines, far above any map that can be indexed: beyond them they would fill the memory.
 MAX_LENGTH_M = 1e10
 MAX_CELLS = 3_000_000
 MAX_PAIRS, MAX_PAIRS_PER_SEGMENT = 1_000_000, 100
@@ -39,7 +39,7 @@ MAX_PAIRS, MAX_PAIRS_PER_SEGMENT = 1_000_000, 100
 
 @dataclass(frozen=True)
 class SimplifyOptions:
-    """What the width of the roads hides. Lengths are in the units of the graph's plane (metres or pixels).
+    """Distances below which the width of the roads merges them, in units of the graph's plane (metres or pixels).
 
     Attributes
     ----------
@@ -59,7 +59,7 @@ class SimplifyOptions:
     max_passes: int = 3
 
     def times(self, factor: float) -> SimplifyOptions:
-        """Return them with lengths that are so many times as long."""
+        """Return them with all lengths multiplied by a factor."""
         lengths = ("merge_radius", "fuse_distance", "stub_length")
         return replace(self, **{name: factor * getattr(self, name) for name in lengths})
 
@@ -83,7 +83,7 @@ def planarize(lines: Sequence[LineString] | Any, grid_m: float = 0.1) -> RoadGra
     Raises
     ------
     RoadSourceError
-        There are so many crossings, or so many kilometres, that they are no roads: memory and time are bounded.
+        The number of crossings, or the total length, is implausible for roads: memory and time are bounded.
     """
     import shapely
 
@@ -140,7 +140,7 @@ def _require_mappable(lines: AnyArray) -> None:
 
 
 def _repeated(edges: Int32Array, offsets: IntArray) -> BoolArray:
-    """Tell which straight edges join the same two nodes as one before them: they differed by rounding only."""
+    """Return which straight edges join the same two nodes as one before them: they differ by rounding only."""
     straight = np.flatnonzero(np.diff(offsets) == 2)
     _, first = np.unique(np.sort(edges[straight], axis=1), axis=0, return_index=True)
     repeated = np.zeros(len(edges), bool)
@@ -178,7 +178,7 @@ def _noded(lines: AnyArray, grid: float) -> AnyArray:
 def coverage(graph: RoadGraph, cell_m: float = 150.0, gap_m: float = 600.0) -> list[FloatArray]:
     """Outline the ground where the map knows its roads, no farther than the roads themselves reach.
 
-    Covered is every cell with a road, what lies in gaps between such cells, and what they enclose; of that, what lies
+    Covered are all cells with a road, the gaps between such cells, and the areas they enclose; of that, the part
     within the convex hull of each part's roads, and a road's width around it.
 
     Parameters
@@ -247,7 +247,7 @@ def simplify(
     graph : RoadGraph
         Noded: roads meet only at nodes.
     advance : callable, optional
-        Told the share that is done, at most.
+        Called with the share that is done, at most.
 
     Returns
     -------
@@ -452,7 +452,7 @@ def _drop_stubs(graph: RoadGraph, options: SimplifyOptions) -> RoadGraph:
 def _merge(
     graph: RoadGraph, pairs: IntArray, radius: FloatArray, shortest_loop: float, drop: BoolArray | None = None
 ) -> RoadGraph:
-    """Merge pairs of nodes, nearest first, while the centres of what is merged are nearer than `radius`.
+    """Merge pairs of nodes, nearest first, while the centres of the merged groups are nearer than `radius`.
 
     Loops shorter than `shortest_loop` vanish, and so do loops among the edges to `drop`.
     """

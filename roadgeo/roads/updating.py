@@ -29,7 +29,7 @@ class UpdateOptions:
     Attributes
     ----------
     margin_m
-        Width of the strip around the area that is simplified again with what is new.
+        Width of the strip around the area that is simplified again with the fresh roads.
     tie_m
         Old and fresh roads that end this near each other at the border of the area are one.
     seam_m
@@ -56,7 +56,7 @@ def replace_area(
     ----------
     network : RoadNetwork
     lines : sequence of shapely LineString or MultiLineString
-        Fresh roads in the network's plane, metres; what lies outside `area` is not used.
+        Fresh roads in the network's plane, metres; parts outside `area` are not used.
     area : shapely Polygon or MultiPolygon
         In the network's plane, metres; see `ground_of`.
     meta : dict, optional
@@ -80,7 +80,7 @@ def replace_area(
 
 
 def ground_of(lines: Sequence[Any] | AnyArray, reach_m: float = 200.0) -> Any:
-    """Outline the ground that roads cover: they, what they enclose, and all that lies between roads near each other.
+    """Outline the ground that roads cover: they, the areas they enclose, and the gaps between roads near each other.
 
     Returns
     -------
@@ -141,7 +141,7 @@ def replace_roads(
 
 
 def _cut(whole: AnyArray, area: Any, *, inside: bool) -> AnyArray:
-    """Keep the parts of lines inside an area, or outside; what does not cross its border stays as it is."""
+    """Keep the parts of lines inside an area, or outside; lines that do not cross its border stay as they are."""
     import shapely
 
     shapely.prepare(area)

@@ -23,18 +23,18 @@ __all__ = ["Vectorization", "VectorizeOptions", "road_width", "vectorize", "widt
 #: Bands of rows that `width_by_area` looks at first, and how many road pixels they must hold.
 _BAND_ROWS, _BAND_STEP, _BAND_MIN_ROAD, _MAX_BAND_PIXELS = 48, 192, 2000, 1 << 24
 
-#: Streets run together where the width by area is so many times that by length, which it usually exceeds by so much.
+#: Streets run together where the width by area exceeds that by length by the first factor; the second is usual.
 _RUN_TOGETHER, _USUALLY_WIDER = 1.5, 1.16
 #: Specks are less deep, pixels.
 _SPECK_DEPTH = 3
 
-_MAX_DEPTH = 1000  # of a road, pixels; deeper ones are not told apart
-_STRIP_PIXELS = 1 << 24  # large masks are gone through so many pixels at a time
+_MAX_DEPTH = 1000  # of a road, pixels; the limit of the distance transform
+_STRIP_PIXELS = 1 << 24  # large masks are processed in strips of this size
 
 #: Rays in the fan before a free end (an odd number), and how many of their pixels may touch the end itself.
 _BENDS, _NEAR = 11, 2
 
-_MAX_ROUNDS = 3  # of pruning; what later ones would still find is not worth their time
+_MAX_ROUNDS = 3  # of pruning; later ones find too little for their time
 
 
 @dataclass(frozen=True)
@@ -53,7 +53,7 @@ class VectorizeOptions:
     max_pieces
         A mask that falls into more pieces of road is noise and is refused, so that time and memory are bounded.
     max_cover
-        What is traced is noise, too, where roads of its length and width would cover more than this share of the frame:
+        Traced lines are noise, too, if roads of their length and width would cover more than this share of the frame:
         those of a dense town cover 0.16.
     closing_widths, opening_widths
         Gaps up to this are closed; threads up to this are cut.
@@ -68,7 +68,7 @@ class VectorizeOptions:
     bridge_angle_deg
         How far from its own direction it may bend to get there.
     bent_widths
-        So far from a junction a skeleton is bent: the road is drawn straight there.
+        Within this distance of a junction a skeleton is bent: the road is drawn straight there.
     smoothing_widths
         Standard deviation of the smoothing along a road.
     vertex_spacing_px
@@ -95,7 +95,7 @@ class VectorizeOptions:
 
 @dataclass(frozen=True)
 class Vectorization:
-    """What was traced from a mask.
+    """The roads traced from a mask.
 
     Attributes
     ----------
@@ -104,7 +104,7 @@ class Vectorization:
     road_width_px : float
         Median road width.
     is_open : (N,) bool
-        Nodes where a road leaves the frame or the observed ground: ends of what was seen, not of the road.
+        Nodes where a road leaves the frame or the observed ground: the view ends there, not the road.
     """
 
     graph: RoadGraph
@@ -132,7 +132,7 @@ def vectorize(mask: RoadMask, options: VectorizeOptions | None = None) -> Vector
     options = options or VectorizeOptions()
     width_px = road_width(mask)
     crowded = np.ceil(np.sqrt(mask.roads.size / options.max_working_pixels))
-    # What is wider than the frame is no road; a grid much coarser than the frame would be filled up to whole cells.
+    # Nothing wider than the frame is a road; a grid much coarser than the frame would be filled up to whole cells.
     factor = int(max(min(round(width_px / options.working_width_px), *mask.shape), crowded, 1))
     width = max(width_px / factor, 1.0)
     states = _reduce(mask, factor, min(0.5, 0.45 * width_px / factor))
@@ -163,7 +163,7 @@ def _refuse_corners(states: AnyArray, name: str, options: VectorizeOptions) -> N
 
 
 def _refuse_noise(skeleton: _Skeleton, width: float, area: int, name: str, options: VectorizeOptions) -> None:
-    """Refuse, before all that takes longer, what was traced where there are no roads: hatching, halftones, noise."""
+    """Refuse lines that cannot be roads, before all slow steps: hatching, halftones, noise."""
     n_pieces, covered = len(skeleton.edges), float(skeleton.lengths.sum()) * width / area
     told = f"{n_pieces:,} pieces of road, expected at most {options.max_pieces:,}"
     if covered > options.max_cover:
@@ -178,7 +178,7 @@ def _refuse_noise(skeleton: _Skeleton, width: float, area: int, name: str, optio
 def road_width(mask: RoadMask) -> float:
     """Estimate the usual road width of a mask in pixels: by area (see `width_by_area`).
 
-    Where wide streets run together over more ground than all that can be told apart, as towards the horizon of a steep
+    Where wide streets run together over more ground than all distinct ones cover, as towards the horizon of a steep
     view, it is that of most roads by their length.
 
     Raises
@@ -197,8 +197,8 @@ def road_width(mask: RoadMask) -> float:
 def width_by_area(mask: RoadMask) -> float:
     """Estimate how wide roads are that make up a mask, in pixels: four times the mean depth of a road pixel.
 
-    Depths within a straight road are spread evenly between 0 and half its width. What is much deeper than the median
-    is no road and counts as little as a road can.
+    Depths within a straight road are spread evenly between 0 and half its width. Pixels much deeper than the median
+    are no road and count as little as a road can.
 
     Raises
     ------
@@ -249,7 +249,7 @@ def _width(counts: IntArray) -> float:
 
 
 def _width_of_half(counts: IntArray, width: float) -> float:
-    """Return the width that half of all roads have at most, by length; what is much less wide than `width` is no road.
+    """Return the width that half of all roads have at most, by length; lines much narrower than `width` are no roads.
 
     At a depth there are as many pixels as the roads that reach it are long, twice.
     """
@@ -321,7 +321,7 @@ def _morph(flags: AnyArray, operation: int, diameter: float) -> AnyArray:
 
 @dataclass(frozen=True)
 class _Skeleton:
-    """What `trace` returns; see there."""
+    """The result of `trace`; see there."""
 
     xy: FloatArray
     is_open: BoolArray

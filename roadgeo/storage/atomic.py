@@ -93,7 +93,7 @@ def publish(staged: Path, target: str | os.PathLike[str], *, replace: bool = Tru
 
 
 def _rename_to_new(staged: Path, target: Path) -> None:
-    """Give a file a name that must be free; a hard link is what tells so and takes it in one step."""
+    """Rename a file to a name that must be free; a hard link tests that and takes it in one step."""
     try:
         os.link(staged, target)
     except FileExistsError:

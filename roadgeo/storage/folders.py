@@ -11,12 +11,12 @@ from pathlib import Path
 
 __all__ = ["cache_dir", "is_private", "private_temporary_dir", "writable"]
 
-#: So many names of a temporary folder are tried before one is made that no other process will find.
+#: Names of a temporary folder to try before making one that no other process will find.
 _NAMES = 16
 
 
 def cache_dir() -> Path:
-    """Folder of what can be made again: fetched answers, machine code (`ROADGEO_CACHE` overrides).
+    """Folder of files that can be made again: fetched answers, machine code (`ROADGEO_CACHE` overrides).
 
     It need not exist yet.
 
@@ -36,7 +36,7 @@ def cache_dir() -> Path:
 
 
 def private_temporary_dir() -> Path:
-    """Make or find a temporary folder that only this user may write to: what lies in it may be executed.
+    """Make or find a temporary folder that only this user may write to: its files may be executed.
 
     Raises
     ------
@@ -55,7 +55,7 @@ def private_temporary_dir() -> Path:
 
 
 def is_private(folder: Path) -> bool:
-    """Whether a folder is this user's, and only they may write to it: what lies in it may be executed.
+    """Whether a folder is this user's, and only they may write to it: its files may be executed.
 
     Its parent may be a group's, but not everybody's, unless only owners may rename what lies there.
     """
@@ -73,7 +73,7 @@ def writable(folder: Path) -> bool:
     """Make a folder unless it is there, for this user alone; return whether files can be written to it."""
     try:
         folder.mkdir(mode=0o700, parents=True, exist_ok=True)
-        with tempfile.TemporaryFile(dir=folder):  # permission bits say nothing of read-only file systems
+        with tempfile.TemporaryFile(dir=folder):  # permission bits do not show read-only file systems
             return True
     except OSError:
         return False

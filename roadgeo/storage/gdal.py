@@ -1,7 +1,7 @@
-"""What GDAL may do with files of strangers: which drivers, no network, no files beside the one that was named.
+"""Limits on GDAL for files of strangers: few drivers, no network, no files beside the one that was named.
 
-GDAL chooses among some 150 drivers by a file's content, whatever its name. Several of them fetch what a file names from
-the network, and one (MRF) writes where a file tells it to. Rasterio and pyogrio each bring a GDAL of their own.
+GDAL chooses among some 150 drivers by a file's content, whatever its name. Several of them fetch a named file from
+the network, and one (MRF) writes to a path in the file. Rasterio and pyogrio each bring a GDAL of their own.
 """
 
 from __future__ import annotations
@@ -49,7 +49,7 @@ def skip_drivers() -> None:
 
 
 def forget_missing_proj_data() -> None:
-    """Forget where PROJ's data are said to be (another installation's, long gone) if they are not there.
+    """Unset the folder of PROJ's data (another installation's, long gone) if it does not exist.
 
     The libraries bring their own, which they would not look for. Call it before they are loaded.
     """

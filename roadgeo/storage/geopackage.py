@@ -123,7 +123,7 @@ def add_layers(
 ) -> None:
     """Make a GeoPackage of an empty database: for writers that add tables of their own to it.
 
-    `advance` is told which share of the rows is written.
+    `advance` receives the share of the rows that is written.
 
     Raises
     ------
@@ -212,7 +212,7 @@ def open_read_only(path: str | os.PathLike[str]) -> Iterator[sqlite3.Connection]
 
 @dataclass(frozen=True)
 class _Table:
-    """What a layer is before it has rows; `columns` are (name, SQL type)."""
+    """An empty layer; `columns` are (name, SQL type)."""
 
     name: str
     geometry_type: GeometryType | None
@@ -299,7 +299,7 @@ def _fill_tables(
     srs_ids: Mapping[str, int],
     advance: Callable[[float], None] = lambda _: None,
 ) -> None:
-    """Give empty tables the rows of their layers; `advance` is told which share of them is written."""
+    """Give empty tables the rows of their layers; `advance` receives the share of them that is written."""
     n_rows = [max((len(column) for column in layer.columns.values()), default=0) for layer in layers]
     indexed = {name for (name,) in database.execute("SELECT table_name FROM gpkg_extensions")}
     database.execute(f"UPDATE gpkg_contents SET last_change = {NOW}")

@@ -1,4 +1,4 @@
-"""Memory that is no longer needed, given back to the system: what libraries have freed, pages of mapped files."""
+"""Memory given back to the system: blocks that libraries have freed, pages of mapped files."""
 
 from __future__ import annotations
 
@@ -28,7 +28,7 @@ def let_pages_go(arrays: Iterable[AnyArray]) -> None:
     """Take the pages of memory-mapped arrays out of this process; those that are used come back by themselves.
 
     An index is read whole when it is opened, to sum its bytes. A search then looks at part of it. Pages that an array
-    shares with what lies beside it in the file stay.
+    shares with its neighbours in the file stay.
     """
     for array in arrays:
         mapped = _mapped_file(array)

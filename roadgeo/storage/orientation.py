@@ -1,7 +1,7 @@
-"""How a picture's file says that it is to be turned: the Orientation tag of EXIF and TIFF.
+"""Orientation of a stored picture: the tag of that name in EXIF and TIFF.
 
 Viewers, browsers, PIL's `exif_transpose` and `cv2.imread` show a picture upright; GDAL and QGIS show it as stored.
-Here pictures are upright, from `storage.rasters` on; what is written for programs that do not turn them says so.
+Here pictures are upright, from `storage.rasters` on; outputs for programs that ignore the tag use the stored order.
 https://www.cipa.jp/std/documents/e/DC-008-Translation-2019-E.pdf, 4.6.4, and TIFF 6.0, section 8.
 """
 
@@ -23,7 +23,7 @@ _TAG, _SHORT = 274, 3
 _MAX_ENTRIES = 1 << 12  # of an IFD
 _MAX_PARTS = 1 << 12  # segments or chunks before the one that holds EXIF
 
-#: What makes a stored picture upright, in this order: rows become columns, rows are taken from the bottom, columns from
+#: Steps that make a stored picture upright: rows become columns, rows are taken from the bottom, columns from
 #: the right.
 _STEPS = {
     1: (False, False, False),
@@ -38,7 +38,7 @@ _STEPS = {
 
 
 def read_orientation(path: str | os.PathLike[str]) -> int:
-    """Return what a JPEG, TIFF, PNG or WebP says of its orientation, 1 to 8; 1, upright, where it says nothing."""
+    """Return the orientation of a JPEG, TIFF, PNG or WebP, 1 to 8; 1, upright, without the tag."""
     try:
         with open(path, "rb") as file:  # noqa: PTH123 (names may hold what Path refuses)
             found = _read(file, file.read(12))

@@ -1,6 +1,6 @@
 """The one place that opens rasters of strangers.
 
-The driver follows from the file's first bytes and is the only one that GDAL may use. What lies beside the file, its
+The driver follows from the file's first bytes and is the only one that GDAL may use. Files beside the file, its
 overviews elsewhere, and the network are left alone (`storage.gdal`). A GDAL virtual raster names other files, and is
 opened only where the user allows it. Pictures that are to be turned are turned here (`storage.orientation`).
 Rasterio is imported only here and late: it takes longer than to read a mask.
@@ -77,17 +77,17 @@ _BOXES_OF_BOXES = (b"jp2h", b"res ", b"asoc", b"jpch", b"jplh")  # of JPEG 2000
 def open_raster(
     path: str | os.PathLike[str], name: str | None = None, *, is_ours: bool = False, upright: bool = True
 ) -> Iterator[DatasetReader]:
-    """Open a raster that may lack a georeference; what goes wrong while it is open is told in the same way.
+    """Open a raster that may lack a georeference; errors while it is open are raised as those of opening it.
 
     One that is to be turned (see `storage.orientation`) is turned, and its georeference with it: in memory, by another
-    driver. What is written meanwhile is written in `writing_raster`.
+    driver. Rasters to be written meanwhile are opened with `writing_raster`.
 
     Parameters
     ----------
     path : path
         A regular file, or a name in a GDAL file system (/vsizip/, /vsicurl/, ...) that the user typed.
     name : str, optional
-        What messages call it.
+        Name for messages.
     is_ours : bool
         We wrote it just now: it may be a virtual raster.
     upright : bool
@@ -171,7 +171,7 @@ def writing_raster(path: str | os.PathLike[str]) -> Iterator[None]:
 
 
 def _doubt(reason: str, path: Path) -> str:
-    """Say what may be behind an error of GDAL's, as far as something speaks for it."""
+    """Return the likely cause of an error of GDAL's, where there is evidence for one."""
     if "proj.db" in reason:
         return "; PROJ's data are missing: unset PROJ_DATA and PROJ_LIB, or install rasterio again"
     with contextlib.suppress(OSError):
@@ -271,7 +271,7 @@ def _drivers(path: Path, name: str, more: list[str]) -> list[str]:
 def _require_boxes(path: Path, name: str) -> None:
     """Refuse a JPEG 2000 whose boxes do not lie within each other: one in a header without an end, GDAL reads forever.
 
-    ISO/IEC 15444-1, I.4: four bytes of size, four of kind; size 1 means that eight more bytes tell it, 0 that the box
+    ISO/IEC 15444-1, I.4: four bytes of size, four of kind; size 1 means that eight more bytes hold it, 0 that the box
     reaches to the end of the file, which only the last may.
     """
     with path.open("rb") as file:
@@ -357,7 +357,7 @@ def _bands_first(array: AnyArray) -> AnyArray | None:
 
 
 def _orientation(dataset: DatasetReader, path: str | os.PathLike[str], remote: bool) -> int:
-    """Return how a raster is to be turned; of a remote one only GDAL tells, of JPEGs alone."""
+    """Return the orientation of a raster; for a remote one GDAL reports it, of JPEGs alone."""
     if not remote:
         return read_orientation(path)
     told = dataset.tags().get("EXIF_Orientation", "")
@@ -366,7 +366,7 @@ def _orientation(dataset: DatasetReader, path: str | os.PathLike[str], remote: b
 
 @contextmanager
 def _turned(dataset: DatasetReader, orientation: int, name: str) -> Iterator[DatasetReader]:
-    """Make an upright copy of a raster in memory, with all that it says of itself."""
+    """Make an upright copy of a raster in memory, with all its metadata."""
     import rasterio
     from rasterio.control import GroundControlPoint
     from rasterio.enums import ColorInterp, MaskFlags

@@ -1,7 +1,7 @@
 """SQLite files of strangers: only plain tables are read, in an amount of work that their size accounts for.
 
 A view may be an endless query, a generated column or a default value may be a thousand times larger than the file, and
-pages may be shared by so many branches of a tree that its rows never end.
+pages may be shared between branches of a tree until its rows never end.
 """
 
 from __future__ import annotations
@@ -13,14 +13,14 @@ from pathlib import Path
 
 __all__ = ["opened", "table_problem"]
 
-_MAX_DEFAULT = 100  # characters: what is added to every row without being stored in it
+_MAX_DEFAULT = 100  # characters: a default is added to every row without being stored in it
 _STEP = 10_000
 _STEPS, _STEPS_PER_BYTE = 20_000_000, 20  # of SQLite's machine; a row of a table takes about one for each of its bytes
 
 
 @contextmanager
 def opened(path: Path) -> Iterator[sqlite3.Connection]:
-    """Open a file read-only, for queries of bounded cost. What SQLite finds wrong is a `sqlite3.Error`."""
+    """Open a file read-only, for queries of bounded cost. Errors found by SQLite are `sqlite3.Error`."""
     # Immutable: no lock or journal file appears beside a file that lies in a read-only folder. But while QGIS edits it,
     # the latest state lies in the journal beside it, which an immutable file would not have.
     state = "" if path.with_name(f"{path.name}-wal").exists() else "&immutable=1"
@@ -50,7 +50,7 @@ def _guard(database: sqlite3.Connection, path: Path) -> None:
 
 
 def table_problem(database: sqlite3.Connection, name: str) -> str:
-    """Tell why a name is no plain table that holds all it gives; "" where it is one."""
+    """Return why a name is no plain table with stored columns; "" where it is one."""
     found = database.execute(
         "SELECT type, sql FROM sqlite_master WHERE lower(name) = lower(?) AND type IN ('table', 'view')", (name,)
     ).fetchone()
