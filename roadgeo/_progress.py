@@ -23,7 +23,7 @@ def say_nothing(text: str, share: float | None = None) -> None:
     """Ignore progress reports."""
 
 
-#: Called with the number of items, shows how many are done; yields a function that counts one more of a sort ("located").
+#: Called with the number of items, shows how many are done; yields a function that counts one more ("located").
 Counting: TypeAlias = Callable[[int], AbstractContextManager[Callable[[str], None]]]
 
 

@@ -1,1 +1,1 @@
-"""From what a user gives to files on disk: masks and photographs, looks at them, and batches in several processes."""
+"""From the user's input to files on disk: masks and photographs, looks at them, and batches in several processes."""

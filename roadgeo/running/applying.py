@@ -30,14 +30,14 @@ _MAX_BYTES = 64 << 20
 
 
 def read_location(path: str | os.PathLike[str]) -> Location:
-    """Read the place in a `*_location.json`; what it rests on is not in there.
+    """Read the place in a `*_location.json`; the matches behind it are not stored.
 
     Raises
     ------
     MaskError
         It is no such file.
     NotLocatedError
-        It tells of a mask that has no place.
+        The mask has no place.
     """
     name = os.fspath(path)
     try:
@@ -149,14 +149,14 @@ def apply_location(
     Returns
     -------
     list of Path
-        What was written; for each picture all of it or nothing.
+        The files written; for each picture all of them or none.
 
     Raises
     ------
     MaskError
         A picture cannot be read, or shows another frame.
     OutputError
-        A file cannot be written, or an output shows what a location does not tell.
+        A file cannot be written, or an output needs values that a location does not hold.
     """
     outputs = [FOOTPRINT, *find_outputs(products)]
     unfit = [one.name for one in outputs if one in (MATCHES, MATCH_POINTS) or not one.needs_place]

@@ -1,6 +1,6 @@
 """A mask that was mirrored, by a scanner or an array upside down, has no place: whether it is that is tried once.
 
-Where the user allows it, the place of the mask turned over is the answer, told for the mask as it came.
+Where the user allows it, the place of the mask turned over is the answer, in pixels of the mask as given.
 """
 
 from __future__ import annotations
@@ -20,7 +20,7 @@ from roadgeo.workflows import locate
 
 __all__ = ["ask_mirrored"]
 
-#: What a try may take, of the first sweep alone: a mask that is merely turned over is found in a tenth of it, mostly.
+#: Limits of a try, of the first sweep alone: a mask that is merely turned over is mostly found in a tenth of it.
 _WORK_LIMIT_S = 1.0
 _WORTH_A_TRY = {Reason.NOTHING_STANDS_OUT, Reason.TIME_LIMIT}
 
@@ -28,7 +28,7 @@ _WORTH_A_TRY = {Reason.NOTHING_STANDS_OUT, Reason.TIME_LIMIT}
 def ask_mirrored(
     sighting: Sighting, references: Sequence[AnyReference], options: LocateOptions, allowed: bool = False
 ) -> Sighting:
-    """Try a refused mask turned over, left to right; where that is located, the refusal says so.
+    """Try a refused mask turned over, left to right; where that is located, the refusal mentions it.
 
     It stays refused, unless mirrored masks are `allowed`: a mirrored image has no place, and only its owner knows how
     it came about. Where they are, the search for it is as thorough as for any other.
@@ -50,7 +50,7 @@ def ask_mirrored(
 def _turned_back(found: Location, refused: Location) -> Location:
     """Return the place of a mask that was located turned over, as it is of the mask itself.
 
-    The camera saw no mirrored ground, so nothing is said of it.
+    The camera saw no mirrored ground, so the answer has none.
     """
     if found.size is None or found.homography is None or found.footprint is None or found.footprint_lonlat is None:
         return refused
@@ -97,7 +97,7 @@ def _flipped(graph: RoadGraph, width: float) -> RoadGraph:
 
 
 def _told(refused: Location, found: Location) -> Location:
-    """Return the refusal with the time that the try took, and with what it found."""
+    """Return the refusal with the time and the result of the try."""
     spent, more = refused.seconds, found.seconds
     seconds = replace(
         spent,

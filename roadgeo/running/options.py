@@ -17,7 +17,7 @@ __all__ = ["BatchOptions", "ReadOptions"]
 
 @dataclass(frozen=True)
 class ReadOptions:
-    """How masks are read, and what goes with them.
+    """How masks are read, and the files beside them.
 
     Attributes
     ----------
@@ -30,7 +30,7 @@ class ReadOptions:
     exif : bool
         Take the focal length from the photograph, or else the mask.
     dem : str
-        Terrain model that says how high the ground lies under the camera; "" for none.
+        Terrain model with the height of the ground below the camera; "" for none.
     allow_mirror : bool
         Masks that were mirrored have the place that they have turned over.
     units : "auto", "pixels" or "metres"
@@ -64,7 +64,7 @@ class ReadOptions:
         return self.images.get(task.mask, task.mask if of_photograph else None)
 
     def of_query(self) -> QueryOptions:
-        """Return what concerns one query."""
+        """Return the options of one query."""
         from roadgeo.running.queries import QueryOptions
 
         return QueryOptions(
@@ -87,7 +87,7 @@ def _usual_outputs() -> OutputOptions:
 
 @dataclass(frozen=True)
 class BatchOptions:
-    """What is done with every mask of a batch.
+    """The work done for every mask of a batch.
 
     Attributes
     ----------

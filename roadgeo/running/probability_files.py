@@ -1,4 +1,4 @@
-"""Probability maps that stay beside the results of a photograph: what the segmenter saw."""
+"""Probability maps of a segmenter, which stay beside the results of a photograph."""
 
 from __future__ import annotations
 
@@ -37,7 +37,7 @@ def is_ours(path: Path) -> bool:
 
 
 def keep_probability(probability: ProbabilityMap | None, paths: OutputPaths) -> list[Path]:
-    """Write what a segmenter saw.
+    """Write the probabilities of a segmenter.
 
     Raises
     ------

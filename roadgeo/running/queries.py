@@ -1,7 +1,7 @@
-"""What a user gives to be located: a mask, a soft map of roads, a photograph, or several looks at one scene.
+"""The input of a search: a mask, a soft map of roads, a photograph, or several looks at one scene.
 
 A photograph is recognised and its roads are segmented; the probability of road is kept, and looked at with several
-thresholds and, where nobody says how large a pixel is, at several scales (`looks`).
+thresholds and, where the size of a pixel is unknown, at several scales (`looks`).
 """
 
 from __future__ import annotations
@@ -63,7 +63,7 @@ class QueryOptions:
     Attributes
     ----------
     threshold : float or None
-        Values of a mask, or probabilities, above it are road. Default: told by the values.
+        Values of a mask, or probabilities, above it are road. Default: by the histogram of the values.
     band : int or None
         The band that holds a mask, counted from 1.
     segment : "auto", "always" or "never"
@@ -71,13 +71,13 @@ class QueryOptions:
     segmenters : tuple of str
         Plugins, and files of models (.onnx); several are fused. None: the model that ships.
     class_name : str or None
-        The class of a model that is road. Default: told by their names.
+        The class of a model that is road. Default: by the names of its classes.
     fused_with : tuple of str
         Further looks at the same frame, fused with each query.
     threads : int
         Of a model; fixed, so that results are the same on every run.
     mirror : "tell", "never" or "allow"
-        Of a mask that is refused, and would be located turned over: whether that is said, not asked, or the answer.
+        For a refused mask that would be located turned over: whether that is mentioned, not tried, or the answer.
     units : "auto", "pixels" or "metres"
         Of roads that come as lines (see `sources.drawn_roads`).
     layer : str or None
@@ -85,7 +85,7 @@ class QueryOptions:
     aspect : float, "unknown" or None
         How many times a pixel of a mask is as wide as high; None: once.
     bands : (3,) tuple of int, or None
-        The red, green and blue band of a photograph, counted from 1. Default: told by their names, or the first three.
+        The red, green and blue band of a photograph, counted from 1. Default: by their names, or the first three.
     """
 
     threshold: float | None = None
@@ -148,7 +148,7 @@ def locate_query(
 
 @dataclass(frozen=True)
 class FirstLook:
-    """What is seen in a query before it is compared with any map.
+    """The roads seen in a query before it is compared with any map.
 
     Attributes
     ----------
@@ -166,7 +166,7 @@ class FirstLook:
 
 
 def look_once(path: str, gsd_m: tuple[float, float] | None, query: QueryOptions, say: Say = say_nothing) -> FirstLook:
-    """Read a mask, or find the roads of a photograph, as `locate_query` does, in as many ways as the model's card says.
+    """Read a mask, or find the roads of a photograph, as `locate_query` does, in as many ways as the model's card asks.
 
     Parameters
     ----------
@@ -207,7 +207,7 @@ def is_model(segmenter: str) -> bool:
 def _locate_lines(
     path: str, references: Sequence[AnyReference], options: LocateOptions, query: QueryOptions, how: Locate
 ) -> Sighting:
-    """Locate roads that come as lines; what their units tell of scale and north is heeded unless the user said more."""
+    """Locate roads given as lines; their units restrict scale and north unless the user gives narrower limits."""
     drawing, camera = draw_roads(path, query.units, query.layer), options.match.camera
     if drawing.unit_m is not None and camera.gsd_m == CameraOptions().gsd_m:
         known = (drawing.unit_m / 1.05, drawing.unit_m * 1.05)
@@ -291,7 +291,7 @@ class _Frame:
         where that was seen already; `most_ways` is None where there are no more.
     see : callable
         `see(scale, ways)` returns the probability of road, on the grid that roads are traced on; kept for another call.
-        Where `ways` is None each model is shown it in as many as its card says.
+        Where `ways` is None the number in each model's card applies.
     """
 
     own: tuple[int, int]
@@ -342,7 +342,7 @@ def _how_much_finer(own: tuple[int, int], scale: float) -> float:
 
 
 def _of_own_pixels(sighting: Sighting, own: tuple[int, int]) -> Sighting:
-    """Return what was found on a finer grid as it is of a photograph's own pixels, (H, W)."""
+    """Return the probability found on a finer grid at a photograph's own pixels, (H, W)."""
     if sighting.mask.shape == own:
         return sighting
     probability = None if sighting.probability is None else sighting.probability.resized(own)
@@ -361,14 +361,14 @@ def _look_at(see: Callable[[], ProbabilityMap], scale: float, query: QueryOption
     return Look(what, lambda: see().mask(threshold()), see)
 
 
-#: What models saw in whole photographs: by photograph, segmenter and scale.
+#: Probabilities of whole photographs: by photograph, segmenter and scale.
 _Tried = dict[tuple[str, str, float], ProbabilityMap]
 
 
 def _choose_scales(path: str, query: QueryOptions, camera: CameraOptions, say: Say, tried: _Tried) -> Later[float]:
     """Return the scales to try: one where the size of a pixel is known; else the one that the file states comes first.
 
-    The photograph is shown to the model when one of the others is asked for; what is seen then is put into `tried`.
+    The photograph is shown to the model when one of the others is asked for; the result is put into `tried`.
     """
     models = [name for name in query.segmenters if is_model(name)] or ([] if query.segmenters else [""])
     if not models:
@@ -406,7 +406,7 @@ def _fused_mask(path: str, query: QueryOptions) -> RoadMask | None:
 def _see(
     path: str, segmenter: str, scale: float, grid: tuple[int, int], query: QueryOptions, say: Say, ways: int
 ) -> ProbabilityMap:
-    """Return what one segmenter sees in one photograph, not much finer than a grid."""
+    """Return a segmenter's probability for one photograph, not much finer than a grid."""
     if _is_plugin(segmenter):
         return _of_mask(_call_segmenter(segmenter, path, query.threshold), segmenter)
     with open_photograph(path, query.bands) as photograph:
@@ -415,7 +415,7 @@ def _see(
 
 
 def _of_mask(mask: RoadMask, model: str) -> ProbabilityMap:
-    """Return a mask as a map of probabilities 0.9 and 0.1: it says nothing of its doubts."""
+    """Return a mask as a map of probabilities 0.9 and 0.1, for it has none of its own."""
     values = np.where(mask.roads, 229, 25).astype(np.uint8)
     if mask.observed is not None:
         values[~mask.observed] = NODATA
@@ -454,7 +454,7 @@ def _call_segmenter(name: str, path: str, threshold: float | None) -> RoadMask:
 
 
 def _on_grid(options: LocateOptions, k: float) -> LocateOptions:
-    """Return what is known of the camera in pixels of a grid k times as coarse as the photograph."""
+    """Return the camera's limits in pixels of a grid k times as coarse as the photograph."""
     camera = options.match.camera
     focal = None if camera.focal_px is None else camera.focal_px / k
     camera = replace(camera, gsd_m=(k * camera.gsd_m[0], k * camera.gsd_m[1]), focal_px=focal)

@@ -1,6 +1,6 @@
-"""Building a reference in shards: roads are streamed once onto disk, and each shard is built from what lies near it.
+"""Building a reference in shards: roads are streamed once onto disk, and each shard is built from the roads near it.
 
-Memory is bounded by what one shard needs: about 12 kB for each of its intersections, margins included. A build that is
+Memory is bounded by the need of one shard: about 12 kB for each of its intersections, margins included. A build that is
 killed goes on where it stopped, and one that is done is not done again, as long as its sources and options are the
 same.
 """
@@ -91,7 +91,7 @@ class ShardOptions:
     Attributes
     ----------
     count : int or None
-        About so many shards; None: as many as keep each at a size that is quick to build.
+        Approximate number of shards; None: as many as keep each at a size that is quick to build.
     size_m : float or None
         Side of square shards instead.
     margin_m : float
@@ -165,7 +165,7 @@ def build_shards(
 
 
 def _fingerprint(roads: RoadFiles, name: str, options: ShardOptions) -> str:
-    """Return a digest of what is built, and how: equal for the same question."""
+    """Return a digest of sources and options: equal for the same question."""
     files = [(str(file.resolve()), file.stat().st_size, file.stat().st_mtime_ns) for file in roads.files]
     asked = [files, asdict(replace(roads, paths=())), asdict(options), name, FORMAT_VERSION]
     return blake2b(json.dumps(asked).encode(), digest_size=8).hexdigest()
@@ -250,7 +250,7 @@ def _with_crs(part: RoadLines, roads: RoadFiles, file: Path) -> RoadLines:
 
 
 def _add_up(told: dict[str, Any], part: dict[str, Any]) -> None:
-    """Add the counts of a part of a source to what is told of it."""
+    """Add the counts of a part of a source to its totals."""
     for key, value in part.items():
         is_count = type(value) is int
         told[key] = told.get(key, 0) + value if is_count else value
@@ -335,13 +335,13 @@ class ShardWork:
     options: ShardOptions
 
     def prepare(self) -> Callable[[ShardBox], ShardEntry | str]:
-        """Return what builds one shard, unless it is there."""
+        """Return the builder of one shard, unless the shard exists."""
         told = json.loads((Path(self.work) / "lines.json").read_text(encoding="utf-8"))
         spool, crs = Spool(Path(self.work) / "lines", told["size"]), str(told["crs"])
         return lambda box: self._build(box, spool, crs)
 
     def give_up(self, task: ShardBox, reason: str) -> str:
-        """Say that a shard could not be built."""
+        """Report that a shard could not be built."""
         return f"shard {task.name}: {reason}"
 
     def _build(self, box: ShardBox, spool: Spool, crs: str) -> ShardEntry:
@@ -354,7 +354,7 @@ class ShardWork:
         if len(lines):
             names, kinds = labels.T if (labels != "").any() else (None, None)
             entry = self._build_reference(entry, RoadLines(lines, crs, kinds, meta={"name": box.name}, name=names), box)
-        write_bytes(done, json.dumps(asdict(entry)).encode())  # last: what it tells of is there
+        write_bytes(done, json.dumps(asdict(entry)).encode())  # last: the files that it lists exist
         return entry
 
     def _build_reference(self, entry: ShardEntry, lines: RoadLines, box: ShardBox) -> ShardEntry:

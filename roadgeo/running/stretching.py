@@ -1,7 +1,7 @@
 """A scan whose pixels are not square, or nobody knows: the mask is stretched until it is located.
 
 A facsimile, a film scanned too fast, a picture made to fit a page: along one side the ground is sampled finer than
-along the other, by a factor that nobody wrote down. No camera sees ground so, and the search looks for what one sees.
+along the other, by an unknown factor. No camera sees ground so, and the search looks for views of cameras.
 """
 
 from __future__ import annotations
@@ -35,7 +35,7 @@ def ask_stretched(
     options: LocateOptions,
     aspect: float | Literal["unknown"] = "unknown",
 ) -> Sighting:
-    """Try a mask that is not located with pixels `aspect` times as wide as high; what is located first is the answer.
+    """Try a refused mask with pixels `aspect` times as wide as high; the first that is located is the answer.
 
     Each try could agree by chance: together they pay for all of them.
     """

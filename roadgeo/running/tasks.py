@@ -19,11 +19,11 @@ __all__ = ["SUFFIXES", "Task", "find_masks", "name_tasks"]
 
 _LOG = logging.getLogger(__name__)
 
-#: What a folder is searched for.
+#: Suffixes of the files that a folder is searched for.
 SUFFIXES = (".tif", ".tiff", ".png", ".jpg", ".jpeg", ".jp2", ".bmp", ".pgm", ".webp", ".vrt", ".img", ".npy")
 
 
-#: File systems take names of 255 bytes; outputs, and what they are called while they are written, need the rest.
+#: File systems take names of 255 bytes; outputs, and their temporary names, need the rest.
 _MAX_STEM_BYTES = 180
 
 
@@ -36,14 +36,14 @@ class Task:
 
     @property
     def query(self) -> str:
-        """What results call the mask: its path, with bytes that are no text as escapes."""
+        """Name of the mask in results: its path, with bytes that are no text as escapes."""
         return os.fsencode(self.mask).decode(errors="backslashreplace")
 
 
 def find_masks(arguments: Sequence[str], recursive: bool = False) -> list[str]:
     """Expand folders (their images, not our own results) and patterns, which not every shell expands; keep the rest.
 
-    Images in folders within folders are found where that is asked for; else it is said that there are some.
+    Images in folders within folders are found with `recursive`; else a message mentions them.
     """
     found: list[str] = []
     for argument in arguments:
@@ -66,7 +66,7 @@ def _images_in(folder: Path, recursive: bool) -> Iterator[Path]:
 
 
 def _tell_passed_over(folder: Path) -> None:
-    """Say that there are images in folders within a folder."""
+    """Mention images in folders within a folder."""
     first = next((path for path in _images_in(folder, recursive=True) if path.parent != folder), None)
     if first is not None:
         _LOG.warning(
@@ -90,7 +90,7 @@ def name_tasks(masks: Sequence[str]) -> list[Task]:
     used = [0] * len(masks)
     while True:
         stems = [stems[level] for stems, level in zip(known, used, strict=True)]
-        taken = Counter(stem.casefold() for stem in stems)  # one name to file systems that do not tell cases apart
+        taken = Counter(stem.casefold() for stem in stems)  # one name to file systems that ignore case
         shared = [n for n, stem in enumerate(stems) if taken[stem.casefold()] > 1 and used[n] < len(known[n]) - 1]
         if not shared:
             return [Task(mask, stem) for mask, stem in zip(masks, stems, strict=True)]
@@ -108,7 +108,7 @@ def _stems(mask: str, n: int) -> list[str]:
 
 
 def _shortened(stem: str) -> str:
-    """Leave room for what is put behind a stem; a digest keeps apart what differs further on or is no text."""
+    """Leave room for the ending of a stem; a digest distinguishes names that differ later on or are no text."""
     name = os.fsencode(stem)
     if len(name) <= _MAX_STEM_BYTES and visible(stem) == stem:
         return stem

@@ -1,6 +1,6 @@
 """Where frames enter: masks, photographs or a video become road masks with times, one after another.
 
-Memory holds two frames at a time. How a frame moved is taken from a file, or told by the photographs, or by the masks.
+Memory holds two frames at a time. The motion of a frame comes from a file, from the photographs, or from the masks.
 """
 
 from __future__ import annotations
@@ -27,7 +27,7 @@ from roadgeo.storage.atomic import writing
 
 __all__ = ["VIDEOS", "FrameOptions", "read_frames", "read_stills"]
 
-#: What is taken for a video, by its name.
+#: Suffixes of videos.
 VIDEOS = (".mp4", ".mov", ".avi", ".mkv", ".m4v", ".mpg", ".mpeg", ".ts", ".webm", ".wmv")
 
 
@@ -46,11 +46,11 @@ class FrameOptions:
     motion : mapping of frame name to (3, 3), or None
         Pixel of a frame to pixel of the one before.
     motion_px : float or None
-        Standard deviation of where the motion puts a corner. None: what is usual for its source.
+        Standard deviation of a corner moved by the motion. None: the usual one of its source.
     every_s : float
         Of a video, the time between the frames taken; 0: all.
     interval_s : float
-        Time between images, which say nothing of it.
+        Time between images without timestamps.
     recursive : bool
         Whether folders stand for the images in all folders within them, too.
     """
@@ -71,7 +71,7 @@ class FrameOptions:
 
 
 class _Image(NamedTuple):
-    """A frame's file, what it is called, and when it was taken."""
+    """A frame's file, its name, and its time."""
 
     path: str
     name: str
@@ -80,7 +80,7 @@ class _Image(NamedTuple):
 
 @dataclass
 class _Last:
-    """What is remembered of the frame before."""
+    """The previous frame, as far as the next one needs it."""
 
     mask: RoadMask | None = None
     grey: AnyArray | None = None
@@ -154,7 +154,7 @@ def _video(path: str, options: FrameOptions, stack: ExitStack) -> Iterator[_Imag
         if not good:
             continue
         target = str(Path(folder) / "frame.png")
-        with writing(target):  # OpenCV would not tell of a full disk
+        with writing(target):  # OpenCV does not report a full disk
             Path(target).write_bytes(cv2.imencode(".png", picture)[1].tobytes())
         taken += 1
         yield _Image(target, f"{Path(path).stem}_{k:06d}", k / rate)
@@ -234,7 +234,7 @@ def _motion(
         found = options.motion.get(name, options.motion.get(Path(name).stem))
         return found, 1.5
     if last.mask is None or last.mask.shape != mask.shape:
-        last.odometer = Odometer()  # another camera: how the flight went on tells nothing
+        last.odometer = Odometer()  # another camera: the previous motion does not apply
         return None, 1.5
     if grey is not None and last.grey is not None:
         return between_images(last.grey, grey), 1.5

@@ -53,7 +53,7 @@ class Mosaic:
     Attributes
     ----------
     mask : RoadMask
-        What they show together.
+        The ground that they show together.
     to_mosaic : (K, 3, 3) float64
         Pixel of each frame to pixel of the mask, GDAL's corner convention.
     """
@@ -138,7 +138,7 @@ def lay_down(
 def _paint_all(
     masks: Sequence[RoadMask], matrices: FloatArray, shape: tuple[int, int], options: MosaicOptions
 ) -> tuple[BoolArray, BoolArray]:
-    """Return where frames show road, and where they see, on a mosaic of so many rows and columns."""
+    """Return where frames show road, and the ground they observe, on a mosaic of this size (rows, columns)."""
     roads, seen = np.zeros(shape, np.uint8), np.zeros(shape, np.uint8)
     for mask, matrix in zip(masks, matrices, strict=True):
         _paint(mask, matrix, roads, seen)

@@ -1,4 +1,4 @@
-"""What a flight leaves: a GeoPackage, GeoJSON, GPX, a CSV with the names of MISB ST 0601, and a report."""
+"""The files of a flight: a GeoPackage, GeoJSON, GPX, a CSV with the names of MISB ST 0601, and a report."""
 
 from __future__ import annotations
 
@@ -168,7 +168,7 @@ def _text(make: Callable[[Sequence[Row]], str]) -> Callable[[Path, Sequence[Row]
     return lambda path, rows: write_text(path, make(rows))
 
 
-#: Ending of each file, what writes it, and what it is for.
+#: Ending of each file, its writer, and its purpose.
 WRITERS: dict[str, tuple[Callable[[Path, Sequence[Row]], None], str]] = {
     ".gpkg": (write_geopackage, "footprints, centres and the track, styled for QGIS"),
     ".geojson": (_text(to_geojson), "the same for the web, with times"),

@@ -1,4 +1,4 @@
-"""A flight to look at in a browser: the map, the footprints one after another, and what each frame showed."""
+"""A flight to look at in a browser: the map, the footprints one after another, and the pictures of the frames."""
 
 from __future__ import annotations
 
@@ -80,7 +80,7 @@ _SCRIPT = """
 
 
 class Thumbnails:
-    """Small pictures of what frames showed, kept while the frames themselves go by."""
+    """Small pictures of the frames, kept while the frames themselves go by."""
 
     def __init__(self) -> None:
         self.kept: dict[int, str] = {}
@@ -192,7 +192,7 @@ def _pair(xy: FloatArray) -> str:
 
 
 def _bar(rows: Sequence[Row]) -> str:
-    """Return what plays the frames, and a strip of their statuses."""
+    """Return the player of the frames, and a strip of their statuses."""
     strip = "".join(f'<i style="background:{_COLORS[row.status]}" title="{html.escape(row.name)}"></i>' for row in rows)
     key = "".join(f'<span style="color:{color}">{_SIGNS[name]} {name}</span>' for name, color in _COLORS.items())
     return (
@@ -212,7 +212,7 @@ def _card() -> str:
 
 
 def _values(tracked: Sequence[Tracked], rows: Sequence[Row], drawing: _Drawing, pictures: Mapping[int, str]) -> str:
-    """Return what the page's script shows of each frame, as JSON that may stand in HTML."""
+    """Return the data of each frame for the page's script, as JSON that may stand in HTML."""
     frames = [
         {
             "name": row.name,

@@ -32,12 +32,12 @@ class CameraPlace:
 
 @dataclass(frozen=True)
 class Row:
-    """What is known of a frame, for people and files.
+    """A frame's row, for people and files.
 
     Attributes
     ----------
     time : datetime or None
-        UTC; None where nobody said when the flight began.
+        UTC; None where the start of the flight is unknown.
     center : (lon, lat) or None
     footprint : (4, 2) float64 or None
         Corners TL, TR, BR, BL as longitude and latitude.
@@ -98,7 +98,7 @@ class Row:
 
 
 def make_rows(tracked: Sequence[Tracked], begun: datetime | None = None, focal_px: float | None = None) -> list[Row]:
-    """Describe frames; `begun` says when the first one was taken, `focal_px` what the camera's focal length is."""
+    """Describe frames; `begun` is the time of the first one, `focal_px` the camera's focal length."""
     return [_row(one, begun, focal_px) for one in tracked]
 
 
