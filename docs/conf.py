@@ -34,7 +34,6 @@ exclude_patterns = [".*", "build", "site", "tests", "wheel"]  # folders that nee
 
 extensions = ["myst_nb", "sphinx.ext.autodoc", "sphinx.ext.napoleon"]
 myst_heading_anchors = 4
-myst_enable_extensions = ["dollarmath"]
 nb_execution_mode = "off"  # a test runs the notebook
 default_role = "literal"
 autodoc_member_order = "bysource"

@@ -26,6 +26,28 @@ def test_an_example_runs_as_it_stands(name: str, expected: list[str], tmp_path: 
         assert text in done.stdout
 
 
+def test_correlation_with_heading_and_scale_finds_clean_masks(tmp_path: Path) -> None:
+    command = [sys.executable, "-W", "error", str(EXAMPLES / "correlate.py"), "-n", "1"]
+    done = subprocess.run(command, capture_output=True, text=True, cwd=tmp_path, check=True)
+    assert "| clean, level | 1 of 1 | 1 of 1 | 0 |" in done.stdout
+
+
+def test_the_tables_of_how_well_are_those_of_the_code(tmp_path: Path) -> None:
+    """The bands of the odds; and a bench's output becomes a table."""
+    subprocess.run([sys.executable, str(EXAMPLES / "tables.py"), "--check"], cwd=tmp_path, check=True)
+    kind = {"masks": 8, "right": 7, "wrong": 0, "cpu_s": [0.1]}
+    kind |= {"corners_m": [0.5, 1.25], "error_over_claim": [0.9, 1.1]}
+    absent = {**kind, "right": 0}
+    sys.path.insert(0, str(EXAMPLES))
+    try:
+        from tables import bench_table
+    finally:
+        sys.path.remove(str(EXAMPLES))
+    lines = list(bench_table({"this": {"clean": kind, "turned over": absent}}))
+    assert lines[2].endswith("| 7 of 8 | 0 | 0.5 m / 1.2 m | 0.90, 1.10 | 0.1 |")
+    assert lines[3] == "| turned over: no place |  | 0 of 8 |  |  | 0.1 |"
+
+
 def test_the_bench_compares_two_checkouts_and_goes_on_where_it_stopped(tmp_path: Path) -> None:
     shutil.copytree(EXAMPLES.parent / "roadgeo", tmp_path / "other" / "roadgeo")
     command = [sys.executable, str(EXAMPLES / "bench.py"), "--cities", str(ROADS), "-n", "1", "-j", "1", "--out", "out"]

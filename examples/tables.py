@@ -1,0 +1,91 @@
+"""Write the tables of docs/how-well.md that each version measures again: python examples/tables.py BENCH.json.
+
+BENCH.json is the file `bench.json` of `python examples/bench.py --out FOLDER`; of two checkouts the first one counts.
+The bands of the odds are those of `error_rate` in a result. `--check` writes nothing, and fails if one would change.
+"""
+
+from __future__ import annotations
+
+import argparse
+import json
+import re
+from collections.abc import Iterator
+from pathlib import Path
+from typing import Any
+
+from roadgeo.location import ERROR_RATES
+
+PAGE = Path(__file__).parents[1] / "docs" / "how-well.md"
+NAMES = {
+    "base": "usual: 10 % gone, 4 % false, ragged edges",
+    "clean": "clean: level, nothing gone or false, smooth edges",
+    "frame512": "frames of 512 m",
+    "frame512gone20": "frames of 512 m, 20 % gone, 5 % false",
+    "frame800": "frames of 800 m",
+    "few8_12": "8 to 12 intersections",
+    "gone50": "half gone",
+    "gone40false40": "40 % gone, 40 % false",
+    "false60": "60 % false",
+    "tilt50_60": "tilt 50 to 60°",
+    "warp6": "bent by 6 pixels",
+    "lens": "lens, k1 -0.08",
+    "stale40": "40 % of the streets unknown to the map",
+    "void_half": "half of the frame black",
+    "all": "all of them",
+    "turned over": "turned over: no place",
+    "elsewhere": "of another city: no place",
+}
+
+
+def bench_table(runs: dict[str, dict[str, Any]]) -> Iterator[str]:
+    """Yield the lines of the table of kinds."""
+    kinds = next(iter(runs.values()))
+    yield "| | located right | wrong | corners, median / 90 % | error / claimed, median, rms | seconds, median |"
+    yield "|---|---|---|---|---|---|"
+    for kind in (name for name in NAMES if name in kinds):
+        one = kinds[kind]
+        corners = ratios = right = ""
+        if one["right"]:
+            right = f"{one['right']:,} of {one['masks']:,}"
+            corners = " / ".join(f"{value:.2g} m" for value in one["corners_m"])
+            ratios = ", ".join(f"{value:.2f}" for value in one["error_over_claim"])
+        wrong = f"{one['wrong']}" if right else f"{one['wrong']} of {one['masks']:,}"
+        yield f"| {NAMES[kind]} | {right} | {wrong} | {corners} | {ratios} | {one['cpu_s'][0]:.2g} |"
+
+
+def trust_table() -> Iterator[str]:
+    """Yield the lines of the table of scores."""
+    yield "| score | reported | wrong |"
+    yield "|---|---|---|"
+    for rate, above in zip(ERROR_RATES, [*ERROR_RATES[1:], None], strict=True):
+        band = f"{rate.score:g} and more" if above is None else f"{rate.score:g} to {above.score:g}"
+        at_most = f"{rate.wrong} (at most {rate.at_most:.0%})".replace("%", " %") if rate.reported else "-"
+        yield f"| {band} | {rate.reported:,} | {at_most} |"
+
+
+def put(page: str, name: str, lines: Iterator[str]) -> str:
+    """Return the page with another table between the comments of that name."""
+    table = "\n".join(lines)
+    found = re.compile(rf"(<!-- {name} -->\n).*?(\n<!-- end -->)", re.DOTALL)
+    if not found.search(page):
+        raise SystemExit(f"Error: {PAGE} has no table {name}; expected <!-- {name} --> and <!-- end --> around it")
+    return found.sub(lambda match: match[1] + table + match[2], page)
+
+
+def main(arguments: list[str] | None = None) -> None:
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument("bench", nargs="?", type=Path, help="bench.json; without it the odds alone")
+    parser.add_argument("--check", action="store_true")
+    options = parser.parse_args(arguments)
+    before = page = PAGE.read_text(encoding="utf-8")
+    if options.bench:
+        page = put(page, "bench", bench_table(json.loads(options.bench.read_text(encoding="utf-8"))))
+    page = put(page, "trust", trust_table())
+    if options.check and page != before:
+        raise SystemExit(f"Error: the tables of {PAGE.name} are out of date; run python examples/tables.py")
+    if not options.check:
+        PAGE.write_text(page, encoding="utf-8")
+
+
+if __name__ == "__main__":
+    main()
