@@ -24,14 +24,14 @@ def probability_path(paths: OutputPaths) -> Path:
 
 def is_ours(path: Path) -> bool:
     """Whether a file is a probability map that we wrote, not a mask of the user's."""
-    from roadgeo.sources.segmentation.probability import TAG
+    from roadgeo.sources.masks import PROBABILITY_TAG
     from roadgeo.storage.rasters import open_raster
 
     if not path.is_file():
         return False
     try:
         with open_raster(path) as raster:
-            return TAG in raster.tags()
+            return PROBABILITY_TAG in raster.tags()
     except MaskError:
         return False
 

@@ -40,6 +40,7 @@ from roadgeo.sources.segmentation.probability import NODATA, ProbabilityMap, fus
 from roadgeo.sources.segmentation.scales import rank_scales, scale_of, try_scales
 from roadgeo.sources.segmentation.tiling import map_shape, segment
 from roadgeo.sources.streams import QUERY_ENDINGS
+from roadgeo.sources.thresholds import spread_probability
 from roadgeo.workflows import locate
 
 __all__ = ["FirstLook", "QueryOptions", "is_model", "locate_query", "look_once"]
@@ -51,9 +52,6 @@ _MAX_SCALES = 3
 #: times its own along a side: narrow gaps between roads close on coarse ones.
 _MOST_FINER, _LEAST_FINER = 2.0, 1.25
 _KNOWN_SPAN = 1.7  # a range of pixel sizes narrower than this is one scale
-
-#: Further thresholds of a probability map, as shares of the way from the model's own to 0 (below 0) and to 1.
-_FURTHER_THRESHOLDS = (-0.5, 0.4)
 
 
 @dataclass(frozen=True)
@@ -259,8 +257,8 @@ def _locate_photograph(
 def _plan_looks(frame: _Frame, query: QueryOptions) -> Later[Look]:
     """Return the best scale's look, the photograph in more ways, other scales, and other thresholds at the best."""
 
-    def look(i: int, ways: int | None = None, share: float = 0.0) -> Look:
-        return _look_at(partial(frame.see, frame.scales[i], ways), frame.scales[i], query, share)
+    def look(i: int, ways: int | None = None, further: int = 0) -> Look:
+        return _look_at(partial(frame.see, frame.scales[i], ways), frame.scales[i], query, further)
 
     def look_more_ways() -> Look:
         one = look(0, frame.most_ways)
@@ -270,7 +268,7 @@ def _plan_looks(frame: _Frame, query: QueryOptions) -> Later[Look]:
     makers += [look_more_ways] if frame.most_ways else []
     makers += [partial(look, i) for i in range(1, len(frame.scales))]
     if query.threshold is None:
-        makers += [partial(look, 0, frame.most_ways, share) for share in _FURTHER_THRESHOLDS]
+        makers += [partial(look, 0, frame.most_ways, further) for further in (1, 2)]
     return Later(makers)
 
 
@@ -350,14 +348,13 @@ def _of_own_pixels(sighting: Sighting, own: tuple[int, int]) -> Sighting:
     return replace(sighting, location=location, mask=mask, probability=probability)
 
 
-def _look_at(see: Callable[[], ProbabilityMap], scale: float, query: QueryOptions, share: float = 0.0) -> Look:
-    """Return a look at a probability map, at the model's threshold or a share of the way from there to 0 or 1."""
+def _look_at(see: Callable[[], ProbabilityMap], scale: float, query: QueryOptions, further: int = 0) -> Look:
+    """Return a look at a probability map, at the model's threshold or a further one."""
 
     def threshold() -> float:
-        own = see().threshold if query.threshold is None else query.threshold
-        return own + share * (own if share < 0 else 1 - own)
+        return spread_probability(see().threshold if query.threshold is None else query.threshold)[further]
 
-    what = f"scale {scale:.3g}" + (f", threshold {share:+.0%}" if share else "")
+    what = f"scale {scale:.3g}" + (f", another threshold ({further})" if further else "")
     return Look(what, lambda: see().mask(threshold()), see)
 
 
@@ -416,7 +413,7 @@ def _see(
 
 def _of_mask(mask: RoadMask, model: str) -> ProbabilityMap:
     """Return a mask as a map of probabilities 0.9 and 0.1, for it has none of its own."""
-    values = np.where(mask.roads, 229, 25).astype(np.uint8)
+    values = np.where(mask.roads, 229, 25).astype(np.uint8) if mask.probability is None else mask.probability.copy()
     if mask.observed is not None:
         values[~mask.observed] = NODATA
     return ProbabilityMap(values, 0.5, mask.name, model)

@@ -21,7 +21,14 @@ from roadgeo.geometry.mask import PROBABILITY_SURE, PROBABILITY_UNKNOWN, RoadMas
 from roadgeo.roads.borders import find_border
 from roadgeo.roads.observed import find_voids
 from roadgeo.roads.vectorization import road_width
-from roadgeo.sources.thresholds import Sample, are_labels, find_thresholds, find_unlabelled, ground_and_road
+from roadgeo.sources.thresholds import (
+    Sample,
+    are_labels,
+    find_thresholds,
+    find_unlabelled,
+    ground_and_road,
+    spread_probability,
+)
 from roadgeo.storage.gdal import is_named_remote
 from roadgeo.storage.orientation import read_orientation, turn_upright
 from roadgeo.storage.rasters import MAX_SIDE as MAX_RASTER_SIDE
@@ -31,9 +38,12 @@ from roadgeo.storage.silence import silenced
 if TYPE_CHECKING:
     from rasterio import DatasetReader
 
-__all__ = ["MaskSource", "open_mask", "read_mask"]
+__all__ = ["PROBABILITY_TAG", "THRESHOLD_TAG", "MaskSource", "open_mask", "read_mask"]
 
 _LOG = logging.getLogger(__name__)
+
+#: Tags by which our own maps of probability are told from masks that users made, and of the threshold of their model.
+PROBABILITY_TAG, THRESHOLD_TAG = "ROADGEO", "THRESHOLD"
 
 MIN_SIDE, MAX_SIDE = 32, 20_000
 _MAX_CLASSES = 32  # whose colours a palette holds
@@ -59,7 +69,7 @@ class _Raster:
 
     `read(top, bottom, step)` returns every `step`-th value of these rows as (rows, columns, B), and where they are
     valid as (rows, columns) bool, or None for everywhere. `has_alpha`: they are valid where they are not transparent.
-    `n_unread`: bands beyond those that are read.
+    `n_unread`: bands beyond those that are read. `model_threshold`: of a map of probability that we wrote.
     """
 
     name: str
@@ -68,6 +78,7 @@ class _Raster:
     read: Callable[[int, int, int], tuple[AnyArray, BoolArray | None]]
     has_alpha: bool = False
     n_unread: int = 0
+    model_threshold: float | None = None
 
 
 def read_mask(
@@ -134,10 +145,11 @@ class MaskSource:
         MaskError
             There are none, or hardly others.
         """
-        name = self._raster.name
+        name, is_mask = self._raster.name, self._raster.model_threshold is None
         roads, observed = _separate(self._raster, self._channel, threshold)
-        roads, observed = _told_apart(name, roads, observed)
-        if self._voids:
+        if is_mask:
+            roads, observed = _told_apart(name, roads, observed)
+        if self._voids and is_mask:
             width = road_width(RoadMask(roads, name=name))
             roads, observed = _without_border(name, roads, observed, width)
             observed = find_voids(roads, width) if observed is None else observed
@@ -149,6 +161,8 @@ class MaskSource:
         """Return how sure each pixel is to be road, as `RoadMask.probability`; None of a mask, which does not say."""
         if self._levels is None:
             return None
+        if self._raster.model_threshold is not None:
+            return _between(self._raster, self._channel, 0.0, float(PROBABILITY_SURE))
         sure = _between(self._raster, self._channel, *self._levels)
         dark = roads.any() and np.median(sure[roads]) < PROBABILITY_SURE / 2  # roads on light ground
         return np.where(sure == PROBABILITY_UNKNOWN, sure, PROBABILITY_SURE - sure) if dark else sure
@@ -166,6 +180,11 @@ def open_mask(
     """Open a road mask or a soft map of roads: parameters and errors as of `read_mask`."""
     with _open(source, band, name) as raster:
         _require_size(raster.name, *raster.shape, MAX_RASTER_SIDE)
+        own = raster.model_threshold
+        if own is not None and threshold is None:
+            values = tuple(float(round(PROBABILITY_SURE * one)) for one in spread_probability(own))
+            yield MaskSource(values, raster, 0, False, (0.0, float(PROBABILITY_SURE)))
+            return
         _require_mask(raster)
         raster = _drawn(raster)
         seen = _sample(raster)
@@ -174,7 +193,7 @@ def open_mask(
         if threshold is None:
             raster, sample = _without_unlabelled(raster, sample)
         thresholds = find_thresholds(sample) if threshold is None else (threshold,)
-        levels = ground_and_road(sample, thresholds[0]) if len(thresholds) > 1 else None
+        levels = ground_and_road(sample, thresholds[0]) if len(thresholds) > 1 or own is not None else None
         yield MaskSource(thresholds, raster, channel, voids, levels)
 
 
@@ -485,7 +504,18 @@ def _of_dataset(dataset: DatasetReader, band: int | None, name: str, nodata: flo
     has_alpha = len(colour) < dataset.count
     n_unread = 0 if band is not None else len(colour) - len(chosen)
     n_bands = len(chosen) if palette is None else palette.shape[1]
-    return _Raster(name, (dataset.height, dataset.width), n_bands, read, has_alpha, n_unread)
+    return _Raster(name, (dataset.height, dataset.width), n_bands, read, has_alpha, n_unread, _model_threshold(dataset))
+
+
+def _model_threshold(dataset: DatasetReader) -> float | None:
+    """Return the threshold of the model that made a map of probability, where that is one that we wrote."""
+    tags = dataset.tags()
+    if PROBABILITY_TAG not in tags or dataset.count != 1 or dataset.dtypes[0] != "uint8":
+        return None
+    with contextlib.suppress(ValueError):
+        threshold = float(tags.get(THRESHOLD_TAG, ""))
+        return threshold if 0.0 < threshold < 1.0 else None
+    return None
 
 
 def _palette_of_picture(dataset: DatasetReader) -> AnyArray | None:

@@ -16,7 +16,7 @@ from roadgeo.errors import MaskError, PhotographError
 from roadgeo.geometry.mask import RoadMask
 from roadgeo.roads.vectorization import width_by_area
 
-__all__ = ["Sample", "are_labels", "find_thresholds", "find_unlabelled", "ground_and_road"]
+__all__ = ["Sample", "are_labels", "find_thresholds", "find_unlabelled", "ground_and_road", "spread_probability"]
 
 _COLOURED_SHARE = 0.05  # more than this: a photograph
 _GREY_SHARE = 0.25  # more than this is neither dark nor light: a soft map on uneven ground
@@ -40,6 +40,8 @@ _BINS = 256  # of a histogram that a threshold is found by
 
 #: Further thresholds of a soft map, as shares of the way from the ground's value to the roads'.
 _FURTHER = (0.3, 0.7)
+#: Further thresholds of probabilities, as shares of the way from the model's own to 0 (below 0) and to 1.
+_FURTHER_PROBABILITIES = (-0.5, 0.4)
 
 
 @dataclass(frozen=True)
@@ -93,6 +95,13 @@ def find_thresholds(sample: Sample) -> tuple[float, ...]:
     grey = _grey_share(sample, values)
     usual = 127.0 if sample.seen.dtype == np.uint8 and high > 127 and grey <= _GREY_SHARE else _otsu(values)
     return (usual,) if grey <= _CRISP_SHARE else _spread(values, usual)
+
+
+def spread_probability(threshold: float) -> tuple[float, ...]:
+    """Return the thresholds worth trying on probabilities of road: a model's own first."""
+    return threshold, *(
+        threshold + share * (threshold if share < 0 else 1 - threshold) for share in _FURTHER_PROBABILITIES
+    )
 
 
 def find_unlabelled(sample: Sample) -> tuple[float | None, str]:

@@ -19,7 +19,8 @@ from roadgeo.geometry.mask import RoadMask
 from roadgeo.matching.options import LocateOptions
 from roadgeo.running import queries
 from roadgeo.running.queries import QueryOptions, _how_much_finer, locate_query
-from roadgeo.sources.segmentation.probability import TAG, ProbabilityMap
+from roadgeo.sources.masks import PROBABILITY_TAG
+from roadgeo.sources.segmentation.probability import ProbabilityMap
 from roadgeo.sources.segmentation.scales import rank_scales
 from roadgeo.sources.segmentation.tiling import segment
 from roadgeo.storage.geopackage import read_layer
@@ -156,7 +157,7 @@ def test_a_photograph_is_located(
     assert document["query"] == str(photo)
     assert offset(document) < 3.0
     with rasterio.open(tmp_path / "flight_mask.tif") as kept:
-        assert TAG in kept.tags()
+        assert PROBABILITY_TAG in kept.tags()
         assert kept.shape == cv2.imread(str(photo)).shape[:2]
     with rasterio.open(tmp_path / "flight_footprint.tif") as drawn:
         assert drawn.count >= 3  # the photograph itself, not its mask
@@ -270,7 +271,7 @@ def test_what_is_seen_is_shown_without_a_map(
     nearest = np.linalg.norm(np.array(points["coarse"])[:, None] - fine, axis=2).min(axis=1)
     assert np.median(nearest) < 0.5
     with rasterio.open(tmp_path / "seen" / "coarse_mask.tif") as kept:
-        assert TAG in kept.tags()
+        assert PROBABILITY_TAG in kept.tags()
         assert kept.shape == (image.shape[0] // 2, image.shape[1] // 2)
     drawn = cv2.imread(str(tmp_path / "seen" / "flight_vectorized.png"))
     assert drawn.shape == image.shape

@@ -15,7 +15,7 @@ import numpy as np
 from roadgeo._arrays import AnyArray, BoolArray, FloatArray
 from roadgeo.geometry.frame import Frame
 from roadgeo.geometry.homography import Homography
-from roadgeo.geometry.mask import RoadMask
+from roadgeo.geometry.mask import PROBABILITY_SURE, PROBABILITY_UNKNOWN, RoadMask
 
 __all__ = ["Mosaic", "MosaicOptions", "chain", "lay_down", "lay_together", "level"]
 
@@ -131,18 +131,26 @@ def lay_down(
     to_pixel = np.array([[scale, 0.0, -scale * low[0]], [0.0, scale, -scale * low[1]], [0.0, 0.0, 1.0]])
     to_mosaic = to_pixel @ levelled
     columns, rows = np.ceil((high - low) * scale).astype(int) + 1
-    shown, seen = _paint_all(masks, to_mosaic, (rows, columns), options)
-    return Mosaic(RoadMask(shown, seen, masks[0].name), to_mosaic)
+    shown, seen, probability = _paint_all(masks, to_mosaic, (rows, columns), options)
+    return Mosaic(RoadMask(shown, seen, masks[0].name, probability), to_mosaic)
 
 
 def _paint_all(
     masks: Sequence[RoadMask], matrices: FloatArray, shape: tuple[int, int], options: MosaicOptions
-) -> tuple[BoolArray, BoolArray]:
-    """Return where frames show road, and the ground they observe, on a mosaic of this size (rows, columns)."""
+) -> tuple[BoolArray, BoolArray, AnyArray | None]:
+    """Return where frames show road, the ground they observe, and how probable roads are, on a mosaic (rows, columns).
+
+    The probability is the mean of the frames', as in `RoadMask`; None where they have none.
+    """
     roads, seen = np.zeros(shape, np.uint8), np.zeros(shape, np.uint8)
+    total = np.zeros(shape, np.uint16) if any(mask.probability is not None for mask in masks) else None
     for mask, matrix in zip(masks, matrices, strict=True):
-        _paint(mask, matrix, roads, seen)
-    return (seen > 0) & (roads > options.share * seen), seen > 0
+        _paint(mask, matrix, roads, seen, total)
+    shown = (seen > 0) & (roads > options.share * seen)
+    if total is None:
+        return shown, seen > 0, None
+    mean = np.minimum(total // np.maximum(seen, 1), PROBABILITY_SURE)
+    return shown, seen > 0, np.where(seen > 0, mean, PROBABILITY_UNKNOWN).astype(np.uint8)
 
 
 def _is_sound(corners: FloatArray) -> bool:
@@ -154,8 +162,11 @@ def _is_sound(corners: FloatArray) -> bool:
     return bool(areas.min() > 0.0 and areas.max() < 16.0 * areas.min())
 
 
-def _paint(mask: RoadMask, matrix: FloatArray, roads: AnyArray, seen: AnyArray) -> None:
-    """Count where a frame shows road, and where it sees at all, on the mosaic; both (R, C) uint8 are changed."""
+def _paint(mask: RoadMask, matrix: FloatArray, roads: AnyArray, seen: AnyArray, total: AnyArray | None) -> None:
+    """Count where a frame shows road, and where it sees at all, on the mosaic; both (R, C) uint8 are changed.
+
+    `total` (R, C) uint16: what the probability of road is added to.
+    """
     height, width = mask.shape
     corners = Homography(matrix)(Frame(width, height).corners)
     left, top = np.maximum(np.floor(corners.min(axis=0)).astype(int) - 1, 0)
@@ -171,4 +182,9 @@ def _paint(mask: RoadMask, matrix: FloatArray, roads: AnyArray, seen: AnyArray) 
         np.full(mask.shape, 255, np.uint8) if mask.observed is None else mask.observed.view(np.uint8) * np.uint8(255)
     )
     roads[part] += cv2.warpPerspective(values, warp, size, flags=cv2.INTER_AREA) > 127
-    seen[part] += cv2.warpPerspective(known, warp, size, flags=cv2.INTER_NEAREST) > 127
+    sees = cv2.warpPerspective(known, warp, size, flags=cv2.INTER_NEAREST) > 127
+    seen[part] += sees
+    if total is not None:
+        sure = mask.roads * np.uint8(PROBABILITY_SURE) if mask.probability is None else mask.probability
+        sure = np.where(sure == PROBABILITY_UNKNOWN, np.uint8(0), sure)
+        total[part] += cv2.warpPerspective(sure, warp, size, flags=cv2.INTER_AREA) * sees

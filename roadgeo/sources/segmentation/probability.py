@@ -13,15 +13,13 @@ import numpy as np
 from roadgeo._arrays import AnyArray
 from roadgeo.errors import MaskError
 from roadgeo.geometry.mask import PROBABILITY_SURE, PROBABILITY_UNKNOWN, RoadMask
+from roadgeo.sources.masks import PROBABILITY_TAG, THRESHOLD_TAG
 from roadgeo.storage.files import replacing
 
-__all__ = ["NODATA", "TAG", "ProbabilityMap", "fuse"]
+__all__ = ["NODATA", "ProbabilityMap", "fuse"]
 
 #: 0 to 254 stand for probabilities 0 to 1; this for ground that was not observed.
 NODATA = PROBABILITY_UNKNOWN
-
-#: The tag by which our own probability maps are told from masks that users made.
-TAG = "ROADGEO"
 
 
 @dataclass(frozen=True)
@@ -97,7 +95,11 @@ class ProbabilityMap:
         profile = {"driver": "GTiff", "count": 1, "dtype": "uint8", "compress": "deflate", "nodata": NODATA}
         if abs(self.pixel * width - width) > 0.5:
             profile["transform"] = rasterio.Affine.scale(self.pixel, -self.pixel)
-        tags = {TAG: "probability of road, 0 to 254", "MODEL": self.model, "THRESHOLD": f"{self.threshold:g}"}
+        tags = {
+            PROBABILITY_TAG: "probability of road, 0 to 254",
+            "MODEL": self.model,
+            THRESHOLD_TAG: f"{self.threshold:g}",
+        }
         with replacing(Path(path), sync=False) as staged, warnings.catch_warnings():
             warnings.simplefilter("ignore", NotGeoreferencedWarning)
             with (

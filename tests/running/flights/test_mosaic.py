@@ -6,7 +6,7 @@ import numpy as np
 
 from roadgeo.geometry.frame import Frame
 from roadgeo.geometry.homography import Homography
-from roadgeo.geometry.mask import RoadMask
+from roadgeo.geometry.mask import PROBABILITY_UNKNOWN, RoadMask
 from roadgeo.geometry.pinhole import make_view
 from roadgeo.running.flights.mosaic import MosaicOptions, chain, lay_together, level
 
@@ -55,3 +55,18 @@ def test_roads_that_one_frame_misses_are_taken_from_others():
 def test_motion_of_no_camera_is_refused():
     masks = [RoadMask(np.ones((240, 320), bool))] * 2
     assert lay_together(masks, [np.eye(3), np.diag([-1.0, 1.0, 1.0])], 5.0) is None
+
+
+def test_a_mosaic_is_as_sure_as_its_frames():
+    _, motion = flight(0.0, 4)
+    roads = np.zeros((240, 320), bool)
+    roads[:, 150:170] = True
+    frames = [RoadMask(roads, probability=np.where(roads, sure, 30).astype(np.uint8)) for sure in (200, 100, 200, 100)]
+    mosaic = lay_together(frames, motion, 20.0, MosaicOptions(road_px=20.0))
+    assert mosaic is not None
+    assert mosaic.mask.probability is not None
+    assert mosaic.mask.observed is not None
+    column, row = np.floor(Homography(mosaic.to_mosaic[1])(np.array([160.5, 120.5]))).astype(int)
+    assert 130 <= mosaic.mask.probability[row, column] <= 170
+    assert (mosaic.mask.probability[~mosaic.mask.observed] == PROBABILITY_UNKNOWN).all()
+    assert lay_together([RoadMask(roads)] * 4, motion, 20.0).mask.probability is None

@@ -9,10 +9,12 @@ import rasterio
 from worlds.models import brightness_model
 
 from roadgeo.errors import MaskError
+from roadgeo.sources.masks import PROBABILITY_TAG, open_mask, read_mask
 from roadgeo.sources.segmentation.network import load_network
 from roadgeo.sources.segmentation.photograph import open_photograph
-from roadgeo.sources.segmentation.probability import NODATA, TAG, ProbabilityMap, fuse
+from roadgeo.sources.segmentation.probability import NODATA, ProbabilityMap, fuse
 from roadgeo.sources.segmentation.tiling import _look, _starts, segment
+from roadgeo.sources.thresholds import spread_probability
 
 MODELS = Path(__file__).parents[2] / "data" / "models"
 pytestmark = pytest.mark.filterwarnings("ignore::rasterio.errors.NotGeoreferencedWarning")
@@ -187,8 +189,28 @@ def test_a_map_is_kept_with_nodata(tmp_path: Path) -> None:
     with rasterio.open(tmp_path / "photo_mask.tif") as dataset:
         np.testing.assert_array_equal(dataset.read(1), values)
         assert dataset.nodata == NODATA
-        assert TAG in dataset.tags()
+        assert PROBABILITY_TAG in dataset.tags()
         assert dataset.tags()["THRESHOLD"] == "0.4"
+
+
+@pytest.mark.parametrize("void", [False, True])
+def test_a_map_that_was_kept_is_read_as_it_was(tmp_path: Path, void: bool) -> None:
+    """So that what is located again rests on the same probability, and on the same observed ground."""
+    values = np.full((70, 80), 12, np.uint8)
+    values[30:38], values[33:35, :60] = 90, 240
+    values[:3, :] = 250  # as a scan's margin, or a border, would look
+    if void:
+        values[:, 70:] = NODATA
+    seen = ProbabilityMap(values, 0.26, "photo.jpg", "m.onnx")
+    seen.write(tmp_path / "photo_mask.tif")
+    with open_mask(tmp_path / "photo_mask.tif") as opened:
+        assert len(opened.thresholds) == 3
+        for given, share in zip(opened.thresholds, spread_probability(0.26), strict=True):
+            read, made = opened.read(given), seen.mask(share)
+            np.testing.assert_array_equal(read.roads, made.roads)
+            np.testing.assert_array_equal(read.probability, made.probability)
+            assert (read.observed is None) == (made.observed is None) == (not void)
+    np.testing.assert_array_equal(read_mask(tmp_path / "photo_mask.tif", threshold=100).probability, values)
 
 
 def test_a_map_of_a_large_photograph_lies_on_it(tmp_path: Path) -> None:
