@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import re
 
-__all__ = ["visible"]
+__all__ = ["counted", "visible"]
 
 #: Control characters; those that turn the direction of text; line separators; bytes of names that are no text.
 _UNSEEN = re.compile("[\x00-\x1f\x7f-\x9f\u061c\u200e\u200f\u2028-\u202e\u2066-\u2069\ud800-\udfff]")
@@ -20,6 +20,11 @@ def visible(text: str, *, ours: bool = False) -> str:
     if ours:
         return "".join(part if i % 2 else _UNSEEN.sub(_escape, part) for i, part in enumerate(_OURS.split(text)))
     return _UNSEEN.sub(_escape, re.sub("[\r\n\t]+", " ", text))
+
+
+def counted(number: int, noun: str) -> str:
+    """Say how many there are of what is counted: "1 road", "2,649 roads"."""
+    return f"{number:,} {noun}{'' if number == 1 else 's'}"
 
 
 def _escape(match: re.Match[str]) -> str:

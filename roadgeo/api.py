@@ -7,14 +7,15 @@ import os
 from collections.abc import Iterable, Sequence
 from dataclasses import dataclass, field, fields, replace
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, TypeAlias
+from typing import TYPE_CHECKING, Any, Literal, TypeAlias
 
 import numpy as np
 
-from roadgeo.errors import NotLocatedError, OutputError, name_extra
-from roadgeo.geometry.areas import Box, find_area, is_box
+from roadgeo.errors import NotLocatedError, OutputError, PluginError, how_to_install, name_extra
+from roadgeo.geometry.areas import Box
 from roadgeo.geometry.mask import RoadMask
 from roadgeo.location import Location
+from roadgeo.matching.hints import apply_hints, read_hint
 from roadgeo.matching.index import ReferenceIndex
 from roadgeo.matching.options import LocateOptions
 from roadgeo.reference.reference import AnyReference, BuildOptions, Reference, swapped_near
@@ -65,7 +66,7 @@ class Answer(Location):
         OutputError
             A file cannot be written.
         PluginError
-            There is no such output.
+            There is no such output, or one of another package failed; all else is written.
         """
         from roadgeo.outputs.location_files import OutputOptions, write_location
         from roadgeo.outputs.paths import output_paths
@@ -75,7 +76,10 @@ class Answer(Location):
             Path(out_dir).mkdir(parents=True, exist_ok=True)
         paths = output_paths(out_dir, stem or Path(self.query).stem or "mask")
         options = OutputOptions(products=tuple(also))
-        return write_location(self, self.mask, paths, options, self.photo, self.indexes).files
+        written = write_location(self, self.mask, paths, options, self.photo, self.indexes)
+        if written.faults:
+            raise PluginError("; ".join(written.faults))
+        return written.files
 
     def plot(self) -> Figure:
         """Draw the mask and its place on the map, as a matplotlib figure.
@@ -90,7 +94,7 @@ class Answer(Location):
         from roadgeo.outputs.figure import draw_figure, has_matplotlib
 
         if not has_matplotlib():
-            raise OutputError("plot() needs matplotlib: pip install 'roadgeo[plot]'")
+            raise OutputError(f"plot() needs matplotlib: {how_to_install('plot')}")
         subject = self._subject()
         return draw_figure(self, self.mask, subject.roads, subject.attribution)
 
@@ -184,70 +188,82 @@ def locate(
     reference: References = (),
     options: LocateOptions | None = None,
     *,
-    gsd: float | tuple[float, float] | None = None,
-    near: tuple[float, float, float] | None = None,
+    gsd: float | tuple[float, float] | str | None = None,
+    near: tuple[float, float, float] | str | None = None,
     within: str | Box | None = None,
     max_tilt: float | None = None,
     north_up: bool | None = None,
-    heading: float | tuple[float, float] | None = None,
-    focal: float | None = None,
+    heading: float | tuple[float, float] | str | None = None,
+    focal: float | Literal["exif"] | None = None,
+    effort: Literal["quick", "full"] | None = None,
+    time_limit: float | None = None,
 ) -> Answer:
-    """Find where a road mask, or a photograph, lies on a map. Nothing is written.
+    """Find where a photograph, or a mask of roads, lies on a map. Nothing is written.
 
-    A mask that is not found is an answer with a reason, not an error.
+    An image that is not found is an answer with a reason, not an error.
 
-    >>> location = roadgeo.locate("photo_mask.png", "boston-ma", gsd=(0.3, 0.6))
-    >>> location.status, location.center, location.reason
+    >>> answer = roadgeo.locate("drone.png", "porto.gpkg", gsd=0.8)
+    >>> answer.status, round(answer.center.lat, 2)
+    ('located', 41.15)
 
     Parameters
     ----------
     mask : path, array, PIL image, xarray DataArray, rasterio dataset or RoadMask
-        Bright, or 1, where there is road; or the file of a photograph, whose roads are found first. Arrays have the
+        A photograph, whose roads are found first; or a mask: bright, or 1, where there is road. Arrays have the
         shape (H, W), (H, W, C) or (C, H, W).
     reference : Reference, path or name, or several
         Files REF.gpkg, or names in the library. Default: all of the library.
     options : LocateOptions
-        Everything that can be chosen. The following override it.
-    gsd : float or (float, float)
-        Metres per pixel at the middle, at least and at most; a single value stands for 0.8 to 1.25 times it.
+        Everything that can be chosen. The following override it; texts are read as on the command line.
     near : (longitude, latitude, metres)
         The middle lies within that distance of this place.
     within : str or (west, south, east, north)
         The middle lies in this country or state, or within these degrees.
-    max_tilt : float
-        Greatest angle of the camera from the vertical, degrees.
-    north_up : bool
-        The image's up is grid north of the reference, within 5 degrees.
+    gsd : float or (float, float)
+        Metres per pixel at the middle, at least and at most; a single value stands for 0.8 to 1.25 times it.
     heading : float or (float, float)
         Direction of the image's up, degrees clockwise from north, and by how much it may be off (default 10).
-    focal : float
-        Focal length in pixels of the mask.
+    north_up : bool
+        The image's up is grid north of the reference, within 5 degrees.
+    max_tilt : float
+        Greatest angle of the camera from the vertical, degrees.
+    focal : float or "exif"
+        Focal length in pixels of the image; or as a file's EXIF says.
+    effort : "quick" or "full"
+        Whether the search ends early, or roads alone are searched too (the default).
+    time_limit : float
+        Seconds after which the search stops.
 
     Raises
     ------
     MaskError
-        The mask cannot be read or shows no roads.
+        The image cannot be read or shows no roads.
     IndexFormatError
         A reference is missing or unusable.
     ValueError
-        `near` lies on no map, but would with longitude and latitude exchanged; `within` is no area.
+        A hint makes no sense; `near` lies on no map, but would with longitude and latitude exchanged.
     """
     from roadgeo.running.looks import Sighting
     from roadgeo.running.pictures import read_picture
     from roadgeo.running.queries import locate_query
     from roadgeo.workflows import locate as locate_mask
 
+    given = {
+        "near": near,
+        "within": within,
+        "gsd": gsd,
+        "heading": heading,
+        "north_up": north_up,
+        "max_tilt": max_tilt,
+        "focal": focal,
+        "effort": effort,
+        "time_limit": time_limit,
+    }
+    options = _with_hints(options or LocateOptions(), given, mask)
     references = _open(reference)
-    hints = {"gsd_m": _range(gsd), "max_tilt_deg": max_tilt, "north_up": north_up, "focal_px": focal}
-    if heading is not None:
-        hints["heading_deg"] = heading if isinstance(heading, tuple) else (float(heading), 10.0)
-    meant = None if near is None else swapped_near(near, references)
+    meant = None if options.near is None else swapped_near(options.near, references)
     if meant is not None:
         raise ValueError(f"near={near} lies on none of the maps; longitude comes first: did you mean near={meant}?")
-    area = find_area(within) if isinstance(within, str) else within
-    if area is not None and not is_box(area):
-        raise ValueError(f"within={area}: expected west, south, east and north in degrees, south below north")
-    options = _with_hints(options or LocateOptions(), hints, near, area)
     if isinstance(mask, RoadMask):
         sighting = Sighting(locate_mask(mask, references, options), mask)
     else:
@@ -255,8 +271,20 @@ def locate(
     told = {"options": _told(options), "reference_digest": _digest(references, sighting.location)}
     found = {one.name: getattr(sighting.location, one.name) for one in fields(Location)}
     indexes = tuple(one.index_of(sighting.location) for one in references)
-    photo = str(mask) if sighting.of_photograph else None
+    photo = str(mask) if sighting.of_photograph and isinstance(mask, str | os.PathLike) else None
     return Answer(**{**found, **told}, mask=sighting.mask, photo=photo, indexes=indexes)
+
+
+def _with_hints(options: LocateOptions, given: dict[str, Any], image: Any) -> LocateOptions:
+    """Put what is known where the search looks for it."""
+    known = dict(read_hint(name, value) for name, value in given.items() if value is not None)
+    if known.get("focal_px") == "exif":
+        from roadgeo.sources.exif import focal_in_pixels
+
+        if not isinstance(image, str | os.PathLike):
+            raise ValueError('focal="exif" is for files; give the focal length in pixels')
+        known["focal_px"] = focal_in_pixels(os.fspath(image))
+    return apply_hints(options, known)
 
 
 def _told(options: LocateOptions) -> dict[str, Any]:
@@ -286,23 +314,3 @@ def _open(reference: References) -> list[AnyReference]:
     if not given:
         return open_references(())
     return [open_references([os.fspath(one)])[0] if isinstance(one, str | os.PathLike) else one for one in given]
-
-
-def _range(gsd: float | tuple[float, float] | None) -> tuple[float, float] | None:
-    if gsd is None or isinstance(gsd, tuple):
-        return gsd
-    return 0.8 * float(gsd), 1.25 * float(gsd)
-
-
-def _with_hints(
-    options: LocateOptions,
-    hints: dict[str, Any],
-    near: tuple[float, float, float] | None,
-    within: Box | None,
-) -> LocateOptions:
-    """Put what is known of the camera and the place where the search looks for it."""
-    known = {name: value for name, value in hints.items() if value is not None}
-    camera = replace(options.match.camera, **known)
-    within = options.match.within if within is None else within
-    options = replace(options, match=replace(options.match, camera=camera, within=within))
-    return options if near is None else replace(options, near=near)

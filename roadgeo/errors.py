@@ -4,6 +4,10 @@ A message holds what was wrong, what was got, what was expected and what to do, 
 found on the map is no error: it is a `Location` with a reason.
 """
 
+import re
+import sys
+from pathlib import Path
+
 from roadgeo._text import visible
 
 __all__ = [
@@ -19,6 +23,7 @@ __all__ = [
     "PluginError",
     "RoadSourceError",
     "RoadgeoError",
+    "how_to_install",
     "name_extra",
 ]
 
@@ -100,6 +105,30 @@ def name_extra(error: ModuleNotFoundError) -> MissingPackageError | None:
     package = (error.name or "").partition(".")[0]
     if package not in _EXTRAS:
         return None
-    return MissingPackageError(
-        f"this needs {package}, which is not installed: pip install 'roadgeo[{_EXTRAS[package]}]'"
-    )
+    return MissingPackageError(f"this needs {package}, which is not installed: {how_to_install(_EXTRAS[package])}")
+
+
+def how_to_install(extra: str) -> str:
+    """Return the command that adds what an extra of this package needs, to the Python that runs now.
+
+    Nothing is said of roadgeo itself: from where it was installed, a checkout or a file, is not known any more.
+    """
+    from importlib.metadata import PackageNotFoundError, requires
+
+    try:
+        asked = requires("roadgeo") or []
+    except PackageNotFoundError:  # run from its source
+        asked = []
+    found = (re.fullmatch(r"([\w.-]+(?:\[[\w,-]+\])?)[^;]*;\s*extra == ['\"]([\w-]+)['\"]", one) for one in asked)
+    packages = " ".join(_quoted(one[1]) for one in found if one and one[2] == extra) or f"'roadgeo[{extra}]'"
+    parts = Path(sys.prefix).parts
+    if "pipx" in parts:
+        return f"pipx inject roadgeo {packages}"
+    if "uv" in parts and "tools" in parts:
+        return f"uv pip install --python {_quoted(sys.executable)} {packages}"
+    return f"{_quoted(sys.executable or 'python')} -m pip install {packages}"
+
+
+def _quoted(word: str) -> str:
+    """Quote a word that a shell, of whatever system, would take apart."""
+    return word if re.fullmatch(r"[\w./:\\+-]+", word) else f'"{word}"'

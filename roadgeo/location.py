@@ -283,7 +283,8 @@ class Location:
     camera : Camera or None
         Where the camera was; None where no camera above the ground would see the frame so.
     alternatives : tuple of Place
-        The best other places on any of the references, best first, in the CRS of the best one.
+        The best other places on any of the references, best first, in the CRS of the best one. Where nothing is
+        located, the best place that there was comes first.
     stopped : str
         Why the search ended: "accepted", an answer that stands out; "exhausted", nothing was left to try; "work" or
         "time", a limit. Only with "time" may the answer depend on the machine and its load. "" where none was needed.

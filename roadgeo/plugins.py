@@ -13,7 +13,15 @@ from typing import Any
 
 from roadgeo.errors import PluginError, RoadgeoError
 
-__all__ = ["GROUPS", "OUTPUTS", "SEGMENTERS", "SOURCES", "call_plugin", "find_plugins", "load_plugin"]
+__all__ = [
+    "GROUPS",
+    "OUTPUTS",
+    "SEGMENTERS",
+    "SOURCES",
+    "call_plugin",
+    "find_plugins",
+    "load_plugin",
+]
 
 GROUPS = SOURCES, SEGMENTERS, OUTPUTS = "roadgeo.sources", "roadgeo.segmenters", "roadgeo.outputs"
 

@@ -9,7 +9,7 @@ from pathlib import Path
 import pytest
 
 import roadgeo
-from roadgeo.errors import name_extra
+from roadgeo.errors import how_to_install, name_extra
 from roadgeo.evaluation.demo import ROADS, demo_masks
 
 ROOT = Path(__file__).parents[1]
@@ -97,3 +97,22 @@ def test_placeholder_addresses_stand_in_one_place() -> None:
     files = [path for path in ROOT.rglob("*") if path.suffix in {".py", ".md", ".toml", ".cff", ".yaml", ".txt"}]
     ours = [path for path in files if not {".venv", ".lowest", ".uv", "build", "tests"} & set(path.parts)]
     assert {path.name for path in ours if "roadgeo.example.org" in path.read_text("utf-8")} == held
+
+
+@pytest.mark.parametrize(
+    ("prefix", "begins"),
+    [
+        ("/home/a/.local/share/pipx/venvs/roadgeo", "pipx inject roadgeo onnxruntime"),
+        ("/home/a/.local/share/uv/tools/roadgeo", "uv pip install --python /x/python onnxruntime"),
+        ("/home/a/project/.venv", "/x/python -m pip install onnxruntime"),
+    ],
+)
+def test_what_is_missing_is_installed_where_roadgeo_is(
+    prefix: str, begins: str, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Nobody need know where roadgeo itself came from: there may be no such package anywhere."""
+    monkeypatch.setattr(sys, "prefix", prefix)
+    monkeypatch.setattr(sys, "executable", "/x/python")
+    assert how_to_install("segment").startswith(begins)
+    monkeypatch.setattr(sys, "executable", "/my programs/python")
+    assert "pipx" in prefix or '"/my programs/python"' in how_to_install("segment")

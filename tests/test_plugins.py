@@ -13,6 +13,7 @@ import cv2
 import numpy as np
 import pytest
 import shapely
+from outputs.test_location_files import located, road_mask
 
 from roadgeo import plugins
 from roadgeo.cli import main
@@ -20,7 +21,10 @@ from roadgeo.errors import MaskError, PluginError
 from roadgeo.evaluation.demo import ROADS, demo_masks
 from roadgeo.geometry.mask import RoadMask
 from roadgeo.geometry.projection import to_lonlat
-from roadgeo.outputs.registry import ALSO
+from roadgeo.outputs import registry
+from roadgeo.outputs.location_files import OutputOptions, write_location
+from roadgeo.outputs.paths import output_paths
+from roadgeo.outputs.registry import ALSO, Output
 from roadgeo.plugins import GROUPS, OUTPUTS, SEGMENTERS, SOURCES, call_plugin, find_plugins, load_plugin
 from roadgeo.sources.masks import read_mask
 from roadgeo.sources.roads import fetch_roads, read_roads
@@ -234,3 +238,22 @@ def test_nothing_is_looked_up_before_a_plugin_is_named() -> None:
     )
     done = subprocess.run([sys.executable, "-c", script], capture_output=True, text=True, check=True)
     assert done.stdout.splitlines()[-1] == "False"
+
+
+@pytest.mark.parametrize("fails", ["raises", "writes nothing"])
+def test_a_faulty_output_is_blamed_by_name_and_the_rest_is_kept(
+    fails: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    def write(path: Path, _: object) -> None:
+        if fails == "raises":
+            path.write_text("half")
+            raise KeyError("x")
+
+    monkeypatch.setattr(registry, "_load", lambda name: Output(name, "_broken.txt", write, "broken"))
+    options = OutputOptions(products=("broken", "geojson"))
+    written = write_location(located(), road_mask(), output_paths(tmp_path, "a"), options)
+    (fault,) = written.faults
+    assert f"the output 'broken' of {__name__} failed: " in fault
+    assert "tell its makers; all else is written" in fault
+    assert {path.name for path in written.files} == {path.name for path in tmp_path.iterdir()}
+    assert {"a_location.json", "a_footprint.geojson"} <= {path.name for path in written.files}

@@ -32,21 +32,23 @@ _COLLECT_AFTER = 200_000
 #: import the module.
 COMMANDS = {
     "index": ("roadgeo.cli.index", "Build a reference: the searchable roads of a place."),
-    "locate": ("roadgeo.cli.locate", "Find road masks on a reference and draw them there."),
-    "verify": ("roadgeo.cli.verify", "Check whether georeferenced images are where they say."),
-    "track": ("roadgeo.cli.track", "Follow a flight over the map, frame by frame."),
-    "apply": ("roadgeo.cli.apply", "Put another picture of a located frame on the map."),
+    "locate": ("roadgeo.cli.locate", "Find where images lie on a map, and draw them there."),
     "serve": ("roadgeo.cli.serve", "A page to drop photographs on; answers over HTTP."),
-    "vectorize": ("roadgeo.cli.vectorize", "Show what roads are seen in a mask."),
-    "info": ("roadgeo.cli.references", "Describe a reference."),
-    "check": ("roadgeo.cli.references", "Verify every byte and number of a reference."),
-    "list": ("roadgeo.cli.references", "List the references in the library."),
-    "remove": ("roadgeo.cli.references", "Remove references from the library."),
-    "simulate": ("roadgeo.cli.simulate", "Draw road masks whose place is known."),
-    "evaluate": ("roadgeo.cli.evaluate", "Measure how well masks are located, and where they would be."),
     "qgis": ("roadgeo.cli.qgis", "Install the QGIS plugin."),
     "demo": ("roadgeo.cli.demo", "Locate five masks in Porto: needs no network and no data."),
-    "completion": ("roadgeo.cli.completion", "Complete commands and options in your shell."),
+    "reference": ("roadgeo.cli.references", "List, describe, test and remove references."),
+    "track": ("roadgeo.cli.track", "Follow a flight over the map, frame by frame."),
+    "verify": ("roadgeo.cli.verify", "Say whether georeferenced images are where they claim to be."),
+    "apply": ("roadgeo.cli.apply", "Put another picture of a located frame on the map."),
+    "vectorize": ("roadgeo.cli.vectorize", "Show what roads are seen in an image."),
+    "evaluate": ("roadgeo.cli.evaluate", "Measure how well masks are located, and where they would be."),
+    "simulate": ("roadgeo.cli.simulate", "Draw road masks whose place is known."),
+}
+
+#: Commands that are not listed: what is called once, and names of before, which stay for one version.
+_UNLISTED = {
+    "completion": "roadgeo.cli.completion",
+    **dict.fromkeys(("info", "check", "list", "remove"), "roadgeo.cli.references"),
 }
 
 
@@ -59,9 +61,10 @@ class LazyGroup(click.Group):
 
     def get_command(self, ctx: click.Context, cmd_name: str) -> click.Command | None:  # noqa: ARG002
         """Import one command."""
-        if cmd_name not in COMMANDS:
+        home = COMMANDS[cmd_name][0] if cmd_name in COMMANDS else _UNLISTED.get(cmd_name)
+        if home is None:
             return None
-        module = importlib.import_module(COMMANDS[cmd_name][0])
+        module = importlib.import_module(home)
         return getattr(module, f"{cmd_name}_command")  # type: ignore[no-any-return]
 
     def resolve_command(
@@ -78,6 +81,8 @@ class LazyGroup(click.Group):
             near = difflib.get_close_matches(args[0], COMMANDS, n=1)
             hint = f"Did you mean {near[0]}?" if near else ""
             raise click.UsageError(f"No such command {args[0]!r}. {hint}".strip(), ctx)
+        if args and _UNLISTED.get(args[0]) == "roadgeo.cli.references" and sys.stderr.isatty():
+            echo(f"`roadgeo {args[0]}` is called `roadgeo reference {args[0]}` now", err=True)
         ctx.meta["roadgeo.arguments"] = list(args)  # see `cli.command_line`
         return super().resolve_command(ctx, args)
 
@@ -87,23 +92,40 @@ class LazyGroup(click.Group):
             formatter.write_dl([(name, summary) for name, (_, summary) in COMMANDS.items()])
 
 
+def _list_plugins(ctx: click.Context, _: click.Parameter, asked: bool) -> None:
+    if asked and not ctx.resilient_parsing:
+        from roadgeo.cli.references import list_plugins
+
+        list_plugins(as_json=False)
+        ctx.exit()
+
+
 @click.group(
     cls=LazyGroup,
     invoke_without_command=True,
     context_settings={"help_option_names": ["-h", "--help"], "max_content_width": 100},
-    epilog="Exit status: 0 every mask located, 3 at least one not located, 1 error, 2 usage.",
+    epilog="Exit status: 0 every image located, 3 at least one not located, 1 error, 2 usage.",
 )
 @click.version_option(__version__, prog_name="roadgeo")
+@click.option(
+    "--plugins",
+    is_flag=True,
+    is_eager=True,
+    expose_value=False,
+    callback=_list_plugins,
+    help="List the road sources, segmenters and outputs that are installed.",
+)
 @click.pass_context
 def cli(ctx: click.Context) -> None:
     """Locate aerial images from their roads alone.
 
     \b
       roadgeo index --osm "Boston, MA"      once: fetch and index the roads of a place
-      roadgeo locate image_mask.tif         find the mask there; image_mask_footprint.tif opens in QGIS
+      roadgeo locate photo.jpg --report     find a photograph, or a mask of roads, there
       roadgeo demo                          see it work, offline, in a minute
 
-    `roadgeo COMMAND --help` explains each command, with examples.
+    `roadgeo COMMAND --help` explains each command, with examples; `roadgeo completion --help` how your shell completes
+    them.
     """
     if os.environ.get("NO_COLOR"):
         ctx.color = False

@@ -8,24 +8,24 @@ import click
 
 from roadgeo.cli.accuracy import tell_accuracy
 from roadgeo.cli.folders import make_folder
-from roadgeo.cli.parameters import CRS, Plugin, out_dir_option
+from roadgeo.cli.options import Command, Plugin, option, out_dir_option, take
 from roadgeo.cli.printing import echo
 from roadgeo.outputs.registry import offered
 
 __all__ = ["apply_command"]
 
 
-@click.command("apply", short_help="Put another picture of a located frame on the map.")
+@click.command("apply", cls=Command, short_help="Put another picture of a located frame on the map.")
 @click.argument("location", metavar="LOCATION.json", type=click.Path())
 @click.argument("pictures", metavar="PICTURE...", nargs=-1, required=True, type=click.Path())
 @out_dir_option()
-@click.option(
+@option(
     "--stretch",
     is_flag=True,
     help="The picture's sides may be in another proportion: it shows the same ground all the same, as a scan does whose"
     " pixels are not square.",
 )
-@click.option(
+@option(
     "--also",
     "products",
     metavar="NAME",
@@ -33,30 +33,8 @@ __all__ = ["apply_command"]
     multiple=True,
     help="Write a further form, as of `roadgeo locate`: points, gcps, iiif, geojson, kmz ... Repeatable.",
 )
-@click.option(
-    "--crs", metavar="CRS", type=CRS, help="CRS of what is drawn, such as EPSG:3857. Default: the location's own."
-)
-@click.option(
-    "--resolution",
-    metavar="SIZE",
-    type=click.FloatRange(min=0, min_open=True),
-    help="Pixel size of what is drawn, in units of its CRS. Default: the picture's own.",
-)
-@click.option(
-    "--resampling",
-    type=click.Choice(["nearest", "bilinear", "cubic", "lanczos"]),
-    default="cubic",
-    show_default=True,
-    help="How values between pixels are found; nearest for classes.",
-)
-@click.option(
-    "--compression",
-    type=click.Choice(["deflate", "zstd", "jpeg", "webp"]),
-    default="deflate",
-    show_default=True,
-    help="Of what is drawn; jpeg and webp make photographs of 8 bits five times smaller, and lose some detail.",
-)
-@click.option("-q", "--quiet", is_flag=True, help="Say nothing but errors.")
+@take("crs", "resolution", "resampling", "compression", rare=False)
+@take("quiet")
 def apply_command(location: str, pictures: tuple[str, ...], out_dir: str, quiet: bool, **given: Any) -> int:
     """Put PICTUREs on the map by the place that one of their frame was found at.
 

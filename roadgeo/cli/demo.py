@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING, Any
 import click
 
 from roadgeo.cli import ERROR
-from roadgeo.cli.parameters import out_dir_option
+from roadgeo.cli.options import out_dir_option
 from roadgeo.cli.printing import echo
 from roadgeo.outputs.wording import format_lonlat
 
@@ -70,6 +70,11 @@ def demo_command(out_dir: str) -> int:
     echo(
         f"\nLook at {folder / 'drone_overlay.png'}. In QGIS, open {folder / 'drone_footprint.tif'} and "
         f"{folder / 'drone_location.gpkg'} over {folder / 'porto.gpkg'}. The masks are in {folder / 'masks'}."
+    )
+    command = f"roadgeo locate {folder / PHOTO.name} -r {folder / 'porto.gpkg'} --report"
+    echo(
+        f"\nNext, on this map: `{command}`. With a photograph of your own: first `roadgeo index --osm"
+        ' "Your town"`, once; then `roadgeo locate photo.jpg --report`.'
     )
     if wrong:
         echo(f"Error: {wrong} masks came out wrong; please report it", err=True)

@@ -17,8 +17,7 @@ from click.core import ParameterSource
 
 from roadgeo._text import visible
 from roadgeo.cli.command_line import made_by
-from roadgeo.cli.hints import hint_options, make_options
-from roadgeo.cli.parameters import out_dir_option
+from roadgeo.cli.options import Command, hinted, make_options, option, out_dir_option, take
 from roadgeo.cli.printing import echo
 from roadgeo.cli.progress import count_up
 from roadgeo.cli.queries import QUERY_OPTIONS, query_options, query_sets
@@ -33,26 +32,25 @@ if TYPE_CHECKING:
 __all__ = ["evaluate_command"]
 
 
-@click.command("evaluate", short_help="Measure how well masks are located.")
+@click.command("evaluate", cls=Command, short_help="Measure how well masks are located.")
 @click.argument("reference", metavar="REF")
-@click.option("--queries", type=click.Path(exists=True, path_type=Path), help="A query set: its folder, or its table.")
+@option("--queries", type=click.Path(exists=True, path_type=Path), help="A query set: its folder, or its table.")
 @query_options
-@click.option("--method", type=click.Choice(["auto", "pair"]), default="auto", show_default=True, help="As in locate.")
-@click.option("--effort", type=click.Choice(["quick", "full"]), default="full", show_default=True, help="As in locate.")
-@hint_options("gsd_m", "max_tilt_deg", "north_up", gsd_m="--known-gsd")
-@click.option("--time-limit", type=click.FloatRange(0.01), metavar="S", help="Per mask. Default: as in locate.")
-@click.option(
+@option("--method", type=click.Choice(["auto", "pair"]), default="auto", show_default=True, help="As in locate.")
+@take("gsd", called="--known-gsd", help="Pixel size as it is told to the search, metres.")
+@take("max_tilt", "north_up", "effort", "time_limit")
+@option(
     "--radius", metavar="METRES", type=click.FloatRange(0.01), default=20.0, show_default=True, help="Right if nearer."
 )
-@click.option("-j", "--jobs", metavar="N", type=click.IntRange(1), default=1, show_default=True, help="Processes.")
-@click.option("--map", "as_map", is_flag=True, help="Map where such masks (of the first --noise) are located.")
-@click.option(
+@take("jobs", help="Processes.")
+@option("--map", "as_map", is_flag=True, help="Map where such masks (of the first --noise) are located.")
+@option(
     "--height",
     metavar="METRES",
     type=click.FloatRange(1),
     help="Above ground, in place of --gsd: height/focal.",
 )
-@click.option(
+@option(
     "--check",
     metavar="N",
     type=click.IntRange(0),
@@ -60,18 +58,13 @@ __all__ = ["evaluate_command"]
     help="With --map: try N other masks and count those located in each class.",
 )
 @out_dir_option("Write here, and go on from here.", None, Path)
-@click.option("--json", "as_json", is_flag=True, help="Print the figures as one JSON object.")
-@click.option("-q", "--quiet", is_flag=True, help="Say nothing but errors, and what --json prints.")
+@option("--json", "as_json", is_flag=True, help="Print the figures as one JSON object.")
+@take("quiet")
 def evaluate_command(
     reference: str,
     queries: Path | None,
     roads: Path | None,
     method: Literal["auto", "pair"],
-    effort: Literal["quick", "full"],
-    gsd_m: tuple[float, float] | None,
-    max_tilt_deg: float | None,
-    north_up: bool,
-    time_limit: float | None,
     radius: float,
     jobs: int,
     as_map: bool,
@@ -112,11 +105,11 @@ def evaluate_command(
     if height is not None:
         options["gsd"] = (height / (options["focal"] or options["size"]),) * 2
     compile_once(quiet)
-    hints = {"gsd_m": gsd_m, "max_tilt_deg": max_tilt_deg, "north_up": north_up}
-    locator = ReferenceLocator((path,), make_options(method, time_limit, hints, effort))
-    known = {"known_gsd": gsd_m, "max_tilt": max_tilt_deg, "north_up": north_up or None, "time_limit_s": time_limit}
-    quicker = {"effort": effort} if effort != "full" else {}
-    told = {"reference": path.stem, "method": method, **_known(known), **quicker}
+    hints = hinted(options)
+    locator = ReferenceLocator((path,), make_options(hints, method))
+    options = {name: value for name, value in options.items() if name not in _HINTED}
+    known = {_HINTED[name]: value for name, value in hints.items() if value != "full"}
+    told = {"reference": path.stem, "method": method, **known}
     if as_map:
         survey = _survey(locator, options, told)
         survey = replace(survey, check=check, jobs=jobs, out_dir=out_dir, counting=partial(count_up, quiet=quiet))
@@ -125,6 +118,16 @@ def evaluate_command(
     query_set, settings = _query_set(path, queries, roads, options)
     settings |= told
     _evaluate(query_set, locator, settings, radius, jobs, out_dir, as_json, quiet)
+
+
+#: How the settings of an evaluation call what was told to the search.
+_HINTED = {
+    "gsd_m": "known_gsd",
+    "max_tilt_deg": "max_tilt",
+    "north_up": "north_up",
+    "effort": "effort",
+    "time_limit_s": "time_limit_s",
+}
 
 
 def _survey(locator: ReferenceLocator, options: dict[str, Any], told: dict[str, Any]) -> Survey:

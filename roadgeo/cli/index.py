@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import sys
 from pathlib import Path
 from time import perf_counter
 from typing import TYPE_CHECKING, Any
@@ -9,8 +10,8 @@ from typing import TYPE_CHECKING, Any
 import click
 
 from roadgeo._progress import Say
-from roadgeo.cli.clusters import cluster_options, make_cluster
-from roadgeo.cli.parameters import BOX, CRS, NEAR, Plugin, verbosity_options
+from roadgeo._text import counted
+from roadgeo.cli.options import BOX, CRS, NEAR, Command, Plugin, make_cluster, option, take
 from roadgeo.cli.printing import echo
 from roadgeo.cli.shards import build_in_shards, shard_options
 
@@ -19,74 +20,96 @@ if TYPE_CHECKING:
 
 __all__ = ["index_command"]
 
+SOURCE, ROADS, RESULT = "Where the roads come from", "Which roads", "The reference"
 
-@click.command("index", short_help="Build a reference: the searchable roads of a place.")
-@click.option("--osm", "place", metavar="PLACE", help="Fetch a place's roads from OpenStreetMap, by its name.")
-@click.option("--bbox", metavar="W,S,E,N", type=BOX, help="Fetch the roads in a box, degrees; or cut --roads to it.")
-@click.option("--around", metavar="LON,LAT,METRES", type=NEAR, help="Fetch the roads within a distance of a point.")
-@click.option(
-    "--polygon",
-    metavar="FILE",
-    type=click.Path(),
-    help="Fetch the roads inside a polygon of a file (GeoJSON, GeoPackage ...).",
+
+@click.command("index", cls=Command, short_help="Build a reference: the searchable roads of a place.")
+@option("--osm", "place", metavar="PLACE", help="Fetch the roads of a place from OpenStreetMap.", group=SOURCE)
+@option(
+    "--bbox", metavar="W,S,E,N", type=BOX, help="Fetch those in a box, degrees; or cut --roads to it.", group=SOURCE
 )
-@click.option(
+@option("--around", metavar="LON,LAT,METRES", type=NEAR, help="Fetch those within a distance of a point.", group=SOURCE)
+@option("--polygon", metavar="FILE", type=click.Path(), help="Fetch those inside a polygon of a file.", group=SOURCE)
+@option(
     "--roads",
     metavar="FILE",
     type=click.Path(),
     multiple=True,
     help="Take roads from a file or a folder of files. Repeatable.",
+    group=SOURCE,
 )
-@click.option(
+@option(
     "--source",
     "plugin",
     metavar="NAME:WHERE",
     type=Plugin("roadgeo.sources", has_argument=True),
-    help="Take roads from a plugin; `roadgeo info --plugins` lists them.",
+    help="Take roads from a plugin; `roadgeo --plugins` lists them.",
+    group=SOURCE,
+    rare=True,
 )
-@click.option("--layer", metavar="NAME", help="Layer of --roads, where there are several.")
-@click.option("--crs", metavar="CRS", type=CRS, help="CRS of --roads, where the file does not say, such as EPSG:26986.")
-@click.option(
+@option("--layer", metavar="NAME", help="Layer of --roads, where there are several.", group=SOURCE)
+@option(
+    "--crs",
+    metavar="CRS",
+    type=CRS,
+    help="CRS of --roads, where the file does not say, such as EPSG:26986.",
+    group=SOURCE,
+)
+@option(
     "--kinds",
     type=click.Choice(["main", "drivable", "vehicles", "all"]),
     default="drivable",
     show_default=True,
     help="Which roads: those that the masks show.",
+    group=ROADS,
 )
-@click.option("--tunnels", is_flag=True, help="Take tunnels too, which a camera does not see.")
-@click.option("--attribution", metavar="TEXT", help="Whom to name beside the map, where --roads does not say.")
-@click.option("--date", metavar="YYYY-MM-DD", help="Fetch the roads as they were on that day.")
-@click.option("--overpass-url", metavar="URL", help="Overpass server to fetch from.")
-@click.option("--nominatim-url", metavar="URL", help="Nominatim server that finds --osm places.")
-@click.option("--no-cache", is_flag=True, help="Fetch anew what was fetched before.")
-@click.option(
+@option("--tunnels", is_flag=True, help="Take tunnels too, which a camera does not see.", group=ROADS, rare=True)
+@option(
+    "--attribution",
+    metavar="TEXT",
+    help="Whom to name beside the map, where --roads does not say.",
+    group=ROADS,
+    rare=True,
+)
+@option("--date", metavar="YYYY-MM-DD", help="Fetch the roads as they were on that day.", group=SOURCE, rare=True)
+@option("--overpass-url", metavar="URL", help="Overpass server to fetch from.", group=SOURCE, rare=True)
+@option("--nominatim-url", metavar="URL", help="Nominatim server that finds --osm places.", group=SOURCE, rare=True)
+@option("--no-cache", is_flag=True, help="Fetch anew what was fetched before.", group=SOURCE, rare=True)
+@option(
     "--coarse",
     is_flag=True,
     help="Draw main roads alone, as pixels of 2 to 12 m show them: a map of a whole region, for images of 5 to 50 km.",
+    group=ROADS,
 )
-@click.option(
+@option(
     "--update",
     is_flag=True,
     help="Bring a reference up to date: replace its roads on the ground asked for, or add that; keep the rest.",
+    group=RESULT,
 )
-@click.option(
+@option(
     "--rebuild",
     metavar="REF",
     help="Build the index of REF again from its GeoPackage alone, after an edit in QGIS for example.",
+    group=RESULT,
 )
-@click.option(
-    "--name", metavar="NAME", help="Name of the reference. Default: after the place, else after REF.gpkg or the file."
+@option(
+    "--name",
+    metavar="NAME",
+    help="Name of the reference. Default: after the place, else after REF.gpkg or the file.",
+    group=RESULT,
 )
-@click.option(
+@option(
     "-o",
     "--out",
     metavar="REF.gpkg",
     type=click.Path(),
     help="Where it goes. Default: into the library, under its name.",
+    group=RESULT,
 )
 @shard_options
-@cluster_options
-@verbosity_options
+@take("cluster", group="In pieces")
+@take("verbosity")
 def index_command(
     out: str | None,
     name: str | None,
@@ -156,6 +179,8 @@ def index_command(
     make_folder(path.parent)  # before the long part
     if update:
         reference_freshness(path)  # there must be one
+    else:
+        _ask_before_replacing(path, quiet)
     read = {"roads": _read, "plugin": _read_plugin}.get(given, _fetch)
     compile_once(quiet)
     with show_steps(quiet) as say:
@@ -169,7 +194,7 @@ def index_command(
             echo(f"  {key}: {value}", err=True)
     if not quiet:
         seconds = perf_counter() - started
-        found = f"{path}: {len(reference.index):,} intersections in {seconds:.1f} s"
+        found = f"{path}: {counted(len(reference.index), 'intersection')} in {seconds:.1f} s"
         echo(f"{found}; search it with `roadgeo locate MASK -r {out or path.stem}`")
 
 
@@ -197,6 +222,23 @@ def _require_geopackage(out: str | None) -> None:
         )
 
 
+def _ask_before_replacing(path: Path, quiet: bool) -> None:
+    """Ask whether a reference of that name may go, or where nobody can be asked say that it does."""
+    from roadgeo.errors import RoadgeoError
+    from roadgeo.reference.inspection import describe_reference
+
+    if not path.exists():
+        return
+    try:
+        known = counted(describe_reference(path).get("counts", {}).get("intersections", 0), "intersection")
+    except RoadgeoError:  # it is damaged: nothing is lost
+        return
+    if sys.stdin.isatty() and sys.stderr.isatty():
+        click.confirm(f"There is a reference {path.stem} of {known}. Replace it?", abort=True, err=True)
+    elif not quiet:
+        echo(f"replaces {path}, a reference of {known}; --update would add to it", err=True)
+
+
 def _rebuild(name: str, quiet: bool) -> None:
     from roadgeo.cli.compilation import compile_once
     from roadgeo.cli.progress import show_steps
@@ -208,7 +250,7 @@ def _rebuild(name: str, quiet: bool) -> None:
     with show_steps(quiet) as say:
         reference = rebuild_reference(path, say)
     if not quiet:
-        echo(f"{path}: {len(reference.index):,} intersections indexed again")
+        echo(f"{path}: {counted(len(reference.index), 'intersection')} indexed again")
 
 
 # --- where the roads come from ----------------------------------------------------------------------------------------

@@ -4,32 +4,38 @@ from __future__ import annotations
 
 import json
 from collections import Counter
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import replace
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, Literal, TypeVar
+from typing import TYPE_CHECKING, Any, Literal
 
 import click
 
 from roadgeo._text import visible
 from roadgeo.cli import ERROR, NOT_LOCATED
 from roadgeo.cli.accuracy import tell_accuracy
-from roadgeo.cli.clusters import cluster_options, make_cluster
 from roadgeo.cli.command_line import said_options
 from roadgeo.cli.folders import make_folder
-from roadgeo.cli.hints import HINTS, hint_options, make_options, refuse_swapped
-from roadgeo.cli.parameters import (
+from roadgeo.cli.options import (
     ASPECT,
-    CRS,
+    IMAGE,
+    RESULTS,
+    SEARCH,
+    Command,
     Plugin,
+    hinted,
+    make_cluster,
+    make_options,
+    option,
     out_dir_option,
-    recursive_option,
-    references_option,
-    verbosity_options,
+    read_options,
+    refuse_swapped,
+    take,
 )
-from roadgeo.cli.photographs import mask_options, read_options, segmenting_options
 from roadgeo.cli.printing import echo
 from roadgeo.cli.truths import read_truths
+from roadgeo.errors import how_to_install
+from roadgeo.matching.hints import HINTS
 from roadgeo.outputs.registry import (
     ALSO,
     ALWAYS,
@@ -52,237 +58,189 @@ if TYPE_CHECKING:
 
 __all__ = ["describe", "locate_command", "pair_images"]
 
-Command = TypeVar("Command", bound=Callable[..., Any])
-
 #: Options that change nothing of a result, or that are said mask by mask.
 _OF_NO_ACCOUNT = {
     *("as_json", "divide_map", "engine", "images", "jobs", "quiet", "recursive", "scheduler", "skip_existing"),
     "verbose",
 }
 
-_HELP = """Find where road MASKs lie on a map, and draw them there.
+_HELP = """Find where aerial images lie on a map, and draw them there.
 
-A mask is an image of the roads that an aerial picture shows: bright or 1 where there is road. Its size, heading,
-scale and camera need not be known; what is known shortens the search, and tells places apart that look alike. Give
-files, folders or patterns.
-
-A photograph may stand for its mask: it is recognised, a network finds its roads (pip install 'roadgeo[segment]'), and
-what it saw is kept as PHOTO_mask.tif. So may roads as lines, in pixels, metres or degrees: roads.geojson, tracks.gpkg.
-
-\b
-For each located photo_mask.tif:
-{always}
-
-\b
-Where asked for:
-{asked}
-
-For several masks also roadgeo_summary.gpkg and roadgeo_summary.csv, all footprints in one, and with --report
-roadgeo_report.html, which lists them. What Ctrl-C cut short goes on with --skip-existing.
-
-\b
-With --also:
-{also}
-  and what plugins offer (roadgeo info --plugins)
+An image is a photograph, whose roads a network finds first; a mask, bright where there is road; or roads as lines.
+Give files, folders or patterns. Nothing else need be known; what is known shortens the search.
 
 \b
 Examples:
-  roadgeo locate photo_mask.tif
-  roadgeo locate masks/ --reference boston-ma --out-dir found --plot
-  roadgeo locate *.png --json --jobs 4 > found.jsonl
-  roadgeo locate photo_mask.png --image photo.tif --crs EPSG:3857 --also geojson --also points
-  roadgeo locate mask.png --gsd 0.3:0.6 --near=-71.06,42.36,5000
-  roadgeo locate photo.jpg --segmenter my_roads.onnx
+  roadgeo locate photo.jpg --report
+  roadgeo locate flight/ --reference boston-ma --out-dir found --json --jobs 4 > found.jsonl
+  roadgeo locate photo_mask.png --image photo.tif --crs EPSG:3857 --also geojson
+  roadgeo locate photo.jpg --gsd 0.3 --near=-71.06,42.36,5000
 
-Exit status: 0 every mask located, 3 at least one not located, 1 error, 2 usage.
+\b
+For each located photo.jpg:
+{always}
+
+Exit status: 0 all located, 3 at least one not located, 1 error, 2 usage.
+"""
+
+_MORE = """Where asked for:
+{asked}
+
+With --also:
+{also}
+  and what plugins offer (roadgeo --plugins)
+
+For several images also roadgeo_summary.gpkg and roadgeo_summary.csv, all footprints
+in one, and with --report roadgeo_report.html, which lists them. What a network saw in
+a photograph is kept as PHOTO_mask.tif. What Ctrl-C cut short goes on with --skip-existing.
 """
 
 
 def _listed(outputs: Sequence[Output]) -> str:
     """List files with what they are for."""
-    names = [output.path(Path(), "photo_mask").name for output in outputs]
+    names = [output.path(Path(), "photo").name for output in outputs]
     said = [f"{one.option}: {one.summary}" if one.option else one.summary for one in outputs]
     width = max(map(len, names))
     return "\n".join(f"  {name:<{width}}  {text}" for name, text in zip(names, said, strict=True))
 
 
-def _help() -> str:
+def _more() -> str:
     asked = [OVERLAY, FIGURES["pdf"], REPORT, EXPLANATION_PICTURE, EXPLANATION]
     also = "\n".join(f"  {name:<9}  {output.summary}" for name, output in ALSO.items())
-    return _HELP.format(always=_listed(ALWAYS), asked=_listed(asked), also=also)
+    return _MORE.format(asked=_listed(asked), also=also)
 
 
-#: How the result is drawn, and in which further forms.
-_DRAWING = [
-    click.option("--plot", is_flag=True, help=f"Also write MASK{OVERLAY.ending}: {OVERLAY.summary}."),
-    click.option(
-        "--figure",
-        type=click.Choice(list(FIGURES)),
-        help="Also write MASK_figure, the same with axes, for papers. Needs matplotlib: pip install 'roadgeo[plot]'.",
-    ),
-    click.option(
-        "--report",
-        is_flag=True,
-        help=f"Also write MASK{REPORT.ending}, to look at in a browser, located or not; needs no network.",
-    ),
-    click.option(
-        "--explain",
-        is_flag=True,
-        help=f"Also write MASK{EXPLANATION_PICTURE.ending} and .json: how far the search got, the best rejected"
-        " places, what was missing.",
-    ),
-    click.option(
-        "--truth",
-        metavar="LON,LAT|FILE",
-        help="With --explain: where the middle really lies, or a truth.csv of many masks; says which stage lost it.",
-    ),
-    click.option(
-        "--image",
-        "images",
-        metavar="PHOTO",
-        type=click.Path(),
-        multiple=True,
-        help="Draw this photograph on the map instead of its mask. One per mask, in order, or a folder of them.",
-    ),
-    click.option(
-        "--also",
-        "products",
-        metavar="NAME",
-        type=Plugin("roadgeo.outputs", names=offered),
-        multiple=True,
-        help="Write a further form of the result: see below. Repeatable.",
-    ),
-    click.option("--gcps", is_flag=True, help=f"The same as --also gcps: {GCPS.summary}."),
-    click.option(
-        "--crs",
-        metavar="CRS",
-        type=CRS,
-        help="CRS of what is drawn, such as EPSG:3857. Default: the reference's, metric.",
-    ),
-    click.option(
-        "--resolution",
-        metavar="SIZE",
-        type=click.FloatRange(min=0, min_open=True),
-        help="Pixel size of what is drawn, in units of its CRS. Default: the picture's own.",
-    ),
-    click.option(
-        "--resampling",
-        type=click.Choice(["nearest", "bilinear", "cubic", "lanczos"]),
-        default="cubic",
-        show_default=True,
-        help="How a photograph's values between its pixels are found.",
-    ),
-    click.option(
-        "--compression",
-        type=click.Choice(["deflate", "zstd", "jpeg", "webp"]),
-        default="deflate",
-        show_default=True,
-        help="Of what is drawn; jpeg and webp make photographs of 8 bits five times smaller, and lose some detail.",
-    ),
-    click.option(
-        "--max-pixels",
-        metavar="N",
-        type=click.IntRange(1),
-        default=400_000_000,
-        show_default=True,
-        help="Draw coarser rather than more than this.",
-    ),
-]
-
-
-def _drawing_options(command: Command) -> Command:
-    """Add the options of `_DRAWING`."""
-    for option in reversed(_DRAWING):
-        command = option(command)
-    return command
-
-
-@click.command("locate", short_help="Find road masks on a reference and draw them there.", help=_help())
-@click.argument("masks", metavar="MASK...", nargs=-1, required=True, type=click.Path())
-@references_option()
-@out_dir_option()
-@click.option("--json", "as_json", is_flag=True, help="Print one JSON object per mask and line, in input order.")
-@_drawing_options
-@segmenting_options
-@click.option(
-    "--units",
-    type=click.Choice(["auto", "pixels", "metres"]),
-    default="auto",
-    show_default=True,
-    help="What the coordinates are of roads that come as lines (GeoJSON, GeoPackage ...). auto: told by the CRS.",
+@click.command(
+    "locate",
+    cls=Command,
+    short_help="Find where images lie on a map, and draw them there.",
+    help=_HELP.format(always=_listed([one for one in ALWAYS if one.ending.endswith((".json", ".tif", ".gpkg"))])),
+    more=_more,
 )
-@click.option("--layer", metavar="NAME", help="Layer of roads that come as lines, where there are several.")
-@click.option(
+@click.argument("masks", metavar="IMAGE...", nargs=-1, required=True, type=click.Path())
+@take("references", *HINTS)
+@option(
     "--allow-mirror",
     is_flag=True,
-    help="Where a mask has no place, turn it over: film scanned from its back. Without it, that is only told.",
+    help="Where an image has no place, turn it over: film scanned from its back. Without it, that is only told.",
+    group=IMAGE,
+    rare=True,
 )
-@click.option(
+@option(
     "--aspect",
     metavar="RATIO|unknown",
     type=ASPECT,
     help="How many times a pixel is as wide as high, of scans that are stretched; unknown: from 0.5 to 2 is tried.",
+    group=IMAGE,
+    rare=True,
 )
-@click.option(
+@option(
     "--dem",
     metavar="FILE",
     default="",
     type=click.Path(),
     help="Terrain model (GeoTIFF, metres): how high the ground lies, and so how high the camera was above the sea.",
+    group=IMAGE,
+    rare=True,
 )
-@mask_options
-@hint_options()
-@click.option(
+@out_dir_option()
+@option("--report", is_flag=True, help="Also a page for the browser, located or not.", group=RESULTS)
+@option("--plot", is_flag=True, help="Also a picture, to look at.", group=RESULTS)
+@option(
+    "--image",
+    "images",
+    metavar="PHOTO",
+    type=click.Path(),
+    multiple=True,
+    help="Draw this photograph in place of its mask. One per mask, in order, or a folder of them. Repeatable.",
+    group=RESULTS,
+)
+@option(
+    "--also",
+    "products",
+    metavar="NAME",
+    type=Plugin("roadgeo.outputs", names=offered),
+    multiple=True,
+    help="Also as points, geojson, kmz, worldfile and others. Repeatable; --help-all lists all forms.",
+    group=RESULTS,
+)
+@take("json", group=RESULTS)
+@option(
+    "--skip-existing/--overwrite",
+    default=False,
+    help="Keep results younger than their images, or make them anew, the default.",
+    group=RESULTS,
+    rare=True,
+)
+@option(
+    "--explain",
+    is_flag=True,
+    help="How far the search got, the best rejected places, what was missing: a picture and JSON.",
+    group=RESULTS,
+    rare=True,
+)
+@option(
+    "--truth",
+    metavar="LON,LAT|FILE",
+    help="With --explain: where the middle really lies, or a truth.csv of many masks; says which stage lost it.",
+    group=RESULTS,
+    rare=True,
+)
+@option(
+    "--figure",
+    type=click.Choice(list(FIGURES)),
+    help="Also write IMAGE_figure, the picture with axes, for papers. Needs matplotlib.",
+    group=RESULTS,
+    rare=True,
+)
+@option("--gcps", is_flag=True, help=f"The same as --also gcps: {GCPS.summary}.", group=RESULTS, rare=True)
+@take("crs", "resolution", "resampling", "compression")
+@option(
+    "--max-pixels",
+    metavar="N",
+    type=click.IntRange(1),
+    default=400_000_000,
+    show_default=True,
+    help="Draw coarser rather than more than this.",
+    group=RESULTS,
+    rare=True,
+)
+@take("recursive", "segmenting", "fuse", "mask_values")
+@option(
+    "--units",
+    type=click.Choice(["auto", "pixels", "metres"]),
+    default="auto",
+    show_default=True,
+    help="What the coordinates are of roads that come as lines (GeoJSON, GeoPackage ...). auto: told by the CRS.",
+    group=IMAGE,
+    rare=True,
+)
+@option("--layer", metavar="NAME", help="Layer of roads that come as lines.", group=IMAGE, rare=True)
+@take("jobs")
+@option(
     "--method",
     type=click.Choice(["auto", "pair"]),
     default="auto",
-    show_default=True,
-    help="auto: the best there is. pair: exactly the paper's matcher.",
+    help="auto: the best there is, the default. pair: exactly the paper's matcher.",
+    group=SEARCH,
+    rare=True,
 )
-@click.option(
-    "--effort",
-    type=click.Choice(["quick", "full"]),
-    default="full",
-    show_default=True,
-    help="quick: end the search early, for masks that are clean. full: try harder on those that are broken.",
-)
-@click.option(
-    "--time-limit",
-    metavar="SECONDS",
-    type=click.FloatRange(min=0, min_open=True),
-    help="Stop searching for a mask after this time, wherever the search is. Default: 60, with --method pair 10.",
-)
-@click.option(
-    "--skip-existing/--overwrite",
-    default=False,
-    help="Keep results that are there and younger than their masks, or make them anew, the default.",
-)
-@click.option(
-    "-j",
-    "--jobs",
-    metavar="N",
-    type=click.IntRange(1),
-    default=1,
-    show_default=True,
-    help="Processes; for one mask alone: threads. Results do not depend on it.",
-)
-@cluster_options
-@click.option(
+@take("cluster")
+@option(
     "--divide-map",
     is_flag=True,
     help="On a Dask cluster: each worker keeps and searches a share of the map's shards, for all masks: for maps that"
     " no machine holds.",
+    group=SEARCH,
+    rare=True,
 )
-@recursive_option
-@verbosity_options
+@take("verbosity")
 def locate_command(
     masks: tuple[str, ...],
     references: tuple[str, ...],
     out_dir: str,
     as_json: bool,
     method: Literal["auto", "pair"],
-    effort: Literal["quick", "full"],
-    time_limit: float | None,
     skip_existing: bool,
     jobs: int,
     engine: str | None,
@@ -292,11 +250,11 @@ def locate_command(
     verbose: bool,
     **given: Any,
 ) -> int:
-    """Find where road masks lie on a map, and draw them there; for the help see above."""
+    """Find where images lie on a map, and draw them there; for the help see above."""
     from roadgeo.cli.compilation import compile_once
     from roadgeo.cli.progress import count_up, print_steps, show_steps
 
-    options = make_options(method, time_limit, {name: given[name] for name in HINTS}, effort)
+    options = make_options(hinted(given), method)
     options = replace(options, truths=read_truths(given["truth"], explain=given["explain"]))
     outputs = _output_options(given)
     found = find_masks(masks, given["recursive"])
@@ -340,7 +298,8 @@ def locate_command(
         files = write_overview(out_dir, tasks, outcomes, opened if given["report"] else None, given["products"])
         if not quiet:
             echo(f"{_summarize(counts)}; all footprints: {', '.join(map(str, files))}", err=True)
-    return ERROR if counts["error"] else 0 if counts["located"] == len(tasks) else NOT_LOCATED
+    failed = counts["error"] or any(outcome.faults for outcome in outcomes)
+    return ERROR if failed else 0 if counts["located"] == len(tasks) else NOT_LOCATED
 
 
 def _output_options(given: Mapping[str, Any]) -> OutputOptions:
@@ -353,7 +312,7 @@ def _output_options(given: Mapping[str, Any]) -> OutputOptions:
         from roadgeo.outputs.figure import has_matplotlib
 
         if not has_matplotlib():
-            raise click.UsageError("--figure needs matplotlib: pip install 'roadgeo[plot]'.")
+            raise click.UsageError(f"--figure needs matplotlib: {how_to_install('plot')}")
     asked = [
         *given["products"],
         *([GCPS.name] if given["gcps"] else []),
@@ -432,6 +391,8 @@ def _summarize(counts: Counter[str]) -> str:
 def _report(outcome: Outcome, as_json: bool, quiet: bool, verbose: bool, single: bool) -> None:
     if as_json:
         echo(json.dumps(outcome.document))
+    for fault in outcome.faults:
+        echo(f"{click.style('Error:', fg='red')} {visible(fault)}", err=True)
     if outcome.status == "error":
         echo(describe(outcome), err=True)
         return
@@ -447,4 +408,10 @@ def _report(outcome: Outcome, as_json: bool, quiet: bool, verbose: bool, single:
 def _details(document: dict[str, Any]) -> str:
     seconds = ", ".join(f"{step} {value:.3f}" for step, value in document["seconds"].items())
     stats = ", ".join(f"{value} {name.replace('_', ' ')}" for name, value in document["stats"].items())
-    return f"  seconds: {seconds}\n  {stats}"
+    lines = [f"seconds: {seconds}", stats]
+    if document["log10_odds"] is not None:
+        lines.append(f"log10 odds against any other place: {document['log10_odds']:.2f}")
+    if document["center"] is None and document["alternatives"]:
+        best = document["alternatives"][0]["center"]
+        lines.append(f"the best place, not sure enough: {format_lonlat(best['lon'], best['lat'])}")
+    return "\n".join(f"  {line}" for line in lines)

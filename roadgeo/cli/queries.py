@@ -8,7 +8,8 @@ from typing import TYPE_CHECKING, Any, TypeVar
 
 import click
 
-from roadgeo.cli.parameters import RANGE, Numbers
+from roadgeo.cli.options import GSD, RANGE, Read, option
+from roadgeo.matching.hints import read_numbers
 
 if TYPE_CHECKING:
     from roadgeo.evaluation.simulation import SimulationOptions
@@ -18,22 +19,25 @@ __all__ = ["QUERY_OPTIONS", "query_options", "query_sets"]
 Command = TypeVar("Command", bound=Callable[..., Any])
 
 
-def _wrong_angles(low: float, high: float) -> str:
-    return "" if -360 <= low <= high <= 360 else "LO must not be above HI, both within ±360"
+def _read_angles(text: str) -> tuple[float, float]:
+    low, high = (read_numbers(text, "LO:HI in degrees", (1, 2)) * 2)[:2]
+    if not -360 <= low <= high <= 360:
+        raise ValueError(f"got {text!r}: LO must not be above HI, both within ±360; expected LO:HI")
+    return low, high
 
 
 #: Degrees, least and greatest.
-ANGLES = Numbers("angles", ("LO", "HI"), ":", _wrong_angles)
+ANGLES = Read("angles", _read_angles)
 
 _OPTIONS = [
-    click.option(
+    option(
         "-n",
         "--count",
         metavar="N",
         type=click.IntRange(1),
         help="Masks per noise model.  [default: 40]",
     ),
-    click.option(
+    option(
         "--noise",
         type=click.Choice(["clean", "segmented", "poor"]),
         multiple=True,
@@ -41,21 +45,21 @@ _OPTIONS = [
         show_default=True,
         help="What goes wrong in the masks; repeat it for several.",
     ),
-    click.option(
+    option(
         "--roads",
         metavar="FILE",
         type=click.Path(exists=True, path_type=Path),
         help="Draw the roads of this file, another map of the place, in place of the reference's own.",
     ),
-    click.option(
+    option(
         "--gsd",
-        metavar="LO:HI",
-        type=RANGE,
+        metavar="SIZE|LO:HI",
+        type=GSD,
         default="0.7:1.4",
         show_default=True,
         help="Metres per pixel at the centre.",
     ),
-    click.option(
+    option(
         "--tilt",
         metavar="LO:HI",
         type=ANGLES,
@@ -63,7 +67,7 @@ _OPTIONS = [
         show_default=True,
         help="Of the optical axis from the vertical, degrees.",
     ),
-    click.option(
+    option(
         "--heading",
         metavar="LO:HI",
         type=ANGLES,
@@ -71,7 +75,7 @@ _OPTIONS = [
         show_default=True,
         help="Where the image's up points, degrees from north.",
     ),
-    click.option(
+    option(
         "--size",
         metavar="PX",
         type=click.IntRange(64, 20_000),
@@ -79,16 +83,14 @@ _OPTIONS = [
         show_default=True,
         help="Side of a mask, pixels.",
     ),
-    click.option(
+    option(
         "--window",
         type=click.FloatRange(10),
         metavar="METRES",
         help="Side on the ground, in place of --size.",
     ),
-    click.option(
-        "--focal", type=click.FloatRange(1), metavar="PX", help="Focal length in pixels.  [default: the side]"
-    ),
-    click.option(
+    option("--focal", type=click.FloatRange(1), metavar="PX", help="Focal length in pixels.  [default: the side]"),
+    option(
         "--intersections",
         metavar="LO:HI",
         type=RANGE,
@@ -96,7 +98,7 @@ _OPTIONS = [
         show_default=True,
         help="How many a mask must show.",
     ),
-    click.option(
+    option(
         "--road-width",
         metavar="LO:HI",
         type=RANGE,
@@ -104,14 +106,14 @@ _OPTIONS = [
         show_default=True,
         help="Of a street, metres.",
     ),
-    click.option(
+    option(
         "--mirrored",
         metavar="N",
         type=click.IntRange(0),
         default=0,
         help="Draw so many masks turned over besides, which have no place and must be refused.",
     ),
-    click.option(
+    option(
         "--seed",
         metavar="N",
         type=click.IntRange(0),
@@ -131,8 +133,8 @@ QUERY_OPTIONS = {
 
 def query_options(command: Command) -> Command:
     """Add the options that `query_sets` takes."""
-    for option in reversed(_OPTIONS):
-        command = option(command)
+    for add in reversed(_OPTIONS):
+        command = add(command)
     return command
 
 

@@ -1,4 +1,4 @@
-"""`roadgeo info`, `check`, `list` and `remove`: what is known of references, and keeping the library tidy."""
+"""`roadgeo reference`: what is known of references, and keeping the library tidy."""
 
 from __future__ import annotations
 
@@ -12,18 +12,29 @@ from roadgeo.cli import ERROR
 from roadgeo.cli.command_line import made_by
 from roadgeo.cli.printing import echo
 
-__all__ = ["check_command", "info_command", "list_command", "remove_command"]
+__all__ = ["check_command", "info_command", "list_command", "list_plugins", "reference_command", "remove_command"]
 
 
 #: Of what `info --json` and `list --json` print.
 SCHEMA = "roadgeo.reference-info/1"
 
 
-@click.command("info", short_help="Describe a reference.")
+@click.group("reference", short_help="List, describe, test and remove references.")
+def reference_command() -> None:
+    """List, describe, test and remove references: the maps that `roadgeo index` builds and `roadgeo locate` searches.
+
+    \b
+    Examples:
+      roadgeo reference list
+      roadgeo reference info boston-ma
+      roadgeo reference check maps/*.gpkg
+      roadgeo reference remove boston-ma
+    """
+
+
+@reference_command.command("info", short_help="Describe a reference.")
 @click.argument("reference", metavar="REF", type=click.Path(), required=False)
-@click.option(
-    "--plugins", is_flag=True, help="Instead, list the road sources, segmenters and outputs that are installed."
-)
+@click.option("--plugins", is_flag=True, hidden=True, help="The same as `roadgeo --plugins`.")
 @click.option("--json", "as_json", is_flag=True, help="Print everything that is known as one JSON object.")
 def info_command(reference: str | None, plugins: bool, as_json: bool) -> None:
     """Describe a reference: a file (REF.gpkg or REF.index) or a name in the library.
@@ -32,12 +43,11 @@ def info_command(reference: str | None, plugins: bool, as_json: bool) -> None:
 
     \b
     Examples:
-      roadgeo info boston-ma
-      roadgeo info maps/porto.gpkg --json
-      roadgeo info --plugins
+      roadgeo reference info boston-ma
+      roadgeo reference info maps/porto.gpkg --json
     """
     if plugins:
-        _list_plugins(as_json)
+        list_plugins(as_json)
         return
     if reference is None:
         raise click.UsageError("Missing argument 'REF'.")
@@ -53,7 +63,8 @@ def info_command(reference: str | None, plugins: bool, as_json: bool) -> None:
         echo(f"{label:<{width}}  {visible(value)}")
 
 
-def _list_plugins(as_json: bool) -> None:
+def list_plugins(as_json: bool) -> None:
+    """Print the plugins that are installed: group, name, package, object."""
     from roadgeo.plugins import GROUPS, find_plugins
 
     found = [plugin for group in GROUPS for _, plugin in sorted(find_plugins(group).items())]
@@ -68,7 +79,7 @@ def _list_plugins(as_json: bool) -> None:
         echo("  ".join([*(text.ljust(width) for text, width in zip(row, widths, strict=False)), row[3]]))
 
 
-@click.command("check", short_help="Verify every byte and number of a reference.")
+@reference_command.command("check", short_help="Test whether the files of references are sound.")
 @click.argument("references", metavar="REF...", nargs=-1, required=True, type=click.Path())
 def check_command(references: tuple[str, ...]) -> int:
     """Verify references thoroughly: all digests, all ranges, and that index and GeoPackage agree.
@@ -78,8 +89,8 @@ def check_command(references: tuple[str, ...]) -> int:
 
     \b
     Examples:
-      roadgeo check boston-ma
-      roadgeo check maps/*.gpkg
+      roadgeo reference check boston-ma
+      roadgeo reference check maps/*.gpkg
     """
     from roadgeo.errors import RoadgeoError
     from roadgeo.reference.inspection import check_reference
@@ -100,7 +111,7 @@ def check_command(references: tuple[str, ...]) -> int:
     return status
 
 
-@click.command("list", short_help="List the references in the library.")
+@reference_command.command("list", short_help="List the references in the library.")
 @click.option("--json", "as_json", is_flag=True, help="Print one JSON object per reference and line.")
 def list_command(as_json: bool) -> int:
     """List the references in the library: what `roadgeo locate` searches when it is given no --reference.
@@ -109,8 +120,8 @@ def list_command(as_json: bool) -> int:
 
     \b
     Examples:
-      roadgeo list
-      roadgeo list --json
+      roadgeo reference list
+      roadgeo reference list --json
     """
     from roadgeo.errors import RoadgeoError
     from roadgeo.reference.inspection import describe_reference
@@ -133,7 +144,7 @@ def list_command(as_json: bool) -> int:
     return status
 
 
-@click.command("remove", short_help="Remove references from the library.")
+@reference_command.command("remove", short_help="Remove references from the library.")
 @click.argument("names", metavar="NAME...", nargs=-1, required=True)
 @click.option("-y", "--yes", is_flag=True, help="Do not ask.")
 def remove_command(names: tuple[str, ...], yes: bool) -> None:
@@ -141,11 +152,13 @@ def remove_command(names: tuple[str, ...], yes: bool) -> None:
 
     \b
     Examples:
-      roadgeo remove boston-ma
-      roadgeo remove boston-ma porto --yes
+      roadgeo reference remove boston-ma
+      roadgeo reference remove boston-ma porto --yes
     """
-    from roadgeo.reference.library import library_dir, remove_reference
+    from roadgeo.reference.library import library_dir, remove_reference, shelved_files
 
+    for name in names:
+        shelved_files(name)  # what is not there is not asked about
     if not yes:
         click.confirm(f"Delete {', '.join(names)} from {library_dir()}?", abort=True, err=True)
     for name in names:

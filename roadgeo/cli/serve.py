@@ -16,8 +16,9 @@ from typing import TYPE_CHECKING, Any
 
 import click
 
-from roadgeo.cli.parameters import references_option, verbosity_options
+from roadgeo.cli.options import Command, option, take
 from roadgeo.cli.printing import echo
+from roadgeo.matching.hints import HINTS
 
 if TYPE_CHECKING:
     from roadgeo.running.flights.mavlink import MavlinkSender
@@ -38,9 +39,8 @@ searches again. It opens in your browser; nothing leaves this machine.
   GET  / /api /conformance /processes /processes/locate /jobs /health
 
 \b
-What is known goes into the URL, or beside the image in JSON:
-  near=LON,LAT,RADIUS  within=WEST,SOUTH,EAST,NORTH  gsd=LOW,HIGH
-  maxTilt=DEG  focal=PIXELS  northUp=true  timeLimit=SECONDS
+What is known goes into the URL or the form, or beside the image in JSON, in the words of `roadgeo locate`:
+{hints}
 
 It listens on this machine only. With --host others may ask, and then all must show a token:
 `Authorization: Bearer TOKEN`, which the environment variable ROADGEO_TOKEN or --token-file gives. There is no
@@ -50,7 +50,7 @@ Requests wait for a free process, so many as --waiting says; whoever comes then 
 size of images, the time to send and to search are bounded too. Ctrl-C ends it.
 
 With --mavlink each place that is found goes to an autopilot, too: that of the camera where the request gives its focal
-length, otherwise the frame's middle (pip install 'roadgeo[mavlink]').
+length, otherwise the frame's middle (it needs pymavlink).
 
 \b
 Examples:
@@ -62,6 +62,13 @@ Examples:
 
 Exit status: 0 ended, 1 error, 2 usage.
 """
+
+
+def _help() -> str:
+    """Say what may be known."""
+    hints = [f"{hint.parameter}={hint.form or 'true'}" for hint in HINTS.values()]
+    lines = (hints[:3], hints[3:6], hints[6:])
+    return _HELP.format(hints="\n".join("  " + "  ".join(line) for line in lines))
 
 
 def _read_basemap(_: click.Context, __: click.Parameter, url: str | None) -> str:
@@ -82,39 +89,26 @@ def _read_basemap(_: click.Context, __: click.Parameter, url: str | None) -> str
     return url
 
 
-@click.command("serve", short_help="A page to drop photographs on; answers over HTTP.", help=_HELP)
-@references_option()
-@click.option("--host", metavar="ADDRESS", help="Listen there, and ask for a token. Default: 127.0.0.1, without one.")
-@click.option("--port", type=click.IntRange(0, 65535), default=8017, show_default=True, help="0: any that is free.")
-@click.option("--token-file", metavar="FILE", type=click.Path(), help="The token is the first line of this file.")
-@click.option("-j", "--jobs", metavar="N", type=click.IntRange(1), default=1, show_default=True, help="Processes.")
-@click.option(
-    "--waiting", metavar="N", type=click.IntRange(0), default=8, show_default=True, help="Requests that may wait."
-)
-@click.option(
-    "--max-bytes", metavar="N", type=click.IntRange(1), default=64_000_000, show_default=True, help="Of a body."
-)
-@click.option(
-    "--max-pixels", metavar="N", type=click.IntRange(1), default=64_000_000, show_default=True, help="Of an image."
-)
-@click.option(
-    "--time-limit",
-    metavar="SECONDS",
-    type=click.FloatRange(min=0, min_open=True),
-    default=10.0,
-    show_default=True,
-    help="Of a search; requests may ask for less.",
-)
-@click.option("--mavlink", metavar="URL", help="Also send places to an autopilot, to such as udpout:127.0.0.1:14550.")
-@click.option(
+@click.command("serve", cls=Command, short_help="A page to drop photographs on; answers over HTTP.", help=_help())
+@take("references")
+@option("--host", metavar="ADDRESS", help="Listen there, and ask for a token. Default: 127.0.0.1, without one.")
+@option("--port", type=click.IntRange(0, 65535), default=8017, show_default=True, help="0: any that is free.")
+@option("--token-file", metavar="FILE", type=click.Path(), help="The token is the first line of this file.")
+@take("jobs", help="Processes that locate. Default: 1.")
+@option("--waiting", metavar="N", type=click.IntRange(0), default=8, show_default=True, help="Requests that may wait.")
+@option("--max-bytes", metavar="N", type=click.IntRange(1), default=64_000_000, show_default=True, help="Of a body.")
+@option("--max-pixels", metavar="N", type=click.IntRange(1), default=64_000_000, show_default=True, help="Of an image.")
+@take("time_limit", default=10.0, help="Stop each search then. Default: 10; requests may ask for less.")
+@take("mavlink")
+@option(
     "--basemap",
     metavar="URL",
     callback=_read_basemap,
     help="Tiles that the page shows below the roads: https://.../{z}/{x}/{y}.png.",
 )
-@click.option("--basemap-attribution", metavar="TEXT", default="", help="Whom their owner asks to name.")
-@click.option("--no-browser", is_flag=True, help="Do not open the page in a browser.")
-@verbosity_options
+@option("--basemap-attribution", metavar="TEXT", default="", help="Whom their owner asks to name.")
+@option("--no-browser", is_flag=True, help="Do not open the page in a browser.")
+@take("verbosity")
 def serve_command(
     references: tuple[str, ...],
     mavlink: str | None,
@@ -234,7 +228,7 @@ def _options(given: dict[str, Any]) -> ServeOptions:
         waiting=given["waiting"],
         max_bytes=given["max_bytes"],
         max_pixels=given["max_pixels"],
-        time_limit_s=given["time_limit"],
+        time_limit_s=given["time_limit_s"],
         connections=given["jobs"] + given["waiting"] + 64,
         basemap=given["basemap"],
         basemap_attribution=given["basemap_attribution"],

@@ -10,6 +10,7 @@ from typing import TYPE_CHECKING, Any, TypeVar
 
 import click
 
+from roadgeo.cli.options import option
 from roadgeo.cli.printing import echo
 
 if TYPE_CHECKING:
@@ -46,36 +47,40 @@ class _Shards(click.ParamType):  # type: ignore[type-arg]  # generic only in lat
 
 
 _OPTIONS = [
-    click.option(
+    option(
         "--shards",
         metavar="auto|N|SIZEkm",
         type=_Shards(),
-        help="Build REF.shards, in pieces: as many as is good, about N, or squares of a side. For maps of any size.",
+        help="Build REF.shards, in pieces. As many as is good, about N, or squares of a side: for maps of any size.",
+        group="In pieces",
     ),
-    click.option(
+    option(
         "--margin",
         metavar="METRES",
         type=click.FloatRange(0, 100_000),
         default=3000.0,
         show_default=True,
-        help="With --shards: ground that neighbours share, half the diagonal of the largest frame to locate.",
+        help="Ground that neighbours share. Half the diagonal of the largest frame to locate.",
+        group="In pieces",
+        rare=True,
     ),
-    click.option(
+    option(
         "-j",
         "--jobs",
         metavar="N",
         type=click.IntRange(1),
         default=1,
         show_default=True,
-        help="With --shards: processes, each of which builds a shard at a time.",
+        help="Processes, each of which builds a piece at a time.",
+        group="In pieces",
     ),
 ]
 
 
 def shard_options(command: Command) -> Command:
     """Add the options that say how a map is cut."""
-    for option in reversed(_OPTIONS):
-        command = option(command)
+    for add in reversed(_OPTIONS):
+        command = add(command)
     return command
 
 

@@ -8,7 +8,7 @@ from typing import Any
 import click
 
 from roadgeo.cli.command_line import made_by
-from roadgeo.cli.parameters import out_dir_option
+from roadgeo.cli.options import out_dir_option, take
 from roadgeo.cli.printing import echo
 from roadgeo.cli.progress import count_up
 from roadgeo.cli.queries import query_options, query_sets
@@ -20,7 +20,7 @@ __all__ = ["simulate_command"]
 @click.argument("reference", metavar="REF")
 @out_dir_option("Where to write.", None, Path, required=True)
 @query_options
-@click.option("-q", "--quiet", is_flag=True, help="Say nothing but errors.")
+@take("quiet")
 def simulate_command(reference: str, out_dir: Path, roads: Path | None, quiet: bool, **options: Any) -> None:
     """Draw road masks from a reference's own roads, as a camera would see them and a segmenter get them wrong.
 
@@ -32,7 +32,7 @@ def simulate_command(reference: str, out_dir: Path, roads: Path | None, quiet: b
     Examples:
       roadgeo simulate boston-ma -o queries
       roadgeo simulate boston-ma -o drone --noise segmented --gsd 0.3:0.6 --tilt 30:50 --intersections 12:30
-      roadgeo simulate boston-ma -o plan --window 1500 --gsd 1:1 --tilt 0:0 --heading 0:0 -n 100
+      roadgeo simulate boston-ma -o plan --window 1500 --gsd 1:1 --tilt 0 --heading 0 -n 100
     """
     import cv2
 

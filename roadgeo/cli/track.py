@@ -16,9 +16,17 @@ import click
 from roadgeo.cli import NOT_LOCATED
 from roadgeo.cli.accuracy import tell_accuracy
 from roadgeo.cli.folders import make_folder
-from roadgeo.cli.hints import hint_options, make_options, refuse_swapped
-from roadgeo.cli.parameters import out_dir_option, recursive_option, references_option, verbosity_options
-from roadgeo.cli.photographs import mask_options
+from roadgeo.cli.options import (
+    RESULTS,
+    Command,
+    Read,
+    hinted,
+    make_options,
+    option,
+    out_dir_option,
+    refuse_swapped,
+    take,
+)
 from roadgeo.cli.printing import echo
 
 if TYPE_CHECKING:
@@ -27,6 +35,9 @@ if TYPE_CHECKING:
     from roadgeo.running.flights.tracker import FlightFrame, Tracked, TrackOptions
 
 __all__ = ["track_command"]
+
+#: Heading of what concerns flights.
+FLIGHT = "The flight"
 
 _HELP = """Follow a flight over the map, frame by frame.
 
@@ -55,105 +66,74 @@ What is written to --out-dir:
   flight.csv      one row a frame, columns named as in MISB ST 0601
   flight.html     the flight on the map, to play in a browser; needs no network
 
-With --camera the place of the camera is told, too: not that of the ground in the frame's middle. That is what an
+With --focal the place of the camera is told, too: not that of the ground in the frame's middle. That is what an
 autopilot needs; --mavlink sends it as soon as it is known, for PX4 (GLOBAL_POSITION_SENSOR) and ArduPilot
-(EXTERNAL_POSITION_ESTIMATE), with its standard deviation and delay; without --camera, the frame's middle. It needs
-pip install 'roadgeo[mavlink]'.
+(EXTERNAL_POSITION_ESTIMATE), with its standard deviation and delay; without --focal, the frame's middle. It needs
+pymavlink.
 
 \b
 Examples:
   roadgeo track frames/ --reference boston-ma --motion odometry.csv
   roadgeo track flight.mp4 --every 0.5 --start 2024-05-01T09:30:00Z --out-dir found
   roadgeo track frame_*.png --json > flight.jsonl
-  roadgeo track frames/ --camera 640 --mavlink udpout:127.0.0.1:14550
+  roadgeo track frames/ --focal 640 --mavlink udpout:127.0.0.1:14550
   roadgeo track --unordered strip_1951/*.tif --out-dir found
 
 Exit status: 0 every frame has a place, 3 at least one is lost, 1 error, 2 usage.
 """
 
 
-class Moment(click.ParamType):  # type: ignore[type-arg]
-    """A time, UTC unless it says otherwise."""
-
-    name = "time"
-
-    def convert(self, value: Any, param: click.Parameter | None, ctx: click.Context | None) -> datetime:
-        """Parse the text.
-
-        Raises
-        ------
-        click.BadParameter
-            It is no time.
-        """
-        if isinstance(value, datetime):
-            return value
-        try:
-            moment = datetime.fromisoformat(str(value))
-        except ValueError:
-            self.fail(f"got {value!r}, expected a time such as 2024-05-01T09:30:00Z", param, ctx)
-        return moment if moment.tzinfo else moment.replace(tzinfo=UTC)
+def _read_time(text: str) -> datetime:
+    """Read a time; UTC unless it says otherwise."""
+    try:
+        moment = datetime.fromisoformat(text)
+    except ValueError as error:
+        raise ValueError(f"got {text!r}, expected a time such as 2024-05-01T09:30:00Z") from error
+    return moment if moment.tzinfo else moment.replace(tzinfo=UTC)
 
 
-@click.command("track", short_help="Follow a flight over the map, frame by frame.", help=_HELP)
+TIME = Read("time", _read_time)
+
+
+@click.command("track", cls=Command, short_help="Follow a flight over the map, frame by frame.", help=_HELP)
 @click.argument("frames", metavar="FRAMES...", nargs=-1, required=True, type=click.Path())
-@references_option()
+@take("references", "near", "within", "gsd", "max_tilt")
+@take("focal", metavar="PIXELS", help="Focal length in pixels: places are then the camera's.")
 @out_dir_option()
-@click.option("--name", default="flight", show_default=True, help="What the results are called.")
-@click.option("--json", "as_json", is_flag=True, help="Print a JSON object per frame and line, as soon as it is known.")
-@click.option("--motion", metavar="FILE", type=click.Path(), help="How each frame moved: see above.")
-@click.option(
+@option("--name", default="flight", help="What the results are called. Default: flight.", group=RESULTS)
+@take("json", group=RESULTS, help="Print one JSON object per frame and line, as it is known.")
+@take("mavlink", group=RESULTS)
+@option("--motion", metavar="FILE", type=click.Path(), help="How each frame moved: see above.", group=FLIGHT)
+@option(
     "--motion-sigma",
     metavar="PX",
     type=click.FloatRange(min=0, min_open=True),
     help="How far off the motion may put a corner. Default: 1.5, of masks 12.",
+    group=FLIGHT,
+    rare=True,
 )
-@click.option("--unordered", is_flag=True, help="The frames are in no order; all are solved together.")
-@click.option(
+@option("--unordered", is_flag=True, help="The frames are in no order; all are solved together.", group=FLIGHT)
+@option(
     "--every",
     metavar="SECONDS",
     type=click.FloatRange(min=0),
     default=1.0,
-    show_default=True,
-    help="Time between the frames that are taken of a video.",
+    help="Take a frame of a video every so often. Default: 1.",
+    group=FLIGHT,
 )
-@click.option(
+@option(
     "--interval",
     metavar="SECONDS",
     type=click.FloatRange(min=0),
     default=1.0,
-    show_default=True,
-    help="Time between images.",
+    help="Time between images. Default: 1.",
+    group=FLIGHT,
 )
-@click.option("--start", metavar="TIME", type=Moment(), help="When the first frame was taken.")
-@click.option(
-    "--segment",
-    type=click.Choice(["auto", "always", "never"]),
-    default="auto",
-    show_default=True,
-    help="Find the roads in photographs first: in what looks like one, in everything, or in nothing.",
-)
-@click.option("--segmenter", "model", metavar="MODEL.onnx", type=click.Path(), default="", help="Who finds them.")
-@click.option("--class", "class_name", metavar="NAME", help="Class of the model that is road.")
-@mask_options
-@hint_options("gsd_m", "max_tilt_deg", "near", "within")
-@click.option(
-    "--camera",
-    "focal_px",
-    metavar="PIXELS",
-    type=click.FloatRange(min=0, min_open=True),
-    help="Focal length in pixels of the frames: the place of the camera is told, too.",
-)
-@click.option("--mavlink", metavar="URL", help="Also send places to an autopilot, to such as udpout:127.0.0.1:14550.")
-@click.option(
-    "--time-limit",
-    metavar="SECONDS",
-    type=click.FloatRange(min=0, min_open=True),
-    default=10.0,
-    show_default=True,
-    help="Of one search.",
-)
-@recursive_option
-@verbosity_options
+@option("--start", metavar="TIME", type=TIME, help="When the first frame was taken.", group=FLIGHT)
+@take("segment", "class_name", "mask_values")
+@take("segmenters", multiple=False, default="", metavar="MODEL.onnx", type=click.Path(), help="Who finds the roads.")
+@take("time_limit", default=10.0, help="Stop each search then. Default: 10.")
+@take("recursive", "verbosity")
 def track_command(
     frames: tuple[str, ...],
     references: tuple[str, ...],
@@ -162,7 +142,7 @@ def track_command(
     as_json: bool,
     start: datetime | None,
     mavlink: str | None,
-    focal_px: float | None,
+    focal_px: Any,
     unordered: bool,
     quiet: bool,
     verbose: bool,
@@ -175,6 +155,8 @@ def track_command(
     from roadgeo.running.flights.report import Thumbnails
     from roadgeo.running.flights.rows import make_rows
 
+    if focal_px == "exif":
+        raise click.UsageError("--focal exif: of frames give the focal length in pixels.")
     if unordered and (mavlink or given["motion"]):
         raise click.UsageError("--unordered frames are no flight: leave out --mavlink and --motion.")
     options, reading = _track_options(given), _frame_options(given)
@@ -250,8 +232,7 @@ def _sender(url: str | None) -> Iterator[Callable[[Row], None]]:
 def _track_options(given: dict[str, Any]) -> TrackOptions:
     from roadgeo.running.flights.tracker import TrackOptions
 
-    hints = {name: given[name] for name in ("gsd_m", "max_tilt_deg", "near", "within")}
-    return TrackOptions(locate=make_options("auto", given["time_limit"], hints))
+    return TrackOptions(locate=make_options(hinted(given)))
 
 
 def _frame_options(given: dict[str, Any]) -> FrameOptions:
@@ -263,7 +244,7 @@ def _frame_options(given: dict[str, Any]) -> FrameOptions:
         given["threshold"],
         given["band"],
         given["segment"],
-        given["model"],
+        given["segmenters"],
         given["class_name"],
         given["gsd_m"],
         motion,

@@ -2,17 +2,14 @@
 
 from __future__ import annotations
 
-from functools import partial
 from typing import TYPE_CHECKING, Any
 
 import click
 
-from roadgeo._text import visible
+from roadgeo._text import counted, visible
 from roadgeo.cli import ERROR
 from roadgeo.cli.folders import make_folder
-from roadgeo.cli.hints import hint_options
-from roadgeo.cli.parameters import out_dir_option, recursive_option
-from roadgeo.cli.photographs import mask_options, n_threads, segmenting_options
+from roadgeo.cli.options import Command, n_threads, out_dir_option, take
 from roadgeo.cli.printing import echo
 from roadgeo.cli.progress import show_steps
 from roadgeo.running.tasks import Task, find_masks, name_tasks
@@ -24,26 +21,23 @@ if TYPE_CHECKING:
 __all__ = ["vectorize_command"]
 
 
-@click.command("vectorize", short_help="Show what roads are seen in a mask or a photograph.")
+@click.command("vectorize", cls=Command, short_help="Show what roads are seen in a mask or a photograph.")
 @click.argument("images", metavar="IMAGE...", nargs=-1, required=True, type=click.Path())
 @out_dir_option()
-@mask_options
-@hint_options("gsd_m")
-@partial(segmenting_options, fuse=False)
-@recursive_option
+@take("gsd", "recursive", "segmenting", "mask_values")
 def vectorize_command(
     images: tuple[str, ...], out_dir: str, gsd_m: tuple[float, float] | None, recursive: bool, **given: Any
 ) -> int:
     """Show what roads and intersections are seen in IMAGEs: the first thing to look at when one was not located.
 
-    An image is a road mask or a photograph (pip install 'roadgeo[segment]'). For photo.jpg it writes
+    An image is a road mask or a photograph. For photo.jpg it writes
     photo_vectorized.gpkg, in pixel coordinates, which lies on the image when both are opened in QGIS,
     photo_vectorized.png, and of a photograph photo_mask.tif, the probability of road.
 
     \b
     Examples:
       roadgeo vectorize photo_mask.tif
-      roadgeo vectorize photo.jpg --gsd 0.3:0.4
+      roadgeo vectorize photo.jpg --gsd 0.3
       roadgeo vectorize probability.tif --band 2 --threshold 0.4 --out-dir seen
     """
     from roadgeo.cli.compilation import compile_once
@@ -89,5 +83,5 @@ def _show(task: Task, out_dir: str, gsd_m: tuple[float, float] | None, query: Qu
     files = write_vectorized(
         out_dir, task.stem, look.mask, graph, scene.intersections, coarser=look.coarser, photo=photo
     )
-    seen = f"{len(scene.intersections)} intersections, {graph.n_edges} roads between them"
+    seen = f"{counted(len(scene.intersections), 'intersection')}, {counted(graph.n_edges, 'road')} between them"
     return f"{seen}; wrote {', '.join(map(str, files + kept))}"

@@ -13,8 +13,7 @@ import click
 from roadgeo.cli import ERROR, NOT_LOCATED
 from roadgeo.cli.command_line import made_by
 from roadgeo.cli.folders import make_folder
-from roadgeo.cli.parameters import CRS, out_dir_option, recursive_option, references_option, verbosity_options
-from roadgeo.cli.photographs import mask_options, read_options, segmenting_options
+from roadgeo.cli.options import IMAGE, RESULTS, Command, option, out_dir_option, read_options, take
 from roadgeo.cli.printing import echo
 
 if TYPE_CHECKING:
@@ -28,22 +27,26 @@ OFF = 4
 _COLORS = {"agrees": "green", "off": "red", "unknown": "yellow"}
 
 
-@click.command("verify", short_help="Check whether georeferenced images are where they say.")
+@click.command("verify", cls=Command, short_help="Check whether georeferenced images are where they say.")
 @click.argument("images", metavar="IMAGE...", nargs=-1, required=True, type=click.Path())
-@references_option("Reference to hold them against")
+@take(
+    "references",
+    help="Map to hold them against: REF.gpkg, or a name in the library. Repeatable. Default: all of the library.",
+)
 @out_dir_option("Where files go; made if missing. Default: here.")
-@click.option("--json", "as_json", is_flag=True, help="Print one JSON object per image and line, in input order.")
-@click.option(
+@take("json", group=RESULTS)
+@option(
     "--fix",
     is_flag=True,
     help="Of each image that is off, write IMAGE_fixed.tif: the same pixels with the corrected georeference; and"
     " IMAGE_fixed.points, for the QGIS Georeferencer.",
+    group=RESULTS,
 )
-@click.option("--in-place", is_flag=True, help="Correct the georeference of GeoTIFFs that are off themselves.")
-@click.option(
+@option("--in-place", is_flag=True, help="Correct the georeference of GeoTIFFs that are off themselves.", group=RESULTS)
+@option(
     "--josm", is_flag=True, help="Write roadgeo_offsets.xml: imagery offset bookmarks, as JOSM's preferences hold them."
 )
-@click.option(
+@option(
     "--tolerance",
     metavar="METRES",
     type=click.FloatRange(0.1, 100),
@@ -51,28 +54,26 @@ _COLORS = {"agrees": "green", "off": "red", "unknown": "yellow"}
     show_default=True,
     help="An image agrees if, on average over the frame, it is off by less.",
 )
-@click.option(
+@option(
     "--reach",
     metavar="METRES",
     type=click.FloatRange(20, 2000),
     default=350.0,
     show_default=True,
+    rare=True,
     help="How far off it may be: nothing beyond is looked at.",
 )
-@click.option(
+@option(
     "--max-turn",
     metavar="DEG",
     type=click.FloatRange(0, 45),
     default=6.0,
     show_default=True,
+    rare=True,
     help="By how much it may be turned.",
 )
-@click.option("--crs", metavar="CRS", type=CRS, help="CRS of images that name none, such as EPSG:25832.")
-@segmenting_options
-@mask_options
-@click.option("-j", "--jobs", metavar="N", type=click.IntRange(1), default=1, show_default=True, help="Processes.")
-@recursive_option
-@verbosity_options
+@take("crs", help="CRS of images that name none, such as EPSG:25832.", group=IMAGE)
+@take("recursive", "segmenting", "fuse", "mask_values", "jobs", "verbosity")
 def verify_command(
     images: tuple[str, ...],
     out_dir: str,
@@ -87,7 +88,7 @@ def verify_command(
 ) -> int:
     """Check whether georeferenced IMAGEs are where they say, by the roads they show.
 
-    An image is a road mask or a photograph (pip install 'roadgeo[segment]') with a place: a geotransform, control
+    An image is a road mask or a photograph with a place: a geotransform, control
     points, or a world file. Its roads are held against those of a reference, from the given place outwards; the world
     is never searched (that is what `roadgeo locate` does). Of each image is said that it
 

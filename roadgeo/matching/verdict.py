@@ -9,6 +9,7 @@ from time import perf_counter
 
 import numpy as np
 
+from roadgeo._text import counted
 from roadgeo.geometry.camera import CameraOptions
 from roadgeo.geometry.projection import from_lonlat, metres_apart
 from roadgeo.location import Location, Place, Reason, Seen, Stats
@@ -213,6 +214,8 @@ def _refuse(
     nearest = best.found if best is not None else max(found, key=lambda one: one.n_tried)
     score = best.score if best is not None else -math.inf
     code, reason = _why_nothing(query, nearest, score, options)
+    if best is not None:  # not reported, but shown
+        location = replace(location, alternatives=(best.center, *location.alternatives))
     location = replace(location, reason_code=code)
     distinct = dict.fromkeys(one.index.name for one in found)  # shards bear the name of their map
     if len(distinct) == 1:
@@ -231,18 +234,18 @@ def _why_nothing(query: Query, found: Found, score: float, options: LocateOption
     """Say why nothing is reported, to programs and to people, and what may help."""
     n, needed = len(query.scene.intersections), options.min_intersections
     if n < needed:
-        seen = f"only {n} intersections are seen" if n else "no intersections are seen"
-        return Reason.FEW_INTERSECTIONS, f"{seen}, at least {needed} {'is' if needed == 1 else 'are'} needed"
+        seen = f"only {counted(n, 'intersection')} {'is' if n == 1 else 'are'}" if n else "no intersections are"
+        return Reason.FEW_INTERSECTIONS, f"{seen} seen, at least {needed} {'is' if needed == 1 else 'are'} needed"
     if found.said:
         return Reason.TIME_LIMIT if found.stopped in ("work", "time") else Reason.NOTHING_STANDS_OUT, found.said
     searched = searched_within(options)
     if found.n_searched < needed and (options.near is not None or options.match.within is not None):
         given = "around the place given by near" if options.near is not None else "in the area given by within"
-        return Reason.FEW_NEAR, f"the map has {found.n_searched} intersections {given}{searched}"
+        return Reason.FEW_NEAR, f"the map has {counted(found.n_searched, 'intersection')} {given}{searched}"
     if math.isfinite(score):
-        best = f"the best has log10 odds {score:.1f}, {options.min_log10_odds:g} are needed"
+        best = f"the best is {_lead(score)} another, where {_times(options.min_log10_odds)} are asked for"
     else:
-        best = "none passed the tests"
+        best = "none fits"
     if found.stopped == "work":
         told = f"stopped after as much work as a search may take; of the places tried, {best}{searched}"
         return Reason.TIME_LIMIT, f"{told}; {_how_far(query, found, options)}"
@@ -259,6 +262,18 @@ def _why_nothing(query: Query, found: Found, score: float, options: LocateOption
     elif options.effort == "quick":
         advice = "; a search with full effort, more roads in view or another map may help"
     return Reason.NOTHING_STANDS_OUT, f"{nothing}{advice}"
+
+
+def _lead(log10_odds: float) -> str:
+    """Say how much likelier a place is than the best other one."""
+    return "no likelier than" if log10_odds < 0.2 else f"only {_times(log10_odds)} as likely as"
+
+
+def _times(log10_odds: float) -> str:
+    """Say a factor with two digits, one where it is large: "2.5 times", "3,000 times"."""
+    factor = 10.0**log10_odds
+    digits = 1 if factor < 10 else -math.floor(log10_odds)
+    return f"{round(factor, digits):,.{max(digits, 0)}f} times"
 
 
 def _how_far(query: Query, found: Found, options: LocateOptions) -> str:

@@ -12,6 +12,7 @@ import cv2
 import numpy as np
 
 from roadgeo._arrays import AnyArray, FloatArray
+from roadgeo._text import counted
 from roadgeo.errors import OutputError
 from roadgeo.geometry.homography import Homography
 from roadgeo.geometry.mask import RoadMask, plane_to_pixel
@@ -147,7 +148,7 @@ def _draw_seen(scene: Scene, mask: RoadMask, lines: Sequence[FloatArray]) -> Any
     top, left = (_MASK - size[1]) // 2, (_MASK - size[0]) // 2
     panel[top : top + size[1], left : left + size[0]] = small
     unseen_share = 1.0 - float(scene.observed.mean())
-    numbers = f"{columns} x {rows} px   ·   {n} intersections   ·   {scene.n_edges} roads"
+    numbers = f"{columns} x {rows} px   ·   {counted(n, 'intersection')}   ·   {counted(scene.n_edges, 'road')}"
     if unseen_share > 0.01:
         numbers += f"   ·   {unseen_share:.0%} not observed"
     write_text(panel, numbers, (0, _MASK + 28), 19, INK)

@@ -10,7 +10,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from roadgeo._arrays import FloatArray
-from roadgeo.errors import OutputError
+from roadgeo.errors import OutputError, how_to_install
 from roadgeo.geometry.mask import RoadMask, plane_to_pixel
 from roadgeo.location import Location
 from roadgeo.outputs.canvas import FRAME, MAP_ROAD, MATCH, QUERY_ROAD, Color, touching
@@ -56,7 +56,7 @@ def write_figure(path: Path, subject: Subject) -> None:
         matplotlib is missing.
     """
     if not has_matplotlib():
-        raise OutputError(f"{subject.location.query}: figures need matplotlib; pip install 'roadgeo[plot]'")
+        raise OutputError(f"{subject.location.query}: figures need matplotlib: {how_to_install('plot')}")
     figure = draw_figure(subject.location, subject.mask, subject.roads, subject.attribution)
     figure.savefig(path, metadata={"Creator": "roadgeo"} if path.suffix in {".pdf", ".svg"} else None)
 

@@ -5,13 +5,13 @@ from __future__ import annotations
 import json
 import os
 from collections.abc import Iterable, Iterator, Sequence
-from contextlib import ExitStack
+from contextlib import ExitStack, suppress
 from dataclasses import dataclass, field, replace
 from pathlib import Path
 from time import perf_counter
 from typing import NamedTuple
 
-from roadgeo.errors import CrsError, MaskError, OutputError
+from roadgeo.errors import CrsError, MaskError, OutputError, RoadgeoError
 from roadgeo.geometry.mask import RoadMask
 from roadgeo.location import Location
 from roadgeo.matching.explanation import Explanation
@@ -50,11 +50,14 @@ class Written(NamedTuple):
         With `seconds.write` set.
     files, removed : list of Path
         Files of this run, the JSON first, and outdated files of an earlier run.
+    faults : list of str
+        Failures of outputs of other packages; everything else is written.
     """
 
     location: Location
     files: list[Path]
     removed: list[Path]
+    faults: list[str]
 
 
 def wanted_outputs(names: Iterable[str], located: bool, has_photo: bool, has_camera: bool = True) -> list[Output]:
@@ -114,8 +117,12 @@ def write_location(
         with ExitStack() as files:
             # Entered first, renamed last: whoever sees the JSON finds the other files whole.
             report = files.enter_context(replacing(targets.pop(JSON), sync=False))
-            for output, path in targets.items():
-                output.write(files.enter_context(replacing(path, sync=False)), subject)
+            faults = []
+            for output, path in list(targets.items()):
+                fault = _write(output, path, subject, files)
+                if fault:
+                    faults.append(fault)
+                    del targets[output]
             removed = list(_remove(_stale(subject, wanted, options.products)))
             if photo is not None:  # an earlier mask's style would colour the photograph
                 removed += _remove([paths.of(STYLE)])
@@ -127,7 +134,27 @@ def write_location(
         with replacing(paths.json, sync=False) as report:
             write_json(report, subject)
         raise type(error)(f"{error}; what was found is in {paths.json}") from error
-    return Written(location, [paths.json, *targets.values()], removed)
+    return Written(location, [paths.json, *targets.values()], removed, faults)
+
+
+def _write(output: Output, path: Path, subject: Subject, files: ExitStack) -> str:
+    """Write one output, which appears with the others; what one of another package fails at is returned instead."""
+    if output in REGISTRY.values():
+        output.write(files.enter_context(replacing(path, sync=False)), subject)
+        return ""
+    own = ExitStack()
+    file = own.enter_context(replacing(path, sync=False))
+    try:
+        output.write(file, subject)
+        file.stat()
+    except Exception as error:
+        with suppress(Exception):
+            own.__exit__(type(error), error, error.__traceback__)
+        whose = f"the output {output.name!r} of {output.write.__module__}"
+        said = str(error) if isinstance(error, RoadgeoError) else f"{type(error).__name__}: {error}; tell its makers"
+        return f"{subject.location.query}: {whose} failed: {' '.join(said.split())}; all else is written"
+    files.enter_context(own)
+    return ""
 
 
 def write_json(path: Path, subject: Subject) -> None:

@@ -130,7 +130,8 @@ def draw_overlay(
     _draw_scale_bar(canvas)
     _draw_north(canvas)
     _draw_legend(canvas)
-    left = _draw_frames(location, mask, photo, canvas.image.shape[0], round(options.map_px * options.mask_share))
+    left = np.full((canvas.image.shape[0], round(options.map_px * options.mask_share), 3), LIT, np.uint8)
+    _draw_frames(left[canvas.top : len(left) - canvas.top // 2], location, mask, photo)  # between title and legend
     gap = np.full((canvas.image.shape[0], _GAP, 3), LIT, np.uint8)
     picture = np.hstack([left, gap, canvas.image])
     _draw_title(picture, location, canvas.top)
@@ -252,12 +253,12 @@ def _draw_legend(canvas: _Canvas) -> None:
 # --- the photograph and the mask --------------------------------------------------------------------------------------
 
 
-def _draw_frames(location: Location, mask: RoadMask, photo: AnyArray | None, height: int, width: int) -> AnyArray:
-    """Draw the photograph, if there is one, above the mask, in the middle of a panel of the given size."""
-    panel = np.full((height, width, 3), LIT, np.uint8)
+def _draw_frames(panel: AnyArray, location: Location, mask: RoadMask, photo: AnyArray | None) -> None:
+    """Draw the photograph, if there is one, above the mask, in the middle of a panel (h, w, 3)."""
+    height, width = panel.shape[:2]
     rows, columns = mask.shape
     n = 1 if photo is None else 2
-    room = np.array([width - 2 * _GAP, (height - (4 + 2 * n) * _GAP) / n])
+    room = np.array([width - 2 * _GAP, (height - 2 * n * _GAP) / n])
     scale = float((room / (columns, rows)).min())
     size = (max(round(columns * scale), 1), max(round(rows * scale), 1))
     left, top = (width - size[0]) // 2 + _GAP // 4, (height - n * size[1] - (n - 1) * 2 * _GAP) // 2
@@ -272,7 +273,6 @@ def _draw_frames(location: Location, mask: RoadMask, photo: AnyArray | None, hei
     if location.evidence is not None:
         at = plane_to_pixel(location.evidence.query_xy) * scale + (left - 0.5, top - 0.5)
         draw_dots(panel, fixed_point(at), 3.6 if location.n_matched < 200 else 2.4)
-    return panel
 
 
 def _draw_frame(panel: AnyArray, picture: AnyArray, left: int, top: int) -> None:

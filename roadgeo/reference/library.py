@@ -25,6 +25,7 @@ __all__ = [
     "remove_reference",
     "resolve_reference",
     "resolve_whole",
+    "shelved_files",
 ]
 
 
@@ -97,7 +98,7 @@ def resolve_reference(name_or_path: str | os.PathLike[str]) -> Path:
         raise not_a_reference(name)
     known = [path.stem for path in list_references()]
     near = difflib.get_close_matches(make_slug(name), known, n=1)
-    hint = f"did you mean {near[0]}?" if near else "`roadgeo list` shows the library, `roadgeo index` adds to it"
+    hint = f"did you mean {near[0]}?" if near else "`roadgeo reference list` shows the library, `roadgeo index` adds"
     raise IndexFormatError(f"no reference {name!r}, neither as a file nor in {library_dir()}: {hint}")
 
 
@@ -132,16 +133,28 @@ def remove_reference(name: str) -> list[Path]:
     OutputError
         When a file cannot be deleted.
     """
+    files = shelved_files(name)
+    for file in files:
+        with writing(file):
+            shutil.rmtree(file) if file.is_dir() else file.unlink()
+    return files
+
+
+def shelved_files(name: str) -> list[Path]:
+    """Return the files of a reference in the library, or its folder of shards.
+
+    Raises
+    ------
+    IndexFormatError
+        The library has no reference of that name.
+    """
     paths = _shelved(name)
     files = [file for file in (paths.index, paths.geopackage) if file.is_file()]
     shards = paths.geopackage.with_suffix(ENDING)
     if manifest_path(shards):
         files.append(shards)
     if not files:
-        raise IndexFormatError(f"no reference {name!r} in {library_dir()}; `roadgeo list` shows what there is")
-    for file in files:
-        with writing(file):
-            shutil.rmtree(file) if file.is_dir() else file.unlink()
+        raise IndexFormatError(f"no reference {name!r} in {library_dir()}; `roadgeo reference list` shows all")
     return files
 
 

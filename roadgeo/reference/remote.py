@@ -17,7 +17,7 @@ from hashlib import blake2b
 from pathlib import Path
 from typing import Any
 
-from roadgeo.errors import IndexFormatError
+from roadgeo.errors import IndexFormatError, how_to_install
 from roadgeo.storage.atomic import publish, staging, writing
 from roadgeo.storage.files import write_text
 from roadgeo.storage.folders import cache_dir
@@ -123,7 +123,8 @@ def _reaching(url: str) -> Iterator[Any]:
         yield
     except ImportError as error:
         raise IndexFormatError(
-            f"{url}: {error}; references elsewhere need pip install 'roadgeo[dask]', and s3fs or gcsfs for such stores"
+            f"{url}: {error}; references elsewhere need more: {how_to_install('dask')}, and s3fs or gcsfs"
+            " for such stores"
         ) from error
     except Exception as error:
         # Each store has errors of its own, and many libraries beneath.

@@ -96,6 +96,8 @@ class Outcome:
         The photograph that was drawn, and its width in widths of the mask.
     earlier : bool
         An earlier run found it; nothing was done now.
+    faults : tuple of str
+        What outputs of other packages failed at; all else is written.
     """
 
     status: Status
@@ -104,6 +106,7 @@ class Outcome:
     removed: tuple[str, ...] = ()
     photo: tuple[str, float] | None = None
     earlier: bool = False
+    faults: tuple[str, ...] = ()
 
 
 def locate_masks(
@@ -305,19 +308,18 @@ class Locating:
             tuple(map(str, (*written.files, *kept))),
             tuple(map(str, written.removed)),
             (photo, _scale(photo, mask)) if photo and location.located else None,
+            faults=tuple(written.faults),
         )
 
     def search_options(self, task: Task) -> LocateOptions:
         """Return the options, with the focal length that the photograph's EXIF states where that was asked for."""
         if not self.reading.exif:
             return self.options.search
-        from roadgeo.sources.exif import read_focal_length
-        from roadgeo.storage.rasters import raster_size
+        from roadgeo.matching.hints import apply_hints
+        from roadgeo.sources.exif import focal_in_pixels
 
-        longer_side = max(raster_size(task.mask))
-        focal_px = read_focal_length(self.reading.images.get(task.mask, task.mask)) * longer_side
-        match = self.options.search.match
-        return replace(self.options.search, match=replace(match, camera=replace(match.camera, focal_px=focal_px)))
+        focal_px = focal_in_pixels(task.mask, self.reading.images.get(task.mask))
+        return apply_hints(self.options.search, {"focal_px": focal_px})
 
 
 def _without_views(outputs: OutputOptions) -> OutputOptions:

@@ -19,7 +19,7 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, TypeVar
 
-from roadgeo.errors import RoadgeoError
+from roadgeo.errors import RoadgeoError, how_to_install
 from roadgeo.running.processes import Work, without_interrupts
 from roadgeo.storage.folders import private_temporary_dir
 
@@ -36,8 +36,6 @@ _AHEAD, RETRIES = 2, 3
 
 #: A scheduler must answer, and have a worker, within this time.
 _PATIENCE_S = 30
-
-_SAID = "pip install 'roadgeo[dask]'"
 
 
 @dataclass(frozen=True)
@@ -89,7 +87,7 @@ def connected(cluster: Cluster) -> Iterator[Any]:
     try:
         from distributed import Client
     except ImportError as error:
-        raise RoadgeoError(f"a cluster needs dask: {_SAID}") from error
+        raise RoadgeoError(f"a cluster needs dask: {how_to_install('dask')}") from error
 
     with contextlib.ExitStack() as stack:
         address = cluster.scheduler or stack.enter_context(_local_cluster(cluster.workers))

@@ -136,9 +136,9 @@ def _discount(sighting: Sighting, look: Look, tried: int, options: LocateOptions
         return sighting
     odds = location.log10_odds - off
     if odds < options.min_log10_odds:
-        few = f"at {look.what}, look {tried}, log10 odds {odds:.1f} are left, {options.min_log10_odds:g} are needed"
+        few = f"seen in {tried} ways one place stands out, at {look.what}, but not clearly enough for so many tries"
         return replace(sighting, location=_refused(location, few))
-    reason = f"{location.reason}; at {look.what}, for which as look {tried} a factor of {tried} is off the odds"
+    reason = f"{location.reason}; seen in another way ({look.what}) than at first"
     center = None if location.center is None else replace(location.center, log10_odds=odds)
     others = tuple(_less_sure(one, off) for one in location.alternatives)
     runner_up = location.runner_up and _less_sure(location.runner_up, off)
@@ -161,6 +161,7 @@ def _refused(location: Location, reason: str) -> Location:
         location.reference,
         location.attribution,
         reason_code=Reason.TOO_MANY_LOOKS,
+        alternatives=tuple(filter(None, (location.center, *location.alternatives))),
     )
     kept = ("size", "n_intersections", "seconds", "stats", "stopped", "seen")
     seen = {name: getattr(location, name) for name in kept}
@@ -180,13 +181,13 @@ def _best_of(sightings: Sequence[Sighting], options: LocateOptions) -> Sighting:
     )
     location = replace(best.location, seconds=seconds)
     if len(sightings) > 1 and location.status == "not_located":
-        location = replace(location, reason=f"{location.reason} ({len(sightings)} looks taken)")
+        location = replace(location, reason=f"{location.reason} (seen in {len(sightings)} ways)")
     rivals = [one for one in locations if one is not best.location and _elsewhere(one, location)]
     rival = max(rivals, key=lambda one: one.log10_odds or -math.inf, default=None)
     if location.located and rival is not None:
         lead = (location.log10_odds or 0.0) - (rival.log10_odds or 0.0)
         if lead < options.min_margin:
-            reason = f"two looks find two places almost equally: they differ by {lead:.1f} in log10 odds"
+            reason = "seen in two ways it fits at two places, almost equally"
             others = () if rival.center is None else (rival.center, *location.alternatives)
             location = replace(
                 location,

@@ -6,9 +6,9 @@ import os
 import re
 
 from roadgeo.errors import MaskError
-from roadgeo.storage.rasters import open_raster
+from roadgeo.storage.rasters import open_raster, raster_size
 
-__all__ = ["estimate_gsd", "read_focal_length"]
+__all__ = ["estimate_gsd", "focal_in_pixels", "read_focal_length"]
 
 #: Width of a 35 mm film frame, which "FocalLengthIn35mmFilm" refers to.
 FILM_WIDTH_MM = 36.0
@@ -28,10 +28,20 @@ def read_focal_length(path: str | os.PathLike[str]) -> float:
     focal = _number(stated)
     if not 1.0 <= focal <= 5000.0:
         raise MaskError(
-            f"{path}: EXIF names no focal length (FocalLengthIn35mmFilm is {stated or 'missing'}); "
-            "give it in pixels: --camera PIXELS"
+            f"{path}: EXIF names no focal length (FocalLengthIn35mmFilm is {stated or 'missing'}); give it in pixels"
         )
     return focal / FILM_WIDTH_MM
+
+
+def focal_in_pixels(image: str, photo: str | None = None) -> float:
+    """Return the focal length in pixels of an image, as EXIF states it: its own, or that of its photograph.
+
+    Raises
+    ------
+    MaskError
+        As for `read_focal_length`.
+    """
+    return read_focal_length(photo or image) * max(raster_size(image))
 
 
 def estimate_gsd(path: str | os.PathLike[str]) -> float | None:

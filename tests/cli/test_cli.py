@@ -7,7 +7,7 @@ import click
 import pytest
 
 from roadgeo.cli import COMMANDS, LazyGroup, cli, main
-from roadgeo.cli.parameters import BOX, NEAR, RANGE, Numbers
+from roadgeo.cli.options import BOX, NEAR, RANGE, Read
 from roadgeo.errors import RoadgeoError
 
 
@@ -36,7 +36,7 @@ def test_no_command_shows_help(capfd: pytest.CaptureFixture[str]) -> None:
     ("arguments", "message"),
     [
         (["nonesuch"], "Error: No such command 'nonesuch'. Try 'roadgeo --help'.\n"),
-        (["info"], "Error: Missing argument 'REF'. Try 'roadgeo info --help'.\n"),
+        (["reference", "info"], "Error: Missing argument 'REF'. Try 'roadgeo reference info --help'.\n"),
     ],
 )
 def test_usage_is_one_line_and_status_2(arguments: list[str], message: str, capfd: pytest.CaptureFixture[str]) -> None:
@@ -88,11 +88,12 @@ def test_a_reader_that_leaves_is_no_error_with_traceback() -> None:
     [
         (RANGE, "0.5:2", (0.5, 2.0)),
         (RANGE, "2:2", (2.0, 2.0)),
+        (RANGE, "2", (2.0, 2.0)),
         (NEAR, "-71.1,42.3,5000", (-71.1, 42.3, 5000.0)),
         (BOX, "179,-19,-179,-16", (179.0, -19.0, -179.0, -16.0)),
     ],
 )
-def test_numbers_are_read(kind: Numbers, text: str, numbers: tuple[float, ...]) -> None:
+def test_numbers_are_read(kind: Read, text: str, numbers: tuple[float, ...]) -> None:
     assert kind.convert(text, None, None) == numbers
     assert kind.convert(numbers, None, None) == numbers
 
@@ -102,7 +103,6 @@ def test_numbers_are_read(kind: Numbers, text: str, numbers: tuple[float, ...]) 
     [
         (RANGE, "2:1"),
         (RANGE, "0:1"),
-        (RANGE, "1"),
         (RANGE, "a:b"),
         (RANGE, "1:nan"),
         (NEAR, "42.3,-171.1,10"),
@@ -113,7 +113,7 @@ def test_numbers_are_read(kind: Numbers, text: str, numbers: tuple[float, ...]) 
         (BOX, "1,2,190,4"),
     ],
 )
-def test_numbers_that_make_no_sense_are_refused(kind: Numbers, text: str) -> None:
+def test_numbers_that_make_no_sense_are_refused(kind: Read, text: str) -> None:
     with pytest.raises(click.BadParameter, match="expected"):
         kind.convert(text, None, None)
 
@@ -153,8 +153,8 @@ def run_on_a_terminal(arguments: list[str], environment: dict[str, str]) -> str:
 
 
 def test_colours_appear_on_terminals_that_want_them() -> None:
-    assert "\x1b[31mError:" in run_on_a_terminal(["info", "nonesuch"], {"NO_COLOR": ""})
-    plain = run_on_a_terminal(["info", "nonesuch"], {"NO_COLOR": "1"})
+    assert "\x1b[31mError:" in run_on_a_terminal(["reference", "info", "nonesuch"], {"NO_COLOR": ""})
+    plain = run_on_a_terminal(["reference", "info", "nonesuch"], {"NO_COLOR": "1"})
     assert plain.startswith("Error: no reference 'nonesuch'")
     assert "\x1b" not in plain
 
@@ -172,6 +172,6 @@ def test_a_mistyped_command_is_asked_about(typed: str, meant: str, capfd: pytest
         (BOX, "42.23,-171.19,42.44,-170.95", "-171.19,42.23,-170.95,42.44"),
     ],
 )
-def test_exchanged_degrees_are_asked_about(kind: Numbers, text: str, meant: str) -> None:
+def test_exchanged_degrees_are_asked_about(kind: Read, text: str, meant: str) -> None:
     with pytest.raises(click.BadParameter, match=f"longitude comes first: did you mean {meant}"):
         kind.convert(text, None, None)

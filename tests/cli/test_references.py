@@ -80,3 +80,21 @@ def test_kinds_that_no_column_tells_are_not_claimed(
         assert main(["info", str(tmp_path / "ref.gpkg")]) == 0
         (line,) = [line for line in capsys.readouterr().out.splitlines() if line.startswith("kinds")]
         assert told in line
+
+
+def test_what_is_not_there_is_not_asked_about(
+    library: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr("click.termui.visible_prompt_func", lambda _: pytest.fail("asked"))
+    assert main(["reference", "remove", "good", "none-such"]) == 1
+    assert "no reference 'none-such'" in capsys.readouterr().err
+    assert (library / "good.gpkg").exists()
+
+
+def test_what_is_replaced_is_said(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    write_streets(tmp_path / "a.gpkg")
+    build = ["index", "--roads", str(tmp_path / "a.gpkg"), "--out", str(tmp_path / "ref.gpkg")]
+    assert main(build) == 0
+    assert "replaces" not in capsys.readouterr().err
+    assert main(build) == 0
+    assert f"replaces {tmp_path / 'ref.gpkg'}, a reference of " in capsys.readouterr().err

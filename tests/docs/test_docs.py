@@ -256,7 +256,7 @@ def test_figures_that_drifted_are_noticed(line: str, got: str, wrong: int) -> No
 def test_pipes_and_redirections_work(desk: Path) -> None:
     text = (
         "```bash\nroadgeo locate photo_mask.png -r roadgeo_demo/porto.gpkg --json > a.jsonl  # status 3\n"
-        "ROADGEO_LIBRARY=nowhere roadgeo list | wc -l\n```\n```text\n0\n```\n"
+        "ROADGEO_LIBRARY=nowhere roadgeo reference list | wc -l\n```\n```text\n0\n```\n"
     )
     run_page(text)
     assert json.loads((desk / "a.jsonl").read_text())["status"] == "not_located"

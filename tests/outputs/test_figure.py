@@ -46,5 +46,5 @@ def test_what_is_missing_is_said(tmp_path: Path, monkeypatch: pytest.MonkeyPatch
         draw_figure(replace(located(), homography=None), road_mask(), map_roads())
     monkeypatch.setitem(sys.modules, "matplotlib", None)
     monkeypatch.setattr("importlib.util.find_spec", lambda name: None)
-    with pytest.raises(OutputError, match=r"pip install 'roadgeo\[plot\]'"):
+    with pytest.raises(OutputError, match=r"-m pip install matplotlib"):
         write_figure(tmp_path / "a.pdf", subject())

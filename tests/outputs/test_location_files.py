@@ -175,7 +175,7 @@ def test_the_geopackage_holds_other_places_and_how_sure_the_corners_are(tmp_path
 
 def test_the_json_is_the_location(tmp_path: Path) -> None:
     paths = output_paths(tmp_path, "a")
-    written, files, _ = write_location(located(), road_mask(), paths)
+    written, files, *_ = write_location(located(), road_mask(), paths)
     assert all(path.exists() for path in files)
     assert json.loads(paths.json.read_text()) == json.loads(json.dumps(written.to_dict()))
     assert json.loads(paths.json.read_text())["attribution"] == "© somebody"

@@ -9,6 +9,7 @@ from outputs.test_location_files import CRS, located, road_mask
 
 from roadgeo.errors import OutputError
 from roadgeo.geometry.homography import Homography
+from roadgeo.geometry.mask import RoadMask
 from roadgeo.geometry.projection import LocalPlane
 from roadgeo.outputs.overlay import FRAME, MATCH, QUERY_ROAD, PlotOptions, draw_overlay, write_overlay
 from roadgeo.outputs.paths import output_paths
@@ -67,6 +68,20 @@ def test_a_photograph_is_drawn_above_its_mask_and_what_is_transparent_is_not(sha
     assert green[:, 0].max() < 0.55 * len(with_it)  # above the mask
     mask = np.argwhere((with_it[:, : int(width)] == 60).all(axis=2))
     assert mask[:, 0].min() > green[:, 0].max()
+
+
+@pytest.mark.parametrize("with_photo", [False, True])
+@pytest.mark.parametrize("shape", [(500, 500), (900, 300), (300, 900), (1, 1), (4000, 40), (40, 4000)])
+def test_nothing_is_drawn_over_the_title_or_the_legend(shape: tuple[int, int], with_photo: bool) -> None:
+    photo = np.full((*shape, 4), (10, 200, 30, 255), np.uint8) if with_photo else None
+    mask = RoadMask(np.ones(shape, np.bool_))
+    options = PlotOptions()
+    picture = draw_overlay(replace(located(), evidence=None), mask, np.empty((0, 4)), "© them", options, photo)
+    top, panel = round(options.map_px * 0.075), round(options.map_px * options.mask_share)
+    for strip in (picture[:top], picture[-(top // 2) :, :panel]):
+        for color in (FRAME, (60, 60, 60), (10, 200, 30)):
+            assert not (strip == color).all(axis=2).any()
+    assert (picture[top : -(top // 2), :panel] == FRAME).all(axis=2).any()
 
 
 def test_the_photograph_of_a_result_is_drawn(tmp_path: Path) -> None:

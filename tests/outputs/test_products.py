@@ -46,7 +46,7 @@ def written(tmp_path_factory: pytest.TempPathFactory) -> OutputPaths:
     paths = output_paths(tmp_path / "out", "mask")
     paths.folder.mkdir()
     options = OutputOptions(products=tuple(ALSO))
-    _, files, _ = write_location(located(), road_mask(), paths, options, tmp_path / "photo.png")
+    _, files, *_ = write_location(located(), road_mask(), paths, options, tmp_path / "photo.png")
     assert sorted(files) == sorted(paths.folder.iterdir())
     return paths
 

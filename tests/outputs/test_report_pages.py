@@ -224,7 +224,7 @@ def test_many_masks_are_listed_with_their_reports(porto: Reference, found: Locat
     other = replace(porto.index, meta={**porto.index.meta, "name": "lisbon", "attribution": "© Lisbon"})
     read = Reader(render_batch(entries, [other, porto.index]))
     assert read.open == []
-    for said in ("3 masks", "1 located, 1 not located, 1 failed", "else&where.png", "no <place>", "c.png: missing"):
+    for said in ("3 images", "1 located, 1 not located, 1 failed", "else&where.png", "no <place>", "c.png: missing"):
         assert said in read.text
     assert "On porto" in read.text  # nothing lies on the first, which is shown because it was searched
     addresses = [attrs["href"] for tag, attrs in read.tags if tag == "a"]

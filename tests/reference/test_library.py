@@ -82,7 +82,7 @@ def test_unknown_names_are_told_what_is_near() -> None:
     add("Boston, MA")
     with pytest.raises(IndexFormatError, match="did you mean boston-ma"):
         resolve_reference("bostom")
-    with pytest.raises(IndexFormatError, match="roadgeo list"):
+    with pytest.raises(IndexFormatError, match="roadgeo reference list"):
         resolve_reference("Tokyo")
     with pytest.raises(IndexFormatError, match="Tokyo"):
         remove_reference("Tokyo")

@@ -183,7 +183,7 @@ def test_without_a_scheduler_processes_of_this_machine_do_it(scheduler, tmp_path
 
 def test_without_dask_the_command_is_said(monkeypatch):
     monkeypatch.setitem(sys.modules, "distributed", None)
-    with pytest.raises(RoadgeoError, match=r"pip install 'roadgeo\[dask\]'"):
+    with pytest.raises(RoadgeoError, match=r"-m pip install dask"):
         list(Cluster().run([1], Squares("")))
 
 

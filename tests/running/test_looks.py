@@ -53,7 +53,7 @@ def test_each_look_costs_its_part_of_the_odds_and_of_the_time():
     assert location.status == "located"
     assert location.log10_odds == pytest.approx(9 - np.log10(3))
     assert location.center.log10_odds == location.log10_odds
-    assert "off the odds" in location.reason
+    assert "seen in another way" in location.reason
     np.testing.assert_allclose(limits, [6.0, 5.4, 9.0])
 
 
@@ -62,7 +62,7 @@ def test_what_is_too_unlikely_for_a_second_look_is_refused():
     assert location.status == "not_located"
     assert location.center is None
     assert location.log10_odds is None
-    assert "are needed" in location.reason
+    assert "not clearly enough" in location.reason
 
 
 def test_no_look_is_taken_when_the_time_is_gone():

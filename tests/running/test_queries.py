@@ -344,7 +344,7 @@ def test_without_a_model_it_is_said(demo_reference: Path, photo: Path, monkeypat
     import roadgeo
 
     monkeypatch.setattr("importlib.util.find_spec", lambda name: None)
-    with pytest.raises(ModelError, match=r"pip install 'roadgeo\[segment\]'"):
+    with pytest.raises(ModelError, match=r"-m pip install onnxruntime"):
         locate_query(str(photo), [roadgeo.open_reference(demo_reference)])
 
 

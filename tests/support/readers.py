@@ -19,12 +19,13 @@ import numpy as np
 import pyproj
 import shapely
 
-from roadgeo.cli.parameters import ASPECT, BOX, CAMERA, NEAR, RANGE
-from roadgeo.cli.track import Moment
+from roadgeo.cli.options import ASPECT, BOX, GSD, NEAR, RANGE, Read
+from roadgeo.cli.track import TIME
 from roadgeo.cli.truths import read_truths
 from roadgeo.errors import RoadgeoError
 from roadgeo.evaluation.truth import read_truth
 from roadgeo.geometry.projection import LocalPlane, serves_as_plane, to_lonlat
+from roadgeo.matching.hints import HINTS
 from roadgeo.reference.index_file import read_index
 from roadgeo.reference.network_file import read_network
 from roadgeo.reference.shards import describe_shards, open_shards
@@ -193,9 +194,10 @@ _HINTS = {
     b"N": NEAR.convert,
     b"B": BOX.convert,
     b"R": RANGE.convert,
-    b"C": CAMERA.convert,
+    b"C": Read("focal", HINTS["focal"].read).convert,
+    b"G": GSD.convert,
     b"A": ASPECT.convert,
-    b"M": Moment().convert,
+    b"M": TIME.convert,
     b"T": lambda text, *_: read_truths(text, explain=True),
 }
 

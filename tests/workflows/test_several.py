@@ -95,7 +95,7 @@ def test_a_weak_place_does_not_beat_one_that_explains_more(query, searched):
     best = judge(query, searched("a", (4.0, 30_000.0)), searched("b", (0.5, 0.0), (-0.5, 5000.0), likelihood=30.0))
     assert best.status != "located"
     assert best.log10_odds == 0.5
-    assert best.reason.startswith("no place on this map stands out: the best has log10 odds 0.5")
+    assert best.reason.startswith("no place on this map stands out: the best is only 3.2 times as likely as another,")
 
 
 def test_places_that_repeat_are_told_whatever_another_map_holds(query, searched):
@@ -159,7 +159,7 @@ def test_a_refusal_gives_the_reason_of_what_came_nearest(query, searched):
     near_miss = searched("b", (1.5, 0.0), stopped="time")
     best = judge(query, searched("a", tried=9000), near_miss, searched("c", (1.0, 9000.0)))
     assert best.reason.startswith("stopped at the time limit of 60 s, so that another run may tell otherwise; of the")
-    assert "of the places tried, the best has log10 odds 1.5" in best.reason
+    assert "of the places tried, the best is only 30 times as likely as another," in best.reason
     assert best.stopped == "time"
 
 
@@ -171,7 +171,7 @@ def test_an_answer_that_the_clock_cut_short_says_so(query, searched):
     assert (whole.status, whole.stopped) == ("located", "work")
     assert "another run" not in whole.reason
     refused = judge(query, searched("a", stopped="work"))
-    assert refused.reason.startswith("stopped after as much work as a search may take; of the places tried, none")
+    assert refused.reason.startswith("stopped after as much work as a search may take; of the places tried, none fits")
 
 
 NEAR, CAMERA = (-71.06, 42.36, 500.0), CameraOptions()
@@ -195,7 +195,22 @@ def test_a_refusal_names_the_limits_that_were_given(query, searched, near, camer
     reason = judge(query, searched("a", stopped=stopped), near=near, match=match).reason
     if stopped == "time":
         assert reason.startswith("stopped at the time limit of 60 s")
-        assert (told.partition(": ")[0] if near or camera else "none passed the tests") in reason
+        assert (told.partition(": ")[0] if near or camera else "none fits") in reason
     else:
         assert told in reason
         assert reason.endswith(" may help")
+
+
+def test_a_refusal_shows_the_best_place_that_there_was(query, searched):
+    best = judge(query, searched("a", (1.5, 300.0), (0.5, 5000.0)))
+    assert (best.status, best.center) == ("not_located", None)
+    assert [one.log10_odds for one in best.alternatives] == [1.5, 0.5]
+
+
+@pytest.mark.parametrize(
+    ("odds", "told"), [(-3.0, "no likelier than"), (0.7, "only 5.0 times"), (3.2, "only 2,000 times")]
+)
+def test_how_much_likelier_a_place_is_is_said_without_logarithms(query, searched, odds, told):
+    reason = judge(query, searched("a", (odds, 0.0))).reason
+    assert told in reason
+    assert "3,000 times are asked for" in reason

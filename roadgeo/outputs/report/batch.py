@@ -13,6 +13,7 @@ from urllib.parse import quote
 
 import numpy as np
 
+from roadgeo._text import counted
 from roadgeo.matching.index import ReferenceIndex
 from roadgeo.outputs.columns import attributes
 from roadgeo.outputs.report.page import STATUS, footer, render_page, section
@@ -92,8 +93,9 @@ def render_batch(entries: Sequence[Entry], indexes: Sequence[ReferenceIndex]) ->
     listed = f'<ol class="list">{items}</ol>{note if left_out else ""}'
     named = dict.fromkeys(_credit(index) for index, _ in maps)
     parts = [section("Masks", listed), *others, footer("; ".join(filter(None, named)))]
-    header = f"<h1>{len(entries)} masks</h1><p>{said}</p>"
-    return render_page(f"{len(entries)} masks", header, f"<main>{views[0]}<aside>{''.join(parts)}</aside></main>")
+    title = counted(len(entries), "image")
+    header = f"<h1>{title}</h1><p>{said}</p>"
+    return render_page(title, header, f"<main>{views[0]}<aside>{''.join(parts)}</aside></main>")
 
 
 def _credit(index: ReferenceIndex) -> str:

@@ -15,6 +15,7 @@ from pathlib import Path
 import numpy as np
 
 from roadgeo import __version__
+from roadgeo._text import counted
 from roadgeo.geometry.mask import RoadMask, plane_to_pixel
 from roadgeo.geometry.pinhole import polygon_area
 from roadgeo.location import Location, Place
@@ -151,9 +152,11 @@ def _explain(location: Location) -> str:
         few = (
             f": few. {_FEW} or more, from a mask of more ground, would help" if location.n_intersections < _FEW else ""
         )
+        n, best = location.n_intersections, next(iter(location.alternatives), None)
         texts = [
             "Nothing was georeferenced. What to look at:",
-            f"{location.n_intersections} intersections are seen in the mask{few}.",
+            *([f"The best place that it had, though not sure enough: {_link(best)}."] if best else []),
+            f"{counted(n, 'intersection')} {'is' if n == 1 else 'are'} seen in the mask{few}.",
             "Do the coloured lines follow the mask's roads? If not, a cleaner mask, --threshold or --band may help.",
             f"Was the right map searched? It was {location.reference}.",
             "Whatever is known shortens the search and may save a mask: --near, --gsd, --north-up, --max-tilt.",

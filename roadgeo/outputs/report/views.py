@@ -141,8 +141,8 @@ class Shown:
         return Evidence(evidence.query_graph, *picked)
 
     def runner_up(self) -> FloatArray | None:
-        """Position (2,) in the CRS of the middle of the best other place."""
-        other = self.location.runner_up
+        """Position (2,) in the CRS of the middle of the best other place; of a refusal, of the best that it had."""
+        other = self.location.runner_up if self.place else next(iter(self.location.alternatives), None)
         return None if other is None else np.array([other.x, other.y])
 
     def draw_picture(self, color: tuple[int, int, int]) -> AnyArray:
@@ -281,7 +281,8 @@ def draw_overview(subject: Shown) -> str:
         marks.append(f'<g class="{location.status}"><path d="{d}"/></g>')
     other = subject.runner_up()
     if other is not None:
-        cross = pin(window.to_svg(other), '<path d="M-6-6L6 6M-6 6L6-6"/>', "runner-up")
+        called = "runner-up" if subject.place else "the best, not sure enough"
+        cross = pin(window.to_svg(other), '<path d="M-6-6L6 6M-6 6L6-6"/>', called)
         marks.append(f'<g class="runner-up">{cross}</g>')
     said = f"All of the map {index.name}" + (", with the footprint" if subject.place else "")
     box = " ".join(f"{value:.0f}" for value in window.box)

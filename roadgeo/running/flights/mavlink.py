@@ -1,6 +1,6 @@
 """Places sent to an autopilot over MAVLink: PX4's GLOBAL_POSITION_SENSOR, ArduPilot's external position estimate.
 
-pymavlink is an extra: pip install 'roadgeo[mavlink]'. Messages go out by whatever pymavlink connects to (udpout:, tcp:,
+pymavlink is an extra. Messages go out by whatever pymavlink connects to (udpout:, tcp:,
 a serial port); nothing is received. A heartbeat tells that we are there. See https://mavlink.io/en/messages/common.html,
 message 296 and command 43003.
 """
@@ -18,7 +18,7 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
-from roadgeo.errors import OutputError
+from roadgeo.errors import OutputError, how_to_install
 
 __all__ = ["MavlinkOptions", "MavlinkSender", "PositionFix", "fix_of", "has_pymavlink"]
 
@@ -178,7 +178,7 @@ class MavlinkSender:
 
 def _connect(url: str, options: MavlinkOptions) -> Any:
     if not has_pymavlink():
-        raise OutputError("MAVLink needs pymavlink: pip install 'roadgeo[mavlink]'")
+        raise OutputError(f"MAVLink needs pymavlink: {how_to_install('mavlink')}")
     form = re.fullmatch(r"(udpout|udpin|udpbcast|tcp|tcpin):[^:\s]+:(\d{1,5})", url)
     if not (form and int(form[2]) < 65536) and not Path(url.split(",")[0]).exists():  # a device, and its speed
         raise OutputError(f"cannot send MAVLink to {url}; expected such as udpout:127.0.0.1:14550, or a serial device")
@@ -197,5 +197,5 @@ def _connect(url: str, options: MavlinkOptions) -> Any:
             os.environ.pop("MAVLINK20", None)
     if not hasattr(link.mav, "global_position_sensor_send"):
         link.close()
-        raise OutputError("pymavlink is too old: it knows no GLOBAL_POSITION_SENSOR; pip install -U pymavlink")
+        raise OutputError(f"pymavlink is too old: it knows no GLOBAL_POSITION_SENSOR; {how_to_install('mavlink')} -U")
     return link

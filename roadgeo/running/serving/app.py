@@ -35,8 +35,8 @@ from roadgeo.running.serving.requests import (
     Refused,
     ending_of,
     read_execution,
+    read_hints,
     read_query_string,
-    read_texts,
 )
 from roadgeo.running.serving.tiles import MAX_ZOOM, Tiles
 from roadgeo.running.serving.view import OFFERED, PICTURE, SEEN, VIEW, WARPED, safe_stem
@@ -179,7 +179,7 @@ class Service:
             image = form.get("image")
             if not isinstance(image, UploadFile):
                 raise Refused(400, "expected a form with a file named image: curl -F image=@photo.jpg")
-            hints |= read_texts({key: value for key, value in form.items() if isinstance(value, str)})
+            hints |= read_hints({key: value for key, value in form.items() if isinstance(value, str)})
             with part.open("wb") as file:
                 await asyncio.to_thread(shutil.copyfileobj, image.file, file)
         except MultiPartException as error:

@@ -6,6 +6,7 @@ from collections.abc import Sequence
 from typing import Any
 
 from roadgeo import __version__
+from roadgeo.matching.hints import HINTS
 
 __all__ = ["DOCUMENTS", "documents_of", "problem"]
 
@@ -14,26 +15,10 @@ _CONFORMS = [f"{_CORE}/{part}" for part in ("core", "ogc-process-description", "
 
 DOCUMENTS = ("/", "/api", "/conformance", "/processes", "/processes/locate", "/jobs")
 
+#: What may be known, as texts or as JSON.
 _HINTS: dict[str, dict[str, Any]] = {
-    "near": {
-        "title": "The middle lies within RADIUS metres of this place: LON,LAT,RADIUS",
-        "schema": {"type": "array", "items": {"type": "number"}, "minItems": 3, "maxItems": 3},
-    },
-    "within": {
-        "title": "The middle lies within these degrees: WEST,SOUTH,EAST,NORTH",
-        "schema": {"type": "array", "items": {"type": "number"}, "minItems": 4, "maxItems": 4},
-    },
-    "gsd": {
-        "title": "Metres per pixel at the middle, least and greatest",
-        "schema": {"type": "array", "items": {"type": "number"}, "minItems": 2, "maxItems": 2},
-    },
-    "maxTilt": {
-        "title": "Greatest angle of the camera from the vertical, degrees",
-        "schema": {"type": "number", "minimum": 0, "maximum": 80},
-    },
-    "focal": {"title": "Focal length in pixels", "schema": {"type": "number", "exclusiveMinimum": 0}},
-    "northUp": {"title": "The image's up is north, within 5 degrees", "schema": {"type": "boolean"}},
-    "timeLimit": {"title": "Seconds to search", "schema": {"type": "number", "exclusiveMinimum": 0}},
+    hint.parameter: {"title": hint.help, "schema": {"anyOf": [hint.schema, {"type": "string"}]}}
+    for hint in HINTS.values()
 }
 
 

@@ -352,8 +352,10 @@ def _answer(asked: Asked, references: Sequence[Any], say: Say = say_nothing) -> 
 def _locate(asked: Asked, references: Sequence[Any], say: Say) -> Answer:
     from dataclasses import replace
 
+    from roadgeo.matching.hints import apply_hints
     from roadgeo.running.queries import locate_query
     from roadgeo.running.serving.view import SEEN, write_view
+    from roadgeo.sources.exif import focal_in_pixels
     from roadgeo.workflows import LocateOptions, locate
 
     def search(*asked_of: Any) -> Any:
@@ -367,12 +369,10 @@ def _locate(asked: Asked, references: Sequence[Any], say: Say) -> Answer:
     if width * height > asked.max_pixels:
         told = f"{width} x {height} pixels, expected at most {asked.max_pixels:,} in all: reduce it"
         return Answer(413, {"detail": told})
-    default = LocateOptions()
-    hints = dict(asked.hints)
-    near, within = hints.pop("near", None), hints.pop("within", None)
-    match = replace(default.match, camera=replace(default.match.camera, **hints), within=within)
-    limits = replace(default.search, time_limit_s=asked.time_limit_s)
-    options = replace(default, near=near, match=match, search=limits)
+    hints = {**asked.hints, "time_limit_s": asked.time_limit_s}
+    if hints.get("focal_px") == "exif":
+        hints["focal_px"] = focal_in_pixels(asked.path)
+    options = apply_hints(LocateOptions(), hints)
     # Which roads a photograph shows does not depend on where it lies: found once, they are not looked for again. How
     # large its pixels are would change what the network is shown.
     seen = Path(asked.path).with_name(SEEN)

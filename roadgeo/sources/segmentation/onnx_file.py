@@ -17,11 +17,9 @@ from pathlib import Path
 from typing import Any, NamedTuple
 
 from roadgeo._arrays import AnyArray
-from roadgeo.errors import ModelError
+from roadgeo.errors import ModelError, how_to_install
 
-__all__ = ["INSTALL", "OnnxModel", "Port", "open_onnx"]
-
-INSTALL = "pip install 'roadgeo[segment]'"
+__all__ = ["OnnxModel", "Port", "open_onnx"]
 
 _MAX_BYTES = 512 << 20
 _MAX_NODES = 20_000
@@ -119,7 +117,7 @@ def open_onnx(path: str | os.PathLike[str], threads: int = 1) -> OnnxModel:
         onnxruntime is missing; the file is missing, too large, no ONNX, or holds what is listed above.
     """
     if importlib.util.find_spec("onnxruntime") is None:
-        raise ModelError(f"to find the roads in a photograph onnxruntime is needed: {INSTALL}")
+        raise ModelError(f"to find the roads in a photograph onnxruntime is needed: {how_to_install('segment')}")
     name, file = os.fspath(path), Path(path)
     if not file.is_file():
         raise ModelError(f"{name}: no such model file; check the path")

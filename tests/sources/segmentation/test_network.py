@@ -279,7 +279,7 @@ def test_a_model_that_gives_no_image(tmp_path: Path) -> None:
 
 def test_without_onnxruntime_the_command_is_said(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr("importlib.util.find_spec", lambda name: None)
-    with pytest.raises(ModelError, match=r"pip install 'roadgeo\[segment\]'"):
+    with pytest.raises(ModelError, match=r"-m pip install onnxruntime"):
         load_network(DEFAULT_MODEL)
 
 

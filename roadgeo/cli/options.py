@@ -1,0 +1,560 @@
+"""Options of the commands: their types, those that several commands share, and how their help is laid out."""
+
+from __future__ import annotations
+
+import os
+import re
+import textwrap
+from collections.abc import Callable, Mapping, Sequence
+from pathlib import Path
+from typing import TYPE_CHECKING, Any, TypeVar
+
+import click
+
+from roadgeo.cli.printing import echo
+from roadgeo.matching.hints import HINTS, apply_hints, read_box, read_numbers, read_place, read_range
+
+if TYPE_CHECKING:
+    from roadgeo.matching.options import LocateOptions
+    from roadgeo.reference.reference import AnyReference
+    from roadgeo.running.cluster import Cluster
+    from roadgeo.running.options import ReadOptions
+
+__all__ = [
+    "ASPECT",
+    "BOX",
+    "CRS",
+    "GSD",
+    "IMAGE",
+    "NEAR",
+    "RANGE",
+    "RESULTS",
+    "SEARCH",
+    "Command",
+    "Plugin",
+    "Read",
+    "hinted",
+    "make_cluster",
+    "make_options",
+    "n_threads",
+    "option",
+    "out_dir_option",
+    "read_options",
+    "refuse_swapped",
+    "take",
+]
+
+Decorated = TypeVar("Decorated", bound=Callable[..., Any])
+
+_MAX_THREADS = 4
+
+
+# --- help in groups ---------------------------------------------------------------------------------------------------
+
+#: Whether all of the help is shown, among what click's contexts share.
+_WHOLE = "roadgeo.help-all"
+
+
+class _Option(click.Option):
+    """An option with the heading that it stands under; one that is rarely wanted is explained by --help-all only."""
+
+    def __init__(
+        self, *names: Any, group: str = "Others", rare: bool = False, earlier: str = "", **settings: Any
+    ) -> None:
+        super().__init__(*names, **settings)
+        self.group, self.rare, self.earlier = group, rare, earlier
+
+    def get_help_record(self, ctx: click.Context) -> tuple[str, str] | None:
+        """Return names and help, without a name from before; but for --help-all the first sentence of the help only."""
+        record = super().get_help_record(ctx)
+        if record is None:
+            return None
+        names, told = record
+        if getattr(ctx.command, "is_long", False) and not ctx.meta.get(_WHOLE, False):
+            default = re.search(r"\[default: [^\];]*", told)
+            told = re.split(r"(?<=[^.]\.) ", self.help or "")[0] + (f"  {default[0]}]" if default else "")
+        return names.replace(f", {self.earlier}", "") if self.earlier else names, told
+
+
+class Command(click.Command):
+    """A command whose help lists its options in groups, and leaves what is rarely wanted to --help-all.
+
+    `more` is text that --help-all shows besides.
+    """
+
+    def __init__(self, *args: Any, more: str | Callable[[], str] = "", **settings: Any) -> None:
+        super().__init__(*args, **settings)
+        self.more = more
+        self.is_long = bool(more) or any(getattr(one, "rare", False) for one in self.params)
+        if self.is_long:
+            told = "Show this message with all options."
+            self.params.append(
+                _Option(["--help-all"], is_flag=True, is_eager=True, expose_value=False, callback=_show_all, help=told)
+            )
+
+    def format_options(self, ctx: click.Context, formatter: click.HelpFormatter) -> None:
+        """List the options in groups; of those left out the names alone."""
+        whole = ctx.meta.get(_WHOLE, False)
+        groups: dict[str, list[tuple[str, str]]] = {}
+        left_out: dict[str, list[str]] = {}
+        for parameter in self.get_params(ctx):
+            record = parameter.get_help_record(ctx)
+            if record is None or not isinstance(parameter, click.Option):
+                continue
+            group = getattr(parameter, "group", "Others")
+            if getattr(parameter, "rare", False) and not whole:
+                left_out.setdefault(group, []).append(max(parameter.opts, key=len))
+                groups.setdefault(group, [])
+            else:
+                groups.setdefault(group, []).append(record)
+        groups["Others"] = groups.pop("Others", [])  # those of all commands come last
+        for group, records in groups.items():
+            with formatter.section(group):
+                if records:
+                    formatter.write_dl(records, col_max=24)
+                if left_out.get(group):
+                    names = "and " + ", ".join(left_out[group])
+                    room = formatter.width - formatter.current_indent
+                    lines = textwrap.wrap(names, room, break_on_hyphens=False)
+                    formatter.write("".join(f"{'':{formatter.current_indent}}{line}\n" for line in lines))
+        if whole and self.more:
+            formatter.write_paragraph()
+            formatter.write(self.more() if callable(self.more) else self.more)
+
+
+def _show_all(ctx: click.Context, _: click.Parameter, asked: bool) -> None:
+    if asked and not ctx.resilient_parsing:
+        ctx.meta[_WHOLE] = True
+        echo(ctx.get_help(), color=ctx.color)
+        ctx.exit()
+
+
+def option(*names: str, **settings: Any) -> Callable[[Decorated], Decorated]:
+    """Make an option as click does, with `group` and `rare`."""
+    return click.option(*names, cls=_Option, **settings)
+
+
+# --- types ------------------------------------------------------------------------------------------------------------
+
+
+class Read(click.ParamType):  # type: ignore[type-arg]  # generic only in late versions of click
+    """Whatever a function reads from a text; a value that is no text was read before.
+
+    Parameters
+    ----------
+    read : callable
+        Takes the text; raises ValueError or a RoadgeoError that says what was got and expected.
+    """
+
+    def __init__(self, name: str, read: Callable[[str], Any]) -> None:
+        self.name, self.read = name, read
+
+    def convert(self, value: Any, param: click.Parameter | None, ctx: click.Context | None) -> Any:
+        """Read it.
+
+        Raises
+        ------
+        click.BadParameter
+            It cannot be read.
+        """
+        from roadgeo.errors import RoadgeoError
+
+        if not isinstance(value, str):
+            return value
+        try:
+            return self.read(value)
+        except (ValueError, RoadgeoError) as error:
+            self.fail(str(error), param, ctx)
+
+
+class Plugin(click.ParamType):  # type: ignore[type-arg]
+    """The name of a plugin, and with `has_argument` a colon and what it is to look at: "osm:Boston, MA".
+
+    `names` gives the names that are known, where there are more than the plugins'; a file that ends so is taken too.
+    """
+
+    name = "plugin"
+
+    def __init__(
+        self,
+        group: str,
+        *,
+        has_argument: bool = False,
+        names: Callable[[], Sequence[str]] | None = None,
+        file_ending: str = "",
+    ) -> None:
+        self.group, self.has_argument, self.names, self.file_ending = group, has_argument, names, file_ending
+
+    def _known(self) -> Sequence[str]:
+        if self.names is not None:
+            return self.names()
+        from roadgeo.plugins import find_plugins
+
+        return sorted(find_plugins(self.group))
+
+    def convert(self, value: Any, param: click.Parameter | None, ctx: click.Context | None) -> str:
+        """Check that it is there; nothing of it is imported or read.
+
+        Raises
+        ------
+        click.BadParameter
+            It is not, or the colon is missing.
+        """
+        text = str(value)
+        if self.file_ending and text.lower().endswith(self.file_ending):
+            if not os.path.isfile(text):  # noqa: PTH113 (names may hold what Path refuses)
+                self.fail(f"no such model file: {text}", param, ctx)
+            return text
+        name, colon, _ = text.partition(":")
+        known = self._known()
+        if name not in known or bool(colon) != self.has_argument:
+            expected = ", ".join(f"{one}:WHERE" if self.has_argument else one for one in known)
+            self.fail(f"got {text!r}, expected one of {expected}", param, ctx)
+        return text
+
+    def shell_complete(self, ctx: click.Context, param: click.Parameter, incomplete: str) -> list[Any]:  # noqa: ARG002
+        """Offer the names that begin so."""
+        from click.shell_completion import CompletionItem
+
+        return [CompletionItem(name) for name in self._known() if name.startswith(incomplete)]
+
+
+def _read_bands(text: str) -> tuple[int, ...]:
+    numbers = [int(part) if part.strip().isdecimal() else 0 for part in text.split(",")]
+    if len(numbers) != 3 or min(numbers) < 1:
+        raise ValueError(f"got {text!r}, expected R,G,B: three numbers from 1")
+    return tuple(numbers)
+
+
+def _read_aspect(text: str) -> float | str:
+    if text == "unknown":
+        return text
+    form = "a number from 0.25 to 4, or unknown"
+    (ratio,) = read_numbers(text, form, (1,))
+    if not 0.25 <= ratio <= 4.0:
+        raise ValueError(f"got {text!r}, expected {form}")
+    return ratio
+
+
+def _read_crs(text: str) -> str:
+    from roadgeo.storage.crs import name_crs
+
+    return name_crs(text)
+
+
+#: Two numbers, least and greatest; a pixel size; a place and a radius; a box in degrees.
+RANGE, GSD, NEAR, BOX = (
+    Read("range", read_range),
+    Read("gsd", HINTS["gsd"].read),
+    Read("near", read_place),
+    Read("box", read_box),
+)
+ASPECT, CRS = Read("aspect", _read_aspect), Read("CRS", _read_crs)
+
+
+# --- options that commands share --------------------------------------------------------------------------------------
+
+RESULTS = "The results"
+WHERE, IMAGE, SEARCH = HINTS["near"].group, HINTS["gsd"].group, HINTS["effort"].group
+
+
+def _hint_option(name: str, **settings: Any) -> Callable[[Decorated], Decorated]:
+    hint = HINTS[name]
+    names = [settings.pop("called", hint.option), *([hint.also] if hint.also else [])]
+    if hint.form == "":
+        settings = {"is_flag": True, "default": None, **settings}
+    elif hint.name == "effort":
+        settings = {"type": click.Choice(["quick", "full"]), **settings}
+    else:
+        settings = {"metavar": hint.form, "type": Read(hint.name, hint.read), **settings}
+    return option(*names, hint.goes_to, **{"help": hint.help, "group": hint.group, "earlier": hint.also, **settings})
+
+
+_SEGMENT = "Which images are photographs, whose roads are found first: those that look so, all, or none. Default: auto."
+
+#: Names and settings of each option by its own name, which `take` takes.
+_SHARED: dict[str, tuple[tuple[str, ...], dict[str, Any]]] = {
+    "references": (
+        ("-r", "--reference", "references"),
+        {
+            "metavar": "REF",
+            "type": click.Path(),
+            "multiple": True,
+            "help": "Map to search: REF.gpkg, or a name in the library. Repeatable. Default: all of the library.",
+            "group": WHERE,
+        },
+    ),
+    "json": (("--json", "as_json"), {"is_flag": True, "help": "Print one JSON object per image and line."}),
+    "crs": (
+        ("--crs",),
+        {
+            "metavar": "CRS",
+            "type": CRS,
+            "help": "CRS of what is drawn: EPSG:3857. Default: the map's own, metric.",
+            "group": RESULTS,
+        },
+    ),
+    "resolution": (
+        ("--resolution",),
+        {
+            "metavar": "SIZE",
+            "type": click.FloatRange(min=0, min_open=True),
+            "help": "Pixel size of what is drawn, in units of its CRS. Default: the picture's own.",
+            "group": RESULTS,
+            "rare": True,
+        },
+    ),
+    "resampling": (
+        ("--resampling",),
+        {
+            "type": click.Choice(["nearest", "bilinear", "cubic", "lanczos"]),
+            "default": "cubic",
+            "show_default": True,
+            "help": "How values between pixels are found; nearest for classes.",
+            "group": RESULTS,
+            "rare": True,
+        },
+    ),
+    "compression": (
+        ("--compression",),
+        {
+            "type": click.Choice(["deflate", "zstd", "jpeg", "webp"]),
+            "default": "deflate",
+            "show_default": True,
+            "help": "Of what is drawn. jpeg and webp make photographs of 8 bits five times smaller, with some loss.",
+            "group": RESULTS,
+            "rare": True,
+        },
+    ),
+    "segment": (
+        ("--segment",),
+        {
+            "type": click.Choice(["auto", "always", "never"]),
+            "default": "auto",
+            "help": _SEGMENT,
+            "group": IMAGE,
+            "rare": True,
+        },
+    ),
+    "segmenters": (
+        ("--segmenter", "segmenters"),
+        {
+            "metavar": "NAME|MODEL.onnx",
+            "type": Plugin("roadgeo.segmenters", file_ending=".onnx"),
+            "multiple": True,
+            "help": "Who finds the roads of photographs: a plugin (`roadgeo --plugins`), or a model as QGIS"
+            " Deepness, GeoDeep or STAC describe them. Several are fused. Default: the model that ships.",
+            "group": IMAGE,
+            "rare": True,
+        },
+    ),
+    "class_name": (
+        ("--class", "class_name"),
+        {
+            "metavar": "NAME",
+            "help": "Class of the model that is road. Default: told by the names.",
+            "group": IMAGE,
+            "rare": True,
+        },
+    ),
+    "fuse": (
+        ("--fuse",),
+        {
+            "is_flag": True,
+            "help": "All images show one frame (exposures, masks of several models): fuse them.",
+            "group": IMAGE,
+            "rare": True,
+        },
+    ),
+    "threshold": (
+        ("--threshold",),
+        {
+            "metavar": "T",
+            "type": float,
+            "help": "Values above T are road; of photographs, probabilities. Default: told by the values.",
+            "group": IMAGE,
+            "rare": True,
+        },
+    ),
+    "band": (
+        ("--band",),
+        {
+            "metavar": "N",
+            "type": click.IntRange(1),
+            "help": "Band that holds the mask. Default: told by the bands.",
+            "group": IMAGE,
+            "rare": True,
+        },
+    ),
+    "bands": (
+        ("--bands",),
+        {
+            "metavar": "R,G,B",
+            "type": Read("bands", _read_bands),
+            "help": "Red, green and blue band of photographs: 3,2,1. Default: by their names, or the first three.",
+            "group": IMAGE,
+            "rare": True,
+        },
+    ),
+    "recursive": (
+        ("--recursive",),
+        {"is_flag": True, "help": "Also take the images of folders within folders.", "group": IMAGE},
+    ),
+    "jobs": (
+        ("-j", "--jobs"),
+        {
+            "metavar": "N",
+            "type": click.IntRange(1),
+            "default": 1,
+            "show_default": False,
+            "help": "Processes that locate at the same time. For one image alone, threads. Results do not depend on it."
+            " Default: 1.",
+            "group": SEARCH,
+        },
+    ),
+    "engine": (
+        ("--engine",),
+        {
+            "type": click.Choice(["local", "dask"]),
+            "help": "Where it is done: in --jobs processes here, the default, or on a Dask cluster of as many workers,"
+            " which survives their death. Needs dask and distributed.",
+            "group": SEARCH,
+            "rare": True,
+        },
+    ),
+    "scheduler": (
+        ("--scheduler",),
+        {
+            "metavar": "ADDRESS",
+            "help": "Use the Dask cluster at this address, tcp://10.0.0.1:8786. Its workers see the same files.",
+            "group": SEARCH,
+            "rare": True,
+        },
+    ),
+    "mavlink": (
+        ("--mavlink",),
+        {"metavar": "URL", "help": "Also send places to an autopilot, to such as udpout:127.0.0.1:14550."},
+    ),
+    "quiet": (("-q", "--quiet"), {"is_flag": True, "help": "Say nothing but errors, and what --json prints."}),
+    "verbose": (("-v", "--verbose"), {"is_flag": True, "help": "Say more: numbers, times, files read."}),
+}
+
+#: Several that go together.
+_TOGETHER = {
+    "segmenting": ("segment", "segmenters", "class_name"),
+    "mask_values": ("threshold", "band", "bands"),
+    "cluster": ("engine", "scheduler"),
+    "verbosity": ("quiet", "verbose"),
+}
+
+
+def take(*names: str, **settings: Any) -> Callable[[Decorated], Decorated]:
+    """Add options of the tables by their names; `settings` replace what the tables say of a single one."""
+
+    def add(command: Decorated) -> Decorated:
+        for name in reversed([one for given in names for one in _TOGETHER.get(given, (given,))]):
+            if name in HINTS:
+                command = _hint_option(name, **settings)(command)
+            else:
+                called, usual = _SHARED[name]
+                command = option(*called, **(usual | settings))(command)
+        return command
+
+    return add
+
+
+def out_dir_option(
+    help_text: str = "Folder for the results; made if missing. Default: here.",
+    default: str | None = ".",
+    path_type: type[str] | type[Path] = str,
+    **more: Any,
+) -> Callable[[Decorated], Decorated]:
+    """Make the option that says where results go."""
+    kind = click.Path(file_okay=False, path_type=path_type)
+    more.setdefault("group", RESULTS)
+    return option("-o", "--out-dir", metavar="DIR", default=default, type=kind, help=help_text, **more)
+
+
+# --- what the options come to -----------------------------------------------------------------------------------------
+
+
+def hinted(given: Mapping[str, Any]) -> dict[str, Any]:
+    """Return what is known of the image, of all that was given; a switch that was not set says nothing."""
+    names = (hint.goes_to for hint in HINTS.values())
+    return {name: given[name] for name in names if given.get(name) is not None and given[name] is not False}
+
+
+def make_options(known: Mapping[str, Any], method: Any = "auto") -> LocateOptions:
+    """Put what was given in its place among the options of all stages; the rest stays as it is.
+
+    Raises
+    ------
+    click.UsageError
+        The paper's method knows no hints.
+    """
+    from dataclasses import replace
+
+    from roadgeo.workflows import LocateOptions
+
+    if method == "pair":
+        idle = [hint for hint in HINTS.values() if hint.group != SEARCH and known.get(hint.goes_to, False) is not False]
+        if idle:
+            raise click.UsageError(f"--method pair knows no {', '.join(one.option for one in idle)}: leave it out.")
+    return apply_hints(replace(LocateOptions(), method=method), known)
+
+
+def refuse_swapped(near: tuple[float, float, float] | None, references: Sequence[AnyReference]) -> None:
+    """Ask what is meant where a place lies on no map, but would with longitude and latitude exchanged.
+
+    Raises
+    ------
+    click.UsageError
+        It is so.
+    """
+    from roadgeo.reference.reference import swapped_near
+
+    meant = None if near is None else swapped_near(near, references)
+    if near is not None and meant is not None:
+        raise click.UsageError(
+            f"--near={near[0]:.9g},{near[1]:.9g},{near[2]:g} lies on none of the maps; longitude comes first:"
+            f" did you mean --near={meant[0]:.9g},{meant[1]:.9g},{meant[2]:g}?"
+        )
+
+
+def n_threads(jobs: int = 1) -> int:
+    """Return how many threads a model gets."""
+    return 1 if jobs > 1 else min(os.cpu_count() or 1, _MAX_THREADS)
+
+
+def read_options(given: Mapping[str, Any], photos: Mapping[str, str], others: Sequence[str], jobs: int) -> ReadOptions:
+    """Put together how what is given is read; `others` are fused with each query."""
+    from roadgeo.running.options import ReadOptions
+
+    same = ("threshold", "band", "segment", "segmenters", "class_name", "bands", "layer", "aspect")
+    return ReadOptions(
+        images=photos,
+        exif=given.get("focal_px") == "exif",
+        fused_with=tuple(others),
+        threads=n_threads(jobs),
+        dem=given.get("dem") or "",
+        allow_mirror=bool(given.get("allow_mirror")),
+        units=given.get("units") or "auto",
+        **{name: given.get(name) for name in same},  # type: ignore[arg-type]
+    )
+
+
+def make_cluster(engine: str | None, scheduler: str | None, jobs: int) -> Cluster | None:
+    """Return the cluster that was asked for, None for processes of this machine.
+
+    Raises
+    ------
+    click.UsageError
+        A scheduler and another engine.
+    """
+    if scheduler is None and engine != "dask":
+        return None
+    if engine == "local":
+        raise click.UsageError("--scheduler goes with --engine dask.")
+    from roadgeo.running.cluster import Cluster
+
+    return Cluster(scheduler, jobs)

@@ -1,0 +1,337 @@
+"""What a user may know of an image: one table, by which the command line, HTTP, QGIS and Python read it alike.
+
+A value is a number, several numbers, or a text such as "0.3", "0.3:0.6", "90+-10" or "-71.06,42.36,5000".
+"""
+
+from __future__ import annotations
+
+import math
+import re
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass, replace
+from typing import TYPE_CHECKING, Any, Literal
+
+from roadgeo.geometry.areas import Box, find_area, is_box
+
+if TYPE_CHECKING:
+    from roadgeo.matching.options import LocateOptions
+
+__all__ = ["HINTS", "Hint", "apply_hints", "read_box", "read_hint", "read_numbers", "read_place", "read_range"]
+
+#: One pixel size stands for a range from it divided by this to it times this: sizes are seldom known better.
+_GSD_FACTOR = 1.25
+#: By how much a heading may be off where that is not said, degrees.
+_HEADING_OFF_DEG = 10.0
+#: What a URL or a form says of a switch.
+_YES, _NO = ("", "1", "true", "yes"), ("0", "false", "no")
+
+
+@dataclass(frozen=True)
+class Hint:
+    """One thing that may be known.
+
+    Attributes
+    ----------
+    name : str
+        As a keyword of Python; `option` is its name on the command line, `parameter` over HTTP.
+    goes_to : str
+        Its name among the hints of `apply_hints`: a field of the options of a search, with its unit.
+    form : str
+        How a value is written; "" for a switch.
+    help : str
+        What it is, with its unit and its default.
+    read : callable
+        Takes a value in any form; returns what the search takes. Raises ValueError: "got ..., expected ...".
+    schema : mapping
+        JSON Schema of a value over HTTP, next to a text.
+    group : str
+        Under which heading of the help it stands.
+    also : str
+        An earlier name of the option.
+    """
+
+    name: str
+    goes_to: str
+    form: str
+    help: str
+    read: Callable[[Any], Any]
+    schema: Mapping[str, Any]
+    group: str = "The image"
+    also: str = ""
+
+    @property
+    def option(self) -> str:
+        """The name on the command line: --max-tilt."""
+        return "--" + self.name.replace("_", "-")
+
+    @property
+    def parameter(self) -> str:
+        """The name over HTTP: maxTilt."""
+        first, *others = self.name.split("_")
+        return first + "".join(map(str.capitalize, others))
+
+
+# --- reading ----------------------------------------------------------------------------------------------------------
+
+
+def read_numbers(value: Any, form: str, counts: Sequence[int], separators: str = ",:") -> tuple[float, ...]:
+    """Return the finite numbers that a value holds.
+
+    Raises
+    ------
+    ValueError
+        It holds others, or another count than one of `counts`.
+    """
+    if isinstance(value, str):
+        parts: Sequence[Any] = re.split(f"[{separators}]", value)
+    else:
+        parts = value if isinstance(value, Sequence) else [value]
+    try:
+        numbers = () if any(isinstance(part, bool) for part in parts) else tuple(map(float, parts))
+    except (TypeError, ValueError, OverflowError):
+        numbers = ()
+    if len(numbers) not in counts or not all(map(math.isfinite, numbers)):
+        raise ValueError(f"got {_shown(value)}, expected {form}")
+    return numbers
+
+
+def _shown(value: Any) -> str:
+    return repr(value)[:60]
+
+
+def _split_tolerance(value: Any) -> tuple[Any, str]:
+    """Split "90+-10" into its value and its tolerance; "" where none is given."""
+    if not isinstance(value, str):
+        return value, ""
+    center, _, off = value.replace("±", "+-").partition("+-")
+    return center, off.strip()
+
+
+def read_range(value: Any, form: str = "a number above 0, or LO:HI") -> tuple[float, float]:
+    """Return two numbers above 0, the second not below the first; one number stands for both.
+
+    Raises
+    ------
+    ValueError
+        They are others.
+    """
+    low, high = (read_numbers(value, form, (1, 2)) * 2)[:2]
+    if not 0 < low <= high:
+        raise ValueError(f"got {_shown(value)}: LO must be above 0 and not above HI; expected {form}")
+    return low, high
+
+
+_GSD_FORM = "metres per pixel: 0.3, 0.3+-10% or 0.3:0.6"
+
+
+def _read_gsd(value: Any) -> tuple[float, float]:
+    center, off = _split_tolerance(value)
+    low, high = read_range(center, _GSD_FORM)
+    if off:
+        share = read_numbers(off.removesuffix("%"), _GSD_FORM, (1,))[0]
+        reach = low * share / 100 if off.endswith("%") else share
+        return read_range((low - reach, high + reach), _GSD_FORM)
+    single = not isinstance(center, Sequence) or (isinstance(center, str) and not re.search("[,:]", center))
+    return (low / _GSD_FACTOR, low * _GSD_FACTOR) if single else (low, high)
+
+
+def _read_heading(value: Any) -> tuple[float, float]:
+    form = "degrees clockwise from north: 90 or 90+-10"
+    center, off = _split_tolerance(value)
+    numbers = read_numbers(center, form, (1,) if off else (1, 2))
+    heading, may_be_off = (*numbers, *read_numbers(off or _HEADING_OFF_DEG, form, (1,)))[:2]
+    if not (-360.0 <= heading <= 360.0 and 0.0 < may_be_off <= 180.0):
+        raise ValueError(f"got {_shown(value)}, expected {form}")
+    return heading, may_be_off
+
+
+def read_place(value: Any) -> tuple[float, float, float]:
+    """Return longitude, latitude (degrees) and a radius (metres).
+
+    Raises
+    ------
+    ValueError
+        They are none; where longitude and latitude were exchanged it says so.
+    """
+    form = "LON,LAT,RADIUS in degrees and metres"
+    lon, lat, radius = read_numbers(value, form, (3,), ",")
+    if not (-180 <= lon <= 180 and -90 <= lat <= 90):
+        swapped = _swapped((lat, lon), f",{radius:g}")
+        raise ValueError(
+            f"got {_shown(value)}: longitude must lie within ±180, latitude within ±90{swapped}; expected {form}"
+        )
+    if not 0 < radius < 2e7:
+        raise ValueError(f"got {_shown(value)}: the radius must be above 0 metres; expected {form}")
+    return lon, lat, radius
+
+
+def read_box(value: Any) -> Box:
+    """Return west, south, east and north, degrees; west may exceed east, across the 180th meridian.
+
+    Raises
+    ------
+    ValueError
+        They are none; where longitude and latitude were exchanged it says so.
+    """
+    form = "W,S,E,N in degrees"
+    west, south, east, north = read_numbers(value, form, (4,), ",")
+    if not -90 <= south < north <= 90:
+        swapped = _swapped((south, west, north, east))
+        raise ValueError(f"got {_shown(value)}: south must lie below north, both within ±90{swapped}; expected {form}")
+    if not is_box((west, south, east, north)):
+        raise ValueError(f"got {_shown(value)}: west and east must differ and lie within ±180; expected {form}")
+    return west, south, east, north
+
+
+def _swapped(exchanged: Sequence[float], rest: str = "") -> str:
+    """Ask whether longitudes and latitudes were exchanged; only remind of their order where that would be as wrong."""
+    lons, lats = exchanged[::2], exchanged[1::2]
+    sound = (
+        all(-180 <= lon <= 180 for lon in lons) and all(-90 <= lat <= 90 for lat in lats) and sorted(lats) == [*lats]
+    )
+    meant = ",".join(f"{number:g}" for number in exchanged) + rest
+    return f" (longitude comes first: did you mean {meant}?)" if sound else " (longitude comes first)"
+
+
+def _read_area(value: Any) -> Box:
+    return find_area(value) if isinstance(value, str) else read_box(value)
+
+
+def _read_focal(value: Any) -> float | Literal["exif"]:
+    if isinstance(value, str) and value.lower() == "exif":
+        return "exif"
+    form = "pixels above 0, or exif"
+    (focal,) = read_numbers(value, form, (1,))
+    if not 0 < focal <= 1e6:
+        raise ValueError(f"got {_shown(value)}, expected {form}")
+    return focal
+
+
+def _read_number(value: Any, low: float, high: float, form: str) -> float:
+    (number,) = read_numbers(value, form, (1,))
+    if not low <= number <= high:
+        raise ValueError(f"got {_shown(value)}, expected {form}")
+    return number
+
+
+def _read_switch(value: Any) -> bool:
+    word = str(value).lower() if isinstance(value, bool | str) else "neither"
+    if word not in (*_YES, *_NO):
+        raise ValueError(f"got {_shown(value)}, expected true or false")
+    return word in _YES
+
+
+def _read_effort(value: Any) -> Literal["quick", "full"]:
+    if value not in ("quick", "full"):
+        raise ValueError(f"got {_shown(value)}, expected quick or full")
+    return value  # type: ignore[no-any-return]
+
+
+# --- the table --------------------------------------------------------------------------------------------------------
+
+
+def _numbers(low: int, high: int) -> dict[str, Any]:
+    return {"type": "array", "items": {"type": "number"}, "minItems": low, "maxItems": high}
+
+
+_WHERE = "Where to look"
+_SEARCH = "The search"
+
+_TABLE = (
+    Hint(
+        "near", "near", "LON,LAT,RADIUS",
+        "The middle lies within RADIUS metres of there.",
+        read_place, _numbers(3, 3), _WHERE,
+    ),
+    Hint(
+        "within", "within", "AREA",
+        "The middle lies in a country or state. Or within W,S,E,N in degrees.",
+        _read_area, _numbers(4, 4), _WHERE,
+    ),
+    Hint(
+        "gsd", "gsd_m", "SIZE|LO:HI",
+        "Pixel size, metres: 0.3, 0.3+-10% or 0.3:0.6. It is that at the middle; 0.3 alone stands for 0.24 to"
+        " 0.375, a quarter more or less. Default: 0.1:12.",
+        _read_gsd, {"oneOf": [{"type": "number", "exclusiveMinimum": 0}, _numbers(2, 2)]},
+    ),
+    Hint(
+        "heading", "heading_deg", "DEG[+-DEG]",
+        "Where up points, degrees from north: 90+-10. Clockwise; the second number is 10 if left out.",
+        _read_heading, {"oneOf": [{"type": "number"}, _numbers(2, 2)]},
+    ),
+    Hint(
+        "north_up", "north_up", "",
+        "Up is north. Grid north of the reference, within 5 degrees.",
+        _read_switch, {"type": "boolean"},
+    ),
+    Hint(
+        "max_tilt", "max_tilt_deg", "DEG",
+        "Greatest tilt of the camera, degrees. From the vertical. Default: 60.",
+        lambda value: _read_number(value, 0, 80, "degrees from 0 to 80"),
+        {"type": "number", "minimum": 0, "maximum": 80},
+    ),
+    Hint(
+        "focal", "focal_px", "PIXELS|exif",
+        "Focal length in pixels, or as the EXIF says. That of --image, if one is given.",
+        _read_focal, {"oneOf": [{"type": "number", "exclusiveMinimum": 0}, {"enum": ["exif"]}]},
+        also="--camera",
+    ),
+    Hint(
+        "effort", "effort", "quick|full",
+        "How hard to try, full by default. quick: stop early, for clean masks. full: also search by roads alone, for"
+        " broken masks and photographs.",
+        _read_effort, {"enum": ["quick", "full"]}, _SEARCH,
+    ),
+    Hint(
+        "time_limit", "time_limit_s", "SECONDS",
+        "Stop searching for an image then. Default: 60; with --method pair 10.",
+        lambda value: _read_number(value, 1e-3, 1e6, "seconds above 0"),
+        {"type": "number", "exclusiveMinimum": 0}, _SEARCH,
+    ),
+)  # fmt: skip
+
+#: What may be known, by its name.
+HINTS: dict[str, Hint] = {hint.name: hint for hint in _TABLE}
+
+
+def read_hint(name: str, value: Any) -> tuple[str, Any]:
+    """Return where a hint goes to, and its value as the search takes it.
+
+    Raises
+    ------
+    ValueError
+        The value makes no sense; the name stands first in the message.
+    """
+    hint = HINTS[name]
+    try:
+        return hint.goes_to, hint.read(value)
+    except ValueError as error:
+        raise ValueError(f"{name}: {error}") from error
+
+
+def apply_hints(options: LocateOptions, known: Mapping[str, Any]) -> LocateOptions:
+    """Put what is known in its place among the options of all stages; the rest stays as it is.
+
+    Parameters
+    ----------
+    known : mapping
+        Values by `Hint.goes_to`; None is not known. A focal length "exif" is for the caller to look up.
+    """
+    given = {name: value for name, value in known.items() if value is not None}
+    camera: dict[str, Any] = {
+        name: given[name] for name in ("gsd_m", "heading_deg", "north_up", "max_tilt_deg") if name in given
+    }
+    if given.get("focal_px", "exif") != "exif":
+        camera["focal_px"] = given["focal_px"]
+    match = replace(options.match, camera=replace(options.match.camera, **camera))
+    if "within" in given:
+        match = replace(match, within=given["within"])
+    options = replace(options, match=match)
+    if "time_limit_s" in given:
+        limit = given["time_limit_s"]
+        options = replace(
+            options,
+            search=replace(options.search, time_limit_s=limit),
+            pair=replace(options.pair, time_limit_s=limit),
+        )
+    return replace(options, **{name: given[name] for name in ("near", "effort") if name in given})

@@ -1,0 +1,141 @@
+"""What is typed becomes what is meant, or one line says what was expected."""
+
+import inspect
+import math
+import re
+from pathlib import Path
+
+import click
+import pytest
+from click.shell_completion import ShellComplete
+from hypothesis import given
+from hypothesis import strategies as st
+
+import roadgeo
+from roadgeo.cli import COMMANDS, cli
+from roadgeo.cli.options import ASPECT, BOX, GSD, NEAR, RANGE, Plugin, Read
+from roadgeo.matching.hints import HINTS
+from roadgeo.running.serving.documents import documents_of
+from roadgeo.running.serving.requests import read_query_string
+
+
+def offered(*typed: str, incomplete: str) -> list[str]:
+    """What a shell offers in place of the last word."""
+    shell = ShellComplete(cli, {}, "roadgeo", "_ROADGEO_COMPLETE")
+    return [item.value for item in shell.get_completions(list(typed), incomplete)]
+
+
+FOCAL = Read("focal", HINTS["focal"].read)
+
+
+@pytest.mark.parametrize(("typed", "meant"), [("exif", "exif"), ("EXIF", "exif"), ("1200", 1200.0), (8.5, 8.5)])
+def test_focal_lengths(typed: object, meant: object) -> None:
+    assert FOCAL.convert(typed, None, None) == meant
+
+
+@pytest.mark.parametrize(("typed", "meant"), [("unknown", "unknown"), ("0.25", 0.25), ("4", 4.0)])
+def test_aspects(typed: str, meant: object) -> None:
+    assert ASPECT.convert(typed, None, None) == meant
+
+
+@pytest.mark.parametrize("typed", ["0.2", "4.1", "nan", "wide", ""])
+def test_what_is_no_aspect(typed: str) -> None:
+    with pytest.raises(click.BadParameter, match=r"expected a number from 0\.25 to 4, or unknown"):
+        ASPECT.convert(typed, None, None)
+
+
+def test_names_of_plugins_are_offered() -> None:
+    plugin = Plugin("none", names=lambda: ["geojson", "geopose", "kmz"])
+    assert [one.value for one in plugin.shell_complete(None, None, "geo")] == ["geojson", "geopose"]
+
+
+def test_commands_are_offered() -> None:
+    assert offered(incomplete="ver") == ["verify"]
+    assert "vectorize" in offered(incomplete="ve")
+
+
+TEXTS = st.text(max_size=40) | st.lists(st.floats().map(str) | st.integers().map(str), min_size=1, max_size=5).map(
+    ",".join
+)
+
+
+@pytest.mark.parametrize(("kind", "count"), [(BOX, 4), (NEAR, 3), (RANGE, 2), (GSD, 2)], ids=lambda one: str(one))
+@given(text=TEXTS)
+def test_any_text_is_finite_numbers_or_refused(kind: Read, count: int, text: str) -> None:
+    try:
+        found = kind.convert(text, None, None)
+    except click.BadParameter:
+        return
+    assert len(found) == count
+    assert all(map(math.isfinite, found))
+
+
+@given(TEXTS)
+def test_any_text_is_a_length_a_ratio_or_refused(text: str) -> None:
+    for kind in (FOCAL, ASPECT):
+        try:
+            found = kind.convert(text, None, None)
+        except click.BadParameter:
+            continue
+        assert found in ("exif", "unknown") or 0 < float(found) < math.inf
+
+
+# --- one table --------------------------------------------------------------------------------------------------------
+
+
+def command(name: str) -> click.Command:
+    found = cli.get_command(click.Context(cli), name)
+    assert found is not None
+    return found
+
+
+def shown(name: str, option: str = "--help") -> str:
+    with click.Context(command(name), info_name=f"roadgeo {name}", terminal_width=80) as context:
+        context.meta["roadgeo.help-all"] = option == "--help-all"
+        return command(name).get_help(context)
+
+
+def test_every_hint_is_an_option_of_locate_a_parameter_over_http_and_a_keyword_of_python() -> None:
+    options = {name for one in command("locate").params for name in one.opts}
+    assert {hint.option for hint in HINTS.values()} <= options
+    keywords = inspect.signature(roadgeo.locate).parameters
+    assert {name for name, one in keywords.items() if one.kind is one.KEYWORD_ONLY} == set(HINTS)
+    inputs = documents_of(["porto"])["/processes/locate"]["inputs"]
+    assert list(inputs) == ["image", *(hint.parameter for hint in HINTS.values())]
+
+
+def test_one_pixel_size_is_one_fact_in_every_spelling() -> None:
+    for one in ("0.3", 0.3):
+        assert HINTS["gsd"].read(one) == pytest.approx((0.24, 0.375))
+    assert GSD.convert("0.3+-10%", None, None) == pytest.approx((0.27, 0.33))
+    assert read_query_string("gsd=0.3") == {"gsd_m": pytest.approx((0.24, 0.375))}
+    for text in ("0.3:0.6", "0.3,0.6"):
+        assert read_query_string(f"gsd={text}") == {"gsd_m": (0.3, 0.6)} == {"gsd_m": GSD.convert(text, None, None)}
+
+
+def test_options_of_plugins_dialogs_exist_on_the_command_line() -> None:
+    """QGIS says what was set by options: each has to exist, with the words among which one chooses."""
+    plugin = Path(roadgeo.__file__).parent / "qgis" / "plugin"
+    known = {name for one in COMMANDS for parameter in command(one).params for name in parameter.opts}
+    said = {flag for file in plugin.glob("*.py") for flag in re.findall(r'"f?(--[a-z-]+)', file.read_text("utf-8"))}
+    assert said
+    assert said <= known | {"--help", "--version"}
+
+
+def test_the_help_of_locate_fits_on_a_page() -> None:
+    assert shown("locate").count("\n") < 60
+    assert "--divide-map" in shown("locate")  # its name
+    assert "share of the map's shards" not in " ".join(shown("locate").split())
+    whole = " ".join(shown("locate", "--help-all").split())
+    assert "share of the map's shards" in whole
+    assert "geopose" in whole
+
+
+def test_there_are_no_more_than_twelve_commands() -> None:
+    assert len(COMMANDS) <= 12
+
+
+@pytest.mark.parametrize("name", ["info", "check", "list", "remove"])
+def test_earlier_names_are_the_same_commands(name: str) -> None:
+    assert name not in COMMANDS
+    assert command(name) is command("reference").commands[name]
