@@ -105,7 +105,8 @@ def name_extra(error: ModuleNotFoundError) -> MissingPackageError | None:
     package = (error.name or "").partition(".")[0]
     if package not in _EXTRAS:
         return None
-    return MissingPackageError(f"this needs {package}, which is not installed: {how_to_install(_EXTRAS[package])}")
+    extra = _EXTRAS[package]
+    return MissingPackageError(f"this needs {package}, which is not installed (extra {extra}): {how_to_install(extra)}")
 
 
 def how_to_install(extra: str) -> str:

@@ -401,7 +401,7 @@ def test_a_folder_that_cannot_be_written_to_is_named(
     "arguments",
     [
         ["locate"],
-        ["locate", "a.png", "--gsd", "3"],
+        ["locate", "a.png", "--gsd", "3:1"],
         ["locate", "a.png", "--near", "1,2"],
         ["locate", "a.png", "--within", "1,2,3"],
         ["locate", "a.png", "--within", "Atlantis"],
