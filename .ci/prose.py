@@ -1,0 +1,118 @@
+"""Count odd words and long sentences in prose: python .ci/prose.py [--limits] PATH...
+
+Prose is what docstrings and comments of Python files hold, and Markdown without its code, tables and quotations of
+output. Counts are per 1,000 lines. With `--limits` the exit status is 1 where a count is above its limit, or a Markdown
+file has a sentence that is too long.
+"""
+
+from __future__ import annotations
+
+import argparse
+import ast
+import io
+import re
+import sys
+import tokenize
+from collections.abc import Iterable, Iterator
+from pathlib import Path
+
+#: What is counted, and how often it may stand in 1,000 lines.
+COUNTED = {
+    "say, tell": (re.compile(r"\b(?:say|says|said|saying|tell|tells|told|telling)\b", re.IGNORECASE), 9.0),
+    "so many, so much": (re.compile(r"\bso (?:many|much|few|little|large|long|often|far)\b", re.IGNORECASE), 2.0),
+    "what (as a noun)": (
+        re.compile(r"(?:^|[.;:,(] |\b(?:of|for|from|with|by|at|on|than|and) )what\b", re.IGNORECASE),
+        12.0,
+    ),
+}
+#: Words of a sentence in Markdown.
+LONGEST = 35
+
+
+def prose_of_python(text: str) -> Iterator[str]:
+    """Yield the lines of docstrings and comments that hold a letter."""
+    for node in ast.walk(ast.parse(text)):
+        if isinstance(node, ast.Module | ast.ClassDef | ast.FunctionDef | ast.AsyncFunctionDef):
+            yield from (ast.get_docstring(node) or "").splitlines()
+    for token in tokenize.generate_tokens(io.StringIO(text).readline):
+        if token.type == tokenize.COMMENT and not re.match(r"#\s*(?:noqa|type:|pragma|!|-{5})", token.string):
+            yield token.string.lstrip("#: ")
+
+
+def paragraphs(text: str) -> Iterator[tuple[int, str]]:
+    """Yield (line, text) of the paragraphs, items and headings of Markdown, without code and tables."""
+    text = re.sub(
+        r"^( *)(```|~~~).*?^\1\2\s*$", lambda found: "\n" * found[0].count("\n"), text, flags=re.DOTALL | re.MULTILINE
+    )
+    start, lines = 0, []
+    for number, line in enumerate([*text.splitlines(), ""], 1):
+        fresh = re.match(r"\s*(?:[-*+]|\d+\.)\s|#", line)
+        if lines and (fresh or not line.strip() or line.lstrip().startswith("|")):
+            yield start, " ".join(lines)
+            lines = []
+        if line.strip() and not line.lstrip().startswith(("|", "<!--", "    ")):
+            start = start if lines else number
+            lines.append(line.strip())
+
+
+def prose_of_markdown(text: str) -> Iterator[str]:
+    """Yield the lines of its paragraphs, 100 characters each."""
+    for _, paragraph in paragraphs(text):
+        yield from re.findall(r".{1,100}(?:\s|$)", paragraph)
+
+
+def long_sentences(text: str) -> Iterator[tuple[int, int, str]]:
+    """Yield (line, words, sentence) of the sentences of Markdown that are too long."""
+    for line, paragraph in paragraphs(text):
+        plain = re.sub(r"!?\[([^\]]*)\]\([^)]*\)", r"\1", paragraph)  # the text of a link counts, its target does not
+        plain = re.sub(r"`[^`]*`", "code", plain)
+        for sentence in re.split(r"(?<=[.!?:;])\s+(?=[\"'(*]*[A-Z0-9a-z`])|\s[-*]\s", plain):
+            words = re.findall(r"[A-Za-z][\w'’-]*", sentence)
+            if len(words) > LONGEST:
+                yield line, len(words), sentence
+
+
+def find_files(paths: Iterable[str]) -> list[Path]:
+    """Find Python and Markdown files in folders."""
+    found = []
+    for path in map(Path, paths):
+        found += sorted(one for one in path.rglob("*") if one.suffix in {".py", ".md"}) if path.is_dir() else [path]
+    return found
+
+
+def main() -> int:
+    """Print a table."""
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument("paths", nargs="+")
+    parser.add_argument("--limits", action="store_true")
+    parser.add_argument("--show", action="store_true", help="print each line that counts")
+    args = parser.parse_args()
+    lines: list[str] = []
+    bad = 0
+    for path in find_files(args.paths):
+        text = path.read_text("utf-8")
+        own = [
+            line
+            for line in (prose_of_python if path.suffix == ".py" else prose_of_markdown)(text)
+            if re.search("[a-z]", line)
+        ]
+        lines += own
+        if args.show:
+            sys.stdout.writelines(
+                f"{path}: {line.strip()}\n" for line in own if any(e.search(line) for e, _ in COUNTED.values())
+            )
+        if path.suffix == ".md":
+            for line, words, sentence in long_sentences(text):
+                bad += 1
+                sys.stdout.write(f"{path}:{line}: a sentence of {words} words: {sentence[:90]} ...\n")
+    sys.stdout.write(f"{len(lines)} lines of prose\n")
+    for name, (pattern, limit) in COUNTED.items():
+        count = sum(len(pattern.findall(line)) for line in lines)
+        rate = 1000 * count / max(len(lines), 1)
+        bad += rate > limit
+        sys.stdout.write(f"{name:20} {count:5} {rate:6.1f} per 1,000 lines, limit {limit:g}\n")
+    return int(args.limits and bad > 0)
+
+
+if __name__ == "__main__":
+    sys.exit(main())
