@@ -125,19 +125,17 @@ class Evidence:
     def lead(self, matrix: FloatArray, others: Sequence[FloatArray]) -> float:
         """Return by how many powers of ten a place leads the best of others, piece by piece; inf where there is none.
 
-        All are compared by the deviation and the shares that explain the place best.
+        All are compared by the deviation and the share of false roads that explain the place best, and by the query's
+        roads alone: of many wrong places the best lies where the map shows little that the query lacks, and all others
+        show more in every piece.
         """
         seen, mapped = self._count(matrix, self._piece_px, self._shape)
         of_query, of_map = self._ratios(mapped)
         nats = self._nats(of_query, of_map, seen.sum(axis=0), mapped.sum(axis=0))
-        sigma, missing, false = np.unravel_index(int(nats.argmax()), nats.shape)
-        by_query, by_map = of_query[sigma, false], of_map[sigma, missing]
-        here = seen @ by_query + mapped @ by_map
-        leads = []
-        for other in others:
-            seen, mapped = self._count(other, self._piece_px, self._shape)
-            leads.append(log10_lead(here - (seen @ by_query + mapped @ by_map)))
-        return min(leads, default=math.inf)
+        sigma, _, false = np.unravel_index(int(nats.argmax()), nats.shape)
+        ratios = of_query[sigma, false]
+        there = (self._count(other, self._piece_px, self._shape)[0] for other in others)
+        return min((log10_lead((seen - other) @ ratios) for other in there), default=math.inf)
 
     def contradicted(self, matrix: FloatArray) -> float:
         """Return which share of the roads lies in regions of the frame where the place explains less than chance.

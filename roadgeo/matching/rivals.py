@@ -4,6 +4,9 @@ A place is worth its lead over the best other one. Where streets form a lattice 
 well: what both explain tells nothing, and what only one explains speaks for that one. Others are those that the search
 met, and those that shifts and turns of the place lead to, on the map around it. Where one of them explains more, it is
 the best place, and is compared in its turn.
+
+Two numbers make the lead: how many pieces of the query speak for the place rather than for the best other one (see
+`Evidence.lead`), and how far what the place explains stands out of what all others do (`log10_gap`).
 """
 
 from __future__ import annotations
@@ -31,12 +34,14 @@ from roadgeo.matching.search import Search
 from roadgeo.matching.triples import larger
 from roadgeo.matching.verification import agreement
 
-__all__ = ["RivalOptions", "Rivals", "Standing", "similar_places"]
+__all__ = ["RivalOptions", "Rivals", "Standing", "log10_gap", "similar_places"]
 
 _NO_SEEDS: IntArray = np.array([], np.int64)
 
 #: Streets that cross at right angles fit themselves when they are turned by one.
 _TURNS_DEG = (0.0, 90.0, 180.0, 270.0)
+#: So many others tell what a gap is worth, at most and at least; their spacing counts as so much at least (log10).
+_TAIL, _LEAST_TAIL, _LEAST_SPACING = 20, 5, 0.3
 #: So often another place may turn out to be the better one.
 _MOST_TURNS = 4
 
@@ -69,7 +74,7 @@ class RivalOptions:
 
     certain: float = 12.0
     repeating: float = 0.35
-    doubt: float = 130.0
+    doubt: float = 60.0
     usually_contradicted: float = 0.02
     n_known: int = 12
     n_places: int = 40
@@ -116,8 +121,8 @@ class Rivals:
         """Places of fewer powers of ten than `needed` are not compared, and none after the time limit."""
         self.estimators, self.options, self.ledger, self.needed = estimators, options, ledger, needed
         self._deadline = time.perf_counter() + time_limit_s
-        self._known: dict[int, Standing] = {}
-        self._doubts: dict[int, float] = {}
+        self._known: dict[int, Standing] = {}  # by the place's id, which its standing keeps from being given again
+        self._doubts: dict[int, tuple[FloatArray, float]] = {}  # of a place as it was laid
 
     def __call__(self, parts: Sequence[Search[Hypothesis]]) -> Search[Hypothesis] | None:
         """Return the part whose likeliest place leads all others by twice what is needed, if there is one."""
@@ -137,7 +142,7 @@ class Rivals:
         if not ranked:
             return None
         started = time.perf_counter()
-        best = max(ranked[: self.options.n_known], key=lambda one: one.log10_likelihood - self._doubt(estimator, one))
+        best = max(ranked[: self.options.n_known], key=lambda one: one.log10_likelihood - self.doubt(estimator, one))
         for _ in range(_MOST_TURNS):
             standing = self._known.get(id(best)) or self._compare(estimator, best, ranked)
             self._known[id(best)] = standing
@@ -151,7 +156,7 @@ class Rivals:
         scene, index, options, matrix = estimator.scene_of(best), estimator.index, self.options, best.laid
         if best.log10_likelihood < self.needed:
             return Standing(best, None, best.log10_odds)
-        doubt = self._doubt(estimator, best)
+        doubt = self.doubt(estimator, best)
         likeliest = next((m.log10_likelihood for m in ranked if not estimator.same(m, best)), 0.0)
         odds = min(best.log10_odds, best.log10_likelihood - max(likeliest, 0.0))
         if odds >= options.certain and max(likeliest, best.nearby) < options.repeating * best.log10_likelihood:
@@ -161,30 +166,34 @@ class Rivals:
         evidence = Evidence(scene, index, sampling(matrix, scene.size), estimator.options.evidence)
         worth, middle = evidence.weigh(matrix), Homography(matrix).everywhere(scene.center)
         apart_m = options.apart * scene.half_size * evidence.gsd_m
-        met = [(model.laid, self._doubt(estimator, model)) for model in ranked[: 1 + options.n_known]]
+        met = [(model.laid, self.doubt(estimator, model)) for model in ranked[: 1 + options.n_known]]
         around = [(other, 0.0) for other in similar_places(matrix, evidence, estimator.options, options)]
         others: list[tuple[float, FloatArray]] = []
+        explained = []
         for other, against in [*met, *around]:
             there = Homography(other).everywhere(scene.center)
             if np.hypot(*(there - middle)) > apart_m and estimator.may_be(other):
-                others.append((evidence.weigh(other) - against, other))
+                explained.append(evidence.weigh(other))
+                others.append((explained[-1] - against, other))
         others.sort(key=lambda one: -one[0])
         if others and others[0][0] > worth:
             return Standing(best, others[0][1], worth - others[0][0], worth, others[0][0])
         lead = evidence.lead(matrix, [other for _, other in others[: options.n_compared]])
+        lead += log10_gap(worth, explained)
         # The larger the map, the more places may lead all that lie around them.
         paid = 2.0 * math.log10(larger(self.ledger.n_reference))
         likelihood, rival = others[0] if others else (-math.inf, None)
         return Standing(best, rival, min(lead, worth) - paid - doubt, worth, likelihood)
 
-    def _doubt(self, estimator: TripleEstimator, model: Hypothesis) -> float:
-        """Return what speaks against a place, in powers of ten, for what it contradicts; asked once of each."""
-        if id(model) not in self._doubts:
-            scene, matrix, options = estimator.scene_of(model), model.laid, self.options
+    def doubt(self, estimator: TripleEstimator, model: Hypothesis) -> float:
+        """Return by how many powers of ten what a place contradicts, as it is laid, speaks against it; measured once."""
+        known, matrix = self._doubts.get(id(model)), model.laid
+        if known is None or known[0] is not matrix:
+            scene = estimator.scene_of(model)
             evidence = Evidence(scene, estimator.index, sampling(matrix, scene.size), estimator.options.evidence)
-            share = evidence.contradicted(matrix) - options.usually_contradicted
-            self._doubts[id(model)] = options.doubt * max(share, 0.0)
-        return self._doubts[id(model)]
+            share = evidence.contradicted(matrix) - self.options.usually_contradicted
+            known = self._doubts[id(model)] = matrix, self.options.doubt * max(share, 0.0)
+        return known[1]
 
     def _take(self, estimator: TripleEstimator, matrix: FloatArray, ranked: Sequence[Hypothesis]) -> Hypothesis:
         """Return the hypothesis of a place that explains more than the likeliest: one that was met, or a new one."""
@@ -201,7 +210,7 @@ class Rivals:
 def similar_places(
     matrix: FloatArray, evidence: Evidence, match: MatchOptions, options: RivalOptions
 ) -> list[FloatArray]:
-    """Return other places (3, 3) around one that most of the roads would fit, each laid as well as it can be."""
+    """Return other places (3, 3) around one that most roads would fit, the likeliest laid as well as they can be."""
     scene, index = evidence.scene, evidence.index
     center = Homography(matrix).everywhere(scene.center)
     found: list[tuple[float, FloatArray]] = []
@@ -212,7 +221,26 @@ def similar_places(
     found.sort(key=lambda one: -one[0])
     roughly = [_lay(start, scene, index, match, options.n_points) for _, start in found[: options.n_places]]
     roughly.sort(key=evidence.weigh, reverse=True)
-    return [_lay(start, scene, index, match, None) for start in roughly[: options.n_laid]]
+    finely = [_lay(start, scene, index, match, None) for start in roughly[: options.n_laid]]
+    return finely + roughly[options.n_laid :]
+
+
+def log10_gap(best: float, others: Sequence[float]) -> float:
+    """Log10 odds that the best of places explains more than the next by more than chance.
+
+    Of many places that explain something by chance the best few differ by exponential spacings (Renyi, 1953), however
+    many there are: the gap to the next is compared with how far that one leads the others. Where streets form a lattice
+    others crowd below the best; where they do not, few come near. A place that explains less than another has a gap
+    below zero, whatever speaks against the other.
+    """
+    ranked = np.sort(others)[::-1][: _TAIL + 1]
+    if not len(ranked):
+        return 0.0
+    n, gap = len(ranked) - 1, best - float(ranked[0])
+    if gap <= 0.0 or n < _LEAST_TAIL:
+        return min(gap, 0.0)
+    usual = float((ranked[:-1] - ranked[-1]).sum() / (1.0 - 1.0 / np.arange(2, n + 2)).sum())
+    return n * math.log10(1.0 + gap / (n * max(usual, _LEAST_SPACING)))
 
 
 def _lay(

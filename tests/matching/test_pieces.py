@@ -8,6 +8,7 @@ import numpy as np
 import pytest
 from hypothesis import given
 from hypothesis import strategies as st
+from scipy.stats import rankdata
 from worlds.scenes import Sight, camera, look, random_network, scene_of
 
 import roadgeo
@@ -81,8 +82,14 @@ def test_alike_places_lead_by_nothing():
 def test_a_lead_is_never_surer_than_all_ways_to_draw_the_signs_tell(drawn):
     sizes, signs = map(np.array, drawn)
     all_signs = np.array(list(itertools.product((-1, 1), repeat=len(sizes))))
-    as_much = np.mean(all_signs @ sizes >= (signs @ sizes) - 1e-9)
+    ranks = rankdata(sizes)
+    as_much = np.mean(all_signs @ ranks >= (signs @ ranks) - 1e-9)
     assert 10.0 ** -log10_lead(signs * sizes) >= as_much - 1e-12
+
+
+def test_one_piece_outweighs_no_others():
+    told = np.append(np.linspace(1.0, 2.0, 30), -100.0)
+    assert log10_lead(told) > log10_lead(told[:-1]) - 1.5 > 4.0
 
 
 def test_a_long_lead_is_counted_without_end():

@@ -16,7 +16,7 @@ from roadgeo.matching.hypothesis import Hypothesis
 from roadgeo.matching.ledger import Ledger
 from roadgeo.matching.local_search import Shift, move_about
 from roadgeo.matching.options import LocateOptions
-from roadgeo.matching.rivals import RivalOptions, Rivals, similar_places
+from roadgeo.matching.rivals import RivalOptions, Rivals, log10_gap, similar_places
 from roadgeo.matching.search import Search
 from roadgeo.matching.triples import larger
 from roadgeo.matching.verification import agreement
@@ -153,7 +153,7 @@ def test_similar_places_lie_on_the_streets_around_as_large_as_the_place_and_not_
     truth, _, evidence = broken
     wrong = beside(truth, evidence)
     places = similar_places(wrong, evidence, MatchOptions(), RivalOptions())
-    assert 0 < len(places) <= RivalOptions().n_laid
+    assert 0 < len(places) <= RivalOptions().n_places
     assert min(apart(broken, one) for one in places) < 3.0  # the place itself is among them
     assert sum(apart(broken, one, wrong) > 500.0 for one in places) > 1
     size = evidence.scene.size
@@ -161,6 +161,25 @@ def test_similar_places_lie_on_the_streets_around_as_large_as_the_place_and_not_
         assert np.linalg.det(one) > 0.0
         assert sampling(one, size) == pytest.approx(sampling(wrong, size), rel=0.1)
         assert evidence.weigh(one) > 0.0
+
+
+# --- how far the best of many leads by chance -------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize("n_places", [30, 3000])
+def test_a_gap_by_chance_is_as_rare_as_it_says(n_places):
+    drawn = np.sort(np.random.default_rng(5).exponential(2.0, (4000, n_places)), axis=1)
+    gaps = np.array([log10_gap(float(row[-1]), row[:-1]) for row in drawn])
+    for log10_odds in (0.5, 1.0, 2.0):
+        assert 0.5 < (gaps >= log10_odds).mean() * 10.0**log10_odds < 1.6
+
+
+def test_a_gap_needs_others_and_counts_against_what_explains_less():
+    assert log10_gap(20.0, []) == 0.0
+    assert log10_gap(20.0, [1.0, 2.0]) == 0.0
+    assert log10_gap(20.0, [23.0, 2.0]) == -3.0
+    few, crowd = np.linspace(1.0, 8.0, 21), np.linspace(7.5, 8.0, 21)
+    assert log10_gap(10.0, crowd) > log10_gap(10.0, few) > 0.0
 
 
 # --- streets that do not repeat ---------------------------------------------------------------------------------------
