@@ -186,7 +186,7 @@ class Rivals:
         return Standing(best, rival, min(lead, worth) - paid - doubt, worth, likelihood)
 
     def doubt(self, estimator: TripleEstimator, model: Hypothesis) -> float:
-        """Return by how many powers of ten what a place contradicts, as it is laid, speaks against it; measured once."""
+        """Return by how many powers of ten what a place contradicts speaks against it, as it is laid; asked once."""
         known, matrix = self._doubts.get(id(model)), model.laid
         if known is None or known[0] is not matrix:
             scene = estimator.scene_of(model)
