@@ -1,6 +1,6 @@
 """Tables out of road files of every kind, part by part, so that a file of any size is read in a bounded memory.
 
-Formats are told by the file's name: OpenStreetMap data through osmium, answers of Overpass, osmnx's `.graphml`,
+The file's name determines its format: OpenStreetMap data through osmium, answers of Overpass, osmnx's `.graphml`,
 (Geo)Parquet, and everything else that GDAL reads (GeoPackage, Shapefile, GeoJSON, FlatGeobuf, GPX, KML, DXF ...).
 """
 
@@ -36,7 +36,7 @@ ENDINGS = OSM_ENDINGS + _PARQUET + _GRAPHS + _GDAL
 #: Layers to prefer where a file has several with lines, and drivers whose layers are parts of one drawing.
 _LAYERS = ("roads", "edges", "lines", "entities")
 _DRAWINGS = (".gpx", ".kml", ".kmz")
-#: Names of columns that hold shapes in a Parquet file that does not say so.
+#: Names of columns that hold shapes in a Parquet file without `geo`.
 _SHAPES = ("geometry", "geom", "wkb_geometry", "wkb", "the_geom", "shape", "wkt")
 _PEEK = 1000
 
@@ -44,16 +44,16 @@ _PEEK = 1000
 def stream_tables(
     path: Path, layer: str | None, most: int, advance: Callable[[float], None], folder: Path, *, areas: bool = False
 ) -> Iterator[RoadTable]:
-    """Yield what a file holds, at most so many features at a time.
+    """Yield the content of a file in parts, of a bounded number of features each.
 
     Parameters
     ----------
     layer : str, optional
         Of a file with several; the one with lines by default, all of a GPX or KML file.
     advance : callable
-        Told which share of the file is read.
+        Called with the share of the file that is read.
     folder : Path
-        For what is put aside while the file is read.
+        For temporary files of the reading.
     areas : bool
         Polygons will do where there are no lines.
 
@@ -129,7 +129,7 @@ def _is_filled(path: Path, layer: str) -> bool:
 
 
 def _choose_columns(path: Path, layer: str) -> list[str]:
-    """Return the columns of a layer that may tell something of a road: by their names, else by their values."""
+    """Return the columns of a layer that may describe a road: by their names, else by their values."""
     fields = list_fields(path, layer)
     known = [name for name in fields if is_known_column(name)]
     if not fields or {"highway", "fclass"} & {name.lower() for name in known}:
@@ -210,7 +210,7 @@ def _objects(column: Any) -> AnyArray:
 
 
 def _require_rows(path: Path) -> None:
-    """Refuse what says to hold more rows than bytes: a few bytes may stand for billions of equal rows."""
+    """Refuse a file that claims more rows than bytes: a few bytes may stand for billions of equal rows."""
     import pyarrow.parquet as pq
 
     meta = pq.read_metadata(path)
@@ -244,7 +244,7 @@ def graph_table(graph: Any) -> RoadTable:
     Raises
     ------
     RoadSourceError
-        Its edges and nodes do not tell where they lie.
+        Its edges and nodes have no coordinates.
     """
     import shapely
 

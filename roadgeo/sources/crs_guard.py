@@ -1,6 +1,6 @@
 """CRS in vector files that name other files: found before GDAL opens them, which looks at such files on its own.
 
-What a CRS may not name is told by `storage.crs`. Here stands where each format keeps its CRS.
+`storage.crs` defines which names a CRS may not have. Here stands where each format keeps its CRS.
 """
 
 from __future__ import annotations
@@ -26,12 +26,12 @@ _KEYS = (b'"crs"', b"'crs'", b"[\"']spatialReference[\"']")
 #: Letters that may be written as escapes: where there are any, all ways to write "crs".
 _ESCAPES = (rb"\u0063", rb"\u0072", rb"\u0073")
 _CRS = re.compile(rb"[\"'](?:c|\\u0063)(?:r|\\u0072)(?:s|\\u0073)[\"']|[\"']spatialReference[\"']")
-#: More than so many that are no JSON are no map.
+#: A file with more such texts than this, none of them JSON, is no map.
 _MOST_PUZZLING = 8
-#: The CRS of GML, and what would let it hide.
+#: The CRS of GML, and the markup that could hide it.
 _SRS_NAME = re.compile(rb"srsName\s*=\s*(\"[^\"]*|'[^']*)")
 _DATA = re.compile(rb"<data\s[^<>]*>([^<>]*[=\[{][^<>]*)<")
-#: A CRS is looked for in so much behind its key, and at the beginning of binary formats.
+#: A CRS is searched within this many bytes after its key, and at the beginning of binary formats.
 _WINDOW = 1 << 16
 
 
@@ -67,7 +67,7 @@ def _require_regular(path: Path) -> None:
 
 
 def _texts(path: Path) -> Iterator[str]:
-    """Yield what may hold a CRS in a file and in those beside it, decoded as far as its format asks for that."""
+    """Yield the parts of a file, and of those beside it, that may hold a CRS, decoded as far as its format requires."""
     if path.is_dir():
         for table in path.glob("*.gdbtable"):
             yield _plain(_start(table))
@@ -94,7 +94,7 @@ def _start(path: Path, most: int = _WINDOW) -> bytes:
 
 
 def _plain(content: bytes) -> str:
-    """Return bytes as text, UTF-16 too: names of files are told from letters of ASCII alone."""
+    """Return bytes as text, UTF-16 too: names of files are recognised by letters of ASCII alone."""
     return content.replace(b"\0", b"").decode("latin-1")
 
 
@@ -119,7 +119,7 @@ def _of_parquet(path: Path) -> Iterator[str]:
 
     try:
         told = json.loads((pq.read_schema(path).metadata or {}).get(b"geo", b"{}"))
-    except (pa.ArrowException, ValueError, RecursionError, OSError):  # whoever reads it will say so
+    except (pa.ArrowException, ValueError, RecursionError, OSError):  # the reader will report it
         return
     yield json.dumps(told)
     yield from all_text(told)
@@ -135,7 +135,7 @@ def _of_xml(content: mmap.mmap) -> Iterator[str]:
 
 
 def _of_json(content: mmap.mmap) -> Iterator[str]:
-    """Yield the text of what follows each key of a CRS, its escapes resolved; as it stands where it is no JSON."""
+    """Yield the text after each key of a CRS, its escapes resolved; as it stands where it is no JSON."""
     keys = [_CRS] if any(content.find(letter) >= 0 for letter in _ESCAPES) else [re.compile(key) for key in _KEYS]
     puzzling = 0
     for match in (match for key in keys for match in key.finditer(content)):

@@ -36,9 +36,9 @@ class Drawing:
     to_pixel : (3, 3) float64 or None
         The lines' coordinates to pixels of the mask (column, row; corner convention). None where they came in degrees.
     unit_m : float or None
-        Metres per pixel, where the lines' units say.
+        Metres per pixel, where the lines' units determine it.
     north_up : bool
-        Whether they say that up is north, within a few degrees.
+        Whether the units imply that up is north, within a few degrees.
     """
 
     mask: RoadMask
@@ -55,13 +55,13 @@ def draw_roads(path: str | os.PathLike[str], units: Units = "auto", layer: str |
     layer : str, optional
         Of a file with several.
     units : "auto", "pixels" or "metres"
-        What their coordinates are. By default degrees or metres where the file names a CRS that they fit, and pixels of
+        Units of their coordinates. By default degrees or metres where the file names a CRS that they fit, and pixels of
         a picture where all lie below the x axis, as QGIS digitises on one. Pixels above it are rows, downwards.
 
     Raises
     ------
     MaskError
-        The file holds no lines, or does not tell its units.
+        The file holds no lines, or its units are unknown.
     """
     from roadgeo.sources.streams import read_lines
 
@@ -99,7 +99,7 @@ def draw_roads(path: str | os.PathLike[str], units: Units = "auto", layer: str |
 
 
 def _tell_units(name: str, coords: FloatArray, crs: str | None) -> Literal["pixels", "metres", "degrees"]:
-    """Tell what coordinates are by their CRS and size."""
+    """Return the units of coordinates by their CRS and size."""
     low, high = coords.min(axis=0), coords.max(axis=0)
     if crs is not None:
         known = known_crs(crs)

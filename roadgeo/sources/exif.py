@@ -1,4 +1,4 @@
-"""What a photograph says of its own camera."""
+"""A photograph's metadata on its own camera."""
 
 from __future__ import annotations
 
@@ -20,7 +20,7 @@ def read_focal_length(path: str | os.PathLike[str]) -> float:
     Raises
     ------
     MaskError
-        The file cannot be read, or says nothing of its focal length.
+        The file cannot be read, or has no focal length.
     """
     with open_raster(path, upright=False) as source:
         tags = {**source.tags(), **source.tags(ns="EXIF")}

@@ -1,4 +1,4 @@
-"""What a raster says of its own place: a geotransform, control points, or a world file beside it."""
+"""The georeference of a raster: a geotransform, control points, or a world file beside it."""
 
 from __future__ import annotations
 
@@ -33,7 +33,7 @@ _GRID = 5
 
 @dataclass(frozen=True)
 class Georeference:
-    """Where a raster says that it lies.
+    """The place of a raster by its own georeference.
 
     Attributes
     ----------
@@ -110,7 +110,7 @@ def read_georeference(path: str | os.PathLike[str], crs: str | None = None) -> G
     Parameters
     ----------
     crs : str, optional
-        Of a world file, as pyproj takes it, or in place of what the raster, or a `.prj` beside it, says.
+        Of a world file, as pyproj takes it, or in place of that of the raster, or of a `.prj` beside it.
 
     Raises
     ------

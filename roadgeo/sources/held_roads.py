@@ -42,7 +42,7 @@ def choose_roads(
         Arrays of coordinates (N, 2) or (N, 3), x first, are a line each; of a single one, rows that are not finite part
         the lines.
     crs : anything that pyproj knows, optional
-        CRS of the coordinates; needed where the roads do not say.
+        CRS of the coordinates; needed where the roads have none.
 
     Raises
     ------

@@ -18,14 +18,14 @@ OSM_ATTRIBUTION = "© OpenStreetMap contributors, ODbL 1.0"
 
 @dataclass(frozen=True)
 class RoadTable:
-    """What a container holds, or a part of it, as it stands there. Dimension: N features.
+    """The content of a container, or a part of it, unchanged. Dimension: N features.
 
     Attributes
     ----------
     shapes : (N,) object
         Shapely geometries of any type, or None.
     crs : str or None
-        "EPSG:n" or WKT; None where the container does not say.
+        "EPSG:n" or WKT; None where the container has none.
     columns : dict
         (N,) object each, by name in lower case.
     meta : dict
@@ -47,15 +47,15 @@ class RoadLines:
     lines : (L,) object
         Shapely LineStrings, 2-D, finite, not empty, in the source's CRS.
     crs : str or None
-        "EPSG:n" or WKT; None where the source does not say.
+        "EPSG:n" or WKT; None where the source has none.
     highway : (L,) object or None
-        What kind of road each is, in OpenStreetMap's words (`highway`), or None; None where the source tells no kinds.
+        Kind of each road, in OpenStreetMap's words (`highway`), or None; None where the source has no kinds.
     tunnel : (L,) bool or None
         Runs in a tunnel.
     meta : dict
         Provenance: plain values.
     name : (L,) object or None
-        What the streets are called, text or None; to look at.
+        Names of the streets, text or None; for display.
     areas : (A,) object
         Polygons that may be roads drawn as surfaces.
     """
@@ -94,7 +94,7 @@ def join_lines(parts: Sequence[RoadLines]) -> RoadLines:
 def simple_lines(shapes: AnyArray) -> tuple[AnyArray, AnyArray]:
     """Return the 2-D LineStrings in any shapes, and the shape that each came from.
 
-    Missing and empty ones are left out, so is what is no line, and so are lines with a vertex that is not finite.
+    Missing and empty ones are left out, and so are other shapes, and lines with a vertex that is not finite.
     """
     import shapely
 

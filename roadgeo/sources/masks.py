@@ -42,24 +42,24 @@ __all__ = ["PROBABILITY_TAG", "THRESHOLD_TAG", "MaskSource", "open_mask", "read_
 
 _LOG = logging.getLogger(__name__)
 
-#: Tags by which our own maps of probability are told from masks that users made, and of the threshold of their model.
+#: Tags that mark our own maps of probability among masks that users made, and the threshold of their model.
 PROBABILITY_TAG, THRESHOLD_TAG = "ROADGEO", "THRESHOLD"
 
 MIN_SIDE, MAX_SIDE = 32, 20_000
 _MAX_CLASSES = 32  # whose colours a palette holds
 _MAX_BANDS = 3  # of a mask, unless one of them is chosen
-_STRIP_PIXELS = 1 << 25  # rows are read and thresholded so many pixels at a time
-_SAMPLE_PIXELS = 1 << 18  # what a mask's values mean is told from about so many
-_MIDDLE_PIXELS = 1 << 22  # and, where neighbours matter, from so many in the middle rows
+_STRIP_PIXELS = 1 << 25  # rows are read and thresholded in strips of this size
+_SAMPLE_PIXELS = 1 << 18  # size of the sample by which a mask's values are interpreted
+_MIDDLE_PIXELS = 1 << 22  # and, where neighbours matter, of a sample of the middle rows
 _OPENCV_BYTES = 1 << 25  # larger files are read window by window, by GDAL
 _MAX_ROAD_SHARE = 0.35  # of a frame
 
 #: OpenCV reads what is no larger than this when decoded: importing rasterio would take longer than reading the mask.
 _MAX_DECODED_BYTES = 1 << 29
 _PNG_MAGIC, _PNG_END = b"\x89PNG\r\n\x1a\n", b"IEND"
-_PNG_COLOURS, _PALETTE = 25, 3  # where a PNG says what its values are, and what it says of a palette's
+_PNG_COLOURS, _PALETTE = 25, 3  # offset of a PNG's colour type, and its value for palettes
 
-#: What is larger, whatever its sign, stands for no value: the least number of a type is often written for nodata.
+#: Larger values, whatever their sign, stand for no value: the least number of a type is often written for nodata.
 _MAX_VALUE = 1e30
 
 
@@ -96,14 +96,14 @@ def read_mask(
     source : path or array
         A raster file, or an (H, W) or (H, W, bands) array (a masked array's masked pixels are unobserved).
     band : int, optional
-        The band that holds the mask, counted from 1. Default: told by the bands, where they can be told apart.
+        The band that holds the mask, counted from 1. Default: by the bands' content, where that is clear.
     threshold : float, optional
-        Values above it are road. Default: told by the values: half of the range of a probability or of a
+        Values above it are road. Default: by the values: half of the range of a probability or of a
         grey scale, otherwise between the two groups of values (Otsu 1979).
     name : str, optional
-        What to call the mask. Default: the path as given.
+        Name of the mask. Default: the path as given.
     voids : bool
-        Whether to look for black corners that a warped image left in its frame, and for what a scan shows around its
+        Whether to look for black corners that a warped image left in its frame, and for the surroundings of a scanned
         map: margins, the line around it, captions. Nodata, NaN and alpha 0 are never taken for observed ground.
 
     Returns
@@ -158,7 +158,7 @@ class MaskSource:
         return RoadMask(roads, observed, name, self._probability(roads))
 
     def _probability(self, roads: BoolArray) -> AnyArray | None:
-        """Return how sure each pixel is to be road, as `RoadMask.probability`; None of a mask, which does not say."""
+        """Return the probability of each pixel, as `RoadMask.probability`; None of a mask, which has none."""
         if self._levels is None:
             return None
         if self._raster.model_threshold is not None:
@@ -215,7 +215,7 @@ def _drawn(raster: _Raster) -> _Raster:
 
 
 def _without_unlabelled(raster: _Raster, sample: Sample) -> tuple[_Raster, Sample]:
-    """Leave out what has no label in a map of labels, and say what was taken for what."""
+    """Leave out pixels without a label in a map of labels, and report how its values were read."""
     unlabelled, told = find_unlabelled(sample)
     if told:
         _LOG.warning("%s: %s; another --threshold tells them apart otherwise", visible(raster.name), told)
@@ -389,7 +389,7 @@ def _read_with_opencv(path: str, name: str) -> AnyArray | None:
     if image is None:
         return None
     if is_png and content[_PNG_COLOURS] == _PALETTE and image.shape[2:] == (3,) and _n_colours(image) == 3:
-        with open_raster(path, name) as dataset:  # OpenCV does not tell which colour is which
+        with open_raster(path, name) as dataset:  # OpenCV does not return the palette's index
             labels: AnyArray = dataset.read(1)
         return labels if are_labels(labels) else image
     return np.ascontiguousarray(turn_upright(image, read_orientation(path)))
@@ -438,7 +438,7 @@ def _require_mask(raster: _Raster) -> None:
             raise PhotographError(f"{many}, if it is a mask: the first of them look like a photograph") from error
         raise
     except MaskError:
-        pass  # what is said below comes first
+        pass  # the error below comes first
     _require_size(raster.name, *raster.shape, MAX_SIDE)
     raise MaskError(many)
 
@@ -473,7 +473,7 @@ def _of_array(array: AnyArray, band: int | None, name: str, *, alpha: bool) -> _
 
 
 def _of_dataset(dataset: DatasetReader, band: int | None, name: str, nodata: float | None) -> _Raster:
-    """Wrap an open GDAL dataset; `nodata` is what is called so beside it."""
+    """Wrap an open GDAL dataset; `nodata` is the value of a side file."""
     from rasterio.enums import ColorInterp, MaskFlags
     from rasterio.windows import Window
 

@@ -1,6 +1,6 @@
 """OpenStreetMap's own files, whatever their order, the sign of their ids and their number of versions.
 
-osmium reads them. A PBF file is cut between its blobs, to be looked at before, and to tell how much of it is read.
+osmium reads them. A PBF file is cut between its blobs, to check them before, and to know how much of it is read.
 """
 
 from __future__ import annotations
@@ -26,7 +26,7 @@ __all__ = ["OSM_ENDINGS", "stream_ways"]
 
 OSM_ENDINGS = (".osm.pbf", ".pbf", ".osm", ".osm.gz", ".osm.bz2", ".osm.xml", ".osh", ".osh.gz", ".osh.bz2")
 
-#: PBF files are read in parts of about this size; what may stand in them at most, as their specification says.
+#: PBF files are read in parts of about this size; the other two are limits of their specification.
 _PART, _MAX_BLOB, _MAX_BLOB_HEADER = 1 << 20, 32 << 20, 64 << 10
 #: Places of nodes are kept in memory up to this size of a PBF file (8 times its size), else on disk.
 _NODES_IN_MEMORY = 100_000_000
@@ -38,7 +38,7 @@ _Way = tuple[Any, str, str | None, str | None]  # line, highway, tunnel, name
 
 
 def stream_ways(path: Path, most: int, advance: Callable[[float], None], folder: Path) -> Iterator[RoadTable]:
-    """Yield the ways with a `highway` tag that exist, in their newest versions, at most so many at a time.
+    """Yield the ways with a `highway` tag that exist, in their newest versions, in parts of bounded size.
 
     Nodes may stand behind ways or be left out where ways bring their places along. Of a way cut off by an extract it is
     the part whose nodes are there; ways without any are counted.
@@ -46,7 +46,7 @@ def stream_ways(path: Path, most: int, advance: Callable[[float], None], folder:
     Parameters
     ----------
     advance : callable
-        Told which share of the file is read.
+        Called with the share of the file that is read.
     folder : Path
         Where the places of the nodes of a large file may be kept.
 
@@ -103,7 +103,7 @@ def _highways(path: Path, header: Any, advance: Callable[[float], None], folder:
     places = osmium.NodeLocationsForWays(osmium.index.create_map(kept))
     places.ignore_errors()
     pool, factory = osmium.io.ThreadPool(), osmium.geom.WKBFactory()
-    # What is handed to osmium is kept alive here: its iterators do not do so.
+    # Objects handed to osmium are kept alive here: its iterators do not do so.
     filters = osmium.filter.EntityFilter(osmium.osm.WAY), osmium.filter.KeyFilter("highway")
     features = {header.get(f"pbf_optional_feature_{n}") for n in range(4)}
     is_plain = _is_pbf(path) and not header.has_multiple_object_versions and "LocationsOnWays" not in features
@@ -216,7 +216,7 @@ def _is_pbf(path: Path) -> bool:
 
 
 def _head(path: Path) -> Any:
-    """Return what osmium is to read for a file's header: of a damaged PBF file on disk it forgets to close it."""
+    """Return the source of a file's header for osmium, which forgets to close a damaged PBF file on disk."""
     import osmium
 
     if not _is_pbf(path):
@@ -226,10 +226,10 @@ def _head(path: Path) -> Any:
 
 
 def _parts(path: Path) -> Iterator[tuple[Any, float]]:
-    """Yield what osmium is to read one after another, and the share of the file that is read then.
+    """Yield the sources that osmium reads one after another, and the share of the file that is read then.
 
     A PBF file is a row of blobs, the first of them a header, each with a header of its own. It is cut between them,
-    for osmium does not tell how far it is. Other files are left whole.
+    for osmium does not report its progress. Other files are left whole.
     """
     import osmium
 
@@ -284,7 +284,7 @@ def _require_text(blob: bytes) -> None:
 
 
 def _unpacked(blob: bytes) -> bytes:
-    """Return what is in a blob: of its fields 1 is that as it is, 3 what zlib made of it; there is but one."""
+    """Return the content of a blob: field 1 holds it as it is, field 3 compressed by zlib; there is but one."""
     contents = [(field, content) for field, content in fields(memoryview(blob)) if not isinstance(content, int)]
     if len(contents) != 1 or contents[0][0] not in {1, 3}:
         raise RuntimeError("a part of it is not compressed by zlib; write it with that, as osmium does by default")

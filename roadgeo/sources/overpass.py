@@ -118,7 +118,7 @@ def fetch_lines(
     Parameters
     ----------
     hint : str
-        Added to what is said where there are no roads.
+        Added to the error where there are no roads.
 
     Raises
     ------
@@ -216,7 +216,7 @@ def _network(area: Any, tags: str) -> Any:
 
 
 def _count_parts(area: Any) -> int:
-    """Count the requests in which osmnx asks for the network of an area; 1 should it no longer tell."""
+    """Count the requests in which osmnx asks for the network of an area; 1 should it no longer report them."""
     import osmnx as ox
 
     plane, crs = ox.projection.project_geometry(area)
@@ -264,7 +264,7 @@ def _timestamp(folder: Path) -> str | None:
 
 @contextlib.contextmanager
 def _asking(options: FetchOptions, query: str, say: Say, n_parts: int = 1) -> Iterator[Path]:
-    """Set osmnx up for one query and yield the folder of its answers; what goes wrong becomes a `RoadSourceError`."""
+    """Set osmnx up for one query and yield the folder of its answers; errors become a `RoadSourceError`."""
     import osmnx as ox
     import requests
 
@@ -300,7 +300,7 @@ def _asking(options: FetchOptions, query: str, say: Say, n_parts: int = 1) -> It
                 "extracts are at download.geofabrik.de and extract.bbbike.org"
             ) from error
         except (ValueError, LookupError, TypeError, AttributeError, ArithmeticError, RecursionError) as error:
-            # JSON of any shape: what it makes osmnx raise is osmnx's to know.
+            # JSON of any shape: osmnx may raise anything.
             shutil.rmtree(folder, ignore_errors=True)
             raise RoadSourceError(f"{host} gave an answer that makes no sense: {first_line(error)}") from error
         finally:
@@ -346,7 +346,7 @@ def _answers(options: FetchOptions, query: str) -> Iterator[Path]:
 
 
 def _is_whole(answer: Path) -> bool:
-    """Say whether a kept answer was written to its end: osmnx may have been interrupted."""
+    """Return whether a kept answer was written to its end: osmnx may have been interrupted."""
     with answer.open("rb") as file:
         file.seek(max(answer.stat().st_size - 1, 0))
         return file.read(1) in (b"}", b"]")
@@ -362,14 +362,14 @@ class _Parts:
     say: Say
 
     def tell(self) -> None:
-        """Say what is asked for next, if anything is."""
+        """Report the next request, if there is one."""
         if self.done < self.total:
             part = f" for part {self.done + 1} of {self.total}" if self.total > 1 else ""
             self.say(f"asking {self.host}{part}", self.done / self.total if part else None)
 
 
 class _Patience:
-    """A hook of `requests` that asks a busy server again, says so, and notices an Overpass that gave up."""
+    """A hook of `requests` that asks a busy server again, reports it, and notices an Overpass that gave up."""
 
     def __init__(self, options: FetchOptions, say: Say, parts: _Parts) -> None:
         self.options = options

@@ -1,4 +1,4 @@
-"""Road lines on a metric plane, from files or from OpenStreetMap: what a reference is built from."""
+"""Road lines on a metric plane, from files or from OpenStreetMap: the input of a reference."""
 
 from __future__ import annotations
 
@@ -41,7 +41,7 @@ _LOG = logging.getLogger(__name__)
 #: West, south, east, north in degrees; west > east where it lies astride 180 degrees.
 Box = tuple[float, float, float, float]
 
-#: Of lines that lie beyond the Earth in their CRS so many, as a share, may be left out; of more the CRS is wrong.
+#: Greatest share of lines beyond the Earth in their CRS that is left out; with more of them the CRS is wrong.
 _MOST_ASTRAY = 0.1
 
 
@@ -60,7 +60,7 @@ class Roads:
     area : shapely Polygon or MultiPolygon, or None
         The ground whose roads were asked for, in degrees; None where it was all that there are.
     names, kinds : (L,) object or None
-        What each street is called, and its `highway`: text, "" where that is not known; None: of none.
+        Name of each street, and its `highway`: text, "" where that is not known; None: of none.
     """
 
     lines: AnyArray
@@ -75,7 +75,7 @@ class Roads:
         return len(self.lines)
 
     def __repr__(self) -> str:
-        """Say in one line what it is."""
+        """Describe the roads in one line."""
         return f"<Roads: {len(self):,} lines, {self.plane.crs[:40]}>"
 
 
@@ -99,10 +99,10 @@ def read_roads(
     layer : str, optional
         Layer of files that have several.
     crs : str, optional
-        CRS of the coordinates, whatever the files say. Needed where a file says nothing, as a shapefile without its
+        CRS of the coordinates, whatever the files state. Needed where a file states none, as a shapefile without its
         .prj. OpenStreetMap files are always in degrees.
     which : RoadKind
-        Kinds of road to take, where the file tells them apart (see `sources.schemas`); otherwise all, and that is said.
+        Kinds of road to take, where the file has kinds (see `sources.schemas`); otherwise all, with a message.
     tunnels : bool
         Take tunnels too: a mask does not show them.
     bbox : (west, south, east, north), optional
@@ -110,7 +110,7 @@ def read_roads(
     attribution : str, optional
         Overrides what the sources call for.
     say : Say
-        Told what is being read and, of PBF files, how much of it.
+        Called with the source being read and, of PBF files, the share that is read.
 
     Raises
     ------
@@ -171,7 +171,7 @@ def fetch_roads(
     options : FetchOptions, optional
         Servers, cache, patience, date.
     say : Say
-        Told what is being waited for, and how much of it has come.
+        Called with the server that is waited for, and the share that has come.
 
     Raises
     ------
@@ -368,7 +368,7 @@ def _clip(lines: AnyArray, bbox: Box) -> tuple[AnyArray, AnyArray]:
 
 
 def overruled_crs(own: str | None, given: str, file: Path | str) -> str:
-    """Return the CRS that was given, and warn where a file says another."""
+    """Return the given CRS, and warn where a file states another."""
     known = _known_crs(given)
     if own is not None and not known_crs(own).equals(known_crs(known), ignore_axis_order=True):
         _LOG.warning(

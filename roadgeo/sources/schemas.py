@@ -1,8 +1,8 @@
-"""One adapter from tables of any schema to roads: what kind each is, whether it is in a tunnel, its name, whom to name.
+"""One adapter from tables of any schema to roads: kind of each, tunnel or not, name, attribution.
 
-A schema is told by its words: `residential` is OpenStreetMap's, `A Road` the Ordnance Survey's, `S1400` that of TIGER.
+A schema is recognised by its words: `residential` is OpenStreetMap's, `A Road` the Ordnance Survey's, `S1400` of TIGER.
 Columns with well-known names are looked at first, then any whose values are such words. Numbers count in columns that
-are known by name alone. What is something else (a stream, a fence, a railway) is left out and counted; a road whose
+are known by name alone. Other lines (a stream, a fence, a railway) are left out and counted; a road whose
 kind is not known stays one.
 """
 
@@ -24,7 +24,7 @@ from roadgeo.sources.lines import OSM_ATTRIBUTION, RoadLines, RoadTable, simple_
 
 __all__ = ["Schema", "is_known_column", "names_kinds", "recognise"]
 
-#: What a word may stand for beside values of `highway`: no road, and a road of a kind that other columns may tell.
+#: Meanings of a word beside values of `highway`: no road, and a road of a kind that other columns may hold.
 _NONE, _ROAD = "none", "road"
 
 
@@ -48,7 +48,7 @@ _LETTERS = str.maketrans({"ø": "o", "æ": "ae", "ß": "ss", "ð": "d", "ł": "l
 
 
 def _words(**kinds: str) -> dict[str, str]:
-    """Return words by what they stand for, given as text with commas between them."""
+    """Return words by their meaning, given as text with commas between them."""
     return {_plain(word): kind for kind, words in kinds.items() for word in words.split(",")}
 
 
@@ -192,7 +192,7 @@ _NAMES = (
     "nom_1_gauc", "nom_collab", "nam", "gatenavn", "adressenav", "vagnamn", "st_name", "road_name",
 )  # fmt: skip
 _TAGS = ("other_tags", "all_tags", "tags")
-#: Keys of OpenStreetMap that tell what a line is if it is no road.
+#: Keys of OpenStreetMap that describe a line that is no road.
 _OTHER_KEYS = (
     "waterway", "railway", "barrier", "power", "aeroway", "aerialway", "man_made", "natural", "landuse", "building",
     "boundary", "leisure", "amenity", "pipeline",
@@ -207,17 +207,17 @@ _PAIR = re.compile(r'"(highway|tunnel|area|railway|waterway|barrier|power)"\s*(?
 
 
 _CODE = re.compile(r"[a-z]\d+")
-#: Values that are looked at to tell what a column holds.
+#: Number of values by which the content of a column is recognised.
 _SAMPLE = 1000
 
 
 def is_known_column(name: str) -> bool:
-    """Whether a column of this name may tell something of a road."""
+    """Whether a column of this name may describe a road."""
     return name.lower()[:10] in _KNOWN
 
 
 def names_kinds(values: AnyArray) -> bool:
-    """Whether most of what is filled in a column are words for kinds of lines, of one maker of maps."""
+    """Whether most filled values of a column are words for kinds of lines, of one maker of maps."""
     return _maker_of(values) is not None
 
 
@@ -228,7 +228,7 @@ class Schema:
     Attributes
     ----------
     kinds : tuple of (column, words)
-        What tells the kind, in the order in which it is believed.
+        Columns with the kind, in order of precedence.
     none_is_no_road : bool
         A line without a kind is something else, as in a table of OpenStreetMap's.
     attribution : str
@@ -239,7 +239,7 @@ class Schema:
     attribution: str = ""
 
     def adapt(self, table: RoadTable) -> RoadLines:
-        """Return the lines of a table that are roads, or may be; what is left out is counted in `meta`."""
+        """Return the lines of a table that are roads, or may be; others are counted in `meta`."""
         columns = _named(table.columns)
         kinds, others = self._kinds(columns, len(table.shapes))
         shapes = table.shapes[~others]
@@ -280,7 +280,7 @@ class Schema:
 
 
 def recognise(table: RoadTable) -> Schema:
-    """Tell the schema of a table by its columns and their values."""
+    """Recognise the schema of a table by its columns and their values."""
     columns = _named(table.columns)
     makers: dict[str, str] = {}
     kinds: dict[str, Mapping[str, str]] = {}
@@ -319,14 +319,14 @@ def _named(columns: Mapping[str, AnyArray]) -> dict[str, AnyArray]:
 
 
 def _maker_of(values: AnyArray) -> str | None:
-    """Return whose words most of what is filled in are."""
+    """Return the maker of maps whose words most filled values are."""
     shares = {maker: _share(values, vocabulary.words) for maker, vocabulary in _VOCABULARIES.items()}
     best = max(shares, key=lambda maker: shares[maker])
     return best if shares[best] > 0.5 else None
 
 
 def _share(values: AnyArray, words: Mapping[str, str]) -> float:
-    """Return the share of what is filled in that is known."""
+    """Return the share of the filled values that is known."""
     if not words:
         return 0.0
     filled = [value for value in values if _is_filled(value)]
@@ -389,7 +389,7 @@ def _flags(value: Any) -> Any:
 
 
 def _text(value: Any) -> str | None:
-    """Return what a street is called; of Overture's names the primary one."""
+    """Return the name of a street; of Overture's names the primary one."""
     told = _json(value)
     told = told.get("primary") if isinstance(told, dict) else value
     return ";".join(map(str, told)) if isinstance(told, list | tuple) else str(told) if _is_filled(told) else None
@@ -407,11 +407,11 @@ def _itself(value: Any) -> Any:
 
 
 def _below(value: Any) -> str:
-    """Say whether the IGN has a road below the ground: a number below 0."""
+    """Return whether the IGN has a road below the ground: a number below 0."""
     return "yes" if str(value).strip().startswith("-") else "no"
 
 
-#: How columns tell a tunnel that do not say so themselves.
+#: Tunnels in columns of other names.
 _HIDDEN: dict[str, Callable[[Any], Any]] = {
     "road_flags": _flags,
     "pos_sol": _below,
@@ -432,7 +432,7 @@ def _count_broken(shapes: AnyArray) -> int:
 
 
 def _each(values: AnyArray, make: Callable[[Any], Any]) -> AnyArray:
-    """Return what a function makes of each value; of equal text it is asked once."""
+    """Return a function's result for each value; it is called once for equal text."""
     made: dict[str, Any] = {}
     found = np.empty(len(values), object)
     for i, value in enumerate(values):

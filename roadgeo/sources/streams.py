@@ -26,7 +26,7 @@ _LOG = logging.getLogger(__name__)
 #: Files that hold lines, not pixels, by their names.
 QUERY_ENDINGS = (*ENDINGS, ".json", *(ending + packed for ending in ENDINGS for packed in PACKED), ".zip")
 
-#: Features that are looked at to tell whether a file of a folder holds roads.
+#: Number of features by which a file of a folder is recognised as roads.
 _LOOK = 20_000
 _WHOLE = 1 << 30
 
@@ -34,8 +34,8 @@ _WHOLE = 1 << 30
 def list_sources(path: Path) -> list[Path]:
     """Return the files of a folder (not of folders in it) that hold roads, by name, or the path itself.
 
-    Passed over, with a word, are results and references of roadgeo, what holds no lines or other lines than roads, and,
-    where other files tell kinds of roads, those that do not.
+    Passed over, with a message, are results and references of roadgeo, files without roads and, where
+    other files have kinds of roads, those that do not.
 
     Raises
     ------
@@ -91,7 +91,7 @@ def _is_own(file: Path) -> bool:
 
 
 def _tells_kinds(file: Path) -> bool:
-    """Whether a file tells what kind of road its lines are.
+    """Whether a file has kinds of roads.
 
     Raises
     ------
@@ -115,7 +115,7 @@ def read_lines(
     layer : str, optional
         Of a file with several; the one with lines by default.
     advance : callable, optional
-        Told which share of the file is read.
+        Called with the share of the file that is read.
     areas : bool
         Roads drawn as polygons will do where there are no lines.
 
@@ -138,7 +138,7 @@ def stream_lines(
     *,
     areas: bool = False,
 ) -> Iterator[RoadLines]:
-    """Yield the lines of a road file as `read_lines` gives them, of at most so many features at a time.
+    """Yield the lines of a road file as `read_lines` gives them, in parts of bounded size.
 
     Raises
     ------
@@ -177,7 +177,7 @@ def _unpacked(path: Path, folder: Path) -> list[Path]:
 
 
 def tell_source(name: str, meta: Mapping[str, Any]) -> None:
-    """Say what of a source was left out, or is not known."""
+    """Report the parts of a source that were left out, or are not known."""
     counts = {
         "no_roads": "are no roads: streams, railways, fences, or not built",
         "broken": "have a vertex that is not finite",
@@ -209,5 +209,5 @@ def reading(path: Path) -> Iterator[None]:
     try:
         yield
     except (ProjError, ShapelyError, RuntimeError, ValueError, LookupError, ArithmeticError, OSError) as error:
-        # Many libraries read such files, and what a damaged one makes them raise is theirs to know.
+        # Many libraries read such files, and a damaged one may make them raise anything.
         raise RoadSourceError(f"{path}: damaged, or not what its name says: {first_line(error)}") from error

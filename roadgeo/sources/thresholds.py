@@ -1,4 +1,4 @@
-"""What a raster's values mean: a mask, probabilities, classes or a photograph; and the thresholds worth trying.
+"""Interpretation of a raster's values: a mask, probabilities, classes or a photograph; and the thresholds to try.
 
 Values are judged from a sample of pixels spread over the raster and, where neighbours matter, from rows of it.
 """
@@ -25,7 +25,7 @@ _MIN_CORRELATION = 0.3  # between the bands of a photograph
 _MAX_CLASS = 32  # whole numbers up to this, three or more of them, are the classes of a map, unless they are faint
 
 #: Values that are not crisp show roads only where (measured on soft maps and on the photographs of the Massachusetts
-#: Roads Dataset in grey, plain and blurred) little of the frame is light, the dark ground is even, and what is light
+#: Roads Dataset in grey, plain and blurred) little of the frame is light, the dark ground is even, and the light area
 #: falls into few pieces of one width. In an inverted map dark and light change places.
 _MAX_LIGHT = 0.35  # share of the frame
 _MAX_SPREAD = 0.22  # standard deviation of the ground, of the difference between light and dark
@@ -105,9 +105,9 @@ def spread_probability(threshold: float) -> tuple[float, ...]:
 
 
 def find_unlabelled(sample: Sample) -> tuple[float | None, str]:
-    """Find the value of pixels that have no label in a map of labels, and say what was taken for what.
+    """Find the value of pixels that have no label in a map of labels, and describe how its values were read.
 
-    Maps for training have 0 for the ground, 1 for road and a third value for what counts for nothing: 255 in PASCAL VOC
+    Maps for training have 0 for the ground, 1 for road and a third value for ignored pixels: 255 in PASCAL VOC
     and mmsegmentation, -1, or the largest of a type. In other rasters such a third value is the road, and the 1 noise.
 
     Returns
@@ -115,7 +115,7 @@ def find_unlabelled(sample: Sample) -> tuple[float | None, str]:
     value : float or None
         None where there is no such value.
     told : str
-        "" where there is nothing to tell.
+        "" where there is nothing to report.
     """
     values = sample.seen[:, sample.channel]
     levels = np.unique(values)
@@ -236,7 +236,7 @@ def _grey_share(sample: Sample, values: AnyArray) -> float:
 
 
 def _shows_roads(rows: AnyArray, threshold: float) -> bool:
-    """Tell whether light (rows, columns) look like roads on even ground: see the constants above."""
+    """Return whether light (rows, columns) look like roads on even ground: see the constants above."""
     light: BoolArray = rows > threshold
     if np.count_nonzero(light) > 0.5 * light.size:
         light, rows = ~light, -rows

@@ -1,4 +1,4 @@
-"""Packed files of strangers: what they unpack to is bounded, and goes into a passing folder."""
+"""Packed files of strangers: unpacked size is bounded, and a temporary folder receives them."""
 
 from __future__ import annotations
 
@@ -17,7 +17,7 @@ __all__ = ["PACKED", "read_chunks", "require_bounded", "unpack"]
 #: Endings of packed files. OpenStreetMap's are read as they are.
 PACKED = (".gz", ".bz2", ".zip")
 
-#: A packed file may unpack to so many bytes, and beyond them to so many times its size: XML shrinks to a tenth.
+#: A packed file may unpack to this many bytes, and beyond them to a multiple of its size: XML shrinks to a tenth.
 _FREE, _TIMES = 64 << 20, 100
 _CHUNK, _BLOCK = 1 << 20, 4096
 
@@ -67,7 +67,7 @@ def unpack(path: Path, folder: Path) -> Path:
     try:
         with zipfile.ZipFile(path) as archive:
             members = archive.infolist()
-            # No more of a member is unpacked than it says; and each costs a block of the disk.
+            # No more of a member is unpacked than its header states; and each costs a block of the disk.
             require_bounded(path, sum(member.file_size + _BLOCK for member in members))
             archive.extractall(folder)  # leaves out what would lie outside
     except (zipfile.BadZipFile, zlib.error, EOFError, RuntimeError, NotImplementedError, ValueError) as error:

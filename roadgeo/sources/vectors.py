@@ -1,8 +1,8 @@
 """The one place that opens vector files of strangers with GDAL: few drivers, no network, no views.
 
 GDAL chooses its driver by content, and some drivers fetch what a file names, run programs, or read any other file.
-While a file is read only those below are registered, and its network leads nowhere. Pyogrio's GDAL is its own; what is
-left out is registered again afterwards, for this may be part of a larger program.
+While a file is read only those below are registered, and its network leads nowhere. Pyogrio's GDAL is its own; the
+other drivers are registered again afterwards, for this may be part of a larger program.
 """
 
 from __future__ import annotations
@@ -86,7 +86,7 @@ def list_layers(path: Path) -> list[tuple[str, str]]:
 
 
 def count_features(path: Path, layer: str) -> int:
-    """Return how many features a layer says to hold.
+    """Return the number of features that a layer claims to hold.
 
     Raises
     ------
@@ -118,8 +118,8 @@ def read_layer(
 ) -> VectorLayer:
     """Read a layer (the first by default), with those of the named columns that it has.
 
-    Some features are left out before, and at most so many are read. Text that is not in the encoding that the file
-    names is read as Latin-1, which may garble it, and that is told.
+    The first `skip` features are left out, and a bounded number is read. Text that is not in the encoding that the file
+    names is read as Latin-1, which may garble it, and that is reported.
 
     Raises
     ------
@@ -153,7 +153,7 @@ def require_file(path: Path) -> None:
 
 @contextmanager
 def _guarded(path: Path, layer: str | None = None) -> Iterator[Path]:
-    """Check what can be checked without GDAL, then read with as little of it as is needed; yield what to open."""
+    """Check all that needs no GDAL, then read with as little of it as possible; yield the source to open."""
     from pyogrio.errors import CRSError, DataLayerError, DataSourceError
 
     require_file(path)
@@ -233,7 +233,7 @@ def _offline() -> Iterator[None]:
 
 
 def _refuse_links(path: Path) -> None:
-    """Refuse a GeoJSON whose CRS is said elsewhere: its coordinates would be taken for degrees."""
+    """Refuse a GeoJSON whose CRS stands elsewhere: its coordinates would be taken for degrees."""
     if not path.is_file() or _head(path)[:1] not in (b"{", b"["):
         return
     with path.open("rb") as file, mmap.mmap(file.fileno(), 0, access=mmap.ACCESS_READ) as content:
@@ -261,7 +261,7 @@ def _require_stored(path: Path, layer: str | None = None) -> None:
 
 
 def _computed(database: sqlite3.Connection, layer: str | None) -> list[str]:
-    """Tell what is computed: of GeoPackage's own tables, which GDAL reads in any case, or of one layer."""
+    """Return the computed columns and tables: GeoPackage's own, which GDAL reads in any case, or those of one layer."""
     if layer is None:
         names = [name for (name,) in database.execute(_OWN_TABLES)]
         return [problem for problem in (table_problem(database, name) for name in names) if problem]

@@ -1,4 +1,4 @@
-"""What must be known of a model to run it, from its own metadata or the STAC item beside it.
+"""The description of a model that is needed to run it, from its own metadata or the STAC item beside it.
 
 Conventions: QGIS Deepness and GeoDeep keep JSON strings in an ONNX file's `metadata_props`
 (https://qgis-plugin-deepness.readthedocs.io, "Adding metadata to ONNX model"; https://github.com/uav4geo/GeoDeep,
@@ -21,7 +21,7 @@ from roadgeo.sources.segmentation.onnx_file import OnnxModel, Port
 
 __all__ = ["MAX_WAYS", "ModelCard", "channels_come_last", "read_card", "size_of"]
 
-#: A tile can be shown to a model in so many ways.
+#: Number of ways in which a tile can be shown to a model.
 MAX_WAYS = 4
 
 _ROAD, _NOT = {"road", "roads", "street", "streets", "highway", "highways"}, {"not", "no", "non", "without"}
@@ -56,7 +56,7 @@ class ModelCard:
     threshold : float
         Probabilities above it are road.
     ways : int
-        In so many it is shown each tile at the first look, see `tiling.segment`: more than one, where it is quick.
+        Number of ways in which each tile is shown at the first look, see `tiling.segment`: more than one, if it is fast.
     output : str
         The output that shows roads.
     channels : tuple of int
@@ -64,7 +64,7 @@ class ModelCard:
     gives_classes : bool
         Whether the output is the class of each pixel (argmax).
     is_probability : bool or None
-        Whether the output is a probability already; None: told by its values.
+        Whether the output is a probability already; None: by its values.
     """
 
     resolution_m: float | None
@@ -88,7 +88,7 @@ def read_card(model: OnnxModel, class_name: str | None = None) -> ModelCard:
     Parameters
     ----------
     class_name : str, optional
-        The class that is road. Default: told by the names of the classes.
+        The class that is road. Default: by the names of the classes.
 
     Raises
     ------
@@ -106,7 +106,7 @@ def read_card(model: OnnxModel, class_name: str | None = None) -> ModelCard:
 
 
 class _WrongModelError(Exception):
-    """Why a model cannot be run, and what to do."""
+    """Why a model cannot be run, and the remedy."""
 
 
 def _make_card(model: OnnxModel, told: dict[str, Any], class_name: str | None) -> ModelCard:
@@ -144,7 +144,7 @@ def _make_card(model: OnnxModel, told: dict[str, Any], class_name: str | None) -
 
 
 def _tile_of(model: OnnxModel, told: dict[str, Any]) -> tuple[tuple[int, int], bool]:
-    """Return (height, width) of the input, its own where it is fixed, else as told; and whether channels come last."""
+    """Return (height, width) of the input, its own where it is fixed, else as given; and whether channels come last."""
     if len(model.inputs) != 1:
         raise _WrongModelError(f"takes {len(model.inputs)} inputs; expected one, a picture")
     port = model.inputs[0]
@@ -190,15 +190,15 @@ def _n_channels(output: Port) -> int | None:
 
 
 def channels_come_last(sides: Sequence[int | None]) -> bool:
-    """Tell (height, width, channels) from (channels, height, width): there are fewer channels than pixels."""
+    """Distinguish (height, width, channels) from (channels, height, width): there are fewer channels than pixels."""
     return sides[2] is not None and all(side is None or side > sides[2] for side in sides[:2])
 
 
 def _choose_channels(output: Port, names: dict[int, str], class_name: str | None) -> tuple[int, ...]:
-    """Tell which channels of an output are road."""
+    """Return which channels of an output are road."""
     n, wanted = _n_channels(output), _wanted(names, class_name)
     if n == 1:
-        # A single channel is by convention the last of the classes, told from the others by the threshold.
+        # A single channel is by convention the last of the classes, separated from the others by the threshold.
         if max(names, default=0) in wanted or (not names and class_name in (None, output.name)):
             return (0,)
         raise _WrongModelError(_ask(names, class_name))
@@ -208,7 +208,7 @@ def _choose_channels(output: Port, names: dict[int, str], class_name: str | None
 
 
 def _choose_classes(output: Port, names: dict[int, str], class_name: str | None) -> tuple[int, ...]:
-    """Tell which values of an output are road; nothing where that is said nowhere: all but 0 then."""
+    """Return which values of an output are road; nothing where the model does not state it: all but 0 then."""
     wanted = _wanted(names, class_name)
     if not names and class_name in (None, output.name):
         return ()
@@ -327,7 +327,7 @@ def _read_scaling(one: dict[str, Any]) -> dict[str, Any]:
 
 
 def _affine(step: dict[str, Any]) -> tuple[float, float]:
-    """Return what is subtracted, and what is divided by then."""
+    """Return the subtrahend and the divisor of the scaling."""
     kind = step.get("type")
     if kind is None:
         return 0.0, 1.0

@@ -24,7 +24,7 @@ DEFAULT_MODEL = Path(__file__).parent / "model" / "roads.onnx"
 
 #: Pixels of the input, along a side, that one of the output may stand for.
 _STRIDES = (1, 2, 4, 8, 16, 32)
-_CLEARLY = 0.1  # so much better a correlation outweighs what a size suggests
+_CLEARLY = 0.1  # lead of a correlation that outweighs the guess by size
 
 
 @dataclass
@@ -37,7 +37,7 @@ class Network:
         Its file's name.
     card : ModelCard
     seen : (height, width)
-        The middle of a tile, pixels, that a model tells of: all of it, or less where its output is cropped.
+        The middle of a tile, pixels, that a model's output covers: all of it, or less where its output is cropped.
     """
 
     name: str
@@ -49,12 +49,12 @@ class Network:
 
     @property
     def margin(self) -> tuple[int, int]:
-        """Rows above and columns to the left of what is seen of a tile."""
+        """Rows above and columns to the left of the visible part of a tile."""
         (height, width), (rows, columns) = self.card.tile, self.seen
         return (height - rows) // 2, (width - columns) // 2
 
     def __call__(self, tile: AnyArray) -> Float32Array:
-        """Return the probability of road in what is seen of a tile.
+        """Return the probability of road in the visible part of a tile.
 
         Parameters
         ----------
@@ -144,7 +144,7 @@ def load_network(
 
 
 def _gives_probability(network: Network) -> bool:
-    """Tell probabilities from logits by what a model makes of plain and of noisy tiles: logits leave 0 to 1."""
+    """Distinguish probabilities from logits by a model's output for plain and for noisy tiles: logits leave 0 to 1."""
     height, width = network.card.tile
     noise, smooth = _noise(height, width)
     for tile in (noise, smooth, np.zeros_like(noise), np.full_like(noise, 255)):
@@ -166,7 +166,7 @@ def _what_is_seen(network: Network) -> tuple[tuple[int, int], tuple[int, int]]:
 
     A whole share of a tile's sides is all of it, in larger pixels; any other the middle, for models without padding
     leave out the edge. That is held against what a model gives for a picture and for the same moved sideways, which
-    tells the size of its pixels.
+    determines the size of its pixels.
     """
     height, width = network.card.tile
     moved = max(width // 2 // _STRIDES[-1], 1) * _STRIDES[-1]
@@ -193,7 +193,7 @@ def _what_is_seen(network: Network) -> tuple[tuple[int, int], tuple[int, int]]:
 
 
 def _likeness(here: Float32Array, there: Float32Array, moved: int) -> float:
-    """Return the correlation of two outputs (C, h, w) where the second shows what lies so many columns to the right."""
+    """Return the correlation of two outputs (C, h, w) where the second shows the first's content moved by columns."""
     columns = here.shape[2] - moved
     if columns < 2:
         return 0.0

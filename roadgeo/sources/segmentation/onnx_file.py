@@ -23,14 +23,14 @@ __all__ = ["OnnxModel", "Port", "open_onnx"]
 
 _MAX_BYTES = 512 << 20
 _MAX_NODES = 20_000
-_MAX_MEMORY = 4 << 30  # bytes of all models that are open, with what they hold while they run
+_MAX_MEMORY = 4 << 30  # bytes of all open models, with their working memory
 _MAX_SECONDS = 600.0  # of one tile
 
 _CONTROL = {"If", "Loop", "Scan", "SequenceMap"}
 _RANDOM = {"RandomNormal", "RandomNormalLike", "RandomUniform", "RandomUniformLike", "Multinomial", "Bernoulli"}
 _STRING = 8  # of TensorProto.DataType
 
-#: What is looked at of a file: its messages with their fields, which may all be repeated, by name and number
+#: Parts of a file that are checked: its messages with their fields, which may all be repeated, by name and number
 #: (https://github.com/onnx/onnx/blob/main/onnx/onnx.proto).
 _SCHEMA = {
     "Model": (("version", 1, "int64"), ("graph", 7, "Graph"), ("training", 20, "bytes"), ("function", 25, "bytes")),
@@ -142,7 +142,7 @@ def open_onnx(path: str | os.PathLike[str], threads: int = 1) -> OnnxModel:
 
 
 class _RefusedError(Exception):
-    """Why a file is refused, and what to do."""
+    """Why a file is refused, and the remedy."""
 
 
 def _require_network(content: bytes) -> dict[str, str]:
@@ -216,7 +216,7 @@ def _message_types() -> dict[str, Any]:
 
 
 def _without_telemetry() -> Any:
-    """Return onnxruntime, told to report nothing: else it keeps an identifier of the device, and sends what it did."""
+    """Return onnxruntime with its telemetry off: else it keeps an identifier of the device, and sends a report."""
     os.environ.setdefault("ORT_DISABLE_TELEMETRY", "1")  # read while it is imported
     import onnxruntime
 
@@ -252,7 +252,7 @@ def _limit_memory() -> None:
 
 
 def _port(told: Any) -> Port:
-    """Translate what onnxruntime tells of an input or output: tensor(float16), [1, 3, "height", None]."""
+    """Translate onnxruntime's description of an input or output: tensor(float16), [1, 3, "height", None]."""
     kind = str(told.type).removeprefix("tensor(").removesuffix(")")
     kind = {"float": "float32", "double": "float64"}.get(kind, kind)
     shape = tuple(side if isinstance(side, int) and side > 0 else None for side in told.shape)

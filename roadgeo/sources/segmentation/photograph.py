@@ -22,7 +22,7 @@ __all__ = ["Photograph", "find_ground", "find_voids", "open_photograph"]
 
 MIN_SIDE = 64
 _STRIP_PIXELS = 1 << 21  # read at a time
-_SAMPLE_SIDE = 1024  # deep values are stretched by what a sample of this size holds
+_SAMPLE_SIDE = 1024  # deep values are stretched by the range of a sample of this size
 
 #: A void is a plain white or black area (JPEG smears its values and its edge), larger than any white roof.
 _WHITE, _BLACK = 250, 3
@@ -57,7 +57,7 @@ def open_photograph(path: str | os.PathLike[str], bands: tuple[int, int, int] | 
     Parameters
     ----------
     bands : (3,) tuple of int, optional
-        Numbers from 1 of the red, green and blue band. Default: told by their names, or else the first three.
+        Numbers from 1 of the red, green and blue band. Default: by their names, or else the first three.
 
     Raises
     ------
@@ -121,7 +121,7 @@ def _read(
 
 
 def _find_stretch(dataset: DatasetReader, bands: list[int], name: str) -> Callable[[AnyArray], AnyArray]:
-    """Return what makes (H, W, 3) 8-bit RGB of (H, W, B) values."""
+    """Return a function from (H, W, B) values to (H, W, 3) 8-bit RGB."""
     palette = read_palette(dataset) if dataset.count == 1 and dataset.dtypes[0] == "uint8" else None
     if palette is not None:
         table = palette

@@ -35,7 +35,7 @@ class ProbabilityMap:
     name : str
         Of the photograph.
     model : str
-        What made it.
+        Its maker.
     pixel : float
         Pixels of the photograph for each of these, along a side.
     """

@@ -1,8 +1,8 @@
-"""At which scale a photograph is shown to a model, where nobody says how large its pixels are.
+"""The scale at which a photograph is shown to a model, where the size of its pixels is unknown.
 
 At the right scale many intersections are seen with confidence; where a photograph is shown too small roads run into
 each other, too large they fall apart and the model is in doubt. The larger it is shown, the less of it: from scale to
-scale the part where most roads were seen before, and what is seen of the same ground is compared.
+scale the part where most roads were seen before; results on the same ground are compared.
 """
 
 from __future__ import annotations
@@ -35,7 +35,7 @@ _DEFAULT_RESOLUTION_M = 1.0
 _MIN_SIDE, _MAX_ENLARGED = 192, 4096  # pixels at the model's scale
 _TRIED_TILES = 1.9  # side of the part that is tried, tiles: 2 x 2 of them cover it
 _DOUBT = 4  # power of the share of probability that lies on roads
-#: A search takes as long as showing a model so many pixels. A scale at which it is still to be shown all of the
+#: Pixels shown to a model in the time of a search. A scale at which it is still to be shown all of the
 #: photograph must promise more.
 _COST_OF_SEARCH = 2_000_000
 
@@ -48,7 +48,7 @@ def scale_of(gsd_m: float, network: Network) -> float:
 def try_scales(
     photograph: Photograph, network: Network, gsd_m: tuple[float, float] = (0.0, math.inf)
 ) -> tuple[float, ...]:
-    """Return the scales to try on a photograph of this size, whose pixels cover so many metres, in no order."""
+    """Return the scales to try on a photograph of this size, whose pixels cover this many metres, in no order."""
     low, high = scale_of(gsd_m[0], network) / _BRIDGED, scale_of(gsd_m[1], network) * _BRIDGED
     fitting = [scale for scale in PYRAMID if _fits(map_shape(photograph, scale), scale)]
     if not fitting:
@@ -89,7 +89,7 @@ def rank_scales(
 
 
 def score(seen: ProbabilityMap | None) -> float:
-    """Say how much a map looks like roads: its intersections, weighted down where the model is in doubt."""
+    """Return how much a map looks like roads: its intersections, weighted down where the model is in doubt."""
     if seen is None:
         return 0.0
     known = seen.values != NODATA
@@ -113,7 +113,7 @@ class _Part(NamedTuple):
 
 
 def _most_roads(part: _Part, seen: ProbabilityMap | None, size: Sequence[int]) -> tuple[_Part, ProbabilityMap | None]:
-    """Return the (height, width) at most of a part where most roads were seen, and what was seen there."""
+    """Return the (height, width) at most of a part where most roads were seen, and the probability there."""
     height, width = (min(side, most) for side, most in zip((part.height, part.width), size, strict=True))
     if seen is None or (height, width) == (part.height, part.width):
         left, top = part.left + (part.width - width) // 2, part.top + (part.height - height) // 2

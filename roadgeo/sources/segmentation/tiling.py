@@ -29,7 +29,7 @@ _SURE = np.float32(1e-4)
 
 
 def map_shape(photograph: Photograph, scale: float, step: int = 1) -> tuple[int, int]:
-    """Return (H, W) of what a model is shown of a photograph: `scale` pixels for each of its own, along a side.
+    """Return (H, W) of a photograph as shown to a model: `scale` pixels for each of its own, along a side.
 
     Both are multiples of `step`.
     """
@@ -56,7 +56,7 @@ def segment(
         Pixels shown to the model for each pixel of the map, along a side: memory grows with the map, not with the
         photograph.
     ways : int
-        Each tile is shown to the model in so many ways, at most 4: as it is, turned by half, turned over left to right
+        Number of ways in which each tile is shown, at most 4: as it is, turned by half, turned over left to right
         and top to bottom. The mean counts: roads that are seen one way only are mostly none.
 
     Raises
@@ -97,7 +97,7 @@ def segment(
 
 
 def _look(network: Network, ways: int, tile: AnyArray) -> Float32Array:
-    """Return what a model sees in a tile, shown in some ways: the mean of the logits, as a probability."""
+    """Return a model's result for a tile, shown in some ways: the mean of the logits, as a probability."""
     if ways == 1:
         return network(tile)
     seen = [network(np.ascontiguousarray(tile[::down, ::right]))[::down, ::right] for down, right in _WAYS[:ways]]
@@ -114,7 +114,7 @@ def _reduce(rows: Float32Array, step: int) -> Float32Array:
 
 
 class _Seen(NamedTuple):
-    """What a model tells of a tile: its (height, width), where it begins in the tile, the tile's size, the overlap."""
+    """The visible part of a tile: its (height, width), where it begins in the tile, the tile's size, the overlap."""
 
     size: tuple[int, int]
     margin: tuple[int, int]
@@ -175,7 +175,7 @@ def _weight(tile: tuple[int, int], overlap: float) -> Float32Array:
 
 
 def _fill(part: AnyArray, tile: tuple[int, int], missing: tuple[int, int]) -> AnyArray:
-    """Return a part of a photograph at the size of a tile: what is missing around it is its own reflection.
+    """Return a part of a photograph at the size of a tile: its reflection fills the missing margins.
 
     `missing`: rows above it and columns to its left; the others lack below and to its right.
     """
