@@ -23,7 +23,7 @@ def visible(text: str, *, ours: bool = False) -> str:
 
 
 def counted(number: int, noun: str) -> str:
-    """Say how many there are of what is counted: "1 road", "2,649 roads"."""
+    """Return a count with its noun: "1 road", "2,649 roads"."""
     return f"{number:,} {noun}{'' if number == 1 else 's'}"
 
 

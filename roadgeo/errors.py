@@ -112,7 +112,7 @@ def name_extra(error: ModuleNotFoundError) -> MissingPackageError | None:
 def how_to_install(extra: str) -> str:
     """Return the command that adds what an extra of this package needs, to the Python that runs now.
 
-    Nothing is said of roadgeo itself: from where it was installed, a checkout or a file, is not known any more.
+    It does not name roadgeo itself, whose source, a checkout or a file, is not known any more.
     """
     from importlib.metadata import PackageNotFoundError, requires
 

@@ -45,7 +45,7 @@ COMMANDS = {
     "simulate": ("roadgeo.cli.simulate", "Draw road masks whose place is known."),
 }
 
-#: Commands that are not listed: what is called once, and names of before, which stay for one version.
+#: Commands that are not listed: those that are called once, and former names, which stay for one version.
 _UNLISTED = {
     "completion": "roadgeo.cli.completion",
     **dict.fromkeys(("info", "check", "list", "remove"), "roadgeo.cli.references"),
@@ -70,7 +70,7 @@ class LazyGroup(click.Group):
     def resolve_command(
         self, ctx: click.Context, args: list[str]
     ) -> tuple[str | None, click.Command | None, list[str]]:
-        """Find the command that is meant; of a name that is mistyped say which may be.
+        """Find the command that is meant; for a mistyped name suggest one.
 
         Raises
         ------
@@ -163,7 +163,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
             raise
         return _fail(str(missing), ERROR)
     except BrokenPipeError:
-        # Whoever read our output has gone; what Python still holds for it must not raise at exit.
+        # The reader of our output has gone; text that Python still holds for it must not raise at exit.
         os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
         return ERROR
     except Exception as error:

@@ -1,4 +1,4 @@
-"""What is said once of how exact places are in other coordinates than the map's own."""
+"""One message on the accuracy of places in other coordinates than the map's own."""
 
 from __future__ import annotations
 
@@ -11,13 +11,13 @@ __all__ = ["tell_accuracy"]
 
 
 def tell_accuracy(documents: Iterable[Mapping[str, Any]], drawn_in: str | None = None) -> None:
-    """Say where PROJ lacks a grid for longitude and latitude of results, or for the CRS that they are drawn in."""
+    """Report where PROJ lacks a grid for longitude and latitude of results, or for the CRS that they are drawn in."""
     from roadgeo.geometry.transformation import LONLAT, Exactness, exactness
 
     targets = {LONLAT: "longitude and latitude"}
     if drawn_in is not None:
         targets.setdefault(drawn_in, f"places in {drawn_in}" if len(drawn_in) < 20 else "places in the CRS asked for")
-    shared: dict[Exactness, dict[str, None]] = {}  # of what each is said
+    shared: dict[Exactness, dict[str, None]] = {}  # the references that share each
     for document in documents:
         crs, center = document.get("crs"), document.get("center")
         if crs and center:

@@ -38,7 +38,7 @@ __all__ = ["apply_command"]
 def apply_command(location: str, pictures: tuple[str, ...], out_dir: str, quiet: bool, **given: Any) -> int:
     """Put PICTUREs on the map by the place that one of their frame was found at.
 
-    LOCATION.json is what `roadgeo locate` wrote. A PICTURE is another scan, band, exposure or analysis of the same
+    LOCATION.json is written by `roadgeo locate`. A PICTURE is another scan, band, exposure or analysis of the same
     frame, of any number of pixels: for each, PICTURE_footprint.tif is drawn on the map (Cloud Optimized GeoTIFF). No
     roads are looked for, and no reference is needed.
 
@@ -48,7 +48,7 @@ def apply_command(location: str, pictures: tuple[str, ...], out_dir: str, quiet:
       roadgeo apply photo_mask_location.json band*.tif --out-dir bands --crs EPSG:3857
       roadgeo apply sheet_location.json fine_scan.tif --also iiif --also points
 
-    Exit status: 0 all well, 3 LOCATION.json tells of no sure place, 1 error, 2 usage.
+    Exit status: 0 all well, 3 LOCATION.json holds no sure place, 1 error, 2 usage.
     """
     from roadgeo.cli import NOT_LOCATED
     from roadgeo.errors import NotLocatedError

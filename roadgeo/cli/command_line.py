@@ -1,4 +1,4 @@
-"""The command that was typed: results say by which one they were made, and how to make them again."""
+"""The command as typed: results name it, so that they can be made again."""
 
 from __future__ import annotations
 
@@ -23,7 +23,7 @@ def typed_command() -> list[str]:
 
 
 def made_by() -> dict[str, Any]:
-    """Return what every JSON says of its making: the version, and the command."""
+    """Return the origin that every JSON names: the version, and the command."""
     return {"version": __version__, "command": shlex.join(typed_command())}
 
 
@@ -48,7 +48,7 @@ def said_options(left_out: Collection[str] = ()) -> list[str]:
 
 
 def _say(option: click.Option, value: Any) -> list[str]:
-    """Say one option with its value, or one for each of its values."""
+    """Write one option with its value, or one for each of its values."""
     if option.is_flag:
         return [option.opts[-1] if value else option.secondary_opts[-1]]
     values: Sequence[str] = value if option.multiple else [value]

@@ -48,7 +48,7 @@ def demo_command(out_dir: str) -> int:
     from roadgeo.storage.files import write_bytes
     from roadgeo.workflows import build_reference
 
-    # what the demonstration starts from is left beside its results
+    # the sources of the demonstration are left beside its results
     folder, masks = Path(out_dir), demo_masks()
     make_folder(folder / "masks")
     for source, name in [(ROADS, ROADS.name), (PHOTO, PHOTO.name), *((m.path, f"masks/{m.path.name}") for m in masks)]:
@@ -82,7 +82,7 @@ def demo_command(out_dir: str) -> int:
 
 
 def _judge(outcome: Outcome, mask: DemoMask) -> tuple[bool, str]:
-    """Compare with the truth: whether it is right, and what to say."""
+    """Compare with the truth; return whether it is right, and a sentence."""
     found = outcome.document
     if outcome.status == "error":
         return False, str(found["reason"])

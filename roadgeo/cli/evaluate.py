@@ -81,8 +81,8 @@ def evaluate_command(
     evaluation.json, report.html and trials.jsonl, from which the same command goes on when it was interrupted. A table
     of your own needs the columns file, crs, width, height and h00 to h22, the homography from pixels to the CRS.
 
-    With --map masks are tried all over the map (-n of them, 600 if not said), and REF_localizability.tif (styled in
-    QGIS), .png and .json say where they would be located, may be ambiguous, or show too few intersections.
+    With --map masks are tried all over the map (-n of them, by default 600), and REF_localizability.tif (styled in
+    QGIS), .png and .json show where they would be located, may be ambiguous, or show too few intersections.
 
     \b
     Examples:
@@ -120,7 +120,7 @@ def evaluate_command(
     _evaluate(query_set, locator, settings, radius, jobs, out_dir, as_json, quiet)
 
 
-#: How the settings of an evaluation call what was told to the search.
+#: Names of the search's hints in the settings of an evaluation.
 _HINTED = {
     "gsd_m": "known_gsd",
     "max_tilt_deg": "max_tilt",
@@ -145,7 +145,7 @@ def _known(settings: dict[str, Any]) -> dict[str, Any]:
     return {name: value for name, value in settings.items() if value is not None}
 
 
-#: Parameters that say nothing beside an option, or without --map.
+#: Parameters without an effect beside an option, or without --map.
 _IDLE = {
     "": {"check"},
     "--queries": {*QUERY_OPTIONS, "check", "height"},
@@ -216,7 +216,7 @@ def _evaluate(
 
 
 def _made_of(locator: ReferenceLocator) -> dict[str, Any]:
-    """Return what a JSON says of its making."""
+    """Return the origin that a JSON names."""
     from roadgeo.reference.files import reference_digest
 
     return made_by() | {"reference_digest": ", ".join(map(reference_digest, locator.references)) or None}
@@ -232,7 +232,7 @@ def _recorded(record: Path | None) -> int:
 def _query_set(
     reference: Path, queries: Path | None, roads: Path | None, options: dict[str, Any]
 ) -> tuple[QuerySet, dict[str, Any]]:
-    """Choose between a query set on disk and one to draw, and say which."""
+    """Choose between a query set on disk and one to draw, and report it."""
     from roadgeo.evaluation.trials import DrawnMasks, MaskFiles, count_elsewhere
     from roadgeo.evaluation.truth import read_truth
 
@@ -327,7 +327,7 @@ def _pair(spread: Spread, digits: int, scale: float = 1.0) -> str:
 
 
 def _verdicts(evaluation: Evaluation) -> Iterator[str]:
-    """Say what the numbers in the tables are, and whether odds and standard deviations hold."""
+    """Describe the numbers in the tables, and whether odds and standard deviations hold."""
     yield "In brackets: 95 % confidence. Metres, ms: median/95 %."
     broken = [step for step in evaluation.odds if not step.holds]
     surest = next((step for step in reversed(evaluation.odds) if step.wrong.of), None)

@@ -209,7 +209,7 @@ def _kinds_of_coarse(update: bool, in_shards: bool) -> str:
     return str(context.params["kinds"]) if named else "main"
 
 
-#: Endings of what `--out` may be taken for.
+#: Endings that `--out` must not have.
 _OTHER_FORMATS = {".shp", ".geojson", ".json", ".fgb", ".kml", ".gml", ".parquet", ".sqlite", ".osm", ".pbf", ".zip"}
 
 
@@ -223,7 +223,7 @@ def _require_geopackage(out: str | None) -> None:
 
 
 def _ask_before_replacing(path: Path, quiet: bool) -> None:
-    """Ask whether a reference of that name may go, or where nobody can be asked say that it does."""
+    """Ask whether a reference of that name may go, or where nobody can be asked report that it does."""
     from roadgeo.errors import RoadgeoError
     from roadgeo.reference.inspection import describe_reference
 
@@ -259,7 +259,7 @@ _FETCHED = {"place": "--osm PLACE", "around": "--around LON,LAT,METRES", "polygo
 
 
 def _one_source(source: dict[str, Any]) -> str:
-    """Name the option that says where the roads come from; a box alone is a source, with --roads it cuts them."""
+    """Name the option of the source; a box alone is a source, with --roads it cuts them."""
     given = [option for option in (*_FETCHED, "roads", "plugin") if source[option]]
     if source["bbox"] and given != ["roads"]:
         given.append("bbox")

@@ -58,7 +58,7 @@ if TYPE_CHECKING:
 
 __all__ = ["describe", "locate_command", "pair_images"]
 
-#: Options that change nothing of a result, or that are said mask by mask.
+#: Options without an effect on a result, or with a value for each mask.
 _OF_NO_ACCOUNT = {
     *("as_json", "divide_map", "engine", "images", "jobs", "quiet", "recursive", "scheduler", "skip_existing"),
     "verbose",
@@ -97,7 +97,7 @@ a photograph is kept as PHOTO_mask.tif. What Ctrl-C cut short goes on with --ski
 
 
 def _listed(outputs: Sequence[Output]) -> str:
-    """List files with what they are for."""
+    """List files with their purposes."""
     names = [output.path(Path(), "photo").name for output in outputs]
     said = [f"{one.option}: {one.summary}" if one.option else one.summary for one in outputs]
     width = max(map(len, names))
@@ -272,7 +272,7 @@ def locate_command(
     make_folder(out_dir)
     photos = pair_images([task.mask for task in tasks], given["images"])
     reading = read_options(given, photos, others, jobs)
-    # Opened here too: what is wrong with them is said once, and the search is compiled before processes start.
+    # Opened here too: their errors are printed once, and the search is compiled before processes start.
     opened = open_references(references, print_steps(quiet))
     refuse_swapped(given["near"], opened)
     compile_once(quiet)
@@ -328,7 +328,7 @@ def _output_options(given: Mapping[str, Any]) -> OutputOptions:
 
 
 def pair_images(masks: Sequence[str], images: Sequence[str]) -> dict[str, str]:
-    """Say which photograph belongs to which mask.
+    """Match photographs with masks.
 
     One photograph per mask in the same order, or a folder in which it has the mask's name, less a final "_mask".
 
@@ -354,7 +354,7 @@ def pair_images(masks: Sequence[str], images: Sequence[str]) -> dict[str, str]:
 
 
 def describe(outcome: Outcome) -> str:
-    """Say what became of a mask, in a line or two."""
+    """Print the result of a mask, in a line or two."""
     found = outcome.document
     words = outcome.status.replace("_", " ")
     if outcome.status == "error":
@@ -378,7 +378,7 @@ def describe(outcome: Outcome) -> str:
 
 
 def _summarize(counts: Counter[str]) -> str:
-    """Say how many masks came to what."""
+    """Print how many masks had which result."""
     parts = [f"{counts['located']} located"]
     if counts["ambiguous"]:
         parts.append(f"{counts['ambiguous']} ambiguous")

@@ -143,7 +143,7 @@ class Read(click.ParamType):  # type: ignore[type-arg]  # generic only in late v
     Parameters
     ----------
     read : callable
-        Takes the text; raises ValueError or a RoadgeoError that says what was got and expected.
+        Takes the text; raises ValueError or a RoadgeoError with the value got and the one expected.
     """
 
     def __init__(self, name: str, read: Callable[[str], Any]) -> None:
@@ -168,7 +168,7 @@ class Read(click.ParamType):  # type: ignore[type-arg]  # generic only in late v
 
 
 class Plugin(click.ParamType):  # type: ignore[type-arg]
-    """The name of a plugin, and with `has_argument` a colon and what it is to look at: "osm:Boston, MA".
+    """The name of a plugin, and with `has_argument` a colon and its argument: "osm:Boston, MA".
 
     `names` gives the names that are known, where there are more than the plugins'; a file that ends so is taken too.
     """
@@ -449,7 +449,7 @@ _TOGETHER = {
 
 
 def take(*names: str, **settings: Any) -> Callable[[Decorated], Decorated]:
-    """Add options of the tables by their names; `settings` replace what the tables say of a single one."""
+    """Add options of the tables by their names; `settings` replace the tables' settings of a single one."""
 
     def add(command: Decorated) -> Decorated:
         for name in reversed([one for given in names for one in _TOGETHER.get(given, (given,))]):
@@ -469,7 +469,7 @@ def out_dir_option(
     path_type: type[str] | type[Path] = str,
     **more: Any,
 ) -> Callable[[Decorated], Decorated]:
-    """Make the option that says where results go."""
+    """Make the option of the output folder."""
     kind = click.Path(file_okay=False, path_type=path_type)
     more.setdefault("group", RESULTS)
     return option("-o", "--out-dir", metavar="DIR", default=default, type=kind, help=help_text, **more)
@@ -479,7 +479,7 @@ def out_dir_option(
 
 
 def hinted(given: Mapping[str, Any]) -> dict[str, Any]:
-    """Return what is known of the image, of all that was given; a switch that was not set says nothing."""
+    """Return the hints on the image, of all parameters; a switch that was not set is none."""
     names = (hint.goes_to for hint in HINTS.values())
     return {name: given[name] for name in names if given.get(name) is not None and given[name] is not False}
 

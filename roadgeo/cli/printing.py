@@ -10,5 +10,5 @@ __all__ = ["echo"]
 
 
 def echo(text: str, *, err: bool = False, color: bool | None = None) -> None:
-    """Print lines; what names may hold besides text is shown, not obeyed by the terminal."""
+    """Print lines; control characters in names are shown, not obeyed by the terminal."""
     click.echo(visible(text, ours=True), err=err, color=color)

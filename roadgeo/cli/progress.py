@@ -17,7 +17,7 @@ __all__ = ["count_up", "print_steps", "show_steps"]
 
 @contextmanager
 def show_steps(quiet: bool) -> Iterator[Say]:
-    """Show on standard error what is being done: yield what is told the steps and how much of each is done.
+    """Show the steps on standard error: yield a function that receives each step and the share of it that is done.
 
     On a terminal each step has a bar, with the time it has left where its share is known; elsewhere see `print_steps`.
     """
@@ -30,7 +30,7 @@ def show_steps(quiet: bool) -> Iterator[Say]:
 
 
 def print_steps(quiet: bool) -> Say:
-    """Return what prints each step once, as a line on standard error.
+    """Return a function that prints each step once, as a line on standard error.
 
     Programs that set ROADGEO_PROGRESS=json get lines such as {"progress": {"done": 30, "total": 100, "text": "..."}}
     besides, where a share is known.
@@ -54,7 +54,7 @@ def print_steps(quiet: bool) -> Say:
 
 @contextmanager
 def _show_bars() -> Iterator[Say]:
-    """Yield what keeps a bar for every step; all are gone at the end."""
+    """Yield a function that keeps a bar for every step; all are gone at the end."""
     from rich.console import Console
     from rich.progress import BarColumn, Progress, TaskProgressColumn, TextColumn, TimeRemainingColumn
 
@@ -74,7 +74,7 @@ def _show_bars() -> Iterator[Say]:
 
 
 def name_counts(counts: Counter[str]) -> str:
-    """Say how many there are of each sort, as they came."""
+    """Count the items of each sort, in order of appearance."""
     return ", ".join(f"{n} {sort}" for sort, n in counts.items())
 
 
@@ -82,7 +82,7 @@ def name_counts(counts: Counter[str]) -> str:
 def count_up(
     total: int, quiet: bool, as_json: bool = False, summarize: Callable[[Counter[str]], str] = name_counts
 ) -> Iterator[Callable[[str], None]]:
-    """Show on standard error how many of `total` are done; yield what counts one more of a sort.
+    """Show on standard error how many of `total` are done; yield a function that counts one more of a sort.
 
     People get a bar on a terminal, unless the JSON of `as_json` fills that too, or there is but one to do. Programs
     that set ROADGEO_PROGRESS=json get lines like {"progress": {"done": 3, "total": 10, "text": "2 located, 1 failed"}}.
@@ -104,7 +104,7 @@ def count_up(
 
 
 def _print_counts(total: int) -> Callable[[str], None]:
-    """Return what prints one more of `total` as a line of JSON."""
+    """Return a function that prints one more of `total` as a line of JSON."""
     done = 0
 
     def tell(text: str) -> None:
@@ -117,7 +117,7 @@ def _print_counts(total: int) -> Callable[[str], None]:
 
 @contextmanager
 def _show_bar(total: int) -> Iterator[Callable[[str], None]]:
-    """Show a bar of `total` steps; yield what moves it on, with a text beside it.
+    """Show a bar of `total` steps; yield a function that moves it on, with a text beside it.
 
     Lines printed to a terminal meanwhile appear above it; standard output that goes elsewhere is left alone.
     """

@@ -1,4 +1,4 @@
-"""Options that say which query masks are drawn, for `simulate` and `evaluate`."""
+"""Options of the query masks to draw, for `simulate` and `evaluate`."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""`roadgeo reference`: what is known of references, and keeping the library tidy."""
+"""`roadgeo reference`: descriptions of references, and a tidy library."""
 
 from __future__ import annotations
 
@@ -15,7 +15,7 @@ from roadgeo.cli.printing import echo
 __all__ = ["check_command", "info_command", "list_command", "list_plugins", "reference_command", "remove_command"]
 
 
-#: Of what `info --json` and `list --json` print.
+#: Schema of the output of `info --json` and `list --json`.
 SCHEMA = "roadgeo.reference-info/1"
 
 
@@ -114,7 +114,7 @@ def check_command(references: tuple[str, ...]) -> int:
 @reference_command.command("list", short_help="List the references in the library.")
 @click.option("--json", "as_json", is_flag=True, help="Print one JSON object per reference and line.")
 def list_command(as_json: bool) -> int:
-    """List the references in the library: what `roadgeo locate` searches when it is given no --reference.
+    """List the references in the library, which `roadgeo locate` searches without --reference.
 
     The library is a folder of the user's data; the environment variable ROADGEO_LIBRARY names another.
 
@@ -167,7 +167,7 @@ def remove_command(names: tuple[str, ...], yes: bool) -> None:
 
 
 def _lines(described: dict[str, Any]) -> list[tuple[str, str]]:
-    """Label and value of what a person wants to know."""
+    """Label and value of the main properties."""
     meta, counts = described.get("meta", {}), described.get("counts", {})
     size = sum(described["files"].values())
     lines = [
@@ -197,7 +197,7 @@ def _lines(described: dict[str, Any]) -> list[tuple[str, str]]:
 
 
 def _kinds_text(kinds: str, sources: Any) -> str:
-    """Return which kinds were taken, and of which sources all lines were, for they do not tell kinds of roads."""
+    """Return which kinds were taken, and of which sources all lines, because they have no kinds of roads."""
     told = [one for one in sources if isinstance(one, dict) and "kinds_known" in one]
     unknown = [visible(str(one.get("name"))) for one in told if one["kinds_known"] is False]
     if not unknown:

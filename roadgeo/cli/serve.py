@@ -65,7 +65,7 @@ Exit status: 0 ended, 1 error, 2 usage.
 
 
 def _help() -> str:
-    """Say what may be known."""
+    """List the hints."""
     hints = [f"{hint.parameter}={hint.form or 'true'}" for hint in HINTS.values()]
     lines = (hints[:3], hints[3:6], hints[6:])
     return _HELP.format(hints="\n".join("  " + "  ".join(line) for line in lines))
@@ -126,7 +126,7 @@ def serve_command(
     from roadgeo.running.serving.server import Server
     from roadgeo.running.serving.workers import Workers
 
-    # Compiled and opened here first: what is wrong with the references is said before anything listens.
+    # Compiled and opened here first: errors in the references are printed before anything listens.
     options = _options(given)
     compile_once(quiet)
     maps = open_references(references, print_steps(quiet))
@@ -182,7 +182,7 @@ class _Log(logging.Handler):
 
 
 def _log(quiet: bool) -> None:
-    """Have faults written to stderr, and unless `quiet` a line for each request: who, what, which status."""
+    """Have faults written to stderr, and unless `quiet` a line for each request: client, request, status."""
     log = _Log()
     log.setFormatter(logging.Formatter("%(asctime)s %(message)s"))
     logging.getLogger().addHandler(log)

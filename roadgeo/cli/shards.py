@@ -27,7 +27,7 @@ class _Shards(click.ParamType):  # type: ignore[type-arg]  # generic only in lat
     name = "shards"
 
     def convert(self, value: Any, param: click.Parameter | None, ctx: click.Context | None) -> dict[str, Any]:
-        """Return what the options of the build are given.
+        """Return the options of the build, by their names.
 
         Raises
         ------
@@ -78,7 +78,7 @@ _OPTIONS = [
 
 
 def shard_options(command: Command) -> Command:
-    """Add the options that say how a map is cut."""
+    """Add the options that control how a map is cut."""
     for add in reversed(_OPTIONS):
         command = add(command)
     return command
@@ -94,7 +94,7 @@ def build_in_shards(
     cluster: Cluster | None,
     quiet: bool,
 ) -> None:
-    """Build a reference in shards from road files, and say what there is.
+    """Build a reference in shards from road files, and describe the result.
 
     Raises
     ------
@@ -110,7 +110,7 @@ def build_in_shards(
 
     if not source["roads"]:
         raise click.UsageError("--shards goes with --roads: what is fetched from OpenStreetMap fits in one piece.")
-    # Where to: a folder, in the library unless `--out` says otherwise.
+    # Target: a folder, in the library unless `--out` names another.
     started = perf_counter()
     path = Path(out) if out else new_reference(name).with_suffix(ENDING)
     if path.suffix != ENDING:
@@ -118,7 +118,7 @@ def build_in_shards(
             raise click.UsageError(f"--out {out}: with --shards that is a folder; did you mean {path.stem}{ENDING}?")
         path = path.with_name(f"{path.name}{ENDING}")
     make_folder(path)
-    # What from, and how.
+    # Sources and options.
     files = RoadFiles(
         tuple(map(Path, source["roads"])),
         source["layer"],

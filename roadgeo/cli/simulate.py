@@ -25,7 +25,7 @@ def simulate_command(reference: str, out_dir: Path, roads: Path | None, quiet: b
     """Draw road masks from a reference's own roads, as a camera would see them and a segmenter get them wrong.
 
     Writes NOISE/q_NNNN.png, footprints.gpkg, and truth.csv and truth.json, which hold for each mask the homography from
-    its pixels to the CRS (h00 to h22; the centre of the top-left pixel is (0.5, 0.5)), the camera, and what was done to
+    its pixels to the CRS (h00 to h22; the centre of the top-left pixel is (0.5, 0.5)), the camera, and the changes to
     the roads. The same options draw the same masks.
 
     \b

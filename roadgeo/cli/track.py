@@ -36,7 +36,7 @@ if TYPE_CHECKING:
 
 __all__ = ["track_command"]
 
-#: Heading of what concerns flights.
+#: Heading of the options of flights.
 FLIGHT = "The flight"
 
 _HELP = """Follow a flight over the map, frame by frame.
@@ -84,7 +84,7 @@ Exit status: 0 every frame has a place, 3 at least one is lost, 1 error, 2 usage
 
 
 def _read_time(text: str) -> datetime:
-    """Read a time; UTC unless it says otherwise."""
+    """Read a time; UTC unless it has another zone."""
     try:
         moment = datetime.fromisoformat(text)
     except ValueError as error:
@@ -164,7 +164,7 @@ def track_command(
     refuse_swapped(given["near"], opened)
     make_folder(out_dir)
     compile_once(quiet)
-    # Frames are told of as they come; what is learnt later of earlier ones takes the place of what was known.
+    # Frames are printed as they come; later knowledge of earlier ones replaces their rows.
     known: dict[int, Tracked] = {}
     pictures = Thumbnails()
     with _sender(mavlink) as send:
@@ -210,7 +210,7 @@ def _place_all(
 
 @contextmanager
 def _sender(url: str | None) -> Iterator[Callable[[Row], None]]:
-    """Yield what sends the place of the latest frame; it was taken when it is read, unless its time is told."""
+    """Yield a function that sends the place of the latest frame; its time is that of reading, unless it has one."""
     if url is None:
         yield lambda _: None
         return

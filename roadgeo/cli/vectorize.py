@@ -1,4 +1,4 @@
-"""`roadgeo vectorize`: what the program sees in a mask or a photograph, for a person to look at."""
+"""`roadgeo vectorize`: the roads seen in a mask or a photograph, for inspection."""
 
 from __future__ import annotations
 
@@ -28,7 +28,7 @@ __all__ = ["vectorize_command"]
 def vectorize_command(
     images: tuple[str, ...], out_dir: str, gsd_m: tuple[float, float] | None, recursive: bool, **given: Any
 ) -> int:
-    """Show what roads and intersections are seen in IMAGEs: the first thing to look at when one was not located.
+    """Show the roads and intersections seen in IMAGEs: the first thing to look at when one was not located.
 
     An image is a road mask or a photograph. For photo.jpg it writes
     photo_vectorized.gpkg, in pixel coordinates, which lies on the image when both are opened in QGIS,
@@ -66,7 +66,7 @@ def vectorize_command(
 
 
 def _show(task: Task, out_dir: str, gsd_m: tuple[float, float] | None, query: QueryOptions, say: Say) -> str:
-    """Write what is seen in an image; return it in words."""
+    """Write the roads seen in an image; return them in words."""
     from roadgeo.errors import MaskError
     from roadgeo.matching.query import trace_query
     from roadgeo.outputs.paths import output_paths

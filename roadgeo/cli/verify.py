@@ -27,7 +27,7 @@ OFF = 4
 _COLORS = {"agrees": "green", "off": "red", "unknown": "yellow"}
 
 
-@click.command("verify", cls=Command, short_help="Check whether georeferenced images are where they say.")
+@click.command("verify", cls=Command, short_help="Check whether georeferenced images are where they claim to be.")
 @click.argument("images", metavar="IMAGE...", nargs=-1, required=True, type=click.Path())
 @take(
     "references",
@@ -86,15 +86,15 @@ def verify_command(
     verbose: bool,
     **given: Any,
 ) -> int:
-    """Check whether georeferenced IMAGEs are where they say, by the roads they show.
+    """Check whether georeferenced IMAGEs are where they claim to be, by the roads they show.
 
     An image is a road mask or a photograph with a place: a geotransform, control
     points, or a world file. Its roads are held against those of a reference, from the given place outwards; the world
-    is never searched (that is what `roadgeo locate` does). Of each image is said that it
+    is never searched (`roadgeo locate` does that). Each image
 
     \b
       agrees      within --tolerance
-      is off      by so many metres to move it east and north, degrees to turn it clockwise,
+      is off      by metres east and north, degrees clockwise,
                   and its scale, with standard deviations; --fix writes it corrected
       is unknown  it cannot be judged, and why: few roads, another map, streets that repeat
 
@@ -122,7 +122,7 @@ def verify_command(
         raise click.UsageError(f"No images in {', '.join(images)}.")
     tasks = name_tasks(found[:1] if given["fuse"] else found)
     settings = _settings(given, found[1:] if given["fuse"] else [], jobs)
-    open_references(settings.references, print_steps(quiet))  # what is wrong with them is said once
+    open_references(settings.references, print_steps(quiet))  # their errors are printed once
     compile_once(quiet)
     if fix or josm or len(tasks) > 1:
         make_folder(out_dir)
@@ -175,7 +175,7 @@ def _correct(one: Verified, image: Path, stem: Path, fix: bool, in_place: bool) 
 
 
 def describe(document: dict[str, Any]) -> str:
-    """Say what became of an image, in a line."""
+    """Print the result of an image, in a line."""
     verdict, found = document["verdict"], document.get("displacement")
     word = click.style(verdict, fg=_COLORS.get(verdict))
     if verdict == "off" and found is not None:
