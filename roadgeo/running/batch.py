@@ -1,6 +1,6 @@
 """Many masks, in one process or several: each is read, located, written and described, in input order.
 
-`locate_masks` is what `roadgeo locate` runs. Nothing that is wrong with one mask stops the others.
+`locate_masks` runs `roadgeo locate`. No fault of one mask stops the others.
 """
 
 from __future__ import annotations
@@ -46,7 +46,7 @@ __all__ = [
 
 
 def open_references(names: Iterable[str], say: Say = say_nothing) -> list[AnyReference]:
-    """Open references by path or name; none named: all of the library. `say` is told of an index that has to be built.
+    """Open references by path or name; none named: all of the library. `say` is called if an index has to be built.
 
     Raises
     ------
@@ -70,7 +70,7 @@ def _resolve(names: Iterable[str]) -> list[Path]:
 
 
 def _named_for_workers(names: Sequence[str]) -> list[str]:
-    """Name references by their paths, for workers may have another library; what lies elsewhere each host fetches."""
+    """Name references by their paths, for workers may have another library; each host fetches those at a URL."""
     from roadgeo.reference.library import resolve_reference
     from roadgeo.reference.remote import is_remote
 
@@ -84,7 +84,7 @@ def _named_for_workers(names: Sequence[str]) -> list[str]:
 
 @dataclass(frozen=True)
 class Outcome:
-    """What became of one mask.
+    """The result of one mask.
 
     Attributes
     ----------
@@ -97,7 +97,7 @@ class Outcome:
     earlier : bool
         An earlier run found it; nothing was done now.
     faults : tuple of str
-        What outputs of other packages failed at; all else is written.
+        Errors of outputs of other packages; all other files are written.
     """
 
     status: Status
@@ -119,9 +119,9 @@ def locate_masks(
     cluster: Cluster | None = None,
     say: Say = say_nothing,
 ) -> Iterator[Outcome]:
-    """Locate masks and write their results; yield what became of each in the order of the tasks.
+    """Locate masks and write their results; yield the outcome of each in the order of the tasks.
 
-    What is wrong with one mask never stops the others: it has the status "error".
+    No fault of one mask stops the others: its status is "error".
 
     Parameters
     ----------
@@ -133,7 +133,7 @@ def locate_masks(
     cluster : Cluster, optional
         Where it is done instead; the results do not depend on that either.
     say
-        Told how far a photograph's roads are found; other processes tell nothing.
+        Called with the share of a photograph whose roads are found; not in other processes.
 
     Raises
     ------
@@ -155,7 +155,7 @@ def locate_masks(
 
 @dataclass(frozen=True)
 class Locating:
-    """What is done with every mask; travels to other processes."""
+    """The work for every mask; travels to other processes."""
 
     references: tuple[str, ...]
     out_dir: str
@@ -169,7 +169,7 @@ class Locating:
 
     @property
     def outputs(self) -> OutputOptions:
-        """What is written."""
+        """The files to write."""
         return self.options.outputs
 
     def prepare(self) -> Callable[[Task], Outcome]:
@@ -178,7 +178,7 @@ class Locating:
         return lambda task: self.do(task, asked)
 
     def ask(self) -> Asked:
-        """Open the references, and say what every mask is asked."""
+        """Open the references, and collect the question that every mask is asked."""
         from roadgeo.reference.inspection import reference_digest
         from roadgeo.reference.reference import open_reference
 
@@ -211,7 +211,7 @@ class Locating:
         return shlex.join(["roadgeo", "locate", task.query, *fused, *drawn, *self.options.command])
 
     def _told(self) -> dict[str, Any]:
-        """Return the options that differ from the usual ones, as plain values: what the JSON says was asked."""
+        """Return the options that differ from the defaults, as plain values for the JSON."""
         usual = BatchOptions()
         reading = replace(self.reading, images={}, threads=ReadOptions.threads)
         told = {
@@ -244,7 +244,7 @@ class Locating:
             return self.failed(task, "FAULT", f"{task.query}: {what}; this is a fault of roadgeo, please report it")
 
     def earlier(self, task: Task, asked: Asked) -> Outcome | None:
-        """Return what an earlier run found, if that is whole, the answer to the same question, and younger than it.
+        """Return the result of an earlier run, if it is whole, the answer to the same question, and younger than it.
 
         None too where results of before are not to be kept.
         """
@@ -332,7 +332,7 @@ def _without_views(outputs: OutputOptions) -> OutputOptions:
 
 @dataclass(frozen=True)
 class Asked:
-    """What every mask of a batch is asked: on which references, of which digests by name, with which options."""
+    """The question that every mask of a batch is asked: references, their digests by name, options."""
 
     references: list[AnyReference]
     digests: list[tuple[str, str]]
@@ -345,7 +345,7 @@ class Asked:
         return ", ".join(found[:1] or [digest for _, digest in self.digests])
 
     def same(self, document: Mapping[str, Any]) -> bool:
-        """Whether an earlier result answers the same question; where it does not say, it does."""
+        """Whether an earlier result answers the same question; without a question in it, it does."""
         options, digest = document.get("options"), document.get("reference_digest")
         same_maps = digest is None or set(digest.split(", ")) <= {each for _, each in self.digests}
         return same_maps and (options is None or options == self.options)
@@ -369,7 +369,7 @@ def _as_json(value: Any) -> Any:
     return dataclasses.asdict(value) if dataclasses.is_dataclass(value) and not isinstance(value, type) else value
 
 
-#: What each kind of error means to programs: names in `location.Reason`.
+#: Meaning of each kind of error for programs: names in `location.Reason`.
 _CODES = (
     (IndexFormatError, "NO_REFERENCE"),
     (OutputError, "NOT_WRITTEN"),
@@ -460,6 +460,6 @@ def write_overview(
 
 
 def _places_on(name: str, documents: Sequence[Mapping[str, Any]]) -> list[tuple[float, float]]:
-    """Return longitude and latitude of what was found on a reference."""
+    """Return longitude and latitude of a place on a reference."""
     centers = [one["center"] for one in documents if one.get("center") and one.get("reference") == name]
     return [(center["lon"], center["lat"]) for center in centers]

@@ -2,7 +2,7 @@
 
 Tasks travel in groups. No more groups are under way than keep all workers busy, so that neither the scheduler nor this
 process holds more than those, whatever the number of tasks. A group whose worker dies is done again on another; when
-that kills every worker, its tasks are done one by one with nothing beside them, and what kills them again is given up.
+that kills every worker, its tasks are done one by one with nothing beside them, and those that kill again are given up.
 
 Workers read the same files under the same paths. Each has one thread; kernels are compiled on each host once.
 """
@@ -28,10 +28,10 @@ __all__ = ["RETRIES", "Cluster", "Made", "Stream", "connected", "prepared", "run
 Task = TypeVar("Task")
 Result = TypeVar("Result")
 
-#: Most tasks in a group. A group should take seconds: what takes less is lost in sending it about.
+#: Most tasks in a group. A group should take seconds: shorter ones are dominated by sending.
 _MOST_TOGETHER = 100
 
-#: Groups under way for each worker, and so many times a group is done again elsewhere.
+#: Groups under way for each worker, and the number of times that a group is repeated elsewhere.
 _AHEAD, RETRIES = 2, 3
 
 #: A scheduler must answer, and have a worker, within this time.
@@ -226,7 +226,7 @@ def prepared(made: Made) -> Any:
 
 @contextlib.contextmanager
 def _one_of_host() -> Iterator[None]:
-    """Let one process of this host compile kernels while the others wait for what it compiled."""
+    """Let one process of this host compile kernels while the others wait for its files."""
     try:
         import fcntl
     except ImportError:  # Windows

@@ -1,16 +1,16 @@
 """Masks on a map that is divided among the workers of a cluster, for maps that no machine holds.
 
 A part of the map, a shard or a whole reference, belongs to the worker for which a hash of the two is greatest
-(rendezvous hashing): where a worker goes, its parts go to the others, and all else stays where it was fetched. What was
-under way when a worker died is sent once more. For a group of masks
+(rendezvous hashing): where a worker goes, its parts go to the others; all others stay where they were fetched. Tasks
+under way when a worker died are sent once more. For a group of masks
 
 1. each worker takes a quick look for every mask on its parts;
 2. masks that no worker located are searched for on all parts, as thoroughly as was asked;
 3. the parts that hold places which may be reported are searched together, by the worker of the best of them, which
    writes the results: one rule of odds, margin and twins over the whole map.
 
-In all three a place is charged as if all parts had been searched in one process (`LocateOptions.elsewhere`). What no
-worker finds is refused with the words of the one that came nearest.
+In all three a place is charged as if all parts had been searched in one process (`LocateOptions.elsewhere`). A mask
+that no worker finds is refused with the words of the one that came nearest.
 """
 
 from __future__ import annotations
@@ -50,7 +50,7 @@ _LOOK_AGAIN_S = 2.0
 
 @dataclass(frozen=True)
 class Vote:
-    """What the search of one share of the map says of a mask.
+    """The result of the search of one share of the map for a mask.
 
     Attributes
     ----------
@@ -59,7 +59,7 @@ class Vote:
     answer : Location or None
         None: the mask cannot be searched for, or was left alone.
     missing : str
-        What is wrong with a part that cannot be opened.
+        The fault of a part that cannot be opened.
     """
 
     places: tuple[tuple[float, str], ...] = ()
@@ -69,7 +69,7 @@ class Vote:
 
 @dataclass(frozen=True)
 class Ballot:
-    """What all shares together say of a mask.
+    """The result of all shares together for a mask.
 
     Attributes
     ----------
@@ -80,7 +80,7 @@ class Ballot:
     refusal : Location or None
         Of the share that came nearest, where none has a place.
     missing : str
-        What is wrong with a part of the map, which was not searched: then nothing can be said of the mask.
+        The fault of a part of the map, which was not searched: then the mask has no answer.
     """
 
     parts: tuple[str, ...]
@@ -161,7 +161,7 @@ def _size(part: Part) -> int:
 
 @dataclass(frozen=True)
 class _Sent:
-    """A group of masks under way: what will come, the workers that must live, and how often it was sent before."""
+    """A group of masks under way: its future, the workers that must live, and how often it was sent before."""
 
     futures: Sequence[Any]
     group: Sequence[Any]
@@ -245,7 +245,7 @@ def _finish_all(
 
 @dataclass(frozen=True)
 class _Division:
-    """What is done with every mask, and the parts of the map with their sizes; travels to the workers."""
+    """The work for every mask, and the parts of the map with their sizes; travels to the workers."""
 
     locating: Locating
     sizes: Mapping[str, int]
@@ -272,7 +272,7 @@ class _Voter:
         return {_path(part): name for name, part in _parts_of(self.asked.references).items()}
 
     def vote(self, task: Task, share: Sequence[str], first: bool) -> Vote:
-        """Search a share for a mask. What is wrong with the mask is told when it is finished."""
+        """Search a share for a mask. A fault of the mask is reported when it is finished."""
         locating, places = self.division.locating, list[tuple[float, str]]()
 
         def how(mask: RoadMask, references: Sequence[AnyReference], options: LocateOptions) -> Location:

@@ -59,7 +59,7 @@ class Look:
     Attributes
     ----------
     what : str
-        What tells it from the others, for people: "threshold 63".
+        Its name among the others, for people: "threshold 63".
     make : callable
         Returns the mask; may raise MaskError.
     probability : callable, optional
@@ -130,7 +130,7 @@ def _take(look: Look, references: Sequence[AnyReference], options: LocateOptions
 
 
 def _discount(sighting: Sighting, look: Look, tried: int, options: LocateOptions) -> Sighting:
-    """Take log10 of the number of looks off the odds; what is then too unlikely is not located."""
+    """Take log10 of the number of looks off the odds; a place that is then too unlikely is not located."""
     location, off = sighting.location, math.log10(tried)
     if tried == 1 or location.log10_odds is None:
         return sighting

@@ -1,7 +1,7 @@
 """Places that earlier frames of a flight proposed, weighed again with all that later ones have shown.
 
-What a search finds once may be chance; what goes on to explain all that frames show, as more of them come, is not. So
-each frame that comes may tell, whether or not the map is searched again, and where streets are alike a flight is found
+A place that one search finds may be chance; a place that explains all frames, as more of them come, is not. So
+each new frame contributes, whether or not the map is searched again, and where streets are alike a flight is found
 some frames sooner: the place that explains most is compared with all others that were proposed, and with those around.
 """
 
@@ -39,7 +39,7 @@ __all__ = ["CandidateOptions", "Candidates", "Look"]
 
 _NO_SEEDS: IntArray = np.array([], np.int64)
 
-#: So often the places are compared at the scale of the best one, until it stays that.
+#: Number of times that the places are compared at the scale of the best one, until it stays that.
 _MOST_SCALES = 4
 
 
@@ -87,7 +87,7 @@ class _Candidate:
     Attributes
     ----------
     index : ReferenceIndex
-        What it was found on.
+        The map that it was found on.
     whole : ReferenceIndex
         The reference that is part of.
     matrix : (3, 3) float64
@@ -158,7 +158,7 @@ class Candidates:
     Attributes
     ----------
     n_looks : int
-        Searches of the map so far: each takes its share off the odds.
+        Searches of the map until now: each takes its share off the odds.
     """
 
     references: Sequence[Reference]
@@ -182,7 +182,7 @@ class Candidates:
         return self._search(look, options)
 
     def _search(self, look: Look, options: LocateOptions) -> Location:
-        """Search the map where that is due, and judge what is found together with what was proposed before."""
+        """Search the map where that is due, and judge the results together with earlier proposals."""
         found: list[Found] = []
         if look.searched:
             parts = [part for one in self.references for part in one.parts]
@@ -196,7 +196,7 @@ class Candidates:
     def _judged(self, found: Sequence[Found], look: Look, options: LocateOptions) -> list[Found]:
         """Compare the place that explains most with all others that were proposed, then with those around it.
 
-        Return what was found, with that place and its best rival alone. Each look may find a place by chance.
+        Return the results, with that place and its best rival alone. Each look may find a place by chance.
         """
         judged = [replace(one, fits=()) for one in found]
         best = self._best(look, options)
@@ -239,7 +239,7 @@ class Candidates:
         return Evidence(look.query.scene, fit.index, gsd_m, options.match.evidence).weigh(fit.matrix)
 
     def _take(self, found: Found, recorder: _Recorder, look: Look, options: LocateOptions) -> None:
-        """Keep what a search proposed, unless it is known."""
+        """Keep the proposals of a search, unless they are known."""
         last, to_frame = look.numbers[-1], PIXEL_TO_PLANE @ look.mosaic.to_mosaic[-1]
         size, estimator = look.query.scene.size, recorder.estimator
         if estimator is None:

@@ -1,7 +1,7 @@
 """Places sent to an autopilot over MAVLink: PX4's GLOBAL_POSITION_SENSOR, ArduPilot's external position estimate.
 
-pymavlink is an extra. Messages go out by whatever pymavlink connects to (udpout:, tcp:,
-a serial port); nothing is received. A heartbeat tells that we are there. See https://mavlink.io/en/messages/common.html,
+pymavlink is an extra. Messages go out by any connection of pymavlink (udpout:, tcp:,
+a serial port); nothing is received. A heartbeat announces us. See https://mavlink.io/en/messages/common.html,
 message 296 and command 43003.
 """
 
@@ -22,11 +22,11 @@ from roadgeo.errors import OutputError, how_to_install
 
 __all__ = ["MavlinkOptions", "MavlinkSender", "PositionFix", "fix_of", "has_pymavlink"]
 
-#: MAV_COMP_ID_VISUAL_INERTIAL_ODOMETRY and MAV_TYPE_ONBOARD_CONTROLLER: what we are to the autopilot.
+#: MAV_COMP_ID_VISUAL_INERTIAL_ODOMETRY and MAV_TYPE_ONBOARD_CONTROLLER: our role for the autopilot.
 _COMPONENT, _TYPE = 197, 18
 _SRC_VISION = 2
 _COMMAND_EXTERNAL_POSITION = 43003
-#: The time of transmission starts anew after so many seconds: a 32-bit float then tells milliseconds.
+#: The time of transmission starts anew after this many seconds: a 32-bit float then resolves milliseconds.
 _WRAP_S = 36_000.0
 
 
@@ -73,7 +73,7 @@ class PositionFix:
 
 
 def fix_of(found: Mapping[str, Any], taken_s: float) -> PositionFix | None:
-    """Return where to say that we are, of a frame's row or a location as plain values; None where that is not known.
+    """Return our position, from a frame's row or a location as plain values; None where that is not known.
 
     That is the place of the camera where its focal length was given, and otherwise that of the frame's middle.
     """

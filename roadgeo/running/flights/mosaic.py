@@ -165,7 +165,7 @@ def _is_sound(corners: FloatArray) -> bool:
 def _paint(mask: RoadMask, matrix: FloatArray, roads: AnyArray, seen: AnyArray, total: AnyArray | None) -> None:
     """Count where a frame shows road, and where it sees at all, on the mosaic; both (R, C) uint8 are changed.
 
-    `total` (R, C) uint16: what the probability of road is added to.
+    `total` (R, C) uint16: the probability of road is added to it.
     """
     height, width = mask.shape
     corners = Homography(matrix)(Frame(width, height).corners)

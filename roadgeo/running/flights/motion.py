@@ -33,7 +33,7 @@ __all__ = ["Odometer", "TracedMask", "between_images", "between_masks", "overlay
 
 _COLUMNS = [f"h{i}{j}" for i in range(3) for j in range(3)]
 
-#: Photographs are compared at no more than this side; of so many features this many must agree on a homography.
+#: Photographs are compared at no more than this side; number of features, and of those that must agree on a homography.
 _IMAGE_SIDE, _FEATURES, _FEWEST_FEATURES = 1000, 2000, 25
 
 #: Masks are compared roughly at about this side, turned by these angles, and shifted by up to this share of a frame.
@@ -43,10 +43,10 @@ _ROUGH_SIDE, _TURNS_DEG, _FARTHEST = 96, (-12.0, -8.0, -4.0, 0.0, 4.0, 8.0, 12.0
 _SHIFT_CELLS, _LINEAR_SIGMA, _CORNER_SIGMA = 3.0, 0.05, 0.008
 #: The least share of road points in the overlap that must lie on roads of the other mask.
 _LEAST_SHARE = 0.6
-#: Frames in no order are laid on each other where they share so much: less agrees by chance.
+#: Frames in no order are laid on each other where they share this part: less agrees by chance.
 _LEAST_SHARED = 0.3
 #: Flights go on as they went: the middle of a frame moves by no more than this share of a frame otherwise than before,
-#: and of what moved otherwise so much is taken off, per frame's side.
+#: and the score of a motion that differs is reduced by this much, per frame's side.
 _STEADY, _OTHERWISE = 0.1, 1.28
 #: How well a motion must fit (see `_Laid`), where that of the frame before is known, and where it is not; by how much
 #: it must then lead any other.
@@ -90,7 +90,7 @@ def read_motion(path: str | os.PathLike[str]) -> dict[str, FloatArray]:
 
 
 def write_motion(names: Sequence[str], motion: Sequence[FloatArray] | FloatArray) -> str:
-    """Return what `read_motion` reads."""
+    """Return the text that `read_motion` reads."""
     text = io.StringIO()
     table = csv.writer(text, lineterminator="\n")
     table.writerow(["frame", *_COLUMNS])
@@ -134,14 +134,14 @@ def _half_turn(frame: Frame) -> FloatArray:
 
 @dataclass
 class Odometer:
-    """Tells how each mask of a flight moved; where the masks do not tell, it goes on as it went, a frame or two."""
+    """Estimates how each mask of a flight moved; where masks do not show it, it goes on as it went, a frame or two."""
 
     _traced: TracedMask | None = None
     _motion: FloatArray | None = None
     _held: int = 0
 
     def move(self, before: RoadMask, mask: RoadMask) -> tuple[FloatArray | None, float]:
-        """Return the motion of a mask against the one before, None where nothing tells it; and how far off it may be.
+        """Return the motion of a mask against the one before, None where it is unknown; and its standard deviation.
 
         Returns
         -------
@@ -164,7 +164,7 @@ class Odometer:
 class _Laid(NamedTuple):
     """A mask laid on another: how, the share of roads that agree, and of the frame that both see.
 
-    Where frames share less, less can disagree: how well it fits is the agreement, times the root of what is shared.
+    Where frames share less, less can disagree: the quality is the agreement, times the root of the shared part.
     """
 
     motion: FloatArray
@@ -182,7 +182,7 @@ class _Laid(NamedTuple):
 
 
 def between_masks(one: TracedMask, other: TracedMask, last: FloatArray | None = None) -> FloatArray | None:
-    """Return the motion (3, 3) of `other` against `one` by the roads that both show; None where those do not tell it.
+    """Return the motion (3, 3) of `other` against `one` by the roads that both show; None where those do not fix it.
 
     Parameters
     ----------

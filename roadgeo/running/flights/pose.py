@@ -1,7 +1,7 @@
 """Where a frame lies, as the places of its corners with their covariance: predicted by motion, corrected by roads.
 
-An extended Kalman filter. Its state is a frame's four corners on the reference plane in metres, eight numbers that say
-the same as a homography; measurements are the distances of the frame's road points from roads of the map.
+An extended Kalman filter. Its state is a frame's four corners on the reference plane in metres, eight numbers
+equivalent to a homography; measurements are the distances of the frame's road points from roads of the map.
 """
 
 from __future__ import annotations
@@ -33,10 +33,10 @@ class FilterOptions:
     correlation_m : float
         Errors of the map and of the mask keep their sign over about this length of road.
     radii : tuple of (float, float)
-        Of each step of the adjustment: roads are looked for so many metres, and so many standard deviations of the
+        Of each step of the adjustment: search radius in metres, and in standard deviations of the
         prediction, away; the lesser of the two counts.
     least_radius_m : float
-        They are always looked for so far away.
+        They are always searched within this radius.
     max_turn_deg : float
         Roads count that run the point's way, within this angle.
     fewest : int

@@ -1,6 +1,6 @@
 """Strips of an archive: frames that overlap, in no order, are solved together and placed together.
 
-Each pair of frames is laid on each other, by what their pictures show or by their roads. The links that result make
+Each pair of frames is laid on each other, by features of their pictures or by their roads. The resulting links make
 one or more nets; in each, all frames are adjusted at once, so that every link agrees with the others, and the mosaic of
 all is located like one mask. There each frame is laid on the roads of the map by itself.
 """
@@ -77,7 +77,7 @@ def place_strips(
     options: TrackOptions | None = None,
     strips: StripOptions | None = None,
 ) -> list[Tracked]:
-    """Place frames of one or more strips; return what is known of each, in the order in which they lie beside another.
+    """Place frames of one or more strips; return a row for each, in the order in which they lie beside another.
 
     Parameters
     ----------
@@ -132,7 +132,7 @@ class _Net:
         if mosaic is None:
             return [], "the frames do not fit together on one plane"
         options = tracker.look_options(mosaic, masks)
-        paid = math.log10(1 + len(self.frames))  # so many searches are made: each could agree by chance
+        paid = math.log10(1 + len(self.frames))  # one search each: any could agree by chance
         location = locate(
             mosaic.mask, references, replace(options, min_log10_odds=round(options.min_log10_odds + paid, 1))
         )
@@ -157,7 +157,7 @@ class _Net:
         return [known.get(k, Tracked(one, "lost", why, one.number)) for k, one in enumerate(self.frames)]
 
     def _stands(self, one: Tracked) -> bool:
-        """Whether a frame is where it was put, and not a block beside; one without roads has nothing to say."""
+        """Whether a frame is where it was put, and not a block beside; a frame without roads is."""
         if one.status == "predicted":
             return math.isnan(one.log10_odds)
         if one.status != "located" or one.pose is None or one.reference is None:
@@ -238,7 +238,7 @@ def _gap(a: FloatArray, b: FloatArray, frame: Frame) -> float:
 def adjust(start: Sequence[FloatArray], frame: Frame, links: Sequence[Link]) -> FloatArray:
     """Adjust homographies (K, 3, 3) of frames of one size to one plane, so that all links agree as well as they can.
 
-    The first stays. What is made least is how far the two frames of a link put the corners of their overlap apart.
+    The first stays. Minimised is the distance between the places of an overlap's corners by the two frames of a link.
     """
     matrices = np.stack(start)
     if len(matrices) < 3 or not links:

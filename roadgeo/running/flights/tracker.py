@@ -36,7 +36,7 @@ from roadgeo.running.flights.pose import FilterOptions, Pose, correct, predict, 
 
 __all__ = ["Fix", "FlightFrame", "FrameStatus", "TrackOptions", "Tracked", "Tracker", "follow", "track"]
 
-#: A tracked frame is compared with so many places nearby.
+#: Number of places nearby that a tracked frame is compared with.
 _N_SHIFTS = 25
 
 FrameStatus = Literal["located", "tracked", "predicted", "lost"]
@@ -53,8 +53,8 @@ class TrackOptions:
     most_frames : int
         Of more frames that wait for a place, the latest are laid together.
     fewest_intersections, more_intersections, more_frames : int
-        A mosaic is looked for once it shows so many intersections, and again when it shows so many more, or so many
-        frames have come since.
+        A mosaic is located once it shows the first number of intersections, and again after the second number of more
+        intersections, or the third of more frames.
     start_sigma_m : float
         Standard deviation of a located mosaic.
     least_odds : float
@@ -63,7 +63,7 @@ class TrackOptions:
         Nor does one agree that no camera sees so, by this skew (see `CameraOptions`): along a single road, where motion
         is known roughly, the fit bends frames at will. Frames in place had at most 0.03, one that drifted off 0.2.
     patience : int
-        After so many frames in a row that do not agree the flight is lost.
+        Number of frames in a row without agreement after which the flight is lost.
     lost_frames : float
         It is lost, too, when it may be off by this share of a frame.
     """
@@ -114,7 +114,7 @@ class FlightFrame:
 
 @dataclass(frozen=True)
 class Tracked:
-    """What is known of a frame.
+    """The state of a frame.
 
     Attributes
     ----------
@@ -184,7 +184,7 @@ class Tracker:
         return self._pose is None
 
     def feed(self, frame: FlightFrame) -> list[Tracked]:
-        """Take the next frame; return what is known of it now, after what has become known of earlier ones."""
+        """Take the next frame; return its state, after later knowledge of earlier ones."""
         waiting = _Waiting(frame, _trace(frame.mask, self.options))
         if self._pose is not None:
             return self._follow(waiting)
@@ -345,9 +345,9 @@ class Tracker:
         return placed
 
     def _place_from_surest(self, placed: list[Tracked], known_at: int) -> None:
-        """Place frames once more, by motion from the surest one in both directions; keep what agrees better.
+        """Place frames once more, by motion from the surest one in both directions; keep the place that agrees better.
 
-        A mosaic bends: what lies far from the roads that located it may be anywhere. Frames of an archive, which have
+        A mosaic bends: frames far from the roads that located it may be anywhere. Frames of an archive, which have
         neither motion nor order, stay.
         """
         odds = [one.log10_odds if one.status == "located" else -math.inf for one in placed]
@@ -372,7 +372,7 @@ class Tracker:
 def track(
     frames: Iterable[FlightFrame], references: Sequence[Reference], options: TrackOptions | None = None
 ) -> list[Tracked]:
-    """Follow a flight to its end; return what is known of each frame in the end, in order."""
+    """Follow a flight to its end; return the final state of each frame, in order."""
     known: dict[int, Tracked] = {}
     for _, news in follow(frames, references, options):
         known.update({one.frame.number: one for one in news})
@@ -382,7 +382,7 @@ def track(
 def follow(
     frames: Iterable[FlightFrame], references: Sequence[Reference], options: TrackOptions | None = None
 ) -> Iterator[tuple[FlightFrame, list[Tracked]]]:
-    """Follow a flight; yield each frame with what has become known by it."""
+    """Follow a flight; yield each frame with the states that it changes."""
     tracker = Tracker(references, options)
     for frame in frames:
         yield frame, tracker.feed(frame)

@@ -1,1 +1,1 @@
-"""The server: references are kept open, and who posts a mask or a photograph is told where it lies."""
+"""The server: references are kept open; clients post masks or photographs and receive their places."""

@@ -1,4 +1,4 @@
-"""What the server answers: routes, each a few lines; processes locate (`workers`)."""
+"""Routes of the server, each a few lines; processes locate (`workers`)."""
 
 from __future__ import annotations
 
@@ -47,10 +47,10 @@ __all__ = ["Service"]
 _LOG = logging.getLogger(__name__)
 
 _CHUNK = 1 << 16
-#: A file of an answer may take so long to be made; a token is no longer.
+#: Time to make a file of an answer, seconds; length of a token.
 _WRITE_S, _MOST_TOKEN = 60.0, 4096
 
-#: What never changes under its address, and what changes with roadgeo itself.
+#: Headers of files that never change under their address, and of those that change with roadgeo itself.
 _FOR_EVER = {"Cache-Control": "private, max-age=86400, immutable"}
 _AS_IT_IS = {"Cache-Control": "no-cache"}
 
@@ -59,7 +59,7 @@ Told = Callable[[dict[str, Any], float], None]
 
 
 class Service:
-    """The routes, and what they share.
+    """The routes, and their shared state.
 
     Attributes
     ----------
@@ -205,7 +205,7 @@ class Service:
     # --- how it is located --------------------------------------------------------------------------------------------
 
     async def _ask(self, job: Job, came: float, keeps: bool = False) -> Answer:
-        """Have a process locate an image, and tell others of its place."""
+        """Have a process locate an image, and report its place to listeners."""
         loop, hints = asyncio.get_running_loop(), dict(job.hints)
         limit = min(hints.pop(LIMIT, self._options.time_limit_s), self._options.time_limit_s)
         asked = Asked(str(job.path), hints, limit, self._options.max_pixels, job.name, keeps)
@@ -221,7 +221,7 @@ class Service:
         return answer
 
     def _tell(self, told: Told, document: dict[str, Any], came: float) -> None:
-        """Tell others of a place; what they make of it is not the matter of who asked."""
+        """Report a place to listeners; their errors do not concern the client."""
         try:
             told(document, came)
         except Exception:
@@ -268,7 +268,7 @@ class Service:
         return _said(job.answer, lambda document: {"location": document})
 
     async def _events(self, request: Request) -> Response:
-        """Tell a job's state whenever it changes, as server-sent events."""
+        """Send a job's state whenever it changes, as server-sent events."""
         job = self._find(request)
 
         async def tell() -> AsyncIterator[str]:
@@ -294,7 +294,7 @@ class Service:
         return _created(job)
 
     async def _shown(self, request: Request) -> Response:
-        """Return what the page shows of an answer."""
+        """Return the page's view of an answer."""
         job, name = self._find(request), request.url.path.rpartition("/")[2]
         path = job.folder / name
         if job.status != "successful" or not path.is_file():
@@ -414,7 +414,7 @@ async def _keep_body(request: Request, folder: Path) -> Path:
 
 
 def _job_of(folder: Path, part: Path, name: str, hints: dict[str, Any]) -> Job:
-    """Return the job of an image that has come, under a name that says what it is."""
+    """Return the job of an image that has come, under a name with its ending."""
     with part.open("rb") as file:
         ending = ending_of(file.read(16))
     image = part.rename(folder / f"{safe_stem(name)}{ending}")
@@ -433,7 +433,7 @@ def _said(answer: Answer, show: Callable[[dict[str, Any]], dict[str, Any]]) -> R
 
 
 async def _no_route(request: Request, error: Exception) -> Response:
-    """Say that there is nothing, or nothing of this kind."""
+    """Answer that there is nothing, or nothing of this kind."""
     status = getattr(error, "status_code", 404)
     if status == 405:
         allowed = (getattr(error, "headers", None) or {}).get("Allow", "GET")

@@ -1,4 +1,4 @@
-"""What the server says of itself: the documents of OGC API - Processes, part 1."""
+"""The server's description of itself: the documents of OGC API - Processes, part 1."""
 
 from __future__ import annotations
 
@@ -15,7 +15,7 @@ _CONFORMS = [f"{_CORE}/{part}" for part in ("core", "ogc-process-description", "
 
 DOCUMENTS = ("/", "/api", "/conformance", "/processes", "/processes/locate", "/jobs")
 
-#: What may be known, as texts or as JSON.
+#: Hints, as texts or as JSON.
 _HINTS: dict[str, dict[str, Any]] = {
     hint.parameter: {"title": hint.help, "schema": {"anyOf": [hint.schema, {"type": "string"}]}}
     for hint in HINTS.values()
@@ -24,7 +24,7 @@ _HINTS: dict[str, dict[str, Any]] = {
 
 def documents_of(references: Sequence[str]) -> dict[str, dict[str, Any]]:
     """Return each document by its path."""
-    # The one process there is: what it takes and what it returns.
+    # The one process: its inputs and outputs.
     summary = {
         "id": "locate",
         "title": "Locate a road mask or a photograph",
@@ -73,7 +73,7 @@ def documents_of(references: Sequence[str]) -> dict[str, dict[str, Any]]:
 
 
 def problem(status: int, title: str, detail: str) -> dict[str, Any]:
-    """Return what is wrong, as RFC 7807 has it."""
+    """Return an error as a document of RFC 7807."""
     return {"type": "about:blank", "status": status, "title": title, "detail": detail}
 
 

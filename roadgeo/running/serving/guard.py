@@ -1,4 +1,4 @@
-"""What stands before the routes: who may ask, how much and for how long may be sent, and how a refusal is said."""
+"""Checks before the routes: clients, limits of size and time, and the form of refusals."""
 
 from __future__ import annotations
 
@@ -42,7 +42,7 @@ _HEADERS = {
 
 
 def refusal(refused: Refused) -> Response:
-    """Return what is wrong, as RFC 7807 has it."""
+    """Return an error as a document of RFC 7807."""
     status = HTTPStatus(refused.status)
     headers = {} if refused.retry_after_s is None else {"Retry-After": str(refused.retry_after_s)}
     if refused.status == 401:
@@ -52,7 +52,7 @@ def refusal(refused: Refused) -> Response:
 
 
 def require_body(headers: Headers, most: int) -> None:
-    """Refuse a body that says it is too large, or does not say how it ends.
+    """Refuse a body that is declared too large, or does not declare how it ends.
 
     Raises
     ------
@@ -113,7 +113,7 @@ class Guard:
         return None
 
     def _require_head(self, scope: Scope) -> None:
-        """Refuse a head that is too large, or asks for what is no path."""
+        """Refuse a head that is too large, or asks for something that is no path."""
         headers = scope["headers"]
         if len(headers) > _MOST_HEADERS or sum(len(name) + len(value) for name, value in headers) > MAX_HEAD_BYTES:
             raise Refused(431, f"more than {_MOST_HEADERS} headers, or {MAX_HEAD_BYTES:,} bytes of them")
@@ -152,18 +152,18 @@ class Guard:
 
 
 def is_open(path: str, headers: Headers) -> bool:
-    """Whether a path is answered without a token: what tells nothing of anybody, and the page, which asks for it."""
+    """Whether a path is answered without a token: those without private content, and the page, which asks for it."""
     is_page = path == "/" and "text/html" in headers.get("accept", "")
     return is_page or path in ("/health", "/session") or path.startswith("/page/")
 
 
 def pass_of(token: str) -> str:
-    """Return what a browser keeps in the token's place, from which that cannot be told."""
+    """Return a browser's substitute for the token, which does not reveal it."""
     return hmac.new(token.encode(), b"roadgeo serve", hashlib.sha256).hexdigest()
 
 
 def is_same(shown: str, secret: str) -> bool:
-    """Compare in a time that does not tell how much is right; headers come as Latin-1, whatever was meant."""
+    """Compare in a time that is independent of the match; headers come as Latin-1, whatever was meant."""
     given = shown.encode("latin-1", "replace")
     return hmac.compare_digest(given, secret.encode()) or hmac.compare_digest(shown.encode(), secret.encode())
 
@@ -177,7 +177,7 @@ def _host_of(address: str) -> str | None:
 
 
 class _Body:
-    """The body of a request, of which only so much is taken, and only for so long."""
+    """The body of a request, limited in size and time."""
 
     def __init__(self, receive: Receive, options: ServeOptions) -> None:
         self._receive, self._most, self._body_s = receive, options.max_bytes, options.body_s
@@ -199,7 +199,7 @@ class _Body:
 
 
 class _Answer:
-    """Sends an answer, with what every one has in its head."""
+    """Sends an answer, with the headers that all share."""
 
     def __init__(self, send: Send) -> None:
         self._send, self.started = send, False

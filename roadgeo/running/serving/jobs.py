@@ -1,4 +1,4 @@
-"""What is asked without waiting: jobs, how far they are, and their answers, kept for a while."""
+"""Requests without waiting: jobs, their progress, and their answers, kept for a while."""
 
 from __future__ import annotations
 
@@ -21,7 +21,7 @@ __all__ = ["Job", "Jobs", "Status"]
 #: As OGC API - Processes calls them.
 Status = Literal["accepted", "running", "successful", "failed", "dismissed"]
 
-#: So often a listener hears that the connection still stands.
+#: Interval of messages that keep a listener's connection, seconds.
 _PULSE_S = 10.0
 
 
@@ -32,11 +32,11 @@ class Job:
     Attributes
     ----------
     folder : Path
-        Holds the image, and later what the answer is shown with.
+        Holds the image, and later the files of its view.
     image : str
         The name of its file.
     name : str
-        What its sender calls it.
+        Its sender's name for it.
     hints : dict
         With which it is searched, as `requests.read_hints` gives them.
     """
@@ -67,7 +67,7 @@ class Job:
         return self.status in ("successful", "failed", "dismissed")
 
     def tell(self, text: str, share: float | None = None) -> None:
-        """Say how far it is."""
+        """Record the progress."""
         if self.is_over:
             return
         self.status, self.message = "running", text

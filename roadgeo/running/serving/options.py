@@ -1,4 +1,4 @@
-"""What the server allows."""
+"""Limits and settings of the server."""
 
 from __future__ import annotations
 
@@ -11,7 +11,7 @@ LOOPBACK = ("127.0.0.1", "::1", "localhost")
 
 @dataclass(frozen=True)
 class ServeOptions:
-    """What the server allows.
+    """Limits and settings of the server.
 
     Attributes
     ----------
@@ -30,7 +30,7 @@ class ServeOptions:
     connections : int
         Open at once.
     kept_jobs, kept_bytes : int
-        Answers that are kept for who asked not to wait, and what they may take on disk.
+        Answers that are kept for clients that asked not to wait, and their limit on disk.
     basemap, basemap_attribution : str
         Address of the tiles of a map that the page shows below the roads, with {z}, {x} and {y}; "" for none.
     """

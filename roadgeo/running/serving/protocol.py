@@ -17,7 +17,7 @@ __all__ = ["MAX_HEAD_BYTES", "protocol_of"]
 
 #: Of a request line and of all headers together.
 MAX_HEAD_BYTES = 1 << 16
-#: A connection that was refused stays so long, that its answer is heard before it is closed.
+#: A connection that was refused stays open this long, that its answer is received before it is closed.
 _LINGER_S = 0.3
 
 
@@ -33,7 +33,7 @@ class _Protocol(H11Protocol):
     _is_refused = False
 
     def connection_made(self, transport: asyncio.Transport) -> None:  # type: ignore[override]
-        """Take a connection, or say that there are too many."""
+        """Take a connection, or answer that there are too many."""
         if len(self.connections) >= self.options.connections:
             self.transport = transport
             self._refuse(503, "too many connections are open; come again")
@@ -82,7 +82,7 @@ class _Protocol(H11Protocol):
             self._writing.cancel()
 
     def send_400_response(self, msg: str) -> None:
-        """Say what is wrong with a request that h11 refuses."""
+        """Answer a request that h11 refuses."""
         error = sys.exception()
         self._refuse(getattr(error, "error_status_hint", 400), str(error or msg)[:200])
 

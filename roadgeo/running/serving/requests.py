@@ -1,4 +1,4 @@
-"""What is asked of the server: an image in the body, or in JSON, and hints; all of it may be hostile."""
+"""Requests to the server: an image in the body, or in JSON, and hints; all of it may be hostile."""
 
 from __future__ import annotations
 
@@ -13,7 +13,7 @@ from roadgeo.matching.hints import HINTS
 
 __all__ = ["LIMIT", "Refused", "ending_of", "read_execution", "read_hints", "read_query_string"]
 
-#: How files begin that are read. What refers to other files, as a VRT does, is none of them.
+#: First bytes of the files that are read. Files that refer to others, as a VRT does, are not among them.
 _MAGIC = {
     b"\x89PNG\r\n\x1a\n": ".png",
     b"II*\0": ".tif",
@@ -27,7 +27,7 @@ _MAGIC = {
     b"\0\0\0\x0cjP  ": ".jp2",
 }
 
-#: What may be known, by its name over HTTP.
+#: Hints by their names over HTTP.
 _NAMES = {hint.parameter: hint for hint in HINTS.values()}
 #: Of a text among them.
 _MOST_LETTERS = 200
@@ -36,7 +36,7 @@ LIMIT = HINTS["time_limit"].goes_to
 
 
 class Refused(Exception):  # noqa: N818 (an answer, not a fault)
-    """A request that cannot be served: an HTTP status, and what was wrong, expected, and to do."""
+    """A request that cannot be served: an HTTP status, and the fault, the expectation and the remedy."""
 
     def __init__(self, status: int, detail: str, retry_after_s: int | None = None) -> None:
         super().__init__(detail)

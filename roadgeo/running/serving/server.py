@@ -23,7 +23,7 @@ from roadgeo.running.serving.workers import Workers
 
 __all__ = ["Server"]
 
-#: So long answers under way are waited for once the processes have ended.
+#: Time for answers under way once the processes have ended, seconds.
 _FAREWELL_S = 2
 
 
@@ -39,7 +39,7 @@ class Server:
     def __init__(
         self, workers: Workers, references: Sequence[AnyReference], options: ServeOptions, told: Told | None = None
     ) -> None:
-        """Listen; `told` hears of each place that is found: of its document, and when its request came.
+        """Listen; `told` receives each place that is found: its document, and the time of its request.
 
         Raises
         ------
@@ -89,7 +89,7 @@ class Server:
 
 
 class _Uvicorn(uvicorn.Server):
-    """Ends the processes before it waits for their answers: who still waits is told to come again."""
+    """Ends the processes before it waits for their answers: clients that still wait are asked to come again."""
 
     def __init__(self, config: uvicorn.Config, workers: Workers) -> None:
         super().__init__(config)

@@ -1,4 +1,4 @@
-"""What the page shows of an answer, and the files that it offers: made by the process that located, kept beside it."""
+"""The page's view of an answer, and the files that it offers: made by the process that located, kept beside it."""
 
 from __future__ import annotations
 
@@ -37,7 +37,7 @@ __all__ = ["OFFERED", "PICTURE", "SEEN", "VIEW", "WARPED", "safe_stem", "write_o
 PICTURE, WARPED, VIEW, SEEN = "picture.jpg", "warped.webp", "view.json", "seen.tif"
 _KEPT = "kept.pickle.gz"
 
-#: What may be had of an answer. A virtual raster would lead to a file that its reader has not.
+#: Outputs that an answer offers. A virtual raster would lead to a file that its reader has not.
 OFFERED: dict[str, Output] = {
     one.name: one for one in (FOOTPRINT, GEOPACKAGE, JSON, REPORT, OVERLAY, *ALSO.values()) if one is not VRT
 }
@@ -49,13 +49,13 @@ _MASK_COLOR = (228, 87, 46)
 
 
 def safe_stem(name: str) -> str:
-    """Return what may stand in a file's name of what a sender calls a file."""
+    """Return the safe part of a sender's file name."""
     stem = re.sub(r"[^\w-]+", "_", Path(name.replace("\\", "/")).stem)[:50].strip("_")
     return stem or "image"
 
 
 def write_view(path: Path, sighting: Sighting, references: Sequence[AnyReference]) -> None:
-    """Write what the page shows of an answer, beside the image at `path`, and keep what its files are made of."""
+    """Write the page's view of an answer, beside the image at `path`, and keep the inputs of its files."""
     location, folder = sighting.location, path.parent
     indexes = [one.index_of(location) for one in references]
     photo = path if sighting.of_photograph else None
@@ -107,7 +107,7 @@ def write_output(path: Path, name: str, references: Sequence[AnyReference]) -> P
 
 
 def _show_place(folder: Path, shown: Shown, place: Placement) -> dict[str, Any]:
-    """Return what lies on the map, in longitude and latitude, and draw the picture there."""
+    """Return the layers on the map, in longitude and latitude, and draw the picture there."""
 
     def lay(pixels: FloatArray) -> FloatArray:
         return to_lonlat(place.crs, place.to_crs(pixels))
@@ -153,7 +153,7 @@ def _draw_on_map(path: Path, shown: Shown, place: Placement) -> list[list[float]
 
 
 def _write_picture(path: Path, image: AnyArray) -> None:
-    """Write (h, w, 3) or, with opacity, (h, w, 4) uint8 as what the path's suffix says."""
+    """Write (h, w, 3) or, with opacity, (h, w, 4) uint8 in the format of the path's suffix."""
     turned = cv2.COLOR_RGBA2BGRA if image.shape[2] == 4 else cv2.COLOR_RGB2BGR
     key = cv2.IMWRITE_WEBP_QUALITY if path.suffix == ".webp" else cv2.IMWRITE_JPEG_QUALITY
     encoded = cv2.imencode(path.suffix, cv2.cvtColor(np.ascontiguousarray(image), turned), [key, _QUALITY])[1]

@@ -1,6 +1,6 @@
-"""Processes that locate for the server: what they are given may break them, and then another one is started.
+"""Processes that locate for the server: a hostile image may break them, and then another one is started.
 
-Only so many requests may work or wait at once; whoever comes then is told to come again. A process that breaks costs
+A bounded number of requests may work or wait at once; further ones are asked to come again. A process that breaks costs
 nobody an answer, unless the next one breaks by the same image.
 """
 
@@ -28,13 +28,13 @@ __all__ = ["Answer", "Asked", "Full", "Place", "Told", "Workers"]
 
 _LOG = logging.getLogger(__name__)
 
-#: A process that has not answered so long after its time limit is ended.
+#: A process that has not answered this long after its time limit is ended.
 _GRACE_S = 15.0
-#: Where progress is told, and who waits may call it off, it may take so much longer: a busy machine is no fault.
+#: The same where progress is reported, and the client may cancel: a busy machine is no fault.
 _PATIENT_S = 90.0
-#: So long it may open its references.
+#: Time to open its references.
 _START_S = 120.0
-#: So often it is looked whether somebody still waits.
+#: Interval of checks whether the client still waits.
 _GLANCE_S = 0.25
 #: Processes that are given an image, one after another, as long as they break.
 _TRIES = 2
@@ -55,9 +55,9 @@ class Asked:
     hints : dict
         `near`, `within`, `gsd_m`, `max_tilt_deg`, `focal_px`, `north_up`, as far as they are known.
     name : str
-        What the answer calls it.
+        Name of the image in the answer.
     keeps : bool
-        Whether progress is told, and what the page shows is kept beside the file (see `view`).
+        Whether progress is reported, and the page's view is kept beside the file (see `view`).
     wanted : str
         The name of an output of an answer that was kept so, which is asked for instead of a place.
     """
@@ -73,7 +73,7 @@ class Asked:
 
 @dataclass(frozen=True)
 class Told:
-    """How far a process is with what it was asked: see `Say`."""
+    """Progress of a process with its request: see `Say`."""
 
     text: str
     share: float | None = None
@@ -81,7 +81,7 @@ class Told:
 
 @dataclass(frozen=True)
 class Answer:
-    """An HTTP status, and the document or, from 400 on, the sentence that says what is wrong."""
+    """An HTTP status, and the document or, from 400 on, the sentence that describes the error."""
 
     status: int
     document: dict[str, Any]
@@ -144,7 +144,7 @@ class Workers:
         Parameters
         ----------
         say
-            Told how far it is.
+            Called with the progress.
         called_off : Event, optional
             Once it is set nobody waits for the answer any more.
         """

@@ -1,4 +1,4 @@
-"""The page that people see: its files as they are sent, and what a browser may load beside them."""
+"""The page for people: its files as they are sent, and the sources that a browser may load."""
 
 from __future__ import annotations
 
@@ -31,7 +31,7 @@ def page_text(name: str) -> str:
 
 
 def policy_of(options: ServeOptions) -> str:
-    """Return what the page may load: what this server sends, and the tiles of a basemap that the user named."""
+    """Return the sources that the page may load: this server, and the tiles of a basemap that the user named."""
     basemap = ""
     if options.basemap:
         parts = urlsplit(options.basemap)
