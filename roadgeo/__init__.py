@@ -1,9 +1,11 @@
 """roadgeo: locate an aerial image from its roads alone.
 
 >>> import roadgeo
->>> ref = roadgeo.build_reference(roads_gdf)  # or a file, shapely lines ...; or roadgeo.open_reference("boston.gpkg")
->>> loc = roadgeo.locate("image_mask.tif", ref, gsd=(0.3, 0.6))  # or an array, a PIL image, a photograph ...
->>> loc.status, loc.center, loc.log10_odds
+>>> reference = roadgeo.index("porto_roads.gpkg")  # or "Boston, MA", lines ...; later roadgeo.open_reference(path)
+>>> answer = roadgeo.locate("drone.png", reference, gsd=0.8)  # or a photograph, an array, a PIL image ...
+>>> answer.status, round(answer.center.lon, 2), round(answer.center.lat, 2)
+('located', -8.61, 41.15)
+>>> files = answer.write("found", also=["report"])
 
 Names are imported when they are first used, so that `import roadgeo` costs nothing.
 """
@@ -17,7 +19,7 @@ from typing import TYPE_CHECKING, Any
 __version__ = "0.1.0"
 
 if TYPE_CHECKING:
-    from roadgeo.api import Answer, build_reference, locate
+    from roadgeo.api import Answer, build_reference, index, locate, track, vectorize, verify
     from roadgeo.errors import RoadgeoError
     from roadgeo.geometry.mask import RoadMask
     from roadgeo.location import Location
@@ -37,9 +39,13 @@ __all__ = [
     "__version__",
     "build_reference",
     "explain",
+    "index",
     "locate",
     "open_reference",
     "read_schema",
+    "track",
+    "vectorize",
+    "verify",
 ]
 
 _HOMES = {
@@ -52,9 +58,13 @@ _HOMES = {
     "RoadgeoError": "errors",
     "build_reference": "api",
     "explain": "workflows",
+    "index": "api",
     "locate": "api",
     "open_reference": "reference.reference",
     "read_schema": "outputs.schemas",
+    "track": "api",
+    "vectorize": "api",
+    "verify": "api",
 }
 
 

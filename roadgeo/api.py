@@ -5,13 +5,15 @@ from __future__ import annotations
 import json
 import os
 from collections.abc import Iterable, Sequence
+from contextlib import nullcontext
 from dataclasses import dataclass, field, fields, replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Literal, TypeAlias
 
 import numpy as np
 
-from roadgeo.errors import NotLocatedError, OutputError, PluginError, how_to_install, name_extra
+from roadgeo._arrays import AnyArray
+from roadgeo.errors import MaskError, NotLocatedError, OutputError, PluginError, how_to_install, name_extra
 from roadgeo.geometry.areas import Box
 from roadgeo.geometry.mask import RoadMask
 from roadgeo.location import Location
@@ -23,12 +25,17 @@ from roadgeo.reference.shards import ShardedReference
 from roadgeo.roads.kinds import RoadKind
 
 if TYPE_CHECKING:
+    from datetime import datetime
+
+    import networkx as nx
     import xarray as xr
     from matplotlib.figure import Figure
 
     from roadgeo.outputs.subject import Subject
+    from roadgeo.running.flights.rows import Row
+    from roadgeo.running.verifying import Verified
 
-__all__ = ["Answer", "build_reference", "locate"]
+__all__ = ["Answer", "build_reference", "index", "locate", "track", "vectorize", "verify"]
 
 #: A reference that is open, its file, its name in the library; or several of them.
 References: TypeAlias = "AnyReference | str | os.PathLike[str] | Iterable[AnyReference | str | os.PathLike[str]]"
@@ -44,14 +51,22 @@ class Answer(Location):
         The roads as they were read, or found in a photograph.
     photo : str or None
         The photograph, where the query was one.
+    pixels : array or None
+        The same, where it was no file: (H, W) or (H, W, bands).
     """
 
     mask: RoadMask = field(default_factory=lambda: RoadMask(np.zeros((1, 1), np.bool_)), repr=False)
     photo: str | None = None
+    pixels: AnyArray | None = field(default=None, repr=False)
     indexes: tuple[ReferenceIndex, ...] = field(default=(), repr=False)
 
     def write(self, out_dir: str | os.PathLike[str] = ".", also: Sequence[str] = (), stem: str = "") -> list[Path]:
         """Write the files that `roadgeo locate` writes; return their paths.
+
+        >>> answer = roadgeo.locate("drone.png", "porto.gpkg")
+        >>> [path.name for path in answer.write("found", also=["geojson"])]  # doctest: +NORMALIZE_WHITESPACE
+        ['drone_location.json', 'drone_footprint.tif', 'drone_footprint.qml', 'drone_location.gpkg',
+         'drone_footprint.geojson']
 
         Parameters
         ----------
@@ -70,19 +85,25 @@ class Answer(Location):
         """
         from roadgeo.outputs.location_files import OutputOptions, write_location
         from roadgeo.outputs.paths import output_paths
+        from roadgeo.running.pictures import as_file
         from roadgeo.storage.atomic import writing
 
         with writing(out_dir):
             Path(out_dir).mkdir(parents=True, exist_ok=True)
         paths = output_paths(out_dir, stem or Path(self.query).stem or "mask")
         options = OutputOptions(products=tuple(also))
-        written = write_location(self, self.mask, paths, options, self.photo, self.indexes)
+        photo = self.photo if self.pixels is None else self.pixels
+        with nullcontext() if photo is None else as_file(photo) as file:
+            written = write_location(self, self.mask, paths, options, file, self.indexes)
         if written.faults:
             raise PluginError("; ".join(written.faults))
         return written.files
 
     def plot(self) -> Figure:
         """Draw the mask and its place on the map, as a matplotlib figure.
+
+        >>> figure = roadgeo.locate("drone.png", "porto.gpkg").plot()
+        >>> figure.savefig("drone.pdf")
 
         Raises
         ------
@@ -102,6 +123,9 @@ class Answer(Location):
         """Return the mask on the map, dimensions y and x: 0 outside the footprint, 1 ground, 2 road.
 
         `attrs["crs"]` and `attrs["transform"]` say where it lies.
+
+        >>> roadgeo.locate("drone.png", "porto.gpkg").to_xarray().dims
+        ('y', 'x')
 
         Raises
         ------
@@ -142,8 +166,11 @@ def build_reference(
 ) -> Reference:
     """Build a reference from roads, as `roadgeo index` does.
 
-    >>> reference = roadgeo.build_reference("streets.gpkg", "boston")
-    >>> reference = roadgeo.build_reference(lines, "boston", crs="EPSG:26986")  # shapely lines, or arrays
+    >>> reference = roadgeo.build_reference("porto_roads.gpkg", "porto", path="city.gpkg")
+    >>> len(reference.index)
+    2649
+
+    From lines or arrays it is made by `roadgeo.build_reference(lines, "porto", crs="EPSG:32629")`.
 
     Parameters
     ----------
@@ -181,6 +208,55 @@ def build_reference(
         return build(chosen, name or (where.stem if where else ""), options, path=where)
     except ModuleNotFoundError as error:
         raise name_extra(error) or error from error
+
+
+def index(
+    roads: Any,
+    name: str = "",
+    options: BuildOptions | None = None,
+    *,
+    crs: Any = None,
+    path: str | os.PathLike[str] | None = None,
+    kinds: RoadKind = "drivable",
+    tunnels: bool = False,
+    attribution: str | None = None,
+) -> Reference:
+    """Build a reference of a place, or from roads, as `roadgeo index` does.
+
+    >>> reference = roadgeo.index("porto_roads.gpkg", attribution="© OpenStreetMap contributors")
+    >>> reference
+    <Reference 'porto-roads': 2,649 intersections, EPSG:32629, not written>
+
+    The roads of `roadgeo.index("Boston, MA", path="boston.gpkg")` come from OpenStreetMap.
+
+    Parameters
+    ----------
+    roads : str, or (west, south, east, north), or as of `build_reference`
+        A place that OpenStreetMap knows, where there is no file of that name; or a box in degrees.
+    name, options, crs, path, kinds, tunnels, attribution
+        As of `build_reference`.
+
+    Raises
+    ------
+    CrsError, RoadSourceError
+        As of `build_reference`; there is no such place, or no network.
+    OutputError
+        It cannot be written.
+    """
+    from roadgeo.reference.library import make_slug
+
+    is_box = isinstance(roads, tuple) and len(roads) == 4 and all(isinstance(one, int | float) for one in roads)
+    if is_box or (isinstance(roads, str) and not Path(roads).exists() and not Path(roads).suffix):
+        from roadgeo.sources.roads import fetch_roads
+
+        name = name or (Path(path).stem if path else "box" if is_box else make_slug(roads))
+        where = {"bbox" if is_box else "place": roads}
+        roads = fetch_roads(**where, which=kinds, tunnels=tunnels)
+    elif not name and path is None and isinstance(roads, str | os.PathLike):
+        name = make_slug(Path(roads).name.split(".")[0])
+    return build_reference(
+        roads, name, options, crs=crs, path=path, kinds=kinds, tunnels=tunnels, attribution=attribution
+    )
 
 
 def locate(
@@ -264,15 +340,17 @@ def locate(
     meant = None if options.near is None else swapped_near(options.near, references)
     if meant is not None:
         raise ValueError(f"near={near} lies on none of the maps; longitude comes first: did you mean near={meant}?")
-    if isinstance(mask, RoadMask):
+    picture = None if isinstance(mask, RoadMask) else read_picture(mask)
+    if picture is None:
         sighting = Sighting(locate_mask(mask, references, options), mask)
     else:
-        sighting = locate_query(read_picture(mask), references, options)
+        sighting = locate_query(picture, references, options)
     told = {"options": _told(options), "reference_digest": _digest(references, sighting.location)}
     found = {one.name: getattr(sighting.location, one.name) for one in fields(Location)}
     indexes = tuple(one.index_of(sighting.location) for one in references)
-    photo = str(mask) if sighting.of_photograph and isinstance(mask, str | os.PathLike) else None
-    return Answer(**{**found, **told}, mask=sighting.mask, photo=photo, indexes=indexes)
+    picture = picture if sighting.of_photograph else None
+    photo, pixels = (picture, None) if isinstance(picture, str) else (None, picture)
+    return Answer(**{**found, **told}, mask=sighting.mask, photo=photo, pixels=pixels, indexes=indexes)
 
 
 def _with_hints(options: LocateOptions, given: dict[str, Any], image: Any) -> LocateOptions:
@@ -285,6 +363,167 @@ def _with_hints(options: LocateOptions, given: dict[str, Any], image: Any) -> Lo
             raise ValueError('focal="exif" is for files; give the focal length in pixels')
         known["focal_px"] = focal_in_pixels(os.fspath(image))
     return apply_hints(options, known)
+
+
+def verify(
+    image: str | os.PathLike[str],
+    reference: References = (),
+    *,
+    tolerance: float = 3.0,
+    reach: float = 350.0,
+    max_turn: float = 6.0,
+    crs: str | None = None,
+) -> Verified:
+    """Say whether a georeferenced image lies where it claims to, as `roadgeo verify` does. Nothing is written.
+
+    >>> verified = roadgeo.verify("drone_footprint.tif", "porto.gpkg")
+    >>> verified.verdict
+    'agrees'
+
+    Parameters
+    ----------
+    image : path
+        A mask or a photograph with a geotransform, control points or a world file.
+    reference : Reference, path or name, or several
+        As of `locate`.
+    tolerance, reach : float
+        It agrees if it is off by less, on average over the frame; nothing beyond `reach` is looked at. Metres.
+    max_turn : float
+        By how much it may be turned, degrees.
+    crs : str
+        Of world files, which name none.
+
+    Returns
+    -------
+    Verified
+        Its `verdict` is "agrees", "off", "unknown" or "error"; its `document` says by how much, and why.
+
+    Raises
+    ------
+    IndexFormatError
+        A reference is missing or unusable.
+    """
+    from roadgeo.matching.checking import CheckOptions
+    from roadgeo.running.verifying import VerifyRun, verify_image
+
+    usual = CheckOptions()
+    options = replace(usual, tolerance_m=tolerance, search=replace(usual.search, reach_m=reach, turn_deg=max_turn))
+    return verify_image(os.fspath(image), _open(reference), VerifyRun(options=options, crs=crs))
+
+
+def track(
+    frames: Any,
+    reference: References = (),
+    *,
+    motion: str | os.PathLike[str] | None = None,
+    unordered: bool = False,
+    every: float = 1.0,
+    interval: float = 1.0,
+    start: datetime | None = None,
+    gsd: float | tuple[float, float] | str | None = None,
+    near: tuple[float, float, float] | str | None = None,
+    within: str | Box | None = None,
+    max_tilt: float | None = None,
+    focal: float | None = None,
+    time_limit: float = 10.0,
+) -> list[Row]:
+    """Follow a flight over the map, frame by frame, as `roadgeo track` does. Nothing is written.
+
+    >>> rows = roadgeo.track("frames", "porto.gpkg", gsd=1.0)
+    >>> [row.status for row in rows]
+    ['located', 'tracked', 'tracked']
+
+    Parameters
+    ----------
+    frames : path or paths
+        Images in order, folders, patterns, or a video.
+    reference : Reference, path or name, or several
+        As of `locate`.
+    motion : path
+        A table of how each frame moved (see `roadgeo track --help`). Default: seen in the frames.
+    unordered : bool
+        The frames are in no order: all are solved together.
+    every, interval : float
+        Seconds between the frames that are taken of a video, and between images.
+    start : datetime
+        When the first frame was taken.
+    gsd, near, within, max_tilt, focal, time_limit
+        As of `locate`; with `focal`, pixels, the places of the camera are told too.
+
+    Returns
+    -------
+    list of Row
+        One for each frame: its `status` is "located", "tracked", "predicted" or "lost".
+
+    Raises
+    ------
+    MaskError
+        A frame cannot be read; there is none.
+    IndexFormatError
+        A reference is missing or unusable.
+    """
+    from roadgeo.running.flights.frames import FrameOptions, read_frames, read_stills
+    from roadgeo.running.flights.motion import read_motion
+    from roadgeo.running.flights.rows import make_rows
+    from roadgeo.running.flights.strips import place_strips
+    from roadgeo.running.flights.tracker import TrackOptions, follow
+
+    given = {"gsd": gsd, "near": near, "within": within, "max_tilt": max_tilt, "time_limit": time_limit}
+    options = TrackOptions(locate=_with_hints(LocateOptions(), given, None))
+    moved = None if motion is None else read_motion(os.fspath(motion))
+    reading = FrameOptions(gsd_m=_hint("gsd", gsd), motion=moved, every_s=every, interval_s=interval)
+    paths = [os.fspath(one) for one in ([frames] if isinstance(frames, str | os.PathLike) else frames)]
+    opened: Any = _open(reference)
+    if unordered:
+        tracked = list(place_strips(list(read_stills(paths, reading)), opened, options))
+    else:
+        learnt = follow(read_frames(paths, reading), opened, options)
+        known = {one.frame.number: one for _, news in learnt for one in news}
+        tracked = [known[number] for number in sorted(known)]
+    if not tracked:
+        raise MaskError(f"no frames in {', '.join(paths)}")
+    return make_rows(tracked, start, _hint("focal", focal))
+
+
+def vectorize(image: Any, *, gsd: float | tuple[float, float] | str | None = None) -> nx.MultiGraph:
+    """Return the roads that are seen in a mask or a photograph, as `roadgeo vectorize` shows them.
+
+    >>> graph = roadgeo.vectorize("drone.png")
+    >>> graph.number_of_edges() > 100
+    True
+
+    Parameters
+    ----------
+    image : path, array, PIL image, xarray DataArray or rasterio dataset
+        As of `locate`.
+    gsd : float or (float, float)
+        Metres per pixel, as of `locate`: photographs are shown to the network at its own.
+
+    Returns
+    -------
+    networkx.MultiGraph
+        Pixels (column, row) of the image: nodes with `x` and `y`, edges with `geometry` and `length`.
+
+    Raises
+    ------
+    MaskError
+        It cannot be read, or shows no roads.
+    """
+    from roadgeo.geometry.mask import plane_to_pixel
+    from roadgeo.matching.query import trace_query
+    from roadgeo.running.pictures import read_picture
+    from roadgeo.running.queries import QueryOptions, look_once
+
+    seen = look_once(read_picture(image), _hint("gsd", gsd), QueryOptions())
+    _, graph = trace_query(seen.mask)
+    return graph.to_networkx(
+        lambda xy: seen.coarser * plane_to_pixel(xy),
+        name=os.fspath(image) if isinstance(image, str | os.PathLike) else "array",
+    )
+
+
+def _hint(name: str, value: Any) -> Any:
+    return None if value is None else read_hint(name, value)[1]
 
 
 def _told(options: LocateOptions) -> dict[str, Any]:

@@ -173,6 +173,11 @@ def explain(
 ) -> Explanation:
     """Locate a mask as `locate` does, and tell how far the search got, what it rejected and what was missing.
 
+    >>> reference = roadgeo.open_reference("porto.gpkg")
+    >>> explanation = roadgeo.explain("elsewhere.png", reference)
+    >>> explanation.location.status
+    'not_located'
+
     Raises
     ------
     MaskError

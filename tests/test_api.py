@@ -8,6 +8,7 @@ import cv2
 import numpy as np
 import pytest
 import rasterio
+from PIL import Image
 
 import roadgeo
 from roadgeo.errors import MaskError, NotLocatedError
@@ -162,3 +163,27 @@ def test_an_answer_is_drawn(answer: roadgeo.Answer, porto: roadgeo.Reference, tm
         with pytest.raises(NotLocatedError):
             draw()
     assert [path.name for path in refused.write(tmp_path / "refused")] == ["drone_location.json"]
+
+
+@pytest.mark.parametrize("kind", ["array", "floats", "PIL"])
+def test_photographs_that_are_no_files_are_segmented_as_files_are(
+    kind: str, porto: roadgeo.Reference, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    from roadgeo.running import queries
+    from roadgeo.running.looks import Sighting
+
+    photograph = cv2.cvtColor(cv2.imread(str(PHOTO)), cv2.COLOR_BGR2RGB)
+    given = {"array": photograph, "floats": photograph / 255.0, "PIL": Image.fromarray(photograph)}[kind]
+    read: list[np.ndarray] = []
+
+    def segmented(paths: tuple[str, ...], *_: object) -> Sighting:
+        with rasterio.open(paths[0]) as file:
+            read.append(np.moveaxis(file.read(), 0, 2))
+        location = roadgeo.Location(paths[0], "not_located", f"hardly a road in {paths[0]}")
+        return Sighting(location, roadgeo.RoadMask(np.zeros((9, 9))))
+
+    monkeypatch.setattr(queries, "_locate_photograph", segmented)
+    found = roadgeo.locate(given, porto)
+    assert (found.query, found.reason, found.photo) == ("array", "hardly a road in array", None)
+    assert np.array_equal(read[0], photograph)
+    assert found.pixels is not None

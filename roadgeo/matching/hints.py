@@ -121,7 +121,7 @@ def read_range(value: Any, form: str = "a number above 0, or LO:HI") -> tuple[fl
     return low, high
 
 
-_GSD_FORM = "metres per pixel: 0.3, 0.3+-10% or 0.3:0.6"
+_GSD_FORM = "metres per pixel as SIZE or LO:HI: 0.3, 0.3+-10% or 0.3:0.6"
 
 
 def _read_gsd(value: Any) -> tuple[float, float]:

@@ -21,6 +21,8 @@ from roadgeo.roads.simplification import SimplifyOptions, planarize, simplify
 from roadgeo.storage.memory import give_back_memory, let_pages_go
 
 if TYPE_CHECKING:
+    import networkx as nx
+
     from roadgeo.reference.shards import ShardedReference
 
 __all__ = [
@@ -79,6 +81,23 @@ class Reference:
     def indexes_at(self, places: Sequence[tuple[float, float]]) -> list[ReferenceIndex]:  # noqa: ARG002
         """Return the indexes that show places."""
         return [self.index]
+
+    def to_networkx(self) -> nx.MultiGraph:
+        """Return its roads as a networkx graph, in its CRS, as osmnx has them: see `RoadGraph.to_networkx`.
+
+        >>> graph = roadgeo.open_reference("porto.gpkg").to_networkx()
+        >>> graph.number_of_edges(), graph.graph["crs"]
+        (4576, 'EPSG:32629')
+
+        Raises
+        ------
+        IndexFormatError
+            It was opened from its index alone: its GeoPackage is gone.
+        """
+        from roadgeo.reference.network_file import read_network
+
+        network = self.network or read_network(Path(self.index.path).with_suffix(".gpkg"))
+        return network.graph.to_networkx(network.plane.to_crs, crs=network.plane.crs, name=self.name)
 
     def save(self, path: str | Path, say: Say = say_nothing) -> None:
         """Write `path`.gpkg and `path`.index (see `files.write_reference`)."""
@@ -172,6 +191,9 @@ def open_reference(path: str | Path, say: Say = say_nothing) -> AnyReference:
 
     A missing index, or one of an earlier format, is built from the GeoPackage. Of shards only the manifest is read;
     each is opened when it is first searched.
+
+    >>> roadgeo.open_reference("porto.gpkg").name
+    'porto'
 
     Raises
     ------

@@ -2,12 +2,16 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
 from roadgeo._arrays import FloatArray, Int32Array, IntArray
+
+if TYPE_CHECKING:
+    import networkx as nx
 
 __all__ = ["RoadGraph"]
 
@@ -66,6 +70,29 @@ class RoadGraph:
     def polylines(self) -> list[FloatArray]:
         """Vertices of every edge, views."""
         return [self.polyline(e) for e in range(self.n_edges)]
+
+    def to_networkx(self, move: Callable[[FloatArray], FloatArray] | None = None, **about: Any) -> nx.MultiGraph:
+        """Return it as a networkx graph: nodes with `x` and `y`, edges with `geometry` (shapely) and `length`.
+
+        Parameters
+        ----------
+        move : callable, optional
+            Takes positions (..., 2) from the plane to where the graph is to lie; lengths stay those of the plane.
+        **about
+            What the graph says of itself: `crs`, as osmnx has it, for example.
+        """
+        import networkx as nx
+        import shapely
+
+        move = move or (lambda xy: xy)
+        graph = nx.MultiGraph(**about)
+        xy = move(self.xy).reshape(-1, 2).tolist()
+        graph.add_nodes_from((n, {"x": x, "y": y}) for n, (x, y) in enumerate(xy))
+        line_of = np.repeat(np.arange(self.n_edges), np.diff(self.offsets))
+        lines = shapely.linestrings(move(self.coords).reshape(-1, 2), indices=line_of)
+        ends = zip(self.edges.tolist(), lines, self.edge_lengths().tolist(), strict=True)
+        graph.add_edges_from((a, b, {"geometry": line, "length": length}) for (a, b), line, length in ends)
+        return graph
 
     def degree(self) -> IntArray:
         """(N,) number of edge ends at each node; a loop counts twice."""

@@ -3,7 +3,11 @@
 from __future__ import annotations
 
 import os
+import warnings
+from collections.abc import Iterator
+from contextlib import contextmanager
 from pathlib import Path
+from tempfile import TemporaryDirectory
 from typing import Any
 
 import numpy as np
@@ -13,7 +17,7 @@ from roadgeo.errors import MaskError
 from roadgeo.sources.thresholds import are_labels
 from roadgeo.storage.orientation import UPRIGHT, turn_upright
 
-__all__ = ["read_picture"]
+__all__ = ["as_file", "read_picture"]
 
 #: An axis no longer than this holds bands: a mask has at least 32 rows and columns.
 _MAX_BANDS = 16
@@ -46,6 +50,35 @@ def read_picture(picture: Any) -> str | AnyArray:
     if array.ndim not in (2, 3):
         raise MaskError(f"an array of shape {array.shape}; expected (rows, columns), with bands first or last")
     return _bands_last(array)
+
+
+@contextmanager
+def as_file(picture: str | AnyArray) -> Iterator[str]:
+    """Yield the path of a picture: its own, or that of a GeoTIFF of an array (H, W) or (H, W, bands) meanwhile.
+
+    Numbers between 0 and 1 become those of 8 bits; what is masked is transparent.
+    """
+    if isinstance(picture, str):
+        yield picture
+        return
+    import rasterio
+
+    values = np.ma.filled(picture, 0)
+    values = values[..., None] if values.ndim == 2 else values
+    if values.dtype.kind == "f" and values.size and float(np.nanmax(values)) <= 1.0:
+        values = np.rint(255.0 * np.nan_to_num(values)).astype(np.uint8)
+    hidden = np.ma.getmaskarray(picture).reshape(values.shape).all(axis=2)
+    with TemporaryDirectory(prefix="roadgeo-") as folder, warnings.catch_warnings():
+        warnings.simplefilter("ignore", rasterio.errors.NotGeoreferencedWarning)
+        path = str(Path(folder) / "photograph.tif")
+        height, width, count = values.shape
+        with rasterio.open(
+            path, "w", driver="GTiff", height=height, width=width, count=count, dtype=values.dtype
+        ) as file:
+            file.write(np.moveaxis(values, 2, 0))
+            if hidden.any():
+                file.write_mask(~hidden)
+        yield path
 
 
 def _bands_last(array: AnyArray) -> AnyArray:

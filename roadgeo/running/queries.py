@@ -28,6 +28,7 @@ from roadgeo.plugins import SEGMENTERS, call_plugin
 from roadgeo.reference.reference import AnyReference
 from roadgeo.running.looks import Later, Locate, Look, Sighting, locate_looks
 from roadgeo.running.mirroring import ask_mirrored
+from roadgeo.running.pictures import as_file
 from roadgeo.running.regridding import of_own_pixels, on_grid
 from roadgeo.running.stretching import ask_stretched
 from roadgeo.sources.drawn_roads import Units, draw_roads
@@ -51,6 +52,8 @@ _MAX_SCALES = 3
 #: Roads of a photograph whose pixels are coarser than a model's are traced on the model's, but of no more than so many
 #: times its own along a side: narrow gaps between roads close on coarse ones.
 _MOST_FINER, _LEAST_FINER = 2.0, 1.25
+#: What results call a picture that is no file.
+_ARRAY = "array"
 _KNOWN_SPAN = 1.7  # a range of pixel sizes narrower than this is one scale
 
 
@@ -136,11 +139,14 @@ def locate_query(
             asked = query.mirror != "never"
             return ask_mirrored(sighting, references, options, query.mirror == "allow") if asked else sighting
         except PhotographError:
-            if query.segment == "never" or not isinstance(path, str):
+            if query.segment == "never":
                 raise
-    if not isinstance(path, str):
-        raise MaskError("the roads of a photograph are found in files only: save it as GeoTIFF or PNG first")
-    sighting = _locate_photograph((path, *query.fused_with), references, options, query, how, say)
+    with as_file(path) as file:
+        sighting = _locate_photograph((file, *query.fused_with), references, options, query, how, say)
+        if not isinstance(path, str):
+            location = sighting.location
+            told = location.reason.replace(file, _ARRAY)
+            sighting = replace(sighting, location=replace(location, query=_ARRAY, reason=told))
     return replace(sighting, of_photograph=True)
 
 
@@ -163,12 +169,14 @@ class FirstLook:
     probability: ProbabilityMap | None = None
 
 
-def look_once(path: str, gsd_m: tuple[float, float] | None, query: QueryOptions, say: Say = say_nothing) -> FirstLook:
+def look_once(
+    path: str | AnyArray, gsd_m: tuple[float, float] | None, query: QueryOptions, say: Say = say_nothing
+) -> FirstLook:
     """Read a mask, or find the roads of a photograph, as `locate_query` does, in as many ways as the model's card asks.
 
     Parameters
     ----------
-    path : str
+    path : str, or (H, W) or (H, W, bands) array
     gsd_m : (2,) or None
         Metres per pixel, if known: photographs are shown to the model at its own.
 
@@ -184,6 +192,11 @@ def look_once(path: str, gsd_m: tuple[float, float] | None, query: QueryOptions,
         except PhotographError:
             if query.segment == "never":
                 raise
+    with as_file(path) as file:
+        return _look_at_photograph(file, gsd_m, query, say)
+
+
+def _look_at_photograph(path: str, gsd_m: tuple[float, float] | None, query: QueryOptions, say: Say) -> FirstLook:
     plugin = _only_plugin(query)
     if plugin:
         return FirstLook(_call_segmenter(plugin, path, query.threshold))

@@ -18,7 +18,9 @@ NAMES = tuple(sorted(path.name.removesuffix(_ENDING) for path in _FOLDER.glob(f"
 def read_schema(name: str) -> dict[str, Any]:
     """Read the schema of that name, one of `NAMES`.
 
-    >>> jsonschema.validate(json.loads(Path("mask_location.json").read_text()), read_schema("location"))
+    >>> import json, jsonschema
+    >>> with open("drone_location.json") as file:
+    ...     jsonschema.validate(json.load(file), roadgeo.read_schema("location"))
     """
     schema: dict[str, Any] = json.loads((_FOLDER / f"{name}{_ENDING}").read_text(encoding="utf-8"))
     return schema
