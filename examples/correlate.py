@@ -30,7 +30,10 @@ TILTED = ViewOptions((1000, 1000), gsd_m=(0.8, 1.25), heading_deg=(0.0, 360.0), 
 KINDS = {
     "clean, level": (LEVEL, NoiseModel((0, 0), (0, 0), warp_px=0, raggedness=0)),
     "clean, tilted 10 to 30°": (TILTED, NoiseModel((0, 0), (0, 0), warp_px=0, raggedness=0)),
-    "20 % gone, 8 % false, tilted": (TILTED, NoiseModel((0.15, 0.25), (0.05, 0.12), warp_px=0.8, raggedness=0.12)),
+    "15 to 25 % gone, 5 to 12 % false, tilted": (
+        TILTED,
+        NoiseModel((0.15, 0.25), (0.05, 0.12), warp_px=0.8, raggedness=0.12),
+    ),
 }
 
 

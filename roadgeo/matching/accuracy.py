@@ -22,21 +22,21 @@ __all__ = ["with_honest_corners"]
 
 #: Cells of the frame agree where they have this part of the best one's share of road points on roads; and where those
 #: hold less than this share of all points, only a part of the frame may agree. Points count where a pixel reaches up to
-#: so many times further than usual: what a tilted frame shows far away cannot be traced.
+#: this many times further than usual: a tilted frame cannot show distant roads well enough to trace.
 _LEAST_SHARE, _MOST_OF_FRAME, _AS_NEAR = 0.5, 0.85, 1.5
-#: It does where the mask shows less than this part, of the map's roads elsewhere, of what it shows of those there.
+#: It does where the mask shows less than this part of the map's roads elsewhere, compared with the part shown there.
 #: Training masks seen through lenses that were not found: 0.27 to 0.46; with many false roads and many gone: 0.65 and
 #: more, which look alike from the mask's side.
 _LEAST_SHOWN = 0.55
 
-#: How errors add up, fitted to the corners of 900 masks, good and bad, and of 34 of a real city. What residuals say
-#: too much, where no lens was found; over how much more ground errors keep their sign far away, by how far a pixel
-#: reaches; and what no number of points improves: a part of the residuals' rms, and the mask's accuracy, pixels,
+#: How errors add up, fitted to the corners of 900 masks, good and bad, and of 34 of a real city. The factor by which
+#: residuals overstate them without a lens; over how much more ground errors keep their sign far away, by the reach
+#: of a pixel; and the floor that no number of points lowers: a part of the residuals' rms, and the mask's accuracy, px,
 #: beside that of the map (`RefineOptions.sigma_floor_m`).
 _OVERSTATED, _FAR, _FLOOR, _FLOOR_PX = 0.67, 0.5, 0.15, 0.1
-#: Residuals end at three standard deviations: roads further off do not pull. Those beyond so many are near the end,
-#: many of them where a mask is bent. There the pull falls to nothing, and the fit is held less firmly: each takes so
-#: much off the slope of the pull. By their number and the pull there it would be 0.6, fitted it is more.
+#: Residuals end at three standard deviations: roads further off do not pull. Those beyond 2.5 are near the end,
+#: many of them where a mask is bent. There the pull falls to nothing, and the fit is held less firmly: each reduces
+#: the slope of the pull by this amount. By their number and the pull there it would be 0.6, fitted it is more.
 _NEAR_END, _PULL_AT_END = 2.5, 1.1
 
 
@@ -86,11 +86,11 @@ def with_honest_corners(
     # sandwich estimate of an M-estimator's covariance (Huber 1981, 6.3)
     covariance = scatter**2 * inverse @ (scaled.T * as_long**2 @ rows) @ inverse
     covariance = covariance + covariance_of_doubt(equations, k1, seen, used, inverse, rows, weights)
-    if partly:  # a lens that is told from none where k1 is so many times its deviation may be anything below that
+    if partly:  # a lens that is not significant may have any k1 below the limit of significance
         unseen = min(lens.sigma, lens.significance / math.sqrt(3.0) * math.sqrt(covariance[8, 8]))
         by_k1 = covariance[:, 8] / covariance[8, 8]
         covariance = covariance + max(unseen**2 - covariance[8, 8], 0.0) * np.outer(by_k1, by_k1)
-    if k1:  # the middle of the lens, which was not estimated, by what it would do to what was
+    if k1:  # the middle of the lens was not estimated: add its effect on the parameters
         unknown = lens.center_sigma_px * np.einsum("ni,nij->nj", seen.normals[used], by_center)
         moved = inverse @ (scaled.T @ unknown)
         covariance = covariance + moved @ moved.T

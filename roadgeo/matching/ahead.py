@@ -1,7 +1,7 @@
 """Work done ahead of its use: the next few of many independent pieces, in threads, while one is used.
 
-What is searched for one intersection of the query does not depend on what came of another. Kernels let other threads
-run, so as many intersections are looked for at a time as there are processors, and what comes of them is taken in
+The search for one intersection of the query does not depend on the results of another. Kernels let other threads
+run, so as many intersections are searched at a time as there are processors, and their results are used in
 order: an answer does not depend on the number of threads.
 """
 
@@ -19,7 +19,7 @@ Result = TypeVar("Result")
 
 
 class Ahead:
-    """Does independent pieces of work ahead of their use in so many threads; in one, each when it is used.
+    """Does independent pieces of work ahead of their use in a number of threads; in one, each when it is used.
 
     Attributes
     ----------
@@ -32,9 +32,9 @@ class Ahead:
         self._pool = ThreadPoolExecutor(threads, "roadgeo-search") if threads > 1 else None
 
     def map(self, work: Callable[[Item], Result], items: Iterable[Item]) -> Iterator[Result]:
-        """Yield what comes of each item, in order; begun for no more than `threads` items beyond those that were used.
+        """Yield the result of each item, in order; begun for no more than `threads` items beyond those that were used.
 
-        What was begun in vain is dropped.
+        Unused results are dropped.
         """
         if self._pool is None:
             yield from map(work, items)
@@ -52,7 +52,7 @@ class Ahead:
                 one.cancel()
 
     def close(self) -> None:
-        """End the threads; what they still do is dropped when it is done."""
+        """End the threads; unfinished results are dropped."""
         if self._pool is not None:
             self._pool.shutdown(wait=False, cancel_futures=True)
 

@@ -22,18 +22,18 @@ from roadgeo.matching.scene import Scene
 
 __all__ = ["between_carriageways", "refine_between", "weight_on_roads"]
 
-#: Roads so far apart, metres, may be one on the map, if it has one road for both: nearest points, seen from the two,
+#: Roads at these distances, metres, may be one on the map, if it has one for both: nearest points, seen from the two,
 #: that lie within this part of how far they are apart.
 _APART_M, _ONE = (3.0, 30.0), 0.35
 #: The nearest point beside one lies within half the way to the next along the road, or a little more.
 _BESIDE = 0.55
-#: Intersections within so many of these ways are of such a road: the map has them in the middle too.
+#: Intersections within this multiple of that distance are of such a road: the map has them in the middle too.
 _NEAR = 2.0
 #: A smaller share of the points does not bend a fit.
 _FEW = 0.03
-#: Where the middle lies follows from the fit, and the fit from it: first from about so many points, then from all.
+#: The middle depends on the fit, and the fit on the middle: first about this many points are used, then all.
 _ROUNDS = (200, None)
-#: Points within so many standard deviations of a road lie on it.
+#: Points within this many standard deviations of a road lie on it.
 _ON_ROADS = 4.0
 
 

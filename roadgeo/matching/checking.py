@@ -30,7 +30,7 @@ _NO_SEEDS: IntArray = np.array([], np.int64)
 
 @dataclass(frozen=True)
 class CheckOptions:
-    """What counts as right, and as beyond doubt.
+    """Thresholds of a right place, and of certainty.
 
     Attributes
     ----------
@@ -40,15 +40,15 @@ class CheckOptions:
         Log10 odds that the best place must have against each other place nearby, and where it is the given one: of a
         dozen places that fit by chance, the best is seldom that.
     min_chi2 : float
-        What is off must differ from nothing by this: 18.5 is met by chance once in 1000 with 4 degrees of freedom.
+        Chi-squared of a displacement that counts as off: 18.5 is met by chance once in 1000 with 4 degrees of freedom.
     max_sigma_m : float
-        Where the frame's place is less sure than this, nothing is said.
+        A frame whose place is less certain than this is not judged.
     min_roads_m : float
         Length of road that mask and map must each show.
     max_drift_m : float
         Refinement that moves the corners by more than this has lost its way.
     twin_m : float
-        Half of what lies between the lines of a dual carriageway, up to 1.8 times as much.
+        Half the distance between the lines of a dual carriageway, up to 1.8 times as much.
     piece_m : float
         Roads agree or not over about this length; pieces are independent.
     perspective_sigma : float
@@ -72,7 +72,7 @@ class CheckOptions:
 
 @dataclass(frozen=True)
 class Checked:
-    """What became of a given place.
+    """The result for a given place.
 
     Attributes
     ----------
@@ -121,7 +121,7 @@ def check_place(start: FloatArray, scene: Scene, index: ReferenceIndex, options:
 
 @dataclass(frozen=True)
 class _Place:
-    """A place, how well each piece of the frame agrees there, and what refined it, where that could be done."""
+    """A place, the agreement of each piece of the frame there, and its refinement, where that was possible."""
 
     matrix: FloatArray
     pieces: FloatArray
@@ -130,7 +130,7 @@ class _Place:
 
 
 class _Judge:
-    """Refines places of one scene and tells how well they agree."""
+    """Refines places of one scene and measures their agreement."""
 
     def __init__(self, scene: Scene, index: ReferenceIndex, start: FloatArray, options: CheckOptions) -> None:
         self.scene, self.index, self.start, self.options = scene, index, start, options
@@ -234,7 +234,7 @@ def _judge_best(judge: _Judge, places: Sequence[_Place]) -> Checked:
         float(np.mean(judge.pieces(judge.start))),
         best.matched,
     )
-    # What follows from how far it lies from where it was said to be.
+    # Consequences of the distance from the claimed place.
     off, sigma = found.over(judge.corners), found.sigma_over(judge.corners)
     said = f"off by {off:.1f} ± {sigma:.1f} m"
     agrees = off <= options.tolerance_m

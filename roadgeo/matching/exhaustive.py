@@ -1,7 +1,7 @@
 """Proposals where heading and scale are roughly known: the roads seen are laid everywhere on the map.
 
 Query and map are drawn on a coarse raster, and correlated by FFT, for each of a few turns and scales: no intersection
-need be intact. How well they agree is told by the Dice coefficient of what both show, 2 |A and B| / (|A| + |B|), on the
+need be intact. Their agreement is the Dice coefficient of the roads of both, 2 |A and B| / (|A| + |B|), on the
 ground that the query observed; roads count by the squared cosine between their directions.
 """
 
@@ -41,7 +41,7 @@ class ExhaustiveOptions:
     most_cells : float
         Cells times turns and scales that are few enough: a larger map is not looked at.
     n_kept : int
-        So many places are followed.
+        Number of places that are followed.
     apart_m : float
         Places nearer than this to a better one are the same.
     """
@@ -123,7 +123,7 @@ def _spread(center: float, off: float, step: float) -> FloatArray:
 
 
 def _similarity(scene: Scene, x: float, y: float, scale: float, turn: float) -> FloatArray:
-    """Return the homography (3, 3) that lays the frame's middle on x, y, its up turned clockwise by so many radians."""
+    """Return the homography (3, 3) that lays the frame's middle on x, y, its up turned clockwise by `turn`, radians."""
     c, s = scale * math.cos(turn), scale * math.sin(turn)
     linear = np.array([[c, s], [-s, c]])
     return np.vstack((np.column_stack((linear, (x, y) - linear @ scene.center)), (0.0, 0.0, 1.0)))

@@ -31,7 +31,7 @@ class GrowOptions:
     max_scale_ratio : float
         Away from the middle of a tilted frame the ground sampling may differ from that at the middle by this factor.
     screen_points, screen_radius_m, screen_radius_px, screen_share
-        Of so many road points near the anchor, this share must lie within these radii of roads of the map.
+        Of this number of road points near the anchor, this share must lie within these radii of roads of the map.
     max_screened, max_grown, max_verified : int
         Bounds of one anchor's work: proposals screened, grown, and grown ones scored.
     sigma_m, sigma_px, radius_m, radius_px

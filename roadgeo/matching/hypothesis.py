@@ -1,4 +1,4 @@
-"""A hypothesis: a homography that grew from proposals, and what came of it."""
+"""A hypothesis: a homography that grew from proposals, and its results."""
 
 from __future__ import annotations
 
@@ -20,14 +20,14 @@ __all__ = ["MINIMAL", "Hypothesis", "Lead", "Spot"]
 #: Matches that determine a homography; that many seeds are excluded from the evidence.
 MINIMAL = 4
 
-#: What led to a hypothesis: number of the stage, and intersection of the query.
+#: Origin of a hypothesis: number of the stage, and intersection of the query.
 Lead: TypeAlias = tuple[int, int]
 
 
 class Spot(NamedTuple):
     """Where the middle of a frame lies by a hypothesis.
 
-    `x`, `y`: plane metres; `reach_m`: what lies nearer means the same place, 50 m or a twentieth of the frame's size;
+    `x`, `y`: plane metres; `reach_m`: nearer middles mean the same place, 50 m or a twentieth of the frame's size;
     `matrix`, `laid`: the homographies that it was computed of, before and after refinement.
     """
 
@@ -40,11 +40,11 @@ class Spot(NamedTuple):
 
 @dataclass
 class Hypothesis:
-    """A grown hypothesis and what came of it.
+    """A grown hypothesis and its results.
 
     `by_roads`: it grew by roads over the whole frame; `leads`: the intersections of the query that proposed it, each
-    with the number of the stage in which it did; `log10_likelihood`, `nearby`: what it explains, and what the best
-    place nearby does (see `evidence`); `n_tried`: places tried when it was scored; `fault`: the camera's last
+    with the number of the stage in which it did; `log10_likelihood`, `nearby`: that of the place, and that of the best
+    place nearby (see `evidence`); `n_tried`: places tried when it was scored; `fault`: the camera's last
     objection, None where it had none; `lens`: how it fits when it is grown anew behind a lens.
     """
 
@@ -83,5 +83,5 @@ class Hypothesis:
 
     @property
     def n_found(self) -> int:
-        """So many intersections of the query proposed it."""
+        """Number of intersections of the query that proposed it."""
         return len(self.leads)

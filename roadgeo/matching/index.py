@@ -39,12 +39,12 @@ __all__ = [
     "unpack_tangents",
 ]
 
-#: Buckets of roads are so many times narrower than those of intersections: roads are looked up some 20 m around.
+#: Factor by which buckets of roads are narrower than those of intersections: roads are looked up some 20 m around.
 _FINER = 2
 #: Seed of the order of the table's entries within a cell.
 _SHUFFLE_SEED = 7
 
-#: What an index from a stranger may hold: the kernels sample segments every few metres, in each bucket that lists them.
+#: Limits of an index from a stranger: the kernels sample segments every few metres, in each bucket that lists them.
 _MAX_DISTANCE_M = 5e7
 _MAX_SEGMENT_M, _MAX_MEAN_SEGMENT_M = 1e6, 1e4
 
@@ -64,7 +64,7 @@ class IndexOptions:
     min_shape : float
         Triangles thinner than this (twice the area over the longest side squared) carry no stable code.
     codes_per_vertex : int
-        At most so many pairs of tangents are coded at a vertex with three tangents or more.
+        Most pairs of tangents that are coded at a vertex with three tangents or more.
     min_bucket_m : float
         Least size of the grid's buckets.
     simplify_m : float
@@ -87,7 +87,7 @@ class ReferenceIndex:
     Attributes
     ----------
     meta : mapping
-        Plain values: name, crs, origin, grid, shape, options, counts and what the network's own `meta` holds.
+        Plain values: name, crs, origin, grid, shape, options, counts and the content of the network's own `meta`.
     xy : (N, 2) float64
         Intersections in plane metres, sorted by bucket.
     branches : (N, R, 2) int8
@@ -127,12 +127,12 @@ class ReferenceIndex:
         return len(self.xy)
 
     def __repr__(self) -> str:
-        """Say in one line what it is."""
+        """Describe the index in one line."""
         return f"<ReferenceIndex {self.name!r}: {len(self):,} intersections>"
 
     @property
     def name(self) -> str:
-        """What the user calls the reference."""
+        """The reference's name for the user."""
         return str(self.meta.get("name", ""))
 
     @property
@@ -188,7 +188,7 @@ class ReferenceIndex:
     def within(self, middle: FloatArray, reach_m: float) -> FloatArray:
         """Return (M, 2) the intersections less than `reach_m` from `middle`, (2,) plane metres, in both x and y.
 
-        Only the buckets there are looked at: what it costs does not grow with the map.
+        Only the buckets there are read: the cost does not grow with the map.
         """
         x0, y0, size = self.grid
         columns, rows = self.shape
@@ -213,7 +213,7 @@ class ReferenceIndex:
 
     @classmethod
     def from_parts(cls, meta: Mapping[str, Any], arrays: Mapping[str, AnyArray], path: str = "") -> ReferenceIndex:
-        """Rebuild from what a file held, after checking every shape, type and integer reference.
+        """Rebuild from the content of a file, after checking every shape, type and integer reference.
 
         Raises
         ------
@@ -396,7 +396,7 @@ def _tabulate(
 
 
 def _place_in_table(cells: Int32Array, entries: AnyArray) -> Int32Array:
-    """Return what entries are sorted by: their cells, and within those their sides (see `kernels.triple_codes`)."""
+    """Return the sort key of entries: their cells, and within those their sides (see `kernels.triple_codes`)."""
     sides = ((entries >> np.uint64(24)) & np.uint64(1023)).astype(np.int32)
     return np.asarray(cells * np.int32(1024) + sides, np.int32)
 

@@ -1,4 +1,4 @@
-"""What one search has tried, on all of its parts together."""
+"""Counts of the attempts of one search, on all of its parts together."""
 
 from __future__ import annotations
 
@@ -14,7 +14,7 @@ class Ledger:
     Attributes
     ----------
     n_reference : int
-        Intersections of all parts: what is tried on them is bounded as on one map of that size.
+        Intersections of all parts: attempts on them are bounded as on one map of that size.
     n_tried, beside : int, float
         Those, and how many are tried on the whole map for each that is tried here (see `LocateOptions.elsewhere`).
     n_by_triples : int

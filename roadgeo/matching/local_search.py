@@ -2,7 +2,7 @@
 
 The roads around the frame are drawn on a coarse raster, one layer for each of 16 directions. A road point of the query
 reads the layer of its own direction: the layer around its place is the answer for all shifts at once, and the sum over
-all points tells how many of them lie on roads under each shift (a generalised Hough transform; Ballard 1981). Turns are
+all points counts those on roads under each shift (a generalised Hough transform; Ballard 1981). Turns are
 tried one by one.
 """
 
@@ -39,7 +39,7 @@ class LocalSearchOptions:
     cell_m : float
         Side of the raster's cells, and step of the shifts.
     road_m : float
-        Width of the roads that are drawn: what a step of shift and of turn moves a point by must fit in.
+        Width of the roads that are drawn: the motion of a point by a step of shift and of turn must fit in.
     direction_deg : float
         Directions within this of a road's run along it.
     max_points : int

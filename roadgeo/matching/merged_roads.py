@@ -1,4 +1,4 @@
-"""Where roads of a mask have merged: what looks like one wide road may be the two carriageways of a motorway.
+"""Where roads of a mask have merged: one wide road may be the two carriageways of a motorway.
 
 The line that is traced of them runs between the two of the map. Were it laid on either, the frame would be off by half
 their distance; so a fit does not rest on it where it has others.
@@ -19,10 +19,10 @@ from roadgeo.matching.scene import Scene
 
 __all__ = ["find_merged", "mark_merged", "nearest_of", "points_on_map", "roads_beside", "without_merged"]
 
-#: Roads have merged where a mask is so many times wider than usual, and by so many pixels, at most of so many points in
-#: a row: at crossings it is wide as well, but not for long.
+#: Roads have merged where a mask is wider than usual by this factor, and by this many pixels, at most for a number of
+#: points in a row: at crossings it is wide as well, but not for long.
 _MERGED, _LEAST_MORE, _IN_A_ROW = 1.6, 4.0, 5
-#: Intersections belong to merged roads within so many road widths of their points.
+#: Intersections belong to merged roads within this many road widths of their points.
 _NEAR_WIDTHS = 2.0
 #: The map has two roads where one lies beside a point, 3 to 23 metres from it.
 _BESIDE_M, _GIVE_OR_TAKE_M = 13.0, 10.0
@@ -31,14 +31,14 @@ _MOST = 0.5
 
 
 def mark_merged(scene: Scene, roads: BoolArray, width: float) -> Scene:
-    """Return the scene of a mask, its roads (H, W) usually `width` pixels wide, with what is known of merged roads."""
+    """Return the scene of a mask, its roads (H, W) usually `width` pixels wide, with its merged roads marked."""
     merged = find_merged(roads, scene.points, scene.directions, width)
     xy, away = scene.intersections.xy, _NEAR_WIDTHS * width
     return replace(scene, merged=merged, merged_at=nearest_of(xy, scene.points, np.flatnonzero(merged), away))
 
 
 def find_merged(roads: BoolArray, points: FloatArray, directions: FloatArray, width: float) -> BoolArray:
-    """Tell at which points (S, 2) of the query plane a mask's roads (H, W) are so wide that two may have merged.
+    """Return at which points (S, 2) of the query plane a mask's roads (H, W) are so wide that two may have merged.
 
     `directions` (S, 2) run along the road; `width` is the usual one, pixels, where not most have merged.
     """
@@ -94,7 +94,7 @@ def without_merged(
 def roads_beside(
     matrix: FloatArray, scene: Scene, index: ReferenceIndex, beside_m: float, give_or_take_m: float, max_turn_deg: float
 ) -> tuple[BoolArray, BoolArray]:
-    """Tell which road points (S,) have a road of the map that runs their way so far to the right, and to the left."""
+    """Return which road points (S,) have a road of the map beside them that runs their way, to the right and left."""
     points, along, _ = points_on_map(matrix, scene)
     min_cos, roads = math.cos(math.radians(max_turn_deg)), index.road_buckets
 

@@ -18,14 +18,14 @@ from roadgeo.matching.refinement import spacing_m
 
 __all__ = ["covariance_of_doubt"]
 
-#: Another road lies so far beside the one that was met, metres, and runs its way to so many degrees.
+#: Another road lies at this distance beside the matched one, metres, and runs its way within this angle, degrees.
 _BESIDE_M, _GIVE_OR_TAKE_M, _MAX_TURN_DEG = 13.0, 9.0, 12.0
-#: The mask shows it where it has a road point within so many metres across, and along: or so many steps between points.
+#: The mask shows it where it has a road point within these distances, metres, across and along (or steps of points).
 _SHOWN_M, _ALONG_M, _ALONG_STEPS = 5.0, 8.0, 1.2
-#: Roads are taken to be off together that run the same way, of so many, and have the other road on the same side.
+#: Roads are assumed to be off together that run the same one of these ways and have the other road on the same side.
 _WAYS, _FEWEST = 4, 3
 #: How likely such roads are the other ones; less where the rest of the frame stands against it: half as likely where
-#: the sum of its squares would grow by so many. Fitted to the corners of training masks.
+#: the sum of its squares would grow by this amount. Fitted to the corners of training masks.
 _LIKELY, _AGAINST = 0.1, 50.0
 
 
@@ -38,7 +38,7 @@ def covariance_of_doubt(
     rows: FloatArray,
     weights: FloatArray,
 ) -> FloatArray:
-    """Return what the parameters' covariance (P, P) gains by doubt which roads were met.
+    """Return the addition to the parameters' covariance (P, P) by doubt about which roads were matched.
 
     Parameters
     ----------

@@ -1,4 +1,4 @@
-"""What is searched: whole references and shards of larger ones, opened when they are needed."""
+"""The parts of a search: whole references and shards of larger ones, opened when they are needed."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""What follows from a fit: where the frame lies on Earth, and how it was seen."""
+"""Consequences of a fit: where the frame lies on Earth, and how it was seen."""
 
 from __future__ import annotations
 
@@ -38,7 +38,7 @@ def place_frame(location: Location, query: Query, fit: Fit, options: MatchOption
     homography = plane.to_crs_matrix() @ level.matrix @ PIXEL_TO_PLANE
     ground = Homography(homography).everywhere(np.vstack([frame.corners, frame.center]))
     lonlat = to_lonlat(plane.crs, ground)
-    # How the camera looked at it, and which intersections say so.
+    # The view of the camera, and the intersections that support it.
     focal_px = options.camera.focal_px
     camera = pose(level.matrix, scene.size, focal_px)
     north = grid_north(plane, ground[4])
@@ -72,7 +72,7 @@ def place_frame(location: Location, query: Query, fit: Fit, options: MatchOption
 
 
 def _level(fit: Fit, query: Query, options: VerifyOptions) -> Fit:
-    """Return a fit as a camera sees it that looks straight down, unless the roads say that it was tilted."""
+    """Return a fit restricted to a camera that looks straight down, unless the roads are inconsistent with it."""
     if fit.corner_covariance_m2 is None or fit.lens_k1:
         return fit
     scene = query.scene

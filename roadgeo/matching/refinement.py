@@ -51,11 +51,11 @@ class RefineOptions:
     few_matches : int
         With fewer matches the start is held: they alone would not determine a homography, and it would be forgotten.
     most_unsure : float
-        Without the points of merged roads a fit's corners may be so many times less sure.
+        Factor by which a fit's corners may be less certain without the points of merged roads.
     least_support : float
         Matches take part when at least this share of their neighbours are matched.
     n_cells, least_share : int, float
-        The frame is divided into so many cells a side; a cell takes part when at least this share of its road points
+        The frame is divided into this many cells a side; a cell takes part when at least this share of its road points
         meet roads.
     correlation_m : float
         Errors of the map and of the mask keep their sign over about this length of road: points closer than that are no
@@ -161,7 +161,7 @@ def corner_covariance(
 
 
 def scatter_m(rms: float, sigma_m: float, options: RefineOptions) -> float:
-    """Return what road points of this rms and standard deviation count as in the covariance of a fit, metres."""
+    """Return the scatter in the covariance of a fit of road points of this rms and standard deviation, metres."""
     return rms * max(1.0, rms / (options.usual_rms * sigma_m))
 
 
@@ -213,7 +213,7 @@ def refine(
     matched : (N,) int
         Map intersection of each query intersection, or -1.
     n_points : int, optional
-        Use about so many of the scene's road points.
+        Use about this number of the scene's road points.
     held : bool
         Hold the homography near its start also where there are matches enough: it is right all over the frame.
     """

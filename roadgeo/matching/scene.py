@@ -1,4 +1,4 @@
-"""The query as search, verification and refinement see it: intersections, road points, and what was observed."""
+"""The query for search, verification and refinement: intersections, road points, and the observed ground."""
 
 from __future__ import annotations
 
@@ -57,7 +57,7 @@ class Scene:
     points, directions : (S, 2) float64
         Points spread evenly along the roads, and unit vectors along the road.
     weights : (S,) float64
-        What each point counts where roads are compared: its probability of road, 1 where the mask tells none.
+        Weight of each point where roads are compared: its probability of road, 1 where the mask has none.
     dense_points, dense_directions : (D, 2) float64
         The same, closer together: enough of them within a few roads of any place.
     road_length_px : float
@@ -72,7 +72,7 @@ class Scene:
     road_width_px : float
         Usual width of the mask's roads; 0: not known.
     merged : (S,) bool or None
-        Points where the mask is so much wider than usual that two roads may have merged, such as the carriageways of a
+        Points where the mask is wider than usual, as where two roads may have merged, such as the carriageways of a
         motorway: the line between them is neither's. None: not known.
     merged_at : (N,) int64 or None
         Of each intersection the nearest such point, within two road widths; -1: none.
@@ -186,7 +186,7 @@ def prepare_scene(
     spacing = max(options.min_point_spacing_px, length / options.max_road_points)
     points, directions = sample_roads(graph, spacing)
     dense = sample_roads(graph, max(options.min_dense_spacing_px, length / options.max_dense_points))
-    # how far each cell of the frame is from a road; drawn from the graph, for what is thinner than a cell counts too
+    # distance of each cell of the frame to a road; drawn from the graph, so that roads thinner than a cell count too
     scale = max(1.0, max(size) / options.field_cells)
     cells = (int(np.ceil(height / scale)), int(np.ceil(width / scale)))
     canvas = np.full(cells, 255, np.uint8)

@@ -26,7 +26,7 @@ class Source(Protocol):
         min_ratio: float,
         ahead: Ahead = ALONE,
     ) -> Iterator[list[Proposals]]:
-        """Yield what one query intersection after another may be on each index, the most promising first.
+        """Yield proposals for one query intersection after another on each index, the most promising first.
 
         `scale` = (least, greatest) root of the determinant of a proposed map, metres per pixel; `min_ratio` is the
         least ratio of its singular values. `ahead` looks for the next intersections meanwhile.

@@ -48,11 +48,11 @@ class TripleOptions:
     Attributes
     ----------
     n_neighbours : int
-        Triples are formed with pairs of so many nearest neighbours of the anchor.
+        Triples are formed with pairs of this number of nearest neighbours of the anchor.
     min_shape : float
         Thinner triangles are left out (see `kernels.triple_codes.orient`); the map's may be thinner still.
     codes_per_vertex : int
-        Of an intersection with three tangents or more, so many pairs of tangents are looked up.
+        Of an intersection with three tangents or more, this number of pairs of tangents is looked up.
     angle_tolerance_deg, ray_tolerance_deg : float
         How far tangents may turn in the equilateral frame, and branches in the map's.
     affine_tolerance : float
@@ -64,7 +64,7 @@ class TripleOptions:
     max_weighed : int
         Of more intersections, evenly chosen ones may become anchors: to weigh all would take longer than to use some.
     max_hits, max_compared : int
-        An anchor's triples are looked up, the rarest first, until so many were found or compared: on a map of 15,000
+        An anchor's triples are looked up, the rarest first, until this number is found or compared: on a map of 15,000
         intersections, and on a larger one more by the root of the ratio.
     """
 
@@ -80,14 +80,14 @@ class TripleOptions:
     max_compared: int = 400_000
 
     def bounds(self, n_reference: int, share: float = 1.0) -> tuple[int, int]:
-        """Return `max_hits` and `max_compared` for a share of a map of so many intersections."""
+        """Return `max_hits` and `max_compared` for a share of a map of this number of intersections."""
         scale = share * larger(n_reference)
         return max(int(self.max_hits * scale), 1), int(self.max_compared * scale)
 
 
 @dataclass(frozen=True)
 class Proposals:
-    """What one anchor proposes. Dimensions: M proposals, K neighbour slots.
+    """The proposals of one anchor. Dimensions: M proposals, K neighbour slots.
 
     Attributes
     ----------
@@ -131,10 +131,10 @@ def propose(
     options: TripleOptions,
     ahead: Ahead = ALONE,
 ) -> Iterator[list[Proposals]]:
-    """Yield, for one anchor after another (see `TripleOptions.spread`), what it proposes on each of the indexes.
+    """Yield, for one anchor after another (see `TripleOptions.spread`), its proposals on each of the indexes.
 
-    Which anchors and triples come first, and how much is compared, is told by all indexes together, as if they were
-    one; each gets a share of the bounds that grows with what it has to compare.
+    All indexes together determine which anchors and triples come first, and how much is compared, as if they were
+    one; each gets a share of the bounds that grows with its number of entries to compare.
     """
     query, branches = scene.intersections, scene.branches
     neighbours = np.ascontiguousarray(scene.neighbours[:, : options.n_neighbours])
@@ -201,7 +201,7 @@ def _count_alike(seen: TripleQuery, anchors: IntArray, options: TripleOptions, s
 
 
 def _shares(seen: TripleQuery, anchor: int, indexes: Sequence[ReferenceIndex], options: TripleOptions) -> FloatArray:
-    """Return how to share out an anchor's work: half of it by size, half by what there is to compare."""
+    """Return how to share out an anchor's work: half of it by size, half by the entries to compare."""
     if len(indexes) == 1:
         return np.ones(1)
     one = np.array([anchor])
@@ -220,7 +220,7 @@ def _look_up(
     hits: Hits,
     options: TripleOptions,
 ) -> Proposals:
-    """Look an anchor's triples up in one index; return what they propose there, the best placed first."""
+    """Look an anchor's triples up in one index; return their proposals there, the best placed first."""
     max_hits, max_compared = bounds
     ids, affine = hits = Hits(hits.ids[:max_hits], hits.affine[:max_hits])
     n_hits, n_compared = look_up_each(seen, anchor, slots, max_compared, index.triple_map, limits, hits)

@@ -1,6 +1,6 @@
 """How much agrees at a place: intersections, roads of the query on roads of the map, and roads of the map it shows.
 
-These shares tell how a fit grows and what is reported; what a place is worth is told by `evidence`.
+These shares control growth and are reported; `evidence` compares places.
 """
 
 from __future__ import annotations

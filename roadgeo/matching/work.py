@@ -1,4 +1,4 @@
-"""How much work a search has done, told by counts: the same on every machine, busy or idle."""
+"""The work of a search, measured by counts: the same on every machine, busy or idle."""
 
 from __future__ import annotations
 
@@ -18,7 +18,7 @@ _SAMPLE, _TESTED, _COUNTED_POINT = 0.35e-3, 0.1e-6, 0.04e-6
 
 
 class Work(NamedTuple):
-    """Counts of what a search did.
+    """Counts of a search.
 
     Attributes
     ----------
@@ -43,13 +43,13 @@ class Work(NamedTuple):
 
     @property
     def seconds(self) -> float:
-        """What it takes one core of a usual machine."""
+        """The time on one core of a usual machine."""
         tried = _ROUND * self.rounds + _TUPLE * self.tuples + _PLACE * self.places + _GROWN * self.grown
         return tried + (_VERIFIED + _VERIFIED_POINT * self.points) * self.verified
 
 
 class PairWork(NamedTuple):
-    """Counts of what the paper's search did.
+    """Counts of the paper's search.
 
     Attributes
     ----------
@@ -70,5 +70,5 @@ class PairWork(NamedTuple):
 
     @property
     def seconds(self) -> float:
-        """What it takes one core of a usual machine."""
+        """The time on one core of a usual machine."""
         return _SAMPLE * self.samples + _TESTED * self.tested + _COUNTED_POINT * self.points * self.hypotheses

@@ -67,7 +67,7 @@ class PairOptions:
     max_tuple_intersections : int
         Of larger queries, this many intersections at random form the tuples; all of them still judge.
     work_limit_s : float
-        The search stops after so much work: seconds of a usual machine, counted, not measured.
+        The search stops after this amount of work: seconds of a usual machine, counted, not measured.
     time_limit_s : float
         The same after this time by the clock: the last resort.
     """
@@ -224,7 +224,7 @@ def _fours(n: int) -> tuple[IntArray, IntArray]:
 
 
 def well_fitted(index: ReferenceIndex) -> BoolArray:
-    """Tell which intersections (N,) have branches that are all long and straight enough (section 4.2)."""
+    """Return which intersections (N,) have branches that are all long and straight enough (section 4.2)."""
     vectors = index.branches.astype(float) / 127.0
     at, column = np.nonzero(vectors.any(axis=2))
     ahead = vectors[at, column]
@@ -235,7 +235,7 @@ def well_fitted(index: ReferenceIndex) -> BoolArray:
     road_residuals(points, along, np.full(len(points), _REACH_M), _MIN_COS, index.road_buckets, out)
     across = np.column_stack([-along[:, 1], along[:, 0]])
     offsets = (out[:, 0] * (out[:, 1:] * across).sum(axis=1)).reshape(-1, len(steps))
-    # What is left beside the line fitted to a branch, which need not meet the intersection; NaN: it is too short.
+    # Residuals of the line fitted to a branch, which need not meet the intersection; NaN: it is too short.
     basis = np.linalg.qr(np.column_stack([np.ones(len(steps)), steps]))[0]
     error = np.abs(offsets - offsets @ basis @ basis.T).mean(axis=1)
     good = np.ones(len(index), bool)
