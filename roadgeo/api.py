@@ -199,7 +199,7 @@ def build_reference(
     MissingPackageError
         A package of the extra `maps` is not installed.
     """
-    from roadgeo.sources.held_roads import choose_roads
+    from roadgeo.sources.roads import choose_roads
     from roadgeo.workflows import build_reference as build
 
     where = None if path is None else Path(path)

@@ -41,6 +41,7 @@ _EXTRAS = {
     "pymavlink": "mavlink",
     "pyogrio": "maps",
     "python_multipart": "serve",
+    "requests": "maps",
     "scipy": "track",
     "shapely": "maps",
     "starlette": "serve",

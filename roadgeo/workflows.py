@@ -74,7 +74,7 @@ def build_reference(
         It cannot be written.
     """
     from roadgeo.reference.network_file import as_stored
-    from roadgeo.sources.held_roads import choose_roads
+    from roadgeo.sources.roads import choose_roads
 
     chosen = choose_roads(roads, kinds, tunnels, attribution, say)
     options = options or BuildOptions()

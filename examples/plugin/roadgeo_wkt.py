@@ -6,14 +6,13 @@ import cv2
 import shapely
 
 from roadgeo.outputs.registry import Output
-from roadgeo.sources.roads import Roads, project_lines
+from roadgeo.sources.roads import choose_roads
 
 
 def read_wkt(where, say=print):
     """Roads from a text file: on each line one LINESTRING in degrees."""
     say(f"reading {where}")
-    lines, plane = project_lines(shapely.from_wkt(Path(where).read_text().splitlines()), "EPSG:4326")
-    return Roads(lines, plane)
+    return choose_roads(shapely.from_wkt(Path(where).read_text().splitlines()), crs="EPSG:4326")
 
 
 def find_yellow(picture):

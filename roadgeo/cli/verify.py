@@ -160,6 +160,7 @@ def _settings(given: dict[str, Any], others: list[str], jobs: int) -> VerifyRun:
 def _correct(one: Verified, image: Path, stem: Path, fix: bool, in_place: bool) -> list[Path]:
     """Write the corrected files of an image that is off, as far as they are asked for."""
     from roadgeo.outputs.verification_files import write_fixed, write_in_place, write_points
+    from roadgeo.storage.orientation import read_orientation
 
     if one.corrected is None:
         return []
@@ -167,7 +168,7 @@ def _correct(one: Verified, image: Path, stem: Path, fix: bool, in_place: bool) 
     if fix:
         files = [stem.with_name(f"{stem.name}_fixed{ending}") for ending in (".tif", ".points")]
         write_fixed(image, files[0], one.corrected)
-        write_points(files[1], one.corrected.of_stored(image))
+        write_points(files[1], one.corrected.of_stored(read_orientation(image)))
     if in_place:
         write_in_place(image, one.corrected)
         files.append(image)

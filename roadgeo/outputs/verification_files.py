@@ -23,9 +23,10 @@ from roadgeo.errors import OutputError
 from roadgeo.outputs.names import bare_names, table_cell, without_folders
 from roadgeo.storage.crs import known_crs
 from roadgeo.storage.files import replacing, write_text
+from roadgeo.storage.orientation import read_orientation
 
 if TYPE_CHECKING:
-    from roadgeo.sources.georeference import Georeference
+    from roadgeo.geometry.georeference import Georeference
 
 __all__ = ["editor_offset", "id_fragment", "write_fixed", "write_in_place", "write_josm", "write_points", "write_table"]
 
@@ -129,7 +130,7 @@ def write_fixed(image: Path, path: Path, place: Georeference) -> None:
     with replacing(path) as temporary:
         with open_raster(image, upright=False) as source:
             rasterio.shutil.copy(source, temporary, driver="GTiff", compress="DEFLATE", tiled=True, bigtiff="IF_SAFER")
-        _set_place(temporary, place.of_stored(image))
+        _set_place(temporary, place.of_stored(read_orientation(image)))
 
 
 def write_in_place(image: Path, place: Georeference) -> None:
@@ -146,7 +147,7 @@ def write_in_place(image: Path, place: Georeference) -> None:
         driver = source.driver
     if driver != "GTiff":
         raise OutputError(f"{image}: only GeoTIFFs can be corrected in place; use --fix, which writes one")
-    _set_place(image, place.of_stored(image))
+    _set_place(image, place.of_stored(read_orientation(image)))
 
 
 def _set_place(path: Path, place: Georeference) -> None:

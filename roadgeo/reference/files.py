@@ -46,6 +46,7 @@ __all__ = [
     "ReferencePaths",
     "check_reference",
     "describe_reference",
+    "identities",
     "open_reference",
     "rebuild_index",
     "reference_digest",
@@ -151,13 +152,13 @@ def open_reference(
     paths = reference_paths(path)
     failed, patience = None, time.monotonic() + _PATIENCE_S
     while True:
-        before = _identities(paths)
+        before = identities(paths.geopackage)
         try:
             return _open(paths, rebuild)
         except IndexFormatError as error:
             # Another process may have replaced the reference meanwhile: half the old one was read, half the new.
             # Equal files before and after are no proof, for an index may have come and gone between; twice is.
-            if _identities(paths) == before == failed:
+            if identities(paths.geopackage) == before == failed:
                 # But a third may have built the old index beside the new GeoPackage, which a busy writer will replace.
                 if not isinstance(error, _StaleError) or time.monotonic() > patience:
                     raise
@@ -188,13 +189,13 @@ def rebuild_index(path: str | os.PathLike[str], build: Callable[[RoadNetwork], I
         The index cannot be written.
     """
     paths = reference_paths(path)
-    before = _identities(paths)
+    before = identities(paths.geopackage)
     network = read_network(paths.geopackage)
     meta, arrays = build(network)
     with staging(paths.index) as folder:
         staged = folder / paths.index.name
         dump_index(staged, meta, arrays, _about(network, meta))
-        if _identities(paths) != before:
+        if identities(paths.geopackage) != before:
             raise IndexFormatError(f"{paths.geopackage} or its index was replaced meanwhile; try again")
         publish(staged, paths.index)
 
@@ -294,23 +295,24 @@ def check_reference(path: str | os.PathLike[str]) -> list[str]:
 
 def _rebuild(paths: ReferencePaths, rebuild: Callable[[RoadNetwork], IndexParts]) -> IndexParts:
     """Build a missing index, and keep it where that is possible and nobody has written another meanwhile."""
-    before = _identities(paths)
+    before = identities(paths.geopackage)
     network = read_network(paths.geopackage)
-    if _identities(paths) != before:
+    if identities(paths.geopackage) != before:
         raise IndexFormatError(f"{paths.geopackage} was replaced while it was read; try again")
     meta, arrays = rebuild(network)
     # A reference in a read-only folder serves as well; it only costs this time at every opening.
     with contextlib.suppress(OutputError), staging(paths.index) as folder:
         staged = folder / paths.index.name
         dump_index(staged, meta, arrays, _about(network, meta))
-        if _identities(paths) == before:
+        if identities(paths.geopackage) == before:
             paths.index.unlink(missing_ok=True)
             publish(staged, paths.index, replace=False)
     return meta, arrays
 
 
-def _identities(paths: ReferencePaths) -> list[tuple[int, int] | None]:
-    """Return an identity of each file, which changes when it is replaced; None where there is none."""
+def identities(path: str | os.PathLike[str]) -> list[tuple[int, int] | None]:
+    """Return an identity of each file of a reference, which changes when it is replaced; None where there is none."""
+    paths = reference_paths(path)
     found: list[tuple[int, int] | None] = []
     for path in (paths.geopackage, paths.index):
         try:

@@ -25,6 +25,7 @@ from roadgeo.storage.folders import cache_dir
 __all__ = ["fetch_manifest", "fetch_shard", "is_remote"]
 
 _MANIFEST, _SOURCE = "manifest.json", "source.txt"
+_MAX_MANIFEST = 256 << 20
 
 #: Protocols that may be fetched from: web servers, and the object stores of Amazon, Google and Microsoft.
 _PROTOCOLS = ("https", "http", "s3", "gs", "az")
@@ -50,13 +51,15 @@ def fetch_manifest(url: str) -> Path:
     folder = _kept() / name
     with writing(folder):
         folder.mkdir(parents=True, exist_ok=True)
-    _fetch(f"{url}/{_MANIFEST}", folder / _MANIFEST)
+    _fetch(f"{url}/{_MANIFEST}", folder / _MANIFEST, _MAX_MANIFEST)
     write_text(folder / _SOURCE, url)
     return folder
 
 
-def fetch_shard(folder: Path, build: str, name: str) -> bool:
+def fetch_shard(folder: Path, build: str, name: str, most: float) -> bool:
     """Fetch the index of a shard, if the folder is one that `fetch_manifest` returned; return whether it is.
+
+    Of no more bytes than the manifest tells of both its files.
 
     Raises
     ------
@@ -70,7 +73,7 @@ def fetch_shard(folder: Path, build: str, name: str) -> bool:
     target = folder / build / f"{name}.index"
     with writing(target):
         target.parent.mkdir(exist_ok=True)
-    _fetch(f"{source.read_text(encoding='utf-8')}/{build}/{name}.index", target)
+    _fetch(f"{source.read_text(encoding='utf-8')}/{build}/{name}.index", target, most)
     return True
 
 
@@ -79,7 +82,7 @@ def _kept() -> Path:
     return cache_dir() / "shards"
 
 
-def _fetch(url: str, target: Path) -> None:
+def _fetch(url: str, target: Path, most: float) -> None:
     """Copy a file here, whole or not at all: others may be fetching or reading it, too."""
     protocol, _, rest = url.partition("://")
     if protocol.lower() not in _PROTOCOLS or "::" in rest:
@@ -94,9 +97,21 @@ def _fetch(url: str, target: Path) -> None:
         files = fsspec.filesystem(protocol.lower(), **told)
     with staging(target) as folder:
         with _reaching(url):
-            files.get_file(files._strip_protocol(url), str(folder / target.name))
+            files.get_file(files._strip_protocol(url), str(folder / target.name), callback=_at_most(most))
         with writing(target):
             publish(folder / target.name, target)
+
+
+def _at_most(most: float) -> Any:
+    """Return what ends a transfer of more bytes: it is told of the size, and of each part as it comes."""
+    from fsspec.callbacks import Callback
+
+    class AtMost(Callback):  # type: ignore[misc]
+        def call(self, *_args: Any, **_options: Any) -> None:
+            if max(self.size or 0, self.value) > most:
+                raise OSError(f"is of more than the {most:,.0f} bytes that it was said to have")
+
+    return AtMost()
 
 
 @cache

@@ -33,7 +33,8 @@ from roadgeo.geometry.areas import Box, overlap
 from roadgeo.location import Location
 from roadgeo.matching.index import COARSENESS, ReferenceIndex
 from roadgeo.matching.parts import Near, touches
-from roadgeo.reference.files import check_reference, reference_digest, reference_paths
+from roadgeo.reference.files import check_reference, identities, reference_digest, reference_paths
+from roadgeo.reference.network_file import stored_digest
 from roadgeo.reference.remote import fetch_shard
 from roadgeo.reference.spool import Bounds
 from roadgeo.storage.atomic import publish, staging
@@ -252,27 +253,35 @@ class Shard:
 
     @cached_property
     def _index(self) -> ReferenceIndex:
-        from roadgeo.reference.reference import open_whole
-
         paths = reference_paths(self.path)
         if not paths.index.is_file() and not paths.geopackage.is_file():
             self._fetch()
         try:
-            return open_whole(self._checked()).index
+            return self._opened()
         except IndexFormatError:  # what was fetched may have been damaged since
             if not self._fetch():
                 raise
-        return open_whole(self._checked()).index
+        return self._opened()
 
     def _fetch(self) -> bool:
         """Fetch it, if it lies elsewhere; return whether it does."""
-        return fetch_shard(self.path.parent.parent, self.path.parent.name, self.entry.name)
+        return fetch_shard(self.path.parent.parent, self.path.parent.name, self.entry.name, self.entry.bytes)
 
-    def _checked(self) -> Path:
-        """Return where it lies, if it is the one that the manifest names."""
-        if reference_digest(self.path) not in {self.entry.digest, ""}:
-            raise IndexFormatError(f"{self.path}: is not the shard that the manifest names; build the reference again")
-        return self.path
+    def _opened(self) -> ReferenceIndex:
+        """Open it, if it is the one that the manifest names, and was that all the while."""
+        from roadgeo.reference.reference import open_whole
+
+        for _ in range(2):  # an index that is missing is built by opening it
+            before = identities(self.path)
+            index = open_whole(self.path).index
+            digest = reference_digest(self.path) or stored_digest(reference_paths(self.path).geopackage)
+            if digest != self.entry.digest:
+                raise IndexFormatError(
+                    f"{self.path}: is not the shard that the manifest names; build the reference again"
+                )
+            if identities(self.path) == before:
+                return index
+        raise IndexFormatError(f"{self.path}: is replaced again and again; try when that is done")
 
 
 @dataclass(frozen=True)

@@ -14,7 +14,7 @@ import numpy as np
 
 from roadgeo._arrays import AnyArray
 from roadgeo.errors import MaskError
-from roadgeo.sources.thresholds import are_labels
+from roadgeo.roads.thresholds import are_labels
 from roadgeo.storage.orientation import UPRIGHT, turn_upright
 
 __all__ = ["as_file", "read_picture"]

@@ -103,7 +103,7 @@ def _run_together(tasks: Sequence[Task], work: Work[Task, Result], jobs: int) ->
             for future in futures:
                 yield future.result()
         except BaseException:
-            for process in multiprocessing.active_children():
+            for process in list((pool._processes or {}).values()):  # ours alone: a program may have others
                 process.terminate()
             pool.shutdown(cancel_futures=True)
             raise

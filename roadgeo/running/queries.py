@@ -26,6 +26,7 @@ from roadgeo.location import Location, Reason
 from roadgeo.matching.options import LocateOptions
 from roadgeo.plugins import SEGMENTERS, call_plugin
 from roadgeo.reference.reference import AnyReference
+from roadgeo.roads.thresholds import spread_probability
 from roadgeo.running.looks import Later, Locate, Look, Sighting, locate_looks
 from roadgeo.running.mirroring import ask_mirrored
 from roadgeo.running.pictures import as_file
@@ -41,7 +42,6 @@ from roadgeo.sources.segmentation.probability import NODATA, ProbabilityMap, fus
 from roadgeo.sources.segmentation.scales import rank_scales, scale_of, try_scales
 from roadgeo.sources.segmentation.tiling import map_shape, segment
 from roadgeo.sources.streams import QUERY_ENDINGS
-from roadgeo.sources.thresholds import spread_probability
 from roadgeo.workflows import locate
 
 __all__ = ["FirstLook", "QueryOptions", "is_model", "locate_query", "look_once"]

@@ -21,7 +21,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from roadgeo._progress import Say, say_nothing
-from roadgeo.errors import CrsError, RoadgeoError, RoadSourceError
+from roadgeo.errors import RoadgeoError, RoadSourceError
 from roadgeo.geometry.projection import transformer
 from roadgeo.matching.index import build_index
 from roadgeo.reference.index_file import FORMAT_VERSION
@@ -40,7 +40,8 @@ from roadgeo.roads.kinds import MAIN_CLASSES, RoadKind, main_ranks
 from roadgeo.roads.labels import label_roads
 from roadgeo.running.processes import run
 from roadgeo.sources.lines import RoadLines
-from roadgeo.sources.roads import Box, as_text, choose_lines, join_roads, overruled_crs
+from roadgeo.sources.overpass import box_area
+from roadgeo.sources.roads import Box, as_text, choose_lines, join_roads, with_crs
 from roadgeo.sources.streams import list_sources, stream_lines, tell_source
 from roadgeo.storage.atomic import writing
 from roadgeo.storage.crs import known_crs
@@ -214,12 +215,13 @@ def _stream(roads: RoadFiles, folder: Path, options: ShardOptions, crs: str | No
         shutil.rmtree(folder, ignore_errors=True)
         folder.mkdir()
     spool, sources = None, []
+    area = None if roads.bbox is None else box_area(roads.bbox)
     for file in roads.files:
         told: dict[str, Any] = {}
         what = f"reading {file.name}"
         say(what)
         for part in stream_lines(file, roads.layer, advance=lambda share, what=what: say(what, share)):  # type: ignore[misc]
-            chosen = choose_lines(_with_crs(part, roads, file), file.name, roads.which, roads.tunnels, roads.bbox)
+            chosen = choose_lines(with_crs(part, roads.crs, file), file.name, roads.which, roads.tunnels, area)
             _add_up(told, chosen.meta)
             crs = crs or chosen.crs
             if spool is None:
@@ -241,14 +243,6 @@ def _stream(roads: RoadFiles, folder: Path, options: ShardOptions, crs: str | No
     return None if spool is None else _Spooled(str(crs), spool.size, dict(spool.n_segments), meta)
 
 
-def _with_crs(part: RoadLines, roads: RoadFiles, file: Path) -> RoadLines:
-    if roads.crs is not None and part.meta["format"] != "OpenStreetMap":
-        return replace(part, crs=overruled_crs(part.crs, roads.crs, file))
-    if part.crs is None:
-        raise CrsError(f"{file}: says nothing of its CRS; name it, for example --crs EPSG:26986")
-    return part
-
-
 def _add_up(told: dict[str, Any], part: dict[str, Any]) -> None:
     """Add the counts of a part of a source to its totals."""
     for key, value in part.items():
@@ -262,9 +256,8 @@ def _to(lines: RoadLines, crs: str) -> Any:
 
     if lines.crs == crs:
         return lines.lines
-    coords = shapely.get_coordinates(lines.lines)
-    moved = np.stack(transformer(str(lines.crs), crs).transform(coords[:, 0], coords[:, 1]), axis=1)
-    return shapely.set_coordinates(lines.lines.copy(), moved)
+    way = transformer(str(lines.crs), crs)
+    return shapely.transform(lines.lines, lambda xy: np.stack(way.transform(*xy.T), axis=1))
 
 
 def _labels(lines: RoadLines) -> Any:

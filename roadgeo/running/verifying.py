@@ -15,6 +15,7 @@ from roadgeo._arrays import FloatArray
 from roadgeo.errors import CrsError, RoadgeoError
 from roadgeo.geometry.displacement import Displacement
 from roadgeo.geometry.frame import Frame
+from roadgeo.geometry.georeference import Georeference
 from roadgeo.geometry.homography import Homography
 from roadgeo.geometry.mask import PIXEL_TO_PLANE, RoadMask
 from roadgeo.geometry.projection import LocalPlane, grid_north, to_lonlat
@@ -28,7 +29,7 @@ from roadgeo.reference.reference import Reference
 from roadgeo.running.processes import run
 from roadgeo.running.queries import QueryOptions, locate_query
 from roadgeo.running.tasks import Task
-from roadgeo.sources.georeference import Georeference, read_georeference
+from roadgeo.sources.georeference import read_georeference
 
 if TYPE_CHECKING:
     from roadgeo.reference.reference import AnyReference

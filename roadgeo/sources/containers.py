@@ -15,14 +15,15 @@ import numpy as np
 
 from roadgeo._arrays import AnyArray
 from roadgeo.errors import NoRoadsError, RoadSourceError
-from roadgeo.sources.crs_guard import refuse_named_files
-from roadgeo.sources.lines import OSM_ATTRIBUTION, RoadTable, crs_name
+from roadgeo.sources.lines import OSM_ATTRIBUTION, RoadTable, objects
 from roadgeo.sources.osm_files import OSM_ENDINGS, stream_ways
 from roadgeo.sources.schemas import is_known_column, names_kinds
-from roadgeo.sources.unpacking import require_bounded
-from roadgeo.sources.vectors import count_features, first_line, list_fields, list_layers, read_layer
+from roadgeo.storage.crs import crs_name
+from roadgeo.storage.crs_guard import refuse_named_files
+from roadgeo.storage.unpacking import require_bounded
+from roadgeo.storage.vectors import describe_layer, first_line, list_layers, read_layer
 
-__all__ = ["ENDINGS", "graph_table", "stream_tables"]
+__all__ = ["ENDINGS", "held_table", "overpass_table", "stream_tables"]
 
 _PARQUET = (".parquet", ".geoparquet", ".pq")
 _GRAPHS = (".graphml",)
@@ -39,6 +40,10 @@ _DRAWINGS = (".gpx", ".kml", ".kmz")
 #: Names of columns that hold shapes in a Parquet file without `geo`.
 _SHAPES = ("geometry", "geom", "wkb_geometry", "wkb", "the_geom", "shape", "wkt")
 _PEEK = 1000
+_EXPECTED = (
+    "expected a path, a GeoDataFrame, a GeoSeries, a graph of osmnx or momepy, shapely lines, "
+    "or arrays of coordinates of shape (N, 2)"
+)
 
 
 def stream_tables(
@@ -70,7 +75,7 @@ def stream_tables(
     elif name.endswith(_PARQUET):
         yield from _stream_parquet(path, most, advance)
     elif name.endswith(".json") and (elements := _overpass_elements(path)) is not None:
-        yield _overpass_table(elements)
+        yield overpass_table(elements)
     else:
         yield from _stream_gdal(path, layer, most, advance, areas=areas)
 
@@ -85,16 +90,15 @@ def _stream_gdal(
 
     layers = _choose_layers(path, layer, areas=areas)
     for n, one in enumerate(layers):
-        columns = _choose_columns(path, one)
-        total = max(count_features(path, one), 1)
-        for skip in range(0, total, most):
+        total, columns = _choose_columns(path, one)
+        for skip in range(0, max(total, 1), most):
             found = read_layer(path, one, columns, skip, most if total > most else None)
             if found.shapes is None:
                 raise NoRoadsError(f"{path}: layer {one!r} has no geometry, expected lines")
             shapes = shapely.from_wkb(found.shapes, on_invalid="ignore")
             meta = {"format": found.driver, "layer": ", ".join(layers), **found.told}
             yield RoadTable(shapes, crs_name(found.crs), found.columns, meta)
-            advance((n + min(skip + most, total) / total) / len(layers))
+            advance((n + min((skip + most) / max(total, 1), 1.0)) / len(layers))
 
 
 def _choose_layers(path: Path, layer: str | None, *, areas: bool) -> list[str]:
@@ -123,19 +127,19 @@ def _choose_layers(path: Path, layer: str | None, *, areas: bool) -> list[str]:
 
 def _is_filled(path: Path, layer: str) -> bool:
     try:
-        return count_features(path, layer) > 0
+        return describe_layer(path, layer)[0] > 0
     except RoadSourceError:  # a view, which is refused only if it is the one to read
         return True
 
 
-def _choose_columns(path: Path, layer: str) -> list[str]:
-    """Return the columns of a layer that may describe a road: by their names, else by their values."""
-    fields = list_fields(path, layer)
+def _choose_columns(path: Path, layer: str) -> tuple[int, list[str]]:
+    """Return the size of a layer, and its columns that may tell something of a road: by their names, else values."""
+    total, fields = describe_layer(path, layer)
     known = [name for name in fields if is_known_column(name)]
     if not fields or {"highway", "fclass"} & {name.lower() for name in known}:
-        return known
+        return total, known
     head = read_layer(path, layer, fields, 0, _PEEK).columns
-    return known + [name for name, values in head.items() if name not in known and names_kinds(values)]
+    return total, known + [name for name in fields if name not in known and names_kinds(head[name.lower()])]
 
 
 def _listed(names: Sequence[str]) -> str:
@@ -161,7 +165,7 @@ def _stream_parquet(path: Path, most: int, advance: Callable[[float], None]) -> 
             known = [name for name in names if is_known_column(name)]
             wanted, done = known or names, 0
             for batch in file.iter_batches(most, columns=[shape_column, *wanted]):
-                columns = {name: _objects(batch[name]) for name in wanted}
+                columns = {name: objects(batch[name].to_pylist()) for name in wanted}
                 yield RoadTable(_shapes(batch, shape_column, encoding), crs, columns, {"format": "Parquet"})
                 done += len(batch)
                 advance(done / file.metadata.num_rows)
@@ -195,18 +199,12 @@ def _shapes(batch: Any, column: str, encoding: str) -> AnyArray:
     import shapely
 
     if encoding.upper() == "WKB":
-        return np.asarray(shapely.from_wkb(_objects(batch[column]), on_invalid="ignore"))
+        return np.asarray(shapely.from_wkb(batch[column].to_pylist(), on_invalid="ignore"))
     if encoding == "WKT":
-        return np.asarray(shapely.from_wkt(_objects(batch[column]), on_invalid="ignore"))
+        return np.asarray(shapely.from_wkt(batch[column].to_pylist(), on_invalid="ignore"))
     named = pa.field(column, batch.schema.field(column).type, metadata={"ARROW:extension:name": f"geoarrow.{encoding}"})
     table = pa.Table.from_arrays([batch[column]], schema=pa.schema([named]))
     return np.asarray(gpd.GeoDataFrame.from_arrow(table, geometry=column).geometry.to_numpy())
-
-
-def _objects(column: Any) -> AnyArray:
-    found = np.empty(len(column), object)
-    found[:] = column.to_pylist()
-    return found
 
 
 def _require_rows(path: Path) -> None:
@@ -232,13 +230,49 @@ def _read_graphml(path: Path) -> RoadTable:
 
     refuse_named_files(path)
     try:
-        table = graph_table(ox.load_graphml(path))
+        table = _graph_table(ox.load_graphml(path))
     except (ET.ParseError, nx.NetworkXError, KeyError, ValueError, TypeError, AttributeError) as error:
         raise RoadSourceError(f"{path}: not a street network saved by osmnx: {first_line(error)}") from error
     return RoadTable(table.shapes, table.crs, table.columns, {"format": "GraphML", "attribution": OSM_ATTRIBUTION})
 
 
-def graph_table(graph: Any) -> RoadTable:
+def held_table(roads: Any) -> RoadTable:
+    """Return what a program holds as a table: a GeoDataFrame or GeoSeries, a graph, shapely lines, arrays.
+
+    Raises
+    ------
+    RoadSourceError
+        It is something else.
+    """
+    import shapely
+
+    if hasattr(roads, "edges") and hasattr(roads, "graph"):  # networkx
+        return _graph_table(roads)
+    if hasattr(roads, "columns") and hasattr(roads, "geometry"):
+        columns = {str(name): roads[name].to_numpy(object) for name in roads.columns if name != roads.geometry.name}
+        return RoadTable(roads.geometry.to_numpy(object), crs_name(roads.crs), columns)
+    try:
+        listed = [roads] if isinstance(roads, shapely.Geometry) else list(roads)
+        if isinstance(roads, np.ndarray) and roads.ndim == 2:  # one array: cut at its rows that are not finite
+            rows, broken = roads.astype(float), ~np.isfinite(roads.astype(float)).all(axis=1)
+            parts = zip(np.split(rows, np.flatnonzero(broken)), np.split(broken, np.flatnonzero(broken)), strict=True)
+            listed = [part[~gap] for part, gap in parts]
+        shapes = [one if one is None or isinstance(one, shapely.Geometry) else _line(one) for one in listed]
+    except (TypeError, ValueError) as error:
+        raise RoadSourceError(f"roads of type {type(roads).__name__} cannot be read: {error}; {_EXPECTED}") from error
+    return RoadTable(objects(shapes), crs_name(getattr(roads, "crs", None)))
+
+
+def _line(coordinates: Any) -> Any:
+    import shapely
+
+    points = np.asarray(coordinates, np.float64)
+    if points.ndim != 2 or points.shape[1] not in (2, 3):
+        raise ValueError(f"coordinates of shape {points.shape}")
+    return shapely.LineString(points) if len(points) > 1 else shapely.LineString()
+
+
+def _graph_table(graph: Any) -> RoadTable:
     """Return the edges of a networkx graph as a table: of osmnx, momepy, or with `geometry` or nodes that have x and y.
 
     Raises
@@ -263,11 +297,13 @@ def graph_table(graph: Any) -> RoadTable:
             shape = shapely.LineString(ends)
         shapes.append(shape)
         rows.append(data)
-    names = [str(name) for name in dict.fromkeys(name for row in rows for name in row) if is_known_column(str(name))]
-    columns = {name: np.array([None, *(row.get(name) for row in rows)], object)[1:] for name in names}
-    found = np.empty(len(shapes), object)
-    found[:] = shapes
-    return RoadTable(found, crs_name(graph.graph.get("crs")), columns)
+    return RoadTable(objects(shapes), crs_name(graph.graph.get("crs")), _columns(rows))
+
+
+def _columns(rows: Sequence[Mapping[Any, Any]]) -> dict[str, AnyArray]:
+    """Return of rows of attributes the columns that may tell something of a road."""
+    names = [name for name in dict.fromkeys(name for row in rows for name in row) if is_known_column(str(name))]
+    return {str(name): objects(row.get(name) for row in rows) for name in names}
 
 
 def _node_place(graph: Any, node: Any) -> tuple[float, float] | None:
@@ -293,7 +329,7 @@ def _overpass_elements(path: Path) -> list[Any] | None:
     return elements if isinstance(elements, list) else None
 
 
-def _overpass_table(elements: Sequence[Any]) -> RoadTable:
+def overpass_table(elements: Sequence[Any]) -> RoadTable:
     """Return the ways with a `highway` tag, whose places stand in them or in nodes anywhere."""
     import shapely
 
@@ -301,25 +337,17 @@ def _overpass_table(elements: Sequence[Any]) -> RoadTable:
     nodes = {one["id"]: one for one in known if one.get("type") == "node" and isinstance(one.get("id"), int)}
     shapes: list[Any] = []
     tags: list[Mapping[str, Any]] = []
-    n_lost = 0
     for way in known:
         told = way.get("tags")
-        if not isinstance(told, Mapping) or "highway" not in told or told.get("area") == "yes":
-            continue
-        if way.get("type") != "way":
+        if way.get("type") != "way" or not isinstance(told, Mapping) or "highway" not in told:
             continue
         try:
             ends = way.get("geometry") or [nodes.get(node) for node in way.get("nodes") or ()]
             places = [(float(end["lon"]), float(end["lat"])) for end in ends if end]
         except (LookupError, TypeError, ValueError, OverflowError):
             places = []
-        n_lost += len(places) < 2
         shapes.append(shapely.LineString(places) if len(places) > 1 else None)
         tags.append(told)
-    columns = {
-        name: np.array([None, *(one.get(name) for one in tags)], object)[1:] for name in ("highway", "tunnel", "name")
-    }
-    found = np.empty(len(shapes), object)
-    found[:] = shapes
-    meta = {"format": "OpenStreetMap", "attribution": OSM_ATTRIBUTION} | ({"without_places": n_lost} if n_lost else {})
-    return RoadTable(found, "EPSG:4326", columns, meta)
+    lost = {"without_places": shapes.count(None)} if None in shapes else {}
+    meta = {"format": "OpenStreetMap", "attribution": OSM_ATTRIBUTION}
+    return RoadTable(objects(shapes), "EPSG:4326", _columns(tags), meta | lost)

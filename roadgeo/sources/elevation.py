@@ -9,7 +9,7 @@ import numpy as np
 from roadgeo._arrays import FloatArray
 from roadgeo.errors import CrsError, MaskError
 from roadgeo.geometry.projection import transformer
-from roadgeo.sources.lines import crs_name
+from roadgeo.storage.crs import crs_name
 from roadgeo.storage.rasters import open_raster
 
 __all__ = ["ground_heights"]

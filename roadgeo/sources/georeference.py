@@ -3,18 +3,14 @@
 from __future__ import annotations
 
 import os
-from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING
 
-import cv2
 import numpy as np
 
 from roadgeo._arrays import FloatArray
 from roadgeo.errors import CrsError, MaskError
-from roadgeo.geometry.frame import Frame
-from roadgeo.geometry.homography import Homography
-from roadgeo.geometry.projection import LocalPlane, to_lonlat, transformer
+from roadgeo.geometry.georeference import Georeference, fit_place
 from roadgeo.storage.crs import name_crs
 from roadgeo.storage.orientation import read_orientation, stored_from_upright
 from roadgeo.storage.rasters import open_raster
@@ -22,86 +18,11 @@ from roadgeo.storage.rasters import open_raster
 if TYPE_CHECKING:
     from rasterio import DatasetReader
 
-__all__ = ["Georeference", "read_georeference", "read_stated_middle"]
+__all__ = ["read_georeference", "read_stated_middle"]
 
 _WORLD_FILE_BYTES, _PRJ_BYTES = 4096, 1 << 16
 #: Formats that hold a place, by the first bytes of a file: TIFF, and the others that GDAL reads one from.
 _HOLD_A_PLACE = (b"II", b"MM", b"EHFA", b"\0\0\0\x0cjP", b"\xff\x4f\xff\x51")
-#: Side of the grid of points that a georeference is taken to another CRS by.
-_GRID = 5
-
-
-@dataclass(frozen=True)
-class Georeference:
-    """The place of a raster by its own georeference.
-
-    Attributes
-    ----------
-    matrix : (3, 3) float64
-        Pixel (column, row; GDAL corner convention) to CRS: affine, or a homography fitted to control points.
-    crs : str
-        "EPSG:n" where there is a code, else WKT2.
-    size : (int, int)
-        Width and height, pixels.
-    source : str
-        "geotransform", "control points" or "world file".
-    """
-
-    matrix: FloatArray
-    crs: str
-    size: tuple[int, int]
-    source: str
-
-    def on_plane(self, plane: LocalPlane) -> FloatArray:
-        """Return the homography (3, 3) from pixels to a reference's plane, metres.
-
-        Between two CRS it is fitted to a grid of points, for frames are small: to some millimetres over kilometres.
-
-        Raises
-        ------
-        CrsError
-            It lies outside what the plane's CRS, or its own, is made for.
-        """
-        pixels = self._grid()
-        there = Homography(self.matrix).facing(Frame(*self.size).center)(pixels)
-        xy = plane.from_crs(np.stack(transformer(self.crs, plane.crs).transform(*there.T), axis=1))
-        if not np.isfinite(xy).all():
-            raise CrsError(f"its corners lie outside what {self.crs[:40]} or {plane.crs[:40]} is made for")
-        return _fit(pixels, xy, projective=True)
-
-    def middle(self) -> tuple[float, float]:
-        """Return longitude and latitude of the middle of the frame."""
-        center = Frame(*self.size).center
-        lon, lat = to_lonlat(self.crs, Homography(self.matrix).facing(center)(np.array([center])))[0].tolist()
-        return lon, lat
-
-    def moved(self, on_plane: FloatArray, plane: LocalPlane) -> Georeference:
-        """Return the georeference that puts the raster where `on_plane` (3, 3), pixels to a plane, does.
-
-        An affine one stays affine: it is fitted to the grid of points.
-        """
-        pixels = self._grid()
-        there = plane.to_crs(Homography(on_plane).facing(Frame(*self.size).center)(pixels))
-        xy = np.stack(transformer(plane.crs, self.crs).transform(*there.T), axis=1)
-        matrix = _fit(pixels, xy, projective=self.source == "control points")
-        return Georeference(matrix, self.crs, self.size, self.source)
-
-    def of_stored(self, path: str | os.PathLike[str]) -> Georeference:
-        """Return the same for the pixels of the raster's file as they are stored (see `storage.orientation`)."""
-        turned = stored_from_upright(read_orientation(path), self.size)
-        size = self.size if abs(turned[0, 0]) > 0.5 else self.size[::-1]
-        return Georeference(self.matrix @ np.linalg.inv(turned), self.crs, size, self.source)
-
-    def control_points(self) -> tuple[FloatArray, FloatArray]:
-        """Return (25, 2) pixel positions all over the raster and where they lie in its CRS."""
-        pixels = self._grid()
-        return pixels, Homography(self.matrix).facing(Frame(*self.size).center)(pixels)
-
-    def _grid(self) -> FloatArray:
-        """(25, 2) pixel positions all over the raster."""
-        width, height = self.size
-        columns, rows = np.meshgrid(np.linspace(0, width, _GRID), np.linspace(0, height, _GRID))
-        return np.stack([columns.ravel(), rows.ravel()], axis=1)
 
 
 def read_georeference(path: str | os.PathLike[str], crs: str | None = None) -> Georeference | None:
@@ -140,21 +61,15 @@ def read_georeference(path: str | os.PathLike[str], crs: str | None = None) -> G
 
 def read_stated_middle(path: str | os.PathLike[str]) -> tuple[float, float] | None:
     """Return longitude and latitude of the middle of a raster by its own georeference; None where it has none."""
-    from roadgeo.sources.lines import crs_name
-
     try:
         with open(path, "rb") as file:  # noqa: PTH123 (names may hold what Path refuses)
             if not file.read(8).startswith(_HOLD_A_PLACE):
                 return None
-        with open_raster(path) as dataset:
-            crs = None if dataset.crs is None else crs_name(dataset.crs.to_wkt())
-            if crs is None or dataset.transform.is_identity:
-                return None
-            x, y = dataset.xy(dataset.height / 2 - 0.5, dataset.width / 2 - 0.5)  # counts from pixels' middles
-    except (MaskError, OSError, ValueError):
+        found = read_georeference(path)
+    except (MaskError, CrsError, OSError, ValueError):
         return None
-    lon, lat = to_lonlat(crs, np.array([[x, y]]))[0].tolist()
-    return (lon, lat) if np.isfinite([lon, lat]).all() else None
+    middle = found.middle() if found is not None else (np.nan, np.nan)
+    return middle if np.isfinite(middle).all() else None
 
 
 def _crs_of(raster: DatasetReader) -> str | None:
@@ -185,7 +100,7 @@ def _of_raster(raster: DatasetReader) -> tuple[str, FloatArray] | None:
     if len(points) < 3:
         return None
     pixels = np.array([[point.col, point.row] for point in points], float)
-    return "control points", _fit(pixels, np.array([[p.x, p.y] for p in points], float), len(points) >= 5)
+    return "control points", fit_place(pixels, np.array([[p.x, p.y] for p in points], float), len(points) >= 5)
 
 
 def _of_world_file(path: Path) -> FloatArray | None:
@@ -203,21 +118,3 @@ def _of_world_file(path: Path) -> FloatArray | None:
         # A world file speaks of the first pixel's centre.
         return np.array([[a, b, c - (a + b) / 2], [d, e, f - (d + e) / 2], [0.0, 0.0, 1.0]])
     return None
-
-
-def _fit(pixels: FloatArray, xy: FloatArray, projective: bool) -> FloatArray:
-    """Fit a homography or an affine map (3, 3) to points (N, 2) by least squares."""
-    origin, unit = xy.mean(axis=0), max(float(np.ptp(xy, axis=0).max()), 1e-12)
-    middle, side = pixels.mean(axis=0), max(float(np.ptp(pixels, axis=0).max()), 1e-12)
-    a, b = (pixels - middle) / side, (xy - origin) / unit
-    if projective:
-        matrix, _ = cv2.findHomography(a, b, 0)
-        if matrix is None:
-            raise MaskError("its control points lie on a line; expected some all over the picture")
-    else:
-        solved = np.linalg.lstsq(np.c_[a, np.ones(len(a))], b, rcond=None)[0]
-        matrix = np.vstack([solved.T, [0.0, 0.0, 1.0]])
-    to_unit = np.array([[1 / side, 0, -middle[0] / side], [0, 1 / side, -middle[1] / side], [0, 0, 1.0]])
-    from_unit = np.array([[unit, 0, origin[0]], [0, unit, origin[1]], [0, 0, 1.0]])
-    result = from_unit @ matrix @ to_unit
-    return np.asarray(result / result[2, 2])

@@ -3,15 +3,17 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from typing import Any
 
 import numpy as np
 
-from roadgeo._arrays import AnyArray, BoolArray
-from roadgeo.storage.crs import known_crs
+from roadgeo._arrays import AnyArray, BoolArray, IntArray
 
-__all__ = ["OSM_ATTRIBUTION", "RoadLines", "RoadTable", "crs_name", "join_lines", "simple_lines"]
+__all__ = [
+    *("OSM_ATTRIBUTION", "RoadLines", "RoadTable", "cut_lines", "join_lines", "objects", "simple_areas"),
+    "simple_lines",
+]
 
 OSM_ATTRIBUTION = "© OpenStreetMap contributors, ODbL 1.0"
 
@@ -27,7 +29,7 @@ class RoadTable:
     crs : str or None
         "EPSG:n" or WKT; None where the container has none.
     columns : dict
-        (N,) object each, by name in lower case.
+        (N,) object each, by name.
     meta : dict
         Provenance: plain values.
     """
@@ -68,6 +70,13 @@ class RoadLines:
     name: AnyArray | None = None
     areas: AnyArray = field(default_factory=lambda: np.empty(0, object))
 
+    def take(self, rows: IntArray | BoolArray) -> RoadLines:
+        """Return some of the lines."""
+        highway, tunnel, name = (
+            None if column is None else column[rows] for column in (self.highway, self.tunnel, self.name)
+        )
+        return replace(self, lines=self.lines[rows], highway=highway, tunnel=tunnel, name=name)
+
 
 def join_lines(parts: Sequence[RoadLines]) -> RoadLines:
     """Put parts of one source together: counts in `meta` are added up, and where parts differ in CRS they must not."""
@@ -82,10 +91,8 @@ def join_lines(parts: Sequence[RoadLines]) -> RoadLines:
         if all(getattr(part, name) is None for part in parts):
             return None
         empty = False if name == "tunnel" else None
-        columns = [getattr(part, name) for part in parts]
-        sizes = [len(part.lines) for part in parts]
-        filled = [np.full(n, empty) if one is None else one for one, n in zip(columns, sizes, strict=True)]
-        return np.concatenate(filled)
+        columns = [(getattr(part, name), len(part.lines)) for part in parts]
+        return np.concatenate([np.full(n, empty) if one is None else one for one, n in columns])
 
     lines, areas = (np.concatenate([getattr(part, name) for part in parts]) for name in ("lines", "areas"))
     return RoadLines(lines, first.crs, column("highway"), column("tunnel"), meta, column("name"), areas)
@@ -126,18 +133,39 @@ def _parts(shapes: AnyArray) -> tuple[AnyArray, AnyArray]:
     return parts, place
 
 
-def crs_name(crs: Any) -> str | None:
-    """Return a CRS as "EPSG:n" or WKT2; None where there is none, or one that is bound to no place on Earth."""
-    if crs is None:
-        return None
-    from pyproj.exceptions import CRSError
+def cut_lines(lines: AnyArray, area: Any) -> tuple[AnyArray, AnyArray]:
+    """Return the pieces of lines within an area, both in degrees, and the line that each came from.
 
-    try:
-        known = known_crs(crs)
-    except CRSError:
-        return None
-    known = known.to_2d() if len(known.axis_info) == 3 else known
-    if not (known.is_geographic or known.is_projected):
-        return None
-    code = known.to_epsg(min_confidence=100)
-    return f"EPSG:{code}" if code else known.to_wkt("WKT2_2019")
+    A line or the area may lie astride 180 degrees.
+    """
+    import shapely
+
+    coords, line = shapely.get_coordinates(lines, return_index=True)
+    jumps = (np.abs(np.diff(coords[:, 0])) > 180.0) & (np.diff(line) == 0)
+    astride = np.isin(line, line[1:][jumps])
+    coords[astride, 0] %= 360.0
+    lines = shapely.set_coordinates(lines.copy(), coords)
+    parts = shapely.get_parts(area)
+    if (
+        np.ptp(shapely.total_bounds(parts)[::2]) > 180.0
+        and (np.ptp(shapely.bounds(parts)[:, ::2], axis=1) < 180.0).all()
+    ):
+        area = shapely.union_all(shapely.transform(parts, lambda xy: xy + 360.0 * (xy < 0.0) * (1.0, 0.0)))
+    pieces, places = [], []
+    for turn in (-360.0, 0.0, 360.0):
+        ground = shapely.transform(area, lambda xy, turn=turn: np.add(xy, (turn, 0.0)))
+        shapely.prepare(ground)
+        near = np.flatnonzero(shapely.intersects(ground, lines))
+        inside = shapely.covers(ground, lines[near])
+        pieces.append(np.where(inside, lines[near], shapely.intersection(lines[near], np.where(inside, None, ground))))
+        places.append(near)
+    found, place = simple_lines(np.concatenate(pieces))
+    return found, np.concatenate(places)[place]
+
+
+def objects(values: Any) -> AnyArray:
+    """Return an (N,) array of any values as they are, such as shapes or texts."""
+    listed = list(values)
+    found = np.empty(len(listed), object)
+    found[:] = listed
+    return found

@@ -20,8 +20,7 @@ from roadgeo.errors import MaskError, PhotographError
 from roadgeo.geometry.mask import PROBABILITY_SURE, PROBABILITY_UNKNOWN, RoadMask
 from roadgeo.roads.borders import find_border
 from roadgeo.roads.observed import find_voids
-from roadgeo.roads.vectorization import road_width
-from roadgeo.sources.thresholds import (
+from roadgeo.roads.thresholds import (
     Sample,
     are_labels,
     find_thresholds,
@@ -29,6 +28,7 @@ from roadgeo.sources.thresholds import (
     ground_and_road,
     spread_probability,
 )
+from roadgeo.roads.vectorization import road_width
 from roadgeo.storage.gdal import is_named_remote
 from roadgeo.storage.orientation import read_orientation, turn_upright
 from roadgeo.storage.rasters import MAX_SIDE as MAX_RASTER_SIDE

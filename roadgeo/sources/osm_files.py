@@ -18,16 +18,24 @@ import numpy as np
 from roadgeo._arrays import AnyArray, FloatArray, IntArray
 from roadgeo.errors import RoadSourceError
 from roadgeo.sources.lines import OSM_ATTRIBUTION, RoadTable
-from roadgeo.sources.protobuf import WireError, fields
-from roadgeo.sources.unpacking import read_chunks
-from roadgeo.sources.vectors import first_line
+from roadgeo.sources.protobuf import message_types
+from roadgeo.storage.unpacking import read_chunks
+from roadgeo.storage.vectors import first_line
 
 __all__ = ["OSM_ENDINGS", "stream_ways"]
 
-OSM_ENDINGS = (".osm.pbf", ".pbf", ".osm", ".osm.gz", ".osm.bz2", ".osm.xml", ".osh", ".osh.gz", ".osh.bz2")
+OSM_ENDINGS = (*(".osm.pbf", ".pbf", ".osm", ".osm.gz", ".osm.bz2", ".osm.xml", ".osh", ".osh.gz", ".osh.bz2", ".o5m"),)
 
 #: PBF files are read in parts of about this size; the other two are limits of their specification.
 _PART, _MAX_BLOB, _MAX_BLOB_HEADER = 1 << 20, 32 << 20, 64 << 10
+_PACKED = (("lzma", 4, "bytes"), ("bzip2", 5, "bytes"), ("lz4", 6, "bytes"), ("zstd", 7, "bytes"))
+#: What is looked at of a PBF file (https://github.com/openstreetmap/OSM-binary).
+_PBF = (
+    ("BlobHeader", (("size", 3, "int64"),)),
+    ("Blob", (("raw", 1, "bytes"), ("zlib", 3, "bytes"), *_PACKED)),
+    ("Block", (("texts", 1, "bytes"),)),
+    ("Texts", (("text", 1, "bytes"),)),
+)
 #: Places of nodes are kept in memory up to this size of a PBF file (8 times its size), else on disk.
 _NODES_IN_MEMORY = 100_000_000
 #: An object that JOSM's user has deleted stays in its file.
@@ -254,15 +262,17 @@ def _read_blob(file: BinaryIO) -> bytes:
     RuntimeError
         As osmium does: it is cut off, or there is none.
     """
+    from google.protobuf.message import DecodeError
+
     prefix = file.read(4)
     header = file.read(min(int.from_bytes(prefix, "big"), _MAX_BLOB_HEADER))
     try:
-        sizes = [value for field, value in fields(memoryview(header)) if field == 3 and isinstance(value, int)]
-        blob = file.read(sizes[0]) if len(sizes) == 1 and sizes[0] <= _MAX_BLOB else b""
-        if len(prefix) < 4 or len(header) != int.from_bytes(prefix, "big") or sizes != [len(blob)]:
+        (size,) = message_types(_PBF)["BlobHeader"].FromString(header).size
+        blob = file.read(size) if 0 <= size <= _MAX_BLOB else b""
+        if len(prefix) < 4 or len(header) != int.from_bytes(prefix, "big") or size != len(blob):
             raise RuntimeError("it is cut off, damaged or no PBF file")
         _require_text(blob)
-    except WireError as error:
+    except (DecodeError, ValueError, zlib.error) as error:
         raise RuntimeError("it is cut off, damaged or no PBF file") from error
     return prefix + header + blob
 
@@ -270,26 +280,14 @@ def _read_blob(file: BinaryIO) -> bytes:
 def _require_text(blob: bytes) -> None:
     """Refuse a blob with a zero byte in a text: osmium takes it for the end of that, and reads on beyond all texts.
 
-    Raises
-    ------
-    RuntimeError, WireError
-        There is one; or the blob is compressed in another way than with zlib, so that it cannot be looked at.
+    Or one that is compressed in another way than with zlib, so that it cannot be looked at.
     """
-    for field, table in fields(memoryview(_unpacked(blob))):
-        # Zero bytes are rare, but for the length of the empty text that every table begins with.
-        if field == 1 and not isinstance(table, int) and table[2:].tobytes().count(0):
-            for _, text in fields(table):
-                if not isinstance(text, int) and text.tobytes().count(0):
-                    raise RuntimeError("it is damaged: a text in it holds a zero byte")
-
-
-def _unpacked(blob: bytes) -> bytes:
-    """Return the content of a blob: field 1 holds it as it is, field 3 compressed by zlib; there is but one."""
-    contents = [(field, content) for field, content in fields(memoryview(blob)) if not isinstance(content, int)]
-    if len(contents) != 1 or contents[0][0] not in {1, 3}:
+    messages = message_types(_PBF)
+    stored = messages["Blob"].FromString(blob)
+    if len(stored.raw) + len(stored.zlib) != 1 or stored.lzma or stored.lz4 or stored.zstd or stored.bzip2:
         raise RuntimeError("a part of it is not compressed by zlib; write it with that, as osmium does by default")
-    ((field, content),) = contents
-    try:
-        return content.tobytes() if field == 1 else zlib.decompressobj().decompress(content, _MAX_BLOB + 1)
-    except zlib.error as error:
-        raise RuntimeError("it is damaged: a part of it cannot be unpacked") from error
+    content = stored.raw[0] if stored.raw else zlib.decompressobj().decompress(stored.zlib[0], _MAX_BLOB + 1)
+    for table in messages["Block"].FromString(content).texts:
+        # Zero bytes are rare, but for the length of the empty text that every table begins with.
+        if table[2:].count(0) and any(0 in text for text in messages["Texts"].FromString(table).text):
+            raise RuntimeError("it is damaged: a text in it holds a zero byte")

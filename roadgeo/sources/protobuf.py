@@ -1,61 +1,32 @@
-"""The wire format of Protocol Buffers: fields of a message, read without its schema.
-
-Enough to look at the text of a PBF file before osmium does: a message is walked in place, and fields are never copied.
-https://protobuf.dev/programming-guides/encoding/
-"""
+"""Messages of Protocol Buffers, of which a few fields are looked at before another library reads the whole."""
 
 from __future__ import annotations
 
-from collections.abc import Iterator
+from collections.abc import Mapping
+from functools import cache
+from typing import Any
 
-__all__ = ["Field", "WireError", "fields"]
+__all__ = ["Schema", "message_types"]
 
-#: A field: its number, and a varint's value or the bytes of a nested message, string or packed list.
-Field = tuple[int, "int | memoryview"]
-
-VARINT, FIXED64, BYTES, FIXED32 = 0, 1, 2, 5
-
-
-class WireError(ValueError):
-    """The bytes are no protobuf message."""
+#: Messages by name; of each the fields, which may all be repeated, by name, number and type: another message's name.
+Schema = tuple[tuple[str, tuple[tuple[str, int, str], ...]], ...]
 
 
-def fields(message: memoryview) -> Iterator[Field]:
-    """Walk the fields of a message in order.
+@cache
+def message_types(schema: Schema) -> Mapping[str, Any]:
+    """Return the classes of messages; what else is in one is passed over."""
+    from google.protobuf import descriptor_pb2, descriptor_pool, message_factory
 
-    Raises
-    ------
-    WireError
-        It is cut short, or not in this format.
-    """
-    at = 0
-    while at < len(message):
-        key, at = _varint(message, at)
-        number, kind = key >> 3, key & 7
-        if kind == VARINT:
-            value, at = _varint(message, at)
-            yield number, value
-            continue
-        if kind == BYTES:
-            size, at = _varint(message, at)
-        elif kind in (FIXED64, FIXED32):
-            size = 8 if kind == FIXED64 else 4
-        else:
-            raise WireError(f"field {number} is of the unknown kind {kind}")
-        if number == 0 or at + size > len(message):
-            raise WireError(f"field {number} reaches beyond its message")
-        yield number, message[at : at + size]
-        at += size
-
-
-def _varint(message: memoryview, at: int) -> tuple[int, int]:
-    """Return a varint and the position after it."""
-    value = shift = 0
-    while at < len(message) and shift < 70:
-        byte = message[at]
-        at += 1
-        value |= (byte & 0x7F) << shift
-        if byte < 0x80:
-            return value & 0xFFFFFFFFFFFFFFFF, at
-        shift += 7
-    raise WireError("a number is cut short")
+    described = descriptor_pb2.FieldDescriptorProto
+    plain = {"int64": described.TYPE_INT64, "bytes": described.TYPE_BYTES}
+    file = descriptor_pb2.FileDescriptorProto(name="roadgeo.proto", package="roadgeo")
+    for name, fields in schema:
+        message = file.message_type.add(name=name)
+        for field, number, kind in fields:
+            added = message.field.add(name=field, number=number, label=described.LABEL_REPEATED)
+            added.type = plain.get(kind, described.TYPE_MESSAGE)
+            if kind not in plain:
+                added.type_name = f".roadgeo.{kind}"
+    pool = descriptor_pool.DescriptorPool()
+    pool.Add(file)
+    return {name: message_factory.GetMessageClass(pool.FindMessageTypeByName(f"roadgeo.{name}")) for name, _ in schema}

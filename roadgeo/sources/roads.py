@@ -1,4 +1,8 @@
-"""Road lines on a metric plane, from files or from OpenStreetMap: the input of a reference."""
+"""Roads on a metric plane: of files, of OpenStreetMap, or of what a program holds. References are built of them.
+
+Whatever holds roads gives tables (`containers`, `overpass`), and one adapter makes lines of them (`schemas`). Here the
+lines that were asked for are chosen and brought to one plane.
+"""
 
 from __future__ import annotations
 
@@ -7,33 +11,25 @@ import os
 from collections.abc import Iterable, Sequence
 from dataclasses import dataclass, field, replace
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import numpy as np
 
-from roadgeo._arrays import AnyArray, FloatArray
+from roadgeo._arrays import AnyArray, BoolArray, FloatArray
 from roadgeo._progress import Say, say_nothing
 from roadgeo._text import visible
-from roadgeo.errors import CrsError, RoadSourceError
-from roadgeo.geometry.projection import LocalPlane, choose_plane, transformer
+from roadgeo.errors import CrsError, NoRoadsError, RoadSourceError
+from roadgeo.geometry.projection import LocalPlane, choose_plane, to_lonlat, transformer
 from roadgeo.roads.kinds import RoadKind, drives
-from roadgeo.sources.lines import RoadLines, crs_name, simple_lines
+from roadgeo.sources.containers import held_table
+from roadgeo.sources.lines import RoadLines, cut_lines
+from roadgeo.sources.overpass import FetchOptions, box_area, fetch_lines, find_place, read_area, square
+from roadgeo.sources.schemas import recognise
 from roadgeo.sources.streams import list_sources, read_lines, tell_source
-from roadgeo.storage.crs import known_crs
-
-if TYPE_CHECKING:
-    from roadgeo.sources.overpass import FetchOptions
+from roadgeo.storage.crs import known_crs, name_crs
 
 __all__ = [
-    "Box",
-    "Roads",
-    "as_text",
-    "choose_lines",
-    "fetch_roads",
-    "join_roads",
-    "overruled_crs",
-    "project_lines",
-    "read_roads",
+    *("Box", "Roads", "as_text", "choose_lines", "choose_roads", "fetch_roads", "join_roads", "read_roads", "with_crs"),
 ]
 
 _LOG = logging.getLogger(__name__)
@@ -43,6 +39,8 @@ Box = tuple[float, float, float, float]
 
 #: Greatest share of lines beyond the Earth in their CRS that is left out; with more of them the CRS is wrong.
 _MOST_ASTRAY = 0.1
+#: A vertex at the origin of coordinates is one that is missing where no other lies as near it as that.
+_FAR_DEG = 1.0
 
 
 @dataclass(frozen=True)
@@ -77,6 +75,44 @@ class Roads:
     def __repr__(self) -> str:
         """Describe the roads in one line."""
         return f"<Roads: {len(self):,} lines, {self.plane.crs[:40]}>"
+
+
+def choose_roads(
+    roads: Any,
+    which: RoadKind = "drivable",
+    tunnels: bool = False,
+    attribution: str | None = None,
+    say: Say = say_nothing,
+    crs: Any = None,
+) -> Roads:
+    """Return the roads to build a reference from, of files or of whatever a program holds; `Roads` as they are.
+
+    Parameters
+    ----------
+    roads : Roads, path or paths, GeoDataFrame, GeoSeries, networkx graph with places, shapely lines, arrays
+        Arrays of coordinates (N, 2) or (N, 3), x first, are a line each; of a single one, rows that are not finite part
+        the lines.
+    crs : anything that pyproj knows, optional
+        CRS of the coordinates; needed where the roads have none.
+
+    Raises
+    ------
+    CrsError
+        There is no CRS, or the coordinates do not fit it.
+    RoadSourceError
+        There are no lines of the kind asked for, or what is given holds none.
+    """
+    paths, name = (str, os.PathLike), "the roads"
+    if isinstance(roads, Roads):
+        return roads if attribution is None else replace(roads, meta={**roads.meta, "attribution": attribution})
+    listed = roads if isinstance(roads, list | tuple) else [roads]
+    if listed and all(isinstance(one, paths) for one in listed):
+        given = None if crs is None else name_crs(crs)
+        return read_roads(listed, crs=given, which=which, tunnels=tunnels, attribution=attribution, say=say)
+    table = held_table(roads)
+    chosen = choose_lines(with_crs(recognise(table).adapt(table), crs, name), name, which, tunnels)
+    tell_source(name, chosen.meta)
+    return join_roads([chosen], {"roads": which, "tunnels": tunnels, "bbox": None}, attribution)
 
 
 def read_roads(
@@ -119,28 +155,23 @@ def read_roads(
     CrsError
         A file has no CRS and none was given, or its coordinates do not fit.
     """
-    from roadgeo.sources.overpass import box_area
-
     given = [path] if isinstance(path, str | os.PathLike) else list(path)
     files = [file for one in given for file in list_sources(Path(one))]
+    area = None if bbox is None else box_area(bbox)
     sources, elsewhere = [], []
     for n, file in enumerate(files, 1):
         what = f"reading {file.name}" + (f", {n} of {len(files)}" if len(files) > 1 else "")
         say(what)
         source = read_lines(file, layer, lambda share, what=what: say(what, share))  # type: ignore[misc]
-        if crs is not None and source.meta["format"] != "OpenStreetMap":
-            source = replace(source, crs=overruled_crs(source.crs, crs, file))
-        if source.crs is None:
-            raise CrsError(f"{file}: says nothing of its CRS; name it, for example --crs EPSG:26986")
-        chosen = choose_lines(source, file.name, which, tunnels, bbox)
+        source = with_crs(source, crs, file)
+        chosen = choose_lines(source, file.name, which, tunnels, area)
         tell_source(file.name, chosen.meta)
         if not len(chosen.lines):
-            elsewhere.append(source)
+            elsewhere.append(_corners(source))
         sources.append(chosen)
     if len(elsewhere) == len(sources):
         raise _no_roads(sources, _ask_exchanged(bbox, elsewhere))
-    roads = join_roads(sources, {"roads": which, "tunnels": tunnels, "bbox": _plain(bbox)}, attribution)
-    return roads if bbox is None else replace(roads, area=box_area(bbox))
+    return join_roads(sources, {"roads": which, "tunnels": tunnels, "bbox": _plain(bbox)}, attribution, area)
 
 
 def fetch_roads(
@@ -180,10 +211,7 @@ def fetch_roads(
     ValueError
         Not exactly one area.
     """
-    from roadgeo.sources.overpass import FetchOptions, box_area, fetch_lines, find_place, read_area, square
-
-    given = [area is not None for area in (place, bbox, polygon, around)]
-    if sum(given) != 1:
+    if sum(area is not None for area in (place, bbox, polygon, around)) != 1:
         raise ValueError("give exactly one of place, bbox, polygon and around")
     options = options or FetchOptions()
     if place is not None:
@@ -194,38 +222,48 @@ def fetch_roads(
         area, name = square(*around), "{:g},{:g} within {:g} m".format(*around)
     else:
         area, name = read_area(polygon)
-    source = fetch_lines(area, which, tunnels, options, say, hint=_ask_exchanged(bbox))
-    chosen = choose_lines(source, name, which, tunnels, None)
-    return replace(join_roads([chosen], {"roads": which, "tunnels": tunnels, "bbox": _plain(bbox)}, None), area=area)
+    source = choose_lines(fetch_lines(area, which, tunnels, options, say), name, which, tunnels, area)
+    if not len(source.lines):
+        hint = _ask_exchanged(bbox)
+        raise NoRoadsError(f"OpenStreetMap has no {which} roads there; check the area or try another --kinds{hint}")
+    return join_roads([source], {"roads": which, "tunnels": tunnels, "bbox": _plain(bbox)}, None, area)
 
 
-def project_lines(shapes: Iterable[Any], crs: Any) -> tuple[AnyArray, LocalPlane]:
-    """Take shapely lines from their CRS (anything pyproj understands) to a metric plane of our choice.
+def with_crs(source: RoadLines, crs: Any, name: Path | str) -> RoadLines:
+    """Return a source in the CRS that was given, or else its own; OpenStreetMap's are in degrees in any case.
 
     Raises
     ------
     CrsError
-        No CRS, or coordinates that do not fit it.
-    RoadSourceError
-        No lines.
+        There is none.
     """
-    lines, _ = simple_lines(np.fromiter(shapes, object))
-    name = crs_name(crs)
-    if name is None:
-        raise CrsError("the roads have no CRS; set one, for example roads.set_crs('EPSG:26986')")
-    roads = join_roads([RoadLines(lines, name, meta={"name": "the roads"})], {}, None)
-    return roads.lines, roads.plane
+    if crs is None or source.meta.get("format") == "OpenStreetMap":
+        if source.crs is None:
+            raise CrsError(f"{name}: says nothing of its CRS; name it, for example --crs EPSG:26986, crs= in Python")
+        return source
+    known, own = name_crs(crs), source.crs
+    if own is not None and not known_crs(own).equals(known_crs(known), ignore_axis_order=True):
+        _LOG.warning(
+            "%s: says that its CRS is %s; read as %s, as --crs asks. Leave --crs out if that is wrong",
+            visible(str(name)),
+            known_crs(own).name if len(own) > len("EPSG:123456") else own,
+            crs,
+        )
+    return replace(source, crs=known)
 
 
-def choose_lines(source: RoadLines, name: str, which: RoadKind, tunnels: bool, bbox: Box | None) -> RoadLines:
-    """Keep the lines that were asked for, and count what was left out."""
+def choose_lines(source: RoadLines, name: str, which: RoadKind, tunnels: bool, area: Any = None) -> RoadLines:
+    """Keep the lines that were asked for, and count what was left out; they are cut at the border of an area."""
+    import shapely
+
     wanted = np.ones(len(source.lines), bool) if source.highway is None else drives(source.highway, which)
     hidden = np.zeros(len(wanted), bool) if tunnels or source.tunnel is None else source.tunnel & wanted
-    chosen = np.flatnonzero(wanted & ~hidden)
-    lines, crs = source.lines[chosen], source.crs
-    if bbox is not None:
-        lines, place = _clip(_to_degrees(lines, source.crs, name), bbox)
-        chosen, crs = chosen[place], "EPSG:4326"
+    chosen = source.take(wanted & ~hidden)
+    astray = _astray(chosen, name)
+    chosen = chosen.take(~astray)
+    if area is not None:
+        lines, place = cut_lines(shapely.transform(chosen.lines, lambda xy: to_lonlat(str(source.crs), xy)), area)
+        chosen = replace(chosen.take(place), lines=lines, crs="EPSG:4326")
     meta = {
         "name": name,
         **source.meta,
@@ -233,25 +271,23 @@ def choose_lines(source: RoadLines, name: str, which: RoadKind, tunnels: bool, b
         "kinds_known": source.highway is not None,
         "other_kinds": int((~wanted).sum()),
         "tunnels": int(hidden.sum()),
-        "kept": len(lines),
+        **({"astray": int(astray.sum())} if astray.any() else {}),
+        "kept": len(chosen.lines),
     }
-    called = None if source.name is None else source.name[chosen]
-    kinds = None if source.highway is None else source.highway[chosen]
-    return RoadLines(lines, crs, kinds, meta=meta, name=called)
+    return replace(chosen, tunnel=None, meta=meta)
 
 
-def join_roads(sources: Sequence[RoadLines], meta: dict[str, Any], attribution: str | None) -> Roads:
+def join_roads(sources: Sequence[RoadLines], meta: dict[str, Any], attribution: str | None, area: Any = None) -> Roads:
     """Take the lines of all sources to one plane."""
-    filled = [_on_earth(source) for source in sources if len(source.lines)]
+    filled = [source for source in sources if len(source.lines)]
     if not filled:
         raise _no_roads(sources)
     shared = {source.crs for source in filled}
     own_crs = shared.pop() if len(shared) == 1 else None
     plane = choose_plane(np.concatenate([_corners(source) for source in filled]), own_crs)
-    lines = np.concatenate([_to_plane(source, plane) for source in filled])
     calls = dict.fromkeys(source.meta["attribution"] for source in filled if source.meta.get("attribution"))
     return Roads(
-        lines,
+        np.concatenate([_to_plane(source, plane) for source in filled]),
         plane,
         {
             **meta,
@@ -259,6 +295,7 @@ def join_roads(sources: Sequence[RoadLines], meta: dict[str, Any], attribution: 
             "sources": [source.meta for source in sources],
             "attribution": "; ".join(calls) if attribution is None else attribution,
         },
+        area,
         names=as_text([source.name for source in filled], filled),
         kinds=as_text([source.highway for source in filled], filled),
     )
@@ -285,32 +322,35 @@ def _corners(source: RoadLines) -> FloatArray:
     import shapely
 
     bounds = shapely.bounds(source.lines)
-    points = np.concatenate((bounds[:, :2], bounds[:, 2:]))
-    return np.stack(transformer(_crs_of(source), "EPSG:4326").transform(points[:, 0], points[:, 1]), axis=1)
+    return to_lonlat(str(source.crs), np.concatenate((bounds[:, :2], bounds[:, 2:])))
 
 
-def _on_earth(source: RoadLines) -> RoadLines:
-    """Return a source without the few lines that lie beyond the Earth, which one wrong value makes."""
+def _astray(source: RoadLines, name: str) -> BoolArray:
+    """Tell which lines lie beyond the Earth, or have a vertex at the origin of coordinates, far off all others.
+
+    One wrong value makes such lines, or a missing one that is written as 0.
+    """
     import shapely
 
-    lonlat = _corners(source)
-    sound = np.asarray(np.isfinite(lonlat).all(axis=1) & (np.abs(lonlat) <= (360.0, 90.0)).all(axis=1))
-    kept = sound[: len(source.lines)] & sound[len(source.lines) :]
-    if kept.all():
-        return source
-    n_astray = int((~kept).sum())
-    if n_astray > _MOST_ASTRAY * len(kept):
+    corners = _corners(source)
+    lonlat = np.hstack((corners[: len(source.lines)], corners[len(source.lines) :]))
+    sound = np.asarray((np.isfinite(lonlat) & (np.abs(lonlat) <= (360.0, 90.0) * 2)).all(axis=1))
+    if np.count_nonzero(~sound) > _MOST_ASTRAY * len(sound):
         reach = np.abs(shapely.total_bounds(source.lines)).max()
         raise CrsError(
-            f"{source.meta['name']}: coordinates reach {reach:.6g} and do not fit its CRS, {_crs_of(source)[:40]}; "
+            f"{name}: coordinates reach {reach:.6g} and do not fit its CRS, {str(source.crs)[:40]}; "
             "give the right one with --crs"
         )
-    _LOG.warning("%s: left out %s lines that lie beyond the Earth", source.meta["name"], f"{n_astray:,}")
-    highway, name = (None if one is None else one[kept] for one in (source.highway, source.name))
-    return replace(source, lines=source.lines[kept], highway=highway, name=name, tunnel=None)
+    coords, line = shapely.get_coordinates(source.lines, return_index=True)
+    suspected = np.isin(np.arange(len(sound)), line[(coords == 0.0).all(axis=1)])
+    others = lonlat[sound & ~suspected].reshape(-1, 2)
+    if suspected.any() and len(others):
+        apart = np.abs(others - to_lonlat(str(source.crs), np.zeros((1, 2)))).max(axis=1)
+        sound &= ~suspected | bool((apart < _FAR_DEG).any())
+    return ~sound
 
 
-def _ask_exchanged(bbox: Box | None, sources: Sequence[RoadLines] | None = None) -> str:
+def _ask_exchanged(bbox: Box | None, corners: Sequence[FloatArray] | None = None) -> str:
     """Ask whether longitudes and latitudes of a box without roads were exchanged, if there are roads in it then."""
     import shapely
 
@@ -318,10 +358,8 @@ def _ask_exchanged(bbox: Box | None, sources: Sequence[RoadLines] | None = None)
         return ""
     south, west, north, east = bbox  # if so
     sound = -90 <= south < north <= 90 and -180 <= west < east <= 180
-    if sound and sources is not None:
-        sound = any(
-            shapely.box(west, south, east, north).intersects(shapely.multipoints(_corners(one))) for one in sources
-        )
+    if sound and corners is not None:
+        sound = any(shapely.box(west, south, east, north).intersects(shapely.multipoints(one)) for one in corners)
     return f" (longitude comes first: did you mean --bbox={west:g},{south:g},{east:g},{north:g}?)" if sound else ""
 
 
@@ -329,75 +367,9 @@ def _to_plane(source: RoadLines, plane: LocalPlane) -> AnyArray:
     """Return a source's lines in plane metres."""
     import shapely
 
-    way = transformer(_crs_of(source), plane.crs)
-    coords = shapely.get_coordinates(source.lines)
-    xy = plane.from_crs(np.stack(way.transform(coords[:, 0], coords[:, 1]), axis=1))
-    return np.asarray(shapely.set_coordinates(source.lines.copy(), xy))
-
-
-def _to_degrees(lines: AnyArray, crs: str | None, name: str) -> AnyArray:
-    import shapely
-
-    if crs is None:
-        raise CrsError(f"{name}: says nothing of its CRS")
-    coords = shapely.get_coordinates(lines)
-    lonlat = np.stack(transformer(crs, "EPSG:4326").transform(coords[:, 0], coords[:, 1]), axis=1)
-    return np.asarray(shapely.set_coordinates(lines.copy(), lonlat))
-
-
-def _clip(lines: AnyArray, bbox: Box) -> tuple[AnyArray, AnyArray]:
-    """Cut lines in degrees at the border of a box; a line or a box may lie astride 180 degrees.
-
-    Returns
-    -------
-    pieces, line
-        And the line that each piece came from.
-    """
-    import shapely
-
-    west, south, east, north = bbox
-    east += 360.0 * (east < west)
-    coords, line = shapely.get_coordinates(lines, return_index=True)
-    jumps = (np.abs(np.diff(coords[:, 0])) > 180.0) & (np.diff(line) == 0)
-    astride = np.isin(line, line[1:][jumps])
-    coords[astride, 0] %= 360.0
-    lines = shapely.set_coordinates(lines.copy(), coords)
-    pieces = [shapely.clip_by_rect(lines, west + turn, south, east + turn, north) for turn in (-360.0, 0.0, 360.0)]
-    found, place = simple_lines(np.concatenate(pieces))
-    return found, place % max(len(lines), 1)
-
-
-def overruled_crs(own: str | None, given: str, file: Path | str) -> str:
-    """Return the given CRS, and warn where a file states another."""
-    known = _known_crs(given)
-    if own is not None and not known_crs(own).equals(known_crs(known), ignore_axis_order=True):
-        _LOG.warning(
-            "%s: says that its CRS is %s; read as %s, as --crs asks. Leave --crs out if that is wrong",
-            visible(str(file)),
-            known_crs(own).name if len(own) > len("EPSG:123456") else own,
-            given,
-        )
-    return known
-
-
-def _known_crs(crs: str) -> str:
-    """Return the name of a CRS that a user gave.
-
-    Raises
-    ------
-    CrsError
-        It is none of places on Earth.
-    """
-    name = crs_name(crs)
-    if name is None:
-        raise CrsError(f"{crs!r} is no CRS of places on Earth; expected for example EPSG:26986")
-    return name
-
-
-def _crs_of(source: RoadLines) -> str:
-    if source.crs is None:
-        raise CrsError(f"{source.meta.get('name', 'the roads')}: no CRS")
-    return source.crs
+    way = transformer(str(source.crs), plane.crs)
+    moved = shapely.transform(source.lines, lambda xy: plane.from_crs(np.stack(way.transform(*xy.T), axis=1)))
+    return np.asarray(moved)
 
 
 def _no_roads(sources: Sequence[RoadLines], hint: str = "") -> RoadSourceError:

@@ -1,20 +1,22 @@
 """One adapter from tables of any schema to roads: kind of each, tunnel or not, name, attribution.
 
-A schema is recognised by its words: `residential` is OpenStreetMap's, `A Road` the Ordnance Survey's, `S1400` of TIGER.
-Columns with well-known names are looked at first, then any whose values are such words. Numbers count in columns that
-are known by name alone. Other lines (a stream, a fence, a railway) are left out and counted; a road whose
-kind is not known stays one.
+A schema is told by its words, which stand in `schemas.toml`: `residential` is OpenStreetMap's, `A Road` the Ordnance
+Survey's, `S1400` that of TIGER. Columns with well-known names are looked at first, then any that hold such words.
+Numbers count in columns that are known by name alone. What is something else (a stream, a fence, a railway) is left
+out and counted; a road whose kind is not known stays one.
 """
 
 from __future__ import annotations
 
 import json
 import re
+import tomllib
 import unicodedata
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from functools import partial
-from typing import Any, NamedTuple
+from pathlib import Path
+from typing import Any
 
 import numpy as np
 
@@ -26,16 +28,7 @@ __all__ = ["Schema", "is_known_column", "names_kinds", "recognise"]
 
 #: Meanings of a word beside values of `highway`: no road, and a road of a kind that other columns may hold.
 _NONE, _ROAD = "none", "road"
-
-
-class _Vocabulary(NamedTuple):
-    """Words of one maker of maps, less all but letters and digits, and the `highway` that each stands for.
-
-    `r*` stands for codes that begin so.
-    """
-
-    words: Mapping[str, str]
-    attribution: str = ""
+_LETTERS = str.maketrans({"ø": "o", "æ": "ae", "ß": "ss", "ð": "d", "ł": "l"})
 
 
 def _plain(text: str) -> str:
@@ -44,168 +37,25 @@ def _plain(text: str) -> str:
     return "".join(letter for letter in unicodedata.normalize("NFKD", text) if letter.isascii() and letter.isalnum())
 
 
-_LETTERS = str.maketrans({"ø": "o", "æ": "ae", "ß": "ss", "ð": "d", "ł": "l"})
+def _by_word(kinds: Mapping[str, Sequence[str]]) -> dict[str, str]:
+    """Return what words stand for: those that end in `*`, for codes that begin so."""
+    return {_plain(word) + word[-1] * (word[-1] == "*"): kind for kind, words in kinds.items() for word in words}
 
 
-def _words(**kinds: str) -> dict[str, str]:
-    """Return words by their meaning, given as text with commas between them."""
-    return {_plain(word): kind for kind, words in kinds.items() for word in words.split(",")}
-
-
-#: Lines of OpenStreetMap that are something else, by the value of their own key.
-_OSM_OTHERS = (
-    "rail,light_rail,subway,tram,narrow_gauge,monorail,funicular,miniature,preserved,standard_gauge,rack,miniature_railway,"
-    "stream,river,canal,drain,ditch,riverbank,dam,weir,dock,tidal_channel,water,wetland,reservoir,glacier,"
-    "fence,wall,hedge,city_wall,retaining_wall,kerb,guard_rail,handrail,line,minor_line,cable,pipeline,cutline,"
-    "coastline,cliff,ridge,valley,arete,embankment,tree_row,cable_car,gondola,chair_lift,drag_lift,t-bar,j-bar,platter,"
-    "mixed_lift,zip_line,goods,runway,taxiway,apron,ferry,building,administrative,forest,park,residential_area"
+_DATA = tomllib.loads(Path(__file__).with_suffix(".toml").read_text(encoding="utf-8"))
+_WORDS = {maker: _by_word(kinds) for maker, kinds in _DATA["words"].items()}
+_CODES = {column: _by_word(kinds) for column, kinds in _DATA["codes"].items()}
+_KINDS, _TUNNELS, _NAMES, _TAGS, _OTHER_KEYS = (
+    _DATA["columns"][of] for of in ("kind", "tunnel", "name", "tags", "other")
 )
-_OSM = {_plain(word): word for word in KNOWN_HIGHWAYS} | {_plain(word): _NONE for word in NO_ROADS}
-_OSM = {_plain(word): _NONE for word in _OSM_OTHERS.split(",")} | _OSM
-_HIGHWAY = dict(_OSM)  # of a column `highway`: other words in it stand for kinds that are not known here
-
-_VOCABULARIES = {
-    "OpenStreetMap": _Vocabulary(_OSM),
-    "TIGER": _Vocabulary(
-        _words(
-            motorway="S1100,A11,A12,A13,A14,A15,A16,A17,A18,A19",
-            primary="S1200,A21,A22,A23,A24,A25,A26,A27,A28,A29",
-            secondary="A31,A32,A33,A34,A35,A36,A37,A38,A39",
-            residential="S1400,A41,A42,A43,A44,A45,A46,A47,A48,A49",
-            track="S1500,A51,A52,A53",
-            motorway_link="S1630,A63",
-            service="S1640,S1730,S1740,S1750,S1780,S1810,A64,A73,A74",
-            footway="S1710,A71",
-            steps="S1720,A72",
-            cycleway="S1820",
-            bridleway="S1830",
-            road="A60,A61,A62",
-        )
-        | dict.fromkeys(("r*", "h*", "k*", "p*", "l*", "c*", "g*", "b*", "d*", "e*", "f*"), _NONE),
-        "U.S. Census Bureau, TIGER/Line",
-    ),
-    "Ordnance Survey": _Vocabulary(
-        _words(
-            motorway="Motorway,Motorway Collapsed Dual Carriageway",
-            primary="A Road,A Road Primary,Primary Road,A Road Collapsed Dual Carriageway",
-            secondary="B Road,B Road Primary,B Road Collapsed Dual Carriageway",
-            tertiary="Minor Road,Classified Unnumbered,Minor Road Collapsed Dual Carriageway",
-            residential="Local Road,Local Access Road,Local Street",
-            unclassified="Unclassified",
-            service="Restricted Local Access Road,Secondary Access Road,Restricted Secondary Access Road,"
-            "Not Classified,Private Road Publicly Accessible,Private Road Restricted Access",
-            pedestrian="Pedestrianised Street,Shared Use Road",
-            footway="Path,Path With Cycle And Pedestrian Access",
-        ),
-        "Contains OS data © Crown copyright and database right",
-    ),
-    "IGN": _Vocabulary(
-        _words(
-            motorway="Type autoroutier,Autoroute,Quasi-autoroute",
-            primary="Liaison principale,Route à 2 chaussées",
-            secondary="Liaison régionale",
-            tertiary="Liaison locale",
-            road="Route à 1 chaussée,Rond-point,Bretelle",
-            track="Route empierrée,Chemin",
-            path="Sentier",
-            steps="Escalier",
-            cycleway="Piste cyclable",
-            none="Bac ou liaison maritime,Bac auto,Bac piéton,Voie ferrée principale,Voie de service,Tramway,Métro,"
-            "LGV,Funiculaire ou crémaillère,Cours d'eau,Écoulement naturel,Écoulement canalisé,Mur,Clôture,"
-            "Ligne électrique",
-        ),
-        "© IGN, Licence Ouverte 2.0",
-    ),
-    "NVDB": _Vocabulary(
-        _words(
-            road="Enkel bilveg,Kanalisert veg,Rampe,Rundkjøring,Bilnät,Vanlig väg",
-            trunk="Europaveg,Europaväg,Motortrafikled",
-            motorway="Motorveg,Motorväg",
-            primary="Riksveg,Riksväg",
-            secondary="Fylkesveg,Primär länsväg",
-            tertiary="Övrig länsväg,Sekundär länsväg,Tertiär länsväg",
-            residential="Kommunal veg,Kommunalveg,Kommunal väg,Kommunal gata",
-            living_street="Gatetun,Gångfartsområde",
-            service="Privat veg,Privatveg,Enskild väg",
-            track="Skogsveg,Skogsbilveg,Traktorveg",
-            pedestrian="Gågate,Gågata",
-            cycleway="Gang- og sykkelveg,Sykkelveg,Cykelnät,Cykelväg",
-            footway="Gangveg,Fortau,Gangfelt,Gångnät,Gångväg",
-            steps="Trapp,Trappa",
-            path="Sti",
-            none="Bilferje,Passasjerferje,Annet,Färjeled,Jernbane,Järnväg",
-        ),
-        "Nasjonal vegdatabank (NVDB), NLOD",
-    ),
-    "ATKIS": _Vocabulary(
-        _words(
-            motorway="Bundesautobahn",
-            primary="Bundesstraße",
-            secondary="Landesstraße,Staatsstraße,Landesstraße Staatsstraße",
-            tertiary="Kreisstraße",
-            residential="Gemeindestraße",
-            road="AX_Strassenachse,AX_Fahrbahnachse,AX_Strasse,Straßenachse,Fahrbahnachse,Straße",
-            track="AX_Fahrwegachse,Fahrwegachse,Hauptwirtschaftsweg,Wirtschaftsweg",
-            path="AX_WegPfadSteig,Weg Pfad Steig",
-            pedestrian="Fußgängerzone",
-            footway="Fußweg",
-            cycleway="Radweg,Rad- und Fußweg",
-            none="AX_Bahnstrecke,AX_Gleis,AX_Gewaesserachse,AX_Seilbahn,AX_Leitung,AX_BauwerkImVerkehrsbereich,AX_Fahrleitung",
-        ),
-    ),
-}
-
-#: Numbers that stand for kinds, in columns of these names: roads of Norway by who keeps them, of ATKIS and of the IGN.
-_CODES = {
-    "wdm": {"1301": "motorway", "1303": "primary", "1305": "secondary", "1306": "tertiary", "1307": "residential"},
-    "widmung": {"1301": "motorway", "1303": "primary", "1305": "secondary", "1306": "tertiary", "1307": "residential"},
-    "fkt": {"5211": "track", "5212": "track", "1808": "pedestrian"},
-    "objart": {
-        "42002": _ROAD,
-        "42003": _ROAD,
-        "42005": _ROAD,
-        "42008": "track",
-        "53003": "path",
-        **dict.fromkeys(("42014", "42015", "42016", "44004", "51004", "53001", "53005", "53006", "53007"), _NONE),
-    },
-    "vegkategor": {
-        "e": "trunk",
-        "r": "primary",
-        "f": "secondary",
-        "k": "residential",
-        "p": "service",
-        "s": "track",
-    },
-    "importance": {"1": "trunk", "2": "primary", "3": "secondary", "4": "tertiary", "5": "residential"},
-}
-
-#: Names of columns, of which ten letters are left in a shapefile, in the order in which they are believed.
-_KINDS = (
-    "highway", "fclass", "mtfcc", "cfcc", "function", "roadfuncti", "road_funct", "classifica", "road_class",
-    "roadclassi", "nature", "typeveg", "type_veg", "typvei", "vegtype", "vagtyp", "vägtyp", "wdm", "widmung", "fkt",
-    "importance", "vegkategor", "vagkategor", "vägkategor", "kategori", "vocation", "objart", "objart_txt", "class",
-    "type", "subtype",
-)  # fmt: skip
-_TUNNELS = ("tunnel", "road_flags", "road_struc", "roadstruct", "structure", "pos_sol", "position_p", "medium")
-_NAMES = (
-    "name", "names", "street_nam", "streetname", "fullname", "name1", "name_1", "nom", "nom_rue_g", "nom_voie_g",
-    "nom_1_gauc", "nom_collab", "nam", "gatenavn", "adressenav", "vagnamn", "st_name", "road_name",
-)  # fmt: skip
-_TAGS = ("other_tags", "all_tags", "tags")
-#: Keys of OpenStreetMap that describe a line that is no road.
-_OTHER_KEYS = (
-    "waterway", "railway", "barrier", "power", "aeroway", "aerialway", "man_made", "natural", "landuse", "building",
-    "boundary", "leisure", "amenity", "pipeline",
-)  # fmt: skip
-_OSM_MARKS = {"osm_id", "osm_way_id", "osm_type", "full_id", "osmid", "@id", *_TAGS, *_OTHER_KEYS}
-_OSM_KINDS = ("highway", "fclass")
 _OSM_NAME, _OVERTURE = "OpenStreetMap", "© OpenStreetMap contributors, Overture Maps Foundation, ODbL 1.0"
+_OSM = _WORDS[_OSM_NAME] | _by_word({word: [word] for word in KNOWN_HIGHWAYS} | {_NONE: sorted(NO_ROADS)})
+_WORDS[_OSM_NAME] = _OSM
+_HIGHWAY = dict(_OSM)  # of a column `highway`: other words in it stand for kinds that are not known here
+_OSM_MARKS = {*_DATA["columns"]["mark"], *_TAGS, *_OTHER_KEYS}
 _AREA = "area"
-
-_KNOWN = {name[:10] for name in (*_KINDS, *_TUNNELS, *_NAMES, *_TAGS, *_OTHER_KEYS, *_OSM_MARKS, _AREA)}
-_PAIR = re.compile(r'"(highway|tunnel|area|railway|waterway|barrier|power)"\s*(?:=>|:)\s*"([^"]*)"')
-
-
+_KNOWN = {name[:10] for name in (*_KINDS, *_TUNNELS, *_NAMES, *_OSM_MARKS, _AREA)}
+_PAIR = re.compile(r'"(highway|tunnel|area)"\s*(?:=>|:)\s*"([^"]*)"')
 _CODE = re.compile(r"[a-z]\d+")
 #: Number of values by which the content of a column is recognised.
 _SAMPLE = 1000
@@ -291,14 +141,14 @@ def recognise(table: RoadTable) -> Schema:
         if _share(columns[name], _CODES.get(name, {})) > 0.5:
             kinds[name] = _CODES[name]
         elif maker := _maker_of(columns[name]):
-            kinds[name], makers[name] = _VOCABULARIES[maker].words, maker
-            if name in _OSM_KINDS and maker == _OSM_NAME:
+            kinds[name], makers[name] = _WORDS[maker], maker
+            if name in ("highway", "fclass") and maker == _OSM_NAME:
                 break
     is_osm = bool(columns.keys() & _OSM_MARKS) or table.meta.get("format") == _OSM_NAME
     if "highway" in columns and (is_osm or makers.get("highway") == _OSM_NAME):
         kinds = {"highway": _HIGHWAY}
         makers["highway"] = _OSM_NAME
-    credit = [_VOCABULARIES[maker].attribution for maker in makers.values()]
+    credit = [_DATA["attribution"].get(maker, "") for maker in makers.values()]
     if {"subtype", "class"} <= makers.keys():
         credit = [_OVERTURE]
     elif is_osm and _OSM_NAME in makers.values():
@@ -320,7 +170,7 @@ def _named(columns: Mapping[str, AnyArray]) -> dict[str, AnyArray]:
 
 def _maker_of(values: AnyArray) -> str | None:
     """Return the maker of maps whose words most filled values are."""
-    shares = {maker: _share(values, vocabulary.words) for maker, vocabulary in _VOCABULARIES.items()}
+    shares = {maker: _share(values, words) for maker, words in _WORDS.items()}
     best = max(shares, key=lambda maker: shares[maker])
     return best if shares[best] > 0.5 else None
 

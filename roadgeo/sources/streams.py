@@ -15,9 +15,9 @@ from roadgeo.sources.containers import ENDINGS, stream_tables
 from roadgeo.sources.lines import RoadLines, join_lines
 from roadgeo.sources.osm_files import OSM_ENDINGS
 from roadgeo.sources.schemas import recognise
-from roadgeo.sources.unpacking import PACKED, unpack
-from roadgeo.sources.vectors import first_line, require_file
 from roadgeo.storage.geopackage import layer_names
+from roadgeo.storage.unpacking import PACKED, unpack
+from roadgeo.storage.vectors import first_line, require_file
 
 __all__ = ["QUERY_ENDINGS", "list_sources", "read_lines", "reading", "stream_lines", "tell_source"]
 
@@ -182,6 +182,7 @@ def tell_source(name: str, meta: Mapping[str, Any]) -> None:
         "no_roads": "are no roads: streams, railways, fences, or not built",
         "broken": "have a vertex that is not finite",
         "without_places": "are ways whose nodes are not in the file",
+        "astray": "lie beyond the Earth, or have a vertex at 0, 0 far off all others",
     }
     for key, what in counts.items():
         if meta.get(key):

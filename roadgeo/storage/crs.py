@@ -18,7 +18,7 @@ from roadgeo.errors import CrsError
 if TYPE_CHECKING:
     from pyproj import CRS
 
-__all__ = ["all_text", "known_crs", "name_crs", "named_file"]
+__all__ = ["NoCrsError", "all_text", "crs_name", "known_crs", "name_crs", "named_file"]
 
 #: What PROJ's strings say behind a key that takes files, and what WKT and PROJJSON say of files.
 _KEYS = re.compile(r"(?:grids|file|model)\s*=\s*(\"[^\"]*|[^\s\"]*)", re.IGNORECASE)
@@ -28,6 +28,10 @@ _WKT = re.compile(
     r'(?:PARAMETERFILE\s*[\[(]\s*"(?:[^"]|"")*"|EXTENSION\s*[\[(]\s*"PROJ4_GRIDS")\s*,\s*"((?:[^"]|"")*)"',
     re.IGNORECASE,
 )
+
+
+class NoCrsError(CrsError):
+    """What was given is no CRS, or none of places on Earth."""
 
 
 def known_crs(crs: Any) -> CRS:
@@ -50,8 +54,10 @@ def name_crs(crs: Any) -> str:
 
     Raises
     ------
-    CrsError
+    NoCrsError
         It is none, or none of places on a map.
+    CrsError
+        It names a file that is none of PROJ's own.
     """
     from pyproj.exceptions import CRSError
 
@@ -60,12 +66,20 @@ def name_crs(crs: Any) -> str:
     try:
         known = known_crs(crs)
     except CRSError as error:
-        raise CrsError(f"{told} is no CRS that PROJ knows; {expected}") from error
+        raise NoCrsError(f"{told} is no CRS that PROJ knows; {expected}") from error
     known = known.to_2d() if len(known.axis_info) == 3 else known
     if not (known.is_geographic or known.is_projected):
-        raise CrsError(f"{told} is no CRS of places on Earth, but {known.type_name}; {expected}")
+        raise NoCrsError(f"{told} is no CRS of places on Earth, but {known.type_name}; {expected}")
     code = known.to_epsg(min_confidence=100)
     return f"EPSG:{code}" if code else known.to_wkt("WKT2_2019")
+
+
+def crs_name(crs: Any) -> str | None:
+    """Return a CRS as `name_crs` does; None where there is none, or one that is bound to no place on Earth."""
+    try:
+        return None if crs is None else name_crs(crs)
+    except NoCrsError:
+        return None
 
 
 @lru_cache(maxsize=64)

@@ -39,7 +39,7 @@ SEALED = {"GDAL_DISABLE_READDIR_ON_OPEN": "EMPTY_DIR", **NETWORK}
 def skip_drivers() -> None:
     """Have GDAL leave out its dangerous drivers, for programs that are roadgeo's alone: call it before GDAL is loaded.
 
-    Programs that merely use roadgeo keep their drivers; `storage.rasters` and `sources.vectors` guard each file.
+    Programs that merely use roadgeo keep their drivers; `storage.rasters` and `storage.vectors` guard each file.
     """
     given = os.environ.get("GDAL_SKIP", "")
     before = (name.strip() for name in (given.split(",") if "," in given else given.split()))

@@ -16,7 +16,7 @@ from roadgeo.reference import remote
 from roadgeo.reference.files import reference_digest
 from roadgeo.reference.library import resolve_reference
 from roadgeo.reference.network_file import as_stored
-from roadgeo.reference.reference import Reference, open_reference
+from roadgeo.reference.reference import Reference, open_reference, open_whole
 from roadgeo.reference.shards import Manifest, ShardEntry, write_manifest
 
 fsspec = pytest.importorskip("fsspec")
@@ -31,8 +31,9 @@ def built(tmp_path_factory):
     reference = Reference(build_index(network), network)
     reference.save(folder / "00ff" / "a.gpkg")
     index, digest = reference.index, reference_digest(folder / "00ff" / "a.gpkg")
+    size = sum(file.stat().st_size for file in (folder / "00ff").iterdir())
     entry = ShardEntry(
-        "a", (-180, -90, 180, 90), (-180, -90, 180, 90), index.plane.crs, len(index), len(index), 1.0, 1, digest
+        "a", (-180, -90, 180, 90), (-180, -90, 180, 90), index.plane.crs, len(index), len(index), 1.0, size, digest
     )
     write_manifest(folder, Manifest("town", "00ff", index.plane.crs, 3000.0, {}, (entry,)))
     return folder
@@ -87,6 +88,48 @@ def test_another_shard_in_its_place_is_refused(in_memory, built, tmp_path):
     in_memory.put(str(tmp_path / "other.index"), "/bucket/town.shards/00ff/a.index")
     with pytest.raises(IndexFormatError, match="not the shard that the manifest names"):
         open_reference(URL).parts[0].open()
+
+
+@pytest.mark.parametrize("kind", ["index", "gpkg"])
+def test_another_shard_that_takes_its_place_while_it_is_opened_is_refused(built, tmp_path, monkeypatch, kind):
+    shutil.copytree(built, tmp_path / "town.shards")
+    network = as_stored(random_network(2, 1500.0))
+    Reference(build_index(network), network).save(tmp_path / "a.gpkg")
+    shard = open_reference(tmp_path / "town.shards").parts[0]
+
+    def swap(path):
+        for ending in ("gpkg", "index"):
+            shard.path.with_suffix(f".{ending}").unlink()
+        shutil.copy(tmp_path / f"a.{kind}", shard.path.with_suffix(f".{kind}"))
+        return open_whole(path)
+
+    monkeypatch.setattr("roadgeo.reference.reference.open_whole", swap)
+    with pytest.raises(IndexFormatError, match="not the shard that the manifest names"):
+        shard.open()
+
+
+@pytest.mark.parametrize("tells", [True, False])
+def test_no_more_is_fetched_than_the_manifest_tells(built, tmp_path, cache, tells):
+    shutil.copytree(built, tmp_path / "www" / "town.shards")
+    size = sum(file.stat().st_size for file in (built / "00ff").iterdir())
+
+    class Endless(_Quiet):
+        def do_GET(self):
+            if not self.path.endswith(".index"):
+                super().do_GET()
+                return
+            self.send_response(200)
+            if tells:
+                self.send_header("Content-Length", str(1 << 40))
+            self.end_headers()
+            with contextlib.suppress(OSError):
+                for _ in range(1 << 10):
+                    self.wfile.write(bytes(1 << 20))
+
+    refused = pytest.raises(IndexFormatError, match=r"is of more than the [0-9,]+ bytes that it was said to have")
+    with _serving(functools.partial(Endless, directory=str(tmp_path / "www"))) as port, refused:
+        open_reference(f"http://127.0.0.1:{port}/town.shards").parts[0].open()
+    assert sum(file.stat().st_size for file in cache.rglob("*") if file.is_file()) < size
 
 
 def test_what_is_not_there_is_an_error_on_one_line(in_memory, cache):

@@ -1,4 +1,5 @@
 import contextlib
+import multiprocessing
 import os
 import signal
 import subprocess
@@ -39,6 +40,19 @@ def test_results_come_in_the_order_of_the_tasks(jobs: int) -> None:
 def test_a_process_that_dies_costs_one_result() -> None:
     results = list(run(["a", "b", "die", "c", "d"], Shout(), 2))
     assert results == ["A", "B", "die: the process that worked on it died (out of memory?)", "C", "D"]
+
+
+def test_who_stops_early_ends_the_workers_and_no_process_of_the_program() -> None:
+    other = multiprocessing.get_context("spawn").Process(target=time.sleep, args=(60,))
+    other.start()
+    try:
+        results = run(["a", "b", "c"], Shout(), 2)
+        assert next(results) == "A"
+        results.close()
+        assert multiprocessing.active_children() == [other]
+    finally:
+        other.kill()
+        other.join()
 
 
 @pytest.mark.skipif(os.name == "nt", reason="signals of POSIX")

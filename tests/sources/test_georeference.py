@@ -103,7 +103,7 @@ def test_a_world_file_speaks_of_stored_pixels(tmp_path: Path, orientation: int) 
     assert found.size == (80, 60)
     last = {3: (0, 0), 6: (width, 0), 7: (0, 0)}[orientation]  # of the file, where the upright picture ends below right
     assert Homography(found.matrix)(np.array([80.0, 60.0])) == pytest.approx(at(PLACE, *last), abs=1e-6)
-    stored = found.of_stored(path)
+    stored = found.of_stored(orientation)
     assert stored.matrix == pytest.approx(np.array(PLACE).reshape(3, 3), abs=1e-9)
     assert stored.size == (width, height)
 

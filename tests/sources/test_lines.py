@@ -353,6 +353,16 @@ def test_archives(tmp_path, name):
     assert len(read_lines(tmp_path / name).lines) == len(streets()[0])
 
 
+def test_names_of_columns_that_are_not_in_the_encoding_that_a_file_names(tmp_path):
+    file = write_vector(tmp_path / "a.shp", [LineString([(0, 0), (0.01, 0.01)])], vXgtyp=["Gångväg"])
+    part = file.with_suffix(".dbf")
+    part.write_bytes(part.read_bytes().replace(b"vXgtyp", b"v\xe4gtyp").replace("Gångväg".encode(), b"G\xe5ngv\xe4g  "))
+    file.with_suffix(".cpg").write_text("UTF-8")
+    read = read_lines(file)
+    assert read.highway.tolist() == ["footway"]
+    assert read.meta["encoding"] == "Latin-1"
+
+
 @pytest.mark.parametrize("suffix", [".geojson", ".shp", ".csv"])
 def test_text_that_is_not_in_the_encoding_that_a_file_names(tmp_path, suffix):
     line = LineString([(0, 0), (0.01, 0.01)])

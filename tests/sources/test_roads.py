@@ -3,6 +3,7 @@ from itertools import pairwise
 from pathlib import Path
 
 import numpy as np
+import pyogrio
 import pytest
 import shapely
 from pyproj import Transformer
@@ -14,7 +15,7 @@ from roadgeo.geometry.projection import from_lonlat, to_lonlat
 from roadgeo.roads.intersections import find_intersections
 from roadgeo.roads.kinds import highways
 from roadgeo.roads.simplification import planarize, simplify
-from roadgeo.sources.roads import Roads, project_lines, read_roads
+from roadgeo.sources.roads import Roads, choose_roads, read_roads
 
 HERE = LineString([(-71.09, 42.345), (-71.08, 42.345), (-71.08, 42.352)])
 
@@ -151,7 +152,7 @@ def test_coordinates_that_do_not_fit_the_crs(tmp_path):
 
 @pytest.mark.parametrize("crs", ["EPSG:123456", "nonsense", "EPSG:5703"])
 def test_a_crs_that_is_none(tmp_path, crs):
-    with pytest.raises(CrsError, match="no CRS of places on Earth"):
+    with pytest.raises(CrsError, match="is no CRS"):
         read_roads(write(tmp_path / "a.gpkg", HERE), crs=crs)
 
 
@@ -188,13 +189,31 @@ def test_progress_is_told(tmp_path):
 
 
 def test_lines_from_memory():
-    lines, plane = project_lines([HERE, None], "EPSG:4326")
-    assert plane.crs == "EPSG:32619"
-    assert shapely.length(lines).sum() == pytest.approx(823.6 + 777.6, rel=0.005)
-    with pytest.raises(CrsError, match="the roads have no CRS"):
-        project_lines([HERE], None)
+    roads = choose_roads([HERE, None], crs="EPSG:4326")
+    assert roads.plane.crs == "EPSG:32619"
+    assert shapely.length(roads.lines).sum() == pytest.approx(823.6 + 777.6, rel=0.005)
+    with pytest.raises(CrsError, match="the roads: says nothing of its CRS"):
+        choose_roads([HERE])
     with pytest.raises(RoadSourceError, match="no roads"):
-        project_lines([], "EPSG:4326")
+        choose_roads([], crs="EPSG:4326")
+
+
+@pytest.mark.parametrize("crs", ["EPSG:4326", "EPSG:32619"])
+def test_a_vertex_at_the_origin_far_off_all_others_is_missing(tmp_path, caplog, crs):
+    """Programs write 0, 0 where they know no place; a plane that reaches there is true nowhere."""
+    lines = [HERE, shapely.transform(HERE, lambda xy: xy + 0.001), shapely.transform(HERE, lambda xy: xy - 0.001)]
+    file = write(tmp_path / "a.geojson", *lines)
+    if crs != "EPSG:4326":
+        file = write(tmp_path / "a.gpkg", *lines, crs=crs)
+    found = pyogrio.read_dataframe(file)
+    right = read_roads(file)
+    spoilt = shapely.LineString([(0, 0), *found.geometry[0].coords])
+    roads = choose_roads([spoilt, *found.geometry], crs=crs)
+    assert roads.plane.crs == right.plane.crs
+    assert shapely.equals_exact(roads.lines, right.lines, 1e-6).all()
+    assert "left out 1 of 4 features, which lie beyond the Earth, or have a vertex at 0, 0" in caplog.text
+    near = [shapely.transform(line, lambda xy: xy - HERE.coords[0]) for line in lines]
+    assert len(choose_roads(near, crs="EPSG:4326")) == 3
 
 
 def junctions(ways):

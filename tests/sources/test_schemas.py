@@ -10,9 +10,8 @@ from worlds.schemas import SCHEMAS, expected, frame, table
 
 from roadgeo.errors import NoRoadsError, RoadSourceError
 from roadgeo.geometry.projection import from_lonlat
-from roadgeo.sources.held_roads import choose_roads
 from roadgeo.sources.lines import OSM_ATTRIBUTION, RoadTable
-from roadgeo.sources.roads import read_roads
+from roadgeo.sources.roads import choose_roads, read_roads
 from roadgeo.sources.schemas import recognise
 
 CONTAINERS = ["gpkg", "shp", "geojson", "fgb", "parquet", "frame", "folder", "zip", "geojson.gz"]
@@ -148,7 +147,7 @@ def test_lines_that_are_broken_are_left_out_and_counted(caplog):
         roads = choose_roads(column(*lines), crs="EPSG:4326")
     assert len(roads) == 17
     assert "left out 2 of 20 features, which have a vertex that is not finite" in caplog.text
-    assert "left out 1 lines that lie beyond the Earth" in caplog.text
+    assert "left out 1 of 20 features, which lie beyond the Earth" in caplog.text
 
 
 def test_unknown_kinds_are_told(tmp_path, caplog):

@@ -1,6 +1,10 @@
 """A CRS of a stranger opens no file: neither its grids nor what defines it."""
 
 import json
+import os
+import subprocess
+import sys
+from pathlib import Path
 
 import numpy as np
 import pyproj
@@ -72,6 +76,21 @@ def test_no_file_is_opened(way: int, file: str) -> None:
 )
 def test_what_names_no_file_is_as_pyproj_has_it(crs: str) -> None:
     assert known_crs(crs) == pyproj.CRS(crs)
+
+
+@pytest.mark.skipif(not hasattr(os, "mkfifo"), reason="no pipes with names here")
+def test_a_grid_in_the_current_folder_is_not_opened(tmp_path: Path) -> None:
+    """Whoever opens a pipe that nobody writes to waits for ever."""
+    os.mkfifo(tmp_path / "own.gsb")
+    code = (
+        "import contextlib, pyproj\nfrom rasterio.warp import transform\n"
+        "crs = '+proj=longlat +ellps=bessel +nadgrids=own.gsb +type=crs'\n"
+        "with contextlib.suppress(pyproj.exceptions.ProjError):\n"
+        "    pyproj.Transformer.from_crs(crs, 'EPSG:4326')\n"
+        "with contextlib.suppress(Exception):\n"
+        "    transform(crs, 'EPSG:4326', [10.0], [50.0])\n"
+    )
+    subprocess.run([sys.executable, "-c", code], cwd=tmp_path, check=True, timeout=120)
 
 
 # --- words for one CRS ------------------------------------------------------------------------------------------------

@@ -33,11 +33,9 @@ from roadgeo.running.applying import apply_location, read_location
 from roadgeo.running.flights.frames import FrameOptions, _video
 from roadgeo.running.flights.motion import read_motion
 from roadgeo.running.serving.requests import Refused, ending_of, read_execution, read_query_string
-from roadgeo.sources import vectors
 from roadgeo.sources.elevation import ground_heights
 from roadgeo.sources.exif import estimate_gsd, read_focal_length
 from roadgeo.sources.georeference import read_georeference, read_stated_middle
-from roadgeo.sources.lines import crs_name
 from roadgeo.sources.masks import read_mask
 from roadgeo.sources.overpass import FetchOptions, fetch_lines, find_place
 from roadgeo.sources.roads import read_roads
@@ -45,6 +43,8 @@ from roadgeo.sources.segmentation.card import read_card
 from roadgeo.sources.segmentation.onnx_file import open_onnx
 from roadgeo.sources.segmentation.photograph import find_ground, open_photograph
 from roadgeo.sources.streams import stream_lines
+from roadgeo.storage import vectors
+from roadgeo.storage.crs import crs_name
 from support.untrusted_web import answered, serve_request
 
 CORPUS = Path(__file__).parents[1] / "corpus"

@@ -11,7 +11,6 @@ from types import SimpleNamespace
 from typing import Any
 from unittest import mock
 
-import geopandas
 import requests
 import urllib3
 import uvicorn
@@ -34,9 +33,7 @@ def answered(content: bytes) -> Iterator[None]:
         return response
 
     adapter = mock.patch.object(requests.adapters.HTTPAdapter, "send", send)
-    # Which zone a place lies in is looked up for half a second.
-    plane = mock.patch.object(geopandas.GeoSeries, "estimate_utm_crs", return_value="EPSG:32629")
-    with adapter, plane, mock.patch("osmnx._http._config_dns"), mock.patch("time.sleep"):
+    with adapter, mock.patch("time.sleep"):
         yield
 
 

@@ -11,7 +11,7 @@ from __future__ import annotations
 import ast
 import json
 import re
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
@@ -101,18 +101,14 @@ def read_card(model: OnnxModel, class_name: str | None = None) -> ModelCard:
         return _make_card(model, told, class_name)
     except (TypeError, ValueError, KeyError, AttributeError, RecursionError) as error:
         raise ModelError(f"{path}: its metadata make no sense ({error}); correct them") from error
-    except _WrongModelError as error:
+    except ModelError as error:
         raise ModelError(f"{path}: {error}") from error
-
-
-class _WrongModelError(Exception):
-    """Why a model cannot be run, and the remedy."""
 
 
 def _make_card(model: OnnxModel, told: dict[str, Any], class_name: str | None) -> ModelCard:
     kind = str(told.get("model_type", "Segmentor"))
     if kind.lower() not in ("segmentor", "segmenter", "segmentation", "semantic-segmentation"):
-        raise _WrongModelError(f"is a model for {kind}; expected one for segmentation (Segmentor)")
+        raise ModelError(f"is a model for {kind}; expected one for segmentation (Segmentor)")
     tile, channels_last = _tile_of(model, told)
     names = told.get("classes", {})
     output = _choose_output(model, class_name)
@@ -146,13 +142,13 @@ def _make_card(model: OnnxModel, told: dict[str, Any], class_name: str | None) -
 def _tile_of(model: OnnxModel, told: dict[str, Any]) -> tuple[tuple[int, int], bool]:
     """Return (height, width) of the input, its own where it is fixed, else as given; and whether channels come last."""
     if len(model.inputs) != 1:
-        raise _WrongModelError(f"takes {len(model.inputs)} inputs; expected one, a picture")
+        raise ModelError(f"takes {len(model.inputs)} inputs; expected one, a picture")
     port = model.inputs[0]
     last = len(port.shape) == 4 and port.shape[3] == 3 != port.shape[1]
     is_picture = len(port.shape) == 4 and port.shape[0] in (None, 1) and (last or port.shape[1] in (None, 3))
     if port.kind not in _TAKEN or not is_picture:
         sizes = ", ".join("any" if side is None else str(side) for side in port.shape)
-        raise _WrongModelError(
+        raise ModelError(
             f"takes {port.kind} of shape ({sizes}); expected {', '.join(_TAKEN)}; (1, 3, height, width) or "
             "(1, height, width, 3), RGB"
         )
@@ -161,7 +157,7 @@ def _tile_of(model: OnnxModel, told: dict[str, Any]) -> tuple[tuple[int, int], b
     free = max(_TILE_STEP, round(wanted / _TILE_STEP) * _TILE_STEP)
     tile = sides[0] or free, sides[1] or free
     if not all(_TILE_STEP <= side <= _MAX_TILE for side in tile):
-        raise _WrongModelError(f"takes tiles of {tile[1]} x {tile[0]} pixels; expected {_TILE_STEP} to {_MAX_TILE}")
+        raise ModelError(f"takes tiles of {tile[1]} x {tile[0]} pixels; expected {_TILE_STEP} to {_MAX_TILE}")
     return tile, last
 
 
@@ -169,7 +165,7 @@ def _choose_output(model: OnnxModel, class_name: str | None) -> Port:
     """Choose among heads: the one of the class's name, the one named after roads, or the first that is an image."""
     images = [port for port in model.outputs if port.kind in _GIVEN + _WHOLE and len(port.shape) in (0, 3, 4)]
     if not images:
-        raise _WrongModelError("gives no image of numbers; expected (1, classes, height, width)")
+        raise ModelError("gives no image of numbers; expected (1, classes, height, width)")
     named = [port for port in images if port.name == class_name]
     return (named or [port for port in images if _is_road(port.name)] or images)[0]
 
@@ -197,25 +193,23 @@ def channels_come_last(sides: Sequence[int | None]) -> bool:
 def _choose_channels(output: Port, names: dict[int, str], class_name: str | None) -> tuple[int, ...]:
     """Return which channels of an output are road."""
     n, wanted = _n_channels(output), _wanted(names, class_name)
-    if n == 1:
-        # A single channel is by convention the last of the classes, separated from the others by the threshold.
-        if max(names, default=0) in wanted or (not names and class_name in (None, output.name)):
-            return (0,)
-        raise _WrongModelError(_ask(names, class_name))
-    if not wanted or (n is not None and max(wanted) >= n):
-        raise _WrongModelError(_ask(names, class_name))
+    unnamed = not names and class_name in (None, output.name)
+    # A single channel is by convention the last of the classes, told from the others by the threshold.
+    if n == 1 and (unnamed or max(names, default=0) in wanted):
+        return (0,)
+    if n == 1 or not wanted or (n is not None and max(wanted) >= n):
+        raise ModelError(_ask(names, class_name))
     return tuple(wanted)
 
 
 def _choose_classes(output: Port, names: dict[int, str], class_name: str | None) -> tuple[int, ...]:
     """Return which values of an output are road; nothing where the model does not state it: all but 0 then."""
-    wanted = _wanted(names, class_name)
     if not names and class_name in (None, output.name):
         return ()
-    if not names and class_name is not None and class_name.isdecimal():
-        wanted = [int(class_name)]
+    is_number = not names and str(class_name).isdecimal()
+    wanted = [int(str(class_name))] if is_number else _wanted(names, class_name)
     if not wanted:
-        raise _WrongModelError(_ask(names, class_name))
+        raise ModelError(_ask(names, class_name))
     return tuple(wanted)
 
 
@@ -239,28 +233,21 @@ def _is_road(name: str) -> bool:
 
 
 def _read_metadata(props: dict[str, str]) -> dict[str, Any]:
-    """Read `metadata_props` as Deepness and GeoDeep write them."""
-    told: dict[str, Any] = {}
-    if "model_type" in props:
-        told["model_type"] = _value(props["model_type"])
-    names = props.get("class_names", props.get("names"))
-    if names is not None:
-        told["classes"] = _classes(_value(names))
-    if "resolution" in props:
-        told["resolution_m"] = float(_value(props["resolution"])) / 100.0
-    size = props.get("tiles_size", props.get("tile_size"))
-    if size is not None:
-        told["tile"] = int(_value(size))
-    for key, name in (("standardization_mean", "mean"), ("standardization_std", "std")):
-        if key in props:
-            told[name] = _value(props[key])
-    if "tiles_overlap" in props:
-        told["overlap"] = float(_value(props["tiles_overlap"])) / 100.0
-    if "seg_thresh" in props:
-        told["threshold"] = float(_value(props["seg_thresh"]))
-    if "ways" in props:  # roadgeo's own
-        told["ways"] = int(_value(props["ways"]))
-    return told
+    """Read `metadata_props` as Deepness and GeoDeep write them; `ways` is roadgeo's own."""
+    read: dict[str, tuple[str, Callable[[Any], Any]]] = {
+        "model_type": ("model_type", str),
+        "names": ("classes", _classes),
+        "class_names": ("classes", _classes),
+        "resolution": ("resolution_m", lambda centimetres: float(centimetres) / 100.0),
+        "tile_size": ("tile", int),
+        "tiles_size": ("tile", int),
+        "standardization_mean": ("mean", lambda one: one),
+        "standardization_std": ("std", lambda one: one),
+        "tiles_overlap": ("overlap", lambda percent: float(percent) / 100.0),
+        "seg_thresh": ("threshold", float),
+        "ways": ("ways", int),
+    }
+    return {name: make(_value(props[key])) for key, (name, make) in read.items() if key in props}
 
 
 def _value(text: str) -> Any:
@@ -276,8 +263,9 @@ def _value(text: str) -> Any:
 
 
 def _classes(names: Any) -> dict[int, str]:
-    pairs = names.items() if isinstance(names, dict) else enumerate(names)
-    found = {int(key): str(name) for key, name in pairs}
+    found = {
+        int(key): str(name) for key, name in (names if isinstance(names, dict) else dict(enumerate(names))).items()
+    }
     if len(found) > 1000:
         raise ValueError(f"{len(found)} classes")
     return found
@@ -337,7 +325,7 @@ def _affine(step: dict[str, Any]) -> tuple[float, float]:
         return float(step["minimum"]), float(step["maximum"]) - float(step["minimum"])
     if kind == "scale":
         return 0.0, float(step["value"])
-    raise _WrongModelError(f"asks for values scaled by {kind!r}; expected z-score, min-max or scale")
+    raise ModelError(f"asks for values scaled by {kind!r}; expected z-score, min-max or scale")
 
 
 def _triple(value: Any, what: str) -> tuple[float, float, float]:

@@ -18,6 +18,7 @@ from typing import Any, NamedTuple
 
 from roadgeo._arrays import AnyArray
 from roadgeo.errors import ModelError, how_to_install
+from roadgeo.sources.protobuf import message_types
 
 __all__ = ["OnnxModel", "Port", "open_onnx"]
 
@@ -30,18 +31,20 @@ _CONTROL = {"If", "Loop", "Scan", "SequenceMap"}
 _RANDOM = {"RandomNormal", "RandomNormalLike", "RandomUniform", "RandomUniformLike", "Multinomial", "Bernoulli"}
 _STRING = 8  # of TensorProto.DataType
 
-#: Parts of a file that are checked: its messages with their fields, which may all be repeated, by name and number
-#: (https://github.com/onnx/onnx/blob/main/onnx/onnx.proto).
-_SCHEMA = {
-    "Model": (("version", 1, "int64"), ("graph", 7, "Graph"), ("training", 20, "bytes"), ("function", 25, "bytes")),
-    "Graph": (("node", 1, "Node"), ("stored", 5, "Tensor"), ("sparse", 15, "bytes")),
-    "Node": (("output", 2, "bytes"), ("operator", 4, "bytes"), ("attribute", 5, "Attribute"), ("domain", 7, "bytes")),
-    "Attribute": (
-        *(("tensor", 5, "Tensor"), ("tensors", 10, "Tensor"), ("graph", 6, "bytes"), ("graphs", 11, "bytes")),
-        *(("sparse", 22, "bytes"), ("sparses", 23, "bytes")),
+#: What is looked at of a file (https://github.com/onnx/onnx/blob/main/onnx/onnx.proto).
+_SCHEMA = (
+    ("Model", (("version", 1, "int64"), ("graph", 7, "Graph"), ("training", 20, "bytes"), ("function", 25, "bytes"))),
+    ("Graph", (("node", 1, "Node"), ("stored", 5, "Tensor"), ("sparse", 15, "bytes"))),
+    ("Node", (("output", 2, "bytes"), ("operator", 4, "bytes"), ("attribute", 5, "Attribute"), ("domain", 7, "bytes"))),
+    (
+        "Attribute",
+        (
+            *(("tensor", 5, "Tensor"), ("tensors", 10, "Tensor"), ("graph", 6, "bytes"), ("graphs", 11, "bytes")),
+            *(("sparse", 22, "bytes"), ("sparses", 23, "bytes")),
+        ),
     ),
-    "Tensor": (("kind", 2, "int64"), ("external", 13, "bytes"), ("location", 14, "int64")),
-}
+    ("Tensor", (("kind", 2, "int64"), ("external", 13, "bytes"), ("location", 14, "int64"))),
+)
 
 
 class Port(NamedTuple):
@@ -128,7 +131,7 @@ def open_onnx(path: str | os.PathLike[str], threads: int = 1) -> OnnxModel:
     content = file.read_bytes()
     try:
         last = _require_network(content)
-    except _RefusedError as error:
+    except ModelError as error:
         raise ModelError(f"{name}: {error}") from error
     try:
         session = _open_session(content, threads)
@@ -141,28 +144,24 @@ def open_onnx(path: str | os.PathLike[str], threads: int = 1) -> OnnxModel:
     return OnnxModel(name, inputs, outputs, last, metadata, session)
 
 
-class _RefusedError(Exception):
-    """Why a file is refused, and the remedy."""
-
-
 def _require_network(content: bytes) -> dict[str, str]:
     """Look through a ModelProto; return the operator that makes each value."""
     from google.protobuf.message import DecodeError
 
     try:
-        model = _message_types()["Model"].FromString(content)
+        model = message_types(_SCHEMA)["Model"].FromString(content)
     except DecodeError as error:
-        raise _RefusedError("not an ONNX model, or damaged; export it again") from error
+        raise ModelError("not an ONNX model, or damaged; export it again") from error
     if not model.version or len(model.graph) != 1:
-        raise _RefusedError(f"not an ONNX model, or damaged: it holds {len(model.graph)} graphs; export it again")
+        raise ModelError(f"not an ONNX model, or damaged: it holds {len(model.graph)} graphs; export it again")
     for what, held in (("training steps", model.training), ("functions", model.function)):
         if held:
-            raise _RefusedError(f"holds {what} of its own; expected a plain network: export it with its parts inlined")
+            raise ModelError(f"holds {what} of its own; expected a plain network: export it with its parts inlined")
     (graph,) = model.graph
     if graph.sparse:
-        raise _RefusedError("holds sparse tensors; expected dense ones: export it anew")
+        raise ModelError("holds sparse tensors; expected dense ones: export it anew")
     if len(graph.node) > _MAX_NODES:
-        raise _RefusedError(f"has more than {_MAX_NODES:,} operators; expected a network for segmentation")
+        raise ModelError(f"has more than {_MAX_NODES:,} operators; expected a network for segmentation")
     _require_numbers(graph.stored)
     for node in graph.node:
         _require_plain(node)
@@ -174,13 +173,13 @@ def _require_plain(node: Any) -> None:
     operator = "".join(map(_text, node.operator))
     for domain in map(_text, node.domain):
         if domain not in ("", "ai.onnx"):
-            raise _RefusedError(f"uses the operator {domain}.{operator}; expected ONNX's own: export it without others")
+            raise ModelError(f"uses the operator {domain}.{operator}; expected ONNX's own: export it without others")
     if operator in _CONTROL | _RANDOM or len(node.operator) > 1:
         what = "random numbers" if operator in _RANDOM else "control flow"
-        raise _RefusedError(f"uses {what} ({operator}); expected a plain network: export it anew")
+        raise ModelError(f"uses {what} ({operator}); expected a plain network: export it anew")
     for attribute in node.attribute:
         if attribute.graph or attribute.graphs or attribute.sparse or attribute.sparses:
-            raise _RefusedError("holds graphs or sparse tensors within operators; expected a plain network")
+            raise ModelError("holds graphs or sparse tensors within operators; expected a plain network")
         _require_numbers([*attribute.tensor, *attribute.tensors])
 
 
@@ -188,31 +187,9 @@ def _require_numbers(tensors: Iterable[Any]) -> None:
     """Refuse tensors that lie in another file, or hold text."""
     for tensor in tensors:
         if tensor.external or any(tensor.location):
-            raise _RefusedError("keeps data in another file; expected all in one: save it without external data")
+            raise ModelError("keeps data in another file; expected all in one: save it without external data")
         if _STRING in tensor.kind:
-            raise _RefusedError("holds a tensor of text; expected numbers")
-
-
-@cache
-def _message_types() -> dict[str, Any]:
-    """Return the classes of the messages of `_SCHEMA`."""
-    from google.protobuf import descriptor_pb2, descriptor_pool, message_factory
-
-    described = descriptor_pb2.FieldDescriptorProto
-    plain = {"int64": described.TYPE_INT64, "bytes": described.TYPE_BYTES}
-    package = "roadgeo.onnx"
-    file = descriptor_pb2.FileDescriptorProto(name=f"{package}.proto", package=package)
-    for name, fields in _SCHEMA.items():
-        message = file.message_type.add(name=name)
-        for field_name, number, kind in fields:
-            added = message.field.add(name=field_name, number=number, label=described.LABEL_REPEATED)
-            if kind in plain:
-                added.type = plain[kind]
-            else:
-                added.type, added.type_name = described.TYPE_MESSAGE, f".{package}.{kind}"
-    pool = descriptor_pool.DescriptorPool()
-    pool.Add(file)
-    return {name: message_factory.GetMessageClass(pool.FindMessageTypeByName(f"{package}.{name}")) for name in _SCHEMA}
+            raise ModelError("holds a tensor of text; expected numbers")
 
 
 def _without_telemetry() -> Any:

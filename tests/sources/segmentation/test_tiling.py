@@ -9,12 +9,12 @@ import rasterio
 from worlds.models import brightness_model
 
 from roadgeo.errors import MaskError
+from roadgeo.roads.thresholds import spread_probability
 from roadgeo.sources.masks import PROBABILITY_TAG, open_mask, read_mask
 from roadgeo.sources.segmentation.network import load_network
 from roadgeo.sources.segmentation.photograph import open_photograph
 from roadgeo.sources.segmentation.probability import NODATA, ProbabilityMap, fuse
 from roadgeo.sources.segmentation.tiling import _look, _starts, segment
-from roadgeo.sources.thresholds import spread_probability
 
 MODELS = Path(__file__).parents[2] / "data" / "models"
 pytestmark = pytest.mark.filterwarnings("ignore::rasterio.errors.NotGeoreferencedWarning")

@@ -7,33 +7,23 @@ other drivers are registered again afterwards, for this may be part of a larger 
 
 from __future__ import annotations
 
-import mmap
 import os
-import re
 import sqlite3
 import tempfile
 import threading
 import warnings
-from collections.abc import Iterator, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager
 from pathlib import Path
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 from roadgeo._arrays import AnyArray
 from roadgeo.errors import RoadSourceError
-from roadgeo.sources.crs_guard import refuse_named_files
+from roadgeo.storage.crs_guard import refuse_named_files
 from roadgeo.storage.gdal import CONSENT, NETWORK, allowed_drivers
 from roadgeo.storage.sqlite import opened, table_problem
 
-__all__ = [
-    "VectorLayer",
-    "count_features",
-    "first_line",
-    "list_fields",
-    "list_layers",
-    "read_layer",
-    "require_file",
-]
+__all__ = ["VectorLayer", "describe_layer", "first_line", "list_layers", "read_layer", "require_file"]
 
 #: GDAL's names of the drivers that may read; they read the file, and those beside it that belong to it.
 _DRIVERS = {
@@ -48,7 +38,6 @@ _OWN_TABLES = (
 )
 
 _LOCK = threading.RLock()
-_LINK = re.compile(rb'"crs"\s*:\s*\{[^\[\]]{0,2000}?"type"\s*:\s*"(link|url)"', re.IGNORECASE)
 
 
 class VectorLayer(NamedTuple):
@@ -85,32 +74,13 @@ def list_layers(path: Path) -> list[tuple[str, str]]:
         return [(str(name), str(kind)) for name, kind in pyogrio.list_layers(file)]
 
 
-def count_features(path: Path, layer: str) -> int:
-    """Return the number of features that a layer claims to hold.
-
-    Raises
-    ------
-    RoadSourceError
-        As `list_layers`.
-    """
+def describe_layer(path: Path, layer: str) -> tuple[int, list[str]]:
+    """Return how many features a layer says to hold, and the names of its columns; errors as of `list_layers`."""
     import pyogrio
 
     with _guarded(path, layer) as file:
-        return int(pyogrio.read_info(file, layer=layer, force_feature_count=True)["features"])
-
-
-def list_fields(path: Path, layer: str) -> list[str]:
-    """Return the names of a layer's columns.
-
-    Raises
-    ------
-    RoadSourceError
-        As `list_layers`.
-    """
-    import pyogrio
-
-    with _guarded(path, layer) as file:
-        return [str(name) for name in pyogrio.read_info(file, layer=layer)["fields"]]
+        told, _ = _decoded(lambda **more: pyogrio.read_info(file, layer=layer, force_feature_count=True, **more))
+        return int(told["features"]), [str(name) for name in told["fields"]]
 
 
 def read_layer(
@@ -119,28 +89,27 @@ def read_layer(
     """Read a layer (the first by default), with those of the named columns that it has.
 
     The first `skip` features are left out, and a bounded number is read. Text that is not in the encoding that the file
-    names is read as Latin-1, which may garble it, and that is reported.
-
-    Raises
-    ------
-    RoadSourceError
-        As `list_layers`.
+    names is read as Latin-1, which may garble it, and that is told. Errors are those of `list_layers`.
     """
     import pyogrio
 
     with _guarded(path) as file:
         layer = layer or str(pyogrio.list_layers(file)[0][0])
         _require_stored(path, layer)
-        info = pyogrio.read_info(file, layer=layer)
         part = {"skip_features": skip, "max_features": most, "columns": list(columns), "force_2d": True}
-        told = {}
-        try:
-            meta, _, shapes, values = pyogrio.raw.read(file, layer=layer, **part)
-        except UnicodeDecodeError:
-            meta, _, shapes, values = pyogrio.raw.read(file, layer=layer, encoding="ISO-8859-1", **part)
-            told["encoding"] = "Latin-1"
+        info, _ = _decoded(lambda **more: pyogrio.read_info(file, layer=layer, **more))
+        found, told = _decoded(lambda **more: pyogrio.raw.read(file, layer=layer, **part, **more))
+    meta, _, shapes, values = found
     named = {name.lower(): column for name, column in zip(meta["fields"], values, strict=True)}
     return VectorLayer(shapes, named, meta["crs"], info["driver"], told)
+
+
+def _decoded(read: Callable[..., Any]) -> tuple[Any, dict[str, str]]:
+    """Return what is read, as Latin-1 where it is not in the encoding that its file names, and whether that is so."""
+    try:
+        return read(), {}
+    except UnicodeDecodeError:
+        return read(encoding="ISO-8859-1"), {"encoding": "Latin-1"}
 
 
 def require_file(path: Path) -> None:
@@ -158,7 +127,6 @@ def _guarded(path: Path, layer: str | None = None) -> Iterator[Path]:
 
     require_file(path)
     refuse_named_files(path)
-    _refuse_links(path)
     _require_stored(path)
     if layer is not None:
         _require_stored(path, layer)
@@ -230,18 +198,6 @@ def _offline() -> Iterator[None]:
     finally:
         pyogrio.set_gdal_config_options(before)
         os.environ.update(exempt)
-
-
-def _refuse_links(path: Path) -> None:
-    """Refuse a GeoJSON whose CRS stands elsewhere: its coordinates would be taken for degrees."""
-    if not path.is_file() or _head(path)[:1] not in (b"{", b"["):
-        return
-    with path.open("rb") as file, mmap.mmap(file.fileno(), 0, access=mmap.ACCESS_READ) as content:
-        at = content.find(b'"crs"')
-        while at >= 0:
-            if _LINK.match(content[at : at + 4096]):
-                raise RoadSourceError(f"{path}: says its CRS by a link, which is not followed; name it in the file")
-            at = content.find(b'"crs"', at + 5)
 
 
 def _require_stored(path: Path, layer: str | None = None) -> None:

@@ -8,7 +8,7 @@ from hypothesis.extra import numpy as arrays
 
 from roadgeo._arrays import AnyArray
 from roadgeo.errors import MaskError
-from roadgeo.sources.thresholds import Sample, find_thresholds
+from roadgeo.roads.thresholds import Sample, find_thresholds
 
 KINDS = st.sampled_from([np.uint8, np.int16, np.int32, np.float32, np.float64])
 

@@ -10,7 +10,7 @@ import shapely
 from worlds.fenway import streets
 
 from roadgeo.errors import RoadSourceError
-from roadgeo.sources.held_roads import choose_roads
+from roadgeo.sources.roads import choose_roads
 
 CRS = "EPSG:4326"
 

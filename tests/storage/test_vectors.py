@@ -157,7 +157,7 @@ class TestDatabases:
 class TestBombs:
     @pytest.mark.parametrize("suffix", [".gz", ".bz2"])
     def test_compressed(self, tmp_path, suffix, monkeypatch):
-        monkeypatch.setattr("roadgeo.sources.unpacking._FREE", 1 << 20)
+        monkeypatch.setattr("roadgeo.storage.unpacking._FREE", 1 << 20)
         path = tmp_path / f"roads.osm{suffix}"
         blank = b"<osm version='0.6'>" + b" " * (20 << 20) + b"</osm>"
         path.write_bytes(gzip.compress(blank) if suffix == ".gz" else bz2.compress(blank))

@@ -1,4 +1,4 @@
-"""CRS in vector files that name other files: found before GDAL opens them, which looks at such files on its own.
+"""CRS in vector files that name other files, or lie elsewhere: found before GDAL opens them, and what they name.
 
 `storage.crs` defines which names a CRS may not have. Here stands where each format keeps its CRS.
 """
@@ -36,7 +36,7 @@ _WINDOW = 1 << 16
 
 
 def refuse_named_files(path: Path) -> None:
-    """Refuse a map whose CRS would have any other file opened, or beside which a pipe lies in the place of a part.
+    """Refuse a map whose CRS would have any other file opened, or lies elsewhere, or where a part beside it is a pipe.
 
     Raises
     ------
@@ -83,7 +83,7 @@ def _texts(path: Path) -> Iterator[str]:
         yield _plain(_start(path, 12 + int.from_bytes(head[8:12], "little")))
     elif head.lstrip(b"\xef\xbb\xbf \t\r\n")[:1] in (b"{", b"[", b"<"):
         with path.open("rb") as file, mmap.mmap(file.fileno(), 0, access=mmap.ACCESS_READ) as content:
-            yield from _of_xml(content) if b"<" in head[:8] else _of_json(content)
+            yield from _of_xml(content) if b"<" in head[:8] else _of_json(path, content)
     elif head.startswith(b"PAR1"):
         yield from _of_parquet(path)
 
@@ -134,7 +134,7 @@ def _of_xml(content: mmap.mmap) -> Iterator[str]:
         yield html.unescape(match[1].decode("latin-1"))
 
 
-def _of_json(content: mmap.mmap) -> Iterator[str]:
+def _of_json(path: Path, content: mmap.mmap) -> Iterator[str]:
     """Yield the text after each key of a CRS, its escapes resolved; as it stands where it is no JSON."""
     keys = [_CRS] if any(content.find(letter) >= 0 for letter in _ESCAPES) else [re.compile(key) for key in _KEYS]
     puzzling = 0
@@ -142,10 +142,13 @@ def _of_json(content: mmap.mmap) -> Iterator[str]:
         for window in (1 << 12, 1 << 24):
             text = content[match.end() : match.end() + window].decode("utf-8", "replace").lstrip(" \t\r\n:")
             try:
-                yield from all_text(json.JSONDecoder().raw_decode(text)[0])
-                break
+                told = json.JSONDecoder().raw_decode(text)[0]
+                yield from all_text(told)
             except (ValueError, RecursionError):
                 continue
+            if isinstance(told, dict) and str(told.get("type")).lower() in ("link", "url"):
+                raise RoadSourceError(f"{path}: says its CRS by a link, which is not followed; name it in the file")
+            break
         else:
             puzzling += 1
             yield text if puzzling < _MOST_PUZZLING else "file=/"

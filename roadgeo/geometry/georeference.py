@@ -1,0 +1,109 @@
+"""Where a raster lies: what takes its pixels to a CRS, and to a plane."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import cv2
+import numpy as np
+
+from roadgeo._arrays import FloatArray
+from roadgeo.errors import CrsError, MaskError
+from roadgeo.geometry.frame import Frame
+from roadgeo.geometry.homography import Homography
+from roadgeo.geometry.projection import LocalPlane, to_lonlat, transformer
+from roadgeo.storage.orientation import stored_from_upright
+
+__all__ = ["Georeference", "fit_place"]
+
+#: Side of the grid of points that a georeference is taken to another CRS by.
+_GRID = 5
+
+
+@dataclass(frozen=True)
+class Georeference:
+    """The place of a raster by its own georeference.
+
+    Attributes
+    ----------
+    matrix : (3, 3) float64
+        Pixel (column, row; GDAL corner convention) to CRS: affine, or a homography fitted to control points.
+    crs : str
+        "EPSG:n" where there is a code, else WKT2.
+    size : (int, int)
+        Width and height, pixels.
+    source : str
+        "geotransform", "control points" or "world file".
+    """
+
+    matrix: FloatArray
+    crs: str
+    size: tuple[int, int]
+    source: str
+
+    def on_plane(self, plane: LocalPlane) -> FloatArray:
+        """Return the homography (3, 3) from pixels to a reference's plane, metres.
+
+        Between two CRS it is fitted to a grid of points, for frames are small: to some millimetres over kilometres.
+
+        Raises
+        ------
+        CrsError
+            It lies outside what the plane's CRS, or its own, is made for.
+        """
+        pixels, there = self.control_points()
+        xy = plane.from_crs(np.stack(transformer(self.crs, plane.crs).transform(*there.T), axis=1))
+        if not np.isfinite(xy).all():
+            raise CrsError(f"its corners lie outside what {self.crs[:40]} or {plane.crs[:40]} is made for")
+        return fit_place(pixels, xy, projective=True)
+
+    def middle(self) -> tuple[float, float]:
+        """Return longitude and latitude of the middle of the frame."""
+        lon, lat = to_lonlat(self.crs, self._there(np.array([Frame(*self.size).center])))[0].tolist()
+        return lon, lat
+
+    def moved(self, on_plane: FloatArray, plane: LocalPlane) -> Georeference:
+        """Return the georeference that puts the raster where `on_plane` (3, 3), pixels to a plane, does.
+
+        An affine one stays affine: it is fitted to the grid of points.
+        """
+        pixels, _ = self.control_points()
+        there = plane.to_crs(Homography(on_plane).facing(Frame(*self.size).center)(pixels))
+        xy = np.stack(transformer(plane.crs, self.crs).transform(*there.T), axis=1)
+        matrix = fit_place(pixels, xy, projective=self.source == "control points")
+        return Georeference(matrix, self.crs, self.size, self.source)
+
+    def of_stored(self, orientation: int) -> Georeference:
+        """Return the same for the pixels of the raster's file as they are stored (see `storage.orientation`)."""
+        turned = stored_from_upright(orientation, self.size)
+        size = self.size if abs(turned[0, 0]) > 0.5 else self.size[::-1]
+        return Georeference(self.matrix @ np.linalg.inv(turned), self.crs, size, self.source)
+
+    def control_points(self) -> tuple[FloatArray, FloatArray]:
+        """Return (25, 2) pixel positions all over the raster and where they lie in its CRS."""
+        width, height = self.size
+        columns, rows = np.meshgrid(np.linspace(0, width, _GRID), np.linspace(0, height, _GRID))
+        pixels = np.stack([columns.ravel(), rows.ravel()], axis=1)
+        return pixels, self._there(pixels)
+
+    def _there(self, pixels: FloatArray) -> FloatArray:
+        """Take pixel positions (N, 2) to the CRS."""
+        return Homography(self.matrix).facing(Frame(*self.size).center)(pixels)
+
+
+def fit_place(pixels: FloatArray, xy: FloatArray, projective: bool) -> FloatArray:
+    """Fit a homography or an affine map (3, 3) to points (N, 2) by least squares."""
+    origin, unit = xy.mean(axis=0), max(float(np.ptp(xy, axis=0).max()), 1e-12)
+    middle, side = pixels.mean(axis=0), max(float(np.ptp(pixels, axis=0).max()), 1e-12)
+    a, b = (pixels - middle) / side, (xy - origin) / unit
+    if projective:
+        matrix, _ = cv2.findHomography(a, b, 0)
+        if matrix is None:
+            raise MaskError("its control points lie on a line; expected some all over the picture")
+    else:
+        solved = np.linalg.lstsq(np.c_[a, np.ones(len(a))], b, rcond=None)[0]
+        matrix = np.vstack([solved.T, [0.0, 0.0, 1.0]])
+    to_unit = np.array([[1 / side, 0, -middle[0] / side], [0, 1 / side, -middle[1] / side], [0, 0, 1.0]])
+    from_unit = np.array([[unit, 0, origin[0]], [0, unit, origin[1]], [0, 0, 1.0]])
+    result = from_unit @ matrix @ to_unit
+    return np.asarray(result / result[2, 2])
