@@ -35,12 +35,11 @@ from roadgeo.running.stretching import ask_stretched
 from roadgeo.sources.drawn_roads import Units, draw_roads
 from roadgeo.sources.exif import estimate_gsd
 from roadgeo.sources.masks import open_mask, read_mask
-from roadgeo.sources.segmentation.card import MAX_WAYS
 from roadgeo.sources.segmentation.network import DEFAULT_MODEL, Network, load_network
 from roadgeo.sources.segmentation.photograph import open_photograph
 from roadgeo.sources.segmentation.probability import NODATA, ProbabilityMap, fuse
 from roadgeo.sources.segmentation.scales import rank_scales, scale_of, try_scales
-from roadgeo.sources.segmentation.tiling import map_shape, segment
+from roadgeo.sources.segmentation.tiling import MAX_MAP_PIXELS, map_shape, segment
 from roadgeo.sources.streams import QUERY_ENDINGS
 from roadgeo.workflows import locate
 
@@ -54,6 +53,10 @@ _MAX_SCALES = 3
 _MOST_FINER, _LEAST_FINER = 2.0, 1.25
 #: What results call a picture that is no file.
 _ARRAY = "array"
+#: In a second way a model is shown a photograph so many times finer, and the mean of the log odds counts. Of labelled
+#: tiles of Boston and Miami F1 within 4 m is .914 and .867 at 1 m per pixel, .945 and .873 at 0.71 m, .941 and .882 of
+#: both (turned by half instead: .923 and .878). Beyond `_MOST_FINER` pixels for each of its own it is turned by half.
+_FINER, _WAYS = math.sqrt(2.0), 2
 _KNOWN_SPAN = 1.7  # a range of pixel sizes narrower than this is one scale
 
 
@@ -268,7 +271,10 @@ def _locate_photograph(
 
 
 def _plan_looks(frame: _Frame, query: QueryOptions) -> Later[Look]:
-    """Return the best scale's look, the photograph in more ways, other scales, and other thresholds at the best."""
+    """Return the best scale's look, the photograph in more ways, other scales, and other thresholds at the best.
+
+    Where the scale is known, what is seen at it alone, and finer alone, are the other scales.
+    """
 
     def look(i: int, ways: int | None = None, further: int = 0) -> Look:
         return _look_at(partial(frame.see, frame.scales[i], ways), frame.scales[i], query, further)
@@ -277,9 +283,15 @@ def _plan_looks(frame: _Frame, query: QueryOptions) -> Later[Look]:
         one = look(0, frame.most_ways)
         return replace(one, what=f"{one.what}, shown {frame.most_ways} ways")
 
+    def look_alone(scale: float) -> Look:
+        one = _look_at(partial(frame.see, scale, 1), scale, query)
+        return replace(one, what=f"{one.what} alone")
+
     makers: list[Callable[[], Look]] = [partial(look, 0, frame.first_ways)]
     makers += [look_more_ways] if frame.most_ways else []
     makers += [partial(look, i) for i in range(1, len(frame.scales))]
+    if frame.finer_too:
+        makers += [partial(look_alone, frame.scales[0]), partial(look_alone, _FINER * frame.scales[0])]
     if query.threshold is None:
         makers += [partial(look, 0, frame.most_ways, further) for further in (1, 2)]
     return Later(makers)
@@ -300,6 +312,8 @@ class _Frame:
     first_ways, most_ways : int or None
         In how many ways a model is shown the photograph at the best scale, first and at most (see `see`): first in 1
         where that was seen already; `most_ways` is None where there are no more.
+    finer_too : bool
+        Whether what is seen at the scale alone, and finer alone, are looks of their own.
     see : callable
         `see(scale, ways)` returns the probability of road, on the grid that roads are traced on; kept for another call.
         Where `ways` is None the number in each model's card applies.
@@ -310,6 +324,7 @@ class _Frame:
     scales: Sequence[float]
     first_ways: int | None
     most_ways: int | None
+    finer_too: bool
     see: Callable[[float, int | None], ProbabilityMap]
 
 
@@ -326,14 +341,24 @@ def _open_frame(paths: Sequence[str], query: QueryOptions, camera: CameraOptions
     ways_by_card = {name: _network_of(name, query).card.ways for name in names if not _is_plugin(name)}
     masks = {path: read for path in paths if (read := _fused_mask(path, query)) is not None}
 
+    def may_be_finer(scale: float) -> bool:
+        shown = _FINER * scale
+        return shown <= _MOST_FINER and math.prod(own) * (k * shown) ** 2 <= MAX_MAP_PIXELS
+
     def see_one(path: str, name: str, scale: float, ways: int | None) -> ProbabilityMap:
         if path in masks and not _is_plugin(name):
             return _of_mask(masks[path], "mask")
         ways = ways or ways_by_card.get(name, 1)
+        if ways > 1 and name in ways_by_card and may_be_finer(scale):
+            parts = (_FINER * scale, ways // 2), (scale, ways - ways // 2)
+            return fuse([see_one(path, name, *part) for part in parts])
         known = tried.get((path, name, scale)) if ways == 1 else None
         if known is not None and known.values.shape[0] < 2 * grid[0]:
             return known
-        return _see(path, name, scale, grid, query, say, ways)
+        seen = _see(path, name, scale, grid, query, say, ways)
+        if ways == 1:
+            tried[path, name, scale] = seen
+        return seen
 
     @lru_cache(_MAX_SCALES + 1)
     def see(scale: float, ways: int | None) -> ProbabilityMap:
@@ -342,8 +367,10 @@ def _open_frame(paths: Sequence[str], query: QueryOptions, camera: CameraOptions
 
     only_masks = masks.keys() >= set(paths)
     is_seen = not only_masks and any(scale == scales[0] for *_, scale in tried)
-    has_more = not only_masks and (is_seen or min(ways_by_card.values(), default=MAX_WAYS) < MAX_WAYS)
-    return _Frame(own, k / finer, scales, 1 if is_seen else None, MAX_WAYS if has_more else None, see)
+    least = min(ways_by_card.values(), default=_WAYS)
+    has_more = not only_masks and (is_seen or least < _WAYS)
+    in_both = bool(ways_by_card) and not only_masks and not is_seen and len(scales) == 1 and may_be_finer(scales[0])
+    return _Frame(own, k / finer, scales, 1 if is_seen else None, _WAYS if has_more else None, in_both, see)
 
 
 def _how_much_finer(own: tuple[int, int], scale: float) -> float:

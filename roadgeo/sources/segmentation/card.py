@@ -56,7 +56,7 @@ class ModelCard:
     threshold : float
         Probabilities above it are road.
     ways : int
-        Number of ways in which each tile is shown at the first look, see `tiling.segment`: more than one, if fast.
+        Number of ways in which each tile is shown at the first look, see `queries`: more than one, if it is fast.
     output : str
         The output that shows roads.
     channels : tuple of int

@@ -113,12 +113,15 @@ class ProbabilityMap:
 def fuse(maps: Sequence[ProbabilityMap]) -> ProbabilityMap:
     """Fuse looks at one scene: the mean of the log odds of those that saw a pixel; the frame is the first one's.
 
+    Those of one threshold mean the same by a probability, which is kept; of others only the thresholds mean the same.
+
     Raises
     ------
     MaskError
         They show frames of different proportions.
     """
     first = maps[0]
+    alike = all(one.threshold == first.threshold for one in maps)
     height, width = first.values.shape
     total, count = np.zeros((height, width), np.float32), np.zeros((height, width), np.float32)
     for one in maps:
@@ -130,12 +133,12 @@ def fuse(maps: Sequence[ProbabilityMap]) -> ProbabilityMap:
             )
         values = one.resized((height, width)).values
         seen = values != NODATA
-        total += np.where(seen, _log_odds(values, one.threshold), 0)
+        total += np.where(seen, _log_odds(values, 0.5 if alike else one.threshold), 0)
         count += seen
     share = 1.0 / (1.0 + np.exp(-total / np.maximum(count, 1)))
     fused = np.where(count > 0, np.rint(254 * share), NODATA).astype(np.uint8)
     models = dict.fromkeys(one.model for one in maps)
-    return ProbabilityMap(fused, 0.5, first.name, " + ".join(models), first.pixel)
+    return ProbabilityMap(fused, first.threshold if alike else 0.5, first.name, " + ".join(models), first.pixel)
 
 
 def _log_odds(values: AnyArray, threshold: float) -> AnyArray:
