@@ -100,5 +100,5 @@ def complete(_: Sphinx, name: str, source: list[str]) -> None:
 
 
 def setup(app: Sphinx) -> None:
-    """Tell Sphinx of `complete`."""
+    """Register `complete`."""
     app.connect("source-read", complete)

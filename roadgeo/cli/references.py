@@ -158,7 +158,7 @@ def remove_command(names: tuple[str, ...], yes: bool) -> None:
     from roadgeo.reference.library import library_dir, remove_reference, shelved_files
 
     for name in names:
-        shelved_files(name)  # what is not there is not asked about
+        shelved_files(name)  # a reference that is not there is not asked about
     if not yes:
         click.confirm(f"Delete {', '.join(names)} from {library_dir()}?", abort=True, err=True)
     for name in names:

@@ -26,7 +26,7 @@ __all__ = ["write_gcps", "write_match_points", "write_matches", "write_odm", "wr
 def write_gcps(path: Path, subject: Subject) -> None:
     """Write the picture's own pixels with control points, as GeoTIFF.
 
-    GDAL draws it on the map with what it fits through the points: `gdalwarp -tps` comes closest, and from version 3.11
+    GDAL draws it by a transformation fitted to the points: `gdalwarp -tps` comes closest, and from version 3.11
     on a homography.
     """
     import rasterio.shutil

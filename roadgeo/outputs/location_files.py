@@ -138,7 +138,7 @@ def write_location(
 
 
 def _write(output: Output, path: Path, subject: Subject, files: ExitStack) -> str:
-    """Write one output, which appears with the others; what one of another package fails at is returned instead."""
+    """Write one output, which appears with the others; the error of another package's output is returned instead."""
     if output in REGISTRY.values():
         output.write(files.enter_context(replacing(path, sync=False)), subject)
         return ""

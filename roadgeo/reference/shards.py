@@ -258,7 +258,7 @@ class Shard:
             self._fetch()
         try:
             return self._opened()
-        except IndexFormatError:  # what was fetched may have been damaged since
+        except IndexFormatError:  # a fetched file may have been damaged since
             if not self._fetch():
                 raise
         return self._opened()

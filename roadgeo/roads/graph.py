@@ -79,7 +79,7 @@ class RoadGraph:
         move : callable, optional
             Takes positions (..., 2) from the plane to where the graph is to lie; lengths stay those of the plane.
         **about
-            What the graph says of itself: `crs`, as osmnx has it, for example.
+            The graph's own attributes: `crs`, as in osmnx, for example.
         """
         import networkx as nx
         import shapely

@@ -24,7 +24,7 @@ _MAX_BANDS = 16
 
 
 def read_picture(picture: Any) -> str | AnyArray:
-    """Return what `sources.masks` reads: the path of a file, or an (H, W) or (H, W, bands) array.
+    """Return the input of `sources.masks`: the path of a file, or an (H, W) or (H, W, bands) array.
 
     Parameters
     ----------
@@ -56,7 +56,7 @@ def read_picture(picture: Any) -> str | AnyArray:
 def as_file(picture: str | AnyArray) -> Iterator[str]:
     """Yield the path of a picture: its own, or that of a GeoTIFF of an array (H, W) or (H, W, bands) meanwhile.
 
-    Numbers between 0 and 1 become those of 8 bits; what is masked is transparent.
+    Numbers between 0 and 1 become those of 8 bits; masked pixels are transparent.
     """
     if isinstance(picture, str):
         yield picture
@@ -89,7 +89,7 @@ def _bands_last(array: AnyArray) -> AnyArray:
 
 
 def _transparent(values: AnyArray, alpha: AnyArray) -> AnyArray:
-    """Mask what is transparent; of black drawn on transparent ground the alpha itself shows the roads."""
+    """Mask transparent pixels; of black drawn on transparent ground the alpha itself shows the roads."""
     if not values[alpha > 0].any():
         return alpha
     hidden = np.repeat((alpha == 0)[..., None], values.shape[2], axis=2)

@@ -26,16 +26,16 @@ TaskIn = TypeVar("TaskIn", contravariant=True)
 Result = TypeVar("Result")
 ResultOut = TypeVar("ResultOut", covariant=True)
 
-#: What nearly every task needs: a fork server loads it once for all processes.
+#: Modules that nearly every task needs: a fork server loads them once for all processes.
 _PRELOAD = ["roadgeo.workflows", "roadgeo.outputs.location_files", "roadgeo.sources.masks"]
 
 
-#: A process whose parent is gone has so long to remove what it has half written.
+#: Time in which a process whose parent is gone removes half-written files.
 _GRACE_S = 5.0
 
 
 class Work(Protocol[TaskIn, ResultOut]):
-    """What is done with each task; it travels to other processes, so it can be pickled."""
+    """The work done for each task; it travels to other processes, so it can be pickled."""
 
     def prepare(self) -> Callable[[TaskIn], ResultOut]:
         """Make a process ready (open the references) and return what does one task."""
@@ -157,7 +157,7 @@ def end_with_parent(clean: Callable[[], None] = lambda: None) -> None:
 
 @contextlib.contextmanager
 def without_interrupts() -> Iterator[None]:
-    """Keep Ctrl-C from processes that are started meanwhile: it reaches them before they can say that they ignore it.
+    """Keep Ctrl-C from processes that are started meanwhile: it reaches them before they can ignore it.
 
     To this process it comes afterwards, and so does SIGTERM: one that is half started is known to nobody who ends it.
     """

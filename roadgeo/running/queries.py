@@ -51,7 +51,7 @@ _MAX_SCALES = 3
 #: Roads of a photograph whose pixels are coarser than a model's are traced on the model's, but of no more than so many
 #: times its own along a side: narrow gaps between roads close on coarse ones.
 _MOST_FINER, _LEAST_FINER = 2.0, 1.25
-#: What results call a picture that is no file.
+#: Name in results of a picture that is no file.
 _ARRAY = "array"
 #: In a second way a model is shown a photograph so many times finer, and the mean of the log odds counts. Of labelled
 #: tiles of Boston and Miami F1 within 4 m is .914 and .867 at 1 m per pixel, .945 and .873 at 0.71 m, .941 and .882 of
@@ -208,7 +208,7 @@ def _look_at_photograph(path: str, gsd_m: tuple[float, float] | None, query: Que
     seen = frame.see(frame.scales[0], None)
     try:
         mask = _look_at(lambda: seen, frame.scales[0], query).make()
-    except MaskError:  # what was seen is worth a look all the same
+    except MaskError:  # the roads seen are worth a look all the same
         mask = RoadMask(np.zeros(seen.values.shape, np.bool_), name=path)
     return FirstLook(mask, frame.coarser, seen.resized(frame.own))
 

@@ -1,4 +1,4 @@
-"""Many georeferenced images: is each where it says? What `roadgeo verify` runs."""
+"""Many georeferenced images: whether each is where it claims to be, for `roadgeo verify`."""
 
 from __future__ import annotations
 
@@ -41,7 +41,7 @@ SCHEMA = "roadgeo.verification/1"
 
 @dataclass(frozen=True)
 class Verified:
-    """What became of one image: its JSON object, and the corrected georeference where it is off."""
+    """The result of one image: its JSON object, and the corrected georeference where it is off."""
 
     document: dict[str, Any]
     corrected: Georeference | None = None
@@ -54,7 +54,7 @@ class Verified:
 
 @dataclass(frozen=True)
 class VerifyRun:
-    """How images are read and judged; `crs` is that of world files, or stands for what images say."""
+    """How images are read and judged; `crs` is that of world files, or replaces the images' own."""
 
     references: tuple[str, ...] = ()
     options: CheckOptions = field(default_factory=CheckOptions)
@@ -76,12 +76,12 @@ class VerifyRun:
 
 
 def verify_images(tasks: Sequence[Task], settings: VerifyRun, jobs: int = 1) -> Iterator[Verified]:
-    """Verify images in one process or several; yield what became of each, in their order."""
+    """Verify images in one process or several; yield the result of each, in their order."""
     return run(tasks, settings, jobs)
 
 
 def verify_image(image: str, references: Sequence[AnyReference], settings: VerifyRun | None = None) -> Verified:
-    """Say whether an image lies where its georeference says; what is wrong with it is told, not raised."""
+    """Judge whether an image lies at its georeference; errors are results, not raised."""
     settings = settings or VerifyRun()
     started = perf_counter()
     try:
@@ -128,7 +128,7 @@ def _inexact(place: Georeference, reference: Reference) -> float:
 
 
 def _allow_for_crs(checked: Checked, image: _Image, reference: Reference) -> Checked:
-    """Judge nothing to be off by what may be the way from an image's CRS to the map's."""
+    """Judge nothing to be off that may be due to the transformation from an image's CRS to the map's."""
     inexact, found = _inexact(image.place, reference), checked.displacement
     if checked.verdict != "off" or found is None or inexact == 0.0:
         return checked
@@ -200,7 +200,7 @@ def _document(
         "agreeing": checked.agreeing,
         "agreeing_as_given": checked.agreeing_as_given,
     }
-    # Where the image says that it lies.
+    # Its place by its own georeference.
     if place is not None:
         middle = Homography(place.matrix).facing(Frame(*place.size).center)(Frame(*place.size).center)
         lon, lat = to_lonlat(place.crs, middle[None])[0].tolist()
@@ -212,7 +212,7 @@ def _document(
             "corrected": None if corrected is None else corrected.matrix.tolist(),
             "center": {"lon": lon, "lat": lat},
         }
-    # Where the roads say that it lies, against that, and against the best other place.
+    # Its place by the roads, against that, and against the best other place.
     if reference is not None and place is not None:
         document["reference"] = reference.name
         document["attribution"] = str(reference.index.meta.get("attribution") or "")

@@ -332,7 +332,7 @@ def _told_apart(name: str, roads: BoolArray, observed: BoolArray | None) -> tupl
     if n_roads <= 0.5 * n_seen:
         return roads, observed
     if n_roads <= _MAX_ROAD_SHARE * roads.size:
-        return roads, None  # what is called nodata, or transparent, is the ground between the roads
+        return roads, None  # nodata, or transparent pixels, are the ground between the roads
     inverted = ~roads if observed is None else observed & ~roads
     if not inverted.any():
         raise MaskError(f"{name}: every pixel is light; expected roads as light pixels on dark ground")

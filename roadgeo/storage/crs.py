@@ -1,4 +1,4 @@
-"""What PROJ may do with a CRS that a stranger's file tells: it opens no file but its own grids.
+"""Limits on a CRS from a stranger's file: PROJ opens no file but its own grids.
 
 A CRS may name grids to shift by (`+nadgrids=`, `PARAMETERFILE`, `EXTENSION["PROJ4_GRIDS", ...]`), or a file that
 defines it (`+init=`), by any path: PROJ then opens that, be it a pipe that nobody writes to. Names without folders are
@@ -20,7 +20,7 @@ if TYPE_CHECKING:
 
 __all__ = ["NoCrsError", "all_text", "crs_name", "known_crs", "name_crs", "named_file"]
 
-#: What PROJ's strings say behind a key that takes files, and what WKT and PROJJSON say of files.
+#: Keys of PROJ's strings that take files, and the forms of file names in WKT and PROJJSON.
 _KEYS = re.compile(r"(?:grids|file|model)\s*=\s*(\"[^\"]*|[^\s\"]*)", re.IGNORECASE)
 _INIT = re.compile(r"init\s*=\s*(\"[^\"]*|[^\s\"]*)", re.IGNORECASE)
 _JSON = re.compile(r'"value"\s*:\s*"((?:[^"\\]|\\.)*)"')

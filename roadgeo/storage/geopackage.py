@@ -110,7 +110,7 @@ def dump_layers(path: Path, layers: Sequence[Layer]) -> None:
         # Made in memory and written at once: on disk, SQLite writes page by page, many of them several times.
         with closing(sqlite3.connect(":memory:")) as empty, closing(sqlite3.connect(":memory:")) as database:
             empty.deserialize(_empty(tuple(tables)))
-            empty.backup(database)  # what is read from bytes may not grow beyond a gigabyte
+            empty.backup(database)  # a database read from bytes may not grow beyond a gigabyte
             _fill_tables(database, tables, layers, srs_ids)
             content = database.serialize()
     except sqlite3.Error as error:

@@ -97,7 +97,7 @@ class _Protocol(H11Protocol):
             self._timer = None
 
     def _give_up(self) -> None:
-        if self.transport.is_closing():  # what is left of an answer is not read
+        if self.transport.is_closing():  # the rest of an answer is not read
             self.transport.abort()
         self.transport.close()
 

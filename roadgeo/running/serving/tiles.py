@@ -114,7 +114,7 @@ def _draw(ends: FloatArray, zoom: int) -> list[FloatArray]:
     step = 1 if zoom > 12 else _EXTENT // _COARSE
     drawn = np.rint(ends / step) * step
     drawn = drawn[(drawn[:, 0] != drawn[:, 1]).any(axis=1)]
-    if step > 1 and len(drawn):  # what falls together is drawn once
+    if step > 1 and len(drawn):  # coinciding points are drawn once
         turned = (drawn[:, 0] > drawn[:, 1]).any(axis=1) & (drawn[:, 0, 0] >= drawn[:, 1, 0])
         alike = np.where(turned[:, None, None], drawn[:, ::-1], drawn).reshape(-1, 4)
         _, first = np.unique(alike @ (1.0, 1e4, 1e8, 1e12), return_index=True)

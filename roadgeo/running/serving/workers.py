@@ -46,7 +46,7 @@ class Full(Exception):  # noqa: N818 (a state of the server, not a fault)
 
 @dataclass(frozen=True)
 class Asked:
-    """What to locate.
+    """A request to locate.
 
     Attributes
     ----------

@@ -305,7 +305,7 @@ def _read_scaling(one: dict[str, Any]) -> dict[str, Any]:
             return {}
         scaling = [{"type": "z-score", **each} for each in statistics]
     steps = scaling if isinstance(scaling, list) else [scaling]
-    low, high = [], []  # what 0 and 1 (that is, 255) become
+    low, high = [], []  # images of 0 and 1 (that is, 255)
     for each in steps if len(steps) == 3 else steps[:1] * 3:
         shift, divisor = _affine(each)
         unit = 1.0 if abs(shift) <= 1.5 and divisor <= 1.5 else 255.0
