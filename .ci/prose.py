@@ -18,11 +18,11 @@ from pathlib import Path
 
 #: What is counted, and how often it may stand in 1,000 lines.
 COUNTED = {
-    "say, tell": (re.compile(r"\b(?:say|says|said|saying|tell|tells|told|telling)\b", re.IGNORECASE), 3.0),
-    "so many, so much": (re.compile(r"\bso (?:many|much|few|little|large|long|often|far)\b", re.IGNORECASE), 1.0),
+    "say, tell": (re.compile(r"\b(?:say|says|said|saying|tell|tells|told|telling)\b", re.IGNORECASE), 6.0),
+    "so many, so much": (re.compile(r"\bso (?:many|much|few|little|large|long|often|far)\b", re.IGNORECASE), 2.0),
     "what (as a noun)": (
         re.compile(r"(?:^|[.;:,(] |\b(?:of|for|from|with|by|at|on|than|and) )what\b", re.IGNORECASE),
-        3.0,
+        6.0,
     ),
 }
 #: Words of a sentence in Markdown.
