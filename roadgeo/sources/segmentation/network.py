@@ -20,7 +20,7 @@ __all__ = ["DEFAULT_MODEL", "Network", "load_network"]
 
 _LOG = logging.getLogger(__name__)
 
-DEFAULT_MODEL = Path(__file__).parent / "model" / "roads.onnx"
+DEFAULT_MODEL = Path(__file__).parent / "model" / "roads.onnx.gz"
 
 #: Pixels of the input, along a side, that one of the output may stand for.
 _STRIDES = (1, 2, 4, 8, 16, 32)
@@ -133,7 +133,7 @@ def load_network(
         raise ModelError("no model is installed with roadgeo; give one that finds roads: --segmenter MODEL.onnx")
     model = open_onnx(path, threads)
     card = read_card(model, class_name)
-    network = Network(path.name, card, card.tile, model, card.is_probability is True)
+    network = Network(path.name.removesuffix(".gz"), card, card.tile, model, card.is_probability is True)
     if card.is_probability is None and not card.gives_classes:
         network._is_probability = _gives_probability(network)
     output = next(port for port in model.outputs if port.name == card.output)

@@ -7,9 +7,11 @@ model is loaded and runs, onnxruntime holds sizes against what is stored; memory
 from __future__ import annotations
 
 import contextlib
+import gzip
 import importlib.util
 import os
 import threading
+import zlib
 from collections.abc import Iterable
 from dataclasses import dataclass, field
 from functools import cache
@@ -110,7 +112,7 @@ class OnnxModel:
 
 
 def open_onnx(path: str | os.PathLike[str], threads: int = 1) -> OnnxModel:
-    """Check that an ONNX file is nothing but a network, and open it.
+    """Check that an ONNX file, which may be compressed (`.gz`), is nothing but a network, and open it.
 
     The number of threads is fixed, so that results are the same on every run.
 
@@ -124,11 +126,13 @@ def open_onnx(path: str | os.PathLike[str], threads: int = 1) -> OnnxModel:
     name, file = os.fspath(path), Path(path)
     if not file.is_file():
         raise ModelError(f"{name}: no such model file; check the path")
-    if file.stat().st_size > _MAX_BYTES:
-        raise ModelError(
-            f"{name}: {file.stat().st_size / 1e6:.0f} MB; expected a model of {_MAX_BYTES >> 20} MB at most"
-        )
-    content = file.read_bytes()
+    try:
+        with gzip.open(file) if file.suffix == ".gz" else file.open("rb") as opened:
+            content = opened.read(_MAX_BYTES + 1)
+    except (gzip.BadGzipFile, EOFError, zlib.error) as error:
+        raise ModelError(f"{name}: cannot be unpacked ({error}); copy it again") from error
+    if len(content) > _MAX_BYTES:
+        raise ModelError(f"{name}: too large; expected a model of {_MAX_BYTES >> 20} MB at most")
     try:
         last = _require_network(content)
     except ModelError as error:

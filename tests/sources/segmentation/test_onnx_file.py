@@ -1,6 +1,7 @@
 """ONNX files are looked at before they run; what is more than a network is refused in one line."""
 
 import contextlib
+import gzip
 from itertools import pairwise
 from pathlib import Path
 
@@ -188,3 +189,17 @@ def test_missing_and_large_files(tmp_path: Path, monkeypatch: pytest.MonkeyPatch
     monkeypatch.setattr("roadgeo.sources.segmentation.onnx_file._MAX_BYTES", 10)
     with pytest.raises(ModelError, match="at most"):
         open_onnx(path)
+
+
+def test_a_compressed_model_is_read_within_bounds(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    plain = brightness_model(tmp_path / "model.onnx", classes=2, props={"resolution": 50})
+    packed = tmp_path / "model.onnx.gz"
+    packed.write_bytes(gzip.compress(Path(plain).read_bytes()))
+    assert open_onnx(packed).metadata == open_onnx(plain).metadata
+    packed.write_bytes(packed.read_bytes()[:-9])
+    with pytest.raises(ModelError, match="cannot be unpacked"):
+        open_onnx(packed)
+    packed.write_bytes(gzip.compress(bytes(10_000_000)))
+    monkeypatch.setattr("roadgeo.sources.segmentation.onnx_file._MAX_BYTES", 10_000)
+    with pytest.raises(ModelError, match="at most"):
+        open_onnx(packed)
