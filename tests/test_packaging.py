@@ -51,6 +51,20 @@ def test_a_missing_package_is_named_with_the_extra_that_brings_it() -> None:
     assert name_extra(ModuleNotFoundError(name="another")) is None
 
 
+def test_the_constraints_pin_every_package_within_its_bounds() -> None:
+    lines = (ROOT / "constraints.txt").read_text("utf-8").splitlines()
+    pinned = [re.match(r"([\w-]+)==([\d.]+)", line).groups() for line in lines if not line.startswith("#")]
+    extras = PROJECT["optional-dependencies"]
+    asked = [
+        *PROJECT["dependencies"],
+        *(one for name in extras if name not in {"desktop", "dev"} for one in extras[name]),
+    ]
+    for name, least in (re.fullmatch(r"([\w-]+)(?:\[\w+\])?>=([\d.]+)", one).groups() for one in asked):
+        versions = [tuple(map(int, version.split("."))) for package, version in pinned if package == name]
+        assert versions, name
+        assert min(versions) >= tuple(map(int, least.split("."))), name
+
+
 WITHOUT_EXTRAS = """
 import sys
 for name in ("scipy", "geopandas", "pandas", "pyogrio", "pyarrow", "shapely", "osmnx", "networkx", "osmium",
