@@ -11,8 +11,10 @@ from __future__ import annotations
 import csv
 import io
 import math
+import warnings
 import xml.etree.ElementTree as ET
 from collections.abc import Mapping, Sequence
+from contextlib import ExitStack
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -154,10 +156,12 @@ def _set_place(path: Path, place: Georeference) -> None:
     """Replace the georeference of a GeoTIFF."""
     import rasterio
     from rasterio.control import GroundControlPoint
-    from rasterio.errors import RasterioError
+    from rasterio.errors import NotGeoreferencedWarning, RasterioError
 
     try:
-        with rasterio.open(path, "r+") as raster:
+        with warnings.catch_warnings(), ExitStack() as files:
+            warnings.simplefilter("ignore", NotGeoreferencedWarning)  # it is about to be
+            raster = files.enter_context(rasterio.open(path, "r+"))
             if np.allclose(place.matrix[2], (0, 0, 1), atol=1e-15):
                 raster.crs, raster.transform = place.crs, rasterio.Affine(*place.matrix[:2].ravel())
             else:

@@ -248,6 +248,10 @@ def sidecar_nodata(path: str | os.PathLike[str]) -> float | None:
         return None
 
 
+#: What images are called that no text is.
+_IMAGES = {".png", ".jpg", ".jpeg", ".tif", ".tiff", ".webp", ".jp2", ".bmp", ".gif"}
+
+
 def _drivers(path: Path, name: str, more: list[str]) -> list[str]:
     """Name the drivers that may read a file: the one of its first bytes, or those that the user allows besides."""
     with path.open("rb") as file:
@@ -261,6 +265,10 @@ def _drivers(path: Path, name: str, more: list[str]) -> list[str]:
     if driver != "VRT" and re.search(rb"<(VRTDataset|MRF_META|GDAL_WMS)", head):
         raise MaskError(f"{name}: holds the text of a raster of another format; convert it to GeoTIFF if you trust it")
     if driver is None and not more:
+        if Path(name).suffix.lower() in _IMAGES and head and not re.search(rb"[^\t\n\f\r -\x7e\x80-\xff]", head):
+            raise MaskError(
+                f"{name}: is text, whatever its name says; expected an image of a format that is read ({_NAMES})"
+            )
         raise MaskError(
             f"{name}: not a raster of a format that is read here ({_NAMES}); convert it to GeoTIFF, "
             f"or name GDAL's driver for it, if you trust the file: {CONSENT}=netCDF"

@@ -18,7 +18,8 @@ from roadgeo.cli import main
 from roadgeo.evaluation.demo import ATTRIBUTION, ROADS, demo_masks
 from roadgeo.geometry.homography import Homography
 from roadgeo.outputs.schemas import read_schema
-from roadgeo.outputs.verification_files import write_josm
+from roadgeo.outputs.verification_files import write_fixed, write_josm
+from roadgeo.sources.georeference import Georeference
 from roadgeo.sources.roads import read_roads
 from roadgeo.workflows import build_reference
 
@@ -155,3 +156,12 @@ def test_what_has_no_place_or_is_no_image_is_told_in_a_line(porto: Path, capfd: 
     Path("b.tif").write_text("no picture")
     assert main(["verify", "b.tif", "missing.tif", "-r", str(porto)]) == 1
     assert capfd.readouterr().err.count("Error:") == 2
+
+
+def test_a_corrected_picture_that_had_a_world_file_is_written_without_a_warning(tmp_path: Path) -> None:
+    """Warnings are errors in tests."""
+    cv2.imwrite(str(tmp_path / "a.png"), np.zeros((40, 50), np.uint8))
+    place = Georeference(np.array([[2.0, 0, 5e5], [0, -2.0, 4.5e6], [0, 0, 1]]), "EPSG:32629", (50, 40), "world file")
+    write_fixed(tmp_path / "a.png", tmp_path / "fixed.tif", place)
+    with rasterio.open(tmp_path / "fixed.tif") as fixed:
+        assert fixed.crs == "EPSG:32629"

@@ -460,3 +460,10 @@ def test_a_cause_is_named_where_something_speaks_for_it(
         raise rasterio.errors.RasterioError(reason)
     told = str(raised.value)
     assert f"{reason}; {doubt}" in told if doubt else told.endswith(reason)
+
+
+def test_text_that_is_called_an_image_is_said_to_be_text(tmp_path: Path) -> None:
+    (tmp_path / "a.jpg").write_text("404: no such file\n", encoding="utf-8")
+    told = r"a\.jpg: is text, whatever its name says; expected an image"
+    with pytest.raises(MaskError, match=told), open_raster(tmp_path / "a.jpg"):
+        pass

@@ -164,28 +164,31 @@ def _video(path: str, options: FrameOptions, stack: ExitStack) -> Iterator[_Imag
 
 def _read(image: _Image, options: FrameOptions, last: _Last) -> tuple[RoadMask, AnyArray | None]:
     """Read a frame as a mask, and as a grey picture where it is a photograph."""
-    if options.segment != "always":
-        try:
-            mask = read_mask(image.path, band=options.band, threshold=options.threshold, name=image.name)
-        except PhotographError:
-            if options.segment == "never":
-                raise
-        except MaskError:
-            blank = _blank(image)
-            if blank is None:
-                raise
-            return blank, None
-        else:
-            return mask, None
-    return _segment(image, options, last)
+    # A white or a black frame among photographs is no mask.
+    of_photographs = options.segment == "always" or (options.segment == "auto" and last.grey is not None)
+    try:
+        if not of_photographs:
+            try:
+                return read_mask(image.path, band=options.band, threshold=options.threshold, name=image.name), None
+            except PhotographError:
+                if options.segment == "never":
+                    raise
+        return _segment(image, options, last)
+    except PhotographError:
+        raise
+    except MaskError:
+        blank = _blank(image)
+        if blank is None:
+            raise
+        return blank, None
 
 
 def _blank(image: _Image) -> RoadMask | None:
-    """Return a mask without any road, which a flight may hold, though nobody can locate it; None if it is none."""
+    """Return a mask without any road for a frame of one colour, which a flight may hold; None if it is none."""
     from roadgeo.storage.rasters import open_raster
 
     with suppress(MaskError), open_raster(image.path) as raster:
-        if raster.count == 1 and not raster.read(1).any():
+        if not np.ptp(raster.read(), axis=(1, 2)).any():
             return RoadMask(np.zeros(raster.shape, np.bool_), name=image.name)
     return None
 

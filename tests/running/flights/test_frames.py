@@ -12,7 +12,9 @@ from worlds.turned import save_turned
 
 from roadgeo.errors import MaskError, PhotographError
 from roadgeo.evaluation.demo import PHOTO
+from roadgeo.running.flights import frames
 from roadgeo.running.flights.frames import FrameOptions, read_frames, read_stills
+from roadgeo.sources.masks import read_mask
 
 
 def shift(dx: float, dy: float) -> np.ndarray:
@@ -125,3 +127,15 @@ def test_what_is_no_video_is_said(tmp_path: Path, capfd: pytest.CaptureFixture[s
     (tmp_path / "a.mp4").write_bytes(b"no video")
     with pytest.raises(MaskError, match="no video that OpenCV reads; give its frames as images"):
         list(read_frames([str(tmp_path / "a.mp4")]))
+
+
+def test_a_white_frame_among_photographs_is_no_mask(
+    model: FrameOptions, photographs: list[str], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    taken: list[str] = []
+    monkeypatch.setattr(frames, "read_mask", lambda path, **_: taken.append(path) or read_mask(path))
+    white = np.full_like(cv2.imread(photographs[0]), 255)
+    white[:40, :120] = 0
+    cv2.imwrite(str(tmp_path / "white.png"), white)
+    assert len(list(read_frames([photographs[0], str(tmp_path / "white.png")], model))) == 2
+    assert taken == [photographs[0]]  # which was found to be none
