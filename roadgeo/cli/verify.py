@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 from collections import Counter
+from collections.abc import Sequence
 from dataclasses import replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -17,6 +18,7 @@ from roadgeo.cli.options import IMAGE, RESULTS, Command, option, out_dir_option,
 from roadgeo.cli.printing import echo
 
 if TYPE_CHECKING:
+    from roadgeo.reference.reference import AnyReference
     from roadgeo.running.verifying import Verified, VerifyRun
 
 __all__ = ["describe", "verify_command"]
@@ -35,6 +37,7 @@ _COLORS = {"agrees": "green", "off": "red", "unknown": "yellow"}
 )
 @out_dir_option("Where files go; made if missing. Default: here.")
 @take("json", group=RESULTS)
+@option("--report", is_flag=True, help="Of each image, a page for the browser: IMAGE_verify.html.", group=RESULTS)
 @option(
     "--fix",
     is_flag=True,
@@ -103,7 +106,7 @@ def verify_command(
 
     \b
     Examples:
-      roadgeo verify ortho.tif
+      roadgeo verify ortho.tif --report
       roadgeo verify tiles/ --reference boston-ma --fix --out-dir fixed
       roadgeo verify scan.jpg --crs EPSG:25832 --tolerance 10
       roadgeo verify *.tif --json --jobs 4 > verified.jsonl
@@ -122,16 +125,18 @@ def verify_command(
         raise click.UsageError(f"No images in {', '.join(images)}.")
     tasks = name_tasks(found[:1] if given["fuse"] else found)
     settings = _settings(given, found[1:] if given["fuse"] else [], jobs)
-    open_references(settings.references, print_steps(quiet))  # their errors are printed once
+    opened = open_references(settings.references, print_steps(quiet))  # their errors are printed once
     compile_once(quiet)
-    if fix or josm or len(tasks) > 1:
+    if fix or josm or given["report"] or len(tasks) > 1:
         make_folder(out_dir)
     results: list[Verified] = []
     with count_up(len(tasks), quiet, as_json) as count:
         for task, one in zip(tasks, verify_images(tasks, settings, jobs), strict=True):
             results.append(one)
             count(one.verdict)
-            files = _correct(one, Path(task.mask), Path(out_dir) / task.stem, fix, in_place)
+            stem = Path(out_dir) / task.stem
+            pages = [_write_page(one, task.mask, stem, opened, settings)] if given["report"] else []
+            files = [*pages, *_correct(one, Path(task.mask), stem, fix, in_place)]
             _report(one, files, as_json, quiet, verbose)
     documents = [one.document for one in results]
     if josm:
@@ -155,6 +160,20 @@ def _settings(given: dict[str, Any], others: list[str], jobs: int) -> VerifyRun:
     options = replace(usual, tolerance_m=given["tolerance"], search=search)
     reading = read_options({**given, "focal_px": None}, {}, others, jobs)
     return VerifyRun(given["references"], options, reading.of_query(), given["crs"])
+
+
+def _write_page(one: Verified, image: str, stem: Path, opened: Sequence[AnyReference], settings: VerifyRun) -> Path:
+    """Write the report of an image."""
+    from roadgeo.outputs.report.verification import write_verification
+    from roadgeo.sources.georeference import read_georeference
+
+    page = stem.with_name(f"{stem.name}_verify.html")
+    place = None if one.verdict == "error" else read_georeference(image, settings.crs)
+    indexes = [] if place is None else [index for each in opened for index in each.indexes_at([place.middle()])]
+    index = next((index for index in indexes if index.name == one.document.get("reference")), None)
+    said = click.unstyle(describe(one.document)).removeprefix(f"{image}: {one.verdict}: ")
+    write_verification(page, one.document, said, place, one.corrected, index)
+    return page
 
 
 def _correct(one: Verified, image: Path, stem: Path, fix: bool, in_place: bool) -> list[Path]:

@@ -16,10 +16,10 @@ from worlds.turned import mark_turned
 
 from roadgeo.cli import main
 from roadgeo.evaluation.demo import ATTRIBUTION, ROADS, demo_masks
+from roadgeo.geometry.georeference import Georeference
 from roadgeo.geometry.homography import Homography
 from roadgeo.outputs.schemas import read_schema
 from roadgeo.outputs.verification_files import write_fixed, write_josm
-from roadgeo.sources.georeference import Georeference
 from roadgeo.sources.roads import read_roads
 from roadgeo.workflows import build_reference
 
@@ -59,9 +59,12 @@ def test_right_wrong_and_unknown_are_told_and_the_wrong_one_is_corrected(
     georeferenced("wrong.tif", 60, -35)
     georeferenced("far.tif", 90_000, 0)
     names = ["right.tif", "wrong.tif", "far.tif"]
-    status = main(["verify", *names, "-r", str(porto), "--fix", "--josm", "--json", "-o", "out"])
+    status = main(["verify", *names, "-r", str(porto), "--fix", "--josm", "--report", "--json", "-o", "out"])
     out, err = capfd.readouterr()
     assert status == 4, err
+    pages = [Path("out", f"{name.removesuffix('.tif')}_verify.html").read_text("utf-8") for name in names]
+    assert ["corrected" in page for page in pages] == [False, True, False]
+    assert ["query-roads" in page.partition("<body>")[2] for page in pages] == [True, True, False]
     right, wrong, far = map(json.loads, out.splitlines())
     for one in (right, wrong, far):
         jsonschema.validate(one, read_schema("verification"))
@@ -83,7 +86,7 @@ def test_right_wrong_and_unknown_are_told_and_the_wrong_one_is_corrected(
     assert (float(bookmark["center_lon"]), float(bookmark["center_lat"])) == pytest.approx(
         (wrong["center"]["lon"], wrong["center"]["lat"]), abs=1e-6
     )
-    written = {path.name for path in Path("out").iterdir()}
+    written = {path.name for path in Path("out").iterdir() if path.suffix != ".html"}
     assert written == {"roadgeo_verify.csv", "roadgeo_offsets.xml", "wrong_fixed.tif", "wrong_fixed.points"}
     assert main(["verify", "out/wrong_fixed.tif", "-r", str(porto)]) == 0
     with rasterio.open("out/wrong_fixed.tif") as fixed, rasterio.open("wrong.tif") as given:
