@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from dataclasses import asdict, dataclass, field
 from enum import StrEnum
 from html import escape
@@ -48,6 +49,8 @@ class Reason(StrEnum):
     #: Two places fit almost equally; or two looks at one scene find two.
     TWO_PLACES = "two_places"
     TWO_LOOKS = "two_looks"
+    #: The middle is uncertain by much of the frame, as along a road that is all that is seen.
+    HALF_A_PLACE = "half_a_place"
     #: The mask shows too few intersections, or hardly a road.
     FEW_INTERSECTIONS = "few_intersections"
     FEW_ROADS = "few_roads"
@@ -71,6 +74,31 @@ class Reason(StrEnum):
     MEMORY = "memory"
     #: Of roadgeo itself.
     FAULT = "fault"
+
+
+class CenterError(NamedTuple):
+    """How far the middle of a frame may be off.
+
+    Attributes
+    ----------
+    along_m, across_m : float
+        Greatest standard deviation of all directions, and that at right angles to it.
+    azimuth_deg : float
+        Direction of the greatest, clockwise from the north of the CRS, 0 to 180.
+    """
+
+    along_m: float
+    across_m: float
+    azimuth_deg: float
+
+    @classmethod
+    def of(cls, covariance: FloatArray) -> CenterError:
+        """Compute it from the covariance (8, 8) of the corners' x and y: the middle is taken for their mean."""
+        mean = np.tile(np.eye(2), 4) / 4.0
+        (across, along), axes = np.linalg.eigh(mean @ covariance @ mean.T)
+        east, north = axes[:, 1]
+        azimuth = math.degrees(math.atan2(east, north)) % 180.0
+        return cls(math.sqrt(max(along, 0.0)), math.sqrt(max(across, 0.0)), azimuth)
 
 
 class ErrorRate(NamedTuple):
@@ -343,6 +371,11 @@ class Location:
     query_to_pixel: FloatArray | None = field(default=None, repr=False)
 
     @property
+    def center_error(self) -> CenterError | None:
+        """How far the middle may be off; None where that is not known."""
+        return None if self.corner_covariance_m2 is None else CenterError.of(self.corner_covariance_m2)
+
+    @property
     def located(self) -> bool:
         """Whether one place was found."""
         return self.status == "located"
@@ -492,6 +525,7 @@ class Location:
             "lens_k1": None if center is None else self.lens_k1,
             "corner_sigma_m": rows(self.corner_sigma_m),
             "corner_covariance_m2": rows(self.corner_covariance_m2),
+            "center_error": None if self.center_error is None else self.center_error._asdict(),
             "lonlat_sigma_m": rows(self.lonlat_sigma_m),
             "lonlat_accuracy_m": None if center is None or np.isnan(self.lonlat_accuracy_m) else self.lonlat_accuracy_m,
             "camera": None if self.camera is None else self.camera.to_dict(),

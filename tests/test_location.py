@@ -92,3 +92,16 @@ def test_a_location_is_a_feature_to_other_libraries():
     assert table.crs == "EPSG:32619"
     assert table.area[0] == pytest.approx(200 * 150, rel=1e-3)
     assert len(REFUSED.to_geodataframe()) == 1
+
+
+@pytest.mark.parametrize("azimuth_deg", [0.0, 30.0, 90.0, 150.0])
+def test_the_middle_is_least_known_along_the_road_that_is_seen(azimuth_deg: float) -> None:
+    along = np.array([np.sin(np.radians(azimuth_deg)), np.cos(np.radians(azimuth_deg))])
+    shift = np.tile(along, 4)  # all corners move together
+    covariance = 100.0**2 * np.outer(shift, shift) + 4.0**2 * 4.0 * np.eye(8)
+    error = replace(LOCATED, corner_covariance_m2=covariance).center_error
+    assert error is not None
+    assert error.along_m == pytest.approx(100.0, rel=0.01)
+    assert error.across_m == pytest.approx(4.0, rel=0.01)
+    assert abs((error.azimuth_deg - azimuth_deg + 90.0) % 180.0 - 90.0) < 0.01
+    assert LOCATED.center_error is None

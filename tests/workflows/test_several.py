@@ -7,7 +7,7 @@ import pytest
 from worlds.scenes import PLANE, camera, look, random_network, scene_of
 
 from roadgeo.geometry.camera import CameraOptions
-from roadgeo.location import Seconds
+from roadgeo.location import Reason, Seconds
 from roadgeo.matching.index import build_index
 from roadgeo.matching.methods import Fit, Found
 from roadgeo.matching.options import LocateOptions
@@ -214,3 +214,19 @@ def test_how_much_likelier_a_place_is_is_said_without_logarithms(query, searched
     reason = judge(query, searched("a", (odds, 0.0))).reason
     assert told in reason
     assert "3,000 times are asked for" in reason
+
+
+@pytest.mark.parametrize(("along_m", "status"), [(5.0, "located"), (100.0, "ambiguous")])
+def test_half_a_place_is_not_located(query, searched, along_m, status):
+    """Of one road alone the mask tells where it lies across that, and not how far along it."""
+    found = searched("a", (20.0, 0.0))
+    east = np.tile([1.0, 0.0], 4)
+    covariance = along_m**2 * np.outer(east, east) + np.eye(8)
+    found = replace(found, fits=tuple(replace(fit, corner_covariance_m2=covariance) for fit in found.fits))
+    answer = judge(query, found)
+    assert answer.status == status
+    if status == "ambiguous":
+        assert answer.reason_code is Reason.HALF_A_PLACE
+        assert answer.reason.startswith("only half a place is known: the middle lies within +-200 m along 90 degrees")
+        assert answer.center is not None
+        assert answer.to_dict()["center_error"]["along_m"] == pytest.approx(100.0, rel=0.01)

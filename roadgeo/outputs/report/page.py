@@ -18,7 +18,7 @@ from roadgeo import __version__
 from roadgeo._text import counted
 from roadgeo.geometry.mask import RoadMask, plane_to_pixel
 from roadgeo.geometry.pinhole import polygon_area
-from roadgeo.location import Location, Place
+from roadgeo.location import Location, Place, Reason
 from roadgeo.matching.index import ReferenceIndex
 from roadgeo.outputs.names import bare_command, bare_name, without_folders
 from roadgeo.outputs.paths import Placement
@@ -142,6 +142,11 @@ def _explain(location: Location) -> str:
     """Return the meaning of the answer, and the advice where there is no place."""
     if location.status == "located":
         texts = [_rival(location)]
+    elif location.reason_code is Reason.HALF_A_PLACE:
+        texts = [
+            "The place is known in one direction only. Nothing was georeferenced; shown is the likeliest.",
+            "A mask of more ground, with roads in other directions, would tell where along them it lies.",
+        ]
     elif location.status == "ambiguous":
         texts = [
             "Two places fit, and which one is right cannot be told. Nothing was georeferenced; shown is the better.",
