@@ -32,12 +32,14 @@ PYRAMID = (1.0, 0.5, 2.0, 0.25, 0.125)
 _BRIDGED = 1.5  # a little more than half a step
 
 _DEFAULT_RESOLUTION_M = 1.0
-_MIN_SIDE, _MAX_ENLARGED = 192, 4096  # pixels at the model's scale
+_MIN_SIDE, _MAX_ENLARGED = 192, 4096 * 4096  # pixels at the model's scale: a side, an area
 _TRIED_TILES = 1.9  # side of the part that is tried, tiles: 2 x 2 of them cover it
 _DOUBT = 4  # power of the share of probability that lies on roads
 #: Pixels shown to a model in the time of a search. A scale at which it is still to be shown all of the
 #: photograph must promise more.
 _COST_OF_SEARCH = 2_000_000
+#: Finer scales are not tried beyond one that promises less than this share of the best: there roads fall apart.
+_HOPELESS = 0.4
 
 
 def scale_of(gsd_m: float, network: Network) -> float:
@@ -58,8 +60,7 @@ def try_scales(
 
 
 def _fits(shape: tuple[int, int], scale: float) -> bool:
-    too_large = math.prod(shape) > MAX_MAP_PIXELS or (scale > 1 and max(shape) > _MAX_ENLARGED)
-    return min(shape) >= _MIN_SIDE and not too_large
+    return min(shape) >= _MIN_SIDE and math.prod(shape) <= (_MAX_ENLARGED if scale > 1 else MAX_MAP_PIXELS)
 
 
 def rank_scales(
@@ -75,16 +76,25 @@ def rank_scales(
     found: dict[float, ProbabilityMap | None] = {}
     worth: dict[float, float] = {}
     part, before, promise = _Part(0, 0, photograph.width, photograph.height), None, 1.0
+    most, seen_anywhere, hopeless = 0.0, 0.0, False
     for scale in scales:
+        if hopeless:
+            found[scale], worth[scale] = None, -scale
+            continue
         part, same_ground = _most_roads(part, before, [round(_TRIED_TILES * side / scale) for side in network.seen])
         before, shown = None, _cut(photograph, part)
         with suppress(MaskError):  # no ground
             before = segment(shown, network, scale)
-        promise *= (score(before) + 1.0) / (score(same_ground) + 1.0)
+        intersections = score(before)
+        promise *= (intersections + 1.0) / (score(same_ground) + 1.0)
         is_whole = (part.height, part.width) == (photograph.height, photograph.width)
         found[scale] = before if is_whole else None
         cost = _COST_OF_SEARCH + (0 if is_whole else math.prod(map_shape(photograph, scale)))
         worth[scale] = promise / math.sqrt(cost)
+        most, seen_anywhere = max(most, promise), max(seen_anywhere, intersections)
+        hopeless = promise < _HOPELESS * most
+    if seen_anywhere < 1.0:  # narrow roads are seen at the finest scale first
+        return {scale: found[scale] for scale in reversed(scales)}
     return {scale: found[scale] for scale in sorted(scales, key=worth.__getitem__, reverse=True)}
 
 

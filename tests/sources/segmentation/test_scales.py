@@ -8,8 +8,10 @@ import numpy as np
 import pytest
 from worlds.models import brightness_model
 
+from roadgeo.sources.segmentation import scales
 from roadgeo.sources.segmentation.network import load_network
 from roadgeo.sources.segmentation.photograph import open_photograph
+from roadgeo.sources.segmentation.probability import ProbabilityMap
 from roadgeo.sources.segmentation.scales import PYRAMID, rank_scales, try_scales
 from roadgeo.sources.segmentation.tiling import segment
 
@@ -93,3 +95,41 @@ def test_roads_in_no_part_are_no_reason_to_fail(network, tmp_path: Path) -> None
     cv2.imwrite(str(path), np.random.default_rng(0).integers(40, 60, (900, 900, 3)).astype(np.uint8))
     with open_photograph(path) as opened:
         assert set(rank_scales(opened, network)) == {0.25, 0.5, 1.0, 2.0}
+
+
+def test_where_no_intersection_is_seen_the_finest_scale_comes_first(
+    network, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Tracks between farms: what is too narrow to be seen on coarse pixels may be seen on finer ones."""
+    cv2.imwrite(str(tmp_path / "farm.png"), np.full((600, 900, 3), 90, np.uint8))
+    monkeypatch.setattr(scales, "score", lambda _: 0.3)
+    with open_photograph(tmp_path / "farm.png") as opened:
+        ranked = list(rank_scales(opened, network))
+    assert ranked == sorted(ranked, reverse=True)
+
+
+def test_scales_at_which_roads_fell_apart_are_not_tried_finer(
+    network, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    cv2.imwrite(str(tmp_path / "town.png"), np.full((900, 900, 3), 90, np.uint8))
+    shown: list[float] = []
+
+    def note(photograph, network, scale):  # type: ignore[no-untyped-def]
+        shown.append(scale)
+        return ProbabilityMap(np.zeros((10, 10), np.uint8))
+
+    monkeypatch.setattr(scales, "segment", note)
+    seen = iter([20.0, 0.0, 5.0, 20.0])  # at the coarsest scale; at the next, and what was seen of the same ground
+    monkeypatch.setattr(scales, "score", lambda _: next(seen))
+    with open_photograph(tmp_path / "town.png") as opened:
+        ranked = rank_scales(opened, network)
+        tried = sorted(try_scales(opened, network))
+    assert shown == tried[:2]
+    assert list(ranked) == tried
+    assert all(ranked[scale] is None for scale in tried[2:])
+
+
+def test_a_long_strip_may_be_enlarged(network, tmp_path: Path) -> None:
+    cv2.imwrite(str(tmp_path / "strip.png"), np.full((1000, 3400, 3), 90, np.uint8))
+    with open_photograph(tmp_path / "strip.png") as opened:
+        assert 2.0 in try_scales(opened, network)

@@ -1,0 +1,64 @@
+"""Real photographs from elsewhere than the network learnt: who tells more never gets less, and nothing is wrong."""
+
+import csv
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from roadgeo.geometry.projection import metres_apart
+from roadgeo.location import Location
+from roadgeo.matching.options import LocateOptions
+from roadgeo.reference.reference import Reference
+from roadgeo.running.queries import QueryOptions, locate_query
+from roadgeo.workflows import build_reference
+
+pytestmark = pytest.mark.realdata
+
+
+@pytest.fixture(scope="module")
+def rows(data_dir: Path) -> list[dict[str, str]]:
+    """Photographs that lie on a map."""
+    with (data_dir / "photographs" / "truth.csv").open() as truth:
+        return [row for row in csv.DictReader(truth) if row["roads"]]
+
+
+@pytest.fixture(scope="module")
+def maps(data_dir: Path, rows: list[dict[str, str]], tmp_path_factory: pytest.TempPathFactory) -> dict[str, Reference]:
+    folder = tmp_path_factory.mktemp("maps")
+    files = dict.fromkeys(row["roads"] for row in rows)
+    return {one: build_reference(data_dir / one, path=folder / f"{Path(one).stem}.gpkg") for one in files}
+
+
+def told(row: dict[str, str], what: str) -> LocateOptions:
+    """What is told of a photograph. No clock: a busy machine changes nothing."""
+    options, gsd = LocateOptions(), float(row["gsd_m"])
+    camera = options.match.camera
+    if what != "nothing":
+        camera = replace(camera, gsd_m=(0.93 * gsd, 1.07 * gsd))
+    if what == "scale and heading":
+        camera = replace(camera, heading_deg=(float(row["heading_deg"]), 5.0))
+    search = replace(options.search, time_limit_s=3600.0)
+    return replace(options, match=replace(options.match, camera=camera), search=search)
+
+
+def is_right(location: Location, row: dict[str, str]) -> bool:
+    assert location.center is not None
+    truth = np.array([float(row["lon"]), float(row["lat"])])
+    off_m = metres_apart(truth, np.array([location.center.lon, location.center.lat]))
+    return off_m < max(15.0, 3.0 * float(row["gsd_m"]))
+
+
+def test_told_is_never_worse_than_blind(data_dir: Path, rows: list[dict[str, str]], maps: dict[str, Reference]) -> None:
+    found: dict[str, set[str]] = {}
+    for what in ("nothing", "scale", "scale and heading"):
+        for row in rows:
+            path, query = str(data_dir / "photographs" / row["file"]), QueryOptions(mirror="never")
+            location = locate_query(path, [maps[row["roads"]]], told(row, what), query).location
+            if location.located:
+                assert is_right(location, row), (what, row["file"])
+                found.setdefault(what, set()).add(row["file"])
+    assert found["nothing"] <= found["scale"]
+    assert found["scale"] <= found["scale and heading"]
+    assert len(found["nothing"]) >= 8
