@@ -1,4 +1,4 @@
-"""What Python programs call: as the command line does it, but with what they have at hand, and nothing is written."""
+"""The Python interface: as the command line, but with objects at hand, and without files."""
 
 from __future__ import annotations
 
@@ -71,10 +71,10 @@ class Answer(Location):
         Parameters
         ----------
         also : sequence of str
-            Further outputs by name: "overlay", "report", "geojson", "matches" and what else `roadgeo locate --help`
+            Further outputs by name: "overlay", "report", "geojson", "matches" and others that `roadgeo locate --help`
             lists.
         stem : str
-            What the names of the files begin with. Default: as the query's file.
+            Start of the files' names. Default: as the query's file.
 
         Raises
         ------
@@ -122,7 +122,7 @@ class Answer(Location):
     def to_xarray(self) -> xr.DataArray:
         """Return the mask on the map, dimensions y and x: 0 outside the footprint, 1 ground, 2 road.
 
-        `attrs["crs"]` and `attrs["transform"]` say where it lies.
+        `attrs["crs"]` and `attrs["transform"]` give its place.
 
         >>> roadgeo.locate("drone.png", "porto.gpkg").to_xarray().dims
         ('y', 'x')
@@ -178,17 +178,17 @@ def build_reference(
         A path is a road file or a folder of them. Arrays are of shape (N, 2), x or longitude first, one for each line;
         or a single one, where rows of NaN stand between the lines.
     name : str
-        What the reference is called. Default: as the file at `path`, if that is given.
+        Name of the reference. Default: as the file at `path`, if that is given.
     crs : anything that pyproj knows, optional
-        CRS of the coordinates. Needed for shapely lines and arrays, and for files that do not say.
+        CRS of the coordinates. Needed for shapely lines and arrays, and for files without one.
     path : path, optional
         Write it there, REF.gpkg and REF.index, and open it from there. Default: nothing is written.
     kinds : "main", "drivable", "vehicles" or "all"
-        Which roads are taken, where they tell their kind (see `roadgeo.sources.schemas`).
+        Kinds of roads to take, where they have kinds (see `roadgeo.sources.schemas`).
     tunnels : bool
         Take tunnels too, which a mask does not show.
     attribution : str, optional
-        Whom to name beside the map, where the roads do not say.
+        Attribution beside the map, where the roads have none.
 
     Raises
     ------
@@ -304,7 +304,7 @@ def locate(
     max_tilt : float
         Greatest angle of the camera from the vertical, degrees.
     focal : float or "exif"
-        Focal length in pixels of the image; or as a file's EXIF says.
+        Focal length in pixels of the image; or as in a file's EXIF.
     effort : "quick" or "full"
         Whether the search ends early, or roads alone are searched too (the default).
     time_limit : float
@@ -374,7 +374,7 @@ def verify(
     max_turn: float = 6.0,
     crs: str | None = None,
 ) -> Verified:
-    """Say whether a georeferenced image lies where it claims to, as `roadgeo verify` does. Nothing is written.
+    """Check whether a georeferenced image lies where it claims to, as `roadgeo verify` does. Nothing is written.
 
     >>> verified = roadgeo.verify("drone_footprint.tif", "porto.gpkg")
     >>> verified.verdict
@@ -396,7 +396,7 @@ def verify(
     Returns
     -------
     Verified
-        Its `verdict` is "agrees", "off", "unknown" or "error"; its `document` says by how much, and why.
+        Its `verdict` is "agrees", "off", "unknown" or "error"; its `document` has the displacement and the reason.
 
     Raises
     ------
@@ -448,7 +448,7 @@ def track(
     start : datetime
         When the first frame was taken.
     gsd, near, within, max_tilt, focal, time_limit
-        As of `locate`; with `focal`, pixels, the places of the camera are told too.
+        As of `locate`; with `focal`, pixels, the places of the camera are given too.
 
     Returns
     -------

@@ -58,13 +58,13 @@ def build_reference(
     roads : Roads, GeoDataFrame or path
         Lines in any CRS; a path is a road file or a folder of them.
     name : str
-        What the reference is called.
+        Name of the reference.
     path : path, optional
         Write it there, and open it from there.
     kinds, tunnels
-        Which roads of a table or a file are taken, where it tells them apart; `Roads` are taken as they are.
+        Kinds of roads to take from a table or a file, where it has kinds; `Roads` are taken as they are.
     attribution : str, optional
-        Whom to name beside the map, where the roads do not say.
+        Attribution beside the map, where the roads have none.
 
     Raises
     ------
@@ -90,7 +90,7 @@ def build_reference(
 def update_reference(path: str | Path, roads: Roads, say: Say = say_nothing) -> Reference:
     """Replace the roads of a reference by others on the ground that those were asked for, or add them, and write it.
 
-    The rest of the network is not drawn again. Where the roads do not say what ground they were asked for, it is the
+    The rest of the network is not drawn again. Where the roads do not state the ground they were asked for, it is the
     ground they lie on. The options are those that the reference was built with.
 
     Raises
@@ -134,7 +134,7 @@ def _drawn(network: RoadNetwork) -> AnyArray:
 
 
 def _require_same_scale(lines: AnyArray, moved: AnyArray) -> None:
-    """Refuse roads that lie so far from a reference that its plane has another scale there, or knows no place there."""
+    """Refuse roads so far from a reference that its plane has another scale there, or has no coordinates there."""
     import shapely
 
     scale = float(shapely.length(moved).sum() / shapely.length(lines).sum())
@@ -171,7 +171,7 @@ def explain(
     reference: AnyReference | Sequence[AnyReference],
     options: LocateOptions | None = None,
 ) -> Explanation:
-    """Locate a mask as `locate` does, and tell how far the search got, what it rejected and what was missing.
+    """Locate a mask as `locate` does, and explain how far the search got, what it rejected and what was missing.
 
     >>> reference = roadgeo.open_reference("porto.gpkg")
     >>> explanation = roadgeo.explain("elsewhere.png", reference)

@@ -1,4 +1,4 @@
-"""Where a raster lies: what takes its pixels to a CRS, and to a plane."""
+"""The place of a raster: the transforms from its pixels to a CRS, and to a plane."""
 
 from __future__ import annotations
 

@@ -59,7 +59,7 @@ def fetch_manifest(url: str) -> Path:
 def fetch_shard(folder: Path, build: str, name: str, most: float) -> bool:
     """Fetch the index of a shard, if the folder is one that `fetch_manifest` returned; return whether it is.
 
-    Of no more bytes than the manifest tells of both its files.
+    The size of both its files in the manifest bounds the transfer.
 
     Raises
     ------
@@ -103,7 +103,7 @@ def _fetch(url: str, target: Path, most: float) -> None:
 
 
 def _at_most(most: float) -> Any:
-    """Return what ends a transfer of more bytes: it is told of the size, and of each part as it comes."""
+    """Return a callback that ends a transfer of more bytes: it receives the size, and each part as it comes."""
     from fsspec.callbacks import Callback
 
     class AtMost(Callback):  # type: ignore[misc]

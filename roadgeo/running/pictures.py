@@ -30,8 +30,8 @@ def read_picture(picture: Any) -> str | AnyArray:
     ----------
     picture : path, array, PIL image, xarray DataArray or rasterio dataset
         Of an array with three axes the short one (up to 16) holds the bands: first as rasterio has it (C, H, W), or
-        last as others do (H, W, C). A dataset that is a file is read as that file. What is transparent, masked or
-        nodata was not observed. A PIL image is turned upright, as `PIL.ImageOps.exif_transpose` does.
+        last as others do (H, W, C). A dataset that is a file is read as that file. Pixels that are transparent, masked
+        or nodata were not observed. A PIL image is turned upright, as `PIL.ImageOps.exif_transpose` does.
 
     Raises
     ------

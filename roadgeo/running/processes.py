@@ -38,7 +38,7 @@ class Work(Protocol[TaskIn, ResultOut]):
     """The work done for each task; it travels to other processes, so it can be pickled."""
 
     def prepare(self) -> Callable[[TaskIn], ResultOut]:
-        """Make a process ready (open the references) and return what does one task."""
+        """Make a process ready (open the references) and return the function that does one task."""
 
     def give_up(self, task: TaskIn, reason: str) -> ResultOut:
         """Make the result of a task whose process died."""
@@ -136,8 +136,8 @@ def _do(task: Any) -> Any:
 def end_with_parent(clean: Callable[[], None] = lambda: None) -> None:
     """End this process when the one that started it is gone, however it went: nobody waits for its results.
 
-    It does what the parent cannot do any more (`clean`), and its main thread is told to end first (SIGTERM), so that it
-    may remove what it has half written.
+    It does the remaining work of the parent (`clean`), and ends its main thread first (SIGTERM), so that it
+    may remove half-written files.
     """
     parent = multiprocessing.parent_process()
     if parent is None:

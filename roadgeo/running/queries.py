@@ -48,12 +48,12 @@ __all__ = ["FirstLook", "QueryOptions", "is_model", "locate_query", "look_once"]
 #: The mask of a larger photograph is reduced, so that time and memory are bounded.
 _MAX_GRID_PIXELS = 64_000_000
 _MAX_SCALES = 3
-#: Roads of a photograph whose pixels are coarser than a model's are traced on the model's, but of no more than so many
+#: Roads of a photograph whose pixels are coarser than a model's are traced on the model's, but at most this many
 #: times its own along a side: narrow gaps between roads close on coarse ones.
 _MOST_FINER, _LEAST_FINER = 2.0, 1.25
 #: Name in results of a picture that is no file.
 _ARRAY = "array"
-#: In a second way a model is shown a photograph so many times finer, and the mean of the log odds counts. Of labelled
+#: In a second way a model is shown a photograph finer by this factor, and the mean of the log odds counts. Of labelled
 #: tiles of Boston and Miami F1 within 4 m is .914 and .867 at 1 m per pixel, .945 and .873 at 0.71 m, .941 and .882 of
 #: both (turned by half instead: .923 and .878). Beyond `_MOST_FINER` pixels for each of its own it is turned by half.
 _FINER, _WAYS = math.sqrt(2.0), 2
@@ -273,7 +273,7 @@ def _locate_photograph(
 def _plan_looks(frame: _Frame, query: QueryOptions) -> Later[Look]:
     """Return the best scale's look, the photograph in more ways, other scales, and other thresholds at the best.
 
-    Where the scale is known, what is seen at it alone, and finer alone, are the other scales.
+    Where the scale is known, the result at it alone, and finer alone, are the other scales.
     """
 
     def look(i: int, ways: int | None = None, further: int = 0) -> Look:

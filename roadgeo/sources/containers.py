@@ -133,7 +133,7 @@ def _is_filled(path: Path, layer: str) -> bool:
 
 
 def _choose_columns(path: Path, layer: str) -> tuple[int, list[str]]:
-    """Return the size of a layer, and its columns that may tell something of a road: by their names, else values."""
+    """Return the size of a layer, and its columns that may describe a road: by their names, else by their values."""
     total, fields = describe_layer(path, layer)
     known = [name for name in fields if is_known_column(name)]
     if not fields or {"highway", "fclass"} & {name.lower() for name in known}:
@@ -237,7 +237,7 @@ def _read_graphml(path: Path) -> RoadTable:
 
 
 def held_table(roads: Any) -> RoadTable:
-    """Return what a program holds as a table: a GeoDataFrame or GeoSeries, a graph, shapely lines, arrays.
+    """Return a program's object as a table: a GeoDataFrame or GeoSeries, a graph, shapely lines, arrays.
 
     Raises
     ------
@@ -301,7 +301,7 @@ def _graph_table(graph: Any) -> RoadTable:
 
 
 def _columns(rows: Sequence[Mapping[Any, Any]]) -> dict[str, AnyArray]:
-    """Return of rows of attributes the columns that may tell something of a road."""
+    """Return the columns of rows of attributes that may describe a road."""
     names = [name for name in dict.fromkeys(name for row in rows for name in row) if is_known_column(str(name))]
     return {str(name): objects(row.get(name) for row in rows) for name in names}
 

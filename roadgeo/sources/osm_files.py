@@ -29,7 +29,7 @@ OSM_ENDINGS = (*(".osm.pbf", ".pbf", ".osm", ".osm.gz", ".osm.bz2", ".osm.xml", 
 #: PBF files are read in parts of about this size; the other two are limits of their specification.
 _PART, _MAX_BLOB, _MAX_BLOB_HEADER = 1 << 20, 32 << 20, 64 << 10
 _PACKED = (("lzma", 4, "bytes"), ("bzip2", 5, "bytes"), ("lz4", 6, "bytes"), ("zstd", 7, "bytes"))
-#: What is looked at of a PBF file (https://github.com/openstreetmap/OSM-binary).
+#: The checked parts of a PBF file (https://github.com/openstreetmap/OSM-binary).
 _PBF = (
     ("BlobHeader", (("size", 3, "int64"),)),
     ("Blob", (("raw", 1, "bytes"), ("zlib", 3, "bytes"), *_PACKED)),

@@ -212,12 +212,12 @@ def _date_setting(date: str | None) -> str:
 
 
 def _ask(url: str, options: FetchOptions, say: Say, query: str = "", part: tuple[int, int] = (0, 1)) -> Any:
-    """Return what a server answers, or answered before: a list of Nominatim's, or the object of Overpass.
+    """Return a server's answer, new or kept: a list of Nominatim's, or the object of Overpass.
 
     Parameters
     ----------
     query : str
-        What is posted.
+        The body of the request.
     part : (int, int)
         The number of this part, from 0, and how many there are.
     """
@@ -269,7 +269,7 @@ def _ask(url: str, options: FetchOptions, say: Say, query: str = "", part: tuple
 
 
 def _patience(host: str, options: FetchOptions, say: Say) -> Any:
-    """Return what has a busy server asked again, and tells of it."""
+    """Return a hook that asks a busy server again, and reports it."""
     from urllib3 import Retry
     from urllib3.exceptions import InvalidHeader
 

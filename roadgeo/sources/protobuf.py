@@ -14,7 +14,7 @@ Schema = tuple[tuple[str, tuple[tuple[str, int, str], ...]], ...]
 
 @cache
 def message_types(schema: Schema) -> Mapping[str, Any]:
-    """Return the classes of messages; what else is in one is passed over."""
+    """Return the classes of messages; other fields are passed over."""
     from google.protobuf import descriptor_pb2, descriptor_pool, message_factory
 
     described = descriptor_pb2.FieldDescriptorProto

@@ -1,4 +1,4 @@
-"""Roads on a metric plane: of files, of OpenStreetMap, or of what a program holds. References are built of them.
+"""Roads on a metric plane: of files, of OpenStreetMap, or of a program's objects. References are built of them.
 
 Whatever holds roads gives tables (`containers`, `overpass`), and one adapter makes lines of them (`schemas`). Here the
 lines that were asked for are chosen and brought to one plane.
@@ -326,7 +326,7 @@ def _corners(source: RoadLines) -> FloatArray:
 
 
 def _astray(source: RoadLines, name: str) -> BoolArray:
-    """Tell which lines lie beyond the Earth, or have a vertex at the origin of coordinates, far off all others.
+    """Return which lines lie beyond the Earth, or have a vertex at the origin of coordinates, far off all others.
 
     One wrong value makes such lines, or a missing one that is written as 0.
     """

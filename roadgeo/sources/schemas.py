@@ -1,8 +1,8 @@
 """One adapter from tables of any schema to roads: kind of each, tunnel or not, name, attribution.
 
-A schema is told by its words, which stand in `schemas.toml`: `residential` is OpenStreetMap's, `A Road` the Ordnance
+A schema is recognised by its words, listed in `schemas.toml`: `residential` is OpenStreetMap's, `A Road` the Ordnance
 Survey's, `S1400` that of TIGER. Columns with well-known names are looked at first, then any that hold such words.
-Numbers count in columns that are known by name alone. What is something else (a stream, a fence, a railway) is left
+Numbers count in columns that are known by name alone. Other lines (a stream, a fence, a railway) are left
 out and counted; a road whose kind is not known stays one.
 """
 
@@ -38,7 +38,7 @@ def _plain(text: str) -> str:
 
 
 def _by_word(kinds: Mapping[str, Sequence[str]]) -> dict[str, str]:
-    """Return what words stand for: those that end in `*`, for codes that begin so."""
+    """Return words by their meaning: those that end in `*`, for codes that begin so."""
     return {_plain(word) + word[-1] * (word[-1] == "*"): kind for kind, words in kinds.items() for word in words}
 
 

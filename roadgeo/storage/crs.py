@@ -31,7 +31,7 @@ _WKT = re.compile(
 
 
 class NoCrsError(CrsError):
-    """What was given is no CRS, or none of places on Earth."""
+    """The given text is no CRS, or none of places on Earth."""
 
 
 def known_crs(crs: Any) -> CRS:

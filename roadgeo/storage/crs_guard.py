@@ -1,4 +1,4 @@
-"""CRS in vector files that name other files, or lie elsewhere: found before GDAL opens them, and what they name.
+"""CRS in vector files that name other files, or lie elsewhere: both are found before GDAL opens them.
 
 `storage.crs` defines which names a CRS may not have. Here stands where each format keeps its CRS.
 """

@@ -248,7 +248,7 @@ def sidecar_nodata(path: str | os.PathLike[str]) -> float | None:
         return None
 
 
-#: What images are called that no text is.
+#: Suffixes of images, which no text has.
 _IMAGES = {".png", ".jpg", ".jpeg", ".tif", ".tiff", ".webp", ".jp2", ".bmp", ".gif"}
 
 

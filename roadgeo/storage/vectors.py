@@ -75,7 +75,7 @@ def list_layers(path: Path) -> list[tuple[str, str]]:
 
 
 def describe_layer(path: Path, layer: str) -> tuple[int, list[str]]:
-    """Return how many features a layer says to hold, and the names of its columns; errors as of `list_layers`."""
+    """Return the number of features that a layer claims to hold, and its columns' names; errors as of `list_layers`."""
     import pyogrio
 
     with _guarded(path, layer) as file:
@@ -89,7 +89,7 @@ def read_layer(
     """Read a layer (the first by default), with those of the named columns that it has.
 
     The first `skip` features are left out, and a bounded number is read. Text that is not in the encoding that the file
-    names is read as Latin-1, which may garble it, and that is told. Errors are those of `list_layers`.
+    names is read as Latin-1, which may garble it, and that is reported. Errors are those of `list_layers`.
     """
     import pyogrio
 
@@ -105,7 +105,7 @@ def read_layer(
 
 
 def _decoded(read: Callable[..., Any]) -> tuple[Any, dict[str, str]]:
-    """Return what is read, as Latin-1 where it is not in the encoding that its file names, and whether that is so."""
+    """Return the text, as Latin-1 where it is not in the encoding that its file names, and whether that is so."""
     try:
         return read(), {}
     except UnicodeDecodeError:

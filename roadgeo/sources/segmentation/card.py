@@ -194,7 +194,7 @@ def _choose_channels(output: Port, names: dict[int, str], class_name: str | None
     """Return which channels of an output are road."""
     n, wanted = _n_channels(output), _wanted(names, class_name)
     unnamed = not names and class_name in (None, output.name)
-    # A single channel is by convention the last of the classes, told from the others by the threshold.
+    # A single channel is by convention the last of the classes, separated from the others by the threshold.
     if n == 1 and (unnamed or max(names, default=0) in wanted):
         return (0,)
     if n == 1 or not wanted or (n is not None and max(wanted) >= n):

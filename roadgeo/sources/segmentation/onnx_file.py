@@ -33,7 +33,7 @@ _CONTROL = {"If", "Loop", "Scan", "SequenceMap"}
 _RANDOM = {"RandomNormal", "RandomNormalLike", "RandomUniform", "RandomUniformLike", "Multinomial", "Bernoulli"}
 _STRING = 8  # of TensorProto.DataType
 
-#: What is looked at of a file (https://github.com/onnx/onnx/blob/main/onnx/onnx.proto).
+#: The checked parts of a file (https://github.com/onnx/onnx/blob/main/onnx/onnx.proto).
 _SCHEMA = (
     ("Model", (("version", 1, "int64"), ("graph", 7, "Graph"), ("training", 20, "bytes"), ("function", 25, "bytes"))),
     ("Graph", (("node", 1, "Node"), ("stored", 5, "Tensor"), ("sparse", 15, "bytes"))),
