@@ -2,15 +2,23 @@
 
 from __future__ import annotations
 
+import contextlib
 import os
+import re
+import time
 from collections.abc import Iterator
 from contextlib import contextmanager
+from functools import lru_cache
 from pathlib import Path
 
 from roadgeo.errors import OutputError
 from roadgeo.storage.atomic import sync_file, writing
 
 __all__ = ["replacing", "write_bytes", "write_text"]
+
+#: Names of unfinished files, of whatever process, on whatever machine that shares the disk.
+_LEFTOVER = re.compile(r"\..+\.\d+\.part(\.\w+)?")
+_LEFT_S = 3600.0
 
 
 @contextmanager
@@ -26,6 +34,7 @@ def replacing(path: str | os.PathLike[str], sync: bool = True) -> Iterator[Path]
         The folder is missing or not writable, or the disk is full.
     """
     target = Path(path)
+    _remove_leftovers(target.parent)
     temporary = target.with_name(f".{target.stem}.{os.getpid()}.part{target.suffix}")
     try:
         with writing(target):
@@ -38,6 +47,16 @@ def replacing(path: str | os.PathLike[str], sync: bool = True) -> Iterator[Path]
                 temporary.unlink(missing_ok=True)
     except OutputError as error:
         raise OutputError(str(error).replace(str(temporary), str(target))) from error
+
+
+@lru_cache(maxsize=64)
+def _remove_leftovers(folder: Path) -> None:
+    """Remove the unfinished files of writers that were killed an hour ago or earlier; once for each folder."""
+    oldest = time.time() - _LEFT_S
+    for path in folder.glob(".*.part*"):
+        with contextlib.suppress(OSError):
+            if _LEFTOVER.fullmatch(path.name) and path.stat().st_mtime < oldest:
+                path.unlink()
 
 
 def write_bytes(path: str | os.PathLike[str], content: bytes) -> None:

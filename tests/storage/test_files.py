@@ -1,3 +1,4 @@
+import os
 from pathlib import Path
 
 import pytest
@@ -28,3 +29,13 @@ def test_the_old_file_stands_until_the_new_one_is_whole(tmp_path: Path) -> None:
 def test_a_missing_folder_is_named(tmp_path: Path) -> None:
     with pytest.raises(OutputError, match=r"cannot write .*nowhere"):
         write_text(tmp_path / "nowhere" / "a.json", "")
+
+
+def test_unfinished_files_of_writers_that_were_killed_are_removed(tmp_path: Path) -> None:
+    old, fresh, other = (tmp_path / name for name in (".a.12.part.gpkg", ".a.13.part.gpkg", ".a.part.gpkg"))
+    for path in (old, fresh, other):
+        path.touch()
+    for path in (old, other):
+        os.utime(path, (0, 0))
+    write_text(tmp_path / "a.json", "{}")
+    assert sorted(path.name for path in tmp_path.iterdir()) == [".a.13.part.gpkg", ".a.part.gpkg", "a.json"]

@@ -15,6 +15,7 @@ from roadgeo.errors import MaskError
 from roadgeo.geometry.mask import PROBABILITY_SURE, PROBABILITY_UNKNOWN, RoadMask
 from roadgeo.sources.masks import PROBABILITY_TAG, THRESHOLD_TAG
 from roadgeo.storage.files import replacing
+from roadgeo.storage.orientation import UPRIGHT, read_orientation, stored_from_upright
 
 __all__ = ["NODATA", "ProbabilityMap", "fuse"]
 
@@ -77,7 +78,8 @@ class ProbabilityMap:
     def write(self, path: str | os.PathLike[str]) -> None:
         """Write a GeoTIFF on the photograph's pixel grid, with nodata where nothing was observed.
 
-        Of a large photograph on a coarser grid, which lies on the photograph when both are opened in QGIS.
+        It lies on the photograph when both are opened in QGIS, which puts the pixels of that below the x axis, as they
+        are stored: also on a coarser grid, and where the photograph is to be turned.
 
         Raises
         ------
@@ -94,8 +96,11 @@ class ProbabilityMap:
         height, width = self.values.shape
         packed = {"compress": "deflate", "predictor": 2, "zlevel": 1}  # a third of the time, and smaller than without
         profile = {"driver": "GTiff", "count": 1, "dtype": "uint8", "nodata": NODATA, **packed}
-        if abs(self.pixel * width - width) > 0.5:
-            profile["transform"] = rasterio.Affine.scale(self.pixel, -self.pixel)
+        orientation = read_orientation(self.name)
+        if abs(self.pixel * width - width) > 0.5 or orientation != UPRIGHT:
+            stored = stored_from_upright(orientation, (round(self.pixel * width), round(self.pixel * height)))
+            lies = np.diag([1.0, -1.0, 1.0]) @ stored @ np.diag([self.pixel, self.pixel, 1.0])
+            profile["transform"] = rasterio.Affine(*lies[:2].ravel())
         tags = {
             PROBABILITY_TAG: "probability of road, 0 to 254",
             "MODEL": self.model,

@@ -4,9 +4,11 @@ from pathlib import Path
 
 import cv2
 import numpy as np
+import PIL.Image
 import pytest
 import rasterio
 from worlds.models import brightness_model
+from worlds.turned import save_turned
 
 from roadgeo.errors import MaskError
 from roadgeo.roads.thresholds import spread_probability
@@ -211,6 +213,22 @@ def test_a_map_that_was_kept_is_read_as_it_was(tmp_path: Path, void: bool) -> No
             np.testing.assert_array_equal(read.probability, made.probability)
             assert (read.observed is None) == (made.observed is None) == (not void)
     np.testing.assert_array_equal(read_mask(tmp_path / "photo_mask.tif", threshold=100).probability, values)
+
+
+@pytest.mark.parametrize("orientation", range(1, 9))
+def test_a_map_of_a_photograph_that_is_to_be_turned_lies_on_its_stored_pixels(tmp_path: Path, orientation: int) -> None:
+    """QGIS turns no pictures, and puts the pixels of one without a place below the x axis."""
+    values = np.arange(60 * 80, dtype=np.uint8).reshape(60, 80) % 200
+    photo = save_turned(tmp_path / "photo.png", values, orientation)
+    ProbabilityMap(values, name=str(photo)).write(tmp_path / "photo_mask.tif")
+    with PIL.Image.open(photo) as picture, rasterio.open(tmp_path / "photo_mask.tif") as found:
+        stored = np.asarray(picture)
+        transform = found.transform if orientation > 1 else rasterio.Affine.scale(1, -1)
+        for row, column in ((0, 0), (3, 70), (59, 79)):
+            x, y = transform @ (column + 0.5, row + 0.5)
+            assert stored[int(-y), int(x)] == values[row, column]
+    again = read_mask(tmp_path / "photo_mask.tif", threshold=100)
+    assert again.shape == (60, 80)
 
 
 def test_a_map_of_a_large_photograph_lies_on_it(tmp_path: Path) -> None:
