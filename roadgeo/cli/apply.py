@@ -8,33 +8,30 @@ import click
 
 from roadgeo.cli.accuracy import tell_accuracy
 from roadgeo.cli.folders import make_folder
-from roadgeo.cli.options import Command, Plugin, option, out_dir_option, take
+from roadgeo.cli.options import OTHERS, Command, Plugin, each, out_dir_option, row, take
 from roadgeo.cli.printing import echo
 from roadgeo.outputs.registry import offered
 
 __all__ = ["apply_command"]
 
 
+_OPTIONS = (
+    out_dir_option(),
+    row("--stretch", "", OTHERS,
+        "The picture's sides may be in another proportion: it shows the same ground all the same, as a scan does whose "
+        "pixels are not square."),
+    row("--also products", "NAME", OTHERS,
+        "Write a further form, as of `roadgeo locate`: points, gcps, iiif, geojson, kmz ... Repeatable.",
+        type=Plugin("roadgeo.outputs", names=offered), multiple=True),
+    take("crs", "resolution", "resampling", "compression", rare=False),
+    take("quiet"),
+)  # fmt: skip
+
+
 @click.command("apply", cls=Command, short_help="Put another picture of a located frame on the map.")
 @click.argument("location", metavar="LOCATION.json", type=click.Path())
 @click.argument("pictures", metavar="PICTURE...", nargs=-1, required=True, type=click.Path())
-@out_dir_option()
-@option(
-    "--stretch",
-    is_flag=True,
-    help="The picture's sides may be in another proportion: it shows the same ground all the same, as a scan does whose"
-    " pixels are not square.",
-)
-@option(
-    "--also",
-    "products",
-    metavar="NAME",
-    type=Plugin("roadgeo.outputs", names=offered),
-    multiple=True,
-    help="Write a further form, as of `roadgeo locate`: points, gcps, iiif, geojson, kmz ... Repeatable.",
-)
-@take("crs", "resolution", "resampling", "compression", rare=False)
-@take("quiet")
+@each(_OPTIONS)
 def apply_command(location: str, pictures: tuple[str, ...], out_dir: str, quiet: bool, **given: Any) -> int:
     """Put PICTUREs on the map by the place that one of their frame was found at.
 

@@ -17,7 +17,7 @@ from click.core import ParameterSource
 
 from roadgeo._text import visible
 from roadgeo.cli.command_line import made_by
-from roadgeo.cli.options import Command, hinted, make_options, option, out_dir_option, take
+from roadgeo.cli.options import OTHERS, Command, each, hinted, make_options, out_dir_option, row, take
 from roadgeo.cli.printing import echo
 from roadgeo.cli.progress import count_up
 from roadgeo.cli.queries import QUERY_OPTIONS, query_options, query_sets
@@ -32,34 +32,28 @@ if TYPE_CHECKING:
 __all__ = ["evaluate_command"]
 
 
+_OPTIONS = (
+    row("--queries", "PATH", OTHERS,
+        "A query set: its folder, or its table.", type=click.Path(exists=True, path_type=Path)),
+    query_options,
+    row("--method", ("auto", "pair"), OTHERS, "As in locate.", default="auto", show_default=True),
+    take("gsd", called="--known-gsd", help="Pixel size as it is told to the search, metres."),
+    take("max_tilt", "north_up", "effort", "time_limit"),
+    row("--radius", "METRES", OTHERS, "Right if nearer.", type=click.FloatRange(0.01), default=20.0, show_default=True),
+    take("jobs", help="Processes."),
+    row("--map as_map", "", OTHERS, "Map where such masks (of the first --noise) are located."),
+    row("--height", "METRES", OTHERS, "Above ground, in place of --gsd: height/focal.", type=click.FloatRange(1)),
+    row("--check", "N", OTHERS,
+        "With --map: try N other masks and count those located in each class.", type=click.IntRange(0), default=0),
+    out_dir_option("Write here, and go on from here.", None, Path),
+    row("--json as_json", "", OTHERS, "Print the figures as one JSON object."),
+    take("quiet"),
+)  # fmt: skip
+
+
 @click.command("evaluate", cls=Command, short_help="Measure how well masks are located.")
 @click.argument("reference", metavar="REF")
-@option("--queries", type=click.Path(exists=True, path_type=Path), help="A query set: its folder, or its table.")
-@query_options
-@option("--method", type=click.Choice(["auto", "pair"]), default="auto", show_default=True, help="As in locate.")
-@take("gsd", called="--known-gsd", help="Pixel size as it is told to the search, metres.")
-@take("max_tilt", "north_up", "effort", "time_limit")
-@option(
-    "--radius", metavar="METRES", type=click.FloatRange(0.01), default=20.0, show_default=True, help="Right if nearer."
-)
-@take("jobs", help="Processes.")
-@option("--map", "as_map", is_flag=True, help="Map where such masks (of the first --noise) are located.")
-@option(
-    "--height",
-    metavar="METRES",
-    type=click.FloatRange(1),
-    help="Above ground, in place of --gsd: height/focal.",
-)
-@option(
-    "--check",
-    metavar="N",
-    type=click.IntRange(0),
-    default=0,
-    help="With --map: try N other masks and count those located in each class.",
-)
-@out_dir_option("Write here, and go on from here.", None, Path)
-@option("--json", "as_json", is_flag=True, help="Print the figures as one JSON object.")
-@take("quiet")
+@each(_OPTIONS)
 def evaluate_command(
     reference: str,
     queries: Path | None,

@@ -11,7 +11,7 @@ import click
 
 from roadgeo._progress import Say
 from roadgeo._text import counted
-from roadgeo.cli.options import BOX, CRS, NEAR, Command, Plugin, make_cluster, option, take
+from roadgeo.cli.options import BOX, CRS, NEAR, Command, Plugin, each, make_cluster, row, take
 from roadgeo.cli.printing import echo
 from roadgeo.cli.shards import build_in_shards, shard_options
 
@@ -23,93 +23,42 @@ __all__ = ["index_command"]
 SOURCE, ROADS, RESULT = "Where the roads come from", "Which roads", "The reference"
 
 
+_OPTIONS = (
+    row("--osm place", "PLACE", SOURCE, "Fetch the roads of a place from OpenStreetMap."),
+    row("--bbox", "W,S,E,N", SOURCE, "Fetch those in a box, degrees; or cut --roads to it.", type=BOX),
+    row("--around", "LON,LAT,METRES", SOURCE, "Fetch those within a distance of a point.", type=NEAR),
+    row("--polygon", "FILE", SOURCE, "Fetch those inside a polygon of a file.", type=click.Path()),
+    row("--roads", "FILE", SOURCE,
+        "Take roads from a file or a folder of files. Repeatable.", type=click.Path(), multiple=True),
+    row("--source plugin", "NAME:WHERE", SOURCE,
+        "Take roads from a plugin; `roadgeo --plugins` lists them.",
+        type=Plugin("roadgeo.sources", has_argument=True), rare=True),
+    row("--layer", "NAME", SOURCE, "Layer of --roads, where there are several."),
+    row("--crs", "CRS", SOURCE, "CRS of --roads, where the file does not say, such as EPSG:26986.", type=CRS),
+    row("--kinds", ("main", "drivable", "vehicles", "all"), ROADS,
+        "Which roads: those that the masks show.", default="drivable", show_default=True),
+    row("--tunnels", "", ROADS, "Take tunnels too, which a camera does not see.", rare=True),
+    row("--attribution", "TEXT", ROADS, "Whom to name beside the map, where --roads does not say.", rare=True),
+    row("--date", "YYYY-MM-DD", SOURCE, "Fetch the roads as they were on that day.", rare=True),
+    row("--overpass-url", "URL", SOURCE, "Overpass server to fetch from.", rare=True),
+    row("--nominatim-url", "URL", SOURCE, "Nominatim server that finds --osm places.", rare=True),
+    row("--no-cache", "", SOURCE, "Fetch anew what was fetched before.", rare=True),
+    row("--coarse", "", ROADS,
+        "Draw main roads alone, as pixels of 2 to 12 m show them: a map of a whole region, for images of 5 to 50 km."),
+    row("--update", "", RESULT,
+        "Bring a reference up to date: replace its roads on the ground asked for, or add that; keep the rest."),
+    row("--rebuild", "REF", RESULT,
+        "Build the index of REF again from its GeoPackage alone, after an edit in QGIS for example."),
+    row("--name", "NAME", RESULT, "Name of the reference. Default: after the place, else after REF.gpkg or the file."),
+    row("-o --out", "REF.gpkg", RESULT, "Where it goes. Default: into the library, under its name.", type=click.Path()),
+    shard_options,
+    take("cluster", group="In pieces"),
+    take("verbosity"),
+)  # fmt: skip
+
+
 @click.command("index", cls=Command, short_help="Build a reference: the searchable roads of a place.")
-@option("--osm", "place", metavar="PLACE", help="Fetch the roads of a place from OpenStreetMap.", group=SOURCE)
-@option(
-    "--bbox", metavar="W,S,E,N", type=BOX, help="Fetch those in a box, degrees; or cut --roads to it.", group=SOURCE
-)
-@option("--around", metavar="LON,LAT,METRES", type=NEAR, help="Fetch those within a distance of a point.", group=SOURCE)
-@option("--polygon", metavar="FILE", type=click.Path(), help="Fetch those inside a polygon of a file.", group=SOURCE)
-@option(
-    "--roads",
-    metavar="FILE",
-    type=click.Path(),
-    multiple=True,
-    help="Take roads from a file or a folder of files. Repeatable.",
-    group=SOURCE,
-)
-@option(
-    "--source",
-    "plugin",
-    metavar="NAME:WHERE",
-    type=Plugin("roadgeo.sources", has_argument=True),
-    help="Take roads from a plugin; `roadgeo --plugins` lists them.",
-    group=SOURCE,
-    rare=True,
-)
-@option("--layer", metavar="NAME", help="Layer of --roads, where there are several.", group=SOURCE)
-@option(
-    "--crs",
-    metavar="CRS",
-    type=CRS,
-    help="CRS of --roads, where the file does not say, such as EPSG:26986.",
-    group=SOURCE,
-)
-@option(
-    "--kinds",
-    type=click.Choice(["main", "drivable", "vehicles", "all"]),
-    default="drivable",
-    show_default=True,
-    help="Which roads: those that the masks show.",
-    group=ROADS,
-)
-@option("--tunnels", is_flag=True, help="Take tunnels too, which a camera does not see.", group=ROADS, rare=True)
-@option(
-    "--attribution",
-    metavar="TEXT",
-    help="Whom to name beside the map, where --roads does not say.",
-    group=ROADS,
-    rare=True,
-)
-@option("--date", metavar="YYYY-MM-DD", help="Fetch the roads as they were on that day.", group=SOURCE, rare=True)
-@option("--overpass-url", metavar="URL", help="Overpass server to fetch from.", group=SOURCE, rare=True)
-@option("--nominatim-url", metavar="URL", help="Nominatim server that finds --osm places.", group=SOURCE, rare=True)
-@option("--no-cache", is_flag=True, help="Fetch anew what was fetched before.", group=SOURCE, rare=True)
-@option(
-    "--coarse",
-    is_flag=True,
-    help="Draw main roads alone, as pixels of 2 to 12 m show them: a map of a whole region, for images of 5 to 50 km.",
-    group=ROADS,
-)
-@option(
-    "--update",
-    is_flag=True,
-    help="Bring a reference up to date: replace its roads on the ground asked for, or add that; keep the rest.",
-    group=RESULT,
-)
-@option(
-    "--rebuild",
-    metavar="REF",
-    help="Build the index of REF again from its GeoPackage alone, after an edit in QGIS for example.",
-    group=RESULT,
-)
-@option(
-    "--name",
-    metavar="NAME",
-    help="Name of the reference. Default: after the place, else after REF.gpkg or the file.",
-    group=RESULT,
-)
-@option(
-    "-o",
-    "--out",
-    metavar="REF.gpkg",
-    type=click.Path(),
-    help="Where it goes. Default: into the library, under its name.",
-    group=RESULT,
-)
-@shard_options
-@take("cluster", group="In pieces")
-@take("verbosity")
+@each(_OPTIONS)
 def index_command(
     out: str | None,
     name: str | None,

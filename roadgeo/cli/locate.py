@@ -23,13 +23,14 @@ from roadgeo.cli.options import (
     SEARCH,
     Command,
     Plugin,
+    each,
     hinted,
     make_cluster,
     make_options,
-    option,
     out_dir_option,
     read_options,
     refuse_swapped,
+    row,
     take,
 )
 from roadgeo.cli.printing import echo
@@ -110,6 +111,57 @@ def _more() -> str:
     return _MORE.format(asked=_listed(asked), also=also)
 
 
+_OPTIONS = (
+    take("references", *HINTS),
+    row("--allow-mirror", "", IMAGE,
+        "Where an image has no place, turn it over: film scanned from its back. Without it, that is only told.",
+        rare=True),
+    row("--aspect", "RATIO|unknown", IMAGE,
+        "How many times a pixel is as wide as high, of scans that are stretched; unknown: from 0.5 to 2 is tried.",
+        type=ASPECT, rare=True),
+    row("--dem", "FILE", IMAGE,
+        "Terrain model (GeoTIFF, metres): how high the ground lies, and so how high the camera was above the sea.",
+        default="", type=click.Path(), rare=True),
+    out_dir_option(),
+    row("--report", "", RESULTS, "Also a page for the browser, located or not."),
+    row("--plot", "", RESULTS, "Also a picture, to look at."),
+    row("--image images", "PHOTO", RESULTS,
+        "Draw this photograph in place of its mask. One per mask, in order, or a folder of them. Repeatable.",
+        type=click.Path(), multiple=True),
+    row("--also products", "NAME", RESULTS,
+        "Also as points, geojson, kmz, worldfile and others. Repeatable; --help-all lists all forms.",
+        type=Plugin("roadgeo.outputs", names=offered), multiple=True),
+    take("json", group=RESULTS),
+    row("--skip-existing/--overwrite", "", RESULTS,
+        "Keep results younger than their images, or make them anew, the default.", default=False, rare=True),
+    row("--explain", "", RESULTS,
+        "How far the search got, the best rejected places, what was missing: a picture and JSON.", rare=True),
+    row("--truth", "LON,LAT|FILE", RESULTS,
+        "With --explain: where the middle really lies, or a truth.csv of many masks; says which stage lost it.",
+        rare=True),
+    row("--figure", tuple(FIGURES), RESULTS,
+        "Also write IMAGE_figure, the picture with axes, for papers. Needs matplotlib.", rare=True),
+    row("--gcps", "", RESULTS, f"The same as --also gcps: {GCPS.summary}.", rare=True),
+    take("crs", "resolution", "resampling", "compression"),
+    row("--max-pixels", "N", RESULTS,
+        "Draw coarser rather than more than this.",
+        type=click.IntRange(1), default=400_000_000, show_default=True, rare=True),
+    take("recursive", "segmenting", "fuse", "mask_values"),
+    row("--units", ("auto", "pixels", "metres"), IMAGE,
+        "What the coordinates are of roads that come as lines (GeoJSON, GeoPackage ...). auto: told by the CRS.",
+        default="auto", show_default=True, rare=True),
+    row("--layer", "NAME", IMAGE, "Layer of roads that come as lines.", rare=True),
+    take("jobs"),
+    row("--method", ("auto", "pair"), SEARCH,
+        "auto: the best there is, the default. pair: exactly the paper's matcher.", default="auto", rare=True),
+    take("cluster"),
+    row("--divide-map", "", SEARCH,
+        "On a Dask cluster: each worker keeps and searches a share of the map's shards, for all masks: for maps that no"
+        " machine holds.", rare=True),
+    take("verbosity"),
+)  # fmt: skip
+
+
 @click.command(
     "locate",
     cls=Command,
@@ -118,123 +170,7 @@ def _more() -> str:
     more=_more,
 )
 @click.argument("masks", metavar="IMAGE...", nargs=-1, required=True, type=click.Path())
-@take("references", *HINTS)
-@option(
-    "--allow-mirror",
-    is_flag=True,
-    help="Where an image has no place, turn it over: film scanned from its back. Without it, that is only told.",
-    group=IMAGE,
-    rare=True,
-)
-@option(
-    "--aspect",
-    metavar="RATIO|unknown",
-    type=ASPECT,
-    help="How many times a pixel is as wide as high, of scans that are stretched; unknown: from 0.5 to 2 is tried.",
-    group=IMAGE,
-    rare=True,
-)
-@option(
-    "--dem",
-    metavar="FILE",
-    default="",
-    type=click.Path(),
-    help="Terrain model (GeoTIFF, metres): how high the ground lies, and so how high the camera was above the sea.",
-    group=IMAGE,
-    rare=True,
-)
-@out_dir_option()
-@option("--report", is_flag=True, help="Also a page for the browser, located or not.", group=RESULTS)
-@option("--plot", is_flag=True, help="Also a picture, to look at.", group=RESULTS)
-@option(
-    "--image",
-    "images",
-    metavar="PHOTO",
-    type=click.Path(),
-    multiple=True,
-    help="Draw this photograph in place of its mask. One per mask, in order, or a folder of them. Repeatable.",
-    group=RESULTS,
-)
-@option(
-    "--also",
-    "products",
-    metavar="NAME",
-    type=Plugin("roadgeo.outputs", names=offered),
-    multiple=True,
-    help="Also as points, geojson, kmz, worldfile and others. Repeatable; --help-all lists all forms.",
-    group=RESULTS,
-)
-@take("json", group=RESULTS)
-@option(
-    "--skip-existing/--overwrite",
-    default=False,
-    help="Keep results younger than their images, or make them anew, the default.",
-    group=RESULTS,
-    rare=True,
-)
-@option(
-    "--explain",
-    is_flag=True,
-    help="How far the search got, the best rejected places, what was missing: a picture and JSON.",
-    group=RESULTS,
-    rare=True,
-)
-@option(
-    "--truth",
-    metavar="LON,LAT|FILE",
-    help="With --explain: where the middle really lies, or a truth.csv of many masks; says which stage lost it.",
-    group=RESULTS,
-    rare=True,
-)
-@option(
-    "--figure",
-    type=click.Choice(list(FIGURES)),
-    help="Also write IMAGE_figure, the picture with axes, for papers. Needs matplotlib.",
-    group=RESULTS,
-    rare=True,
-)
-@option("--gcps", is_flag=True, help=f"The same as --also gcps: {GCPS.summary}.", group=RESULTS, rare=True)
-@take("crs", "resolution", "resampling", "compression")
-@option(
-    "--max-pixels",
-    metavar="N",
-    type=click.IntRange(1),
-    default=400_000_000,
-    show_default=True,
-    help="Draw coarser rather than more than this.",
-    group=RESULTS,
-    rare=True,
-)
-@take("recursive", "segmenting", "fuse", "mask_values")
-@option(
-    "--units",
-    type=click.Choice(["auto", "pixels", "metres"]),
-    default="auto",
-    show_default=True,
-    help="What the coordinates are of roads that come as lines (GeoJSON, GeoPackage ...). auto: told by the CRS.",
-    group=IMAGE,
-    rare=True,
-)
-@option("--layer", metavar="NAME", help="Layer of roads that come as lines.", group=IMAGE, rare=True)
-@take("jobs")
-@option(
-    "--method",
-    type=click.Choice(["auto", "pair"]),
-    default="auto",
-    help="auto: the best there is, the default. pair: exactly the paper's matcher.",
-    group=SEARCH,
-    rare=True,
-)
-@take("cluster")
-@option(
-    "--divide-map",
-    is_flag=True,
-    help="On a Dask cluster: each worker keeps and searches a share of the map's shards, for all masks: for maps that"
-    " no machine holds.",
-    group=SEARCH,
-    rare=True,
-)
-@take("verbosity")
+@each(_OPTIONS)
 def locate_command(
     masks: tuple[str, ...],
     references: tuple[str, ...],

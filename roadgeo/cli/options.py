@@ -5,7 +5,8 @@ from __future__ import annotations
 import os
 import re
 import textwrap
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Iterable, Mapping, Sequence
+from functools import partial, reduce
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, TypeVar
 
@@ -27,26 +28,31 @@ __all__ = [
     "GSD",
     "IMAGE",
     "NEAR",
+    "OTHERS",
     "RANGE",
     "RESULTS",
     "SEARCH",
     "Command",
     "Plugin",
     "Read",
+    "each",
     "hinted",
     "make_cluster",
     "make_options",
     "n_threads",
-    "option",
     "out_dir_option",
     "read_options",
     "refuse_swapped",
+    "row",
     "take",
 ]
 
 Decorated = TypeVar("Decorated", bound=Callable[..., Any])
 
 _MAX_THREADS = 4
+
+#: Heading of options that stand under no other.
+OTHERS = "Others"
 
 
 # --- help in groups ---------------------------------------------------------------------------------------------------
@@ -59,7 +65,7 @@ class _Option(click.Option):
     """An option with the heading that it stands under; one that is rarely wanted is explained by --help-all only."""
 
     def __init__(
-        self, *names: Any, group: str = "Others", rare: bool = False, earlier: str = "", **settings: Any
+        self, *names: Any, group: str = OTHERS, rare: bool = False, earlier: str = "", **settings: Any
     ) -> None:
         super().__init__(*names, **settings)
         self.group, self.rare, self.earlier = group, rare, earlier
@@ -101,13 +107,13 @@ class Command(click.Command):
             record = parameter.get_help_record(ctx)
             if record is None or not isinstance(parameter, click.Option):
                 continue
-            group = getattr(parameter, "group", "Others")
+            group = getattr(parameter, "group", OTHERS)
             if getattr(parameter, "rare", False) and not whole:
                 left_out.setdefault(group, []).append(max(parameter.opts, key=len))
                 groups.setdefault(group, [])
             else:
                 groups.setdefault(group, []).append(record)
-        groups["Others"] = groups.pop("Others", [])  # those of all commands come last
+        groups[OTHERS] = groups.pop(OTHERS, [])  # those of all commands come last
         for group, records in groups.items():
             with formatter.section(group):
                 if records:
@@ -129,9 +135,38 @@ def _show_all(ctx: click.Context, _: click.Parameter, asked: bool) -> None:
         ctx.exit()
 
 
-def option(*names: str, **settings: Any) -> Callable[[Decorated], Decorated]:
-    """Make an option as click does, with `group` and `rare`."""
-    return click.option(*names, cls=_Option, **settings)
+def row(names: str, shown: str | tuple[str, ...] | None, group: str, told: str, **more: Any) -> Callable[..., Any]:
+    """Make an option from a row of a table. It decorates a command; keywords given with the command replace its own.
+
+    Parameters
+    ----------
+    names : str
+        As click has them, with spaces between: "-j --jobs".
+    shown : str, tuple of str or None
+        What stands for its value (None: its type), or the words among which one chooses; "" for a switch.
+    group : str
+        Under which heading of the help it stands.
+    told : str
+        Its help; what stands behind the first sentence is shown by --help-all only.
+    **more
+        As for `click.option`; `rare`.
+    """
+    kind: dict[str, Any] = {"type": click.Choice(shown)} if isinstance(shown, tuple) else {"metavar": shown}
+    settings = {**({"is_flag": True} if shown == "" else kind), "group": group, "help": told, **more}
+
+    def add(command: Decorated, **own: Any) -> Decorated:
+        return click.option(*names.split(), cls=_Option, **(settings | own))(command)
+
+    return add
+
+
+def each(decorators: Iterable[Callable[[Decorated], Decorated]]) -> Callable[[Decorated], Decorated]:
+    """Put options upon a command, in their order."""
+
+    def add(command: Decorated) -> Decorated:
+        return reduce(lambda decorated, one: one(decorated), reversed([*decorators]), command)
+
+    return add
 
 
 # --- types ------------------------------------------------------------------------------------------------------------
@@ -258,186 +293,62 @@ RESULTS = "The results"
 WHERE, IMAGE, SEARCH = HINTS["near"].group, HINTS["gsd"].group, HINTS["effort"].group
 
 
-def _hint_option(name: str, **settings: Any) -> Callable[[Decorated], Decorated]:
+def _hint_option(name: str, command: Decorated, **own: Any) -> Decorated:
+    """Add the option of a hint."""
     hint = HINTS[name]
-    names = [settings.pop("called", hint.option), *([hint.also] if hint.also else [])]
-    if hint.form == "":
-        settings = {"is_flag": True, "default": None, **settings}
-    elif hint.name == "effort":
-        settings = {"type": click.Choice(["quick", "full"]), **settings}
-    else:
-        settings = {"metavar": hint.form, "type": Read(hint.name, hint.read), **settings}
-    return option(*names, hint.goes_to, **{"help": hint.help, "group": hint.group, "earlier": hint.also, **settings})
+    shown = tuple(hint.form.split("|")) if name == "effort" else hint.form
+    names = [own.pop("called", hint.option), *([hint.also] if hint.also else []), hint.goes_to]
+    kind = {"default": None} if shown == "" else {} if name == "effort" else {"type": Read(name, hint.read)}
+    decorated: Decorated = row(" ".join(names), shown, hint.group, hint.help, earlier=hint.also, **kind)(command, **own)
+    return decorated
 
 
 _SEGMENT = "Which images are photographs, whose roads are found first: those that look so, all, or none. Default: auto."
 
-#: Names and settings of each option by its own name, which `take` takes.
-_SHARED: dict[str, tuple[tuple[str, ...], dict[str, Any]]] = {
-    "references": (
-        ("-r", "--reference", "references"),
-        {
-            "metavar": "REF",
-            "type": click.Path(),
-            "multiple": True,
-            "help": "Map to search: REF.gpkg, or a name in the library. Repeatable. Default: all of the library.",
-            "group": WHERE,
-        },
-    ),
-    "json": (("--json", "as_json"), {"is_flag": True, "help": "Print one JSON object per image and line."}),
-    "crs": (
-        ("--crs",),
-        {
-            "metavar": "CRS",
-            "type": CRS,
-            "help": "CRS of what is drawn: EPSG:3857. Default: the map's own, metric.",
-            "group": RESULTS,
-        },
-    ),
-    "resolution": (
-        ("--resolution",),
-        {
-            "metavar": "SIZE",
-            "type": click.FloatRange(min=0, min_open=True),
-            "help": "Pixel size of what is drawn, in units of its CRS. Default: the picture's own.",
-            "group": RESULTS,
-            "rare": True,
-        },
-    ),
-    "resampling": (
-        ("--resampling",),
-        {
-            "type": click.Choice(["nearest", "bilinear", "cubic", "lanczos"]),
-            "default": "cubic",
-            "show_default": True,
-            "help": "How values between pixels are found; nearest for classes.",
-            "group": RESULTS,
-            "rare": True,
-        },
-    ),
-    "compression": (
-        ("--compression",),
-        {
-            "type": click.Choice(["deflate", "zstd", "jpeg", "webp"]),
-            "default": "deflate",
-            "show_default": True,
-            "help": "Of what is drawn. jpeg and webp make photographs of 8 bits five times smaller, with some loss.",
-            "group": RESULTS,
-            "rare": True,
-        },
-    ),
-    "segment": (
-        ("--segment",),
-        {
-            "type": click.Choice(["auto", "always", "never"]),
-            "default": "auto",
-            "help": _SEGMENT,
-            "group": IMAGE,
-            "rare": True,
-        },
-    ),
-    "segmenters": (
-        ("--segmenter", "segmenters"),
-        {
-            "metavar": "NAME|MODEL.onnx",
-            "type": Plugin("roadgeo.segmenters", file_ending=".onnx"),
-            "multiple": True,
-            "help": "Who finds the roads of photographs: a plugin (`roadgeo --plugins`), or a model as QGIS"
-            " Deepness, GeoDeep or STAC describe them. Several are fused. Default: the model that ships.",
-            "group": IMAGE,
-            "rare": True,
-        },
-    ),
-    "class_name": (
-        ("--class", "class_name"),
-        {
-            "metavar": "NAME",
-            "help": "Class of the model that is road. Default: told by the names.",
-            "group": IMAGE,
-            "rare": True,
-        },
-    ),
-    "fuse": (
-        ("--fuse",),
-        {
-            "is_flag": True,
-            "help": "All images show one frame (exposures, masks of several models): fuse them.",
-            "group": IMAGE,
-            "rare": True,
-        },
-    ),
-    "threshold": (
-        ("--threshold",),
-        {
-            "metavar": "T",
-            "type": float,
-            "help": "Values above T are road; of photographs, probabilities. Default: told by the values.",
-            "group": IMAGE,
-            "rare": True,
-        },
-    ),
-    "band": (
-        ("--band",),
-        {
-            "metavar": "N",
-            "type": click.IntRange(1),
-            "help": "Band that holds the mask. Default: told by the bands.",
-            "group": IMAGE,
-            "rare": True,
-        },
-    ),
-    "bands": (
-        ("--bands",),
-        {
-            "metavar": "R,G,B",
-            "type": Read("bands", _read_bands),
-            "help": "Red, green and blue band of photographs: 3,2,1. Default: by their names, or the first three.",
-            "group": IMAGE,
-            "rare": True,
-        },
-    ),
-    "recursive": (
-        ("--recursive",),
-        {"is_flag": True, "help": "Also take the images of folders within folders.", "group": IMAGE},
-    ),
-    "jobs": (
-        ("-j", "--jobs"),
-        {
-            "metavar": "N",
-            "type": click.IntRange(1),
-            "default": 1,
-            "show_default": False,
-            "help": "Processes that locate at the same time. For one image alone, threads. Results do not depend on it."
-            " Default: 1.",
-            "group": SEARCH,
-        },
-    ),
-    "engine": (
-        ("--engine",),
-        {
-            "type": click.Choice(["local", "dask"]),
-            "help": "Where it is done: in --jobs processes here, the default, or on a Dask cluster of as many workers,"
-            " which survives their death. Needs dask and distributed.",
-            "group": SEARCH,
-            "rare": True,
-        },
-    ),
-    "scheduler": (
-        ("--scheduler",),
-        {
-            "metavar": "ADDRESS",
-            "help": "Use the Dask cluster at this address, tcp://10.0.0.1:8786. Its workers see the same files.",
-            "group": SEARCH,
-            "rare": True,
-        },
-    ),
-    "mavlink": (
-        ("--mavlink",),
-        {"metavar": "URL", "help": "Also send places to an autopilot, to such as udpout:127.0.0.1:14550."},
-    ),
-    "quiet": (("-q", "--quiet"), {"is_flag": True, "help": "Say nothing but errors, and what --json prints."}),
-    "verbose": (("-v", "--verbose"), {"is_flag": True, "help": "Say more: numbers, times, files read."}),
-}
+#: Options of several commands by the names that `take` takes; rows as of `row`.
+_SHARED = {
+    "references": row("-r --reference references", "REF", WHERE,
+        "Map to search: REF.gpkg, or a name in the library. Repeatable. Default: all of the library.",
+        type=click.Path(), multiple=True),
+    "json": row("--json as_json", "", OTHERS, "Print one JSON object per image and line."),
+    "crs": row("--crs", "CRS", RESULTS, "CRS of what is drawn: EPSG:3857. Default: the map's own, metric.", type=CRS),
+    "resolution": row("--resolution", "SIZE", RESULTS,
+        "Pixel size of what is drawn, in units of its CRS. Default: the picture's own.",
+        type=click.FloatRange(min=0, min_open=True), rare=True),
+    "resampling": row("--resampling", ("nearest", "bilinear", "cubic", "lanczos"), RESULTS,
+        "How values between pixels are found; nearest for classes.", default="cubic", show_default=True, rare=True),
+    "compression": row("--compression", ("deflate", "zstd", "jpeg", "webp"), RESULTS,
+        "Of what is drawn. jpeg and webp make photographs of 8 bits five times smaller, with some loss.",
+        default="deflate", show_default=True, rare=True),
+    "segment": row("--segment", ("auto", "always", "never"), IMAGE, _SEGMENT, default="auto", rare=True),
+    "segmenters": row("--segmenter segmenters", "NAME|MODEL.onnx", IMAGE,
+        "Who finds the roads of photographs: a plugin (`roadgeo --plugins`), or a model as QGIS Deepness, GeoDeep "
+        "or STAC describe them. Several are fused. Default: the model that ships.",
+        type=Plugin("roadgeo.segmenters", file_ending=".onnx"), multiple=True, rare=True),
+    "class_name": row("--class class_name", "NAME", IMAGE,
+        "Class of the model that is road. Default: told by the names.", rare=True),
+    "fuse": row("--fuse", "", IMAGE,
+        "All images show one frame (exposures, masks of several models): fuse them.", rare=True),
+    "threshold": row("--threshold", "T", IMAGE,
+        "Values above T are road; of photographs, probabilities. Default: told by the values.", type=float, rare=True),
+    "band": row("--band", "N", IMAGE,
+        "Band that holds the mask. Default: told by the bands.", type=click.IntRange(1), rare=True),
+    "bands": row("--bands", "R,G,B", IMAGE,
+        "Red, green and blue band of photographs: 3,2,1. Default: by their names, or the first three.",
+        type=Read("bands", _read_bands), rare=True),
+    "recursive": row("--recursive", "", IMAGE, "Also take the images of folders within folders."),
+    "jobs": row("-j --jobs", "N", SEARCH,
+        "Processes that locate at the same time. For one image alone, threads. Results do not depend on it. "
+        "Default: 1.", type=click.IntRange(1), default=1, show_default=False),
+    "engine": row("--engine", ("local", "dask"), SEARCH,
+        "Where it is done: in --jobs processes here, the default, or on a Dask cluster of as many workers, which "
+        "survives their death. Needs dask and distributed.", rare=True),
+    "scheduler": row("--scheduler", "ADDRESS", SEARCH,
+        "Use the Dask cluster at this address, tcp://10.0.0.1:8786. Its workers see the same files.", rare=True),
+    "mavlink": row("--mavlink", "URL", OTHERS, "Also send places to an autopilot, to such as udpout:127.0.0.1:14550."),
+    "quiet": row("-q --quiet", "", OTHERS, "Say nothing but errors, and what --json prints."),
+    "verbose": row("-v --verbose", "", OTHERS, "Say more: numbers, times, files read."),
+}  # fmt: skip
 
 #: Several that go together.
 _TOGETHER = {
@@ -451,16 +362,13 @@ _TOGETHER = {
 def take(*names: str, **settings: Any) -> Callable[[Decorated], Decorated]:
     """Add options of the tables by their names; `settings` replace the tables' settings of a single one."""
 
-    def add(command: Decorated) -> Decorated:
+    def add_all(command: Decorated) -> Decorated:
         for name in reversed([one for given in names for one in _TOGETHER.get(given, (given,))]):
-            if name in HINTS:
-                command = _hint_option(name, **settings)(command)
-            else:
-                called, usual = _SHARED[name]
-                command = option(*called, **(usual | settings))(command)
+            add = partial(_hint_option, name) if name in HINTS else _SHARED[name]
+            command = add(command, **settings)
         return command
 
-    return add
+    return add_all
 
 
 def out_dir_option(
@@ -471,8 +379,10 @@ def out_dir_option(
 ) -> Callable[[Decorated], Decorated]:
     """Make the option of the output folder."""
     kind = click.Path(file_okay=False, path_type=path_type)
-    more.setdefault("group", RESULTS)
-    return option("-o", "--out-dir", metavar="DIR", default=default, type=kind, help=help_text, **more)
+    add: Callable[[Decorated], Decorated] = row(
+        "-o --out-dir", "DIR", RESULTS, help_text, **{"type": kind, "default": default, **more}
+    )
+    return add
 
 
 # --- what the options come to -----------------------------------------------------------------------------------------

@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING, Any, TypeVar
 
 import click
 
-from roadgeo.cli.options import GSD, RANGE, Read, option
+from roadgeo.cli.options import GSD, OTHERS, RANGE, Read, row
 from roadgeo.matching.hints import read_numbers
 
 if TYPE_CHECKING:
@@ -29,99 +29,32 @@ def _read_angles(text: str) -> tuple[float, float]:
 #: Degrees, least and greatest.
 ANGLES = Read("angles", _read_angles)
 
-_OPTIONS = [
-    option(
-        "-n",
-        "--count",
-        metavar="N",
-        type=click.IntRange(1),
-        help="Masks per noise model.  [default: 40]",
-    ),
-    option(
-        "--noise",
-        type=click.Choice(["clean", "segmented", "poor"]),
-        multiple=True,
-        default=["clean", "segmented", "poor"],
-        show_default=True,
-        help="What goes wrong in the masks; repeat it for several.",
-    ),
-    option(
-        "--roads",
-        metavar="FILE",
-        type=click.Path(exists=True, path_type=Path),
-        help="Draw the roads of this file, another map of the place, in place of the reference's own.",
-    ),
-    option(
-        "--gsd",
-        metavar="SIZE|LO:HI",
-        type=GSD,
-        default="0.7:1.4",
-        show_default=True,
-        help="Metres per pixel at the centre.",
-    ),
-    option(
-        "--tilt",
-        metavar="LO:HI",
-        type=ANGLES,
-        default="0:30",
-        show_default=True,
-        help="Of the optical axis from the vertical, degrees.",
-    ),
-    option(
-        "--heading",
-        metavar="LO:HI",
-        type=ANGLES,
-        default="0:360",
-        show_default=True,
-        help="Where the image's up points, degrees from north.",
-    ),
-    option(
-        "--size",
-        metavar="PX",
-        type=click.IntRange(64, 20_000),
-        default=1500,
-        show_default=True,
-        help="Side of a mask, pixels.",
-    ),
-    option(
-        "--window",
-        type=click.FloatRange(10),
-        metavar="METRES",
-        help="Side on the ground, in place of --size.",
-    ),
-    option("--focal", type=click.FloatRange(1), metavar="PX", help="Focal length in pixels.  [default: the side]"),
-    option(
-        "--intersections",
-        metavar="LO:HI",
-        type=RANGE,
-        default="30:1000000",
-        show_default=True,
-        help="How many a mask must show.",
-    ),
-    option(
-        "--road-width",
-        metavar="LO:HI",
-        type=RANGE,
-        default="8:11",
-        show_default=True,
-        help="Of a street, metres.",
-    ),
-    option(
-        "--mirrored",
-        metavar="N",
-        type=click.IntRange(0),
-        default=0,
-        help="Draw so many masks turned over besides, which have no place and must be refused.",
-    ),
-    option(
-        "--seed",
-        metavar="N",
-        type=click.IntRange(0),
-        default=0,
-        show_default=True,
-        help="Other seeds draw other masks.",
-    ),
-]
+_OPTIONS = (
+    row("-n --count", "N", OTHERS, "Masks per noise model.  [default: 40]", type=click.IntRange(1)),
+    row("--noise", ("clean", "segmented", "poor"), OTHERS,
+        "What goes wrong in the masks; repeat it for several.",
+        multiple=True, default=["clean", "segmented", "poor"], show_default=True),
+    row("--roads", "FILE", OTHERS,
+        "Draw the roads of this file, another map of the place, in place of the reference's own.",
+        type=click.Path(exists=True, path_type=Path)),
+    row("--gsd", "SIZE|LO:HI", OTHERS,
+        "Metres per pixel at the centre.", type=GSD, default="0.7:1.4", show_default=True),
+    row("--tilt", "LO:HI", OTHERS,
+        "Of the optical axis from the vertical, degrees.", type=ANGLES, default="0:30", show_default=True),
+    row("--heading", "LO:HI", OTHERS,
+        "Where the image's up points, degrees from north.", type=ANGLES, default="0:360", show_default=True),
+    row("--size", "PX", OTHERS,
+        "Side of a mask, pixels.", type=click.IntRange(64, 20_000), default=1500, show_default=True),
+    row("--window", "METRES", OTHERS, "Side on the ground, in place of --size.", type=click.FloatRange(10)),
+    row("--focal", "PX", OTHERS, "Focal length in pixels.  [default: the side]", type=click.FloatRange(1)),
+    row("--intersections", "LO:HI", OTHERS,
+        "How many a mask must show.", type=RANGE, default="30:1000000", show_default=True),
+    row("--road-width", "LO:HI", OTHERS, "Of a street, metres.", type=RANGE, default="8:11", show_default=True),
+    row("--mirrored", "N", OTHERS,
+        "Draw so many masks turned over besides, which have no place and must be refused.",
+        type=click.IntRange(0), default=0),
+    row("--seed", "N", OTHERS, "Other seeds draw other masks.", type=click.IntRange(0), default=0, show_default=True),
+)  # fmt: skip
 
 
 #: Names of the parameters of `query_sets`, and of `--roads`.

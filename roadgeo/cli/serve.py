@@ -16,7 +16,7 @@ from typing import TYPE_CHECKING, Any
 
 import click
 
-from roadgeo.cli.options import Command, option, take
+from roadgeo.cli.options import OTHERS, Command, each, row, take
 from roadgeo.cli.printing import echo
 from roadgeo.matching.hints import HINTS
 
@@ -89,26 +89,27 @@ def _read_basemap(_: click.Context, __: click.Parameter, url: str | None) -> str
     return url
 
 
+_OPTIONS = (
+    take("references"),
+    row("--host", "ADDRESS", OTHERS, "Listen there, and ask for a token. Default: 127.0.0.1, without one."),
+    row("--port", None, OTHERS, "0: any that is free.", type=click.IntRange(0, 65535), default=8017, show_default=True),
+    row("--token-file", "FILE", OTHERS, "The token is the first line of this file.", type=click.Path()),
+    take("jobs", help="Processes that locate. Default: 1."),
+    row("--waiting", "N", OTHERS, "Requests that may wait.", type=click.IntRange(0), default=8, show_default=True),
+    row("--max-bytes", "N", OTHERS, "Of a body.", type=click.IntRange(1), default=64_000_000, show_default=True),
+    row("--max-pixels", "N", OTHERS, "Of an image.", type=click.IntRange(1), default=64_000_000, show_default=True),
+    take("time_limit", default=10.0, help="Stop each search then. Default: 10; requests may ask for less."),
+    take("mavlink"),
+    row("--basemap", "URL", OTHERS,
+        "Tiles that the page shows below the roads: https://.../{z}/{x}/{y}.png.", callback=_read_basemap),
+    row("--basemap-attribution", "TEXT", OTHERS, "Whom their owner asks to name.", default=""),
+    row("--no-browser", "", OTHERS, "Do not open the page in a browser."),
+    take("verbosity"),
+)  # fmt: skip
+
+
 @click.command("serve", cls=Command, short_help="A page to drop photographs on; answers over HTTP.", help=_help())
-@take("references")
-@option("--host", metavar="ADDRESS", help="Listen there, and ask for a token. Default: 127.0.0.1, without one.")
-@option("--port", type=click.IntRange(0, 65535), default=8017, show_default=True, help="0: any that is free.")
-@option("--token-file", metavar="FILE", type=click.Path(), help="The token is the first line of this file.")
-@take("jobs", help="Processes that locate. Default: 1.")
-@option("--waiting", metavar="N", type=click.IntRange(0), default=8, show_default=True, help="Requests that may wait.")
-@option("--max-bytes", metavar="N", type=click.IntRange(1), default=64_000_000, show_default=True, help="Of a body.")
-@option("--max-pixels", metavar="N", type=click.IntRange(1), default=64_000_000, show_default=True, help="Of an image.")
-@take("time_limit", default=10.0, help="Stop each search then. Default: 10; requests may ask for less.")
-@take("mavlink")
-@option(
-    "--basemap",
-    metavar="URL",
-    callback=_read_basemap,
-    help="Tiles that the page shows below the roads: https://.../{z}/{x}/{y}.png.",
-)
-@option("--basemap-attribution", metavar="TEXT", default="", help="Whom their owner asks to name.")
-@option("--no-browser", is_flag=True, help="Do not open the page in a browser.")
-@take("verbosity")
+@each(_OPTIONS)
 def serve_command(
     references: tuple[str, ...],
     mavlink: str | None,

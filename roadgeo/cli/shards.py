@@ -10,7 +10,7 @@ from typing import TYPE_CHECKING, Any, TypeVar
 
 import click
 
-from roadgeo.cli.options import option
+from roadgeo.cli.options import row
 from roadgeo.cli.printing import echo
 
 if TYPE_CHECKING:
@@ -46,35 +46,16 @@ class _Shards(click.ParamType):  # type: ignore[type-arg]  # generic only in lat
         return self.fail(f"got {value!r}, expected auto, a number, or a side such as 25km (1 to 1000)", param, ctx)
 
 
-_OPTIONS = [
-    option(
-        "--shards",
-        metavar="auto|N|SIZEkm",
-        type=_Shards(),
-        help="Build REF.shards, in pieces. As many as is good, about N, or squares of a side: for maps of any size.",
-        group="In pieces",
-    ),
-    option(
-        "--margin",
-        metavar="METRES",
-        type=click.FloatRange(0, 100_000),
-        default=3000.0,
-        show_default=True,
-        help="Ground that neighbours share. Half the diagonal of the largest frame to locate.",
-        group="In pieces",
-        rare=True,
-    ),
-    option(
-        "-j",
-        "--jobs",
-        metavar="N",
-        type=click.IntRange(1),
-        default=1,
-        show_default=True,
-        help="Processes, each of which builds a piece at a time.",
-        group="In pieces",
-    ),
-]
+_OPTIONS = (
+    row("--shards", "auto|N|SIZEkm", "In pieces",
+        "Build REF.shards, in pieces. As many as is good, about N, or squares of a side: for maps of any size.",
+        type=_Shards()),
+    row("--margin", "METRES", "In pieces",
+        "Ground that neighbours share. Half the diagonal of the largest frame to locate.",
+        type=click.FloatRange(0, 100_000), default=3000.0, show_default=True, rare=True),
+    row("-j --jobs", "N", "In pieces",
+        "Processes, each of which builds a piece at a time.", type=click.IntRange(1), default=1, show_default=True),
+)  # fmt: skip
 
 
 def shard_options(command: Command) -> Command:

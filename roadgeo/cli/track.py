@@ -20,11 +20,12 @@ from roadgeo.cli.options import (
     RESULTS,
     Command,
     Read,
+    each,
     hinted,
     make_options,
-    option,
     out_dir_option,
     refuse_swapped,
+    row,
     take,
 )
 from roadgeo.cli.printing import echo
@@ -95,45 +96,33 @@ def _read_time(text: str) -> datetime:
 TIME = Read("time", _read_time)
 
 
+_OPTIONS = (
+    take("references", "near", "within", "gsd", "max_tilt"),
+    take("focal", metavar="PIXELS", help="Focal length in pixels: places are then the camera's."),
+    out_dir_option(),
+    row("--name", None, RESULTS, "What the results are called. Default: flight.", default="flight"),
+    take("json", group=RESULTS, help="Print one JSON object per frame and line, as it is known."),
+    take("mavlink", group=RESULTS),
+    row("--motion", "FILE", FLIGHT, "How each frame moved: see above.", type=click.Path()),
+    row("--motion-sigma", "PX", FLIGHT,
+        "How far off the motion may put a corner. Default: 1.5, of masks 12.",
+        type=click.FloatRange(min=0, min_open=True), rare=True),
+    row("--unordered", "", FLIGHT, "The frames are in no order; all are solved together."),
+    row("--every", "SECONDS", FLIGHT,
+        "Take a frame of a video every so often. Default: 1.", type=click.FloatRange(min=0), default=1.0),
+    row("--interval", "SECONDS", FLIGHT, "Time between images. Default: 1.", type=click.FloatRange(min=0), default=1.0),
+    row("--start", "TIME", FLIGHT, "When the first frame was taken.", type=TIME),
+    take("segment", "class_name", "mask_values"),
+    take("segmenters", multiple=False, default="", metavar="MODEL.onnx", type=click.Path(),
+        help="Who finds the roads."),
+    take("time_limit", default=10.0, help="Stop each search then. Default: 10."),
+    take("recursive", "verbosity"),
+)  # fmt: skip
+
+
 @click.command("track", cls=Command, short_help="Follow a flight over the map, frame by frame.", help=_HELP)
 @click.argument("frames", metavar="FRAMES...", nargs=-1, required=True, type=click.Path())
-@take("references", "near", "within", "gsd", "max_tilt")
-@take("focal", metavar="PIXELS", help="Focal length in pixels: places are then the camera's.")
-@out_dir_option()
-@option("--name", default="flight", help="What the results are called. Default: flight.", group=RESULTS)
-@take("json", group=RESULTS, help="Print one JSON object per frame and line, as it is known.")
-@take("mavlink", group=RESULTS)
-@option("--motion", metavar="FILE", type=click.Path(), help="How each frame moved: see above.", group=FLIGHT)
-@option(
-    "--motion-sigma",
-    metavar="PX",
-    type=click.FloatRange(min=0, min_open=True),
-    help="How far off the motion may put a corner. Default: 1.5, of masks 12.",
-    group=FLIGHT,
-    rare=True,
-)
-@option("--unordered", is_flag=True, help="The frames are in no order; all are solved together.", group=FLIGHT)
-@option(
-    "--every",
-    metavar="SECONDS",
-    type=click.FloatRange(min=0),
-    default=1.0,
-    help="Take a frame of a video every so often. Default: 1.",
-    group=FLIGHT,
-)
-@option(
-    "--interval",
-    metavar="SECONDS",
-    type=click.FloatRange(min=0),
-    default=1.0,
-    help="Time between images. Default: 1.",
-    group=FLIGHT,
-)
-@option("--start", metavar="TIME", type=TIME, help="When the first frame was taken.", group=FLIGHT)
-@take("segment", "class_name", "mask_values")
-@take("segmenters", multiple=False, default="", metavar="MODEL.onnx", type=click.Path(), help="Who finds the roads.")
-@take("time_limit", default=10.0, help="Stop each search then. Default: 10.")
-@take("recursive", "verbosity")
+@each(_OPTIONS)
 def track_command(
     frames: tuple[str, ...],
     references: tuple[str, ...],

@@ -14,7 +14,7 @@ import click
 from roadgeo.cli import ERROR, NOT_LOCATED
 from roadgeo.cli.command_line import made_by
 from roadgeo.cli.folders import make_folder
-from roadgeo.cli.options import IMAGE, RESULTS, Command, option, out_dir_option, read_options, take
+from roadgeo.cli.options import IMAGE, OTHERS, RESULTS, Command, each, out_dir_option, read_options, row, take
 from roadgeo.cli.printing import echo
 
 if TYPE_CHECKING:
@@ -29,54 +29,35 @@ OFF = 4
 _COLORS = {"agrees": "green", "off": "red", "unknown": "yellow"}
 
 
+_OPTIONS = (
+    take(
+        "references",
+        help="Map to hold them against: REF.gpkg, or a name in the library. Repeatable. Default: all of the library.",
+    ),
+    out_dir_option("Where files go; made if missing. Default: here."),
+    take("json", group=RESULTS),
+    row("--report", "", RESULTS, "Of each image, a page for the browser: IMAGE_verify.html."),
+    row("--fix", "", RESULTS,
+        "Of each image that is off, write IMAGE_fixed.tif: the same pixels with the corrected georeference; and "
+        "IMAGE_fixed.points, for the QGIS Georeferencer."),
+    row("--in-place", "", RESULTS, "Correct the georeference of GeoTIFFs that are off themselves."),
+    row("--josm", "", OTHERS, "Write roadgeo_offsets.xml: imagery offset bookmarks, as JOSM's preferences hold them."),
+    row("--tolerance", "METRES", OTHERS,
+        "An image agrees if, on average over the frame, it is off by less.",
+        type=click.FloatRange(0.1, 100), default=3.0, show_default=True),
+    row("--reach", "METRES", OTHERS,
+        "How far off it may be: nothing beyond is looked at.",
+        type=click.FloatRange(20, 2000), default=350.0, show_default=True, rare=True),
+    row("--max-turn", "DEG", OTHERS,
+        "By how much it may be turned.", type=click.FloatRange(0, 45), default=6.0, show_default=True, rare=True),
+    take("crs", help="CRS of images that name none, such as EPSG:25832.", group=IMAGE),
+    take("recursive", "segmenting", "fuse", "mask_values", "jobs", "verbosity"),
+)  # fmt: skip
+
+
 @click.command("verify", cls=Command, short_help="Check whether georeferenced images are where they claim to be.")
 @click.argument("images", metavar="IMAGE...", nargs=-1, required=True, type=click.Path())
-@take(
-    "references",
-    help="Map to hold them against: REF.gpkg, or a name in the library. Repeatable. Default: all of the library.",
-)
-@out_dir_option("Where files go; made if missing. Default: here.")
-@take("json", group=RESULTS)
-@option("--report", is_flag=True, help="Of each image, a page for the browser: IMAGE_verify.html.", group=RESULTS)
-@option(
-    "--fix",
-    is_flag=True,
-    help="Of each image that is off, write IMAGE_fixed.tif: the same pixels with the corrected georeference; and"
-    " IMAGE_fixed.points, for the QGIS Georeferencer.",
-    group=RESULTS,
-)
-@option("--in-place", is_flag=True, help="Correct the georeference of GeoTIFFs that are off themselves.", group=RESULTS)
-@option(
-    "--josm", is_flag=True, help="Write roadgeo_offsets.xml: imagery offset bookmarks, as JOSM's preferences hold them."
-)
-@option(
-    "--tolerance",
-    metavar="METRES",
-    type=click.FloatRange(0.1, 100),
-    default=3.0,
-    show_default=True,
-    help="An image agrees if, on average over the frame, it is off by less.",
-)
-@option(
-    "--reach",
-    metavar="METRES",
-    type=click.FloatRange(20, 2000),
-    default=350.0,
-    show_default=True,
-    rare=True,
-    help="How far off it may be: nothing beyond is looked at.",
-)
-@option(
-    "--max-turn",
-    metavar="DEG",
-    type=click.FloatRange(0, 45),
-    default=6.0,
-    show_default=True,
-    rare=True,
-    help="By how much it may be turned.",
-)
-@take("crs", help="CRS of images that name none, such as EPSG:25832.", group=IMAGE)
-@take("recursive", "segmenting", "fuse", "mask_values", "jobs", "verbosity")
+@each(_OPTIONS)
 def verify_command(
     images: tuple[str, ...],
     out_dir: str,
