@@ -63,11 +63,12 @@ def prose_of_markdown(text: str) -> Iterator[str]:
 
 
 def long_sentences(text: str) -> Iterator[tuple[int, int, str]]:
-    """Yield (line, words, sentence) of the sentences of Markdown that are too long."""
+    """Yield (line, words, sentence) of the sentences of Markdown that are too long; inline code is one word."""
     for line, paragraph in paragraphs(text):
-        plain = re.sub(r"!?\[([^\]]*)\]\([^)]*\)", r"\1", paragraph)  # the text of a link counts, its target does not
-        plain = re.sub(r"`[^`]*`", "code", plain)
-        for sentence in re.split(r"(?<=[.!?:;])\s+(?=[\"'(*]*[A-Z0-9a-z`])|\s[-*]\s", plain):
+        plain = re.sub(r"!\[[^\]]*\]\([^)]*\)", "", paragraph)  # the description of a picture
+        plain = re.sub(r"\[([^\]]*)\]\([^)]*\)", r"\1", plain)  # the text of a link counts, its target does not
+        plain = re.sub(r"`[^`]*`", "Code", plain)
+        for sentence in re.split(r"(?<=[.!?:])[)*\"”]*\s+(?=[\"'(*]*[A-Z0-9])", plain):
             words = re.findall(r"[A-Za-z][\w'’-]*", sentence)
             if len(words) > LONGEST:
                 yield line, len(words), sentence
