@@ -1,4 +1,4 @@
-"""One likelihood: how well a place explains what the query shows, and what the map shows there.
+"""One likelihood: how well a place explains the roads of the query, and those of the map in the frame.
 
 Each piece of the query's roads either lies on a road of the map, off it by a residual, or is false; each piece of the
 map's roads in the frame either is seen, off by a residual, or is missing. Under a place H
@@ -7,10 +7,10 @@ map's roads in the frame either is seen, off by a residual, or is missing. Under
              + sum over the map's roads    log[ (1 - m) g(r; sigma) / b + m ]
 
 with r the residual, g half a normal density, b the density of residuals where roads lie anyhow, f the share of false
-roads and m that of missing ones. How false, how patchy and how inexact a query is nobody knows: sigma, m and f are
+roads and m that of missing ones. The quality of a query is unknown: sigma, m and f are
 marginalised over a small grid. Neighbouring pieces agree together, so that `statement_m` metres of road count once.
 
-By itself log L says little where streets repeat. What a place is worth is its lead over the best other one (see
+By itself log L is of little use where streets repeat. A place is scored by its lead over the best other one (see
 `rivals`), and that is measured piece by piece: were two places alike, each piece of the frame would speak for either
 with the same probability.
 """
@@ -33,41 +33,41 @@ from roadgeo.matching.scene import Scene
 
 __all__ = ["Evidence", "EvidenceOptions"]
 
-#: Grid of what is marginalised: residuals' deviation, in units of what is usual; shares of missing, and of false roads.
+#: Grid of the marginalised parameters: residuals' deviation, in usual ones; shares of missing, and of false roads.
 _SIGMAS = np.array([0.25, 0.4, 0.65, 1.0, 1.6])
 _SHARES = np.array([0.03, 0.1, 0.25, 0.5, 0.75])
-#: Residuals are looked at up to so many usual deviations, in so many bins.
+#: Range of residuals, in usual deviations, and number of bins.
 _REACH, _BINS = 4.0, 24
-#: Of roads that lie anywhere so many run along a road piece, as streets go; the directions of the map's roads are not
-#: compared with those of the query. Shares of pieces that have a road so near anyhow are rounded to a ladder.
+#: This share of roads that lie anywhere runs along a road piece, as streets go; directions of the map's roads are not
+#: compared with those of the query. Shares of pieces with such a road nearby are rounded to a ladder.
 _ALONG, _STEP, _STEPS = 0.42, 0.8, 14
-#: The distance to the query's roads is known to so many cells of its raster.
+#: Accuracy of the distance to the query's roads, in cells of its raster.
 _BLUR_CELLS = 0.35
 
 
 @dataclass(frozen=True)
 class EvidenceOptions:
-    """What residuals are usual, and how much road is one statement.
+    """Usual residuals, and the length of road that is one statement.
 
     Attributes
     ----------
     map_sigma_m, pixel_sigma_px : float
         Usual distance between a mapped road and the road, and usual error of a traced one.
     statement_m : float
-        So much road, of the query and of the map together, counts as one independent statement; never less than
-        `statement_px`, for what a pixel cannot show is no statement.
+        This length of road, of the query and of the map together, counts as one independent statement; never less than
+        `statement_px`, the least length that pixels can show.
     piece_m, piece_px : float
         Width of the frame's pieces, by which two places are compared; the greater one.
     n_regions, region_m, far : int, float, float
         Regions of the longer side of the frame, at most, in which a place may be contradicted, their least width, and
         how many times coarser pixels are than in its middle where it is too far away for that.
     step_m : float
-        The map's roads are sampled once in so many metres.
+        Step of the samples along the map's roads.
     max_turn_deg : float
         Roads agree whose directions differ by less.
     shift_m, n_shifts, n_anchors, n_points : (float, float), int, int, int
         Places nearby: shifts of these lengths, spread evenly, and those that lay one of `n_anchors` intersections of
-        the map near the middle on others around it; they are compared by so many road points first.
+        the map near the middle on others around it; they are compared by `n_points` road points first.
     """
 
     map_sigma_m: float = 1.8
@@ -140,8 +140,8 @@ class Evidence:
     def contradicted(self, matrix: FloatArray) -> float:
         """Return which share of the roads lies in regions of the frame where the place explains less than chance.
 
-        There the query and the map both show roads, and others: what looks like the place in part, as a city laid out
-        like its own mirror image does, is not it. Where only one of them shows roads nothing is contradicted. Far
+        There the query and the map both show roads, but different ones: a place that fits in part, as in a city built
+        like its own mirror image, is not it. Where only one of them shows roads nothing is contradicted. Far
         ground of a steep view, which cannot be traced, does not count.
         """
         scene, options = self.scene, self.options
@@ -241,7 +241,7 @@ class Evidence:
         return np.asarray(shifts[np.argsort(length)[: options.n_shifts]])
 
 
-#: So many of the shifts that lay most road points on roads are weighed.
+#: Number of shifts that are weighed, those that lay most road points on roads.
 _WEIGHED = 12
 
 
@@ -258,7 +258,7 @@ def _shifted(matrix: FloatArray, shift: FloatArray) -> FloatArray:
 
 
 def _anyhow(expected: float) -> int:
-    """Return the share of pieces that have one of so many expected roads near, as a step of the ladder."""
+    """Return the share of pieces that have one of the expected number of roads near, as a step of the ladder."""
     share = 1.0 - math.exp(-expected)
     return min(max(round(math.log(max(share, 1e-9)) / math.log(_STEP)), 0), _STEPS)
 

@@ -1,4 +1,4 @@
-"""What a user may know of an image: one table, by which the command line, HTTP, QGIS and Python read it alike.
+"""Hints on an image: one table, by which the command line, HTTP, QGIS and Python read them alike.
 
 A value is a number, several numbers, or a text such as "0.3", "0.3:0.6", "90+-10" or "-71.06,42.36,5000".
 """
@@ -20,9 +20,9 @@ __all__ = ["HINTS", "Hint", "apply_hints", "read_box", "read_hint", "read_number
 
 #: One pixel size stands for a range from it divided by this to it times this: sizes are seldom known better.
 _GSD_FACTOR = 1.25
-#: By how much a heading may be off where that is not said, degrees.
+#: Tolerance of a heading without one, degrees.
 _HEADING_OFF_DEG = 10.0
-#: What a URL or a form says of a switch.
+#: Values of a switch in a URL or a form.
 _YES, _NO = ("", "1", "true", "yes"), ("0", "false", "no")
 
 
@@ -39,7 +39,7 @@ class Hint:
     form : str
         How a value is written; "" for a switch.
     help : str
-        What it is, with its unit and its default.
+        Its meaning, with its unit and its default.
     read : callable
         Takes a value in any form; returns what the search takes. Raises ValueError: "got ..., expected ...".
     schema : mapping
@@ -151,7 +151,7 @@ def read_place(value: Any) -> tuple[float, float, float]:
     Raises
     ------
     ValueError
-        They are none; where longitude and latitude were exchanged it says so.
+        They are none; where longitude and latitude were exchanged the message mentions it.
     """
     form = "LON,LAT,RADIUS in degrees and metres"
     lon, lat, radius = read_numbers(value, form, (3,), ",")
@@ -171,7 +171,7 @@ def read_box(value: Any) -> Box:
     Raises
     ------
     ValueError
-        They are none; where longitude and latitude were exchanged it says so.
+        They are none; where longitude and latitude were exchanged the message mentions it.
     """
     form = "W,S,E,N in degrees"
     west, south, east, north = read_numbers(value, form, (4,), ",")
@@ -290,7 +290,7 @@ _TABLE = (
     ),
 )  # fmt: skip
 
-#: What may be known, by its name.
+#: Hints by their names.
 HINTS: dict[str, Hint] = {hint.name: hint for hint in _TABLE}
 
 

@@ -22,7 +22,7 @@ from roadgeo.matching.query import Query
 __all__ = ["Needed", "decide", "needed_of"]
 
 
-#: What is said where the clock ended a search: the one case in which an answer depends on the machine and its load.
+#: Reason where the clock ended a search: the one case in which an answer depends on the machine and its load.
 _CUT_SHORT = "so that another run may tell otherwise"
 
 #: Mean share of intersections and roads that agree as at the true place of a good mask.
@@ -35,7 +35,7 @@ _MOST_UNSURE = 0.03
 
 @dataclass(frozen=True)
 class Needed:
-    """What an answer must reach; see `LocateOptions`."""
+    """Thresholds of an answer; see `LocateOptions`."""
 
     log10_odds: float
     margin: float
@@ -43,7 +43,7 @@ class Needed:
 
 
 def needed_of(options: LocateOptions) -> Needed:
-    """Return what an answer must reach."""
+    """Return the thresholds of an answer."""
     return Needed(options.min_log10_odds, options.min_margin, options.min_intersections)
 
 
@@ -69,7 +69,7 @@ def decide(query: Query, found: Sequence[Found], options: LocateOptions) -> Loca
 
 
 def _judge(query: Query, found: Sequence[Found], options: LocateOptions) -> Location:
-    """Compare the places with each other and with what is asked for; describe the best, or say why there is none."""
+    """Compare the places with each other and with the thresholds; describe the best, or why there is none."""
     location = _describe_work(query, found)
     if options.method == "pair":
         return _decide_pairs(location, query, found, options)
@@ -104,7 +104,7 @@ def _judge(query: Query, found: Sequence[Found], options: LocateOptions) -> Loca
 
 
 def _describe_work(query: Query, found: Sequence[Found]) -> Location:
-    """Return what holds whatever the answer is."""
+    """Return the fields that do not depend on the answer."""
     stats = [one.stats for one in found]
     work = Stats(
         sum(one.tuples_sampled for one in stats),
@@ -129,7 +129,7 @@ def _describe_work(query: Query, found: Sequence[Found]) -> Location:
 
 
 def _ended_by(found: Sequence[Found]) -> str:
-    """Say what ended a search of one or more parts: an answer, a limit, or that nothing was left to try."""
+    """Return why a search of one or more parts ended: an answer, a limit, or that nothing was left to try."""
     ends = {one.stopped for one in found}
     return next((end for end in ("accepted", "time", "work", "exhausted") if end in ends), "")
 
@@ -193,7 +193,7 @@ def _are_alike(best: _Candidate, rival: _Candidate) -> bool:
 
 
 def _only_half(placed: Location) -> str:
-    """Say what is known of a place whose middle is uncertain by much of the frame; "" for a whole place."""
+    """Describe a place whose middle is uncertain by much of the frame; "" for a whole place."""
     error = placed.center_error
     if error is None or placed.gsd_m is None or placed.size is None:
         return ""
@@ -232,7 +232,7 @@ def _decide_pairs(location: Location, query: Query, found: Sequence[Found], opti
 def _refuse(
     location: Location, query: Query, found: Sequence[Found], best: _Candidate | None, options: LocateOptions
 ) -> Location:
-    """Say why nothing is reported: of several references, for the one that came nearest."""
+    """Return why nothing is reported: of several references, for the one that came nearest."""
     nearest = best.found if best is not None else max(found, key=lambda one: one.n_tried)
     score = best.score if best is not None else -math.inf
     code, reason = _why_nothing(query, nearest, score, options)
@@ -253,7 +253,7 @@ def _refuse(
 
 
 def _why_nothing(query: Query, found: Found, score: float, options: LocateOptions) -> tuple[Reason, str]:
-    """Say why nothing is reported, to programs and to people, and what may help."""
+    """Return why nothing is reported, for programs and for people, and the remedy."""
     n, needed = len(query.scene.intersections), options.min_intersections
     if n < needed:
         seen = f"only {counted(n, 'intersection')} {'is' if n == 1 else 'are'}" if n else "no intersections are"
@@ -287,19 +287,19 @@ def _why_nothing(query: Query, found: Found, score: float, options: LocateOption
 
 
 def _lead(log10_odds: float) -> str:
-    """Say how much likelier a place is than the best other one."""
+    """Return how much likelier a place is than the best other one."""
     return "no likelier than" if log10_odds < 0.2 else f"only {_times(log10_odds)} as likely as"
 
 
 def _times(log10_odds: float) -> str:
-    """Say a factor with two digits, one where it is large: "2.5 times", "3,000 times"."""
+    """Write a factor with two digits, one where it is large: "2.5 times", "3,000 times"."""
     factor = 10.0**log10_odds
     digits = 1 if factor < 10 else -math.floor(log10_odds)
     return f"{round(factor, digits):,.{max(digits, 0)}f} times"
 
 
 def _how_far(query: Query, found: Found, options: LocateOptions) -> str:
-    """Say how far a search got that was cut short, and what would shorten it."""
+    """Describe how far a search got that was cut short, and the hints that would shorten it."""
     far = f"{found.n_anchors} of {len(query.scene.intersections)} intersections had been looked for"
     (low, high), usual = options.match.camera.gsd_m, CameraOptions().gsd_m
     if (low, high) == usual:

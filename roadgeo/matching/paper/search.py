@@ -51,7 +51,7 @@ _SAMPLE_S, _TESTED_S, _COUNTED_S = 0.35e-3, 0.1e-6, 0.04e-6
 
 @dataclass(frozen=True)
 class PairMatch:
-    """What the search found. Dimensions: M matched intersections.
+    """The result of the search. Dimensions: M matched intersections.
 
     Attributes
     ----------
@@ -72,9 +72,9 @@ class PairMatch:
     confidence : float
         Probability that the search, as far as it got, finds a place that is there: 1 - P_fail-sum (eq. 12).
     stopped : str
-        What ended the search: "accepted", "exhausted", or a limit, "work" or "time"; "" where there was none.
+        Why the search ended: "accepted", "exhausted", or a limit, "work" or "time"; "" where there was none.
     work_s : float
-        What was done, in seconds of a usual machine.
+        The work done, in seconds of a usual machine.
     """
 
     homography: FloatArray | None
@@ -155,7 +155,7 @@ class _Correspondence(NamedTuple):
 
 
 class _Search:
-    """Algorithm 1 at work: the best hypothesis so far, and the counts."""
+    """Algorithm 1 under way: the best hypothesis until now, and the counts."""
 
     def __init__(
         self,
@@ -182,7 +182,7 @@ class _Search:
 
     @property
     def spent(self) -> str:
-        """Say which limit is reached: "work", "time", or "" for neither."""
+        """Return which limit is reached: "work", "time", or "" for neither."""
         if self.work_s >= self.options.work_limit_s:
             return "work"
         return "time" if time.perf_counter() - self.begin > self.options.time_limit_s else ""
