@@ -352,7 +352,8 @@ def _open_frame(paths: Sequence[str], query: QueryOptions, camera: CameraOptions
         ways = ways or ways_by_card.get(name, 1)
         if ways > 1 and name in ways_by_card and may_be_finer(scale):
             parts = (_FINER * scale, ways // 2), (scale, ways - ways // 2)
-            return fuse([see_one(path, name, *part) for part in parts])
+            seen_in = [see_one(path, name, *part) for part in parts]
+            return fuse([one.resized(grid) if one.values.shape[0] > grid[0] else one for one in seen_in])
         known = tried.get((path, name, scale)) if ways == 1 else None
         if known is not None and known.values.shape[0] < 2 * grid[0]:
             return known

@@ -22,6 +22,8 @@ __all__ = ["NODATA", "ProbabilityMap", "fuse"]
 #: 0 to 254 stand for probabilities 0 to 1; this for ground that was not observed.
 NODATA = PROBABILITY_UNKNOWN
 
+_STRIP_PIXELS = 1 << 22  # fused at a time
+
 
 @dataclass(frozen=True)
 class ProbabilityMap:
@@ -129,7 +131,6 @@ def fuse(maps: Sequence[ProbabilityMap]) -> ProbabilityMap:
     first = maps[0]
     alike = all(one.threshold == first.threshold for one in maps)
     height, width = first.values.shape
-    total, count = np.zeros((height, width), np.float32), np.zeros((height, width), np.float32)
     for one in maps:
         rows, columns = one.values.shape
         if abs(rows * width - columns * height) > 0.01 * rows * width:
@@ -137,14 +138,25 @@ def fuse(maps: Sequence[ProbabilityMap]) -> ProbabilityMap:
                 f"{one.name}: {columns} x {rows} pixels, but {first.name} {width} x {height}; "
                 "expected looks at the same frame: cut them alike, or locate them one by one"
             )
-        values = one.resized((height, width)).values
-        seen = values != NODATA
-        total += np.where(seen, _log_odds(values, 0.5 if alike else one.threshold), 0)
-        count += seen
-    share = 1.0 / (1.0 + np.exp(-total / np.maximum(count, 1)))
-    fused = np.where(count > 0, np.rint(254 * share), NODATA).astype(np.uint8)
+    values = [one.resized((height, width)).values for one in maps]
+    thresholds = [0.5 if alike else one.threshold for one in maps]
+    fused = np.empty((height, width), np.uint8)
+    step = max(1, _STRIP_PIXELS // width)
+    for top in range(0, height, step):
+        fused[top : top + step] = _mean([one[top : top + step] for one in values], thresholds)
     models = dict.fromkeys(one.model for one in maps)
     return ProbabilityMap(fused, first.threshold if alike else 0.5, first.name, " + ".join(models), first.pixel)
+
+
+def _mean(values: Sequence[AnyArray], thresholds: Sequence[float]) -> AnyArray:
+    """Return the mean of the log odds of those (H, W) that observed a pixel, as a probability."""
+    total, count = np.zeros(values[0].shape, np.float32), np.zeros(values[0].shape, np.float32)
+    for one, threshold in zip(values, thresholds, strict=True):
+        seen = one != NODATA
+        total += np.where(seen, _log_odds(one, threshold), 0)
+        count += seen
+    share = 1.0 / (1.0 + np.exp(-total / np.maximum(count, 1)))
+    return np.where(count > 0, np.rint(254 * share), NODATA).astype(np.uint8)
 
 
 def _log_odds(values: AnyArray, threshold: float) -> AnyArray:

@@ -13,6 +13,7 @@ from worlds.turned import save_turned
 from roadgeo.errors import MaskError
 from roadgeo.roads.thresholds import spread_probability
 from roadgeo.sources.masks import PROBABILITY_TAG, open_mask, read_mask
+from roadgeo.sources.segmentation import probability
 from roadgeo.sources.segmentation.network import load_network
 from roadgeo.sources.segmentation.photograph import open_photograph
 from roadgeo.sources.segmentation.probability import NODATA, ProbabilityMap, fuse
@@ -274,6 +275,17 @@ def test_a_model_of_another_threshold_counts_from_there() -> None:
     sure, shy = np.full((9, 9), 127, np.uint8), np.full((9, 9), 51, np.uint8)
     fused = fuse([ProbabilityMap(sure, 0.5), ProbabilityMap(shy, 0.2)]).values
     np.testing.assert_allclose(fused, 127, atol=2)
+
+
+def test_maps_are_fused_strip_by_strip(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Of a large photograph the numbers with a point would take gigabytes."""
+    values = np.random.default_rng(1).integers(0, 256, (2, 70, 40)).astype(np.uint8)
+    whole, maps = [], [ProbabilityMap(one, 0.3) for one in values]
+    for pixels in (1 << 20, 1000):
+        monkeypatch.setattr(probability, "_STRIP_PIXELS", pixels)
+        whole.append(fuse(maps))
+    np.testing.assert_array_equal(whole[0].values, whole[1].values)
+    assert whole[0].threshold == 0.3
 
 
 def test_more_ways_average_what_is_seen(network, photo: Path) -> None:
