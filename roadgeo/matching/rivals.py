@@ -66,8 +66,6 @@ class RivalOptions:
         So many places that most road points fit are laid roughly, and so many of them, the likeliest, finely.
     n_points : int
         Road points that each is laid by roughly.
-    n_compared : int
-        So many of all that were met or laid are compared piece by piece, the likeliest.
     apart : float
         Middles of two places lie further from each other than this share of half the frame's diagonal.
     """
@@ -80,7 +78,6 @@ class RivalOptions:
     n_places: int = 40
     n_laid: int = 8
     n_points: int = 200
-    n_compared: int = 6
     apart: float = 0.04
     search: LocalSearchOptions = field(
         default_factory=lambda: LocalSearchOptions(
@@ -178,7 +175,7 @@ class Rivals:
         others.sort(key=lambda one: -one[0])
         if others and others[0][0] > worth:
             return Standing(best, others[0][1], worth - others[0][0], worth, others[0][0])
-        lead = evidence.lead(matrix, [other for _, other in others[: options.n_compared]])
+        lead = evidence.lead(matrix, [other for _, other in others])
         lead += log10_gap(worth, explained)
         # The larger the map, the more places may lead all that lie around them.
         paid = 2.0 * math.log10(larger(self.ledger.n_reference))
