@@ -19,7 +19,7 @@ from roadgeo.errors import MaskError, OutputError
 from roadgeo.evaluation.demo import ATTRIBUTION, ROADS, demo_masks
 from roadgeo.geometry.homography import Homography
 from roadgeo.geometry.mask import RoadMask, pixel_to_plane, plane_to_pixel
-from roadgeo.location import Evidence, Location, Place
+from roadgeo.location import Evidence, Location, Place, Reason
 from roadgeo.matching.index import build_index
 from roadgeo.outputs.location_files import OutputOptions, write_location
 from roadgeo.outputs.paths import output_paths
@@ -133,6 +133,15 @@ def test_a_mask_that_was_not_located_is_shown_with_the_reason(porto: Reference) 
     assert 'class="overview"' in page
     few = replace(location, n_intersections=4)
     assert "4 intersections are seen in the mask: few" in Reader(render_report(few, mask, porto.index)).text
+
+
+def test_half_a_place_is_no_choice_of_two(porto: Reference, drone: RoadMask, found: Location) -> None:
+    reason = "only half a place is known: the middle lies within +-200 m along 62 degrees from north"
+    location = replace(found, status="ambiguous", reason=reason, reason_code=Reason.HALF_A_PLACE)
+    text = Reader(render_report(location, drone, porto.index)).text
+    for said in ("≈ ambiguous", "nly half a place is known", "known in one direction only", "in other directions"):
+        assert said in text
+    assert "Two places fit" not in text
 
 
 def test_two_places_are_both_shown(porto: Reference, drone: RoadMask, found: Location) -> None:
