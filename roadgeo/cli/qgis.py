@@ -11,7 +11,7 @@ __all__ = ["qgis_command"]
 
 @click.group("qgis", short_help="Install the QGIS plugin.")
 def qgis_command() -> None:
-    """Put roadgeo into QGIS: a plugin that adds its commands to the Processing toolbox.
+    """Put roadgeo into QGIS: a plugin with a menu, that adds its commands to the Processing toolbox.
 
     \b
     Examples:
@@ -32,8 +32,7 @@ def qgis_command() -> None:
 def install_command(profile: str) -> None:
     """Put the plugin into a QGIS profile, in place of an earlier version, and enable it there.
 
-    It calls the roadgeo that installed it; another one is set in QGIS, under Settings > Options > Processing >
-    Providers > roadgeo.
+    It calls the roadgeo that installed it; another one is set in QGIS, by Plugins > roadgeo > Set up roadgeo.
 
     \b
     Examples:

@@ -23,7 +23,7 @@ __all__ = ["NAME", "find_profiles", "install_plugin", "write_package"]
 #: Name of the plugin's folder: not `roadgeo`, which would stand before the library of that name in QGIS's Python.
 NAME = "roadgeo_qgis"
 
-#: Name of the file that tells the plugin, which runs without the library, what outputs there are.
+#: Name of the file that lists the outputs for the plugin, which runs without the library.
 OUTPUTS = "outputs.json"
 
 _PLUGIN = Path(__file__).parent / "plugin"
@@ -66,7 +66,7 @@ def write_package(path: str | os.PathLike[str], publisher: Mapping[str, str] | N
     Parameters
     ----------
     publisher : mapping, optional
-        What the repository also asks for: `email`, `repository`, `tracker`, `homepage`. Default: as the package says.
+        Fields that the repository requires: `email`, `repository`, `tracker`, `homepage`. Default: as the package says.
 
     Raises
     ------
@@ -83,7 +83,7 @@ def write_package(path: str | os.PathLike[str], publisher: Mapping[str, str] | N
 
 
 def _publisher() -> dict[str, str]:
-    """Return whom and where to ask, as pyproject.toml says it of the whole package."""
+    """Return the contacts in pyproject.toml, which are those of the whole package."""
     from importlib.metadata import metadata
 
     package = metadata("roadgeo")
@@ -98,7 +98,7 @@ def _publisher() -> dict[str, str]:
 
 
 def _contents() -> dict[Path, bytes]:
-    """Read the plugin's files, by their paths in its folder; what `--also` offers is written down for it."""
+    """Read the plugin's files, by their paths in its folder; with the list that `--also` offers."""
     files = {file.relative_to(_PLUGIN): file.read_bytes() for file in _PLUGIN.rglob("*") if file.is_file()}
     files = {file: content for file, content in files.items() if "__pycache__" not in file.parts}
     offered = {name: output.summary for name, output in ALSO.items()}

@@ -6,6 +6,7 @@ import json
 import os
 import re
 import shutil
+import subprocess
 import sys
 import time
 import zipfile
@@ -62,6 +63,24 @@ def test_the_executable_is_searched_from_the_surest_place_to_the_usual_ones(tmp_
         assert runner.find_executable("", environ, home, beside) == str(place)
     assert runner.find_executable(str(places[0]), environ, home, beside) == str(places[0])
     assert runner.find_executable(str(tmp_path / "none"), environ, home, beside) is None
+
+
+def test_a_python_that_has_roadgeo_may_stand_for_its_program(tmp_path: Path) -> None:
+    assert runner.as_command("/opt/bin/roadgeo") == ["/opt/bin/roadgeo"]
+    for name in ("python", "python3", "python3.13", "Python.exe"):
+        assert runner.as_command(f"/opt/{name}")[1:] == ["-P", "-m", "roadgeo"]
+    new, old = (make_program(tmp_path / name, "") for name in ("python3.12", "python3"))
+    found = runner.find_pythons({"PATH": str(tmp_path)}, tmp_path)
+    assert found[:2] == [str(new), str(old)]  # then that of QGIS
+
+
+def test_what_the_program_says_names_what_qgis_has() -> None:
+    labels = {"--gsd": "Least pixel size", "--osm": "Place"}
+    said = "Give one source: --osm PLACE, or `roadgeo index --bbox`; `roadgeo simulate` and --gsd-like stay"
+    told = runner.in_words_of_qgis(said, labels)
+    assert told == "Give one source: “Place” PLACE, or “Build road reference”; `roadgeo simulate` and --gsd-like stay"
+    asked = "this needs osmnx, which is not installed: pip install 'roadgeo[maps]'"
+    assert runner.in_words_of_qgis(asked, {}).endswith("“Set up roadgeo” installs roadgeo[maps]")
 
 
 def test_the_child_inherits_nothing_of_the_libraries_of_qgis() -> None:
@@ -250,17 +269,33 @@ def test_the_package_keeps_to_the_rules_of_the_plugin_repository(tmp_path: Path)
     assert re.fullmatch(r"\d+\.\d+\.\d+", general["version"])
     assert general["version"] in general["changelog"]
     assert not re.search(r"<\w+>", general["description"] + general["about"])
-    assert (general["experimental"], general["deprecated"]) == ("True", "False")
+    assert (general["experimental"], general["deprecated"]) == ("False", "False")
     assert general["category"] in {"Raster", "Vector", "Database", "Mesh", "Web"}
     assert icon.startswith(b"\x89PNG")
     assert {general["qgisMinimumVersion"], general["qgisMaximumVersion"]} == {"3.22", "4.99"}
 
 
+@pytest.mark.parametrize(
+    "command",
+    [["flake8", "--max-line-length=120", "."], ["bandit", "-q", "-r", "."]],
+    ids=lambda command: command[0],
+)
+def test_the_scanner_of_the_plugin_repository_finds_nothing(command: list[str], tmp_path: Path) -> None:
+    """It unpacks the package and runs these; bandit here with all of its tests, there with those of its choice."""
+    write_package(tmp_path / "plugin.zip")
+    with zipfile.ZipFile(tmp_path / "plugin.zip") as archive:
+        archive.extractall(tmp_path)
+    done = subprocess.run(
+        [sys.executable, "-m", *command], cwd=tmp_path / NAME, capture_output=True, text=True, check=False
+    )
+    assert (done.returncode, done.stdout) == (0, "")
+
+
 def test_every_algorithm_has_its_place_in_the_help_page() -> None:
     names = re.findall(r'NAME, TITLE = "(\w+)"', (PLUGIN / "algorithms.py").read_text("utf-8"))
     page = (PLUGIN / "help.html").read_text("utf-8")
-    assert len(names) == 6
-    assert set(re.findall(r'<h2 id="(\w+)"', page)) == {*names, "program"}
+    assert len(names) == 8
+    assert set(re.findall(r'<h2 id="(\w+)"', page)) == {*names, "mend"}
     assert "src=" not in page  # it needs no network
     assert "href=" not in page
 
@@ -275,7 +310,7 @@ def test_the_plugin_is_written_for_every_qgis_from_3_22_to_qt_6(path: Path) -> N
     tree = ast.parse(source, feature_version=(3, 9))
     imported = {node.module for node in ast.walk(tree) if isinstance(node, ast.ImportFrom)}
     imported |= {alias.name for node in ast.walk(tree) if isinstance(node, ast.Import) for alias in node.names}
-    foreign = ("PyQt", "PySide", "roadgeo", *(() if path.name in ("dock.py", "refit.py") else ("numpy",)))
+    foreign = ("PyQt", "PySide", "roadgeo", *(() if path.name in ("dock.py", "placing.py", "refit.py") else ("numpy",)))
     assert not [name for name in imported if name and name.startswith(foreign)]
     assert not re.findall(r"\b(?:Qt|Qgis|Qgs\w+)\.(?:Type|Flag|[A-Z]\w*)\b(?![.(])", source)
 
@@ -303,8 +338,8 @@ def read_location(path: Path) -> tuple[Homography, dict]:
 def test_the_provider_loads_and_explains_itself(qgis: Qgis) -> None:
     listed = qgis.tool("list").stdout
     names = ["buildreference", "locatemask", "locatemasks", "vectorizemask", "georeferenceimage", "maplocalizability"]
+    names += ["placebypoints", "setup"]
     assert [name for name in names if f"roadgeo:{name}\t" in listed] == names
-    assert "* roadgeo_qgis" in qgis.tool("plugins").stdout
     explained = qgis.tool("help", "roadgeo:georeferenceimage").stdout
     assert "Cloud Optimized GeoTIFF" in explained
 
@@ -354,25 +389,62 @@ def test_a_refused_mask_is_a_warning_with_the_reason(qgis: Qgis, porto: Path) ->
     assert f"warning: elsewhere: {refused['results']['REASON']}" in refused["said"]
 
 
-def test_errors_are_shown_as_qgis_shows_errors(qgis: Qgis, porto: Path) -> None:
-    mask = f"MASK={MASKS['drone'].path}"
-    folder = f"OUTPUT_FOLDER={qgis.folder / 'errors'}"
-    done = qgis.tool("run", "roadgeo:locatemask", "--", mask, f"REFERENCE={qgis.folder / 'none.gpkg'}", folder)
-    assert done.returncode == 1
-    assert "ERROR:\tno reference '" in done.stderr
-    done = qgis.tool("run", "roadgeo:locatemask", "--", mask, f"REFERENCE={porto}", folder, "GSD_MIN=90")
-    assert done.returncode == 1
-    assert "LO must be above 0 and not above HI" in done.stderr
-    done = qgis.tool("run", "roadgeo:buildreference", "--", f"OUTPUT={qgis.folder / 'x.gpkg'}")
-    assert done.returncode == 1
-    assert "Give one source of roads" in done.stderr
+def test_errors_are_shown_in_the_words_of_qgis(qgis: Qgis, porto: Path) -> None:
+    wanted = {"MASK": str(MASKS["drone"].path), "OUTPUT_FOLDER": str(qgis.folder / "errors"), "REFERENCE": str(porto)}
+    locate = "roadgeo:locatemask"
+    build = {"OUTPUT": str(qgis.folder / "x.gpkg")}
+    (absent, scales, twice, nothing, nameless), _, _ = qgis.ask(
+        ("run", {"algorithm": locate, "parameters": {**wanted, "REFERENCE": str(qgis.folder / "none.gpkg")}}),
+        ("run", {"algorithm": locate, "parameters": {**wanted, "GSD_MIN": 90}}),
+        ("run", {"algorithm": locate, "parameters": {**wanted, "AREA": "0,1,0,1 [EPSG:4326]", "WITHIN": "Portugal"}}),
+        ("run", {"algorithm": "roadgeo:buildreference", "parameters": build}),
+        ("run", {"algorithm": "roadgeo:buildreference", "parameters": {"EXTENT": "0,1,0,1 [EPSG:4326]"}}),
+    )
+    assert "no reference '" in absent["failed"]
+    assert "“Least pixel size, metres”" in scales["failed"]
+    assert "by name or by a part of the map" in twice["failed"]
+    assert "Give one source of roads" in nothing["failed"]
+    assert "Give the reference a name" in nameless["failed"]
+    assert "--" not in "".join(one["failed"] for one in (absent, scales, nothing))
 
 
 def test_without_the_executable_nothing_runs_and_the_advice_is_there(qgis: Qgis) -> None:
     answers, _, _ = qgis.ask(("configure", {"executable": "/no/such/roadgeo"}), ("configure", {"executable": ""}))
     assert not answers[0][0]
-    assert "roadgeo qgis install" in answers[0][1]
+    assert "Set up roadgeo" in answers[0][1]
     assert answers[1] == [True, ""]
+
+
+def test_an_environment_is_made_and_roadgeo_installed_there(qgis: Qgis) -> None:
+    """With a Python that plays venv and pip; one that is too old is passed over, a folder with other things refused."""
+    body = """
+import pathlib, shutil, sys
+if sys.argv[1:3] == ["-m", "venv"]:
+    scripts = pathlib.Path(sys.argv[3], "bin")
+    scripts.mkdir(parents=True)
+    shutil.copy(sys.argv[0], scripts / "python")
+if sys.argv[1:3] == ["-m", "pip"]:
+    program = pathlib.Path(sys.argv[0]).with_name("roadgeo")
+    program.write_text("#!/bin/sh\\necho roadgeo, version 9.9 of " + sys.argv[-1])
+    program.chmod(0o755)
+"""
+    python = make_program(qgis.folder / "pythons" / "python3", body)
+    old = make_program(qgis.folder / "pythons" / "python3.11", "import sys\nsys.exit(1)")
+    wanted = {"PROGRAM": str(python), "INSTALL": True, "SOURCE": "roadgeo", "FOLDER": str(qgis.folder / "environment")}
+    answers, _, _ = qgis.ask(
+        ("run", {"algorithm": "roadgeo:setup", "parameters": wanted}),
+        ("run", {"algorithm": "roadgeo:setup", "parameters": {**wanted, "FOLDER": str(qgis.folder / "pythons")}}),
+        ("run", {"algorithm": "roadgeo:setup", "parameters": {**wanted, "PROGRAM": str(old), "FOLDER": "/no/such"}}),
+        ("run", {"algorithm": "roadgeo:setup", "parameters": {"PROGRAM": str(old)}}),
+        ("forget_program", {}),
+    )
+    done, full, aged, named, _ = answers
+    assert "results" in done, done
+    assert done["results"]["FOUND"] == str(qgis.folder / "environment" / "bin" / "roadgeo")
+    assert done["results"]["VERSION"] == "roadgeo"
+    assert "holds other things" in full["failed"]
+    assert "needs Python 3.11 or newer" in aged["failed"]
+    assert "failed" in named["failed"]
 
 
 def test_cancelling_stops_the_executable(qgis: Qgis, porto: Path) -> None:
@@ -446,15 +518,19 @@ def test_results_are_loaded_with_their_styles(qgis: Qgis, porto: Path) -> None:
         "REPORT": True,
     }
     roads = {"ROADS": str(ROADS), "KINDS": "all", "OUTPUT": str(qgis.folder / "again.gpkg")}
-    (built, done), _, _ = qgis.ask(
+    (built, remembered, done), _, _ = qgis.ask(
         ("run", {"algorithm": "roadgeo:buildreference", "parameters": roads}),
+        ("remembered", {}),
         ("run", {"algorithm": "roadgeo:locatemask", "parameters": arguments}),
     )
     assert built["layers"]["again roads"]["colors"] == [MAP_ROAD]
     assert set(built["layers"]) == {"again roads", "again coverage", "again intersections"}
+    assert str(qgis.folder / "again.gpkg") in remembered
     layers = done["layers"]
-    assert set(layers) == {"drone", "drone footprint", "drone matches", "drone residuals", "drone roads"}
-    assert {layer["group"] for layer in layers.values()} == {"drone"}
+    names = {"drone", "drone footprint", "drone matches", "drone residuals", "drone roads"}
+    assert set(layers) == {*names, "porto roads"}  # the map that lies below
+    assert {layers[name]["group"] for name in names} == {"drone"}
+    assert layers["porto roads"]["group"] == ""
     assert Path(done["results"]["REPORT_PAGE"]).name == "drone_report.html"
     assert Path(done["results"]["REPORT_PAGE"]).exists()
     assert all(layer["valid"] and layer["crs"] == "EPSG:32629" for layer in layers.values())

@@ -20,6 +20,7 @@ LOCATION = {
     "gsd_m": 1.0,
     "rotation_deg": 3.0,
     "log10_odds": 30.0,
+    "reference": "town",
 }
 
 
@@ -56,7 +57,7 @@ def test_it_loads_runs_and_unloads(python: str, plugin: Path, tmp_path: Path) ->
     done = run(python, plugin, tmp_path)
     assert done.returncode == 0, done.stderr
     answer = json.loads(done.stdout)
-    assert len(answer["algorithms"]) == 6
+    assert len(answer["algorithms"]) == 8
     for name, (help_page, parameters, outputs, folded) in answer["algorithms"].items():
         assert help_page.startswith("file:///")
         assert help_page.endswith(f"help.html#{name}")
@@ -65,6 +66,7 @@ def test_it_loads_runs_and_unloads(python: str, plugin: Path, tmp_path: Path) ->
         assert folded
     assert answer["results"]["STATUS"] == "located"
     assert answer["layers"] == ["mask matches", "mask residuals", "mask roads", "mask footprint", "mask"]
+    assert answer["told"] == ["locatemask", "mask", "located"]
     assert answer["pages"] == [str(tmp_path / "found" / "mask_report.html")]
 
 
@@ -79,6 +81,8 @@ def test_it_loads_runs_and_unloads(python: str, plugin: Path, tmp_path: Path) ->
         ("session.py", "from qgis.PyQt import sip", "import sip"),
         ("dock.py", "Qt.", "Qt.AlignCenter or Qt."),
         ("dock.py", "QDockWidget,", "QDockWidget, QDesktopWidget,"),
+        ("messages.py", "QHeaderView.ResizeMode.Stretch", "QHeaderView.Stretch"),
+        ("menu.py", "QToolButton.ToolButtonPopupMode.MenuButtonPopup", "QToolButton.MenuButtonPopup"),
     ],
 )
 def test_what_only_pyqt5_knows_is_found(

@@ -44,6 +44,9 @@ class Definition:
     def setHelp(self, text):
         self.help = text
 
+    def setMetadata(self, metadata):
+        self.metadata = metadata
+
     def flags(self):
         return self.own_flags
 
@@ -170,6 +173,9 @@ class Context:
     def project(self):
         return self
 
+    def mapLayers(self):
+        return {}
+
     def addLayerToLoadOnCompletion(self, source, details):
         assert not sip.isdeleted(details.styler)
         self.layers.append(details.name)
@@ -199,6 +205,17 @@ class Application:
     def processingRegistry():
         return REGISTRY
 
+    @staticmethod
+    def qgisSettingsDirPath():
+        return "/config/profiles/default/"
+
+
+class Kept:
+    """QGIS's settings: none yet."""
+
+    def value(self, name, default):
+        return default
+
 
 CORE = {
     "QgsApplication": Application,
@@ -216,6 +233,7 @@ CORE = {
     "QgsProject": object,
     "QgsCoordinateReferenceSystem": str,
     "QgsProviderRegistry": Providers,
+    "QgsSettings": Kept,
 }
 
 
@@ -312,6 +330,9 @@ def main():
     play_qgis()
     sys.path.insert(0, str(Path(folder).parent))
     plugin = importlib.import_module(Path(folder).name).classFactory(None)
+    window, heard = types.ModuleType("messages"), []
+    window.tell = lambda algorithm, finding: heard.extend([algorithm, finding.name, finding.location["status"]])
+    sys.modules[f"{Path(folder).name}.messages"] = window
     plugin.initGui()
     (provider,) = REGISTRY.providers
     assert not provider.icon().isNull()
@@ -332,7 +353,7 @@ def main():
     locate.postProcessAlgorithm(context, feedback)
     application.processEvents()
     plugin.unload()
-    answer = {"algorithms": told, "results": results, "layers": context.layers, "pages": browser.pages}
+    answer = {"algorithms": told, "results": results, "layers": context.layers, "pages": browser.pages, "told": heard}
     print(json.dumps({**answer, "qt": sip.SIP_VERSION_STR, "said": feedback.said}))
 
 

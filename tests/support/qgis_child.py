@@ -102,6 +102,18 @@ def configure(executable):
     return list(QgsApplication.processingRegistry().createAlgorithmById("roadgeo:locatemask").canExecute())
 
 
+def forget_program():
+    """Have the program searched for again."""
+    from processing.core.ProcessingConfig import ProcessingConfig
+
+    ProcessingConfig.setSettingValue("ROADGEO_EXECUTABLE", "")
+
+
+def remembered():
+    """List the references that the plugin remembers."""
+    return __import__("roadgeo_qgis.settings", fromlist=["settings"]).remembered_references()
+
+
 def describe(layer):
     """Say what a layer is and how it is drawn."""
     node = QgsProject.instance().layerTreeRoot().findLayer(layer.id())

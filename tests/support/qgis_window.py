@@ -1,22 +1,26 @@
 """What `test_window.py` does in QGIS's own window: `qgis --code` runs this on a virtual screen.
 
-It opens the dialog of an algorithm, presses its button Run, and keeps what then is in the project, with pictures of the
-dialog and of the window. The task is the JSON file that the environment variable ROADGEO_TASK names.
+A tour of the plugin as a newcomer makes it: set up, build a reference, locate the current layer near what the map
+shows, choose among places, mend by hand. Keeps what happened, and a picture of every dialog. The task is the JSON file
+that the environment variable ROADGEO_TASK names.
 """
 
 import json
 import os
 import traceback
+from dataclasses import replace
 from pathlib import Path
 
-import processing
-from qgis.core import QgsApplication, QgsProject
-from qgis.PyQt.QtCore import QObject, QTimer, pyqtSlot
-from qgis.PyQt.QtGui import QDesktopServices
-from qgis.utils import active_plugins, iface
+from qgis.core import QgsApplication, QgsPointXY, QgsProcessingContext, QgsProject, QgsRasterLayer, QgsVectorLayer
+from qgis.PyQt.QtCore import QEvent, QEventLoop, QObject, QPoint, QPointF, Qt, QTimer, pyqtSlot
+from qgis.PyQt.QtGui import QDesktopServices, QMouseEvent
+from qgis.PyQt.QtTest import QTest
+from qgis.PyQt.QtWidgets import QPushButton, QToolButton
+from qgis.utils import active_plugins, iface, plugins
 
 TASK = json.loads(Path(os.environ["ROADGEO_TASK"]).read_text("utf-8"))
 ANSWER = {"plugins": list(active_plugins), "pages": []}
+PROJECT = QgsProject.instance()
 
 
 class Browser(QObject):
@@ -27,63 +31,236 @@ class Browser(QObject):
         ANSWER["pages"].append(url.toLocalFile())
 
 
+def settle(milliseconds=100):
+    """Let the window draw."""
+    loop = QEventLoop()
+    QTimer.singleShot(milliseconds, loop.quit)
+    loop.exec()
+
+
+def keep(widget, name):
+    """Keep a picture of a widget as it is on the screen."""
+    settle()
+    widget.grab().save(str(Path(TASK["pictures"], f"{name}.png")))
+
+
 def describe(node):
     """Names of groups and layers, as the panel of layers shows them."""
     return {child.name(): describe(child) if hasattr(child, "findGroups") else [] for child in node.children()}
 
 
-def finish():
-    """Write what came out, and leave without QGIS's questions about saving."""
-    Path(TASK["answer"]).write_text(json.dumps(ANSWER), "utf-8")
-    os._exit(0)
+def fill_and_run(dialog, name):
+    """Keep a picture of an algorithm's dialog, and press Run; return its results."""
+    ended, loop = [], QEventLoop()
 
+    def end(successful, results):
+        ended.append({"successful": successful, "results": {key: str(value) for key, value in results.items()}})
+        loop.quit()
 
-def guarded(step):
-    """Have an exception in a step end the test, not wait for its time limit."""
-
-    def call(*arguments):
-        try:
-            step(*arguments)
-        except Exception:
-            ANSWER["error"] = traceback.format_exc()
-            finish()
-
-    return call
-
-
-@guarded
-def start():
-    """Open the dialog, filled in, and press Run."""
-    global dialog  # or Python would let go of it
-    provider = QgsApplication.processingRegistry().providerById("roadgeo")
-    ANSWER["algorithms"] = [algorithm.name() for algorithm in provider.algorithms()]
-    dialog = processing.createAlgorithmDialog(TASK["algorithm"], TASK["parameters"])
-    dialog.algorithmFinished.connect(guarded(ended))
-    dialog.show()
-    QgsApplication.processEvents()
-    ANSWER["title"] = dialog.windowTitle()
-    dialog.grab().save(TASK["dialog"])
+    dialog.algorithmFinished.connect(end)
+    keep(dialog, name)
+    ended_title = dialog.windowTitle()
     dialog.runButton().click()
-
-
-def ended(successful, results):
-    """Look at the map once it is drawn."""
-    ANSWER["successful"], ANSWER["results"] = successful, {name: str(value) for name, value in results.items()}
-    dialog.grab().save(TASK["log"])
+    if not ended:
+        QTimer.singleShot(240_000, loop.quit)
+        loop.exec()
+    keep(dialog, f"{name}_log")
+    assert ended, f"{name} did not end"
     dialog.close()
-    layers = QgsProject.instance().mapLayers().values()
-    iface.setActiveLayer(next(layer for layer in layers if layer.name().endswith("footprint")))
-    iface.zoomToActiveLayer()
-    QTimer.singleShot(0, guarded(look))
+    return {"title": ended_title, **ended[0]}
 
 
-def look():
-    """Keep a picture of the window, and what its panel of layers shows."""
-    iface.mapCanvas().waitWhileRendering()
+def message():
+    """What the message bar says, and its buttons."""
+    settle(1000)
+    item = iface.messageBar().currentItem()
+    buttons = {one.text(): one for one in item.findChildren(QPushButton)} if item else {}
+    return (f"{item.title()}: {item.text()}" if item else ""), buttons
+
+
+def drag(widget, start, end):
+    """Press, move and release the mouse."""
+    left = Qt.MouseButton.LeftButton
+    QTest.mousePress(widget, left, pos=start)
+    for at in ((start + end) / 2, end):  # QTest's own moves hold no button
+        there = widget.mapToGlobal(at)
+        event = QMouseEvent(
+            QEvent.Type.MouseMove, QPointF(at), QPointF(there), left, Qt.MouseButtons(left), Qt.KeyboardModifiers()
+        )
+        QgsApplication.sendEvent(widget, event)
+    QTest.mouseRelease(widget, left, pos=end)
     QgsApplication.processEvents()
-    iface.mainWindow().grab().save(TASK["window"])
-    ANSWER["layers"] = describe(QgsProject.instance().layerTreeRoot())
-    finish()
+
+
+def tour():
+    plugin = plugins["roadgeo_qgis"]
+    menu = plugin.menu
+    module = __import__("roadgeo_qgis.messages", fromlist=["messages"])
+    iface.mainWindow().resize(1280, 850)
+    # The menu and the button.
+    ANSWER["menu"] = [action.text() for action in menu.menu.actions() if action.text()]
+    ANSWER["in_menu"] = any(one.menu() is menu.menu for one in iface.pluginMenu().actions())
+    ANSWER["on_toolbar"] = menu.button in iface.mainWindow().findChildren(QToolButton)
+    menu.menu.popup(iface.mainWindow().mapToGlobal(QPoint(400, 200)))
+    keep(menu.menu, "menu")
+    menu.menu.hide()
+    # Without the program, the window says so at first, and offers to set it up; it finds what is there.
+    menu._ask_to_set_up()
+    ANSWER["first"], buttons = message()
+    ANSWER["first_buttons"] = list(buttons)
+    iface.messageBar().clearWidgets()
+    ANSWER["setup"] = fill_and_run(module.open_dialog("setup", {}), "setup")
+    # Build, from a layer, into the library.
+    roads = QgsVectorLayer(TASK["roads"], "porto streets", "ogr")
+    PROJECT.addMapLayer(roads)
+    wanted = {"ROADS": roads.id(), "KINDS": "all"}
+    ANSWER["build"] = fill_and_run(module.open_dialog("buildreference", wanted), "build")
+    PROJECT.removeMapLayer(roads.id())
+    # Locate the current layer near what the map shows.
+    iface.setActiveLayer(next(one for one in PROJECT.mapLayers().values() if one.name().endswith(" roads")))
+    iface.zoomToActiveLayer()
+    picture = QgsRasterLayer(TASK["picture"], "drone picture")
+    PROJECT.addMapLayer(picture)
+    iface.setActiveLayer(picture)
+    dialog = menu.locate_near()
+    wrapper = dialog.mainWidget().wrappers["REFERENCE"]
+    ANSWER["references"] = [wrapper.combo.itemText(k) for k in range(wrapper.combo.count())]
+    values = dialog.createProcessingParameters()
+    ANSWER["asked"] = {name: str(values.get(name)) for name in ("MASK", "REFERENCE", "AREA")}
+    ANSWER["asked"]["MASK"] = ANSWER["asked"]["MASK"] == picture.id()
+    wrapper.setValue("porto-streets")
+    dialog.mainWidget().wrappers["REPORT"].setWidgetValue(True, QgsProcessingContext())
+    ANSWER["locate"] = fill_and_run(dialog, "locate")
+    ANSWER["message"], buttons = message()
+    ANSWER["buttons"] = list(buttons)
+    buttons["Zoom to it"].click()
+    settle()
+    iface.mapCanvas().waitWhileRendering()
+    keep(iface.mainWindow(), "window")
+    ANSWER["layers"] = describe(PROJECT.layerTreeRoot())
+    extent = iface.mapCanvas().extent()
+    ANSWER["shown"] = [extent.width(), extent.center().x(), extent.center().y()]
+    # Mend by hand.
+    buttons["Mend by hand"].click()
+    mend(menu.dock)
+    menu.dock.hide()
+    choose(module)
+    # Switched off in the list of plugins.
+    plugin.unload()
+    settle()
+    ANSWER["left"] = [
+        any(one.text() == "roadgeo" for one in iface.pluginMenu().actions()),
+        QgsApplication.processingRegistry().providerById("roadgeo") is not None,
+    ]
+
+
+def choose(module):
+    """Two places fit: the second is looked at, and chosen."""
+    session = __import__("roadgeo_qgis.session", fromlist=["session"])
+    location = json.loads(Path(ANSWER["locate"]["results"]["OUTPUT_FOLDER"], "drone_location.json").read_text("utf-8"))
+    center = location["center"]
+    other = {"center": {**center, "lon": center["lon"] + 0.03, "lat": center["lat"] + 0.01}, "log10_odds": -0.4}
+    location |= {"status": "ambiguous", "reason": "two places fit almost equally", "log10_odds": 0.4}
+    location["alternatives"] = [other]
+    parameters = {"MASK": TASK["picture"], "REFERENCE": "porto-streets", "OUTPUT_FOLDER": "TEMPORARY_OUTPUT"}
+    found = session.Finding("drone", TASK["picture"], "", "", location, parameters)
+    module.tell("locatemask", found)
+    ANSWER["ambiguous"], buttons = message()
+    buttons["Choose the place..."].click()
+    dialog = module._OPEN[-1]
+    dialog.table.selectRow(1)
+    settle()
+    iface.mapCanvas().waitWhileRendering()
+    extent = iface.mapCanvas().extent()
+    ANSWER["looked_at"] = extent.center().x()
+    keep(dialog, "places")
+    ANSWER["places"] = [dialog.table.item(row, 1).text() for row in range(dialog.table.rowCount())]
+    dialog.button.click()
+    again = module._OPEN[-1]
+    values = again.createProcessingParameters()
+    ANSWER["chosen"] = {name: str(values.get(name)) for name in ("NEAR", "NEAR_RADIUS", "MASK")}
+    again.close()
+    # Refused: a warning, with nothing to zoom to.
+    module.tell("locatemask", replace(found, location={**location, "status": "not_located", "reason": "no"}))
+    ANSWER["refused"], buttons = message()
+    ANSWER["refused_buttons"] = list(buttons)
+
+
+def residuals(dock):
+    return [float(dock.table.item(k, 1).text() or "nan") for k in range(dock.table.rowCount())]
+
+
+def mend(dock):
+    """Switch off, drag, add and delete points, and write what comes of it."""
+    answer = ANSWER["dock"] = {"shown": dock.isVisible(), "picture": dock.picture}
+    dock.setMinimumHeight(430)
+    settle()
+    dock.view.fitInView(dock.scene.sceneRect(), Qt.AspectRatioMode.KeepAspectRatio)
+    dock._zoom()
+    dock.canvas.waitWhileRendering()
+    answer["head"] = dock.table.horizontalHeaderItem(1).text()
+    answer["before"], answer["said"] = residuals(dock), dock.said.text()
+    answer["points"] = [[one.column, one.row, one.x, one.y] for one in dock.matches]
+    answer["matches"] = len(dock.matches)
+    dock.table.item(0, 0).setCheckState(Qt.CheckState.Unchecked)
+    answer["off"], answer["said_off"] = residuals(dock), dock.said.text()
+    dock.table.item(0, 0).setCheckState(Qt.CheckState.Checked)
+    # Dragged on the map, by 30 pixels to the right.
+    dock.table.selectRow(1)
+    one = dock.matches[1]
+    there = dock.canvas.getCoordinateTransform().transform(QgsPointXY(one.x, one.y))
+    start = QPoint(round(there.x()), round(there.y()))
+    drag(dock.canvas.viewport(), start, start + QPoint(30, 0))
+    answer["moved_m"] = dock.matches[1].x - one.x
+    answer["pixel_m"] = dock.canvas.mapUnitsPerPixel()
+    answer["dragged"] = residuals(dock)
+    # Dragged on the picture, where others lie beside it: the one that is chosen lies on top.
+    dock.table.selectRow(2)
+    two = dock.matches[2]
+    start = dock.view.mapFromScene(two.column, two.row)
+    drag(dock.view.viewport(), start, start + QPoint(0, 25))
+    answer["moved_px"] = dock.matches[2].row - two.row
+    # Both are deleted; one is added by a click on the picture.
+    dock.table.clearSelection()
+    for row in (1, 2):
+        for column in range(3):
+            dock.table.item(row, column).setSelected(True)
+    dock.delete_chosen()
+    answer["deleted"] = len(dock.matches)
+    dock.buttons["Add points"].click()
+    spot = dock.view.mapFromScene(dock.size[0] * 0.9, dock.size[1] * 0.52)
+    QTest.mouseClick(dock.view.viewport(), Qt.MouseButton.LeftButton, pos=spot)
+    answer["added"] = [len(dock.matches), residuals(dock)[-1]]
+    dock.buttons["Add points"].click()
+    keep(dock, "mend")
+    keep(iface.mainWindow(), "mend_window")
+    answer["footprint"] = dock.footprint()
+    for suffix in ("points", "tif"):
+        dock.export(f"{TASK['mended']}.{suffix}")
+    dock.draw()
+    answer["drawn"] = fill_and_run(dock.drawing, "place")["results"]
+    answer["layer"] = any(one.name() == "drone by points" for one in PROJECT.mapLayers().values())
+    answer["matrix"] = dock.found.matrix.tolist()
+    # A picture without points: four are clicked, on the picture and on the map in turn.
+    answer["refused"] = dock.open(TASK["picture"], TASK["picture"])
+    answer["refused_said"] = dock.said.text()
+    dock.open(TASK["picture"])
+    answer["empty"] = dock.said.text()
+    width, height = dock.size
+    for u, v in ((0.1, 0.1), (0.9, 0.1), (0.9, 0.9), (0.1, 0.9)):
+        dock.click("picture", u * width, v * height)
+        answer["then"] = dock.said.text()
+        dock.click("map", -8.61 + 1e-5 * u * width, 41.15 - 1e-5 * v * height)
+    answer["own"] = residuals(dock)
+
+
+def start():
+    try:
+        tour()
+    except Exception:
+        ANSWER["error"] = traceback.format_exc()
+    Path(TASK["answer"]).write_text(json.dumps(ANSWER), "utf-8")
+    os._exit(0)  # without QGIS's questions about saving
 
 
 browser = Browser()

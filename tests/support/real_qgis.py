@@ -8,7 +8,6 @@ from pathlib import Path
 
 CHILD = Path(__file__).with_name("qgis_child.py")
 WINDOW = Path(__file__).with_name("qgis_window.py")
-DOCK = Path(__file__).with_name("qgis_dock.py")
 
 
 @dataclass(frozen=True)
@@ -35,29 +34,20 @@ class Qgis:
         printed = "".join(line for line in done.stderr.splitlines(True) if "setapi() is deprecated" not in line)
         return document["answers"], document["warnings"], printed
 
-    def press_run(self, algorithm: str, parameters: dict) -> dict:
-        """Open an algorithm's dialog in QGIS's own window, on a virtual screen, and press Run; see `qgis_window`."""
-        return self._in_window(WINDOW, {"algorithm": algorithm, "parameters": parameters}, ("dialog", "log", "window"))
-
-    def use_dock(self, **task: str) -> dict:
-        """Use the panel of matches in QGIS's own window, on a virtual screen; see `qgis_dock`."""
-        return self._in_window(DOCK, task, ("window", "dock"))
-
-    def _in_window(self, script: Path, wanted: dict, shown: tuple[str, ...]) -> dict:
-        """Run a script in QGIS's own window; return what it answers, and the files of the pictures it takes."""
-        pictures = {name: str(self.folder / f"{name}.png") for name in shown}
-        task, answer = self.folder / "task.json", self.folder / "answer.json"
+    def tour(self, **task: str) -> dict:
+        """Use the plugin in QGIS's own window, on a virtual screen; see `qgis_window`."""
+        wanted, answer = self.folder / "task.json", self.folder / "answer.json"
         answer.unlink(missing_ok=True)
-        task.write_text(json.dumps({**wanted, "answer": str(answer), **pictures}), "utf-8")
+        wanted.write_text(json.dumps({**task, "answer": str(answer)}), "utf-8")
         command = ["xvfb-run", "--auto-servernum", "--server-args=-screen 0 1280x900x24"]
-        command += ["qgis", "--nologo", "--noversioncheck", "--code", str(script)]
-        environ = {**self.environ, "QT_QPA_PLATFORM": "xcb", "ROADGEO_TASK": str(task)}
+        command += ["qgis", "--nologo", "--noversioncheck", "--code", str(WINDOW)]
+        environ = {**self.environ, "QT_QPA_PLATFORM": "xcb", "ROADGEO_TASK": str(wanted)}
         done = replace(self, environ=environ)._run(command)
         assert answer.exists(), done.stdout + done.stderr
-        return {**json.loads(answer.read_text("utf-8")), **pictures}
+        return json.loads(answer.read_text("utf-8"))
 
     def _run(self, command: list[str], folder: Path | None = None) -> subprocess.CompletedProcess[str]:
-        settings = {"env": self.environ, "cwd": folder or self.folder, "timeout": 240}
+        settings = {"env": self.environ, "cwd": folder or self.folder, "timeout": 600}
         return subprocess.run(command, capture_output=True, text=True, check=False, **settings)
 
 

@@ -1,12 +1,16 @@
-"""The algorithms: parameters, one call of roadgeo, what is loaded."""
+"""The algorithms: parameters, one call of roadgeo, layers to load."""
 
 from __future__ import annotations
 
+import json
+import os
+import shutil
 from pathlib import Path
 from typing import Any, ClassVar
 
 from qgis.core import (
     QgsProcessingAlgorithm,
+    QgsProcessingException,
     QgsProcessingOutputFile,
     QgsProcessingOutputNumber,
     QgsProcessingOutputRasterLayer,
@@ -15,8 +19,11 @@ from qgis.core import (
 )
 from qgis.PyQt.QtCore import QUrl
 from qgis.PyQt.QtGui import QIcon
+from qgis.utils import iface
 
+from .environment import ask_version, install
 from .parameters import (
+    AREA,
     BATCH,
     CAMERA,
     ITS_MASK,
@@ -25,16 +32,18 @@ from .parameters import (
     OUTPUT_FOLDER,
     PICTURE,
     PIXEL_SIZE,
+    POINTS,
     QUERY,
     REFERENCE,
     REPORT,
     ROADS,
     SEGMENT,
+    SETUP,
     Option,
     Values,
 )
-from .session import Session
-from .settings import NOT_FOUND, locate_executable
+from .session import PICTURE_KEPT, POINTS_KEPT, Finding, Session, library
+from .settings import NOT_FOUND, configure, locate_executable, remember_reference, remembered_references
 
 __all__ = [
     "ALGORITHMS",
@@ -43,12 +52,14 @@ __all__ = [
     "LocateMask",
     "LocateMasks",
     "MapLocalizability",
+    "PlaceByPoints",
+    "SetUp",
     "VectorizeMask",
 ]
 
 
 class RoadgeoAlgorithm(QgsProcessingAlgorithm):
-    """What the algorithms share: each has a name, a help text, options, outputs and its `work`."""
+    """The base of the algorithms: each has a name, a help text, options, outputs and its `work`."""
 
     session: Session
     NAME: ClassVar[str]
@@ -63,7 +74,7 @@ class RoadgeoAlgorithm(QgsProcessingAlgorithm):
         raise NotImplementedError
 
     def arguments(self, values: Values) -> list[str]:
-        """Return what the options say on the command line."""
+        """Return the options as arguments of the command line."""
         return [argument for option in self.OPTIONS for argument in option.arguments(values)]
 
     def name(self) -> str:
@@ -102,7 +113,7 @@ class RoadgeoAlgorithm(QgsProcessingAlgorithm):
         return type(self)()
 
     def canExecute(self) -> tuple[bool, str]:
-        """Whether roadgeo is there, and what to do if not."""
+        """Whether roadgeo is there; if not, the remedy."""
         found = locate_executable() is not None
         return found, "" if found else NOT_FOUND
 
@@ -115,12 +126,16 @@ class RoadgeoAlgorithm(QgsProcessingAlgorithm):
 
     def processAlgorithm(self, parameters: dict[str, Any], context: Any, feedback: Any) -> dict[str, Any]:
         """Run."""
-        self.session = Session(context, feedback)
+        self.session = Session(context, feedback, {option.flag: option.label for option in self.OPTIONS})
         return self.work(Values(self, parameters, context, feedback), self.session)
 
     def postProcessAlgorithm(self, context: Any, feedback: Any) -> dict[str, Any]:  # noqa: ARG002 (QGIS's signature)
-        """Open the pages that were asked for; QGIS calls this in the thread of its window."""
+        """Report the result, and open the pages that were asked for; QGIS calls this in the thread of its window."""
         self.session.open_pages()
+        if iface is not None and self.session.finding is not None:
+            from .messages import tell
+
+            tell(self.name(), self.session.finding)
         return {}
 
 
@@ -131,7 +146,8 @@ class BuildReference(RoadgeoAlgorithm):
     TAGS = "index roads osm openstreetmap map database"
     HELP = (
         "Draws the roads of a place as a mask shows them, and indexes their intersections. Done once per place; "
-        "the other algorithms then search it. Give one source: a layer of road lines, a place, or an extent. "
+        "the other algorithms then offer it in their lists. Give one source: a layer of road lines, a place, or an "
+        "extent. "
         "Roads of OpenStreetMap are © OpenStreetMap contributors, ODbL."
     )
     OPTIONS = ROADS
@@ -139,12 +155,36 @@ class BuildReference(RoadgeoAlgorithm):
 
     def work(self, values: Values, session: Session) -> dict[str, Any]:
         """Build it; load its roads and intersections."""
-        path = values.get("FileOutput", "OUTPUT")
-        name = [f"--name={Path(path).stem}"] if values.given("ROADS") and not values.given("NAME") else []
-        session.call("index", f"--out={path}", *name, *self.arguments(values))
+        lines, place, box = (values.given(source) for source in ("ROADS", "PLACE", "EXTENT"))
+        if lines + place + (box and not lines) != 1:
+            raise QgsProcessingException("Give one source of roads: road lines, a place, or an extent")
+        path, name = values.get("FileOutput", "OUTPUT"), values.get("String", "NAME")
+        if path:
+            name = name or ("" if place else Path(path).stem)
+        else:
+            name = name or values.get("String", "PLACE") or values.layer_name("ROADS")
+            if not name:
+                raise QgsProcessingException("Give the reference a name")
+        to = ([f"--out={path}"] if path else []) + ([f"--name={name}"] if name else [])
+        session.call("index", *to, *self.arguments(values))
+        if session.feedback.isCanceled():
+            return {}
+        if path:
+            remember_reference(path)
+        else:
+            files = (file for one in library(fresh=True) for file in one.files if file.endswith(".gpkg"))
+            path = max(files, key=os.path.getmtime)
         for layer in ("coverage", "roads", "intersections"):
             session.show(Path(path), f"{Path(path).stem} {layer}", layer)
         return {"OUTPUT": path}
+
+
+def _references(values: Values) -> list[str]:
+    """Name the reference that was chosen; where none was, all that QGIS knows of."""
+    if values.given("REFERENCE"):
+        return [f"--reference={values.get('String', 'REFERENCE')}"]
+    beside = remembered_references()
+    return [f"--reference={one}" for one in (*(one.name for one in library()), *beside)] if beside else []
 
 
 _LOCATION_OUTPUTS = {
@@ -171,15 +211,13 @@ class LocateMask(RoadgeoAlgorithm):
         "camera known. In a photograph a network finds the roads first. What is located is drawn on the map, with its "
         "footprint, its roads and the intersections that matched. What is not surely found is refused, with the reason."
     )
-    OPTIONS = (QUERY, REFERENCE, REPORT, *MASK_VALUES, *SEGMENT, *CAMERA, OUTPUT_FOLDER)
+    OPTIONS = (QUERY, REFERENCE, AREA, REPORT, *MASK_VALUES, *SEGMENT, *CAMERA, OUTPUT_FOLDER)
     OUTPUTS = _LOCATION_OUTPUTS
 
     def work(self, values: Values, session: Session) -> dict[str, Any]:
         """Locate it; load mask, footprint, roads and matches."""
-        mask, folder = values.raster("MASK"), values.get("String", "OUTPUT_FOLDER")
-        found = session.call("locate", mask, "--json", f"--out-dir={folder}", *self.arguments(values))
-        shown = _show_location(found, Path(folder) / Path(mask).stem, session)
-        return {"OUTPUT_FOLDER": folder, **shown, **_show_report(values, Path(folder) / Path(mask).stem, session)}
+        mask = values.raster("MASK")
+        return _locate(mask, mask, self.arguments(values), values, session)
 
 
 class GeoreferenceImage(RoadgeoAlgorithm):
@@ -192,17 +230,26 @@ class GeoreferenceImage(RoadgeoAlgorithm):
         "Optimized GeoTIFF, transparent outside its footprint. Without a mask a network finds the roads of the image. "
         "The ground is taken for a plane. An image that is not surely found is refused, with the reason."
     )
-    OPTIONS = (PICTURE[0], ITS_MASK, REFERENCE, REPORT, *PICTURE[1:], *MASK_VALUES, *SEGMENT, *CAMERA, OUTPUT_FOLDER)
+    OPTIONS = (
+        PICTURE[0],
+        ITS_MASK,
+        REFERENCE,
+        AREA,
+        REPORT,
+        *PICTURE[1:],
+        *MASK_VALUES,
+        *SEGMENT,
+        *CAMERA,
+        OUTPUT_FOLDER,
+    )
     OUTPUTS = _LOCATION_OUTPUTS
 
     def work(self, values: Values, session: Session) -> dict[str, Any]:
         """Locate the mask and warp the image; load both results."""
-        image, folder = values.raster("IMAGE"), values.get("String", "OUTPUT_FOLDER")
+        image = values.raster("IMAGE")
         mask = values.raster("MASK") if values.given("MASK") else image
-        to = ["--json", f"--out-dir={folder}", *([f"--image={image}"] if values.given("MASK") else [])]
-        found = session.call("locate", mask, *to, *self.arguments(values))
-        shown = _show_location(found, Path(folder) / Path(mask).stem, session)
-        return {"OUTPUT_FOLDER": folder, **shown, **_show_report(values, Path(folder) / Path(mask).stem, session)}
+        drawn = [f"--image={image}"] if values.given("MASK") else []
+        return _locate(mask, image, [*drawn, *self.arguments(values)], values, session)
 
 
 class LocateMasks(RoadgeoAlgorithm):
@@ -225,7 +272,7 @@ class LocateMasks(RoadgeoAlgorithm):
     def work(self, values: Values, session: Session) -> dict[str, Any]:
         """Locate them; load the footprints."""
         masks, folder = values.get("String", "MASKS"), values.get("String", "OUTPUT_FOLDER")
-        to = ["--json", f"--out-dir={folder}"]
+        to = ["--json", f"--out-dir={folder}", *_references(values)]
         found = session.call("locate", masks, *to, *self.arguments(values), some_may_fail=True)
         results = {"OUTPUT_FOLDER": folder, **_count(found)}
         summary = Path(folder) / "roadgeo_summary.gpkg"
@@ -235,7 +282,7 @@ class LocateMasks(RoadgeoAlgorithm):
 
 
 class VectorizeMask(RoadgeoAlgorithm):
-    """What the program sees."""
+    """Roads as the program sees them."""
 
     NAME, TITLE = "vectorizemask", "Vectorize mask or photograph"
     TAGS = "skeleton centre lines trace roads intersections"
@@ -270,43 +317,48 @@ class MapLocalizability(RoadgeoAlgorithm):
 
     def work(self, values: Values, session: Session) -> dict[str, Any]:
         """Try masks all over the map; load what that shows."""
-        reference, folder = values.get("File", "REFERENCE"), values.get("String", "OUTPUT_FOLDER")
+        reference, folder = values.get("String", "REFERENCE"), values.get("String", "OUTPUT_FOLDER")
         session.call("evaluate", reference, "--map", "--json", f"--out-dir={folder}", *self.arguments(values))
         path = Path(folder) / f"{Path(reference).stem}_localizability.tif"
         return {"OUTPUT_FOLDER": folder, "MAP": session.show(path, f"{Path(reference).stem}: where it would work")}
 
 
-def _show_report(values: Values, stem: Path, session: Session) -> dict[str, Any]:
-    """Return the report that was asked for, to be opened in the browser."""
-    page = stem.with_name(f"{stem.name}_report.html")
-    if not values.get("Boolean", "REPORT") or not page.exists():
-        return {}
-    session.pages.append(page)
-    return {"REPORT_PAGE": str(page)}
-
-
-def _show_location(found: list[dict[str, Any]], stem: Path, session: Session) -> dict[str, Any]:
-    """Return the outputs of a location, and load the layers of one that was found."""
+def _locate(mask: str, picture: str, options: list[str], values: Values, session: Session) -> dict[str, Any]:
+    """Locate a mask, load the result, and keep it for the message bar."""
+    folder = values.get("String", "OUTPUT_FOLDER")
+    to = ["--json", f"--out-dir={folder}", "--also=match-points", *_references(values)]
+    found = session.call("locate", mask, *to, *options)
     if not found:
-        return {}
-    location = found[0]
-    results = {"STATUS": location["status"], "REASON": location["reason"]}
+        return {"OUTPUT_FOLDER": folder}
+    location, stem = found[0], Path(folder) / Path(mask).stem
+    page, points = stem.with_name(f"{stem.name}_report.html"), Path(folder) / f"{Path(picture).name}_matches.points"
+    results = {"OUTPUT_FOLDER": folder, "STATUS": location["status"], "REASON": location["reason"]}
+    if values.get("Boolean", "REPORT") and page.exists():
+        session.pages.append(page)
+        results["REPORT_PAGE"] = str(page)
+    points_there, page_there = (str(path) if path.exists() else "" for path in (points, page))
+    session.finding = Finding(stem.name, picture, points_there, page_there, location, values.parameters)
     if location["status"] != "located":
         session.feedback.pushWarning(f"{stem.name}: {location['reason']}")
         return results
+    session.show_map(values.get("String", "REFERENCE") or location["reference"])
+    return {**results, **_show_location(location, stem, {PICTURE_KEPT: picture, POINTS_KEPT: points_there}, session)}
+
+
+def _show_location(location: dict[str, Any], stem: Path, kept: dict[str, str], session: Session) -> dict[str, Any]:
+    """Return the outputs of a location, and load its layers."""
     footprint, package = stem.with_name(f"{stem.name}_footprint.tif"), stem.with_name(f"{stem.name}_location.gpkg")
     name = stem.name
     session.show(package, f"{name} matches", "matches", name)
     session.show(package, f"{name} residuals", "residuals", name)
     session.show(package, f"{name} roads", "query_roads", name)
     return {
-        **results,
         "LONGITUDE": location["center"]["lon"],
         "LATITUDE": location["center"]["lat"],
         "GSD": location["gsd_m"],
         "ROTATION": location["rotation_deg"],
         "LOG10_ODDS": location["log10_odds"],
-        "LOCATION": session.show(package, f"{name} footprint", "footprint", name),
+        "LOCATION": session.show(package, f"{name} footprint", "footprint", name, kept),
         "FOOTPRINT": session.show(footprint, name, group=name),
     }
 
@@ -317,4 +369,83 @@ def _count(found: list[dict[str, Any]]) -> dict[str, Any]:
     return {"LOCATED": located, "NOT_LOCATED": len(statuses) - located - failed, "FAILED": failed}
 
 
-ALGORITHMS = (BuildReference, LocateMask, LocateMasks, VectorizeMask, GeoreferenceImage, MapLocalizability)
+class PlaceByPoints(RoadgeoAlgorithm):
+    """A picture by control points that somebody set."""
+
+    NAME, TITLE = "placebypoints", "Put picture on the map by control points"
+    TAGS = "georeference warp gcp homography projective refit"
+    HELP = (
+        "Draws a picture where control points have it: by the homography with the least squared distances on the map, "
+        "which is what a camera makes of level ground. The panel to mend a place by hand writes such points, and so "
+        "does the Georeferencer."
+    )
+    OPTIONS = POINTS
+    OUTPUTS: ClassVar[dict[str, tuple[Any, str]]] = {
+        "FOOTPRINT": (QgsProcessingOutputRasterLayer, "On the map"),
+        "RMS": (QgsProcessingOutputNumber, "Root mean square of the residuals, map units"),
+    }
+
+    def work(self, values: Values, session: Session) -> dict[str, Any]:
+        """Fit the homography, and have the picture drawn by it."""
+        from .placing import make_location
+
+        picture, folder = values.raster("IMAGE"), values.get("String", "OUTPUT_FOLDER")
+        location, rms = make_location(picture, values.get("File", "POINTS"))
+        told = Path(folder) / f"{Path(picture).stem}_placed.json"
+        told.parent.mkdir(parents=True, exist_ok=True)
+        told.write_text(json.dumps(location), "utf-8")
+        session.call("apply", str(told), picture, f"--out-dir={folder}", *self.arguments(values))
+        name = Path(picture).stem
+        drawn = session.show(Path(folder) / f"{name}_footprint.tif", f"{name} by points")
+        return {"OUTPUT_FOLDER": folder, "FOOTPRINT": drawn, "RMS": rms}
+
+
+class SetUp(RoadgeoAlgorithm):
+    """The program itself."""
+
+    NAME, TITLE = "setup", "Set up roadgeo"
+    TAGS = "install environment python pip first run"
+    HELP = (
+        "Finds the program roadgeo, which does the work in a Python of its own, tries it, and remembers it. Or "
+        "installs it, into an environment that is made for it: neither QGIS nor the system changes."
+    )
+    OPTIONS = SETUP
+    OUTPUTS: ClassVar[dict[str, tuple[Any, str]]] = {
+        "FOUND": (QgsProcessingOutputString, "The program, or the Python that has it"),
+        "VERSION": (QgsProcessingOutputString, "Its version"),
+    }
+
+    def canExecute(self) -> tuple[bool, str]:
+        """Whatever is there."""
+        return True, ""
+
+    def work(self, values: Values, session: Session) -> dict[str, Any]:
+        """Find or install it, and call it."""
+        program = shutil.which(values.get("File", "PROGRAM")) or values.get("File", "PROGRAM")
+        if values.get("Boolean", "INSTALL"):
+            source, folder = values.get("String", "SOURCE"), values.get("File", "FOLDER")
+            found = install(program, source, Path(folder), session)
+        else:
+            found = program or locate_executable() or ""
+        if not found:
+            raise QgsProcessingException(f"{NOT_FOUND} To install it, tick “{SETUP[1].label}”.")
+        version = ask_version(found, session)
+        self.found = found
+        return {"FOUND": found, "VERSION": version}
+
+    def postProcessAlgorithm(self, context: Any, feedback: Any) -> dict[str, Any]:
+        """Remember it, where QGIS keeps its settings."""
+        configure(self.found)
+        return super().postProcessAlgorithm(context, feedback)
+
+
+ALGORITHMS = (
+    BuildReference,
+    LocateMask,
+    LocateMasks,
+    VectorizeMask,
+    GeoreferenceImage,
+    MapLocalizability,
+    PlaceByPoints,
+    SetUp,
+)

@@ -1,4 +1,4 @@
-"""Parameters of the algorithms, and what each of them says on roadgeo's command line."""
+"""Parameters of the algorithms, and their form on roadgeo's command line."""
 
 from __future__ import annotations
 
@@ -29,7 +29,10 @@ from qgis.core import (
     QgsProviderRegistry,
 )
 
+from .environment import ENVIRONMENT
+
 __all__ = [
+    "AREA",
     "BATCH",
     "CAMERA",
     "ITS_MASK",
@@ -39,18 +42,20 @@ __all__ = [
     "OUTPUT_FOLDER",
     "PICTURE",
     "PIXEL_SIZE",
+    "POINTS",
     "QUERY",
     "REFERENCE",
     "REPORT",
     "ROADS",
     "SEGMENT",
+    "SETUP",
     "Option",
     "Values",
 ]
 
 
 class Values:
-    """What the user set."""
+    """The values that the user set."""
 
     def __init__(self, algorithm: Any, parameters: dict[str, Any], context: Any, feedback: Any) -> None:
         self.algorithm, self.parameters, self.context, self.feedback = algorithm, parameters, context, feedback
@@ -85,10 +90,15 @@ class Values:
         return str(path)
 
     def lines(self, name: str) -> tuple[str, str, str]:
-        """Return file, layer and CRS of a layer of lines; what is no file that roadgeo reads is saved as one."""
+        """Return file, layer and CRS of a layer of lines; one that roadgeo cannot read is saved as a file."""
         formats = ["gpkg", "shp", "geojson", "json", "fgb"]
         path, layer = self.get("CompatibleSourceLayerPathAndLayerName", name, formats, formats[0], self.feedback)
         return path, layer, name_crs(self.get("Source", name).sourceCrs())
+
+    def layer_name(self, name: str) -> str:
+        """Return the name of a layer of lines; "" where none is given."""
+        source = self.get("Source", name) if self.given(name) else None
+        return "" if source is None else str(source.sourceName())
 
 
 def name_crs(crs: Any) -> str:
@@ -108,11 +118,15 @@ class Option:
     hint : str
         What it is for.
     say : callable
-        What its value says on the command line; asked only where it has one.
+        Its value as arguments of the command line; called only where it has one.
     settings : dict
         What else its definition takes.
     folded : bool
         Below "Advanced parameters".
+    flag : str
+        Its name on the command line, which messages may use.
+    metadata : dict
+        Metadata for QGIS's dialogs.
     """
 
     kind: Any
@@ -122,17 +136,20 @@ class Option:
     say: Callable[[Values, str], list[str]] = lambda *_: []
     settings: dict[str, Any] = field(default_factory=dict)
     folded: bool = False
+    flag: str = ""
+    metadata: dict[str, Any] = field(default_factory=dict)
 
     def define(self) -> Any:
         """Make its definition, which QGIS then owns."""
         definition = self.kind(self.name, self.label, **self.settings)
         definition.setHelp(self.hint)
+        definition.setMetadata(self.metadata)
         if self.folded:
             definition.setFlags(definition.flags() | QgsProcessingParameterDefinition.Flag.FlagAdvanced)
         return definition
 
     def arguments(self, values: Values) -> list[str]:
-        """Return what it says on the command line."""
+        """Return it as arguments of the command line."""
         return self.say(values, self.name) if values.given(self.name) else []
 
 
@@ -169,6 +186,12 @@ def _box(values: Values, name: str) -> list[str]:
     return [f"--bbox={box.xMinimum():.9g},{box.yMinimum():.9g},{box.xMaximum():.9g},{box.yMaximum():.9g}"]
 
 
+def _area(values: Values, name: str) -> list[str]:
+    if values.given("WITHIN"):
+        raise QgsProcessingException("Say where it lies by name or by a part of the map, not by both")
+    return [text.replace("--bbox", "--within") for text in _box(values, name)]
+
+
 def _lines(values: Values, name: str) -> list[str]:
     path, layer, crs = values.lines(name)
     return [f"--roads={path}", *([f"--layer={layer}"] if layer else []), f"--crs={crs}"]
@@ -184,26 +207,29 @@ def _maybe_unset(settings: dict[str, Any]) -> dict[str, Any]:
 
 def _number(flag: str, name: str, label: str, hint: str, **settings: Any) -> Option:
     settings = {"type": QgsProcessingParameterNumber.Type.Double, **_maybe_unset(settings)}
-    return Option(QgsProcessingParameterNumber, name, label, hint, _said(flag, "Double", "{:.12g}"), settings)
+    return Option(
+        QgsProcessingParameterNumber, name, label, hint, _said(flag, "Double", "{:.12g}"), settings, flag=flag
+    )
 
 
 def _integer(flag: str, name: str, label: str, hint: str, **settings: Any) -> Option:
     settings = {"type": QgsProcessingParameterNumber.Type.Integer, **_maybe_unset(settings)}
-    return Option(QgsProcessingParameterNumber, name, label, hint, _said(flag, "Int"), settings)
+    return Option(QgsProcessingParameterNumber, name, label, hint, _said(flag, "Int"), settings, flag=flag)
 
 
 def _text(flag: str, name: str, label: str, hint: str) -> Option:
-    return Option(QgsProcessingParameterString, name, label, hint, _said(flag, "String"), {"optional": True})
+    return Option(QgsProcessingParameterString, name, label, hint, _said(flag, "String"), {"optional": True}, flag=flag)
 
 
 def _switch(flag: str, name: str, label: str, hint: str) -> Option:
-    return Option(QgsProcessingParameterBoolean, name, label, hint, _switched(flag), {"defaultValue": False})
+    settings = {"defaultValue": False}
+    return Option(QgsProcessingParameterBoolean, name, label, hint, _switched(flag), settings, flag=flag)
 
 
 def _choice(flag: str, name: str, label: str, hint: str, words: list[str], **settings: Any) -> Option:
     """Make a choice among words of the command line."""
     settings = {"options": words, "usesStaticStrings": True, **_maybe_unset(settings)}
-    return Option(QgsProcessingParameterEnum, name, label, hint, _chosen(flag), settings)
+    return Option(QgsProcessingParameterEnum, name, label, hint, _chosen(flag), settings, flag=flag)
 
 
 def _raster(name: str, label: str, hint: str) -> Option:
@@ -244,6 +270,7 @@ MASK_VALUES = _fold(
         _BAND_HINT,
         _said("--band", "Int"),
         {"parentLayerParameterName": "MASK", "optional": True},
+        flag="--band",
     ),
     _THRESHOLD,
 )
@@ -264,6 +291,7 @@ SEGMENT = _fold(
         "A segmentation model, as QGIS's Deepness takes them. Empty: the one that ships with roadgeo.",
         _said("--segmenter", "File"),
         {"extension": "onnx", "optional": True},
+        flag="--segmenter",
     ),
 )
 
@@ -272,12 +300,13 @@ REPORT = _switch(
 )
 
 REFERENCE = Option(
-    QgsProcessingParameterFile,
+    QgsProcessingParameterString,
     "REFERENCE",
     "Road reference",
-    "What Build road reference made. Empty: all references of roadgeo's library are searched.",
-    _said("--reference", "File"),
-    {"extension": "gpkg", "optional": True},
+    "What Build road reference made: one of the list, or a file. Empty: all that there are.",
+    settings={"optional": True},
+    flag="--reference",
+    metadata={"widget_wrapper": {"class": f"{__package__}.references.ReferenceWrapper"}},
 )
 
 PIXEL_SIZE = _fold(
@@ -288,6 +317,7 @@ PIXEL_SIZE = _fold(
         "How much ground a pixel at the middle of the mask covers, at least and at most: the search is narrowed.",
         _scales,
         {"type": QgsProcessingParameterNumber.Type.Double, "defaultValue": 0.1, "minValue": 1e-3},
+        flag="--gsd",
     ),
     Option(
         QgsProcessingParameterNumber,
@@ -308,7 +338,7 @@ CAMERA = PIXEL_SIZE + _fold(
         maxValue=80.0,
     ),
     _text(
-        "--camera",
+        "--focal",
         "FOCAL_LENGTH",
         "Focal length",
         "In pixels of the mask; or the word exif: as the image, or else the mask, says. Empty: not known.",
@@ -321,6 +351,7 @@ CAMERA = PIXEL_SIZE + _fold(
         "The middle of the mask lies near this place.",
         _near,
         {"optional": True},
+        flag="--near",
     ),
     Option(
         QgsProcessingParameterNumber,
@@ -332,9 +363,8 @@ CAMERA = PIXEL_SIZE + _fold(
     _text(
         "--within",
         "WITHIN",
-        "In the area",
-        "The middle of the mask lies in this country or state (Liechtenstein; USA - Utah), or within"
-        " WEST,SOUTH,EAST,NORTH in degrees. Empty: not known.",
+        "In the country or state",
+        "The middle of the mask lies in this country or state (Liechtenstein; USA - Utah). Empty: not known.",
     ),
     _choice(
         "--effort",
@@ -354,7 +384,17 @@ CAMERA = PIXEL_SIZE + _fold(
     ),
 )
 
-#: What `--also` offers: name and what it is for, written down when the plugin is installed or packed.
+AREA = Option(
+    QgsProcessingParameterExtent,
+    "AREA",
+    "It lies on this part of the map",
+    "The middle of the image lies there: with the map canvas extent, near what you see. Empty: not known.",
+    _area,
+    {"optional": True},
+    flag="--within",
+)
+
+#: Outputs that `--also` offers, with their purpose: written when the plugin is installed or packed.
 _OUTPUTS: dict[str, str] = json.loads((Path(__file__).parent / "outputs.json").read_text("utf-8"))
 
 PICTURE = (
@@ -370,6 +410,7 @@ PICTURE = (
         "Empty: the reference's own, which is metric.",
         _crs,
         {"optional": True},
+        flag="--crs",
     ),
     *_fold(
         _number(
@@ -399,8 +440,9 @@ PICTURE = (
 )
 
 BATCH = (
-    _folder("MASKS", "Folder of road masks", "Every image in it is located."),
+    _folder("MASKS", "Folder of road masks or photographs", "Every image in it is located."),
     REFERENCE,
+    AREA,
     _integer(
         "--jobs",
         "JOBS",
@@ -429,6 +471,7 @@ ROADS = (
         "A layer of roads. Or leave it empty, and name a place or an extent: its roads come from OpenStreetMap.",
         _lines,
         {"types": [QgsProcessing.SourceType.TypeVectorLine], "optional": True},
+        flag="--roads",
     ),
     _text("--osm", "PLACE", "Place", "The name of a place in OpenStreetMap, such as Boston, MA."),
     Option(
@@ -438,7 +481,9 @@ ROADS = (
         "Roads in it come from OpenStreetMap; or the road lines are cut to it.",
         _box,
         {"optional": True},
+        flag="--bbox",
     ),
+    _text("--name", "NAME", "Name", "Of the reference, in the list. Empty: after the place, the file or the layer."),
     _choice(
         "--kinds",
         "KINDS",
@@ -450,15 +495,15 @@ ROADS = (
     ),
     *_fold(
         _switch("--tunnels", "TUNNELS", "Tunnels too", "A camera does not see them."),
-        _text("--name", "NAME", "Name", "Name of the reference. Empty: after the place, or else the result's file."),
         _text("--attribution", "ATTRIBUTION", "Attribution", "Whom to name beside the map; goes with road lines."),
     ),
     Option(
         QgsProcessingParameterFileDestination,
         "OUTPUT",
-        "Road reference",
-        "A GeoPackage; its search index, of the same name, lies beside it.",
-        settings={"fileFilter": "GeoPackage (*.gpkg)"},
+        "Keep it in a file of its own",
+        "A GeoPackage; its search index, of the same name, lies beside it. Empty: it is kept in roadgeo's library.",
+        settings={"fileFilter": "GeoPackage (*.gpkg)", "optional": True, "createByDefault": False},
+        flag="--out",
     ),
 )
 
@@ -469,9 +514,8 @@ OUTPUT_FOLDER = Option(
 LOCALIZABILITY = (
     replace(
         REFERENCE,
-        hint="What Build road reference made.",
-        say=lambda *_: [],
-        settings={"extension": "gpkg", "optional": False},
+        hint="What Build road reference made: one of the list, or a file.",
+        settings={"optional": False},
     ),
     _number(
         "--height",
@@ -503,4 +547,51 @@ LOCALIZABILITY = (
         _integer("--jobs", "JOBS", "Processes", "How many masks are tried at once.", defaultValue=1, minValue=1),
     ),
     OUTPUT_FOLDER,
+)
+
+POINTS = (
+    _raster("IMAGE", "Picture", "Any, of any number of bands."),
+    Option(
+        QgsProcessingParameterFile,
+        "POINTS",
+        "Control points",
+        "Four or more, not on one line; a file of the Georeferencer, or of the panel to mend a place by hand.",
+        settings={"extension": "points"},
+    ),
+    replace(PICTURE[1], hint="Empty: that of the points."),
+    *PICTURE[2:4],
+    OUTPUT_FOLDER,
+)
+
+SETUP = (
+    Option(
+        QgsProcessingParameterFile,
+        "PROGRAM",
+        "Program roadgeo, or a Python",
+        "The program, or the Python that has it or that is to have it, 3.11 or newer. Empty: searched for.",
+        settings={"optional": True, "fileFilter": "All files (*)"},  # "*.*", the usual, refuses names without a dot
+    ),
+    _switch(
+        "",
+        "INSTALL",
+        "Install roadgeo into an environment of its own",
+        "With that Python, in the folder below; takes some minutes, about 1 GB, and the network.",
+    ),
+    *_fold(
+        Option(
+            QgsProcessingParameterString,
+            "SOURCE",
+            "What to install",
+            "As pip takes it: roadgeo, or an address, a folder or a wheel that you have. [desktop] adds all "
+            "that building references and photographs need.",
+            settings={"defaultValue": "roadgeo[desktop]"},
+        ),
+        _folder(
+            "FOLDER",
+            "Folder of the environment",
+            "Made if it is missing.",
+            defaultValue=str(ENVIRONMENT),
+            optional=True,
+        ),
+    ),
 )

@@ -6,7 +6,6 @@ from pathlib import Path
 from typing import Any
 
 from qgis.core import QgsApplication, QgsProcessingProvider
-from qgis.PyQt.QtCore import Qt
 from qgis.PyQt.QtGui import QIcon
 
 from .algorithms import ALGORITHMS
@@ -51,13 +50,12 @@ class RoadgeoProvider(QgsProcessingProvider):
 
 
 class RoadgeoPlugin:
-    """What QGIS loads and unloads."""
+    """The object that QGIS loads and unloads."""
 
     def __init__(self, iface: Any = None) -> None:
         self.iface = iface
         self.provider: RoadgeoProvider | None = None
-        self.dock: Any = None
-        self.action: Any = None
+        self.menu: Any = None
 
     def initProcessing(self) -> None:
         """Register the provider; without a window only this is called."""
@@ -65,24 +63,16 @@ class RoadgeoPlugin:
         QgsApplication.processingRegistry().addProvider(self.provider)
 
     def initGui(self) -> None:
-        """Start in a window: with a panel, which is shown when it is asked for."""
+        """Start in a window: with menu, button and panel."""
         self.initProcessing()
-        if self.iface is None:
-            return
-        from .dock import MatchDock
+        if self.iface is not None:
+            from .menu import Menu
 
-        self.dock = MatchDock(self.iface.mainWindow())
-        self.iface.addDockWidget(Qt.DockWidgetArea.BottomDockWidgetArea, self.dock)
-        self.dock.hide()
-        self.action = self.dock.toggleViewAction()
-        self.action.setIcon(QIcon(str(Path(__file__).parent / "icon.png")))
-        self.iface.addPluginToMenu("roadgeo", self.action)
+            self.menu = Menu(self.iface)
 
     def unload(self) -> None:
         """Leave."""
-        if self.dock is not None:
-            self.iface.removePluginMenu("roadgeo", self.action)
-            self.iface.removeDockWidget(self.dock)
-            self.dock.deleteLater()
-            self.dock = None
+        if self.menu is not None:
+            self.menu.remove()
+            self.menu = None
         QgsApplication.processingRegistry().removeProvider(self.provider)

@@ -34,7 +34,7 @@ class Match:
 
 @dataclass(frozen=True)
 class Fit:
-    """What goes through the matches.
+    """The homography through the matches.
 
     Attributes
     ----------
@@ -55,7 +55,7 @@ class Fit:
 
 
 def read_points(path: str | Path) -> tuple[str, list[Match]]:
-    """Read a control-point file: the map's CRS as WKT ("" where it is not told), and the matches.
+    """Read a control-point file: the map's CRS as WKT ("" where it is missing), and the matches.
 
     Raises
     ------

@@ -1,4 +1,4 @@
-"""The roadgeo executable as a child process: where it is, what it inherits, what it says, how it is stopped.
+"""The roadgeo executable as a child process: where it is, its environment, its output, how it is stopped.
 
 Knows nothing of QGIS, whose Python carries other versions of the libraries that roadgeo uses: nothing of roadgeo is
 imported here, nor anything of QGIS there.
@@ -9,16 +9,25 @@ from __future__ import annotations
 import contextlib
 import os
 import queue
+import re
 import shutil
 import signal
-import subprocess
+import subprocess  # nosec B404
 import sys
 import threading
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from pathlib import Path
 from typing import IO, Any
 
-__all__ = ["REMEMBERED", "child_environment", "find_executable", "run"]
+__all__ = [
+    "REMEMBERED",
+    "as_command",
+    "child_environment",
+    "find_executable",
+    "find_pythons",
+    "in_words_of_qgis",
+    "run",
+]
 
 #: File beside this one in which `roadgeo qgis install` leaves the path of the executable that ran it.
 REMEMBERED = "executable.txt"
@@ -41,7 +50,16 @@ _PLACES = (
     "AppData/Local/Programs/Python/Python3*/Scripts",
 )
 
-#: What QGIS sets for its own Python, PROJ and GDAL would break another's.
+#: Commands that messages name, and their counterparts in QGIS.
+_COMMANDS = {
+    "apply": "Mend a place by hand",
+    "index": "Build road reference",
+    "reference": "the list of road references",
+    "locate": "Locate mask or photograph",
+    "vectorize": "Vectorize mask or photograph",
+}
+
+#: Variables that QGIS sets for its own Python, PROJ and GDAL would break another's.
 _NOT_INHERITED = ("PYTHON", "__PYVENV", "PROJ_", "GDAL_")
 
 #: How long a child may take to clean up after it was asked to stop, and how often we look whether it should.
@@ -54,8 +72,8 @@ def find_executable(configured: str, environ: Mapping[str, str], home: Path, bes
     Parameters
     ----------
     configured : str
-        Path from the settings; "" searches: ROADGEO_EXECUTABLE, what the installer left in the folder `beside`, PATH,
-        and the usual places below `home`.
+        Path from the settings; "" searches: ROADGEO_EXECUTABLE, the path that the installer left in the folder
+        `beside`, PATH, and the usual places below `home`.
     """
     if configured:
         return _executable(Path(configured).expanduser())
@@ -67,8 +85,40 @@ def find_executable(configured: str, environ: Mapping[str, str], home: Path, bes
     return next(filter(None, map(_executable, candidates)), None)
 
 
+def find_pythons(environ: Mapping[str, str], home: Path) -> list[str]:
+    """List Pythons that roadgeo may be installed with, the newest first where the name says so."""
+    ending = ".exe" if sys.platform == "win32" else ""
+    names = [*(f"python3.{minor}" for minor in range(15, 10, -1)), "python3", "python"]
+    found = [shutil.which(name, path=environ.get("PATH", "")) for name in names]
+    found += [str(Path(sys.prefix, part, f"python3{ending}")) for part in ("bin", "")]  # that of QGIS
+    found += [str(path) for path in sorted(home.glob(f"AppData/Local/Programs/Python/Python3*/python{ending}"))]
+    return list(dict.fromkeys(path for path in found if path and _executable(Path(path))))
+
+
+def as_command(path: str) -> list[str]:
+    """Return how roadgeo is called by a path from the settings: its program, or a Python that has it."""
+    is_python = re.match(r"python[\d.]*(\.exe)?$", Path(path).name.lower())
+    return [path, "-P", "-m", "roadgeo"] if is_python else [path]
+
+
 def _executable(path: Path) -> str | None:
     return str(path) if path.is_file() and os.access(path, os.X_OK) else None
+
+
+def in_words_of_qgis(text: str, labels: Mapping[str, str]) -> str:
+    """Return a message of the program with QGIS's names for its commands and options.
+
+    Parameters
+    ----------
+    labels : mapping
+        Of the options of the algorithm that runs, by their names on the command line.
+    """
+    text = re.sub(
+        r"`roadgeo (\w+)[^`]*`", lambda found: f"“{_COMMANDS[found[1]]}”" if found[1] in _COMMANDS else found[0], text
+    )
+    text = re.sub(r" ?Try 'roadgeo [^']*'\.?", "", text)
+    text = re.sub(r"pip install '(roadgeo\[\w+\])'", r"“Set up roadgeo” installs \1", text)
+    return re.sub(r"--[a-z][a-z-]*", lambda found: f"“{labels[found[0]]}”" if found[0] in labels else found[0], text)
 
 
 def child_environment(environ: Mapping[str, str]) -> dict[str, str]:
@@ -93,7 +143,8 @@ def run(command: Sequence[str], handle: Callable[[str, str], None], is_cancelled
     else:
         options["start_new_session"] = True
     pipe = subprocess.PIPE
-    with subprocess.Popen(command, stdin=subprocess.DEVNULL, stdout=pipe, stderr=pipe, **options) as process:  # noqa: S603 (ours)
+    options.update(stdin=subprocess.DEVNULL, stdout=pipe, stderr=pipe)
+    with subprocess.Popen(command, **options) as process:  # noqa: S603 # nosec B603
         stopping = None
         try:
             for line in _lines(process):
@@ -146,7 +197,7 @@ def _kill(process: subprocess.Popen[str]) -> None:
     """End the child and all that it started."""
     if sys.platform == "win32":
         command = ["taskkill", "/F", "/T", "/PID", str(process.pid)]
-        subprocess.run(command, capture_output=True, check=False)  # noqa: S603
+        subprocess.run(command, capture_output=True, check=False)  # noqa: S603 # nosec B603
     else:
         with contextlib.suppress(ProcessLookupError):
             os.killpg(process.pid, signal.SIGKILL)

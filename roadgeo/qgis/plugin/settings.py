@@ -1,4 +1,4 @@
-"""Where the executable is: an entry of Processing's settings, or found."""
+"""The plugin's memory: where roadgeo is, as an entry of Processing's settings, and which references it built."""
 
 from __future__ import annotations
 
@@ -7,23 +7,36 @@ from pathlib import Path
 from typing import Any
 
 from processing.core.ProcessingConfig import ProcessingConfig, Setting
+from qgis.core import QgsSettings
 
-from .runner import find_executable
+from .runner import as_command, find_executable
 
-__all__ = ["NOT_FOUND", "add_settings", "locate_executable", "remove_settings"]
+__all__ = [
+    "NOT_FOUND",
+    "add_settings",
+    "configure",
+    "locate_command",
+    "locate_executable",
+    "remember_reference",
+    "remembered_references",
+    "remove_settings",
+]
 
-_EXECUTABLE = "ROADGEO_EXECUTABLE"
+_EXECUTABLE, _REFERENCES = "ROADGEO_EXECUTABLE", "roadgeo/references"
+
+#: How many references are remembered.
+_MOST = 30
 
 NOT_FOUND = (
-    "The program roadgeo was not found. Install it as its README tells, then run `roadgeo qgis install`; or set its "
-    "path in Settings > Options > Processing > Providers > roadgeo."
+    "The program roadgeo was not found on this computer. Plugins > roadgeo > Set up roadgeo finds or installs it; or "
+    "set its path in Settings > Options > Processing > Providers > roadgeo."
 )
 
 
 def add_settings(group: str, icon: Any) -> None:
     """Add the entry to Processing's settings."""
     ProcessingConfig.settingIcons[group] = icon
-    label = "Path of the executable roadgeo (empty: search for it)"
+    label = "Program roadgeo, or a Python that has it (empty: search for it)"
     ProcessingConfig.addSetting(Setting(group, _EXECUTABLE, label, "", valuetype=Setting.FILE))
     ProcessingConfig.readSettings()
 
@@ -33,7 +46,30 @@ def remove_settings() -> None:
     ProcessingConfig.removeSetting(_EXECUTABLE)
 
 
+def configure(path: str) -> None:
+    """Remember where roadgeo is: its program, or a Python that has it."""
+    ProcessingConfig.setSettingValue(_EXECUTABLE, path)
+
+
 def locate_executable() -> str | None:
-    """Return the path of the executable, or None."""
+    """Return the path of the program, or of a Python that has it; None where there is none."""
     configured = str(ProcessingConfig.getSetting(_EXECUTABLE) or "")
     return find_executable(configured, os.environ, Path.home(), Path(__file__).parent)
+
+
+def locate_command() -> list[str] | None:
+    """Return how roadgeo is called, or None."""
+    executable = locate_executable()
+    return None if executable is None else as_command(executable)
+
+
+def remember_reference(path: str) -> None:
+    """Remember a reference that lies outside roadgeo's library."""
+    kept = [one for one in remembered_references() if one != path]
+    QgsSettings().setValue(_REFERENCES, "\n".join([path, *kept][:_MOST]))
+
+
+def remembered_references() -> list[str]:
+    """List the references that were built outside roadgeo's library and are still there, the newest first."""
+    paths = str(QgsSettings().value(_REFERENCES, "") or "").split("\n")
+    return [path for path in paths if path and Path(path).exists()]
