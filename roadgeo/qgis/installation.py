@@ -66,7 +66,7 @@ def write_package(path: str | os.PathLike[str], publisher: Mapping[str, str] | N
     Parameters
     ----------
     publisher : mapping, optional
-        Fields that the repository requires: `email`, `repository`, `tracker`, `homepage`. Default: as the package says.
+        Fields that the repository requires: `email`, `repository`, `tracker`, `homepage`. Default: as in the package.
 
     Raises
     ------

@@ -156,7 +156,7 @@ class MatchDock(QDockWidget):
     Attributes
     ----------
     matches : list of Match
-        As they are now; `found` is what goes through them.
+        The current ones; `found` is the fit through them.
     apart : list of float
         Of each, on or off, how far it lies from where the fit puts it: metres where the CRS is known, else map units.
     adding : bool
@@ -399,7 +399,7 @@ class MatchDock(QDockWidget):
         self._paint()
 
     def _measure(self) -> Any:
-        """Return what measures metres in the points' CRS; None where that is not known."""
+        """Return the object that measures metres in the points' CRS; None where that is not known."""
         crs = QgsCoordinateReferenceSystem.fromWkt(self.crs) if self.crs else QgsCoordinateReferenceSystem()
         if not crs.isValid():
             return None

@@ -45,7 +45,7 @@ def install(python: str, source: str, folder: Path, session: Session) -> str:
     python : str
         That makes it; "": the first on this computer that can.
     source : str
-        What pip is asked for.
+        The requirement for pip.
 
     Raises
     ------

@@ -116,11 +116,11 @@ class Option:
     kind : type
         Class of its definition, one of `QgsProcessingParameter...`.
     hint : str
-        What it is for.
+        Its purpose.
     say : callable
         Its value as arguments of the command line; called only where it has one.
     settings : dict
-        What else its definition takes.
+        Further arguments of its definition.
     folded : bool
         Below "Advanced parameters".
     flag : str

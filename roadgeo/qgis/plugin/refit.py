@@ -82,7 +82,7 @@ def read_points(path: str | Path) -> tuple[str, list[Match]]:
 
 
 def format_points(crs: str, matches: Sequence[Match], found: Fit) -> str:
-    """Return what `read_points` and the Georeferencer read."""
+    """Return the text that `read_points` and the Georeferencer read."""
     lines = [*([f"#CRS: {crs}"] if crs else []), _COLUMNS]
     for one, apart in zip(matches, found.residuals, strict=True):
         told = apart if math.isfinite(apart) else 0.0

@@ -86,7 +86,7 @@ def find_executable(configured: str, environ: Mapping[str, str], home: Path, bes
 
 
 def find_pythons(environ: Mapping[str, str], home: Path) -> list[str]:
-    """List Pythons that roadgeo may be installed with, the newest first where the name says so."""
+    """List Pythons that roadgeo may be installed with, the newest first as far as names show it."""
     ending = ".exe" if sys.platform == "win32" else ""
     names = [*(f"python3.{minor}" for minor in range(15, 10, -1)), "python3", "python"]
     found = [shutil.which(name, path=environ.get("PATH", "")) for name in names]

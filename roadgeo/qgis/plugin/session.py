@@ -70,9 +70,9 @@ class Finding:
     name, picture, points, page : str
         Name of the picture; the files of it, of its matched intersections and of the report, "" where there is none.
     location : dict
-        What the program printed.
+        Output of the program.
     parameters : dict
-        What the algorithm was given.
+        Parameters of the algorithm.
     """
 
     name: str
@@ -115,7 +115,7 @@ def _move(layer: Any, group: str | None) -> None:
         node.parent().removeChildNode(node)
 
 
-#: QGIS deletes a styler with its context, but keeps no reference to what Python knows of it.
+#: QGIS deletes a styler with its context, but keeps no reference to its Python object.
 _STYLERS: list[_Styler] = []
 
 
@@ -193,7 +193,7 @@ class Session:
     def show(
         self, path: Path, title: str, layer: str = "", group: str | None = "", kept: Mapping[str, str] | None = None
     ) -> str:
-        """Have a result loaded when all is done (see `_Styler`); return what QGIS opens it by."""
+        """Have a result loaded when all is done (see `_Styler`); return the name by which QGIS opens it."""
         source = f"{path}|layername={layer}" if layer else str(path)
         project = self.context.project()
         if project is not None and not self.feedback.isCanceled():
