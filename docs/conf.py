@@ -26,7 +26,7 @@ include_patterns = [
     "*.md",
     "docs/**.md",
     "examples/**/README.md",
-    "examples/locate.ipynb",
+    "examples/*.ipynb",
     "roadgeo/sources/segmentation/model/roads.md",
 ]
 
@@ -34,7 +34,7 @@ exclude_patterns = [".*", "build", "site", "tests", "wheel"]  # folders that nee
 
 extensions = ["myst_nb", "sphinx.ext.autodoc", "sphinx.ext.napoleon"]
 myst_heading_anchors = 4
-nb_execution_mode = "off"  # a test runs the notebook
+nb_execution_mode = "off"  # a test runs the notebooks
 default_role = "literal"
 autodoc_member_order = "bysource"
 autodoc_typehints = "none"  # the docstrings give types with shapes and units
@@ -51,7 +51,7 @@ templates_path = ["templates"]
 
 #: Titles of the sidebar, and the pages below each.
 ORDER = {
-    "Tutorial": ["docs/tutorial", "examples/locate"],
+    "Tutorial": ["docs/tutorial", "examples/georeference", "examples/flight", "examples/locate"],
     "How to": [
         "docs/install",
         "docs/masks",
