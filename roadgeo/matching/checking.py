@@ -13,10 +13,10 @@ from roadgeo.geometry.camera import sampling
 from roadgeo.geometry.displacement import Displacement, measure
 from roadgeo.geometry.homography import Homography
 from roadgeo.matching.carriageways import refine_between
+from roadgeo.matching.evidence import Evidence
 from roadgeo.matching.index import ReferenceIndex
 from roadgeo.matching.local_search import LocalSearchOptions, move_about, search_nearby
 from roadgeo.matching.merged_roads import roads_beside
-from roadgeo.matching.pieces import Pieces, log10_lead, sample_roads
 from roadgeo.matching.refinement import Refined, RefineOptions, refine
 from roadgeo.matching.scene import Scene
 from roadgeo.matching.verification import VerifyOptions, agreement
@@ -49,8 +49,6 @@ class CheckOptions:
         Refinement that moves the corners by more than this has lost its way.
     twin_m : float
         Half the distance between the lines of a dual carriageway, up to 1.8 times as much.
-    piece_m : float
-        Roads agree or not over about this length; pieces are independent.
     perspective_sigma : float
         Prior standard deviation of the perspective that is left: georeferenced images are rectified.
     """
@@ -63,7 +61,6 @@ class CheckOptions:
     min_roads_m: float = 300.0
     max_drift_m: float = 40.0
     twin_m: float = 10.0
-    piece_m: float = 60.0
     perspective_sigma: float = 0.003
     search: LocalSearchOptions = field(default_factory=LocalSearchOptions)
     verify: VerifyOptions = field(default_factory=VerifyOptions)
@@ -121,10 +118,10 @@ def check_place(start: FloatArray, scene: Scene, index: ReferenceIndex, options:
 
 @dataclass(frozen=True)
 class _Place:
-    """A place, the agreement of each piece of the frame there, and its refinement, where that was possible."""
+    """A place, what it explains (log10), and its refinement, where that was possible."""
 
     matrix: FloatArray
-    pieces: FloatArray
+    worth: float
     matched: IntArray
     refined: Refined | None
 
@@ -136,10 +133,7 @@ class _Judge:
         self.scene, self.index, self.start, self.options = scene, index, start, options
         self.gsd = sampling(start, scene.size)
         self.corners = Homography(start)(scene.corners)
-        self._pieces = Pieces(scene, index, self.gsd, options.piece_m, options.verify)
-        reach = 1.5 * options.search.reach_m
-        low, high = self.corners.min(axis=0) - reach, self.corners.max(axis=0) + reach
-        self.samples = sample_roads(index, low, high, self._pieces.step_m)
+        self.evidence = Evidence(scene, index, self.gsd)
         tilted = np.abs(start[2, :2]).max() / abs(start[2] @ np.append(scene.center, 1.0)) * scene.half_size > 0.01
         sigma = options.refine.perspective_sigma if tilted else options.perspective_sigma
         self.refine_options = replace(options.refine, perspective_sigma=sigma)
@@ -147,7 +141,7 @@ class _Judge:
     @property
     def map_length_m(self) -> float:
         """Length of the map's roads inside the frame as it is given, metres."""
-        return self._pieces.step_m * float(self._pieces.in_frame(self.start, self.samples)[1].sum())
+        return self.gsd * self.evidence.mapped_px(self.start)
 
     def propose(self) -> list[FloatArray]:
         """Return the starts of the places nearby."""
@@ -159,7 +153,7 @@ class _Judge:
         """Refine places roughly, and return those that are different ones, the one that agrees best first."""
         places = [self.refine(start, 200) for start in starts]
         distinct: list[_Place] = []
-        for place in sorted(places, key=lambda place: -place.pieces.sum()):
+        for place in sorted(places, key=lambda place: -place.worth):
             if all(self.gap(place.matrix, other.matrix) >= self.options.search.apart_m for other in distinct):
                 distinct.append(place)
         return distinct
@@ -178,7 +172,7 @@ class _Judge:
         if refined is not None and n_points is None:
             refined, _ = refine_between(refined, scene, self.index, matched, self.refine_options)
             matrix = refined.matrix
-        return _Place(matrix, self.pieces(matrix), matched, refined)
+        return _Place(matrix, self.evidence.weigh(matrix), matched, refined)
 
     def without_twins(self, matrix: FloatArray) -> Scene:
         """Return the scene without road points that have parallel roads of the map on both sides.
@@ -193,9 +187,10 @@ class _Judge:
             return scene
         return replace(scene.of_points(alone), road_length_px=scene.road_length_px * alone.mean())
 
-    def pieces(self, matrix: FloatArray) -> FloatArray:
-        """Return the share of the roads in each piece of the frame that agree; a half where there are none."""
-        return self._pieces.count(matrix, self.samples).shares
+    def agreeing(self, matrix: FloatArray) -> float:
+        """Return the share of the roads, of mask and map, that agree."""
+        found, _, _ = agreement(matrix, self.scene, self.index, self.gsd, _NO_SEEDS, self.options.verify)
+        return (found.forward + found.backward) / 2.0
 
     def displacement(self, place: _Place) -> Displacement:
         """Return how far a place lies from the given one."""
@@ -208,21 +203,17 @@ class _Judge:
         return float(np.sqrt(np.mean(np.sum(gaps**2, axis=1))))
 
 
-def _lead(a: _Place, b: _Place) -> float:
-    """Log10 odds that one place agrees better than another by more than chance."""
-    return log10_lead(a.pieces - b.pieces)
-
-
 def _judge_best(judge: _Judge, places: Sequence[_Place]) -> Checked:
     """Judge the best of some places, the best first, against the others."""
     # The best place against the rival that comes nearest to it.
     options = judge.options
     best = judge.refine(places[0].matrix, None)
     rivals = [place for place in places[1:] if judge.gap(place.matrix, best.matrix) >= options.search.apart_m]
-    hardest = min(rivals, key=lambda rival: _lead(best, rival), default=None)
+    leads = [judge.evidence.lead(best.matrix, [rival.matrix]) for rival in rivals]
+    lead, hardest = min(zip(leads, rivals, strict=True), key=lambda one: one[0], default=(0.0, None))
     if best.refined is None or hardest is None:
         return Checked("unknown", f"no place within {options.search.reach_m:g} m fits")
-    found, lead = judge.displacement(best), _lead(best, hardest)
+    found = judge.displacement(best)
     known = Checked(
         "unknown",
         "",
@@ -230,8 +221,8 @@ def _judge_best(judge: _Judge, places: Sequence[_Place]) -> Checked:
         best.matrix,
         lead,
         judge.displacement(hardest),
-        float(np.mean(best.pieces)),
-        float(np.mean(judge.pieces(judge.start))),
+        judge.agreeing(best.matrix),
+        judge.agreeing(judge.start),
         best.matched,
     )
     # Consequences of the distance from the claimed place.
