@@ -362,7 +362,7 @@ def test_a_photograph_is_located(qgis: Qgis, porto: Path) -> None:
     pytest.importorskip("onnxruntime")
     folder = qgis.folder / "photograph"
     wanted = ["--", f"MASK={PHOTO}", f"REFERENCE={porto}", f"OUTPUT_FOLDER={folder}"]
-    done = qgis.tool("run", "roadgeo:locatemask", *wanted, "GSD_MIN=0.7", "GSD_MAX=1.4", "SEGMENT=auto")
+    done = qgis.tool("run", "roadgeo:locatemask", *wanted, "PIXEL_SIZE=1", "SEGMENT=auto")
     assert done.returncode == 0, done.stderr
     assert "STATUS:\tlocated" in done.stdout
     assert f"FOOTPRINT:\t{folder / 'drone_photo_footprint.tif'}" in done.stdout

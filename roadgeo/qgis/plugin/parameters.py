@@ -326,6 +326,14 @@ PIXEL_SIZE = _fold(
         "See above.",
         settings={"type": QgsProcessingParameterNumber.Type.Double, "defaultValue": 12.0, "minValue": 1e-3},
     ),
+    Option(  # behind the two numbers: of options that are given twice the last one counts
+        QgsProcessingParameterString,
+        "PIXEL_SIZE",
+        "Or pixel size, as text",
+        "0.3 (from 0.24 to 0.375), 0.3+-10% or 0.3:0.6, metres, as on the command line. It goes before the numbers.",
+        _said("--gsd", "String"),
+        {"optional": True},
+    ),
 )
 
 CAMERA = PIXEL_SIZE + _fold(
