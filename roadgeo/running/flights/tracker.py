@@ -230,9 +230,9 @@ class Tracker:
             odds = _odds(corrected, scene, reference, self.options.locate)
             if odds >= self.options.least_odds:
                 self._pose = corrected
-                why = f"its roads agree; log10 odds {odds:.1f} against places nearby"
+                why = "its roads agree with the map"
                 return Tracked(frame, status, why, known_at, corrected, reference, odds)
-            why = f"its roads do not agree (log10 odds {odds:.1f} against places nearby); placed by its motion"
+            why = "its roads do not agree with the map; placed by its motion"
         frame_m = predicted.frame.half_diagonal * 2.0 * predicted.gsd_m
         if predicted.sigma_m > self.options.lost_frames * frame_m:
             return Tracked(frame, "lost", "no road has agreed for too long", known_at)
