@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 import os
+import re
 from collections.abc import Iterable, Sequence
 from contextlib import nullcontext
 from dataclasses import dataclass, field, fields, replace
@@ -246,7 +247,7 @@ def index(
     from roadgeo.reference.library import make_slug
 
     is_box = isinstance(roads, tuple) and len(roads) == 4 and all(isinstance(one, int | float) for one in roads)
-    if is_box or (isinstance(roads, str) and not Path(roads).exists() and not Path(roads).suffix):
+    if is_box or (isinstance(roads, str) and _is_place(roads)):
         from roadgeo.sources.roads import fetch_roads
 
         name = name or (Path(path).stem if path else "box" if is_box else make_slug(roads))
@@ -257,6 +258,11 @@ def index(
     return build_reference(
         roads, name, options, crs=crs, path=path, kinds=kinds, tunnels=tunnels, attribution=attribution
     )
+
+
+def _is_place(text: str) -> bool:
+    """Whether a text is the name of a place rather than of a file: none is there, and it does not end like one."""
+    return not Path(text).exists() and not re.search(r"[/\\]|\.\w{2,9}$", text)
 
 
 def locate(

@@ -11,6 +11,7 @@ import rasterio
 from PIL import Image
 
 import roadgeo
+from roadgeo.api import _is_place
 from roadgeo.errors import MaskError, NotLocatedError
 from roadgeo.evaluation.demo import PHOTO, ROADS, demo_masks
 from roadgeo.matching.options import LocateOptions
@@ -185,3 +186,24 @@ def test_photographs_that_are_no_files_are_segmented_as_files_are(
     assert (found.query, found.reason, found.photo) == ("array", "hardly a road in array", None)
     assert np.array_equal(read[0], photograph)
     assert found.pixels is not None
+
+
+@pytest.mark.parametrize(
+    ("text", "is_place"),
+    [("Boston, MA", True), ("St. Gallen", True), ("Washington D.C.", True), ("streets.gpkg", False), ("a/b", False)],
+)
+def test_places_are_told_from_files(text: str, is_place: bool) -> None:
+    assert _is_place(text) is is_place
+
+
+def test_the_roads_of_a_place_are_fetched(monkeypatch: pytest.MonkeyPatch) -> None:
+    from roadgeo.sources import roads as sources
+
+    asked: list[dict[str, object]] = []
+    monkeypatch.setattr(sources, "fetch_roads", lambda **where: asked.append(where) or read_roads(ROADS))
+    assert roadgeo.index("Porto, Portugal").name == "porto-portugal"
+    assert roadgeo.index((-8.7, 41.1, -8.6, 41.2)).name == "box"
+    assert [(one.get("place"), one.get("bbox")) for one in asked] == [
+        ("Porto, Portugal", None),
+        (None, (-8.7, 41.1, -8.6, 41.2)),
+    ]
