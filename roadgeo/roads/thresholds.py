@@ -40,8 +40,9 @@ _BINS = 256  # of a histogram that a threshold is found by
 
 #: Further thresholds of a soft map, as shares of the way from the ground's value to the roads'.
 _FURTHER = (0.3, 0.7)
-#: Further thresholds of probabilities, as shares of the way from the model's own to 0 (below 0) and to 1.
-_FURTHER_PROBABILITIES = (-0.5, 0.4)
+#: A further threshold of probabilities, as a share of the model's own: roads count by their probability. Of labelled
+#: photographs of Boston and Miami, told scale and heading, 8 of 12 are located at it, 7 at the model's own.
+_LOWER = 0.27
 
 
 @dataclass(frozen=True)
@@ -99,9 +100,7 @@ def find_thresholds(sample: Sample) -> tuple[float, ...]:
 
 def spread_probability(threshold: float) -> tuple[float, ...]:
     """Return the thresholds worth trying on probabilities of road: a model's own first."""
-    return threshold, *(
-        threshold + share * (threshold if share < 0 else 1 - threshold) for share in _FURTHER_PROBABILITIES
-    )
+    return threshold, _LOWER * threshold
 
 
 def find_unlabelled(sample: Sample) -> tuple[float | None, str]:

@@ -272,9 +272,9 @@ def _locate_photograph(
 
 
 def _plan_looks(frame: _Frame, query: QueryOptions) -> Later[Look]:
-    """Return the best scale's look, the photograph in more ways, other scales, and other thresholds at the best.
+    """Return the best scale's look, the photograph in more ways, other scales, and a lower threshold at the best.
 
-    Where the scale is known, the result at it alone, and finer alone, are the other scales.
+    Where the scale is known, the result at it alone, and finer alone, come last.
     """
 
     def look(i: int, ways: int | None = None, further: int = 0) -> Look:
@@ -291,10 +291,10 @@ def _plan_looks(frame: _Frame, query: QueryOptions) -> Later[Look]:
     makers: list[Callable[[], Look]] = [partial(look, 0, frame.first_ways)]
     makers += [look_more_ways] if frame.most_ways else []
     makers += [partial(look, i) for i in range(1, len(frame.scales))]
+    if query.threshold is None:
+        makers += [partial(look, 0, frame.most_ways, 1)]
     if frame.finer_too:
         makers += [partial(look_alone, frame.scales[0]), partial(look_alone, _FINER * frame.scales[0])]
-    if query.threshold is None:
-        makers += [partial(look, 0, frame.most_ways, further) for further in (1, 2)]
     return Later(makers)
 
 
@@ -396,7 +396,7 @@ def _look_at(see: Callable[[], ProbabilityMap], scale: float, query: QueryOption
     def threshold() -> float:
         return spread_probability(see().threshold if query.threshold is None else query.threshold)[further]
 
-    what = f"scale {scale:.3g}" + (f", another threshold ({further})" if further else "")
+    what = f"scale {scale:.3g}" + (", a lower threshold" if further else "")
     return Look(what, lambda: see().mask(threshold()), see)
 
 

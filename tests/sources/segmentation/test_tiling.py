@@ -207,7 +207,7 @@ def test_a_map_that_was_kept_is_read_as_it_was(tmp_path: Path, void: bool) -> No
     seen = ProbabilityMap(values, 0.26, "photo.jpg", "m.onnx")
     seen.write(tmp_path / "photo_mask.tif")
     with open_mask(tmp_path / "photo_mask.tif") as opened:
-        assert len(opened.thresholds) == 3
+        assert len(opened.thresholds) == 2
         for given, share in zip(opened.thresholds, spread_probability(0.26), strict=True):
             read, made = opened.read(given), seen.mask(share)
             np.testing.assert_array_equal(read.roads, made.roads)
