@@ -181,7 +181,8 @@ def choose(module):
     ANSWER["chosen"] = {name: str(values.get(name)) for name in ("NEAR", "NEAR_RADIUS", "MASK")}
     again.close()
     # Refused: a warning, with nothing to zoom to.
-    module.tell("locatemask", replace(found, location={**location, "status": "not_located", "reason": "no"}))
+    nothing = {"status": "not_located", "reason": "no", "alternatives": [], "center": None, "footprint_lonlat": None}
+    module.tell("locatemask", replace(found, location={**location, **nothing}))
     ANSWER["refused"], buttons = message()
     ANSWER["refused_buttons"] = list(buttons)
 

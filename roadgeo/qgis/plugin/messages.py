@@ -68,8 +68,10 @@ def tell(algorithm: str, finding: Finding) -> None:
             offered.append(("Mend by hand", lambda: _mend(finding)))
     else:
         text, level, offered = location["reason"], Qgis.MessageLevel.Warning, []
-        if location["status"] == "ambiguous":
+        if location["alternatives"] and location["center"]:
             offered.append(("Choose the place...", lambda: keep(PlacesDialog(algorithm, finding))))
+        elif location["footprint_lonlat"]:  # a place that is known along one direction only
+            offered.append(("Zoom to it", lambda: zoom(location["footprint_lonlat"])))
     if finding.page:
         page = QUrl.fromLocalFile(finding.page)
         offered.append(("Report", lambda: QDesktopServices.openUrl(page)))
