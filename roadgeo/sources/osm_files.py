@@ -6,19 +6,18 @@ osmium reads them. A PBF file is cut between its blobs, to check them before, an
 from __future__ import annotations
 
 import re
-import zlib
 from array import array
 from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any, BinaryIO
+from typing import Any
 
 import numpy as np
 
 from roadgeo._arrays import AnyArray, FloatArray, IntArray
 from roadgeo.errors import RoadSourceError
 from roadgeo.sources.lines import OSM_ATTRIBUTION, RoadTable
-from roadgeo.sources.protobuf import message_types
+from roadgeo.storage.pbf import read_parts
 from roadgeo.storage.unpacking import read_chunks
 from roadgeo.storage.vectors import first_line
 
@@ -26,16 +25,6 @@ __all__ = ["OSM_ENDINGS", "stream_ways"]
 
 OSM_ENDINGS = (*(".osm.pbf", ".pbf", ".osm", ".osm.gz", ".osm.bz2", ".osm.xml", ".osh", ".osh.gz", ".osh.bz2", ".o5m"),)
 
-#: PBF files are read in parts of about this size; the other two are limits of their specification.
-_PART, _MAX_BLOB, _MAX_BLOB_HEADER = 1 << 20, 32 << 20, 64 << 10
-_PACKED = (("lzma", 4, "bytes"), ("bzip2", 5, "bytes"), ("lz4", 6, "bytes"), ("zstd", 7, "bytes"))
-#: The checked parts of a PBF file (https://github.com/openstreetmap/OSM-binary).
-_PBF = (
-    ("BlobHeader", (("size", 3, "int64"),)),
-    ("Blob", (("raw", 1, "bytes"), ("zlib", 3, "bytes"), *_PACKED)),
-    ("Block", (("texts", 1, "bytes"),)),
-    ("Texts", (("text", 1, "bytes"),)),
-)
 #: Places of nodes are kept in memory up to this size of a PBF file (8 times its size), else on disk.
 _NODES_IN_MEMORY = 100_000_000
 #: An object that JOSM's user has deleted stays in its file.
@@ -67,7 +56,8 @@ def stream_ways(path: Path, most: int, advance: Callable[[float], None], folder:
 
     try:
         deleted = set() if _is_pbf(path) else _deleted_ways(path)
-        with osmium.io.Reader(_head(path), osmium.osm.NOTHING) as reader:
+        first, _ = next(_parts(path))  # not the path: osmium forgets to close a damaged PBF file on disk
+        with osmium.io.Reader(first, osmium.osm.NOTHING) as reader:
             header = reader.header()
         stamp = header.get("osmosis_replication_timestamp") or header.get("timestamp")
         meta = {"format": "OpenStreetMap", "attribution": OSM_ATTRIBUTION} | ({"osm_timestamp": stamp} if stamp else {})
@@ -216,78 +206,16 @@ def _deleted_ways(path: Path) -> set[int]:
     return found
 
 
-# --- PBF --------------------------------------------------------------------------------------------------------------
-
-
 def _is_pbf(path: Path) -> bool:
     return path.name.lower().endswith(".pbf")
-
-
-def _head(path: Path) -> Any:
-    """Return the source of a file's header for osmium, which forgets to close a damaged PBF file on disk."""
-    import osmium
-
-    if not _is_pbf(path):
-        return str(path)
-    with path.open("rb") as file:
-        return osmium.io.FileBuffer(_read_blob(file), "pbf")
 
 
 def _parts(path: Path) -> Iterator[tuple[Any, float]]:
     """Yield the sources that osmium reads one after another, and the share of the file that is read then.
 
-    A PBF file is a row of blobs, the first of them a header, each with a header of its own. It is cut between them,
-    for osmium does not report its progress. Other files are left whole.
+    A PBF file is cut into parts that are checked, for osmium does not report its progress. Others are left whole.
     """
     import osmium
 
-    if not _is_pbf(path):
-        yield str(path), 1.0
-        return
-    size = path.stat().st_size
-    with path.open("rb") as file:
-        header = _read_blob(file)
-        while file.tell() < size:
-            part = bytearray()
-            while len(part) < _PART and file.tell() < size:
-                part += _read_blob(file)
-            yield osmium.io.FileBuffer(header + part, "pbf"), file.tell() / size
-
-
-def _read_blob(file: BinaryIO) -> bytes:
-    """Read one blob of a PBF file, the header before it, and the size of that before both.
-
-    Raises
-    ------
-    RuntimeError
-        As osmium does: it is cut off, or there is none.
-    """
-    from google.protobuf.message import DecodeError
-
-    prefix = file.read(4)
-    header = file.read(min(int.from_bytes(prefix, "big"), _MAX_BLOB_HEADER))
-    try:
-        (size,) = message_types(_PBF)["BlobHeader"].FromString(header).size
-        blob = file.read(size) if 0 <= size <= _MAX_BLOB else b""
-        if len(prefix) < 4 or len(header) != int.from_bytes(prefix, "big") or size != len(blob):
-            raise RuntimeError("it is cut off, damaged or no PBF file")
-        _require_text(blob)
-    except (DecodeError, ValueError, zlib.error) as error:
-        raise RuntimeError("it is cut off, damaged or no PBF file") from error
-    return prefix + header + blob
-
-
-def _require_text(blob: bytes) -> None:
-    """Refuse a blob with a zero byte in a text: osmium takes it for the end of that, and reads on beyond all texts.
-
-    Or one that is compressed in another way than with zlib, so that it cannot be looked at.
-    """
-    messages = message_types(_PBF)
-    stored = messages["Blob"].FromString(blob)
-    if len(stored.raw) + len(stored.zlib) != 1 or stored.lzma or stored.lz4 or stored.zstd or stored.bzip2:
-        raise RuntimeError("a part of it is not compressed by zlib; write it with that, as osmium does by default")
-    content = stored.raw[0] if stored.raw else zlib.decompressobj().decompress(stored.zlib[0], _MAX_BLOB + 1)
-    for table in messages["Block"].FromString(content).texts:
-        # Zero bytes are rare, but for the length of the empty text that every table begins with.
-        if table[2:].count(0) and any(0 in text for text in messages["Texts"].FromString(table).text):
-            raise RuntimeError("it is damaged: a text in it holds a zero byte")
+    for part, share in read_parts(path) if _is_pbf(path) else ((str(path), 1.0),):
+        yield (osmium.io.FileBuffer(part, "pbf") if isinstance(part, bytes) else part), share

@@ -14,7 +14,7 @@ import tomllib
 import unicodedata
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
-from functools import partial
+from functools import cache, partial
 from pathlib import Path
 from typing import Any
 
@@ -22,7 +22,7 @@ import numpy as np
 
 from roadgeo._arrays import AnyArray, BoolArray
 from roadgeo.roads.kinds import KNOWN_HIGHWAYS, NO_ROADS, in_tunnel
-from roadgeo.sources.lines import OSM_ATTRIBUTION, RoadLines, RoadTable, simple_areas, simple_lines
+from roadgeo.sources.lines import OSM_ATTRIBUTION, RoadLines, RoadTable, objects, simple_areas, simple_lines
 
 __all__ = ["Schema", "is_known_column", "names_kinds", "recognise"]
 
@@ -282,14 +282,6 @@ def _count_broken(shapes: AnyArray) -> int:
 
 
 def _each(values: AnyArray, make: Callable[[Any], Any]) -> AnyArray:
-    """Return a function's result for each value; it is called once for equal text."""
-    made: dict[str, Any] = {}
-    found = np.empty(len(values), object)
-    for i, value in enumerate(values):
-        if isinstance(value, str):
-            if value not in made:
-                made[value] = make(value)
-            found[i] = made[value]
-        else:
-            found[i] = make(value)
-    return found
+    """Return what a function makes of each value; it is called once for equal texts."""
+    made = cache(make)
+    return objects(made(value) if type(value) is str else make(value) for value in values)

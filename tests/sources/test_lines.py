@@ -194,7 +194,7 @@ def test_nonsense_is_refused_on_one_line(tmp_path, name):
 def test_pbf_files_are_read_in_parts_and_progress_is_told(tmp_path, monkeypatch, part_size):
     file = write_streets(tmp_path / "a.osm.pbf")
     whole = read_lines(file)
-    monkeypatch.setattr("roadgeo.sources.osm_files._PART", part_size)
+    monkeypatch.setattr("roadgeo.storage.pbf._PART", part_size)
     told = []
     read = read_lines(file, advance=told.append)
     assert shapely.equals(read.lines, whole.lines).all()

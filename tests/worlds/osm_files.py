@@ -76,7 +76,7 @@ def o5m():
     for n in nodes.values():
         xy = [round(n["lon"] * 1e7), round(n["lat"] * 1e7)]
         moved = _signed(n["id"] - last) + b"\0" + b"".join(_signed(a - b) for a, b in zip(xy, places, strict=True))
-        rows.append(b"\x10" + _number(len(moved)) + moved)
+        rows.append(b"\x10" + varint(len(moved)) + moved)
         last, places = n["id"], xy
     rows.append(b"\xff")
     last = ref = 0
@@ -84,16 +84,16 @@ def o5m():
         steps = b"".join(_signed(b - a) for a, b in zip([ref, *way["nodes"]], way["nodes"], strict=False))
         tags = {key: value for key, value in way["tags"].items() if key in ("highway", "tunnel")}
         texts = b"".join(f"\0{key}\0{value}\0".encode() for key, value in tags.items())
-        content = _signed(way["id"] - last) + b"\0" + _number(len(steps)) + steps + texts
-        rows.append(b"\x11" + _number(len(content)) + content)
+        content = _signed(way["id"] - last) + b"\0" + varint(len(steps)) + steps + texts
+        rows.append(b"\x11" + varint(len(content)) + content)
         last, ref = way["id"], way["nodes"][-1]
     return b"".join([*rows, b"\xfe"])
 
 
-def _number(value):
+def varint(value):
     parts = [value >> shift & 127 for shift in range(0, max(value.bit_length(), 1), 7)]
     return bytes([*(part | 128 for part in parts[:-1]), parts[-1]])
 
 
 def _signed(value):
-    return _number(2 * value if value >= 0 else -2 * value - 1)
+    return varint(2 * value if value >= 0 else -2 * value - 1)

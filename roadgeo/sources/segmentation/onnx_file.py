@@ -20,7 +20,7 @@ from typing import Any, NamedTuple
 
 from roadgeo._arrays import AnyArray
 from roadgeo.errors import ModelError, how_to_install
-from roadgeo.sources.protobuf import message_types
+from roadgeo.storage.protobuf import message_types
 
 __all__ = ["OnnxModel", "Port", "open_onnx"]
 

@@ -5,7 +5,7 @@ from google.protobuf.message import DecodeError
 from hypothesis import given
 from hypothesis import strategies as st
 
-from roadgeo.sources.protobuf import message_types
+from roadgeo.storage.protobuf import message_types
 
 MESSAGES = message_types(
     (("Outer", (("inner", 1, "Inner"), ("number", 2, "int64"))), ("Inner", (("text", 3, "bytes"),)))
