@@ -3,9 +3,9 @@
 from __future__ import annotations
 
 import os
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from pathlib import Path
-from typing import TYPE_CHECKING, cast
+from typing import TYPE_CHECKING
 
 import numpy as np
 
@@ -20,9 +20,7 @@ from roadgeo.matching.index import build_index
 from roadgeo.matching.methods import Found, search_references
 from roadgeo.matching.options import LocateOptions
 from roadgeo.matching.query import Query, read_query
-from roadgeo.matching.record import Record
-from roadgeo.matching.trace import NO_TRACE, Trace
-from roadgeo.matching.truth_record import make_record, tell_truth
+from roadgeo.matching.truth import true_place
 from roadgeo.matching.verdict import decide, needed_of
 from roadgeo.reference.reference import AnyReference, BuildOptions, Reference, build_network, open_whole, stored_options
 from roadgeo.roads.kinds import RoadKind
@@ -162,7 +160,7 @@ def locate(
         The mask cannot be read or shows no roads.
     """
     options, references = options or LocateOptions(), _as_list(reference)
-    query = _read(mask, options)
+    query = _read(mask)
     return decide(query, _search(query, references, options), options)
 
 
@@ -184,15 +182,10 @@ def explain(
         The mask cannot be read or shows no roads.
     """
     options, references = options or LocateOptions(), _as_list(reference)
-    query = _read(mask, options)
-    found = _search(query, references, options, lambda: make_record(query.name, options))
-    records = [cast("Record", one.trace) for one in found]
-    alone = [decide(query, [one], options) for one in found]
-    needed = needed_of(options)
-    stories = [
-        tell_truth(tell(query, one, answer, record, needed), record, answer, needed)
-        for one, answer, record in zip(found, alone, records, strict=True)
-    ]
+    query = _read(mask)
+    found = _search(query, references, options, explained=True)
+    needed, truth = needed_of(options), true_place(query.name, options)
+    stories = [tell(query, one, decide(query, [one], options), needed, truth) for one in found]
     return Explanation(decide(query, found, options), query.scene, query.graph, tuple(stories))
 
 
@@ -203,18 +196,18 @@ def _as_list(reference: AnyReference | Sequence[AnyReference]) -> list[AnyRefere
     return references
 
 
-def _read(mask: RoadMask | AnyArray | str | Path, options: LocateOptions) -> Query:
+def _read(mask: RoadMask | AnyArray | str | Path) -> Query:
     warm_up()
-    return read_query(mask, options.query)
+    return read_query(mask)
 
 
 def _search(
     query: Query,
     references: Sequence[AnyReference],
     options: LocateOptions,
-    make_trace: Callable[[], Trace] = lambda: NO_TRACE,
+    explained: bool = False,
 ) -> list[Found]:
     """Search all references together, within the time that tracing left."""
     left = max(options.search.time_limit_s - query.seconds.vectorize, 0.0)
     parts = [part for one in references for part in one.parts]
-    return search_references(query, parts, options, left, make_trace)
+    return search_references(query, parts, options, left, explained)

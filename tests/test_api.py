@@ -15,8 +15,7 @@ from roadgeo.api import _is_place
 from roadgeo.errors import MaskError, NotLocatedError
 from roadgeo.evaluation.demo import PHOTO, ROADS, demo_masks
 from roadgeo.matching.options import LocateOptions
-from roadgeo.matching.sweeps import Sweep
-from roadgeo.matching.triples import TripleOptions
+from roadgeo.matching.triples import Sweep, TripleOptions
 from roadgeo.reference.inspection import reference_digest
 from roadgeo.sources.roads import read_roads
 

@@ -19,7 +19,7 @@ from __future__ import annotations
 import math
 from collections.abc import Callable
 from dataclasses import dataclass, replace
-from typing import Literal
+from typing import Literal, NamedTuple
 
 import numpy as np
 
@@ -27,7 +27,6 @@ from roadgeo._arrays import FloatArray
 from roadgeo.geometry.frame import Frame
 from roadgeo.geometry.homography import Homography
 from roadgeo.geometry.whitening import whitener
-from roadgeo.kernels.pinhole_fit import SeenCorners, fit_pinhole, place_pinholes
 
 #: Focal lengths that an adjustment may start from, in usual ones.
 _FACTORS = (0.35, 0.5, 0.7, 1.0, 1.4, 2.0, 3.0)
@@ -119,14 +118,87 @@ def find_pose(
     usual = options.usual_focal * frame.half_diagonal
     tried = [options.focal_px] if options.focal_px else [usual * factor for factor in _FACTORS]
     prior = math.log(options.focal_px or usual), 1e-6 if options.focal_px else options.usual_sigma
-    weights = np.ascontiguousarray(whitener(corner_covariance))
-    seen = SeenCorners((frame.corners - frame.center) * (1.0, -1.0), corners, weights, *prior)
-    p, covariance = np.empty(7), np.empty((7, 7))
-    starts = _starts(homography, frame, np.array(tried), seen.log_focal)
-    if not fit_pinhole(starts, seen, options.n_iterations, p, covariance):
+    seen = SeenCorners((frame.corners - frame.center) * (1.0, -1.0), corners, whitener(corner_covariance), *prior)
+    fitted = fit_pinhole(_starts(homography, frame, np.array(tried), seen.log_focal), seen, options.n_iterations)
+    if fitted is None:
         return None
-    pose = _describe(p, covariance, seen.log_focal, options)
+    pose = _describe(*fitted, seen.log_focal, options)
     return replace(pose, position=pose.position + origin)
+
+
+class SeenCorners(NamedTuple):
+    """What is fitted to, and the prior on the focal length.
+
+    `pixels` (4, 2) are the corners from the middle of the frame, y up; `ground` (4, 2) where they lie, metres;
+    `weights` (8, 8) whiten how far off they are; `log_focal` and its standard deviation are those of usual lenses.
+    """
+
+    pixels: FloatArray
+    ground: FloatArray
+    weights: FloatArray
+    log_focal: float
+    log_focal_sigma: float
+
+
+def fit_pinhole(starts: FloatArray, seen: SeenCorners, n_iterations: int) -> tuple[FloatArray, FloatArray] | None:
+    """Fit a pinhole by Levenberg and Marquardt, from the start (S, 7) that is nearest; None where that fails.
+
+    Return its parameters (7,) and their covariance (7, 7).
+    """
+
+    def off(p: FloatArray) -> FloatArray:
+        return pinhole_residuals(p, seen)
+
+    sums = (off(starts) ** 2).sum(axis=-1)
+    if not np.isfinite(sums).any():
+        return None
+    p = starts[int(sums.argmin())]
+    r, least, damping = off(p), float(sums.min()), 1e-3
+    scale = np.array([math.exp(p[2] + p[6])] * 2 + [1.0] * 5)
+    for _ in range(n_iterations):
+        jacobian = _differentiate(off, p, scale)
+        if not np.isfinite(jacobian).all():
+            return None
+        normal = jacobian.T @ jacobian
+        step = -np.linalg.pinv(normal + damping * np.diag(np.diag(normal)), hermitian=True) @ (jacobian.T @ r)
+        longest = float(np.abs(step / scale).max())
+        moved = p + step / max(longest, 1.0)  # no further than by its height, or a radian
+        tried = off(moved)
+        now = float(tried @ tried)
+        if not now <= least:
+            if longest < 1e-9:
+                break
+            damping *= 10.0
+            continue
+        done = least - now < 1e-9 * least + 1e-12
+        p, r, least, damping = moved, tried, now, damping / 10.0
+        if done:
+            break
+    jacobian = _differentiate(off, p, scale)
+    if not np.isfinite(jacobian).all() or np.linalg.matrix_rank(jacobian / np.linalg.norm(jacobian, axis=0)) < 7:
+        return None
+    (_, _, height), _ = _place(p, seen.log_focal)
+    return (p, np.asarray(np.linalg.inv(jacobian.T @ jacobian))) if height > 0.0 else None
+
+
+def pinhole_residuals(p: FloatArray, seen: SeenCorners) -> FloatArray:
+    """Return how far off corners are, whitened, and the focal length from usual ones, (..., 9) of parameters (..., 7).
+
+    The parameters are x and y where the axis meets the ground, log metres per pixel there, the heading, the tilt about
+    two axes were the focal length that of `log_focal`, and the log of the focal length, with which the tilt grows in
+    proportion. Infinite where a corner does not lie below the horizon.
+    """
+    positions, rotations = _place(p, seen.log_focal)
+    corners = np.broadcast_to(seen.pixels, (*p.shape[:-1], 4, 2))
+    focal = np.broadcast_to(-np.exp(p[..., 6])[..., None, None], (*p.shape[:-1], 4, 1))
+    rays = np.concatenate((corners, focal), axis=-1) @ np.swapaxes(rotations, -1, -2)
+    with np.errstate(divide="ignore", invalid="ignore"):
+        reach = positions[..., 2, None] / rays[..., 2]
+        away = positions[..., None, :2] - reach[..., None] * rays[..., :2] - seen.ground
+    whitened = away.reshape(*p.shape[:-1], 8) @ seen.weights.T
+    prior = (p[..., 6:] - seen.log_focal) / seen.log_focal_sigma
+    below = np.asarray((rays[..., 2] < 0.0).all(axis=-1))[..., None]
+    return np.asarray(np.where(below, np.concatenate((whitened, prior), axis=-1), np.inf))
 
 
 def _moved_to(origin: FloatArray, homography: FloatArray) -> FloatArray:
@@ -137,7 +209,7 @@ def _moved_to(origin: FloatArray, homography: FloatArray) -> FloatArray:
 def _starts(homography: FloatArray, frame: Frame, focals: FloatArray, log_focal: float) -> FloatArray:
     """Return parameters (S, 7) of pinholes of some focal lengths that nearly see a homography, above the ground.
 
-    They are as in `kernels.pinhole_fit`.
+    They are as in `pinhole_residuals`.
     """
     middle = frame.center
     to_middle = np.array([[1.0, 0.0, -middle[0]], [0.0, -1.0, middle[1]], [0.0, 0.0, 1.0]])
@@ -181,10 +253,13 @@ def _differentiate(function: Callable[[FloatArray], FloatArray], p: FloatArray, 
 
 def _place(parameters: FloatArray, log_focal: float) -> tuple[FloatArray, FloatArray]:
     """Return positions (..., 3) and rotations (..., 3, 3) of pinholes (..., 7)."""
-    rows = np.ascontiguousarray(parameters.reshape(-1, 7))
-    positions, rotations = np.empty((len(rows), 3)), np.empty((len(rows), 3, 3))
-    place_pinholes(rows, log_focal, positions, rotations)
-    return positions.reshape(*parameters.shape[:-1], 3), rotations.reshape(*parameters.shape[:-1], 3, 3)
+    nothing = np.zeros_like(parameters[..., :1])
+    tilt = np.concatenate((parameters[..., 4:6] * np.exp(parameters[..., 6:] - log_focal), nothing), axis=-1)
+    heading = np.concatenate((nothing, nothing, parameters[..., 3:4]), axis=-1)
+    rotations = _rotation(tilt) @ _rotation(heading)
+    reach = np.exp(parameters[..., 2:3] + parameters[..., 6:])
+    ground = np.concatenate((parameters[..., :2], nothing), axis=-1)
+    return ground + reach * rotations[..., 2], rotations
 
 
 def _describe(p: FloatArray, covariance: FloatArray, log_focal: float, options: PoseOptions) -> Pose:

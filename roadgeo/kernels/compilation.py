@@ -244,8 +244,6 @@ _SEARCH = (
     "road_rings",
     "road_votes",
     "road_growth",
-    "pinhole_fit",
-    "residuals",
     "lens",
 )
 _left_to_numba: set[str] = set()

@@ -100,8 +100,6 @@ def match_all(
     branches: Int8s3,
     radius: float,
     min_cos: float,
-    shift_x: float,
-    shift_y: float,
     one_to_one: bool,
     points: PointBuckets,
     matched: Ints1,
@@ -112,7 +110,7 @@ def match_all(
     Parameters
     ----------
     matrix : (3, 3) float64
-        Query plane to reference plane; the shift, in metres, is added.
+        Query plane to reference plane.
     xy : (N, 2) float64, branches : (N, R, 2) int8
         The query's intersections.
     radius : float
@@ -150,7 +148,7 @@ def match_all(
             (matrix[1, 0] - y * matrix[2, 0]) / w, (matrix[1, 1] - y * matrix[2, 1]) / w,
         )  # fmt: skip
         matched[i], distance[i] = nearest_alike(
-            x + shift_x, y + shift_y, radius, branches, i, ref_xy, ref_branches, starts, grid, shape, jacobian, min_cos
+            x, y, radius, branches, i, ref_xy, ref_branches, starts, grid, shape, jacobian, min_cos
         )
         if matched[i] >= 0:
             count += 1

@@ -14,12 +14,11 @@ from roadgeo.kernels.compilation import kernel
 from roadgeo.kernels.structs import RoadBuckets
 
 __all__ = [
-    "backward_agreement",
     "bin_segments",
     "count_residuals",
-    "forward_distances",
     "meets_road",
     "nearest_road",
+    "road_residuals",
     "screen",
     "shares_near_roads",
 ]
@@ -153,50 +152,6 @@ def nearest_road(
     return math.sqrt(best), fx, fy, ux, uy
 
 
-@kernel(writes=("out",))
-def forward_distances(
-    matrix: Floats2,
-    points: Floats2,
-    directions: Floats2,
-    radius: float,
-    min_cos: float,
-    shift_x: float,
-    shift_y: float,
-    roads: RoadBuckets,
-    out: Floats1,
-) -> int:
-    """Find how far each road point of the query lies from a road of the map that runs its way.
-
-    Parameters
-    ----------
-    matrix : (3, 3) float64
-        Query plane to reference plane; the shift, in metres, is added.
-    points, directions : (S, 2) float64
-        Points on the query's roads, in its plane, and unit vectors along the road.
-    radius, min_cos
-        As in `nearest_road`.
-    out : (S,) float64
-        Filled with metres; inf where no road is near or the point lies beyond the horizon.
-
-    Returns
-    -------
-    int
-        How many are finite.
-    """
-    segments, starts, ids, grid, shape = roads
-    n = 0
-    for i in range(points.shape[0]):
-        ahead, x, y, dx, dy = _carry(matrix, points[i, 0], points[i, 1], directions[i, 0], directions[i, 1])
-        out[i] = np.inf
-        if not ahead:
-            continue
-        x, y = x + shift_x, y + shift_y
-        out[i] = nearest_road(x, y, dx, dy, radius, min_cos, segments, starts, ids, grid, shape)[0]
-        if out[i] < np.inf:
-            n += 1
-    return n
-
-
 @kernel(forceinline=True)
 def _carry(matrix: Floats2, u: float, v: float, du: float, dv: float) -> tuple[bool, float, float, float, float]:
     """Map a point and a unit vector along its road: whether that has a direction this side of the horizon, and both."""
@@ -214,6 +169,48 @@ def _carry(matrix: Floats2, u: float, v: float, du: float, dv: float) -> tuple[b
     return True, x, y, dx / length, dy / length
 
 
+@kernel(writes=("out",))
+def road_residuals(
+    matrix: Floats2,
+    points: Floats2,
+    directions: Floats2,
+    radii: Floats1,
+    min_cos: float,
+    roads: RoadBuckets,
+    out: Floats2,
+) -> int:
+    """Find how far each road point of the query lies from a road of the map that runs its way; return how many do.
+
+    Parameters
+    ----------
+    matrix : (3, 3) float64
+        Query plane to reference plane.
+    points, directions : (S, 2) float64
+        Points on the query's roads, in its plane, and unit vectors along the road.
+    radii : (S,) float64
+        Roads nearer than this count, metres.
+    min_cos
+        As in `nearest_road`.
+    out : (S, 3) float64
+        Filled: the way from the point to the road, metres, and the unit vector in which it is counted; NaN where there
+        is no road, or the point lies beyond the horizon.
+    """
+    met = 0
+    for i in range(points.shape[0]):
+        ahead, x, y, dx, dy = _carry(matrix, points[i, 0], points[i, 1], directions[i, 0], directions[i, 1])
+        out[i, 0] = out[i, 1] = out[i, 2] = np.nan
+        if not ahead:
+            continue
+        d, fx, fy, rx, ry = nearest_road(
+            x, y, dx, dy, radii[i], min_cos, roads.segments, roads.starts, roads.ids, roads.grid, roads.shape
+        )
+        if d < np.inf:
+            met += 1
+            out[i, 0] = (fy - y) * rx - (fx - x) * ry
+            out[i, 1], out[i, 2] = -ry, rx
+    return met
+
+
 @kernel(writes=("shares",))
 def shares_near_roads(
     matrix: Floats2,
@@ -228,7 +225,7 @@ def shares_near_roads(
 ) -> None:
     """Fill `shares` (M,) with the share of the points near roads under each of `shifts` (M, 2), metres.
 
-    Points count by `weights` (S,), at least one of them more than 0; the rest is as in `forward_distances`.
+    Points count by `weights` (S,), at least one of them more than 0; the rest is as in `road_residuals`.
     """
     total = 0.0
     shares[:] = 0.0
@@ -271,88 +268,6 @@ def meets_road(x: float, y: float, dx: float, dy: float, radius: float, min_cos:
     return False
 
 
-@kernel()
-def backward_agreement(
-    inverse: Floats2,
-    bounds: Floats1,
-    step: float,
-    tolerance_m: float,
-    shift_x: float,
-    shift_y: float,
-    roads: RoadBuckets,
-    field: Singles2,
-    field_scale: float,
-    observed: Bools2,
-) -> tuple[int, int]:
-    """Count the map's roads inside the footprint that the query could show, and those that it shows.
-
-    Parameters
-    ----------
-    inverse : (3, 3) float64
-        Reference plane, after minus the shift (metres), to query plane.
-    bounds : (4,) float64
-        x0, y0, x1, y1 of the footprint before the shift: only buckets that meet it are looked at.
-    step : float
-        The map is sampled once in so many metres of road.
-    tolerance_m : float
-        A sample nearer than this to a road of the query counts as shown; pixels by the scale at its place.
-    field : (h, w) float32
-        Distance from each cell of the frame to the nearest road of the query, in cells of `field_scale` pixels; rows
-        run downwards.
-    observed : (h, w) bool
-        Where the query saw the ground.
-
-    Returns
-    -------
-    seen, shown : int
-        Samples on observed ground, and how many of them lie near a road of the query.
-    """
-    segments, starts, ids, grid, shape = roads
-    n_seen, n_near = 0, 0
-    c0 = max(int(np.floor((bounds[0] + shift_x - grid[0]) / grid[2])), 0)
-    c1 = min(int(np.floor((bounds[2] + shift_x - grid[0]) / grid[2])), shape[0] - 1)
-    r0 = max(int(np.floor((bounds[1] + shift_y - grid[1]) / grid[2])), 0)
-    r1 = min(int(np.floor((bounds[3] + shift_y - grid[1]) / grid[2])), shape[1] - 1)
-    det = (
-        inverse[0, 0] * (inverse[1, 1] * inverse[2, 2] - inverse[1, 2] * inverse[2, 1])
-        - inverse[0, 1] * (inverse[1, 0] * inverse[2, 2] - inverse[1, 2] * inverse[2, 0])
-        + inverse[0, 2] * (inverse[1, 0] * inverse[2, 1] - inverse[1, 1] * inverse[2, 0])
-    )
-    for r in range(r0, r1 + 1):
-        for c in range(c0, c1 + 1):
-            bucket = r * shape[0] + c
-            for e in range(starts[bucket], starts[bucket + 1]):
-                s = ids[e]
-                ax, ay = segments[s, 0], segments[s, 1]
-                sx, sy = segments[s, 2] - ax, segments[s, 3] - ay
-                length = math.sqrt(sx * sx + sy * sy)
-                # An even phase over all segments, so that short ones are sampled in proportion to their length.
-                count = int(length / step + ((s * 0.6180339887) % 1.0))
-                for k in range(count):
-                    t = (k + 0.5) / count
-                    x, y = ax + t * sx, ay + t * sy
-                    # A segment may be listed in several buckets: each sample counts in its own.
-                    if int(np.floor((x - grid[0]) / grid[2])) != c or int(np.floor((y - grid[1]) / grid[2])) != r:
-                        continue
-                    x -= shift_x
-                    y -= shift_y
-                    w = inverse[2, 0] * x + inverse[2, 1] * y + inverse[2, 2]
-                    if w <= 0.0:
-                        continue
-                    across = (inverse[0, 0] * x + inverse[0, 1] * y + inverse[0, 2]) / w / field_scale
-                    down = -(inverse[1, 0] * x + inverse[1, 1] * y + inverse[1, 2]) / w / field_scale
-                    if not (0.0 <= across < field.shape[1] and 0.0 <= down < field.shape[0]):
-                        continue
-                    column, row = int(across), int(down)
-                    if not observed[row, column]:
-                        continue
-                    n_seen += 1
-                    scale = math.sqrt(abs(det) / (w * w * w))  # pixels per metre
-                    if field[row, column] * field_scale <= tolerance_m * scale + 0.7 * field_scale:
-                        n_near += 1
-    return n_seen, n_near
-
-
 @kernel(writes=("forward", "backward"))
 def count_residuals(
     matrix: Floats2,
@@ -389,8 +304,11 @@ def count_residuals(
         As in `nearest_road`: metres.
     step : float
         The map is sampled once in so many metres of road.
-    field, field_scale, observed
-        As in `backward_agreement`.
+    field : (h, w) float32
+        Distance from each cell of the frame to the nearest road of the query, in cells of `field_scale` pixels; rows
+        run downwards.
+    observed : (h, w) bool
+        Where the query saw the ground.
     piece_px, columns : float, int
         Width of the frame's pieces, and how many of them are side by side.
     forward, backward : (P, B + 1) float64

@@ -11,16 +11,15 @@ from dataclasses import replace
 
 import numpy as np
 
-from roadgeo._arrays import FloatArray, IntArray
+from roadgeo._arrays import BoolArray, FloatArray, IntArray
 from roadgeo.geometry.homography import Homography
 from roadgeo.kernels.parallel_roads import roads_alongside
-from roadgeo.kernels.residuals import road_residuals
+from roadgeo.kernels.roads import road_residuals
 from roadgeo.matching.index import ReferenceIndex
-from roadgeo.matching.merged_roads import nearest_of, points_on_map
-from roadgeo.matching.refinement import Refined, RefineOptions, refine
-from roadgeo.matching.scene import Scene
+from roadgeo.matching.refinement import SIGMA_M, SIGMA_PX, Refined, RefineOptions, refine
+from roadgeo.matching.scene import MIN_COS, Scene
 
-__all__ = ["between_carriageways", "refine_between", "weight_on_roads"]
+__all__ = ["between_carriageways", "nearest_of", "points_on_map", "refine_between", "roads_beside"]
 
 #: Roads at these distances, metres, may be one on the map, if it has one for both: nearest points, seen from the two,
 #: that lie within this part of how far they are apart.
@@ -47,18 +46,18 @@ def refine_between(
     """
     found, seen = refined, scene
     for n_points in _ROUNDS:
-        moved, left = between_carriageways(found.matrix, scene, index, matched, options.max_turn_deg)
+        moved, left = between_carriageways(found.matrix, scene, index, matched)
         again = None if moved is scene else refine(found.matrix, moved, index, left, options, n_points, held=True)
         if again is None:
             return refined, scene
         found, seen = again, moved
-    before = weight_on_roads(refined.matrix, scene, index, options)
-    better = weight_on_roads(found.matrix, seen, index, options) >= before
+    before = weight_on_roads(refined.matrix, scene, index)
+    better = weight_on_roads(found.matrix, seen, index) >= before
     return (found, seen) if better else (refined, scene)
 
 
 def between_carriageways(
-    matrix: FloatArray, scene: Scene, index: ReferenceIndex, matched: IntArray, max_turn_deg: float
+    matrix: FloatArray, scene: Scene, index: ReferenceIndex, matched: IntArray
 ) -> tuple[Scene, IntArray]:
     """Return the scene with road points halfway between two roads where the map has one; itself if there are few.
 
@@ -66,13 +65,12 @@ def between_carriageways(
     """
     if not len(scene.points):
         return scene, matched
-    min_cos = math.cos(math.radians(max_turn_deg))
     at, along, gsd = points_on_map(matrix, scene)
     across, step_px = np.empty_like(at), scene.road_length_px / len(at)
-    roads_alongside(at, along, _BESIDE * step_px * gsd, *_APART_M, min_cos, across)
+    roads_alongside(at, along, _BESIDE * step_px * gsd, *_APART_M, MIN_COS, across)
     apart = np.hypot(*across.T)
     reach = np.where(np.isfinite(apart), apart, 0.0) + _APART_M[0]
-    feet = [_nearest(start, along, reach, min_cos, index) for start in (at, at + across)]
+    feet = [_nearest(start, along, reach, index) for start in (at, at + across)]
     one = np.hypot(*(feet[0] - feet[1]).T) < _ONE * apart  # not where anything is NaN
     if one.mean() < _FEW:
         return scene, matched
@@ -82,18 +80,51 @@ def between_carriageways(
     return replace(scene, points=points), np.where(there, -1, matched)
 
 
-def weight_on_roads(matrix: FloatArray, scene: Scene, index: ReferenceIndex, options: RefineOptions) -> float:
+def weight_on_roads(matrix: FloatArray, scene: Scene, index: ReferenceIndex) -> float:
     """Return the sum of the road points' weights in a fit of a view from straight above."""
     at, along, gsd = points_on_map(matrix, scene)
-    sigma = math.hypot(options.sigma_m, options.sigma_px * float(np.median(gsd)))
+    sigma = math.hypot(SIGMA_M, SIGMA_PX * float(np.median(gsd)))
     found = np.empty((len(at), 3))
-    min_cos = math.cos(math.radians(options.max_turn_deg))
-    road_residuals(at, along, np.full(len(at), _ON_ROADS * sigma), min_cos, index.road_buckets, found)
+    road_residuals(np.eye(3), at, along, np.full(len(at), _ON_ROADS * sigma), MIN_COS, index.road_buckets, found)
     return float(np.nansum(1.0 / (1.0 + (found[:, 0] / sigma) ** 2)))
 
 
-def _nearest(at: FloatArray, along: FloatArray, reach: FloatArray, min_cos: float, index: ReferenceIndex) -> FloatArray:
+def _nearest(at: FloatArray, along: FloatArray, reach: FloatArray, index: ReferenceIndex) -> FloatArray:
     """Return the nearest points (S, 2) on roads of the map that run along points (S, 2); NaN beyond `reach` (S,)."""
     found = np.empty((len(at), 3))
-    road_residuals(np.ascontiguousarray(at), along, reach, min_cos, index.road_buckets, found)
+    road_residuals(np.eye(3), np.ascontiguousarray(at), along, reach, MIN_COS, index.road_buckets, found)
     return np.asarray(at + found[:, :1] * found[:, 1:])
+
+
+def nearest_of(xy: FloatArray, points: FloatArray, among: IntArray, away: float) -> IntArray:
+    """Return which of `points` (S, 2), `among` those numbered, lies nearest to each of `xy` (N, 2); -1: none within."""
+    nearest, least = np.full(len(xy), -1), np.full(len(xy), away**2)
+    for number in among:
+        square = ((xy - points[number]) ** 2).sum(axis=1)
+        closer = square < least
+        nearest[closer], least[closer] = number, square[closer]
+    return nearest
+
+
+def roads_beside(
+    matrix: FloatArray, scene: Scene, index: ReferenceIndex, beside_m: float, give_or_take_m: float
+) -> tuple[BoolArray, BoolArray]:
+    """Tell which road points (S,) have a road of the map that runs their way so far to the right, and to the left."""
+    points, along, _ = points_on_map(matrix, scene)
+    roads = index.road_buckets
+
+    def beside(away_m: float) -> BoolArray:
+        shifted, away = np.ascontiguousarray(points + away_m * along[:, ::-1] * (1.0, -1.0)), np.empty((len(points), 3))
+        road_residuals(np.eye(3), shifted, along, np.full(len(points), give_or_take_m), MIN_COS, roads, away)
+        return np.isfinite(away[:, 0])
+
+    return beside(beside_m), beside(-beside_m)
+
+
+def points_on_map(matrix: FloatArray, scene: Scene) -> tuple[FloatArray, FloatArray, FloatArray]:
+    """Return road points on the map (S, 2), unit vectors along the roads (S, 2), and metres per pixel there (S,)."""
+    to_map = Homography(matrix).facing(scene.center)
+    points = np.ascontiguousarray(to_map(scene.points))
+    ahead = to_map(scene.points + scene.directions) - points
+    length = np.maximum(np.hypot(*ahead.T), 1e-12)
+    return points, np.ascontiguousarray(ahead / length[:, None]), length

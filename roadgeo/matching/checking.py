@@ -12,11 +12,10 @@ from roadgeo._arrays import FloatArray, IntArray
 from roadgeo.geometry.camera import sampling
 from roadgeo.geometry.displacement import Displacement, measure
 from roadgeo.geometry.homography import Homography
-from roadgeo.matching.carriageways import refine_between
+from roadgeo.matching.carriageways import refine_between, roads_beside
 from roadgeo.matching.evidence import Evidence
 from roadgeo.matching.index import ReferenceIndex
 from roadgeo.matching.local_search import LocalSearchOptions, move_about, search_nearby
-from roadgeo.matching.merged_roads import roads_beside
 from roadgeo.matching.refinement import Refined, RefineOptions, refine
 from roadgeo.matching.scene import Scene
 from roadgeo.matching.verification import VerifyOptions, agreement
@@ -180,8 +179,8 @@ class _Judge:
         A mask often shows a dual carriageway as one line, halfway between the two of the map: were it laid on either,
         the frame would be off by half their distance.
         """
-        scene, twin_m, max_turn = self.scene, self.options.twin_m, self.options.verify.max_turn_deg
-        right, left = roads_beside(matrix, scene, self.index, twin_m, 0.8 * twin_m, max_turn)
+        scene, twin_m = self.scene, self.options.twin_m
+        right, left = roads_beside(matrix, scene, self.index, twin_m, 0.8 * twin_m)
         alone = ~(right & left)
         if alone.mean() < 0.4:
             return scene

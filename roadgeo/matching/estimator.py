@@ -14,15 +14,17 @@ from roadgeo.geometry.areas import Box, lies_in
 from roadgeo.geometry.camera import CameraFault, CameraOptions, judge, sampling
 from roadgeo.geometry.homography import Homography
 from roadgeo.geometry.projection import to_lonlat
+from roadgeo.matching.events import Events, Scored
 from roadgeo.matching.evidence import Evidence, EvidenceOptions
 from roadgeo.matching.exhaustive import ExhaustiveOptions, is_told, propose_everywhere
-from roadgeo.matching.growing import GrowOptions, grow_proposals, screen_proposals
+from roadgeo.matching.growing import grow_proposals, screen_proposals
 from roadgeo.matching.hypothesis import MINIMAL, Hypothesis, Lead
 from roadgeo.matching.index import ReferenceIndex
-from roadgeo.matching.ledger import Ledger
+from roadgeo.matching.ledger import Ledger, Work
 from roadgeo.matching.lens import (
+    ENOUGH,
+    MAX_PLACES,
     LensFit,
-    LensOptions,
     core_excess,
     find_lens,
     grow_whole,
@@ -31,17 +33,13 @@ from roadgeo.matching.lens import (
     straighten_scene,
 )
 from roadgeo.matching.refinement import RefineOptions, refine
-from roadgeo.matching.road_growth import Grown
-from roadgeo.matching.road_search import RoadSearch, RoadSearchOptions
+from roadgeo.matching.road_search import Grown, RoadSearch
 from roadgeo.matching.scene import Scene
 from roadgeo.matching.shared_sweeps import SharedSweeps, Stage
-from roadgeo.matching.sweeps import BEFORE_ROADS, WITHOUT_ROADS, Source, Sweep
-from roadgeo.matching.trace import NO_TRACE, Trace
-from roadgeo.matching.triples import Proposals, larger
+from roadgeo.matching.triples import BEFORE_ROADS, WITHOUT_ROADS, Proposals, Sweep, larger
 from roadgeo.matching.verification import VerifyOptions, agreement
-from roadgeo.matching.work import Work
 
-__all__ = ["Ledger", "MatchOptions", "Source", "Sweep", "TripleEstimator"]
+__all__ = ["Ledger", "MatchOptions", "TripleEstimator"]
 
 #: A place is looked at through a lens once, and again where so much more of the mask's roads agrees.
 _BETTER = 0.05
@@ -52,6 +50,8 @@ _OFTEN_ENOUGH = 2
 _LEAST_LIKELY, _NO_RIVAL, _BEHIND = 0.7, 0.4, 0.7
 #: One that explains as much as the likeliest other place, but for a part, is looked at through a lens.
 _NEARLY = 0.8
+#: As of `RefineOptions`, for what grew by roads: false roads abound there.
+_LEAST_SHARE_BY_ROADS = 0.2
 #: How far a proposal, made of three intersections, may turn the image's up from where it points.
 _ROUGHLY_DEG = 25.0
 
@@ -64,16 +64,16 @@ class MatchOptions:
 
     Attributes
     ----------
-    sweeps, without_roads : tuple of Source
+    sweeps, without_roads : tuple of Sweep
         The sweeps where roads propose after them, and where these are left out: they go on for longer then.
     sightings : int
         Anchors that must lead to a place before it ends the search: a map may hold its twin.
-    roads : RoadSearchOptions or None
-        What follows where no triple leads to a place: None for more sweeps.
+    roads : bool
+        Whether roads propose where no triple leads to a place, rather than more sweeps.
     everywhere : ExhaustiveOptions
         Where heading and scale are told, of laying the roads everywhere on the map instead.
-    lens : LensOptions or None
-        Of a lens that is looked for behind promising places, and behind others that roads led to: None for a pinhole.
+    lens : bool
+        Whether a lens is looked for behind promising places, and behind others that were dropped.
     max_places : int
         The sweeps end too when so many places were screened on a map of 15,000 intersections, and on a larger one more
         by the root of the ratio. Where streets are alike, proposals abound, and late ones are seldom right: of 31 masks
@@ -82,16 +82,15 @@ class MatchOptions:
         Degrees: the middle of the frame is known to lie there (see `geometry.areas`).
     """
 
-    sweeps: tuple[Source, ...] = BEFORE_ROADS
-    without_roads: tuple[Source, ...] = WITHOUT_ROADS
-    grow: GrowOptions = field(default_factory=GrowOptions)
+    sweeps: tuple[Sweep, ...] = BEFORE_ROADS
+    without_roads: tuple[Sweep, ...] = WITHOUT_ROADS
     verify: VerifyOptions = field(default_factory=VerifyOptions)
     evidence: EvidenceOptions = field(default_factory=EvidenceOptions)
     refine: RefineOptions = field(default_factory=RefineOptions)
     camera: CameraOptions = field(default_factory=CameraOptions)
-    roads: RoadSearchOptions | None = field(default_factory=RoadSearchOptions)
+    roads: bool = True
     everywhere: ExhaustiveOptions = field(default_factory=ExhaustiveOptions)
-    lens: LensOptions | None = field(default_factory=LensOptions)
+    lens: bool = True
     max_places: int = 12_000
     sightings: int = 2
     within: Box | None = None
@@ -106,9 +105,9 @@ class TripleEstimator:
         index: ReferenceIndex,
         options: MatchOptions | None = None,
         near: tuple[float, float, float] | None = None,
-        trace: Trace = NO_TRACE,
+        events: Events | None = None,
         ledger: Ledger | None = None,
-        sweeps: SharedSweeps[TripleEstimator] | None = None,
+        sweeps: SharedSweeps | None = None,
     ) -> None:
         """`near` = (x, y, radius) in plane metres restricts where the middle of the frame may lie.
 
@@ -116,7 +115,9 @@ class TripleEstimator:
         """
         self.near = near
         self.ledger = ledger or Ledger()
-        self.trace = trace
+        self.events = events or Events()
+        if self.events.kept:
+            self.events.estimator = self
         self.refine_s = 0.0
         self.n_nulls = 0
         self.verified: list[Hypothesis] = []
@@ -135,7 +136,6 @@ class TripleEstimator:
         self.sweeps.members.append(self)
         self._road_search: RoadSearch | None = None
         self._is_everywhere = False  # whether the roads were laid everywhere on the map
-        trace.began(self)
 
     def stages(self) -> Iterator[Iterator[list[Hypothesis]]]:
         """Yield, for one anchor after another, the hypotheses that grew.
@@ -144,9 +144,9 @@ class TripleEstimator:
 
         On a coarse map roads come first: an intersection is seldom merged there as a mask shows it.
         """
-        options, by_roads = self.options, self.options.roads is not None and len(self.scene.intersections) > 0
+        options, by_roads = self.options, self.options.roads and len(self.scene.intersections) > 0
         sources = options.sweeps if by_roads else options.without_roads
-        sweeps = [self.sweeps.rounds(self, Stage(stage, source, options.grow)) for stage, source in enumerate(sources)]
+        sweeps = [self.sweeps.rounds(self, Stage(stage, source)) for stage, source in enumerate(sources)]
         if by_roads and is_told(options.camera, options.everywhere):
             yield sweeps.pop(0)
             yield self._rounds_everywhere()
@@ -157,8 +157,8 @@ class TripleEstimator:
             return
         roads = [self._rounds_of_roads()]
         yield from sweeps + roads if self.index.coarseness == 1.0 else roads + sweeps
-        if options.lens is not None:
-            yield self._rounds_of_lenses(options.lens)
+        if options.lens:
+            yield self._rounds_of_lenses()
 
     def _rounds_everywhere(self) -> Iterator[list[Hypothesis]]:
         """Yield the places that agree best of all, where heading and scale are told."""
@@ -168,7 +168,7 @@ class TripleEstimator:
             self.n_hypotheses += 1
             _, matched, _ = agreement(matrix, scene, index, sampling(matrix, scene.size), nobody, options.verify)
             hypothesis = Hypothesis(matrix, nobody, 1.0, matched, by_roads=True)
-            self.trace.grown([hypothesis])
+            self.events.note("grown", [hypothesis.matrix])
             yield [hypothesis] if self._is_plausible(hypothesis) else []
 
     @property
@@ -189,7 +189,7 @@ class TripleEstimator:
     def follow(self, leads: Sequence[Lead]) -> Iterator[list[Hypothesis]]:
         """Yield what grew from anchors that led to a place on another part (see `search.Estimator`)."""
         for stage, anchor in leads:
-            if self.options.roads is None or stage < self._stage_of_roads:
+            if not self.options.roads or stage < self._stage_of_roads:
                 yield self.sweeps.pending(self, stage, anchor)
             else:
                 yield from self._rounds_of_roads([anchor])
@@ -212,11 +212,9 @@ class TripleEstimator:
     def _search_by_roads(self) -> RoadSearch:
         """Return the search by roads, which is made when it is needed."""
         if self._road_search is None:
-            options = self.options.roads or RoadSearchOptions()
-            on_map, coarseness = options.on(self.index.coarseness), self.index.coarseness
-            turnout = self.sweeps.turnout(coarseness, on_map)
+            turnout = self.sweeps.turnout(self.index.coarseness)
             self._road_search = RoadSearch(
-                self.scene, self.index, self.options.camera, on_map, self.near, self.sweeps.ahead, turnout
+                self.scene, self.index, self.options.camera, self.near, self.sweeps.ahead, turnout
             )
         return self._road_search
 
@@ -230,7 +228,7 @@ class TripleEstimator:
             self.n_hypotheses += n_proposed
             if anchor >= 0:
                 self._tried.add((stage, anchor))
-                self.trace.voted(anchor, n_proposed)
+                self.events.note("voted", anchor, n_proposed)
             fresh: list[Hypothesis] = []
             again: list[Hypothesis] = []
             for hypothesis in map(self._of_roads, grown):
@@ -244,14 +242,14 @@ class TripleEstimator:
             for one in fresh:
                 one.leads.append((stage, anchor))
             known += fresh
-            self.trace.grown(fresh)
+            self.events.note("grown", [one.matrix for one in fresh])
             yield fresh
 
     def _is_plausible(self, hypothesis: Hypothesis) -> bool:
         """Whether a camera can have seen a grown hypothesis."""
         hypothesis.fault = self.judge(hypothesis.matrix, rough=True)
         if hypothesis.fault is not None:
-            self.trace.refused(hypothesis.fault, hypothesis.matrix)
+            self.events.note("refused", hypothesis.fault, hypothesis.matrix)
         return hypothesis.fault is None
 
     def _of_roads(self, grown: Grown) -> Hypothesis:
@@ -267,7 +265,7 @@ class TripleEstimator:
         return known.log10_likelihood >= _LEAST_LIKELY and self.same(known, hypothesis)
 
     def known_places(self) -> list[Hypothesis]:
-        """Return what was verified and fits (see `shared_sweeps.Member`)."""
+        """Return what was verified and fits ."""
         return self._whole
 
     def enough(self) -> bool:
@@ -283,8 +281,8 @@ class TripleEstimator:
         looked_at = np.flatnonzero(allowed)[:most]
         self._count(len(looked_at))
         self.ledger.n_by_triples += len(looked_at)
-        kept = screen_proposals(self.scene, self.index, proposals, looked_at, stage.grow)
-        self.trace.screened(proposals, allowed, kept)
+        kept = screen_proposals(self.scene, self.index, proposals, looked_at)
+        self.events.note("screened", proposals, allowed, kept)
         return kept
 
     def allow(self, proposals: Proposals) -> BoolArray:
@@ -297,17 +295,16 @@ class TripleEstimator:
             allowed &= away_m < self.near[2] + frame
         return allowed & (self.options.camera.turned_off(j01, j11) < _ROUGHLY_DEG)
 
-    def grow(self, proposals: Proposals, chosen: IntArray, options: GrowOptions | None = None) -> list[Hypothesis]:
+    def grow(self, proposals: Proposals, chosen: IntArray) -> list[Hypothesis]:
         """Grow the chosen proposals of one anchor; return those that did not wither, the best supported first."""
-        options, camera = options or self.options.grow, self.options.camera
-        return grow_proposals(self.scene, self.index, proposals, chosen, options, camera)
+        return grow_proposals(self.scene, self.index, proposals, chosen, self.options.camera)
 
     def follow_up(self, proposals: Proposals, chosen: IntArray, stage: Stage) -> Iterator[Hypothesis]:
         """Yield the grown proposals of one anchor that mean different places and that a camera can have seen."""
         lead = (stage.number, proposals.anchor)
         self.n_hypotheses += len(chosen)
-        grown = self.grow(proposals, chosen, stage.grow)
-        self.trace.grown(grown)
+        grown = self.grow(proposals, chosen)
+        self.events.note("grown", [one.matrix for one in grown])
         distinct: list[Hypothesis] = []
         for h in filter(self._is_plausible, grown):
             known = [one for one in self._whole if self.same(one, h)]
@@ -333,7 +330,8 @@ class TripleEstimator:
         if math.isfinite(model.log10_odds):
             self.verified.append(model)
         self.refine_s += time.perf_counter() - started
-        self.trace.scored(model)
+        fault = None if math.isfinite(model.log10_odds) else model.fault
+        self.events.note("scored", Scored(model, model.log10_odds, fault))
         if not model.by_roads and self._fits_whole(model):
             self._whole.append(model)
         return model.log10_odds
@@ -374,15 +372,15 @@ class TripleEstimator:
 
     def _look_through_lens(self, model: Hypothesis) -> None:
         """Take a lens into a promising place where one explains it better."""
-        index, options, refined, agreeing = self.index, self.options, model.refined, model.found
-        if options.lens is None or refined is None or agreeing is None:
+        index, refined, agreeing = self.index, model.refined, model.found
+        if not self.options.lens or refined is None or agreeing is None:
             return
         if any(share > agreeing.forward - _BETTER and self.same(other, model) for other, share in self._looked):
             return
         self._looked.append((model, agreeing.forward))
-        lens = find_lens(refined.matrix, self.scene, index, agreeing.forward, self.refine_options, options.lens)
-        if lens is None and agreeing.forward < options.lens.enough:
-            lens = grow_whole(refined.matrix, self.scene, index, self.refine_options, options.lens)
+        lens = find_lens(refined.matrix, self.scene, index, agreeing.forward, self.refine_options)
+        if lens is None and agreeing.forward < ENOUGH:
+            lens = grow_whole(refined.matrix, self.scene, index, self.refine_options)
         if lens is None or not self.may_be(lens.matrix):
             return
         seen = replace(model)
@@ -404,24 +402,24 @@ class TripleEstimator:
         model.found, model.matched, model.distance = agreement(lens.matrix, scene, index, gsd, seeds, verify)
         self._weigh(model)
 
-    def _rounds_of_lenses(self, options: LensOptions) -> Iterator[list[Hypothesis]]:
+    def _rounds_of_lenses(self) -> Iterator[list[Hypothesis]]:
         """Yield places that were dropped and that fit after all when grown anew, behind a lens."""
         scene, index, refinement = self.scene, self.index, self.refine_options
         dropped, self._dropped = self._dropped, []
-        gains = [core_excess(one.matrix, scene, index, refinement, options) for one in dropped]
+        gains = [core_excess(one.matrix, scene, index, refinement) for one in dropped]
         places: list[Hypothesis] = []
         for k in np.argsort(-np.array(gains), kind="stable"):
             one = dropped[k]
             twin = next((other for other in places if self.same(one, other)), None)
             if twin is not None:
                 twin.leads += [lead for lead in one.leads if lead not in twin.leads]
-            elif len(places) < options.max_places:
+            elif len(places) < MAX_PLACES:
                 places.append(one)
         for one in places:
-            found = regrow(one.matrix, scene, index, refinement, options)
+            found = regrow(one.matrix, scene, index, refinement)
             if found is None or not self.may_be(found.matrix):
                 yield []
-            elif is_significant(found, scene, options):
+            elif is_significant(found, scene):
                 yield [replace(one, lens=found)]
             else:  # no lens: it had not grown over the whole frame
                 yield [replace(one, matrix=found.matrix, refined=None, by_roads=True)]
@@ -454,8 +452,8 @@ class TripleEstimator:
 
     def refinement(self, model: Hypothesis) -> RefineOptions:
         """Return how a hypothesis is refined."""
-        roads, usual = self.options.roads, self.refine_options
-        return roads.refinement(usual) if model.by_roads and roads is not None else usual
+        usual = self.refine_options
+        return replace(usual, least_share=_LEAST_SHARE_BY_ROADS) if model.by_roads and self.options.roads else usual
 
     def judge(self, matrix: FloatArray, rough: bool = False) -> CameraFault | None:
         """Return why a homography is not plausible for the camera, or None if it is."""

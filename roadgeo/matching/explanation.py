@@ -5,7 +5,7 @@
 ============  ==========================================================================================================
 query         as in `Location`, and so are `status`, `reason`, `reason_code`, `version`, `options`, `command` and
               `reference_digest`
-seen          `intersections` (all of them usable up to `SceneOptions.max_intersections`), how many of them have two
+seen          `intersections` (of very many, those nearest to the middle), how many of them have two
               tangents or more, `roads`, their length and the frame's size in pixels, the share of it that was observed
 searches      one for each reference, in the order in which they were searched:
 
@@ -25,7 +25,7 @@ searches      one for each reference, in the order in which they were searched:
 
               `missing`: sentences
 
-              `truth`: what became of the true place, where it was given; see `truth_record.TruthStory`
+              `truth`: what became of the true place, where it was given; see `truth.TruthStory`
 
               `places`: the best ones, best first; see `RejectedPlace`
 ============  ==========================================================================================================
@@ -34,32 +34,31 @@ searches      one for each reference, in the order in which they were searched:
 from __future__ import annotations
 
 import math
+from collections import Counter
 from collections.abc import Sequence
 from dataclasses import asdict, dataclass, replace
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import numpy as np
 
 from roadgeo import __version__
 from roadgeo._arrays import BoolArray, FloatArray
-from roadgeo.geometry.camera import CameraFault, pose
+from roadgeo.geometry.camera import CameraFault, CameraOptions, pose, sampling
 from roadgeo.geometry.homography import Homography
 from roadgeo.geometry.projection import to_lonlat
-from roadgeo.kernels.roads import forward_distances
+from roadgeo.kernels.roads import road_residuals
 from roadgeo.location import Location, Place
 from roadgeo.matching.estimator import TripleEstimator
+from roadgeo.matching.events import Events, Scored
 from roadgeo.matching.hypothesis import Hypothesis
 from roadgeo.matching.methods import Found
 from roadgeo.matching.query import Query
-from roadgeo.matching.record import Record, Scored, without_limits
-from roadgeo.matching.scene import Scene
+from roadgeo.matching.scene import MIN_COS, Scene
 from roadgeo.matching.search import SearchResult
+from roadgeo.matching.truth import TruthStory, tell_truth
 from roadgeo.matching.verdict import Needed
-from roadgeo.matching.verification import Agreement, tolerance_m
+from roadgeo.matching.verification import Agreement, agreement, tolerance_m
 from roadgeo.roads.graph import RoadGraph
-
-if TYPE_CHECKING:
-    from roadgeo.matching.truth_record import TruthStory
 
 __all__ = ["SCHEMA", "Explanation", "Funnel", "RejectedPlace", "Story", "tell"]
 
@@ -70,6 +69,12 @@ _MAX_PLACES = 6
 
 #: Masks with fewer intersections are seldom located.
 _USUAL_INTERSECTIONS = 6
+
+#: Places that a camera refused which are looked at again, and how many of those are kept.
+_MAX_RETRIED, _MAX_REFUSED, _MAX_ELSEWHERE = 6, 200, 20
+
+#: Limits that a user may have set too narrow; other faults hold for every camera.
+_NEGOTIABLE = (CameraFault.SAMPLING, CameraFault.SKEW, CameraFault.TILT, CameraFault.HEADING)
 
 
 @dataclass(frozen=True)
@@ -224,33 +229,75 @@ class Explanation:
         }
 
 
-def tell(query: Query, found: Found, location: Location, record: Record, needed: Needed) -> Story:
-    """Tell how the search on one reference went; `location` is what it came to on that reference alone."""
-    n, name, located = len(query.scene.intersections), found.index.name, location.located
-    search, result, stats = record.estimator, record.result, found.stats
+def tell(
+    query: Query, found: Found, location: Location, needed: Needed, truth: tuple[float, float] | None = None
+) -> Story:
+    """Tell how the search on one reference went; `location` is what it came to on that reference alone.
+
+    `truth` is longitude and latitude of the true place, where that is known.
+    """
+    n, name, located, events = len(query.scene.intersections), found.index.name, location.located, found.events
+    search, result, stats = events.estimator, events.result, found.stats
     if search is None or result is None:  # there was nothing to search for, or another method searched
         ended = "intersections" if n < needed.intersections else "verified" if stats.tuples_sampled else "anchors"
         funnel = Funnel(n, stats.tuples_sampled, 0, stats.candidates, 0, 0, stats.hypotheses, 0, stats.verified)
-        return Story(name, "", needed, funnel, {}, None if located else ended, () if located else (location.reason,))
+        told = None if truth is None else tell_truth(truth, events, location, needed)
+        missing = () if located else (location.reason,)
+        return Story(name, "", needed, funnel, {}, None if located else ended, _with_truth(missing, told), truth=told)
+    _look_elsewhere(events, search)
+    screened, voted, scored = events.of("screened"), events.of("voted"), events.of("scored")
+    proposed = sum(count for _, count in voted)  # all of them lie on roads
     funnel = Funnel(
         n,
-        len(set(record.anchors)),
+        len({proposals.anchor for proposals, *_ in screened} | {anchor for anchor, _ in voted}),
         search.n_tuples,
         search.n_candidates,
-        record.n_proposals,
-        record.n_on_roads,
+        proposed + sum(len(proposals.reference) for proposals, *_ in screened),
+        proposed + sum(len(kept) for *_, kept in screened),
         search.n_hypotheses,
-        record.n_survived,
+        sum(map(len, events.of("grown"))),
         search.n_verified,
         search.n_nulls,
     )
-    entries = [*record.models, *([] if located else without_limits(record, search))]
+    refusals = Counter([fault for fault, _ in events.of("refused")] + [one.fault for one in scored if one.fault])
+    entries = [*scored, *([] if located else _without_limits(events, search))]
     ranked = _distinct(search, sorted(entries, key=lambda entry: _rank(entry, needed)))
     places = tuple(_describe(search, entry, result, location, needed) for entry in ranked)
-    starved = None if located else _starved(funnel, record, result, needed)
-    missing = () if located else tuple(_missing(funnel, record, search, result, places, needed))
-    refusals = {fault.value: times for fault, times in record.refusals.most_common()}
-    return Story(name, result.stopped, needed, funnel, refusals, starved, missing, places)
+    starved = None if located else _starved(funnel, refusals, result, needed)
+    absent = () if located else tuple(_missing(funnel, refusals, search, result, places, needed))
+    counts = {fault.value: times for fault, times in refusals.most_common()}
+    told = None if truth is None else tell_truth(truth, events, location, needed)
+    return Story(name, result.stopped, needed, funnel, counts, starved, _with_truth(absent, told), places, told)
+
+
+def _with_truth(missing: tuple[str, ...], told: TruthStory | None) -> tuple[str, ...]:
+    return missing if told is None or told.lost_at is None else (told.said, *missing)
+
+
+def _look_elsewhere(events: Events, search: TripleEstimator) -> None:
+    """Grow some proposals that point elsewhere than a camera may: to tell that they would fit."""
+    for proposals, allowed, _ in events.of("screened"):
+        barred = proposals.only(np.flatnonzero(~allowed)[:_MAX_ELSEWHERE])
+        for hypothesis in search.grow(barred, np.arange(len(barred.reference)))[:_MAX_RETRIED]:
+            fault = search.judge(hypothesis.matrix, rough=True)
+            if fault is not None:
+                events.note("refused", fault, hypothesis.matrix)
+
+
+def _without_limits(events: Events, search: TripleEstimator) -> list[Scored]:
+    """Verify the best of the places that the camera refused as if it had not."""
+    scene, index, options = search.scene, search.index, search.options
+    camera = CameraOptions(gsd_m=(0.0, math.inf), max_tilt_deg=180.0, max_skew=math.inf)
+    free = TripleEstimator(scene, index, replace(options, camera=camera), ledger=search.ledger)
+    nobody = np.empty(0, np.int64)
+    compared = []
+    for fault, unscaled in [one for one in events.of("refused") if one[0] in _NEGOTIABLE][:_MAX_REFUSED]:
+        matrix = unscaled / unscaled[2, 2]
+        gsd = sampling(matrix, scene.size)
+        found, matched, _ = agreement(matrix, scene, index, gsd, nobody, options.verify)
+        compared.append((found.rate + found.forward, fault, Hypothesis(matrix, nobody, 0.0, matched)))
+    compared.sort(key=lambda entry: -entry[0])
+    return [Scored(model, free.score(model), fault) for _, fault, model in compared[:_MAX_RETRIED]]
 
 
 def _rank(entry: Scored, needed: Needed) -> tuple[bool, float]:
@@ -287,11 +334,8 @@ def _describe(
     in_crs = index.plane.to_crs(ground)
     lonlat = to_lonlat(index.plane.crs, in_crs)
     # which of the query's road points agree
-    distance = np.empty(len(scene.points))
-    forward_distances(
-        model.matrix, scene.points, scene.directions, tolerance_m(camera.gsd_m, verify),
-        math.cos(math.radians(verify.max_turn_deg)), 0.0, 0.0, index.road_buckets, distance,
-    )  # fmt: skip
+    away, near = np.empty((len(scene.points), 3)), np.full(len(scene.points), tolerance_m(camera.gsd_m, verify))
+    road_residuals(model.matrix, scene.points, scene.directions, near, MIN_COS, index.road_buckets, away)
     place = RejectedPlace(
         matrix=model.matrix,
         center=Place(
@@ -306,7 +350,7 @@ def _describe(
         agreement=model.found,
         log10_likelihood=model.log10_likelihood,
         nearby=model.nearby,
-        agrees=np.isfinite(distance),
+        agrees=np.isfinite(away[:, 0]),
         why="",
         fault=entry.fault,
     )
@@ -354,11 +398,11 @@ def _weakest(place: RejectedPlace) -> str:
     return f"its roads explain 10^{_number(place.log10_likelihood)}, those of a place nearby 10^{_number(place.nearby)}"
 
 
-def _starved(funnel: Funnel, record: Record, result: SearchResult[Hypothesis], needed: Needed) -> str:
+def _starved(funnel: Funnel, refusals: Counter[CameraFault], result: SearchResult[Hypothesis], needed: Needed) -> str:
     """Return the first stage that nothing came out of."""
     stages = ("intersections", "anchors", "tuples", "candidates", "proposals", "on_roads", "survived", "verified")
     empty = next((stage for stage in stages if getattr(funnel, stage) == 0), None)
-    if empty == "verified" and record.refusals:
+    if empty == "verified" and refusals:
         return "camera"
     if empty is not None:
         return empty
@@ -379,7 +423,7 @@ _NOTHING = {
 
 def _missing(
     funnel: Funnel,
-    record: Record,
+    refusals: Counter[CameraFault],
     search: TripleEstimator,
     result: SearchResult[Hypothesis],
     places: Sequence[RejectedPlace],
@@ -389,11 +433,11 @@ def _missing(
     told, scene = [], search.scene
     if result.stopped in ("time", "work"):
         told.append(f"{result.stopped}: the search was stopped by its limit, places may be left untried")
-    starved = _starved(funnel, record, result, needed)
+    starved = _starved(funnel, refusals, result, needed)
     if starved in _NOTHING:
         told.append(_NOTHING[starved])
     if starved == "camera":
-        reasons = ", ".join(f"{fault.value} ({times})" for fault, times in record.refusals.most_common())
+        reasons = ", ".join(f"{fault.value} ({times})" for fault, times in refusals.most_common())
         told.append(f"a camera: all places that grew are such as none sees, or none within the limits: {reasons}")
     best = places[0] if places else None
     if best is not None and best.fault is not None and best.log10_odds >= needed.log10_odds:

@@ -4,29 +4,42 @@ from __future__ import annotations
 
 import math
 from dataclasses import dataclass, replace
+from typing import NamedTuple
 
 import cv2
 import numpy as np
 
-from roadgeo._arrays import FloatArray
+from roadgeo._arrays import BoolArray, FloatArray, IntArray
+from roadgeo.geometry.homography import Homography
 from roadgeo.geometry.lens import Lens
+from roadgeo.kernels.lens import MeetLimits, lens_rows, meet_roads
 from roadgeo.matching.index import ReferenceIndex
-from roadgeo.matching.lens_equations import LensEquations
 from roadgeo.matching.refinement import (
+    SIGMA_M,
+    SIGMA_PX,
+    TOLERANCE_M,
     Refined,
     RefineOptions,
     corner_covariance,
     corner_sigmas,
     denormalise,
+    max_radius_m,
+    normalise,
+    point_weight,
     robust_rms,
     scatter_m,
 )
-from roadgeo.matching.scene import Scene
+from roadgeo.matching.scene import MIN_COS, Scene
 from roadgeo.roads.intersections import Intersections
 
 __all__ = [
+    "ENOUGH",
+    "FEWEST",
+    "K1_SIGMA",
+    "MAX_PLACES",
+    "LensEquations",
     "LensFit",
-    "LensOptions",
+    "Observed",
     "core_excess",
     "find_lens",
     "fit_lens",
@@ -36,6 +49,172 @@ __all__ = [
     "straighten_scene",
 ]
 
+#: Steps that take the homography of the core from one k1 to another.
+_STEPS = 4
+#: Points nearer to the horizon than this w are not seen.
+_LEAST_W = 0.02
+#: Road points that the share of a cell and its neighbours is counted against, where there are fewer.
+_FEWEST = 12
+
+
+class Observed(NamedTuple):
+    """Roads that were met by M of S points.
+
+    Attributes
+    ----------
+    rows : (M, 9) float64
+        Derivatives of the points' places across the roads, normalised.
+    residuals, sigma : (M,) float64
+        Ways to the roads and their standard deviations, metres.
+    own : (M,) float64
+        These where the places are known, in that of the middle of the frame: a pixel may reach further.
+    which : (S,) bool
+        The points.
+    """
+
+    rows: FloatArray
+    residuals: FloatArray
+    sigma: FloatArray
+    own: FloatArray
+    which: BoolArray
+
+    @property
+    def cauchy(self) -> FloatArray:
+        """Weights (M,) that keep outliers from a fit."""
+        return np.asarray(1.0 / (1.0 + (self.residuals / self.sigma) ** 2))
+
+    @property
+    def normals(self) -> FloatArray:
+        """Unit vectors (M, 2) across the roads."""
+        across = self.rows[:, [2, 5]]
+        return np.asarray(across / np.linalg.norm(across, axis=1, keepdims=True))
+
+    @property
+    def scaled(self) -> FloatArray:
+        """Residuals (M,) as if each pixel reached as far as in the middle of the frame, metres."""
+        return np.asarray(self.residuals / self.own)
+
+
+class LensEquations:
+    """Road points of a scene on one map, as nine parameters see them: eight of the homography, and k1."""
+
+    def __init__(self, matrix: FloatArray, scene: Scene, index: ReferenceIndex, options: RefineOptions) -> None:
+        self.scene, self.options = scene, options
+        self.p, self.origin, self.unit = normalise(matrix, scene.center, scene.half_size)
+        self.roads = index.road_buckets
+        gsd = self.unit / scene.half_size
+        self.sigma_m = math.hypot(SIGMA_M, SIGMA_PX * gsd)
+        self.max_radius = max_radius_m(gsd)
+        self.weight = point_weight(scene, self.unit)
+        self.min_cos = MIN_COS
+        self.points = np.ascontiguousarray((scene.points - scene.center) / scene.half_size)
+        self.directions = np.ascontiguousarray(scene.directions)
+        self.half_side = max(scene.size) / 2 / scene.half_size
+
+    def rows(self, k1: float) -> tuple[FloatArray, FloatArray]:
+        """Return places (S, 2) on the map, normalised, and their derivatives (S, 2, 9)."""
+        places, rows = np.empty((len(self.points), 2)), np.empty((len(self.points), 2, 9))
+        lens_rows(self.p, k1, self.half_side, self.points, self.directions, places, rows)
+        return places, rows
+
+    def held(self, sigmas: FloatArray) -> FloatArray:
+        """Return the weights that hold parameters whose standard deviations are `sigmas`."""
+        return np.asarray((self.sigma_m / self.unit / sigmas) ** 2)
+
+    def prior(self, k1_sigma: float) -> FloatArray:
+        """Return the weights (9,) that hold the perspective and k1 near 0."""
+        return np.append(np.zeros(6), self.held(np.array([self.options.perspective_sigma] * 2 + [k1_sigma])))
+
+    def local_scale(self, k1: float) -> tuple[FloatArray, FloatArray]:
+        """Return how far on the ground a pixel reaches across each road (S,), metres; and see below.
+
+        Also the derivatives (S, 2, 2) of normalised places by where the middle of the lens is, in pixels.
+        """
+        scene, (homography, uv) = self.scene, self._seen(k1)
+        stretch = Lens.of(k1, scene.size, y_up=True).stretch(scene.points)
+        jacobian = homography.jacobian(uv) / scene.half_size
+        whole = jacobian @ stretch
+        along = np.linalg.norm((whole @ scene.directions[:, :, None])[..., 0], axis=1)
+        return self.unit * np.abs(np.linalg.det(whole)) / along, jacobian @ (np.eye(2) - stretch)
+
+    def _seen(self, k1: float) -> tuple[Homography, FloatArray]:
+        """Return the normalised homography, and its points (S, 2) as a pinhole sees them; NaN near the horizon."""
+        uv = self._straight(k1)
+        seen = 1.0 + uv @ self.p[6:8] >= _LEAST_W
+        return Homography(np.append(self.p, 1.0).reshape(3, 3)), np.where(seen[:, None], uv, np.nan)
+
+    def _straight(self, k1: float) -> FloatArray:
+        """Return the normalised points (S, 2) as a pinhole sees them."""
+        scene = self.scene
+        return np.asarray(
+            (Lens.of(k1, scene.size, y_up=True).straighten(scene.points) - scene.center) / scene.half_size
+        )
+
+    def core(self, k1: float, n_cells: int, least: float) -> tuple[BoolArray, BoolArray]:
+        """Return which points (S,) lie on roads in the part of the frame where most do, and which lie in that part.
+
+        It is made of those of the frame's `n_cells` x `n_cells` cells, around the best one, in which at least the part
+        `least` of its share of points lies on roads.
+        """
+        met = self.observe(k1, np.zeros((9, 9))).which
+        inside = self.cells(met, n_cells, least)[self.cell_of(n_cells)]
+        return met & inside, inside
+
+    def cells(self, met: BoolArray, n: int, least: float) -> BoolArray:
+        """Return the cells (n, n), rows first, of the core, given which points (S,) lie on roads."""
+        row, column = self.cell_of(n)
+        counts = np.zeros((2, n, n))
+        np.add.at(counts[0], (row, column), met)
+        np.add.at(counts[1], (row, column), 1.0)
+        # A cell is judged together with its neighbours: alone it has a few points.
+        hits, points = (9.0 * cv2.blur(one, (3, 3), borderType=cv2.BORDER_CONSTANT) for one in counts)
+        shares = hits / np.maximum(points, _FEWEST)
+        best = np.unravel_index(shares.argmax(), shares.shape)
+        good = shares >= least * shares.max()
+        _, parts = cv2.connectedComponents(good.astype(np.uint8), connectivity=4)
+        return np.asarray(parts == parts[best])
+
+    def cell_of(self, n: int) -> tuple[IntArray, IntArray]:
+        """Return the row and the column (S,) of the cell that each point lies in, of n x n."""
+        column, row = np.clip((self.scene.points / self.scene.size * (n, -n)).astype(int), 0, n - 1).T
+        return row, column
+
+    def begin(self, k1: float, start: float | None, core: BoolArray) -> FloatArray:
+        """Return the derivatives (C, 2, 9) of core points' places.
+
+        With another k1 to `start` from, let the parameters put the points where they did.
+        """
+        places, rows = self.rows(k1)
+        if start is None or start == k1:
+            return rows[core]
+        target = places[core]
+        for _ in range(_STEPS):
+            places, rows = self.rows(start)
+            flat = rows[core, :, :8].reshape(-1, 8)
+            away = (target - places[core]).ravel()
+            self.p = self.p + np.linalg.solve(flat.T @ flat + 1e-4 * np.eye(8), flat.T @ away)
+        return self.rows(start)[1][core]
+
+    def observe(self, k1: float, inverse: FloatArray, slack: float = 1.0) -> Observed:
+        """Find the roads near points whose places are sure enough.
+
+        How far off a place may be follows from the `inverse` (9, 9) of the normal matrix so far, times `slack`.
+        """
+        n, (x, y) = len(self.points), self.origin
+        rows, residuals, sigma, own = np.empty((n, 9)), np.empty(n), np.empty(n), np.empty(n)
+        limits = MeetLimits(
+            self.unit, float(x), float(y), slack, self.max_radius, self.min_cos,
+            self.sigma_m, SIGMA_M, SIGMA_PX / self.scene.half_size,
+        )  # fmt: skip
+        inverse = np.ascontiguousarray(inverse)
+        meet_roads(
+            self.p, k1, self.half_side, self.points, self.directions, inverse, limits, self.roads,
+            rows, residuals, sigma, own,
+        )  # fmt: skip
+        met = np.isfinite(residuals)
+        return Observed(rows[met], residuals[met], sigma[met], own[met], met)
+
+
 #: A fit that puts so much more of the roads on roads is worth another one.
 _MORE = 0.01
 #: And where a fit has grown over more of the frame, so much more.
@@ -44,65 +223,28 @@ _BETTER = 0.02
 _HELD = 1e-6
 
 
-@dataclass(frozen=True)
-class LensOptions:
-    """When a lens is believed, and how it is found.
-
-    Attributes
-    ----------
-    enough : float
-        Where less than this share of the mask's roads agrees, a lens is tried, else only where residuals hint at one.
-    sigma : float
-        Prior standard deviation of k1.
-    significance : float
-        k1 counts when it is so many of its standard deviations from 0 ...
-    least_px : float
-        ... and moves the frame's corners by at least so much.
-    n_cells, core_share : int, float
-        The frame is divided into so many cells a side. The fit begins with those around the one where most road points
-        lie on roads, as far as they do in this part of its share.
-    fewest : int
-        Road points that a fit needs.
-    slack : float
-        While a fit grows, places may be so many times further off than it says.
-    starts : tuple of float
-        Values of k1 to begin with in turn, where beginning with 0 does not explain enough; first with few road points,
-        and with all of them where a lens shows.
-    n_iterations, n_restarts : int
-        At most.
-    soon, hopeless : int, float
-        A fit that after so many iterations has met less than this share of the road points is given up: wrong places
-        end at 0.2 to 0.4, right ones at 0.75 to 0.9 (training masks).
-    max_places : int
-        So many places that were dropped are grown anew, those first where most road points in one part of the frame
-        lie on roads beyond the share `chance_share` ...
-    quick_points, quick_starts : int, tuple of float
-        ... first with so many road points and these values of k1 to begin with ...
-    least_share : float
-        ... and verified where so many of them end on roads.
-    center_sigma_px : float
-        Standard deviation of the place of the lens's middle in each direction: conventions differ by half a pixel.
-    """
-
-    enough: float = 0.8
-    sigma: float = 0.1
-    significance: float = 5.0
-    least_px: float = 5.0
-    n_cells: int = 10
-    core_share: float = 0.75
-    fewest: int = 12
-    slack: float = 2.0
-    starts: tuple[float, ...] = (-0.15, -0.08, 0.08)
-    n_iterations: int = 30
-    n_restarts: int = 3
-    soon: int = 8
-    hopeless: float = 0.4
-    max_places: int = 12
-    chance_share: float = 0.3
-    quick_points: int = 300
-    quick_starts: tuple[float, ...] = (0.0, -0.07, -0.15)
-    least_share: float = 0.6
-    center_sigma_px: float = 0.5
+#: Where less than this share of the mask's roads agrees, a lens is tried, else only where residuals hint at one.
+ENOUGH = 0.8
+#: Prior standard deviation of k1, which counts when it is so many of its standard deviations from 0, and moves the
+#: frame's corners by at least so many pixels.
+K1_SIGMA, _SIGNIFICANCE, _LEAST_PX = 0.1, 5.0, 5.0
+#: The frame is divided into so many cells a side. The fit begins with those around the one where most road points lie
+#: on roads, as far as they do in this part of its share.
+_CORE = (10, 0.75)
+#: Road points that a fit needs; while a fit grows, places may be so many times further off than it says.
+FEWEST, _SLACK = 12, 2.0
+#: Values of k1 to begin with in turn, where beginning with 0 does not explain enough; first with few road points, and
+#: with all of them where a lens shows.
+_STARTS = (-0.15, -0.08, 0.08)
+#: Iterations and new starts, at most.
+_N_ITERATIONS, _N_RESTARTS = 30, 3
+#: A fit that after so many iterations has met less than this share of the road points is given up: wrong places end at
+#: 0.2 to 0.4, right ones at 0.75 to 0.9 (training masks).
+_SOON, _HOPELESS = 8, 0.4
+#: So many places that were dropped are grown anew, those first where most road points in one part of the frame lie on
+#: roads beyond the share of chance, first with so many road points and these values of k1 to begin with; and verified
+#: where so many of them end on roads.
+MAX_PLACES, _CHANCE_SHARE, _QUICK_POINTS, _QUICK_STARTS, _LEAST_SHARE = 12, 0.3, 300, (0.0, -0.07, -0.15), 0.6
 
 
 @dataclass(frozen=True)
@@ -133,7 +275,6 @@ def fit_lens(
     index: ReferenceIndex,
     k1: float = 0.0,
     refinement: RefineOptions | None = None,
-    options: LensOptions | None = None,
     start: float | None = None,
     held: bool = False,
 ) -> LensFit | None:
@@ -152,21 +293,21 @@ def fit_lens(
     held : bool
         Hold k1 where it begins, at 0 for a pinhole.
     """
-    options, refinement = options or LensOptions(), refinement or RefineOptions()
+    refinement = refinement or RefineOptions()
     equations = LensEquations(matrix, scene, index, refinement)
-    core, _ = equations.core(k1, options.n_cells, options.core_share)
-    if core.sum() < options.fewest:
+    core, _ = equations.core(k1, *_CORE)
+    if core.sum() < FEWEST:
         return None
-    prior = equations.prior(_HELD if held else options.sigma)
+    prior = equations.prior(_HELD if held else K1_SIGMA)
     rows = equations.begin(k1, start, core)
     k1 = k1 if start is None else start
     inverse = _inverse(rows.reshape(-1, 9), np.full(2 * len(rows), 0.5 * equations.weight), prior)
-    rms, n_met, slack = math.inf, 0, options.slack
-    for iteration in range(options.n_iterations):
+    rms, n_met, slack = math.inf, 0, _SLACK
+    for iteration in range(_N_ITERATIONS):
         # Points further out take part as soon as the fit so far says where they lie.
         seen = equations.observe(k1, inverse, slack)
         rows, cauchy, n_seen = seen.rows, seen.cauchy, len(seen.rows)
-        if n_seen < options.fewest or (iteration > options.soon and n_seen < options.hopeless * len(scene.points)):
+        if n_seen < FEWEST or (iteration > _SOON and n_seen < _HOPELESS * len(scene.points)):
             return None
         weights = equations.weight * cauchy / seen.own**2
         inverse = _inverse(rows, weights, prior)
@@ -178,12 +319,12 @@ def fit_lens(
         if not np.isfinite(step).all():
             return None
         rms = robust_rms(seen.scaled, cauchy)
-        if n_seen <= n_met and np.abs(step[:8]).max() * equations.unit < refinement.tolerance_m:
+        if n_seen <= n_met and np.abs(step[:8]).max() * equations.unit < TOLERANCE_M:
             if slack == 1.0:
                 break
             slack = 1.0
         n_met = n_seen
-    covariance = inverse * (scatter_m(rms, equations.sigma_m, refinement) / equations.unit) ** 2
+    covariance = inverse * (scatter_m(rms, equations.sigma_m) / equations.unit) ** 2
     found = denormalise(equations.p, scene.center, scene.half_size, equations.origin, equations.unit)
     corners = corner_covariance(equations.p, covariance[:8, :8], scene, equations.unit, refinement)
     refined = Refined(found / found[2, 2], corner_sigmas(corners), rms, corners, k1)
@@ -204,38 +345,35 @@ def find_lens(
     index: ReferenceIndex,
     agreeing: float,
     refinement: RefineOptions,
-    options: LensOptions,
 ) -> LensFit | None:
     """Fit a lens where it pays: None where the residuals of a refined homography do not show one.
 
     `agreeing` is the share of the mask's roads that agree without a lens.
     """
-    if agreeing >= options.enough and not _hints_at_lens(LensEquations(matrix, scene, index, refinement), options):
+    if agreeing >= ENOUGH and not _hints_at_lens(LensEquations(matrix, scene, index, refinement)):
         return None
-    rough = _fit_from_many(matrix, _thinned(scene, options.quick_points), index, refinement, options)
-    if rough is None or _moves_px(rough, scene) < 0.5 * options.least_px:
+    rough = _fit_from_many(matrix, _thinned(scene, _QUICK_POINTS), index, refinement)
+    if rough is None or _moves_px(rough, scene) < 0.5 * _LEAST_PX:
         return None
-    found = _improved(rough, scene, index, refinement, options)
-    return found if is_significant(found, scene, options) else None
+    found = _improved(rough, scene, index, refinement)
+    return found if is_significant(found, scene) else None
 
 
-def grow_whole(
-    matrix: FloatArray, scene: Scene, index: ReferenceIndex, refinement: RefineOptions, options: LensOptions
-) -> LensFit | None:
+def grow_whole(matrix: FloatArray, scene: Scene, index: ReferenceIndex, refinement: RefineOptions) -> LensFit | None:
     """Grow a homography anew from the part of the frame that it lays on roads, without a lens.
 
     It may have settled where only that part agrees. None where hardly more of the roads come to lie on roads.
     """
     before = LensEquations(matrix, scene, index, refinement).observe(0.0, np.zeros((9, 9)))
-    found = fit_lens(matrix, scene, index, 0.0, refinement, options, held=True)
+    found = fit_lens(matrix, scene, index, 0.0, refinement, held=True)
     better = found is not None and found.share > len(before.rows) / len(scene.points) + _BETTER
     return found if better else None
 
 
-def is_significant(found: LensFit, scene: Scene, options: LensOptions) -> bool:
+def is_significant(found: LensFit, scene: Scene) -> bool:
     """Whether a fit shows a lens: that of a pinhole finds some k1, too."""
-    enough_px = _moves_px(found, scene) >= options.least_px
-    return enough_px and abs(found.k1) >= options.significance * found.k1_sigma
+    enough_px = _moves_px(found, scene) >= _LEAST_PX
+    return enough_px and abs(found.k1) >= _SIGNIFICANCE * found.k1_sigma
 
 
 def _moves_px(found: LensFit, scene: Scene) -> float:
@@ -245,23 +383,19 @@ def _moves_px(found: LensFit, scene: Scene) -> float:
     return float(np.hypot(*moved.T).max())
 
 
-def core_excess(
-    matrix: FloatArray, scene: Scene, index: ReferenceIndex, refinement: RefineOptions, options: LensOptions
-) -> float:
+def core_excess(matrix: FloatArray, scene: Scene, index: ReferenceIndex, refinement: RefineOptions) -> float:
     """Return by how many road points the part of the frame that lies on roads exceeds what chance gives there."""
-    core, inside = LensEquations(matrix, scene, index, refinement).core(0.0, options.n_cells, options.core_share)
-    return float(core.sum() - options.chance_share * inside.sum())
+    core, inside = LensEquations(matrix, scene, index, refinement).core(0.0, *_CORE)
+    return float(core.sum() - _CHANCE_SHARE * inside.sum())
 
 
-def regrow(
-    matrix: FloatArray, scene: Scene, index: ReferenceIndex, refinement: RefineOptions, options: LensOptions
-) -> LensFit | None:
+def regrow(matrix: FloatArray, scene: Scene, index: ReferenceIndex, refinement: RefineOptions) -> LensFit | None:
     """Grow a homography anew from the part of the frame that it lays on roads; None where that does not go far."""
-    quick = _thinned(scene, options.quick_points)
-    for k1 in options.quick_starts:
-        rough = fit_lens(matrix, quick, index, 0.0, refinement, options, k1)
-        if rough is not None and rough.share >= options.least_share:
-            return _improved(rough, scene, index, refinement, options)
+    quick = _thinned(scene, _QUICK_POINTS)
+    for k1 in _QUICK_STARTS:
+        rough = fit_lens(matrix, quick, index, 0.0, refinement, k1)
+        if rough is not None and rough.share >= _LEAST_SHARE:
+            return _improved(rough, scene, index, refinement)
     return None
 
 
@@ -271,26 +405,24 @@ def _thinned(scene: Scene, n_points: int) -> Scene:
 
 
 def _fit_from_many(
-    matrix: FloatArray, scene: Scene, index: ReferenceIndex, refinement: RefineOptions, options: LensOptions
+    matrix: FloatArray, scene: Scene, index: ReferenceIndex, refinement: RefineOptions
 ) -> LensFit | None:
     """Fit a lens from one value of k1 after another, until enough of the roads lie on roads; return the best."""
     best = None
-    for k1 in (0.0, *options.starts):
-        found = fit_lens(matrix, scene, index, 0.0, refinement, options, k1)
+    for k1 in (0.0, *_STARTS):
+        found = fit_lens(matrix, scene, index, 0.0, refinement, k1)
         if found is not None and (best is None or found.share > best.share):
             best = found
-        if best is not None and best.share >= options.enough:
+        if best is not None and best.share >= ENOUGH:
             break
     return best
 
 
-def _improved(
-    found: LensFit, scene: Scene, index: ReferenceIndex, refinement: RefineOptions, options: LensOptions
-) -> LensFit:
+def _improved(found: LensFit, scene: Scene, index: ReferenceIndex, refinement: RefineOptions) -> LensFit:
     """Fit anew from where a fit ended, as long as more of the roads come to lie on roads: it may have been stuck."""
-    for _ in range(options.n_restarts):
-        starts = (found.k1,) if found.share >= options.enough else (found.k1, 0.0, 2.0 * found.k1)
-        again = (fit_lens(found.matrix, scene, index, found.k1, refinement, options, k1) for k1 in starts)
+    for _ in range(_N_RESTARTS):
+        starts = (found.k1,) if found.share >= ENOUGH else (found.k1, 0.0, 2.0 * found.k1)
+        again = (fit_lens(found.matrix, scene, index, found.k1, refinement, k1) for k1 in starts)
         best = max((one for one in again if one is not None), key=lambda one: one.share, default=None)
         if best is None or best.share < found.share:
             break
@@ -300,7 +432,7 @@ def _improved(
     return found
 
 
-def _hints_at_lens(problem: LensEquations, options: LensOptions) -> bool:
+def _hints_at_lens(problem: LensEquations) -> bool:
     """Whether one step from a pinhole would make k1 significant."""
     seen = problem.observe(0.0, np.zeros((9, 9)))
     if len(seen.rows) < 12:
@@ -309,7 +441,7 @@ def _hints_at_lens(problem: LensEquations, options: LensOptions) -> bool:
     inverse = np.linalg.pinv(scaled.T @ seen.rows)
     step = inverse @ (scaled.T @ (seen.residuals / problem.unit))
     rms = math.sqrt(float(np.average(seen.scaled**2, weights=seen.cauchy)))
-    return bool(abs(step[8]) > 0.5 * options.significance * rms / problem.unit * math.sqrt(max(inverse[8, 8], 0.0)))
+    return bool(abs(step[8]) > 0.5 * _SIGNIFICANCE * rms / problem.unit * math.sqrt(max(inverse[8, 8], 0.0)))
 
 
 def straighten_scene(scene: Scene, k1: float) -> Scene:

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 import time
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass, field, replace
 from functools import lru_cache
 
@@ -17,6 +17,7 @@ from roadgeo.geometry.projection import from_lonlat, metres_apart, to_lonlat
 from roadgeo.location import Stats
 from roadgeo.matching.ahead import Ahead
 from roadgeo.matching.estimator import MatchOptions, TripleEstimator
+from roadgeo.matching.events import Events
 from roadgeo.matching.finishing import measure_corners
 from roadgeo.matching.hypothesis import Hypothesis
 from roadgeo.matching.index import ReferenceIndex, crop, unpack_tangents
@@ -30,7 +31,6 @@ from roadgeo.matching.rivals import Rivals, Standing
 from roadgeo.matching.road_search import COARSE_PIXEL_M
 from roadgeo.matching.search import Search, search_together
 from roadgeo.matching.shared_sweeps import SharedSweeps
-from roadgeo.matching.trace import NO_TRACE, Trace
 from roadgeo.matching.triples import larger
 from roadgeo.matching.verification import agreement
 from roadgeo.roads.intersections import Intersections, unpack_branches
@@ -105,7 +105,7 @@ class Found:
         Places that were screened.
     n_anchors : int
         Intersections of the query that were looked for.
-    trace : Trace
+    events : Events
         What was noted of the search.
     """
 
@@ -119,7 +119,7 @@ class Found:
     stats: Stats = field(default_factory=Stats)
     match_s: float = 0.0
     refine_s: float = 0.0
-    trace: Trace = NO_TRACE
+    events: Events = field(default_factory=Events)
 
 
 def search_references(
@@ -127,23 +127,24 @@ def search_references(
     parts: Sequence[Part],
     options: LocateOptions,
     time_limit_s: float,
-    make_trace: Callable[[], Trace] = lambda: NO_TRACE,
+    explained: bool = False,
 ) -> list[Found]:
     """Search references, or parts of them, for a query together, by the method and within the limits of the options.
 
-    Those that cannot hold the place are not opened, unless that is none of them; nothing is told of them. A trace is
-    made for each of the others. Coarse maps come first: where a place stands out on them, the others are not opened.
+    Those that cannot hold the place are not opened, unless that is none of them; nothing is told of them. Coarse
+    maps come first: where a place stands out on them, the others are not opened. Where it is to be `explained`, events
+    are kept.
     """
     coarse, fine = _split(parts, options)
     with Ahead(options.threads) as ahead:
         if not coarse or not fine or options.method == "pair":
-            return _search(query, coarse + fine, options, time_limit_s, make_trace, ahead)
+            return _search(query, coarse + fine, options, time_limit_s, explained, ahead)
         started = time.perf_counter()
-        found = _search(query, coarse, _at_first_look(coarse, options), time_limit_s, make_trace, ahead)
+        found = _search(query, coarse, _at_first_look(coarse, options), time_limit_s, explained, ahead)
         if any(one.stopped == "accepted" for one in found):
             return found
         spent_s = time.perf_counter() - started
-        first, *others = _search(query, coarse + fine, options, time_limit_s - spent_s, make_trace, ahead)
+        first, *others = _search(query, coarse + fine, options, time_limit_s - spent_s, explained, ahead)
         return [replace(first, match_s=first.match_s + spent_s), *others]
 
 
@@ -169,7 +170,7 @@ def _search(
     parts: Sequence[Part],
     options: LocateOptions,
     time_limit_s: float,
-    make_trace: Callable[[], Trace],
+    explained: bool,
     ahead: Ahead,
 ) -> list[Found]:
     """Search parts together."""
@@ -177,16 +178,15 @@ def _search(
     indexes = _open(parts, options, frame_m)
     if len(indexes) > 1:  # every search reads all tables, but few roads: those that masks before this one led to go
         let_pages_go(array for index in indexes for array in index.road_buckets[:3])
-    traces = [make_trace() for _ in indexes]
+    events = [Events(explained) for _ in indexes]
     if len(query.scene.intersections) < options.min_intersections:
-        return [Found(index, trace=trace) for index, trace in zip(indexes, traces, strict=True)]
+        return [Found(index, events=noted) for index, noted in zip(indexes, events, strict=True)]
     if options.method == "pair":
-        found = _search_pairs_in_turn(query, indexes, _within(options, time_limit_s))
-        return [replace(one, trace=trace) for one, trace in zip(found, traces, strict=True)]
+        return _search_pairs_in_turn(query, indexes, _within(options, time_limit_s))
     started, ledger = time.perf_counter(), Ledger()
-    sweeps: SharedSweeps[TripleEstimator] = SharedSweeps(query.scene, options.match.camera, _same_place, ahead)
+    sweeps: SharedSweeps = SharedSweeps(query.scene, options.match.camera, _same_place, ahead)
     shared = (ledger, sweeps)
-    opened = [_Attempt.open(query, one, options, trace, *shared) for one, trace in zip(indexes, traces, strict=True)]
+    opened = [_Attempt.open(query, one, options, noted, *shared) for one, noted in zip(indexes, events, strict=True)]
     n_here = sum(one.n_searched for one in opened if one.search is not None)
     ledger.n_reference = n_here + options.elsewhere
     ledger.beside = ledger.n_reference / max(n_here, 1)
@@ -239,7 +239,7 @@ class _Attempt:
     n_searched: int
     estimator: TripleEstimator | None = None
     search: Search[Hypothesis] | None = None
-    trace: Trace = NO_TRACE
+    events: Events = field(default_factory=Events)
 
     @classmethod
     def open(
@@ -247,28 +247,29 @@ class _Attempt:
         query: Query,
         index: ReferenceIndex,
         options: LocateOptions,
-        trace: Trace,
+        events: Events,
         ledger: Ledger,
-        sweeps: SharedSweeps[TripleEstimator],
+        sweeps: SharedSweeps,
     ) -> _Attempt:
         part, near, within = index, _near(index, options.near), options.match.within
         if within is not None and not Whole(index).touches(within):
-            return cls(index, 0, trace=trace)
+            return cls(index, 0, events=events)
         if near is not None:
             reach = _rounded_up(near[2] + 2.0 * query.scene.half_size * options.match.camera.gsd_m[1])
             part = _part(index, near[:2], reach)
             if len(part) < options.min_intersections:
-                return cls(index, len(part), trace=trace)
-        estimator = TripleEstimator(query.scene, part, _of_effort(options), near, trace, ledger, sweeps)
-        return cls(index, len(part), estimator, Search(estimator), trace)
+                return cls(index, len(part), events=events)
+        estimator = TripleEstimator(query.scene, part, _of_effort(options), near, events, ledger, sweeps)
+        return cls(index, len(part), estimator, Search(estimator), events)
 
     def found(self, scale: float, rivals: Rivals) -> Found:
         """Tell what came of it; work is told for a map `scale` times smaller."""
         estimator = self.estimator
         if self.search is None or estimator is None:
-            return Found(self.index, n_searched=self.n_searched, trace=self.trace)
+            return Found(self.index, n_searched=self.n_searched, events=self.events)
         result, standing = self.search.result(), rivals.standing(self.search)
-        self.trace.finished(estimator, result)
+        if self.events.kept:
+            self.events.result = result
         return Found(
             self.index,
             () if standing is None else _fits(estimator, standing, rivals),
@@ -285,7 +286,7 @@ class _Attempt:
             ),
             match_s=self.search.seconds - estimator.refine_s,
             refine_s=estimator.refine_s,
-            trace=self.trace,
+            events=self.events,
         )
 
 
@@ -332,7 +333,7 @@ def _fit_of_rival(estimator: TripleEstimator, matrix: FloatArray, lead: float, l
 def _of_effort(options: LocateOptions) -> MatchOptions:
     """Return the options of matching; where effort is low roads do not propose, and one anchor is enough."""
     match = options.match
-    return match if options.effort == "full" else replace(match, roads=None, sightings=1)
+    return match if options.effort == "full" else replace(match, roads=False, sightings=1)
 
 
 def _near(index: ReferenceIndex, near: tuple[float, float, float] | None) -> tuple[float, float, float] | None:

@@ -7,7 +7,6 @@ from typing import Literal
 
 from roadgeo.matching.estimator import MatchOptions
 from roadgeo.matching.paper.tuples import PairOptions
-from roadgeo.matching.query import QueryOptions
 from roadgeo.matching.rivals import RivalOptions
 from roadgeo.matching.search import SearchOptions
 
@@ -51,7 +50,6 @@ class LocateOptions:
     truths: tuple[tuple[str, float, float], ...] = ()
     threads: int = 1
     elsewhere: int = 0
-    query: QueryOptions = field(default_factory=QueryOptions)
     match: MatchOptions = field(default_factory=MatchOptions)
     rivals: RivalOptions = field(default_factory=RivalOptions)
     search: SearchOptions = field(default_factory=SearchOptions)

@@ -3,60 +3,39 @@
 from __future__ import annotations
 
 import time
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, replace
 from pathlib import Path
 
 from roadgeo._arrays import AnyArray
 from roadgeo.geometry.mask import RoadMask
 from roadgeo.location import Seconds
-from roadgeo.matching.merged_roads import mark_merged
-from roadgeo.matching.scene import Scene, SceneOptions, prepare_scene
+from roadgeo.matching.scene import Scene, prepare_scene
 from roadgeo.roads.graph import RoadGraph
 from roadgeo.roads.intersections import IntersectionOptions, find_intersections
 from roadgeo.roads.simplification import SimplifyOptions, simplify
-from roadgeo.roads.vectorization import VectorizeOptions, vectorize
+from roadgeo.roads.vectorization import vectorize
 
-__all__ = ["Query", "QueryOptions", "read_query", "trace_query"]
-
-
-@dataclass(frozen=True)
-class QueryOptions:
-    """How a mask becomes intersections. Names ending in `_widths` count road widths."""
-
-    vectorize: VectorizeOptions = field(default_factory=VectorizeOptions)
-    merge_widths: float = 1.4
-    fuse_widths: float = 1.0
-    stub_widths: float = 1.5
-    tangent_widths: float = 4.5
-    skip_widths: float = 0.6
-    branch_widths: float = 0.8
-    scene: SceneOptions = field(default_factory=SceneOptions)
+__all__ = ["Query", "read_query", "trace_query"]
 
 
-def trace_query(mask: RoadMask, options: QueryOptions | None = None) -> tuple[Scene, RoadGraph]:
+#: Lengths in road widths: of a mask's roads those are one road, or one intersection, that lie so near to each other;
+#: shorter ends are none; tangents are fitted to branches of such a length, which begin so far from the intersection.
+_MERGE, _FUSE, _STUB, _TANGENT, _SKIP, _BRANCH = 1.4, 1.0, 1.5, 4.5, 0.6, 0.8
+
+
+def trace_query(mask: RoadMask) -> tuple[Scene, RoadGraph]:
     """Vectorize a mask and prepare it for matching; the same calls as for a reference, in units of its road width."""
-    options = options or QueryOptions()
-    traced = vectorize(mask, options.vectorize)
+    traced = vectorize(mask)
     width = traced.road_width_px
-    graph = simplify(
-        traced.graph,
-        SimplifyOptions(
-            merge_radius=options.merge_widths * width,
-            fuse_distance=options.fuse_widths * width,
-            stub_length=options.stub_widths * width,
-        ),
+    near = SimplifyOptions(merge_radius=_MERGE * width, fuse_distance=_FUSE * width, stub_length=_STUB * width)
+    graph = simplify(traced.graph, near)
+    lengths = IntersectionOptions(
+        tangent_length=_TANGENT * width, skip_length=_SKIP * width, min_branch_length=_BRANCH * width
     )
-    found = find_intersections(
-        graph,
-        IntersectionOptions(
-            tangent_length=options.tangent_widths * width,
-            skip_length=options.skip_widths * width,
-            min_branch_length=options.branch_widths * width,
-        ),
-    )
+    found = find_intersections(graph, lengths)
     height, wide = mask.shape
-    scene = prepare_scene(graph, found, (wide, height), mask.observed, options.scene, mask.probability)
-    return mark_merged(replace(scene, road_width_px=width), mask.roads, width), graph
+    scene = prepare_scene(graph, found, (wide, height), mask.observed, mask.probability)
+    return replace(scene, road_width_px=width), graph
 
 
 @dataclass(frozen=True)
@@ -69,7 +48,7 @@ class Query:
     seconds: Seconds
 
 
-def read_query(mask: RoadMask | AnyArray | str | Path, options: QueryOptions | None = None) -> Query:
+def read_query(mask: RoadMask | AnyArray | str | Path) -> Query:
     """Read a mask, unless it is one already, and trace it.
 
     Raises
@@ -83,5 +62,5 @@ def read_query(mask: RoadMask | AnyArray | str | Path, options: QueryOptions | N
 
         mask = read_mask(mask)
     read = time.perf_counter()
-    scene, graph = trace_query(mask, options)
+    scene, graph = trace_query(mask)
     return Query(mask.name, scene, graph, Seconds(read=read - started, vectorize=time.perf_counter() - read))

@@ -13,21 +13,47 @@ from roadgeo.geometry.homography import Homography
 from roadgeo.kernels.adjustment import adjust
 from roadgeo.kernels.structs import AdjustLimits, Held, Plane, PointPairs, RoadSamples
 from roadgeo.matching.index import ReferenceIndex
-from roadgeo.matching.merged_roads import without_merged
-from roadgeo.matching.scene import Scene
+from roadgeo.matching.scene import MIN_COS, Scene
 
 __all__ = [
+    "SIGMA_M",
+    "SIGMA_PX",
+    "TOLERANCE_M",
     "RefineOptions",
     "Refined",
     "corner_covariance",
     "corner_sigmas",
     "denormalise",
+    "max_radius_m",
     "normalise",
+    "point_weight",
     "refine",
     "robust_rms",
     "scatter_m",
-    "spacing_m",
 ]
+
+
+#: Points whose place is less sure than a third of the sum of metres and pixels do not take part yet.
+_MAX_RADIUS = (20.0, 10.0)
+#: Standard deviation of a road point across the road, the map's in metres and the mask's in pixels, and scale of the
+#: Cauchy weights.
+SIGMA_M, SIGMA_PX = 1.2, 0.9
+#: Weight of a matched intersection against an independent road point: its centre is less certain. Matches take part
+#: when at least this share of their neighbours are matched.
+_INTERSECTION_WEIGHT, _LEAST_SUPPORT = 0.3, 0.3
+#: The frame is divided into so many cells a side.
+_N_CELLS = 8
+#: Errors of the map and of the mask keep their sign over about this length of road, metres: points closer than that are
+#: no independent observations.
+_CORRELATION_M = 60.0
+#: Rms of road points in units of their standard deviation. Where it is more, the mask is bent: its errors are not only
+#: greater, they keep their sign as much further. Fitted to the corners of training masks.
+_USUAL_RMS = 0.7
+#: How far off a homography that is held near its start may be, metres and pixels. With fewer matches it is held: they
+#: alone would not determine a homography, and the start would be forgotten.
+_HELD, _FEW_MATCHES = (5.0, 3.0), 8
+#: Iterations, which end where nothing moves by more, metres.
+_N_ITERATIONS, TOLERANCE_M = 15, 0.02
 
 
 @dataclass(frozen=True)
@@ -36,58 +62,19 @@ class RefineOptions:
 
     Attributes
     ----------
-    max_radius_m, max_radius_px : float
-        Points whose place is less sure than a third of their sum do not take part yet.
-    sigma_m, sigma_px : float
-        Standard deviation of a road point across the road, the map's and the mask's, and scale of the Cauchy weights.
-    intersection_weight : float
-        Weight of a matched intersection against an independent road point: its centre is less certain.
-    max_turn_deg : float
-        Roads count as partners when their directions differ by less.
     perspective_sigma : float
         Prior standard deviation of the two perspective parameters.
-    held_m, held_px : float
-        How far off a homography that is held near its start may be.
-    few_matches : int
-        With fewer matches the start is held: they alone would not determine a homography, and it would be forgotten.
-    most_unsure : float
-        Factor by which a fit's corners may be less certain without the points of merged roads.
-    least_support : float
-        Matches take part when at least this share of their neighbours are matched.
-    n_cells, least_share : int, float
-        The frame is divided into this many cells a side; a cell takes part when at least this share of its road points
-        meet roads.
-    correlation_m : float
-        Errors of the map and of the mask keep their sign over about this length of road: points closer than that are no
-        independent observations.
+    least_share : float
+        A cell of the frame takes part when at least this share of its road points meet roads.
     sigma_floor_m, sigma_floor_px : float
         Accuracy of the map and of the mask as a whole, which no number of points improves: lines are drawn and thinned
         to whole pixels. Fitted to the corners of training masks.
-    usual_rms : float
-        Rms of road points in units of their standard deviation. Where it is more, the mask is bent: its errors are not
-        only greater, they keep their sign as much further. Fitted likewise.
     """
 
-    max_radius_m: float = 20.0
-    max_radius_px: float = 10.0
-    sigma_m: float = 1.2
-    sigma_px: float = 0.9
-    intersection_weight: float = 0.3
-    max_turn_deg: float = 25.0
     perspective_sigma: float = 0.5
-    most_unsure: float = 2.0
-    least_support: float = 0.3
-    n_cells: int = 8
     least_share: float = 0.5
-    correlation_m: float = 60.0
     sigma_floor_m: float = 0.1
     sigma_floor_px: float = 0.15
-    usual_rms: float = 0.7
-    held_m: float = 5.0
-    held_px: float = 3.0
-    few_matches: int = 8
-    n_iterations: int = 15
-    tolerance_m: float = 0.02
 
 
 @dataclass(frozen=True)
@@ -138,14 +125,20 @@ def denormalise(p: FloatArray, center: FloatArray, half_size: float, origin: Flo
     return np.asarray(matrix / half_size)
 
 
-def spacing_m(scene: Scene, unit: float) -> float:
-    """Return the distance between neighbouring road points in metres."""
-    return scene.road_length_px * unit / scene.half_size / max(len(scene.points), 1)
+def max_radius_m(gsd: float) -> float:
+    """Return how sure the place of a point must be, times three."""
+    return _MAX_RADIUS[0] + _MAX_RADIUS[1] * gsd
 
 
-def _cells(uv: FloatArray, options: RefineOptions) -> IntArray:
+def point_weight(scene: Scene, unit: float, step: int = 1) -> float:
+    """Return what each `step`-th road point counts against an independent one."""
+    spacing_m = scene.road_length_px * unit / scene.half_size / max(len(scene.points), 1)
+    return min(1.0, spacing_m * step / _CORRELATION_M)
+
+
+def _cells(uv: FloatArray) -> IntArray:
     """Return the number of the frame's cell that each normalised point lies in."""
-    n = options.n_cells
+    n = _N_CELLS
     columns = np.clip(((uv + 1.0) * (n / 2.0)).astype(np.int64), 0, n - 1)
     return np.asarray(columns[:, 1] * n + columns[:, 0])
 
@@ -160,9 +153,9 @@ def corner_covariance(
     return np.asarray(derivatives @ covariance @ derivatives.T * unit**2 + 0.5 * floor * np.eye(8))
 
 
-def scatter_m(rms: float, sigma_m: float, options: RefineOptions) -> float:
-    """Return the scatter in the covariance of a fit of road points of this rms and standard deviation, metres."""
-    return rms * max(1.0, rms / (options.usual_rms * sigma_m))
+def scatter_m(rms: float, sigma_m: float) -> float:
+    """Return what road points of this rms and standard deviation count as in the covariance of a fit, metres."""
+    return rms * max(1.0, rms / (_USUAL_RMS * sigma_m))
 
 
 def robust_rms(residuals: FloatArray, weights: FloatArray, less: float = 0.0) -> float:
@@ -203,9 +196,6 @@ def refine(
 ) -> Refined | None:
     """Adjust a homography by Gauss-Newton with Cauchy weights; None where that fails.
 
-    With all points, it is adjusted once more to those that do not lie between two roads of the map, where roads of the
-    mask have merged (see `merged_roads`), and that is taken unless it is much less sure.
-
     Parameters
     ----------
     matrix : (3, 3)
@@ -218,56 +208,34 @@ def refine(
         Hold the homography near its start also where there are matches enough: it is right all over the frame.
     """
     options = options or RefineOptions()
-    found = _adjusted(matrix, scene, index, matched, options, n_points, held)
-    if found is None or n_points is not None:
-        return found
-    apart, left = without_merged(found.matrix, scene, index, matched, options.max_turn_deg)
-    if apart is scene:
-        return found
-    without = _adjusted(matrix, apart, index, left, options, n_points, held)
-    if without is None or without.corner_sigma_m.max() > options.most_unsure * found.corner_sigma_m.max():
-        return found
-    return without
-
-
-def _adjusted(
-    matrix: FloatArray,
-    scene: Scene,
-    index: ReferenceIndex,
-    matched: IntArray,
-    options: RefineOptions,
-    n_points: int | None,
-    held: bool,
-) -> Refined | None:
-    """Adjust a homography to all that a scene shows."""
     center, half_size = scene.center, scene.half_size
     p, origin, unit = normalise(matrix, center, half_size)
     gsd = unit / half_size
-    sigma_m = math.hypot(options.sigma_m, options.sigma_px * gsd)
+    sigma_m = math.hypot(SIGMA_M, SIGMA_PX * gsd)
     chosen = matched >= 0
     step = 1 if n_points is None else max(1, len(scene.points) // n_points)
     points = (scene.points[::step] - center) / half_size
     # Isolated matches are probably accidental.
     around = scene.neighbours[chosen]
     support = ((matched[around] >= 0) & (around >= 0)).sum(axis=1) / np.maximum((around >= 0).sum(axis=1), 1)
-    chosen[chosen] = support >= options.least_support
+    chosen[chosen] = support >= _LEAST_SUPPORT
     pairs = (scene.intersections.xy[chosen] - center) / half_size
-    grid, targets = _held_points(p, 6 if held or len(pairs) < options.few_matches else 0)
-    held_weight = 8.0 / 36.0 * (sigma_m / max(options.held_m, options.held_px * gsd)) ** 2
+    grid, targets = _held_points(p, 6 if held or len(pairs) < _FEW_MATCHES else 0)
+    held_weight = 8.0 / 36.0 * (sigma_m / max(_HELD[0], _HELD[1] * gsd)) ** 2
     normal = np.empty((8, 8))
     limits = AdjustLimits(
-        options.n_cells**2, options.least_share, options.max_radius_m + options.max_radius_px * gsd,
-        float(np.cos(np.radians(options.max_turn_deg))), sigma_m, options.sigma_m, options.sigma_px / half_size,
-        (sigma_m / unit / options.perspective_sigma) ** 2, options.n_iterations, options.tolerance_m,
+        _N_CELLS**2, options.least_share, max_radius_m(gsd),
+        MIN_COS, sigma_m, SIGMA_M, SIGMA_PX / half_size,
+        (sigma_m / unit / options.perspective_sigma) ** 2, _N_ITERATIONS, TOLERANCE_M,
     )  # fmt: skip
     directions = np.ascontiguousarray(scene.directions[::step])
-    weight = min(1.0, spacing_m(scene, unit) * step / options.correlation_m)
+    weight = point_weight(scene, unit, step)
     places = (index.xy[matched[chosen]] - origin) / unit
     _, rms = adjust(
         p,
         Plane(unit, origin[0], origin[1]),
-        RoadSamples(points, directions, _cells(points, options), weight),
-        PointPairs(pairs, places, _cells(pairs, options), options.intersection_weight),
+        RoadSamples(points, directions, _cells(points), weight),
+        PointPairs(pairs, places, _cells(pairs), _INTERSECTION_WEIGHT),
         Held(grid, targets, held_weight),
         limits,
         index.road_buckets,
@@ -275,7 +243,7 @@ def _adjusted(
     )
     if not np.isfinite(rms):
         return None
-    inverse = np.asarray(np.linalg.inv(normal) * (scatter_m(rms, sigma_m, options) / unit) ** 2, float)
+    inverse = np.asarray(np.linalg.inv(normal) * (scatter_m(rms, sigma_m) / unit) ** 2, float)
     result = denormalise(p, center, half_size, origin, unit)
     covariance = corner_covariance(p, inverse, scene, unit, options)
     return Refined(result / result[2, 2], corner_sigmas(covariance), rms, covariance)

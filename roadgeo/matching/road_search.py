@@ -4,105 +4,142 @@ from __future__ import annotations
 
 import math
 from collections.abc import Iterable, Iterator, Sequence
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, field
 from itertools import islice
 from typing import NamedTuple
 
 import numpy as np
 
-from roadgeo._arrays import IntArray
+from roadgeo._arrays import FloatArray, IntArray
 from roadgeo.geometry.camera import CameraOptions
+from roadgeo.kernels.road_growth import Stages, grow_by_roads
 from roadgeo.matching.ahead import ALONE, Ahead
 from roadgeo.matching.index import ReferenceIndex
-from roadgeo.matching.refinement import RefineOptions
-from roadgeo.matching.road_growth import Grown, RoadGrower, RoadGrowOptions
-from roadgeo.matching.road_votes import VoteOptions, Voter, Votes
-from roadgeo.matching.scene import Scene
+from roadgeo.matching.road_votes import Voter, Votes
+from roadgeo.matching.scene import MIN_COS, Scene
 from roadgeo.matching.triples import farthest_first, larger
 
-__all__ = ["COARSE_PIXEL_M", "RoadRound", "RoadSearch", "RoadSearchOptions", "Turnout"]
+__all__ = ["COARSE_PIXEL_M", "Grown", "RoadGrower", "RoadRound", "RoadSearch", "Turnout", "followed_more", "scales"]
+
+#: Road points used, and the part of half the frame's diagonal up to which an affine map will do.
+_MAX_POINTS, _AFFINE_UNTIL = 700, 0.45
+#: A proposal withers where fewer of the points around it lie on roads. Wrong ones end at 0.3 to 0.4, masks of which
+#: 40 % are gone and 40 % false at 0.5 and more.
+_LEAST_SHARE = 0.3
+#: Points within the sum of metres and pixels of a road lie on it.
+_TOLERANCE_M, _TOLERANCE_PX = 7.0, 2.0
+#: Prior standard deviation of the two perspective parameters.
+_PERSPECTIVE_SIGMA = 0.4
+#: After each of the first stages so many of an intersection's proposals go on, those that lie closest to roads, and
+#: those that had most votes. Of 396 intersections of which one of 40 proposals led to the place of a broken mask 395 do
+#: so still, at half the time; in lattices 255 of 266, at a quarter.
+_GO_ON, _SURE = (16, 6, 3), 2
+
+
+@dataclass(frozen=True)
+class Grown:
+    """A grown proposal: query plane to reference plane (3, 3), and how close to roads the road points lie, 0 to 1."""
+
+    anchor: int
+    matrix: FloatArray
+    closeness: float
+
+
+class RoadGrower:
+    """Grows proposals of one scene on one map."""
+
+    def __init__(self, scene: Scene, index: ReferenceIndex, camera: CameraOptions, more: int = 1) -> None:
+        """`more` times as many proposals as usual go on after each stage."""
+        self.scene, self.index = scene, index
+        first, second, third = (more * n for n in _GO_ON)
+        perspective = camera.perspective_sigma(_PERSPECTIVE_SIGMA)
+        self._stages = Stages(_AFFINE_UNTIL, _LEAST_SHARE, perspective, MIN_COS, (first, second, third), _SURE)
+        thin = max(1, len(scene.dense_points) // _MAX_POINTS)
+        self.points, self.directions = scene.dense_points[::thin], scene.dense_directions[::thin]
+        self._anchor, self._outwards = -1, (self.points, self.directions)
+
+    def grow(self, anchor: int, references: IntArray, affines: FloatArray) -> list[Grown]:
+        """Grow proposals of query intersection `anchor`; return those that did not wither, in their order.
+
+        `references` (M,) are the map intersections that it is laid on, `affines` (M, 4) how: 2 x 2, row-major.
+        """
+        half_size = self.scene.half_size
+        at = self.scene.intersections.xy[anchor]
+        points, directions = self._outwards_from(anchor)
+        j00, j01, j10, j11 = np.asarray(affines, float).T
+        gsd = np.sqrt(j00 * j11 - j01 * j10)
+        zero = np.zeros_like(gsd)
+        ps = np.stack([j00 / gsd, j01 / gsd, zero, j10 / gsd, j11 / gsd, zero, zero, zero], axis=1)
+        units, origins = half_size * gsd, self.index.xy[references]
+        tolerances = _TOLERANCE_M + _TOLERANCE_PX * gsd
+        closeness = np.empty(len(gsd))
+        roads = self.index.road_buckets
+        grow_by_roads(ps, units, origins, tolerances, points, directions, self._stages, roads, closeness)
+        from_query = np.array([[1.0, 0.0, -at[0]], [0.0, 1.0, -at[1]], [0.0, 0.0, half_size]])
+        grown = []
+        for k in np.flatnonzero(closeness >= 0.0):
+            (x, y), unit = origins[k], units[k]
+            to_reference = np.array([[unit, 0.0, x], [0.0, unit, y], [0.0, 0.0, 1.0]])
+            matrix = to_reference @ np.append(ps[k], 1.0).reshape(3, 3) @ from_query
+            matrix = matrix / (matrix[2] @ np.append(self.scene.center, 1.0))
+            grown.append(Grown(anchor, np.asarray(matrix), float(closeness[k])))
+        return grown
+
+    def _outwards_from(self, anchor: int) -> tuple[FloatArray, FloatArray]:
+        """Return the road points around an intersection, the nearest first, normalised, and the roads' directions.
+
+        Kept: an intersection makes many proposals.
+        """
+        if anchor != self._anchor:
+            away = self.points - self.scene.intersections.xy[anchor]
+            order = np.argsort(np.hypot(*away.T), kind="stable")
+            self._anchor, self._outwards = anchor, (away[order] / self.scene.half_size, self.directions[order])
+        return self._outwards
+
 
 #: The smallest pixels that are looked for on a map of coarseness 1; of a coarse map so many times as large.
 COARSE_PIXEL_M = 0.35
 
 #: How far a proposal, made of two branches, may turn the image's up from where it points.
 _ROUGHLY_DEG = 25.0
+#: So many intersections of the query vote, spread over the frame from its middle outwards.
+_MAX_ANCHORS = 30
+#: Fewer vote, but at least so many, once so many places and turns were tried on a map of 15,000 intersections, and on a
+#: larger one more by the root of the ratio; of a map in parts, on all of them together. In a lattice every crossing can
+#: be turned four ways.
+_MAX_TRIED, _LEAST_ANCHORS = 400_000, 8
+#: So many of an anchor's proposals grow, and so many of what grew are compared with the map, where all anchors vote; a
+#: mask of few intersections has few chances: up to so many times as many then.
+_MAX_GROWN, _MAX_KEPT, _MOST_MORE = 20, 2, 5
+#: Around an anchor the ground sampling may differ by this factor from that at the middle of the frame.
+_SCALE_SLACK = 1.2
+#: Where roads are drawn at least so many pixels wide, they are no thin lines, and only scales are tried at which they
+#: are so wide on the ground, metres.
+_TELLING_WIDTH_PX, _ROAD_WIDTH_M = 6.0, (2.0, 75.0)
+#: Pixels that are greater hardly show what is around an intersection: a place given by near is not looked for further
+#: away than frames of such pixels reach.
+_FAR_M = 5.0
 
 
-@dataclass(frozen=True)
-class RoadSearchOptions:
-    """How much is tried.
+def scales(camera: CameraOptions, road_width_px: float, coarseness: float = 1.0) -> tuple[float, float]:
+    """Return the least and greatest ground sampling around an intersection to try.
 
-    Attributes
-    ----------
-    max_anchors : int
-        So many intersections of the query vote, spread over the frame from its middle outwards.
-    max_tried, least_anchors : int
-        Fewer vote, but at least so many, once so many places and turns were tried on a map of 15,000 intersections, and
-        on a larger one more by the root of the ratio; of a map in parts, on all of them together. In a lattice every
-        crossing can be turned four ways.
-    max_grown, max_kept : int
-        So many of an anchor's proposals grow, and so many of what grew are compared with the map, where all anchors
-        vote; where a mask has fewer intersections, more of each (see `each_of`).
-    scale_slack : float
-        Around an anchor the ground sampling may differ by this factor from that at the middle of the frame.
-    least_share : float
-        As of `RefineOptions`, where false roads abound.
-    road_width_m, telling_width_px : (low, high), float
-        Where roads are drawn at least so many pixels wide, they are no thin lines, and only scales are tried at which
-        they are so wide on the ground.
-    far_m : float
-        Pixels that are greater hardly show what is around an intersection: a place given by near is not looked for
-        further away than frames of such pixels reach.
-    least_gsd_m : float
-        Smaller pixels are not tried: they show more than a coarse map.
+    Small pixels show more than a coarse map.
     """
+    low, high = camera.gsd_m
+    low, high = low / _SCALE_SLACK, high * _SCALE_SLACK
+    if coarseness != 1.0:
+        low = max(low, coarseness * COARSE_PIXEL_M)
+    high = max(high, low)
+    if road_width_px < _TELLING_WIDTH_PX:
+        return low, high
+    least, most = (width / road_width_px for width in _ROAD_WIDTH_M)
+    return (max(low, least), min(high, most)) if least < high and most > low else (low, high)
 
-    votes: VoteOptions = field(default_factory=VoteOptions)
-    grow: RoadGrowOptions = field(default_factory=RoadGrowOptions)
-    max_anchors: int = 30
-    max_tried: int = 400_000
-    least_anchors: int = 8
-    max_grown: int = 20
-    max_kept: int = 2
-    scale_slack: float = 1.2
-    least_share: float = 0.2
-    road_width_m: tuple[float, float] = (2.0, 75.0)
-    telling_width_px: float = 6.0
-    far_m: float = 5.0
-    least_gsd_m: float = 0.0
 
-    def on(self, coarseness: float) -> RoadSearchOptions:
-        """Return them for a map of some coarseness: on a coarse one more lies around an intersection."""
-        if coarseness == 1.0:
-            return self
-        far_m, least_gsd_m = coarseness * self.far_m, coarseness * COARSE_PIXEL_M
-        return replace(self, votes=self.votes.on(coarseness), far_m=far_m, least_gsd_m=least_gsd_m)
-
-    def scales(self, camera: CameraOptions, road_width_px: float) -> tuple[float, float]:
-        """Return the least and greatest ground sampling around an intersection to try."""
-        low, high = camera.gsd_m
-        low, high = max(low / self.scale_slack, self.least_gsd_m), high * self.scale_slack
-        high = max(high, low)
-        if road_width_px < self.telling_width_px:
-            return low, high
-        least, most = (width / road_width_px for width in self.road_width_m)
-        return (max(low, least), min(high, most)) if least < high and most > low else (low, high)
-
-    def each_of(self, n_voters: int) -> RoadSearchOptions:
-        """Return them for so many intersections that vote: as many proposals are followed in all as of `max_anchors`.
-
-        Up to five times as many of each: a mask of few intersections has few chances.
-        """
-        more = max(1, min(5, self.max_anchors // max(n_voters, 1)))
-        go_on = tuple(more * n for n in self.grow.go_on)
-        grow = replace(self.grow, go_on=(go_on[0], go_on[1], go_on[2]))
-        votes = replace(self.votes, kept=more * self.votes.kept)
-        return replace(self, votes=votes, grow=grow, max_grown=more * self.max_grown, max_kept=more * self.max_kept)
-
-    def refinement(self, usual: RefineOptions) -> RefineOptions:
-        """Return how what grew by roads is refined."""
-        return replace(usual, least_share=self.least_share)
+def followed_more(n_voters: int) -> int:
+    """Return how many times more proposals of each of so many intersections are followed: in all, as many as usual."""
+    return max(1, min(_MOST_MORE, _MAX_ANCHORS // max(n_voters, 1)))
 
 
 @dataclass
@@ -119,7 +156,6 @@ class Turnout:
         How many vote in the end, once that is known.
     """
 
-    options: RoadSearchOptions
     n_map: int
     n_tried: int = 0
     last: int | None = None
@@ -127,10 +163,9 @@ class Turnout:
 
     def includes(self, n: int) -> bool:
         """Whether the n-th votes, from 0; the part that comes to it first decides for all."""
-        options = self.options
         if self.last is None and n >= self._asked:
             self._asked = n + 1
-            if n >= options.least_anchors and self.n_tried >= options.max_tried * larger(self.n_map):
+            if n >= _LEAST_ANCHORS and self.n_tried >= _MAX_TRIED * larger(self.n_map):
                 self.last = n
         return self.last is None or n < self.last
 
@@ -160,7 +195,6 @@ class RoadSearch:
         scene: Scene,
         index: ReferenceIndex,
         camera: CameraOptions,
-        options: RoadSearchOptions,
         near: tuple[float, float, float] | None = None,
         ahead: Ahead = ALONE,
         turnout: Turnout | None = None,
@@ -169,26 +203,25 @@ class RoadSearch:
 
         Parts that are searched together share the `turnout`.
         """
-        options = options.each_of(len(scene.intersections))
-        self.scene, self.options, self.ahead = scene, options, ahead
-        self.n_tried = 0
-        self.turnout = turnout or Turnout(options, len(index))
-        scale = options.scales(camera, scene.road_width_px)
+        more, coarseness = followed_more(len(scene.intersections)), index.coarseness
+        self.scene, self.ahead = scene, ahead
+        self.n_tried, self._max_grown, self._max_kept = 0, more * _MAX_GROWN, more * _MAX_KEPT
+        self.turnout = turnout or Turnout(len(index))
+        scale = scales(camera, scene.road_width_px, coarseness)
         center, off = camera.heading or (0.0, 180.0)
         max_turn = min(math.radians(abs(center) + off + _ROUGHLY_DEG), math.pi)
-        candidates = _within(index, near, scene.half_size * min(scale[1], max(options.far_m, scale[0])))
-        self.voter = Voter(scene, index, scale, max_turn, candidates, options.votes)
+        candidates = _within(index, near, scene.half_size * min(scale[1], max(coarseness * _FAR_M, scale[0])))
+        self.voter = Voter(scene, index, scale, max_turn, candidates, more)
         self._tried: set[int] = set()
-        perspective = camera.perspective_sigma(options.grow.perspective_sigma)
-        self.grower = RoadGrower(scene, index, replace(options.grow, perspective_sigma=perspective))
+        self.grower = RoadGrower(scene, index, camera, more)
 
     def rounds(self, only: Sequence[int] | None = None) -> Iterator[RoadRound]:
         """Yield what grew of one anchor's proposals after another; between parts of a large map nothing.
 
         `only` names the anchors to try. None is tried twice.
         """
-        xy, options = self.scene.intersections.xy, self.options
-        anchors = islice(farthest_first(xy, np.arange(len(xy))), options.max_anchors) if only is None else only
+        xy = self.scene.intersections.xy
+        anchors = islice(farthest_first(xy, np.arange(len(xy))), _MAX_ANCHORS) if only is None else only
         for n, (anchor, steps) in enumerate(self.ahead.map(self._vote, anchors)):
             if only is None and not self.turnout.includes(n):
                 return
@@ -201,10 +234,10 @@ class RoadSearch:
                 if votes is None:
                     yield RoadRound(-1, 0, [])
                     continue
-                best = slice(options.max_grown)
+                best = slice(self._max_grown)
                 grown = self.grower.grow(anchor, votes.reference[best], votes.affine[best])
                 some = sorted(grown, key=lambda one: -one.closeness)
-                yield RoadRound(anchor, len(votes.reference[best]), some[: options.max_kept])
+                yield RoadRound(anchor, len(votes.reference[best]), some[: self._max_kept])
 
     def _vote(self, anchor: int) -> tuple[int, Iterable[tuple[int, Votes | None]]]:
         """Return an anchor and its votes, step by step; in threads all of them are there at once."""

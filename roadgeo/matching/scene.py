@@ -2,12 +2,13 @@
 
 from __future__ import annotations
 
+import math
 from dataclasses import dataclass, replace
 
 import cv2
 import numpy as np
 
-from roadgeo._arrays import AnyArray, BoolArray, Float32Array, FloatArray, Int32Array, IntArray
+from roadgeo._arrays import AnyArray, BoolArray, Float32Array, FloatArray, Int32Array
 from roadgeo.geometry.frame import Frame
 from roadgeo.geometry.mask import PROBABILITY_SURE, PROBABILITY_UNKNOWN
 from roadgeo.kernels.buckets import nearest_neighbours
@@ -15,30 +16,20 @@ from roadgeo.matching.index import neighbour_grid, sort_by_bucket
 from roadgeo.roads.graph import RoadGraph
 from roadgeo.roads.intersections import Intersections
 
-__all__ = ["Scene", "SceneOptions", "prepare_scene", "query_neighbours", "sample_roads"]
+__all__ = ["MIN_COS", "Scene", "prepare_scene", "query_neighbours", "sample_roads"]
 
+#: Of more intersections, those nearest to the middle of the frame are kept: they place a mask as surely, and time and
+#: memory are bounded.
+_MAX_INTERSECTIONS, _N_NEIGHBOURS = 5000, 12
+#: Points along the roads, at most and no closer than so many pixels: some for a quick look, more for one intersection's
+#: surroundings.
+_POINTS, _DENSE_POINTS = (600, 6.0), (6000, 3.0)
+#: Cells of the reduced frame along its longer side.
+_FIELD_CELLS = 400
+#: Roads, and branches of intersections, agree whose directions differ by less than 25 degrees: cosine of that.
+MIN_COS = math.cos(math.radians(25.0))
 #: A road's middle is traced within a pixel.
 _NEAR = (-1, 0, 1)
-
-
-@dataclass(frozen=True)
-class SceneOptions:
-    """Sizes of the scene's tables.
-
-    Attributes
-    ----------
-    max_intersections : int
-        Of more, those nearest to the middle of the frame are kept: they place a mask as surely, and time and memory
-        are bounded.
-    """
-
-    max_intersections: int = 5000
-    n_neighbours: int = 12
-    max_road_points: int = 600
-    max_dense_points: int = 6000
-    min_point_spacing_px: float = 6.0
-    min_dense_spacing_px: float = 3.0
-    field_cells: int = 400
 
 
 @dataclass(frozen=True)
@@ -71,11 +62,6 @@ class Scene:
     observed : (h, w) bool
     road_width_px : float
         Usual width of the mask's roads; 0: not known.
-    merged : (S,) bool or None
-        Points where the mask is wider than usual, as where two roads may have merged, such as the carriageways of a
-        motorway: the line between them is neither's. None: not known.
-    merged_at : (N,) int64 or None
-        Of each intersection the nearest such point, within two road widths; -1: none.
     """
 
     size: tuple[int, int]
@@ -93,8 +79,6 @@ class Scene:
     field_scale: float
     observed: BoolArray
     road_width_px: float = 0.0
-    merged: BoolArray | None = None
-    merged_at: IntArray | None = None
 
     @property
     def center(self) -> FloatArray:
@@ -113,20 +97,18 @@ class Scene:
 
     def of_points(self, kept: BoolArray | slice) -> Scene:
         """Return the scene with some of its road points only."""
-        number = np.full(len(self.points) + 1, -1)
-        number[:-1][kept] = np.arange(len(self.points[kept]))
         return replace(
             self,
             points=np.ascontiguousarray(self.points[kept]),
             directions=np.ascontiguousarray(self.directions[kept]),
             weights=np.ascontiguousarray(self.weights[kept]),
-            merged=None if self.merged is None else self.merged[kept],
-            merged_at=None if self.merged_at is None else number[self.merged_at],
         )
 
 
 def query_neighbours(xy: FloatArray, k: int) -> Int32Array:
     """(N, k) nearest neighbours of each point, in the points' own order."""
+    if not len(xy):
+        return np.empty((0, k), np.int32)
     grid, shape = neighbour_grid(xy, 1.0)
     order, starts = sort_by_bucket(xy, grid, shape)
     inside = nearest_neighbours(np.ascontiguousarray(xy[order]), starts, grid, shape, k)
@@ -172,22 +154,18 @@ def prepare_scene(
     intersections: Intersections,
     size: tuple[int, int],
     observed: BoolArray | None = None,
-    options: SceneOptions | None = None,
     probability: AnyArray | None = None,
 ) -> Scene:
     """Prepare a vectorized mask for matching; `size` is (width, height), `observed` and `probability` (height, width).
 
     `probability` is that of `RoadMask`: roads that are less sure count less.
     """
-    options = options or SceneOptions()
     width, height = size
     length = float(graph.edge_lengths().sum())
-    # points along the roads: some for a quick look, more for one intersection's surroundings
-    spacing = max(options.min_point_spacing_px, length / options.max_road_points)
-    points, directions = sample_roads(graph, spacing)
-    dense = sample_roads(graph, max(options.min_dense_spacing_px, length / options.max_dense_points))
-    # distance of each cell of the frame to a road; drawn from the graph, so that roads thinner than a cell count too
-    scale = max(1.0, max(size) / options.field_cells)
+    points, directions = sample_roads(graph, max(_POINTS[1], length / _POINTS[0]))
+    dense = sample_roads(graph, max(_DENSE_POINTS[1], length / _DENSE_POINTS[0]))
+    # how far each cell of the frame is from a road; drawn from the graph, for what is thinner than a cell counts too
+    scale = max(1.0, max(size) / _FIELD_CELLS)
     cells = (int(np.ceil(height / scale)), int(np.ceil(width / scale)))
     canvas = np.full(cells, 255, np.uint8)
     pixels = np.round((graph.coords * (1.0, -1.0) / scale - 0.5) * 16).astype(np.int32)
@@ -198,9 +176,8 @@ def prepare_scene(
         seen = np.ones(cells, bool)
     else:
         seen = cv2.resize(observed.astype(np.uint8), cells[::-1], interpolation=cv2.INTER_AREA) > 0
-    intersections = _nearest(intersections, Frame(*size).plane_center, options.max_intersections)
-    k = options.n_neighbours
-    neighbours = query_neighbours(intersections.xy, k) if len(intersections) else np.empty((0, k), np.int32)
+    intersections = _nearest(intersections, Frame(*size).plane_center, _MAX_INTERSECTIONS)
+    neighbours = query_neighbours(intersections.xy, _N_NEIGHBOURS)
     return Scene(
         size=size,
         intersections=intersections,

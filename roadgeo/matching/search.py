@@ -8,7 +8,7 @@ told by work, which is counted, so that a busy machine finds what an idle one fi
 from __future__ import annotations
 
 import time
-from collections.abc import Iterable, Iterator, Sequence
+from collections.abc import Callable, Iterable, Iterator, Sequence
 from dataclasses import dataclass
 from typing import Generic, Protocol, TypeVar
 
@@ -205,31 +205,18 @@ def search(estimator: Estimator[Model], options: SearchOptions | None = None) ->
     return alone.result()
 
 
-class Proves(Protocol[Model]):
-    """Finds an answer that does not stand out by its score, and is proved otherwise."""
-
-    def __call__(self, parts: Sequence[Search[Model]]) -> Search[Model] | None:
-        """Return the part that holds it, if any does; asked at the end of each stage."""
-
-
-class Same(Protocol[Model]):
-    """Tells whether the answers of two parts are one, where parts overlap."""
-
-    def __call__(self, one: Search[Model], a: Model, other: Search[Model], b: Model) -> bool:
-        """Whether model `a` of one part and `b` of another mean the same answer."""
-
-
 def search_together(
     parts: Sequence[Search[Model]],
     options: SearchOptions | None = None,
-    same: Same[Model] | None = None,
-    proves: Proves[Model] | None = None,
+    same: Callable[[Search[Model], Model, Search[Model], Model], bool] | None = None,
+    proves: Callable[[Sequence[Search[Model]]], Search[Model] | None] | None = None,
 ) -> None:
     """Search many parts until one answer stands out from those of all, they are exhausted, or a limit is reached.
 
     A round of each part in turn, one stage after another. A part whose answer stands out goes on alone until that is
     settled. What led there is tried on all other parts then: if they hold a twin, it is found, and the search goes on.
-    At the end of a stage an answer may be proved otherwise.
+    `same` tells whether models of two parts, which may overlap, mean one answer. At the end of a stage an answer that
+    does not stand out by its score may be proved otherwise: `proves` returns the part that holds it, if any does.
     """
     options = options or SearchOptions()
     ended_by = _Together(parts, options, same, proves).run()
@@ -247,8 +234,8 @@ class _Together(Generic[Model]):
         self,
         parts: Sequence[Search[Model]],
         options: SearchOptions,
-        same: Same[Model] | None,
-        proves: Proves[Model] | None,
+        same: Callable[[Search[Model], Model, Search[Model], Model], bool] | None,
+        proves: Callable[[Sequence[Search[Model]]], Search[Model] | None] | None,
     ) -> None:
         self.parts, self.options, self.same, self.proves = parts, options, same, proves
         self.budget = _Budget(options)

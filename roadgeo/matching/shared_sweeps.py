@@ -10,62 +10,37 @@ from __future__ import annotations
 import heapq
 import math
 from collections.abc import Callable, Iterator, Sequence
-from typing import Generic, NamedTuple, Protocol, TypeAlias, TypeVar
+from typing import TYPE_CHECKING, NamedTuple, TypeAlias
 
 import numpy as np
 
-from roadgeo._arrays import BoolArray, IntArray
+from roadgeo._arrays import IntArray
 from roadgeo.geometry.camera import CameraOptions
+from roadgeo.matching import growing
 from roadgeo.matching.ahead import ALONE, Ahead
-from roadgeo.matching.growing import GrowOptions
 from roadgeo.matching.hypothesis import Hypothesis
-from roadgeo.matching.index import ReferenceIndex
-from roadgeo.matching.road_search import RoadSearchOptions, Turnout
+from roadgeo.matching.road_search import Turnout
 from roadgeo.matching.scene import Scene
-from roadgeo.matching.sweeps import Source
-from roadgeo.matching.triples import Proposals
+from roadgeo.matching.triples import Proposals, Sweep
 
-__all__ = ["Member", "SharedSweeps", "Stage"]
+if TYPE_CHECKING:
+    from roadgeo.matching.estimator import TripleEstimator
+
+__all__ = ["SharedSweeps", "Stage"]
 
 
 class Stage(NamedTuple):
-    """A sweep: its number among the stages of a search, where its proposals come from, and how they are followed."""
+    """A sweep: its number among the stages of a search, and where its proposals come from."""
 
     number: int
-    source: Source
-    grow: GrowOptions
+    source: Sweep
 
-
-class Member(Protocol):
-    """One part that is searched."""
-
-    @property
-    def index(self) -> ReferenceIndex:
-        """What is searched."""
-
-    def allow(self, proposals: Proposals) -> BoolArray:
-        """Tell which proposals the user's hints allow."""
-
-    def screen(self, proposals: Proposals, allowed: BoolArray, most: int, stage: Stage) -> IntArray:
-        """Return those of the first `most` that are allowed and that lie on roads, the best first."""
-
-    def follow_up(self, proposals: Proposals, chosen: IntArray, stage: Stage) -> Iterator[Hypothesis]:
-        """Yield what grew from the chosen proposals, different places, the best supported first."""
-
-    def enough(self) -> bool:
-        """Whether as many places were screened on all parts as are on one map of their size."""
-
-    def known_places(self) -> Sequence[Hypothesis]:
-        """Return the hypotheses that were verified and fit, of which no better version is to be expected."""
-
-
-AnyMember = TypeVar("AnyMember", bound=Member)
 
 #: Whether hypotheses on two parts are one place of one map, which is cut into overlapping pieces.
-SamePlace: TypeAlias = Callable[[AnyMember, Hypothesis, AnyMember, Hypothesis], bool]
+SamePlace: TypeAlias = "Callable[[TripleEstimator, Hypothesis, TripleEstimator, Hypothesis], bool]"
 
 
-class SharedSweeps(Generic[AnyMember]):
+class SharedSweeps:
     """The sweeps of the parts of one search; each part takes from them what concerns it.
 
     Attributes
@@ -78,17 +53,17 @@ class SharedSweeps(Generic[AnyMember]):
         self,
         scene: Scene,
         camera: CameraOptions,
-        same_place: SamePlace[AnyMember] | None = None,
+        same_place: SamePlace | None = None,
         ahead: Ahead = ALONE,
     ) -> None:
         """Begin without parts. `same_place` is asked of hypotheses on different parts."""
         self.scene, self.camera, self.same_place, self.ahead = scene, camera, same_place, ahead
-        self.members: list[AnyMember] = []
+        self.members: list[TripleEstimator] = []
         self._rounds: dict[int, Iterator[_Round]] = {}
         self._done: dict[int, list[_Round]] = {}
         self._turnouts: dict[float, Turnout] = {}
 
-    def rounds(self, member: AnyMember, stage: Stage) -> Iterator[list[Hypothesis]]:
+    def rounds(self, member: TripleEstimator, stage: Stage) -> Iterator[list[Hypothesis]]:
         """Yield what grew on a part from the proposals of one anchor after another, until enough were screened."""
         rounds = self._rounds.setdefault(stage.number, self._work(stage))
         done = self._done.setdefault(stage.number, [])
@@ -102,15 +77,15 @@ class SharedSweeps(Generic[AnyMember]):
             yield done[n].grown.pop(id(member), [])
             n += 1
 
-    def pending(self, member: AnyMember, stage: int, anchor: int) -> list[Hypothesis]:
+    def pending(self, member: TripleEstimator, stage: int, anchor: int) -> list[Hypothesis]:
         """Return what grew on a part from an anchor and was not taken yet."""
         found = (one.grown.pop(id(member), []) for one in self._done.get(stage, []) if one.anchor == anchor)
         return next(found, [])
 
-    def turnout(self, coarseness: float, options: RoadSearchOptions) -> Turnout:
+    def turnout(self, coarseness: float) -> Turnout:
         """Return how many intersections of the scene vote, on all parts of some coarseness alike."""
         n_map = sum(len(member.index) for member in self.members if member.index.coarseness == coarseness)
-        return self._turnouts.setdefault(coarseness, Turnout(options, n_map))
+        return self._turnouts.setdefault(coarseness, Turnout(n_map))
 
     def end(self) -> None:
         """Let go of the parts: each holds on to this, and a cycle would keep their maps open for a while."""
@@ -120,7 +95,7 @@ class SharedSweeps(Generic[AnyMember]):
 
     def _work(self, stage: Stage) -> Iterator[_Round]:
         low, high = self.camera.gsd_m
-        scale = (low / stage.grow.max_scale_ratio, high * stage.grow.max_scale_ratio)
+        scale = (low / growing.MAX_SCALE_RATIO, high * growing.MAX_SCALE_RATIO)
         if self.members[0].enough():
             return
         indexes = [member.index for member in self.members]
@@ -131,33 +106,35 @@ class SharedSweeps(Generic[AnyMember]):
 
     def _grow(self, proposals: Sequence[Proposals], stage: Stage) -> dict[int, list[Hypothesis]]:
         """Follow one anchor's proposals on all parts; return the best of what grew by the part's identity."""
-        members, options = self.members, stage.grow
+        members = self.members
         # The best placed are screened ...
         allowed = [member.allow(one) for member, one in zip(members, proposals, strict=True)]
         placed = [one.placed[may] for one, may in zip(proposals, allowed, strict=True)]
         kept = [
             member.screen(one, may, most, stage)
             for member, one, may, most in zip(
-                members, proposals, allowed, _best(placed, options.max_screened), strict=True
+                members, proposals, allowed, _best(placed, growing.MAX_SCREENED), strict=True
             )
         ]
         # ... an even share of those that lie on roads grows ...
-        share = min(options.max_grown / max(sum(map(len, kept)), 1), 1.0)
+        share = min(growing.MAX_GROWN / max(sum(map(len, kept)), 1), 1.0)
         grown = [
             _owned(member, member.follow_up(one, rows[: math.ceil(share * len(rows))], stage))
             for member, one, rows in zip(members, proposals, kept, strict=True)
             if len(rows)
         ]
         # ... and the best of what grew are verified.
-        best: list[tuple[AnyMember, Hypothesis]] = []
+        best: list[tuple[TripleEstimator, Hypothesis]] = []
         for member, hypothesis in heapq.merge(*grown, key=lambda pair: -pair[1].support):
             if not self._is_met(member, hypothesis, best):
                 best.append((member, hypothesis))
-                if len(best) == options.max_verified:
+                if len(best) == growing.MAX_VERIFIED:
                     break
         return {id(member): [one for owner, one in best if owner is member] for member, _ in best}
 
-    def _is_met(self, member: AnyMember, hypothesis: Hypothesis, best: Sequence[tuple[AnyMember, Hypothesis]]) -> bool:
+    def _is_met(
+        self, member: TripleEstimator, hypothesis: Hypothesis, best: Sequence[tuple[TripleEstimator, Hypothesis]]
+    ) -> bool:
         """Whether another part that overlaps this one has the same place."""
         if self.same_place is None:
             return False
@@ -167,7 +144,7 @@ class SharedSweeps(Generic[AnyMember]):
         )
 
 
-def _owned(member: AnyMember, grown: Iterator[Hypothesis]) -> Iterator[tuple[AnyMember, Hypothesis]]:
+def _owned(member: TripleEstimator, grown: Iterator[Hypothesis]) -> Iterator[tuple[TripleEstimator, Hypothesis]]:
     """Yield what grew, with the part it grew on."""
     return ((member, hypothesis) for hypothesis in grown)
 

@@ -13,6 +13,7 @@ import threading
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, replace
 from functools import lru_cache
+from itertools import islice
 
 import numpy as np
 
@@ -22,9 +23,19 @@ from roadgeo.kernels.triple_codes import UNITS, find_sides
 from roadgeo.kernels.triples import count_alike, gather, look_up_each
 from roadgeo.matching.ahead import ALONE, Ahead
 from roadgeo.matching.index import ReferenceIndex
-from roadgeo.matching.scene import Scene
+from roadgeo.matching.scene import MIN_COS, Scene
 
-__all__ = ["Proposals", "TripleOptions", "farthest_first", "larger", "propose", "smaller"]
+__all__ = [
+    "BEFORE_ROADS",
+    "WITHOUT_ROADS",
+    "Proposals",
+    "Sweep",
+    "TripleOptions",
+    "farthest_first",
+    "larger",
+    "propose",
+    "smaller",
+]
 
 
 #: Intersections of the maps that bounds are made for: a city's.
@@ -41,6 +52,16 @@ def smaller(n_reference: int) -> float:
     return math.sqrt(max(1.0, _USUAL_SIZE / max(n_reference, 1)))
 
 
+#: Thinner triangles are left out (see `kernels.triple_codes.orient`); the map's may be thinner still.
+_MIN_SHAPE = 0.12
+#: Of an intersection with three tangents or more, so many pairs of tangents are looked up.
+_CODES_PER_VERTEX = 1
+#: Hits of one proposal may differ by this part of their maps' size.
+_AFFINE_TOLERANCE = 0.3
+#: Of more intersections, evenly chosen ones may become anchors: to weigh all would take longer than to use some.
+_MAX_WEIGHED = 1000
+
+
 @dataclass(frozen=True)
 class TripleOptions:
     """How triples are looked up and gathered.
@@ -48,34 +69,21 @@ class TripleOptions:
     Attributes
     ----------
     n_neighbours : int
-        Triples are formed with pairs of this number of nearest neighbours of the anchor.
-    min_shape : float
-        Thinner triangles are left out (see `kernels.triple_codes.orient`); the map's may be thinner still.
-    codes_per_vertex : int
-        Of an intersection with three tangents or more, this number of pairs of tangents is looked up.
-    angle_tolerance_deg, ray_tolerance_deg : float
-        How far tangents may turn in the equilateral frame, and branches in the map's.
-    affine_tolerance : float
-        Hits of one proposal may differ by this part of their affine maps' size.
+        Triples are formed with pairs of so many nearest neighbours of the anchor.
+    angle_tolerance_deg : float
+        How far tangents may turn in the equilateral frame.
     spread : bool
         Whether anchors come spread over the frame, from its middle outwards, or those first whose triples are rare.
         Rare triples are soon looked up, but often rare because they are wrong: on `noisy` and `hard` training masks 9 %
         of the rarest sixth of the anchors lead to the place, and 44 % of the commonest.
-    max_weighed : int
-        Of more intersections, evenly chosen ones may become anchors: to weigh all would take longer than to use some.
     max_hits, max_compared : int
         An anchor's triples are looked up, the rarest first, until this number is found or compared: on a map of 15,000
         intersections, and on a larger one more by the root of the ratio.
     """
 
     n_neighbours: int = 8
-    min_shape: float = 0.12
-    codes_per_vertex: int = 1
     angle_tolerance_deg: float = 8.0
-    ray_tolerance_deg: float = 25.0
-    affine_tolerance: float = 0.3
     spread: bool = False
-    max_weighed: int = 1000
     max_hits: int = 12_000
     max_compared: int = 400_000
 
@@ -138,16 +146,15 @@ def propose(
     """
     query, branches = scene.intersections, scene.branches
     neighbours = np.ascontiguousarray(scene.neighbours[:, : options.n_neighbours])
-    weighed = np.arange(0, len(query), max(1, math.ceil(len(query) / options.max_weighed)))
+    weighed = np.arange(0, len(query), max(1, math.ceil(len(query) / _MAX_WEIGHED)))
     # how many entries of the tables each pair of an anchor's neighbours would have to be compared with
     sides = np.empty(query.tangents.shape, np.int8)
     find_sides(query.tangents, branches, sides)
     seen = TripleQuery(query.xy, branches, query.tangents, sides, neighbours)
-    costs = _count_alike(seen, weighed, options, _starts(tuple(indexes)))
+    costs = _count_alike(seen, weighed, _starts(tuple(indexes)))
     n_reference = sum(map(len, indexes))
     tolerance = round(options.angle_tolerance_deg * UNITS / 180.0)
-    min_cos = float(np.cos(np.radians(options.ray_tolerance_deg)))
-    limits = TripleLimits(options.codes_per_vertex, tolerance, min_cos, scale, min_ratio)
+    limits = TripleLimits(_CODES_PER_VERTEX, tolerance, MIN_COS, scale, min_ratio)
     room = _Room(options.bounds(n_reference)[0])
     # anchors with rare codes first, or those that lie furthest from the ones before
     usable = costs >= 0
@@ -160,13 +167,61 @@ def propose(
         a = int(weighed[i])
         slots = np.argwhere(usable[i])
         slots = np.ascontiguousarray(slots[np.argsort(costs[i][usable[i]], kind="stable")])
-        shares = _shares(seen, a, indexes, options)
+        shares = _shares(seen, a, indexes)
         return [
-            _look_up(seen, a, slots, index, options.bounds(n_reference, share), limits, room.hits, options)
+            _look_up(seen, a, slots, index, options.bounds(n_reference, share), limits, room.hits)
             for index, share in zip(indexes, shares, strict=True)
         ]
 
     yield from ahead.map(look_up, farthest_first(query.xy[weighed[able]], able) if options.spread else rarest)
+
+
+@dataclass(frozen=True)
+class Sweep:
+    """One pass over the query's anchors: how many, and how widely their triples are looked up.
+
+    Attributes
+    ----------
+    triples : TripleOptions
+    max_anchors : int
+        On a map of 15,000 intersections or more; on a smaller one, where each takes less time, more.
+    most_more : float
+        At most by this factor.
+    """
+
+    triples: TripleOptions
+    max_anchors: int
+    most_more: float = 3.0
+
+    def proposals(
+        self,
+        scene: Scene,
+        indexes: Sequence[ReferenceIndex],
+        scale: tuple[float, float],
+        min_ratio: float,
+        ahead: Ahead = ALONE,
+    ) -> Iterator[list[Proposals]]:
+        """Yield what one query intersection after another may be on each index, the most promising first.
+
+        `scale` = (least, greatest) root of the determinant of a proposed map, metres per pixel; `min_ratio` is the
+        least ratio of its singular values. `ahead` looks for the next intersections meanwhile.
+        """
+        anchors = propose(scene, indexes, scale, min_ratio, self.triples, ahead)
+        more = min(smaller(sum(map(len, indexes))), self.most_more)
+        return islice(anchors, int(self.max_anchors * more))
+
+
+#: Where the rarest triples lead nowhere, more neighbours are taken, all over the frame.
+_FURTHER = TripleOptions(n_neighbours=12, max_hits=20_000, max_compared=500_000, spread=True, angle_tolerance_deg=7.5)
+_SECOND = Sweep(_FURTHER, 30)
+#: The sweeps that follow one another where roads propose after them: of the rarest triples few intersections suffice;
+#: and those where roads propose nothing.
+BEFORE_ROADS: tuple[Sweep, ...] = (Sweep(TripleOptions(), 12), _SECOND)
+WITHOUT_ROADS: tuple[Sweep, ...] = (
+    Sweep(TripleOptions(), 40),
+    _SECOND,
+    Sweep(replace(_FURTHER, angle_tolerance_deg=10.0), 20),
+)
 
 
 class _Room(threading.local):
@@ -189,24 +244,24 @@ def _added_starts(indexes: tuple[ReferenceIndex, ...]) -> Int32Array:
     return (starts >> max(0, int(starts[-1]).bit_length() - 31)).astype(np.int32)
 
 
-def _count_alike(seen: TripleQuery, anchors: IntArray, options: TripleOptions, starts: Int32Array) -> IntArray:
+def _count_alike(seen: TripleQuery, anchors: IntArray, starts: Int32Array) -> IntArray:
     """Return how many entries of a table are in the cells of each triple of the anchors (see `count_alike`)."""
     k = seen.neighbours.shape[1]
     costs = np.empty((len(anchors), k, k), np.int64)
     count_alike(
-        seen.xy, seen.tangents, seen.sides, seen.neighbours, anchors, options.min_shape, options.codes_per_vertex,
+        seen.xy, seen.tangents, seen.sides, seen.neighbours, anchors, _MIN_SHAPE, _CODES_PER_VERTEX,
         starts, costs,
     )  # fmt: skip
     return costs
 
 
-def _shares(seen: TripleQuery, anchor: int, indexes: Sequence[ReferenceIndex], options: TripleOptions) -> FloatArray:
-    """Return how to share out an anchor's work: half of it by size, half by the entries to compare."""
+def _shares(seen: TripleQuery, anchor: int, indexes: Sequence[ReferenceIndex]) -> FloatArray:
+    """Return how to share out an anchor's work: half of it by size, half by what there is to compare."""
     if len(indexes) == 1:
         return np.ones(1)
     one = np.array([anchor])
     sizes = np.array([len(index) for index in indexes], float)
-    costs = [np.maximum(_count_alike(seen, one, options, index.table_starts), 0).sum() for index in indexes]
+    costs = [np.maximum(_count_alike(seen, one, index.table_starts), 0).sum() for index in indexes]
     return np.asarray(sizes / sizes.sum() + np.array(costs) / max(sum(costs), 1)) / 2.0
 
 
@@ -218,7 +273,6 @@ def _look_up(
     bounds: tuple[int, int],
     limits: TripleLimits,
     hits: Hits,
-    options: TripleOptions,
 ) -> Proposals:
     """Look an anchor's triples up in one index; return their proposals there, the best placed first."""
     max_hits, max_compared = bounds
@@ -230,7 +284,7 @@ def _look_up(
     out_affine = np.empty((len(out_ids), 4))
     out_placed = np.empty(len(out_ids), np.int64)
     order = np.argsort(ids[:n_hits, 0], kind="stable")
-    n = gather(ids, affine, order, k, options.affine_tolerance, out_ids, out_affine, out_placed)
+    n = gather(ids, affine, order, k, _AFFINE_TOLERANCE, out_ids, out_affine, out_placed)
     best = np.lexsort((_scattered(out_ids[:n, 0]), -out_placed[:n]))
     return Proposals(
         anchor, out_ids[best, 0], out_ids[best, 1:], out_affine[best], out_placed[best],

@@ -13,11 +13,11 @@ import numpy as np
 from roadgeo._arrays import FloatArray, IntArray
 from roadgeo.geometry.homography import Homography
 from roadgeo.kernels.point_matching import match_all
-from roadgeo.kernels.roads import backward_agreement, forward_distances
+from roadgeo.kernels.roads import count_residuals
 from roadgeo.matching.index import ReferenceIndex
-from roadgeo.matching.scene import Scene
+from roadgeo.matching.scene import MIN_COS, Scene
 
-__all__ = ["Agreement", "VerifyOptions", "agreement", "map_agreement", "tolerance_m"]
+__all__ = ["Agreement", "VerifyOptions", "agreement", "tolerance_m"]
 
 
 @dataclass(frozen=True)
@@ -34,14 +34,7 @@ class VerifyOptions:
 
     map_sigma_m: float = 1.8
     pixel_sigma_px: float = 1.0
-    max_turn_deg: float = 25.0
-    ray_tolerance_deg: float = 25.0
     backward_step_m: float = 12.0
-
-    @property
-    def ray_cos(self) -> float:
-        """Cosine of the angle within which branches agree."""
-        return math.cos(math.radians(self.ray_tolerance_deg))
 
 
 @dataclass(frozen=True)
@@ -52,7 +45,6 @@ class Agreement:
     tested: int
     forward: float
     backward: float
-    n_seen: int
 
     @property
     def rate(self) -> float:
@@ -68,11 +60,6 @@ class Agreement:
 def tolerance_m(gsd_m: float, options: VerifyOptions) -> float:
     """Three standard deviations of a road's place, map and mask together, in metres."""
     return 3.0 * math.hypot(options.map_sigma_m, options.pixel_sigma_px * gsd_m)
-
-
-def _bounds(matrix: FloatArray, scene: Scene) -> FloatArray:
-    ground = Homography(matrix).everywhere(scene.corners)
-    return np.concatenate([ground.min(axis=0), ground.max(axis=0)])
 
 
 def agreement(
@@ -99,30 +86,16 @@ def agreement(
     found = scene.intersections
     matched = np.empty(len(found), np.int64)
     distance = np.empty(len(found))
-    match_all(
-        matrix, found.xy, scene.branches, 1.5 * tolerance, options.ray_cos, 0.0, 0.0, True,
-        index.point_buckets, matched, distance,
-    )  # fmt: skip
+    match_all(matrix, found.xy, scene.branches, 1.5 * tolerance, MIN_COS, True, index.point_buckets, matched, distance)
     counted = np.ones(len(found), bool)
     counted[seeds] = False
-    out = np.empty(len(scene.points))
-    min_cos = math.cos(math.radians(options.max_turn_deg))
-    roads = index.road_buckets
-    forward_distances(matrix, scene.points, scene.directions, tolerance, min_cos, 0.0, 0.0, roads, out)
-    forward = float(np.average(np.isfinite(out), weights=scene.weights)) if scene.weights.any() else 0.0
-    seen, shown = map_agreement(matrix, scene, index, gsd_m, options)
-    result = Agreement(
-        int((matched[counted] >= 0).sum()), int(counted.sum()),
-        forward, shown / max(seen, 1), seen,
+    ground, (drawn, mapped) = Homography(matrix).everywhere(scene.corners), np.empty((2, 1, 2))
+    count_residuals(
+        matrix, np.asarray(np.linalg.inv(matrix), float), np.concatenate([ground.min(axis=0), ground.max(axis=0)]),
+        scene.points, scene.directions, scene.weights, tolerance, MIN_COS,
+        options.backward_step_m, index.road_buckets, scene.field, scene.field_scale, scene.observed, math.inf, 1,
+        drawn, mapped,
     )  # fmt: skip
-    return result, matched, distance
-
-
-def map_agreement(
-    matrix: FloatArray, scene: Scene, index: ReferenceIndex, gsd_m: float, options: VerifyOptions
-) -> tuple[int, int]:
-    """Return how many points of the map's roads lie where the scene is observed, and how many of them it shows."""
-    return backward_agreement(
-        np.asarray(np.linalg.inv(matrix), float), _bounds(matrix, scene), options.backward_step_m,
-        tolerance_m(gsd_m, options), 0.0, 0.0, index.road_buckets, scene.field, scene.field_scale, scene.observed,
-    )  # fmt: skip
+    forward, backward = (float(near / max(near + none, 1e-9)) for near, none in (drawn[0], mapped[0]))
+    n_matched, n_counted = int((matched[counted] >= 0).sum()), int(counted.sum())
+    return Agreement(n_matched, n_counted, forward, backward), matched, distance

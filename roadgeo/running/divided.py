@@ -278,7 +278,7 @@ class _Voter:
         def how(mask: RoadMask, references: Sequence[AnyReference], options: LocateOptions) -> Location:
             from roadgeo.matching.query import read_query
 
-            query = read_query(mask, options.query)
+            query = read_query(mask)
             left = max(options.search.time_limit_s - query.seconds.vectorize, 0.0)
             found = search_references(query, [part for one in references for part in one.parts], options, left)
             least = options.min_log10_odds - options.min_margin

@@ -156,8 +156,8 @@ def _look(image: _Image, reference: Reference, start: FloatArray) -> Checked:
     results: list[Checked] = []
     width = image.place.size[0]
 
-    def check(mask: RoadMask, _: Sequence[AnyReference], options: LocateOptions) -> Location:
-        query = read_query(mask, options.query)
+    def check(mask: RoadMask, _: Sequence[AnyReference], __: LocateOptions) -> Location:
+        query = read_query(mask)
         coarser = np.diag([width / mask.shape[1]] * 2 + [1.0])  # large photographs are segmented on a coarser grid
         checked = check_place(start @ coarser @ PIXEL_TO_PLANE, query.scene, reference.index, image.settings.options)
         results.append(checked)

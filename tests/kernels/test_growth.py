@@ -181,19 +181,18 @@ class TestKeepNearest:
 
 
 class TestMatchAll:
-    @pytest.mark.parametrize("shift", [(0.0, 0.0), (60.0, -35.0)])
-    def test_like_the_twin(self, world, shift):
+    def test_like_the_twin(self, world):
         def run(one_to_one):
             matched, distance = np.empty(len(world.xy), np.int64), np.empty(len(world.xy))
             n = match_all(
-                TRUTH, world.xy, world.branches, 90.0, MIN_COS, *shift, one_to_one, world.reference, matched, distance
+                TRUTH, world.xy, world.branches, 90.0, MIN_COS, one_to_one, world.reference, matched, distance
             )
             assert n == (matched >= 0).sum() > 0
             return matched, distance
 
         matched, distance = run(one_to_one=False)
         (strict, _), (expected, away), (lax, _) = (
-            naive.match_all(TRUTH, world.xy, world.branches, 90.0, t, shift, False, world.ref_xy, world.ref_branches)
+            naive.match_all(TRUTH, world.xy, world.branches, 90.0, t, False, world.ref_xy, world.ref_branches)
             for t in (TOLERANCE - 0.02, TOLERANCE, TOLERANCE + 0.02)
         )
         clear = (strict == expected) & (lax == expected)  # branches are compared to a degree
@@ -204,12 +203,12 @@ class TestMatchAll:
 
     def test_the_true_homography_matches_the_true_points(self, world):
         matched, distance = np.empty(len(world.xy), np.int64), np.empty(len(world.xy))
-        match_all(TRUTH, world.xy, world.branches, 5.0, MIN_COS, 0.0, 0.0, True, world.reference, matched, distance)
+        match_all(TRUTH, world.xy, world.branches, 5.0, MIN_COS, True, world.reference, matched, distance)
         assert np.array_equal(matched[world.truth >= 0], world.truth[world.truth >= 0])
         assert (distance[world.truth >= 0] < 3).all()
 
     def test_no_query(self, world):
-        nothing = np.empty((0, 2)), np.empty((0, 8, 2), np.int8), 5.0, MIN_COS, 0.0, 0.0, True
+        nothing = np.empty((0, 2)), np.empty((0, 8, 2), np.int8), 5.0, MIN_COS, True
         assert match_all(TRUTH, *nothing, world.reference, np.empty(0, np.int64), np.empty(0)) == 0
 
 

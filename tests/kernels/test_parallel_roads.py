@@ -5,7 +5,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 from naive import simplification as naive
 
-from roadgeo.kernels.parallel_roads import points_beside, roads_alongside
+from roadgeo.kernels.parallel_roads import roads_alongside
 
 
 @given(st.integers(0, 40), st.integers(0, 2**32 - 1))
@@ -25,19 +25,3 @@ def test_two_roads_side_by_side():
     along[10:] *= -1.0
     roads_alongside(xy, along, np.full(20, 5.5), 3.0, 30.0, 0.9, out)
     np.testing.assert_allclose(out, np.repeat([[0.0, 12.0], [0.0, -12.0]], 10, axis=0), atol=1e-12)
-
-
-@given(st.integers(0, 30), st.integers(0, 30), st.integers(0, 2**32 - 1))
-def test_points_beside_like_the_twin(n, m, seed):
-    rng = np.random.default_rng(seed)
-    angle = rng.uniform(0.0, 2.0 * np.pi, n)
-    along = np.stack([np.cos(angle), np.sin(angle)], axis=1)
-    places, points, out = rng.uniform(0, 60, (n, 2)), rng.uniform(0, 60, (m, 2)), np.empty(n, np.bool_)
-    points_beside(places, along, points, 4.0, 9.0, out)
-    assert np.array_equal(out, naive.points_beside(places, along, points, 4.0, 9.0))
-
-
-def test_nothing_lies_beside_no_place():
-    out = np.ones(1, np.bool_)
-    points_beside(np.full((1, 2), np.nan), np.array([[1.0, 0.0]]), np.zeros((3, 2)), 4.0, 9.0, out)
-    assert not out[0]

@@ -7,12 +7,11 @@ import pytest
 from naive import kernels as naive
 
 from roadgeo.kernels.roads import (
-    backward_agreement,
     bin_segments,
     count_residuals,
-    forward_distances,
     meets_road,
     nearest_road,
+    road_residuals,
     screen,
     shares_near_roads,
 )
@@ -119,31 +118,31 @@ class TestMeetsRoad:
 TILTED = np.array([[0.9, -0.3, 260.0], [0.25, 1.1, 420.0], [2e-4, -3e-4, 1.0]])
 
 
-class TestForwardDistances:
-    @pytest.mark.parametrize("shift", [(0.0, 0.0), (31.0, -17.0)])
-    def test_like_the_twin(self, shift):
+class TestRoadResiduals:
+    def test_like_the_twin(self):
         roads = town(3)
         rng = np.random.default_rng(4)
         points, along = rng.uniform((0, -250), (250, 0), (60, 2)), directions(rng, 60)
-        out = np.empty(60)
-        n = forward_distances(TILTED, points, along, 30.0, MIN_COS, *shift, roads, out)
-        expected = naive.forward_distances(TILTED, points, along, 30.0, MIN_COS, shift, roads[0])
-        assert np.isfinite(expected).any()
-        assert np.allclose(out, expected, atol=2e-3)
-        assert n == np.isfinite(out).sum()
+        radii, out = rng.uniform(5, 60, 60), np.empty((60, 3))
+        n = road_residuals(TILTED, points, along, radii, MIN_COS, roads, out)
+        expected = naive.road_residuals(TILTED, points, along, radii, MIN_COS, roads.segments)
+        assert 0 < n == np.isfinite(expected[:, 0]).sum() < 60
+        assert np.allclose(out, expected, atol=2e-3, equal_nan=True)
 
     def test_beyond_the_horizon_there_is_nothing(self):
-        roads = town(3)
         horizon = np.array([[1.0, 0, 300], [0, 1.0, 300], [0, -0.1, 1.0]])
-        out = np.empty(2)
-        points = np.array([[0.0, 20.0], [0.0, 10.0]])  # w = -1, 0
-        assert forward_distances(horizon, points, np.array([[1.0, 0], [0, 1]]), 1e3, 0.0, 0.0, 0.0, roads, out) == 0
-        assert np.isinf(out).all()
+        points, along, out = np.array([[0.0, 20.0], [0.0, 10.0]]), np.array([[1.0, 0], [0, 1]]), np.empty((2, 3))
+        assert road_residuals(horizon, points, along, np.full(2, 1e3), 0.0, town(3), out) == 0  # w = -1, 0
+        assert np.isnan(out).all()
+
+    def test_places_that_are_none(self):
+        nowhere, along, out = np.array([[np.nan, 0.0]]), np.array([[1.0, 0.0]]), np.empty((1, 3))
+        assert road_residuals(np.eye(3), nowhere, along, np.array([9.0]), 0.5, town(), out) == 0
+        assert np.isnan(out).all()
 
     def test_no_points(self):
-        assert (
-            forward_distances(TILTED, np.empty((0, 2)), np.empty((0, 2)), 9.0, 0.5, 0.0, 0.0, town(), np.empty(0)) == 0
-        )
+        nothing = np.empty((0, 2)), np.empty((0, 2)), np.empty(0), 0.5
+        assert road_residuals(TILTED, *nothing, town(), np.empty((0, 3))) == 0
 
 
 class TestSharesNearRoads:
@@ -158,43 +157,6 @@ class TestSharesNearRoads:
         expected = naive.shares_near_roads(TILTED, points, along, weights, 30.0, MIN_COS, shifts, roads.segments)
         np.testing.assert_allclose(shares, expected, rtol=1e-12)
         assert min(expected) > 0
-
-
-class TestBackwardAgreement:
-    @pytest.mark.parametrize("shift", [(0.0, 0.0), (31.0, -17.0)])
-    @pytest.mark.parametrize("scale", [1.0, 2.5])
-    def test_like_the_twin(self, shift, scale):
-        roads = town(5)
-        rng = np.random.default_rng(6)
-        cells = (int(250 / scale), int(300 / scale))
-        field = rng.uniform(0, 12, cells).astype(np.float32)
-        observed = rng.uniform(size=cells) < 0.7
-        inverse = np.linalg.inv(TILTED)
-        corners = np.array([[0, 0, 1], [300, 0, 1], [300, -250, 1], [0, -250, 1]]) @ TILTED.T
-        corners = corners[:, :2] / corners[:, 2:]
-        bounds = np.concatenate([corners.min(axis=0), corners.max(axis=0)])
-        found = backward_agreement(inverse, bounds, 4.0, 6.0, *shift, roads, field, scale, observed)
-
-        def inside(x, y):
-            return GRID[0] <= x < GRID[0] + 800 and GRID[1] <= y < GRID[1] + 600
-
-        expected = naive.backward_agreement(inverse, 4.0, 6.0, shift, roads[0], inside, field, scale, observed)
-        assert expected[0] > 100
-        assert found == pytest.approx(expected, abs=2)  # a sample may lie on the border of two cells
-
-    def test_nothing_seen_counts_for_nothing(self):
-        field = np.zeros((10, 10), np.float32)
-        blind = np.zeros((10, 10), bool)
-        everywhere = np.array([-1e4, -1e4, 1e4, 1e4])
-        move = np.array([[1.0, 0, -100], [0, 1, -400], [0, 0, 1]])
-        assert backward_agreement(move, everywhere, 1.0, 5.0, 0.0, 0.0, town(), field, 20.0, blind) == (0, 0)
-
-    @pytest.mark.parametrize("w", [0.0, 1e-300, np.nan])
-    def test_pixels_at_infinity_are_outside(self, w):
-        inverse = np.array([[1.0, 0, 0], [0, -1.0, 0], [0, 0, w]])
-        field, observed = np.zeros((10, 10), np.float32), np.ones((10, 10), bool)
-        bounds = np.array([-1e4, -1e4, 1e4, 1e4])
-        assert backward_agreement(inverse, bounds, 1.0, 5.0, 0.0, 0.0, town(), field, 20.0, observed) == (0, 0)
 
 
 class TestCountResiduals:

@@ -54,7 +54,6 @@ REASONS = {
     "neighbours": "part of thinning and tracing, whose twins use rows and columns",
     "pair_id": "compared with the numbers it counts through, all of them",
     "rethin": "the second half of `thin`, which has a twin",
-    "road_equations": "its twin stands beside its test",
     "sample_edges": "compared with shapely's interpolation along lines",
     "solve_cholesky": "compared with numpy.linalg",
     "sort_few": "part of `describe_intersections`; rays are tested to ascend",

@@ -14,8 +14,8 @@ from worlds.scenes import PLANE, random_lines, random_network, scene_of
 
 from roadgeo.errors import MaskError
 from roadgeo.geometry.mask import RoadMask
+from roadgeo.matching import scene
 from roadgeo.matching.index import build_index
-from roadgeo.matching.scene import SceneOptions
 from roadgeo.matching.search import SearchOptions
 from roadgeo.reference.reference import Reference, build_network
 from roadgeo.sources.masks import read_mask
@@ -109,10 +109,12 @@ def test_the_reason_says_what_took_the_time(lattice):
     assert " intersections had been looked for; a pixel size known to 30 % (--gsd) leaves 11%" in location.reason
 
 
-def test_of_many_intersections_those_around_the_middle_are_kept():
+def test_of_many_intersections_those_around_the_middle_are_kept(monkeypatch):
     graph = build_network(random_lines(5, 2000.0), PLANE, {}).graph
     shifted = replace(graph, xy=graph.xy - (0.0, 2000.0), coords=graph.coords - (0.0, 2000.0))
-    whole, part = (scene_of(shifted, (2000, 2000), options=SceneOptions(max_intersections=most)) for most in (5000, 60))
+    whole = scene_of(shifted, (2000, 2000))
+    monkeypatch.setattr(scene, "_MAX_INTERSECTIONS", 60)
+    part = scene_of(shifted, (2000, 2000))
     away = np.hypot(*(whole.intersections.xy - (1000.0, -1000.0)).T)
     nearest = np.argsort(away, kind="stable")[:60]
     assert len(whole.intersections) > 100

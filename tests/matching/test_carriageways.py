@@ -4,12 +4,14 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
+from hypothesis import given
+from hypothesis import strategies as st
 from matching.test_explanation import mask_of
-from matching.test_merged_roads import motorways
+from worlds.motorways import motorways
 from worlds.scenes import camera, look, mapped, random_network, scene_of
 
 from roadgeo.geometry.camera import CameraFault, sampling
-from roadgeo.matching.carriageways import between_carriageways, refine_between
+from roadgeo.matching.carriageways import between_carriageways, nearest_of, refine_between
 from roadgeo.matching.estimator import TripleEstimator
 from roadgeo.matching.finishing import measure_corners
 from roadgeo.matching.hypothesis import Hypothesis
@@ -68,7 +70,7 @@ def test_points_move_to_the_middle_and_matches_there_are_dropped(town, seen):
     truth, cut = seen  # its roads do not meet: the intersections are those of the roads before they were made two
     scene = replace(cut, intersections=scene_of(look(town[0], truth)).intersections)
     matched = np.arange(len(scene.intersections))
-    moved, left = between_carriageways(truth, scene, town[1], matched, 25.0)
+    moved, left = between_carriageways(truth, scene, town[1], matched)
     by = np.hypot(*(moved.points - scene.points).T)
     carriageways = scene.points[:, 0] < 0.5 * SIDE
     assert np.median(by[carriageways]) == pytest.approx(9.0, abs=0.5)
@@ -83,7 +85,7 @@ def test_points_move_to_the_middle_and_matches_there_are_dropped(town, seen):
 def test_where_the_map_has_two_they_stay(town, seen):
     truth, scene = seen
     index = build_index(motorways(town[0], has_two(truth, 0.6), 18.0))
-    moved, _ = between_carriageways(truth, scene, index, np.full(len(scene.intersections), -1), 25.0)
+    moved, _ = between_carriageways(truth, scene, index, np.full(len(scene.intersections), -1))
     assert (moved.points != scene.points).any(axis=1).mean() < 0.05
 
 
@@ -102,7 +104,7 @@ def test_a_road_that_is_not_there_beside_one_that_is(town):
     )
     nothing = np.full(len(scene.intersections), -1)
     given = fit(truth, scene, town[1])
-    assert between_carriageways(given.matrix, scene, town[1], nothing, 25.0)[0] is not scene
+    assert between_carriageways(given.matrix, scene, town[1], nothing)[0] is not scene
     found, as_seen = refine_between(given, scene, town[1], nothing, RefineOptions())
     assert found is given
     assert as_seen is scene
@@ -115,7 +117,7 @@ def test_without_any_nothing_changes(town):
     alone = replace(scene, points=scene.points[:1], directions=scene.directions[:1], weights=scene.weights[:1])
     none = replace(alone, points=np.empty((0, 2)), directions=np.empty((0, 2)), weights=np.empty(0))
     for one in (alone, none):
-        assert between_carriageways(truth, one, town[1], nothing, 25.0) == (one, nothing)
+        assert between_carriageways(truth, one, town[1], nothing) == (one, nothing)
     found, _ = refine_between(given, scene, town[1], nothing, RefineOptions())
     assert error_of(found.matrix, truth, scene) < error_of(given.matrix, truth, scene) + 0.05
 
@@ -148,3 +150,17 @@ def test_a_located_mask_lies_right(town):
     have = mapped(np.asarray(location.homography), corners)
     want = network.plane.to_crs(mapped(truth, corners * (1, -1)))
     assert np.hypot(*(have - want).T).max() < 2.0
+
+
+@given(st.integers(0, 30), st.integers(1, 30), st.floats(0.1, 60.0), st.integers(0, 2**32 - 1))
+def test_the_nearest_of_some_points(n, m, away, seed):
+    rng = np.random.default_rng(seed)
+    xy, points = rng.uniform(0, 100, (n, 2)), rng.uniform(0, 100, (m, 2))
+    among = np.flatnonzero(rng.random(m) < 0.5)
+    found = nearest_of(xy, points, among, away)
+    for one, number in zip(xy, found, strict=True):
+        distances = np.hypot(*(points[among] - one).T)
+        if len(among) and distances.min() < away:
+            assert number == among[np.argmin(distances)]
+        else:
+            assert number == -1

@@ -8,14 +8,14 @@ import shapely
 from worlds.scenes import PLANE, Sight, camera, look, mapped, random_lines, random_network, scene_of
 
 from roadgeo.geometry.camera import CameraOptions
-from roadgeo.matching.estimator import MatchOptions, Sweep, TripleEstimator
+from roadgeo.matching import growing
+from roadgeo.matching.estimator import MatchOptions, TripleEstimator
 from roadgeo.matching.index import build_index
 from roadgeo.matching.ledger import Ledger
 from roadgeo.matching.rivals import RivalOptions, Rivals
 from roadgeo.matching.scene import query_neighbours
 from roadgeo.matching.search import Search, SearchOptions, search, search_together
-from roadgeo.matching.sweeps import WITHOUT_ROADS
-from roadgeo.matching.triples import TripleOptions
+from roadgeo.matching.triples import WITHOUT_ROADS, Sweep, TripleOptions
 from roadgeo.reference.reference import build_network
 
 ACCEPT = SearchOptions().accept
@@ -133,7 +133,7 @@ def test_little_to_see(town, scene, n):
     few = replace(found, xy=found.xy[:n], rays=found.rays[:n], tangents=found.tangents[:n])
     neighbours = query_neighbours(few.xy, 8) if n else np.empty((0, 8), np.int32)
     little = replace(scene, intersections=few, branches=scene.branches[:n], neighbours=neighbours)
-    result, _ = locate(little, town[1], MatchOptions(without_roads=WITHOUT_ROADS[:2], roads=None))
+    result, _ = locate(little, town[1], MatchOptions(without_roads=WITHOUT_ROADS[:2], roads=False))
     assert result.score < 6
     by_roads, _ = locate(little, town[1])
     assert (by_roads.score > 6) == (n > 0)  # one intersection and all the roads are enough
@@ -148,15 +148,15 @@ def test_road_points_far_from_the_anchor(town, scene):
 @pytest.mark.parametrize("most", [0, 300])
 def test_places_are_bounded(town, most):
     stranger = scene_of(look(random_network(3, 2000.0), camera((1000, 1000)), sight=Sight(0.5)))
-    options = MatchOptions(max_places=most, without_roads=WITHOUT_ROADS[:2], roads=None)
+    options = MatchOptions(max_places=most, without_roads=WITHOUT_ROADS[:2], roads=False)
     result, estimator = locate(stranger, town[1], options)
     assert result.stopped == "exhausted"
-    assert estimator.n_screened <= most + options.grow.max_screened
+    assert estimator.n_screened <= most + growing.MAX_SCREENED
 
 
 def test_places_on_many_maps_are_bounded_as_on_one(town):
     stranger = scene_of(look(random_network(3, 2000.0), camera((1000, 1000)), sight=Sight(0.5)))
-    options = MatchOptions(max_places=40, without_roads=WITHOUT_ROADS[:2], roads=None)
+    options = MatchOptions(max_places=40, without_roads=WITHOUT_ROADS[:2], roads=False)
     ledger = Ledger(n_reference=3 * len(town[1]))
     parts = [TripleEstimator(stranger, town[1], options, ledger=ledger) for _ in range(3)]
     search_together([Search(one) for one in parts], SearchOptions(time_limit_s=60.0))
@@ -171,7 +171,7 @@ def test_roads_find_a_mask_that_lacks_half_of_the_roads(town):
     found = {}
     for seed in range(6):
         broken = scene_of(look(town[0], truth, sight=Sight(1.5, missing=0.5, false=0.6), seed=seed))
-        for name, options in (("quick", MatchOptions(roads=None)), ("full", MatchOptions())):
+        for name, options in (("quick", MatchOptions(roads=False)), ("full", MatchOptions())):
             result, _ = locate(broken, town[1], options)
             right = result.score >= 3.5 and gap(result, truth, broken) < 10
             found[name] = found.get(name, 0) + right

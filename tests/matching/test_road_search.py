@@ -8,15 +8,13 @@ import pytest
 from worlds.scenes import Sight, camera, look, mapped, random_network, scene_of
 
 from roadgeo.geometry.camera import CameraOptions
-from roadgeo.matching import road_raster
+from roadgeo.matching import road_search, road_votes
 from roadgeo.matching.estimator import MatchOptions, TripleEstimator
 from roadgeo.matching.index import build_index
-from roadgeo.matching.road_growth import RoadGrower, RoadGrowOptions
-from roadgeo.matching.road_raster import RasterOptions, make_raster
-from roadgeo.matching.road_search import COARSE_PIXEL_M, RoadSearch, RoadSearchOptions, Turnout
-from roadgeo.matching.road_votes import VoteOptions, Voter
+from roadgeo.matching.road_search import COARSE_PIXEL_M, RoadGrower, RoadSearch, Turnout, followed_more, scales
+from roadgeo.matching.road_votes import RING_STEP, WIDE_RADIUS_M, RasterOptions, Voter, make_raster
 from roadgeo.matching.search import SearchOptions, search
-from roadgeo.matching.sweeps import WITHOUT_ROADS
+from roadgeo.matching.triples import WITHOUT_ROADS
 
 SCALE = (0.2, 5.0)
 TRUTH = camera((2100, 1900), (1000, 1000), 1.0, 10.0, 20.0, 70.0)
@@ -38,7 +36,7 @@ def corner_gap(matrix, scene, truth=TRUTH):
 
 
 def best_votes(scene, index, anchors, scale=SCALE, max_turn=math.pi):
-    voter = Voter(scene, index, scale, max_turn, everywhere(index), VoteOptions())
+    voter = Voter(scene, index, scale, max_turn, everywhere(index))
     return [list(voter.votes(int(a)))[-1][1] for a in anchors]
 
 
@@ -64,7 +62,7 @@ def test_limits_on_scale_and_turn_are_kept(town, broken):
 
 
 def test_a_map_in_parts_gives_the_same_votes(town, broken):
-    voter = Voter(broken, town[1], SCALE, math.pi, everywhere(town[1]), VoteOptions())
+    voter = Voter(broken, town[1], SCALE, math.pi, everywhere(town[1]))
     whole = list(voter.votes(1))
     parts = list(voter.votes(1, chunk=100))
     assert len(whole) == 1
@@ -73,25 +71,14 @@ def test_a_map_in_parts_gives_the_same_votes(town, broken):
     assert sum(tried for tried, _ in parts) == whole[0][0]
 
 
-def test_on_a_coarse_map_more_of_the_ground_is_looked_at():
-    usual = RoadSearchOptions()
-    assert usual.on(1.0) is usual
-    coarse = usual.on(6.0)
-    assert coarse.votes.wide_radius_m == 6.0 * usual.votes.wide_radius_m
-    assert coarse.votes.raster.radius_m == 6.0 * usual.votes.raster.radius_m
-    assert coarse.votes.raster.cell_m == 6.0 * usual.votes.raster.cell_m
-    assert coarse.scales(CameraOptions(gsd_m=(0.1, 12.0)), 4.0) == (6.0 * COARSE_PIXEL_M, 12.0 * usual.scale_slack)
-    assert coarse.scales(CameraOptions(gsd_m=(0.1, 0.5)), 4.0)[0] > 0.5
+def test_on_a_coarse_map_small_pixels_are_not_looked_for():
+    assert scales(CameraOptions(gsd_m=(0.1, 12.0)), 4.0, 6.0) == (6.0 * COARSE_PIXEL_M, 12.0 * 1.2)
+    assert scales(CameraOptions(gsd_m=(0.1, 0.5)), 4.0, 6.0)[0] > 0.5
 
 
 @pytest.mark.parametrize(("voters", "more"), [(0, 5), (3, 5), (10, 3), (20, 1), (30, 1), (90, 1)])
 def test_of_few_intersections_more_proposals_are_followed(voters, more):
-    usual = RoadSearchOptions()
-    each = usual.each_of(voters)
-    assert (each.max_grown, each.max_kept) == (more * usual.max_grown, more * usual.max_kept)
-    assert each.votes.kept == more * usual.votes.kept >= each.max_grown
-    assert each.grow.go_on == tuple(more * n for n in usual.grow.go_on)
-    assert each.votes.raster == usual.votes.raster
+    assert followed_more(voters) == more
 
 
 def test_an_intersection_far_from_all_roads_has_no_votes(town, broken):
@@ -102,7 +89,7 @@ def test_an_intersection_far_from_all_roads_has_no_votes(town, broken):
 
 def test_a_rough_proposal_grows_to_the_truth(town, broken):
     index = town[1]
-    grower = RoadGrower(broken, index, RoadGrowOptions())
+    grower = RoadGrower(broken, index, CameraOptions())
     gaps = []
     for anchor, at in enumerate(mapped(TRUTH, broken.intersections.xy)):
         j = int(np.argmin(np.hypot(*(index.xy - at).T)))
@@ -122,7 +109,7 @@ def test_finds_a_broken_mask_that_triples_do_not(town, seed):
     network, index = town
     scene = scene_of(look(network, TRUTH, sight=Sight(0.8, missing=0.6, false=0.3), seed=seed))
     limits = SearchOptions(time_limit_s=60.0)
-    quick = search(TripleEstimator(scene, index, MatchOptions(roads=None, without_roads=WITHOUT_ROADS[:2])), limits)
+    quick = search(TripleEstimator(scene, index, MatchOptions(roads=False, without_roads=WITHOUT_ROADS[:2])), limits)
     assert quick.score < 3.5
     full = search(TripleEstimator(scene, index, MatchOptions()), limits)
     assert full.score > 6
@@ -143,27 +130,31 @@ def test_another_town_is_refused(town, seed):
 
 def test_near_restricts_where_votes_are_cast(town, broken):
     index = town[1]
-    everything = RoadSearch(broken, index, CameraOptions(), RoadSearchOptions())
-    around = RoadSearch(broken, index, CameraOptions(gsd_m=(0.8, 1.2)), RoadSearchOptions(), (500.0, 500.0, 100.0))
+    everything = RoadSearch(broken, index, CameraOptions())
+    around = RoadSearch(broken, index, CameraOptions(gsd_m=(0.8, 1.2)), (500.0, 500.0, 100.0))
     assert len(everything.voter.candidates) == len(index)
     assert 0 < len(around.voter.candidates) < len(index) / 2
-    nowhere = RoadSearch(broken, index, CameraOptions(), RoadSearchOptions(), (9e6, 9e6, 100.0))
+    nowhere = RoadSearch(broken, index, CameraOptions(), (9e6, 9e6, 100.0))
     assert all(n == 0 and not grown for _, n, grown in nowhere.rounds())
 
 
 @pytest.mark.slow
-def test_work_is_bounded(town, broken):
+def test_work_is_bounded(town, broken, monkeypatch):
     def n_anchors(**limits):
-        roads = RoadSearch(broken, town[1], CameraOptions(), RoadSearchOptions(**limits))
+        for name, value in limits.items():
+            monkeypatch.setattr(road_search, name, value)
+        roads = RoadSearch(broken, town[1], CameraOptions())
         return sum(anchor >= 0 for anchor, _, _ in roads.rounds())
 
     assert n_anchors() == len(broken.intersections)
-    assert n_anchors(max_anchors=5) == 5
-    assert n_anchors(max_tried=1, least_anchors=3) == 3
+    assert n_anchors(_MAX_ANCHORS=5) == 5
+    assert n_anchors(_MAX_TRIED=1, _LEAST_ANCHORS=3) == 3
 
 
-def test_parts_share_what_may_be_tried():
-    turnout = Turnout(RoadSearchOptions(max_tried=100, least_anchors=2), n_map=15_000)
+def test_parts_share_what_may_be_tried(monkeypatch):
+    monkeypatch.setattr(road_search, "_MAX_TRIED", 100)
+    monkeypatch.setattr(road_search, "_LEAST_ANCHORS", 2)
+    turnout = Turnout(n_map=15_000)
     assert turnout.includes(0)
     turnout.n_tried = 60
     assert turnout.includes(1)
@@ -176,15 +167,17 @@ def test_parts_share_what_may_be_tried():
     assert turnout.last == 3
 
 
-def test_more_may_be_tried_on_a_larger_map():
-    larger = Turnout(RoadSearchOptions(max_tried=100, least_anchors=1), n_map=60_000, n_tried=150)
+def test_more_may_be_tried_on_a_larger_map(monkeypatch):
+    monkeypatch.setattr(road_search, "_MAX_TRIED", 100)
+    monkeypatch.setattr(road_search, "_LEAST_ANCHORS", 1)
+    larger = Turnout(n_map=60_000, n_tried=150)
     assert larger.includes(1)
     larger.n_tried = 200
     assert not larger.includes(2)
 
 
 def test_a_raster_in_use_is_not_drawn_again(town, monkeypatch):
-    monkeypatch.setattr(road_raster, "_MOST_BYTES", 0)
+    monkeypatch.setattr(road_votes, "_MOST_BYTES", 0)
     options = RasterOptions(cell_m=6.0)
     drawn = make_raster(town[1], options)
     other = make_raster(town[1], RasterOptions(cell_m=8.0))
@@ -196,7 +189,7 @@ def test_the_raster_is_made_once_and_has_a_rim(town):
     options = RasterOptions()
     drawn = make_raster(town[1], options)
     assert make_raster(town[1], options) is drawn
-    assert drawn.rim_m > VoteOptions().wide_radius_m * 1.08
+    assert drawn.rim_m > WIDE_RADIUS_M * 1.08
     cells = drawn.cells(town[1].xy)
     rows, columns = np.array(drawn.raster.tile_of.shape) * 64
     rim = drawn.rim_m / options.cell_m
@@ -222,7 +215,7 @@ def test_rings_are_drawn_where_they_are_asked_for(town):
 
 def test_distances_lie_in_rings():
     options = RasterOptions()
-    edges = options.inner_m * options.ring_step ** np.arange(33)
+    edges = options.inner_m * RING_STEP ** np.arange(33)
     assert edges[-1] == pytest.approx(options.radius_m)
     assert options.ring_of(edges[:-1] * 1.01).tolist() == list(range(32))
     assert options.ring_of(np.array([0.0, 0.99 * edges[0], 1.01 * edges[-1]])).tolist()[1:] == [-1, 32]
@@ -235,12 +228,13 @@ def test_a_map_of_few_roads(broken):
     assert result.score < 2.5
 
 
-def test_wide_roads_leave_out_scales_at_which_they_would_be_no_roads():
-    options, camera = RoadSearchOptions(scale_slack=1.0), CameraOptions(gsd_m=(0.1, 12.0))
-    assert options.scales(camera, 0.0) == (0.1, 12.0)
-    assert options.scales(camera, 3.0) == (0.1, 12.0)
-    assert options.scales(camera, 10.0) == pytest.approx((0.2, 7.5))
-    assert options.scales(CameraOptions(gsd_m=(9.0, 12.0)), 10.0) == (9.0, 12.0)
+def test_wide_roads_leave_out_scales_at_which_they_would_be_no_roads(monkeypatch):
+    monkeypatch.setattr(road_search, "_SCALE_SLACK", 1.0)
+    camera = CameraOptions(gsd_m=(0.1, 12.0))
+    assert scales(camera, 0.0) == (0.1, 12.0)
+    assert scales(camera, 3.0) == (0.1, 12.0)
+    assert scales(camera, 10.0) == pytest.approx((0.2, 7.5))
+    assert scales(CameraOptions(gsd_m=(9.0, 12.0)), 10.0) == (9.0, 12.0)
 
 
 @pytest.mark.parametrize("coarseness", [1.0, 4.0])

@@ -1,7 +1,5 @@
 """Scenes: what the search sees of a query."""
 
-from dataclasses import replace
-
 import numpy as np
 import pytest
 import shapely
@@ -10,8 +8,8 @@ from hypothesis import strategies as st
 from naive import kernels as naive
 from worlds.scenes import camera, look, scene_of
 
+from roadgeo.matching import scene as scenes
 from roadgeo.matching.scene import (
-    SceneOptions,
     prepare_scene,
     query_neighbours,
     sample_roads,
@@ -80,7 +78,7 @@ class TestPrepareScene:
         assert scene.road_length_px == pytest.approx(300)
         assert scene.n_edges == 2
         assert len(scene.points) == 50
-        assert scene.neighbours.shape == (0, SceneOptions().n_neighbours)
+        assert scene.neighbours.shape == (0, 12)
 
     def test_field_is_the_distance_to_the_nearest_road(self):
         scene = prepare_scene(CROSS, find_intersections(CROSS), (200, 100))
@@ -103,10 +101,11 @@ class TestPrepareScene:
         scene = prepare_scene(graph, find_intersections(graph), (4000, 3000))
         assert (scene.field.argmin(axis=0) == int(1234 / scene.field_scale)).all()
 
-    def test_what_was_observed(self):
+    def test_what_was_observed(self, monkeypatch):
+        monkeypatch.setattr(scenes, "_FIELD_CELLS", 50)
         seen = np.ones((100, 200), bool)
         seen[:, :80] = False
-        scene = prepare_scene(CROSS, find_intersections(CROSS), (200, 100), seen, SceneOptions(field_cells=50))
+        scene = prepare_scene(CROSS, find_intersections(CROSS), (200, 100), seen)
         assert scene.observed.shape == (25, 50)
         assert not scene.observed[:, :20].any()
         assert scene.observed[:, 20:].all()
@@ -131,27 +130,16 @@ class TestPrepareScene:
 
     def test_points_are_bounded(self, town):
         scene = scene_of(look(town[0], camera((2000, 2000))))
-        assert 300 < len(scene.points) <= SceneOptions().max_road_points
+        assert 300 < len(scene.points) <= 600
         assert len(scene.branches) == len(scene.neighbours) == len(scene.intersections) > 30
         assert (np.hypot(*np.diff(scene.points, axis=0).T) > 0).all()
 
 
 @pytest.mark.parametrize("kept", [slice(None, None, 3), np.arange(600) % 2 == 0])
-@pytest.mark.parametrize("knows", [True, False])
-def test_some_of_the_points_keep_all_that_is_known_of_them(town, kept, knows):
+def test_some_of_the_points_keep_all_that_is_known_of_them(town, kept):
     scene = scene_of(look(town[0], camera((2000, 1900), (1000, 1000), 1.0)))
     kept = kept if isinstance(kept, slice) else kept[: len(scene.points)]
-    merged = scene.points[:, 0] > 500
-    at = np.resize(np.append(np.flatnonzero(merged)[:7], -1), len(scene.intersections))
-    scene = replace(scene, merged=merged, merged_at=at) if knows else scene
     some = scene.of_points(kept)
-    for name in ("points", "directions", "weights", "merged")[: 4 if knows else 3]:
+    for name in ("points", "directions", "weights"):
         assert np.array_equal(getattr(some, name), getattr(scene, name)[kept])
-    assert knows or (some.merged is None and some.merged_at is None)
-    if knows:
-        left = some.merged_at >= 0
-        assert 0 < left.sum() < len(left)
-        assert np.array_equal(some.points[some.merged_at[left]], scene.points[at[left]])
-        gone = set(map(tuple, scene.points[at[~left & (at >= 0)]]))
-        assert not gone & set(map(tuple, some.points))
     assert some.intersections is scene.intersections

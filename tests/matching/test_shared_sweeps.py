@@ -7,15 +7,14 @@ import pytest
 from worlds.scenes import camera, look, random_network, scene_of
 
 from roadgeo.geometry.camera import CameraOptions
+from roadgeo.matching import growing
 from roadgeo.matching.estimator import MatchOptions, TripleEstimator
-from roadgeo.matching.growing import GrowOptions
 from roadgeo.matching.hypothesis import Hypothesis
 from roadgeo.matching.index import build_index
 from roadgeo.matching.ledger import Ledger
 from roadgeo.matching.search import Search, SearchOptions, search_together
 from roadgeo.matching.shared_sweeps import SharedSweeps, Stage
-from roadgeo.matching.sweeps import WITHOUT_ROADS, Sweep
-from roadgeo.matching.triples import Proposals, TripleOptions
+from roadgeo.matching.triples import WITHOUT_ROADS, Proposals, Sweep, TripleOptions
 
 
 @dataclass(eq=False)
@@ -61,10 +60,10 @@ def proposals_of(anchor, placed):
     return Proposals(anchor, np.arange(n), np.zeros((n, 2), int), np.zeros((n, 4)), np.array(placed, int), 1, n, n)
 
 
-def swept(parts, same_place=None, **options):
+def swept(parts, same_place=None):
     sweeps = SharedSweeps(None, CameraOptions(), same_place)
     sweeps.members += parts
-    stage = Stage(0, Plan(parts), GrowOptions(**options))
+    stage = Stage(0, Plan(parts))
     return sweeps, stage
 
 
@@ -72,25 +71,29 @@ def supports(hypotheses):
     return [one.support for one in hypotheses]
 
 
-def test_the_best_of_all_parts_are_verified_each_where_it_grew():
+def test_the_best_of_all_parts_are_verified_each_where_it_grew(monkeypatch):
+    monkeypatch.setattr(growing, "MAX_VERIFIED", 3)
     parts = [Part([[5, 3], [2]]), Part([[9, 1], [8]]), Part([[4], []])]
-    sweeps, stage = swept(parts, max_verified=3)
+    sweeps, stage = swept(parts)
     found = [[supports(one) for one in sweeps.rounds(part, stage)] for part in parts]
     assert found == [[[5.0], [2.0]], [[9.0], [8.0]], [[4.0], []]]
 
 
 @pytest.mark.parametrize(("most", "shares"), [(100, [4, 2, 1]), (3, [1, 2, 0]), (5, [2, 2, 1]), (1, [0, 1, 0])])
-def test_the_best_placed_are_screened_and_of_equals_each_part_gives_one_in_turn(most, shares):
+def test_the_best_placed_are_screened_and_of_equals_each_part_gives_one_in_turn(most, shares, monkeypatch):
+    monkeypatch.setattr(growing, "MAX_SCREENED", most)
     parts = [Part([[3, 3, 3, 3]]), Part([[4, 3]]), Part([[3]])]
-    sweeps, stage = swept(parts, max_screened=most)
+    sweeps, stage = swept(parts)
     for part in parts:
         list(sweeps.rounds(part, stage))
     assert [part.screened for part in parts] == [[share] for share in shares]
 
 
-def test_what_lies_on_roads_grows_in_even_shares():
+def test_what_lies_on_roads_grows_in_even_shares(monkeypatch):
+    monkeypatch.setattr(growing, "MAX_GROWN", 6)
+    monkeypatch.setattr(growing, "MAX_VERIFIED", 100)
     parts = [Part([[3] * 8]), Part([[3] * 4])]
-    sweeps, stage = swept(parts, max_grown=6, max_verified=100)
+    sweeps, stage = swept(parts)
     assert [len(next(sweeps.rounds(part, stage))) for part in parts] == [4, 2]
 
 
@@ -105,13 +108,15 @@ def test_what_a_part_did_not_take_yet_can_be_asked_for_once():
     assert [supports(one) for one in sweeps.rounds(parts[1], stage)] == [[7.0], []]
 
 
-def test_a_place_on_ground_that_shards_share_is_verified_once():
+def test_a_place_on_ground_that_shards_share_is_verified_once(monkeypatch):
+    monkeypatch.setattr(growing, "MAX_VERIFIED", 4)
+
     def same_place(one, a, other, b):
         return a.support // 10 == b.support // 10
 
     parts = [Part([[31, 19]]), Part([[52, 45, 18]]), Part([[60, 11]])]
     parts[2].whole.append(Hypothesis(np.eye(3), np.zeros(1, int), 50.0, np.zeros(1, int)))
-    sweeps, stage = swept(parts, same_place, max_verified=4)
+    sweeps, stage = swept(parts, same_place)
     found = [sorted(supports(next(sweeps.rounds(part, stage)))) for part in parts]
     assert found == [[19.0, 31.0], [45.0], [60.0]]
 
@@ -148,17 +153,18 @@ def test_a_twin_on_another_part_is_met(towns):
     parts = search_all(
         scene_of(look(networks[1], TRUTH)),
         [*indexes, indexes[1]],
-        MatchOptions(without_roads=WITHOUT_ROADS[:2], roads=None),
+        MatchOptions(without_roads=WITHOUT_ROADS[:2], roads=False),
     )
     assert "accepted" not in [one.stopped for one in parts]
     assert min(parts[1].lead, parts[4].lead) > 8.0
 
 
-def test_many_parts_take_as_many_places_as_one(towns):
+def test_many_parts_take_as_many_places_as_one(towns, monkeypatch):
     """Of one anchor's proposals on all parts as many are screened and verified as on one map."""
     _, indexes = towns
     stranger = scene_of(look(random_network(3, 2000.0), TRUTH))
-    options = MatchOptions(without_roads=(Sweep(TripleOptions(), 1),), roads=None, grow=GrowOptions(max_screened=50))
+    monkeypatch.setattr(growing, "MAX_SCREENED", 50)
+    options = MatchOptions(without_roads=(Sweep(TripleOptions(), 1),), roads=False)
     parts = search_all(stranger, indexes, options)
     assert sum(one.estimator.n_screened for one in parts) <= 3 * 50
-    assert sum(one.n_scored for one in parts) <= 3 * options.grow.max_verified
+    assert sum(one.n_scored for one in parts) <= 3 * growing.MAX_VERIFIED

@@ -33,7 +33,6 @@ class TestAgreement:
         assert found.tested == len(scene.intersections)
         assert found.matched == (matched >= 0).sum()
         assert min(found.forward, found.backward) > 0.97
-        assert found.n_seen > 300
         assert (distance[matched >= 0] < 1.5 * tolerance_m(1.0, OPTIONS)).all()
         gaps = mapped(TRUTH, scene.intersections.xy)[matched >= 0] - town[1].xy[matched[matched >= 0]]
         assert distance[matched >= 0] == pytest.approx(np.hypot(*gaps.T))
@@ -45,7 +44,7 @@ class TestAgreement:
     def test_off_the_map_nothing_does(self, town, scene):
         far = np.array([[1, 0, 1e5], [0, 1, 0], [0, 0, 1]]) @ TRUTH
         found, matched, _ = agree(far, scene, town[1])
-        assert (found.rate, found.forward, found.backward, found.n_seen) == (0, 0, 0, 0)
+        assert (found.rate, found.forward, found.backward) == (0, 0, 0)
         assert (matched == -1).all()
 
     def test_seeds_are_matched_but_not_counted(self, town, scene):
@@ -67,7 +66,6 @@ class TestAgreement:
         blind = replace(gaps, observed=gaps.field < 6)
         found, *_ = agree(TRUTH, blind, town[1])
         assert found.backward > 0.9
-        assert found.n_seen < agree(TRUTH, gaps, town[1])[0].n_seen
 
     def test_a_scene_of_nothing(self, town, scene):
         empty = scene_of(look(town[0], np.array([[1, 0, 1e6], [0, 1, 1e6], [0, 0, 1.0]])))

@@ -88,40 +88,13 @@ def jacobian(matrix, xy, step=1e-4):
     return np.stack(columns, axis=1)
 
 
-def forward_distances(matrix, points, directions, radius, min_cos, shift, segments):
-    found = np.full(len(points), np.inf)
-    for i, (point, direction) in enumerate(zip(points, directions, strict=True)):
-        place = transform(matrix, point)
-        if place is None:
-            continue
-        along = jacobian(matrix, point) @ direction
-        found[i] = nearest_road(*(place + shift), *(along / np.hypot(*along)), radius, min_cos, segments)[0]
-    return found
-
-
 def shares_near_roads(matrix, points, directions, weights, radius, min_cos, shifts, segments):
-    found = (forward_distances(matrix, points, directions, radius, min_cos, shift, segments) for shift in shifts)
-    return [np.average(np.isfinite(distances), weights=weights) for distances in found]
-
-
-def backward_agreement(inverse, step, tolerance_m, shift, segments, inside, field, field_scale, observed):
-    """Samples of all segments for which `inside(x, y)`, seen and shown."""
-    seen = shown = 0
-    for s, (x1, y1, x2, y2) in enumerate(segments.astype(float)):
-        count = int(np.hypot(x2 - x1, y2 - y1) / step + (s * 0.6180339887) % 1.0)
-        for k in range(count):
-            t = (k + 0.5) / count
-            place = np.array([x1 + t * (x2 - x1), y1 + t * (y2 - y1)])
-            pixel = transform(inverse, place - shift)
-            if not inside(*place) or pixel is None:
-                continue
-            column, row = np.floor(pixel * (1, -1) / field_scale).astype(int)
-            if not (0 <= row < field.shape[0] and 0 <= column < field.shape[1]) or not observed[row, column]:
-                continue
-            seen += 1
-            scale = np.sqrt(abs(np.linalg.det(jacobian(inverse, place - shift))))
-            shown += field[row, column] * field_scale <= tolerance_m * scale + 0.7 * field_scale
-    return seen, shown
+    radii, shares = np.full(len(points), radius), []
+    for x, y in shifts:
+        moved = np.array([[1, 0, x], [0, 1, y], [0, 0, 1]]) @ matrix
+        found = road_residuals(moved, points, directions, radii, min_cos, segments)
+        shares.append(np.average(np.isfinite(found[:, 0]), weights=weights))
+    return shares
 
 
 def count_residuals(
@@ -130,7 +103,7 @@ def count_residuals(
     """Weights of points, and pixels of the map's road, by the distance of the other: `n` bins, and none so near."""
     forward, backward = np.zeros(n + 1), np.zeros(n + 1)
     edges = np.linspace(0.0, radius, n + 1)
-    distances = forward_distances(matrix, points, directions, radius, min_cos, np.zeros(2), segments)
+    distances = road_distances(matrix, points, directions, radius, min_cos, segments)
     for distance, weight in zip(distances, weights, strict=True):
         forward[np.searchsorted(edges, distance, side="right") - 1 if distance < radius else n] += weight
     inverse = np.linalg.inv(matrix)
@@ -168,15 +141,30 @@ def screen(references, affines, anchor_xy, ref_xy, points, directions, radius, r
     return np.array(shares)
 
 
-def road_residuals(mapped, along, radii, min_cos, segments):
+def road_residuals(matrix, points, directions, radii, min_cos, segments):
     """(S, 3): the way to the nearest road along its normal, and the normal; NaN where there is no road."""
-    out = np.full((len(mapped), 3), np.nan)
-    for i, (place, direction, radius) in enumerate(zip(mapped, along, radii, strict=True)):
-        distance, foot, road = nearest_road(*place, *direction, radius, min_cos, segments)
+    out = np.full((len(points), 3), np.nan)
+    for i, (point, direction, radius) in enumerate(zip(points, directions, radii, strict=True)):
+        place = transform(matrix, point)
+        if place is None:
+            continue
+        along = jacobian(matrix, point) @ direction
+        distance, foot, road = nearest_road(*place, *(along / np.hypot(*along)), radius, min_cos, segments)
         if distance < np.inf:
             across = np.array([-road[1], road[0]])
             out[i] = across @ (foot - place), *across
     return out
+
+
+def road_distances(matrix, points, directions, radius, min_cos, segments):
+    """(S,) metres to the nearest road, to its end where that is nearest; inf where there is none."""
+    found = np.full(len(points), np.inf)
+    for i, (point, direction) in enumerate(zip(points, directions, strict=True)):
+        place = transform(matrix, point)
+        if place is not None:
+            along = jacobian(matrix, point) @ direction
+            found[i] = nearest_road(*place, *(along / np.hypot(*along)), radius, min_cos, segments)[0]
+    return found
 
 
 # growth
@@ -237,13 +225,13 @@ def keep_nearest(matched, distance):
     return kept
 
 
-def match_all(matrix, xy, branches, radius, tolerance, shift, one_to_one, ref_xy, ref_branches):
+def match_all(matrix, xy, branches, radius, tolerance, one_to_one, ref_xy, ref_branches):
     matched, distance = np.full(len(xy), -1), np.full(len(xy), float(radius))
     for i, point in enumerate(xy):
         place = transform(matrix, point)
         if place is not None:
             matched[i], distance[i] = nearest_alike(
-                *(place + shift), radius, branches, i, ref_xy, ref_branches, jacobian(matrix, point), tolerance
+                *place, radius, branches, i, ref_xy, ref_branches, jacobian(matrix, point), tolerance
             )
     return keep_nearest(matched, distance) if one_to_one else matched, distance
 

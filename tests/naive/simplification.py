@@ -133,12 +133,3 @@ def roads_alongside(xy, along, reach, least, most, min_cos):
             if least < away < most and abreast and not np.hypot(*ways[i]) <= away:
                 ways[i] = across
     return ways
-
-
-def points_beside(places, along, points, across, ahead):
-    """Whether one of some points lies in the rectangle around each place on a road."""
-    found = np.zeros(len(places), bool)
-    for i, (place, way) in enumerate(zip(places, along, strict=True)):
-        away = points - place
-        found[i] = bool(((np.abs(away @ way) < ahead) & (np.abs(away @ (-way[1], way[0])) < across)).any())
-    return found

@@ -19,8 +19,9 @@ import numpy as np
 from roadgeo._arrays import BoolArray, FloatArray, IntArray
 from roadgeo.errors import IndexFormatError
 from roadgeo.kernels.pairs import PairBuckets
-from roadgeo.kernels.residuals import road_residuals
+from roadgeo.kernels.roads import road_residuals
 from roadgeo.matching.index import ReferenceIndex, neighbour_grid, sort_by_bucket
+from roadgeo.matching.scene import MIN_COS
 from roadgeo.roads.intersections import Intersections
 
 __all__ = ["PairIndex", "PairOptions", "Tuples", "build_pair_index", "cotangents", "cross_ratios", "well_fitted"]
@@ -32,7 +33,7 @@ _LEAST_BUCKET_M = 10.0
 #: Section 4.2 asks for 15 pixels, of 1 m, of every branch, and an average distance of half a pixel from the tangent.
 #: Branches begin `_SKIP_M` from the intersection (see `IntersectionOptions`), and are looked at in such steps; roads
 #: further off, or turned from the branch by more, are others.
-_LENGTH_M, _MAX_ERROR_M, _SKIP_M, _STEP_M, _REACH_M, _MIN_COS = 15.0, 0.5, 8.0, 3.0, 6.0, math.cos(math.radians(25.0))
+_LENGTH_M, _MAX_ERROR_M, _SKIP_M, _STEP_M, _REACH_M = 15.0, 0.5, 8.0, 3.0, 6.0
 
 
 @dataclass(frozen=True)
@@ -232,7 +233,7 @@ def well_fitted(index: ReferenceIndex) -> BoolArray:
     steps = _SKIP_M + np.arange(0.0, _LENGTH_M + 1e-9, _STEP_M)
     points = (index.xy[at, None] + steps[:, None] * ahead[:, None]).reshape(-1, 2)
     along, out = np.repeat(ahead, len(steps), axis=0), np.empty((len(points), 3))
-    road_residuals(points, along, np.full(len(points), _REACH_M), _MIN_COS, index.road_buckets, out)
+    road_residuals(np.eye(3), points, along, np.full(len(points), _REACH_M), MIN_COS, index.road_buckets, out)
     across = np.column_stack([-along[:, 1], along[:, 0]])
     offsets = (out[:, 0] * (out[:, 1:] * across).sum(axis=1)).reshape(-1, len(steps))
     # Residuals of the line fitted to a branch, which need not meet the intersection; NaN: it is too short.

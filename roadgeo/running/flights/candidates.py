@@ -10,7 +10,6 @@ from __future__ import annotations
 import math
 from collections.abc import Sequence
 from dataclasses import dataclass, field, replace
-from typing import cast
 
 import numpy as np
 
@@ -20,7 +19,6 @@ from roadgeo.geometry.frame import Frame
 from roadgeo.geometry.homography import Homography
 from roadgeo.geometry.mask import PIXEL_TO_PLANE
 from roadgeo.location import Location
-from roadgeo.matching.estimator import TripleEstimator
 from roadgeo.matching.evidence import Evidence
 from roadgeo.matching.hypothesis import Hypothesis
 from roadgeo.matching.index import ReferenceIndex
@@ -29,7 +27,6 @@ from roadgeo.matching.options import LocateOptions
 from roadgeo.matching.query import Query
 from roadgeo.matching.refinement import refine
 from roadgeo.matching.rivals import RivalOptions, similar_places
-from roadgeo.matching.trace import NoTrace
 from roadgeo.matching.verdict import decide
 from roadgeo.matching.verification import agreement
 from roadgeo.reference.reference import Reference
@@ -123,34 +120,6 @@ class _Candidate:
         )  # fmt: skip
 
 
-class _Recorder(NoTrace):
-    """Keeps what a search compared with the map."""
-
-    def __init__(self) -> None:
-        self.estimator: TripleEstimator | None = None
-        self.scored_models: list[Hypothesis] = []
-
-    def began(self, estimator: TripleEstimator) -> None:
-        """Note what searches."""
-        self.estimator = estimator
-
-    def scored(self, model: Hypothesis) -> None:
-        """Note a place."""
-        self.scored_models.append(model)
-
-    def best(self, count: int) -> list[Hypothesis]:
-        """Return the best places, each once."""
-        estimator, kept = self.estimator, list[Hypothesis]()
-        if estimator is None:
-            return kept
-        for model in sorted(self.scored_models, key=lambda one: -one.log10_likelihood):
-            if len(kept) == count or not math.isfinite(model.log10_likelihood):
-                break
-            if not any(estimator.same(model, one) for one in kept):
-                kept.append(model)
-        return kept
-
-
 @dataclass
 class Candidates:
     """The places that one lost flight may be at.
@@ -186,9 +155,9 @@ class Candidates:
         found: list[Found] = []
         if look.searched:
             parts = [part for one in self.references for part in one.parts]
-            found = search_references(look.query, parts, options, options.search.time_limit_s, _Recorder)
+            found = search_references(look.query, parts, options, options.search.time_limit_s, explained=True)
         for one in found:
-            self._take(one, cast("_Recorder", one.trace), look, options)
+            self._take(one, look, options)
         self._kept = [one for one in self._kept if one.fit is not None]
         self._kept = sorted(self._kept, key=_likelihood, reverse=True)[: self.options.most]
         return decide(look.query, self._judged(found, look, options), options)
@@ -238,13 +207,17 @@ class Candidates:
     def _weigh(self, look: Look, options: LocateOptions, fit: Fit, gsd_m: float) -> float:
         return Evidence(look.query.scene, fit.index, gsd_m, options.match.evidence).weigh(fit.matrix)
 
-    def _take(self, found: Found, recorder: _Recorder, look: Look, options: LocateOptions) -> None:
-        """Keep the proposals of a search, unless they are known."""
+    def _take(self, found: Found, look: Look, options: LocateOptions) -> None:
+        """Keep the likeliest places that a search compared with the map, unless they are known."""
         last, to_frame = look.numbers[-1], PIXEL_TO_PLANE @ look.mosaic.to_mosaic[-1]
-        size, estimator = look.query.scene.size, recorder.estimator
+        size, estimator = look.query.scene.size, found.events.estimator
         if estimator is None:
             return
-        for model in recorder.best(self.options.per_look):
+        best: list[Hypothesis] = []
+        for model in sorted(estimator.verified, key=lambda one: -one.log10_likelihood):
+            if len(best) < self.options.per_look and not any(estimator.same(model, one) for one in best):
+                best.append(model)
+        for model in best:
             here = (one for one in self._kept if one.whole is found.index)
             if not any(_are_one(_lay(one, look), model.matrix, size) for one in here):
                 new = _Candidate(estimator.index, found.index, model.matrix @ to_frame, last)

@@ -320,7 +320,7 @@ def _rough_covariance(frame: Frame) -> FloatArray:
 
 def _agreement(motion: FloatArray, frame: Frame, scene: Scene, roads: RoadBuckets) -> float:
     """Return the share of road points inside the other frame that lie on its roads; 0 where hardly any are inside."""
-    from roadgeo.kernels.roads import forward_distances
+    from roadgeo.kernels.roads import road_residuals
 
     pixels = Homography(motion)(scene.points * (1.0, -1.0))
     inside = np.asarray(((pixels > 0) & (pixels < (frame.width, frame.height))).all(axis=1))
@@ -328,10 +328,8 @@ def _agreement(motion: FloatArray, frame: Frame, scene: Scene, roads: RoadBucket
         return 0.0
     matrix = np.diag([1.0, -1.0, 1.0]) @ motion @ np.diag([1.0, -1.0, 1.0])
     points, along = (np.ascontiguousarray(array[inside]) for array in (scene.points, scene.directions))
-    near = forward_distances(
-        matrix, points, along, 6.0, math.cos(math.radians(25.0)), 0.0, 0.0, roads, np.empty(len(points))
-    )
-    return float(near / len(points))
+    radii, ways = np.full(len(points), 6.0), np.empty((len(points), 3))
+    return road_residuals(matrix, points, along, radii, math.cos(math.radians(25.0)), roads, ways) / len(points)
 
 
 def _buckets(graph: RoadGraph) -> RoadBuckets:

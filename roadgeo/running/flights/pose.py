@@ -15,7 +15,7 @@ from roadgeo._arrays import FloatArray
 from roadgeo.geometry.frame import Frame
 from roadgeo.geometry.homography import Homography
 from roadgeo.geometry.mask import PIXEL_TO_PLANE
-from roadgeo.kernels.road_equations import road_equations
+from roadgeo.kernels.roads import road_residuals
 from roadgeo.kernels.structs import RoadBuckets
 from roadgeo.matching.scene import Scene
 
@@ -186,18 +186,13 @@ def correct(pose: Pose, scene: Scene, roads: RoadBuckets, options: FilterOptions
     corners = local.corners
     weight = np.linalg.inv(pose.covariance)
     sigma = math.hypot(options.sigma_m, options.sigma_px * gsd)
-    points = np.ascontiguousarray(local.query(scene.points))
-    spacing = scene.road_length_px * gsd / max(len(points), 1)
+    spacing = scene.road_length_px * gsd / max(len(scene.points), 1)
     share = min(1.0, spacing / options.correlation_m)  # points closer than that are no independent observations
     unsure = float(pose.corner_sigma_m.mean())
-    normal, right = np.empty((8, 8)), np.empty(8)
+    min_cos = math.cos(math.radians(options.max_turn_deg))
     for most_m, deviations in options.radii:
         radius = max(min(most_m, deviations * unsure), options.least_radius_m)
-        normal[:], right[:] = 0.0, 0.0
-        met = road_equations(
-            p, local.unit, local.origin, points, scene.directions, radius, max(sigma, radius / 3.0),
-            math.cos(math.radians(options.max_turn_deg)), roads, normal, right,
-        )  # fmt: skip
+        normal, right, met = _road_equations(local, p, scene, radius, max(sigma, radius / 3.0), min_cos, roads)
         if met < options.fewest:
             return None
         jacobian = local.derivative(p, corners)
@@ -213,3 +208,20 @@ def correct(pose: Pose, scene: Scene, roads: RoadBuckets, options: FilterOptions
     information = scale * normal + jacobian.T @ weight @ jacobian
     covariance = jacobian @ np.linalg.inv(information) @ jacobian.T
     return Pose(local.places(p, corners), (covariance + covariance.T) / 2.0, pose.frame)
+
+
+def _road_equations(
+    local: _Local, p: FloatArray, scene: Scene, radius: float, sigma: float, min_cos: float, roads: RoadBuckets
+) -> tuple[FloatArray, FloatArray, int]:
+    """Return normal (8, 8) and right (8,) sides of normal dp = right, of all points that meet a road, and how many.
+
+    Residuals lie across the roads nearer than `radius` metres, in normalised units, with Cauchy weights by `sigma`.
+    """
+    ways, radii = np.empty((len(scene.points), 3)), np.full(len(scene.points), radius)
+    road_residuals(local.matrix(p), scene.points, scene.directions, radii, min_cos, roads, ways)
+    uv = local.query(scene.points)
+    met = np.isfinite(ways[:, 0]) & (1.0 + uv @ p[6:] >= 0.05)
+    away, normals = ways[met, 0], ways[met, 1:]
+    rows = np.einsum("ni,nij->nj", normals, local.derivative(p, uv[met]).reshape(-1, 2, 8)) / local.unit
+    weighted = rows / (1.0 + (away / sigma) ** 2)[:, None]
+    return weighted.T @ rows, weighted.T @ (away / local.unit), int(met.sum())

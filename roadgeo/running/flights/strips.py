@@ -162,7 +162,7 @@ class _Net:
             return math.isnan(one.log10_odds)
         if one.status != "located" or one.pose is None or one.reference is None:
             return False
-        scene = trace_query(one.frame.mask, self.options.locate.query)[0]
+        scene = trace_query(one.frame.mask)[0]
         start = one.pose.homography.matrix @ PIXEL_TO_PLANE
         checked = check_place(start / start[2, 2], scene, one.reference.index, _CHECK)
         return checked.verdict == "agrees"

@@ -21,7 +21,6 @@ from roadgeo.geometry.camera import CameraFault, CameraOptions, judge
 from roadgeo.geometry.frame import Frame
 from roadgeo.geometry.homography import Homography
 from roadgeo.geometry.mask import PIXEL_TO_PLANE, RoadMask
-from roadgeo.kernels.compilation import load
 from roadgeo.kernels.warmup import warm_up
 from roadgeo.location import Location
 from roadgeo.matching.evidence import Evidence
@@ -168,7 +167,6 @@ class Tracker:
 
     def __init__(self, references: Sequence[Reference], options: TrackOptions | None = None) -> None:
         warm_up()
-        load(["roadgeo.kernels.road_equations"])  # compiled before the first frame, not while it flies by
         self.references, self.options = list(references), options or TrackOptions()
         self.fixes: list[Fix] = []
         self._pose: Pose | None = None
@@ -185,7 +183,7 @@ class Tracker:
 
     def feed(self, frame: FlightFrame) -> list[Tracked]:
         """Take the next frame; return its state, after later knowledge of earlier ones."""
-        waiting = _Waiting(frame, _trace(frame.mask, self.options))
+        waiting = _Waiting(frame, _trace(frame.mask))
         if self._pose is not None:
             return self._follow(waiting)
         return self._search(waiting)
@@ -278,7 +276,7 @@ class Tracker:
             self._window = [waiting]
             self._forget()
             return [Tracked(frame, "lost", "the motion is that of no camera; begun anew", frame.number)]
-        query = _read(mosaic, self.options)
+        query = _read(mosaic)
         n_seen = 0 if query is None else len(query.scene.intersections)
         least = max(self.options.fewest_intersections, self._looked_at + self.options.more_intersections)
         if query is None or (n_seen < least and not self._candidates):
@@ -307,18 +305,18 @@ class Tracker:
         near = options.near
         if near is not None:
             near = (near[0], near[1], near[2] + 0.5 * max(mosaic.mask.shape) * camera.gsd_m[1])
-        match = replace(options.match, camera=camera, lens=None)
+        match = replace(options.match, camera=camera, lens=False)
         return replace(options, match=match, near=near)
 
     def place(self, location: Location, mosaic: Mosaic, frames: Sequence[FlightFrame]) -> list[Tracked]:
         """Place frames whose mosaic was located, each by itself; nothing where most of them do not agree."""
-        self._window = [_Waiting(one, _trace(one.mask, self.options)) for one in frames]
+        self._window = [_Waiting(one, _trace(one.mask)) for one in frames]
         return self._settle(location, mosaic)
 
     def place_beside(self, known: Tracked, frame: FlightFrame) -> Tracked:
         """Place a frame from another one, whose place is known and to whose pixels its motion leads."""
         self._pose, self._reference = known.pose, known.reference
-        return self._step(_Waiting(frame, _trace(frame.mask, self.options)), frame.number, "located")
+        return self._step(_Waiting(frame, _trace(frame.mask)), frame.number, "located")
 
     def _settle(self, location: Location, mosaic: Mosaic) -> list[Tracked]:
         """Place all frames that waited, each by itself; nothing where most of them do not agree."""
@@ -388,9 +386,9 @@ def follow(
         yield frame, tracker.feed(frame)
 
 
-def _trace(mask: RoadMask, options: TrackOptions) -> Scene | None:
+def _trace(mask: RoadMask) -> Scene | None:
     try:
-        return trace_query(mask, options.locate.query)[0]
+        return trace_query(mask)[0]
     except MaskError:
         return None  # a frame without roads is no error: it is followed by its motion
 
@@ -405,10 +403,10 @@ def _road_px(masks: Sequence[RoadMask]) -> float:
     return float(np.median(shown)) if shown else 1.0
 
 
-def _read(mosaic: Mosaic, options: TrackOptions) -> Query | None:
+def _read(mosaic: Mosaic) -> Query | None:
     """Trace a mosaic; None where it shows no roads."""
     try:
-        return read_query(mosaic.mask, options.locate.query)
+        return read_query(mosaic.mask)
     except MaskError:
         return None
 

@@ -1,6 +1,7 @@
 """The stage that lost the true place is the first that it did not come out of."""
 
 import math
+from collections import Counter
 from types import SimpleNamespace
 
 import numpy as np
@@ -10,8 +11,9 @@ from worlds.scenes import PLANE, random_network
 from roadgeo.geometry.camera import CameraFault, CameraOptions
 from roadgeo.geometry.projection import to_lonlat
 from roadgeo.location import Location, Place
+from roadgeo.matching.events import Events
 from roadgeo.matching.index import build_index
-from roadgeo.matching.truth_record import TruthRecord
+from roadgeo.matching.truth import Met, _Place, tell_truth
 from roadgeo.matching.verdict import Needed
 
 NEEDED = Needed(log10_odds=3.0, margin=2.0, intersections=3)
@@ -32,12 +34,8 @@ def lonlat(x, y):
 
 
 def told(estimator, met=(), best=-math.inf, at=(500.0, 500.0), answer=REFUSED):
-    record = TruthRecord(lonlat(*at))
-    record.began(estimator)
-    record.met.update(met)
-    record.best = best
-    record.faults.update([CameraFault.TILT, CameraFault.SKEW, CameraFault.TILT] if "camera" in met else [])
-    return record.told(answer, NEEDED)
+    faults = [CameraFault.TILT, CameraFault.SKEW, CameraFault.TILT] if "camera" in met else []
+    return _Place(estimator, lonlat(*at)).told(Met(Counter(met), Counter(faults), best), answer, NEEDED)
 
 
 @pytest.mark.parametrize(
@@ -85,5 +83,5 @@ def test_off_the_map_nothing_else_counts(estimator):
 
 
 def test_where_nothing_was_searched_it_is_said():
-    story = TruthRecord((-71.0, 42.0)).told(REFUSED, NEEDED)
+    story = tell_truth((-71.0, 42.0), Events(kept=True), REFUSED, NEEDED)
     assert (story.lost_at, story.said) == ("map", "the true place: nothing was searched")
