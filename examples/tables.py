@@ -59,7 +59,7 @@ def trust_table() -> Iterator[str]:
     yield "|---|---|---|"
     for rate, above in zip(ERROR_RATES, [*ERROR_RATES[1:], None], strict=True):
         band = f"{rate.score:g} and more" if above is None else f"{rate.score:g} to {above.score:g}"
-        at_most = f"{rate.wrong} (at most {rate.at_most:.0%})".replace("%", " %") if rate.reported else "-"
+        at_most = f"{rate.wrong} (at most {100 * rate.at_most:.2g} %)" if rate.reported else "-"
         yield f"| {band} | {rate.reported:,} | {at_most} |"
 
 
