@@ -109,7 +109,7 @@ def nearest_of(xy: FloatArray, points: FloatArray, among: IntArray, away: float)
 def roads_beside(
     matrix: FloatArray, scene: Scene, index: ReferenceIndex, beside_m: float, give_or_take_m: float
 ) -> tuple[BoolArray, BoolArray]:
-    """Tell which road points (S,) have a road of the map that runs their way so far to the right, and to the left."""
+    """Return which road points (S,) have a road of the map beside them that runs their way, to the right and left."""
     points, along, _ = points_on_map(matrix, scene)
     roads = index.road_buckets
 

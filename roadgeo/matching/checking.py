@@ -117,7 +117,7 @@ def check_place(start: FloatArray, scene: Scene, index: ReferenceIndex, options:
 
 @dataclass(frozen=True)
 class _Place:
-    """A place, what it explains (log10), and its refinement, where that was possible."""
+    """A place, its evidence (log10), and its refinement, where that was possible."""
 
     matrix: FloatArray
     worth: float

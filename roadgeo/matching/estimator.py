@@ -41,16 +41,16 @@ from roadgeo.matching.verification import VerifyOptions, agreement
 
 __all__ = ["Ledger", "MatchOptions", "TripleEstimator"]
 
-#: A place is looked at through a lens once, and again where so much more of the mask's roads agrees.
+#: A place is fitted through a lens once, and again where this much more of the mask's roads agrees.
 _BETTER = 0.05
-#: A place that so many intersections of the query propose by roads is settled: each looked at the whole map.
+#: A place that this many intersections of the query propose by roads is settled: each searched the whole map.
 _OFTEN_ENOUGH = 2
-#: A place that explains less, in powers of ten, or, laid roughly and less roughly, less than these parts of what the
-#: best one does, is looked at no more.
+#: A place is dropped if its likelihood is lower than the best one's by this (log10), or, laid roughly and less roughly,
+#: below these parts of the best one's.
 _LEAST_LIKELY, _NO_RIVAL, _BEHIND = 0.7, 0.4, 0.7
 #: One that explains as much as the likeliest other place, but for a part, is looked at through a lens.
 _NEARLY = 0.8
-#: As of `RefineOptions`, for what grew by roads: false roads abound there.
+#: As of `RefineOptions`, for places that grew by roads: false roads abound there.
 _LEAST_SHARE_BY_ROADS = 0.2
 #: How far a proposal, made of three intersections, may turn the image's up from where it points.
 _ROUGHLY_DEG = 25.0
@@ -71,11 +71,11 @@ class MatchOptions:
     roads : bool
         Whether roads propose where no triple leads to a place, rather than more sweeps.
     everywhere : ExhaustiveOptions
-        Where heading and scale are told, of laying the roads everywhere on the map instead.
+        Where heading and scale are given, of laying the roads everywhere on the map instead.
     lens : bool
         Whether a lens is looked for behind promising places, and behind others that were dropped.
     max_places : int
-        The sweeps end too when so many places were screened on a map of 15,000 intersections, and on a larger one more
+        The sweeps end too when this many places were screened on a map of 15,000 intersections; on a larger one more
         by the root of the ratio. Where streets are alike, proposals abound, and late ones are seldom right: of 31 masks
         that took more than half a second and were located, all but two had been found among the first 7,000 places.
     within : (west, south, east, north) or None
@@ -161,7 +161,7 @@ class TripleEstimator:
             yield self._rounds_of_lenses()
 
     def _rounds_everywhere(self) -> Iterator[list[Hypothesis]]:
-        """Yield the places that agree best of all, where heading and scale are told."""
+        """Yield the places that agree best of all, where heading and scale are given."""
         scene, index, options, nobody = self.scene, self.index, self.options, np.empty(0, np.int64)
         for matrix in propose_everywhere(scene, index, options.camera, options.everywhere, self.near):
             self._is_everywhere = True
@@ -173,13 +173,13 @@ class TripleEstimator:
 
     @property
     def work(self) -> float:
-        """Seconds that a usual machine takes for what was done (see `search.Estimator`)."""
+        """Seconds that a usual machine takes for the work done (see `search.Estimator`)."""
         points = len(self.scene.dense_points)
         counts = (len(self._tried), self.n_candidates, self.n_screened, self.n_hypotheses, self.n_verified, points)
         return Work(*counts).seconds
 
     def leads(self, model: Hypothesis) -> list[Lead]:
-        """Return what led to a hypothesis (see `search.Estimator`).
+        """Return the anchors that led to a hypothesis (see `search.Estimator`).
 
         On a coarse map nothing that is worth a try on others: it holds all the ground that they show, and coarse maps
         are searched for the same intersections side by side.
@@ -187,7 +187,7 @@ class TripleEstimator:
         return model.leads if self.index.coarseness == 1.0 else []
 
     def follow(self, leads: Sequence[Lead]) -> Iterator[list[Hypothesis]]:
-        """Yield what grew from anchors that led to a place on another part (see `search.Estimator`)."""
+        """Yield places that grew from anchors that led to a place on another part (see `search.Estimator`)."""
         for stage, anchor in leads:
             if not self.options.roads or stage < self._stage_of_roads:
                 yield self.sweeps.pending(self, stage, anchor)
@@ -200,7 +200,7 @@ class TripleEstimator:
         return len({anchor for _, anchor in self._tried})
 
     def _count(self, n_places: int) -> None:
-        """Note that so many more places were tried."""
+        """Count further places as tried."""
         self.n_screened += n_places
         self.ledger.n_tried += round(self.ledger.beside * n_places)
 
@@ -219,7 +219,7 @@ class TripleEstimator:
         return self._road_search
 
     def _rounds_of_roads(self, only: Sequence[int] | None = None) -> Iterator[list[Hypothesis]]:
-        """Yield what grew by roads and is not known yet; a place found again counts as found once more."""
+        """Yield places that grew by roads and are not known yet; a place found again counts as found once more."""
         roads, known, stage = self._search_by_roads(), self._grown_by_roads, self._stage_of_roads
         tried = roads.n_tried
         for anchor, n_proposed, grown in roads.rounds(only):
@@ -253,7 +253,7 @@ class TripleEstimator:
         return hypothesis.fault is None
 
     def _of_roads(self, grown: Grown) -> Hypothesis:
-        """Make a hypothesis of what grew by roads, with the intersections that match."""
+        """Make a hypothesis of a place that grew by roads, with the intersections that match."""
         scene, matrix = self.scene, grown.matrix / grown.matrix[2, 2]
         seeds = np.array([grown.anchor])
         gsd = sampling(matrix, scene.size)
@@ -265,7 +265,7 @@ class TripleEstimator:
         return known.log10_likelihood >= _LEAST_LIKELY and self.same(known, hypothesis)
 
     def known_places(self) -> list[Hypothesis]:
-        """Return what was verified and fits ."""
+        """Return the verified places that fit."""
         return self._whole
 
     def enough(self) -> bool:
@@ -286,7 +286,7 @@ class TripleEstimator:
         return kept
 
     def allow(self, proposals: Proposals) -> BoolArray:
-        """Tell which proposals put the frame's middle where it may be, and its up where it may point."""
+        """Return which proposals put the frame's middle where it may be, and its up where it may point."""
         j00, j01, j10, j11 = proposals.affine.T
         allowed = np.ones(len(j00), bool)
         if self.near is not None:
@@ -316,7 +316,7 @@ class TripleEstimator:
                 yield h
 
     def score(self, model: Hypothesis) -> float:
-        """Refine a hypothesis and return its log10 odds: what it explains, more than the best place nearby does."""
+        """Refine a hypothesis and return its log10 odds: its lead over the best place nearby."""
         started = time.perf_counter()
         self.n_verified += 1
         if model.lens is not None:
@@ -366,7 +366,7 @@ class TripleEstimator:
         model.log10_odds = model.log10_likelihood - most - math.log10(max(model.n_tried, 1))
 
     def _most_elsewhere(self, model: Hypothesis) -> float:
-        """Return what the likeliest other place that was met explains, as log10."""
+        """Return the log10 likelihood of the best other place that was met."""
         likely = sorted(self.verified, key=lambda one: -one.log10_likelihood)
         return next((one.log10_likelihood for one in likely if not self.same(one, model)), 0.0)
 
@@ -460,7 +460,7 @@ class TripleEstimator:
         return judge(matrix, self.scene.size, self.options.camera, rough)
 
     def may_be(self, matrix: FloatArray) -> bool:
-        """Whether a homography is plausible for the camera, and puts the frame where the user said that it lies."""
+        """Whether a homography is plausible for the camera, and agrees with the user's hints on the place."""
         return self.judge(matrix) is None and not self._is_far(matrix)
 
     def _is_far(self, matrix: FloatArray) -> bool:
@@ -475,8 +475,8 @@ class TripleEstimator:
     def settled(self, model: Hypothesis) -> bool:
         """Whether a hypothesis fits the whole frame and was found often enough for a twin to have been found beside it.
 
-        Each anchor that leads to a place would as soon lead to its twin: what several led to, and to nothing else that
-        fits, has none.
+        Each anchor that leads to a place would as soon lead to its twin: if several lead to it, and to no other that
+        fits, it has none.
         """
         if model.found is None or model.refined is None:
             return False

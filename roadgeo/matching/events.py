@@ -1,4 +1,4 @@
-"""What a search did, as one list of events, for whoever explains it afterwards; by default nothing is kept."""
+"""The course of a search as one list of events, for later explanation; by default nothing is kept."""
 
 from __future__ import annotations
 
@@ -24,9 +24,9 @@ class Scored(NamedTuple):
 
 @dataclass
 class Events:
-    """What happened in the search of one part of a map, in order. Keeping it changes nothing.
+    """The events in the search of one part of a map, in order. Keeping them changes nothing.
 
-    An event is its kind and what belongs to it:
+    An event is its kind and its values:
 
     - "screened": one anchor's `Proposals`, which the user's hints allow (M,), and which put roads on roads (K,);
     - "voted": an intersection, and how many places it and the roads around it proposed that were to grow;
@@ -38,7 +38,7 @@ class Events:
     ----------
     kept : bool
     estimator, result
-        What searched, and what it came to; None where nothing is kept, or nothing was searched.
+        The estimator, and its result; None where nothing is kept, or nothing was searched.
     """
 
     kept: bool = False
@@ -52,6 +52,6 @@ class Events:
             self.items.append((kind, *what))
 
     def of(self, kind: str) -> list[Any]:
-        """Return what belongs to the events of a kind: alone, or as a tuple of several."""
+        """Return the values of the events of a kind: alone, or as a tuple of several."""
         found = [what for name, *what in self.items if name == kind]
         return [what[0] if len(what) == 1 else tuple(what) for what in found]

@@ -279,7 +279,7 @@ def _log_ratios(anyhow: int, blur: float) -> FloatArray:
     return np.asarray(np.log((1.0 - _SHARES)[None, :, None] * ratio[:, None, :] + _SHARES[None, :, None]))
 
 
-#: Weighted sums of random signs exceed their standard deviation times z at most so many times as often as a normal
+#: Factor by which weighted sums of random signs may exceed their standard deviation times z more often than a normal
 #: variable does (Bentkus and Dzindzalieta, Bernoulli 21, 2015).
 _OFTENER_THAN_NORMAL = 0.25 / (0.5 * math.erfc(1.0))
 
@@ -290,7 +290,7 @@ def log10_lead(difference: FloatArray) -> float:
     Were they alike, each piece of the frame would speak for either with the same probability: the signed ranks of the
     differences (Wilcoxon, 1945) add up to more than z times the root of the sum of their squares with a probability of
     at most exp(-z^2 / 2) (Hoeffding), and of at most 3.18 times that of a normal variable; the smaller one counts.
-    Ranks, for a few pieces may tell much where one place lies beside a road, and most tell a little.
+    Ranks, for a few pieces may differ much where one place lies beside a road, while most differ little.
     """
     told = difference[difference != 0.0]
     if not len(told):

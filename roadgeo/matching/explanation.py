@@ -1,4 +1,4 @@
-"""Why a mask was or was not located: how far the search got, the best rejected places, and what was missing.
+"""Why a mask was or was not located: how far the search got, the best rejected places, and the missing evidence.
 
 `Explanation.to_dict` gives schema `roadgeo.explanation/1`:
 
@@ -13,7 +13,7 @@ searches      one for each reference, in the order in which they were searched:
               reference ended the search, or "" where there was nothing to search for), `needed` (the least log10 odds
               and margin)
 
-              `funnel`, what went into and came out of each stage: `anchors` (intersections tried), `tuples` of the
+              `funnel`, input and output of each stage: `anchors` (intersections tried), `tuples` of the
               mask looked up, `candidates` (tuples of the map like them), `proposals` (places on which several agree),
               `on_roads` (those that put the roads around the anchor on roads), `grown` (followed outwards), `survived`
               (not given up on the way), `verified` (different ones, refined and compared with the map), `measured`
@@ -25,7 +25,7 @@ searches      one for each reference, in the order in which they were searched:
 
               `missing`: sentences
 
-              `truth`: what became of the true place, where it was given; see `truth.TruthStory`
+              `truth`: the fate of the true place, where it was given; see `truth.TruthStory`
 
               `places`: the best ones, best first; see `RejectedPlace`
 ============  ==========================================================================================================
@@ -79,7 +79,7 @@ _NEGOTIABLE = (CameraFault.SAMPLING, CameraFault.SKEW, CameraFault.TILT, CameraF
 
 @dataclass(frozen=True)
 class Funnel:
-    """What came out of each stage, in order; see the module's text."""
+    """The output of each stage, in order; see the module's text."""
 
     intersections: int = 0
     anchors: int = 0
@@ -95,7 +95,7 @@ class Funnel:
 
 @dataclass(frozen=True)
 class RejectedPlace:
-    """A place that was verified, and why it is not the answer; the answer itself is the first, `why` says so.
+    """A place that was verified, and why it is not the answer; the answer itself is the first, with that as its `why`.
 
     Attributes
     ----------
@@ -106,7 +106,7 @@ class RejectedPlace:
     agreement : Agreement or None
         None where the fit failed before anything could be compared.
     log10_likelihood, nearby : float
-        What it explains, and what the best place nearby does (see `evidence`).
+        Its likelihood, and that of the best place nearby (see `evidence`).
     agrees : (S,) bool
         Which of the scene's road points lie on roads of the map that run their way.
     fault : CameraFault or None
@@ -183,7 +183,7 @@ class Story:
 
 @dataclass(frozen=True)
 class Explanation:
-    """A location and how it came about: what was seen in the mask, and a story for each reference."""
+    """A location and how it came about: the roads seen in the mask, and a story for each reference."""
 
     location: Location
     scene: Scene
@@ -191,7 +191,7 @@ class Explanation:
     stories: tuple[Story, ...]
 
     def __repr__(self) -> str:
-        """Say the answer in one line."""
+        """Describe the answer in one line."""
         return f"<Explanation of {self.location!r}, on {len(self.stories)} references>"
 
     @property
@@ -232,7 +232,7 @@ class Explanation:
 def tell(
     query: Query, found: Found, location: Location, needed: Needed, truth: tuple[float, float] | None = None
 ) -> Story:
-    """Tell how the search on one reference went; `location` is what it came to on that reference alone.
+    """Describe the search on one reference; `location` is its answer on that reference alone.
 
     `truth` is longitude and latitude of the true place, where that is known.
     """
@@ -275,7 +275,7 @@ def _with_truth(missing: tuple[str, ...], told: TruthStory | None) -> tuple[str,
 
 
 def _look_elsewhere(events: Events, search: TripleEstimator) -> None:
-    """Grow some proposals that point elsewhere than a camera may: to tell that they would fit."""
+    """Grow some proposals that point elsewhere than a camera may, to report that they would fit."""
     for proposals, allowed, _ in events.of("screened"):
         barred = proposals.only(np.flatnonzero(~allowed)[:_MAX_ELSEWHERE])
         for hypothesis in search.grow(barred, np.arange(len(barred.reference)))[:_MAX_RETRIED]:
@@ -301,7 +301,7 @@ def _without_limits(events: Events, search: TripleEstimator) -> list[Scored]:
 
 
 def _rank(entry: Scored, needed: Needed) -> tuple[bool, float]:
-    """Sort by odds; what the camera refused comes last, unless nothing else kept it from being the answer."""
+    """Sort by odds; places that the camera refused come last, unless nothing else kept them from being the answer."""
     return entry.fault is not None and entry.log10_odds < needed.log10_odds, -entry.log10_odds
 
 
@@ -325,7 +325,7 @@ def _describe(
     location: Location,
     needed: Needed,
 ) -> RejectedPlace:
-    """Tell all that was found out about a place that was verified."""
+    """Describe a place that was verified."""
     model, scene, index = entry.model, search.scene_of(entry.model), search.index
     verify = search.options.verify
     camera = pose(model.matrix, scene.size)
@@ -360,7 +360,7 @@ def _describe(
 def _why(
     place: RejectedPlace, entry: Scored, result: SearchResult[Hypothesis], location: Location, needed: Needed
 ) -> str:
-    """Say why a place is not the answer."""
+    """Return why a place is not the answer."""
     if entry.fault is not None:
         return f"the camera: {_objection(place, entry.fault)}"
     if not math.isfinite(entry.log10_odds):
@@ -380,7 +380,7 @@ def _number(value: float) -> str:
 
 
 def _objection(place: RejectedPlace, fault: CameraFault) -> str:
-    """Say what the camera has against a place, and what its odds were otherwise."""
+    """Return the camera's objection to a place, and its odds otherwise."""
     values = {
         CameraFault.SAMPLING: f" ({place.gsd_m:.2f} m per pixel)",
         CameraFault.TILT: f" ({place.tilt_deg:.0f} degrees)",
@@ -392,7 +392,7 @@ def _objection(place: RejectedPlace, fault: CameraFault) -> str:
 
 
 def _weakest(place: RejectedPlace) -> str:
-    """Say what a place explains, and the best one nearby."""
+    """Compare a place with the best one nearby."""
     if place.agreement is None:
         return "nothing could be compared"
     return f"its roads explain 10^{_number(place.log10_likelihood)}, those of a place nearby 10^{_number(place.nearby)}"
@@ -429,7 +429,7 @@ def _missing(
     places: Sequence[RejectedPlace],
     needed: Needed,
 ) -> list[str]:
-    """Say what was missing, the surest first."""
+    """List the missing evidence, the surest first."""
     told, scene = [], search.scene
     if result.stopped in ("time", "work"):
         told.append(f"{result.stopped}: the search was stopped by its limit, places may be left untried")

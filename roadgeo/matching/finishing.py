@@ -1,7 +1,7 @@
 """The last fit of a place that may be reported: to the whole frame, and how sure its corners are.
 
-While places are looked for, cells of the frame where few roads are met wait: what is met there may be chance. At the
-right place it is none.
+During the search, cells of the frame where few roads are met wait: these roads may be met by chance. At the
+right place they are not.
 """
 
 from __future__ import annotations
@@ -23,19 +23,19 @@ from roadgeo.matching.verification import agreement
 
 __all__ = ["measure_corners", "with_honest_corners"]
 
-#: Where so much of the mask's roads agrees, no cell of the frame was left out; a fit to all cells loses hardly any.
+#: Where this much of the mask's roads agrees, no cell of the frame was left out; a fit to all cells loses hardly any.
 _WHOLE, _LEAST_LOST = 0.9, 0.03
 #: Standard deviation of the place of a lens's middle in each direction, pixels: conventions differ by half of one.
 _CENTER_SIGMA_PX = 0.5
 
-#: How errors add up, fitted to the corners of 900 masks, good and bad, and of 34 of a real city. What residuals say
-#: too much, where no lens was found; over how much more ground errors keep their sign far away, by how far a pixel
-#: reaches; and what no number of points improves: a part of the residuals' rms, and the mask's accuracy, pixels,
+#: How errors add up, fitted to the corners of 900 masks, good and bad, and of 34 of a real city. The factor by which
+#: residuals overstate them without a lens; over how much more ground errors keep their sign far away, by the reach of a
+#: pixel; and the floor that no number of points lowers: a part of the residuals' rms, and the mask's accuracy, pixels,
 #: beside that of the map (`RefineOptions.sigma_floor_m`).
 _OVERSTATED, _FAR, _FLOOR, _FLOOR_PX = 0.67, 0.5, 0.15, 0.1
-#: Residuals end at three standard deviations: roads further off do not pull. Those beyond so many are near the end,
-#: many of them where a mask is bent. There the pull falls to nothing, and the fit is held less firmly: each takes so
-#: much off the slope of the pull. By their number and the pull there it would be 0.6, fitted it is more.
+#: Residuals end at three standard deviations: roads further off do not pull. Those beyond 2.5 are near the end,
+#: many of them where a mask is bent. There the pull falls to nothing, and the fit is held less firmly: each reduces
+#: the slope of the pull by this amount. By their number and the pull there it would be 0.6, fitted it is more.
 _NEAR_END, _PULL_AT_END = 2.5, 1.1
 
 
@@ -63,9 +63,9 @@ def _fit_whole_frame(estimator: TripleEstimator, best: Hypothesis, refined: Refi
 
 
 def _take(estimator: TripleEstimator, best: Hypothesis, refined: Refined, least: float = 0.0) -> None:
-    """Take a new fit for a place, if at least so much of the mask's roads agrees.
+    """Take a new fit for a place, if at least this share of the mask's roads agrees.
 
-    What was found before stands: the odds rest on it.
+    The earlier result stands: the odds rest on it.
     """
     scene, seeds = estimator.scene, best.seeds[-MINIMAL:]
     gsd = sampling(refined.matrix, scene.size)
@@ -108,7 +108,7 @@ def with_honest_corners(refined: Refined, scene: Scene, index: ReferenceIndex, o
     as_long = (1.0 if k1 else _OVERSTATED) * np.maximum(1.0, reach / np.median(reach)) ** _FAR
     # sandwich estimate of an M-estimator's covariance (Huber 1981, 6.3)
     covariance = (rms / equations.unit) ** 2 * inverse @ (scaled.T * as_long**2 @ rows) @ inverse
-    if k1:  # the middle of the lens, which was not estimated, by what it would do to what was
+    if k1:  # the middle of the lens was not estimated: add its effect on the parameters
         unknown = _CENTER_SIGMA_PX * np.einsum("ni,nij->nj", seen.normals, by_center)
         moved = inverse @ (scaled.T @ unknown)
         covariance = covariance + moved @ moved.T

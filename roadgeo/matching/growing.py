@@ -21,7 +21,7 @@ __all__ = ["MAX_GROWN", "MAX_SCALE_RATIO", "MAX_SCREENED", "MAX_VERIFIED", "grow
 MAX_SCALE_RATIO = 2.0
 #: Bounds of one anchor's work: proposals screened, grown, and grown ones scored.
 MAX_SCREENED, MAX_GROWN, MAX_VERIFIED = 600, 150, 3
-#: Of so many road points near the anchor, this share must lie within these radii of roads of the map: lengths have a
+#: Of this number of road points near the anchor, this share must lie within these radii of roads: lengths have a
 #: part in metres, the map's, and one in pixels, the mask's.
 _SCREEN_POINTS, _SCREEN_SHARE, _SCREEN_RADIUS = 40, 0.6, (8.0, 4.0)
 #: Standard deviation of an intersection's place, and the greatest search radius, likewise.

@@ -36,7 +36,7 @@ class Ledger:
 
 
 class Work(NamedTuple):
-    """Counts of what a search did: they tell its work, the same on every machine, busy or idle.
+    """Counts of a search, which measure its work, the same on every machine, busy or idle.
 
     Attributes
     ----------
@@ -61,6 +61,6 @@ class Work(NamedTuple):
 
     @property
     def seconds(self) -> float:
-        """What it takes one core of a usual machine."""
+        """The time on one core of a usual machine."""
         tried = _ROUND * self.rounds + _TUPLE * self.tuples + _PLACE * self.places + _GROWN * self.grown
         return tried + (_VERIFIED + _VERIFIED_POINT * self.points) * self.verified

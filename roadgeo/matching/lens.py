@@ -198,7 +198,7 @@ class LensEquations:
     def observe(self, k1: float, inverse: FloatArray, slack: float = 1.0) -> Observed:
         """Find the roads near points whose places are sure enough.
 
-        How far off a place may be follows from the `inverse` (9, 9) of the normal matrix so far, times `slack`.
+        The search radius follows from the `inverse` (9, 9) of the normal matrix until now, times `slack`.
         """
         n, (x, y) = len(self.points), self.origin
         rows, residuals, sigma, own = np.empty((n, 9)), np.empty(n), np.empty(n), np.empty(n)
@@ -215,9 +215,9 @@ class LensEquations:
         return Observed(rows[met], residuals[met], sigma[met], own[met], met)
 
 
-#: A fit that puts so much more of the roads on roads is worth another one.
+#: A fit that puts this much more of the roads on roads is worth another one.
 _MORE = 0.01
-#: And where a fit has grown over more of the frame, so much more.
+#: And where a fit has grown over more of the frame, this much more.
 _BETTER = 0.02
 #: Standard deviation of a k1 that is held.
 _HELD = 1e-6
@@ -225,25 +225,25 @@ _HELD = 1e-6
 
 #: Where less than this share of the mask's roads agrees, a lens is tried, else only where residuals hint at one.
 ENOUGH = 0.8
-#: Prior standard deviation of k1, which counts when it is so many of its standard deviations from 0, and moves the
-#: frame's corners by at least so many pixels.
+#: Prior standard deviation of k1, which counts when it is this many of its standard deviations from 0, and moves the
+#: frame's corners by at least this many pixels.
 K1_SIGMA, _SIGNIFICANCE, _LEAST_PX = 0.1, 5.0, 5.0
-#: The frame is divided into so many cells a side. The fit begins with those around the one where most road points lie
+#: Cells of the frame a side. The fit begins with those around the one where most road points lie
 #: on roads, as far as they do in this part of its share.
 _CORE = (10, 0.75)
-#: Road points that a fit needs; while a fit grows, places may be so many times further off than it says.
+#: Road points that a fit needs; factor on its uncertainty while it grows.
 FEWEST, _SLACK = 12, 2.0
 #: Values of k1 to begin with in turn, where beginning with 0 does not explain enough; first with few road points, and
 #: with all of them where a lens shows.
 _STARTS = (-0.15, -0.08, 0.08)
 #: Iterations and new starts, at most.
 _N_ITERATIONS, _N_RESTARTS = 30, 3
-#: A fit that after so many iterations has met less than this share of the road points is given up: wrong places end at
+#: A fit that after this many iterations has met less than this share of the road points is dropped: wrong places end at
 #: 0.2 to 0.4, right ones at 0.75 to 0.9 (training masks).
 _SOON, _HOPELESS = 8, 0.4
-#: So many places that were dropped are grown anew, those first where most road points in one part of the frame lie on
-#: roads beyond the share of chance, first with so many road points and these values of k1 to begin with; and verified
-#: where so many of them end on roads.
+#: Number of dropped places that are grown anew, those first where most road points in one part of the frame lie on
+#: roads beyond the share of chance, first with this number of road points and these values of k1 to begin with; and
+#: verified where this share of them ends on roads.
 MAX_PLACES, _CHANCE_SHARE, _QUICK_POINTS, _QUICK_STARTS, _LEAST_SHARE = 12, 0.3, 300, (0.0, -0.07, -0.15), 0.6
 
 
@@ -281,7 +281,7 @@ def fit_lens(
     """Adjust a homography and k1 to the roads of the map by Gauss-Newton with Cauchy weights; None where that fails.
 
     It begins with the part of the frame that the homography lays on roads, and grows from there: points further out
-    take part when those nearer say where they lie, and how sure each is follows from the fit.
+    take part when nearer ones fix their places, and the certainty of each follows from the fit.
 
     Parameters
     ----------
@@ -304,7 +304,7 @@ def fit_lens(
     inverse = _inverse(rows.reshape(-1, 9), np.full(2 * len(rows), 0.5 * equations.weight), prior)
     rms, n_met, slack = math.inf, 0, _SLACK
     for iteration in range(_N_ITERATIONS):
-        # Points further out take part as soon as the fit so far says where they lie.
+        # Points further out take part as soon as the fit until now fixes their places.
         seen = equations.observe(k1, inverse, slack)
         rows, cauchy, n_seen = seen.rows, seen.cauchy, len(seen.rows)
         if n_seen < FEWEST or (iteration > _SOON and n_seen < _HOPELESS * len(scene.points)):
@@ -400,7 +400,7 @@ def regrow(matrix: FloatArray, scene: Scene, index: ReferenceIndex, refinement: 
 
 
 def _thinned(scene: Scene, n_points: int) -> Scene:
-    """Return a scene with about so many of its road points."""
+    """Return a scene with about this number of its road points."""
     return scene.of_points(slice(None, None, max(1, len(scene.points) // n_points)))
 
 
@@ -445,7 +445,7 @@ def _hints_at_lens(problem: LensEquations) -> bool:
 
 
 def straighten_scene(scene: Scene, k1: float) -> Scene:
-    """Return a scene as a pinhole would have seen it: what a lens with k1 shows, put where it belongs."""
+    """Return a scene as a pinhole would have seen it: its points moved back by a lens with k1."""
     lens = Lens.of(k1, scene.size, y_up=True)
     found = scene.intersections
     vectors = np.stack([np.cos(found.rays), np.sin(found.rays)], axis=-1).astype(float)

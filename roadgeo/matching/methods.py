@@ -62,7 +62,7 @@ class Fit:
     log10_odds : float
         By which the place leads any other; NaN where the method knows none.
     log10_likelihood : float
-        What it explains (see `evidence`).
+        Its likelihood (see `evidence`).
     corner_sigma_m : (4,) float64 or None
     corner_covariance_m2 : (8, 8) float64 or None
         As in `Refined`.
@@ -87,7 +87,7 @@ class Fit:
 
 @dataclass(frozen=True)
 class Found:
-    """What the search of one reference came to.
+    """The result of the search of one reference.
 
     Attributes
     ----------
@@ -98,7 +98,7 @@ class Found:
     stopped : str
         As in `SearchResult`; "" where nothing was searched.
     said : str
-        What the method itself says of the result.
+        The method's own sentence on the result.
     n_searched : int
         Intersections of the part of the reference that was searched.
     n_tried : int
@@ -106,7 +106,7 @@ class Found:
     n_anchors : int
         Intersections of the query that were looked for.
     events : Events
-        What was noted of the search.
+        The events of the search.
     """
 
     index: ReferenceIndex
@@ -131,7 +131,7 @@ def search_references(
 ) -> list[Found]:
     """Search references, or parts of them, for a query together, by the method and within the limits of the options.
 
-    Those that cannot hold the place are not opened, unless that is none of them; nothing is told of them. Coarse
+    Those that cannot hold the place are not opened, unless that is none of them; they have no result. Coarse
     maps come first: where a place stands out on them, the others are not opened. Where it is to be `explained`, events
     are kept.
     """
@@ -157,7 +157,7 @@ def _split(parts: Sequence[Part], options: LocateOptions) -> tuple[list[Part], l
 
 
 def _at_first_look(coarse: Sequence[Part], options: LocateOptions) -> LocateOptions:
-    """Return the options for a look at coarse maps alone: a quick one, unless pixels are so large as they show."""
+    """Return the options for a look at coarse maps alone: a quick one, unless pixels are as large as they show."""
     least_m = options.match.camera.gsd_m[0]
     if all(least_m >= one.coarseness * COARSE_PIXEL_M for one in coarse):
         return options
@@ -205,7 +205,7 @@ def _search(
 
 
 def _open(parts: Sequence[Part], options: LocateOptions, frame_m: float) -> list[ReferenceIndex]:
-    """Open the parts that may hold a place; the first where none does, to say so."""
+    """Open the parts that may hold a place; the first where none does, to report that."""
     able = [part for part in parts if may_show(part, options, frame_m)]
     return [part.open() for part in able or parts[:1]]
 
@@ -263,7 +263,7 @@ class _Attempt:
         return cls(index, len(part), estimator, Search(estimator), events)
 
     def found(self, scale: float, rivals: Rivals) -> Found:
-        """Tell what came of it; work is told for a map `scale` times smaller."""
+        """Return the result; work is that on a map `scale` times smaller."""
         estimator = self.estimator
         if self.search is None or estimator is None:
             return Found(self.index, n_searched=self.n_searched, events=self.events)
@@ -382,7 +382,7 @@ def _search_pairs_in_turn(query: Query, indexes: Sequence[ReferenceIndex], optio
 
 
 def _search_pairs(query: Query, index: ReferenceIndex, options: PairOptions, share: PairOptions) -> Found:
-    """Run the paper's method, within a share of its limits: what it finds has no odds, for it knows none."""
+    """Run the paper's method, within a share of its limits: its places have no odds, for it knows none."""
     scene = query.scene
     table = _pair_index(index, options)
     match = match_pairs(scene.intersections, table, scene.corners, share)

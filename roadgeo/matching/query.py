@@ -19,7 +19,7 @@ __all__ = ["Query", "read_query", "trace_query"]
 
 
 #: Lengths in road widths: of a mask's roads those are one road, or one intersection, that lie so near to each other;
-#: shorter ends are none; tangents are fitted to branches of such a length, which begin so far from the intersection.
+#: shorter ends are none; tangents are fitted to branches of this length, which begin this far from the intersection.
 _MERGE, _FUSE, _STUB, _TANGENT, _SKIP, _BRANCH = 1.4, 1.0, 1.5, 4.5, 0.6, 0.8
 
 

@@ -41,7 +41,7 @@ SIGMA_M, SIGMA_PX = 1.2, 0.9
 #: Weight of a matched intersection against an independent road point: its centre is less certain. Matches take part
 #: when at least this share of their neighbours are matched.
 _INTERSECTION_WEIGHT, _LEAST_SUPPORT = 0.3, 0.3
-#: The frame is divided into so many cells a side.
+#: Cells of the frame a side.
 _N_CELLS = 8
 #: Errors of the map and of the mask keep their sign over about this length of road, metres: points closer than that are
 #: no independent observations.
@@ -131,7 +131,7 @@ def max_radius_m(gsd: float) -> float:
 
 
 def point_weight(scene: Scene, unit: float, step: int = 1) -> float:
-    """Return what each `step`-th road point counts against an independent one."""
+    """Return the weight of each `step`-th road point against an independent one."""
     spacing_m = scene.road_length_px * unit / scene.half_size / max(len(scene.points), 1)
     return min(1.0, spacing_m * step / _CORRELATION_M)
 
@@ -154,7 +154,7 @@ def corner_covariance(
 
 
 def scatter_m(rms: float, sigma_m: float) -> float:
-    """Return what road points of this rms and standard deviation count as in the covariance of a fit, metres."""
+    """Return the scatter in the covariance of a fit of road points of this rms and standard deviation, metres."""
     return rms * max(1.0, rms / (_USUAL_RMS * sigma_m))
 
 

@@ -1,12 +1,12 @@
 """The best other place: always looked for, and compared with the best place by one likelihood.
 
 A place is worth its lead over the best other one. Where streets form a lattice other places explain a query almost as
-well: what both explain tells nothing, and what only one explains speaks for that one. Others are those that the search
+well: roads that both explain do not count, and those of only one speak for it. Others are those that the search
 met, and those that shifts and turns of the place lead to, on the map around it. Where one of them explains more, it is
 the best place, and is compared in its turn.
 
 Two numbers make the lead: how many pieces of the query speak for the place rather than for the best other one (see
-`Evidence.lead`), and how far what the place explains stands out of what all others do (`log10_gap`).
+`Evidence.lead`), and how far its likelihood stands out of that of all others (`log10_gap`).
 """
 
 from __future__ import annotations
@@ -40,9 +40,9 @@ _NO_SEEDS: IntArray = np.array([], np.int64)
 
 #: Streets that cross at right angles fit themselves when they are turned by one.
 _TURNS_DEG = (0.0, 90.0, 180.0, 270.0)
-#: So many others tell what a gap is worth, at most and at least; their spacing counts as so much at least (log10).
+#: Most and fewest others by which a gap is judged; least spacing of them (log10).
 _TAIL, _LEAST_TAIL, _LEAST_SPACING = 20, 5, 0.3
-#: So often another place may turn out to be the better one.
+#: Most times that another place may turn out to be the better one.
 _MOST_TURNS = 4
 
 
@@ -53,17 +53,17 @@ class RivalOptions:
     Attributes
     ----------
     certain, repeating : float
-        A place that leads all places nearby by so many powers of ten is not compared further, where the best of them
-        explains less than such a part of what the place does: streets do not repeat there.
+        A place that leads all places nearby by this many powers of ten is not compared further, if the best of them
+        explains less than this part of it: streets do not repeat there.
     doubt, usually_contradicted : float
         Powers of ten that a place loses where all of the roads are contradicted (see `Evidence.contradicted`), in
         proportion, beyond the usual share. At right places of masks of which up to half is gone, false, stale or bent
         it is 0.03; at the best wrong ones of masks turned over 0.15 and more, where a city was laid out like its own
         mirror image.
     n_known : int
-        So many of the places that the search met are compared, the likeliest.
+        Number of the places met by the search that are compared, the likeliest.
     n_places, n_laid : int
-        So many places that most road points fit are laid roughly, and so many of them, the likeliest, finely.
+        Number of places that most road points fit that are laid roughly, and of the likeliest of them, laid finely.
     n_points : int
         Road points that each is laid by roughly.
     apart : float
@@ -89,7 +89,7 @@ class RivalOptions:
 class Standing(NamedTuple):
     """A place, the best other one (3, 3) if there is any, and by how many powers of ten the place leads it.
 
-    `log10_likelihood`, `rival_likelihood`: what each of them explains, by the same yardstick.
+    `log10_likelihood`, `rival_likelihood`: the likelihood of each, by the same yardstick.
     """
 
     model: Hypothesis

@@ -1,4 +1,4 @@
-"""The search by roads: intersections spread over the frame vote for places, and what they propose grows by roads."""
+"""The search by roads: intersections spread over the frame vote for places, and their proposals grow by roads."""
 
 from __future__ import annotations
 
@@ -30,7 +30,7 @@ _LEAST_SHARE = 0.3
 _TOLERANCE_M, _TOLERANCE_PX = 7.0, 2.0
 #: Prior standard deviation of the two perspective parameters.
 _PERSPECTIVE_SIGMA = 0.4
-#: After each of the first stages so many of an intersection's proposals go on, those that lie closest to roads, and
+#: After each of the first stages this number of an intersection's proposals go on, those that lie closest to roads, and
 #: those that had most votes. Of 396 intersections of which one of 40 proposals led to the place of a broken mask 395 do
 #: so still, at half the time; in lattices 255 of 266, at a quarter.
 _GO_ON, _SURE = (16, 6, 3), 2
@@ -97,26 +97,26 @@ class RoadGrower:
         return self._outwards
 
 
-#: The smallest pixels that are looked for on a map of coarseness 1; of a coarse map so many times as large.
+#: The smallest pixels that are tried on a map of coarseness 1; a coarse map multiplies them by its coarseness.
 COARSE_PIXEL_M = 0.35
 
 #: How far a proposal, made of two branches, may turn the image's up from where it points.
 _ROUGHLY_DEG = 25.0
-#: So many intersections of the query vote, spread over the frame from its middle outwards.
+#: Number of intersections of the query that vote, spread over the frame from its middle outwards.
 _MAX_ANCHORS = 30
-#: Fewer vote, but at least so many, once so many places and turns were tried on a map of 15,000 intersections, and on a
-#: larger one more by the root of the ratio; of a map in parts, on all of them together. In a lattice every crossing can
+#: Fewer vote, but at least the second number, once the first number of places was tried on 15,000 intersections, on a
+#: larger map more by the root of the ratio; of a map in parts, on all of them together. In a lattice every crossing can
 #: be turned four ways.
 _MAX_TRIED, _LEAST_ANCHORS = 400_000, 8
-#: So many of an anchor's proposals grow, and so many of what grew are compared with the map, where all anchors vote; a
-#: mask of few intersections has few chances: up to so many times as many then.
+#: Number of an anchor's proposals that grow, and of those that are then compared with the map, where all vote; a
+#: mask of few intersections has few chances: up to the third number of times as many then.
 _MAX_GROWN, _MAX_KEPT, _MOST_MORE = 20, 2, 5
 #: Around an anchor the ground sampling may differ by this factor from that at the middle of the frame.
 _SCALE_SLACK = 1.2
-#: Where roads are drawn at least so many pixels wide, they are no thin lines, and only scales are tried at which they
-#: are so wide on the ground, metres.
+#: Roads drawn at least this many pixels wide are no thin lines, and only scales are tried at which their
+#: width on the ground lies in this range, metres.
 _TELLING_WIDTH_PX, _ROAD_WIDTH_M = 6.0, (2.0, 75.0)
-#: Pixels that are greater hardly show what is around an intersection: a place given by near is not looked for further
+#: Greater pixels hardly show the surroundings of an intersection: a place given by near is not searched further
 #: away than frames of such pixels reach.
 _FAR_M = 5.0
 
@@ -138,7 +138,7 @@ def scales(camera: CameraOptions, road_width_px: float, coarseness: float = 1.0)
 
 
 def followed_more(n_voters: int) -> int:
-    """Return how many times more proposals of each of so many intersections are followed: in all, as many as usual."""
+    """Return how many times more proposals of each intersection are followed: in all, as many as usual."""
     return max(1, min(_MOST_MORE, _MAX_ANCHORS // max(n_voters, 1)))
 
 
@@ -151,7 +151,7 @@ class Turnout:
     n_map : int
         Intersections of all parts.
     n_tried : int
-        Places and turns tried on them so far.
+        Places and turns tried on them until now.
     last : int or None
         How many vote in the end, once that is known.
     """
@@ -171,7 +171,7 @@ class Turnout:
 
 
 class RoadRound(NamedTuple):
-    """What came of one query intersection: how many proposals were to grow, and those that did.
+    """The results of one query intersection: how many proposals were to grow, and those that did.
 
     The anchor is -1 where only a part of a large map was looked at.
     """
@@ -187,7 +187,7 @@ class RoadSearch:
     Attributes
     ----------
     n_tried : int
-        Places and turns tried so far.
+        Places and turns tried until now.
     """
 
     def __init__(
@@ -216,7 +216,7 @@ class RoadSearch:
         self.grower = RoadGrower(scene, index, camera, more)
 
     def rounds(self, only: Sequence[int] | None = None) -> Iterator[RoadRound]:
-        """Yield what grew of one anchor's proposals after another; between parts of a large map nothing.
+        """Yield the places that grew of one anchor's proposals after another; between parts of a large map nothing.
 
         `only` names the anchors to try. None is tried twice.
         """

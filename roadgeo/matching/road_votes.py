@@ -1,7 +1,7 @@
 """Proposals from roads: one query intersection and the roads around it, laid on every intersection of the map.
 
 Triples of intersections need three neighbours that are all intact. Where roads are missing, false or few, one intact
-intersection and the roads about it still say where they lie: turned so that two branches agree, at each of many scales,
+intersection and the roads about it still fix their place: turned so that two branches agree, at each of many scales,
 most road points fall on roads of the map in the right place, and few elsewhere. How many would by chance depends on the
 scale and on how dense the map's roads are at the place: without that, scales at which the query shrinks to a few blocks
 would crowd out the rest.
@@ -68,7 +68,7 @@ class RasterOptions:
         return np.floor(np.log(np.maximum(metres, 1e-9) / self.inner_m) / math.log(RING_STEP)).astype(np.int64)
 
     def on(self, coarseness: float) -> RasterOptions:
-        """Return them for a coarse map: all lengths are so many times as long."""
+        """Return them for a coarse map: all lengths multiplied by its coarseness."""
         lengths = {name: coarseness * getattr(self, name) for name in ("cell_m", "reach_m", "radius_m")}
         return replace(self, **lengths)
 
@@ -85,7 +85,7 @@ class RoadRaster:
     density : (R, C) float32
         Chance of a point of any direction to meet a road in a tile or those beside it.
     rings : (N, WORDS) uint64
-        Around each intersection of the reference, as far as `has_rings` (N,) says (see `draw_rings_of`).
+        Around each intersection of the reference, as far as `has_rings` (N,) is set (see `draw_rings_of`).
     radii : (RINGS,) float64
         Of the middles of the rings, cells.
     """
@@ -123,7 +123,7 @@ class RoadRaster:
         self.has_rings[missing] = True
 
 
-#: Rasters in use anywhere; and those that are kept, the one used last at the end, up to so many bytes together.
+#: Rasters in use anywhere; and those that are kept, the one used last at the end, up to a number of bytes together.
 _in_use: WeakValueDictionary[tuple[ReferenceIndex, RasterOptions], RoadRaster] = WeakValueDictionary()
 _kept: OrderedDict[tuple[ReferenceIndex, RasterOptions], RoadRaster] = OrderedDict()
 _MOST_BYTES = 500_000_000
@@ -172,13 +172,13 @@ _SCALE_STEPS = np.array([0.96, 1.0, 1.04])
 
 #: How far branches that agree may be apart.
 _TOLERANCE = round(math.radians(20.0) * _PER_RADIAN)
-#: Nearer than so many metres, roads that run straight away from the intersection, with at least this cosine, are left
+#: Nearer than this, metres, roads that run straight away from the intersection, with at least this cosine, are left
 #: out: they are its own branches, which agree by construction. It makes the right place stand out more.
 _OWN_M, _OWN_COS = 150.0, 0.95
 #: A scale at which fewer points are in reach is not tried.
 _LEAST_POINTS = 15
-#: The best so many are judged anew, with at most so many road points, as far away as so many metres. On a coarse map
-#: all lengths are so many times as long.
+#: Number of the best that are judged anew, of road points for that, and their greatest distance, metres. A coarse map
+#: multiplies all lengths.
 _KEPT, _WIDE_POINTS, WIDE_RADIUS_M = 100, 160, 260.0
 #: Share of those that meet roads in the right place, and by chance, in units of the density of roads there: they crowd
 #: around intersections.
@@ -187,7 +187,7 @@ _TRIAL = Trial(0.55, 1.5)
 
 @dataclass(frozen=True)
 class Votes:
-    """What one query intersection may be. Dimension: M proposals, the best first.
+    """Proposals of one query intersection. Dimension: M proposals, the best first.
 
     Attributes
     ----------
@@ -210,7 +210,7 @@ class Votes:
 class _Around(NamedTuple):
     """Road points as seen from one intersection, nearest first: (P, 2) offsets and (P,) distances in pixels.
 
-    `angles` (P,) are directions in units of pi / DIRECTIONS; `radial` (P,) tells which run straight away from it.
+    `angles` (P,) are directions in units of pi / DIRECTIONS; `radial` (P,) marks those that run straight away from it.
     """
 
     offsets: FloatArray

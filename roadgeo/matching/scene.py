@@ -21,7 +21,7 @@ __all__ = ["MIN_COS", "Scene", "prepare_scene", "query_neighbours", "sample_road
 #: Of more intersections, those nearest to the middle of the frame are kept: they place a mask as surely, and time and
 #: memory are bounded.
 _MAX_INTERSECTIONS, _N_NEIGHBOURS = 5000, 12
-#: Points along the roads, at most and no closer than so many pixels: some for a quick look, more for one intersection's
+#: Points along the roads, at most and no closer than this, pixels: some for a quick look, more for one intersection's
 #: surroundings.
 _POINTS, _DENSE_POINTS = (600, 6.0), (6000, 3.0)
 #: Cells of the reduced frame along its longer side.
@@ -164,7 +164,7 @@ def prepare_scene(
     length = float(graph.edge_lengths().sum())
     points, directions = sample_roads(graph, max(_POINTS[1], length / _POINTS[0]))
     dense = sample_roads(graph, max(_DENSE_POINTS[1], length / _DENSE_POINTS[0]))
-    # how far each cell of the frame is from a road; drawn from the graph, for what is thinner than a cell counts too
+    # distance of each cell of the frame to a road; drawn from the graph, so that roads thinner than a cell count too
     scale = max(1.0, max(size) / _FIELD_CELLS)
     cells = (int(np.ceil(height / scale)), int(np.ceil(width / scale)))
     canvas = np.full(cells, 255, np.uint8)

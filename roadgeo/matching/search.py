@@ -1,8 +1,8 @@
 """The hypothesise-and-test loop. It knows no roads and no geometry: a toy model over integers tests it.
 
-One loop drives one problem or many parts of one: breadth first, a little of every part at each stage, and what ends it
-is one answer that stands out from all others, whichever parts they come from. How long it goes on where none does is
-told by work, which is counted, so that a busy machine finds what an idle one finds; the clock is the last resort.
+One loop drives one problem or many parts of one: breadth first, a little of every part at each stage. It ends with
+one answer that stands out from all others, whichever parts they come from. How long it goes on without one is
+measured by work, which is counted, so that a busy machine finds what an idle one finds; the clock is the last resort.
 """
 
 from __future__ import annotations
@@ -18,7 +18,7 @@ Model = TypeVar("Model")
 
 
 class Estimator(Protocol[Model]):
-    """What the loop asks of a problem, or of one part of it."""
+    """The interface of a problem, or of one part of it, to the loop."""
 
     def stages(self) -> Iterator[Iterator[Iterable[Model]]]:
         """Yield stage after stage, the cheapest first; each yields hypotheses a round at a time, the best hopes first.
@@ -29,7 +29,7 @@ class Estimator(Protocol[Model]):
 
     @property
     def work(self) -> float:
-        """What was done so far, in seconds of a usual machine; told by counts, not by a clock."""
+        """The work done until now, in seconds of a usual machine; by counts, not by a clock."""
 
     def score(self, model: Model) -> float:
         """Return the log10 odds of a model."""
@@ -58,9 +58,9 @@ class SearchOptions:
     margin : float
         ... and leads the best different model by as much.
     more_rounds : int
-        A model that reaches both but is not settled is kept for so many more rounds, in case a better version comes.
+        A model that reaches both but is not settled is kept for this many more rounds, in case a better version comes.
     work_limit_s : float
-        No further round is begun, and no further model scored, after so much work: seconds of a usual machine, counted,
+        No further round is begun, and no further model scored, after this work: seconds of a usual machine, counted,
         not measured, so that answers do not depend on the load. On a map of 15,000 intersections, and on a larger one
         more by the root of the ratio.
     time_limit_s : float
@@ -75,7 +75,7 @@ class SearchOptions:
 
 
 class _Budget:
-    """What is left of a search's work and time."""
+    """The rest of a search's work and time."""
 
     def __init__(self, options: SearchOptions) -> None:
         self.left_s = options.work_limit_s
@@ -83,7 +83,7 @@ class _Budget:
 
     @property
     def spent(self) -> str:
-        """Say what is used up: "work", "time", or "" for neither."""
+        """Return which limit is reached: "work", "time", or "" for neither."""
         if self.left_s <= 0.0:
             return "work"
         return "time" if time.perf_counter() > self.deadline else ""
@@ -91,7 +91,7 @@ class _Budget:
 
 @dataclass(frozen=True)
 class SearchResult(Generic[Model]):
-    """Best model, the best that means something else, their scores (-inf where there is none), and what ended it.
+    """Best model, the best that means something else, their scores (-inf where there is none), and why it ended.
 
     `stopped` is "accepted"; "exhausted"; "work" or "time", the limits; or "elsewhere", where another part's answer
     ended the search.
@@ -192,7 +192,7 @@ class Search(Generic[Model]):
         self.leaders = [ranked[0], *[one for one in [next(others, None)] if one is not None]]
 
     def result(self) -> SearchResult[Model]:
-        """Return what came of it."""
+        """Return the result."""
         found: list[tuple[float, Model | None]] = [*self.leaders, (float("-inf"), None), (float("-inf"), None)]
         (score, best), (second, runner_up) = found[:2]
         return SearchResult(best, score, runner_up, second, self.n_rounds, self.n_scored, self.stopped)
@@ -214,8 +214,8 @@ def search_together(
     """Search many parts until one answer stands out from those of all, they are exhausted, or a limit is reached.
 
     A round of each part in turn, one stage after another. A part whose answer stands out goes on alone until that is
-    settled. What led there is tried on all other parts then: if they hold a twin, it is found, and the search goes on.
-    `same` tells whether models of two parts, which may overlap, mean one answer. At the end of a stage an answer that
+    settled. Its anchors are then tried on all other parts: if they hold a twin, it is found, and the search goes on.
+    `same` returns whether models of two parts, which may overlap, mean one answer. At the end of a stage an answer that
     does not stand out by its score may be proved otherwise: `proves` returns the part that holds it, if any does.
     """
     options = options or SearchOptions()
@@ -255,7 +255,7 @@ class _Together(Generic[Model]):
         return "exhausted"
 
     def _go_on(self, one: Search[Model]) -> str:
-        """Do a round of a part, and more while its answer stands out; say what ends the search, "" if nothing does."""
+        """Do a round of a part, and more while its answer stands out; return why the search ends, "" if it does not."""
         goes_on = one.advance(self.budget)
         while goes_on:
             standing = self._stands_out(one)

@@ -1,7 +1,7 @@
 """Sweeps over all parts of one search: an intersection of the query is looked for on all of them at a time.
 
-What it proposes is bounded as on one map: of all parts together the best proposals are screened, of those that lie on
-roads as many are grown, and of what grew the best are verified. So a search of many parts takes little longer than that
+Its proposals are bounded as on one map: of all parts together the best proposals are screened, of those that lie on
+roads as many are grown, and of these the best are verified. So a search of many parts takes little longer than that
 of one, and the place has to be better than chance on each of them only once.
 """
 
@@ -64,7 +64,7 @@ class SharedSweeps:
         self._turnouts: dict[float, Turnout] = {}
 
     def rounds(self, member: TripleEstimator, stage: Stage) -> Iterator[list[Hypothesis]]:
-        """Yield what grew on a part from the proposals of one anchor after another, until enough were screened."""
+        """Yield places that grew on a part from the proposals of one anchor after another, until enough were seen."""
         rounds = self._rounds.setdefault(stage.number, self._work(stage))
         done = self._done.setdefault(stage.number, [])
         n = 0
@@ -78,7 +78,7 @@ class SharedSweeps:
             n += 1
 
     def pending(self, member: TripleEstimator, stage: int, anchor: int) -> list[Hypothesis]:
-        """Return what grew on a part from an anchor and was not taken yet."""
+        """Return places that grew on a part from an anchor and were not taken yet."""
         found = (one.grown.pop(id(member), []) for one in self._done.get(stage, []) if one.anchor == anchor)
         return next(found, [])
 
@@ -105,7 +105,7 @@ class SharedSweeps:
             yield _Round(proposals[0].anchor, self._grow(proposals, stage))
 
     def _grow(self, proposals: Sequence[Proposals], stage: Stage) -> dict[int, list[Hypothesis]]:
-        """Follow one anchor's proposals on all parts; return the best of what grew by the part's identity."""
+        """Follow one anchor's proposals on all parts; return the best places that grew, by the part's identity."""
         members = self.members
         # The best placed are screened ...
         allowed = [member.allow(one) for member, one in zip(members, proposals, strict=True)]
@@ -123,7 +123,7 @@ class SharedSweeps:
             for member, one, rows in zip(members, proposals, kept, strict=True)
             if len(rows)
         ]
-        # ... and the best of what grew are verified.
+        # ... and the best of these are verified.
         best: list[tuple[TripleEstimator, Hypothesis]] = []
         for member, hypothesis in heapq.merge(*grown, key=lambda pair: -pair[1].support):
             if not self._is_met(member, hypothesis, best):
@@ -145,12 +145,12 @@ class SharedSweeps:
 
 
 def _owned(member: TripleEstimator, grown: Iterator[Hypothesis]) -> Iterator[tuple[TripleEstimator, Hypothesis]]:
-    """Yield what grew, with the part it grew on."""
+    """Yield the places that grew, each with its part."""
     return ((member, hypothesis) for hypothesis in grown)
 
 
 class _Round(NamedTuple):
-    """What grew from an anchor's proposals, by the identity of the part it grew on; less what was taken."""
+    """The places that grew from an anchor's proposals, by the identity of their part; without those taken."""
 
     anchor: int
     grown: dict[int, list[Hypothesis]]

@@ -54,7 +54,7 @@ def smaller(n_reference: int) -> float:
 
 #: Thinner triangles are left out (see `kernels.triple_codes.orient`); the map's may be thinner still.
 _MIN_SHAPE = 0.12
-#: Of an intersection with three tangents or more, so many pairs of tangents are looked up.
+#: Number of pairs of tangents that are looked up of an intersection with three tangents or more.
 _CODES_PER_VERTEX = 1
 #: Hits of one proposal may differ by this part of their maps' size.
 _AFFINE_TOLERANCE = 0.3
@@ -69,7 +69,7 @@ class TripleOptions:
     Attributes
     ----------
     n_neighbours : int
-        Triples are formed with pairs of so many nearest neighbours of the anchor.
+        Triples are formed with pairs of this number of nearest neighbours of the anchor.
     angle_tolerance_deg : float
         How far tangents may turn in the equilateral frame.
     spread : bool
@@ -201,7 +201,7 @@ class Sweep:
         min_ratio: float,
         ahead: Ahead = ALONE,
     ) -> Iterator[list[Proposals]]:
-        """Yield what one query intersection after another may be on each index, the most promising first.
+        """Yield proposals for one query intersection after another on each index, the most promising first.
 
         `scale` = (least, greatest) root of the determinant of a proposed map, metres per pixel; `min_ratio` is the
         least ratio of its singular values. `ahead` looks for the next intersections meanwhile.
@@ -256,7 +256,7 @@ def _count_alike(seen: TripleQuery, anchors: IntArray, starts: Int32Array) -> In
 
 
 def _shares(seen: TripleQuery, anchor: int, indexes: Sequence[ReferenceIndex]) -> FloatArray:
-    """Return how to share out an anchor's work: half of it by size, half by what there is to compare."""
+    """Return how to share out an anchor's work: half of it by size, half by the entries to compare."""
     if len(indexes) == 1:
         return np.ones(1)
     one = np.array([anchor])

@@ -31,7 +31,7 @@ _STAGES = ("proposals", "on_roads", "survived", "camera", "verified")
 
 @dataclass(frozen=True)
 class TruthStory:
-    """What became of the true place on one reference.
+    """The fate of the true place on one reference.
 
     Attributes
     ----------
@@ -78,7 +78,7 @@ def true_place(mask: str, options: LocateOptions) -> tuple[float, float] | None:
 
 
 def tell_truth(lonlat: tuple[float, float], events: Events, location: Location, needed: Needed) -> TruthStory:
-    """Tell which stage lost the truth; `location` is the answer on this reference."""
+    """Return which stage lost the truth; `location` is the answer on this reference."""
     if events.estimator is None:
         return TruthStory(*lonlat, "map", "the true place: nothing was searched", dict.fromkeys(_STAGES, 0), None)
     there = _Place(events.estimator, lonlat)
@@ -110,7 +110,7 @@ class _Place:
         return met
 
     def _is_near(self, xy: FloatArray, scales: FloatArray) -> BoolArray:
-        """Tell which places (N, 2) of the frame's middle lie near the truth, at ground samplings (N,)."""
+        """Return which places (N, 2) of the frame's middle lie near the truth, at ground samplings (N,)."""
         limit = np.maximum(_AT_LEAST_M, _ROUGHLY * scales * self.estimator.scene.half_size)
         return np.asarray(np.hypot(*(xy - self.xy).T) <= limit)
 
@@ -121,7 +121,7 @@ class _Place:
         return bool(self._is_near(Homography(matrix).everywhere(scene.center)[None], scale)[0])
 
     def told(self, met: Met, location: Location, needed: Needed) -> TruthStory:
-        """Tell which stage lost it."""
+        """Return which stage lost it."""
         lost_at, said = self._lost(met, location, needed)
         counts = {stage: met.counts[stage] for stage in _STAGES}
         return TruthStory(*self.lonlat, lost_at, said, counts, met.best if math.isfinite(met.best) else None)
@@ -147,7 +147,7 @@ class _Place:
         return "proposals", "the true place was never proposed: no intersection and its neighbours are intact enough"
 
     def _weighed(self, best: float, location: Location, needed: Needed) -> tuple[str | None, str]:
-        """Tell what became of the truth after it was compared with the map."""
+        """Describe the fate of the truth after it was compared with the map."""
         score, located = f"the true place reached log10 odds {best:.1f}", False
         if location.located and location.center is not None:
             center = np.array([[location.center.lon, location.center.lat]])
