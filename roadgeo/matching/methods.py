@@ -272,7 +272,7 @@ class _Attempt:
             self.events.result = result
         return Found(
             self.index,
-            () if standing is None else _fits(estimator, standing, rivals),
+            () if standing is None else _fits(estimator, standing),
             result.stopped,
             n_searched=self.n_searched,
             n_tried=estimator.n_screened,
@@ -290,12 +290,10 @@ class _Attempt:
         )
 
 
-def _fits(estimator: TripleEstimator, standing: Standing, rivals: Rivals) -> tuple[Fit, ...]:
-    """Return the likeliest place, judged as it is reported, and the best other one."""
+def _fits(estimator: TripleEstimator, standing: Standing) -> tuple[Fit, ...]:
+    """Return the likeliest place, and the best other one."""
     model, lead = standing.model, standing.log10_lead
-    before = rivals.doubt(estimator, model)
     measure_corners(estimator, model, lead)
-    lead -= max(rivals.doubt(estimator, model) - before, 0.0)
     fits = [_fit(estimator, model, lead)]
     if standing.rival is not None:
         fits.append(_fit_of_rival(estimator, standing.rival, min(-lead, 0.0), standing.rival_likelihood))
