@@ -3,15 +3,14 @@
 Edges are those of `kernels.simplification`.
 """
 
-import math
 
 import numpy as np
 from numpy.typing import NDArray
 
-from roadgeo.kernels.arrays import Bools1, Floats1, Floats2, Int32s1, Int32s2, Ints1
+from roadgeo.kernels.arrays import Floats1, Floats2, Int32s1, Int32s2, Ints1
 from roadgeo.kernels.compilation import kernel
 
-__all__ = ["find_mates", "fuse_twins", "points_beside", "roads_alongside", "sample_edges", "tie_runs"]
+__all__ = ["find_mates", "fuse_twins", "roads_alongside", "sample_edges", "tie_runs"]
 
 
 @kernel()
@@ -352,29 +351,3 @@ def roads_alongside(
                 nearest = abs(across)
                 out[i, 0] = -across * north
                 out[i, 1] = across * east
-
-
-@kernel(writes=("out",))
-def points_beside(places: Floats2, along: Floats2, points: Floats2, across: float, ahead: float, out: Bools1) -> None:
-    """Tell at which places on roads one of some points lies, give or take.
-
-    Parameters
-    ----------
-    places, along : (N, 2) float64
-        Places and unit vectors along the road. Of a place that is not a number, none lies near.
-    points : (S, 2) float64
-    across, ahead : float
-        How far off a point may be across the road, and along it.
-    out : (N,) bool
-        Filled.
-    """
-    for i in range(len(places)):
-        out[i] = False
-        if math.isnan(places[i, 0]):
-            continue
-        for j in range(len(points)):
-            dx = points[j, 0] - places[i, 0]
-            dy = points[j, 1] - places[i, 1]
-            if abs(dy * along[i, 0] - dx * along[i, 1]) < across and abs(dx * along[i, 0] + dy * along[i, 1]) < ahead:
-                out[i] = True
-                break
