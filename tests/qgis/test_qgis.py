@@ -517,7 +517,7 @@ def test_results_are_loaded_with_their_styles(qgis: Qgis, porto: Path) -> None:
         "OUTPUT_FOLDER": str(qgis.folder / "loaded"),
         "REPORT": True,
     }
-    roads = {"ROADS": str(ROADS), "KINDS": "all", "OUTPUT": str(qgis.folder / "again.gpkg")}
+    roads = {"ROADS": str(ROADS), "KINDS": "all", "OUTPUT": "again.gpkg"}  # in the folder that it runs in
     (built, remembered, done), _, _ = qgis.ask(
         ("run", {"algorithm": "roadgeo:buildreference", "parameters": roads}),
         ("remembered", {}),
