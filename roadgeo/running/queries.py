@@ -54,8 +54,8 @@ _MOST_FINER, _LEAST_FINER = 2.0, 1.25
 #: Name in results of a picture that is no file.
 _ARRAY = "array"
 #: In a second way a model is shown a photograph twice as fine, a step of the scales that are tried blind, and the mean
-#: of the log odds counts. Of labelled tiles of Boston and Miami F1 within 4 m is .914 and .867 at 1 m per pixel, .950 and
-#: .869 at 0.5 m, .949 and .892 of both (turned by half instead: .923 and .878). Where its own pixels are not as fine it
+#: of the log odds counts. Of labelled tiles of Boston and Miami F1 within 4 m is .914 and .867 at 1 m per pixel, .950
+#: and .869 at 0.5 m, .949 and .892 of both (turned by half instead: .923 and .878). Where its pixels are not as fine it
 #: is turned by half.
 _FINER, _WAYS, _ENLARGED = 2.0, 2, 1.1
 _KNOWN_SPAN = 1.7  # a range of pixel sizes narrower than this is one scale
