@@ -3,7 +3,6 @@
 Edges are those of `kernels.simplification`.
 """
 
-
 import numpy as np
 from numpy.typing import NDArray
 
