@@ -1,7 +1,8 @@
-"""The last fit of a place that may be reported: to the whole frame, and how sure its corners are.
+"""The last fit of a place that may be reported: to the whole frame, beside no street, and how sure its corners are.
 
 During the search, cells of the frame where few roads are met wait: these roads may be met by chance. At the
-right place they are not.
+right place they are not. And a part of the frame may have settled on the next street: then the fit is too sure of
+itself, for nothing in it shows that.
 """
 
 from __future__ import annotations
@@ -9,10 +10,13 @@ from __future__ import annotations
 import math
 from dataclasses import replace
 
+import cv2
 import numpy as np
 
+from roadgeo._arrays import FloatArray
 from roadgeo.geometry.camera import sampling
-from roadgeo.matching.carriageways import refine_between
+from roadgeo.geometry.homography import Homography
+from roadgeo.matching.carriageways import refine_between, weight_on_roads
 from roadgeo.matching.estimator import TripleEstimator
 from roadgeo.matching.hypothesis import MINIMAL, Hypothesis
 from roadgeo.matching.index import ReferenceIndex
@@ -21,10 +25,16 @@ from roadgeo.matching.refinement import Refined, RefineOptions, corner_covarianc
 from roadgeo.matching.scene import Scene
 from roadgeo.matching.verification import agreement
 
-__all__ = ["measure_corners", "with_honest_corners"]
+__all__ = ["measure_corners", "refine_beside", "with_honest_corners"]
 
 #: Where this much of the mask's roads agrees, no cell of the frame was left out; a fit to all cells loses hardly any.
 _WHOLE, _LEAST_LOST = 0.9, 0.03
+#: How far corners are moved, one by one, to see whether the fit comes back: metres in the middle of the frame, and not
+#: less than 8 pixels; by how many road points; and how often at most.
+_BESIDE_M, _BESIDE_PX, _N_POINTS, _MOST_ROUNDS = (12.0, 24.0), 8.0, 200, 5
+#: A fit has come back that moves no corner by more than this part of the least step. Another one is better where this
+#: share of the road points lies on roads in addition.
+_BACK, _BETTER = 0.25, 0.006
 #: Standard deviation of the place of a lens's middle in each direction, pixels: conventions differ by half of one.
 _CENTER_SIGMA_PX = 0.5
 
@@ -48,9 +58,15 @@ def measure_corners(estimator: TripleEstimator, best: Hypothesis | None, score: 
         return
     scene = estimator.scene
     if best.refined.lens_k1 == 0.0:
-        if best.found.forward < _WHOLE and score > 0.0:
+        doubtful = best.found.forward < _WHOLE and score > 0.0
+        if doubtful:
             _fit_whole_frame(estimator, best, best.refined, best.found.forward)
         scene = _lay_between_carriageways(estimator, best, best.refined)
+        for _ in range(_MOST_ROUNDS if doubtful else 0):
+            found = refine_beside(best.refined, scene, estimator.index, estimator.refinement(best))
+            if found is None or not estimator.may_be(found.matrix):
+                break
+            _take(estimator, best, found)
     best.refined = with_honest_corners(best.refined, scene, estimator.index, estimator.refine_options)
 
 
@@ -83,6 +99,47 @@ def _lay_between_carriageways(estimator: TripleEstimator, best: Hypothesis, refi
         return scene
     _take(estimator, best, found)
     return seen
+
+
+def refine_beside(refined: Refined, scene: Scene, index: ReferenceIndex, options: RefineOptions) -> Refined | None:
+    """Find a homography beside a refined one that lays more of the roads on roads; None where there is none.
+
+    Each corner of the frame in turn is put elsewhere, the others stay; where the fit does not come back, it may have
+    found something better.
+    """
+    options, nothing = replace(options, least_share=0.0), np.full(len(scene.intersections), -1)
+    places, gsd = Homography(refined.matrix).everywhere(scene.corners), sampling(refined.matrix, scene.size)
+    steps_m = [max(step, _BESIDE_PX * gsd) for step in _BESIDE_M]
+
+    def stays_away(one: Refined) -> bool:
+        moved = np.hypot(*(Homography(one.matrix).everywhere(scene.corners) - places).T)
+        return bool(moved.max() > _BACK * steps_m[0])
+
+    starts = [start for step in steps_m for start in _beside(refined.matrix, scene, step / gsd)]
+    tried = [refine(start, scene, index, nothing, options, _N_POINTS, held=True) for start in starts]
+    weights = {weight_on_roads(one.matrix, scene, index): one for one in tried if one is not None and stays_away(one)}
+    found = refine(weights[max(weights)].matrix, scene, index, nothing, options, held=True) if weights else None
+    needed = weight_on_roads(refined.matrix, scene, index) + _BETTER * len(scene.points)
+    return found if found is not None and weight_on_roads(found.matrix, scene, index) > needed else None
+
+
+def _beside(matrix: FloatArray, scene: Scene, pixels: float) -> list[FloatArray]:
+    """Return homographies (3, 3) that put one corner of the frame elsewhere, and the others where `matrix` does.
+
+    By this many pixels in each corner, and not by less ground than in the middle of the frame: what a steep view shows
+    far away may be off by more.
+    """
+    corners, least_m = scene.corners.astype(np.float32), pixels * sampling(matrix, scene.size)
+    places, by_pixel = Homography(matrix).everywhere(scene.corners), Homography(matrix).jacobian(scene.corners)
+    middle = places.mean(axis=0)
+    back = np.array([[1.0, 0.0, middle[0]], [0.0, 1.0, middle[1]], [0.0, 0.0, 1.0]])
+    found = []
+    for k in range(4):
+        for away in pixels * np.array([(1.0, 0.0), (-1.0, 0.0), (0.0, 1.0), (0.0, -1.0)]) @ by_pixel[k].T:
+            there = places - middle
+            there[k] += away * max(1.0, least_m / float(np.hypot(*away)))
+            found.append(np.asarray(back @ cv2.getPerspectiveTransform(corners, there.astype(np.float32)), float))
+    return found
 
 
 def with_honest_corners(refined: Refined, scene: Scene, index: ReferenceIndex, options: RefineOptions) -> Refined:

@@ -1,14 +1,15 @@
-"""The last fit of a place that may be reported takes the whole frame."""
+"""The last fit of a place that may be reported takes the whole frame, and no part of it stays beside a street."""
 
+import cv2
 import numpy as np
 import pytest
 from worlds.scenes import Sight, mapped, sight_of
 
 from roadgeo.geometry.camera import sampling
 from roadgeo.matching.estimator import MatchOptions, TripleEstimator
-from roadgeo.matching.finishing import measure_corners
+from roadgeo.matching.finishing import measure_corners, refine_beside
 from roadgeo.matching.hypothesis import Hypothesis
-from roadgeo.matching.refinement import Refined
+from roadgeo.matching.refinement import Refined, RefineOptions
 from roadgeo.matching.verification import Agreement
 
 
@@ -27,3 +28,48 @@ def test_only_places_that_may_be_reported_are_fitted_to_the_whole_frame(town, sc
     gaps = np.hypot(*(mapped(best.refined.matrix, scene.corners) - mapped(truth, scene.corners)).T)
     assert (gaps.max() < 1.5) == mended
     assert best.found is found  # the odds rest on it
+
+
+def moved(truth, scene, corner, step):
+    """A homography that puts one corner elsewhere, metres, and the others where the truth does."""
+    places = mapped(truth, scene.corners)
+    middle = places.mean(axis=0)
+    places[corner] += step
+    back = np.array([[1.0, 0.0, middle[0]], [0.0, 1.0, middle[1]], [0.0, 0.0, 1.0]])
+    return back @ cv2.getPerspectiveTransform(scene.corners.astype(np.float32), (places - middle).astype(np.float32))
+
+
+def gaps(matrix, truth, scene):
+    return np.hypot(*(mapped(matrix, scene.corners) - mapped(truth, scene.corners)).T)
+
+
+@pytest.mark.parametrize("corner", range(4))
+def test_a_corner_beside_where_it_belongs_comes_back(town, corner):
+    truth, scene = sight_of(town[0], 5, tilt=15, sight=Sight(0.6))
+    beside = Refined(moved(truth, scene, corner, (14.0, -9.0)), np.ones(4), 1.0, np.eye(8))
+    found = refine_beside(beside, scene, town[1], RefineOptions())
+    assert gaps(beside.matrix, truth, scene).max() > 15.0
+    assert gaps(found.matrix, truth, scene).max() < 1.5
+
+
+@pytest.mark.parametrize(("seed", "missing", "share"), [(7, 0.5, 0.2), (9, 0.7, 0.3), (11, 0.5, 0.3), (13, 0.7, 0.2)])
+def test_the_far_corner_of_a_steep_view_comes_back_from_far_away(town, seed, missing, share):
+    """There a pixel reaches over much ground, and so does what the fit may have settled on."""
+    truth, scene = sight_of(town[0], seed, tilt=45, sight=Sight(1.0, missing, 0.5))
+    way = mapped(truth, scene.corners) - mapped(truth, scene.corners).mean(axis=0)
+    far = int(np.hypot(*way.T).argmax())
+    beside = Refined(moved(truth, scene, far, share * way[far]), np.ones(4), 1.0, np.eye(8))
+    found = refine_beside(beside, scene, town[1], RefineOptions())
+    assert gaps(beside.matrix, truth, scene).max() > 400.0
+    assert gaps(found.matrix, truth, scene).max() < 2.0
+
+
+def test_where_all_belongs_nothing_better_is_found(town):
+    truth, scene = sight_of(town[0], 5, tilt=15, sight=Sight(0.6))
+    assert refine_beside(Refined(truth, np.ones(4), 1.0, np.eye(8)), scene, town[1], RefineOptions()) is None
+
+
+def test_far_from_all_roads_nothing_is_found(town):
+    truth, scene = sight_of(town[0], 5)
+    nowhere = truth + np.array([[0, 0, 90_000.0], [0, 0, 0], [0, 0, 0]])
+    assert refine_beside(Refined(nowhere, np.ones(4), 1.0, np.eye(8)), scene, town[1], RefineOptions()) is None
