@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 
 from roadgeo.kernels.arrays import Bools1, Floats1, Floats2
 from roadgeo.kernels.compilation import kernel
-from roadgeo.kernels.homography_fit import cholesky, solve_cholesky
+from roadgeo.kernels.homography_fit import add_row, cholesky, point_row, solve_cholesky, spread
 from roadgeo.kernels.roads import nearest_road
 from roadgeo.kernels.structs import AdjustLimits, Held, Plane, PointPairs, RoadBuckets, RoadSamples
 
@@ -21,48 +21,7 @@ _HELD_STEPS = 6
 #: Points nearer to the horizon than this w make the adjustment fail.
 _LEAST_W = 0.02
 
-__all__ = ["add_row", "adjust", "carry", "own_sigma", "point_row"]
-
-
-@kernel(writes=("row",))
-def point_row(p: Floats1, u: float, v: float, axis_x: float, axis_y: float, row: Floats1) -> tuple[float, float, float]:
-    """Differentiate a predicted point's component along (axis_x, axis_y) by the parameters `p` (8,).
-
-    Parameters
-    ----------
-    u, v : float
-        Normalised query point.
-    row : (8,) float64
-        Filled with the derivative.
-
-    Returns
-    -------
-    x', y', w : float
-        The point, normalised, and its denominator.
-    """
-    w = 1.0 + p[6] * u + p[7] * v
-    x, y = (p[0] * u + p[1] * v + p[2]) / w, (p[3] * u + p[4] * v + p[5]) / w
-    row[0], row[1], row[2] = axis_x * u / w, axis_x * v / w, axis_x / w
-    row[3], row[4], row[5] = axis_y * u / w, axis_y * v / w, axis_y / w
-    along = axis_x * x + axis_y * y
-    row[6], row[7] = -along * u / w, -along * v / w
-    return x, y, w
-
-
-@kernel()
-def add_row(
-    normal: NDArray[np.float64],
-    right: NDArray[np.float64],
-    row: NDArray[np.float64],
-    weight: float,
-    residual: float,
-) -> None:
-    """Add the equation row . dp = residual to the lower triangle of the normal equations `normal` dp = `right`."""
-    for r in range(8):
-        scaled = weight * row[r]
-        for c in range(r + 1):
-            normal[r, c] += scaled * row[c]
-        right[r] += scaled * residual
+__all__ = ["adjust", "carry", "own_sigma"]
 
 
 @kernel(forceinline=True)
@@ -174,19 +133,6 @@ def _add_held(p: NDArray[np.float64], held: Held, weight: float, system: _System
 
 
 @kernel(forceinline=True)
-def _spread(row: NDArray[np.float64], factor: NDArray[np.float64], work: NDArray[np.float64]) -> float:
-    """Return the variance of what `row` is the derivative of, |L^-1 row|^2, L the factor of the step before."""
-    total = 0.0
-    for r in range(8):
-        value = row[r]
-        for c in range(r):
-            value -= factor[r, c] * work[c]
-        work[r] = value / factor[r, r]
-        total += work[r] * work[r]
-    return total
-
-
-@kernel(forceinline=True)
 def _search_roads(
     p: NDArray[np.float64],
     plane: Plane,
@@ -218,7 +164,7 @@ def _search_roads(
         point_row(p, u, v, -dy, dx, row)
         reach_m = plane.unit * area / (w * w * length)
         own[i] = own_sigma(reach_m, limits.sigma_m, limits.map_sigma_m, limits.mask_sigma)
-        sigma = limits.sigma_m * math.sqrt(own[i] ** 2 + _spread(row, factor, work))
+        sigma = limits.sigma_m * math.sqrt(own[i] ** 2 + spread(row, factor, work))
         if 3.0 * sigma > limits.max_radius * max(1.0, own[i]):
             continue
         searched[cells[i]] += 1.0

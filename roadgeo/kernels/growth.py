@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 
 from roadgeo.kernels.arrays import Bools1, Floats1, Floats2, Floats3, Ints1, Ints2
 from roadgeo.kernels.compilation import kernel
-from roadgeo.kernels.homography_fit import fit_homography, predict, prediction_variance
+from roadgeo.kernels.homography_fit import fit_homography, predict
 from roadgeo.kernels.point_matching import keep_nearest, nearest_alike
 from roadgeo.kernels.structs import GrowthLimits, GrowthQuery, PointBuckets
 
@@ -41,6 +41,7 @@ class _Growth(NamedTuple):
     p: Floats1  # (8,)
     normal: Floats2  # (8, 8)
     factor: Floats2  # (8, 8)
+    row: Floats1  # (8,)
     work: Floats1  # (8,)
 
 
@@ -72,6 +73,7 @@ def _begin(
         np.zeros(8),
         np.empty((8, 8)),
         np.empty((8, 8)),
+        np.empty(8),
         np.empty(8),
     )
 
@@ -114,14 +116,17 @@ def _fit(growth: _Growth, matched: NDArray[np.int64]) -> bool:
 
 @kernel(forceinline=True)
 def _predict_radius(
-    p: NDArray[np.float64], factor: NDArray[np.float64], work: NDArray[np.float64], u: float, v: float, sigma_m: float
+    p: NDArray[np.float64],
+    factor: NDArray[np.float64],
+    row: NDArray[np.float64],
+    work: NDArray[np.float64],
+    u: float,
+    v: float,
+    sigma_m: float,
 ) -> tuple[float, float, float, float]:
     """Return where a query point is predicted, its w, and its search radius in metres: -1 at the horizon."""
-    x, y, w = predict(p, u, v)
-    if w < _LEAST_W:
-        return x, y, w, -1.0
-    sigma = sigma_m * math.sqrt(0.5 * prediction_variance(factor, p, u, v, work))
-    return x, y, w, _SIGMAS * math.sqrt(sigma * sigma + sigma_m * sigma_m)
+    x, y, w, variance = predict(p, u, v, factor, row, work)
+    return x, y, w, -1.0 if w < _LEAST_W else _SIGMAS * sigma_m * math.sqrt(0.5 * variance + 1.0)
 
 
 @kernel(forceinline=True)
@@ -140,7 +145,7 @@ def _expand(
     matched: NDArray[np.int64],
 ) -> tuple[int, int, bool]:
     """Match ever more points, the nearest first, and refit; return matches, tests, and whether growth goes on."""
-    uv, image, p, factor, work = growth.query, growth.image, growth.p, growth.factor, growth.work
+    uv, image, p, factor, row, work = growth.query, growth.image, growth.p, growth.factor, growth.row, growth.work
     x0, y0, unit, branches = growth.x0, growth.y0, growth.unit, query.branches
     ref_xy, ref_branches, starts, grid, shape = points
     ratio = 0.0
@@ -154,7 +159,7 @@ def _expand(
             if done[i]:
                 continue
             # A point waits until it is predicted well enough.
-            x, y, w, radius = _predict_radius(p, factor, work, uv[i, 0], uv[i, 1], growth.sigma_m)
+            x, y, w, radius = _predict_radius(p, factor, row, work, uv[i, 0], uv[i, 1], growth.sigma_m)
             if w < _LEAST_W or radius > growth.radius_m:
                 continue
             j, _ = nearest_alike(
@@ -194,14 +199,14 @@ def _match_anew(
     distance: NDArray[np.float64],
 ) -> tuple[int, int, float]:
     """Match all points anew, one to one; return matches and tests besides the seeds, and the log-likelihood ratio."""
-    uv, image, p, factor, work = growth.query, growth.image, growth.p, growth.factor, growth.work
+    uv, image, p, factor, row, work = growth.query, growth.image, growth.p, growth.factor, growth.row, growth.work
     x0, y0, unit, branches = growth.x0, growth.y0, growth.unit, query.branches
     ref_xy, ref_branches, starts, grid, shape = points
     n_matched, n_tested, ratio = 0, 0, 0.0
     matched[:] = -1
     for index in range(query.order.shape[0]):
         i = query.order[index]
-        x, y, w, radius = _predict_radius(p, factor, work, uv[i, 0], uv[i, 1], growth.sigma_m)
+        x, y, w, radius = _predict_radius(p, factor, row, work, uv[i, 0], uv[i, 1], growth.sigma_m)
         if w < _LEAST_W:
             continue
         j, distance[i] = nearest_alike(

@@ -12,9 +12,18 @@ import math
 import numpy as np
 from numpy.typing import NDArray
 
+from roadgeo.kernels.arrays import Floats1
 from roadgeo.kernels.compilation import kernel
 
-__all__ = ["cholesky", "fit_homography", "predict", "prediction_variance", "solve_cholesky"]
+__all__ = [
+    "add_row",
+    "cholesky",
+    "fit_homography",
+    "point_row",
+    "predict",
+    "solve_cholesky",
+    "spread",
+]
 
 
 @kernel()
@@ -55,6 +64,47 @@ def solve_cholesky(factor: NDArray[np.float64], right: NDArray[np.float64]) -> N
         for k in range(i + 1, n):
             right[i] -= factor[k, i] * right[k]
         right[i] /= factor[i, i]
+
+
+@kernel(writes=("row",))
+def point_row(p: Floats1, u: float, v: float, axis_x: float, axis_y: float, row: Floats1) -> tuple[float, float, float]:
+    """Differentiate a predicted point's component along (axis_x, axis_y) by the parameters `p` (8,).
+
+    Parameters
+    ----------
+    u, v : float
+        Normalised query point.
+    row : (8,) float64
+        Filled with the derivative.
+
+    Returns
+    -------
+    x', y', w : float
+        The point, normalised, and its denominator.
+    """
+    w = 1.0 + p[6] * u + p[7] * v
+    x, y = (p[0] * u + p[1] * v + p[2]) / w, (p[3] * u + p[4] * v + p[5]) / w
+    row[0], row[1], row[2] = axis_x * u / w, axis_x * v / w, axis_x / w
+    row[3], row[4], row[5] = axis_y * u / w, axis_y * v / w, axis_y / w
+    along = axis_x * x + axis_y * y
+    row[6], row[7] = -along * u / w, -along * v / w
+    return x, y, w
+
+
+@kernel()
+def add_row(
+    normal: NDArray[np.float64],
+    right: NDArray[np.float64],
+    row: NDArray[np.float64],
+    weight: float,
+    residual: float,
+) -> None:
+    """Add the equation row . dp = residual to the lower triangle of the normal equations `normal` dp = `right`."""
+    for r in range(8):
+        scaled = weight * row[r]
+        for c in range(r + 1):
+            normal[r, c] += scaled * row[c]
+        right[r] += scaled * residual
 
 
 @kernel()
@@ -104,10 +154,7 @@ def fit_homography(
             row[3 * axis + 2] = 1.0 / w
             row[6] = -target * u / w
             row[7] = -target * v / w
-            for r in range(8):
-                for c in range(r + 1):
-                    normal[r, c] += row[r] * row[c]
-                right[r] += row[r] * target / w
+            add_row(normal, right, row, 1.0, target / w)
     if n < 3:
         return False
     # hold the perspective, and whatever the matches do not determine
@@ -123,41 +170,41 @@ def fit_homography(
     return True
 
 
-@kernel()
-def predict(p: NDArray[np.float64], u: float, v: float) -> tuple[float, float, float]:
-    """Return (x', y', w) of a normalised query point under the parameters `p` (8,)."""
-    w = 1.0 + p[6] * u + p[7] * v
-    return (p[0] * u + p[1] * v + p[2]) / w, (p[3] * u + p[4] * v + p[5]) / w, w
+@kernel(forceinline=True)
+def spread(row: NDArray[np.float64], factor: NDArray[np.float64], work: NDArray[np.float64]) -> float:
+    """Return the variance of what `row` is the derivative of, |L^-1 row|^2, L the factor of the step before."""
+    total = 0.0
+    for r in range(8):
+        value = row[r]
+        for c in range(r):
+            value -= factor[r, c] * work[c]
+        work[r] = value / factor[r, r]
+        total += work[r] * work[r]
+    return total
 
 
 @kernel()
-def prediction_variance(
-    factor: NDArray[np.float64], p: NDArray[np.float64], u: float, v: float, work: NDArray[np.float64]
-) -> float:
-    """Return the variance of a predicted point, summed over x and y, in units of the residuals' variance.
+def predict(
+    p: NDArray[np.float64],
+    u: float,
+    v: float,
+    factor: NDArray[np.float64],
+    row: NDArray[np.float64],
+    work: NDArray[np.float64],
+) -> tuple[float, float, float, float]:
+    """Return x', y', w of a normalised query point under the parameters `p` (8,), and its variance.
 
-    With J (2, 8) the derivative of the point by p, it is the trace of J (L L^T)^-1 J^T, the squared norm of L^-1 J^T.
+    That is summed over x and y, in units of the residuals' variance: with J (2, 8) the derivative of the point by p,
+    the trace of J (L L^T)^-1 J^T.
 
     Parameters
     ----------
     factor : (8, 8) float64
         L, as left by `fit_homography`.
-    work : (8,) float64
+    row, work : (8,) float64
         Room to work in.
     """
-    x, y, w = predict(p, u, v)
-    total = 0.0
-    for axis in range(2):
-        work[:] = 0.0
-        work[3 * axis] = u / w
-        work[3 * axis + 1] = v / w
-        work[3 * axis + 2] = 1.0 / w
-        target = x if axis == 0 else y
-        work[6] = -target * u / w
-        work[7] = -target * v / w
-        for i in range(8):  # |L^-1 row|^2
-            for k in range(i):
-                work[i] -= factor[i, k] * work[k]
-            work[i] /= factor[i, i]
-            total += work[i] * work[i]
-    return total
+    x, y, w = point_row(p, u, v, 1.0, 0.0, row)
+    variance = spread(row, factor, work)
+    point_row(p, u, v, 0.0, 1.0, row)
+    return x, y, w, variance + spread(row, factor, work)

@@ -100,12 +100,11 @@ def match_all(
     branches: Int8s3,
     radius: float,
     min_cos: float,
-    one_to_one: bool,
     points: PointBuckets,
     matched: Ints1,
     distance: Floats1,
 ) -> int:
-    """Match every intersection of the query to the nearest one of the map with agreeing branches.
+    """Match every intersection of the query to the nearest one of the map with agreeing branches, one to one.
 
     Parameters
     ----------
@@ -117,8 +116,6 @@ def match_all(
         Metres.
     min_cos : float
         As in `rays_agree`.
-    one_to_one : bool
-        Whether only the nearest of several claimants keeps an intersection.
     points : PointBuckets
         The map's intersections.
     matched : (N,) int64
@@ -132,9 +129,7 @@ def match_all(
         Number of matches.
     """
     ref_xy, ref_branches, starts, grid, shape = points
-    n = xy.shape[0]
-    count = 0
-    for i in range(n):
+    for i in range(xy.shape[0]):
         matched[i] = -1
         distance[i] = radius
         u, v = xy[i, 0], xy[i, 1]
@@ -150,6 +145,4 @@ def match_all(
         matched[i], distance[i] = nearest_alike(
             x, y, radius, branches, i, ref_xy, ref_branches, starts, grid, shape, jacobian, min_cos
         )
-        if matched[i] >= 0:
-            count += 1
-    return keep_nearest(matched, distance) if one_to_one else count
+    return keep_nearest(matched, distance)

@@ -10,10 +10,10 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from roadgeo.kernels.adjustment import add_row, carry, point_row
+from roadgeo.kernels.adjustment import carry
 from roadgeo.kernels.arrays import Floats1, Floats2
 from roadgeo.kernels.compilation import kernel
-from roadgeo.kernels.homography_fit import cholesky, solve_cholesky
+from roadgeo.kernels.homography_fit import add_row, cholesky, point_row, solve_cholesky
 from roadgeo.kernels.roads import nearest_road
 from roadgeo.kernels.structs import RoadBuckets
 

@@ -22,6 +22,8 @@ from roadgeo.matching.scene import Scene
 __all__ = ["LocalSearchOptions", "Shift", "move_about", "search_nearby"]
 
 _DIRECTIONS = 16
+#: Directions within this angle of a road's run along it.
+_ALONG = math.radians(18.0)
 
 
 @dataclass(frozen=True)
@@ -40,8 +42,6 @@ class LocalSearchOptions:
         Side of the raster's cells, and step of the shifts.
     road_m : float
         Width of the roads that are drawn: the motion of a point by a step of shift and of turn must fit in.
-    direction_deg : float
-        Directions within this of a road's run along it.
     max_points : int
         Road points of the query that vote.
     n_places : int
@@ -55,7 +55,6 @@ class LocalSearchOptions:
     scales: tuple[float, ...] = (1.0,)
     cell_m: float = 5.0
     road_m: float = 15.0
-    direction_deg: float = 18.0
     max_points: int = 300
     n_places: int = 12
     apart_m: float = 25.0
@@ -134,7 +133,7 @@ def _draw_layers(
     angle = np.arctan2(*(b - a).T[::-1]) % math.pi
     lines = np.round(np.stack((a, b), axis=1) / cell * 16.0 - 8.0).astype(np.int32)  # 1/16 cells from cell centres
     layers = np.zeros((_DIRECTIONS, side, side), np.uint8)
-    width = math.radians(options.direction_deg)
+    width = _ALONG
     for d, layer in enumerate(layers):
         away = np.abs((d + 0.5) * math.pi / _DIRECTIONS - angle)
         chosen = lines[np.minimum(away, math.pi - away) <= width]

@@ -86,7 +86,7 @@ def agreement(
     found = scene.intersections
     matched = np.empty(len(found), np.int64)
     distance = np.empty(len(found))
-    match_all(matrix, found.xy, scene.branches, 1.5 * tolerance, MIN_COS, True, index.point_buckets, matched, distance)
+    match_all(matrix, found.xy, scene.branches, 1.5 * tolerance, MIN_COS, index.point_buckets, matched, distance)
     counted = np.ones(len(found), bool)
     counted[seeds] = False
     ground, (drawn, mapped) = Homography(matrix).everywhere(scene.corners), np.empty((2, 1, 2))

@@ -5,7 +5,8 @@ import pytest
 from kernels.test_roads import binned
 from naive import kernels as naive
 
-from roadgeo.kernels.adjustment import add_row, adjust, carry, own_sigma, point_row
+from roadgeo.kernels.adjustment import adjust, carry, own_sigma
+from roadgeo.kernels.homography_fit import add_row, point_row
 from roadgeo.kernels.structs import AdjustLimits, Held, Plane, PointPairs, RoadSamples
 
 P = np.array([0.9, -0.2, 0.05, 0.25, 1.1, -0.02, 0.12, -0.08])

@@ -11,7 +11,6 @@ from roadgeo.kernels.homography_fit import (
     cholesky,
     fit_homography,
     predict,
-    prediction_variance,
     solve_cholesky,
 )
 from roadgeo.kernels.point_matching import keep_nearest, match_all, nearest_alike
@@ -136,12 +135,12 @@ class TestPrediction:
         image = np.array([naive.predict(P, *q) for q in query])
         p, normal, factor = P.copy(), np.empty((8, 8)), np.zeros((8, 8))
         assert fit_homography(query, image, np.arange(9), 0.05, p, normal, factor)
-        x, y, w = predict(p, *uv)
+        x, y, w, variance = predict(p, *uv, factor, np.empty(8), np.empty(8))
         assert (x, y) == pytest.approx(naive.predict(p, *uv))
         assert w == pytest.approx(1 + p[6] * uv[0] + p[7] * uv[1])
         symmetric = np.tril(normal) + np.tril(normal, -1).T
         expected = naive.prediction_variance(symmetric, p, *uv)
-        assert prediction_variance(factor, p, *uv, np.empty(8)) == pytest.approx(expected, rel=1e-4)
+        assert variance == pytest.approx(expected, rel=1e-4)
 
 
 class TestNearestAlike:
@@ -182,33 +181,26 @@ class TestKeepNearest:
 
 class TestMatchAll:
     def test_like_the_twin(self, world):
-        def run(one_to_one):
-            matched, distance = np.empty(len(world.xy), np.int64), np.empty(len(world.xy))
-            n = match_all(
-                TRUTH, world.xy, world.branches, 90.0, MIN_COS, one_to_one, world.reference, matched, distance
-            )
-            assert n == (matched >= 0).sum() > 0
-            return matched, distance
-
-        matched, distance = run(one_to_one=False)
+        matched, distance = np.empty(len(world.xy), np.int64), np.empty(len(world.xy))
+        n = match_all(TRUTH, world.xy, world.branches, 90.0, MIN_COS, world.reference, matched, distance)
+        assert n == (matched >= 0).sum() > 0
         (strict, _), (expected, away), (lax, _) = (
-            naive.match_all(TRUTH, world.xy, world.branches, 90.0, t, False, world.ref_xy, world.ref_branches)
+            naive.match_all(TRUTH, world.xy, world.branches, 90.0, t, world.ref_xy, world.ref_branches)
             for t in (TOLERANCE - 0.02, TOLERANCE, TOLERANCE + 0.02)
         )
         clear = (strict == expected) & (lax == expected)  # branches are compared to a degree
         assert clear.mean() > 0.8
-        assert np.array_equal(matched[clear], expected[clear])
+        assert np.array_equal(matched[clear], naive.keep_nearest(np.where(clear, expected, matched), distance)[clear])
         assert np.allclose(distance[clear], away[clear], atol=1e-3)
-        assert np.array_equal(run(one_to_one=True)[0], naive.keep_nearest(matched, distance))
 
     def test_the_true_homography_matches_the_true_points(self, world):
         matched, distance = np.empty(len(world.xy), np.int64), np.empty(len(world.xy))
-        match_all(TRUTH, world.xy, world.branches, 5.0, MIN_COS, True, world.reference, matched, distance)
+        match_all(TRUTH, world.xy, world.branches, 5.0, MIN_COS, world.reference, matched, distance)
         assert np.array_equal(matched[world.truth >= 0], world.truth[world.truth >= 0])
         assert (distance[world.truth >= 0] < 3).all()
 
     def test_no_query(self, world):
-        nothing = np.empty((0, 2)), np.empty((0, 8, 2), np.int8), 5.0, MIN_COS, True
+        nothing = np.empty((0, 2)), np.empty((0, 8, 2), np.int8), 5.0, MIN_COS
         assert match_all(TRUTH, *nothing, world.reference, np.empty(0, np.int64), np.empty(0)) == 0
 
 

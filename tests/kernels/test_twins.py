@@ -23,6 +23,7 @@ TWINS = {
     "paint_roads": "bits_at",
     "passes": "word_at",
     "point_row": "predict_rows",
+    "predict": "prediction_variance",
     "smooth_chains": "smooth_chain",
     "tie_runs": "runs",
     "vertex_probes": "alike",
@@ -39,6 +40,7 @@ CALLS = {"describe_intersections": "find_intersections", "fit_branches": "find_i
 #: Why a kernel has none.
 REASONS = {
     "add_row": "compared with A^T W A, one line of numpy",
+    "spread": "part of `predict`, which has a twin",
     "carry": "compared with the twins of `predict` and of the Jacobian",
     "cholesky": "compared with numpy.linalg",
     "count_bits": "compared with Python's count of bits",

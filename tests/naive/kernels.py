@@ -225,7 +225,7 @@ def keep_nearest(matched, distance):
     return kept
 
 
-def match_all(matrix, xy, branches, radius, tolerance, one_to_one, ref_xy, ref_branches):
+def match_all(matrix, xy, branches, radius, tolerance, ref_xy, ref_branches):
     matched, distance = np.full(len(xy), -1), np.full(len(xy), float(radius))
     for i, point in enumerate(xy):
         place = transform(matrix, point)
@@ -233,7 +233,7 @@ def match_all(matrix, xy, branches, radius, tolerance, one_to_one, ref_xy, ref_b
             matched[i], distance[i] = nearest_alike(
                 *place, radius, branches, i, ref_xy, ref_branches, jacobian(matrix, point), tolerance
             )
-    return keep_nearest(matched, distance) if one_to_one else matched, distance
+    return matched, distance
 
 
 def grow(
