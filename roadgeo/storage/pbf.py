@@ -39,10 +39,10 @@ def read_parts(path: Path) -> Iterator[tuple[bytes, float]]:
     with path.open("rb") as file:
         header, is_first = read_blob(file), True
         while is_first or file.tell() < size:
-            part, is_first = bytearray(header), False
+            part, is_first = bytearray(), False
             while len(part) < _PART and file.tell() < size:
                 part += read_blob(file)
-            yield bytes(part), file.tell() / size
+            yield header + bytes(part), file.tell() / size
 
 
 def read_blob(file: BinaryIO) -> bytes:
