@@ -91,7 +91,7 @@ def test_addresses_that_are_none_are_told(url):
 
 def test_without_pymavlink_it_is_said_what_to_install(monkeypatch):
     monkeypatch.setattr("roadgeo.running.flights.mavlink.has_pymavlink", lambda: False)
-    with pytest.raises(OutputError, match="pip install .*pymavlink"):
+    with pytest.raises(OutputError, match=r"pip install .*pymavlink"):
         MavlinkSender("udpout:127.0.0.1:1")
 
 
