@@ -59,7 +59,9 @@ TEXTS = st.text(max_size=40) | st.lists(st.floats().map(str) | st.integers().map
 )
 
 
-@pytest.mark.parametrize(("kind", "count"), [(BOX, 4), (NEAR, 3), (RANGE, 2), (GSD, 2)], ids=lambda one: str(one))
+@pytest.mark.parametrize(
+    ("kind", "count"), [(BOX, 4), (NEAR, 3), (RANGE, 2), (GSD, 2)], ids=["box", "near", "range", "gsd"]
+)
 @given(text=TEXTS)
 def test_any_text_is_finite_numbers_or_refused(kind: Read, count: int, text: str) -> None:
     try:
