@@ -18,7 +18,7 @@ from roadgeo.kernels.triple_codes import UNITS, find_sides
 from roadgeo.kernels.triples import look_up_each
 from roadgeo.matching.index import ReferenceIndex, build_index
 from roadgeo.matching.query import trace_query
-from roadgeo.matching.scene import Scene
+from roadgeo.matching.scene import MIN_COS, Scene
 from roadgeo.matching.triples import TripleOptions, propose
 from roadgeo.reference.reference import Reference, build_network
 from roadgeo.sources.masks import read_mask
@@ -117,7 +117,7 @@ def find_triple(scene: Scene, index: ReferenceIndex, to_map: np.ndarray) -> tupl
     find_sides(tangents, scene.branches, sides)
     seen = TripleQuery(xy, scene.branches, tangents, sides, neighbours)
     tolerance = round(options.angle_tolerance_deg * UNITS / 180)
-    limits = TripleLimits(1, tolerance, float(np.cos(np.radians(options.ray_tolerance_deg))), (0.1, 10.0), 0.33)
+    limits = TripleLimits(1, tolerance, MIN_COS, (0.1, 10.0), 0.33)
     good = []
     for (proposals,) in propose(scene, [index], (0.1, 10.0), 0.33, options):
         a = proposals.anchor

@@ -68,7 +68,8 @@ def test_setting_up_finds_the_program_and_calls_it(seen: dict) -> None:
 def test_what_was_built_is_in_the_library_and_in_the_list_of_the_next_dialog(seen: dict) -> None:
     assert seen["build"]["title"] == "Build road reference"
     assert Path(seen["build"]["results"]["OUTPUT"]).name == "porto-streets.gpkg"
-    assert seen["references"] == ["All that there are", "porto-streets"]
+    assert seen["references"][0] == "All that there are"
+    assert "porto-streets" in seen["references"]
 
 
 def test_the_current_layer_is_located_near_what_the_map_shows(seen: dict) -> None:

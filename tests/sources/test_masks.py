@@ -475,7 +475,7 @@ def test_files_that_are_none(tmp_path: Path, roads: np.ndarray) -> None:
     for name, message in (
         ("none.png", "no such file"),
         ("", "is a folder"),
-        ("text.tif", "not a raster"),
+        ("text.tif", "is text, whatever its name says"),
         ("empty.png", "not a raster"),
         ("cut.png", "damaged or cut short"),
     ):
