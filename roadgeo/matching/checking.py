@@ -208,7 +208,8 @@ def _judge_best(judge: _Judge, places: Sequence[_Place]) -> Checked:
     options = judge.options
     best = judge.refine(places[0].matrix, None)
     rivals = [place for place in places[1:] if judge.gap(place.matrix, best.matrix) >= options.search.apart_m]
-    leads = [judge.evidence.lead(best.matrix, [rival.matrix]) for rival in rivals]
+    compare = judge.evidence.compared_with(best.matrix)
+    leads = [compare(rival.matrix)[1] for rival in rivals]
     lead, hardest = min(zip(leads, rivals, strict=True), key=lambda one: one[0], default=(0.0, None))
     if best.refined is None or hardest is None:
         return Checked("unknown", f"no place within {options.search.reach_m:g} m fits")

@@ -18,7 +18,7 @@ with the same probability.
 from __future__ import annotations
 
 import math
-from collections.abc import Sequence
+from collections.abc import Callable
 from dataclasses import dataclass
 from functools import lru_cache
 
@@ -117,7 +117,11 @@ class Evidence:
     def weigh(self, matrix: FloatArray) -> float:
         """Return log10 L of a place, query plane to reference plane (3, 3)."""
         seen, mapped = self._count(matrix, math.inf, (1, 1))
-        nats = self._nats(*self._ratios(mapped), seen[0], mapped[0])
+        return self._log10(seen[0], mapped[0])
+
+    def _log10(self, seen: FloatArray, mapped: FloatArray) -> float:
+        """Return log10 L of histograms."""
+        nats = self._nats(*self._ratios(mapped), seen, mapped)
         most = float(nats.max())
         return (most + math.log(float(np.exp(nats - most).mean()))) / math.log(10.0)
 
@@ -125,20 +129,24 @@ class Evidence:
         """Return how much road the map has on observed ground of the frame, pixels."""
         return float(self._count(matrix, math.inf, (1, 1))[1].sum())
 
-    def lead(self, matrix: FloatArray, others: Sequence[FloatArray]) -> float:
-        """Return by how many powers of ten a place leads the best of others, piece by piece; inf where there is none.
+    def compared_with(self, matrix: FloatArray) -> Callable[[FloatArray], tuple[float, float]]:
+        """Return what compares a place with others: log10 L of another, and by how much the place leads it.
 
-        All are compared by the deviation and the share of false roads that explain the place best, and by the query's
-        roads alone: of many wrong places the best lies where the map shows little that the query lacks, and all others
-        show more in every piece.
+        The lead counts powers of ten, piece by piece. All are compared by the deviation and the share of false roads
+        that explain the place best, and by the query's roads alone: of many wrong places the best lies where the map
+        shows little that the query lacks, and all others show more in every piece.
         """
         seen, mapped = self._count(matrix, self._piece_px, self._shape)
         of_query, of_map = self._ratios(mapped)
         nats = self._nats(of_query, of_map, seen.sum(axis=0), mapped.sum(axis=0))
         sigma, _, false = np.unravel_index(int(nats.argmax()), nats.shape)
         ratios = of_query[sigma, false]
-        there = (self._count(other, self._piece_px, self._shape)[0] for other in others)
-        return min((log10_lead((seen - other) @ ratios) for other in there), default=math.inf)
+
+        def compare(other: FloatArray) -> tuple[float, float]:
+            there, mapped = self._count(other, self._piece_px, self._shape)
+            return self._log10(there.sum(axis=0), mapped.sum(axis=0)), log10_lead((seen - there) @ ratios)
+
+        return compare
 
     def contradicted(self, matrix: FloatArray) -> float:
         """Return which share of the roads lies in regions of the frame where the place explains less than chance.

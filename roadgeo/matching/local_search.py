@@ -10,6 +10,7 @@ from __future__ import annotations
 
 import math
 from dataclasses import dataclass
+from typing import TypeAlias
 
 import cv2
 import numpy as np
@@ -19,11 +20,16 @@ from roadgeo.geometry.homography import Homography
 from roadgeo.matching.index import ReferenceIndex
 from roadgeo.matching.scene import Scene
 
-__all__ = ["LocalSearchOptions", "Shift", "move_about", "search_nearby"]
+__all__ = ["Drawn", "LocalSearchOptions", "Shift", "move_about", "search_nearby"]
+
+#: Layers that were drawn and the corner of their first cell, by the middle and the reach.
+Drawn: TypeAlias = dict[tuple[float, ...], tuple[AnyArray, FloatArray]]
 
 _DIRECTIONS = 16
 #: Directions within this angle of a road's run along it.
 _ALONG = math.radians(18.0)
+#: Greatest count that a byte holds.
+_BYTE = 255
 
 
 @dataclass(frozen=True)
@@ -81,7 +87,11 @@ def move_about(center: FloatArray, shift: Shift) -> FloatArray:
 
 
 def search_nearby(
-    start: FloatArray, scene: Scene, index: ReferenceIndex, options: LocalSearchOptions | None = None
+    start: FloatArray,
+    scene: Scene,
+    index: ReferenceIndex,
+    options: LocalSearchOptions | None = None,
+    drawn: Drawn | None = None,
 ) -> list[Shift]:
     """Return the best places near a start, the best first.
 
@@ -89,6 +99,8 @@ def search_nearby(
     ----------
     start : (3, 3) float64
         Query plane to reference plane.
+    drawn : Drawn, optional
+        Keeps the roads that were drawn, for starts about the same middle, by the same options.
     """
     options = options or LocalSearchOptions()
     thin = max(1, len(scene.points) // options.max_points)
@@ -102,7 +114,9 @@ def search_nearby(
     if not len(points) or not np.isfinite(frame).all():
         return []
     radius = float(np.hypot(*(frame - center).T).max())
-    layers, origin = _draw_layers(index, center, radius * max(options.scales) + options.reach_m, options)
+    drawn, reach_m = {} if drawn is None else drawn, radius * max(options.scales) + options.reach_m
+    key = (*np.round(center, 3).tolist(), round(reach_m, 3))
+    layers, origin = drawn[key] = drawn.get(key) or _draw_layers(index, center, reach_m, options)
     best: list[Shift] = []
     for scale in options.scales:
         for turn in _turns(radius, options):
@@ -157,12 +171,18 @@ def _best_shifts(
     direction = np.minimum((angle / math.pi * _DIRECTIONS).astype(int), _DIRECTIONS - 1)
     span = 2 * reach + 1
     inside = (cells >= 0).all(axis=1) & (cells + span <= side).all(axis=1)
-    votes = np.zeros((span, span), np.uint16)
-    for (column, row), d in zip(cells[inside].tolist(), direction[inside].tolist(), strict=True):
-        votes += layers[d, row : row + span, column : column + span]
+    votes, some = np.zeros((span, span), np.uint16), np.zeros((span, span), np.uint8)
+    for n, ((column, row), d) in enumerate(zip(cells[inside].tolist(), direction[inside].tolist(), strict=True), 1):
+        some += layers[d, row : row + span, column : column + span]
+        if n % _BYTE == 0:  # bytes are added several times as fast
+            votes += some
+            some[:] = 0
+    votes += some
     peaks = votes == cv2.dilate(votes, np.ones((5, 5), np.uint8))
-    rows, columns = np.nonzero(peaks)
-    order = np.argsort(-votes[rows, columns].astype(int), kind="stable")[: 2 * options.n_places]
+    most = 2 * options.n_places
+    at_least = np.cumsum(np.bincount(votes[peaks], minlength=1)[::-1])[::-1]  # peaks of so many votes or more
+    rows, columns = np.nonzero(peaks & (votes >= max(int((at_least >= most).sum()) - 1, 0)))
+    order = np.argsort(-votes[rows, columns].astype(int), kind="stable")[:most]
     return [
         Shift((c - reach) * options.cell_m, (r - reach) * options.cell_m, turn, scale, int(votes[r, c]) / len(points))
         for r, c in zip(rows[order].tolist(), columns[order].tolist(), strict=True)

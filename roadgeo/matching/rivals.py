@@ -13,7 +13,7 @@ from __future__ import annotations
 
 import math
 import time
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field
 from typing import NamedTuple
 
@@ -27,14 +27,14 @@ from roadgeo.matching.evidence import Evidence
 from roadgeo.matching.hypothesis import Hypothesis
 from roadgeo.matching.index import ReferenceIndex
 from roadgeo.matching.ledger import Ledger
-from roadgeo.matching.local_search import LocalSearchOptions, Shift, move_about, search_nearby
+from roadgeo.matching.local_search import Drawn, LocalSearchOptions, Shift, move_about, search_nearby
 from roadgeo.matching.refinement import refine
 from roadgeo.matching.scene import Scene
 from roadgeo.matching.search import Search
 from roadgeo.matching.triples import larger
 from roadgeo.matching.verification import agreement
 
-__all__ = ["RivalOptions", "Rivals", "Standing", "log10_gap", "similar_places"]
+__all__ = ["Other", "RivalOptions", "Rivals", "Standing", "log10_gap", "similar_places"]
 
 _NO_SEEDS: IntArray = np.array([], np.int64)
 
@@ -104,6 +104,15 @@ class Standing(NamedTuple):
         return self.rival is not None and self.rival_likelihood > self.log10_likelihood
 
 
+class Other(NamedTuple):
+    """Another place: its log10 likelihood, by how much the place leads it, itself (3, 3), and what speaks against."""
+
+    worth: float
+    lead: float
+    matrix: FloatArray
+    against: float = 0.0
+
+
 class Rivals:
     """Compares the likeliest place of each part of a map with the best other one; each place once."""
 
@@ -161,26 +170,28 @@ class Rivals:
         if time.perf_counter() > self._deadline:
             return Standing(best, None, min(odds, 0.0), best.log10_likelihood)
         evidence = Evidence(scene, index, sampling(matrix, scene.size), estimator.options.evidence)
+        known = [model for model in ranked[: 1 + options.n_known] if model is not best]
         worth, middle = evidence.weigh(matrix), Homography(matrix).everywhere(scene.center)
-        apart_m = options.apart * scene.half_size * evidence.gsd_m
-        met = [(model.laid, self.doubt(estimator, model)) for model in ranked[: 1 + options.n_known]]
-        around = [(other, 0.0) for other in similar_places(matrix, evidence, estimator.options, options)]
-        others: list[tuple[float, FloatArray]] = []
-        explained = []
-        for other, against in [*met, *around]:
-            there = Homography(other).everywhere(scene.center)
-            if np.hypot(*(there - middle)) > apart_m and estimator.may_be(other):
-                explained.append(evidence.weigh(other))
-                others.append((explained[-1] - against, other))
-        others.sort(key=lambda one: -one[0])
-        if others and others[0][0] > worth:
-            return Standing(best, others[0][1], worth - others[0][0], worth, others[0][0])
-        lead = evidence.lead(matrix, [other for _, other in others])
-        lead += log10_gap(worth, explained)
+        apart_m, compare = options.apart * scene.half_size * evidence.gsd_m, evidence.compared_with(matrix)
+        met = [Other(*compare(model.laid), model.laid, self.doubt(estimator, model)) for model in known]
+        others = [
+            other
+            for other in (*met, *similar_places(matrix, evidence, compare, estimator.options, options))
+            if np.hypot(*(Homography(other.matrix).everywhere(scene.center) - middle)) > apart_m
+            and estimator.may_be(other.matrix)
+        ]
+        rival = max(others, key=lambda one: one.worth - one.against, default=None)
+        if rival is not None and rival.worth - rival.against > worth:
+            likelihood = rival.worth - rival.against
+            return Standing(best, rival.matrix, worth - likelihood, worth, likelihood)
+        lead = min((other.lead for other in others), default=math.inf)
+        lead += log10_gap(worth, [other.worth for other in others])
         # The larger the map, the more places may lead all that lie around them.
         paid = 2.0 * math.log10(larger(self.ledger.n_reference))
-        likelihood, rival = others[0] if others else (-math.inf, None)
-        return Standing(best, rival, min(lead, worth) - paid - doubt, worth, likelihood)
+        odds = min(lead, worth) - paid - doubt
+        if rival is None:
+            return Standing(best, None, odds, worth)
+        return Standing(best, rival.matrix, odds, worth, rival.worth - rival.against)
 
     def doubt(self, estimator: TripleEstimator, model: Hypothesis) -> float:
         """Return by how many powers of ten what a place contradicts speaks against it, as it is laid; asked once."""
@@ -205,21 +216,26 @@ class Rivals:
 
 
 def similar_places(
-    matrix: FloatArray, evidence: Evidence, match: MatchOptions, options: RivalOptions
-) -> list[FloatArray]:
-    """Return other places (3, 3) around one that most roads would fit, the likeliest laid as well as they can be."""
+    matrix: FloatArray,
+    evidence: Evidence,
+    compare: Callable[[FloatArray], tuple[float, float]],
+    match: MatchOptions,
+    options: RivalOptions,
+) -> list[Other]:
+    """Return other places around one that most roads would fit, the likeliest laid as well as they can be."""
     scene, index = evidence.scene, evidence.index
     center = Homography(matrix).everywhere(scene.center)
+    drawn: Drawn = {}
     found: list[tuple[float, FloatArray]] = []
     for turn in _TURNS_DEG:
         turned = move_about(center, Shift(0.0, 0.0, turn, 1.0, 0.0)) @ matrix
-        shifts = search_nearby(turned, scene, index, options.search)
+        shifts = search_nearby(turned, scene, index, options.search, drawn)
         found += [(shift.share, move_about(center, shift) @ turned) for shift in shifts]
     found.sort(key=lambda one: -one[0])
-    roughly = [_lay(start, scene, index, match, options.n_points) for _, start in found[: options.n_places]]
-    roughly.sort(key=evidence.weigh, reverse=True)
-    finely = [_lay(start, scene, index, match, None) for start in roughly[: options.n_laid]]
-    return finely + roughly[options.n_laid :]
+    laid = (_lay(start, scene, index, match, options.n_points) for _, start in found[: options.n_places])
+    roughly = sorted((Other(*compare(one), one) for one in laid), key=lambda one: -one.worth)
+    finely = (_lay(one.matrix, scene, index, match, None) for one in roughly[: options.n_laid])
+    return [*(Other(*compare(one), one) for one in finely), *roughly[options.n_laid :]]
 
 
 def log10_gap(best: float, others: Sequence[float]) -> float:

@@ -152,7 +152,8 @@ def test_only_what_the_user_allows_is_a_rival(broken):
 def test_similar_places_lie_on_the_streets_around_as_large_as_the_place_and_not_mirrored(broken):
     truth, _, evidence = broken
     wrong = beside(truth, evidence)
-    places = similar_places(wrong, evidence, MatchOptions(), RivalOptions())
+    others = similar_places(wrong, evidence, evidence.compared_with(wrong), MatchOptions(), RivalOptions())
+    places = [other.matrix for other in others]
     assert 0 < len(places) <= RivalOptions().n_places
     assert min(apart(broken, one) for one in places) < 3.0  # the place itself is among them
     assert sum(apart(broken, one, wrong) > 500.0 for one in places) > 1
@@ -161,6 +162,7 @@ def test_similar_places_lie_on_the_streets_around_as_large_as_the_place_and_not_
         assert np.linalg.det(one) > 0.0
         assert sampling(one, size) == pytest.approx(sampling(wrong, size), rel=0.1)
         assert evidence.weigh(one) > 0.0
+    assert [other.worth for other in others] == pytest.approx([evidence.weigh(one) for one in places])
 
 
 # --- how far the best of many leads by chance -------------------------------------------------------------------------

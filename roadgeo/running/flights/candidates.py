@@ -179,10 +179,9 @@ class Candidates:
         rival = max(rivals, key=lambda one: one[0], default=None)
         most = max(evidence.nearby(fit.matrix), 0.0 if rival is None else rival[0])
         if worth - most - paid >= options.min_log10_odds:
-            around = similar_places(fit.matrix, evidence, options.match, self.options.rivals)[
-                : self.options.rivals.n_laid
-            ]
-            most = max([most, *(evidence.weigh(one) for one in around if not _are_one(one, fit.matrix, size))])
+            compare, usual = evidence.compared_with(fit.matrix), self.options.rivals
+            around = similar_places(fit.matrix, evidence, compare, options.match, usual)[: usual.n_laid]
+            most = max([most, *(one.worth for one in around if not _are_one(one.matrix, fit.matrix, size))])
         lead = worth - max(most, 0.0) - paid
         fits = (replace(fit, log10_odds=lead),) + (() if rival is None else (replace(rival[1], log10_odds=-lead),))
         k = next((k for k, one in enumerate(judged) if one.index is best.whole), len(judged))
