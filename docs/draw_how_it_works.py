@@ -57,7 +57,7 @@ def main() -> None:
     figure.get_layout_engine().set(w_pad=0.12, h_pad=0.1)
     titles = (
         "1  The mask: where there is road",
-        "2  Its roads, intersections and their directions",
+        "2  Its roads and intersections",
         "3  Three intersections, made equilateral",
         f"4  The code looked up on the map: {len(hits)} fit",
         "5  The right one grows outwards",
@@ -309,7 +309,7 @@ def draw_location(
     told = location.to_dict()
     text = (
         f"{told['n_matched']} of {told['n_intersections']} intersections match\n"
-        f"odds against chance $10^{{{told['log10_odds']:.0f}}}$\n"
+        f"lead over any other place $10^{{{told['log10_odds']:.1f}}}$\n"
         f"corners ± {max(told['corner_sigma_m']):.1f} m"
     )
     ax.text(0.985, 0.02, text, transform=ax.transAxes, fontsize=12, color=INK, ha="right", va="bottom", zorder=6,

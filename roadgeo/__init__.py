@@ -16,7 +16,7 @@ import importlib
 from typing import TYPE_CHECKING, Any
 
 #: Packaging reads it here without importing anything; nothing heavy may be imported above.
-__version__ = "0.1.0"
+__version__ = "1.0.0"
 
 if TYPE_CHECKING:
     from roadgeo.api import Answer, build_reference, index, locate, track, vectorize, verify
