@@ -13,7 +13,7 @@ from typing import TYPE_CHECKING, Any, TypeVar
 import click
 
 from roadgeo.cli.printing import echo
-from roadgeo.matching.hints import HINTS, apply_hints, read_box, read_numbers, read_place, read_range
+from roadgeo.matching.hints import HINTS, Hint, apply_hints, read_box, read_numbers, read_place, read_range
 
 if TYPE_CHECKING:
     from roadgeo.matching.options import LocateOptions
@@ -65,10 +65,10 @@ class _Option(click.Option):
     """An option with the heading that it stands under; one that is rarely wanted is explained by --help-all only."""
 
     def __init__(
-        self, *names: Any, group: str = OTHERS, rare: bool = False, earlier: str = "", **settings: Any
+        self, *names: Any, group: str = OTHERS, rare: bool = False, hint: Hint | None = None, **settings: Any
     ) -> None:
         super().__init__(*names, **settings)
-        self.group, self.rare, self.earlier = group, rare, earlier
+        self.group, self.rare, self.hint = group, rare, hint
 
     def get_help_record(self, ctx: click.Context) -> tuple[str, str] | None:
         """Return names and help, without a name from before; but for --help-all the first sentence of the help only."""
@@ -79,7 +79,7 @@ class _Option(click.Option):
         if getattr(ctx.command, "is_long", False) and not ctx.meta.get(_WHOLE, False):
             default = re.search(r"\[default: [^\];]*", told)
             told = re.split(r"(?<=[^.]\.) ", self.help or "")[0] + (f"  {default[0]}]" if default else "")
-        return names.replace(f", {self.earlier}", "") if self.earlier else names, told
+        return names.replace(f", {self.hint.also}", "") if self.hint and self.hint.also else names, told
 
 
 class Command(click.Command):
@@ -299,7 +299,7 @@ def _hint_option(name: str, command: Decorated, **own: Any) -> Decorated:
     shown = tuple(hint.form.split("|")) if name == "effort" else hint.form
     names = [own.pop("called", hint.option), *([hint.also] if hint.also else []), hint.goes_to]
     kind = {"default": None} if shown == "" else {} if name == "effort" else {"type": Read(name, hint.read)}
-    decorated: Decorated = row(" ".join(names), shown, hint.group, hint.help, earlier=hint.also, **kind)(command, **own)
+    decorated: Decorated = row(" ".join(names), shown, hint.group, hint.told, hint=hint, **kind)(command, **own)
     return decorated
 
 

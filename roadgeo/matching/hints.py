@@ -38,12 +38,16 @@ class Hint:
         Its name among the hints of `apply_hints`: a field of the options of a search, with its unit.
     form : str
         How a value is written; "" for a switch.
+    label : str
+        What it is, in a few words with its unit: the title of its field in a dialog.
     help : str
         Its meaning, with its unit and its default.
     read : callable
         Takes a value in any form; returns what the search takes. Raises ValueError: "got ..., expected ...".
     schema : mapping
         JSON Schema of a value over HTTP, next to a text.
+    default : float or str
+        Its value where none is given, as far as one word tells it; `told` adds it to the help.
     group : str
         Under which heading of the help it stands.
     also : str
@@ -53,9 +57,11 @@ class Hint:
     name: str
     goes_to: str
     form: str
+    label: str
     help: str
     read: Callable[[Any], Any]
     schema: Mapping[str, Any]
+    default: float | str = ""
     group: str = "The image"
     also: str = ""
 
@@ -63,6 +69,12 @@ class Hint:
     def option(self) -> str:
         """The name on the command line: --max-tilt."""
         return "--" + self.name.replace("_", "-")
+
+    @property
+    def told(self) -> str:
+        """The help with the default."""
+        told = self.default == "" or "default" in self.help
+        return self.help if told else f"{self.help} Default: {self.default}."
 
     @property
     def parameter(self) -> str:
@@ -239,54 +251,54 @@ _SEARCH = "The search"
 
 _TABLE = (
     Hint(
-        "near", "near", "LON,LAT,RADIUS",
+        "near", "near", "LON,LAT,RADIUS", "Near",
         "The middle lies within RADIUS metres of there.",
-        read_place, _numbers(3, 3), _WHERE,
+        read_place, _numbers(3, 3), group=_WHERE,
     ),
     Hint(
-        "within", "within", "AREA",
+        "within", "within", "AREA", "In the country or state",
         "The middle lies in a country or state. Or within W,S,E,N in degrees.",
-        _read_area, _numbers(4, 4), _WHERE,
+        _read_area, _numbers(4, 4), group=_WHERE,
     ),
     Hint(
-        "gsd", "gsd_m", "SIZE|LO:HI",
+        "gsd", "gsd_m", "SIZE|LO:HI", "Pixel size, metres",
         "Pixel size, metres: 0.3, 0.3+-10% or 0.3:0.6. It is that at the middle; 0.3 alone stands for 0.24 to"
-        " 0.375, a quarter more or less. Default: 0.1:12.",
-        _read_gsd, {"oneOf": [{"type": "number", "exclusiveMinimum": 0}, _numbers(2, 2)]},
+        " 0.375, a quarter more or less.",
+        _read_gsd, {"oneOf": [{"type": "number", "exclusiveMinimum": 0}, _numbers(2, 2)]}, "0.1:12",
     ),
     Hint(
-        "heading", "heading_deg", "DEG[+-DEG]",
+        "heading", "heading_deg", "DEG[+-DEG]", "Heading, degrees",
         "Where up points, degrees from north: 90+-10. Clockwise; the second number is 10 if left out.",
         _read_heading, {"oneOf": [{"type": "number"}, _numbers(2, 2)]},
     ),
     Hint(
-        "north_up", "north_up", "",
+        "north_up", "north_up", "", "Up is north",
         "Up is north. Grid north of the reference, within 5 degrees.",
         _read_switch, {"type": "boolean"},
     ),
     Hint(
-        "max_tilt", "max_tilt_deg", "DEG",
-        "Greatest tilt of the camera, degrees. From the vertical. Default: 60.",
+        "max_tilt", "max_tilt_deg", "DEG", "Greatest tilt, degrees",
+        "Greatest tilt of the camera, degrees. From the vertical.",
         lambda value: _read_number(value, 0, 80, "degrees from 0 to 80"),
-        {"type": "number", "minimum": 0, "maximum": 80},
+        {"type": "number", "minimum": 0, "maximum": 80}, 60,
     ),
     Hint(
-        "focal", "focal_px", "PIXELS|exif",
-        "Focal length in pixels, or as the EXIF says. That of --image, if one is given.",
+        "focal", "focal_px", "PIXELS|exif", "Focal length, pixels",
+        "Focal length in pixels, or as the EXIF says. That of the photograph, if one goes with a mask.",
         _read_focal, {"oneOf": [{"type": "number", "exclusiveMinimum": 0}, {"enum": ["exif"]}]},
         also="--camera",
     ),
     Hint(
-        "effort", "effort", "quick|full",
+        "effort", "effort", "quick|full", "Effort",
         "How hard to try, full by default. quick: stop early, for clean masks. full: also search by roads alone, for"
         " broken masks and photographs.",
-        _read_effort, {"enum": ["quick", "full"]}, _SEARCH,
+        _read_effort, {"enum": ["quick", "full"]}, "full", _SEARCH,
     ),
     Hint(
-        "time_limit", "time_limit_s", "SECONDS",
-        "Stop searching for an image then. Default: 60; with --method pair 10.",
+        "time_limit", "time_limit_s", "SECONDS", "Time limit, seconds",
+        "Stop searching for an image then. The paper's matcher stops after 10 by itself.",
         lambda value: _read_number(value, 1e-3, 1e6, "seconds above 0"),
-        {"type": "number", "exclusiveMinimum": 0}, _SEARCH,
+        {"type": "number", "exclusiveMinimum": 0}, 60, _SEARCH,
     ),
 )  # fmt: skip
 

@@ -23,8 +23,8 @@ __all__ = ["NAME", "find_profiles", "install_plugin", "write_package"]
 #: Name of the plugin's folder: not `roadgeo`, which would stand before the library of that name in QGIS's Python.
 NAME = "roadgeo_qgis"
 
-#: Name of the file that lists the outputs for the plugin, which runs without the library.
-OUTPUTS = "outputs.json"
+#: Name of the file that lists options and outputs for the plugin, which runs without the library; their commands.
+TABLE, _COMMANDS = "table.json", ("locate", "index", "evaluate")
 
 _PLUGIN = Path(__file__).parent / "plugin"
 
@@ -98,11 +98,14 @@ def _publisher() -> dict[str, str]:
 
 
 def _contents() -> dict[Path, bytes]:
-    """Read the plugin's files, by their paths in its folder; with the list that `--also` offers."""
+    """Read the plugin's files, by their paths in its folder; with the table of options, and what `--also` offers."""
+    from roadgeo.cli.table import describe_options
+
     files = {file.relative_to(_PLUGIN): file.read_bytes() for file in _PLUGIN.rglob("*") if file.is_file()}
     files = {file: content for file, content in files.items() if "__pycache__" not in file.parts}
     offered = {name: output.summary for name, output in ALSO.items()}
-    files[Path(OUTPUTS)] = (json.dumps(offered, indent=1) + "\n").encode()
+    table = {"options": describe_options(_COMMANDS), "outputs": offered}
+    files[Path(TABLE)] = (json.dumps(table, indent=1) + "\n").encode()
     return dict(sorted(files.items()))
 
 

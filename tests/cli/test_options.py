@@ -3,6 +3,7 @@
 import inspect
 import math
 import re
+from dataclasses import replace
 from pathlib import Path
 
 import click
@@ -14,7 +15,8 @@ from hypothesis import strategies as st
 import roadgeo
 from roadgeo.cli import COMMANDS, cli
 from roadgeo.cli.options import ASPECT, BOX, GSD, NEAR, RANGE, Plugin, Read
-from roadgeo.matching.hints import HINTS
+from roadgeo.matching.hints import HINTS, apply_hints
+from roadgeo.matching.options import LocateOptions
 from roadgeo.running.serving.documents import documents_of
 from roadgeo.running.serving.requests import read_query_string
 
@@ -104,6 +106,14 @@ def test_every_hint_is_an_option_of_locate_a_parameter_over_http_and_a_keyword_o
     assert {name for name, one in keywords.items() if one.kind is one.KEYWORD_ONLY} == set(HINTS)
     inputs = documents_of(["porto"])["/processes/locate"]["inputs"]
     assert list(inputs) == ["image", *(hint.parameter for hint in HINTS.values())]
+
+
+def test_the_defaults_of_the_table_are_those_of_the_search() -> None:
+    told = {hint.goes_to: hint.read(hint.default) for hint in HINTS.values() if hint.default != ""}
+    usual = LocateOptions()
+    assert set(told) == {"gsd_m", "max_tilt_deg", "effort", "time_limit_s"}
+    known = apply_hints(usual, told)
+    assert replace(known, pair=usual.pair) == usual
 
 
 def test_one_pixel_size_is_one_fact_in_every_spelling() -> None:

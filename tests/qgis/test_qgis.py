@@ -24,11 +24,11 @@ from roadgeo.cli import main
 from roadgeo.errors import OutputError
 from roadgeo.evaluation.demo import PHOTO, ROADS, demo_masks
 from roadgeo.geometry.homography import Homography
+from roadgeo.matching.hints import HINTS
 from roadgeo.outputs.registry import ALSO
 from roadgeo.qgis import installation
 from roadgeo.qgis.installation import NAME, find_profiles, install_plugin, write_package
 from roadgeo.qgis.plugin import runner
-from roadgeo.workflows import LocateOptions
 
 PLUGIN = Path(installation.__file__).parent / "plugin"
 MASKS = {mask.path.stem: mask for mask in demo_masks()}
@@ -75,7 +75,7 @@ def test_a_python_that_has_roadgeo_may_stand_for_its_program(tmp_path: Path) -> 
 
 
 def test_what_the_program_says_names_what_qgis_has() -> None:
-    labels = {"--gsd": "Least pixel size", "--osm": "Place"}
+    labels = {"--gsd": "Pixel size", "--osm": "Place"}
     said = "Give one source: --osm PLACE, or `roadgeo index --bbox`; `roadgeo simulate` and --gsd-like stay"
     told = runner.in_words_of_qgis(said, labels)
     assert told == "Give one source: “Place” PLACE, or “Build road reference”; `roadgeo simulate` and --gsd-like stay"
@@ -169,8 +169,11 @@ def test_installing_replaces_enables_and_remembers(tmp_path: Path) -> None:
         folder = install_plugin(tmp_path)
         assert folder == tmp_path / "python" / "plugins" / NAME
         installed = {path.name for path in folder.rglob("*")}
-        offered = json.loads((folder / installation.OUTPUTS).read_text("utf-8"))
-        assert offered == {name: output.summary for name, output in ALSO.items()}
+        table = json.loads((folder / installation.TABLE).read_text("utf-8"))
+        assert table["outputs"] == {name: output.summary for name, output in ALSO.items()}
+        assert [name for name, row in table["options"]["locate"].items() if row["is_hint"]] == [
+            hint.option for hint in HINTS.values()
+        ]
         assert {"__init__.py", "metadata.txt", "icon.svg", "LICENSE", "algorithms.py"} <= installed
         assert not {"outdated.py", "__pycache__"} & installed
         assert settings.read_bytes() == (
@@ -342,12 +345,8 @@ def test_the_provider_loads_and_explains_itself(qgis: Qgis) -> None:
     assert [name for name in names if f"roadgeo:{name}\t" in listed] == names
     explained = qgis.tool("help", "roadgeo:georeferenceimage").stdout
     assert "Cloud Optimized GeoTIFF" in explained
-
-
-def test_defaults_are_those_of_the_command_line() -> None:
-    source = (PLUGIN / "parameters.py").read_text("utf-8")
-    defaults = [float(text) for text in re.findall(r'"defaultValue": ([\d_.]+)', source)]
-    assert tuple(defaults[:2]) == LocateOptions().match.camera.gsd_m
+    assert all(f"\n{name.upper()}: {hint.label}\n" in explained for name, hint in HINTS.items())
+    assert "--" not in re.sub(r"-{4,}", "", explained)
 
 
 def test_a_located_mask_lies_where_the_truth_says(located: Path) -> None:
@@ -362,7 +361,7 @@ def test_a_photograph_is_located(qgis: Qgis, porto: Path) -> None:
     pytest.importorskip("onnxruntime")
     folder = qgis.folder / "photograph"
     wanted = ["--", f"MASK={PHOTO}", f"REFERENCE={porto}", f"OUTPUT_FOLDER={folder}"]
-    done = qgis.tool("run", "roadgeo:locatemask", *wanted, "PIXEL_SIZE=1", "SEGMENT=auto")
+    done = qgis.tool("run", "roadgeo:locatemask", *wanted, "GSD=1", "SEGMENT=auto")
     assert done.returncode == 0, done.stderr
     assert "STATUS:\tlocated" in done.stdout
     assert f"FOOTPRINT:\t{folder / 'drone_photo_footprint.tif'}" in done.stdout
@@ -395,13 +394,13 @@ def test_errors_are_shown_in_the_words_of_qgis(qgis: Qgis, porto: Path) -> None:
     build = {"OUTPUT": str(qgis.folder / "x.gpkg")}
     (absent, scales, twice, nothing, nameless), _, _ = qgis.ask(
         ("run", {"algorithm": locate, "parameters": {**wanted, "REFERENCE": str(qgis.folder / "none.gpkg")}}),
-        ("run", {"algorithm": locate, "parameters": {**wanted, "GSD_MIN": 90}}),
+        ("run", {"algorithm": locate, "parameters": {**wanted, "GSD": "90:12"}}),
         ("run", {"algorithm": locate, "parameters": {**wanted, "AREA": "0,1,0,1 [EPSG:4326]", "WITHIN": "Portugal"}}),
         ("run", {"algorithm": "roadgeo:buildreference", "parameters": build}),
         ("run", {"algorithm": "roadgeo:buildreference", "parameters": {"EXTENT": "0,1,0,1 [EPSG:4326]"}}),
     )
     assert "no reference '" in absent["failed"]
-    assert "“Least pixel size, metres”" in scales["failed"]
+    assert "“Pixel size, metres”" in scales["failed"]
     assert "by name or by a part of the map" in twice["failed"]
     assert "Give one source of roads" in nothing["failed"]
     assert "Give the reference a name" in nameless["failed"]
@@ -496,7 +495,7 @@ def test_a_mask_is_vectorized(qgis: Qgis) -> None:
 
 def test_a_photograph_is_vectorized(qgis: Qgis) -> None:
     photo = MASKS["drone"].path.with_name("drone_photo.jpg")
-    arguments = {"MASK": str(photo), "OUTPUT_FOLDER": str(qgis.folder / "seen"), "GSD_MIN": 0.8, "GSD_MAX": 1.2}
+    arguments = {"MASK": str(photo), "OUTPUT_FOLDER": str(qgis.folder / "seen"), "GSD": "0.8:1.2"}
     (done,), _, _ = qgis.ask(("run", {"algorithm": "roadgeo:vectorizemask", "parameters": arguments}))
     assert set(done["layers"]) == {"Roads as seen", "Intersections as seen"}
     assert all(layer["features"] > 30 for layer in done["layers"].values())

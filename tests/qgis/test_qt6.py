@@ -58,7 +58,7 @@ def test_it_loads_runs_and_unloads(python: str, plugin: Path, tmp_path: Path) ->
     assert done.returncode == 0, done.stderr
     answer = json.loads(done.stdout)
     assert len(answer["algorithms"]) == 8
-    for name, (help_page, parameters, outputs, folded) in answer["algorithms"].items():
+    for name, (help_page, parameters, outputs, folded, _) in answer["algorithms"].items():
         assert help_page.startswith("file:///")
         assert help_page.endswith(f"help.html#{name}")
         assert parameters > 2
@@ -68,6 +68,41 @@ def test_it_loads_runs_and_unloads(python: str, plugin: Path, tmp_path: Path) ->
     assert answer["layers"] == ["mask matches", "mask residuals", "mask roads", "mask footprint", "mask"]
     assert answer["told"] == ["locatemask", "mask", "located"]
     assert answer["pages"] == [str(tmp_path / "found" / "mask_report.html")]
+
+
+#: A program that adds a row to the table of hints, installs the plugin, and lists what the other faces make of it.
+ANOTHER_ROW = """
+import json, sys
+from pathlib import Path
+from roadgeo.matching.hints import HINTS, Hint
+schema = {"type": "number", "minimum": 0, "maximum": 1}
+HINTS["cloud"] = Hint("cloud", "cloud_share", "SHARE", "Clouds", "How much they hide.", float, schema, 0.1)
+import roadgeo
+from roadgeo.cli.locate import locate_command
+from roadgeo.qgis.installation import install_plugin
+from roadgeo.running.serving.documents import documents_of
+from roadgeo.running.serving.requests import read_query_string
+options = {name: one.help for one in locate_command.params for name in one.opts}
+inputs = documents_of(["porto"])["/processes/locate"]["inputs"]
+told = [options.get("--cloud"), inputs["cloud"]["title"], read_query_string("cloud=0.5")]
+print(json.dumps([*told, str(install_plugin(Path(sys.argv[1])))]))
+"""
+
+
+def test_a_new_row_of_the_table_is_an_option_everywhere(python: str, tmp_path: Path) -> None:
+    """On the command line, over HTTP and in QGIS by itself; `test_options` asks for the keyword of Python."""
+    command = [sys.executable, "-c", ANOTHER_ROW, str(tmp_path)]
+    made = subprocess.run(command, capture_output=True, text=True, check=False, timeout=120)
+    assert made.returncode == 0, made.stderr
+    typed, described, read, plugin = json.loads(made.stdout)
+    assert typed == described == "How much they hide. Default: 0.1."
+    assert read == {"cloud_share": 0.5}
+    done = run(python, Path(plugin), tmp_path)
+    assert done.returncode == 0, done.stderr
+    algorithms = json.loads(done.stdout)["algorithms"]
+    for name in ("locatemask", "locatemasks", "georeferenceimage"):
+        assert algorithms[name][-1]["CLOUD"] == "Number"
+        assert algorithms[name][-1]["EFFORT"] == "Enum"
 
 
 @pytest.mark.parametrize(

@@ -346,6 +346,7 @@ def main():
         told[made.name()] = [made.helpUrl(), len(made.parameters), len(made.outputs)]
         folded = [one for one in made.parameters.values() if one.flags() & Definition.Flag.FlagAdvanced]
         told[made.name()].append(len(folded))
+        told[made.name()].append({name: type(one).__name__ for name, one in made.parameters.items()})
     locate = next(one for one in provider.algorithms if one.name() == "locatemask").createInstance()
     locate.initAlgorithm()
     context, feedback = Context(), Feedback()

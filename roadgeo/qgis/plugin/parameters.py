@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import json
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Any
@@ -172,10 +172,6 @@ def _crs(values: Values, name: str) -> list[str]:
     return [f"--crs={name_crs(values.get('Crs', name))}"]
 
 
-def _scales(values: Values, name: str) -> list[str]:
-    return [f"--gsd={values.get('Double', name):.9g}:{values.get('Double', 'GSD_MAX'):.9g}"]
-
-
 def _near(values: Values, name: str) -> list[str]:
     point = values.in_degrees("Point", name)
     return [f"--near={point.x():.9g},{point.y():.9g},{values.get('Double', 'NEAR_RADIUS'):.9g}"]
@@ -197,39 +193,52 @@ def _lines(values: Values, name: str) -> list[str]:
     return [f"--roads={path}", *([f"--layer={layer}"] if layer else []), f"--crs={crs}"]
 
 
-# --- kinds of parameters ----------------------------------------------------------------------------------------------
+# --- parameters from the table of options -----------------------------------------------------------------------------
+
+#: The command line's options, and the outputs of `--also` with their purpose: written when the plugin is installed or
+#: packed, for QGIS's Python has no roadgeo.
+_TABLE: dict[str, Any] = json.loads((Path(__file__).parent / "table.json").read_text("utf-8"))
+_OUTPUTS: dict[str, str] = _TABLE["outputs"]
 
 
-def _maybe_unset(settings: dict[str, Any]) -> dict[str, Any]:
-    """Let a parameter that has no default be left out."""
-    return {"optional": "defaultValue" not in settings, **settings}
+def _option(command: str, flag: str, label: str = "", name: str = "", hint: str = "", **settings: Any) -> Option:
+    """Make a parameter of an option of the table; what is given replaces the table's. A default is not said."""
+    row = _TABLE["options"][command][flag]
+    kind, say, form = _form(flag, row["schema"])
+    given = {"defaultValue": row["default"]} if row["default"] != "" else {}
+    settings = {**form, **given, **settings}
 
+    def arguments(values: Values, name: str) -> list[str]:
+        said = say(values, name)
+        return [] if said == [f"{flag}={row['default']}"] else said
 
-def _number(flag: str, name: str, label: str, hint: str, **settings: Any) -> Option:
-    settings = {"type": QgsProcessingParameterNumber.Type.Double, **_maybe_unset(settings)}
     return Option(
-        QgsProcessingParameterNumber, name, label, hint, _said(flag, "Double", "{:.12g}"), settings, flag=flag
+        kind,
+        name or flag[2:].replace("-", "_").upper(),
+        label or row["label"],
+        hint or row["help"],
+        arguments,
+        {"optional": "defaultValue" not in settings or kind is QgsProcessingParameterString, **settings},
+        flag=flag,
     )
 
 
-def _integer(flag: str, name: str, label: str, hint: str, **settings: Any) -> Option:
-    settings = {"type": QgsProcessingParameterNumber.Type.Integer, **_maybe_unset(settings)}
-    return Option(QgsProcessingParameterNumber, name, label, hint, _said(flag, "Int"), settings, flag=flag)
-
-
-def _text(flag: str, name: str, label: str, hint: str) -> Option:
-    return Option(QgsProcessingParameterString, name, label, hint, _said(flag, "String"), {"optional": True}, flag=flag)
-
-
-def _switch(flag: str, name: str, label: str, hint: str) -> Option:
-    settings = {"defaultValue": False}
-    return Option(QgsProcessingParameterBoolean, name, label, hint, _switched(flag), settings, flag=flag)
-
-
-def _choice(flag: str, name: str, label: str, hint: str, words: list[str], **settings: Any) -> Option:
-    """Make a choice among words of the command line."""
-    settings = {"options": words, "usesStaticStrings": True, **_maybe_unset(settings)}
-    return Option(QgsProcessingParameterEnum, name, label, hint, _chosen(flag), settings, flag=flag)
+def _form(flag: str, schema: Mapping[str, Any]) -> tuple[Any, Callable[[Values, str], list[str]], dict[str, Any]]:
+    """Return class, way to say a value, and settings of the parameter whose values a JSON Schema describes."""
+    kind = schema.get("type", "string")
+    if kind == "boolean":
+        return QgsProcessingParameterBoolean, _switched(flag), {"defaultValue": False}
+    if "enum" in schema:
+        return QgsProcessingParameterEnum, _chosen(flag), {"options": schema["enum"], "usesStaticStrings": True}
+    if kind in ("number", "integer"):
+        limits = {"minValue": schema.get("minimum", schema.get("exclusiveMinimum")), "maxValue": schema.get("maximum")}
+        form = {name: limit for name, limit in limits.items() if limit is not None}
+        if kind == "integer":
+            whole = QgsProcessingParameterNumber.Type.Integer
+            return QgsProcessingParameterNumber, _said(flag, "Int"), {"type": whole, **form}
+        real = QgsProcessingParameterNumber.Type.Double
+        return QgsProcessingParameterNumber, _said(flag, "Double", "{:.12g}"), {"type": real, **form}
+    return QgsProcessingParameterString, _said(flag, "String"), {}
 
 
 def _raster(name: str, label: str, hint: str) -> Option:
@@ -260,30 +269,15 @@ QUERY = replace(
 ITS_MASK = replace(
     MASK, hint=f"{MASK.hint} Empty: a network finds the roads of the image.", settings={"optional": True}
 )
-_THRESHOLD = _number("--threshold", "THRESHOLD", "Threshold", "Values above it are road. Empty: told by the values.")
-_BAND_HINT = "Band that holds the mask. Empty: told by the bands."
+_BAND = _option("locate", "--band", "Band")
+_THRESHOLD = _option("locate", "--threshold", "Threshold")
 MASK_VALUES = _fold(
-    Option(
-        QgsProcessingParameterBand,
-        "BAND",
-        "Band",
-        _BAND_HINT,
-        _said("--band", "Int"),
-        {"parentLayerParameterName": "MASK", "optional": True},
-        flag="--band",
-    ),
+    replace(_BAND, kind=QgsProcessingParameterBand, settings={"parentLayerParameterName": "MASK", "optional": True}),
     _THRESHOLD,
 )
 
 SEGMENT = _fold(
-    _choice(
-        "--segment",
-        "SEGMENT",
-        "Find roads in photographs",
-        "In what looks like one (auto), in everything (always), or in nothing (never).",
-        ["auto", "always", "never"],
-        defaultValue="auto",
-    ),
+    _option("locate", "--segment", "Find roads in photographs"),
     Option(
         QgsProcessingParameterFile,
         "SEGMENTER",
@@ -295,8 +289,8 @@ SEGMENT = _fold(
     ),
 )
 
-REPORT = _switch(
-    "--report", "REPORT", "Open a report", "Writes a page with map, mask, residuals and numbers, and opens it."
+REPORT = _option(
+    "locate", "--report", "Open a report", hint="A page with map, mask, residuals and numbers, in the browser."
 )
 
 REFERENCE = Option(
@@ -309,49 +303,10 @@ REFERENCE = Option(
     metadata={"widget_wrapper": {"class": f"{__package__}.references.ReferenceWrapper"}},
 )
 
-PIXEL_SIZE = _fold(
-    Option(
-        QgsProcessingParameterNumber,
-        "GSD_MIN",
-        "Least pixel size, metres",
-        "How much ground a pixel at the middle of the mask covers, at least and at most: the search is narrowed.",
-        _scales,
-        {"type": QgsProcessingParameterNumber.Type.Double, "defaultValue": 0.1, "minValue": 1e-3},
-        flag="--gsd",
-    ),
-    Option(
-        QgsProcessingParameterNumber,
-        "GSD_MAX",
-        "Greatest pixel size, metres",
-        "See above.",
-        settings={"type": QgsProcessingParameterNumber.Type.Double, "defaultValue": 12.0, "minValue": 1e-3},
-    ),
-    Option(  # behind the two numbers: of options that are given twice the last one counts
-        QgsProcessingParameterString,
-        "PIXEL_SIZE",
-        "Or pixel size, as text",
-        "0.3 (from 0.24 to 0.375), 0.3+-10% or 0.3:0.6, metres, as on the command line. It goes before the numbers.",
-        _said("--gsd", "String"),
-        {"optional": True},
-    ),
-)
+PIXEL_SIZE = _fold(_option("locate", "--gsd"))
 
-CAMERA = PIXEL_SIZE + _fold(
-    _number(
-        "--max-tilt",
-        "MAX_TILT",
-        "Greatest tilt, degrees",
-        "Greatest angle of the camera from the vertical.",
-        minValue=0.0,
-        maxValue=80.0,
-    ),
-    _text(
-        "--focal",
-        "FOCAL_LENGTH",
-        "Focal length",
-        "In pixels of the mask; or the word exif: as the image, or else the mask, says. Empty: not known.",
-    ),
-    _switch("--north-up", "NORTH_UP", "North is up", "The top of the mask is north."),
+#: All hints on an image, in the order of the table; a place is clicked on the map.
+CAMERA = _fold(
     Option(
         QgsProcessingParameterPoint,
         "NEAR",
@@ -368,27 +323,10 @@ CAMERA = PIXEL_SIZE + _fold(
         "How near.",
         settings={"type": QgsProcessingParameterNumber.Type.Double, "defaultValue": 10_000.0, "minValue": 1.0},
     ),
-    _text(
-        "--within",
-        "WITHIN",
-        "In the country or state",
-        "The middle of the mask lies in this country or state (Liechtenstein; USA - Utah). Empty: not known.",
-    ),
-    _choice(
-        "--effort",
-        "EFFORT",
-        "Effort",
-        "quick: end the search early, for masks that are clean. full: try harder on those that are broken.",
-        ["quick", "full"],
-        defaultValue="full",
-    ),
-    _number(
-        "--time-limit",
-        "TIME_LIMIT",
-        "Time limit, seconds",
-        "Stop searching for a mask after this time.",
-        defaultValue=60.0,
-        minValue=0.1,
+    *(
+        _option("locate", flag)
+        for flag, row in _TABLE["options"]["locate"].items()
+        if row["is_hint"] and flag != "--near"
     ),
 )
 
@@ -401,9 +339,6 @@ AREA = Option(
     {"optional": True},
     flag="--within",
 )
-
-#: Outputs that `--also` offers, with their purpose: written when the plugin is installed or packed.
-_OUTPUTS: dict[str, str] = json.loads((Path(__file__).parent / "outputs.json").read_text("utf-8"))
 
 PICTURE = (
     _raster(
@@ -421,28 +356,16 @@ PICTURE = (
         flag="--crs",
     ),
     *_fold(
-        _number(
-            "--resolution",
-            "RESOLUTION",
-            "Pixel size of the result",
-            "In units of its CRS. Empty: the image's own.",
-            minValue=0.0,
-        ),
-        _choice(
-            "--resampling",
-            "RESAMPLING",
-            "Resampling",
-            "How values between the image's pixels are found.",
-            ["nearest", "bilinear", "cubic", "lanczos"],
-            defaultValue="cubic",
-        ),
-        _choice(
-            "--also",
+        _option("locate", "--resolution", "Pixel size of the result"),
+        _option("locate", "--resampling", "Resampling"),
+        Option(
+            QgsProcessingParameterEnum,
             "PRODUCTS",
             "Also write",
             f"Further forms of the result. {'; '.join(f'{name}: {what}' for name, what in _OUTPUTS.items())}.",
-            list(_OUTPUTS),
-            allowMultiple=True,
+            _chosen("--also"),
+            {"options": list(_OUTPUTS), "usesStaticStrings": True, "allowMultiple": True, "optional": True},
+            flag="--also",
         ),
     ),
 )
@@ -451,24 +374,8 @@ BATCH = (
     _folder("MASKS", "Folder of road masks or photographs", "Every image in it is located."),
     REFERENCE,
     AREA,
-    _integer(
-        "--jobs",
-        "JOBS",
-        "Processes",
-        "How many masks are located at the same time.",
-        defaultValue=1,
-        minValue=1,
-    ),
-    *_fold(
-        _switch(
-            "--skip-existing",
-            "SKIP_EXISTING",
-            "Keep earlier results",
-            "Masks that have a result in the folder, younger than they are, are not located again.",
-        ),
-        _integer("--band", "BAND", "Band", _BAND_HINT, minValue=1),
-        _THRESHOLD,
-    ),
+    _option("locate", "--jobs", "Processes"),
+    *_fold(_option("locate", "--skip-existing", "Keep earlier results"), _BAND, _THRESHOLD),
 )
 
 ROADS = (
@@ -481,7 +388,7 @@ ROADS = (
         {"types": [QgsProcessing.SourceType.TypeVectorLine], "optional": True},
         flag="--roads",
     ),
-    _text("--osm", "PLACE", "Place", "The name of a place in OpenStreetMap, such as Boston, MA."),
+    _option("index", "--osm", "Place", "PLACE", "The name of a place in OpenStreetMap, such as Boston, MA."),
     Option(
         QgsProcessingParameterExtent,
         "EXTENT",
@@ -491,19 +398,19 @@ ROADS = (
         {"optional": True},
         flag="--bbox",
     ),
-    _text("--name", "NAME", "Name", "Of the reference, in the list. Empty: after the place, the file or the layer."),
-    _choice(
+    _option(
+        "index", "--name", "Name", hint="Of the reference, in the list. Empty: after the place, the file or the layer."
+    ),
+    _option(
+        "index",
         "--kinds",
-        "KINDS",
         "Which roads",
-        "Those that the masks show, where the data tell kinds apart: main roads, public ones for cars (drivable), all "
-        "for vehicles, or all.",
-        ["main", "drivable", "vehicles", "all"],
-        defaultValue="drivable",
+        hint="Those that the masks show, where the data tell kinds apart: main roads, public ones for cars (drivable), "
+        "all for vehicles, or all.",
     ),
     *_fold(
-        _switch("--tunnels", "TUNNELS", "Tunnels too", "A camera does not see them."),
-        _text("--attribution", "ATTRIBUTION", "Attribution", "Whom to name beside the map; goes with road lines."),
+        _option("index", "--tunnels", "Tunnels too"),
+        _option("index", "--attribution", "Attribution", hint="Whom to name beside the map; goes with road lines."),
     ),
     Option(
         QgsProcessingParameterFileDestination,
@@ -525,34 +432,31 @@ LOCALIZABILITY = (
         hint="What Build road reference made: one of the list, or a file.",
         settings={"optional": False},
     ),
-    _number(
+    _option(
+        "evaluate",
         "--height",
-        "HEIGHT",
         "Height above ground, metres",
-        "Of the flight. With the focal length it says how large a pixel is.",
+        hint="Of the flight. With the focal length it says how large a pixel is.",
         defaultValue=400.0,
-        minValue=1.0,
     ),
-    _number("--focal", "FOCAL", "Focal length, pixels", "Of the camera.", defaultValue=1000.0, minValue=1.0),
-    _integer("--size", "SIZE", "Side of the image, pixels", "Of a square one.", defaultValue=1000, minValue=32),
-    _choice(
+    _option("evaluate", "--focal", "Focal length, pixels", hint="Of the camera.", defaultValue=1000.0),
+    _option("evaluate", "--size", "Side of the image, pixels", hint="Of a square one.", defaultValue=1000),
+    _option(
+        "evaluate",
         "--noise",
-        "NOISE",
         "How good the masks are",
-        "Clean, as a network makes them (segmented), or poor.",
-        ["clean", "segmented", "poor"],
+        hint="Clean, as a network makes them (segmented), or poor.",
         defaultValue="segmented",
     ),
     *_fold(
-        _integer(
+        _option(
+            "evaluate",
             "--count",
-            "COUNT",
             "Masks to try",
-            "More of them tell neighbouring places apart more surely, and take longer.",
+            hint="More of them tell neighbouring places apart more surely, and take longer.",
             defaultValue=600,
-            minValue=1,
         ),
-        _integer("--jobs", "JOBS", "Processes", "How many masks are tried at once.", defaultValue=1, minValue=1),
+        _option("evaluate", "--jobs", "Processes"),
     ),
     OUTPUT_FOLDER,
 )
@@ -579,11 +483,12 @@ SETUP = (
         "The program, or the Python that has it or that is to have it, 3.11 or newer. Empty: searched for.",
         settings={"optional": True, "fileFilter": "All files (*)"},  # "*.*", the usual, refuses names without a dot
     ),
-    _switch(
-        "",
+    Option(
+        QgsProcessingParameterBoolean,
         "INSTALL",
         "Install roadgeo into an environment of its own",
         "With that Python, in the folder below; takes some minutes, about 1 GB, and the network.",
+        settings={"defaultValue": False},
     ),
     *_fold(
         Option(

@@ -17,7 +17,7 @@ DOCUMENTS = ("/", "/api", "/conformance", "/processes", "/processes/locate", "/j
 
 #: Hints, as texts or as JSON.
 _HINTS: dict[str, dict[str, Any]] = {
-    hint.parameter: {"title": hint.help, "schema": {"anyOf": [hint.schema, {"type": "string"}]}}
+    hint.parameter: {"title": hint.told, "schema": {"anyOf": [hint.schema, {"type": "string"}]}}
     for hint in HINTS.values()
 }
 
