@@ -1,21 +1,35 @@
 """Write the tables of docs/how-well.md that each version measures again: python examples/tables.py BENCH.json.
 
 BENCH.json is the file `bench.json` of `python examples/bench.py --out FOLDER`; of two checkouts the first one counts.
-The bands of the odds are those of `error_rate` in a result. `--check` writes nothing, and fails if one would change.
+The bands of the odds are those of `error_rate` in a result. The table of worn masks counts the searches that are kept
+in `examples/trust/results`. `--check` writes nothing, and fails if a table would change.
 """
 
 from __future__ import annotations
 
 import argparse
+import csv
 import json
 import re
 from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
 
+import numpy as np
+
 from roadgeo.location import ERROR_RATES
 
 PAGE = Path(__file__).parents[1] / "docs" / "how-well.md"
+SEARCHES = Path(__file__).parent / "trust" / "results"
+#: A place is reported from this score on.
+NEEDED = 3.5
+WORN = {
+    "mild": "mild: 5 to 10 % of the roads gone, 2 to 5 % false",
+    "noisy": "noisy: 15 to 25 % gone, 5 to 12 % false",
+    "few": "few: mild, 8 to 18 intersections",
+    "torn": "torn: 30 to 50 % gone, 10 to 40 % false",
+    "outdated": "outdated: mild, 20 to 40 % of the streets unknown to the map",
+}
 NAMES = {
     "base": "usual: 10 % gone, 4 % false, ragged edges",
     "clean": "clean: level, nothing gone or false, smooth edges",
@@ -53,6 +67,23 @@ def bench_table(runs: dict[str, dict[str, Any]]) -> Iterator[str]:
         yield f"| {NAMES[kind]} | {right} | {wrong} | {corners} | {ratios} | {one['cpu_s'][0]:.2g} |"
 
 
+def worn_table() -> Iterator[str]:
+    """Yield the lines of the table of worn masks, from the searches of `examples/trust`."""
+    yield "| | full effort: located right | seconds, median / 95 % | quick effort: located right | seconds | wrong |"
+    yield "|---|---|---|---|---|---|"
+    for kind, name in WORN.items():
+        cells, wrong = [], 0
+        for effort in ("full", "quick"):
+            (path,) = SEARCHES.glob(f"{effort}_*.csv")
+            with path.open(encoding="utf-8", newline="") as file:
+                rows = [row for row in csv.DictReader(file) if (row["kind"], row["worn"]) == ("there", kind)]
+            reported = [row for row in rows if float(row["score"]) >= NEEDED]
+            right = [float(row["seconds"]) for row in reported if row["right"] == "1"]
+            wrong += len(reported) - len(right)
+            cells += [f"{len(right)} of {len(rows)}", "{:.2f} / {:.1f}".format(*np.percentile(right, (50, 95)))]
+        yield f"| {name} | {' | '.join(cells)} | {wrong} |"
+
+
 def trust_table() -> Iterator[str]:
     """Yield the lines of the table of scores."""
     yield "| score | reported | wrong |"
@@ -80,7 +111,7 @@ def main(arguments: list[str] | None = None) -> None:
     before = page = PAGE.read_text(encoding="utf-8")
     if options.bench:
         page = put(page, "bench", bench_table(json.loads(options.bench.read_text(encoding="utf-8"))))
-    page = put(page, "trust", trust_table())
+    page = put(put(page, "worn", worn_table()), "trust", trust_table())
     if options.check and page != before:
         raise SystemExit(f"Error: the tables of {PAGE.name} are out of date; run python examples/tables.py")
     if not options.check:
