@@ -1,6 +1,7 @@
 """QGIS with the plugin installed, and a reference that it built."""
 
 import os
+from collections.abc import Iterator
 from pathlib import Path
 
 import pytest
@@ -11,7 +12,7 @@ from roadgeo.evaluation.demo import ROADS
 
 
 @pytest.fixture(scope="session")
-def qgis(tmp_path_factory: pytest.TempPathFactory) -> Qgis:
+def qgis(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Qgis]:
     found = find_qgis()
     if found is None:
         if os.environ.get("ROADGEO_REQUIRE_QGIS"):
@@ -37,15 +38,16 @@ def qgis(tmp_path_factory: pytest.TempPathFactory) -> Qgis:
     with pytest.MonkeyPatch.context() as patch:
         patch.setenv("QGIS_CUSTOM_CONFIG_PATH", own["QGIS_CUSTOM_CONFIG_PATH"])
         assert main(["qgis", "install"]) == 0
-    return Qgis(*found, folder, {**kept, **own})
+    started = Qgis(*found, folder, {**kept, **own})
+    yield started
+    started.close()
 
 
 @pytest.fixture(scope="session")
 def porto(qgis: Qgis) -> Path:
     """The reference that *Build road reference* makes."""
     path = qgis.folder / "porto.gpkg"
-    done = qgis.tool("run", "roadgeo:buildreference", "--", f"ROADS={ROADS}", "KINDS=all", f"OUTPUT={path}")
-    assert done.returncode == 0, done.stderr
-    assert f"OUTPUT:\t{path}" in done.stdout
+    done = qgis.run("buildreference", ROADS=ROADS, KINDS="all", OUTPUT=path)
+    assert done["results"]["OUTPUT"] == str(path)
     assert path.with_suffix(".index").exists()
     return path

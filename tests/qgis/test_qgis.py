@@ -360,45 +360,34 @@ def test_a_photograph_is_located(qgis: Qgis, porto: Path) -> None:
     """The option finds its roads; told never to, it is taken for a mask, and no mask looks like that."""
     pytest.importorskip("onnxruntime")
     folder = qgis.folder / "photograph"
-    wanted = ["--", f"MASK={PHOTO}", f"REFERENCE={porto}", f"OUTPUT_FOLDER={folder}"]
-    done = qgis.tool("run", "roadgeo:locatemask", *wanted, "GSD=1", "SEGMENT=auto")
-    assert done.returncode == 0, done.stderr
-    assert "STATUS:\tlocated" in done.stdout
-    assert f"FOOTPRINT:\t{folder / 'drone_photo_footprint.tif'}" in done.stdout
+    wanted = {"MASK": PHOTO, "REFERENCE": porto, "OUTPUT_FOLDER": folder}
+    results = qgis.run("locatemask", **wanted, GSD="1", SEGMENT="auto")["results"]
+    assert results["STATUS"] == "located"
+    assert results["FOOTPRINT"] == str(folder / "drone_photo_footprint.tif")
     with rasterio.open(folder / "drone_photo_footprint.tif") as warped:  # the photograph itself, not its roads
         assert warped.count >= 3
     assert (folder / "drone_photo_mask.tif").exists()
     _, document = read_location(folder / "drone_photo_location.json")
     truth = Homography(MASKS["drone"].homography)(np.array(document["size"]) / 2)  # the mask was made of it
     assert np.hypot(document["center"]["x"] - truth[0], document["center"]["y"] - truth[1]) < 5
-    done = qgis.tool("run", "roadgeo:locatemask", *wanted, "SEGMENT=never")
-    assert done.returncode == 1
-    assert "ERROR:\t" in done.stderr
+    assert qgis.run("locatemask", **wanted, SEGMENT="never")["failed"]
 
 
 def test_a_refused_mask_is_a_warning_with_the_reason(qgis: Qgis, porto: Path) -> None:
-    arguments = {
-        "MASK": str(MASKS["elsewhere"].path),
-        "REFERENCE": str(porto),
-        "OUTPUT_FOLDER": str(qgis.folder / "no"),
-    }
-    (refused,), _, _ = qgis.ask(("run", {"algorithm": "roadgeo:locatemask", "parameters": arguments}))
+    mask, folder = MASKS["elsewhere"].path, qgis.folder / "no"
+    refused = qgis.run("locatemask", MASK=mask, REFERENCE=porto, OUTPUT_FOLDER=folder)
     assert refused["results"]["STATUS"] == "not_located"
     assert refused["layers"] == {}
     assert f"warning: elsewhere: {refused['results']['REASON']}" in refused["said"]
 
 
 def test_errors_are_shown_in_the_words_of_qgis(qgis: Qgis, porto: Path) -> None:
-    wanted = {"MASK": str(MASKS["drone"].path), "OUTPUT_FOLDER": str(qgis.folder / "errors"), "REFERENCE": str(porto)}
-    locate = "roadgeo:locatemask"
-    build = {"OUTPUT": str(qgis.folder / "x.gpkg")}
-    (absent, scales, twice, nothing, nameless), _, _ = qgis.ask(
-        ("run", {"algorithm": locate, "parameters": {**wanted, "REFERENCE": str(qgis.folder / "none.gpkg")}}),
-        ("run", {"algorithm": locate, "parameters": {**wanted, "GSD": "90:12"}}),
-        ("run", {"algorithm": locate, "parameters": {**wanted, "AREA": "0,1,0,1 [EPSG:4326]", "WITHIN": "Portugal"}}),
-        ("run", {"algorithm": "roadgeo:buildreference", "parameters": build}),
-        ("run", {"algorithm": "roadgeo:buildreference", "parameters": {"EXTENT": "0,1,0,1 [EPSG:4326]"}}),
-    )
+    wanted = {"MASK": MASKS["drone"].path, "OUTPUT_FOLDER": qgis.folder / "errors", "REFERENCE": porto}
+    absent = qgis.run("locatemask", **{**wanted, "REFERENCE": qgis.folder / "none.gpkg"})
+    scales = qgis.run("locatemask", **wanted, GSD="90:12")
+    twice = qgis.run("locatemask", **wanted, AREA="0,1,0,1 [EPSG:4326]", WITHIN="Portugal")
+    nothing = qgis.run("buildreference", OUTPUT=qgis.folder / "x.gpkg")
+    nameless = qgis.run("buildreference", EXTENT="0,1,0,1 [EPSG:4326]")
     assert "no reference '" in absent["failed"]
     assert "“Pixel size, metres”" in scales["failed"]
     assert "by name or by a part of the map" in twice["failed"]
@@ -429,15 +418,12 @@ if sys.argv[1:3] == ["-m", "pip"]:
 """
     python = make_program(qgis.folder / "pythons" / "python3", body)
     old = make_program(qgis.folder / "pythons" / "python3.11", "import sys\nsys.exit(1)")
-    wanted = {"PROGRAM": str(python), "INSTALL": True, "SOURCE": "roadgeo", "FOLDER": str(qgis.folder / "environment")}
-    answers, _, _ = qgis.ask(
-        ("run", {"algorithm": "roadgeo:setup", "parameters": wanted}),
-        ("run", {"algorithm": "roadgeo:setup", "parameters": {**wanted, "FOLDER": str(qgis.folder / "pythons")}}),
-        ("run", {"algorithm": "roadgeo:setup", "parameters": {**wanted, "PROGRAM": str(old), "FOLDER": "/no/such"}}),
-        ("run", {"algorithm": "roadgeo:setup", "parameters": {"PROGRAM": str(old)}}),
-        ("forget_program", {}),
-    )
-    done, full, aged, named, _ = answers
+    wanted = {"PROGRAM": python, "INSTALL": True, "SOURCE": "roadgeo", "FOLDER": qgis.folder / "environment"}
+    done = qgis.run("setup", **wanted)
+    full = qgis.run("setup", **{**wanted, "FOLDER": qgis.folder / "pythons"})
+    aged = qgis.run("setup", **{**wanted, "PROGRAM": old, "FOLDER": "/no/such"})
+    named = qgis.run("setup", PROGRAM=old)
+    qgis.ask(("forget_program", {}))
     assert "results" in done, done
     assert done["results"]["FOUND"] == str(qgis.folder / "environment" / "bin" / "roadgeo")
     assert done["results"]["VERSION"] == "roadgeo"
@@ -473,8 +459,7 @@ def test_a_folder_of_masks_is_located_whatever_is_wrong_with_some(qgis: Qgis, po
     for name in ("map_sheet", "high_flight", "elsewhere"):
         shutil.copy(MASKS[name].path, masks)
     (masks / "broken.png").write_text("no picture")
-    arguments = {"MASKS": str(masks), "REFERENCE": str(porto), "OUTPUT_FOLDER": str(folder), "JOBS": 2}
-    (done,), _, _ = qgis.ask(("run", {"algorithm": "roadgeo:locatemasks", "parameters": arguments}))
+    done = qgis.run("locatemasks", MASKS=masks, REFERENCE=porto, OUTPUT_FOLDER=folder, JOBS=2)
     results = done["results"]
     assert [results[name] for name in ("LOCATED", "NOT_LOCATED", "FAILED")] == [2, 1, 1]
     assert done["layers"]["Footprints"]["features"] == 2
@@ -484,8 +469,7 @@ def test_a_folder_of_masks_is_located_whatever_is_wrong_with_some(qgis: Qgis, po
 
 
 def test_a_mask_is_vectorized(qgis: Qgis) -> None:
-    arguments = {"MASK": str(MASKS["segmenter"].path), "OUTPUT_FOLDER": str(qgis.folder / "seen")}
-    (done,), _, _ = qgis.ask(("run", {"algorithm": "roadgeo:vectorizemask", "parameters": arguments}))
+    done = qgis.run("vectorizemask", MASK=MASKS["segmenter"].path, OUTPUT_FOLDER=qgis.folder / "seen")
     assert set(done["layers"]) == {"Roads as seen", "Intersections as seen"}
     for layer in done["layers"].values():
         assert layer["valid"]
@@ -495,33 +479,24 @@ def test_a_mask_is_vectorized(qgis: Qgis) -> None:
 
 def test_a_photograph_is_vectorized(qgis: Qgis) -> None:
     photo = MASKS["drone"].path.with_name("drone_photo.jpg")
-    arguments = {"MASK": str(photo), "OUTPUT_FOLDER": str(qgis.folder / "seen"), "GSD": "0.8:1.2"}
-    (done,), _, _ = qgis.ask(("run", {"algorithm": "roadgeo:vectorizemask", "parameters": arguments}))
+    done = qgis.run("vectorizemask", MASK=photo, OUTPUT_FOLDER=qgis.folder / "seen", GSD="0.8:1.2")
     assert set(done["layers"]) == {"Roads as seen", "Intersections as seen"}
     assert all(layer["features"] > 30 for layer in done["layers"].values())
     assert (qgis.folder / "seen" / "drone_photo_mask.tif").exists()
 
 
 def test_where_masks_would_be_located_is_mapped(qgis: Qgis, porto: Path) -> None:
-    arguments = {"REFERENCE": str(porto), "OUTPUT_FOLDER": str(qgis.folder / "where"), "COUNT": 4, "NOISE": "clean"}
-    (done,), _, _ = qgis.ask(("run", {"algorithm": "roadgeo:maplocalizability", "parameters": arguments}))
+    folder = qgis.folder / "where"
+    done = qgis.run("maplocalizability", REFERENCE=porto, OUTPUT_FOLDER=folder, COUNT=4, NOISE="clean")
     assert set(done["layers"]) == {"porto: where it would work"}
     assert done["layers"]["porto: where it would work"]["renderer"] == "paletted"
 
 
 def test_results_are_loaded_with_their_styles(qgis: Qgis, porto: Path) -> None:
-    arguments = {
-        "MASK": str(MASKS["drone"].path),
-        "REFERENCE": str(porto),
-        "OUTPUT_FOLDER": str(qgis.folder / "loaded"),
-        "REPORT": True,
-    }
-    roads = {"ROADS": str(ROADS), "KINDS": "all", "OUTPUT": "again.gpkg"}  # in the folder that it runs in
-    (built, remembered, done), _, _ = qgis.ask(
-        ("run", {"algorithm": "roadgeo:buildreference", "parameters": roads}),
-        ("remembered", {}),
-        ("run", {"algorithm": "roadgeo:locatemask", "parameters": arguments}),
-    )
+    mask, folder = MASKS["drone"].path, qgis.folder / "loaded"
+    built = qgis.run("buildreference", ROADS=ROADS, KINDS="all", OUTPUT="again.gpkg")  # in the folder that it runs in
+    (remembered,), _, _ = qgis.ask(("remembered", {}))
+    done = qgis.run("locatemask", MASK=mask, REFERENCE=porto, OUTPUT_FOLDER=folder, REPORT=True)
     assert built["layers"]["again roads"]["colors"] == [MAP_ROAD]
     assert set(built["layers"]) == {"again roads", "again coverage", "again intersections"}
     assert str(qgis.folder / "again.gpkg") in remembered
@@ -643,10 +618,9 @@ def test_a_georeferenced_image_agrees_with_the_homography_everywhere(qgis: Qgis,
     height, width = cv2.imread(str(mask), cv2.IMREAD_GRAYSCALE).shape
     size = (width // 2, height // 2)
     picture = coordinate_picture(qgis.folder / "photo.tif", size)
-    inputs = [f"IMAGE={picture}", f"MASK={mask}", f"REFERENCE={porto}", f"OUTPUT_FOLDER={folder}"]
-    more = [*(f"PRODUCTS={product}" for product in ALSO), "RESAMPLING=bilinear"]
-    done = qgis.tool("run", "roadgeo:georeferenceimage", "--", *inputs, *more)
-    assert done.returncode == 0, done.stderr
+    inputs = {"IMAGE": picture, "MASK": mask, "REFERENCE": porto, "OUTPUT_FOLDER": folder}
+    done = qgis.run("georeferenceimage", **inputs, PRODUCTS=list(ALSO), RESAMPLING="bilinear")
+    assert done["results"]["STATUS"] == "located"
     _, document = read_location(folder / "drone_location.json")
     homography = Homography(np.array(document["homography"]) @ np.diag([2, 2, 1]))
     warped = Warped(folder / "drone_footprint.tif", folder / "photo.tif.points", homography, size)
@@ -660,8 +634,7 @@ def test_a_georeferenced_image_agrees_with_the_homography_everywhere(qgis: Qgis,
 def test_ten_real_masks_agree_with_their_homographies(qgis: Qgis, data_dir: Path) -> None:
     reference, photos, folder = qgis.folder / "boston.gpkg", qgis.folder / "photos", qgis.folder / "ten"
     roads = data_dir / "boston" / "boston_osm_roads.gpkg"
-    done = qgis.tool("run", "roadgeo:buildreference", "--", f"ROADS={roads}", f"OUTPUT={reference}")
-    assert done.returncode == 0, done.stderr
+    assert qgis.run("buildreference", ROADS=roads, OUTPUT=reference)["results"]["OUTPUT"] == str(reference)
     tiles = (data_dir / "massachusetts" / "tiles.csv").read_text("utf-8").splitlines()
     stems = [row.partition(",")[0] for row in tiles if ",True," in row][:10]
     photos.mkdir()

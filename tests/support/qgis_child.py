@@ -1,8 +1,10 @@
-"""What the tests ask of QGIS: run by QGIS's own Python as a child of `test_qgis.py`, with a list of tasks."""
+"""What the tests ask of QGIS: run by QGIS's own Python as a child of the tests, which send it lists of tasks."""
 
 import json
 import os
 import sys
+import traceback
+from multiprocessing.connection import Connection
 from pathlib import Path
 
 import qgis.utils
@@ -168,8 +170,8 @@ def project(points, pixels):
 
 
 def main():
-    """Do the tasks of a JSON file, a list of [function, arguments]; write what they return, and QGIS's warnings."""
-    tasks, answers = sys.argv[1:]
+    """Do tasks as they come, lists of [function, arguments]; send what they return, and QGIS's warnings."""
+    pipe = Connection(int(sys.argv[1]))
     application = start()
     warnings = []
 
@@ -178,12 +180,20 @@ def main():
             warnings.append(f"{tag}: {text}")
 
     application.messageLog().messageReceived.connect(hear)
-    wanted = json.loads(Path(tasks).read_text("utf-8"))
-    answered = [globals()[name](**arguments) for name, arguments in wanted]
-    Path(answers).write_text(json.dumps({"answers": answered, "warnings": warnings}), "utf-8")
-    QgsProject.instance().clear()
-    sys.stdout.flush()
-    os._exit(0)  # QGIS 3.22 may crash as it takes itself apart
+    pipe.send_bytes(b"ready")
+    while True:
+        try:
+            wanted = json.loads(pipe.recv_bytes())
+        except EOFError:
+            os._exit(0)  # QGIS 3.22 may crash as it takes itself apart
+        warnings.clear()
+        try:
+            told = {"answers": [globals()[name](**arguments) for name, arguments in wanted], "warnings": warnings}
+        except Exception:
+            told = {"error": traceback.format_exc()}
+        QgsProject.instance().clear()
+        sys.stderr.flush()
+        pipe.send_bytes(json.dumps(told).encode())
 
 
 main()
