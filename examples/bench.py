@@ -206,7 +206,7 @@ def bend(mask: Any, k1: float) -> Any:
     x, y = (column - width / 2) / half, (row - height / 2) / half
     bent = np.hypot(x, y)
     plain = bent.copy()
-    for _ in range(50):  # what lies beyond the frame stays black
+    for _ in range(50):  # ground beyond the frame stays black
         plain = np.minimum(bent / np.maximum(1.0 + k1 * plain**2, 0.5), 3.0)
     scale = half * plain / np.maximum(bent, 1e-9)
     sources = [(width / 2 + scale * x - 0.5).astype(np.float32), (height / 2 + scale * y - 0.5).astype(np.float32)]
@@ -218,7 +218,7 @@ def bend(mask: Any, k1: float) -> Any:
 
 
 def locate_all(folder: Path, city: str, record: Path) -> None:
-    """Locate the masks of a city with the checkout that is imported, by what it offers to everybody."""
+    """Locate the masks of a city with the checkout that is imported, through its public interface."""
     import roadgeo
 
     cv2.setNumThreads(1)
@@ -227,7 +227,7 @@ def locate_all(folder: Path, city: str, record: Path) -> None:
     if not masks:
         return
     reference = roadgeo.build_reference(folder / f"{city}.parquet")
-    roadgeo.locate(folder / f"{masks[0]}.png", reference)  # what is loaded once counts for no mask
+    roadgeo.locate(folder / f"{masks[0]}.png", reference)  # loading counts for no mask
     with record.open("a", encoding="utf-8") as file:
         for name in masks:
             started = time.process_time()
@@ -235,7 +235,7 @@ def locate_all(folder: Path, city: str, record: Path) -> None:
                 answer = roadgeo.locate(folder / f"{name}.png", reference).to_dict()
             except roadgeo.RoadgeoError as error:
                 answer = {"status": "not_located", "reason": str(error)}
-            except Exception as error:  # an engine in the making: counted, and told
+            except Exception as error:  # an engine in the making: counted and reported
                 answer = {"status": "error", "reason": f"{type(error).__name__}: {error}"}
             answer["cpu_s"] = time.process_time() - started
             file.write(json.dumps({"mask": name, "answer": answer}) + "\n")
@@ -409,7 +409,7 @@ def _untimed(answer: dict[str, Any]) -> dict[str, Any]:
 
 
 def report(names: Sequence[str], scores: Sequence[dict[str, Any]], answers: Sequence[Any]) -> tuple[str, Any]:
-    """Write the tables, and what they were made of."""
+    """Write the tables and their data."""
     runs = []
     for one in scores:
         found = list(one.values())

@@ -1,9 +1,9 @@
-"""How well flights are followed: simulated low flights over real cities, their motion known or told by their masks.
+"""How well flights are followed: simulated low flights over real cities, their motion known or taken from their masks.
 
     OMP_NUM_THREADS=1 python examples/flights.py boston.gpkg slc.gpkg liege.gpkg --flights 20 --seed 7
 
 Each flight is followed as `roadgeo track` does it, and then cut: frames of a flight over the next city come instead, as
-if nothing had happened. What is counted: the frame at which a flight was placed, whether it was placed right, how far
+if nothing had happened. Counted are the frame at which a flight was placed, whether it was placed right, how far
 the middle of each frame lies from the truth, processor time of a tracked frame, and after how many frames a cut was
 noticed. The flights of a seed are always the same; the defaults of `TrackOptions` were chosen on seed 100.
 """
@@ -36,7 +36,7 @@ CUT_FRAMES = 6
 
 @dataclass
 class Result:
-    """What became of one flight."""
+    """The outcome of one flight."""
 
     city: str
     number: int
@@ -108,7 +108,7 @@ def cut(tracker: Tracker, flight: Flight, other: Flight, result: Result) -> None
 
 
 def summarize_motion(results: list[Result]) -> dict[str, float]:
-    """How good the motion is that masks tell."""
+    """How good the motion of masks is."""
     told = [error for one in results for error in one.motion_errors_px]
     known = np.array([error for error in told if error is not None])
     return {

@@ -17,7 +17,7 @@ from roadgeo.workflows import LocateOptions
 reference = roadgeo.build_reference(gpd.read_file(ROADS), name="porto")
 folder = Path(tempfile.mkdtemp())
 
-# Options are small frozen dataclasses, one per stage, nested: replace what you know. What is known makes it surer.
+# Options are small frozen dataclasses, one per stage, nested: replace those that you know. Each makes the search surer.
 options = LocateOptions()
 camera = replace(options.match.camera, gsd_m=(0.5, 3.0), max_tilt_deg=40.0)
 options = replace(options, match=replace(options.match, camera=camera))

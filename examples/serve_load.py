@@ -3,7 +3,7 @@
     python examples/serve_load.py boston.gpkg mask.png --rate 200 --seconds 10 --hostile 10000
 
 Starts the server on a free port of this machine, posts a mask at a steady rate, whether or not earlier requests were
-answered, and then hostile requests; prints how many were located, how many were told to come again, how long both
+answered, and then hostile requests; prints how many were located, how many were asked to come again, how long both
 took, and whether the server still locates at the end. Nothing but loopback is asked.
 """
 
@@ -27,7 +27,7 @@ import numpy as np
 
 
 def post(port: int, body: bytes, path: str = "/locate", timeout: float = 90.0) -> tuple[int, float, bool]:
-    """Return status, seconds, and whether it said when to come again."""
+    """Return status, seconds, and whether it gave a time to come again."""
     head = f"POST {path} HTTP/1.1\r\nHost: 127.0.0.1\r\nContent-Length: {len(body)}\r\nConnection: close\r\n\r\n"
     return send(port, head.encode() + body, timeout)
 
@@ -46,12 +46,12 @@ def ask(port: int, data: bytes, timeout: float) -> tuple[bytes, float]:
             while part := sock.recv(65536):
                 answer += part
     except OSError:
-        pass  # what was answered before the connection broke counts
+        pass  # answers before the connection broke count
     return answer, time.perf_counter() - started
 
 
 def status_of(answer: bytes) -> int:
-    """Return the status of an answer, 0 of what is none."""
+    """Return the status of an answer, 0 where it is none."""
     return int(answer[9:12]) if answer[:5] == b"HTTP/" and answer[9:12].isdigit() else 0
 
 
@@ -113,7 +113,7 @@ def attack(port: int, mask: bytes, count: int, seed: int = 0) -> Counter[int]:
         status = status_of(answer)
         with lock:
             seen[status] += 1
-        if status == 500:  # a fault of the server: say which request, so that it can be sent again
+        if status == 500:  # a fault of the server: name the request, so that it can be sent again
             print(f"request {k} after {seconds:.1f} s: {data[:80]!r} -> {answer[-300:]!r}", flush=True)
 
     with ThreadPoolExecutor(16) as pool:

@@ -2,7 +2,7 @@
 
     OMP_NUM_THREADS=1 python examples/strips.py boston.gpkg slc.gpkg liege.gpkg --strips 5 --seed 7
 
-What is counted: strips of which all frames were placed, frames placed, and how far their middles lie from the truth.
+Counted are strips of which all frames were placed, frames placed, and how far their middles lie from the truth.
 """
 
 import argparse

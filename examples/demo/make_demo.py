@@ -37,7 +37,7 @@ PORTO = (-8.6600, 41.1380, -8.5820, 41.1830)  # west, south, east, north: about 
 ATTRIBUTION = "© OpenStreetMap contributors, ODbL 1.0"
 TAGS = ("highway", "name", "oneway", "junction", "bridge", "tunnel", "layer", "lanes", "service", "access", "area")
 
-#: Width on the ground of what OpenStreetMap draws as one line, metres.
+#: Width on the ground of a road that OpenStreetMap draws as one line, metres.
 WIDTH_M = {
     "motorway": 11.0,
     "motorway_link": 6.5,

@@ -1,4 +1,4 @@
-"""What the paper's experiments share: its settings and figures, its search area, locators, and how results are shown.
+"""Shared by the paper's experiments: its settings and figures, its search area, locators, and how results are shown.
 
 Li, Yang, Wang, He, "Road-network-based Rapid Geolocalization" (arXiv 1906.12174), section 4.
 """
@@ -144,7 +144,7 @@ class PairLocator:
 class AutoLocator:
     """roadgeo's default, on the middle of the mask that holds N_r of its intersections where `n_r` is given.
 
-    It goes by the roads too, so a subset of the intersections would leave it most of what it knows.
+    It goes by the roads too, so a subset of the intersections would leave it most of its knowledge.
     """
 
     reference: Path
@@ -163,7 +163,7 @@ class AutoLocator:
 
 
 def as_mask(mask: Any) -> RoadMask:
-    """Take a drawn mask, or the file of one, as `roadgeo.locate` does: the void corners of a warped one are told."""
+    """Take a drawn mask, or the file of one, as `roadgeo.locate` does: the void corners of a warped one are known."""
     from roadgeo.sources.masks import read_mask
 
     return read_mask(mask)
@@ -192,7 +192,7 @@ def middle(mask: RoadMask, n_r: int) -> RoadMask:
 
 
 def trials(queries: QuerySet, locator: Any, options: argparse.Namespace, what: str) -> tuple[list[Trial], Evaluation]:
-    """Run one point of an experiment and say so."""
+    """Run one point of an experiment and report it."""
     done = run_trials(queries, locator, options.jobs)
     found = evaluate([trial.truth for trial in done], [trial.answer for trial in done])
     total = found.total
@@ -213,7 +213,7 @@ def percent(value: float) -> str:
 
 
 def point(found: Evaluation) -> dict[str, Any]:
-    """What a figure or table shows of an evaluation, as plain values."""
+    """The figures of an evaluation, as plain values."""
     plain = found.to_dict()["total"]
     return {name: plain[name] for name in ("queries", "located", "precision", "recall", "center_m", "compute_s")}
 

@@ -3,7 +3,7 @@
     python examples/pose/measure.py REF.gpkg [--count 60] [--seed 5] [--noise segmented] [--out POSES.jsonl]
 
 Views are tilted by 5 to 45 degrees, of any heading, 0.5 to 1 m per pixel, 1200 x 1200, with a focal length of 1200
-pixels. Prints the errors with the focal length given and unknown, and how they compare with what is claimed.
+pixels. Prints the errors with the focal length given and unknown, and how they compare with the claims.
 """
 
 import argparse

@@ -24,7 +24,7 @@ PANELS = {
         ("memory_mb", "resident, most", "#2b2d42"),
     ],
 }
-#: What a column is divided by.
+#: Divisor of a column.
 UNITS = {"disk_mb": 1000.0, "memory_mb": 1000.0}
 
 

@@ -5,7 +5,7 @@
 
 Writes maps/map_01.shards and so on beside it: each the same network seen in a mirror, stretched and turned, indexed
 anew, on a part of the Earth of its own. No view of a camera from above is one of its mirror image, so a mask drawn from
-the first map has no place on the others. What is there already is kept: run it again to go on.
+the first map has no place on the others. Maps that exist are kept: run it again to go on.
 """
 
 import argparse
@@ -56,7 +56,7 @@ def transform(network: RoadNetwork, matrix: np.ndarray, crs: str) -> RoadNetwork
 
 
 def make_shard(source: Path, entry: ShardEntry, target: Path, k: int, build: str) -> ShardEntry:
-    """Write a shard of map k; return what its manifest says of it."""
+    """Write a shard of map k; return its entry in the manifest."""
     crs = f"+proj=aeqd +lat_0=0 +lon_0={APART_DEG * k} +datum=WGS84 +units=m"
     network = transform(read_network(source), transformation(k), crs)
     network = replace(network, meta={**network.meta, "shard_of": build})

@@ -1,4 +1,4 @@
-"""Locate masks on more and more maps, and tell what it takes.
+"""Locate masks on more and more maps, and report the cost.
 
     roadgeo simulate SHARD.gpkg -o masks/SHARD -n 6 --noise clean --noise segmented --tilt 0:20   # of some shards
     python examples/scale/measure.py maps/map_*.shards --masks masks --foreign strangers --out measured

@@ -1,4 +1,4 @@
-"""Make one road file of many copies of a map, none a twin of another: what does building a large map take?
+"""Make one road file of many copies of a map, none a twin of another, to measure how a large map is built.
 
     python examples/scale/roads.py roads.parquet ten.parquet --count 10
     roadgeo index --roads ten.parquet --shards auto --out ten.shards

@@ -1,6 +1,6 @@
 """Crops of pictures as other cameras, heights, seasons and decades would show them; many at a time, on any device.
 
-34 photographs of one survey are few: what the network does not see here it will not know elsewhere. Everything is done
+34 photographs of one survey are few: the network learns nothing that it does not see here. Everything is done
 in PyTorch where the network trains, for processors would draw crops more slowly than an accelerator learns from them.
 """
 
@@ -88,7 +88,7 @@ class Crops:
     ) -> None:
         self.size, self.scales, self.n_tiles, self.device = size, scales, len(tiles), device
         self.rng = torch.Generator(device).manual_seed(seed)
-        self._host = np.random.default_rng(seed)  # what has to be known on this side
+        self._host = np.random.default_rng(seed)  # numbers that are needed on this side
         sizes = [(tile.photo.shape[0], tile.photo.shape[1]) for tile in tiles]
         self.pictures = _Pictures.hold([*sizes, *[(scene_size, scene_size)] * scenes], device)
         for i, tile in enumerate(tiles):
@@ -210,7 +210,7 @@ class _Look:
         return self.uniform() < chance
 
     def some(self, share: float) -> Tensor:
-        """Return the indices of a share of the pictures, one or more: what takes time is done to these alone."""
+        """Return the indices of a share of the pictures, one or more: slow steps are applied to these alone."""
         chosen = self.host.permutation(self.n)[: max(1, round(share * self.n))]
         return torch.from_numpy(chosen).to(self.device)
 
@@ -220,7 +220,7 @@ class _Look:
         return functional.interpolate(coarse, size=(self.size, self.size), mode="bicubic", align_corners=False)
 
     def cover(self, photo: Tensor, truth: Tensor) -> Tensor:
-        """Cover ground in spots, pieces of road too, with what lies elsewhere in the picture: trees, shadows, roofs."""
+        """Cover ground in spots, pieces of road too, with other parts of the picture: trees, shadows, roofs."""
         some = self.some(0.4)
         n, own = len(some), photo[some]
         shift = self.host.integers(self.size // 4, 3 * self.size // 4, 2).tolist()

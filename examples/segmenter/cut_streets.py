@@ -1,6 +1,6 @@
 """Cut windows of real streets for painted scenes out of road files, such as extracts of OpenStreetMap.
 
-    python cut_streets.py porto.osm.pbf=60 boston.gpkg=70 --out streets.npz     # so many windows of each
+    python cut_streets.py porto.osm.pbf=60 boston.gpkg=70 --out streets.npz     # 60 and 70 windows
 
 Any file of lines with a column `highway` that pyogrio reads. Each window is 2.2 km wide, about a place on some road.
 """
@@ -73,7 +73,7 @@ def _windows(path: Path, number: int, rng: Generator) -> list[list[tuple[NDArray
 
 
 def _kind(highway: object) -> int:
-    """Return the index of a kind of road, -1 for what is none; of several the first counts."""
+    """Return the index of a kind of road, -1 for other lines; of several the first counts."""
     text = str(highway[0] if isinstance(highway, list | np.ndarray) and len(highway) else highway)
     text = text.strip("[]'\" ").split("'")[0].split(";")[0]
     text = "link" if text.endswith("_link") else ALIKE.get(text, text)

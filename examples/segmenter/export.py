@@ -4,7 +4,7 @@
 
 Of the pixels that a network calls .3, three in ten should be road. How far a network trained in the same way is from
 that is measured on photographs that it has not seen, those of the fold, and mended in the last layer: log odds become
-`a` times themselves plus `b`. What is exported runs in 8 bits (`quantize.py`).
+`a` times themselves plus `b`. The exported network runs in 8 bits (`quantize.py`).
 """
 
 from __future__ import annotations
@@ -34,7 +34,7 @@ OPSET = 17
 
 METADATA = {
     "model_type": "Segmentor",
-    # One output channel: Deepness counts it as two classes, told apart by the threshold.
+    # One output channel: Deepness counts it as two classes, which the threshold separates.
     "class_names": {"0": "not_road", "1": "road"},
     "resolution": 100,  # cm per pixel
     "tile_size": TILE,
@@ -61,7 +61,7 @@ def export(network: RoadNet, tiles: list[Tile], path: Path, threshold: float = 0
 
 
 def in_32_bits(network: RoadNet) -> onnx.ModelProto:
-    """Return the network as ONNX, with what is constant computed."""
+    """Return the network as ONNX, with its constants computed."""
     image, roads = torch.zeros(1, 3, TILE, TILE), Roads(network).float().eval()
     names = {"input_names": ["image"], "output_names": ["road"]}
     options = onnxruntime.SessionOptions()
@@ -140,7 +140,7 @@ def main() -> None:
         _print_reliability(seen, road)
         _print_reliability(1 / (1 + np.exp(-(a * np.log(seen / (1 - seen)) + b))), road)
         calibrate(network, a, b)
-        threshold = round(1 / (1 + math.exp(-b)), 2)  # what was one half before
+        threshold = round(1 / (1 + math.exp(-b)), 2)  # one half, before calibration
     print("wrote", export(network, tiles, options.path, threshold))
 
 

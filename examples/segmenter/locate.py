@@ -3,7 +3,7 @@
     python locate.py DATA --roads roads_from_labels.parquet --work measured [--model runs/fold0.onnx]
 
 Each held-out photograph is shown whole at 1, 0.5 and 2 m per pixel, as its better half, and as a tilted and turned
-camera would see it; nobody says how large the pixels are. Its true mask, cut and turned alike, shows what could be
+camera would see it; the size of the pixels is unknown. Its true mask, cut and turned alike, shows how much could be
 located at all. With --elsewhere REFERENCE the photographs are looked for on a map that they do not lie on, too.
 Results are kept in --work: a run that was cut short goes on.
 """

@@ -16,7 +16,7 @@ class LossOptions:
     """Weights of the parts of the loss."""
 
     dice: float = 0.5
-    centre: float = 0.3  # skeleton recall (Kirchhoff et al., ECCV 2024): what is lost of the centre lines
+    centre: float = 0.3  # skeleton recall (Kirchhoff et al., ECCV 2024): the share of the centre lines that is lost
     intersection: float = 0.3
     heading: float = 0.25
     coarse: float = 0.3

@@ -110,7 +110,7 @@ class RoadNet(nn.Module):
 
 
 class Roads(nn.Module):
-    """What is exported: RGB to the probability of road, (N, 1, H, W)."""
+    """The exported network: RGB to the probability of road, (N, 1, H, W)."""
 
     def __init__(self, network: RoadNet) -> None:
         super().__init__()

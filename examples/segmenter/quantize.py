@@ -26,8 +26,8 @@ _IN_8_BITS = ["Conv", "Add", "Relu", "Clip", "Resize"]
 def quantize(model: onnx.ModelProto, tiles: list[Tile]) -> onnx.ModelProto:
     """Return a network of float32, from "image" to "road", in 8 bits.
 
-    The last convolutions, which give the logits, and what follows stay in 32 bits: near a road's edge a step of 8 bits
-    would be seen.
+    The last convolutions, which give the logits, and the operators behind them stay in 32 bits: near a road's edge a
+    step of 8 bits would be seen.
     """
     side = model.graph.input[0].type.tensor_type.shape.dim[2].dim_value
     with tempfile.TemporaryDirectory() as folder:
@@ -71,7 +71,7 @@ def _last_layers(graph: onnx.GraphProto) -> list[str]:
 
 
 def fold(graph: onnx.GraphProto) -> None:
-    """Make one of what can be one: paddings and normalisations with the convolutions beside them.
+    """Merge operators: paddings and normalisations into the convolutions beside them.
 
     onnxruntime does so where a normalisation follows a convolution. Here also where features of two sizes were added
     before (`network.Up`), for a factor for each channel may as well come before enlarging and adding.

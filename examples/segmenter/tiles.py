@@ -18,7 +18,7 @@ Floats = NDArray[np.float32]
 
 @dataclass(frozen=True)
 class Tile:
-    """A photograph and what is known of it. Dimensions: H rows, W columns."""
+    """A photograph and its labels. Dimensions: H rows, W columns."""
 
     name: str
     photo: Bytes  # (H, W, 3) RGB

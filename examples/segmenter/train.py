@@ -54,7 +54,7 @@ def main(arguments: list[str] | None = None) -> None:
 
 
 def _write_map(network: RoadNet, tile: Tile, scale: float, folder: Path) -> None:
-    """Write TILE.png: the probability of road as grey (0 to 255) and what was observed as alpha."""
+    """Write TILE.png: the probability of road as grey (0 to 255) and the observed pixels as alpha."""
     folder.mkdir(parents=True, exist_ok=True)
     photo, observed = resample(tile.photo, scale), resample(tile.truth[..., 1], scale)
     road = (predict(network, photo, scale) * 255).round().astype(np.uint8)

@@ -1,4 +1,4 @@
-"""Training for so many minutes: a moving average of the weights, checkpoints on the way."""
+"""Training for a number of minutes: a moving average of the weights, checkpoints on the way."""
 
 from __future__ import annotations
 
@@ -33,7 +33,7 @@ class TrainingOptions:
     """How long and how fast."""
 
     minutes: float = 9.0
-    steps: int | None = None  # so many instead
+    steps: int | None = None  # a number of steps instead of minutes
     batch: int = 64
     size: int = 384  # px of a crop
     rate: float = 2e-3
@@ -223,7 +223,7 @@ def _save(path: Path, network: RoadNet) -> None:
 
 
 class _Clock:
-    """Says how much of the training is done, prints the parts of the loss, and when a checkpoint is due."""
+    """Knows how much of the training is done, prints the parts of the loss, and when a checkpoint is due."""
 
     def __init__(self, options: TrainingOptions, checkpoint: Path, every: int = 100) -> None:
         self.options, self.every, self.path = options, every, checkpoint.with_suffix(".log")

@@ -1,4 +1,4 @@
-"""A segmenter for roadgeo that asks samgeo (Segment Anything, prompted by text) for what is called a road."""
+"""A segmenter for roadgeo that asks samgeo (Segment Anything, prompted by text) for roads."""
 
 import tempfile
 from functools import cache
@@ -8,7 +8,7 @@ from roadgeo.sources.masks import read_mask
 
 
 def find_roads(photo):
-    """The mask of what is called a road in a photograph."""
+    """The mask of the roads in a photograph."""
     with tempfile.TemporaryDirectory() as folder:
         mask = Path(folder) / "roads.tif"
         _model().predict(str(photo), "road", box_threshold=0.24, text_threshold=0.24, output=str(mask))

@@ -14,7 +14,7 @@ shuffled    like `there`, cut into 6 x 6 blocks that were mixed and turned: road
 Every search is a line in `results/EFFORT/CITY_KIND.jsonl`; a run that was stopped goes on where it was, and a larger
 count goes on from a smaller one. Masks of all cities and kinds take turns, so that a table of half a run is fair. In
 the end `results/EFFORT.csv` holds a short line of each; `--add` counts such files of earlier runs, of other seeds, with
-this one. The table tells, for thresholds of the score, how many masks with a place would be located rightly, and how
+this one. The table shows, for thresholds of the score, how many masks with a place would be located rightly, and how
 many others or places would be reported wrongly, with bounds of 95 % confidence (Clopper and Pearson, Biometrika 26,
 1934).
 """
@@ -217,7 +217,7 @@ def _open(key: tuple[Path, ...], locator: ReferenceLocator) -> Callable[[Mask], 
 
 @dataclass(frozen=True)
 class Row:
-    """What one search came to: the kind of its mask, the best score, its lead, and whether the place was right."""
+    """The outcome of one search: the kind of its mask, the best score, its lead, and whether the place was right."""
 
     city: str
     seed: int
@@ -282,7 +282,7 @@ def percent(hits: int, of: int) -> str:
 
 
 def threshold_table(rows: Sequence[Row], least: float, margin: float) -> list[list[str]]:
-    """Tell for each threshold what is reported; below the usual one nobody knows which places were right."""
+    """List for each threshold the places reported; below the usual one it is unknown which were right."""
     there, nowhere = [r for r in rows if r.kind == "there"], [r for r in rows if r.kind != "there"]
     table = [["score at least", "with a place: right", "with a place: wrong", "without a place: wrong"]]
     for threshold in THRESHOLDS:
@@ -296,7 +296,7 @@ def threshold_table(rows: Sequence[Row], least: float, margin: float) -> list[li
 
 
 def band_table(rows: Sequence[Row], least: float, margin: float) -> list[list[str]]:
-    """Tell for each band of `ERROR_RATES`, which results state, what share of the places reported in it is wrong."""
+    """List for each band of `ERROR_RATES`, which results state, the share of wrong places."""
     table = [["score", "reported", "wrong"]]
     edges = [least, *(rate.score for rate in ERROR_RATES if rate.score > least)]
     for low, high in zip(edges, [*edges[1:], math.inf], strict=True):
@@ -307,7 +307,7 @@ def band_table(rows: Sequence[Row], least: float, margin: float) -> list[list[st
 
 
 def kind_table(rows: Sequence[Row], least: float, margin: float) -> list[list[str]]:
-    """Tell what became of each kind and wear."""
+    """List the outcome of each kind and wear."""
     table = [["mask", *WORN, "highest score without a place", "match + refine s, median / 95 %"]]
     for kind in KINDS:
         some = [r for r in rows if r.kind == kind]

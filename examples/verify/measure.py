@@ -3,7 +3,7 @@
     python examples/verify/measure.py OUT REF.gpkg... [--count 134] [--seed 3]
 
 Each reference draws `count` masks (clean, segmented and poor in turn; 0.5 to 2 m pixels, any heading, 1000 x 1000) as
-GeoTIFFs whose geotransform says where they are; every other one lies: by 5 to 300 m, up to 5 degrees. A tenth as many
+GeoTIFFs with a geotransform; that of every other one is wrong: by 5 to 300 m, up to 5 degrees. A tenth as many
 come from another reference's roads and must not be judged. One line of JSON per mask goes to OUT; a second run goes on
 where the first one ended. Prints the shares and errors.
 """
@@ -103,7 +103,7 @@ def main() -> None:
     landscapes = [read_landscape(path) for path in given.references]
     with tempfile.TemporaryDirectory() as folder, given.out.open("a") as out:
         opened = [open_reference(path) for path in given.references]
-        for k in range(given.count + given.count // 10):  # all places in turn: a part of it tells of all
+        for k in range(given.count + given.count // 10):  # all places in turn: a part of the run is a sample of all
             for n, path in enumerate(given.references):
                 elsewhere = landscapes[n - 1] if k >= given.count else None
                 if (path.stem, elsewhere is not None, k) in known:
