@@ -16,7 +16,7 @@ from typing import TYPE_CHECKING, Any
 
 import click
 
-from roadgeo.cli.options import OTHERS, Command, each, row, take
+from roadgeo.cli.options import OTHERS, Command, each, n_threads, row, take
 from roadgeo.cli.printing import echo
 from roadgeo.matching.hints import HINTS
 
@@ -131,7 +131,7 @@ def serve_command(
     options = _options(given)
     compile_once(quiet)
     maps = open_references(references, print_steps(quiet))
-    workers = Workers(references, options.workers, options.waiting)
+    workers = Workers(references, options.workers, options.waiting, n_threads(options.workers))
     try:
         sender = None if mavlink is None else MavlinkSender(mavlink)
         server = Server(workers, maps, options, None if sender is None else partial(_tell, sender))

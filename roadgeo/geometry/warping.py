@@ -147,26 +147,44 @@ def source_pixels(
     """
     to_pixel, to_crs = Homography(pixel_to_crs).inverse(), Homography(grid.to_crs_matrix(column, row))
 
-    def look_up(across: FloatArray, along: FloatArray) -> FloatArray:
+    def put(across: FloatArray, along: FloatArray) -> FloatArray:
         points = to_crs(np.stack(np.meshgrid(across, along), axis=2))
-        pixels = to_pixel(points if to_place is None else to_place(points))
+        return points if to_place is None else to_place(points)
+
+    def see(points: FloatArray) -> FloatArray:
+        pixels = to_pixel(points)
         return pixels if lens is None else lens.bend(pixels)
 
+    # What the camera makes of a plane bends more than what a change of the CRS does.
     for step in _NODE_STEPS:
         if 4 * step > min(size):
             continue
         cells = [math.ceil(side / step) for side in size]
-        nodes = look_up(*(_every(step, n + 2) - 0.5 * step for n in cells))
-        middles = look_up(*(_every(step, n + 1) for n in cells))
-        between = (nodes[1:, 1:] + nodes[1:, :-1] + nodes[:-1, 1:] + nodes[:-1, :-1]) / 4.0
-        near = (np.abs(middles / picture - 0.5) < 0.75).all(axis=2)
-        if np.abs(between - middles)[near].max(initial=0.0) < _NODE_ERROR_PX:
-            found = np.empty((2, size[1], size[0]))
-            for axis in (0, 1):
-                fine = cv2.resize(nodes[..., axis], None, fx=step, fy=step, interpolation=cv2.INTER_LINEAR)
-                found[axis] = fine[step : step + size[1], step : step + size[0]]
-            return found
-    return np.moveaxis(look_up(*(_every(1, side) + 0.5 for side in size)), 2, 0)
+        nodes = put(*(_every(step, n + 2) - 0.5 * step for n in cells))
+        middles = see(put(*(_every(step, n + 1) for n in cells)))
+        near = np.asarray((np.abs(middles / picture - 0.5) < 0.75).all(axis=2))
+        if _is_near(_between(see(nodes)), middles, near):
+            return np.moveaxis(_resize(see(nodes), step, size), 2, 0)
+        if _is_near(see(_between(nodes)), middles, near):
+            return np.moveaxis(see(_resize(nodes, step, size)), 2, 0)
+    return np.moveaxis(see(put(*(_every(1, side) + 0.5 for side in size))), 2, 0)
+
+
+def _between(nodes: FloatArray) -> FloatArray:
+    return (nodes[1:, 1:] + nodes[1:, :-1] + nodes[:-1, 1:] + nodes[:-1, :-1]) / 4.0
+
+
+def _is_near(found: FloatArray, exact: FloatArray, near: AnyArray) -> bool:
+    return bool(np.abs(found - exact)[near].max(initial=0.0) < _NODE_ERROR_PX)
+
+
+def _resize(nodes: FloatArray, step: int, size: tuple[int, int]) -> FloatArray:
+    """Return positions at all pixels of a block, bilinear between those at its nodes."""
+    fine = np.empty((size[1], size[0], 2))
+    for axis in (0, 1):
+        whole = cv2.resize(nodes[..., axis], None, fx=step, fy=step, interpolation=cv2.INTER_LINEAR)
+        fine[..., axis] = whole[step : step + size[1], step : step + size[0]]
+    return fine
 
 
 def _every(step: int, n: int) -> FloatArray:

@@ -43,7 +43,7 @@ from roadgeo.sources.segmentation.tiling import MAX_MAP_PIXELS, map_shape, segme
 from roadgeo.sources.streams import QUERY_ENDINGS
 from roadgeo.workflows import locate
 
-__all__ = ["FirstLook", "QueryOptions", "is_model", "locate_query", "look_once"]
+__all__ = ["FirstLook", "QueryOptions", "is_model", "load_model", "locate_query", "look_once"]
 
 #: The mask of a larger photograph is reduced, so that time and memory are bounded.
 _MAX_GRID_PIXELS = 64_000_000
@@ -467,12 +467,18 @@ def _is_plugin(segmenter: str) -> bool:
 
 
 def _network_of(segmenter: str, query: QueryOptions) -> Network:
-    return _network(segmenter, query.class_name, query.threads)
+    return load_model(segmenter, query.class_name, query.threads)
 
 
 @lru_cache(maxsize=4)
-def _network(path: str, class_name: str | None, threads: int) -> Network:
-    """Load a model, once for a batch."""
+def load_model(path: str = "", class_name: str | None = None, threads: int = 1) -> Network:
+    """Load a model, by default the one that ships, once for a batch.
+
+    Raises
+    ------
+    ModelError
+        It is none that can be used, or what runs models is not installed.
+    """
     return load_network(Path(path) if path else DEFAULT_MODEL, class_name=class_name, threads=threads)
 
 

@@ -15,6 +15,7 @@ import tempfile
 import threading
 import time
 from collections.abc import Sequence
+from contextlib import suppress
 from dataclasses import dataclass
 from functools import partial
 from multiprocessing.connection import Connection
@@ -111,17 +112,17 @@ class Place:
 
 
 class Workers:
-    """Processes, each with its references open."""
+    """Processes, each with its references open, and a network for photographs that is loaded."""
 
-    def __init__(self, references: Sequence[str], count: int, waiting: int) -> None:
-        """Start them; `waiting` more requests than there are processes may wait."""
+    def __init__(self, references: Sequence[str], count: int, waiting: int, threads: int = 1) -> None:
+        """Start them; `waiting` more requests than there are processes may wait, and the network has `threads`."""
         context = multiprocessing.get_context("spawn")
         self._idle: queue.Queue[_Worker] = queue.Queue()
         self._places = threading.Semaphore(count + waiting)
         self._all: list[_Worker] = []
         self._lock = threading.Lock()
         self._closed = False
-        for worker in [_Worker(context, references) for _ in range(count)]:
+        for worker in [_Worker(context, references, threads) for _ in range(count)]:
             self._all.append(worker)
             worker.wait_until_ready()
             self._idle.put(worker)
@@ -195,8 +196,8 @@ class Workers:
 class _Worker:
     """One process, and the pipe to it."""
 
-    def __init__(self, context: Any, references: Sequence[str]) -> None:
-        self._context, self._references = context, list(references)
+    def __init__(self, context: Any, references: Sequence[str], threads: int) -> None:
+        self._context, self._given = context, (list(references), threads)
         self.start()
 
     def start(self) -> None:
@@ -210,7 +211,7 @@ class _Worker:
         self._is_open = False
         self._pipe, theirs = self._context.Pipe()
         try:
-            process = self._context.Process(target=_serve, args=(theirs, self._references), daemon=True)
+            process = self._context.Process(target=_serve, args=(theirs, *self._given), daemon=True)
             with without_interrupts():
                 process.start()
         finally:
@@ -282,21 +283,24 @@ class _Worker:
 # --- in the process ---------------------------------------------------------------------------------------------------
 
 
-def _serve(pipe: Connection, names: list[str]) -> None:
+def _serve(pipe: Connection, names: list[str], threads: int = 1) -> None:
     """Answer until the pipe is closed."""
     signal.signal(signal.SIGINT, signal.SIG_IGN)
     folders: set[Path] = set()
     end_with_parent(lambda: _remove_all(folders))
     import cv2
 
-    from roadgeo.errors import RoadgeoError
+    from roadgeo.errors import ModelError, RoadgeoError
     from roadgeo.kernels.warmup import warm_up
     from roadgeo.running.batch import open_references
+    from roadgeo.running.queries import load_model
 
     cv2.setNumThreads(1)
     try:
         references = open_references(names)
         warm_up()
+        with suppress(ModelError):  # masks are located without it
+            load_model("", None, threads)
     except RoadgeoError as error:
         pipe.send(str(error))
         return
@@ -306,7 +310,7 @@ def _serve(pipe: Connection, names: list[str]) -> None:
             asked: Asked = pipe.recv()
             folders.update(_folder_of(asked.path))
             say = partial(_tell, pipe) if asked.keeps else say_nothing
-            pipe.send(_answer(asked, references, say))
+            pipe.send(_answer(asked, references, say, threads))
     except (EOFError, OSError):
         return
 
@@ -330,12 +334,12 @@ def _tell(pipe: Connection, text: str, share: float | None = None) -> None:
     pipe.send(Told(text, share))
 
 
-def _answer(asked: Asked, references: Sequence[Any], say: Say = say_nothing) -> Answer:
+def _answer(asked: Asked, references: Sequence[Any], say: Say = say_nothing, threads: int = 1) -> Answer:
     """Do what is asked; the one place where what goes wrong with an image is caught."""
     from roadgeo.errors import MaskError, ModelError, OutputError, RoadgeoError
 
     try:
-        return _write(asked, references) if asked.wanted else _locate(asked, references, say)
+        return _write(asked, references) if asked.wanted else _locate(asked, references, say, threads)
     except (MaskError, OutputError) as error:
         return Answer(422, {"detail": _without(asked.path, str(error))})
     except ModelError as error:  # the image is a photograph, and none are read here
@@ -349,11 +353,11 @@ def _answer(asked: Asked, references: Sequence[Any], say: Say = say_nothing) -> 
         )
 
 
-def _locate(asked: Asked, references: Sequence[Any], say: Say) -> Answer:
+def _locate(asked: Asked, references: Sequence[Any], say: Say, threads: int) -> Answer:
     from dataclasses import replace
 
     from roadgeo.matching.hints import apply_hints
-    from roadgeo.running.queries import locate_query
+    from roadgeo.running.queries import QueryOptions, locate_query
     from roadgeo.running.serving.view import SEEN, write_view
     from roadgeo.sources.exif import focal_in_pixels
     from roadgeo.workflows import LocateOptions, locate
@@ -378,7 +382,8 @@ def _locate(asked: Asked, references: Sequence[Any], say: Say) -> Answer:
     seen = Path(asked.path).with_name(SEEN)
     is_known = seen.is_file() and not asked.hints.keys() & {"gsd_m", "focal_px"}
     say("reading the image")
-    sighting = locate_query(str(seen) if is_known else asked.path, references, options, how=search, say=tell)
+    image, query = str(seen) if is_known else asked.path, QueryOptions(threads=threads)
+    sighting = locate_query(image, references, options, query, how=search, say=tell)
     sighting = replace(sighting, of_photograph=sighting.of_photograph or is_known)
     location = replace(sighting.location, query=asked.name)
     location = replace(location, reason=_without(asked.path, _without(str(seen), location.reason)))
