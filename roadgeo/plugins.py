@@ -71,7 +71,7 @@ def call_plugin(group: str, name: str, *arguments: Any, **options: Any) -> Any:
         raise
     except Exception as error:
         said = _describe(find_plugins(group)[name])
-        raise PluginError(f"{said} failed: {type(error).__name__}: {error}; tell its makers") from error
+        raise PluginError(f"{said} failed: {type(error).__name__}: {error}; inform its makers") from error
 
 
 def _describe(plugin: EntryPoint) -> str:

@@ -254,6 +254,6 @@ def test_a_faulty_output_is_blamed_by_name_and_the_rest_is_kept(
     written = write_location(located(), road_mask(), output_paths(tmp_path, "a"), options)
     (fault,) = written.faults
     assert f"the output 'broken' of {__name__} failed: " in fault
-    assert "tell its makers; all else is written" in fault
+    assert "inform its makers; all else is written" in fault
     assert {path.name for path in written.files} == {path.name for path in tmp_path.iterdir()}
     assert {"a_location.json", "a_footprint.geojson"} <= {path.name for path in written.files}

@@ -282,7 +282,7 @@ def pair_images(masks: Sequence[str], images: Sequence[str]) -> dict[str, str]:
             raise click.UsageError(f"No photograph in {images[0]} has the name of {missing[0]}.")
         return {mask: image for mask, image in found.items() if image is not None}
     if images and len(images) != len(masks):
-        raise click.UsageError(f"Got {len(masks)} masks and {len(images)} times --image, expected as many.")
+        raise click.UsageError(f"Got {len(masks)} masks and {len(images)} times --image; expected one for each mask.")
     return dict(zip(masks, images, strict=False))
 
 

@@ -409,7 +409,7 @@ def make_options(known: Mapping[str, Any], method: Any = "auto") -> LocateOption
     if method == "pair":
         idle = [hint for hint in HINTS.values() if hint.group != SEARCH and known.get(hint.goes_to, False) is not False]
         if idle:
-            raise click.UsageError(f"--method pair knows no {', '.join(one.option for one in idle)}: leave it out.")
+            raise click.UsageError(f"--method pair takes no {', '.join(one.option for one in idle)}: leave it out.")
     return apply_hints(replace(LocateOptions(), method=method), known)
 
 

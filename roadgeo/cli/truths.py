@@ -28,7 +28,7 @@ def read_truths(given: str | None, *, explain: bool) -> tuple[tuple[str, float, 
     if given is None:
         return ()
     if not explain:
-        raise click.UsageError("--truth says nothing without --explain: add it.")
+        raise click.UsageError("--truth needs --explain: add it.")
     if _is_file(given):
         return _from_table(Path(given))
     try:
@@ -53,7 +53,7 @@ def _from_table(path: Path) -> tuple[tuple[str, float, float], ...]:
     truths = []
     for truth in read_truth(path):
         if truth.crs is None:
-            raise click.UsageError(f"{path} does not say its CRS: add a column crs.")
+            raise click.UsageError(f"{path} has no CRS: add a column crs.")
         lon, lat = transformer(truth.crs, "EPSG:4326").transform(*truth.center)
         truths.append((truth.file, float(lon), float(lat)))
     return tuple(truths)

@@ -99,7 +99,7 @@ def fit_place(pixels: FloatArray, xy: FloatArray, projective: bool) -> FloatArra
     if projective:
         matrix, _ = cv2.findHomography(a, b, 0)
         if matrix is None:
-            raise MaskError("its control points lie on a line; expected some all over the picture")
+            raise MaskError("its control points lie on a line; expected them all over the picture")
     else:
         solved = np.linalg.lstsq(np.c_[a, np.ones(len(a))], b, rcond=None)[0]
         matrix = np.vstack([solved.T, [0.0, 0.0, 1.0]])

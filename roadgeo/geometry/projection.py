@@ -102,7 +102,7 @@ def choose_plane(lonlat: FloatArray, own_crs: str | None = None) -> LocalPlane:
     if not reach <= 360.0 or np.abs(points[:, 1]).max() > 90.0:
         raise CrsError(
             f"coordinates reach {reach:.6g}, expected degrees of longitude and latitude; "
-            "the data's CRS is not what it says: give the right one with --crs"
+            "the data's CRS is wrong: give the right one with --crs"
         )
     crs = own_crs if own_crs and serves_as_plane(own_crs, points) else _conformal_crs(points)
     if own_crs and crs != own_crs:
@@ -206,7 +206,7 @@ def transformer(source: str, target: str) -> Transformer:
     try:
         return Transformer.from_crs(known_crs(source), known_crs(target), always_xy=True)
     except ProjError as error:
-        raise CrsError(f"no way from {_short(source)} to {_short(target)}: {error}") from error
+        raise CrsError(f"no transformation from {_short(source)} to {_short(target)}: {error}") from error
 
 
 def _longitudes(lon: FloatArray) -> tuple[float, float]:

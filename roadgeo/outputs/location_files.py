@@ -151,7 +151,7 @@ def _write(output: Output, path: Path, subject: Subject, files: ExitStack) -> st
         with suppress(Exception):
             own.__exit__(type(error), error, error.__traceback__)
         whose = f"the output {output.name!r} of {output.write.__module__}"
-        said = str(error) if isinstance(error, RoadgeoError) else f"{type(error).__name__}: {error}; tell its makers"
+        said = str(error) if isinstance(error, RoadgeoError) else f"{type(error).__name__}: {error}; inform its makers"
         return f"{subject.location.query}: {whose} failed: {' '.join(said.split())}; all else is written"
     files.enter_context(own)
     return ""

@@ -109,7 +109,7 @@ def _at_most(most: float) -> Any:
     class AtMost(Callback):  # type: ignore[misc]
         def call(self, *_args: Any, **_options: Any) -> None:
             if max(self.size or 0, self.value) > most:
-                raise OSError(f"is of more than the {most:,.0f} bytes that it was said to have")
+                raise OSError(f"is larger than the {most:,.0f} bytes in the manifest")
 
     return AtMost()
 
@@ -138,7 +138,7 @@ def _reaching(url: str) -> Iterator[Any]:
         yield
     except ImportError as error:
         raise IndexFormatError(
-            f"{url}: {error}; references elsewhere need more: {how_to_install('dask')}, and s3fs or gcsfs"
+            f"{url}: {error}; references at a URL need more packages: {how_to_install('dask')}, and s3fs or gcsfs"
             " for such stores"
         ) from error
     except Exception as error:

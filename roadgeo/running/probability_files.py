@@ -48,6 +48,6 @@ def keep_probability(probability: ProbabilityMap | None, paths: OutputPaths) -> 
         return []
     path = probability_path(paths)
     if path.exists() and not is_ours(path):
-        raise OutputError(f"{path}: is there already, and was not written by roadgeo; choose another --out-dir")
+        raise OutputError(f"{path}: exists, and was not written by roadgeo; choose another --out-dir")
     probability.write(path)
     return [path]

@@ -190,7 +190,7 @@ def _geometry_of(file: Any) -> tuple[str, str | None, str]:
             return name, None, "WKB"
         if name.lower() in _SHAPES and (pa.types.is_string(kind) or pa.types.is_large_string(kind)):
             return name, None, "WKT"
-    raise ValueError(f"it says nothing of a geometry column, and has none named {', '.join(_SHAPES[:3])} ...")
+    raise ValueError(f"it declares no geometry column, and has none named {', '.join(_SHAPES[:3])} ...")
 
 
 def _shapes(batch: Any, column: str, encoding: str) -> AnyArray:
@@ -214,7 +214,7 @@ def _require_rows(path: Path) -> None:
     meta = pq.read_metadata(path)
     unpacked = sum(meta.row_group(i).total_byte_size for i in range(meta.num_row_groups))
     if meta.num_rows > (size := path.stat().st_size):
-        raise ValueError(f"its {size:,} bytes say to hold {meta.num_rows:,} rows and {unpacked:,} bytes")
+        raise ValueError(f"its {size:,} bytes claim to hold {meta.num_rows:,} rows and {unpacked:,} bytes")
     require_bounded(path, unpacked)
 
 
@@ -291,7 +291,7 @@ def _graph_table(graph: Any) -> RoadTable:
             ends = [_node_place(graph, node) for node in (start, end)]
             if None in ends:
                 raise RoadSourceError(
-                    "the edges of the graph do not tell where they lie: expected `geometry`, or nodes with `x` and "
+                    "the edges of the graph have no place: expected `geometry`, or nodes with `x` and "
                     "`y`, as osmnx and momepy have them; of a skeleton of pixels locate the mask that it was drawn from"
                 )
             shape = shapely.LineString(ends)

@@ -38,7 +38,7 @@ def ground_heights(dem: str | os.PathLike[str], xy: FloatArray, crs: str) -> Flo
             raise MaskError(f"{os.fspath(dem)}: holds complex values; expected heights in metres")
         own = crs_name(raster.crs.to_wkt())
         if own is None:
-            raise CrsError(f"{os.fspath(dem)}: its CRS is none of places on Earth; assign the right one")
+            raise CrsError(f"{os.fspath(dem)}: its CRS does not describe places on Earth; assign the right one")
         there = np.stack(transformer(crs, own).transform(*np.asarray(xy, float).T), axis=1)
         inside = np.isfinite(there).all(axis=1)
         values = np.full(len(there), np.nan)

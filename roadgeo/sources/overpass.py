@@ -177,7 +177,7 @@ def read_area(polygon: str | os.PathLike[str] | Any) -> tuple[Any, str]:
         raise RoadSourceError(f"{path}: no polygon in it, expected the outline of an area")
     crs = crs_name(found.crs)
     if crs is None:
-        raise RoadSourceError(f"{path}: says nothing of its CRS; save the outline in one, for example as GeoJSON")
+        raise RoadSourceError(f"{path}: has no CRS; save the outline with one, for example as GeoJSON")
     return shapely.transform(shapely.union_all(parts), lambda xy: to_lonlat(crs, xy)), path.stem
 
 
@@ -257,7 +257,7 @@ def _ask(url: str, options: FetchOptions, say: Say, query: str = "", part: tuple
         answer = None
     elements = answer if not query else answer.get("elements") if isinstance(answer, dict) else None
     if not isinstance(elements, list):
-        raise RoadSourceError(f"{host} gave an answer that makes no sense: {response.text[:60]!r}")
+        raise RoadSourceError(f"{host} gave an answer that cannot be read: {response.text[:60]!r}")
     remark = str(answer.get("remark", "")) if query else ""
     if "error" in remark:
         raise RoadSourceError(f"{host} gave up: {remark[:200]}; ask for a smaller area")

@@ -239,7 +239,7 @@ def with_crs(source: RoadLines, crs: Any, name: Path | str) -> RoadLines:
     """
     if crs is None or source.meta.get("format") == "OpenStreetMap":
         if source.crs is None:
-            raise CrsError(f"{name}: says nothing of its CRS; name it, for example --crs EPSG:26986, crs= in Python")
+            raise CrsError(f"{name}: has no CRS; name it, for example --crs EPSG:26986, crs= in Python")
         return source
     known, own = name_crs(crs), source.crs
     if own is not None and not known_crs(own).equals(known_crs(known), ignore_axis_order=True):

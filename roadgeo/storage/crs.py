@@ -69,7 +69,7 @@ def name_crs(crs: Any) -> str:
         raise NoCrsError(f"{told} is no CRS that PROJ knows; {expected}") from error
     known = known.to_2d() if len(known.axis_info) == 3 else known
     if not (known.is_geographic or known.is_projected):
-        raise NoCrsError(f"{told} is no CRS of places on Earth, but {known.type_name}; {expected}")
+        raise NoCrsError(f"{told} is no CRS of a map, but a {known.type_name}; {expected}")
     code = known.to_epsg(min_confidence=100)
     return f"EPSG:{code}" if code else known.to_wkt("WKT2_2019")
 

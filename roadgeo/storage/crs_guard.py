@@ -147,7 +147,7 @@ def _of_json(path: Path, content: mmap.mmap) -> Iterator[str]:
             except (ValueError, RecursionError):
                 continue
             if isinstance(told, dict) and str(told.get("type")).lower() in ("link", "url"):
-                raise RoadSourceError(f"{path}: says its CRS by a link, which is not followed; name it in the file")
+                raise RoadSourceError(f"{path}: gives its CRS as a link, which is not followed; name it in the file")
             break
         else:
             puzzling += 1

@@ -129,9 +129,9 @@ def open_raster(
                     with _turned(dataset, orientation, name) as turned:
                         yield turned
         except UnicodeEncodeError as error:
-            raise MaskError(f"{name}: its name is no text, GDAL does not take it; rename it") from error
+            raise MaskError(f"{name}: its name is not valid text; rename it") from error
         except UnicodeDecodeError as error:
-            raise MaskError(f"{name}: its metadata are no text; save it without them") from error
+            raise MaskError(f"{name}: its metadata are not valid text; save it without them") from error
         except (RasterioError, CPLE_BaseError) as error:
             reason = " ".join(str(error.__cause__ or error).split())[:300]  # libtiff's own words, where it has some
             raise MaskError(f"{name}: not a raster that can be read ({reason}); give an image or GeoTIFF") from error

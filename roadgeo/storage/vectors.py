@@ -137,7 +137,7 @@ def _guarded(path: Path, layer: str | None = None) -> Iterator[Path]:
             yield file
     except (CRSError, UnboundLocalError) as error:  # the latter is pyogrio's
         told = "it is no text in UTF-8" if isinstance(error, UnboundLocalError) else first_line(error)
-        raise RoadSourceError(f"{path}: names a CRS that is none: {told}") from error
+        raise RoadSourceError(f"{path}: names an unknown CRS: {told}") from error
     except (DataSourceError, DataLayerError, UnicodeDecodeError) as error:
         told = "of a format that is not read here" if "not recognized" in str(error) else first_line(error)
         told = told.replace(str(file), str(path))

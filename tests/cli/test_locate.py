@@ -310,7 +310,7 @@ def test_a_bad_mask_is_one_line_and_status_1(
 @pytest.mark.parametrize("known", [["--north-up"], ["--gsd", "0.5:1"], ["--near=-8.6,41.1,500"], ["--max-tilt", "0"]])
 def test_the_papers_method_knows_no_hints(known: list[str], porto: Path, capfd: pytest.CaptureFixture[str]) -> None:
     assert main(["locate", str(MASKS["drone"].path), "-r", str(porto), "--method", "pair", *known]) == 2
-    assert f"--method pair knows no {known[0].partition('=')[0]}" in capfd.readouterr().err
+    assert f"--method pair takes no {known[0].partition('=')[0]}" in capfd.readouterr().err
 
 
 def last_line(capfd: pytest.CaptureFixture[str]) -> str:
@@ -330,7 +330,7 @@ def test_roads_that_are_none_are_named(tmp_path: Path, capfd: pytest.CaptureFixt
     Path("nocrs.prj").unlink()
     gpd.GeoDataFrame(geometry=[shapely.Point(-71, 42)], crs=4326).to_file("points.geojson")
     for name, message in [
-        ("nocrs.shp", "says nothing of its CRS"),
+        ("nocrs.shp", "has no CRS"),
         ("points.geojson", "holds Point, expected lines"),
         ("missing.shp", "no such file"),
     ]:

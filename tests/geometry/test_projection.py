@@ -74,7 +74,7 @@ def test_what_is_not_degrees_is_refused(lonlat, message):
 
 
 def test_an_unknown_crs_is_named():
-    with pytest.raises(CrsError, match="no way from EPSG:999999 to EPSG:4326"):
+    with pytest.raises(CrsError, match="no transformation from EPSG:999999 to EPSG:4326"):
         to_lonlat("EPSG:999999", [[0, 0]])
 
 

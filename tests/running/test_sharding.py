@@ -329,7 +329,7 @@ def test_files_of_different_crs_become_one_map(roads, sharded, tmp_path):
 def test_a_file_without_a_crs_asks_for_it(tmp_path):
     path = write_vector(tmp_path / "a.shp", [shapely.LineString([(0, 0), (1000, 0)])])
     path.with_suffix(".prj").unlink()
-    with pytest.raises(CrsError, match=r"says nothing of its CRS; name it, for example --crs EPSG:26986"):
+    with pytest.raises(CrsError, match=r"has no CRS; name it, for example --crs EPSG:26986"):
         build_shards(RoadFiles((path,)), tmp_path / "a.shards", "a")
 
 

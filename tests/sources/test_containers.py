@@ -70,7 +70,7 @@ def test_a_skeleton_of_pixels_says_that_it_lies_nowhere():
     graph.add_node(0, pts=np.array([[3, 4]]), o=np.array([3.0, 4.0]))
     graph.add_node(1, pts=np.array([[9, 4]]), o=np.array([9.0, 4.0]))
     graph.add_edge(0, 1, pts=np.array([[4, 4], [5, 4]]), weight=2.0)
-    with pytest.raises(RoadSourceError, match="do not tell where they lie: expected `geometry`, or nodes with"):
+    with pytest.raises(RoadSourceError, match="have no place: expected `geometry`, or nodes with"):
         choose_roads(graph, crs=CRS)
 
 

@@ -240,7 +240,7 @@ def test_a_plain_parquet_table_is_refused(tmp_path):
     import pandas as pd
 
     pd.DataFrame({"highway": ["primary"]}).to_parquet(tmp_path / "x.parquet")
-    with pytest.raises(RoadSourceError, match="says nothing of a geometry column"):
+    with pytest.raises(RoadSourceError, match="declares no geometry column"):
         read_lines(tmp_path / "x.parquet")
 
 

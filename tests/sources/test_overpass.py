@@ -114,7 +114,7 @@ def test_a_large_area_is_asked_for_in_parts_and_resumed(osm, pauses, monkeypatch
     monkeypatch.setattr("roadgeo.sources.overpass._PART_DEG", 0.005)
     said = []
     osm.overpass += [(200, {}, osm.roads), (500, {}, b"<html>")]
-    with pytest.raises(RoadSourceError, match="makes no sense"):
+    with pytest.raises(RoadSourceError, match="cannot be read"):
         fetch_roads("Fenway, Boston", options=ask(osm), say=lambda *step: said.append(step))
     host = osm.url[7:]
     n_parts = int(said[1][0].rpartition(" ")[2])
@@ -173,8 +173,8 @@ def test_a_server_that_stays_busy_is_given_up(osm, pauses):
     [
         ("cut", "cannot be reached or broke off"),
         ((200, {}, EMPTY), "no drivable roads there"),
-        ((200, {}, b"<html>hello</html>"), "makes no sense"),
-        ((400, {}, b"<html>bad query</html>"), "makes no sense"),
+        ((200, {}, b"<html>hello</html>"), "cannot be read"),
+        ((400, {}, b"<html>bad query</html>"), "cannot be read"),
         (
             (200, {}, EMPTY[:-1] + b', "remark": "runtime error: Query timed out in \\"query\\" at line 1"}'),
             "gave up: runtime error: Query timed out",
@@ -223,7 +223,7 @@ def test_an_exchanged_box_is_suspected_where_there_are_no_roads(osm, pauses):
     ("shapes", "crs", "message"),
     [
         ([shapely.LineString([(0, 0), (1, 1)])], "EPSG:4326", "no polygon in it"),
-        ([OUTLINE], None, "says nothing of its CRS"),
+        ([OUTLINE], None, "has no CRS"),
     ],
 )
 def test_outlines_that_are_of_no_use(tmp_path, shapes, crs, message):

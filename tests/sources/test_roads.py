@@ -137,7 +137,7 @@ def test_a_shapefile_without_prj_asks_for_a_crs(tmp_path):
     file = write(tmp_path / "a.shp", HERE, crs="EPSG:2249")
     expected = read_roads(file)
     file.with_suffix(".prj").unlink()
-    with pytest.raises(CrsError, match=r"a.shp: says nothing of its CRS; name it, for example --crs EPSG:26986"):
+    with pytest.raises(CrsError, match=r"a.shp: has no CRS; name it, for example --crs EPSG:26986"):
         read_roads(file)
     found = read_roads(file, crs="EPSG:2249")
     assert shapely.equals_exact(found.lines, expected.lines, 0.01).all()
@@ -192,7 +192,7 @@ def test_lines_from_memory():
     roads = choose_roads([HERE, None], crs="EPSG:4326")
     assert roads.plane.crs == "EPSG:32619"
     assert shapely.length(roads.lines).sum() == pytest.approx(823.6 + 777.6, rel=0.005)
-    with pytest.raises(CrsError, match="the roads: says nothing of its CRS"):
+    with pytest.raises(CrsError, match="the roads: has no CRS"):
         choose_roads([HERE])
     with pytest.raises(RoadSourceError, match="no roads"):
         choose_roads([], crs="EPSG:4326")

@@ -132,8 +132,8 @@ def test_what_has_no_code_is_wkt_that_gdal_reads_too(given: str) -> None:
         ("EPSG:999999", "no CRS that PROJ knows"),
         (999999, "no CRS that PROJ knows"),
         ("", "no CRS that PROJ knows"),
-        ("EPSG:4978", "no CRS of places on Earth, but Geocentric CRS"),
-        ("EPSG:5701", "no CRS of places on Earth, but Vertical CRS"),
+        ("EPSG:4978", "no CRS of a map, but a Geocentric CRS"),
+        ("EPSG:5701", "no CRS of a map, but a Vertical CRS"),
         ('ENGCRS["a sheet",EDATUM["it"],CS[Cartesian,2],AXIS["x",east],AXIS["y",north],UNIT["m",1]]', "no CRS of"),
     ],
 )

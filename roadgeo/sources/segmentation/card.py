@@ -100,7 +100,7 @@ def read_card(model: OnnxModel, class_name: str | None = None) -> ModelCard:
         told = {**_read_metadata(model.metadata), **_read_sidecar(path.with_suffix(".json"))}
         return _make_card(model, told, class_name)
     except (TypeError, ValueError, KeyError, AttributeError, RecursionError) as error:
-        raise ModelError(f"{path}: its metadata make no sense ({error}); correct them") from error
+        raise ModelError(f"{path}: its metadata are invalid ({error}); correct them") from error
     except ModelError as error:
         raise ModelError(f"{path}: {error}") from error
 

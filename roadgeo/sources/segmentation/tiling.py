@@ -70,7 +70,7 @@ def segment(
     if math.prod(shape) > MAX_MAP_PIXELS:
         raise MaskError(
             f"{photograph.name}: {shape[1]} x {shape[0]} pixels at the model's scale; expected at most "
-            f"{MAX_MAP_PIXELS:,} in all: say how large a pixel is (--gsd), or cut the photograph up"
+            f"{MAX_MAP_PIXELS:,} in all: give the size of a pixel (--gsd), or cut the photograph up"
         )
     values = np.empty((shape[0] // step, shape[1] // step), np.uint8)
     ground = find_ground(photograph, values.shape)

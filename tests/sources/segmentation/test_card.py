@@ -75,7 +75,7 @@ def test_a_document_that_describes_no_model_is_left_alone(tmp_path: Path, docume
     [
         (item(value_scaling=[{"type": "clip"}]), "scaled by 'clip'; expected z-score, min-max or scale"),
         ({"properties": {"mlm:input": [{}], "mlm:output": [{"tasks": ["object-detection"]}]}}, "object-detection"),
-        (item(value_scaling=[{"type": "z-score"}]), "make no sense"),
+        (item(value_scaling=[{"type": "z-score"}]), "are invalid"),
     ],
 )
 def test_an_item_that_cannot_be_followed(tmp_path: Path, document: object, message: str) -> None:

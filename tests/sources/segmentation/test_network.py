@@ -123,13 +123,13 @@ def test_a_stac_item_beside_the_model(tmp_path: Path, picture: np.ndarray) -> No
         ({"props": {"model_type": "Detector"}}, "model for Detector"),
         ({"classes": 2}, "names no class after roads .* --class"),
         ({"classes": 2, "props": {"class_names": {0: "sea", 1: "land"}}}, "0 sea, 1 land"),
-        ({"props": {"resolution": -5}}, "make no sense"),
-        ({"props": {"resolution": "wide"}}, "make no sense"),
-        ({"props": {"standardization_std": [0, 0, 0]}}, "make no sense"),
-        ({"props": {"standardization_mean": [1, 2]}}, "make no sense"),
-        ({"props": {"tiles_overlap": 200}}, "make no sense"),
-        ({"props": {"class_names": 7}}, "make no sense"),
-        ({"raw_props": {"seg_thresh": "["}}, "make no sense"),
+        ({"props": {"resolution": -5}}, "are invalid"),
+        ({"props": {"resolution": "wide"}}, "are invalid"),
+        ({"props": {"standardization_std": [0, 0, 0]}}, "are invalid"),
+        ({"props": {"standardization_mean": [1, 2]}}, "are invalid"),
+        ({"props": {"tiles_overlap": 200}}, "are invalid"),
+        ({"props": {"class_names": 7}}, "are invalid"),
+        ({"raw_props": {"seg_thresh": "["}}, "are invalid"),
         ({"raw_props": {"ways": "5"}}, "ways 5, expected 1 to 4"),
         ({"size": 8}, "tiles of 8 x 8"),
         ({"size": None, "props": {"tile_size": 100_000}}, "tiles of"),
@@ -238,7 +238,7 @@ def test_classes_without_names(tmp_path: Path) -> None:
     path = save(helper.make_graph(nodes, "g", *ports), tmp_path / "m.onnx")
     picture = np.zeros((64, 64, 3), np.uint8)
     picture[:20, :, 1] = picture[40:, :, 2] = 9
-    with pytest.raises(ModelError, match=r"m\.onnx: gives the classes 1, 2; say which is road: --class NUMBER"):
+    with pytest.raises(ModelError, match=r"m\.onnx: gives the classes 1, 2; choose the road: --class NUMBER"):
         load_network(path)(picture)
     np.testing.assert_array_equal(load_network(path, class_name="2")(picture) > 0.5, picture[..., 2] > 0)
     picture[:20] = 0
