@@ -76,16 +76,18 @@ class _Image(NamedTuple):
     path: str
     name: str
     time_s: float
+    stays: bool = True
 
 
 @dataclass
 class _Last:
-    """The previous frame, as far as the next one needs it."""
+    """The previous frame, as far as the next one needs it, and whether there was a photograph."""
 
     mask: RoadMask | None = None
     grey: AnyArray | None = None
     odometer: Odometer = field(default_factory=Odometer)
     scale: dict[str, float] = field(default_factory=dict)
+    has_photographs: bool = False
 
 
 def read_frames(arguments: Sequence[str], options: FrameOptions | None = None) -> Iterator[FlightFrame]:
@@ -112,16 +114,24 @@ def read_stills(
 ) -> Iterator[tuple[FlightFrame, AnyArray | None]]:
     """Read frames that are in no order: files, folders or patterns; each with its picture in grey where it is one.
 
+    They are of one kind: where one is a photograph, those that came before it were no masks.
+
     Raises
     ------
     MaskError, ModelError
         As of `read_frames`.
     """
     options, last = options or FrameOptions(), _Last()
+    read: list[tuple[_Image, FlightFrame, AnyArray | None]] = []
     with ExitStack() as stack:
         for number, image in enumerate(_images(arguments, options, stack)):
             mask, grey = _read(image, options, last)
-            yield FlightFrame(number, image.name, image.time_s, mask), grey
+            read.append((image, FlightFrame(number, image.name, image.time_s, mask), grey))
+        for image, frame, grey in read:
+            if last.has_photographs and grey is None and image.stays and frame.mask.roads.any():
+                mask, grey = _read(image, options, last)
+                frame = replace(frame, mask=mask)
+            yield frame, grey
 
 
 def _images(arguments: Sequence[str], options: FrameOptions, stack: ExitStack) -> Iterator[_Image]:
@@ -157,7 +167,7 @@ def _video(path: str, options: FrameOptions, stack: ExitStack) -> Iterator[_Imag
         with writing(target):  # OpenCV does not report a full disk
             Path(target).write_bytes(cv2.imencode(".png", picture)[1].tobytes())
         taken += 1
-        yield _Image(target, f"{Path(path).stem}_{k:06d}", k / rate)
+        yield _Image(target, f"{Path(path).stem}_{k:06d}", k / rate, stays=False)
     if not taken:
         raise MaskError(f"{path}: no frame of the video can be read; give its frames as images")
 
@@ -165,7 +175,7 @@ def _video(path: str, options: FrameOptions, stack: ExitStack) -> Iterator[_Imag
 def _read(image: _Image, options: FrameOptions, last: _Last) -> tuple[RoadMask, AnyArray | None]:
     """Read a frame as a mask, and as a grey picture where it is a photograph."""
     # A white or a black frame among photographs is no mask.
-    of_photographs = options.segment == "always" or (options.segment == "auto" and last.grey is not None)
+    of_photographs = options.segment == "always" or (options.segment == "auto" and last.has_photographs)
     try:
         if not of_photographs:
             try:
@@ -173,6 +183,7 @@ def _read(image: _Image, options: FrameOptions, last: _Last) -> tuple[RoadMask, 
             except PhotographError:
                 if options.segment == "never":
                     raise
+        last.has_photographs = True
         return _segment(image, options, last)
     except PhotographError:
         raise

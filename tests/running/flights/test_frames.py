@@ -63,7 +63,8 @@ def test_a_photograph_without_roads_is_a_frame_of_the_flight(model: FrameOptions
 
 def test_stills_keep_their_picture(model: FrameOptions, photographs: list[str], tmp_path: Path) -> None:
     cv2.imwrite(str(tmp_path / "mask.png"), streets())
-    (_, grey), (_, none) = read_stills([photographs[0], str(tmp_path / "mask.png")], model)
+    ((_, grey),) = read_stills(photographs[:1], model)
+    ((_, none),) = read_stills([str(tmp_path / "mask.png")], model)
     expected = cv2.imread(photographs[0], cv2.IMREAD_GRAYSCALE)  # libpng rounds otherwise
     assert np.abs(grey.astype(int) - expected).max() <= 1
     assert none is None
@@ -129,13 +130,31 @@ def test_what_is_no_video_is_said(tmp_path: Path, capfd: pytest.CaptureFixture[s
         list(read_frames([str(tmp_path / "a.mp4")]))
 
 
+@pytest.fixture
+def white(photographs: list[str], tmp_path: Path) -> str:
+    """A photograph that is white but for a corner."""
+    picture = np.full_like(cv2.imread(photographs[0]), 255)
+    picture[:40, :120] = 0
+    cv2.imwrite(str(tmp_path / "white.png"), picture)
+    return str(tmp_path / "white.png")
+
+
 def test_a_white_frame_among_photographs_is_no_mask(
-    model: FrameOptions, photographs: list[str], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+    model: FrameOptions, photographs: list[str], white: str, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     taken: list[str] = []
     monkeypatch.setattr(frames, "read_mask", lambda path, **_: taken.append(path) or read_mask(path))
-    white = np.full_like(cv2.imread(photographs[0]), 255)
-    white[:40, :120] = 0
-    cv2.imwrite(str(tmp_path / "white.png"), white)
-    assert len(list(read_frames([photographs[0], str(tmp_path / "white.png")], model))) == 2
+    assert len(list(read_frames([photographs[0], white, white, photographs[1]], model))) == 4
     assert taken == [photographs[0]]  # which was found to be none
+
+
+@pytest.mark.parametrize("place", [0, 1, 2])
+def test_nor_is_one_of_an_archive_wherever_it_comes(
+    model: FrameOptions, photographs: list[str], white: str, place: int
+) -> None:
+    assert read_mask(white).roads[:40, :120].all()
+    given = [*photographs[:place], white, *photographs[place:2]]
+    read = list(read_stills(given, model))
+    assert [frame.name for frame, _ in read] == [Path(path).name for path in given]
+    assert not read[place][0].mask.roads[:40, :120].any()
+    assert all(grey is not None for k, (_, grey) in enumerate(read) if k != place)
