@@ -62,7 +62,12 @@ def test_a_newcomer_without_the_program_is_led_to_its_set_up(seen: dict) -> None
 def test_setting_up_finds_the_program_and_calls_it(seen: dict) -> None:
     assert seen["setup"]["successful"]
     assert Path(seen["setup"]["results"]["FOUND"]).stem == "roadgeo"
-    assert seen["setup"]["results"]["VERSION"][0].isdigit()
+    version = seen["setup"]["results"]["VERSION"]
+    assert version[0].isdigit()
+    # What asked for it is gone; what comes next is offered.
+    assert seen["ready"] == f"roadgeo: Version {version} is set up."
+    assert seen["ready_buttons"] == ["Build road reference..."]
+    assert not [text for text in seen["messages"] if "not on this computer" in text]
 
 
 def test_what_was_built_is_in_the_library_and_in_the_list_of_the_next_dialog(seen: dict) -> None:

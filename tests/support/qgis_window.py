@@ -12,6 +12,7 @@ from dataclasses import replace
 from pathlib import Path
 
 from qgis.core import QgsApplication, QgsPointXY, QgsProcessingContext, QgsProject, QgsRasterLayer, QgsVectorLayer
+from qgis.gui import QgsMessageBarItem
 from qgis.PyQt.QtCore import QEvent, QEventLoop, QObject, QPoint, QPointF, Qt, QTimer, pyqtSlot
 from qgis.PyQt.QtGui import QDesktopServices, QMouseEvent
 from qgis.PyQt.QtTest import QTest
@@ -105,11 +106,14 @@ def tour():
     keep(menu.menu, "menu")
     menu.menu.hide()
     # Without the program, the window says so at first, and offers to set it up; it finds what is there.
-    menu._ask_to_set_up()
+    menu.ask_to_set_up()
     ANSWER["first"], buttons = message()
     ANSWER["first_buttons"] = list(buttons)
-    iface.messageBar().clearWidgets()
-    ANSWER["setup"] = fill_and_run(module.open_dialog("setup", {}), "setup")
+    buttons["Set up roadgeo..."].click()
+    ANSWER["setup"] = fill_and_run(module._OPEN[-1], "setup")
+    ANSWER["ready"], buttons = message()
+    ANSWER["ready_buttons"] = list(buttons)
+    ANSWER["messages"] = [one.text() for one in iface.messageBar().findChildren(QgsMessageBarItem)]
     # Build, from a layer, into the library.
     roads = QgsVectorLayer(TASK["roads"], "porto streets", "ogr")
     PROJECT.addMapLayer(roads)

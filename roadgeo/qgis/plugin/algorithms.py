@@ -428,14 +428,18 @@ class SetUp(RoadgeoAlgorithm):
         else:
             found = program or locate_executable() or ""
         if not found:
-            raise QgsProcessingException(f"{NOT_FOUND} To install it, tick “{SETUP[1].label}”.")
-        version = ask_version(found, session)
-        self.found = found
-        return {"FOUND": found, "VERSION": version}
+            told = f"To install it, tick “{SETUP[1].label}”, or name it above."
+            raise QgsProcessingException(f"The program roadgeo was not found on this computer. {told}")
+        self.found = {"FOUND": found, "VERSION": ask_version(found, session)}
+        return self.found
 
     def postProcessAlgorithm(self, context: Any, feedback: Any) -> dict[str, Any]:
         """Remember it, where QGIS keeps its settings."""
-        configure(self.found)
+        configure(self.found["FOUND"])
+        if iface is not None:
+            from .messages import tell_ready
+
+            tell_ready(self.found["VERSION"])
         return super().postProcessAlgorithm(context, feedback)
 
 

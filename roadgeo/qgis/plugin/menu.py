@@ -6,12 +6,13 @@ from pathlib import Path
 from typing import Any
 
 from qgis.core import Qgis, QgsApplication, QgsRasterLayer
+from qgis.PyQt import sip
 from qgis.PyQt.QtCore import Qt, QUrl
 from qgis.PyQt.QtGui import QDesktopServices, QIcon
-from qgis.PyQt.QtWidgets import QMenu, QPushButton, QToolButton
+from qgis.PyQt.QtWidgets import QMenu, QToolButton
 
 from .dock import MatchDock
-from .messages import open_dialog
+from .messages import open_dialog, push
 from .settings import locate_executable
 
 __all__ = ["Menu"]
@@ -42,7 +43,7 @@ class Menu:
         self._add("folder", "Locate a folder of images...", "mIconFolder.svg", lambda: self._open("locatemasks"))
         self._add("mend", "Mend a place by hand", "mActionEditNodesItem.svg", self.mend)
         self.menu.addSeparator()
-        self._add("setup", "Set up roadgeo...", "mActionOptions.svg", lambda: open_dialog("setup", {}))
+        self._add("setup", "Set up roadgeo...", "mActionOptions.svg", self.set_up)
         self._add("help", "Help", "mActionHelpContents.svg", self.help)
         iface.pluginMenu().addMenu(self.menu)
         button = QToolButton()
@@ -53,8 +54,9 @@ class Menu:
         button.clicked.connect(self.locate)
         self.button = button
         self.on_toolbar = iface.addToolBarWidget(button)
+        self.question: Any = None
         if locate_executable() is None:
-            self._ask_to_set_up()
+            self.ask_to_set_up()
 
     def _add(self, name: str, text: str, icon: str, does: Any) -> None:
         action = self.menu.addAction(QgsApplication.getThemeIcon(f"/{icon}"), text)
@@ -63,15 +65,22 @@ class Menu:
 
     def _open(self, algorithm: str, **parameters: Any) -> Any:
         """Open an algorithm's dialog; without the program, that which sets it up."""
-        return open_dialog(algorithm if locate_executable() else "setup", parameters)
+        return open_dialog(algorithm, parameters) if locate_executable() else self.set_up()
 
-    def _ask_to_set_up(self) -> None:
+    def set_up(self) -> Any:
+        """Open the dialog that finds or, where it is not there, installs the program."""
+        return open_dialog("setup", {"INSTALL": locate_executable() is None})
+
+    def ask_to_set_up(self) -> None:
+        """Ask in the message bar, until it is done."""
         text = "The program that does the work is not on this computer yet, or was not found."
-        message = self.iface.messageBar().createMessage("roadgeo", text)
-        button = QPushButton("Set up roadgeo...")
-        button.clicked.connect(lambda: open_dialog("setup", {}))
-        message.layout().addWidget(button)
-        self.iface.messageBar().pushWidget(message, Qgis.MessageLevel.Info, 0)
+        self.question = push("roadgeo", text, [("Set up roadgeo...", self.set_up)], Qgis.MessageLevel.Info)
+
+    def forget_question(self) -> None:
+        """Take the question back."""
+        question, self.question = self.question, None
+        if question is not None and not sip.isdeleted(question):
+            self.iface.messageBar().popWidget(question)
 
     def locate(self) -> Any:
         """Locate the raster layer that is selected; where none is, the dialog asks for one."""

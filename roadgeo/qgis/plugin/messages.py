@@ -33,7 +33,7 @@ from qgis.utils import iface, plugins
 
 from .session import Finding
 
-__all__ = ["PlacesDialog", "open_dialog", "tell"]
+__all__ = ["PlacesDialog", "open_dialog", "push", "tell", "tell_ready"]
 
 _LONLAT = "EPSG:4326"
 
@@ -57,10 +57,28 @@ def keep(dialog: Any) -> None:
     _OPEN[:] = [one for one in [*_OPEN, dialog] if not sip.isdeleted(one) and one.isVisible()]
 
 
+def push(title: str, text: str, offered: list[tuple[str, Any]], level: Any, lasts_s: int = 0) -> Any:
+    """Put a message with buttons into the window's message bar, and return it; 0 seconds: until it is closed."""
+    message = iface.messageBar().createMessage(title, text)
+    for label, does in offered:
+        button = QPushButton(label)
+        button.clicked.connect(lambda _=False, does=does: does())
+        message.layout().addWidget(button)
+    return iface.messageBar().pushWidget(message, level, lasts_s)
+
+
+def tell_ready(version: str) -> None:
+    """Report that the program is set up, in place of the question that asked for it, with what comes next."""
+    offered = [("Build road reference...", lambda: open_dialog("buildreference", {}))]
+    _menu().forget_question()
+    QTimer.singleShot(
+        _AFTER_MS, lambda: push("roadgeo", f"Version {version} is set up.", offered, Qgis.MessageLevel.Success)
+    )
+
+
 def tell(algorithm: str, finding: Finding) -> None:
     """Report a result in the window's message bar, with buttons for the next step."""
     location = finding.location
-    bar = iface.messageBar()
     if location["status"] == "located":
         text = f"located, {location['gsd_m']:.2g} m per pixel, up is {location['rotation_deg'] % 360.0:.0f}° from north"
         level, offered = Qgis.MessageLevel.Success, [("Zoom to it", lambda: zoom(location["footprint_lonlat"]))]
@@ -75,17 +93,16 @@ def tell(algorithm: str, finding: Finding) -> None:
     if finding.page:
         page = QUrl.fromLocalFile(finding.page)
         offered.append(("Report", lambda: QDesktopServices.openUrl(page)))
-    message = bar.createMessage(finding.name, text)
-    for label, does in offered:
-        button = QPushButton(label)
-        button.clicked.connect(does)
-        message.layout().addWidget(button)
-    lasts = 0 if level == Qgis.MessageLevel.Warning else 20
-    QTimer.singleShot(_AFTER_MS, lambda: bar.pushWidget(message, level, lasts))
+    lasts_s = 0 if level == Qgis.MessageLevel.Warning else 20
+    QTimer.singleShot(_AFTER_MS, lambda: push(finding.name, text, offered, level, lasts_s))
+
+
+def _menu() -> Any:
+    return plugins[Path(__file__).parent.name].menu
 
 
 def _mend(finding: Finding) -> None:
-    plugins[Path(__file__).parent.name].menu.mend(finding.picture, finding.points)
+    _menu().mend(finding.picture, finding.points)
 
 
 def zoom(lonlat: list[list[float]], scale: float = 1.3) -> None:
