@@ -17,8 +17,7 @@ from roadgeo.kernels.structs import Hits, TripleLimits, TripleQuery
 from roadgeo.kernels.triple_codes import UNITS, find_sides
 from roadgeo.kernels.triples import look_up_each
 from roadgeo.matching.index import ReferenceIndex, build_index
-from roadgeo.matching.query import trace_query
-from roadgeo.matching.scene import MIN_COS, Scene
+from roadgeo.matching.scene import MIN_COS, Scene, trace_query
 from roadgeo.matching.triples import TripleOptions, propose
 from roadgeo.reference.reference import Reference, build_network
 from roadgeo.sources.masks import read_mask

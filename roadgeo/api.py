@@ -516,7 +516,7 @@ def vectorize(image: Any, *, gsd: float | tuple[float, float] | str | None = Non
         It cannot be read, or shows no roads.
     """
     from roadgeo.geometry.mask import plane_to_pixel
-    from roadgeo.matching.query import trace_query
+    from roadgeo.matching.scene import trace_query
     from roadgeo.running.pictures import read_picture
     from roadgeo.running.queries import QueryOptions, look_once
 

@@ -19,7 +19,7 @@ from roadgeo.matching.explanation import Explanation, tell
 from roadgeo.matching.index import build_index
 from roadgeo.matching.methods import Found, search_references
 from roadgeo.matching.options import LocateOptions
-from roadgeo.matching.query import Query, read_query
+from roadgeo.matching.scene import Query, read_query
 from roadgeo.matching.truth import true_place
 from roadgeo.matching.verdict import decide, needed_of
 from roadgeo.reference.reference import AnyReference, BuildOptions, Reference, build_network, open_whole, stored_options

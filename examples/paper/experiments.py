@@ -23,7 +23,7 @@ from roadgeo.geometry.mask import PIXEL_TO_PLANE, RoadMask
 from roadgeo.matching.index import build_index
 from roadgeo.matching.paper.search import match_pairs
 from roadgeo.matching.paper.tuples import PairIndex, PairOptions, build_pair_index
-from roadgeo.matching.query import trace_query
+from roadgeo.matching.scene import trace_query
 from roadgeo.reference.library import resolve_reference
 from roadgeo.reference.network_file import as_stored, read_network
 from roadgeo.reference.reference import Reference, open_reference

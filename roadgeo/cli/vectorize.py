@@ -68,7 +68,7 @@ def vectorize_command(
 def _show(task: Task, out_dir: str, gsd_m: tuple[float, float] | None, query: QueryOptions, say: Say) -> str:
     """Write the roads seen in an image; return them in words."""
     from roadgeo.errors import MaskError
-    from roadgeo.matching.query import trace_query
+    from roadgeo.matching.scene import trace_query
     from roadgeo.outputs.paths import output_paths
     from roadgeo.outputs.vectorized import write_vectorized
     from roadgeo.running.probability_files import keep_probability

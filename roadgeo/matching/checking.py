@@ -13,18 +13,15 @@ from roadgeo.geometry.camera import sampling
 from roadgeo.geometry.displacement import Displacement, measure
 from roadgeo.geometry.homography import Homography
 from roadgeo.matching.carriageways import refine_between, roads_beside
-from roadgeo.matching.evidence import Evidence
+from roadgeo.matching.evidence import Evidence, agreement, match_intersections
+from roadgeo.matching.exhaustive import LocalSearchOptions, move_about, search_nearby
 from roadgeo.matching.index import ReferenceIndex
-from roadgeo.matching.local_search import LocalSearchOptions, move_about, search_nearby
 from roadgeo.matching.refinement import Refined, RefineOptions, refine
 from roadgeo.matching.scene import Scene
-from roadgeo.matching.verification import VerifyOptions, agreement
 
 __all__ = ["CheckOptions", "Checked", "Verdict", "check_place"]
 
 Verdict = Literal["agrees", "off", "unknown"]
-
-_NO_SEEDS: IntArray = np.array([], np.int64)
 
 
 @dataclass(frozen=True)
@@ -62,7 +59,6 @@ class CheckOptions:
     twin_m: float = 10.0
     perspective_sigma: float = 0.003
     search: LocalSearchOptions = field(default_factory=LocalSearchOptions)
-    verify: VerifyOptions = field(default_factory=VerifyOptions)
     refine: RefineOptions = field(default_factory=RefineOptions)
 
 
@@ -163,7 +159,7 @@ class _Judge:
         scene = self.scene if n_points else self.without_twins(start)
         matched = np.full(len(self.scene.intersections), -1)
         for _ in range(3):
-            _, matched, _ = agreement(matrix, self.scene, self.index, self.gsd, _NO_SEEDS, self.options.verify)
+            matched, _ = match_intersections(matrix, self.scene, self.index, self.gsd)
             step = refine(matrix, scene, self.index, matched, self.refine_options, n_points, held=True)
             if step is None or not self.gap(step.matrix, start) < self.options.max_drift_m:
                 break
@@ -188,7 +184,7 @@ class _Judge:
 
     def agreeing(self, matrix: FloatArray) -> float:
         """Return the share of the roads, of mask and map, that agree."""
-        found, _, _ = agreement(matrix, self.scene, self.index, self.gsd, _NO_SEEDS, self.options.verify)
+        found, _, _ = agreement(matrix, self.scene, self.index, self.gsd)
         return (found.forward + found.backward) / 2.0
 
     def displacement(self, place: _Place) -> Displacement:

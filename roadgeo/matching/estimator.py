@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 import time
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterator
 from dataclasses import dataclass, field, replace
 
 import numpy as np
@@ -14,37 +14,27 @@ from roadgeo.geometry.areas import Box, lies_in
 from roadgeo.geometry.camera import CameraFault, CameraOptions, judge, sampling
 from roadgeo.geometry.homography import Homography
 from roadgeo.geometry.projection import to_lonlat
-from roadgeo.matching.events import Events, Scored
-from roadgeo.matching.evidence import Evidence, EvidenceOptions
+from roadgeo.matching.events import Events, Ledger, Scored, Work
+from roadgeo.matching.evidence import Evidence, EvidenceOptions, agreement, match_intersections
 from roadgeo.matching.exhaustive import ExhaustiveOptions, is_told, propose_everywhere
-from roadgeo.matching.growing import grow_proposals, screen_proposals
-from roadgeo.matching.hypothesis import MINIMAL, Hypothesis, Lead
+from roadgeo.matching.growing import Hypothesis, SharedSweeps, grow_proposals, screen_proposals
 from roadgeo.matching.index import ReferenceIndex
-from roadgeo.matching.ledger import Ledger, Work
 from roadgeo.matching.lens import (
     ENOUGH,
-    MAX_PLACES,
     LensFit,
-    core_excess,
     find_lens,
     grow_whole,
-    is_significant,
-    regrow,
     straighten_scene,
 )
 from roadgeo.matching.refinement import RefineOptions, refine
 from roadgeo.matching.road_search import Grown, RoadSearch
 from roadgeo.matching.scene import Scene
-from roadgeo.matching.shared_sweeps import SharedSweeps, Stage
 from roadgeo.matching.triples import BEFORE_ROADS, WITHOUT_ROADS, Proposals, Sweep, larger
-from roadgeo.matching.verification import VerifyOptions, agreement
 
 __all__ = ["Ledger", "MatchOptions", "TripleEstimator"]
 
 #: A place is fitted through a lens once, and again where this much more of the mask's roads agrees.
 _BETTER = 0.05
-#: A place that this many intersections of the query propose by roads is settled: each searched the whole map.
-_OFTEN_ENOUGH = 2
 #: A place is dropped if its likelihood is lower than the best one's by this (log10), or, laid roughly and less roughly,
 #: below these parts of the best one's.
 _LEAST_LIKELY, _NO_RIVAL, _BEHIND = 0.7, 0.4, 0.7
@@ -66,14 +56,12 @@ class MatchOptions:
     ----------
     sweeps, without_roads : tuple of Sweep
         The sweeps where roads propose after them, and where these are left out: they go on for longer then.
-    sightings : int
-        Anchors that must lead to a place before it ends the search: a map may hold its twin.
     roads : bool
         Whether roads propose where no triple leads to a place, rather than more sweeps.
     everywhere : ExhaustiveOptions
         Where heading and scale are given, of laying the roads everywhere on the map instead.
     lens : bool
-        Whether a lens is looked for behind promising places, and behind others that were dropped.
+        Whether a lens is looked for behind promising places.
     max_places : int
         The sweeps end too when this many places were screened on a map of 15,000 intersections; on a larger one more
         by the root of the ratio. Where streets are alike, proposals abound, and late ones are seldom right: of 31 masks
@@ -84,7 +72,6 @@ class MatchOptions:
 
     sweeps: tuple[Sweep, ...] = BEFORE_ROADS
     without_roads: tuple[Sweep, ...] = WITHOUT_ROADS
-    verify: VerifyOptions = field(default_factory=VerifyOptions)
     evidence: EvidenceOptions = field(default_factory=EvidenceOptions)
     refine: RefineOptions = field(default_factory=RefineOptions)
     camera: CameraOptions = field(default_factory=CameraOptions)
@@ -92,7 +79,6 @@ class MatchOptions:
     everywhere: ExhaustiveOptions = field(default_factory=ExhaustiveOptions)
     lens: bool = True
     max_places: int = 12_000
-    sightings: int = 2
     within: Box | None = None
 
 
@@ -121,7 +107,6 @@ class TripleEstimator:
         self.refine_s = 0.0
         self.n_nulls = 0
         self.verified: list[Hypothesis] = []
-        self._dropped: list[Hypothesis] = []
         self._looked: list[tuple[Hypothesis, float]] = []  # through a lens, and which share of roads agreed without
         self._whole: list[Hypothesis] = []  # verified, and no better version of them is to be expected
         self.scene = scene
@@ -130,23 +115,21 @@ class TripleEstimator:
         camera, usual = self.options.camera, self.options.refine
         self.refine_options = replace(usual, perspective_sigma=camera.perspective_sigma(usual.perspective_sigma))
         self.n_tuples = self.n_candidates = self.n_screened = self.n_hypotheses = self.n_verified = 0
-        self._tried: set[Lead] = set()
-        self._grown_by_roads: list[Hypothesis] = []
+        self._n_rounds, self._anchors = 0, set[int]()
         self.sweeps = sweeps or SharedSweeps(scene, camera)
         self.sweeps.members.append(self)
-        self._road_search: RoadSearch | None = None
         self._is_everywhere = False  # whether the roads were laid everywhere on the map
 
     def stages(self) -> Iterator[Iterator[list[Hypothesis]]]:
         """Yield, for one anchor after another, the hypotheses that grew.
 
-        Triples propose them, then roads, then what was dropped grows anew behind a lens.
+        Triples propose them, then roads.
 
         On a coarse map roads come first: an intersection is seldom merged there as a mask shows it.
         """
         options, by_roads = self.options, self.options.roads and len(self.scene.intersections) > 0
         sources = options.sweeps if by_roads else options.without_roads
-        sweeps = [self.sweeps.rounds(self, Stage(stage, source)) for stage, source in enumerate(sources)]
+        sweeps = [self.sweeps.rounds(self, source) for source in sources]
         if by_roads and is_told(options.camera, options.everywhere):
             yield sweeps.pop(0)
             yield self._rounds_everywhere()
@@ -157,17 +140,15 @@ class TripleEstimator:
             return
         roads = [self._rounds_of_roads()]
         yield from sweeps + roads if self.index.coarseness == 1.0 else roads + sweeps
-        if options.lens:
-            yield self._rounds_of_lenses()
 
     def _rounds_everywhere(self) -> Iterator[list[Hypothesis]]:
         """Yield the places that agree best of all, where heading and scale are given."""
-        scene, index, options, nobody = self.scene, self.index, self.options, np.empty(0, np.int64)
+        scene, index, options = self.scene, self.index, self.options
         for matrix in propose_everywhere(scene, index, options.camera, options.everywhere, self.near):
             self._is_everywhere = True
             self.n_hypotheses += 1
-            _, matched, _ = agreement(matrix, scene, index, sampling(matrix, scene.size), nobody, options.verify)
-            hypothesis = Hypothesis(matrix, nobody, 1.0, matched, by_roads=True)
+            matched, _ = match_intersections(matrix, scene, index, sampling(matrix, scene.size))
+            hypothesis = Hypothesis(matrix, 1.0, matched, by_roads=True)
             self.events.note("grown", [hypothesis.matrix])
             yield [hypothesis] if self._is_plausible(hypothesis) else []
 
@@ -175,75 +156,45 @@ class TripleEstimator:
     def work(self) -> float:
         """Seconds that a usual machine takes for the work done (see `search.Estimator`)."""
         points = len(self.scene.dense_points)
-        counts = (len(self._tried), self.n_candidates, self.n_screened, self.n_hypotheses, self.n_verified, points)
+        counts = (self._n_rounds, self.n_candidates, self.n_screened, self.n_hypotheses, self.n_verified, points)
         return Work(*counts).seconds
-
-    def leads(self, model: Hypothesis) -> list[Lead]:
-        """Return the anchors that led to a hypothesis (see `search.Estimator`).
-
-        On a coarse map nothing that is worth a try on others: it holds all the ground that they show, and coarse maps
-        are searched for the same intersections side by side.
-        """
-        return model.leads if self.index.coarseness == 1.0 else []
-
-    def follow(self, leads: Sequence[Lead]) -> Iterator[list[Hypothesis]]:
-        """Yield places that grew from anchors that led to a place on another part (see `search.Estimator`)."""
-        for stage, anchor in leads:
-            if not self.options.roads or stage < self._stage_of_roads:
-                yield self.sweeps.pending(self, stage, anchor)
-            else:
-                yield from self._rounds_of_roads([anchor])
 
     @property
     def n_anchors(self) -> int:
         """Intersections of the query that were looked for."""
-        return len({anchor for _, anchor in self._tried})
+        return len(self._anchors)
 
     def _count(self, n_places: int) -> None:
         """Count further places as tried."""
         self.n_screened += n_places
         self.ledger.n_tried += round(self.ledger.beside * n_places)
 
-    @property
-    def _stage_of_roads(self) -> int:
-        """Number of the stage in which roads propose."""
-        return len(self.options.sweeps)
-
-    def _search_by_roads(self) -> RoadSearch:
-        """Return the search by roads, which is made when it is needed."""
-        if self._road_search is None:
-            turnout = self.sweeps.turnout(self.index.coarseness)
-            self._road_search = RoadSearch(
-                self.scene, self.index, self.options.camera, self.near, self.sweeps.ahead, turnout
-            )
-        return self._road_search
-
-    def _rounds_of_roads(self, only: Sequence[int] | None = None) -> Iterator[list[Hypothesis]]:
-        """Yield places that grew by roads and are not known yet; a place found again counts as found once more."""
-        roads, known, stage = self._search_by_roads(), self._grown_by_roads, self._stage_of_roads
-        tried = roads.n_tried
-        for anchor, n_proposed, grown in roads.rounds(only):
+    def _rounds_of_roads(self) -> Iterator[list[Hypothesis]]:
+        """Yield places that grew by roads and are not known yet."""
+        known: list[Hypothesis] = []
+        options, turnout = self.options, self.sweeps.turnout(self.index.coarseness)
+        roads = RoadSearch(self.scene, self.index, options.camera, self.near, self.sweeps.ahead, turnout)
+        tried = 0
+        for anchor, n_proposed, grown in roads.rounds():
             self._count(roads.n_tried - tried)
             tried = roads.n_tried
             self.n_hypotheses += n_proposed
             if anchor >= 0:
-                self._tried.add((stage, anchor))
+                self._look_for(anchor)
                 self.events.note("voted", anchor, n_proposed)
             fresh: list[Hypothesis] = []
-            again: list[Hypothesis] = []
             for hypothesis in map(self._of_roads, grown):
-                twins = [one for one in known if self._is_found_again(one, hypothesis)]
-                if twins or any(self.same(one, hypothesis) for one in fresh):
-                    again += twins[:1]
-                elif self._is_plausible(hypothesis):
-                    fresh.append(hypothesis)
-            for one in known:
-                one.leads += [(stage, anchor)] * any(one is other for other in again)
-            for one in fresh:
-                one.leads.append((stage, anchor))
+                is_known = any(self._is_found_again(one, hypothesis) for one in known)
+                if not is_known and not any(self.same(one, hypothesis) for one in fresh):
+                    fresh += [hypothesis] * self._is_plausible(hypothesis)
             known += fresh
             self.events.note("grown", [one.matrix for one in fresh])
             yield fresh
+
+    def _look_for(self, anchor: int) -> None:
+        """Count an intersection of the query that is looked for on the map."""
+        self._n_rounds += 1
+        self._anchors.add(anchor)
 
     def _is_plausible(self, hypothesis: Hypothesis) -> bool:
         """Whether a camera can have seen a grown hypothesis."""
@@ -255,10 +206,8 @@ class TripleEstimator:
     def _of_roads(self, grown: Grown) -> Hypothesis:
         """Make a hypothesis of a place that grew by roads, with the intersections that match."""
         scene, matrix = self.scene, grown.matrix / grown.matrix[2, 2]
-        seeds = np.array([grown.anchor])
-        gsd = sampling(matrix, scene.size)
-        _, matched, _ = agreement(matrix, scene, self.index, gsd, seeds, self.options.verify)
-        return Hypothesis(matrix, seeds, grown.closeness, matched, by_roads=True)
+        matched, _ = match_intersections(matrix, scene, self.index, sampling(matrix, scene.size))
+        return Hypothesis(matrix, grown.closeness, matched, by_roads=True)
 
     def _is_found_again(self, known: Hypothesis, hypothesis: Hypothesis) -> bool:
         """Whether a verified place that is promising was proposed by another intersection as well."""
@@ -273,9 +222,9 @@ class TripleEstimator:
         larger_by = larger(max(self.ledger.n_reference, len(self.index)))
         return self.ledger.n_by_triples >= int(self.options.max_places * larger_by)
 
-    def screen(self, proposals: Proposals, allowed: BoolArray, most: int, stage: Stage) -> IntArray:
+    def screen(self, proposals: Proposals, allowed: BoolArray, most: int) -> IntArray:
         """Return the proposals that are allowed and lie on roads, the best placed first."""
-        self._tried.add((stage.number, proposals.anchor))
+        self._look_for(proposals.anchor)
         self.n_tuples += proposals.n_tuples
         self.n_candidates += proposals.n_hits
         looked_at = np.flatnonzero(allowed)[:most]
@@ -299,19 +248,14 @@ class TripleEstimator:
         """Grow the chosen proposals of one anchor; return those that did not wither, the best supported first."""
         return grow_proposals(self.scene, self.index, proposals, chosen, self.options.camera)
 
-    def follow_up(self, proposals: Proposals, chosen: IntArray, stage: Stage) -> Iterator[Hypothesis]:
+    def follow_up(self, proposals: Proposals, chosen: IntArray) -> Iterator[Hypothesis]:
         """Yield the grown proposals of one anchor that mean different places and that a camera can have seen."""
-        lead = (stage.number, proposals.anchor)
         self.n_hypotheses += len(chosen)
         grown = self.grow(proposals, chosen)
         self.events.note("grown", [one.matrix for one in grown])
         distinct: list[Hypothesis] = []
         for h in filter(self._is_plausible, grown):
-            known = [one for one in self._whole if self.same(one, h)]
-            for one in known:
-                one.leads += [lead] * (lead not in one.leads)
-            if not known and not any(self.same(h, other) for other in distinct):
-                h.leads.append(lead)
+            if not any(self.same(h, other) for other in (*self._whole, *distinct)):
                 distinct.append(h)
                 yield h
 
@@ -319,14 +263,9 @@ class TripleEstimator:
         """Refine a hypothesis and return its log10 odds: its lead over the best place nearby."""
         started = time.perf_counter()
         self.n_verified += 1
-        if model.lens is not None:
-            self._see_through(model, model.lens)
-        else:
-            self._verify(model)
-            if model.log10_likelihood >= max(_LEAST_LIKELY, _NEARLY * self._most_elsewhere(model)):
-                self._look_through_lens(model)
-            elif model.refined is not None:
-                self._dropped.append(model)
+        self._verify(model)
+        if model.log10_likelihood >= max(_LEAST_LIKELY, _NEARLY * self._most_elsewhere(model)):
+            self._look_through_lens(model)
         if math.isfinite(model.log10_odds):
             self.verified.append(model)
         self.refine_s += time.perf_counter() - started
@@ -343,8 +282,6 @@ class TripleEstimator:
             if not self._converge(model, n_points):
                 model.log10_odds = -math.inf
                 return
-            evidence = Evidence(self.scene, self.index, model.gsd_m, self.options.evidence)
-            model.log10_likelihood = evidence.weigh(model.matrix)
             if model.log10_likelihood < max(_LEAST_LIKELY, least):
                 self._charge(model)
                 return
@@ -352,9 +289,10 @@ class TripleEstimator:
 
     def _weigh(self, model: Hypothesis) -> None:
         """Weigh a hypothesis, and the best place nearby where it explains more than any other that was met."""
-        evidence = Evidence(self.scene_of(model), self.index, model.gsd_m, self.options.evidence)
-        model.log10_likelihood = evidence.weigh(model.matrix)
+        if model.found is not None:
+            model.log10_likelihood = model.found.log10_likelihood
         if model.log10_likelihood > self._most_elsewhere(model):
+            evidence = Evidence(self.scene_of(model), self.index, model.gsd_m, self.options.evidence)
             model.nearby = evidence.nearby(model.matrix, self.near)
             self.n_nulls += 1
         self._charge(model)
@@ -394,35 +332,11 @@ class TripleEstimator:
 
     def _see_through(self, model: Hypothesis, lens: LensFit) -> None:
         """Verify a hypothesis as seen through a lens."""
-        index, verify = self.index, self.options.verify
         scene = straighten_scene(self.scene, lens.k1) if lens.k1 else self.scene
         model.refined, model.matrix = lens.refined, lens.matrix
         model.gsd_m = gsd = sampling(lens.matrix, scene.size)
-        seeds = model.seeds[-MINIMAL:]
-        model.found, model.matched, model.distance = agreement(lens.matrix, scene, index, gsd, seeds, verify)
+        model.found, model.matched, model.distance = agreement(lens.matrix, scene, self.index, gsd)
         self._weigh(model)
-
-    def _rounds_of_lenses(self) -> Iterator[list[Hypothesis]]:
-        """Yield places that were dropped and that fit after all when grown anew, behind a lens."""
-        scene, index, refinement = self.scene, self.index, self.refine_options
-        dropped, self._dropped = self._dropped, []
-        gains = [core_excess(one.matrix, scene, index, refinement) for one in dropped]
-        places: list[Hypothesis] = []
-        for k in np.argsort(-np.array(gains), kind="stable"):
-            one = dropped[k]
-            twin = next((other for other in places if self.same(one, other)), None)
-            if twin is not None:
-                twin.leads += [lead for lead in one.leads if lead not in twin.leads]
-            elif len(places) < MAX_PLACES:
-                places.append(one)
-        for one in places:
-            found = regrow(one.matrix, scene, index, refinement)
-            if found is None or not self.may_be(found.matrix):
-                yield []
-            elif is_significant(found, scene):
-                yield [replace(one, lens=found)]
-            else:  # no lens: it had not grown over the whole frame
-                yield [replace(one, matrix=found.matrix, refined=None, by_roads=True)]
 
     def scene_of(self, model: Hypothesis) -> Scene:
         """Return the scene as a pinhole sees it, behind the lens that a hypothesis found."""
@@ -431,7 +345,7 @@ class TripleEstimator:
 
     def _converge(self, model: Hypothesis, n_points: int | None) -> bool:
         """Refine until nothing more agrees: more matches make a better fit, and that finds more matches."""
-        scene, verify = self.scene, self.options.verify
+        scene = self.scene
         best, options = -1.0, self.refinement(model)
         for _ in range(5):
             refined = refine(model.matrix, scene, self.index, model.matched, options, n_points, model.by_roads)
@@ -439,12 +353,13 @@ class TripleEstimator:
             if refined is None or model.fault is not None or self._is_far(refined.matrix):
                 return model.refined is not None and best >= 0.0
             gsd = sampling(refined.matrix, scene.size)
-            found, matched, distance = agreement(refined.matrix, scene, self.index, gsd, model.seeds[-MINIMAL:], verify)
+            found, matched, distance = agreement(refined.matrix, scene, self.index, gsd)
             if found.forward < best:
                 break
             improved = found.forward > best + 0.01
             best = found.forward
             model.matrix, model.refined, model.found = refined.matrix, refined, found
+            model.log10_likelihood = found.log10_likelihood
             model.matched, model.distance, model.gsd_m = matched, distance, gsd
             if not improved:
                 break
@@ -471,18 +386,6 @@ class TripleEstimator:
         if self.near is not None and np.hypot(*(middle - self.near[:2])) > self.near[2]:
             return True
         return within is not None and not lies_in(within, *to_lonlat(plane.crs, plane.to_crs(middle[None]))[0])
-
-    def settled(self, model: Hypothesis) -> bool:
-        """Whether a hypothesis fits the whole frame and was found often enough for a twin to have been found beside it.
-
-        Each anchor that leads to a place would as soon lead to its twin: if several lead to it, and to no other that
-        fits, it has none.
-        """
-        if model.found is None or model.refined is None:
-            return False
-        if model.by_roads:
-            return model.n_found >= _OFTEN_ENOUGH
-        return model.n_found >= self.options.sightings and self._fits_whole(model)
 
     def _fits_whole(self, model: Hypothesis) -> bool:
         """Whether a hypothesis fits the whole frame, so that no better version of it is to be expected."""

@@ -24,19 +24,20 @@ from functools import lru_cache
 
 import numpy as np
 
-from roadgeo._arrays import FloatArray
+from roadgeo._arrays import FloatArray, IntArray
 from roadgeo.geometry.homography import Homography
+from roadgeo.kernels.point_matching import match_all
 from roadgeo.kernels.roads import count_residuals, shares_near_roads
 from roadgeo.matching.index import ReferenceIndex
-from roadgeo.matching.scene import Scene
+from roadgeo.matching.scene import MIN_COS, Scene
 
-__all__ = ["Evidence", "EvidenceOptions", "log10_lead"]
+__all__ = ["Agreement", "Evidence", "EvidenceOptions", "agreement", "log10_lead", "match_intersections", "tolerance_m"]
 
 #: Grid of the marginalised parameters: residuals' deviation, in usual ones; shares of missing, and of false roads.
 _SIGMAS = np.array([0.25, 0.4, 0.65, 1.0, 1.6])
 _SHARES = np.array([0.03, 0.1, 0.25, 0.5, 0.75])
-#: Range of residuals, in usual deviations, and number of bins.
-_REACH, _BINS = 4.0, 24
+#: Range of residuals, in usual deviations, and number of bins; those of roads that agree.
+_REACH, _BINS, _AGREEING = 4.0, 24, 18
 #: This share of roads that lie anywhere runs along a road piece, as streets go; directions of the map's roads are not
 #: compared with those of the query. Shares of pieces with such a road nearby are rounded to a ladder.
 _ALONG, _STEP, _STEPS = 0.42, 0.8, 14
@@ -91,6 +92,38 @@ class EvidenceOptions:
         return math.cos(math.radians(self.max_turn_deg))
 
 
+@dataclass(frozen=True)
+class Agreement:
+    """What agrees at a place.
+
+    Attributes
+    ----------
+    matched, tested : int
+        Intersections of the query that meet one of the map, and all of them.
+    forward, backward : float
+        Share of the query's roads on roads of the map, and of the map's roads on roads of the query, within three
+        standard deviations.
+    log10_likelihood : float
+        That of `Evidence`, by the yardstick of the place itself.
+    """
+
+    matched: int
+    tested: int
+    forward: float
+    backward: float
+    log10_likelihood: float = -math.inf
+
+    @property
+    def rate(self) -> float:
+        """Share of intersections matched."""
+        return self.matched / max(self.tested, 1)
+
+    @property
+    def mean(self) -> float:
+        """Mean of the shares of intersections, of the query's roads and of the map's roads that agree."""
+        return (self.rate + self.forward + self.backward) / 3
+
+
 class Evidence:
     """Weighs places of one scene on one map, all with the same yardstick.
 
@@ -118,6 +151,12 @@ class Evidence:
         """Return log10 L of a place, query plane to reference plane (3, 3)."""
         seen, mapped = self._count(matrix, math.inf, (1, 1))
         return self._log10(seen[0], mapped[0])
+
+    def agreement(self, matrix: FloatArray, matched: IntArray) -> Agreement:
+        """Return what agrees at a place, where intersections of the query are `matched` (N,) with the map's, or -1."""
+        seen, mapped = self._count(matrix, math.inf, (1, 1))
+        forward, backward = (float(one[0, :_AGREEING].sum() / max(one.sum(), 1e-9)) for one in (seen, mapped))
+        return Agreement(int((matched >= 0).sum()), len(matched), forward, backward, self._log10(seen[0], mapped[0]))
 
     def _log10(self, seen: FloatArray, mapped: FloatArray) -> float:
         """Return log10 L of histograms."""
@@ -250,6 +289,31 @@ class Evidence:
             possible &= np.hypot(*(middle + shifts - within[:2]).T) <= within[2]
         shifts, length = shifts[possible], length[possible]
         return np.asarray(shifts[np.argsort(length)[: options.n_shifts]])
+
+
+def tolerance_m(gsd_m: float, options: EvidenceOptions | None = None) -> float:
+    """Return how far roads that agree may lie apart: three standard deviations, metres."""
+    usual = options or EvidenceOptions()
+    return 3.0 * math.hypot(usual.map_sigma_m, usual.pixel_sigma_px * gsd_m)
+
+
+def match_intersections(
+    matrix: FloatArray, scene: Scene, index: ReferenceIndex, gsd_m: float
+) -> tuple[IntArray, FloatArray]:
+    """Return the map's intersection that each of the query's is (N,), or -1, and metres between them (N,)."""
+    found = scene.intersections
+    matched, distance = np.empty(len(found), np.int64), np.empty(len(found))
+    reach_m = 1.5 * tolerance_m(gsd_m)
+    match_all(matrix, found.xy, scene.branches, reach_m, MIN_COS, index.point_buckets, matched, distance)
+    return matched, distance
+
+
+def agreement(
+    matrix: FloatArray, scene: Scene, index: ReferenceIndex, gsd_m: float
+) -> tuple[Agreement, IntArray, FloatArray]:
+    """Return what agrees at a place, and which intersections are matched, and how well (see `match_intersections`)."""
+    matched, distance = match_intersections(matrix, scene, index, gsd_m)
+    return Evidence(scene, index, gsd_m).agreement(matrix, matched), matched, distance
 
 
 #: Number of shifts that are weighed, those that lay most road points on roads.

@@ -1,8 +1,9 @@
-"""Proposals where heading and scale are roughly known: the roads seen are laid everywhere on the map.
+"""The places near a given one where a mask's roads run on roads of the map: shifts and small turns of a start.
 
-Query and map are drawn on a coarse raster, and correlated by FFT, for each of a few turns and scales: no intersection
-need be intact. Their agreement is the Dice coefficient of the roads of both, 2 |A and B| / (|A| + |B|), on the
-ground that the query observed; roads count by the squared cosine between their directions.
+The roads around the frame are drawn on a coarse raster, one layer for each of 16 directions. A road point of the query
+reads the layer of its own direction: the layer around its place is the answer for all shifts at once, and the sum over
+all points counts those on roads under each shift (a generalised Hough transform; Ballard 1981). Turns are
+tried one by one.
 """
 
 from __future__ import annotations
@@ -10,7 +11,7 @@ from __future__ import annotations
 import math
 from collections.abc import Iterator
 from dataclasses import dataclass, field
-from typing import Any
+from typing import Any, TypeAlias
 
 import cv2
 import numpy as np
@@ -20,10 +21,196 @@ from roadgeo.geometry.camera import CameraOptions
 from roadgeo.geometry.frame import Frame
 from roadgeo.geometry.homography import Homography
 from roadgeo.matching.index import ReferenceIndex
-from roadgeo.matching.local_search import LocalSearchOptions, move_about, search_nearby
 from roadgeo.matching.scene import Scene
 
-__all__ = ["ExhaustiveOptions", "is_told", "propose_everywhere"]
+__all__ = [
+    "Drawn",
+    "ExhaustiveOptions",
+    "LocalSearchOptions",
+    "Shift",
+    "is_told",
+    "move_about",
+    "propose_everywhere",
+    "search_nearby",
+]
+
+
+#: Layers that were drawn and the corner of their first cell, by the middle and the reach.
+Drawn: TypeAlias = dict[tuple[float, ...], tuple[AnyArray, FloatArray]]
+
+_DIRECTIONS = 16
+#: Directions within this angle of a road's run along it.
+_ALONG = math.radians(18.0)
+#: Greatest count that a byte holds.
+_BYTE = 255
+
+
+@dataclass(frozen=True)
+class LocalSearchOptions:
+    """How far and how finely is searched.
+
+    Attributes
+    ----------
+    reach_m : float
+        Greatest shift, east and north.
+    turn_deg : float
+        Greatest turn, either way.
+    scales : tuple of float
+        Factors by which the frame may be too small.
+    cell_m : float
+        Side of the raster's cells, and step of the shifts.
+    road_m : float
+        Width of the roads that are drawn: the motion of a point by a step of shift and of turn must fit in.
+    max_points : int
+        Road points of the query that vote.
+    n_places : int
+        Places returned.
+    apart_m : float
+        Places nearer than this to a better one are the same.
+    """
+
+    reach_m: float = 350.0
+    turn_deg: float = 6.0
+    scales: tuple[float, ...] = (1.0,)
+    cell_m: float = 5.0
+    road_m: float = 15.0
+    max_points: int = 300
+    n_places: int = 12
+    apart_m: float = 25.0
+
+
+@dataclass(frozen=True)
+class Shift:
+    """A place near the start: metres east and north, degrees clockwise, scale, and the share of points on roads."""
+
+    east_m: float
+    north_m: float
+    turn_deg: float
+    scale: float
+    share: float
+
+
+def move_about(center: FloatArray, shift: Shift) -> FloatArray:
+    """Return the (3, 3) similarity that turns and scales the plane about a point (2,), and then shifts it."""
+    turn = -math.radians(shift.turn_deg)
+    a, b = shift.scale * math.cos(turn), shift.scale * math.sin(turn)
+    linear = np.array([[a, -b], [b, a]])
+    to = center - linear @ center + np.array([shift.east_m, shift.north_m])
+    return np.array([[a, -b, to[0]], [b, a, to[1]], [0.0, 0.0, 1.0]])
+
+
+def search_nearby(
+    start: FloatArray,
+    scene: Scene,
+    index: ReferenceIndex,
+    options: LocalSearchOptions | None = None,
+    drawn: Drawn | None = None,
+) -> list[Shift]:
+    """Return the best places near a start, the best first.
+
+    Parameters
+    ----------
+    start : (3, 3) float64
+        Query plane to reference plane.
+    drawn : Drawn, optional
+        Keeps the roads that were drawn, for starts about the same middle, by the same options.
+    """
+    options = options or LocalSearchOptions()
+    thin = max(1, len(scene.points) // options.max_points)
+    to_map = Homography(start)
+    points = to_map(scene.points[::thin])
+    ends = to_map(scene.points[::thin] + scene.directions[::thin])
+    seen = np.isfinite(points).all(axis=1) & np.isfinite(ends).all(axis=1)
+    points, ends = points[seen], ends[seen]
+    center = to_map(scene.center)
+    frame = to_map(scene.corners)
+    if not len(points) or not np.isfinite(frame).all():
+        return []
+    radius = float(np.hypot(*(frame - center).T).max())
+    drawn, reach_m = {} if drawn is None else drawn, radius * max(options.scales) + options.reach_m
+    key = (*np.round(center, 3).tolist(), round(reach_m, 3))
+    layers, origin = drawn[key] = drawn.get(key) or _draw_layers(index, center, reach_m, options)
+    best: list[Shift] = []
+    for scale in options.scales:
+        for turn in _turns(radius, options):
+            turned = move_about(center, Shift(0.0, 0.0, turn, scale, 0.0))
+            best += _best_shifts(
+                layers, origin, Homography(turned)(points), Homography(turned)(ends), turn, scale, options
+            )
+    return _distinct(best, options)
+
+
+def _turns(radius_m: float, options: LocalSearchOptions) -> FloatArray:
+    """Return the turns to try: the frame's corners move by less than a road's width from one to the next."""
+    step = min(math.degrees(0.8 * options.road_m / radius_m), 1.5)
+    n = math.ceil(options.turn_deg / step)
+    return np.asarray(np.linspace(-options.turn_deg, options.turn_deg, 2 * n + 1))
+
+
+def _draw_layers(
+    index: ReferenceIndex, center: FloatArray, reach_m: float, options: LocalSearchOptions
+) -> tuple[AnyArray, FloatArray]:
+    """Draw the roads around a point: (16, rows, columns) uint8, 1 on roads; and the first cell's corner (2,)."""
+    cell = options.cell_m
+    side = math.ceil(2.0 * (reach_m + 2.0 * cell) / cell)
+    origin = center - side * cell / 2.0
+    a, b = index.segments[:, :2].astype(float) - origin, index.segments[:, 2:].astype(float) - origin
+    outside = (np.minimum(a, b) > side * cell).any(axis=1) | (np.maximum(a, b) < 0.0).any(axis=1)
+    a, b = a[~outside], b[~outside]
+    angle = np.arctan2(*(b - a).T[::-1]) % math.pi
+    lines = np.round(np.stack((a, b), axis=1) / cell * 16.0 - 8.0).astype(np.int32)  # 1/16 cells from cell centres
+    layers = np.zeros((_DIRECTIONS, side, side), np.uint8)
+    width = _ALONG
+    for d, layer in enumerate(layers):
+        away = np.abs((d + 0.5) * math.pi / _DIRECTIONS - angle)
+        chosen = lines[np.minimum(away, math.pi - away) <= width]
+        cv2.polylines(layer, list(chosen), False, 1, max(1, round(options.road_m / cell)), cv2.LINE_8, 4)
+    return layers, origin
+
+
+def _best_shifts(
+    layers: AnyArray,
+    origin: FloatArray,
+    points: FloatArray,
+    ends: FloatArray,
+    turn: float,
+    scale: float,
+    options: LocalSearchOptions,
+) -> list[Shift]:
+    """Return the best shifts of one turn."""
+    reach, side = round(options.reach_m / options.cell_m), layers.shape[1]
+    cells = np.floor((points - origin) / options.cell_m).astype(int) - reach
+    angle = np.arctan2(*(ends - points).T[::-1]) % math.pi
+    direction = np.minimum((angle / math.pi * _DIRECTIONS).astype(int), _DIRECTIONS - 1)
+    span = 2 * reach + 1
+    inside = (cells >= 0).all(axis=1) & (cells + span <= side).all(axis=1)
+    votes, some = np.zeros((span, span), np.uint16), np.zeros((span, span), np.uint8)
+    for n, ((column, row), d) in enumerate(zip(cells[inside].tolist(), direction[inside].tolist(), strict=True), 1):
+        some += layers[d, row : row + span, column : column + span]
+        if n % _BYTE == 0:  # bytes are added several times as fast
+            votes += some
+            some[:] = 0
+    votes += some
+    peaks = votes == cv2.dilate(votes, np.ones((5, 5), np.uint8))
+    most = 2 * options.n_places
+    at_least = np.cumsum(np.bincount(votes[peaks], minlength=1)[::-1])[::-1]  # peaks of so many votes or more
+    rows, columns = np.nonzero(peaks & (votes >= max(int((at_least >= most).sum()) - 1, 0)))
+    order = np.argsort(-votes[rows, columns].astype(int), kind="stable")[:most]
+    return [
+        Shift((c - reach) * options.cell_m, (r - reach) * options.cell_m, turn, scale, int(votes[r, c]) / len(points))
+        for r, c in zip(rows[order].tolist(), columns[order].tolist(), strict=True)
+    ]
+
+
+def _distinct(shifts: list[Shift], options: LocalSearchOptions) -> list[Shift]:
+    """Return the best shifts that lie apart from better ones."""
+    kept: list[Shift] = []
+    for one in sorted(shifts, key=lambda shift: -shift.share):
+        if all(math.hypot(one.east_m - k.east_m, one.north_m - k.north_m) >= options.apart_m for k in kept):
+            kept.append(one)
+        if len(kept) == options.n_places:
+            break
+    return kept
 
 
 @dataclass(frozen=True)

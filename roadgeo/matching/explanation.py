@@ -50,14 +50,13 @@ from roadgeo.kernels.roads import road_residuals
 from roadgeo.location import Location, Place
 from roadgeo.matching.estimator import TripleEstimator
 from roadgeo.matching.events import Events, Scored
-from roadgeo.matching.hypothesis import Hypothesis
+from roadgeo.matching.evidence import Agreement, agreement, tolerance_m
+from roadgeo.matching.growing import Hypothesis
 from roadgeo.matching.methods import Found
-from roadgeo.matching.query import Query
-from roadgeo.matching.scene import MIN_COS, Scene
+from roadgeo.matching.scene import MIN_COS, Query, Scene
 from roadgeo.matching.search import SearchResult
 from roadgeo.matching.truth import TruthStory, tell_truth
 from roadgeo.matching.verdict import Needed
-from roadgeo.matching.verification import Agreement, agreement, tolerance_m
 from roadgeo.roads.graph import RoadGraph
 
 __all__ = ["SCHEMA", "Explanation", "Funnel", "RejectedPlace", "Story", "tell"]
@@ -289,13 +288,12 @@ def _without_limits(events: Events, search: TripleEstimator) -> list[Scored]:
     scene, index, options = search.scene, search.index, search.options
     camera = CameraOptions(gsd_m=(0.0, math.inf), max_tilt_deg=180.0, max_skew=math.inf)
     free = TripleEstimator(scene, index, replace(options, camera=camera), ledger=search.ledger)
-    nobody = np.empty(0, np.int64)
     compared = []
     for fault, unscaled in [one for one in events.of("refused") if one[0] in _NEGOTIABLE][:_MAX_REFUSED]:
         matrix = unscaled / unscaled[2, 2]
         gsd = sampling(matrix, scene.size)
-        found, matched, _ = agreement(matrix, scene, index, gsd, nobody, options.verify)
-        compared.append((found.rate + found.forward, fault, Hypothesis(matrix, nobody, 0.0, matched)))
+        found, matched, _ = agreement(matrix, scene, index, gsd)
+        compared.append((found.rate + found.forward, fault, Hypothesis(matrix, 0.0, matched)))
     compared.sort(key=lambda entry: -entry[0])
     return [Scored(model, free.score(model), fault) for _, fault, model in compared[:_MAX_RETRIED]]
 
@@ -327,14 +325,13 @@ def _describe(
 ) -> RejectedPlace:
     """Describe a place that was verified."""
     model, scene, index = entry.model, search.scene_of(entry.model), search.index
-    verify = search.options.verify
     camera = pose(model.matrix, scene.size)
     # where it lies
     ground = Homography(model.matrix).everywhere(np.vstack([scene.corners, scene.center]))
     in_crs = index.plane.to_crs(ground)
     lonlat = to_lonlat(index.plane.crs, in_crs)
     # which of the query's road points agree
-    away, near = np.empty((len(scene.points), 3)), np.full(len(scene.points), tolerance_m(camera.gsd_m, verify))
+    away, near = np.empty((len(scene.points), 3)), np.full(len(scene.points), tolerance_m(camera.gsd_m))
     road_residuals(model.matrix, scene.points, scene.directions, near, MIN_COS, index.road_buckets, away)
     place = RejectedPlace(
         matrix=model.matrix,

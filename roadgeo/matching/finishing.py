@@ -18,12 +18,12 @@ from roadgeo.geometry.camera import sampling
 from roadgeo.geometry.homography import Homography
 from roadgeo.matching.carriageways import refine_between, weight_on_roads
 from roadgeo.matching.estimator import TripleEstimator
-from roadgeo.matching.hypothesis import MINIMAL, Hypothesis
+from roadgeo.matching.evidence import agreement
+from roadgeo.matching.growing import Hypothesis
 from roadgeo.matching.index import ReferenceIndex
 from roadgeo.matching.lens import FEWEST, K1_SIGMA, LensEquations
 from roadgeo.matching.refinement import Refined, RefineOptions, corner_covariance, corner_sigmas, refine, robust_rms
 from roadgeo.matching.scene import Scene
-from roadgeo.matching.verification import agreement
 
 __all__ = ["measure_corners", "refine_beside", "with_honest_corners"]
 
@@ -83,9 +83,9 @@ def _take(estimator: TripleEstimator, best: Hypothesis, refined: Refined, least:
 
     The earlier result stands: the odds rest on it.
     """
-    scene, seeds = estimator.scene, best.seeds[-MINIMAL:]
+    scene = estimator.scene
     gsd = sampling(refined.matrix, scene.size)
-    found, matched, distance = agreement(refined.matrix, scene, estimator.index, gsd, seeds, estimator.options.verify)
+    found, matched, distance = agreement(refined.matrix, scene, estimator.index, gsd)
     if found.forward >= least:
         best.refined, best.matrix, best.gsd_m = refined, refined.matrix, gsd
         best.matched, best.distance = matched, distance

@@ -1,20 +1,99 @@
-"""Proposals are screened by the roads around them, and grown outwards, intersection by intersection."""
+"""Hypotheses: proposals are screened by the roads around them, and grown outwards, intersection by intersection."""
 
 from __future__ import annotations
 
+import heapq
+import math
+from collections.abc import Callable, Iterator, Sequence
+from dataclasses import dataclass, field
+from typing import TYPE_CHECKING, NamedTuple, TypeAlias
+
 import numpy as np
 
-from roadgeo._arrays import IntArray
-from roadgeo.geometry.camera import CameraOptions
+from roadgeo._arrays import FloatArray, IntArray
+from roadgeo.geometry.camera import CameraFault, CameraOptions, sampling
+from roadgeo.geometry.frame import Frame
+from roadgeo.geometry.homography import Homography
 from roadgeo.kernels.growth import grow_each
 from roadgeo.kernels.roads import screen
 from roadgeo.kernels.structs import GrowthLimits, GrowthQuery
-from roadgeo.matching.hypothesis import Hypothesis
+from roadgeo.matching.evidence import Agreement
 from roadgeo.matching.index import ReferenceIndex
+from roadgeo.matching.refinement import Refined
+from roadgeo.matching.road_search import Turnout
 from roadgeo.matching.scene import MIN_COS, Scene
-from roadgeo.matching.triples import Proposals
+from roadgeo.matching.search import ALONE, Ahead
+from roadgeo.matching.triples import Proposals, Sweep
 
-__all__ = ["MAX_GROWN", "MAX_SCALE_RATIO", "MAX_SCREENED", "MAX_VERIFIED", "grow_proposals", "screen_proposals"]
+if TYPE_CHECKING:
+    from roadgeo.matching.estimator import TripleEstimator
+
+
+__all__ = [
+    "MAX_GROWN",
+    "MAX_SCALE_RATIO",
+    "MAX_SCREENED",
+    "MAX_VERIFIED",
+    "Hypothesis",
+    "SharedSweeps",
+    "Spot",
+    "grow_proposals",
+    "screen_proposals",
+]
+
+
+class Spot(NamedTuple):
+    """Where the middle of a frame lies by a hypothesis.
+
+    `x`, `y`: plane metres; `reach_m`: nearer middles mean the same place, 50 m or a twentieth of the frame's size;
+    `matrix`, `laid`: the homographies that it was computed of, before and after refinement.
+    """
+
+    matrix: FloatArray
+    laid: FloatArray
+    x: float
+    y: float
+    reach_m: float
+
+
+@dataclass
+class Hypothesis:
+    """A grown hypothesis and its results.
+
+    `by_roads`: it grew by roads over the whole frame; `log10_likelihood`, `nearby`: that of the place, and that of the
+    best place nearby (see `evidence`); `n_tried`: places tried when it was scored; `fault`: the camera's last
+    objection, None where it had none.
+    """
+
+    matrix: FloatArray
+    support: float
+    matched: IntArray
+    refined: Refined | None = None
+    found: Agreement | None = None
+    log10_likelihood: float = -np.inf
+    nearby: float = 0.0
+    distance: FloatArray | None = None
+    gsd_m: float = np.nan
+    log10_odds: float = -np.inf
+    n_tried: int = 1
+    fault: CameraFault | None = None
+    by_roads: bool = False
+    _spot: Spot | None = field(default=None, repr=False)
+
+    @property
+    def laid(self) -> FloatArray:
+        """The homography (3, 3), refined if it was."""
+        return self.matrix if self.refined is None else self.refined.matrix
+
+    def spot(self, size: tuple[int, int]) -> Spot:
+        """Return where the middle of a frame of that size lies; kept, for in a lattice it is asked for without end."""
+        laid, kept = self.laid, self._spot
+        if kept is None or kept.matrix is not self.matrix or kept.laid is not laid:
+            frame = Frame(*size)
+            x, y = Homography(laid).everywhere(frame.plane_center).tolist()
+            reach_m = frame.one_place_m(sampling(self.matrix, size))
+            kept = self._spot = Spot(self.matrix, laid, x, y, reach_m)
+        return kept
 
 
 #: Away from the middle of a tilted frame the ground sampling may differ from that at the middle by this factor.
@@ -80,10 +159,130 @@ def grow_proposals(
         proposals.reference[chosen], proposals.affine[chosen], partners,
         index.point_buckets, limits, _MIN_MATCHED, matched, matrices, ratios,
     )  # fmt: skip
-    # A ratio that is not finite marks one that withered; the seeds are the anchor and the neighbours it is made with.
-    best = np.argsort(-ratios, kind="stable")[: np.isfinite(ratios).sum()]
-    seeds = [np.append(neighbours[anchor][partners[m] >= 0], anchor) for m in best]
-    return [
-        Hypothesis(matrices[m] / matrices[m, 2, 2], made_of, float(ratios[m]), matched[m])
-        for m, made_of in zip(best, seeds, strict=True)
-    ]
+    best = np.argsort(-ratios, kind="stable")[: np.isfinite(ratios).sum()]  # others withered
+    return [Hypothesis(matrices[m] / matrices[m, 2, 2], float(ratios[m]), matched[m]) for m in best]
+
+
+#: Whether hypotheses on two parts are one place of one map, which is cut into overlapping pieces.
+SamePlace: TypeAlias = "Callable[[TripleEstimator, Hypothesis, TripleEstimator, Hypothesis], bool]"
+
+
+#: The places that grew from an anchor's proposals, by the identity of their part; without those taken.
+_Grown: TypeAlias = "dict[int, list[Hypothesis]]"
+
+
+class SharedSweeps:
+    """The sweeps of the parts of one search; each part takes from them what concerns it.
+
+    Attributes
+    ----------
+    members : list
+        The parts; all have joined before the first takes anything.
+    """
+
+    def __init__(
+        self,
+        scene: Scene,
+        camera: CameraOptions,
+        same_place: SamePlace | None = None,
+        ahead: Ahead = ALONE,
+    ) -> None:
+        """Begin without parts. `same_place` is asked of hypotheses on different parts."""
+        self.scene, self.camera, self.same_place, self.ahead = scene, camera, same_place, ahead
+        self.members: list[TripleEstimator] = []
+        self._rounds: dict[int, Iterator[_Grown]] = {}  # by the identity of a sweep
+        self._done: dict[int, list[_Grown]] = {}
+        self._turnouts: dict[float, Turnout] = {}
+
+    def rounds(self, member: TripleEstimator, sweep: Sweep) -> Iterator[list[Hypothesis]]:
+        """Yield places that grew on a part from the proposals of one anchor after another, until enough were seen."""
+        rounds = self._rounds.setdefault(id(sweep), self._work(sweep))
+        done = self._done.setdefault(id(sweep), [])
+        n = 0
+        while True:
+            if n == len(done):
+                grown = next(rounds, None)
+                if grown is None:
+                    return
+                done.append(grown)
+            yield done[n].pop(id(member), [])
+            n += 1
+
+    def turnout(self, coarseness: float) -> Turnout:
+        """Return how many intersections of the scene vote, on all parts of some coarseness alike."""
+        n_map = sum(len(member.index) for member in self.members if member.index.coarseness == coarseness)
+        return self._turnouts.setdefault(coarseness, Turnout(n_map))
+
+    def end(self) -> None:
+        """Let go of the parts: each holds on to this, and a cycle would keep their maps open for a while."""
+        self.members.clear()
+        self._rounds.clear()
+        self._done.clear()
+
+    def _work(self, sweep: Sweep) -> Iterator[_Grown]:
+        low, high = self.camera.gsd_m
+        scale = (low / MAX_SCALE_RATIO, high * MAX_SCALE_RATIO)
+        if self.members[0].enough():
+            return
+        indexes = [member.index for member in self.members]
+        for proposals in sweep.proposals(self.scene, indexes, scale, self.camera.min_shape_ratio, self.ahead):
+            if self.members[0].enough():
+                return
+            yield self._grow(proposals)
+
+    def _grow(self, proposals: Sequence[Proposals]) -> _Grown:
+        """Follow one anchor's proposals on all parts; return the best places that grew, by the part's identity."""
+        members = self.members
+        # The best placed are screened ...
+        allowed = [member.allow(one) for member, one in zip(members, proposals, strict=True)]
+        placed = [one.placed[may] for one, may in zip(proposals, allowed, strict=True)]
+        kept = [
+            member.screen(one, may, most)
+            for member, one, may, most in zip(members, proposals, allowed, _best(placed, MAX_SCREENED), strict=True)
+        ]
+        # ... an even share of those that lie on roads grows ...
+        share = min(MAX_GROWN / max(sum(map(len, kept)), 1), 1.0)
+        grown = [
+            _owned(member, member.follow_up(one, rows[: math.ceil(share * len(rows))]))
+            for member, one, rows in zip(members, proposals, kept, strict=True)
+            if len(rows)
+        ]
+        # ... and the best of these are verified.
+        best: list[tuple[TripleEstimator, Hypothesis]] = []
+        for member, hypothesis in heapq.merge(*grown, key=lambda pair: -pair[1].support):
+            if not self._is_met(member, hypothesis, best):
+                best.append((member, hypothesis))
+                if len(best) == MAX_VERIFIED:
+                    break
+        return {id(member): [one for owner, one in best if owner is member] for member, _ in best}
+
+    def _is_met(
+        self, member: TripleEstimator, hypothesis: Hypothesis, best: Sequence[tuple[TripleEstimator, Hypothesis]]
+    ) -> bool:
+        """Whether another part that overlaps this one has the same place."""
+        if self.same_place is None:
+            return False
+        known = [(other, one) for other in self.members for one in other.known_places()]
+        return any(
+            other is not member and self.same_place(member, hypothesis, other, one) for other, one in (*best, *known)
+        )
+
+
+def _owned(member: TripleEstimator, grown: Iterator[Hypothesis]) -> Iterator[tuple[TripleEstimator, Hypothesis]]:
+    """Yield the places that grew, each with its part."""
+    return ((member, hypothesis) for hypothesis in grown)
+
+
+def _best(placed: Sequence[IntArray], most: int) -> IntArray:
+    """Return how many of each part's proposals, the best placed first, are among the best `most` of all.
+
+    Of equals each part gives one in turn.
+    """
+    counts = np.array([len(one) for one in placed])
+    if counts.sum() <= most:
+        return counts
+    owners = np.repeat(np.arange(len(placed)), counts)
+    all_placed = np.concatenate(placed)
+    turns = np.concatenate([np.arange(len(one)) - np.searchsorted(-one, -one) for one in placed])
+    chosen = np.lexsort((turns, -all_placed))[:most]
+    return np.bincount(owners[chosen], minlength=len(placed))

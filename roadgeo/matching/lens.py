@@ -36,16 +36,12 @@ __all__ = [
     "ENOUGH",
     "FEWEST",
     "K1_SIGMA",
-    "MAX_PLACES",
     "LensEquations",
     "LensFit",
     "Observed",
-    "core_excess",
     "find_lens",
     "fit_lens",
     "grow_whole",
-    "is_significant",
-    "regrow",
     "straighten_scene",
 ]
 
@@ -241,10 +237,8 @@ _N_ITERATIONS, _N_RESTARTS = 30, 3
 #: A fit that after this many iterations has met less than this share of the road points is dropped: wrong places end at
 #: 0.2 to 0.4, right ones at 0.75 to 0.9 (training masks).
 _SOON, _HOPELESS = 8, 0.4
-#: Number of dropped places that are grown anew, those first where most road points in one part of the frame lie on
-#: roads beyond the share of chance, first with this number of road points and these values of k1 to begin with; and
-#: verified where this share of them ends on roads.
-MAX_PLACES, _CHANCE_SHARE, _QUICK_POINTS, _QUICK_STARTS, _LEAST_SHARE = 12, 0.3, 300, (0.0, -0.07, -0.15), 0.6
+#: With this number of road points a lens is looked for first.
+_QUICK_POINTS = 300
 
 
 @dataclass(frozen=True)
@@ -356,7 +350,7 @@ def find_lens(
     if rough is None or _moves_px(rough, scene) < 0.5 * _LEAST_PX:
         return None
     found = _improved(rough, scene, index, refinement)
-    return found if is_significant(found, scene) else None
+    return found if _is_significant(found, scene) else None
 
 
 def grow_whole(matrix: FloatArray, scene: Scene, index: ReferenceIndex, refinement: RefineOptions) -> LensFit | None:
@@ -370,7 +364,7 @@ def grow_whole(matrix: FloatArray, scene: Scene, index: ReferenceIndex, refineme
     return found if better else None
 
 
-def is_significant(found: LensFit, scene: Scene) -> bool:
+def _is_significant(found: LensFit, scene: Scene) -> bool:
     """Whether a fit shows a lens: that of a pinhole finds some k1, too."""
     enough_px = _moves_px(found, scene) >= _LEAST_PX
     return enough_px and abs(found.k1) >= _SIGNIFICANCE * found.k1_sigma
@@ -381,22 +375,6 @@ def _moves_px(found: LensFit, scene: Scene) -> float:
     corners = scene.corners.astype(float)
     moved = Lens.of(found.k1, scene.size, y_up=True).bend(corners) - corners
     return float(np.hypot(*moved.T).max())
-
-
-def core_excess(matrix: FloatArray, scene: Scene, index: ReferenceIndex, refinement: RefineOptions) -> float:
-    """Return by how many road points the part of the frame that lies on roads exceeds what chance gives there."""
-    core, inside = LensEquations(matrix, scene, index, refinement).core(0.0, *_CORE)
-    return float(core.sum() - _CHANCE_SHARE * inside.sum())
-
-
-def regrow(matrix: FloatArray, scene: Scene, index: ReferenceIndex, refinement: RefineOptions) -> LensFit | None:
-    """Grow a homography anew from the part of the frame that it lays on roads; None where that does not go far."""
-    quick = _thinned(scene, _QUICK_POINTS)
-    for k1 in _QUICK_STARTS:
-        rough = fit_lens(matrix, quick, index, 0.0, refinement, k1)
-        if rough is not None and rough.share >= _LEAST_SHARE:
-            return _improved(rough, scene, index, refinement)
-    return None
 
 
 def _thinned(scene: Scene, n_points: int) -> Scene:

@@ -15,24 +15,21 @@ from roadgeo.geometry.camera import sampling
 from roadgeo.geometry.homography import Homography
 from roadgeo.geometry.projection import from_lonlat, metres_apart, to_lonlat
 from roadgeo.location import Stats
-from roadgeo.matching.ahead import Ahead
 from roadgeo.matching.estimator import MatchOptions, TripleEstimator
-from roadgeo.matching.events import Events
+from roadgeo.matching.events import Events, Ledger
+from roadgeo.matching.evidence import agreement
 from roadgeo.matching.finishing import measure_corners
-from roadgeo.matching.hypothesis import Hypothesis
+from roadgeo.matching.growing import Hypothesis, SharedSweeps
 from roadgeo.matching.index import ReferenceIndex, crop, unpack_tangents
-from roadgeo.matching.ledger import Ledger
 from roadgeo.matching.options import LocateOptions
 from roadgeo.matching.paper.search import match_pairs
 from roadgeo.matching.paper.tuples import PairIndex, PairOptions, build_pair_index, well_fitted
 from roadgeo.matching.parts import Part, Whole, same_within_m
-from roadgeo.matching.query import Query
 from roadgeo.matching.rivals import Rivals, Standing
 from roadgeo.matching.road_search import COARSE_PIXEL_M
-from roadgeo.matching.search import Search, search_together
-from roadgeo.matching.shared_sweeps import SharedSweeps
+from roadgeo.matching.scene import Query
+from roadgeo.matching.search import Ahead, Search, search_together
 from roadgeo.matching.triples import larger
-from roadgeo.matching.verification import agreement
 from roadgeo.roads.intersections import Intersections, unpack_branches
 from roadgeo.storage.memory import let_pages_go
 
@@ -322,16 +319,15 @@ def _fit(estimator: TripleEstimator, model: Hypothesis, lead: float) -> Fit | No
 
 def _fit_of_rival(estimator: TripleEstimator, matrix: FloatArray, lead: float, likelihood: float) -> Fit:
     """Return the best other place."""
-    scene, index, verify = estimator.scene, estimator.index, estimator.options.verify
-    gsd, seeds = sampling(matrix, scene.size), np.empty(0, np.int64)
-    found, matched, distance = agreement(matrix, scene, index, gsd, seeds, verify)
+    scene, index = estimator.scene, estimator.index
+    found, matched, distance = agreement(matrix, scene, index, sampling(matrix, scene.size))
     return Fit(index, matrix, matched, distance, found.forward, lead, likelihood, agreement=found.mean)
 
 
 def _of_effort(options: LocateOptions) -> MatchOptions:
-    """Return the options of matching; where effort is low roads do not propose, and one anchor is enough."""
+    """Return the options of matching; where effort is low roads do not propose."""
     match = options.match
-    return match if options.effort == "full" else replace(match, roads=False, sightings=1)
+    return match if options.effort == "full" else replace(match, roads=False)
 
 
 def _near(index: ReferenceIndex, near: tuple[float, float, float] | None) -> tuple[float, float, float] | None:

@@ -18,10 +18,10 @@ from roadgeo.geometry.similarity import find_similarity
 from roadgeo.geometry.transformation import LONLAT, exactness
 from roadgeo.location import Camera, Evidence, Location, Place
 from roadgeo.matching.estimator import MatchOptions
+from roadgeo.matching.evidence import agreement
 from roadgeo.matching.methods import Fit
-from roadgeo.matching.query import Query
 from roadgeo.matching.refinement import corner_sigmas
-from roadgeo.matching.verification import VerifyOptions, agreement
+from roadgeo.matching.scene import Query
 
 __all__ = ["center_of", "place_frame"]
 
@@ -34,7 +34,7 @@ def place_frame(location: Location, query: Query, fit: Fit, options: MatchOption
     # Where the corners and the middle lie, in the map's CRS.
     plane, scene = fit.index.plane, query.scene
     frame = Frame(*scene.size)
-    level = _level(fit, query, options.verify)
+    level = _level(fit, query)
     homography = plane.to_crs_matrix() @ level.matrix @ PIXEL_TO_PLANE
     ground = Homography(homography).everywhere(np.vstack([frame.corners, frame.center]))
     lonlat = to_lonlat(plane.crs, ground)
@@ -71,7 +71,7 @@ def place_frame(location: Location, query: Query, fit: Fit, options: MatchOption
     )
 
 
-def _level(fit: Fit, query: Query, options: VerifyOptions) -> Fit:
+def _level(fit: Fit, query: Query) -> Fit:
     """Return a fit restricted to a camera that looks straight down, unless the roads are inconsistent with it."""
     if fit.corner_covariance_m2 is None or fit.lens_k1:
         return fit
@@ -82,7 +82,7 @@ def _level(fit: Fit, query: Query, options: VerifyOptions) -> Fit:
     matrix, covariance = found.matrix, found.corner_covariance + found.doubt
     # The covariance may be too cautious. Roads that agreed must go on to agree.
     gsd = sampling(matrix, scene.size)
-    agreeing, _, _ = agreement(matrix, scene, fit.index, gsd, np.empty(0, np.int64), options)
+    agreeing, _, _ = agreement(matrix, scene, fit.index, gsd)
     if not agreeing.forward >= fit.agreeing - _LEAST_LOST:
         return fit
     return replace(fit, matrix=matrix, corner_covariance_m2=covariance, corner_sigma_m=corner_sigmas(covariance))

@@ -19,24 +19,21 @@ from typing import NamedTuple
 
 import numpy as np
 
-from roadgeo._arrays import FloatArray, IntArray
+from roadgeo._arrays import FloatArray
 from roadgeo.geometry.camera import judge, sampling
 from roadgeo.geometry.homography import Homography
 from roadgeo.matching.estimator import MatchOptions, TripleEstimator
-from roadgeo.matching.evidence import Evidence
-from roadgeo.matching.hypothesis import Hypothesis
+from roadgeo.matching.events import Ledger
+from roadgeo.matching.evidence import Evidence, match_intersections
+from roadgeo.matching.exhaustive import Drawn, LocalSearchOptions, Shift, move_about, search_nearby
+from roadgeo.matching.growing import Hypothesis
 from roadgeo.matching.index import ReferenceIndex
-from roadgeo.matching.ledger import Ledger
-from roadgeo.matching.local_search import Drawn, LocalSearchOptions, Shift, move_about, search_nearby
 from roadgeo.matching.refinement import refine
 from roadgeo.matching.scene import Scene
 from roadgeo.matching.search import Search
 from roadgeo.matching.triples import larger
-from roadgeo.matching.verification import agreement
 
 __all__ = ["Other", "RivalOptions", "Rivals", "Standing", "log10_gap", "similar_places"]
-
-_NO_SEEDS: IntArray = np.array([], np.int64)
 
 #: Streets that cross at right angles fit themselves when they are turned by one.
 _TURNS_DEG = (0.0, 90.0, 180.0, 270.0)
@@ -208,9 +205,9 @@ class Rivals:
         known = next((model for model in ranked if model.laid is matrix), None)
         if known is not None:
             return known
-        scene, index, options = estimator.scene, estimator.index, estimator.options
-        _, matched, _ = agreement(matrix, scene, index, sampling(matrix, scene.size), _NO_SEEDS, options.verify)
-        model = Hypothesis(matrix, _NO_SEEDS, 1.0, matched, by_roads=True)
+        scene, index = estimator.scene, estimator.index
+        matched, _ = match_intersections(matrix, scene, index, sampling(matrix, scene.size))
+        model = Hypothesis(matrix, 1.0, matched, by_roads=True)
         estimator.score(model)
         return model
 
@@ -261,7 +258,7 @@ def _lay(
 ) -> FloatArray:
     """Refine a place; where it loses its way, it stays as it is."""
     gsd = sampling(start, scene.size)
-    _, matched, _ = agreement(start, scene, index, gsd, _NO_SEEDS, match.verify)
+    matched, _ = match_intersections(start, scene, index, gsd)
     refined = refine(start, scene, index, matched, match.refine, n_points, held=True)
     if refined is None or judge(refined.matrix, scene.size, match.camera) is not None:
         return start

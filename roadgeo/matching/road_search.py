@@ -1,25 +1,336 @@
-"""The search by roads: intersections spread over the frame vote for places, and their proposals grow by roads."""
+"""Proposals from roads: one query intersection and the roads around it, laid on every intersection of the map.
+
+Triples of intersections need three neighbours that are all intact. Where roads are missing, false or few, one intact
+intersection and the roads about it still fix their place: turned so that two branches agree, at each of many scales,
+most road points fall on roads of the map in the right place, and few elsewhere. How many would by chance depends on the
+scale and on how dense the map's roads are at the place: without that, scales at which the query shrinks to a few blocks
+would crowd out the rest.
+
+The map's roads are drawn for that as a raster of direction bits, and as rings around its intersections, which are kept
+while they are in use.
+"""
 
 from __future__ import annotations
 
 import math
-from collections.abc import Iterable, Iterator, Sequence
-from dataclasses import dataclass, field
+from collections import OrderedDict
+from collections.abc import Iterable, Iterator
+from dataclasses import dataclass, field, replace
 from itertools import islice
 from typing import NamedTuple
+from weakref import WeakValueDictionary
 
 import numpy as np
 
-from roadgeo._arrays import FloatArray, IntArray
+from roadgeo._arrays import AnyArray, BoolArray, Float32Array, FloatArray, IntArray
 from roadgeo.geometry.camera import CameraOptions
 from roadgeo.kernels.road_growth import Stages, grow_by_roads
-from roadgeo.matching.ahead import ALONE, Ahead
+from roadgeo.kernels.road_raster import DIRECTIONS, TILE, Raster, mark_tiles, measure_tiles, paint_roads
+from roadgeo.kernels.road_rings import RINGS, WORDS, draw_rings, mark_rings
+from roadgeo.kernels.road_votes import WHOLE_TURN, Places, RoadPoints, Trial, improve_votes, vote
 from roadgeo.matching.index import ReferenceIndex
-from roadgeo.matching.road_votes import Voter, Votes
 from roadgeo.matching.scene import MIN_COS, Scene
+from roadgeo.matching.search import ALONE, Ahead
 from roadgeo.matching.triples import farthest_first, larger
+from roadgeo.roads.intersections import unpack_branches
 
-__all__ = ["COARSE_PIXEL_M", "Grown", "RoadGrower", "RoadRound", "RoadSearch", "Turnout", "followed_more", "scales"]
+__all__ = [
+    "COARSE_PIXEL_M",
+    "RING_STEP",
+    "Grown",
+    "RasterOptions",
+    "RoadGrower",
+    "RoadRaster",
+    "RoadRound",
+    "RoadSearch",
+    "Turnout",
+    "Voter",
+    "Votes",
+    "followed_more",
+    "make_raster",
+    "scales",
+]
+
+
+#: Ratio of a ring around an intersection to the next, and how far directions may differ from a road's and belong to it.
+RING_STEP, _TURN = 1.08, math.radians(20.0)
+
+
+@dataclass(frozen=True)
+class RasterOptions:
+    """How roads are drawn.
+
+    Attributes
+    ----------
+    cell_m : float
+        Side of a cell.
+    reach_m : float
+        Cells whose centres lie within this distance of a road belong to it: at 200 m from an intersection, half a step
+        of scale (4 %) moves a road by 8 m.
+    radius_m : float
+        Where the rings around intersections end, less than 63 cells away.
+    """
+
+    cell_m: float = 6.0
+    reach_m: float = 8.0
+    radius_m: float = 220.0
+
+    def __post_init__(self) -> None:
+        if self.radius_m >= (TILE - 1) * self.cell_m:
+            raise ValueError(f"radius_m is {self.radius_m:g}; expected less than {TILE - 1} cells of the raster")
+
+    @property
+    def inner_m(self) -> float:
+        """Where the rings begin."""
+        return self.radius_m / RING_STEP**RINGS
+
+    def ring_of(self, metres: FloatArray | float) -> IntArray:
+        """Return the rings that distances lie in, 0 to RINGS - 1; others are beyond."""
+        return np.floor(np.log(np.maximum(metres, 1e-9) / self.inner_m) / math.log(RING_STEP)).astype(np.int64)
+
+    def on(self, coarseness: float) -> RasterOptions:
+        """Return them for a coarse map: all lengths multiplied by its coarseness."""
+        lengths = {name: coarseness * getattr(self, name) for name in ("cell_m", "reach_m", "radius_m")}
+        return replace(self, **lengths)
+
+
+@dataclass(frozen=True, eq=False)
+class RoadRaster:
+    """A raster over the whole reference (see `kernels.road_raster`), with a rim of empty tiles.
+
+    Attributes
+    ----------
+    origin : (x, y)
+        Its corner in plane metres.
+    raster : Raster
+    density : (R, C) float32
+        Chance of a point of any direction to meet a road in a tile or those beside it.
+    rings : (N, WORDS) uint64
+        Around each intersection of the reference, as far as `has_rings` (N,) is set (see `draw_rings_of`).
+    radii : (RINGS,) float64
+        Of the middles of the rings, cells.
+    """
+
+    origin: tuple[float, float]
+    raster: Raster
+    density: Float32Array
+    rings: AnyArray
+    has_rings: BoolArray
+    radii: FloatArray
+
+    @property
+    def rim_m(self) -> float:
+        """Nothing that kernels look up may lie further than this from all roads and intersections."""
+        return self.raster.cell * TILE
+
+    @property
+    def nbytes(self) -> int:
+        """Size of its arrays."""
+        return int(self.raster.tile_of.nbytes + self.raster.bits.nbytes + self.density.nbytes + self.rings.nbytes)
+
+    def cells(self, xy: FloatArray) -> FloatArray:
+        """Return (N, 2) plane metres as cells from the corner."""
+        return np.asarray((xy - self.origin) / self.raster.cell)
+
+    def density_at(self, xy: FloatArray) -> FloatArray:
+        """Return the density at (N, 2) places inside the raster."""
+        tiles = (self.cells(xy) / TILE).astype(np.int64)
+        return np.asarray(self.density[tiles[:, 1], tiles[:, 0]], float)
+
+    def draw_rings_of(self, cells: FloatArray, places: IntArray) -> None:
+        """Draw the rings of intersections, (N, 2) cells of all and (M,) numbers, as far as they are not drawn yet."""
+        missing = places[~self.has_rings[places]]
+        draw_rings(cells, missing, self.radii, self.raster, self.rings)
+        self.has_rings[missing] = True
+
+
+#: Rasters in use anywhere; and those that are kept, the one used last at the end, up to a number of bytes together.
+_in_use: WeakValueDictionary[tuple[ReferenceIndex, RasterOptions], RoadRaster] = WeakValueDictionary()
+_kept: OrderedDict[tuple[ReferenceIndex, RasterOptions], RoadRaster] = OrderedDict()
+_MOST_BYTES = 500_000_000
+
+
+def make_raster(index: ReferenceIndex, options: RasterOptions) -> RoadRaster:
+    """Return the raster of a reference, drawn anew unless it is in use or kept from before.
+
+    Drawing takes some hundredths of a second, and 9 MB, for a city of 400 km2. Those used last are kept, up to a size:
+    many masks are looked for on the same maps, one after the other.
+    """
+    key = (index, options)
+    drawn = _in_use.get(key) or _draw(index, options)
+    _in_use[key] = _kept[key] = drawn
+    _kept.move_to_end(key)
+    while len(_kept) > 1 and sum(one.nbytes for one in _kept.values()) > _MOST_BYTES:
+        _kept.popitem(last=False)
+    return drawn
+
+
+def _draw(index: ReferenceIndex, options: RasterOptions) -> RoadRaster:
+    segments, size = index.segments, options.cell_m * TILE
+    ends = segments.reshape(-1, 2)
+    low = np.minimum(ends.min(axis=0), index.xy.min(axis=0)) - size
+    high = np.maximum(ends.max(axis=0), index.xy.max(axis=0)) + size
+    columns, rows = (math.ceil(side / size) + 1 for side in high - low)
+    tile_of = np.empty((rows, columns), np.int32)
+    x0, y0 = float(low[0]), float(low[1])
+    n = mark_tiles(segments, x0, y0, options.cell_m, options.reach_m, tile_of)
+    bits = np.zeros((n + 1, TILE, TILE), np.uint16)
+    paint_roads(segments, x0, y0, options.cell_m, options.reach_m, _TURN, tile_of, bits)
+    raster = Raster(tile_of, bits, options.cell_m)
+    density = np.empty((rows, columns), np.float32)
+    measure_tiles(raster, density)
+    radii = np.asarray(options.inner_m * RING_STEP ** (np.arange(RINGS) + 0.5) / options.cell_m)
+    n = len(index.xy)
+    return RoadRaster((x0, y0), raster, density, np.empty((n, WORDS), np.uint64), np.zeros(n, bool), radii)
+
+
+#: Where the map has hardly a road, chance is not less than this.
+_LEAST_DENSITY = 0.005
+_PER_RADIAN = WHOLE_TURN / (2.0 * math.pi)
+_TURN_STEPS = np.radians([-6.0, -3.0, 0.0, 3.0, 6.0])
+_SCALE_STEPS = np.array([0.96, 1.0, 1.04])
+
+
+#: How far branches that agree may be apart.
+_TOLERANCE = round(math.radians(20.0) * _PER_RADIAN)
+#: Nearer than this, metres, roads that run straight away from the intersection, with at least this cosine, are left
+#: out: they are its own branches, which agree by construction. It makes the right place stand out more.
+_OWN_M, _OWN_COS = 150.0, 0.95
+#: A scale at which fewer points are in reach is not tried.
+_LEAST_POINTS = 15
+#: Number of the best that are judged anew, of road points for that, and their greatest distance, metres. A coarse map
+#: multiplies all lengths.
+_KEPT, _WIDE_POINTS, WIDE_RADIUS_M = 100, 160, 260.0
+#: Share of those that meet roads in the right place, and by chance, in units of the density of roads there: they crowd
+#: around intersections.
+_TRIAL = Trial(0.55, 1.5)
+
+
+@dataclass(frozen=True)
+class Votes:
+    """Proposals of one query intersection. Dimension: M proposals, the best first.
+
+    Attributes
+    ----------
+    anchor : int
+        The query intersection.
+    reference : (M,) int64
+        Map intersections it may be.
+    affine : (M, 4) float64
+        The 2 x 2 map (row-major) from query to reference around it.
+    ratio : (M,) float64
+        Log-likelihood ratio of the road points against chance, nats.
+    """
+
+    anchor: int
+    reference: IntArray
+    affine: FloatArray
+    ratio: FloatArray
+
+
+class _Around(NamedTuple):
+    """Road points as seen from one intersection, nearest first: (P, 2) offsets and (P,) distances in pixels.
+
+    `angles` (P,) are directions in units of pi / DIRECTIONS; `radial` (P,) marks those that run straight away from it.
+    """
+
+    offsets: FloatArray
+    away: FloatArray
+    angles: FloatArray
+    radial: BoolArray
+
+
+class Voter:
+    """Compares the roads around intersections of one scene with one map, within limits on scale and turn."""
+
+    def __init__(
+        self,
+        scene: Scene,
+        index: ReferenceIndex,
+        scale: tuple[float, float],
+        max_turn: float,
+        candidates: IntArray,
+        more: int = 1,
+    ) -> None:
+        """`scale` in metres per pixel, `max_turn` of the image's up from north in radians, `candidates` on the map.
+
+        `more` times as many proposals as usual are kept.
+        """
+        self.scene, self.index = scene, index
+        self.max_turn, self.candidates, self.kept = max_turn, candidates, more * _KEPT
+        self.raster = RasterOptions().on(index.coarseness)
+        step = RING_STEP
+        n = int(math.log(scale[1] / scale[0]) / math.log(step)) + 1  # between the limits, half a step from them at most
+        self.scales = np.asarray(math.sqrt(scale[0] * scale[1]) * step ** (np.arange(n) - (n - 1) / 2))
+        self.drawn: RoadRaster = make_raster(index, self.raster)
+        cells, rays = self.drawn.cells(index.xy), unpack_branches(index.branches)
+        self.drawn.draw_rings_of(cells, candidates)
+        density = np.maximum(self.drawn.density_at(index.xy), _LEAST_DENSITY)
+        counts = np.isfinite(rays).sum(axis=1)
+        self.places = Places(cells, _whole(rays).astype(np.int32), counts, density, self.drawn.rings)
+
+    def votes(self, anchor: int, chunk: int = 20_000) -> Iterator[tuple[int, Votes | None]]:
+        """Yield, after each `chunk` of the map's intersections, how many places and turns were tried on it.
+
+        With the last come the best proposals, before it None.
+        """
+        rays = self.scene.intersections.rays[anchor]
+        rays = _whole(rays[np.isfinite(rays)])
+        around = self._around(anchor)
+        points = self._mark(around)
+        max_turn = round(self.max_turn * _PER_RADIAN)
+        found, kept, tried = np.empty((self.kept, 4)), 0, 0
+        for first in range(0, len(self.candidates), chunk):
+            kept, tried = vote(
+                self.candidates[first : first + chunk], rays, _TOLERANCE, max_turn, self.scales, points,
+                _LEAST_POINTS, self.places, found, kept,
+            )  # fmt: skip
+            if first + chunk < len(self.candidates):
+                yield tried, None
+        wide = self._wide(around)
+        improve_votes(found[:kept], _TURN_STEPS, _SCALE_STEPS, wide, self.places, self.drawn.raster, _TRIAL)
+        best = found[:kept][np.argsort(-found[:kept, 3], kind="stable")]
+        c, s = np.cos(best[:, 1]) * best[:, 2], np.sin(best[:, 1]) * best[:, 2]
+        yield tried, Votes(anchor, best[:, 0].astype(np.int64), np.stack([c, -s, s, c], axis=1), best[:, 3])
+
+    def _around(self, anchor: int) -> _Around:
+        """Return the road points as seen from a query intersection, as far as any scale may reach, nearest first."""
+        scene = self.scene
+        offsets = scene.dense_points - scene.intersections.xy[anchor]
+        away = np.hypot(*offsets.T)
+        (near,) = np.nonzero(away < WIDE_RADIUS_M * self.index.coarseness / self.scales[0])
+        order = near[np.argsort(away[near], kind="stable")]
+        offsets, away, directions = offsets[order], away[order], scene.dense_directions[order]
+        angles = np.arctan2(directions[:, 1], directions[:, 0]) * (DIRECTIONS / math.pi) + DIRECTIONS
+        radial = np.abs((offsets * directions).sum(axis=1)) > _OWN_COS * away
+        return _Around(offsets, away, angles, radial)
+
+    def _mark(self, around: _Around) -> AnyArray:
+        """Return the rings of the query at each scale, (S, WORDS)."""
+        raster = self.raster
+        bearings = np.arctan2(around.offsets[:, 1], around.offsets[:, 0])
+        across = np.abs(np.sin(around.angles * (math.pi / DIRECTIONS) - bearings)) > math.sqrt(0.5)
+        words = np.zeros((len(self.scales), WORDS), np.uint64)
+        rings, own = raster.ring_of(around.away * self.scales[0]), around.radial.astype(np.int64)
+        mark_rings(rings, bearings, 1 - across, own, int(raster.ring_of(_OWN_M * self.index.coarseness)), words)
+        return words
+
+    def _wide(self, around: _Around) -> RoadPoints:
+        """Choose the points that judge proposals anew at each scale, evenly by distance."""
+        usable = np.searchsorted(around.away, WIDE_RADIUS_M * self.index.coarseness / self.scales)
+        n = np.minimum(usable, _WIDE_POINTS)
+        starts = np.concatenate(([0], np.cumsum(n)))
+        scale = np.repeat(np.arange(len(n)), n)
+        taken = (np.arange(len(scale)) - starts[scale]) * (usable[scale] - 1) // np.maximum(n[scale] - 1, 1)
+        return RoadPoints(self.scales, starts, around.offsets[taken], around.angles[taken])
+
+
+def _whole(angles: AnyArray) -> IntArray:
+    """Return radians as whole numbers (see `kernels.road_votes.WHOLE_TURN`); NaN becomes 0."""
+    turns = np.nan_to_num(np.asarray(angles, float)) * _PER_RADIAN
+    whole: IntArray = np.round(turns).astype(np.int64)
+    return whole.clip(-WHOLE_TURN // 2, WHOLE_TURN // 2 - 1)
+
 
 #: Road points used, and the part of half the frame's diagonal up to which an affine map will do.
 _MAX_POINTS, _AFFINE_UNTIL = 700, 0.45
@@ -212,22 +523,15 @@ class RoadSearch:
         max_turn = min(math.radians(abs(center) + off + _ROUGHLY_DEG), math.pi)
         candidates = _within(index, near, scene.half_size * min(scale[1], max(coarseness * _FAR_M, scale[0])))
         self.voter = Voter(scene, index, scale, max_turn, candidates, more)
-        self._tried: set[int] = set()
         self.grower = RoadGrower(scene, index, camera, more)
 
-    def rounds(self, only: Sequence[int] | None = None) -> Iterator[RoadRound]:
-        """Yield the places that grew of one anchor's proposals after another; between parts of a large map nothing.
-
-        `only` names the anchors to try. None is tried twice.
-        """
+    def rounds(self) -> Iterator[RoadRound]:
+        """Yield the places that grew of one anchor's proposals after another; between parts of a large map nothing."""
         xy = self.scene.intersections.xy
-        anchors = islice(farthest_first(xy, np.arange(len(xy))), _MAX_ANCHORS) if only is None else only
+        anchors = islice(farthest_first(xy, np.arange(len(xy))), _MAX_ANCHORS)
         for n, (anchor, steps) in enumerate(self.ahead.map(self._vote, anchors)):
-            if only is None and not self.turnout.includes(n):
+            if not self.turnout.includes(n):
                 return
-            if anchor in self._tried:
-                continue
-            self._tried.add(anchor)
             for tried, votes in steps:
                 self.n_tried += tried
                 self.turnout.n_tried += tried

@@ -8,11 +8,14 @@ measured by work, which is counted, so that a busy machine finds what an idle on
 from __future__ import annotations
 
 import time
+from collections import deque
 from collections.abc import Callable, Iterable, Iterator, Sequence
+from concurrent.futures import Future, ThreadPoolExecutor
 from dataclasses import dataclass
 from typing import Generic, Protocol, TypeVar
 
-__all__ = ["Estimator", "Search", "SearchOptions", "SearchResult", "search", "search_together"]
+__all__ = ["ALONE", "Ahead", "Estimator", "Search", "SearchOptions", "SearchResult", "search", "search_together"]
+
 
 Model = TypeVar("Model")
 
@@ -34,17 +37,8 @@ class Estimator(Protocol[Model]):
     def score(self, model: Model) -> float:
         """Return the log10 odds of a model."""
 
-    def settled(self, model: Model) -> bool:
-        """Whether a model is complete, so that no better version of the same answer is to be expected."""
-
     def same(self, a: Model, b: Model) -> bool:
         """Whether two models mean the same answer."""
-
-    def leads(self, model: Model) -> Sequence[tuple[int, int]]:
-        """Return the samples that led to a model, each with the number of its stage: they would lead to a twin, too."""
-
-    def follow(self, leads: Sequence[tuple[int, int]]) -> Iterator[Iterable[Model]]:
-        """Yield rounds of such of these samples as were not tried on this part yet."""
 
 
 @dataclass(frozen=True)
@@ -53,12 +47,8 @@ class SearchOptions:
 
     Attributes
     ----------
-    accept : float
-        A round ends the search when its best model is settled, reaches this score ...
-    margin : float
-        ... and leads the best different model by as much.
-    more_rounds : int
-        A model that reaches both but is not settled is kept for this many more rounds, in case a better version comes.
+    accept, margin : float
+        A model stands out that reaches this score, and leads the best different model by as much.
     work_limit_s : float
         No further round is begun, and no further model scored, after this work: seconds of a usual machine, counted,
         not measured, so that answers do not depend on the load. On a map of 15,000 intersections, and on a larger one
@@ -69,7 +59,6 @@ class SearchOptions:
 
     accept: float = 8.0
     margin: float = 4.0
-    more_rounds: int = 25
     work_limit_s: float = 10.0
     time_limit_s: float = 60.0
 
@@ -119,8 +108,6 @@ class Search(Generic[Model]):
         Number of the stage that comes next.
     ended : bool
         Whether all stages are through.
-    accepted_since : int or None
-        Rounds done when the best model first reached what ends a search.
     seconds : float
         Spent on this part.
     """
@@ -132,7 +119,6 @@ class Search(Generic[Model]):
         self.promising: list[tuple[float, Model]] = []
         self.stage = self.n_rounds = self.n_scored = 0
         self.ended = False
-        self.accepted_since: int | None = None
         self.stopped = ""
         self.seconds = 0.0
         self._charged_s = 0.0
@@ -158,15 +144,6 @@ class Search(Generic[Model]):
         self._charge(budget)
         self.seconds += time.perf_counter() - started
         return models is not None
-
-    def follow(self, leads: Sequence[tuple[int, int]], budget: _Budget) -> None:
-        """Try samples that led to an answer on another part, as far as they were not tried yet."""
-        started = time.perf_counter()
-        for models in self.estimator.follow(leads):
-            self._take(models, budget)
-            if budget.spent:
-                break
-        self.seconds += time.perf_counter() - started
 
     def _take(self, models: Iterable[Model], budget: _Budget) -> None:
         """Score the models of a round."""
@@ -213,10 +190,10 @@ def search_together(
 ) -> None:
     """Search many parts until one answer stands out from those of all, they are exhausted, or a limit is reached.
 
-    A round of each part in turn, one stage after another. A part whose answer stands out goes on alone until that is
-    settled. Its anchors are then tried on all other parts: if they hold a twin, it is found, and the search goes on.
-    `same` returns whether models of two parts, which may overlap, mean one answer. At the end of a stage an answer that
-    does not stand out by its score may be proved otherwise: `proves` returns the part that holds it, if any does.
+    A round of each part in turn, one stage after another: what one sample of the query leads to is met on all parts
+    before an answer is accepted. `same` returns whether models of two parts, which may overlap, mean one answer.
+    `proves` returns the part whose answer is proved otherwise than by its score, if any is: it is asked where an answer
+    stands out, which is accepted only then, and at the end of each stage.
     """
     options = options or SearchOptions()
     ended_by = _Together(parts, options, same, proves).run()
@@ -242,50 +219,26 @@ class _Together(Generic[Model]):
 
     def run(self) -> str:
         stage = 0
-        while running := [one for one in self.parts if not one.ended]:
-            here = [one for one in running if one.stage == stage]
-            while here:
+        while not all(one.ended for one in self.parts):
+            while here := [one for one in self.parts if one.stage == stage and not one.ended]:
                 for one in here:
-                    if ended_by := self._go_on(one):
-                        return ended_by
-                here = [one for one in here if one.stage == stage and not one.ended]
-            if self._is_proved():
+                    one.advance(self.budget)
+                    if spent := self.budget.spent:
+                        return spent
+                best = next(filter(self._stands_out, here), None)
+                if best is not None and self._is_proved(best):
+                    return "accepted"
+            if self.proves is not None and self._is_proved(None):
                 return "accepted"
             stage += 1
         return "exhausted"
 
-    def _go_on(self, one: Search[Model]) -> str:
-        """Do a round of a part, and more while its answer stands out; return why the search ends, "" if it does not."""
-        goes_on = one.advance(self.budget)
-        while goes_on:
-            standing = self._stands_out(one)
-            if standing and self._is_final(one):
-                self._try_elsewhere(one)
-                if self._stands_out(one):
-                    one.stopped = "accepted"
-                    return "accepted"
-                standing = False
-            if spent := self.budget.spent:
-                return spent
-            if not standing or len(self.parts) == 1:
-                break
-            goes_on = one.advance(self.budget) or (not one.ended and one.advance(self.budget))
-        return ""
-
-    def _is_proved(self) -> bool:
-        """Whether an answer is proved otherwise than by its score."""
-        proved = None if self.proves is None else self.proves(self.parts)
-        if proved is None:
-            return False
-        proved.stopped = "accepted"
-        return True
-
-    def _try_elsewhere(self, one: Search[Model]) -> None:
-        """Try what led to a part's best answer on the others, which may hold its twin."""
-        leads = one.estimator.leads(one.leaders[0][1])
-        for other in self.parts:
-            if other is not one:
-                other.follow(leads, self.budget)
+    def _is_proved(self, best: Search[Model] | None) -> bool:
+        """Whether an answer ends the search: that of a part which stands out, unless another proof is asked for."""
+        proved = best if self.proves is None else self.proves(self.parts)
+        if proved is not None:
+            proved.stopped = "accepted"
+        return proved is not None
 
     def _stands_out(self, one: Search[Model]) -> bool:
         """Whether a part's best answer leads every other one, on any part."""
@@ -301,9 +254,57 @@ class _Together(Generic[Model]):
             for score, model in other.leaders
         )
 
-    def _is_final(self, one: Search[Model]) -> bool:
-        """Whether no better version of a part's best answer is to be expected, or was waited for long enough."""
-        if one.accepted_since is None:
-            one.accepted_since = one.n_rounds
-        waited = one.n_rounds - one.accepted_since
-        return one.estimator.settled(one.leaders[0][1]) or waited >= self.options.more_rounds
+
+Item = TypeVar("Item")
+Result = TypeVar("Result")
+
+
+class Ahead:
+    """Does independent pieces of work ahead of their use in a number of threads; in one, each when it is used.
+
+    Attributes
+    ----------
+    threads : int
+    """
+
+    def __init__(self, threads: int = 1) -> None:
+        """Begin without threads: they start with the first piece of work."""
+        self.threads = threads
+        self._pool = ThreadPoolExecutor(threads, "roadgeo-search") if threads > 1 else None
+
+    def map(self, work: Callable[[Item], Result], items: Iterable[Item]) -> Iterator[Result]:
+        """Yield the result of each item, in order; begun for no more than `threads` items beyond those that were used.
+
+        Unused results are dropped.
+        """
+        if self._pool is None:
+            yield from map(work, items)
+            return
+        begun: deque[Future[Result]] = deque()
+        try:
+            for item in items:
+                begun.append(self._pool.submit(work, item))
+                if len(begun) > self.threads:
+                    yield begun.popleft().result()
+            while begun:
+                yield begun.popleft().result()
+        finally:
+            for one in begun:
+                one.cancel()
+
+    def close(self) -> None:
+        """End the threads; unfinished results are dropped."""
+        if self._pool is not None:
+            self._pool.shutdown(wait=False, cancel_futures=True)
+
+    def __enter__(self) -> Ahead:
+        """Use it, and close it in the end."""
+        return self
+
+    def __exit__(self, *_: object) -> None:
+        """Close it."""
+        self.close()
+
+
+#: Each piece of work is done when it is used.
+ALONE = Ahead()

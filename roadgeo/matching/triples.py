@@ -21,9 +21,9 @@ from roadgeo._arrays import FloatArray, Int32Array, IntArray
 from roadgeo.kernels.structs import Hits, TripleLimits, TripleQuery
 from roadgeo.kernels.triple_codes import UNITS, find_sides
 from roadgeo.kernels.triples import count_alike, gather, look_up_each
-from roadgeo.matching.ahead import ALONE, Ahead
 from roadgeo.matching.index import ReferenceIndex
 from roadgeo.matching.scene import MIN_COS, Scene
+from roadgeo.matching.search import ALONE, Ahead
 
 __all__ = [
     "BEFORE_ROADS",

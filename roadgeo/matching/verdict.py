@@ -17,7 +17,7 @@ from roadgeo.matching.methods import Fit, Found
 from roadgeo.matching.options import LocateOptions
 from roadgeo.matching.parts import same_within_m
 from roadgeo.matching.placing import center_of, place_frame
-from roadgeo.matching.query import Query
+from roadgeo.matching.scene import Query
 
 __all__ = ["Needed", "decide", "needed_of"]
 

@@ -276,7 +276,7 @@ class _Voter:
         locating, places = self.division.locating, list[tuple[float, str]]()
 
         def how(mask: RoadMask, references: Sequence[AnyReference], options: LocateOptions) -> Location:
-            from roadgeo.matching.query import read_query
+            from roadgeo.matching.scene import read_query
 
             query = read_query(mask)
             left = max(options.search.time_limit_s - query.seconds.vectorize, 0.0)

@@ -23,7 +23,7 @@ from roadgeo.geometry.transformation import exactness
 from roadgeo.location import Location
 from roadgeo.matching.checking import Checked, CheckOptions, check_place
 from roadgeo.matching.options import LocateOptions
-from roadgeo.matching.query import read_query
+from roadgeo.matching.scene import read_query
 from roadgeo.outputs.verification_files import editor_offset, id_fragment
 from roadgeo.reference.reference import Reference
 from roadgeo.running.processes import run

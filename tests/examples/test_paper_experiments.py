@@ -100,7 +100,7 @@ def test_a_subset_is_always_the_same(experiments, town):
 def test_the_middle_of_a_mask_holds_the_intersections_asked_for(experiments):
     from roadgeo.evaluation.noise import NoiseModel, draw_mask
     from roadgeo.geometry.pinhole import make_view
-    from roadgeo.matching.query import trace_query
+    from roadgeo.matching.scene import trace_query
 
     view = make_view((1350.0, 1350.0), (900, 900), 1.0)
     mask, _ = draw_mask(lattice_town(28), view, NoiseModel(), (8.0, 9.0), np.random.default_rng(0))

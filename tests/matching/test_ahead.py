@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 
 from roadgeo.kernels.roads import bin_segments
-from roadgeo.matching.ahead import ALONE, Ahead
+from roadgeo.matching.search import ALONE, Ahead
 
 
 @pytest.fixture(params=[1, 2, 5])

@@ -138,7 +138,7 @@ import resource, sys
 import numpy as np
 from roadgeo.errors import MaskError
 from roadgeo.geometry.mask import RoadMask
-from roadgeo.matching.query import trace_query
+from roadgeo.matching.scene import trace_query
 roads = np.random.default_rng(0).random((4500, 4500), np.float32) < 0.3
 try:
     trace_query(RoadMask(roads))

@@ -13,11 +13,11 @@ from worlds.scenes import camera, look, mapped, random_network, scene_of
 from roadgeo.geometry.camera import CameraFault, sampling
 from roadgeo.matching.carriageways import between_carriageways, nearest_of, refine_between
 from roadgeo.matching.estimator import TripleEstimator
+from roadgeo.matching.evidence import agreement
 from roadgeo.matching.finishing import measure_corners
-from roadgeo.matching.hypothesis import Hypothesis
+from roadgeo.matching.growing import Hypothesis
 from roadgeo.matching.index import build_index
 from roadgeo.matching.refinement import RefineOptions, refine
-from roadgeo.matching.verification import agreement
 from roadgeo.reference.reference import Reference
 from roadgeo.workflows import locate
 
@@ -130,8 +130,8 @@ def test_a_place_is_refined_so_for_the_last_time_unless_no_camera_sees_it(town, 
     given = fit(truth, scene, town[1])
     nothing = np.full(len(scene.intersections), -1)
     gsd = sampling(given.matrix, scene.size)
-    found, _, _ = agreement(given.matrix, scene, town[1], gsd, nothing[:0], estimator.options.verify)
-    best = Hypothesis(given.matrix, nothing[:0], 1.0, nothing, refined=given, found=found, gsd_m=gsd)
+    found, _, _ = agreement(given.matrix, scene, town[1], gsd)
+    best = Hypothesis(given.matrix, 1.0, nothing, refined=given, found=found, gsd_m=gsd)
     measure_corners(estimator, best, 10.0)
     error, before = (error_of(matrix, truth, scene) for matrix in (best.refined.matrix, given.matrix))
     assert best.found is found  # the odds rest on it

@@ -7,7 +7,7 @@ from worlds.scenes import Sight, camera, look, scene_of
 
 from roadgeo.geometry.homography import Homography
 from roadgeo.matching.checking import CheckOptions, check_place
-from roadgeo.matching.local_search import LocalSearchOptions, Shift, move_about, search_nearby
+from roadgeo.matching.exhaustive import LocalSearchOptions, Shift, move_about, search_nearby
 
 SIGHT = Sight(sigma_m=1.0, missing=0.2, false=0.1)
 

@@ -10,8 +10,8 @@ from worlds.scenes import PLANE, Sight, camera, look, mapped, random_lines, rand
 from roadgeo.geometry.camera import CameraOptions
 from roadgeo.matching import growing
 from roadgeo.matching.estimator import MatchOptions, TripleEstimator
+from roadgeo.matching.events import Ledger
 from roadgeo.matching.index import build_index
-from roadgeo.matching.ledger import Ledger
 from roadgeo.matching.rivals import RivalOptions, Rivals
 from roadgeo.matching.scene import query_neighbours
 from roadgeo.matching.search import Search, SearchOptions, search, search_together
@@ -177,17 +177,6 @@ def test_roads_find_a_mask_that_lacks_half_of_the_roads(town):
             found[name] = found.get(name, 0) + right
             assert right or result.score < 3.5
     assert found["full"] >= found["quick"] + 2
-
-
-def test_a_place_ends_the_search_when_several_anchors_led_to_it(town, scene):
-    """One anchor may lead to a place and miss its twin; what two led to, and to nothing else, has none."""
-    once, _ = locate(scene, town[1], MatchOptions(sightings=1))
-    twice, _ = locate(scene, town[1], MatchOptions())
-    assert once.stopped == twice.stopped == "accepted"
-    assert once.n_rounds < twice.n_rounds
-    assert (once.best.n_found, twice.best.n_found) == (1, 2)
-    assert twice.n_scored == once.n_scored  # what is found again is not refined again
-    assert gap(twice, TRUTH, scene) == gap(once, TRUTH, scene)
 
 
 def test_more_anchors_are_tried_on_a_small_map(town, scene):

@@ -18,8 +18,8 @@ import roadgeo
 from roadgeo.geometry.homography import Homography
 from roadgeo.matching import evidence
 from roadgeo.matching.evidence import Evidence, EvidenceOptions, log10_lead
+from roadgeo.matching.exhaustive import Shift, move_about
 from roadgeo.matching.index import build_index
-from roadgeo.matching.local_search import Shift, move_about
 from roadgeo.matching.options import LocateOptions
 from roadgeo.reference.reference import Reference
 

@@ -10,7 +10,7 @@ from roadgeo.location import Location, Seconds
 from roadgeo.matching.estimator import MatchOptions
 from roadgeo.matching.methods import Fit
 from roadgeo.matching.placing import place_frame
-from roadgeo.matching.query import Query
+from roadgeo.matching.scene import Query
 
 
 def placed(town, tilt: float, sigma_m: float, shaken_m: float = 0.0) -> tuple[Location, np.ndarray]:

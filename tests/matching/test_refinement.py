@@ -4,17 +4,15 @@ import numpy as np
 import pytest
 from worlds.scenes import Sight, mapped, shaken, sight_of
 
+from roadgeo.matching.evidence import match_intersections
 from roadgeo.matching.index import IndexOptions, build_index
 from roadgeo.matching.refinement import RefineOptions, refine
-from roadgeo.matching.verification import VerifyOptions, agreement
-
-NO_SEEDS = np.array([], int)
 
 
 def refined(start, scene, index, gsd=1.0, rounds=3):
     matrix, result = start, None
     for _ in range(rounds):
-        _, matched, _ = agreement(matrix, scene, index, gsd, NO_SEEDS, VerifyOptions())
+        matched, _ = match_intersections(matrix, scene, index, gsd)
         result = refine(matrix, scene, index, matched)
         assert result is not None
         matrix = result.matrix
@@ -81,7 +79,7 @@ def test_more_noise_is_claimed_as_such(town):
 def test_wrong_matches_do_no_harm(town):
     truth, scene = sight_of(town[0], 5, 20.0, Sight(0.5))
     index = town[1]
-    _, matched, _ = agreement(truth, scene, index, 1.0, NO_SEEDS, VerifyOptions())
+    matched, _ = match_intersections(truth, scene, index, 1.0)
     swapped = matched.copy()
     few = np.flatnonzero(matched >= 0)[::6]
     swapped[few] = index.neighbours[matched[few], 0]
@@ -91,14 +89,14 @@ def test_wrong_matches_do_no_harm(town):
 
 def test_fewer_points_do_nearly_as_well(town):
     truth, scene = sight_of(town[0], 6, 20.0, Sight(0.5))
-    _, matched, _ = agreement(truth, scene, town[1], 1.0, NO_SEEDS, VerifyOptions())
+    matched, _ = match_intersections(truth, scene, town[1], 1.0)
     result = refine(truth, scene, town[1], matched, n_points=150)
     assert np.abs(mapped(result.matrix, scene.corners) - mapped(truth, scene.corners)).max() < 2
 
 
 def test_a_floor_under_every_claim(town):
     truth, scene = sight_of(town[0], 7)
-    _, matched, _ = agreement(truth, scene, town[1], 1.0, NO_SEEDS, VerifyOptions())
+    matched, _ = match_intersections(truth, scene, town[1], 1.0)
     floor = RefineOptions(sigma_floor_m=3.0)
     assert (refine(truth, scene, town[1], matched, floor).corner_sigma_m >= 3.0).all()
 
@@ -113,7 +111,7 @@ def test_nothing_to_stand_on_is_no_refinement(town):
 def test_few_true_matches_are_enough_where_roads_agree(town, n_matches):
     """Of a few lone matches the filter leaves none: the fit used to forget where it began, and failed."""
     truth, scene = sight_of(town[0], 8, 15.0, Sight(0.8))
-    _, matched, _ = agreement(truth, scene, town[1], 1.0, NO_SEEDS, VerifyOptions())
+    matched, _ = match_intersections(truth, scene, town[1], 1.0)
     few = np.full(len(matched), -1)
     chosen = np.flatnonzero(matched >= 0)[:: max(1, int((matched >= 0).sum()) // max(n_matches, 1))][:n_matches]
     few[chosen] = matched[chosen]

@@ -11,20 +11,18 @@ from roadgeo.geometry.homography import Homography
 from roadgeo.location import Reason
 from roadgeo.matching import rivals
 from roadgeo.matching.estimator import MatchOptions, TripleEstimator
-from roadgeo.matching.evidence import Evidence
-from roadgeo.matching.hypothesis import Hypothesis
-from roadgeo.matching.ledger import Ledger
-from roadgeo.matching.local_search import Shift, move_about
+from roadgeo.matching.events import Ledger
+from roadgeo.matching.evidence import Evidence, match_intersections
+from roadgeo.matching.exhaustive import Shift, move_about
+from roadgeo.matching.growing import Hypothesis
 from roadgeo.matching.options import LocateOptions
 from roadgeo.matching.rivals import RivalOptions, Rivals, log10_gap, similar_places
 from roadgeo.matching.search import Search
 from roadgeo.matching.triples import larger
-from roadgeo.matching.verification import agreement
 from roadgeo.reference.reference import Reference
 from roadgeo.workflows import locate
 
 NEEDED = LocateOptions().min_log10_odds
-NO_SEEDS = np.array([], np.int64)
 
 
 @pytest.fixture(scope="module")
@@ -45,8 +43,8 @@ def search_of(world, *matrices, near=None, match=None):
     estimator = TripleEstimator(evidence.scene, index, match, near)
     for matrix in matrices:
         gsd = sampling(matrix, evidence.scene.size)
-        _, matched, _ = agreement(matrix, evidence.scene, index, gsd, NO_SEEDS, estimator.options.verify)
-        estimator.score(Hypothesis(matrix, NO_SEEDS, 1.0, matched, by_roads=True))
+        matched, _ = match_intersections(matrix, evidence.scene, index, gsd)
+        estimator.score(Hypothesis(matrix, 1.0, matched, by_roads=True))
     return Search(estimator), estimator
 
 

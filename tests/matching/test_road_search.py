@@ -8,11 +8,22 @@ import pytest
 from worlds.scenes import Sight, camera, look, mapped, random_network, scene_of
 
 from roadgeo.geometry.camera import CameraOptions
-from roadgeo.matching import road_search, road_votes
+from roadgeo.matching import road_search
 from roadgeo.matching.estimator import MatchOptions, TripleEstimator
 from roadgeo.matching.index import build_index
-from roadgeo.matching.road_search import COARSE_PIXEL_M, RoadGrower, RoadSearch, Turnout, followed_more, scales
-from roadgeo.matching.road_votes import RING_STEP, WIDE_RADIUS_M, RasterOptions, Voter, make_raster
+from roadgeo.matching.road_search import (
+    COARSE_PIXEL_M,
+    RING_STEP,
+    WIDE_RADIUS_M,
+    RasterOptions,
+    RoadGrower,
+    RoadSearch,
+    Turnout,
+    Voter,
+    followed_more,
+    make_raster,
+    scales,
+)
 from roadgeo.matching.search import SearchOptions, search
 from roadgeo.matching.triples import WITHOUT_ROADS
 
@@ -116,7 +127,6 @@ def test_finds_a_broken_mask_that_triples_do_not(town, seed):
     assert full.score - full.runner_up_score > 4
     assert corner_gap(full.best.refined.matrix, scene) < 6
     assert full.best.by_roads
-    assert full.best.n_found >= 2
 
 
 @pytest.mark.slow
@@ -177,7 +187,7 @@ def test_more_may_be_tried_on_a_larger_map(monkeypatch):
 
 
 def test_a_raster_in_use_is_not_drawn_again(town, monkeypatch):
-    monkeypatch.setattr(road_votes, "_MOST_BYTES", 0)
+    monkeypatch.setattr(road_search, "_MOST_BYTES", 0)
     options = RasterOptions(cell_m=6.0)
     drawn = make_raster(town[1], options)
     other = make_raster(town[1], RasterOptions(cell_m=8.0))

@@ -9,11 +9,10 @@ from worlds.scenes import camera, look, random_network, scene_of
 from roadgeo.geometry.camera import CameraOptions
 from roadgeo.matching import growing
 from roadgeo.matching.estimator import MatchOptions, TripleEstimator
-from roadgeo.matching.hypothesis import Hypothesis
+from roadgeo.matching.events import Ledger
+from roadgeo.matching.growing import Hypothesis, SharedSweeps
 from roadgeo.matching.index import build_index
-from roadgeo.matching.ledger import Ledger
 from roadgeo.matching.search import Search, SearchOptions, search_together
-from roadgeo.matching.shared_sweeps import SharedSweeps, Stage
 from roadgeo.matching.triples import WITHOUT_ROADS, Proposals, Sweep, TripleOptions
 
 
@@ -29,13 +28,13 @@ class Part:
     def allow(self, proposals):
         return np.ones(len(proposals.placed), bool)
 
-    def screen(self, proposals, allowed, most, stage):
+    def screen(self, proposals, allowed, most):
         self.screened.append(most)
         return np.arange(most)
 
-    def follow_up(self, proposals, chosen, stage):
+    def follow_up(self, proposals, chosen):
         for one in proposals.placed[chosen]:
-            yield Hypothesis(np.eye(3), chosen[:1], float(one), chosen)
+            yield Hypothesis(np.eye(3), float(one), chosen)
 
     def enough(self):
         return False
@@ -63,8 +62,7 @@ def proposals_of(anchor, placed):
 def swept(parts, same_place=None):
     sweeps = SharedSweeps(None, CameraOptions(), same_place)
     sweeps.members += parts
-    stage = Stage(0, Plan(parts))
-    return sweeps, stage
+    return sweeps, Plan(parts)
 
 
 def supports(hypotheses):
@@ -74,8 +72,8 @@ def supports(hypotheses):
 def test_the_best_of_all_parts_are_verified_each_where_it_grew(monkeypatch):
     monkeypatch.setattr(growing, "MAX_VERIFIED", 3)
     parts = [Part([[5, 3], [2]]), Part([[9, 1], [8]]), Part([[4], []])]
-    sweeps, stage = swept(parts)
-    found = [[supports(one) for one in sweeps.rounds(part, stage)] for part in parts]
+    sweeps, sweep = swept(parts)
+    found = [[supports(one) for one in sweeps.rounds(part, sweep)] for part in parts]
     assert found == [[[5.0], [2.0]], [[9.0], [8.0]], [[4.0], []]]
 
 
@@ -83,9 +81,9 @@ def test_the_best_of_all_parts_are_verified_each_where_it_grew(monkeypatch):
 def test_the_best_placed_are_screened_and_of_equals_each_part_gives_one_in_turn(most, shares, monkeypatch):
     monkeypatch.setattr(growing, "MAX_SCREENED", most)
     parts = [Part([[3, 3, 3, 3]]), Part([[4, 3]]), Part([[3]])]
-    sweeps, stage = swept(parts)
+    sweeps, sweep = swept(parts)
     for part in parts:
-        list(sweeps.rounds(part, stage))
+        list(sweeps.rounds(part, sweep))
     assert [part.screened for part in parts] == [[share] for share in shares]
 
 
@@ -93,19 +91,16 @@ def test_what_lies_on_roads_grows_in_even_shares(monkeypatch):
     monkeypatch.setattr(growing, "MAX_GROWN", 6)
     monkeypatch.setattr(growing, "MAX_VERIFIED", 100)
     parts = [Part([[3] * 8]), Part([[3] * 4])]
-    sweeps, stage = swept(parts)
-    assert [len(next(sweeps.rounds(part, stage))) for part in parts] == [4, 2]
+    sweeps, sweep = swept(parts)
+    assert [len(next(sweeps.rounds(part, sweep))) for part in parts] == [4, 2]
 
 
-def test_what_a_part_did_not_take_yet_can_be_asked_for_once():
+def test_each_part_takes_what_grew_on_it_in_its_own_time():
     parts = [Part([[5], [6]]), Part([[7], [8]])]
-    sweeps, stage = swept(parts)
-    first = sweeps.rounds(parts[0], stage)
+    sweeps, sweep = swept(parts)
+    first = sweeps.rounds(parts[0], sweep)
     assert [supports(next(first)), supports(next(first))] == [[5.0], [6.0]]
-    assert supports(sweeps.pending(parts[1], 0, 1)) == [8.0]
-    assert sweeps.pending(parts[1], 0, 1) == []
-    assert sweeps.pending(parts[1], 7, 1) == []
-    assert [supports(one) for one in sweeps.rounds(parts[1], stage)] == [[7.0], []]
+    assert [supports(one) for one in sweeps.rounds(parts[1], sweep)] == [[7.0], [8.0]]
 
 
 def test_a_place_on_ground_that_shards_share_is_verified_once(monkeypatch):
@@ -115,9 +110,9 @@ def test_a_place_on_ground_that_shards_share_is_verified_once(monkeypatch):
         return a.support // 10 == b.support // 10
 
     parts = [Part([[31, 19]]), Part([[52, 45, 18]]), Part([[60, 11]])]
-    parts[2].whole.append(Hypothesis(np.eye(3), np.zeros(1, int), 50.0, np.zeros(1, int)))
-    sweeps, stage = swept(parts, same_place)
-    found = [sorted(supports(next(sweeps.rounds(part, stage)))) for part in parts]
+    parts[2].whole.append(Hypothesis(np.eye(3), 50.0, np.zeros(1, int)))
+    sweeps, sweep = swept(parts, same_place)
+    found = [sorted(supports(next(sweeps.rounds(part, sweep)))) for part in parts]
     assert found == [[19.0, 31.0], [45.0], [60.0]]
 
 

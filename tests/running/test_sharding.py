@@ -17,7 +17,7 @@ from roadgeo.location import Seconds
 from roadgeo.matching import methods
 from roadgeo.matching.methods import search_references
 from roadgeo.matching.options import LocateOptions
-from roadgeo.matching.query import Query
+from roadgeo.matching.scene import Query
 from roadgeo.matching.verdict import decide
 from roadgeo.reference.inspection import check_reference, reference_digest
 from roadgeo.reference.network_file import read_network

@@ -11,7 +11,7 @@ from roadgeo.location import Reason, Seconds
 from roadgeo.matching.index import build_index
 from roadgeo.matching.methods import Fit, Found
 from roadgeo.matching.options import LocateOptions
-from roadgeo.matching.query import Query
+from roadgeo.matching.scene import Query
 from roadgeo.matching.verdict import decide
 
 SIZE = (1000, 1000)

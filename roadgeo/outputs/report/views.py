@@ -14,7 +14,7 @@ from roadgeo._arrays import AnyArray, BoolArray, FloatArray
 from roadgeo.geometry.mask import RoadMask, plane_to_pixel
 from roadgeo.location import Evidence, Location, Seen
 from roadgeo.matching.index import ReferenceIndex
-from roadgeo.matching.query import trace_query
+from roadgeo.matching.scene import trace_query
 from roadgeo.outputs.canvas import touching
 from roadgeo.outputs.names import bare_name
 from roadgeo.outputs.paths import Placement

@@ -13,28 +13,26 @@ from dataclasses import dataclass, field, replace
 
 import numpy as np
 
-from roadgeo._arrays import FloatArray, IntArray
+from roadgeo._arrays import FloatArray
 from roadgeo.geometry.camera import judge, sampling
 from roadgeo.geometry.frame import Frame
 from roadgeo.geometry.homography import Homography
 from roadgeo.geometry.mask import PIXEL_TO_PLANE
 from roadgeo.location import Location
-from roadgeo.matching.evidence import Evidence
-from roadgeo.matching.hypothesis import Hypothesis
+from roadgeo.matching.evidence import Evidence, agreement, match_intersections
+from roadgeo.matching.growing import Hypothesis
 from roadgeo.matching.index import ReferenceIndex
 from roadgeo.matching.methods import Fit, Found, search_references
 from roadgeo.matching.options import LocateOptions
-from roadgeo.matching.query import Query
 from roadgeo.matching.refinement import refine
 from roadgeo.matching.rivals import RivalOptions, similar_places
+from roadgeo.matching.scene import Query
 from roadgeo.matching.verdict import decide
-from roadgeo.matching.verification import agreement
 from roadgeo.reference.reference import Reference
 from roadgeo.running.flights.mosaic import Mosaic
 
 __all__ = ["CandidateOptions", "Candidates", "Look"]
 
-_NO_SEEDS: IntArray = np.array([], np.int64)
 
 #: Number of times that the places are compared at the scale of the best one, until it stays that.
 _MOST_SCALES = 4
@@ -105,16 +103,15 @@ class _Candidate:
         matrix, self.fit = _lay(self, look), None
         if matrix is None or judge(matrix, whole.size, match.camera, rough=True) is not None:
             return
-        _, matched, _ = agreement(matrix, whole, self.index, sampling(matrix, whole.size), _NO_SEEDS, match.verify)
+        matched, _ = match_intersections(matrix, whole, self.index, sampling(matrix, whole.size))
         refined = refine(matrix, whole, self.index, matched, match.refine, held=True)
         if refined is None or judge(refined.matrix, whole.size, match.camera) is not None:
             return
         matrix, gsd = refined.matrix, sampling(refined.matrix, whole.size)
-        found, matched, distance = agreement(matrix, whole, self.index, gsd, _NO_SEEDS, match.verify)
-        likelihood = Evidence(whole, self.index, gsd, match.evidence).weigh(matrix)
+        found, matched, distance = agreement(matrix, whole, self.index, gsd)
         self.matrix, self.seen_at = matrix @ PIXEL_TO_PLANE @ look.mosaic.to_mosaic[-1], look.numbers[-1]
         self.fit = Fit(
-            self.index, matrix, matched, distance, found.forward, -math.inf, likelihood,
+            self.index, matrix, matched, distance, found.forward, -math.inf, found.log10_likelihood,
             refined.corner_sigma_m, refined.corner_covariance_m2,
             agreement=found.mean,
         )  # fmt: skip

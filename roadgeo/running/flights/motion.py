@@ -24,8 +24,7 @@ from roadgeo.geometry.homography import Homography
 from roadgeo.geometry.mask import RoadMask
 from roadgeo.kernels.roads import bin_segments
 from roadgeo.kernels.structs import RoadBuckets
-from roadgeo.matching.query import trace_query
-from roadgeo.matching.scene import Scene
+from roadgeo.matching.scene import Scene, trace_query
 from roadgeo.roads.graph import RoadGraph
 from roadgeo.running.flights.pose import FilterOptions, Pose, correct
 

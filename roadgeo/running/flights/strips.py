@@ -19,7 +19,7 @@ from roadgeo.geometry.frame import Frame
 from roadgeo.geometry.homography import Homography, map_each
 from roadgeo.geometry.mask import PIXEL_TO_PLANE, RoadMask
 from roadgeo.matching.checking import CheckOptions, check_place
-from roadgeo.matching.query import trace_query
+from roadgeo.matching.scene import trace_query
 from roadgeo.reference.reference import Reference
 from roadgeo.roads.vectorization import road_width
 from roadgeo.running.flights.mosaic import lay_down

@@ -25,8 +25,7 @@ from roadgeo.kernels.warmup import warm_up
 from roadgeo.location import Location
 from roadgeo.matching.evidence import Evidence
 from roadgeo.matching.options import LocateOptions
-from roadgeo.matching.query import Query, read_query, trace_query
-from roadgeo.matching.scene import Scene
+from roadgeo.matching.scene import Query, Scene, read_query, trace_query
 from roadgeo.reference.reference import Reference
 from roadgeo.roads.vectorization import road_width
 from roadgeo.running.flights.candidates import CandidateOptions, Candidates, Look

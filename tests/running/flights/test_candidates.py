@@ -8,7 +8,7 @@ from roadgeo.evaluation.landscape import Landscape
 from roadgeo.geometry.homography import Homography
 from roadgeo.geometry.mask import RoadMask
 from roadgeo.matching.options import LocateOptions
-from roadgeo.matching.query import read_query
+from roadgeo.matching.scene import read_query
 from roadgeo.reference.reference import Reference
 from roadgeo.running.flights.candidates import CandidateOptions, Candidates, Look
 from roadgeo.running.flights.mosaic import lay_together

@@ -8,10 +8,9 @@ from hypothesis import given
 from hypothesis import strategies as st
 from worlds.scenes import Sight, camera, look, mapped, scene_of
 
-from roadgeo.matching.verification import VerifyOptions, agreement, tolerance_m
+from roadgeo.matching.evidence import Evidence, EvidenceOptions, agreement, tolerance_m
 
-OPTIONS = VerifyOptions()
-NO_SEEDS = np.array([], int)
+OPTIONS = EvidenceOptions()
 TRUTH = camera((2000, 1900), (1000, 1000), 1.0, 20.0, 50.0, 130.0)
 ELSEWHERE = np.array([[1, 0, 333.0], [0, 1, -271.0], [0, 0, 1]]) @ TRUTH
 
@@ -22,8 +21,8 @@ def scene(town):
     return scene_of(look(town[0], TRUTH, sight=Sight(0.5)))
 
 
-def agree(matrix, scene, index, seeds=NO_SEEDS):
-    return agreement(matrix, scene, index, 1.0, seeds, OPTIONS)
+def agree(matrix, scene, index):
+    return agreement(matrix, scene, index, 1.0)
 
 
 class TestAgreement:
@@ -33,7 +32,7 @@ class TestAgreement:
         assert found.tested == len(scene.intersections)
         assert found.matched == (matched >= 0).sum()
         assert min(found.forward, found.backward) > 0.97
-        assert (distance[matched >= 0] < 1.5 * tolerance_m(1.0, OPTIONS)).all()
+        assert (distance[matched >= 0] < 1.5 * tolerance_m(1.0)).all()
         gaps = mapped(TRUTH, scene.intersections.xy)[matched >= 0] - town[1].xy[matched[matched >= 0]]
         assert distance[matched >= 0] == pytest.approx(np.hypot(*gaps.T))
 
@@ -47,13 +46,9 @@ class TestAgreement:
         assert (found.rate, found.forward, found.backward) == (0, 0, 0)
         assert (matched == -1).all()
 
-    def test_seeds_are_matched_but_not_counted(self, town, scene):
-        seeds = np.array([3, 5, 8])
-        every, matched, _ = agree(TRUTH, scene, town[1])
-        fewer, again, _ = agree(TRUTH, scene, town[1], seeds)
-        assert np.array_equal(matched, again)
-        assert fewer.tested == every.tested - 3
-        assert fewer.matched == every.matched - (matched[seeds] >= 0).sum()
+    def test_its_likelihood_is_that_of_the_evidence(self, town, scene):
+        for matrix in (TRUTH, ELSEWHERE):
+            assert agree(matrix, scene, town[1])[0].log10_likelihood == Evidence(scene, town[1], 1.0).weigh(matrix)
 
     def test_roads_that_the_query_misses_count_against_it(self, town):
         gaps = scene_of(look(town[0], TRUTH, sight=Sight(missing=0.4)))
@@ -75,4 +70,4 @@ class TestAgreement:
 
 @given(st.floats(0.1, 10))
 def test_tolerance_grows_with_the_sampling(gsd):
-    assert tolerance_m(gsd, OPTIONS) > 3 * max(OPTIONS.map_sigma_m, OPTIONS.pixel_sigma_px * gsd)
+    assert tolerance_m(gsd) > 3 * max(OPTIONS.map_sigma_m, OPTIONS.pixel_sigma_px * gsd)
