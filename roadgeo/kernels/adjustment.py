@@ -48,7 +48,7 @@ def _determinant(p: Floats1) -> float:
 
 @kernel(forceinline=True)
 def own_sigma(reach_m: float, sigma_m: float, map_sigma_m: float, mask_sigma: float) -> float:
-    """Return how many times less sure than in the middle of the frame a point is where a step of 1 reaches so far.
+    """Return how many times less sure than in the middle a point is, by the reach of a step of 1 there.
 
     The other arguments are as in `structs.AdjustLimits`.
     """
@@ -66,7 +66,7 @@ class _System(NamedTuple):
 
 
 class _Met(NamedTuple):
-    """What the search for roads met: of each road point, and of each cell of the frame."""
+    """Results of the search for roads: of each road point, and of each cell of the frame."""
 
     met: Bools1
     normals: Floats2  # unit vectors across the road
@@ -239,8 +239,8 @@ def adjust(
 
     The first step takes matched intersections, and points held where the map to be adjusted put them, for the first
     `_HELD_STEPS`. Then a road point's residual is its distance across the nearest road of the map that runs its way.
-    How far off it may be is predicted from the system so far: it is searched as far as three times that, and not at all
-    beyond the greatest radius, so that the fit grows outwards from where it is sure.
+    Its standard deviation is predicted from the present system: it is searched as far as three times that, and not at
+    all beyond the greatest radius, so that the fit grows outwards from where it is sure.
 
     Parameters
     ----------

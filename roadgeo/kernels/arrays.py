@@ -1,4 +1,4 @@
-"""Arrays of kernels by type and number of dimensions, all C-contiguous, and what an annotation means to a kernel."""
+"""Arrays of kernels by type and number of dimensions, all C-contiguous, and the meaning of annotations to kernels."""
 
 from dataclasses import dataclass
 from typing import Annotated, Any, TypeAlias, get_args, get_origin, get_type_hints
@@ -83,13 +83,13 @@ def kind_of(annotation: Any) -> Kind:
     Raises
     ------
     TypeError
-        It does not say enough, such as an array without its number of dimensions.
+        It is incomplete, such as an array without its number of dimensions.
     """
     if annotation in (float, int, bool, None):
         return annotation  # type: ignore[no-any-return]
     if get_origin(annotation) is Annotated:
         array, ndim = get_args(annotation)
-        told = get_args(array)  # of the alias `NDArray[scalar]`, or, before NumPy made it one, of what it stands for
+        told = get_args(array)  # of the alias `NDArray[scalar]`, or, before NumPy made it one, of its expansion
         return ArrayKind(np.dtype(told[0] if len(told) == 1 else get_args(told[1])[0]), ndim)
     if get_origin(annotation) is tuple:
         return TupleKind(tuple(map(kind_of, get_args(annotation))))

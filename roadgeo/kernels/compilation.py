@@ -38,7 +38,7 @@ from roadgeo.storage.folders import cache_dir, is_private, private_temporary_dir
 __all__ = ["Kernel", "compiled", "entries", "kernel", "kernel_folder", "load", "modules_of_the_search"]
 
 _Function = TypeVar("_Function", bound=Callable[..., Any])
-#: Told how many kernels are compiled, and of how many.
+#: Called with the number of kernels that are compiled, and of all.
 Progress = Callable[[int, int], None]
 
 _LOG = logging.getLogger(__name__)
@@ -91,7 +91,7 @@ class Kernel:
 
     @cached_property
     def part(self) -> Any:
-        """What numba compiles into other kernels."""
+        """Functions that numba compiles into other kernels."""
         import numba
 
         _teach_numba()
@@ -173,7 +173,7 @@ class _Call:
 
 
 def _fill(slots: list[Any], values: Sequence[Any], kinds: tuple[Kind, ...], name: str) -> bool:
-    """Add what machine code is told of values; False: an array is not what it expects."""
+    """Add the machine words of a value; False: an array is not what it expects."""
     for value, kind in zip(values, kinds, strict=True):
         if type(kind) is ArrayKind:
             if value.dtype != kind.dtype or value.ndim != kind.ndim or not value.flags.c_contiguous:
@@ -262,7 +262,7 @@ def entries(module: str) -> list[Kernel]:
 
 
 class _Engine(NamedTuple):
-    """llvmlite and what it knows of this machine."""
+    """llvmlite and its description of this machine."""
 
     llvm: Any
     machine: Any
@@ -278,7 +278,7 @@ def _engine() -> _Engine:
     llvm.initialize_native_asmprinter()
     cpu, features = llvm.get_host_cpu_name(), llvm.get_host_cpu_features().flatten()
     target = llvm.Target.from_triple(llvm.get_process_triple())
-    # As numba has it: what is compiled here is for this machine only.
+    # As numba does: code is compiled for this machine only.
     reloc = "static" if target.name.startswith("x86") else "default"
     machine = target.create_target_machine(cpu, features, 3, reloc, "jitdefault", jit=True)
     return _Engine(llvm, machine, f"{llvmlite.__version__} {cpu} {features}")
@@ -288,7 +288,7 @@ def _engine() -> _Engine:
 def kernel_folder() -> Path:
     """Return the folder of the kernels' machine code, a temporary one where the user's cache folder cannot be written.
 
-    It is named after all that the code depends on. What lies there is executed, so nobody else may write to it.
+    It is named after all that the code depends on. Its files are executed, so nobody else may write to it.
     """
     python = f"{platform.python_version()}{getattr(sys, 'abiflags', '')} {sys.implementation.cache_tag}"
     known = (__version__, _engine().name, platform.machine(), python, np.__version__, _numba_version())
@@ -337,7 +337,7 @@ def _file(module: str) -> Path:
 
 
 def _compile(module: str, progress: Callable[[int], None]) -> None:
-    """Compile a module's kernels and keep their code; what this machine cannot keep is left to numba."""
+    """Compile a module's kernels and keep their code; numba compiles those that this machine cannot keep."""
     try:
         _require_known_numba()
         from roadgeo.kernels.machine_code import compile_kernels
@@ -361,7 +361,7 @@ def _compile(module: str, progress: Callable[[int], None]) -> None:
 
 
 def _require_known_numba() -> None:
-    """Raise `ImportError` where numba is newer than what was tried."""
+    """Raise `ImportError` where numba is newer than the versions that were tried."""
     found = _numba_version()
     if tuple(map(int, re.findall(r"\d+", found)[:2])) > _NEWEST_NUMBA:
         raise ImportError(f"numba {found} is newer than {'.'.join(map(str, _NEWEST_NUMBA))}")

@@ -18,7 +18,7 @@ from roadgeo.kernels.structs import GrowthLimits, GrowthQuery, PointBuckets
 
 __all__ = ["grow", "grow_each"]
 
-#: Rounds of growth, each over all points not tested yet; a fit when so many times more points are matched.
+#: Rounds of growth, each over all points not tested yet; a fit when the points matched have grown by this factor.
 _ROUNDS, _MORE = 8, 1.2
 #: Search radius in standard deviations; points nearer to the horizon than this w are left out.
 _SIGMAS, _LEAST_W = 2.5, 0.1

@@ -129,7 +129,7 @@ def fit_homography(
     prior : float
         Weight that holds the two perspective parameters near zero: variance of a residual over theirs.
     p : (8,) float64
-        Parameters so far; replaced.
+        Present parameters; replaced.
     normal, factor : (8, 8) float64
         Their lower triangles are filled with the normal matrix and its Cholesky factor.
     """
@@ -172,7 +172,7 @@ def fit_homography(
 
 @kernel(forceinline=True)
 def spread(row: NDArray[np.float64], factor: NDArray[np.float64], work: NDArray[np.float64]) -> float:
-    """Return the variance of what `row` is the derivative of, |L^-1 row|^2, L the factor of the step before."""
+    """Return the variance of the value whose derivative is `row`, |L^-1 row|^2, L the factor of the step before."""
     total = 0.0
     for r in range(8):
         value = row[r]

@@ -17,7 +17,7 @@ from roadgeo.kernels.structs import RoadBuckets
 
 __all__ = ["MeetLimits", "lens_rows", "meet_roads"]
 
-#: A barrel folds over where r (1 + k1 r^2) no longer grows; nothing is seen so far out.
+#: A barrel folds over where r (1 + k1 r^2) no longer grows; nothing is seen beyond.
 _UNFOLDED = 0.98
 _NEWTON_STEPS = 8
 #: Points nearer to the horizon than this w are not seen.
@@ -32,7 +32,7 @@ class MeetLimits(NamedTuple):
     unit, x, y : float
         Metres per normalised unit of the reference plane, and where its (0, 0) lies.
     slack : float
-        Places may be so many times further off than the parameters' covariance says.
+        Places may be off by this multiple of the parameters' covariance.
     max_radius, min_cos, sigma_m, map_sigma_m, mask_sigma
         As in `kernels.structs.AdjustLimits`.
     """
@@ -151,7 +151,7 @@ def meet_roads(
     p, k1, half_side, points, directions
         As in `lens_rows`.
     inverse : (9, 9) float64
-        Inverse of the normal matrix so far: how sure a place is follows from it.
+        Inverse of the present normal matrix: how sure a place is follows from it.
     rows : (S, 9) float64
         Filled for points that meet a road: the derivatives of their places across it, normalised.
     residuals : (S,) float64
@@ -159,7 +159,7 @@ def meet_roads(
     sigmas : (S,) float64
         Filled for points that meet a road: the standard deviation of that, metres.
     own : (S,) float64
-        Filled likewise: what it would be if the place were known, in that of the middle of the frame.
+        Filled likewise: its value if the place were known, in that of the middle of the frame.
 
     Returns
     -------

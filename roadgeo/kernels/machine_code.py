@@ -1,7 +1,7 @@
 """From kernels to machine code that needs no numba to run: compiled by numba, called through a plain interface.
 
 Each kernel gets an entry `int32 roadgeo_NAME(int64 *arguments, int64 *results)`. Arrays are passed as the addresses of
-numpy's objects; what a kernel allocates is counted by the few lines below instead of numba's runtime.
+numpy's objects; allocations of a kernel are counted by the few lines below instead of numba's runtime.
 """
 
 from __future__ import annotations
@@ -38,7 +38,7 @@ class CannotKeep(Exception):  # noqa: N818
 
 
 def compile_kernels(kernels: Sequence[Kernel], llvm: Any, machine: Any, progress: Callable[[int], None]) -> bytes:
-    """Compile kernels into one object file; `progress` is told how many are done.
+    """Compile kernels into one object file; `progress` is called with the number done.
 
     Raises
     ------
@@ -141,7 +141,7 @@ def _argument(context: Any, builder: ir.IRBuilder, kind: Kind, numbers: Iterator
 
 
 def _results(context: Any, builder: ir.IRBuilder, kind: Kind, value: Any) -> Iterator[Any]:
-    """Yield the numbers that a kernel's result is told by."""
+    """Yield the numbers that make a kernel's result."""
     if isinstance(kind, TupleKind):
         for member, part in zip(kind.members, cgutils.unpack_tuple(builder, value, len(kind.members)), strict=True):
             yield from _results(context, builder, member, part)

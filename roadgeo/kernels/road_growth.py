@@ -21,7 +21,7 @@ __all__ = ["Stages", "fit_to_roads", "grow_by_roads", "share_on_roads"]
 
 #: Points of the first stage, and how many times more each further one has; of more points than these, evenly chosen.
 _FIRST, _MORE, _ENOUGH = 60, 1.45, 120
-#: Search radii of a stage's steps, metres: a proposal's scale and turn are rougher than what a grown map predicts.
+#: Search radii of a stage's steps, metres: a proposal's scale and turn are rougher than a grown map's predictions.
 _FIRST_RADII, _RADII = (25.0, 18.0, 12.0), (18.0, 12.0, 12.0)
 #: How far a stage may take the map from the one before: standard deviations of its linear part, and of its place.
 _LINEAR_SIGMA, _PLACE_SIGMA_M = 0.08, 10.0
@@ -36,7 +36,7 @@ class Stages(NamedTuple):
 
     `affine_until` in normalised units; a stage fails with fewer than `least_share` of its points on roads;
     `perspective_sigma` is the prior standard deviation of the two perspective parameters; roads count that turn from a
-    point's direction by less than `min_cos` says; only `go_on` maps go on after each of the first stages, those whose
+    point's direction by less than `min_cos` allows; only `go_on` maps go on after each of the first stages, those whose
     points lie closest to roads, and besides them the first `sure` ones.
     """
 

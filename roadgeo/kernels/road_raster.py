@@ -1,4 +1,4 @@
-"""The roads of a map as a raster of direction bits, which say what ways roads run near a place.
+"""The roads of a map as a raster of direction bits, the directions of the roads near a place.
 
 Cells of `cell` metres hold 16 bits, one for each of 16 ranges of direction modulo pi. A road sets the bits of its own
 and the nearest directions in all cells near it, so that one look-up answers "does a road pass here that runs my way?".
@@ -81,7 +81,7 @@ def paint_roads(
     segments, x0, y0, cell, reach, tile_of
         As in `mark_tiles`, which filled `tile_of`.
     turn : float
-        Directions whose range's middle differs by less than so many radians are set.
+        Directions whose range's middle differs by less than this number of radians are set.
     bits : (T + 1, TILE, TILE) uint16
         Zeros; filled.
     """

@@ -1,6 +1,6 @@
 """The roads around a place as rings of bits: a turn rotates words, and a step of scale moves them to the next ring.
 
-Around a place lie rings whose radii grow in equal ratio, each divided into 64 bearings. A word for each ring says at
+Around a place lie rings whose radii grow in equal ratio, each divided into 64 bearings. A word for each ring holds at
 which of them roads pass that run along the bearing, another those that run across it. So all roads around one
 intersection are compared with those around another in a few instructions for each ring. (Log-polar bins, as in shape
 contexts: Belongie, Malik and Puzicha, PAMI 2002.)
@@ -24,7 +24,7 @@ WORDS = 2 * RINGS
 
 @kernel(writes=("words",))
 def draw_rings(cells: Floats2, places: Ints1, radii: Floats1, raster: Raster, words: UInt64s2) -> None:
-    """Say where roads pass around places.
+    """Mark where roads pass around places.
 
     Parameters
     ----------
@@ -60,7 +60,7 @@ def draw_rings(cells: Floats2, places: Ints1, radii: Floats1, raster: Raster, wo
 
 @kernel(writes=("words",))
 def mark_rings(rings: Ints1, bearings: Floats1, along: Ints1, own: Ints1, first_own: int, words: UInt64s2) -> None:
-    """Say where road points of the query lie around one of its intersections, at each of S scales.
+    """Mark where road points of the query lie around one of its intersections, at each of S scales.
 
     Parameters
     ----------
@@ -71,7 +71,7 @@ def mark_rings(rings: Ints1, bearings: Floats1, along: Ints1, own: Ints1, first_
     along : (P,) int64
         1 where the road runs along the bearing, within 45 degrees, 0 where it runs across.
     own : (P,) int64
-        1 for points on what may be branches of the intersection itself, which count from ring `first_own` on only.
+        1 for points on possible branches of the intersection itself, which count from ring `first_own` on only.
     words : (S, WORDS) uint64
         Zeros; filled.
     """

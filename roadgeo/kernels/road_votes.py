@@ -13,7 +13,7 @@ from roadgeo.kernels.road_rings import BEARINGS, WORDS, count_bits, turn_bits
 
 __all__ = ["MAX_TURNS", "WHOLE_TURN", "Places", "RoadPoints", "Trial", "find_turns", "improve_votes", "vote"]
 
-#: Angles of branches are whole numbers: what is beyond a whole turn falls away, and the uppermost 6 bits of 32 are the
+#: Angles of branches are whole numbers: bits beyond a whole turn fall away, and the uppermost 6 bits of 32 are the
 #: bearing that they point to.
 WHOLE_TURN = 1 << 32
 _HALF_TURN, _MASK, _BITS = 1 << 31, (1 << 32) - 1, 26
@@ -78,7 +78,7 @@ def _turns_allowed(rays: Ints1, directions: Int32s2, m: int, j: int, tolerance: 
     branches = np.uint64(0)
     for t in range(m):
         branches |= np.uint64(1) << np.uint64(_bearing(int(directions[j, t])))
-    # two angles and the turn are rounded: what agrees lies up to one and a half bearings further apart than it is
+    # two angles and the turn are rounded: agreeing roads lie up to one and a half bearings further apart than it is
     for _ in range((tolerance >> _BITS) + 2):
         branches |= turn_bits(branches, 1) | turn_bits(branches, -1)
     # turns at which no ray lacks a branch, one does, and two or more do
@@ -181,7 +181,7 @@ def vote(
 ) -> tuple[int, int]:
     """Lay the roads around a query intersection on those around map intersections; keep the best.
 
-    Each turn that the branches allow is tried at every scale. What counts is how many points meet roads beyond those
+    Each turn that the branches allow is tried at every scale. The score is how many points meet roads beyond those
     that would by chance, if the rings of the place were turned at random, in standard deviations of that number; of all
     scales of one turn the best.
 
@@ -292,7 +292,7 @@ def improve_votes(
     Parameters
     ----------
     votes : (K, 4) float64
-        As left by `vote`; turn and scale are replaced by the best, and what they were judged by with the log-likelihood
+        As left by `vote`; turn and scale are replaced by the best, and their votes by the log-likelihood
         ratio of the points against chance, nats.
     turns, factors : float64
         Steps: radians added, and factors of the scale.

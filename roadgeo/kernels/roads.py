@@ -35,7 +35,7 @@ def bin_segments(
     """Count the segments of every bucket, or list them.
 
     A segment is listed in every bucket of its bounding box that it crosses or comes near: segments are short, and a few
-    entries too many cost less than an exact clip. What lies outside the grid belongs to the buckets of its rim.
+    entries too many cost less than an exact clip. Roads outside the grid belong to the buckets of its rim.
 
     Parameters
     ----------
@@ -134,7 +134,7 @@ def nearest_road(
                 sx, sy = segments[s, 2] - ax, segments[s, 3] - ay
                 square = sx * sx + sy * sy
                 across = (x - ax) * sy - (y - ay) * sx
-                if across * across > best * square:  # as most are: too far from the line, told without a division
+                if across * across > best * square:  # as most are: too far from the line, found without a division
                     continue
                 t = ((x - ax) * sx + (y - ay) * sy) / square if square > 0.0 else 0.0
                 t = min(max(t, 0.0), 1.0)
@@ -299,11 +299,11 @@ def count_residuals(
     bounds : (4,) float64
         x0, y0, x1, y1 of the footprint: only buckets that meet it are looked at.
     points, directions, weights : (S, 2), (S, 2), (S,) float64
-        Road points of the query, unit vectors along the road, and what each counts.
+        Road points of the query, unit vectors along the road, and the weight of each.
     radius, min_cos
         As in `nearest_road`: metres.
     step : float
-        The map is sampled once in so many metres of road.
+        The map is sampled once in this number of metres of road.
     field : (h, w) float32
         Distance from each cell of the frame to the nearest road of the query, in cells of `field_scale` pixels; rows
         run downwards.
@@ -312,7 +312,7 @@ def count_residuals(
     piece_px, columns : float, int
         Width of the frame's pieces, and how many of them are side by side.
     forward, backward : (P, B + 1) float64
-        P pieces, row by row; B bins of equal width up to `radius`, and what has no road nearer. The first counts
+        P pieces, row by row; B bins of equal width up to `radius`, and roads without one nearer. The first counts
         weights, the second pixels of road.
     """
     segments, starts, ids, grid, shape = roads
@@ -399,7 +399,7 @@ def screen(
     points, directions : (S, 2) float64
         Road points near it, and unit vectors along the road.
     radius, radius_px : float
-        Roads count within `radius` metres and so many pixels more.
+        Roads count within `radius` metres and this number of pixels more.
     min_cos
         As in `nearest_road`.
     least : float

@@ -1,4 +1,4 @@
-"""What travels together through kernels, as NamedTuples.
+"""Values that travel together through kernels, as NamedTuples.
 
 Planes are in metres (reference) or pixels, y up (query). `grid` and `shape` are those of `kernels.buckets`.
 """
@@ -68,7 +68,7 @@ class TripleMap(NamedTuple):
 
 
 class TripleLimits(NamedTuple):
-    """What a look-up lets through."""
+    """Limits of a look-up."""
 
     codes_per_vertex: int
     tolerance: int  # of angles, in units
@@ -78,7 +78,7 @@ class TripleLimits(NamedTuple):
 
 
 class Hits(NamedTuple):
-    """Room for what a look-up finds."""
+    """Room for the hits of a look-up."""
 
     ids: Ints2  # (H, 5): A, slot of b, B, slot of c, C
     affine: Floats2  # (H, 4): the 2 x 2 map, row-major, from query to reference
@@ -150,10 +150,10 @@ class Held(NamedTuple):
 class AdjustLimits(NamedTuple):
     """How an adjustment goes on.
 
-    Where fewer than `least_share` of a cell's searched points meet a road, what does meet one is chance, and the cell
+    Where fewer than `least_share` of a cell's searched points meet a road, they meet it by chance, and the cell
     waits. The iteration ends when no parameter moves by more than `tolerance_m`.
 
-    A pixel that reaches further on the ground says less of it: in a tilted frame standard deviations grow with it.
+    A pixel that reaches further on the ground shows it less exactly: standard deviations grow with it in tilted frames.
     """
 
     n_cells: int

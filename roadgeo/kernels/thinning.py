@@ -20,7 +20,7 @@ SOLID = 2  # beyond the frame or unobserved: road for all we know, never deleted
 #: Roles of a pixel by its neighbours: not simple; simple; a free end of a line; simple with two neighbours that touch.
 KEEP, DELETE, TIP, CORNER = 0, 1, 2, 3
 
-LEVELS_PER_PIXEL = 8  # distances are told apart to 1/8 px
+LEVELS_PER_PIXEL = 8  # distances differ from 1/8 px on
 DEEPEST = np.float32(4096.0)  # and not beyond this: without any GROUND they are infinite
 
 
@@ -58,7 +58,7 @@ def neighbours(flat: NDArray[np.uint8], p: np.uint64, stride: np.uint64) -> np.u
 
 @kernel()
 def touches_solid(flat: NDArray[np.uint8], p: np.uint64, stride: np.uint64) -> bool:
-    """Tell whether a neighbour of pixel `p` is SOLID."""
+    """Return whether a neighbour of pixel `p` is SOLID."""
     above = flat[p - stride] | flat[p - stride - np.uint64(1)] | flat[p - stride + np.uint64(1)]
     below = flat[p + stride] | flat[p + stride - np.uint64(1)] | flat[p + stride + np.uint64(1)]
     return bool((above | below | flat[p - np.uint64(1)] | flat[p + np.uint64(1)]) & SOLID)
@@ -79,7 +79,7 @@ def neighbour_steps(stride: int) -> NDArray[np.uint64]:
 def _is_ridge(
     flat: NDArray[np.uint8], depth: NDArray[np.float32], p: np.uint64, back: np.uint64, steps: NDArray[np.uint64]
 ) -> bool:
-    """Tell whether no neighbour that is left lies deeper than pixel `p`; `back` leads to the north-west one."""
+    """Return whether no neighbour that is left lies deeper than pixel `p`; `back` leads to the north-west one."""
     for k in range(8):
         q = p - back + steps[k]
         if flat[q] != GROUND and depth[q] > depth[p]:

@@ -20,7 +20,7 @@ LOWEST_BIT = np.array([max((code & -code).bit_length() - 1, 0) for code in range
 
 @kernel()
 def _label(states: Bytes2, pixels: Int32s1, node_of: Int32s1) -> int:
-    """Tell pixels of chains from those of nodes by how many neighbours they have; return the sum of the latter's."""
+    """Separate pixels of chains from those of nodes by their number of neighbours; return the sum of the latter's."""
     flat = states.ravel()
     stride = np.uint64(states.shape[1])
     slots = 0

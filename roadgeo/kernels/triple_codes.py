@@ -10,7 +10,7 @@ Two sorted cells at a vertex make one of 45 pairs, three vertices one of 45^3 ta
 `anchor << 40 | slot of Y << 37 | slot of Z << 34 | sides << 24 | six positions within the cells`, slots being columns
 of `neighbours`. Each position takes 4 bits of which the highest is 0: with that bit set as a guard, one subtraction
 compares all six. `sides` says on which sides of each vertex the road along a tangent leaves it: most entries whose
-angles agree are told apart by them, before anything else of the map is read. A cell's entries are sorted by them.
+angles agree differ in them, before anything else of the map is read. A cell's entries are sorted by them.
 """
 
 import math

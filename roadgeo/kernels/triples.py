@@ -92,7 +92,7 @@ def count_alike(
 ) -> None:
     """Fill `costs[i, s, t]` with the number of table entries in the cells of a triple (anchors[i], slot s, slot t).
 
-    -1 where there is no such triple. It says how common a triple is on the map: cheap ones are looked up first.
+    -1 where there is no such triple. It shows how common a triple is on the map: cheap ones are looked up first.
     """
     codes = np.empty((3, limit, 3), np.int64)
     n = np.empty(3, np.int64)
@@ -214,7 +214,7 @@ def _agree(
 
 @kernel(forceinline=True)
 def _sides(entry: np.uint64) -> int:
-    """Return the sides of an entry's three vertices, 81 x + 9 y + z: what entries of a cell are sorted by."""
+    """Return the sides of an entry's three vertices, 81 x + 9 y + z: the sort key of a cell's entries."""
     return int(np.int64((entry >> np.uint64(24)) & np.uint64(1023)))
 
 
@@ -321,7 +321,7 @@ def _find_cells(
 def _look_up(
     query: TripleQuery, one: _Triangle, table: TripleMap, limits: TripleLimits, hits: Hits, n_hits: int
 ) -> tuple[int, int]:
-    """Append the map's triples whose codes agree with those of a query triple; return (hits so far, entries compared).
+    """Append the map's triples whose codes agree with those of a query triple; return (all hits, entries compared).
 
     See `look_up_each`.
     """

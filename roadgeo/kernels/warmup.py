@@ -21,7 +21,7 @@ _KEPT_DAYS = 30.0
 def warm_up(say: Say = say_nothing) -> None:
     """Load the machine code of the search, after compiling what this machine has none of.
 
-    It is cheap to call again. `say` hears of compilation only.
+    It is cheap to call again. `say` is called for compilation only.
     """
     compiling = False
 
