@@ -131,9 +131,10 @@ def index_command(
     else:
         _ask_before_replacing(path, quiet)
     read = {"roads": _read, "plugin": _read_plugin}.get(given, _fetch)
-    compile_once(quiet)
     with show_steps(quiet) as say:
         roads = read(source, given, say)
+    compile_once(quiet)  # nobody waits for that whose roads cannot be read
+    with show_steps(quiet) as say:
         if update:
             reference = update_reference(path, roads, say)
         else:

@@ -337,7 +337,7 @@ def _report(outcome: Outcome, as_json: bool, quiet: bool, verbose: bool, single:
     echo(describe(outcome), err=as_json)
     if verbose:
         echo(_details(outcome.document), err=as_json)
-    if (single or verbose) and outcome.files and outcome.status == "located":
+    if (single or verbose) and outcome.files:
         echo("  wrote " + visible(", ".join(outcome.files)), err=as_json)
 
 

@@ -96,7 +96,7 @@ def test_the_second_look_shows_the_photograph_more_ways(
     else:
         with pytest.raises(MaskError):
             locate_query(str(photo), [], options, query)
-    queries._network.cache_clear()  # another test looks what is said without a model
+    queries.load_model.cache_clear()  # another test looks what is said without a model
     if ways and not names:  # the model that ships is shown all ways at once; each of them alone comes after
         assert [one.endswith("alone") for one in taken] == [False, False, True, True]
         return

@@ -137,7 +137,7 @@ class _Net:
             mosaic.mask, references, replace(options, min_log10_odds=round(options.min_log10_odds + paid, 1))
         )
         if not location.located:
-            return [], f"{len(frames)} frames together: {location.reason}"
+            return [], f"{len(frames)} frames together: {location.reason}" if len(frames) > 1 else location.reason
         placed = [one for one in tracker.place(location, mosaic, frames) if one.status == "located"]
         return placed, "a place was found, but the frames by themselves do not agree"
 
