@@ -312,7 +312,7 @@ class _Frame:
         Those worth trying, the most promising first.
     first_ways, most_ways : int or None
         In how many ways a model is shown the photograph at the best scale, first and at most (see `see`): first in 1
-        where that was seen already; `most_ways` is None where there are no more.
+        where that was seen already, but not the next finer scale; `most_ways` is None where there are no more.
     finer_too : bool
         Whether what is seen at the scale alone, and finer alone, are looks of their own.
     see : callable
@@ -368,7 +368,8 @@ def _open_frame(paths: Sequence[str], query: QueryOptions, camera: CameraOptions
         return maps[0] if len(maps) == 1 else fuse(maps)
 
     only_masks = masks.keys() >= set(paths)
-    is_seen = not only_masks and any(scale == scales[0] for *_, scale in tried)
+    shown = {scale for *_, scale in tried}
+    is_seen = not only_masks and scales[0] in shown and not (may_be_finer(scales[0]) and _FINER * scales[0] in shown)
     least = min(ways_by_card.values(), default=_WAYS)
     has_more = not only_masks and (is_seen or least < _WAYS)
     in_both = bool(ways_by_card) and not only_masks and not is_seen and len(scales) == 1 and may_be_finer(scales[0])

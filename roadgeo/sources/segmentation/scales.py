@@ -33,13 +33,13 @@ _BRIDGED = 1.5  # a little more than half a step
 
 _DEFAULT_RESOLUTION_M = 1.0
 _MIN_SIDE, _MAX_ENLARGED = 192, 4096 * 4096  # pixels at the model's scale: a side, an area
-_TRIED_TILES = 1.9  # side of the part that is tried, tiles: 2 x 2 of them cover it
+_TRIED_TILES = 1.87  # side of the part that is tried, tiles: 2 x 2 of them, overlapping by an eighth, cover it
 _DOUBT = 4  # power of the share of probability that lies on roads
 #: Pixels shown to a model in the time of a search. A scale at which it is still to be shown all of the
 #: photograph must promise more.
 _COST_OF_SEARCH = 2_000_000
 #: Finer scales are not tried beyond one that promises less than this share of the best: there roads fall apart.
-_HOPELESS = 0.4
+_HOPELESS = 0.8
 
 
 def scale_of(gsd_m: float, network: Network) -> float:
