@@ -272,10 +272,7 @@ def _locate_photograph(
 
 
 def _plan_looks(frame: _Frame, query: QueryOptions) -> Later[Look]:
-    """Return the best scale's look, the photograph in more ways, other scales, and a lower threshold at the best.
-
-    Where the scale is known, the result at it alone, and finer alone, come last.
-    """
+    """Return the best scale's look, the photograph in more ways, other scales, and a lower threshold at the best."""
 
     def look(i: int, ways: int | None = None, further: int = 0) -> Look:
         return _look_at(partial(frame.see, frame.scales[i], ways), frame.scales[i], query, further)
@@ -284,17 +281,11 @@ def _plan_looks(frame: _Frame, query: QueryOptions) -> Later[Look]:
         one = look(0, frame.most_ways)
         return replace(one, what=f"{one.what}, shown {frame.most_ways} ways")
 
-    def look_alone(scale: float) -> Look:
-        one = _look_at(partial(frame.see, scale, 1), scale, query)
-        return replace(one, what=f"{one.what} alone")
-
     makers: list[Callable[[], Look]] = [partial(look, 0, frame.first_ways)]
     makers += [look_more_ways] if frame.most_ways else []
     makers += [partial(look, i) for i in range(1, len(frame.scales))]
     if query.threshold is None:
         makers += [partial(look, 0, frame.most_ways, 1)]
-    if frame.finer_too:
-        makers += [partial(look_alone, frame.scales[0]), partial(look_alone, _FINER * frame.scales[0])]
     return Later(makers)
 
 
@@ -313,8 +304,6 @@ class _Frame:
     first_ways, most_ways : int or None
         In how many ways a model is shown the photograph at the best scale, first and at most (see `see`): first in 1
         where that was seen already, but not the next finer scale; `most_ways` is None where there are no more.
-    finer_too : bool
-        Whether what is seen at the scale alone, and finer alone, are looks of their own.
     see : callable
         `see(scale, ways)` returns the probability of road, on the grid that roads are traced on; kept for another call.
         Where `ways` is None the number in each model's card applies.
@@ -325,7 +314,6 @@ class _Frame:
     scales: Sequence[float]
     first_ways: int | None
     most_ways: int | None
-    finer_too: bool
     see: Callable[[float, int | None], ProbabilityMap]
 
 
@@ -372,8 +360,7 @@ def _open_frame(paths: Sequence[str], query: QueryOptions, camera: CameraOptions
     is_seen = not only_masks and scales[0] in shown and not (may_be_finer(scales[0]) and _FINER * scales[0] in shown)
     least = min(ways_by_card.values(), default=_WAYS)
     has_more = not only_masks and (is_seen or least < _WAYS)
-    in_both = bool(ways_by_card) and not only_masks and not is_seen and len(scales) == 1 and may_be_finer(scales[0])
-    return _Frame(own, k / finer, scales, 1 if is_seen else None, _WAYS if has_more else None, in_both, see)
+    return _Frame(own, k / finer, scales, 1 if is_seen else None, _WAYS if has_more else None, see)
 
 
 def _how_much_finer(own: tuple[int, int], scale: float) -> float:
