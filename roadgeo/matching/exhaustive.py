@@ -10,7 +10,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Iterator
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from typing import Any, TypeAlias
 
 import cv2
@@ -221,8 +221,9 @@ class ExhaustiveOptions:
     ----------
     most_scale, most_turn_deg : float
         Scales from least to greatest, and turns either way, that are few enough to try them all.
-    cell_m : float
-        Side of the raster's cells; a step of turn or scale moves a corner of the frame by `step_cells` of them.
+    cell_m, cells : float
+        Side of the raster's cells, at least, and cells from the middle of the frame to its edge, at most; a step of
+        turn or scale moves a corner by `step_cells` of them.
     road_m : float
         Width of the map's roads.
     most_cells : float
@@ -236,6 +237,7 @@ class ExhaustiveOptions:
     most_scale: float = 1.6
     most_turn_deg: float = 20.0
     cell_m: float = 12.0
+    cells: float = 80.0
     step_cells: float = 2.5
     road_m: float = 36.0
     most_cells: float = 1.5e9
@@ -266,7 +268,9 @@ def propose_everywhere(
     None where the map is too large; `near` = (x, y, radius) restricts where the middle of the frame may lie.
     """
     center, off = camera.heading or (0.0, 180.0)
-    cell, half_m = options.cell_m, scene.half_size * math.sqrt(camera.gsd_m[0] * camera.gsd_m[1])
+    half_m = scene.half_size * math.sqrt(camera.gsd_m[0] * camera.gsd_m[1])
+    cell = max(options.cell_m, half_m / options.cells)
+    options = replace(options, cell_m=cell)
     step = options.step_cells * cell / half_m
     turns = _spread(center, off + 1.0, math.degrees(step))
     least, most = np.log(camera.gsd_m)
@@ -324,9 +328,10 @@ def _draw_map(
     lines = np.round(np.stack((a, b), axis=1) / options.cell_m * 16.0 - 8.0).astype(np.int32)
     sector = np.floor(np.mod(np.arctan2(*(b - a).T[::-1]), np.pi) / np.pi * 16.0).astype(int) % 16
     drawn, along = np.zeros(shape, np.uint8), np.zeros(shape, np.complex64)
+    wide = max(round(options.road_m / options.cell_m), 1)
     for k in range(16):
         layer = np.zeros(shape, np.uint8)
-        cv2.polylines(layer, list(lines[sector == k]), False, 1, round(options.road_m / options.cell_m), cv2.LINE_8, 4)
+        cv2.polylines(layer, list(lines[sector == k]), False, 1, wide, cv2.LINE_8, 4)
         along += layer * np.exp(2j * np.pi * (k + 0.5) / 16.0).astype(np.complex64)
         drawn |= layer
     return drawn.astype(np.float32), along / np.maximum(np.abs(along), 1e-6)

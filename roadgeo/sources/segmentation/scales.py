@@ -33,18 +33,17 @@ _BRIDGED = 1.5  # a little more than half a step
 
 _DEFAULT_RESOLUTION_M = 1.0
 _MIN_SIDE, _MAX_ENLARGED = 192, 4096 * 4096  # pixels at the model's scale: a side, an area
+_MOST_ENLARGED = 4.0  # along a side; beyond it time grows, and no more roads are seen
 _TRIED_TILES = 1.87  # side of the part that is tried, tiles: 2 x 2 of them, overlapping by an eighth, cover it
 _DOUBT = 4  # power of the share of probability that lies on roads
 #: Pixels shown to a model in the time of a search. A scale at which it is still to be shown all of the
 #: photograph must promise more.
 _COST_OF_SEARCH = 2_000_000
-#: Finer scales are not tried beyond one that promises less than this share of the best: there roads fall apart.
-_HOPELESS = 0.8
 
 
 def scale_of(gsd_m: float, network: Network) -> float:
-    """Return the scale that shows a model ground of its own resolution."""
-    return gsd_m / (network.card.resolution_m or _DEFAULT_RESOLUTION_M)
+    """Return the scale that shows a model ground of its own resolution, or as near to it as enlarging helps."""
+    return min(gsd_m / (network.card.resolution_m or _DEFAULT_RESOLUTION_M), _MOST_ENLARGED)
 
 
 def try_scales(
@@ -92,7 +91,8 @@ def rank_scales(
         cost = _COST_OF_SEARCH + (0 if is_whole else math.prod(map_shape(photograph, scale)))
         worth[scale] = promise / math.sqrt(cost)
         most, seen_anywhere = max(most, promise), max(seen_anywhere, intersections)
-        hopeless = promise < _HOPELESS * most
+        # Finer scales are not tried beyond one that promises clearly less than the best: there roads fall apart.
+        hopeless = promise + math.sqrt(promise) < most
     if seen_anywhere < 1.0:  # narrow roads are seen at the finest scale first
         return {scale: found[scale] for scale in reversed(scales)}
     return {scale: found[scale] for scale in sorted(scales, key=worth.__getitem__, reverse=True)}
