@@ -58,6 +58,7 @@ _ARRAY = "array"
 #: and .869 at 0.5 m, .949 and .892 of both (turned by half instead: .923 and .878). Where its pixels are not as fine it
 #: is turned by half.
 _FINER, _WAYS, _ENLARGED = 2.0, 2, 1.1
+_MANY_PIXELS = 4_000_000  # shown to a model in one way first: so large a scene is mostly located by that
 _KNOWN_SPAN = 1.7  # a range of pixel sizes narrower than this is one scale
 
 
@@ -303,7 +304,8 @@ class _Frame:
         Those worth trying, the most promising first.
     first_ways, most_ways : int or None
         In how many ways a model is shown the photograph at the best scale, first and at most (see `see`): first in 1
-        where that was seen already, but not the next finer scale; `most_ways` is None where there are no more.
+        where that was seen already, but not the next finer scale, and where there is much to show; `most_ways` is
+        None where there are no more.
     see : callable
         `see(scale, ways)` returns the probability of road, on the grid that roads are traced on; kept for another call.
         Where `ways` is None the number in each model's card applies.
@@ -357,10 +359,11 @@ def _open_frame(paths: Sequence[str], query: QueryOptions, camera: CameraOptions
 
     only_masks = masks.keys() >= set(paths)
     shown = {scale for *_, scale in tried}
-    is_seen = not only_masks and scales[0] in shown and not (may_be_finer(scales[0]) and _FINER * scales[0] in shown)
+    in_one = scales[0] in shown and not (may_be_finer(scales[0]) and _FINER * scales[0] in shown)
+    in_one = not only_masks and (in_one or math.prod(own) * (k * scales[0]) ** 2 > _MANY_PIXELS)
     least = min(ways_by_card.values(), default=_WAYS)
-    has_more = not only_masks and (is_seen or least < _WAYS)
-    return _Frame(own, k / finer, scales, 1 if is_seen else None, _WAYS if has_more else None, see)
+    has_more = not only_masks and (in_one or least < _WAYS)
+    return _Frame(own, k / finer, scales, 1 if in_one else None, _WAYS if has_more else None, see)
 
 
 def _how_much_finer(own: tuple[int, int], scale: float) -> float:
