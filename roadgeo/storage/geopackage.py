@@ -438,7 +438,3 @@ def _decode(blob: bytes, path: str | os.PathLike[str], layer: str) -> FloatArray
 
 def _quoted(name: str) -> str:
     return '"' + name.replace('"', '""') + '"'
-
-
-def _literal(text: str) -> str:
-    return "'" + text.replace("'", "''") + "'"
