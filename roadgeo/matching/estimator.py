@@ -38,8 +38,6 @@ _BETTER = 0.05
 #: A place is dropped if its likelihood is lower than the best one's by this (log10), or, laid roughly and less roughly,
 #: below these parts of the best one's.
 _LEAST_LIKELY, _NO_RIVAL, _BEHIND = 0.7, 0.4, 0.7
-#: One that explains as much as the likeliest other place, but for a part, is looked at through a lens.
-_NEARLY = 0.8
 #: As of `RefineOptions`, for places that grew by roads: false roads abound there.
 _LEAST_SHARE_BY_ROADS = 0.2
 #: How far a proposal, made of three intersections, may turn the image's up from where it points.
@@ -264,7 +262,7 @@ class TripleEstimator:
         started = time.perf_counter()
         self.n_verified += 1
         self._verify(model)
-        if model.log10_likelihood >= max(_LEAST_LIKELY, _NEARLY * self._most_elsewhere(model)):
+        if model.log10_likelihood >= max(_LEAST_LIKELY, self._most_elsewhere(model)):
             self._look_through_lens(model)
         if math.isfinite(model.log10_odds):
             self.verified.append(model)

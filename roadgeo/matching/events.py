@@ -9,7 +9,7 @@ if TYPE_CHECKING:
     from roadgeo.geometry.camera import CameraFault
     from roadgeo.matching.estimator import TripleEstimator
     from roadgeo.matching.growing import Hypothesis
-    from roadgeo.matching.search import SearchResult
+    from roadgeo.matching.search import Search
 
 
 __all__ = ["Events", "Ledger", "Scored", "Work"]
@@ -44,7 +44,7 @@ class Events:
 
     kept: bool = False
     estimator: TripleEstimator | None = None
-    result: SearchResult[Hypothesis] | None = None
+    result: Search[Hypothesis] | None = None
     items: list[tuple[Any, ...]] = field(default_factory=list)
 
     def note(self, kind: str, *what: Any) -> None:

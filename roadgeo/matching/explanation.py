@@ -54,7 +54,7 @@ from roadgeo.matching.evidence import Agreement, agreement, tolerance_m
 from roadgeo.matching.growing import Hypothesis
 from roadgeo.matching.methods import Found
 from roadgeo.matching.scene import MIN_COS, Query, Scene
-from roadgeo.matching.search import SearchResult
+from roadgeo.matching.search import Search
 from roadgeo.matching.truth import TruthStory, tell_truth
 from roadgeo.matching.verdict import Needed
 from roadgeo.roads.graph import RoadGraph
@@ -319,7 +319,7 @@ def _distinct(search: TripleEstimator, entries: Sequence[Scored]) -> list[Scored
 def _describe(
     search: TripleEstimator,
     entry: Scored,
-    result: SearchResult[Hypothesis],
+    result: Search[Hypothesis],
     location: Location,
     needed: Needed,
 ) -> RejectedPlace:
@@ -354,9 +354,7 @@ def _describe(
     return replace(place, why=_why(place, entry, result, location, needed))
 
 
-def _why(
-    place: RejectedPlace, entry: Scored, result: SearchResult[Hypothesis], location: Location, needed: Needed
-) -> str:
+def _why(place: RejectedPlace, entry: Scored, result: Search[Hypothesis], location: Location, needed: Needed) -> str:
     """Return why a place is not the answer."""
     if entry.fault is not None:
         return f"the camera: {_objection(place, entry.fault)}"
@@ -395,7 +393,7 @@ def _weakest(place: RejectedPlace) -> str:
     return f"its roads explain 10^{_number(place.log10_likelihood)}, those of a place nearby 10^{_number(place.nearby)}"
 
 
-def _starved(funnel: Funnel, refusals: Counter[CameraFault], result: SearchResult[Hypothesis], needed: Needed) -> str:
+def _starved(funnel: Funnel, refusals: Counter[CameraFault], result: Search[Hypothesis], needed: Needed) -> str:
     """Return the first stage that nothing came out of."""
     stages = ("intersections", "anchors", "tuples", "candidates", "proposals", "on_roads", "survived", "verified")
     empty = next((stage for stage in stages if getattr(funnel, stage) == 0), None)
@@ -422,7 +420,7 @@ def _missing(
     funnel: Funnel,
     refusals: Counter[CameraFault],
     search: TripleEstimator,
-    result: SearchResult[Hypothesis],
+    result: Search[Hypothesis],
     places: Sequence[RejectedPlace],
     needed: Needed,
 ) -> list[str]:

@@ -93,7 +93,7 @@ class Found:
     fits : tuple of Fit
         The likeliest place, and the best other one, as far as there are any.
     stopped : str
-        As in `SearchResult`; "" where nothing was searched.
+        As in `Search`; "" where nothing was searched.
     said : str
         The method's own sentence on the result.
     n_searched : int
@@ -264,7 +264,7 @@ class _Attempt:
         estimator = self.estimator
         if self.search is None or estimator is None:
             return Found(self.index, n_searched=self.n_searched, events=self.events)
-        result, standing = self.search.result(), rivals.standing(self.search)
+        result, standing = self.search, rivals.standing(self.search)
         if self.events.kept:
             self.events.result = result
         return Found(

@@ -14,7 +14,7 @@ from concurrent.futures import Future, ThreadPoolExecutor
 from dataclasses import dataclass
 from typing import Generic, Protocol, TypeVar
 
-__all__ = ["ALONE", "Ahead", "Estimator", "Search", "SearchOptions", "SearchResult", "search", "search_together"]
+__all__ = ["ALONE", "Ahead", "Estimator", "Search", "SearchOptions", "search", "search_together"]
 
 
 Model = TypeVar("Model")
@@ -78,23 +78,6 @@ class _Budget:
         return "time" if time.perf_counter() > self.deadline else ""
 
 
-@dataclass(frozen=True)
-class SearchResult(Generic[Model]):
-    """Best model, the best that means something else, their scores (-inf where there is none), and why it ended.
-
-    `stopped` is "accepted"; "exhausted"; "work" or "time", the limits; or "elsewhere", where another part's answer
-    ended the search.
-    """
-
-    best: Model | None
-    score: float
-    runner_up: Model | None
-    runner_up_score: float
-    n_rounds: int
-    n_scored: int
-    stopped: str
-
-
 class Search(Generic[Model]):
     """The search of one part, which goes on a round at a time.
 
@@ -102,12 +85,13 @@ class Search(Generic[Model]):
     ----------
     leaders : list of (score, model)
         The best model of each of the two best answers, the best first.
-    promising : list of (score, model)
-        All with a score above 0.
     stage : int
         Number of the stage that comes next.
     ended : bool
         Whether all stages are through.
+    stopped : str
+        Why it ended: "accepted"; "exhausted"; "work" or "time", the limits; or "elsewhere", where another part's answer
+        ended the search.
     seconds : float
         Spent on this part.
     """
@@ -116,7 +100,6 @@ class Search(Generic[Model]):
         """Begin, without doing anything yet."""
         self.estimator = estimator
         self.leaders: list[tuple[float, Model]] = []
-        self.promising: list[tuple[float, Model]] = []
         self.stage = self.n_rounds = self.n_scored = 0
         self.ended = False
         self.stopped = ""
@@ -126,12 +109,17 @@ class Search(Generic[Model]):
         self._rounds: Iterator[Iterable[Model]] | None = next(self._stages, None)
 
     @property
-    def lead(self) -> float:
-        """Score of the best answer."""
+    def score(self) -> float:
+        """That of the best answer, -inf where there is none."""
         return self.leaders[0][0] if self.leaders else float("-inf")
 
-    def advance(self, budget: _Budget) -> bool:
-        """Do one round; where the stage has none left pass to the next, and return False."""
+    @property
+    def best(self) -> Model | None:
+        """The best model."""
+        return self.leaders[0][1] if self.leaders else None
+
+    def advance(self, budget: _Budget) -> None:
+        """Do one round, or pass to the next stage where this one has none left."""
         started = time.perf_counter()
         models = None if self._rounds is None else next(self._rounds, None)
         if models is None:
@@ -143,7 +131,6 @@ class Search(Generic[Model]):
             self._take(models, budget)
         self._charge(budget)
         self.seconds += time.perf_counter() - started
-        return models is not None
 
     def _take(self, models: Iterable[Model], budget: _Budget) -> None:
         """Score the models of a round."""
@@ -162,24 +149,16 @@ class Search(Generic[Model]):
 
     def _enter(self, score: float, model: Model) -> None:
         """Keep the two best different answers after a new one came in."""
-        if score > 0:
-            self.promising.append((score, model))
         ranked = sorted([*self.leaders, (score, model)], key=lambda item: -item[0])
         others = (one for one in ranked[1:] if not self.estimator.same(one[1], ranked[0][1]))
         self.leaders = [ranked[0], *[one for one in [next(others, None)] if one is not None]]
 
-    def result(self) -> SearchResult[Model]:
-        """Return the result."""
-        found: list[tuple[float, Model | None]] = [*self.leaders, (float("-inf"), None), (float("-inf"), None)]
-        (score, best), (second, runner_up) = found[:2]
-        return SearchResult(best, score, runner_up, second, self.n_rounds, self.n_scored, self.stopped)
 
-
-def search(estimator: Estimator[Model], options: SearchOptions | None = None) -> SearchResult[Model]:
+def search(estimator: Estimator[Model], options: SearchOptions | None = None) -> Search[Model]:
     """Score hypotheses round by round until one stands out, they are exhausted, or a limit is reached."""
     alone = Search(estimator)
     search_together([alone], options)
-    return alone.result()
+    return alone
 
 
 def search_together(
@@ -242,13 +221,13 @@ class _Together(Generic[Model]):
 
     def _stands_out(self, one: Search[Model]) -> bool:
         """Whether a part's best answer leads every other one, on any part."""
-        if one.lead < self.options.accept:
+        if one.score < self.options.accept:
             return False
         best = one.leaders[0][1]
-        if any(one.lead - score < self.options.margin for score, _ in one.leaders[1:]):
+        if any(one.score - score < self.options.margin for score, _ in one.leaders[1:]):
             return False
         return all(
-            one.lead - score >= self.options.margin or (self.same is not None and self.same(one, best, other, model))
+            one.score - score >= self.options.margin or (self.same is not None and self.same(one, best, other, model))
             for other in self.parts
             if other is not one
             for score, model in other.leaders

@@ -33,14 +33,15 @@ class Toy:
 
 
 def answers(result):
-    return (result.best and result.best[0], result.runner_up and result.runner_up[0])
+    first, second, *_ = [*(model[0] for _, model in result.leaders), None, None]
+    return (first, second)
 
 
 @pytest.mark.parametrize("plan", [[], [[]], [[], []]])
 def test_nothing_to_score(plan):
     result = search(Toy(plan))
     assert answers(result) == (None, None)
-    assert result.score == result.runner_up_score == float("-inf")
+    assert result.score == float("-inf")
     assert result.stopped == "exhausted"
     assert (result.n_rounds, result.n_scored) == (len(plan), 0)
 
@@ -50,7 +51,7 @@ def test_stops_after_the_round_in_which_one_stands_out():
     result = search(toy)
     assert toy.scored == [1, 2, 50]
     assert answers(result) == (2, 50)
-    assert (result.score, result.runner_up_score) == (30.0, 4.0)
+    assert [score for score, _ in result.leaders] == [30.0, 4.0]
     assert (result.n_rounds, result.n_scored, result.stopped) == (2, 3, "accepted")
 
 
@@ -58,7 +59,7 @@ def test_a_score_without_a_margin_is_not_enough():
     result = search(Toy([[(1, 30.0), (50, 28.0)], [(52, 29.0)], [(90, 1.0)]]))
     assert result.stopped == "exhausted"
     assert answers(result) == (1, 52)
-    assert result.runner_up_score == 29.0
+    assert result.leaders[1][0] == 29.0
 
 
 def test_a_better_version_of_the_same_answer_is_no_runner_up():
@@ -131,7 +132,7 @@ def test_an_answer_that_is_proved_ends_the_search_with_its_stage():
     asked = []
 
     def proves(parts):
-        best = max(parts, key=lambda one: one.lead)
+        best = max(parts, key=lambda one: one.score)
         asked.append(best.leaders[0][1][0])
         return best if asked[-1] == 21 else None
 
@@ -145,7 +146,7 @@ def test_an_answer_that_is_proved_ends_the_search_with_its_stage():
 def test_what_stands_out_and_is_not_proved_does_not_end_the_search():
     """It may be the place, fitted to a part of the frame only: a better version may come."""
     toy = Toy([[(1, 30.0)], [(2, 31.0)], [(3, 1.0)]])
-    (one,) = together(toy, proves=lambda parts: parts[0] if parts[0].lead > 30.0 else None)
+    (one,) = together(toy, proves=lambda parts: parts[0] if parts[0].score > 30.0 else None)
     assert (toy.scored, one.stopped) == ([1, 2], "accepted")
 
 
@@ -155,7 +156,7 @@ def test_parts_take_turns_and_an_answer_that_stands_out_ends_all():
     parts = together(*toys)
     assert [len(toy.scored) for toy in toys] == [3, 3, 3]
     assert [one.stopped for one in parts] == ["elsewhere", "accepted", "elsewhere"]
-    assert parts[1].result().best == (17, 30.0)
+    assert parts[1].best == (17, 30.0)
 
 
 def test_no_part_goes_to_the_next_stage_before_the_others():
@@ -173,7 +174,7 @@ def test_a_twin_on_another_part_is_found_before_an_answer_is_accepted():
     a, b = Toy([[], [(17, 30.0)], []]), Toy([[], [(52, 29.0)], []])
     parts = together(a, b)
     assert [one.stopped for one in parts] == ["exhausted", "exhausted"]
-    assert (parts[0].lead, parts[1].lead) == (30.0, 29.0)
+    assert (parts[0].score, parts[1].score) == (30.0, 29.0)
 
 
 def test_the_same_place_on_a_part_that_overlaps_is_no_rival():

@@ -151,7 +151,7 @@ def test_a_twin_on_another_part_is_met(towns):
         MatchOptions(without_roads=WITHOUT_ROADS[:2], roads=False),
     )
     assert "accepted" not in [one.stopped for one in parts]
-    assert min(parts[1].lead, parts[4].lead) > 8.0
+    assert min(parts[1].score, parts[4].score) > 8.0
 
 
 def test_many_parts_take_as_many_places_as_one(towns, monkeypatch):
