@@ -15,8 +15,8 @@ from roadgeo.geometry.camera import CameraFault, CameraOptions, judge, sampling
 from roadgeo.geometry.homography import Homography
 from roadgeo.geometry.projection import to_lonlat
 from roadgeo.matching.events import Events, Ledger, Scored, Work
-from roadgeo.matching.evidence import Evidence, EvidenceOptions, agreement, match_intersections
-from roadgeo.matching.exhaustive import ExhaustiveOptions, is_told, propose_everywhere
+from roadgeo.matching.evidence import Evidence, agreement, match_intersections
+from roadgeo.matching.exhaustive import is_told, propose_everywhere
 from roadgeo.matching.growing import Hypothesis, SharedSweeps, grow_proposals, screen_proposals
 from roadgeo.matching.index import ReferenceIndex
 from roadgeo.matching.lens import (
@@ -56,8 +56,6 @@ class MatchOptions:
         The sweeps where roads propose after them, and where these are left out: they go on for longer then.
     roads : bool
         Whether roads propose where no triple leads to a place, rather than more sweeps.
-    everywhere : ExhaustiveOptions
-        Where heading and scale are given, of laying the roads everywhere on the map instead.
     lens : bool
         Whether a lens is looked for behind promising places.
     max_places : int
@@ -70,11 +68,9 @@ class MatchOptions:
 
     sweeps: tuple[Sweep, ...] = BEFORE_ROADS
     without_roads: tuple[Sweep, ...] = WITHOUT_ROADS
-    evidence: EvidenceOptions = field(default_factory=EvidenceOptions)
     refine: RefineOptions = field(default_factory=RefineOptions)
     camera: CameraOptions = field(default_factory=CameraOptions)
     roads: bool = True
-    everywhere: ExhaustiveOptions = field(default_factory=ExhaustiveOptions)
     lens: bool = True
     max_places: int = 12_000
     within: Box | None = None
@@ -128,7 +124,7 @@ class TripleEstimator:
         options, by_roads = self.options, self.options.roads and len(self.scene.intersections) > 0
         sources = options.sweeps if by_roads else options.without_roads
         sweeps = [self.sweeps.rounds(self, source) for source in sources]
-        if by_roads and is_told(options.camera, options.everywhere):
+        if by_roads and is_told(options.camera):
             yield sweeps.pop(0)
             yield self._rounds_everywhere()
             if self._is_everywhere:
@@ -142,7 +138,7 @@ class TripleEstimator:
     def _rounds_everywhere(self) -> Iterator[list[Hypothesis]]:
         """Yield the places that agree best of all, where heading and scale are given."""
         scene, index, options = self.scene, self.index, self.options
-        for matrix in propose_everywhere(scene, index, options.camera, options.everywhere, self.near):
+        for matrix in propose_everywhere(scene, index, options.camera, self.near):
             self._is_everywhere = True
             self.n_hypotheses += 1
             matched, _ = match_intersections(matrix, scene, index, sampling(matrix, scene.size))
@@ -290,7 +286,7 @@ class TripleEstimator:
         if model.found is not None:
             model.log10_likelihood = model.found.log10_likelihood
         if model.log10_likelihood > self._most_elsewhere(model):
-            evidence = Evidence(self.scene_of(model), self.index, model.gsd_m, self.options.evidence)
+            evidence = Evidence(self.scene_of(model), self.index, model.gsd_m)
             model.nearby = evidence.nearby(model.matrix, self.near)
             self.n_nulls += 1
         self._charge(model)

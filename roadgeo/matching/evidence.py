@@ -31,7 +31,7 @@ from roadgeo.kernels.roads import count_residuals, shares_near_roads
 from roadgeo.matching.index import ReferenceIndex
 from roadgeo.matching.scene import MIN_COS, Scene
 
-__all__ = ["Agreement", "Evidence", "EvidenceOptions", "agreement", "log10_lead", "match_intersections", "tolerance_m"]
+__all__ = ["Agreement", "Evidence", "agreement", "log10_lead", "match_intersections", "tolerance_m"]
 
 #: Grid of the marginalised parameters: residuals' deviation, in usual ones; shares of missing, and of false roads.
 _SIGMAS = np.array([0.25, 0.4, 0.65, 1.0, 1.6])
@@ -43,53 +43,21 @@ _REACH, _BINS, _AGREEING = 4.0, 24, 18
 _ALONG, _STEP, _STEPS = 0.42, 0.8, 14
 #: Accuracy of the distance to the query's roads, in cells of its raster.
 _BLUR_CELLS = 0.35
-
-
-@dataclass(frozen=True)
-class EvidenceOptions:
-    """Usual residuals, and the length of road that is one statement.
-
-    Attributes
-    ----------
-    map_sigma_m, pixel_sigma_px : float
-        Usual distance between a mapped road and the road, and usual error of a traced one.
-    statement_m : float
-        This length of road, of the query and of the map together, counts as one independent statement; never less than
-        `statement_px`, the least length that pixels can show.
-    piece_m, piece_px : float
-        Width of the frame's pieces, by which two places are compared; the greater one.
-    n_regions, region_m, far : int, float, float
-        Regions of the longer side of the frame, at most, in which a place may be contradicted, their least width, and
-        how many times coarser pixels are than in its middle where it is too far away for that.
-    step_m : float
-        Step of the samples along the map's roads.
-    max_turn_deg : float
-        Roads agree whose directions differ by less.
-    shift_m, n_shifts, n_anchors, n_points : (float, float), int, int, int
-        Places nearby: shifts of these lengths, spread evenly, and those that lay one of `n_anchors` intersections of
-        the map near the middle on others around it; they are compared by `n_points` road points first.
-    """
-
-    map_sigma_m: float = 1.8
-    pixel_sigma_px: float = 1.0
-    statement_m: float = 480.0
-    statement_px: float = 96.0
-    piece_m: float = 60.0
-    piece_px: float = 12.0
-    n_regions: int = 6
-    region_m: float = 170.0
-    far: float = 1.6
-    step_m: float = 6.0
-    max_turn_deg: float = 25.0
-    shift_m: tuple[float, float] = (30.0, 320.0)
-    n_shifts: int = 150
-    n_anchors: int = 3
-    n_points: int = 150
-
-    @property
-    def min_cos(self) -> float:
-        """Cosine of the angle within which roads agree."""
-        return math.cos(math.radians(self.max_turn_deg))
+#: Usual distance between a mapped road and the road, and usual error of a traced one.
+MAP_SIGMA_M, PIXEL_SIGMA_PX = 1.8, 1.0
+#: This length of road, of the query and of the map together, counts as one independent statement, but never less than
+#: pixels can show.
+STATEMENT_M, STATEMENT_PX = 480.0, 96.0
+#: Width of the frame's pieces, by which two places are compared; the greater one.
+_PIECE_M, _PIECE_PX = 60.0, 12.0
+#: Regions of the longer side of the frame, at most, in which a place may be contradicted, their least width, and how
+#: many times coarser pixels are than in its middle where it is too far away for that.
+_N_REGIONS, _REGION_M, _FAR = 6, 170.0, 1.6
+#: Step of the samples along the map's roads.
+STEP_M = 6.0
+#: Places nearby: shifts of these lengths, spread evenly, and those that lay one of some intersections of the map near
+#: the middle on others around it; they are compared by this number of road points, and the best of them weighed.
+_SHIFT_M, _N_SHIFTS, _N_ANCHORS, _N_POINTS, _WEIGHED = (30.0, 320.0), 150, 3, 150, 12
 
 
 @dataclass(frozen=True)
@@ -134,14 +102,11 @@ class Evidence:
         as many metres roads would agree anyhow wherever the frame is laid small.
     """
 
-    def __init__(
-        self, scene: Scene, index: ReferenceIndex, gsd_m: float, options: EvidenceOptions | None = None
-    ) -> None:
-        self.scene, self.index, self.gsd_m, self.options = scene, index, gsd_m, options or EvidenceOptions()
-        usual = self.options
-        self._sigma_m = math.hypot(usual.map_sigma_m, usual.pixel_sigma_px * gsd_m)
-        self._statement_px = max(usual.statement_m / gsd_m, usual.statement_px)
-        self._piece_px = max(usual.piece_m / gsd_m, usual.piece_px)
+    def __init__(self, scene: Scene, index: ReferenceIndex, gsd_m: float) -> None:
+        self.scene, self.index, self.gsd_m = scene, index, gsd_m
+        self._sigma_m = math.hypot(MAP_SIGMA_M, PIXEL_SIGMA_PX * gsd_m)
+        self._statement_px = max(STATEMENT_M / gsd_m, STATEMENT_PX)
+        self._piece_px = max(_PIECE_M / gsd_m, _PIECE_PX)
         width, height = scene.size
         self._shape = math.ceil(height / self._piece_px), math.ceil(width / self._piece_px)
         self._observed_px = float(scene.observed.sum()) * scene.field_scale**2
@@ -194,8 +159,8 @@ class Evidence:
         like its own mirror image, is not it. Where only one of them shows roads nothing is contradicted. Far
         ground of a steep view, which cannot be traced, does not count.
         """
-        scene, options = self.scene, self.options
-        side = max(max(scene.size) / options.n_regions, options.region_m / self.gsd_m)
+        scene = self.scene
+        side = max(max(scene.size) / _N_REGIONS, _REGION_M / self.gsd_m)
         columns, rows = (max(round(length / side), 1) for length in scene.size)
         seen, mapped = self._count(matrix, side, (rows, columns))
         of_query, of_map = self._ratios(mapped)
@@ -205,20 +170,20 @@ class Evidence:
         row, column = np.divmod(np.arange(rows * columns), columns)
         middles = np.stack(((column + 0.5) * side, -(row + 0.5) * side), axis=1)
         scales = np.sqrt(np.abs(np.linalg.det(Homography(matrix).jacobian(middles)))) / _sampling(matrix, scene)
-        near = np.nan_to_num(scales, nan=math.inf) < options.far
+        near = np.nan_to_num(scales, nan=math.inf) < _FAR
         both = np.minimum(seen.sum(axis=1), mapped.sum(axis=1)) * near
         return float(both[worth < 0.0].sum() / both.sum()) if both.any() else 0.0
 
     def _count(self, matrix: FloatArray, piece_px: float, shape: tuple[int, int]) -> tuple[FloatArray, FloatArray]:
         """Return histograms of the residuals of the query's roads and of the map's, pixels of road, (P, bins) each."""
-        scene, index, options = self.scene, self.index, self.options
+        scene, index = self.scene, self.index
         scale = _sampling(matrix, scene) / self.gsd_m
         ground = Homography(matrix).everywhere(scene.corners)
         seen, mapped = (np.empty((shape[0] * shape[1], _BINS + 1)) for _ in range(2))
         count_residuals(
             matrix, np.asarray(np.linalg.inv(matrix), float), np.concatenate([ground.min(axis=0), ground.max(axis=0)]),
-            scene.points, scene.directions, scene.weights, _REACH * self._sigma_m * scale, options.min_cos,
-            options.step_m, index.road_buckets, scene.field, scene.field_scale, scene.observed, piece_px, shape[1],
+            scene.points, scene.directions, scene.weights, _REACH * self._sigma_m * scale, MIN_COS,
+            STEP_M, index.road_buckets, scene.field, scene.field_scale, scene.observed, piece_px, shape[1],
             seen, mapped,
         )  # fmt: skip
         seen *= scene.road_length_px / max(len(scene.points), 1)
@@ -238,63 +203,70 @@ class Evidence:
         """Return log L by (sigma, missing, false)."""
         return np.asarray(((of_query @ seen)[:, None, :] + (of_map @ mapped)[:, :, None]) / self._statement_px)
 
-    def nearby(self, matrix: FloatArray, near: tuple[float, float, float] | None = None) -> float:
+    def nearby(
+        self,
+        matrix: FloatArray,
+        near: tuple[float, float, float] | None = None,
+        n_shifts: int = _N_SHIFTS,
+        n_anchors: int = _N_ANCHORS,
+    ) -> float:
         """Return log10 L of the best place that a shift leads to.
 
         Shifts lie on a sunflower spiral, so that all directions and distances are met evenly, and where intersections
         of the map come to lie on others, unless that takes the middle of the frame out of the circle `near` =
         (x, y, radius), plane metres.
         """
-        scene, options = self.scene, self.options
+        scene = self.scene
         reach_m = 2.0 * self._sigma_m * _sampling(matrix, scene) / self.gsd_m
-        shifts = np.concatenate((self._spiral(reach_m), self._onto_neighbours(matrix, reach_m, near)))
+        shifts = np.concatenate(
+            (self._spiral(reach_m, n_shifts), self._onto_neighbours(matrix, reach_m, near, n_anchors))
+        )
         shares = np.empty(len(shifts))
-        thin = max(1, len(scene.points) // options.n_points)
+        thin = max(1, len(scene.points) // _N_POINTS)
         points, directions, weights = (
             np.ascontiguousarray(array[::thin]) for array in (scene.points, scene.directions, scene.weights)
         )
         shares_near_roads(
-            matrix, points, directions, weights, reach_m, options.min_cos, shifts, self.index.road_buckets, shares
+            matrix, points, directions, weights, reach_m, MIN_COS, shifts, self.index.road_buckets, shares
         )
         best = np.argsort(-shares, kind="stable")[:_WEIGHED]
         return max((self.weigh(_shifted(matrix, shifts[k])) for k in best), default=0.0)
 
     def _least_shift(self, reach_m: float) -> float:
         """Shifts no shorter than three times what roads may be apart, and agree: nearer is the place itself."""
-        return max(1.0, 4.5 * reach_m / self.options.shift_m[0])
+        return max(1.0, 4.5 * reach_m / _SHIFT_M[0])
 
-    def _spiral(self, reach_m: float) -> FloatArray:
+    def _spiral(self, reach_m: float, n_shifts: int) -> FloatArray:
         """Return shifts (n_shifts, 2) in metres on a sunflower spiral."""
-        k, wider = np.arange(self.options.n_shifts), self._least_shift(reach_m)
-        low, high = (wider * end for end in self.options.shift_m)
+        k, wider = np.arange(n_shifts), self._least_shift(reach_m)
+        low, high = (wider * end for end in _SHIFT_M)
         radius = np.sqrt(low**2 + (high**2 - low**2) * (k + 0.5) / len(k))
         angle = k * math.pi * (3.0 - math.sqrt(5.0))
         return np.stack((radius * np.cos(angle), radius * np.sin(angle)), axis=1)
 
     def _onto_neighbours(
-        self, matrix: FloatArray, reach_m: float, within: tuple[float, float, float] | None
+        self, matrix: FloatArray, reach_m: float, within: tuple[float, float, float] | None, n_anchors: int
     ) -> FloatArray:
         """Return shifts (M, 2) in metres that lay an intersection of the map near the frame's middle on others."""
-        options, wider = self.options, self._least_shift(reach_m)
-        low, high = (wider * end for end in options.shift_m)
+        wider = self._least_shift(reach_m)
+        low, high = (wider * end for end in _SHIFT_M)
         middle = Homography(matrix)(self.scene.center)
         near = self.index.within(middle, 2.0 * high)
         if not len(near):
             return np.empty((0, 2))
-        anchors = near[np.argsort(((near - middle) ** 2).sum(axis=1))[: options.n_anchors]]
+        anchors = near[np.argsort(((near - middle) ** 2).sum(axis=1))[:n_anchors]]
         shifts = (near - anchors[:, None]).reshape(-1, 2)
         length = np.hypot(*shifts.T)
         possible = (length > low) & (length < high)
         if within is not None:
             possible &= np.hypot(*(middle + shifts - within[:2]).T) <= within[2]
         shifts, length = shifts[possible], length[possible]
-        return np.asarray(shifts[np.argsort(length)[: options.n_shifts]])
+        return np.asarray(shifts[np.argsort(length)[:_N_SHIFTS]])
 
 
-def tolerance_m(gsd_m: float, options: EvidenceOptions | None = None) -> float:
+def tolerance_m(gsd_m: float) -> float:
     """Return how far roads that agree may lie apart: three standard deviations, metres."""
-    usual = options or EvidenceOptions()
-    return 3.0 * math.hypot(usual.map_sigma_m, usual.pixel_sigma_px * gsd_m)
+    return 3.0 * math.hypot(MAP_SIGMA_M, PIXEL_SIGMA_PX * gsd_m)
 
 
 def match_intersections(
@@ -314,10 +286,6 @@ def agreement(
     """Return what agrees at a place, and which intersections are matched, and how well (see `match_intersections`)."""
     matched, distance = match_intersections(matrix, scene, index, gsd_m)
     return Evidence(scene, index, gsd_m).agreement(matrix, matched), matched, distance
-
-
-#: Number of shifts that are weighed, those that lay most road points on roads.
-_WEIGHED = 12
 
 
 def _sampling(matrix: FloatArray, scene: Scene) -> float:

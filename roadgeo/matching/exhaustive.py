@@ -10,7 +10,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Iterator
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass
 from typing import Any, TypeAlias
 
 import cv2
@@ -25,7 +25,6 @@ from roadgeo.matching.scene import Scene
 
 __all__ = [
     "Drawn",
-    "ExhaustiveOptions",
     "LocalSearchOptions",
     "Shift",
     "is_told",
@@ -213,54 +212,29 @@ def _distinct(shifts: list[Shift], options: LocalSearchOptions) -> list[Shift]:
     return kept
 
 
-@dataclass(frozen=True)
-class ExhaustiveOptions:
-    """How finely is looked, and how much.
-
-    Attributes
-    ----------
-    most_scale, most_turn_deg : float
-        Scales from least to greatest, and turns either way, that are few enough to try them all.
-    cell_m, cells : float
-        Side of the raster's cells, at least, and cells from the middle of the frame to its edge, at most; a step of
-        turn or scale moves a corner by `step_cells` of them.
-    road_m : float
-        Width of the map's roads.
-    most_cells : float
-        Cells times turns and scales that are few enough: a larger map is not looked at.
-    n_kept : int
-        Number of places that are followed.
-    apart_m : float
-        Places nearer than this to a better one are the same.
-    """
-
-    most_scale: float = 1.6
-    most_turn_deg: float = 20.0
-    cell_m: float = 12.0
-    cells: float = 80.0
-    step_cells: float = 2.5
-    road_m: float = 36.0
-    most_cells: float = 1.5e9
-    n_kept: int = 40
-    apart_m: float = 40.0
-    nearer: LocalSearchOptions = field(
-        default_factory=lambda: LocalSearchOptions(
-            reach_m=36.0, turn_deg=3.0, scales=(0.96, 1.0, 1.04), max_points=120, n_places=1
-        )
-    )
+#: Scales from least to greatest, and turns either way, that are few enough to try them all.
+_MOST_SCALE, _MOST_TURN_DEG = 1.6, 20.0
+#: Side of the raster's cells, at least, and width of the map's roads, metres; cells from the middle of the frame to its
+#: edge, at most; a step of turn or scale moves a corner by this number of them.
+_CELL_M, _ROAD_M, _CELLS, _STEP_CELLS = 12.0, 36.0, 80.0, 2.5
+#: Cells times turns and scales that are few enough: a larger map is not looked at.
+_MOST_CELLS = 1.5e9
+#: Number of places that are followed; places nearer than this to a better one are the same.
+_N_KEPT, _APART_M = 40, 40.0
+#: Each of them is sought anew within a step.
+_NEARER = LocalSearchOptions(reach_m=36.0, turn_deg=3.0, scales=(0.96, 1.0, 1.04), max_points=120, n_places=1)
 
 
-def is_told(camera: CameraOptions, options: ExhaustiveOptions) -> bool:
+def is_told(camera: CameraOptions) -> bool:
     """Whether heading and scale are known well enough."""
     (low, high), heading = camera.gsd_m, camera.heading
-    return high <= options.most_scale * low and heading is not None and heading[1] <= options.most_turn_deg
+    return high <= _MOST_SCALE * low and heading is not None and heading[1] <= _MOST_TURN_DEG
 
 
 def propose_everywhere(
     scene: Scene,
     index: ReferenceIndex,
     camera: CameraOptions,
-    options: ExhaustiveOptions,
     near: tuple[float, float, float] | None = None,
 ) -> Iterator[FloatArray]:
     """Yield homographies (3, 3), query plane to reference plane, of the places that agree best, the best first.
@@ -269,9 +243,8 @@ def propose_everywhere(
     """
     center, off = camera.heading or (0.0, 180.0)
     half_m = scene.half_size * math.sqrt(camera.gsd_m[0] * camera.gsd_m[1])
-    cell = max(options.cell_m, half_m / options.cells)
-    options = replace(options, cell_m=cell)
-    step = options.step_cells * cell / half_m
+    cell = max(_CELL_M, half_m / _CELLS)
+    step = _STEP_CELLS * cell / half_m
     turns = _spread(center, off + 1.0, math.degrees(step))
     least, most = np.log(camera.gsd_m)
     scales = np.exp(_spread((least + most) / 2.0, (most - least) / 2.0, step))
@@ -281,30 +254,30 @@ def propose_everywhere(
         low, high = np.maximum(low, np.subtract(near[:2], reach)), np.minimum(high, np.add(near[:2], reach))
     low, high = low - half_m, high + half_m
     columns, rows = (max(int(n), 1) for n in np.ceil((high - low) / cell))
-    if (high <= low).any() or columns * rows * len(turns) * len(scales) > options.most_cells:
+    if (high <= low).any() or columns * rows * len(turns) * len(scales) > _MOST_CELLS:
         return
     fft = _transforms()
     shape = cv2.getOptimalDFTSize(rows), cv2.getOptimalDFTSize(columns)
-    drawn, along = _draw_map(index, low, (rows, columns), options)
+    drawn, along = _draw_map(index, low, (rows, columns), cell)
     mapped = fft.rfft2(drawn, shape)
     mapped_along = fft.rfft2(drawn * along.real, shape), fft.rfft2(drawn * along.imag, shape)
     found: list[tuple[float, float, float, float, float]] = []
     for scale in scales:
         for turn in turns:
-            found += _best(scene, scale, math.radians(turn), mapped, mapped_along, shape, (rows, columns), low, options)
+            found += _best(scene, scale, math.radians(turn), mapped, mapped_along, shape, (rows, columns), low, cell)
     found.sort(key=lambda one: -one[0])
     kept: list[tuple[float, float]] = []
     for _, x, y, scale, turn in found:
-        if all(math.hypot(x - u, y - v) >= options.apart_m for u, v in kept):
+        if all(math.hypot(x - u, y - v) >= _APART_M for u, v in kept):
             kept.append((x, y))
-            yield _nearer(_similarity(scene, x, y, scale, turn), scene, index, options)
-        if len(kept) == options.n_kept:
+            yield _nearer(_similarity(scene, x, y, scale, turn), scene, index)
+        if len(kept) == _N_KEPT:
             return
 
 
-def _nearer(start: FloatArray, scene: Scene, index: ReferenceIndex, options: ExhaustiveOptions) -> FloatArray:
+def _nearer(start: FloatArray, scene: Scene, index: ReferenceIndex) -> FloatArray:
     """Return the place near a start, within a step, that lays most road points on roads."""
-    best = next(iter(search_nearby(start, scene, index, options.nearer)), None)
+    best = next(iter(search_nearby(start, scene, index, _NEARER)), None)
     return start if best is None else move_about(Homography(start).everywhere(scene.center), best) @ start
 
 
@@ -321,14 +294,14 @@ def _similarity(scene: Scene, x: float, y: float, scale: float, turn: float) -> 
 
 
 def _draw_map(
-    index: ReferenceIndex, low: FloatArray, shape: tuple[int, int], options: ExhaustiveOptions
+    index: ReferenceIndex, low: FloatArray, shape: tuple[int, int], cell_m: float
 ) -> tuple[AnyArray, AnyArray]:
     """Draw the map's roads, rows upwards: (rows, columns) float32 0 to 1, and exp(2 i direction) of the last drawn."""
     a, b = index.segments[:, :2] - low, index.segments[:, 2:] - low
-    lines = np.round(np.stack((a, b), axis=1) / options.cell_m * 16.0 - 8.0).astype(np.int32)
+    lines = np.round(np.stack((a, b), axis=1) / cell_m * 16.0 - 8.0).astype(np.int32)
     sector = np.floor(np.mod(np.arctan2(*(b - a).T[::-1]), np.pi) / np.pi * 16.0).astype(int) % 16
     drawn, along = np.zeros(shape, np.uint8), np.zeros(shape, np.complex64)
-    wide = max(round(options.road_m / options.cell_m), 1)
+    wide = max(round(_ROAD_M / cell_m), 1)
     for k in range(16):
         layer = np.zeros(shape, np.uint8)
         cv2.polylines(layer, list(lines[sector == k]), False, 1, wide, cv2.LINE_8, 4)
@@ -355,21 +328,21 @@ def _best(
     shape: tuple[int, int],
     inside: tuple[int, int],
     low: FloatArray,
-    options: ExhaustiveOptions,
+    cell_m: float,
 ) -> list[tuple[float, float, float, float, float]]:
     """Return (agreement, x, y, scale, turn) of the best places for one scale and turn."""
     matrix = _similarity(scene, 0.0, 0.0, scale, turn)
     points = scene.dense_points @ matrix[:2, :2].T + matrix[:2, 2]
     ways = scene.dense_directions @ matrix[:2, :2].T
     frame = Frame(*scene.size).plane_corners @ matrix[:2, :2].T + matrix[:2, 2]
-    half = np.ceil(np.abs(frame).max(axis=0) / options.cell_m).astype(int) + 1
-    cells = np.floor(points / options.cell_m).astype(int) + half
+    half = np.ceil(np.abs(frame).max(axis=0) / cell_m).astype(int) + 1
+    cells = np.floor(points / cell_m).astype(int) + half
     size = 2 * half[1] + 1, 2 * half[0] + 1
     seen, along = np.zeros(size, np.float32), np.zeros(size, np.complex64)
     seen[cells[:, 1], cells[:, 0]] = 1.0
     np.add.at(along, (cells[:, 1], cells[:, 0]), np.exp(2j * np.arctan2(ways[:, 1], ways[:, 0])).astype(np.complex64))
     along /= np.maximum(np.abs(along), 1e-6)
-    window = _observed(scene, matrix, half, size, options.cell_m)
+    window = _observed(scene, matrix, half, size, cell_m)
     fft = _transforms()
 
     def spectrum(template: AnyArray) -> AnyArray:
@@ -379,13 +352,13 @@ def _best(
     alike += mapped_along[0] * spectrum(seen * along.real) + mapped_along[1] * spectrum(seen * along.imag)
     both = fft.irfft2(0.5 * alike, shape)[: inside[0], : inside[1]]
     shown = fft.irfft2(mapped * spectrum(window), shape)[: inside[0], : inside[1]]
-    wide = options.road_m / options.cell_m
+    wide = _ROAD_M / cell_m
     dice = 2.0 * both / (float(seen.sum()) + np.maximum(shown, 0.0) / wide)
     peaks = (dice >= cv2.dilate(dice, np.ones((5, 5), np.uint8))) & (dice > 0.2)
     r, c = np.nonzero(peaks)
-    order = np.argsort(-dice[r, c], kind="stable")[: options.n_kept]
+    order = np.argsort(-dice[r, c], kind="stable")[:_N_KEPT]
     return [
-        (float(dice[i, j]), *(low + (np.array([j, i]) + half + 0.5) * options.cell_m).tolist(), scale, turn)
+        (float(dice[i, j]), *(low + (np.array([j, i]) + half + 0.5) * cell_m).tolist(), scale, turn)
         for i, j in zip(r[order].tolist(), c[order].tolist(), strict=True)
     ]
 

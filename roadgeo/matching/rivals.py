@@ -166,7 +166,7 @@ class Rivals:
             return Standing(best, None, odds - doubt, best.log10_likelihood)
         if time.perf_counter() > self._deadline:
             return Standing(best, None, min(odds, 0.0), best.log10_likelihood)
-        evidence = Evidence(scene, index, sampling(matrix, scene.size), estimator.options.evidence)
+        evidence = Evidence(scene, index, sampling(matrix, scene.size))
         known = [model for model in ranked[: 1 + options.n_known] if model is not best]
         worth, middle = evidence.weigh(matrix), Homography(matrix).everywhere(scene.center)
         apart_m, compare = options.apart * scene.half_size * evidence.gsd_m, evidence.compared_with(matrix)
@@ -195,7 +195,7 @@ class Rivals:
         known, matrix = self._doubts.get(id(model)), model.laid
         if known is None or known[0] is not matrix:
             scene = estimator.scene_of(model)
-            evidence = Evidence(scene, estimator.index, sampling(matrix, scene.size), estimator.options.evidence)
+            evidence = Evidence(scene, estimator.index, sampling(matrix, scene.size))
             share = evidence.contradicted(matrix) - self.options.usually_contradicted
             known = self._doubts[id(model)] = matrix, self.options.doubt * max(share, 0.0)
         return known[1]

@@ -8,9 +8,8 @@ from hypothesis import given
 from hypothesis import strategies as st
 from worlds.scenes import Sight, camera, look, mapped, scene_of
 
-from roadgeo.matching.evidence import Evidence, EvidenceOptions, agreement, tolerance_m
+from roadgeo.matching.evidence import MAP_SIGMA_M, PIXEL_SIGMA_PX, Evidence, agreement, tolerance_m
 
-OPTIONS = EvidenceOptions()
 TRUTH = camera((2000, 1900), (1000, 1000), 1.0, 20.0, 50.0, 130.0)
 ELSEWHERE = np.array([[1, 0, 333.0], [0, 1, -271.0], [0, 0, 1]]) @ TRUTH
 
@@ -70,4 +69,4 @@ class TestAgreement:
 
 @given(st.floats(0.1, 10))
 def test_tolerance_grows_with_the_sampling(gsd):
-    assert tolerance_m(gsd) > 3 * max(OPTIONS.map_sigma_m, OPTIONS.pixel_sigma_px * gsd)
+    assert tolerance_m(gsd) > 3 * max(MAP_SIGMA_M, PIXEL_SIGMA_PX * gsd)

@@ -17,7 +17,7 @@ from worlds.scenes import Sight, camera, look, random_network, scene_of, shaken
 import roadgeo
 from roadgeo.geometry.homography import Homography
 from roadgeo.matching import evidence
-from roadgeo.matching.evidence import Evidence, EvidenceOptions, log10_lead
+from roadgeo.matching.evidence import Evidence, log10_lead
 from roadgeo.matching.exhaustive import Shift, move_about
 from roadgeo.matching.index import build_index
 from roadgeo.matching.options import LocateOptions
@@ -144,7 +144,7 @@ class TestNearby:
         """However rough the yardstick: shifts by less than what roads may be off, and agree, are the place itself."""
         found = Evidence(scene, town[1], gsd_m)
         reach_m = 2.0 * math.hypot(1.8, gsd_m) / gsd_m
-        shifts = np.concatenate((found._spiral(reach_m), found._onto_neighbours(TRUTH, reach_m, None)))
+        shifts = np.concatenate((found._spiral(reach_m, 150), found._onto_neighbours(TRUTH, reach_m, None, 3)))
         assert np.hypot(*shifts.T).min() >= max(30.0, 4.5 * reach_m)
         assert found.nearby(TRUTH) < found.weigh(TRUTH)
 
@@ -155,13 +155,13 @@ class TestNearby:
         a, *others = xy[np.argsort(np.hypot(*(xy - middle).T))[:20]]
         step = next(a - b for b in others if 60.0 < np.hypot(*(a - b)) < 300.0)
         wrong = moved(TRUTH, scene, *step)
-        found = Evidence(scene, town[1], 1.0, EvidenceOptions(n_anchors=20))
-        assert found.nearby(wrong) > 0.7 * found.weigh(TRUTH) > 3.0 * found.weigh(wrong)
+        found = Evidence(scene, town[1], 1.0)
+        assert found.nearby(wrong, n_anchors=20) > 0.7 * found.weigh(TRUTH) > 3.0 * found.weigh(wrong)
 
     def test_intersections_lead_no_further_than_the_user_allows(self, town, scene):
         found, middle = Evidence(scene, town[1], 1.0), Homography(TRUTH)(scene.center)
-        shifts = found._onto_neighbours(TRUTH, 4.0, (*middle, 150.0))
-        assert 0 < len(shifts) < len(found._onto_neighbours(TRUTH, 4.0, None))
+        shifts = found._onto_neighbours(TRUTH, 4.0, (*middle, 150.0), 3)
+        assert 0 < len(shifts) < len(found._onto_neighbours(TRUTH, 4.0, None, 3))
         assert np.hypot(*shifts.T).max() <= 150.0
 
     def test_off_the_map_there_is_nothing(self, town, scene):
@@ -180,21 +180,21 @@ class TestArithmetic:
         small = (260, 200)
         truth = camera((2000, 1900), small, 1.3, 10.0, 50.0, 130.0)
         scene = seen(town, truth, small, sigma_m=1.0, missing=0.2, false=0.2)
-        options, gsd = EvidenceOptions(), 1.3
+        gsd = 1.3
         found = Evidence(scene, town[1], gsd)
         local = np.hypot(*(town[1].segments[:, :2] - (2000, 1900)).T) < 600.0
-        assert found.weigh(truth) == pytest.approx(self.twin(truth, scene, town[1], local, gsd, options), abs=0.02)
+        assert found.weigh(truth) == pytest.approx(self.twin(truth, scene, town[1], local, gsd), abs=0.02)
 
     @staticmethod
-    def twin(matrix, scene, index, local, gsd, o):
-        sigma_m = math.hypot(o.map_sigma_m, o.pixel_sigma_px * gsd)
+    def twin(matrix, scene, index, local, gsd):
+        sigma_m = math.hypot(evidence.MAP_SIGMA_M, evidence.PIXEL_SIGMA_PX * gsd)
         width, height = scene.size
         scale = math.sqrt(abs(np.linalg.det(naive.jacobian(matrix, np.array([width / 2, -height / 2])))))
         radius, blur = 4.0 * sigma_m * scale / gsd, 0.35 * scene.field_scale * gsd / sigma_m
         segments = index.segments.copy()
         segments[~local] = 1e7  # numbered as they are, but out of sight: the twin is slow
         counted = naive.count_residuals(
-            matrix, scene.points, scene.directions, scene.weights, radius, o.min_cos, o.step_m, segments,
+            matrix, scene.points, scene.directions, scene.weights, radius, evidence.MIN_COS, evidence.STEP_M, segments,
             lambda x, y: True, scene.field, scene.field_scale, scene.observed, 24,
         )  # fmt: skip
         metres = counted[0] * scene.road_length_px / len(scene.points) * gsd, counted[1] * gsd
@@ -215,7 +215,7 @@ class TestArithmetic:
                             r = (k + 0.5) * 4.0 / 24
                             g = math.sqrt(2 / math.pi) / s * math.exp(-0.5 * (r / s) ** 2) if k < 24 else 0.0
                             b = density / 4.0  # evenly, up to the reach
-                            nats += length / o.statement_m * math.log((1 - share) * g / b + share)
+                            nats += length / evidence.STATEMENT_M * math.log((1 - share) * g / b + share)
                     likelihoods.append(nats)
         most = max(likelihoods)
         return (most + math.log(np.mean(np.exp(np.array(likelihoods) - most)))) / math.log(10.0)

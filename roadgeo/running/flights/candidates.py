@@ -165,14 +165,14 @@ class Candidates:
         Return the results, with that place and its best rival alone. Each look may find a place by chance.
         """
         judged = [replace(one, fits=()) for one in found]
-        best = self._best(look, options)
+        best = self._best(look)
         if best is None or best.fit is None:
             return judged or [Found(one.index) for one in self.references]
         scene, size, fit = look.query.scene, look.query.scene.size, best.fit
-        evidence = Evidence(scene, best.index, sampling(fit.matrix, size), options.match.evidence)
+        evidence = Evidence(scene, best.index, sampling(fit.matrix, size))
         worth, paid = evidence.weigh(fit.matrix), math.log10(max(self.n_looks, 1))
         others = [one.fit for one in self._kept if one.fit is not None and one is not best]
-        rivals = [(self._weigh(look, options, one, evidence.gsd_m), one) for one in others if _differ(one, fit, size)]
+        rivals = [(self._weigh(look, one, evidence.gsd_m), one) for one in others if _differ(one, fit, size)]
         rival = max(rivals, key=lambda one: one[0], default=None)
         most = max(evidence.nearby(fit.matrix), 0.0 if rival is None else rival[0])
         if worth - most - paid >= options.min_log10_odds:
@@ -187,21 +187,21 @@ class Candidates:
         judged[k] = replace(judged[k], fits=fits)
         return judged
 
-    def _best(self, look: Look, options: LocateOptions) -> _Candidate | None:
+    def _best(self, look: Look) -> _Candidate | None:
         """Return the place that explains most, all measured at its own scale."""
         best = max(self._kept, key=_likelihood, default=None)
         for _ in range(_MOST_SCALES):
             if best is None or best.fit is None:
                 return None
             gsd = sampling(best.fit.matrix, look.query.scene.size)
-            weighed = [(self._weigh(look, options, one.fit, gsd), one) for one in self._kept if one.fit is not None]
+            weighed = [(self._weigh(look, one.fit, gsd), one) for one in self._kept if one.fit is not None]
             before, best = best, max(weighed, key=lambda one: one[0])[1]
             if best is before:
                 break
         return best
 
-    def _weigh(self, look: Look, options: LocateOptions, fit: Fit, gsd_m: float) -> float:
-        return Evidence(look.query.scene, fit.index, gsd_m, options.match.evidence).weigh(fit.matrix)
+    def _weigh(self, look: Look, fit: Fit, gsd_m: float) -> float:
+        return Evidence(look.query.scene, fit.index, gsd_m).weigh(fit.matrix)
 
     def _take(self, found: Found, look: Look, options: LocateOptions) -> None:
         """Keep the likeliest places that a search compared with the map, unless they are known."""

@@ -224,7 +224,7 @@ class Tracker:
         if fault is not None:
             why = f"on its roads: {fault.value}; placed by its motion"
         elif corrected is not None and scene is not None and reference is not None:
-            odds = _odds(corrected, scene, reference, self.options.locate)
+            odds = _odds(corrected, scene, reference)
             if odds >= self.options.least_odds:
                 self._pose = corrected
                 why = "its roads agree with the map"
@@ -415,12 +415,10 @@ def _scale(matrix: FloatArray, frame: Frame) -> float:
     return math.sqrt(abs(float(np.linalg.det(Homography(matrix).jacobian(frame.center)))))
 
 
-def _odds(pose: Pose, scene: Scene, reference: Reference, options: LocateOptions) -> float:
+def _odds(pose: Pose, scene: Scene, reference: Reference) -> float:
     """Return the log10 odds of a frame at its place against places nearby."""
     matrix = pose.homography.matrix @ PIXEL_TO_PLANE
     # The frame was followed here, so that where streets are alike a block beside it, by which a search is judged, is no
     # rival: shifts that meet whole blocks are left out.
-    evidence = Evidence(
-        scene, reference.index, pose.gsd_m, replace(options.match.evidence, n_anchors=0, n_shifts=_N_SHIFTS)
-    )
-    return evidence.weigh(matrix) - max(evidence.nearby(matrix), 0.0)
+    evidence = Evidence(scene, reference.index, pose.gsd_m)
+    return evidence.weigh(matrix) - max(evidence.nearby(matrix, n_shifts=_N_SHIFTS, n_anchors=0), 0.0)
