@@ -14,7 +14,7 @@ from __future__ import annotations
 import math
 import time
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass
 from typing import NamedTuple
 
 import numpy as np
@@ -43,44 +43,37 @@ _TAIL, _LEAST_TAIL, _LEAST_SPACING = 20, 5, 0.3
 _MOST_TURNS = 4
 
 
+#: A place that leads all places nearby by `certain` powers of ten is not compared further, if the best of them explains
+#: less than this part of it: streets do not repeat there.
+_REPEATING = 0.35
+#: Powers of ten that a place loses where all of the roads are contradicted (see `Evidence.contradicted`), in
+#: proportion, beyond the usual share. At right places of masks of which up to half is gone, false, stale or bent it is
+#: 0.03; at the best wrong ones of masks turned over 0.15 and more, where a city was laid out like its own mirror image.
+_DOUBT, _USUALLY_CONTRADICTED = 60.0, 0.02
+#: Number of the places met by the search that are compared, the likeliest; and of road points that each of those around
+#: is laid by roughly.
+_N_KNOWN, _N_POINTS = 12, 200
+#: Middles of two places lie further from each other than this share of half the frame's diagonal.
+_APART = 0.04
+#: Streets around a place.
+_AROUND = LocalSearchOptions(reach_m=4000.0, turn_deg=0.0, cell_m=10.0, road_m=20.0, max_points=200, n_places=40)
+
+
 @dataclass(frozen=True)
 class RivalOptions:
     """Where other places are looked for.
 
     Attributes
     ----------
-    certain, repeating : float
-        A place that leads all places nearby by this many powers of ten is not compared further, if the best of them
-        explains less than this part of it: streets do not repeat there.
-    doubt, usually_contradicted : float
-        Powers of ten that a place loses where all of the roads are contradicted (see `Evidence.contradicted`), in
-        proportion, beyond the usual share. At right places of masks of which up to half is gone, false, stale or bent
-        it is 0.03; at the best wrong ones of masks turned over 0.15 and more, where a city was laid out like its own
-        mirror image.
-    n_known : int
-        Number of the places met by the search that are compared, the likeliest.
+    certain : float
+        A place that leads all places nearby by as many powers of ten is not compared further.
     n_places, n_laid : int
         Number of places that most road points fit that are laid roughly, and of the likeliest of them, laid finely.
-    n_points : int
-        Road points that each is laid by roughly.
-    apart : float
-        Middles of two places lie further from each other than this share of half the frame's diagonal.
     """
 
     certain: float = 12.0
-    repeating: float = 0.35
-    doubt: float = 60.0
-    usually_contradicted: float = 0.02
-    n_known: int = 12
     n_places: int = 40
     n_laid: int = 8
-    n_points: int = 200
-    apart: float = 0.04
-    search: LocalSearchOptions = field(
-        default_factory=lambda: LocalSearchOptions(
-            reach_m=4000.0, turn_deg=0.0, cell_m=10.0, road_m=20.0, max_points=200, n_places=40
-        )
-    )
 
 
 class Standing(NamedTuple):
@@ -145,7 +138,7 @@ class Rivals:
         if not ranked:
             return None
         started = time.perf_counter()
-        best = max(ranked[: self.options.n_known], key=lambda one: one.log10_likelihood - self.doubt(estimator, one))
+        best = max(ranked[:_N_KNOWN], key=lambda one: one.log10_likelihood - self.doubt(estimator, one))
         for _ in range(_MOST_TURNS):
             standing = self._known.get(id(best)) or self._compare(estimator, best, ranked)
             self._known[id(best)] = standing
@@ -162,14 +155,14 @@ class Rivals:
         doubt = self.doubt(estimator, best)
         likeliest = next((m.log10_likelihood for m in ranked if not estimator.same(m, best)), 0.0)
         odds = min(best.log10_odds, best.log10_likelihood - max(likeliest, 0.0))
-        if odds >= options.certain and max(likeliest, best.nearby) < options.repeating * best.log10_likelihood:
+        if odds >= options.certain and max(likeliest, best.nearby) < _REPEATING * best.log10_likelihood:
             return Standing(best, None, odds - doubt, best.log10_likelihood)
         if time.perf_counter() > self._deadline:
             return Standing(best, None, min(odds, 0.0), best.log10_likelihood)
         evidence = Evidence(scene, index, sampling(matrix, scene.size))
-        known = [model for model in ranked[: 1 + options.n_known] if model is not best]
+        known = [model for model in ranked[: 1 + _N_KNOWN] if model is not best]
         worth, middle = evidence.weigh(matrix), Homography(matrix).everywhere(scene.center)
-        apart_m, compare = options.apart * scene.half_size * evidence.gsd_m, evidence.compared_with(matrix)
+        apart_m, compare = _APART * scene.half_size * evidence.gsd_m, evidence.compared_with(matrix)
         met = [Other(*compare(model.laid), model.laid, self.doubt(estimator, model)) for model in known]
         others = [
             other
@@ -196,8 +189,8 @@ class Rivals:
         if known is None or known[0] is not matrix:
             scene = estimator.scene_of(model)
             evidence = Evidence(scene, estimator.index, sampling(matrix, scene.size))
-            share = evidence.contradicted(matrix) - self.options.usually_contradicted
-            known = self._doubts[id(model)] = matrix, self.options.doubt * max(share, 0.0)
+            share = evidence.contradicted(matrix) - _USUALLY_CONTRADICTED
+            known = self._doubts[id(model)] = matrix, _DOUBT * max(share, 0.0)
         return known[1]
 
     def _take(self, estimator: TripleEstimator, matrix: FloatArray, ranked: Sequence[Hypothesis]) -> Hypothesis:
@@ -226,10 +219,10 @@ def similar_places(
     found: list[tuple[float, FloatArray]] = []
     for turn in _TURNS_DEG:
         turned = move_about(center, Shift(0.0, 0.0, turn, 1.0, 0.0)) @ matrix
-        shifts = search_nearby(turned, scene, index, options.search, drawn)
+        shifts = search_nearby(turned, scene, index, _AROUND, drawn)
         found += [(shift.share, move_about(center, shift) @ turned) for shift in shifts]
     found.sort(key=lambda one: -one[0])
-    laid = (_lay(start, scene, index, match, options.n_points) for _, start in found[: options.n_places])
+    laid = (_lay(start, scene, index, match, _N_POINTS) for _, start in found[: options.n_places])
     roughly = sorted((Other(*compare(one), one) for one in laid), key=lambda one: -one.worth)
     finely = (_lay(one.matrix, scene, index, match, None) for one in roughly[: options.n_laid])
     return [*(Other(*compare(one), one) for one in finely), *roughly[options.n_laid :]]
