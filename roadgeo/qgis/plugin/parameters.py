@@ -456,7 +456,7 @@ LOCALIZABILITY = (
             hint="More of them tell neighbouring places apart more surely, and take longer.",
             defaultValue=600,
         ),
-        _option("evaluate", "--jobs", "Processes"),
+        _option("locate", "--jobs", "Processes"),
     ),
     OUTPUT_FOLDER,
 )
