@@ -2,21 +2,19 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping
+from collections.abc import Mapping
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, TypeVar
+from typing import TYPE_CHECKING, Any
 
 import click
 
-from roadgeo.cli.options import GSD, OTHERS, RANGE, Read, row
+from roadgeo.cli.options import GSD, OTHERS, RANGE, Read, each, row
 from roadgeo.matching.hints import read_numbers
 
 if TYPE_CHECKING:
     from roadgeo.evaluation.simulation import SimulationOptions
 
 __all__ = ["QUERY_OPTIONS", "query_options", "query_sets"]
-
-Command = TypeVar("Command", bound=Callable[..., Any])
 
 
 def _read_angles(text: str) -> tuple[float, float]:
@@ -29,7 +27,8 @@ def _read_angles(text: str) -> tuple[float, float]:
 #: Degrees, least and greatest.
 ANGLES = Read("angles", _read_angles)
 
-_OPTIONS = (
+#: Adds the options that `query_sets` takes.
+query_options = each((
     row("-n --count", "N", OTHERS, "Masks per noise model.  [default: 40]", type=click.IntRange(1)),
     row("--noise", ("clean", "segmented", "poor"), OTHERS,
         "What goes wrong in the masks; repeat it for several.",
@@ -54,7 +53,7 @@ _OPTIONS = (
         "Draw so many masks turned over besides, which have no place and must be refused.",
         type=click.IntRange(0), default=0),
     row("--seed", "N", OTHERS, "Other seeds draw other masks.", type=click.IntRange(0), default=0, show_default=True),
-)  # fmt: skip
+))  # fmt: skip
 
 
 #: Names of the parameters of `query_sets`, and of `--roads`.
@@ -62,13 +61,6 @@ QUERY_OPTIONS = {
     *("count", "noise", "roads", "gsd", "tilt", "heading", "size", "window", "focal"),
     *("intersections", "road_width", "mirrored", "seed"),
 }
-
-
-def query_options(command: Command) -> Command:
-    """Add the options that `query_sets` takes."""
-    for add in reversed(_OPTIONS):
-        command = add(command)
-    return command
 
 
 def query_sets(options: Mapping[str, Any]) -> tuple[tuple[SimulationOptions, int], ...]:

@@ -3,22 +3,19 @@
 from __future__ import annotations
 
 import re
-from collections.abc import Callable
 from pathlib import Path
 from time import perf_counter
-from typing import TYPE_CHECKING, Any, TypeVar
+from typing import TYPE_CHECKING, Any
 
 import click
 
-from roadgeo.cli.options import row
+from roadgeo.cli.options import each, row
 from roadgeo.cli.printing import echo
 
 if TYPE_CHECKING:
     from roadgeo.running.cluster import Cluster
 
 __all__ = ["build_in_shards", "shard_options"]
-
-Command = TypeVar("Command", bound=Callable[..., Any])
 
 
 class _Shards(click.ParamType):  # type: ignore[type-arg]  # generic only in late versions of click
@@ -46,7 +43,8 @@ class _Shards(click.ParamType):  # type: ignore[type-arg]  # generic only in lat
         return self.fail(f"got {value!r}, expected auto, a number, or a side such as 25km (1 to 1000)", param, ctx)
 
 
-_OPTIONS = (
+#: Adds the options that control how a map is cut.
+shard_options = each((
     row("--shards", "auto|N|SIZEkm", "In pieces",
         "Build REF.shards, in pieces. As many as is good, about N, or squares of a side: for maps of any size.",
         type=_Shards()),
@@ -55,14 +53,7 @@ _OPTIONS = (
         type=click.FloatRange(0, 100_000), default=3000.0, show_default=True, rare=True),
     row("-j --jobs", "N", "In pieces",
         "Processes, each of which builds a piece at a time.", type=click.IntRange(1), default=1, show_default=True),
-)  # fmt: skip
-
-
-def shard_options(command: Command) -> Command:
-    """Add the options that control how a map is cut."""
-    for add in reversed(_OPTIONS):
-        command = add(command)
-    return command
+))  # fmt: skip
 
 
 def build_in_shards(

@@ -21,41 +21,13 @@ from qgis.PyQt.QtCore import QUrl
 from qgis.PyQt.QtGui import QIcon
 from qgis.utils import iface
 
+from . import parameters as given
 from .environment import ask_version, install
-from .parameters import (
-    AREA,
-    BATCH,
-    CAMERA,
-    ITS_MASK,
-    LOCALIZABILITY,
-    MASK_VALUES,
-    OUTPUT_FOLDER,
-    PICTURE,
-    PIXEL_SIZE,
-    POINTS,
-    QUERY,
-    REFERENCE,
-    REPORT,
-    ROADS,
-    SEGMENT,
-    SETUP,
-    Option,
-    Values,
-)
+from .parameters import Option, Values
 from .session import PICTURE_KEPT, POINTS_KEPT, Finding, Session, library
 from .settings import NOT_FOUND, configure, locate_executable, remember_reference, remembered_references
 
-__all__ = [
-    "ALGORITHMS",
-    "BuildReference",
-    "GeoreferenceImage",
-    "LocateMask",
-    "LocateMasks",
-    "MapLocalizability",
-    "PlaceByPoints",
-    "SetUp",
-    "VectorizeMask",
-]
+__all__ = ["ALGORITHMS"]
 
 
 class RoadgeoAlgorithm(QgsProcessingAlgorithm):
@@ -150,7 +122,7 @@ class BuildReference(RoadgeoAlgorithm):
         "extent. "
         "Roads of OpenStreetMap are © OpenStreetMap contributors, ODbL."
     )
-    OPTIONS = ROADS
+    OPTIONS = given.ROADS
     OUTPUTS: ClassVar[dict[str, tuple[Any, str]]] = {}
 
     def work(self, values: Values, session: Session) -> dict[str, Any]:
@@ -211,7 +183,16 @@ class LocateMask(RoadgeoAlgorithm):
         "camera known. In a photograph a network finds the roads first. What is located is drawn on the map, with its "
         "footprint, its roads and the intersections that matched. What is not surely found is refused, with the reason."
     )
-    OPTIONS = (QUERY, REFERENCE, AREA, REPORT, *MASK_VALUES, *SEGMENT, *CAMERA, OUTPUT_FOLDER)
+    OPTIONS = (
+        given.QUERY,
+        given.REFERENCE,
+        given.AREA,
+        given.REPORT,
+        *given.MASK_VALUES,
+        *given.SEGMENT,
+        *given.CAMERA,
+        given.OUTPUT_FOLDER,
+    )
     OUTPUTS = _LOCATION_OUTPUTS
 
     def work(self, values: Values, session: Session) -> dict[str, Any]:
@@ -231,16 +212,16 @@ class GeoreferenceImage(RoadgeoAlgorithm):
         "The ground is taken for a plane. An image that is not surely found is refused, with the reason."
     )
     OPTIONS = (
-        PICTURE[0],
-        ITS_MASK,
-        REFERENCE,
-        AREA,
-        REPORT,
-        *PICTURE[1:],
-        *MASK_VALUES,
-        *SEGMENT,
-        *CAMERA,
-        OUTPUT_FOLDER,
+        given.PICTURE[0],
+        given.ITS_MASK,
+        given.REFERENCE,
+        given.AREA,
+        given.REPORT,
+        *given.PICTURE[1:],
+        *given.MASK_VALUES,
+        *given.SEGMENT,
+        *given.CAMERA,
+        given.OUTPUT_FOLDER,
     )
     OUTPUTS = _LOCATION_OUTPUTS
 
@@ -261,7 +242,7 @@ class LocateMasks(RoadgeoAlgorithm):
         "Locates every road mask in a folder, and gathers their footprints in one layer. "
         "A mask that cannot be read is reported; the others are finished."
     )
-    OPTIONS = (*BATCH, *CAMERA, OUTPUT_FOLDER)
+    OPTIONS = (*given.BATCH, *given.CAMERA, given.OUTPUT_FOLDER)
     OUTPUTS: ClassVar[dict[str, tuple[Any, str]]] = {
         "LOCATED": (QgsProcessingOutputNumber, "Located"),
         "NOT_LOCATED": (QgsProcessingOutputNumber, "Not located, or ambiguous"),
@@ -290,7 +271,7 @@ class VectorizeMask(RoadgeoAlgorithm):
         "Shows what roads and intersections are seen in a road mask or a photograph: the first thing to look at when "
         "one was not located. The layers are in pixels and lie on the image where it has no georeference."
     )
-    OPTIONS = (QUERY, *MASK_VALUES, *SEGMENT, *PIXEL_SIZE, OUTPUT_FOLDER)
+    OPTIONS = (given.QUERY, *given.MASK_VALUES, *given.SEGMENT, *given.PIXEL_SIZE, given.OUTPUT_FOLDER)
     OUTPUTS: ClassVar[dict[str, tuple[Any, str]]] = {"VECTORIZED": (QgsProcessingOutputVectorLayer, "Roads as seen")}
 
     def work(self, values: Values, session: Session) -> dict[str, Any]:
@@ -312,7 +293,7 @@ class MapLocalizability(RoadgeoAlgorithm):
         "Says before a flight where it would be located: masks as the camera would see them are drawn from the "
         "reference's own roads, all over the map, and each is searched for. Takes some minutes."
     )
-    OPTIONS = LOCALIZABILITY
+    OPTIONS = given.LOCALIZABILITY
     OUTPUTS: ClassVar[dict[str, tuple[Any, str]]] = {"MAP": (QgsProcessingOutputRasterLayer, "Where it would work")}
 
     def work(self, values: Values, session: Session) -> dict[str, Any]:
@@ -379,7 +360,7 @@ class PlaceByPoints(RoadgeoAlgorithm):
         "which is what a camera makes of level ground. The panel to mend a place by hand writes such points, and so "
         "does the Georeferencer."
     )
-    OPTIONS = POINTS
+    OPTIONS = given.POINTS
     OUTPUTS: ClassVar[dict[str, tuple[Any, str]]] = {
         "FOOTPRINT": (QgsProcessingOutputRasterLayer, "On the map"),
         "RMS": (QgsProcessingOutputNumber, "Root mean square of the residuals, map units"),
@@ -409,7 +390,7 @@ class SetUp(RoadgeoAlgorithm):
         "Finds the program roadgeo, which does the work in a Python of its own, tries it, and remembers it. Or "
         "installs it, into an environment that is made for it: neither QGIS nor the system changes."
     )
-    OPTIONS = SETUP
+    OPTIONS = given.SETUP
     OUTPUTS: ClassVar[dict[str, tuple[Any, str]]] = {
         "FOUND": (QgsProcessingOutputString, "The program, or the Python that has it"),
         "VERSION": (QgsProcessingOutputString, "Its version"),
@@ -428,7 +409,7 @@ class SetUp(RoadgeoAlgorithm):
         else:
             found = program or locate_executable() or ""
         if not found:
-            told = f"To install it, tick “{SETUP[1].label}”, or name it above."
+            told = f"To install it, tick “{given.SETUP[1].label}”, or name it above."
             raise QgsProcessingException(f"The program roadgeo was not found on this computer. {told}")
         self.found = {"FOUND": found, "VERSION": ask_version(found, session)}
         return self.found

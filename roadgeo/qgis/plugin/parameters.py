@@ -32,26 +32,9 @@ from qgis.core import (
 from .environment import ENVIRONMENT
 
 __all__ = [
-    "AREA",
-    "BATCH",
-    "CAMERA",
-    "ITS_MASK",
-    "LOCALIZABILITY",
-    "MASK",
-    "MASK_VALUES",
-    "OUTPUT_FOLDER",
-    "PICTURE",
-    "PIXEL_SIZE",
-    "POINTS",
-    "QUERY",
-    "REFERENCE",
-    "REPORT",
-    "ROADS",
-    "SEGMENT",
-    "SETUP",
-    "Option",
-    "Values",
-]
+    "AREA", "BATCH", "CAMERA", "ITS_MASK", "LOCALIZABILITY", "MASK", "MASK_VALUES", "OUTPUT_FOLDER", "PICTURE",
+    "PIXEL_SIZE", "POINTS", "QUERY", "REFERENCE", "REPORT", "ROADS", "SEGMENT", "SETUP", "Option", "Values",
+]  # fmt: skip
 
 
 class Values:
@@ -199,6 +182,7 @@ def _lines(values: Values, name: str) -> list[str]:
 #: packed, for QGIS's Python has no roadgeo.
 _TABLE: dict[str, Any] = json.loads((Path(__file__).parent / "table.json").read_text("utf-8"))
 _OUTPUTS: dict[str, str] = _TABLE["outputs"]
+_HINTS = _TABLE["options"]["locate"].items()
 
 
 def _option(command: str, flag: str, label: str = "", name: str = "", hint: str = "", **settings: Any) -> Option:
@@ -256,119 +240,82 @@ def _fold(*options: Option) -> tuple[Option, ...]:
 
 # --- the parameters ---------------------------------------------------------------------------------------------------
 
+#: Nothing need be given.
+_MAY_LACK = {"optional": True}
+
 MASK = _raster(
-    "MASK",
-    "Road mask",
+    "MASK", "Road mask",
     "An image of the roads that the aerial picture shows: bright, or 1, where there is road. It needs no georeference.",
-)
+)  # fmt: skip
 QUERY = replace(
-    MASK,
-    label="Road mask, or photograph",
+    MASK, label="Road mask, or photograph",
     hint=f"{MASK.hint} A photograph is recognised, and a network finds its roads.",
-)
-ITS_MASK = replace(
-    MASK, hint=f"{MASK.hint} Empty: a network finds the roads of the image.", settings={"optional": True}
-)
+)  # fmt: skip
+ITS_MASK = replace(MASK, hint=f"{MASK.hint} Empty: a network finds the roads of the image.", settings=_MAY_LACK)
 _BAND = _option("locate", "--band", "Band")
 _THRESHOLD = _option("locate", "--threshold", "Threshold")
 MASK_VALUES = _fold(
-    replace(_BAND, kind=QgsProcessingParameterBand, settings={"parentLayerParameterName": "MASK", "optional": True}),
+    replace(_BAND, kind=QgsProcessingParameterBand, settings={"parentLayerParameterName": "MASK", **_MAY_LACK}),
     _THRESHOLD,
 )
-
 SEGMENT = _fold(
     _option("locate", "--segment", "Find roads in photographs"),
     Option(
-        QgsProcessingParameterFile,
-        "SEGMENTER",
-        "Model for photographs",
+        QgsProcessingParameterFile, "SEGMENTER", "Model for photographs",
         "A segmentation model, as QGIS's Deepness takes them. Empty: the one that ships with roadgeo.",
-        _said("--segmenter", "File"),
-        {"extension": "onnx", "optional": True},
-        flag="--segmenter",
+        _said("--segmenter", "File"), {"extension": "onnx", **_MAY_LACK}, flag="--segmenter",
     ),
-)
-
+)  # fmt: skip
 REPORT = _option(
     "locate", "--report", "Open a report", hint="A page with map, mask, residuals and numbers, in the browser."
 )
-
 REFERENCE = Option(
-    QgsProcessingParameterString,
-    "REFERENCE",
-    "Road reference",
+    QgsProcessingParameterString, "REFERENCE", "Road reference",
     "What Build road reference made: one of the list, or a file. Empty: all that there are.",
-    settings={"optional": True},
-    flag="--reference",
+    settings=_MAY_LACK, flag="--reference",
     metadata={"widget_wrapper": {"class": f"{__package__}.references.ReferenceWrapper"}},
-)
+)  # fmt: skip
 
 PIXEL_SIZE = _fold(_option("locate", "--gsd"))
 
 #: All hints on an image, in the order of the table; a place is clicked on the map.
 CAMERA = _fold(
     Option(
-        QgsProcessingParameterPoint,
-        "NEAR",
-        "Near",
-        "The middle of the mask lies near this place.",
-        _near,
-        {"optional": True},
-        flag="--near",
+        QgsProcessingParameterPoint, "NEAR", "Near",
+        "The middle of the mask lies near this place.", _near, _MAY_LACK, flag="--near",
     ),
     Option(
-        QgsProcessingParameterNumber,
-        "NEAR_RADIUS",
-        "Within, metres",
-        "How near.",
+        QgsProcessingParameterNumber, "NEAR_RADIUS", "Within, metres", "How near.",
         settings={"type": QgsProcessingParameterNumber.Type.Double, "defaultValue": 10_000.0, "minValue": 1.0},
     ),
-    *(
-        _option("locate", flag)
-        for flag, row in _TABLE["options"]["locate"].items()
-        if row["is_hint"] and flag != "--near"
-    ),
-)
-
+    *(_option("locate", flag) for flag, row in _HINTS if row["is_hint"] and flag != "--near"),
+)  # fmt: skip
 AREA = Option(
-    QgsProcessingParameterExtent,
-    "AREA",
-    "It lies on this part of the map",
+    QgsProcessingParameterExtent, "AREA", "It lies on this part of the map",
     "The middle of the image lies there: with the map canvas extent, near what you see. Empty: not known.",
-    _area,
-    {"optional": True},
-    flag="--within",
-)
+    _area, _MAY_LACK, flag="--within",
+)  # fmt: skip
 
 PICTURE = (
     _raster(
-        "IMAGE",
-        "Image",
+        "IMAGE", "Image",
         "The picture that the mask shows the roads of, of the same frame. Its size may differ from the mask's.",
     ),
     Option(
-        QgsProcessingParameterCrs,
-        "CRS",
-        "CRS of the result",
-        "Empty: the reference's own, which is metric.",
-        _crs,
-        {"optional": True},
-        flag="--crs",
+        QgsProcessingParameterCrs, "CRS", "CRS of the result",
+        "Empty: the reference's own, which is metric.", _crs, _MAY_LACK, flag="--crs",
     ),
     *_fold(
         _option("locate", "--resolution", "Pixel size of the result"),
         _option("locate", "--resampling", "Resampling"),
         Option(
-            QgsProcessingParameterEnum,
-            "PRODUCTS",
-            "Also write",
+            QgsProcessingParameterEnum, "PRODUCTS", "Also write",
             f"Further forms of the result. {'; '.join(f'{name}: {what}' for name, what in _OUTPUTS.items())}.",
             _chosen("--also"),
-            {"options": list(_OUTPUTS), "usesStaticStrings": True, "allowMultiple": True, "optional": True},
-            flag="--also",
+            {"options": list(_OUTPUTS), "usesStaticStrings": True, "allowMultiple": True, **_MAY_LACK}, flag="--also",
         ),
     ),
-)
+)  # fmt: skip
 
 BATCH = (
     _folder("MASKS", "Folder of road masks or photographs", "Every image in it is located."),
@@ -380,31 +327,21 @@ BATCH = (
 
 ROADS = (
     Option(
-        QgsProcessingParameterFeatureSource,
-        "ROADS",
-        "Road lines",
+        QgsProcessingParameterFeatureSource, "ROADS", "Road lines",
         "A layer of roads. Or leave it empty, and name a place or an extent: its roads come from OpenStreetMap.",
-        _lines,
-        {"types": [QgsProcessing.SourceType.TypeVectorLine], "optional": True},
-        flag="--roads",
+        _lines, {"types": [QgsProcessing.SourceType.TypeVectorLine], **_MAY_LACK}, flag="--roads",
     ),
     _option("index", "--osm", "Place", "PLACE", "The name of a place in OpenStreetMap, such as Boston, MA."),
     Option(
-        QgsProcessingParameterExtent,
-        "EXTENT",
-        "Extent",
-        "Roads in it come from OpenStreetMap; or the road lines are cut to it.",
-        _box,
-        {"optional": True},
-        flag="--bbox",
+        QgsProcessingParameterExtent, "EXTENT", "Extent",
+        "Roads in it come from OpenStreetMap; or the road lines are cut to it.", _box, _MAY_LACK, flag="--bbox",
     ),
     _option(
-        "index", "--name", "Name", hint="Of the reference, in the list. Empty: after the place, the file or the layer."
+        "index", "--name", "Name",
+        hint="Of the reference, in the list. Empty: after the place, the file or the layer.",
     ),
     _option(
-        "index",
-        "--kinds",
-        "Which roads",
+        "index", "--kinds", "Which roads",
         hint="Those that the masks show, where the data tell kinds apart: main roads, public ones for cars (drivable), "
         "all for vehicles, or all.",
     ),
@@ -413,98 +350,71 @@ ROADS = (
         _option("index", "--attribution", "Attribution", hint="Whom to name beside the map; goes with road lines."),
     ),
     Option(
-        QgsProcessingParameterFileDestination,
-        "OUTPUT",
-        "Keep it in a file of its own",
+        QgsProcessingParameterFileDestination, "OUTPUT", "Keep it in a file of its own",
         "A GeoPackage; its search index, of the same name, lies beside it. Empty: it is kept in roadgeo's library.",
-        settings={"fileFilter": "GeoPackage (*.gpkg)", "optional": True, "createByDefault": False},
-        flag="--out",
+        settings={"fileFilter": "GeoPackage (*.gpkg)", "createByDefault": False, **_MAY_LACK}, flag="--out",
     ),
-)
+)  # fmt: skip
 
 OUTPUT_FOLDER = Option(
     QgsProcessingParameterFolderDestination, "OUTPUT_FOLDER", "Folder for the results", "Made if it is missing."
 )
 
 LOCALIZABILITY = (
-    replace(
-        REFERENCE,
-        hint="What Build road reference made: one of the list, or a file.",
-        settings={"optional": False},
-    ),
+    replace(REFERENCE, hint="What Build road reference made: one of the list, or a file.", settings={}),
     _option(
-        "evaluate",
-        "--height",
-        "Height above ground, metres",
-        hint="Of the flight. With the focal length it says how large a pixel is.",
-        defaultValue=400.0,
+        "evaluate", "--height", "Height above ground, metres",
+        hint="Of the flight. With the focal length it says how large a pixel is.", defaultValue=400.0,
     ),
     _option("evaluate", "--focal", "Focal length, pixels", hint="Of the camera.", defaultValue=1000.0),
     _option("evaluate", "--size", "Side of the image, pixels", hint="Of a square one.", defaultValue=1000),
     _option(
-        "evaluate",
-        "--noise",
-        "How good the masks are",
-        hint="Clean, as a network makes them (segmented), or poor.",
-        defaultValue="segmented",
+        "evaluate", "--noise", "How good the masks are",
+        hint="Clean, as a network makes them (segmented), or poor.", defaultValue="segmented",
     ),
     *_fold(
         _option(
-            "evaluate",
-            "--count",
-            "Masks to try",
-            hint="More of them tell neighbouring places apart more surely, and take longer.",
-            defaultValue=600,
+            "evaluate", "--count", "Masks to try",
+            hint="More of them tell neighbouring places apart more surely, and take longer.", defaultValue=600,
         ),
         _option("locate", "--jobs", "Processes"),
     ),
     OUTPUT_FOLDER,
-)
+)  # fmt: skip
 
 POINTS = (
     _raster("IMAGE", "Picture", "Any, of any number of bands."),
     Option(
-        QgsProcessingParameterFile,
-        "POINTS",
-        "Control points",
+        QgsProcessingParameterFile, "POINTS", "Control points",
         "Four or more, not on one line; a file of the Georeferencer, or of the panel to mend a place by hand.",
         settings={"extension": "points"},
     ),
     replace(PICTURE[1], hint="Empty: that of the points."),
     *PICTURE[2:4],
     OUTPUT_FOLDER,
-)
+)  # fmt: skip
 
 SETUP = (
     Option(
-        QgsProcessingParameterFile,
-        "PROGRAM",
-        "Program roadgeo, or a Python",
+        QgsProcessingParameterFile, "PROGRAM", "Program roadgeo, or a Python",
         "The program, or the Python that has it or that is to have it, 3.11 or newer. Empty: searched for.",
-        settings={"optional": True, "fileFilter": "All files (*)"},  # "*.*", the usual, refuses names without a dot
+        settings={"fileFilter": "All files (*)", **_MAY_LACK},  # "*.*", the usual, refuses names without a dot
     ),
     Option(
-        QgsProcessingParameterBoolean,
-        "INSTALL",
-        "Install roadgeo into an environment of its own",
+        QgsProcessingParameterBoolean, "INSTALL", "Install roadgeo into an environment of its own",
         "With that Python, in the folder below; takes some minutes, 1.3 GB, and the network.",
         settings={"defaultValue": False},
     ),
     *_fold(
         Option(
-            QgsProcessingParameterString,
-            "SOURCE",
-            "What to install",
+            QgsProcessingParameterString, "SOURCE", "What to install",
             "As pip takes it: roadgeo, or an address, a folder or a wheel that you have. [desktop] adds all "
             "that building references and photographs need.",
             settings={"defaultValue": "roadgeo[desktop]"},
         ),
         _folder(
-            "FOLDER",
-            "Folder of the environment",
-            "Made if it is missing.",
-            defaultValue=str(ENVIRONMENT),
-            optional=True,
+            "FOLDER", "Folder of the environment", "Made if it is missing.",
+            defaultValue=str(ENVIRONMENT), optional=True,
         ),
     ),
-)
+)  # fmt: skip
