@@ -180,6 +180,8 @@ def _best_of(sightings: Sequence[Sighting], options: LocateOptions) -> Sighting:
         refine=sum(one.seconds.refine for one in locations),
     )
     location = replace(best.location, seconds=seconds)
+    if len(sightings) > 1 and location.status == "not_located":
+        location = replace(location, reason=f"{location.reason} (seen in {len(sightings)} ways)")
     rivals = [one for one in locations if one is not best.location and _elsewhere(one, location)]
     rival = max(rivals, key=lambda one: one.log10_odds or -math.inf, default=None)
     if location.located and rival is not None:
