@@ -7,13 +7,12 @@ itself, for nothing in it shows that.
 
 from __future__ import annotations
 
-import math
 from dataclasses import replace
 
 import cv2
 import numpy as np
 
-from roadgeo._arrays import FloatArray
+from roadgeo._arrays import BoolArray, FloatArray, IntArray
 from roadgeo.geometry.camera import sampling
 from roadgeo.geometry.homography import Homography
 from roadgeo.matching.carriageways import refine_between, weight_on_roads
@@ -22,7 +21,7 @@ from roadgeo.matching.evidence import agreement
 from roadgeo.matching.growing import Hypothesis
 from roadgeo.matching.index import ReferenceIndex
 from roadgeo.matching.lens import FEWEST, K1_SIGMA, LensEquations
-from roadgeo.matching.refinement import Refined, RefineOptions, corner_covariance, corner_sigmas, refine, robust_rms
+from roadgeo.matching.refinement import Refined, RefineOptions, corner_covariance, corner_sigmas, refine
 from roadgeo.matching.scene import Scene
 
 __all__ = ["measure_corners", "refine_beside", "with_honest_corners"]
@@ -38,15 +37,15 @@ _BACK, _BETTER = 0.25, 0.006
 #: Standard deviation of the place of a lens's middle in each direction, pixels: conventions differ by half of one.
 _CENTER_SIGMA_PX = 0.5
 
-#: How errors add up, fitted to the corners of 900 masks, good and bad, and of 34 of a real city. The factor by which
-#: residuals overstate them without a lens; over how much more ground errors keep their sign far away, by the reach of a
-#: pixel; and the floor that no number of points lowers: a part of the residuals' rms, and the mask's accuracy, pixels,
-#: beside that of the map (`RefineOptions.sigma_floor_m`).
-_OVERSTATED, _FAR, _FLOOR, _FLOOR_PX = 0.67, 0.5, 0.15, 0.1
-#: Residuals end at three standard deviations: roads further off do not pull. Those beyond 2.5 are near the end,
-#: many of them where a mask is bent. There the pull falls to nothing, and the fit is held less firmly: each reduces
-#: the slope of the pull by this amount. By their number and the pull there it would be 0.6, fitted it is more.
-_NEAR_END, _PULL_AT_END = 2.5, 1.1
+#: Road points further apart than this multiple of the usual step lie on different roads. Longer roads are cut in pieces
+#: of this number of points: errors keep their sign over less.
+_GAP, _PIECE = 1.5, 12
+#: Beyond three standard deviations no road is met: there the pull, 3 / (1 + 3^2), falls to nothing. Roads that are
+#: nearly as far count those at that end: they take its fall, over half a standard deviation, off the slope of the pull.
+_NEAR_END, _FALL = 2.5, 0.3 / 0.5
+#: Where the slopes would leave a fit undetermined, as where a mask is bent, all roads hold it, by this part of their
+#: weights.
+_LEAST_SLOPE = 0.17
 
 
 def measure_corners(estimator: TripleEstimator, best: Hypothesis | None, score: float) -> None:
@@ -143,10 +142,11 @@ def _beside(matrix: FloatArray, scene: Scene, pixels: float) -> list[FloatArray]
 
 
 def with_honest_corners(refined: Refined, scene: Scene, index: ReferenceIndex, options: RefineOptions) -> Refined:
-    """Return a refined homography with the covariance of its corners measured anew.
+    """Return a refined homography with the covariance of its corners by the jackknife.
 
-    The fit takes all residuals for equally uncertain but for how far a pixel reaches. But far away errors keep their
-    sign over more ground, and the middle of a lens is not known exactly.
+    Each road, or piece of a long one, is left out in turn, and the scatter of the corners is their covariance (a
+    jackknife of clusters; Bell and McCaffrey 2002). It assumes nothing of how large errors are, how far they keep their
+    sign, or which roads were met wrongly. A corner is as uncertain as the roads on which it depends.
 
     The matrix stays as it is, and so does the covariance where too few roads are met.
     """
@@ -154,24 +154,38 @@ def with_honest_corners(refined: Refined, scene: Scene, index: ReferenceIndex, o
     seen = equations.observe(k1, np.zeros((9, 9)))
     if len(seen.rows) < FEWEST:
         return refined
-    reach, by_center = (array[seen.which] for array in equations.local_scale(k1))
     free = 9 if k1 else 8
     rows, weights = seen.rows[:, :free], equations.weight * seen.cauchy / seen.own**2
-    scaled = weights[:, None] * rows
-    normal = scaled.T @ rows + np.diag(equations.prior(K1_SIGMA)[:free])
-    inverse = np.asarray(np.linalg.pinv(normal, hermitian=True), float)
-    near_end = np.abs(seen.residuals / seen.sigma) > _NEAR_END
-    rms = robust_rms(seen.scaled, seen.cauchy, _PULL_AT_END * float(near_end.sum()))
-    as_long = (1.0 if k1 else _OVERSTATED) * np.maximum(1.0, reach / np.median(reach)) ** _FAR
-    # sandwich estimate of an M-estimator's covariance (Huber 1981, 6.3)
-    covariance = (rms / equations.unit) ** 2 * inverse @ (scaled.T * as_long**2 @ rows) @ inverse
-    if k1:  # the middle of the lens was not estimated: add its effect on the parameters
-        unknown = _CENTER_SIGMA_PX * np.einsum("ni,nij->nj", seen.normals, by_center)
-        moved = inverse @ (scaled.T @ unknown)
+    prior = np.diag(equations.prior(K1_SIGMA)[:free]) + 1e-9 * np.eye(free)
+    starts = _starts_of_pieces(scene, seen.which)
+    squares = rows[:, :, None] * rows[:, None, :]
+    at_end = np.abs(seen.residuals / seen.sigma) > _NEAR_END
+    slopes = weights * (2.0 * seen.cauchy - 1.0 - _FALL * at_end / seen.cauchy)
+    normals = np.add.reduceat(slopes[:, None, None] * squares, starts)
+    weighted = np.add.reduceat(weights[:, None, None] * squares, starts)
+    if np.linalg.eigvalsh(normals.sum(axis=0) + prior - _LEAST_SLOPE * (weighted.sum(axis=0) + prior)).min() <= 0.0:
+        normals = _LEAST_SLOPE * weighted
+    pulls = np.add.reduceat((weights * seen.residuals / equations.unit)[:, None] * rows, starts)
+    normal = normals.sum(axis=0) + prior
+    moved = np.linalg.solve(normal - normals, pulls[:, :, None])[:, :, 0]
+    inverse = np.linalg.inv(normal)
+    # What the prior holds is as uncertain as the prior.
+    covariance = moved.T @ moved + (equations.sigma_m / equations.unit) ** 2 * inverse @ prior @ inverse
+    if k1:  # nor was the middle of the lens estimated
+        unknown = _CENTER_SIGMA_PX * np.einsum("ni,nij->nj", seen.normals, equations.by_center(k1)[seen.which])
+        moved = inverse @ ((weights[:, None] * rows).T @ unknown)
         covariance = covariance + moved @ moved.T
-    floor_m = math.hypot(options.sigma_floor_m, _FLOOR * rms)
-    options = replace(options, sigma_floor_m=floor_m, sigma_floor_px=_FLOOR_PX)
     corners = corner_covariance(equations.p, covariance[:8, :8], scene, equations.unit, options)
     if not np.isfinite(corners).all():
         return refined
     return replace(refined, corner_sigma_m=corner_sigmas(corners), corner_covariance_m2=corners)
+
+
+def _starts_of_pieces(scene: Scene, which: BoolArray) -> IntArray:
+    """Return where, among the road points of `which` (S,), each piece of road begins."""
+    step = scene.road_length_px / len(scene.points)
+    first = np.concatenate(([True], np.hypot(*np.diff(scene.points, axis=0).T) > _GAP * step))
+    road = np.cumsum(first) - 1
+    along = np.arange(len(first)) - np.flatnonzero(first)[road]
+    piece = np.cumsum(first | (along % _PIECE == 0))
+    return np.unique(piece[which], return_index=True)[1]

@@ -121,17 +121,11 @@ class LensEquations:
         """Return the weights (9,) that hold the perspective and k1 near 0."""
         return np.append(np.zeros(6), self.held(np.array([self.options.perspective_sigma] * 2 + [k1_sigma])))
 
-    def local_scale(self, k1: float) -> tuple[FloatArray, FloatArray]:
-        """Return how far on the ground a pixel reaches across each road (S,), metres; and see below.
-
-        Also the derivatives (S, 2, 2) of normalised places by where the middle of the lens is, in pixels.
-        """
+    def by_center(self, k1: float) -> FloatArray:
+        """Return the derivatives (S, 2, 2) of normalised places by where the middle of the lens is, in pixels."""
         scene, (homography, uv) = self.scene, self._seen(k1)
         stretch = Lens.of(k1, scene.size, y_up=True).stretch(scene.points)
-        jacobian = homography.jacobian(uv) / scene.half_size
-        whole = jacobian @ stretch
-        along = np.linalg.norm((whole @ scene.directions[:, :, None])[..., 0], axis=1)
-        return self.unit * np.abs(np.linalg.det(whole)) / along, jacobian @ (np.eye(2) - stretch)
+        return np.asarray(homography.jacobian(uv) / scene.half_size @ (np.eye(2) - stretch))
 
     def _seen(self, k1: float) -> tuple[Homography, FloatArray]:
         """Return the normalised homography, and its points (S, 2) as a pinhole sees them; NaN near the horizon."""

@@ -158,12 +158,9 @@ def scatter_m(rms: float, sigma_m: float) -> float:
     return rms * max(1.0, rms / (_USUAL_RMS * sigma_m))
 
 
-def robust_rms(residuals: FloatArray, weights: FloatArray, less: float = 0.0) -> float:
-    """Return the scale of residuals (M,) with Cauchy weights: as of `kernels.adjustment.adjust`.
-
-    `less` is taken off the sum of the slopes of their pull.
-    """
-    slopes = max(float((weights * (2.0 * weights - 1.0)).sum()) - less, 0.1 * float(weights.sum()))
+def robust_rms(residuals: FloatArray, weights: FloatArray) -> float:
+    """Return the scale of residuals (M,) with Cauchy weights: as of `kernels.adjustment.adjust`."""
+    slopes = max(float((weights * (2.0 * weights - 1.0)).sum()), 0.1 * float(weights.sum()))
     return math.sqrt(float(((weights * residuals) ** 2).sum()) * float(weights.sum())) / slopes
 
 

@@ -1,5 +1,7 @@
 """The last fit of a place that may be reported takes the whole frame, and no part of it stays beside a street."""
 
+from dataclasses import replace
+
 import cv2
 import numpy as np
 import pytest
@@ -8,9 +10,9 @@ from worlds.scenes import Sight, mapped, sight_of
 from roadgeo.geometry.camera import sampling
 from roadgeo.matching.estimator import MatchOptions, TripleEstimator
 from roadgeo.matching.evidence import Agreement
-from roadgeo.matching.finishing import measure_corners, refine_beside
+from roadgeo.matching.finishing import measure_corners, refine_beside, with_honest_corners
 from roadgeo.matching.growing import Hypothesis
-from roadgeo.matching.refinement import Refined, RefineOptions
+from roadgeo.matching.refinement import Refined, RefineOptions, refine
 
 
 @pytest.mark.parametrize(
@@ -73,3 +75,23 @@ def test_far_from_all_roads_nothing_is_found(town):
     truth, scene = sight_of(town[0], 5)
     nowhere = truth + np.array([[0, 0, 90_000.0], [0, 0, 0], [0, 0, 0]])
     assert refine_beside(Refined(nowhere, np.ones(4), 1.0, np.eye(8)), scene, town[1], RefineOptions()) is None
+
+
+def test_corners_that_depend_on_one_road_are_as_unsure_as_that_road(town):
+    """The mask shows roads in its lower half, and above them one that lies 6 m beside where the map has it."""
+    ratios = []
+    for seed in range(5, 11):
+        truth, whole = sight_of(town[0], seed, tilt=15, sight=Sight(0.6))
+        down = -whole.points[:, 1] / whole.size[1]
+        above = np.flatnonzero(down < 0.3)
+        roads = np.split(above, np.flatnonzero(np.diff(above) != 1) + 1)
+        road = max(roads, key=len)[:10]
+        points, kept = whole.points.copy(), down > 0.55
+        points[road] += 6.0 * whole.directions[road][:, ::-1] * (-1, 1)
+        kept[road] = True
+        scene = replace(whole, points=points, road_length_px=whole.road_length_px * kept.mean()).of_points(kept)
+        nothing = np.full(len(scene.intersections), -1)
+        refined = refine(truth, scene, town[1], nothing, held=True)
+        claimed = with_honest_corners(refined, scene, town[1], RefineOptions()).corner_sigma_m
+        ratios.append(np.mean(gaps(refined.matrix, truth, scene) ** 2) / np.mean(claimed**2))
+    assert np.sqrt(np.mean(ratios)) < 2.0  # 9 by the residuals alone
