@@ -153,7 +153,9 @@ def recognise(table: RoadTable) -> Schema:
         credit = [_OVERTURE]
     elif is_osm and _OSM_NAME in makers.values():
         credit = [OSM_ATTRIBUTION]
-    is_own = any(kinds.get(name) is words for name, words in (("highway", _HIGHWAY), ("fclass", _OSM)))
+    # A table with `highway` and nothing else of OpenStreetMap's was made of roads alone: there a kind is missing.
+    is_whole = any(name in _KNOWN for name in columns if name != "highway")
+    is_own = is_whole and any(kinds.get(name) is words for name, words in (("highway", _HIGHWAY), ("fclass", _OSM)))
     return Schema(tuple(kinds.items()), is_own, next(filter(None, credit), ""))
 
 

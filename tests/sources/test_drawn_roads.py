@@ -34,7 +34,9 @@ def test_a_layer_is_chosen(tmp_path, mask):
 
 def test_streams_are_not_drawn(tmp_path, mask):
     lines, highway, _ = streets()
-    file = write_vector(tmp_path / "a.gpkg", [*lines, lines[0].buffer(0.001).boundary], highway=[*highway, None])
+    names = [str(k) for k in range(len(lines) + 1)]
+    stream = lines[0].buffer(0.001).boundary
+    file = write_vector(tmp_path / "a.gpkg", [*lines, stream], highway=[*highway, None], name=names)
     assert (draw_roads(file).mask.roads == mask).all()
 
 

@@ -133,7 +133,8 @@ def test_measured_and_raised_lines_lose_the_rest(tmp_path):
 @pytest.mark.parametrize(
     ("kinds", "expected"),
     [
-        ({"highway": ["residential", None, "service"]}, ["residential", "service"]),
+        ({"highway": ["residential", None, "service"], "name": ["a", "b", "c"]}, ["residential", "service"]),
+        ({"highway": ["residential", None, "service"]}, ["residential", None, "service"]),
         ({"fclass": ["residential", "primary", "service"]}, ["residential", "primary", "service"]),
         ({"HIGHWAY": ["residential", "primary", "service"]}, ["residential", "primary", "service"]),
         ({"class": ["A", "B", "C"]}, None),

@@ -103,6 +103,7 @@ def test_whom_to_name(columns, attribution):
         ({"highway": ["something_new", "residential", "residential"]}, ["something_new", "residential", "residential"]),
         ({"highway": ["construction", "residential", "service"]}, ["residential", "service"]),
         ({"highway": ["residential", None, ""], "name": ["a", "b", "c"]}, ["residential"]),
+        ({"highway": ["residential", None, ""], "city": ["a", "b", "c"]}, ["residential", None, None]),  # all are roads
         ({"railway": ["rail", None, "no"]}, None),
         ({"highway": [None, None, None], "waterway": ["river", None, None]}, []),
         (
