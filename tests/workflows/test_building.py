@@ -45,7 +45,7 @@ def test_whom_to_name_is_kept(roads, tmp_path):
 
 
 def test_a_table_without_a_crs_is_refused(roads):
-    with pytest.raises(CrsError, match="nothing of its CRS; name it"):
+    with pytest.raises(CrsError, match="has no CRS; name it"):
         build_reference(roads.set_crs(None, allow_override=True))
 
 
@@ -100,10 +100,10 @@ def test_roads_are_taken_however_they_are_held(kind, roads):
 @pytest.mark.parametrize(
     ("given", "error", "match"),
     [
-        ([np.zeros((2, 2))], CrsError, "nothing of its CRS; name it"),
+        ([np.zeros((2, 2))], CrsError, "has no CRS; name it"),
         ([np.zeros((2, 5))], RoadSourceError, r"list cannot be read: coordinates of shape \(2, 5\); expected a path"),
         (7, RoadSourceError, "of type int cannot be read"),
-        ([], CrsError, "nothing of its CRS"),
+        ([], CrsError, "has no CRS"),
     ],
 )
 def test_what_holds_no_roads_is_named(given, error, match):
