@@ -34,7 +34,7 @@ _BRIDGED = 1.5  # a little more than half a step
 _DEFAULT_RESOLUTION_M = 1.0
 _MIN_SIDE, _MAX_ENLARGED = 192, 4096 * 4096  # pixels at the model's scale: a side, an area
 _MOST_ENLARGED = 4.0  # along a side; beyond it time grows, and no more roads are seen
-_TRIED_TILES = 1.87  # side of the part that is tried, tiles: 2 x 2 of them, overlapping by an eighth, cover it
+_TRIED_TILES = 1.875  # side of the part that is tried, tiles: 2 x 2 of them, overlapping by an eighth, cover it
 _DOUBT = 4  # power of the share of probability that lies on roads
 #: Pixels shown to a model in the time of a search. A scale at which it is still to be shown all of the
 #: photograph must promise more.
