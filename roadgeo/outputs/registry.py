@@ -31,6 +31,7 @@ __all__ = [
     "find_outputs",
     "is_result",
     "offered",
+    "result_endings",
 ]
 
 #: Endings of the names of further results, before their suffixes: those of `vectorize` and of `evaluate --map`.
@@ -235,11 +236,15 @@ def _load(name: str) -> Output:
     return output
 
 
-def is_result(name: str) -> bool:
-    """Whether a file of this name is one of our results, or of a plugin's, rather than a mask."""
+def result_endings() -> tuple[str, ...]:
+    """Return how names of results end, ours and those of plugins; all installed packages are asked for it."""
+    return tuple(output.ending for output in (*REGISTRY.values(), *_installed()) if "{" not in output.ending)
+
+
+def is_result(name: str, endings: tuple[str, ...]) -> bool:
+    """Whether a file of this name is a result, by `result_endings`, rather than a mask."""
     stem, _, _ = name.rpartition(".")
-    endings = [output.ending for output in (*REGISTRY.values(), *_installed()) if "{" not in output.ending]
-    return name.lower().endswith(tuple(endings)) or stem.endswith((VECTORIZED, LOCALIZABILITY))
+    return name.lower().endswith(endings) or stem.endswith((VECTORIZED, LOCALIZABILITY))
 
 
 def _installed() -> Iterable[Output]:

@@ -12,7 +12,7 @@ from dataclasses import dataclass
 from pathlib import Path
 
 from roadgeo._text import visible
-from roadgeo.outputs.registry import is_result
+from roadgeo.outputs.registry import is_result, result_endings
 from roadgeo.running.probability_files import ENDING, is_ours
 
 __all__ = ["SUFFIXES", "Task", "find_masks", "name_tasks"]
@@ -60,9 +60,10 @@ def find_masks(arguments: Sequence[str], recursive: bool = False) -> list[str]:
 
 def _images_in(folder: Path, recursive: bool) -> Iterator[Path]:
     """Yield the images of a folder, and of all within it."""
+    endings = result_endings()
     for root, folders, names in os.walk(folder):
         folders[:] = [name for name in sorted(folders) if recursive and not name.startswith(".")]
-        yield from (path for path in (Path(root, name) for name in sorted(names)) if _is_mask(path))
+        yield from (path for path in (Path(root, name) for name in sorted(names)) if _is_mask(path, endings))
 
 
 def _tell_passed_over(folder: Path) -> None:
@@ -75,8 +76,8 @@ def _tell_passed_over(folder: Path) -> None:
         )
 
 
-def _is_mask(path: Path) -> bool:
-    if path.suffix.lower() not in SUFFIXES or path.name.startswith(".") or is_result(path.name):
+def _is_mask(path: Path, endings: tuple[str, ...]) -> bool:
+    if path.suffix.lower() not in SUFFIXES or path.name.startswith(".") or is_result(path.name, endings):
         return False
     return not (path.name.endswith(ENDING) and is_ours(path))
 
