@@ -360,7 +360,7 @@ def _open_frame(paths: Sequence[str], query: QueryOptions, camera: CameraOptions
     only_masks = masks.keys() >= set(paths)
     shown = {scale for *_, scale in tried}
     in_one = scales[0] in shown and not (may_be_finer(scales[0]) and _FINER * scales[0] in shown)
-    in_one = not only_masks and (in_one or math.prod(own) * (k * scales[0]) ** 2 > _MANY_PIXELS)
+    in_one = bool(ways_by_card) and not only_masks and (in_one or math.prod(own) * (k * scales[0]) ** 2 > _MANY_PIXELS)
     least = min(ways_by_card.values(), default=_WAYS)
     has_more = not only_masks and (in_one or least < _WAYS)
     return _Frame(own, k / finer, scales, 1 if in_one else None, _WAYS if has_more else None, see)

@@ -71,6 +71,23 @@ def offset(document: dict, size: int = 1) -> float:
     return float(np.hypot(*(found[:2] / found[2] - expected[:2] / expected[2])))
 
 
+def test_plugins_alone_have_no_more_ways_however_large_the_photograph(
+    photo: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    taken: list[str] = []
+
+    def note(looks, *_):  # type: ignore[no-untyped-def]
+        taken.extend(look.what for look in looks)
+        raise MaskError("that is all")
+
+    monkeypatch.setattr(queries, "locate_looks", note)
+    monkeypatch.setattr(queries, "_MANY_PIXELS", 1)
+    monkeypatch.setattr(queries, "_call_segmenter", lambda *_: RoadMask(np.zeros((10, 10), np.bool_)))
+    locate_query(str(photo), [], query=QueryOptions(segment="always", segmenters=("one", "another")))
+    assert taken
+    assert not any("ways" in one for one in taken)
+
+
 @pytest.mark.parametrize(("segmenters", "ways"), [((), True), (("model",), True), (("plugin",), False)])
 def test_the_second_look_shows_the_photograph_more_ways(
     segmenters: tuple[str, ...], ways: bool, model: str, photo: Path, monkeypatch: pytest.MonkeyPatch
