@@ -264,6 +264,7 @@ def choose_lines(source: RoadLines, name: str, which: RoadKind, tunnels: bool, a
     if area is not None:
         lines, place = cut_lines(shapely.transform(chosen.lines, lambda xy: to_lonlat(str(source.crs), xy)), area)
         chosen = replace(chosen.take(place), lines=lines, crs="EPSG:4326")
+    kindless = 0 if chosen.highway is None else sum(kind is None for kind in chosen.highway)
     meta = {
         "name": name,
         **source.meta,
@@ -272,6 +273,7 @@ def choose_lines(source: RoadLines, name: str, which: RoadKind, tunnels: bool, a
         "other_kinds": int((~wanted).sum()),
         "tunnels": int(hidden.sum()),
         **({"astray": int(astray.sum())} if astray.any() else {}),
+        **({"without_kind": kindless} if kindless else {}),
         "kept": len(chosen.lines),
     }
     return replace(chosen, tunnel=None, meta=meta)

@@ -191,6 +191,9 @@ def tell_source(name: str, meta: Mapping[str, Any]) -> None:
             )
     if "encoding" in meta:
         _LOG.warning("%s: its text is not in the encoding that it names; read as Latin-1, names may be garbled", name)
+    if meta.get("without_kind"):
+        kindless, kept = f"{meta['without_kind']:,}", f"{meta['kept']:,}"
+        _LOG.warning("%s: %s of %s lines have no kind of road; they are taken, paths too", name, kindless, kept)
     if not meta["kinds_known"]:
         _LOG.warning(
             "%s: no column tells what kind of road a line is (as highway, fclass or class do): all %s lines are taken, "

@@ -165,3 +165,10 @@ def test_lines_of_something_else_are_no_roads(tmp_path):
         read_roads(file)
     with pytest.raises(RoadSourceError):
         read_roads(file, which="all")
+
+
+def test_lines_that_are_taken_without_a_kind_are_told(tmp_path, caplog):
+    lines = [shapely.LineString([(0.001 * k, 0), (0.001 * k, 0.01)]) for k in range(3)]
+    file = write_vector(tmp_path / "a.gpkg", lines, highway=["residential", None, None])
+    assert len(read_roads(file).lines) == 3
+    assert "2 of 3 lines have no kind of road; they are taken" in caplog.text
