@@ -21,8 +21,7 @@ from roadgeo.evaluation.simulation import SimulationOptions, ViewOptions
 from roadgeo.evaluation.trials import QuerySet, Trial, run_trials
 from roadgeo.geometry.mask import PIXEL_TO_PLANE, RoadMask
 from roadgeo.matching.index import build_index
-from roadgeo.matching.paper.search import match_pairs
-from roadgeo.matching.paper.tuples import PairIndex, PairOptions, build_pair_index
+from roadgeo.matching.paper import PairIndex, PairOptions, build_pair_index, match_pairs
 from roadgeo.matching.scene import trace_query
 from roadgeo.reference.library import resolve_reference
 from roadgeo.reference.network_file import as_stored, read_network

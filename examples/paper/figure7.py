@@ -14,7 +14,7 @@ import experiments as paper
 import numpy as np
 
 from roadgeo.evaluation.trials import DrawnMasks
-from roadgeo.matching.paper.tuples import build_pair_index
+from roadgeo.matching.paper import build_pair_index
 
 
 def main() -> None:

@@ -22,8 +22,7 @@ from roadgeo.matching.finishing import measure_corners
 from roadgeo.matching.growing import Hypothesis, SharedSweeps
 from roadgeo.matching.index import ReferenceIndex, crop, unpack_tangents
 from roadgeo.matching.options import LocateOptions
-from roadgeo.matching.paper.search import match_pairs
-from roadgeo.matching.paper.tuples import PairIndex, PairOptions, build_pair_index, well_fitted
+from roadgeo.matching.paper import PairIndex, PairOptions, build_pair_index, match_pairs, well_fitted
 from roadgeo.matching.parts import Part, Whole, same_within_m
 from roadgeo.matching.rivals import Rivals, Standing
 from roadgeo.matching.road_search import COARSE_PIXEL_M

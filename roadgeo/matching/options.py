@@ -6,7 +6,7 @@ from dataclasses import dataclass, field
 from typing import Literal
 
 from roadgeo.matching.estimator import MatchOptions
-from roadgeo.matching.paper.tuples import PairOptions
+from roadgeo.matching.paper import PairOptions
 from roadgeo.matching.rivals import RivalOptions
 from roadgeo.matching.search import SearchOptions
 

@@ -1,0 +1,598 @@
+"""The paper's matcher: tuples of two intersections with their tangents, in a hypothesise-and-test search.
+
+Li, Yang, Wang, He, "Road-network-based Rapid Geolocalization" (arXiv 1906.12174), sections 3.2-3.3, complete. Where the
+paper leaves a choice open or a step costs nothing but time, this module decides as follows.
+
+- Equal types at both ends leave open which end is which: such a tuple is looked up both ways.
+- Candidates are drawn without repetition, so k_i draws (eq. 15) need at most N_match tests.
+- The matching pairs of eq. 10 are one to one. Read literally, any number of query intersections may match the same
+  one, and an H that shrinks the image to a few streets passes for a place.
+- The paper's "gold standard" is the Sampson error of all tangents for each hypothesis, and after the search the
+  geometric error of all matched intersections, with guided matching (Hartley & Zisserman, algorithm 4.6).
+- Query tuples of a type that the reference does not hold are not drawn.
+
+A fixed inlier ratio separates right from wrong poorly; this is the baseline that other methods are measured against.
+
+At each end of a tuple every tangent has an angle r in (0, pi), counterclockwise from the connecting line; its cotangent
+falls as the angle grows, so "in one rotational sense, starting from the line" is "falling cotangents". Cross ratios of
+lines in that order are greater than 1, so that a relative error (eq. 6) makes sense; trees hold their logarithms.
+
+Frames: query plane in pixels and reference plane in metres, both y up (see `geometry.mask`); x_ref = H x_query.
+"""
+
+from __future__ import annotations
+
+import math
+import time
+from collections.abc import Mapping
+from dataclasses import dataclass
+from functools import cache
+from itertools import combinations
+from typing import Any, Literal, NamedTuple
+
+import numpy as np
+
+from roadgeo._arrays import BoolArray, FloatArray, IntArray
+from roadgeo.errors import IndexFormatError
+from roadgeo.geometry.homography import Homography
+from roadgeo.kernels.pairs import PairBuckets, count_inliers
+from roadgeo.kernels.roads import road_residuals
+from roadgeo.matching.index import ReferenceIndex, neighbour_grid, sort_by_bucket
+from roadgeo.matching.refinement import denormalise, normalise
+from roadgeo.matching.scene import MIN_COS
+from roadgeo.roads.intersections import Intersections
+
+__all__ = ["PairIndex", "PairMatch", "PairOptions", "build_pair_index", "match_pairs", "well_fitted"]
+
+#: A dense city of 15,000 intersections has some millions; each takes about 100 bytes while the tables are built.
+_MAX_TUPLES = 30_000_000
+#: Greatest probability to miss a place that is there (lambda, eq. 13).
+_LAMBDA = 0.01
+#: Of larger queries, this many intersections at random form the tuples; all of them still judge.
+_MAX_TUPLE_INTERSECTIONS = 1000
+#: Section 4.2 asks for 15 pixels, of 1 m, of every branch, and an average distance of half a pixel from the tangent.
+#: Branches begin `_SKIP_M` from the intersection (see `IntersectionOptions`), and are looked at in such steps; roads
+#: further off, or turned from the branch by more, are others.
+_LENGTH_M, _MAX_ERROR_M, _SKIP_M, _STEP_M, _REACH_M = 15.0, 0.5, 8.0, 3.0, 6.0
+#: Intersections tested in one kernel call, about a tenth of a second: the grain of the limits.
+_TESTS_PER_CALL = 5_000_000
+#: Seconds of a usual machine, on masks of Liège: of a query tuple, of a candidate, and of an intersection by which a
+#: hypothesis is judged, which is given up as soon as too many miss.
+_SAMPLE_S, _TESTED_S, _COUNTED_S = 0.35e-3, 0.1e-6, 0.04e-6
+
+
+@dataclass(frozen=True)
+class PairOptions:
+    """Thresholds of the paper, by its symbols. Those that the paper states are 0.3, 0.5 and 30.
+
+    Attributes
+    ----------
+    d_max_m : float
+        Greatest distance between the two intersections of a reference tuple (eq. 8).
+    min_line_angle_deg : float
+        Least angle between a tangent and the connecting line (eq. 7).
+    delta_cross_ratio : float
+        Relative error allowed in every cross ratio (eq. 6).
+    tangent_orders : {"++", "all"}
+        Correspondences of the tangents tried (section 3.2): both ends in the same rotational sense, the only physical
+        one, with w > 0 all over the frame; or all four, anything going.
+    lambda_1 : float
+        Greatest probability to miss a tuple's counterpart that is there (eq. 14).
+    p_query : float
+        Probability that a query tuple has its counterpart in the reference (eq. 12).
+    delta_inlier : float
+        Inlier ratio above which a place is found.
+    inlier_distance_m : float
+        How close to an intersection of the same type a mapped one must come (eq. 10).
+    one_to_one : bool
+        Let each reference intersection match once only. False: eq. 10 to the letter.
+    min_intersections : int
+        Queries with fewer are not searched.
+    rarest_first : bool
+        Draw query tuples of types rare in the reference first (section 3.3). False: all types alike.
+    work_limit_s, time_limit_s : float
+        The search stops after this amount of work, counted in seconds of a usual machine, or this time by the clock.
+    """
+
+    d_max_m: float = 1000.0
+    min_line_angle_deg: float = 15.0
+    delta_cross_ratio: float = 0.3
+    tangent_orders: Literal["++", "all"] = "++"
+    lambda_1: float = 0.05
+    p_query: float = 0.01
+    delta_inlier: float = 0.5
+    inlier_distance_m: float = 20.0
+    one_to_one: bool = True
+    min_intersections: int = 30
+    rarest_first: bool = True
+    work_limit_s: float = 10.0
+    time_limit_s: float = 60.0
+
+
+# --- tuples of the reference ------------------------------------------------------------------------------------------
+
+
+class Tuples(NamedTuple):
+    """Tuples of one type: (P, 2) intersections, and a `scipy` tree of their D cross ratios, None where D = 0."""
+
+    pairs: IntArray
+    tree: Any
+
+
+@dataclass(frozen=True, eq=False)
+class PairIndex:
+    """Reference tuples hashed by type, with one search tree of cross ratios for each type.
+
+    Attributes
+    ----------
+    codes : (N,) int64
+        Types of the intersections, 16 N_B + N_q.
+    tuples : mapping of int to Tuples
+        By type, 256 times the code of the first end and that of the second; the first is never the greater.
+    """
+
+    reference: Intersections
+    codes: IntArray
+    tuples: Mapping[int, Tuples]
+    buckets: PairBuckets
+
+    def __len__(self) -> int:
+        """Return the number of all tuples."""
+        return sum(len(one.pairs) for one in self.tuples.values())
+
+
+def build_pair_index(intersections: Intersections, options: PairOptions | None = None) -> PairIndex:
+    """Extract, hash and sort the reference's tuples (section 3.3, "Sampling in reference map").
+
+    Of the options `d_max_m` and `min_line_angle_deg` matter.
+
+    Raises
+    ------
+    IndexFormatError
+        More intersections lie close to each other than on any map.
+    """
+    from scipy.spatial import cKDTree
+
+    options, xy = options or PairOptions(), intersections.xy
+    codes = type_codes(intersections)
+    pairs = list_pairs(intersections, np.arange(len(xy)), options.d_max_m, options)
+    keys = type_keys(codes, pairs)
+    order = np.argsort(keys, kind="stable")
+    tuples = {}
+    for of_type in np.split(pairs[order], np.flatnonzero(np.diff(keys[order])) + 1) if len(pairs) else []:
+        step = (xy[of_type[:, 1]] - xy[of_type[:, 0]]).T
+        ratios = [cross_ratios(cotangents(intersections, ends, *step)) for ends in of_type.T]
+        logs = np.log(np.concatenate(ratios, axis=1))
+        tree = cKDTree(logs, balanced_tree=False, compact_nodes=False) if logs.shape[1] else None
+        tuples[int(type_keys(codes, of_type[:1])[0])] = Tuples(of_type, tree)
+    grid, shape = neighbour_grid(xy, min_bucket=10.0) if len(xy) else ((0.0, 0.0, 1.0), (1, 1))
+    items, starts = sort_by_bucket(xy, grid, shape)
+    return PairIndex(intersections, codes, tuples, PairBuckets(xy[items], codes[items], starts, grid, shape))
+
+
+def list_pairs(found: Intersections, chosen: IntArray, d_max: float, options: PairOptions) -> IntArray:
+    """Return the (P, 2) tuples of (chosen) intersections that pass eq. 7-8, the end of lesser code first.
+
+    Raises
+    ------
+    IndexFormatError
+        They would fill the memory.
+    """
+    from scipy.spatial import cKDTree
+
+    tree = cKDTree(found.xy[chosen])
+    if len(chosen) ** 2 > _MAX_TUPLES:
+        count = (int(tree.count_neighbors(tree, d_max)) - len(chosen)) // 2
+        if count > _MAX_TUPLES:
+            raise IndexFormatError(
+                f"the map has {count:,} pairs of intersections nearer than {d_max:g} m, expected at most"
+                f" {_MAX_TUPLES:,}; the paper's method does not fit it: use the usual one"
+            )
+    pairs = chosen[tree.query_pairs(d_max, output_type="ndarray").reshape(-1, 2)]
+    dx, dy = (found.xy[pairs[:, 1]] - found.xy[pairs[:, 0]]).T
+    phi, least = np.arctan2(dy, dx), math.sin(math.radians(options.min_line_angle_deg))
+    passes = (dx != 0.0) | (dy != 0.0)
+    for ends in pairs.T:
+        passes &= found.n_tangents[ends] >= 2  # fewer cannot carry a homography (eq. 9)
+        # NaN: there is none
+        passes &= ~(np.abs(np.sin(found.tangents[ends] - phi[:, None])) <= least).any(axis=1)
+    pairs, codes = np.sort(pairs[passes], axis=1), type_codes(found)
+    swapped = codes[pairs[:, 0]] > codes[pairs[:, 1]]
+    pairs[swapped] = pairs[swapped, ::-1]
+    return np.asarray(pairs)
+
+
+def type_codes(intersections: Intersections) -> IntArray:
+    """Return the (N,) types of intersections, 16 N_B + N_q."""
+    return (16 * intersections.n_branches + intersections.n_tangents).astype(np.int64)
+
+
+def type_keys(codes: IntArray, pairs: IntArray) -> IntArray:
+    """Return the (P,) types of tuples (see `PairIndex.tuples`)."""
+    return np.asarray(256 * codes[pairs[:, 0]] + codes[pairs[:, 1]])
+
+
+def cotangents(found: Intersections, ends: IntArray, dx: FloatArray, dy: FloatArray) -> FloatArray:
+    """Return the (P, N_q) cotangents, falling, of the tangents of `ends` (P,), all of one N_q, relative to lines."""
+    tangents = found.tangents[ends, : int(found.n_tangents[ends[0]])].astype(float)
+    return np.asarray(-np.sort(-1.0 / np.tan(tangents - np.arctan2(dy, dx)[:, None]), axis=1))
+
+
+def cross_ratios(cot: FloatArray) -> FloatArray:
+    """Return (P, D) cross ratios (a, b; c, d) = sin(ac) sin(bd) / (sin(bc) sin(ad)) of fours of lines (eq. 4).
+
+    They are concurrent: the tangents and the connecting line, whose cotangent is infinite, so that two factors cancel.
+    """
+    by_line, others = _fours(cot.shape[1])
+    b, c, d = cot[:, by_line].transpose(2, 0, 1)
+    first = (b - d) / (b - c)
+    a, b, c, d = cot[:, others].transpose(2, 0, 1)
+    return np.concatenate((first, (a - c) * (b - d) / ((b - c) * (a - d))), axis=1)
+
+
+@cache
+def _fours(n: int) -> tuple[IntArray, IntArray]:
+    """Return threes of n tangents, which make fours with the connecting line, and fours of them."""
+    three, four = (np.array(list(combinations(range(n), k)), np.int64).reshape(-1, k) for k in (3, 4))
+    return three, four
+
+
+def well_fitted(index: ReferenceIndex) -> BoolArray:
+    """Return which intersections (N,) have branches that are all long and straight enough (section 4.2)."""
+    vectors = index.branches.astype(float) / 127.0
+    at, column = np.nonzero(vectors.any(axis=2))
+    ahead = vectors[at, column]
+    ahead /= np.linalg.norm(ahead, axis=1, keepdims=True)
+    steps = _SKIP_M + np.arange(0.0, _LENGTH_M + 1e-9, _STEP_M)
+    points = (index.xy[at, None] + steps[:, None] * ahead[:, None]).reshape(-1, 2)
+    along, out = np.repeat(ahead, len(steps), axis=0), np.empty((len(points), 3))
+    road_residuals(np.eye(3), points, along, np.full(len(points), _REACH_M), MIN_COS, index.road_buckets, out)
+    across = np.column_stack([-along[:, 1], along[:, 0]])
+    offsets = (out[:, 0] * (out[:, 1:] * across).sum(axis=1)).reshape(-1, len(steps))
+    # Residuals of the line fitted to a branch, which need not meet the intersection; NaN: it is too short.
+    basis = np.linalg.qr(np.column_stack([np.ones(len(steps)), steps]))[0]
+    error = np.abs(offsets - offsets @ basis @ basis.T).mean(axis=1)
+    good = np.ones(len(index), bool)
+    good[at[~(error <= _MAX_ERROR_M)]] = False
+    return good
+
+
+# --- the search -------------------------------------------------------------------------------------------------------
+
+
+@dataclass(frozen=True)
+class PairMatch:
+    """The result of the search. Dimensions: M matched intersections.
+
+    Attributes
+    ----------
+    homography : (3, 3) float64 or None
+        Query plane to reference plane, w = 1 at the frame's centre. None: not located.
+    matches : (M, 2) int64
+        Query intersection, and the reference intersection near which it lands.
+    inlier_ratio : float
+        M over the query's intersections (eq. 10); 0 where not located.
+    n_samples, n_sum, candidates : int
+        Query tuples drawn (l), the sum of their k_i (eq. 15) and that of their N_match.
+    hypotheses : int
+        Homographies whose inliers were counted.
+    confidence : float
+        Probability that the search, as far as it got, finds a place that is there: 1 - P_fail-sum (eq. 12).
+    stopped : str
+        Why the search ended: "accepted", "exhausted", or a limit, "work" or "time"; "" where there was none.
+    work_s : float
+        The work done, in seconds of a usual machine.
+    """
+
+    homography: FloatArray | None
+    matches: IntArray
+    inlier_ratio: float
+    n_samples: int
+    n_sum: int
+    candidates: int
+    hypotheses: int
+    confidence: float
+    reason: str
+    stopped: str
+    work_s: float
+    seconds: float
+
+
+def query_draws(lambda_: float, lambda_1: float, p_query: float) -> int:
+    """Return the number l of query tuples to draw (eq. 16)."""
+    return math.floor(math.log(lambda_) / math.log(1.0 - p_query + p_query * lambda_1)) + 1
+
+
+def reference_draws(n_match: int, lambda_1: float) -> int:
+    """Return the number k_i of candidates to draw from N_match, with replacement (eq. 15)."""
+    if n_match <= 1:
+        return n_match
+    return math.floor(math.log(lambda_1) / math.log1p(-1.0 / n_match)) + 1
+
+
+def match_pairs(
+    query: Intersections, index: PairIndex, frame: FloatArray, options: PairOptions | None = None, seed: int = 0
+) -> PairMatch:
+    """Find the query on the reference (Algorithm 1).
+
+    Parameters
+    ----------
+    query : Intersections
+        Query plane, pixels.
+    frame : (4, 2) float64
+        The image's corners in the query plane.
+    seed : int
+        Of the random draws.
+    """
+    options = options or PairOptions()
+    search = _Search(query, index, np.asarray(frame, float), options, np.random.default_rng(seed))
+    if len(query) < options.min_intersections:
+        return search.report(f"only {len(query)} intersections, {options.min_intersections} are needed")
+    for (a, b), key in search.draw_query_tuples():
+        search.test(a, b, key)
+        if search.homography is not None:
+            return search.located(search.homography)
+        if search.spent:
+            return search.cut_short(search.spent)
+    return search.report(
+        f"no such place (confidence {search.confidence:.3g}): none matched more than {options.delta_inlier:.0%} of the "
+        f"intersections in {search.n_samples} query tuples and {search.hypotheses} hypotheses",
+        "exhausted",
+    )
+
+
+class _Correspondence(NamedTuple):
+    """One way in which a query tuple may correspond to reference tuples of its type: which end, which tangent orders.
+
+    Attributes
+    ----------
+    ends : (2,) int64
+        Query intersections that become P1 and P2.
+    cotangents : two (N_q,) arrays
+        Of their tangents, relative to the connecting line, in the order in which they correspond.
+    candidates : (C, 2) int64
+        Reference tuples with like cross ratios.
+    """
+
+    ends: IntArray
+    cotangents: tuple[FloatArray, FloatArray]
+    candidates: IntArray
+
+
+class _Search:
+    """Algorithm 1 under way: the best hypothesis until now, and the counts."""
+
+    def __init__(
+        self,
+        query: Intersections,
+        index: PairIndex,
+        frame: FloatArray,
+        options: PairOptions,
+        rng: np.random.Generator,
+    ) -> None:
+        self.begin = time.perf_counter()
+        self.query, self.index, self.frame, self.options, self.rng = query, index, frame, options, rng
+        self.codes = type_codes(query)
+        # Rare types miss most often where a hypothesis is wrong: they judge first.
+        self.judges = np.argsort(np.bincount(index.codes, minlength=256)[self.codes], kind="stable")
+        self.best = math.floor(options.delta_inlier * len(query))
+        self.homography: FloatArray | None = None
+        self.n_samples = self.n_sum = self.candidates = self.tested = self.hypotheses = 0
+        self.log_p_fail = 0.0
+
+    @property
+    def work_s(self) -> float:
+        counted = len(self.query) * self.hypotheses
+        return _SAMPLE_S * self.n_samples + _TESTED_S * self.tested + _COUNTED_S * counted
+
+    @property
+    def spent(self) -> str:
+        """Return which limit is reached: "work", "time", or "" for neither."""
+        if self.work_s >= self.options.work_limit_s:
+            return "work"
+        return "time" if time.perf_counter() - self.begin > self.options.time_limit_s else ""
+
+    @property
+    def confidence(self) -> float:
+        return -math.expm1(self.log_p_fail)
+
+    def draw_query_tuples(self) -> list[tuple[list[int], int]]:
+        """Draw l query tuples with their types, those rare in the reference first, at random within a type."""
+        options, rng, tuples = self.options, self.rng, self.index.tuples
+        chosen = np.arange(len(self.query))
+        if len(chosen) > _MAX_TUPLE_INTERSECTIONS:
+            chosen = rng.choice(chosen, _MAX_TUPLE_INTERSECTIONS, replace=False)
+        pairs = list_pairs(self.query, chosen, np.inf, options)
+        keys = type_keys(self.codes, pairs)
+        order = rng.permutation(np.flatnonzero(np.isin(keys, list(tuples))))
+        if options.rarest_first:
+            order = order[np.argsort([len(tuples[key].pairs) for key in keys[order].tolist()], kind="stable")]
+        drawn = order[: query_draws(_LAMBDA, options.lambda_1, options.p_query)]
+        return list(zip(pairs[drawn].tolist(), keys[drawn].tolist(), strict=True))
+
+    def correspondences(self, a: int, b: int, key: int) -> list[_Correspondence]:
+        """Find the candidates of the query tuple (a, b) by the matching rules (section 3.2, eq. 6)."""
+        options, (pairs, tree) = self.options, self.index.tuples[key]
+        low, high = math.log1p(-options.delta_cross_ratio), math.log1p(options.delta_cross_ratio)
+        found = []
+        for ends in np.array([(a, b), (b, a)] if self.codes[a] == self.codes[b] else [(a, b)]):
+            step = self.query.xy[ends[1]] - self.query.xy[ends[0]]
+            falling = [cotangents(self.query, ends[k : k + 1], step[:1], step[1:])[0] for k in (0, 1)]
+            for signs in [(1, 1)] if options.tangent_orders == "++" else [(1, 1), (1, -1), (-1, 1), (-1, -1)]:
+                # Clockwise, angles count the other way round: cotangents change sign and, to fall again, order.
+                first, second = (sign * cot[::sign] for sign, cot in zip(signs, falling, strict=True))
+                candidates = pairs
+                if tree is not None:
+                    d_c = np.log(np.concatenate((cross_ratios(first[None]), cross_ratios(second[None])), axis=1))[0]
+                    rows = tree.query_ball_point(d_c + (low + high) / 2.0, (high - low) / 2.0, p=np.inf)
+                    candidates = pairs[np.sort(np.array(rows, np.int64))]
+                found.append(_Correspondence(ends, (first * signs[0], second * signs[1]), candidates))
+        return found
+
+    def test(self, a: int, b: int, key: int) -> None:
+        """Draw candidates for the query tuple (a, b) of type `key` and test them, within the limits."""
+        correspondences = self.correspondences(a, b, key)
+        n_match = sum(len(one.candidates) for one in correspondences)
+        k = reference_draws(n_match, self.options.lambda_1)
+        tested = 0
+        for one in correspondences:
+            n = len(one.candidates)
+            tested += self._test(one, min(n, math.ceil(k * n / max(n_match, 1))))
+        self.n_samples += 1
+        self.n_sum += k
+        self.candidates += n_match
+        self.log_p_fail += math.log1p(-self.options.p_query * (tested / n_match if n_match else 1.0))
+
+    def _test(self, one: _Correspondence, n_draws: int) -> int:
+        """Test `n_draws` candidates in random order; return how many the limits allowed."""
+        drawn, done = self.rng.permutation(len(one.candidates))[:n_draws], 0
+        # The kernel comes back now and then, for a look at the limits.
+        per_call = max(1, _TESTS_PER_CALL // len(self.query))
+        while done < n_draws and not self.spent:
+            some = one.candidates[drawn[done : done + per_call]]
+            models = self.models(one, some)
+            self.best, row = self.count(models, self.best)
+            if row >= 0:
+                self.homography = models[row]
+            self.hypotheses += len(models)
+            self.tested += len(some)
+            done += len(some)
+        return done
+
+    def models(self, one: _Correspondence, candidates: IntArray) -> FloatArray:
+        """Return (H, 3, 3), the homographies of candidates from all lines in closed form (eq. 9), as a camera may see.
+
+        Both planes are taken to frames where P1 = (0, 0) and P2 = (1, 0): a normalisation under which every homography
+        that keeps the connecting line is ``[[a1, b1, 0], [0, 1, 0], [a1 - a2, b1 - b2, a2]]``, and eq. 9 falls apart
+        into one linear equation cot r' = a_i cot r + b_i for each tangent at P_i. It is not mirrored and has no horizon
+        between the two ends just if a1, a2 > 0.
+        """
+        reference, (first, second) = self.index.reference, self.query.xy[one.ends]
+        step = (reference.xy[candidates[:, 1]] - reference.xy[candidates[:, 0]]).T
+        (a1, b1), (a2, b2) = (
+            fit_pencils(cot, cotangents(reference, ends, *step))
+            for cot, ends in zip(one.cotangents, candidates.T, strict=True)
+        )
+        zero, unit = np.zeros_like(a1), np.ones_like(a1)
+        between = _stacked([[a1, b1, zero], [zero, unit, zero], [a1 - a2, b1 - b2, a2]])
+        (x, y), (dx, dy) = reference.xy[candidates[:, 0]].T, step
+        from_pair = _stacked([[dx, -dy, x], [dy, dx, y], [zero, zero, unit]])
+        (ex, ey), (x, y) = (second - first) / np.sum((second - first) ** 2), first
+        into_pair = np.array([[ex, ey, -ex * x - ey * y], [-ey, ex, ey * x - ex * y], [0.0, 0.0, 1.0]])
+        models = from_pair @ between @ into_pair
+        if self.options.tangent_orders == "all":
+            return np.asarray(models)
+        in_front = (np.column_stack([self.frame, np.ones(4)]) @ models[:, 2].T > 0.0).all(axis=0)
+        return np.asarray(models[(a1 > 0.0) & (a2 > 0.0) & in_front])
+
+    def count(self, models: FloatArray, best: int) -> tuple[int, int]:
+        """Return the greatest inlier count (eq. 10) and its model, or `best` and -1; see `kernels.pairs`."""
+        options = self.options
+        xy, codes = self.query.xy[self.judges], self.codes[self.judges]
+        radius, one_to_one = options.inlier_distance_m, options.one_to_one
+        return count_inliers(models, xy, codes, self.index.buckets, radius, one_to_one, best)
+
+    def matches(self, homography: FloatArray) -> IntArray:
+        """Return the (M, 2) matching pairs MP under a homography (eq. 10)."""
+        from scipy.spatial import cKDTree
+
+        reference, codes = self.index.reference, self.index.codes
+        with np.errstate(divide="ignore", invalid="ignore"):
+            xy = np.nan_to_num(Homography(homography).everywhere(self.query.xy), nan=1e300, posinf=1e300, neginf=1e300)
+        nearest, distance = np.full(len(xy), -1), np.full(len(xy), np.inf)
+        for code in np.unique(self.codes):
+            here, there = np.flatnonzero(self.codes == code), np.flatnonzero(codes == code)
+            if len(there):
+                away, found = cKDTree(reference.xy[there]).query(
+                    xy[here], distance_upper_bound=self.options.inlier_distance_m
+                )
+                near = np.isfinite(away)
+                nearest[here[near]], distance[here[near]] = there[found[near]], away[near]
+        found = np.flatnonzero(nearest >= 0)
+        if self.options.one_to_one:
+            closest_first = found[np.argsort(distance[found], kind="stable")]
+            found = np.sort(closest_first[np.unique(nearest[closest_first], return_index=True)[1]])
+        return np.column_stack([found, nearest[found]])
+
+    def located(self, homography: FloatArray) -> PairMatch:
+        """Refine the best homography on its matches, as long as that matches more, and report it."""
+        matches = self.matches(homography)
+        for _ in range(5):
+            refined = fit_points(homography, self.query.xy[matches[:, 0]], self.index.reference.xy[matches[:, 1]])
+            rematched = self.matches(refined)
+            w = Homography(refined).w(self.frame)
+            is_allowed = self.options.tangent_orders == "all" or bool(np.all(w * w[0] > 0))
+            if len(rematched) < len(matches) or not is_allowed:
+                break
+            is_stable = np.array_equal(rematched, matches)
+            homography, matches = refined, rematched
+            if is_stable:
+                break
+        reason = (
+            f"{len(matches)} of {len(self.query)} intersections ({len(matches) / len(self.query):.0%}) match, after"
+            f" {self.n_samples} query tuples and {self.hypotheses} hypotheses"
+        )
+        middle = self.frame.mean(axis=0)
+        return self.report(reason, "accepted", homography / Homography(homography).w(middle), matches)
+
+    def cut_short(self, limit: str) -> PairMatch:
+        """Report that no place was found before a limit was reached."""
+        options = self.options
+        ended = "after as much work as a search may take"
+        if limit == "time":
+            ended = f"at the time limit of {options.time_limit_s:g} s, so that a machine with less to do may find more"
+        return self.report(
+            f"stopped {ended}; {self.n_samples} query tuples (confidence {self.confidence:.3g}): none matched more "
+            f"than {options.delta_inlier:.0%} of the intersections",
+            limit,
+        )
+
+    def report(
+        self, reason: str, stopped: str = "", homography: FloatArray | None = None, matches: IntArray | None = None
+    ) -> PairMatch:
+        """Report a place, or that none was found."""
+        matched = np.empty((0, 2), np.int64) if matches is None else matches
+        ratio, seconds = len(matched) / max(len(self.query), 1), time.perf_counter() - self.begin
+        counts = self.n_samples, self.n_sum, self.candidates, self.hypotheses, self.confidence
+        return PairMatch(homography, matched, ratio, *counts, reason, stopped, self.work_s, seconds)
+
+
+def _stacked(rows: list[list[FloatArray]]) -> FloatArray:
+    """Return (C, 3, 3) matrices of three rows of three elements (C,)."""
+    return np.moveaxis(np.array(rows), 2, 0)
+
+
+def fit_pencils(query: FloatArray, reference: FloatArray) -> tuple[FloatArray, FloatArray]:
+    """Fit cot r' = alpha cot r + beta to the lines (n,) of a pencil and (C, n) of others: two (C,) arrays.
+
+    It is exact for two lines, gold standard for more: each is weighted by the inverse variance of its equation when all
+    angles r, r' carry equal noise (the Sampson error, Hartley & Zisserman 4.2.6), from d cot r = -(1 + cot^2 r) dr.
+    """
+    alpha = (reference[:, 0] - reference[:, -1]) / (query[0] - query[-1])
+    beta = reference[:, 0] - alpha * query[0]
+    for _ in range(3 if len(query) > 2 else 0):
+        w = 1.0 / ((alpha[:, None] * (1.0 + query**2)) ** 2 + (1.0 + reference**2) ** 2)
+        sw, sx, sy, sxx, sxy = ((w * of).sum(axis=1) for of in (1.0, query, reference, query**2, query * reference))
+        alpha = (sw * sxy - sx * sy) / (sw * sxx - sx * sx)
+        beta = (sy - alpha * sx) / sw
+    return alpha, beta
+
+
+def fit_points(homography: FloatArray, query_xy: FloatArray, reference_xy: FloatArray) -> FloatArray:
+    """Minimise the squared distances |H x - x'| over all pairs of points, from a given homography.
+
+    Gold standard for errors in the reference plane only (Hartley & Zisserman, section 4.2). Returns the given
+    homography where the points cannot carry eight parameters.
+    """
+    from scipy.optimize import least_squares
+
+    if len(query_xy) < 4:
+        return homography
+    middle, spread = query_xy.mean(axis=0), float(query_xy.std()) or 1.0
+    p, origin, unit = normalise(homography, middle, spread)
+    uv, places = (query_xy - middle) / spread, (reference_xy - origin) / unit
+
+    def off(p: FloatArray) -> FloatArray:
+        return np.asarray((Homography(np.append(p, 1.0).reshape(3, 3)).everywhere(uv) - places).ravel())
+
+    return denormalise(least_squares(off, p, method="lm", xtol=1e-12, ftol=1e-12).x, middle, spread, origin, unit)
