@@ -15,12 +15,11 @@ from roadgeo.errors import RoadSourceError
 from roadgeo.geometry.mask import RoadMask
 from roadgeo.kernels.warmup import warm_up
 from roadgeo.location import Location
-from roadgeo.matching.explanation import Explanation, tell
+from roadgeo.matching.explanation import Explanation, tell, true_place
 from roadgeo.matching.index import build_index
 from roadgeo.matching.methods import Found, search_references
 from roadgeo.matching.options import LocateOptions
 from roadgeo.matching.scene import Query, read_query
-from roadgeo.matching.truth import true_place
 from roadgeo.matching.verdict import decide, needed_of
 from roadgeo.reference.reference import AnyReference, BuildOptions, Reference, build_network, open_whole, stored_options
 from roadgeo.roads.kinds import RoadKind

@@ -1,34 +1,6 @@
 """Why a mask was or was not located: how far the search got, the best rejected places, and the missing evidence.
 
-`Explanation.to_dict` gives schema `roadgeo.explanation/1`:
-
-============  ==========================================================================================================
-query         as in `Location`, and so are `status`, `reason`, `reason_code`, `version`, `options`, `command` and
-              `reference_digest`
-seen          `intersections` (of very many, those nearest to the middle), how many of them have two
-              tangents or more, `roads`, their length and the frame's size in pixels, the share of it that was observed
-searches      one for each reference, in the order in which they were searched:
-
-              `reference`, `stopped` ("accepted", "exhausted", "work" or "time", "elsewhere": a place on another
-              reference ended the search, or "" where there was nothing to search for), `needed` (the least log10 odds
-              and margin)
-
-              `funnel`, input and output of each stage: `anchors` (intersections tried), `tuples` of the
-              mask looked up, `candidates` (tuples of the map like them), `proposals` (places on which several agree),
-              `on_roads` (those that put the roads around the anchor on roads), `grown` (followed outwards), `survived`
-              (not given up on the way), `verified` (different ones, refined and compared with the map), `measured`
-              (likely ones that were compared with all places nearby)
-
-              `camera_refusals`: how often which reason kept a place that had grown from being verified
-
-              `starved_at`: the first stage that nothing came out of, "odds" or "margin"; null where it was located
-
-              `missing`: sentences
-
-              `truth`: the fate of the true place, where it was given; see `truth.TruthStory`
-
-              `places`: the best ones, best first; see `RejectedPlace`
-============  ==========================================================================================================
+`Explanation.to_dict` gives schema `roadgeo.explanation/1`, which `outputs/schemas` describes.
 """
 
 from __future__ import annotations
@@ -37,59 +9,83 @@ import math
 from collections import Counter
 from collections.abc import Sequence
 from dataclasses import asdict, dataclass, replace
+from functools import cached_property
+from pathlib import Path
 from typing import Any
 
 import numpy as np
 
 from roadgeo import __version__
 from roadgeo._arrays import BoolArray, FloatArray
-from roadgeo.geometry.camera import CameraFault, CameraOptions, pose, sampling
+from roadgeo.geometry.camera import CameraFault, CameraOptions, CameraPose, pose, sampling
 from roadgeo.geometry.homography import Homography
-from roadgeo.geometry.projection import to_lonlat
+from roadgeo.geometry.projection import from_lonlat, to_lonlat
 from roadgeo.kernels.roads import road_residuals
 from roadgeo.location import Location, Place
 from roadgeo.matching.estimator import TripleEstimator
 from roadgeo.matching.events import Events, Scored
-from roadgeo.matching.evidence import Agreement, agreement, tolerance_m
+from roadgeo.matching.evidence import agreement, tolerance_m
 from roadgeo.matching.growing import Hypothesis
 from roadgeo.matching.methods import Found
+from roadgeo.matching.options import LocateOptions
+from roadgeo.matching.placing import center_of
 from roadgeo.matching.scene import MIN_COS, Query, Scene
 from roadgeo.matching.search import Search
-from roadgeo.matching.truth import TruthStory, tell_truth
 from roadgeo.matching.verdict import Needed
 from roadgeo.roads.graph import RoadGraph
 
-__all__ = ["SCHEMA", "Explanation", "Funnel", "RejectedPlace", "Story", "tell"]
+__all__ = ["SCHEMA", "Explanation", "Funnel", "RejectedPlace", "Story", "TruthStory", "tell", "true_place"]
 
 SCHEMA = "roadgeo.explanation/1"
 
 #: Places that are shown.
 _MAX_PLACES = 6
-
 #: Masks with fewer intersections are seldom located.
 _USUAL_INTERSECTIONS = 6
-
 #: Places that a camera refused which are looked at again, and how many of those are kept.
 _MAX_RETRIED, _MAX_REFUSED, _MAX_ELSEWHERE = 6, 200, 20
-
 #: Limits that a user may have set too narrow; other faults hold for every camera.
 _NEGOTIABLE = (CameraFault.SAMPLING, CameraFault.SKEW, CameraFault.TILT, CameraFault.HEADING)
+#: How far the middle of a rough proposal may lie from the truth, in halves of the frame's diagonal, and at least.
+_ROUGHLY, _AT_LEAST_M = 0.25, 50.0
+#: Pixels that are greater hardly reach as far as intersections are.
+_LARGE_PIXEL_M = 5.0
+
+#: What is missing where nothing came out of a stage.
+_NOTHING = {
+    "anchors": "no intersection has three neighbours and tangents that make usable tuples",
+    "tuples": "no intersection has three neighbours and tangents that make usable tuples",
+    "candidates": "no tuple of the mask's intersections is like one of the map's",
+    "proposals": "nowhere on the map do two tuples that share an intersection agree",
+    "on_roads": "wherever tuples agree, the roads around them do not",
+    "survived": "whatever was followed outwards met too few intersections where they should be",
+}
+#: The stage that lost the true place, and how, by the last one that met it.
+_LOST = {
+    "camera": ("camera", "grew, but the camera's limits refused it"),
+    "verified": ("verified", "grew, but could not be refined to the map's roads"),
+    "survived": ("verified", "grew, but was not among the best of its intersection"),
+    "on_roads": ("survived", "was proposed, but what was followed outwards from there did not fit"),
+    "proposals": ("on_roads", "was proposed, but the roads around the intersection did not agree"),
+    "": ("proposals", "was never proposed: no intersection and its neighbours are intact enough"),
+}
+_MET = ("proposals", "on_roads", "survived", "camera", "verified")
 
 
 @dataclass(frozen=True)
 class Funnel:
-    """The output of each stage, in order; see the module's text."""
+    """The output of each stage, in order."""
 
     intersections: int = 0
-    anchors: int = 0
-    tuples: int = 0
-    candidates: int = 0
-    proposals: int = 0
-    on_roads: int = 0
-    grown: int = 0
-    survived: int = 0
-    verified: int = 0
-    measured: int = 0
+    anchors: int = 0  # intersections tried
+    tuples: int = 0  # of the mask, looked up
+    candidates: int = 0  # tuples of the map like them
+    proposals: int = 0  # places on which several agree
+    on_roads: int = 0  # those that put the roads around the anchor on roads
+    grown: int = 0  # followed outwards
+    survived: int = 0  # not given up on the way
+    verified: int = 0  # different ones, refined and compared with the map
+    measured: int = 0  # likely ones that were compared with all places nearby
 
 
 @dataclass(frozen=True)
@@ -98,46 +94,34 @@ class RejectedPlace:
 
     Attributes
     ----------
-    matrix : (3, 3) float64
-        Query plane to reference plane.
+    scored : Scored
+        The hypothesis, its odds, and the camera's objection if that ended it.
     footprint, footprint_lonlat : (4, 2) float64
         Corners TL, TR, BR, BL, plane metres and longitude, latitude.
-    agreement : Agreement or None
-        None where the fit failed before anything could be compared.
-    log10_likelihood, nearby : float
-        Its likelihood, and that of the best place nearby (see `evidence`).
     agrees : (S,) bool
         Which of the scene's road points lie on roads of the map that run their way.
-    fault : CameraFault or None
-        The camera's objection, if that ended it.
     """
 
-    matrix: FloatArray
+    scored: Scored
+    camera: CameraPose
     center: Place
     footprint: FloatArray
     footprint_lonlat: FloatArray
-    log10_odds: float
-    gsd_m: float
-    rotation_deg: float
-    tilt_deg: float
-    agreement: Agreement | None
-    log10_likelihood: float
-    nearby: float
     agrees: BoolArray
-    why: str
-    fault: CameraFault | None = None
+    why: str = ""
 
     def to_dict(self) -> dict[str, Any]:
         """Plain values, ready for `json.dumps`."""
-        found = self.agreement
+        model, center, camera = self.scored.model, self.center, self.camera
+        found = model.found
         return {
             "why": self.why,
-            "log10_odds": self.log10_odds if math.isfinite(self.log10_odds) else None,
-            "center": {"x": self.center.x, "y": self.center.y, "lon": self.center.lon, "lat": self.center.lat},
+            "log10_odds": _finite(self.scored.log10_odds),
+            "center": {"x": center.x, "y": center.y, "lon": center.lon, "lat": center.lat},
             "footprint_lonlat": self.footprint_lonlat.tolist(),
-            "gsd_m": self.gsd_m,
-            "rotation_deg": self.rotation_deg,
-            "tilt_deg": self.tilt_deg,
+            "gsd_m": camera.gsd_m,
+            "rotation_deg": camera.rotation_deg,
+            "tilt_deg": camera.tilt_deg,
             "agreement": found
             and {
                 "intersections": found.rate,
@@ -146,14 +130,47 @@ class RejectedPlace:
                 "roads_of_mask": found.forward,
                 "roads_of_map": found.backward,
             },
-            "log10_likelihood": self.log10_likelihood if math.isfinite(self.log10_likelihood) else None,
-            "nearby": self.nearby,
+            "log10_likelihood": _finite(model.log10_likelihood),
+            "nearby": model.nearby,
         }
 
 
 @dataclass(frozen=True)
+class TruthStory:
+    """The fate of the true place on one reference.
+
+    Attributes
+    ----------
+    lost_at : str or None
+        The first stage that it did not come out of: "map", "proposals", "on_roads", "survived", "camera", "verified",
+        "odds" or "margin"; None where it was located there. `said` is that in a sentence.
+    counts : dict
+        How often the place was met at "proposals", "on_roads", "survived", "camera" (refused) and "verified".
+    log10_odds : float or None
+        The best that it reached.
+    """
+
+    lon: float
+    lat: float
+    lost_at: str | None
+    said: str
+    counts: dict[str, int]
+    log10_odds: float | None
+
+
+@dataclass(frozen=True)
 class Story:
-    """How the search on one reference went; see the module's text."""
+    """How the search on one reference went.
+
+    Attributes
+    ----------
+    stopped : str
+        As in `Search`; "elsewhere": a place on another reference ended it, "": there was nothing to search for.
+    camera_refusals : dict
+        How often which reason kept a place that had grown from being verified.
+    starved_at : str or None
+        The first stage that nothing came out of, "camera", "odds" or "margin"; None where it was located.
+    """
 
     reference: str
     stopped: str
@@ -167,16 +184,14 @@ class Story:
 
     def to_dict(self) -> dict[str, Any]:
         """Plain values, ready for `json.dumps`."""
+        values = {name: getattr(self, name) for name in ("reference", "stopped", "camera_refusals", "starved_at")}
         return {
-            "reference": self.reference,
-            "stopped": self.stopped,
+            **values,
             "needed": asdict(self.needed),
             "funnel": asdict(self.funnel),
-            "camera_refusals": self.camera_refusals,
-            "starved_at": self.starved_at,
             "missing": list(self.missing),
             "places": [place.to_dict() for place in self.places],
-            "truth": self.truth and self.truth.to_dict(),
+            "truth": self.truth and asdict(self.truth),
         }
 
 
@@ -198,13 +213,13 @@ class Explanation:
         """The story of the reference that the mask was located on, or else came nearest to it."""
 
         def rank(story: Story) -> tuple[bool, float]:
-            best = max((place.log10_odds for place in story.places), default=-math.inf)
+            best = max((place.scored.log10_odds for place in story.places), default=-math.inf)
             return self.location.located and story.reference == self.location.reference, best
 
         return max(self.stories, key=rank)
 
     def to_dict(self) -> dict[str, Any]:
-        """Plain values, ready for `json.dumps`; see the module's text."""
+        """Plain values, ready for `json.dumps`."""
         location, scene = self.location, self.scene
         return {
             "schema": SCHEMA,
@@ -240,133 +255,159 @@ def tell(
     if search is None or result is None:  # there was nothing to search for, or another method searched
         ended = "intersections" if n < needed.intersections else "verified" if stats.tuples_sampled else "anchors"
         funnel = Funnel(n, stats.tuples_sampled, 0, stats.candidates, 0, 0, stats.hypotheses, 0, stats.verified)
-        told = None if truth is None else tell_truth(truth, events, location, needed)
-        missing = () if located else (location.reason,)
-        return Story(name, "", needed, funnel, {}, None if located else ended, _with_truth(missing, told), truth=told)
-    _look_elsewhere(events, search)
-    screened, voted, scored = events.of("screened"), events.of("voted"), events.of("scored")
-    proposed = sum(count for _, count in voted)  # all of them lie on roads
-    funnel = Funnel(
-        n,
-        len({proposals.anchor for proposals, *_ in screened} | {anchor for anchor, _ in voted}),
-        search.n_tuples,
-        search.n_candidates,
-        proposed + sum(len(proposals.reference) for proposals, *_ in screened),
-        proposed + sum(len(kept) for *_, kept in screened),
-        search.n_hypotheses,
-        sum(map(len, events.of("grown"))),
-        search.n_verified,
-        search.n_nulls,
-    )
-    refusals = Counter([fault for fault, _ in events.of("refused")] + [one.fault for one in scored if one.fault])
-    entries = [*scored, *([] if located else _without_limits(events, search))]
-    ranked = _distinct(search, sorted(entries, key=lambda entry: _rank(entry, needed)))
-    places = tuple(_describe(search, entry, result, location, needed) for entry in ranked)
-    starved = None if located else _starved(funnel, refusals, result, needed)
-    absent = () if located else tuple(_missing(funnel, refusals, search, result, places, needed))
-    counts = {fault.value: times for fault, times in refusals.most_common()}
-    told = None if truth is None else tell_truth(truth, events, location, needed)
-    return Story(name, result.stopped, needed, funnel, counts, starved, _with_truth(absent, told), places, told)
+        missing: tuple[str, ...] = () if located else (location.reason,)
+        story = Story(name, "", needed, funnel, {}, None if located else ended, missing)
+    else:
+        course = _Course(events, search, result, location, needed)
+        counts = {fault.value: times for fault, times in course.refusals.most_common()}
+        starved, missing = (None, ()) if located else (course.starved, tuple(course.missing()))
+        story = Story(name, result.stopped, needed, course.funnel, counts, starved, missing, course.places)
+    if truth is None:
+        return story
+    told = tell_truth(truth, events, location, needed)
+    return replace(story, truth=told, missing=story.missing if told.lost_at is None else (told.said, *story.missing))
 
 
-def _with_truth(missing: tuple[str, ...], told: TruthStory | None) -> tuple[str, ...]:
-    return missing if told is None or told.lost_at is None else (told.said, *missing)
+class _Course:
+    """The course of a search: its events, counted and described."""
+
+    def __init__(
+        self, events: Events, search: TripleEstimator, result: Search[Hypothesis], location: Location, needed: Needed
+    ) -> None:
+        self.events, self.search, self.result = events, search, result
+        self.location, self.needed = location, needed
+        self._look_elsewhere()
+        scored = events.of("scored")
+        self.refusals = Counter(
+            [fault for fault, _ in events.of("refused")] + [one.fault for one in scored if one.fault]
+        )
+        entries = [*scored, *([] if location.located else self._without_limits())]
+        self.places = tuple(map(self._describe, self._distinct(sorted(entries, key=self._rank))))
+
+    def _look_elsewhere(self) -> None:
+        """Grow some proposals that point elsewhere than a camera may, to report that they would fit."""
+        for proposals, allowed, _ in self.events.of("screened"):
+            barred = proposals.only(np.flatnonzero(~allowed)[:_MAX_ELSEWHERE])
+            for hypothesis in self.search.grow(barred, np.arange(len(barred.reference)))[:_MAX_RETRIED]:
+                fault = self.search.judge(hypothesis.matrix, rough=True)
+                if fault is not None:
+                    self.events.note("refused", fault, hypothesis.matrix)
+
+    def _without_limits(self) -> list[Scored]:
+        """Verify the best of the places that the camera refused as if it had not."""
+        scene, index, options = self.search.scene, self.search.index, self.search.options
+        camera = CameraOptions(gsd_m=(0.0, math.inf), max_tilt_deg=180.0, max_skew=math.inf)
+        free = TripleEstimator(scene, index, replace(options, camera=camera), ledger=self.search.ledger)
+        compared = []
+        for fault, unscaled in [one for one in self.events.of("refused") if one[0] in _NEGOTIABLE][:_MAX_REFUSED]:
+            matrix = unscaled / unscaled[2, 2]
+            found, matched, _ = agreement(matrix, scene, index, sampling(matrix, scene.size))
+            compared.append((found.rate + found.forward, fault, Hypothesis(matrix, 0.0, matched)))
+        compared.sort(key=lambda entry: -entry[0])
+        return [Scored(model, free.score(model), fault) for _, fault, model in compared[:_MAX_RETRIED]]
+
+    def _rank(self, entry: Scored) -> tuple[bool, float]:
+        """Sort by odds; places that the camera refused come last, unless that alone kept them from being the answer."""
+        return entry.fault is not None and entry.log10_odds < self.needed.log10_odds, -entry.log10_odds
+
+    def _distinct(self, entries: Sequence[Scored]) -> list[Scored]:
+        """Return the best entry of each place."""
+        kept: list[Scored] = []
+        for entry in entries:
+            if len(kept) == _MAX_PLACES or (kept and not math.isfinite(entry.log10_odds)):
+                break
+            if not any(self.search.same(entry.model, other.model) for other in kept):
+                kept.append(entry)
+        return kept
+
+    @cached_property
+    def funnel(self) -> Funnel:
+        search, events = self.search, self.events
+        screened, voted = events.of("screened"), events.of("voted")
+        proposed = sum(count for _, count in voted)  # all of them lie on roads
+        return Funnel(
+            len(search.scene.intersections),
+            len({proposals.anchor for proposals, *_ in screened} | {anchor for anchor, _ in voted}),
+            search.n_tuples,
+            search.n_candidates,
+            proposed + sum(len(proposals.reference) for proposals, *_ in screened),
+            proposed + sum(len(kept) for *_, kept in screened),
+            search.n_hypotheses,
+            sum(map(len, events.of("grown"))),
+            search.n_verified,
+            search.n_nulls,
+        )
+
+    def _describe(self, entry: Scored) -> RejectedPlace:
+        """Describe a place that was verified."""
+        matrix, index = entry.model.matrix, self.search.index
+        scene = self.search.scene_of(entry.model)
+        camera = pose(matrix, scene.size)
+        # which of the query's road points agree
+        away, near = np.empty((len(scene.points), 3)), np.full(len(scene.points), tolerance_m(camera.gsd_m))
+        road_residuals(matrix, scene.points, scene.directions, near, MIN_COS, index.road_buckets, away)
+        ground = Homography(matrix).everywhere(scene.corners)
+        lonlat = to_lonlat(index.plane.crs, index.plane.to_crs(ground))
+        center = center_of(matrix, scene, index.plane, entry.log10_odds)
+        place = RejectedPlace(entry, camera, center, ground, lonlat, np.isfinite(away[:, 0]))
+        return replace(place, why=self._why(place))
+
+    def _why(self, place: RejectedPlace) -> str:
+        """Return why a place is not the answer."""
+        entry, needed = place.scored, self.needed
+        if entry.fault is not None:
+            return f"the camera: {_objection(place)}"
+        if not math.isfinite(entry.log10_odds):
+            return "the fit does not converge to a place within the limits"
+        if entry.model is self.result.best and self.location.located:
+            return "located"
+        if entry.log10_odds >= needed.log10_odds:
+            if self.result.score - entry.log10_odds < needed.margin:
+                return f"fits as well as another place: the margin is below {needed.margin:g}"
+            return f"another place has log10 odds {_number(self.result.score)}"
+        return f"log10 odds {_number(entry.log10_odds)} of {needed.log10_odds:g} needed: {_weakest(place)}"
+
+    @property
+    def starved(self) -> str:
+        """The first stage that nothing came out of."""
+        stages = ("intersections", "anchors", "tuples", "candidates", "proposals", "on_roads", "survived", "verified")
+        empty = next((stage for stage in stages if getattr(self.funnel, stage) == 0), None)
+        if empty is None:
+            return "odds" if self.result.score < self.needed.log10_odds else "margin"
+        return "camera" if empty == "verified" and self.refusals else empty
+
+    def missing(self) -> list[str]:
+        """List the missing evidence, the surest first."""
+        told, n, starved = [], self.funnel.intersections, self.starved
+        if self.result.stopped in ("time", "work"):
+            told.append(f"{self.result.stopped}: the search was stopped by its limit, places may be left untried")
+        if starved in _NOTHING:
+            told.append(_NOTHING[starved])
+        if starved == "camera":
+            reasons = ", ".join(f"{fault.value} ({times})" for fault, times in self.refusals.most_common())
+            told.append(f"a camera: all places that grew are such as none sees, or none within the limits: {reasons}")
+        best = self.places[0] if self.places else None
+        if best is not None and best.scored.fault is not None and best.scored.log10_odds >= self.needed.log10_odds:
+            objection = _objection(best)
+            told.append(f"the limits on the camera may be too narrow: the best place fails by them alone: {objection}")
+        elif best is not None and starved == "odds":
+            told.append(f"evidence: at the best place {_weakest(best)}")
+        if starved == "margin":
+            told.append(
+                "difference: another place fits almost as well; more of the surroundings in view would tell them apart"
+            )
+        if n < _USUAL_INTERSECTIONS:
+            few = f"masks with fewer than {_USUAL_INTERSECTIONS} are seldom located"
+            told.append(f"intersections: {n} are seen; {few}")
+        if best is not None and best.scored.model.nearby > 0.5 * best.scored.model.log10_likelihood > 0.0:
+            told.append("variety: streets here are so alike that a shifted copy explains half as much and more")
+        if self.search.near is not None and not self.places:
+            told.append("perhaps the circle given is wrong: nothing outside it was tried")
+        return told or ["agreement: nothing on this map is like the mask; another map may be needed"]
 
 
-def _look_elsewhere(events: Events, search: TripleEstimator) -> None:
-    """Grow some proposals that point elsewhere than a camera may, to report that they would fit."""
-    for proposals, allowed, _ in events.of("screened"):
-        barred = proposals.only(np.flatnonzero(~allowed)[:_MAX_ELSEWHERE])
-        for hypothesis in search.grow(barred, np.arange(len(barred.reference)))[:_MAX_RETRIED]:
-            fault = search.judge(hypothesis.matrix, rough=True)
-            if fault is not None:
-                events.note("refused", fault, hypothesis.matrix)
-
-
-def _without_limits(events: Events, search: TripleEstimator) -> list[Scored]:
-    """Verify the best of the places that the camera refused as if it had not."""
-    scene, index, options = search.scene, search.index, search.options
-    camera = CameraOptions(gsd_m=(0.0, math.inf), max_tilt_deg=180.0, max_skew=math.inf)
-    free = TripleEstimator(scene, index, replace(options, camera=camera), ledger=search.ledger)
-    compared = []
-    for fault, unscaled in [one for one in events.of("refused") if one[0] in _NEGOTIABLE][:_MAX_REFUSED]:
-        matrix = unscaled / unscaled[2, 2]
-        gsd = sampling(matrix, scene.size)
-        found, matched, _ = agreement(matrix, scene, index, gsd)
-        compared.append((found.rate + found.forward, fault, Hypothesis(matrix, 0.0, matched)))
-    compared.sort(key=lambda entry: -entry[0])
-    return [Scored(model, free.score(model), fault) for _, fault, model in compared[:_MAX_RETRIED]]
-
-
-def _rank(entry: Scored, needed: Needed) -> tuple[bool, float]:
-    """Sort by odds; places that the camera refused come last, unless nothing else kept them from being the answer."""
-    return entry.fault is not None and entry.log10_odds < needed.log10_odds, -entry.log10_odds
-
-
-def _distinct(search: TripleEstimator, entries: Sequence[Scored]) -> list[Scored]:
-    """Return the best entry of each place."""
-    kept: list[Scored] = []
-    for entry in entries:
-        if kept and not math.isfinite(entry.log10_odds):
-            break
-        if not any(search.same(entry.model, other.model) for other in kept):
-            kept.append(entry)
-        if len(kept) == _MAX_PLACES:
-            break
-    return kept
-
-
-def _describe(
-    search: TripleEstimator,
-    entry: Scored,
-    result: Search[Hypothesis],
-    location: Location,
-    needed: Needed,
-) -> RejectedPlace:
-    """Describe a place that was verified."""
-    model, scene, index = entry.model, search.scene_of(entry.model), search.index
-    camera = pose(model.matrix, scene.size)
-    # where it lies
-    ground = Homography(model.matrix).everywhere(np.vstack([scene.corners, scene.center]))
-    in_crs = index.plane.to_crs(ground)
-    lonlat = to_lonlat(index.plane.crs, in_crs)
-    # which of the query's road points agree
-    away, near = np.empty((len(scene.points), 3)), np.full(len(scene.points), tolerance_m(camera.gsd_m))
-    road_residuals(model.matrix, scene.points, scene.directions, near, MIN_COS, index.road_buckets, away)
-    place = RejectedPlace(
-        matrix=model.matrix,
-        center=Place(
-            float(in_crs[4, 0]), float(in_crs[4, 1]), float(lonlat[4, 0]), float(lonlat[4, 1]), entry.log10_odds
-        ),
-        footprint=ground[:4],
-        footprint_lonlat=lonlat[:4],
-        log10_odds=entry.log10_odds,
-        gsd_m=camera.gsd_m,
-        rotation_deg=camera.rotation_deg,
-        tilt_deg=camera.tilt_deg,
-        agreement=model.found,
-        log10_likelihood=model.log10_likelihood,
-        nearby=model.nearby,
-        agrees=np.isfinite(away[:, 0]),
-        why="",
-        fault=entry.fault,
-    )
-    return replace(place, why=_why(place, entry, result, location, needed))
-
-
-def _why(place: RejectedPlace, entry: Scored, result: Search[Hypothesis], location: Location, needed: Needed) -> str:
-    """Return why a place is not the answer."""
-    if entry.fault is not None:
-        return f"the camera: {_objection(place, entry.fault)}"
-    if not math.isfinite(entry.log10_odds):
-        return "the fit does not converge to a place within the limits"
-    if entry.model is result.best and location.located:
-        return "located"
-    if entry.log10_odds >= needed.log10_odds:
-        if result.score - entry.log10_odds < needed.margin:
-            return f"fits as well as another place: the margin is below {needed.margin:g}"
-        return f"another place has log10 odds {_number(result.score)}"
-    return f"log10 odds {_number(entry.log10_odds)} of {needed.log10_odds:g} needed: {_weakest(place)}"
+def _finite(value: float) -> float | None:
+    return value if math.isfinite(value) else None
 
 
 def _number(value: float) -> str:
@@ -374,83 +415,108 @@ def _number(value: float) -> str:
     return f"{round(value, 1) + 0.0:.1f}"
 
 
-def _objection(place: RejectedPlace, fault: CameraFault) -> str:
+def _objection(place: RejectedPlace) -> str:
     """Return the camera's objection to a place, and its odds otherwise."""
+    fault, odds, camera = place.scored.fault, place.scored.log10_odds, place.camera
     values = {
-        CameraFault.SAMPLING: f" ({place.gsd_m:.2f} m per pixel)",
-        CameraFault.TILT: f" ({place.tilt_deg:.0f} degrees)",
-        CameraFault.HEADING: f" (up is {place.rotation_deg % 360:.0f} degrees)",
+        CameraFault.SAMPLING: f" ({camera.gsd_m:.2f} m per pixel)",
+        CameraFault.TILT: f" ({camera.tilt_deg:.0f} degrees)",
+        CameraFault.HEADING: f" (up is {camera.rotation_deg % 360:.0f} degrees)",
     }
-    known = math.isfinite(place.log10_odds)
-    odds = f"; without that its log10 odds were {_number(place.log10_odds)}" if known else ""
-    return f"{fault.value}{values.get(fault, '')}{odds}"
+    otherwise = f"; without that its log10 odds were {_number(odds)}" if math.isfinite(odds) else ""
+    return "" if fault is None else f"{fault.value}{values.get(fault, '')}{otherwise}"
 
 
 def _weakest(place: RejectedPlace) -> str:
     """Compare a place with the best one nearby."""
-    if place.agreement is None:
+    model = place.scored.model
+    if model.found is None:
         return "nothing could be compared"
-    return f"its roads explain 10^{_number(place.log10_likelihood)}, those of a place nearby 10^{_number(place.nearby)}"
+    return f"its roads explain 10^{_number(model.log10_likelihood)}, those of a place nearby 10^{_number(model.nearby)}"
 
 
-def _starved(funnel: Funnel, refusals: Counter[CameraFault], result: Search[Hypothesis], needed: Needed) -> str:
-    """Return the first stage that nothing came out of."""
-    stages = ("intersections", "anchors", "tuples", "candidates", "proposals", "on_roads", "survived", "verified")
-    empty = next((stage for stage in stages if getattr(funnel, stage) == 0), None)
-    if empty == "verified" and refusals:
-        return "camera"
-    if empty is not None:
-        return empty
-    if result.score < needed.log10_odds:
-        return "odds"
-    return "margin"
+# --- the true place ---------------------------------------------------------------------------------------------------
 
 
-_NOTHING = {
-    "anchors": "no intersection has three neighbours and tangents that make usable tuples",
-    "tuples": "no intersection has three neighbours and tangents that make usable tuples",
-    "candidates": "no tuple of the mask's intersections is like one of the map's",
-    "proposals": "nowhere on the map do two tuples that share an intersection agree",
-    "on_roads": "wherever tuples agree, the roads around them do not",
-    "survived": "whatever was followed outwards met too few intersections where they should be",
-}
+def true_place(mask: str, options: LocateOptions) -> tuple[float, float] | None:
+    """Return longitude and latitude of a mask's true place where that is given."""
+    for name, lon, lat in options.truths:
+        if not name or Path(mask).as_posix().endswith(name):
+            return lon, lat
+    return None
 
 
-def _missing(
-    funnel: Funnel,
-    refusals: Counter[CameraFault],
-    search: TripleEstimator,
-    result: Search[Hypothesis],
-    places: Sequence[RejectedPlace],
-    needed: Needed,
-) -> list[str]:
-    """List the missing evidence, the surest first."""
-    told, scene = [], search.scene
-    if result.stopped in ("time", "work"):
-        told.append(f"{result.stopped}: the search was stopped by its limit, places may be left untried")
-    starved = _starved(funnel, refusals, result, needed)
-    if starved in _NOTHING:
-        told.append(_NOTHING[starved])
-    if starved == "camera":
-        reasons = ", ".join(f"{fault.value} ({times})" for fault, times in refusals.most_common())
-        told.append(f"a camera: all places that grew are such as none sees, or none within the limits: {reasons}")
-    best = places[0] if places else None
-    if best is not None and best.fault is not None and best.log10_odds >= needed.log10_odds:
-        objection = _objection(best, best.fault)
-        told.append(f"the limits on the camera may be too narrow: the best place fails by them alone: {objection}")
-    elif best is not None and starved == "odds":
-        told.append(f"evidence: at the best place {_weakest(best)}")
-    if starved == "margin":
-        told.append(
-            "difference: another place fits almost as well; more of the surroundings in view would tell them apart"
-        )
-    if len(scene.intersections) < _USUAL_INTERSECTIONS:
-        told.append(
-            f"intersections: {len(scene.intersections)} are seen; masks with fewer than {_USUAL_INTERSECTIONS} are"
-            " seldom located"
-        )
-    if best is not None and best.nearby > 0.5 * best.log10_likelihood > 0.0:
-        told.append("variety: streets here are so alike that a shifted copy explains half as much and more")
-    if search.near is not None and not places:
-        told.append("perhaps the circle given is wrong: nothing outside it was tried")
-    return told or ["agreement: nothing on this map is like the mask; another map may be needed"]
+def tell_truth(lonlat: tuple[float, float], events: Events, location: Location, needed: Needed) -> TruthStory:
+    """Return which stage lost the truth; `location` is the answer on this reference."""
+    if events.estimator is None:
+        return TruthStory(*lonlat, "map", "the true place: nothing was searched", dict.fromkeys(_MET, 0), None)
+    there = _TruePlace(events.estimator, lonlat)
+    return there.told(*there.met(events), location, needed)
+
+
+class _TruePlace:
+    """The true place on the map that was searched."""
+
+    def __init__(self, estimator: TripleEstimator, lonlat: tuple[float, float]) -> None:
+        self.estimator, self.lonlat = estimator, lonlat
+        self.xy = np.asarray(from_lonlat(estimator.index.plane, np.array([lonlat]))[0], float)
+
+    def met(self, events: Events) -> tuple[dict[str, int], list[CameraFault], float]:
+        """Return how often each stage met it, the camera's objections to it, and the best odds that it reached."""
+        counts, scene, index = dict.fromkeys(_MET, 0), self.estimator.scene, self.estimator.index
+        for proposals, _, kept in events.of("screened"):
+            linear = proposals.affine.reshape(-1, 2, 2)
+            middles = index.xy[proposals.reference] + linear @ (scene.center - scene.intersections.xy[proposals.anchor])
+            near = self._is_near(middles, np.sqrt(np.abs(np.linalg.det(linear))))
+            counts["proposals"] += int(near.sum())
+            counts["on_roads"] += int(near[kept].sum())
+        scored = [one for one in events.of("scored") if self._is_there(one.model.matrix)]
+        faults = [fault for fault, matrix in events.of("refused") if self._is_there(matrix / matrix[2, 2])]
+        faults += [one.fault for one in scored if one.fault is not None]
+        survived = sum(self._is_there(matrix) for grown in events.of("grown") for matrix in grown)
+        counts |= {"survived": survived, "camera": len(faults), "verified": len(scored)}
+        return counts, faults, max((one.log10_odds for one in scored), default=-math.inf)
+
+    def _is_near(self, xy: FloatArray, scales: FloatArray) -> BoolArray:
+        """Return which places (N, 2) of the frame's middle lie near the truth, at ground samplings (N,)."""
+        limit = np.maximum(_AT_LEAST_M, _ROUGHLY * scales * self.estimator.scene.half_size)
+        return np.asarray(np.hypot(*(xy - self.xy).T) <= limit)
+
+    def _is_there(self, matrix: FloatArray) -> bool:
+        """Whether a homography puts the middle of the frame near the truth."""
+        scene = self.estimator.scene
+        scale = np.array([sampling(matrix, scene.size)])
+        return bool(self._is_near(Homography(matrix).everywhere(scene.center)[None], scale)[0])
+
+    def told(
+        self, counts: dict[str, int], faults: list[CameraFault], best: float, location: Location, needed: Needed
+    ) -> TruthStory:
+        """Return which stage lost it."""
+        estimator = self.estimator
+        reach_m = estimator.scene.half_size * min(estimator.options.camera.gsd_m[1], _LARGE_PIXEL_M)
+        lost_at: str | None
+        if np.hypot(*(estimator.index.xy - self.xy).T).min() > 2.0 * reach_m:
+            lost_at, how = "map", "lies off the map that was searched"
+        elif counts.get("verified") and math.isfinite(best):
+            lost_at, how = self._weighed(best, location, needed)
+        else:
+            last = next((stage for stage in _LOST if counts.get(stage)), "")
+            lost_at, how = _LOST[last]
+            if last == "camera":
+                how += ": " + ", ".join(fault.value for fault, _ in Counter(faults).most_common())
+        return TruthStory(*self.lonlat, lost_at, f"the true place {how}", counts, _finite(best))
+
+    def _weighed(self, best: float, location: Location, needed: Needed) -> tuple[str | None, str]:
+        """Describe the fate of the truth after it was compared with the map."""
+        score, located = f"reached log10 odds {best:.1f}", False
+        if location.located and location.center is not None:
+            center = np.array([[location.center.lon, location.center.lat]])
+            xy = from_lonlat(self.estimator.index.plane, center)
+            located = bool(self._is_near(xy, np.array([location.gsd_m or 1.0]))[0])
+        if best < needed.log10_odds and not located:
+            return "odds", f"{score}, {needed.log10_odds:g} are needed"
+        if not located:
+            return "margin", f"{score}, but another place as much, or it was met too late"
+        if best < needed.log10_odds:
+            return None, f"{score}, but leads any other place where these streets repeat, and was located"
+        return None, f"{score} and was located"

@@ -13,7 +13,7 @@ from roadgeo.geometry.frame import Frame
 from roadgeo.geometry.homography import Homography
 from roadgeo.geometry.mask import PIXEL_TO_PLANE
 from roadgeo.geometry.pose import PoseOptions, find_pose, turned
-from roadgeo.geometry.projection import grid_north, to_lonlat
+from roadgeo.geometry.projection import LocalPlane, grid_north, to_lonlat
 from roadgeo.geometry.similarity import find_similarity
 from roadgeo.geometry.transformation import LONLAT, exactness
 from roadgeo.location import Camera, Evidence, Location, Place
@@ -21,7 +21,7 @@ from roadgeo.matching.estimator import MatchOptions
 from roadgeo.matching.evidence import agreement
 from roadgeo.matching.methods import Fit
 from roadgeo.matching.refinement import corner_sigmas
-from roadgeo.matching.scene import Query
+from roadgeo.matching.scene import Query, Scene
 
 __all__ = ["center_of", "place_frame"]
 
@@ -53,7 +53,7 @@ def place_frame(location: Location, query: Query, fit: Fit, options: MatchOption
         homography=homography / homography[2, 2],
         footprint=ground[:4],
         footprint_lonlat=lonlat[:4],
-        center=Place(float(ground[4, 0]), float(ground[4, 1]), float(lonlat[4, 0]), float(lonlat[4, 1]), odds),
+        center=_place(ground[4], lonlat[4], odds),
         fitted="homography" if level is fit else "similarity",
         lens_k1=fit.lens_k1,
         corner_sigma_m=level.corner_sigma_m,
@@ -109,9 +109,12 @@ def _find_camera(
     return Camera(x, y, lon, lat, height, heading, pitch, roll, *lens, found.covariance, rotation)
 
 
-def center_of(query: Query, fit: Fit) -> Place:
+def center_of(matrix: FloatArray, scene: Scene, plane: LocalPlane, log10_odds: float) -> Place:
     """Return where the middle of the frame lies."""
-    plane = fit.index.plane
-    ground = plane.to_crs(Homography(fit.matrix).everywhere(query.scene.center)[None])
+    ground = plane.to_crs(Homography(matrix).everywhere(scene.center)[None])
     lonlat = to_lonlat(plane.crs, ground)
-    return Place(float(ground[0, 0]), float(ground[0, 1]), float(lonlat[0, 0]), float(lonlat[0, 1]), fit.log10_odds)
+    return _place(ground[0], lonlat[0], log10_odds)
+
+
+def _place(xy: FloatArray, lonlat: FloatArray, log10_odds: float) -> Place:
+    return Place(float(xy[0]), float(xy[1]), float(lonlat[0]), float(lonlat[1]), log10_odds)

@@ -144,7 +144,11 @@ def _pool(query: Query, found: Sequence[Found]) -> list[_Candidate]:
 
     Of places on different references the likelier one is the best.
     """
-    pool = [_Candidate(one, fit, center_of(query, fit)) for one in found for fit in one.fits]
+    pool = [
+        _Candidate(one, fit, center_of(fit.matrix, query.scene, fit.index.plane, fit.log10_odds))
+        for one in found
+        for fit in one.fits
+    ]
     distinct: list[_Candidate] = []
     for candidate in sorted(pool, key=lambda one: (-one.fit.log10_likelihood, -one.score)):
         if all(_differ(query, one, candidate) for one in distinct):

@@ -231,15 +231,16 @@ def _strokes(scene: Scene, place: RejectedPlace, chosen: AnyArray) -> FloatArray
     """Map (C, 2, 2) short strokes along the mask's roads around the chosen road points to the plane."""
     half = 0.5 * scene.road_length_px / max(len(scene.points), 1) * scene.directions[chosen]
     ends = np.stack([scene.points[chosen] - half, scene.points[chosen] + half], axis=1)
-    strokes = Homography(place.matrix)(ends)
+    strokes = Homography(place.scored.model.matrix)(ends)
     return strokes[np.isfinite(strokes).all(axis=(1, 2))]
 
 
 def _caption(panel: AnyArray, origin: tuple[int, int], side: int, number: int, place: RejectedPlace) -> None:
     x, y = origin
-    odds = f"log10 odds {round(place.log10_odds, 1) + 0.0:.1f}" if math.isfinite(place.log10_odds) else "no fit"
+    log10_odds = place.scored.log10_odds
+    odds = f"log10 odds {round(log10_odds, 1) + 0.0:.1f}" if math.isfinite(log10_odds) else "no fit"
     write_text(panel, f"{number}   {odds}", (x, y + 24), 19, INK, bold=True)
-    where = f"{format_lonlat(place.center.lon, place.center.lat)}   ·   {place.gsd_m:.2f} m/px"
+    where = f"{format_lonlat(place.center.lon, place.center.lat)}   ·   {place.camera.gsd_m:.2f} m/px"
     write_text(panel, where, (x, y + 48), 15, FAINT_INK)
     for i, line in enumerate(_wrap(place.why, side // 8)[:3]):
         write_text(panel, line, (x, y + 70 + 19 * i), 15, INK)

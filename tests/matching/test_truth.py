@@ -12,8 +12,8 @@ from roadgeo.geometry.camera import CameraFault, CameraOptions
 from roadgeo.geometry.projection import to_lonlat
 from roadgeo.location import Location, Place
 from roadgeo.matching.events import Events
+from roadgeo.matching.explanation import _TruePlace, tell_truth
 from roadgeo.matching.index import build_index
-from roadgeo.matching.truth import Met, _Place, tell_truth
 from roadgeo.matching.verdict import Needed
 
 NEEDED = Needed(log10_odds=3.0, margin=2.0, intersections=3)
@@ -35,7 +35,7 @@ def lonlat(x, y):
 
 def told(estimator, met=(), best=-math.inf, at=(500.0, 500.0), answer=REFUSED):
     faults = [CameraFault.TILT, CameraFault.SKEW, CameraFault.TILT] if "camera" in met else []
-    return _Place(estimator, lonlat(*at)).told(Met(Counter(met), Counter(faults), best), answer, NEEDED)
+    return _TruePlace(estimator, lonlat(*at)).told(dict(Counter(met)), faults, best, answer, NEEDED)
 
 
 @pytest.mark.parametrize(
