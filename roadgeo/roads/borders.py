@@ -163,15 +163,14 @@ def _covers(roads: BoolArray, deep: int, slopes: FloatArray) -> list[FloatArray]
     shifts = np.rint(slopes[:, None] * (np.arange(wide) - wide / 2)).astype(np.int64)
     most = int(np.abs(shifts).max())
     # Columns that are shifted alike are counted at once, by sums over all columns before them.
-    sums = np.zeros((deep + 2 * most, wide + 1), np.int32)
-    np.cumsum(np.ascontiguousarray(roads[:deep]), axis=1, out=sums[most : most + deep, 1:])
-    rows = np.arange(deep)[:, None] + most
+    sums = np.zeros((wide + 1, deep + 2 * most), np.int32)
+    np.cumsum(np.ascontiguousarray(roads[:deep].T), axis=0, out=sums[1:, most : most + deep])
+    windows = np.lib.stride_tricks.sliding_window_view(sums, deep, axis=1)
     covers = []
-    for shift in shifts:
-        starts = np.flatnonzero(np.diff(shift, prepend=most + 1))
+    for shift in shifts + most:
+        starts = np.flatnonzero(np.diff(shift, prepend=-1))
         stops = np.append(starts[1:], wide)
-        rows_there = rows + shift[starts]
-        covers.append((sums[rows_there, stops] - sums[rows_there, starts]).sum(axis=1) / wide)
+        covers.append((windows[stops, shift[starts]] - windows[starts, shift[starts]]).sum(axis=0) / wide)
     return covers
 
 

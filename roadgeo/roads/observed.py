@@ -114,7 +114,8 @@ def _hull(roads: BoolArray) -> FloatArray:
     """Return the convex hull (V, 2) around all road pixels, clockwise as seen in the image."""
     rows = np.flatnonzero(roads.any(axis=1))
     left = roads.argmax(axis=1)[rows]
-    right = roads.shape[1] - roads[:, ::-1].argmax(axis=1)[rows]
+    mirrored = cv2.flip(roads.view(np.uint8), 1).view(np.bool_)  # backwards, `argmax` looks at one pixel at a time
+    right = roads.shape[1] - mirrored.argmax(axis=1)[rows]
     ends = [np.stack((x, y), axis=1) for x in (left, right) for y in (rows, rows + 1)]
     hull = cv2.convexHull(np.concatenate(ends).astype(np.int32), clockwise=False)  # OpenCV thinks of y upwards
     return np.asarray(hull[:, 0], np.float64)

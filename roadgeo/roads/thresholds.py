@@ -7,6 +7,7 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import dataclass, replace
+from functools import cached_property
 
 import cv2
 import numpy as np
@@ -66,6 +67,14 @@ class Sample:
     channel: int
     read_rows: Callable[[], AnyArray]
 
+    @cached_property
+    def levels(self) -> AnyArray:
+        """The different values of that band, ascending."""
+        values = self.seen[:, self.channel]
+        ends = np.unique([values.min(), values.max()])
+        is_mask = ((values == ends[0]) | (values == ends[-1])).all()
+        return ends if is_mask else np.unique(values)
+
 
 def find_thresholds(sample: Sample) -> tuple[float, ...]:
     """Find the thresholds above which values may be road: one for a mask, several for a soft map, the best first.
@@ -77,8 +86,7 @@ def find_thresholds(sample: Sample) -> tuple[float, ...]:
     MaskError
         It is a map of several classes.
     """
-    values = sample.seen[:, sample.channel].astype(np.float64)
-    levels = np.unique(values)
+    values, levels = sample.seen[:, sample.channel].astype(np.float64), sample.levels.astype(np.float64)
     low, high = levels[0], levels[-1]
     if len(levels) <= 2:
         return (float(low + high) / 2 if high > low else float(np.nextafter(high, -np.inf) if high > 0 else high),)
@@ -116,8 +124,7 @@ def find_unlabelled(sample: Sample) -> tuple[float | None, str]:
     told : str
         "" where there is nothing to report.
     """
-    values = sample.seen[:, sample.channel]
-    levels = np.unique(values)
+    values, levels = sample.seen[:, sample.channel], sample.levels
     others = levels[(levels < 0) | (levels > _MAX_CLASS)]
     classes = levels[(levels >= 0) & (levels <= _MAX_CLASS)]
     if len(others) != 1 or len(classes) < 2 or len(levels) < 3 or np.any(levels != np.round(levels)):

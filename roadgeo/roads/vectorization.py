@@ -285,10 +285,11 @@ def _shrink(flags: AnyArray, factor: int, share: float) -> AnyArray:
     reduced = np.empty((rows, columns), np.uint8)
     step = max(_STRIP_PIXELS // (width * factor), 1)
     for top in range(0, rows, step):
-        strip = flags[top * factor : (top + step) * factor] * np.uint8(254)
+        strip: AnyArray = flags[top * factor : (top + step) * factor] * np.uint8(254)
         fill = (-len(strip) % factor, columns * factor - width)
-        filled = cv2.copyMakeBorder(strip, 0, fill[0], 0, fill[1], cv2.BORDER_REPLICATE)
-        mean = cv2.resize(filled, (columns, len(filled) // factor), interpolation=cv2.INTER_AREA)
+        if any(fill):
+            strip = cv2.copyMakeBorder(strip, 0, fill[0], 0, fill[1], cv2.BORDER_REPLICATE)
+        mean = cv2.resize(strip, (columns, len(strip) // factor), interpolation=cv2.INTER_AREA)
         reduced[top : top + step] = mean >= max(int(254 * share), 1)
     return reduced
 

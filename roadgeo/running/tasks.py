@@ -48,9 +48,10 @@ def find_masks(arguments: Sequence[str], recursive: bool = False) -> list[str]:
     found: list[str] = []
     for argument in arguments:
         if Path(argument).is_dir():
-            found += sorted(str(path) for path in _images_in(Path(argument), recursive))
+            endings = result_endings()
+            found += sorted(str(path) for path in _images_in(Path(argument), endings, recursive))
             if not recursive:
-                _tell_passed_over(Path(argument))
+                _tell_passed_over(Path(argument), endings)
         elif glob.has_magic(argument) and not Path(argument).exists():
             found += sorted(glob.glob(argument, recursive=True)) or [argument]  # noqa: PTH207 (patterns may be absolute)
         else:
@@ -58,17 +59,16 @@ def find_masks(arguments: Sequence[str], recursive: bool = False) -> list[str]:
     return found
 
 
-def _images_in(folder: Path, recursive: bool) -> Iterator[Path]:
-    """Yield the images of a folder, and of all within it."""
-    endings = result_endings()
+def _images_in(folder: Path, endings: tuple[str, ...], recursive: bool) -> Iterator[Path]:
+    """Yield the images of a folder, and of all within it, but for results, whose names have such endings."""
     for root, folders, names in os.walk(folder):
         folders[:] = [name for name in sorted(folders) if recursive and not name.startswith(".")]
         yield from (path for path in (Path(root, name) for name in sorted(names)) if _is_mask(path, endings))
 
 
-def _tell_passed_over(folder: Path) -> None:
+def _tell_passed_over(folder: Path, endings: tuple[str, ...]) -> None:
     """Mention images in folders within a folder."""
-    first = next((path for path in _images_in(folder, recursive=True) if path.parent != folder), None)
+    first = next((path for path in _images_in(folder, endings, recursive=True) if path.parent != folder), None)
     if first is not None:
         _LOG.warning(
             "%s: images in folders within it, such as %s, are passed over; --recursive takes them too",
