@@ -24,60 +24,52 @@ __all__ = ["CheckOptions", "Checked", "Verdict", "check_place"]
 Verdict = Literal["agrees", "off", "unknown"]
 
 
+#: Log10 odds that the best place must have against each other place nearby, and where it is the given one: of a dozen
+#: places that fit by chance, the best is seldom that.
+_MIN_LOG10, _MIN_LOG10_AS_GIVEN = 2.0, 1.0
+#: Chi-squared of a displacement that counts as off: met by chance once in 1000 with 4 degrees of freedom.
+_MIN_CHI2 = 18.5
+#: Length of road, metres, that mask and map must each show.
+_MIN_ROADS_M = 300.0
+#: Refinement that moves the corners by more than this, metres, has lost its way.
+_MAX_DRIFT_M = 40.0
+#: Half the distance between the lines of a dual carriageway, metres, up to 1.8 times as much.
+_TWIN_M = 10.0
+#: Prior standard deviation of the perspective that is left: georeferenced images are rectified.
+_PERSPECTIVE_SIGMA = 0.003
+
+
 @dataclass(frozen=True)
 class CheckOptions:
-    """Thresholds of a right place, and of certainty.
+    """When a place is right, and where it is looked for.
 
     Attributes
     ----------
     tolerance_m : float
         A place agrees where the frame, on average, is off by less.
-    min_log10, min_log10_as_given : float
-        Log10 odds that the best place must have against each other place nearby, and where it is the given one: of a
-        dozen places that fit by chance, the best is seldom that.
-    min_chi2 : float
-        Chi-squared of a displacement that counts as off: 18.5 is met by chance once in 1000 with 4 degrees of freedom.
     max_sigma_m : float
         A frame whose place is less certain than this is not judged.
-    min_roads_m : float
-        Length of road that mask and map must each show.
-    max_drift_m : float
-        Refinement that moves the corners by more than this has lost its way.
-    twin_m : float
-        Half the distance between the lines of a dual carriageway, up to 1.8 times as much.
-    perspective_sigma : float
-        Prior standard deviation of the perspective that is left: georeferenced images are rectified.
     """
 
     tolerance_m: float = 3.0
-    min_log10: float = 2.0
-    min_log10_as_given: float = 1.0
-    min_chi2: float = 18.5
     max_sigma_m: float = 3.0
-    min_roads_m: float = 300.0
-    max_drift_m: float = 40.0
-    twin_m: float = 10.0
-    perspective_sigma: float = 0.003
     search: LocalSearchOptions = field(default_factory=LocalSearchOptions)
-    refine: RefineOptions = field(default_factory=RefineOptions)
 
 
 @dataclass(frozen=True)
 class Checked:
-    """The result for a given place.
+    """The result for a given place; None: not known.
 
     Attributes
     ----------
     displacement : Displacement or None
-        From where it was put to where it belongs, on the reference plane. None where that is not known.
+        From where it was put to where it belongs, on the reference plane.
     matrix : (3, 3) float64 or None
         Query plane to reference plane, corrected.
-    log10_lead : float or None
-        Log10 odds of the best place against its hardest rival.
-    rival : Displacement or None
-        Where that lies.
-    agreeing : float or None
-        Share of the roads, of mask and map, that agree at the best place; `agreeing_as_given` at the given one.
+    log10_lead, rival : float, Displacement or None
+        Log10 odds of the best place against its hardest rival, and where that lies.
+    agreeing, agreeing_as_given : float or None
+        Share of the roads, of mask and map, that agree at the best place, and at the given one.
     matched : (N,) int or None
         Map intersection of each query intersection, or -1.
     """
@@ -103,10 +95,10 @@ def check_place(start: FloatArray, scene: Scene, index: ReferenceIndex, options:
     """
     options = options or CheckOptions()
     gsd = sampling(start, scene.size)
-    if scene.road_length_px * gsd < options.min_roads_m:
+    if scene.road_length_px * gsd < _MIN_ROADS_M:
         return Checked("unknown", f"too few roads: the mask shows {scene.road_length_px * gsd:.0f} m of them")
     judge = _Judge(scene, index, start, options)
-    if judge.map_length_m < options.min_roads_m:
+    if judge.map_length_m < _MIN_ROADS_M:
         return Checked("unknown", f"the map has {judge.map_length_m:.0f} m of roads there: not on this map")
     return _judge_best(judge, judge.refine_all([start, *judge.propose()]))
 
@@ -130,8 +122,7 @@ class _Judge:
         self.corners = Homography(start)(scene.corners)
         self.evidence = Evidence(scene, index, self.gsd)
         tilted = np.abs(start[2, :2]).max() / abs(start[2] @ np.append(scene.center, 1.0)) * scene.half_size > 0.01
-        sigma = options.refine.perspective_sigma if tilted else options.perspective_sigma
-        self.refine_options = replace(options.refine, perspective_sigma=sigma)
+        self.refine_options = RefineOptions() if tilted else RefineOptions(perspective_sigma=_PERSPECTIVE_SIGMA)
 
     @property
     def map_length_m(self) -> float:
@@ -161,7 +152,7 @@ class _Judge:
         for _ in range(3):
             matched, _ = match_intersections(matrix, self.scene, self.index, self.gsd)
             step = refine(matrix, scene, self.index, matched, self.refine_options, n_points, held=True)
-            if step is None or not self.gap(step.matrix, start) < self.options.max_drift_m:
+            if step is None or not self.gap(step.matrix, start) < _MAX_DRIFT_M:
                 break
             refined, matrix = step, step.matrix
         if refined is not None and n_points is None:
@@ -175,8 +166,8 @@ class _Judge:
         A mask often shows a dual carriageway as one line, halfway between the two of the map: were it laid on either,
         the frame would be off by half their distance.
         """
-        scene, twin_m = self.scene, self.options.twin_m
-        right, left = roads_beside(matrix, scene, self.index, twin_m, 0.8 * twin_m)
+        scene = self.scene
+        right, left = roads_beside(matrix, scene, self.index, _TWIN_M, 0.8 * _TWIN_M)
         alone = ~(right & left)
         if alone.mean() < 0.4:
             return scene
@@ -225,7 +216,7 @@ def _judge_best(judge: _Judge, places: Sequence[_Place]) -> Checked:
     off, sigma = found.over(judge.corners), found.sigma_over(judge.corners)
     said = f"off by {off:.1f} ± {sigma:.1f} m"
     agrees = off <= options.tolerance_m
-    needed = options.min_log10_as_given if agrees else options.min_log10
+    needed = _MIN_LOG10_AS_GIVEN if agrees else _MIN_LOG10
     if lead < needed:
         told = f"the best leads by 10^{lead:.1f}, 10^{needed:g} is needed"
         nothing = f"no place within {options.search.reach_m:g} m stands out: {told}"
@@ -234,6 +225,6 @@ def _judge_best(judge: _Judge, places: Sequence[_Place]) -> Checked:
         return replace(known, reason=f"the roads place it to {sigma:.1f} m only")
     if agrees:
         return replace(known, verdict="agrees", reason=said)
-    if found.significance < options.min_chi2 or off - sigma < options.tolerance_m:
+    if found.significance < _MIN_CHI2 or off - sigma < options.tolerance_m:
         return replace(known, reason=f"{said}: that may be chance")
     return replace(known, verdict="off", reason=said)

@@ -6,7 +6,8 @@ from worlds.motorways import motorways
 from worlds.scenes import Sight, camera, look, scene_of
 
 from roadgeo.geometry.homography import Homography
-from roadgeo.matching.checking import CheckOptions, check_place
+from roadgeo.matching import checking
+from roadgeo.matching.checking import check_place
 from roadgeo.matching.exhaustive import LocalSearchOptions, Shift, move_about, search_nearby
 
 SIGHT = Sight(sigma_m=1.0, missing=0.2, false=0.1)
@@ -34,11 +35,14 @@ def test_a_right_place_agrees(town, sights) -> None:
         assert found.agreeing == pytest.approx(found.agreeing_as_given, abs=0.05)
 
 
-def test_points_that_have_a_twin_beside_them_are_left_out_with_all_that_is_known_of_them(town, sights) -> None:
+def test_points_that_have_a_twin_beside_them_are_left_out_with_all_that_is_known_of_them(
+    town, sights, monkeypatch
+) -> None:
     """As if a block were a dual carriageway."""
     truth, scene = sights[0]
     for twin_m in (80.0, 100.0):
-        assert check_place(truth, scene, town[1], CheckOptions(twin_m=twin_m)).verdict in ("agrees", "unknown")
+        monkeypatch.setattr(checking, "_TWIN_M", twin_m)
+        assert check_place(truth, scene, town[1]).verdict in ("agrees", "unknown")
 
 
 @pytest.mark.slow
