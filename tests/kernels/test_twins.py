@@ -14,6 +14,7 @@ from roadgeo.kernels.compilation import Kernel
 
 #: Twins of other names: of one item where the kernel does all, or of what the kernel's result is made of.
 TWINS = {
+    "count_inliers": "evaluate_pairs",
     "cut_edges": "cut_edge",
     "describe_intersections": "merge_lines",
     "find_sides": "sides_of",
@@ -35,7 +36,11 @@ TWINS = {
 }
 
 #: What a test calls instead of a kernel that it compares.
-CALLS = {"describe_intersections": "find_intersections", "fit_branches": "find_intersections"}
+CALLS = {
+    "count_inliers": "evaluate_pairs",
+    "describe_intersections": "find_intersections",
+    "fit_branches": "find_intersections",
+}
 
 #: Why a kernel has none.
 REASONS = {
