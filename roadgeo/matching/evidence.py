@@ -172,7 +172,8 @@ class Evidence:
         scales = np.sqrt(np.abs(np.linalg.det(Homography(matrix).jacobian(middles)))) / _sampling(matrix, scene)
         near = np.nan_to_num(scales, nan=math.inf) < _FAR
         both = np.minimum(seen.sum(axis=1), mapped.sum(axis=1)) * near
-        return float(both[worth < 0.0].sum() / both.sum()) if both.any() else 0.0
+        share = float(both[worth < 0.0].sum() / both.sum()) if both.any() else 0.0
+        return max(share - 0.5 / len(both), 0.0)  # that of half a region is usual: a railway may run through one
 
     def _count(self, matrix: FloatArray, piece_px: float, shape: tuple[int, int]) -> tuple[FloatArray, FloatArray]:
         """Return histograms of the residuals of the query's roads and of the map's, pixels of road, (P, bins) each."""

@@ -47,9 +47,9 @@ _MOST_TURNS = 4
 #: less than this part of it: streets do not repeat there.
 _REPEATING = 0.35
 #: Powers of ten that a place loses where all of the roads are contradicted (see `Evidence.contradicted`), in
-#: proportion, beyond the usual share. At right places of masks of which up to half is gone, false, stale or bent it is
-#: 0.03; at the best wrong ones of masks turned over 0.15 and more, where a city was laid out like its own mirror image.
-_DOUBT, _USUALLY_CONTRADICTED = 60.0, 0.02
+#: proportion. At right places of masks of which up to half is gone, false, stale or bent the share is below 0.03; at
+#: the best wrong ones of masks turned over 0.15 and more, where a city was laid out like its own mirror image.
+_DOUBT = 60.0
 #: Number of the places met by the search that are compared, the likeliest; and of road points that each of those around
 #: is laid by roughly.
 _N_KNOWN, _N_POINTS = 12, 200
@@ -189,8 +189,7 @@ class Rivals:
         if known is None or known[0] is not matrix:
             scene = estimator.scene_of(model)
             evidence = Evidence(scene, estimator.index, sampling(matrix, scene.size))
-            share = evidence.contradicted(matrix) - _USUALLY_CONTRADICTED
-            known = self._doubts[id(model)] = matrix, _DOUBT * max(share, 0.0)
+            known = self._doubts[id(model)] = matrix, _DOUBT * evidence.contradicted(matrix)
         return known[1]
 
     def _take(self, estimator: TripleEstimator, matrix: FloatArray, ranked: Sequence[Hypothesis]) -> Hypothesis:
