@@ -268,6 +268,26 @@ def meets_road(x: float, y: float, dx: float, dy: float, radius: float, min_cos:
     return False
 
 
+@kernel(forceinline=True)
+def _lies_beside(
+    inverse: Floats2, grid: tuple[float, float, float], column: int, row: int, right: float, bottom: float
+) -> bool:
+    """Whether a bucket lies wholly beyond one side of the frame, of which (0, 0) and (right, bottom) are corners."""
+    left, beyond, above, below = 0, 0, 0, 0
+    for k in range(4):
+        x, y = grid[0] + (column + k % 2) * grid[2], grid[1] + (row + k // 2) * grid[2]
+        w = inverse[2, 0] * x + inverse[2, 1] * y + inverse[2, 2]
+        if w <= 0.0:
+            return False
+        u = inverse[0, 0] * x + inverse[0, 1] * y + inverse[0, 2]
+        v = inverse[1, 0] * x + inverse[1, 1] * y + inverse[1, 2]
+        left += u < 0.0
+        beyond += u > right * w
+        above += v > 0.0
+        below += v < bottom * w
+    return max(left, beyond, above, below) == 4
+
+
 @kernel(writes=("forward", "backward"))
 def count_residuals(
     matrix: Floats2,
@@ -330,6 +350,7 @@ def count_residuals(
             row = min(max(int(-points[i, 1] / piece_px), 0), last_row)
             column = min(max(int(points[i, 0] / piece_px), 0), columns - 1)
         forward[row * columns + column, min(int(n * away / radius), n) if away < radius else n] += weights[i]
+    right, bottom = field.shape[1] * field_scale, -field.shape[0] * field_scale
     c0 = max(int(np.floor((bounds[0] - grid[0]) / grid[2])), 0)
     c1 = min(int(np.floor((bounds[2] - grid[0]) / grid[2])), shape[0] - 1)
     r0 = max(int(np.floor((bounds[1] - grid[1]) / grid[2])), 0)
@@ -342,6 +363,8 @@ def count_residuals(
     for r in range(r0, r1 + 1):
         for c in range(c0, c1 + 1):
             bucket = r * shape[0] + c
+            if starts[bucket] == starts[bucket + 1] or _lies_beside(inverse, grid, c, r, right, bottom):
+                continue
             for e in range(starts[bucket], starts[bucket + 1]):
                 s = ids[e]
                 ax, ay = segments[s, 0], segments[s, 1]

@@ -53,8 +53,8 @@ _PIECE_M, _PIECE_PX = 60.0, 12.0
 #: Regions of the longer side of the frame, at most, in which a place may be contradicted, their least width, and how
 #: many times coarser pixels are than in its middle where it is too far away for that.
 _N_REGIONS, _REGION_M, _FAR = 6, 170.0, 1.6
-#: Step of the samples along the map's roads.
-STEP_M = 6.0
+#: Step of the samples along the map's roads, at least; no less than a cell of the query's raster.
+STEP_M = 12.0
 #: Places nearby: shifts of these lengths, spread evenly, and those that lay one of some intersections of the map near
 #: the middle on others around it; they are compared by this number of road points, and the best of them weighed.
 _SHIFT_M, _N_SHIFTS, _N_ANCHORS, _N_POINTS, _WEIGHED = (30.0, 320.0), 150, 3, 150, 12
@@ -179,12 +179,12 @@ class Evidence:
         """Return histograms of the residuals of the query's roads and of the map's, pixels of road, (P, bins) each."""
         scene, index = self.scene, self.index
         scale = _sampling(matrix, scene) / self.gsd_m
-        ground = Homography(matrix).everywhere(scene.corners)
+        ground, step_m = Homography(matrix).everywhere(scene.corners), max(STEP_M, scene.field_scale * self.gsd_m)
         seen, mapped = (np.empty((shape[0] * shape[1], _BINS + 1)) for _ in range(2))
         count_residuals(
             matrix, np.asarray(np.linalg.inv(matrix), float), np.concatenate([ground.min(axis=0), ground.max(axis=0)]),
             scene.points, scene.directions, scene.weights, _REACH * self._sigma_m * scale, MIN_COS,
-            STEP_M, index.road_buckets, scene.field, scene.field_scale, scene.observed, piece_px, shape[1],
+            step_m, index.road_buckets, scene.field, scene.field_scale, scene.observed, piece_px, shape[1],
             seen, mapped,
         )  # fmt: skip
         seen *= scene.road_length_px / max(len(scene.points), 1)

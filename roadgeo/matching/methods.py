@@ -194,7 +194,7 @@ def _search(
 
     scale = larger(sum(one.n_searched for one in opened))
     limits = replace(options.search, time_limit_s=left, work_limit_s=scale * options.search.work_limit_s)
-    rivals = Rivals(estimators, options.rivals, ledger, options.min_log10_odds, left)
+    rivals = Rivals(estimators, ledger, options.min_log10_odds, left)
     search_together(list(estimators), limits, same, rivals)
     sweeps.end()
     return [one.found(scale, rivals) for one in opened]

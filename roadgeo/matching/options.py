@@ -7,7 +7,6 @@ from typing import Literal
 
 from roadgeo.matching.estimator import MatchOptions
 from roadgeo.matching.paper import PairOptions
-from roadgeo.matching.rivals import RivalOptions
 from roadgeo.matching.search import SearchOptions
 
 __all__ = ["LocateOptions"]
@@ -51,6 +50,5 @@ class LocateOptions:
     threads: int = 1
     elsewhere: int = 0
     match: MatchOptions = field(default_factory=MatchOptions)
-    rivals: RivalOptions = field(default_factory=RivalOptions)
     search: SearchOptions = field(default_factory=SearchOptions)
     pair: PairOptions = field(default_factory=PairOptions)

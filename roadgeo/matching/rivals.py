@@ -2,8 +2,8 @@
 
 A place is worth its lead over the best other one. Where streets form a lattice other places explain a query almost as
 well: roads that both explain do not count, and those of only one speak for it. Others are those that the search
-met, and those that shifts and turns of the place lead to, on the map around it. Where one of them explains more, it is
-the best place, and is compared in its turn.
+met, and, where these leave it a lead, those that shifts and turns of the place lead to, on the map around it. Where one
+of them explains more, it is the best place, and is compared in its turn.
 
 Two numbers make the lead: how many pieces of the query speak for the place rather than for the best other one (see
 `Evidence.lead`), and how far its likelihood stands out of that of all others (`log10_gap`).
@@ -14,7 +14,7 @@ from __future__ import annotations
 import math
 import time
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import replace
 from typing import NamedTuple
 
 import numpy as np
@@ -33,7 +33,7 @@ from roadgeo.matching.scene import Scene
 from roadgeo.matching.search import Search
 from roadgeo.matching.triples import larger
 
-__all__ = ["Other", "RivalOptions", "Rivals", "Standing", "log10_gap", "similar_places"]
+__all__ = ["N_LAID", "Other", "Rivals", "Standing", "log10_gap", "similar_places"]
 
 #: Streets that cross at right angles fit themselves when they are turned by one.
 _TURNS_DEG = (0.0, 90.0, 180.0, 270.0)
@@ -43,9 +43,12 @@ _TAIL, _LEAST_TAIL, _LEAST_SPACING = 20, 5, 0.3
 _MOST_TURNS = 4
 
 
-#: A place that leads all places nearby by `certain` powers of ten is not compared further, if the best of them explains
+#: A place that leads all places nearby by so many powers of ten is not compared further, if the best of them explains
 #: less than this part of it: streets do not repeat there.
-_REPEATING = 0.35
+_CERTAIN, _REPEATING = 12.0, 0.35
+#: Streets around are looked at where the places that were met leave this part of the lead that is needed. At wrong
+#: places they leave up to a tenth, at right ones nine tenths and more.
+_WORTH_LOOKING = 0.5
 #: Powers of ten that a place loses where all of the roads are contradicted (see `Evidence.contradicted`), in
 #: proportion. At right places of masks of which up to half is gone, false, stale or bent the share is below 0.03; at
 #: the best wrong ones of masks turned over 0.15 and more, where a city was laid out like its own mirror image.
@@ -53,27 +56,13 @@ _DOUBT = 60.0
 #: Number of the places met by the search that are compared, the likeliest; and of road points that each of those around
 #: is laid by roughly.
 _N_KNOWN, _N_POINTS = 12, 200
+#: Number of the likeliest of those around that are laid finely.
+N_LAID = 8
 #: Middles of two places lie further from each other than this share of half the frame's diagonal.
 _APART = 0.04
-#: Streets around a place.
+#: Streets around a place, and the blocks beside it.
 _AROUND = LocalSearchOptions(reach_m=4000.0, turn_deg=0.0, cell_m=10.0, road_m=20.0, max_points=200, n_places=40)
-
-
-@dataclass(frozen=True)
-class RivalOptions:
-    """Where other places are looked for.
-
-    Attributes
-    ----------
-    certain : float
-        A place that leads all places nearby by as many powers of ten is not compared further.
-    n_places, n_laid : int
-        Number of places that most road points fit that are laid roughly, and of the likeliest of them, laid finely.
-    """
-
-    certain: float = 12.0
-    n_places: int = 40
-    n_laid: int = 8
+_NEARBY = replace(_AROUND, reach_m=500.0, n_places=8)
 
 
 class Standing(NamedTuple):
@@ -109,13 +98,12 @@ class Rivals:
     def __init__(
         self,
         estimators: Mapping[Search[Hypothesis], TripleEstimator],
-        options: RivalOptions,
         ledger: Ledger,
         needed: float,
         time_limit_s: float = math.inf,
     ) -> None:
         """Places of fewer powers of ten than `needed` are not compared, and none after the time limit."""
-        self.estimators, self.options, self.ledger, self.needed = estimators, options, ledger, needed
+        self.estimators, self.ledger, self.needed = estimators, ledger, needed
         self._deadline = time.perf_counter() + time_limit_s
         self._known: dict[int, Standing] = {}  # by the place's id, which its standing keeps from being given again
         self._doubts: dict[int, tuple[FloatArray, float]] = {}  # of a place as it was laid
@@ -149,39 +137,47 @@ class Rivals:
         return standing
 
     def _compare(self, estimator: TripleEstimator, best: Hypothesis, ranked: Sequence[Hypothesis]) -> Standing:
-        scene, index, options, matrix = estimator.scene_of(best), estimator.index, self.options, best.laid
+        scene, matrix = estimator.scene_of(best), best.laid
         if best.log10_likelihood < self.needed:
             return Standing(best, None, best.log10_odds)
         doubt = self.doubt(estimator, best)
         likeliest = next((m.log10_likelihood for m in ranked if not estimator.same(m, best)), 0.0)
         odds = min(best.log10_odds, best.log10_likelihood - max(likeliest, 0.0))
-        if odds >= options.certain and max(likeliest, best.nearby) < _REPEATING * best.log10_likelihood:
+        if odds >= _CERTAIN and max(likeliest, best.nearby) < _REPEATING * best.log10_likelihood:
             return Standing(best, None, odds - doubt, best.log10_likelihood)
         if time.perf_counter() > self._deadline:
             return Standing(best, None, min(odds, 0.0), best.log10_likelihood)
-        evidence = Evidence(scene, index, sampling(matrix, scene.size))
-        known = [model for model in ranked[: 1 + _N_KNOWN] if model is not best]
+        evidence = Evidence(scene, estimator.index, sampling(matrix, scene.size))
         worth, middle = evidence.weigh(matrix), Homography(matrix).everywhere(scene.center)
         apart_m, compare = _APART * scene.half_size * evidence.gsd_m, evidence.compared_with(matrix)
-        met = [Other(*compare(model.laid), model.laid, self.doubt(estimator, model)) for model in known]
-        others = [
-            other
-            for other in (*met, *similar_places(matrix, evidence, compare, estimator.options, options))
-            if np.hypot(*(Homography(other.matrix).everywhere(scene.center) - middle)) > apart_m
-            and estimator.may_be(other.matrix)
-        ]
-        rival = max(others, key=lambda one: one.worth - one.against, default=None)
-        if rival is not None and rival.worth - rival.against > worth:
-            likelihood = rival.worth - rival.against
-            return Standing(best, rival.matrix, worth - likelihood, worth, likelihood)
-        lead = min((other.lead for other in others), default=math.inf)
-        lead += log10_gap(worth, [other.worth for other in others])
         # The larger the map, the more places may lead all that lie around them.
-        paid = 2.0 * math.log10(larger(self.ledger.n_reference))
-        odds = min(lead, worth) - paid - doubt
-        if rival is None:
-            return Standing(best, None, odds, worth)
-        return Standing(best, rival.matrix, odds, worth, rival.worth - rival.against)
+        against = 2.0 * math.log10(larger(self.ledger.n_reference)) + doubt
+
+        def stand(others: Sequence[Other]) -> Standing:
+            others = [
+                other
+                for other in others
+                if np.hypot(*(Homography(other.matrix).everywhere(scene.center) - middle)) > apart_m
+                and estimator.may_be(other.matrix)
+            ]
+            rival = max(others, key=lambda one: one.worth - one.against, default=None)
+            lead = min((other.lead for other in others), default=math.inf)
+            lead += log10_gap(worth, [other.worth for other in others])
+            if rival is None:
+                return Standing(best, None, min(lead, worth) - against, worth)
+            likelihood = rival.worth - rival.against
+            odds = worth - likelihood if likelihood > worth else min(lead, worth) - against
+            return Standing(best, rival.matrix, odds, worth, likelihood)
+
+        known = [model for model in ranked[: 1 + _N_KNOWN] if model is not best]
+        met = [Other(*compare(model.laid), model.laid, self.doubt(estimator, model)) for model in known]
+        standing = stand(met)
+        if standing.log10_lead >= _WORTH_LOOKING * self.needed:
+            return stand([*met, *similar_places(matrix, evidence, compare, estimator.options)])
+        if best.nearby < _REPEATING * worth:
+            return standing
+        # Another block may be the place.
+        return stand([*met, *similar_places(matrix, evidence, compare, estimator.options, _NEARBY)])
 
     def doubt(self, estimator: TripleEstimator, model: Hypothesis) -> float:
         """Return by how many powers of ten what a place contradicts speaks against it, as it is laid; asked once."""
@@ -209,7 +205,7 @@ def similar_places(
     evidence: Evidence,
     compare: Callable[[FloatArray], tuple[float, float]],
     match: MatchOptions,
-    options: RivalOptions,
+    around: LocalSearchOptions = _AROUND,
 ) -> list[Other]:
     """Return other places around one that most roads would fit, the likeliest laid as well as they can be."""
     scene, index = evidence.scene, evidence.index
@@ -218,13 +214,13 @@ def similar_places(
     found: list[tuple[float, FloatArray]] = []
     for turn in _TURNS_DEG:
         turned = move_about(center, Shift(0.0, 0.0, turn, 1.0, 0.0)) @ matrix
-        shifts = search_nearby(turned, scene, index, _AROUND, drawn)
+        shifts = search_nearby(turned, scene, index, around, drawn)
         found += [(shift.share, move_about(center, shift) @ turned) for shift in shifts]
     found.sort(key=lambda one: -one[0])
-    laid = (_lay(start, scene, index, match, _N_POINTS) for _, start in found[: options.n_places])
+    laid = (_lay(start, scene, index, match, _N_POINTS) for _, start in found[: around.n_places])
     roughly = sorted((Other(*compare(one), one) for one in laid), key=lambda one: -one.worth)
-    finely = (_lay(one.matrix, scene, index, match, None) for one in roughly[: options.n_laid])
-    return [*(Other(*compare(one), one) for one in finely), *roughly[options.n_laid :]]
+    finely = (_lay(one.matrix, scene, index, match, None) for one in roughly[:N_LAID])
+    return [*(Other(*compare(one), one) for one in finely), *roughly[N_LAID:]]
 
 
 def log10_gap(best: float, others: Sequence[float]) -> float:

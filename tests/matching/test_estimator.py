@@ -12,7 +12,7 @@ from roadgeo.matching import growing
 from roadgeo.matching.estimator import MatchOptions, TripleEstimator
 from roadgeo.matching.events import Ledger
 from roadgeo.matching.index import build_index
-from roadgeo.matching.rivals import RivalOptions, Rivals
+from roadgeo.matching.rivals import Rivals
 from roadgeo.matching.scene import query_neighbours
 from roadgeo.matching.search import Search, SearchOptions, search, search_together
 from roadgeo.matching.triples import WITHOUT_ROADS, Sweep, TripleOptions
@@ -90,7 +90,7 @@ def test_twins_leave_no_margin():
     result, estimator = locate(scene, index)
     assert result.score > 6
     one = Search(estimator)
-    standing = Rivals({one: estimator}, RivalOptions(), Ledger(), 3.5).standing(one)
+    standing = Rivals({one: estimator}, Ledger(), 3.5).standing(one)
     assert standing.log10_lead < 1
     places = {tuple(np.round(estimator.center(model) / 100).astype(int)) for _, model in result.leaders}
     middle = mapped(truth, scene.center[None])[0]

@@ -16,7 +16,7 @@ from roadgeo.matching.evidence import Evidence, match_intersections
 from roadgeo.matching.exhaustive import Shift, move_about
 from roadgeo.matching.growing import Hypothesis
 from roadgeo.matching.options import LocateOptions
-from roadgeo.matching.rivals import RivalOptions, Rivals, log10_gap, similar_places
+from roadgeo.matching.rivals import Rivals, log10_gap, similar_places
 from roadgeo.matching.search import Search
 from roadgeo.matching.triples import larger
 from roadgeo.reference.reference import Reference
@@ -48,10 +48,10 @@ def search_of(world, *matrices, near=None, match=None):
     return Search(estimator), estimator
 
 
-def stand(world, *matrices, n_reference=866, options=None, **told):
+def stand(world, *matrices, n_reference=866, **told):
     """Compare the likeliest of some places with the best other one."""
     one, estimator = search_of(world, *matrices, **told)
-    return Rivals({one: estimator}, options or RivalOptions(), Ledger(n_reference=n_reference), NEEDED).standing(one)
+    return Rivals({one: estimator}, Ledger(n_reference=n_reference), NEEDED).standing(one)
 
 
 def apart(world, matrix, other=None):
@@ -112,13 +112,13 @@ def drawn(index, matrix, size):
 
 
 @pytest.mark.slow
-def test_a_place_known_to_the_search_is_a_rival_wherever_it_lies(broken):
+def test_a_place_known_to_the_search_is_a_rival_wherever_it_lies(broken, monkeypatch):
     """Also where nothing around the best place is looked at."""
     truth, _, evidence = broken
-    nothing_else = RivalOptions(n_places=0, n_laid=0)
+    monkeypatch.setattr(rivals, "similar_places", lambda *_: [])
     far = move_about(Homography(truth)(evidence.scene.center), Shift(-550.0, 450.0, 0.0, 1.0, 0.0)) @ truth
-    alone = stand(broken, truth, options=nothing_else)
-    both = stand(broken, truth, far, options=nothing_else)
+    alone = stand(broken, truth)
+    both = stand(broken, truth, far)
     assert alone.rival is None
     assert apart(broken, both.rival, far) < 5.0
     assert both.log10_lead <= alone.log10_lead
@@ -150,9 +150,9 @@ def test_only_what_the_user_allows_is_a_rival(broken):
 def test_similar_places_lie_on_the_streets_around_as_large_as_the_place_and_not_mirrored(broken):
     truth, _, evidence = broken
     wrong = beside(truth, evidence)
-    others = similar_places(wrong, evidence, evidence.compared_with(wrong), MatchOptions(), RivalOptions())
+    others = similar_places(wrong, evidence, evidence.compared_with(wrong), MatchOptions())
     places = [other.matrix for other in others]
-    assert 0 < len(places) <= RivalOptions().n_places
+    assert 0 < len(places) <= rivals._AROUND.n_places
     assert min(apart(broken, one) for one in places) < 3.0  # the place itself is among them
     assert sum(apart(broken, one, wrong) > 500.0 for one in places) > 1
     size = evidence.scene.size
@@ -196,7 +196,7 @@ def test_a_place_beyond_doubt_is_not_compared_further(plain, monkeypatch):
     monkeypatch.setattr(rivals, "similar_places", None)
     standing = stand(plain, plain[0])
     assert standing.rival is None
-    assert standing.log10_lead == standing.model.log10_odds > RivalOptions().certain
+    assert standing.log10_lead == standing.model.log10_odds > rivals._CERTAIN
 
 
 def test_what_explains_less_than_is_needed_is_not_compared(plain, monkeypatch):
@@ -204,22 +204,24 @@ def test_what_explains_less_than_is_needed_is_not_compared(plain, monkeypatch):
     monkeypatch.setattr(rivals, "similar_places", None)
     wrong = move_about(Homography(truth)(evidence.scene.center), Shift(700.0, 300.0, 50.0, 1.0, 0.0)) @ truth
     one, estimator = search_of(plain, wrong)
-    asked = Rivals({one: estimator}, RivalOptions(), Ledger(), NEEDED)
+    asked = Rivals({one: estimator}, Ledger(), NEEDED)
     standing = asked.standing(one)
     assert standing is None or standing.log10_lead < NEEDED
     assert asked([one]) is None
 
 
 @pytest.mark.slow
-def test_where_it_is_compared_it_leads_as_clearly(plain):
-    standing = stand(plain, plain[0], options=RivalOptions(certain=np.inf))
+def test_where_it_is_compared_it_leads_as_clearly(plain, monkeypatch):
+    certain = rivals._CERTAIN
+    monkeypatch.setattr(rivals, "_CERTAIN", np.inf)
+    standing = stand(plain, plain[0])
     assert apart(plain, standing.model.laid) < 2.0
-    assert standing.log10_lead > RivalOptions().certain
+    assert standing.log10_lead > certain
 
 
 def test_nothing_met_has_no_standing(plain):
     one, estimator = search_of(plain)
-    asked = Rivals({one: estimator}, RivalOptions(), Ledger(), NEEDED)
+    asked = Rivals({one: estimator}, Ledger(), NEEDED)
     assert asked.standing(one) is None
     assert asked([one]) is None
 
@@ -229,18 +231,28 @@ def test_a_search_ends_where_a_place_leads_by_twice_what_is_needed(broken):
     one, estimator = search_of(broken, broken[0])
     empty, other = search_of(broken)
     both = {empty: other, one: estimator}
-    standing = Rivals(both, RivalOptions(), Ledger(n_reference=866), 1.0).standing(one)
+    standing = Rivals(both, Ledger(n_reference=866), 1.0).standing(one)
     half = 0.49 * standing.log10_lead
-    assert Rivals(both, RivalOptions(), Ledger(n_reference=866), half)([empty, one]) is one
-    assert Rivals(both, RivalOptions(), Ledger(n_reference=15_000 * 10**4), half)([empty, one]) is None
-    assert Rivals(both, RivalOptions(), Ledger(n_reference=866), 1.1 * half)([empty, one]) is None
+    assert Rivals(both, Ledger(n_reference=866), half)([empty, one]) is one
+    assert Rivals(both, Ledger(n_reference=15_000 * 10**4), half)([empty, one]) is None
+    assert Rivals(both, Ledger(n_reference=866), 1.1 * half)([empty, one]) is None
 
 
 @pytest.mark.slow
 def test_a_place_is_compared_once_and_remembered(broken, monkeypatch):
     one, estimator = search_of(broken, broken[0])
-    asked = Rivals({one: estimator}, RivalOptions(), Ledger(n_reference=866), NEEDED)
+    asked = Rivals({one: estimator}, Ledger(n_reference=866), NEEDED)
     first, spent = asked.standing(one), one.seconds
     assert spent > 0.0  # it is part of the search
     monkeypatch.setattr(rivals, "similar_places", None)
     assert asked.standing(one) is first
+
+
+@pytest.mark.slow
+def test_streets_around_are_looked_at_only_where_the_places_met_leave_a_lead(even, broken, monkeypatch):
+    """A block beside may still be the place where the best one that was met leads nothing."""
+    looked = []
+    monkeypatch.setattr(rivals, "similar_places", lambda *told: looked.append(told[4:]) or [])
+    stand(even, even[0], beside(even[0], even[2]))
+    stand(broken, broken[0])
+    assert looked == [(rivals._NEARBY,), ()]

@@ -25,7 +25,7 @@ from roadgeo.matching.index import ReferenceIndex
 from roadgeo.matching.methods import Fit, Found, search_references
 from roadgeo.matching.options import LocateOptions
 from roadgeo.matching.refinement import refine
-from roadgeo.matching.rivals import RivalOptions, similar_places
+from roadgeo.matching.rivals import N_LAID, similar_places
 from roadgeo.matching.scene import Query
 from roadgeo.matching.verdict import decide
 from roadgeo.reference.reference import Reference
@@ -48,13 +48,10 @@ class CandidateOptions:
         Best places of each look that are weighed again with the frames to come.
     most : int
         Of more, those that explain most are kept.
-    rivals : RivalOptions
-        Where else the frames would fit.
     """
 
     per_look: int = 30
     most: int = 60
-    rivals: RivalOptions = field(default_factory=RivalOptions)
 
 
 @dataclass(frozen=True)
@@ -176,8 +173,8 @@ class Candidates:
         rival = max(rivals, key=lambda one: one[0], default=None)
         most = max(evidence.nearby(fit.matrix), 0.0 if rival is None else rival[0])
         if worth - most - paid >= options.min_log10_odds:
-            compare, usual = evidence.compared_with(fit.matrix), self.options.rivals
-            around = similar_places(fit.matrix, evidence, compare, options.match, usual)[: usual.n_laid]
+            compare = evidence.compared_with(fit.matrix)
+            around = similar_places(fit.matrix, evidence, compare, options.match)[:N_LAID]
             most = max([most, *(one.worth for one in around if not _are_one(one.matrix, fit.matrix, size))])
         lead = worth - max(most, 0.0) - paid
         fits = (replace(fit, log10_odds=lead),) + (() if rival is None else (replace(rival[1], log10_odds=-lead),))
