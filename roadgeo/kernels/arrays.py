@@ -1,36 +1,11 @@
 """Arrays of kernels by type and number of dimensions, all C-contiguous, and the meaning of annotations to kernels."""
 
+from collections.abc import Iterator
 from dataclasses import dataclass
 from typing import Annotated, Any, TypeAlias, get_args, get_origin, get_type_hints
 
 import numpy as np
 from numpy.typing import NDArray
-
-__all__ = [
-    "ArrayKind",
-    "Bools1",
-    "Bools2",
-    "Bytes1",
-    "Bytes2",
-    "Floats1",
-    "Floats2",
-    "Floats3",
-    "Int8s2",
-    "Int8s3",
-    "Int32s1",
-    "Int32s2",
-    "Ints1",
-    "Ints2",
-    "Ints3",
-    "Kind",
-    "Singles1",
-    "Singles2",
-    "TupleKind",
-    "UInt64s1",
-    "UInt64s2",
-    "Words3",
-    "kind_of",
-]
 
 Floats1: TypeAlias = Annotated[NDArray[np.float64], 1]
 Floats2: TypeAlias = Annotated[NDArray[np.float64], 2]
@@ -77,8 +52,8 @@ class TupleKind:
 Kind: TypeAlias = ArrayKind | TupleKind | type[float] | type[int] | type[bool] | None
 
 
-def kind_of(annotation: Any) -> Kind:
-    """Return what an annotation means to a kernel.
+def kind_of(annotation: Any, written: bool = False) -> Kind:
+    """Return what an annotation means to a kernel, which writes to the arrays in it or only reads them.
 
     Raises
     ------
@@ -90,10 +65,19 @@ def kind_of(annotation: Any) -> Kind:
     if get_origin(annotation) is Annotated:
         array, ndim = get_args(annotation)
         told = get_args(array)  # of the alias `NDArray[scalar]`, or, before NumPy made it one, of its expansion
-        return ArrayKind(np.dtype(told[0] if len(told) == 1 else get_args(told[1])[0]), ndim)
+        return ArrayKind(np.dtype(told[0] if len(told) == 1 else get_args(told[1])[0]), ndim, written)
     if get_origin(annotation) is tuple:
-        return TupleKind(tuple(map(kind_of, get_args(annotation))))
+        return TupleKind(tuple(kind_of(member, written) for member in get_args(annotation)))
     if hasattr(annotation, "_fields"):
         hints = get_type_hints(annotation, include_extras=True)
-        return TupleKind(tuple(kind_of(hints[name]) for name in annotation._fields), annotation)
+        return TupleKind(tuple(kind_of(hints[name], written) for name in annotation._fields), annotation)
     raise TypeError(f"{annotation} is no type of a kernel's argument")
+
+
+def leaves(*kinds: Kind) -> Iterator[Kind]:
+    """Yield the arrays and numbers that kinds consist of."""
+    for kind in kinds:
+        if isinstance(kind, TupleKind):
+            yield from leaves(*kind.members)
+        elif kind is not None:
+            yield kind

@@ -24,7 +24,6 @@ import struct
 import sys
 import threading
 from collections.abc import Callable, Iterator, Sequence
-from dataclasses import replace
 from functools import cached_property, lru_cache
 from pathlib import Path
 from typing import Any, NamedTuple, TypeVar, cast
@@ -32,7 +31,7 @@ from typing import Any, NamedTuple, TypeVar, cast
 import numpy as np
 
 from roadgeo import __version__
-from roadgeo.kernels.arrays import ArrayKind, Kind, TupleKind, kind_of
+from roadgeo.kernels.arrays import ArrayKind, Kind, TupleKind, kind_of, leaves
 from roadgeo.storage.folders import cache_dir, is_private, private_temporary_dir, writable
 
 __all__ = ["Kernel", "compiled", "entries", "kernel", "kernel_folder", "load", "modules_of_the_search"]
@@ -147,8 +146,13 @@ class _Call:
     def __init__(self, one: Kernel, code: Any, release: Callable[[int], None]) -> None:
         self.code, self.release, self.kernel = code, release, one
         self.name, self.arguments, self.result = one.name, one.arguments or (), one.result
-        self.pack = struct.Struct("=" + "".join(map(_argument_format, self.arguments))).pack
-        self.answer = struct.Struct("=" + _result_format(one.result))
+        given = ("d" if leaf is float else "q" for leaf in leaves(*self.arguments))
+        returned = (
+            f"QQ{leaf.ndim}q" if isinstance(leaf, ArrayKind) else ("d" if leaf is float else "q")
+            for leaf in leaves(one.result)
+        )
+        self.pack = struct.Struct("=" + "".join(given)).pack
+        self.answer = struct.Struct("=" + "".join(returned))
         self.room = ctypes.c_char * max(self.answer.size, 8)
 
     def __call__(self, *args: Any) -> Any:
@@ -189,39 +193,17 @@ def _fill(slots: list[Any], values: Sequence[Any], kinds: tuple[Kind, ...], name
     return True
 
 
-def _argument_format(kind: Kind) -> str:
-    if isinstance(kind, TupleKind):
-        return "".join(map(_argument_format, kind.members))
-    return "d" if kind is float else "q"
-
-
-def _result_format(kind: Kind) -> str:
-    if kind is None:
-        return ""
-    if isinstance(kind, TupleKind):
-        return "".join(map(_result_format, kind.members))
-    if isinstance(kind, ArrayKind):
-        return "QQ" + "q" * kind.ndim
-    return "d" if kind is float else "q"
-
-
 def _kinds(function: Callable[..., Any], writes: tuple[str, ...]) -> tuple[tuple[Kind, ...] | None, Kind]:
     """Read the kinds of a function's arguments and of its result from its annotations."""
     names = function.__code__.co_varnames[: function.__code__.co_argcount]
     try:
-        arguments = tuple(_written(kind_of(function.__annotations__[name]), name in writes) for name in names)
-        result = _written(kind_of(function.__annotations__["return"]), True)
+        arguments = tuple(kind_of(function.__annotations__[name], name in writes) for name in names)
+        result = kind_of(function.__annotations__["return"], True)
     except (KeyError, TypeError):
         return None, None
     # With numbers alone, or a private name, it is a part of others.
     known = any(isinstance(kind, ArrayKind | TupleKind) for kind in arguments) and not function.__name__.startswith("_")
     return (arguments, result) if known else (None, None)
-
-
-def _written(kind: Kind, is_written: bool) -> Kind:
-    if isinstance(kind, TupleKind):
-        return replace(kind, members=tuple(_written(member, is_written) for member in kind.members))
-    return replace(kind, written=is_written) if isinstance(kind, ArrayKind) else kind
 
 
 # --- machine code kept ------------------------------------------------------------------------------------------------
@@ -306,11 +288,10 @@ def kernel_folder() -> Path:
 def _numba_version() -> str:
     """Return numba's version, out of its file: to import it, or to ask the package's metadata, takes too long."""
     spec = importlib.util.find_spec("numba")
-    if spec is not None and spec.origin is not None:
-        with contextlib.suppress(OSError):
-            told = re.search(r'"version": "([^"]+)"', Path(spec.origin).with_name("_version.py").read_text("utf-8"))
-            if told:
-                return told[1]
+    with contextlib.suppress(OSError):
+        source = Path(getattr(spec, "origin", None) or "").with_name("_version.py").read_text("utf-8")
+        if told := re.search(r'"version": "([^"]+)"', source):
+            return told[1]
     from importlib.metadata import version
 
     return version("numba")

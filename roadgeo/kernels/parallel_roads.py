@@ -1,6 +1,6 @@
 """Kernels of `roadgeo.roads.simplification`: roads that run beside each other, such as the two ways of a motorway.
 
-Edges are those of `kernels.simplification`.
+Edges are those of `kernels.simplification`; `lengths` (E,) are theirs.
 """
 
 import numpy as np
@@ -9,7 +9,7 @@ from numpy.typing import NDArray
 from roadgeo.kernels.arrays import Floats1, Floats2, Int32s1, Int32s2, Ints1
 from roadgeo.kernels.compilation import kernel
 
-__all__ = ["find_mates", "fuse_twins", "roads_alongside", "sample_edges", "tie_runs"]
+__all__ = ["find_mates", "find_twins", "roads_alongside", "sample_edges", "tie_runs"]
 
 
 @kernel()
@@ -28,47 +28,31 @@ def _point_at(coords: NDArray[np.float64], lo: int, hi: int, along: float) -> tu
 
 
 @kernel()
-def fuse_twins(
-    edges: Int32s2,
-    offsets: Ints1,
-    coords: Floats2,
-    lengths: Floats1,
-    by_ends: Ints1,
-    distance: float,
-    spacing: float,
-) -> tuple[Int32s2, Floats2, Ints1]:
-    """Make one edge, halfway, of edges that run beside each other between the same two nodes.
+def find_twins(
+    edges: Int32s2, offsets: Ints1, coords: Floats2, lengths: Floats1, by_ends: Ints1, distance: float
+) -> Ints1:
+    """Find edges that run beside each other between the same two nodes: (E,) the first of those that each is one of.
+
+    Twins are everywhere nearer to each other than `distance`, compared at equal shares of their lengths.
 
     Parameters
     ----------
     edges : (E, 2) int32
         With `edges[e, 0] <= edges[e, 1]`.
-    offsets : (E + 1,) int64
-    coords : (C, 2) float64
-    lengths : (E,) float64
     by_ends : (E,) int64
         Order of the edges by their two ends.
-    distance : float
-        Twins are everywhere nearer to each other than this, compared at equal shares of their lengths.
-    spacing : float
-        Of the vertices of an edge made of twins.
-
-    Returns
-    -------
-    edges, coords, offsets
     """
     n_edges = len(edges)
-    stands = np.arange(n_edges)  # the edge that each one goes into
-    members = np.ones(n_edges, np.int64)
+    first = np.arange(n_edges)
     for a in range(n_edges):
         e = by_ends[a]
-        if stands[e] != e or edges[e, 0] == edges[e, 1]:
+        if first[e] != e or edges[e, 0] == edges[e, 1]:
             continue
         for b in range(a + 1, n_edges):
             f = by_ends[b]
             if edges[f, 0] != edges[e, 0] or edges[f, 1] != edges[e, 1]:
                 break
-            if stands[f] != f:
+            if first[f] != f:
                 continue
             near = True
             for k in range(1, 12):
@@ -78,66 +62,17 @@ def fuse_twins(
                     near = False
                     break
             if near:
-                stands[f] = e
-                members[e] += 1
-
-    size = 0
-    n_out = 0
-    for e in range(n_edges):
-        if stands[e] == e:
-            n_out += 1
-            size += offsets[e + 1] - offsets[e] if members[e] == 1 else int(lengths[e] / spacing) + 2
-    out_edges = np.empty((n_out, 2), np.int32)
-    out_offsets = np.zeros(n_out + 1, np.int64)
-    out = np.zeros((size, 2))
-    place = np.empty(n_edges, np.int64)
-    size = 0
-    n_out = 0
-    for e in range(n_edges):
-        if stands[e] == e:
-            place[e] = n_out
-            out_edges[n_out, 0], out_edges[n_out, 1] = edges[e, 0], edges[e, 1]
-            if members[e] == 1:
-                for c in range(offsets[e], offsets[e + 1]):
-                    out[size, 0] = coords[c, 0]
-                    out[size, 1] = coords[c, 1]
-                    size += 1
-            else:
-                size += int(lengths[e] / spacing) + 2
-            n_out += 1
-            out_offsets[n_out] = size
-    for e in range(n_edges):
-        head = stands[e]
-        if members[head] > 1:
-            lo = out_offsets[place[head]]
-            n = out_offsets[place[head] + 1] - lo
-            for k in range(n):
-                x, y = _point_at(coords, offsets[e], offsets[e + 1], lengths[e] * k / (n - 1))
-                out[lo + k, 0] += x / members[head]
-                out[lo + k, 1] += y / members[head]
-    return out_edges, out, out_offsets
+                first[f] = e
+    return first
 
 
 @kernel(writes=("xy", "direction"))
 def sample_edges(
-    offsets: Ints1,
-    coords: Floats2,
-    lengths: Floats1,
-    starts: Ints1,
-    xy: Floats2,
-    direction: Floats2,
+    offsets: Ints1, coords: Floats2, lengths: Floats1, starts: Ints1, xy: Floats2, direction: Floats2
 ) -> None:
-    """Write points evenly spaced along every edge, both ends included, and the road's direction there.
+    """Write points `xy` (S, 2) evenly spaced along every edge, both ends included, and unit vectors along the road.
 
-    Parameters
-    ----------
-    offsets : (E + 1,) int64
-    coords : (C, 2) float64
-    lengths : (E,) float64
-    starts : (E + 1,) int64
-        Edge e gets samples `starts[e]` to `starts[e + 1]`, two or more.
-    xy, direction : (S, 2) float64
-        Written; directions are unit vectors.
+    Edge e gets the samples `starts[e]` to `starts[e + 1]`, two or more.
     """
     for e in range(len(lengths)):
         n = starts[e + 1] - starts[e]
@@ -178,17 +113,11 @@ def find_mates(
 
     Parameters
     ----------
-    xy, direction : (S, 2) float64
-    edge : (S,) int32
-        The edge of each sample.
-    edges : (E, 2) int32
-    starts : (E + 1,) int64
-        Edge e has the samples `starts[e]` to `starts[e + 1]`.
+    xy, direction, edge, starts
+        Samples as of `sample_edges`, and the edge of each.
     order, key : (S,) int64
         Samples sorted by the cell (row * n_columns + column, with empty cells around) that they lie in, and those
         cells, ascending; cells are `distance` wide.
-    n_columns : int
-    distance : float
     min_cos : float
         Least |cosine| of the angle between the two roads.
 
@@ -245,22 +174,14 @@ def find_mates(
 
 @kernel()
 def tie_runs(
-    starts: Ints1,
-    lengths: Floats1,
-    edge: Int32s1,
-    mate: Ints1,
-    apart: Floats1,
-    split_distance: float,
-    least: float,
+    starts: Ints1, lengths: Floats1, edge: Int32s1, mate: Ints1, apart: Floats1, split_distance: float, least: float
 ) -> Floats2:
     """Tie two edges together where they begin and where they cease to run side by side.
 
     Parameters
     ----------
-    starts : (E + 1,) int64
-    lengths : (E,) float64
-    edge, mate : (S,) int64
-    apart : (S,) float64
+    starts, edge, mate, apart
+        Samples and their mates, as of `find_mates`.
     split_distance : float
         Where two roads part, they are one until they are this far apart.
     least : float

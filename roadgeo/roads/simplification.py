@@ -16,7 +16,7 @@ import numpy as np
 from roadgeo._arrays import AnyArray, BoolArray, FloatArray, Int32Array, IntArray
 from roadgeo.errors import RoadSourceError
 from roadgeo.kernels import simplification as kernels
-from roadgeo.kernels.parallel_roads import find_mates, fuse_twins, sample_edges, tie_runs
+from roadgeo.kernels.parallel_roads import find_mates, find_twins, sample_edges, tie_runs
 from roadgeo.roads.graph import RoadGraph
 from roadgeo.storage.memory import give_back_memory
 
@@ -300,13 +300,28 @@ def _close_narrow_faces(graph: RoadGraph, options: SimplifyOptions) -> RoadGraph
     if graph.n_edges == 0:
         return graph
     follow, area = _walk_faces(graph)
-    face = kernels.narrow_faces(follow, area, _lengths(graph), options.fuse_distance, 6.0 * options.merge_radius)
+    face = narrow_faces(follow, area, _lengths(graph), options.fuse_distance, 6.0 * options.merge_radius)
     node = graph.edges.ravel()
     inner = np.flatnonzero(face >= 0)
     pairs = np.stack((node[inner], node[face[inner]]), axis=1).astype(np.int64)
     pairs = pairs[pairs[:, 0] != pairs[:, 1]]
     filled = np.asarray((face >= 0).reshape(-1, 2).any(axis=1))
     return _merge(graph, pairs, np.full(len(pairs), np.inf), 0.0, drop=filled)
+
+
+def narrow_faces(follow: IntArray, area: FloatArray, lengths: FloatArray, width: float, longest: float) -> IntArray:
+    """Return the first half-edge (2 E,) of the narrow face on the left of each half-edge, -1 for other faces.
+
+    `follow` and `area` are those of `_walk_faces`, `lengths` (E,). A face is narrow when twice its area is less than
+    `width` times its perimeter, which is less than `longest`.
+    """
+    first, ahead = np.arange(len(follow)), follow
+    while (lower := np.minimum(first, first[ahead])).sum() < first.sum():  # twice as far ahead each time
+        first, ahead = lower, ahead[ahead]
+    total = np.bincount(first, area, len(follow))
+    perimeter = np.bincount(first, np.repeat(lengths, 2), len(follow))
+    narrow = (perimeter < longest) & (2 * total > 0.0) & (2 * total < width * perimeter)
+    return np.asarray(np.where(narrow[first], first, -1))
 
 
 def _walk_faces(graph: RoadGraph) -> tuple[IntArray, FloatArray]:
@@ -339,16 +354,30 @@ def _fuse_parallels(graph: RoadGraph, options: SimplifyOptions) -> RoadGraph:
     if not ((ends[1:] == ends[:-1]).all(axis=1) & (ends[1:, 0] != ends[1:, 1])).any():
         return graph if tied is halved else tied
     turned = _turned(tied)
-    edges, coords, offsets = fuse_twins(
-        turned.edges,
-        turned.offsets,
-        turned.coords,
-        _lengths(turned),
-        by_ends,
-        1.5 * options.fuse_distance,
-        0.5 * options.fuse_distance,
+    first = find_twins(
+        turned.edges, turned.offsets, turned.coords, _lengths(turned), by_ends, 1.5 * options.fuse_distance
     )
-    return RoadGraph(tied.xy, edges, coords, offsets)
+    return fuse_twins(turned, first, 0.5 * options.fuse_distance)
+
+
+def fuse_twins(graph: RoadGraph, first: IntArray, spacing: float) -> RoadGraph:
+    """Make one edge, halfway, of each edge and its twins (see `find_twins`), with a vertex every `spacing`."""
+    members = np.bincount(first, minlength=graph.n_edges)
+    is_first = members > 0
+    lengths = _lengths(graph)
+    count = np.where(members > 1, (lengths / spacing).astype(np.int64) + 2, np.diff(graph.offsets))
+    starts = np.concatenate(([0], np.cumsum(np.where(is_first, count, 0))))
+    coords = np.zeros((starts[-1], 2))
+    alone = np.repeat(members == 1, np.diff(graph.offsets))
+    coords[np.repeat(members[is_first] == 1, count[is_first])] = graph.coords[alone]
+    twins = np.flatnonzero(members[first] > 1)
+    samples = np.concatenate(([0], np.cumsum(count[first[twins]])))
+    xy, direction = np.empty((2, samples[-1], 2))
+    part = _keep_edges(graph, members[first] > 1)
+    sample_edges(part.offsets, part.coords, lengths[twins], samples, xy, direction)
+    for n, e in enumerate(first[twins]):
+        coords[starts[e] : starts[e + 1]] += xy[samples[n] : samples[n + 1]] / members[e]
+    return RoadGraph(graph.xy, graph.edges[is_first], coords, starts[np.append(is_first, True)])
 
 
 def _find_ties(graph: RoadGraph, options: SimplifyOptions) -> FloatArray:
@@ -415,15 +444,7 @@ def _tie(graph: RoadGraph, ties: FloatArray, options: SimplifyOptions) -> RoadGr
     if len(pairs) == 0:
         return graph
     cuts = inner[fresh]
-    places, edges, coords, offsets = kernels.cut_edges(
-        graph.edges,
-        graph.offsets,
-        graph.coords,
-        along[cuts],
-        np.concatenate(([0], np.cumsum(np.bincount(edge[cuts], minlength=graph.n_edges)))),
-        graph.n_nodes,
-    )
-    cut = RoadGraph(np.concatenate((graph.xy, places)), edges, coords, offsets)
+    cut = cut_edges(graph, along[cuts], np.bincount(edge[cuts], minlength=graph.n_edges))
     return _merge(cut, pairs, np.full(len(pairs), 2.0 * options.fuse_distance), 4 * options.merge_radius)
 
 
@@ -432,14 +453,22 @@ def _halve_loops(graph: RoadGraph) -> RoadGraph:
     loop = graph.edges[:, 0] == graph.edges[:, 1]
     if not loop.any():
         return graph
-    places, edges, coords, offsets = kernels.cut_edges(
-        graph.edges,
-        graph.offsets,
-        graph.coords,
-        _lengths(graph)[loop] / 2,
-        np.concatenate(([0], np.cumsum(loop))),
-        graph.n_nodes,
-    )
+    return cut_edges(graph, _lengths(graph)[loop] / 2, loop.astype(np.int64))
+
+
+def cut_edges(graph: RoadGraph, cuts: FloatArray, count: IntArray) -> RoadGraph:
+    """Cut edges at arc lengths (K,), edge after edge and ascending, of which each has `count` (E,).
+
+    Cut k becomes node `n_nodes + k`.
+    """
+    starts = np.concatenate(([0], np.cumsum(count)))
+    places, at = kernels.find_cuts(graph.offsets, graph.coords, cuts, starts)
+    k = np.arange(len(cuts))
+    # A cut ends one edge and begins the next: its vertex and its node come twice.
+    coords = np.insert(graph.coords, np.repeat(at, 2), np.repeat(places, 2, axis=0), axis=0)
+    middle = np.repeat(2 * np.repeat(np.arange(graph.n_edges), count) + 1, 2)
+    edges: Int32Array = np.insert(graph.edges.ravel(), middle, np.repeat(graph.n_nodes + k, 2)).reshape(-1, 2)
+    offsets = np.sort(np.concatenate((graph.offsets + 2 * starts, at + 2 * k + 1)))
     return RoadGraph(np.concatenate((graph.xy, places)), edges, coords, offsets)
 
 
@@ -460,13 +489,21 @@ def _merge(
     if len(pairs):
         order = np.argsort(np.hypot(*(graph.xy[pairs[:, 0]] - graph.xy[pairs[:, 1]]).T), kind="stable")
         cluster, centre = kernels.draw_together(graph.xy, pairs[order], radius[order])
-        coords, offsets = kernels.reattach(centre, graph.edges, graph.offsets, graph.coords)
-        merged = RoadGraph(centre, cluster[graph.edges].astype(np.int32), coords, offsets)
+        merged = replace(reattach(graph, centre), edges=cluster[graph.edges].astype(np.int32))
     loop = merged.edges[:, 0] == merged.edges[:, 1]
     if not loop.any():
         return merged
     short = _lengths(merged) < shortest_loop
     return _keep_edges(merged, ~(loop & (short if drop is None else short | drop)))
+
+
+def reattach(graph: RoadGraph, centre: FloatArray) -> RoadGraph:
+    """Move nodes to `centre` (N, 2): every edge runs from the one place to the other through all its old vertices."""
+    place, ends = centre[graph.edges], np.stack((graph.offsets[:-1], graph.offsets[1:]), axis=1)
+    fresh = (place != graph.coords[ends - [0, 1]]).any(axis=2)
+    coords = np.insert(graph.coords, ends[fresh], place[fresh], axis=0)
+    offsets = graph.offsets + np.concatenate(([0], np.cumsum(fresh.sum(axis=1))))
+    return RoadGraph(centre, graph.edges, coords, offsets)
 
 
 def _lengths(graph: RoadGraph) -> FloatArray:

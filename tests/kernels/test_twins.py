@@ -15,11 +15,11 @@ from roadgeo.kernels.compilation import Kernel
 #: Twins of other names: of one item where the kernel does all, or of what the kernel's result is made of.
 TWINS = {
     "count_inliers": "evaluate_pairs",
-    "cut_edges": "cut_edge",
+    "find_cuts": "cut_edge",
     "describe_intersections": "merge_lines",
     "find_sides": "sides_of",
     "fit_branches": "fit_branch",
-    "fuse_twins": "are_twins",
+    "find_twins": "are_twins",
     "orient": "shape_of",
     "paint_roads": "bits_at",
     "passes": "word_at",
@@ -39,6 +39,7 @@ TWINS = {
 CALLS = {
     "count_inliers": "evaluate_pairs",
     "describe_intersections": "find_intersections",
+    "find_cuts": "cut_edges",
     "fit_branches": "find_intersections",
 }
 

@@ -10,7 +10,18 @@ from roadgeo.errors import RoadSourceError
 from roadgeo.kernels import parallel_roads
 from roadgeo.kernels import simplification as kernels
 from roadgeo.roads.graph import RoadGraph
-from roadgeo.roads.simplification import SimplifyOptions, _keep_edges, _walk_faces, coverage, planarize, simplify
+from roadgeo.roads.simplification import (
+    SimplifyOptions,
+    _keep_edges,
+    _walk_faces,
+    coverage,
+    cut_edges,
+    fuse_twins,
+    narrow_faces,
+    planarize,
+    reattach,
+    simplify,
+)
 
 
 def network(*lines):
@@ -304,8 +315,7 @@ def test_edges_measure_and_reattach_as_their_twins(graph):
     np.testing.assert_allclose(measured, [LineString(line).length for line in graph.polylines()])
     np.testing.assert_allclose(measured, graph.edge_lengths())
     centre = np.round(graph.xy / 20) * 20
-    coords, offsets = kernels.reattach(centre, graph.edges, graph.offsets, graph.coords)
-    moved = RoadGraph(centre, graph.edges, coords, offsets)
+    moved = reattach(graph, centre)
     expected = naive.reattach(centre, graph.edges, graph.polylines())
     assert [list(map(tuple, line.tolist())) for line in moved.polylines()] == expected
 
@@ -316,17 +326,15 @@ def test_edges_measure_and_reattach_as_their_twins(graph):
 def test_edges_are_cut_as_by_the_twin(graph, shares):
     lengths = graph.edge_lengths()
     cuts = [sorted({lengths[e] * shares[2 * e], lengths[e] * shares[2 * e + 1]}) for e in range(graph.n_edges)]
-    starts = np.concatenate(([0], np.cumsum([len(c) for c in cuts])))
-    places, edges, coords, offsets = kernels.cut_edges(
-        graph.edges, graph.offsets, graph.coords, np.concatenate(cuts), starts, graph.n_nodes
-    )
-    pieces = RoadGraph(np.concatenate((graph.xy, places)), edges, coords, offsets)
+    pieces = cut_edges(graph, np.concatenate(cuts), np.array([len(c) for c in cuts]))
     assert valid(pieces) or graph.degree().min() == 0 or lengths.min() == 0
     expected = [piece for line, c in zip(graph.polylines(), cuts, strict=True) for piece in naive.cut_edge(line, c)]
     if lengths.min() > 0:
         assert pieces.n_edges == len(expected)
         np.testing.assert_allclose(pieces.edge_lengths(), [piece.length for piece in expected], atol=1e-9)
-        np.testing.assert_allclose(coords[offsets[:-1]], [piece.coords[0] for piece in expected], atol=1e-9)
+        np.testing.assert_allclose(
+            pieces.coords[pieces.offsets[:-1]], [piece.coords[0] for piece in expected], atol=1e-9
+        )
 
 
 @pytest.mark.slow
@@ -337,10 +345,11 @@ def test_twins_are_fused_as_by_the_twin(graph, distance):
     lines = [line[::-1] if turned else line for line, turned in zip(graph.polylines(), back, strict=True)]
     graph = RoadGraph.from_polylines(graph.xy, np.sort(graph.edges, axis=1), lines)
     by_ends = np.lexsort((graph.edges[:, 1], graph.edges[:, 0]))
-    edges, coords, offsets = parallel_roads.fuse_twins(
-        graph.edges, graph.offsets, graph.coords, graph.edge_lengths(), by_ends, distance, 3.0
+    fused = fuse_twins(
+        graph,
+        parallel_roads.find_twins(graph.edges, graph.offsets, graph.coords, graph.edge_lengths(), by_ends, distance),
+        3.0,
     )
-    fused = RoadGraph(graph.xy, edges, coords, offsets)
     heads: list[list[int]] = []
     for e in by_ends:
         for group in heads:
@@ -351,7 +360,7 @@ def test_twins_are_fused_as_by_the_twin(graph, distance):
         else:
             heads.append([e])
     heads.sort(key=lambda group: group[0])
-    assert edges.tolist() == [graph.edges[group[0]].tolist() for group in heads]
+    assert fused.edges.tolist() == [graph.edges[group[0]].tolist() for group in heads]
     for line, group in zip(fused.polylines(), heads, strict=True):
         if len(group) == 1:
             np.testing.assert_array_equal(line, lines[group[0]])
@@ -450,7 +459,7 @@ def test_narrow_faces_agree_with_their_twin(drawn, width):
         return
     graph, lines = _keep_edges(whole, closed), lines[closed]
     follow, area = _walk_faces(graph)
-    face = kernels.narrow_faces(follow, area, graph.edge_lengths(), width, 200.0)
+    face = narrow_faces(follow, area, graph.edge_lengths(), width, 200.0)
     found = [
         (area[face == first].sum(), graph.edge_lengths()[np.flatnonzero(face == first) // 2].sum())
         for first in np.unique(face[face >= 0])
