@@ -34,16 +34,10 @@ class Events:
     - "grown": homographies (3, 3) that grew;
     - "refused": the camera's objection, and a homography that grew and that no camera can have seen;
     - "scored": a `Scored`.
-
-    Attributes
-    ----------
-    kept : bool
-    estimator, result
-        The estimator, and its result; None where nothing is kept, or nothing was searched.
     """
 
     kept: bool = False
-    estimator: TripleEstimator | None = None
+    estimator: TripleEstimator | None = None  # where anything was searched, and is kept
     result: Search[Hypothesis] | None = None
     items: list[tuple[Any, ...]] = field(default_factory=list)
 
@@ -68,47 +62,23 @@ _VERIFIED, _VERIFIED_POINT = 1e-3, 3.5e-6
 
 @dataclass
 class Ledger:
-    """Places tried in one search, on all of its parts together: each of them could have agreed by chance.
+    """Places tried in one search, on all of its parts together: each of them could have agreed by chance."""
 
-    Attributes
-    ----------
-    n_reference : int
-        Intersections of all parts: attempts on them are bounded as on one map of that size.
-    n_tried, beside : int, float
-        Those, and how many are tried on the whole map for each that is tried here (see `LocateOptions.elsewhere`).
-    n_by_triples : int
-        Those that triples proposed.
-    """
-
-    n_reference: int = 0
+    n_reference: int = 0  # intersections of all parts: attempts are bounded as on one map of that size
     n_tried: int = 0
-    n_by_triples: int = 0
-    beside: float = 1.0
+    n_by_triples: int = 0  # those that triples proposed
+    beside: float = 1.0  # tried on the whole map for each that is tried here (see `LocateOptions.elsewhere`)
 
 
 class Work(NamedTuple):
-    """Counts of a search, which measure its work, the same on every machine, busy or idle.
+    """Counts of a search, which measure its work, the same on every machine, busy or idle."""
 
-    Attributes
-    ----------
-    rounds : int
-        Intersections of the query that were tried.
-    tuples : int
-        Tuples of the map that were like those of the query.
-    places : int
-        Places that were screened or voted for.
-    grown, verified : int
-        Hypotheses that were grown, and that were compared with the map.
-    points : int
-        Road points of the query that each was compared by.
-    """
-
-    rounds: int
-    tuples: int
-    places: int
-    grown: int
-    verified: int
-    points: int
+    rounds: int  # intersections of the query that were tried
+    tuples: int  # of the map, that were like those of the query
+    places: int  # screened or voted for
+    grown: int  # hypotheses
+    verified: int  # those compared with the map
+    points: int  # road points of the query that each was compared by
 
     @property
     def seconds(self) -> float:

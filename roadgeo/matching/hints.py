@@ -30,40 +30,19 @@ _YES, _NO = ("", "1", "true", "yes"), ("0", "false", "no")
 class Hint:
     """One thing that may be known.
 
-    Attributes
-    ----------
-    name : str
-        As a keyword of Python; `option` is its name on the command line, `parameter` over HTTP.
-    goes_to : str
-        Its name among the hints of `apply_hints`: a field of the options of a search, with its unit.
-    form : str
-        How a value is written; "" for a switch.
-    label : str
-        What it is, in a few words with its unit: the title of its field in a dialog.
-    help : str
-        Its meaning, with its unit and its default.
-    read : callable
-        Takes a value in any form; returns what the search takes. Raises ValueError: "got ..., expected ...".
-    schema : mapping
-        JSON Schema of a value over HTTP, next to a text.
-    default : float or str
-        Its value where none is given, as far as one word tells it; `told` adds it to the help.
-    group : str
-        Under which heading of the help it stands.
-    also : str
-        An earlier name of the option.
+    `read` takes a value in any form, and returns what the search takes; it raises ValueError: "got ..., expected ...".
     """
 
-    name: str
-    goes_to: str
-    form: str
-    label: str
-    help: str
+    name: str  # as a keyword of Python; `option` is its name on the command line, `parameter` over HTTP
+    goes_to: str  # its name among the hints of `apply_hints`: a field of the options of a search, with its unit
+    form: str  # how a value is written; "" for a switch
+    label: str  # the title of its field in a dialog, with its unit
+    help: str  # its meaning, with its unit and its default
     read: Callable[[Any], Any]
-    schema: Mapping[str, Any]
-    default: float | str = ""
-    group: str = "The image"
-    also: str = ""
+    schema: Mapping[str, Any]  # JSON Schema of a value over HTTP, next to a text
+    default: float | str = ""  # where none is given, as far as one word tells it; `told` adds it to the help
+    group: str = "The image"  # the heading of the help that it stands under
+    also: str = ""  # an earlier name of the option
 
     @property
     def option(self) -> str:
@@ -84,16 +63,16 @@ class Hint:
 
 
 # --- reading ----------------------------------------------------------------------------------------------------------
+# All of these raise ValueError, "got ..., expected ...", for values that they cannot take.
+
+
+def _expect(holds: bool, value: Any, form: str, why: str = "") -> None:
+    if not holds:
+        raise ValueError(f"got {repr(value)[:60]}{f': {why};' if why else ','} expected {form}")
 
 
 def read_numbers(value: Any, form: str, counts: Sequence[int], separators: str = ",:") -> tuple[float, ...]:
-    """Return the finite numbers that a value holds.
-
-    Raises
-    ------
-    ValueError
-        It holds others, or another count than one of `counts`.
-    """
+    """Return the finite numbers that a value holds, as many as one of `counts`."""
     if isinstance(value, str):
         parts: Sequence[Any] = re.split(f"[{separators}]", value)
     else:
@@ -102,13 +81,14 @@ def read_numbers(value: Any, form: str, counts: Sequence[int], separators: str =
         numbers = () if any(isinstance(part, bool) for part in parts) else tuple(map(float, parts))
     except (TypeError, ValueError, OverflowError):
         numbers = ()
-    if len(numbers) not in counts or not all(map(math.isfinite, numbers)):
-        raise ValueError(f"got {_shown(value)}, expected {form}")
+    _expect(len(numbers) in counts and all(map(math.isfinite, numbers)), value, form)
     return numbers
 
 
-def _shown(value: Any) -> str:
-    return repr(value)[:60]
+def _read_number(value: Any, low: float, high: float, form: str) -> float:
+    (number,) = read_numbers(value, form, (1,))
+    _expect(low <= number <= high, value, form)
+    return number
 
 
 def _split_tolerance(value: Any) -> tuple[Any, str]:
@@ -120,29 +100,20 @@ def _split_tolerance(value: Any) -> tuple[Any, str]:
 
 
 def read_range(value: Any, form: str = "a number above 0, or LO:HI") -> tuple[float, float]:
-    """Return two numbers above 0, the second not below the first; one number stands for both.
-
-    Raises
-    ------
-    ValueError
-        They are others.
-    """
+    """Return two numbers above 0, the second not below the first; one number stands for both."""
     low, high = (read_numbers(value, form, (1, 2)) * 2)[:2]
-    if not 0 < low <= high:
-        raise ValueError(f"got {_shown(value)}: LO must be above 0 and not above HI; expected {form}")
+    _expect(0 < low <= high, value, form, "LO must be above 0 and not above HI")
     return low, high
 
 
-_GSD_FORM = "metres per pixel as SIZE or LO:HI: 0.3, 0.3+-10% or 0.3:0.6"
-
-
 def _read_gsd(value: Any) -> tuple[float, float]:
+    form = "metres per pixel as SIZE or LO:HI: 0.3, 0.3+-10% or 0.3:0.6"
     center, off = _split_tolerance(value)
-    low, high = read_range(center, _GSD_FORM)
+    low, high = read_range(center, form)
     if off:
-        share = read_numbers(off.removesuffix("%"), _GSD_FORM, (1,))[0]
+        share = read_numbers(off.removesuffix("%"), form, (1,))[0]
         reach = low * share / 100 if off.endswith("%") else share
-        return read_range((low - reach, high + reach), _GSD_FORM)
+        return read_range((low - reach, high + reach), form)
     single = not isinstance(center, Sequence) or (isinstance(center, str) and not re.search("[,:]", center))
     return (low / _GSD_FACTOR, low * _GSD_FACTOR) if single else (low, high)
 
@@ -152,55 +123,35 @@ def _read_heading(value: Any) -> tuple[float, float]:
     center, off = _split_tolerance(value)
     numbers = read_numbers(center, form, (1,) if off else (1, 2))
     heading, may_be_off = (*numbers, *read_numbers(off or _HEADING_OFF_DEG, form, (1,)))[:2]
-    if not (-360.0 <= heading <= 360.0 and 0.0 < may_be_off <= 180.0):
-        raise ValueError(f"got {_shown(value)}, expected {form}")
+    _expect(-360.0 <= heading <= 360.0 and 0.0 < may_be_off <= 180.0, value, form)
     return heading, may_be_off
 
 
 def read_place(value: Any) -> tuple[float, float, float]:
-    """Return longitude, latitude (degrees) and a radius (metres).
-
-    Raises
-    ------
-    ValueError
-        They are none; where longitude and latitude were exchanged the message mentions it.
-    """
+    """Return longitude, latitude (degrees) and a radius (metres); tell where the two were exchanged."""
     form = "LON,LAT,RADIUS in degrees and metres"
     lon, lat, radius = read_numbers(value, form, (3,), ",")
-    if not (-180 <= lon <= 180 and -90 <= lat <= 90):
-        swapped = _swapped((lat, lon), f",{radius:g}")
-        raise ValueError(
-            f"got {_shown(value)}: longitude must lie within ±180, latitude within ±90{swapped}; expected {form}"
-        )
-    if not 0 < radius < 2e7:
-        raise ValueError(f"got {_shown(value)}: the radius must be above 0 metres; expected {form}")
+    swapped = _swapped((lat, lon), f",{radius:g}")
+    on_earth = -180 <= lon <= 180 and -90 <= lat <= 90
+    _expect(on_earth, value, form, f"longitude must lie within ±180, latitude within ±90{swapped}")
+    _expect(0 < radius < 2e7, value, form, "the radius must be above 0 metres")
     return lon, lat, radius
 
 
 def read_box(value: Any) -> Box:
-    """Return west, south, east and north, degrees; west may exceed east, across the 180th meridian.
-
-    Raises
-    ------
-    ValueError
-        They are none; where longitude and latitude were exchanged the message mentions it.
-    """
+    """Return west, south, east and north, degrees; west may exceed east, across the 180th meridian."""
     form = "W,S,E,N in degrees"
     west, south, east, north = read_numbers(value, form, (4,), ",")
-    if not -90 <= south < north <= 90:
-        swapped = _swapped((south, west, north, east))
-        raise ValueError(f"got {_shown(value)}: south must lie below north, both within ±90{swapped}; expected {form}")
-    if not is_box((west, south, east, north)):
-        raise ValueError(f"got {_shown(value)}: west and east must differ and lie within ±180; expected {form}")
+    swapped = _swapped((south, west, north, east))
+    _expect(-90 <= south < north <= 90, value, form, f"south must lie below north, both within ±90{swapped}")
+    _expect(is_box((west, south, east, north)), value, form, "west and east must differ and lie within ±180")
     return west, south, east, north
 
 
 def _swapped(exchanged: Sequence[float], rest: str = "") -> str:
     """Ask whether longitudes and latitudes were exchanged; only remind of their order where that would be as wrong."""
     lons, lats = exchanged[::2], exchanged[1::2]
-    sound = (
-        all(-180 <= lon <= 180 for lon in lons) and all(-90 <= lat <= 90 for lat in lats) and sorted(lats) == [*lats]
-    )
+    sound = max(map(abs, lons)) <= 180 and max(map(abs, lats)) <= 90 and sorted(lats) == [*lats]
     meant = ",".join(f"{number:g}" for number in exchanged) + rest
     return f" (longitude comes first: did you mean {meant}?)" if sound else " (longitude comes first)"
 
@@ -212,30 +163,17 @@ def _read_area(value: Any) -> Box:
 def _read_focal(value: Any) -> float | Literal["exif"]:
     if isinstance(value, str) and value.lower() == "exif":
         return "exif"
-    form = "pixels above 0, or exif"
-    (focal,) = read_numbers(value, form, (1,))
-    if not 0 < focal <= 1e6:
-        raise ValueError(f"got {_shown(value)}, expected {form}")
-    return focal
-
-
-def _read_number(value: Any, low: float, high: float, form: str) -> float:
-    (number,) = read_numbers(value, form, (1,))
-    if not low <= number <= high:
-        raise ValueError(f"got {_shown(value)}, expected {form}")
-    return number
+    return _read_number(value, math.ulp(0.0), 1e6, "pixels above 0, or exif")
 
 
 def _read_switch(value: Any) -> bool:
     word = str(value).lower() if isinstance(value, bool | str) else "neither"
-    if word not in (*_YES, *_NO):
-        raise ValueError(f"got {_shown(value)}, expected true or false")
+    _expect(word in (*_YES, *_NO), value, "true or false")
     return word in _YES
 
 
 def _read_effort(value: Any) -> Literal["quick", "full"]:
-    if value not in ("quick", "full"):
-        raise ValueError(f"got {_shown(value)}, expected quick or full")
+    _expect(value in ("quick", "full"), value, "quick or full")
     return value  # type: ignore[no-any-return]
 
 
@@ -330,20 +268,18 @@ def apply_hints(options: LocateOptions, known: Mapping[str, Any]) -> LocateOptio
         Values by `Hint.goes_to`; None is not known. A focal length "exif" is for the caller to look up.
     """
     given = {name: value for name, value in known.items() if value is not None}
-    camera: dict[str, Any] = {
-        name: given[name] for name in ("gsd_m", "heading_deg", "north_up", "max_tilt_deg") if name in given
-    }
-    if given.get("focal_px", "exif") != "exif":
-        camera["focal_px"] = given["focal_px"]
-    match = replace(options.match, camera=replace(options.match.camera, **camera))
-    if "within" in given:
-        match = replace(match, within=given["within"])
-    options = replace(options, match=match)
-    if "time_limit_s" in given:
-        limit = given["time_limit_s"]
-        options = replace(
-            options,
-            search=replace(options.search, time_limit_s=limit),
-            pair=replace(options.pair, time_limit_s=limit),
-        )
-    return replace(options, **{name: given[name] for name in ("near", "effort") if name in given})
+    if given.get("focal_px") == "exif":
+        del given["focal_px"]
+
+    def among(*names: str) -> dict[str, Any]:
+        return {name: given[name] for name in names if name in given}
+
+    camera = replace(options.match.camera, **among("gsd_m", "heading_deg", "north_up", "max_tilt_deg", "focal_px"))
+    limit = among("time_limit_s")
+    return replace(
+        options,
+        match=replace(options.match, camera=camera, **among("within")),
+        search=replace(options.search, **limit),
+        pair=replace(options.pair, **limit),
+        **among("near", "effort"),
+    )

@@ -41,8 +41,6 @@ __all__ = [
 
 #: Factor by which buckets of roads are narrower than those of intersections: roads are looked up some 20 m around.
 _FINER = 2
-#: Seed of the order of the table's entries within a cell.
-_SHUFFLE_SEED = 7
 
 #: Limits of an index from a stranger: the kernels sample segments every few metres, in each bucket that lists them.
 _MAX_DISTANCE_M = 5e7
@@ -224,18 +222,19 @@ class ReferenceIndex:
         return cls(meta=meta, path=path, **{name: arrays[name] for name in _SCHEMA})
 
 
-_SCHEMA: dict[str, tuple[str, int]] = {  # name: (dtype, dimensions)
-    "xy": ("<f8", 2),
-    "branches": ("|i1", 3),
-    "tangents": ("<i2", 2),
-    "neighbours": ("<i4", 2),
-    "point_starts": ("<i4", 1),
-    "segments": ("<f4", 2),
-    "segment_starts": ("<i4", 1),
-    "segment_ids": ("<i4", 1),
-    "table_starts": ("<i4", 1),
-    "table_entries": ("<u8", 1),
-    "source": ("<i4", 1),
+#: Types of the arrays, and their shapes: letters are dimensions, of one size wherever they occur.
+_SCHEMA: dict[str, tuple[str, str]] = {
+    "xy": ("<f8", "N 2"),
+    "branches": ("|i1", "N R 2"),
+    "tangents": ("<i2", "N R"),
+    "neighbours": ("<i4", "N K"),
+    "point_starts": ("<i4", "B"),
+    "segments": ("<f4", "S 4"),
+    "segment_starts": ("<i4", "C"),
+    "segment_ids": ("<i4", "I"),
+    "table_starts": ("<i4", "D"),
+    "table_entries": ("<u8", "T"),
+    "source": ("<i4", "N"),
 }
 
 
@@ -244,49 +243,47 @@ def _check_parts(meta: Mapping[str, Any], arrays: Mapping[str, AnyArray], path: 
         if not condition:
             raise IndexFormatError(f"{path or 'index'}: {what}; rebuild it with `roadgeo index`")
 
-    def is_number(value: object) -> bool:
-        return isinstance(value, (int, float)) and -1e15 < value < 1e15
+    def are_numbers(values: object, n: int) -> bool:
+        numbers = values if isinstance(values, (list, tuple)) and len(values) == n else [None]
+        return all(isinstance(value, (int, float)) and -1e15 < value < 1e15 for value in numbers)
 
-    for name, (dtype, ndim) in _SCHEMA.items():
+    # Types and shapes.
+    sizes = {str(n): n for n in (2, 4)}
+    for name, (dtype, dimensions) in _SCHEMA.items():
         require(name in arrays, f"array {name!r} is missing")
-        array = arrays[name]
-        require(array.dtype == np.dtype(dtype) and array.ndim == ndim, f"array {name!r} has the wrong type or shape")
-    grid, shape, origin = meta.get("grid"), meta.get("shape"), meta.get("origin")
-    require(isinstance(grid, (list, tuple)) and len(grid) == 3 and all(map(is_number, grid)), "bad grid")
-    require(isinstance(origin, (list, tuple)) and len(origin) == 2 and all(map(is_number, origin)), "bad origin")
-    require(isinstance(shape, (list, tuple)) and len(shape) == 2 and all(type(s) is int for s in shape), "bad shape")
+        array, letters = arrays[name], dimensions.split()
+        as_expected = array.dtype == np.dtype(dtype) and array.ndim == len(letters)
+        require(as_expected, f"array {name!r} has the wrong type or shape")
+        for letter, n in zip(letters, array.shape, strict=True):
+            require(sizes.setdefault(letter, n) == n, f"bad {name}")
+    n = sizes["N"]
+    require(2 <= sizes["R"] <= MAX_BRANCHES, "bad tangents")
+    require(1 <= sizes["K"] <= MAX_NEIGHBOURS, "bad neighbours")
+    # The plane and its grid.
+    grid, shape = meta.get("grid"), meta.get("shape")
+    require(are_numbers(grid, 3) and grid[2] > 0, "bad grid")  # type: ignore[index]
+    require(are_numbers(meta.get("origin"), 2), "bad origin")
+    columns, rows = shape if are_numbers(shape, 2) else (0, 0)  # type: ignore[misc]
+    require(type(columns) is type(rows) is int and min(columns, rows) > 0 and columns * rows < 2**31, "bad shape")
     require(isinstance(meta.get("crs"), str), "no CRS")
-    assert grid is not None  # noqa: S101 - for the type checker; `require` has raised
-    assert shape is not None  # noqa: S101
-    require(grid[2] > 0 and min(shape) > 0 and shape[0] * shape[1] < 2**31, "bad grid")
-    n = len(arrays["xy"])
-    n_buckets = shape[0] * shape[1]
-    n_road_buckets = n_buckets if len(arrays["segment_starts"]) == n_buckets + 1 else _FINER**2 * n_buckets
-    require(arrays["xy"].shape == (n, 2) and n < 2**31 and _lie_on_earth(arrays["xy"]), "bad positions")
-    columns = arrays["tangents"].shape[1]
-    require(2 <= columns <= MAX_BRANCHES and arrays["tangents"].shape == (n, columns), "bad tangents")
-    require(arrays["branches"].shape == (n, columns, 2), "bad branches")
-    k = arrays["neighbours"].shape[1]
-    require(1 <= k <= MAX_NEIGHBOURS and arrays["neighbours"].shape == (n, k), "bad neighbours")
-    require(arrays["segments"].shape[1] == 4 and arrays["source"].shape == (n,), "bad segments")
+    require(n < 2**31 and _lie_on_earth(arrays["xy"]), "bad positions")
+    # Where parts of other arrays begin, and what numbers point to.
+    n_buckets = columns * rows
+    n_road_buckets = n_buckets if sizes["C"] == n_buckets + 1 else _FINER**2 * n_buckets
     for starts, total, size in (
         ("point_starts", n, n_buckets),
-        ("segment_starts", len(arrays["segment_ids"]), n_road_buckets),
-        ("table_starts", len(arrays["table_entries"]), TABLE),
+        ("segment_starts", sizes["I"], n_road_buckets),
+        ("table_starts", sizes["T"], TABLE),
     ):
         array = arrays[starts]
         require(array.shape == (size + 1,), f"{starts} has the wrong length")
         require(int(array[0]) == 0 and int(array[-1]) == total, f"{starts} does not cover its array")
         require(bool((array[1:] >= array[:-1]).all()), f"{starts} is not ascending")
-    if n:
-        neighbours = arrays["neighbours"]
-        require(int(neighbours.min()) >= -1 and int(neighbours.max()) < n, "a neighbour is out of range")
-    ids = arrays["segment_ids"]
-    require(
-        len(ids) == 0 or (int(ids.min()) >= 0 and int(ids.max()) < len(arrays["segments"])),
-        "a segment id is out of range",
-    )
-    require(_are_short(arrays["segments"], ids), "bad segments")
+    for name, least, most, what in (("neighbours", -1, n, "neighbour"), ("segment_ids", 0, sizes["S"], "segment id")):
+        array = arrays[name]
+        within = array.size == 0 or (int(array.min()) >= least and int(array.max()) < most)
+        require(within, f"a {what} is out of range")
+    require(_are_short(arrays["segments"], arrays["segment_ids"]), "bad segments")
 
 
 def _lie_on_earth(metres: AnyArray) -> bool:
@@ -311,14 +308,12 @@ def check_table(index: ReferenceIndex) -> None:
     """
     entries = index.table_entries
     anchors = (entries >> np.uint64(40)).astype(np.int64)
+    slots = ((entries >> np.array([[37], [34]], np.uint64)) & np.uint64(7)).astype(np.int64)
+    exist = (anchors < len(index)).all() and (slots < index.neighbours.shape[1]).all()
+    if not exist or (index.neighbours[anchors, slots] < 0).any():
+        raise IndexFormatError("a table entry is out of range; rebuild the index with `roadgeo index`")
     if len(anchors) == 0:
         return
-    if int(anchors.max()) >= len(index):
-        raise IndexFormatError("a table entry is out of range; rebuild the index with `roadgeo index`")
-    for shift in (37, 34):
-        slots = ((entries >> np.uint64(shift)) & np.uint64(7)).astype(np.int64)
-        if int(slots.max()) >= index.neighbours.shape[1] or (index.neighbours[anchors, slots] < 0).any():
-            raise IndexFormatError("a table entry is out of range; rebuild the index with `roadgeo index`")
     places = _place_in_table(np.repeat(np.arange(TABLE, dtype=np.int32), np.diff(index.table_starts)), entries)
     if (places[1:] < places[:-1]).any():
         raise IndexFormatError("the table's entries are not in order; rebuild the index with `roadgeo index`")
@@ -339,9 +334,8 @@ def sort_by_bucket(
     xy: FloatArray, grid: tuple[float, float, float], shape: tuple[int, int]
 ) -> tuple[Int32Array, Int32Array]:
     """Return the order that sorts points by bucket, and the (B + 1,) starts of the buckets in that order."""
-    columns = np.clip(np.floor((xy[:, 0] - grid[0]) / grid[2]).astype(np.int64), 0, shape[0] - 1)
-    rows = np.clip(np.floor((xy[:, 1] - grid[1]) / grid[2]).astype(np.int64), 0, shape[1] - 1)
-    bucket = rows * shape[0] + columns
+    cells = np.clip(np.floor((xy - grid[:2]) / grid[2]).astype(np.int64), 0, (shape[0] - 1, shape[1] - 1))
+    bucket = cells @ (1, shape[0])
     counts = np.bincount(bucket, minlength=shape[0] * shape[1])
     starts = np.concatenate(([0], np.cumsum(counts))).astype(np.int32)
     return np.argsort(bucket, kind="stable").astype(np.int32), starts
@@ -388,7 +382,7 @@ def _tabulate(
     starts = np.cumsum(counts)
     entries = np.empty(total, np.uint64)
     fill_table(xy, tangents, sides, neighbours, *shape_limit, starts.copy(), entries)
-    order = np.random.default_rng(_SHUFFLE_SEED).permutation(total)
+    order = np.random.default_rng(7).permutation(total)
     entries = entries[order]
     cells = np.repeat(np.arange(TABLE, dtype=np.int32), np.diff(starts))[order]
     entries = entries[np.argsort(_place_in_table(cells, entries), kind="stable")]
@@ -407,28 +401,38 @@ def crop(index: ReferenceIndex, center: tuple[float, float], radius_m: float) ->
     Neighbours and triples are those of the intersections left, so that a small part of a large map is searched as
     quickly and as thoroughly as a small map.
     """
-    inside = np.hypot(*(index.xy - center).T) <= radius_m
-    (kept,) = np.nonzero(inside)
-    buckets = np.repeat(np.arange(len(index.point_starts) - 1), np.diff(index.point_starts))
-    point_starts = np.concatenate(([0], np.cumsum(np.bincount(buckets[kept], minlength=len(index.point_starts) - 1))))
-    point_starts = point_starts.astype(np.int32)
-    xy, branches = np.ascontiguousarray(index.xy[kept]), np.ascontiguousarray(index.branches[kept])
-    packed = np.ascontiguousarray(index.tangents[kept])
+    (kept,) = np.nonzero(np.hypot(*(index.xy - center).T) <= radius_m)
+    n_buckets = len(index.point_starts) - 1
+    buckets = np.repeat(np.arange(n_buckets), np.diff(index.point_starts))[kept]
+    starts = np.concatenate(([0], np.cumsum(np.bincount(buckets, minlength=n_buckets)))).astype(np.int32)
     stored = {"n_neighbours": index.neighbours.shape[1], **index.meta.get("index_options", {})}
     options = IndexOptions(**{f.name: stored[f.name] for f in fields(IndexOptions) if f.name in stored})
-    neighbours = nearest_neighbours(xy, point_starts, index.grid, index.shape, options.n_neighbours)
-    table_starts, entries = _tabulate(xy, unpack_tangents(packed), branches, neighbours, options)
-    return replace(
-        index,
-        xy=xy,
-        branches=branches,
-        tangents=packed,
-        neighbours=neighbours,
-        point_starts=point_starts,
-        table_starts=table_starts,
-        table_entries=entries,
-        source=index.source[kept],
-    )
+    points = index.xy[kept], index.branches[kept], unpack_tangents(index.tangents[kept])
+    return replace(index, source=index.source[kept], **_of_points(*points, starts, index.grid, index.shape, options))
+
+
+def _of_points(
+    xy: FloatArray,
+    branches: AnyArray,
+    tangents: Float32Array,
+    starts: Int32Array,
+    grid: tuple[float, float, float],
+    shape: tuple[int, int],
+    options: IndexOptions,
+) -> dict[str, Any]:
+    """Return the arrays of an index that are made of its intersections, sorted by bucket."""
+    xy, branches, tangents = map(np.ascontiguousarray, (xy, branches, tangents))
+    neighbours = nearest_neighbours(xy, starts, grid, shape, options.n_neighbours)
+    table_starts, entries = _tabulate(xy, tangents, branches, neighbours, options)
+    return {
+        "xy": xy,
+        "branches": branches,
+        "tangents": pack_tangents(tangents),
+        "neighbours": neighbours,
+        "point_starts": starts,
+        "table_starts": table_starts,
+        "table_entries": entries,
+    }
 
 
 def build_index(network: RoadNetwork, options: IndexOptions | None = None, say: Say = say_nothing) -> ReferenceIndex:
@@ -452,14 +456,8 @@ def build_index(network: RoadNetwork, options: IndexOptions | None = None, say: 
         )
     what = f"indexing {len(found):,} intersections"
     say(what, 0.0)
-    segments = _cut_segments(network.graph, options.simplify_m)
     grid, shape = neighbour_grid(found.xy, options.min_bucket_m)
-    order, point_starts = sort_by_bucket(found.xy, grid, shape)
-    xy = np.ascontiguousarray(found.xy[order])
-    tangents = np.ascontiguousarray(found.tangents[order])
-    neighbours = nearest_neighbours(xy, point_starts, grid, shape, options.n_neighbours)
-
-    say(what, 0.2)
+    segments = _cut_segments(network.graph, options.simplify_m)
     finer = (*grid[:2], grid[2] / _FINER), (_FINER * shape[0], _FINER * shape[1])
     counts = np.zeros(_FINER**2 * shape[0] * shape[1] + 1, np.int64)
     total = bin_segments(segments, *finer, counts, np.empty(0, np.int32))
@@ -467,9 +465,10 @@ def build_index(network: RoadNetwork, options: IndexOptions | None = None, say: 
     segment_ids = np.empty(total, np.int32)
     bin_segments(segments, *finer, segment_starts.astype(np.int64), segment_ids)
 
-    say(what, 0.4)
-    branches = np.ascontiguousarray(found.branches()[order])
-    table_starts, entries = _tabulate(xy, tangents, branches, neighbours, options)
+    say(what, 0.3)
+    order, point_starts = sort_by_bucket(found.xy, grid, shape)
+    points = found.xy[order], found.branches()[order], found.tangents[order]
+    of_points = _of_points(*points, point_starts, grid, shape, options)
 
     meta = {
         **network.meta,
@@ -478,22 +477,16 @@ def build_index(network: RoadNetwork, options: IndexOptions | None = None, say: 
         "grid": list(grid),
         "shape": list(shape),
         "index_options": asdict(options),
-        "n_intersections": len(xy),
+        "n_intersections": len(found),
         "n_segments": len(segments),
     }
     index = ReferenceIndex(
         meta=meta,
-        xy=xy,
-        branches=branches,
-        tangents=pack_tangents(tangents),
-        neighbours=neighbours,
-        point_starts=point_starts,
         segments=segments,
         segment_starts=segment_starts,
         segment_ids=segment_ids,
-        table_starts=table_starts,
-        table_entries=entries,
         source=order,
+        **of_points,
     )
     for array in index.arrays().values():
         array.setflags(write=False)  # as in one opened from a file, so that kernels are compiled once for both

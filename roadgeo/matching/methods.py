@@ -49,20 +49,15 @@ class Fit:
         The reference, or the part of it that was searched.
     matrix : (3, 3) float64
         Query plane to reference plane.
-    matched : (N,) int
-        Intersection of `index` that each of the query's is, or -1.
-    distance : (N,) float64
-        Metres between them.
+    matched, distance : (N,) int, (N,) float64
+        Intersection of `index` that each of the query's is, or -1, and metres between them.
     agreeing : float
         Share of the query's roads that agree.
     log10_odds : float
         By which the place leads any other; NaN where the method knows none.
     log10_likelihood : float
-        Its likelihood (see `evidence`).
-    corner_sigma_m : (4,) float64 or None
-    corner_covariance_m2 : (8, 8) float64 or None
-        As in `Refined`.
-    lens_k1 : float
+        See `evidence`.
+    corner_sigma_m, corner_covariance_m2, lens_k1
         As of `Refined`.
     agreement : float
         Mean of the shares of intersections, of the query's roads and of the map's roads that agree.
@@ -95,14 +90,9 @@ class Found:
         As in `Search`; "" where nothing was searched.
     said : str
         The method's own sentence on the result.
-    n_searched : int
-        Intersections of the part of the reference that was searched.
-    n_tried : int
-        Places that were screened.
-    n_anchors : int
-        Intersections of the query that were looked for.
-    events : Events
-        The events of the search.
+    n_searched, n_tried, n_anchors : int
+        Intersections of the part of the reference that was searched, places that were screened, and intersections of
+        the query that were looked for.
     """
 
     index: ReferenceIndex
