@@ -226,7 +226,6 @@ _SEARCH = (
     "road_rings",
     "road_votes",
     "road_growth",
-    "lens",
 )
 _left_to_numba: set[str] = set()
 _kept_alive: list[Any] = []

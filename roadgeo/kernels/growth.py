@@ -1,7 +1,7 @@
 """Growth of a hypothesis: from a few matched intersections outwards over the whole query.
 
-The parameters p of the model are those of `kernels.homography_fit`, around the anchor: query (x - xa) / half_size to
-reference (X - XA) / unit.
+The parameters p of the model are those of `kernels.adjustment`, without a lens, around the anchor: query
+(x - xa) / half_size to reference (X - XA) / unit.
 """
 
 import math
@@ -10,9 +10,9 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
+from roadgeo.kernels.adjustment import add_point, begin_system, point_row, solve_system, spread
 from roadgeo.kernels.arrays import Bools1, Floats1, Floats2, Floats3, Ints1, Ints2
 from roadgeo.kernels.compilation import kernel
-from roadgeo.kernels.homography_fit import fit_homography, predict
 from roadgeo.kernels.point_matching import keep_nearest, nearest_alike
 from roadgeo.kernels.structs import GrowthLimits, GrowthQuery, PointBuckets
 
@@ -22,6 +22,8 @@ __all__ = ["grow", "grow_each"]
 _ROUNDS, _MORE = 8, 1.2
 #: Search radius in standard deviations; points nearer to the horizon than this w are left out.
 _SIGMAS, _LEAST_W = 2.5, 0.1
+#: Matches that a fit needs.
+_FEWEST = 3
 
 
 class _Growth(NamedTuple):
@@ -32,15 +34,16 @@ class _Growth(NamedTuple):
     unit: float  # metres per normalised unit
     sigma_m: float
     radius_m: float
-    prior: float  # see `fit_homography`
+    prior: Floats1  # (9,), see `begin_system`
     gain: float  # of the log-likelihood ratio by a hit, and by a miss
     loss: float
     query: Floats2  # (N, 2) normalised
     image: Floats2  # (N, 2) places of the partners, normalised
     seed: Bools1  # (N,)
-    p: Floats1  # (8,)
+    p: Floats1  # (9,)
     normal: Floats2  # (8, 8)
     factor: Floats2  # (8, 8)
+    right: Floats1  # (8,)
     row: Floats1  # (8,)
     work: Floats1  # (8,)
 
@@ -58,21 +61,24 @@ def _begin(
     for i in range(n):
         normalised[i, 0] = (query.xy[i, 0] - query.xy[query.anchor, 0]) / query.half_size
         normalised[i, 1] = (query.xy[i, 1] - query.xy[query.anchor, 1]) / query.half_size
+    prior = np.zeros(9)
+    prior[6] = prior[7] = (sigma_m / unit) ** 2 / limits.perspective_sigma**2
     return _Growth(
         points.xy[ref_anchor, 0],
         points.xy[ref_anchor, 1],
         unit,
         sigma_m,
         limits.radius[0] + limits.radius[1] * gsd,
-        (sigma_m / unit) ** 2 / limits.perspective_sigma**2,
+        prior,
         math.log(limits.hit_rate / limits.chance_rate),
         math.log((1.0 - limits.hit_rate) / (1.0 - limits.chance_rate)),
         normalised,
         np.zeros((n, 2)),
         np.zeros(n, np.bool_),
-        np.zeros(8),
+        np.zeros(9),
         np.empty((8, 8)),
         np.empty((8, 8)),
+        np.empty(8),
         np.empty(8),
         np.empty(8),
     )
@@ -111,7 +117,19 @@ def _place_seeds(
 
 @kernel()
 def _fit(growth: _Growth, matched: NDArray[np.int64]) -> bool:
-    return fit_homography(growth.query, growth.image, matched, growth.prior, growth.p, growth.normal, growth.factor)
+    """Take one step of least squares to all that is matched; return whether that worked."""
+    query, image, p, normal, right, row = (
+        growth.query, growth.image, growth.p, growth.normal, growth.right, growth.row,
+    )  # fmt: skip
+    begin_system(p, growth.prior, normal, right)
+    n = 0
+    for i in range(matched.shape[0]):
+        if matched[i] >= 0:
+            n += 1
+            point, place = (query[i, 0], query[i, 1]), (image[i, 0], image[i, 1])
+            if not add_point(p, 1.0, point, place, 1.0, normal, right, row) >= 0.5 * _LEAST_W:
+                return False
+    return n >= _FEWEST and solve_system(p, normal, right, growth.factor) >= 0.0
 
 
 @kernel(forceinline=True)
@@ -124,8 +142,15 @@ def _predict_radius(
     v: float,
     sigma_m: float,
 ) -> tuple[float, float, float, float]:
-    """Return where a query point is predicted, its w, and its search radius in metres: -1 at the horizon."""
-    x, y, w, variance = predict(p, u, v, factor, row, work)
+    """Return where a query point is predicted, its w, and its search radius in metres: -1 at the horizon.
+
+    Its variance is that of x and y together, in units of the residuals' variance: with J (2, 8) the derivative of the
+    point by p, and L L^T the normal matrix, the trace of J (L L^T)^-1 J^T.
+    """
+    x, y, w = point_row(p, u, v, (0.0, 0.0), 1.0, 0.0, row)
+    variance = spread(row, factor, work)
+    point_row(p, u, v, (0.0, 0.0), 0.0, 1.0, row)
+    variance += spread(row, factor, work)
     return x, y, w, -1.0 if w < _LEAST_W else _SIGMAS * sigma_m * math.sqrt(0.5 * variance + 1.0)
 
 

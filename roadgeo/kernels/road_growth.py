@@ -1,6 +1,6 @@
 """Growth of a hypothesis by roads alone: from the roads around one intersection outwards over the whole query.
 
-The parameters are those of `kernels.homography_fit`, between normalised coordinates: query (x - x0) / half_size and
+The parameters are those of `kernels.adjustment`, between normalised coordinates: query (x - x0) / half_size and
 reference (X - X0) / unit.
 """
 
@@ -10,10 +10,9 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from roadgeo.kernels.adjustment import carry
+from roadgeo.kernels.adjustment import add_row, carry, point_row, solve_system
 from roadgeo.kernels.arrays import Floats1, Floats2
 from roadgeo.kernels.compilation import kernel
-from roadgeo.kernels.homography_fit import add_row, cholesky, point_row, solve_cholesky
 from roadgeo.kernels.roads import nearest_road
 from roadgeo.kernels.structs import RoadBuckets
 
@@ -121,16 +120,11 @@ def fit_to_roads(
         if away == np.inf:
             continue
         met += 1
-        point_row(p, points[i, 0], points[i, 1], -ry, rx, row)
+        point_row(p, points[i, 0], points[i, 1], (0.0, 0.0), -ry, rx, row)
         add_row(normal, right, row, 1.0 / (1.0 + (2.0 * away / radius) ** 2), away / unit)
     for r in range(8):
         normal[r, r] += holds[r]
-    if met < _FEWEST or not cholesky(normal, factor):
-        return False
-    solve_cholesky(factor, right)
-    for r in range(8):
-        p[r] += right[r]
-    return True
+    return met >= _FEWEST and solve_system(p, normal, right, factor) >= 0.0
 
 
 @kernel()

@@ -5,7 +5,19 @@ Planes are in metres (reference) or pixels, y up (query). `grid` and `shape` are
 
 from typing import NamedTuple
 
-from roadgeo.kernels.arrays import Floats2, Int8s2, Int8s3, Int32s1, Int32s2, Ints1, Ints2, Singles2, UInt64s1
+from roadgeo.kernels.arrays import (
+    Bools1,
+    Floats1,
+    Floats2,
+    Int8s2,
+    Int8s3,
+    Int32s1,
+    Int32s2,
+    Ints1,
+    Ints2,
+    Singles2,
+    UInt64s1,
+)
 
 __all__ = [
     "AdjustLimits",
@@ -13,6 +25,7 @@ __all__ = [
     "GrowthQuery",
     "Held",
     "Hits",
+    "Met",
     "Plane",
     "PointBuckets",
     "PointPairs",
@@ -128,6 +141,7 @@ class RoadSamples(NamedTuple):
     directions: Floats2  # (S, 2) unit vectors along the road
     cells: Ints1  # (S,) the cell of the frame that each lies in
     weight: float  # of one, against an observation of standard deviation `AdjustLimits.sigma_m`
+    half_side: float  # half of the frame's longer side: the unit of k1
 
 
 class PointPairs(NamedTuple):
@@ -147,6 +161,16 @@ class Held(NamedTuple):
     weight: float  # in the first step; half of it in the next, and so on
 
 
+class Met(NamedTuple):
+    """Roads that road points met, in S x n numbers for n parameters."""
+
+    rows: Floats2  # (S, n) derivatives of the points' places across the roads
+    residuals: Floats1  # (S,) metres across to the roads, NaN where none is met
+    sigmas: Floats1  # (S,) standard deviations of that
+    own: Floats1  # (S,) of it where the places are known, in that of the middle of the frame
+    searched: Bools1  # (S,) whether the place was sure enough
+
+
 class AdjustLimits(NamedTuple):
     """How an adjustment goes on.
 
@@ -163,6 +187,6 @@ class AdjustLimits(NamedTuple):
     sigma_m: float  # standard deviation of a road point across the road in the middle of the frame
     map_sigma_m: float  # the map's part of it
     mask_sigma: float  # and the mask's, normalised units of the query
-    prior: float  # weight that holds the two perspective parameters near zero
+    prior: Floats1  # (9,) weights that hold parameters near zero
     n_iterations: int
     tolerance_m: float

@@ -12,12 +12,12 @@ from roadgeo._arrays import FloatArray, IntArray
 from roadgeo.geometry.camera import sampling
 from roadgeo.geometry.displacement import Displacement, measure
 from roadgeo.geometry.homography import Homography
-from roadgeo.matching.carriageways import refine_between, roads_beside
+from roadgeo.kernels.roads import road_residuals
 from roadgeo.matching.evidence import Evidence, agreement, match_intersections
 from roadgeo.matching.exhaustive import LocalSearchOptions, move_about, search_nearby
 from roadgeo.matching.index import ReferenceIndex
-from roadgeo.matching.refinement import Refined, RefineOptions, refine
-from roadgeo.matching.scene import Scene
+from roadgeo.matching.refinement import Refined, RefineOptions, points_on_map, refine, refine_between
+from roadgeo.matching.scene import MIN_COS, Scene
 
 __all__ = ["CheckOptions", "Checked", "Verdict", "check_place"]
 
@@ -167,8 +167,12 @@ class _Judge:
         the frame would be off by half their distance.
         """
         scene = self.scene
-        right, left = roads_beside(matrix, scene, self.index, _TWIN_M, 0.8 * _TWIN_M)
-        alone = ~(right & left)
+        points, along, _ = points_on_map(matrix, scene)
+        alone, found = np.zeros(len(points), bool), np.empty((len(points), 3))
+        for across in (along[:, ::-1] * (1.0, -1.0), along[:, ::-1] * (-1.0, 1.0)):
+            reach, shifted = np.full(len(points), 0.8 * _TWIN_M), np.ascontiguousarray(points + _TWIN_M * across)
+            road_residuals(np.eye(3), shifted, along, reach, MIN_COS, self.index.road_buckets, found)
+            alone |= np.isnan(found[:, 0])
         if alone.mean() < 0.4:
             return scene
         return replace(scene.of_points(alone), road_length_px=scene.road_length_px * alone.mean())

@@ -15,17 +15,11 @@ from roadgeo.geometry.camera import CameraFault, CameraOptions, judge, sampling
 from roadgeo.geometry.homography import Homography
 from roadgeo.geometry.projection import to_lonlat
 from roadgeo.matching.events import Events, Ledger, Scored, Work
-from roadgeo.matching.evidence import Evidence, agreement, match_intersections
+from roadgeo.matching.evidence import Evidence, match_intersections
 from roadgeo.matching.exhaustive import is_told, propose_everywhere
 from roadgeo.matching.growing import Hypothesis, SharedSweeps, grow_proposals, screen_proposals
 from roadgeo.matching.index import ReferenceIndex
-from roadgeo.matching.lens import (
-    ENOUGH,
-    LensFit,
-    find_lens,
-    grow_whole,
-    straighten_scene,
-)
+from roadgeo.matching.lens import ENOUGH, find_lens, grow_whole, straighten_scene
 from roadgeo.matching.refinement import RefineOptions, refine
 from roadgeo.matching.road_search import Grown, RoadSearch
 from roadgeo.matching.scene import Scene
@@ -285,8 +279,6 @@ class TripleEstimator:
 
     def _weigh(self, model: Hypothesis) -> None:
         """Weigh a hypothesis, and the best place nearby where it explains more than any other that was met."""
-        if model.found is not None:
-            model.log10_likelihood = model.found.log10_likelihood
         if model.log10_likelihood > self._most_elsewhere(model):
             evidence = Evidence(self.scene_of(model), self.index, model.gsd_m)
             model.nearby = evidence.nearby(model.matrix, self.near)
@@ -317,22 +309,11 @@ class TripleEstimator:
             lens = grow_whole(refined.matrix, self.scene, index, self.refine_options)
         if lens is None or not self.may_be(lens.matrix):
             return
-        seen = replace(model)
-        self._see_through(seen, lens)
-        if seen.found is None or seen.log10_odds < model.log10_odds or seen.found.forward < agreeing.forward:
-            return
-        model.refined, model.matrix, model.gsd_m = seen.refined, seen.matrix, seen.gsd_m
-        model.found, model.nearby, model.log10_odds = seen.found, seen.nearby, seen.log10_odds
-        model.log10_likelihood = seen.log10_likelihood
-        model.matched, model.distance = seen.matched, seen.distance
-
-    def _see_through(self, model: Hypothesis, lens: LensFit) -> None:
-        """Verify a hypothesis as seen through a lens."""
-        scene = straighten_scene(self.scene, lens.k1) if lens.k1 else self.scene
-        model.refined, model.matrix = lens.refined, lens.matrix
-        model.gsd_m = gsd = sampling(lens.matrix, scene.size)
-        model.found, model.matched, model.distance = agreement(lens.matrix, scene, self.index, gsd)
-        self._weigh(model)
+        scene = straighten_scene(self.scene, lens.lens_k1) if lens.lens_k1 else self.scene
+        seen = model.lay(lens, scene, index)
+        self._weigh(seen)
+        if seen.log10_odds >= model.log10_odds and seen.found is not None and seen.found.forward >= agreeing.forward:
+            model.take(seen)
 
     def scene_of(self, model: Hypothesis) -> Scene:
         """Return the scene as a pinhole sees it, behind the lens that a hypothesis found."""
@@ -348,17 +329,14 @@ class TripleEstimator:
             model.fault = None if refined is None else self.judge(refined.matrix)
             if refined is None or model.fault is not None or self._is_far(refined.matrix):
                 return model.refined is not None and best >= 0.0
-            gsd = sampling(refined.matrix, scene.size)
-            found, matched, distance = agreement(refined.matrix, scene, self.index, gsd)
-            if found.forward < best:
+            laid = model.lay(refined, scene, self.index)
+            agreeing = 0.0 if laid.found is None else laid.found.forward
+            if agreeing < best:
                 break
-            improved = found.forward > best + 0.01
-            best = found.forward
-            model.matrix, model.refined, model.found = refined.matrix, refined, found
-            model.log10_likelihood = found.log10_likelihood
-            model.matched, model.distance, model.gsd_m = matched, distance, gsd
-            if not improved:
+            model.take(laid)
+            if agreeing <= best + 0.01:
                 break
+            best = agreeing
         return True
 
     def refinement(self, model: Hypothesis) -> RefineOptions:

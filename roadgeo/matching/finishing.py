@@ -15,13 +15,20 @@ import numpy as np
 from roadgeo._arrays import BoolArray, FloatArray, IntArray
 from roadgeo.geometry.camera import sampling
 from roadgeo.geometry.homography import Homography
-from roadgeo.matching.carriageways import refine_between, weight_on_roads
+from roadgeo.geometry.lens import Lens
 from roadgeo.matching.estimator import TripleEstimator
-from roadgeo.matching.evidence import agreement
 from roadgeo.matching.growing import Hypothesis
 from roadgeo.matching.index import ReferenceIndex
-from roadgeo.matching.lens import FEWEST, K1_SIGMA, LensEquations
-from roadgeo.matching.refinement import Refined, RefineOptions, corner_covariance, corner_sigmas, refine
+from roadgeo.matching.lens import FEWEST
+from roadgeo.matching.refinement import (
+    Equations,
+    Refined,
+    RefineOptions,
+    corner_sigmas,
+    refine,
+    refine_between,
+    weight_on_roads,
+)
 from roadgeo.matching.scene import Scene
 
 __all__ = ["measure_corners", "refine_beside", "with_honest_corners"]
@@ -82,12 +89,9 @@ def _take(estimator: TripleEstimator, best: Hypothesis, refined: Refined, least:
 
     The earlier result stands: the odds rest on it.
     """
-    scene = estimator.scene
-    gsd = sampling(refined.matrix, scene.size)
-    found, matched, distance = agreement(refined.matrix, scene, estimator.index, gsd)
-    if found.forward >= least:
-        best.refined, best.matrix, best.gsd_m = refined, refined.matrix, gsd
-        best.matched, best.distance = matched, distance
+    laid = best.lay(refined, estimator.scene, estimator.index)
+    if laid.found is not None and laid.found.forward >= least:
+        best.take(replace(laid, found=best.found, log10_likelihood=best.log10_likelihood))
 
 
 def _lay_between_carriageways(estimator: TripleEstimator, best: Hypothesis, refined: Refined) -> Scene:
@@ -150,32 +154,39 @@ def with_honest_corners(refined: Refined, scene: Scene, index: ReferenceIndex, o
 
     The matrix stays as it is, and so does the covariance where too few roads are met.
     """
-    equations, k1 = LensEquations(refined.matrix, scene, index, options), refined.lens_k1
-    seen = equations.observe(k1, np.zeros((9, 9)))
-    if len(seen.rows) < FEWEST:
+    k1 = refined.lens_k1
+    equations = Equations(refined.matrix, scene, index, options, k1 or None)
+    which = equations.meet()
+    if which.sum() < FEWEST:
         return refined
-    free = 9 if k1 else 8
-    rows, weights = seen.rows[:, :free], equations.weight * seen.cauchy / seen.own**2
-    prior = np.diag(equations.prior(K1_SIGMA)[:free]) + 1e-9 * np.eye(free)
-    starts = _starts_of_pieces(scene, seen.which)
+    rows, residuals, sigmas, own, _ = (one[which] for one in equations.met)
+    cauchy, free = equations.cauchy[which], rows.shape[1]
+    weights = equations.weight * cauchy / own**2
+    prior = np.diag(equations.prior[:free]) + 1e-9 * np.eye(free)
+    starts = _starts_of_pieces(scene, which)
     squares = rows[:, :, None] * rows[:, None, :]
-    at_end = np.abs(seen.residuals / seen.sigma) > _NEAR_END
-    slopes = weights * (2.0 * seen.cauchy - 1.0 - _FALL * at_end / seen.cauchy)
+    at_end = np.abs(residuals / sigmas) > _NEAR_END
+    slopes = weights * (2.0 * cauchy - 1.0 - _FALL * at_end / cauchy)
     normals = np.add.reduceat(slopes[:, None, None] * squares, starts)
     weighted = np.add.reduceat(weights[:, None, None] * squares, starts)
     if np.linalg.eigvalsh(normals.sum(axis=0) + prior - _LEAST_SLOPE * (weighted.sum(axis=0) + prior)).min() <= 0.0:
         normals = _LEAST_SLOPE * weighted
-    pulls = np.add.reduceat((weights * seen.residuals / equations.unit)[:, None] * rows, starts)
+    pulls = np.add.reduceat((weights * residuals / equations.unit)[:, None] * rows, starts)
     normal = normals.sum(axis=0) + prior
     moved = np.linalg.solve(normal - normals, pulls[:, :, None])[:, :, 0]
     inverse = np.linalg.inv(normal)
     # What the prior holds is as uncertain as the prior.
     covariance = moved.T @ moved + (equations.sigma_m / equations.unit) ** 2 * inverse @ prior @ inverse
     if k1:  # nor was the middle of the lens estimated
-        unknown = _CENTER_SIGMA_PX * np.einsum("ni,nij->nj", seen.normals, equations.by_center(k1)[seen.which])
-        moved = inverse @ ((weights[:, None] * rows).T @ unknown)
-        covariance = covariance + moved @ moved.T
-    corners = corner_covariance(equations.p, covariance[:8, :8], scene, equations.unit, options)
+        lens, across = Lens.of(k1, scene.size, y_up=True), rows[:, [2, 5]]
+        across /= np.linalg.norm(across, axis=1, keepdims=True)
+        straight = equations.normalised(lens.straighten(scene.points[which]))
+        by_center = (
+            equations.homography.jacobian(straight) / scene.half_size @ (np.eye(2) - lens.stretch(scene.points[which]))
+        )
+        moved = inverse @ ((weights[:, None] * rows).T @ np.einsum("ni,nij->nj", across, by_center))
+        covariance = covariance + _CENTER_SIGMA_PX**2 * moved @ moved.T
+    corners = equations.corner_covariance(covariance[:8, :8])
     if not np.isfinite(corners).all():
         return refined
     return replace(refined, corner_sigma_m=corner_sigmas(corners), corner_covariance_m2=corners)

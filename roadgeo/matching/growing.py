@@ -5,7 +5,7 @@ from __future__ import annotations
 import heapq
 import math
 from collections.abc import Callable, Iterator, Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from typing import TYPE_CHECKING, NamedTuple, TypeAlias
 
 import numpy as np
@@ -17,7 +17,7 @@ from roadgeo.geometry.homography import Homography
 from roadgeo.kernels.growth import grow_each
 from roadgeo.kernels.roads import screen
 from roadgeo.kernels.structs import GrowthLimits, GrowthQuery
-from roadgeo.matching.evidence import Agreement
+from roadgeo.matching.evidence import Agreement, agreement
 from roadgeo.matching.index import ReferenceIndex
 from roadgeo.matching.refinement import Refined
 from roadgeo.matching.road_search import Turnout
@@ -46,11 +46,10 @@ class Spot(NamedTuple):
     """Where the middle of a frame lies by a hypothesis.
 
     `x`, `y`: plane metres; `reach_m`: nearer middles mean the same place, 50 m or a twentieth of the frame's size;
-    `matrix`, `laid`: the homographies that it was computed of, before and after refinement.
+    `matrix`: the homography that it was computed of.
     """
 
     matrix: FloatArray
-    laid: FloatArray
     x: float
     y: float
     reach_m: float
@@ -80,19 +79,26 @@ class Hypothesis:
     by_roads: bool = False
     _spot: Spot | None = field(default=None, repr=False)
 
-    @property
-    def laid(self) -> FloatArray:
-        """The homography (3, 3), refined if it was."""
-        return self.matrix if self.refined is None else self.refined.matrix
+    def lay(self, refined: Refined, scene: Scene, index: ReferenceIndex) -> Hypothesis:
+        """Return it as refined, with what agrees with it, of a scene as a pinhole sees it."""
+        gsd_m = sampling(refined.matrix, scene.size)
+        found, matched, distance = agreement(refined.matrix, scene, index, gsd_m)
+        return replace(
+            self, matrix=refined.matrix, refined=refined, gsd_m=gsd_m, found=found, matched=matched,
+            distance=distance, log10_likelihood=found.log10_likelihood,
+        )  # fmt: skip
+
+    def take(self, other: Hypothesis) -> None:
+        """Become another version of the same place."""
+        vars(self).update(vars(other))
 
     def spot(self, size: tuple[int, int]) -> Spot:
         """Return where the middle of a frame of that size lies; kept, for in a lattice it is asked for without end."""
-        laid, kept = self.laid, self._spot
-        if kept is None or kept.matrix is not self.matrix or kept.laid is not laid:
+        kept = self._spot
+        if kept is None or kept.matrix is not self.matrix:
             frame = Frame(*size)
-            x, y = Homography(laid).everywhere(frame.plane_center).tolist()
-            reach_m = frame.one_place_m(sampling(self.matrix, size))
-            kept = self._spot = Spot(self.matrix, laid, x, y, reach_m)
+            x, y = Homography(self.matrix).everywhere(frame.plane_center).tolist()
+            kept = self._spot = Spot(self.matrix, x, y, frame.one_place_m(sampling(self.matrix, size)))
         return kept
 
 

@@ -3,33 +3,35 @@
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import lru_cache
 
 import numpy as np
 
-from roadgeo._arrays import FloatArray, IntArray
+from roadgeo._arrays import BoolArray, FloatArray, IntArray
 from roadgeo.geometry.homography import Homography
-from roadgeo.kernels.adjustment import adjust
-from roadgeo.kernels.structs import AdjustLimits, Held, Plane, PointPairs, RoadSamples
+from roadgeo.geometry.lens import Lens
+from roadgeo.kernels.adjustment import adjust, meet_roads
+from roadgeo.kernels.parallel_roads import roads_alongside
+from roadgeo.kernels.roads import road_residuals
+from roadgeo.kernels.structs import AdjustLimits, Held, Met, Plane, PointPairs, RoadSamples
 from roadgeo.matching.index import ReferenceIndex
 from roadgeo.matching.scene import MIN_COS, Scene
 
 __all__ = [
-    "SIGMA_M",
-    "SIGMA_PX",
-    "TOLERANCE_M",
+    "NO_PAIRS",
+    "Equations",
     "RefineOptions",
     "Refined",
-    "corner_covariance",
+    "between_carriageways",
     "corner_sigmas",
     "denormalise",
-    "max_radius_m",
+    "nearest_of",
     "normalise",
-    "point_weight",
+    "points_on_map",
     "refine",
-    "robust_rms",
-    "scatter_m",
+    "refine_between",
+    "weight_on_roads",
 ]
 
 
@@ -37,7 +39,7 @@ __all__ = [
 _MAX_RADIUS = (20.0, 10.0)
 #: Standard deviation of a road point across the road, the map's in metres and the mask's in pixels, and scale of the
 #: Cauchy weights.
-SIGMA_M, SIGMA_PX = 1.2, 0.9
+_SIGMA_M, _SIGMA_PX = 1.2, 0.9
 #: Weight of a matched intersection against an independent road point: its centre is less certain. Matches take part
 #: when at least this share of their neighbours are matched.
 _INTERSECTION_WEIGHT, _LEAST_SUPPORT = 0.3, 0.3
@@ -53,7 +55,11 @@ _USUAL_RMS = 0.7
 #: alone would not determine a homography, and the start would be forgotten.
 _HELD, _FEW_MATCHES = (5.0, 3.0), 8
 #: Iterations, which end where nothing moves by more, metres.
-_N_ITERATIONS, TOLERANCE_M = 15, 0.02
+_N_ITERATIONS, _TOLERANCE_M = 15, 0.02
+#: Prior standard deviation of k1.
+_K1_SIGMA = 0.1
+#: No matched intersections.
+NO_PAIRS = PointPairs(np.empty((0, 2)), np.empty((0, 2)), np.empty(0, np.int64), 0.0)
 
 
 @dataclass(frozen=True)
@@ -91,8 +97,11 @@ class Refined:
         Of the road points' distances from the map's roads, robustly.
     corner_covariance_m2 : (8, 8) float64
         Of the corners' x and y, in the order x, y of the first, x, y of the second, and so on.
-    lens_k1 : float
-        Of the lens behind which the query plane is that of a pinhole (see `geometry.lens`); 0 without one.
+    lens_k1, k1_sigma : float
+        Of the lens behind which the query plane is that of a pinhole (see `geometry.lens`), and its standard
+        deviation; 0 without one.
+    share : float
+        Part of the road points that lies on roads.
     """
 
     matrix: FloatArray
@@ -100,12 +109,14 @@ class Refined:
     rms_m: float
     corner_covariance_m2: FloatArray
     lens_k1: float = 0.0
+    k1_sigma: float = 0.0
+    share: float = 0.0
 
 
 def normalise(matrix: FloatArray, center: FloatArray, half_size: float) -> tuple[FloatArray, FloatArray, float]:
     """Normalise a homography.
 
-    Return the eight parameters (see `kernels.homography_fit`), the reference point under the middle, and the unit in
+    Return the eight parameters (see `kernels.adjustment`), the reference point under the middle, and the unit in
     metres.
     """
     homography = Homography(matrix)
@@ -125,15 +136,107 @@ def denormalise(p: FloatArray, center: FloatArray, half_size: float, origin: Flo
     return np.asarray(matrix / half_size)
 
 
-def max_radius_m(gsd: float) -> float:
-    """Return how sure the place of a point must be, times three."""
-    return _MAX_RADIUS[0] + _MAX_RADIUS[1] * gsd
+class Equations:
+    """Road points of a scene on one map, as a camera and its lens see them from about where a homography puts it.
 
+    Attributes
+    ----------
+    p : (9,) float64
+        The parameters (see `kernels.adjustment`).
+    unit : float
+        Metres per normalised unit of the reference plane.
+    weight : float
+        Of a road point against an independent observation of standard deviation `sigma_m` in the middle of the frame.
+    prior : (9,) float64
+        Weights that hold parameters near zero.
+    met : Met
+        The roads that the points met last.
+    """
 
-def point_weight(scene: Scene, unit: float, step: int = 1) -> float:
-    """Return the weight of each `step`-th road point against an independent one."""
-    spacing_m = scene.road_length_px * unit / scene.half_size / max(len(scene.points), 1)
-    return min(1.0, spacing_m * step / _CORRELATION_M)
+    def __init__(
+        self,
+        matrix: FloatArray,
+        scene: Scene,
+        index: ReferenceIndex,
+        options: RefineOptions,
+        k1: float | None = None,
+        step: int = 1,
+    ) -> None:
+        """Each `step`-th road point takes part. Without a `k1` the camera is a pinhole, and stays one."""
+        self.scene, self.options, self.roads = scene, options, index.road_buckets
+        p, self._origin, self.unit = normalise(matrix, scene.center, scene.half_size)
+        self.p, free = np.append(p, k1 or 0.0), 8 if k1 is None else 9
+        self.gsd = gsd = self.unit / scene.half_size
+        self.sigma_m = math.hypot(_SIGMA_M, _SIGMA_PX * gsd)
+        sigmas = np.array([self.options.perspective_sigma] * 2 + [_K1_SIGMA])
+        self.prior = np.append(np.zeros(6), (self.sigma_m / self.unit / sigmas) ** 2)
+        spacing_m = scene.road_length_px * gsd / max(len(scene.points), 1)
+        self.weight = min(1.0, spacing_m * step / _CORRELATION_M)
+        xy, along = self.normalised(scene.points[::step]), np.ascontiguousarray(scene.directions[::step])
+        half_side = max(scene.size) / 2.0 / scene.half_size
+        self.samples = RoadSamples(xy, along, _cells(xy), self.weight, half_side)
+        self._plane = Plane(self.unit, *self._origin.tolist())
+        self._limits = AdjustLimits(
+            _N_CELLS**2, options.least_share, _MAX_RADIUS[0] + _MAX_RADIUS[1] * gsd,
+            MIN_COS, self.sigma_m, _SIGMA_M, _SIGMA_PX / scene.half_size, self.prior, _N_ITERATIONS, _TOLERANCE_M,
+        )  # fmt: skip
+        n = len(xy)
+        self.met = Met(np.empty((n, free)), np.full(n, np.nan), np.empty(n), np.empty(n), np.empty(n, np.bool_))
+
+    @property
+    def homography(self) -> Homography:
+        """The normalised homography."""
+        return Homography(np.append(self.p[:8], 1.0).reshape(3, 3))
+
+    def normalised(self, points: FloatArray) -> FloatArray:
+        """Normalise points (N, 2) of the query plane."""
+        return np.asarray((points - self.scene.center) / self.scene.half_size)
+
+    def places(self, points: FloatArray) -> FloatArray:
+        """Return where normalised points (N, 2) come to lie on the map, normalised."""
+        straight = Lens(float(self.p[8]), (0.0, 0.0), self.samples.half_side).straighten(points)
+        return self.homography.everywhere(straight)
+
+    def pairs(self, xy: FloatArray, places: FloatArray, weight: float) -> PointPairs:
+        """Return points (N, 2) of the query plane that belong at places (N, 2) of the map."""
+        query = self.normalised(xy)
+        return PointPairs(query, (places - self._origin) / self.unit, _cells(query), weight)
+
+    def meet(self) -> BoolArray:
+        """Find the roads near all points, and return which points (S,) met one."""
+        n = self.met.rows.shape[1]
+        meet_roads(self.p, self._plane, self.samples, self._limits, 0.0, self.roads, np.zeros((n, n)), self.met)
+        return np.isfinite(self.met.residuals)
+
+    @property
+    def cauchy(self) -> FloatArray:
+        """Weights (S,) that keep outliers from a fit; NaN of points that met no road."""
+        return np.asarray(1.0 / (1.0 + (self.met.residuals / self.met.sigmas) ** 2))
+
+    def adjust(self, pairs: PointPairs, held: Held, slack: float = 1.0) -> Refined | None:
+        """Fit the parameters to roads and to points (see `kernels.adjustment.adjust`); None where that fails."""
+        n = self.met.rows.shape[1]
+        normal = np.empty((n, n))
+        used, rms = adjust(
+            self.p, self._plane, self.samples, pairs, held, self._limits, slack, self.roads, normal, self.met
+        )
+        if not np.isfinite(rms):
+            return None
+        normal += np.tril(normal, -1).T
+        # Where the mask is bent, its errors keep their sign as much further as they are greater.
+        scatter = rms * max(1.0, rms / (_USUAL_RMS * self.sigma_m)) / self.unit
+        covariance = np.asarray(np.linalg.inv(normal) * scatter**2, float)
+        corners = self.corner_covariance(covariance[:8, :8])
+        found = denormalise(self.p[:8], self.scene.center, self.scene.half_size, self._origin, self.unit)
+        k1_sigma = math.sqrt(max(float(covariance[8, 8]), 0.0)) if n == 9 else 0.0
+        k1, share = float(self.p[8]), used / max(len(self.samples.xy), 1)
+        return Refined(found / found[2, 2], corner_sigmas(corners), rms, corners, k1, k1_sigma, share)
+
+    def corner_covariance(self, covariance: FloatArray) -> FloatArray:
+        """Return the covariance (8, 8) of the frame's corners, square metres, from that of the homography (8, 8)."""
+        derivatives = self.homography.by_elements(self.normalised(self.scene.corners)).reshape(8, 8)
+        floor = self.options.sigma_floor_m**2 + (self.options.sigma_floor_px * self.gsd) ** 2
+        return np.asarray(derivatives @ covariance @ derivatives.T * self.unit**2 + 0.5 * floor * np.eye(8))
 
 
 def _cells(uv: FloatArray) -> IntArray:
@@ -141,27 +244,6 @@ def _cells(uv: FloatArray) -> IntArray:
     n = _N_CELLS
     columns = np.clip(((uv + 1.0) * (n / 2.0)).astype(np.int64), 0, n - 1)
     return np.asarray(columns[:, 1] * n + columns[:, 0])
-
-
-def corner_covariance(
-    p: FloatArray, covariance: FloatArray, scene: Scene, unit: float, options: RefineOptions
-) -> FloatArray:
-    """Return the covariance (8, 8) of the frame's corners, square metres (see `Refined`), from that of `p` (8, 8)."""
-    homography = Homography(np.append(p, 1.0).reshape(3, 3))
-    derivatives = homography.by_elements((scene.corners - scene.center) / scene.half_size).reshape(8, 8)
-    floor = options.sigma_floor_m**2 + (options.sigma_floor_px * unit / scene.half_size) ** 2
-    return np.asarray(derivatives @ covariance @ derivatives.T * unit**2 + 0.5 * floor * np.eye(8))
-
-
-def scatter_m(rms: float, sigma_m: float) -> float:
-    """Return the scatter in the covariance of a fit of road points of this rms and standard deviation, metres."""
-    return rms * max(1.0, rms / (_USUAL_RMS * sigma_m))
-
-
-def robust_rms(residuals: FloatArray, weights: FloatArray) -> float:
-    """Return the scale of residuals (M,) with Cauchy weights: as of `kernels.adjustment.adjust`."""
-    slopes = max(float((weights * (2.0 * weights - 1.0)).sum()), 0.1 * float(weights.sum()))
-    return math.sqrt(float(((weights * residuals) ** 2).sum()) * float(weights.sum())) / slopes
 
 
 def corner_sigmas(covariance: FloatArray) -> FloatArray:
@@ -176,10 +258,11 @@ def _grid(n: int) -> FloatArray:
     return np.stack(np.meshgrid(side, side), axis=-1).reshape(-1, 2)
 
 
-def _held_points(p: FloatArray, n: int) -> tuple[FloatArray, FloatArray]:
-    """Return n x n points over the frame that are held, and where `p` puts them."""
-    uv = _grid(n)
-    return uv, Homography(np.append(p, 1.0).reshape(3, 3)).everywhere(uv)
+def weight_on_roads(matrix: FloatArray, scene: Scene, index: ReferenceIndex) -> float:
+    """Return the sum of the Cauchy weights of road points, as a homography lays them."""
+    equations = Equations(matrix, scene, index, RefineOptions())
+    equations.meet()
+    return float(np.nansum(equations.cauchy))
 
 
 def refine(
@@ -204,43 +287,103 @@ def refine(
     held : bool
         Hold the homography near its start also where there are matches enough: it is right all over the frame.
     """
-    options = options or RefineOptions()
-    center, half_size = scene.center, scene.half_size
-    p, origin, unit = normalise(matrix, center, half_size)
-    gsd = unit / half_size
-    sigma_m = math.hypot(SIGMA_M, SIGMA_PX * gsd)
-    chosen = matched >= 0
     step = 1 if n_points is None else max(1, len(scene.points) // n_points)
-    points = (scene.points[::step] - center) / half_size
+    equations = Equations(matrix, scene, index, options or RefineOptions(), step=step)
     # Isolated matches are probably accidental.
+    chosen = matched >= 0
     around = scene.neighbours[chosen]
     support = ((matched[around] >= 0) & (around >= 0)).sum(axis=1) / np.maximum((around >= 0).sum(axis=1), 1)
     chosen[chosen] = support >= _LEAST_SUPPORT
-    pairs = (scene.intersections.xy[chosen] - center) / half_size
-    grid, targets = _held_points(p, 6 if held or len(pairs) < _FEW_MATCHES else 0)
-    held_weight = 8.0 / 36.0 * (sigma_m / max(_HELD[0], _HELD[1] * gsd)) ** 2
-    normal = np.empty((8, 8))
-    limits = AdjustLimits(
-        _N_CELLS**2, options.least_share, max_radius_m(gsd),
-        MIN_COS, sigma_m, SIGMA_M, SIGMA_PX / half_size,
-        (sigma_m / unit / options.perspective_sigma) ** 2, _N_ITERATIONS, TOLERANCE_M,
-    )  # fmt: skip
-    directions = np.ascontiguousarray(scene.directions[::step])
-    weight = point_weight(scene, unit, step)
-    places = (index.xy[matched[chosen]] - origin) / unit
-    _, rms = adjust(
-        p,
-        Plane(unit, origin[0], origin[1]),
-        RoadSamples(points, directions, _cells(points), weight),
-        PointPairs(pairs, places, _cells(pairs), _INTERSECTION_WEIGHT),
-        Held(grid, targets, held_weight),
-        limits,
-        index.road_buckets,
-        normal,
-    )
-    if not np.isfinite(rms):
-        return None
-    inverse = np.asarray(np.linalg.inv(normal) * (scatter_m(rms, sigma_m) / unit) ** 2, float)
-    result = denormalise(p, center, half_size, origin, unit)
-    covariance = corner_covariance(p, inverse, scene, unit, options)
-    return Refined(result / result[2, 2], corner_sigmas(covariance), rms, covariance)
+    pairs = equations.pairs(scene.intersections.xy[chosen], index.xy[matched[chosen]], _INTERSECTION_WEIGHT)
+    grid = _grid(6 if held or len(pairs.query) < _FEW_MATCHES else 0)
+    weight = 8.0 / 36.0 * (equations.sigma_m / max(_HELD[0], _HELD[1] * equations.gsd)) ** 2
+    return equations.adjust(pairs, Held(grid, equations.places(grid), weight))
+
+
+# --- carriageways -----------------------------------------------------------------------------------------------------
+#
+# Where a mask shows two roads, and the map has one between them, either is as near to the map's road as the other. A
+# fit that lays one on it is off by half of how far they are apart, and surer than it should be; so their middle is
+# laid there.
+
+#: Roads at these distances, metres, may be one on the map, if it has one for both: nearest points, seen from the two,
+#: that lie within this part of how far they are apart.
+_APART_M, _ONE = (3.0, 30.0), 0.35
+#: The nearest point beside one lies within half the way to the next along the road, or a little more.
+_BESIDE = 0.55
+#: Intersections within this multiple of that distance are of such a road: the map has them in the middle too.
+_NEAR = 2.0
+#: A smaller share of the points does not bend a fit.
+_FEW = 0.03
+#: The middle depends on the fit, and the fit on the middle: first about this many points are used, then all.
+_ROUNDS = (200, None)
+
+
+def refine_between(
+    refined: Refined, scene: Scene, index: ReferenceIndex, matched: IntArray, options: RefineOptions
+) -> tuple[Refined, Scene]:
+    """Refine a homography once more where the map has one road for two of the mask.
+
+    Return it and the scene with road points between the two, or what was given where there are few, or where no more of
+    the points lie on roads so: a false road beside a true one looks alike.
+    """
+    found, seen = refined, scene
+    for n_points in _ROUNDS:
+        moved, left = between_carriageways(found.matrix, scene, index, matched)
+        again = None if moved is scene else refine(found.matrix, moved, index, left, options, n_points, held=True)
+        if again is None:
+            return refined, scene
+        found, seen = again, moved
+    before = weight_on_roads(refined.matrix, scene, index)
+    better = weight_on_roads(found.matrix, seen, index) >= before
+    return (found, seen) if better else (refined, scene)
+
+
+def between_carriageways(
+    matrix: FloatArray, scene: Scene, index: ReferenceIndex, matched: IntArray
+) -> tuple[Scene, IntArray]:
+    """Return the scene with road points halfway between two roads where the map has one; itself if there are few.
+
+    The matches (N,) come without those at such points.
+    """
+    if not len(scene.points):
+        return scene, matched
+    at, along, gsd = points_on_map(matrix, scene)
+    across, step_px = np.empty_like(at), scene.road_length_px / len(at)
+    roads_alongside(at, along, _BESIDE * step_px * gsd, *_APART_M, MIN_COS, across)
+    apart = np.hypot(*across.T)
+    reach = np.where(np.isfinite(apart), apart, 0.0) + _APART_M[0]
+    feet = [_nearest(start, along, reach, index) for start in (at, at + across)]
+    one = np.hypot(*(feet[0] - feet[1]).T) < _ONE * apart  # not where anything is NaN
+    if one.mean() < _FEW:
+        return scene, matched
+    points = scene.points.copy()
+    points[one] = Homography(matrix).inverse().everywhere(at[one] + 0.5 * across[one])
+    there = nearest_of(scene.intersections.xy, scene.points, np.flatnonzero(one), _NEAR * step_px) >= 0
+    return replace(scene, points=points), np.where(there, -1, matched)
+
+
+def _nearest(at: FloatArray, along: FloatArray, reach: FloatArray, index: ReferenceIndex) -> FloatArray:
+    """Return the nearest points (S, 2) on roads of the map that run along points (S, 2); NaN beyond `reach` (S,)."""
+    found = np.empty((len(at), 3))
+    road_residuals(np.eye(3), np.ascontiguousarray(at), along, reach, MIN_COS, index.road_buckets, found)
+    return np.asarray(at + found[:, :1] * found[:, 1:])
+
+
+def nearest_of(xy: FloatArray, points: FloatArray, among: IntArray, away: float) -> IntArray:
+    """Return which of `points` (S, 2), `among` those numbered, lies nearest to each of `xy` (N, 2); -1: none within."""
+    nearest, least = np.full(len(xy), -1), np.full(len(xy), away**2)
+    for number in among:
+        square = ((xy - points[number]) ** 2).sum(axis=1)
+        closer = square < least
+        nearest[closer], least[closer] = number, square[closer]
+    return nearest
+
+
+def points_on_map(matrix: FloatArray, scene: Scene) -> tuple[FloatArray, FloatArray, FloatArray]:
+    """Return road points on the map (S, 2), unit vectors along the roads (S, 2), and metres per pixel there (S,)."""
+    to_map = Homography(matrix).facing(scene.center)
+    points = np.ascontiguousarray(to_map(scene.points))
+    ahead = to_map(scene.points + scene.directions) - points
+    length = np.maximum(np.hypot(*ahead.T), 1e-12)
+    return points, np.ascontiguousarray(ahead / length[:, None]), length

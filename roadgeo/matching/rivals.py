@@ -137,7 +137,7 @@ class Rivals:
         return standing
 
     def _compare(self, estimator: TripleEstimator, best: Hypothesis, ranked: Sequence[Hypothesis]) -> Standing:
-        scene, matrix = estimator.scene_of(best), best.laid
+        scene, matrix = estimator.scene_of(best), best.matrix
         if best.log10_likelihood < self.needed:
             return Standing(best, None, best.log10_odds)
         doubt = self.doubt(estimator, best)
@@ -170,7 +170,7 @@ class Rivals:
             return Standing(best, rival.matrix, odds, worth, likelihood)
 
         known = [model for model in ranked[: 1 + _N_KNOWN] if model is not best]
-        met = [Other(*compare(model.laid), model.laid, self.doubt(estimator, model)) for model in known]
+        met = [Other(*compare(model.matrix), model.matrix, self.doubt(estimator, model)) for model in known]
         standing = stand(met)
         if standing.log10_lead >= _WORTH_LOOKING * self.needed:
             return stand([*met, *similar_places(matrix, evidence, compare, estimator.options)])
@@ -181,7 +181,7 @@ class Rivals:
 
     def doubt(self, estimator: TripleEstimator, model: Hypothesis) -> float:
         """Return by how many powers of ten what a place contradicts speaks against it, as it is laid; asked once."""
-        known, matrix = self._doubts.get(id(model)), model.laid
+        known, matrix = self._doubts.get(id(model)), model.matrix
         if known is None or known[0] is not matrix:
             scene = estimator.scene_of(model)
             evidence = Evidence(scene, estimator.index, sampling(matrix, scene.size))
@@ -190,7 +190,7 @@ class Rivals:
 
     def _take(self, estimator: TripleEstimator, matrix: FloatArray, ranked: Sequence[Hypothesis]) -> Hypothesis:
         """Return the hypothesis of a place that explains more than the likeliest: one that was met, or a new one."""
-        known = next((model for model in ranked if model.laid is matrix), None)
+        known = next((model for model in ranked if model.matrix is matrix), None)
         if known is not None:
             return known
         scene, index = estimator.scene, estimator.index

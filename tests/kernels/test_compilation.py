@@ -13,7 +13,7 @@ import roadgeo
 
 COMPUTE = """
 import numpy as np, roadgeo
-from roadgeo.kernels.homography_fit import cholesky
+from roadgeo.kernels.adjustment import cholesky
 assert cholesky(np.eye(2), np.empty((2, 2)))
 from roadgeo.kernels.compilation import kernel_folder
 print(roadgeo.__file__, kernel_folder(), sep="\\n")

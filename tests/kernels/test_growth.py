@@ -7,12 +7,6 @@ from hypothesis import strategies as st
 from naive import kernels as naive
 
 from roadgeo.kernels.growth import grow, grow_each
-from roadgeo.kernels.homography_fit import (
-    cholesky,
-    fit_homography,
-    predict,
-    solve_cholesky,
-)
 from roadgeo.kernels.point_matching import keep_nearest, match_all, nearest_alike
 from roadgeo.kernels.structs import GrowthLimits, GrowthQuery, PointBuckets
 from roadgeo.matching.index import neighbour_grid, sort_by_bucket
@@ -20,7 +14,6 @@ from roadgeo.matching.index import neighbour_grid, sort_by_bucket
 TOLERANCE = np.radians(25)
 MIN_COS = np.cos(TOLERANCE)
 TRUTH = np.array([[0.8, -0.55, 700.0], [0.5, 0.75, 900.0], [1.5e-4, -1e-4, 1.0]])
-P = np.array([0.9, -0.2, 0.05, 0.25, 1.1, -0.02, 0.15, -0.1])
 
 
 def branches_of(angles):
@@ -75,72 +68,6 @@ class World:
 @pytest.fixture(scope="module")
 def world():
     return World()
-
-
-class TestCholesky:
-    @pytest.mark.parametrize("n", [1, 3, 8])
-    def test_factorises_and_solves(self, n):
-        rng = np.random.default_rng(n)
-        root = rng.normal(0, 1, (n, n + 2))
-        matrix = root @ root.T
-        factor, right = np.zeros((n, n)), rng.normal(0, 1, n)
-        expected = np.linalg.solve(matrix, right)
-        assert cholesky(np.tril(matrix), factor)
-        assert np.allclose(factor, np.linalg.cholesky(matrix))
-        solve_cholesky(factor, right)
-        assert np.allclose(right, expected)
-
-    @pytest.mark.parametrize("matrix", [np.zeros((2, 2)), -np.eye(3), np.ones((2, 2)), np.full((2, 2), np.nan)])
-    def test_refuses_what_is_not_positive_definite(self, matrix):
-        assert not cholesky(matrix, np.zeros(matrix.shape))
-
-
-class TestFitHomography:
-    @pytest.mark.parametrize("n", [3, 4, 12])
-    @pytest.mark.parametrize("start", [np.zeros(8), P])
-    def test_like_the_twin(self, n, start):
-        rng = np.random.default_rng(n)
-        query, matched = rng.uniform(-0.7, 0.7, (n + 2, 2)), np.r_[-1, np.arange(n), -1]
-        image = np.array([naive.predict(P, *q) for q in query]) + rng.normal(0, 0.01, query.shape)
-        p, normal, factor = start.copy(), np.empty((8, 8)), np.zeros((8, 8))
-        assert fit_homography(query, image, matched, 0.01, p, normal, factor)
-        expected, system = naive.fit_homography(query, image, matched, 0.01, start)
-        assert np.allclose(p, expected, atol=1e-6)
-        assert np.allclose(np.tril(normal), np.tril(system))
-
-    def test_exact_points_give_the_homography(self):
-        query = np.random.default_rng(0).uniform(-0.7, 0.7, (20, 2))
-        image = np.array([naive.predict(P, *q) for q in query])
-        p, normal, factor = np.zeros(8), np.empty((8, 8)), np.zeros((8, 8))
-        for _ in range(3):
-            assert fit_homography(query, image, np.arange(20), 0.0, p, normal, factor)
-        assert np.allclose(p, P, atol=1e-6)
-
-    @pytest.mark.parametrize("matched", [[], [-1, -1, -1, -1], [0, 1, -1, -1]])
-    def test_two_points_are_too_few(self, matched):
-        query = np.random.default_rng(0).uniform(-1, 1, (len(matched), 2))
-        room = np.empty((8, 8)), np.zeros((8, 8))
-        assert not fit_homography(query, query, np.array(matched, np.int64), 1.0, np.zeros(8), *room)
-
-    def test_points_beyond_the_horizon_cannot_be(self):
-        query = np.array([[0.0, 0], [1, 0], [0, 1], [1, 1]])
-        p = np.array([1.0, 0, 0, 0, 1, 0, -1, -1])  # w = -1 at (1, 1)
-        assert not fit_homography(query, query, np.arange(4), 1.0, p, np.empty((8, 8)), np.zeros((8, 8)))
-
-
-class TestPrediction:
-    @pytest.mark.parametrize("uv", [(0.0, 0.0), (0.4, -0.7), (1.0, 1.0)])
-    def test_like_the_twin(self, uv):
-        query = np.random.default_rng(1).uniform(-0.5, 0.5, (9, 2))
-        image = np.array([naive.predict(P, *q) for q in query])
-        p, normal, factor = P.copy(), np.empty((8, 8)), np.zeros((8, 8))
-        assert fit_homography(query, image, np.arange(9), 0.05, p, normal, factor)
-        x, y, w, variance = predict(p, *uv, factor, np.empty(8), np.empty(8))
-        assert (x, y) == pytest.approx(naive.predict(p, *uv))
-        assert w == pytest.approx(1 + p[6] * uv[0] + p[7] * uv[1])
-        symmetric = np.tril(normal) + np.tril(normal, -1).T
-        expected = naive.prediction_variance(symmetric, p, *uv)
-        assert variance == pytest.approx(expected, rel=1e-4)
 
 
 class TestNearestAlike:

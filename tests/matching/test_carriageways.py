@@ -11,13 +11,12 @@ from worlds.motorways import motorways
 from worlds.scenes import camera, look, mapped, random_network, scene_of
 
 from roadgeo.geometry.camera import CameraFault, sampling
-from roadgeo.matching.carriageways import between_carriageways, nearest_of, refine_between
 from roadgeo.matching.estimator import TripleEstimator
 from roadgeo.matching.evidence import agreement
 from roadgeo.matching.finishing import measure_corners
 from roadgeo.matching.growing import Hypothesis
 from roadgeo.matching.index import build_index
-from roadgeo.matching.refinement import RefineOptions, refine
+from roadgeo.matching.refinement import RefineOptions, between_carriageways, nearest_of, refine, refine_between
 from roadgeo.reference.reference import Reference
 from roadgeo.workflows import locate
 

@@ -64,7 +64,7 @@ def apart(world, matrix, other=None):
 @pytest.mark.slow
 def test_the_place_leads_all_others_by_the_streets_that_are_missing_there(broken):
     standing = stand(broken, broken[0])
-    assert apart(broken, standing.model.laid) < 2.0
+    assert apart(broken, standing.model.matrix) < 2.0
     assert apart(broken, standing.rival) > 50.0
     assert standing.log10_lead > NEEDED
     # The best other place lies further away than those nearby, by which the search judged.
@@ -76,7 +76,7 @@ def test_a_rival_that_explains_more_takes_over(broken):
     """The search met a block beside only: that leads nothing, and what leads it is the place."""
     truth, _, evidence = broken
     standing, direct = stand(broken, beside(truth, evidence)), stand(broken, truth)
-    assert apart(broken, standing.model.laid) < 2.0
+    assert apart(broken, standing.model.matrix) < 2.0
     assert standing.model.refined is not None  # and it can be told like any that the search met
     assert standing.log10_lead == pytest.approx(direct.log10_lead, abs=0.5)
 
@@ -215,7 +215,7 @@ def test_where_it_is_compared_it_leads_as_clearly(plain, monkeypatch):
     certain = rivals._CERTAIN
     monkeypatch.setattr(rivals, "_CERTAIN", np.inf)
     standing = stand(plain, plain[0])
-    assert apart(plain, standing.model.laid) < 2.0
+    assert apart(plain, standing.model.matrix) < 2.0
     assert standing.log10_lead > certain
 
 

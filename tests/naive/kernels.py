@@ -4,6 +4,7 @@ from itertools import combinations, permutations, product
 
 import numpy as np
 
+from roadgeo.geometry.lens import Lens
 from roadgeo.kernels.triple_codes import UNITS
 
 # buckets
@@ -184,22 +185,14 @@ def predict_rows(p, u, v, step=1e-6):
     return np.stack([(predict(p + move, u, v) - predict(p - move, u, v)) / (2 * step) for move in step * np.eye(8)], 1)
 
 
-def fit_homography(query, image, matched, prior, p):
-    """One weighted linear least-squares step: x' w = h . (u, v, 1), over the old w. Returns p and the normal matrix."""
-    rows, right = [], []
-    for (u, v), target, m in zip(query, image, matched, strict=True):
-        if m < 0:
-            continue
-        w = 1.0 + p[6] * u + p[7] * v
-        x, y = target
-        rows.append(np.array([u, v, 1, 0, 0, 0, -x * u, -x * v]) / w)
-        rows.append(np.array([0, 0, 0, u, v, 1, -y * u, -y * v]) / w)
-        right += [x / w, y / w]
-    rows += [np.sqrt(prior) * np.eye(8)[k] for k in (6, 7)]
-    rows += list(np.sqrt(1e-9) * np.eye(8))
-    right += [0.0] * 10
-    A = np.array(rows)
-    return np.linalg.lstsq(A, np.array(right), rcond=None)[0], A.T @ A
+def fit_points(query, image, matched, prior, p):
+    """One Gauss-Newton step to matched points. Returns p (8,) and the normal matrix."""
+    normal, right = 1e-9 * np.eye(8) + np.diag([0.0] * 6 + [prior] * 2), np.append(np.zeros(6), -prior * p[6:8])
+    for point, place, m in zip(query, image, matched, strict=True):
+        if m >= 0:
+            more, side = add_point(np.append(p, 0.0), 1.0, point, place, 1.0, 8)
+            normal, right = normal + more, right + side
+    return p + np.linalg.solve(normal, right), normal
 
 
 def prediction_variance(normal, p, u, v):
@@ -252,7 +245,7 @@ def grow(
     def fit(p):
         if (matched >= 0).sum() < 3 or (1.0 + query[matched >= 0] @ p[6:] < 0.05).any():
             raise GivenUpError
-        return fit_homography(query, (ref_xy[matched] - ref_xy[ref_anchor]) / unit, matched, prior, p)
+        return fit_points(query, (ref_xy[matched] - ref_xy[ref_anchor]) / unit, matched, prior, p)
 
     def search(i, p, normal):
         """(place, search radius, Jacobian) of a query point, or None near the horizon."""
@@ -375,75 +368,107 @@ def grow_by_roads(ps, unit, origins, tolerance, points, directions, stages, segm
     return scores
 
 
+# adjustment
+
+
 def own_sigma(reach_m, sigma_m, map_sigma_m, mask_sigma):
     """The map's and the mask's part of how unsure a point is, in that of the middle of the frame."""
     return np.sqrt(map_sigma_m**2 + (mask_sigma * reach_m) ** 2) / sigma_m
 
 
-def adjust(
-    p, unit, origin, points, directions, point_cells, point_weight, pairs, targets, pair_cells, pair_weight,
-    held, held_targets, held_weight, n_cells, least_share, max_radius, min_cos, sigma_m, map_sigma_m, mask_sigma,
-    prior, n_iterations, tolerance_m, segments,
-):  # fmt: skip
-    """(p, road points used, rms, normal matrix) of Gauss-Newton steps with Cauchy weights."""
-    shares = np.ones(n_cells)
-    previous, rms = -1, np.inf
-    normal = None
-    for iteration in range(n_iterations + 1):
-        rows, weights, residuals = [], [], []
-        for pair, target, cell in zip(pairs, targets, pair_cells, strict=True):
-            gap = target - predict(p, *pair)
-            if shares[cell] >= least_share and np.hypot(*gap) * unit <= max_radius:
-                reach = unit * np.sqrt(abs(np.linalg.det(jacobian(np.append(p, 1.0).reshape(3, 3), pair))))
-                own = own_sigma(reach, sigma_m, map_sigma_m, mask_sigma)
-                weight = pair_weight / (own**2 + (np.hypot(*gap) * unit / (2 * sigma_m)) ** 2)
-                rows += list(predict_rows(p, *pair))
-                weights += [weight, weight]
-                residuals += list(gap)
+def see(p, half_side, uv):
+    """Where a normalised point comes to lie, by a homography p[:8] behind a lens p[8]; NaN where w < 0.02."""
+    straight = Lens(p[8], (0.0, 0.0), half_side).straighten(np.asarray(uv, float))
+    return predict(p[:8], *straight) if 1.0 + straight @ p[6:8] >= 0.02 else np.full(2, np.nan)
+
+
+def see_rows(p, half_side, uv, step=1e-6):
+    """(2, 9) derivative of that by the parameters, by central differences."""
+    moves = step * np.eye(9)
+    return np.stack([(see(p + m, half_side, uv) - see(p - m, half_side, uv)) / (2 * step) for m in moves], 1)
+
+
+def see_jacobian(p, half_side, uv, step=1e-6):
+    """(2, 2) derivative of that by the point, likewise."""
+    moves = step * np.eye(2)
+    return np.stack([(see(p, half_side, uv + m) - see(p, half_side, uv - m)) / (2 * step) for m in moves], 1)
+
+
+def add_point(p, half_side, point, place, weight, n):
+    """(normal matrix (n, n), right side (n,)) of the two equations of a point."""
+    rows = see_rows(p, half_side, point)[:, :n]
+    return weight * rows.T @ rows, weight * rows.T @ (place - see(p, half_side, point))
+
+
+def meet_roads(p, plane, points, limits, slack, inverse, segments):
+    """(whether its place is sure enough, row, residual, sigma, own) of each point, None for what there is not."""
+    found = []
+    for point, direction in zip(points.xy, points.directions, strict=True):
+        place, local = see(p, points.half_side, point), see_jacobian(p, points.half_side, point)
+        along = local @ direction
+        reach = plane.unit * abs(np.linalg.det(local)) / np.hypot(*along)
+        along /= np.hypot(*along)
+        rows = see_rows(p, points.half_side, point)[:, : len(inverse)]
+        row = np.array([-along[1], along[0]]) @ rows
+        own = own_sigma(reach, limits.sigma_m, limits.map_sigma_m, limits.mask_sigma)
+        sigma = limits.sigma_m * np.sqrt(own**2 + slack**2 * row @ inverse @ row)
+        if not 3 * sigma <= limits.max_radius * max(1.0, own):
+            found.append((False, None, None, None, None))
+            continue
+        here = np.array([plane.x, plane.y]) + plane.unit * place
+        distance, foot, road = nearest_road(*here, *along, 3 * sigma, limits.min_cos, segments)
+        across = np.array([-road[1], road[0]])
+        is_met = distance < np.inf
+        found.append((True, across @ rows, across @ (foot - here), sigma, own) if is_met else (True, *[None] * 4))
+    return found
+
+
+def adjust(p, free, plane, points, pairs, held, limits, slack, segments):
+    """(p, road points used, rms, normal matrix) of Gauss-Newton steps with Cauchy weights on `free` parameters."""
+    shares = np.ones(limits.n_cells)
+    previous, rms, normal, half_side = -1, np.inf, None, points.half_side
+    for iteration in range(limits.n_iterations + 1):
+        prior = limits.prior[:free]
+        before, normal, right = normal, np.diag(prior + 1e-9), -prior * p[:free]
+        both = []
+        for pair, target, cell in zip(pairs.query, pairs.reference, pairs.cells, strict=True):
+            far = np.hypot(*(target - see(p, half_side, pair))) * plane.unit
+            if shares[cell] >= limits.least_share and far <= limits.max_radius:
+                reach = plane.unit * np.sqrt(abs(np.linalg.det(see_jacobian(p, half_side, pair))))
+                own = own_sigma(reach, limits.sigma_m, limits.map_sigma_m, limits.mask_sigma)
+                both.append((pair, target, pairs.weight / (own**2 + (far / (2 * limits.sigma_m)) ** 2)))
         if iteration < 6:
-            for point, target in zip(held, held_targets, strict=True):
-                rows += list(predict_rows(p, *point))
-                weights += [held_weight * 0.5**iteration] * 2
-                residuals += list(target - predict(p, *point))
-        met = []
+            both += [(*one, held.weight * 0.5**iteration) for one in zip(held.query, held.reference, strict=True)]
+        for one in both:
+            more, side = add_point(p, half_side, *one, free)
+            normal, right = normal + more, right + side
+        used = []
         if iteration > 0:
-            searched, hits = np.zeros(n_cells), np.zeros(n_cells)
-            for i, (point, direction) in enumerate(zip(points, directions, strict=True)):
-                local = jacobian(np.append(p, 1.0).reshape(3, 3), point)
-                along = local @ direction
-                reach = unit * abs(np.linalg.det(local)) / np.hypot(*along)
-                along /= np.hypot(*along)
-                row = np.array([-along[1], along[0]]) @ predict_rows(p, *point)
-                own = own_sigma(reach, sigma_m, map_sigma_m, mask_sigma)
-                sigma = sigma_m * np.sqrt(own**2 + row @ np.linalg.inv(normal) @ row)
-                if 3 * sigma > max_radius * max(1.0, own):
-                    continue
-                searched[point_cells[i]] += 1
-                place = origin + unit * predict(p, *point)
-                distance, foot, road = nearest_road(*place, *along, 3 * sigma, min_cos, segments)
-                if distance < np.inf:
-                    hits[point_cells[i]] += 1
-                    across = np.array([-road[1], road[0]])
-                    met.append((point_cells[i], across @ predict_rows(p, *point), across @ (foot - place), sigma, own))
-            shares = np.where(searched > 0, hits / np.maximum(searched, 1), 1.0)
-            met = [m[1:] for m in met if shares[m[0]] >= least_share]
-            for row, residual, sigma, own in met:
-                rows.append(row)
-                weights.append(point_weight / own**2 / (1 + (residual / sigma) ** 2))
-                residuals.append(residual / unit)
-            if met:
-                r, s, own = np.array([m[1:] for m in met]).T
+            found = meet_roads(p, plane, points, limits, slack, np.linalg.inv(before), segments)
+            for cell in range(limits.n_cells):
+                here = [one for one, c in zip(found, points.cells, strict=True) if c == cell and one[0]]
+                shares[cell] = np.mean([one[1] is not None for one in here]) if here else 1.0
+            used = [
+                one[1:]
+                for one, cell in zip(found, points.cells, strict=True)
+                if one[1] is not None and shares[cell] >= limits.least_share
+            ]
+            for row, residual, sigma, own in used:
+                weight = points.weight / own**2 / (1 + (residual / sigma) ** 2)
+                normal, right = normal + weight * np.outer(row, row), right + weight * row * residual / plane.unit
+            if used:
+                r, s, own = np.array([one[1:] for one in used]).T
                 cauchy = 1 / (1 + (r / s) ** 2)
                 slope = (1 - (r / s) ** 2) * cauchy**2  # of the influence r * cauchy
                 rms = np.sqrt(np.mean((cauchy * r / own) ** 2) * cauchy.mean()) / max(slope.mean(), 0.1 * cauchy.mean())
-        A, W = np.array(rows).reshape(-1, 8), np.array(weights)
-        hold = np.diag([0.0] * 6 + [prior] * 2)
-        normal = A.T @ (W[:, None] * A) + hold + 1e-9 * np.eye(8)
-        step = np.linalg.solve(normal, A.T @ (W * np.array(residuals)) - hold @ p)
-        p = p + step
-        if iteration > (6 if len(held) else 1) and np.abs(step).max() * unit < tolerance_m and len(met) <= previous:
-            break
-        previous = len(met)
+        step = np.linalg.solve(normal, right)
+        p = p + np.append(step, np.zeros(9 - free))
+        settled = iteration > (6 if len(held.query) else 1)
+        if settled and np.abs(step).max() * plane.unit < limits.tolerance_m and len(used) <= previous:
+            if slack == 1.0:
+                break
+            slack = 1.0
+        previous = len(used)
     return p, previous, rms, normal
 
 
