@@ -14,7 +14,7 @@ from roadgeo.geometry.displacement import Displacement, measure
 from roadgeo.geometry.homography import Homography
 from roadgeo.kernels.roads import road_residuals
 from roadgeo.matching.evidence import Evidence, agreement, match_intersections
-from roadgeo.matching.exhaustive import LocalSearchOptions, move_about, search_nearby
+from roadgeo.matching.exhaustive import APART_M, LocalSearchOptions, move_about, search_nearby
 from roadgeo.matching.index import ReferenceIndex
 from roadgeo.matching.refinement import Refined, RefineOptions, points_on_map, refine, refine_between
 from roadgeo.matching.scene import MIN_COS, Scene
@@ -140,7 +140,7 @@ class _Judge:
         places = [self.refine(start, 200) for start in starts]
         distinct: list[_Place] = []
         for place in sorted(places, key=lambda place: -place.worth):
-            if all(self.gap(place.matrix, other.matrix) >= self.options.search.apart_m for other in distinct):
+            if all(self.gap(place.matrix, other.matrix) >= APART_M for other in distinct):
                 distinct.append(place)
         return distinct
 
@@ -198,7 +198,7 @@ def _judge_best(judge: _Judge, places: Sequence[_Place]) -> Checked:
     # The best place against the rival that comes nearest to it.
     options = judge.options
     best = judge.refine(places[0].matrix, None)
-    rivals = [place for place in places[1:] if judge.gap(place.matrix, best.matrix) >= options.search.apart_m]
+    rivals = [place for place in places[1:] if judge.gap(place.matrix, best.matrix) >= APART_M]
     compare = judge.evidence.compared_with(best.matrix)
     leads = [compare(rival.matrix)[1] for rival in rivals]
     lead, hardest = min(zip(leads, rivals, strict=True), key=lambda one: one[0], default=(0.0, None))

@@ -44,6 +44,10 @@ _ALONG = math.radians(18.0)
 _BYTE = 255
 
 
+#: Places nearer than this to a better one, metres, are the same.
+APART_M = 25.0
+
+
 @dataclass(frozen=True)
 class LocalSearchOptions:
     """How far and how finely is searched.
@@ -64,8 +68,6 @@ class LocalSearchOptions:
         Road points of the query that vote.
     n_places : int
         Places returned.
-    apart_m : float
-        Places nearer than this to a better one are the same.
     """
 
     reach_m: float = 350.0
@@ -75,7 +77,6 @@ class LocalSearchOptions:
     road_m: float = 15.0
     max_points: int = 300
     n_places: int = 12
-    apart_m: float = 25.0
 
 
 @dataclass(frozen=True)
@@ -205,7 +206,7 @@ def _distinct(shifts: list[Shift], options: LocalSearchOptions) -> list[Shift]:
     """Return the best shifts that lie apart from better ones."""
     kept: list[Shift] = []
     for one in sorted(shifts, key=lambda shift: -shift.share):
-        if all(math.hypot(one.east_m - k.east_m, one.north_m - k.north_m) >= options.apart_m for k in kept):
+        if all(math.hypot(one.east_m - k.east_m, one.north_m - k.north_m) >= APART_M for k in kept):
             kept.append(one)
         if len(kept) == options.n_places:
             break

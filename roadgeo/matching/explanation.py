@@ -253,7 +253,7 @@ def tell(
     n, name, located, events = len(query.scene.intersections), found.index.name, location.located, found.events
     search, result, stats = events.estimator, events.result, found.stats
     if search is None or result is None:  # there was nothing to search for, or another method searched
-        ended = "intersections" if n < needed.intersections else "verified" if stats.tuples_sampled else "anchors"
+        ended = "intersections" if n == 0 else "verified" if stats.tuples_sampled else "anchors"
         funnel = Funnel(n, stats.tuples_sampled, 0, stats.candidates, 0, 0, stats.hypotheses, 0, stats.verified)
         missing: tuple[str, ...] = () if located else (location.reason,)
         story = Story(name, "", needed, funnel, {}, None if located else ended, missing)

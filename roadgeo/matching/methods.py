@@ -165,7 +165,7 @@ def _search(
     if len(indexes) > 1:  # every search reads all tables, but few roads: those that masks before this one led to go
         let_pages_go(array for index in indexes for array in index.road_buckets[:3])
     events = [Events(explained) for _ in indexes]
-    if len(query.scene.intersections) < options.min_intersections:
+    if len(query.scene.intersections) == 0:
         return [Found(index, events=noted) for index, noted in zip(indexes, events, strict=True)]
     if options.method == "pair":
         return _search_pairs_in_turn(query, indexes, _within(options, time_limit_s))
@@ -243,7 +243,7 @@ class _Attempt:
         if near is not None:
             reach = _rounded_up(near[2] + 2.0 * query.scene.half_size * options.match.camera.gsd_m[1])
             part = _part(index, near[:2], reach)
-            if len(part) < options.min_intersections:
+            if len(part) == 0:
                 return cls(index, len(part), events=events)
         estimator = TripleEstimator(query.scene, part, _of_effort(options), near, events, ledger, sweeps)
         return cls(index, len(part), estimator, Search(estimator), events)

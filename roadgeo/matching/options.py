@@ -26,8 +26,6 @@ class LocateOptions:
         Powers of ten by which a place must explain more than any other place to be reported as located.
     min_margin : float
         The same, against a place that another look at the scene found.
-    min_intersections : int
-        Masks with fewer are not searched.
     truths : tuple of (str, lon, lat)
         For explanations: where the middle of the frame of masks whose names end so really lies. The search does not
         look at it.
@@ -45,7 +43,6 @@ class LocateOptions:
     near: tuple[float, float, float] | None = None
     min_log10_odds: float = 3.5
     min_margin: float = 2.0
-    min_intersections: int = 1
     truths: tuple[tuple[str, float, float], ...] = ()
     threads: int = 1
     elsewhere: int = 0

@@ -48,6 +48,8 @@ __all__ = ["PairIndex", "PairMatch", "PairOptions", "build_pair_index", "match_p
 _MAX_TUPLES = 30_000_000
 #: Greatest probability to miss a place that is there (lambda, eq. 13).
 _LAMBDA = 0.01
+#: Least angle between a tangent and the connecting line, degrees (eq. 7).
+_LEAST_ANGLE_DEG = 15.0
 #: Of larger queries, this many intersections at random form the tuples; all of them still judge.
 _MAX_TUPLE_INTERSECTIONS = 1000
 #: Section 4.2 asks for 15 pixels, of 1 m, of every branch, and an average distance of half a pixel from the tangent.
@@ -69,8 +71,6 @@ class PairOptions:
     ----------
     d_max_m : float
         Greatest distance between the two intersections of a reference tuple (eq. 8).
-    min_line_angle_deg : float
-        Least angle between a tangent and the connecting line (eq. 7).
     delta_cross_ratio : float
         Relative error allowed in every cross ratio (eq. 6).
     tangent_orders : {"++", "all"}
@@ -95,7 +95,6 @@ class PairOptions:
     """
 
     d_max_m: float = 1000.0
-    min_line_angle_deg: float = 15.0
     delta_cross_ratio: float = 0.3
     tangent_orders: Literal["++", "all"] = "++"
     lambda_1: float = 0.05
@@ -144,7 +143,7 @@ class PairIndex:
 def build_pair_index(intersections: Intersections, options: PairOptions | None = None) -> PairIndex:
     """Extract, hash and sort the reference's tuples (section 3.3, "Sampling in reference map").
 
-    Of the options `d_max_m` and `min_line_angle_deg` matter.
+    Of the options `d_max_m` matters.
 
     Raises
     ------
@@ -155,7 +154,7 @@ def build_pair_index(intersections: Intersections, options: PairOptions | None =
 
     options, xy = options or PairOptions(), intersections.xy
     codes = type_codes(intersections)
-    pairs = list_pairs(intersections, np.arange(len(xy)), options.d_max_m, options)
+    pairs = list_pairs(intersections, np.arange(len(xy)), options.d_max_m)
     keys = type_keys(codes, pairs)
     order = np.argsort(keys, kind="stable")
     tuples = {}
@@ -170,7 +169,7 @@ def build_pair_index(intersections: Intersections, options: PairOptions | None =
     return PairIndex(intersections, codes, tuples, PairBuckets(xy[items], codes[items], starts, grid, shape))
 
 
-def list_pairs(found: Intersections, chosen: IntArray, d_max: float, options: PairOptions) -> IntArray:
+def list_pairs(found: Intersections, chosen: IntArray, d_max: float) -> IntArray:
     """Return the (P, 2) tuples of (chosen) intersections that pass eq. 7-8, the end of lesser code first.
 
     Raises
@@ -190,7 +189,7 @@ def list_pairs(found: Intersections, chosen: IntArray, d_max: float, options: Pa
             )
     pairs = chosen[tree.query_pairs(d_max, output_type="ndarray").reshape(-1, 2)]
     dx, dy = (found.xy[pairs[:, 1]] - found.xy[pairs[:, 0]]).T
-    phi, least = np.arctan2(dy, dx), math.sin(math.radians(options.min_line_angle_deg))
+    phi, least = np.arctan2(dy, dx), math.sin(math.radians(_LEAST_ANGLE_DEG))
     passes = (dx != 0.0) | (dy != 0.0)
     for ends in pairs.T:
         passes &= found.n_tangents[ends] >= 2  # fewer cannot carry a homography (eq. 9)
@@ -402,7 +401,7 @@ class _Search:
         chosen = np.arange(len(self.query))
         if len(chosen) > _MAX_TUPLE_INTERSECTIONS:
             chosen = rng.choice(chosen, _MAX_TUPLE_INTERSECTIONS, replace=False)
-        pairs = list_pairs(self.query, chosen, np.inf, options)
+        pairs = list_pairs(self.query, chosen, np.inf)
         keys = type_keys(self.codes, pairs)
         order = rng.permutation(np.flatnonzero(np.isin(keys, list(tuples))))
         if options.rarest_first:

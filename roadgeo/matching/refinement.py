@@ -56,6 +56,9 @@ _USUAL_RMS = 0.7
 _HELD, _FEW_MATCHES = (5.0, 3.0), 8
 #: Iterations, which end where nothing moves by more, metres.
 _N_ITERATIONS, _TOLERANCE_M = 15, 0.02
+#: Accuracy of the map, metres, and of the mask, pixels, as a whole, which no number of points improves: lines are drawn
+#: and thinned to whole pixels. Fitted to the corners of training masks.
+_SIGMA_FLOOR = (0.1, 0.15)
 #: Prior standard deviation of k1.
 _K1_SIGMA = 0.1
 #: No matched intersections.
@@ -72,15 +75,10 @@ class RefineOptions:
         Prior standard deviation of the two perspective parameters.
     least_share : float
         A cell of the frame takes part when at least this share of its road points meet roads.
-    sigma_floor_m, sigma_floor_px : float
-        Accuracy of the map and of the mask as a whole, which no number of points improves: lines are drawn and thinned
-        to whole pixels. Fitted to the corners of training masks.
     """
 
     perspective_sigma: float = 0.5
     least_share: float = 0.5
-    sigma_floor_m: float = 0.1
-    sigma_floor_px: float = 0.15
 
 
 @dataclass(frozen=True)
@@ -235,7 +233,7 @@ class Equations:
     def corner_covariance(self, covariance: FloatArray) -> FloatArray:
         """Return the covariance (8, 8) of the frame's corners, square metres, from that of the homography (8, 8)."""
         derivatives = self.homography.by_elements(self.normalised(self.scene.corners)).reshape(8, 8)
-        floor = self.options.sigma_floor_m**2 + (self.options.sigma_floor_px * self.gsd) ** 2
+        floor = _SIGMA_FLOOR[0] ** 2 + (_SIGMA_FLOOR[1] * self.gsd) ** 2
         return np.asarray(derivatives @ covariance @ derivatives.T * self.unit**2 + 0.5 * floor * np.eye(8))
 
 

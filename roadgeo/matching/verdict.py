@@ -39,12 +39,11 @@ class Needed:
 
     log10_odds: float
     margin: float
-    intersections: int
 
 
 def needed_of(options: LocateOptions) -> Needed:
     """Return the thresholds of an answer."""
-    return Needed(options.min_log10_odds, options.min_margin, options.min_intersections)
+    return Needed(options.min_log10_odds, options.min_margin)
 
 
 @dataclass(frozen=True)
@@ -258,14 +257,12 @@ def _refuse(
 
 def _why_nothing(query: Query, found: Found, score: float, options: LocateOptions) -> tuple[Reason, str]:
     """Return why nothing is reported, for programs and for people, and the remedy."""
-    n, needed = len(query.scene.intersections), options.min_intersections
-    if n < needed:
-        seen = f"only {counted(n, 'intersection')} {'is' if n == 1 else 'are'}" if n else "no intersections are"
-        return Reason.FEW_INTERSECTIONS, f"{seen} seen, at least {needed} {'is' if needed == 1 else 'are'} needed"
+    if len(query.scene.intersections) == 0:
+        return Reason.FEW_INTERSECTIONS, "no intersections are seen, at least 1 is needed"
     if found.said:
         return Reason.TIME_LIMIT if found.stopped in ("work", "time") else Reason.NOTHING_STANDS_OUT, found.said
     searched = searched_within(options)
-    if found.n_searched < needed and (options.near is not None or options.match.within is not None):
+    if found.n_searched == 0 and (options.near is not None or options.match.within is not None):
         given = "around the place given by near" if options.near is not None else "in the area given by within"
         return Reason.FEW_NEAR, f"the map has {counted(found.n_searched, 'intersection')} {given}{searched}"
     if math.isfinite(score):

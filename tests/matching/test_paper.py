@@ -2,6 +2,7 @@
 
 import math
 from dataclasses import replace
+from unittest.mock import patch
 
 import numpy as np
 import pytest
@@ -200,8 +201,9 @@ def test_cross_ratios_are_invariant_under_homographies(seed, tilt_deg):
     query, seen = view(network, camera(rng, (500, 500), tilt_deg))
     if len(seen) < 2:
         return
-    options = PairOptions(d_max_m=1e6, min_line_angle_deg=5)
-    there, here = build_pair_index(network, options), build_pair_index(query, options)
+    options = PairOptions(d_max_m=1e6)
+    with patch.object(paper, "_LEAST_ANGLE_DEG", 5.0):
+        there, here = build_pair_index(network, options), build_pair_index(query, options)
     known = {
         (key, tuple(p)): row
         for key, one in there.tuples.items()

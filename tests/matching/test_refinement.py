@@ -4,9 +4,10 @@ import numpy as np
 import pytest
 from worlds.scenes import Sight, mapped, shaken, sight_of
 
+from roadgeo.matching import refinement
 from roadgeo.matching.evidence import match_intersections
 from roadgeo.matching.index import IndexOptions, build_index
-from roadgeo.matching.refinement import RefineOptions, refine
+from roadgeo.matching.refinement import refine
 
 
 def refined(start, scene, index, gsd=1.0, rounds=3):
@@ -94,11 +95,11 @@ def test_fewer_points_do_nearly_as_well(town):
     assert np.abs(mapped(result.matrix, scene.corners) - mapped(truth, scene.corners)).max() < 2
 
 
-def test_a_floor_under_every_claim(town):
+def test_a_floor_under_every_claim(town, monkeypatch):
     truth, scene = sight_of(town[0], 7)
     matched, _ = match_intersections(truth, scene, town[1], 1.0)
-    floor = RefineOptions(sigma_floor_m=3.0)
-    assert (refine(truth, scene, town[1], matched, floor).corner_sigma_m >= 3.0).all()
+    monkeypatch.setattr(refinement, "_SIGMA_FLOOR", (3.0, 0.15))
+    assert (refine(truth, scene, town[1], matched).corner_sigma_m >= 3.0).all()
 
 
 def test_nothing_to_stand_on_is_no_refinement(town):

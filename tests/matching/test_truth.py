@@ -16,7 +16,7 @@ from roadgeo.matching.explanation import _TruePlace, tell_truth
 from roadgeo.matching.index import build_index
 from roadgeo.matching.verdict import Needed
 
-NEEDED = Needed(log10_odds=3.0, margin=2.0, intersections=3)
+NEEDED = Needed(log10_odds=3.0, margin=2.0)
 REFUSED = Location("q", "not_located", "")
 
 
