@@ -1,6 +1,5 @@
 """Arrays of kernels by type and number of dimensions, all C-contiguous, and the meaning of annotations to kernels."""
 
-from collections.abc import Iterator
 from dataclasses import dataclass
 from typing import Annotated, Any, TypeAlias, get_args, get_origin, get_type_hints
 
@@ -74,10 +73,9 @@ def kind_of(annotation: Any, written: bool = False) -> Kind:
     raise TypeError(f"{annotation} is no type of a kernel's argument")
 
 
-def leaves(*kinds: Kind) -> Iterator[Kind]:
-    """Yield the arrays and numbers that kinds consist of."""
+def leaves(*kinds: Kind) -> list[Kind]:
+    """Return the arrays and numbers that kinds consist of."""
+    found: list[Kind] = []
     for kind in kinds:
-        if isinstance(kind, TupleKind):
-            yield from leaves(*kind.members)
-        elif kind is not None:
-            yield kind
+        found += leaves(*kind.members) if isinstance(kind, TupleKind) else [kind] * (kind is not None)
+    return found

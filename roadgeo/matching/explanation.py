@@ -28,10 +28,9 @@ from roadgeo.matching.evidence import agreement, tolerance_m
 from roadgeo.matching.growing import Hypothesis
 from roadgeo.matching.methods import Found
 from roadgeo.matching.options import LocateOptions
-from roadgeo.matching.placing import center_of
 from roadgeo.matching.scene import MIN_COS, Query, Scene
 from roadgeo.matching.search import Search
-from roadgeo.matching.verdict import Needed
+from roadgeo.matching.verdict import Needed, center_of
 from roadgeo.roads.graph import RoadGraph
 
 __all__ = ["SCHEMA", "Explanation", "Funnel", "RejectedPlace", "Story", "TruthStory", "tell", "true_place"]

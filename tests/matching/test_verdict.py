@@ -9,8 +9,8 @@ from worlds.scenes import Sight, look, sight_of
 from roadgeo.location import Location, Seconds
 from roadgeo.matching.estimator import MatchOptions
 from roadgeo.matching.methods import Fit
-from roadgeo.matching.placing import place_frame
 from roadgeo.matching.scene import Query
+from roadgeo.matching.verdict import place_frame
 
 
 def placed(town, tilt: float, sigma_m: float, shaken_m: float = 0.0) -> tuple[Location, np.ndarray]:
