@@ -40,7 +40,7 @@ _TURNS_DEG = (0.0, 90.0, 180.0, 270.0)
 #: Most and fewest others by which a gap is judged; least spacing of them (log10).
 _TAIL, _LEAST_TAIL, _LEAST_SPACING = 20, 5, 0.3
 #: Most times that another place may turn out to be the better one.
-_MOST_TURNS = 4
+_MOST_TURNS = 12
 
 
 #: A place that leads all places nearby by so many powers of ten is not compared further, if the best of them explains
