@@ -164,30 +164,29 @@ def _search(
     indexes = _open(parts, options, frame_m)
     if len(indexes) > 1:  # every search reads all tables, but few roads: those that masks before this one led to go
         let_pages_go(array for index in indexes for array in index.road_buckets[:3])
-    events = [Events(explained) for _ in indexes]
     if len(query.scene.intersections) == 0:
-        return [Found(index, events=noted) for index, noted in zip(indexes, events, strict=True)]
+        return [Found(index, events=Events(explained)) for index in indexes]
     if options.method == "pair":
-        return _search_pairs_in_turn(query, indexes, _within(options, time_limit_s))
+        return _search_pairs_in_turn(query, indexes, options, time_limit_s)
     started, ledger = time.perf_counter(), Ledger()
     sweeps: SharedSweeps = SharedSweeps(query.scene, options.match.camera, _same_place, ahead)
-    shared = (ledger, sweeps)
-    opened = [_Attempt.open(query, one, options, noted, *shared) for one, noted in zip(indexes, events, strict=True)]
-    n_here = sum(one.n_searched for one in opened if one.search is not None)
+    begun = [_begin(query, one, options, Events(explained), ledger, sweeps) for one in indexes]
+    estimators = {Search(estimator): estimator for _, estimator in begun if estimator is not None}
+    n_here = sum(found.n_searched for found, estimator in begun if estimator is not None)
     ledger.n_reference = n_here + options.elsewhere
     ledger.beside = ledger.n_reference / max(n_here, 1)
     left = time_limit_s - (time.perf_counter() - started)
-    estimators = {one.search: one.estimator for one in opened if one.search is not None and one.estimator is not None}
 
     def same(one: Search[Hypothesis], a: Hypothesis, other: Search[Hypothesis], b: Hypothesis) -> bool:
         return _same_ground(estimators[one], a, estimators[other], b)
 
-    scale = larger(sum(one.n_searched for one in opened))
+    scale = larger(sum(found.n_searched for found, _ in begun))
     limits = replace(options.search, time_limit_s=left, work_limit_s=scale * options.search.work_limit_s)
     rivals = Rivals(estimators, ledger, options.min_log10_odds, left)
     search_together(list(estimators), limits, same, rivals)
     sweeps.end()
-    return [one.found(scale, rivals) for one in opened]
+    searches = iter(estimators)
+    return [found if one is None else _end(found, one, next(searches), rivals, scale) for found, one in begun]
 
 
 def _open(parts: Sequence[Part], options: LocateOptions, frame_m: float) -> list[ReferenceIndex]:
@@ -217,63 +216,45 @@ def _same_place(one: TripleEstimator, a: Hypothesis, other: TripleEstimator, b: 
     return bool(shard_of) and shard_of == other.index.meta.get("shard_of") and _same_ground(one, a, other, b)
 
 
-@dataclass(frozen=True)
-class _Attempt:
-    """A reference that is searched; or is not, for it has hardly an intersection near the place that was given."""
+def _begin(
+    query: Query,
+    index: ReferenceIndex,
+    options: LocateOptions,
+    events: Events,
+    ledger: Ledger,
+    sweeps: SharedSweeps,
+) -> tuple[Found, TripleEstimator | None]:
+    """Return a result without places, and what searches for them, unless none can be near the place that was given."""
+    part, near, within = index, _near(index, options.near), options.match.within
+    if within is not None and not Whole(index).touches(within):
+        return Found(index, events=events), None
+    if near is not None:
+        reach = _rounded_up(near[2] + 2.0 * query.scene.half_size * options.match.camera.gsd_m[1])
+        part = _part(index, near[:2], reach)
+        if len(part) == 0:
+            return Found(index, events=events), None
+    estimator = TripleEstimator(query.scene, part, _of_effort(options), near, events, ledger, sweeps)
+    return Found(index, n_searched=len(part), events=events), estimator
 
-    index: ReferenceIndex
-    n_searched: int
-    estimator: TripleEstimator | None = None
-    search: Search[Hypothesis] | None = None
-    events: Events = field(default_factory=Events)
 
-    @classmethod
-    def open(
-        cls,
-        query: Query,
-        index: ReferenceIndex,
-        options: LocateOptions,
-        events: Events,
-        ledger: Ledger,
-        sweeps: SharedSweeps,
-    ) -> _Attempt:
-        part, near, within = index, _near(index, options.near), options.match.within
-        if within is not None and not Whole(index).touches(within):
-            return cls(index, 0, events=events)
-        if near is not None:
-            reach = _rounded_up(near[2] + 2.0 * query.scene.half_size * options.match.camera.gsd_m[1])
-            part = _part(index, near[:2], reach)
-            if len(part) == 0:
-                return cls(index, len(part), events=events)
-        estimator = TripleEstimator(query.scene, part, _of_effort(options), near, events, ledger, sweeps)
-        return cls(index, len(part), estimator, Search(estimator), events)
-
-    def found(self, scale: float, rivals: Rivals) -> Found:
-        """Return the result; work is that on a map `scale` times smaller."""
-        estimator = self.estimator
-        if self.search is None or estimator is None:
-            return Found(self.index, n_searched=self.n_searched, events=self.events)
-        result, standing = self.search, rivals.standing(self.search)
-        if self.events.kept:
-            self.events.result = result
-        return Found(
-            self.index,
-            () if standing is None else _fits(estimator, standing),
-            result.stopped,
-            n_searched=self.n_searched,
-            n_tried=estimator.n_screened,
-            n_anchors=estimator.n_anchors,
-            stats=Stats(
-                estimator.n_tuples,
-                estimator.n_candidates,
-                estimator.n_hypotheses,
-                estimator.n_verified,
-                round(1000 * estimator.work / scale),
-            ),
-            match_s=self.search.seconds - estimator.refine_s,
-            refine_s=estimator.refine_s,
-            events=self.events,
-        )
+def _end(found: Found, estimator: TripleEstimator, search: Search[Hypothesis], rivals: Rivals, scale: float) -> Found:
+    """Return the result with its places; work is that on a map `scale` times smaller."""
+    standing = rivals.standing(search)
+    if found.events.kept:
+        found.events.result = search
+    fits = () if standing is None else _fits(estimator, standing)
+    work_ms = round(1000 * estimator.work / scale)
+    counts = estimator.n_tuples, estimator.n_candidates, estimator.n_hypotheses, estimator.n_verified
+    return replace(
+        found,
+        fits=fits,
+        stopped=search.stopped,
+        n_tried=estimator.n_screened,
+        n_anchors=estimator.n_anchors,
+        stats=Stats(*counts, work_ms),
+        match_s=search.seconds - estimator.refine_s,
+        refine_s=estimator.refine_s,
+    )
 
 
 def _fits(estimator: TripleEstimator, standing: Standing) -> tuple[Fit, ...]:
@@ -342,23 +323,16 @@ def _part(index: ReferenceIndex, center: tuple[float, float], radius_m: float) -
 # --- the paper's method -----------------------------------------------------------------------------------------------
 
 
-def _within(options: LocateOptions, time_limit_s: float) -> PairOptions:
-    """Return the options of the paper's method, within the limits of the whole search."""
-    pair = options.pair
-    return replace(
-        pair,
-        work_limit_s=min(pair.work_limit_s, options.search.work_limit_s),
-        time_limit_s=min(pair.time_limit_s, time_limit_s),
-    )
-
-
-def _search_pairs_in_turn(query: Query, indexes: Sequence[ReferenceIndex], options: PairOptions) -> list[Found]:
+def _search_pairs_in_turn(
+    query: Query, indexes: Sequence[ReferenceIndex], options: LocateOptions, time_s: float
+) -> list[Found]:
     """Search one reference after another; each gets an even share of the work and the time that are left."""
     found: list[Found] = []
-    work_s, time_s = options.work_limit_s, options.time_limit_s
+    pair = options.pair
+    work_s, time_s = min(pair.work_limit_s, options.search.work_limit_s), min(pair.time_limit_s, time_s)
     for n_left in range(len(indexes), 0, -1):
-        share = replace(options, work_limit_s=work_s / n_left, time_limit_s=time_s / n_left)
-        one = _search_pairs(query, indexes[-n_left], options, share)
+        share = replace(pair, work_limit_s=work_s / n_left, time_limit_s=time_s / n_left)
+        one = _search_pairs(query, indexes[-n_left], pair, share)
         work_s, time_s = max(work_s - one.stats.work_ms / 1000, 0.0), max(time_s - one.match_s, 0.0)
         found.append(one)
     return found
