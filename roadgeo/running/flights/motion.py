@@ -26,7 +26,7 @@ from roadgeo.kernels.roads import bin_segments
 from roadgeo.kernels.structs import RoadBuckets
 from roadgeo.matching.scene import Scene, trace_query
 from roadgeo.roads.graph import RoadGraph
-from roadgeo.running.flights.pose import FilterOptions, Pose, correct
+from roadgeo.running.flights.pose import FilterOptions, correct, start
 
 __all__ = ["Odometer", "TracedMask", "between_images", "between_masks", "overlay", "read_motion", "write_motion"]
 
@@ -299,7 +299,7 @@ def _refine(guess: FloatArray, frame: Frame, scene: Scene, roads: RoadBuckets) -
     corners = Homography(guess).facing(frame.center)(frame.corners)
     if not np.isfinite(corners).all():
         return None
-    pose = Pose(corners * (1.0, -1.0), _rough_covariance(frame), frame)
+    pose = start(corners * (1.0, -1.0), frame, _rough_covariance(frame))
     placed = correct(pose, scene, roads, _FILTER)
     if placed is None:
         return None

@@ -1,13 +1,15 @@
 """Where a frame lies, as the places of its corners with their covariance: predicted by motion, corrected by roads.
 
 An extended Kalman filter. Its state is a frame's four corners on the reference plane in metres, eight numbers
-equivalent to a homography; measurements are the distances of the frame's road points from roads of the map.
+equivalent to a homography, and the focal length, which all frames share. Measurements are the distances of the frame's
+road points from roads of the map, and that a pinhole with square pixels sees the plane so: motions that are free
+homographies bend the frames, and within a dozen of them they drift four times as far.
 """
 
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 
@@ -15,11 +17,17 @@ from roadgeo._arrays import FloatArray
 from roadgeo.geometry.frame import Frame
 from roadgeo.geometry.homography import Homography
 from roadgeo.geometry.mask import PIXEL_TO_PLANE
+from roadgeo.geometry.pose import PoseOptions
 from roadgeo.kernels.roads import road_residuals
 from roadgeo.kernels.structs import RoadBuckets
 from roadgeo.matching.scene import Scene
 
 __all__ = ["FilterOptions", "Pose", "correct", "predict", "start"]
+
+#: Focal length of usual lenses, in halves of the frame's diagonal, and the standard deviation of its log.
+_LENS = PoseOptions()
+#: Standard deviation of a real camera's skews above real ground, and of the log of its focal length between frames.
+_SKEW, _REFOCUSING = 0.005, 0.002
 
 
 @dataclass(frozen=True)
@@ -60,14 +68,17 @@ class Pose:
     ----------
     corners : (4, 2) float64
         TL, TR, BR, BL on the reference plane, metres.
-    covariance : (8, 8) float64
-        Of the corners x0 y0 x1 y1 ..., square metres.
+    covariance : (9, 9) float64
+        Of the corners x0 y0 x1 y1 ..., metres, and of `log_focal`.
     frame : Frame
+    log_focal : float
+        Log of the focal length in halves of the frame's diagonal.
     """
 
     corners: FloatArray
     covariance: FloatArray
     frame: Frame
+    log_focal: float
 
     @property
     def homography(self) -> Homography:
@@ -89,12 +100,12 @@ class Pose:
     def sigma_m(self) -> float:
         """Standard deviation of the middle's place: root mean square of its distance from the truth."""
         row = _rows(_Local.of(self), self.corners, np.zeros((1, 2)))
-        return math.sqrt(float(np.trace(row @ self.covariance @ row.T)))
+        return math.sqrt(float(np.trace(row @ self.covariance[:8, :8] @ row.T)))
 
     @property
     def corner_sigma_m(self) -> FloatArray:
         """(4,) the same of the corners."""
-        return np.asarray(np.sqrt(self.covariance.diagonal().reshape(4, 2).sum(axis=1)))
+        return np.asarray(np.sqrt(self.covariance.diagonal()[:8].reshape(4, 2).sum(axis=1)))
 
 
 @dataclass(frozen=True)
@@ -150,13 +161,13 @@ def _rows(local: _Local, corners: FloatArray, uv: FloatArray) -> FloatArray:
     return np.asarray(local.derivative(p, uv) @ np.linalg.inv(local.derivative(p, local.corners)))
 
 
-def start(corners: FloatArray, frame: Frame, sigma_m: float) -> Pose:
-    """Return the pose of a frame whose corners (4, 2) are known, each to `sigma_m` metres."""
-    return Pose(corners, np.eye(8) * sigma_m**2 / 2.0, frame)
+def start(corners: FloatArray, frame: Frame, covariance: FloatArray) -> Pose:
+    """Return the pose of a frame whose corners (4, 2) are known, with their covariance (8, 8), and of a usual lens."""
+    return Pose(corners, _beside_focal(covariance, _LENS.usual_sigma**2), frame, math.log(_LENS.usual_focal))
 
 
 def predict(pose: Pose, motion: FloatArray, sigma_px: float) -> Pose | None:
-    """Return where the next frame lies by its motion alone; None where that cannot be.
+    """Return where the next frame lies by its motion, as a camera sees it; None where that cannot be.
 
     Parameters
     ----------
@@ -173,10 +184,46 @@ def predict(pose: Pose, motion: FloatArray, sigma_px: float) -> Pose | None:
     p = local.parameters(pose.corners)
     if (np.c_[uv, np.ones(4)] @ np.append(p[6:], 1.0) < 0.05).any():
         return None
-    rows = _rows(local, pose.corners, uv)
-    noise = (pose.gsd_m * sigma_px) ** 2 / 2.0
-    covariance = rows @ pose.covariance @ rows.T + np.eye(8) * noise
-    return Pose(local.places(p, uv), covariance, pose.frame)
+    move = _beside_focal(_rows(local, pose.corners, uv))
+    noise = np.diag([(pose.gsd_m * sigma_px) ** 2 / 2.0] * 8 + [_REFOCUSING**2])
+    moved = replace(pose, corners=local.places(p, uv), covariance=move @ pose.covariance @ move.T + noise)
+    return _as_cameras_see(moved)
+
+
+def _beside_focal(matrix: FloatArray, focal: float = 1.0) -> FloatArray:
+    """Return a matrix (8, 8) of the corners with a number of the focal length beside it, (9, 9)."""
+    return np.block([[matrix, np.zeros((8, 1))], [np.zeros((1, 8)), focal]])
+
+
+def _as_cameras_see(pose: Pose) -> Pose:
+    """Correct a pose by a measurement: both skews of a pinhole, of a focal length that is unknown too, are 0."""
+    local = _Local.of(pose)
+    corners, p = local.corners, local.parameters(pose.corners)
+    to_state = _beside_focal(np.asarray(np.linalg.inv(local.derivative(p, corners)), float))
+    spread = to_state @ pose.covariance @ to_state.T
+    given = state = np.append(p, pose.log_focal)
+    for _ in range(3):
+        off, rows = _skews(state)
+        gain = np.linalg.solve(rows @ spread @ rows.T + _SKEW**2 * np.eye(2), rows @ spread).T
+        state = given - gain @ (off + rows @ (given - state))
+    if not np.isfinite(state).all() or (np.c_[corners, np.ones(4)] @ np.append(state[6:8], 1.0) < 0.05).any():
+        return pose
+    back = _beside_focal(local.derivative(state[:8], corners))
+    covariance = back @ (spread - gain @ rows @ spread) @ back.T
+    return Pose(local.places(state[:8], corners), (covariance + covariance.T) / 2.0, pose.frame, float(state[8]))
+
+
+def _skews(state: FloatArray) -> tuple[FloatArray, FloatArray]:
+    """Return both skews (2,) of a state, parameters of `_Local` and log of the focal length, and derivatives (2, 9).
+
+    Two unit vectors on the plane are perpendicular and equally long; how far a camera sees them from that.
+    """
+    near = state + 1e-6 * np.vstack((np.zeros(9), np.eye(9), -np.eye(9)))
+    seen = np.linalg.inv(np.insert(near[:, :8], 8, 1.0, axis=1).reshape(-1, 3, 3))[:, :, :2]
+    seen[:, :2] /= np.exp(near[:, 8])[:, None, None]
+    (aa, ab), (_, bb) = np.moveaxis(np.swapaxes(seen, 1, 2) @ seen, 0, -1)
+    skews = np.stack((ab / np.sqrt(aa * bb), 0.5 * np.log(aa / bb)))
+    return skews[:, 0], (skews[:, 1:10] - skews[:, 10:]) / 2e-6
 
 
 def correct(pose: Pose, scene: Scene, roads: RoadBuckets, options: FilterOptions) -> Pose | None:
@@ -184,7 +231,8 @@ def correct(pose: Pose, scene: Scene, roads: RoadBuckets, options: FilterOptions
     local, gsd = _Local.of(pose), pose.gsd_m
     p = local.parameters(pose.corners)
     corners = local.corners
-    weight = np.linalg.inv(pose.covariance)
+    before = pose.covariance[:8, :8]
+    weight = np.linalg.inv(before)
     sigma = math.hypot(options.sigma_m, options.sigma_px * gsd)
     spacing = scene.road_length_px * gsd / max(len(scene.points), 1)
     share = min(1.0, spacing / options.correlation_m)  # points closer than that are no independent observations
@@ -207,7 +255,12 @@ def correct(pose: Pose, scene: Scene, roads: RoadBuckets, options: FilterOptions
     jacobian = local.derivative(p, corners)
     information = scale * normal + jacobian.T @ weight @ jacobian
     covariance = jacobian @ np.linalg.inv(information) @ jacobian.T
-    return Pose(local.places(p, corners), (covariance + covariance.T) / 2.0, pose.frame)
+    # The focal length follows the corners as far as it depended on them.
+    placed, follows = local.places(p, corners), pose.covariance[8, :8] @ weight
+    both = np.vstack((np.eye(8), follows))
+    joint = both @ covariance @ both.T + np.diag([0.0] * 8 + [pose.covariance[8, 8] - follows @ before @ follows])
+    log_focal = pose.log_focal + float(follows @ (placed - pose.corners).ravel())
+    return Pose(placed, (joint + joint.T) / 2.0, pose.frame, log_focal)
 
 
 def _road_equations(

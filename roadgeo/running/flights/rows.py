@@ -133,7 +133,7 @@ def _row(one: Tracked, begun: datetime | None, focal_px: float | None) -> Row:
 def _camera(pose: Pose, plane: LocalPlane, focal_px: float) -> CameraPlace | None:
     """Find the camera of a focal length behind a frame; None where there is none above the ground."""
     size = round(pose.frame.width), round(pose.frame.height)
-    found = find_pose(pose.homography.matrix, size, pose.covariance, PoseOptions(focal_px=focal_px))
+    found = find_pose(pose.homography.matrix, size, pose.covariance[:8, :8], PoseOptions(focal_px=focal_px))
     if found is None:
         return None
     lon, lat = to_lonlat(plane.crs, plane.to_crs(found.position[None, :2]))[0]

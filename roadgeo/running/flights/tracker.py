@@ -17,7 +17,7 @@ import numpy as np
 
 from roadgeo._arrays import FloatArray
 from roadgeo.errors import MaskError
-from roadgeo.geometry.camera import CameraFault, CameraOptions, judge
+from roadgeo.geometry.camera import CameraOptions
 from roadgeo.geometry.frame import Frame
 from roadgeo.geometry.homography import Homography
 from roadgeo.geometry.mask import PIXEL_TO_PLANE, RoadMask
@@ -57,9 +57,6 @@ class TrackOptions:
         Standard deviation of a located mosaic.
     least_odds : float
         Log10 odds against places nearby by which a tracked frame agrees with the map.
-    max_skew : float
-        Nor does one agree that no camera sees so, by this skew (see `CameraOptions`): along a single road, where motion
-        is known roughly, the fit bends frames at will. Frames in place had at most 0.03, one that drifted off 0.2.
     patience : int
         Number of frames in a row without agreement after which the flight is lost.
     lost_frames : float
@@ -76,7 +73,6 @@ class TrackOptions:
     more_frames: int = 3
     start_sigma_m: float = 4.0
     least_odds: float = 0.5
-    max_skew: float = 0.15
     patience: int = 3
     lost_frames: float = 0.3
 
@@ -220,10 +216,7 @@ class Tracker:
             else correct(predicted, scene, reference.index.road_buckets, self.options.filter)
         )
         odds, why = math.nan, "it shows hardly a road of the map; placed by its motion"
-        fault = None if corrected is None else self._fault(corrected)
-        if fault is not None:
-            why = f"on its roads: {fault.value}; placed by its motion"
-        elif corrected is not None and scene is not None and reference is not None:
+        if corrected is not None and scene is not None and reference is not None:
             odds = _odds(corrected, scene, reference)
             if odds >= self.options.least_odds:
                 self._pose = corrected
@@ -235,12 +228,6 @@ class Tracker:
             return Tracked(frame, "lost", "no road has agreed for too long", known_at)
         self._pose = predicted
         return Tracked(frame, "predicted", why, known_at, predicted, reference, odds)
-
-    def _fault(self, pose: Pose) -> CameraFault | None:
-        """Return why no camera sees a frame as its roads would have it: along a single road they bend it at will."""
-        frame = pose.frame
-        matrix, size = pose.homography.matrix @ PIXEL_TO_PLANE, (round(frame.width), round(frame.height))
-        return judge(matrix, size, replace(self.options.locate.match.camera, max_skew=self.options.max_skew))
 
     def _lose(self, waiting: _Waiting, reason: str) -> list[Tracked]:
         """Declare the flight lost: frames that did not agree wait for a place again."""
@@ -328,7 +315,7 @@ class Tracker:
             frame = waiting.frame.frame
             corners = plane.from_crs(location.pixel_to_map(Homography(matrix)(frame.corners)))
             if np.isfinite(corners).all():
-                here = start(corners, frame, self.options.start_sigma_m)
+                here = start(corners, frame, np.eye(8) * self.options.start_sigma_m**2 / 2.0)
                 placed.append(self._judge(waiting, here, last.number, "located"))
         agreed = sum(one.status == "located" for one in placed)
         if len(placed) < len(self._window) or agreed < 0.5 * len(placed):
