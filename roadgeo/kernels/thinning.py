@@ -99,9 +99,9 @@ def rethin(
 
     Parameters
     ----------
-    states : (H, W) uint8, C-contiguous
+    states : (H, W) uint8
         GROUND, ROAD or SOLID; its outermost rows and columns are not ROAD. Changed in place.
-    distance : (H, W) float32, C-contiguous
+    distance : (H, W) float32
         Distance to the nearest GROUND pixel, before thinning.
     pixels : (P,) int32
         Flat indices that hold all ROAD pixels, in the order in which to try them; others are left out.
@@ -109,10 +109,6 @@ def rethin(
         A free end of a line is kept where the road is at least this deep: bumps on its edge leave no hairs.
     keep_pairs : bool
         In the first round, keep free ends of lines two pixels wide, too: else those would be eaten from end to end.
-
-    Returns
-    -------
-    (Q,) int32
     """
     flat = states.ravel()
     depth = distance.ravel()

@@ -95,23 +95,17 @@ def trace(states: Bytes2, pixels: Int32s1, node_of: Int32s1) -> tuple[Floats2, B
 
     Parameters
     ----------
-    states : (H, W) uint8, C-contiguous
-        As left by `thin`.
-    pixels : (P,) int32
-        Flat indices of its ROAD pixels.
+    states, pixels : (H, W) uint8, (P,) int32
+        As left by `thin`: its ROAD pixels.
     node_of : (H * W,) int32
         Room to work in; need not be set.
 
     Returns
     -------
-    xy : (N, 2) float64
-        Mean (column, row) of each node's pixels.
-    is_open : (N,) bool
-    edges : (E, 2) int32
-        Nodes at the two ends of each chain.
-    chain : (C,) int32
-        Flat indices of the pixels strictly between the nodes, chain after chain.
-    offsets : (E + 1,) int64
+    xy, is_open : (N, 2) float64, (N,) bool
+        Mean (column, row) of each node's pixels, and which nodes are open ends.
+    edges, chain, offsets : (E, 2) int32, (C,) int32, (E + 1,) int64
+        Nodes at the two ends of each chain; flat indices of the pixels strictly between them, chain after chain.
     """
     flat = states.ravel()
     width = states.shape[1]
@@ -183,22 +177,19 @@ def smooth_chains(
 
     Parameters
     ----------
-    distance : (H, W) float32, C-contiguous
-    chain : (C,) int32
-        Flat indices of pixels, none in the outermost rows and columns.
-    chain_offsets : (E + 1,) int64
-        Chain e owns `chain[chain_offsets[e]:chain_offsets[e + 1]]`, possibly nothing.
+    distance : (H, W) float32
+    chain, chain_offsets : (C,) int32, (E + 1,) int64
+        Flat indices of pixels, none in the outermost rows and columns: those of chain e, possibly none, are
+        `chain[chain_offsets[e]:chain_offsets[e + 1]]`.
     ends : (E, 4) float64
         Column, row of the nodes at the two ends.
     trims : (E, 2) int64
         How many pixels to leave out at either end: near a junction a skeleton is bent. One pixel is always kept.
-    passes, spacing : int
 
     Returns
     -------
-    coords : (V, 2) float64
+    coords, offsets : (V, 2) float64, (E + 1,) int64
         Column, row (pixel centres at whole numbers), from node to node; at least two vertices per chain.
-    offsets : (E + 1,) int64
     """
     depth = distance.ravel()
     width = distance.shape[1]

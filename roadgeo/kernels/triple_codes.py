@@ -50,16 +50,9 @@ def vertex_angle(e1x: float, e1y: float, e2x: float, e2y: float, tangent: float)
 
 @kernel(writes=("sides",))
 def find_sides(tangents: Singles2, branches: Int8s3, sides: Int8s2) -> None:
-    """Find on which sides branches run along each tangent.
+    """Find on which sides branches (N, R, 2), as in `rays_agree`, run along each tangent (N, T), in radians.
 
-    Parameters
-    ----------
-    tangents : (N, T) float32
-        Directions in radians, NaN behind the last.
-    branches : (N, R, 2) int8
-        As in `rays_agree`.
-    sides : (N, T) int8
-        Filled with FORWARDS, BACKWARDS or BOTH; BOTH too where no branch is found.
+    `sides` (N, T) is filled with FORWARDS, BACKWARDS or BOTH; BOTH too where no branch is found.
     """
     for i in range(tangents.shape[0]):
         for t in range(tangents.shape[1]):

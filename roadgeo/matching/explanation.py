@@ -24,7 +24,7 @@ from roadgeo.kernels.roads import road_residuals
 from roadgeo.location import Location, Place
 from roadgeo.matching.estimator import TripleEstimator
 from roadgeo.matching.events import Events, Scored
-from roadgeo.matching.evidence import agreement, tolerance_m
+from roadgeo.matching.evidence import Evidence, agreement, tolerance_m
 from roadgeo.matching.growing import Hypothesis
 from roadgeo.matching.methods import Found
 from roadgeo.matching.options import LocateOptions
@@ -37,12 +37,12 @@ __all__ = ["SCHEMA", "Explanation", "Funnel", "RejectedPlace", "Story", "TruthSt
 
 SCHEMA = "roadgeo.explanation/1"
 
-#: Places that are shown.
+#: Places that are shown, and those that a camera refused which are looked at again.
 _MAX_PLACES = 6
 #: Masks with fewer intersections are seldom located.
 _USUAL_INTERSECTIONS = 6
-#: Places that a camera refused which are looked at again, and how many of those are kept.
-_MAX_RETRIED, _MAX_REFUSED, _MAX_ELSEWHERE = 6, 200, 20
+#: Places that a camera refused which are compared, and proposals of an anchor which hints bar that are grown.
+_MAX_REFUSED, _MAX_ELSEWHERE = 200, 20
 #: Limits that a user may have set too narrow; other faults hold for every camera.
 _NEGOTIABLE = (CameraFault.SAMPLING, CameraFault.SKEW, CameraFault.TILT, CameraFault.HEADING)
 #: How far the middle of a rough proposal may lie from the truth, in halves of the frame's diagonal, and at least.
@@ -99,6 +99,8 @@ class RejectedPlace:
         Corners TL, TR, BR, BL, plane metres and longitude, latitude.
     agrees : (S,) bool
         Which of the scene's road points lie on roads of the map that run their way.
+    nearby : float
+        What the best place nearby explains (log10); 0 where nothing could be compared.
     """
 
     scored: Scored
@@ -107,6 +109,7 @@ class RejectedPlace:
     footprint: FloatArray
     footprint_lonlat: FloatArray
     agrees: BoolArray
+    nearby: float
     why: str = ""
 
     def to_dict(self) -> dict[str, Any]:
@@ -130,7 +133,7 @@ class RejectedPlace:
                 "roads_of_map": found.backward,
             },
             "log10_likelihood": _finite(model.log10_likelihood),
-            "nearby": model.nearby,
+            "nearby": self.nearby,
         }
 
 
@@ -223,12 +226,9 @@ class Explanation:
         return {
             "schema": SCHEMA,
             "version": __version__,
-            "query": location.query,
-            "status": location.status,
-            "reason": location.reason,
+            **{name: getattr(location, name) for name in ("query", "status", "reason", "options")},
             "reason_code": location.reason_code.value,
             "reference_digest": location.reference_digest or None,
-            "options": location.options,
             "command": location.command or None,
             "seen": {
                 "size": list(scene.size),
@@ -287,7 +287,7 @@ class _Course:
         """Grow some proposals that point elsewhere than a camera may, to report that they would fit."""
         for proposals, allowed, _ in self.events.of("screened"):
             barred = proposals.only(np.flatnonzero(~allowed)[:_MAX_ELSEWHERE])
-            for hypothesis in self.search.grow(barred, np.arange(len(barred.reference)))[:_MAX_RETRIED]:
+            for hypothesis in self.search.grow(barred, np.arange(len(barred.reference)))[:_MAX_PLACES]:
                 fault = self.search.judge(hypothesis.matrix, rough=True)
                 if fault is not None:
                     self.events.note("refused", fault, hypothesis.matrix)
@@ -303,7 +303,7 @@ class _Course:
             found, matched, _ = agreement(matrix, scene, index, sampling(matrix, scene.size))
             compared.append((found.rate + found.forward, fault, Hypothesis(matrix, 0.0, matched)))
         compared.sort(key=lambda entry: -entry[0])
-        return [Scored(model, free.score(model), fault) for _, fault, model in compared[:_MAX_RETRIED]]
+        return [Scored(model, free.score(model), fault) for _, fault, model in compared[:_MAX_PLACES]]
 
     def _rank(self, entry: Scored) -> tuple[bool, float]:
         """Sort by odds; places that the camera refused come last, unless that alone kept them from being the answer."""
@@ -348,7 +348,12 @@ class _Course:
         ground = Homography(matrix).everywhere(scene.corners)
         lonlat = to_lonlat(index.plane.crs, index.plane.to_crs(ground))
         center = center_of(matrix, scene, index.plane, entry.log10_odds)
-        place = RejectedPlace(entry, camera, center, ground, lonlat, np.isfinite(away[:, 0]))
+        nearby = entry.model.nearby
+        if (
+            nearby == 0.0 and entry.model.found is not None
+        ):  # where another place explains more, the search looks at none
+            nearby = Evidence(scene, index, entry.model.gsd_m).nearby(matrix, self.search.near)
+        place = RejectedPlace(entry, camera, center, ground, lonlat, np.isfinite(away[:, 0]), nearby)
         return replace(place, why=self._why(place))
 
     def _why(self, place: RejectedPlace) -> str:
@@ -398,7 +403,7 @@ class _Course:
         if n < _USUAL_INTERSECTIONS:
             few = f"masks with fewer than {_USUAL_INTERSECTIONS} are seldom located"
             told.append(f"intersections: {n} are seen; {few}")
-        if best is not None and best.scored.model.nearby > 0.5 * best.scored.model.log10_likelihood > 0.0:
+        if best is not None and best.nearby > 0.5 * best.scored.model.log10_likelihood > 0.0:
             told.append("variety: streets here are so alike that a shifted copy explains half as much and more")
         if self.search.near is not None and not self.places:
             told.append("perhaps the circle given is wrong: nothing outside it was tried")
@@ -431,7 +436,7 @@ def _weakest(place: RejectedPlace) -> str:
     model = place.scored.model
     if model.found is None:
         return "nothing could be compared"
-    return f"its roads explain 10^{_number(model.log10_likelihood)}, those of a place nearby 10^{_number(model.nearby)}"
+    return f"its roads explain 10^{_number(model.log10_likelihood)}, those of a place nearby 10^{_number(place.nearby)}"
 
 
 # --- the true place ---------------------------------------------------------------------------------------------------

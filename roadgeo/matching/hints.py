@@ -22,8 +22,6 @@ __all__ = ["HINTS", "Hint", "apply_hints", "read_box", "read_hint", "read_number
 _GSD_FACTOR = 1.25
 #: Tolerance of a heading without one, degrees.
 _HEADING_OFF_DEG = 10.0
-#: Values of a switch in a URL or a form.
-_YES, _NO = ("", "1", "true", "yes"), ("0", "false", "no")
 
 
 @dataclass(frozen=True)
@@ -168,8 +166,9 @@ def _read_focal(value: Any) -> float | Literal["exif"]:
 
 def _read_switch(value: Any) -> bool:
     word = str(value).lower() if isinstance(value, bool | str) else "neither"
-    _expect(word in (*_YES, *_NO), value, "true or false")
-    return word in _YES
+    yes, no = ("", "1", "true", "yes"), ("0", "false", "no")  # in a URL or a form
+    _expect(word in (*yes, *no), value, "true or false")
+    return word in yes
 
 
 def _read_effort(value: Any) -> Literal["quick", "full"]:
@@ -184,19 +183,16 @@ def _numbers(low: int, high: int) -> dict[str, Any]:
     return {"type": "array", "items": {"type": "number"}, "minItems": low, "maxItems": high}
 
 
-_WHERE = "Where to look"
-_SEARCH = "The search"
-
 _TABLE = (
     Hint(
         "near", "near", "LON,LAT,RADIUS", "Near",
         "The middle lies within RADIUS metres of there.",
-        read_place, _numbers(3, 3), group=_WHERE,
+        read_place, _numbers(3, 3), group="Where to look",
     ),
     Hint(
         "within", "within", "AREA", "In the country or state",
         "The middle lies in a country or state. Or within W,S,E,N in degrees.",
-        _read_area, _numbers(4, 4), group=_WHERE,
+        _read_area, _numbers(4, 4), group="Where to look",
     ),
     Hint(
         "gsd", "gsd_m", "SIZE|LO:HI", "Pixel size, metres",
@@ -230,13 +226,13 @@ _TABLE = (
         "effort", "effort", "quick|full", "Effort",
         "How hard to try, full by default. quick: stop early, for clean masks. full: also search by roads alone, for"
         " broken masks and photographs.",
-        _read_effort, {"enum": ["quick", "full"]}, "full", _SEARCH,
+        _read_effort, {"enum": ["quick", "full"]}, "full", "The search",
     ),
     Hint(
         "time_limit", "time_limit_s", "SECONDS", "Time limit, seconds",
         "Stop searching for an image then. The paper's matcher stops after 10 by itself.",
         lambda value: _read_number(value, 1e-3, 1e6, "seconds above 0"),
-        {"type": "number", "exclusiveMinimum": 0}, 60, _SEARCH,
+        {"type": "number", "exclusiveMinimum": 0}, 60, "The search",
     ),
 )  # fmt: skip
 
