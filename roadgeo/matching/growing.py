@@ -105,7 +105,7 @@ class Hypothesis:
 #: Away from the middle of a tilted frame the ground sampling may differ from that at the middle by this factor.
 MAX_SCALE_RATIO = 2.0
 #: Bounds of one anchor's work: proposals screened, grown, and grown ones scored.
-MAX_SCREENED, MAX_GROWN, MAX_VERIFIED = 600, 90, 2
+MAX_SCREENED, MAX_GROWN, MAX_VERIFIED = 600, 150, 3
 #: Of this number of road points near the anchor, this share must lie within these radii of roads: lengths have a
 #: part in metres, the map's, and one in pixels, the mask's.
 _SCREEN_POINTS, _SCREEN_SHARE, _SCREEN_RADIUS = 40, 0.6, (8.0, 4.0)
