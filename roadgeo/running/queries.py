@@ -273,7 +273,10 @@ def _locate_photograph(
 
 
 def _plan_looks(frame: _Frame, query: QueryOptions) -> Later[Look]:
-    """Return the best scale's look, the photograph in more ways, other scales, and a lower threshold at the best."""
+    """Return the best scale's look, the photograph in more ways, other scales, and a lower threshold at the best.
+
+    Where one scale is known, what was shown at two scales together is looked at alone, too.
+    """
 
     def look(i: int, ways: int | None = None, further: int = 0) -> Look:
         return _look_at(partial(frame.see, frame.scales[i], ways), frame.scales[i], query, further)
@@ -282,11 +285,16 @@ def _plan_looks(frame: _Frame, query: QueryOptions) -> Later[Look]:
         one = look(0, frame.most_ways)
         return replace(one, what=f"{one.what}, shown {frame.most_ways} ways")
 
+    def look_alone(scale: float) -> Look:
+        one = _look_at(partial(frame.see, scale, 1), scale, query)
+        return replace(one, what=f"{one.what}, shown alone")
+
     makers: list[Callable[[], Look]] = [partial(look, 0, frame.first_ways)]
     makers += [look_more_ways] if frame.most_ways else []
     makers += [partial(look, i) for i in range(1, len(frame.scales))]
     if query.threshold is None:
         makers += [partial(look, 0, frame.most_ways, 1)]
+    makers += [partial(look_alone, scale) for scale in frame.alone]
     return Later(makers)
 
 
@@ -306,6 +314,8 @@ class _Frame:
         In how many ways a model is shown the photograph at the best scale, first and at most (see `see`): first in 1
         where that was seen already, but not the next finer scale, and where there is much to show; `most_ways` is
         None where there are no more.
+    alone : tuple of float
+        Where one scale is known: those that the first look shows together.
     see : callable
         `see(scale, ways)` returns the probability of road, on the grid that roads are traced on; kept for another call.
         Where `ways` is None the number in each model's card applies.
@@ -316,6 +326,7 @@ class _Frame:
     scales: Sequence[float]
     first_ways: int | None
     most_ways: int | None
+    alone: tuple[float, ...]
     see: Callable[[float, int | None], ProbabilityMap]
 
 
@@ -363,7 +374,9 @@ def _open_frame(paths: Sequence[str], query: QueryOptions, camera: CameraOptions
     in_one = bool(ways_by_card) and not only_masks and (in_one or math.prod(own) * (k * scales[0]) ** 2 > _MANY_PIXELS)
     least = min(ways_by_card.values(), default=_WAYS)
     has_more = not only_masks and (in_one or least < _WAYS)
-    return _Frame(own, k / finer, scales, 1 if in_one else None, _WAYS if has_more else None, see)
+    together = len(scales) == 1 and bool(ways_by_card) and not (only_masks or has_more) and may_be_finer(scales[0])
+    alone = (scales[0], _FINER * scales[0]) if together else ()
+    return _Frame(own, k / finer, scales, 1 if in_one else None, _WAYS if has_more else None, alone, see)
 
 
 def _how_much_finer(own: tuple[int, int], scale: float) -> float:
