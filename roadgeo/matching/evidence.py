@@ -27,7 +27,7 @@ import numpy as np
 from roadgeo._arrays import FloatArray, IntArray
 from roadgeo.geometry.homography import Homography
 from roadgeo.kernels.point_matching import match_all
-from roadgeo.kernels.roads import count_residuals, shares_near_roads
+from roadgeo.kernels.roads import count_residuals, road_residuals, shares_near_roads
 from roadgeo.matching.index import ReferenceIndex
 from roadgeo.matching.scene import MIN_COS, Scene
 
@@ -151,6 +151,21 @@ class Evidence:
             return self._log10(there.sum(axis=0), mapped.sum(axis=0)), log10_lead((seen - there) @ ratios)
 
         return compare
+
+    def shared(self, matrix: FloatArray, other: FloatArray) -> float:
+        """Return of which share of the query's roads on roads at another place the same road is met at this one.
+
+        A version of the place slides along some roads, and loses others; a block beside meets most roads elsewhere.
+        """
+        scene, reach_m = self.scene, tolerance_m(self.gsd_m)
+        met = np.empty((len(scene.points), 3))
+        radii = np.full(len(scene.points), reach_m)
+        road_residuals(other, scene.points, scene.directions, radii, MIN_COS, self.index.road_buckets, met)
+        on_road = np.isfinite(met[:, 0])
+        moved = (Homography(matrix).everywhere(scene.points) - Homography(other).everywhere(scene.points))[on_road]
+        across = np.abs((moved * met[on_road, 1:]).sum(axis=1))
+        alike = (across < 2.0 * reach_m) & (np.hypot(*moved.T) < _PIECE_M)
+        return float(alike.mean()) if on_road.any() else 0.0
 
     def contradicted(self, matrix: FloatArray) -> float:
         """Return which share of the roads lies in regions of the frame where the place explains less than chance.

@@ -58,8 +58,9 @@ _DOUBT = 60.0
 _N_KNOWN, _N_POINTS = 12, 200
 #: Number of the likeliest of those around that are laid finely.
 N_LAID = 8
-#: Middles of two places lie further from each other than this share of half the frame's diagonal.
-_APART = 0.04
+#: Middles of two places lie further from each other than this share of half the frame's diagonal, and fewer than this
+#: share of the roads that are met at one are met at the other (see `Evidence.shared`), unless that explains more.
+_APART, _SAME = 0.04, 0.67
 #: Streets around a place, and the blocks beside it.
 _AROUND = LocalSearchOptions(reach_m=4000.0, turn_deg=0.0, cell_m=10.0, road_m=20.0, max_points=200, n_places=40)
 _NEARBY = replace(_AROUND, reach_m=500.0, n_places=8)
@@ -159,6 +160,7 @@ class Rivals:
                 for other in others
                 if np.hypot(*(Homography(other.matrix).everywhere(scene.center) - middle)) > apart_m
                 and estimator.may_be(other.matrix)
+                and (other.worth - other.against > worth or evidence.shared(matrix, other.matrix) < _SAME)
             ]
             rival = max(others, key=lambda one: one.worth - one.against, default=None)
             lead = min((other.lead for other in others), default=math.inf)

@@ -15,7 +15,7 @@ from __future__ import annotations
 import math
 from collections import OrderedDict
 from collections.abc import Iterable, Iterator
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, field
 from itertools import islice
 from typing import NamedTuple
 from weakref import WeakValueDictionary
@@ -36,9 +36,9 @@ from roadgeo.roads.intersections import unpack_branches
 
 __all__ = [
     "COARSE_PIXEL_M",
+    "RADIUS_M",
     "RING_STEP",
     "Grown",
-    "RasterOptions",
     "RoadGrower",
     "RoadRaster",
     "RoadRound",
@@ -48,50 +48,23 @@ __all__ = [
     "Votes",
     "followed_more",
     "make_raster",
+    "ring_of",
     "scales",
 ]
 
 
 #: Ratio of a ring around an intersection to the next, and how far directions may differ from a road's and belong to it.
 RING_STEP, _TURN = 1.08, math.radians(20.0)
+#: Side of a raster's cells; how far from a road the middles of its cells lie, for at 200 m from an intersection half a
+#: step of scale moves a road by 8 m; and where the rings around intersections end, less than 63 cells away. Metres; a
+#: coarse map multiplies all lengths by its coarseness.
+_CELL_M, _REACH_M, RADIUS_M = 6.0, 8.0, 220.0
 
 
-@dataclass(frozen=True)
-class RasterOptions:
-    """How roads are drawn.
-
-    Attributes
-    ----------
-    cell_m : float
-        Side of a cell.
-    reach_m : float
-        Cells whose centres lie within this distance of a road belong to it: at 200 m from an intersection, half a step
-        of scale (4 %) moves a road by 8 m.
-    radius_m : float
-        Where the rings around intersections end, less than 63 cells away.
-    """
-
-    cell_m: float = 6.0
-    reach_m: float = 8.0
-    radius_m: float = 220.0
-
-    def __post_init__(self) -> None:
-        if self.radius_m >= (TILE - 1) * self.cell_m:
-            raise ValueError(f"radius_m is {self.radius_m:g}; expected less than {TILE - 1} cells of the raster")
-
-    @property
-    def inner_m(self) -> float:
-        """Where the rings begin."""
-        return self.radius_m / RING_STEP**RINGS
-
-    def ring_of(self, metres: FloatArray | float) -> IntArray:
-        """Return the rings that distances lie in, 0 to RINGS - 1; others are beyond."""
-        return np.floor(np.log(np.maximum(metres, 1e-9) / self.inner_m) / math.log(RING_STEP)).astype(np.int64)
-
-    def on(self, coarseness: float) -> RasterOptions:
-        """Return them for a coarse map: all lengths multiplied by its coarseness."""
-        lengths = {name: coarseness * getattr(self, name) for name in ("cell_m", "reach_m", "radius_m")}
-        return replace(self, **lengths)
+def ring_of(metres: FloatArray) -> IntArray:
+    """Return the rings that distances lie in, 0 to RINGS - 1, on a map of coarseness 1; others are beyond."""
+    inner_m = RADIUS_M / RING_STEP**RINGS
+    return np.floor(np.log(np.maximum(metres, 1e-9) / inner_m) / math.log(RING_STEP)).astype(np.int64)
 
 
 @dataclass(frozen=True, eq=False)
@@ -119,11 +92,6 @@ class RoadRaster:
     radii: FloatArray
 
     @property
-    def rim_m(self) -> float:
-        """Nothing that kernels look up may lie further than this from all roads and intersections."""
-        return self.raster.cell * TILE
-
-    @property
     def nbytes(self) -> int:
         """Size of its arrays."""
         return int(self.raster.tile_of.nbytes + self.raster.bits.nbytes + self.density.nbytes + self.rings.nbytes)
@@ -145,41 +113,40 @@ class RoadRaster:
 
 
 #: Rasters in use anywhere; and those that are kept, the one used last at the end, up to a number of bytes together.
-_in_use: WeakValueDictionary[tuple[ReferenceIndex, RasterOptions], RoadRaster] = WeakValueDictionary()
-_kept: OrderedDict[tuple[ReferenceIndex, RasterOptions], RoadRaster] = OrderedDict()
+_in_use: WeakValueDictionary[ReferenceIndex, RoadRaster] = WeakValueDictionary()
+_kept: OrderedDict[ReferenceIndex, RoadRaster] = OrderedDict()
 _MOST_BYTES = 500_000_000
 
 
-def make_raster(index: ReferenceIndex, options: RasterOptions) -> RoadRaster:
+def make_raster(index: ReferenceIndex) -> RoadRaster:
     """Return the raster of a reference, drawn anew unless it is in use or kept from before.
 
     Drawing takes some hundredths of a second, and 9 MB, for a city of 400 km2. Those used last are kept, up to a size:
     many masks are looked for on the same maps, one after the other.
     """
-    key = (index, options)
-    drawn = _in_use.get(key) or _draw(index, options)
-    _in_use[key] = _kept[key] = drawn
-    _kept.move_to_end(key)
+    drawn = _in_use.get(index) or _draw(index)
+    _in_use[index] = _kept[index] = drawn
+    _kept.move_to_end(index)
     while len(_kept) > 1 and sum(one.nbytes for one in _kept.values()) > _MOST_BYTES:
         _kept.popitem(last=False)
     return drawn
 
 
-def _draw(index: ReferenceIndex, options: RasterOptions) -> RoadRaster:
-    segments, size = index.segments, options.cell_m * TILE
+def _draw(index: ReferenceIndex) -> RoadRaster:
+    segments, cell, reach = index.segments, index.coarseness * _CELL_M, index.coarseness * _REACH_M
     ends = segments.reshape(-1, 2)
-    low = np.minimum(ends.min(axis=0), index.xy.min(axis=0)) - size
-    high = np.maximum(ends.max(axis=0), index.xy.max(axis=0)) + size
-    columns, rows = (math.ceil(side / size) + 1 for side in high - low)
+    low = np.minimum(ends.min(axis=0), index.xy.min(axis=0)) - cell * TILE  # nothing that is looked up lies beyond
+    high = np.maximum(ends.max(axis=0), index.xy.max(axis=0)) + cell * TILE
+    columns, rows = (math.ceil(side / (cell * TILE)) + 1 for side in high - low)
     tile_of = np.empty((rows, columns), np.int32)
     x0, y0 = float(low[0]), float(low[1])
-    n = mark_tiles(segments, x0, y0, options.cell_m, options.reach_m, tile_of)
+    n = mark_tiles(segments, x0, y0, cell, reach, tile_of)
     bits = np.zeros((n + 1, TILE, TILE), np.uint16)
-    paint_roads(segments, x0, y0, options.cell_m, options.reach_m, _TURN, tile_of, bits)
-    raster = Raster(tile_of, bits, options.cell_m)
+    paint_roads(segments, x0, y0, cell, reach, _TURN, tile_of, bits)
+    raster = Raster(tile_of, bits, cell)
     density = np.empty((rows, columns), np.float32)
     measure_tiles(raster, density)
-    radii = np.asarray(options.inner_m * RING_STEP ** (np.arange(RINGS) + 0.5) / options.cell_m)
+    radii = np.asarray(RADIUS_M * RING_STEP ** (np.arange(RINGS) + 0.5 - RINGS) / _CELL_M)
     n = len(index.xy)
     return RoadRaster((x0, y0), raster, density, np.empty((n, WORDS), np.uint64), np.zeros(n, bool), radii)
 
@@ -258,11 +225,10 @@ class Voter:
         """
         self.scene, self.index = scene, index
         self.max_turn, self.candidates, self.kept = max_turn, candidates, more * _KEPT
-        self.raster = RasterOptions().on(index.coarseness)
         step = RING_STEP
         n = int(math.log(scale[1] / scale[0]) / math.log(step)) + 1  # between the limits, half a step from them at most
         self.scales = np.asarray(math.sqrt(scale[0] * scale[1]) * step ** (np.arange(n) - (n - 1) / 2))
-        self.drawn: RoadRaster = make_raster(index, self.raster)
+        self.drawn: RoadRaster = make_raster(index)
         cells, rays = self.drawn.cells(index.xy), unpack_branches(index.branches)
         self.drawn.draw_rings_of(cells, candidates)
         density = np.maximum(self.drawn.density_at(index.xy), _LEAST_DENSITY)
@@ -307,12 +273,11 @@ class Voter:
 
     def _mark(self, around: _Around) -> AnyArray:
         """Return the rings of the query at each scale, (S, WORDS)."""
-        raster = self.raster
         bearings = np.arctan2(around.offsets[:, 1], around.offsets[:, 0])
         across = np.abs(np.sin(around.angles * (math.pi / DIRECTIONS) - bearings)) > math.sqrt(0.5)
         words = np.zeros((len(self.scales), WORDS), np.uint64)
-        rings, own = raster.ring_of(around.away * self.scales[0]), around.radial.astype(np.int64)
-        mark_rings(rings, bearings, 1 - across, own, int(raster.ring_of(_OWN_M * self.index.coarseness)), words)
+        rings, own = ring_of(around.away * self.scales[0] / self.index.coarseness), around.radial.astype(np.int64)
+        mark_rings(rings, bearings, 1 - across, own, int(ring_of(np.asarray(_OWN_M))), words)
         return words
 
     def _wide(self, around: _Around) -> RoadPoints:

@@ -11,7 +11,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 from naive import kernels as naive
 from scipy.stats import rankdata
-from worlds.lattices import contest
+from worlds.lattices import beside, contest
 from worlds.scenes import Sight, camera, look, random_network, scene_of, shaken
 
 import roadgeo
@@ -128,6 +128,22 @@ class TestScale:
         told = Evidence(scene, index, gsd_m).weigh(truth)
         assert told > 12.0
         assert Evidence(scene, index, gsd_m).nearby(truth) < 0.35 * told
+
+
+class TestShared:
+    """Whether the same pieces of the query lie on the same roads of the map."""
+
+    def test_a_version_of_a_place_is_the_place(self, town, scene):
+        found, rng = Evidence(scene, town[1], 1.0), np.random.default_rng(3)
+        assert found.shared(TRUTH, TRUTH) == 1.0
+        assert min(found.shared(TRUTH, shaken(TRUTH, scene, 12.0, rng)) for _ in range(8)) > 0.7
+        assert found.shared(TRUTH, moved(TRUTH, scene, turn=1.0)) > 0.7
+
+    def test_another_place_is_not_however_near(self, town, scene):
+        truth, _, lattice = contest(1.0)
+        assert lattice.shared(truth, beside(truth, lattice)) < 0.3
+        assert Evidence(scene, town[1], 1.0).shared(TRUTH, moved(TRUTH, scene, east=90.0, north=90.0)) < 0.3
+        assert Evidence(scene, town[1], 1.0).shared(TRUTH, moved(TRUTH, scene, east=1e6)) == 0.0
 
 
 class TestNearby:

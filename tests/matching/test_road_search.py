@@ -13,15 +13,16 @@ from roadgeo.matching.estimator import MatchOptions, TripleEstimator
 from roadgeo.matching.index import build_index
 from roadgeo.matching.road_search import (
     COARSE_PIXEL_M,
+    RADIUS_M,
     RING_STEP,
     WIDE_RADIUS_M,
-    RasterOptions,
     RoadGrower,
     RoadSearch,
     Turnout,
     Voter,
     followed_more,
     make_raster,
+    ring_of,
     scales,
 )
 from roadgeo.matching.search import SearchOptions, search
@@ -188,29 +189,27 @@ def test_more_may_be_tried_on_a_larger_map(monkeypatch):
 
 def test_a_raster_in_use_is_not_drawn_again(town, monkeypatch):
     monkeypatch.setattr(road_search, "_MOST_BYTES", 0)
-    options = RasterOptions(cell_m=6.0)
-    drawn = make_raster(town[1], options)
-    other = make_raster(town[1], RasterOptions(cell_m=8.0))
-    assert make_raster(town[1], options) is drawn
+    drawn = make_raster(town[1])
+    other = make_raster(build_index(random_network(7, 400.0)))
+    assert make_raster(town[1]) is drawn
     assert drawn is not other
 
 
 def test_the_raster_is_made_once_and_has_a_rim(town):
-    options = RasterOptions()
-    drawn = make_raster(town[1], options)
-    assert make_raster(town[1], options) is drawn
-    assert drawn.rim_m > WIDE_RADIUS_M * 1.08
+    drawn = make_raster(town[1])
+    assert make_raster(town[1]) is drawn
+    assert 64 * drawn.raster.cell > WIDE_RADIUS_M * 1.08
+    assert drawn.radii[-1] < 63
     cells = drawn.cells(town[1].xy)
     rows, columns = np.array(drawn.raster.tile_of.shape) * 64
-    rim = drawn.rim_m / options.cell_m
-    assert cells.min() >= rim - 1e-6
-    assert cells[:, 0].max() <= columns - rim
-    assert cells[:, 1].max() <= rows - rim
+    assert cells.min() >= 64 - 1e-6
+    assert cells[:, 0].max() <= columns - 64
+    assert cells[:, 1].max() <= rows - 64
     assert not drawn.raster.bits[0].any()
 
 
 def test_rings_are_drawn_where_they_are_asked_for(town):
-    drawn = make_raster(town[1], RasterOptions(cell_m=6.5))
+    drawn = road_search._draw(town[1])
     cells = drawn.cells(town[1].xy)
     drawn.draw_rings_of(cells, np.array([3, 1]))
     assert np.flatnonzero(drawn.has_rings).tolist() == [1, 3]
@@ -224,12 +223,10 @@ def test_rings_are_drawn_where_they_are_asked_for(town):
 
 
 def test_distances_lie_in_rings():
-    options = RasterOptions()
-    edges = options.inner_m * RING_STEP ** np.arange(33)
-    assert edges[-1] == pytest.approx(options.radius_m)
-    assert options.ring_of(edges[:-1] * 1.01).tolist() == list(range(32))
-    assert options.ring_of(np.array([0.0, 0.99 * edges[0], 1.01 * edges[-1]])).tolist()[1:] == [-1, 32]
-    assert options.ring_of(0.0) < 0
+    edges = RADIUS_M * RING_STEP ** np.arange(-32.0, 1.0)
+    assert ring_of(edges[:-1] * 1.01).tolist() == list(range(32))
+    assert ring_of(np.array([0.0, 0.99 * edges[0], 1.01 * edges[-1]])).tolist()[1:] == [-1, 32]
+    assert ring_of(np.zeros(1)) < 0
 
 
 def test_a_map_of_few_roads(broken):
@@ -245,10 +242,3 @@ def test_wide_roads_leave_out_scales_at_which_they_would_be_no_roads(monkeypatch
     assert scales(camera, 3.0) == (0.1, 12.0)
     assert scales(camera, 10.0) == pytest.approx((0.2, 7.5))
     assert scales(CameraOptions(gsd_m=(9.0, 12.0)), 10.0) == (9.0, 12.0)
-
-
-@pytest.mark.parametrize("coarseness", [1.0, 4.0])
-def test_points_too_far_for_the_raster_are_refused(coarseness):
-    assert RasterOptions(radius_m=370.0).on(coarseness).radius_m == 370.0 * coarseness
-    with pytest.raises(ValueError, match="expected less than 63 cells"):
-        RasterOptions(radius_m=380.0)
