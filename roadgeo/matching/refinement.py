@@ -179,7 +179,7 @@ class Equations:
             MIN_COS, self.sigma_m, _SIGMA_M, _SIGMA_PX / scene.half_size, self.prior, _N_ITERATIONS, _TOLERANCE_M,
         )  # fmt: skip
         n = len(xy)
-        self.met = Met(np.empty((n, free)), np.full(n, np.nan), np.empty(n), np.empty(n), np.empty(n, np.bool_))
+        self.met = Met(np.empty((n, free)), np.full(n, np.nan), np.ones(n), np.empty(n), np.empty(n, np.bool_))
 
     @property
     def homography(self) -> Homography:
