@@ -53,6 +53,8 @@ _PIECE_M, _PIECE_PX = 60.0, 12.0
 #: Regions of the longer side of the frame, at most, in which a place may be contradicted, their least width, and how
 #: many times coarser pixels are than in its middle where it is too far away for that.
 _N_REGIONS, _REGION_M, _FAR = 6, 170.0, 1.6
+#: A region is contradicted where the place explains less than this part of what it explains elsewhere.
+_HARDLY = 0.1
 #: Step of the samples along the map's roads, at least; no less than a cell of the query's raster.
 STEP_M = 12.0
 #: Places nearby: shifts of these lengths, spread evenly, and those that lay one of some intersections of the map near
@@ -168,7 +170,7 @@ class Evidence:
         return float(alike.mean()) if on_road.any() else 0.0
 
     def contradicted(self, matrix: FloatArray) -> float:
-        """Return which share of the roads lies in regions of the frame where the place explains less than chance.
+        """Return which share of the roads lies in regions of the frame where the place explains little or nothing.
 
         There the query and the map both show roads, but different ones: a place that fits in part, as in a city built
         like its own mirror image, is not it. Where only one of them shows roads nothing is contradicted. Far
@@ -187,7 +189,10 @@ class Evidence:
         scales = np.sqrt(np.abs(np.linalg.det(Homography(matrix).jacobian(middles)))) / _sampling(matrix, scene)
         near = np.nan_to_num(scales, nan=math.inf) < _FAR
         both = np.minimum(seen.sum(axis=1), mapped.sum(axis=1)) * near
-        share = float(both[worth < 0.0].sum() / both.sum()) if both.any() else 0.0
+        if not both.any():
+            return 0.0
+        least = _HARDLY * max(float(worth[near].sum()), 0.0) * both / both.sum()
+        share = float(both[worth < least].sum() / both.sum())
         return max(share - 0.5 / len(both), 0.0)  # that of half a region is usual: a railway may run through one
 
     def _count(self, matrix: FloatArray, piece_px: float, shape: tuple[int, int]) -> tuple[FloatArray, FloatArray]:
