@@ -1,4 +1,4 @@
-"""The places near a given one where a mask's roads run on roads of the map: shifts and small turns of a start.
+"""The places where a mask's roads run on roads of the map: shifts and turns of a start, or everywhere on the map.
 
 The roads around the frame are drawn on a coarse raster, one layer for each of 16 directions. A road point of the query
 reads the layer of its own direction: the layer around its place is the answer for all shifts at once, and the sum over
@@ -11,15 +11,15 @@ from __future__ import annotations
 import math
 from collections.abc import Iterator
 from dataclasses import dataclass
-from typing import Any, TypeAlias
+from typing import TypeAlias
 
 import cv2
 import numpy as np
 
 from roadgeo._arrays import AnyArray, FloatArray
 from roadgeo.geometry.camera import CameraOptions
-from roadgeo.geometry.frame import Frame
 from roadgeo.geometry.homography import Homography
+from roadgeo.matching.evidence import Evidence
 from roadgeo.matching.index import ReferenceIndex
 from roadgeo.matching.scene import Scene
 
@@ -220,8 +220,10 @@ _MOST_SCALE, _MOST_TURN_DEG = 1.6, 20.0
 _CELL_M, _ROAD_M, _CELLS, _STEP_CELLS = 12.0, 36.0, 80.0, 2.5
 #: Cells times turns and scales that are few enough: a larger map is not looked at.
 _MOST_CELLS = 1.5e9
-#: Number of places that are followed; places nearer than this to a better one are the same.
-_N_KEPT, _APART_M = 40, 40.0
+#: The map is looked at in squares of this number of cells from the middle: what is counted there fits in a cache.
+_SQUARE = 200
+#: Road points that vote; places that are ranked, and that are followed; nearer ones than this, metres, are the same.
+_N_POINTS, _N_RANKED, _N_KEPT, _APART_M = 150, 400, 40, 40.0
 #: Each of them is sought anew within a step.
 _NEARER = LocalSearchOptions(reach_m=36.0, turn_deg=3.0, scales=(0.96, 1.0, 1.04), max_points=120, n_places=1)
 
@@ -243,35 +245,37 @@ def propose_everywhere(
     None where the map is too large; `near` = (x, y, radius) restricts where the middle of the frame may lie.
     """
     center, off = camera.heading or (0.0, 180.0)
-    half_m = scene.half_size * math.sqrt(camera.gsd_m[0] * camera.gsd_m[1])
+    gsd_m, most = math.sqrt(camera.gsd_m[0] * camera.gsd_m[1]), math.log(camera.gsd_m[1] / camera.gsd_m[0]) / 2.0
+    half_m = scene.half_size * gsd_m
     cell = max(_CELL_M, half_m / _CELLS)
     step = _STEP_CELLS * cell / half_m
-    turns = _spread(center, off + 1.0, math.degrees(step))
-    least, most = np.log(camera.gsd_m)
-    scales = np.exp(_spread((least + most) / 2.0, (most - least) / 2.0, step))
+    turns, scales = _spread(center, off + 1.0, math.degrees(step)), tuple(np.exp(_spread(0.0, most, step)).tolist())
     low, high = index.bounds
     if near is not None:
-        reach = near[2] + half_m
-        low, high = np.maximum(low, np.subtract(near[:2], reach)), np.minimum(high, np.add(near[:2], reach))
-    low, high = low - half_m, high + half_m
-    columns, rows = (max(int(n), 1) for n in np.ceil((high - low) / cell))
-    if (high <= low).any() or columns * rows * len(turns) * len(scales) > _MOST_CELLS:
+        low, high = np.maximum(low, np.subtract(near[:2], near[2])), np.minimum(high, np.add(near[:2], near[2]))
+    reach = _SQUARE * cell
+    squares = np.maximum(np.ceil((high - low) / (2.0 * reach)), 1.0).astype(int)
+    if (high < low).any() or squares.prod() * (2 * _SQUARE) ** 2 * len(turns) * len(scales) > _MOST_CELLS:
         return
-    fft = _transforms()
-    shape = cv2.getOptimalDFTSize(rows), cv2.getOptimalDFTSize(columns)
-    drawn, along = _draw_map(index, low, (rows, columns), cell)
-    mapped = fft.rfft2(drawn, shape)
-    mapped_along = fft.rfft2(drawn * along.real, shape), fft.rfft2(drawn * along.imag, shape)
-    found: list[tuple[float, float, float, float, float]] = []
-    for scale in scales:
+    around = LocalSearchOptions(reach, 0.0, scales, cell, _ROAD_M, _N_POINTS, _N_KEPT)
+    found: list[tuple[float, FloatArray]] = []
+    for square in np.ndindex(*squares):
+        drawn: Drawn = {}
+        middle = low + (2.0 * np.array(square) + 1.0) * reach
         for turn in turns:
-            found += _best(scene, scale, math.radians(turn), mapped, mapped_along, shape, (rows, columns), low, cell)
+            start = _similarity(scene, middle, gsd_m, math.radians(turn))
+            shifts = search_nearby(start, scene, index, around, drawn)
+            found += [(shift.share, move_about(middle, shift) @ start) for shift in shifts]
+    # Where the map has more roads more points lie on them anyhow: Dice's coefficient heeds that.
     found.sort(key=lambda one: -one[0])
-    kept: list[tuple[float, float]] = []
-    for _, x, y, scale, turn in found:
-        if all(math.hypot(x - u, y - v) >= _APART_M for u, v in kept):
-            kept.append((x, y))
-            yield _nearer(_similarity(scene, x, y, scale, turn), scene, index)
+    evidence, seen_px = Evidence(scene, index, gsd_m), scene.road_length_px
+    ranked = [(share / (seen_px + evidence.mapped_px(one)), one) for share, one in found[:_N_RANKED]]
+    kept: list[FloatArray] = []
+    for _, one in sorted(ranked, key=lambda one: -one[0]):
+        spot = Homography(one).everywhere(scene.center)
+        if all(math.hypot(*(spot - other)) >= _APART_M for other in kept):
+            kept.append(spot)
+            yield _nearer(one, scene, index)
         if len(kept) == _N_KEPT:
             return
 
@@ -287,86 +291,8 @@ def _spread(center: float, off: float, step: float) -> FloatArray:
     return np.asarray(np.linspace(center - off, center + off, 2 * math.ceil(off / step) + 1 if off > step / 2 else 1))
 
 
-def _similarity(scene: Scene, x: float, y: float, scale: float, turn: float) -> FloatArray:
-    """Return the homography (3, 3) that lays the frame's middle on x, y, its up turned clockwise by `turn`, radians."""
+def _similarity(scene: Scene, middle: FloatArray, scale: float, turn: float) -> FloatArray:
+    """Return the homography (3, 3) that lays the frame's middle on a point (2,), its up turned clockwise, radians."""
     c, s = scale * math.cos(turn), scale * math.sin(turn)
     linear = np.array([[c, s], [-s, c]])
-    return np.vstack((np.column_stack((linear, (x, y) - linear @ scene.center)), (0.0, 0.0, 1.0)))
-
-
-def _draw_map(
-    index: ReferenceIndex, low: FloatArray, shape: tuple[int, int], cell_m: float
-) -> tuple[AnyArray, AnyArray]:
-    """Draw the map's roads, rows upwards: (rows, columns) float32 0 to 1, and exp(2 i direction) of the last drawn."""
-    a, b = index.segments[:, :2] - low, index.segments[:, 2:] - low
-    lines = np.round(np.stack((a, b), axis=1) / cell_m * 16.0 - 8.0).astype(np.int32)
-    sector = np.floor(np.mod(np.arctan2(*(b - a).T[::-1]), np.pi) / np.pi * 16.0).astype(int) % 16
-    drawn, along = np.zeros(shape, np.uint8), np.zeros(shape, np.complex64)
-    wide = max(round(_ROAD_M / cell_m), 1)
-    for k in range(16):
-        layer = np.zeros(shape, np.uint8)
-        cv2.polylines(layer, list(lines[sector == k]), False, 1, wide, cv2.LINE_8, 4)
-        along += layer * np.exp(2j * np.pi * (k + 0.5) / 16.0).astype(np.complex64)
-        drawn |= layer
-    return drawn.astype(np.float32), along / np.maximum(np.abs(along), 1e-6)
-
-
-def _transforms() -> Any:
-    """Return the module of Fourier transforms: scipy's, or numpy's, five times slower, where scipy is not installed."""
-    try:
-        from scipy import fft
-    except ModuleNotFoundError:
-        from numpy import fft
-    return fft
-
-
-def _best(
-    scene: Scene,
-    scale: float,
-    turn: float,
-    mapped: AnyArray,
-    mapped_along: tuple[AnyArray, AnyArray],
-    shape: tuple[int, int],
-    inside: tuple[int, int],
-    low: FloatArray,
-    cell_m: float,
-) -> list[tuple[float, float, float, float, float]]:
-    """Return (agreement, x, y, scale, turn) of the best places for one scale and turn."""
-    matrix = _similarity(scene, 0.0, 0.0, scale, turn)
-    points = scene.dense_points @ matrix[:2, :2].T + matrix[:2, 2]
-    ways = scene.dense_directions @ matrix[:2, :2].T
-    frame = Frame(*scene.size).plane_corners @ matrix[:2, :2].T + matrix[:2, 2]
-    half = np.ceil(np.abs(frame).max(axis=0) / cell_m).astype(int) + 1
-    cells = np.floor(points / cell_m).astype(int) + half
-    size = 2 * half[1] + 1, 2 * half[0] + 1
-    seen, along = np.zeros(size, np.float32), np.zeros(size, np.complex64)
-    seen[cells[:, 1], cells[:, 0]] = 1.0
-    np.add.at(along, (cells[:, 1], cells[:, 0]), np.exp(2j * np.arctan2(ways[:, 1], ways[:, 0])).astype(np.complex64))
-    along /= np.maximum(np.abs(along), 1e-6)
-    window = _observed(scene, matrix, half, size, cell_m)
-    fft = _transforms()
-
-    def spectrum(template: AnyArray) -> AnyArray:
-        return np.asarray(np.conj(fft.rfft2(template, shape)))
-
-    alike = mapped * spectrum(seen)
-    alike += mapped_along[0] * spectrum(seen * along.real) + mapped_along[1] * spectrum(seen * along.imag)
-    both = fft.irfft2(0.5 * alike, shape)[: inside[0], : inside[1]]
-    shown = fft.irfft2(mapped * spectrum(window), shape)[: inside[0], : inside[1]]
-    wide = _ROAD_M / cell_m
-    dice = 2.0 * both / (float(seen.sum()) + np.maximum(shown, 0.0) / wide)
-    peaks = (dice >= cv2.dilate(dice, np.ones((5, 5), np.uint8))) & (dice > 0.2)
-    r, c = np.nonzero(peaks)
-    order = np.argsort(-dice[r, c], kind="stable")[:_N_KEPT]
-    return [
-        (float(dice[i, j]), *(low + (np.array([j, i]) + half + 0.5) * cell_m).tolist(), scale, turn)
-        for i, j in zip(r[order].tolist(), c[order].tolist(), strict=True)
-    ]
-
-
-def _observed(scene: Scene, matrix: FloatArray, half: AnyArray, size: tuple[int, int], cell_m: float) -> AnyArray:
-    """Return the ground that the query observed, on the raster around the middle of the frame: 1 there, else 0."""
-    to_cells = np.array([[1.0 / cell_m, 0.0, half[0]], [0.0, 1.0 / cell_m, half[1]], [0.0, 0.0, 1.0]]) @ matrix
-    flip = np.array([[scene.field_scale, 0.0, 0.0], [0.0, -scene.field_scale, 0.0], [0.0, 0.0, 1.0]])
-    seen = scene.observed.astype(np.float32)
-    return np.asarray(cv2.warpPerspective(seen, to_cells @ flip, size[::-1], flags=cv2.INTER_NEAREST))
+    return np.vstack((np.column_stack((linear, middle - linear @ scene.center)), (0.0, 0.0, 1.0)))
