@@ -169,9 +169,10 @@ def straighten(
     frame's longer side, normalised: the unit of k1.
     """
     ou, ov = u / half_side, v / half_side
-    seen = math.sqrt(ou * ou + ov * ov)
+    seen = ou * ou + ov * ov
     if k1 == 0.0 or seen == 0.0:
-        return u, v, du, dv, -u * seen * seen, -v * seen * seen, 1.0
+        return u, v, du, dv, -u * seen, -v * seen, 1.0
+    seen = math.sqrt(seen)
     r = _radius(seen, k1)
     scale, square = r / seen, r * r
     u, v = u * scale, v * scale
@@ -267,7 +268,7 @@ def own_sigma(reach_m: float, sigma_m: float, map_sigma_m: float, mask_sigma: fl
 
     The other arguments are as in `structs.AdjustLimits`.
     """
-    return math.hypot(map_sigma_m, mask_sigma * reach_m) / sigma_m
+    return math.sqrt(map_sigma_m**2 + (mask_sigma * reach_m) ** 2) / sigma_m
 
 
 class _System(NamedTuple):

@@ -45,6 +45,9 @@ _LOG = logging.getLogger(__name__)
 #: The newest numba whose private parts `machine_code` was tried with; kernels of later ones are left to numba whole.
 _NEWEST_NUMBA = (0, 68)
 
+#: Divisions are not looked at for a zero, may become products, and products with sums one instruction: a tenth quicker.
+_OPTIONS: dict[str, Any] = {"error_model": "numpy", "fastmath": {"contract", "arcp", "nsz"}}
+
 _lock = threading.RLock()
 
 
@@ -79,7 +82,7 @@ class Kernel:
 
     def __init__(self, function: Callable[..., Any], options: dict[str, Any], writes: tuple[str, ...] = ()) -> None:
         functools.update_wrapper(self, function)
-        self.function, self.options = function, options
+        self.function, self.options = function, {**_OPTIONS, **options}
         self.name, self.module = function.__name__, function.__module__
         self.arguments, self.result = _kinds(function, writes)
         self._run: Callable[..., Any] | None = None

@@ -82,10 +82,9 @@ def _buckets_around(
     x: float, y: float, radius: float, grid: tuple[float, float, float], shape: tuple[int, int]
 ) -> tuple[int, int, int, int]:
     """Return the first and last column, and the first and last row, of the buckets that a circle may touch."""
-    c0 = max(int(np.floor((x - radius - grid[0]) / grid[2])), 0)
-    c1 = min(int(np.floor((x + radius - grid[0]) / grid[2])), shape[0] - 1)
-    r0 = max(int(np.floor((y - radius - grid[1]) / grid[2])), 0)
-    r1 = min(int(np.floor((y + radius - grid[1]) / grid[2])), shape[1] - 1)
+    column, row, reach = (x - grid[0]) / grid[2], (y - grid[1]) / grid[2], radius / grid[2]
+    c0, c1 = int(max(column - reach, 0.0)), int(min(column + reach, shape[0] - 1.0))
+    r0, r1 = int(max(row - reach, 0.0)), int(min(row + reach, shape[1] - 1.0))
     return c0, c1, r0, r1
 
 
