@@ -214,7 +214,7 @@ def vote(
         for w in range(WORDS):
             points_of[s, w] = np.int16(count_bits(points[s, w]))
             n_points[s] += points_of[s, w]
-    turns, expected = np.empty(MAX_TURNS, np.int64), np.empty(n_scales)
+    turns, expected, per_sigma = np.empty(MAX_TURNS, np.int64), np.empty(n_scales), np.empty(n_scales)
     roads, here = np.empty(WORDS, np.int16), np.empty(WORDS, np.uint64)
     for index in range(candidates.shape[0]):
         j = candidates[index]
@@ -228,6 +228,8 @@ def vote(
             for w in range(WORDS):
                 total = np.int32(total + np.int32(np.int32(points_of[s, w]) * np.int32(roads[w])))
             expected[s] = total / BEARINGS
+        for s in range(n_scales):
+            per_sigma[s] = 1.0 / math.sqrt(max(expected[s] * (1.0 - expected[s] / max(n_points[s], 1.0)), 1.0))
         for t in range(n_turns):
             if abs(turns[t]) > max_turn:
                 continue
@@ -237,14 +239,14 @@ def vote(
                 here[w] = turn_bits(places.rings[j, w], back)
             best, where = votes[0, 3] if kept == votes.shape[0] else 0.0, -1
             for s in range(n_scales):
+                if n_points[s] < least:
+                    continue
                 met = np.uint64(0)
                 for w in range(WORDS):
                     met += count_bits(here[w] & points[s, w])
-                beyond = met - expected[s]
-                if n_points[s] >= least and beyond > 0.0:
-                    beyond /= math.sqrt(max(expected[s] * (1.0 - expected[s] / n_points[s]), 1.0))
-                    if beyond > best:
-                        best, where = beyond, s
+                beyond = (met - expected[s]) * per_sigma[s]
+                if beyond > best:
+                    best, where = beyond, s
             if where >= 0:
                 slot = kept if kept < votes.shape[0] else 0  # the last, or that of the worst vote
                 kept = min(kept + 1, votes.shape[0])
