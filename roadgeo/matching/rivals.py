@@ -154,14 +154,14 @@ class Rivals:
         # The larger the map, the more places may lead all that lie around them.
         against = 2.0 * math.log10(larger(self.ledger.n_reference)) + doubt
 
-        def stand(others: Sequence[Other]) -> Standing:
-            others = [
-                other
-                for other in others
-                if np.hypot(*(Homography(other.matrix).everywhere(scene.center) - middle)) > apart_m
+        def is_rival(other: Other) -> bool:
+            return bool(
+                np.hypot(*(Homography(other.matrix).everywhere(scene.center) - middle)) > apart_m
                 and estimator.may_be(other.matrix)
                 and (other.worth - other.against > worth or evidence.shared(matrix, other.matrix) < _SAME)
-            ]
+            )
+
+        def stand(others: Sequence[Other]) -> Standing:
             rival = max(others, key=lambda one: one.worth - one.against, default=None)
             lead = min((other.lead for other in others), default=math.inf)
             lead += log10_gap(worth, [other.worth for other in others])
@@ -172,14 +172,17 @@ class Rivals:
             return Standing(best, rival.matrix, odds, worth, likelihood)
 
         known = [model for model in ranked[: 1 + _N_KNOWN] if model is not best]
-        met = [Other(*compare(model.matrix), model.matrix, self.doubt(estimator, model)) for model in known]
-        standing = stand(met)
+        met = (Other(*compare(model.matrix), model.matrix, self.doubt(estimator, model)) for model in known)
+        rivals = list(filter(is_rival, met))
+        standing = stand(rivals)
         if standing.log10_lead >= _WORTH_LOOKING * self.needed:
-            return stand([*met, *similar_places(matrix, evidence, compare, estimator.options)])
-        if best.nearby < _REPEATING * worth:
+            around = _AROUND
+        elif best.nearby < _REPEATING * worth:
             return standing
-        # Another block may be the place.
-        return stand([*met, *similar_places(matrix, evidence, compare, estimator.options, _NEARBY)])
+        else:
+            around = _NEARBY  # another block may be the place
+        similar = similar_places(matrix, evidence, compare, estimator.options, around)
+        return stand([*rivals, *filter(is_rival, similar)])
 
     def doubt(self, estimator: TripleEstimator, model: Hypothesis) -> float:
         """Return by how many powers of ten what a place contradicts speaks against it, as it is laid; asked once."""
