@@ -256,7 +256,8 @@ def _place(parameters: FloatArray, log_focal: float) -> tuple[FloatArray, FloatA
     nothing = np.zeros_like(parameters[..., :1])
     tilt = np.concatenate((parameters[..., 4:6] * np.exp(parameters[..., 6:] - log_focal), nothing), axis=-1)
     heading = np.concatenate((nothing, nothing, parameters[..., 3:4]), axis=-1)
-    rotations = _rotation(tilt) @ _rotation(heading)
+    tilted, turned_by = _rotation(np.stack((tilt, heading)))
+    rotations = tilted @ turned_by
     reach = np.exp(parameters[..., 2:3] + parameters[..., 6:])
     ground = np.concatenate((parameters[..., :2], nothing), axis=-1)
     return ground + reach * rotations[..., 2], rotations

@@ -359,11 +359,14 @@ def count_residuals(
         - inverse[0, 1] * (inverse[1, 0] * inverse[2, 2] - inverse[1, 2] * inverse[2, 0])
         + inverse[0, 2] * (inverse[1, 0] * inverse[2, 1] - inverse[1, 1] * inverse[2, 0])
     )
+    root_det, per_cell, per_piece, per_bin = math.sqrt(abs(det)), 1.0 / field_scale, field_scale / piece_px, n / radius
     for r in range(r0, r1 + 1):
         for c in range(c0, c1 + 1):
             bucket = r * shape[0] + c
             if starts[bucket] == starts[bucket + 1] or _lies_beside(inverse, grid, c, r, right, bottom):
                 continue
+            left, below = grid[0] + c * grid[2], grid[1] + r * grid[2]
+            beyond, above = grid[0] + (c + 1) * grid[2], grid[1] + (r + 1) * grid[2]
             for e in range(starts[bucket], starts[bucket + 1]):
                 s = ids[e]
                 ax, ay = segments[s, 0], segments[s, 1]
@@ -374,22 +377,23 @@ def count_residuals(
                     t = (k + 0.5) / count
                     x, y = ax + t * sx, ay + t * sy
                     # A segment may be listed in several buckets: each sample counts in its own.
-                    if int(np.floor((x - grid[0]) / grid[2])) != c or int(np.floor((y - grid[1]) / grid[2])) != r:
+                    if x < left or x >= beyond or y < below or y >= above:
                         continue
                     w = inverse[2, 0] * x + inverse[2, 1] * y + inverse[2, 2]
                     if w <= 0.0:
                         continue
-                    across = (inverse[0, 0] * x + inverse[0, 1] * y + inverse[0, 2]) / w / field_scale
-                    down = -(inverse[1, 0] * x + inverse[1, 1] * y + inverse[1, 2]) / w / field_scale
+                    nearer = 1.0 / w
+                    cells = nearer * per_cell
+                    across = (inverse[0, 0] * x + inverse[0, 1] * y + inverse[0, 2]) * cells
+                    down = -(inverse[1, 0] * x + inverse[1, 1] * y + inverse[1, 2]) * cells
                     if not (0.0 <= across < field.shape[1] and 0.0 <= down < field.shape[0]):
                         continue
                     if not observed[int(down), int(across)]:
                         continue
-                    scale = math.sqrt(abs(det) / (w * w * w))  # pixels per metre
+                    scale = root_det * nearer * math.sqrt(nearer)  # pixels per metre
                     away = max(field[int(down), int(across)] - 0.5, 0.0) * field_scale / scale
-                    row = min(int(down * field_scale / piece_px), last_row)
-                    column = min(int(across * field_scale / piece_px), columns - 1)
-                    bin_ = min(int(n * away / radius), n) if away < radius else n
+                    row, column = min(int(down * per_piece), last_row), min(int(across * per_piece), columns - 1)
+                    bin_ = min(int(per_bin * away), n) if away < radius else n
                     backward[row * columns + column, bin_] += length / count * scale
 
 

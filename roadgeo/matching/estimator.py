@@ -35,7 +35,8 @@ _LEAST_LIKELY, _BEHIND = 0.7, (0.8, 0.9)
 #: A place that explains less than this part of the best one, laid once, is not laid again. One that grew by roads is
 #: not laid, if it explains less as it grew: of 71 right ones none explained less than 0.9.
 _HARDLY = 0.5
-#: A lens is looked for behind places that lead all others so far by as many powers of ten: those of lenses led by 2.8.
+#: Places that lead all others so far by as many powers of ten are compared with those nearby, and a lens is looked for
+#: behind those that lead these, too: of ten places behind lenses, or laid on a part, the weakest led by 3.2.
 _LEADING = 2.0
 #: As of `RefineOptions`, for places that grew by roads: false roads abound there.
 _LEAST_SHARE_BY_ROADS = 0.2
@@ -257,7 +258,7 @@ class TripleEstimator:
         started = time.perf_counter()
         self.n_verified += 1
         self._verify(model)
-        if model.log10_likelihood >= max(self._most_elsewhere(model), 0.0) + _LEADING:
+        if model.log10_odds >= _LEADING:
             self._look_through_lens(model)
         if math.isfinite(model.log10_odds):
             self.verified.append(model)
@@ -287,17 +288,23 @@ class TripleEstimator:
         self._weigh(model)
 
     def _weigh(self, model: Hypothesis) -> None:
-        """Weigh a hypothesis, and the best place nearby where it explains more than any other that was met."""
-        if model.log10_likelihood > self._most_elsewhere(model):
-            evidence = Evidence(self.scene_of(model), self.index, model.gsd_m)
-            model.nearby = evidence.nearby(model.matrix, self.near)
-            self.n_nulls += 1
+        """Weigh a hypothesis, and the best place nearby where it leads all others that were met."""
         self._charge(model)
+        if model.log10_odds >= _LEADING:
+            self.nearby(model)
+            self._charge(model)
+
+    def nearby(self, model: Hypothesis) -> float:
+        """Return the log10 likelihood of the best place nearby (see `Evidence.nearby`), which is looked for once."""
+        if model.nearby is None:
+            self.n_nulls += 1
+            model.nearby = Evidence(self.scene_of(model), self.index, model.gsd_m).nearby(model.matrix, self.near)
+        return model.nearby
 
     def _charge(self, model: Hypothesis) -> None:
         """Give a hypothesis its odds: by how much it explains more than others do, less the places tried."""
         model.n_tried = self.ledger.n_tried
-        most = max(model.nearby, self._most_elsewhere(model), 0.0)
+        most = max(model.nearby or 0.0, self._most_elsewhere(model), 0.0)
         model.log10_odds = model.log10_likelihood - most - math.log10(max(model.n_tried, 1))
 
     def _most_elsewhere(self, model: Hypothesis) -> float:
@@ -334,7 +341,7 @@ class TripleEstimator:
 
         A place that is less likely than `least` is not refined again.
         """
-        scene = self.scene
+        scene, before = self.scene, -1.0 if model.found is None else model.found.forward
         best, options = -1.0, self.refinement(model)
         for _ in range(5):
             refined = refine(model.matrix, scene, self.index, model.matched, options, n_points, model.by_roads)
@@ -346,7 +353,7 @@ class TripleEstimator:
             if agreeing < best:
                 break
             model.take(laid)
-            if agreeing <= best + 0.01 or laid.log10_likelihood < least:
+            if agreeing <= max(before, best) + 0.01 or laid.log10_likelihood < least:
                 break
             best = agreeing
         return True

@@ -59,7 +59,7 @@ _HARDLY = 0.1
 STEP_M = 12.0
 #: Places nearby: shifts of these lengths, spread evenly, and those that lay one of some intersections of the map near
 #: the middle on others around it; they are compared by this number of road points, and the best of them weighed.
-_SHIFT_M, _N_SHIFTS, _N_ANCHORS, _N_POINTS, _WEIGHED = (30.0, 320.0), 150, 3, 150, 12
+_SHIFT_M, _N_SHIFTS, _N_ANCHORS, _N_POINTS, _WEIGHED = (30.0, 320.0), 150, 3, 150, 6
 
 
 @dataclass(frozen=True)

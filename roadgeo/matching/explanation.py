@@ -24,7 +24,7 @@ from roadgeo.kernels.roads import road_residuals
 from roadgeo.location import Location, Place
 from roadgeo.matching.estimator import TripleEstimator
 from roadgeo.matching.events import Events, Scored
-from roadgeo.matching.evidence import Evidence, agreement, tolerance_m
+from roadgeo.matching.evidence import agreement, tolerance_m
 from roadgeo.matching.growing import Hypothesis
 from roadgeo.matching.methods import Found
 from roadgeo.matching.options import LocateOptions
@@ -348,11 +348,7 @@ class _Course:
         ground = Homography(matrix).everywhere(scene.corners)
         lonlat = to_lonlat(index.plane.crs, index.plane.to_crs(ground))
         center = center_of(matrix, scene, index.plane, entry.log10_odds)
-        nearby = entry.model.nearby
-        if (
-            nearby == 0.0 and entry.model.found is not None
-        ):  # where another place explains more, the search looks at none
-            nearby = Evidence(scene, index, entry.model.gsd_m).nearby(matrix, self.search.near)
+        nearby = 0.0 if entry.model.found is None else self.search.nearby(entry.model)
         place = RejectedPlace(entry, camera, center, ground, lonlat, np.isfinite(away[:, 0]), nearby)
         return replace(place, why=self._why(place))
 

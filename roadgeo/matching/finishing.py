@@ -37,10 +37,10 @@ __all__ = ["measure_corners", "refine_beside", "with_honest_corners"]
 _WHOLE, _LEAST_LOST = 0.9, 0.03
 #: How far corners are moved, one by one, to see whether the fit comes back: metres in the middle of the frame, and not
 #: less than 8 pixels; by how many road points; and how often at most.
-_BESIDE_M, _BESIDE_PX, _N_POINTS, _MOST_ROUNDS = (12.0, 24.0), 8.0, 200, 5
-#: A fit has come back that moves no corner by more than this part of the least step. Another one is better where this
-#: share of the road points lies on roads in addition.
-_BACK, _BETTER = 0.25, 0.006
+_BESIDE_M, _BESIDE_PX, _N_POINTS, _MOST_ROUNDS = 24.0, 8.0, 150, 5
+#: A fit has come back that moves no corner by more than this part of the step. Another one is better where this share
+#: of the road points lies on roads in addition.
+_BACK, _BETTER = 0.125, 0.006
 #: Standard deviation of the place of a lens's middle in each direction, pixels: conventions differ by half of one.
 _CENTER_SIGMA_PX = 0.5
 
@@ -112,13 +112,13 @@ def refine_beside(refined: Refined, scene: Scene, index: ReferenceIndex, options
     """
     options, nothing = replace(options, least_share=0.0), np.full(len(scene.intersections), -1)
     places, gsd = Homography(refined.matrix).everywhere(scene.corners), sampling(refined.matrix, scene.size)
-    steps_m = [max(step, _BESIDE_PX * gsd) for step in _BESIDE_M]
+    step_m = max(_BESIDE_M, _BESIDE_PX * gsd)
 
     def stays_away(one: Refined) -> bool:
         moved = np.hypot(*(Homography(one.matrix).everywhere(scene.corners) - places).T)
-        return bool(moved.max() > _BACK * steps_m[0])
+        return bool(moved.max() > _BACK * step_m)
 
-    starts = [start for step in steps_m for start in _beside(refined.matrix, scene, step / gsd)]
+    starts = _beside(refined.matrix, scene, step_m / gsd)
     tried = [refine(start, scene, index, nothing, options, _N_POINTS, held=True) for start in starts]
     weights = {weight_on_roads(one.matrix, scene, index): one for one in tried if one is not None and stays_away(one)}
     found = refine(weights[max(weights)].matrix, scene, index, nothing, options, held=True) if weights else None

@@ -60,8 +60,8 @@ class Hypothesis:
     """A grown hypothesis and its results.
 
     `by_roads`: it grew by roads over the whole frame; `log10_likelihood`, `nearby`: that of the place, and that of the
-    best place nearby (see `evidence`); `n_tried`: places tried when it was scored; `fault`: the camera's last
-    objection, None where it had none.
+    best place nearby (see `evidence`), None before it is looked for; `n_tried`: places tried when it was scored;
+    `fault`: the camera's last objection, None where it had none.
     """
 
     matrix: FloatArray
@@ -70,7 +70,7 @@ class Hypothesis:
     refined: Refined | None = None
     found: Agreement | None = None
     log10_likelihood: float = -np.inf
-    nearby: float = 0.0
+    nearby: float | None = None
     distance: FloatArray | None = None
     gsd_m: float = np.nan
     log10_odds: float = -np.inf
@@ -85,7 +85,7 @@ class Hypothesis:
         found, matched, distance = agreement(refined.matrix, scene, index, gsd_m)
         return replace(
             self, matrix=refined.matrix, refined=refined, gsd_m=gsd_m, found=found, matched=matched,
-            distance=distance, log10_likelihood=found.log10_likelihood,
+            distance=distance, log10_likelihood=found.log10_likelihood, nearby=None,
         )  # fmt: skip
 
     def take(self, other: Hypothesis) -> None:

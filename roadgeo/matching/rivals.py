@@ -43,9 +43,10 @@ _TAIL, _LEAST_TAIL, _LEAST_SPACING = 20, 5, 0.3
 _MOST_TURNS = 12
 
 
-#: A place that leads all places nearby by so many powers of ten is not compared further, if the best of them explains
-#: less than this part of it: streets do not repeat there.
-_CERTAIN, _REPEATING = 12.0, 0.35
+#: A place that leads all places nearby by so many powers of ten, and is contradicted by less than so many, is not
+#: compared further if the best of them explains less than this part of it: streets do not repeat there. Of 274 masks
+#: turned over four led by so much, where a city is like its mirror image: they were contradicted by 8.7 and more.
+_CERTAIN, _DOUBTED, _REPEATING = 12.0, 1.0, 0.5
 #: Streets around are looked at where the places that were met leave this part of the lead that is needed. At wrong
 #: places they leave up to a tenth, at right ones nine tenths and more.
 _WORTH_LOOKING = 0.5
@@ -144,7 +145,8 @@ class Rivals:
         doubt = self.doubt(estimator, best)
         likeliest = next((m.log10_likelihood for m in ranked if not estimator.same(m, best)), 0.0)
         odds = min(best.log10_odds, best.log10_likelihood - max(likeliest, 0.0))
-        if odds >= _CERTAIN and max(likeliest, best.nearby) < _REPEATING * best.log10_likelihood:
+        most = _REPEATING * best.log10_likelihood
+        if odds >= _CERTAIN and doubt < _DOUBTED and max(likeliest, estimator.nearby(best)) < most:
             return Standing(best, None, odds - doubt, best.log10_likelihood)
         if time.perf_counter() > self._deadline:
             return Standing(best, None, min(odds, 0.0), best.log10_likelihood)
@@ -177,7 +179,7 @@ class Rivals:
         standing = stand(rivals)
         if standing.log10_lead >= _WORTH_LOOKING * self.needed:
             around = _AROUND
-        elif best.nearby < _REPEATING * worth:
+        elif estimator.nearby(best) < _REPEATING * worth:
             return standing
         else:
             around = _NEARBY  # another block may be the place
