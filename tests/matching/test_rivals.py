@@ -255,4 +255,4 @@ def test_streets_around_are_looked_at_only_where_the_places_met_leave_a_lead(eve
     monkeypatch.setattr(rivals, "similar_places", lambda *told: looked.append(told[4:]) or [])
     stand(even, even[0], beside(even[0], even[2]))
     stand(broken, broken[0])
-    assert looked == [(rivals._NEARBY,), ()]
+    assert looked == [(rivals._NEARBY,), (rivals._AROUND,)]
