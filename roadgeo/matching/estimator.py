@@ -298,7 +298,8 @@ class TripleEstimator:
         """Return the log10 likelihood of the best place nearby (see `Evidence.nearby`), which is looked for once."""
         if model.nearby is None:
             self.n_nulls += 1
-            model.nearby = Evidence(self.scene_of(model), self.index, model.gsd_m).nearby(model.matrix, self.near)
+            gsd_m = sampling(model.matrix, self.scene.size)
+            model.nearby = Evidence(self.scene_of(model), self.index, gsd_m).nearby(model.matrix, self.near)
         return model.nearby
 
     def _charge(self, model: Hypothesis) -> None:
@@ -384,7 +385,7 @@ class TripleEstimator:
         """Whether a hypothesis fits the whole frame, so that no better version of it is to be expected."""
         if model.found is None or model.refined is None or not math.isfinite(model.log10_odds):
             return False
-        frame_m = 2.0 * self.scene.half_size * model.gsd_m
+        frame_m = 2.0 * self.scene.half_size * sampling(model.matrix, self.scene.size)
         return model.found.forward >= 0.65 and bool(model.refined.corner_sigma_m.max() <= 0.005 * frame_m)
 
     def center(self, model: Hypothesis) -> FloatArray:

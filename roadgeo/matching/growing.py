@@ -72,7 +72,6 @@ class Hypothesis:
     log10_likelihood: float = -np.inf
     nearby: float | None = None
     distance: FloatArray | None = None
-    gsd_m: float = np.nan
     log10_odds: float = -np.inf
     n_tried: int = 1
     fault: CameraFault | None = None
@@ -81,10 +80,9 @@ class Hypothesis:
 
     def lay(self, refined: Refined, scene: Scene, index: ReferenceIndex) -> Hypothesis:
         """Return it as refined, with what agrees with it, of a scene as a pinhole sees it."""
-        gsd_m = sampling(refined.matrix, scene.size)
-        found, matched, distance = agreement(refined.matrix, scene, index, gsd_m)
+        found, matched, distance = agreement(refined.matrix, scene, index, sampling(refined.matrix, scene.size))
         return replace(
-            self, matrix=refined.matrix, refined=refined, gsd_m=gsd_m, found=found, matched=matched,
+            self, matrix=refined.matrix, refined=refined, found=found, matched=matched,
             distance=distance, log10_likelihood=found.log10_likelihood, nearby=None,
         )  # fmt: skip
 

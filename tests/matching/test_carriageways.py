@@ -130,7 +130,7 @@ def test_a_place_is_refined_so_for_the_last_time_unless_no_camera_sees_it(town, 
     nothing = np.full(len(scene.intersections), -1)
     gsd = sampling(given.matrix, scene.size)
     found, _, _ = agreement(given.matrix, scene, town[1], gsd)
-    best = Hypothesis(given.matrix, 1.0, nothing, refined=given, found=found, gsd_m=gsd)
+    best = Hypothesis(given.matrix, 1.0, nothing, refined=given, found=found)
     measure_corners(estimator, best, 10.0)
     error, before = (error_of(matrix, truth, scene) for matrix in (best.refined.matrix, given.matrix))
     assert best.found is found  # the odds rest on it

@@ -7,7 +7,6 @@ import numpy as np
 import pytest
 from worlds.scenes import Sight, mapped, sight_of
 
-from roadgeo.geometry.camera import sampling
 from roadgeo.matching.estimator import MatchOptions, TripleEstimator
 from roadgeo.matching.evidence import Agreement
 from roadgeo.matching.finishing import measure_corners, refine_beside, with_honest_corners
@@ -24,8 +23,7 @@ def test_only_places_that_may_be_reported_are_fitted_to_the_whole_frame(town, sc
     truth, scene = sight_of(town[0], 5, tilt=15, sight=Sight(0.6))
     matrix, nothing = np.array([[1, 0, 3.0], [0, 1, -2.0], [0, 0, 1]]) @ truth, np.full(len(scene.intersections), -1)
     rough, found = Refined(matrix, np.ones(4), 1.0, np.eye(8)), Agreement(0, 10, agreeing, 0.8)
-    gsd = sampling(matrix, scene.size)
-    best = Hypothesis(matrix, 1.0, nothing, refined=rough, found=found, gsd_m=gsd)
+    best = Hypothesis(matrix, 1.0, nothing, refined=rough, found=found)
     measure_corners(TripleEstimator(scene, town[1], MatchOptions(within=within)), best, score)
     gaps = np.hypot(*(mapped(best.refined.matrix, scene.corners) - mapped(truth, scene.corners)).T)
     assert (gaps.max() < 1.5) == mended

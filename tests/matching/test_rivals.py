@@ -54,6 +54,17 @@ def stand(world, *matrices, n_reference=866, **told):
     return Rivals({one: estimator}, Ledger(n_reference=n_reference), NEEDED).standing(one)
 
 
+def test_a_place_that_explains_too_little_to_be_laid_has_places_nearby_too(even):
+    """What would beat it may turn out to be none, and then it is compared."""
+    truth, _, evidence = even
+    middle = Homography(truth)(evidence.scene.center)
+    wrong = move_about(middle, Shift(700.0, 300.0, 50.0, 1.0, 0.0)) @ truth
+    _, estimator = search_of(even, truth, wrong)
+    unlaid = estimator.verified[-1]
+    assert unlaid.refined is None
+    assert np.isfinite(estimator.nearby(unlaid))
+
+
 def apart(world, matrix, other=None):
     """Metres between the middles of two places, the second the true one unless it is given."""
     truth, _, evidence = world
