@@ -316,7 +316,6 @@ def meet_roads(
     plane: Plane,
     points: RoadSamples,
     limits: AdjustLimits,
-    slack: float,
     roads: RoadBuckets,
     factor: Floats2,
     met: Met,
@@ -326,10 +325,8 @@ def meet_roads(
     Parameters
     ----------
     p : (9,) float64
-    slack : float
-        Places may be off by this multiple of what `factor` makes them; with 0 they are known.
     factor : (n, n) float64
-        Cholesky factor of the present normal matrix.
+        Cholesky factor of the present normal matrix, by which places are unsure; zeros where they are known.
     met : Met
         Filled.
     """
@@ -350,11 +347,8 @@ def meet_roads(
         # How far the road may lie follows from how sure the fit is here.
         reach_m = plane.unit * area * shrink / (w * w * length)
         own[i] = own_sigma(reach_m, limits.sigma_m, limits.map_sigma_m, limits.mask_sigma)
-        variance = own[i] ** 2
-        if slack > 0.0:
-            point_row(p, u, v, (mu, mv), -dy, dx, row)
-            variance += slack**2 * spread(row, factor, work)
-        sigma = limits.sigma_m * math.sqrt(variance)
+        point_row(p, u, v, (mu, mv), -dy, dx, row)
+        sigma = limits.sigma_m * math.sqrt(own[i] ** 2 + spread(row, factor, work))
         if not 3.0 * sigma <= limits.max_radius * max(1.0, own[i]):  # NaN neither
             continue
         searched[i] = True
@@ -411,7 +405,6 @@ def adjust(
     pairs: PointPairs,
     held: Held,
     limits: AdjustLimits,
-    slack: float,
     roads: RoadBuckets,
     normal: Floats2,
     met: Met,
@@ -427,8 +420,6 @@ def adjust(
     ----------
     p : (9,) float64
         Adjusted in place: the first n.
-    slack : float
-        As in `meet_roads` while the fit grows, 1 or more.
     normal : (n, n) float64
         Filled with the last normal matrix, its lower triangle.
     met : Met
@@ -459,7 +450,7 @@ def adjust(
                     return -1, np.inf
         used = 0
         if iteration > 0:
-            meet_roads(p, plane, points, limits, slack, roads, system.factor, met)
+            meet_roads(p, plane, points, limits, roads, system.factor, met)
             _count_shares(points, met, shares)
             used, scale = _add_roads(plane.unit, points, limits.least_share, shares, system, met)
             if scale != np.inf:
@@ -471,8 +462,6 @@ def adjust(
         # Not done while points are held, or more roads are still being met.
         settled = iteration > (1 if held.query.shape[0] == 0 else _HELD_STEPS)
         if settled and largest * plane.unit < limits.tolerance_m and used <= previous:
-            if slack == 1.0:
-                break
-            slack = 1.0
+            break
         previous = used
     return previous, rms

@@ -31,16 +31,18 @@ _BETTER = 0.02
 #: A k1 counts when it is this many of its standard deviations from 0, and moves the frame's corners by at least this
 #: many pixels.
 _SIGNIFICANCE, _LEAST_PX = 5.0, 5.0
-#: Cells of the frame a side. The fit begins with those around the one where most road points lie
-#: on roads, as far as they do in this part of its share, and about this number of points there are held at first.
+#: Cells of the frame a side. The fit begins with the largest part of the frame in which road points lie on roads as
+#: often as in this part of the best cell's share, and about this number of points there are held at first.
 _CORE, _N_HELD = (10, 0.75), 50
-#: Road points that a fit needs; factor on its uncertainty while it grows.
-FEWEST, _SLACK = 12, 2.0
-#: Values of k1 to begin with in turn, until one explains enough, with about this number of road points.
-_STARTS, _QUICK_POINTS = (0.0, -0.15, -0.08, 0.08), 300
-#: A fit that has met less than this share of the road points is dropped: wrong places end at 0.2 to 0.4, right ones at
-#: 0.75 to 0.9 (training masks).
-_HOPELESS = 0.4
+#: Road points that a fit needs.
+FEWEST = 12
+#: As of `RefineOptions`, while a fit grows. Twice as far each point meets some road, and a part of the frame that meets
+#: wrong ones bends the fit over the others.
+_MAX_RADIUS = (10.0, 5.0)
+#: Values of k1 to begin with in turn, until one explains enough.
+_STARTS = (0.0, -0.15, -0.08, 0.08)
+#: A fit that has met less than this share of the road points is dropped.
+_HOPELESS = 0.3
 
 
 def find_lens(
@@ -52,9 +54,9 @@ def find_lens(
     """
     if agreeing >= ENOUGH and not _hints_at_lens(Equations(matrix, scene, index, refinement, 0.0)):
         return None
-    step, best = max(1, len(scene.points) // _QUICK_POINTS), None
+    best = None
     for start in _STARTS:
-        found = fit_lens(matrix, scene, index, refinement, start=start, step=step)
+        found = fit_lens(matrix, scene, index, refinement, start=start)
         if found is not None and (best is None or found.share > best.share):
             best = found
         if best is not None and best.share >= ENOUGH:
@@ -84,7 +86,6 @@ def fit_lens(
     refinement: RefineOptions,
     k1: float | None = 0.0,
     start: float | None = None,
-    step: int = 1,
 ) -> Refined | None:
     """Adjust a homography and k1 to the roads of the map; None where that fails.
 
@@ -100,11 +101,9 @@ def fit_lens(
         None: without a lens.
     start : float, optional
         Value of k1 to begin with, other than `k1`.
-    step : int
-        Use each `step`-th of the scene's road points.
     """
-    equations = Equations(matrix, scene, index, replace(refinement, least_share=0.0), k1, step)
-    (core,) = np.nonzero(_core(equations.meet(), scene.points[::step], scene.size))
+    equations = Equations(matrix, scene, index, replace(refinement, max_radius=_MAX_RADIUS), k1)
+    (core,) = np.nonzero(_core(equations.meet(), scene.points, scene.size))
     if len(core) < FEWEST:
         return None
     some = core[:: max(1, len(core) // _N_HELD)]
@@ -116,14 +115,15 @@ def fit_lens(
             return None
         equations.p[:] = np.append((homography / homography[2, 2]).ravel()[:8], start)
     held = Held(points, places, 0.5 * equations.weight * len(core) / len(some))
-    found = equations.adjust(NO_PAIRS, held, _SLACK)
+    found = equations.adjust(NO_PAIRS, held)
     return None if found is None or found.share < max(_HOPELESS, FEWEST / len(equations.samples.xy)) else found
 
 
 def _core(met: BoolArray, points: FloatArray, size: tuple[int, int]) -> BoolArray:
     """Return which points (S,) of those that met roads lie in the part of a frame where most did.
 
-    It is made of those cells of the frame, around the best one, in which nearly as great a share did.
+    It is made of cells in which nearly as great a share did as in the best one, and is the part with most such points:
+    a small one may meet roads by chance.
     """
     n, least = _CORE
     column, row = np.clip((points / size * (n, -n)).astype(int), 0, n - 1).T
@@ -134,8 +134,10 @@ def _core(met: BoolArray, points: FloatArray, size: tuple[int, int]) -> BoolArra
     hits, all_points = (9.0 * cv2.blur(one, (3, 3), borderType=cv2.BORDER_CONSTANT) for one in counts)
     shares = hits / np.maximum(all_points, FEWEST)
     good = shares >= least * shares.max()
-    _, parts = cv2.connectedComponents(good.astype(np.uint8), connectivity=4)
-    return np.asarray(met & (parts == parts[np.unravel_index(shares.argmax(), shares.shape)])[row, column])
+    part = cv2.connectedComponents(good.astype(np.uint8), connectivity=4)[1][row, column]
+    n_met = np.bincount(part, met)
+    n_met[0] = 0.0  # of the other cells
+    return np.asarray(met & (part == n_met.argmax()))
 
 
 def _moves_px(found: Refined, scene: Scene) -> float:

@@ -35,8 +35,6 @@ __all__ = [
 ]
 
 
-#: Points whose place is less sure than a third of the sum of metres and pixels do not take part yet.
-_MAX_RADIUS = (20.0, 10.0)
 #: Standard deviation of a road point across the road, the map's in metres and the mask's in pixels, and scale of the
 #: Cauchy weights.
 _SIGMA_M, _SIGMA_PX = 1.2, 0.9
@@ -75,10 +73,13 @@ class RefineOptions:
         Prior standard deviation of the two perspective parameters.
     least_share : float
         A cell of the frame takes part when at least this share of its road points meet roads.
+    max_radius : (float, float)
+        Points whose place is less sure than a third of the sum of metres and pixels do not take part yet.
     """
 
     perspective_sigma: float = 0.5
     least_share: float = 0.5
+    max_radius: tuple[float, float] = (20.0, 10.0)
 
 
 @dataclass(frozen=True)
@@ -175,7 +176,7 @@ class Equations:
         self.samples = RoadSamples(xy, along, _cells(xy), self.weight, half_side)
         self._plane = Plane(self.unit, *self._origin.tolist())
         self._limits = AdjustLimits(
-            _N_CELLS**2, options.least_share, _MAX_RADIUS[0] + _MAX_RADIUS[1] * gsd,
+            _N_CELLS**2, options.least_share, options.max_radius[0] + options.max_radius[1] * gsd,
             MIN_COS, self.sigma_m, _SIGMA_M, _SIGMA_PX / scene.half_size, self.prior, _N_ITERATIONS, _TOLERANCE_M,
         )  # fmt: skip
         n = len(xy)
@@ -203,7 +204,7 @@ class Equations:
     def meet(self) -> BoolArray:
         """Find the roads near all points, and return which points (S,) met one."""
         n = self.met.rows.shape[1]
-        meet_roads(self.p, self._plane, self.samples, self._limits, 0.0, self.roads, np.zeros((n, n)), self.met)
+        meet_roads(self.p, self._plane, self.samples, self._limits, self.roads, np.zeros((n, n)), self.met)
         return np.isfinite(self.met.residuals)
 
     @property
@@ -211,13 +212,11 @@ class Equations:
         """Weights (S,) that keep outliers from a fit; NaN of points that met no road."""
         return np.asarray(1.0 / (1.0 + (self.met.residuals / self.met.sigmas) ** 2))
 
-    def adjust(self, pairs: PointPairs, held: Held, slack: float = 1.0) -> Refined | None:
+    def adjust(self, pairs: PointPairs, held: Held) -> Refined | None:
         """Fit the parameters to roads and to points (see `kernels.adjustment.adjust`); None where that fails."""
         n = self.met.rows.shape[1]
         normal = np.empty((n, n))
-        used, rms = adjust(
-            self.p, self._plane, self.samples, pairs, held, self._limits, slack, self.roads, normal, self.met
-        )
+        used, rms = adjust(self.p, self._plane, self.samples, pairs, held, self._limits, self.roads, normal, self.met)
         if not np.isfinite(rms):
             return None
         normal += np.tril(normal, -1).T

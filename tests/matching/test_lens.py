@@ -11,7 +11,7 @@ from roadgeo.matching import finishing
 from roadgeo.matching.estimator import TripleEstimator
 from roadgeo.matching.events import Events
 from roadgeo.matching.finishing import with_honest_corners
-from roadgeo.matching.lens import find_lens, fit_lens, grow_whole, straighten_scene
+from roadgeo.matching.lens import _core, find_lens, fit_lens, grow_whole, straighten_scene
 from roadgeo.matching.refinement import Refined, RefineOptions, refine
 from roadgeo.matching.search import SearchOptions, search
 
@@ -86,6 +86,24 @@ def test_what_fits_in_one_part_of_the_frame_grows_over_all_of_it_without_a_lens(
     assert found.lens_k1 == 0.0  # else it would be taken for one behind a lens
     assert np.hypot(*(mapped(found.matrix, scene.corners) - corners).T).max() < 2.0
     assert grow_whole(truth, *given) is None  # nothing is gained
+
+
+@pytest.mark.parametrize("seed", [1, 2, 3])
+def test_a_fit_grows_over_the_frame_where_a_fifth_of_the_roads_is_missing_and_two_fifths_are_false(town, seed):
+    truth, straight = sight_of(town[0], seed, tilt=25, sight=Sight(0.6, 0.2, 0.4))
+    scene = through_lens(straight, -0.12)
+    found = find_lens(bent_start(truth, scene, -0.12), scene, town[1], 0.3, RefineOptions())
+    assert found.lens_k1 == pytest.approx(-0.12, abs=0.002)
+    assert np.hypot(*(mapped(found.matrix, scene.corners) - mapped(truth, scene.corners)).T).max() < 2.0
+
+
+def test_a_fit_begins_with_the_largest_part_that_lies_on_roads_not_with_a_small_one_that_does_by_chance():
+    x, y = (one.ravel() for one in np.meshgrid(np.arange(10.0, 1000.0, 20.0), np.arange(10.0, 1000.0, 20.0)))
+    left, corner = x < 500, (x > 800) & (y < 200)
+    met = np.where(left, (x + y) % 100 != 20, corner)  # four of five
+    core = _core(met, np.stack((x, -y), axis=1), (1000, 1000))
+    assert core.sum() > 0.7 * (met & left).sum()
+    assert not core[corner].any()
 
 
 def test_a_wrong_place_does_not_grow(town):

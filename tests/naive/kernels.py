@@ -400,7 +400,7 @@ def add_point(p, half_side, point, place, weight, n):
     return weight * rows.T @ rows, weight * rows.T @ (place - see(p, half_side, point))
 
 
-def meet_roads(p, plane, points, limits, slack, inverse, segments):
+def meet_roads(p, plane, points, limits, inverse, segments):
     """(whether its place is sure enough, row, residual, sigma, own) of each point, None for what there is not."""
     found = []
     for point, direction in zip(points.xy, points.directions, strict=True):
@@ -411,7 +411,7 @@ def meet_roads(p, plane, points, limits, slack, inverse, segments):
         rows = see_rows(p, points.half_side, point)[:, : len(inverse)]
         row = np.array([-along[1], along[0]]) @ rows
         own = own_sigma(reach, limits.sigma_m, limits.map_sigma_m, limits.mask_sigma)
-        sigma = limits.sigma_m * np.sqrt(own**2 + slack**2 * row @ inverse @ row)
+        sigma = limits.sigma_m * np.sqrt(own**2 + row @ inverse @ row)
         if not 3 * sigma <= limits.max_radius * max(1.0, own):
             found.append((False, None, None, None, None))
             continue
@@ -423,7 +423,7 @@ def meet_roads(p, plane, points, limits, slack, inverse, segments):
     return found
 
 
-def adjust(p, free, plane, points, pairs, held, limits, slack, segments):
+def adjust(p, free, plane, points, pairs, held, limits, segments):
     """(p, road points used, rms, normal matrix) of Gauss-Newton steps with Cauchy weights on `free` parameters."""
     shares = np.ones(limits.n_cells)
     previous, rms, normal, half_side = -1, np.inf, None, points.half_side
@@ -444,7 +444,7 @@ def adjust(p, free, plane, points, pairs, held, limits, slack, segments):
             normal, right = normal + more, right + side
         used = []
         if iteration > 0:
-            found = meet_roads(p, plane, points, limits, slack, np.linalg.inv(before), segments)
+            found = meet_roads(p, plane, points, limits, np.linalg.inv(before), segments)
             for cell in range(limits.n_cells):
                 here = [one for one, c in zip(found, points.cells, strict=True) if c == cell and one[0]]
                 shares[cell] = np.mean([one[1] is not None for one in here]) if here else 1.0
@@ -465,9 +465,7 @@ def adjust(p, free, plane, points, pairs, held, limits, slack, segments):
         p = p + np.append(step, np.zeros(9 - free))
         settled = iteration > (6 if len(held.query) else 1)
         if settled and np.abs(step).max() * plane.unit < limits.tolerance_m and len(used) <= previous:
-            if slack == 1.0:
-                break
-            slack = 1.0
+            break
         previous = len(used)
     return p, previous, rms, normal
 
