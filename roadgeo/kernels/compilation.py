@@ -45,7 +45,9 @@ _LOG = logging.getLogger(__name__)
 #: The newest numba whose private parts `machine_code` was tried with; kernels of later ones are left to numba whole.
 _NEWEST_NUMBA = (0, 68)
 
-#: Divisions are not looked at for a zero, may become products, and products with sums one instruction: a tenth quicker.
+#: Of kernels that match: divisions are not looked at for a zero, may become products, and products with sums one
+#: instruction. That is a tenth quicker. Kernels that draw a map compute as they are written, for it must be the same on
+#: every machine.
 _OPTIONS: dict[str, Any] = {"error_model": "numpy", "fastmath": {"contract", "arcp", "nsz"}}
 
 _lock = threading.RLock()
@@ -82,8 +84,9 @@ class Kernel:
 
     def __init__(self, function: Callable[..., Any], options: dict[str, Any], writes: tuple[str, ...] = ()) -> None:
         functools.update_wrapper(self, function)
-        self.function, self.options = function, {**_OPTIONS, **options}
         self.name, self.module = function.__name__, function.__module__
+        usual = _OPTIONS if self.module.rpartition(".")[2] in _MATCHING else {}
+        self.function, self.options = function, {**usual, **options}
         self.arguments, self.result = _kinds(function, writes)
         self._run: Callable[..., Any] | None = None
 
@@ -211,16 +214,11 @@ def _kinds(function: Callable[..., Any], writes: tuple[str, ...]) -> tuple[tuple
 
 # --- machine code kept ------------------------------------------------------------------------------------------------
 
-#: Modules whose kernels every search needs. Those of the paper's method are compiled when it is asked for.
-_SEARCH = (
-    "simplification",
-    "parallel_roads",
-    "thinning",
-    "tracing",
-    "intersections",
-    "buckets",
+#: Modules whose kernels every search needs: those that draw masks and maps, and those that match them. Those of the
+#: paper's method are compiled when it is asked for.
+_DRAWING = ("simplification", "parallel_roads", "thinning", "tracing", "intersections", "buckets", "triple_codes")
+_MATCHING = (
     "roads",
-    "triple_codes",
     "triples",
     "point_matching",
     "growth",
@@ -236,7 +234,7 @@ _kept_alive: list[Any] = []
 
 def modules_of_the_search() -> list[str]:
     """Names of the modules whose kernels every search needs."""
-    return [f"roadgeo.kernels.{name}" for name in _SEARCH]
+    return [f"roadgeo.kernels.{name}" for name in (*_DRAWING, *_MATCHING)]
 
 
 def entries(module: str) -> list[Kernel]:

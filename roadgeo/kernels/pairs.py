@@ -20,7 +20,7 @@ class PairBuckets(NamedTuple):
     shape: tuple[int, int]
 
 
-@kernel()
+@kernel(error_model="numpy")
 def _nearest(buckets: PairBuckets, x: float, y: float, code: int, radius: float) -> int:
     """Return the place of the reference intersection of type `code` nearest to (x, y) within `radius`, or -1."""
     xy, codes, starts, grid, shape = buckets
@@ -41,7 +41,7 @@ def _nearest(buckets: PairBuckets, x: float, y: float, code: int, radius: float)
     return found
 
 
-@kernel()
+@kernel(error_model="numpy")
 def count_inliers(
     models: Floats3, xy: Floats2, codes: Ints1, buckets: PairBuckets, radius: float, one_to_one: bool, best: int
 ) -> tuple[int, int]:
