@@ -9,7 +9,6 @@ import math
 from collections import Counter
 from collections.abc import Sequence
 from dataclasses import asdict, dataclass, replace
-from functools import cached_property
 from pathlib import Path
 from typing import Any
 
@@ -275,6 +274,7 @@ class _Course:
     ) -> None:
         self.events, self.search, self.result = events, search, result
         self.location, self.needed = location, needed
+        self.funnel = self._count()  # before further places are compared, to be shown
         self._look_elsewhere()
         scored = events.of("scored")
         self.refusals = Counter(
@@ -319,8 +319,8 @@ class _Course:
                 kept.append(entry)
         return kept
 
-    @cached_property
-    def funnel(self) -> Funnel:
+    def _count(self) -> Funnel:
+        """Count what came out of each stage of the search."""
         search, events = self.search, self.events
         screened, voted = events.of("screened"), events.of("voted")
         proposed = sum(count for _, count in voted)  # all of them lie on roads

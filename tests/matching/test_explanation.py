@@ -14,9 +14,12 @@ from roadgeo.cli import main
 from roadgeo.geometry.camera import CameraOptions
 from roadgeo.geometry.mask import RoadMask, plane_to_pixel
 from roadgeo.geometry.projection import to_lonlat
-from roadgeo.matching.explanation import SCHEMA, Explanation
+from roadgeo.matching.explanation import SCHEMA, Explanation, tell
 from roadgeo.matching.index import build_index
+from roadgeo.matching.methods import search_references
+from roadgeo.matching.scene import read_query
 from roadgeo.matching.search import SearchOptions
+from roadgeo.matching.verdict import decide, needed_of
 from roadgeo.outputs.explanation_sheet import AGREES, STARVED, draw_explanation, write_explanation_picture
 from roadgeo.outputs.paths import output_paths
 from roadgeo.outputs.subject import Subject
@@ -58,6 +61,16 @@ def lattice():
     at = np.arange(40) * 90.0
     ways = [LineString([(x, 0), (x, at[-1])]) for x in at] + [LineString([(0, y), (at[-1], y)]) for y in at]
     return reference_of(build_network(ways, PLANE, {"name": "lattice"}))
+
+
+def test_places_that_are_compared_to_be_shown_do_not_count_as_measured(lattice):
+    """The funnel is that of the search, not of its explanation."""
+    query, options = read_query(mask_of(lattice.network)), LocateOptions()
+    (found,) = search_references(query, lattice.parts, options, 60.0, explained=True)
+    measured = found.events.estimator.n_nulls
+    assert len(found.events.estimator.verified) > measured
+    story = tell(query, found, decide(query, [found], options), needed_of(options))
+    assert story.funnel.measured == measured
 
 
 def with_camera(**limits) -> LocateOptions:
