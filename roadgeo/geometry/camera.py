@@ -144,17 +144,22 @@ def _pinholes(matrix: FloatArray, size: tuple[int, int], focal_px: float | None)
     For each focal length f the columns of diag(1/f, 1/f, 1) G, G the inverse map with the frame's middle as origin,
     should be perpendicular and equally long (Hartley & Zisserman, 8.1.1).
     """
-    center = Frame(*size).plane_center
-    shift = np.array([[1.0, 0.0, -center[0]], [0.0, 1.0, -center[1]], [0.0, 0.0, 1.0]])
-    g = shift @ np.linalg.inv(matrix)
+    (a, b, c), (d, e, f), (g, h, i) = matrix.tolist()
+    x, y = size[0] / 2.0, -size[1] / 2.0
+    # The columns of the inverse, but for a factor, and the frame's middle taken off.
+    u0, v0, w0 = e * i - f * h, f * g - d * i, d * h - e * g
+    u1, v1, w1 = c * h - b * i, a * i - c * g, b * g - a * h
+    u0, v0, u1, v1 = u0 - x * w0, v0 - y * w0, u1 - x * w1, v1 - y * w1
     focal = np.array([focal_px]) if focal_px else _FOCAL_STEPS * math.hypot(*size) / 2.0
     # columns of diag(1/f, 1/f, 1) G, up to the factor 1/f
-    aa = g[0, 0] ** 2 + g[1, 0] ** 2 + (focal * g[2, 0]) ** 2
-    bb = g[0, 1] ** 2 + g[1, 1] ** 2 + (focal * g[2, 1]) ** 2
-    ab = g[0, 0] * g[0, 1] + g[1, 0] * g[1, 1] + focal**2 * g[2, 0] * g[2, 1]
-    skew = np.maximum(np.abs(ab) / np.sqrt(aa * bb), 0.5 * np.abs(np.log(aa / bb)))
-    vertical = g[0, 0] * g[1, 1] - g[1, 0] * g[0, 1]  # z of their cross product, whose length is sqrt(aa bb - ab^2)
-    cosine = abs(vertical) / np.sqrt(np.maximum(aa * bb - ab**2, 1e-300))
+    square = focal**2
+    aa = u0 * u0 + v0 * v0 + square * (w0 * w0)
+    bb = u1 * u1 + v1 * v1 + square * (w1 * w1)
+    ab = u0 * u1 + v0 * v1 + square * (w0 * w1)
+    product = aa * bb
+    skew = np.maximum(np.abs(ab) / np.sqrt(product), 0.5 * np.abs(np.log(aa / bb)))
+    vertical = u0 * v1 - v0 * u1  # z of their cross product, whose length is sqrt(aa bb - ab^2)
+    cosine = abs(vertical) / np.sqrt(np.maximum(product - ab**2, 1e-300))
     return _Pinholes(focal, skew, np.degrees(np.arccos(np.minimum(1.0, cosine))))
 
 

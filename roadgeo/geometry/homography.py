@@ -68,9 +68,10 @@ class Homography:
 
     def by_elements(self, xy: FloatArray) -> FloatArray:
         """Return the (N, 2, 8) derivative of mapped points by the matrix's elements but the last, at (N, 2) points."""
-        points, image = np.asarray(xy, float), self.everywhere(xy)
-        rows = np.column_stack([points, np.ones(len(points))]) / self._homogeneous(points)[:, 2:]
-        derivative = np.zeros((len(points), 2, 8))
+        mapped, rows = self._homogeneous(xy), np.ones((len(xy), 3))
+        rows[:, :2] = xy
+        rows /= mapped[:, 2:]
+        image, derivative = mapped[:, :2] / mapped[:, 2:], np.zeros((len(xy), 2, 8))
         derivative[:, 0, 0:3] = derivative[:, 1, 3:6] = rows
         derivative[:, :, 6:8] = -image[:, :, None] * rows[:, None, :2]
         return derivative

@@ -43,6 +43,8 @@ class Lens:
 
     def straighten(self, points: FloatArray) -> FloatArray:
         """Take (..., 2) points as the lens shows them to where a pinhole would have put them."""
+        if self.k1 == 0.0:
+            return np.asarray(points, float)
         offset = (points - self.center) / self.half_side
         seen = np.hypot(offset[..., 0], offset[..., 1])
         scale = np.divide(self._radius(seen), seen, out=np.ones_like(seen), where=seen > 0)

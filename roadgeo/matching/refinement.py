@@ -120,7 +120,7 @@ def normalise(matrix: FloatArray, center: FloatArray, half_size: float) -> tuple
     """
     homography = Homography(matrix)
     origin = homography.everywhere(center)
-    unit = half_size * float(np.sqrt(abs(np.linalg.det(homography.jacobian(center)))))
+    unit = half_size * math.sqrt(abs(homography.area_scale(*center.tolist())))
     to_query = np.array([[half_size, 0.0, center[0]], [0.0, half_size, center[1]], [0.0, 0.0, 1.0]])
     from_reference = np.array([[1.0, 0.0, -origin[0]], [0.0, 1.0, -origin[1]], [0.0, 0.0, unit]])
     p = from_reference @ matrix @ to_query
@@ -164,16 +164,17 @@ class Equations:
         """Each `step`-th road point takes part. Without a `k1` the camera is a pinhole, and stays one."""
         self.scene, self.options, self.roads = scene, options, index.road_buckets
         p, self._origin, self.unit = normalise(matrix, scene.center, scene.half_size)
-        self.p, free = np.append(p, k1 or 0.0), 8 if k1 is None else 9
+        self.p, free = np.array([*p, k1 or 0.0]), 8 if k1 is None else 9
         self.gsd = gsd = self.unit / scene.half_size
         self.sigma_m = math.hypot(_SIGMA_M, _SIGMA_PX * gsd)
-        sigmas = np.array([self.options.perspective_sigma] * 2 + [_K1_SIGMA])
-        self.prior = np.append(np.zeros(6), (self.sigma_m / self.unit / sigmas) ** 2)
+        self.prior = np.zeros(9)
+        self.prior[6:8] = (self.sigma_m / self.unit / options.perspective_sigma) ** 2
+        self.prior[8] = (self.sigma_m / self.unit / _K1_SIGMA) ** 2
         spacing_m = scene.road_length_px * gsd / max(len(scene.points), 1)
         self.weight = min(1.0, spacing_m * step / _CORRELATION_M)
-        xy, along = self.normalised(scene.points[::step]), np.ascontiguousarray(scene.directions[::step])
+        xy, along, cells = _samples(scene, step)
         half_side = max(scene.size) / 2.0 / scene.half_size
-        self.samples = RoadSamples(xy, along, _cells(xy), self.weight, half_side)
+        self.samples = RoadSamples(xy, along, cells, self.weight, half_side)
         self._plane = Plane(self.unit, *self._origin.tolist())
         self._limits = AdjustLimits(
             _N_CELLS**2, options.least_share, options.max_radius[0] + options.max_radius[1] * gsd,
@@ -185,7 +186,7 @@ class Equations:
     @property
     def homography(self) -> Homography:
         """The normalised homography."""
-        return Homography(np.append(self.p[:8], 1.0).reshape(3, 3))
+        return Homography(np.array([*self.p[:8], 1.0]).reshape(3, 3))
 
     def normalised(self, points: FloatArray) -> FloatArray:
         """Normalise points (N, 2) of the query plane."""
@@ -234,6 +235,13 @@ class Equations:
         derivatives = self.homography.by_elements(self.normalised(self.scene.corners)).reshape(8, 8)
         floor = _SIGMA_FLOOR[0] ** 2 + (_SIGMA_FLOOR[1] * self.gsd) ** 2
         return np.asarray(derivatives @ covariance @ derivatives.T * self.unit**2 + 0.5 * floor * np.eye(8))
+
+
+@lru_cache(maxsize=8)
+def _samples(scene: Scene, step: int) -> tuple[FloatArray, FloatArray, IntArray]:
+    """Return each `step`-th road point (S, 2), normalised, the road's direction there (S, 2), and its cell (S,)."""
+    xy = (scene.points[::step] - scene.center) / scene.half_size
+    return xy, np.ascontiguousarray(scene.directions[::step]), _cells(xy)
 
 
 def _cells(uv: FloatArray) -> IntArray:

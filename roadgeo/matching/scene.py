@@ -5,6 +5,7 @@ from __future__ import annotations
 import math
 import time
 from dataclasses import dataclass, replace
+from functools import cached_property
 from pathlib import Path
 
 import cv2
@@ -47,9 +48,9 @@ MIN_COS = math.cos(math.radians(25.0))
 _NEAR = (-1, 0, 1)
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, eq=False)
 class Scene:
-    """One query, in the query plane (pixels, y up).
+    """One query, in the query plane (pixels, y up); equal to itself only.
 
     Dimensions: N intersections, K neighbours, S road points, (h, w) cells of the reduced frame.
 
@@ -95,17 +96,17 @@ class Scene:
     observed: BoolArray
     road_width_px: float = 0.0
 
-    @property
+    @cached_property
     def center(self) -> FloatArray:
         """(2,) middle of the frame."""
         return Frame(*self.size).plane_center
 
-    @property
+    @cached_property
     def corners(self) -> FloatArray:
         """(4, 2) corners TL, TR, BR, BL of the frame."""
         return Frame(*self.size).plane_corners
 
-    @property
+    @cached_property
     def half_size(self) -> float:
         """Half the frame's diagonal in pixels."""
         return Frame(*self.size).half_diagonal
