@@ -8,7 +8,8 @@ each.
 
 from __future__ import annotations
 
-from importlib.metadata import EntryPoint, entry_points
+from functools import lru_cache
+from importlib.metadata import Distribution, EntryPoint, entry_points
 from typing import Any
 
 from roadgeo.errors import PluginError, RoadgeoError
@@ -34,7 +35,13 @@ def find_plugins(group: str) -> dict[str, EntryPoint]:
 
 def package_of(plugin: EntryPoint) -> str:
     """Name the package that offers a plugin."""
-    return plugin.dist.name if plugin.dist else ""
+    return _name(plugin.dist) if plugin.dist else ""
+
+
+@lru_cache(maxsize=64)
+def _name(package: Distribution) -> str:
+    """Name a package: read once for all that it offers, for its whole description is parsed for it."""
+    return package.name
 
 
 def load_plugin(group: str, name: str) -> Any:

@@ -157,8 +157,8 @@ def _find_line(roads: BoolArray, width: float, options: BorderOptions) -> _Line 
     return max((line for cover, line in found if cover >= 0.97 * best), key=lambda line: line.depth)
 
 
-def _covers(roads: BoolArray, deep: int, slopes: FloatArray) -> list[FloatArray]:
-    """Return which share of each of the first `deep` rows (deep,) is road, rows sloping by `slopes`."""
+def _covers(roads: BoolArray, deep: int, slopes: FloatArray) -> FloatArray:
+    """Return which share of each of the first `deep` rows is road, rows sloping by `slopes` (S,): (S, deep)."""
     wide = roads.shape[1]
     shifts = np.rint(slopes[:, None] * (np.arange(wide) - wide / 2)).astype(np.int64)
     most = int(np.abs(shifts).max())
@@ -166,12 +166,13 @@ def _covers(roads: BoolArray, deep: int, slopes: FloatArray) -> list[FloatArray]
     sums = np.zeros((wide + 1, deep + 2 * most), np.int32)
     np.cumsum(np.ascontiguousarray(roads[:deep].T), axis=0, out=sums[1:, most : most + deep])
     windows = np.lib.stride_tricks.sliding_window_view(sums, deep, axis=1)
-    covers = []
-    for shift in shifts + most:
-        starts = np.flatnonzero(np.diff(shift, prepend=-1))
-        stops = np.append(starts[1:], wide)
-        covers.append((windows[stops, shift[starts]] - windows[starts, shift[starts]]).sum(axis=0) / wide)
-    return covers
+    shifts += most
+    slope, starts = np.nonzero(np.diff(shifts, axis=1, prepend=-1))
+    stops = np.append(starts[1:], 0)
+    stops[stops == 0] = wide  # the next slope begins
+    shift = shifts[slope, starts]
+    runs = windows[stops, shift] - windows[starts, shift]
+    return np.asarray(np.add.reduceat(runs, np.flatnonzero(starts == 0)) / wide)
 
 
 def _innermost(cover: FloatArray, beyond: int, options: BorderOptions) -> int | None:
