@@ -15,12 +15,12 @@ from roadgeo.errors import RoadSourceError
 from roadgeo.geometry.mask import RoadMask
 from roadgeo.kernels.warmup import warm_up
 from roadgeo.location import Location
-from roadgeo.matching.explanation import Explanation, tell, true_place
+from roadgeo.matching.explanation import Explanation, tell
 from roadgeo.matching.index import build_index
 from roadgeo.matching.methods import Found, search_references
 from roadgeo.matching.options import LocateOptions
 from roadgeo.matching.scene import Query, read_query
-from roadgeo.matching.verdict import decide, needed_of
+from roadgeo.matching.verdict import decide
 from roadgeo.reference.reference import AnyReference, BuildOptions, Reference, build_network, open_whole, stored_options
 from roadgeo.roads.kinds import RoadKind
 from roadgeo.roads.labels import label_roads
@@ -183,9 +183,8 @@ def explain(
     options, references = options or LocateOptions(), _as_list(reference)
     query = _read(mask)
     found = _search(query, references, options, explained=True)
-    needed, truth = needed_of(options), true_place(query.name, options)
-    stories = [tell(query, one, decide(query, [one], options), needed, truth) for one in found]
-    return Explanation(decide(query, found, options), query.scene, query.graph, tuple(stories))
+    stories = tuple(tell(query, one, options) for one in found)
+    return Explanation(decide(query, found, options), query.scene, query.graph, stories)
 
 
 def _as_list(reference: AnyReference | Sequence[AnyReference]) -> list[AnyReference]:

@@ -150,7 +150,7 @@ class _Judge:
         scene = self.scene if n_points else self.without_twins(start)
         matched = np.full(len(self.scene.intersections), -1)
         for _ in range(3):
-            matched, _ = match_intersections(matrix, self.scene, self.index, self.gsd)
+            matched, _ = match_intersections(matrix, self.scene, self.index)
             step = refine(matrix, scene, self.index, matched, self.refine_options, n_points, held=True)
             if step is None or not self.gap(step.matrix, start) < _MAX_DRIFT_M:
                 break
@@ -179,7 +179,7 @@ class _Judge:
 
     def agreeing(self, matrix: FloatArray) -> float:
         """Return the share of the roads, of mask and map, that agree."""
-        found, _, _ = agreement(matrix, self.scene, self.index, self.gsd)
+        found, _, _ = agreement(matrix, self.scene, self.index)
         return (found.forward + found.backward) / 2.0
 
     def displacement(self, place: _Place) -> Displacement:

@@ -14,14 +14,14 @@ from roadgeo.geometry.areas import Box, lies_in
 from roadgeo.geometry.camera import CameraFault, CameraOptions, judge, sampling
 from roadgeo.geometry.homography import Homography
 from roadgeo.geometry.projection import to_lonlat
-from roadgeo.matching.events import Events, Ledger, Scored, Work
-from roadgeo.matching.evidence import Evidence, match_intersections
+from roadgeo.matching.events import Events, Ledger, Scored
+from roadgeo.matching.evidence import Evidence
 from roadgeo.matching.exhaustive import is_told, propose_everywhere
 from roadgeo.matching.growing import Hypothesis, SharedSweeps, grow_proposals, screen_proposals
 from roadgeo.matching.index import ReferenceIndex
 from roadgeo.matching.lens import ENOUGH, find_lens, grow_whole, straighten_scene
 from roadgeo.matching.refinement import RefineOptions, refine
-from roadgeo.matching.road_search import Grown, RoadSearch
+from roadgeo.matching.road_search import RoadSearch
 from roadgeo.matching.scene import Scene
 from roadgeo.matching.triples import BEFORE_ROADS, WITHOUT_ROADS, Proposals, Sweep, larger
 
@@ -42,6 +42,10 @@ _LEADING = 2.0
 _LEAST_SHARE_BY_ROADS = 0.2
 #: How far a proposal, made of three intersections, may turn the image's up from where it points.
 _ROUGHLY_DEG = 25.0
+#: Seconds that each step takes, roughly, measured on lattices, where searches are longest: an intersection of the query
+#: that is looked for, a triple of the map like one of the query's, a place that is screened or voted for, a hypothesis
+#: that grows, and one that is compared with the map, with each road point.
+_ROUND_S, _TUPLE_S, _PLACE_S, _GROWN_S, _VERIFIED_S, _VERIFIED_POINT_S = 2e-3, 0.5e-6, 1.5e-6, 0.5e-3, 1e-3, 3.5e-6
 
 
 @dataclass(frozen=True)
@@ -141,17 +145,16 @@ class TripleEstimator:
         for matrix in propose_everywhere(scene, index, options.camera, self.near):
             self._is_everywhere = True
             self.n_hypotheses += 1
-            matched, _ = match_intersections(matrix, scene, index, sampling(matrix, scene.size))
-            hypothesis = Hypothesis(matrix, 1.0, matched, by_roads=True)
+            hypothesis = Hypothesis.at(matrix, scene, index)
             self.events.note("grown", [hypothesis.matrix])
             yield [hypothesis] if self._is_plausible(hypothesis) else []
 
     @property
     def work(self) -> float:
-        """Seconds that a usual machine takes for the work done (see `search.Estimator`)."""
-        points = len(self.scene.dense_points)
-        counts = (self._n_rounds, self.n_candidates, self.n_screened, self.n_hypotheses, self.n_verified, points)
-        return Work(*counts).seconds
+        """Seconds that a usual machine takes for the work done (see `search.Estimator`), on one core."""
+        verified_s = _VERIFIED_S + _VERIFIED_POINT_S * len(self.scene.dense_points)
+        tried_s = _ROUND_S * self._n_rounds + _TUPLE_S * self.n_candidates + _PLACE_S * self.n_screened
+        return tried_s + _GROWN_S * self.n_hypotheses + verified_s * self.n_verified
 
     @property
     def n_anchors(self) -> int:
@@ -177,9 +180,10 @@ class TripleEstimator:
                 self._look_for(anchor)
                 self.events.note("voted", anchor, n_proposed)
             fresh: list[Hypothesis] = []
-            for hypothesis in map(self._of_roads, grown):
-                is_known = any(self._is_found_again(one, hypothesis) for one in known)
-                if not is_known and not any(self.same(one, hypothesis) for one in fresh):
+            for one in grown:
+                hypothesis = Hypothesis.at(one.matrix / one.matrix[2, 2], self.scene, self.index, one.closeness)
+                is_known = any(self._is_found_again(other, hypothesis) for other in known)
+                if not is_known and not any(self.same(other, hypothesis) for other in fresh):
                     fresh += [hypothesis] * self._is_plausible(hypothesis)
             known += fresh
             self.events.note("grown", [one.matrix for one in fresh])
@@ -196,12 +200,6 @@ class TripleEstimator:
         if hypothesis.fault is not None:
             self.events.note("refused", hypothesis.fault, hypothesis.matrix)
         return hypothesis.fault is None
-
-    def _of_roads(self, grown: Grown) -> Hypothesis:
-        """Make a hypothesis of a place that grew by roads, with the intersections that match."""
-        scene, matrix = self.scene, grown.matrix / grown.matrix[2, 2]
-        matched, _ = match_intersections(matrix, scene, self.index, sampling(matrix, scene.size))
-        return Hypothesis(matrix, grown.closeness, matched, by_roads=True)
 
     def _is_found_again(self, known: Hypothesis, hypothesis: Hypothesis) -> bool:
         """Whether a verified place that is promising was proposed by another intersection as well."""
@@ -304,9 +302,8 @@ class TripleEstimator:
 
     def _charge(self, model: Hypothesis) -> None:
         """Give a hypothesis its odds: by how much it explains more than others do, less the places tried."""
-        model.n_tried = self.ledger.n_tried
         most = max(model.nearby or 0.0, self._most_elsewhere(model), 0.0)
-        model.log10_odds = model.log10_likelihood - most - math.log10(max(model.n_tried, 1))
+        model.log10_odds = model.log10_likelihood - most - math.log10(max(self.ledger.n_tried, 1))
 
     def _most_elsewhere(self, model: Hypothesis) -> float:
         """Return the log10 likelihood of the best other place that was met."""

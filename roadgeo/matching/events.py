@@ -12,7 +12,7 @@ if TYPE_CHECKING:
     from roadgeo.matching.search import Search
 
 
-__all__ = ["Events", "Ledger", "Scored", "Work"]
+__all__ = ["Events", "Ledger", "Scored"]
 
 
 class Scored(NamedTuple):
@@ -52,14 +52,6 @@ class Events:
         return [what[0] if len(what) == 1 else tuple(what) for what in found]
 
 
-# Seconds that each step takes one core of a usual machine, roughly; measured on lattices, where searches are longest.
-_ROUND = 2e-3
-_TUPLE = 0.5e-6
-_PLACE = 1.5e-6
-_GROWN = 0.5e-3
-_VERIFIED, _VERIFIED_POINT = 1e-3, 3.5e-6
-
-
 @dataclass
 class Ledger:
     """Places tried in one search, on all of its parts together: each of them could have agreed by chance."""
@@ -68,20 +60,3 @@ class Ledger:
     n_tried: int = 0
     n_by_triples: int = 0  # those that triples proposed
     beside: float = 1.0  # tried on the whole map for each that is tried here (see `LocateOptions.elsewhere`)
-
-
-class Work(NamedTuple):
-    """Counts of a search, which measure its work, the same on every machine, busy or idle."""
-
-    rounds: int  # intersections of the query that were tried
-    tuples: int  # of the map, that were like those of the query
-    places: int  # screened or voted for
-    grown: int  # hypotheses
-    verified: int  # those compared with the map
-    points: int  # road points of the query that each was compared by
-
-    @property
-    def seconds(self) -> float:
-        """The time on one core of a usual machine."""
-        tried = _ROUND * self.rounds + _TUPLE * self.tuples + _PLACE * self.places + _GROWN * self.grown
-        return tried + (_VERIFIED + _VERIFIED_POINT * self.points) * self.verified

@@ -25,6 +25,7 @@ from functools import lru_cache
 import numpy as np
 
 from roadgeo._arrays import FloatArray, IntArray
+from roadgeo.geometry.camera import sampling
 from roadgeo.geometry.homography import Homography
 from roadgeo.kernels.point_matching import match_all
 from roadgeo.kernels.roads import count_residuals, road_residuals, shares_near_roads
@@ -186,7 +187,7 @@ class Evidence:
         worth = seen @ of_query[sigma, false] + mapped @ of_map[sigma, missing]
         row, column = np.divmod(np.arange(rows * columns), columns)
         middles = np.stack(((column + 0.5) * side, -(row + 0.5) * side), axis=1)
-        scales = np.sqrt(np.abs(np.linalg.det(Homography(matrix).jacobian(middles)))) / _sampling(matrix, scene)
+        scales = np.sqrt(np.abs(np.linalg.det(Homography(matrix).jacobian(middles)))) / sampling(matrix, scene.size)
         near = np.nan_to_num(scales, nan=math.inf) < _FAR
         both = np.minimum(seen.sum(axis=1), mapped.sum(axis=1)) * near
         if not both.any():
@@ -198,7 +199,7 @@ class Evidence:
     def _count(self, matrix: FloatArray, piece_px: float, shape: tuple[int, int]) -> tuple[FloatArray, FloatArray]:
         """Return histograms of the residuals of the query's roads and of the map's, pixels of road, (P, bins) each."""
         scene, index = self.scene, self.index
-        scale = _sampling(matrix, scene) / self.gsd_m
+        scale = sampling(matrix, scene.size) / self.gsd_m
         ground, step_m = Homography(matrix).everywhere(scene.corners), max(STEP_M, scene.field_scale * self.gsd_m)
         seen, mapped = (np.empty((shape[0] * shape[1], _BINS + 1)) for _ in range(2))
         count_residuals(
@@ -238,7 +239,7 @@ class Evidence:
         (x, y, radius), plane metres.
         """
         scene = self.scene
-        reach_m = 2.0 * self._sigma_m * _sampling(matrix, scene) / self.gsd_m
+        reach_m = 2.0 * self._sigma_m * sampling(matrix, scene.size) / self.gsd_m
         shifts = np.concatenate(
             (self._spiral(reach_m, n_shifts), self._onto_neighbours(matrix, reach_m, near, n_anchors))
         )
@@ -290,28 +291,19 @@ def tolerance_m(gsd_m: float) -> float:
     return 3.0 * math.hypot(MAP_SIGMA_M, PIXEL_SIGMA_PX * gsd_m)
 
 
-def match_intersections(
-    matrix: FloatArray, scene: Scene, index: ReferenceIndex, gsd_m: float
-) -> tuple[IntArray, FloatArray]:
+def match_intersections(matrix: FloatArray, scene: Scene, index: ReferenceIndex) -> tuple[IntArray, FloatArray]:
     """Return the map's intersection that each of the query's is (N,), or -1, and metres between them (N,)."""
     found = scene.intersections
     matched, distance = np.empty(len(found), np.int64), np.empty(len(found))
-    reach_m = 1.5 * tolerance_m(gsd_m)
+    reach_m = 1.5 * tolerance_m(sampling(matrix, scene.size))
     match_all(matrix, found.xy, scene.branches, reach_m, MIN_COS, index.point_buckets, matched, distance)
     return matched, distance
 
 
-def agreement(
-    matrix: FloatArray, scene: Scene, index: ReferenceIndex, gsd_m: float
-) -> tuple[Agreement, IntArray, FloatArray]:
+def agreement(matrix: FloatArray, scene: Scene, index: ReferenceIndex) -> tuple[Agreement, IntArray, FloatArray]:
     """Return what agrees at a place, and which intersections are matched, and how well (see `match_intersections`)."""
-    matched, distance = match_intersections(matrix, scene, index, gsd_m)
-    return Evidence(scene, index, gsd_m).agreement(matrix, matched), matched, distance
-
-
-def _sampling(matrix: FloatArray, scene: Scene) -> float:
-    width, height = scene.size
-    return math.sqrt(abs(Homography(matrix).area_scale(width / 2, -height / 2)))
+    matched, distance = match_intersections(matrix, scene, index)
+    return Evidence(scene, index, sampling(matrix, scene.size)).agreement(matrix, matched), matched, distance
 
 
 def _shifted(matrix: FloatArray, shift: FloatArray) -> FloatArray:

@@ -29,10 +29,10 @@ from roadgeo.matching.methods import Found
 from roadgeo.matching.options import LocateOptions
 from roadgeo.matching.scene import MIN_COS, Query, Scene
 from roadgeo.matching.search import Search
-from roadgeo.matching.verdict import Needed, center_of
+from roadgeo.matching.verdict import center_of, decide
 from roadgeo.roads.graph import RoadGraph
 
-__all__ = ["SCHEMA", "Explanation", "Funnel", "RejectedPlace", "Story", "TruthStory", "tell", "true_place"]
+__all__ = ["SCHEMA", "Explanation", "Funnel", "RejectedPlace", "Story", "TruthStory", "tell"]
 
 SCHEMA = "roadgeo.explanation/1"
 
@@ -167,6 +167,8 @@ class Story:
     ----------
     stopped : str
         As in `Search`; "elsewhere": a place on another reference ended it, "": there was nothing to search for.
+    needed : dict
+        The log10 odds and the margin that are asked for.
     camera_refusals : dict
         How often which reason kept a place that had grown from being verified.
     starved_at : str or None
@@ -175,7 +177,7 @@ class Story:
 
     reference: str
     stopped: str
-    needed: Needed
+    needed: dict[str, float]
     funnel: Funnel
     camera_refusals: dict[str, int]
     starved_at: str | None
@@ -185,10 +187,9 @@ class Story:
 
     def to_dict(self) -> dict[str, Any]:
         """Plain values, ready for `json.dumps`."""
-        values = {name: getattr(self, name) for name in ("reference", "stopped", "camera_refusals", "starved_at")}
+        plain = ("reference", "stopped", "needed", "camera_refusals", "starved_at")
         return {
-            **values,
-            "needed": asdict(self.needed),
+            **{name: getattr(self, name) for name in plain},
             "funnel": asdict(self.funnel),
             "missing": list(self.missing),
             "places": [place.to_dict() for place in self.places],
@@ -241,13 +242,10 @@ class Explanation:
         }
 
 
-def tell(
-    query: Query, found: Found, location: Location, needed: Needed, truth: tuple[float, float] | None = None
-) -> Story:
-    """Describe the search on one reference; `location` is its answer on that reference alone.
-
-    `truth` is longitude and latitude of the true place, where that is known.
-    """
+def tell(query: Query, found: Found, options: LocateOptions) -> Story:
+    """Describe the search on one reference."""
+    location = decide(query, [found], options)  # its answer on that reference alone
+    needed = {"log10_odds": options.min_log10_odds, "margin": options.min_margin}
     n, name, located, events = len(query.scene.intersections), found.index.name, location.located, found.events
     search, result, stats = events.estimator, events.result, found.stats
     if search is None or result is None:  # there was nothing to search for, or another method searched
@@ -256,13 +254,14 @@ def tell(
         missing: tuple[str, ...] = () if located else (location.reason,)
         story = Story(name, "", needed, funnel, {}, None if located else ended, missing)
     else:
-        course = _Course(events, search, result, location, needed)
+        course = _Course(events, search, result, location, options)
         counts = {fault.value: times for fault, times in course.refusals.most_common()}
         starved, missing = (None, ()) if located else (course.starved, tuple(course.missing()))
         story = Story(name, result.stopped, needed, course.funnel, counts, starved, missing, course.places)
+    truth = _true_place(query.name, options)
     if truth is None:
         return story
-    told = tell_truth(truth, events, location, needed)
+    told = tell_truth(truth, events, location, options)
     return replace(story, truth=told, missing=story.missing if told.lost_at is None else (told.said, *story.missing))
 
 
@@ -270,10 +269,15 @@ class _Course:
     """The course of a search: its events, counted and described."""
 
     def __init__(
-        self, events: Events, search: TripleEstimator, result: Search[Hypothesis], location: Location, needed: Needed
+        self,
+        events: Events,
+        search: TripleEstimator,
+        result: Search[Hypothesis],
+        location: Location,
+        options: LocateOptions,
     ) -> None:
         self.events, self.search, self.result = events, search, result
-        self.location, self.needed = location, needed
+        self.location, self.needed, self.margin = location, options.min_log10_odds, options.min_margin
         self.funnel = self._count()  # before further places are compared, to be shown
         self._look_elsewhere()
         scored = events.of("scored")
@@ -300,14 +304,14 @@ class _Course:
         compared = []
         for fault, unscaled in [one for one in self.events.of("refused") if one[0] in _NEGOTIABLE][:_MAX_REFUSED]:
             matrix = unscaled / unscaled[2, 2]
-            found, matched, _ = agreement(matrix, scene, index, sampling(matrix, scene.size))
+            found, matched, _ = agreement(matrix, scene, index)
             compared.append((found.rate + found.forward, fault, Hypothesis(matrix, 0.0, matched)))
         compared.sort(key=lambda entry: -entry[0])
         return [Scored(model, free.score(model), fault) for _, fault, model in compared[:_MAX_PLACES]]
 
     def _rank(self, entry: Scored) -> tuple[bool, float]:
         """Sort by odds; places that the camera refused come last, unless that alone kept them from being the answer."""
-        return entry.fault is not None and entry.log10_odds < self.needed.log10_odds, -entry.log10_odds
+        return entry.fault is not None and entry.log10_odds < self.needed, -entry.log10_odds
 
     def _distinct(self, entries: Sequence[Scored]) -> list[Scored]:
         """Return the best entry of each place."""
@@ -354,18 +358,18 @@ class _Course:
 
     def _why(self, place: RejectedPlace) -> str:
         """Return why a place is not the answer."""
-        entry, needed = place.scored, self.needed
+        entry = place.scored
         if entry.fault is not None:
             return f"the camera: {_objection(place)}"
         if not math.isfinite(entry.log10_odds):
             return "the fit does not converge to a place within the limits"
         if entry.model is self.result.best and self.location.located:
             return "located"
-        if entry.log10_odds >= needed.log10_odds:
-            if self.result.score - entry.log10_odds < needed.margin:
-                return f"fits as well as another place: the margin is below {needed.margin:g}"
+        if entry.log10_odds >= self.needed:
+            if self.result.score - entry.log10_odds < self.margin:
+                return f"fits as well as another place: the margin is below {self.margin:g}"
             return f"another place has log10 odds {_number(self.result.score)}"
-        return f"log10 odds {_number(entry.log10_odds)} of {needed.log10_odds:g} needed: {_weakest(place)}"
+        return f"log10 odds {_number(entry.log10_odds)} of {self.needed:g} needed: {_weakest(place)}"
 
     @property
     def starved(self) -> str:
@@ -373,7 +377,7 @@ class _Course:
         stages = ("intersections", "anchors", "tuples", "candidates", "proposals", "on_roads", "survived", "verified")
         empty = next((stage for stage in stages if getattr(self.funnel, stage) == 0), None)
         if empty is None:
-            return "odds" if self.result.score < self.needed.log10_odds else "margin"
+            return "odds" if self.result.score < self.needed else "margin"
         return "camera" if empty == "verified" and self.refusals else empty
 
     def missing(self) -> list[str]:
@@ -387,7 +391,7 @@ class _Course:
             reasons = ", ".join(f"{fault.value} ({times})" for fault, times in self.refusals.most_common())
             told.append(f"a camera: all places that grew are such as none sees, or none within the limits: {reasons}")
         best = self.places[0] if self.places else None
-        if best is not None and best.scored.fault is not None and best.scored.log10_odds >= self.needed.log10_odds:
+        if best is not None and best.scored.fault is not None and best.scored.log10_odds >= self.needed:
             objection = _objection(best)
             told.append(f"the limits on the camera may be too narrow: the best place fails by them alone: {objection}")
         elif best is not None and starved == "odds":
@@ -438,7 +442,7 @@ def _weakest(place: RejectedPlace) -> str:
 # --- the true place ---------------------------------------------------------------------------------------------------
 
 
-def true_place(mask: str, options: LocateOptions) -> tuple[float, float] | None:
+def _true_place(mask: str, options: LocateOptions) -> tuple[float, float] | None:
     """Return longitude and latitude of a mask's true place where that is given."""
     for name, lon, lat in options.truths:
         if not name or Path(mask).as_posix().endswith(name):
@@ -446,12 +450,12 @@ def true_place(mask: str, options: LocateOptions) -> tuple[float, float] | None:
     return None
 
 
-def tell_truth(lonlat: tuple[float, float], events: Events, location: Location, needed: Needed) -> TruthStory:
+def tell_truth(lonlat: tuple[float, float], events: Events, location: Location, options: LocateOptions) -> TruthStory:
     """Return which stage lost the truth; `location` is the answer on this reference."""
     if events.estimator is None:
         return TruthStory(*lonlat, "map", "the true place: nothing was searched", dict.fromkeys(_MET, 0), None)
     there = _TruePlace(events.estimator, lonlat)
-    return there.told(*there.met(events), location, needed)
+    return there.told(*there.met(events), location, options.min_log10_odds)
 
 
 class _TruePlace:
@@ -489,7 +493,7 @@ class _TruePlace:
         return bool(self._is_near(Homography(matrix).everywhere(scene.center)[None], scale)[0])
 
     def told(
-        self, counts: dict[str, int], faults: list[CameraFault], best: float, location: Location, needed: Needed
+        self, counts: dict[str, int], faults: list[CameraFault], best: float, location: Location, needed: float
     ) -> TruthStory:
         """Return which stage lost it."""
         estimator = self.estimator
@@ -506,17 +510,17 @@ class _TruePlace:
                 how += ": " + ", ".join(fault.value for fault, _ in Counter(faults).most_common())
         return TruthStory(*self.lonlat, lost_at, f"the true place {how}", counts, _finite(best))
 
-    def _weighed(self, best: float, location: Location, needed: Needed) -> tuple[str | None, str]:
+    def _weighed(self, best: float, location: Location, needed: float) -> tuple[str | None, str]:
         """Describe the fate of the truth after it was compared with the map."""
         score, located = f"reached log10 odds {best:.1f}", False
         if location.located and location.center is not None:
             center = np.array([[location.center.lon, location.center.lat]])
             xy = from_lonlat(self.estimator.index.plane, center)
             located = bool(self._is_near(xy, np.array([location.gsd_m or 1.0]))[0])
-        if best < needed.log10_odds and not located:
-            return "odds", f"{score}, {needed.log10_odds:g} are needed"
+        if best < needed and not located:
+            return "odds", f"{score}, {needed:g} are needed"
         if not located:
             return "margin", f"{score}, but another place as much, or it was met too late"
-        if best < needed.log10_odds:
+        if best < needed:
             return None, f"{score}, but leads any other place where these streets repeat, and was located"
         return None, f"{score} and was located"

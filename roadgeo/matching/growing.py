@@ -17,7 +17,7 @@ from roadgeo.geometry.homography import Homography
 from roadgeo.kernels.growth import grow_each
 from roadgeo.kernels.roads import screen
 from roadgeo.kernels.structs import GrowthLimits, GrowthQuery
-from roadgeo.matching.evidence import Agreement, agreement
+from roadgeo.matching.evidence import Agreement, agreement, match_intersections
 from roadgeo.matching.index import ReferenceIndex
 from roadgeo.matching.refinement import Refined
 from roadgeo.matching.road_search import Turnout
@@ -60,8 +60,7 @@ class Hypothesis:
     """A grown hypothesis and its results.
 
     `by_roads`: it grew by roads over the whole frame; `log10_likelihood`, `nearby`: that of the place, and that of the
-    best place nearby (see `evidence`), None before it is looked for; `n_tried`: places tried when it was scored;
-    `fault`: the camera's last objection, None where it had none.
+    best place nearby (see `evidence`), None before it is looked for; `fault`: the camera's last objection, or None.
     """
 
     matrix: FloatArray
@@ -73,14 +72,18 @@ class Hypothesis:
     nearby: float | None = None
     distance: FloatArray | None = None
     log10_odds: float = -np.inf
-    n_tried: int = 1
     fault: CameraFault | None = None
     by_roads: bool = False
     _spot: Spot | None = field(default=None, repr=False)
 
+    @classmethod
+    def at(cls, matrix: FloatArray, scene: Scene, index: ReferenceIndex, support: float = 1.0) -> Hypothesis:
+        """Return that of a place that did not grow by intersections, with those that match there."""
+        return cls(matrix, support, match_intersections(matrix, scene, index)[0], by_roads=True)
+
     def lay(self, refined: Refined, scene: Scene, index: ReferenceIndex) -> Hypothesis:
         """Return it as refined, with what agrees with it, of a scene as a pinhole sees it."""
-        found, matched, distance = agreement(refined.matrix, scene, index, sampling(refined.matrix, scene.size))
+        found, matched, distance = agreement(refined.matrix, scene, index)
         return replace(
             self, matrix=refined.matrix, refined=refined, found=found, matched=matched,
             distance=distance, log10_likelihood=found.log10_likelihood, nearby=None,

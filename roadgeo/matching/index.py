@@ -200,11 +200,6 @@ class ReferenceIndex:
         near = np.concatenate(parts)
         return np.asarray(near[np.abs(near - middle).max(axis=1) < reach_m])
 
-    @property
-    def nbytes(self) -> int:
-        """Size of all arrays."""
-        return sum(array.nbytes for array in self.arrays().values())
-
     def arrays(self) -> dict[str, AnyArray]:
         """All arrays by name, for writing."""
         return {f.name: getattr(self, f.name) for f in fields(self) if f.name not in {"meta", "path"}}

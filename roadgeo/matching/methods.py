@@ -11,7 +11,6 @@ from functools import lru_cache
 import numpy as np
 
 from roadgeo._arrays import FloatArray, IntArray
-from roadgeo.geometry.camera import sampling
 from roadgeo.geometry.homography import Homography
 from roadgeo.geometry.projection import from_lonlat, metres_apart, to_lonlat
 from roadgeo.location import Stats
@@ -290,7 +289,7 @@ def _fit(estimator: TripleEstimator, model: Hypothesis, lead: float) -> Fit | No
 def _fit_of_rival(estimator: TripleEstimator, matrix: FloatArray, lead: float, likelihood: float) -> Fit:
     """Return the best other place."""
     scene, index = estimator.scene, estimator.index
-    found, matched, distance = agreement(matrix, scene, index, sampling(matrix, scene.size))
+    found, matched, distance = agreement(matrix, scene, index)
     return Fit(index, matrix, matched, distance, found.forward, lead, likelihood, agreement=found.mean)
 
 

@@ -495,19 +495,14 @@ class _Search:
         """Return the (M, 2) matching pairs MP under a homography (eq. 10)."""
         from scipy.spatial import cKDTree
 
-        reference, codes = self.index.reference, self.index.codes
+        radius = self.options.inlier_distance_m
         with np.errstate(divide="ignore", invalid="ignore"):
             xy = np.nan_to_num(Homography(homography).everywhere(self.query.xy), nan=1e300, posinf=1e300, neginf=1e300)
-        nearest, distance = np.full(len(xy), -1), np.full(len(xy), np.inf)
-        for code in np.unique(self.codes):
-            here, there = np.flatnonzero(self.codes == code), np.flatnonzero(codes == code)
-            if len(there):
-                away, found = cKDTree(reference.xy[there]).query(
-                    xy[here], distance_upper_bound=self.options.inlier_distance_m
-                )
-                near = np.isfinite(away)
-                nearest[here[near]], distance[here[near]] = there[found[near]], away[near]
-        found = np.flatnonzero(nearest >= 0)
+        # Types lie further apart than the radius.
+        tree = cKDTree(np.column_stack([self.index.reference.xy, 2.0 * radius * self.index.codes]))
+        at = np.column_stack([xy, 2.0 * radius * self.codes])
+        distance, nearest = tree.query(at, distance_upper_bound=radius)
+        found = np.flatnonzero(np.isfinite(distance))
         if self.options.one_to_one:
             closest_first = found[np.argsort(distance[found], kind="stable")]
             found = np.sort(closest_first[np.unique(nearest[closest_first], return_index=True)[1]])

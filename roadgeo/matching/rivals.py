@@ -200,9 +200,7 @@ class Rivals:
         known = next((model for model in ranked if model.matrix is matrix), None)
         if known is not None:
             return known
-        scene, index = estimator.scene, estimator.index
-        matched, _ = match_intersections(matrix, scene, index, sampling(matrix, scene.size))
-        model = Hypothesis(matrix, 1.0, matched, by_roads=True)
+        model = Hypothesis.at(matrix, estimator.scene, estimator.index)
         estimator.score(model)
         return model
 
@@ -253,7 +251,7 @@ def _lay(
 ) -> FloatArray:
     """Refine a place; where it loses its way, it stays as it is."""
     gsd = sampling(start, scene.size)
-    matched, _ = match_intersections(start, scene, index, gsd)
+    matched, _ = match_intersections(start, scene, index)
     refined = refine(start, scene, index, matched, match.refine, n_points, held=True)
     if refined is None or judge(refined.matrix, scene.size, match.camera) is not None:
         return start

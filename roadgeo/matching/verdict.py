@@ -11,7 +11,7 @@ import numpy as np
 
 from roadgeo._arrays import FloatArray
 from roadgeo._text import counted
-from roadgeo.geometry.camera import CameraOptions, pose, sampling
+from roadgeo.geometry.camera import CameraOptions, pose
 from roadgeo.geometry.frame import Frame
 from roadgeo.geometry.homography import Homography
 from roadgeo.geometry.mask import PIXEL_TO_PLANE
@@ -28,7 +28,7 @@ from roadgeo.matching.parts import same_within_m
 from roadgeo.matching.refinement import corner_sigmas
 from roadgeo.matching.scene import Query, Scene
 
-__all__ = ["Needed", "center_of", "decide", "needed_of", "place_frame"]
+__all__ = ["center_of", "decide", "place_frame"]
 
 
 #: Reason where the clock ended a search: the one case in which an answer depends on the machine and its load.
@@ -43,19 +43,6 @@ _MOST_UNSURE = 0.03
 
 #: A similarity agrees with as many of the query's roads as the homography but for this share, or it is none.
 _LEAST_LOST = 0.02
-
-
-@dataclass(frozen=True)
-class Needed:
-    """Thresholds of an answer; see `LocateOptions`."""
-
-    log10_odds: float
-    margin: float
-
-
-def needed_of(options: LocateOptions) -> Needed:
-    """Return the thresholds of an answer."""
-    return Needed(options.min_log10_odds, options.min_margin)
 
 
 @dataclass(frozen=True)
@@ -402,8 +389,7 @@ def _level(fit: Fit, query: Query) -> Fit:
         return fit
     matrix, covariance = found.matrix, found.corner_covariance + found.doubt
     # The covariance may be too cautious. Roads that agreed must go on to agree.
-    gsd = sampling(matrix, scene.size)
-    agreeing, _, _ = agreement(matrix, scene, fit.index, gsd)
+    agreeing, _, _ = agreement(matrix, scene, fit.index)
     if not agreeing.forward >= fit.agreeing - _LEAST_LOST:
         return fit
     return replace(fit, matrix=matrix, corner_covariance_m2=covariance, corner_sigma_m=corner_sigmas(covariance))

@@ -8,6 +8,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 from worlds.scenes import Sight, camera, look, mapped, scene_of
 
+from roadgeo.geometry.camera import sampling
 from roadgeo.matching.evidence import MAP_SIGMA_M, PIXEL_SIGMA_PX, Evidence, agreement, tolerance_m
 
 TRUTH = camera((2000, 1900), (1000, 1000), 1.0, 20.0, 50.0, 130.0)
@@ -20,13 +21,9 @@ def scene(town):
     return scene_of(look(town[0], TRUTH, sight=Sight(0.5)))
 
 
-def agree(matrix, scene, index):
-    return agreement(matrix, scene, index, 1.0)
-
-
 class TestAgreement:
     def test_everything_agrees_in_the_true_place(self, town, scene):
-        found, matched, distance = agree(TRUTH, scene, town[1])
+        found, matched, distance = agreement(TRUTH, scene, town[1])
         assert found.rate > 0.8  # at the frame's border branches are cut off
         assert found.tested == len(scene.intersections)
         assert found.matched == (matched >= 0).sum()
@@ -36,34 +33,35 @@ class TestAgreement:
         assert distance[matched >= 0] == pytest.approx(np.hypot(*gaps.T))
 
     def test_little_agrees_elsewhere(self, town, scene):
-        found, *_ = agree(ELSEWHERE, scene, town[1])
+        found, *_ = agreement(ELSEWHERE, scene, town[1])
         assert max(found.rate, found.forward, found.backward) < 0.4
 
     def test_off_the_map_nothing_does(self, town, scene):
         far = np.array([[1, 0, 1e5], [0, 1, 0], [0, 0, 1]]) @ TRUTH
-        found, matched, _ = agree(far, scene, town[1])
+        found, matched, _ = agreement(far, scene, town[1])
         assert (found.rate, found.forward, found.backward) == (0, 0, 0)
         assert (matched == -1).all()
 
     def test_its_likelihood_is_that_of_the_evidence(self, town, scene):
         for matrix in (TRUTH, ELSEWHERE):
-            assert agree(matrix, scene, town[1])[0].log10_likelihood == Evidence(scene, town[1], 1.0).weigh(matrix)
+            evidence = Evidence(scene, town[1], sampling(matrix, scene.size))
+            assert agreement(matrix, scene, town[1])[0].log10_likelihood == evidence.weigh(matrix)
 
     def test_roads_that_the_query_misses_count_against_it(self, town):
         gaps = scene_of(look(town[0], TRUTH, sight=Sight(missing=0.4)))
-        found, *_ = agree(TRUTH, gaps, town[1])
+        found, *_ = agreement(TRUTH, gaps, town[1])
         assert found.forward > 0.95
         assert found.backward < 0.8
 
     def test_unobserved_ground_counts_for_nothing(self, town):
         gaps = scene_of(look(town[0], TRUTH, sight=Sight(missing=0.4)))
         blind = replace(gaps, observed=gaps.field < 6)
-        found, *_ = agree(TRUTH, blind, town[1])
+        found, *_ = agreement(TRUTH, blind, town[1])
         assert found.backward > 0.9
 
     def test_a_scene_of_nothing(self, town, scene):
         empty = scene_of(look(town[0], np.array([[1, 0, 1e6], [0, 1, 1e6], [0, 0, 1.0]])))
-        found, *_ = agree(TRUTH, empty, town[1])
+        found, *_ = agreement(TRUTH, empty, town[1])
         assert (found.rate, found.forward) == (0, 0)
 
 

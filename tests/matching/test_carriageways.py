@@ -10,7 +10,7 @@ from matching.test_explanation import mask_of
 from worlds.motorways import motorways
 from worlds.scenes import camera, look, mapped, random_network, scene_of
 
-from roadgeo.geometry.camera import CameraFault, sampling
+from roadgeo.geometry.camera import CameraFault
 from roadgeo.matching.estimator import TripleEstimator
 from roadgeo.matching.evidence import agreement
 from roadgeo.matching.finishing import measure_corners
@@ -128,8 +128,7 @@ def test_a_place_is_refined_so_for_the_last_time_unless_no_camera_sees_it(town, 
     monkeypatch.setattr(estimator, "judge", lambda matrix, rough=False: fault)
     given = fit(truth, scene, town[1])
     nothing = np.full(len(scene.intersections), -1)
-    gsd = sampling(given.matrix, scene.size)
-    found, _, _ = agreement(given.matrix, scene, town[1], gsd)
+    found, _, _ = agreement(given.matrix, scene, town[1])
     best = Hypothesis(given.matrix, 1.0, nothing, refined=given, found=found)
     measure_corners(estimator, best, 10.0)
     error, before = (error_of(matrix, truth, scene) for matrix in (best.refined.matrix, given.matrix))

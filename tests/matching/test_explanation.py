@@ -19,7 +19,6 @@ from roadgeo.matching.index import build_index
 from roadgeo.matching.methods import search_references
 from roadgeo.matching.scene import read_query
 from roadgeo.matching.search import SearchOptions
-from roadgeo.matching.verdict import decide, needed_of
 from roadgeo.outputs.explanation_sheet import AGREES, STARVED, draw_explanation, write_explanation_picture
 from roadgeo.outputs.paths import output_paths
 from roadgeo.outputs.subject import Subject
@@ -69,7 +68,7 @@ def test_places_that_are_compared_to_be_shown_do_not_count_as_measured(lattice):
     (found,) = search_references(query, lattice.parts, options, 60.0, explained=True)
     measured = found.events.estimator.n_nulls
     assert len(found.events.estimator.verified) > measured
-    story = tell(query, found, decide(query, [found], options), needed_of(options))
+    story = tell(query, found, options)
     assert story.funnel.measured == measured
 
 

@@ -12,7 +12,7 @@ from roadgeo.location import Reason
 from roadgeo.matching import rivals
 from roadgeo.matching.estimator import MatchOptions, TripleEstimator
 from roadgeo.matching.events import Ledger
-from roadgeo.matching.evidence import Evidence, match_intersections
+from roadgeo.matching.evidence import Evidence
 from roadgeo.matching.exhaustive import Shift, move_about
 from roadgeo.matching.growing import Hypothesis
 from roadgeo.matching.options import LocateOptions
@@ -42,9 +42,7 @@ def search_of(world, *matrices, near=None, match=None):
     _, index, evidence = world
     estimator = TripleEstimator(evidence.scene, index, match, near)
     for matrix in matrices:
-        gsd = sampling(matrix, evidence.scene.size)
-        matched, _ = match_intersections(matrix, evidence.scene, index, gsd)
-        estimator.score(Hypothesis(matrix, 1.0, matched, by_roads=True))
+        estimator.score(Hypothesis.at(matrix, evidence.scene, index))
     return Search(estimator), estimator
 
 

@@ -14,9 +14,8 @@ from roadgeo.location import Location, Place
 from roadgeo.matching.events import Events
 from roadgeo.matching.explanation import _TruePlace, tell_truth
 from roadgeo.matching.index import build_index
-from roadgeo.matching.verdict import Needed
+from roadgeo.matching.options import LocateOptions
 
-NEEDED = Needed(log10_odds=3.0, margin=2.0)
 REFUSED = Location("q", "not_located", "")
 
 
@@ -35,7 +34,7 @@ def lonlat(x, y):
 
 def told(estimator, met=(), best=-math.inf, at=(500.0, 500.0), answer=REFUSED):
     faults = [CameraFault.TILT, CameraFault.SKEW, CameraFault.TILT] if "camera" in met else []
-    return _TruePlace(estimator, lonlat(*at)).told(dict(Counter(met)), faults, best, answer, NEEDED)
+    return _TruePlace(estimator, lonlat(*at)).told(dict(Counter(met)), faults, best, answer, 3.0)
 
 
 @pytest.mark.parametrize(
@@ -83,5 +82,5 @@ def test_off_the_map_nothing_else_counts(estimator):
 
 
 def test_where_nothing_was_searched_it_is_said():
-    story = tell_truth((-71.0, 42.0), Events(kept=True), REFUSED, NEEDED)
+    story = tell_truth((-71.0, 42.0), Events(kept=True), REFUSED, LocateOptions())
     assert (story.lost_at, story.said) == ("map", "the true place: nothing was searched")

@@ -100,12 +100,12 @@ class _Candidate:
         matrix, self.fit = _lay(self, look), None
         if matrix is None or judge(matrix, whole.size, match.camera, rough=True) is not None:
             return
-        matched, _ = match_intersections(matrix, whole, self.index, sampling(matrix, whole.size))
+        matched, _ = match_intersections(matrix, whole, self.index)
         refined = refine(matrix, whole, self.index, matched, match.refine, held=True)
         if refined is None or judge(refined.matrix, whole.size, match.camera) is not None:
             return
-        matrix, gsd = refined.matrix, sampling(refined.matrix, whole.size)
-        found, matched, distance = agreement(matrix, whole, self.index, gsd)
+        matrix = refined.matrix
+        found, matched, distance = agreement(matrix, whole, self.index)
         self.matrix, self.seen_at = matrix @ PIXEL_TO_PLANE @ look.mosaic.to_mosaic[-1], look.numbers[-1]
         self.fit = Fit(
             self.index, matrix, matched, distance, found.forward, -math.inf, found.log10_likelihood,
