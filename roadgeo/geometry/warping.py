@@ -121,7 +121,7 @@ def warp(
             size = block.shape[1::-1]
             if to_place is None and lens is None:
                 source = to_center @ crs_to_pixel @ grid.to_crs_matrix(column, row) @ to_corner
-                block[...] = cv2.warpPerspective(image, source, size, flags=interpolation | cv2.WARP_INVERSE_MAP)
+                cv2.warpPerspective(image, source, size, block, flags=interpolation | cv2.WARP_INVERSE_MAP)
             else:
                 picture = image.shape[1], image.shape[0]
                 seen = source_pixels(pixel_to_crs, grid, column, row, size, picture, to_place, lens)

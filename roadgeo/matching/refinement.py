@@ -220,7 +220,8 @@ class Equations:
         used, rms = adjust(self.p, self._plane, self.samples, pairs, held, self._limits, self.roads, normal, self.met)
         if not np.isfinite(rms):
             return None
-        normal += np.tril(normal, -1).T
+        normal = normal + normal.T  # only the lower triangle was filled
+        normal.flat[:: n + 1] *= 0.5
         # Where the mask is bent, its errors keep their sign as much further as they are greater.
         scatter = rms * max(1.0, rms / (_USUAL_RMS * self.sigma_m)) / self.unit
         covariance = np.asarray(np.linalg.inv(normal) * scatter**2, float)

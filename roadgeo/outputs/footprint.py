@@ -86,7 +86,7 @@ def _write_mask(path: Path, subject: Subject) -> None:
         stack.enter_context(writing_raster(path))
         optimized = stack.enter_context(rasterio.MemoryFile(ext="tif"))
         plain = stack.enter_context(rasterio.open("", "w", **profile))
-        plain.write(warp_mask(subject), 1)
+        plain.write(warp_mask(subject)[None])
         plain.write_colormap(1, {value: _rgba(color) for value, (color, _, _) in PALETTE.items()})
         plain.update_tags(**_tags(subject))
         # Reduced in memory: left to the COG driver, they are written, compressed and read again on the way.
