@@ -238,6 +238,9 @@ def row_of(city: str, seed: int, kind: str, trial: Trial) -> Row:
     rival = (trial.answer.get("runner_up") or {}).get("log10_odds")
     best = found.log10_odds if math.isfinite(found.log10_odds) else -math.inf
     lead = math.inf if rival is None else best - rival
+    asked = LocateOptions()
+    if found.status != "located" and best >= asked.min_log10_odds and lead >= asked.min_margin:
+        best = -math.inf  # refused for another reason, as half a place: it is reported at no threshold
     seconds = sum(found.seconds.get(step, 0.0) for step in ("match", "refine"))
     return Row(city, seed, kind, trial.truth.kind.split("_")[-1], best, lead, found.right, seconds)
 

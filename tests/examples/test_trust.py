@@ -7,6 +7,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
+from roadgeo.evaluation.truth import Truth
 from roadgeo.location import ERROR_RATES
 from roadgeo.workflows import LocateOptions
 
@@ -48,6 +49,13 @@ def test_rows_are_counted_by_threshold_band_and_kind(trust):
     assert bands["5 to 8"][0] == "0"
     kinds = {row[0]: row for row in trust.kind_table(rows, 3.5, 2.0)}
     assert kinds["elsewhere"][-2] == "3.7"
+
+
+@pytest.mark.parametrize(("status", "score"), [("located", 5.5), ("ambiguous", -np.inf)])
+def test_half_a_place_is_reported_at_no_threshold(trust, status, score):
+    truth = Truth("a.png", "there_few", np.eye(3), None, (100, 100))
+    answer = {"status": status, "log10_odds": 5.5, "runner_up": {"log10_odds": -5.5}}
+    assert trust.row_of("porto", 1, "there", trust.Trial(truth, answer)).score == score
 
 
 def test_the_error_rates_that_results_state_are_those_counted(trust):
