@@ -22,7 +22,7 @@ from roadgeo.matching.index import ReferenceIndex
 from roadgeo.matching.lens import ENOUGH, find_lens, grow_whole, straighten_scene
 from roadgeo.matching.refinement import RefineOptions, refine
 from roadgeo.matching.road_search import RoadSearch
-from roadgeo.matching.scene import Scene
+from roadgeo.matching.scene import AGREE_DEG, Scene
 from roadgeo.matching.triples import BEFORE_ROADS, WITHOUT_ROADS, Proposals, Sweep, larger
 
 __all__ = ["Ledger", "MatchOptions", "TripleEstimator"]
@@ -40,8 +40,6 @@ _HARDLY = 0.5
 _LEADING = 2.0
 #: As of `RefineOptions`, for places that grew by roads: false roads abound there.
 _LEAST_SHARE_BY_ROADS = 0.2
-#: How far a proposal, made of three intersections, may turn the image's up from where it points.
-_ROUGHLY_DEG = 25.0
 #: Seconds that each step takes, roughly, measured on lattices, where searches are longest: an intersection of the query
 #: that is looked for, a triple of the map like one of the query's, a place that is screened or voted for, a hypothesis
 #: that grows, and one that is compared with the map, with each road point.
@@ -171,17 +169,14 @@ class TripleEstimator:
         known: list[Hypothesis] = []
         options, turnout = self.options, self.sweeps.turnout(self.index.coarseness)
         roads = RoadSearch(self.scene, self.index, options.camera, self.near, self.sweeps.ahead, turnout)
-        tried = 0
-        for anchor, n_proposed, grown in roads.rounds():
-            self._count(roads.n_tried - tried)
-            tried = roads.n_tried
+        for anchor, n_tried, n_proposed, grown in roads.rounds():
+            self._count(n_tried)
             self.n_hypotheses += n_proposed
-            if anchor >= 0:
-                self._look_for(anchor)
-                self.events.note("voted", anchor, n_proposed)
+            self._look_for(anchor)
+            self.events.note("voted", anchor, n_proposed)
             fresh: list[Hypothesis] = []
             for one in grown:
-                hypothesis = Hypothesis.at(one.matrix / one.matrix[2, 2], self.scene, self.index, one.closeness)
+                hypothesis = Hypothesis.at(one.matrix, self.scene, self.index, one.closeness)
                 is_known = any(self._is_found_again(other, hypothesis) for other in known)
                 if not is_known and not any(self.same(other, hypothesis) for other in fresh):
                     fresh += [hypothesis] * self._is_plausible(hypothesis)
@@ -234,7 +229,7 @@ class TripleEstimator:
             frame = 2.0 * self.scene.half_size * np.sqrt(np.maximum(j00 * j11 - j01 * j10, 0.0))
             away_m = np.hypot(*(self.index.xy[proposals.reference] - self.near[:2]).T)
             allowed &= away_m < self.near[2] + frame
-        return allowed & (self.options.camera.turned_off(j01, j11) < _ROUGHLY_DEG)
+        return allowed & (self.options.camera.turned_off(j01, j11) < AGREE_DEG)
 
     def grow(self, proposals: Proposals, chosen: IntArray) -> list[Hypothesis]:
         """Grow the chosen proposals of one anchor; return those that did not wither, the best supported first."""
@@ -387,10 +382,9 @@ class TripleEstimator:
 
     def center(self, model: Hypothesis) -> FloatArray:
         """Where the middle of the frame lies, in plane metres."""
-        spot = model.spot(self.scene.size)
-        return np.array([spot.x, spot.y])
+        return np.array(model.spot(self.scene.size)[:2])
 
     def same(self, a: Hypothesis, b: Hypothesis) -> bool:
         """Whether two hypotheses put the middle of the frame within 50 m, or a twentieth of its size, of each other."""
-        one, other = a.spot(self.scene.size), b.spot(self.scene.size)
-        return math.hypot(one.x - other.x, one.y - other.y) < one.reach_m
+        (x, y, reach_m), (other_x, other_y, _) = a.spot(self.scene.size), b.spot(self.scene.size)
+        return math.hypot(x - other_x, y - other_y) < reach_m

@@ -6,7 +6,7 @@ import heapq
 import math
 from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass, field, replace
-from typing import TYPE_CHECKING, NamedTuple, TypeAlias
+from typing import TYPE_CHECKING, TypeAlias
 
 import numpy as np
 
@@ -36,23 +36,9 @@ __all__ = [
     "MAX_VERIFIED",
     "Hypothesis",
     "SharedSweeps",
-    "Spot",
     "grow_proposals",
     "screen_proposals",
 ]
-
-
-class Spot(NamedTuple):
-    """Where the middle of a frame lies by a hypothesis.
-
-    `x`, `y`: plane metres; `reach_m`: nearer middles mean the same place, 50 m or a twentieth of the frame's size;
-    `matrix`: the homography that it was computed of.
-    """
-
-    matrix: FloatArray
-    x: float
-    y: float
-    reach_m: float
 
 
 @dataclass
@@ -74,7 +60,7 @@ class Hypothesis:
     log10_odds: float = -np.inf
     fault: CameraFault | None = None
     by_roads: bool = False
-    _spot: Spot | None = field(default=None, repr=False)
+    _spot: tuple[float, float, float] | None = field(default=None, repr=False)
 
     @classmethod
     def at(cls, matrix: FloatArray, scene: Scene, index: ReferenceIndex, support: float = 1.0) -> Hypothesis:
@@ -86,21 +72,23 @@ class Hypothesis:
         found, matched, distance = agreement(refined.matrix, scene, index)
         return replace(
             self, matrix=refined.matrix, refined=refined, found=found, matched=matched,
-            distance=distance, log10_likelihood=found.log10_likelihood, nearby=None,
+            distance=distance, log10_likelihood=found.log10_likelihood, nearby=None, _spot=None,
         )  # fmt: skip
 
     def take(self, other: Hypothesis) -> None:
         """Become another version of the same place."""
         vars(self).update(vars(other))
 
-    def spot(self, size: tuple[int, int]) -> Spot:
-        """Return where the middle of a frame of that size lies; kept, for in a lattice it is asked for without end."""
-        kept = self._spot
-        if kept is None or kept.matrix is not self.matrix:
+    def spot(self, size: tuple[int, int]) -> tuple[float, float, float]:
+        """Return x and y of the middle of a frame of that size, plane metres; nearer ones than the third are the same.
+
+        It is kept, for in a lattice it is asked for without end.
+        """
+        if self._spot is None:
             frame = Frame(*size)
             x, y = Homography(self.matrix).everywhere(frame.plane_center).tolist()
-            kept = self._spot = Spot(self.matrix, x, y, frame.one_place_m(sampling(self.matrix, size)))
-        return kept
+            self._spot = x, y, frame.one_place_m(sampling(self.matrix, size))
+        return self._spot
 
 
 #: Away from the middle of a tilted frame the ground sampling may differ from that at the middle by this factor.

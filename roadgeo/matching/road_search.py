@@ -14,7 +14,7 @@ from __future__ import annotations
 
 import math
 from collections import OrderedDict
-from collections.abc import Iterable, Iterator
+from collections.abc import Iterator
 from dataclasses import dataclass, field
 from itertools import islice
 from typing import NamedTuple
@@ -29,7 +29,8 @@ from roadgeo.kernels.road_raster import DIRECTIONS, TILE, Raster, mark_tiles, me
 from roadgeo.kernels.road_rings import RINGS, WORDS, draw_rings, mark_rings
 from roadgeo.kernels.road_votes import WHOLE_TURN, Places, RoadPoints, Trial, improve_votes, vote
 from roadgeo.matching.index import ReferenceIndex
-from roadgeo.matching.scene import MIN_COS, Scene
+from roadgeo.matching.refinement import denormalise
+from roadgeo.matching.scene import AGREE_DEG, MIN_COS, Scene
 from roadgeo.matching.search import ALONE, Ahead
 from roadgeo.matching.triples import farthest_first, larger
 from roadgeo.roads.intersections import unpack_branches
@@ -187,12 +188,15 @@ class Votes:
         The 2 x 2 map (row-major) from query to reference around it.
     ratio : (M,) float64
         Log-likelihood ratio of the road points against chance, nats.
+    n_tried : int
+        Places and turns tried.
     """
 
     anchor: int
     reference: IntArray
     affine: FloatArray
     ratio: FloatArray
+    n_tried: int
 
 
 class _Around(NamedTuple):
@@ -235,29 +239,22 @@ class Voter:
         counts = np.isfinite(rays).sum(axis=1)
         self.places = Places(cells, _whole(rays).astype(np.int32), counts, density, self.drawn.rings)
 
-    def votes(self, anchor: int, chunk: int = 20_000) -> Iterator[tuple[int, Votes | None]]:
-        """Yield, after each `chunk` of the map's intersections, how many places and turns were tried on it.
-
-        With the last come the best proposals, before it None.
-        """
+    def votes(self, anchor: int) -> Votes:
+        """Return the best proposals of a query intersection."""
         rays = self.scene.intersections.rays[anchor]
         rays = _whole(rays[np.isfinite(rays)])
         around = self._around(anchor)
         points = self._mark(around)
         max_turn = round(self.max_turn * _PER_RADIAN)
-        found, kept, tried = np.empty((self.kept, 4)), 0, 0
-        for first in range(0, len(self.candidates), chunk):
-            kept, tried = vote(
-                self.candidates[first : first + chunk], rays, _TOLERANCE, max_turn, self.scales, points,
-                _LEAST_POINTS, self.places, found, kept,
-            )  # fmt: skip
-            if first + chunk < len(self.candidates):
-                yield tried, None
+        found = np.empty((self.kept, 4))
+        kept, tried = vote(
+            self.candidates, rays, _TOLERANCE, max_turn, self.scales, points, _LEAST_POINTS, self.places, found, 0
+        )
         wide = self._wide(around)
         improve_votes(found[:kept], _TURN_STEPS, _SCALE_STEPS, wide, self.places, self.drawn.raster, _TRIAL)
         best = found[:kept][np.argsort(-found[:kept, 3], kind="stable")]
         c, s = np.cos(best[:, 1]) * best[:, 2], np.sin(best[:, 1]) * best[:, 2]
-        yield tried, Votes(anchor, best[:, 0].astype(np.int64), np.stack([c, -s, s, c], axis=1), best[:, 3])
+        return Votes(anchor, best[:, 0].astype(np.int64), np.stack([c, -s, s, c], axis=1), best[:, 3], tried)
 
     def _around(self, anchor: int) -> _Around:
         """Return the road points as seen from a query intersection, as far as any scale may reach, nearest first."""
@@ -316,7 +313,6 @@ _GO_ON, _SURE = (16, 6, 3), 2
 class Grown:
     """A grown proposal: query plane to reference plane (3, 3), and how close to roads the road points lie, 0 to 1."""
 
-    anchor: int
     matrix: FloatArray
     closeness: float
 
@@ -332,7 +328,6 @@ class RoadGrower:
         self._stages = Stages(_AFFINE_UNTIL, _LEAST_SHARE, perspective, MIN_COS, (first, second, third), _SURE)
         thin = max(1, len(scene.dense_points) // _MAX_POINTS)
         self.points, self.directions = scene.dense_points[::thin], scene.dense_directions[::thin]
-        self._anchor, self._outwards = -1, (self.points, self.directions)
 
     def grow(self, anchor: int, references: IntArray, affines: FloatArray) -> list[Grown]:
         """Grow proposals of query intersection `anchor`; return those that did not wither, in their order.
@@ -341,7 +336,9 @@ class RoadGrower:
         """
         half_size = self.scene.half_size
         at = self.scene.intersections.xy[anchor]
-        points, directions = self._outwards_from(anchor)
+        away = self.points - at
+        outwards = np.argsort(np.hypot(*away.T), kind="stable")
+        points, directions = away[outwards] / half_size, self.directions[outwards]
         j00, j01, j10, j11 = np.asarray(affines, float).T
         gsd = np.sqrt(j00 * j11 - j01 * j10)
         zero = np.zeros_like(gsd)
@@ -351,33 +348,16 @@ class RoadGrower:
         closeness = np.empty(len(gsd))
         roads = self.index.road_buckets
         grow_by_roads(ps, units, origins, tolerances, points, directions, self._stages, roads, closeness)
-        from_query = np.array([[1.0, 0.0, -at[0]], [0.0, 1.0, -at[1]], [0.0, 0.0, half_size]])
         grown = []
         for k in np.flatnonzero(closeness >= 0.0):
-            (x, y), unit = origins[k], units[k]
-            to_reference = np.array([[unit, 0.0, x], [0.0, unit, y], [0.0, 0.0, 1.0]])
-            matrix = to_reference @ np.append(ps[k], 1.0).reshape(3, 3) @ from_query
-            matrix = matrix / (matrix[2] @ np.append(self.scene.center, 1.0))
-            grown.append(Grown(anchor, np.asarray(matrix), float(closeness[k])))
+            matrix = denormalise(ps[k], at, half_size, origins[k], float(units[k]))
+            grown.append(Grown(matrix / matrix[2, 2], float(closeness[k])))
         return grown
-
-    def _outwards_from(self, anchor: int) -> tuple[FloatArray, FloatArray]:
-        """Return the road points around an intersection, the nearest first, normalised, and the roads' directions.
-
-        Kept: an intersection makes many proposals.
-        """
-        if anchor != self._anchor:
-            away = self.points - self.scene.intersections.xy[anchor]
-            order = np.argsort(np.hypot(*away.T), kind="stable")
-            self._anchor, self._outwards = anchor, (away[order] / self.scene.half_size, self.directions[order])
-        return self._outwards
 
 
 #: The smallest pixels that are tried on a map of coarseness 1; a coarse map multiplies them by its coarseness.
 COARSE_PIXEL_M = 0.35
 
-#: How far a proposal, made of two branches, may turn the image's up from where it points.
-_ROUGHLY_DEG = 25.0
 #: Number of intersections of the query that vote, spread over the frame from its middle outwards.
 _MAX_ANCHORS = 30
 #: Fewer vote, but at least the second number, once the first number of places was tried on 15,000 intersections, on a
@@ -447,24 +427,16 @@ class Turnout:
 
 
 class RoadRound(NamedTuple):
-    """The results of one query intersection: how many proposals were to grow, and those that did.
-
-    The anchor is -1 where only a part of a large map was looked at.
-    """
+    """The results of one query intersection: places and turns tried, proposals that were to grow, those that did."""
 
     anchor: int
+    n_tried: int
     n_proposed: int
     grown: list[Grown]
 
 
 class RoadSearch:
-    """Proposes places for a scene on a map by roads alone.
-
-    Attributes
-    ----------
-    n_tried : int
-        Places and turns tried until now.
-    """
+    """Proposes places for a scene on a map by roads alone."""
 
     def __init__(
         self,
@@ -481,37 +453,27 @@ class RoadSearch:
         """
         more, coarseness = followed_more(len(scene.intersections)), index.coarseness
         self.scene, self.ahead = scene, ahead
-        self.n_tried, self._max_grown, self._max_kept = 0, more * _MAX_GROWN, more * _MAX_KEPT
+        self._max_grown, self._max_kept = more * _MAX_GROWN, more * _MAX_KEPT
         self.turnout = turnout or Turnout(len(index))
         scale = scales(camera, scene.road_width_px, coarseness)
         center, off = camera.heading or (0.0, 180.0)
-        max_turn = min(math.radians(abs(center) + off + _ROUGHLY_DEG), math.pi)
+        max_turn = min(math.radians(abs(center) + off + AGREE_DEG), math.pi)
         candidates = _within(index, near, scene.half_size * min(scale[1], max(coarseness * _FAR_M, scale[0])))
         self.voter = Voter(scene, index, scale, max_turn, candidates, more)
         self.grower = RoadGrower(scene, index, camera, more)
 
     def rounds(self) -> Iterator[RoadRound]:
-        """Yield the places that grew of one anchor's proposals after another; between parts of a large map nothing."""
+        """Yield the places that grew of one anchor's proposals after another."""
         xy = self.scene.intersections.xy
         anchors = islice(farthest_first(xy, np.arange(len(xy))), _MAX_ANCHORS)
-        for n, (anchor, steps) in enumerate(self.ahead.map(self._vote, anchors)):
+        for n, votes in enumerate(self.ahead.map(self.voter.votes, anchors)):
             if not self.turnout.includes(n):
                 return
-            for tried, votes in steps:
-                self.n_tried += tried
-                self.turnout.n_tried += tried
-                if votes is None:
-                    yield RoadRound(-1, 0, [])
-                    continue
-                best = slice(self._max_grown)
-                grown = self.grower.grow(anchor, votes.reference[best], votes.affine[best])
-                some = sorted(grown, key=lambda one: -one.closeness)
-                yield RoadRound(anchor, len(votes.reference[best]), some[: self._max_kept])
-
-    def _vote(self, anchor: int) -> tuple[int, Iterable[tuple[int, Votes | None]]]:
-        """Return an anchor and its votes, step by step; in threads all of them are there at once."""
-        steps = self.voter.votes(anchor)
-        return anchor, steps if self.ahead.threads == 1 else list(steps)
+            self.turnout.n_tried += votes.n_tried
+            best = slice(self._max_grown)
+            grown = self.grower.grow(votes.anchor, votes.reference[best], votes.affine[best])
+            some = sorted(grown, key=lambda one: -one.closeness)
+            yield RoadRound(votes.anchor, votes.n_tried, len(votes.reference[best]), some[: self._max_kept])
 
 
 def _within(index: ReferenceIndex, near: tuple[float, float, float] | None, reach_m: float) -> IntArray:

@@ -23,6 +23,7 @@ from roadgeo.roads.simplification import SimplifyOptions, simplify
 from roadgeo.roads.vectorization import vectorize
 
 __all__ = [
+    "AGREE_DEG",
     "MIN_COS",
     "Query",
     "Scene",
@@ -42,8 +43,10 @@ _MAX_INTERSECTIONS, _N_NEIGHBOURS = 5000, 12
 _POINTS, _DENSE_POINTS = (600, 6.0), (6000, 3.0)
 #: Cells of the reduced frame along its longer side.
 _FIELD_CELLS = 400
-#: Roads, and branches of intersections, agree whose directions differ by less than 25 degrees: cosine of that.
-MIN_COS = math.cos(math.radians(25.0))
+#: Roads, and branches of intersections, agree whose directions differ by less, degrees: so far a proposal made of them
+#: may turn the image's up. And the cosine of that.
+AGREE_DEG = 25.0
+MIN_COS = math.cos(math.radians(AGREE_DEG))
 #: A road's middle is traced within a pixel.
 _NEAR = (-1, 0, 1)
 
