@@ -16,6 +16,9 @@ from roadgeo._arrays import BoolArray, FloatArray
 
 __all__ = ["BorderOptions", "find_border"]
 
+#: Rows of a margin, at least.
+_LEAST_DEPTH = 3
+
 
 @dataclass(frozen=True)
 class BorderOptions:
@@ -101,10 +104,12 @@ def _reduced(roads: BoolArray, factor: int) -> BoolArray:
 
 def _solid_depth(roads: BoolArray, options: BorderOptions) -> int:
     """Return the rows of a solid margin, 0 for none; its ragged edge belongs to it."""
+    if (roads[:_LEAST_DEPTH].mean(axis=1) < options.solid).any():
+        return 0
     share = roads[: int(options.most * len(roads))].mean(axis=1)
     solid = share >= options.solid
     depth = int(np.argmin(solid)) if not solid.all() else 0
-    if depth < 3:
+    if depth < _LEAST_DEPTH:
         return 0
     ragged = share[depth : depth + max(3, depth // 4)] >= 0.5
     return depth + (int(np.flatnonzero(ragged)[-1]) + 1 if ragged.any() else 0)
@@ -147,7 +152,9 @@ def _find_line(roads: BoolArray, width: float, options: BorderOptions) -> _Line 
     beyond = round(1.5 * width) + 1
     slopes = np.tan(np.radians(np.linspace(-options.max_turn_deg, options.max_turn_deg, 21)))
     found: list[tuple[float, _Line]] = []
-    for slope, cover in zip(slopes, _covers(roads, int(options.most * len(roads)), slopes), strict=True):
+    covers = _covers(roads, int(options.most * len(roads)), slopes)
+    able = (covers >= options.least_line).any(axis=1)
+    for slope, cover in zip(slopes[able], covers[able], strict=True):
         line = _innermost(cover, beyond, options)
         if line is not None:
             found.append((float(cover[line]), _Line(line + 1.0, float(slope))))
