@@ -27,6 +27,7 @@ __all__ = ["FilterOptions", "Pose", "correct", "predict", "start"]
 #: Focal length of usual lenses, in halves of the frame's diagonal, and the standard deviation of its log.
 _LENS = PoseOptions()
 #: Standard deviation of a real camera's skews above real ground, and of the log of its focal length between frames.
+#: The map of a slope of 10 % has a skew of 0.005.
 _SKEW, _REFOCUSING = 0.005, 0.002
 
 

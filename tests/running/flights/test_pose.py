@@ -34,7 +34,10 @@ def follow(number, **options):
 
 
 def test_frames_without_roads_drift_as_little_as_a_camera_and_no_more_than_is_claimed():
-    """As a chain of free homographies the 18 frames, 1.7 km, drift by 53 m."""
+    """As a chain of free homographies the 18 frames, 1.7 km, drift by 53 m; no use of them leaves less than 11 m.
+
+    What is least is computed by `examples/drift.py`; of more flights, the filter's drift is 13.2 m.
+    """
     flights = [follow(number) for number in range(20)]
     error = np.array([np.hypot(*(pose.center - view.homography(pose.frame.center))) for view, pose in flights])
     claimed = np.array([pose.sigma_m for _, pose in flights])
