@@ -171,7 +171,8 @@ def vote(
     candidates: Ints1,
     rays: Ints1,
     tolerance: int,
-    max_turn: int,
+    turn: int,
+    max_off: int,
     scales: Floats1,
     points: UInt64s2,
     least: int,
@@ -191,8 +192,8 @@ def vote(
         Map intersections to try.
     rays, tolerance
         As in `find_turns`.
-    max_turn : int
-        Turns beyond are left out.
+    turn, max_off : int
+        Turns that differ from `turn` by more than `max_off` are left out.
     scales : (S,) float64
         Metres per unit of the query plane.
     points : (S, WORDS) uint64
@@ -231,7 +232,7 @@ def vote(
         for s in range(n_scales):
             per_sigma[s] = 1.0 / math.sqrt(max(expected[s] * (1.0 - expected[s] / max(n_points[s], 1.0)), 1.0))
         for t in range(n_turns):
-            if abs(turns[t]) > max_turn:
+            if abs(_wrapped(turns[t] - turn)) > max_off:
                 continue
             tried += 1
             back = -_bearing(turns[t] + (1 << (_BITS - 1)))

@@ -16,7 +16,6 @@ from roadgeo.geometry.homography import Homography
 from roadgeo.geometry.projection import to_lonlat
 from roadgeo.matching.events import Events, Ledger, Scored
 from roadgeo.matching.evidence import Evidence
-from roadgeo.matching.exhaustive import is_told, propose_everywhere
 from roadgeo.matching.growing import Hypothesis, SharedSweeps, grow_proposals, screen_proposals
 from roadgeo.matching.index import ReferenceIndex
 from roadgeo.matching.lens import ENOUGH, find_lens, grow_whole, straighten_scene
@@ -114,7 +113,6 @@ class TripleEstimator:
         self._n_rounds, self._anchors = 0, set[int]()
         self.sweeps = sweeps or SharedSweeps(scene, camera)
         self.sweeps.members.append(self)
-        self._is_everywhere = False  # whether the roads were laid everywhere on the map
 
     def stages(self) -> Iterator[Iterator[list[Hypothesis]]]:
         """Yield, for one anchor after another, the hypotheses that grew.
@@ -126,26 +124,11 @@ class TripleEstimator:
         options, by_roads = self.options, self.options.roads and len(self.scene.intersections) > 0
         sources = options.sweeps if by_roads else options.without_roads
         sweeps = [self.sweeps.rounds(self, source) for source in sources]
-        if by_roads and is_told(options.camera):
-            yield sweeps.pop(0)
-            yield self._rounds_everywhere()
-            if self._is_everywhere:
-                return
         if not by_roads:
             yield from sweeps
             return
         roads = [self._rounds_of_roads()]
         yield from sweeps + roads if self.index.coarseness == 1.0 else roads + sweeps
-
-    def _rounds_everywhere(self) -> Iterator[list[Hypothesis]]:
-        """Yield the places that agree best of all, where heading and scale are given."""
-        scene, index, options = self.scene, self.index, self.options
-        for matrix in propose_everywhere(scene, index, options.camera, self.near):
-            self._is_everywhere = True
-            self.n_hypotheses += 1
-            hypothesis = Hypothesis.at(matrix, scene, index)
-            self.events.note("grown", [hypothesis.matrix])
-            yield [hypothesis] if self._is_plausible(hypothesis) else []
 
     @property
     def work(self) -> float:

@@ -1,4 +1,4 @@
-"""The places where a mask's roads run on roads of the map: shifts and turns of a start, or everywhere on the map.
+"""The places where a mask's roads run on roads of the map: shifts and turns of a start.
 
 The roads around the frame are drawn on a coarse raster, one layer for each of 16 directions. A road point of the query
 reads the layer of its own direction: the layer around its place is the answer for all shifts at once, and the sum over
@@ -9,7 +9,6 @@ tried one by one.
 from __future__ import annotations
 
 import math
-from collections.abc import Iterator
 from dataclasses import dataclass
 from typing import TypeAlias
 
@@ -17,9 +16,7 @@ import cv2
 import numpy as np
 
 from roadgeo._arrays import AnyArray, FloatArray
-from roadgeo.geometry.camera import CameraOptions
 from roadgeo.geometry.homography import Homography
-from roadgeo.matching.evidence import Evidence
 from roadgeo.matching.index import ReferenceIndex
 from roadgeo.matching.scene import Scene
 
@@ -27,9 +24,7 @@ __all__ = [
     "Drawn",
     "LocalSearchOptions",
     "Shift",
-    "is_told",
     "move_about",
-    "propose_everywhere",
     "search_nearby",
 ]
 
@@ -211,88 +206,3 @@ def _distinct(shifts: list[Shift], options: LocalSearchOptions) -> list[Shift]:
         if len(kept) == options.n_places:
             break
     return kept
-
-
-#: Scales from least to greatest, and turns either way, that are few enough to try them all.
-_MOST_SCALE, _MOST_TURN_DEG = 1.6, 20.0
-#: Side of the raster's cells, at least, and width of the map's roads, metres; cells from the middle of the frame to its
-#: edge, at most; a step of turn or scale moves a corner by this number of them.
-_CELL_M, _ROAD_M, _CELLS, _STEP_CELLS = 12.0, 36.0, 80.0, 2.5
-#: Cells times turns and scales that are few enough: a larger map is not looked at.
-_MOST_CELLS = 1.5e9
-#: The map is looked at in squares of this number of cells from the middle: what is counted there fits in a cache.
-_SQUARE = 200
-#: Road points that vote; places that are ranked, and that are followed; nearer ones than this, metres, are the same.
-_N_POINTS, _N_RANKED, _N_KEPT, _APART_M = 150, 400, 40, 40.0
-#: Each of them is sought anew within a step.
-_NEARER = LocalSearchOptions(reach_m=36.0, turn_deg=3.0, scales=(0.96, 1.0, 1.04), max_points=120, n_places=1)
-
-
-def is_told(camera: CameraOptions) -> bool:
-    """Whether heading and scale are known well enough."""
-    (low, high), heading = camera.gsd_m, camera.heading
-    return high <= _MOST_SCALE * low and heading is not None and heading[1] <= _MOST_TURN_DEG
-
-
-def propose_everywhere(
-    scene: Scene,
-    index: ReferenceIndex,
-    camera: CameraOptions,
-    near: tuple[float, float, float] | None = None,
-) -> Iterator[FloatArray]:
-    """Yield homographies (3, 3), query plane to reference plane, of the places that agree best, the best first.
-
-    None where the map is too large; `near` = (x, y, radius) restricts where the middle of the frame may lie.
-    """
-    center, off = camera.heading or (0.0, 180.0)
-    gsd_m, most = math.sqrt(camera.gsd_m[0] * camera.gsd_m[1]), math.log(camera.gsd_m[1] / camera.gsd_m[0]) / 2.0
-    half_m = scene.half_size * gsd_m
-    cell = max(_CELL_M, half_m / _CELLS)
-    step = _STEP_CELLS * cell / half_m
-    turns, scales = _spread(center, off + 1.0, math.degrees(step)), tuple(np.exp(_spread(0.0, most, step)).tolist())
-    low, high = index.bounds
-    if near is not None:
-        low, high = np.maximum(low, np.subtract(near[:2], near[2])), np.minimum(high, np.add(near[:2], near[2]))
-    reach = _SQUARE * cell
-    squares = np.maximum(np.ceil((high - low) / (2.0 * reach)), 1.0).astype(int)
-    if (high < low).any() or squares.prod() * (2 * _SQUARE) ** 2 * len(turns) * len(scales) > _MOST_CELLS:
-        return
-    around = LocalSearchOptions(reach, 0.0, scales, cell, _ROAD_M, _N_POINTS, _N_KEPT)
-    found: list[tuple[float, FloatArray]] = []
-    for square in np.ndindex(*squares):
-        drawn: Drawn = {}
-        middle = low + (2.0 * np.array(square) + 1.0) * reach
-        for turn in turns:
-            start = _similarity(scene, middle, gsd_m, math.radians(turn))
-            shifts = search_nearby(start, scene, index, around, drawn)
-            found += [(shift.share, move_about(middle, shift) @ start) for shift in shifts]
-    # Where the map has more roads more points lie on them anyhow: Dice's coefficient heeds that.
-    found.sort(key=lambda one: -one[0])
-    evidence, seen_px = Evidence(scene, index, gsd_m), scene.road_length_px
-    ranked = [(share / (seen_px + evidence.mapped_px(one)), one) for share, one in found[:_N_RANKED]]
-    kept: list[FloatArray] = []
-    for _, one in sorted(ranked, key=lambda one: -one[0]):
-        spot = Homography(one).everywhere(scene.center)
-        if all(math.hypot(*(spot - other)) >= _APART_M for other in kept):
-            kept.append(spot)
-            yield _nearer(one, scene, index)
-        if len(kept) == _N_KEPT:
-            return
-
-
-def _nearer(start: FloatArray, scene: Scene, index: ReferenceIndex) -> FloatArray:
-    """Return the place near a start, within a step, that lays most road points on roads."""
-    best = next(iter(search_nearby(start, scene, index, _NEARER)), None)
-    return start if best is None else move_about(Homography(start).everywhere(scene.center), best) @ start
-
-
-def _spread(center: float, off: float, step: float) -> FloatArray:
-    """Return values around a center, both ends included, no further than a step apart."""
-    return np.asarray(np.linspace(center - off, center + off, 2 * math.ceil(off / step) + 1 if off > step / 2 else 1))
-
-
-def _similarity(scene: Scene, middle: FloatArray, scale: float, turn: float) -> FloatArray:
-    """Return the homography (3, 3) that lays the frame's middle on a point (2,), its up turned clockwise, radians."""
-    c, s = scale * math.cos(turn), scale * math.sin(turn)
-    linear = np.array([[c, s], [-s, c]])
-    return np.vstack((np.column_stack((linear, middle - linear @ scene.center)), (0.0, 0.0, 1.0)))

@@ -20,7 +20,7 @@ from typing import NamedTuple
 import numpy as np
 
 from roadgeo._arrays import FloatArray
-from roadgeo.geometry.camera import judge, sampling
+from roadgeo.geometry.camera import CameraFault, judge, sampling
 from roadgeo.geometry.homography import Homography
 from roadgeo.matching.estimator import MatchOptions, TripleEstimator
 from roadgeo.matching.events import Ledger
@@ -219,6 +219,8 @@ def similar_places(
     found: list[tuple[float, FloatArray]] = []
     for turn in _TURNS_DEG:
         turned = move_about(center, Shift(0.0, 0.0, turn, 1.0, 0.0)) @ matrix
+        if judge(turned, scene.size, match.camera) is CameraFault.HEADING:
+            continue
         shifts = search_nearby(turned, scene, index, around, drawn)
         found += [(shift.share, move_about(center, shift) @ turned) for shift in shifts]
     found.sort(key=lambda one: -one[0])

@@ -219,16 +219,16 @@ class Voter:
         scene: Scene,
         index: ReferenceIndex,
         scale: tuple[float, float],
-        max_turn: float,
+        heading: tuple[float, float],
         candidates: IntArray,
         more: int = 1,
     ) -> None:
-        """`scale` in metres per pixel, `max_turn` of the image's up from north in radians, `candidates` on the map.
+        """`scale` in metres per pixel; `heading` of the image's up, and how far off, radians; `candidates` on the map.
 
         `more` times as many proposals as usual are kept.
         """
         self.scene, self.index = scene, index
-        self.max_turn, self.candidates, self.kept = max_turn, candidates, more * _KEPT
+        self.heading, self.candidates, self.kept = heading, candidates, more * _KEPT
         step = RING_STEP
         n = int(math.log(scale[1] / scale[0]) / math.log(step)) + 1  # between the limits, half a step from them at most
         self.scales = np.asarray(math.sqrt(scale[0] * scale[1]) * step ** (np.arange(n) - (n - 1) / 2))
@@ -245,11 +245,12 @@ class Voter:
         rays = _whole(rays[np.isfinite(rays)])
         around = self._around(anchor)
         points = self._mark(around)
-        max_turn = round(self.max_turn * _PER_RADIAN)
+        turn, max_off = -round(self.heading[0] * _PER_RADIAN), round(self.heading[1] * _PER_RADIAN)
         found = np.empty((self.kept, 4))
         kept, tried = vote(
-            self.candidates, rays, _TOLERANCE, max_turn, self.scales, points, _LEAST_POINTS, self.places, found, 0
-        )
+            self.candidates, rays, _TOLERANCE, turn, max_off, self.scales, points,
+            _LEAST_POINTS, self.places, found, 0,
+        )  # fmt: skip
         wide = self._wide(around)
         improve_votes(found[:kept], _TURN_STEPS, _SCALE_STEPS, wide, self.places, self.drawn.raster, _TRIAL)
         best = found[:kept][np.argsort(-found[:kept, 3], kind="stable")]
@@ -457,9 +458,9 @@ class RoadSearch:
         self.turnout = turnout or Turnout(len(index))
         scale = scales(camera, scene.road_width_px, coarseness)
         center, off = camera.heading or (0.0, 180.0)
-        max_turn = min(math.radians(abs(center) + off + AGREE_DEG), math.pi)
+        heading = math.radians(center), math.radians(min(off + AGREE_DEG, 180.0))
         candidates = _within(index, near, scene.half_size * min(scale[1], max(coarseness * _FAR_M, scale[0])))
-        self.voter = Voter(scene, index, scale, max_turn, candidates, more)
+        self.voter = Voter(scene, index, scale, heading, candidates, more)
         self.grower = RoadGrower(scene, index, camera, more)
 
     def rounds(self) -> Iterator[RoadRound]:

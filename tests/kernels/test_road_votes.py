@@ -96,9 +96,9 @@ def world(seed, n_places=30):
 
 class TestVote:
     @pytest.mark.parametrize("seed", range(4))
-    @pytest.mark.parametrize("max_turn", [math.pi, 0.8])
-    def test_like_the_twin(self, seed, max_turn):
-        n_places = 300 if max_turn > 3 else 900
+    @pytest.mark.parametrize(("middle", "max_off"), [(0.0, math.pi), (0.0, 0.8), (3.0, 0.8)])
+    def test_like_the_twin(self, seed, middle, max_off):
+        n_places = 300 if max_off > 3 else 900
         _, places, _, rays = world(seed, n_places)
         rng = np.random.default_rng(seed)
         scales, marked = np.array([1.0, 1.1, 1.2]), np.zeros((3, WORDS), np.uint64)
@@ -110,7 +110,7 @@ class TestVote:
         expected, tried_all = [], 0
         for j in range(n_places):
             for turn in turns_of(rays, places[1:3], j):
-                if abs(turn) <= max_turn:
+                if abs(math.remainder(turn - middle, 2 * math.pi)) <= max_off:
                     tried_all += 1
                     back = round(turn / (2 * math.pi) * BEARINGS)
                     at = {
@@ -124,10 +124,10 @@ class TestVote:
         assert len(expected) > 6
         found = np.empty((len(expected) // 2 + 1, 4))  # more than are kept
         kept, tried = 0, 0
-        tolerance, most = (int(whole([a])[0]) for a in (TOLERANCE, max_turn - 1e-9))
+        tolerance, toward, most = (int(whole([a])[0]) for a in (TOLERANCE, middle, max_off - 1e-9))
         for some in (np.arange(11), np.arange(11, n_places)):  # a part of the map after the other
             with np.errstate(over="ignore"):  # bits are counted by a product of which the uppermost digits count
-                kept, n = vote(some, whole(rays), tolerance, most, scales, marked, 15, places, found, kept)
+                kept, n = vote(some, whole(rays), tolerance, toward, most, scales, marked, 15, places, found, kept)
             tried += n
         assert (kept, tried) == (len(found), tried_all)
         best = found[np.argsort(-found[:, 3])]

@@ -6,7 +6,7 @@ import pytest
 from worlds.lattices import beside, contest
 from worlds.scenes import Sight, camera, look, scene_of
 
-from roadgeo.geometry.camera import CameraOptions, sampling
+from roadgeo.geometry.camera import CameraOptions, pose, sampling
 from roadgeo.geometry.homography import Homography
 from roadgeo.location import Reason
 from roadgeo.matching import rivals
@@ -170,6 +170,24 @@ def test_similar_places_lie_on_the_streets_around_as_large_as_the_place_and_not_
         assert sampling(one, size) == pytest.approx(sampling(wrong, size), rel=0.1)
         assert evidence.weigh(one) > 0.0
     assert [other.worth for other in others] == pytest.approx([evidence.weigh(one) for one in places])
+
+
+@pytest.mark.slow
+def test_similar_places_point_where_the_image_may(broken):
+    """Those that a hint on the heading rules out would crowd out the others, and be compared in vain."""
+    truth, _, evidence = broken
+    up = pose(truth, evidence.scene.size).rotation_deg
+    told = MatchOptions(camera=CameraOptions(heading_deg=(up, 5.0)))
+    compare = evidence.compared_with(truth)
+    anywhere, there = (similar_places(truth, evidence, compare, match) for match in (MatchOptions(), told))
+
+    def n_turned(others):
+        away = [pose(other.matrix, evidence.scene.size).rotation_deg - up for other in others]
+        return sum(abs((turn + 180.0) % 360.0 - 180.0) > 45.0 for turn in away)
+
+    assert n_turned(anywhere) > 0
+    assert n_turned(there) == 0
+    assert len(there) >= len(anywhere) - n_turned(anywhere)
 
 
 # --- how far the best of many leads by chance -------------------------------------------------------------------------
