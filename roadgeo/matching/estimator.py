@@ -296,7 +296,7 @@ class TripleEstimator:
         if any(share > agreeing.forward - _BETTER and self.same(other, model) for other, share in self._looked):
             return
         self._looked.append((model, agreeing.forward))
-        lens = find_lens(refined.matrix, self.scene, index, agreeing.forward, self.refine_options)
+        lens = find_lens(refined.matrix, self.scene, index, self.refine_options)
         if lens is None and agreeing.forward < ENOUGH:
             lens = grow_whole(refined.matrix, self.scene, index, self.refine_options)
         if lens is None or not self.may_be(lens.matrix):

@@ -24,7 +24,7 @@ __all__ = [
     "straighten_scene",
 ]
 
-#: Where less than this share of the mask's roads agrees, a lens is tried, else only where residuals hint at one.
+#: Where this share of the mask's roads agrees no other fit is looked for.
 ENOUGH = 0.8
 #: A fit without a lens that has grown over more of the frame puts this much more of the roads on roads.
 _BETTER = 0.02
@@ -45,15 +45,8 @@ _STARTS = (0.0, -0.15, -0.08, 0.08)
 _HOPELESS = 0.3
 
 
-def find_lens(
-    matrix: FloatArray, scene: Scene, index: ReferenceIndex, agreeing: float, refinement: RefineOptions
-) -> Refined | None:
-    """Fit a lens where it pays: None where the residuals of a refined homography do not show one.
-
-    `agreeing` is the share of the mask's roads that agree without a lens.
-    """
-    if agreeing >= ENOUGH and not _hints_at_lens(Equations(matrix, scene, index, refinement, 0.0)):
-        return None
+def find_lens(matrix: FloatArray, scene: Scene, index: ReferenceIndex, refinement: RefineOptions) -> Refined | None:
+    """Fit a lens where it pays: None where the roads do not show one."""
     best = None
     for start in _STARTS:
         found = fit_lens(matrix, scene, index, refinement, start=start)
@@ -145,24 +138,6 @@ def _moves_px(found: Refined, scene: Scene) -> float:
     corners = scene.corners.astype(float)
     moved = Lens.of(found.lens_k1, scene.size, y_up=True).bend(corners) - corners
     return float(np.hypot(*moved.T).max())
-
-
-def _hints_at_lens(equations: Equations) -> bool:
-    """Whether one step from a pinhole would make k1 significant."""
-    met = equations.meet()
-    if met.sum() < FEWEST:
-        return False
-    rows, scaled, cauchy = (
-        equations.met.rows[met],
-        (equations.met.residuals / equations.met.own)[met],
-        equations.cauchy[met],
-    )
-    weighted = (equations.weight * cauchy / equations.met.own[met] ** 2)[:, None] * rows
-    inverse = np.linalg.pinv(weighted.T @ rows)
-    step = inverse @ (weighted.T @ (equations.met.residuals[met] / equations.unit))
-    rms = float(np.sqrt(np.average(scaled**2, weights=cauchy)))
-    sigma = rms / equations.unit * float(np.sqrt(max(inverse[8, 8], 0.0)))
-    return bool(abs(step[8]) > 0.5 * _SIGNIFICANCE * sigma)
 
 
 def straighten_scene(scene: Scene, k1: float) -> Scene:

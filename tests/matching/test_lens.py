@@ -43,7 +43,7 @@ def test_homography_and_lens_are_found_together_and_corners_are_as_sure_as_claim
 def test_a_lens_is_taken_only_where_it_pays(town, k1, pays):
     truth, straight = sight_of(town[0], 7, tilt=10, sight=Sight(0.6))
     scene = through_lens(straight, k1)
-    found = find_lens(truth, scene, town[1], 0.9 if k1 == 0.0 else 0.5, RefineOptions())
+    found = find_lens(truth, scene, town[1], RefineOptions())
     assert (found is not None) == pays
 
 
@@ -71,7 +71,7 @@ def test_what_fits_in_one_part_of_the_frame_grows_over_all_of_it_behind_a_lens(t
     start = bent_start(truth, scene, k1)
     corners = mapped(truth, scene.corners)
     assert np.hypot(*(mapped(start, scene.corners) - corners).T).max() > 60.0  # metres
-    found = find_lens(start, scene, town[1], 0.3, RefineOptions())
+    found = find_lens(start, scene, town[1], RefineOptions())
     assert found.lens_k1 == pytest.approx(k1, abs=0.002)
     assert np.hypot(*(mapped(found.matrix, scene.corners) - corners).T).max() < 2.0
 
@@ -92,7 +92,7 @@ def test_what_fits_in_one_part_of_the_frame_grows_over_all_of_it_without_a_lens(
 def test_a_fit_grows_over_the_frame_where_a_fifth_of_the_roads_is_missing_and_two_fifths_are_false(town, seed):
     truth, straight = sight_of(town[0], seed, tilt=25, sight=Sight(0.6, 0.2, 0.4))
     scene = through_lens(straight, -0.12)
-    found = find_lens(bent_start(truth, scene, -0.12), scene, town[1], 0.3, RefineOptions())
+    found = find_lens(bent_start(truth, scene, -0.12), scene, town[1], RefineOptions())
     assert found.lens_k1 == pytest.approx(-0.12, abs=0.002)
     assert np.hypot(*(mapped(found.matrix, scene.corners) - mapped(truth, scene.corners)).T).max() < 2.0
 
@@ -110,7 +110,7 @@ def test_a_wrong_place_does_not_grow(town):
     truth, scene = sight_of(town[0], 5, tilt=15, sight=Sight(0.6))
     wrong = np.array([[1.0, 0, 137.0], [0, 1.0, 211.0], [0, 0, 1]]) @ truth
     given = (scene, town[1])
-    assert find_lens(wrong, *given, 0.3, RefineOptions()) is None
+    assert find_lens(wrong, *given, RefineOptions()) is None
     assert grow_whole(wrong, *given, RefineOptions()) is None
 
 
