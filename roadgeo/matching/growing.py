@@ -20,7 +20,7 @@ from roadgeo.kernels.structs import GrowthLimits, GrowthQuery
 from roadgeo.matching.evidence import Agreement, agreement, match_intersections
 from roadgeo.matching.index import ReferenceIndex
 from roadgeo.matching.refinement import Refined
-from roadgeo.matching.road_search import Turnout
+from roadgeo.matching.road_search import PERSPECTIVE_SIGMA, Turnout
 from roadgeo.matching.scene import MIN_COS, Scene
 from roadgeo.matching.search import ALONE, Ahead
 from roadgeo.matching.triples import Proposals, Sweep
@@ -100,8 +100,6 @@ MAX_SCREENED, MAX_GROWN, MAX_VERIFIED = 600, 150, 3
 _SCREEN_POINTS, _SCREEN_SHARE, _SCREEN_RADIUS = 40, 0.6, (8.0, 4.0)
 #: Standard deviation of an intersection's place, and the greatest search radius, likewise.
 _SIGMA, _RADIUS = (3.5, 1.5), (20.0, 5.0)
-#: Prior standard deviation of the two perspective parameters.
-_PERSPECTIVE_SIGMA = 0.4
 #: Of the sequential test: share of intersections that match if true and if not, and the nats lost before it gives up.
 _HIT_RATE, _CHANCE_RATE, _PATIENCE = 0.45, 0.08, 6.0
 #: Least matches besides the seeds; of more intersections, those nearest to the anchor decide how well one grows.
@@ -147,7 +145,7 @@ def grow_proposals(
     matched = np.empty((len(chosen), len(xy)), np.int64)
     matrices = np.empty((len(chosen), 3, 3))
     ratios = np.empty(len(chosen))
-    perspective = camera.perspective_sigma(_PERSPECTIVE_SIGMA)
+    perspective = camera.perspective_sigma(PERSPECTIVE_SIGMA)
     limits = GrowthLimits(_SIGMA, _RADIUS, MIN_COS, perspective, _HIT_RATE, _CHANCE_RATE, _PATIENCE)
     grow_each(
         GrowthQuery(xy, scene.branches, neighbours, order, scene.half_size, anchor),

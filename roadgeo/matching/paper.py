@@ -271,8 +271,8 @@ class PairMatch:
         Query intersection, and the reference intersection near which it lands.
     inlier_ratio : float
         M over the query's intersections (eq. 10); 0 where not located.
-    n_samples, n_sum, candidates : int
-        Query tuples drawn (l), the sum of their k_i (eq. 15) and that of their N_match.
+    n_samples, candidates : int
+        Query tuples drawn (l), and the sum of their N_match.
     hypotheses : int
         Homographies whose inliers were counted.
     confidence : float
@@ -287,7 +287,6 @@ class PairMatch:
     matches: IntArray
     inlier_ratio: float
     n_samples: int
-    n_sum: int
     candidates: int
     hypotheses: int
     confidence: float
@@ -376,7 +375,7 @@ class _Search:
         self.judges = np.argsort(np.bincount(index.codes, minlength=256)[self.codes], kind="stable")
         self.best = math.floor(options.delta_inlier * len(query))
         self.homography: FloatArray | None = None
-        self.n_samples = self.n_sum = self.candidates = self.tested = self.hypotheses = 0
+        self.n_samples = self.candidates = self.tested = self.hypotheses = 0
         self.log_p_fail = 0.0
 
     @property
@@ -438,7 +437,6 @@ class _Search:
             n = len(one.candidates)
             tested += self._test(one, min(n, math.ceil(k * n / max(n_match, 1))))
         self.n_samples += 1
-        self.n_sum += k
         self.candidates += n_match
         self.log_p_fail += math.log1p(-self.options.p_query * (tested / n_match if n_match else 1.0))
 
@@ -547,7 +545,7 @@ class _Search:
         """Report a place, or that none was found."""
         matched = np.empty((0, 2), np.int64) if matches is None else matches
         ratio, seconds = len(matched) / max(len(self.query), 1), time.perf_counter() - self.begin
-        counts = self.n_samples, self.n_sum, self.candidates, self.hypotheses, self.confidence
+        counts = self.n_samples, self.candidates, self.hypotheses, self.confidence
         return PairMatch(homography, matched, ratio, *counts, reason, stopped, self.work_s, seconds)
 
 

@@ -37,6 +37,7 @@ from roadgeo.roads.intersections import unpack_branches
 
 __all__ = [
     "COARSE_PIXEL_M",
+    "PERSPECTIVE_SIGMA",
     "RADIUS_M",
     "RING_STEP",
     "Grown",
@@ -47,7 +48,6 @@ __all__ = [
     "Turnout",
     "Voter",
     "Votes",
-    "followed_more",
     "make_raster",
     "ring_of",
     "scales",
@@ -221,14 +221,10 @@ class Voter:
         scale: tuple[float, float],
         heading: tuple[float, float],
         candidates: IntArray,
-        more: int = 1,
     ) -> None:
-        """`scale` in metres per pixel; `heading` of the image's up, and how far off, radians; `candidates` on the map.
-
-        `more` times as many proposals as usual are kept.
-        """
+        """`scale` in metres per pixel; `heading` of the image's up, and how far off, radians; map's `candidates`."""
         self.scene, self.index = scene, index
-        self.heading, self.candidates, self.kept = heading, candidates, more * _KEPT
+        self.heading, self.candidates = heading, candidates
         step = RING_STEP
         n = int(math.log(scale[1] / scale[0]) / math.log(step)) + 1  # between the limits, half a step from them at most
         self.scales = np.asarray(math.sqrt(scale[0] * scale[1]) * step ** (np.arange(n) - (n - 1) / 2))
@@ -246,7 +242,7 @@ class Voter:
         around = self._around(anchor)
         points = self._mark(around)
         turn, max_off = -round(self.heading[0] * _PER_RADIAN), round(self.heading[1] * _PER_RADIAN)
-        found = np.empty((self.kept, 4))
+        found = np.empty((_KEPT, 4))
         kept, tried = vote(
             self.candidates, rays, _TOLERANCE, turn, max_off, self.scales, points,
             _LEAST_POINTS, self.places, found, 0,
@@ -302,8 +298,8 @@ _MAX_POINTS, _AFFINE_UNTIL = 700, 0.45
 _LEAST_SHARE = 0.3
 #: Points within the sum of metres and pixels of a road lie on it.
 _TOLERANCE_M, _TOLERANCE_PX = 7.0, 2.0
-#: Prior standard deviation of the two perspective parameters.
-_PERSPECTIVE_SIGMA = 0.4
+#: Prior standard deviation of the two perspective parameters, while a place grows.
+PERSPECTIVE_SIGMA = 0.4
 #: After each of the first stages this number of an intersection's proposals go on, those that lie closest to roads, and
 #: those that had most votes. Of 396 intersections of which one of 40 proposals led to the place of a broken mask 395 do
 #: so still, at half the time; in lattices 255 of 266, at a quarter.
@@ -321,12 +317,10 @@ class Grown:
 class RoadGrower:
     """Grows proposals of one scene on one map."""
 
-    def __init__(self, scene: Scene, index: ReferenceIndex, camera: CameraOptions, more: int = 1) -> None:
-        """`more` times as many proposals as usual go on after each stage."""
+    def __init__(self, scene: Scene, index: ReferenceIndex, camera: CameraOptions) -> None:
         self.scene, self.index = scene, index
-        first, second, third = (more * n for n in _GO_ON)
-        perspective = camera.perspective_sigma(_PERSPECTIVE_SIGMA)
-        self._stages = Stages(_AFFINE_UNTIL, _LEAST_SHARE, perspective, MIN_COS, (first, second, third), _SURE)
+        perspective = camera.perspective_sigma(PERSPECTIVE_SIGMA)
+        self._stages = Stages(_AFFINE_UNTIL, _LEAST_SHARE, perspective, MIN_COS, _GO_ON, _SURE)
         thin = max(1, len(scene.dense_points) // _MAX_POINTS)
         self.points, self.directions = scene.dense_points[::thin], scene.dense_directions[::thin]
 
@@ -365,9 +359,8 @@ _MAX_ANCHORS = 30
 #: larger map more by the root of the ratio; of a map in parts, on all of them together. In a lattice every crossing can
 #: be turned four ways.
 _MAX_TRIED, _LEAST_ANCHORS = 400_000, 8
-#: Number of an anchor's proposals that grow, and of those that are then compared with the map, where all vote; a
-#: mask of few intersections has few chances: up to the third number of times as many then.
-_MAX_GROWN, _MAX_KEPT, _MOST_MORE = 20, 2, 5
+#: Number of an anchor's proposals that grow, and of those that are then compared with the map.
+_MAX_GROWN, _MAX_KEPT = 20, 2
 #: Around an anchor the ground sampling may differ by this factor from that at the middle of the frame.
 _SCALE_SLACK = 1.2
 #: Roads drawn at least this many pixels wide are no thin lines, and only scales are tried at which their
@@ -392,11 +385,6 @@ def scales(camera: CameraOptions, road_width_px: float, coarseness: float = 1.0)
         return low, high
     least, most = (width / road_width_px for width in _ROAD_WIDTH_M)
     return (max(low, least), min(high, most)) if least < high and most > low else (low, high)
-
-
-def followed_more(n_voters: int) -> int:
-    """Return how many times more proposals of each intersection are followed: in all, as many as usual."""
-    return max(1, min(_MOST_MORE, _MAX_ANCHORS // max(n_voters, 1)))
 
 
 @dataclass
@@ -452,16 +440,15 @@ class RoadSearch:
 
         Parts that are searched together share the `turnout`.
         """
-        more, coarseness = followed_more(len(scene.intersections)), index.coarseness
+        coarseness = index.coarseness
         self.scene, self.ahead = scene, ahead
-        self._max_grown, self._max_kept = more * _MAX_GROWN, more * _MAX_KEPT
         self.turnout = turnout or Turnout(len(index))
         scale = scales(camera, scene.road_width_px, coarseness)
         center, off = camera.heading or (0.0, 180.0)
         heading = math.radians(center), math.radians(min(off + AGREE_DEG, 180.0))
         candidates = _within(index, near, scene.half_size * min(scale[1], max(coarseness * _FAR_M, scale[0])))
-        self.voter = Voter(scene, index, scale, heading, candidates, more)
-        self.grower = RoadGrower(scene, index, camera, more)
+        self.voter = Voter(scene, index, scale, heading, candidates)
+        self.grower = RoadGrower(scene, index, camera)
 
     def rounds(self) -> Iterator[RoadRound]:
         """Yield the places that grew of one anchor's proposals after another."""
@@ -471,10 +458,10 @@ class RoadSearch:
             if not self.turnout.includes(n):
                 return
             self.turnout.n_tried += votes.n_tried
-            best = slice(self._max_grown)
+            best = slice(_MAX_GROWN)
             grown = self.grower.grow(votes.anchor, votes.reference[best], votes.affine[best])
             some = sorted(grown, key=lambda one: -one.closeness)
-            yield RoadRound(votes.anchor, votes.n_tried, len(votes.reference[best]), some[: self._max_kept])
+            yield RoadRound(votes.anchor, votes.n_tried, len(votes.reference[best]), some[:_MAX_KEPT])
 
 
 def _within(index: ReferenceIndex, near: tuple[float, float, float] | None, reach_m: float) -> IntArray:

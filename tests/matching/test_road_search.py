@@ -20,7 +20,6 @@ from roadgeo.matching.road_search import (
     RoadSearch,
     Turnout,
     Voter,
-    followed_more,
     make_raster,
     ring_of,
     scales,
@@ -77,11 +76,6 @@ def test_limits_on_scale_and_turn_are_kept(town, broken, up):
 def test_on_a_coarse_map_small_pixels_are_not_looked_for():
     assert scales(CameraOptions(gsd_m=(0.1, 12.0)), 4.0, 6.0) == (6.0 * COARSE_PIXEL_M, 12.0 * 1.2)
     assert scales(CameraOptions(gsd_m=(0.1, 0.5)), 4.0, 6.0)[0] > 0.5
-
-
-@pytest.mark.parametrize(("voters", "more"), [(0, 5), (3, 5), (10, 3), (20, 1), (30, 1), (90, 1)])
-def test_of_few_intersections_more_proposals_are_followed(voters, more):
-    assert followed_more(voters) == more
 
 
 def test_an_intersection_far_from_all_roads_has_no_votes(town, broken):
