@@ -15,7 +15,7 @@ from roadgeo.geometry.camera import CameraFault, CameraOptions, judge, sampling
 from roadgeo.geometry.homography import Homography
 from roadgeo.geometry.projection import to_lonlat
 from roadgeo.matching.events import Events, Ledger, Scored
-from roadgeo.matching.evidence import Evidence
+from roadgeo.matching.evidence import Evidence, statement_px
 from roadgeo.matching.growing import Hypothesis, SharedSweeps, grow_proposals, screen_proposals
 from roadgeo.matching.index import ReferenceIndex
 from roadgeo.matching.lens import ENOUGH, find_lens, grow_whole, straighten_scene
@@ -333,6 +333,10 @@ class TripleEstimator:
                 break
             best = agreeing
         return True
+
+    def explained(self, model: Hypothesis) -> float:
+        """Return what a place explains, which compares it with places of other scales (see `statement_px`)."""
+        return model.log10_likelihood * statement_px(sampling(model.matrix, self.scene.size))
 
     def refinement(self, model: Hypothesis) -> RefineOptions:
         """Return how a hypothesis is refined."""

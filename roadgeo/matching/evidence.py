@@ -32,7 +32,7 @@ from roadgeo.kernels.roads import count_residuals, road_residuals, shares_near_r
 from roadgeo.matching.index import ReferenceIndex
 from roadgeo.matching.scene import MIN_COS, Scene
 
-__all__ = ["Agreement", "Evidence", "agreement", "log10_lead", "match_intersections", "tolerance_m"]
+__all__ = ["Agreement", "Evidence", "agreement", "log10_lead", "match_intersections", "statement_px", "tolerance_m"]
 
 #: Grid of the marginalised parameters: residuals' deviation, in usual ones; shares of missing, and of false roads.
 _SIGMAS = np.array([0.25, 0.4, 0.65, 1.0, 1.6])
@@ -108,7 +108,7 @@ class Evidence:
     def __init__(self, scene: Scene, index: ReferenceIndex, gsd_m: float) -> None:
         self.scene, self.index, self.gsd_m = scene, index, gsd_m
         self._sigma_m = math.hypot(MAP_SIGMA_M, PIXEL_SIGMA_PX * gsd_m)
-        self._statement_px = max(STATEMENT_M / gsd_m, STATEMENT_PX)
+        self._statement_px = statement_px(gsd_m)
         self._piece_px = max(_PIECE_M / gsd_m, _PIECE_PX)
         width, height = scene.size
         self._shape = math.ceil(height / self._piece_px), math.ceil(width / self._piece_px)
@@ -284,6 +284,15 @@ class Evidence:
             possible &= np.hypot(*(middle + shifts - within[:2]).T) <= within[2]
         shifts, length = shifts[possible], length[possible]
         return np.asarray(shifts[np.argsort(length)[:_N_SHIFTS]])
+
+
+def statement_px(gsd_m: float) -> float:
+    """Return how many pixels of road count as one independent statement.
+
+    A likelihood times that compares places of different scale: it is what they explain of the same pixels. By
+    themselves those of larger pixels have more statements to make.
+    """
+    return max(STATEMENT_M / gsd_m, STATEMENT_PX)
 
 
 def tolerance_m(gsd_m: float) -> float:

@@ -11,12 +11,13 @@ from functools import lru_cache
 import numpy as np
 
 from roadgeo._arrays import FloatArray, IntArray
+from roadgeo.geometry.camera import sampling
 from roadgeo.geometry.homography import Homography
 from roadgeo.geometry.projection import from_lonlat, metres_apart, to_lonlat
 from roadgeo.location import Stats
 from roadgeo.matching.estimator import MatchOptions, TripleEstimator
 from roadgeo.matching.events import Events, Ledger
-from roadgeo.matching.evidence import agreement
+from roadgeo.matching.evidence import agreement, statement_px
 from roadgeo.matching.finishing import measure_corners
 from roadgeo.matching.growing import Hypothesis, SharedSweeps
 from roadgeo.matching.index import ReferenceIndex, crop, unpack_tangents
@@ -54,7 +55,7 @@ class Fit:
         Share of the query's roads that agree.
     log10_odds : float
         By which the place leads any other; NaN where the method knows none.
-    log10_likelihood : float
+    log10_likelihood, statement_px : float
         See `evidence`.
     corner_sigma_m, corner_covariance_m2, lens_k1
         As of `Refined`.
@@ -73,6 +74,12 @@ class Fit:
     corner_covariance_m2: FloatArray | None = None
     lens_k1: float = 0.0
     agreement: float = math.nan
+    statement_px: float = 1.0
+
+    @property
+    def explained(self) -> float:
+        """What compares it with places of other scales (see `evidence.statement_px`)."""
+        return self.log10_likelihood * self.statement_px
 
 
 @dataclass(frozen=True)
@@ -263,7 +270,8 @@ def _fits(estimator: TripleEstimator, standing: Standing) -> tuple[Fit, ...]:
     fits = [_fit(estimator, model, lead)]
     if standing.rival is not None:
         fits.append(_fit_of_rival(estimator, standing.rival, min(-lead, 0.0), standing.rival_likelihood))
-    return tuple(filter(None, fits))
+    counted_px = statement_px(sampling(model.matrix, estimator.scene.size))
+    return tuple(replace(fit, statement_px=counted_px) for fit in fits if fit is not None)
 
 
 def _fit(estimator: TripleEstimator, model: Hypothesis, lead: float) -> Fit | None:

@@ -148,7 +148,7 @@ def _pool(query: Query, found: Sequence[Found]) -> list[_Candidate]:
         for fit in one.fits
     ]
     distinct: list[_Candidate] = []
-    for candidate in sorted(pool, key=lambda one: (-one.fit.log10_likelihood, -one.score)):
+    for candidate in sorted(pool, key=lambda one: (-one.fit.explained, -one.score)):
         if all(_differ(query, one, candidate) for one in distinct):
             distinct.append(candidate)
     return distinct
@@ -173,8 +173,8 @@ def _seen_from(best: _Candidate, rival: _Candidate) -> Place:
 
 def _against(best: _Candidate, rivals: Sequence[_Candidate]) -> _Candidate:
     """Return a place with the odds by which it leads also those on other references."""
-    elsewhere = [one.fit.log10_likelihood for one in rivals if one.found is not best.found]
-    odds = min([best.score, *(best.fit.log10_likelihood - likelihood for likelihood in elsewhere)])
+    leads = [best.fit.explained - one.fit.explained for one in rivals if one.found is not best.found]
+    odds = min([best.score, *(lead / best.fit.statement_px for lead in leads)])
     return replace(best, fit=replace(best.fit, log10_odds=odds), center=replace(best.center, log10_odds=odds))
 
 

@@ -98,6 +98,17 @@ def test_a_weak_place_does_not_beat_one_that_explains_more(query, searched):
     assert best.reason.startswith("no place on this map stands out: the best is only 3.2 times as likely as another,")
 
 
+def test_places_of_different_scales_are_compared_by_what_they_explain_of_the_same_pixels(query, searched):
+    """Laid five times as large, a mask has five times as much road that may agree by chance."""
+    here, large = searched("a", (20.0, 0.0), likelihood=100.0), searched("b", (-8.0, 30_000.0), likelihood=180.0)
+    here, large = (
+        replace(one, fits=tuple(replace(fit, statement_px=px) for fit in one.fits))
+        for one, px in ((here, 600.0), (large, 120.0))
+    )
+    best = judge(query, large, here)
+    assert (best.status, best.reference, best.log10_odds) == ("located", "a", 20.0)
+
+
 def test_places_that_repeat_are_told_whatever_another_map_holds(query, searched):
     pair = searched("b", (0.5, 0.0), (-0.5, 5000.0), likelihood=30.0)
     pair = replace(pair, fits=tuple(replace(fit, agreement=0.95) for fit in pair.fits))
