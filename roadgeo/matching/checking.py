@@ -14,10 +14,10 @@ from roadgeo.geometry.displacement import Displacement, measure
 from roadgeo.geometry.homography import Homography
 from roadgeo.kernels.roads import road_residuals
 from roadgeo.matching.evidence import Evidence, agreement, match_intersections
-from roadgeo.matching.exhaustive import APART_M, LocalSearchOptions, move_about, search_nearby
 from roadgeo.matching.index import ReferenceIndex
 from roadgeo.matching.refinement import Refined, RefineOptions, points_on_map, refine, refine_between
 from roadgeo.matching.scene import MIN_COS, Scene
+from roadgeo.matching.shifts import APART_M, LocalSearchOptions, move_about, search_nearby
 
 __all__ = ["CheckOptions", "Checked", "Verdict", "check_place"]
 

@@ -25,12 +25,12 @@ from roadgeo.geometry.homography import Homography
 from roadgeo.matching.estimator import MatchOptions, TripleEstimator
 from roadgeo.matching.events import Ledger
 from roadgeo.matching.evidence import Evidence, match_intersections, statement_px
-from roadgeo.matching.exhaustive import Drawn, LocalSearchOptions, Shift, move_about, search_nearby
 from roadgeo.matching.growing import Hypothesis
 from roadgeo.matching.index import ReferenceIndex
 from roadgeo.matching.refinement import refine
 from roadgeo.matching.scene import Scene
 from roadgeo.matching.search import Search
+from roadgeo.matching.shifts import Drawn, LocalSearchOptions, Shift, move_about, search_nearby
 from roadgeo.matching.triples import larger
 
 __all__ = ["N_LAID", "Other", "Rivals", "Standing", "log10_gap", "similar_places"]
@@ -188,14 +188,12 @@ class Rivals:
         met = (Other(*compare(model.matrix), model.matrix, self.doubt(estimator, model)) for model in known)
         rivals = list(filter(is_rival, met))
         standing = stand(rivals)
-        if standing.log10_lead >= _WORTH_LOOKING * self.needed:
-            around = _AROUND
-        elif estimator.nearby(best) < _REPEATING * worth:
+        leads = standing.log10_lead >= _WORTH_LOOKING * self.needed
+        if not leads and estimator.nearby(best) < _REPEATING * worth:
             return standing
-        else:
-            around = _NEARBY  # another block may be the place
-        similar = similar_places(matrix, evidence, compare, estimator.options, around)
-        return stand([*rivals, *filter(is_rival, similar)])
+        for around in (_NEARBY, _AROUND) if leads else (_NEARBY,):  # a block beside may be the place
+            rivals += filter(is_rival, similar_places(matrix, evidence, compare, estimator.options, around))
+        return stand(rivals)
 
     def doubt(self, estimator: TripleEstimator, model: Hypothesis) -> float:
         """Return by how many powers of ten what a place contradicts speaks against it, as it is laid; asked once."""

@@ -8,7 +8,7 @@ from worlds.scenes import Sight, camera, look, scene_of
 from roadgeo.geometry.homography import Homography
 from roadgeo.matching import checking
 from roadgeo.matching.checking import check_place
-from roadgeo.matching.exhaustive import LocalSearchOptions, Shift, move_about, search_nearby
+from roadgeo.matching.shifts import LocalSearchOptions, Shift, move_about, search_nearby
 
 SIGHT = Sight(sigma_m=1.0, missing=0.2, false=0.1)
 

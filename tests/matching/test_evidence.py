@@ -18,9 +18,9 @@ import roadgeo
 from roadgeo.geometry.homography import Homography
 from roadgeo.matching import evidence
 from roadgeo.matching.evidence import Evidence, log10_lead
-from roadgeo.matching.exhaustive import Shift, move_about
 from roadgeo.matching.index import build_index
 from roadgeo.matching.options import LocateOptions
+from roadgeo.matching.shifts import Shift, move_about
 from roadgeo.reference.reference import Reference
 
 SIZE = (900, 700)

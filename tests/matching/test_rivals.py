@@ -13,11 +13,11 @@ from roadgeo.matching import rivals
 from roadgeo.matching.estimator import MatchOptions, TripleEstimator
 from roadgeo.matching.events import Ledger
 from roadgeo.matching.evidence import Evidence
-from roadgeo.matching.exhaustive import Shift, move_about
 from roadgeo.matching.growing import Hypothesis
 from roadgeo.matching.options import LocateOptions
 from roadgeo.matching.rivals import Rivals, log10_gap, similar_places
 from roadgeo.matching.search import Search
+from roadgeo.matching.shifts import Shift, move_about
 from roadgeo.matching.triples import larger
 from roadgeo.reference.reference import Reference
 from roadgeo.workflows import locate
@@ -288,10 +288,12 @@ def test_a_place_is_compared_once_and_remembered(broken, monkeypatch):
 
 
 @pytest.mark.slow
-def test_streets_around_are_looked_at_only_where_the_places_met_leave_a_lead(even, broken, monkeypatch):
-    """A block beside may still be the place where the best one that was met leads nothing."""
+def test_streets_around_are_looked_at_only_where_the_places_met_and_the_blocks_beside_leave_a_lead(
+    even, broken, monkeypatch
+):
+    """A block beside may be the place, whether or not the best one that was met leads."""
     looked = []
     monkeypatch.setattr(rivals, "similar_places", lambda *told: looked.append(told[4:]) or [])
     stand(even, even[0], beside(even[0], even[2]))
     stand(broken, broken[0])
-    assert looked == [(rivals._NEARBY,), (rivals._AROUND,)]
+    assert looked == [(rivals._NEARBY,), (rivals._NEARBY,), (rivals._AROUND,)]

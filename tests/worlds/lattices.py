@@ -6,8 +6,8 @@ import shapely
 from roadgeo.geometry.homography import Homography
 from roadgeo.geometry.projection import LocalPlane
 from roadgeo.matching.evidence import Evidence
-from roadgeo.matching.exhaustive import Shift, move_about
 from roadgeo.matching.index import build_index
+from roadgeo.matching.shifts import Shift, move_about
 from roadgeo.workflows import build_network
 from worlds.scenes import Sight, camera, look, scene_of
 

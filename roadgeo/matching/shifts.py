@@ -187,10 +187,11 @@ def _best_shifts(
             some[:] = 0
     votes += some
     peaks = votes == cv2.dilate(votes, np.ones((5, 5), np.uint8))
-    most = 2 * options.n_places
+    most = 4 * options.n_places
     at_least = np.cumsum(np.bincount(votes[peaks], minlength=1)[::-1])[::-1]  # peaks of so many votes or more
     rows, columns = np.nonzero(peaks & (votes >= max(int((at_least >= most).sum()) - 1, 0)))
-    order = np.argsort(-votes[rows, columns].astype(int), kind="stable")[:most]
+    away = np.hypot(rows - reach, columns - reach)  # of equals the nearest: where blocks repeat, one beside
+    order = np.lexsort((away, -votes[rows, columns].astype(int)))[:most]
     return [
         Shift((c - reach) * options.cell_m, (r - reach) * options.cell_m, turn, scale, int(votes[r, c]) / len(points))
         for r, c in zip(rows[order].tolist(), columns[order].tolist(), strict=True)
@@ -200,7 +201,7 @@ def _best_shifts(
 def _distinct(shifts: list[Shift], options: LocalSearchOptions) -> list[Shift]:
     """Return the best shifts that lie apart from better ones."""
     kept: list[Shift] = []
-    for one in sorted(shifts, key=lambda shift: -shift.share):
+    for one in sorted(shifts, key=lambda shift: (-shift.share, math.hypot(shift.east_m, shift.north_m))):
         if all(math.hypot(one.east_m - k.east_m, one.north_m - k.north_m) >= APART_M for k in kept):
             kept.append(one)
         if len(kept) == options.n_places:
