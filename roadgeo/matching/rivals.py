@@ -24,7 +24,7 @@ from roadgeo.geometry.camera import CameraFault, judge, sampling
 from roadgeo.geometry.homography import Homography
 from roadgeo.matching.estimator import MatchOptions, TripleEstimator
 from roadgeo.matching.events import Ledger
-from roadgeo.matching.evidence import Evidence, match_intersections, statement_px
+from roadgeo.matching.evidence import Evidence, match_intersections
 from roadgeo.matching.growing import Hypothesis
 from roadgeo.matching.index import ReferenceIndex
 from roadgeo.matching.refinement import refine
@@ -118,28 +118,18 @@ class Rivals:
         standing = self.standing(best)
         return best if standing is not None and standing.log10_lead >= 2.0 * self.needed else None
 
-    def _likeliest(self, estimator: TripleEstimator) -> Hypothesis | None:
-        """Return the place of a part that is put forward; None where nothing was verified."""
-        ranked = sorted(estimator.verified, key=lambda model: -model.log10_likelihood)[:_N_KNOWN]
-        return max(ranked, key=lambda one: one.log10_likelihood - self.doubt(estimator, one), default=None)
-
     def _explained(self, one: Search[Hypothesis]) -> float:
         estimator = self.estimators[one]
-        likeliest = self._likeliest(estimator)
-        return -math.inf if likeliest is None else estimator.explained(likeliest)
+        return max(map(estimator.explained, estimator.verified), default=-math.inf)
 
     def standing(self, one: Search[Hypothesis]) -> Standing | None:
         """Compare the likeliest place of a part with the best other one; None where nothing was verified."""
         estimator = self.estimators[one]
-        best, started = self._likeliest(estimator), time.perf_counter()
-        if best is None:
-            return None
-        most = max(map(self._explained, self.estimators))
-        explained = estimator.explained(best)
-        if explained < _REPEATING * most:  # another part has a better place
-            gsd_m = sampling(best.matrix, estimator.scene.size)
-            return Standing(best, None, (explained - most) / statement_px(gsd_m), best.log10_likelihood)
         ranked = sorted(estimator.verified, key=lambda model: -model.log10_likelihood)
+        if not ranked:
+            return None
+        started = time.perf_counter()
+        best = max(ranked[:_N_KNOWN], key=lambda one: one.log10_likelihood - self.doubt(estimator, one))
         for _ in range(_MOST_TURNS):
             standing = self._known.get(id(best)) or self._compare(estimator, best, ranked)
             self._known[id(best)] = standing

@@ -246,18 +246,6 @@ def test_where_it_is_compared_it_leads_as_clearly(plain, monkeypatch):
     assert standing.log10_lead > certain
 
 
-def test_a_part_that_explains_less_than_half_of_another_is_not_compared(plain):
-    truth, _, evidence = plain
-    middle = Homography(truth)(evidence.scene.center)
-    right, there = search_of(plain, truth)
-    wrong, elsewhere = search_of(plain, move_about(middle, Shift(0.0, 8.0, 0.0, 1.0, 0.0)) @ truth)
-    likeliest = elsewhere.verified[0]
-    likeliest.log10_likelihood = 0.4 * there.verified[0].log10_likelihood
-    standing = Rivals({right: there, wrong: elsewhere}, Ledger(), NEEDED).standing(wrong)
-    assert (standing.model, standing.rival) == (likeliest, None)
-    assert standing.log10_lead == pytest.approx(-1.5 * likeliest.log10_likelihood, rel=0.05)
-
-
 def test_nothing_met_has_no_standing(plain):
     one, estimator = search_of(plain)
     asked = Rivals({one: estimator}, Ledger(), NEEDED)
