@@ -53,8 +53,6 @@ class LocalSearchOptions:
         Greatest shift, east and north.
     turn_deg : float
         Greatest turn, either way.
-    scales : tuple of float
-        Factors by which the frame may be too small.
     cell_m : float
         Side of the raster's cells, and step of the shifts.
     road_m : float
@@ -67,7 +65,6 @@ class LocalSearchOptions:
 
     reach_m: float = 350.0
     turn_deg: float = 6.0
-    scales: tuple[float, ...] = (1.0,)
     cell_m: float = 5.0
     road_m: float = 15.0
     max_points: int = 300
@@ -122,16 +119,13 @@ def search_nearby(
     if not len(points) or not np.isfinite(frame).all():
         return []
     radius = float(np.hypot(*(frame - center).T).max())
-    drawn, reach_m = {} if drawn is None else drawn, radius * max(options.scales) + options.reach_m
+    drawn, reach_m = {} if drawn is None else drawn, radius + options.reach_m
     key = (*np.round(center, 3).tolist(), round(reach_m, 3))
     layers, origin = drawn[key] = drawn.get(key) or _draw_layers(index, center, reach_m, options)
     best: list[Shift] = []
-    for scale in options.scales:
-        for turn in _turns(radius, options):
-            turned = move_about(center, Shift(0.0, 0.0, turn, scale, 0.0))
-            best += _best_shifts(
-                layers, origin, Homography(turned)(points), Homography(turned)(ends), turn, scale, options
-            )
+    for turn in _turns(radius, options):
+        turned = Homography(move_about(center, Shift(0.0, 0.0, turn, 1.0, 0.0)))
+        best += _best_shifts(layers, origin, turned(points), turned(ends), turn, options)
     return _distinct(best, options)
 
 
@@ -155,10 +149,9 @@ def _draw_layers(
     angle = np.arctan2(*(b - a).T[::-1]) % math.pi
     lines = np.round(np.stack((a, b), axis=1) / cell * 16.0 - 8.0).astype(np.int32)  # 1/16 cells from cell centres
     layers = np.zeros((_DIRECTIONS, side, side), np.uint8)
-    width = _ALONG
     for d, layer in enumerate(layers):
         away = np.abs((d + 0.5) * math.pi / _DIRECTIONS - angle)
-        chosen = lines[np.minimum(away, math.pi - away) <= width]
+        chosen = lines[np.minimum(away, math.pi - away) <= _ALONG]
         cv2.polylines(layer, list(chosen), False, 1, max(1, round(options.road_m / cell)), cv2.LINE_8, 4)
     return layers, origin
 
@@ -169,7 +162,6 @@ def _best_shifts(
     points: FloatArray,
     ends: FloatArray,
     turn: float,
-    scale: float,
     options: LocalSearchOptions,
 ) -> list[Shift]:
     """Return the best shifts of one turn."""
@@ -187,13 +179,13 @@ def _best_shifts(
             some[:] = 0
     votes += some
     peaks = votes == cv2.dilate(votes, np.ones((5, 5), np.uint8))
-    most = 4 * options.n_places
+    most = 4 * options.n_places  # several cells of one peak may be equal
     at_least = np.cumsum(np.bincount(votes[peaks], minlength=1)[::-1])[::-1]  # peaks of so many votes or more
     rows, columns = np.nonzero(peaks & (votes >= max(int((at_least >= most).sum()) - 1, 0)))
     away = np.hypot(rows - reach, columns - reach)  # of equals the nearest: where blocks repeat, one beside
     order = np.lexsort((away, -votes[rows, columns].astype(int)))[:most]
     return [
-        Shift((c - reach) * options.cell_m, (r - reach) * options.cell_m, turn, scale, int(votes[r, c]) / len(points))
+        Shift((c - reach) * options.cell_m, (r - reach) * options.cell_m, turn, 1.0, int(votes[r, c]) / len(points))
         for r, c in zip(rows[order].tolist(), columns[order].tolist(), strict=True)
     ]
 
