@@ -22,7 +22,7 @@ from roadgeo.matching.hints import HINTS
 
 if TYPE_CHECKING:
     from roadgeo.running.flights.mavlink import MavlinkSender
-    from roadgeo.running.serving.options import ServeOptions
+    from roadgeo.serving.options import ServeOptions
 
 __all__ = ["serve_command"]
 
@@ -124,8 +124,8 @@ def serve_command(
     from roadgeo.errors import OutputError, RoadgeoError
     from roadgeo.running.batch import open_references
     from roadgeo.running.flights.mavlink import MavlinkSender
-    from roadgeo.running.serving.server import Server
-    from roadgeo.running.serving.workers import Workers
+    from roadgeo.serving.server import Server
+    from roadgeo.serving.workers import Workers
 
     # Compiled and opened here first: errors in the references are printed before anything listens.
     options = _options(given)
@@ -208,7 +208,7 @@ def _options(given: dict[str, Any]) -> ServeOptions:
     click.UsageError
         Others may ask, and there is no token.
     """
-    from roadgeo.running.serving.options import LOOPBACK, ServeOptions
+    from roadgeo.serving.options import LOOPBACK, ServeOptions
 
     token = os.environ.get("ROADGEO_TOKEN", "").strip()
     if given["token_file"] is not None:

@@ -17,8 +17,8 @@ from roadgeo.cli import COMMANDS, cli
 from roadgeo.cli.options import ASPECT, BOX, GSD, NEAR, RANGE, Plugin, Read
 from roadgeo.matching.hints import HINTS, apply_hints
 from roadgeo.matching.options import LocateOptions
-from roadgeo.running.serving.documents import documents_of
-from roadgeo.running.serving.requests import read_query_string
+from roadgeo.serving.documents import documents_of
+from roadgeo.serving.requests import read_query_string
 
 
 def offered(*typed: str, incomplete: str) -> list[str]:

@@ -80,8 +80,8 @@ HINTS["cloud"] = Hint("cloud", "cloud_share", "SHARE", "Clouds", "How much they 
 import roadgeo
 from roadgeo.cli.locate import locate_command
 from roadgeo.qgis.installation import install_plugin
-from roadgeo.running.serving.documents import documents_of
-from roadgeo.running.serving.requests import read_query_string
+from roadgeo.serving.documents import documents_of
+from roadgeo.serving.requests import read_query_string
 options = {name: one.help for one in locate_command.params for name in one.opts}
 inputs = documents_of(["porto"])["/processes/locate"]["inputs"]
 told = [options.get("--cloud"), inputs["cloud"]["title"], read_query_string("cloud=0.5")]

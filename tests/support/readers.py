@@ -32,7 +32,7 @@ from roadgeo.reference.shards import describe_shards, open_shards
 from roadgeo.running.applying import apply_location, read_location
 from roadgeo.running.flights.frames import FrameOptions, _video
 from roadgeo.running.flights.motion import read_motion
-from roadgeo.running.serving.requests import Refused, ending_of, read_execution, read_query_string
+from roadgeo.serving.requests import Refused, ending_of, read_execution, read_query_string
 from roadgeo.sources.elevation import ground_heights
 from roadgeo.sources.exif import estimate_gsd, read_focal_length
 from roadgeo.sources.georeference import read_georeference, read_stated_middle

@@ -16,10 +16,10 @@ import urllib3
 import uvicorn
 from uvicorn.server import ServerState
 
-from roadgeo.running.serving.app import Service
-from roadgeo.running.serving.options import ServeOptions
-from roadgeo.running.serving.protocol import protocol_of
-from roadgeo.running.serving.workers import Answer, Place
+from roadgeo.serving.app import Service
+from roadgeo.serving.options import ServeOptions
+from roadgeo.serving.protocol import protocol_of
+from roadgeo.serving.workers import Answer, Place
 
 
 @contextmanager

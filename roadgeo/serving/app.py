@@ -25,12 +25,12 @@ from starlette.routing import Route
 
 from roadgeo import __version__
 from roadgeo.reference.reference import AnyReference
-from roadgeo.running.serving.documents import documents_of
-from roadgeo.running.serving.guard import COOKIE, Guard, is_same, pass_of, refusal, require_body
-from roadgeo.running.serving.jobs import Job, Jobs
-from roadgeo.running.serving.options import ServeOptions
-from roadgeo.running.serving.page import page_file, page_text, policy_of
-from roadgeo.running.serving.requests import (
+from roadgeo.serving.documents import documents_of
+from roadgeo.serving.guard import COOKIE, Guard, is_same, pass_of, refusal, require_body
+from roadgeo.serving.jobs import Job, Jobs
+from roadgeo.serving.options import ServeOptions
+from roadgeo.serving.page import page_file, page_text, policy_of
+from roadgeo.serving.requests import (
     LIMIT,
     Refused,
     ending_of,
@@ -38,9 +38,9 @@ from roadgeo.running.serving.requests import (
     read_hints,
     read_query_string,
 )
-from roadgeo.running.serving.tiles import MAX_ZOOM, Tiles
-from roadgeo.running.serving.view import OFFERED, PICTURE, SEEN, VIEW, WARPED, safe_stem
-from roadgeo.running.serving.workers import Answer, Asked, Place, Workers
+from roadgeo.serving.tiles import MAX_ZOOM, Tiles
+from roadgeo.serving.view import OFFERED, PICTURE, SEEN, VIEW, WARPED, safe_stem
+from roadgeo.serving.workers import Answer, Asked, Place, Workers
 
 __all__ = ["Service"]
 

@@ -8,7 +8,7 @@ from mapbox_vector_tile import decode
 
 from roadgeo.geometry.projection import to_lonlat
 from roadgeo.reference.reference import Reference
-from roadgeo.running.serving.tiles import MAX_ZOOM, Tiles
+from roadgeo.serving.tiles import MAX_ZOOM, Tiles
 
 WORLD_M = 2 * 20037508.342789244
 

@@ -10,8 +10,8 @@ from typing import Any
 
 from uvicorn.protocols.http.h11_impl import H11Protocol
 
-from roadgeo.running.serving.documents import problem
-from roadgeo.running.serving.options import ServeOptions
+from roadgeo.serving.documents import problem
+from roadgeo.serving.options import ServeOptions
 
 __all__ = ["MAX_HEAD_BYTES", "protocol_of"]
 

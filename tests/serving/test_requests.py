@@ -8,7 +8,7 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from roadgeo.running.serving.requests import Refused, ending_of, read_execution, read_hints, read_query_string
+from roadgeo.serving.requests import Refused, ending_of, read_execution, read_hints, read_query_string
 
 
 @pytest.mark.parametrize(

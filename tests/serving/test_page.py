@@ -18,10 +18,10 @@ from roadgeo.evaluation.simulation import SimulationOptions, ViewOptions, simula
 from roadgeo.geometry.projection import to_lonlat
 from roadgeo.location import Location, Place, Reason
 from roadgeo.reference.reference import Reference
-from roadgeo.running.serving.options import ServeOptions
-from roadgeo.running.serving.server import Server
-from roadgeo.running.serving.workers import Full, _answer
-from roadgeo.running.serving.workers import Place as Seat
+from roadgeo.serving.options import ServeOptions
+from roadgeo.serving.server import Server
+from roadgeo.serving.workers import Full, _answer
+from roadgeo.serving.workers import Place as Seat
 from roadgeo.workflows import locate
 
 VIEW = ViewOptions(size_px=(900, 900), gsd_m=(1.0, 1.0), heading_deg=(0.0, 360.0), intersections=(25, 1000))

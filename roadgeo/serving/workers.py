@@ -358,7 +358,7 @@ def _locate(asked: Asked, references: Sequence[Any], say: Say, threads: int) -> 
 
     from roadgeo.matching.hints import apply_hints
     from roadgeo.running.queries import QueryOptions, locate_query
-    from roadgeo.running.serving.view import SEEN, write_view
+    from roadgeo.serving.view import SEEN, write_view
     from roadgeo.sources.exif import focal_in_pixels
     from roadgeo.workflows import LocateOptions, locate
 
@@ -394,7 +394,7 @@ def _locate(asked: Asked, references: Sequence[Any], say: Say, threads: int) -> 
 
 
 def _write(asked: Asked, references: Sequence[Any]) -> Answer:
-    from roadgeo.running.serving.view import write_output
+    from roadgeo.serving.view import write_output
 
     return Answer(200, {"file": write_output(Path(asked.path), asked.wanted, references).name})
 

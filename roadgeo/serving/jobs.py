@@ -13,8 +13,8 @@ from datetime import UTC, datetime
 from pathlib import Path
 from typing import Any, Literal
 
-from roadgeo.running.serving.options import ServeOptions
-from roadgeo.running.serving.workers import Answer
+from roadgeo.serving.options import ServeOptions
+from roadgeo.serving.workers import Answer
 
 __all__ = ["Job", "Jobs", "Status"]
 

@@ -17,11 +17,11 @@ from starlette.responses import JSONResponse, Response
 from starlette.types import ASGIApp, Message, Receive, Scope, Send
 
 from roadgeo._text import visible
-from roadgeo.running.serving.documents import problem
-from roadgeo.running.serving.options import LOOPBACK, ServeOptions
-from roadgeo.running.serving.protocol import MAX_HEAD_BYTES
-from roadgeo.running.serving.requests import Refused
-from roadgeo.running.serving.workers import Full
+from roadgeo.serving.documents import problem
+from roadgeo.serving.options import LOOPBACK, ServeOptions
+from roadgeo.serving.protocol import MAX_HEAD_BYTES
+from roadgeo.serving.requests import Refused
+from roadgeo.serving.workers import Full
 
 __all__ = ["COOKIE", "Guard", "is_same", "pass_of", "refusal", "require_body"]
 

@@ -16,10 +16,10 @@ import uvicorn
 
 from roadgeo import __version__
 from roadgeo.reference.reference import AnyReference
-from roadgeo.running.serving.app import Service, Told
-from roadgeo.running.serving.options import ServeOptions
-from roadgeo.running.serving.protocol import MAX_HEAD_BYTES, protocol_of
-from roadgeo.running.serving.workers import Workers
+from roadgeo.serving.app import Service, Told
+from roadgeo.serving.options import ServeOptions
+from roadgeo.serving.protocol import MAX_HEAD_BYTES, protocol_of
+from roadgeo.serving.workers import Workers
 
 __all__ = ["Server"]
 

@@ -38,7 +38,7 @@ from roadgeo.location import Location
 from roadgeo.reference.reference import Reference
 from roadgeo.running.flights.mavlink import has_pymavlink
 from roadgeo.running.looks import Sighting
-from roadgeo.running.serving.workers import Asked, Workers, _answer, _folder_of, _remove_all, _serve
+from roadgeo.serving.workers import Asked, Workers, _answer, _folder_of, _remove_all, _serve
 from roadgeo.sources.segmentation.probability import ProbabilityMap
 
 pytestmark = pytest.mark.slow
@@ -199,14 +199,14 @@ def test_an_image_that_breaks_every_process_is_told_so(one_worker, monkeypatch):
 
     workers, asked = one_worker
     with monkeypatch.context() as patch:
-        patch.setattr("roadgeo.running.serving.workers._Worker.ask", broken)
+        patch.setattr("roadgeo.serving.workers._Worker.ask", broken)
         assert workers.ask(asked).status == 500
     assert workers.ask(asked).status == 200
 
 
 def test_what_takes_too_long_is_ended_and_no_fault(one_worker, monkeypatch):
     workers, asked = one_worker
-    monkeypatch.setattr("roadgeo.running.serving.workers._GRACE_S", 0.3)
+    monkeypatch.setattr("roadgeo.serving.workers._GRACE_S", 0.3)
     with asked_beside(workers, replace(asked, time_limit_s=0.2)) as answers:
         pass
     assert [one.status for one in answers] == [503]
@@ -240,7 +240,7 @@ def test_photographs_are_refused_where_there_is_no_model_for_them(monkeypatch):
     def none(*_, **__):
         raise ModelError("photographs need onnxruntime: pip install 'roadgeo[segment]'")
 
-    monkeypatch.setattr("roadgeo.running.serving.workers._size", lambda _: (10, 10))
+    monkeypatch.setattr("roadgeo.serving.workers._size", lambda _: (10, 10))
     monkeypatch.setattr("roadgeo.running.queries.locate_query", none)
     answer = _answer(Asked("photo.jpg", {}, 1.0, 1000), [])
     assert answer.status == 415

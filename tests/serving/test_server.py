@@ -14,9 +14,9 @@ from types import SimpleNamespace
 
 import pytest
 
-from roadgeo.running.serving.options import ServeOptions
-from roadgeo.running.serving.server import Server
-from roadgeo.running.serving.workers import Answer, Full, Place
+from roadgeo.serving.options import ServeOptions
+from roadgeo.serving.server import Server
+from roadgeo.serving.workers import Answer, Full, Place
 
 PNG = b"\x89PNG\r\n\x1a\n" + bytes(40)
 FOUND = {"schema": "roadgeo.location/1", "status": "located", "center": {"lon": 1.0, "lat": 2.0}}

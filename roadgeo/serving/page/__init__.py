@@ -6,7 +6,7 @@ from functools import cache
 from pathlib import Path
 from urllib.parse import urlsplit
 
-from roadgeo.running.serving.options import ServeOptions
+from roadgeo.serving.options import ServeOptions
 
 __all__ = ["page_file", "page_text", "policy_of"]
 
