@@ -14,6 +14,7 @@ import numpy as np
 import pytest
 import shapely
 from outputs.test_location_files import located, road_mask
+from scipy.spatial.transform import Rotation
 
 from roadgeo import plugins
 from roadgeo.cli import main
@@ -133,7 +134,7 @@ def test_a_segmenter_may_return_a_mask_or_an_array(offer, kind: str) -> None:
         (["index", "--source", "files:a.gpkg", "--roads", "a.gpkg"], 2, "Give one source of roads"),
         (["index", "--source", "files:missing.gpkg"], 1, "missing.gpkg"),
         (["locate", "a.png", "--segmenter", "eyes"], 2, "got 'eyes', expected one of mask"),
-        (["locate", "a.png", "--also", "bread"], 2, "got 'bread', expected one of gcps, geojson, geopose"),
+        (["locate", "a.png", "--also", "bread"], 2, "got 'bread', expected one of gcps, geojson, kmz"),
         (["info"], 2, "Missing argument 'REF'"),
     ],
 )
@@ -194,9 +195,9 @@ def installed(tmp_path_factory: pytest.TempPathFactory) -> dict[str, str]:
     return {**os.environ, "PYTHONPATH": path}
 
 
-def test_the_example_is_twenty_lines() -> None:
+def test_the_example_is_twenty_five_lines() -> None:
     lines = (ROOT / "examples" / "plugin" / "roadgeo_wkt.py").read_text(encoding="utf-8").splitlines()
-    assert sum(bool(line.strip()) for line in lines) <= 21
+    assert sum(bool(line.strip()) for line in lines) <= 25
 
 
 @pytest.mark.slow
@@ -224,12 +225,15 @@ def test_the_example_is_installed_and_used(installed: dict[str, str], tmp_path: 
     cv2.imwrite(str(tmp_path / "sheet.png"), sheet)
     found = json.loads(
         roadgeo(
-            "locate", "sheet.png", "-r", "porto.gpkg", "--segmenter", "yellow", "--also", "wkt", "--json", "--quiet"
+            "locate", "sheet.png", "-r", "porto.gpkg", "--segmenter", "yellow", "--also", "geopose", "--json", "--quiet"
         )
     )
     assert found["status"] == "located"
-    polygon = shapely.from_wkt((tmp_path / "sheet_footprint.wkt").read_text(encoding="utf-8"))
-    assert shapely.get_coordinates(polygon)[:4] == pytest.approx(np.array(found["footprint"]))
+    pose = json.loads((tmp_path / "sheet_geopose.json").read_text(encoding="utf-8"))
+    camera = found["camera"]
+    assert (pose["position"]["lon"], pose["position"]["lat"]) == (camera["lon"], camera["lat"])
+    looks = Rotation.from_quat([pose["quaternion"][axis] for axis in "xyzw"]).apply([0.0, 0.0, -1.0])
+    assert looks[2] == pytest.approx(-1.0, abs=0.02)  # a sheet lies level
 
 
 def test_nothing_is_looked_up_before_a_plugin_is_named() -> None:

@@ -1,9 +1,11 @@
-"""A road source, a segmenter and an output for roadgeo: well-known text, and the yellow roads of printed maps."""
+"""A road source, a segmenter and an output for roadgeo: well-known text, yellow roads of printed maps, OGC GeoPose."""
 
+import json
 from pathlib import Path
 
 import cv2
 import shapely
+from scipy.spatial.transform import Rotation
 
 from roadgeo.outputs.registry import Output
 from roadgeo.sources.roads import choose_roads
@@ -21,9 +23,12 @@ def find_yellow(picture):
     return cv2.inRange(hsv, (20, 90, 90), (35, 255, 255))
 
 
-def write_wkt(path, subject):
-    """The footprint as a POLYGON in the reference's CRS."""
-    path.write_text(f"{shapely.Polygon(subject.place.footprint).wkt}\n")
+def write_geopose(path, subject):
+    """The camera's position and axes (x right, y to the image's top, z backwards) to east, north, up: OGC 21-056r11."""
+    camera = subject.location.camera
+    turn = dict(zip("xyzw", Rotation.from_matrix(camera.rotation).as_quat().tolist(), strict=True))
+    position = {"lat": camera.lat, "lon": camera.lon, "h": camera.height_m}
+    path.write_text(json.dumps({"position": position, "quaternion": turn}))
 
 
-WKT = Output("wkt", "_footprint.wkt", write_wkt, "footprint as well-known text")
+GEOPOSE = Output("geopose", "_geopose.json", write_geopose, "the camera, as OGC GeoPose", needs_camera=True)

@@ -21,7 +21,7 @@ _OPTIONS = (
         "The picture's sides may be in another proportion: it shows the same ground all the same, as a scan does whose "
         "pixels are not square."),
     row("--also products", "NAME", OTHERS,
-        "Write a further form, as of `roadgeo locate`: points, gcps, iiif, geojson, kmz ... Repeatable.",
+        "Write a further form, as of `roadgeo locate`: points, gcps, geojson, kmz ... Repeatable.",
         type=Plugin("roadgeo.outputs", names=offered), multiple=True),
     take("crs", "resolution", "resampling", "compression", rare=False),
     take("quiet"),
@@ -43,7 +43,7 @@ def apply_command(location: str, pictures: tuple[str, ...], out_dir: str, quiet:
     Examples:
       roadgeo apply photo_mask_location.json infrared.tif
       roadgeo apply photo_mask_location.json band*.tif --out-dir bands --crs EPSG:3857
-      roadgeo apply sheet_location.json fine_scan.tif --also iiif --also points
+      roadgeo apply sheet_location.json fine_scan.tif --also kmz --also points
 
     Exit status: 0 all well, 3 LOCATION.json holds no sure place, 1 error, 2 usage.
     """

@@ -35,14 +35,12 @@ from roadgeo.cli.options import (
 )
 from roadgeo.cli.printing import echo
 from roadgeo.cli.truths import read_truths
-from roadgeo.errors import how_to_install
 from roadgeo.matching.hints import HINTS
 from roadgeo.outputs.registry import (
     ALSO,
     ALWAYS,
     EXPLANATION,
     EXPLANATION_PICTURE,
-    FIGURES,
     GCPS,
     OVERLAY,
     REPORT,
@@ -106,7 +104,7 @@ def _listed(outputs: Sequence[Output]) -> str:
 
 
 def _more() -> str:
-    asked = [OVERLAY, FIGURES["pdf"], REPORT, EXPLANATION_PICTURE, EXPLANATION]
+    asked = [OVERLAY, REPORT, EXPLANATION_PICTURE, EXPLANATION]
     also = "\n".join(f"  {name:<9}  {output.summary}" for name, output in ALSO.items())
     return _MORE.format(asked=_listed(asked), also=also)
 
@@ -139,8 +137,6 @@ _OPTIONS = (
     row("--truth", "LON,LAT|FILE", RESULTS,
         "With --explain: where the middle really lies, or a truth.csv of many masks; says which stage lost it.",
         rare=True),
-    row("--figure", tuple(FIGURES), RESULTS,
-        "Also write IMAGE_figure, the picture with axes, for papers. Needs matplotlib.", rare=True),
     row("--gcps", "", RESULTS, f"The same as --also gcps: {GCPS.summary}.", rare=True),
     take("crs", "resolution", "resampling", "compression"),
     row("--max-pixels", "N", RESULTS,
@@ -231,7 +227,7 @@ def locate_command(
         tell_accuracy((outcome.document for outcome in outcomes), given["crs"])
     counts = Counter[str](outcome.status for outcome in outcomes)
     if len(tasks) > 1:
-        files = write_overview(out_dir, tasks, outcomes, opened if given["report"] else None, given["products"])
+        files = write_overview(out_dir, tasks, outcomes, opened if given["report"] else None)
         if not quiet:
             echo(f"{_summarize(counts)}; all footprints: {', '.join(map(str, files))}", err=True)
     failed = counts["error"] or any(outcome.faults for outcome in outcomes)
@@ -243,17 +239,10 @@ def _output_options(given: Mapping[str, Any]) -> OutputOptions:
     from roadgeo.outputs.location_files import OutputOptions
     from roadgeo.outputs.orthophoto import ImageOptions
 
-    figure = given["figure"]
-    if figure is not None:
-        from roadgeo.outputs.figure import has_matplotlib
-
-        if not has_matplotlib():
-            raise click.UsageError(f"--figure needs matplotlib: {how_to_install('plot')}")
     asked = [
         *given["products"],
         *([GCPS.name] if given["gcps"] else []),
         *([OVERLAY.name] if given["plot"] else []),
-        *([FIGURES[figure].name] if figure else []),
         *([REPORT.name] if given["report"] else []),
         *([EXPLANATION.name, EXPLANATION_PICTURE.name] if given["explain"] else []),
     ]

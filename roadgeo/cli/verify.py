@@ -41,7 +41,6 @@ _OPTIONS = (
         "Of each image that is off, write IMAGE_fixed.tif: the same pixels with the corrected georeference; and "
         "IMAGE_fixed.points, for the QGIS Georeferencer."),
     row("--in-place", "", RESULTS, "Correct the georeference of GeoTIFFs that are off themselves."),
-    row("--josm", "", OTHERS, "Write roadgeo_offsets.xml: imagery offset bookmarks, as JOSM's preferences hold them."),
     row("--tolerance", "METRES", OTHERS,
         "An image agrees if, on average over the frame, it is off by less.",
         type=click.FloatRange(0.1, 100), default=3.0, show_default=True),
@@ -64,7 +63,6 @@ def verify_command(
     as_json: bool,
     fix: bool,
     in_place: bool,
-    josm: bool,
     jobs: int,
     quiet: bool,
     verbose: bool,
@@ -82,8 +80,7 @@ def verify_command(
                   and its scale, with standard deviations; --fix writes it corrected
       is unknown  it cannot be judged, and why: few roads, another map, streets that repeat
 
-    For several images also roadgeo_verify.csv, with a row each. Its columns mercator_east and mercator_north are the
-    offset that JOSM asks for; `id` ends the address of iD or Rapid, where it moves the imagery.
+    For several images also roadgeo_verify.csv, with a row each.
 
     \b
     Examples:
@@ -96,7 +93,7 @@ def verify_command(
     """
     from roadgeo.cli.compilation import compile_once
     from roadgeo.cli.progress import count_up, print_steps
-    from roadgeo.outputs.verification_files import write_josm, write_table
+    from roadgeo.outputs.verification_files import write_table
     from roadgeo.running.batch import open_references
     from roadgeo.running.tasks import find_masks, name_tasks
     from roadgeo.running.verifying import verify_images
@@ -108,7 +105,7 @@ def verify_command(
     settings = _settings(given, found[1:] if given["fuse"] else [], jobs)
     opened = open_references(settings.references, print_steps(quiet))  # their errors are printed once
     compile_once(quiet)
-    if fix or josm or given["report"] or len(tasks) > 1:
+    if fix or given["report"] or len(tasks) > 1:
         make_folder(out_dir)
     results: list[Verified] = []
     with count_up(len(tasks), quiet, as_json) as count:
@@ -120,8 +117,6 @@ def verify_command(
             files = [*pages, *_correct(one, Path(task.mask), stem, fix, in_place)]
             _report(one, files, as_json, quiet, verbose)
     documents = [one.document for one in results]
-    if josm:
-        write_josm(Path(out_dir) / "roadgeo_offsets.xml", documents)
     counts = Counter(one.verdict for one in results)
     if len(tasks) > 1:
         write_table(Path(out_dir) / "roadgeo_verify.csv", documents)

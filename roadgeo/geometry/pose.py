@@ -31,7 +31,7 @@ from roadgeo.geometry.whitening import whitener
 #: Focal lengths that an adjustment may start from, in usual ones.
 _FACTORS = (0.35, 0.5, 0.7, 1.0, 1.4, 2.0, 3.0)
 
-__all__ = ["Pose", "PoseOptions", "find_pose", "omega_phi_kappa", "quaternion", "turned"]
+__all__ = ["Pose", "PoseOptions", "find_pose", "turned"]
 
 
 @dataclass(frozen=True)
@@ -312,30 +312,3 @@ def _angles(rotation: FloatArray) -> FloatArray:
 def turned(rotation: FloatArray, clockwise_deg: float) -> FloatArray:
     """Return a rotation counted from a north that lies this angle clockwise of the plane's y axis."""
     return _rotation(np.array([0.0, 0.0, math.radians(clockwise_deg)])) @ rotation
-
-
-def omega_phi_kappa(rotation: FloatArray) -> tuple[float, float, float]:
-    """Return the angles, radians, of R = Rx(omega) Ry(phi) Rz(kappa), camera axes to east, north, up (PATB)."""
-    phi = math.asin(max(-1.0, min(1.0, float(rotation[0, 2]))))
-    return (
-        math.atan2(-rotation[1, 2], rotation[2, 2]),
-        phi,
-        math.atan2(-rotation[0, 1], rotation[0, 0]),
-    )
-
-
-def quaternion(rotation: FloatArray) -> tuple[float, float, float, float]:
-    """Return x, y, z, w of a rotation, w not negative (Shepperd 1978)."""
-    r = rotation
-    squares = np.array([1 + r[0, 0] - r[1, 1] - r[2, 2], 1 - r[0, 0] + r[1, 1] - r[2, 2],
-                        1 - r[0, 0] - r[1, 1] + r[2, 2], 1 + r[0, 0] + r[1, 1] + r[2, 2]])  # fmt: skip
-    k = int(np.argmax(squares))
-    products = np.array([
-        [squares[0], r[0, 1] + r[1, 0], r[0, 2] + r[2, 0], r[2, 1] - r[1, 2]],
-        [r[0, 1] + r[1, 0], squares[1], r[1, 2] + r[2, 1], r[0, 2] - r[2, 0]],
-        [r[0, 2] + r[2, 0], r[1, 2] + r[2, 1], squares[2], r[1, 0] - r[0, 1]],
-        [r[2, 1] - r[1, 2], r[0, 2] - r[2, 0], r[1, 0] - r[0, 1], squares[3]],
-    ])  # fmt: skip
-    q = products[k] / (2.0 * math.sqrt(squares[k]))
-    q = -q if q[3] < 0 else q
-    return float(q[0]), float(q[1]), float(q[2]), float(q[3])

@@ -23,7 +23,6 @@ if TYPE_CHECKING:
 __all__ = [
     "ALSO",
     "ALWAYS",
-    "FIGURES",
     "LOCALIZABILITY",
     "REGISTRY",
     "VECTORIZED",
@@ -105,17 +104,6 @@ GEOPACKAGE = Output(
 OVERLAY = Output(
     "overlay", "_overlay.png", _by("overlay", "write_overlay"), "the mask and its place, to look at", option="--plot"
 )
-#: The formats of figures for papers.
-FIGURES = {
-    kind: Output(
-        f"figure-{kind}",
-        f"_figure.{kind}",
-        _by("figure", "write_figure"),
-        "the same with axes, for papers",
-        option=f"--figure {kind}",
-    )
-    for kind in ("pdf", "svg", "png")
-}
 REPORT = Output(
     "report",
     "_report.html",
@@ -169,41 +157,15 @@ WORLD_FILE = Output(
 GEOJSON = Output("geojson", "_footprint.geojson", _by("outlines", "write_geojson"), "footprint as GeoJSON (RFC 7946)")
 STAC = Output("stac", "_stac.json", _by("outlines", "write_stac"), "STAC Item of the drawn raster")
 KMZ = Output("kmz", "_overlay.kmz", _by("kmz", "write_kmz"), "ground overlay for Google Earth")
-GEOPOSE = Output(
-    "geopose",
-    "_geopose.json",
-    _by("cameras", "write_geopose"),
-    "where the camera was, as OGC GeoPose (Basic-Quaternion)",
-    needs_camera=True,
-)
-ORTHORITY = Output(
-    "orthority",
-    "_ext_param.geojson",
-    _by("cameras", "write_orthority"),
-    "where the camera was, as Orthority reads it",
-    needs_camera=True,
-)
-ODM_GEO = Output(
-    "odm-geo",
-    "_geo.txt",
-    _by("cameras", "write_odm_geo"),
-    "where the camera was, for OpenDroneMap; of several masks also geo.txt",
-    needs_camera=True,
-)
-IIIF = Output("iiif", "_iiif.json", _by("iiif", "write_iiif"), "IIIF Georeference Annotation, for Allmaps and viewers")
 
 #: Written for every located mask; of these only the JSON where there is no place.
 ALWAYS = (JSON, FOOTPRINT, STYLE, GEOPACKAGE)
-_FURTHER = (
-    *(GCPS, VRT, POINTS, MATCHES, MATCH_POINTS, ODM, WORLD_FILE, GEOJSON, STAC, KMZ),
-    *(IIIF, GEOPOSE, ORTHORITY, ODM_GEO),
-)
+_FURTHER = (GCPS, VRT, POINTS, MATCHES, MATCH_POINTS, ODM, WORLD_FILE, GEOJSON, STAC, KMZ)
 #: Written where `--also` asks for them, by the names under which pyproject.toml registers them too.
 ALSO = {output.name: output for output in _FURTHER}
 #: All of our own.
 REGISTRY = {
-    output.name: output
-    for output in (*ALWAYS, OVERLAY, *FIGURES.values(), REPORT, EXPLANATION_PICTURE, EXPLANATION, *ALSO.values())
+    output.name: output for output in (*ALWAYS, OVERLAY, REPORT, EXPLANATION_PICTURE, EXPLANATION, *ALSO.values())
 }
 
 

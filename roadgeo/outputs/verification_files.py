@@ -1,18 +1,10 @@
-"""Outputs of `roadgeo verify`: corrected copies, control points, one table of all, and offsets for map editors.
-
-Editors of OpenStreetMap move imagery by metres of the Mercator map, which are longer than those on the ground by about
-1 / cos(latitude): JOSM as bookmarks in its preferences (`imagery.offsetbookmarks`, in EPSG:3857), which it imports from
-a file of commands whose root is `config`; iD and Rapid as `offset=east,north` in the fragment of the URL. Both move the
-imagery to the east and north where the numbers are positive.
-"""
+"""Outputs of `roadgeo verify`: corrected copies, control points, one table of all."""
 
 from __future__ import annotations
 
 import csv
 import io
-import math
 import warnings
-import xml.etree.ElementTree as ET
 from collections.abc import Mapping, Sequence
 from contextlib import ExitStack
 from pathlib import Path
@@ -20,7 +12,6 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from roadgeo._text import visible
 from roadgeo.errors import OutputError
 from roadgeo.outputs.names import bare_names, table_cell, without_folders
 from roadgeo.storage.crs import known_crs
@@ -30,33 +21,12 @@ from roadgeo.storage.orientation import read_orientation
 if TYPE_CHECKING:
     from roadgeo.geometry.georeference import Georeference
 
-__all__ = ["editor_offset", "id_fragment", "write_fixed", "write_in_place", "write_josm", "write_points", "write_table"]
+__all__ = ["write_fixed", "write_in_place", "write_points", "write_table"]
 
 _COLUMNS = (
     "image", "verdict", "reason", "reference", "east_m", "north_m", "turn_deg", "scale", "sigma_m", "off_m",
-    "residual_m", "log10_lead", "agreeing", "agreeing_as_given", "lon", "lat", "mercator_east", "mercator_north", "id",
+    "residual_m", "log10_lead", "agreeing", "agreeing_as_given", "lon", "lat",
 )  # fmt: skip
-
-#: Radii of WGS 84.
-_EQUATORIAL_M, _POLAR_M = 6378137.0, 6356752.314245
-
-
-def editor_offset(east_m: float, north_m: float, lat: float) -> tuple[float, float]:
-    """Return a shift on the ground as metres of the Mercator map, which draws the ellipsoid's latitudes on a sphere."""
-    stretch = 1.0 / math.cos(math.radians(lat))
-    flat = (_POLAR_M / _EQUATORIAL_M) ** 2
-    round_ = math.sqrt(1.0 - (1.0 - flat) * math.sin(math.radians(lat)) ** 2)
-    # The radii of curvature are a / round_ to the east and a flat / round_^3 to the north.
-    return east_m * stretch * round_, north_m * stretch * round_**3 / flat
-
-
-def id_fragment(lon: float, lat: float, offset: tuple[float, float]) -> str:
-    """Return the fragment of a URL that opens iD or Rapid there with its imagery moved by metres of the Mercator map.
-
-    Both take a metre to the north for one of a globe whose meridian has the polar radius.
-    """
-    east, north = offset[0], offset[1] * _POLAR_M / _EQUATORIAL_M
-    return f"#map=17/{lat:.5f}/{lon:.5f}&offset={east:.2f},{north:.2f}"
 
 
 def write_table(path: Path, documents: Sequence[Mapping[str, Any]]) -> None:
@@ -72,38 +42,9 @@ def write_table(path: Path, documents: Sequence[Mapping[str, Any]]) -> None:
 
 
 def _cell(document: Mapping[str, Any], name: str) -> Any:
-    parts = (document, document.get("displacement") or {}, document.get("editors") or {}, document.get("center") or {})
+    parts = (document, document.get("displacement") or {}, document.get("center") or {})
     found = next((part[name] for part in parts if part.get(name) is not None), "")
     return table_cell(found) if isinstance(found, str) else found
-
-
-def write_josm(path: Path, documents: Sequence[Mapping[str, Any]]) -> None:
-    """Write the offsets of images that are off as bookmarks that JOSM adds to those it has."""
-    root = ET.Element("config")
-    preferences = ET.SubElement(root, "preferences", operation="append")
-    bookmarks = ET.SubElement(preferences, "maps", key="imagery.offsetbookmarks")
-    for document in documents:
-        if document["verdict"] != "off":
-            continue
-        entry = ET.SubElement(bookmarks, "map")
-        values = {
-            "projection_code": "EPSG:3857",
-            "imagery_name": _plain(Path(document["image"]).name),
-            "name": f"roadgeo {_plain(Path(document['image']).stem)}",
-            "dx": f"{document['editors']['mercator_east']:.3f}",
-            "dy": f"{document['editors']['mercator_north']:.3f}",
-            "center_lon": f"{document['center']['lon']:.7f}",
-            "center_lat": f"{document['center']['lat']:.7f}",
-        }
-        for key, value in values.items():
-            ET.SubElement(entry, "tag", key=key, value=value)
-    ET.indent(root)
-    write_text(path, ET.tostring(root, encoding="unicode", xml_declaration=True) + "\n")
-
-
-def _plain(name: str) -> str:
-    """Return a name that is safe in JOSM, which runs text in ${} as a program; XML has no control characters."""
-    return visible(name).replace("${", "$(")
 
 
 def write_points(path: Path, place: Georeference) -> None:

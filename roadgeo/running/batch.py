@@ -19,7 +19,7 @@ import numpy as np
 
 from roadgeo._progress import Say, say_nothing
 from roadgeo.errors import IndexFormatError, ModelError, OutputError, PluginError, RoadgeoError, name_extra
-from roadgeo.outputs.registry import JSON, ODM_GEO, REPORT
+from roadgeo.outputs.registry import JSON, REPORT
 from roadgeo.running.options import BatchOptions, ReadOptions
 from roadgeo.running.probability_files import is_ours, keep_probability, probability_path
 from roadgeo.running.processes import run
@@ -426,11 +426,8 @@ def write_overview(
     tasks: Sequence[Task],
     outcomes: Sequence[Outcome],
     references: Sequence[AnyReference] | None,
-    products: Sequence[str] = (),
 ) -> list[Path]:
     """Write all footprints in one GeoPackage and one table, and where references are given a page of all reports.
-
-    Where the `products` asked for hold "odm-geo", also one `geo.txt` with all cameras.
 
     Raises
     ------
@@ -441,12 +438,6 @@ def write_overview(
 
     folder, documents = Path(out_dir), [outcome.document for outcome in outcomes]
     files = write_summary(folder, documents)
-    if ODM_GEO.name in products:
-        from roadgeo.outputs.cameras import write_odm_geos
-
-        files.append(folder / "geo.txt")
-        names = [one.photo[0] if one.photo else one.document["query"] for one in outcomes]
-        write_odm_geos(files[-1], [{**each, "query": name} for each, name in zip(documents, names, strict=True)])
     if references is not None:
         from roadgeo.outputs.report import Entry, write_batch
 

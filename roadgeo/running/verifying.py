@@ -24,7 +24,6 @@ from roadgeo.location import Location
 from roadgeo.matching.checking import Checked, CheckOptions, check_place
 from roadgeo.matching.options import LocateOptions
 from roadgeo.matching.scene import read_query
-from roadgeo.outputs.verification_files import editor_offset, id_fragment
 from roadgeo.reference.reference import Reference
 from roadgeo.running.processes import run
 from roadgeo.running.queries import QueryOptions, locate_query
@@ -216,19 +215,11 @@ def _document(
     if reference is not None and place is not None:
         document["reference"] = reference.name
         document["attribution"] = str(reference.index.meta.get("attribution") or "")
-        plane, lat = reference.index.plane, document["center"]["lat"]
+        plane = reference.index.plane
         known, rival = checked.displacement, checked.rival
         frame = None if known is None else _frame_of(place, reference)
         document["displacement"] = None if known is None else _told(known, plane, frame, _inexact(place, reference))
         document["rival"] = None if rival is None else _told(rival, plane, None)
-        if checked.verdict == "off":
-            shift = document["displacement"]
-            offset = editor_offset(shift["east_m"], shift["north_m"], lat)
-            document["editors"] = {
-                "mercator_east": offset[0],
-                "mercator_north": offset[1],
-                "id": id_fragment(document["center"]["lon"], lat, offset),
-            }
     return document
 
 

@@ -29,11 +29,11 @@ def located(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 
 def test_the_photograph_comes_out_as_if_locate_had_drawn_it(located: Path, tmp_path: Path) -> None:
-    given = ["--also", "iiif", "--also", "geopose", "--also", "points", "-o", str(tmp_path), "-q"]
+    given = ["--also", "geojson", "--also", "points", "-o", str(tmp_path), "-q"]
     assert main(["apply", str(located / "drone_location.json"), str(PHOTO), *given]) == 0
     names = {path.name for path in tmp_path.iterdir()}
     stem = PHOTO.stem
-    assert names == {f"{stem}_footprint.tif", f"{stem}_iiif.json", f"{stem}_geopose.json", f"{PHOTO.name}.points"}
+    assert names == {f"{stem}_footprint.tif", f"{stem}_footprint.geojson", f"{PHOTO.name}.points"}
     with (
         rasterio.open(tmp_path / f"{stem}_footprint.tif") as ours,
         rasterio.open(located / "drone_footprint.tif") as his,

@@ -70,20 +70,6 @@ def test_a_mask_is_located_and_everything_is_written(
     assert center_error(json.loads((tmp_path / "drone_location.json").read_text()), MASKS["drone"]) < 2
 
 
-def test_a_figure_is_written_and_goes_with_the_place(
-    porto: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capfd: pytest.CaptureFixture[str]
-) -> None:
-    pytest.importorskip("matplotlib")
-    shutil.copy(MASKS["drone"].path, "a.png")
-    assert main(["locate", "a.png", "-r", str(porto), "--figure", "pdf", "-q"]) == 0
-    assert (tmp_path / "a_figure.pdf").read_bytes().startswith(b"%PDF")
-    assert main(["locate", "a.png", "-r", str(porto), "--near", "0,0,10", "-q"]) == 3
-    assert not (tmp_path / "a_figure.pdf").exists()
-    monkeypatch.setattr("roadgeo.outputs.figure.has_matplotlib", lambda: False)
-    assert main(["locate", "a.png", "-r", str(porto), "--figure", "pdf", "-q"]) == 2
-    assert "-m pip install matplotlib" in capfd.readouterr().err
-
-
 def test_json_lines_stand_in_input_order_and_alone_on_standard_output(
     porto: Path, tmp_path: Path, capfd: pytest.CaptureFixture[str]
 ) -> None:

@@ -47,8 +47,8 @@ def test_what_is_no_aspect(typed: str) -> None:
 
 
 def test_names_of_plugins_are_offered() -> None:
-    plugin = Plugin("none", names=lambda: ["geojson", "geopose", "kmz"])
-    assert [one.value for one in plugin.shell_complete(None, None, "geo")] == ["geojson", "geopose"]
+    plugin = Plugin("none", names=lambda: ["geojson", "geometry", "kmz"])
+    assert [one.value for one in plugin.shell_complete(None, None, "geo")] == ["geojson", "geometry"]
 
 
 def test_commands_are_offered() -> None:
@@ -140,7 +140,7 @@ def test_the_help_of_locate_fits_on_a_page() -> None:
     assert "share of the map's shards" not in " ".join(shown("locate").split())
     whole = " ".join(shown("locate", "--help-all").split())
     assert "share of the map's shards" in whole
-    assert "geopose" in whole
+    assert "worldfile" in whole
 
 
 def test_there_are_no_more_than_twelve_commands() -> None:

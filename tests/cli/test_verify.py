@@ -2,14 +2,11 @@
 
 import csv
 import json
-import re
-import xml.etree.ElementTree as ET
 from pathlib import Path
 
 import cv2
 import jsonschema
 import numpy as np
-import pyproj
 import pytest
 import rasterio
 from worlds.turned import mark_turned
@@ -19,7 +16,7 @@ from roadgeo.evaluation.demo import ATTRIBUTION, ROADS, demo_masks
 from roadgeo.geometry.georeference import Georeference
 from roadgeo.geometry.homography import Homography
 from roadgeo.outputs.schemas import read_schema
-from roadgeo.outputs.verification_files import write_fixed, write_josm
+from roadgeo.outputs.verification_files import write_fixed
 from roadgeo.sources.roads import read_roads
 from roadgeo.workflows import build_reference
 
@@ -59,7 +56,7 @@ def test_right_wrong_and_unknown_are_told_and_the_wrong_one_is_corrected(
     georeferenced("wrong.tif", 60, -35)
     georeferenced("far.tif", 90_000, 0)
     names = ["right.tif", "wrong.tif", "far.tif"]
-    status = main(["verify", *names, "-r", str(porto), "--fix", "--josm", "--report", "--json", "-o", "out"])
+    status = main(["verify", *names, "-r", str(porto), "--fix", "--report", "--json", "-o", "out"])
     out, err = capfd.readouterr()
     assert status == 4, err
     pages = [Path("out", f"{name.removesuffix('.tif')}_verify.html").read_text("utf-8") for name in names]
@@ -72,63 +69,14 @@ def test_right_wrong_and_unknown_are_told_and_the_wrong_one_is_corrected(
     assert "lies on none of the maps" in far["reason"]
     shift = wrong["displacement"]
     assert np.hypot(shift["east_m"] + 60, shift["north_m"] - 35) < 3  # grid north is not north: 0.3 degrees here
-    offset = mercator_offset(wrong["center"], shift["east_m"], shift["north_m"])
-    assert (wrong["editors"]["mercator_east"], wrong["editors"]["mercator_north"]) == pytest.approx(offset, abs=0.01)
-    east, north = map(float, re.search(r"&offset=([-\d.]+),([-\d.]+)$", wrong["editors"]["id"]).groups())
-    tiles = 2 * np.pi * np.array([6378137.0, 6356752.314245])  # as iD and Rapid make offsets shares of the map
-    moved = np.array([east, north]) / tiles * 2 * np.pi * 6378137.0
-    assert moved == pytest.approx(offset, abs=0.02)
     rows = list(csv.DictReader(Path("out/roadgeo_verify.csv").read_text().splitlines()))
     assert [row["verdict"] for row in rows] == ["agrees", "off", "unknown"]
-    (bookmark,) = josm_bookmarks("out/roadgeo_offsets.xml")
-    assert float(bookmark["dx"]) == pytest.approx(wrong["editors"]["mercator_east"], abs=1e-3)
-    assert float(bookmark["dy"]) == pytest.approx(wrong["editors"]["mercator_north"], abs=1e-3)
-    assert (float(bookmark["center_lon"]), float(bookmark["center_lat"])) == pytest.approx(
-        (wrong["center"]["lon"], wrong["center"]["lat"]), abs=1e-6
-    )
     written = {path.name for path in Path("out").iterdir() if path.suffix != ".html"}
-    assert written == {"roadgeo_verify.csv", "roadgeo_offsets.xml", "wrong_fixed.tif", "wrong_fixed.points"}
+    assert written == {"roadgeo_verify.csv", "wrong_fixed.tif", "wrong_fixed.points"}
     assert main(["verify", "out/wrong_fixed.tif", "-r", str(porto)]) == 0
     with rasterio.open("out/wrong_fixed.tif") as fixed, rasterio.open("wrong.tif") as given:
         assert (fixed.read() == given.read()).all()
         assert fixed.crs == given.crs
-
-
-def mercator_offset(center: dict[str, float], east_m: float, north_m: float) -> np.ndarray:
-    """Go there on the ellipsoid, and see how far that is on the Mercator map."""
-    lon, lat, _ = pyproj.Geod(ellps="WGS84").fwd(
-        center["lon"], center["lat"], np.degrees(np.arctan2(east_m, north_m)), np.hypot(east_m, north_m)
-    )
-    to_map = pyproj.Transformer.from_crs(4326, 3857, always_xy=True).transform
-    return np.subtract(to_map(lon, lat), to_map(center["lon"], center["lat"]))
-
-
-def josm_bookmarks(path: str) -> list[dict[str, str]]:
-    """Read a file as JOSM imports it: what a command says is appended to what the preferences hold under its key."""
-    root = ET.parse(path).getroot()
-    kept: dict[str, list[dict[str, str]]] = {}
-    for command in root:  # CustomConfigurator looks at the children of the root, and at no name of the root
-        assert (command.tag, command.attrib) == ("preferences", {"operation": "append"})
-        for setting in command:
-            assert setting.tag == "maps"
-            maps = [{tag.attrib["key"]: tag.attrib["value"] for tag in one} for one in setting]
-            kept.setdefault(setting.attrib["key"], []).extend(maps)
-    assert set(kept) == {"imagery.offsetbookmarks"}
-    for one in kept["imagery.offsetbookmarks"]:  # the fields of OffsetBookmark that it reads
-        assert set(one) == {"projection_code", "imagery_name", "name", "dx", "dy", "center_lon", "center_lat"}
-        assert one["projection_code"] == "EPSG:3857"
-    return kept["imagery.offsetbookmarks"]
-
-
-def test_names_of_images_run_nothing_in_josm(tmp_path: Path) -> None:
-    """JOSM takes what stands in ${} for a program."""
-    image = "${java.lang.Runtime.exit(1)}\x07\ud800.tif"
-    editors = {"mercator_east": 1.0, "mercator_north": 2.0}
-    document = {"image": image, "verdict": "off", "editors": editors, "center": {"lon": 3.0, "lat": 4.0}}
-    write_josm(tmp_path / "offsets.xml", [document, {"image": "right.tif", "verdict": "agrees"}])
-    (bookmark,) = josm_bookmarks(str(tmp_path / "offsets.xml"))
-    assert "${" not in bookmark["name"] + bookmark["imagery_name"]
-    assert "java.lang" in bookmark["imagery_name"]
 
 
 def test_an_image_is_overwritten_only_where_that_is_asked_for(porto: Path, capfd: pytest.CaptureFixture[str]) -> None:

@@ -74,7 +74,7 @@ def test_no_file_shows_the_folders_of_whoever_made_it(tmp_path: Path, monkeypatc
     assert main(["index", "--roads", str(ROADS), "--out", str(tmp_path / "porto.gpkg"), "-q"]) == 0
     masks = [str(tmp_path / name) for name in ("a/drone.png", "b/drone.png", "b/empty.png")]
     also = [word for name in ALSO for word in ("--also", name)]
-    more = ["--plot", "--report", "--explain", "--figure", "svg", *also]
+    more = ["--plot", "--report", "--explain", *also]
     assert main(["locate", *masks, "-r", str(tmp_path / "porto"), "-o", ".", "-q", *more]) == 1
     assert main(["verify", "a_drone_gcps.tif", *masks[1:], "-r", str(tmp_path / "porto"), "-o", ".", "-q"]) == 1
     shown = {path.name for path in Path().iterdir() if tmp_path.name.encode() in _content(path)}

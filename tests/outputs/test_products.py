@@ -18,7 +18,6 @@ from worlds.turned import save_turned
 from roadgeo.errors import OutputError
 from roadgeo.geometry.homography import Homography
 from roadgeo.location import Location
-from roadgeo.outputs.cameras import write_odm_geos
 from roadgeo.outputs.kmz import write_kmz
 from roadgeo.outputs.location_files import OutputOptions, write_location
 from roadgeo.outputs.outlines import write_geojson
@@ -27,14 +26,6 @@ from roadgeo.outputs.registry import ALSO
 from roadgeo.outputs.subject import Subject
 from roadgeo.storage.files import replacing
 from roadgeo.storage.rasters import open_raster
-
-CAMERA = {
-    "sigma": {"x_m": 1.0, "y_m": 1.0, "height_m": 2.0},
-    "altitude_m": 90.0,
-    "height_m": 80.0,
-    "lon": -8.6,
-    "lat": 41.1,
-}
 
 
 @pytest.fixture(scope="module")
@@ -122,7 +113,7 @@ def test_programs_that_do_not_turn_pictures_get_points_of_the_stored_pixels(tmp_
     stored = cv2.imread(str(photo), cv2.IMREAD_UNCHANGED)[..., ::-1]
     size = np.array(stored.shape[1::-1])
     paths = output_paths(tmp_path, "mask")
-    products = ("gcps", "vrt", "points", "match-points", "odm", "matches", "iiif")
+    products = ("gcps", "vrt", "points", "match-points", "odm", "matches")
     write_location(located(), road_mask(), paths, OutputOptions(products=products), photo)
 
     def right(column_row: np.ndarray, xy: np.ndarray, atol: float = 1e-6) -> None:
@@ -143,19 +134,14 @@ def test_programs_that_do_not_turn_pictures_get_points_of_the_stored_pixels(tmp_
     with (tmp_path / "mask_matches.csv").open(encoding="utf-8") as file:
         pixels = [(float(row["column"]), float(row["row"])) for row in csv.DictReader(file)]
     np.testing.assert_allclose(pixels, 2 * located().evidence.query_xy * (1, -1), atol=1e-6)  # of the upright picture
-    source = json.loads((tmp_path / "mask_iiif.json").read_text())["target"]["source"]
-    assert (source["width"], source["height"]) == (800, 600)
 
 
 def test_names_that_opendronemap_does_not_take_are_told(tmp_path: Path, caplog: pytest.LogCaptureFixture) -> None:
     photo = tmp_path / "My Photo 1.png"
     cv2.imwrite(str(photo), np.zeros((300, 400, 3), np.uint8))
     write_location(located(), road_mask(), output_paths(tmp_path, "a"), OutputOptions(products=("odm",)), photo)
-    document = {"status": "located", "query": "My Photo 2.png", "camera": CAMERA, "lonlat_accuracy_m": 2.0}
-    write_odm_geos(tmp_path / "geo.txt", [document, {**document, "query": "plain.png"}])
-    assert (tmp_path / "geo.txt").read_text().splitlines()[2].split()[7] == f"{np.sqrt(1 + 1 + 4):.3f}"
     told = "{}: OpenDroneMap takes no names with spaces: rename the picture, and in what is written"
-    assert [record.getMessage() for record in caplog.records] == [told.format(f"My Photo {k}.png") for k in (1, 2)]
+    assert [record.getMessage() for record in caplog.records] == [told.format("My Photo 1.png")]
     assert "My Photo 1.png" in (tmp_path / "a_gcp_list.txt").read_text()
 
 

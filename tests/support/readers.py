@@ -185,7 +185,7 @@ def apply(path: Path) -> None:
         return
     out.mkdir()
     try:
-        apply_location(location, [str(path.with_name("mask.png"))], out, products=("points", "geopose"), stretch=True)
+        apply_location(location, [str(path.with_name("mask.png"))], out, products=("points", "geojson"), stretch=True)
     finally:
         shutil.rmtree(out, ignore_errors=True)
 
