@@ -7,6 +7,7 @@ import os
 import re
 import shutil
 import sys
+import sysconfig
 import zipfile
 from collections.abc import Mapping
 from email.utils import parseaddr
@@ -110,12 +111,12 @@ def _contents() -> dict[Path, bytes]:
 
 
 def _this_executable() -> Path | None:
-    """Return the program that runs now, or the one beside the running Python."""
+    """Return the program that runs now, or the one of the running Python."""
     name = "roadgeo.exe" if sys.platform == "win32" else "roadgeo"
-    for folder in (Path(sys.argv[0]).absolute().parent, Path(sys.executable).absolute().parent):
-        if (folder / name).is_file():
-            return folder / name
-    return None
+    running = Path(sys.argv[0]).absolute()
+    candidates = [running.with_name(name)] if running.stem == "roadgeo" else []
+    candidates.append(Path(sysconfig.get_path("scripts"), name))
+    return next((path for path in candidates if path.is_file()), None)
 
 
 # --- profiles ---------------------------------------------------------------------------------------------------------

@@ -3,12 +3,10 @@
 import ast
 import configparser
 import json
-import os
 import re
 import shutil
 import subprocess
 import sys
-import time
 import zipfile
 from dataclasses import dataclass
 from pathlib import Path
@@ -17,7 +15,7 @@ import cv2
 import numpy as np
 import pytest
 import rasterio
-from support.real_qgis import Qgis
+from support.real_qgis import Qgis, is_running, make_program
 
 import roadgeo
 from roadgeo.cli import main
@@ -33,125 +31,6 @@ from roadgeo.qgis.plugin import runner
 PLUGIN = Path(installation.__file__).parent / "plugin"
 MASKS = {mask.path.stem: mask for mask in demo_masks()}
 ROAD, FOOTPRINT, MAP_ROAD = "#e4572e", "#1f6fb4", "#546e7a"
-
-
-def make_program(path: Path, body: str) -> Path:
-    path.parent.mkdir(parents=True, exist_ok=True)
-    path.write_text(f"#!{sys.executable}\n{body}", encoding="utf-8")
-    path.chmod(0o755)
-    return path
-
-
-# --- finding the executable -------------------------------------------------------------------------------------------
-
-
-def test_the_executable_is_searched_from_the_surest_place_to_the_usual_ones(tmp_path: Path) -> None:
-    home, beside = tmp_path / "home", tmp_path / "plugin"
-    beside.mkdir()
-    places = [
-        home / "projects" / ".venv" / "bin" / "roadgeo",
-        home / ".local" / "bin" / "roadgeo",
-        tmp_path / "path" / "roadgeo",
-        tmp_path / "remembered" / "roadgeo",
-        tmp_path / "told" / "roadgeo",
-    ]
-    environ = {"PATH": str(places[2].parent), "ROADGEO_EXECUTABLE": str(places[4])}
-    (beside / runner.REMEMBERED).write_text(f"{places[3]}\n", "utf-8")
-    assert runner.find_executable("", environ, home, beside) is None
-    for place in places:  # each takes precedence over those before it
-        make_program(place, "")
-        assert runner.find_executable("", environ, home, beside) == str(place)
-    assert runner.find_executable(str(places[0]), environ, home, beside) == str(places[0])
-    assert runner.find_executable(str(tmp_path / "none"), environ, home, beside) is None
-
-
-def test_a_python_that_has_roadgeo_may_stand_for_its_program(tmp_path: Path) -> None:
-    assert runner.as_command("/opt/bin/roadgeo") == ["/opt/bin/roadgeo"]
-    for name in ("python", "python3", "python3.13", "Python.exe"):
-        assert runner.as_command(f"/opt/{name}")[1:] == ["-P", "-m", "roadgeo"]
-    new, old = (make_program(tmp_path / name, "") for name in ("python3.12", "python3"))
-    found = runner.find_pythons({"PATH": str(tmp_path)}, tmp_path)
-    assert found[:2] == [str(new), str(old)]  # then that of QGIS
-
-
-def test_what_the_program_says_names_what_qgis_has() -> None:
-    labels = {"--gsd": "Pixel size", "--osm": "Place"}
-    said = "Give one source: --osm PLACE, or `roadgeo index --bbox`; `roadgeo simulate` and --gsd-like stay"
-    told = runner.in_words_of_qgis(said, labels)
-    assert told == "Give one source: “Place” PLACE, or “Build road reference”; `roadgeo simulate` and --gsd-like stay"
-    asked = "this needs osmnx, which is not installed: pip install 'roadgeo[maps]'"
-    assert runner.in_words_of_qgis(asked, {}).endswith("“Set up roadgeo” installs roadgeo[maps]")
-
-
-def test_the_child_inherits_nothing_of_the_libraries_of_qgis() -> None:
-    environ = {"PYTHONHOME": "a", "PYTHONPATH": "b", "PROJ_LIB": "c", "PROJ_DATA": "d", "GDAL_DATA": "e", "PATH": "f"}
-    kept = runner.child_environment(environ)
-    assert kept == {"PATH": "f", "PYTHONIOENCODING": "utf-8", "ROADGEO_PROGRESS": "json", "NO_COLOR": "1"}
-
-
-# --- running it -------------------------------------------------------------------------------------------------------
-
-
-def never() -> bool:
-    return False
-
-
-def test_lines_of_both_streams_arrive_and_the_status(tmp_path: Path) -> None:
-    program = make_program(
-        tmp_path / "roadgeo",
-        "import sys\nprint('São João')\nprint('oops', file=sys.stderr)\nprint('x' * 300000)\nsys.exit(3)",
-    )
-    heard: list[tuple[str, str]] = []
-    assert runner.run([str(program)], lambda *line: heard.append(line), never) == 3
-    assert [line for stream, line in heard if stream == "stdout"] == ["São João", "x" * 300000]
-    assert [line for stream, line in heard if stream == "stderr"] == ["oops"]
-
-
-@pytest.mark.skipif(sys.platform == "win32", reason="signals")
-@pytest.mark.parametrize(
-    ("heeding", "status", "last"),
-    [
-        ("worker.kill(); worker.wait(); print('clean', flush=True); sys.exit(130)", 130, ["clean"]),
-        ("sys.exit(130)", 130, []),  # in a hurry: what it started is left, with the pipes open
-        ("time.sleep(600)", -9, []),
-    ],
-    ids=["cleans up", "leaves its worker behind", "stubborn"],
-)
-def test_cancelling_stops_the_child_and_its_own_children(
-    heeding: str, status: int, last: list[str], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    """One that heeds the interrupt may clean up; whatever it started and left, or all if it does not, is killed."""
-    monkeypatch.setattr(runner, "_GRACE_S", 0.5)
-    body = f"""
-import subprocess, sys, time
-worker = subprocess.Popen([sys.executable, "-c", "import time; time.sleep(60)"])
-try:
-    print(worker.pid, flush=True)
-    time.sleep(600)
-except KeyboardInterrupt:
-    {heeding}
-"""
-    heard: list[str] = []
-    started = time.monotonic()
-    program = make_program(tmp_path / "roadgeo", body)
-    ended = runner.run([str(program)], lambda _, line: heard.append(line), lambda: bool(heard))
-    assert time.monotonic() - started < 10
-    assert (ended, heard[1:]) == (status, last)
-    assert not is_running(int(heard[0]))
-
-
-def is_running(process: int) -> bool:
-    """Whether a process runs on; one that ended is not counted, even if nobody asked for its status yet."""
-    for _ in range(50):
-        try:
-            os.kill(process, 0)
-        except ProcessLookupError:
-            return False
-        status = Path(f"/proc/{process}/stat")
-        if status.exists() and status.read_text().rpartition(")")[2].split()[0] == "Z":
-            return False
-        time.sleep(0.1)
-    return True
 
 
 # --- installing -------------------------------------------------------------------------------------------------------
@@ -406,12 +285,13 @@ def test_without_the_executable_nothing_runs_and_the_advice_is_there(qgis: Qgis)
 def test_an_environment_is_made_and_roadgeo_installed_there(qgis: Qgis) -> None:
     """With a Python that plays venv and pip; one that is too old is passed over, a folder with other things refused."""
     body = """
-import pathlib, shutil, sys
-if sys.argv[1:3] == ["-m", "venv"]:
-    scripts = pathlib.Path(sys.argv[3], "bin")
+import os, pathlib, shutil, sys
+assert sys.argv[1] == "-I" and os.getcwd() != os.path.dirname(os.environ["QGIS_CUSTOM_CONFIG_PATH"])
+if sys.argv[2:4] == ["-m", "venv"]:
+    scripts = pathlib.Path(sys.argv[4], "bin")
     scripts.mkdir(parents=True)
     shutil.copy(sys.argv[0], scripts / "python")
-if sys.argv[1:3] == ["-m", "pip"]:
+if sys.argv[2:4] == ["-m", "pip"]:
     program = pathlib.Path(sys.argv[0]).with_name("roadgeo")
     program.write_text("#!/bin/sh\\necho roadgeo, version 9.9 of " + sys.argv[-1])
     program.chmod(0o755)
@@ -423,6 +303,7 @@ if sys.argv[1:3] == ["-m", "pip"]:
     full = qgis.run("setup", **{**wanted, "FOLDER": qgis.folder / "pythons"})
     aged = qgis.run("setup", **{**wanted, "PROGRAM": old, "FOLDER": "/no/such"})
     named = qgis.run("setup", PROGRAM=old)
+    absent = qgis.run("setup", PROGRAM="no_such_program")
     qgis.ask(("forget_program", {}))
     assert "results" in done, done
     assert done["results"]["FOUND"] == str(qgis.folder / "environment" / "bin" / "roadgeo")
@@ -430,16 +311,35 @@ if sys.argv[1:3] == ["-m", "pip"]:
     assert "holds other things" in full["failed"]
     assert "needs Python 3.11 or newer" in aged["failed"]
     assert "failed" in named["failed"]
+    assert "give its full path" in absent["failed"]
+
+
+def test_setting_up_runs_nothing_of_the_current_folder(qgis: Qgis) -> None:
+    """Modules lie there that venv, pip and the trial of a Python would import, and programs of the names asked for."""
+    stolen = qgis.folder / "stolen"
+    planted = [qgis.folder / f"{name}.py" for name in ("ensurepip", "venv", "pip", "json", "multiprocessing")]
+    for path in planted:
+        path.write_text(f"open({str(stolen)!r}, 'a').write({path.name!r})", "utf-8")
+    planted += [make_program(qgis.folder / name, planted[0].read_text("utf-8")) for name in ("roadgeo", "python3")]
+    done = qgis.run("setup", PROGRAM=sys.executable, INSTALL=True, SOURCE="/no/such.whl", FOLDER=qgis.folder / "made")
+    qgis.run("setup")
+    qgis.ask(("forget_program", {}))
+    for path in planted:
+        path.unlink()
+    assert "failed" in done
+    assert (qgis.folder / "made" / "pyvenv.cfg").exists()
+    assert not stolen.exists(), stolen.read_text("utf-8")
 
 
 def test_cancelling_stops_the_executable(qgis: Qgis, porto: Path) -> None:
     body = """
 import os, sys, time
-open("started", "w").write(str(os.getpid()))
+folder = os.path.dirname(__file__)
+open(folder + "/started", "w").write(str(os.getpid()))
 try:
     time.sleep(600)
 except KeyboardInterrupt:
-    open("cleaned", "w").close()
+    open(folder + "/cleaned", "w").close()
 """
     program = make_program(qgis.folder / "slow" / "roadgeo", body)
     arguments = {
@@ -449,8 +349,8 @@ except KeyboardInterrupt:
     }
     task = {"algorithm": "roadgeo:locatemask", "parameters": arguments, "executable": str(program), "seconds": 1.5}
     qgis.ask(("cancel", task))
-    assert not is_running(int((qgis.folder / "started").read_text()))
-    assert (qgis.folder / "cleaned").exists()
+    assert not is_running(int((qgis.folder / "slow" / "started").read_text()))
+    assert (qgis.folder / "slow" / "cleaned").exists()
 
 
 def test_a_folder_of_masks_is_located_whatever_is_wrong_with_some(qgis: Qgis, porto: Path) -> None:

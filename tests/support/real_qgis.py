@@ -1,8 +1,11 @@
 """The real QGIS as a child process, with a profile of its own."""
 
 import json
+import os
 import shutil
 import subprocess
+import sys
+import time
 from dataclasses import dataclass, field
 from multiprocessing.connection import Connection, Pipe
 from pathlib import Path
@@ -101,3 +104,25 @@ def find_qgis() -> tuple[str, str] | None:
         if subprocess.run([python, "-c", "import qgis.core"], capture_output=True, check=False).returncode == 0:
             return process, python
     return None
+
+
+def make_program(path: Path, body: str) -> Path:
+    """Write a program in Python, and make it executable."""
+    path.parent.mkdir(parents=True, exist_ok=True)
+    path.write_text(f"#!{sys.executable}\n{body}", encoding="utf-8")
+    path.chmod(0o755)
+    return path
+
+
+def is_running(process: int) -> bool:
+    """Whether a process runs on; one that ended is not counted, even if nobody asked for its status yet."""
+    for _ in range(50):
+        try:
+            os.kill(process, 0)
+        except ProcessLookupError:
+            return False
+        status = Path(f"/proc/{process}/stat")
+        if status.exists() and status.read_text().rpartition(")")[2].split()[0] == "Z":
+            return False
+        time.sleep(0.1)
+    return True

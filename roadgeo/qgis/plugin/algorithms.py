@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import json
 import os
-import shutil
 from pathlib import Path
 from typing import Any, ClassVar
 
@@ -24,6 +23,7 @@ from qgis.utils import iface
 from . import parameters as given
 from .environment import ask_version, install
 from .parameters import Option, Values
+from .runner import find_program
 from .session import PICTURE_KEPT, POINTS_KEPT, Finding, Session, library
 from .settings import NOT_FOUND, configure, locate_executable, remember_reference, remembered_references
 
@@ -130,7 +130,7 @@ class BuildReference(RoadgeoAlgorithm):
         lines, place, box = (values.given(source) for source in ("ROADS", "PLACE", "EXTENT"))
         if lines + place + (box and not lines) != 1:
             raise QgsProcessingException("Give one source of roads: road lines, a place, or an extent")
-        path, name = values.get("FileOutput", "OUTPUT"), values.get("String", "NAME")
+        path, name = values.path("FileOutput", "OUTPUT"), values.get("String", "NAME")
         if path:
             name = name or ("" if place else Path(path).stem)
         else:
@@ -154,7 +154,7 @@ class BuildReference(RoadgeoAlgorithm):
 def _references(values: Values) -> list[str]:
     """Name the reference that was chosen; where none was, all that QGIS knows of."""
     if values.given("REFERENCE"):
-        return [f"--reference={values.get('String', 'REFERENCE')}"]
+        return [f"--reference={values.reference()}"]
     beside = remembered_references()
     return [f"--reference={one}" for one in (*(one.name for one in library()), *beside)] if beside else []
 
@@ -252,7 +252,7 @@ class LocateMasks(RoadgeoAlgorithm):
 
     def work(self, values: Values, session: Session) -> dict[str, Any]:
         """Locate them; load the footprints."""
-        masks, folder = values.get("String", "MASKS"), values.get("String", "OUTPUT_FOLDER")
+        masks, folder = values.path("String", "MASKS"), values.path("String", "OUTPUT_FOLDER")
         to = ["--json", f"--out-dir={folder}", *_references(values)]
         found = session.call("locate", masks, *to, *self.arguments(values), some_may_fail=True)
         results = {"OUTPUT_FOLDER": folder, **_count(found)}
@@ -276,7 +276,7 @@ class VectorizeMask(RoadgeoAlgorithm):
 
     def work(self, values: Values, session: Session) -> dict[str, Any]:
         """Vectorize it; load roads and intersections."""
-        mask, folder = values.raster("MASK"), values.get("String", "OUTPUT_FOLDER")
+        mask, folder = values.raster("MASK"), values.path("String", "OUTPUT_FOLDER")
         session.call("vectorize", mask, f"--out-dir={folder}", *self.arguments(values))
         path = Path(folder) / f"{Path(mask).stem}_vectorized.gpkg"
         roads = session.show(path, "Roads as seen", "roads", Path(mask).stem)
@@ -298,7 +298,7 @@ class MapLocalizability(RoadgeoAlgorithm):
 
     def work(self, values: Values, session: Session) -> dict[str, Any]:
         """Try masks all over the map; load what that shows."""
-        reference, folder = values.get("String", "REFERENCE"), values.get("String", "OUTPUT_FOLDER")
+        reference, folder = values.reference(), values.path("String", "OUTPUT_FOLDER")
         session.call("evaluate", reference, "--map", "--json", f"--out-dir={folder}", *self.arguments(values))
         path = Path(folder) / f"{Path(reference).stem}_localizability.tif"
         return {"OUTPUT_FOLDER": folder, "MAP": session.show(path, f"{Path(reference).stem}: where it would work")}
@@ -306,7 +306,7 @@ class MapLocalizability(RoadgeoAlgorithm):
 
 def _locate(mask: str, picture: str, options: list[str], values: Values, session: Session) -> dict[str, Any]:
     """Locate a mask, load the result, and keep it for the message bar."""
-    folder = values.get("String", "OUTPUT_FOLDER")
+    folder = values.path("String", "OUTPUT_FOLDER")
     to = ["--json", f"--out-dir={folder}", "--also=match-points", *_references(values)]
     found = session.call("locate", mask, *to, *options)
     if not found:
@@ -322,7 +322,7 @@ def _locate(mask: str, picture: str, options: list[str], values: Values, session
     if location["status"] != "located":
         session.feedback.pushWarning(f"{stem.name}: {location['reason']}")
         return results
-    session.show_map(values.get("String", "REFERENCE") or location["reference"])
+    session.show_map(values.reference() or location["reference"])
     return {**results, **_show_location(location, stem, {PICTURE_KEPT: picture, POINTS_KEPT: points_there}, session)}
 
 
@@ -370,7 +370,7 @@ class PlaceByPoints(RoadgeoAlgorithm):
         """Fit the homography, and have the picture drawn by it."""
         from .placing import make_location
 
-        picture, folder = values.raster("IMAGE"), values.get("String", "OUTPUT_FOLDER")
+        picture, folder = values.raster("IMAGE"), values.path("String", "OUTPUT_FOLDER")
         location, rms = make_location(picture, values.get("File", "POINTS"))
         told = Path(folder) / f"{Path(picture).stem}_placed.json"
         told.parent.mkdir(parents=True, exist_ok=True)
@@ -402,9 +402,12 @@ class SetUp(RoadgeoAlgorithm):
 
     def work(self, values: Values, session: Session) -> dict[str, Any]:
         """Find or install it, and call it."""
-        program = shutil.which(values.get("File", "PROGRAM")) or values.get("File", "PROGRAM")
+        named = values.get("File", "PROGRAM")
+        program = find_program(named, os.environ) if named else ""
+        if program is None:
+            raise QgsProcessingException(f"{named} is not a program of this computer: give its full path")
         if values.get("Boolean", "INSTALL"):
-            source, folder = values.get("String", "SOURCE"), values.get("File", "FOLDER")
+            source, folder = values.get("String", "SOURCE"), values.path("File", "FOLDER")
             found = install(program, source, Path(folder), session)
         else:
             found = program or locate_executable() or ""

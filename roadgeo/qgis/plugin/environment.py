@@ -56,10 +56,11 @@ def install(python: str, source: str, folder: Path, session: Session) -> str:
         raise QgsProcessingException(f"{folder} holds other things; name a folder that is empty or not there yet")
     made = _choose(python, session)
     session.feedback.setProgressText(f"Making an environment in {folder} ...")
-    session.tell(made, "-m", "venv", str(folder))
+    session.tell(made, "-I", "-m", "venv", str(folder))
     scripts, ending = ("Scripts", ".exe") if sys.platform == "win32" else ("bin", "")
     session.feedback.setProgressText(f"Installing {source} ...")
-    session.tell(str(folder / scripts / f"python{ending}"), "-m", "pip", "install", "--progress-bar=off", source)
+    python = str(folder / scripts / f"python{ending}")
+    session.tell(python, "-I", "-m", "pip", "install", "--progress-bar=off", source)
     return str(folder / scripts / f"roadgeo{ending}")
 
 
@@ -68,7 +69,7 @@ def _choose(python: str, session: Session) -> str:
     named = [python] if python else find_pythons(os.environ, Path.home())
     for one in named:
         try:
-            session.tell(one, "-c", _TRIAL)
+            session.tell(one, "-I", "-c", _TRIAL)
         except QgsProcessingException:
             continue
         return one

@@ -52,6 +52,16 @@ class Values:
         """Return a value as `QgsProcessingAlgorithm.parameterAs<kind>` reads it."""
         return getattr(self.algorithm, f"parameterAs{kind}")(self.parameters, name, self.context, *more)
 
+    def path(self, kind: str, name: str) -> str:
+        """Return a path in full, for the program runs in another folder; "" where none is given."""
+        text = self.get(kind, name)
+        return str(Path(text).absolute()) if text else ""
+
+    def reference(self) -> str:
+        """Return the name of the reference in roadgeo's library, or its file in full; "" where none is given."""
+        text = str(self.get("String", "REFERENCE"))
+        return str(Path(text).absolute()) if Path(text).suffix and Path(text).exists() else text
+
     def in_degrees(self, kind: str, name: str) -> Any:
         """Return a point or an extent as longitudes and latitudes."""
         return self.get(kind, name, QgsCoordinateReferenceSystem("EPSG:4326"))
@@ -70,13 +80,13 @@ class Values:
         path = QgsProviderRegistry.instance().decodeUri(layer.providerType(), layer.source()).get("path", "")
         if not Path(path).is_file():
             raise QgsProcessingException(f"{layer.name()} is not a file on this computer; save it as GeoTIFF first")
-        return str(path)
+        return str(Path(path).absolute())
 
     def lines(self, name: str) -> tuple[str, str, str]:
         """Return file, layer and CRS of a layer of lines; one that roadgeo cannot read is saved as a file."""
         formats = ["gpkg", "shp", "geojson", "json", "fgb"]
         path, layer = self.get("CompatibleSourceLayerPathAndLayerName", name, formats, formats[0], self.feedback)
-        return path, layer, name_crs(self.get("Source", name).sourceCrs())
+        return str(Path(path).absolute()), layer, name_crs(self.get("Source", name).sourceCrs())
 
     def layer_name(self, name: str) -> str:
         """Return the name of a layer of lines; "" where none is given."""
@@ -141,6 +151,10 @@ class Option:
 
 def _said(flag: str, kind: str, form: str = "{}") -> Callable[[Values, str], list[str]]:
     return lambda values, name: [f"{flag}={form.format(values.get(kind, name))}"]
+
+
+def _path(flag: str) -> Callable[[Values, str], list[str]]:
+    return lambda values, name: [f"{flag}={values.path('File', name)}"]
 
 
 def _switched(flag: str) -> Callable[[Values, str], list[str]]:
@@ -263,7 +277,7 @@ SEGMENT = _fold(
     Option(
         QgsProcessingParameterFile, "SEGMENTER", "Model for photographs",
         "A segmentation model, as QGIS's Deepness takes them. Empty: the one that ships with roadgeo.",
-        _said("--segmenter", "File"), {"extension": "onnx", **_MAY_LACK}, flag="--segmenter",
+        _path("--segmenter"), {"extension": "onnx", **_MAY_LACK}, flag="--segmenter",
     ),
 )  # fmt: skip
 REPORT = _option(

@@ -10,7 +10,6 @@ import contextlib
 import os
 import queue
 import re
-import shutil
 import signal
 import subprocess  # nosec B404
 import sys
@@ -24,6 +23,7 @@ __all__ = [
     "as_command",
     "child_environment",
     "find_executable",
+    "find_program",
     "find_pythons",
     "in_words_of_qgis",
     "run",
@@ -35,16 +35,16 @@ REMEMBERED = "executable.txt"
 _NAME, _SCRIPTS = ("roadgeo.exe", "Scripts") if sys.platform == "win32" else ("roadgeo", "bin")
 
 #: Where programs and environments are put below the home folder; QGIS often starts with a shorter PATH than a terminal.
+#: No pattern stands for a folder in the home folder itself: an archive that was unpacked there would be started.
+_CONDAS = ("miniconda3", "anaconda3", "miniforge3", "mambaforge", "micromamba", ".conda", ".local/share/mamba")
 _PLACES = (
     ".local/bin",
     f".local/share/uv/tools/roadgeo/{_SCRIPTS}",
     f".local/share/pipx/venvs/roadgeo/{_SCRIPTS}",
     f"pipx/venvs/roadgeo/{_SCRIPTS}",
     f".venv/{_SCRIPTS}",
-    f"*/.venv/{_SCRIPTS}",
     f".virtualenvs/*/{_SCRIPTS}",
-    f"*conda*/envs/*/{_SCRIPTS}",
-    f"*forge*/envs/*/{_SCRIPTS}",
+    *(f"{conda}/envs/*/{_SCRIPTS}" for conda in _CONDAS),
     "Library/Python/3*/bin",
     "AppData/Roaming/Python/Python3*/Scripts",
     "AppData/Local/Programs/Python/Python3*/Scripts",
@@ -76,33 +76,50 @@ def find_executable(configured: str, environ: Mapping[str, str], home: Path, bes
         `beside`, PATH, and the usual places below `home`.
     """
     if configured:
-        return _executable(Path(configured).expanduser())
+        return find_program(configured, environ)
     remembered = beside / REMEMBERED
-    told = [environ.get("ROADGEO_EXECUTABLE", ""), remembered.read_text("utf-8") if remembered.is_file() else ""]
-    told.append(shutil.which(_NAME, path=environ.get("PATH", "")) or "")
-    places = (place / _NAME for pattern in _PLACES for place in sorted(home.glob(pattern)))
-    candidates = [*(Path(path.strip()) for path in told if path.strip()), *places]
-    return next(filter(None, map(_executable, candidates)), None)
+    names = [environ.get("ROADGEO_EXECUTABLE", ""), remembered.read_text("utf-8") if remembered.is_file() else ""]
+    names += [_NAME, *(str(place / _NAME) for pattern in _PLACES for place in sorted(home.glob(pattern)))]
+    found = (find_program(name.strip(), environ) for name in names if name.strip())
+    return next(filter(None, found), None)
 
 
 def find_pythons(environ: Mapping[str, str], home: Path) -> list[str]:
     """List Pythons that roadgeo may be installed with, the newest first as far as names show it."""
     ending = ".exe" if sys.platform == "win32" else ""
     names = [*(f"python3.{minor}" for minor in range(15, 10, -1)), "python3", "python"]
-    found = [shutil.which(name, path=environ.get("PATH", "")) for name in names]
-    found += [str(Path(sys.prefix, part, f"python3{ending}")) for part in ("bin", "")]  # that of QGIS
-    found += [str(path) for path in sorted(home.glob(f"AppData/Local/Programs/Python/Python3*/python{ending}"))]
-    return list(dict.fromkeys(path for path in found if path and _executable(Path(path))))
+    names += [str(Path(sys.prefix, part, f"python3{ending}")) for part in ("bin", "")]  # QGIS's own
+    names += [str(path) for path in sorted(home.glob(f"AppData/Local/Programs/Python/Python3*/python{ending}"))]
+    return list(dict.fromkeys(filter(None, (find_program(name, environ) for name in names))))
+
+
+def find_program(name: str, environ: Mapping[str, str]) -> str | None:
+    """Return the full path of a program that is given by its path, or by its name in the folders of PATH.
+
+    The current folder is passed over, whatever PATH holds and Windows does: anybody's files may lie there.
+    """
+    path = Path(name).expanduser()
+    if path.name != name:
+        return str(path.absolute()) if _is_executable(path) else None
+    if sys.platform == "win32" and path.suffix.lower() != ".exe":
+        name += ".exe"
+    for folder in map(Path, environ.get("PATH", "").split(os.pathsep)):
+        if folder.is_absolute() and _is_executable(folder / name) and not folder.samefile(os.curdir):
+            return str(folder / name)
+    return None
+
+
+def _is_executable(path: Path) -> bool:
+    return path.is_file() and os.access(path, os.X_OK)
 
 
 def as_command(path: str) -> list[str]:
-    """Return how roadgeo is called by a path from the settings: its program, or a Python that has it."""
+    """Return how roadgeo is called by a path from the settings: its program, or a Python that has it.
+
+    `-P` rather than `-I`, which the Python of Windows' store could not find it with: that installs for one user alone.
+    """
     is_python = re.match(r"python[\d.]*(\.exe)?$", Path(path).name.lower())
     return [path, "-P", "-m", "roadgeo"] if is_python else [path]
-
-
-def _executable(path: Path) -> str | None:
-    return str(path) if path.is_file() and os.access(path, os.X_OK) else None
 
 
 def in_words_of_qgis(text: str, labels: Mapping[str, str]) -> str:
@@ -122,13 +139,17 @@ def in_words_of_qgis(text: str, labels: Mapping[str, str]) -> str:
 
 
 def child_environment(environ: Mapping[str, str]) -> dict[str, str]:
-    """Return the child's environment: nothing of QGIS's own Python, PROJ and GDAL; UTF-8, and progress as JSON."""
+    """Return the child's environment: nothing of QGIS's own Python, PROJ and GDAL; UTF-8, and progress as JSON.
+
+    Neither the child nor the workers that it starts import from the current folder.
+    """
     kept = {name: value for name, value in environ.items() if not name.startswith(_NOT_INHERITED)}
-    return {**kept, "PYTHONIOENCODING": "utf-8", "ROADGEO_PROGRESS": "json", "NO_COLOR": "1"}
+    own = {"PYTHONIOENCODING": "utf-8", "PYTHONSAFEPATH": "1", "ROADGEO_PROGRESS": "json", "NO_COLOR": "1"}
+    return {**kept, **own}
 
 
 def run(command: Sequence[str], handle: Callable[[str, str], None], is_cancelled: Callable[[], bool]) -> int:
-    """Run a command to its end and return its exit status.
+    """Run a command to its end, in the plugin's own folder, and return its exit status.
 
     Parameters
     ----------
@@ -138,6 +159,7 @@ def run(command: Sequence[str], handle: Callable[[str, str], None], is_cancelled
         Asked ten times a second; once true the child and its own children are stopped.
     """
     options: dict[str, Any] = {"encoding": "utf-8", "errors": "replace", "env": child_environment(os.environ)}
+    options["cwd"] = Path(__file__).parent  # in the current folder a stranger's modules and settings may lie
     if sys.platform == "win32":
         options["creationflags"] = subprocess.CREATE_NO_WINDOW
     else:
@@ -196,7 +218,8 @@ def _stop(process: subprocess.Popen[str]) -> None:
 def _kill(process: subprocess.Popen[str]) -> None:
     """End the child and all that it started."""
     if sys.platform == "win32":
-        command = ["taskkill", "/F", "/T", "/PID", str(process.pid)]
+        taskkill = Path(os.environ["SYSTEMROOT"], "System32", "taskkill.exe")
+        command = [str(taskkill), "/F", "/T", "/PID", str(process.pid)]
         subprocess.run(command, capture_output=True, check=False)  # noqa: S603 # nosec B603
     else:
         with contextlib.suppress(ProcessLookupError):
