@@ -15,10 +15,10 @@ import numpy as np
 
 from roadgeo._arrays import FloatArray
 from roadgeo.evaluation.flights import FlightOptions, _draw_views, _motion
+from roadgeo.flights.pose import Pose, predict, start
 from roadgeo.geometry.frame import Frame
 from roadgeo.geometry.pinhole import View
 from roadgeo.geometry.pose import _place, _starts
-from roadgeo.running.flights.pose import Pose, predict, start
 
 OPTIONS, START_M = FlightOptions(n_frames=(19, 19), gsd_m=(0.5, 0.5)), 0.3
 #: Numbers of a frame: where its axis meets the ground (2), log metres per pixel, heading, tilt (2), log focal length,

@@ -21,12 +21,12 @@ import numpy as np
 from roadgeo._arrays import FloatArray
 from roadgeo.evaluation.flights import Flight, FlightOptions, simulate_flight
 from roadgeo.evaluation.landscape import Landscape
+from roadgeo.flights.motion import Odometer
+from roadgeo.flights.tracker import FlightFrame, Tracked, Tracker
 from roadgeo.geometry.homography import Homography
 from roadgeo.geometry.mask import RoadMask
 from roadgeo.reference.network_file import read_network
 from roadgeo.reference.reference import Reference, open_reference
-from roadgeo.running.flights.motion import Odometer
-from roadgeo.running.flights.tracker import FlightFrame, Tracked, Tracker
 from roadgeo.sources.masks import read_mask
 
 #: A fix is wrong where a frame's middle lies further than this from the truth, metres.

@@ -14,10 +14,10 @@ import numpy as np
 
 from roadgeo.evaluation.flights import FlightOptions, simulate_flight
 from roadgeo.evaluation.landscape import Landscape
+from roadgeo.flights.strips import place_strips
+from roadgeo.flights.tracker import FlightFrame
 from roadgeo.reference.network_file import read_network
 from roadgeo.reference.reference import open_reference
-from roadgeo.running.flights.strips import place_strips
-from roadgeo.running.flights.tracker import FlightFrame
 from roadgeo.sources.masks import read_mask
 
 

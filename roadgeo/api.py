@@ -32,8 +32,8 @@ if TYPE_CHECKING:
     import xarray as xr
     from matplotlib.figure import Figure
 
+    from roadgeo.flights.rows import Row
     from roadgeo.outputs.subject import Subject
-    from roadgeo.running.flights.rows import Row
     from roadgeo.running.verifying import Verified
 
 __all__ = ["Answer", "build_reference", "index", "locate", "track", "vectorize", "verify"]
@@ -468,11 +468,11 @@ def track(
     IndexFormatError
         A reference is missing or unusable.
     """
-    from roadgeo.running.flights.frames import FrameOptions, read_frames, read_stills
-    from roadgeo.running.flights.motion import read_motion
-    from roadgeo.running.flights.rows import make_rows
-    from roadgeo.running.flights.strips import place_strips
-    from roadgeo.running.flights.tracker import TrackOptions, follow
+    from roadgeo.flights.frames import FrameOptions, read_frames, read_stills
+    from roadgeo.flights.motion import read_motion
+    from roadgeo.flights.rows import make_rows
+    from roadgeo.flights.strips import place_strips
+    from roadgeo.flights.tracker import TrackOptions, follow
 
     given = {"gsd": gsd, "near": near, "within": within, "max_tilt": max_tilt, "time_limit": time_limit}
     options = TrackOptions(locate=_with_hints(LocateOptions(), given, None))

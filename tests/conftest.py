@@ -20,7 +20,7 @@ settings.load_profile("steady")
 
 
 #: Folders whose tests start programs, draw masks or run whole commands: they take most of the time.
-SLOW = ("accept", "cli", "docs", "evaluation", "examples", "outputs", "qgis", "running", "workflows")
+SLOW = ("accept", "cli", "docs", "evaluation", "examples", "flights", "outputs", "qgis", "running", "workflows")
 
 
 def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:

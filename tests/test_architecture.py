@@ -26,7 +26,7 @@ STOREYS_TEXT = """
     exits         outputs
     workflows     workflows
     running       running
-    flights       running.flights serving
+    flights       flights serving
     evaluation    evaluation
     demonstration evaluation.demo
     faces         api cli qgis __main__ __init__

@@ -21,7 +21,7 @@ from roadgeo.cli.printing import echo
 from roadgeo.matching.hints import HINTS
 
 if TYPE_CHECKING:
-    from roadgeo.running.flights.mavlink import MavlinkSender
+    from roadgeo.flights.mavlink import MavlinkSender
     from roadgeo.serving.options import ServeOptions
 
 __all__ = ["serve_command"]
@@ -122,8 +122,8 @@ def serve_command(
     from roadgeo.cli.compilation import compile_once
     from roadgeo.cli.progress import print_steps
     from roadgeo.errors import OutputError, RoadgeoError
+    from roadgeo.flights.mavlink import MavlinkSender
     from roadgeo.running.batch import open_references
-    from roadgeo.running.flights.mavlink import MavlinkSender
     from roadgeo.serving.server import Server
     from roadgeo.serving.workers import Workers
 
@@ -193,7 +193,7 @@ def _log(quiet: bool) -> None:
 
 def _tell(sender: MavlinkSender, found: dict[str, Any], came_s: float) -> None:
     """Send the place of a mask that was located; it was taken when its request came."""
-    from roadgeo.running.flights.mavlink import fix_of
+    from roadgeo.flights.mavlink import fix_of
 
     fix = fix_of(found, came_s)
     if fix is not None:

@@ -31,9 +31,9 @@ from roadgeo.cli.options import (
 from roadgeo.cli.printing import echo
 
 if TYPE_CHECKING:
-    from roadgeo.running.flights.frames import FrameOptions
-    from roadgeo.running.flights.rows import Row
-    from roadgeo.running.flights.tracker import FlightFrame, Tracked, TrackOptions
+    from roadgeo.flights.frames import FrameOptions
+    from roadgeo.flights.rows import Row
+    from roadgeo.flights.tracker import FlightFrame, Tracked, TrackOptions
 
 __all__ = ["track_command"]
 
@@ -140,9 +140,9 @@ def track_command(
     """Follow a flight over the map, frame by frame; for the help see above."""
     from roadgeo.cli.compilation import compile_once
     from roadgeo.cli.progress import print_steps
+    from roadgeo.flights.report import Thumbnails
+    from roadgeo.flights.rows import make_rows
     from roadgeo.running.batch import open_references
-    from roadgeo.running.flights.report import Thumbnails
-    from roadgeo.running.flights.rows import make_rows
 
     if focal_px == "exif":
         raise click.UsageError("--focal exif: of frames give the focal length in pixels.")
@@ -181,8 +181,8 @@ def track_command(
 def _follow(
     frames: tuple[str, ...], reading: FrameOptions, opened: Any, options: TrackOptions
 ) -> Iterator[tuple[FlightFrame, list[Tracked]]]:
-    from roadgeo.running.flights.frames import read_frames
-    from roadgeo.running.flights.tracker import follow
+    from roadgeo.flights.frames import read_frames
+    from roadgeo.flights.tracker import follow
 
     return follow(read_frames(frames, reading), opened, options)
 
@@ -190,8 +190,8 @@ def _follow(
 def _place_all(
     frames: tuple[str, ...], reading: FrameOptions, opened: Any, options: TrackOptions
 ) -> Iterator[tuple[FlightFrame, list[Tracked]]]:
-    from roadgeo.running.flights.frames import read_stills
-    from roadgeo.running.flights.strips import place_strips
+    from roadgeo.flights.frames import read_stills
+    from roadgeo.flights.strips import place_strips
 
     for one in place_strips(list(read_stills(frames, reading)), opened, options):
         yield one.frame, [one]
@@ -203,7 +203,7 @@ def _sender(url: str | None) -> Iterator[Callable[[Row], None]]:
     if url is None:
         yield lambda _: None
         return
-    from roadgeo.running.flights.mavlink import MavlinkSender, fix_of
+    from roadgeo.flights.mavlink import MavlinkSender, fix_of
 
     with MavlinkSender(url) as sender:
         read_at = time.time()
@@ -219,14 +219,14 @@ def _sender(url: str | None) -> Iterator[Callable[[Row], None]]:
 
 
 def _track_options(given: dict[str, Any]) -> TrackOptions:
-    from roadgeo.running.flights.tracker import TrackOptions
+    from roadgeo.flights.tracker import TrackOptions
 
     return TrackOptions(locate=make_options(hinted(given)))
 
 
 def _frame_options(given: dict[str, Any]) -> FrameOptions:
-    from roadgeo.running.flights.frames import FrameOptions
-    from roadgeo.running.flights.motion import read_motion
+    from roadgeo.flights.frames import FrameOptions
+    from roadgeo.flights.motion import read_motion
 
     motion = None if given["motion"] is None else read_motion(given["motion"])
     return FrameOptions(
@@ -256,8 +256,8 @@ def _without_mask(one: Tracked) -> Tracked:
 
 
 def _write(folder: Path, name: str, tracked: list[Tracked], rows: list[Row], pictures: Any) -> list[str]:
-    from roadgeo.running.flights.outputs import WRITERS
-    from roadgeo.running.flights.report import render_flight
+    from roadgeo.flights.outputs import WRITERS
+    from roadgeo.flights.report import render_flight
     from roadgeo.storage.files import write_text
 
     written = []

@@ -19,10 +19,10 @@ from support.mavlink_peer import listening, of_kind
 from roadgeo.cli import main
 from roadgeo.evaluation.flights import FlightOptions, simulate_flight
 from roadgeo.evaluation.landscape import Landscape
+from roadgeo.flights.mavlink import has_pymavlink
+from roadgeo.flights.motion import write_motion
 from roadgeo.outputs.schemas import read_schema
 from roadgeo.reference.reference import Reference
-from roadgeo.running.flights.mavlink import has_pymavlink
-from roadgeo.running.flights.motion import write_motion
 
 OPTIONS = FlightOptions(size_px=(400, 300), n_frames=(7, 7), gsd_m=(1.0, 1.2), turn_deg=1.0, intersections=(2, 30))
 

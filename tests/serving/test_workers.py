@@ -33,10 +33,10 @@ from roadgeo.errors import IndexFormatError, ModelError
 from roadgeo.evaluation.landscape import Landscape
 from roadgeo.evaluation.noise import NOISE_MODELS
 from roadgeo.evaluation.simulation import SimulationOptions, ViewOptions, simulate_query
+from roadgeo.flights.mavlink import has_pymavlink
 from roadgeo.geometry.mask import RoadMask
 from roadgeo.location import Location
 from roadgeo.reference.reference import Reference
-from roadgeo.running.flights.mavlink import has_pymavlink
 from roadgeo.running.looks import Sighting
 from roadgeo.serving.workers import Asked, Workers, _answer, _folder_of, _remove_all, _serve
 from roadgeo.sources.segmentation.probability import ProbabilityMap

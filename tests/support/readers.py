@@ -24,14 +24,14 @@ from roadgeo.cli.track import TIME
 from roadgeo.cli.truths import read_truths
 from roadgeo.errors import RoadgeoError
 from roadgeo.evaluation.truth import read_truth
+from roadgeo.flights.frames import FrameOptions, _video
+from roadgeo.flights.motion import read_motion
 from roadgeo.geometry.projection import LocalPlane, serves_as_plane, to_lonlat
 from roadgeo.matching.hints import HINTS
 from roadgeo.reference.index_file import read_index
 from roadgeo.reference.network_file import read_network
 from roadgeo.reference.shards import describe_shards, open_shards
 from roadgeo.running.applying import apply_location, read_location
-from roadgeo.running.flights.frames import FrameOptions, _video
-from roadgeo.running.flights.motion import read_motion
 from roadgeo.serving.requests import Refused, ending_of, read_execution, read_query_string
 from roadgeo.sources.elevation import ground_heights
 from roadgeo.sources.exif import estimate_gsd, read_focal_length

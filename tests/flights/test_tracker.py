@@ -8,12 +8,12 @@ import shapely
 
 from roadgeo.evaluation.flights import FlightOptions, simulate_flight
 from roadgeo.evaluation.landscape import Landscape
+from roadgeo.flights.pose import start
+from roadgeo.flights.tracker import FlightFrame, Tracked, Tracker, track
 from roadgeo.geometry.mask import RoadMask
 from roadgeo.geometry.projection import LocalPlane
 from roadgeo.matching.index import build_index
 from roadgeo.reference.reference import Reference
-from roadgeo.running.flights.pose import start
-from roadgeo.running.flights.tracker import FlightFrame, Tracked, Tracker, track
 from roadgeo.workflows import build_network
 
 OPTIONS = FlightOptions(size_px=(400, 300), n_frames=(9, 9), gsd_m=(1.0, 1.2), turn_deg=1.0, intersections=(2, 30))
@@ -138,6 +138,6 @@ def test_frames_without_motion_stay_where_the_mosaic_puts_them(flight, monkeypat
     monkeypatch.setattr(Tracker, "_settle", lambda self, *found: given.append(found) or settle(self, *found))
     known = track(frames, [reference])
     n = sum(one.status == "located" for one in known)
-    monkeypatch.setattr("roadgeo.running.flights.tracker.predict", lambda *_: pytest.fail("moved without a motion"))
+    monkeypatch.setattr("roadgeo.flights.tracker.predict", lambda *_: pytest.fail("moved without a motion"))
     placed = Tracker([reference]).place(*given[-1], [replace(frame, motion=None) for frame in frames[:n]])
     assert [one.status for one in placed] == ["located"] * n

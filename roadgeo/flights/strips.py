@@ -15,6 +15,9 @@ from itertools import combinations
 import numpy as np
 
 from roadgeo._arrays import AnyArray, FloatArray
+from roadgeo.flights.mosaic import lay_down
+from roadgeo.flights.motion import TracedMask, between_images, overlay
+from roadgeo.flights.tracker import FlightFrame, Tracked, Tracker, TrackOptions
 from roadgeo.geometry.frame import Frame
 from roadgeo.geometry.homography import Homography, map_each
 from roadgeo.geometry.mask import PIXEL_TO_PLANE, RoadMask
@@ -22,9 +25,6 @@ from roadgeo.matching.checking import CheckOptions, check_place
 from roadgeo.matching.scene import trace_query
 from roadgeo.reference.reference import Reference
 from roadgeo.roads.vectorization import road_width
-from roadgeo.running.flights.mosaic import lay_down
-from roadgeo.running.flights.motion import TracedMask, between_images, overlay
-from roadgeo.running.flights.tracker import FlightFrame, Tracked, Tracker, TrackOptions
 from roadgeo.workflows import locate
 
 __all__ = ["Link", "StripOptions", "adjust", "find_links", "find_nets", "place_strips"]

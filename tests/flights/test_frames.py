@@ -6,14 +6,14 @@ from pathlib import Path
 import cv2
 import numpy as np
 import pytest
-from running.flights.test_motion import MOTION, gap, seen, streets
+from flights.test_motion import MOTION, gap, seen, streets
 from worlds.models import brightness_model
 from worlds.turned import save_turned
 
 from roadgeo.errors import MaskError, PhotographError
 from roadgeo.evaluation.demo import PHOTO
-from roadgeo.running.flights import frames
-from roadgeo.running.flights.frames import FrameOptions, read_frames, read_stills
+from roadgeo.flights import frames
+from roadgeo.flights.frames import FrameOptions, read_frames, read_stills
 from roadgeo.sources.masks import read_mask
 
 

@@ -5,13 +5,13 @@ import pytest
 
 from roadgeo.evaluation.flights import FlightOptions, simulate_flight
 from roadgeo.evaluation.landscape import Landscape
+from roadgeo.flights.candidates import CandidateOptions, Candidates, Look
+from roadgeo.flights.mosaic import lay_together
 from roadgeo.geometry.homography import Homography
 from roadgeo.geometry.mask import RoadMask
 from roadgeo.matching.options import LocateOptions
 from roadgeo.matching.scene import read_query
 from roadgeo.reference.reference import Reference
-from roadgeo.running.flights.candidates import CandidateOptions, Candidates, Look
-from roadgeo.running.flights.mosaic import lay_together
 
 FLIGHT = FlightOptions(size_px=(400, 300), n_frames=(9, 9), gsd_m=(1.0, 1.2), turn_deg=1.0, intersections=(2, 30))
 

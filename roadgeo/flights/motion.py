@@ -19,6 +19,7 @@ import numpy as np
 
 from roadgeo._arrays import AnyArray, FloatArray
 from roadgeo.errors import MaskError, RoadSourceError
+from roadgeo.flights.pose import FilterOptions, correct, start
 from roadgeo.geometry.frame import Frame
 from roadgeo.geometry.homography import Homography
 from roadgeo.geometry.mask import RoadMask
@@ -26,7 +27,6 @@ from roadgeo.kernels.roads import bin_segments
 from roadgeo.kernels.structs import RoadBuckets
 from roadgeo.matching.scene import Scene, trace_query
 from roadgeo.roads.graph import RoadGraph
-from roadgeo.running.flights.pose import FilterOptions, correct, start
 
 __all__ = ["Odometer", "TracedMask", "between_images", "between_masks", "overlay", "read_motion", "write_motion"]
 

@@ -8,7 +8,7 @@ import pytest
 from support.mavlink_peer import free_port, listening, of_kind
 
 from roadgeo.errors import OutputError
-from roadgeo.running.flights.mavlink import MavlinkOptions, MavlinkSender, PositionFix, fix_of, has_pymavlink
+from roadgeo.flights.mavlink import MavlinkOptions, MavlinkSender, PositionFix, fix_of, has_pymavlink
 
 pytestmark = pytest.mark.slow
 
@@ -90,7 +90,7 @@ def test_addresses_that_are_none_are_told(url):
 
 
 def test_without_pymavlink_it_is_said_what_to_install(monkeypatch):
-    monkeypatch.setattr("roadgeo.running.flights.mavlink.has_pymavlink", lambda: False)
+    monkeypatch.setattr("roadgeo.flights.mavlink.has_pymavlink", lambda: False)
     with pytest.raises(OutputError, match=r"pip install .*pymavlink"):
         MavlinkSender("udpout:127.0.0.1:1")
 

@@ -11,11 +11,11 @@ from typing import Any
 import numpy as np
 
 from roadgeo._arrays import FloatArray
+from roadgeo.flights.pose import Pose
+from roadgeo.flights.tracker import Tracked
 from roadgeo.geometry.pose import PoseOptions, find_pose
 from roadgeo.geometry.projection import LocalPlane, grid_north, to_lonlat
 from roadgeo.geometry.transformation import LONLAT, exactness
-from roadgeo.running.flights.pose import Pose
-from roadgeo.running.flights.tracker import Tracked
 
 __all__ = ["CameraPlace", "Row", "make_rows"]
 

@@ -4,11 +4,11 @@ from itertools import pairwise
 
 import numpy as np
 
+from roadgeo.flights.mosaic import MosaicOptions, chain, lay_together, level
 from roadgeo.geometry.frame import Frame
 from roadgeo.geometry.homography import Homography
 from roadgeo.geometry.mask import PROBABILITY_UNKNOWN, RoadMask
 from roadgeo.geometry.pinhole import make_view
-from roadgeo.running.flights.mosaic import MosaicOptions, chain, lay_together, level
 
 FRAME = Frame(320, 240)
 

@@ -14,6 +14,7 @@ from dataclasses import dataclass, field, replace
 import numpy as np
 
 from roadgeo._arrays import FloatArray
+from roadgeo.flights.mosaic import Mosaic
 from roadgeo.geometry.camera import judge, sampling
 from roadgeo.geometry.frame import Frame
 from roadgeo.geometry.homography import Homography
@@ -29,7 +30,6 @@ from roadgeo.matching.rivals import N_LAID, similar_places
 from roadgeo.matching.scene import Query
 from roadgeo.matching.verdict import decide
 from roadgeo.reference.reference import Reference
-from roadgeo.running.flights.mosaic import Mosaic
 
 __all__ = ["CandidateOptions", "Candidates", "Look"]
 

@@ -9,9 +9,7 @@ import pytest
 from roadgeo.errors import RoadSourceError
 from roadgeo.evaluation.flights import FlightOptions, simulate_flight
 from roadgeo.evaluation.landscape import Landscape
-from roadgeo.geometry.homography import Homography
-from roadgeo.geometry.mask import RoadMask
-from roadgeo.running.flights.motion import (
+from roadgeo.flights.motion import (
     Odometer,
     TracedMask,
     between_images,
@@ -19,6 +17,8 @@ from roadgeo.running.flights.motion import (
     read_motion,
     write_motion,
 )
+from roadgeo.geometry.homography import Homography
+from roadgeo.geometry.mask import RoadMask
 
 MOTION = np.array([[0.99, 0.03, 12.0], [-0.03, 1.01, -80.0], [1e-5, -2e-5, 1.0]])
 CORNERS = np.array([[0.0, 0.0], [320, 0], [320, 240], [0, 240]])

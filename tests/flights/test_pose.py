@@ -6,9 +6,9 @@ import numpy as np
 import pytest
 
 from roadgeo.evaluation.flights import FlightOptions, _draw_views, _motion
+from roadgeo.flights.pose import _Local, _skews, predict, start
 from roadgeo.geometry.frame import Frame
 from roadgeo.geometry.pinhole import make_view
-from roadgeo.running.flights.pose import _Local, _skews, predict, start
 
 
 class Anywhere:

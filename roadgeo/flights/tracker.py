@@ -17,6 +17,9 @@ import numpy as np
 
 from roadgeo._arrays import FloatArray
 from roadgeo.errors import MaskError
+from roadgeo.flights.candidates import CandidateOptions, Candidates, Look
+from roadgeo.flights.mosaic import Mosaic, MosaicOptions, lay_together
+from roadgeo.flights.pose import FilterOptions, Pose, correct, predict, start
 from roadgeo.geometry.camera import CameraOptions
 from roadgeo.geometry.frame import Frame
 from roadgeo.geometry.homography import Homography
@@ -28,9 +31,6 @@ from roadgeo.matching.options import LocateOptions
 from roadgeo.matching.scene import Query, Scene, read_query, trace_query
 from roadgeo.reference.reference import Reference
 from roadgeo.roads.vectorization import road_width
-from roadgeo.running.flights.candidates import CandidateOptions, Candidates, Look
-from roadgeo.running.flights.mosaic import Mosaic, MosaicOptions, lay_together
-from roadgeo.running.flights.pose import FilterOptions, Pose, correct, predict, start
 
 __all__ = ["Fix", "FlightFrame", "FrameStatus", "TrackOptions", "Tracked", "Tracker", "follow", "track"]
 

@@ -13,11 +13,11 @@ import cv2
 import numpy as np
 
 from roadgeo._arrays import AnyArray, FloatArray
+from roadgeo.flights.rows import Row
+from roadgeo.flights.tracker import Tracked
 from roadgeo.geometry.mask import RoadMask
 from roadgeo.outputs.report.page import footer, render_page, section
 from roadgeo.outputs.report.svg import draw_lines, join_segments, thin_lines
-from roadgeo.running.flights.rows import Row
-from roadgeo.running.flights.tracker import Tracked
 
 __all__ = ["Thumbnails", "render_flight"]
 

@@ -6,13 +6,13 @@ import pytest
 
 from roadgeo.evaluation.flights import FlightOptions, simulate_flight
 from roadgeo.evaluation.landscape import Landscape
+from roadgeo.flights.motion import TracedMask, overlay
+from roadgeo.flights.strips import Link, adjust, find_nets, place_strips
+from roadgeo.flights.tracker import FlightFrame
 from roadgeo.geometry.frame import Frame
 from roadgeo.geometry.homography import Homography
 from roadgeo.geometry.mask import RoadMask
 from roadgeo.reference.reference import Reference
-from roadgeo.running.flights.motion import TracedMask, overlay
-from roadgeo.running.flights.strips import Link, adjust, find_nets, place_strips
-from roadgeo.running.flights.tracker import FlightFrame
 
 STRIP = FlightOptions(
     size_px=(500, 500), n_frames=(6, 6), gsd_m=(1.0, 1.2), tilt_deg=(0.0, 3.0), turn_deg=1.0, intersections=(4, 90)

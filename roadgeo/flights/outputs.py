@@ -14,8 +14,8 @@ from typing import Any
 import numpy as np
 
 from roadgeo import __version__
+from roadgeo.flights.rows import Row
 from roadgeo.outputs.names import table_cell
-from roadgeo.running.flights.rows import Row
 from roadgeo.storage.files import write_text
 from roadgeo.storage.geopackage import Layer, write_layers
 from roadgeo.storage.qml import draw_fill, draw_line, draw_marker

@@ -18,9 +18,9 @@ import numpy as np
 
 from roadgeo._arrays import AnyArray, FloatArray
 from roadgeo.errors import MaskError, PhotographError
+from roadgeo.flights.motion import Odometer, between_images
+from roadgeo.flights.tracker import FlightFrame
 from roadgeo.geometry.mask import RoadMask
-from roadgeo.running.flights.motion import Odometer, between_images
-from roadgeo.running.flights.tracker import FlightFrame
 from roadgeo.running.tasks import find_masks
 from roadgeo.sources.masks import read_mask
 from roadgeo.storage.atomic import writing
