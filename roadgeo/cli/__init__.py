@@ -1,6 +1,7 @@
 """The command line: options, one call, printing. Each command is a module, imported only when it is used.
 
-Exit status: 0 all well (and every mask located), 3 at least one mask not located, 1 error, 2 usage, 130 interrupted.
+Exit status: 0 all well (and every mask located), 3 at least one mask not located, 1 error, 2 usage, 130 interrupted,
+143 ended by SIGTERM.
 """
 
 from __future__ import annotations
@@ -12,6 +13,8 @@ import os
 import signal
 import sys
 from collections.abc import Sequence
+from types import FrameType
+from typing import Any
 
 import click
 
@@ -20,9 +23,9 @@ from roadgeo.cli.printing import echo
 from roadgeo.errors import RoadgeoError, name_extra
 from roadgeo.storage.gdal import forget_missing_proj_data, skip_drivers
 
-__all__ = ["COMMANDS", "ERROR", "INTERRUPTED", "NOT_LOCATED", "cli", "main"]
+__all__ = ["COMMANDS", "ERROR", "INTERRUPTED", "NOT_LOCATED", "Group", "cli", "main"]
 
-ERROR, USAGE, NOT_LOCATED, INTERRUPTED = 1, 2, 3, 130
+ERROR, USAGE, NOT_LOCATED, INTERRUPTED, TERMINATED = 1, 2, 3, 130, 128 + signal.SIGTERM
 
 #: Objects after which Python looks for cycles that nobody holds. A command makes few; to look for them after every 700
 #: objects, as is usual, takes some per cent of the time of a short one.
@@ -52,7 +55,18 @@ _UNLISTED = {
 }
 
 
-class LazyGroup(click.Group):
+class Group(click.Group):
+    """A group that prints its help where no command is given."""
+
+    def parse_args(self, ctx: click.Context, args: list[str]) -> list[str]:
+        """Read its own options."""
+        if not args and not ctx.resilient_parsing:
+            echo(ctx.get_help())
+            ctx.exit(USAGE)
+        return super().parse_args(ctx, args)
+
+
+class LazyGroup(Group):
     """A group that imports a command's module when the command runs or its own help is asked for."""
 
     def list_commands(self, ctx: click.Context) -> list[str]:  # noqa: ARG002 (click's signature)
@@ -102,8 +116,8 @@ def _list_plugins(ctx: click.Context, _: click.Parameter, asked: bool) -> None:
 
 @click.group(
     cls=LazyGroup,
-    invoke_without_command=True,
-    context_settings={"help_option_names": ["-h", "--help"], "max_content_width": 100},
+    # A command that has more to show than its help has an option --help-all of its own.
+    context_settings={"help_option_names": ["-h", "--help", "--help-all"], "max_content_width": 100},
     epilog="Exit status: 0 every image located, 3 at least one not located, 1 error, 2 usage.",
 )
 @click.version_option(__version__, prog_name="roadgeo")
@@ -129,9 +143,16 @@ def cli(ctx: click.Context) -> None:
     """
     if os.environ.get("NO_COLOR"):
         ctx.color = False
-    if ctx.invoked_subcommand is None:
-        echo(ctx.get_help())
-        ctx.exit(USAGE)
+
+
+#: Signals of a supervisor, of which the process is about to end.
+_signals: list[int] = []
+
+
+def _terminate(number: int, frame: FrameType | None) -> Any:
+    """Clean up as at Ctrl-C."""
+    _signals.append(number)
+    signal.default_int_handler(number, frame)
 
 
 def main(arguments: Sequence[str] | None = None) -> int:
@@ -139,7 +160,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
     if arguments is None:  # the process is ours
         gc.set_threshold(_COLLECT_AFTER)
         if signal.getsignal(signal.SIGTERM) == signal.SIG_DFL:
-            signal.signal(signal.SIGTERM, signal.default_int_handler)  # it cleans up as at Ctrl-C
+            signal.signal(signal.SIGTERM, _terminate)
     skip_drivers()
     forget_missing_proj_data()
     try:
@@ -154,7 +175,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
         return _fail(error.format_message(), error.exit_code)
     except (click.Abort, KeyboardInterrupt):
         echo("Interrupted.", err=True)
-        return INTERRUPTED
+        return TERMINATED if _signals else INTERRUPTED
     except RoadgeoError as error:
         return _fail(str(error), ERROR)
     except ModuleNotFoundError as error:

@@ -79,13 +79,6 @@ def index_command(
     Done once per place; `roadgeo locate` then searches it. The result is REF.gpkg, which opens styled in QGIS, and
     REF.index beside it. Without --out it goes into the library, which `roadgeo locate` searches by default.
 
-    With --update the reference named by --name (in the library) or --out is changed: on the ground asked for (the
-    place, the box, the polygon, or where the roads of --roads lie) its roads are replaced, or added where it has none.
-    The rest stays as it is, and so do the options it was built with.
-
-    With --shards a map of any size is built piece by piece from road files, in as much memory as one piece needs; the
-    result is a folder, REF.shards, and is searched as one map. The same command goes on with a build cut short.
-
     \b
     Examples:
       roadgeo index --osm "Boston, MA"
@@ -97,6 +90,14 @@ def index_command(
       roadgeo index --rebuild maps/streets.gpkg
       roadgeo index --roads germany.osm.pbf --shards auto --jobs 4
       roadgeo index --osm "Massachusetts" --coarse --name massachusetts-main
+    \f
+
+    With --update the reference named by --name (in the library) or --out is changed: on the ground asked for (the
+    place, the box, the polygon, or where the roads of --roads lie) its roads are replaced, or added where it has none.
+    The rest stays as it is, and so do the options it was built with.
+
+    With --shards a map of any size is built piece by piece from road files, in as much memory as one piece needs; the
+    result is a folder, REF.shards, and is searched as one map. The same command goes on with a build cut short.
     """
     from roadgeo.cli.compilation import compile_once
     from roadgeo.cli.folders import make_folder

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import inspect
 import os
 import re
 import textwrap
@@ -85,18 +86,27 @@ class _Option(click.Option):
 class Command(click.Command):
     """A command whose help lists its options in groups, and leaves what is rarely wanted to --help-all.
 
-    `more` is text that --help-all shows besides.
+    --help-all shows besides what stands in the help below a form feed, and `more`, below the options.
     """
 
     def __init__(self, *args: Any, more: str | Callable[[], str] = "", **settings: Any) -> None:
         super().__init__(*args, **settings)
         self.more = more
-        self.is_long = bool(more) or any(getattr(one, "rare", False) for one in self.params)
+        self.is_long = (
+            bool(more) or "\f" in (self.help or "") or any(getattr(one, "rare", False) for one in self.params)
+        )
         if self.is_long:
             told = "Show this message with all options."
             self.params.append(
                 _Option(["--help-all"], is_flag=True, is_eager=True, expose_value=False, callback=_show_all, help=told)
             )
+
+    def format_help_text(self, ctx: click.Context, formatter: click.HelpFormatter) -> None:
+        """Write what the command does."""
+        first, _, rest = inspect.cleandoc(self.help or "").partition("\f")
+        formatter.write_paragraph()
+        with formatter.indentation():
+            formatter.write_text(f"{first.strip()}\n\n{rest.strip()}" if ctx.meta.get(_WHOLE, False) else first)
 
     def format_options(self, ctx: click.Context, formatter: click.HelpFormatter) -> None:
         """List the options in groups; of those left out the names alone."""

@@ -4,12 +4,13 @@ from __future__ import annotations
 
 import click
 
+from roadgeo.cli import Group
 from roadgeo.cli.printing import echo
 
 __all__ = ["qgis_command"]
 
 
-@click.group("qgis", short_help="Install the QGIS plugin.")
+@click.group("qgis", cls=Group, short_help="Install the QGIS plugin.")
 def qgis_command() -> None:
     """Put roadgeo into QGIS: a plugin with a menu, that adds its commands to the Processing toolbox.
 

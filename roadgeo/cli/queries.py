@@ -44,15 +44,17 @@ query_options = each((
         "Where the image's up points, degrees from north.", type=ANGLES, default="0:360", show_default=True),
     row("--size", "PX", OTHERS,
         "Side of a mask, pixels.", type=click.IntRange(64, 20_000), default=1500, show_default=True),
-    row("--window", "METRES", OTHERS, "Side on the ground, in place of --size.", type=click.FloatRange(10)),
+    row("--window", "METRES", OTHERS, "Side on the ground, in place of --size.", type=click.FloatRange(10), rare=True),
     row("--focal", "PX", OTHERS, "Focal length in pixels.  [default: the side]", type=click.FloatRange(1)),
     row("--intersections", "LO:HI", OTHERS,
-        "How many a mask must show.", type=RANGE, default="30:1000000", show_default=True),
-    row("--road-width", "LO:HI", OTHERS, "Of a street, metres.", type=RANGE, default="8:11", show_default=True),
+        "How many a mask must show.", type=RANGE, default="30:1000000", show_default=True, rare=True),
+    row("--road-width", "LO:HI", OTHERS,
+        "Of a street, metres.", type=RANGE, default="8:11", show_default=True, rare=True),
     row("--mirrored", "N", OTHERS,
         "Draw so many masks turned over besides, which have no place and must be refused.",
-        type=click.IntRange(0), default=0),
-    row("--seed", "N", OTHERS, "Other seeds draw other masks.", type=click.IntRange(0), default=0, show_default=True),
+        type=click.IntRange(0), default=0, rare=True),
+    row("--seed", "N", OTHERS,
+        "Other seeds draw other masks.", type=click.IntRange(0), default=0, show_default=True, rare=True),
 ))  # fmt: skip
 
 

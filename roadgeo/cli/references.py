@@ -8,7 +8,7 @@ from typing import Any
 import click
 
 from roadgeo._text import visible
-from roadgeo.cli import ERROR
+from roadgeo.cli import ERROR, Group
 from roadgeo.cli.command_line import made_by
 from roadgeo.cli.printing import echo
 
@@ -19,7 +19,7 @@ __all__ = ["check_command", "info_command", "list_command", "list_plugins", "ref
 SCHEMA = "roadgeo.reference-info/1"
 
 
-@click.group("reference", short_help="List, describe, test and remove references.")
+@click.group("reference", cls=Group, short_help="List, describe, test and remove references.")
 def reference_command() -> None:
     """List, describe, test and remove references: the maps that `roadgeo index` builds and `roadgeo locate` searches.
 

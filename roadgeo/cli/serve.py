@@ -38,19 +38,9 @@ searches again. It opens in your browser; nothing leaves this machine.
   GET  /jobs/ID  /jobs/ID/events         of a request with the header Prefer: respond-async
   GET  / /api /conformance /processes /processes/locate /jobs /health
 
-\b
-What is known goes into the URL or the form, or beside the image in JSON, in the words of `roadgeo locate`:
-{hints}
-
 It listens on this machine only. With --host others may ask, and then all must show a token:
 `Authorization: Bearer TOKEN`, which the environment variable ROADGEO_TOKEN or --token-file gives. There is no
 encryption; put a proxy before it where the network is not your own.
-
-Requests wait for a free process, so many as --waiting says; whoever comes then hears 503 and when to come again. The
-size of images, the time to send and to search are bounded too. Ctrl-C ends it.
-
-With --mavlink each place that is found goes to an autopilot, too: that of the camera where the request gives its focal
-length, otherwise the frame's middle (it needs pymavlink).
 
 \b
 Examples:
@@ -61,6 +51,17 @@ Examples:
   roadgeo serve --mavlink udpout:127.0.0.1:14550
 
 Exit status: 0 ended, 1 error, 2 usage.
+\f
+
+\b
+What is known goes into the URL or the form, or beside the image in JSON, in the words of `roadgeo locate`:
+{hints}
+
+Requests wait for a free process, so many as --waiting says; whoever comes then hears 503 and when to come again. The
+size of images, the time to send and to search are bounded too. Ctrl-C ends it.
+
+With --mavlink each place that is found goes to an autopilot, too: that of the camera where the request gives its focal
+length, otherwise the frame's middle (it needs pymavlink).
 """
 
 

@@ -52,13 +52,6 @@ there on each is followed from the one before, in some hundredths of a second. W
   predicted  by its motion alone: hardly a road agrees here
   lost       not known; the search begins anew
 
-How a frame moved is told by the photographs, or roughly by the masks alone; best is --motion FILE, what your odometry
-knows: a CSV with the columns frame (the file's name) and h00 ... h22, row by row, the homography that takes a pixel
-(column, row) of the frame to the pixel of the frame before that shows the same ground. The first frame needs none.
-
-Frames of an archive are in no order: with --unordered each is laid on each other, by what the pictures show or by the
-roads of the masks; what overlaps is solved together, located together, and each frame is placed.
-
 \b
 What is written to --out-dir:
   flight.gpkg     footprints, centres and the track, styled for QGIS
@@ -66,11 +59,6 @@ What is written to --out-dir:
   flight.gpx      the track, for GPS programs
   flight.csv      one row a frame, columns named as in MISB ST 0601
   flight.html     the flight on the map, to play in a browser; needs no network
-
-With --focal the place of the camera is told, too: not that of the ground in the frame's middle. That is what an
-autopilot needs; --mavlink sends it as soon as it is known, for PX4 (GLOBAL_POSITION_SENSOR) and ArduPilot
-(EXTERNAL_POSITION_ESTIMATE), with its standard deviation and delay; without --focal, the frame's middle. It needs
-pymavlink.
 
 \b
 Examples:
@@ -80,7 +68,20 @@ Examples:
   roadgeo track frames/ --focal 640 --mavlink udpout:127.0.0.1:14550
   roadgeo track --unordered strip_1951/*.tif --out-dir found
 
-Exit status: 0 every frame has a place, 3 at least one is lost, 1 error, 2 usage.
+Exit status: 0 every frame placed, 3 at least one lost, 1 error, 2 usage.
+\f
+
+How a frame moved is told by the photographs, or roughly by the masks alone; best is --motion FILE, what your odometry
+knows: a CSV with the columns frame (the file's name) and h00 ... h22, row by row, the homography that takes a pixel
+(column, row) of the frame to the pixel of the frame before that shows the same ground. The first frame needs none.
+
+Frames of an archive are in no order: with --unordered each is laid on each other, by what the pictures show or by the
+roads of the masks; what overlaps is solved together, located together, and each frame is placed.
+
+With --focal the place of the camera is told, too: not that of the ground in the frame's middle. That is what an
+autopilot needs; --mavlink sends it as soon as it is known, for PX4 (GLOBAL_POSITION_SENSOR) and ArduPilot
+(EXTERNAL_POSITION_ESTIMATE), with its standard deviation and delay; without --focal, the frame's middle. It needs
+pymavlink.
 """
 
 
@@ -100,9 +101,9 @@ _OPTIONS = (
     take("references", "near", "within", "gsd", "max_tilt"),
     take("focal", metavar="PIXELS", help="Focal length in pixels: places are then the camera's."),
     out_dir_option(),
-    row("--name", None, RESULTS, "What the results are called. Default: flight.", default="flight"),
+    row("--name", None, RESULTS, "What the results are called. Default: flight.", default="flight", rare=True),
     take("json", group=RESULTS, help="Print one JSON object per frame and line, as it is known."),
-    take("mavlink", group=RESULTS),
+    take("mavlink", group=RESULTS, rare=True),
     row("--motion", "FILE", FLIGHT, "How each frame moved: see above.", type=click.Path()),
     row("--motion-sigma", "PX", FLIGHT,
         "How far off the motion may put a corner. Default: 1.5, of masks 12.",
@@ -110,13 +111,15 @@ _OPTIONS = (
     row("--unordered", "", FLIGHT, "The frames are in no order; all are solved together."),
     row("--every", "SECONDS", FLIGHT,
         "Take a frame of a video every so often. Default: 1.", type=click.FloatRange(min=0), default=1.0),
-    row("--interval", "SECONDS", FLIGHT, "Time between images. Default: 1.", type=click.FloatRange(min=0), default=1.0),
+    row("--interval", "SECONDS", FLIGHT,
+        "Time between images. Default: 1.", type=click.FloatRange(min=0), default=1.0, rare=True),
     row("--start", "TIME", FLIGHT, "When the first frame was taken.", type=TIME),
     take("segment", "class_name", "mask_values"),
     take("segmenters", multiple=False, default="", metavar="MODEL.onnx", type=click.Path(),
         help="Who finds the roads."),
-    take("time_limit", default=10.0, help="Stop each search then. Default: 10."),
-    take("recursive", "verbosity"),
+    take("time_limit", group=FLIGHT, default=10.0, help="Stop each search then. Default: 10."),
+    take("recursive", group=FLIGHT, rare=True),
+    take("verbosity"),
 )  # fmt: skip
 
 

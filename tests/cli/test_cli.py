@@ -27,9 +27,13 @@ def test_every_command_has_the_name_of_the_table_and_examples(name: str) -> None
     assert f"roadgeo {name}" in (command.help or "")
 
 
-def test_no_command_shows_help(capfd: pytest.CaptureFixture[str]) -> None:
-    assert main([]) == 2
-    assert "Commands:" in capfd.readouterr().out
+@pytest.mark.parametrize("group", [(), ("reference",), ("qgis",)])
+def test_no_command_shows_help(group: tuple[str, ...], capfd: pytest.CaptureFixture[str]) -> None:
+    assert main(group) == 2
+    out, err = capfd.readouterr()
+    assert out.startswith(" ".join(("Usage: roadgeo", *group)))
+    assert "\nCommands:\n" in out
+    assert err == ""
 
 
 @pytest.mark.parametrize(

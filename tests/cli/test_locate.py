@@ -163,7 +163,7 @@ def test_a_batch_that_is_told_to_end_cleans_up(porto: Path) -> None:
             time.sleep(0.001)
         batch.terminate()
         _, said = batch.communicate(timeout=60)
-        assert (batch.returncode, said.strip()) == (130, "Interrupted.")
+        assert (batch.returncode, said.strip()) == (128 + signal.SIGTERM, "Interrupted.")
         assert is_gone(batch.pid)
     assert {path.name for path in Path("out").iterdir() if path.name.startswith((".", "tmp"))} == set()
 

@@ -13,7 +13,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 import roadgeo
-from roadgeo.cli import COMMANDS, cli
+from roadgeo.cli import COMMANDS, cli, main
 from roadgeo.cli.options import ASPECT, BOX, GSD, NEAR, RANGE, Plugin, Read
 from roadgeo.matching.hints import HINTS, apply_hints
 from roadgeo.matching.options import LocateOptions
@@ -134,8 +134,20 @@ def test_options_of_plugins_dialogs_exist_on_the_command_line() -> None:
     assert said <= known | {"--help", "--version", "--progress-bar"}  # the last one of pip
 
 
-def test_the_help_of_locate_fits_on_a_page() -> None:
-    assert shown("locate").count("\n") < 60
+EVERY = [*COMMANDS, *(f"{group} {name}" for group in ("reference", "qgis") for name in command(group).commands)]
+
+
+@pytest.mark.parametrize("name", EVERY)
+def test_help_fits_on_a_page_and_every_command_shows_all_of_it(name: str, capfd: pytest.CaptureFixture[str]) -> None:
+    lines = {}
+    for option in ("--help", "--help-all"):
+        assert main([*name.split(), option]) == 0
+        lines[option] = capfd.readouterr().out.splitlines()
+    assert len(lines["--help"]) <= 60
+    assert len(lines["--help-all"]) >= len(lines["--help"])
+
+
+def test_what_is_rarely_wanted_is_explained_by_all_of_the_help() -> None:
     assert "--divide-map" in shown("locate")  # its name
     assert "share of the map's shards" not in " ".join(shown("locate").split())
     whole = " ".join(shown("locate", "--help-all").split())
