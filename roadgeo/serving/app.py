@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import asyncio
+import errno
 import json
 import logging
 import shutil
@@ -39,7 +40,7 @@ from roadgeo.serving.requests import (
     read_query_string,
 )
 from roadgeo.serving.tiles import MAX_ZOOM, Tiles
-from roadgeo.serving.view import OFFERED, PICTURE, SEEN, VIEW, WARPED, safe_stem
+from roadgeo.serving.view import OFFERED, OWN, PICTURE, SEEN, SENT, VIEW, WARPED, safe_stem
 from roadgeo.serving.workers import Answer, Asked, Place, Workers
 
 __all__ = ["Service"]
@@ -106,7 +107,7 @@ class Service:
             Route(f"{job}/again", self._again, methods=["POST"]),
             Route(f"{job}/files", self._files),
             Route(f"{job}/files/{{name}}", self._file),
-            *(Route(f"{job}/{name}", self._shown) for name in (PICTURE, WARPED, VIEW)),
+            Route(f"{job}/{{name}}", self._shown),
         ]
 
     # --- what is asked ------------------------------------------------------------------------------------------------
@@ -146,7 +147,7 @@ class Service:
         except OSError as error:
             if isinstance(error, TimeoutError | ConnectionError):
                 raise
-            raise Refused(503, f"the image cannot be kept: {error.strerror or error}; come again", 1) from error
+            raise self._make_room(error) from error
         finally:
             if not is_kept:
                 place.give_back()
@@ -156,7 +157,13 @@ class Service:
         try:
             return self._jobs.make_folder()
         except OSError as error:
-            raise Refused(503, f"the image cannot be kept: {error.strerror or error}; come again", 1) from error
+            raise self._make_room(error) from error
+
+    def _make_room(self, error: OSError) -> Refused:
+        """Let the oldest answer go where the disk is full; return what its sender is asked for: to come again."""
+        if error.errno in (errno.ENOSPC, errno.EDQUOT):
+            self._jobs.make_room()
+        return Refused(503, f"the image cannot be kept: {error.strerror or error}; come again", 1)
 
     async def _take_image(self, request: Request, folder: Path) -> Job:
         """Take an image that is the body; hints stand in the URL."""
@@ -232,7 +239,10 @@ class Service:
 
         async def work() -> None:
             try:
-                job.end(await self._ask(job, came, keeps=True))
+                answer = await self._ask(job, came, keeps=True)
+                if answer.lacks_view:
+                    self._jobs.make_room()
+                job.end(answer)
             except Exception:
                 _LOG.exception("a fault of the server at a job")
                 job.end(Answer(500, {"detail": "a fault of roadgeo: its log tells which"}))
@@ -283,21 +293,20 @@ class Service:
         hints = read_query_string(request.url.query)
         place, folder = self._workers.take_place(), self._make_folder()
         try:
-            for name in (old.image, SEEN):
-                await asyncio.to_thread(_link, old.folder / name, folder / name)
+            await asyncio.to_thread(_copy, old, folder)
         except OSError as error:
             place.give_back()
             shutil.rmtree(folder, ignore_errors=True)
-            raise Refused(503, f"the image cannot be kept: {error.strerror or error}; come again", 1) from error
+            raise self._make_room(error) from error
         job = Job(folder, old.image, old.name, hints)
         self._start(job, place, came)
         return _created(job)
 
     async def _shown(self, request: Request) -> Response:
         """Return the page's view of an answer."""
-        job, name = self._find(request), request.url.path.rpartition("/")[2]
-        path = job.folder / name
-        if job.status != "successful" or not path.is_file():
+        job, name = self._find(request), request.path_params["name"]
+        path = job.folder / OWN / name
+        if name not in (PICTURE, WARPED, VIEW) or job.status != "successful" or not path.is_file():
             raise Refused(404, f"the job is {job.status}: there is nothing to show")
         return FileResponse(path, headers=_FOR_EVER)
 
@@ -324,7 +333,7 @@ class Service:
             answer = await asyncio.get_running_loop().run_in_executor(self._threads, ask)
         if answer.status >= 400:
             return _said(answer, dict)
-        path = job.folder / answer.document["file"]
+        path = Path(answer.document["file"])
         return FileResponse(path, media_type="application/octet-stream", filename=path.name)
 
     # --- the page -----------------------------------------------------------------------------------------------------
@@ -394,14 +403,13 @@ def _document_routes(documents: dict[str, dict[str, Any]]) -> list[Route]:
     return [route(path) for path in documents if path != "/"]
 
 
-def _link(old: Path, new: Path) -> None:
-    """Have a file lie in another folder, too, if it is there."""
-    if not old.is_file():
-        return
-    try:
-        new.hardlink_to(old)
-    except OSError:  # of file systems that know none
-        shutil.copyfile(old, new)
+def _copy(old: Job, folder: Path) -> None:
+    """Copy an image, and what was seen in it, into another folder."""
+    shutil.copyfile(old.path, folder / SENT / old.image)
+    seen = old.folder / OWN / SEEN
+    if seen.is_file():
+        (folder / OWN).mkdir()
+        shutil.copyfile(seen, folder / OWN / SEEN)
 
 
 async def _keep_body(request: Request, folder: Path) -> Path:
@@ -417,7 +425,7 @@ def _job_of(folder: Path, part: Path, name: str, hints: dict[str, Any]) -> Job:
     """Return the job of an image that has come, under a name with its ending."""
     with part.open("rb") as file:
         ending = ending_of(file.read(16))
-    image = part.rename(folder / f"{safe_stem(name)}{ending}")
+    image = part.rename(folder / SENT / f"{safe_stem(name)}{ending}")
     return Job(folder, image.name, Path(name.replace("\\", "/")).name[:200], hints)
 
 
@@ -442,4 +450,4 @@ async def _no_route(request: Request, error: Exception) -> Response:
         return response
     if status != 404:
         return refusal(Refused(status, str(getattr(error, "detail", error))[:200]))
-    return refusal(Refused(404, f"there is nothing at {request.url.path[:80]}; begin at /"))
+    return refusal(Refused(404, f"there is nothing at {request.scope['path'][:80]}; begin at /"))

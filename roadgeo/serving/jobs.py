@@ -14,6 +14,7 @@ from pathlib import Path
 from typing import Any, Literal
 
 from roadgeo.serving.options import ServeOptions
+from roadgeo.serving.view import SENT
 from roadgeo.serving.workers import Answer
 
 __all__ = ["Job", "Jobs", "Status"]
@@ -32,7 +33,7 @@ class Job:
     Attributes
     ----------
     folder : Path
-        Holds the image, and later the files of its view.
+        Holds the image in `sent`, and all of our own in folders beside that (see `view`).
     image : str
         The name of its file.
     name : str
@@ -59,7 +60,7 @@ class Job:
     @property
     def path(self) -> Path:
         """The file of the image."""
-        return self.folder / self.image
+        return self.folder / SENT / self.image
 
     @property
     def is_over(self) -> bool:
@@ -131,9 +132,10 @@ class Jobs:
         self._all: dict[str, Job] = {}
 
     def make_folder(self) -> Path:
-        """Make the folder of a job that is to come."""
+        """Make the folder of a job that is to come, and in it one for the image."""
         folder = self._folder / secrets.token_hex(16)
         folder.mkdir(mode=0o700)
+        (folder / SENT).mkdir()
         return folder
 
     def add(self, job: Job) -> None:
@@ -151,9 +153,21 @@ class Jobs:
         self._all.pop(job.id, None)
         shutil.rmtree(job.folder, ignore_errors=True)
 
+    def make_room(self) -> None:
+        """Forget the oldest that is over: the disk is full."""
+        oldest = next((job for job in self._all.values() if job.is_over), None)
+        if oldest is not None:
+            self.remove(oldest)
+
     def let_go(self) -> None:
-        """Forget the oldest that are over, as far as there are too many or they take too much room."""
+        """Forget the oldest that are over, as far as there are too many or they take too much room.
+
+        Nothing is kept on disk of jobs that failed.
+        """
         over = [job for job in self._all.values() if job.is_over]
+        for job in over:
+            if job.status == "failed":
+                shutil.rmtree(job.folder, ignore_errors=True)
         sizes = [_size(job.folder) for job in over]
         while over and (len(over) > self._options.kept_jobs or (sum(sizes) > self._options.kept_bytes and over[1:])):
             self.remove(over.pop(0))
@@ -162,5 +176,5 @@ class Jobs:
 
 def _size(folder: Path) -> int:
     with suppress(OSError):
-        return sum(path.stat().st_size for path in folder.iterdir())
+        return sum(path.stat().st_size for path in folder.rglob("*"))
     return 0

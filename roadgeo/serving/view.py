@@ -30,16 +30,21 @@ from roadgeo.reference.reference import AnyReference
 from roadgeo.running.looks import Sighting
 from roadgeo.storage.files import replacing
 
-__all__ = ["OFFERED", "PICTURE", "SEEN", "VIEW", "WARPED", "safe_stem", "write_output", "write_view"]
+__all__ = ["OFFERED", "OWN", "PICTURE", "SEEN", "SENT", "VIEW", "WARPED", "safe_stem", "write_output", "write_view"]
 
-#: Names of files beside an image that was located: the picture reduced, the same on the map, all else that is shown,
+#: Folders of a job: the image as it was sent, files of our own, and outputs that were asked for. Apart from each other,
+#: for senders choose names.
+SENT, OWN, _OUTPUTS = "sent", "own", "outputs"
+#: Names of files of our own: the picture reduced, the same on the map, all else that is shown,
 #: and of a photograph the probability of road.
 PICTURE, WARPED, VIEW, SEEN = "picture.jpg", "warped.webp", "view.json", "seen.tif"
 _KEPT = "kept.pickle.gz"
 
 #: Outputs that an answer offers. A virtual raster would lead to a file that its reader has not.
 OFFERED: dict[str, Output] = {
-    one.name: one for one in (FOOTPRINT, GEOPACKAGE, JSON, REPORT, OVERLAY, *ALSO.values()) if one is not VRT
+    output.name: output
+    for output in (FOOTPRINT, GEOPACKAGE, JSON, REPORT, OVERLAY, *ALSO.values())
+    if output is not VRT
 }
 
 #: Longer side of the picture, and on the map, pixels; their quality; side of the CRS in which web maps draw, metres.
@@ -55,8 +60,9 @@ def safe_stem(name: str) -> str:
 
 
 def write_view(path: Path, sighting: Sighting, references: Sequence[AnyReference]) -> None:
-    """Write the page's view of an answer, beside the image at `path`, and keep the inputs of its files."""
-    location, folder = sighting.location, path.parent
+    """Write the page's view of an answer for the image at `path`, and keep the inputs of its files."""
+    location, folder = sighting.location, path.parent.with_name(OWN)
+    folder.mkdir(exist_ok=True)
     indexes = [one.index_of(location) for one in references]
     photo = path if sighting.of_photograph else None
     try:
@@ -86,9 +92,10 @@ def write_output(path: Path, name: str, references: Sequence[AnyReference]) -> P
         It cannot be made.
     """
     location: Location
-    with gzip.open(path.parent / _KEPT, "rb") as file:  # our own, in a folder that is ours alone
+    with gzip.open(path.parent.with_name(OWN) / _KEPT, "rb") as file:  # our own, in a folder that is ours alone
         location, mask, of_photograph = pickle.load(file)  # noqa: S301
-    output, paths = OFFERED[name], output_paths(path.parent, path.stem)
+    folder = path.parent.with_name(_OUTPUTS)
+    output, paths = OFFERED[name], output_paths(folder, path.stem)
     if output.needs_place and not location.located:
         raise OutputError("there is no place on the map to show")
     if output.needs_camera and location.camera is None:
@@ -97,6 +104,7 @@ def write_output(path: Path, name: str, references: Sequence[AnyReference]) -> P
     subject = Subject(
         location, mask, paths, ImageOptions(max_pixels=64_000_000), path if of_photograph else None, indexes
     )
+    folder.mkdir(exist_ok=True)
     target = paths.of(output, path.name)
     with replacing(target, sync=False) as written:
         output.write(written, subject)

@@ -82,10 +82,17 @@ class Told:
 
 @dataclass(frozen=True)
 class Answer:
-    """An HTTP status, and the document or, from 400 on, the sentence that describes the error."""
+    """An HTTP status, and the document or, from 400 on, the sentence that describes the error.
+
+    Attributes
+    ----------
+    lacks_view : bool
+        Whether there was no room on the disk for the page's view of it.
+    """
 
     status: int
     document: dict[str, Any]
+    lacks_view: bool = False
 
 
 class CalledOff(Exception):  # noqa: N818 (a wish, not a fault)
@@ -358,7 +365,7 @@ def _locate(asked: Asked, references: Sequence[Any], say: Say, threads: int) -> 
 
     from roadgeo.matching.hints import apply_hints
     from roadgeo.running.queries import QueryOptions, locate_query
-    from roadgeo.serving.view import SEEN, write_view
+    from roadgeo.serving.view import OWN, SEEN, write_view
     from roadgeo.sources.exif import focal_in_pixels
     from roadgeo.workflows import LocateOptions, locate
 
@@ -379,7 +386,7 @@ def _locate(asked: Asked, references: Sequence[Any], say: Say, threads: int) -> 
     options = apply_hints(LocateOptions(), hints)
     # Which roads a photograph shows does not depend on where it lies: found once, they are not looked for again. How
     # large its pixels are would change what the network is shown.
-    seen = Path(asked.path).with_name(SEEN)
+    seen = Path(asked.path).parent.with_name(OWN) / SEEN
     is_known = seen.is_file() and not asked.hints.keys() & {"gsd_m", "focal_px"}
     say("reading the image")
     image, query = str(seen) if is_known else asked.path, QueryOptions(threads=threads)
@@ -387,16 +394,21 @@ def _locate(asked: Asked, references: Sequence[Any], say: Say, threads: int) -> 
     sighting = replace(sighting, of_photograph=sighting.of_photograph or is_known)
     location = replace(sighting.location, query=asked.name)
     location = replace(location, reason=_without(asked.path, _without(str(seen), location.reason)))
+    lacks_view = False
     if asked.keeps:
         say("drawing the answer")
-        write_view(Path(asked.path), replace(sighting, location=location), references)
-    return Answer(200, location.to_dict())
+        try:
+            write_view(Path(asked.path), replace(sighting, location=location), references)
+        except OSError:  # a full disk: the place was found all the same
+            _LOG.exception("an answer is kept without its view")
+            lacks_view = True
+    return Answer(200, location.to_dict(), lacks_view)
 
 
 def _write(asked: Asked, references: Sequence[Any]) -> Answer:
     from roadgeo.serving.view import write_output
 
-    return Answer(200, {"file": write_output(Path(asked.path), asked.wanted, references).name})
+    return Answer(200, {"file": str(write_output(Path(asked.path), asked.wanted, references))})
 
 
 def _size(path: str) -> tuple[int, int]:

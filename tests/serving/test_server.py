@@ -12,13 +12,22 @@ from contextlib import contextmanager, suppress
 from pathlib import Path
 from types import SimpleNamespace
 
+import cv2
+import numpy as np
 import pytest
 
+from roadgeo.geometry.mask import RoadMask
+from roadgeo.location import Location
+from roadgeo.reference.reference import Reference
+from roadgeo.running.looks import Sighting
 from roadgeo.serving.options import ServeOptions
 from roadgeo.serving.server import Server
-from roadgeo.serving.workers import Answer, Full, Place
+from roadgeo.serving.workers import Answer, Full, Place, _answer
+from roadgeo.sources.segmentation.probability import ProbabilityMap
 
 PNG = b"\x89PNG\r\n\x1a\n" + bytes(40)
+REFUSED = Location("photo.png", "not_located", "hardly a road", size=(60, 40))
+SEEN_ROADS = ProbabilityMap(np.full((40, 60), 9, np.uint8))
 FOUND = {"schema": "roadgeo.location/1", "status": "located", "center": {"lon": 1.0, "lat": 2.0}}
 
 
@@ -243,15 +252,47 @@ def test_a_fault_is_told_and_logged_and_the_next_is_served(caplog):
         assert ask(server, "GET", "/")[0].status == 200
 
 
-def test_a_disk_that_is_full_is_no_fault(monkeypatch):
-    def full(*_, **__):
-        raise OSError(errno.ENOSPC, os.strerror(errno.ENOSPC))
+def fill(monkeypatch, folders):
+    """Let the disk of the server be full as long as it holds so many folders."""
+    make = Path.mkdir
 
+    def mkdir(path, *args, **kwargs):
+        if path.parent.name.startswith("roadgeo-") and len(list(path.parent.iterdir())) >= folders:
+            raise OSError(errno.ENOSPC, os.strerror(errno.ENOSPC))
+        make(path, *args, **kwargs)
+
+    monkeypatch.setattr("pathlib.Path.mkdir", mkdir)
+
+
+def test_a_disk_that_is_full_is_no_fault(monkeypatch):
     with serving() as server:
-        monkeypatch.setattr("pathlib.Path.rename", full)
+        fill(monkeypatch, 0)
         answer, document = ask(server, "POST", "/locate", PNG)
         assert (answer.status, answer.headers["Retry-After"]) == (503, "1")
         assert "No space left" in document["detail"]
+
+
+def test_a_disk_that_is_full_keeps_nobody_out_for_ever(monkeypatch):
+    with serving() as server:
+        fill(monkeypatch, 2)
+        jobs = []
+        for _ in range(2):
+            jobs.append(ask(server, "POST", "/locate", PNG, LATER)[1]["jobID"])
+            wait_for(server, jobs[-1], "successful")
+        assert [ask(server, "POST", "/locate", PNG)[0].status for _ in range(2)] == [503, 200]
+        assert [ask(server, "GET", f"/jobs/{job}")[0].status for job in jobs] == [404, 200]
+
+
+def test_an_answer_without_its_view_is_kept_and_makes_room():
+    workers = Workers()
+    with serving(workers) as server:
+        old = ask(server, "POST", "/locate", PNG, LATER)[1]["jobID"]
+        wait_for(server, old, "successful")
+        workers.ask = lambda *_: Answer(200, FOUND, lacks_view=True)
+        job = ask(server, "POST", "/locate", PNG, LATER)[1]["jobID"]
+        wait_for(server, job, "successful")
+        assert ask(server, "GET", f"/jobs/{job}/results")[1] == {"location": FOUND}
+        assert ask(server, "GET", f"/jobs/{old}")[0].status == 404
 
 
 def test_who_asked_gets_the_place_though_it_cannot_be_told_to_others():
@@ -557,6 +598,7 @@ def test_a_job_that_fails_says_why():
         assert wait_for(server, job, "failed")["message"] == "the image: no road in it"
         answer, document = ask(server, "GET", f"/jobs/{job}/results")
         assert (answer.status, document["detail"]) == (422, "the image: no road in it")
+        assert not list(Path(server._folder.name).iterdir())  # of what failed nothing is kept on disk
 
 
 def test_a_job_is_called_off_and_forgotten():
@@ -672,6 +714,38 @@ def test_an_image_is_searched_again_with_other_hints():
         assert ask(server, "POST", f"/jobs/{job['jobID']}/again?colour=red", b"")[0].status == 400
 
 
+@pytest.mark.parametrize("name", ["picture.jpg", "seen.tif", "warped.webp", "view.json.png"])
+def test_an_image_stays_as_it_was_sent_whatever_it_is_called(name, town, monkeypatch):
+    def locate_query(path, *_, **__):
+        return Sighting(REFUSED, RoadMask(np.zeros((40, 60), bool)), probability=SEEN_ROADS, of_photograph=True)
+
+    monkeypatch.setattr("roadgeo.running.queries.locate_query", locate_query)
+    network, index = town
+    workers, references = Workers(), [Reference(index, network)]
+    workers.ask = lambda asked, *_: workers.asked.append(asked) or _answer(asked, references)
+    image = cv2.imencode(Path(name).suffix, np.full((40, 60, 3), 99, np.uint8))[1].tobytes()
+    body, headers = form((b'name="image"; filename="%b"' % name.encode(), image))
+    with serving(workers) as server:
+        first = ask(server, "POST", "/locate", body, {**headers, **LATER})[1]["jobID"]
+        wait_for(server, first, "successful")
+        again = ask(server, "POST", f"/jobs/{first}/again", b"")[1]["jobID"]
+        wait_for(server, again, "successful")
+        assert [Path(asked.path).read_bytes() == image for asked in workers.asked] == [True, True]
+        assert get(server, f"/jobs/{again}/picture.jpg")[1][:2] == b"\xff\xd8"
+
+
+def test_the_host_chooses_no_file():
+    workers = Workers()
+    with serving(workers) as server:
+        job = ask(server, "POST", "/locate", PNG, LATER)[1]["jobID"]
+        wait_for(server, job, "successful")
+        own = Path(workers.asked[0].path).parent.with_name("own")
+        own.mkdir()
+        (own / "kept.pickle.gz").write_bytes(b"ours")
+        for host in ("localhost/kept.pickle.gz?", "localhost/kept.pickle.gz#", "localhost"):
+            assert b"ours" not in get(server, f"/jobs/{job}/view.json", {"Host": host})[1]
+
+
 def test_only_files_that_are_offered_may_be_had():
     workers = Workers()
     with serving(workers) as server:
@@ -694,5 +768,5 @@ def test_names_of_senders_lead_nowhere(name):
     body, headers = form((b'name="image"; filename="%b"' % name.encode(), PNG))
     with serving(workers) as server:
         assert ask(server, "POST", "/locate", body, headers)[0].status == 200
-        assert Path(workers.asked[0].path).parent.parent == Path(server._folder.name)
+        assert Path(workers.asked[0].path).parents[2] == Path(server._folder.name)
         assert len(Path(workers.asked[0].path).name) < 60

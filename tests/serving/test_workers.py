@@ -36,7 +36,7 @@ from roadgeo.evaluation.simulation import SimulationOptions, ViewOptions, simula
 from roadgeo.flights.mavlink import has_pymavlink
 from roadgeo.geometry.mask import RoadMask
 from roadgeo.location import Location
-from roadgeo.reference.reference import Reference
+from roadgeo.reference.reference import Reference, open_reference
 from roadgeo.running.looks import Sighting
 from roadgeo.serving.workers import Asked, Workers, _answer, _folder_of, _remove_all, _serve
 from roadgeo.sources.segmentation.probability import ProbabilityMap
@@ -258,12 +258,24 @@ def test_the_roads_of_a_photograph_are_found_once(tmp_path, town, monkeypatch):
 
     monkeypatch.setattr("roadgeo.running.queries.locate_query", locate_query)
     network, index = town
-    cv2.imwrite(str(tmp_path / "photo.png"), np.full((40, 60, 3), 99, np.uint8))
+    (tmp_path / "sent").mkdir()
+    image = tmp_path / "sent" / "photo.png"
+    cv2.imwrite(str(image), np.full((40, 60, 3), 99, np.uint8))
     for hints in ({}, {"near": (0.0, 0.0, 9.0)}, {"gsd_m": (1.0, 2.0)}):
-        asked = Asked(str(tmp_path / "photo.png"), hints, 1.0, 10_000, keeps=True)
+        asked = Asked(str(image), hints, 1.0, 10_000, keeps=True)
         assert _answer(asked, [Reference(index, network)]).status == 200
-        assert json.loads((tmp_path / "view.json").read_text())["is_photograph"] is True
+        assert json.loads((tmp_path / "own" / "view.json").read_text())["is_photograph"] is True
     assert asked_of == ["photo.png", "seen.tif", "photo.png"]
+
+
+def test_a_place_is_told_though_there_is_no_room_for_its_view(place, monkeypatch):
+    def full(*_):
+        raise OSError(errno.ENOSPC, os.strerror(errno.ENOSPC))
+
+    monkeypatch.setattr("roadgeo.serving.view.write_view", full)
+    asked = Asked(str(place[0] / "mask.png"), {"gsd_m": (0.5, 2.0)}, 10.0, 64_000_000, keeps=True)
+    answer = _answer(asked, [open_reference(place[0] / "town.gpkg")])
+    assert (answer.status, answer.document["status"], answer.lacks_view) == (200, "located", True)
 
 
 def test_a_missing_reference_is_said(tmp_path):
