@@ -49,3 +49,15 @@ def town() -> "tuple[RoadNetwork, ReferenceIndex]":
 
     network = random_network(1, 4000.0)
     return network, build_index(network)
+
+
+@pytest.fixture(scope="session")
+def porto(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """The reference of the demonstration's roads, with its attribution; not to be changed."""
+    from roadgeo.evaluation.demo import ATTRIBUTION, ROADS
+    from roadgeo.sources.roads import read_roads
+    from roadgeo.workflows import build_reference
+
+    path = tmp_path_factory.mktemp("reference") / "porto.gpkg"
+    build_reference(read_roads(ROADS, attribution=ATTRIBUTION), "porto", path=path)
+    return path

@@ -10,20 +10,17 @@ import rasterio
 
 from roadgeo.cli import main
 from roadgeo.errors import MaskError
-from roadgeo.evaluation.demo import ATTRIBUTION, PHOTO, ROADS, demo_masks
+from roadgeo.evaluation.demo import PHOTO, demo_masks
 from roadgeo.running.applying import read_location
-from roadgeo.sources.roads import read_roads
-from roadgeo.workflows import build_reference
 
 DRONE = next(mask.path for mask in demo_masks() if mask.path.stem == "drone")
 
 
 @pytest.fixture(scope="module")
-def located(tmp_path_factory: pytest.TempPathFactory) -> Path:
+def located(porto: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
     """The location of the demonstration's drone mask, with its photograph drawn by `locate` itself."""
     folder = tmp_path_factory.mktemp("located")
-    build_reference(read_roads(ROADS, attribution=ATTRIBUTION), "porto", path=folder / "porto.gpkg")
-    given = ["-r", str(folder / "porto.gpkg"), "--image", str(PHOTO), "--effort", "quick", "-q", "-o", str(folder)]
+    given = ["-r", str(porto), "--image", str(PHOTO), "--effort", "quick", "-q", "-o", str(folder)]
     assert main(["locate", str(DRONE), *given]) == 0
     return folder
 

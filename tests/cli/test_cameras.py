@@ -7,28 +7,25 @@ import numpy as np
 import pytest
 
 from roadgeo.cli import main
-from roadgeo.evaluation.demo import ATTRIBUTION, ROADS, demo_masks
+from roadgeo.evaluation.demo import demo_masks
 from roadgeo.geometry.homography import Homography
 from roadgeo.geometry.pose import turned
 from roadgeo.geometry.projection import LocalPlane, grid_north
-from roadgeo.sources.roads import read_roads
-from roadgeo.workflows import build_reference
 
 DRONE = next(mask for mask in demo_masks() if mask.path.stem == "drone")
 
 
 @pytest.fixture(scope="module")
-def folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
+def folder(porto: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
     """The demonstration's drone mask, located, over ground that lies 90 m high."""
     import rasterio
 
     folder = tmp_path_factory.mktemp("cameras")
-    build_reference(read_roads(ROADS, attribution=ATTRIBUTION), "porto", path=folder / "porto.gpkg")
     place = rasterio.Affine(0.001, 0, -8.7, 0, -0.001, 41.2)
     profile = {"driver": "GTiff", "width": 200, "height": 200, "count": 1, "dtype": "float32", "nodata": -9999}
     with rasterio.open(folder / "dem.tif", "w", crs="EPSG:4326", transform=place, **profile) as dem:
         dem.write(np.full((200, 200), 90.0, np.float32), 1)
-    given = ["-r", str(folder / "porto.gpkg"), "--dem", str(folder / "dem.tif"), "--effort", "quick", "-q"]
+    given = ["-r", str(porto), "--dem", str(folder / "dem.tif"), "--effort", "quick", "-q"]
     assert main(["locate", str(DRONE.path), "-o", str(folder), *given]) == 0
     return folder
 
@@ -64,7 +61,9 @@ def test_the_camera_and_the_homography_see_the_same(folder: Path) -> None:
         assert seen(camera, axes, position, ground) == pytest.approx(pixel, abs=1.5)
 
 
-def test_a_terrain_model_without_a_place_is_refused(folder: Path, capfd: pytest.CaptureFixture[str]) -> None:
-    given = ["-r", str(folder / "porto.gpkg"), "--dem", str(DRONE.path), "-o", str(folder / "out"), "-q"]
+def test_a_terrain_model_without_a_place_is_refused(
+    porto: Path, folder: Path, capfd: pytest.CaptureFixture[str]
+) -> None:
+    given = ["-r", str(porto), "--dem", str(DRONE.path), "-o", str(folder / "out"), "-q"]
     assert main(["locate", str(DRONE.path), *given]) == 1
     assert "expected a terrain model" in capfd.readouterr().err

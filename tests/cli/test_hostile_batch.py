@@ -11,15 +11,7 @@ import pytest
 import rasterio
 
 from roadgeo.cli import main
-from roadgeo.evaluation.demo import ROADS, demo_masks
-from roadgeo.workflows import build_reference
-
-
-@pytest.fixture(scope="module")
-def porto(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    path = tmp_path_factory.mktemp("reference") / "porto.gpkg"
-    build_reference(ROADS, "porto", path=path)
-    return path
+from roadgeo.evaluation.demo import demo_masks
 
 
 def write_hostile(folder: Path) -> int:

@@ -8,20 +8,11 @@ import jsonschema
 import pytest
 
 from roadgeo.cli import main
-from roadgeo.evaluation.demo import ATTRIBUTION, PHOTO, ROADS, demo_masks
+from roadgeo.evaluation.demo import PHOTO, demo_masks
 from roadgeo.location import Location, Reason
 from roadgeo.outputs.schemas import NAMES, read_schema
-from roadgeo.sources.roads import read_roads
-from roadgeo.workflows import build_reference
 
 DRONE = next(mask.path for mask in demo_masks() if mask.path.stem == "drone")
-
-
-@pytest.fixture(scope="module")
-def porto(tmp_path_factory: pytest.TempPathFactory) -> str:
-    path = tmp_path_factory.mktemp("reference") / "porto.gpkg"
-    build_reference(read_roads(ROADS, attribution=ATTRIBUTION), "porto", path=path)
-    return str(path)
 
 
 @pytest.fixture(autouse=True)
@@ -39,8 +30,8 @@ def test_a_schema_is_one(name: str) -> None:
         jsonschema.validate({"schema": "another"}, schema)
 
 
-def test_results_refusals_and_errors_have_the_same_keys(porto: str, capfd: pytest.CaptureFixture[str]) -> None:
-    asked = ["-r", porto, "--effort", "quick", "--segment", "never", "--json", "-q", "--near=-8.6,41.15,9000"]
+def test_results_refusals_and_errors_have_the_same_keys(porto: Path, capfd: pytest.CaptureFixture[str]) -> None:
+    asked = ["-r", str(porto), "--effort", "quick", "--segment", "never", "--json", "-q", "--near=-8.6,41.15,9000"]
     Path("empty.png").write_bytes(b"")
     assert main(["locate", str(DRONE), str(PHOTO), "empty.png", "--explain", *asked]) == 1
     found = [json.loads(line) for line in capfd.readouterr().out.splitlines()]
@@ -55,10 +46,10 @@ def test_results_refusals_and_errors_have_the_same_keys(porto: str, capfd: pytes
     assert explained["reference_digest"] == found[0]["reference_digest"]
 
 
-def test_the_command_of_a_result_makes_it_again(porto: str, capfd: pytest.CaptureFixture[str]) -> None:
+def test_the_command_of_a_result_makes_it_again(porto: Path, capfd: pytest.CaptureFixture[str]) -> None:
     folder = str(DRONE.parent)
-    given = ["-r", porto, "--effort", "quick", "--gsd", "0.5:2", "-o", "found", "--plot", "--json", "-q", "-j", "1"]
-    main(["locate", f"{folder}/drone.png", f"{folder}/map_sheet.png", *given])
+    options = ["--effort", "quick", "--gsd", "0.5:2", "-o", "found", "--plot", "--json", "-q", "-j", "1"]
+    main(["locate", f"{folder}/drone.png", f"{folder}/map_sheet.png", "-r", str(porto), *options])
     first = json.loads(capfd.readouterr().out.splitlines()[0])
     program, *command = shlex.split(first["command"])
     assert program == "roadgeo"
@@ -69,10 +60,10 @@ def test_the_command_of_a_result_makes_it_again(porto: str, capfd: pytest.Captur
     assert shlex.split(again["command"]) == [program, *command]
 
 
-def test_references_and_plugins_are_told_by_schema(porto: str, capfd: pytest.CaptureFixture[str]) -> None:
-    Path("porto.gpkg").write_bytes(Path(porto).read_bytes())  # without an index: less is known
+def test_references_and_plugins_are_told_by_schema(porto: Path, capfd: pytest.CaptureFixture[str]) -> None:
+    Path("porto.gpkg").write_bytes(porto.read_bytes())  # without an index: less is known
     for command, schema in (
-        (["info", porto, "--json"], "info"),
+        (["info", str(porto), "--json"], "info"),
         (["info", "porto.gpkg", "--json"], "info"),
         (["list", "--json"], "info"),
         (["info", "--plugins", "--json"], "plugins"),

@@ -9,19 +9,10 @@ import pytest
 import shapely
 
 from roadgeo.cli import main
-from roadgeo.evaluation.demo import ATTRIBUTION, ROADS, demo_masks
+from roadgeo.evaluation.demo import ROADS, demo_masks
 from roadgeo.geometry.homography import Homography
-from roadgeo.sources.roads import read_roads
-from roadgeo.workflows import build_reference
 
 DRONE = next(mask for mask in demo_masks() if mask.path.stem == "drone")
-
-
-@pytest.fixture(scope="module")
-def porto(tmp_path_factory: pytest.TempPathFactory) -> str:
-    path = tmp_path_factory.mktemp("reference") / "porto.gpkg"
-    build_reference(read_roads(ROADS, attribution=ATTRIBUTION), "porto", path=path)
-    return str(path)
 
 
 @pytest.fixture(autouse=True)
@@ -37,14 +28,14 @@ def piece() -> gpd.GeoSeries:
     return roads.clip(shapely.box(x - 600, y - 500, x + 600, y + 500)).explode()
 
 
-def located(name: str, porto: str, capfd: pytest.CaptureFixture[str], *more: str) -> dict:
-    status = main(["locate", name, "-r", porto, "--effort", "quick", "--json", "-q", *more])
+def located(name: str, porto: Path, capfd: pytest.CaptureFixture[str], *more: str) -> dict:
+    status = main(["locate", name, "-r", str(porto), "--effort", "quick", "--json", "-q", *more])
     out, err = capfd.readouterr()
     assert status == 0, err + out
     return json.loads(out)
 
 
-def test_lines_traced_on_a_picture_lie_where_the_picture_does(porto: str, capfd: pytest.CaptureFixture[str]) -> None:
+def test_lines_traced_on_a_picture_lie_where_the_picture_does(porto: Path, capfd: pytest.CaptureFixture[str]) -> None:
     assert main(["vectorize", str(DRONE.path)]) == 0
     capfd.readouterr()
     found = located("drone_vectorized.gpkg", porto, capfd)
@@ -57,12 +48,12 @@ def test_lines_traced_on_a_picture_lie_where_the_picture_does(porto: str, capfd:
 
 @pytest.mark.filterwarnings("ignore:'crs' was not provided")
 def test_metres_of_nowhere_are_found_with_their_scale(
-    porto: str, piece: gpd.GeoSeries, capfd: pytest.CaptureFixture[str]
+    porto: Path, piece: gpd.GeoSeries, capfd: pytest.CaptureFixture[str]
 ) -> None:
     middle = np.array(piece.total_bounds).reshape(2, 2).mean(axis=0)
     turned = piece.rotate(35, origin=tuple(middle)).translate(-middle[0] + 90, -middle[1] - 40)
     gpd.GeoSeries(turned.to_numpy()).to_file("survey.fgb", engine="pyogrio")
-    assert main(["locate", "survey.fgb", "-r", porto, "-q"]) == 1
+    assert main(["locate", "survey.fgb", "-r", str(porto), "-q"]) == 1
     assert "give --units pixels or --units metres" in capfd.readouterr().err
     found = located("survey.fgb", porto, capfd, "--units", "metres")
     to_crs = Homography(np.array(found["homography"])) @ Homography(np.array(found["query_to_pixel"]))
@@ -70,7 +61,7 @@ def test_metres_of_nowhere_are_found_with_their_scale(
 
 
 def test_degrees_that_are_off_are_put_right(
-    porto: str, piece: gpd.GeoSeries, capfd: pytest.CaptureFixture[str]
+    porto: Path, piece: gpd.GeoSeries, capfd: pytest.CaptureFixture[str]
 ) -> None:
     off = piece.translate(700, -300)
     off.to_crs("EPSG:4326").to_file("tracks.geojson", engine="pyogrio")
@@ -84,8 +75,8 @@ def test_degrees_that_are_off_are_put_right(
     assert found["query_to_pixel"] is None
 
 
-def test_a_file_without_lines_is_refused(porto: str, capfd: pytest.CaptureFixture[str]) -> None:
+def test_a_file_without_lines_is_refused(porto: Path, capfd: pytest.CaptureFixture[str]) -> None:
     gpd.GeoSeries([shapely.Point(1, 2)], crs="EPSG:4326").to_file("points.geojson", engine="pyogrio")
-    assert main(["locate", "points.geojson", "-r", porto, "-q"]) == 1
+    assert main(["locate", "points.geojson", "-r", str(porto), "-q"]) == 1
     assert "expected lines: the centre lines of roads" in capfd.readouterr().err
     assert not Path("points_location.json").exists()

@@ -25,17 +25,8 @@ from roadgeo.cli.locate import pair_images
 from roadgeo.evaluation.demo import ATTRIBUTION, ROADS, DemoMask, demo_masks
 from roadgeo.geometry.homography import Homography
 from roadgeo.reference.files import reference_digest
-from roadgeo.sources.roads import read_roads
-from roadgeo.workflows import build_reference
 
 MASKS = {mask.path.stem: mask for mask in demo_masks()}
-
-
-@pytest.fixture(scope="module")
-def porto(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    path = tmp_path_factory.mktemp("reference") / "porto.gpkg"
-    build_reference(read_roads(ROADS, attribution=ATTRIBUTION), "porto", path=path)
-    return path
 
 
 @pytest.fixture(autouse=True)

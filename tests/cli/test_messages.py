@@ -12,18 +12,9 @@ import rasterio
 from worlds.fenway import write_streets
 
 from roadgeo.cli import main
-from roadgeo.evaluation.demo import ATTRIBUTION, ROADS, demo_masks
-from roadgeo.sources.roads import read_roads
-from roadgeo.workflows import build_reference
+from roadgeo.evaluation.demo import demo_masks
 
 DRONE = next(mask.path for mask in demo_masks() if mask.path.stem == "drone")
-
-
-@pytest.fixture(scope="module")
-def porto(tmp_path_factory: pytest.TempPathFactory) -> str:
-    path = tmp_path_factory.mktemp("reference") / "porto.gpkg"
-    build_reference(read_roads(ROADS, attribution=ATTRIBUTION), "porto", path=path)
-    return str(path)
 
 
 @pytest.fixture(autouse=True)
@@ -31,8 +22,8 @@ def _desk(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.chdir(tmp_path)
 
 
-def locate(mask: str, porto: str, *more: str) -> int:
-    return main(["locate", mask, "-r", porto, "--effort", "quick", *more])
+def locate(mask: str, porto: Path, *more: str) -> int:
+    return main(["locate", mask, "-r", str(porto), "--effort", "quick", *more])
 
 
 def drone() -> np.ndarray:
@@ -59,7 +50,7 @@ def test_a_crs_against_the_files_own_is_said(tmp_path: Path, caplog: pytest.LogC
 
 
 @pytest.mark.parametrize("suffix", ["png", "tif"])
-def test_black_roads_on_transparent_ground_are_roads(suffix: str, porto: str) -> None:
+def test_black_roads_on_transparent_ground_are_roads(suffix: str, porto: Path) -> None:
     black = np.dstack([np.zeros((*drone().shape, 3), np.uint8), drone()])
     if suffix == "png":
         cv2.imwrite("black.png", black)
@@ -71,7 +62,7 @@ def test_black_roads_on_transparent_ground_are_roads(suffix: str, porto: str) ->
     assert locate(f"black.{suffix}", porto) == 0
 
 
-def test_what_libraries_print_is_swallowed(porto: str, capfd: pytest.CaptureFixture[str]) -> None:
+def test_what_libraries_print_is_swallowed(porto: Path, capfd: pytest.CaptureFixture[str]) -> None:
     """libpng and libjpeg print their warnings themselves; of libtiff's errors the reason is told."""
     rows = drone()
     Path("profile.png").write_bytes(png(rows, (b"iCCP", b"bad\0\0" + zlib.compress(b"no profile"))))
@@ -92,7 +83,7 @@ def test_what_libraries_print_is_swallowed(porto: str, capfd: pytest.CaptureFixt
 
 
 @pytest.mark.parametrize("most", [40, 0.2])
-def test_maps_of_low_probabilities_are_located(most: float, porto: str, capfd: pytest.CaptureFixture[str]) -> None:
+def test_maps_of_low_probabilities_are_located(most: float, porto: Path, capfd: pytest.CaptureFixture[str]) -> None:
     """A network that is never sure: its largest value is 40 of 255, or 0.2."""
     soft = cv2.GaussianBlur(drone(), (0, 0), 2).astype(np.float32) * (most / 255)
     if most > 1:
@@ -103,7 +94,7 @@ def test_maps_of_low_probabilities_are_located(most: float, porto: str, capfd: p
     assert "located at 41.15" in capfd.readouterr().out
 
 
-def test_several_thresholds_are_tried_before_a_refusal(porto: str, capfd: pytest.CaptureFixture[str]) -> None:
+def test_several_thresholds_are_tried_before_a_refusal(porto: Path, capfd: pytest.CaptureFixture[str]) -> None:
     soft = np.zeros((400, 400), np.uint8)
     cv2.line(soft, (100, 0), (140, 400), 255, 9)
     cv2.line(soft, (0, 200), (400, 200), 255, 9)
@@ -112,7 +103,7 @@ def test_several_thresholds_are_tried_before_a_refusal(porto: str, capfd: pytest
     assert "(seen in " in capfd.readouterr().out
 
 
-def test_a_mirrored_mask_is_refused_with_the_reason(porto: str, capfd: pytest.CaptureFixture[str]) -> None:
+def test_a_mirrored_mask_is_refused_with_the_reason(porto: Path, capfd: pytest.CaptureFixture[str]) -> None:
     cv2.imwrite("mirrored.png", drone()[:, ::-1])
     assert locate("mirrored.png", porto, "--json", "-q") == 3
     refused = json.loads(capfd.readouterr().out)
@@ -122,7 +113,7 @@ def test_a_mirrored_mask_is_refused_with_the_reason(porto: str, capfd: pytest.Ca
     assert sorted(path.name for path in Path().iterdir()) == ["mirrored.png", "mirrored_location.json"]
 
 
-def test_a_mirrored_mask_is_located_where_that_is_allowed(porto: str, capfd: pytest.CaptureFixture[str]) -> None:
+def test_a_mirrored_mask_is_located_where_that_is_allowed(porto: Path, capfd: pytest.CaptureFixture[str]) -> None:
     """What is drawn of it is what is drawn of the mask the right way round."""
     cv2.imwrite("mirrored.png", drone()[:, ::-1])
     more = ["--plot", "--report", "--also", "gcps"]
@@ -143,7 +134,7 @@ def test_a_mirrored_mask_is_located_where_that_is_allowed(porto: str, capfd: pyt
         assert same.mean() > 0.98
 
 
-def test_the_place_that_a_mask_states_is_compared(porto: str, capfd: pytest.CaptureFixture[str]) -> None:
+def test_the_place_that_a_mask_states_is_compared(porto: Path, capfd: pytest.CaptureFixture[str]) -> None:
     """A mask that has a georeference, which is 120 m off in the east."""
     assert locate(str(DRONE), porto, "--json", "-q") == 0
     found = json.loads(capfd.readouterr().out)

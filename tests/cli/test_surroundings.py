@@ -13,19 +13,12 @@ import rasterio
 
 from roadgeo.cli import main
 from roadgeo.errors import OutputError
-from roadgeo.evaluation.demo import ROADS, demo_masks
+from roadgeo.evaluation.demo import demo_masks
 from roadgeo.storage.gdal import forget_missing_proj_data
 from roadgeo.storage.rasters import writing_raster
-from roadgeo.workflows import build_reference, locate
+from roadgeo.workflows import locate
 
 DRONE = next(one.path for one in demo_masks() if one.path.stem == "drone")
-
-
-@pytest.fixture(scope="module")
-def porto(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    path = tmp_path_factory.mktemp("reference") / "porto.gpkg"
-    build_reference(ROADS, "porto", path=path)
-    return path
 
 
 def test_proj_data_that_are_not_where_the_environment_says_are_looked_for_elsewhere(

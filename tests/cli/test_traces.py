@@ -12,7 +12,6 @@ import pytest
 from roadgeo.evaluation.demo import ROADS, demo_masks
 from roadgeo.outputs.registry import ALSO
 from roadgeo.storage.folders import cache_dir
-from roadgeo.workflows import build_reference
 
 DRONE = next(one.path for one in demo_masks() if one.path.stem == "drone")
 
@@ -22,13 +21,6 @@ _CHANGES = (
     *("link", "linkat", "symlink", "symlinkat", "truncate"),
 )
 _TRACE = ["strace", "-f", "-qq", "-y", "--seccomp-bpf", "-s", "4096"]
-
-
-@pytest.fixture(scope="module")
-def porto(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    path = tmp_path_factory.mktemp("reference") / "porto.gpkg"
-    build_reference(ROADS, "porto", path=path)
-    return path
 
 
 @pytest.fixture(scope="module", autouse=True)

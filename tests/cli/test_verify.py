@@ -12,22 +12,13 @@ import rasterio
 from worlds.turned import mark_turned
 
 from roadgeo.cli import main
-from roadgeo.evaluation.demo import ATTRIBUTION, ROADS, demo_masks
+from roadgeo.evaluation.demo import demo_masks
 from roadgeo.geometry.georeference import Georeference
 from roadgeo.geometry.homography import Homography
 from roadgeo.outputs.schemas import read_schema
 from roadgeo.outputs.verification_files import write_fixed
-from roadgeo.sources.roads import read_roads
-from roadgeo.workflows import build_reference
 
 SHEET = next(mask for mask in demo_masks() if mask.path.stem == "map_sheet")
-
-
-@pytest.fixture(scope="module")
-def porto(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    path = tmp_path_factory.mktemp("reference") / "porto.gpkg"
-    build_reference(read_roads(ROADS, attribution=ATTRIBUTION), "porto", path=path)
-    return path
 
 
 @pytest.fixture(autouse=True)

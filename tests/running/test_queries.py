@@ -14,7 +14,7 @@ from worlds.models import brightness_model
 from roadgeo import open_reference
 from roadgeo.cli import main
 from roadgeo.errors import MaskError, ModelError, PhotographError
-from roadgeo.evaluation.demo import ROADS, demo_masks
+from roadgeo.evaluation.demo import demo_masks
 from roadgeo.geometry.mask import RoadMask
 from roadgeo.matching.options import LocateOptions
 from roadgeo.running import queries
@@ -24,7 +24,6 @@ from roadgeo.sources.segmentation.probability import ProbabilityMap
 from roadgeo.sources.segmentation.scales import rank_scales
 from roadgeo.sources.segmentation.tiling import segment
 from roadgeo.storage.geopackage import read_layer
-from roadgeo.workflows import build_reference
 
 pytestmark = pytest.mark.filterwarnings("ignore::rasterio.errors.NotGeoreferencedWarning")
 
@@ -36,13 +35,6 @@ def model(tmp_path_factory: pytest.TempPathFactory) -> str:
     """Sees a road where a picture is light."""
     props = {"class_names": {0: "ground", 1: "road"}, "resolution": 100, "tiles_overlap": 10}
     return str(brightness_model(tmp_path_factory.mktemp("models") / "light.onnx", size=256, props=props))
-
-
-@pytest.fixture(scope="module")
-def demo_reference(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    path = tmp_path_factory.mktemp("reference") / "porto.gpkg"
-    build_reference(str(ROADS), "porto", path=path)
-    return path
 
 
 @pytest.fixture(scope="module")
@@ -172,9 +164,9 @@ def test_what_was_seen_while_scales_were_ranked_is_looked_at_first(
 
 
 def test_a_photograph_is_located(
-    tmp_path: Path, demo_reference: Path, model: str, photo: Path, capsys: pytest.CaptureFixture[str]
+    tmp_path: Path, porto: Path, model: str, photo: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    given = [str(photo), "-r", str(demo_reference), "--segmenter", model, "-o", str(tmp_path)]
+    given = [str(photo), "-r", str(porto), "--segmenter", model, "-o", str(tmp_path)]
     document = run(capsys, *given)
     assert document["status"] == "located"
     assert document["query"] == str(photo)
@@ -189,7 +181,7 @@ def test_a_photograph_is_located(
 
 
 def test_a_photograph_with_infrared_is_located(
-    tmp_path: Path, demo_reference: Path, model: str, photo: Path, capsys: pytest.CaptureFixture[str]
+    tmp_path: Path, porto: Path, model: str, photo: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
     """Nobody says that its fourth band is no mask."""
     colours = np.moveaxis(cv2.imread(str(photo))[..., ::-1], 2, 0)
@@ -197,19 +189,19 @@ def test_a_photograph_with_infrared_is_located(
     size = {"height": colours.shape[1], "width": colours.shape[2]}
     with rasterio.open(path, "w", driver="GTiff", count=4, dtype="uint8", photometric="MINISBLACK", **size) as dataset:
         dataset.write(np.concatenate([colours, 255 - colours[:1]]))
-    document = run(capsys, str(path), "-r", str(demo_reference), "--segmenter", model, "-o", str(tmp_path))
+    document = run(capsys, str(path), "-r", str(porto), "--segmenter", model, "-o", str(tmp_path))
     assert document["status"] == "located"
     assert offset(document) < 3.0
 
 
 def test_roads_of_coarse_pixels_are_traced_on_the_models_grid(
-    tmp_path: Path, demo_reference: Path, model: str, photo: Path, capsys: pytest.CaptureFixture[str]
+    tmp_path: Path, porto: Path, model: str, photo: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
     """What is told and drawn is of the photograph's own pixels all the same."""
     image = cv2.imread(str(photo))
     small = cv2.resize(image, None, fx=0.5, fy=0.5, interpolation=cv2.INTER_AREA)
     cv2.imwrite(str(tmp_path / "coarse.png"), small)
-    given = ["-r", str(demo_reference), "--segmenter", model, "-o", str(tmp_path)]
+    given = ["-r", str(porto), "--segmenter", model, "-o", str(tmp_path)]
     fine = run(capsys, str(photo), *given, "--gsd", "0.6:1")
     coarse = run(capsys, str(tmp_path / "coarse.png"), *given, "--gsd", "1.2:2", "--report")
     height, width = small.shape[:2]
@@ -241,9 +233,9 @@ def test_how_much_finer(own: tuple[int, int], scale: float, expected: float) -> 
 
 
 def test_what_was_seen_is_told_and_drawn(
-    tmp_path: Path, demo_reference: Path, model: str, photo: Path, capsys: pytest.CaptureFixture[str]
+    tmp_path: Path, porto: Path, model: str, photo: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    given = [str(photo), "-r", str(demo_reference), "--segmenter", model, "-o", str(tmp_path), "--report"]
+    given = [str(photo), "-r", str(porto), "--segmenter", model, "-o", str(tmp_path), "--report"]
     assert main(["locate", *given]) == 0
     told = capsys.readouterr()
     assert "looking for the scale of" in told.err
@@ -251,13 +243,13 @@ def test_what_was_seen_is_told_and_drawn(
     page = (tmp_path / "flight_report.html").read_text()
     assert "Roads seen in it" in page
     assert page.count('id="probability"') == 1
-    assert main(["locate", str(MASK.path), "-r", str(demo_reference), "-o", str(tmp_path), "--report"]) == 0
+    assert main(["locate", str(MASK.path), "-r", str(porto), "-o", str(tmp_path), "--report"]) == 0
     assert "probability" not in (tmp_path / "drone_report.html").read_text().split("<script>")[0].split("</style>")[1]
 
 
 @pytest.mark.parametrize("stated", [None, 0.8])
 def test_no_scale_is_looked_for_in_vain(
-    demo_reference: Path, model: str, photo: Path, monkeypatch: pytest.MonkeyPatch, stated: float | None
+    porto: Path, model: str, photo: Path, monkeypatch: pytest.MonkeyPatch, stated: float | None
 ) -> None:
     """Where the file states one it comes first; where none is known, what was seen on the way is taken."""
     calls = []
@@ -265,7 +257,7 @@ def test_no_scale_is_looked_for_in_vain(
     monkeypatch.setattr(queries, "rank_scales", lambda *given: calls.append("ranked") or rank_scales(*given))
     monkeypatch.setattr(queries, "segment", lambda *given, **told: calls.append("shown") or segment(*given, **told))
     query = QueryOptions(segmenters=(model,))
-    sighting = locate_query(str(photo), [open_reference(demo_reference)], query=query)
+    sighting = locate_query(str(photo), [open_reference(porto)], query=query)
     assert sighting.location.located
     assert calls == ["ranked" if stated is None else "shown"]
     calls.clear()
@@ -323,52 +315,52 @@ def test_what_plugins_and_masks_show(
 
 
 def test_our_own_probability_map_is_no_further_query(
-    tmp_path: Path, demo_reference: Path, model: str, photo: Path, capsys: pytest.CaptureFixture[str]
+    tmp_path: Path, porto: Path, model: str, photo: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
     (tmp_path / "flight.jpg").write_bytes(photo.read_bytes())
-    given = [str(tmp_path), "-r", str(demo_reference), "--segmenter", model, "-o", str(tmp_path)]
+    given = [str(tmp_path), "-r", str(porto), "--segmenter", model, "-o", str(tmp_path)]
     run(capsys, *given)
     assert (tmp_path / "flight_mask.tif").exists()
     assert run(capsys, *given)["query"].endswith("flight.jpg")
 
 
 def test_a_mask_of_the_users_is_not_overwritten(
-    tmp_path: Path, demo_reference: Path, model: str, photo: Path, capsys: pytest.CaptureFixture[str]
+    tmp_path: Path, porto: Path, model: str, photo: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
     mine = tmp_path / "flight_mask.tif"
     cv2.imwrite(str(mine), np.zeros((50, 50), np.uint8))
     content = mine.read_bytes()
-    status = main(["locate", str(photo), "-r", str(demo_reference), "--segmenter", model, "-o", str(tmp_path)])
+    status = main(["locate", str(photo), "-r", str(porto), "--segmenter", model, "-o", str(tmp_path)])
     assert status == 1
     assert "not written by roadgeo" in capsys.readouterr().err
     assert mine.read_bytes() == content
     assert [path.name for path in tmp_path.iterdir()] == ["flight_mask.tif"]
 
 
-def test_never_means_never(demo_reference: Path, model: str, photo: Path) -> None:
+def test_never_means_never(porto: Path, model: str, photo: Path) -> None:
     import roadgeo
 
-    reference = roadgeo.open_reference(demo_reference)
+    reference = roadgeo.open_reference(porto)
     with pytest.raises(PhotographError, match="looks like a photograph"):
         locate_query(str(photo), [reference], query=QueryOptions(segment="never", segmenters=(model,)))
 
 
-def test_a_mask_stays_a_mask(demo_reference: Path, model: str) -> None:
+def test_a_mask_stays_a_mask(porto: Path, model: str) -> None:
     import roadgeo
 
-    reference = roadgeo.open_reference(demo_reference)
+    reference = roadgeo.open_reference(porto)
     sighting = locate_query(str(MASK.path), [reference], query=QueryOptions(segmenters=(model,)))
     assert sighting.location.located
     assert not sighting.of_photograph
     assert sighting.probability is None
 
 
-def test_without_a_model_it_is_said(demo_reference: Path, photo: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_without_a_model_it_is_said(porto: Path, photo: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     import roadgeo
 
     monkeypatch.setattr("importlib.util.find_spec", lambda name: None)
     with pytest.raises(ModelError, match=r"-m pip install onnxruntime"):
-        locate_query(str(photo), [roadgeo.open_reference(demo_reference)])
+        locate_query(str(photo), [roadgeo.open_reference(porto)])
 
 
 def test_fused_masks_are_shown_to_no_model(monkeypatch: pytest.MonkeyPatch) -> None:
@@ -388,7 +380,7 @@ def test_fused_masks_are_shown_to_no_model(monkeypatch: pytest.MonkeyPatch) -> N
 
 
 def test_two_exposures_are_fused(
-    tmp_path: Path, demo_reference: Path, model: str, photo: Path, capsys: pytest.CaptureFixture[str]
+    tmp_path: Path, porto: Path, model: str, photo: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
     """Each shows one half of the roads."""
     image = cv2.imread(str(photo))
@@ -399,19 +391,19 @@ def test_two_exposures_are_fused(
         cv2.imwrite(str(tmp_path / name), shaded)
     pair = [str(tmp_path / "a.jpg"), str(tmp_path / "b.jpg")]
     out = str(tmp_path / "out")
-    document = run(capsys, *pair, "--fuse", "-r", str(demo_reference), "--segmenter", model, "-o", out)
+    document = run(capsys, *pair, "--fuse", "-r", str(porto), "--segmenter", model, "-o", out)
     assert document["status"] == "located"
     assert offset(document) < 3.0
 
 
 def test_a_photograph_that_shows_no_road_is_not_located(
-    tmp_path: Path, demo_reference: Path, model: str, capsys: pytest.CaptureFixture[str]
+    tmp_path: Path, porto: Path, model: str, capsys: pytest.CaptureFixture[str]
 ) -> None:
     rng = np.random.default_rng(0)
     dark = rng.integers(20, 90, (300, 300, 3)).astype(np.uint8)
     cv2.imwrite(str(tmp_path / "dark.png"), dark)
     out = str(tmp_path / "out")
-    given = [str(tmp_path / "dark.png"), "-r", str(demo_reference), "--segmenter", model, "-o", out]
+    given = [str(tmp_path / "dark.png"), "-r", str(porto), "--segmenter", model, "-o", out]
     document = run(capsys, *given, "--segment", "always", "--report")
     assert document["status"] == "not_located"
     assert "hardly a road" in document["reason"]

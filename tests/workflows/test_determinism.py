@@ -7,10 +7,8 @@ import sys
 from pathlib import Path
 
 import cv2
-import pytest
 
-from roadgeo.evaluation.demo import PHOTO, ROADS, demo_masks
-from roadgeo.workflows import build_reference
+from roadgeo.evaluation.demo import PHOTO, demo_masks
 
 MASKS = [one.path for one in demo_masks() if one.path.stem in ("drone", "elsewhere", "map_sheet")]
 #: The number of processors, for as many threads does the network take, and then a command.
@@ -20,13 +18,6 @@ os.cpu_count = lambda: int(sys.argv[1])
 from roadgeo.cli import main
 sys.exit(main(sys.argv[2:]) == 1)
 """
-
-
-@pytest.fixture(scope="module")
-def porto(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    path = tmp_path_factory.mktemp("reference") / "porto.gpkg"
-    build_reference(ROADS, "porto", path=path)
-    return path
 
 
 def answers(porto: Path, out: Path, masks: list[Path], *more: str, threads: int = 1) -> dict[str, object]:
