@@ -7,8 +7,6 @@ from collections.abc import Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING
 
-import numpy as np
-
 from roadgeo._arrays import AnyArray
 from roadgeo._progress import Say, say_nothing
 from roadgeo.errors import RoadSourceError
@@ -21,17 +19,16 @@ from roadgeo.matching.methods import Found, search_references
 from roadgeo.matching.options import LocateOptions
 from roadgeo.matching.scene import Query, read_query
 from roadgeo.matching.verdict import decide
-from roadgeo.reference.reference import AnyReference, BuildOptions, Reference, build_network, open_whole, stored_options
+from roadgeo.reference.reference import AnyReference, BuildOptions, Reference, build_network, open_whole
 from roadgeo.roads.kinds import RoadKind
 from roadgeo.roads.labels import label_roads
-from roadgeo.roads.network import RoadNetwork
 
 if TYPE_CHECKING:
     import geopandas as gpd
 
     from roadgeo.sources.roads import Roads
 
-__all__ = ["LocateOptions", "build_reference", "explain", "locate", "update_reference"]
+__all__ = ["LocateOptions", "build_reference", "explain", "locate"]
 
 
 # --- roads to a reference ---------------------------------------------------------------------------------------------
@@ -76,69 +73,12 @@ def build_reference(
     chosen = choose_roads(roads, kinds, tunnels, attribution, say)
     options = options or BuildOptions()
     network = build_network(chosen.lines, chosen.plane, {"name": name, **chosen.meta}, options, say)
-    network = as_stored(label_roads(network, [chosen.lines], [chosen.names], [chosen.kinds]))
+    network = as_stored(label_roads(network, chosen.lines, chosen.names, chosen.kinds))
     reference = Reference(build_index(network, options.index, say), network)
     if path is None:
         return reference
     reference.save(path, say)
     return open_whole(path)  # as `locate` has it: memory-mapped arrays are another type to compiled code
-
-
-def update_reference(path: str | Path, roads: Roads, say: Say = say_nothing) -> Reference:
-    """Replace the roads of a reference by others on the ground that those were asked for, or add them, and write it.
-
-    The rest of the network is not drawn again. Where the roads do not state the ground they were asked for, it is the
-    ground they lie on. The options are those that the reference was built with.
-
-    Raises
-    ------
-    IndexFormatError
-        There is no such reference, or it is damaged.
-    OutputError
-        It cannot be written; the old one stays as it was.
-    """
-    from roadgeo.reference.files import reference_paths
-    from roadgeo.reference.network_file import as_stored, read_network
-    from roadgeo.roads.updating import UpdateOptions, ground_of, move_area, move_lines, replace_area
-
-    old = read_network(reference_paths(path).geopackage)
-    options = stored_options(old)
-    lines = move_lines(roads.lines, roads.plane, old.plane)
-    _require_same_scale(roads.lines, lines)
-    area = ground_of(lines) if roads.area is None else move_area(roads.area, old.plane)
-    owed = dict.fromkeys([old.meta.get("attribution", ""), roads.meta.get("attribution", "")])
-    meta = {
-        **old.meta,
-        "sources": [*old.meta.get("sources", []), *roads.meta.get("sources", [])],
-        "attribution": "; ".join(filter(None, owed)),
-    }
-    say(f"drawing {len(lines):,} lines among the others as a mask shows them")
-    drawn_alike = UpdateOptions(simplify=options.simplify, intersections=options.intersections)
-    network = replace_area(old, lines, area, meta, drawn_alike)
-    names, kinds = [roads.names, old.names], [roads.kinds, old.kinds]
-    network = as_stored(label_roads(network, [lines, _drawn(old)], names, kinds))
-    Reference(build_index(network, options.index, say), network).save(path, say)
-    return open_whole(path)
-
-
-def _drawn(network: RoadNetwork) -> AnyArray:
-    """Return the roads of a network as shapely lines."""
-    import shapely
-
-    graph = network.graph
-    numbers = np.repeat(np.arange(graph.n_edges), np.diff(graph.offsets))
-    return np.asarray(shapely.linestrings(graph.coords, indices=numbers) if graph.n_edges else [], object)
-
-
-def _require_same_scale(lines: AnyArray, moved: AnyArray) -> None:
-    """Refuse roads so far from a reference that its plane has another scale there, or has no coordinates there."""
-    import shapely
-
-    scale = float(shapely.length(moved).sum() / shapely.length(lines).sum())
-    if not 0.95 < scale < 1.05:
-        raise RoadSourceError(
-            "the roads lie too far from the reference to be drawn on its plane; build one reference from both sources"
-        )
 
 
 # --- a mask to a place ------------------------------------------------------------------------------------------------

@@ -45,12 +45,11 @@ _OPTIONS = (
     row("--no-cache", "", SOURCE, "Fetch anew what was fetched before.", rare=True),
     row("--coarse", "", ROADS,
         "Draw main roads alone, as pixels of 2 to 12 m show them: a map of a whole region, for images of 5 to 50 km."),
-    row("--update", "", RESULT,
-        "Bring a reference up to date: replace its roads on the ground asked for, or add that; keep the rest."),
     row("--rebuild", "REF", RESULT,
         "Build the index of REF again from its GeoPackage alone, after an edit in QGIS for example."),
     row("--name", "NAME", RESULT, "Name of the reference. Default: after the place, else after REF.gpkg or the file."),
     row("-o --out", "REF.gpkg", RESULT, "Where it goes. Default: into the library, under its name.", type=click.Path()),
+    row("--replace", "", RESULT, "Replace a reference of that name without asking."),
     shard_options,
     take("cluster", group="In pieces"),
     take("verbosity"),
@@ -63,7 +62,7 @@ def index_command(
     out: str | None,
     name: str | None,
     coarse: bool,
-    update: bool,
+    replace: bool,
     rebuild: str | None,
     shards: dict[str, Any] | None,
     margin: float,
@@ -85,8 +84,6 @@ def index_command(
       roadgeo index --bbox=-71.19,42.23,-70.95,42.44 --name boston
       roadgeo index --roads streets.shp --crs EPSG:26986 --out maps/streets.gpkg
       roadgeo index --roads massachusetts.osm.pbf --bbox=-71.19,42.23,-70.95,42.44
-      roadgeo index --update --osm "Cambridge, MA" --name boston-ma
-      roadgeo index --update --roads new_estate.geojson --out maps/streets.gpkg
       roadgeo index --rebuild maps/streets.gpkg
       roadgeo index --roads germany.osm.pbf --shards auto --jobs 4
       roadgeo index --osm "Massachusetts" --coarse --name massachusetts-main
@@ -102,44 +99,36 @@ def index_command(
     from roadgeo.cli.compilation import compile_once
     from roadgeo.cli.folders import make_folder
     from roadgeo.cli.progress import show_steps
-    from roadgeo.reference.files import reference_freshness
     from roadgeo.reference.library import make_slug, new_reference
     from roadgeo.reference.reference import COARSE
-    from roadgeo.workflows import build_reference, update_reference
+    from roadgeo.workflows import build_reference
 
     started = perf_counter()
     if rebuild is not None:
-        if update or coarse or name or out or any(source[option] for option in (*_FETCHED, "bbox", "roads", "plugin")):
+        if replace or coarse or name or out or any(source[option] for option in (*_FETCHED, "bbox", "roads", "plugin")):
             raise click.UsageError("--rebuild takes nothing but the reference: its roads are in its GeoPackage.")
         _rebuild(rebuild, quiet)
         return
     given = _one_source(source)
     if coarse:
-        source["kinds"] = _kinds_of_coarse(update, shards is not None)
+        source["kinds"] = _kinds_of_coarse(shards is not None)
     if shards is None:
         _require_geopackage(out)
     name = name or _name(source, given, out)
     if shards is not None:
-        if update:
-            raise click.UsageError("--update changes a reference of one piece; build one in --shards again instead.")
         cluster = make_cluster(engine, scheduler, jobs)
         build_in_shards(source, name, out, shards, margin, jobs, cluster, quiet)
         return
     path = Path(out) if out else new_reference(name)
     make_folder(path.parent)  # before the long part
-    if update:
-        reference_freshness(path)  # there must be one
-    else:
-        _ask_before_replacing(path, quiet)
+    if not replace:
+        _keep_or_replace(path)
     read = {"roads": _read, "plugin": _read_plugin}.get(given, _fetch)
     with show_steps(quiet) as say:
         roads = read(source, given, say)
     compile_once(quiet)  # nobody waits for that whose roads cannot be read
     with show_steps(quiet) as say:
-        if update:
-            reference = update_reference(path, roads, say)
-        else:
-            reference = build_reference(roads, make_slug(name), COARSE if coarse else None, path=path, say=say)
+        reference = build_reference(roads, make_slug(name), COARSE if coarse else None, path=path, say=say)
     if verbose:
         for key, value in roads.meta.items():
             echo(f"  {key}: {value}", err=True)
@@ -149,10 +138,8 @@ def index_command(
         echo(f"{found}; search it with `roadgeo locate MASK -r {out or path.stem}`")
 
 
-def _kinds_of_coarse(update: bool, in_shards: bool) -> str:
+def _kinds_of_coarse(in_shards: bool) -> str:
     """Return which roads a coarse map holds: main ones, unless the user named others."""
-    if update:
-        raise click.UsageError("--update keeps the options that a reference was built with: leave out --coarse.")
     if in_shards:
         raise click.UsageError("--shards makes a coarse map beside the shards: leave out --coarse.")
     context = click.get_current_context()
@@ -173,21 +160,26 @@ def _require_geopackage(out: str | None) -> None:
         )
 
 
-def _ask_before_replacing(path: Path, quiet: bool) -> None:
-    """Ask whether a reference of that name may go, or where nobody can be asked report that it does."""
-    from roadgeo.errors import RoadgeoError
+def _keep_or_replace(path: Path) -> None:
+    """Ask whether a reference at that path may be replaced; where nobody can be asked, it stays.
+
+    Raises
+    ------
+    OutputError
+        Nobody can be asked.
+    """
+    from roadgeo.errors import IndexFormatError, OutputError
     from roadgeo.reference.inspection import describe_reference
 
     if not path.exists():
         return
     try:
         known = counted(describe_reference(path).get("counts", {}).get("intersections", 0), "intersection")
-    except RoadgeoError:  # it is damaged: nothing is lost
+    except IndexFormatError:  # it is damaged: nothing is lost
         return
-    if sys.stdin.isatty() and sys.stderr.isatty():
-        click.confirm(f"There is a reference {path.stem} of {known}. Replace it?", abort=True, err=True)
-    elif not quiet:
-        echo(f"replaces {path}, a reference of {known}; --update would add to it", err=True)
+    if not (sys.stdin.isatty() and sys.stderr.isatty()):
+        raise OutputError(f"{path}: is a reference of {known}; replace it with --replace, or choose another name")
+    click.confirm(f"There is a reference {path.stem} of {known}. Replace it?", abort=True, err=True)
 
 
 def _rebuild(name: str, quiet: bool) -> None:

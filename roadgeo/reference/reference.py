@@ -135,7 +135,7 @@ def build_network(
 ) -> RoadNetwork:
     """Draw road lines (shapely, in plane metres) as a mask sees them, and find their intersections.
 
-    The network's `meta` is the one given and the options, for whoever builds its index again or updates it.
+    The network's `meta` is the one given and the options, for whoever builds its index again.
     """
     from roadgeo.roads.simplification import coverage
 

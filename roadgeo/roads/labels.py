@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
 from dataclasses import replace
 
 import numpy as np
@@ -17,34 +16,24 @@ __all__ = ["label_roads"]
 _REACH_M = 30.0
 
 
-def label_roads(
-    network: RoadNetwork, lines: Sequence[AnyArray], names: Sequence[AnyArray | None], kinds: Sequence[AnyArray | None]
-) -> RoadNetwork:
+def label_roads(network: RoadNetwork, lines: AnyArray, names: AnyArray | None, kinds: AnyArray | None) -> RoadNetwork:
     """Give each road the name and the kind of the line that is nearest to its middle.
 
     Parameters
     ----------
-    lines : sequence of (L,) object
-        Shapely lines in plane metres, of one or more sources.
-    names, kinds : sequence of (L,) object or None
-        Text of each source's lines; None where it knows none.
+    lines : (L,) object
+        Shapely lines in plane metres.
+    names, kinds : (L,) object or None
+        Text of each line; None where no line has any.
     """
-    if all(column is None for column in (*names, *kinds)):
+    if names is None and kinds is None:
         return network
-    nearest = _nearest(network.graph, np.concatenate(list(lines)))
-    columns = [_joined(column, lines) for column in (names, kinds)]
-    named, classed = (np.append(column, "")[nearest] for column in columns)
-    return replace(network, names=named, kinds=classed)
-
-
-def _joined(columns: Sequence[AnyArray | None], lines: Sequence[AnyArray]) -> AnyArray:
-    """Join the columns of all sources, "" where one knows none."""
-    return np.concatenate(
-        [
-            np.full(len(own), "", object) if column is None else column
-            for column, own in zip(columns, lines, strict=True)
-        ]
+    nearest = _nearest(network.graph, lines)
+    named, classed = (
+        np.append(np.full(len(lines), "", object) if column is None else column, "")[nearest]
+        for column in (names, kinds)
     )
+    return replace(network, names=named, kinds=classed)
 
 
 def _nearest(graph: RoadGraph, lines: AnyArray) -> AnyArray:

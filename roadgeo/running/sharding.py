@@ -361,7 +361,7 @@ class ShardWork:
             del meta["shard_of"]  # a place on it lies not quite where it lies on a shard
             options = replace(options, simplify=COARSE.simplify)
         network = build_network(joined.lines, joined.plane, meta, options)
-        network = as_stored(label_roads(network, [joined.lines], [joined.names], [joined.kinds]))
+        network = as_stored(label_roads(network, joined.lines, joined.names, joined.kinds))
         if len(network.intersections) < 3:
             return entry
         index = build_index(network, self.options.build.index)

@@ -55,8 +55,6 @@ class Roads:
     meta : dict
         Plain values: `sources` (one dict each: where from, features read, lines kept and left out, OSM timestamp),
         `attribution`, `roads` (which kinds), `tunnels`, `bbox`.
-    area : shapely Polygon or MultiPolygon, or None
-        The ground whose roads were asked for, in degrees; None where it was all that there are.
     names, kinds : (L,) object or None
         Name of each street, and its `highway`: text, "" where that is not known; None: of none.
     """
@@ -64,7 +62,6 @@ class Roads:
     lines: AnyArray
     plane: LocalPlane
     meta: dict[str, Any] = field(default_factory=dict)
-    area: Any = None
     names: AnyArray | None = None
     kinds: AnyArray | None = None
 
@@ -171,7 +168,7 @@ def read_roads(
         sources.append(chosen)
     if len(elsewhere) == len(sources):
         raise _no_roads(sources, _ask_exchanged(bbox, elsewhere))
-    return join_roads(sources, {"roads": which, "tunnels": tunnels, "bbox": _plain(bbox)}, attribution, area)
+    return join_roads(sources, {"roads": which, "tunnels": tunnels, "bbox": _plain(bbox)}, attribution)
 
 
 def fetch_roads(
@@ -226,7 +223,7 @@ def fetch_roads(
     if not len(source.lines):
         hint = _ask_exchanged(bbox)
         raise NoRoadsError(f"OpenStreetMap has no {which} roads there; check the area or try another --kinds{hint}")
-    return join_roads([source], {"roads": which, "tunnels": tunnels, "bbox": _plain(bbox)}, None, area)
+    return join_roads([source], {"roads": which, "tunnels": tunnels, "bbox": _plain(bbox)}, None)
 
 
 def with_crs(source: RoadLines, crs: Any, name: Path | str) -> RoadLines:
@@ -279,7 +276,7 @@ def choose_lines(source: RoadLines, name: str, which: RoadKind, tunnels: bool, a
     return replace(chosen, tunnel=None, meta=meta)
 
 
-def join_roads(sources: Sequence[RoadLines], meta: dict[str, Any], attribution: str | None, area: Any = None) -> Roads:
+def join_roads(sources: Sequence[RoadLines], meta: dict[str, Any], attribution: str | None) -> Roads:
     """Take the lines of all sources to one plane."""
     filled = [source for source in sources if len(source.lines)]
     if not filled:
@@ -297,7 +294,6 @@ def join_roads(sources: Sequence[RoadLines], meta: dict[str, Any], attribution: 
             "sources": [source.meta for source in sources],
             "attribution": "; ".join(calls) if attribution is None else attribution,
         },
-        area,
         names=as_text([source.name for source in filled], filled),
         kinds=as_text([source.highway for source in filled], filled),
     )

@@ -99,18 +99,6 @@ def test_a_coarse_map_holds_main_roads_merged_farther(tmp_path, capsys):
 
 
 @pytest.mark.parametrize(
-    ("more", "told"),
-    [
-        (["--update", "--name", "a"], "--update keeps the options"),
-        (["--shards", "auto"], "--shards makes a coarse map beside the shards"),
-    ],
-)
-def test_where_a_coarse_map_cannot_be_asked_for(more, told, capsys):
-    assert index("--roads", "x.gpkg", "--coarse", *more) == 2
-    assert told in capsys.readouterr().err
-
-
-@pytest.mark.parametrize(
     ("given", "name"),
     [(["--out", "My b.gpkg"], "my-b"), (["--out", "b.index"], "b"), (["--name", "C", "--out", "b"], "c")],
 )
@@ -142,62 +130,6 @@ def counts(reference, capsys):
     assert main(["info", str(reference), "--json"]) == 0
     told = json.loads(capsys.readouterr().out.partition("\n")[2])
     return told["counts"]["intersections"], told["road_km"], told["meta"]
-
-
-def test_a_part_is_added_and_replaced_and_the_rest_stays(tmp_path, capsys):
-    streets, whole, grown = write_streets(tmp_path / "a.geojson"), tmp_path / "whole.gpkg", tmp_path / "grown.gpkg"
-    assert index("--roads", streets, "--out", whole) == 0
-    assert index("--roads", streets, WEST, "--out", grown) == 0
-    n, length, _ = counts(whole, capsys)
-    n_west, length_west, meta = counts(grown, capsys)
-    assert n_west < n
-    assert index("--update", "--roads", streets, EAST, "--out", grown) == 0
-    n_grown, length_grown, told = counts(grown, capsys)
-    assert n_grown == pytest.approx(n, abs=2)
-    assert length_grown == pytest.approx(length, rel=0.02)
-    assert length_grown > length_west
-    assert (told["name"], told["options"], len(told["sources"])) == ("grown", meta["options"], 2)
-    assert index("--update", "--roads", streets, EAST, "--out", grown) == 0
-    assert counts(grown, capsys)[:2] == pytest.approx((n_grown, length_grown), rel=0.01)
-
-
-def test_roads_of_a_file_replace_those_where_they_lie(tmp_path, capsys):
-    streets, reference = write_streets(tmp_path / "a.geojson"), tmp_path / "a.gpkg"
-    assert index("--roads", streets, "--out", reference) == 0
-    n, length, _ = counts(reference, capsys)
-    assert index("--update", "--roads", streets, "--out", reference) == 0
-    assert counts(reference, capsys)[:2] == pytest.approx((n, length), rel=0.02)
-
-
-def test_a_fetched_area_replaces_that_of_the_reference(osm, tmp_path, capsys):
-    assert index("--osm", "Fenway, Boston", osm=osm) == 0
-    n, length, _ = counts("fenway-boston", capsys)
-    assert index("--update", INNER, "--name", "fenway-boston", osm=osm) == 0
-    n_new, length_new, meta = counts("fenway-boston", capsys)
-    assert (n_new, length_new) == pytest.approx((n, length), rel=0.03)
-    assert meta["attribution"].count("OpenStreetMap") == 1
-    assert len(meta["sources"]) == 2
-
-
-def test_an_update_of_nothing_is_refused_before_anything_is_fetched(osm, tmp_path, capsys):
-    assert index("--update", "--osm", "Fenway, Boston", "--out", tmp_path / "none.gpkg", osm=osm, quiet=True) == 1
-    told = capsys.readouterr().err
-    assert "no reference" in told
-    assert told.count("\n") == 1
-    assert not osm.searches
-
-
-def test_an_update_from_far_away_is_refused(tmp_path, capsys):
-    reference, far = tmp_path / "a.gpkg", tmp_path / "far.geojson"
-    streets = write_streets(tmp_path / "a.geojson")
-    assert index("--roads", streets, "--out", reference) == 0
-    lines = [shapely.LineString([(10.0, 0.001 * k), (10.01, 0.001 * k)]) for k in range(5)]
-    write_vector(far, lines)
-    before = reference.read_bytes()
-    capsys.readouterr()
-    assert index("--update", "--roads", far, "--out", reference, quiet=True) == 1
-    assert "too far from the reference" in capsys.readouterr().err
-    assert reference.read_bytes() == before
 
 
 def test_an_index_is_built_again_from_the_geopackage_alone(tmp_path, monkeypatch, capsys):

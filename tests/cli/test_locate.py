@@ -230,18 +230,6 @@ def test_the_library_is_searched_by_default(tmp_path: Path, capfd: pytest.Captur
     assert "is empty and no --reference was given" in capfd.readouterr().err
 
 
-def test_a_part_of_a_reference_is_replaced(tmp_path: Path, capfd: pytest.CaptureFixture[str]) -> None:
-    west, east = "-8.67,41.13,-8.62,41.19", "-8.63,41.13,-8.57,41.19"
-    roads = ["index", "--roads", str(ROADS), "-o", "porto.gpkg", "-q"]
-    assert main([*roads, "--bbox=" + west]) == 0
-    assert main(["locate", str(MASKS["drone"].path), "-r", "porto.gpkg", "-q"]) == 3
-    assert main([*roads, "--update", "--bbox=" + east]) == 0
-    assert main(["check", "porto.gpkg"]) == 0
-    assert main(["locate", str(MASKS["drone"].path), str(MASKS["segmenter"].path), "-r", "porto.gpkg", "-q"]) == 0
-    assert main(["index", "--update", "--roads", str(ROADS), "-o", "missing.gpkg", "-q"]) == 1
-    assert "missing.gpkg" in capfd.readouterr().err
-
-
 def test_vectorize_shows_what_the_program_saw(tmp_path: Path, capfd: pytest.CaptureFixture[str]) -> None:
     assert main(["vectorize", str(MASKS["segmenter"].path), "-o", "out"]) == 0
     assert sorted(path.name for path in Path("out").iterdir()) == [

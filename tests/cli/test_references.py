@@ -1,6 +1,7 @@
 """The library: listed, checked and emptied."""
 
 import json
+import re
 from pathlib import Path
 
 import pytest
@@ -91,10 +92,21 @@ def test_what_is_not_there_is_not_asked_about(
     assert (library / "good.gpkg").exists()
 
 
-def test_what_is_replaced_is_said(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+def test_a_reference_is_replaced_only_if_the_user_says_so(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """It used to be replaced with a message where nobody could be asked."""
     write_streets(tmp_path / "a.gpkg")
-    build = ["index", "--roads", str(tmp_path / "a.gpkg"), "--out", str(tmp_path / "ref.gpkg")]
+    made = tmp_path / "ref.gpkg"
+    build = ["index", "--roads", str(tmp_path / "a.gpkg"), "--out", str(made)]
     assert main(build) == 0
-    assert "replaces" not in capsys.readouterr().err
-    assert main(build) == 0
-    assert f"replaces {tmp_path / 'ref.gpkg'}, a reference of " in capsys.readouterr().err
+    capsys.readouterr()
+    before = made.stat()
+    assert main(build) == 1
+    told = capsys.readouterr().err
+    assert re.fullmatch(rf"Error: {re.escape(str(made))}: is a reference of \d+ intersections; .* --replace.*\n", told)
+    assert made.stat() == before
+    assert main([*build, "--replace", "--quiet"]) == 0
+    assert made.stat().st_ino != before.st_ino
+    made.write_bytes(b"damaged")
+    assert main([*build, "--quiet"]) == 0

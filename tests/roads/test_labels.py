@@ -12,7 +12,7 @@ import shapely
 import roadgeo
 from roadgeo.reference.network_file import _texts, read_network
 from roadgeo.sources.roads import read_roads
-from roadgeo.workflows import build_reference, update_reference
+from roadgeo.workflows import build_reference
 
 AT = 100.0 * np.arange(6)
 STREETS = [[(x, 0), (x, 500)] for x in AT] + [[(0, y), (500, y)] for y in AT]
@@ -64,18 +64,6 @@ def test_files_and_cut_files_keep_them_too(tmp_path: Path) -> None:
     assert list(whole.names) == [name or "" for name in NAMES]
     assert len(cut) == len(cut.names) == 9
     assert set(cut.names) == {*(name or "" for name in NAMES)} - {"3. Straße", "4. Straße", "5. Straße"}
-
-
-def test_an_update_keeps_the_names_of_the_rest(tmp_path: Path) -> None:
-    build_reference(streets(), path=tmp_path / "a.gpkg")
-    renamed = streets(["new"] * 12).iloc[[0, 1, 6, 7, 8, 9, 10, 11]]
-    renamed.geometry = renamed.geometry.apply(lambda line: shapely.clip_by_rect(line, 529990, 4555990, 530110, 4556510))
-    (tmp_path / "new").mkdir()
-    renamed.to_file(tmp_path / "new" / "b.gpkg")
-    update_reference(tmp_path / "a.gpkg", read_roads(tmp_path / "new" / "b.gpkg"))
-    named = {name for name, _, (x, _) in roads_of(tmp_path / "a.gpkg") if x > 530250}
-    assert named >= {"4. Straße", "Main St", "O'Brien <&> Co"}
-    assert "new" in {name for name, _, _ in roads_of(tmp_path / "a.gpkg")}
 
 
 def test_references_without_names_are_as_before(tmp_path: Path) -> None:

@@ -368,7 +368,7 @@ def test_what_needs_one_piece_says_so(sharded, asked, capsys):
         (["--shards", "many", "--roads", "x"], "expected auto, a number, or a side"),
         (["--shards", "4", "--osm", "Boston"], "--shards goes with --roads"),
         (["--shards", "4", "--roads", "x", "--out", "a.gpkg"], "did you mean a.shards"),
-        (["--shards", "4", "--roads", "x", "--update"], "--update changes a reference of one piece"),
+        (["--shards", "4", "--roads", "x", "--coarse"], "--shards makes a coarse map beside the shards"),
     ],
 )
 def test_what_cannot_be_asked_is_a_usage_error(given, told, capsys):

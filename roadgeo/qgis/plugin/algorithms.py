@@ -137,7 +137,7 @@ class BuildReference(RoadgeoAlgorithm):
             name = name or values.get("String", "PLACE") or values.layer_name("ROADS")
             if not name:
                 raise QgsProcessingException("Give the reference a name")
-        to = ([f"--out={path}"] if path else []) + ([f"--name={name}"] if name else [])
+        to = ([f"--out={path}", "--replace"] if path else []) + ([f"--name={name}"] if name else [])
         session.call("index", *to, *self.arguments(values))
         if session.feedback.isCanceled():
             return {}
