@@ -348,6 +348,7 @@ def _tangent_layer(found: Intersections, plane: LocalPlane) -> Layer:
         plane.crs,
         draw_line("242,166,90", 0.25),
         f"Tangents of the intersections, {_TANGENT_LINE_M:.0f} m of each",
+        indexed=False,  # to look at, at a few intersections
     )
 
 

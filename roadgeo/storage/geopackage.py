@@ -23,7 +23,6 @@ from roadgeo.errors import CrsError, IndexFormatError, OutputError
 from roadgeo.storage.crs import known_crs
 from roadgeo.storage.files import replacing
 from roadgeo.storage.geopackage_sql import NOW, RTREE_TRIGGERS, SCHEMA, STYLES_SCHEMA
-from roadgeo.storage.rtree import pack_rtree
 from roadgeo.storage.sqlite import opened, table_problem
 
 __all__ = [
@@ -69,6 +68,8 @@ class Layer:
         Anything pyproj understands ("EPSG:32619", WKT2), or `PIXELS`.
     style : str
         QML: how QGIS draws the layer when it opens it. Empty: QGIS chooses.
+    indexed : bool
+        Whether the layer has a spatial index; the index takes about as long to write as the rows.
     """
 
     name: str
@@ -78,6 +79,7 @@ class Layer:
     crs: str = PIXELS
     style: str = ""
     description: str = ""
+    indexed: bool = True
 
 
 def write_layers(path: str | os.PathLike[str], layers: Sequence[Layer]) -> None:
@@ -220,11 +222,14 @@ class _Table:
     crs: str
     styled: bool
     description: str
+    indexed: bool
 
     @classmethod
     def of(cls, layer: Layer) -> _Table:
         columns = tuple((name, _sql_type(values)) for name, values in layer.columns.items())
-        return cls(layer.name, layer.geometry_type, columns, layer.crs, bool(layer.style), layer.description)
+        return cls(
+            layer.name, layer.geometry_type, columns, layer.crs, bool(layer.style), layer.description, layer.indexed
+        )
 
 
 def _srs_ids(tables: Sequence[_Table]) -> dict[str, int]:
@@ -282,6 +287,8 @@ def _make_table(database: sqlite3.Connection, table: _Table, srs_id: int) -> Non
         return
     entry = (table.name, table.geometry_type, srs_id)
     database.execute("INSERT INTO gpkg_geometry_columns VALUES (?, 'geom', ?, ?, 0, 0)", entry)
+    if not table.indexed:
+        return
     # Without SQLite's rtree module the file is as valid, only slower to pan over.
     with suppress(sqlite3.OperationalError):
         database.execute(f'CREATE VIRTUAL TABLE "rtree_{table.name}_geom" USING rtree(id, minx, maxx, miny, maxy)')
@@ -311,7 +318,8 @@ def _fill_tables(
             update = "UPDATE gpkg_contents SET min_x = ?, min_y = ?, max_x = ?, max_y = ? WHERE table_name = ?"
             database.execute(update, (*extent, table.name))
             if table.name in indexed:
-                _fill_spatial_index(database, f"rtree_{table.name}_geom", bounds)
+                boxes = zip(range(1, len(bounds) + 1), *bounds.T.tolist(), strict=True)
+                database.executemany(f'INSERT INTO "rtree_{table.name}_geom" VALUES (?, ?, ?, ?, ?)', boxes)
         if table.name in indexed:
             database.executescript(RTREE_TRIGGERS.format(t=table.name))
     if styled := [(layer.name, layer.name, layer.style) for layer in layers if layer.style]:
@@ -336,18 +344,6 @@ def _fill_table(database: sqlite3.Connection, table: _Table, layer: Layer, srs_i
         rows = zip(range(1, len(values[0]) + 1), *values, strict=True)
         database.executemany(f"INSERT INTO {_quoted(table.name)} VALUES ({marks})", rows)
     return bounds
-
-
-def _fill_spatial_index(database: sqlite3.Connection, table: str, bounds: FloatArray) -> None:
-    """Fill the tables behind an empty R-tree; inserting into it would take as long as all else."""
-    (node_size,) = database.execute(f'SELECT length(data) FROM "{table}_node" WHERE nodeno = 1').fetchone()
-    tree = pack_rtree(bounds, node_size)
-    raw = tree.nodes.tobytes()
-    blobs = (raw[i : i + node_size] for i in range(0, len(raw), node_size))
-    database.executemany(f'REPLACE INTO "{table}_node" VALUES (?, ?)', enumerate(blobs, 1))
-    parents = list(enumerate(tree.parents.tolist(), 1))[1:]
-    database.executemany(f'INSERT INTO "{table}_parent" VALUES (?, ?)', parents)
-    database.executemany(f'INSERT INTO "{table}_rowid" VALUES (?, ?)', enumerate(tree.leaves.tolist(), 1))
 
 
 def _sql_type(values: Sequence[Any] | AnyArray) -> str:
