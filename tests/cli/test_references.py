@@ -74,7 +74,7 @@ def test_kinds_that_no_column_tells_are_not_claimed(
     write_streets(known)
     for files, told in (([bare], "not known, all lines of bare.gpkg were taken"), ([bare, known], "drivable; of bare")):
         named = [part for file in files for part in ("--roads", str(file))]
-        assert main(["index", *named, "--out", str(tmp_path / "ref.gpkg")]) == 0
+        assert main(["index", *named, "--out", str(tmp_path / "ref.gpkg"), "--replace"]) == 0
         capsys.readouterr()
         assert caplog.text.count("bare.gpkg: no column tells what kind of road a line is") == 1
         caplog.clear()
