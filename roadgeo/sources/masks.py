@@ -1,4 +1,4 @@
-"""Where a query mask enters: any raster that GDAL or OpenCV reads becomes a `RoadMask`."""
+"""Where a query mask enters: any raster that GDAL reads becomes a `RoadMask`."""
 
 from __future__ import annotations
 
@@ -8,10 +8,8 @@ import os
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from dataclasses import dataclass, replace
-from pathlib import Path
 from typing import TYPE_CHECKING
 
-import cv2
 import numpy as np
 
 from roadgeo._arrays import AnyArray, BoolArray
@@ -29,11 +27,8 @@ from roadgeo.roads.thresholds import (
     spread_probability,
 )
 from roadgeo.roads.vectorization import road_width
-from roadgeo.storage.gdal import is_named_remote
-from roadgeo.storage.orientation import read_orientation, turn_upright
 from roadgeo.storage.rasters import MAX_SIDE as MAX_RASTER_SIDE
-from roadgeo.storage.rasters import image_size, open_raster, read_palette, require_file, sidecar_nodata
-from roadgeo.storage.silence import silenced
+from roadgeo.storage.rasters import open_raster, sidecar_nodata
 
 if TYPE_CHECKING:
     from rasterio import DatasetReader
@@ -51,13 +46,7 @@ _MAX_BANDS = 3  # of a mask, unless one of them is chosen
 _STRIP_PIXELS = 1 << 25  # rows are read and thresholded in strips of this size
 _SAMPLE_PIXELS = 1 << 18  # size of the sample by which a mask's values are interpreted
 _MIDDLE_PIXELS = 1 << 22  # and, where neighbours matter, of a sample of the middle rows
-_OPENCV_BYTES = 1 << 25  # larger files are read window by window, by GDAL
 _MAX_ROAD_SHARE = 0.35  # of a frame
-
-#: OpenCV reads what is no larger than this when decoded: importing rasterio would take longer than reading the mask.
-_MAX_DECODED_BYTES = 1 << 29
-_PNG_MAGIC, _PNG_END = b"\x89PNG\r\n\x1a\n", b"IEND"
-_PNG_COLOURS, _PALETTE = 25, 3  # offset of a PNG's colour type, and its value for palettes
 
 #: Larger values, whatever their sign, stand for no value: the least number of a type is often written for nodata.
 _MAX_VALUE = 1e30
@@ -355,61 +344,10 @@ def _without_border(
 def _open(source: str | os.PathLike[str] | AnyArray, band: int | None, name: str | None) -> Iterator[_Raster]:
     """Open a source for reading."""
     if not isinstance(source, str | os.PathLike):
-        yield _of_array(np.ma.asanyarray(source), band, name or "array", alpha=False)
+        yield _of_array(np.ma.asanyarray(source), band, name or "array")
         return
-    path = os.fspath(source)
-    name = name or path
-    if not is_named_remote(path):
-        require_file(path, name)
-        image = _read_with_opencv(path, name)
-        if image is not None:
-            yield _of_array(image, band, name, alpha=image.ndim == 3 and image.shape[2] == 4)
-            return
-    with open_raster(path, name) as dataset:
-        yield _of_dataset(dataset, band, name, sidecar_nodata(path))
-
-
-def _read_with_opencv(path: str, name: str) -> AnyArray | None:
-    """Decode a PNG, JPEG or BMP without side files; None where GDAL has to, or can in less memory."""
-    size = image_size(Path(path))
-    if size is not None:
-        _require_size(name, size[1], size[0], MAX_RASTER_SIDE)
-    if size is None or max(size[:2]) > MAX_SIDE or size[2] > _MAX_DECODED_BYTES:
-        return None
-    if Path(path + ".aux.xml").exists() or _is_large(path):
-        return None
-    content = np.fromfile(path, np.uint8)
-    is_png = content[: len(_PNG_MAGIC)].tobytes() == _PNG_MAGIC
-    image = None
-    if not is_png or _is_whole_png(content.data):
-        with contextlib.suppress(cv2.error), silenced():
-            image = cv2.imdecode(content, cv2.IMREAD_UNCHANGED)  # as it is stored
-    if is_png and image is None:  # GDAL would read the rest as black
-        raise MaskError(f"{name}: a PNG that is damaged or cut short; copy or export it again")
-    if image is None:
-        return None
-    if is_png and content[_PNG_COLOURS] == _PALETTE and image.shape[2:] == (3,) and _n_colours(image) == 3:
-        with open_raster(path, name) as dataset:  # OpenCV does not return the palette's index
-            labels: AnyArray = dataset.read(1)
-        return labels if are_labels(labels) else image
-    return np.ascontiguousarray(turn_upright(image, read_orientation(path)))
-
-
-def _n_colours(image: AnyArray) -> int:
-    """Count the colours of an (H, W, 3) image of 8 bits, in some of its rows."""
-    numbers = image.astype(np.uint32) @ np.array([1 << 16, 1 << 8, 1], np.uint32)
-    return len(np.unique(numbers[:: max(1, len(numbers) // 512)]))
-
-
-def _is_whole_png(content: memoryview) -> bool:
-    """Whether all chunks lie within a PNG, the last of them too: for one that claims a gigabyte, that is allocated."""
-    at = len(_PNG_MAGIC)
-    while at + 12 <= len(content):
-        size, kind = int.from_bytes(content[at : at + 4], "big"), bytes(content[at + 4 : at + 8])
-        at += 12 + size
-        if kind == _PNG_END:
-            return at <= len(content)
-    return False
+    with open_raster(source, name) as dataset:
+        yield _of_dataset(dataset, band, name or os.fspath(source), sidecar_nodata(source))
 
 
 def _require_size(name: str, height: int, width: int, most: int) -> None:
@@ -443,12 +381,8 @@ def _require_mask(raster: _Raster) -> None:
     raise MaskError(many)
 
 
-def _is_large(path: str) -> bool:
-    return Path(path).stat().st_size > _OPENCV_BYTES
-
-
-def _of_array(array: AnyArray, band: int | None, name: str, *, alpha: bool) -> _Raster:
-    """Wrap an (H, W) or (H, W, bands) array; its last band may be alpha."""
+def _of_array(array: AnyArray, band: int | None, name: str) -> _Raster:
+    """Wrap an (H, W) or (H, W, bands) array."""
     if array.ndim not in (2, 3) or array.dtype.kind not in "biuf" or array.size == 0:
         raise MaskError(
             f"{name}: an array of shape {array.shape} and type {array.dtype}; expected (rows, columns) or "
@@ -457,8 +391,6 @@ def _of_array(array: AnyArray, band: int | None, name: str, *, alpha: bool) -> _
     whole = array if array.ndim == 3 else array[..., None]
     data = np.ma.getdata(whole)
     valid = np.asarray(~np.ma.getmaskarray(whole).any(axis=2)) if np.ma.is_masked(whole) else None
-    if alpha:
-        data, valid = data[..., :-1], data[..., -1] > 0
     chosen = _bands(name, band, data.shape[2])
     n_unread = 0 if band is not None else data.shape[2] - len(chosen)
     data = data[..., chosen]
@@ -469,7 +401,7 @@ def _of_array(array: AnyArray, band: int | None, name: str, *, alpha: bool) -> _
         rows = slice(top, bottom, step)
         return data[rows, ::step], None if valid is None else valid[rows, ::step]
 
-    return _Raster(name, (data.shape[0], data.shape[1]), data.shape[2], read, alpha, n_unread)
+    return _Raster(name, (data.shape[0], data.shape[1]), data.shape[2], read, n_unread=n_unread)
 
 
 def _of_dataset(dataset: DatasetReader, band: int | None, name: str, nodata: float | None) -> _Raster:
@@ -486,9 +418,7 @@ def _of_dataset(dataset: DatasetReader, band: int | None, name: str, nodata: flo
     kinds = {str(dataset.dtypes[i - 1]) for i in chosen}
     if not all(kind.startswith(("bool", "int", "uint", "float")) for kind in kinds):
         raise MaskError(f"{name}: holds values of type {', '.join(sorted(kinds))}; expected real numbers")
-    palette = _palette_of_picture(dataset) if len(colour) == 1 else None
-    if palette is not None and are_labels(dataset.read(colour[0])):
-        palette = None
+    palette = _palette(dataset, colour[0]) if len(colour) == 1 else None
     all_valid = MaskFlags.all_valid in list(dataset.mask_flag_enums)[chosen[0] - 1]
 
     def read(top: int, bottom: int, step: int) -> tuple[AnyArray, BoolArray | None]:
@@ -499,11 +429,14 @@ def _of_dataset(dataset: DatasetReader, band: int | None, name: str, nodata: flo
         if nodata is not None and dataset.nodata is None:
             known = (values != nodata).all(axis=2)
             valid = known if valid is None else valid & known
-        return values if palette is None else palette[values[..., 0]], valid
+        if palette is None:
+            return values, valid
+        shown = palette[values[..., 0]]
+        return shown[..., :3], shown[..., 3] > 0 if valid is None else valid & (shown[..., 3] > 0)
 
-    has_alpha = len(colour) < dataset.count
+    has_alpha = len(colour) < dataset.count or (palette is not None and not palette[:, 3].all())
     n_unread = 0 if band is not None else len(colour) - len(chosen)
-    n_bands = len(chosen) if palette is None else palette.shape[1]
+    n_bands = len(chosen) if palette is None else 3
     return _Raster(name, (dataset.height, dataset.width), n_bands, read, has_alpha, n_unread, _model_threshold(dataset))
 
 
@@ -518,10 +451,16 @@ def _model_threshold(dataset: DatasetReader) -> float | None:
     return None
 
 
-def _palette_of_picture(dataset: DatasetReader) -> AnyArray | None:
-    """Return (256, 3) colours of more kinds than classes have; None where values mean what they are."""
-    palette = read_palette(dataset) if dataset.dtypes[0] == "uint8" else None
-    return palette if palette is not None and len(np.unique(palette, axis=0)) > _MAX_CLASSES else None
+def _palette(dataset: DatasetReader, band: int) -> AnyArray | None:
+    """Return the (256, 4) colours that values stand for; None where the values mean what they are, as classes do."""
+    if dataset.dtypes[band - 1] != "uint8" or dataset.colorinterp[band - 1].name != "palette":
+        return None
+    colours = dataset.colormap(band)
+    palette = np.array([colours.get(value, (0, 0, 0, 255)) for value in range(256)], np.uint8)
+    used = np.unique(dataset.read(band))
+    shown = palette[used, :3]
+    is_picture = len(used) > _MAX_CLASSES or (shown == shown[:, :1]).all()  # or greys
+    return palette if is_picture and not are_labels(used) else None
 
 
 def _bands(name: str, band: int | None, n_bands: int) -> list[int]:

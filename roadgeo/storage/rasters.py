@@ -116,6 +116,8 @@ def open_raster(
         drivers = _drivers(Path(path), name, allowed_drivers() + ["VRT"] * is_ours)
     if not remote and drivers == ["JP2OpenJPEG"]:
         _require_boxes(Path(path), name)
+    if not remote and drivers == ["PNG"]:
+        _require_chunks(Path(path), name)
     with warnings.catch_warnings():
         warnings.simplefilter("ignore", NotGeoreferencedWarning)
         try:
@@ -298,6 +300,17 @@ def _require_boxes(path: Path, name: str) -> None:
                     raise MaskError(f"{name}: a JPEG 2000 that is damaged or cut short; copy or export it again")
                 within += [(at + head, at + size)] * (kind in _BOXES_OF_BOXES)
                 at += size
+
+
+def _require_chunks(path: Path, name: str) -> None:
+    """Refuse a PNG whose chunks do not lie within it, the last of them too: GDAL reads what is missing as black."""
+    with path.open("rb") as file:
+        at, end, kind = file.seek(8), path.stat().st_size, b""
+        while kind != b"IEND" and at <= end:
+            size, kind = struct.unpack(">I4s", file.read(8).ljust(8, b"\0"))
+            at = file.seek(at + 12 + size)
+        if at > end:
+            raise MaskError(f"{name}: a PNG that is damaged or cut short; copy or export it again")
 
 
 @contextmanager

@@ -4,8 +4,8 @@
 
 A writer replaces one reference by another again and again, and is killed (SIGKILL) at a random moment. Then the
 reference must be one of the two, with its own index or with none, in which case the index is built from the GeoPackage.
-With a COMMAND (such as `roadgeo index --roads R.gpkg --out REF.gpkg --replace`; the word REF stands for the reference) that is
-killed instead. The last, undisturbed writer must leave two files and nothing else.
+With a COMMAND (such as `roadgeo index --roads R.gpkg --out REF.gpkg --replace`; the word REF stands for the
+reference) that is killed instead. The last, undisturbed writer must leave two files and nothing else.
 """
 
 import argparse
