@@ -14,7 +14,7 @@ from typing import TYPE_CHECKING, Any, Literal, TypeAlias
 import numpy as np
 
 from roadgeo._arrays import AnyArray
-from roadgeo.errors import MaskError, NotLocatedError, OutputError, PluginError, how_to_install, name_extra
+from roadgeo.errors import MaskError, NotLocatedError, PluginError, name_extra
 from roadgeo.geometry.areas import Box
 from roadgeo.geometry.mask import RoadMask
 from roadgeo.location import Location
@@ -30,9 +30,9 @@ if TYPE_CHECKING:
 
     import networkx as nx
     import xarray as xr
-    from matplotlib.figure import Figure
 
     from roadgeo.flights.rows import Row
+    from roadgeo.outputs.plot import Plot
     from roadgeo.outputs.subject import Subject
     from roadgeo.running.verifying import Verified
 
@@ -100,25 +100,21 @@ class Answer(Location):
             raise PluginError("; ".join(written.faults))
         return written.files
 
-    def plot(self) -> Figure:
-        """Draw the mask and its place on the map, as a matplotlib figure.
+    def plot(self) -> Plot:
+        """Draw the mask's place on the map; notebooks show it.
 
-        >>> figure = roadgeo.locate("drone.png", "porto.gpkg").plot()
-        >>> figure.savefig("drone.pdf")
+        >>> roadgeo.locate("drone.png", "porto.gpkg").plot().save("drone.svg")
 
         Raises
         ------
         NotLocatedError
             There is no place.
-        OutputError
-            matplotlib is missing.
         """
-        from roadgeo.outputs.figure import draw_figure, has_matplotlib
+        from roadgeo.outputs.drawing.views import Shown
+        from roadgeo.outputs.plot import draw_plot
 
-        if not has_matplotlib():
-            raise OutputError(f"plot() needs matplotlib: {how_to_install('plot')}")
         subject = self._subject()
-        return draw_figure(self, self.mask, subject.roads, subject.attribution)
+        return draw_plot(Shown.of(self, self.mask, subject.index, attribution=subject.attribution))
 
     def to_xarray(self) -> xr.DataArray:
         """Return the mask on the map, dimensions y and x: 0 outside the footprint, 1 ground, 2 road.

@@ -31,7 +31,6 @@ __all__ = [
 _EXTRAS = {
     "geopandas": "maps",
     "mapbox_vector_tile": "serve",
-    "matplotlib": "plot",
     "networkx": "maps",
     "onnxruntime": "segment",
     "osmium": "maps",

@@ -42,7 +42,7 @@ def test_the_conda_recipe_is_of_this_version_and_needs_the_same() -> None:
 def test_a_missing_package_is_named_with_the_extra_that_brings_it() -> None:
     extras = PROJECT["optional-dependencies"]
     brought = {"geopandas": ("geopandas", "pandas", "pyogrio"), "protobuf": ()}
-    for extra in ("maps", "track", "serve", "segment", "plot", "mavlink"):
+    for extra in ("maps", "track", "serve", "segment", "mavlink"):
         for package in (re.match(r"[\w-]+", one)[0] for one in extras[extra]):
             for name in brought.get(package, (package.replace("-", "_"),)):
                 told = str(name_extra(ModuleNotFoundError(name=f"{name}.part")))
@@ -68,7 +68,7 @@ def test_the_constraints_pin_every_package_within_its_bounds() -> None:
 WITHOUT_EXTRAS = """
 import sys
 for name in ("scipy", "geopandas", "pandas", "pyogrio", "pyarrow", "shapely", "osmnx", "networkx", "osmium",
-             "starlette", "uvicorn", "matplotlib", "mapbox_vector_tile", "python_multipart", "dask"):
+             "starlette", "uvicorn", "mapbox_vector_tile", "python_multipart", "dask"):
     sys.modules[name] = None
 from roadgeo.cli import main
 sys.exit(main(sys.argv[1:]))

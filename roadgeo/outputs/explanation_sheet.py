@@ -5,7 +5,7 @@ from __future__ import annotations
 import json
 import math
 from collections.abc import Sequence
-from dataclasses import dataclass, fields
+from dataclasses import fields
 from pathlib import Path
 
 import cv2
@@ -19,38 +19,21 @@ from roadgeo.geometry.mask import RoadMask, plane_to_pixel
 from roadgeo.matching.explanation import Explanation, Funnel, RejectedPlace, Story
 from roadgeo.matching.index import ReferenceIndex
 from roadgeo.matching.scene import Scene
-from roadgeo.outputs.canvas import (
-    FAINT_INK,
-    FRAME,
-    INK,
-    LIT,
-    MAP_ROAD,
-    MATCH,
-    PAPER,
-    QUERY_ROAD,
-    SHIFT,
-    Color,
-    draw_dots,
-    draw_outline,
-    fixed_point,
-    touching,
-    write_png,
-    write_text,
-)
+from roadgeo.outputs.drawing.layers import Color, Dots, Layer, Lines, Ring, rgb
+from roadgeo.outputs.drawing.raster import FAINT, INK, Canvas, blank, draw_legend, write_png, write_text
+from roadgeo.outputs.drawing.views import Shown, ViewOptions, Window, frame_layers, map_layer
 from roadgeo.outputs.names import bare_command, bare_name, without_folders
 from roadgeo.outputs.subject import Subject
 from roadgeo.outputs.wording import format_lonlat
 
 __all__ = ["draw_explanation", "write_explanation", "write_explanation_picture"]
 
-AGREES: Color = (0, 128, 128)
-ROAD_PIXEL: Color = (206, 208, 210)
-UNSEEN: Color = (228, 224, 214)
 BAR: Color = (150, 178, 204)
-STARVED: Color = (200, 66, 40)
+STARVED: Color = rgb("bad")
 
 _WIDTH, _MARGIN, _HEAD = 2000, 30, 96
 _MASK = 840  # side of the panel that shows the mask
+_PLACE_VERTICES = 20_000  # of the map's roads in the picture of a place
 _CAPTION = 132  # height of the text below a place
 
 #: Names of the stages of `Funnel` in the picture.
@@ -105,50 +88,40 @@ def draw_explanation(explanation: Explanation, mask: RoadMask, index: ReferenceI
     """
     told = explanation.stories
     story = next((one for one in told if one.reference == index.name), told[0])
-    seen = _draw_seen(explanation.scene, mask, list(explanation.graph.polylines()))
-    left = np.vstack([seen, _draw_funnel(story)])
-    places = _draw_places(story.places, explanation.scene, index)
-    notes = _draw_notes(story)
-    right = np.vstack([places, notes])
+    left = np.vstack([_draw_seen(explanation, mask, index), _draw_funnel(story)])
+    right = np.vstack([_draw_places(story.places, explanation.scene, index), _draw_notes(story)])
     height = max(len(left), len(right))
-    picture = np.full((_HEAD + height + _MARGIN, _WIDTH, 3), LIT, np.uint8)
+    picture = blank(_HEAD + height + _MARGIN, _WIDTH)
     picture[_HEAD : _HEAD + len(left), _MARGIN : _MARGIN + left.shape[1]] = left
     picture[_HEAD : _HEAD + len(right), -right.shape[1] - _MARGIN : -_MARGIN] = right
     location = explanation.location
     name = Path(location.query).name or "mask"
     title = f"{name} on {story.reference}: {location.status.replace('_', ' ')}"
     write_text(picture, title, (_MARGIN, 42), 30, INK, bold=True)
-    write_text(picture, _shorten(location.reason, 150), (_MARGIN, 78), 21, FAINT_INK)
+    write_text(picture, _shorten(location.reason, 150), (_MARGIN, 78), 21, FAINT)
     attribution = str(index.meta.get("attribution", ""))
-    write_text(picture, attribution, (_WIDTH - right.shape[1] - _MARGIN, len(picture) - 12), 14, FAINT_INK)
+    write_text(picture, attribution, (_WIDTH - right.shape[1] - _MARGIN, len(picture) - 12), 14, FAINT)
     return picture
 
 
 # --- the mask ---------------------------------------------------------------------------------------------------------
 
 
-def _draw_seen(scene: Scene, mask: RoadMask, lines: Sequence[FloatArray]) -> AnyArray:
+def _draw_seen(explanation: Explanation, mask: RoadMask, index: ReferenceIndex) -> AnyArray:
     """Draw the mask, its traced roads and its intersections, and a line of numbers below."""
-    rows, columns = mask.shape
-    scale = _MASK / max(rows, columns)
-    size = (max(round(columns * scale), 1), max(round(rows * scale), 1))
-    roads = cv2.resize(mask.roads.view(np.uint8) * np.uint8(255), size, interpolation=cv2.INTER_AREA)[..., None] / 255
-    small = np.rint(np.array(PAPER) * (1 - roads) + np.array(ROAD_PIXEL) * roads).astype(np.uint8)
-    if mask.observed is not None:
-        unseen = cv2.resize((~mask.observed).view(np.uint8), size, interpolation=cv2.INTER_NEAREST) > 0
-        small[unseen] = UNSEEN
-
-    def pixels(xy: FloatArray) -> AnyArray:
-        return fixed_point(plane_to_pixel(xy) * scale - 0.5)
-
-    cv2.polylines(small, [pixels(line) for line in lines], False, QUERY_ROAD, 1, cv2.LINE_AA, SHIFT)
-    n = len(scene.intersections)
-    draw_dots(small, pixels(scene.intersections.xy), 3.2 if n < 200 else 1.8 if n < 1000 else 0.8)
-    panel = np.full((_MASK + 40, _MASK, 3), LIT, np.uint8)
-    top, left = (_MASK - size[1]) // 2, (_MASK - size[0]) // 2
-    panel[top : top + size[1], left : left + size[0]] = small
+    scene, location = explanation.scene, explanation.location
+    lines = [plane_to_pixel(line) for line in explanation.graph.polylines()]
+    crossings = plane_to_pixel(scene.intersections.xy)
+    shown = Shown(location, mask, index, ViewOptions(), None, lines, crossings, None, "")
+    canvas = Canvas.of(shown.box, _MASK, _MASK)
+    drawn = [layer for layer in frame_layers(shown) if layer.name in {"picture", "query-roads"}]
+    canvas.draw([*drawn, Layer("matches", "", [Dots(crossings)])])
+    panel, image = blank(_MASK + 40, _MASK), canvas.image[:_MASK, :_MASK]
+    top, left = (_MASK - len(image)) // 2, (_MASK - image.shape[1]) // 2
+    panel[top : top + len(image), left : left + image.shape[1]] = image
     unseen_share = 1.0 - float(scene.observed.mean())
-    numbers = f"{columns} x {rows} px   ·   {counted(n, 'intersection')}   ·   {counted(scene.n_edges, 'road')}"
+    numbers = f"{shown.size[0]} x {shown.size[1]} px   ·   {counted(len(crossings), 'intersection')}"
+    numbers += f"   ·   {counted(scene.n_edges, 'road')}"
     if unseen_share > 0.01:
         numbers += f"   ·   {unseen_share:.0%} not observed"
     write_text(panel, numbers, (0, _MASK + 28), 19, INK)
@@ -158,7 +131,7 @@ def _draw_seen(scene: Scene, mask: RoadMask, lines: Sequence[FloatArray]) -> Any
 def _draw_funnel(story: Story) -> AnyArray:
     """Draw a bar for each stage; its length is the logarithm of the number of candidates left."""
     stages = [field.name for field in fields(Funnel)]
-    panel = np.full((40 + 29 * len(stages), _MASK, 3), LIT, np.uint8)
+    panel = blank(40 + 29 * len(stages), _MASK)
     write_text(panel, "How far the search got", (0, 24), 21, INK, bold=True)
     most = max(max(getattr(story.funnel, stage) for stage in stages), 10)
     for i, stage in enumerate(stages):
@@ -176,31 +149,16 @@ def _draw_funnel(story: Story) -> AnyArray:
 # --- the places -------------------------------------------------------------------------------------------------------
 
 
-@dataclass(frozen=True)
-class _Tile:
-    """A square picture of the map; pixel = (plane - low) * scale, rows downwards."""
-
-    image: AnyArray
-    low: FloatArray
-    scale: float
-
-    def pixels(self, xy: FloatArray) -> AnyArray:
-        """Take plane positions (..., 2) to fixed-point pixels."""
-        at = (xy - self.low) * self.scale
-        at[..., 1] = len(self.image) - at[..., 1]
-        return fixed_point(np.clip(at - 0.5, -20_000, 20_000))
-
-
 def _draw_places(places: Sequence[RejectedPlace], scene: Scene, index: ReferenceIndex) -> AnyArray:
     width = _WIDTH - _MASK - 3 * _MARGIN
     if not places:
-        panel = np.full((160, width, 3), PAPER, np.uint8)
-        write_text(panel, "No place got as far as being compared with the map.", (_MARGIN, 90), 22, FAINT_INK)
+        panel = blank(160, width, rgb("paper"))
+        write_text(panel, "No place got as far as being compared with the map.", (_MARGIN, 90), 22, FAINT)
         return panel
     columns = min(max(len(places), 2), 3)
     side = (width - (columns - 1) * _MARGIN) // columns
     rows = -(-len(places) // columns)
-    panel = np.full((rows * (side + _CAPTION), width, 3), LIT, np.uint8)
+    panel = blank(rows * (side + _CAPTION), width)
     for i, place in enumerate(places):
         top, left = i // columns * (side + _CAPTION), i % columns * (side + _MARGIN)
         panel[top : top + side, left : left + side] = _draw_place(place, scene, index, side)
@@ -209,22 +167,20 @@ def _draw_places(places: Sequence[RejectedPlace], scene: Scene, index: Reference
 
 
 def _draw_place(place: RejectedPlace, scene: Scene, index: ReferenceIndex, side: int) -> AnyArray:
-    low, high = place.footprint.min(axis=0), place.footprint.max(axis=0)
-    reach = 0.57 * float((high - low).max())
-    middle = (low + high) / 2
-    tile = _Tile(np.full((side, side, 3), PAPER, np.uint8), middle - reach, side / (2 * reach))
-    frame = tile.pixels(place.footprint)
-    cv2.fillPoly(tile.image, [frame], LIT, cv2.LINE_AA, SHIFT)
-    ends = index.segments.reshape(-1, 2, 2)
-    near = touching(ends, middle - reach, middle + reach)
-    width = int(np.clip(round(9.0 * tile.scale), 2, 9))
-    roads = list(tile.pixels(ends[near].astype(np.float64)))
-    cv2.polylines(tile.image, roads, False, MAP_ROAD, width, cv2.LINE_AA, SHIFT)
-    for agrees, color in ((False, QUERY_ROAD), (True, AGREES)):
-        strokes = _strokes(scene, place, place.agrees == agrees)
-        cv2.polylines(tile.image, list(tile.pixels(strokes)), False, color, 2, cv2.LINE_AA, SHIFT)
-    draw_outline(tile.image, frame)
-    return tile.image
+    """Draw the map around a place, and on it the mask's roads: (side, side, 3)."""
+    middle = place.footprint.min(axis=0) / 2 + place.footprint.max(axis=0) / 2
+    reach = 0.57 * float(np.ptp(place.footprint, axis=0).max())
+    # Its window in the map's CRS, as the layers have it, which is the plane shifted.
+    west, south = index.plane.to_crs(middle - reach).tolist()
+    window = Window(west, south + 2 * reach, 2 * reach, 2 * reach)
+    corners = window.place(index.plane.to_crs(place.footprint))
+    canvas = Canvas.of(window.box, side, side)
+    canvas.draw([Layer("ground", "", [Ring(corners)]), map_layer(index, window, window, _PLACE_VERTICES)])
+    for name, agrees in (("query-roads", False), ("agreeing-roads", True)):
+        strokes = window.place(index.plane.to_crs(_strokes(scene, place, place.agrees == agrees)))
+        canvas.draw([Layer(name, "", [Lines(list(strokes))])])
+    canvas.draw([Layer("footprint", "", [Ring(corners, up=True)])])
+    return canvas.image[:side, :side]
 
 
 def _strokes(scene: Scene, place: RejectedPlace, chosen: AnyArray) -> FloatArray:
@@ -238,10 +194,10 @@ def _strokes(scene: Scene, place: RejectedPlace, chosen: AnyArray) -> FloatArray
 def _caption(panel: AnyArray, origin: tuple[int, int], side: int, number: int, place: RejectedPlace) -> None:
     x, y = origin
     log10_odds = place.scored.log10_odds
-    odds = f"log10 odds {round(log10_odds, 1) + 0.0:.1f}" if math.isfinite(log10_odds) else "no fit"
+    odds = f"score {round(log10_odds, 1) + 0.0:.1f}" if math.isfinite(log10_odds) else "no fit"
     write_text(panel, f"{number}   {odds}", (x, y + 24), 19, INK, bold=True)
     where = f"{format_lonlat(place.center.lon, place.center.lat)}   ·   {place.camera.gsd_m:.2f} m/px"
-    write_text(panel, where, (x, y + 48), 15, FAINT_INK)
+    write_text(panel, where, (x, y + 48), 15, FAINT)
     for i, line in enumerate(_wrap(place.why, side // 8)[:3]):
         write_text(panel, line, (x, y + 70 + 19 * i), 15, INK)
 
@@ -253,7 +209,7 @@ def _draw_notes(story: Story) -> AnyArray:
     """Write the stage that failed, and the meaning of the colours."""
     width = _WIDTH - _MASK - 3 * _MARGIN
     lines = [line for note in story.missing for line in _bullet(note, width // 10)]
-    panel = np.full((114 + 27 * len(lines), width, 3), LIT, np.uint8)
+    panel = blank(114 + 27 * len(lines), width)
     y = 38
     if lines:
         write_text(panel, "What was missing", (0, y), 21, INK, bold=True)
@@ -261,18 +217,14 @@ def _draw_notes(story: Story) -> AnyArray:
     for line in lines:
         write_text(panel, line, (0, y), 18, INK)
         y += 27
-    x, y = 0, y + 18
-    keys = (
-        ("map", MAP_ROAD, 6),
-        ("mask, agrees", AGREES, 3),
-        ("mask, does not", QUERY_ROAD, 3),
-        ("frame, with its top", FRAME, 4),
-    )
-    for label, color, thickness in keys:
-        cv2.line(panel, (x + 3, y - 6), (x + 36, y - 6), color, thickness, cv2.LINE_AA)
-        x = write_text(panel, label, (x + 46, y), 17, INK) + 34
-    draw_dots(panel, np.array([[x + 6, y - 6]]) << SHIFT, 4.0)
-    write_text(panel, "intersection", (x + 20, y), 17, MATCH)
+    keys = [
+        Layer("map-roads", "map", [Lines([])]),
+        Layer("agreeing-roads", "mask, agrees", [Lines([])]),
+        Layer("query-roads", "mask, does not", [Lines([])]),
+        Layer("footprint", "frame, with its top", [Lines([])]),
+        Layer("matches", "intersection", [Dots(np.empty((0, 2)))]),
+    ]
+    draw_legend(panel, keys, 0, y + 18, 17)
     return panel
 
 

@@ -4,30 +4,31 @@ from __future__ import annotations
 
 from pathlib import Path
 
-import cv2
 import numpy as np
 
-from roadgeo._arrays import AnyArray, FloatArray
+from roadgeo._arrays import AnyArray
 from roadgeo.errors import OutputError
 from roadgeo.geometry.mask import RoadMask, plane_to_pixel
+from roadgeo.outputs.drawing import layers as drawn
+from roadgeo.outputs.drawing.layers import Color, Dots, Lines, Picture
+from roadgeo.outputs.drawing.raster import Canvas, write_png
+from roadgeo.outputs.drawing.views import mask_picture
 from roadgeo.outputs.orthophoto import read_preview
 from roadgeo.outputs.registry import VECTORIZED
 from roadgeo.roads.graph import RoadGraph
 from roadgeo.roads.intersections import Intersections
-from roadgeo.storage.files import write_bytes
+from roadgeo.storage.files import replacing
 from roadgeo.storage.geopackage import PIXELS, Layer, write_layers
 from roadgeo.storage.qml import draw_line, draw_marker
 
 __all__ = ["draw_vectorized", "write_vectorized"]
 
 _MAX_SIDE = 6000  # of the picture; larger masks are drawn reduced
-_STRIP_ROWS = 256
 
-# Colours as OpenCV orders them: blue, green, red.
-_SEEN = np.array((200, 60, 200))  # over a photograph
-_PALER, _TINT = 0.8, 0.4
-_GROUND, _ROAD, _UNSEEN = (30, 24, 20), (110, 104, 98), (70, 40, 40)
-_LINE, _RAY, _CENTRE = (40, 190, 255), (90, 90, 255), (255, 255, 255)
+#: Over a photograph: how much of it is left, and where the mask has roads.
+_PALER = 0.35
+_SEEN: Color = (200, 60, 200)
+_GREY: Color = (206, 208, 210)
 
 
 def write_vectorized(
@@ -79,11 +80,9 @@ def write_vectorized(
         ) from error
     package, picture = (folder / f"{stem}{VECTORIZED}{suffix}" for suffix in (".gpkg", ".png"))
     write_layers(package, _layers(graph, intersections, coarser))
-    ground = None if photo is None else read_preview(photo, _MAX_SIDE)[..., 2::-1]
-    encoded, content = cv2.imencode(".png", draw_vectorized(mask, graph, intersections, ground))
-    if not encoded:
-        raise OutputError(f"cannot encode {picture}")
-    write_bytes(picture, content.tobytes())
+    ground = None if photo is None else read_preview(photo, _MAX_SIDE)
+    with replacing(picture) as temporary:
+        write_png(temporary, draw_vectorized(mask, graph, intersections, ground))
     return [package, picture]
 
 
@@ -124,35 +123,30 @@ def _layers(graph: RoadGraph, intersections: Intersections, coarser: float) -> l
 def draw_vectorized(
     mask: RoadMask, graph: RoadGraph, intersections: Intersections, ground: AnyArray | None = None
 ) -> AnyArray:
-    """Draw roads and intersections over the mask, (H, W, 3) uint8, blue, green, red; reduced if it is large.
+    """Draw roads and intersections over the mask, (H, W, 3) uint8, red, green, blue; reduced if it is large.
 
-    `ground` is a photograph of the frame, of any size, to draw them over instead.
+    `ground` is a photograph of the frame, (h, w, 4) of any size, to draw them over.
     """
+    height, width = mask.shape
     scale = min(1.0, _MAX_SIDE / max(mask.shape))
-    roads = mask.roads.view(np.uint8) * np.uint8(255)
-    size = (max(round(mask.shape[1] * scale), 1), max(round(mask.shape[0] * scale), 1))
-    share = cv2.resize(roads, size, interpolation=cv2.INTER_AREA)
-    shown = None if ground is None else cv2.resize(ground, size, interpolation=cv2.INTER_AREA)
-    over, tint = (np.array(_ROAD), 1.0) if shown is None else (_SEEN, _TINT)
-    picture = np.empty((*share.shape, 3), np.uint8)
-    for top in range(0, len(share), _STRIP_ROWS):  # floating-point numbers of all of it would take gigabytes
-        strip = slice(top, top + _STRIP_ROWS)
-        below = np.array(_GROUND) if shown is None else _PALER * shown[strip]
-        picture[strip] = np.rint(below + tint * (share[strip, :, None] / 255.0) * (over - below))
-    if mask.observed is not None:
-        seen = cv2.resize(mask.observed.view(np.uint8), size, interpolation=cv2.INTER_NEAREST)
-        picture[seen == 0] = _UNSEEN
-    cv2.polylines(picture, [_fixed(line, scale) for line in graph.polylines()], False, _LINE, 1, cv2.LINE_AA, 4)
+    box = (0.0, 0.0, float(width), float(height))
     directions = np.stack((np.cos(intersections.rays), np.sin(intersections.rays)), axis=-1)
     tips = intersections.xy[:, None] + 12.0 / scale * directions
     rays = [np.stack((intersections.xy[i], tips[i, k])) for i, k in np.argwhere(np.isfinite(intersections.rays))]
-    cv2.polylines(picture, [_fixed(ray, scale) for ray in rays], False, _RAY, 1, cv2.LINE_AA, 4)
-    for column, row in _fixed(intersections.xy, scale)[:, 0].tolist():
-        cv2.circle(picture, (column, row), 3 * 16, _CENTRE, cv2.FILLED, cv2.LINE_AA, 4)
-    return np.asarray(picture)
-
-
-def _fixed(xy: FloatArray, scale: float) -> AnyArray:
-    """Take (V, 2) points of the query plane to OpenCV's (V, 1, 2) pixels from pixel centres, in sixteenths."""
-    sixteenths = np.rint((plane_to_pixel(xy) * scale - 0.5) * 16)
-    return np.asarray(sixteenths, np.int32)[:, None]
+    canvas = Canvas.of(box, 0, 0, scale)
+    if ground is not None:
+        paler = ground.copy()
+        paler[..., 3] = (paler[..., 3] * (1.0 - _PALER)).astype(np.uint8)
+        canvas.draw([drawn.Layer("picture", "", [Picture(paler, box)])])
+    seen = mask_picture(mask, _GREY if ground is None else _SEEN, _MAX_SIDE)
+    if ground is not None:
+        seen[..., 3] //= 3
+    canvas.draw(
+        [
+            drawn.Layer("picture", "", [Picture(seen, box)]),
+            drawn.Layer("query-roads", "", [Lines([plane_to_pixel(line) for line in graph.polylines()])]),
+            drawn.Layer("branches", "", [Lines([plane_to_pixel(ray) for ray in rays])]),
+            drawn.Layer("matches", "", [Dots(plane_to_pixel(intersections.xy))]),
+        ]
+    )
+    return canvas.image

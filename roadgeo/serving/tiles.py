@@ -13,7 +13,7 @@ from roadgeo._arrays import AnyArray, FloatArray
 from roadgeo.geometry.areas import Box
 from roadgeo.geometry.projection import from_lonlat, to_lonlat, transformer
 from roadgeo.matching.index import ReferenceIndex
-from roadgeo.outputs.report.svg import join_segments
+from roadgeo.outputs.drawing.svg import join_segments
 from roadgeo.reference.reference import AnyReference
 from roadgeo.reference.shards import ShardedReference
 

@@ -21,10 +21,10 @@ from roadgeo.geometry.mask import plane_to_pixel
 from roadgeo.geometry.projection import to_lonlat
 from roadgeo.geometry.warping import cover, warp
 from roadgeo.location import Location
+from roadgeo.outputs.drawing.views import Shown, ViewOptions
 from roadgeo.outputs.orthophoto import ImageOptions, choose_target, read_preview
 from roadgeo.outputs.paths import Placement, output_paths
 from roadgeo.outputs.registry import ALSO, FOOTPRINT, GEOPACKAGE, JSON, OVERLAY, REPORT, VRT, Output
-from roadgeo.outputs.report.views import ReportOptions, Shown
 from roadgeo.outputs.subject import Subject
 from roadgeo.reference.reference import AnyReference
 from roadgeo.running.looks import Sighting
@@ -66,7 +66,7 @@ def write_view(path: Path, sighting: Sighting, references: Sequence[AnyReference
     indexes = [one.index_of(location) for one in references]
     photo = path if sighting.of_photograph else None
     try:
-        shown: Shown | None = Shown.of(location, sighting.mask, indexes[0], photo, ReportOptions(picture_px=_SIDE), "")
+        shown: Shown | None = Shown.of(location, sighting.mask, indexes[0], photo, ViewOptions(picture_px=_SIDE), "")
     except MaskError:  # there is not a road in it
         shown = None
     _write_picture(folder / PICTURE, read_preview(path, _SIDE)[..., :3])

@@ -19,7 +19,8 @@ from roadgeo.matching.index import build_index
 from roadgeo.matching.methods import search_references
 from roadgeo.matching.scene import read_query
 from roadgeo.matching.search import SearchOptions
-from roadgeo.outputs.explanation_sheet import AGREES, STARVED, draw_explanation, write_explanation_picture
+from roadgeo.outputs.drawing.layers import rgb
+from roadgeo.outputs.explanation_sheet import STARVED, draw_explanation, write_explanation_picture
 from roadgeo.outputs.paths import output_paths
 from roadgeo.outputs.subject import Subject
 from roadgeo.reference.reference import Reference, build_network
@@ -201,7 +202,7 @@ class TestPicture:
         picture = draw_explanation(explain(mask, town), mask, town.index)
         assert picture.dtype == np.uint8
         assert picture.shape[1:] == (2000, 3)
-        assert (picture == AGREES).all(axis=2).sum() > 500
+        assert (picture == rgb("agree")).all(axis=2).sum() > 500
         assert not (picture == STARVED).all(axis=2).any()
 
     @pytest.mark.slow

@@ -1,3 +1,4 @@
+import xml.etree.ElementTree as ET
 from dataclasses import replace
 from pathlib import Path
 from types import SimpleNamespace
@@ -11,10 +12,15 @@ from roadgeo.errors import OutputError
 from roadgeo.geometry.homography import Homography
 from roadgeo.geometry.mask import RoadMask
 from roadgeo.geometry.projection import LocalPlane
-from roadgeo.outputs.overlay import FRAME, MATCH, QUERY_ROAD, PlotOptions, draw_overlay, write_overlay
+from roadgeo.location import Location
+from roadgeo.outputs.drawing.layers import rgb
+from roadgeo.outputs.drawing.views import Shown
+from roadgeo.outputs.overlay import PlotOptions, draw_overlay, write_overlay
 from roadgeo.outputs.paths import output_paths
+from roadgeo.outputs.plot import draw_plot
 from roadgeo.outputs.subject import Subject
 
+FRAME, MATCH, QUERY_ROAD, MAP_ROAD = map(rgb, ("frame", "match", "query", "map-road"))
 LETTERS = [True, False] if hasattr(cv2, "FontFace") else [False]
 
 
@@ -24,49 +30,63 @@ def map_roads() -> np.ndarray:
     return np.array([[*a, *b], [*b, *c], [0.0, 0.0, 1.0, 1.0]])
 
 
-def subject() -> Subject:
-    """What outputs show, on a map of those roads."""
+def city() -> SimpleNamespace:
+    """A map of those roads."""
     plane = LocalPlane(CRS, (531000.0, 4556000.0))
     segments = map_roads() - (531000.0, 4556000.0) * 2
-    index = SimpleNamespace(name="porto", meta={"attribution": "© them"}, plane=plane, segments=segments)
-    return Subject(located(), road_mask(), output_paths("", "a"), indexes=[index])
+    return SimpleNamespace(
+        name="porto", meta={"attribution": "© them"}, plane=plane, segments=segments, xy=segments[:1, :2]
+    )
+
+
+def subject() -> Subject:
+    """What outputs show, on that map."""
+    return Subject(located(), road_mask(), output_paths("", "a"), indexes=[city()])
+
+
+def shown(location: Location | None = None, mask: RoadMask | None = None, photo: np.ndarray | None = None) -> Shown:
+    """What pictures show, on that map."""
+    location, mask = location or located(), mask or road_mask()
+    of = Shown.of(replace(location, seen=None), road_mask(), city(), attribution="© them")
+    return replace(of, mask=mask, location=location, photograph=photo)
 
 
 @pytest.mark.parametrize("truetype", LETTERS)
 def test_everything_is_drawn(truetype: bool, monkeypatch: pytest.MonkeyPatch) -> None:
     if not truetype:
         monkeypatch.delattr(cv2, "FontFace", raising=False)
-    picture = draw_overlay(located(), road_mask(), map_roads(), "© OpenStreetMap contributors", PlotOptions(map_px=600))
+    picture = draw_overlay(shown(), PlotOptions(map_px=600))
     assert picture.dtype == np.uint8
-    for color in (FRAME, MATCH, QUERY_ROAD):
+    for color in (FRAME, MATCH, QUERY_ROAD, MAP_ROAD):
         assert (picture == color).all(axis=2).sum() > 50
 
 
 @pytest.mark.parametrize("stretch", [(1.0, 1.0), (12.0, 1.0), (1.0, 12.0)])
 def test_a_long_footprint_still_makes_a_picture_of_bounded_size(stretch: tuple[float, float]) -> None:
     long = located(np.diag([*stretch, 1.0]) @ located().homography)
-    picture = draw_overlay(long, road_mask(), map_roads(), options=PlotOptions(map_px=500))
+    picture = draw_overlay(shown(long), PlotOptions(map_px=500))
     assert max(picture.shape) < 1000
 
 
-def test_a_location_without_evidence_is_drawn_without_roads() -> None:
-    picture = draw_overlay(replace(located(), evidence=None), road_mask(), np.empty((0, 4)))
+def test_a_location_without_evidence_is_drawn_without_matches() -> None:
+    picture = draw_overlay(shown(replace(located(), evidence=None)))
     assert (picture == FRAME).all(axis=2).any()
+    assert not (picture == MATCH).all(axis=2).any()
 
 
 @pytest.mark.parametrize("shape", [(40, 60), (400, 600), (900, 300)])
 def test_a_photograph_is_drawn_above_its_mask_and_what_is_transparent_is_not(shape: tuple[int, int]) -> None:
     photo = np.full((*shape, 4), (10, 200, 30, 255), np.uint8)
     photo[:, shape[1] // 2 :, 3] = 0
-    with_it = draw_overlay(located(), road_mask(), map_roads(), photo=photo)
-    without = draw_overlay(located(), road_mask(), map_roads())
+    with_it = draw_overlay(shown(photo=photo))
+    without = draw_overlay(shown())
     assert with_it.shape == without.shape
     green = np.argwhere((with_it == (10, 200, 30)).all(axis=2))
     width = 0.6 * PlotOptions.map_px
     assert len(green) > 0.02 * width**2
     assert green[:, 1].max() < 0.6 * width  # half of it is transparent
     assert green[:, 0].max() < 0.55 * len(with_it)  # above the mask
-    mask = np.argwhere((with_it[:, : int(width)] == 60).all(axis=2))
+    mask = np.argwhere((with_it[:, : int(width)] == MATCH).all(axis=2))
     assert mask[:, 0].min() > green[:, 0].max()
 
 
@@ -76,10 +96,10 @@ def test_nothing_is_drawn_over_the_title_or_the_legend(shape: tuple[int, int], w
     photo = np.full((*shape, 4), (10, 200, 30, 255), np.uint8) if with_photo else None
     mask = RoadMask(np.ones(shape, np.bool_))
     options = PlotOptions()
-    picture = draw_overlay(replace(located(), evidence=None), mask, np.empty((0, 4)), "© them", options, photo)
+    picture = draw_overlay(shown(replace(located(), evidence=None), mask, photo), options)
     top, panel = round(options.map_px * 0.075), round(options.map_px * options.mask_share)
     for strip in (picture[:top], picture[-(top // 2) :, :panel]):
-        for color in (FRAME, (60, 60, 60), (10, 200, 30)):
+        for color in (FRAME, (10, 200, 30)):
             assert not (strip == color).all(axis=2).any()
     assert (picture[top : -(top // 2), :panel] == FRAME).all(axis=2).any()
 
@@ -93,7 +113,22 @@ def test_the_photograph_of_a_result_is_drawn(tmp_path: Path) -> None:
 
 def test_the_picture_is_written(tmp_path: Path) -> None:
     write_overlay(tmp_path / "a.png", subject())
-    drawn = draw_overlay(located(), road_mask(), map_roads(), "© them")
+    drawn = draw_overlay(shown())
     np.testing.assert_array_equal(cv2.imread(str(tmp_path / "a.png"))[..., ::-1], drawn)
     with pytest.raises(OutputError, match="no place"):
-        draw_overlay(replace(located(), homography=None), road_mask(), map_roads())
+        draw_overlay(shown(replace(located(), homography=None)))
+
+
+def test_a_plot_is_saved_as_its_name_tells(tmp_path: Path) -> None:
+    plot = draw_plot(shown())
+    for name in ("a.svg", "a.png"):
+        plot.save(tmp_path / name)
+    root = ET.parse(tmp_path / "a.svg").getroot()
+    groups = [each.get("class") for each in root if each.tag.endswith("}g")]
+    assert groups == ["ground", "map-roads", "query-roads", "footprint", "matches"]
+    assert "© them" in (tmp_path / "a.svg").read_text("utf-8")
+    picture = cv2.imread(str(tmp_path / "a.png"))[..., ::-1]
+    assert picture.shape[1] == 1400
+    assert (picture == FRAME).all(axis=2).any()
+    with pytest.raises(OutputError, match=r"\.svg or \.png"):
+        plot.save(tmp_path / "a.pdf")

@@ -21,10 +21,11 @@ from roadgeo.geometry.homography import Homography
 from roadgeo.geometry.mask import RoadMask, pixel_to_plane, plane_to_pixel
 from roadgeo.location import Evidence, Location, Place, Reason
 from roadgeo.matching.index import build_index
+from roadgeo.outputs.drawing.svg import draw_dots, draw_image, draw_lines, join_segments, thin_lines
+from roadgeo.outputs.drawing.views import ViewOptions
 from roadgeo.outputs.location_files import OutputOptions, write_location
 from roadgeo.outputs.paths import output_paths
-from roadgeo.outputs.report import Entry, ReportOptions, render_batch, render_report, write_batch
-from roadgeo.outputs.report.svg import draw_dots, draw_image, draw_lines, join_segments, thin_lines
+from roadgeo.outputs.report import Entry, render_batch, render_report, write_batch
 from roadgeo.reference.reference import Reference, build_network
 from roadgeo.sources.masks import read_mask
 from roadgeo.sources.roads import read_roads
@@ -131,6 +132,9 @@ def test_a_mask_that_was_not_located_is_shown_with_the_reason(porto: Reference) 
         assert said in text
     assert 'data-frame="map"' not in page
     assert 'class="overview"' in page
+    best = location.alternatives[0]
+    assert f'<a href="https://www.openstreetmap.org/?mlat={best.lat:.6f}' in page
+    assert "href" not in text
     few = replace(location, n_intersections=4)
     assert "4 intersections are seen in the mask: few" in Reader(render_report(few, mask, porto.index)).text
 
@@ -149,10 +153,12 @@ def test_two_places_are_both_shown(porto: Reference, drone: RoadMask, found: Loc
     page = render_report(location, drone, porto.index)
     text = Reader(page).text
     assert "≈ ambiguous" in text
-    assert "566 m to the north-east, 10^1.0 times less likely" in text
+    assert "570 m to the north-east, 10^8 times less likely" in text
+    unsure = render_report(replace(location, log10_odds=-0.4), drone, porto.index)
+    assert "to the north-east, about as likely" in Reader(unsure).text
     assert page.count('<g class="runner-up"') == 2  # around the footprint, and on the whole map
     far = render_report(rival(location, -30_000.0, 0.0), drone, porto.index)
-    assert "30.0 km to the west" in far
+    assert "30 km to the west" in far
     assert far.count('<g class="runner-up"') == 1
 
 
@@ -206,7 +212,7 @@ def test_a_mask_is_traced_once(
     porto: Reference, drone: RoadMask, found: Location, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     anew = render_report(replace(found, seen=None), drone, porto.index)
-    monkeypatch.setattr("roadgeo.outputs.report.views.trace_query", None)
+    monkeypatch.setattr("roadgeo.outputs.drawing.views.trace_query", None)
     assert render_report(found, drone, porto.index) == anew
 
 
@@ -293,7 +299,7 @@ def test_the_file_stays_small_whatever_is_shown(porto: Reference, found: Locatio
 
 
 def test_limits_can_be_chosen(porto: Reference, drone: RoadMask, found: Location) -> None:
-    options = ReportOptions(
+    options = ViewOptions(
         max_map_vertices=200, max_query_vertices=100, max_matches=3, picture_bytes=2000, overview_bytes=2000
     )
     page = render_report(found, drone, porto.index, options=options)

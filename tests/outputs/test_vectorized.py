@@ -9,6 +9,7 @@ import pytest
 
 from roadgeo.errors import OutputError
 from roadgeo.geometry.mask import RoadMask
+from roadgeo.outputs.drawing.layers import rgb
 from roadgeo.outputs.vectorized import draw_vectorized, write_vectorized
 from roadgeo.roads.graph import RoadGraph
 from roadgeo.roads.intersections import find_intersections
@@ -41,7 +42,7 @@ def test_both_files_show_the_crossing(tmp_path: Path, mask: RoadMask) -> None:
     np.testing.assert_allclose(columns["length_px"], graph.edge_lengths())
     picture = cv2.imread(str(paths[1]))
     assert picture.shape == (80, 120, 3)
-    assert (picture[40, 60] == 255).all()  # the centre, white
+    assert (picture[40, 60, ::-1] == rgb("match")).all()  # the intersection
     assert (picture[40, 110] == picture[5, 110]).all()  # not observed
 
 
@@ -63,7 +64,7 @@ def test_a_large_picture_takes_little_more_memory_than_itself() -> None:
     roads[::200], roads[:, ::200] = True, True
     mask = RoadMask(roads)
     graph = vectorize(mask).graph
-    ground = np.full((2000, 2000, 3), 90, np.uint8)
+    ground = np.full((2000, 2000, 4), 90, np.uint8)
     tracemalloc.start()
     picture = draw_vectorized(mask, graph, find_intersections(graph), ground)
     _, peak = tracemalloc.get_traced_memory()

@@ -4,6 +4,5 @@ from __future__ import annotations
 
 from roadgeo.outputs.report.batch import Entry, render_batch, write_batch
 from roadgeo.outputs.report.page import render_report, write_report
-from roadgeo.outputs.report.views import ReportOptions
 
-__all__ = ["Entry", "ReportOptions", "render_batch", "render_report", "write_batch", "write_report"]
+__all__ = ["Entry", "render_batch", "render_report", "write_batch", "write_report"]

@@ -16,10 +16,11 @@ import numpy as np
 from roadgeo._text import counted
 from roadgeo.matching.index import ReferenceIndex
 from roadgeo.outputs.columns import attributes
+from roadgeo.outputs.drawing.layers import Layer, Ring
+from roadgeo.outputs.drawing.views import whole_map
 from roadgeo.outputs.report.page import STATUS, footer, render_page, section
-from roadgeo.outputs.report.viewer import Layer, draw_viewer, ring_data
-from roadgeo.outputs.report.views import Window, draw_whole_map
-from roadgeo.outputs.wording import format_lonlat
+from roadgeo.outputs.report.viewer import draw_viewer, window_data
+from roadgeo.outputs.wording import format_lonlat, write_sigma
 from roadgeo.storage.files import write_text
 
 __all__ = ["Entry", "render_batch", "write_batch"]
@@ -56,7 +57,7 @@ class Entry:
         return str(self.document["status"])
 
     def wrap(self, content: str) -> str:
-        """Make HTML or SVG a link to the report."""
+        """Make HTML a link to the report."""
         return f'<a href="{html.escape(quote(self.link))}">{content}</a>' if self.link else content
 
 
@@ -108,23 +109,17 @@ def _has_place(entry: Entry) -> bool:
 
 def _draw_map(index: ReferenceIndex, entries: Sequence[Entry]) -> str:
     """Draw a whole map with the footprints that lie on it, each a link."""
-    picture, window = draw_whole_map(index, _OVERVIEW_BYTES, 2 * _VIEW_PX)
-    layers = [Layer("picture", "", picture)]
+    picture, window = whole_map(index, _OVERVIEW_BYTES, 2 * _VIEW_PX)
+    layers = [picture]
     for status in ("ambiguous", "located"):
-        outlines = "".join(_outline(window, entry) for entry in entries if _has_place(entry) and entry.status == status)
-        layers.append(Layer(status, STATUS[status][2:], outlines, '<path d="M3 2h20v10h-20z"/>'))
-    attributes = {"data-frame": "map", "data-west": f"{window.west:.3f}", "data-north": f"{window.north:.3f}"}
-    attributes["style"] = f"--u:{window.width / _VIEW_PX:.4g}"
-    return draw_viewer(
-        f"The footprints on the map {index.name}", window.box, layers, attributes, scale=True, credit=_credit(index)
-    )
-
-
-def _outline(window: Window, entry: Entry) -> str:
-    corners = window.to_svg(np.array(entry.document["footprint"], float))
-    if not np.isfinite(corners).all():
-        return ""
-    return entry.wrap(f'<path d="{ring_data(corners)}"><title>{html.escape(entry.path.name)}</title></path>')
+        there = [entry for entry in entries if entry.status == status and _has_place(entry)]
+        rings = [
+            Ring(window.place(np.array(entry.document["footprint"], float)), title=entry.path.name, link=entry.link)
+            for entry in there
+        ]
+        layers.append(Layer(status, STATUS[status][2:], rings))
+    text, data = f"The footprints on the map {index.name}", window_data(window, _VIEW_PX)
+    return draw_viewer(text, window.box, layers, data, scale=True, credit=_credit(index))
 
 
 def _item(entry: Entry, with_folder: bool) -> str:
@@ -135,9 +130,9 @@ def _item(entry: Entry, with_folder: bool) -> str:
     if entry.status == "located" and center:
         parts.append(format_lonlat(center["lon"], center["lat"]))
         if sigma:
-            parts.append(f"corners ± {max(sigma):.1f} m")
+            parts.append(f"corners {write_sigma(max(sigma))}")
         if odds is not None:
-            parts.append(f"odds 10<sup>{odds:.1f}</sup>")
+            parts.append(f"score {odds:.1f}")
     said = " · ".join(parts) or html.escape(str(attributes(document)["reason"]))
     status = f'<span class="status {entry.status}">{STATUS[entry.status]}</span>'
     return f"<li>{entry.wrap(html.escape(name or 'mask'))} {status}<br><small>{said}</small></li>"

@@ -7,6 +7,7 @@ are missing.
 from __future__ import annotations
 
 import html
+import json
 import math
 import os
 from collections.abc import Sequence
@@ -20,21 +21,24 @@ from roadgeo.geometry.mask import RoadMask, plane_to_pixel
 from roadgeo.geometry.pinhole import polygon_area
 from roadgeo.location import Location, Place, Reason
 from roadgeo.matching.index import ReferenceIndex
+from roadgeo.outputs.drawing.layers import Cross, Layer, Ring
+from roadgeo.outputs.drawing.svg import draw_layer, stylesheet
+from roadgeo.outputs.drawing.views import (
+    SIGMAS,
+    Shown,
+    ViewOptions,
+    Window,
+    frame_layers,
+    place_layers,
+    whole_map,
+)
 from roadgeo.outputs.names import bare_command, bare_name, without_folders
 from roadgeo.outputs.paths import Placement
-from roadgeo.outputs.report.place_view import draw_place
-from roadgeo.outputs.report.views import (
-    ReportOptions,
-    Shown,
-    Window,
-    draw_mask,
-    draw_overview,
-    draw_probability,
-)
+from roadgeo.outputs.report.viewer import draw_viewer, frame_data, window_data
 from roadgeo.outputs.subject import Subject
-from roadgeo.outputs.wording import format_lonlat
+from roadgeo.outputs.wording import format_lonlat, write_distance, write_lead, write_sigma
 
-__all__ = ["STATUS", "footer", "render_page", "render_report", "section", "write_report"]
+__all__ = ["STATUS", "footer", "render_page", "render_report", "section", "table", "write_report"]
 
 #: How each status is shown: by a sign and a word, not by colour alone.
 STATUS = {"located": "✓ located", "ambiguous": "≈ ambiguous", "not_located": "✕ not located", "error": "! failed"}
@@ -44,6 +48,12 @@ _WINDS = ("north", "north-east", "east", "south-east", "south", "south-west", "w
 
 #: Below this number of intersections a report recommends a larger frame.
 _FEW = 12
+
+#: Widths in pixels that views are scaled for until the page's script knows better.
+_PLACE_PX, _MASK_PX, _OVERVIEW_PX = 900, 400, 380
+
+#: Screen pixels that a large residual's arrow (the 90th percentile) and a corner's circle get at most.
+_ARROW_PX, _CIRCLE_PX = 26.0, 60.0
 
 
 def write_report(path: Path, subject: Subject) -> None:
@@ -58,7 +68,7 @@ def render_report(
     index: ReferenceIndex,
     attribution: str = "",
     picture: str | os.PathLike[str] | None = None,
-    options: ReportOptions | None = None,
+    options: ViewOptions | None = None,
 ) -> str:
     """Render what became of a mask, located or not, as a whole HTML page.
 
@@ -76,18 +86,17 @@ def render_report(
     MaskError
         The picture cannot be read, or the mask shows no roads.
     """
-    subject = Shown.of(location, mask, index, picture, options or ReportOptions(), attribution)
+    subject = Shown.of(location, mask, index, picture, options, attribution)
     place = subject.place
-    views = [draw_mask(subject)] if place is None else [draw_place(subject, place), draw_mask(subject)]
+    views = [_draw_frame(subject)] if place is None else [_draw_place(subject, place), _draw_frame(subject)]
     parts = [
-        _explain(location),
-        section("In the mask" if mask.probability is None else "In the photograph", "".join(views[1:])),
-        section("Roads seen in it", draw_probability(subject)),
-        section("Where on the map", draw_overview(subject)),
-        section("Numbers", _table(_numbers(subject))),
+        _explain(subject),
+        section(f"In the {subject.subject}", "".join(views[1:])),
+        section("Where on the map", _draw_overview(subject)),
+        section("Numbers", table(_numbers(subject))),
         "" if place is None else section("Corners", _corners(subject, place)),
         section("Matched intersections", _matches(subject)),
-        f"<details><summary>Everything else</summary>{_table(_details(subject))}</details>",
+        f"<details><summary>Everything else</summary>{table(_details(subject))}</details>",
     ]
     name = bare_name(location.query) or "mask"
     header = (
@@ -111,7 +120,7 @@ def render_page(title: str, header: str, body: str) -> str:
 <link rel="icon" href="data:,">
 <title>{html.escape(title)}</title>
 <style>
-{style}</style>
+{stylesheet()}{style}</style>
 <noscript><style>.buttons, .legend input {{ display: none }}</style></noscript>
 </head>
 <body>
@@ -135,57 +144,122 @@ def footer(attribution: str) -> str:
     return f"<footer>{credit}Made by roadgeo {__version__}. This file needs no network.</footer>"
 
 
+def table(rows: Sequence[tuple[str, str]]) -> str:
+    """Return a table of labels and values (HTML)."""
+    body = "".join(f'<tr><th scope="row">{html.escape(label)}</th><td>{value}</td></tr>' for label, value in rows)
+    return f'<table class="numbers">{body}</table>'
+
+
+# --- views ------------------------------------------------------------------------------------------------------------
+
+
+def _draw_frame(subject: Shown) -> str:
+    """Draw the mask, or its photograph, with the roads and intersections seen in it: an HTML figure."""
+    layers, probable = frame_layers(subject), subject.probability()
+    if probable is not None:
+        layers.insert(1, Layer("probability", "probability of road", [probable], shown=False))
+    text = f"The {subject.subject} {bare_name(subject.location.query)}, with the roads and intersections seen in it"
+    return draw_viewer(text, subject.box, layers, frame_data(subject.box, _MASK_PX))
+
+
+def _draw_place(subject: Shown, place: Placement) -> str:
+    """Draw the map around a footprint, and the footprint on it: an HTML figure."""
+    window = Window.around(place.footprint, subject.options.margin, subject.runner_up())
+    arrows, per_px = _arrow_scale(subject.location), window.width / _PLACE_PX
+    data = window_data(window, _PLACE_PX) | {
+        "data-homography": json.dumps((window.matrix() @ place.homography).tolist()),
+        "data-arrows": f"{arrows:.4g}",
+    }
+    data["style"] += f";--k:{max(1.0, arrows * per_px):.4g}"
+    location, layers = subject.location, place_layers(subject, place, window)
+    text = f"Map, north up: the footprint of {bare_name(location.query)} over the roads of {location.reference}"
+    return draw_viewer(text, window.box, layers, data, scale=True, enlarged=True, credit=subject.attribution)
+
+
+def _arrow_scale(location: Location) -> float:
+    """Screen pixels for a metre of residual, or of a corner's circle."""
+    evidence, sigma = location.evidence, location.corner_sigma_m
+    scales = [1000.0]
+    if evidence is not None and len(evidence.residual_m):
+        scales.append(_ARROW_PX / max(float(np.percentile(evidence.residual_m, 90)), 1e-3))
+    if sigma is not None and np.isfinite(sigma).any():
+        scales.append(_CIRCLE_PX / max(SIGMAS * float(np.nanmax(sigma)), 1e-3))
+    return min(scales)
+
+
+def _draw_overview(subject: Shown) -> str:
+    """Draw all of the map, and where on it the mask and the runner-up lie."""
+    index, location = subject.index, subject.location
+    if index.name != location.reference:  # several were searched
+        return f"<p>Searched: {html.escape(location.reference)}.</p>"
+    picture, window = whole_map(index, subject.options.overview_bytes, 2 * _OVERVIEW_PX)
+    layers = [picture]
+    if subject.place is not None:
+        layers.append(Layer(location.status, "", [Ring(window.place(subject.place.footprint))]))
+    other = subject.runner_up()
+    if other is not None:
+        called = "runner-up" if subject.place else "best"
+        layers.append(Layer("runner-up", "", [Cross(window.place(other), called)]))
+    text = f"All of the map {index.name}" + (", with the footprint" if subject.place else "")
+    box = " ".join(f"{value:.0f}" for value in window.box)
+    return (
+        f'<svg class="overview" viewBox="{box}" role="img" aria-label="{html.escape(text)}" '
+        f'style="--u:{window.width / _OVERVIEW_PX:.4g}">{"".join(map(draw_layer, layers))}</svg>'
+        f'<p class="faint">{html.escape(index.name)}: {len(index):,} intersections, '
+        f"{window.width / 1000:.0f} × {window.height / 1000:.0f} km</p>"
+    )
+
+
 # --- words ------------------------------------------------------------------------------------------------------------
 
 
-def _explain(location: Location) -> str:
-    """Return the meaning of the answer, and the advice where there is no place."""
+def _explain(subject: Shown) -> str:
+    """Return the meaning of the answer, and the advice where there is no place: HTML."""
+    location = subject.location
     if location.status == "located":
         texts = [_rival(location)]
     elif location.reason_code is Reason.HALF_A_PLACE:
         texts = [
             "The place is known in one direction only. Nothing was georeferenced; shown is the likeliest.",
-            "A mask of more ground, with roads in other directions, would tell where along them it lies.",
+            f"A {subject.subject} of more ground, with roads in other directions, would tell where along them it lies.",
         ]
     elif location.status == "ambiguous":
         texts = [
             "Two places fit, and which one is right cannot be told. Nothing was georeferenced; shown is the better.",
             _rival(location),
-            "A mask of more ground, or whatever is known of it (--near, --gsd, --north-up), may decide between them.",
+            f"A {subject.subject} of more ground, or a hint (--near, --gsd, --north-up), may decide between them.",
         ]
     else:
-        few = (
-            f": few. {_FEW} or more, from a mask of more ground, would help" if location.n_intersections < _FEW else ""
-        )
-        n, best = location.n_intersections, next(iter(location.alternatives), None)
-        texts = [
-            "Nothing was georeferenced. What to look at:",
-            *([f"The best place that it had, though not sure enough: {_link(best)}."] if best else []),
-            f"{counted(n, 'intersection')} {'is' if n == 1 else 'are'} seen in the mask{few}.",
-            "Do the coloured lines follow the mask's roads? If not, a cleaner mask, --threshold or --band may help.",
-            f"Was the right map searched? It was {location.reference}.",
-            "Whatever is known shortens the search and may save a mask: --near, --gsd, --north-up, --max-tilt.",
-        ]
-    return "".join(f"<p>{html.escape(text)}</p>" for text in texts if text)
+        texts = _advice(subject)
+    return "".join(f"<p>{text}</p>" for text in texts if text)
+
+
+def _advice(subject: Shown) -> list[str]:
+    """Return what to look at where nothing was found: HTML."""
+    location, called = subject.location, subject.subject
+    n, best = location.n_intersections, next(iter(location.alternatives), None)
+    few = f": few. {_FEW} or more, of more ground, would help" if n < _FEW else ""
+    return [
+        "Nothing was georeferenced. What to look at:",
+        f"The best place that it had, though not sure enough: {_link(best)}" if best else "",
+        f"{counted(n, 'intersection')} {'is' if n == 1 else 'are'} seen in the {called}{few}.",
+        f"Do the coloured lines follow its roads? If not, a cleaner {called}, --threshold or --band may help.",
+        f"Was the right map searched? It was {html.escape(location.reference)}.",
+        f"Whatever is known shortens the search and may save a {called}: --near, --gsd, --north-up, --max-tilt.",
+    ]
 
 
 def _rival(location: Location) -> str:
-    """Describe the best other place, where odds were computed."""
+    """Describe the best other place, where odds were computed: HTML."""
     other, center = location.runner_up, location.center
     if location.log10_odds is None or center is None:
         return ""
     if other is None:
         return "No other place came close."
-    lead = f"10^{location.log10_odds - other.log10_odds:.1f} times less likely"
-    return f"The best other place lies {_way(center, other)}, {lead}: {format_lonlat(other.lon, other.lat)}."
-
-
-def _way(here: Place, there: Place) -> str:
-    """Return distance and direction: 1.3 km to the north-east."""
-    dx, dy = there.x - here.x, there.y - here.y
-    wind = _WINDS[round(math.degrees(math.atan2(dx, dy)) / 45.0) % 8]
-    distance = math.hypot(dx, dy)
-    return f"{distance:.0f} m to the {wind}" if distance < 1000 else f"{distance / 1000:.1f} km to the {wind}"
+    apart = math.hypot(other.x - center.x, other.y - center.y)
+    wind = _WINDS[round(math.degrees(math.atan2(other.x - center.x, other.y - center.y)) / 45.0) % 8]
+    way = f"{write_distance(apart)} to the {wind}"
+    return f"The best other place lies {way}, {write_lead(location.log10_odds)}: {_link(other)}"
 
 
 def _sentence(text: str) -> str:
@@ -193,11 +267,6 @@ def _sentence(text: str) -> str:
 
 
 # --- numbers ----------------------------------------------------------------------------------------------------------
-
-
-def _table(rows: Sequence[tuple[str, str]]) -> str:
-    body = "".join(f'<tr><th scope="row">{html.escape(label)}</th><td>{value}</td></tr>' for label, value in rows)
-    return f'<table class="numbers">{body}</table>'
 
 
 def _numbers(subject: Shown) -> list[tuple[str, str]]:
@@ -213,26 +282,21 @@ def _numbers(subject: Shown) -> list[tuple[str, str]]:
         rows.append(("Sampling", f"{place.gsd_m:.3g} m per pixel at the middle"))
     rows.append(("Frame", frame))
     if location.rotation_deg is not None:
-        rows.append(("Image's up", f"{location.rotation_deg % 360:.1f}° clockwise from north"))
+        rows.append(("Image's up", f"{round(location.rotation_deg) % 360}° clockwise from north"))
     if location.tilt_deg is not None:
         source = f" <small>({html.escape(location.tilt_source)})</small>" if location.tilt_source else ""
         rows.append(("Tilt", f"{location.tilt_deg:.1f}° from the vertical{source}"))
     sigma = location.corner_sigma_m
     if sigma is not None and np.isfinite(sigma).all():
-        low, high = sigma.min(), sigma.max()
-        rows.append(("Corners", f"± {low:.1f} to {high:.1f} m <small>(standard deviation)</small>"))
+        rows.append(("Corners", f"{write_sigma(sigma.max())} <small>(standard deviation, at worst)</small>"))
     # Support.
     matched = f"{location.n_matched} of {location.n_intersections} matched"
     rows.append(("Intersections", matched if place else f"{location.n_intersections} seen"))
     if location.evidence is not None and len(location.evidence.residual_m):
         middle, worst = np.percentile(location.evidence.residual_m, (50, 100))
-        rows.append(("Residuals", f"median {middle:.1f} m, largest {worst:.1f} m"))
+        rows.append(("Residuals", f"median {write_distance(middle)}, largest {write_distance(worst)}"))
     if location.log10_odds is not None:
-        rows.append(("Odds", f"10<sup>{location.log10_odds:.1f}</sup> : 1 against any other place"))
-    if location.runner_up is not None:
-        rows.append(
-            ("Runner-up", f"10<sup>{location.runner_up.log10_odds:.1f}</sup> : 1<br>{_link(location.runner_up)}")
-        )
+        rows.append(("Score", f"{location.log10_odds:.1f} <small>(powers of ten ahead of any other place)</small>"))
     rows.append(("Time", f"{location.seconds.total - location.seconds.write:.2f} s"))
     return rows
 
@@ -247,7 +311,8 @@ def _link(place: Place) -> str:
 def _corners(subject: Shown, place: Placement) -> str:
     """List the corners, each with a button that shows it on the map."""
     location = subject.location
-    positions = Window.around(subject, place, subject.options.margin).to_svg(place.footprint)
+    window = Window.around(place.footprint, subject.options.margin, subject.runner_up())
+    positions = window.place(place.footprint)
     lonlat = np.full((4, 2), np.nan) if location.footprint_lonlat is None else location.footprint_lonlat
     sigma = np.full(4, np.nan) if location.corner_sigma_m is None else location.corner_sigma_m
     rows = []
@@ -256,7 +321,7 @@ def _corners(subject: Shown, place: Placement) -> str:
         show = f'<button type="button" data-x="{at[0]:.1f}" data-y="{at[1]:.1f}" data-span="{span:.0f}">{name}</button>'
         where = format_lonlat(*degrees) if np.isfinite(degrees).all() else ""
         where += f"<br><small>{xy[0]:,.1f}, {xy[1]:,.1f}</small>"
-        rows.append(f"<tr><td>{show}</td><td>{where}</td><td>{f'± {s:.1f} m' if math.isfinite(s) else '–'}</td></tr>")
+        rows.append(f"<tr><td>{show}</td><td>{where}</td><td>{write_sigma(s) or '–'}</td></tr>")
     crs = place.crs if place.crs.upper().startswith("EPSG:") else "a plane of its own, see below"
     return f'<table>{"".join(rows)}</table><p class="faint">Metres in {html.escape(crs)}</p>'
 

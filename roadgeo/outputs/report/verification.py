@@ -14,12 +14,13 @@ from roadgeo.geometry.frame import Frame
 from roadgeo.geometry.georeference import Georeference
 from roadgeo.geometry.homography import Homography
 from roadgeo.matching.index import ReferenceIndex
-from roadgeo.outputs.canvas import touching
+from roadgeo.outputs.drawing.layers import Layer, Lines, Picture
+from roadgeo.outputs.drawing.svg import join_segments, thin_lines
+from roadgeo.outputs.drawing.views import touching
 from roadgeo.outputs.names import bare_name
 from roadgeo.outputs.orthophoto import read_preview
-from roadgeo.outputs.report.page import footer, render_page, section
-from roadgeo.outputs.report.svg import draw_image, draw_lines, join_segments, thin_lines
-from roadgeo.outputs.report.viewer import PICTURE_SIGN, Layer, draw_viewer
+from roadgeo.outputs.report.page import footer, render_page, section, table
+from roadgeo.outputs.report.viewer import draw_viewer, frame_data
 from roadgeo.storage.files import write_text
 
 __all__ = ["write_verification"]
@@ -60,9 +61,8 @@ def write_verification(
     """
     name, verdict = bare_name(document["image"]), document["verdict"]
     view = "" if place is None else _draw(document["image"], name, place, corrected, index)
-    rows = [(label, value) for label, value in _numbers(document) if value]
-    body = "".join(f'<tr><th scope="row">{label}</th><td>{html.escape(value)}</td></tr>' for label, value in rows)
-    parts = section("Numbers", f'<table class="numbers">{body}</table>' if rows else "")
+    rows = [(label, html.escape(value)) for label, value in _numbers(document) if value]
+    parts = section("Numbers", table(rows) if rows else "")
     header = (
         f'<h1>{html.escape(name)}</h1><span class="status {_STATUS[verdict]}">{_SIGN[verdict]}</span>'
         f"<p>{html.escape(said)}</p>"
@@ -77,30 +77,28 @@ def _draw(
     """Draw the image, and the map's roads in its pixels."""
     width, height = place.size
     box = (0.0, 0.0, float(width), float(height))
-    picture = draw_image(read_preview(Path(image), _PICTURE_PX), box, _PICTURE_BYTES)
-    layers = [Layer("picture", "image", picture, PICTURE_SIGN)]
+    layers = [Layer("picture", "image", [Picture(read_preview(Path(image), _PICTURE_PX), box, _PICTURE_BYTES)])]
     if index is not None:
         given = "the map's roads, as the image has them" if corrected else "roads of the map"
-        layers.append(Layer("map-roads" if corrected else "query-roads", given, _draw_roads(place, index)))
+        layers.append(Layer("map-roads" if corrected else "query-roads", given, _roads_in(place, index)))
         if corrected is not None:
-            layers.append(Layer("query-roads", "the map's roads, corrected", _draw_roads(corrected, index)))
-    attributes = {"data-frame": "mask", "style": f"--u:{max(width, height) / 900:.4g}"}
-    return draw_viewer(f"The image {name}, with the roads of the map", box, layers, attributes)
+            layers.append(Layer("query-roads", "the map's roads, corrected", _roads_in(corrected, index)))
+    return draw_viewer(f"The image {name}, with the roads of the map", box, layers, frame_data(box, 900))
 
 
-def _draw_roads(place: Georeference, index: ReferenceIndex) -> str:
-    """Draw the map's roads where they lie in an image by one of its places."""
+def _roads_in(place: Georeference, index: ReferenceIndex) -> list[Lines]:
+    """Return the map's roads where they lie in an image by one of its places."""
     frame = Frame(*place.size)
     there = Homography(place.on_plane(index.plane)).facing(frame.center)
     corners: FloatArray = there(frame.corners)
     ends = index.segments.reshape(-1, 2, 2).astype(float)
     near = ends[touching(ends, corners.min(axis=0), corners.max(axis=0))]
     if len(near) == 0:
-        return ""
+        return []
     back = there.inverse()
     pixels = np.asarray(back(near.reshape(-1, 2))).reshape(-1, 2, 2)
     kept = touching(pixels, np.zeros(2), np.array(place.size, float))
-    return draw_lines(thin_lines(join_segments(pixels[kept]), _MOST_VERTICES))
+    return [Lines(thin_lines(join_segments(pixels[kept]), _MOST_VERTICES))]
 
 
 def _numbers(document: Mapping[str, Any]) -> list[tuple[str, str]]:

@@ -1,31 +1,16 @@
-"""Common parts of a report's views: layers of SVG that can be switched, moved about in and zoomed into."""
+"""The views of a page: layers that can be switched, moved about in and zoomed into."""
 
 from __future__ import annotations
 
 import html
 from collections.abc import Sequence
-from dataclasses import dataclass
 
-from roadgeo._arrays import FloatArray
-from roadgeo.outputs.report.svg import draw_dots
+from roadgeo.outputs.drawing.layers import Box, Layer
+from roadgeo.outputs.drawing.svg import draw_layer, draw_marks, draw_sign
+from roadgeo.outputs.drawing.views import Window
 
-__all__ = ["DOT_SIGN", "PICTURE_SIGN", "RING_SIGN", "Layer", "draw_rings", "draw_viewer", "pin", "ring_data"]
+__all__ = ["draw_viewer", "frame_data", "window_data"]
 
-
-@dataclass(frozen=True)
-class Layer:
-    """Something that can be shown or not: `name` is its class in the style sheet, `sign` stands in the legend."""
-
-    name: str
-    label: str
-    content: str
-    sign: str = '<path d="M2 7h22"/>'
-    shown: bool = True
-
-
-DOT_SIGN = '<path class="halo" d="M13 7h.1"/><path d="M13 7h.1"/>'
-RING_SIGN = '<path d="M13 7h.1"/><path class="core" d="M13 7h.1"/>'
-PICTURE_SIGN = '<rect x="3" y="2" width="20" height="10"/>'
 _BUTTONS = (
     '<div class="buttons"><button type="button" data-act="in" aria-label="Zoom in">+</button>'
     '<button type="button" data-act="out" aria-label="Zoom out">−</button>'
@@ -38,10 +23,10 @@ _MARKS = (
 
 
 def draw_viewer(
-    said: str,
-    box: tuple[float, float, float, float],
+    text: str,
+    box: Box,
     layers: Sequence[Layer],
-    attributes: dict[str, str],
+    data: dict[str, str],
     *,
     scale: bool = False,
     enlarged: bool = False,
@@ -51,6 +36,10 @@ def draw_viewer(
 
     Parameters
     ----------
+    text : str
+        Describes the view to those who cannot see it.
+    data : dict
+        Attributes of the SVG, for the page's script; see `frame_data`, `window_data`.
     scale : bool
         Show a scale bar: the units are metres.
     enlarged : bool
@@ -63,35 +52,34 @@ def draw_viewer(
     named = f'<span class="credit">{html.escape(credit)}</span>' if credit else ""
     pad = 0.02 * max(box[2:])
     view = f"{box[0] - pad:.1f} {box[1] - pad:.1f} {box[2] + 2 * pad:.1f} {box[3] + 2 * pad:.1f}"
-    given = "".join(f' {name}="{html.escape(value)}"' for name, value in attributes.items())
-    groups = "".join(f'<g class="{one.name}{"" if one.shown else " off"}">{one.content}</g>' for one in layers)
+    given = "".join(f' {name}="{html.escape(value)}"' for name, value in data.items())
+    groups = "".join(map(draw_layer, layers))
     legend = "".join(
-        f'<label><input type="checkbox" data-toggles="{one.name}"{" checked" if one.shown else ""}>'
-        f'<svg viewBox="0 0 26 14" aria-hidden="true" class="{one.name}">{one.sign}</svg>'
-        f"{html.escape(one.label)}</label>"
-        for one in layers
-        if one.content and one.label
+        f'<label><input type="checkbox" data-toggles="{layer.name}"{" checked" if layer.shown else ""}>'
+        f'<svg viewBox="0 0 26 14" aria-hidden="true" class="{layer.name}">{draw_sign(layer)}</svg>'
+        f"{html.escape(layer.label)}</label>"
+        for layer in layers
+        if layer.label and draw_marks(layer.marks[:1])
     )
     return (
         '<figure class="viewer"><div class="stage" tabindex="0" role="group" '
         'aria-label="Zoom with + and −, move with the arrow keys, 0 shows all">'
-        f'<svg class="view" viewBox="{view}" role="img" aria-label="{html.escape(said)}"{given}>{groups}{_MARKS}</svg>'
+        f'<svg class="view" viewBox="{view}" role="img" aria-label="{html.escape(text)}"{given}>{groups}{_MARKS}</svg>'
         f'{_BUTTONS}<div class="notes">{notes}<span class="position"></span></div>{named}</div>'
         f'<fieldset class="legend" aria-label="Layers">{legend}</fieldset></figure>'
     )
 
 
-def pin(at: FloatArray, content: str, text: str) -> str:
-    """Put something that keeps its size on the screen at an SVG position."""
-    said = f'<text x="13" y="5">{html.escape(text)}</text>'
-    return f'<g transform="translate({at[0]:.2f} {at[1]:.2f})"><g class="fixed">{content}{said}</g></g>'
+def frame_data(box: Box, width_px: float) -> dict[str, str]:
+    """Return the attributes of a view of an image, drawn for a width in pixels until the page's script knows better."""
+    return {"data-frame": "mask", "style": f"--u:{max(box[2:]) / width_px:.4g}"}
 
 
-def ring_data(corners: FloatArray) -> str:
-    """Path data of a closed ring (K, 2)."""
-    return "M" + " ".join(f"{x:.1f},{y:.1f}" for x, y in corners.tolist()) + "z"
-
-
-def draw_rings(points: FloatArray) -> str:
-    """Draw intersections that do not match."""
-    return draw_dots(points, ("", "core"))
+def window_data(window: Window, width_px: float) -> dict[str, str]:
+    """Return the attributes of a view of the map."""
+    return {
+        "data-frame": "map",
+        "data-west": f"{window.west:.3f}",
+        "data-north": f"{window.north:.3f}",
+        "style": f"--u:{window.width / width_px:.4g}",
+    }

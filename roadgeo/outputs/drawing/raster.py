@@ -1,0 +1,174 @@
+"""The writer of pixels: layers on a canvas, text, legends and PNG files (by OpenCV; red, green, blue)."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from pathlib import Path
+
+import cv2
+import numpy as np
+
+from roadgeo._arrays import AnyArray, FloatArray
+from roadgeo.errors import OutputError
+from roadgeo.outputs.drawing.layers import LOOKS, Box, Color, Dots, Layer, Lines, Look, Picture, Ring, rgb
+
+__all__ = ["FAINT", "INK", "LIT", "SHIFT", "Canvas", "blank", "draw_legend", "fixed_point", "write_png", "write_text"]
+
+LIT, INK, FAINT = (255, 255, 255), rgb("ink"), rgb("faint")
+
+SHIFT = 4  # fractional bits of the coordinates that OpenCV draws at
+
+#: Pictures are looked at from farther away than screens: their strokes are this much wider.
+_WEIGHT = 1.3
+
+#: Rows that are blended at once, lest numbers of a large picture's whole take gigabytes.
+_STRIP = 256
+
+
+def blank(height: int, width: int, color: Color = LIT) -> AnyArray:
+    """Return an empty picture (height, width, 3) uint8."""
+    return np.full((height, width, 3), color, np.uint8)
+
+
+def fixed_point(pixels: AnyArray) -> AnyArray:
+    """Turn pixels into the fixed-point ones that OpenCV draws at."""
+    return np.asarray(np.rint(np.clip(pixels, -20_000, 20_000) * (1 << SHIFT)).astype(np.int32))
+
+
+@dataclass(frozen=True)
+class Canvas:
+    """A picture (h, w, 3) uint8 of a part of a frame: pixel = (position - corner) * scale."""
+
+    image: AnyArray
+    corner: tuple[float, float]
+    scale: float
+
+    @classmethod
+    def of(cls, box: Box, width: int, height: int, scale: float | None = None) -> Canvas:
+        """Lay paper under a box, as large as fits into (width, height) pixels, or at a scale."""
+        scale = min(width / box[2], height / box[3]) if scale is None else scale
+        size = (max(round(box[3] * scale), 1), max(round(box[2] * scale), 1))
+        return cls(blank(*size, rgb("paper")), box[:2], scale)
+
+    def pixels(self, xy: FloatArray) -> AnyArray:
+        """Take positions (..., 2) to fixed-point pixels."""
+        return fixed_point((xy - np.array(self.corner)) * self.scale - 0.5)
+
+    def draw(self, layers: Sequence[Layer]) -> None:
+        """Draw the layers that are shown, from the lowest up."""
+        for layer in layers:
+            if not layer.shown:
+                continue
+            for mark in layer.marks:
+                self._draw_mark(mark, LOOKS.get(layer.name))
+
+    def _draw_mark(self, mark: object, look: Look | None) -> None:
+        match mark, look:
+            case Picture(image, box, _, _), _:
+                self._blend(image, box)
+            case Lines(lines), Look():
+                drawn = [self.pixels(line) for line in lines]
+                cv2.polylines(self.image, drawn, False, rgb(look.color), self._width(look), cv2.LINE_AA, SHIFT)
+            case Dots(points, hollow), Look():
+                self._draw_dots(self.pixels(points), look, hollow)
+            case Ring(corners, up), Look():
+                self._draw_ring(self.pixels(corners), look, up)
+
+    def _width(self, look: Look) -> int:
+        if look.width_m:
+            return int(np.clip(round(look.width_m * self.scale), 2, 12))
+        return max(round(look.width_px * _WEIGHT), 1)
+
+    def _draw_dots(self, centers: AnyArray, look: Look, hollow: bool) -> None:
+        crowd = 1.0 if len(centers) < 200 else 0.7 if len(centers) < 1000 else 0.3
+        radius = look.width_px * _WEIGHT * crowd / 2
+        outer, inner = (look.color, "paper") if hollow else ("halo", look.color)
+        radii = (radius, radius / 2) if hollow else (radius + 1.6, radius)
+        for x, y in centers.reshape(-1, 2).tolist():
+            for color, size in zip((outer, inner), radii, strict=True):
+                cv2.circle(self.image, (x, y), round(size * (1 << SHIFT)), rgb(color), -1, cv2.LINE_AA, SHIFT)
+
+    def _draw_ring(self, ring: AnyArray, look: Look, up: bool) -> None:
+        color = rgb(look.color)
+        if look.fill:
+            filled = self.image if look.fill == 1.0 else self.image.copy()
+            cv2.fillPoly(filled, [ring], color, cv2.LINE_AA, SHIFT)
+            self.image[...] = cv2.addWeighted(filled, look.fill, self.image, 1.0 - look.fill, 0.0)
+        if look.width_px:
+            width = self._width(look)
+            cv2.polylines(self.image, [ring], True, LIT, width + 3, cv2.LINE_AA, SHIFT)
+            cv2.polylines(self.image, [ring], True, color, width, cv2.LINE_AA, SHIFT)
+        if up:
+            left, right = ring[0].astype(float), ring[1].astype(float)
+            along = (right - left) / max(float(np.hypot(*(right - left))), 1.0)
+            out = np.array([along[1], -along[0]])
+            middle, size = (left + right) / 2, 16 * (1 << SHIFT)
+            tip = np.array([middle - along * size, middle + along * size, middle + out * 1.3 * size])
+            cv2.fillPoly(self.image, [np.rint(tip).astype(np.int32)], color, cv2.LINE_AA, SHIFT)
+
+    def _blend(self, picture: AnyArray, box: Box) -> None:
+        """Lay a picture over a part of the canvas; what reaches beyond is cut off."""
+        first = np.rint((np.array(box[:2]) - self.corner) * self.scale).astype(int)
+        size = np.maximum(np.rint(np.array(box[2:]) * self.scale).astype(int), 1)
+        way = cv2.INTER_AREA if size[0] < picture.shape[1] else cv2.INTER_NEAREST
+        drawn = (
+            picture if tuple(size) == picture.shape[1::-1] else cv2.resize(picture, size.tolist(), interpolation=way)
+        )
+        height, width = self.image.shape[:2]
+        left, right = max(first[0], 0), min(first[0] + size[0], width)
+        for top in range(max(first[1], 0), min(first[1] + size[1], height), _STRIP):
+            bottom = min(top + _STRIP, first[1] + size[1], height)
+            over = drawn[top - first[1] : bottom - first[1], left - first[0] : right - first[0]]
+            below = self.image[top:bottom, left:right]
+            opacity = over[..., 3:].astype(np.uint16)
+            mixed = opacity * over[..., :3] + (255 - opacity) * below
+            below[...] = (mixed + 127) // 255
+
+
+# --- around the canvas ------------------------------------------------------------------------------------------------
+
+
+def write_text(image: AnyArray, text: str, origin: tuple[int, int], size: int, color: Color, bold: bool = False) -> int:
+    """Write text with its baseline's left end at `origin`; return the x where it ends."""
+    if hasattr(cv2, "FontFace"):
+        (end, _), _ = cv2.putText(image, text, origin, color, cv2.FontFace("sans"), size, 700 if bold else 400)
+        return int(end)
+    # OpenCV 4 brings only stroked letters, and only ASCII ones.
+    for sign, plain in (("°", " deg"), ("±", "+-"), ("·", "|"), ("©", "(c)")):
+        text = text.replace(sign, plain)
+    scale, thickness = size / 26, 2 if bold else 1
+    cv2.putText(image, text, origin, cv2.FONT_HERSHEY_DUPLEX, scale, color, thickness, cv2.LINE_AA)
+    (width, _), _ = cv2.getTextSize(text, cv2.FONT_HERSHEY_DUPLEX, scale, thickness)
+    return origin[0] + int(width)
+
+
+def draw_legend(image: AnyArray, layers: Sequence[Layer], x: int, baseline: int, size: int) -> None:
+    """Write the labels of the layers that are shown, each with its sign, from (x, baseline) on."""
+    middle = baseline - round(size * 0.35)
+    for layer in layers:
+        look = LOOKS.get(layer.name)
+        if look is None or not (layer.shown and layer.label and layer.marks):
+            continue
+        if isinstance(layer.marks[0], Dots):
+            cv2.circle(image, (x + size // 2, middle), 6, rgb(look.color), -1, cv2.LINE_AA)
+            end = x + round(1.3 * size)
+        else:
+            width = 6 if look.width_m else max(round(look.width_px * _WEIGHT), 3)
+            end = x + round(2.5 * size)
+            cv2.line(image, (x + 4, middle), (end - size // 2, middle), rgb(look.color), width, cv2.LINE_AA)
+        x = write_text(image, layer.label, (end, baseline), size, INK) + round(1.4 * size)
+
+
+def write_png(path: Path, image: AnyArray) -> None:
+    """Write a picture (H, W, 3).
+
+    Raises
+    ------
+    OutputError
+        It is too large for the format.
+    """
+    done, encoded = cv2.imencode(".png", image[:, :, ::-1], [cv2.IMWRITE_PNG_COMPRESSION, 9])
+    if not done:
+        raise OutputError(f"cannot write {path}: OpenCV did not encode the picture; use a smaller one")
+    path.write_bytes(encoded.tobytes())

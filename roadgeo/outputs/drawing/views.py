@@ -1,0 +1,362 @@
+"""The layers of a result: of its mask or photograph, of its place on the map, and of a whole map."""
+
+from __future__ import annotations
+
+import math
+import os
+from dataclasses import dataclass
+
+import cv2
+import numpy as np
+
+from roadgeo._arrays import AnyArray, BoolArray, FloatArray
+from roadgeo.geometry.mask import RoadMask, plane_to_pixel
+from roadgeo.geometry.warping import cover, warp
+from roadgeo.location import Evidence, Location, Seen
+from roadgeo.matching.index import ReferenceIndex
+from roadgeo.matching.scene import trace_query
+from roadgeo.outputs.drawing.layers import (
+    Arrows,
+    Box,
+    Circles,
+    Color,
+    Cross,
+    Dots,
+    Layer,
+    Lines,
+    Picture,
+    Ring,
+    rgb,
+)
+from roadgeo.outputs.drawing.svg import join_segments, thin_lines
+from roadgeo.outputs.paths import Placement
+from roadgeo.outputs.wording import write_sigma
+
+__all__ = [
+    "SIGMAS", "STILL", "Shown", "ViewOptions", "Window", "frame_layers", "map_layer", "mask_picture", "place_layers",
+    "touching", "whole_map",
+]  # fmt: skip
+
+#: A circle that holds a corner's true position with 95 %, in rms distances.
+SIGMAS = 1.73
+
+#: Layers of a place that need no script and no scale of their own: what pictures show of it.
+STILL = ("ground", "map-roads", "query-roads", "footprint", "matches")
+
+_GREY: Color = (150, 155, 163)
+_PROBABLE: Color = (255, 210, 31)
+_UNKNOWN = 255  # in a map of probabilities
+
+
+@dataclass(frozen=True)
+class ViewOptions:
+    """How much the views of a result hold.
+
+    Attributes
+    ----------
+    margin, reach : float
+        Ground shown around the footprint at first, and ground whose roads are there to be moved to, in lengths of the
+        footprint's longer side.
+    max_map_vertices, max_query_vertices : int
+        Of the roads of the map and of the mask.
+    max_matches : int
+        Those with the largest residuals are listed and drawn.
+    picture_px, picture_bytes : int
+        Longer side of the photograph or mask, and size of each of its two copies: in its frame and on the map.
+    overview_bytes : int
+        Size of the picture of the whole map.
+    """
+
+    margin: float = 0.12
+    reach: float = 0.7
+    max_map_vertices: int = 80_000
+    max_query_vertices: int = 25_000
+    max_matches: int = 1500
+    picture_px: int = 1400
+    picture_bytes: int = 300_000
+    overview_bytes: int = 150_000
+
+
+@dataclass(frozen=True)
+class Shown:
+    """A result and its pictures.
+
+    Attributes
+    ----------
+    place : Placement or None
+        Where the mask lies, if anywhere.
+    lines : list of (V, 2)
+        The mask's roads, pixels.
+    seen : (N, 2) float64
+        Its intersections, pixels.
+    photograph : (h, w, 4) uint8 or None
+        Reduced.
+    """
+
+    location: Location
+    mask: RoadMask
+    index: ReferenceIndex
+    options: ViewOptions
+    place: Placement | None
+    lines: list[FloatArray]
+    seen: FloatArray
+    photograph: AnyArray | None
+    attribution: str
+
+    @classmethod
+    def of(
+        cls,
+        location: Location,
+        mask: RoadMask,
+        index: ReferenceIndex,
+        picture: str | os.PathLike[str] | None = None,
+        options: ViewOptions | None = None,
+        attribution: str = "",
+    ) -> Shown:
+        """Take the roads of the mask, or trace them again, and read the picture.
+
+        Raises
+        ------
+        MaskError
+            The picture cannot be read, or the mask shows no roads.
+        """
+        options, seen = options or ViewOptions(), location.seen
+        if seen is None:
+            scene, graph = trace_query(mask)
+            seen = Seen(graph, scene.intersections.xy)
+        lines = thin_lines([plane_to_pixel(line) for line in seen.graph.polylines()], options.max_query_vertices, 0.4)
+        photograph = None
+        if picture is not None:
+            from roadgeo.outputs.orthophoto import read_preview
+
+            photograph = read_preview(picture, options.picture_px)
+        place = None if location.homography is None else Placement.of(location)
+        crossings = plane_to_pixel(seen.xy)
+        return cls(location, mask, index, options, place, lines, crossings, photograph, attribution)
+
+    @property
+    def subject(self) -> str:
+        """What the image is, in words: "photograph" or "mask"."""
+        return "mask" if self.photograph is None and self.mask.probability is None else "photograph"
+
+    @property
+    def size(self) -> tuple[int, int]:
+        """Width and height of the mask."""
+        return self.mask.shape[1], self.mask.shape[0]
+
+    @property
+    def box(self) -> Box:
+        """The frame."""
+        return 0.0, 0.0, float(self.size[0]), float(self.size[1])
+
+    def placed(self) -> Placement:
+        """Return the place.
+
+        Raises
+        ------
+        OutputError
+            There is none.
+        """
+        return self.place or Placement.of(self.location)
+
+    def matches(self) -> Evidence | None:
+        """Those with the largest residuals, in falling order."""
+        evidence = self.location.evidence
+        if evidence is None:
+            return None
+        first = np.argsort(-evidence.residual_m, kind="stable")[: self.options.max_matches]
+        picked = (evidence.query_xy[first], evidence.reference_xy[first], evidence.residual_m[first])
+        return Evidence(evidence.query_graph, *picked)
+
+    def runner_up(self) -> FloatArray | None:
+        """Position (2,) in the CRS of the middle of the best other place; of a refusal, of the best that it had."""
+        other = self.location.runner_up if self.place else next(iter(self.location.alternatives), None)
+        return None if other is None else np.array([other.x, other.y])
+
+    def draw_picture(self, color: Color) -> AnyArray:
+        """Draw the photograph, or else the mask's roads in a colour: (h, w, 4) uint8."""
+        return mask_picture(self.mask, color, self.options.picture_px) if self.photograph is None else self.photograph
+
+    def probability(self) -> Picture | None:
+        """Return a segmenter's probability, lighter where higher; None without one."""
+        seen = self.mask.probability
+        if seen is None:
+            return None
+        image = _tinted(np.where(seen == _UNKNOWN, 0, seen).astype(np.uint8), _PROBABLE, self.options.picture_px)
+        return Picture(image, self.box, self.options.picture_bytes, lossless=True)
+
+
+@dataclass(frozen=True)
+class Window:
+    """A part of the map; its frame counts metres from its north-western corner, y down."""
+
+    west: float
+    north: float
+    width: float
+    height: float
+
+    @classmethod
+    def around(cls, ring: FloatArray, margin: float, other: FloatArray | None = None) -> Window:
+        """Lay it around corners (K, 2), and around another point that is no farther off than twice their size.
+
+        `margin` is left on each side, in lengths of the longer side.
+        """
+        ring = ring[np.isfinite(ring).all(axis=1)]
+        low, high = ring.min(axis=0), ring.max(axis=0)
+        size = float((high - low).max())
+        if other is not None and (np.abs(other - (low + high) / 2) < 2 * size).all():
+            low, high = np.minimum(low, other), np.maximum(high, other)
+        west, north = math.floor(low[0] - margin * size), math.ceil(high[1] + margin * size)
+        return cls(west, north, high[0] + margin * size - west, north - (low[1] - margin * size))
+
+    def no_longer_than(self, ratio: float) -> Window:
+        """Widen it to at most this ratio of its sides."""
+        x, y = max(self.height / ratio - self.width, 0.0), max(self.width / ratio - self.height, 0.0)
+        return Window(self.west - x / 2, self.north + y / 2, self.width + x, self.height + y)
+
+    @property
+    def box(self) -> Box:
+        """All of it, in its frame."""
+        return 0.0, 0.0, self.width, self.height
+
+    def place(self, xy: FloatArray) -> FloatArray:
+        """Take CRS positions (..., 2) to its frame."""
+        return (np.asarray(xy, float) - (self.west, self.north)) * (1.0, -1.0)
+
+    def matrix(self) -> FloatArray:
+        """(3, 3) homography that does the same."""
+        return np.array([[1.0, 0.0, -self.west], [0.0, -1.0, self.north], [0.0, 0.0, 1.0]])
+
+    def holds(self, xy: FloatArray) -> BoolArray:
+        """Whether CRS positions (..., 2) lie inside."""
+        at = self.place(xy)
+        return np.asarray(((at >= 0) & (at <= (self.width, self.height))).all(axis=-1))
+
+    def segments(self, index: ReferenceIndex) -> FloatArray:
+        """(S, 2, 2) CRS positions of the ends of the map's road segments that may touch the window."""
+        low = index.plane.from_crs(np.array([self.west, self.north - self.height]))
+        high = index.plane.from_crs(np.array([self.west + self.width, self.north]))
+        ends = index.segments.reshape(-1, 2, 2)
+        near = touching(ends, low, high)
+        return index.plane.to_crs(ends[near].astype(float))
+
+
+def touching(ends: AnyArray, low: FloatArray, high: FloatArray) -> BoolArray:
+    """Return which segments, given by their ends (S, 2, 2), may touch the box between two of its corners."""
+    return np.asarray((ends.max(axis=1) >= low).all(axis=1) & (ends.min(axis=1) <= high).all(axis=1))
+
+
+def mask_picture(mask: RoadMask, color: Color, side: int) -> AnyArray:
+    """Draw a mask's roads in a colour, and what was not observed in grey: (h, w, 4) uint8, at most `side` pixels."""
+    image = _tinted(mask.roads.view(np.uint8) * np.uint8(255), color, side)
+    if mask.observed is not None:
+        unseen = cv2.resize((~mask.observed).view(np.uint8), image.shape[1::-1], interpolation=cv2.INTER_NEAREST)
+        image[unseen > 0] = (*_GREY, 60)
+    return image
+
+
+def _tinted(opacity: AnyArray, color: Color, side: int) -> AnyArray:
+    """Draw a colour at opacities (H, W), reduced to a side; few levels of opacity are coded in few bytes."""
+    factor = min(1.0, side / max(opacity.shape))
+    size = [max(round(length * factor), 1) for length in opacity.shape[::-1]]
+    image = np.empty((size[1], size[0], 4), np.uint8)
+    image[..., :3] = color
+    image[..., 3] = np.bitwise_and(cv2.resize(opacity, size, interpolation=cv2.INTER_AREA), 0xF0)
+    return image
+
+
+# --- the frame --------------------------------------------------------------------------------------------------------
+
+
+def frame_layers(subject: Shown) -> list[Layer]:
+    """Return the mask, or its photograph, with the roads and intersections seen in it; in its pixels."""
+    is_photograph = subject.photograph is not None
+    image = subject.draw_picture(_GREY)
+    picture = Picture(image, subject.box, subject.options.picture_bytes, lossless=not is_photograph)
+    matches = subject.matches()
+    matched = np.empty((0, 2)) if matches is None else plane_to_pixel(matches.query_xy)
+    taken = set(map(tuple, matched.tolist()))
+    others = np.array([xy for xy in subject.seen.tolist() if tuple(xy) not in taken]).reshape(-1, 2)
+    others = others[: subject.options.max_query_vertices // 4]
+    called = "other intersections" if len(matched) else "its intersections"
+    return [
+        Layer("picture", "photograph" if is_photograph else "mask", [picture]),
+        Layer("query-roads", "its roads", [Lines(subject.lines)]),
+        Layer("unmatched", called, [Dots(others, hollow=True)]),
+        Layer("matches", "matched", [Dots(matched)]),
+        Layer("edge", "", [Ring(subject.mask.corners, up=True)]),
+    ]
+
+
+# --- the place --------------------------------------------------------------------------------------------------------
+
+
+def place_layers(subject: Shown, place: Placement, window: Window) -> list[Layer]:
+    """Return the map around a footprint, and the footprint on it; in the frame of a window."""
+    location, options = subject.location, subject.options
+    wide = Window.around(place.footprint, options.reach, subject.runner_up())
+    crossings = subject.index.plane.to_crs(subject.index.xy)
+    crossings = window.place(crossings[wide.holds(crossings)][: options.max_map_vertices // 4])
+    corners = window.place(place.footprint)
+    lines = [line for line in (window.place(place.to_crs(one)) for one in subject.lines) if np.isfinite(line).all()]
+    layers = [
+        Layer("ground", "", [Ring(corners)]),
+        *_picture_on_map(subject, place, window),
+        map_layer(subject.index, window, wide, options.max_map_vertices),
+        Layer("unmatched", "intersections of the map", [Dots(crossings, hollow=True)], shown=False),
+        Layer("query-roads", f"roads of the {subject.subject}", [Lines(lines)]),
+        Layer("footprint", "footprint", [Ring(corners, up=True)]),
+    ]
+    matches = subject.matches()
+    if matches is not None:
+        at, found = window.place(matches.reference_xy), window.place(place.to_crs(plane_to_pixel(matches.query_xy)))
+        layers.append(Layer("residuals", "residuals", [Arrows(at, found - at)]))
+        layers.append(Layer("matches", "matched intersections", [Dots(at)]))
+    sigma = location.corner_sigma_m
+    if sigma is not None:
+        texts = list(map(write_sigma, sigma.tolist()))
+        layers.append(Layer("sigma", "corners, 95 %", [Circles(corners, SIGMAS * sigma, texts)]))
+    other = subject.runner_up()
+    if other is not None and window.holds(other):
+        layers.append(Layer("runner-up", "runner-up", [Cross(window.place(other), "runner-up")]))
+    return layers
+
+
+def map_layer(index: ReferenceIndex, window: Window, wide: Window, max_vertices: int) -> Layer:
+    """Return the roads of a map in a wide window, in the frame of another."""
+    roads = join_segments(window.place(wide.segments(index)))
+    return Layer("map-roads", "roads of the map", [Lines(thin_lines(roads, max_vertices))])
+
+
+def _picture_on_map(subject: Shown, place: Placement, window: Window) -> list[Layer]:
+    """Return the photograph, or the mask's roads, warped to where it lies; nothing where that cannot be drawn."""
+    image = subject.draw_picture(rgb("query"))
+    size = image.shape[1], image.shape[0]
+    to_crs = place.homography @ np.diag([subject.size[0] / size[0], subject.size[1] / size[1], 1.0])
+    grid = cover(size, to_crs, None, subject.options.picture_px**2)
+    if grid.width == 0:
+        return []
+    is_photograph = subject.photograph is not None
+    interpolation = cv2.INTER_LINEAR if is_photograph else cv2.INTER_NEAREST
+    warped = warp(image, to_crs, grid, interpolation=interpolation, lens=place.lens(size))
+    x, y = window.place(np.array([grid.west, grid.north])).tolist()
+    box = (x, y, grid.width * grid.resolution, grid.height * grid.resolution)
+    picture = Picture(warped, box, subject.options.picture_bytes, lossless=not is_photograph)
+    return [Layer("picture", "photograph" if is_photograph else "mask", [picture], shown=is_photograph)]
+
+
+# --- the whole map ----------------------------------------------------------------------------------------------------
+
+
+def whole_map(index: ReferenceIndex, max_bytes: int, width_px: int) -> tuple[Layer, Window]:
+    """Return all roads of a reference as a picture, and its window."""
+    x0, y0, size = index.grid
+    columns, rows = index.shape
+    west, south = index.plane.to_crs(np.array([x0, y0])).tolist()
+    window = Window(west, south + rows * size, columns * size, rows * size)
+    scale = min(width_px / window.width, 2 * width_px / window.height)
+    alpha = np.zeros((max(round(window.height * scale), 1), max(round(window.width * scale), 1)), np.uint8)
+    ends = (index.segments.reshape(-1, 2, 2) - (x0, y0 + rows * size)) * (scale, -scale)
+    cv2.polylines(alpha, list(np.rint(ends * 16).astype(np.int32)), False, 160, 1, cv2.LINE_AA, 4)
+    image = _tinted(alpha, _GREY, max(alpha.shape))
+    return Layer("picture", "", [Picture(image, window.box, max_bytes, lossless=True)]), window
