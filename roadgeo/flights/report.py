@@ -98,7 +98,8 @@ def render_flight(
         why = html.escape(rows[-1].reason if rows else "no frames")
         return render_page(title, header, f"<main><aside><p>The flight was not located: {why}</p></aside></main>")
     # Footprints in metres from the corner of the map that is shown.
-    corners = {k: _corners(one) for k, one in enumerate(tracked) if one.pose is not None and one.reference is reference}
+    there = [k for k, one in enumerate(tracked) if one.reference is not None and one.reference.name == reference.name]
+    corners = {k: _corners(tracked[k]) for k in there}
     window = Window.around(np.concatenate(list(corners.values())), _MARGIN).no_longer_than(2.0)
     rings = {k: window.place(ring) for k, ring in corners.items()}
     layers = [map_layer(reference.index, window, window, _VERTICES)]
