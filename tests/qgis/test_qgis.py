@@ -12,6 +12,7 @@ from dataclasses import dataclass
 from pathlib import Path
 
 import cv2
+import geopandas
 import numpy as np
 import pytest
 import rasterio
@@ -174,7 +175,7 @@ def test_the_scanner_of_the_plugin_repository_finds_nothing(command: list[str], 
 
 
 def test_every_algorithm_has_its_place_in_the_help_page() -> None:
-    names = re.findall(r'NAME, TITLE = "(\w+)"', (PLUGIN / "algorithms.py").read_text("utf-8"))
+    names = re.findall(r'NAME = "(\w+)"', (PLUGIN / "algorithms.py").read_text("utf-8"))
     page = (PLUGIN / "help.html").read_text("utf-8")
     assert len(names) == 8
     assert set(re.findall(r'<h2 id="(\w+)"', page)) == {*names, "mend"}
@@ -192,7 +193,12 @@ def test_the_plugin_is_written_for_every_qgis_from_3_22_to_qt_6(path: Path) -> N
     tree = ast.parse(source, feature_version=(3, 9))
     imported = {node.module for node in ast.walk(tree) if isinstance(node, ast.ImportFrom)}
     imported |= {alias.name for node in ast.walk(tree) if isinstance(node, ast.Import) for alias in node.names}
-    foreign = ("PyQt", "PySide", "roadgeo", *(() if path.name in ("dock.py", "placing.py", "refit.py") else ("numpy",)))
+    foreign = (
+        "PyQt",
+        "PySide",
+        "roadgeo",
+        *(() if path.name in ("canvases.py", "dock.py", "placing.py", "refit.py") else ("numpy",)),
+    )
     assert not [name for name in imported if name and name.startswith(foreign)]
     assert not re.findall(r"\b(?:Qt|Qgis|Qgs\w+)\.(?:Type|Flag|[A-Z]\w*)\b(?![.(])", source)
 
@@ -256,7 +262,7 @@ def test_a_refused_mask_is_a_warning_with_the_reason(qgis: Qgis, porto: Path) ->
     mask, folder = MASKS["elsewhere"].path, qgis.folder / "no"
     refused = qgis.run("locatemask", MASK=mask, REFERENCE=porto, OUTPUT_FOLDER=folder)
     assert refused["results"]["STATUS"] == "not_located"
-    assert refused["layers"] == {}
+    assert set(refused["layers"]) == {"porto roads"}  # on which its best places are
     assert f"warning: elsewhere: {refused['results']['REASON']}" in refused["said"]
 
 
@@ -269,7 +275,7 @@ def test_errors_are_shown_in_the_words_of_qgis(qgis: Qgis, porto: Path) -> None:
     nameless = qgis.run("buildreference", EXTENT="0,1,0,1 [EPSG:4326]")
     assert "no reference '" in absent["failed"]
     assert "“Pixel size, metres”" in scales["failed"]
-    assert "by name or by a part of the map" in twice["failed"]
+    assert "Name the country or state, or give a part of the map" in twice["failed"]
     assert "Give one source of roads" in nothing["failed"]
     assert "Give the reference a name" in nameless["failed"]
     assert "--" not in "".join(one["failed"] for one in (absent, scales, nothing))
@@ -368,13 +374,17 @@ def test_a_folder_of_masks_is_located_whatever_is_wrong_with_some(qgis: Qgis, po
     assert any(line.startswith("error: ") and "broken.png" in line for line in done["said"])
 
 
-def test_a_mask_is_vectorized(qgis: Qgis) -> None:
-    done = qgis.run("vectorizemask", MASK=MASKS["segmenter"].path, OUTPUT_FOLDER=qgis.folder / "seen")
-    assert set(done["layers"]) == {"Roads as seen", "Intersections as seen"}
-    for layer in done["layers"].values():
-        assert layer["valid"]
-        assert layer["features"] > 50
-    assert done["layers"]["Roads as seen"]["colors"] == ["#ffbe28"]
+def test_a_mask_is_vectorized_and_each_run_has_its_own_group(qgis: Qgis) -> None:
+    parameters = {"MASK": str(MASKS["segmenter"].path)}
+    tasks = [{**parameters, "OUTPUT_FOLDER": str(qgis.folder / name)} for name in ("seen", "seen again")]
+    runs, _, _ = qgis.ask(*(("run", {"algorithm": "roadgeo:vectorizemask", "parameters": task}) for task in tasks))
+    for run, group in zip(runs, ("segmenter", "segmenter (2)"), strict=True):
+        assert set(run["layers"]) == {"Roads as seen", "Intersections as seen"}
+        for layer in run["layers"].values():
+            assert layer["valid"]
+            assert layer["features"] > 50
+            assert layer["group"] == group
+        assert run["layers"]["Roads as seen"]["colors"] == ["#ffbe28"]
 
 
 def test_a_photograph_is_vectorized(qgis: Qgis) -> None:
@@ -401,13 +411,15 @@ def test_results_are_loaded_with_their_styles(qgis: Qgis, porto: Path) -> None:
     assert set(built["layers"]) == {"again roads", "again coverage", "again intersections"}
     assert str(qgis.folder / "again.gpkg") in remembered
     layers = done["layers"]
-    names = {"drone", "drone footprint", "drone matches", "drone residuals", "drone roads"}
+    names = {"drone", "drone footprint", "drone matches", "drone residuals × 20", "drone roads"}
     assert set(layers) == {*names, "porto roads"}  # the map that lies below
     assert {layers[name]["group"] for name in names} == {"drone"}
     assert layers["porto roads"]["group"] == ""
     assert Path(done["results"]["REPORT_PAGE"]).name == "drone_report.html"
     assert Path(done["results"]["REPORT_PAGE"]).exists()
     assert all(layer["valid"] and layer["crs"] == "EPSG:32629" for layer in layers.values())
+    residuals = geopandas.read_file(folder / "drone_location.gpkg", layer="residuals")
+    assert np.allclose(residuals.length, 20 * residuals["residual_m"], rtol=0.01)  # as the layer's name has it
     assert layers["drone"]["renderer"] == "paletted"
     assert layers["drone footprint"]["colors"] == [FOOTPRINT]
     assert layers["drone roads"]["colors"] == [ROAD]

@@ -98,7 +98,7 @@ def test_the_message_tells_it_and_zooms_there(seen: dict) -> None:
 
 
 def test_the_results_lie_in_a_group_over_the_roads_of_the_reference(seen: dict) -> None:
-    names = ["drone residuals", "drone roads", "drone matches", "drone footprint", "drone"]
+    names = ["drone residuals × 20", "drone roads", "drone matches", "drone footprint", "drone"]
     assert list(seen["layers"]["drone"]) == names
     assert "porto-streets roads" in seen["layers"]
 
@@ -111,13 +111,22 @@ def test_the_window_shows_footprint_and_roads(seen: dict, folder: Path) -> None:
         assert cv2.imread(str(folder / f"{name}.png")).std() > 15  # not an empty box
 
 
-def test_of_places_that_fit_alike_one_is_looked_at_and_chosen(seen: dict) -> None:
-    assert seen["ambiguous"] == "drone: two places fit almost equally"
-    assert seen["places"] == ["0.0 km", "2.8 km"]
-    assert seen["looked_at"] == pytest.approx(-8.608 + 0.03, abs=5e-3)
+def test_of_places_that_fit_alike_the_likeliest_comes_first_and_any_is_looked_at_and_chosen(seen: dict) -> None:
+    assert seen["ambiguous"].startswith("drone: two places fit almost equally")
+    assert seen["ambiguous_buttons"] == ["Choose the place...", "Mend by hand"]
+    assert seen["button_within"]
+    assert seen["places"] == [["porto-streets", "0.0 km", "best"], ["porto-streets", "1.4 km", "6 times less"]]
+    assert seen["looked_at"] == pytest.approx(-8.608, abs=5e-3)
     lon, lat = (float(text) for text in seen["chosen"]["NEAR"].split(" ")[0].split(","))
-    assert (lon, lat) == (pytest.approx(-8.578, abs=1e-3), pytest.approx(41.1625, abs=1e-3))
-    assert float(seen["chosen"]["NEAR_RADIUS"]) < 1000
+    assert (lon, lat) == (pytest.approx(-8.608, abs=1e-3), pytest.approx(41.1525, abs=1e-3))
+    assert float(seen["chosen"]["NEAR_RADIUS"]) < 500
+
+
+def test_what_is_not_sure_at_the_chosen_place_either_is_mended_from_there(seen: dict) -> None:
+    assert seen["again"].startswith("drone: not sure near the chosen place either: two places")
+    residuals, footprint, expected = seen["corners"]
+    assert residuals == pytest.approx([0.0] * 4, abs=0.01)
+    assert np.allclose(footprint, expected, atol=0.01)
     assert seen["refused"] == "drone: no"
     assert seen["refused_buttons"] == []
 
@@ -125,6 +134,7 @@ def test_of_places_that_fit_alike_one_is_looked_at_and_chosen(seen: dict) -> Non
 def test_the_panel_opens_with_the_points_of_what_was_located(seen: dict) -> None:
     dock = seen["dock"]
     assert dock["shown"]
+    assert seen["opened"] == [dock["picture"], dock["matches"]]  # from the menu as well
     assert dock["head"] == "Residual (m)"
     given = [Match(*point) for point in dock["points"]]
     assert dock["said"].startswith(f"{len(given)} of {len(given)} points")
@@ -146,6 +156,14 @@ def test_points_are_moved_on_both_sides_deleted_and_added(seen: dict) -> None:
     assert dock["moved_px"] > 5.0
     assert dock["deleted"] == dock["matches"] - 2
     assert dock["added"] == [dock["matches"] - 1, pytest.approx(0.0, abs=0.01)]
+
+
+def test_the_list_is_sorted_and_a_change_is_taken_back(seen: dict) -> None:
+    numbers, residuals = seen["dock"]["sorted"]
+    assert residuals == sorted(residuals, reverse=True)
+    assert numbers[0] == 2  # which was dragged
+    assert residuals == [seen["dock"]["dragged"][number - 1] for number in numbers]
+    assert seen["dock"]["undone"] == [True, seen["dock"]["before"]]
 
 
 def test_what_is_written_is_the_mended_fit(seen: dict) -> None:

@@ -234,6 +234,7 @@ CORE = {
     "QgsCoordinateReferenceSystem": str,
     "QgsProviderRegistry": Providers,
     "QgsSettings": Kept,
+    **{f"Qgs{name}": object for name in ("CoordinateTransform", "PointXY", "VectorLayer")},
 }
 
 
@@ -331,7 +332,7 @@ def main():
     sys.path.insert(0, str(Path(folder).parent))
     plugin = importlib.import_module(Path(folder).name).classFactory(None)
     window, heard = types.ModuleType("messages"), []
-    window.tell = lambda algorithm, finding: heard.extend([algorithm, finding.name, finding.location["status"]])
+    window.announce = lambda algorithm, finding: heard.extend([algorithm, finding.name, finding.location["status"]])
     sys.modules[f"{Path(folder).name}.messages"] = window
     plugin.initGui()
     (provider,) = REGISTRY.providers

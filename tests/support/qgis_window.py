@@ -5,6 +5,7 @@ shows, choose among places, mend by hand. Keeps what happened, and a picture of 
 that the environment variable ROADGEO_TASK names.
 """
 
+import importlib
 import json
 import os
 import traceback
@@ -96,7 +97,7 @@ def drag(widget, start, end):
 def tour():
     plugin = plugins["roadgeo_qgis"]
     menu = plugin.menu
-    module = __import__("roadgeo_qgis.messages", fromlist=["messages"])
+    messages, window = (importlib.import_module(f"roadgeo_qgis.{name}") for name in ("messages", "window"))
     iface.mainWindow().resize(1280, 850)
     # The menu and the button.
     ANSWER["menu"] = [action.text() for action in menu.menu.actions() if action.text()]
@@ -110,7 +111,7 @@ def tour():
     ANSWER["first"], buttons = message()
     ANSWER["first_buttons"] = list(buttons)
     buttons["Set up roadgeo..."].click()
-    ANSWER["setup"] = fill_and_run(module._OPEN[-1], "setup")
+    ANSWER["setup"] = fill_and_run(window.OPEN[-1], "setup")
     ANSWER["ready"], buttons = message()
     ANSWER["ready_buttons"] = list(buttons)
     ANSWER["messages"] = [one.text() for one in iface.messageBar().findChildren(QgsMessageBarItem)]
@@ -118,7 +119,7 @@ def tour():
     roads = QgsVectorLayer(TASK["roads"], "porto streets", "ogr")
     PROJECT.addMapLayer(roads)
     wanted = {"ROADS": roads.id(), "KINDS": "all"}
-    ANSWER["build"] = fill_and_run(module.open_dialog("buildreference", wanted), "build")
+    ANSWER["build"] = fill_and_run(window.open_dialog("buildreference", wanted), "build")
     PROJECT.removeMapLayer(roads.id())
     # Locate the current layer near what the map shows.
     iface.setActiveLayer(next(one for one in PROJECT.mapLayers().values() if one.name().endswith(" roads")))
@@ -144,11 +145,13 @@ def tour():
     ANSWER["layers"] = describe(PROJECT.layerTreeRoot())
     extent = iface.mapCanvas().extent()
     ANSWER["shown"] = [extent.width(), extent.center().x(), extent.center().y()]
-    # Mend by hand.
+    # Mend by hand: from the menu, it opens what was located; from the message, with its points.
+    menu.mend()
+    ANSWER["opened"] = [menu.dock.picture, len(menu.dock.matches)]
     buttons["Mend by hand"].click()
     mend(menu.dock)
     menu.dock.hide()
-    choose(module)
+    choose(messages, window)
     # Switched off in the list of plugins.
     plugin.unload()
     settle()
@@ -158,35 +161,48 @@ def tour():
     ]
 
 
-def choose(module):
-    """Two places fit: the second is looked at, and chosen."""
-    session = __import__("roadgeo_qgis.session", fromlist=["session"])
+def choose(messages, window):
+    """Two places fit, of which the likelier is listed behind: the other is looked at, and chosen."""
+    session = importlib.import_module("roadgeo_qgis.session")
     location = json.loads(Path(ANSWER["locate"]["results"]["OUTPUT_FOLDER"], "drone_location.json").read_text("utf-8"))
     center = location["center"]
-    other = {"center": {**center, "lon": center["lon"] + 0.03, "lat": center["lat"] + 0.01}, "log10_odds": -0.4}
-    location |= {"status": "ambiguous", "reason": "two places fit almost equally", "log10_odds": 0.4}
-    location["alternatives"] = [other]
+    reason = "two places fit almost equally: the roads that the picture shows explain one of them only 6 times better; "
+    reason += "a pixel size, a heading or a part of the map would decide between them"
+    likelier = {"center": {**center, "lon": center["lon"] - 0.01, "lat": center["lat"] + 0.01}, "log10_odds": 1.2}
+    location |= {"status": "ambiguous", "reason": reason, "log10_odds": 0.4, "alternatives": [likelier]}
     parameters = {"MASK": TASK["picture"], "REFERENCE": "porto-streets", "OUTPUT_FOLDER": "TEMPORARY_OUTPUT"}
     found = session.Finding("drone", TASK["picture"], "", "", location, parameters)
-    module.tell("locatemask", found)
+    messages.announce("locatemask", found)
     ANSWER["ambiguous"], buttons = message()
+    ANSWER["ambiguous_buttons"] = list(buttons)
+    bar, last = iface.messageBar(), buttons["Mend by hand"]
+    ANSWER["button_within"] = last.mapTo(bar, QPoint(last.width(), 0)).x() < bar.width()
+    keep(iface.mainWindow(), "ambiguous")
     buttons["Choose the place..."].click()
-    dialog = module._OPEN[-1]
+    dialog = window.OPEN[-1]
     dialog.table.selectRow(1)
     settle()
     iface.mapCanvas().waitWhileRendering()
     extent = iface.mapCanvas().extent()
     ANSWER["looked_at"] = extent.center().x()
     keep(dialog, "places")
-    ANSWER["places"] = [dialog.table.item(row, 1).text() for row in range(dialog.table.rowCount())]
+    ANSWER["places"] = [[dialog.table.item(row, k).text() for k in (1, 2, 3)] for row in range(dialog.table.rowCount())]
     dialog.button.click()
-    again = module._OPEN[-1]
+    again = window.OPEN[-1]
     values = again.createProcessingParameters()
     ANSWER["chosen"] = {name: str(values.get(name)) for name in ("NEAR", "NEAR_RADIUS", "MASK")}
     again.close()
+    # Not sure there either: the panel opens with the corners of the best place.
+    messages.announce("locatemask", replace(found, parameters={**parameters, **ANSWER["chosen"]}))
+    ANSWER["again"], buttons = message()
+    buttons["Mend by hand"].click()
+    dock = plugins["roadgeo_qgis"].menu.dock
+    ANSWER["corners"] = [residuals(dock), dock.footprint(), location["footprint"]]
+    dock.hide()
     # Refused: a warning, with nothing to zoom to.
-    nothing = {"status": "not_located", "reason": "no", "alternatives": [], "center": None, "footprint_lonlat": None}
-    module.tell("locatemask", replace(found, location={**location, **nothing}))
+    nothing = dict.fromkeys(("center", "footprint", "footprint_lonlat"))
+    refused = {**location, **nothing, "status": "not_located", "reason": "no", "alternatives": []}
+    messages.announce("locatemask", replace(found, location=refused))
     ANSWER["refused"], buttons = message()
     ANSWER["refused_buttons"] = list(buttons)
 
@@ -204,11 +220,11 @@ def mend(dock):
     dock._zoom()
     dock.canvas.waitWhileRendering()
     answer["head"] = dock.table.horizontalHeaderItem(1).text()
-    answer["before"], answer["said"] = residuals(dock), dock.said.text()
+    answer["before"], answer["said"] = residuals(dock), dock.status.text()
     answer["points"] = [[one.column, one.row, one.x, one.y] for one in dock.matches]
     answer["matches"] = len(dock.matches)
     dock.table.item(0, 0).setCheckState(Qt.CheckState.Unchecked)
-    answer["off"], answer["said_off"] = residuals(dock), dock.said.text()
+    answer["off"], answer["said_off"] = residuals(dock), dock.status.text()
     dock.table.item(0, 0).setCheckState(Qt.CheckState.Checked)
     # Dragged on the map, by 30 pixels to the right.
     dock.table.selectRow(1)
@@ -219,6 +235,12 @@ def mend(dock):
     answer["moved_m"] = dock.matches[1].x - one.x
     answer["pixel_m"] = dock.canvas.mapUnitsPerPixel()
     answer["dragged"] = residuals(dock)
+    # Sorted by residuals, the largest first; and taken back.
+    dock.sort(1)
+    answer["sorted"] = [[int(dock.table.item(k, 0).text()) for k in range(dock.table.rowCount())], residuals(dock)]
+    dock.sort(0)
+    dock.undo()
+    answer["undone"] = [dock.matches[1] == one, residuals(dock)]
     # Dragged on the picture, where others lie beside it: the one that is chosen lies on top.
     dock.table.selectRow(2)
     two = dock.matches[2]
@@ -248,13 +270,13 @@ def mend(dock):
     answer["matrix"] = dock.found.matrix.tolist()
     # A picture without points: four are clicked, on the picture and on the map in turn.
     answer["refused"] = dock.open(TASK["picture"], TASK["picture"])
-    answer["refused_said"] = dock.said.text()
+    answer["refused_said"] = dock.status.text()
     dock.open(TASK["picture"])
-    answer["empty"] = dock.said.text()
+    answer["empty"] = dock.status.text()
     width, height = dock.size
     for u, v in ((0.1, 0.1), (0.9, 0.1), (0.9, 0.9), (0.1, 0.9)):
         dock.click("picture", u * width, v * height)
-        answer["then"] = dock.said.text()
+        answer["then"] = dock.status.text()
         dock.click("map", -8.61 + 1e-5 * u * width, 41.15 - 1e-5 * v * height)
     answer["own"] = residuals(dock)
 

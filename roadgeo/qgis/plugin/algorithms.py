@@ -4,6 +4,8 @@ from __future__ import annotations
 
 import json
 import os
+import re
+from html import unescape
 from pathlib import Path
 from typing import Any, ClassVar
 
@@ -22,24 +24,34 @@ from qgis.utils import iface
 
 from . import parameters as given
 from .environment import ask_version, install
+from .library import list_places, list_references
 from .parameters import Option, Values
 from .runner import find_program
-from .session import PICTURE_KEPT, POINTS_KEPT, Finding, Session, library
+from .session import PICTURE_KEPT, POINTS_KEPT, Finding, Group, Session
 from .settings import NOT_FOUND, configure, locate_executable, remember_reference, remembered_references
 
 __all__ = ["ALGORITHMS"]
 
+#: Name of the layer of residuals, whose arrows are drawn longer than they are.
+_RESIDUALS = "residuals × 20"
+
+
+#: The help page: title and text of each algorithm, by its name.
+_PAGE = Path(__file__).parent / "help.html"
+_SECTION = r'<h2 id="(\w+)">(.*?)</h2>\s*(.*?)\s*(?=<h2|</body)'
+_HELP: dict[str, tuple[str, str]] = {
+    name: (unescape(title), text) for name, title, text in re.findall(_SECTION, _PAGE.read_text("utf-8"), re.DOTALL)
+}
+
 
 class RoadgeoAlgorithm(QgsProcessingAlgorithm):
-    """The base of the algorithms: each has a name, a help text, options, outputs and its `work`."""
+    """The base of the algorithms: each has a name, a section of the help page, options, outputs and its `work`."""
 
     session: Session
     NAME: ClassVar[str]
-    TITLE: ClassVar[str]
     TAGS: ClassVar[str]
-    HELP: ClassVar[str]
     OPTIONS: ClassVar[tuple[Option, ...]]
-    OUTPUTS: ClassVar[dict[str, tuple[Any, str]]]
+    OUTPUTS: ClassVar[dict[str, tuple[Any, str]]] = {}
 
     def work(self, values: Values, session: Session) -> dict[str, Any]:
         """Call roadgeo and return the results."""
@@ -55,20 +67,20 @@ class RoadgeoAlgorithm(QgsProcessingAlgorithm):
 
     def displayName(self) -> str:
         """Name in the toolbox."""
-        return self.TITLE
+        return _HELP[self.NAME][0]
 
     def shortDescription(self) -> str:
         """First sentence of the help."""
-        return self.HELP.split(". ")[0] + "."
+        return unescape(re.sub(r"<[^>]+>", "", _HELP[self.NAME][1])).replace("\n", " ").split(". ")[0] + "."
 
     def shortHelpString(self) -> str:
         """Text beside the parameters: the help, then every parameter with its hint."""
         hints = (f"<p><b>{option.label}</b><br>{option.hint}</p>" for option in self.OPTIONS)
-        return f"<p>{self.HELP}</p>" + "".join(hints)
+        return _HELP[self.NAME][1] + "".join(hints)
 
     def helpUrl(self) -> str:
         """Page behind the button Help: it ships with the plugin, and needs no network."""
-        page = QUrl.fromLocalFile(str(Path(__file__).parent / "help.html"))
+        page = QUrl.fromLocalFile(str(_PAGE))
         page.setFragment(self.NAME)
         return str(page.toString())
 
@@ -105,25 +117,18 @@ class RoadgeoAlgorithm(QgsProcessingAlgorithm):
         """Report the result, and open the pages that were asked for; QGIS calls this in the thread of its window."""
         self.session.open_pages()
         if iface is not None and self.session.finding is not None:
-            from .messages import tell
+            from .messages import announce
 
-            tell(self.name(), self.session.finding)
+            announce(self.name(), self.session.finding)
         return {}
 
 
 class BuildReference(RoadgeoAlgorithm):
     """Roads in, a reference out."""
 
-    NAME, TITLE = "buildreference", "Build road reference"
+    NAME = "buildreference"
     TAGS = "index roads osm openstreetmap map database"
-    HELP = (
-        "Draws the roads of a place as a mask shows them, and indexes their intersections. Done once per place; "
-        "the other algorithms then offer it in their lists. Give one source: a layer of road lines, a place, or an "
-        "extent. "
-        "Roads of OpenStreetMap are © OpenStreetMap contributors, ODbL."
-    )
     OPTIONS = given.ROADS
-    OUTPUTS: ClassVar[dict[str, tuple[Any, str]]] = {}
 
     def work(self, values: Values, session: Session) -> dict[str, Any]:
         """Build it; load its roads and intersections."""
@@ -144,8 +149,7 @@ class BuildReference(RoadgeoAlgorithm):
         if path:
             remember_reference(path)
         else:
-            files = (file for one in library(fresh=True) for file in one.files if file.endswith(".gpkg"))
-            path = max(files, key=os.path.getmtime)
+            path = max((known.file for known in list_references(fresh=True) if known.file), key=os.path.getmtime)
         for layer in ("coverage", "roads", "intersections"):
             session.show(Path(path), f"{Path(path).stem} {layer}", layer)
         return {"OUTPUT": path}
@@ -155,8 +159,8 @@ def _references(values: Values) -> list[str]:
     """Name the reference that was chosen; where none was, all that QGIS knows of."""
     if values.given("REFERENCE"):
         return [f"--reference={values.reference()}"]
-    beside = remembered_references()
-    return [f"--reference={one}" for one in (*(one.name for one in library()), *beside)] if beside else []
+    known = list_references() if remembered_references() else []  # by itself the program searches its whole library
+    return [f"--reference={reference.value}" for reference in known]
 
 
 _LOCATION_OUTPUTS = {
@@ -176,23 +180,9 @@ _LOCATION_OUTPUTS = {
 class LocateMask(RoadgeoAlgorithm):
     """One mask."""
 
-    NAME, TITLE = "locatemask", "Locate mask or photograph"
+    NAME = "locatemask"
     TAGS = "georeference geolocate footprint position match roads photo"
-    HELP = (
-        "Finds where a road mask, or a photograph, lies on a road reference, with no position, heading, scale or "
-        "camera known. In a photograph a network finds the roads first. What is located is drawn on the map, with its "
-        "footprint, its roads and the intersections that matched. What is not surely found is refused, with the reason."
-    )
-    OPTIONS = (
-        given.QUERY,
-        given.REFERENCE,
-        given.AREA,
-        given.REPORT,
-        *given.MASK_VALUES,
-        *given.SEGMENT,
-        *given.CAMERA,
-        given.OUTPUT_FOLDER,
-    )
+    OPTIONS = (given.QUERY, *given.SEARCH, given.OUTPUT_FOLDER)
     OUTPUTS = _LOCATION_OUTPUTS
 
     def work(self, values: Values, session: Session) -> dict[str, Any]:
@@ -204,45 +194,25 @@ class LocateMask(RoadgeoAlgorithm):
 class GeoreferenceImage(RoadgeoAlgorithm):
     """The picture itself."""
 
-    NAME, TITLE = "georeferenceimage", "Georeference image"
+    NAME = "georeferenceimage"
     TAGS = "warp photo orthorectify gcp control points"
-    HELP = (
-        "Finds where the road mask of an image lies on a road reference, and draws the image itself there: a Cloud "
-        "Optimized GeoTIFF, transparent outside its footprint. Without a mask a network finds the roads of the image. "
-        "The ground is taken for a plane. An image that is not surely found is refused, with the reason."
-    )
-    OPTIONS = (
-        given.PICTURE[0],
-        given.ITS_MASK,
-        given.REFERENCE,
-        given.AREA,
-        given.REPORT,
-        *given.PICTURE[1:],
-        *given.MASK_VALUES,
-        *given.SEGMENT,
-        *given.CAMERA,
-        given.OUTPUT_FOLDER,
-    )
+    OPTIONS = (given.IMAGE, given.ITS_MASK, *given.SEARCH, *given.DRAWING, given.PRODUCTS, given.OUTPUT_FOLDER)
     OUTPUTS = _LOCATION_OUTPUTS
 
     def work(self, values: Values, session: Session) -> dict[str, Any]:
         """Locate the mask and warp the image; load both results."""
-        image = values.raster("IMAGE")
-        mask = values.raster("MASK") if values.given("MASK") else image
-        drawn = [f"--image={image}"] if values.given("MASK") else []
+        image, has_mask = values.raster("IMAGE"), values.given("MASK")
+        drawn = [f"--image={image}"] if has_mask else []
+        mask = values.raster("MASK") if has_mask else image
         return _locate(mask, image, [*drawn, *self.arguments(values)], values, session)
 
 
 class LocateMasks(RoadgeoAlgorithm):
     """A folder of masks."""
 
-    NAME, TITLE = "locatemasks", "Locate masks (batch)"
+    NAME = "locatemasks"
     TAGS = "georeference geolocate footprints many folder"
-    HELP = (
-        "Locates every road mask in a folder, and gathers their footprints in one layer. "
-        "A mask that cannot be read is reported; the others are finished."
-    )
-    OPTIONS = (*given.BATCH, *given.CAMERA, given.OUTPUT_FOLDER)
+    OPTIONS = given.BATCH
     OUTPUTS: ClassVar[dict[str, tuple[Any, str]]] = {
         "LOCATED": (QgsProcessingOutputNumber, "Located"),
         "NOT_LOCATED": (QgsProcessingOutputNumber, "Not located, or ambiguous"),
@@ -265,13 +235,9 @@ class LocateMasks(RoadgeoAlgorithm):
 class VectorizeMask(RoadgeoAlgorithm):
     """Roads as the program sees them."""
 
-    NAME, TITLE = "vectorizemask", "Vectorize mask or photograph"
+    NAME = "vectorizemask"
     TAGS = "skeleton centre lines trace roads intersections"
-    HELP = (
-        "Shows what roads and intersections are seen in a road mask or a photograph: the first thing to look at when "
-        "one was not located. The layers are in pixels and lie on the image where it has no georeference."
-    )
-    OPTIONS = (given.QUERY, *given.MASK_VALUES, *given.SEGMENT, *given.PIXEL_SIZE, given.OUTPUT_FOLDER)
+    OPTIONS = given.VECTORIZE
     OUTPUTS: ClassVar[dict[str, tuple[Any, str]]] = {"VECTORIZED": (QgsProcessingOutputVectorLayer, "Roads as seen")}
 
     def work(self, values: Values, session: Session) -> dict[str, Any]:
@@ -279,20 +245,17 @@ class VectorizeMask(RoadgeoAlgorithm):
         mask, folder = values.raster("MASK"), values.path("String", "OUTPUT_FOLDER")
         session.call("vectorize", mask, f"--out-dir={folder}", *self.arguments(values))
         path = Path(folder) / f"{Path(mask).stem}_vectorized.gpkg"
-        roads = session.show(path, "Roads as seen", "roads", Path(mask).stem)
-        session.show(path, "Intersections as seen", "intersections", Path(mask).stem)
+        group = Group(Path(mask).stem)
+        roads = session.show(path, "Roads as seen", "roads", group)
+        session.show(path, "Intersections as seen", "intersections", group)
         return {"OUTPUT_FOLDER": folder, "VECTORIZED": roads}
 
 
 class MapLocalizability(RoadgeoAlgorithm):
     """Where it would work."""
 
-    NAME, TITLE = "maplocalizability", "Map where masks would be located"
+    NAME = "maplocalizability"
     TAGS = "localizability promise evaluate simulate plan flight where"
-    HELP = (
-        "Says before a flight where it would be located: masks as the camera would see them are drawn from the "
-        "reference's own roads, all over the map, and each is searched for. Takes some minutes."
-    )
     OPTIONS = given.LOCALIZABILITY
     OUTPUTS: ClassVar[dict[str, tuple[Any, str]]] = {"MAP": (QgsProcessingOutputRasterLayer, "Where it would work")}
 
@@ -306,41 +269,44 @@ class MapLocalizability(RoadgeoAlgorithm):
 
 def _locate(mask: str, picture: str, options: list[str], values: Values, session: Session) -> dict[str, Any]:
     """Locate a mask, load the result, and keep it for the message bar."""
-    folder = values.path("String", "OUTPUT_FOLDER")
+    folder = Path(values.path("String", "OUTPUT_FOLDER"))
     to = ["--json", f"--out-dir={folder}", "--also=match-points", *_references(values)]
+    results: dict[str, Any] = {"OUTPUT_FOLDER": str(folder)}
     found = session.call("locate", mask, *to, *options)
     if not found:
-        return {"OUTPUT_FOLDER": folder}
-    location, stem = found[0], Path(folder) / Path(mask).stem
-    page, points = stem.with_name(f"{stem.name}_report.html"), Path(folder) / f"{Path(picture).name}_matches.points"
-    results = {"OUTPUT_FOLDER": folder, "STATUS": location["status"], "REASON": location["reason"]}
+        return results
+    location, name = found[0], Path(mask).stem
+    results |= {"STATUS": location["status"], "REASON": location["reason"]}
+    page, points = folder / f"{name}_report.html", folder / f"{Path(picture).name}_matches.points"
     if values.get("Boolean", "REPORT") and page.exists():
         session.pages.append(page)
         results["REPORT_PAGE"] = str(page)
     points_there, page_there = (str(path) if path.exists() else "" for path in (points, page))
-    session.finding = Finding(stem.name, picture, points_there, page_there, location, values.parameters)
+    session.finding = Finding(name, picture, points_there, page_there, location, values.parameters)
     if location["status"] != "located":
-        session.feedback.pushWarning(f"{stem.name}: {location['reason']}")
+        for name_of_map in {place.map for place in list_places(location)} - {""}:
+            session.show_map(name_of_map)
+        session.feedback.pushWarning(f"{name}: {location['reason']}")
         return results
     session.show_map(values.reference() or location["reference"])
-    return {**results, **_show_location(location, stem, {PICTURE_KEPT: picture, POINTS_KEPT: points_there}, session)}
+    kept = {PICTURE_KEPT: picture, POINTS_KEPT: points_there}
+    return {**results, **_show_location(location, folder / name, kept, session)}
 
 
 def _show_location(location: dict[str, Any], stem: Path, kept: dict[str, str], session: Session) -> dict[str, Any]:
     """Return the outputs of a location, and load its layers."""
-    footprint, package = stem.with_name(f"{stem.name}_footprint.tif"), stem.with_name(f"{stem.name}_location.gpkg")
-    name = stem.name
-    session.show(package, f"{name} matches", "matches", name)
-    session.show(package, f"{name} residuals", "residuals", name)
-    session.show(package, f"{name} roads", "query_roads", name)
+    name, package = stem.name, stem.with_name(f"{stem.name}_location.gpkg")
+    group = Group(name)
+    for title, layer in (("matches", "matches"), (_RESIDUALS, "residuals"), ("roads", "query_roads")):
+        session.show(package, f"{name} {title}", layer, group)
     return {
         "LONGITUDE": location["center"]["lon"],
         "LATITUDE": location["center"]["lat"],
         "GSD": location["gsd_m"],
         "ROTATION": location["rotation_deg"],
         "LOG10_ODDS": location["log10_odds"],
-        "LOCATION": session.show(package, f"{name} footprint", "footprint", name, kept),
-        "FOOTPRINT": session.show(footprint, name, group=name),
+        "LOCATION": session.show(package, f"{name} footprint", "footprint", group, kept),
+        "FOOTPRINT": session.show(stem.with_name(f"{name}_footprint.tif"), name, group=group),
     }
 
 
@@ -353,13 +319,8 @@ def _count(found: list[dict[str, Any]]) -> dict[str, Any]:
 class PlaceByPoints(RoadgeoAlgorithm):
     """A picture by control points that somebody set."""
 
-    NAME, TITLE = "placebypoints", "Put picture on the map by control points"
+    NAME = "placebypoints"
     TAGS = "georeference warp gcp homography projective refit"
-    HELP = (
-        "Draws a picture where control points have it: by the homography with the least squared distances on the map, "
-        "which is what a camera makes of level ground. The panel to mend a place by hand writes such points, and so "
-        "does the Georeferencer."
-    )
     OPTIONS = given.POINTS
     OUTPUTS: ClassVar[dict[str, tuple[Any, str]]] = {
         "FOOTPRINT": (QgsProcessingOutputRasterLayer, "On the map"),
@@ -384,12 +345,8 @@ class PlaceByPoints(RoadgeoAlgorithm):
 class SetUp(RoadgeoAlgorithm):
     """The program itself."""
 
-    NAME, TITLE = "setup", "Set up roadgeo"
+    NAME = "setup"
     TAGS = "install environment python pip first run"
-    HELP = (
-        "Finds the program roadgeo, which does the work in a Python of its own, tries it, and remembers it. Or "
-        "installs it, into an environment that is made for it: neither QGIS nor the system changes."
-    )
     OPTIONS = given.SETUP
     OUTPUTS: ClassVar[dict[str, tuple[Any, str]]] = {
         "FOUND": (QgsProcessingOutputString, "The program, or the Python that has it"),
@@ -421,9 +378,9 @@ class SetUp(RoadgeoAlgorithm):
         """Remember it, where QGIS keeps its settings."""
         configure(self.found["FOUND"])
         if iface is not None:
-            from .messages import tell_ready
+            from .messages import announce_ready
 
-            tell_ready(self.found["VERSION"])
+            announce_ready(self.found["VERSION"])
         return super().postProcessAlgorithm(context, feedback)
 
 

@@ -23,16 +23,14 @@ from qgis.core import (
     QgsRectangle,
     QgsWkbTypes,
 )
-from qgis.gui import QgsMapCanvas, QgsMapTool, QgsRubberBand, QgsVertexMarker
-from qgis.PyQt.QtCore import QCoreApplication, QRectF, QSize, Qt
-from qgis.PyQt.QtGui import QBrush, QColor, QPainter, QPen, QPixmap
+from qgis.gui import QgsMapCanvas, QgsRubberBand
+from qgis.PyQt.QtCore import QRectF, QSize, Qt
+from qgis.PyQt.QtGui import QColor, QKeySequence, QPixmap
 from qgis.PyQt.QtWidgets import (
     QDockWidget,
     QFileDialog,
-    QGraphicsEllipseItem,
     QGraphicsPixmapItem,
     QGraphicsScene,
-    QGraphicsView,
     QHBoxLayout,
     QHeaderView,
     QLabel,
@@ -46,108 +44,18 @@ from qgis.PyQt.QtWidgets import (
 )
 from qgis.utils import iface
 
-from .messages import open_dialog
+from .canvases import Dot, MapTool, Marker, PictureView
 from .refit import FEWEST, Fit, Match, fit, format_points, place, read_points
 from .session import PICTURE_KEPT, POINTS_KEPT
+from .window import open_dialog
 
 __all__ = ["MatchDock"]
 
 #: Colours of a point that is on, off, and chosen in the list; of the footprint; and how near a click must be, pixels.
-_ON, _OFF, _CHOSEN, _FRAME, _NEAR = "#1f6fb4", "#9a9a9a", "#e4572e", "#1f6fb4", 12.0
+_ON, _OFF, _CHOSEN, _FRAME, _NEAR = QColor("#1f6fb4"), QColor("#9a9a9a"), QColor("#e4572e"), QColor("#1f6fb4"), 12.0
 
 #: Pictures are shown with at most this number of pixels a side.
 _SHOWN_PX = 3000
-
-
-def _tr(text: str) -> str:
-    return str(QCoreApplication.translate("roadgeo", text))
-
-
-class _Dot(QGraphicsEllipseItem):
-    """A point on the picture, which can be dragged; as large on the screen however large the picture is."""
-
-    def __init__(self, number: int, moved: Callable[[int, float, float], None]) -> None:
-        super().__init__(QRectF(-6.0, -6.0, 12.0, 12.0))
-        self._number, self._moved = number, moved
-        self.setFlag(QGraphicsEllipseItem.GraphicsItemFlag.ItemIsMovable)
-        self.setFlag(QGraphicsEllipseItem.GraphicsItemFlag.ItemIgnoresTransformations)
-        self.setCursor(Qt.CursorShape.SizeAllCursor)
-
-    def mouseMoveEvent(self, event: Any) -> None:
-        """Report its new position."""
-        super().mouseMoveEvent(event)
-        self._moved(self._number, self.pos().x(), self.pos().y())
-
-
-class _Picture(QGraphicsView):
-    """The picture: the wheel zooms, dragging moves it, and a click adds a point where that is switched on."""
-
-    def __init__(self, scene: Any, dock: MatchDock) -> None:
-        super().__init__(scene)
-        self._dock = dock
-        self.setRenderHint(QPainter.RenderHint.SmoothPixmapTransform)
-        self.setTransformationAnchor(QGraphicsView.ViewportAnchor.AnchorUnderMouse)
-        self.setDragMode(QGraphicsView.DragMode.ScrollHandDrag)
-
-    def wheelEvent(self, event: Any) -> None:
-        """Zoom where the pointer is."""
-        factor = 1.25 if event.angleDelta().y() > 0 else 0.8
-        self.scale(factor, factor)
-
-    def mousePressEvent(self, event: Any) -> None:
-        """Add a point, or let it be moved."""
-        if self._dock.adding and not isinstance(self.itemAt(event.pos()), _Dot):
-            there = self.mapToScene(event.pos())
-            self._dock.click("picture", there.x(), there.y())
-        else:
-            super().mousePressEvent(event)
-
-
-class _MapTool(QgsMapTool):
-    """Drags the point on the map that is pressed upon; elsewhere it adds one, or moves the map."""
-
-    def __init__(self, canvas: Any, dock: MatchDock) -> None:
-        super().__init__(canvas)
-        self._dock, self._held, self._panning = dock, -1, False
-
-    def canvasPressEvent(self, event: Any) -> None:
-        """Take the point under the pointer."""
-        self._held = self._dock.nearest_on_map(event.pos())
-
-    def canvasMoveEvent(self, event: Any) -> None:
-        """Have it follow."""
-        if self._held >= 0:
-            there = self.toMapCoordinates(event.pos())
-            self._dock.move_on_map(self._held, there.x(), there.y())
-        elif event.buttons() & Qt.MouseButton.LeftButton and not self._dock.adding:
-            self._panning = True
-            self.canvas().panAction(event)
-
-    def canvasReleaseEvent(self, event: Any) -> None:
-        """Leave it there."""
-        there = self.toMapCoordinates(event.pos())
-        if self._held >= 0:
-            self._dock.move_on_map(self._held, there.x(), there.y())
-        elif self._dock.adding:
-            self._dock.click("map", there.x(), there.y())
-        elif self._panning:
-            self.canvas().panActionEnd(event.pos())
-        self._held, self._panning = -1, False
-
-
-class _Table(QTableWidget):
-    """The points as a list, of which the key Delete takes away what is selected."""
-
-    def __init__(self, dock: MatchDock) -> None:
-        super().__init__(0, 3)
-        self._dock = dock
-
-    def keyPressEvent(self, event: Any) -> None:
-        """Delete, or move on in the list."""
-        if event.key() == Qt.Key.Key_Delete:
-            self._dock.delete_chosen()
-        else:
-            super().keyPressEvent(event)
 
 
 class MatchDock(QDockWidget):
@@ -158,100 +66,125 @@ class MatchDock(QDockWidget):
     matches : list of Match
         The current ones; `found` is the fit through them.
     apart : list of float
-        Of each, on or off, how far it lies from where the fit puts it: metres where the CRS is known, else map units.
+        Distance of each, on or off, from where the fit puts it: metres where the CRS is known, else map units.
+    order : list of int
+        The matches in the order of the list's rows.
     adding : bool
         Whether a click adds a point.
     """
 
     def __init__(self, parent: Any = None) -> None:
-        super().__init__(_tr("roadgeo: mend a place by hand"), parent)
+        super().__init__("roadgeo: mend a place by hand", parent)
         self.setObjectName("RoadgeoMatches")
         self.matches: list[Match] = []
         self.found = Fit(None)
         self.apart: list[float] = []
-        self.crs = ""
-        self.picture = ""
-        self.size = (0, 0)
-        self.dots: list[_Dot] = []
-        self.markers: list[Any] = []
+        self.order: list[int] = []
+        self.crs, self.picture, self.size = "", "", (0, 0)
+        self.dots: list[Dot] = []
+        self.markers: list[Marker] = []
+        self._past: list[list[Match]] = []
         self._clicked: dict[str, tuple[float, float]] = {}
-        self._filling = False
+        self._filling, self._sorted_by = False, 0
         self.scene = QGraphicsScene(self)
-        self.view = _Picture(self.scene, self)
+        self.view = PictureView(self.scene, self)
         self.canvas = QgsMapCanvas()
         self.canvas.setCanvasColor(QColor("#ffffff"))
         self.band = QgsRubberBand(self.canvas, QgsWkbTypes.GeometryType.PolygonGeometry)
-        self.band.setStrokeColor(QColor(_FRAME))
+        self.band.setStrokeColor(_FRAME)
         self.band.setFillColor(QColor(31, 111, 180, 30))
-        self.tool = _MapTool(self.canvas, self)
+        self.tool = MapTool(self.canvas, self, self._nearest_on_map)
         self.canvas.setMapTool(self.tool)
-        self.table = _Table(self)
+        self.table = QTableWidget(0, 3)
         self.table.verticalHeader().hide()
         self.table.horizontalHeader().setSectionResizeMode(QHeaderView.ResizeMode.ResizeToContents)
+        self.table.horizontalHeader().setSortIndicatorShown(True)
+        self.table.horizontalHeader().sectionClicked.connect(self.sort)
         self.table.setSelectionBehavior(QTableWidget.SelectionBehavior.SelectRows)
         self.table.itemChanged.connect(self._switched)
         self.table.itemSelectionChanged.connect(self._paint)
-        self.said = QLabel(_tr("Open a picture that was located, or any picture to place it by points of your own."))
+        self.status = QLabel("Open a picture that was located, or any picture to place it by points of your own.")
+        self.status.setWordWrap(True)
+        self.buttons: dict[str, QPushButton] = {}
         self._lay_out()
-        self._name_columns()
 
     @property
     def adding(self) -> bool:
         """Whether a click adds a point."""
-        return bool(self.add_button.isChecked())
+        return bool(self.buttons["Add points"].isChecked())
 
     def _lay_out(self) -> None:
+        actions: dict[str, Callable[[], object]] = {
+            "Open...": self.offer,
+            "Add points": self._start_adding,
+            "Delete": self.delete_chosen,
+            "Undo": self.undo,
+            "Put on the map...": self.draw,
+            "Export...": self.ask_export,
+        }
         row = QHBoxLayout()
-        self.buttons = {}
-        for text, does in (
-            ("Open...", self.offer),
-            ("Add points", self._start_adding),
-            ("Delete", self.delete_chosen),
-            ("Put on the map...", self.draw),
-            ("Export...", self.ask_export),
-        ):
-            self.buttons[text] = QPushButton(_tr(text))
+        for text, does in actions.items():
+            self.buttons[text] = QPushButton(text)
             self.buttons[text].clicked.connect(lambda _=False, does=does: does())
             row.addWidget(self.buttons[text])
-        self.add_button = self.buttons["Add points"]
-        self.add_button.setCheckable(True)
-        row.addWidget(self.said, 1)
+        row.addStretch(1)
+        self.buttons["Add points"].setCheckable(True)
         sides = QSplitter(Qt.Orientation.Horizontal)
         for side in (self.view, self.canvas, self.table):
             sides.addWidget(side)
-        self.table.setMinimumWidth(265)
-        sides.setSizes([400, 400, 265])
-        body, column = QWidget(), QVBoxLayout()
+        self.table.setMinimumWidth(310)
+        sides.setSizes([400, 400, 310])
+        body = QWidget()
+        column = QVBoxLayout(body)
         column.addLayout(row)
+        column.addWidget(self.status)
         column.addWidget(sides, 1)
-        body.setLayout(column)
         self.setWidget(body)
+        self.refit()
 
-    def _name_columns(self) -> None:
-        unit = "m" if self._measure() is not None else _tr("map units")
-        self.table.setHorizontalHeaderLabels([_tr("Point"), _tr("Residual") + f" ({unit})", _tr("Pixel")])
+    def keyPressEvent(self, event: Any) -> None:
+        """Delete what is selected in the list, or take the last change back."""
+        if event.key() == Qt.Key.Key_Delete:
+            self.delete_chosen()
+        elif event.matches(QKeySequence.StandardKey.Undo):
+            self.undo()
+        else:
+            super().keyPressEvent(event)
 
     # --- opening ------------------------------------------------------------------------------------------------------
+
+    def _located(self) -> list[tuple[str, str, str]]:
+        """List name, picture and points of what was located in this project, the current layer first."""
+        found = {}
+        for layer in [iface.activeLayer(), *QgsProject.instance().layerTreeRoot().layerOrder()]:
+            picture, points = (layer.customProperty(key) if layer else "" for key in (PICTURE_KEPT, POINTS_KEPT))
+            if picture and Path(picture).is_file():
+                found[picture, points] = layer.name()
+        return [(name, picture, points if Path(points).is_file() else "") for (picture, points), name in found.items()]
+
+    def open_first(self) -> None:
+        """Open what was located last, or the picture of the current layer; without either, offer a choice."""
+        layer, located = iface.activeLayer(), self._located()
+        if located:
+            self.open(*located[0][1:])
+        elif not (isinstance(layer, QgsRasterLayer) and Path(layer.source()).is_file() and self.open(layer.source())):
+            self.offer()
 
     def offer(self) -> None:
         """Offer the pictures that were located in this project, and others."""
         menu = QMenu(self)
-        for layer in QgsProject.instance().mapLayers().values():
-            picture, points = (str(layer.customProperty(key, "") or "") for key in (PICTURE_KEPT, POINTS_KEPT))
-            if picture and Path(picture).is_file():
-                points = points if Path(points).is_file() else ""
-                menu.addAction(layer.name(), lambda picture=picture, points=points: self.open(picture, points))
-        if not menu.isEmpty():
-            menu.addSeparator()
-        menu.addAction(_tr("Another picture..."), self.ask_open)
+        for name, picture, points in self._located():
+            menu.addAction(name, lambda picture=picture, points=points: self.open(picture, points))
+        menu.addSeparator()
+        menu.addAction("Another picture...", self.ask_open)
         menu.popup(self.buttons["Open..."].mapToGlobal(self.buttons["Open..."].rect().bottomLeft()))
 
     def ask_open(self) -> None:
         """Ask for a picture, and for its control points, which it need not have."""
-        picture, _ = QFileDialog.getOpenFileName(self, _tr("Picture"))
+        picture, _ = QFileDialog.getOpenFileName(self, "Picture")
         if picture:
-            told = _tr("Its control points, if there are any; else Cancel")
-            points, _ = QFileDialog.getOpenFileName(self, told, str(Path(picture).parent), "*.points")
+            title = "Its control points, if there are any; else Cancel"
+            points, _ = QFileDialog.getOpenFileName(self, title, str(Path(picture).parent), "*.points")
             self.open(picture, points)
 
     def open(self, picture: str, points: str = "") -> bool:
@@ -260,75 +193,78 @@ class MatchDock(QDockWidget):
         try:
             crs, matches = read_points(points) if points else ("", [])
         except ValueError as error:
-            self.said.setText(str(error))
+            self.status.setText(str(error))
             return False
         if not layer.isValid():
-            self.said.setText(_tr("{} is no picture that can be shown.").format(picture))
+            self.status.setText(f"{picture} is no picture that can be shown.")
             return False
         self.picture, self.crs = picture, crs or QgsProject.instance().crs().toWkt()
         self.size = (layer.width(), layer.height())
+        self._past = []
         self._renew([])
         self.scene.clear()
         self.scene.addItem(_preview(layer))
         self.scene.setSceneRect(QRectF(0.0, 0.0, *map(float, self.size)))
         self.view.fitInView(self.scene.sceneRect(), Qt.AspectRatioMode.KeepAspectRatio)
         self.canvas.setDestinationCrs(QgsCoordinateReferenceSystem.fromWkt(self.crs))
-        shown = QgsProject.instance().layerTreeRoot().checkedLayers()
-        self.canvas.setLayers(shown)
-        self._name_columns()
+        self.canvas.setLayers(QgsProject.instance().layerTreeRoot().checkedLayers())
         self._renew(matches)
         self._zoom()
         return True
 
     def _renew(self, matches: list[Match]) -> None:
         """Take other points."""
-        self.matches, self._clicked = list(matches), {}
+        self.matches, self.order, self._clicked = list(matches), list(range(len(matches))), {}
         for dot in self.dots:
             self.scene.removeItem(dot)
         for marker in self.markers:
             self.canvas.scene().removeItem(marker)
-        self.dots = [_Dot(k, self.move_on_picture) for k in range(len(matches))]
+        self.dots = [Dot(number + 1, self) for number in self.order]
         for dot in self.dots:
             self.scene.addItem(dot)
-        self.markers = [QgsVertexMarker(self.canvas) for _ in matches]
-        self._fill_table()
-        self.refit()
-
-    def _fill_table(self) -> None:
+        self.markers = [Marker(self.canvas, number + 1) for number in self.order]
         self._filling = True
         self.table.setRowCount(len(self.matches))
-        for k, one in enumerate(self.matches):
-            name = QTableWidgetItem(str(k + 1))
-            name.setFlags(name.flags() | Qt.ItemFlag.ItemIsUserCheckable)
-            name.setCheckState(Qt.CheckState.Checked if one.on else Qt.CheckState.Unchecked)
-            for column, item in enumerate((name, QTableWidgetItem(), QTableWidgetItem())):
-                item.setFlags(item.flags() & ~Qt.ItemFlag.ItemIsEditable)
-                self.table.setItem(k, column, item)
+        for row in range(len(self.matches)):
+            for column in range(3):
+                item = QTableWidgetItem()
+                item.setFlags(item.flags() & ~Qt.ItemFlag.ItemIsEditable | Qt.ItemFlag.ItemIsUserCheckable)
+                self.table.setItem(row, column, item)
         self._filling = False
+        self.refit()
 
     def _zoom(self) -> None:
         """Show all points on the map; without any, the extent of the window's map."""
         if self.matches:
             extent = QgsRectangle()
             extent.setMinimal()
-            for one in self.matches:
-                extent.combineExtentWith(one.x, one.y)
+            for match in self.matches:
+                extent.combineExtentWith(match.x, match.y)
             extent.scale(1.3)
             self.canvas.setExtent(extent)
-        elif iface is not None:
+        else:
             self.canvas.setExtent(iface.mapCanvas().extent())
         self.canvas.refresh()
 
     # --- changing -----------------------------------------------------------------------------------------------------
 
+    def remember(self) -> None:
+        """Keep the points as they are, for `undo`."""
+        self._past.append(list(self.matches))
+        self.buttons["Undo"].setEnabled(True)
+
+    def undo(self) -> None:
+        """Take the last change back."""
+        while self._past:
+            before = self._past.pop()
+            if before != self.matches:
+                self._renew(before)
+                break
+        self.buttons["Undo"].setEnabled(bool(self._past))
+
     def _start_adding(self) -> None:
         self._clicked = {}
-        if self.adding:
-            self.said.setText(
-                _tr("Click a spot on the picture or on the map; then drag the point to where it belongs.")
-            )
-        else:
-            self._tell()
+        self._describe()
 
     def click(self, side: str, u: float, v: float) -> None:
         """Add a point at a spot of the "picture" or the "map".
@@ -336,66 +272,81 @@ class MatchDock(QDockWidget):
         On the other side it goes where the fit has it; without a fit the next click there places it.
         """
         self._clicked[side] = (u, v)
+        other = "map" if side == "picture" else "picture"
         if self.found.matrix is not None and len(self._clicked) == 1:
-            other = "map" if side == "picture" else "picture"
             matrix = self.found.matrix if side == "picture" else np.linalg.inv(self.found.matrix)
             self._clicked[other] = tuple(place(matrix, np.array([[u, v]]))[0].tolist())
         if len(self._clicked) == 2:
-            one = Match(*self._clicked["picture"], *self._clicked["map"])
-            self._renew([*self.matches, one])
+            self.remember()
+            self._renew([*self.matches, Match(*self._clicked["picture"], *self._clicked["map"])])
             self.table.selectRow(len(self.matches) - 1)
         else:
-            other = _tr("map") if side == "picture" else _tr("picture")
-            self.said.setText(_tr("Now click the same spot on the {}.").format(other))
+            self.status.setText(f"Now click the same spot on the {other}.")
+
+    def _chosen(self) -> set[int]:
+        return {self.order[index.row()] for index in self.table.selectedIndexes()}
 
     def delete_chosen(self) -> None:
         """Delete the points that are selected in the list."""
-        chosen = {index.row() for index in self.table.selectedIndexes()}
-        self._renew([one for k, one in enumerate(self.matches) if k not in chosen])
+        chosen = self._chosen()
+        self.remember()
+        self._renew([match for number, match in enumerate(self.matches) if number not in chosen])
 
-    def switch(self, number: int, on: bool) -> None:
-        """Switch a point on or off."""
-        self.matches[number] = replace(self.matches[number], on=on)
+    def move(self, number: int, **to: Any) -> None:
+        """Put a point elsewhere: on the picture (`column` and `row`) or on the map (`x` and `y`)."""
+        self.matches[number] = replace(self.matches[number], **to)
         self.refit()
 
-    def move_on_picture(self, number: int, column: float, row: float) -> None:
-        """Put a point elsewhere on the picture."""
-        self.matches[number] = replace(self.matches[number], column=column, row=row)
-        self.refit()
+    def _switched(self, item: Any) -> None:
+        """Switch a point on or off, as its row was ticked."""
+        if not self._filling and item.column() == 0:
+            number = self.order[item.row()]
+            self.remember()
+            self.matches[number] = replace(self.matches[number], on=item.checkState() == Qt.CheckState.Checked)
+            self.refit()
 
-    def move_on_map(self, number: int, x: float, y: float) -> None:
-        """Put a point elsewhere on the map."""
-        self.matches[number] = replace(self.matches[number], x=x, y=y)
-        self.refit()
-
-    def nearest_on_map(self, pixel: Any) -> int:
+    def _nearest_on_map(self, pixel: Any) -> int:
         """Return the point under a pixel of the map, a chosen one before others; -1 for none."""
-        to_pixels = self.canvas.getCoordinateTransform()
-        chosen = {index.row() for index in self.table.selectedIndexes()}
-        apart = []
-        for k, one in enumerate(self.matches):
-            there = to_pixels.transform(QgsPointXY(one.x, one.y))
-            far = math.hypot(there.x() - pixel.x(), there.y() - pixel.y())
-            apart.append((far > _NEAR, k not in chosen, far))
+        chosen, apart = self._chosen(), []
+        for number, marker in enumerate(self.markers):
+            far = math.hypot(marker.pos().x() - pixel.x(), marker.pos().y() - pixel.y())
+            apart.append((far > _NEAR, number not in chosen, far))
         best = min(range(len(apart)), key=apart.__getitem__, default=-1)
         return best if best >= 0 and not apart[best][0] else -1
 
-    def _switched(self, item: Any) -> None:
-        if not self._filling and item.column() == 0:
-            self.switch(item.row(), item.checkState() == Qt.CheckState.Checked)
+    def sort(self, column: int) -> None:
+        """Sort the list by number, by residual, the largest first, or by pixel; a second time the other way round."""
+        keys = (lambda k: k, lambda k: -self.apart[k], lambda k: (self.matches[k].column, self.matches[k].row))
+        again = self._sorted_by == column + 1
+        self._sorted_by = 0 if again else column + 1
+        chosen = self._chosen()
+        self.order = sorted(range(len(self.matches)), key=keys[column], reverse=again)
+        descending = again != (column == 1)
+        shown = Qt.SortOrder.DescendingOrder if descending else Qt.SortOrder.AscendingOrder
+        self.table.horizontalHeader().setSortIndicator(column, shown)
+        self.refit()
+        self.table.clearSelection()
+        for row, number in enumerate(self.order):
+            for cell in range(3 if number in chosen else 0):
+                self.table.item(row, cell).setSelected(True)
+
+    # --- showing ------------------------------------------------------------------------------------------------------
 
     def refit(self) -> None:
         """Fit anew, and show it."""
         self.found = fit(self.matches)
         self.apart = self._residuals()
+        unit = "m" if self._measure() is not None else "map units"
+        self.table.setHorizontalHeaderLabels(["Point", f"Residual ({unit})", "Pixel"])
         self._filling = True
-        for k, (one, apart) in enumerate(zip(self.matches, self.apart)):  # noqa: B905 (as long as each other)
-            state = Qt.CheckState.Checked if one.on else Qt.CheckState.Unchecked
-            self.table.item(k, 0).setCheckState(state)
-            self.table.item(k, 1).setText(f"{apart:.2f}" if math.isfinite(apart) else "")
-            self.table.item(k, 2).setText(f"{one.column:.0f}, {one.row:.0f}")
+        for row, number in enumerate(self.order):
+            match, apart = self.matches[number], self.apart[number]
+            self.table.item(row, 0).setCheckState(Qt.CheckState.Checked if match.on else Qt.CheckState.Unchecked)
+            residual = f"{apart:.2f}" if math.isfinite(apart) else ""
+            for column, text in enumerate((str(number + 1), residual, f"{match.column:.0f}, {match.row:.0f}")):
+                self.table.item(row, column).setText(text)
         self._filling = False
-        self._tell()
+        self._describe()
         self._paint()
 
     def _measure(self) -> Any:
@@ -409,44 +360,42 @@ class MatchDock(QDockWidget):
         return measure
 
     def _residuals(self) -> list[float]:
-        """Return how far each point lies from where the fit puts it, in metres where they can be measured."""
+        """Return the distance of each point from where the fit puts it, in metres where they can be measured."""
         measure = self._measure()
         if measure is None or self.found.matrix is None:
             return self.found.residuals
-        fitted = place(self.found.matrix, np.array([(one.column, one.row) for one in self.matches]))
+        fitted = place(self.found.matrix, np.array([(match.column, match.row) for match in self.matches]))
         pairs = zip(fitted.tolist(), self.matches)  # noqa: B905 (as long as each other)
-        return [measure.measureLine(QgsPointXY(*there), QgsPointXY(one.x, one.y)) for there, one in pairs]
+        return [measure.measureLine(QgsPointXY(*there), QgsPointXY(match.x, match.y)) for there, match in pairs]
 
-    def _tell(self) -> None:
-        n = sum(one.on for one in self.matches)
-        if self.found.matrix is None:
-            self.said.setText(_tr("{} of {} points are on: a fit needs {}, not on one line.").format(
-                n, len(self.matches), FEWEST
-            ))  # fmt: skip
-            return
-        used = [apart for one, apart in zip(self.matches, self.apart) if one.on]  # noqa: B905
-        rms = math.sqrt(sum(apart * apart for apart in used) / len(used))
-        unit = "m" if self._measure() is not None else _tr("map units")
-        self.said.setText(_tr("{} of {} points, {:.2f} {} root mean square").format(n, len(self.matches), rms, unit))
+    def _describe(self) -> None:
+        used = [apart for match, apart in zip(self.matches, self.apart) if match.on]  # noqa: B905
+        text = f"{len(used)} of {len(self.matches)} points"
+        if self.adding:
+            text = "Click a spot on the picture or on the map; then drag the point to where it belongs."
+        elif self.found.matrix is None:
+            text += f" are on: a fit needs {FEWEST}, not on one line." if self.picture else ""
+        else:
+            rms = math.sqrt(sum(apart * apart for apart in used) / len(used))
+            text += f", {rms:.2f} {'m' if self._measure() is not None else 'map units'} root mean square"
+        if self.picture:
+            self.status.setText(text)
 
     def _paint(self) -> None:
         """Draw points and footprint as they are."""
-        chosen = {index.row() for index in self.table.selectedIndexes()}
-        for k, (one, dot, marker) in enumerate(zip(self.matches, self.dots, self.markers)):  # noqa: B905
-            color = QColor(_CHOSEN if k in chosen else _ON if one.on else _OFF)
-            dot.setPos(one.column, one.row)
-            dot.setZValue(2.0 if k in chosen else 1.0)  # of dots that overlap, the chosen one is dragged
-            dot.setPen(QPen(QColor("#ffffff"), 1.0))
-            dot.setBrush(QBrush(color))
-            marker.setCenter(QgsPointXY(one.x, one.y))
-            marker.setColor(color)
-            marker.setIconType(QgsVertexMarker.IconType.ICON_CIRCLE)
-            marker.setIconSize(11)
-            marker.setPenWidth(3)
+        chosen = self._chosen()
+        for number, (match, dot, marker) in enumerate(zip(self.matches, self.dots, self.markers)):  # noqa: B905
+            dot.color = marker.color = _CHOSEN if number in chosen else _ON if match.on else _OFF
+            dot.setPos(match.column, match.row)
+            marker.put(match.x, match.y)
+            for point in (dot, marker):
+                point.setZValue(2.0 if number in chosen else 1.0)  # of dots that overlap, the chosen one is dragged
+                point.update()
         points = [QgsPointXY(*corner) for corner in self.footprint()]
         self.band.setToGeometry(QgsGeometry.fromPolygonXY([points] if points else []), None)
         self.buttons["Put on the map..."].setEnabled(self.found.matrix is not None)
         self.buttons["Delete"].setEnabled(bool(chosen))
+        self.buttons["Undo"].setEnabled(bool(self._past))
 
     def footprint(self) -> list[tuple[float, float]]:
         """Return the picture's corners on the map; none without a fit."""
@@ -461,17 +410,22 @@ class MatchDock(QDockWidget):
     def ask_export(self) -> None:
         """Ask where to write the matches."""
         start = f"{self.picture}.points" if self.picture else ""  # where the Georeferencer looks for them
-        path, _ = QFileDialog.getSaveFileName(self, _tr("Write control points"), start, "*.points *.tif")
+        path, _ = QFileDialog.getSaveFileName(self, "Write control points", start, "*.points *.tif")
         if path:
             self.export(path)
 
     def export(self, path: str) -> None:
         """Write the matches as control points; as GeoTIFF, with the picture, where the name ends so."""
         if path.lower().endswith((".tif", ".tiff")):
-            _write_geotiff(path, self.picture, self.crs, self.matches)
+            from osgeo import gdal  # type: ignore[import-not-found]  # QGIS's own
+
+            points = [gdal.GCP(match.x, match.y, 0.0, match.column, match.row) for match in self.matches if match.on]
+            gdal.Translate(
+                path, self.picture, GCPs=points, outputSRS=self.crs or None, creationOptions=["COMPRESS=DEFLATE"]
+            )
         else:
             Path(path).write_text(format_points(self.crs, self.matches, self.found), "utf-8")
-        self.said.setText(_tr("Wrote {}").format(path))
+        self.status.setText(f"Wrote {path}")
 
     def draw(self) -> None:
         """Open the dialog that puts the picture on the map by the points as they are."""
@@ -489,11 +443,3 @@ def _preview(layer: Any) -> Any:
     item.setTransform(item.transform().scale(width / image.width(), height / image.height()))
     item.setTransformationMode(Qt.TransformationMode.SmoothTransformation)
     return item
-
-
-def _write_geotiff(path: str, picture: str, crs: str, matches: list[Match]) -> None:
-    """Write the picture's own pixels with the matches that are on as control points."""
-    from osgeo import gdal  # type: ignore[import-not-found]  # QGIS's own
-
-    points = [gdal.GCP(one.x, one.y, 0.0, one.column, one.row) for one in matches if one.on]
-    gdal.Translate(path, picture, GCPs=points, outputSRS=crs or None, creationOptions=["COMPRESS=DEFLATE"])

@@ -12,8 +12,8 @@ from qgis.PyQt.QtGui import QDesktopServices, QIcon
 from qgis.PyQt.QtWidgets import QMenu, QToolButton
 
 from .dock import MatchDock
-from .messages import open_dialog, push
 from .settings import locate_executable
+from .window import open_dialog, push
 
 __all__ = ["Menu"]
 
@@ -74,7 +74,7 @@ class Menu:
     def ask_to_set_up(self) -> None:
         """Ask in the message bar, until it is done."""
         text = "The program that does the work is not on this computer yet, or was not found."
-        self.question = push("roadgeo", text, [("Set up roadgeo...", self.set_up)], Qgis.MessageLevel.Info)
+        self.question = push("roadgeo", text, {"Set up roadgeo...": self.set_up}, Qgis.MessageLevel.Info)
 
     def forget_question(self) -> None:
         """Take the question back."""
@@ -107,6 +107,8 @@ class Menu:
         self.dock.raise_()
         if picture:
             self.dock.open(picture, points)
+        elif not self.dock.picture:
+            self.dock.open_first()
 
     def help(self) -> None:
         """Open the help page, which ships with the plugin."""

@@ -32,8 +32,8 @@ from qgis.core import (
 from .environment import ENVIRONMENT
 
 __all__ = [
-    "AREA", "BATCH", "CAMERA", "ITS_MASK", "LOCALIZABILITY", "MASK", "MASK_VALUES", "OUTPUT_FOLDER", "PICTURE",
-    "PIXEL_SIZE", "POINTS", "QUERY", "REFERENCE", "REPORT", "ROADS", "SEGMENT", "SETUP", "Option", "Values",
+    "BATCH", "DRAWING", "IMAGE", "ITS_MASK", "LOCALIZABILITY", "OUTPUT_FOLDER", "POINTS", "PRODUCTS", "QUERY", "ROADS",
+    "SEARCH", "SETUP", "VECTORIZE", "Option", "Values",
 ]  # fmt: skip
 
 
@@ -110,14 +110,16 @@ class Option:
         Class of its definition, one of `QgsProcessingParameter...`.
     hint : str
         Its purpose.
-    say : callable
-        Its value as arguments of the command line; called only where it has one.
+    flag : str
+        Its name on the command line, which messages may use; "" where it has none.
     settings : dict
         Further arguments of its definition.
+    write : callable
+        Its value as arguments of the command line, where that is more than the flag with the value.
+    default : str
+        The program's own, which is left out.
     folded : bool
         Below "Advanced parameters".
-    flag : str
-        Its name on the command line, which messages may use.
     metadata : dict
         Metadata for QGIS's dialogs.
     """
@@ -126,66 +128,61 @@ class Option:
     name: str
     label: str
     hint: str
-    say: Callable[[Values, str], list[str]] = lambda *_: []
-    settings: dict[str, Any] = field(default_factory=dict)
-    folded: bool = False
     flag: str = ""
-    metadata: dict[str, Any] = field(default_factory=dict)
+    settings: Mapping[str, Any] = field(default_factory=dict)
+    write: Callable[[Values, str], list[str]] | None = None
+    default: str = ""
+    folded: bool = False
+    metadata: Mapping[str, Any] = field(default_factory=dict)
 
     def define(self) -> Any:
         """Make its definition, which QGIS then owns."""
         definition = self.kind(self.name, self.label, **self.settings)
         definition.setHelp(self.hint)
-        definition.setMetadata(self.metadata)
+        definition.setMetadata(dict(self.metadata))
         if self.folded:
             definition.setFlags(definition.flags() | QgsProcessingParameterDefinition.Flag.FlagAdvanced)
         return definition
 
     def arguments(self, values: Values) -> list[str]:
         """Return it as arguments of the command line."""
-        return self.say(values, self.name) if values.given(self.name) else []
+        if not self.flag or not values.given(self.name):
+            return []
+        if self.write is not None:
+            return self.write(values, self.name)
+        if self.kind is QgsProcessingParameterBoolean:
+            return [self.flag] if values.get("Boolean", self.name) else []
+        return [f"{self.flag}={text}" for text in _READ[self.kind](values, self.name) if text != self.default]
 
 
-# --- ways to say a value ----------------------------------------------------------------------------------------------
+#: A value as text, or several, by the class of the parameter.
+_READ: dict[Any, Callable[[Values, str], list[str]]] = {
+    QgsProcessingParameterBand: lambda values, name: [str(values.get("Int", name))],
+    QgsProcessingParameterCrs: lambda values, name: [name_crs(values.get("Crs", name))],
+    QgsProcessingParameterEnum: lambda values, name: values.get("EnumStrings", name),
+    QgsProcessingParameterFile: lambda values, name: [values.path("File", name)],
+    QgsProcessingParameterNumber: lambda values, name: [f"{values.get('Double', name):.12g}"],
+    QgsProcessingParameterString: lambda values, name: [str(values.get("String", name))],
+}
 
 
-def _said(flag: str, kind: str, form: str = "{}") -> Callable[[Values, str], list[str]]:
-    return lambda values, name: [f"{flag}={form.format(values.get(kind, name))}"]
-
-
-def _path(flag: str) -> Callable[[Values, str], list[str]]:
-    return lambda values, name: [f"{flag}={values.path('File', name)}"]
-
-
-def _switched(flag: str) -> Callable[[Values, str], list[str]]:
-    return lambda values, name: [flag] if values.get("Boolean", name) else []
-
-
-def _chosen(flag: str) -> Callable[[Values, str], list[str]]:
-    return lambda values, name: [f"{flag}={word}" for word in values.get("EnumStrings", name)]
-
-
-def _crs(values: Values, name: str) -> list[str]:
-    return [f"--crs={name_crs(values.get('Crs', name))}"]
-
-
-def _near(values: Values, name: str) -> list[str]:
+def _write_near(values: Values, name: str) -> list[str]:
     point = values.in_degrees("Point", name)
     return [f"--near={point.x():.9g},{point.y():.9g},{values.get('Double', 'NEAR_RADIUS'):.9g}"]
 
 
-def _box(values: Values, name: str) -> list[str]:
+def _write_box(values: Values, name: str) -> list[str]:
     box = values.in_degrees("Extent", name)
     return [f"--bbox={box.xMinimum():.9g},{box.yMinimum():.9g},{box.xMaximum():.9g},{box.yMaximum():.9g}"]
 
 
-def _area(values: Values, name: str) -> list[str]:
+def _write_area(values: Values, name: str) -> list[str]:
     if values.given("WITHIN"):
-        raise QgsProcessingException("Say where it lies by name or by a part of the map, not by both")
-    return [text.replace("--bbox", "--within") for text in _box(values, name)]
+        raise QgsProcessingException("Name the country or state, or give a part of the map, not both")
+    return [text.replace("--bbox", "--within") for text in _write_box(values, name)]
 
 
-def _lines(values: Values, name: str) -> list[str]:
+def _write_lines(values: Values, name: str) -> list[str]:
     path, layer, crs = values.lines(name)
     return [f"--roads={path}", *([f"--layer={layer}"] if layer else []), f"--crs={crs}"]
 
@@ -195,57 +192,34 @@ def _lines(values: Values, name: str) -> list[str]:
 #: The command line's options, and the outputs of `--also` with their purpose: written when the plugin is installed or
 #: packed, for QGIS's Python has no roadgeo.
 _TABLE: dict[str, Any] = json.loads((Path(__file__).parent / "table.json").read_text("utf-8"))
-_OUTPUTS: dict[str, str] = _TABLE["outputs"]
-_HINTS = _TABLE["options"]["locate"].items()
+_OUTPUTS, _LOCATE = _TABLE["outputs"], _TABLE["options"]["locate"]
 
 
-def _option(command: str, flag: str, label: str = "", name: str = "", hint: str = "", **settings: Any) -> Option:
-    """Make a parameter of an option of the table; what is given replaces the table's. A default is not said."""
-    row = _TABLE["options"][command][flag]
-    kind, say, form = _form(flag, row["schema"])
-    given = {"defaultValue": row["default"]} if row["default"] != "" else {}
-    settings = {**form, **given, **settings}
-
-    def arguments(values: Values, name: str) -> list[str]:
-        said = say(values, name)
-        return [] if said == [f"{flag}={row['default']}"] else said
-
-    return Option(
-        kind,
-        name or flag[2:].replace("-", "_").upper(),
-        label or row["label"],
-        hint or row["help"],
-        arguments,
-        {"optional": "defaultValue" not in settings or kind is QgsProcessingParameterString, **settings},
-        flag=flag,
-    )
+def _option(command: str, flag: str, label: str = "", hint: str = "", name: str = "", **settings: Any) -> Option:
+    """Make a parameter of an option of the table; a given label, hint or setting replaces the table's."""
+    row, words = _TABLE["options"][command][flag], flag[2:].replace("-", " ")
+    kind, form = _form(row["schema"])
+    if row["default"] != "":
+        form["defaultValue"] = row["default"]
+    form.update(settings)
+    form.setdefault("optional", "defaultValue" not in form or kind is QgsProcessingParameterString)
+    name, label = name or words.replace(" ", "_").upper(), label or row["label"] or words.capitalize()
+    return Option(kind, name, label, hint or row["help"], flag, form, default=str(row["default"]))
 
 
-def _form(flag: str, schema: Mapping[str, Any]) -> tuple[Any, Callable[[Values, str], list[str]], dict[str, Any]]:
-    """Return class, way to say a value, and settings of the parameter whose values a JSON Schema describes."""
+def _form(schema: Mapping[str, Any]) -> tuple[Any, dict[str, Any]]:
+    """Return class and settings of the parameter whose values a JSON Schema describes."""
     kind = schema.get("type", "string")
     if kind == "boolean":
-        return QgsProcessingParameterBoolean, _switched(flag), {"defaultValue": False}
+        return QgsProcessingParameterBoolean, {"defaultValue": False}
     if "enum" in schema:
-        return QgsProcessingParameterEnum, _chosen(flag), {"options": schema["enum"], "usesStaticStrings": True}
+        return QgsProcessingParameterEnum, {"options": schema["enum"], "usesStaticStrings": True}
     if kind in ("number", "integer"):
         limits = {"minValue": schema.get("minimum", schema.get("exclusiveMinimum")), "maxValue": schema.get("maximum")}
+        whole, real = QgsProcessingParameterNumber.Type.Integer, QgsProcessingParameterNumber.Type.Double
         form = {name: limit for name, limit in limits.items() if limit is not None}
-        if kind == "integer":
-            whole = QgsProcessingParameterNumber.Type.Integer
-            return QgsProcessingParameterNumber, _said(flag, "Int"), {"type": whole, **form}
-        real = QgsProcessingParameterNumber.Type.Double
-        return QgsProcessingParameterNumber, _said(flag, "Double", "{:.12g}"), {"type": real, **form}
-    return QgsProcessingParameterString, _said(flag, "String"), {}
-
-
-def _raster(name: str, label: str, hint: str) -> Option:
-    return Option(QgsProcessingParameterRasterLayer, name, label, hint)
-
-
-def _folder(name: str, label: str, hint: str, **settings: Any) -> Option:
-    behavior = QgsProcessingParameterFile.Behavior.Folder
-    return Option(QgsProcessingParameterFile, name, label, hint, settings={"behavior": behavior, **settings})
+        return QgsProcessingParameterNumber, {"type": whole if kind == "integer" else real, **form}
+    return QgsProcessingParameterString, {}
 
 
 def _fold(*options: Option) -> tuple[Option, ...]:
@@ -256,155 +230,141 @@ def _fold(*options: Option) -> tuple[Option, ...]:
 
 #: Nothing need be given.
 _MAY_LACK = {"optional": True}
+_FOLDER = {"behavior": QgsProcessingParameterFile.Behavior.Folder}
 
-MASK = _raster(
-    "MASK", "Road mask",
+_MASK = Option(
+    QgsProcessingParameterRasterLayer, "MASK", "Road mask",
     "An image of the roads that the aerial picture shows: bright, or 1, where there is road. It needs no georeference.",
 )  # fmt: skip
 QUERY = replace(
-    MASK, label="Road mask, or photograph",
-    hint=f"{MASK.hint} A photograph is recognised, and a network finds its roads.",
+    _MASK, label="Road mask, or photograph",
+    hint=f"{_MASK.hint} A photograph is recognised, and a network finds its roads.",
 )  # fmt: skip
-ITS_MASK = replace(MASK, hint=f"{MASK.hint} Empty: a network finds the roads of the image.", settings=_MAY_LACK)
-_BAND = _option("locate", "--band", "Band")
-_THRESHOLD = _option("locate", "--threshold", "Threshold")
-MASK_VALUES = _fold(
-    replace(_BAND, kind=QgsProcessingParameterBand, settings={"parentLayerParameterName": "MASK", **_MAY_LACK}),
-    _THRESHOLD,
-)
-SEGMENT = _fold(
-    _option("locate", "--segment", "Find roads in photographs"),
-    Option(
-        QgsProcessingParameterFile, "SEGMENTER", "Model for photographs",
-        "A segmentation model, as QGIS's Deepness takes them. Empty: the one that ships with roadgeo.",
-        _path("--segmenter"), {"extension": "onnx", **_MAY_LACK}, flag="--segmenter",
-    ),
+ITS_MASK = replace(_MASK, hint=f"{_MASK.hint} Empty: a network finds the roads of the image.", settings=_MAY_LACK)
+IMAGE = replace(
+    _MASK, name="IMAGE", label="Image",
+    hint="The picture that the mask shows the roads of, of the same frame. Its size may differ from the mask's.",
 )  # fmt: skip
-REPORT = _option(
-    "locate", "--report", "Open a report", hint="A page with map, mask, residuals and numbers, in the browser."
-)
-REFERENCE = Option(
+_REFERENCE = Option(
     QgsProcessingParameterString, "REFERENCE", "Road reference",
-    "What Build road reference made: one of the list, or a file. Empty: all that there are.",
-    settings=_MAY_LACK, flag="--reference",
+    "What Build road reference made: one of the list, or a file. Empty: all that there are.", settings=_MAY_LACK,
     metadata={"widget_wrapper": {"class": f"{__package__}.references.ReferenceWrapper"}},
 )  # fmt: skip
-
-PIXEL_SIZE = _fold(_option("locate", "--gsd"))
-
+_AREA = Option(
+    QgsProcessingParameterExtent, "AREA", "It lies on this part of the map",
+    "The middle of the image lies there: with the map canvas extent, near what you see. Empty: not known.",
+    "--within", _MAY_LACK, _write_area,
+)  # fmt: skip
+_BAND, _THRESHOLD = _option("locate", "--band"), _option("locate", "--threshold")
+_READING = (
+    *_fold(
+        replace(_BAND, kind=QgsProcessingParameterBand, settings={"parentLayerParameterName": "MASK", **_MAY_LACK}),
+        _THRESHOLD,
+        _option("locate", "--segment", "Find roads in photographs"),
+        Option(
+            QgsProcessingParameterFile, "SEGMENTER", "Model for photographs",
+            "A segmentation model, as QGIS's Deepness takes them. Empty: the one that ships with roadgeo.",
+            "--segmenter", {"extension": "onnx", **_MAY_LACK},
+        ),
+    ),
+)  # fmt: skip
 #: All hints on an image, in the order of the table; a place is clicked on the map.
-CAMERA = _fold(
+_HINTS = _fold(
     Option(
-        QgsProcessingParameterPoint, "NEAR", "Near",
-        "The middle of the mask lies near this place.", _near, _MAY_LACK, flag="--near",
+        QgsProcessingParameterPoint, "NEAR", "Near", "The middle of the mask lies near this place.",
+        "--near", _MAY_LACK, _write_near,
     ),
     Option(
         QgsProcessingParameterNumber, "NEAR_RADIUS", "Within, metres", "How near.",
         settings={"type": QgsProcessingParameterNumber.Type.Double, "defaultValue": 10_000.0, "minValue": 1.0},
     ),
-    *(_option("locate", flag) for flag, row in _HINTS if row["is_hint"] and flag != "--near"),
+    *(_option("locate", flag) for flag, row in _LOCATE.items() if row["is_hint"] and flag != "--near"),
 )  # fmt: skip
-AREA = Option(
-    QgsProcessingParameterExtent, "AREA", "It lies on this part of the map",
-    "The middle of the image lies there: with the map canvas extent, near what you see. Empty: not known.",
-    _area, _MAY_LACK, flag="--within",
-)  # fmt: skip
-
-PICTURE = (
-    _raster(
-        "IMAGE", "Image",
-        "The picture that the mask shows the roads of, of the same frame. Its size may differ from the mask's.",
-    ),
-    Option(
-        QgsProcessingParameterCrs, "CRS", "CRS of the result",
-        "Empty: the reference's own, which is metric.", _crs, _MAY_LACK, flag="--crs",
-    ),
-    *_fold(
-        _option("locate", "--resolution", "Pixel size of the result"),
-        _option("locate", "--resampling", "Resampling"),
-        Option(
-            QgsProcessingParameterEnum, "PRODUCTS", "Also write",
-            f"Further forms of the result. {'; '.join(f'{name}: {what}' for name, what in _OUTPUTS.items())}.",
-            _chosen("--also"),
-            {"options": list(_OUTPUTS), "usesStaticStrings": True, "allowMultiple": True, **_MAY_LACK}, flag="--also",
-        ),
-    ),
-)  # fmt: skip
-
-BATCH = (
-    _folder("MASKS", "Folder of road masks or photographs", "Every image in it is located."),
-    REFERENCE,
-    AREA,
-    _option("locate", "--jobs", "Processes"),
-    *_fold(_option("locate", "--skip-existing", "Keep earlier results"), _BAND, _THRESHOLD),
+_REPORT = _option(
+    "locate", "--report", "Open a report", "A page with map, mask, residuals and numbers, in the browser."
 )
-
-ROADS = (
-    Option(
-        QgsProcessingParameterFeatureSource, "ROADS", "Road lines",
-        "A layer of roads. Or leave it empty, and name a place or an extent: its roads come from OpenStreetMap.",
-        _lines, {"types": [QgsProcessing.SourceType.TypeVectorLine], **_MAY_LACK}, flag="--roads",
-    ),
-    _option("index", "--osm", "Place", "PLACE", "The name of a place in OpenStreetMap, such as Boston, MA."),
-    Option(
-        QgsProcessingParameterExtent, "EXTENT", "Extent",
-        "Roads in it come from OpenStreetMap; or the road lines are cut to it.", _box, _MAY_LACK, flag="--bbox",
-    ),
-    _option(
-        "index", "--name", "Name",
-        hint="Of the reference, in the list. Empty: after the place, the file or the layer.",
-    ),
-    _option(
-        "index", "--kinds", "Which roads",
-        hint="Those that the masks show, where the data tell kinds apart: main roads, public ones for cars (drivable), "
-        "all for vehicles, or all.",
-    ),
-    *_fold(
-        _option("index", "--tunnels", "Tunnels too"),
-        _option("index", "--attribution", "Attribution", hint="Whom to name beside the map; goes with road lines."),
-    ),
-    Option(
-        QgsProcessingParameterFileDestination, "OUTPUT", "Keep it in a file of its own",
-        "A GeoPackage; its search index, of the same name, lies beside it. Empty: it is kept in roadgeo's library.",
-        settings={"fileFilter": "GeoPackage (*.gpkg)", "createByDefault": False, **_MAY_LACK}, flag="--out",
-    ),
-)  # fmt: skip
-
+SEARCH = (_REFERENCE, _AREA, _REPORT, *_READING, *_HINTS)
 OUTPUT_FOLDER = Option(
     QgsProcessingParameterFolderDestination, "OUTPUT_FOLDER", "Folder for the results", "Made if it is missing."
 )
-
-LOCALIZABILITY = (
-    replace(REFERENCE, hint="What Build road reference made: one of the list, or a file.", settings={}),
-    _option(
-        "evaluate", "--height", "Height above ground, metres",
-        hint="Of the flight. With the focal length it says how large a pixel is.", defaultValue=400.0,
+VECTORIZE = (QUERY, *_READING, *_fold(_option("locate", "--gsd")), OUTPUT_FOLDER)
+BATCH = (
+    Option(
+        QgsProcessingParameterFile, "MASKS", "Folder of road masks or photographs", "Every image in it is located.",
+        settings=_FOLDER,
     ),
-    _option("evaluate", "--focal", "Focal length, pixels", hint="Of the camera.", defaultValue=1000.0),
-    _option("evaluate", "--size", "Side of the image, pixels", hint="Of a square one.", defaultValue=1000),
-    _option(
-        "evaluate", "--noise", "How good the masks are",
-        hint="Clean, as a network makes them (segmented), or poor.", defaultValue="segmented",
-    ),
-    *_fold(
-        _option(
-            "evaluate", "--count", "Masks to try",
-            hint="More of them tell neighbouring places apart more surely, and take longer.", defaultValue=600,
-        ),
-        _option("locate", "--jobs", "Processes"),
-    ),
+    _REFERENCE,
+    _AREA,
+    _option("locate", "--jobs", "Processes"),
+    *_fold(_option("locate", "--skip-existing", "Keep earlier results"), _BAND, _THRESHOLD),
+    *_HINTS,
     OUTPUT_FOLDER,
 )  # fmt: skip
 
+DRAWING = (
+    Option(
+        QgsProcessingParameterCrs, "CRS", "CRS of the result", "Empty: the reference's own, which is metric.",
+        "--crs", _MAY_LACK,
+    ),
+    *_fold(_option("locate", "--resolution", "Pixel size of the result"), _option("locate", "--resampling")),
+)  # fmt: skip
+PRODUCTS = Option(
+    QgsProcessingParameterEnum, "PRODUCTS", "Also write",
+    f"Further forms of the result. {'; '.join(f'{name}: {purpose}' for name, purpose in _OUTPUTS.items())}.", "--also",
+    {"options": list(_OUTPUTS), "usesStaticStrings": True, "allowMultiple": True, **_MAY_LACK}, folded=True,
+)  # fmt: skip
 POINTS = (
-    _raster("IMAGE", "Picture", "Any, of any number of bands."),
+    replace(IMAGE, label="Picture", hint="Any, of any number of bands."),
     Option(
         QgsProcessingParameterFile, "POINTS", "Control points",
         "Four or more, not on one line; a file of the Georeferencer, or of the panel to mend a place by hand.",
         settings={"extension": "points"},
     ),
-    replace(PICTURE[1], hint="Empty: that of the points."),
-    *PICTURE[2:4],
+    replace(DRAWING[0], hint="Empty: the CRS of the points."),
+    *DRAWING[1:],
+    OUTPUT_FOLDER,
+)  # fmt: skip
+
+ROADS = (
+    Option(
+        QgsProcessingParameterFeatureSource, "ROADS", "Road lines",
+        "A layer of roads. Or leave it empty, and name a place or an extent: its roads come from OpenStreetMap.",
+        "--roads", {"types": [QgsProcessing.SourceType.TypeVectorLine], **_MAY_LACK}, _write_lines,
+    ),
+    _option("index", "--osm", "Place", "The name of a place in OpenStreetMap, such as Boston, MA.", "PLACE"),
+    Option(
+        QgsProcessingParameterExtent, "EXTENT", "Extent",
+        "Roads in it come from OpenStreetMap; or the road lines are cut to it.", "--bbox", _MAY_LACK, _write_box,
+    ),
+    _option("index", "--name", "", "Of the reference, in the list. Empty: after the place, the file or the layer."),
+    _option("index", "--kinds", "Which roads"),
+    *_fold(_option("index", "--tunnels"), _option("index", "--attribution", "", "Whom to name beside the map.")),
+    Option(
+        QgsProcessingParameterFileDestination, "OUTPUT", "Keep it in a file of its own",
+        "A GeoPackage; its search index, of the same name, lies beside it. Empty: it is kept in roadgeo's library.",
+        settings={"fileFilter": "GeoPackage (*.gpkg)", "createByDefault": False, **_MAY_LACK},
+    ),
+)  # fmt: skip
+
+LOCALIZABILITY = (
+    replace(_REFERENCE, hint="What Build road reference made: one of the list, or a file.", settings={}),
+    _option(
+        "evaluate", "--height", "Height above ground, metres",
+        "Of the flight. With the focal length it gives the pixel size.", defaultValue=400.0,
+    ),
+    _option("evaluate", "--focal", "Focal length, pixels", "Of the camera.", defaultValue=1000.0),
+    _option("evaluate", "--size", "Side of the image, pixels", "Of a square one.", defaultValue=1000),
+    _option(
+        "evaluate", "--noise", "How good the masks are",
+        "Clean, as a network makes them (segmented), or poor.", defaultValue="segmented",
+    ),
+    *_fold(
+        _option(
+            "evaluate", "--count", "Masks to try",
+            "More of them distinguish neighbouring places more surely, and take longer.", defaultValue=600,
+        ),
+        _option("locate", "--jobs", "Processes"),
+    ),
     OUTPUT_FOLDER,
 )  # fmt: skip
 
@@ -426,9 +386,9 @@ SETUP = (
             "that building references and photographs need.",
             settings={"defaultValue": "roadgeo[desktop]"},
         ),
-        _folder(
-            "FOLDER", "Folder of the environment", "Made if it is missing.",
-            defaultValue=str(ENVIRONMENT), optional=True,
+        Option(
+            QgsProcessingParameterFile, "FOLDER", "Folder of the environment", "Made if it is missing.",
+            settings={"defaultValue": str(ENVIRONMENT), **_FOLDER, **_MAY_LACK},
         ),
     ),
 )  # fmt: skip

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from pathlib import Path
 from typing import Any
 
 from processing.gui.wrappers import WidgetWrapper
@@ -10,8 +9,7 @@ from qgis.core import QgsProcessingParameterDefinition
 from qgis.gui import QgsGui
 from qgis.PyQt.QtWidgets import QComboBox, QFileDialog, QHBoxLayout, QToolButton, QWidget
 
-from .session import library
-from .settings import remembered_references
+from .library import list_references
 
 __all__ = ["ReferenceWrapper"]
 
@@ -37,10 +35,10 @@ class _Wrapper(WidgetWrapper):
         self.combo.setEditable(True)
         if self.parameterDefinition().flags() & QgsProcessingParameterDefinition.Flag.FlagOptional:
             self.combo.addItem("All that there are", "")
-        for one in library():
-            self.combo.addItem(one.name, one.name)
-        for path in remembered_references():
-            self.combo.addItem(f"{Path(path).stem} ({path})", path)
+        for known in list_references():
+            self.combo.addItem(
+                known.name if known.value == known.name else f"{known.name} ({known.value})", known.value
+            )
         self.combo.currentIndexChanged.connect(lambda: self.widgetValueHasChanged.emit(self))
         button, whole, row = QToolButton(), QWidget(), QHBoxLayout()
         button.setText("…")

@@ -2,9 +2,8 @@
 
 from __future__ import annotations
 
-import json
+import itertools
 import shlex
-import time
 from collections.abc import Mapping
 from dataclasses import dataclass
 from pathlib import Path
@@ -22,43 +21,17 @@ from qgis.PyQt.QtCore import QUrl
 from qgis.PyQt.QtGui import QDesktopServices
 from qgis.utils import iface
 
+from .library import find_reference, parse
 from .runner import in_words_of_qgis, run
-from .settings import NOT_FOUND, locate_command, remembered_references
+from .settings import NOT_FOUND, locate_command
 
-__all__ = ["PICTURE_KEPT", "POINTS_KEPT", "Finding", "Session", "Shelved", "library"]
+__all__ = ["PICTURE_KEPT", "POINTS_KEPT", "Finding", "Group", "Session"]
 
 #: Properties of the layer that shows a footprint: the picture, and its matched intersections, to mend it by hand.
 PICTURE_KEPT, POINTS_KEPT = "roadgeo/picture", "roadgeo/points"
 
 #: Exit statuses of roadgeo: all well, and something was not located, which are no errors; an error.
 _WELL, _ERROR = (0, 3), 1
-
-
-@dataclass(frozen=True)
-class Shelved:
-    """A reference in roadgeo's library: its name, and its files."""
-
-    name: str
-    files: tuple[str, ...]
-
-
-#: Contents of the library, and when they were asked for: the dialog of a batch has many lists of references.
-_SHELVED: list[Shelved] = []
-_ASKED, _FRESH_S = [-1e9], 5.0
-
-
-def library(fresh: bool = False) -> list[Shelved]:
-    """List the references in roadgeo's library, as its program knows them."""
-    command = locate_command()
-    if command is not None and (fresh or time.monotonic() - _ASKED[0] > _FRESH_S):
-        lines: list[str] = []
-        run([*command, "reference", "list", "--json"], lambda _, line: lines.append(line), lambda: False)
-        found = [document for document in map(_parse, lines) if document is not None]
-        _SHELVED[:] = [
-            Shelved(Path(next(iter(one["files"]))).stem, tuple(one["files"])) for one in found if one.get("files")
-        ]
-        _ASKED[0] = time.monotonic()
-    return list(_SHELVED)
 
 
 @dataclass(frozen=True)
@@ -83,14 +56,28 @@ class Finding:
     parameters: dict[str, Any]
 
 
+class Group:
+    """A group of results on top of the project's layers: made with its first layer, under a name that no other has."""
+
+    def __init__(self, name: str) -> None:
+        self.name, self._node = name, None
+
+    def node(self, root: Any) -> Any:
+        """Return it in the tree of layers."""
+        if self._node is None or sip.isdeleted(self._node):
+            names = (self.name if k == 1 else f"{self.name} ({k})" for k in itertools.count(1))
+            self._node = root.insertGroup(0, next(name for name in names if root.findGroup(name) is None))
+        return self._node
+
+
 class _Styler(QgsProcessingLayerPostProcessorInterface):
     """Gives a layer the style that roadgeo wrote with it, where Processing would pick one at random, and its place.
 
-    That is on top, in a group of results where it has a name; or below all (None). `kept` becomes
+    A layer goes on top of a group of results; or below all layers (None); or stays where it is (""). `kept` becomes
     custom properties of the layer, which the project keeps.
     """
 
-    def __init__(self, group: str | None, kept: Mapping[str, str]) -> None:
+    def __init__(self, group: Group | str | None, kept: Mapping[str, str]) -> None:
         super().__init__()
         self.group, self.kept = group, dict(kept)
 
@@ -99,30 +86,17 @@ class _Styler(QgsProcessingLayerPostProcessorInterface):
         layer.triggerRepaint()
         for key, value in self.kept.items():
             layer.setCustomProperty(key, value)
-        if self.group != "":
-            _move(layer, self.group)
-
-
-def _move(layer: Any, group: str | None) -> None:
-    """Put a layer that was just added on top of a group of the project, which is made; or below all (None)."""
-    root = QgsProject.instance().layerTreeRoot()
-    node = root.findLayer(layer.id())
-    if node is None:
-        return
-    there = root if group is None else root.findGroup(group) or root.insertGroup(0, group)
-    if node.parent() is not there or group is None:
-        there.insertChildNode(-1 if group is None else 0, node.clone())
+        root = QgsProject.instance().layerTreeRoot()
+        node = root.findLayer(layer.id())
+        if self.group == "" or node is None:
+            return
+        into, place = (self.group.node(root), 0) if isinstance(self.group, Group) else (root, -1)
+        into.insertChildNode(place, node.clone())
         node.parent().removeChildNode(node)
 
 
 #: QGIS deletes a styler with its context, but keeps no reference to its Python object.
 _STYLERS: list[_Styler] = []
-
-
-def _new_styler(group: str | None, kept: Mapping[str, str]) -> _Styler:
-    _STYLERS[:] = [styler for styler in _STYLERS if not sip.isdeleted(styler)]
-    _STYLERS.append(_Styler(group, kept))
-    return _STYLERS[-1]
 
 
 class Session:
@@ -170,7 +144,7 @@ class Session:
 
     def _hear(self, stream: str, line: str) -> None:
         """Take one line: results and progress are JSON objects, all else is for people."""
-        document, line = _parse(line), in_words_of_qgis(line, self.labels)
+        document, line = parse(line), in_words_of_qgis(line, self.labels)
         if document is not None and "progress" in document:
             progress = document["progress"]
             self.feedback.setProgress(100.0 * progress["done"] / progress["total"])
@@ -191,30 +165,37 @@ class Session:
         self._step = step
 
     def show(
-        self, path: Path, title: str, layer: str = "", group: str | None = "", kept: Mapping[str, str] | None = None
+        self,
+        path: Path,
+        title: str,
+        layer: str = "",
+        group: Group | str | None = "",
+        kept: Mapping[str, str] | None = None,
     ) -> str:
         """Have a result loaded when all is done (see `_Styler`); return the name by which QGIS opens it."""
         source = f"{path}|layername={layer}" if layer else str(path)
         project = self.context.project()
         if project is not None and not self.feedback.isCanceled():
+            if self._is_shown(source):
+                group = ""  # QGIS loads no second one, and this may lie where its user wants it
             hint = QgsProcessingUtils.LayerHint.Vector if layer else QgsProcessingUtils.LayerHint.Raster
             details = QgsProcessingContext.LayerDetails(title, project, title, hint)
             details.forceName = True
-            details.setPostProcessor(_new_styler(group, kept or {}))
+            styler = _Styler(group, kept or {})
+            _STYLERS[:] = [*(known for known in _STYLERS if not sip.isdeleted(known)), styler]
+            details.setPostProcessor(styler)
             self.context.addLayerToLoadOnCompletion(source, details)
         return source
 
-    def show_map(self, reference: str) -> None:
+    def show_map(self, value: str) -> None:
         """Have the roads of a reference, named or a file, loaded below all else, where the project has them not yet."""
-        files = [reference, *(file for one in library() if one.name == reference for file in one.files)]
-        files += [path for path in remembered_references() if Path(path).stem == reference]
-        path = next((Path(one) for one in files if one.endswith(".gpkg") and Path(one).is_file()), None)
+        reference = find_reference(value)
+        if reference.file and not self._is_shown(f"{reference.file}|layername=roads"):
+            self.show(Path(reference.file), f"{reference.name} roads", "roads", None)
+
+    def _is_shown(self, source: str) -> bool:
         project = self.context.project()
-        if path is None or project is None:
-            return
-        shown = {layer.source() for layer in project.mapLayers().values()}
-        if f"{path}|layername=roads" not in shown:
-            self.show(path, f"{path.stem} roads", "roads", None)
+        return project is not None and source in {layer.source() for layer in project.mapLayers().values()}
 
     def tell(self, *command: str) -> list[str]:
         """Run another program, pass on its output, and return its lines.
@@ -244,13 +225,3 @@ class Session:
         """Show reports in the browser, where there is a window."""
         for page in self.pages if iface is not None else []:
             QDesktopServices.openUrl(QUrl.fromLocalFile(str(page)))
-
-
-def _parse(line: str) -> dict[str, Any] | None:
-    if not line.startswith("{"):
-        return None
-    try:
-        document = json.loads(line)
-    except ValueError:
-        return None
-    return document if isinstance(document, dict) else None

@@ -1,0 +1,123 @@
+"""The places at which a picture may lie: looked at on the map, until it is searched for again near the chosen one."""
+
+from __future__ import annotations
+
+from typing import Any
+
+from qgis.core import QgsDistanceArea, QgsPointXY
+from qgis.gui import QgsVertexMarker
+from qgis.PyQt.QtGui import QColor
+from qgis.PyQt.QtWidgets import (
+    QDialog,
+    QDialogButtonBox,
+    QHeaderView,
+    QLabel,
+    QTableWidget,
+    QTableWidgetItem,
+    QVBoxLayout,
+)
+from qgis.utils import iface
+
+from .library import LONLAT, Place, list_places
+from .session import Finding
+from .window import open_dialog, to_map, zoom
+
+__all__ = ["PlacesDialog"]
+
+_COLUMNS = ("Latitude, longitude", "Map", "From the first", "How likely")
+
+
+class PlacesDialog(QDialog):
+    """The places, the likeliest first.
+
+    Attributes
+    ----------
+    places : list of Place
+    """
+
+    def __init__(self, algorithm: str, finding: Finding) -> None:
+        super().__init__(iface.mainWindow())
+        self.setWindowTitle(f"Where is {finding.name}?")
+        self.algorithm, self.finding = algorithm, finding
+        self.places = list_places(finding.location)
+        self.markers = [_mark(place) for place in self.places]
+        self.table = QTableWidget(len(self.places), len(_COLUMNS))
+        self.table.setHorizontalHeaderLabels(_COLUMNS)
+        self.table.horizontalHeader().setSectionResizeMode(QHeaderView.ResizeMode.Stretch)
+        self.table.setSelectionBehavior(QTableWidget.SelectionBehavior.SelectRows)
+        self.table.setSelectionMode(QTableWidget.SelectionMode.SingleSelection)
+        self.table.setEditTriggers(QTableWidget.EditTrigger.NoEditTriggers)
+        for row, place in enumerate(self.places):
+            away = f"{_measure(self.places[0], place) / 1000:.1f} km"
+            texts = (f"{place.lat:.5f}, {place.lon:.5f}", place.map, away, _compare(self.places[0], place))
+            for column, text in enumerate(texts):
+                self.table.setItem(row, column, QTableWidgetItem(text))
+        self.table.itemSelectionChanged.connect(self._look)
+        self.table.doubleClicked.connect(self.choose)
+        advice = QLabel(
+            f"{finding.location['reason']}\nSelect a place to see it on the map; have the picture located where you "
+            "know it is. Where that does not decide, mend it by hand."
+        )
+        advice.setWordWrap(True)
+        buttons = QDialogButtonBox(QDialogButtonBox.StandardButton.Close)
+        self.button = buttons.addButton("Locate it here...", QDialogButtonBox.ButtonRole.AcceptRole)
+        self.button.clicked.connect(self.choose)
+        buttons.rejected.connect(self.reject)
+        column = QVBoxLayout(self)
+        for widget in (advice, self.table, buttons):
+            column.addWidget(widget)
+        self.resize(680, 320)
+        self.finished.connect(self._clear)
+        self.table.selectRow(0)
+
+    def _look(self) -> None:
+        """Show the selected place, as much around it as the picture covers."""
+        chosen = self.places[max(self.table.currentRow(), 0)]
+        for place, marker in zip(self.places, self.markers):  # noqa: B905 (as long as each other)
+            marker.setColor(QColor("#e4572e" if place is chosen else "#1f6fb4"))
+        corners = self.finding.location["footprint_lonlat"] or [(-0.01, -0.01), (0.01, 0.01)]
+        middle = [sum(side) / len(corners) for side in zip(*corners)]  # noqa: B905 (longitudes and latitudes)
+        zoom([(chosen.lon + lon - middle[0], chosen.lat + lat - middle[1]) for lon, lat in corners], 2.0)
+
+    def choose(self) -> None:
+        """Open the dialog again, to search near the selected place alone."""
+        chosen = self.places[max(self.table.currentRow(), 0)]
+        others = [_measure(chosen, place) for place in self.places if place is not chosen]
+        near = {
+            "NEAR": f"{chosen.lon!r},{chosen.lat!r} [{LONLAT}]",
+            "NEAR_RADIUS": min([1000.0, *(distance / 3 for distance in others)]),
+        }
+        open_dialog(self.algorithm, {**self.finding.parameters, **near})
+        self.accept()
+
+    def _clear(self) -> None:
+        for marker in self.markers:
+            iface.mapCanvas().scene().removeItem(marker)
+
+
+def _mark(place: Place) -> Any:
+    marker = QgsVertexMarker(iface.mapCanvas())
+    marker.setCenter(to_map(place.lon, place.lat))
+    marker.setIconType(QgsVertexMarker.IconType.ICON_CIRCLE)
+    marker.setIconSize(16)
+    marker.setPenWidth(4)
+    return marker
+
+
+def _measure(place: Place, other: Place) -> float:
+    """Return the distance of two places, metres."""
+    measure = QgsDistanceArea()
+    measure.setEllipsoid("WGS84")
+    return float(measure.measureLine(QgsPointXY(place.lon, place.lat), QgsPointXY(other.lon, other.lat)))
+
+
+def _compare(best: Place, place: Place) -> str:
+    """Return how likely a place is beside the best one, rounded as a person would."""
+    if best.log10_odds is None or place.log10_odds is None:
+        return ""
+    if place is best:
+        return "best"
+    less = best.log10_odds - place.log10_odds
+    if less < 0.2:
+        return "as likely"
+    return "a million times less, or more" if less > 6 else f"{float(f'{10**less:.1g}'):,.0f} times less"
