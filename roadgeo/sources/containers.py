@@ -156,7 +156,6 @@ def _stream_parquet(path: Path, most: int, advance: Callable[[float], None]) -> 
     import pyarrow as pa
     import pyarrow.parquet as pq
 
-    refuse_named_files(path)
     try:
         _require_rows(path)
         with pq.ParquetFile(path) as file:

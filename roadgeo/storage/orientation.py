@@ -9,18 +9,20 @@ from __future__ import annotations
 
 import os
 import struct
+from collections.abc import Iterator
 from typing import BinaryIO
 
 import numpy as np
 
 from roadgeo._arrays import AnyArray, FloatArray
 
-__all__ = ["UPRIGHT", "read_orientation", "stored_from_upright", "turn_upright"]
+__all__ = ["UPRIGHT", "read_orientation", "stored_from_upright", "tiff_values", "turn_upright"]
 
 UPRIGHT = 1
 
 _TAG, _SHORT = 274, 3
-_MAX_ENTRIES = 1 << 12  # of an IFD
+_MAX_ENTRIES, _MAX_VALUE = 1 << 16, 1 << 24  # of an IFD; bytes of a value
+_BYTES = {1: 1, 2: 1, 3: 2, 4: 4, 6: 1, 7: 1, 8: 2, 9: 4, 11: 4, 13: 4}  # of the types of TIFF; of others 8
 _MAX_PARTS = 1 << 12  # segments or chunks before the one that holds EXIF
 
 #: Steps that make a stored picture upright: rows become columns, rows are taken from the bottom, columns from
@@ -112,19 +114,36 @@ def _of_chunks(file: BinaryIO, at: int, layout: str, wanted: bytes) -> int:
 
 
 def _of_tiff(file: BinaryIO, start: int) -> int:
-    """Read the entry in the first directory of a TIFF, or BigTIFF, that begins at `start`."""
+    kind, value, order = next(tiff_values(file, start, _TAG), (0, b"", ""))
+    return int(struct.unpack(order + "H", value[:2])[0]) if kind == _SHORT else UPRIGHT
+
+
+def tiff_values(file: BinaryIO, start: int, wanted: int) -> Iterator[tuple[int, bytes, str]]:
+    """Yield the values of a tag in the first directory of a TIFF, or BigTIFF, that begins at `start`.
+
+    Each with its type, cut off where the file ends, and with the order of its bytes, "<" or ">".
+
+    Raises
+    ------
+    struct.error
+        The directory is cut off.
+    """
     file.seek(start)
     head = file.read(16)
     order = "<" if head.startswith(b"II") else ">"
     is_big = struct.unpack(order + "H", head[2:4])[0] == 43
-    offset = struct.unpack(order + ("Q" if is_big else "I"), head[8:16] if is_big else head[4:8])[0]
+    number, count, length = ("Q", "Q", 20) if is_big else ("I", "H", 12)
+    size = struct.calcsize(order + number)
+    (offset,) = struct.unpack(order + number, head[8:16] if is_big else head[4:8])
     file.seek(start + offset)
-    n_entries = struct.unpack(order + ("Q" if is_big else "H"), file.read(8 if is_big else 2))[0]
-    length = 20 if is_big else 12
-    for _ in range(min(n_entries, _MAX_ENTRIES)):
+    (n_entries,) = struct.unpack(order + count, file.read(struct.calcsize(order + count)))
+    for n in range(min(n_entries, _MAX_ENTRIES)):
+        file.seek(start + offset + struct.calcsize(order + count) + n * length)
         entry = file.read(length)
-        tag, kind = struct.unpack(order + "HH", entry[:4])
-        if tag == _TAG:
-            value: int = struct.unpack(order + "H", entry[12:14] if is_big else entry[8:10])[0]
-            return value if kind == _SHORT else UPRIGHT
-    return UPRIGHT
+        tag, kind, n_values = struct.unpack(order + "HH" + number, entry[: 4 + size])
+        if tag != wanted:
+            continue
+        n_bytes = min(n_values * _BYTES.get(kind, 8), _MAX_VALUE)
+        if n_bytes > size:
+            file.seek(start + struct.unpack(order + number, entry[4 + size :])[0])
+        yield kind, entry[4 + size :][:n_bytes] if n_bytes <= size else file.read(n_bytes), order

@@ -9,6 +9,7 @@ Rasterio is imported only here and late: it takes longer than to read a mask.
 from __future__ import annotations
 
 import contextlib
+import mmap
 import os
 import re
 import shutil
@@ -24,8 +25,9 @@ import numpy as np
 
 from roadgeo._arrays import AnyArray
 from roadgeo.errors import MaskError, OutputError
+from roadgeo.storage.crs import file_in_bytes
 from roadgeo.storage.gdal import CONSENT, NETWORK, SEALED, allowed_drivers, is_named_remote
-from roadgeo.storage.orientation import UPRIGHT, read_orientation, stored_from_upright, turn_upright
+from roadgeo.storage.orientation import UPRIGHT, read_orientation, stored_from_upright, tiff_values, turn_upright
 
 if TYPE_CHECKING:
     from rasterio import DatasetReader
@@ -70,6 +72,7 @@ _ARRAY = b"\x93NUMPY"
 _CACHE_BYTES = 256 << 20  # of decoded blocks; GDAL's own is a twentieth of the machine's memory
 _HEAD_BYTES = 8192
 _LITTLE_SPACE = 8 << 20
+_GEO_TEXT = 34737  # tag of GeoTIFF
 _BOXES_OF_BOXES = (b"jp2h", b"res ", b"asoc", b"jpch", b"jplh")  # of JPEG 2000
 
 
@@ -114,10 +117,12 @@ def open_raster(
         drivers = allowed_drivers() + [driver for _, driver in _DRIVERS[:-1]]
     else:
         drivers = _drivers(Path(path), name, allowed_drivers() + ["VRT"] * is_ours)
-    if not remote and drivers == ["JP2OpenJPEG"]:
-        _require_boxes(Path(path), name)
-    if not remote and drivers == ["PNG"]:
-        _require_chunks(Path(path), name)
+    if not remote:
+        _require_own_crs(Path(path), drivers, name)
+        if drivers == ["JP2OpenJPEG"]:
+            _require_boxes(Path(path), name)
+        if drivers == ["PNG"]:
+            _require_chunks(Path(path), name)
     with warnings.catch_warnings():
         warnings.simplefilter("ignore", NotGeoreferencedWarning)
         try:
@@ -276,6 +281,36 @@ def _drivers(path: Path, name: str, more: list[str]) -> list[str]:
             f"or name GDAL's driver for it, if you trust the file: {CONSENT}=netCDF"
         )
     return [driver] if driver else more
+
+
+def _require_own_crs(path: Path, drivers: list[str], name: str) -> None:
+    """Refuse a raster whose CRS names a file, which GDAL would open with it, or whose pixels lie in another file.
+
+    A GeoTIFF has its CRS in a tag, JPEG 2000 and Erdas Imagine files have it anywhere, other formats have none.
+    """
+    found = ""
+    with path.open("rb") as file:
+        if drivers == ["GTiff"]:
+            with contextlib.suppress(struct.error):
+                for _, text, _ in tiff_values(file, 0, _GEO_TEXT):
+                    found = found or file_in_bytes(text)
+        elif drivers in (["HFA"], ["JP2OpenJPEG"]):
+            with mmap.mmap(file.fileno(), 0, access=mmap.ACCESS_READ) as content:
+                found = file_in_bytes(content) or (_file_of_imagine(content, path) if drivers == ["HFA"] else "")
+    if found:
+        raise MaskError(
+            f"{name}: names another file, {found[:60]!r}, which is not opened; convert it to a plain GeoTIFF"
+        )
+
+
+def _file_of_imagine(content: mmap.mmap, path: Path) -> str:
+    """Return the other file where an Erdas Imagine file keeps its pixels, or its overviews if they are there."""
+    if re.search(rb"(?<!_)ExternalRasterDMS\0", content):
+        return f"{path.stem}.ige"
+    if not re.search(rb"(?<!_)RRDNamesList\0", content):
+        return ""
+    named = {os.fsdecode(name) for name in re.findall(rb"([^\0(]{1,255})\(:", content)} - {path.name}
+    return next((name for name in sorted(named) if os.path.exists(path.parent / name)), "")  # noqa: PTH110
 
 
 def _require_boxes(path: Path, name: str) -> None:

@@ -15,7 +15,8 @@ from roadgeo.errors import RoadSourceError
 __all__ = ["PACKED", "read_chunks", "require_bounded", "unpack"]
 
 #: Endings of packed files. OpenStreetMap's are read as they are.
-PACKED = (".gz", ".bz2", ".zip")
+_ARCHIVES = (".zip", ".shz")
+PACKED = (".gz", ".bz2", *_ARCHIVES)
 
 #: A packed file may unpack to this many bytes, and beyond them to a multiple of its size: XML shrinks to a tenth.
 _FREE, _TIMES = 64 << 20, 100
@@ -59,7 +60,7 @@ def unpack(path: Path, folder: Path) -> Path:
     RoadSourceError
         As `read_chunks`; it is encrypted, or no archive.
     """
-    if path.suffix.lower() != ".zip":
+    if path.suffix.lower() not in _ARCHIVES:
         target = folder / path.stem
         with target.open("wb") as out:
             out.writelines(read_chunks(path))

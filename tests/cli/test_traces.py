@@ -8,6 +8,7 @@ import sys
 from pathlib import Path
 
 import pytest
+from support.read_all import BEGIN
 
 from roadgeo.evaluation.demo import ROADS, demo_masks
 from roadgeo.outputs.registry import ALSO
@@ -20,6 +21,8 @@ _CHANGES = (
     *("creat", "mkdir", "mkdirat", "mknod", "mknodat", "rename", "renameat", "renameat2"),
     *("link", "linkat", "symlink", "symlinkat", "truncate"),
 )
+#: What the system and Python look at at any time.
+_SYSTEM = ("/proc", "/sys", "/dev/null", "/dev/urandom", "/etc", "/usr/share", "/usr/lib", "/lib")
 _TRACE = ["strace", "-f", "-qq", "-y", "--seccomp-bpf", "-s", "4096"]
 
 
@@ -92,3 +95,25 @@ def test_no_output_leaves_more_than_itself(porto: Path, tmp_path: Path) -> None:
     assert any(path.name.endswith(".kmz") for path in paths)
     assert not strays(paths, tmp_path)
     assert not asked
+
+
+def test_readers_open_nothing_but_their_files(tmp_path: Path) -> None:
+    """Maps, rasters, models, references and locations of the corpus: many of them name files, pipes and servers."""
+    program = Path(__file__).parents[1] / "support" / "read_all.py"
+    environment = os.environ | {"TMPDIR": str(tmp_path), "PYTHONPATH": os.pathsep.join(filter(None, sys.path))}
+    environment |= {"HOME": str(tmp_path), "ROADGEO_CACHE": str(cache_dir()), "GDAL_DRIVER_PATH": "disable"}
+    (tmp_path / "files").mkdir()
+    command = [*_TRACE, "-o", str(tmp_path / "trace.txt"), "-e", "trace=%network,open,openat,stat,newfstatat"]
+    read = [sys.executable, str(program), str(tmp_path / "files")]
+    subprocess.run([*command, *read], cwd=tmp_path, env=environment, timeout=900, check=True)
+    lines = (tmp_path / "trace.txt").read_text("utf-8", "replace").splitlines()
+    start = next(n for n, line in enumerate(lines) if BEGIN in line)
+    calls = [line.split(maxsplit=1)[1] for line in lines[start + 1 :]]
+    opened = [path for line in calls if line.startswith("open") for path in _paths(line, tmp_path)]
+    own = [
+        Path(path) for path in (sys.prefix, sys.base_prefix, tmp_path, Path(__file__).parents[2], cache_dir(), *_SYSTEM)
+    ]
+    assert any(path.name == "roads.shp" for path in opened)
+    assert not {str(path) for path in opened if not any(path.is_relative_to(one) for one in own)}
+    assert not [line for line in calls if not line.startswith(("open", "stat", "newfstatat", "+++", "---", "<..."))]
+    assert not [line for line in calls if "/nowhere" in line]

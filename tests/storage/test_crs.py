@@ -13,7 +13,7 @@ import rasterio
 
 from roadgeo.errors import CrsError
 from roadgeo.geometry.projection import to_lonlat
-from roadgeo.storage.crs import known_crs, name_crs
+from roadgeo.storage.crs import file_in_bytes, known_crs, name_crs
 
 GEOGCS = (
     'GEOGCS["x",DATUM["y",SPHEROID["GRS 1980",6378137,298.257222101]{}],PRIMEM["Greenwich",0],'
@@ -47,6 +47,28 @@ def naming(file: str) -> list[str]:
         BOUND.replace("{}", file).replace("PARAMETERFILE[", "ParameterFile ( ").replace(',ID["EPSG",8656]]', ")"),
         json.dumps(pyproj.CRS(BOUND.replace("{}", file)).to_json_dict()),
     ]
+
+
+@pytest.mark.parametrize(
+    "crs",
+    [
+        GEOGCS.format(",EXTENSION[PROJ4_GRIDS,/tmp/fifo]"),
+        GEOGCS.format(",EXTENSION[\u201cPROJ4_GRIDS\u201d,\u201c/tmp/fifo\u201d]"),
+        GEOGCS.format(',EXTENSION["PROJ4_GRIDS"["a"],"/tmp/fifo"]'),
+        GEOGCS.format(',EXTENSION["PROJ4","+proj=longlat +nadgrids=""a b,/tmp/fifo"" "]'),
+        '{"init": "/tmp/fifo:1"}',
+        '{"proj": "longlat", "ellps": "GRS80", "nadgrids": "/tmp/fifo"}',
+        json.dumps(pyproj.CRS(BOUND.format("a.gsb")).to_json_dict()).replace(
+            '"value": "a.gsb"', '"valu\\u0065": "\\u002ftmp/fifo", "n": ' + "1" * 5000
+        ),
+        "+init+=+/tmp/fifo:1",
+    ],
+)
+def test_other_ways_to_write_it_are_known(crs: str) -> None:
+    with pytest.raises(CrsError, match="names the file"):
+        known_crs(crs)
+    if not crs.startswith("{"):
+        assert file_in_bytes(bytes(1_000_000) + crs.encode() + bytes(100))
 
 
 @pytest.mark.parametrize("file", ["/dev/stdin", "../fifo", "sub/fifo", r"C:\grid.gsb", "https://host/grid.tif"])

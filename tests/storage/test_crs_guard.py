@@ -15,6 +15,7 @@ from storage.test_crs import naming
 from roadgeo.errors import RoadgeoError
 from roadgeo.sources.roads import read_roads
 
+CORPUS = Path(__file__).parents[1] / "corpus"
 LINES = [shapely.LineString([(5e5, 4.5e6), (501000, 4501000)]), shapely.LineString([(5e5, 4501000), (501000, 4500000)])]
 
 
@@ -102,6 +103,43 @@ def test_a_crs_opens_no_file(made: Callable[[Path, str], Path], way: int, tmp_pa
     path = made(tmp_path, naming("/nowhere/fifo")[way])
     with pytest.raises(RoadgeoError, match="names the file"):
         read_roads(path, which="all")
+
+
+@pytest.mark.parametrize(
+    ("name", "message"),
+    [
+        ("geojson/crs_key_escaped.geojson", "names the file '/nowhere/roadgeo/fifo'"),
+        ("geojson/crs_key_of_other_case.geojson", "names the file '/nowhere/roadgeo/fifo'"),
+        ("geojson/crs_trailing_comma.geojson", "what it says of its CRS is no valid JSON; save it again"),
+        ("geojson/crs_raw_tab.geojson", "what it says of its CRS is no valid JSON; save it again"),
+        ("geojson/crs_key_twice.geojson", "what it says of its CRS is no valid JSON; save it again"),
+        ("zip/crs_names_a_file.zip", "names the file '/nowhere/roadgeo/fifo'"),
+        ("tab/view_of_other_tables.tab", "is a view of other tables, which are not opened"),
+    ],
+)
+def test_what_only_lenient_readers_understand_is_refused(name: str, message: str) -> None:
+    with pytest.raises(RoadgeoError, match=message):
+        read_roads(CORPUS / name, which="all")
+
+
+def test_archives_are_recognised_by_their_content_and_unpacked_by_us(tmp_path: Path) -> None:
+    """GDAL opens archives by itself, and what is packed cannot be looked at."""
+    content = (CORPUS / "zip" / "crs_names_a_file.zip").read_bytes()
+    for ending, message in ((".shz", "names the file"), (".kml", "is packed, whatever its name says")):
+        (tmp_path / f"roads{ending}").write_bytes(content)
+        with pytest.raises(RoadgeoError, match=message):
+            read_roads(tmp_path / f"roads{ending}", which="all")
+
+
+def test_a_crs_is_found_however_far_from_the_beginning(tmp_path: Path) -> None:
+    path = shapefile(tmp_path, " " * 100_000 + naming("/nowhere/fifo")[6])
+    with pytest.raises(RoadgeoError, match="names the file"):
+        read_roads(path, which="all")
+    geopandas.GeoDataFrame(geometry=LINES, crs="EPSG:32629").to_file(tmp_path / "roads.gdb", driver="OpenFileGDB")
+    with (tmp_path / "roads.gdb" / "a00000004.gdbtable").open("ab") as table:
+        table.write(bytes(100_000) + naming("/nowhere/fifo")[6].encode("utf-16-le"))
+    with pytest.raises(RoadgeoError, match="names the file"):
+        read_roads(tmp_path / "roads.gdb", which="all")
 
 
 @pytest.mark.skipif(not hasattr(os, "mkfifo"), reason="no pipes with names here")

@@ -298,6 +298,7 @@ READERS = {
     "kml": Reader(read_map, "roads.kml"),
     "gpx": Reader(read_map, "roads.gpx"),
     "mif": Reader(read_map, "roads.mif", ("roads.mid",)),
+    "tab": Reader(read_map, "roads.tab"),
     "flatgeobuf": Reader(read_map, "roads.fgb"),
     "sqlite": Reader(read_map, "roads.sqlite"),
     "osm": Reader(read_map, "roads.osm"),

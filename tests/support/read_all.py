@@ -1,0 +1,37 @@
+"""Read each file of the corpus with its reader, in a folder: what is opened meanwhile is for a tracer to see.
+
+python tests/support/read_all.py FOLDER
+"""
+
+import contextlib
+import os
+import sys
+from pathlib import Path
+
+sys.path.insert(0, str(Path(__file__).parents[1]))
+
+from support.readers import READERS, drivers_registered_once, feed, seeds
+
+#: Fuzzing makes its own; the others listen to, or call, a server that they start.
+_LEFT_OUT = {"index", "request", "http", "overpass", "nominatim"}
+#: Once it is opened, all libraries are loaded.
+BEGIN = "/roadgeo-reads-strangers-files"
+
+
+def main() -> None:
+    """Read all files twice: what libraries open when they are used for the first time is left out."""
+    folder = Path(sys.argv[1])
+    with drivers_registered_once():
+        for turn in range(2):
+            if turn:
+                os.path.exists(BEGIN)  # noqa: PTH110 - one call of the system
+            for name in sorted(READERS.keys() - _LEFT_OUT):
+                for path in seeds(name):
+                    within = folder / f"{turn}-{name}-{path.name}"
+                    within.mkdir()
+                    with contextlib.suppress(AssertionError):
+                        feed(READERS[name], within)(path.read_bytes())
+
+
+if __name__ == "__main__":
+    main()
