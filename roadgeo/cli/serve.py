@@ -34,13 +34,12 @@ searches again. It opens in your browser; nothing leaves this machine.
 \b
   POST /locate                           an image as the body -> the answer, JSON as of locate --json
                                          a form too: curl -F image=@photo.jpg
-  POST /processes/locate/execution       the same by OGC API - Processes, the image in JSON, base64
-  GET  /jobs/ID  /jobs/ID/events         of a request with the header Prefer: respond-async
-  GET  / /api /conformance /processes /processes/locate /jobs /health
+  GET  /jobs/ID  /jobs/ID/results        with the header Prefer: respond-async; progress: /jobs/ID/events
+  GET  /  /health                        the page; whether it answers
 
 It listens on this machine only. With --host others may ask, and then all must show a token:
 `Authorization: Bearer TOKEN`, which the environment variable ROADGEO_TOKEN or --token-file gives. There is no
-encryption; put a proxy before it where the network is not your own.
+encryption, and slow clients are waited for: put a proxy before it where the network is not your own.
 
 \b
 Examples:
@@ -54,7 +53,7 @@ Exit status: 0 ended, 1 error, 2 usage.
 \f
 
 \b
-What is known goes into the URL or the form, or beside the image in JSON, in the words of `roadgeo locate`:
+What is known goes into the URL or the form, in the words of `roadgeo locate`:
 {hints}
 
 Requests wait for a free process, so many as --waiting says; whoever comes then hears 503 and when to come again. The

@@ -3,42 +3,31 @@
 from __future__ import annotations
 
 import asyncio
-import errno
 import json
 import logging
 import shutil
 import time
-from collections.abc import AsyncGenerator, AsyncIterator, Awaitable, Callable, Sequence
+from collections.abc import AsyncIterator, Callable, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from contextlib import suppress
-from functools import partial
 from pathlib import Path
 from typing import Any
 
 from starlette.applications import Starlette
 from starlette.datastructures import UploadFile
 from starlette.exceptions import HTTPException
-from starlette.formparsers import MultiPartException, MultiPartParser
 from starlette.middleware import Middleware
-from starlette.requests import Request
+from starlette.requests import ClientDisconnect, Request
 from starlette.responses import FileResponse, HTMLResponse, JSONResponse, Response, StreamingResponse
 from starlette.routing import Route
 
 from roadgeo import __version__
 from roadgeo.reference.reference import AnyReference
-from roadgeo.serving.documents import documents_of
-from roadgeo.serving.guard import COOKIE, Guard, is_same, pass_of, refusal, require_body
+from roadgeo.serving.guard import COOKIE, Guard, is_same, pass_of, problem
 from roadgeo.serving.jobs import Job, Jobs
 from roadgeo.serving.options import ServeOptions
 from roadgeo.serving.page import page_file, page_text, policy_of
-from roadgeo.serving.requests import (
-    LIMIT,
-    Refused,
-    ending_of,
-    read_execution,
-    read_hints,
-    read_query_string,
-)
+from roadgeo.serving.requests import LIMIT, ending_of, read_hints, read_query_string
 from roadgeo.serving.tiles import MAX_ZOOM, Tiles
 from roadgeo.serving.view import OFFERED, OWN, PICTURE, SEEN, SENT, VIEW, WARPED, safe_stem
 from roadgeo.serving.workers import Answer, Asked, Place, Workers
@@ -47,16 +36,15 @@ __all__ = ["Service"]
 
 _LOG = logging.getLogger(__name__)
 
-_CHUNK = 1 << 16
-#: Time to make a file of an answer, seconds; length of a token.
-_WRITE_S, _MOST_TOKEN = 60.0, 4096
+#: Time to make a file of an answer, seconds.
+_WRITE_S = 60.0
 
 #: Headers of files that never change under their address, and of those that change with roadgeo itself.
 _FOR_EVER = {"Cache-Control": "private, max-age=86400, immutable"}
 _AS_IT_IS = {"Cache-Control": "no-cache"}
 
-#: Hears of each place that is found: of its document, and when its request came.
-Told = Callable[[dict[str, Any], float], None]
+#: Called with the document of each place that is found, and with the time of its request.
+Listener = Callable[[dict[str, Any], float], None]
 
 
 class Service:
@@ -73,21 +61,20 @@ class Service:
         workers: Workers,
         references: Sequence[AnyReference],
         options: ServeOptions,
-        folder: Path,
-        told: Told | None = None,
+        listener: Listener | None = None,
     ) -> None:
-        """Make the routes; images, and answers that are kept, lie in `folder`."""
-        self._workers, self._options, self._told = workers, options, told
-        self._jobs, self._tiles = Jobs(folder, options), Tiles(references)
+        self._workers, self._options, self._listener = workers, options, listener
+        self._jobs, self._tiles = Jobs(workers.folder, options), Tiles(references)
         self._threads = ThreadPoolExecutor(options.workers + options.waiting + 4)
         self._drawing = ThreadPoolExecutor(1)  # whatever maps are looked at, the rest of the machine searches
-        self._documents, self._policy = documents_of([one.name for one in references]), policy_of(options)
+        self._policy = policy_of(options)
         self._tasks: set[asyncio.Task[None]] = set()
         self.app = Starlette(
-            routes=[*self._routes(), *_document_routes(self._documents)],
+            routes=self._routes(),
             middleware=[Middleware(Guard, options=options)],
-            exception_handlers={HTTPException: _no_route},
+            exception_handlers={HTTPException: _refuse, ClientDisconnect: _hang_up, Exception: _fail},
         )
+        self.app.router.redirect_slashes = False  # a redirect would name the host that the client claims
 
     def _routes(self) -> list[Route]:
         job = "/jobs/{job}"
@@ -96,10 +83,9 @@ class Service:
             Route("/page/{name}", self._page),
             Route("/session", self._open_session, methods=["POST"]),
             Route("/references", self._references),
-            Route("/tiles/{reference:int}/{zoom:int}/{column:int}/{row:int}.mvt", self._tile),
+            Route("/tiles/{reference}/{zoom}/{column}/{row}.mvt", self._tile),
             Route("/health", self._health),
             Route("/locate", self._locate, methods=["POST"]),
-            Route("/processes/locate/execution", self._execute, methods=["POST"]),
             Route(job, self._job, methods=["GET"]),
             Route(job, self._dismiss, methods=["DELETE"]),
             Route(f"{job}/results", self._results),
@@ -110,109 +96,35 @@ class Service:
             Route(f"{job}/{{name}}", self._shown),
         ]
 
-    # --- what is asked ------------------------------------------------------------------------------------------------
-
     async def _health(self, _: Request) -> Response:
         return JSONResponse({"status": "ok", "version": __version__})
 
+    # --- locating -----------------------------------------------------------------------------------------------------
+
     async def _locate(self, request: Request) -> Response:
-        kind = request.headers.get("content-type", "").split(";")[0].strip().lower()
-        take = self._take_form if kind == "multipart/form-data" else self._take_image
-        return await self._serve(request, take, self._options.max_bytes, lambda document: document)
-
-    async def _execute(self, request: Request) -> Response:
-        most = min(self._options.max_bytes, self._options.max_json_bytes)
-        return await self._serve(request, self._take_execution, most, lambda document: {"location": document})
-
-    async def _serve(
-        self,
-        request: Request,
-        take: Callable[[Request, Path], Awaitable[Job]],
-        most: int,
-        show: Callable[[dict[str, Any]], dict[str, Any]],
-    ) -> Response:
-        """Take an image, and locate it at once, or as a job where its sender prefers not to wait."""
+        """Locate an image at once, or as a job where its sender prefers not to wait."""
         came = time.time()
-        require_body(request.headers, most)
-        place = self._workers.take_place()
-        folder, is_kept = self._make_folder(), False
-        try:
-            job = await take(request, folder)
+        with self._workers.take_place():
+            pass  # whoever comes when it is full need not send an image first; who sends one slowly holds no place
+        with self._jobs.room() as folder:
+            job = await _take(request, folder)
             if "respond-async" in request.headers.get("prefer", "").lower():
-                self._start(job, place, came)
-                is_kept = True
-                return _created(job)
-            answer = await self._ask(job, came)
-            return _said(answer, show)
-        except OSError as error:
-            if isinstance(error, TimeoutError | ConnectionError):
-                raise
-            raise self._make_room(error) from error
-        finally:
-            if not is_kept:
-                place.give_back()
-                shutil.rmtree(folder, ignore_errors=True)
+                return self._start(job, came, f"jobs/{job.id}")
+            with self._workers.take_place():
+                answer = await self._ask(job, came)
+        return _respond(answer, answer.document)
 
-    def _make_folder(self) -> Path:
-        try:
-            return self._jobs.make_folder()
-        except OSError as error:
-            raise self._make_room(error) from error
-
-    def _make_room(self, error: OSError) -> Refused:
-        """Let the oldest answer go where the disk is full; return what its sender is asked for: to come again."""
-        if error.errno in (errno.ENOSPC, errno.EDQUOT):
-            self._jobs.make_room()
-        return Refused(503, f"the image cannot be kept: {error.strerror or error}; come again", 1)
-
-    async def _take_image(self, request: Request, folder: Path) -> Job:
-        """Take an image that is the body; hints stand in the URL."""
-        hints = read_query_string(request.url.query)
-        return _job_of(folder, await _keep_body(request, folder), "", hints)
-
-    async def _take_form(self, request: Request, folder: Path) -> Job:
-        """Take a form as browsers and `curl -F` send it: an image, and hints beside it or in the URL."""
-        hints = read_query_string(request.url.query)
-        body, part = await _keep_body(request, folder), folder / "part"
-
-        async def chunks() -> AsyncGenerator[bytes, None]:
-            with body.open("rb") as file:
-                while chunk := file.read(_CHUNK):
-                    yield chunk
-
-        parser = MultiPartParser(request.headers, chunks(), max_files=1, max_fields=20, max_part_size=4096)
-        try:
-            form = await parser.parse()
-            image = form.get("image")
-            if not isinstance(image, UploadFile):
-                raise Refused(400, "expected a form with a file named image: curl -F image=@photo.jpg")
-            hints |= read_hints({key: value for key, value in form.items() if isinstance(value, str)})
-            with part.open("wb") as file:
-                await asyncio.to_thread(shutil.copyfileobj, image.file, file)
-        except MultiPartException as error:
-            raise Refused(400, f"no form that can be read: {error.message}") from error
-        finally:
-            for spooled in parser._files_to_close_on_error:  # those of a torn form would stay open
-                spooled.close()
-        body.unlink()
-        return _job_of(folder, part, image.filename or "", hints)
-
-    async def _take_execution(self, request: Request, folder: Path) -> Job:
-        """Take an execute request of OGC API - Processes: all of it is JSON."""
-        most, body = min(self._options.max_bytes, self._options.max_json_bytes), bytearray()
-        async for chunk in request.stream():
-            body += chunk
-            if len(body) > most:
-                raise Refused(413, f"JSON of more than {most:,} bytes; post the image itself to /locate")
-        image, hints = read_execution(bytes(body))
-        part = folder / "image"
-        part.write_bytes(image)
-        return _job_of(folder, part, "", hints)
-
-    # --- how it is located --------------------------------------------------------------------------------------------
+    async def _again(self, request: Request) -> Response:
+        """Search for an image again, with other hints, as another job."""
+        came, old, hints = time.time(), self._find(request), read_query_string(_query_of(request))
+        if not old.path.is_file():
+            raise HTTPException(404, "its image is not kept: send it again")
+        with self._jobs.room() as folder:
+            await asyncio.to_thread(_copy, old, folder)
+            return self._start(Job(folder, old.image, old.name, hints), came, f"../{folder.name}")
 
     async def _ask(self, job: Job, came: float, keeps: bool = False) -> Answer:
-        """Have a process locate an image, and report its place to listeners."""
+        """Have a process locate an image, and report its place to the listener."""
         loop, hints = asyncio.get_running_loop(), dict(job.hints)
         limit = min(hints.pop(LIMIT, self._options.time_limit_s), self._options.time_limit_s)
         asked = Asked(str(job.path), hints, limit, self._options.max_pixels, job.name, keeps)
@@ -221,47 +133,36 @@ class Service:
             with suppress(RuntimeError):  # the loop has ended
                 loop.call_soon_threadsafe(job.tell, text, share)
 
-        ask = partial(self._workers.ask, asked, say, job.called_off)
-        answer = await loop.run_in_executor(self._threads, ask)
-        if answer.status == 200 and self._told is not None:
-            await loop.run_in_executor(self._threads, self._tell, self._told, answer.document, came)
+        answer = await loop.run_in_executor(self._threads, self._workers.ask, asked, say, job.called_off)
+        if answer.status == 200 and self._listener is not None:
+            await loop.run_in_executor(self._threads, _report, self._listener, answer.document, came)
         return answer
 
-    def _tell(self, told: Told, document: dict[str, Any], came: float) -> None:
-        """Report a place to listeners; their errors do not concern the client."""
-        try:
-            told(document, came)
-        except Exception:
-            _LOG.exception("a place could not be told")
-
-    def _start(self, job: Job, place: Place, came: float) -> None:
+    def _start(self, job: Job, came: float, location: str) -> Response:
         """Locate while nobody waits."""
-
-        async def work() -> None:
-            try:
-                answer = await self._ask(job, came, keeps=True)
-                if answer.lacks_view:
-                    self._jobs.make_room()
-                job.end(answer)
-            except Exception:
-                _LOG.exception("a fault of the server at a job")
-                job.end(Answer(500, {"detail": "a fault of roadgeo: its log tells which"}))
-            finally:
-                place.give_back()
-                self._jobs.let_go()
-
+        place = self._workers.take_place()
         self._jobs.add(job)
-        task = asyncio.get_running_loop().create_task(work())
+        task = asyncio.get_running_loop().create_task(self._work(job, place, came))
         self._tasks.add(task)
         task.add_done_callback(self._tasks.discard)
+        return JSONResponse(job.to_dict(), 201, {"Location": location, "Preference-Applied": "respond-async"})
+
+    async def _work(self, job: Job, place: Place, came: float) -> None:
+        with place:
+            try:
+                answer = await self._ask(job, came, keeps=True)
+            except Exception:
+                _LOG.exception("a fault of the server at a job")
+                answer = Answer(500, {"detail": "a fault of roadgeo: its log tells which"})
+        if answer.lacks_view:
+            self._jobs.make_room()
+        job.end(answer)
+        self._jobs.let_go()
 
     # --- jobs ---------------------------------------------------------------------------------------------------------
 
     def _find(self, request: Request) -> Job:
-        job = self._jobs.find(request.path_params["job"])
-        if job is None:
-            raise Refused(404, f"there is no such job; the latest {self._options.kept_jobs} are kept")
-        return job
+        return self._jobs.find(request.path_params["job"])
 
     async def _job(self, request: Request) -> Response:
         return JSONResponse(self._find(request).to_dict())
@@ -274,8 +175,8 @@ class Service:
     async def _results(self, request: Request) -> Response:
         job = self._find(request)
         if job.answer is None:
-            raise Refused(404, f"the job is {job.status}: there is no result yet")
-        return _said(job.answer, lambda document: {"location": document})
+            raise HTTPException(404, f"the job is {job.status}: there is no result yet")
+        return _respond(job.answer, {"location": job.answer.document})
 
     async def _events(self, request: Request) -> Response:
         """Send a job's state whenever it changes, as server-sent events."""
@@ -287,38 +188,23 @@ class Service:
 
         return StreamingResponse(tell(), headers={"Cache-Control": "no-store"}, media_type="text/event-stream")
 
-    async def _again(self, request: Request) -> Response:
-        """Search for an image again, with other hints, as another job."""
-        old, came = self._find(request), time.time()
-        hints = read_query_string(request.url.query)
-        place, folder = self._workers.take_place(), self._make_folder()
-        try:
-            await asyncio.to_thread(_copy, old, folder)
-        except OSError as error:
-            place.give_back()
-            shutil.rmtree(folder, ignore_errors=True)
-            raise self._make_room(error) from error
-        job = Job(folder, old.image, old.name, hints)
-        self._start(job, place, came)
-        return _created(job)
-
     async def _shown(self, request: Request) -> Response:
         """Return the page's view of an answer."""
         job, name = self._find(request), request.path_params["name"]
         path = job.folder / OWN / name
         if name not in (PICTURE, WARPED, VIEW) or job.status != "successful" or not path.is_file():
-            raise Refused(404, f"the job is {job.status}: there is nothing to show")
+            raise HTTPException(404, f"the job is {job.status}: there is nothing to show")
         return FileResponse(path, headers=_FOR_EVER)
 
     async def _files(self, request: Request) -> Response:
-        """List the files that may be had of an answer."""
+        """List the files that may be had of an answer; their addresses start at the page's."""
         job = self._find(request)
         document = job.answer.document if job.answer is not None and job.status == "successful" else {}
         located, camera = document.get("status") == "located", document.get("camera") is not None
         offered = [
-            {"name": one.name, "summary": one.summary, "href": f"/jobs/{job.id}/files/{one.name}"}
-            for one in OFFERED.values()
-            if document and (located or not one.needs_place) and (camera or not one.needs_camera)
+            {"name": output.name, "summary": output.summary, "href": f"jobs/{job.id}/files/{output.name}"}
+            for output in OFFERED.values()
+            if document and (located or not output.needs_place) and (camera or not output.needs_camera)
         ]
         return JSONResponse({"files": offered})
 
@@ -326,29 +212,25 @@ class Service:
         """Return one of them, made when it is first asked for."""
         job, name = self._find(request), request.path_params["name"]
         if name not in OFFERED or job.status != "successful":
-            raise Refused(404, f"there is no such file; {', '.join(OFFERED)} may be had of what was located")
+            raise HTTPException(404, f"there is no such file; {', '.join(OFFERED)} may be had of what was located")
         asked = Asked(str(job.path), {}, _WRITE_S, self._options.max_pixels, wanted=name)
         with self._workers.take_place():
-            ask = partial(self._workers.ask, asked)
-            answer = await asyncio.get_running_loop().run_in_executor(self._threads, ask)
+            answer = await asyncio.get_running_loop().run_in_executor(self._threads, self._workers.ask, asked)
         if answer.status >= 400:
-            return _said(answer, dict)
+            return _respond(answer, {})
         path = Path(answer.document["file"])
         return FileResponse(path, media_type="application/octet-stream", filename=path.name)
 
     # --- the page -----------------------------------------------------------------------------------------------------
 
-    async def _landing(self, request: Request) -> Response:
-        """Return the page to people, to programs what it is."""
-        if "text/html" not in request.headers.get("accept", ""):
-            return JSONResponse(self._documents["/"])
+    async def _landing(self, _: Request) -> Response:
         return HTMLResponse(page_text("index.html"), headers={"Content-Security-Policy": self._policy, **_AS_IT_IS})
 
     async def _page(self, request: Request) -> Response:
         name = request.path_params["name"]
         path = page_file(name)
         if path is None:
-            raise Refused(404, "there is nothing of that name; begin at /")
+            raise HTTPException(404, "there is nothing of that name; begin at /")
         kind = {".css": "text/css", ".html": "text/html"}.get(Path(name).suffix, "text/javascript")
         packed = {"Content-Encoding": "gzip"} if path.suffix == ".gz" else {}
         headers = {"Content-Security-Policy": self._policy, **_AS_IT_IS, **packed}
@@ -356,34 +238,27 @@ class Service:
 
     async def _open_session(self, request: Request) -> Response:
         """Give a browser a pass for the token that its user typed, once."""
-        body = bytearray()
-        async for chunk in request.stream():
-            body += chunk
-            if len(body) > _MOST_TOKEN:
-                raise Refused(413, "expected a token")
-        given = body.decode("utf-8", "replace").strip()
-        if self._options.token and not is_same(given, self._options.token):
-            raise Refused(401, "this is not the token")
+        given, token = (await request.body()).decode("utf-8", "replace").strip(), self._options.token
+        if token and not is_same(given, token):
+            raise HTTPException(401, "this is not the token")
         response = JSONResponse({"status": "ok"})
-        if self._options.token:
-            response.set_cookie(COOKIE, pass_of(self._options.token), httponly=True, samesite="strict")
+        if token:
+            response.set_cookie(COOKIE, pass_of(token), httponly=True, samesite="strict")
         return response
 
     async def _references(self, _: Request) -> Response:
-        loop = asyncio.get_running_loop()
-        told = await loop.run_in_executor(self._drawing, self._tiles.describe)
-        limits = {"max_bytes": self._options.max_bytes, "kept": self._options.kept_jobs}
-        shown = {"references": told, "max_zoom": MAX_ZOOM, "basemap": self._options.basemap}
-        return JSONResponse({**shown, "basemap_attribution": self._options.basemap_attribution, **limits})
+        references = await asyncio.get_running_loop().run_in_executor(self._drawing, self._tiles.describe)
+        limits = {"max_bytes": self._options.max_bytes, "kept": self._options.kept_jobs, "max_zoom": MAX_ZOOM}
+        basemap = {"basemap": self._options.basemap, "basemap_attribution": self._options.basemap_attribution}
+        return JSONResponse({"references": references, **limits, **basemap})
 
     async def _tile(self, request: Request) -> Response:
         """Return the roads of a map as a vector tile."""
-        asked = request.path_params
-        where = (asked["reference"], asked["zoom"], asked["column"], asked["row"])
         try:
+            where = [int(request.path_params[name]) for name in ("reference", "zoom", "column", "row")]
             tile = await asyncio.get_running_loop().run_in_executor(self._drawing, self._tiles.tile, *where)
-        except KeyError as error:
-            raise Refused(404, "there is no such tile") from error
+        except (KeyError, ValueError) as error:  # no number, or one of thousands of digits
+            raise HTTPException(404, "there is no such tile") from error
         headers = {"Cache-Control": "private, max-age=3600"}
         return Response(tile, media_type="application/vnd.mapbox-vector-tile", headers=headers)
 
@@ -393,14 +268,31 @@ class Service:
             pool.shutdown(wait=False, cancel_futures=True)
 
 
-def _document_routes(documents: dict[str, dict[str, Any]]) -> list[Route]:
-    def route(path: str) -> Route:
-        async def answer(_: Request) -> Response:
-            return JSONResponse(documents[path])
+def _query_of(request: Request) -> str:
+    query: bytes = request.scope["query_string"]  # `request.url` begins with what the client calls the host
+    return query.decode("latin-1")
 
-        return Route(path, answer)
 
-    return [route(path) for path in documents if path != "/"]
+async def _take(request: Request, folder: Path) -> Job:
+    """Take an image that is the body, or a file of a form; hints stand in the URL, and in the form."""
+    part, hints, name = folder / "part", read_query_string(_query_of(request)), ""
+    if request.headers.get("content-type", "").lower().startswith("multipart/form-data"):
+        async with request.form(max_files=1, max_fields=20, max_part_size=4096) as form:
+            image = form.get("image")
+            if not isinstance(image, UploadFile):
+                raise HTTPException(400, "expected a form with a file named image: curl -F image=@photo.jpg")
+            hints |= read_hints({key: value for key, value in form.items() if isinstance(value, str)})
+            name = (image.filename or "").replace("\\", "/")
+            with part.open("wb") as file:
+                await asyncio.to_thread(shutil.copyfileobj, image.file, file)
+    else:
+        with part.open("wb") as file:
+            async for chunk in request.stream():
+                file.write(chunk)
+    with part.open("rb") as file:
+        ending = ending_of(file.read(16))
+    image_path = part.rename(folder / SENT / f"{safe_stem(name)}{ending}")
+    return Job(folder, image_path.name, Path(name).name[:200], hints)
 
 
 def _copy(old: Job, folder: Path) -> None:
@@ -412,42 +304,25 @@ def _copy(old: Job, folder: Path) -> None:
         shutil.copyfile(seen, folder / OWN / SEEN)
 
 
-async def _keep_body(request: Request, folder: Path) -> Path:
-    """Write a body to a file as it comes."""
-    path = folder / "body"
-    with path.open("wb") as file:
-        async for chunk in request.stream():
-            file.write(chunk)
-    return path
+def _report(listener: Listener, document: dict[str, Any], came: float) -> None:
+    """Report a place to the listener, whose errors do not concern the client."""
+    try:
+        listener(document, came)
+    except Exception:
+        _LOG.exception("a place could not be reported")
 
 
-def _job_of(folder: Path, part: Path, name: str, hints: dict[str, Any]) -> Job:
-    """Return the job of an image that has come, under a name with its ending."""
-    with part.open("rb") as file:
-        ending = ending_of(file.read(16))
-    image = part.rename(folder / SENT / f"{safe_stem(name)}{ending}")
-    return Job(folder, image.name, Path(name.replace("\\", "/")).name[:200], hints)
+def _respond(answer: Answer, document: dict[str, Any]) -> Response:
+    return problem(answer.status, answer.document["detail"]) if answer.status >= 400 else JSONResponse(document)
 
 
-def _created(job: Job) -> Response:
-    headers = {"Location": f"/jobs/{job.id}", "Preference-Applied": "respond-async"}
-    return JSONResponse(job.to_dict(), 201, headers)
+async def _refuse(_: Request, error: Any) -> Response:
+    return problem(error.status_code, error.detail, error.headers)
 
 
-def _said(answer: Answer, show: Callable[[dict[str, Any]], dict[str, Any]]) -> Response:
-    if answer.status >= 400:
-        return refusal(Refused(answer.status, answer.document["detail"], 1 if answer.status == 503 else None))
-    return JSONResponse(show(answer.document))
+async def _hang_up(_: Request, __: Exception) -> Response:
+    return Response(status_code=400)  # nobody is there to read it
 
 
-async def _no_route(request: Request, error: Exception) -> Response:
-    """Answer that there is nothing, or nothing of this kind."""
-    status = getattr(error, "status_code", 404)
-    if status == 405:
-        allowed = (getattr(error, "headers", None) or {}).get("Allow", "GET")
-        response = refusal(Refused(405, f"expected {allowed}"))
-        response.headers["Allow"] = allowed
-        return response
-    if status != 404:
-        return refusal(Refused(status, str(getattr(error, "detail", error))[:200]))
-    return refusal(Refused(404, f"there is nothing at {request.scope['path'][:80]}; begin at /"))
+async def _fail(_: Request, __: Exception) -> Response:
+    return problem(500, "a fault of roadgeo: its log tells which")

@@ -1,36 +1,28 @@
-"""Checks before the routes: clients, limits of size and time, and the form of refusals."""
+"""Checks before the routes: who may ask, how large a body may be and how long it may take, and the form of errors."""
 
 from __future__ import annotations
 
 import asyncio
 import hashlib
 import hmac
-import logging
+from collections.abc import Mapping
 from http import HTTPStatus
 from http.cookies import CookieError, SimpleCookie
-from typing import Any
 from urllib.parse import urlsplit
 
 from starlette.datastructures import Headers, MutableHeaders
-from starlette.requests import ClientDisconnect
+from starlette.exceptions import HTTPException
 from starlette.responses import JSONResponse, Response
 from starlette.types import ASGIApp, Message, Receive, Scope, Send
 
-from roadgeo._text import visible
-from roadgeo.serving.documents import problem
 from roadgeo.serving.options import LOOPBACK, ServeOptions
-from roadgeo.serving.protocol import MAX_HEAD_BYTES
-from roadgeo.serving.requests import Refused
-from roadgeo.serving.workers import Full
 
-__all__ = ["COOKIE", "Guard", "is_same", "pass_of", "refusal", "require_body"]
-
-_LOG = logging.getLogger(__name__)
-
-_MOST_HEADERS, _MOST_TARGET = 100, 8192
+__all__ = ["COOKIE", "Guard", "is_same", "pass_of", "problem"]
 
 #: Under this name a browser shows that it was given the token.
 COOKIE = "roadgeo"
+#: Longest body of a request that brings a token.
+_TOKEN_BYTES = 4096
 
 #: Nothing here is for other sites, and nothing of other sites belongs here.
 _HEADERS = {
@@ -41,99 +33,49 @@ _HEADERS = {
 }
 
 
-def refusal(refused: Refused) -> Response:
+def problem(status: int, detail: str, headers: Mapping[str, str] | None = None) -> Response:
     """Return an error as a document of RFC 7807."""
-    status = HTTPStatus(refused.status)
-    headers = {} if refused.retry_after_s is None else {"Retry-After": str(refused.retry_after_s)}
-    if refused.status == 401:
-        headers["WWW-Authenticate"] = "Bearer"
-    told = problem(refused.status, status.phrase, refused.detail)
-    return JSONResponse(told, refused.status, headers, "application/problem+json")
-
-
-def require_body(headers: Headers, most: int) -> None:
-    """Refuse a body that is declared too large, or does not declare how it ends.
-
-    Raises
-    ------
-    Refused
-        It is so.
-    """
-    coding, lengths = headers.get("transfer-encoding", "").strip().lower(), headers.getlist("content-length")
-    if coding not in ("", "chunked") or (coding and lengths) or len(lengths) > 1:
-        raise Refused(400, "expected either Content-Length, once, or Transfer-Encoding: chunked")
-    if headers.get("content-encoding", "identity").lower() != "identity":
-        raise Refused(415, "expected a body without Content-Encoding")
-    if not coding and not lengths:
-        raise Refused(411, "expected Content-Length, or Transfer-Encoding: chunked")
-    if lengths and int(lengths[0]) > most:
-        raise Refused(413, f"a body of {int(lengths[0]):,} bytes, expected at most {most:,}")
+    document = {"type": "about:blank", "status": status, "title": HTTPStatus(status).phrase, "detail": detail}
+    more = {401: {"WWW-Authenticate": "Bearer"}, 408: {"Connection": "close"}, 503: {"Retry-After": "1"}}
+    return JSONResponse(document, status, {**more.get(status, {}), **(headers or {})}, "application/problem+json")
 
 
 class Guard:
-    """Lets through who may ask what may be asked, and answers the others."""
+    """Lets through who may ask, within the limits of a body, and gives all answers their common headers."""
 
     def __init__(self, app: ASGIApp, options: ServeOptions) -> None:
         self._app, self._options = app, options
 
     async def __call__(self, scope: Scope, receive: Receive, send: Send) -> None:
-        """Answer one request."""
-        if scope["type"] != "http":
-            await self._app(scope, receive, send)
-            return
-        body, answer = _Body(receive, self._options), _Answer(send)
-        refused = await self._answer(scope, body.receive, answer.send)
-        if refused is None:
-            return
-        if answer.started:
-            raise ConnectionAbortedError("an answer broke off")
-        response = refusal(refused)
-        if refused.status in (408, 500):  # otherwise what is left of the body is passed over: the sender hears this
-            response.headers["Connection"] = "close"
-        await response(scope, receive, answer.send)
+        """Answer a request."""
 
-    async def _answer(self, scope: Scope, receive: Receive, send: Send) -> Refused | None:
-        """Let a request through; return why it cannot be answered."""
+        async def send_all(message: Message) -> None:
+            if message["type"] == "http.response.start":
+                headers = MutableHeaders(scope=message)
+                for name, value in _HEADERS.items():
+                    headers.setdefault(name, value)
+            await send(message)
+
+        most = _TOKEN_BYTES if scope["path"] == "/session" else self._options.max_bytes
         try:
-            self._require_head(scope)
-            self._require_right(scope)
-            scope["path"] = scope["path"].rstrip("/") or "/"
-            await self._app(scope, receive, send)
-        except Refused as refused:
-            return refused
-        except Full:
-            return Refused(503, "as many requests as may be are waiting; come again", 1)
-        except TimeoutError:
-            return Refused(408, "the request took too long to be sent")
-        except (ClientDisconnect, ConnectionError):  # whoever asked has gone
-            return None
-        except Exception:
-            _LOG.exception("a fault of the server at %s", visible(f"{scope['method']} {scope['path'][:200]}"))
-            return Refused(500, "a fault of roadgeo: its log tells which")
-        return None
+            self._require_right(scope["path"], Headers(scope=scope), most)
+        except HTTPException as error:
+            await problem(error.status_code, error.detail)(scope, receive, send_all)
+            return
+        await self._app(scope, _limit(receive, most, self._options.body_s), send_all)
 
-    def _require_head(self, scope: Scope) -> None:
-        """Refuse a head that is too large, or asks for something that is no path."""
-        headers = scope["headers"]
-        if len(headers) > _MOST_HEADERS or sum(len(name) + len(value) for name, value in headers) > MAX_HEAD_BYTES:
-            raise Refused(431, f"more than {_MOST_HEADERS} headers, or {MAX_HEAD_BYTES:,} bytes of them")
-        if len(scope["raw_path"]) + len(scope["query_string"]) > _MOST_TARGET:
-            raise Refused(414, f"the address is longer than {_MOST_TARGET:,} bytes")
-        if not scope["raw_path"].startswith(b"/"):
-            raise Refused(400, "the address cannot be read: expected a path")
-
-    def _require_right(self, scope: Scope) -> None:
-        """Refuse who may not ask."""
-        headers = Headers(scope=scope)
+    def _require_right(self, path: str, headers: Headers, most: int) -> None:
+        """Refuse who may not ask, and bodies that are declared too large."""
+        host, origin = headers.get("host", ""), headers.get("origin")
         if self._options.token:
-            if not is_open(scope["path"], headers) and not self._shows_token(headers):
-                raise Refused(401, "expected the header Authorization: Bearer TOKEN")
-        # Other names may be tricks of a page in a browser.
-        elif _host_of("//" + headers.get("host", "localhost")) not in LOOPBACK:
-            raise Refused(403, "this server answers to localhost and 127.0.0.1 only")
-        origin = headers.get("origin")
-        if origin and not self._is_own(origin, headers.get("host", "")):
-            raise Refused(403, "this server does not answer to pages of other sites")
+            if not _is_open(path) and not self._shows_token(headers):
+                raise HTTPException(401, "expected the header Authorization: Bearer TOKEN")
+        elif _split("//" + host)[1] not in LOOPBACK:  # other names may be tricks of a page in a browser
+            raise HTTPException(403, "this server answers to localhost and 127.0.0.1 only")
+        if origin and _split(origin)[0] != host.lower():
+            raise HTTPException(403, "this server does not answer to pages of other sites")
+        if int(headers.get("content-length", 0)) > most:
+            raise HTTPException(413, f"a body of {headers['content-length']} bytes, expected at most {most:,}")
 
     def _shows_token(self, headers: Headers) -> bool:
         shown = headers.get("authorization", "")
@@ -145,16 +87,10 @@ class Guard:
             return False
         return cookie is not None and is_same(cookie.value, pass_of(self._options.token))
 
-    def _is_own(self, origin: str, host: str) -> bool:
-        """Whether a page is one of ours: those of this machine, and with a token those of this server's own name."""
-        name = _host_of(origin)
-        return name in LOOPBACK or (bool(self._options.token) and name is not None and name == _host_of("//" + host))
 
-
-def is_open(path: str, headers: Headers) -> bool:
+def _is_open(path: str) -> bool:
     """Whether a path is answered without a token: those without private content, and the page, which asks for it."""
-    is_page = path == "/" and "text/html" in headers.get("accept", "")
-    return is_page or path in ("/health", "/session") or path.startswith("/page/")
+    return path in ("/", "/health", "/session") or path.startswith("/page/")
 
 
 def pass_of(token: str) -> str:
@@ -168,47 +104,33 @@ def is_same(shown: str, secret: str) -> bool:
     return hmac.compare_digest(given, secret.encode()) or hmac.compare_digest(shown.encode(), secret.encode())
 
 
-def _host_of(address: str) -> str | None:
-    """Return the name in an address; None where that cannot be read."""
+def _split(address: str) -> tuple[str, str | None]:
+    """Return name and port of an address as it is written, and the name alone; nothing where that cannot be read."""
     try:
-        return urlsplit(address).hostname
+        parts = urlsplit(address)
+        return parts.netloc.lower(), parts.hostname
     except ValueError:
-        return None
+        return "", None
 
 
-class _Body:
-    """The body of a request, limited in size and time."""
+def _limit(receive: Receive, most: int, body_s: float) -> Receive:
+    """Bound a body in size and time; what comes after it, such as that the client has gone, is waited for."""
+    until, taken, is_whole = 0.0, 0, False
 
-    def __init__(self, receive: Receive, options: ServeOptions) -> None:
-        self._receive, self._most, self._body_s = receive, options.max_bytes, options.body_s
-        self._until: float | None = None
-        self._taken, self._whole = 0, False
-
-    async def receive(self) -> Message:
-        """Return the next part."""
-        if self._whole:
-            return await self._receive()
-        now = asyncio.get_running_loop().time()
-        self._until = self._until or now + self._body_s
-        message = await asyncio.wait_for(self._receive(), max(self._until - now, 0.0))
-        self._whole = message["type"] != "http.request" or not message.get("more_body", False)
-        self._taken += len(message.get("body", b""))
-        if self._taken > self._most:
-            raise Refused(413, f"a body of more than {self._most:,} bytes")
+    async def take() -> Message:
+        nonlocal until, taken, is_whole
+        if is_whole:
+            return await receive()
+        until = until or asyncio.get_running_loop().time() + body_s
+        try:
+            async with asyncio.timeout_at(until):
+                message = await receive()
+        except TimeoutError as error:
+            raise HTTPException(408, f"the body took longer than {body_s:g} s to be sent") from error
+        is_whole = not message.get("more_body", False)
+        taken += len(message.get("body", b""))
+        if taken > most:
+            raise HTTPException(413, f"a body of more than {most:,} bytes")
         return message
 
-
-class _Answer:
-    """Sends an answer, with the headers that all share."""
-
-    def __init__(self, send: Send) -> None:
-        self._send, self.started = send, False
-
-    async def send(self, message: Message) -> None:
-        """Send a part."""
-        if message["type"] == "http.response.start":
-            self.started = True
-            headers: Any = MutableHeaders(scope=message)
-            for name, value in _HEADERS.items():
-                headers.setdefault(name, value)
-        await self._send(message)
+    return take

@@ -3,15 +3,17 @@
 from __future__ import annotations
 
 import asyncio
+import errno
 import secrets
 import shutil
 import threading
-from collections.abc import AsyncIterator
-from contextlib import suppress
+from collections.abc import AsyncIterator, Iterator
+from contextlib import contextmanager, suppress
 from dataclasses import dataclass, field
-from datetime import UTC, datetime
 from pathlib import Path
 from typing import Any, Literal
+
+from starlette.exceptions import HTTPException
 
 from roadgeo.serving.options import ServeOptions
 from roadgeo.serving.view import SENT
@@ -19,7 +21,6 @@ from roadgeo.serving.workers import Answer
 
 __all__ = ["Job", "Jobs", "Status"]
 
-#: As OGC API - Processes calls them.
 Status = Literal["accepted", "running", "successful", "failed", "dismissed"]
 
 #: Interval of messages that keep a listener's connection, seconds.
@@ -33,7 +34,7 @@ class Job:
     Attributes
     ----------
     folder : Path
-        Holds the image in `sent`, and all of our own in folders beside that (see `view`).
+        Holds the image in `sent`, and all of our own in folders beside that (see `view`). Its name is the job's.
     image : str
         The name of its file.
     name : str
@@ -46,16 +47,17 @@ class Job:
     image: str
     name: str
     hints: dict[str, Any]
-    id: str = field(default_factory=lambda: secrets.token_hex(16))
     status: Status = "accepted"
     message: str = "waiting for a free process"
     progress: int = 0
     answer: Answer | None = None
-    created: datetime = field(default_factory=lambda: datetime.now(UTC))
-    started: datetime | None = None
-    finished: datetime | None = None
     called_off: threading.Event = field(default_factory=threading.Event)
     _changed: asyncio.Event = field(default_factory=asyncio.Event)
+
+    @property
+    def id(self) -> str:
+        """The job's name."""
+        return self.folder.name
 
     @property
     def path(self) -> Path:
@@ -69,42 +71,30 @@ class Job:
 
     def tell(self, text: str, share: float | None = None) -> None:
         """Record the progress."""
-        if self.is_over:
-            return
-        self.status, self.message = "running", text
-        self.started = self.started or datetime.now(UTC)
-        self.progress = 0 if share is None else round(100 * min(max(share, 0.0), 1.0))
-        self._wake()
+        self._become("running", text, 0 if share is None else round(100 * min(max(share, 0.0), 1.0)))
 
     def end(self, answer: Answer) -> None:
         """Keep the answer."""
-        if self.is_over:
-            return
         found = answer.status == 200
-        self.answer, self.finished, self.progress = answer, datetime.now(UTC), 100
-        self.status = "successful" if found else "failed"
-        self.message = str(answer.document.get("reason" if found else "detail", ""))
-        self._wake()
+        self.answer = None if self.is_over else answer
+        message = str(answer.document.get("reason" if found else "detail", ""))
+        self._become("successful" if found else "failed", message, 100)
 
     def call_off(self) -> None:
         """Have nobody wait for it any more."""
         self.called_off.set()
-        if not self.is_over:
-            self.status, self.message, self.finished = "dismissed", "it was called off", datetime.now(UTC)
-        self._wake()
+        self._become("dismissed", "it was called off", self.progress)
+
+    def _become(self, status: Status, message: str, progress: int) -> None:
+        if self.is_over:
+            return
+        self.status, self.message, self.progress = status, message, progress
+        old, self._changed = self._changed, asyncio.Event()
+        old.set()
 
     def to_dict(self) -> dict[str, Any]:
-        """Return its state as OGC API - Processes has it."""
-        times = {"created": self.created, "started": self.started, "finished": self.finished}
-        return {
-            "jobID": self.id,
-            "processID": "locate",
-            "type": "process",
-            "status": self.status,
-            "message": self.message,
-            "progress": self.progress,
-            **{name: time.isoformat(timespec="milliseconds") for name, time in times.items() if time},
-        }
+        """Return its state as it is told to clients."""
+        return {"jobID": self.id, "status": self.status, "message": self.message, "progress": self.progress}
 
     async def watch(self) -> AsyncIterator[dict[str, Any] | None]:
         """Yield its state now and whenever that changes, until it is over; None where nothing happened for a while."""
@@ -119,10 +109,6 @@ class Job:
                 except TimeoutError:
                     yield None
 
-    def _wake(self) -> None:
-        old, self._changed = self._changed, asyncio.Event()
-        old.set()
-
 
 class Jobs:
     """All jobs; of those that are over the latest are kept."""
@@ -131,21 +117,44 @@ class Jobs:
         self._folder, self._options = folder, options
         self._all: dict[str, Job] = {}
 
-    def make_folder(self) -> Path:
-        """Make the folder of a job that is to come, and in it one for the image."""
+    @contextmanager
+    def room(self) -> Iterator[Path]:
+        """Make a folder for an image, which goes again unless a job is added that lies in it.
+
+        Raises
+        ------
+        HTTPException
+            The image cannot be kept. Where the disk is full the oldest answer goes, that the next one can.
+        """
         folder = self._folder / secrets.token_hex(16)
-        folder.mkdir(mode=0o700)
-        (folder / SENT).mkdir()
-        return folder
+        try:
+            folder.mkdir(mode=0o700)
+            (folder / SENT).mkdir()
+            yield folder
+        except OSError as error:
+            if error.errno in (errno.ENOSPC, errno.EDQUOT):
+                self.make_room()
+            raise HTTPException(503, f"the image cannot be kept: {error.strerror or error}; come again") from error
+        finally:
+            if folder.name not in self._all:
+                shutil.rmtree(folder, ignore_errors=True)
 
     def add(self, job: Job) -> None:
         """Keep a job, and let go of the oldest that are over."""
         self._all[job.id] = job
         self.let_go()
 
-    def find(self, name: str) -> Job | None:
-        """Return a job by its name."""
-        return self._all.get(name)
+    def find(self, name: str) -> Job:
+        """Return a job by its name.
+
+        Raises
+        ------
+        HTTPException
+            There is no such job.
+        """
+        if name not in self._all:
+            raise HTTPException(404, f"there is no such job; the latest {self._options.kept_jobs} are kept")
+        return self._all[name]
 
     def remove(self, job: Job) -> None:
         """Call a job off, and forget it."""

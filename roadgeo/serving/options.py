@@ -20,15 +20,13 @@ class ServeOptions:
     workers, waiting : int
         Processes, and requests that may wait for one.
     max_bytes, max_pixels : int
-        Of an image, as sent and unpacked.
-    max_json_bytes : int
-        Of a body that is JSON, which is held in memory; an image in it counts a third more than its bytes.
-    head_s, body_s : float
-        Time to send a request's head, and its body.
+        Size of an image, as sent and unpacked.
+    body_s : float
+        Time to send a request's body.
     time_limit_s : float
-        Of a search; requests may ask for less.
+        Longest search; requests may ask for less.
     connections : int
-        Open at once.
+        Open at once; with more, every request gets 503.
     kept_jobs, kept_bytes : int
         Answers that are kept for clients that asked not to wait, and their limit on disk.
     basemap, basemap_attribution : str
@@ -42,8 +40,6 @@ class ServeOptions:
     waiting: int = 8
     max_bytes: int = 64_000_000
     max_pixels: int = 64_000_000
-    max_json_bytes: int = 16_000_000
-    head_s: float = 10.0
     body_s: float = 60.0
     time_limit_s: float = 10.0
     connections: int = 64

@@ -1,7 +1,7 @@
 """The server: Starlette's routes (`app`) behind a guard, spoken to by uvicorn over HTTP; processes locate (`workers`).
 
-Everything is bounded: connections, time to send a request, its size, and how many wait. On loopback it answers only to
-the names of this machine, and not to pages of other sites that a browser shows.
+Connections, heads, bodies and waiting requests are bounded. On loopback it answers only to the names of this machine,
+and not to pages of other sites that a browser shows. A server for others stands behind a proxy.
 """
 
 from __future__ import annotations
@@ -9,22 +9,21 @@ from __future__ import annotations
 import asyncio
 import socket
 from collections.abc import Sequence
-from pathlib import Path
-from tempfile import TemporaryDirectory
 
 import uvicorn
 
 from roadgeo import __version__
 from roadgeo.reference.reference import AnyReference
-from roadgeo.serving.app import Service, Told
+from roadgeo.serving.app import Listener, Service
 from roadgeo.serving.options import ServeOptions
-from roadgeo.serving.protocol import MAX_HEAD_BYTES, protocol_of
 from roadgeo.serving.workers import Workers
 
 __all__ = ["Server"]
 
-#: Time for answers under way once the processes have ended, seconds.
-_FAREWELL_S = 2
+#: Longest head of a request, bytes.
+_HEAD_BYTES = 1 << 16
+#: Time for answers under way once the processes have ended, and that a connection may stay idle, seconds.
+_FAREWELL_S, _IDLE_S = 2, 10
 
 
 class Server:
@@ -37,9 +36,13 @@ class Server:
     """
 
     def __init__(
-        self, workers: Workers, references: Sequence[AnyReference], options: ServeOptions, told: Told | None = None
+        self,
+        workers: Workers,
+        references: Sequence[AnyReference],
+        options: ServeOptions,
+        listener: Listener | None = None,
     ) -> None:
-        """Listen; `told` receives each place that is found: its document, and the time of its request.
+        """Listen on a port; `listener` is called with each place that is found.
 
         Raises
         ------
@@ -50,18 +53,19 @@ class Server:
         self._socket = _listen(options.host, options.port)
         self.server_address = self._socket.getsockname()
         self.server_port: int = self.server_address[1]
-        self._folder = TemporaryDirectory(prefix="roadgeo-", ignore_cleanup_errors=True)
-        self._service = Service(workers, references, options, Path(self._folder.name), told)
+        self._service = Service(workers, references, options, listener)
         config = uvicorn.Config(
             self._service.app,
-            http=protocol_of(options),
+            http="h11",
             ws="none",
             lifespan="off",
             log_config=None,
             server_header=False,
             headers=[("Server", f"roadgeo/{__version__}")],
             proxy_headers=False,
-            h11_max_incomplete_event_size=MAX_HEAD_BYTES,
+            limit_concurrency=options.connections,
+            timeout_keep_alive=_IDLE_S,
+            h11_max_incomplete_event_size=_HEAD_BYTES,
             timeout_graceful_shutdown=_FAREWELL_S,
         )
         self._uvicorn = _Uvicorn(config, workers)
@@ -85,7 +89,6 @@ class Server:
         self._socket.close()
         self._workers.close()
         self._service.close()
-        self._folder.cleanup()
 
 
 class _Uvicorn(uvicorn.Server):

@@ -11,7 +11,6 @@ import multiprocessing
 import queue
 import shutil
 import signal
-import tempfile
 import threading
 import time
 from collections.abc import Sequence
@@ -20,12 +19,15 @@ from dataclasses import dataclass
 from functools import partial
 from multiprocessing.connection import Connection
 from pathlib import Path
+from tempfile import TemporaryDirectory
 from typing import Any
+
+from starlette.exceptions import HTTPException
 
 from roadgeo._progress import Say, say_nothing
 from roadgeo.running.processes import end_with_parent, without_interrupts
 
-__all__ = ["Answer", "Asked", "Full", "Place", "Told", "Workers"]
+__all__ = ["Answer", "Asked", "Full", "Place", "Workers"]
 
 _LOG = logging.getLogger(__name__)
 
@@ -41,8 +43,11 @@ _GLANCE_S = 0.25
 _TRIES = 2
 
 
-class Full(Exception):  # noqa: N818 (a state of the server, not a fault)
+class Full(HTTPException):
     """As many requests as may be are working or waiting."""
+
+    def __init__(self) -> None:
+        super().__init__(503, "as many requests as may be are waiting; come again")
 
 
 @dataclass(frozen=True)
@@ -73,14 +78,6 @@ class Asked:
 
 
 @dataclass(frozen=True)
-class Told:
-    """Progress of a process with its request: see `Say`."""
-
-    text: str
-    share: float | None = None
-
-
-@dataclass(frozen=True)
 class Answer:
     """An HTTP status, and the document or, from 400 on, the sentence that describes the error.
 
@@ -100,42 +97,49 @@ class CalledOff(Exception):  # noqa: N818 (a wish, not a fault)
 
 
 class Place:
-    """The right of one request to wait for a process and to have it."""
+    """The right of one request to wait for a process and to have it: a context manager that gives it back."""
 
     def __init__(self, places: threading.Semaphore) -> None:
-        self._places: threading.Semaphore | None = places
+        self._places = places
 
-    def __enter__(self) -> Place:
-        return self
+    def __enter__(self) -> None:
+        pass
 
     def __exit__(self, *_: object) -> None:
-        self.give_back()
-
-    def give_back(self) -> None:
-        """Let another request have it."""
-        places, self._places = self._places, None
-        if places is not None:
-            places.release()
+        self._places.release()
 
 
 class Workers:
-    """Processes, each with its references open, and a network for photographs that is loaded."""
+    """Processes, each with its references open, and a network for photographs that is loaded.
+
+    Attributes
+    ----------
+    folder : Path
+        For images, until the processes are ended. If the server is killed they remove it.
+    """
 
     def __init__(self, references: Sequence[str], count: int, waiting: int, threads: int = 1) -> None:
         """Start them; `waiting` more requests than there are processes may wait, and the network has `threads`."""
         context = multiprocessing.get_context("spawn")
+        self._temporary = TemporaryDirectory(prefix="roadgeo-", ignore_cleanup_errors=True)
+        self.folder = Path(self._temporary.name)
+        given = (list(references), threads, self.folder)
         self._idle: queue.Queue[_Worker] = queue.Queue()
         self._places = threading.Semaphore(count + waiting)
         self._all: list[_Worker] = []
         self._lock = threading.Lock()
         self._closed = False
-        for worker in [_Worker(context, references, threads) for _ in range(count)]:
-            self._all.append(worker)
-            worker.wait_until_ready()
-            self._idle.put(worker)
+        try:
+            self._all += [_Worker(context, given) for _ in range(count)]
+            for worker in self._all:
+                worker.wait_until_ready()
+                self._idle.put(worker)
+        except BaseException:
+            self.close()
+            raise
 
     def take_place(self) -> Place:
-        """Take the place of one request, until it is given back.
+        """Take the place of one request, until its context ends.
 
         Raises
         ------
@@ -174,8 +178,8 @@ class Workers:
                     self._restart(worker, "nobody waits for its answer any more")
                 except TimeoutError as error:
                     self._restart(worker, f"it took {error}")
-                    told = f"it took {error} and was ended; reduce the image, or come again when less is asked"
-                    return Answer(503, {"detail": told})
+                    detail = f"it took {error} and was ended; reduce the image, or come again when less is asked"
+                    return Answer(503, {"detail": detail})
                 except (EOFError, OSError) as error:
                     self._restart(worker, f"it broke ({type(error).__name__})")
         except OSError as error:
@@ -198,13 +202,14 @@ class Workers:
             self._closed = True
             for worker in self._all:
                 worker.end()
+        self._temporary.cleanup()
 
 
 class _Worker:
     """One process, and the pipe to it."""
 
-    def __init__(self, context: Any, references: Sequence[str], threads: int) -> None:
-        self._context, self._given = context, (list(references), threads)
+    def __init__(self, context: Any, given: tuple[list[str], int, Path]) -> None:
+        self._context, self._given = context, given
         self.start()
 
     def start(self) -> None:
@@ -263,10 +268,10 @@ class _Worker:
             if called_off.is_set():
                 raise CalledOff
             if self._pipe.poll(min(_GLANCE_S, patience_s)):
-                heard = self._pipe.recv()
-                if isinstance(heard, Answer):
-                    return heard
-                say(heard.text, heard.share)
+                message = self._pipe.recv()  # an answer, or the progress
+                if isinstance(message, Answer):
+                    return message
+                say(*message)
         raise TimeoutError(f"longer than {patience_s:g} s")
 
     def _open(self) -> str:
@@ -290,11 +295,10 @@ class _Worker:
 # --- in the process ---------------------------------------------------------------------------------------------------
 
 
-def _serve(pipe: Connection, names: list[str], threads: int = 1) -> None:
+def _serve(pipe: Connection, names: list[str], threads: int, folder: Path) -> None:
     """Answer until the pipe is closed."""
     signal.signal(signal.SIGINT, signal.SIG_IGN)
-    folders: set[Path] = set()
-    end_with_parent(lambda: _remove_all(folders))
+    end_with_parent(partial(shutil.rmtree, folder, ignore_errors=True))
     import cv2
 
     from roadgeo.errors import ModelError, RoadgeoError
@@ -315,30 +319,14 @@ def _serve(pipe: Connection, names: list[str], threads: int = 1) -> None:
     try:
         while True:
             asked: Asked = pipe.recv()
-            folders.update(_folder_of(asked.path))
             say = partial(_tell, pipe) if asked.keeps else say_nothing
             pipe.send(_answer(asked, references, say, threads))
     except (EOFError, OSError):
         return
 
 
-def _folder_of(path: str) -> list[Path]:
-    """Return the temporary folder of the server in which a file lies, if it is one."""
-    return [
-        folder
-        for folder in Path(path).parents
-        if folder.parent == Path(tempfile.gettempdir()) and folder.name.startswith("roadgeo-")
-    ]
-
-
-def _remove_all(folders: set[Path]) -> None:
-    """Remove the images that a server which was killed has left."""
-    for folder in folders:
-        shutil.rmtree(folder, ignore_errors=True)
-
-
 def _tell(pipe: Connection, text: str, share: float | None = None) -> None:
-    pipe.send(Told(text, share))
+    pipe.send((text, share))
 
 
 def _answer(asked: Asked, references: Sequence[Any], say: Say = say_nothing, threads: int = 1) -> Answer:
@@ -378,8 +366,8 @@ def _locate(asked: Asked, references: Sequence[Any], say: Say, threads: int) -> 
 
     width, height = _size(asked.path)
     if width * height > asked.max_pixels:
-        told = f"{width} x {height} pixels, expected at most {asked.max_pixels:,} in all: reduce it"
-        return Answer(413, {"detail": told})
+        detail = f"{width} x {height} pixels, expected at most {asked.max_pixels:,} in all: reduce it"
+        return Answer(413, {"detail": detail})
     hints = {**asked.hints, "time_limit_s": asked.time_limit_s}
     if hints.get("focal_px") == "exif":
         hints["focal_px"] = focal_in_pixels(asked.path)
@@ -415,8 +403,8 @@ def _size(path: str) -> tuple[int, int]:
     """Return (width, height) of an image without unpacking it."""
     from roadgeo.storage.rasters import image_size, raster_size
 
-    told = image_size(Path(path))
-    return raster_size(path) if told is None else told[:2]
+    size = image_size(Path(path))
+    return raster_size(path) if size is None else size[:2]
 
 
 def _without(path: str, message: str) -> str:

@@ -35,8 +35,8 @@ PATIENCE_MS = 60_000
 class Direct:
     """Answers as processes do, in the thread that asks: a name that holds "hard" is located with a hint only."""
 
-    def __init__(self, references):
-        self.references, self.asked = references, []
+    def __init__(self, references, folder):
+        self.references, self.folder, self.asked = references, folder, []
         self.places, self.goes_on = threading.Semaphore(3), threading.Event()
         self.goes_on.set()
 
@@ -65,7 +65,7 @@ def served(town, tmp_path_factory):
     query = simulate_query(Landscape.from_network(network), SimulationOptions(VIEW, NOISE_MODELS["clean"]), 0)
     mask = tmp_path_factory.mktemp("page") / "mask.png"
     cv2.imwrite(str(mask), query.mask)
-    workers = Direct([Reference(index, network)])
+    workers = Direct([Reference(index, network)], tmp_path_factory.mktemp("images"))
     lonlat = to_lonlat(index.plane.crs, np.array([query.truth.center]))[0]
     with serving(workers) as server:
         yield server, workers, mask, lonlat

@@ -11,7 +11,6 @@ import socket
 import struct
 import subprocess
 import sys
-import tempfile
 import threading
 import time
 import urllib.error
@@ -38,7 +37,7 @@ from roadgeo.geometry.mask import RoadMask
 from roadgeo.location import Location
 from roadgeo.reference.reference import Reference, open_reference
 from roadgeo.running.looks import Sighting
-from roadgeo.serving.workers import Asked, Workers, _answer, _folder_of, _remove_all, _serve
+from roadgeo.serving.workers import Asked, Workers, _answer, _serve
 from roadgeo.sources.segmentation.probability import ProbabilityMap
 
 pytestmark = pytest.mark.slow
@@ -106,13 +105,13 @@ def answers(pipe, questions):
     return said
 
 
-def serve(references, questions, monkeypatch):
+def serve(references, questions, monkeypatch, tmp_path):
     """Do what a process does, in this one."""
     monkeypatch.setattr(signal, "signal", lambda *_: None)
     ours, its = multiprocessing.Pipe()
     with ThreadPoolExecutor(1) as pool:
         said = pool.submit(answers, ours, questions)
-        _serve(its, references)
+        _serve(its, references, 1, tmp_path)
         return said.result()
 
 
@@ -128,7 +127,7 @@ def test_what_a_process_answers(place, tmp_path, monkeypatch):
         Asked(str(tmp_path / "bomb.png"), {}, 10.0, 64_000_000),
         Asked(str(tmp_path / "cut.png"), {}, 10.0, 64_000_000),
     ]
-    ready, found, elsewhere, small, bomb, cut = serve([str(folder / "town.gpkg")], asked, monkeypatch)
+    ready, found, elsewhere, small, bomb, cut = serve([str(folder / "town.gpkg")], asked, monkeypatch, tmp_path)
     assert ready is True
     assert (found.status, found.document["status"], found.document["query"]) == (200, "located", "")
     assert (elsewhere.status, elsewhere.document["reason_code"]) == (200, "few_near")
@@ -146,13 +145,13 @@ def test_a_fault_is_answered_and_not_where_files_lie(place, tmp_path, monkeypatc
     monkeypatch.setattr("roadgeo.running.queries.locate_query", fail)
     folder, _ = place
     asked = [Asked(str(folder / "mask.png"), {}, 10.0, 64_000_000)]
-    _, answer = serve([str(folder / "town.gpkg")], asked, monkeypatch)
+    _, answer = serve([str(folder / "town.gpkg")], asked, monkeypatch, tmp_path)
     assert answer.status == 500
     assert answer.document == {"detail": "a fault of roadgeo: ZeroDivisionError: in the image"}
 
 
 def test_a_process_that_cannot_open_its_references_says_so(tmp_path, monkeypatch):
-    (said,) = serve([str(tmp_path / "nonesuch.gpkg")], [], monkeypatch)
+    (said,) = serve([str(tmp_path / "nonesuch.gpkg")], [], monkeypatch, tmp_path)
     assert "nonesuch.gpkg" in said
 
 
@@ -242,7 +241,7 @@ def test_photographs_are_refused_where_there_is_no_model_for_them(monkeypatch):
 
     monkeypatch.setattr("roadgeo.serving.workers._size", lambda _: (10, 10))
     monkeypatch.setattr("roadgeo.running.queries.locate_query", none)
-    answer = _answer(Asked("photo.jpg", {}, 1.0, 1000), [])
+    answer = _answer(Asked("/images/sent/photo.jpg", {}, 1.0, 1000), [])
     assert answer.status == 415
     assert "onnxruntime" in answer.document["detail"]
 
@@ -324,28 +323,20 @@ def test_the_command_serves_until_it_is_interrupted(place):
 
 
 @pytest.mark.skipif(os.name == "nt", reason="signals of POSIX")
-def test_images_of_a_server_that_was_killed_are_removed(tmp_path, monkeypatch):
-    monkeypatch.setattr(tempfile, "tempdir", str(tmp_path))
-    images = tmp_path / "roadgeo-x" / "job"
-    images.mkdir(parents=True)
-    (images / "image.png").touch()
-    folders = set(_folder_of(str(images / "image.png")))
-    assert folders == {tmp_path / "roadgeo-x"}
-    assert not _folder_of(str(tmp_path / "mine" / "image.png"))
-    _remove_all(folders)
-    assert not list(tmp_path.iterdir())
-
-
-@pytest.mark.skipif(os.name == "nt", reason="signals of POSIX")
-def test_processes_do_not_outlive_the_server(place):
+def test_neither_processes_nor_images_outlive_a_server_that_is_killed(place, tmp_path):
     program = "import sys; from roadgeo.cli import main; sys.exit(main())"
     command = [sys.executable, "-c", program, "serve", "-r", str(place[0] / "town.gpkg"), "--port", "0", "-j", "2"]
-    with subprocess.Popen(command, stderr=subprocess.PIPE, text=True, start_new_session=True) as process:
+    environment = {**os.environ, "TMPDIR": str(tmp_path)}
+    with subprocess.Popen(
+        command, stderr=subprocess.PIPE, text=True, start_new_session=True, env=environment
+    ) as process:
         try:
             assert any("Listening" in line for line in process.stderr)
+            assert list(tmp_path.glob("roadgeo-*"))
             process.kill()
             process.wait(10)
             assert is_gone(process.pid)
+            assert not list(tmp_path.glob("roadgeo-*"))
         finally:
             with contextlib.suppress(ProcessLookupError):
                 os.killpg(process.pid, signal.SIGKILL)

@@ -18,6 +18,7 @@ import click
 import numpy as np
 import pyproj
 import shapely
+from starlette.exceptions import HTTPException
 
 from roadgeo.cli.options import ASPECT, BOX, GSD, NEAR, RANGE, Read
 from roadgeo.cli.track import TIME
@@ -32,7 +33,7 @@ from roadgeo.reference.index_file import read_index
 from roadgeo.reference.network_file import read_network
 from roadgeo.reference.shards import describe_shards, open_shards
 from roadgeo.running.applying import apply_location, read_location
-from roadgeo.serving.requests import Refused, ending_of, read_execution, read_query_string
+from roadgeo.serving.requests import ending_of, read_query_string
 from roadgeo.sources.elevation import ground_heights
 from roadgeo.sources.exif import estimate_gsd, read_focal_length
 from roadgeo.sources.georeference import read_georeference, read_stated_middle
@@ -49,7 +50,7 @@ from support.untrusted_web import answered, serve_request
 
 CORPUS = Path(__file__).parents[1] / "corpus"
 #: What may be raised: our own errors, and how the command line and the server say that something makes no sense.
-REFUSALS = (RoadgeoError, click.UsageError, Refused)
+REFUSALS = (RoadgeoError, click.UsageError, HTTPException)
 
 
 def _as_it_is(content: bytes) -> bytes:
@@ -212,8 +213,8 @@ def read_hint(path: Path) -> None:
 def read_request(path: Path) -> None:
     """Read the parts of a request to the server, as far as they are one."""
     content = path.read_bytes()
-    for part in (read_execution, lambda body: read_query_string(body.decode("latin-1")), lambda body: ending_of(body)):
-        with contextlib.suppress(Refused):
+    for part in (lambda body: read_query_string(body.decode("latin-1")), ending_of):
+        with contextlib.suppress(HTTPException):
             part(content)
 
 

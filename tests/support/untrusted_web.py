@@ -14,11 +14,11 @@ from unittest import mock
 import requests
 import urllib3
 import uvicorn
+from uvicorn.protocols.http.h11_impl import H11Protocol
 from uvicorn.server import ServerState
 
 from roadgeo.serving.app import Service
 from roadgeo.serving.options import ServeOptions
-from roadgeo.serving.protocol import protocol_of
 from roadgeo.serving.workers import Answer, Place
 
 
@@ -59,7 +59,7 @@ class _Wire(asyncio.Transport):
         return False
 
 
-_LIMITS = ServeOptions(head_s=0.2, body_s=0.2)
+_LIMITS = ServeOptions(body_s=0.2)
 _WORKERS = SimpleNamespace(take_place=lambda: Place(Semaphore()), ask=lambda *_: Answer(200, {}))
 
 
@@ -71,9 +71,10 @@ def serve_request(content: bytes) -> bytes:
 async def _serve(content: bytes) -> bytes:
     wire = _Wire()
     with TemporaryDirectory() as folder:
-        service = Service(_WORKERS, [SimpleNamespace(name="town")], _LIMITS, Path(folder))  # type: ignore[arg-type, list-item]
+        workers = SimpleNamespace(folder=Path(folder), **vars(_WORKERS))
+        service = Service(workers, [SimpleNamespace(name="town")], _LIMITS)  # type: ignore[arg-type, list-item]
         config = uvicorn.Config(service.app, ws="none", lifespan="off", log_config=None)
-        connection = protocol_of(_LIMITS)(config, ServerState(), {})
+        connection = H11Protocol(config, ServerState(), {})
         connection.connection_made(wire)
         connection.data_received(content)
         if not wire.is_closing():
