@@ -145,7 +145,7 @@ class TripleEstimator:
     def _count(self, n_places: int) -> None:
         """Count further places as tried."""
         self.n_screened += n_places
-        self.ledger.n_tried += round(self.ledger.beside * n_places)
+        self.ledger.n_tried += n_places
 
     def _rounds_of_roads(self) -> Iterator[list[Hypothesis]]:
         """Yield places that grew by roads and are not known yet."""

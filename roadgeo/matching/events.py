@@ -59,4 +59,3 @@ class Ledger:
     n_reference: int = 0  # intersections of all parts: attempts are bounded as on one map of that size
     n_tried: int = 0
     n_by_triples: int = 0  # those that triples proposed
-    beside: float = 1.0  # tried on the whole map for each that is tried here (see `LocateOptions.elsewhere`)

@@ -178,9 +178,7 @@ def _search(
     sweeps: SharedSweeps = SharedSweeps(query.scene, options.match.camera, _same_place, ahead)
     begun = [_begin(query, one, options, Events(explained), ledger, sweeps) for one in indexes]
     estimators = {Search(estimator): estimator for _, estimator in begun if estimator is not None}
-    n_here = sum(found.n_searched for found, estimator in begun if estimator is not None)
-    ledger.n_reference = n_here + options.elsewhere
-    ledger.beside = ledger.n_reference / max(n_here, 1)
+    ledger.n_reference = sum(found.n_searched for found, estimator in begun if estimator is not None)
     left = time_limit_s - (time.perf_counter() - started)
 
     def same(one: Search[Hypothesis], a: Hypothesis, other: Search[Hypothesis], b: Hypothesis) -> bool:

@@ -34,8 +34,6 @@ class LocateOptions:
         city.
     threads : int
         Of the search for one mask. The answer does not depend on it.
-    elsewhere : int
-        Intersections of the map that other processes search. A place is charged as if they were searched here, too.
     """
 
     method: Literal["auto", "pair"] = "auto"
@@ -45,7 +43,6 @@ class LocateOptions:
     min_margin: float = 2.0
     truths: tuple[tuple[str, float, float], ...] = ()
     threads: int = 1
-    elsewhere: int = 0
     match: MatchOptions = field(default_factory=MatchOptions)
     search: SearchOptions = field(default_factory=SearchOptions)
     pair: PairOptions = field(default_factory=PairOptions)

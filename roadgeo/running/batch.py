@@ -215,7 +215,7 @@ class Locating:
         usual = BatchOptions()
         reading = replace(self.reading, images={}, threads=ReadOptions.threads)
         told = {
-            **changed_options(replace(self.options.search, truths=(), threads=1, elsewhere=0), usual.search),
+            **changed_options(replace(self.options.search, truths=(), threads=1), usual.search),
             **changed_options(reading, usual.reading),
             **changed_options(self.outputs.image, usual.outputs.image),
         }

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import contextlib
+import functools
 import multiprocessing
 import multiprocessing.connection
 import os
@@ -19,7 +20,7 @@ from typing import Any, Protocol, TypeVar
 
 from roadgeo.errors import RoadgeoError
 
-__all__ = ["Work", "end_with_parent", "run", "without_interrupts"]
+__all__ = ["Work", "end_with_parent", "outlive", "run", "without_interrupts"]
 
 Task = TypeVar("Task")
 TaskIn = TypeVar("TaskIn", contravariant=True)
@@ -54,20 +55,42 @@ def run(tasks: Sequence[Task], work: Work[Task, Result], jobs: int) -> Iterator[
         yield from map(do, tasks)
         return
     _require_guard()
+    together = functools.partial(_run_together, work=work, jobs=jobs)
+    yield from outlive(tasks, work, together, BrokenProcessPool, "the process that worked on it died (out of memory?)")
+
+
+def outlive(
+    tasks: Sequence[Task],
+    work: Work[Task, Result],
+    together: Callable[[Sequence[Task]], Iterator[Result]],
+    died: type[Exception],
+    reason: str,
+) -> Iterator[Result]:
+    """Yield the results of all tasks in order, though processes die of some: these are given up.
+
+    Parameters
+    ----------
+    together : callable
+        Does tasks in other processes, and yields their results in order.
+    died : type
+        Raised by `together` where processes died. Any task then running may be to blame, so the first that has no
+        result runs again, alone.
+    reason : str
+        Why a task is given up.
+    """
     rest = list(tasks)
     while rest:
         done = 0
         try:
-            for result in _run_together(rest, work, jobs):
+            for result in together(rest):
                 yield result
                 done += 1
-        except BrokenProcessPool:
-            # Any of those then running may be to blame, so the first that has no result runs again, alone.
+        except died:
             suspect = rest[done]
             try:
-                yield from _run_together([suspect], work, 1)
-            except BrokenProcessPool:
-                yield work.give_up(suspect, "the process that worked on it died (out of memory?)")
+                yield from together([suspect])
+            except died:
+                yield work.give_up(suspect, reason)
             done += 1
         rest = rest[done:]
 

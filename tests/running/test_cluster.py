@@ -22,7 +22,7 @@ from roadgeo.errors import RoadgeoError
 from roadgeo.reference.shards import open_shards
 
 pytest.importorskip("distributed")
-from roadgeo.running.cluster import Cluster, Stream
+from roadgeo.running.cluster import Cluster
 
 pytestmark = pytest.mark.slow
 
@@ -35,7 +35,7 @@ def scheduler(tmp_path_factory):
     folder = tmp_path_factory.mktemp("dask")
     environment = {
         **os.environ,
-        "PYTHONPATH": str(TESTS),
+        "PYTHONPATH": os.pathsep.join([str(TESTS), os.environ.get("PYTHONPATH", "")]),
         "DASK_DISTRIBUTED__SCHEDULER__ALLOWED_FAILURES": "1",
         "DASK_DISTRIBUTED__ADMIN__LOW_LEVEL_LOG_LENGTH": "0",
     }
@@ -94,7 +94,7 @@ def test_results_come_in_order_and_each_task_is_done_once(scheduler, tmp_path):
 
 
 def test_no_more_is_under_way_than_keeps_the_workers_busy(scheduler, tmp_path):
-    results = Cluster(scheduler, together=1).run(range(200), Squares(str(tmp_path)))
+    results = Cluster(scheduler).run(range(200), Squares(str(tmp_path)))
     assert next(results) == 0
     time.sleep(0.5)
     assert len(counts(tmp_path)) <= 10
@@ -103,53 +103,10 @@ def test_no_more_is_under_way_than_keeps_the_workers_busy(scheduler, tmp_path):
 
 def test_killed_workers_lose_nothing_and_what_kills_them_all_is_given_up(scheduler, tmp_path):
     work = Squares(str(tmp_path), once=(3,), always=17)
-    found = list(Cluster(scheduler, together=5).run(range(20), work))
+    found = list(Cluster(scheduler).run(range(20), work))
     assert [one for n, one in enumerate(found) if n != 17] == [n * n for n in range(20) if n != 17]
     assert found[17].startswith("17: the workers that it was given to died")
     assert len(found) == 20
-
-
-class Blaming:
-    """A client whose scheduler blames all that was under way for the death of a worker, as Dask's may."""
-
-    def __init__(self, *killers):
-        self.killers, self.under_way = killers, []
-
-    def nthreads(self):
-        return {"tcp://one": 1, "tcp://other": 1}
-
-    def submit(self, do, made, tasks, **_):
-        future = Blamed(self, tasks)
-        self.under_way.append(future)
-        return future
-
-    def cancel(self, futures):
-        assert not futures
-
-
-class Blamed:
-    def __init__(self, client, tasks):
-        self.client, self.tasks = client, tasks
-        self.blamed = False
-
-    def result(self):
-        from distributed.scheduler import KilledWorker
-
-        if any(n in self.client.killers for one in self.client.under_way for n in one.tasks):
-            for one in self.client.under_way:
-                one.blamed = True
-        self.client.under_way.remove(self)
-        if self.blamed:
-            raise KilledWorker("task", None, 1)
-        return [n * n for n in self.tasks]
-
-
-@pytest.mark.parametrize("together", [1, 5])
-def test_nobody_is_given_up_for_what_was_beside_it(together):
-    stream = Stream(Blaming(6, 17), Squares(""), together)
-    found = list(stream.results(range(40)))
-    assert [one for n, one in enumerate(found) if n not in (6, 17)] == [n * n for n in range(40) if n not in (6, 17)]
-    assert (found[6], found[17]) == (f"6: {stream.died}", f"17: {stream.died}")
 
 
 def test_shards_and_masks_come_out_as_from_one_process(scheduler, tmp_path, monkeypatch, capsys):

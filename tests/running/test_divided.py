@@ -2,7 +2,6 @@
 
 import json
 import shutil
-from dataclasses import replace
 from pathlib import Path
 
 import cv2
@@ -13,11 +12,9 @@ from worlds.fenway import write_vector
 from worlds.scenes import PLANE, random_lines
 
 from roadgeo.cli import main
-from roadgeo.location import Location
 
 pytest.importorskip("distributed")
-from roadgeo.running import divided
-from roadgeo.running.divided import Ballot, Vote, count, owners
+from roadgeo.running.divided import owners
 
 PARTS = [f"0/{n}" for n in range(300)]
 
@@ -31,37 +28,6 @@ def test_each_part_has_one_owner_and_a_worker_that_goes_leaves_the_others_alone(
     for worker in workers[1:]:
         assert set(before[worker]) <= set(after[worker])
     assert owners(["0/"], workers[:1]) == {workers[0]: ["0/"]}
-
-
-LOCATED = Location("q", "located", "found", log10_odds=9.0)
-REFUSED = Location("q", "not_located", "nothing", log10_odds=2.0)
-
-
-@pytest.mark.parametrize(
-    ("votes", "ballot"),
-    [
-        ([Vote(), Vote(((9.0, "b1"),), LOCATED), Vote((), REFUSED)], Ballot(("b1",), located=True)),
-        (
-            [Vote(((4.0, "a2"), (2.5, "a1")), LOCATED), Vote(((9.0, "b1"), (3.0, "b1")), LOCATED)],
-            Ballot(("b1", "a2", "a1"), located=True),
-        ),
-        # A weak place elsewhere is a rival of one that is located, but no place by itself.
-        ([Vote(((2.0, "a1"),), REFUSED), Vote(((3.6, "b1"),), LOCATED)], Ballot(("b1", "a1"), located=True)),
-        ([Vote(((2.0, "a1"),), REFUSED), Vote((), None)], Ballot(("a",), refusal=REFUSED)),
-        ([Vote((), replace(REFUSED, log10_odds=None)), Vote((), REFUSED)], Ballot(("b",), refusal=REFUSED)),
-        ([Vote((), None), Vote((), replace(REFUSED, log10_odds=None))],
-         Ballot(("b",), refusal=replace(REFUSED, log10_odds=None))),
-        (
-            [Vote(((9.0, "a1"), (8.5, "a2")), replace(LOCATED, status="ambiguous")), Vote((), REFUSED)],
-            Ballot(("a1", "a2")),
-        ),
-        ([Vote(), Vote()], Ballot(("a",))),
-        ([Vote(((9.0, "a1"),), LOCATED), Vote(missing="b is damaged")], Ballot(("a",), missing="b is damaged")),
-        ([Vote((), REFUSED), Vote((), replace(LOCATED, status="ambiguous", log10_odds=0.5))], Ballot(("b", "b2"))),
-    ],
-)  # fmt: skip
-def test_votes_are_counted(votes, ballot):
-    assert count(votes, [["a", "a2"], ["b", "b2"], ["c"]][: len(votes)]) == ballot
 
 
 @pytest.fixture(scope="module")
@@ -153,59 +119,3 @@ def test_of_a_map_that_lacks_a_part_nothing_is_said(town, tmp_path, monkeypatch,
 def test_it_needs_a_cluster_and_the_usual_search(more, capsys):
     assert main(["locate", __file__, "--divide-map", *more]) == 2
     assert "--divide-map goes with --engine dask" in capsys.readouterr().err
-
-
-class Work:
-    """Stands for what is done with masks on a map of a few parts."""
-
-    sizes = dict.fromkeys(PARTS[:4], 100)
-
-    def give_up(self, task, reason):
-        return f"{task}: {reason}"
-
-
-class Future:
-    def __init__(self, found=None):
-        self.found = found
-
-    def result(self, timeout):
-        if self.found is None:
-            raise TimeoutError
-        return self.found
-
-
-class Client:
-    """A cluster of three workers, which die and come back under other names once a group was sent, `deaths` times."""
-
-    def __init__(self, deaths):
-        self.deaths, self.groups = deaths, 0
-
-    def nthreads(self):
-        return {f"tcp://{self.groups}-{k}": 1 for k in range(3)}
-
-    def submit(self, do, *given, workers=(), **_):
-        if do is divided._decided:
-            self.groups += 1
-        if do is not divided._finish_all:
-            return Future({})
-        return Future() if self.groups <= self.deaths else Future({0: "found"})
-
-    def cancel(self, futures):
-        assert all(future.found is None for future in futures)
-
-
-@pytest.mark.parametrize(("deaths", "found"), [(0, ["found"]), (2, ["found"]), (9, None)])
-def test_what_a_dead_worker_was_to_do_is_sent_once_more(deaths, found, monkeypatch):
-    monkeypatch.setattr(divided, "_LOOK_AGAIN_S", 0.01)
-    client = Client(deaths)
-    stream = divided._DividedStream(client, Work(), 1)
-    assert stream._wait_for(stream._send(["q"])) == found
-    assert client.groups == min(deaths, divided.RETRIES) + 1
-
-
-def test_masks_beside_one_that_kills_all_workers_are_located(monkeypatch):
-    """After the group died they are done one by one; the first dies again."""
-    monkeypatch.setattr(divided, "_LOOK_AGAIN_S", 0.01)
-    client = Client(divided.RETRIES + 1)
-    stream = divided._DividedStream(client, Work(), 2)
-    assert list(stream._one_by_one(["p", "q"])) == [f"p: {stream.died}", "found"]
