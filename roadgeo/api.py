@@ -513,10 +513,11 @@ def vectorize(image: Any, *, gsd: float | tuple[float, float] | str | None = Non
     """
     from roadgeo.geometry.mask import plane_to_pixel
     from roadgeo.matching.scene import trace_query
+    from roadgeo.running.options import ReadOptions
     from roadgeo.running.pictures import read_picture
-    from roadgeo.running.queries import QueryOptions, look_once
+    from roadgeo.running.queries import look_once
 
-    seen = look_once(read_picture(image), _hint("gsd", gsd), QueryOptions())
+    seen = look_once(read_picture(image), _hint("gsd", gsd), ReadOptions())
     _, graph = trace_query(seen.mask)
     return graph.to_networkx(
         lambda xy: seen.coarser * plane_to_pixel(xy),

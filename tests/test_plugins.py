@@ -118,10 +118,10 @@ def test_what_a_plugin_refuses_is_said_as_it_says_it(offer) -> None:
 
 @pytest.mark.parametrize("kind", ["mask", "array"])
 def test_a_segmenter_may_return_a_mask_or_an_array(offer, kind: str) -> None:
-    from roadgeo.running.queries import _call_segmenter
+    from roadgeo.running.photographs import call_segmenter
 
     offer(segmenters_mask=f"{__name__}:see_mask", segmenters_array=f"{__name__}:see_array")
-    mask = _call_segmenter(kind, str(SHEET), None)
+    mask = call_segmenter(kind, str(SHEET), None)
     assert mask.name == str(SHEET)
     assert np.array_equal(mask.roads, read_mask(SHEET).roads)
 

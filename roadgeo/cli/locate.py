@@ -203,7 +203,16 @@ def locate_command(
     options = replace(options, threads=jobs if len(tasks) == 1 and cluster is None else 1)
     make_folder(out_dir)
     photos = pair_images([task.mask for task in tasks], given["images"])
-    reading = read_options(given, photos, others, jobs)
+    asked = BatchOptions(
+        options,
+        outputs,
+        read_options(given, others, jobs),
+        images=photos,
+        exif=given["focal_px"] == "exif",
+        dem=given["dem"],
+        skip_existing=skip_existing,
+        command=tuple(said_options(_OF_NO_ACCOUNT)),
+    )
     # Opened here too: their errors are printed once, and the search is compiled before processes start.
     opened = open_references(references, print_steps(quiet))
     refuse_swapped(given["near"], opened)
@@ -215,7 +224,7 @@ def locate_command(
             tasks,
             references,
             out_dir,
-            BatchOptions(options, outputs, reading, skip_existing, tuple(said_options(_OF_NO_ACCOUNT))),
+            asked,
             jobs=jobs,
             cluster=cluster,
             say=say,

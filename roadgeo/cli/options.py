@@ -446,21 +446,15 @@ def n_threads(jobs: int = 1) -> int:
     return 1 if jobs > 1 else min(os.cpu_count() or 1, _MAX_THREADS)
 
 
-def read_options(given: Mapping[str, Any], photos: Mapping[str, str], others: Sequence[str], jobs: int) -> ReadOptions:
+def read_options(given: Mapping[str, Any], others: Sequence[str] = (), jobs: int = 1) -> ReadOptions:
     """Put together how what is given is read; `others` are fused with each query."""
+    from dataclasses import fields
+
     from roadgeo.running.options import ReadOptions
 
-    same = ("threshold", "band", "segment", "segmenters", "class_name", "bands", "layer", "aspect")
-    return ReadOptions(
-        images=photos,
-        exif=given.get("focal_px") == "exif",
-        fused_with=tuple(others),
-        threads=n_threads(jobs),
-        dem=given.get("dem") or "",
-        allow_mirror=bool(given.get("allow_mirror")),
-        units=given.get("units") or "auto",
-        **{name: given.get(name) for name in same},  # type: ignore[arg-type]
-    )
+    known = {field.name: given[field.name] for field in fields(ReadOptions) if given.get(field.name) is not None}
+    mirror = "allow" if given.get("allow_mirror") else "tell"
+    return ReadOptions(**{**known, "fused_with": tuple(others), "threads": n_threads(jobs), "mirror": mirror})
 
 
 def make_cluster(engine: str | None, scheduler: str | None, jobs: int) -> Cluster | None:

@@ -24,6 +24,7 @@ from roadgeo.cli.options import (
     hinted,
     make_options,
     out_dir_option,
+    read_options,
     refuse_swapped,
     row,
     take,
@@ -231,18 +232,15 @@ def _frame_options(given: dict[str, Any]) -> FrameOptions:
     from roadgeo.flights.frames import FrameOptions
     from roadgeo.flights.motion import read_motion
 
-    motion = None if given["motion"] is None else read_motion(given["motion"])
+    segmenters = (given["segmenters"],) if given["segmenters"] else ()
     return FrameOptions(
-        given["threshold"],
-        given["band"],
-        given["segment"],
-        given["segmenters"],
-        given["class_name"],
-        given["gsd_m"],
-        motion,
-        given["motion_sigma"],
-        given["every"],
-        given["interval"],
+        reading=read_options({**given, "segmenters": segmenters}),
+        gsd_m=given["gsd_m"],
+        motion=None if given["motion"] is None else read_motion(given["motion"]),
+        motion_px=given["motion_sigma"],
+        every_s=given["every"],
+        interval_s=given["interval"],
+        recursive=given["recursive"],
     )
 
 

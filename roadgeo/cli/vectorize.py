@@ -9,14 +9,14 @@ import click
 from roadgeo._text import counted, visible
 from roadgeo.cli import ERROR
 from roadgeo.cli.folders import make_folder
-from roadgeo.cli.options import Command, n_threads, out_dir_option, take
+from roadgeo.cli.options import Command, out_dir_option, read_options, take
 from roadgeo.cli.printing import echo
 from roadgeo.cli.progress import show_steps
 from roadgeo.running.tasks import Task, find_masks, name_tasks
 
 if TYPE_CHECKING:
     from roadgeo._progress import Say
-    from roadgeo.running.queries import QueryOptions
+    from roadgeo.running.options import ReadOptions
 
 __all__ = ["vectorize_command"]
 
@@ -42,16 +42,15 @@ def vectorize_command(
     """
     from roadgeo.cli.compilation import compile_once
     from roadgeo.errors import RoadgeoError
-    from roadgeo.running.queries import QueryOptions
 
     make_folder(out_dir)
     compile_once(quiet=False)
-    query = QueryOptions(**given, threads=n_threads())
+    reading = read_options(given)
     status = 0
     with show_steps(quiet=False) as say:
         for task in name_tasks(find_masks(images, recursive)):
             try:
-                seen = _show(task, out_dir, gsd_m, query, say)
+                seen = _show(task, out_dir, gsd_m, reading, say)
             except RoadgeoError as error:
                 echo(f"Error: {error}", err=True)
                 status = ERROR
@@ -65,7 +64,7 @@ def vectorize_command(
     return status
 
 
-def _show(task: Task, out_dir: str, gsd_m: tuple[float, float] | None, query: QueryOptions, say: Say) -> str:
+def _show(task: Task, out_dir: str, gsd_m: tuple[float, float] | None, reading: ReadOptions, say: Say) -> str:
     """Write the roads seen in an image; return them in words."""
     from roadgeo.errors import MaskError
     from roadgeo.matching.scene import trace_query
@@ -74,7 +73,7 @@ def _show(task: Task, out_dir: str, gsd_m: tuple[float, float] | None, query: Qu
     from roadgeo.running.probability_files import keep_probability
     from roadgeo.running.queries import look_once
 
-    look = look_once(task.mask, gsd_m, query, say)
+    look = look_once(task.mask, gsd_m, reading, say)
     kept = keep_probability(look.probability, output_paths(out_dir, task.stem))
     if kept and not look.mask.roads.any():
         raise MaskError(f"{task.mask}: no road is seen in it that is probable enough; wrote {kept[0]}, to look at")

@@ -134,8 +134,7 @@ def _settings(given: dict[str, Any], others: list[str], jobs: int) -> VerifyRun:
     usual = CheckOptions()
     search = replace(usual.search, reach_m=given["reach"], turn_deg=given["max_turn"])
     options = replace(usual, tolerance_m=given["tolerance"], search=search)
-    reading = read_options({**given, "focal_px": None}, {}, others, jobs)
-    return VerifyRun(given["references"], options, reading.of_query(), given["crs"])
+    return VerifyRun(given["references"], options, read_options(given, others, jobs), given["crs"])
 
 
 def _write_page(one: Verified, image: str, stem: Path, opened: Sequence[AnyReference], settings: VerifyRun) -> Path:

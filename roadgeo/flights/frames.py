@@ -9,9 +9,8 @@ import tempfile
 from collections.abc import Iterator, Mapping, Sequence
 from contextlib import ExitStack, suppress
 from dataclasses import dataclass, field, replace
-from functools import lru_cache
 from pathlib import Path
-from typing import Literal, NamedTuple
+from typing import NamedTuple
 
 import cv2
 import numpy as np
@@ -21,6 +20,8 @@ from roadgeo.errors import MaskError, PhotographError
 from roadgeo.flights.motion import Odometer, between_images
 from roadgeo.flights.tracker import FlightFrame
 from roadgeo.geometry.mask import RoadMask
+from roadgeo.running.options import ReadOptions
+from roadgeo.running.photographs import load_model
 from roadgeo.running.tasks import find_masks
 from roadgeo.sources.masks import read_mask
 from roadgeo.storage.atomic import writing
@@ -37,10 +38,8 @@ class FrameOptions:
 
     Attributes
     ----------
-    threshold, band, segment, bands
-        As for `running.queries.QueryOptions`.
-    model : str
-        File of the network that finds roads in photographs; "": the one that ships.
+    reading : ReadOptions
+        How each is read; roads of photographs are found by one network.
     gsd_m : (low, high) or None
         Metres per pixel, where that is known: photographs are shown to the network at its own.
     motion : mapping of frame name to (3, 3), or None
@@ -55,18 +54,12 @@ class FrameOptions:
         Whether folders stand for the images in all folders within them, too.
     """
 
-    threshold: float | None = None
-    band: int | None = None
-    segment: Literal["auto", "always", "never"] = "auto"
-    model: str = ""
-    class_name: str | None = None
+    reading: ReadOptions = field(default_factory=ReadOptions)
     gsd_m: tuple[float, float] | None = None
     motion: Mapping[str, FloatArray] | None = None
     motion_px: float | None = None
     every_s: float = 1.0
     interval_s: float = 1.0
-    threads: int = 1
-    bands: tuple[int, int, int] | None = None
     recursive: bool = False
 
 
@@ -174,14 +167,15 @@ def _video(path: str, options: FrameOptions, stack: ExitStack) -> Iterator[_Imag
 
 def _read(image: _Image, options: FrameOptions, last: _Last) -> tuple[RoadMask, AnyArray | None]:
     """Read a frame as a mask, and as a grey picture where it is a photograph."""
+    reading = options.reading
     # A white or a black frame among photographs is no mask.
-    of_photographs = options.segment == "always" or (options.segment == "auto" and last.has_photographs)
+    of_photographs = reading.segment == "always" or (reading.segment == "auto" and last.has_photographs)
     try:
         if not of_photographs:
             try:
-                return read_mask(image.path, band=options.band, threshold=options.threshold, name=image.name), None
+                return read_mask(image.path, band=reading.band, threshold=reading.threshold, name=image.name), None
             except PhotographError:
-                if options.segment == "never":
+                if reading.segment == "never":
                     raise
         last.has_photographs = True
         return _segment(image, options, last)
@@ -213,8 +207,9 @@ def _segment(image: _Image, options: FrameOptions, last: _Last) -> tuple[RoadMas
     from roadgeo.sources.segmentation.scales import rank_scales, scale_of
     from roadgeo.sources.segmentation.tiling import segment
 
-    network = _network(options.model, options.class_name, options.threads)
-    with open_photograph(image.path, options.bands) as photograph:
+    reading = options.reading
+    network = load_model(*reading.segmenters[:1], class_name=reading.class_name, threads=reading.threads)
+    with open_photograph(image.path, reading.bands) as photograph:
         if "scale" not in last.scale:
             known = options.gsd_m
             scale = (
@@ -227,17 +222,10 @@ def _segment(image: _Image, options: FrameOptions, last: _Last) -> tuple[RoadMas
         seen = segment(photograph, network, last.scale["scale"]).resized(shape)
         rgb, _ = photograph.read(0.0, 0.0, float(photograph.width), float(photograph.height), shape)
     try:
-        mask = seen.mask(seen.threshold if options.threshold is None else options.threshold)
+        mask = seen.mask(seen.threshold if reading.threshold is None else reading.threshold)
     except MaskError:
         mask = RoadMask(np.zeros(shape, np.bool_))
     return replace(mask, name=image.name), np.asarray(cv2.cvtColor(rgb, cv2.COLOR_RGB2GRAY))
-
-
-@lru_cache(maxsize=1)
-def _network(path: str, class_name: str | None, threads: int):  # type: ignore[no-untyped-def]
-    from roadgeo.sources.segmentation.network import DEFAULT_MODEL, load_network
-
-    return load_network(Path(path) if path else DEFAULT_MODEL, class_name=class_name, threads=threads)
 
 
 def _motion(

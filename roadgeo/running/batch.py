@@ -163,11 +163,6 @@ class Locating:
     say: Say
 
     @property
-    def reading(self) -> ReadOptions:
-        """How masks are read."""
-        return self.options.reading
-
-    @property
     def outputs(self) -> OutputOptions:
         """The files to write."""
         return self.options.outputs
@@ -205,18 +200,19 @@ class Locating:
         """Return the command line that makes one result again."""
         if not self.options.command:
             return ""
-        photo = self.reading.images.get(task.mask)
+        photo = self.options.images.get(task.mask)
         drawn = [f"--image={photo}"] if photo else []
-        fused = self.reading.fused_with
+        fused = self.options.reading.fused_with
         return shlex.join(["roadgeo", "locate", task.query, *fused, *drawn, *self.options.command])
 
     def _told(self) -> dict[str, Any]:
         """Return the options that differ from the defaults, as plain values for the JSON."""
         usual = BatchOptions()
-        reading = replace(self.reading, images={}, threads=ReadOptions.threads)
+        reading = replace(self.options.reading, threads=ReadOptions.threads)
         told = {
             **changed_options(replace(self.options.search, truths=(), threads=1), usual.search),
             **changed_options(reading, usual.reading),
+            **{name: value for name in ("exif", "dem") if (value := getattr(self.options, name))},
             **changed_options(self.outputs.image, usual.outputs.image),
         }
         plain: dict[str, Any] = json.loads(json.dumps(told))
@@ -263,7 +259,7 @@ class Locating:
             return None
         if not isinstance(document, dict) or (document.get("schema"), document.get("query")) != (SCHEMA, task.query):
             return None
-        status, photo = document.get("status"), self.reading.photo(task, is_ours(probability_path(paths)))
+        status, photo = document.get("status"), self.options.photo(task, is_ours(probability_path(paths)))
         if status not in {"located", "ambiguous", "not_located"} or not asked.same(document):
             return None
         wanted = wanted_outputs(self.outputs.products, status == "located", bool(photo), bool(document.get("camera")))
@@ -281,7 +277,7 @@ class Locating:
         started = perf_counter()
         how = how or (explain if EXPLANATION.name in self.outputs.products else locate)
         options = self.search_options(task)
-        sighting = locate_query(task.mask, asked.references, options, self.reading.of_query(), how=how, say=self.say)
+        sighting = locate_query(task.mask, asked.references, options, self.options.reading, how=how, say=self.say)
         location, mask, explanation = sighting.location, sighting.mask, sighting.explanation
         # the clock of the search knows its own steps only: the rest was reading
         spent = location.seconds
@@ -289,14 +285,14 @@ class Locating:
         location = replace(
             location,
             query=task.query,
-            camera=_on_ground(location, self.reading.dem),
+            camera=_on_ground(location, self.options.dem),
             seconds=replace(spent, open=asked.seconds, read=max(reading_s, 0.0)),
             options=asked.options,
             command=self._command(task),
             stated_offset_m=_off_stated(task.mask, location),
             reference_digest=asked.digest(location.reference),
         )
-        paths, photo = output_paths(self.out_dir, task.stem), self.reading.photo(task, sighting.of_photograph)
+        paths, photo = output_paths(self.out_dir, task.stem), self.options.photo(task, sighting.of_photograph)
         explanation = explanation and replace(explanation, location=location)
         kept = keep_probability(sighting.probability, paths)
         indexes = [one.index_of(location) for one in asked.references]
@@ -313,12 +309,12 @@ class Locating:
 
     def search_options(self, task: Task) -> LocateOptions:
         """Return the options, with the focal length that the photograph's EXIF states where that was asked for."""
-        if not self.reading.exif:
+        if not self.options.exif:
             return self.options.search
         from roadgeo.matching.hints import apply_hints
         from roadgeo.sources.exif import focal_in_pixels
 
-        focal_px = focal_in_pixels(task.mask, self.reading.images.get(task.mask))
+        focal_px = focal_in_pixels(task.mask, self.options.images.get(task.mask))
         return apply_hints(self.options.search, {"focal_px": focal_px})
 
 

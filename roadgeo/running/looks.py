@@ -9,19 +9,19 @@ from __future__ import annotations
 import math
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
-from typing import TypeVar, overload
+from typing import TypeVar
 
 import numpy as np
 
 from roadgeo.errors import MaskError
 from roadgeo.geometry.mask import RoadMask
-from roadgeo.location import Location, Place, Reason
+from roadgeo.location import Location, Place, Reason, Seconds
 from roadgeo.matching.explanation import Explanation
 from roadgeo.matching.options import LocateOptions
 from roadgeo.reference.reference import AnyReference
 from roadgeo.sources.segmentation.probability import ProbabilityMap
 
-__all__ = ["Later", "Locate", "Look", "Sighting", "locate_looks"]
+__all__ = ["Locate", "Seen", "Sighting", "locate_looks", "total_seconds"]
 
 #: Share of the work left that a look may take; the last one may take all.
 _SHARE = 0.6
@@ -32,43 +32,21 @@ Locate = Callable[[RoadMask, Sequence[AnyReference], LocateOptions], "Location |
 T = TypeVar("T")
 
 
-class Later(Sequence[T]):
-    """A sequence of known length whose elements are made when they are asked for: most looks are never taken."""
-
-    def __init__(self, makers: Sequence[Callable[[], T]]) -> None:
-        self._makers = makers
-
-    def __len__(self) -> int:
-        return len(self._makers)
-
-    @overload
-    def __getitem__(self, index: int) -> T: ...
-
-    @overload
-    def __getitem__(self, index: slice) -> Later[T]: ...
-
-    def __getitem__(self, index: int | slice) -> T | Later[T]:
-        """Make an element, or leave the others out."""
-        return Later(self._makers[index]) if isinstance(index, slice) else self._makers[index]()
-
-
 @dataclass(frozen=True)
-class Look:
-    """A mask to locate, made when it is needed.
+class Seen:
+    """The roads that one look shows.
 
     Attributes
     ----------
     what : str
-        Its name among the others, for people: "threshold 63".
-    make : callable
-        Returns the mask; may raise MaskError.
-    probability : callable, optional
-        Returns what a segmenter saw, where the mask is made of that.
+        The look's name among the others, for people: "threshold 63".
+    probability : ProbabilityMap, optional
+        What a segmenter saw, where the mask is made of that.
     """
 
     what: str
-    make: Callable[[], RoadMask]
-    probability: Callable[[], ProbabilityMap] | None = None
+    mask: RoadMask
+    probability: ProbabilityMap | None = None
 
 
 @dataclass(frozen=True)
@@ -83,9 +61,20 @@ class Sighting:
 
 
 def locate_looks(
-    looks: Sequence[Look], references: Sequence[AnyReference], options: LocateOptions, how: Locate
+    looks: Sequence[T],
+    look: Callable[[T], Seen],
+    references: Sequence[AnyReference],
+    options: LocateOptions,
+    how: Locate,
 ) -> Sighting:
-    """Take one look after another until one is located, within the limits of one search.
+    """Take one look after another until a mask is located, within the limits of one search.
+
+    Parameters
+    ----------
+    looks : sequence
+        What distinguishes them, such as thresholds, the most promising first.
+    look : callable
+        Takes one of them; may raise MaskError.
 
     Raises
     ------
@@ -95,19 +84,22 @@ def locate_looks(
     sightings: list[Sighting] = []
     failure: MaskError | None = None
     work_left, time_left = options.search.work_limit_s, options.search.time_limit_s
-    for tried, look in enumerate(looks, 1):
+    for tried, which in enumerate(looks, 1):
         if tried > 1 and (work_left <= 0.05 * options.search.work_limit_s or time_left <= 0.0):
             break
         share = 1.0 if tried == len(looks) else _SHARE
         try:
-            sighting = _take(look, references, _limited(options, share * work_left, time_left), how)
+            seen = look(which)
+            found = how(seen.mask, references, _limited(options, share * work_left, time_left))
         except MaskError as error:
             failure = failure or error
             continue
-        seconds = sighting.location.seconds
-        work_left -= sighting.location.stats.work_ms / 1000
+        explanation, location = (found, found.location) if isinstance(found, Explanation) else (None, found)
+        seconds = location.seconds
+        work_left -= location.stats.work_ms / 1000
         time_left -= seconds.vectorize + seconds.match + seconds.refine
-        sightings.append(_discount(sighting, look, tried, options))
+        location = _discount(location, seen.what, tried, options)
+        sightings.append(Sighting(location, seen.mask, explanation, seen.probability))
         if sightings[-1].location.located:
             break
     if not sightings:
@@ -120,32 +112,20 @@ def _limited(options: LocateOptions, work_limit_s: float, time_limit_s: float) -
     return replace(options, search=limits)
 
 
-def _take(look: Look, references: Sequence[AnyReference], options: LocateOptions, how: Locate) -> Sighting:
-    mask = look.make()
-    found = how(mask, references, options)
-    probability = look.probability() if look.probability else None
-    if isinstance(found, Explanation):
-        return Sighting(found.location, mask, found, probability)
-    return Sighting(found, mask, probability=probability)
-
-
-def _discount(sighting: Sighting, look: Look, tried: int, options: LocateOptions) -> Sighting:
+def _discount(location: Location, what: str, tried: int, options: LocateOptions) -> Location:
     """Take log10 of the number of looks off the odds; a place that is then too unlikely is not located."""
-    location, off = sighting.location, math.log10(tried)
+    off = math.log10(tried)
     if tried == 1 or location.log10_odds is None:
-        return sighting
+        return location
     odds = location.log10_odds - off
     if odds < options.min_log10_odds:
-        few = f"seen in {tried} ways one place stands out, at {look.what}, but not clearly enough for so many tries"
-        return replace(sighting, location=_refused(location, few))
-    reason = f"{location.reason}; seen in another way ({look.what}) than at first"
+        few = f"seen in {tried} ways one place stands out, at {what}, but not clearly enough for so many tries"
+        return _refused(location, few)
+    reason = f"{location.reason}; seen in another way ({what}) than at first"
     center = None if location.center is None else replace(location.center, log10_odds=odds)
     others = tuple(_less_sure(one, off) for one in location.alternatives)
     runner_up = location.runner_up and _less_sure(location.runner_up, off)
-    location = replace(
-        location, reason=reason, log10_odds=odds, center=center, runner_up=runner_up, alternatives=others
-    )
-    return replace(sighting, location=location)
+    return replace(location, reason=reason, log10_odds=odds, center=center, runner_up=runner_up, alternatives=others)
 
 
 def _less_sure(place: Place, off: float) -> Place:
@@ -173,13 +153,7 @@ def _best_of(sightings: Sequence[Sighting], options: LocateOptions) -> Sighting:
     rank = {"located": 2, "ambiguous": 1, "not_located": 0}
     best = max(sightings, key=lambda one: (rank[one.location.status], one.location.log10_odds or -math.inf))
     locations = [one.location for one in sightings]
-    seconds = replace(
-        best.location.seconds,
-        vectorize=sum(one.seconds.vectorize for one in locations),
-        match=sum(one.seconds.match for one in locations),
-        refine=sum(one.seconds.refine for one in locations),
-    )
-    location = replace(best.location, seconds=seconds)
+    location = replace(best.location, seconds=total_seconds(*(one.seconds for one in locations)))
     if len(sightings) > 1 and location.status == "not_located":
         location = replace(location, reason=f"{location.reason} (seen in {len(sightings)} ways)")
     rivals = [one for one in locations if one is not best.location and _elsewhere(one, location)]
@@ -198,6 +172,12 @@ def _best_of(sightings: Sequence[Sighting], options: LocateOptions) -> Sighting:
                 alternatives=others,
             )
     return replace(best, location=location)
+
+
+def total_seconds(*spent: Seconds) -> Seconds:
+    """Return the time of several searches of one query."""
+    steps = ("vectorize", "match", "refine")
+    return replace(spent[0], **{step: sum(getattr(seconds, step) for seconds in spent) for step in steps})
 
 
 def _elsewhere(one: Location, best: Location) -> bool:

@@ -1,4 +1,4 @@
-"""How a batch of masks is read, located and written."""
+"""How queries are read, and how a batch of them is located and written."""
 
 from __future__ import annotations
 
@@ -9,68 +9,65 @@ from typing import TYPE_CHECKING, Literal
 if TYPE_CHECKING:
     from roadgeo.matching.options import LocateOptions
     from roadgeo.outputs.location_files import OutputOptions
-    from roadgeo.running.queries import QueryOptions
     from roadgeo.running.tasks import Task
 
-__all__ = ["BatchOptions", "ReadOptions"]
+__all__ = ["BatchOptions", "ReadOptions", "is_model"]
 
 
 @dataclass(frozen=True)
 class ReadOptions:
-    """How masks are read, and the files beside them.
+    """How what is given is read.
 
     Attributes
     ----------
-    threshold, band
-        As for `sources.masks.read_mask`.
-    segment, segmenters, class_name, fused_with, threads
-        As for `queries.QueryOptions`.
-    images : mapping of mask to photograph
-        Drawn on the map instead of the masks.
-    exif : bool
-        Take the focal length from the photograph, or else the mask.
-    dem : str
-        Terrain model with the height of the ground below the camera; "" for none.
-    allow_mirror : bool
-        Masks that were mirrored have the place that they have turned over.
+    threshold : float or None
+        Values of a mask, or probabilities, above it are road. Default: by the histogram of the values.
+    band : int or None
+        The band that holds a mask, counted from 1.
+    segment : "auto", "always" or "never"
+        Whether photographs are recognised, everything is taken for one, or nothing.
+    segmenters : tuple of str
+        Plugins, and files of models (.onnx); several are fused. Default: the model that ships.
+    class_name : str or None
+        The class of a model that is road. Default: by the names of its classes.
+    fused_with : tuple of str
+        Further images of the same frame, fused with each query.
+    threads : int
+        Of a model; fixed, so that results are the same on every run.
+    mirror : "tell", "never" or "allow"
+        For a refused mask that would be located turned over: whether that is mentioned, not tried, or the answer.
     units : "auto", "pixels" or "metres"
-        Of roads that come as lines.
+        Of roads that come as lines (see `sources.drawn_roads`).
     layer : str or None
         Of a file of such roads that has several.
     aspect : float, "unknown" or None
-        How many times a pixel is as wide as high; None: once.
+        How many times a pixel of a mask is as wide as high; None: once.
     bands : (3,) tuple of int, or None
-        The red, green and blue band of photographs, counted from 1.
+        The red, green and blue band of a photograph, counted from 1. Default: by their names, or the first three.
     """
 
     threshold: float | None = None
     band: int | None = None
-    images: Mapping[str, str] = field(default_factory=dict)
-    exif: bool = False
     segment: Literal["auto", "always", "never"] = "auto"
     segmenters: tuple[str, ...] = ()
     class_name: str | None = None
     fused_with: tuple[str, ...] = ()
     threads: int = 1
-    dem: str = ""
-    allow_mirror: bool = False
+    mirror: Literal["tell", "never", "allow"] = "tell"
     units: Literal["auto", "pixels", "metres"] = "auto"
     layer: str | None = None
     aspect: float | Literal["unknown"] | None = None
     bands: tuple[int, int, int] | None = None
 
-    def photo(self, task: Task, of_photograph: bool) -> str | None:
-        """Return the photograph that is drawn, if any: one that was given, or the query itself."""
-        return self.images.get(task.mask, task.mask if of_photograph else None)
+    @property
+    def may_be_mask(self) -> bool:
+        """Whether a query may be a mask; plugins are shown all that is given."""
+        return self.segment == "never" or (self.segment == "auto" and all(map(is_model, self.segmenters)))
 
-    def of_query(self) -> QueryOptions:
-        """Return the options of one query."""
-        from roadgeo.running.queries import QueryOptions
 
-        return QueryOptions(
-            self.threshold, self.band, self.segment, self.segmenters, self.class_name, self.fused_with, self.threads,
-            "allow" if self.allow_mirror else "tell", self.units, self.layer, self.aspect, self.bands,
-        )  # fmt: skip
+def is_model(segmenter: str) -> bool:
+    """Whether a segmenter is the file of a model, not the name of a plugin."""
+    return segmenter.lower().endswith(".onnx")
 
 
 def _usual_search() -> LocateOptions:
@@ -91,6 +88,12 @@ class BatchOptions:
 
     Attributes
     ----------
+    images : mapping of mask to photograph
+        Drawn on the map instead of the masks.
+    exif : bool
+        Take the focal length from the photograph, or else the mask.
+    dem : str
+        Terrain model with the height of the ground below the camera; "" for none.
     skip_existing : bool
         Keep results of the same question that are whole and younger than their masks.
     command : tuple of str
@@ -100,5 +103,12 @@ class BatchOptions:
     search: LocateOptions = field(default_factory=_usual_search)
     outputs: OutputOptions = field(default_factory=_usual_outputs)
     reading: ReadOptions = field(default_factory=ReadOptions)
+    images: Mapping[str, str] = field(default_factory=dict)
+    exif: bool = False
+    dem: str = ""
     skip_existing: bool = False
     command: tuple[str, ...] = ()
+
+    def photo(self, task: Task, of_photograph: bool) -> str | None:
+        """Return the photograph that is drawn, if any: one that was given, or the query itself."""
+        return self.images.get(task.mask, task.mask if of_photograph else None)

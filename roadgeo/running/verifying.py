@@ -25,8 +25,9 @@ from roadgeo.matching.checking import Checked, CheckOptions, check_place
 from roadgeo.matching.options import LocateOptions
 from roadgeo.matching.scene import read_query
 from roadgeo.reference.reference import Reference
+from roadgeo.running.options import ReadOptions
 from roadgeo.running.processes import run
-from roadgeo.running.queries import QueryOptions, locate_query
+from roadgeo.running.queries import locate_query
 from roadgeo.running.tasks import Task
 from roadgeo.sources.georeference import read_georeference
 
@@ -57,7 +58,7 @@ class VerifyRun:
 
     references: tuple[str, ...] = ()
     options: CheckOptions = field(default_factory=CheckOptions)
-    query: QueryOptions = field(default_factory=QueryOptions)
+    reading: ReadOptions = field(default_factory=ReadOptions)
     crs: str | None = None
 
     def prepare(self) -> Callable[[Task], Verified]:
@@ -167,8 +168,8 @@ def _look(image: _Image, reference: Reference, start: FloatArray) -> Checked:
     options = LocateOptions()
     match = replace(options.match, camera=replace(options.match.camera, gsd_m=(gsd / 1.1, gsd * 1.1)))
     search = replace(options.search, time_limit_s=60.0)
-    query = replace(image.settings.query, mirror="never")  # that would search the whole map
-    locate_query(image.name, [reference], replace(options, match=match, search=search), query, how=check)
+    reading = replace(image.settings.reading, mirror="never")  # a variant would search the whole map
+    locate_query(image.name, [reference], replace(options, match=match, search=search), reading, how=check)
     if not results:
         return Checked("unknown", "hardly a road is seen in it")
     return next((one for one in results if one.verdict != "unknown"), results[0])

@@ -304,7 +304,7 @@ def _serve(pipe: Connection, names: list[str], threads: int, folder: Path) -> No
     from roadgeo.errors import ModelError, RoadgeoError
     from roadgeo.kernels.warmup import warm_up
     from roadgeo.running.batch import open_references
-    from roadgeo.running.queries import load_model
+    from roadgeo.running.photographs import load_model
 
     cv2.setNumThreads(1)
     try:
@@ -352,7 +352,8 @@ def _locate(asked: Asked, references: Sequence[Any], say: Say, threads: int) -> 
     from dataclasses import replace
 
     from roadgeo.matching.hints import apply_hints
-    from roadgeo.running.queries import QueryOptions, locate_query
+    from roadgeo.running.options import ReadOptions
+    from roadgeo.running.queries import locate_query
     from roadgeo.serving.view import OWN, SEEN, write_view
     from roadgeo.sources.exif import focal_in_pixels
     from roadgeo.workflows import LocateOptions, locate
@@ -377,7 +378,7 @@ def _locate(asked: Asked, references: Sequence[Any], say: Say, threads: int) -> 
     seen = Path(asked.path).parent.with_name(OWN) / SEEN
     is_known = seen.is_file() and not asked.hints.keys() & {"gsd_m", "focal_px"}
     say("reading the image")
-    image, query = str(seen) if is_known else asked.path, QueryOptions(threads=threads)
+    image, query = str(seen) if is_known else asked.path, ReadOptions(threads=threads)
     sighting = locate_query(image, references, options, query, how=search, say=tell)
     sighting = replace(sighting, of_photograph=sighting.of_photograph or is_known)
     location = replace(sighting.location, query=asked.name)

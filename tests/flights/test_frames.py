@@ -14,6 +14,7 @@ from roadgeo.errors import MaskError, PhotographError
 from roadgeo.evaluation.demo import PHOTO
 from roadgeo.flights import frames
 from roadgeo.flights.frames import FrameOptions, read_frames, read_stills
+from roadgeo.running.options import ReadOptions
 from roadgeo.sources.masks import read_mask
 
 
@@ -25,7 +26,7 @@ def shift(dx: float, dy: float) -> np.ndarray:
 def model(tmp_path: Path) -> FrameOptions:
     """Frames of half a metre, and a network that takes what is light for road."""
     path = brightness_model(tmp_path / "light.onnx", props={"resolution": 50})
-    return FrameOptions(model=str(path), gsd_m=(0.4, 0.625))
+    return FrameOptions(ReadOptions(segmenters=(str(path),)), gsd_m=(0.4, 0.625))
 
 
 @pytest.fixture
@@ -56,7 +57,7 @@ def test_where_the_scale_is_not_known_one_serves_all(model: FrameOptions, photog
 def test_a_photograph_without_roads_is_a_frame_of_the_flight(model: FrameOptions, tmp_path: Path) -> None:
     path = tmp_path / "sea.png"
     cv2.imwrite(str(path), np.random.default_rng(0).integers(20, 60, (300, 400, 3)).astype(np.uint8))
-    (frame,) = read_frames([str(path)], replace(model, segment="always"))
+    (frame,) = read_frames([str(path)], replace(model, reading=replace(model.reading, segment="always")))
     assert frame.mask.roads.shape == (300, 400)
     assert not frame.mask.roads.any()
 
@@ -87,7 +88,7 @@ def test_frames_are_upright(model: FrameOptions, photographs: list[str], tmp_pat
 
 def test_photographs_are_refused_where_masks_are_meant(photographs: list[str]) -> None:
     with pytest.raises(PhotographError):
-        list(read_frames(photographs, FrameOptions(segment="never")))
+        list(read_frames(photographs, FrameOptions(ReadOptions(segment="never"))))
 
 
 @pytest.fixture

@@ -16,7 +16,7 @@ from roadgeo.geometry.mask import RoadMask
 from roadgeo.outputs.registry import REGISTRY, Output
 from roadgeo.plugins import OUTPUTS
 from roadgeo.running.batch import Asked, Locating, Outcome
-from roadgeo.running.options import BatchOptions, ReadOptions
+from roadgeo.running.options import BatchOptions
 from roadgeo.running.tasks import Task, find_masks, name_tasks
 
 
@@ -133,8 +133,8 @@ def test_the_focal_length_of_exif_is_in_pixels_of_the_mask(tmp_path: Path) -> No
     photo, mask = jpeg_with_exif(tmp_path / "photo.jpg", 24), tmp_path / "mask.png"
     cv2.imwrite(str(mask), np.zeros((400, 600), np.uint8))
     task = Task(str(mask), "mask")
-    reading = ReadOptions(images={str(mask): str(photo)}, exif=True)
-    work = Locating((), str(tmp_path), BatchOptions(reading=reading), say_nothing)
+    options = BatchOptions(images={str(mask): str(photo)}, exif=True)
+    work = Locating((), str(tmp_path), options, say_nothing)
     assert work.search_options(task).match.camera.focal_px == pytest.approx(400.0)
-    plain = replace(work, options=BatchOptions(reading=replace(reading, exif=False)))
+    plain = replace(work, options=replace(options, exif=False))
     assert plain.search_options(task).match.camera.focal_px is None

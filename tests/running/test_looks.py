@@ -7,7 +7,7 @@ from roadgeo.errors import MaskError
 from roadgeo.geometry.mask import RoadMask
 from roadgeo.location import Location, Place, Stats
 from roadgeo.matching.options import LocateOptions
-from roadgeo.running.looks import Look, locate_looks
+from roadgeo.running.looks import Seen, locate_looks
 
 OPTIONS = LocateOptions()
 MASK = RoadMask(np.eye(40, dtype=bool))
@@ -33,8 +33,8 @@ def take(*answers, options=OPTIONS):
             raise answer
         return answer
 
-    looks = [Look(f"look {i}", lambda: MASK) for i in range(len(answers))]
-    return locate_looks(looks, [], options, how).location, limits
+    looks = range(len(answers))
+    return locate_looks(looks, lambda i: Seen(f"look {i}", MASK), [], options, how).location, limits
 
 
 def test_the_first_look_that_is_located_is_the_answer():

@@ -17,8 +17,10 @@ from roadgeo.errors import MaskError, ModelError, PhotographError
 from roadgeo.evaluation.demo import demo_masks
 from roadgeo.geometry.mask import RoadMask
 from roadgeo.matching.options import LocateOptions
-from roadgeo.running import queries
-from roadgeo.running.queries import QueryOptions, _how_much_finer, locate_query
+from roadgeo.running import photographs, queries
+from roadgeo.running.options import ReadOptions
+from roadgeo.running.photographs import _how_much_finer
+from roadgeo.running.queries import locate_query
 from roadgeo.sources.masks import PROBABILITY_TAG
 from roadgeo.sources.segmentation.probability import ProbabilityMap
 from roadgeo.sources.segmentation.scales import rank_scales
@@ -69,13 +71,13 @@ def test_plugins_alone_have_no_more_ways_however_large_the_photograph(
     taken: list[str] = []
 
     def note(looks, *_):  # type: ignore[no-untyped-def]
-        taken.extend(look.what for look in looks)
+        taken.extend(look.note for look in looks)
         raise MaskError("that is all")
 
-    monkeypatch.setattr(queries, "locate_looks", note)
-    monkeypatch.setattr(queries, "_MANY_PIXELS", 1)
-    monkeypatch.setattr(queries, "_call_segmenter", lambda *_: RoadMask(np.zeros((10, 10), np.bool_)))
-    locate_query(str(photo), [], query=QueryOptions(segment="always", segmenters=("one", "another")))
+    monkeypatch.setattr(photographs, "locate_looks", note)
+    monkeypatch.setattr(photographs, "_MANY_PIXELS", 1)
+    monkeypatch.setattr(photographs, "call_segmenter", lambda *_: RoadMask(np.zeros((10, 10), np.bool_)))
+    locate_query(str(photo), [], reading=ReadOptions(segment="always", segmenters=("one", "another")))
     assert taken
     assert not any("ways" in one for one in taken)
 
@@ -87,16 +89,16 @@ def test_the_second_look_shows_the_photograph_more_ways(
     taken: list[str] = []
 
     def note(looks, *_):  # type: ignore[no-untyped-def]
-        taken.extend(look.what for look in looks)
+        taken.extend(look.note for look in looks)
         raise MaskError("that is all")
 
     nothing = ProbabilityMap(np.zeros((10, 10), np.uint8), 0.5)
-    monkeypatch.setattr(queries, "locate_looks", note)
-    monkeypatch.setattr(queries, "segment", lambda *_, **__: nothing)
+    monkeypatch.setattr(photographs, "locate_looks", note)
+    monkeypatch.setattr(photographs, "segment", lambda *_, **__: nothing)
     names = tuple(model if name == "model" else name for name in segmenters)
     mask = RoadMask(np.zeros((10, 10), np.bool_))
-    monkeypatch.setattr(queries, "_call_segmenter", lambda *_: mask)
-    query = QueryOptions(segment="always", segmenters=names)
+    monkeypatch.setattr(photographs, "call_segmenter", lambda *_: mask)
+    query = ReadOptions(segment="always", segmenters=names)
     options = LocateOptions()
     camera = replace(options.match.camera, gsd_m=(0.45, 0.55))
     options = replace(options, match=replace(options.match, camera=camera))
@@ -105,9 +107,9 @@ def test_the_second_look_shows_the_photograph_more_ways(
     else:
         with pytest.raises(MaskError):
             locate_query(str(photo), [], options, query)
-    queries.load_model.cache_clear()  # another test looks what is said without a model
+    photographs.load_model.cache_clear()  # another test looks what is said without a model
     if ways and not names:  # the model that ships is shown all ways at once; then each of these alone
-        assert [one.split(", ")[1:] for one in taken] == [[], ["a lower threshold"], ["shown alone"], ["shown alone"]]
+        assert taken == ["", ", a lower threshold", ", shown alone", ", shown alone"]
         return
     assert (len(taken) > 1 and taken[1].endswith("shown 2 ways")) == ways
     assert not any("ways" in one for one in taken[:1] + taken[2:])
@@ -127,8 +129,8 @@ def test_the_first_look_shows_the_photograph_in_as_many_ways_as_the_model_says(
         shown.append((round(scale, 1), ways))
         return ProbabilityMap(np.zeros((10, 10), np.uint8), 0.5)
 
-    monkeypatch.setattr(queries, "segment", note)
-    queries.look_once(str(photo), (0.45, 0.55), QueryOptions(segment="always", segmenters=(str(model),)))
+    monkeypatch.setattr(photographs, "segment", note)
+    queries.look_once(str(photo), (0.45, 0.55), ReadOptions(segment="always", segmenters=(str(model),)))
     assert shown == expected
 
 
@@ -147,18 +149,18 @@ def test_what_was_seen_while_scales_were_ranked_is_looked_at_first(
         shown.append((round(scale, 1), ways))
         return nothing
 
-    def take(looks, *_):  # type: ignore[no-untyped-def]
+    def take(looks, see, *_):  # type: ignore[no-untyped-def]
         for look in looks:
-            taken.append(look.what)
+            taken.append(f"{look.rank}{look.note}")
             with suppress(MaskError):
-                look.make()
+                see(look)
         raise MaskError("that is all")
 
-    monkeypatch.setattr(queries, "segment", note)
-    monkeypatch.setattr(queries, "locate_looks", take)
-    monkeypatch.setattr(queries, "rank_scales", lambda *_: {0.5: nothing, 1.0: None, 2.0: None})
-    locate_query(str(photo), [], LocateOptions(), QueryOptions(segment="always", segmenters=(str(model),)))
-    assert taken[:4] == ["scale 0.5", "scale 0.5, shown 2 ways", "scale 1", "scale 2"]
+    monkeypatch.setattr(photographs, "segment", note)
+    monkeypatch.setattr(photographs, "locate_looks", take)
+    monkeypatch.setattr(photographs, "rank_scales", lambda *_: {0.5: nothing, 1.0: None, 2.0: None})
+    locate_query(str(photo), [], LocateOptions(), ReadOptions(segment="always", segmenters=(str(model),)))
+    assert taken[:4] == ["0", "0, shown 2 ways", "1", "2"]
     # Where its own pixels are not as fine it is turned instead; for other thresholds nothing is shown again.
     assert shown == [(1.0, 1), (1.0, 2), (2.0, 2)]
 
@@ -252,11 +254,11 @@ def test_no_scale_is_looked_for_in_vain(
 ) -> None:
     """Where the file states one it comes first; where none is known, what was seen on the way is taken."""
     calls = []
-    monkeypatch.setattr(queries, "estimate_gsd", lambda _: stated)
-    monkeypatch.setattr(queries, "rank_scales", lambda *given: calls.append("ranked") or rank_scales(*given))
-    monkeypatch.setattr(queries, "segment", lambda *given, **told: calls.append("shown") or segment(*given, **told))
-    query = QueryOptions(segmenters=(model,))
-    sighting = locate_query(str(photo), [open_reference(porto)], query=query)
+    monkeypatch.setattr(photographs, "estimate_gsd", lambda _: stated)
+    monkeypatch.setattr(photographs, "rank_scales", lambda *given: calls.append("ranked") or rank_scales(*given))
+    monkeypatch.setattr(photographs, "segment", lambda *given, **told: calls.append("shown") or segment(*given, **told))
+    query = ReadOptions(segmenters=(model,))
+    sighting = locate_query(str(photo), [open_reference(porto)], reading=query)
     assert sighting.location.located
     assert calls == ["ranked" if stated is None else "shown"]
     calls.clear()
@@ -296,11 +298,11 @@ def test_what_is_seen_is_shown_without_a_map(
 def test_what_plugins_and_masks_show(
     tmp_path: Path, photo: Path, model: str, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    monkeypatch.setattr(queries, "call_plugin", lambda *_: cv2.imread(str(MASK.path), cv2.IMREAD_GRAYSCALE))
-    seen = queries.look_once(str(photo), None, QueryOptions(segmenters=("plugin",)))
+    monkeypatch.setattr(photographs, "call_plugin", lambda *_: cv2.imread(str(MASK.path), cv2.IMREAD_GRAYSCALE))
+    seen = queries.look_once(str(photo), None, ReadOptions(segmenters=("plugin",)))
     assert seen.probability is None
     assert seen.coarser == 1.0
-    np.testing.assert_array_equal(seen.mask.roads, queries.look_once(str(MASK.path), None, QueryOptions()).mask.roads)
+    np.testing.assert_array_equal(seen.mask.roads, queries.look_once(str(MASK.path), None, ReadOptions()).mask.roads)
     assert main(["vectorize", str(photo), "--segment", "never", "-o", str(tmp_path)]) == 1
     assert "looks like a photograph" in capsys.readouterr().err
     given = ["vectorize", str(photo), "-o", str(tmp_path), "--segmenter", model]
@@ -341,14 +343,14 @@ def test_never_means_never(porto: Path, model: str, photo: Path) -> None:
 
     reference = roadgeo.open_reference(porto)
     with pytest.raises(PhotographError, match="looks like a photograph"):
-        locate_query(str(photo), [reference], query=QueryOptions(segment="never", segmenters=(model,)))
+        locate_query(str(photo), [reference], reading=ReadOptions(segment="never", segmenters=(model,)))
 
 
 def test_a_mask_stays_a_mask(porto: Path, model: str) -> None:
     import roadgeo
 
     reference = roadgeo.open_reference(porto)
-    sighting = locate_query(str(MASK.path), [reference], query=QueryOptions(segmenters=(model,)))
+    sighting = locate_query(str(MASK.path), [reference], reading=ReadOptions(segmenters=(model,)))
     assert sighting.location.located
     assert not sighting.of_photograph
     assert sighting.probability is None
@@ -365,15 +367,15 @@ def test_without_a_model_it_is_said(porto: Path, photo: Path, monkeypatch: pytes
 def test_fused_masks_are_shown_to_no_model(monkeypatch: pytest.MonkeyPatch) -> None:
     taken: list[str] = []
 
-    def note(looks, *_):  # type: ignore[no-untyped-def]
-        taken.extend(look.what for look in looks)
-        looks[0].make()
+    def note(looks, see, *_):  # type: ignore[no-untyped-def]
+        taken.extend(look.note for look in looks)
+        see(looks[0])
         raise StopIteration
 
-    monkeypatch.setattr(queries, "locate_looks", note)
-    monkeypatch.setattr(queries, "_see", lambda *_: pytest.fail("a mask was shown to a model"))
+    monkeypatch.setattr(photographs, "locate_looks", note)
+    monkeypatch.setattr(photographs, "segment", lambda *_: pytest.fail("a mask was shown to a model"))
     with pytest.raises(StopIteration):
-        locate_query(str(MASK.path), [], query=QueryOptions(fused_with=(str(MASK.path),)))
+        locate_query(str(MASK.path), [], reading=ReadOptions(fused_with=(str(MASK.path),)))
     assert taken
     assert not any("ways" in one for one in taken)
 

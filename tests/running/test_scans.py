@@ -9,7 +9,8 @@ from roadgeo.evaluation.noise import NOISE_MODELS
 from roadgeo.evaluation.simulation import SimulationOptions, ViewOptions, simulate_query
 from roadgeo.geometry.homography import Homography
 from roadgeo.reference.reference import Reference
-from roadgeo.running.queries import QueryOptions, locate_query
+from roadgeo.running.options import ReadOptions
+from roadgeo.running.queries import locate_query
 
 pytestmark = pytest.mark.slow
 
@@ -42,7 +43,7 @@ def test_a_stretched_scan_is_located_where_that_is_allowed(drawn, stretch, aspec
     reference, mask, truth = drawn
     scan = cv2.resize(mask, (round(700 / stretch), 700), interpolation=cv2.INTER_AREA)
     assert not locate_query(scan, [reference]).location.located
-    location = locate_query(scan, [reference], query=QueryOptions(aspect=aspect)).location
+    location = locate_query(scan, [reference], reading=ReadOptions(aspect=aspect)).location
     assert location.located
     wide = float(location.reason.split("its pixels are ")[1].split()[0])
     assert wide == pytest.approx(stretch, rel=0.02)

@@ -12,7 +12,8 @@ from roadgeo.geometry.projection import metres_apart
 from roadgeo.location import Location
 from roadgeo.matching.options import LocateOptions
 from roadgeo.reference.reference import Reference
-from roadgeo.running.queries import QueryOptions, locate_query
+from roadgeo.running.options import ReadOptions
+from roadgeo.running.queries import locate_query
 from roadgeo.workflows import build_reference
 
 pytestmark = pytest.mark.realdata
@@ -61,7 +62,7 @@ def test_told_is_no_worse_than_blind(data_dir: Path, rows: list[dict[str, str]],
     found: dict[str, dict[str, float]] = {"nothing": {}, "scale": {}, "scale and heading": {}}
     for what in found:
         for row in rows:
-            path, query = str(data_dir / "photographs" / row["file"]), QueryOptions(mirror="never")
+            path, query = str(data_dir / "photographs" / row["file"]), ReadOptions(mirror="never")
             location = locate_query(path, [maps[row["roads"]]], told(row, what), query).location
             if location.located:
                 assert is_right(location, row), (what, row["file"])

@@ -1,4 +1,4 @@
-"""A location by other pixels than a query's own says the same of the ground."""
+"""The location of a variant says the same of the ground in the query's own pixels."""
 
 from dataclasses import replace
 
@@ -7,7 +7,7 @@ import pytest
 
 from roadgeo.evaluation.demo import ROADS, demo_masks
 from roadgeo.geometry.homography import Homography
-from roadgeo.running.regridding import of_own_pixels, on_grid
+from roadgeo.running.variants import in_pixels_of, mirrored, resampled
 from roadgeo.sources.masks import read_mask
 from roadgeo.workflows import build_reference, locate
 
@@ -24,11 +24,11 @@ def located():
 @pytest.mark.parametrize("factor", [(0.5, 0.5), (2.0, 2.0), (0.5, 1.0)])
 def test_corners_stay_where_they_are(located, factor):
     size = tuple(round(side * f) for side, f in zip(located.size, factor, strict=True))
-    own = of_own_pixels(located, size)
+    scale = np.array(size) / located.size
+    own = in_pixels_of(located, size, np.diag([*(1.0 / scale), 1.0]))
     assert own.size == size
     corners = np.array([(0, 0), (size[0], 0), size, (0, size[1])], float)
     assert np.allclose(Homography(own.homography)(corners), located.footprint)
-    scale = np.array(size) / located.size
     assert np.allclose(own.evidence.query_xy, located.evidence.query_xy * scale)
     assert np.allclose(own.evidence.query_graph.coords, located.evidence.query_graph.coords * scale)
     assert np.allclose(own.seen.xy, located.seen.xy * scale)
@@ -40,12 +40,22 @@ def test_corners_stay_where_they_are(located, factor):
 
 def test_what_has_no_place_has_none_on_another_grid(located):
     bare = replace(located, homography=None, camera=None, seen=None, evidence=None, gsd_m=None)
-    own = of_own_pixels(bare, (10, 10))
+    own = in_pixels_of(bare, (10, 10), np.eye(3))
     assert own.size == (10, 10)
     assert own.homography is None
-    assert of_own_pixels(located, located.size) is located
     nothing = replace(located, size=None)
-    assert of_own_pixels(nothing, (10, 10)) is nothing
+    assert in_pixels_of(nothing, (10, 10), np.eye(3)) is nothing
+
+
+def test_a_mask_turned_over_has_the_corners_of_the_mask(located):
+    variant = mirrored(read_mask(MASK.path))
+    turned = in_pixels_of(located, located.size, variant.matrix)
+    assert np.allclose(turned.footprint, located.footprint[[1, 0, 3, 2]])
+    assert np.allclose(turned.corner_sigma_m, located.corner_sigma_m[[1, 0, 3, 2]])
+    placed = Homography(turned.homography)(turned.evidence.query_xy * (1.0, -1.0))
+    assert np.allclose(placed, Homography(located.homography)(located.evidence.query_xy * (1.0, -1.0)))
+    again = in_pixels_of(turned, located.size, variant.matrix)
+    assert np.allclose(again.corner_covariance_m2, located.corner_covariance_m2)
 
 
 def test_masks_on_another_grid():
@@ -54,7 +64,7 @@ def test_masks_on_another_grid():
     seen = np.ones(mask.shape, np.bool_)
     seen[: height // 2] = False
     values = np.where(mask.roads, 200, 30).astype(np.uint8)
-    small = on_grid(replace(mask, observed=seen, probability=values), (height // 2, width // 2))
+    small = resampled(replace(mask, observed=seen, probability=values), (height // 2, width // 2)).mask
     assert small.shape == small.observed.shape == small.probability.shape == (height // 2, width // 2)
     assert small.roads.mean() == pytest.approx(mask.roads.mean(), rel=0.1)
     assert not small.observed[: height // 4 - 1].any()
