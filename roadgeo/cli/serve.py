@@ -104,7 +104,7 @@ _OPTIONS = (
         "Tiles that the page shows below the roads: https://.../{z}/{x}/{y}.png.", callback=_read_basemap),
     row("--basemap-attribution", "TEXT", OTHERS, "Whom their owner asks to name.", default=""),
     row("--no-browser", "", OTHERS, "Do not open the page in a browser."),
-    take("verbosity"),
+    take("quiet"),
 )  # fmt: skip
 
 
@@ -115,7 +115,6 @@ def serve_command(
     mavlink: str | None,
     no_browser: bool,
     quiet: bool,
-    verbose: bool,  # noqa: ARG001
     **given: Any,
 ) -> int:
     """Keep references open, and answer; for the help see above."""
