@@ -3,10 +3,9 @@
 from __future__ import annotations
 
 import json
-import math
 import sys
 import time
-from collections.abc import Iterator, Sequence
+from collections.abc import Sequence
 from dataclasses import replace
 from functools import partial
 from pathlib import Path
@@ -25,9 +24,11 @@ from roadgeo.cli.queries import QUERY_OPTIONS, query_options, query_sets
 if TYPE_CHECKING:
     from rich.table import Table
 
-    from roadgeo.evaluation.scoring import Evaluation, Share, Spread, Summary
+    from roadgeo.evaluation.scoring import Evaluation, Summary
     from roadgeo.evaluation.survey import Survey
     from roadgeo.evaluation.trials import QuerySet, ReferenceLocator
+    from roadgeo.evaluation.truth import Truth
+    from roadgeo.matching.index import ReferenceIndex
 
 __all__ = ["evaluate_command"]
 
@@ -75,8 +76,8 @@ def evaluate_command(
     """Locate masks whose place is known, and count.
 
     Without --queries the masks are drawn as `roadgeo simulate` draws them. With --out-dir the folder gets
-    evaluation.json, report.html and trials.jsonl, from which the same command goes on when it was interrupted. A table
-    of your own needs the columns file, crs, width, height and h00 to h22, the homography from pixels to the CRS.
+    evaluation.json, masks.csv, report.html and trials.jsonl, from which the same command goes on when it was
+    interrupted. A table of your own needs the columns file, crs, width, height and h00 to h22, the homography from pixels to the CRS.
 
     With --map masks are tried all over the map (-n of them, by default 600), and REF_localizability.tif (styled in
     QGIS), .png and .json show where they would be located, may be ambiguous, or show too few intersections.
@@ -197,12 +198,14 @@ def _evaluate(
     evaluation = evaluate(truths, [trial.answer for trial in trials], settings, radius)
     document = evaluation.to_dict() | _made_of(locator)
     if out_dir is not None:
-        from roadgeo.evaluation.report import render_report
+        from roadgeo.evaluation.report import masks_to_csv, render_report
         from roadgeo.storage.files import write_text
 
         title = f"{settings['reference']}: {len(trials)} masks"
         write_text(out_dir / "evaluation.json", json.dumps(document, indent=1) + "\n")
-        write_text(out_dir / "report.html", render_report(evaluation, truths, title))
+        write_text(out_dir / "masks.csv", masks_to_csv(evaluation))
+        page = render_report(evaluation, truths, title, _maps_of(locator, truths))
+        write_text(out_dir / "report.html", page)
     if as_json:
         echo(json.dumps({name: part for name, part in document.items() if name != "scores"}))
     elif not quiet:
@@ -210,6 +213,16 @@ def _evaluate(
         earlier = f" ({before} of them recorded before)" if before else ""
         where = f"; see {out_dir}" if out_dir else ""
         echo(f"{len(trials)} masks{earlier} in {elapsed:.1f} s{where}", err=True)
+
+
+def _maps_of(locator: ReferenceLocator, truths: Sequence[Truth]) -> list[ReferenceIndex]:
+    """Return the maps, or of a divided one the parts, that the masks lie on."""
+    from roadgeo.geometry.projection import transformer
+    from roadgeo.reference.reference import open_reference
+
+    placed = [truth for truth in truths if truth.on_map and truth.crs is not None]
+    there = [transformer(str(truth.crs), "EPSG:4326").transform(*truth.center) for truth in placed]
+    return [index for path in locator.references for index in open_reference(path).indexes_at(there)]
 
 
 def _made_of(locator: ReferenceLocator) -> dict[str, Any]:
@@ -277,12 +290,12 @@ def _write_map(survey: Survey, as_json: bool, quiet: bool) -> None:
 def _print(evaluation: Evaluation) -> None:
     from rich.console import Console
 
-    from roadgeo.evaluation.report import TITLES
+    from roadgeo.evaluation.report import TITLES, verdicts
 
     console = Console(width=None if sys.stdout.isatty() else 100)
     for by, groups in evaluation.breakdowns.items():
         console.print(_table(TITLES[by], [*groups, evaluation.total] if by == "kind" else groups))
-    for line in _verdicts(evaluation):
+    for line in verdicts(evaluation):
         console.print(line, highlight=False, markup=False)
 
 
@@ -291,50 +304,14 @@ def _table(title: str, groups: Sequence[Summary]) -> Table:
     from rich.markup import escape
     from rich.table import Table
 
+    from roadgeo.evaluation.report import HEADS, summarize_group
+
     table = Table(title=title, title_justify="left", box=SIMPLE_HEAD, pad_edge=False, padding=(0, 1, 0, 0))
     absent = any(group.refused.of for group in groups)
-    heads = ["", "masks", "precision %", "recall %", *(["refused"] if absent else []), "centre m", "corners m", "ms"]
-    for head in heads:
-        table.add_column(head, justify="right" if head else "left", no_wrap=True)
+    shown = [k for k, head in enumerate(HEADS) if head != "refused" or absent]
+    for k in shown:
+        table.add_column(HEADS[k], justify="right" if HEADS[k] else "left", no_wrap=True)
     for group in groups:
-        table.add_row(
-            escape(visible(group.name)),
-            str(group.queries),
-            _percent(group.precision),
-            _percent(group.recall),
-            *([f"{group.refused.hits}/{group.refused.of}" if group.refused.of else "-"] if absent else []),
-            _pair(group.center_m, 1),
-            _pair(group.corners_rms_m, 1),
-            _pair(group.compute_s, 0, 1000),
-        )
+        cells = summarize_group(group)
+        table.add_row(*(escape(visible(cells[k])) for k in shown))
     return table
-
-
-def _percent(estimate: Share) -> str:
-    if not estimate.of:
-        return "-"
-    return f"{100 * estimate.value:.3g} ({100 * estimate.low:.0f}-{100 * estimate.high:.0f})"
-
-
-def _pair(spread: Spread, digits: int, scale: float = 1.0) -> str:
-    """Median and 95th percentile."""
-    if math.isnan(spread.median):
-        return "-"
-    return f"{scale * spread.median:.{digits}f}/{scale * spread.p95:.{digits}f}"
-
-
-def _verdicts(evaluation: Evaluation) -> Iterator[str]:
-    """Describe the numbers in the tables, and whether odds and standard deviations hold."""
-    yield "In brackets: 95 % confidence. Metres, ms: median/95 %."
-    broken = [step for step in evaluation.odds if not step.holds]
-    surest = next((step for step in reversed(evaluation.odds) if step.wrong.of), None)
-    if broken:
-        step = broken[0]
-        wrong = f"{step.wrong.hits} of {step.wrong.of}"
-        yield f"Odds promise too much: {wrong} located at 10^{step.at_least:g} or more are wrong."
-    elif surest is not None:
-        located = evaluation.odds[0].wrong
-        yield f"Odds hold: {located.hits} of {located.of} located masks are wrong, no count contradicts them."
-    if evaluation.sigma.within_1.of:
-        robust = f"robustly {evaluation.sigma.robust:.2f}"
-        yield f"Corner errors are {evaluation.sigma.rms:.2f} times what is claimed ({robust})."

@@ -9,7 +9,6 @@ map; the weights are fitted to the trials by logistic regression.
 from __future__ import annotations
 
 import math
-from collections.abc import Iterator
 from dataclasses import dataclass
 
 import cv2
@@ -18,6 +17,8 @@ import numpy as np
 from roadgeo._arrays import AnyArray, BoolArray, FloatArray
 from roadgeo.evaluation.scoring import share
 from roadgeo.geometry.projection import LocalPlane
+from roadgeo.outputs.drawing.layers import Layer, Lines, Picture
+from roadgeo.outputs.drawing.raster import FAINT, INK, Canvas, blank, draw_scale_bar, write_text
 from roadgeo.roads.network import RoadNetwork
 from roadgeo.storage.qml import draw_palette
 
@@ -332,53 +333,30 @@ def to_qml() -> str:
     return draw_palette(PALETTE)
 
 
-def draw_localizability(network: RoadNetwork, found: LocalizabilityMap, title: str, longer_px: int = 1400) -> bytes:
-    """Draw the map over its roads, with legend and scale, as PNG."""
+def draw_localizability(network: RoadNetwork, found: LocalizabilityMap, title: str, longer_px: int = 1400) -> AnyArray:
+    """Draw the map over its roads, with legend and scale: (height, width, 3) uint8, red, green, blue."""
+    grid, colors = found.grid, {value: (*_rgb(color), alpha) for value, (color, alpha, _) in PALETTE.items()}
     rows, columns = found.classes.shape
-    scale = longer_px / max(rows, columns)
-    size = round(columns * scale), round(rows * scale)
-    top, bottom = 56, 44
-    picture = np.full((size[1] + top + bottom, max(size[0], 640), 3), 255, np.uint8)
-    ground = picture[top : top + size[1], : size[0]]
-    ground[:] = (236, 241, 243)
-    classes = cv2.resize(found.classes, size, interpolation=cv2.INTER_NEAREST)
-    for value, (color, alpha, _) in PALETTE.items():
-        ground[classes == value] = _blend((236, 241, 243), color, alpha)
-    to_pixel = scale / found.grid.cell_m
-    lines = [
-        np.rint((line - (found.grid.west, found.grid.north)) * (16 * to_pixel, -16 * to_pixel)).astype(np.int32)
-        for line in network.graph.polylines()
-    ]
-    cv2.polylines(ground, lines, False, (70, 66, 62), 1, cv2.LINE_AA, 4)
-    cv2.putText(picture, title, (10, 24), cv2.FONT_HERSHEY_DUPLEX, 0.6, (40, 40, 40), 1, cv2.LINE_AA)
-    for at, (color, alpha, label) in zip(_legend_steps(), list(PALETTE.values())[1:], strict=False):
-        cv2.rectangle(picture, (at, 34), (at + 14, 48), _blend((255, 255, 255), color, alpha), -1)
-        cv2.putText(picture, label, (at + 20, 46), cv2.FONT_HERSHEY_SIMPLEX, 0.42, (40, 40, 40), 1, cv2.LINE_AA)
-    _draw_scale(picture, to_pixel, len(picture) - 18)
-    attribution = str(network.meta.get("attribution") or "").encode("ascii", "ignore").decode().strip()
-    cv2.putText(
-        picture, attribution, (360, len(picture) - 13), cv2.FONT_HERSHEY_SIMPLEX, 0.42, (90, 90, 90), 1, cv2.LINE_AA
-    )
-    return bytes(cv2.imencode(".png", picture)[1].tobytes())
+    box = (0.0, 0.0, columns * grid.cell_m, rows * grid.cell_m)
+    canvas = Canvas.of(box, longer_px, longer_px)
+    lines = [(line - (grid.west, grid.north)) * (1.0, -1.0) for line in network.graph.polylines()]
+    classes = np.array([colors[value] for value in range(len(PALETTE))], np.uint8)[found.classes]
+    canvas.draw([Layer("picture", "", [Picture(classes, box)]), Layer("way", "", [Lines(lines)])])
+    draw_scale_bar(canvas, 22)
+    top, bottom = 84, 36
+    height, width = canvas.image.shape[:2]
+    picture = blank(height + top + bottom, max(width, 700))
+    picture[top : top + height, :width] = canvas.image
+    write_text(picture, title, (10, 32), 24, INK, bold=True)
+    x = 10
+    for value, (_, alpha, label) in list(PALETTE.items())[1:]:
+        color = tuple(round((alpha * part + (255 - alpha) * 255) / 255) for part in colors[value][:3])
+        cv2.rectangle(picture, (x, 54), (x + 16, 70), color, -1)
+        x = write_text(picture, label, (x + 24, 69), 17, INK) + 28
+    write_text(picture, str(network.meta.get("attribution") or ""), (10, len(picture) - 11), 16, FAINT)
+    return picture
 
 
-def _legend_steps() -> Iterator[int]:
-    yield from (10, 170, 400)
-
-
-def _blend(paper: tuple[int, int, int], color: str, alpha: int) -> tuple[int, int, int]:
-    """Blue, green, red of a "#rrggbb" laid over paper."""
-    bgr = [int(color[i : i + 2], 16) for i in (5, 3, 1)]
-    mixed = [round((alpha * c + (255 - alpha) * p) / 255) for c, p in zip(bgr, paper, strict=True)]
-    return mixed[0], mixed[1], mixed[2]
-
-
-def _draw_scale(picture: AnyArray, pixels_per_m: float, y: int) -> None:
-    """Draw a bar of a round length, at most 300 pixels long."""
-    limit = 300 / pixels_per_m
-    step = 10.0 ** math.floor(math.log10(limit))
-    length = max(k * step for k in (1, 2, 5) if k * step <= limit)
-    end = 10 + round(length * pixels_per_m)
-    cv2.line(picture, (10, y), (end, y), (40, 40, 40), 3)
-    words = f"{length / 1000:g} km" if length >= 1000 else f"{length:g} m"
-    cv2.putText(picture, words, (end + 8, y + 5), cv2.FONT_HERSHEY_SIMPLEX, 0.45, (40, 40, 40), 1, cv2.LINE_AA)
+def _rgb(color: str) -> tuple[int, int, int]:
+    red, green, blue = bytes.fromhex(color.removeprefix("#"))
+    return red, green, blue

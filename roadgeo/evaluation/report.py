@@ -1,18 +1,27 @@
-"""One HTML file that shows an evaluation: tables and charts (inline SVG), readable offline and on a phone."""
+"""What an evaluation shows: sentences and tables, as CSV and as one page of the layers that all pages show."""
 
 from __future__ import annotations
 
+import csv
 import html
+import io
 import math
-from collections.abc import Callable, Sequence
-from dataclasses import dataclass
+from collections.abc import Iterator, Sequence
 
 import numpy as np
 
-from roadgeo.evaluation.scoring import Calibration, Evaluation, OddsStep, Score, Share, Spread, Summary
+from roadgeo._arrays import FloatArray
+from roadgeo.evaluation.scoring import Evaluation, Score, Share, Spread, Summary
 from roadgeo.evaluation.truth import Truth
+from roadgeo.geometry.projection import transformer
+from roadgeo.matching.index import ReferenceIndex
+from roadgeo.outputs.drawing.layers import Layer, Ring
+from roadgeo.outputs.drawing.views import Window, map_layer
+from roadgeo.outputs.names import table_cell
+from roadgeo.outputs.report.page import footer, render_page, section
+from roadgeo.outputs.report.viewer import draw_viewer, window_data
 
-__all__ = ["TITLES", "render_report"]
+__all__ = ["HEADS", "TITLES", "masks_to_csv", "render_report", "summarize_group", "verdicts"]
 
 TITLES = {
     "kind": "Kind of mask",
@@ -22,78 +31,113 @@ TITLES = {
     "density_km2": "Intersections per km²",
 }
 
-_NOTE = (
-    "In brackets: 95 % confidence (Wilson). Metres and milliseconds: median / 95 %; errors of masks located rightly,"
-    " time of vectorizing, matching and refining. Refused: of the masks that have no place on the map."
-)
+#: Heads of `summarize_group`.
+HEADS = ("", "masks", "precision %", "recall %", "refused", "centre m", "corners m", "ms")
 
-_BLUE, _ORANGE, _GREEN, _RED, _GREY = "#1f6fb4", "#e4572e", "#2e8b57", "#c62828", "#9aa0a6"
-_OUTCOMES = {"right": _GREEN, "wrong": _RED, "ambiguous": _ORANGE, "not located": _GREY}
+_NOTE = "In brackets: 95 % confidence. Metres, ms: median/95 %."
+_OUTCOMES = ("right", "wrong", "ambiguous", "not_located")
 
-#: Order of the masks that were lost, and how many of them are named.
-_LOST = ["wrong", "ambiguous", "not located"]
-_MOST_LOST = 200
-
-_PAGE = """<!DOCTYPE html>
-<html lang="en">
-<head>
-<meta charset="utf-8">
-<meta name="viewport" content="width=device-width, initial-scale=1">
-<title>{title}</title>
-<style>
-:root {{ color-scheme: light; }}
-body {{ font: 15px/1.5 system-ui, sans-serif; color: #262a30; background: #f7f6f3; margin: 0; }}
-main {{ max-width: 1080px; margin: 0 auto; padding: 1.2rem; }}
-h1 {{ font-size: 1.5rem; margin: .2rem 0; }} h2 {{ font-size: 1.1rem; margin: 1.8rem 0 .4rem; }}
-p, figcaption {{ max-width: 46rem; }} figcaption, .faint {{ color: #5f666e; font-size: .87rem; }}
-.tiles {{ display: grid; grid-template-columns: repeat(auto-fit, minmax(140px, 1fr)); gap: .6rem; margin: 1rem 0; }}
-.tile {{ background: #fff; border: 1px solid #e2e0da; border-radius: 8px; padding: .6rem .8rem; }}
-.tile b {{ display: block; font-size: 1.35rem; font-variant-numeric: tabular-nums; }}
-.scroll {{ overflow-x: auto; }}
-table {{ border-collapse: collapse; background: #fff; font-size: .88rem; font-variant-numeric: tabular-nums; }}
-th, td {{ border: 1px solid #e2e0da; padding: .25rem .55rem; text-align: right; white-space: nowrap; }}
-th:first-child, td:first-child {{ text-align: left; }} thead th {{ background: #efede7; }}
-td.words {{ text-align: left; white-space: normal; min-width: 20rem; }}
-.charts {{ display: grid; grid-template-columns: repeat(auto-fit, minmax(min(100%, 430px), 1fr)); gap: 1rem; }}
-figure {{ margin: 0; background: #fff; border: 1px solid #e2e0da; border-radius: 8px; padding: .6rem; }}
-svg {{ width: 100%; height: auto; display: block; }} svg text {{ font: 12px system-ui, sans-serif; fill: #40464d; }}
-</style>
-</head>
-<body><main>
-<h1>{title}</h1>
-{body}
-</main></body>
-</html>
-"""
+#: Masks that are named on the page, vertices of the map's roads on it, and the width it is first drawn for.
+_MOST_LOST, _VERTICES, _VIEW_PX, _MARGIN = 200, 80_000, 900, 0.05
 
 
-def render_report(evaluation: Evaluation, truths: Sequence[Truth], title: str) -> str:
+# --- words and tables -------------------------------------------------------------------------------------------------
+
+
+def summarize_group(group: Summary) -> list[str]:
+    """Return what `HEADS` name of a group of masks: shares with their intervals, median and 95th percentile."""
+    return [
+        group.name,
+        str(group.queries),
+        _percent(group.precision),
+        _percent(group.recall),
+        f"{group.refused.hits}/{group.refused.of}" if group.refused.of else "-",
+        _pair(group.center_m, 1),
+        _pair(group.corners_rms_m, 1),
+        _pair(group.compute_s, 0, 1000),
+    ]
+
+
+def verdicts(evaluation: Evaluation) -> Iterator[str]:
+    """Describe the numbers in the tables, and whether scores and standard deviations hold."""
+    yield _NOTE
+    broken = [step for step in evaluation.odds if not step.holds]
+    surest = next((step for step in reversed(evaluation.odds) if step.wrong.of), None)
+    if broken:
+        step = broken[0]
+        wrong = f"{step.wrong.hits} of {step.wrong.of}"
+        yield f"Odds promise too much: {wrong} located at 10^{step.at_least:g} or more are wrong."
+    elif surest is not None:
+        located = evaluation.odds[0].wrong
+        yield f"Odds hold: {located.hits} of {located.of} located masks are wrong, no count contradicts them."
+    if evaluation.sigma.within_1.of:
+        robust = f"robustly {evaluation.sigma.robust:.2f}"
+        yield f"Corner errors are {evaluation.sigma.rms:.2f} times what is claimed ({robust})."
+
+
+def _percent(estimate: Share) -> str:
+    if not estimate.of:
+        return "-"
+    return f"{100 * estimate.value:.3g} ({100 * estimate.low:.0f}-{100 * estimate.high:.0f})"
+
+
+def _pair(spread: Spread, digits: int, scale: float = 1.0) -> str:
+    """Median and 95th percentile."""
+    if math.isnan(spread.median):
+        return "-"
+    return f"{scale * spread.median:.{digits}f}/{scale * spread.p95:.{digits}f}"
+
+
+def _outcome(entry: Score) -> str:
+    """One of `_OUTCOMES`; a mask without a place is right where it is not located."""
+    if entry.right or (not entry.on_map and not entry.located):
+        return "right"
+    return "wrong" if entry.located else "ambiguous" if entry.status == "ambiguous" else "not_located"
+
+
+def masks_to_csv(evaluation: Evaluation) -> str:
+    """Return a table of all masks: what each is, how it fared, and why."""
+    names = list(dict.fromkeys(name for entry in evaluation.scores for name in entry.properties))
+    text = io.StringIO()
+    table = csv.writer(text, lineterminator="\n")
+    own = ["file", "kind", "on_map", "status", "outcome", "center_m", "corners_rms_m", "log10_odds", "compute_s"]
+    table.writerow([*own, "reason", *names])
+    for entry in evaluation.scores:
+        numbers = (entry.center_m, entry.corners_rms_m, entry.log10_odds, entry.compute_s)
+        cells = [table_cell(entry.file), entry.kind, entry.on_map, entry.status, _outcome(entry)]
+        cells += ["" if math.isnan(number) else f"{number:.6g}" for number in numbers]
+        table.writerow([*cells, table_cell(entry.reason), *(entry.properties.get(name, "") for name in names)])
+    return text.getvalue()
+
+
+# --- the page ---------------------------------------------------------------------------------------------------------
+
+
+def render_report(
+    evaluation: Evaluation, truths: Sequence[Truth], title: str, indexes: Sequence[ReferenceIndex] = ()
+) -> str:
     """Render an evaluation as a whole HTML page.
 
     Parameters
     ----------
     truths : sequence of Truth
         In the order of `evaluation.scores`; for the map.
+    indexes : sequence of ReferenceIndex, optional
+        The map, or its parts that the masks lie on, to draw its roads.
     """
     settings = ", ".join(f"{name} {_text(value)}" for name, value in evaluation.settings.items())
-    parts = [f'<p class="faint">{html.escape(settings)}</p>', _tiles(evaluation)]
-    for by, table in evaluation.breakdowns.items():
-        parts.append(f"<h2>{TITLES[by]}</h2>{_summary_table([*table, evaluation.total] if by == 'kind' else table)}")
-    parts.append(f'<p class="faint">{_NOTE}</p>')
-    parts.append(_lost_table(evaluation.scores))
-    charts = [
-        *(_share_chart(by, table) for by, table in evaluation.breakdowns.items() if len(table) > 1),
-        _odds_chart(evaluation.odds),
-        _sigma_chart(evaluation.scores, evaluation.sigma),
-        _error_chart(evaluation.scores),
-        _time_chart(evaluation.scores),
-        _map(evaluation.scores, truths),
-    ]
-    parts.append(f'<h2>Charts</h2><div class="charts">{"".join(charts)}</div>')
-    return _PAGE.format(title=html.escape(title), body="\n".join(parts))
-
-
-# --- words and numbers ------------------------------------------------------------------------------------------------
+    header = f"<h1>{html.escape(title)}</h1><p>{html.escape(settings)}</p>"
+    parts = ["".join(f"<p>{html.escape(line)}</p>" for line in verdicts(evaluation))]
+    for by, groups in evaluation.breakdowns.items():
+        rows = [summarize_group(group) for group in ([*groups, evaluation.total] if by == "kind" else groups)]
+        parts.append(section(TITLES[by], _table(HEADS, rows)))
+    parts.append(section("Masks that were lost", _lost(evaluation.scores)))
+    attribution = "; ".join(
+        dict.fromkeys(filter(None, (str(index.meta.get("attribution") or "") for index in indexes)))
+    )
+    parts.append(footer(attribution))
+    view = _draw_map(evaluation.scores, truths, indexes, attribution)
+    return render_page(title, header, f"<main>{view}<aside>{''.join(parts)}</aside></main>")
 
 
 def _text(value: object) -> str:
@@ -104,292 +148,55 @@ def _text(value: object) -> str:
     return f"{value:g}" if isinstance(value, float) else str(value)
 
 
-def _percent(estimate: Share) -> str:
-    if not estimate.of:
-        return "–"
-    return f"{100 * estimate.value:.1f} % <small>({100 * estimate.low:.1f}–{100 * estimate.high:.1f})</small>"
+def _table(heads: Sequence[str], rows: Sequence[Sequence[str]]) -> str:
+    head = "".join(f'<th scope="col">{html.escape(name)}</th>' for name in heads)
+    body = "".join("<tr>" + "".join(f"<td>{html.escape(cell)}</td>" for cell in row) + "</tr>" for row in rows)
+    return f'<div class="scroll" tabindex="0"><table><thead><tr>{head}</tr></thead><tbody>{body}</tbody></table></div>'
 
 
-def _number(value: float, digits: int = 1) -> str:
-    return "–" if math.isnan(value) else f"{value:.{digits}f}"
-
-
-def _spread(spread: Spread, scale: float = 1.0, digits: int = 1) -> str:
-    return f"{_number(scale * spread.median, digits)} / {_number(scale * spread.p95, digits)}"
-
-
-def _tiles(evaluation: Evaluation) -> str:
-    total = evaluation.total
-    tiles = [
-        ("precision", _percent(total.precision)),
-        ("recall", _percent(total.recall)),
-        ("centre error, median", f"{_number(total.center_m.median)} m"),
-        ("corners rms, 95 %", f"{_number(total.corners_rms_m.p95)} m"),
-        ("time per mask, median", f"{_number(1000 * total.compute_s.median, 0)} ms"),
-        ("error / claimed sigma", _number(evaluation.sigma.rms, 2)),
-    ]
-    shown = "".join(f'<div class="tile">{name}<b>{value}</b></div>' for name, value in tiles)
-    return f'<div class="tiles">{shown}</div>'
-
-
-def _summary_table(table: Sequence[Summary]) -> str:
-    heads = ["", "masks", "located", "ambiguous", "precision", "recall", "centre, m", "corners, m", "time, ms"]
-    absent = any(group.refused.of for group in table)
-    if absent:
-        heads.append("refused")
-    rows = []
-    for group in table:
-        cells = [
-            html.escape(group.name),
-            str(group.queries),
-            str(group.located),
-            str(group.ambiguous),
-            _percent(group.precision),
-            _percent(group.recall),
-            _spread(group.center_m),
-            _spread(group.corners_rms_m),
-            _spread(group.compute_s, 1000, 0),
-        ]
-        if absent:
-            cells.append(f"{group.refused.hits}/{group.refused.of}" if group.refused.of else "–")
-        rows.append("<tr>" + "".join(f"<td>{cell}</td>" for cell in cells) + "</tr>")
-    head = "".join(f"<th>{name}</th>" for name in heads)
-    return f'<div class="scroll"><table><thead><tr>{head}</tr></thead><tbody>{"".join(rows)}</tbody></table></div>'
-
-
-def _lost_table(scores: Sequence[Score]) -> str:
+def _lost(scores: Sequence[Score]) -> str:
     """Name the masks that were not located rightly, wrong ones first, and why not."""
-    lost = sorted((s for s in scores if _outcome(s) != "right"), key=lambda s: _LOST.index(_outcome(s)))
+    lost = [entry for outcome in _OUTCOMES[1:] for entry in scores if _outcome(entry) == outcome]
     if not lost:
-        return "<h2>Masks that were lost</h2><p>None.</p>"
-    rows = []
-    for entry in lost[:_MOST_LOST]:
-        cells = [
-            html.escape(entry.file),
-            _outcome(entry),
+        return "<p>None.</p>"
+    rows = [
+        [
+            entry.file,
+            _outcome(entry).replace("_", " "),
             _number(entry.center_m),
             _number(entry.log10_odds),
-            _number(entry.properties.get("n_intersections", math.nan), 0),
-            _number(entry.properties.get("tilt_deg", math.nan), 0),
-            _number(1000 * entry.compute_s, 0),
+            entry.reason,
         ]
-        reason = f'<td class="words">{html.escape(entry.reason)}</td>'
-        rows.append("<tr>" + "".join(f"<td>{cell}</td>" for cell in cells) + reason + "</tr>")
-    heads = ["", "outcome", "centre, m", "log10 odds", "intersections", "tilt, °", "time, ms", "reason given"]
-    head = "".join(f"<th>{name}</th>" for name in heads)
-    more = f"<p>And {len(lost) - _MOST_LOST} more; see evaluation.json.</p>" if len(lost) > _MOST_LOST else ""
-    return (
-        f'<h2>Masks that were lost</h2><div class="scroll"><table><thead><tr>{head}</tr></thead>'
-        f"<tbody>{''.join(rows)}</tbody></table></div>{more}"
-    )
-
-
-# --- charts -----------------------------------------------------------------------------------------------------------
-
-_WIDTH, _HEIGHT, _LEFT, _RIGHT, _TOP, _BOTTOM = 460, 300, 52, 12, 24, 46
-
-
-@dataclass(frozen=True)
-class _Plane:
-    """A chart's frame: its ranges; the SVG drawn before is put between `open` and `close`."""
-
-    x: tuple[float, float]
-    y: tuple[float, float]
-
-    def at(self, x: float, y: float) -> tuple[float, float]:
-        """SVG position of a value, kept inside the frame."""
-        across = min(max((x - self.x[0]) / (self.x[1] - self.x[0]), 0.0), 1.0)
-        up = min(max((y - self.y[0]) / (self.y[1] - self.y[0]), 0.0), 1.0)
-        return _LEFT + across * (_WIDTH - _LEFT - _RIGHT), _HEIGHT - _BOTTOM - up * (_HEIGHT - _TOP - _BOTTOM)
-
-    def line(self, xs: Sequence[float], ys: Sequence[float], color: str, dash: str = "") -> str:
-        """Polyline through values."""
-        points = " ".join("{:.1f},{:.1f}".format(*self.at(x, y)) for x, y in zip(xs, ys, strict=True))
-        return f'<polyline points="{points}" fill="none" stroke="{color}" stroke-width="2" stroke-dasharray="{dash}"/>'
-
-    def whisker(self, x: float, low: float, value: float, high: float, color: str, shift: float = 0.0) -> str:
-        """Dot with its interval, `shift` pixels aside."""
-        (px, top), (_, middle), (_, bottom) = (self.at(x, v) for v in (high, value, low))
-        px += shift
-        return (
-            f'<line x1="{px:.1f}" x2="{px:.1f}" y1="{top:.1f}" y2="{bottom:.1f}" stroke="{color}" stroke-width="2"/>'
-            f'<circle cx="{px:.1f}" cy="{middle:.1f}" r="4" fill="{color}"/>'
-        )
-
-    def frame(
-        self,
-        x_ticks: Sequence[tuple[float, str]],
-        y_ticks: Sequence[tuple[float, str]],
-        x_label: str,
-        legend: Sequence[tuple[str, str]],
-    ) -> str:
-        """Grid, tick labels, axis label and legend."""
-        parts = []
-        for y, label in y_ticks:
-            px, py = self.at(self.x[0], y)
-            parts.append(f'<line x1="{px}" x2="{_WIDTH - _RIGHT}" y1="{py:.1f}" y2="{py:.1f}" stroke="#e8e6e0"/>')
-            parts.append(f'<text x="{px - 6}" y="{py + 4:.1f}" text-anchor="end">{html.escape(label)}</text>')
-        for x, label in x_ticks:
-            px, py = self.at(x, self.y[0])
-            parts.append(f'<text x="{px:.1f}" y="{py + 17:.1f}" text-anchor="middle">{html.escape(label)}</text>')
-        middle = (_LEFT + _WIDTH - _RIGHT) / 2
-        parts.append(f'<text x="{middle}" y="{_HEIGHT - 8}" text-anchor="middle">{html.escape(x_label)}</text>')
-        at = float(_LEFT)
-        for label, color in legend:
-            parts.append(f'<rect x="{at}" y="5" width="11" height="11" fill="{color}"/>')
-            parts.append(f'<text x="{at + 15}" y="15">{html.escape(label)}</text>')
-            at += 30 + 6.6 * len(label)
-        return "".join(parts)
-
-
-def _figure(title: str, svg: str, caption: str, height: float = _HEIGHT) -> str:
-    name = html.escape(title)
-    return (
-        f'<figure><b>{name}</b><svg viewBox="0 0 {_WIDTH} {height:.0f}" role="img" aria-label="{name}">{svg}</svg>'
-        f"<figcaption>{html.escape(caption)}</figcaption></figure>"
-    )
-
-
-_SHARES = [(value / 4, f"{25 * value} %") for value in range(5)]
-
-
-def _share_chart(by: str, table: Sequence[Summary]) -> str:
-    plane = _Plane((-0.5, len(table) - 0.5), (0.0, 1.0))
-    dots = [
-        plane.frame(
-            [(i, g.name) for i, g in enumerate(table)], _SHARES, TITLES[by], [("precision", _BLUE), ("recall", _ORANGE)]
-        )
+        for entry in lost[:_MOST_LOST]
     ]
-    for i, group in enumerate(table):
-        for estimate, color, shift in ((group.precision, _BLUE, -6.0), (group.recall, _ORANGE, 6.0)):
-            if estimate.of:
-                dots.append(plane.whisker(i, estimate.low, estimate.value, estimate.high, color, shift))
-    return _figure(f"Precision and recall: {TITLES[by].lower()}", "".join(dots), "Bars: 95 % confidence.")
+    more = f"<p>And {len(lost) - _MOST_LOST} more; see masks.csv.</p>" if len(lost) > _MOST_LOST else ""
+    return _table(("", "outcome", "centre m", "score", "reason given"), rows) + more
 
 
-def _odds_chart(steps: Sequence[OddsStep]) -> str:
-    known = [step for step in steps if step.wrong.of]
-    limit = max((step.at_least for step in known), default=1.0) or 1.0
-    plane = _Plane((0.0, limit), (-4.0, 0.0))
-
-    def log(value: float) -> float:
-        return math.log10(max(value, 1e-4))
-
-    fine = np.linspace(0.0, limit, 60).tolist()
-    parts = [
-        plane.frame(
-            [(step.at_least, f"{step.at_least:g}") for step in known],
-            [(k, f"{10.0 ** (k + 2):g} %") for k in range(-4, 1)],
-            "located at log10 odds of at least",
-            [("wrong", _BLUE), ("promised at most", _GREY)],
-        ),
-        plane.line(fine, [log(1 / (1 + 10**x)) for x in fine], _GREY, "5 4"),
-    ]
-    parts += [plane.whisker(s.at_least, log(s.wrong.low), log(s.wrong.value), log(s.wrong.high), _BLUE) for s in known]
-    worst = [f"{step.at_least:g}" for step in known if not step.holds]
-    verdict = f"The count contradicts the odds at {', '.join(worst)}." if worst else "No count contradicts the odds."
-    return _figure(
-        "Do the odds mean what they say?", "".join(parts), f"Share of wrong ones, 95 % confidence. {verdict}"
-    )
-
-
-def _sigma_chart(scores: Sequence[Score], calibration: Calibration) -> str:
-    ratios = [
-        error / sigma
-        for s in scores
-        if s.right
-        for error, sigma in zip(s.corners_m, s.sigma_m, strict=True)
-        if sigma > 0 and math.isfinite(error)
-    ]
-    fine = np.linspace(0.0, 4.0, 80).tolist()
-    plane = _Plane((0.0, 4.0), (0.0, 1.0))
-    svg = (
-        plane.frame(
-            [(k, str(k)) for k in range(5)], _SHARES, "corner error / claimed", [("measured", _BLUE), ("honest", _GREY)]
-        )
-        + plane.line(fine, [1 - math.exp(-x * x) for x in fine], _GREY, "5 4")
-        + _cumulative(plane, ratios, _BLUE)
-    )
-    caption = f"Corner errors in units of sigma: rms {_number(calibration.rms, 2)}, 1 is honest."
-    return _figure("Do the standard deviations mean what they say?", svg, caption)
-
-
-def _error_chart(scores: Sequence[Score]) -> str:
-    right = [s for s in scores if s.right]
-    limit = max([2.0, *(s.corners_rms_m for s in right)])
-    return _log_chart(
-        "Errors of masks located rightly",
-        "metres",
-        (0.1, limit),
-        [("centre", _BLUE, [s.center_m for s in right]), ("corners, rms", _ORANGE, [s.corners_rms_m for s in right])],
-        lambda value: f"{value:g}",
-    )
-
-
-def _time_chart(scores: Sequence[Score]) -> str:
-    seconds = [s.compute_s for s in scores if s.seconds]
-    return _log_chart(
-        "Time per mask",
-        "vectorize + match + refine",
-        (0.01, max([1.0, *seconds])),
-        [("all masks", _BLUE, seconds)],
-        lambda value: f"{value:g} s" if value >= 1 else f"{1000 * value:g} ms",
-    )
-
-
-def _log_chart(
-    title: str,
-    label: str,
-    limits: tuple[float, float],
-    curves: Sequence[tuple[str, str, Sequence[float]]],
-    words: Callable[[float], str],
-) -> str:
-    """Draw cumulative shares over a logarithmic axis."""
-    low, high = math.log10(limits[0]), math.ceil(math.log10(limits[1]))
-    plane = _Plane((low, max(high, low + 1)), (0.0, 1.0))
-    ticks = [(k, words(10.0**k)) for k in range(math.ceil(low), int(plane.x[1]) + 1)]
-    svg = plane.frame(ticks, _SHARES, label, [(name, color) for name, color, _ in curves])
-    for _, color, values in curves:
-        svg += _cumulative(plane, [math.log10(max(value, limits[0])) for value in values], color)
-    return _figure(title, svg, "Share of masks with at most this much.")
-
-
-def _cumulative(plane: _Plane, values: Sequence[float], color: str) -> str:
-    xs = sorted(values)
-    n = len(xs)
-    return plane.line([plane.x[0], *xs, plane.x[1]], [0.0, *((i + 1) / n for i in range(n)), 1.0], color) if n else ""
-
-
-def _outcome(entry: Score) -> str:
-    if entry.right or (not entry.on_map and not entry.located):
-        return "right"
-    if entry.located:
-        return "wrong"
-    return "ambiguous" if entry.status == "ambiguous" else "not located"
-
-
-def _map(scores: Sequence[Score], truths: Sequence[Truth]) -> str:
-    shown = [(entry, truth) for entry, truth in zip(scores, truths, strict=True) if truth.on_map]
-    if not shown:
+def _draw_map(scores: Sequence[Score], truths: Sequence[Truth], indexes: Sequence[ReferenceIndex], credit: str) -> str:
+    """Draw where the masks lie, by outcome, over the roads of the map; nothing where none has a place."""
+    there = [(entry, truth) for entry, truth in zip(scores, truths, strict=True) if truth.on_map]
+    if not there:
         return ""
-    corners = np.concatenate([truth.footprint for _, truth in shown])
-    low, size = corners.min(axis=0), np.ptp(corners, axis=0).max()
-    scale = (_WIDTH - 20) / size
-    height = np.ptp(corners[:, 1]) * scale + 40
-    parts = []
-    for name in ("not located", "right", "ambiguous", "wrong"):
-        for entry, truth in shown:
-            if _outcome(entry) == name:
-                points = (truth.footprint - low) * (scale, -scale) + (10, height - 10)
-                path = " ".join(f"{x:.1f},{y:.1f}" for x, y in points)
-                color = _OUTCOMES[name]
-                style = f'fill="{color}" fill-opacity=".12" stroke="{color}"'
-                name_of = html.escape(f"{entry.file}: {name}")
-                parts.append(f'<polygon points="{path}" {style}><title>{name_of}</title></polygon>')
-    at = 10.0
-    for name, color in _OUTCOMES.items():
-        parts.append(
-            f'<rect x="{at}" y="5" width="11" height="11" fill="{color}"/><text x="{at + 15}" y="15">{name}</text>'
-        )
-        at += 30 + 6.6 * len(name)
-    return _figure("Where the masks lie", "".join(parts), "Footprints, north up.", height)
+    crs = indexes[0].plane.crs if indexes else there[0][1].crs
+    rings = [_footprint(truth, crs) for _, truth in there]
+    window = Window.around(np.concatenate(rings), _MARGIN)
+    roads = [mark for index in indexes for mark in map_layer(index, window, window, _VERTICES).marks]
+    layers = [Layer("map-roads", "roads of the map", roads)]
+    for outcome in _OUTCOMES:
+        name = outcome.replace("_", " ")
+        marks = [
+            Ring(window.place(ring), title=f"{entry.file}: {name}")
+            for (entry, _), ring in zip(there, rings, strict=True)
+            if _outcome(entry) == outcome
+        ]
+        layers.append(Layer(outcome, name, marks))
+    data = window_data(window, _VIEW_PX)
+    return draw_viewer("Where the masks lie", window.box, layers, data, scale=True, credit=credit)
+
+
+def _footprint(truth: Truth, crs: str | None) -> FloatArray:
+    """Return the footprint (4, 2) of a mask in a CRS."""
+    if truth.crs is None or crs is None or truth.crs == crs:
+        return truth.footprint
+    return np.column_stack(transformer(truth.crs, crs).transform(*truth.footprint.T))

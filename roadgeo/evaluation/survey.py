@@ -24,10 +24,11 @@ from roadgeo.evaluation.localizability import (
 from roadgeo.evaluation.scoring import score, share
 from roadgeo.evaluation.simulation import SimulationOptions, footprint_area
 from roadgeo.evaluation.trials import DrawnMasks, PlacedMasks, QuerySet, ReferenceLocator, Trial, run_trials
+from roadgeo.outputs.drawing.raster import write_png
 from roadgeo.outputs.registry import LOCALIZABILITY
 from roadgeo.reference.network_file import read_network
 from roadgeo.roads.network import RoadNetwork
-from roadgeo.storage.files import write_bytes, write_text
+from roadgeo.storage.files import replacing, write_bytes, write_text
 
 __all__ = ["ANY", "Survey", "write_survey"]
 
@@ -148,7 +149,8 @@ def write_survey(
     files = [out_dir / f"{stem}{suffix}" for suffix in (".tif", ".qml", ".png", ".json")]
     write_bytes(files[0], to_geotiff(found))
     write_text(files[1], to_qml())
-    write_bytes(files[2], draw_localizability(network, found, title))
+    with replacing(files[2]) as temporary:
+        write_png(temporary, draw_localizability(network, found, title))
     summary = {**survey.summarize(found), "settings": survey.settings, **(told or {})}
     write_text(files[3], json.dumps(summary, indent=1) + "\n")
     return summary, files

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import math
 from dataclasses import dataclass, replace
 from pathlib import Path
 
@@ -20,6 +19,8 @@ from roadgeo.outputs.drawing.raster import (
     Canvas,
     blank,
     draw_legend,
+    draw_plate,
+    draw_scale_bar,
     fixed_point,
     write_png,
     write_text,
@@ -82,7 +83,7 @@ def draw_overlay(subject: Shown, options: PlotOptions | None = None) -> AnyArray
     layers = [layer for layer in place_layers(subject, place, window) if layer.name in STILL]
     canvas.draw(layers)
     top = round(options.map_px * 0.075)
-    _draw_scale_bar(canvas, top)
+    draw_scale_bar(canvas, top // 4)
     _draw_north(canvas.image, top)
     # The frame beside it, title and legend around both.
     height, width = canvas.image.shape[:2]
@@ -148,31 +149,10 @@ def _draw_view(subject: Shown, layers: list[Layer], scale: float) -> AnyArray:
 # --- on the map -------------------------------------------------------------------------------------------------------
 
 
-def _draw_scale_bar(canvas: Canvas, top: int) -> None:
-    image = canvas.image
-    height, width = image.shape[:2]
-    room = 0.22 * width / canvas.scale
-    power = 10.0 ** math.floor(math.log10(room))
-    length = next(step * power for step in (5.0, 2.0, 1.0) if step * power <= room)
-    text = f"{length:g} m" if length < 1000 else f"{length / 1000:g} km"
-    size = top // 4
-    left, bar, y = round(width * 0.025), round(length * canvas.scale), height - round(top * 0.3)
-    _draw_plate(image, (left - 14, y - 2 * size - 6), (left + bar + 14, y + 16))
-    cv2.rectangle(image, (left, y), (left + bar, y + 5), INK, -1)
-    cv2.rectangle(image, (left + bar // 2, y + 1), (left + bar - 1, y + 4), LIT, -1)
-    write_text(image, text, (left, y - size // 2), size, INK)
-
-
 def _draw_north(image: AnyArray, top: int) -> None:
     width, size = image.shape[1], top // 4
     x, y = width - 2 * size, round(2.2 * size)
-    _draw_plate(image, (x - round(1.3 * size), y - round(1.8 * size)), (width - size // 2, y + round(2.6 * size)))
+    draw_plate(image, (x - round(1.3 * size), y - round(1.8 * size)), (width - size // 2, y + round(2.6 * size)))
     arrow = np.array([[x, y - 1.4 * size], [x + 0.8 * size, y + size], [x, y + 0.5 * size], [x - 0.8 * size, y + size]])
     cv2.fillPoly(image, [fixed_point(arrow)], INK, cv2.LINE_AA, SHIFT)
     write_text(image, "N", (x - round(0.36 * size), y + round(2.2 * size)), size, INK, bold=True)
-
-
-def _draw_plate(image: AnyArray, first: tuple[int, int], last: tuple[int, int]) -> None:
-    """Lighten a rectangle, so that what is written there stands out from the roads."""
-    part = image[max(first[1], 0) : last[1], max(first[0], 0) : last[0]]
-    part[...] = (part * 0.15 + np.array(LIT) * 0.85).astype(np.uint8)

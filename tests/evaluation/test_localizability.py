@@ -128,4 +128,4 @@ def test_outputs_are_where_they_belong():
         assert raster.read(2).max() <= 100
         assert raster.count == 2
     assert "would be located" in to_qml()
-    assert draw_localizability(network(), found, "Town").startswith(b"\x89PNG")
+    assert draw_localizability(network(), found, "Town").std() > 10

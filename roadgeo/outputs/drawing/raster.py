@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
@@ -13,7 +14,10 @@ from roadgeo._arrays import AnyArray, FloatArray
 from roadgeo.errors import OutputError
 from roadgeo.outputs.drawing.layers import LOOKS, Box, Color, Dots, Layer, Lines, Look, Picture, Ring, rgb
 
-__all__ = ["FAINT", "INK", "LIT", "SHIFT", "Canvas", "blank", "draw_legend", "fixed_point", "write_png", "write_text"]
+__all__ = [
+    "FAINT", "INK", "LIT", "SHIFT", "Canvas", "blank", "draw_legend", "draw_plate", "draw_scale_bar", "fixed_point",
+    "write_png", "write_text",
+]  # fmt: skip
 
 LIT, INK, FAINT = (255, 255, 255), rgb("ink"), rgb("faint")
 
@@ -158,6 +162,27 @@ def draw_legend(image: AnyArray, layers: Sequence[Layer], x: int, baseline: int,
             end = x + round(2.5 * size)
             cv2.line(image, (x + 4, middle), (end - size // 2, middle), rgb(look.color), width, cv2.LINE_AA)
         x = write_text(image, layer.label, (end, baseline), size, INK) + round(1.4 * size)
+
+
+def draw_scale_bar(canvas: Canvas, size: int) -> None:
+    """Draw a scale bar, its letters `size` pixels high, in the lower left corner of a canvas whose unit is a metre."""
+    image = canvas.image
+    height, width = image.shape[:2]
+    room = 0.22 * width / canvas.scale
+    power = 10.0 ** math.floor(math.log10(room))
+    length = next(step * power for step in (5.0, 2.0, 1.0) if step * power <= room)
+    text = f"{length:g} m" if length < 1000 else f"{length / 1000:g} km"
+    left, bar, y = round(width * 0.025), round(length * canvas.scale), height - round(1.2 * size)
+    draw_plate(image, (left - 14, y - 2 * size - 6), (left + bar + 14, y + 16))
+    cv2.rectangle(image, (left, y), (left + bar, y + 5), INK, -1)
+    cv2.rectangle(image, (left + bar // 2, y + 1), (left + bar - 1, y + 4), LIT, -1)
+    write_text(image, text, (left, y - size // 2), size, INK)
+
+
+def draw_plate(image: AnyArray, first: tuple[int, int], last: tuple[int, int]) -> None:
+    """Lighten a rectangle, so that what is written there stands out from the roads."""
+    part = image[max(first[1], 0) : last[1], max(first[0], 0) : last[0]]
+    part[...] = (part * 0.15 + np.array(LIT) * 0.85).astype(np.uint8)
 
 
 def write_png(path: Path, image: AnyArray) -> None:
