@@ -77,7 +77,8 @@ def evaluate_command(
 
     Without --queries the masks are drawn as `roadgeo simulate` draws them. With --out-dir the folder gets
     evaluation.json, masks.csv, report.html and trials.jsonl, from which the same command goes on when it was
-    interrupted. A table of your own needs the columns file, crs, width, height and h00 to h22, the homography from pixels to the CRS.
+    interrupted. A table of your own needs the columns file, crs, width, height and h00 to h22, the homography from
+    pixels to the CRS.
 
     With --map masks are tried all over the map (-n of them, by default 600), and REF_localizability.tif (styled in
     QGIS), .png and .json show where they would be located, may be ambiguous, or show too few intersections.
@@ -304,14 +305,12 @@ def _table(title: str, groups: Sequence[Summary]) -> Table:
     from rich.markup import escape
     from rich.table import Table
 
-    from roadgeo.evaluation.report import HEADS, summarize_group
+    from roadgeo.evaluation.report import summary_table
 
     table = Table(title=title, title_justify="left", box=SIMPLE_HEAD, pad_edge=False, padding=(0, 1, 0, 0))
-    absent = any(group.refused.of for group in groups)
-    shown = [k for k, head in enumerate(HEADS) if head != "refused" or absent]
-    for k in shown:
-        table.add_column(HEADS[k], justify="right" if HEADS[k] else "left", no_wrap=True)
-    for group in groups:
-        cells = summarize_group(group)
-        table.add_row(*(escape(visible(cells[k])) for k in shown))
+    heads, rows = summary_table(groups)
+    for head in heads:
+        table.add_column(head, justify="right" if head else "left", no_wrap=True)
+    for cells in rows:
+        table.add_row(*(escape(visible(cell)) for cell in cells))
     return table

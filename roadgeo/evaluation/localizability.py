@@ -341,7 +341,7 @@ def draw_localizability(network: RoadNetwork, found: LocalizabilityMap, title: s
     canvas = Canvas.of(box, longer_px, longer_px)
     lines = [(line - (grid.west, grid.north)) * (1.0, -1.0) for line in network.graph.polylines()]
     classes = np.array([colors[value] for value in range(len(PALETTE))], np.uint8)[found.classes]
-    canvas.draw([Layer("picture", "", [Picture(classes, box)]), Layer("way", "", [Lines(lines)])])
+    canvas.draw([Layer("picture", "", [Picture(classes, box)]), Layer("streets", "", [Lines(lines)])])
     draw_scale_bar(canvas, 22)
     top, bottom = 84, 36
     height, width = canvas.image.shape[:2]

@@ -21,7 +21,7 @@ from roadgeo.outputs.names import table_cell
 from roadgeo.outputs.report.page import footer, render_page, section
 from roadgeo.outputs.report.viewer import draw_viewer, window_data
 
-__all__ = ["HEADS", "TITLES", "masks_to_csv", "render_report", "summarize_group", "verdicts"]
+__all__ = ["TITLES", "masks_to_csv", "render_report", "summary_table", "verdicts"]
 
 TITLES = {
     "kind": "Kind of mask",
@@ -30,9 +30,6 @@ TITLES = {
     "gsd_m": "Ground sampling, m per pixel",
     "density_km2": "Intersections per km²",
 }
-
-#: Heads of `summarize_group`.
-HEADS = ("", "masks", "precision %", "recall %", "refused", "centre m", "corners m", "ms")
 
 _NOTE = "In brackets: 95 % confidence. Metres, ms: median/95 %."
 _OUTCOMES = ("right", "wrong", "ambiguous", "not_located")
@@ -44,18 +41,27 @@ _MOST_LOST, _VERTICES, _VIEW_PX, _MARGIN = 200, 80_000, 900, 0.05
 # --- words and tables -------------------------------------------------------------------------------------------------
 
 
-def summarize_group(group: Summary) -> list[str]:
-    """Return what `HEADS` name of a group of masks: shares with their intervals, median and 95th percentile."""
-    return [
-        group.name,
-        str(group.queries),
-        _percent(group.precision),
-        _percent(group.recall),
-        f"{group.refused.hits}/{group.refused.of}" if group.refused.of else "-",
-        _pair(group.center_m, 1),
-        _pair(group.corners_rms_m, 1),
-        _pair(group.compute_s, 0, 1000),
+def summary_table(groups: Sequence[Summary]) -> tuple[list[str], list[list[str]]]:
+    """Return the heads and the rows of a table of groups: shares with their intervals, median and 95th percentile.
+
+    Where every mask has a place, no column counts those that were rightly refused.
+    """
+    absent = any(group.refused.of for group in groups)
+    heads = ["", "masks", "precision %", "recall %", *(["refused"] if absent else []), "centre m", "corners m", "ms"]
+    rows = [
+        [
+            group.name,
+            str(group.queries),
+            _percent(group.precision),
+            _percent(group.recall),
+            *([f"{group.refused.hits}/{group.refused.of}" if group.refused.of else "-"] if absent else []),
+            _pair(group.center_m, 1),
+            _pair(group.corners_rms_m, 1),
+            _pair(group.compute_s, 0, 1000),
+        ]
+        for group in groups
     ]
+    return heads, rows
 
 
 def verdicts(evaluation: Evaluation) -> Iterator[str]:
@@ -129,12 +135,12 @@ def render_report(
     header = f"<h1>{html.escape(title)}</h1><p>{html.escape(settings)}</p>"
     parts = ["".join(f"<p>{html.escape(line)}</p>" for line in verdicts(evaluation))]
     for by, groups in evaluation.breakdowns.items():
-        rows = [summarize_group(group) for group in ([*groups, evaluation.total] if by == "kind" else groups)]
-        parts.append(section(TITLES[by], _table(HEADS, rows)))
+        parts.append(
+            section(TITLES[by], _table(*summary_table([*groups, evaluation.total] if by == "kind" else groups)))
+        )
     parts.append(section("Masks that were lost", _lost(evaluation.scores)))
-    attribution = "; ".join(
-        dict.fromkeys(filter(None, (str(index.meta.get("attribution") or "") for index in indexes)))
-    )
+    owed = dict.fromkeys(str(index.meta.get("attribution") or "") for index in indexes)
+    attribution = "; ".join(filter(None, owed))
     parts.append(footer(attribution))
     view = _draw_map(evaluation.scores, truths, indexes, attribution)
     return render_page(title, header, f"<main>{view}<aside>{''.join(parts)}</aside></main>")
@@ -159,16 +165,10 @@ def _lost(scores: Sequence[Score]) -> str:
     lost = [entry for outcome in _OUTCOMES[1:] for entry in scores if _outcome(entry) == outcome]
     if not lost:
         return "<p>None.</p>"
-    rows = [
-        [
-            entry.file,
-            _outcome(entry).replace("_", " "),
-            _number(entry.center_m),
-            _number(entry.log10_odds),
-            entry.reason,
-        ]
-        for entry in lost[:_MOST_LOST]
-    ]
+    rows = []
+    for entry in lost[:_MOST_LOST]:
+        numbers = ["-" if math.isnan(value) else f"{value:.1f}" for value in (entry.center_m, entry.log10_odds)]
+        rows.append([entry.file, _outcome(entry).replace("_", " "), *numbers, entry.reason])
     more = f"<p>And {len(lost) - _MOST_LOST} more; see masks.csv.</p>" if len(lost) > _MOST_LOST else ""
     return _table(("", "outcome", "centre m", "score", "reason given"), rows) + more
 

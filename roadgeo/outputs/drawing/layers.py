@@ -88,6 +88,7 @@ LOOKS = {
     "sigma": Look("frame", 1.6, dash="4 4"),
     "runner-up": Look("other", 3.0),
     "now": Look("ink", 3.0, fill=0.22),
+    "streets": Look("ink", 0.8),
     "way": Look("ink", 1.6, dash="5 3"),
     **{name: Look("good", 2.0, fill=0.15) for name in ("located", "right")},
     **{name: Look("fair", 2.0, fill=0.15) for name in ("ambiguous", "predicted")},
