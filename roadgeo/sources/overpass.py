@@ -1,46 +1,45 @@
-"""Roads of an area from OpenStreetMap's servers: Nominatim finds the place, Overpass gives its roads.
+"""Roads of an area from OpenStreetMap's servers, asked by osmnx: Nominatim finds the place, Overpass gives its roads.
 
-Answers are kept in the user's cache folder, and read there as files of Overpass are.
+Osmnx keeps their limits, waits while they are busy, and keeps each answer as a file; here these are read as files of
+Overpass are. Osmnx is imported only here and late: it takes longer than to open a reference.
 """
 
 from __future__ import annotations
 
-import contextlib
 import hashlib
 import json
-import math
 import os
 import re
+import shutil
+import socket
+import tempfile
 import time
-from collections.abc import Mapping
+import warnings
+from collections.abc import Iterator
+from contextlib import contextmanager
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
-from urllib.parse import urlencode, urlsplit
-
-import numpy as np
+from urllib.parse import urlsplit
 
 from roadgeo import __version__
 from roadgeo._progress import Say, say_nothing
-from roadgeo.errors import OutputError, RoadSourceError
+from roadgeo._text import counted
+from roadgeo.errors import RoadSourceError
 from roadgeo.roads.kinds import RoadKind, highways
 from roadgeo.sources.containers import overpass_table
 from roadgeo.sources.lines import RoadLines, simple_areas
 from roadgeo.sources.schemas import recognise
 from roadgeo.storage.crs import crs_name
-from roadgeo.storage.files import write_bytes
-from roadgeo.storage.folders import cache_dir
+from roadgeo.storage.folders import cache_dir, writable
 from roadgeo.storage.vectors import first_line, read_layer
 
 __all__ = ["FetchOptions", "box_area", "fetch_lines", "find_place", "read_area", "square"]
 
-OVERPASS_URL = "https://overpass-api.de/api"
-NOMINATIM_URL = "https://nominatim.openstreetmap.org"
-
-_BUSY = (429, 502, 503, 504)
-_MOST_PAUSE_S = 300.0
-#: A server is asked for squares of at most this side, degrees of latitude: 50 km.
-_PART_DEG = 0.45
+_BUSY = (429, 504)  # osmnx waits a minute, and asks again without end
+_MOST_TRIES = 5
+_MOST_AGE_S = 30 * 86400.0
+_TAIL_BYTES = 4096  # of an answer, where Overpass puts its remark
 
 
 @dataclass(frozen=True)
@@ -54,23 +53,13 @@ class FetchOptions:
     date
         Roads as of this day, "2019-10-28" or "2019-10-28T19:20:00Z"; None: now.
     cache
-        Keep answers, and take them from there.
-    max_age_days
-        Older answers are fetched anew.
-    timeout_s
-        For one request.
-    retries, pause_s
-        A busy server is asked again this often, after this pause at first, then after twice as long each time.
+        Take answers of the last 30 days from the cache.
     """
 
-    overpass_url: str = OVERPASS_URL
-    nominatim_url: str = NOMINATIM_URL
+    overpass_url: str = "https://overpass-api.de/api"
+    nominatim_url: str = "https://nominatim.openstreetmap.org"
     date: str | None = None
     cache: bool = True
-    max_age_days: float = 30.0
-    timeout_s: float = 180.0
-    retries: int = 5
-    pause_s: float = 15.0
 
 
 def find_place(place: str, options: FetchOptions, say: Say = say_nothing) -> tuple[Any, str]:
@@ -88,23 +77,19 @@ def find_place(place: str, options: FetchOptions, say: Say = say_nothing) -> tup
     RoadSourceError
         The place is unknown, or is a point without an area; the server cannot be reached.
     """
-    import shapely
-
-    query = urlencode({"q": place, "format": "json", "polygon_geojson": 1, "limit": 50, "dedupe": 0})
-    found = [one for one in _ask(f"{options.nominatim_url}/search?{query}", options, say) if isinstance(one, Mapping)]
-    if not found:
-        raise RoadSourceError(f"{place!r}: OpenStreetMap knows no such place; check the spelling")
-    for one in found:
-        shape = one.get("geojson")
-        if not isinstance(shape, Mapping) or shape.get("type") not in ("Polygon", "MultiPolygon"):
-            continue
-        area = shapely.from_geojson(json.dumps(shape), on_invalid="ignore")
-        if area is not None and np.isfinite(area.bounds).all() and area.area > 0:
-            return area, str(one.get("display_name", place))
-    raise RoadSourceError(
-        f"{place!r} is a point on OpenStreetMap, not an area; name a town or district, "
-        "or give a box around it with --bbox W,S,E,N"
-    )
+    with _asking(options.nominatim_url, options, say, place) as (osmnx, _):
+        try:
+            found = osmnx.geocode_to_gdf(place)
+        except TypeError as error:
+            raise RoadSourceError(
+                f"{place!r} is a point on OpenStreetMap, not an area; name a town or district, "
+                "or give a box around it with --bbox W,S,E,N"
+            ) from error
+        except ValueError as error:
+            if "returned 0 results" not in str(error):
+                raise
+            raise RoadSourceError(f"{place!r}: OpenStreetMap knows no such place; check the spelling") from error
+    return found.geometry[0], str(found.display_name[0])
 
 
 def fetch_lines(area: Any, which: RoadKind, tunnels: bool, options: FetchOptions, say: Say = say_nothing) -> RoadLines:
@@ -120,18 +105,25 @@ def fetch_lines(area: Any, which: RoadKind, tunnels: bool, options: FetchOptions
     kinds = highways(which)
     tags = '["highway"]' if kinds is None else f'["highway"~"^({"|".join(kinds)})$"]'
     tags += '["area"!~"yes"]' + ("" if tunnels else '["tunnel"!~"^(yes|avalanche_protector)$"]')
-    head, server = f"[out:json][timeout:{options.timeout_s:.0f}]{_date_setting(options.date)}", options.overpass_url
     found: dict[tuple[str, str], Any] = {}
-    stamps, parts = [], _parts(area)
-    for n, part in enumerate(parts):
-        ways = "".join(f'way{tags}(poly:"{ring}");' for ring in _rings(part))
-        answer = _ask(f"{server}/interpreter", options, say, f"{head};({ways});(._;>;);out;", (n, len(parts)))
-        found |= {(str(one.get("type")), str(one.get("id"))): one for one in answer["elements"] if type(one) is dict}
-        stamps += re.findall(r"timestamp_osm_base\W+([-\w:]+)", json.dumps(answer.get("osm3s")))
+    stamps: list[str] = []
+    with _asking(options.overpass_url, options, say, f"{tags} {area.wkt}") as (osmnx, folder):
+        osmnx.settings.cache_only_mode = True
+        for side in _sides(area):
+            try:
+                osmnx.graph_from_polygon(side, custom_filter=tags)
+            except InterruptedError:  # osmnx's own end of that mode, once all answers are kept
+                continue
+        for file in sorted(folder.glob("*.json")):
+            answer = json.loads(file.read_bytes())
+            found |= {(str(one["type"]), str(one["id"])): one for one in answer["elements"]}
+            stamps += re.findall(r"timestamp_osm_base\W+([-\w:]+)", json.dumps(answer.get("osm3s")))
+        if not found:
+            shutil.rmtree(folder)
     table = overpass_table(list(found.values()))
-    told = {"server": server, "osm_timestamp": min(stamps, default=None), "date": options.date}
+    known = {"server": options.overpass_url, "osm_timestamp": min(stamps, default=None), "date": options.date}
     lines = recognise(table).adapt(table)
-    return replace(lines, meta=lines.meta | {key: value for key, value in told.items() if value})
+    return replace(lines, meta=lines.meta | {key: value for key, value in known.items() if value})
 
 
 def box_area(bbox: tuple[float, float, float, float]) -> Any:
@@ -181,25 +173,130 @@ def read_area(polygon: str | os.PathLike[str] | Any) -> tuple[Any, str]:
     return shapely.transform(shapely.union_all(parts), lambda xy: to_lonlat(crs, xy)), path.stem
 
 
-def _parts(area: Any) -> list[Any]:
-    """Cut an area in degrees into parts that are asked for one by one."""
+def _sides(area: Any) -> list[Any]:
+    """Return the parts of an area in degrees east and west of 180 degrees: on a plane they lie far apart."""
     import shapely
 
-    west, south, east, north = area.bounds
-    rows = max(math.ceil((north - south) / _PART_DEG), 1)
-    columns = max(math.ceil((east - west) * math.cos(math.radians((south + north) / 2)) / _PART_DEG), 1)
-    x, y = np.meshgrid(np.linspace(west, east, columns + 1), np.linspace(south, north, rows + 1))
-    boxes = shapely.box(*(side.ravel() for side in (x[:-1, :-1], y[:-1, :-1], x[1:, 1:], y[1:, 1:])))
-    boxes = boxes[shapely.intersects(area, boxes)]
-    return [part for part in shapely.intersection(area, boxes) if part.area > 0] if len(boxes) > 1 else [area]
+    west, _, east, _ = area.bounds
+    if east - west < 180.0:
+        return [area]
+    halves = shapely.intersection(area, shapely.box([-180.0, 0.0], -90.0, [0.0, 180.0], 90.0))
+    return [half for half in halves if half.area > 0]
 
 
-def _rings(part: Any) -> list[str]:
-    """Return the outlines of the polygons of a part, as Overpass takes them."""
-    import shapely
+@contextmanager
+def _asking(url: str, options: FetchOptions, say: Say, question: str) -> Iterator[tuple[Any, Path]]:
+    """Give osmnx with its settings for a question to a server, and the folder that keeps the answers.
 
-    rings = shapely.get_exterior_ring(simple_areas(np.array([part], object)))
-    return [" ".join(f"{lat:.6f} {lon:.6f}" for lon, lat in ring.coords) for ring in rings]
+    Raises
+    ------
+    RoadSourceError
+        The server cannot be reached, breaks off, stays busy, or gives no answer that is whole.
+    """
+    import osmnx
+    import requests
+
+    host = urlsplit(url).netloc
+    before = {name: value for name, value in vars(osmnx.settings).items() if not name.startswith("_")}
+    resolve = socket.getaddrinfo  # osmnx replaces it
+    with _folder(f"{url} {options.date} {question}", options.cache) as folder, warnings.catch_warnings():
+        warnings.simplefilter("ignore", UserWarning)  # that a large area takes long: `say` shows that
+        is_known = any(folder.iterdir())
+        if not is_known:
+            say(f"asking {host}")
+        settings = {
+            "cache_folder": folder,
+            "use_cache": True,
+            "doh_url_template": None,
+            "http_referer": "roadgeo",
+            "http_user_agent": f"roadgeo/{__version__}",
+            "nominatim_url": options.nominatim_url,
+            "overpass_rate_limit": is_known or _answers(f"{url}/status"),  # else osmnx would wait a minute
+            "overpass_settings": f"[out:json][timeout:{{timeout}}]{_date_setting(options.date)}{{maxsize}}",
+            "overpass_url": options.overpass_url,
+            "requests_kwargs": {"hooks": {"response": _Watch(host, say)}},
+        }
+        try:
+            vars(osmnx.settings).update(settings)
+            yield osmnx, folder
+        except requests.exceptions.Timeout as error:
+            raise RoadSourceError(f"{host} did not answer in time; try again later") from error
+        except requests.exceptions.RequestException as error:
+            raise RoadSourceError(
+                f"{host} cannot be reached or broke off; is there a network connection? Without one give --roads FILE: "
+                "extracts are at download.geofabrik.de and extract.bbbike.org"
+            ) from error
+        except (ValueError, LookupError, TypeError, AttributeError) as error:
+            shutil.rmtree(folder, ignore_errors=True)
+            raise RoadSourceError(f"{host} gave an answer that cannot be read: {str(error)[:80]}") from error
+        finally:
+            vars(osmnx.settings).update(before)
+            socket.getaddrinfo = resolve
+
+
+@contextmanager
+def _folder(question: str, cache: bool) -> Iterator[Path]:
+    """Give the folder that keeps the answers to a question; it holds none that are old, or none at all."""
+    kept = cache_dir() / "osm" / hashlib.sha256(question.encode()).hexdigest()[:20]
+    if kept.is_dir() and not (cache and kept.stat().st_mtime > time.time() - _MOST_AGE_S and _are_whole(kept)):
+        shutil.rmtree(kept, ignore_errors=True)
+    if writable(kept):
+        yield kept
+    else:
+        with tempfile.TemporaryDirectory() as folder:
+            yield Path(folder)
+
+
+def _are_whole(folder: Path) -> bool:
+    """Whether no answer in a folder was cut short while it was written."""
+    try:
+        return all(json.loads(file.read_bytes()) is not None for file in folder.glob("*.json"))
+    except (OSError, ValueError):
+        return False
+
+
+def _answers(url: str) -> bool:
+    """Whether there is something at a URL."""
+    import requests
+
+    try:
+        return bool(requests.get(url, timeout=30.0).ok)
+    except requests.exceptions.RequestException:
+        return False
+
+
+class _Watch:
+    """Looks at each answer that osmnx gets: reports what is waited for, and refuses what osmnx would take."""
+
+    def __init__(self, host: str, say: Say) -> None:
+        self.host, self.say, self.n_busy, self.n_answers = host, say, 0, 0
+
+    def __call__(self, response: Any, *_: Any, **__: Any) -> None:
+        """Look at a response of `requests`.
+
+        Raises
+        ------
+        RoadSourceError
+            The server stays busy, or marks its answer as cut short.
+        """
+        if response.url.endswith("/status"):
+            wait = re.search(r"in (\d+) seconds", response.text)
+            if wait and "slots available now" not in response.text:
+                self.say(f"{self.host} is busy, asking again in {wait[1]} s")
+        elif response.status_code in _BUSY:
+            self.n_busy += 1
+            if self.n_busy > _MOST_TRIES:
+                raise RoadSourceError(
+                    f"{self.host} is still busy ({response.status_code}) after {_MOST_TRIES} more tries; "
+                    "try later, a smaller area, or another server"
+                )
+            self.say(f"{self.host} is busy ({response.status_code}), asking again in a minute")
+        elif remark := re.search(rb'"remark"\s*:\s*"(.{1,200})', response.content[-_TAIL_BYTES:]):
+            reason = remark[1].decode("utf-8", "replace").rstrip('"}] \n')
+            raise RoadSourceError(f"{self.host} gave up: {reason}; ask for a smaller area")
+        else:
+            self.n_answers += 1
+            self.say(f"asking {self.host}, after {counted(self.n_answers, 'answer')}")
 
 
 def _date_setting(date: str | None) -> str:
@@ -209,79 +306,3 @@ def _date_setting(date: str | None) -> str:
     if not re.fullmatch(r"\d{4}-\d\d-\d\d(T\d\d:\d\d:\d\dZ)?", date):
         raise RoadSourceError(f"{date!r} is no date; expected for example 2019-10-28")
     return f'[date:"{date if "T" in date else date + "T00:00:00Z"}"]'
-
-
-def _ask(url: str, options: FetchOptions, say: Say, query: str = "", part: tuple[int, int] = (0, 1)) -> Any:
-    """Return a server's answer, new or kept: a list of Nominatim's, or the object of Overpass.
-
-    Parameters
-    ----------
-    query : str
-        The body of the request.
-    part : (int, int)
-        The number of this part, from 0, and how many there are.
-    """
-    import requests
-    from requests.adapters import HTTPAdapter
-
-    host = urlsplit(url).netloc
-    kept = cache_dir() / "osm" / f"{hashlib.sha256(f'{url} {query}'.encode()).hexdigest()[:20]}.json"
-    with contextlib.suppress(OSError, ValueError):  # there is none, or it is damaged
-        if options.cache and kept.stat().st_mtime > time.time() - options.max_age_days * 86400.0:
-            return json.loads(kept.read_bytes())
-    n, total = part
-    say(f"asking {host}" + (f" for part {n + 1} of {total}" if total > 1 else ""), n / total if total > 1 else None)
-    try:
-        with requests.Session() as session:
-            session.headers.update({"User-Agent": f"roadgeo/{__version__}", "Referer": "roadgeo"})
-            for scheme in ("http://", "https://"):
-                session.mount(scheme, HTTPAdapter(max_retries=_patience(host, options, say)))
-            response = session.request(
-                "POST" if query else "GET", url, data={"data": query} if query else None, timeout=options.timeout_s
-            )
-    except requests.exceptions.Timeout as error:
-        raise RoadSourceError(f"{host} did not answer within {options.timeout_s:g} s; try again later") from error
-    except requests.exceptions.RequestException as error:
-        raise RoadSourceError(
-            f"{host} cannot be reached or broke off; is there a network connection? Without one give --roads FILE: "
-            "extracts are at download.geofabrik.de and extract.bbbike.org"
-        ) from error
-    if response.status_code in _BUSY:
-        raise RoadSourceError(
-            f"{host} is still busy ({response.status_code}) after {options.retries} more tries; "
-            "try later, a smaller area, or another server"
-        )
-    try:
-        answer = response.json()
-    except (ValueError, RecursionError):
-        answer = None
-    elements = answer if not query else answer.get("elements") if isinstance(answer, dict) else None
-    if not isinstance(elements, list):
-        raise RoadSourceError(f"{host} gave an answer that cannot be read: {response.text[:60]!r}")
-    remark = str(answer.get("remark", "")) if query else ""
-    if "error" in remark:
-        raise RoadSourceError(f"{host} gave up: {remark[:200]}; ask for a smaller area")
-    if options.cache and elements:
-        with contextlib.suppress(OSError, OutputError):
-            kept.parent.mkdir(parents=True, exist_ok=True)
-            write_bytes(kept, response.content)
-    return answer
-
-
-def _patience(host: str, options: FetchOptions, say: Say) -> Any:
-    """Return a hook that asks a busy server again, and reports it."""
-    from urllib3 import Retry
-    from urllib3.exceptions import InvalidHeader
-
-    class Patience(Retry):
-        def sleep(self, response: Any = None) -> None:
-            wait = options.pause_s * 2.0 ** (len(self.history) - 1)
-            with contextlib.suppress(InvalidHeader):
-                wait = min(self.get_retry_after(response) or wait, _MOST_PAUSE_S)
-            say(f"{host} is busy ({response.status}), trying again in {wait:.0f} s")
-            time.sleep(wait)
-
-    return Patience(
-        None, connect=0, read=False, other=0, status=options.retries, status_forcelist=_BUSY, allowed_methods=None,
-        raise_on_status=False,
-    )  # fmt: skip

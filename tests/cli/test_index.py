@@ -61,7 +61,7 @@ def test_places_that_cannot_be_indexed(osm, tmp_path, capsys, arguments, message
 def test_a_busy_server_is_waited_for_and_said(osm, capsys):
     osm.overpass.append((429, {"Retry-After": "3"}, b"busy"))
     assert index("--bbox=-71.0925,42.3445,-71.08,42.3525", osm=osm) == 0
-    assert "is busy (429), trying again in 3 s" in capsys.readouterr().err
+    assert "is busy (429), asking again in a minute" in capsys.readouterr().err
 
 
 @pytest.mark.parametrize("answer", ["cut", (200, {}, EMPTY), (500, {}, b"<html>")], ids=["cut", "empty", "broken"])

@@ -1,7 +1,9 @@
+import os
 import socket
 import time
 
 import numpy as np
+import osmnx
 import pytest
 import shapely
 from worlds.fake_osm import EMPTY, OUTLINE, fake_osm
@@ -46,7 +48,7 @@ def test_the_roads_of_a_place(osm, pauses):
     inside = shapely.intersection(lines, OUTLINE)
     ratio = shapely.length(roads.lines).sum() / (shapely.length(inside).sum() * 97_000)  # metres per degree, about
     assert 0.85 < ratio < 1.2
-    assert said == [f"asking {osm.url[7:]}"] * 2
+    assert said == [f"asking {osm.url[7:]}", f"asking {osm.url[7:]}, after 1 answer"] * 2
     (query,) = osm.queries
     assert '["highway"~"^(living_street|motorway|' in query
     assert '["tunnel"!~"^(yes|avalanche_protector)$"]' in query
@@ -60,7 +62,9 @@ def test_answers_are_kept_and_grow_old(osm, pauses):
     assert (len(osm.queries), len(osm.searches), said) == (1, 1, [])
     assert again.meta == first.meta
     assert shapely.equals(first.lines, again.lines).all()
-    fetch_roads("Fenway, Boston", options=ask(osm, max_age_days=-1))
+    for folder in (cache_dir() / "osm").iterdir():
+        os.utime(folder, (0, 0))
+    fetch_roads("Fenway, Boston", options=ask(osm))
     assert (len(osm.queries), len(osm.searches)) == (2, 2)
     fetch_roads("Fenway, Boston", options=ask(osm, cache=False))
     assert len(osm.queries) == 3
@@ -111,23 +115,26 @@ def test_an_area_astride_180_degrees_is_asked_for_in_two(osm, pauses):
 
 
 def test_a_large_area_is_asked_for_in_parts_and_resumed(osm, pauses, monkeypatch):
-    monkeypatch.setattr("roadgeo.sources.overpass._PART_DEG", 0.005)
-    said = []
-    osm.overpass += [(200, {}, osm.roads), (500, {}, b"<html>")]
-    with pytest.raises(RoadSourceError, match="cannot be read"):
-        fetch_roads("Fenway, Boston", options=ask(osm), say=lambda *step: said.append(step))
-    host = osm.url[7:]
-    n_parts = int(said[1][0].rpartition(" ")[2])
-    assert n_parts > 2
-    assert said[1:] == [(f"asking {host} for part {k + 1} of {n_parts}", k / n_parts) for k in range(len(said) - 1)]
-    said.clear()
+    monkeypatch.setattr(osmnx.settings, "max_query_area_size", 500_000)
     osm.overpass += [(200, {}, osm.roads), "cut"]
     with pytest.raises(RoadSourceError, match="broke off"):
         fetch_roads("Fenway, Boston", options=ask(osm))
-    n_asked = len(osm.queries)
-    fetch_roads("Fenway, Boston", options=ask(osm), say=lambda *step: said.append(step))
-    assert len(osm.queries) == n_asked + n_parts - 2  # what came before is kept
-    assert said == [(f"asking {host} for part {k + 1} of {n_parts}", k / n_parts) for k in range(2, n_parts)]
+    assert len(osm.queries) == 2
+    said = []
+    roads = fetch_roads("Fenway, Boston", options=ask(osm), say=lambda text, share=None: said.append(text))
+    n_parts = len(set(osm.queries))
+    assert n_parts > 3
+    assert len(osm.queries) == n_parts + 1  # what came before is kept
+    assert said == [f"asking {osm.url[7:]}, after {n} answer{'s' * (n > 1)}" for n in range(1, n_parts)]
+    assert len(roads) == len(fetch_roads("Fenway, Boston", options=ask(osm)))
+    assert len(osm.queries) == n_parts + 1
+
+
+def test_nothing_of_osmnx_is_changed_for_the_rest_of_a_program(osm, pauses):
+    before, resolve = dict(vars(osmnx.settings)), socket.getaddrinfo
+    fetch_roads("Fenway, Boston", options=ask(osm))
+    assert dict(vars(osmnx.settings)) == before
+    assert socket.getaddrinfo is resolve
 
 
 @pytest.mark.parametrize(
@@ -143,15 +150,16 @@ def test_places_without_an_area(osm, pauses, name, message):
 
 
 def test_a_busy_server_is_asked_again(osm, pauses):
-    osm.overpass.extend([(429, {"Retry-After": "7"}, b"busy"), (504, {}, b"<html>timeout</html>")])
+    osm.overpass.extend([(429, {}, b"busy"), (504, {}, b"<html>timeout</html>")])
     said = []
     host = osm.url[7:]
     assert len(fetch_roads(bbox=OUTLINE.bounds, options=ask(osm), say=lambda text, share=None: said.append(text))) > 0
     assert said[1:] == [
-        f"{host} is busy (429), trying again in 7 s",
-        f"{host} is busy (504), trying again in 30 s",
+        f"{host} is busy (429), asking again in a minute",
+        f"{host} is busy (504), asking again in a minute",
+        f"asking {host}, after 1 answer",
     ]
-    assert pauses[-2:] == [7.0, 30.0]
+    assert max(pauses) == 55
     assert len(osm.queries) == 3
     assert len(set(osm.queries)) == 1
 
@@ -164,8 +172,8 @@ def test_a_busy_nominatim_is_asked_again(osm, pauses):
 
 def test_a_server_that_stays_busy_is_given_up(osm, pauses):
     osm.overpass.extend([(429, {}, b"busy")] * 9)
-    with pytest.raises(RoadSourceError, match=r"is still busy \(429\) after 2 more tries; try later"):
-        fetch_roads(bbox=OUTLINE.bounds, options=ask(osm, retries=2))
+    with pytest.raises(RoadSourceError, match=r"is still busy \(429\) after 5 more tries; try later"):
+        fetch_roads(bbox=OUTLINE.bounds, options=ask(osm))
 
 
 @pytest.mark.parametrize(
@@ -175,12 +183,13 @@ def test_a_server_that_stays_busy_is_given_up(osm, pauses):
         ((200, {}, EMPTY), "no drivable roads there"),
         ((200, {}, b"<html>hello</html>"), "cannot be read"),
         ((400, {}, b"<html>bad query</html>"), "cannot be read"),
+        ((200, {}, b'[{"a": 1}]'), "cannot be read"),
         (
             (200, {}, EMPTY[:-1] + b', "remark": "runtime error: Query timed out in \\"query\\" at line 1"}'),
             "gave up: runtime error: Query timed out",
         ),
     ],
-    ids=["cut", "empty", "html", "refused", "gave up"],
+    ids=["cut", "empty", "html", "refused", "list", "gave up"],
 )
 def test_answers_that_are_of_no_use(osm, pauses, answer, message):
     osm.overpass.append(answer)
