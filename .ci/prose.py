@@ -1,8 +1,8 @@
-"""Count odd words and long sentences in prose: python .ci/prose.py [--limits] [--show] PATH...
+"""Count odd words and long sentences in prose: python .ci/prose.py [--limits] [--allow NAME=RATE] [--show] PATH...
 
 Prose is what docstrings and comments of Python files hold, and Markdown without its code, tables and quotations of
-output. Counts are per 1,000 lines. With `--limits` the exit status is 1 where a count is above its limit, or a Markdown
-file has a sentence that is too long.
+output. Names that mean anything are counted in the code. Counts are per 1,000 lines. With `--limits` the exit status is
+1 where a count is above its limit, or a Markdown file has a sentence that is too long; `--allow` raises a limit.
 """
 
 from __future__ import annotations
@@ -13,6 +13,7 @@ import io
 import re
 import sys
 import tokenize
+from collections import Counter
 from collections.abc import Iterable, Iterator
 from pathlib import Path
 
@@ -24,7 +25,12 @@ COUNTED = {
         re.compile(r"(?:^|[.;:,(] |\b(?:of|for|from|with|by|at|on|than|and) )what\b", re.IGNORECASE),
         6.0,
     ),
+    "that of, those of": (re.compile(r"\b(?:that|those) of\b", re.IGNORECASE), 1.0),
+    "Of ...": (re.compile(r"(?:^|[.!?:;] |^\W+)Of\b"), 0.5),
+    "is none": (re.compile(r"\b(?:is|are|was|were) none\b"), 1.0),
 }
+#: Identifiers that mean anything, and how often they may stand in 1,000 lines of Python.
+NAMES = {"told": 0.0, "one": 3.0}
 #: Words of a sentence in Markdown.
 LONGEST = 35
 
@@ -38,6 +44,12 @@ def prose_of_python(text: str) -> Iterator[str]:
     for token in tokenize.generate_tokens(io.StringIO(text).readline):
         if token.type == tokenize.COMMENT and not re.match(r"#\s*(?:noqa|type:|pragma|!|-{3})", token.string):
             yield token.string.lstrip("#: ")
+
+
+def names_of_python(text: str) -> Counter[str]:
+    """Count the identifiers of a module that mean anything."""
+    tokens = tokenize.generate_tokens(io.StringIO(text).readline)
+    return Counter(token.string for token in tokens if token.type == tokenize.NAME and token.string in NAMES)
 
 
 def paragraphs(text: str) -> Iterator[tuple[int, str]]:
@@ -78,7 +90,8 @@ def find_files(paths: Iterable[str]) -> list[Path]:
     """Find Python and Markdown files in folders."""
     found = []
     for path in map(Path, paths):
-        found += sorted(one for one in path.rglob("*") if one.suffix in {".py", ".md"}) if path.is_dir() else [path]
+        files = path.rglob("*") if path.is_dir() else [path]
+        found += sorted(file for file in files if file.suffix in {".py", ".md"})
     return found
 
 
@@ -87,10 +100,13 @@ def main() -> int:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("paths", nargs="+")
     parser.add_argument("--limits", action="store_true")
+    parser.add_argument("--allow", action="append", default=[], metavar="NAME=RATE")
     parser.add_argument("--show", action="store_true", help="print each line that counts")
     args = parser.parse_args()
+    allowed = {name: float(rate) for name, _, rate in (text.rpartition("=") for text in args.allow)}
     lines: list[str] = []
-    bad = 0
+    names: Counter[str] = Counter()
+    n_code = bad = 0
     for path in find_files(args.paths):
         text = path.read_text("utf-8")
         own = [
@@ -99,6 +115,9 @@ def main() -> int:
             if re.search("[a-z]", line)
         ]
         lines += own
+        if path.suffix == ".py":
+            n_code += len(text.splitlines())
+            names += names_of_python(text)
         if args.show:
             sys.stdout.writelines(
                 f"{path}: {line.strip()}\n" for line in own if any(e.search(line) for e, _ in COUNTED.values())
@@ -108,11 +127,16 @@ def main() -> int:
                 bad += 1
                 sys.stdout.write(f"{path}:{line}: a sentence of {words} words: {sentence[:90]} ...\n")
     sys.stdout.write(f"{len(lines)} lines of prose\n")
-    for name, (pattern, limit) in COUNTED.items():
-        count = sum(len(pattern.findall(line)) for line in lines)
-        rate = 1000 * count / max(len(lines), 1)
-        bad += rate > limit
-        sys.stdout.write(f"{name:20} {count:5} {rate:6.1f} per 1,000 lines, limit {limit:g}\n")
+    counted = [
+        (name, sum(len(pattern.findall(line)) for line in lines), len(lines), limit)
+        for name, (pattern, limit) in COUNTED.items()
+    ]
+    counted += [(name, names[name], n_code, limit) for name, limit in NAMES.items()]
+    for name, count, n_lines, limit in counted:
+        most = allowed.get(name, limit)
+        rate = 1000 * count / max(n_lines, 1)
+        bad += rate > most
+        sys.stdout.write(f"{name:20} {count:5} {rate:6.1f} per 1,000 lines, limit {most:g}\n")
     return int(args.limits and bad > 0)
 
 

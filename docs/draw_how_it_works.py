@@ -305,11 +305,11 @@ def draw_location(
     ax.fill(*outline.T, color="white", alpha=0.6, lw=0, zorder=1.5)
     draw_lines(ax, [apply(to_map, line) for line in roads], AGREES, 1.5, zorder=3)
     ax.plot(*outline.T, color=FRAME, lw=3, zorder=4)
-    told = location.to_dict()
+    document = location.to_dict()
     text = (
-        f"{told['n_matched']} of {told['n_intersections']} intersections match\n"
-        f"lead over any other place $10^{{{told['log10_odds']:.1f}}}$\n"
-        f"corners ± {max(told['corner_sigma_m']):.1f} m"
+        f"{document['n_matched']} of {document['n_intersections']} intersections match\n"
+        f"lead over any other place $10^{{{document['log10_odds']:.1f}}}$\n"
+        f"corners ± {max(document['corner_sigma_m']):.1f} m"
     )
     ax.text(0.985, 0.02, text, transform=ax.transAxes, fontsize=12, color=INK, ha="right", va="bottom", zorder=6,
             bbox={"fc": "white", "ec": "none", "alpha": 0.95, "pad": 4})  # fmt: skip

@@ -42,7 +42,7 @@ import numpy as np  # noqa: E402
 HERE = Path(__file__).resolve().parents[1]
 SEED = 4711
 SIDE_M = 20_000.0
-#: Two plain cities and two grids; a night adds eight. Names are those of the atlas.
+#: Two plain cities and two grids; a night adds eight. Names are as in the atlas.
 CITIES = ("boston", "montevideo", "saopaulo", "chicago")
 LONG = (*CITIES, "liege", "slc", "wuhan", "porto", "douala", "columbus", "portland", "astana")
 #: Masks of each kind and city, and of each kind without a place.
@@ -151,19 +151,19 @@ def draw_masks(folder: Path, asked: Sequence[Asked]) -> list[Asked]:
     from roadgeo.sources.roads import read_roads
 
     landscapes: dict[str, Landscape] = {}
-    for one in asked:
-        path = folder / f"{one.name}.json"
+    for entry in asked:
+        path = folder / f"{entry.name}.json"
         if path.is_file():
             continue
         path.parent.mkdir(exist_ok=True)
-        if one.source not in landscapes:
-            roads = read_roads(folder / f"{one.source}.parquet")
-            landscapes[one.source] = Landscape.from_lines(roads.lines, roads.plane)
-        record = draw(landscapes[one.source], path.with_suffix(".png"), one.kind, one.how, one.k)
+        if entry.source not in landscapes:
+            roads = read_roads(folder / f"{entry.source}.parquet")
+            landscapes[entry.source] = Landscape.from_lines(roads.lines, roads.plane)
+        record = draw(landscapes[entry.source], path.with_suffix(".png"), entry.kind, entry.how, entry.k)
         path.write_text(json.dumps(record), encoding="utf-8")
-    drawn = [one for one in asked if (folder / f"{one.name}.png").is_file()]
-    for one in sorted(set(asked) - set(drawn), key=lambda one: one.name):
-        tell(f"{one.name}: no place for such a mask")
+    drawn = [query for query in asked if (folder / f"{query.name}.png").is_file()]
+    for entry in sorted(set(asked) - set(drawn), key=lambda item: item.name):
+        tell(f"{entry.name}: no place for such a mask")
     return drawn
 
 
@@ -289,7 +289,7 @@ def locate_in_processes(
         tell(f"{city}: located by {name}")
 
     with ThreadPoolExecutor(jobs) as pool:
-        for future in [pool.submit(run, city, *one) for city in cities for one in checkouts]:
+        for future in [pool.submit(run, city, *checkout) for city in cities for checkout in checkouts]:
             future.result()
     return {
         name: {
@@ -310,28 +310,28 @@ def read_scores(folder: Path, asked: Sequence[Asked], answers: dict[str, Any]) -
     from roadgeo.evaluation.truth import truth_from_record
 
     scores = {}
-    for one in asked:
-        truth = truth_from_record(json.loads((folder / f"{one.name}.json").read_text(encoding="utf-8")))
-        answer = answers[one.name]
+    for query in asked:
+        truth = truth_from_record(json.loads((folder / f"{query.name}.json").read_text(encoding="utf-8")))
+        answer = answers[query.name]
         radius = max(20.0, 0.02 * truth.properties["gsd_m"] * max(truth.size))
-        scores[one.name] = (score(truth, answer, radius), answer["cpu_s"])
+        scores[query.name] = (score(truth, answer, radius), answer["cpu_s"])
     return scores
 
 
 def summarize(scores: Sequence[tuple[Any, float]]) -> dict[str, Any]:
     """Count some masks: plain numbers, for the table and for JSON."""
-    found = [one for one, _ in scores]
-    right = [one for one in found if one.right]
-    errors = np.array([one.corners_rms_m for one in right])
-    claims = np.array([math.sqrt(np.mean(np.square(one.sigma_m))) for one in right])
-    odds = [one.log10_odds for one in found if math.isfinite(one.log10_odds)]
+    found = [item for item, _ in scores]
+    right = [result for result in found if result.right]
+    errors = np.array([result.corners_rms_m for result in right])
+    claims = np.array([math.sqrt(np.mean(np.square(result.sigma_m))) for result in right])
+    odds = [result.log10_odds for result in found if math.isfinite(result.log10_odds)]
     spent = [seconds for _, seconds in scores]
-    refused = [seconds for one, seconds in scores if not one.located]
+    refused = [seconds for item, seconds in scores if not item.located]
     return {
         "masks": len(found),
         "right": len(right),
-        "wrong": sum(one.located and not one.right for one in found),
-        "errors": sum(one.status == "error" for one in found),
+        "wrong": sum(result.located and not result.right for result in found),
+        "errors": sum(result.status == "error" for result in found),
         "corners_m": _quantiles(errors, 0.5, 0.9),
         "error_over_claim": [*_quantiles(errors / claims, 0.5), _rms(errors / claims)],
         "highest_odds": max(odds, default=None),
@@ -395,13 +395,13 @@ def tabulate(
 
 def compare(names: Sequence[str], scores: Sequence[dict[str, Any]], answers: Sequence[dict[str, Any]]) -> Iterator[str]:
     """List the masks that two checkouts answer differently."""
-    one, other = scores
-    for first, second, name in ((one, other, names[0]), (other, one, names[1])):
+    item, other = scores
+    for first, second, name in ((item, other, names[0]), (other, item, names[1])):
         only = [mask for mask in first if first[mask][0].right and not second[mask][0].right]
         yield f"right with {name} only: {len(only)}  {' '.join(only)}".rstrip()
     plain = [{k: _untimed(v) for k, v in some.items()} for some in answers]
-    same = sum(plain[0][mask] == plain[1][mask] for mask in one)
-    yield f"the same to the last bit, times aside: {same} of {len(one)}"
+    same = sum(plain[0][mask] == plain[1][mask] for mask in item)
+    yield f"the same to the last bit, times aside: {same} of {len(item)}"
 
 
 def _untimed(answer: dict[str, Any]) -> dict[str, Any]:
@@ -411,8 +411,8 @@ def _untimed(answer: dict[str, Any]) -> dict[str, Any]:
 def report(names: Sequence[str], scores: Sequence[dict[str, Any]], answers: Sequence[Any]) -> tuple[str, Any]:
     """Write the tables and their data."""
     runs = []
-    for one in scores:
-        found = list(one.values())
+    for item in scores:
+        found = list(item.values())
         kinds = list(dict.fromkeys(score.kind for score, _ in found))
         groups = {kind: [entry for entry in found if entry[0].kind == kind] for kind in kinds}
         groups["all"] = [entry for entry in found if entry[0].on_map]
@@ -421,9 +421,9 @@ def report(names: Sequence[str], scores: Sequence[dict[str, Any]], answers: Sequ
     absent = [kind for kind in ABSENT if kind in runs[0]]
     lines = [f"{'  |  '.join(names)}", "", *tabulate(runs, order, PRESENT, "with a place")]
     lines += ["", *tabulate(runs, absent, MISSING, "without a place")] if absent else []
-    for name, one in zip(names, scores, strict=True):
-        bad = [f"{mask} (10^{s.log10_odds:.1f})" for mask, (s, _) in one.items() if s.located and not s.right]
-        broken = [f"{mask} ({s.reason})" for mask, (s, _) in one.items() if s.status == "error"]
+    for name, item in zip(names, scores, strict=True):
+        bad = [f"{mask} (10^{s.log10_odds:.1f})" for mask, (s, _) in item.items() if s.located and not s.right]
+        broken = [f"{mask} ({s.reason})" for mask, (s, _) in item.items() if s.status == "error"]
         lines += ["", f"wrong with {name}: {', '.join(bad) or 'none'}"]
         lines += [f"errors with {name}: {', '.join(broken)}"] if broken else []
     lines += ["", *compare(names, scores, answers)] if len(names) == 2 else []
@@ -472,7 +472,7 @@ def main(arguments: Sequence[str] | None = None) -> None:
     asked = draw_masks(folder, ask(cities, options.kinds, count))
     tell(f"{len(asked)} masks are drawn")
     for city in cities:
-        names = [one.name for one in asked if one.city == city]
+        names = [query.name for query in asked if query.city == city]
         (folder / f"{city}.masks").write_text(json.dumps(names), encoding="utf-8")
     checkouts = [checkout(what, folder) for what in (str(HERE), options.against) if what]
     if len({name for _, name in checkouts}) < len(checkouts):

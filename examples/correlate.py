@@ -41,7 +41,7 @@ class DrawnMap:
     """The map's roads as a raster, and its spectrum."""
 
     def __init__(self, roads: gpd.GeoDataFrame, side: int) -> None:
-        """Draw them; `side` is that of the largest template, cells."""
+        """Draw them; `side` is the largest template's, in cells."""
         self.west, south, east, self.north = roads.total_bounds
         rows, columns = (int(length / CELL_M) + side for length in (self.north - south, east - self.west))
         self.shape = cv2.getOptimalDFTSize(rows + side), cv2.getOptimalDFTSize(columns + side)
@@ -73,7 +73,7 @@ def turn_north(mask: np.ndarray, truth: Truth, side: int) -> tuple[np.ndarray, n
     middle = np.array(truth.size) / 2
     to_map = truth.homography
     ahead = [to_map @ np.append(middle + step, 1.0) for step in ((0, 0), (0, -1), (1, 0))]
-    here, up, right = (one[:2] / one[2] for one in ahead)
+    here, up, right = (vector[:2] / vector[2] for vector in ahead)
     scale = np.sqrt(abs(np.linalg.det([up - here, right - here])))
     angle = np.arctan2(*(up - here))  # clockwise from north
     linear = scale / CELL_M * np.array([[np.cos(angle), -np.sin(angle)], [np.sin(angle), np.cos(angle)]])

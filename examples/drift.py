@@ -3,8 +3,8 @@
     OMP_NUM_THREADS=1 python examples/drift.py --flights 100 --seed 1000
 
 Simulated flights of 19 frames over ground without roads: the corners of the first frame are known to 0.3 m, each motion
-to 0.7 pixels. Shown is the distance of the last frame's middle from the truth, root mean square. That of the filter is
-measured. The least is computed: all frames adjusted at once, linearised at the truth (Cramer-Rao bound), for cameras
+to 0.7 pixels. Shown is the distance of the last frame's middle from the truth, root mean square. The filter's distance
+is measured. The least is computed: all frames adjusted at once, linearised at the truth (Cramer-Rao bound), for cameras
 that are known more or less, and with other knowledge beside the motions.
 """
 
@@ -22,7 +22,7 @@ from roadgeo.geometry.pose import _place, _starts
 
 OPTIONS, START_M = FlightOptions(n_frames=(19, 19), gsd_m=(0.5, 0.5)), 0.3
 #: Numbers of a frame: where its axis meets the ground (2), log metres per pixel, heading, tilt (2), log focal length,
-#: and both skews, those of ground that is no plane.
+#: and both skews, as of ground that is no plane.
 N, HEIGHT, HEADING, TILT, FOCAL, SKEWS = 9, slice(2, 3), slice(3, 4), slice(4, 6), slice(6, 7), slice(7, 9)
 EXACT = 1e-7
 #: Standard deviations of the first focal length, its change between frames, and of what else is known.
@@ -93,12 +93,12 @@ def least(views: tuple[View, ...], known: dict[str, float]) -> float:
 def homographies(frames: FloatArray, frame: Frame, log_focal: float) -> FloatArray:
     """Return pixel to ground (K, 3, 3) of frames (K, N)."""
     positions, rotations = _place(frames[:, :7], log_focal)
-    (x, y), nothing, one = frame.center, np.zeros(len(frames)), np.ones(len(frames))
+    (x, y), nothing, item = frame.center, np.zeros(len(frames)), np.ones(len(frames))
     skew, longer = 0.5 * frames[:, SKEWS].T
     lens = np.moveaxis(
         np.array([
-            [one + longer, skew, nothing],
-            [-skew, longer - one, nothing],
+            [item + longer, skew, nothing],
+            [-skew, longer - item, nothing],
             [nothing, nothing, -np.exp(frames[:, 6])],
         ]),
         2, 0,

@@ -68,18 +68,18 @@ def fly(flight: Flight, other: Flight, reference: Reference, city: str, own_moti
             result.motion_errors_px.append(motion_error(flight, k, motion))
         frame = FlightFrame(k, mask.name, float(k), mask, motion, motion_px)
         was_lost, started = tracker.is_lost, time.process_time()
-        known.update({one.frame.number: one for one in tracker.feed(frame)})
+        known.update({first.frame.number: first for first in tracker.feed(frame)})
         spent = time.process_time() - started
         if was_lost:
             result.search_s += spent
         else:
             result.tracking_ms.append(1000.0 * spent)
-    for k, one in known.items():
-        if one.pose is not None:
+    for k, item in known.items():
+        if item.pose is not None:
             truth = flight.views[k].homography(np.array(flight.options.size_px) / 2)
-            result.errors_m.append(float(np.hypot(*(one.pose.center - truth))))
-            result.sigmas_m.append(one.pose.sigma_m)
-    result.statuses = dict(Counter(one.status for one in known.values()))
+            result.errors_m.append(float(np.hypot(*(item.pose.center - truth))))
+            result.sigmas_m.append(item.pose.sigma_m)
+    result.statuses = dict(Counter(entry.status for entry in known.values()))
     result.fixed_at = tracker.fixes[0].last + 1 if tracker.fixes else None
     result.wrong = any(error > WRONG_M for error in result.errors_m)
     if not tracker.is_lost:
@@ -101,7 +101,7 @@ def cut(tracker: Tracker, flight: Flight, other: Flight, result: Result) -> None
     for k, mask in enumerate(masks_of(other)[:CUT_FRAMES]):
         frame = FlightFrame(len(flight.views) + k, mask.name, 0.0, mask, flight.motion[1 + k])
         news = tracker.feed(frame)
-        if any(one.status == "lost" for one in news):
+        if any(new.status == "lost" for new in news):
             result.cut_noticed_after = k + 1
             return
         result.cut_claimed += news[-1].status == "tracked"
@@ -109,10 +109,10 @@ def cut(tracker: Tracker, flight: Flight, other: Flight, result: Result) -> None
 
 def summarize_motion(results: list[Result]) -> dict[str, float]:
     """How good the motion of masks is."""
-    told = [error for one in results for error in one.motion_errors_px]
-    known = np.array([error for error in told if error is not None])
+    values = [error for result in results for error in result.motion_errors_px]
+    known = np.array([error for error in values if error is not None])
     return {
-        "motion known": len(known) / len(told),
+        "motion known": len(known) / len(values),
         "motion error px, median": float(np.median(known)),
         "motion error px, p95": float(np.quantile(known, 0.95)),
         "motion off by more than 50 px": float(np.mean(known > 50.0)),
@@ -120,17 +120,19 @@ def summarize_motion(results: list[Result]) -> dict[str, float]:
 
 
 def summarize(results: list[Result]) -> dict[str, float]:
-    errors = np.concatenate([one.errors_m for one in results] or [np.zeros(0)])
-    sigmas = np.concatenate([one.sigmas_m for one in results])
-    tracking = np.concatenate([one.tracking_ms for one in results])
-    cuts = [one.cut_noticed_after for one in results if one.fixed_at]
+    errors = np.concatenate([result.errors_m for result in results] or [np.zeros(0)])
+    sigmas = np.concatenate([result.sigmas_m for result in results])
+    tracking = np.concatenate([result.tracking_ms for result in results])
+    cuts = [result.cut_noticed_after for result in results if result.fixed_at]
     return {
         "flights": len(results),
-        "frames": sum(one.frames for one in results),
-        "fixed within 12 frames": float(np.mean([one.fixed_at is not None and one.fixed_at <= 12 for one in results])),
-        "fixed": float(np.mean([one.fixed_at is not None for one in results])),
-        "wrong flights": sum(one.wrong for one in results),
-        "frames placed": len(errors) / sum(one.frames for one in results),
+        "frames": sum(result.frames for result in results),
+        "fixed within 12 frames": float(
+            np.mean([result.fixed_at is not None and result.fixed_at <= 12 for result in results])
+        ),
+        "fixed": float(np.mean([result.fixed_at is not None for result in results])),
+        "wrong flights": sum(result.wrong for result in results),
+        "frames placed": len(errors) / sum(result.frames for result in results),
         "error m, median": float(np.median(errors)),
         "error m, p95": float(np.quantile(errors, 0.95)),
         "error m, max": float(errors.max()),
@@ -138,7 +140,7 @@ def summarize(results: list[Result]) -> dict[str, float]:
         "tracking ms, mean": float(tracking.mean()),
         "tracking ms, p99": float(np.quantile(tracking, 0.99)),
         "cuts noticed within 3 frames": float(np.mean([n is not None and n <= 3 for n in cuts])),
-        "search s, median": float(np.median([one.search_s for one in results])),
+        "search s, median": float(np.median([result.search_s for result in results])),
     }
 
 
@@ -156,19 +158,19 @@ def main() -> None:
     references = [open_reference(path) for path in given.references]
     results = []
     for k in range(given.flights):
-        flights = [simulate_flight(one, options, k) for one in landscapes]
+        flights = [simulate_flight(landscape, options, k) for landscape in landscapes]
         for c, flight in enumerate(flights):
             other = flights[(c + 1) % len(flights)]
             results.append(fly(flight, other, references[c], references[c].name, given.motion == "masks"))
-            one = results[-1]
-            told = f"{one.city} {k}: fixed at {one.fixed_at} of {one.frames}, {one.statuses}"
-            largest = max(one.errors_m, default=0.0)
-            print(f"{told}, largest error {largest:.1f} m, cut noticed after {one.cut_noticed_after}", flush=True)
+            first = results[-1]
+            reported = f"{first.city} {k}: fixed at {first.fixed_at} of {first.frames}, {first.statuses}"
+            largest = max(first.errors_m, default=0.0)
+            print(f"{reported}, largest error {largest:.1f} m, cut noticed after {first.cut_noticed_after}", flush=True)
             if given.out:
                 with given.out.open("a") as file:
-                    file.write(json.dumps(asdict(one)) + "\n")
-    told = summarize(results) | (summarize_motion(results) if given.motion == "masks" else {})
-    for name, value in told.items():
+                    file.write(json.dumps(asdict(first)) + "\n")
+    reported = summarize(results) | (summarize_motion(results) if given.motion == "masks" else {})
+    for name, value in reported.items():
         print(f"{name:32} {value:.3g}")
 
 

@@ -51,7 +51,7 @@ def ask(port: int, data: bytes, timeout: float) -> tuple[bytes, float]:
 
 
 def status_of(answer: bytes) -> int:
-    """Return the status of an answer, 0 where it is none."""
+    """Return the status of an answer, 0 if it is no HTTP answer."""
     return int(answer[9:12]) if answer[:5] == b"HTTP/" and answer[9:12].isdigit() else 0
 
 
@@ -106,7 +106,7 @@ def hostile(rng: random.Random, mask: bytes) -> tuple[bytes, float]:
 def attack(port: int, mask: bytes, count: int, seed: int = 0) -> Counter[int]:
     seen, lock = Counter[int](), threading.Lock()
 
-    def one(k: int) -> None:
+    def send(k: int) -> None:
         data, patience = hostile(random.Random(seed * 1_000_003 + k), mask)
         answer, seconds = ask(port, data, patience)
         status = status_of(answer)
@@ -116,11 +116,11 @@ def attack(port: int, mask: bytes, count: int, seed: int = 0) -> Counter[int]:
             print(f"request {k} after {seconds:.1f} s: {data[:80]!r} -> {answer[-300:]!r}", flush=True)
 
     with ThreadPoolExecutor(16) as pool:
-        list(pool.map(one, range(count)))
+        list(pool.map(send, range(count)))
     return seen
 
 
-def told(name: str, seconds: list[float]) -> None:
+def report(name: str, seconds: list[float]) -> None:
     if seconds:
         p50, p99 = (1000 * float(np.quantile(seconds, q)) for q in (0.5, 0.99))
         print(f"{name:28} {len(seconds):6}   median {p50:8.1f} ms   p99 {p99:8.1f} ms")
@@ -144,10 +144,10 @@ def main() -> None:
             line = next(line for line in server.stderr or [] if "Listening" in line)
             port = int(re.findall(r":(\d+)/", line)[0])
             alone = [post(port, mask)[1] for _ in range(5)]
-            told("alone", alone)
+            report("alone", alone)
             answers = steady(port, mask, given.rate, given.seconds)
-            told("answered", [s for status, s, _ in answers if status == 200])
-            told("told to come again", [s for status, s, again in answers if status == 503 and again])
+            report("answered", [s for status, s, _ in answers if status == 200])
+            report("told to come again", [s for status, s, again in answers if status == 503 and again])
             others = [status for status, _, again in answers if status != 200 and not (status == 503 and again)]
             print(f"neither: {len(others)} {dict(Counter(others))}")
             started = time.perf_counter()

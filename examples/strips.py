@@ -43,16 +43,16 @@ def main() -> None:
                 [(FlightFrame(n, str(i), float(n), masks[i]), None) for n, i in enumerate(order)], [reference]
             )
             spent = time.process_time() - started
-            placed = [one for one in tracked if one.pose is not None]
+            placed = [sighting for sighting in tracked if sighting.pose is not None]
             off = []
-            for one in placed:
-                truth = flight.views[int(one.frame.name)].homography(one.frame.frame.center)
-                off.append(float(np.hypot(*(one.pose.center - truth))))
+            for item in placed:
+                truth = flight.views[int(item.frame.name)].homography(item.frame.frame.center)
+                off.append(float(np.hypot(*(item.pose.center - truth))))
             errors += off
             n_frames += len(masks)
             whole.append(len(placed) == len(masks))
-            told = f"{reference.name} {k}: {len(placed)} of {len(masks)} placed, in {spent:.1f} s CPU"
-            print(f"{told}, largest error {max(off, default=0.0):.1f} m", flush=True)
+            reported = f"{reference.name} {k}: {len(placed)} of {len(masks)} placed, in {spent:.1f} s CPU"
+            print(f"{reported}, largest error {max(off, default=0.0):.1f} m", flush=True)
     print(f"{sum(whole)} of {len(whole)} strips whole, {len(errors)} of {n_frames} frames placed")
     print(f"error m: median {np.median(errors):.2f}, p95 {np.quantile(errors, 0.95):.2f}, max {max(errors):.1f}")
     print(f"frames more than 20 m off: {sum(error > 20.0 for error in errors)}")

@@ -1,8 +1,8 @@
 """Write the tables of docs/how-well.md that each version measures again: python examples/tables.py BENCH.json.
 
 BENCH.json is the file `bench.json` of `python examples/bench.py --out FOLDER`; of two checkouts the first one counts.
-The bands of the odds are those of `error_rate` in a result. The table of worn masks counts the searches that are kept
-in `examples/trust/results`. `--check` writes nothing, and fails if a table would change.
+The bands of the odds are the same as in `error_rate` of a result. The table of worn masks counts the searches kept in
+`examples/trust/results`. `--check` writes nothing, and fails if a table would change.
 """
 
 from __future__ import annotations
@@ -57,14 +57,14 @@ def bench_table(runs: dict[str, dict[str, Any]]) -> Iterator[str]:
     yield "| | located right | wrong | corners, median / 90 % | error / claimed, median, rms | seconds, median |"
     yield "|---|---|---|---|---|---|"
     for kind in (name for name in NAMES if name in kinds):
-        one = kinds[kind]
+        item = kinds[kind]
         corners = ratios = right = ""
-        if one["right"]:
-            right = f"{one['right']:,} of {one['masks']:,}"
-            corners = " / ".join(f"{value:.2g} m" for value in one["corners_m"])
-            ratios = ", ".join(f"{value:.2f}" for value in one["error_over_claim"])
-        wrong = f"{one['wrong']}" if right else f"{one['wrong']} of {one['masks']:,}"
-        yield f"| {NAMES[kind]} | {right} | {wrong} | {corners} | {ratios} | {one['cpu_s'][0]:.2g} |"
+        if item["right"]:
+            right = f"{item['right']:,} of {item['masks']:,}"
+            corners = " / ".join(f"{value:.2g} m" for value in item["corners_m"])
+            ratios = ", ".join(f"{value:.2f}" for value in item["error_over_claim"])
+        wrong = f"{item['wrong']}" if right else f"{item['wrong']} of {item['masks']:,}"
+        yield f"| {NAMES[kind]} | {right} | {wrong} | {corners} | {ratios} | {item['cpu_s'][0]:.2g} |"
 
 
 def worn_table() -> Iterator[str]:

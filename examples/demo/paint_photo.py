@@ -2,7 +2,7 @@
 
     python examples/demo/paint_photo.py
 
-Aerial photographs that anyone may pass on are rare, so this one is painted. The streets are those of OpenStreetMap, as
+Aerial photographs that anyone may pass on are rare, so this one is painted. The streets come from OpenStreetMap, as
 the camera of the mask sees them; roofs, gardens, trees and cars only look the part.
 """
 

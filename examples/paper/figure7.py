@@ -24,7 +24,7 @@ def main() -> None:
     area = paper.search_area(options.reference, options.out)
     table = build_pair_index(paper.read_network(area).intersections, paper.PAIR)
     keys = list(table.tuples)
-    counts = np.array([len(one.pairs) for one in table.tuples.values()])
+    counts = np.array([len(item.pairs) for item in table.tuples.values()])
     order = np.argsort(-counts)
     shares = np.cumsum(counts[order]) / counts.sum()
     print(f"{len(table):,} tuples of {len(counts)} types; the commonest:")

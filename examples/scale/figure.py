@@ -29,7 +29,7 @@ UNITS = {"disk_mb": 1000.0, "memory_mb": 1000.0}
 
 
 def draw(rows: list[dict[str, str]], target: Path) -> None:
-    """Draw a panel for each kind of cost, both axes logarithmic; a slope of 1 is growth as that of the map."""
+    """Draw a panel for each kind of cost, both axes logarithmic; at a slope of 1 a cost grows as the map does."""
     # Letters stay letters, and the same table gives the same file.
     plt.rcParams.update(
         {"svg.fonttype": "none", "svg.hashsalt": "roadgeo", "font.size": 9, "font.family": "sans-serif"}

@@ -77,8 +77,8 @@ def make_map(first: Path, folder: Path, k: int) -> None:
     for entry in manifest.filled:
         source = first.parent / manifest.build / f"{entry.name}.gpkg"
         entries.append(make_shard(source, entry, folder / "shards" / f"{entry.name}.index", k, f"map_{k:02d}"))
-    told = {**asdict(manifest), "name": folder.stem, "build": "shards", "shards": tuple(entries), "coarse": None}
-    write_manifest(folder, Manifest(**told))
+    reported = {**asdict(manifest), "name": folder.stem, "build": "shards", "shards": tuple(entries), "coarse": None}
+    write_manifest(folder, Manifest(**reported))
 
 
 def main() -> None:

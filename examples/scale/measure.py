@@ -60,34 +60,34 @@ def locate_all(maps: list[Path], masks: dict[str, tuple[float, float] | None], e
             if found.status == "located" and found.center is not None and truth is not None:
                 away = metres_apart(np.array([found.center.lon, found.center.lat]), np.array(truth))
             memory = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / 1024
-            told = {"mask": mask, "has_place": truth is not None, "status": found.status, "away_m": away}
-            told |= {"seconds": seconds, "odds": found.log10_odds, "memory_mb": memory, "first_s": first_s}
-            file.write(json.dumps(told) + "\n")
+            reported = {"mask": mask, "has_place": truth is not None, "status": found.status, "away_m": away}
+            reported |= {"seconds": seconds, "odds": found.log10_odds, "memory_mb": memory, "first_s": first_s}
+            file.write(json.dumps(reported) + "\n")
             file.flush()
 
 
 def summarise(maps: list[Path], masks: Collection[str], out: Path) -> dict[str, float]:
     """Return a row of the table."""
     rows = [json.loads(line) for line in out.read_text().splitlines()]
-    rows = [one for one in rows if one["mask"] in masks]
+    rows = [row for row in rows if row["mask"] in masks]
     manifests = [json.loads((path / "manifest.json").read_text()) for path in maps]
-    shards = [one for manifest in manifests for one in manifest["shards"] if one["crs"]]
-    located = [one for one in rows if one["status"] == "located"]
-    right = [one for one in located if one["away_m"] is not None and one["away_m"] <= RIGHT_M]
-    refused = [one["seconds"] for one in rows if not one["has_place"]]
+    shards = [item for manifest in manifests for item in manifest["shards"] if item["crs"]]
+    located = [row for row in rows if row["status"] == "located"]
+    right = [result for result in located if result["away_m"] is not None and result["away_m"] <= RIGHT_M]
+    refused = [row["seconds"] for row in rows if not row["has_place"]]
     return {
         "maps": len(maps),
-        "intersections": sum(one["own_intersections"] for one in shards),
+        "intersections": sum(shard["own_intersections"] for shard in shards),
         "shards": len(shards),
-        "disk_mb": round(sum(one["bytes"] for one in shards) / 1e6),
-        "masks": sum(one["has_place"] for one in rows),
+        "disk_mb": round(sum(shard["bytes"] for shard in shards) / 1e6),
+        "masks": sum(row["has_place"] for row in rows),
         "right": len(right),
         "wrong": len(located) - len(right),
-        "median_s": round(float(np.median([one["seconds"] for one in right])), 3),
-        "p90_s": round(float(np.quantile([one["seconds"] for one in right], 0.9)), 3),
+        "median_s": round(float(np.median([result["seconds"] for result in right])), 3),
+        "p90_s": round(float(np.quantile([result["seconds"] for result in right], 0.9)), 3),
         "strangers": len(refused),
         "refusal_s": round(float(np.median(refused)), 3) if refused else float("nan"),
-        "memory_mb": round(max(one["memory_mb"] for one in rows)),
+        "memory_mb": round(max(row["memory_mb"] for row in rows)),
         "first_s": round(rows[0]["first_s"], 2),
     }
 

@@ -3,7 +3,7 @@
     python examples/scale/roads.py roads.parquet ten.parquet --count 10
     roadgeo index --roads ten.parquet --shards auto --out ten.shards
 
-The copies are those of `maps.py`: the first is left as it is, the others are the same roads seen in a mirror, stretched
+The copies are made as by `maps.py`: the first is left as it is, the others are the same roads in a mirror, stretched
 and turned, each on a part of the Earth of its own. They are written one after another, a row group each.
 """
 

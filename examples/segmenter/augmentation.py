@@ -34,8 +34,8 @@ class _Pictures:
 
     def put(self, index: int, picture: Bytes) -> None:
         """Replace a picture by one of the same size."""
-        one = torch.from_numpy(picture).to(self.pixels.device)
-        for (start, rows, columns), values in zip(self.known[index], _smaller(one), strict=True):
+        item = torch.from_numpy(picture).to(self.pixels.device)
+        for (start, rows, columns), values in zip(self.known[index], _smaller(item), strict=True):
             self.pixels[start : start + rows * columns] = values.reshape(-1, CHANNELS)
 
     @classmethod
@@ -177,9 +177,9 @@ class Crops:
         across, along = scale * stretch * mirrored, scale / stretch
         tilt = (0.12 * self._normal(n, 2)).clamp(-0.25, 0.25) / self.size * ~straight[:, None]
         c, s, half = angle.cos(), angle.sin(), (self.size - 1) / 2
-        one = torch.ones_like(c)
+        ones = torch.ones_like(c)
         view = torch.stack(
-            [c * across, -s * along, 0 * c, s * across, c * along, 0 * c, tilt[:, 0], tilt[:, 1], one], 1
+            [c * across, -s * along, 0 * c, s * across, c * along, 0 * c, tilt[:, 0], tilt[:, 1], ones], 1
         )
         view = view.view(n, 3, 3)
         view[:, :2] += middle[:, :, None] * view[:, 2:]
@@ -277,11 +277,11 @@ class _Look:
         return photo.clamp(0, 1)
 
     def _scratch(self, photo: Tensor) -> Tensor:
-        line, one = torch.linspace(-1, 1, self.size, device=self.device), (len(photo), 1, 1, 1)
+        line, item = torch.linspace(-1, 1, self.size, device=self.device), (len(photo), 1, 1, 1)
         for _ in range(2):
-            angle, offset = self.uniform(0, math.pi, *one), self.uniform(-0.9, 0.9, *one)
+            angle, offset = self.uniform(0, math.pi, *item), self.uniform(-0.9, 0.9, *item)
             distance = (angle.cos() * line + angle.sin() * line[:, None] - offset).abs()
-            photo = torch.where(distance < self.uniform(0.5, 2.0, *one) / self.size, self.uniform(0, 1, *one), photo)
+            photo = torch.where(distance < self.uniform(0.5, 2.0, *item) / self.size, self.uniform(0, 1, *item), photo)
         return photo
 
     def mark_voids(self, photo: Tensor, truth: Tensor) -> Tensor:
@@ -299,11 +299,12 @@ class _Look:
 
 def _places(flags: list[NDArray[np.bool_]], device: str) -> tuple[Tensor, Tensor, Tensor]:
     """Return (N, 2) x, y of every fourth pixel along a side that is flagged, and each picture's first and number."""
-    found = [np.argwhere(one[::4, ::4])[:, ::-1] * 4.0 for one in flags]
+    found = [np.argwhere(flag[::4, ::4])[:, ::-1] * 4.0 for flag in flags]
     found = [
-        one if len(one) else np.array([[f.shape[1] / 2, f.shape[0] / 2]]) for one, f in zip(found, flags, strict=True)
+        result if len(result) else np.array([[f.shape[1] / 2, f.shape[0] / 2]])
+        for result, f in zip(found, flags, strict=True)
     ]
-    count = np.array([len(one) for one in found])
+    count = np.array([len(result) for result in found])
     xy = torch.from_numpy(np.concatenate(found)).float().to(device)
     return xy, torch.from_numpy(count.cumsum() - count).to(device), torch.from_numpy(count).to(device)
 

@@ -16,7 +16,7 @@ from torch.nn import functional
 
 __all__ = ["WIDTHS", "Encoder"]
 
-#: Of each stage: blocks, stride, size of the kernel, how many times wider inside, channels.
+#: For each stage: blocks, stride, size of the kernel, how many times wider inside, channels.
 STAGES = (
     (1, 1, 3, 1, 16),
     (3, 2, 3, 6, 24),

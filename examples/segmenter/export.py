@@ -2,8 +2,8 @@
 
     python export.py DATA runs/all.pt roads.onnx --held-out 0 runs/fold0.pt
 
-Of the pixels that a network calls .3, three in ten should be road. How far a network trained in the same way is from
-that is measured on photographs that it has not seen, those of the fold, and mended in the last layer: log odds become
+Three in ten of the pixels that a network calls .3 should be road. How far a network trained in the same way is from
+that is measured on photographs that it has not seen, the fold's, and mended in the last layer: log odds become
 `a` times themselves plus `b`. The exported network runs in 8 bits (`quantize.py`).
 """
 
@@ -99,7 +99,7 @@ def _held_out_pixels(network: RoadNet, tiles: list[Tile]) -> tuple[NDArray[np.fl
     for tile in tiles:
         ground = tile.observed[every]
         parts.append((probabilities(network, tile.photo)[every][ground], tile.road[every][ground]))
-    seen, road = (np.concatenate(one) for one in zip(*parts, strict=True))
+    seen, road = (np.concatenate(item) for item in zip(*parts, strict=True))
     return seen.clip(1e-5, 1 - 1e-5), road
 
 

@@ -57,9 +57,9 @@ def _measure(
     elsewhere = 0
     for other in options.elsewhere:
         found = _locate(folder / "photos", folder / f"on_{other.stem}", other, segmenter)
-        elsewhere += sum(one["status"] == "located" for one in found.values())
+        elsewhere += sum(result["status"] == "located" for result in found.values())
     both = [name for name, off in right["true"].items() if max(off, right["seen"].get(name, np.inf)) <= RIGHT_M]
-    n_true, n_seen = (sum(off <= RIGHT_M for off in one.values()) for one in right.values())
+    n_true, n_seen = (sum(off <= RIGHT_M for off in result.values()) for result in right.values())
     coarse = sum(RIGHT_M < off <= WRONG_M for off in right["seen"].values())
     wrong = sum(off > WRONG_M for off in right["seen"].values())
     counts = f"{n_seen} | {len(both)} of {n_true} | {coarse} | {wrong} | {elsewhere}"
@@ -112,7 +112,7 @@ def _locate(queries: Path, out: Path, reference: Path, more: list[str]) -> dict[
     """Locate a folder of queries, but for those located already, and return the results by name."""
     _roadgeo("locate", queries, "-r", reference, "-o", out, "--time-limit", 60, "--skip-existing", "-q", *more)
     found = [json.loads(path.read_text()) for path in sorted(out.glob("*_location.json"))]
-    return {Path(one["query"]).stem: one for one in found}
+    return {Path(result["query"]).stem: result for result in found}
 
 
 def _judge(
@@ -120,15 +120,15 @@ def _judge(
 ) -> dict[str, float]:
     """Return of each that is located how many metres the middle of its frame is off."""
     judged = {}
-    for name, one in found.items():
-        if one["status"] != "located":
+    for name, result in found.items():
+        if result["status"] != "located":
             continue
         matrix, (width, height) = views[name]
         column, row = _apply(np.linalg.inv(matrix), width / 2, height / 2)
         x, y = places[name]
         right = np.array([x + column - 750, y - (row - 750)])  # photographs of 1500 px of 1 m
-        columns, rows = one["size"]
-        judged[name] = float(np.linalg.norm(_apply(np.array(one["homography"]), columns / 2, rows / 2) - right))
+        columns, rows = result["size"]
+        judged[name] = float(np.linalg.norm(_apply(np.array(result["homography"]), columns / 2, rows / 2) - right))
     return judged
 
 

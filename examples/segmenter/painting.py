@@ -1,7 +1,7 @@
 """Painted scenes: real streets between invented houses, and photographs with houses, trees and shadows painted in.
 
 34 photographs of one survey show no deep shadows of towers, no gravel, no boulevards of eight lanes, no railways in
-sand. A painted scene shows what they lack, and its label is right to the pixel. Streets are those of OpenStreetMap.
+sand. A painted scene shows what they lack, and its label is right to the pixel. Streets come from OpenStreetMap.
 """
 
 from __future__ import annotations
@@ -411,7 +411,7 @@ class _Canvas:
             hull = cv2.convexHull(np.concatenate([foot, far]).astype(np.float32))
             cv2.fillPoly(self.shadow, [np.rint(hull).astype(np.int32)], 255, cv2.LINE_AA, 4)
         self._cast()
-        for x, y, angle, width, depth, height, hue in sorted(roofs, key=lambda one: one[5]):
+        for x, y, angle, width, depth, height, hue in sorted(roofs, key=lambda item: item[5]):
             colour = np.array(ROOFS[hue], np.float32) * rng.uniform(0.8, 1.15)
             foot = _box(x, y, angle, width, depth)
             top = foot + np.rint(self.lean * height * 16).astype(np.int32)

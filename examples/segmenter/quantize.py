@@ -102,13 +102,13 @@ class _Layers:
         """Let the convolution after a padding with zeros pad by itself."""
         *_, top, left, _, _, bottom, right = self.value(pad.input[1]).tolist()
         for conv in self._replace(pad):
-            (pads,) = (one.ints for one in conv.attribute if one.name == "pads")
+            (pads,) = (item.ints for item in conv.attribute if item.name == "pads")
             pads[:] = [a + b for a, b in zip(pads, (top, left, bottom, right), strict=True)]
 
     def fold_normalisation(self, norm: onnx.NodeProto) -> None:
         """Scale and shift the two convolutions whose features are added before a normalisation."""
         gain, shift, mean, variance = (self.value(name) for name in norm.input[1:5])
-        (epsilon,) = (one.f for one in norm.attribute if one.name == "epsilon")
+        (epsilon,) = (item.f for item in norm.attribute if item.name == "epsilon")
         factor = gain / np.sqrt(variance + np.float32(epsilon))
         add = self.maker[norm.input[0]]
         if add.op_type != "Add":

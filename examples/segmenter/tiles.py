@@ -60,7 +60,7 @@ def truth_of(road: NDArray[np.bool_], observed: NDArray[np.bool_], known: NDArra
 
 
 def unobserved(photo: Bytes, least_area: int = 20_000) -> NDArray[np.bool_]:
-    """Return (H, W) where the photograph is a large plain white or black area: there is none of the ground."""
+    """Return (H, W) where the photograph is a large plain white or black area, where no ground is shown."""
     void = np.zeros(photo.shape[:2], bool)
     for plain in (photo.min(axis=2) >= 250, photo.max(axis=2) <= 3):
         opened = cv2.morphologyEx(plain.astype(np.uint8), cv2.MORPH_OPEN, np.ones((15, 15), np.uint8))
@@ -87,5 +87,5 @@ def _near_intersections(centre: NDArray[np.bool_], sigma: float = 5.0) -> NDArra
     elsewhere = np.full(centre.shape, 255, np.uint8)
     for x, y in np.rint(centroids[1:]).astype(int):
         elsewhere[y, x] = 0
-    distance = np.minimum(cv2.distanceTransform(elsewhere, cv2.DIST_L2, 5), 10 * sigma)  # far where there is none
+    distance = np.minimum(cv2.distanceTransform(elsewhere, cv2.DIST_L2, 5), 10 * sigma)  # far where there is no road
     return 255 * np.exp(-0.5 * (distance / sigma) ** 2)

@@ -214,7 +214,7 @@ def _average(mean: RoadNet, network: RoadNet, keep: float) -> None:
 
 
 def _save(path: Path, network: RoadNet) -> None:
-    """Keep the weights, those of the kernels in 16 bits."""
+    """Keep the weights, the kernels' in 16 bits."""
     path.parent.mkdir(parents=True, exist_ok=True)
     state = {name: value.half() if value.ndim == 4 else value for name, value in network.state_dict().items()}
     partial = path.with_suffix(".part")

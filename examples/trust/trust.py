@@ -2,7 +2,7 @@
 
     python examples/trust/trust.py CITY.gpkg CITY.gpkg ... --out results --count 200 --effort quick --jobs 4
 
-Every argument is a file of road lines; its reference is built from all roads but those of a band across the middle,
+Every argument is a file of road lines; its reference is built from all roads but a band across the middle,
 3.5 km wide. `--count` masks are drawn of each city and kind, worn in five ways (see `WORN`), and searched:
 
 there       of the city's roads outside the band, to compare with: these have a place

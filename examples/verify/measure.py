@@ -3,7 +3,7 @@
     python examples/verify/measure.py OUT REF.gpkg... [--count 134] [--seed 3]
 
 Each reference draws `count` masks (clean, segmented and poor in turn; 0.5 to 2 m pixels, any heading, 1000 x 1000) as
-GeoTIFFs with a geotransform; that of every other one is wrong: by 5 to 300 m, up to 5 degrees. A tenth as many
+GeoTIFFs with a geotransform; every other one is wrong: by 5 to 300 m, up to 5 degrees. A tenth as many
 come from another reference's roads and must not be judged. One line of JSON per mask goes to OUT; a second run goes on
 where the first one ended. Prints the shares and errors.
 """
@@ -70,10 +70,10 @@ def trial(k: int, seed: int, landscape, elsewhere, reference, folder: Path) -> d
 
 def report(records: list[dict]) -> None:
     """Print shares and errors."""
-    own = [one for one in records if not one["foreign"]]
-    right = [one for one in own if one["verdict"] == ("off" if one["moved"] else "agrees")]
-    wrong = [one for one in own if one["verdict"] == ("agrees" if one["moved"] else "off")]
-    errors = [one["error_m"] for one in right if one["moved"]]
+    own = [record for record in records if not record["foreign"]]
+    right = [item for item in own if item["verdict"] == ("off" if item["moved"] else "agrees")]
+    wrong = [item for item in own if item["verdict"] == ("agrees" if item["moved"] else "off")]
+    errors = [result["error_m"] for result in right if result["moved"]]
     print(
         f"{len(right)} of {len(own)} right ({len(right) / len(own):.1%}), {len(wrong)} wrong, "
         f"{len(own) - len(right) - len(wrong)} not judged"
@@ -82,12 +82,12 @@ def report(records: list[dict]) -> None:
         f"displacement recovered within {np.median(errors):.2f} m (median), {np.percentile(errors, 95):.2f} m (p95),"
         f" {max(errors):.2f} m (worst)"
     )
-    foreign = [one for one in records if one["foreign"]]
+    foreign = [record for record in records if record["foreign"]]
     print(
-        f"{sum(one['verdict'] == 'unknown' for one in foreign)} of {len(foreign)} masks of other places not judged;"
-        f" the highest lead 10^{max((one['log10_lead'] or 0.0 for one in foreign), default=0.0):.1f}"
+        f"{sum(item['verdict'] == 'unknown' for item in foreign)} of {len(foreign)} masks of other places not judged;"
+        f" the highest lead 10^{max((item['log10_lead'] or 0.0 for item in foreign), default=0.0):.1f}"
     )
-    print(f"seconds: median {np.median([one['seconds'] for one in records]):.2f}")
+    print(f"seconds: median {np.median([record['seconds'] for record in records]):.2f}")
 
 
 def main() -> None:
@@ -99,7 +99,7 @@ def main() -> None:
     given = parser.parse_args()
     warm_up()
     done = [json.loads(line) for line in given.out.read_text().splitlines()] if given.out.exists() else []
-    known = {(one["city"], one["foreign"], one["k"]) for one in done}
+    known = {(item["city"], item["foreign"], item["k"]) for item in done}
     landscapes = [read_landscape(path) for path in given.references]
     with tempfile.TemporaryDirectory() as folder, given.out.open("a") as out:
         opened = [open_reference(path) for path in given.references]

@@ -43,17 +43,6 @@ def test_a_view_is_the_projection_of_its_camera(tilt, azimuth, heading, gsd, foc
     assert float(view.sampling(middle)) == pytest.approx(gsd / np.sqrt(np.cos(np.radians(tilt))))
 
 
-def test_a_tilted_view_reaches_farther_where_it_leans():
-    view = make_view(CENTER, (100, 100), 1.0, tilt_deg=40, tilt_azimuth_deg=90)
-    east = view.footprint[:, 0] - CENTER[0]
-    assert east.max() > 1.5 * -east.min()
-
-
-@pytest.mark.parametrize(("tilt", "seen"), [(0, True), (45, True), (60, False), (80, False)])
-def test_frames_that_reach_to_the_horizon_are_told(tilt, seen):
-    assert sees_ground(make_view(CENTER, (100, 100), 1.0, tilt)) is seen
-
-
 def test_a_warped_mask_shows_what_its_matrix_says():
     mask = np.zeros((200, 300), np.uint8)
     mask[80:100, 180:200] = 255

@@ -254,7 +254,7 @@ def test_exact_observations_give_the_homography(seed):
 
 @pytest.mark.slow
 @pytest.mark.parametrize("changes", [{}, {"max_radius": 12.0}, {"least_share": 0.8}, {"prior": 10.0}])
-@pytest.mark.parametrize("seed", range(3))
+@pytest.mark.parametrize("seed", range(2))
 def test_like_the_twin(seed, changes):
     town = Town(seed, noise=1.5, points=50)
     town.directions[:12] = town.directions[:12, ::-1]  # some roads run across
@@ -268,10 +268,9 @@ def test_like_the_twin(seed, changes):
     assert np.allclose(np.tril(normal), np.tril(system), rtol=1e-2, atol=1e-3)
 
 
-@pytest.mark.parametrize("seed", range(3))
 @pytest.mark.slow
-def test_like_the_twin_where_points_are_held(seed):
-    town, start = Town(seed, noise=1.5, pairs=3), jittered(P, 0.004, seed)
+def test_like_the_twin_where_points_are_held():
+    town, start = Town(0, noise=1.5, pairs=3), jittered(P, 0.004, 0)
     p, n, rms, normal = run(town, start, held_at=start)
     expected = naive.adjust(start, 8, *town.arguments(held_at=start), town.roads[0].astype(float))
     assert np.allclose(p, expected[0], atol=1e-6)
@@ -289,44 +288,6 @@ def test_like_the_twin_with_a_lens():
     assert n == expected[1]
     assert rms == pytest.approx(expected[2], rel=1e-3)
     assert np.allclose(np.tril(normal), np.tril(expected[3]), rtol=1e-2, atol=1e-3)
-
-
-@pytest.mark.parametrize("k1", [-0.12, 0.0, 0.08])
-def test_the_lens_is_found_with_the_homography(k1):
-    p, n, rms, _ = run(Town(1, k1=k1), jittered(P, 0.004, 1), 9, prior=0.0)
-    assert p[8] == pytest.approx(k1, abs=1e-3)
-    assert corner_gap(p, P) < 0.1
-    assert n > 60
-    assert rms < 0.02
-
-
-@pytest.mark.parametrize("pairs", [0, 2])
-def test_held_near_its_start_roads_are_enough(pairs):
-    town, start = Town(pairs=pairs), jittered(P, 0.006, 4)
-    assert corner_gap(start, P) > 4
-    free, n_free, *_ = run(town, start)
-    assert n_free == -1 or corner_gap(free, P) > 4
-    p, n, *_ = run(town, start, held_at=start)
-    assert n > 50
-    assert corner_gap(p, P) < 0.5
-
-
-def test_wrong_matches_are_outvoted():
-    town = Town(4, noise=0.5)
-    town.targets[:4] += (0.05, -0.05)  # 28 m off
-    p, *_ = run(town, jittered(P, 0.004))
-    assert corner_gap(p, P) < 2
-
-
-def test_cells_where_roads_do_not_meet_wait():
-    town = Town(6)
-    town.cells = lambda xy: (xy[:, 0] > 0).astype(np.int64)
-    right = town.points[:, 0] > 0
-    rng = np.random.default_rng(0)
-    town.points[right] += rng.uniform(-0.2, 0.2, (right.sum(), 2))  # what is there is not on the map
-    n = run(town, P, least_share=0.6, max_radius=8.0)[1]
-    assert n <= (~right).sum()
-    assert run(town, P, least_share=0.0, max_radius=8.0)[1] > n
 
 
 @pytest.mark.parametrize("pairs", [0, 1])

@@ -55,30 +55,6 @@ def test_thin_equals_its_slow_twin(states: np.ndarray, min_end_depth: float) -> 
     np.testing.assert_array_equal(actual, expected)
 
 
-@pytest.mark.slow
-@settings(deadline=None, max_examples=200)
-@given(random_states())
-def test_thinning_joins_and_parts_nothing(states: np.ndarray) -> None:
-    left = thinned(states, 2.0)
-    for picture in (states, left):
-        assert set(np.unique(picture)) <= {GROUND, ROAD, SOLID}
-    np.testing.assert_array_equal(left[states != ROAD], states[states != ROAD])
-    for before, after, connected in (
-        (states != GROUND, left != GROUND, np.ones((3, 3))),
-        (states == GROUND, left == GROUND, None),
-    ):
-        assert ndimage.label(before, connected)[1] == ndimage.label(after, connected)[1]
-
-
-@pytest.mark.slow
-@settings(deadline=None, max_examples=100)
-@given(random_states())
-def test_what_is_left_is_one_pixel_wide(states: np.ndarray) -> None:
-    left = thinned(states, 0.0)
-    for row, column in np.argwhere(left == ROAD):
-        assert not naive.is_simple(left, row, column) or naive.n_neighbours(left, row, column) == 1
-
-
 @pytest.mark.parametrize(
     ("picture", "expected"),
     [

@@ -65,13 +65,6 @@ def test_tangents_are_stored_to_a_hundredth_of_a_degree():
 
 
 class TestBuildIndex:
-    def test_points_lie_in_their_buckets(self, town):
-        index = town[1]
-        bucket = np.repeat(np.arange(len(index.point_starts) - 1), np.diff(index.point_starts))
-        x0, y0, size = index.grid
-        assert np.array_equal(np.floor((index.xy[:, 0] - x0) / size), bucket % index.shape[0])
-        assert np.array_equal(np.floor((index.xy[:, 1] - y0) / size), bucket // index.shape[0])
-
     def test_rows_are_those_of_the_network(self, town):
         network, index = town
         found = network.intersections
@@ -96,16 +89,6 @@ class TestBuildIndex:
         assert drawn.length == pytest.approx(roads.length, rel=1e-3)
         assert drawn.hausdorff_distance(roads) <= IndexOptions().simplify_m + 1e-3
 
-    @pytest.mark.slow
-    def test_every_segment_is_listed(self, town):
-        index = town[1]
-        roads = index.road_buckets
-        assert roads.grid == pytest.approx((*index.grid[:2], index.grid[2] / 2))
-        crossed = naive.bin_segments(index.segments, roads.grid, roads.shape)
-        for bucket, segments in enumerate(crossed):
-            listed = roads.ids[roads.starts[bucket] : roads.starts[bucket + 1]]
-            assert segments <= set(listed.tolist())
-
     def test_an_index_of_an_earlier_version_has_wider_buckets_of_roads(self, town):
         index = town[1]
         counts = np.zeros(index.shape[0] * index.shape[1] + 1, np.int64)
@@ -127,12 +110,6 @@ class TestBuildIndex:
         assert (np.diff(np.sort(np.stack([anchor, b, c], axis=1), axis=1), axis=1) > 0).all()
         ab, ac = index.xy[b] - index.xy[anchor], index.xy[c] - index.xy[anchor]
         assert (ab[:, 0] * ac[:, 1] - ab[:, 1] * ac[:, 0] > 0).all()
-
-    def test_size_is_bounded(self, town):
-        index = town[1]
-        table = index.table_starts.nbytes
-        all_bytes = sum(array.nbytes for array in index.arrays().values())
-        assert (all_bytes - table) / len(index) < 3000
 
     def test_arrays_cannot_be_written(self, town):
         assert not any(array.flags.writeable for array in town[1].arrays().values())
@@ -169,11 +146,6 @@ class TestBuildIndex:
         index = build_index(RoadNetwork(nothing, piled, PLANE))
         assert len(index.table_entries) == 0
         assert len(index.segments) == len(index.segment_ids) == 0
-
-    def test_options_change_the_table(self, town):
-        fewer = build_index(town[0], IndexOptions(n_neighbours=5))
-        assert fewer.neighbours.shape[1] == 5
-        assert len(fewer.table_entries) < len(town[1].table_entries)
 
 
 class TestFromParts:

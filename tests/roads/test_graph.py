@@ -21,24 +21,8 @@ def graph() -> RoadGraph:
     return RoadGraph.from_polylines(np.array([[0.0, 0], [3, 4]]), np.array([[0, 1], [1, 0], [1, 1]]), LINES)
 
 
-def test_counts(graph):
-    assert (graph.n_nodes, graph.n_edges) == (2, 3)
-    assert graph.degree().tolist() == [2, 4]
-    assert graph.offsets.tolist() == [0, 2, 5, 9]
-
-
 def test_lengths(graph):
     assert graph.edge_lengths() == pytest.approx([5, 7, 2 + np.sqrt(2)])
-
-
-def test_polylines_are_views(graph):
-    assert all(np.array_equal(a, b) for a, b in zip(graph.polylines(), LINES, strict=True))
-    assert np.shares_memory(graph.polyline(1), graph.coords)
-
-
-def test_types_are_fixed():
-    graph = RoadGraph.from_polylines([[0, 0], [1, 0]], [[0, 1]], [np.array([[0, 0], [1, 0]])])
-    assert [a.dtype for a in (graph.xy, graph.edges, graph.coords, graph.offsets)] == ["f8", "i4", "f8", "i8"]
 
 
 @pytest.mark.parametrize("n", [0, 3])

@@ -111,18 +111,6 @@ def test_crossings_further_apart_stay_two():
     assert degrees(graph) == [1, 1, 1, 1, 3, 3]
 
 
-def test_two_carriageways_become_one_road():
-    graph = simplify(
-        network(
-            [(-200, 0), (0, 0), (10, 4), (190, 4), (200, 0), (400, 0)],
-            [(0, 0), (10, -4), (190, -4), (200, 0)],
-            [(0, 0), (0, 100)],
-            [(200, 0), (200, 100)],
-        )
-    )
-    assert degrees(graph) == [1, 1, 1, 1, 3, 3]
-
-
 def test_stubs_are_dropped_and_longer_dead_ends_stay():
     graph = simplify(network([(-200, 0), (200, 0)], [(0, 0), (0, 14)], [(50, 0), (50, 40)]))
     assert degrees(graph) == [1, 1, 1, 3]
