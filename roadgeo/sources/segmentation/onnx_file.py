@@ -31,6 +31,7 @@ _MAX_SECONDS = 600.0  # of one tile
 
 _CONTROL = {"If", "Loop", "Scan", "SequenceMap"}
 _RANDOM = {"RandomNormal", "RandomNormalLike", "RandomUniform", "RandomUniformLike", "Multinomial", "Bernoulli"}
+_ORT = b"ORTM"  # where the file of another format has it, which onnxruntime would read instead
 _STRING = 8  # of TensorProto.DataType
 
 #: The checked parts of a file (https://github.com/onnx/onnx/blob/main/onnx/onnx.proto).
@@ -152,6 +153,8 @@ def _require_network(content: bytes) -> dict[str, str]:
     """Look through a ModelProto; return the operator that makes each value."""
     from google.protobuf.message import DecodeError
 
+    if content[4:8] == _ORT:
+        raise ModelError("in onnxruntime's own format, which cannot be looked at; export it as ONNX")
     try:
         model = message_types(_SCHEMA)["Model"].FromString(content)
     except DecodeError as error:
@@ -215,6 +218,7 @@ def _open_session(content: bytes, threads: int) -> Any:
     options.enable_mem_pattern = False
     options.add_session_config_entry("session.intra_op.allow_spinning", "0")  # waiting threads leave the core to others
     options.add_session_config_entry("session.use_env_allocators", "1")  # those of `_limit_memory`
+    options.add_session_config_entry("session.load_model_format", "ONNX")  # what was looked at, whatever else it may be
     # Constants that operators make are made while the model runs, when memory is bounded.
     return onnxruntime.InferenceSession(
         content, options, ["CPUExecutionProvider"], disabled_optimizers=["ConstantFolding"], enable_fallback=0

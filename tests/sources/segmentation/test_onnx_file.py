@@ -12,9 +12,11 @@ from onnx import TensorProto, helper, numpy_helper
 from worlds.models import brightness_model, save
 
 from roadgeo.errors import ModelError
+from roadgeo.sources.segmentation import onnx_file
 from roadgeo.sources.segmentation.network import load_network
 from roadgeo.sources.segmentation.onnx_file import Port, open_onnx
 
+CORPUS = Path(__file__).parents[2] / "corpus"
 IMAGE = helper.make_tensor_value_info("image", TensorProto.FLOAT, [1, 3, 64, 64])
 GIVEN = helper.make_tensor_value_info("road", TensorProto.FLOAT, [1, 1, 64, 64])
 
@@ -203,3 +205,12 @@ def test_a_compressed_model_is_read_within_bounds(tmp_path: Path, monkeypatch: p
     monkeypatch.setattr("roadgeo.sources.segmentation.onnx_file._MAX_BYTES", 10_000)
     with pytest.raises(ModelError, match="at most"):
         open_onnx(packed)
+
+
+def test_a_file_that_is_two_networks_is_refused(tmp_path: Path) -> None:
+    """onnxruntime would take it for its own format; if it came to that, it reads the network that was looked at."""
+    content = b"\x12\x06xxORTM" + (CORPUS / "onnx" / "plain.onnx").read_bytes()
+    (tmp_path / "two.onnx").write_bytes(content)
+    with pytest.raises(ModelError, match="in onnxruntime's own format, which cannot be looked at"):
+        open_onnx(tmp_path / "two.onnx")
+    assert onnx_file._open_session(content, 1).get_outputs()
