@@ -161,9 +161,14 @@ def _stream_parquet(path: Path, most: int, advance: Callable[[float], None]) -> 
         with pq.ParquetFile(path) as file:
             shape_column, crs, encoding = _geometry_of(file)
             names = [name for name in file.schema_arrow.names if name != shape_column]
-            known = [name for name in names if is_known_column(name)]
-            wanted, done = known or names, 0
+            leaves = [file.schema.column(n) for n in range(len(file.schema.names))]
+        wanted = [name for name in names if is_known_column(name)] or names
+        text = [leaf.path for leaf in leaves if leaf.physical_type == "BYTE_ARRAY"]
+        done, size = 0, 0
+        with pq.ParquetFile(path, read_dictionary=text) as file:
             for batch in file.iter_batches(most, columns=[shape_column, *wanted]):
+                size += sum(map(_unpacked_size, batch.columns))
+                require_bounded(path, size)
                 columns = {name: objects(batch[name].to_pylist()) for name in wanted}
                 yield RoadTable(_shapes(batch, shape_column, encoding), crs, columns, {"format": "Parquet"})
                 done += len(batch)
@@ -206,15 +211,29 @@ def _shapes(batch: Any, column: str, encoding: str) -> AnyArray:
     return np.asarray(gpd.GeoDataFrame.from_arrow(table, geometry=column).geometry.to_numpy())
 
 
+def _unpacked_size(column: Any) -> int:
+    """Return the bytes of a column's values; a value of a dictionary counts as often as it is named."""
+    import pyarrow as pa
+    import pyarrow.compute as pc
+
+    if pa.types.is_dictionary(column.type):
+        return int(pc.sum(pc.take(pc.binary_length(column.dictionary), column.indices)).as_py() or 0)
+    if pa.types.is_struct(column.type):
+        return sum(map(_unpacked_size, column.flatten()))
+    return _unpacked_size(column.flatten()) if pa.types.is_nested(column.type) else int(column.nbytes)
+
+
 def _require_rows(path: Path) -> None:
-    """Refuse a file that claims more rows than bytes: a few bytes may stand for billions of equal rows."""
+    """Refuse a file that claims more rows than bytes, or long lists: a few bytes may stand for billions of values."""
     import pyarrow.parquet as pq
 
     meta = pq.read_metadata(path)
-    unpacked = sum(meta.row_group(i).total_byte_size for i in range(meta.num_row_groups))
+    groups = [meta.row_group(i) for i in range(meta.num_row_groups)]
+    values = max((group.column(j).num_values for group in groups for j in range(group.num_columns)), default=0)
+    unpacked = sum(group.total_byte_size for group in groups)
     if meta.num_rows > (size := path.stat().st_size):
         raise ValueError(f"its {size:,} bytes claim to hold {meta.num_rows:,} rows and {unpacked:,} bytes")
-    require_bounded(path, unpacked)
+    require_bounded(path, max(unpacked, 8 * values))
 
 
 # --- graphs, and answers of Overpass ----------------------------------------------------------------------------------
