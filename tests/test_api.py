@@ -130,7 +130,7 @@ def test_a_photograph_goes_the_way_of_the_command_line(
     def segmented(paths: tuple[str, ...], *_: object) -> Sighting:
         return Sighting(roadgeo.Location(paths[0], "not_located", "hardly a road"), roadgeo.RoadMask(np.zeros((9, 9))))
 
-    monkeypatch.setattr(queries, "_locate_photograph", segmented)
+    monkeypatch.setattr(queries, "locate_photograph", segmented)
     found = roadgeo.locate(PHOTO, porto)
     assert (found.reason, found.photo) == ("hardly a road", str(PHOTO))
 
@@ -180,7 +180,7 @@ def test_photographs_that_are_no_files_are_segmented_as_files_are(
         location = roadgeo.Location(paths[0], "not_located", f"hardly a road in {paths[0]}")
         return Sighting(location, roadgeo.RoadMask(np.zeros((9, 9))))
 
-    monkeypatch.setattr(queries, "_locate_photograph", segmented)
+    monkeypatch.setattr(queries, "locate_photograph", segmented)
     found = roadgeo.locate(given, porto)
     assert (found.query, found.reason, found.photo) == ("array", "hardly a road in array", None)
     assert np.array_equal(read[0], photograph)
