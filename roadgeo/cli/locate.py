@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import logging
 from collections import Counter
 from collections.abc import Mapping, Sequence
 from dataclasses import replace
@@ -50,12 +51,14 @@ from roadgeo.outputs.registry import (
 from roadgeo.outputs.wording import format_lonlat
 from roadgeo.running.batch import Outcome, locate_masks, open_references, write_overview
 from roadgeo.running.options import BatchOptions
-from roadgeo.running.tasks import find_masks, name_tasks
+from roadgeo.running.tasks import SUFFIXES, find_masks, name_tasks
 
 if TYPE_CHECKING:
     from roadgeo.outputs.location_files import OutputOptions
 
 __all__ = ["describe", "locate_command", "pair_images"]
+
+_LOG = logging.getLogger(__name__)
 
 #: Options without an effect on a result, or with a value for each mask.
 _OF_NO_ACCOUNT = {
@@ -264,7 +267,8 @@ def _output_options(given: Mapping[str, Any]) -> OutputOptions:
 def pair_images(masks: Sequence[str], images: Sequence[str]) -> dict[str, str]:
     """Match photographs with masks.
 
-    One photograph per mask in the same order, or a folder in which it has the mask's name, less a final "_mask".
+    One photograph per mask in the same order, or a folder in which it has the mask's name, less a final "_mask". Of
+    several with that name the first format of `SUFFIXES` counts.
 
     Raises
     ------
@@ -272,16 +276,26 @@ def pair_images(masks: Sequence[str], images: Sequence[str]) -> dict[str, str]:
         Another number of photographs than of masks, or none in the folder.
     """
     if len(images) == 1 and Path(images[0]).is_dir():
-        by_stem = {path.stem: str(path) for path in sorted(Path(images[0]).iterdir()) if path.suffix}
-        stems = {mask: Path(mask).stem for mask in masks}
-        found = {mask: by_stem.get(stem.removesuffix("_mask"), by_stem.get(stem)) for mask, stem in stems.items()}
-        missing = [mask for mask, image in found.items() if image is None]
-        if missing:
-            raise click.UsageError(f"No photograph in {images[0]} has the name of {missing[0]}.")
-        return {mask: image for mask, image in found.items() if image is not None}
+        pictures = [path for path in Path(images[0]).iterdir() if path.suffix.lower() in SUFFIXES]
+        pictures.sort(key=lambda path: (SUFFIXES.index(path.suffix.lower()), path))
+        return {mask: _photograph_of(mask, pictures, images[0]) for mask in masks}
     if images and len(images) != len(masks):
         raise click.UsageError(f"Got {len(masks)} masks and {len(images)} times --image; expected one for each mask.")
     return dict(zip(masks, images, strict=False))
+
+
+def _photograph_of(mask: str, pictures: Sequence[Path], folder: str) -> str:
+    """Return the picture that has a mask's name and is not the mask; the first of several, which is mentioned."""
+    stem = Path(mask).stem
+    others = [path for path in pictures if path.resolve() != Path(mask).resolve()]
+    for name in dict.fromkeys((stem.removesuffix("_mask"), stem)):
+        found = [path for path in others if path.stem == name]
+        if len(found) > 1:
+            chosen, other = (visible(str(path)) for path in found[:2])
+            _LOG.warning("%s: %s is drawn, though %s has its name, too", visible(mask), chosen, other)
+        if found:
+            return str(found[0])
+    raise click.UsageError(f"No photograph in {folder} has the name of {mask}.")
 
 
 # --- printing ---------------------------------------------------------------------------------------------------------

@@ -5,8 +5,9 @@ Memory holds two frames at a time. The motion of a frame comes from a file, from
 
 from __future__ import annotations
 
+import logging
 import tempfile
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Generator, Iterator, Mapping, Sequence
 from contextlib import ExitStack, suppress
 from dataclasses import dataclass, field, replace
 from pathlib import Path
@@ -22,11 +23,13 @@ from roadgeo.flights.tracker import FlightFrame
 from roadgeo.geometry.mask import RoadMask
 from roadgeo.running.options import ReadOptions
 from roadgeo.running.photographs import load_model
-from roadgeo.running.tasks import find_masks
+from roadgeo.running.tasks import SUFFIXES, find_masks, in_natural_order
 from roadgeo.sources.masks import read_mask
 from roadgeo.storage.atomic import writing
 
 __all__ = ["VIDEOS", "FrameOptions", "read_frames", "read_stills"]
+
+_LOG = logging.getLogger(__name__)
 
 #: Suffixes of videos.
 VIDEOS = (".mp4", ".mov", ".avi", ".mkv", ".m4v", ".mpg", ".mpeg", ".ts", ".webm", ".wmv")
@@ -128,31 +131,35 @@ def read_stills(
 
 
 def _images(arguments: Sequence[str], options: FrameOptions, stack: ExitStack) -> Iterator[_Image]:
-    number = 0
-    for argument in arguments:
-        if Path(argument).suffix.lower() in VIDEOS and Path(argument).is_file():
-            yield from _video(argument, options, stack)
-            continue
-        for path in find_masks([argument], options.recursive):
-            yield _Image(path, Path(path).name, number * options.interval_s)
-            number += 1
+    """Yield frames with their times: each file begins where the one before ended."""
+    if len(arguments) > 1 and list(arguments) == sorted(arguments) != sorted(arguments, key=in_natural_order):
+        _LOG.warning("frames come in the order of their names as text, frame_10 before frame_2; give their folder")
+    begun_s = 0.0
+    for path in find_masks(arguments, options.recursive, SUFFIXES + VIDEOS):
+        if Path(path).suffix.lower() in VIDEOS and Path(path).is_file():
+            begun_s = yield from _video(path, options, stack, begun_s)
+        else:
+            yield _Image(path, Path(path).name, begun_s)
+            begun_s += options.interval_s
 
 
-def _video(path: str, options: FrameOptions, stack: ExitStack) -> Iterator[_Image]:
-    """Take frames of a video; each is a file for as long as it is read."""
+def _video(path: str, options: FrameOptions, stack: ExitStack, begun_s: float = 0.0) -> Generator[_Image, None, float]:
+    """Take frames of a video that begins at a time; each is a file for as long as it is read. Return when it ends."""
     folder = stack.enter_context(tempfile.TemporaryDirectory(prefix="roadgeo-"))
     video = cv2.VideoCapture(path)
     stack.callback(video.release)
     rate = video.get(cv2.CAP_PROP_FPS)
     if not video.isOpened() or not 0.01 < rate < 10_000:
         raise MaskError(f"{path}: no video that OpenCV reads; give its frames as images")
-    taken, next_s = 0, 0.0
+    taken, next_s, at_s = 0, 0.0, 0.0
     for k in range(1 << 31):
         if not video.grab():
             break
-        if k / rate + 1e-9 < next_s:
+        # Frames of phones and links come at no fixed rate; where the container states no time, they do.
+        at_s = video.get(cv2.CAP_PROP_POS_MSEC) / 1000.0 or k / rate
+        if at_s + 1e-9 < next_s:
             continue
-        next_s = k / rate + options.every_s
+        next_s = at_s + options.every_s
         good, picture = video.retrieve()
         if not good:
             continue
@@ -160,9 +167,10 @@ def _video(path: str, options: FrameOptions, stack: ExitStack) -> Iterator[_Imag
         with writing(target):  # OpenCV does not report a full disk
             Path(target).write_bytes(cv2.imencode(".png", picture)[1].tobytes())
         taken += 1
-        yield _Image(target, f"{Path(path).stem}_{k:06d}", k / rate, stays=False)
+        yield _Image(target, f"{Path(path).stem}_{k:06d}", begun_s + at_s, stays=False)
     if not taken:
         raise MaskError(f"{path}: no frame of the video can be read; give its frames as images")
+    return begun_s + at_s + 1.0 / rate
 
 
 def _read(image: _Image, options: FrameOptions, last: _Last) -> tuple[RoadMask, AnyArray | None]:

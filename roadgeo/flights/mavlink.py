@@ -75,8 +75,11 @@ class PositionFix:
 def fix_of(found: Mapping[str, Any], taken_s: float) -> PositionFix | None:
     """Return our position, from a frame's row or a location as plain values; None where that is not known.
 
-    That is the place of the camera where its focal length was given, and otherwise that of the frame's middle.
+    That is the place of the camera where its focal length was given, and otherwise that of the frame's middle. A frame
+    whose roads contradict the place that its motion predicts is not known.
     """
+    if found.get("status") == "predicted" and found.get("log10_odds") is not None:
+        return None
     camera = found.get("camera")
     if camera and camera.get("source", "camera") == "camera":
         told = camera.get("sigma")

@@ -109,6 +109,13 @@ class Pose:
         return np.asarray(np.sqrt(self.covariance.diagonal()[:8].reshape(4, 2).sum(axis=1)))
 
 
+def loosened(pose: Pose, shift_m: float) -> Pose:
+    """Return a frame that may be shifted as a whole by so much besides: root mean square of the distance."""
+    covariance = pose.covariance.copy()
+    covariance[:8, :8] += 0.5 * shift_m**2 * np.tile(np.eye(2), (4, 4))
+    return replace(pose, covariance=covariance)
+
+
 @dataclass(frozen=True)
 class _Local:
     """Normalised coordinates: of a frame, (0, 0) is its middle; of the plane, `origin`, in units of `unit` metres."""

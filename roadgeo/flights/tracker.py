@@ -19,7 +19,7 @@ from roadgeo._arrays import FloatArray
 from roadgeo.errors import MaskError
 from roadgeo.flights.candidates import CandidateOptions, Candidates, Look
 from roadgeo.flights.mosaic import Mosaic, MosaicOptions, lay_together
-from roadgeo.flights.pose import FilterOptions, Pose, correct, predict, start
+from roadgeo.flights.pose import FilterOptions, Pose, correct, loosened, predict, start
 from roadgeo.geometry.camera import CameraOptions
 from roadgeo.geometry.frame import Frame
 from roadgeo.geometry.homography import Homography
@@ -222,12 +222,13 @@ class Tracker:
                 self._pose = corrected
                 why = "its roads agree with the map"
                 return Tracked(frame, status, why, known_at, corrected, reference, odds)
-            why = "its roads do not agree with the map; placed by its motion"
+            why = "its roads contradict the map where its motion puts it: it may be a frame's width away"
         frame_m = predicted.frame.half_diagonal * 2.0 * predicted.gsd_m
         if predicted.sigma_m > self.options.lost_frames * frame_m:
             return Tracked(frame, "lost", "no road has agreed for too long", known_at)
         self._pose = predicted
-        return Tracked(frame, "predicted", why, known_at, predicted, reference, odds)
+        stated = predicted if math.isnan(odds) else loosened(predicted, frame_m)
+        return Tracked(frame, "predicted", why, known_at, stated, reference, odds)
 
     def _lose(self, waiting: _Waiting, reason: str) -> list[Tracked]:
         """Declare the flight lost: frames that did not agree wait for a place again."""

@@ -6,8 +6,9 @@ import glob
 import hashlib
 import logging
 import os
+import re
 from collections import Counter
-from collections.abc import Iterator, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -15,13 +16,20 @@ from roadgeo._text import visible
 from roadgeo.outputs.registry import is_result, result_endings
 from roadgeo.running.probability_files import ENDING, is_ours
 
-__all__ = ["SUFFIXES", "Task", "find_masks", "name_tasks"]
+__all__ = ["SUFFIXES", "Task", "find_masks", "in_natural_order", "name_tasks"]
 
 _LOG = logging.getLogger(__name__)
 
-#: Suffixes of the files that a folder is searched for.
-SUFFIXES = (".tif", ".tiff", ".png", ".jpg", ".jpeg", ".jp2", ".bmp", ".pgm", ".webp", ".vrt", ".img", ".npy")
-
+#: Suffixes of the files that a folder is searched for, as `storage.rasters` reads them.
+SUFFIXES = (
+    *(".tif", ".tiff", ".jpg", ".jpeg", ".jpe", ".jfif", ".jp2", ".j2k", ".webp", ".png", ".bmp", ".gif"),
+    *(".pgm", ".ppm", ".pnm", ".vrt", ".img", ".npy"),
+)
+#: Suffixes of pictures that are not read.
+_NOT_READ = (
+    *(".heic", ".heif", ".avif", ".jxl", ".svg", ".psd", ".exr", ".tga", ".ecw", ".sid"),
+    *(".dng", ".nef", ".cr2", ".cr3", ".arw", ".orf", ".raf", ".rw2", ".pef", ".srw"),
+)
 
 #: File systems take names of 255 bytes; outputs, and their temporary names, need the rest.
 _MAX_STEM_BYTES = 180
@@ -40,44 +48,58 @@ class Task:
         return os.fsencode(self.mask).decode(errors="backslashreplace")
 
 
-def find_masks(arguments: Sequence[str], recursive: bool = False) -> list[str]:
+def find_masks(arguments: Sequence[str], recursive: bool = False, suffixes: tuple[str, ...] = SUFFIXES) -> list[str]:
     """Expand folders (their images, not our own results) and patterns, which not every shell expands; keep the rest.
 
-    Images in folders within folders are found with `recursive`; else a message mentions them.
+    Numbers in names count as numbers: frame_2 comes before frame_10. Images in folders within folders are found with
+    `recursive`; else a message mentions them. Another mentions pictures of formats that are not read.
     """
     found: list[str] = []
     for argument in arguments:
         if Path(argument).is_dir():
-            endings = result_endings()
-            found += sorted(str(path) for path in _images_in(Path(argument), endings, recursive))
-            if not recursive:
-                _tell_passed_over(Path(argument), endings)
+            found += _images_in(Path(argument), recursive, suffixes)
         elif glob.has_magic(argument) and not Path(argument).exists():
-            found += sorted(glob.glob(argument, recursive=True)) or [argument]  # noqa: PTH207 (patterns may be absolute)
+            names = glob.glob(argument, recursive=True)  # noqa: PTH207 (patterns may be absolute)
+            found += sorted(names, key=in_natural_order) or [argument]
         else:
             found.append(argument)
     return found
 
 
-def _images_in(folder: Path, endings: tuple[str, ...], recursive: bool) -> Iterator[Path]:
-    """Yield the images of a folder, and of all within it, but for results, whose names have such endings."""
-    for root, folders, names in os.walk(folder):
-        folders[:] = [name for name in sorted(folders) if recursive and not name.startswith(".")]
-        yield from (path for path in (Path(root, name) for name in sorted(names)) if _is_mask(path, endings))
+def in_natural_order(name: str) -> list[str | int]:
+    """Return a key by which names are sorted as people count: numbers within them by their values."""
+    return [int(part) if k % 2 else part for k, part in enumerate(re.split(r"(\d+)", name))]
 
 
-def _tell_passed_over(folder: Path, endings: tuple[str, ...]) -> None:
-    """Mention images in folders within a folder."""
-    first = next((path for path in _images_in(folder, endings, recursive=True) if path.parent != folder), None)
-    if first is not None:
+def _images_in(folder: Path, recursive: bool, suffixes: tuple[str, ...]) -> list[str]:
+    """Return the images of a folder, and of all within it, but for results; mention what is passed over."""
+    endings, names = result_endings(), [name for name in _walk(folder) if not Path(name).name.startswith(".")]
+    here = [name for name in names if recursive or Path(name).parent == folder]
+    unread = Counter(Path(name).suffix.lower() for name in here if Path(name).suffix.lower() in _NOT_READ)
+    if unread:
+        listed = ", ".join(f"{n} {suffix}" for suffix, n in unread.items())
+        _LOG.warning("%s: passed over: %s: formats that are not read; convert them", visible(str(folder)), listed)
+    images = [name for name in names if _is_mask(Path(name), endings, suffixes)]
+    beyond = [] if recursive else [name for name in images if Path(name).parent != folder]
+    if beyond:
         _LOG.warning(
             "%s: images in folders within it, such as %s, are passed over; --recursive takes them too",
-            *(visible(str(one)) for one in (folder, first.relative_to(folder))),
+            *(visible(str(path)) for path in (folder, Path(beyond[0]).relative_to(folder))),
         )
+    return [name for name in images if recursive or Path(name).parent == folder]
 
 
-def _is_mask(path: Path, endings: tuple[str, ...]) -> bool:
-    if path.suffix.lower() not in SUFFIXES or path.name.startswith(".") or is_result(path.name, endings):
+def _walk(folder: Path) -> list[str]:
+    """Return all files of a folder and of those within it, but for hidden ones."""
+    found = []
+    for root, folders, names in os.walk(folder):
+        folders[:] = [name for name in folders if not name.startswith(".")]
+        found += [str(Path(root, name)) for name in names]
+    return sorted(found, key=in_natural_order)
+
+
+def _is_mask(path: Path, endings: tuple[str, ...], suffixes: tuple[str, ...]) -> bool:
+    if path.suffix.lower() not in suffixes or is_result(path.name, endings):
         return False
     return not (path.name.endswith(ENDING) and is_ours(path))
 

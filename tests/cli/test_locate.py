@@ -188,6 +188,28 @@ def test_photographs_go_with_their_masks(tmp_path: Path) -> None:
         pair_images(["c.png"], [str(tmp_path)])
 
 
+def test_photographs_lie_beside_labels_logs_and_masks(tmp_path: Path, caplog: pytest.LogCaptureFixture) -> None:
+    names = (
+        "drone.json",
+        "drone.jpg",
+        "drone.SRT",
+        "drone.txt",
+        "drone.xml",
+        "drone.png",
+        "104_sat.jpg",
+        "104_mask.png",
+    )
+    for name in (*names, "two.tif", "two.png"):
+        (tmp_path / name).touch()
+    mask = str(tmp_path / "drone.png")
+    assert pair_images([mask], [str(tmp_path)]) == {mask: str(tmp_path / "drone.jpg")}
+    with pytest.raises(click.UsageError, match=r"No photograph in .* has the name of .*104_mask\.png"):
+        pair_images([str(tmp_path / "104_mask.png")], [str(tmp_path)])
+    assert not caplog.records
+    assert pair_images(["two_mask.png"], [str(tmp_path)]) == {"two_mask.png": str(tmp_path / "two.tif")}
+    assert "two.tif is drawn, though" in caplog.text
+
+
 def test_options_narrow_the_search(porto: Path, capfd: pytest.CaptureFixture[str]) -> None:
     mask = str(MASKS["map_sheet"].path)
     reference = ["-r", str(porto), "-q"]

@@ -131,6 +131,53 @@ def test_what_is_no_video_is_said(tmp_path: Path, capfd: pytest.CaptureFixture[s
         list(read_frames([str(tmp_path / "a.mp4")]))
 
 
+class Recording:
+    """Stands for a video of OpenCV's: frames at times, seconds; the rate that it states is another."""
+
+    def __init__(self, times: list[float]) -> None:
+        self.times, self.at = times, -1
+
+    def grab(self) -> bool:
+        self.at += 1
+        return self.at < len(self.times)
+
+    def get(self, what: int) -> float:
+        return 10.0 if what == cv2.CAP_PROP_FPS else 1000.0 * self.times[self.at]
+
+    def retrieve(self) -> tuple[bool, np.ndarray]:
+        return True, np.zeros((64, 64, 3), np.uint8)
+
+    def isOpened(self) -> bool:  # noqa: N802
+        return True
+
+    def release(self) -> None:
+        pass
+
+
+def test_frames_of_videos_have_their_own_times_and_files_follow_one_another(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    times = {"DJI_1.MP4": [0.0, 0.2, 0.4, 3.0, 3.1], "DJI_2.MP4": [0.0, 1.5], "DJI_10.MP4": [0.0, 2.0]}
+    monkeypatch.setattr(cv2, "VideoCapture", lambda path: Recording(times[Path(path).name]))
+    for name in times:
+        (tmp_path / name).touch()
+    cv2.imwrite(str(tmp_path / "DJI_11.png"), np.zeros((64, 64), np.uint8))
+    read = [(frame.name, round(frame.time_s, 3)) for frame in read_frames([str(tmp_path)])]
+    assert read == [
+        *(("DJI_1_000000", 0.0), ("DJI_1_000003", 3.0)),
+        *(("DJI_2_000000", 3.2), ("DJI_2_000001", 4.7)),
+        *(("DJI_10_000000", 4.8), ("DJI_10_000001", 6.8), ("DJI_11.png", 6.9)),
+    ]
+
+
+def test_names_in_the_order_of_text_are_mentioned(masks: list[str], caplog: pytest.LogCaptureFixture) -> None:
+    renamed = [str(Path(masks[0]).with_name(name)) for name in ("n1.png", "n10.png", "n2.png")]
+    for path, name in zip(masks, renamed, strict=False):
+        Path(path).rename(name)
+    assert [frame.name for frame in read_frames(renamed)] == ["n1.png", "n10.png", "n2.png"]
+    assert "give their folder" in caplog.text
+
+
 @pytest.fixture
 def white(photographs: list[str], tmp_path: Path) -> str:
     """A photograph that is white but for a corner."""

@@ -1,5 +1,6 @@
 """A flight over a made-up town: found, followed, lost where it ends."""
 
+import math
 from dataclasses import replace
 
 import numpy as np
@@ -8,7 +9,9 @@ import shapely
 
 from roadgeo.evaluation.flights import FlightOptions, simulate_flight
 from roadgeo.evaluation.landscape import Landscape
+from roadgeo.flights.mavlink import fix_of
 from roadgeo.flights.pose import start
+from roadgeo.flights.rows import make_rows
 from roadgeo.flights.tracker import FlightFrame, Tracked, Tracker, track
 from roadgeo.geometry.mask import RoadMask
 from roadgeo.geometry.projection import LocalPlane
@@ -73,6 +76,22 @@ def test_a_frame_without_roads_is_followed_by_its_motion(flight):
     assert tracked[7].status == "predicted"
     assert error(flown, tracked[7]) < 10.0
     assert tracked[8].status == "tracked"
+
+
+def test_a_frame_that_contradicts_its_motion_may_be_anywhere_and_is_not_sent(flight):
+    """As after frames that a link dropped: the motion is that of before."""
+    _, frames, reference = flight
+    tracker = Tracker([reference])
+    for frame in frames[:4]:
+        tracker.feed(frame)
+    assert not tracker.is_lost
+    (news,) = tracker.feed(replace(frames[8], motion=frames[4].motion))
+    (row,) = make_rows([news])
+    assert (news.status, math.isnan(news.log10_odds)) == ("predicted", False)
+    width_m = news.frame.frame.width * news.pose.gsd_m
+    assert news.pose.sigma_m > width_m
+    assert news.pose.corner_sigma_m.min() > width_m
+    assert fix_of(row.to_dict(), 0.0) is None
 
 
 def test_without_motion_a_flight_is_lost(flight):

@@ -49,6 +49,30 @@ def test_folders_within_folders_are_taken_where_asked_for_and_told_of_else(
     ]
 
 
+def test_numbers_in_names_count_as_numbers(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.chdir(tmp_path)
+    names = [
+        *("flight2/frame_2.png", "flight2/frame_10.png", "flight10/frame_1.png"),
+        *("seen (2).jpg", "seen (10).jpg", "seen_9999.jpg", "seen_10000.jpg"),
+    ]
+    for name in reversed(names):
+        Path("all", name).parent.mkdir(parents=True, exist_ok=True)
+        Path("all", name).touch()
+    assert find_masks(["all"], recursive=True) == [str(Path("all", name)) for name in names]
+    assert find_masks(["all/seen_*"]) == [str(Path("all", name)) for name in names[-2:]]
+
+
+def test_formats_that_are_read_by_name_are_taken_from_folders_and_others_are_mentioned(
+    tmp_path: Path, caplog: pytest.LogCaptureFixture
+) -> None:
+    for name in ("a.gif", "b.ppm", "c.JFIF", "d.heic", "e.HEIC", "f.dng", "g.txt", ".h.avif", "in/i.jxl"):
+        (tmp_path / name).parent.mkdir(exist_ok=True)
+        (tmp_path / name).touch()
+    assert find_masks([str(tmp_path)]) == [str(tmp_path / name) for name in ("a.gif", "b.ppm", "c.JFIF")]
+    passed = "passed over: 2 .heic, 1 .dng: formats that are not read; convert them"
+    assert [one.getMessage() for one in caplog.records] == [f"{tmp_path}: {passed}"]
+
+
 def test_results_never_share_a_name() -> None:
     tasks = name_tasks(["x/q.png", "y/q.png", "y/q.tif", "y/r.png"])
     assert [task.stem for task in tasks] == ["x_q", "y_q_png", "y_q_tif", "r"]
