@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import os
+
 import click
 
 from roadgeo.cli import Group
@@ -44,6 +46,8 @@ def install_command(profile: str) -> None:
 
     for folder in find_profiles(profile):
         echo(f"installed {install_plugin(folder)}")
+    if "VIRTUAL_ENV" in os.environ:
+        echo("Leave the environment first (deactivate): QGIS would take its Python for its own.", err=True)
     echo("Start QGIS anew: the Processing toolbox has a group roadgeo.", err=True)
 
 

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import io
 import json
 import os
 import re
@@ -9,15 +10,19 @@ import shutil
 import sys
 import sysconfig
 import zipfile
+from base64 import urlsafe_b64encode
 from collections.abc import Mapping
 from email.utils import parseaddr
+from hashlib import sha256
+from importlib import metadata
 from pathlib import Path
 
+import roadgeo
 from roadgeo.errors import OutputError
 from roadgeo.outputs.registry import ALSO
 from roadgeo.qgis.plugin.runner import REMEMBERED
 from roadgeo.storage.atomic import writing
-from roadgeo.storage.files import replacing, write_bytes
+from roadgeo.storage.files import write_bytes
 
 __all__ = ["NAME", "find_profiles", "install_plugin", "write_package"]
 
@@ -62,7 +67,7 @@ def install_plugin(profile: Path) -> Path:
 
 
 def write_package(path: str | os.PathLike[str], publisher: Mapping[str, str] | None = None) -> None:
-    """Write the plugin as the ZIP that QGIS installs, and that its plugin repository takes.
+    """Write the plugin as the ZIP that QGIS installs, and that its plugin repository takes; roadgeo itself lies in it.
 
     Parameters
     ----------
@@ -74,40 +79,68 @@ def write_package(path: str | os.PathLike[str], publisher: Mapping[str, str] | N
     OutputError
         It cannot be written.
     """
-    with replacing(path) as temporary, zipfile.ZipFile(temporary, "w", zipfile.ZIP_DEFLATED) as archive:
-        for file, content in _contents().items():
-            if file.name == "metadata.txt":
-                told = {**_publisher(), **(publisher or {})}
-                content += "".join(f"{key}={value}\n" for key, value in told.items()).encode()
-            # A date of its own would make the same plugin another file each time.
-            archive.writestr(zipfile.ZipInfo(f"{NAME}/{file.as_posix()}"), content, zipfile.ZIP_DEFLATED)
+    files = {f"{NAME}/{file.as_posix()}": content for file, content in _contents().items()}
+    fields = {**_publisher(), **(publisher or {})}
+    files[f"{NAME}/metadata.txt"] += "".join(f"{key}={value}\n" for key, value in fields.items()).encode()
+    files.update((f"{NAME}/{name}", content) for name, content in _make_wheel().items())
+    write_bytes(Path(path), _pack(files))
+
+
+def _make_wheel() -> dict[str, bytes]:
+    """Return name and content of a wheel of roadgeo as it is installed, so that the plugin can have it installed."""
+    distribution = metadata.distribution("roadgeo")
+    stem, root = f"roadgeo-{distribution.version}", Path(roadgeo.__file__).parent
+    files = {f"roadgeo/{file.as_posix()}": content for file, content in _read_folder(root).items()}
+    for name in ("METADATA", "entry_points.txt"):
+        files[f"{stem}.dist-info/{name}"] = (distribution.read_text(name) or "").encode()
+    files[f"{stem}.dist-info/WHEEL"] = (
+        b"Wheel-Version: 1.0\nGenerator: roadgeo\nRoot-Is-Purelib: true\nTag: py3-none-any\n"
+    )
+    record = "".join(f"{name},sha256={_digest(content)},{len(content)}\n" for name, content in files.items())
+    files[f"{stem}.dist-info/RECORD"] = f"{record}{stem}.dist-info/RECORD,,\n".encode()
+    return {f"{stem}-py3-none-any.whl": _pack(files)}
+
+
+def _digest(content: bytes) -> str:
+    """Return the SHA-256 as a wheel's record has it."""
+    return urlsafe_b64encode(sha256(content).digest()).decode().rstrip("=")
+
+
+def _pack(files: Mapping[str, bytes]) -> bytes:
+    """Return a ZIP; dates of their own would make the same files another one each time."""
+    packed = io.BytesIO()
+    with zipfile.ZipFile(packed, "w", zipfile.ZIP_DEFLATED) as archive:
+        for name, content in files.items():
+            archive.writestr(zipfile.ZipInfo(name), content, zipfile.ZIP_DEFLATED)
+    return packed.getvalue()
+
+
+def _read_folder(folder: Path) -> dict[Path, bytes]:
+    """Read all files of a Python package, by their paths in it, without compiled ones."""
+    files = (path for path in sorted(folder.rglob("*")) if path.is_file() and "__pycache__" not in path.parts)
+    return {file.relative_to(folder): file.read_bytes() for file in files}
 
 
 def _publisher() -> dict[str, str]:
     """Return the contacts in pyproject.toml, which are those of the whole package."""
-    from importlib.metadata import metadata
-
-    package = metadata("roadgeo")
+    package = metadata.metadata("roadgeo")
     urls = dict(entry.split(", ", 1) for entry in package.get_all("Project-URL") or [])
-    told = {
+    fields = {
         "email": parseaddr(package["Author-email"] or "")[1],
         "homepage": urls.get("Homepage", ""),
         "repository": urls.get("Repository", ""),
         "tracker": urls.get("Issues", ""),
     }
-    return {key: value for key, value in told.items() if value}
+    return {key: value for key, value in fields.items() if value}
 
 
 def _contents() -> dict[Path, bytes]:
     """Read the plugin's files, by their paths in its folder; with the table of options, and what `--also` offers."""
     from roadgeo.cli.table import describe_options
 
-    files = {file.relative_to(_PLUGIN): file.read_bytes() for file in _PLUGIN.rglob("*") if file.is_file()}
-    files = {file: content for file, content in files.items() if "__pycache__" not in file.parts}
     offered = {name: output.summary for name, output in ALSO.items()}
     table = {"options": describe_options(_COMMANDS), "outputs": offered}
-    files[Path(TABLE)] = (json.dumps(table, indent=1) + "\n").encode()
-    return dict(sorted(files.items()))
+    return {**_read_folder(_PLUGIN), Path(TABLE): (json.dumps(table, indent=1) + "\n").encode()}
 
 
 def _this_executable() -> Path | None:

@@ -14,10 +14,13 @@ from .runner import as_command, find_pythons
 if TYPE_CHECKING:
     from .session import Session
 
-__all__ = ["ENVIRONMENT", "ask_version", "install"]
+__all__ = ["ENVIRONMENT", "SOURCE", "ask_version", "install"]
 
 #: Where it is made, beside the profiles, which share it.
 ENVIRONMENT = Path(QgsApplication.qgisSettingsDirPath()).parents[1] / "roadgeo"
+
+#: What pip installs: the wheel that came with the plugin, as a package; else the one that pip finds.
+SOURCE = f"{next(map(str, Path(__file__).parent.glob('roadgeo-*.whl')), 'roadgeo')}[desktop]"
 
 #: A Python has to be new enough, and have venv and pip; it prints its version in any case.
 _TRIAL = "import sys; print(sys.version.split()[0]); import ensurepip, venv; sys.exit(sys.version_info < (3, 11))"
@@ -60,7 +63,11 @@ def install(python: str, source: str, folder: Path, session: Session) -> str:
     scripts, ending = ("Scripts", ".exe") if sys.platform == "win32" else ("bin", "")
     session.feedback.setProgressText(f"Installing {source} ...")
     python = str(folder / scripts / f"python{ending}")
-    session.tell(python, "-I", "-m", "pip", "install", "--progress-bar=off", source)
+    try:
+        session.tell(python, "-I", "-m", "pip", "install", "--disable-pip-version-check", "--progress-bar=off", source)
+    except QgsProcessingException as error:
+        advice = "; give under “What to install” a wheel, the folder of its sources or an address, in full"
+        raise QgsProcessingException(f"{source} was not installed: {error}{advice}") from error
     return str(folder / scripts / f"roadgeo{ending}")
 
 

@@ -29,7 +29,7 @@ from qgis.core import (
     QgsProviderRegistry,
 )
 
-from .environment import ENVIRONMENT
+from .environment import ENVIRONMENT, SOURCE
 
 __all__ = [
     "BATCH", "DRAWING", "IMAGE", "ITS_MASK", "LOCALIZABILITY", "OUTPUT_FOLDER", "POINTS", "PRODUCTS", "QUERY", "ROADS",
@@ -382,9 +382,9 @@ SETUP = (
     *_fold(
         Option(
             QgsProcessingParameterString, "SOURCE", "What to install",
-            "As pip takes it: roadgeo, or an address, a folder or a wheel that you have. [desktop] adds all "
-            "that building references and photographs need.",
-            settings={"defaultValue": "roadgeo[desktop]"},
+            "As pip takes it: the wheel that came with the plugin, or another, a folder of sources or an address, in "
+            "full. [desktop] adds all that building references and photographs need.",
+            settings={"defaultValue": SOURCE},
         ),
         Option(
             QgsProcessingParameterFile, "FOLDER", "Folder of the environment", "Made if it is missing.",
