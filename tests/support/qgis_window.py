@@ -7,12 +7,13 @@ that the environment variable ROADGEO_TASK names.
 
 import importlib
 import json
+import math
 import os
 import traceback
 from dataclasses import replace
 from pathlib import Path
 
-from qgis.core import QgsApplication, QgsPointXY, QgsProcessingContext, QgsProject, QgsRasterLayer, QgsVectorLayer
+from qgis.core import QgsApplication, QgsProcessingContext, QgsProject, QgsRasterLayer, QgsVectorLayer
 from qgis.gui import QgsMessageBarItem
 from qgis.PyQt.QtCore import QEvent, QEventLoop, QObject, QPoint, QPointF, Qt, QTimer, pyqtSlot
 from qgis.PyQt.QtGui import QDesktopServices, QMouseEvent
@@ -216,8 +217,9 @@ def mend(dock):
     answer = ANSWER["dock"] = {"shown": dock.isVisible(), "picture": dock.picture}
     dock.setMinimumHeight(430)
     settle()
-    dock.view.fitInView(dock.scene.sceneRect(), Qt.AspectRatioMode.KeepAspectRatio)
+    dock.view.zoomToFullExtent()
     dock._zoom()
+    dock.view.waitWhileRendering()
     dock.canvas.waitWhileRendering()
     answer["head"] = dock.table.horizontalHeaderItem(1).text()
     answer["before"], answer["said"] = residuals(dock), dock.status.text()
@@ -229,22 +231,21 @@ def mend(dock):
     # Dragged on the map, by 30 pixels to the right.
     dock.table.selectRow(1)
     one = dock.matches[1]
-    there = dock.canvas.getCoordinateTransform().transform(QgsPointXY(one.x, one.y))
-    start = QPoint(round(there.x()), round(there.y()))
+    start = dock.canvas.pixel(1).toPoint()
     drag(dock.canvas.viewport(), start, start + QPoint(30, 0))
     answer["moved_m"] = dock.matches[1].x - one.x
     answer["pixel_m"] = dock.canvas.mapUnitsPerPixel()
     answer["dragged"] = residuals(dock)
     # Sorted by residuals, the largest first; and taken back.
-    dock.sort(1)
+    dock.sort(1, Qt.SortOrder.DescendingOrder)
     answer["sorted"] = [[int(dock.table.item(k, 0).text()) for k in range(dock.table.rowCount())], residuals(dock)]
-    dock.sort(0)
+    dock.sort(0, Qt.SortOrder.AscendingOrder)
     dock.undo()
     answer["undone"] = [dock.matches[1] == one, residuals(dock)]
     # Dragged on the picture, where others lie beside it: the one that is chosen lies on top.
     dock.table.selectRow(2)
     two = dock.matches[2]
-    start = dock.view.mapFromScene(two.column, two.row)
+    start = dock.view.pixel(2).toPoint()
     drag(dock.view.viewport(), start, start + QPoint(0, 25))
     answer["moved_px"] = dock.matches[2].row - two.row
     # Both are deleted; one is added by a click on the picture.
@@ -255,7 +256,10 @@ def mend(dock):
     dock.delete_chosen()
     answer["deleted"] = len(dock.matches)
     dock.buttons["Add points"].click()
-    spot = dock.view.mapFromScene(dock.size[0] * 0.9, dock.size[1] * 0.52)
+    spots = [(dock.size[0] * k / 20, dock.size[1] * n / 20) for k in range(2, 19) for n in range(2, 19)]
+    free = max(spots, key=lambda spot: min(math.dist(spot, (one.column, one.row)) for one in dock.matches))
+    there = dock.view.getCoordinateTransform().transform(free[0], -free[1])
+    spot = QPoint(round(there.x()), round(there.y()))
     QTest.mouseClick(dock.view.viewport(), Qt.MouseButton.LeftButton, pos=spot)
     answer["added"] = [len(dock.matches), residuals(dock)[-1]]
     dock.buttons["Add points"].click()

@@ -23,14 +23,12 @@ from qgis.core import (
     QgsRectangle,
     QgsWkbTypes,
 )
-from qgis.gui import QgsMapCanvas, QgsRubberBand
-from qgis.PyQt.QtCore import QRectF, QSize, Qt
-from qgis.PyQt.QtGui import QColor, QKeySequence, QPixmap
+from qgis.gui import QgsRubberBand
+from qgis.PyQt.QtCore import Qt
+from qgis.PyQt.QtGui import QColor, QKeySequence
 from qgis.PyQt.QtWidgets import (
     QDockWidget,
     QFileDialog,
-    QGraphicsPixmapItem,
-    QGraphicsScene,
     QHBoxLayout,
     QHeaderView,
     QLabel,
@@ -44,18 +42,15 @@ from qgis.PyQt.QtWidgets import (
 )
 from qgis.utils import iface
 
-from .canvases import Dot, MapTool, Marker, PictureView
-from .refit import FEWEST, Fit, Match, fit, format_points, place, read_points
+from .canvases import Side
+from .refit import FEWEST, Fit, Match, fit, format_points, place, read_points, rms
 from .session import PICTURE_KEPT, POINTS_KEPT
 from .window import open_dialog
 
 __all__ = ["MatchDock"]
 
-#: Colours of a point that is on, off, and chosen in the list; of the footprint; and how near a click must be, pixels.
-_ON, _OFF, _CHOSEN, _FRAME, _NEAR = QColor("#1f6fb4"), QColor("#9a9a9a"), QColor("#e4572e"), QColor("#1f6fb4"), 12.0
-
-#: Pictures are shown with at most this number of pixels a side.
-_SHOWN_PX = 3000
+#: Colours of a point that is on, off, and chosen in the list, and of the footprint.
+_ON, _OFF, _CHOSEN, _FRAME = (QColor(color) for color in ("#1f6fb4", "#9a9a9a", "#e4572e", "#1f6fb4"))
 
 
 class MatchDock(QDockWidget):
@@ -81,25 +76,20 @@ class MatchDock(QDockWidget):
         self.apart: list[float] = []
         self.order: list[int] = []
         self.crs, self.picture, self.size = "", "", (0, 0)
-        self.dots: list[Dot] = []
-        self.markers: list[Marker] = []
         self._past: list[list[Match]] = []
         self._clicked: dict[str, tuple[float, float]] = {}
-        self._filling, self._sorted_by = False, 0
-        self.scene = QGraphicsScene(self)
-        self.view = PictureView(self.scene, self)
-        self.canvas = QgsMapCanvas()
-        self.canvas.setCanvasColor(QColor("#ffffff"))
+        self._filling = False
+        self.view, self.canvas = Side("picture", self), Side("map", self)
         self.band = QgsRubberBand(self.canvas, QgsWkbTypes.GeometryType.PolygonGeometry)
         self.band.setStrokeColor(_FRAME)
         self.band.setFillColor(QColor(31, 111, 180, 30))
-        self.tool = MapTool(self.canvas, self, self._nearest_on_map)
-        self.canvas.setMapTool(self.tool)
         self.table = QTableWidget(0, 3)
         self.table.verticalHeader().hide()
         self.table.horizontalHeader().setSectionResizeMode(QHeaderView.ResizeMode.ResizeToContents)
+        self.table.horizontalHeader().setSectionsClickable(True)
+        self.table.horizontalHeader().setSortIndicator(0, Qt.SortOrder.AscendingOrder)
         self.table.horizontalHeader().setSortIndicatorShown(True)
-        self.table.horizontalHeader().sectionClicked.connect(self.sort)
+        self.table.horizontalHeader().sortIndicatorChanged.connect(self.sort)
         self.table.setSelectionBehavior(QTableWidget.SelectionBehavior.SelectRows)
         self.table.itemChanged.connect(self._switched)
         self.table.itemSelectionChanged.connect(self._paint)
@@ -200,12 +190,8 @@ class MatchDock(QDockWidget):
             return False
         self.picture, self.crs = picture, crs or QgsProject.instance().crs().toWkt()
         self.size = (layer.width(), layer.height())
-        self._past = []
-        self._renew([])
-        self.scene.clear()
-        self.scene.addItem(_preview(layer))
-        self.scene.setSceneRect(QRectF(0.0, 0.0, *map(float, self.size)))
-        self.view.fitInView(self.scene.sceneRect(), Qt.AspectRatioMode.KeepAspectRatio)
+        self._past, self.layer = [], layer
+        self.view.show_picture(layer)
         self.canvas.setDestinationCrs(QgsCoordinateReferenceSystem.fromWkt(self.crs))
         self.canvas.setLayers(QgsProject.instance().layerTreeRoot().checkedLayers())
         self._renew(matches)
@@ -215,14 +201,8 @@ class MatchDock(QDockWidget):
     def _renew(self, matches: list[Match]) -> None:
         """Take other points."""
         self.matches, self.order, self._clicked = list(matches), list(range(len(matches))), {}
-        for dot in self.dots:
-            self.scene.removeItem(dot)
-        for marker in self.markers:
-            self.canvas.scene().removeItem(marker)
-        self.dots = [Dot(number + 1, self) for number in self.order]
-        for dot in self.dots:
-            self.scene.addItem(dot)
-        self.markers = [Marker(self.canvas, number + 1) for number in self.order]
+        for side in (self.view, self.canvas):
+            side.renew(len(matches))
         self._filling = True
         self.table.setRowCount(len(self.matches))
         for row in range(len(self.matches)):
@@ -283,17 +263,20 @@ class MatchDock(QDockWidget):
         else:
             self.status.setText(f"Now click the same spot on the {other}.")
 
-    def _chosen(self) -> set[int]:
+    def chosen(self) -> set[int]:
+        """Return the points that are selected in the list."""
         return {self.order[index.row()] for index in self.table.selectedIndexes()}
 
     def delete_chosen(self) -> None:
         """Delete the points that are selected in the list."""
-        chosen = self._chosen()
+        chosen = self.chosen()
         self.remember()
         self._renew([match for number, match in enumerate(self.matches) if number not in chosen])
 
-    def move(self, number: int, **to: Any) -> None:
-        """Put a point elsewhere: on the picture (`column` and `row`) or on the map (`x` and `y`)."""
+    def move(self, side: str, number: int, u: float, v: float) -> None:
+        """Put a point elsewhere on the "picture" or the "map"."""
+        fields = ("column", "row") if side == "picture" else ("x", "y")
+        to: dict[str, Any] = dict(zip(fields, (u, v)))  # noqa: B905 (as long as each other)
         self.matches[number] = replace(self.matches[number], **to)
         self.refit()
 
@@ -305,27 +288,13 @@ class MatchDock(QDockWidget):
             self.matches[number] = replace(self.matches[number], on=item.checkState() == Qt.CheckState.Checked)
             self.refit()
 
-    def _nearest_on_map(self, pixel: Any) -> int:
-        """Return the point under a pixel of the map, a chosen one before others; -1 for none."""
-        chosen, apart = self._chosen(), []
-        for number, marker in enumerate(self.markers):
-            far = math.hypot(marker.pos().x() - pixel.x(), marker.pos().y() - pixel.y())
-            apart.append((far > _NEAR, number not in chosen, far))
-        best = min(range(len(apart)), key=apart.__getitem__, default=-1)
-        return best if best >= 0 and not apart[best][0] else -1
-
-    def sort(self, column: int) -> None:
-        """Sort the list by number, by residual, the largest first, or by pixel; a second time the other way round."""
-        keys = (lambda k: k, lambda k: -self.apart[k], lambda k: (self.matches[k].column, self.matches[k].row))
-        again = self._sorted_by == column + 1
-        self._sorted_by = 0 if again else column + 1
-        chosen = self._chosen()
-        self.order = sorted(range(len(self.matches)), key=keys[column], reverse=again)
-        descending = again != (column == 1)
-        shown = Qt.SortOrder.DescendingOrder if descending else Qt.SortOrder.AscendingOrder
-        self.table.horizontalHeader().setSortIndicator(column, shown)
-        self.refit()
+    def sort(self, column: int, order: Any) -> None:
+        """Sort the list by number, residual or pixel."""
+        chosen, descending = self.chosen(), order == Qt.SortOrder.DescendingOrder
+        keys = (lambda k: k, lambda k: self.apart[k], lambda k: (self.matches[k].column, self.matches[k].row))
+        self.order = sorted(range(len(self.matches)), key=keys[column], reverse=descending)
         self.table.clearSelection()
+        self.refit()
         for row, number in enumerate(self.order):
             for cell in range(3 if number in chosen else 0):
                 self.table.item(row, cell).setSelected(True)
@@ -376,21 +345,17 @@ class MatchDock(QDockWidget):
         elif self.found.matrix is None:
             text += f" are on: a fit needs {FEWEST}, not on one line." if self.picture else ""
         else:
-            rms = math.sqrt(sum(apart * apart for apart in used) / len(used))
-            text += f", {rms:.2f} {'m' if self._measure() is not None else 'map units'} root mean square"
+            text += f", {rms(used):.2f} {'m' if self._measure() is not None else 'map units'} root mean square"
         if self.picture:
             self.status.setText(text)
 
     def _paint(self) -> None:
         """Draw points and footprint as they are."""
-        chosen = self._chosen()
-        for number, (match, dot, marker) in enumerate(zip(self.matches, self.dots, self.markers)):  # noqa: B905
-            dot.color = marker.color = _CHOSEN if number in chosen else _ON if match.on else _OFF
-            dot.setPos(match.column, match.row)
-            marker.put(match.x, match.y)
-            for point in (dot, marker):
-                point.setZValue(2.0 if number in chosen else 1.0)  # of dots that overlap, the chosen one is dragged
-                point.update()
+        chosen = self.chosen()
+        for number, match in enumerate(self.matches):
+            color = _CHOSEN if number in chosen else _ON if match.on else _OFF
+            self.view.put(number, match.column, match.row, color, number in chosen)
+            self.canvas.put(number, match.x, match.y, color, number in chosen)
         points = [QgsPointXY(*corner) for corner in self.footprint()]
         self.band.setToGeometry(QgsGeometry.fromPolygonXY([points] if points else []), None)
         self.buttons["Put on the map..."].setEnabled(self.found.matrix is not None)
@@ -432,14 +397,3 @@ class MatchDock(QDockWidget):
         points = QgsProcessingUtils.generateTempFilename(f"{Path(self.picture).name}.points")
         self.export(points)
         self.drawing = open_dialog("placebypoints", {"IMAGE": self.picture, "POINTS": points})
-
-
-def _preview(layer: Any) -> Any:
-    """Draw a picture of any size and depth, stretched as QGIS does; in the picture's own pixels."""
-    width, height = layer.width(), layer.height()
-    scale = min(1.0, _SHOWN_PX / max(width, height))
-    image = layer.previewAsImage(QSize(max(1, round(width * scale)), max(1, round(height * scale))))
-    item = QGraphicsPixmapItem(QPixmap.fromImage(image))
-    item.setTransform(item.transform().scale(width / image.width(), height / image.height()))
-    item.setTransformationMode(Qt.TransformationMode.SmoothTransformation)
-    return item

@@ -9,13 +9,14 @@ import numpy as np
 from qgis.core import (
     QgsCoordinateReferenceSystem,
     QgsCoordinateTransform,
+    QgsGeometry,
     QgsPointXY,
     QgsProcessingException,
     QgsProject,
     QgsRasterLayer,
 )
 
-from .refit import FEWEST, fit, place, read_points
+from .refit import FEWEST, fit, place, read_points, rms
 
 __all__ = ["make_location"]
 
@@ -38,16 +39,13 @@ def make_location(picture: str, points: str) -> tuple[dict[str, Any], float]:
     if not crs.isValid():
         raise QgsProcessingException(f"{points}: does not say in which CRS its points are")
     width, height = layer.width(), layer.height()
-    frame = np.array(
-        [[0.0, 0.0], [width, 0.0], [width, height], [0.0, height], [width / 2, height / 2], [width / 2, 0.0]]
-    )
-    there = place(found.matrix, frame)
+    corners = [(0.0, 0.0), (width, 0.0), (width, height), (0.0, height)]
+    frame = np.array([*corners, (width / 2, height / 2), (width / 2, 0.0)])
+    there = place(found.matrix, frame).tolist()
+    spots = [QgsPointXY(*spot) for spot in there]
     transform = QgsCoordinateTransform(crs, QgsCoordinateReferenceSystem("EPSG:4326"), QgsProject.instance())
-    lonlat = [[one.x(), one.y()] for one in (transform.transform(QgsPointXY(*spot)) for spot in there.tolist())]
-    (x, y), up = there[4].tolist(), there[5] - there[4]
-    diagonals = there[2] - there[0], there[3] - there[1]
-    area = 0.5 * abs(float(diagonals[0][0] * diagonals[1][1] - diagonals[0][1] * diagonals[1][0]))
-    used = [apart for one, apart in zip(matches, found.residuals) if one.on]  # noqa: B905 (as long as each other)
+    lonlat = [[spot.x(), spot.y()] for spot in map(transform.transform, spots)]
+    used = [apart for match, apart in zip(matches, found.residuals) if match.on]  # noqa: B905 (as long as each other)
     location = {
         "schema": "roadgeo.location/1",
         "query": picture,
@@ -56,10 +54,10 @@ def make_location(picture: str, points: str) -> tuple[dict[str, Any], float]:
         "crs": wkt,
         "size": [width, height],
         "homography": found.matrix.tolist(),
-        "footprint": there[:4].tolist(),
+        "footprint": there[:4],
         "footprint_lonlat": lonlat[:4],
-        "center": {"x": x, "y": y, "lon": lonlat[4][0], "lat": lonlat[4][1]},
-        "gsd_m": math.sqrt(area / (width * height)),
-        "rotation_deg": math.degrees(math.atan2(up[0], up[1])),
+        "center": dict(zip(("x", "y", "lon", "lat"), (*there[4], *lonlat[4]))),  # noqa: B905
+        "gsd_m": math.sqrt(QgsGeometry.fromPolygonXY([spots[:4]]).area() / (width * height)),
+        "rotation_deg": spots[4].azimuth(spots[5]),
     }
-    return location, math.sqrt(sum(apart * apart for apart in used) / len(used))
+    return location, rms(used)

@@ -13,7 +13,7 @@ from pathlib import Path
 
 import numpy as np
 
-__all__ = ["FEWEST", "Fit", "Match", "fit", "format_points", "place", "read_points"]
+__all__ = ["FEWEST", "Fit", "Match", "fit", "format_points", "place", "read_points", "rms"]
 
 #: Points that a homography needs.
 FEWEST = 4
@@ -47,11 +47,10 @@ class Fit:
     matrix: np.ndarray | None
     residuals: list[float] = field(default_factory=list)
 
-    @property
-    def rms(self) -> float:
-        """Root mean square of the residuals that are known."""
-        known = [one for one in self.residuals if math.isfinite(one)]
-        return math.sqrt(sum(one * one for one in known) / len(known)) if known else math.nan
+
+def rms(residuals: Sequence[float]) -> float:
+    """Return the root mean square of residuals."""
+    return math.sqrt(sum(apart * apart for apart in residuals) / len(residuals))
 
 
 def read_points(path: str | Path) -> tuple[str, list[Match]]:
@@ -66,8 +65,7 @@ def read_points(path: str | Path) -> tuple[str, list[Match]]:
         lines = Path(path).read_text("utf-8-sig").splitlines()
     except (OSError, UnicodeDecodeError) as error:
         raise ValueError(f"{path} cannot be read: {error}") from error
-    told = [line for line in lines if line.startswith("#")]
-    crs = next((line.partition(":")[2].strip() for line in told if line.startswith("#CRS:")), "")
+    crs = next((line.partition(":")[2].strip() for line in lines if line.startswith("#CRS:")), "")
     try:
         rows = list(csv.DictReader(line for line in lines if line and not line.startswith("#")))
         matches = [
@@ -84,9 +82,8 @@ def read_points(path: str | Path) -> tuple[str, list[Match]]:
 def format_points(crs: str, matches: Sequence[Match], found: Fit) -> str:
     """Return the text that `read_points` and the Georeferencer read."""
     lines = [*([f"#CRS: {crs}"] if crs else []), _COLUMNS]
-    for one, apart in zip(matches, found.residuals, strict=True):
-        told = apart if math.isfinite(apart) else 0.0
-        lines.append(f"{one.x!r},{one.y!r},{one.column!r},{-one.row!r},{int(one.on)},0,0,{told!r}")
+    for match, apart in zip(matches, np.nan_to_num(found.residuals).tolist()):  # noqa: B905 (as long as each other)
+        lines.append(f"{match.x!r},{match.y!r},{match.column!r},{-match.row!r},{int(match.on)},0,0,{apart!r}")
     return "\n".join(lines) + "\n"
 
 
