@@ -89,9 +89,9 @@ def test_an_answer_says_what_was_asked_and_of_which_map(porto: roadgeo.Reference
     found = roadgeo.locate(DRONE, built, QUICK, gsd=1.0)
     assert found.options == {"effort": "quick", "match": {"camera": {"gsd_m": [0.8, 1.25]}}}
     assert found.reference_digest == reference_digest(tmp_path / "city.gpkg")
-    for one in (porto, porto.index, found, found.mask, read_roads(ROADS), roadgeo.explain(found.mask, built, QUICK)):
-        assert "\n" not in repr(one)
-        assert len(repr(one)) < 200
+    for item in (porto, porto.index, found, found.mask, read_roads(ROADS), roadgeo.explain(found.mask, built, QUICK)):
+        assert "\n" not in repr(item)
+        assert len(repr(item)) < 200
     (written,) = (path for path in found.write(tmp_path) if path.suffix == ".json")
     assert json.loads(written.read_text())["reference_digest"] == found.reference_digest
 
@@ -202,7 +202,7 @@ def test_the_roads_of_a_place_are_fetched(monkeypatch: pytest.MonkeyPatch) -> No
     monkeypatch.setattr(sources, "fetch_roads", lambda **where: asked.append(where) or read_roads(ROADS))
     assert roadgeo.index("Porto, Portugal").name == "porto-portugal"
     assert roadgeo.index((-8.7, 41.1, -8.6, 41.2)).name == "box"
-    assert [(one.get("place"), one.get("bbox")) for one in asked] == [
+    assert [(query.get("place"), query.get("bbox")) for query in asked] == [
         ("Porto, Portugal", None),
         (None, (-8.7, 41.1, -8.6, 41.2)),
     ]

@@ -14,7 +14,7 @@ def _gdal():
         yield
 
 
-@pytest.mark.parametrize(("name", "path"), FILES, ids=lambda one: one.name if isinstance(one, Path) else one)
+@pytest.mark.parametrize(("name", "path"), FILES, ids=lambda item: item.name if isinstance(item, Path) else item)
 def test_each_is_read_or_refused(name: str, path: Path, tmp_path: Path) -> None:
     feed(READERS[name], tmp_path)(path.read_bytes())
 

@@ -42,6 +42,6 @@ def test_examples_give_what_they_show(name: str, desk: Path, monkeypatch: pytest
 
 def test_every_public_function_has_an_example() -> None:
     functions = [getattr(roadgeo, name) for name in roadgeo.__all__]
-    functions = [one for one in functions if inspect.isfunction(one)]
+    functions = [function for function in functions if inspect.isfunction(function)]
     assert len(functions) > 7
-    assert [one.__name__ for one in functions if ">>>" not in (one.__doc__ or "")] == []
+    assert [function.__name__ for function in functions if ">>>" not in (function.__doc__ or "")] == []

@@ -24,11 +24,11 @@ _SCRIPT = Path(__file__).parent / "support" / "endurance.py"
 def test_neither_memory_nor_files_nor_time_grow() -> None:
     # In a process of its own: in this one other tests' files may be closed, and their connections open, meanwhile.
     run = subprocess.run([sys.executable, str(_SCRIPT), "--count", "150"], capture_output=True, text=True, check=True)
-    told = json.loads(run.stdout)
-    assert set(told["became"]) == {"located", "not_located", "damaged"}
-    assert told["open_files"][-1] == told["open_files"][1]
-    assert told["resident_mb"][-1] <= 1.05 * told["resident_mb"][1]
-    assert min(told["median_ms"][-5:]) <= 1.5 * max(told["median_ms"][:5])
+    output = json.loads(run.stdout)
+    assert set(output["became"]) == {"located", "not_located", "damaged"}
+    assert output["open_files"][-1] == output["open_files"][1]
+    assert output["resident_mb"][-1] <= 1.05 * output["resident_mb"][1]
+    assert min(output["median_ms"][-5:]) <= 1.5 * max(output["median_ms"][:5])
 
 
 @pytest.mark.parametrize("n_references", [1, 2])
@@ -41,10 +41,10 @@ def test_a_map_is_let_go_with_its_reference(tmp_path: Path, n_references: int) -
     try:
         for _ in range(6):
             references = [open_reference(tmp_path / "town.gpkg") for _ in range(n_references)]
-            kept += [weakref.ref(part.open()) for one in references for part in one.parts]
+            kept += [weakref.ref(part.open()) for reference in references for part in reference.parts]
             locate(np.where(mask, np.uint8(255), np.uint8(0)), references)
         del references
     finally:
         gc.enable()
     # Of several, the last are remembered for the next mask.
-    assert sum(one() is not None for one in kept) == (0 if n_references == 1 else n_references)
+    assert sum(entry() is not None for entry in kept) == (0 if n_references == 1 else n_references)

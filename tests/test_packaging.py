@@ -34,7 +34,7 @@ def test_the_conda_recipe_is_of_this_version_and_needs_the_same() -> None:
     listed = re.findall(r"- ([\w-]+) (>=[\d.]+)", needed)
     extras = PROJECT["optional-dependencies"]
     every = {*PROJECT["dependencies"], *extras["maps"], *extras["track"], *extras["serve"]}
-    asked = [re.fullmatch(r"([\w-]+)(>=[\d.]+)", one).groups() for one in every]
+    asked = [re.fullmatch(r"([\w-]+)(>=[\d.]+)", item).groups() for item in every]
     expected = {(ON_CONDA.get(name, name), version) for name, version in asked}
     assert set(listed) == {("python", PROJECT["requires-python"]), *expected}
 
@@ -43,11 +43,13 @@ def test_a_missing_package_is_named_with_the_extra_that_brings_it() -> None:
     extras = PROJECT["optional-dependencies"]
     brought = {"geopandas": ("geopandas", "pandas", "pyogrio"), "protobuf": ()}
     for extra in ("maps", "track", "serve", "segment", "mavlink"):
-        for package in (re.match(r"[\w-]+", one)[0] for one in extras[extra]):
+        for package in (re.match(r"[\w-]+", item)[0] for item in extras[extra]):
             for name in brought.get(package, (package.replace("-", "_"),)):
-                told = str(name_extra(ModuleNotFoundError(name=f"{name}.part")))
-                named = re.fullmatch(rf"this needs {name}, which is not installed \(extra (\w+)\): .* install .+", told)
-                assert any(one.startswith(package) for one in extras[named[1]])
+                reported = str(name_extra(ModuleNotFoundError(name=f"{name}.part")))
+                named = re.fullmatch(
+                    rf"this needs {name}, which is not installed \(extra (\w+)\): .* install .+", reported
+                )
+                assert any(item.startswith(package) for item in extras[named[1]])
     assert name_extra(ModuleNotFoundError(name="another")) is None
 
 
@@ -57,9 +59,9 @@ def test_the_constraints_pin_every_package_within_its_bounds() -> None:
     extras = PROJECT["optional-dependencies"]
     asked = [
         *PROJECT["dependencies"],
-        *(one for name in extras if name not in {"desktop", "dev"} for one in extras[name]),
+        *(item for name in extras if name not in {"desktop", "dev"} for item in extras[name]),
     ]
-    for name, least in (re.fullmatch(r"([\w-]+)(?:\[\w+\])?>=([\d.]+)", one).groups() for one in asked):
+    for name, least in (re.fullmatch(r"([\w-]+)(?:\[\w+\])?>=([\d.]+)", query).groups() for query in asked):
         versions = [tuple(map(int, version.split("."))) for package, version in pinned if package == name]
         assert versions, name
         assert min(versions) >= tuple(map(int, least.split("."))), name

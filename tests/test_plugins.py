@@ -209,7 +209,7 @@ def test_the_example_is_installed_and_used(installed: dict[str, str], tmp_path: 
         return done.stdout
 
     listed = json.loads(roadgeo("info", "--plugins", "--json"))
-    assert {one["group"] for one in listed if one["package"] == "roadgeo-wkt 1.0"} == set(GROUPS)
+    assert {entry["group"] for entry in listed if entry["package"] == "roadgeo-wkt 1.0"} == set(GROUPS)
     assert "roadgeo.segmenters  yellow" in roadgeo("info", "--plugins")
 
     roads = read_roads(ROADS)

@@ -17,11 +17,11 @@ def test_what_was_promised_is_there(part: str, name: str) -> None:
 
 def test_no_parameter_is_asked_for_that_was_not() -> None:
     for name, kept in KEPT["roadgeo"].items():
-        asked = [one for one in NOW["roadgeo"][name] if one.endswith("!")]
+        asked = [item for item in NOW["roadgeo"][name] if item.endswith("!")]
         assert set(asked) <= set(kept)
 
 
 def test_parameters_stay_in_order() -> None:
     for name in ("build_reference", "locate", "explain", "open_reference", "read_schema"):
         kept, now = KEPT["roadgeo"][name], NOW["roadgeo"][name]
-        assert [one for one in now if one in kept] == kept
+        assert [item for item in now if item in kept] == kept

@@ -41,9 +41,9 @@ def test_the_photograph_comes_out_as_if_locate_had_drawn_it(located: Path, tmp_p
 
 def test_what_is_read_is_what_was_written(located: Path) -> None:
     document = json.loads((located / "drone_location.json").read_text())
-    told = read_location(located / "drone_location.json").to_dict()
+    reported = read_location(located / "drone_location.json").to_dict()
     for key in ("homography", "footprint", "center", "camera", "corner_covariance_m2", "lens_k1", "size"):
-        assert told[key] == document[key]
+        assert reported[key] == document[key]
 
 
 @pytest.mark.parametrize(

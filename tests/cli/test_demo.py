@@ -11,7 +11,7 @@ from roadgeo.running.batch import Outcome
 
 
 def mask_called(stem: str) -> DemoMask:
-    return next(one for one in demo_masks() if one.path.stem == stem)
+    return next(demo_mask for demo_mask in demo_masks() if demo_mask.path.stem == stem)
 
 
 def located(mask: DemoMask, east_m: float) -> Outcome:

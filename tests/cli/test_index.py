@@ -40,9 +40,9 @@ def test_a_place_becomes_a_reference_in_the_library(osm, tmp_path, capsys):
     capsys.readouterr()
     assert {file.name for file in (tmp_path / "library").iterdir()} == {"fenway-boston.gpkg", "fenway-boston.index"}
     assert main(["info", "fenway-boston", "--json"]) == 0
-    told = json.loads(capsys.readouterr().out)
-    assert "OpenStreetMap contributors" in json.dumps(told, ensure_ascii=False)
-    assert "2022-05-04T19:30:42Z" in json.dumps(told)
+    output = json.loads(capsys.readouterr().out)
+    assert "OpenStreetMap contributors" in json.dumps(output, ensure_ascii=False)
+    assert "2022-05-04T19:30:42Z" in json.dumps(output)
 
 
 @pytest.mark.parametrize(
@@ -68,10 +68,10 @@ def test_a_busy_server_is_waited_for_and_said(osm, capsys):
 def test_answers_of_no_use_are_an_error_on_one_line(osm, tmp_path, capsys, answer):
     osm.overpass.append(answer)
     assert index("--bbox=-71.0925,42.3445,-71.08,42.3525", osm=osm, quiet=True) == 1
-    told = capsys.readouterr().err
-    assert told.startswith("Error: ")
-    assert told.count("\n") == 1
-    assert "fault of roadgeo" not in told
+    output = capsys.readouterr().err
+    assert output.startswith("Error: ")
+    assert output.count("\n") == 1
+    assert "fault of roadgeo" not in output
     assert not list(tmp_path.rglob("*.gpkg"))
 
 
@@ -128,8 +128,8 @@ def counts(reference, capsys):
     capsys.readouterr()
     assert main(["check", str(reference)]) == 0
     assert main(["info", str(reference), "--json"]) == 0
-    told = json.loads(capsys.readouterr().out.partition("\n")[2])
-    return told["counts"]["intersections"], told["road_km"], told["meta"]
+    output = json.loads(capsys.readouterr().out.partition("\n")[2])
+    return output["counts"]["intersections"], output["road_km"], output["meta"]
 
 
 def test_an_index_is_built_again_from_the_geopackage_alone(tmp_path, monkeypatch, capsys):
@@ -157,9 +157,9 @@ def test_an_index_is_built_again_from_the_geopackage_alone(tmp_path, monkeypatch
 def test_a_folder_one_may_not_write_to_is_named_before_the_long_part(tmp_path, monkeypatch, capsys):
     monkeypatch.setattr(os, "access", lambda _, mode: not mode & os.W_OK)  # root may write everywhere
     assert index("--roads", write_streets(tmp_path / "a.geojson"), "--out", tmp_path / "shelf" / "a.gpkg") == 1
-    told = capsys.readouterr().err
-    assert told.endswith("permission denied; choose a folder you may write to\n")
-    assert told.count("\n") == 1
+    output = capsys.readouterr().err
+    assert output.endswith("permission denied; choose a folder you may write to\n")
+    assert output.count("\n") == 1
 
 
 def test_ctrl_c_leaves_nothing_behind(tmp_path, monkeypatch, capsys):
@@ -181,8 +181,8 @@ def test_the_library_from_filling_to_removing(tmp_path, monkeypatch, capsys):
         assert index("--roads", streets, "--name", name, quiet=True) == 0
     assert index("--roads", streets, quiet=True) == 0
     assert main(["list"]) == 0
-    told = capsys.readouterr().out
-    assert [line.split()[0] for line in told.splitlines()] == ["fenway-streets", "one", "two"]
+    output = capsys.readouterr().out
+    assert [line.split()[0] for line in output.splitlines()] == ["fenway-streets", "one", "two"]
     assert main(["remove", "one", "fenway-streets", "--yes"]) == 0
     assert sorted(file.name for file in (tmp_path / "library").iterdir()) == ["two.gpkg", "two.index"]
 

@@ -40,7 +40,7 @@ def test_results_refusals_and_errors_have_the_same_keys(porto: Path, capfd: pyte
     for document in found:
         jsonschema.validate(document, read_schema("location"))
         assert list(document) == list(found[0])
-    assert [one["reason_code"] for one in found] == ["located", "invalid", "invalid", "few_near"]
+    assert [result["reason_code"] for result in found] == ["located", "invalid", "invalid", "few_near"]
     explained = json.loads(Path("drone_explain.json").read_text())
     jsonschema.validate(explained, read_schema("explanation"))
     assert explained["reference_digest"] == found[0]["reference_digest"]

@@ -70,10 +70,10 @@ def test_json_lines_stand_in_input_order_and_alone_on_standard_output(
     status = main(["locate", "a.png", "missing.png", "b.png", "c.png", "-r", str(porto), "--json", "-o", "out"])
     out, err = capfd.readouterr()
     found = [json.loads(line) for line in out.splitlines()]
-    assert [one["query"] for one in found] == ["a.png", "missing.png", "b.png", "c.png"]
-    assert [one["status"] for one in found] == ["not_located", "error", "error", "located"]
-    assert all(one["schema"] == "roadgeo.location/1" and one["reason"] for one in found)
-    assert [one["attribution"] for one in found] == [ATTRIBUTION, "", "", ATTRIBUTION]
+    assert [result["query"] for result in found] == ["a.png", "missing.png", "b.png", "c.png"]
+    assert [result["status"] for result in found] == ["not_located", "error", "error", "located"]
+    assert all(result["schema"] == "roadgeo.location/1" and result["reason"] for result in found)
+    assert [result["attribution"] for result in found] == [ATTRIBUTION, "", "", ATTRIBUTION]
     assert status == 1
     assert err.count("Error: ") == 2
     assert "1 located, 1 not located, 2 failed" in err
@@ -88,9 +88,9 @@ def test_processes_give_the_same_results(porto: Path, tmp_path: Path, capfd: pyt
         out, err = capfd.readouterr()
         assert err == ""
         results.append([json.loads(line) for line in out.splitlines()])
-    alone, together = ([{**one, "seconds": None, "command": None} for one in found] for found in results)
+    alone, together = ([{**result, "seconds": None, "command": None} for result in found] for found in results)
     assert alone == together
-    assert [one["status"] == "located" for one in alone] == [mask.in_map for mask in MASKS.values()]
+    assert [item["status"] == "located" for item in alone] == [mask.in_map for mask in MASKS.values()]
     for found, mask in zip(alone, MASKS.values(), strict=True):
         if mask.in_map:
             assert center_error(found, mask) < 2
@@ -109,7 +109,7 @@ def test_what_was_cut_short_goes_on_where_it_was(
     Path("out/elsewhere_location.json").write_text("half a fi")
     assert main([*locate, "--skip-existing"]) == 3
     again = [json.loads(line) for line in capfd.readouterr().out.splitlines()]
-    assert [one["status"] for one in again] == ["located", "not_located", "located"]
+    assert [result["status"] for result in again] == ["located", "not_located", "located"]
     assert again[0] == marked
     assert Path("out/roadgeo_summary.csv").read_text().count("\n") == 4
     os.utime("drone.png", (2e9, 2e9))  # the mask was made anew
@@ -134,7 +134,7 @@ def test_a_batch_that_was_killed_goes_on_where_it_was(porto: Path, capfd: pytest
     assert main(["locate", *given, "--skip-existing"]) == 0
     assert len(capfd.readouterr().out.splitlines()) == 6
     found = [json.loads(Path(f"out/{name}_location.json").read_text()) for name in names]
-    assert [one["homography"] for one in found] == [found[0]["homography"]] * 6
+    assert [result["homography"] for result in found] == [found[0]["homography"]] * 6
     assert all(path.stat().st_mtime_ns == at for path, at in written.items() if "drone_0" in path.name)
     assert {path.name for path in Path("out").iterdir() if path.name.startswith((".", "tmp"))} == set()
 
@@ -218,7 +218,7 @@ def test_options_narrow_the_search(porto: Path, capfd: pytest.CaptureFixture[str
     assert main(["locate", mask, *reference, "--gsd", "2:3"]) == 3
     assert main(["locate", mask, *reference, "--near=-8.60,41.15,500"]) == 3
     assert capfd.readouterr().out == ""
-    for limits, told in [
+    for limits, reported in [
         (["--near=-8.60,41.15,500"], "searched within 500 m of -8.6,41.15: "),
         (["--within", "Italy"], "the map has 0 intersections in the area given by within; searched within longitudes"),
         (
@@ -227,7 +227,7 @@ def test_options_narrow_the_search(porto: Path, capfd: pytest.CaptureFixture[str
         ),
     ]:
         assert main(["locate", mask, "-r", str(porto), "--effort", "quick", *limits]) == 3
-        assert told in capfd.readouterr().out
+        assert reported in capfd.readouterr().out
 
 
 def test_the_papers_matcher_says_once_what_it_found(porto: Path, capfd: pytest.CaptureFixture[str]) -> None:

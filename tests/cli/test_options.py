@@ -47,7 +47,7 @@ def test_what_is_no_aspect(typed: str) -> None:
 
 def test_names_of_plugins_are_offered() -> None:
     plugin = Plugin("none", names=lambda: ["geojson", "geometry", "kmz"])
-    assert [one.value for one in plugin.shell_complete(None, None, "geo")] == ["geojson", "geometry"]
+    assert [item.value for item in plugin.shell_complete(None, None, "geo")] == ["geojson", "geometry"]
 
 
 def test_commands_are_offered() -> None:
@@ -99,24 +99,24 @@ def shown(name: str, option: str = "--help") -> str:
 
 
 def test_every_hint_is_an_option_of_locate_a_parameter_over_http_and_a_keyword_of_python() -> None:
-    options = {name for one in command("locate").params for name in one.opts}
+    options = {name for param in command("locate").params for name in param.opts}
     assert {hint.option for hint in HINTS.values()} <= options
     keywords = inspect.signature(roadgeo.locate).parameters
-    assert {name for name, one in keywords.items() if one.kind is one.KEYWORD_ONLY} == set(HINTS)
+    assert {name for name, keyword in keywords.items() if keyword.kind is keyword.KEYWORD_ONLY} == set(HINTS)
     assert all(f"  {hint.parameter}=" in shown("serve", "--help-all") for hint in HINTS.values())
 
 
 def test_the_defaults_of_the_table_are_those_of_the_search() -> None:
-    told = {hint.goes_to: hint.read(hint.default) for hint in HINTS.values() if hint.default != ""}
+    output = {hint.goes_to: hint.read(hint.default) for hint in HINTS.values() if hint.default != ""}
     usual = LocateOptions()
-    assert set(told) == {"gsd_m", "max_tilt_deg", "effort", "time_limit_s"}
-    known = apply_hints(usual, told)
+    assert set(output) == {"gsd_m", "max_tilt_deg", "effort", "time_limit_s"}
+    known = apply_hints(usual, output)
     assert replace(known, pair=usual.pair) == usual
 
 
 def test_one_pixel_size_is_one_fact_in_every_spelling() -> None:
-    for one in ("0.3", 0.3):
-        assert HINTS["gsd"].read(one) == pytest.approx((0.24, 0.375))
+    for item in ("0.3", 0.3):
+        assert HINTS["gsd"].read(item) == pytest.approx((0.24, 0.375))
     assert GSD.convert("0.3+-10%", None, None) == pytest.approx((0.27, 0.33))
     assert read_query_string("gsd=0.3") == {"gsd_m": pytest.approx((0.24, 0.375))}
     for text in ("0.3:0.6", "0.3,0.6"):
@@ -126,7 +126,7 @@ def test_one_pixel_size_is_one_fact_in_every_spelling() -> None:
 def test_options_of_plugins_dialogs_exist_on_the_command_line() -> None:
     """QGIS says what was set by options: each has to exist, with the words among which one chooses."""
     plugin = Path(roadgeo.__file__).parent / "qgis" / "plugin"
-    known = {name for one in COMMANDS for parameter in command(one).params for name in parameter.opts}
+    known = {name for item in COMMANDS for parameter in command(item).params for name in parameter.opts}
     said = {flag for file in plugin.glob("*.py") for flag in re.findall(r'"f?(--[a-z-]+)', file.read_text("utf-8"))}
     assert said
     assert said <= known | {"--help", "--version", "--progress-bar"}  # the last one of pip

@@ -47,7 +47,7 @@ def test_names_of_masks_do_not_speak_to_the_terminal(
     assert main(["locate", *masks, "-r", str(tmp_path / "r.gpkg"), "-o", str(tmp_path), "--verbose"]) == 1
     assert main(["vectorize", *masks, "-o", str(tmp_path)]) == 1
     said = "".join(capfd.readouterr())
-    assert not [one for one in FORBIDDEN if one in said]
+    assert not [item for item in FORBIDDEN if item in said]
     assert "intersections are seen" in said
     assert "fault of roadgeo" not in said
 
@@ -60,14 +60,14 @@ def test_names_of_references_do_not_speak_to_the_terminal(
     index = ["index", "--roads", str(tmp_path / "roads.geojson"), "--out"]
     assert main([*index, str(tmp_path / f"{ESCAPES}.gpkg")]) == 0
     with sqlite3.connect(tmp_path / f"{ESCAPES}.gpkg") as database:
-        told = (json.dumps(f"{ESCAPES}\nOpenStreetMap"), "attribution")
-        database.execute("UPDATE roadgeo_meta SET value = ? WHERE key = ?", told)
+        reported = (json.dumps(f"{ESCAPES}\nOpenStreetMap"), "attribution")
+        database.execute("UPDATE roadgeo_meta SET value = ? WHERE key = ?", reported)
     assert main(["list"]) == 0
     assert main(["info", str(tmp_path / f"{ESCAPES}.gpkg")]) == 0
     main(["check", str(tmp_path / f"{ESCAPES}.gpkg")])
     assert main(["locate", "missing.png", "-r", f"no{ESCAPES}"]) == 1
     said = "".join(capfd.readouterr())
-    assert not [one for one in FORBIDDEN if one in said]
+    assert not [item for item in FORBIDDEN if item in said]
     assert "\\x1b]0;owned" in said
 
 
@@ -78,5 +78,5 @@ def test_long_names_leave_room_for_what_is_put_behind_them(letter: str, tmp_path
     first, second = name_tasks([f"{tmp_path}/{longest}.png", f"{tmp_path}/{longest[:-1]}x.png"])
     assert first.stem != second.stem
     assert first.stem[:50] == longest[:50]
-    assert max(len(os.fsencode(one.stem)) for one in (first, second)) <= 180
+    assert max(len(os.fsencode(item.stem)) for item in (first, second)) <= 180
     assert name_tasks([f"{tmp_path}/{letter * 60}.png"])[0].stem == letter * 60

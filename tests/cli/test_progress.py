@@ -38,10 +38,10 @@ def test_quiet_is_quiet(capsys):
 def test_programs_get_lines_of_json_each_per_cent_once(capsys, monkeypatch):
     monkeypatch.setenv("ROADGEO_PROGRESS", "json")
     walk(print_steps(quiet=False))
-    told = capsys.readouterr().err.splitlines()
-    shares = [json.loads(line)["progress"] for line in told if line.startswith("{")]
+    output = capsys.readouterr().err.splitlines()
+    shares = [json.loads(line)["progress"] for line in output if line.startswith("{")]
     assert shares == [{"done": k, "total": 100, "text": "drawing"} for k in range(100)]
-    assert [line for line in told if not line.startswith("{")] == ["reading ...", "drawing ...", "writing ..."]
+    assert [line for line in output if not line.startswith("{")] == ["reading ...", "drawing ...", "writing ..."]
 
 
 class Terminal:

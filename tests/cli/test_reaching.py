@@ -99,7 +99,7 @@ def test_how_images_are_read_reaches_each_command(tmp_path: Path) -> None:
 
 
 def test_what_locate_alone_reads() -> None:
-    told = given(locate_command, "--allow-mirror", "--aspect=1.5", "--units=metres", "--layer=roads")
-    reading = read_options(told, ["other.tif"], jobs=2)
+    reported = given(locate_command, "--allow-mirror", "--aspect=1.5", "--units=metres", "--layer=roads")
+    reading = read_options(reported, ["other.tif"], jobs=2)
     assert (reading.mirror, reading.aspect, reading.units, reading.layer) == ("allow", 1.5, "metres", "roads")
     assert (reading.fused_with, reading.threads) == (("other.tif",), 1)

@@ -24,17 +24,17 @@ def library(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
 
 def test_what_is_damaged_is_said_and_the_rest_is_listed(library: Path, capsys: pytest.CaptureFixture[str]) -> None:
     assert main(["list", "--json"]) == 1
-    told = capsys.readouterr()
-    assert [json.loads(line)["name"] for line in told.out.splitlines()] == ["good"]
-    assert told.err.startswith(f"Error: {library / 'bad.gpkg'}")
-    assert len(told.err.splitlines()) == 1
+    output = capsys.readouterr()
+    assert [json.loads(line)["name"] for line in output.out.splitlines()] == ["good"]
+    assert output.err.startswith(f"Error: {library / 'bad.gpkg'}")
+    assert len(output.err.splitlines()) == 1
 
 
 def test_every_reference_is_checked(library: Path, capsys: pytest.CaptureFixture[str]) -> None:
     assert main(["check", "bad", "nonesuch", "good"]) == 1
-    told = capsys.readouterr()
-    assert told.out == "good: sound\n"
-    first, *_, last = told.err.splitlines()
+    output = capsys.readouterr()
+    assert output.out == "good: sound\n"
+    first, *_, last = output.err.splitlines()
     assert first.startswith(f"Error: {library / 'bad.gpkg'}")
     assert last.startswith("Error: no reference 'nonesuch'")
 
@@ -72,7 +72,10 @@ def test_kinds_that_no_column_tells_are_not_claimed(
         tmp_path / "a.gpkg",
     )
     write_streets(known)
-    for files, told in (([bare], "not known, all lines of bare.gpkg were taken"), ([bare, known], "drivable; of bare")):
+    for files, reported in (
+        ([bare], "not known, all lines of bare.gpkg were taken"),
+        ([bare, known], "drivable; of bare"),
+    ):
         named = [part for file in files for part in ("--roads", str(file))]
         assert main(["index", *named, "--out", str(tmp_path / "ref.gpkg"), "--replace"]) == 0
         capsys.readouterr()
@@ -80,7 +83,7 @@ def test_kinds_that_no_column_tells_are_not_claimed(
         caplog.clear()
         assert main(["info", str(tmp_path / "ref.gpkg")]) == 0
         (line,) = [line for line in capsys.readouterr().out.splitlines() if line.startswith("kinds")]
-        assert told in line
+        assert reported in line
 
 
 def test_what_is_not_there_is_not_asked_about(
@@ -103,8 +106,10 @@ def test_a_reference_is_replaced_only_if_the_user_says_so(
     capsys.readouterr()
     before = made.stat()
     assert main(build) == 1
-    told = capsys.readouterr().err
-    assert re.fullmatch(rf"Error: {re.escape(str(made))}: is a reference of \d+ intersections; .* --replace.*\n", told)
+    output = capsys.readouterr().err
+    assert re.fullmatch(
+        rf"Error: {re.escape(str(made))}: is a reference of \d+ intersections; .* --replace.*\n", output
+    )
     assert made.stat() == before
     assert main([*build, "--replace", "--quiet"]) == 0
     assert made.stat().st_ino != before.st_ino

@@ -18,7 +18,7 @@ from roadgeo.storage.gdal import forget_missing_proj_data
 from roadgeo.storage.rasters import writing_raster
 from roadgeo.workflows import locate
 
-DRONE = next(one.path for one in demo_masks() if one.path.stem == "drone")
+DRONE = next(demo_mask.path for demo_mask in demo_masks() if demo_mask.path.stem == "drone")
 
 
 def test_proj_data_that_are_not_where_the_environment_says_are_looked_for_elsewhere(

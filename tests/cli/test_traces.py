@@ -14,7 +14,7 @@ from roadgeo.evaluation.demo import ROADS, demo_masks
 from roadgeo.outputs.registry import ALSO
 from roadgeo.storage.folders import cache_dir
 
-DRONE = next(one.path for one in demo_masks() if one.path.stem == "drone")
+DRONE = next(demo_mask.path for demo_mask in demo_masks() if demo_mask.path.stem == "drone")
 
 #: System calls that make, change or move a file.
 _CHANGES = (
@@ -68,7 +68,7 @@ def strays(paths: list[Path], folder: Path) -> list[Path]:
     """Return the paths that are neither of the outputs nor of the cache, nor temporary and gone."""
     assert not [*(folder / "temporary").iterdir()]
     allowed = (folder / "out", folder / "temporary", cache_dir(), Path("/dev/null"))
-    return [path for path in paths if not any(path.is_relative_to(one) for one in allowed)]
+    return [path for path in paths if not any(path.is_relative_to(item) for item in allowed)]
 
 
 def test_a_photograph_reaches_nobody_and_leaves_only_its_outputs(porto: Path, tmp_path: Path) -> None:
@@ -114,6 +114,6 @@ def test_readers_open_nothing_but_their_files(tmp_path: Path) -> None:
         Path(path) for path in (sys.prefix, sys.base_prefix, tmp_path, Path(__file__).parents[2], cache_dir(), *_SYSTEM)
     ]
     assert any(path.name == "roads.shp" for path in opened)
-    assert not {str(path) for path in opened if not any(path.is_relative_to(one) for one in own)}
+    assert not {str(path) for path in opened if not any(path.is_relative_to(item) for item in own)}
     assert not [line for line in calls if not line.startswith(("open", "stat", "newfstatat", "+++", "---", "<..."))]
     assert not [line for line in calls if "/nowhere" in line]

@@ -48,10 +48,10 @@ def test_a_flight_is_followed_and_written(flown, tmp_path, capfd):
     focal = str(flight.views[0].focal_px)
     given = ["-o", str(tmp_path), "--start", "2024-05-01T09:30:00", "--json", "--camera", focal]
     assert main([*command, *given]) == 0
-    told = [json.loads(line) for line in capfd.readouterr().out.splitlines()]
-    for one in told:
-        jsonschema.validate(one, read_schema("frame"))
-    rows = {one["frame"]: one for one in told}
+    output = [json.loads(line) for line in capfd.readouterr().out.splitlines()]
+    for entry in output:
+        jsonschema.validate(entry, read_schema("frame"))
+    rows = {item["frame"]: item for item in output}
     assert sorted(rows) == list(range(7))
     assert rows[6]["time"] == "2024-05-01T09:30:06Z"
     for k, row in rows.items():
@@ -67,7 +67,7 @@ def test_a_flight_is_followed_and_written(flown, tmp_path, capfd):
     points = ET.parse(tmp_path / "flight.gpx").getroot().findall(".//{*}trkpt")
     assert len(points) == 7
     features = json.loads((tmp_path / "flight.geojson").read_text())["features"]
-    assert [one["geometry"]["type"] for one in features] == ["Polygon"] * 7 + ["LineString"]
+    assert [feature["geometry"]["type"] for feature in features] == ["Polygon"] * 7 + ["LineString"]
     assert len(features[-1]["properties"]["coordTimes"]) == 7
     with closing(sqlite3.connect(tmp_path / "flight.gpkg")) as database:
         assert database.execute("select count(*) from footprints").fetchone() == (7,)
@@ -129,7 +129,7 @@ def test_a_video_is_a_flight(flown, tmp_path, capfd):
     command = ["track", str(tmp_path / "flight.avi"), "-r", str(folder / "town.gpkg"), "-o", str(tmp_path), "--json"]
     assert main([*command, "--every", "0.5", "--segment", "never", "--threshold", "127", "--band", "1"]) in (0, 3)
     rows = [json.loads(line) for line in capfd.readouterr().out.splitlines()]
-    assert sorted({one["time_s"] for one in rows}) == [0.0, 0.5, 1.0]
+    assert sorted({row["time_s"] for row in rows}) == [0.0, 0.5, 1.0]
 
 
 @pytest.mark.parametrize(

@@ -54,9 +54,9 @@ def test_right_wrong_and_unknown_are_told_and_the_wrong_one_is_corrected(
     assert ["corrected" in page for page in pages] == [False, True, False]
     assert ["query-roads" in page.partition("<body>")[2] for page in pages] == [True, True, False]
     right, wrong, far = map(json.loads, out.splitlines())
-    for one in (right, wrong, far):
-        jsonschema.validate(one, read_schema("verification"))
-    assert [one["verdict"] for one in (right, wrong, far)] == ["agrees", "off", "unknown"]
+    for entry in (right, wrong, far):
+        jsonschema.validate(entry, read_schema("verification"))
+    assert [item["verdict"] for item in (right, wrong, far)] == ["agrees", "off", "unknown"]
     assert "lies on none of the maps" in far["reason"]
     shift = wrong["displacement"]
     assert np.hypot(shift["east_m"] + 60, shift["north_m"] - 35) < 3  # grid north is not north: 0.3 degrees here

@@ -24,5 +24,5 @@ def test_a_notebook_runs(name: str, expected: list[str], tmp_path: Path) -> None
     nbclient.NotebookClient(notebook, timeout=240, resources={"metadata": {"path": str(tmp_path)}}).execute()
     shown = [output for cell in notebook.cells for output in cell.get("outputs", [])]
     text = "\n".join(str(output.get("text") or output.get("data")) for output in shown)
-    assert [one for one in expected if one not in text] == []
+    assert [value for value in expected if value not in text] == []
     assert name != "locate.ipynb" or any("image/png" in output.get("data", {}) for output in shown)

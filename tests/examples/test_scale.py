@@ -27,25 +27,27 @@ def run(name: str, *arguments: object, cwd: Path) -> str:
 
 @pytest.mark.slow
 def test_a_mask_has_one_place_on_maps_that_were_made_of_one(tmp_path: Path) -> None:
-    one = tmp_path / "map_00.shards"
+    item = tmp_path / "map_00.shards"
     for command in (
-        ["index", "--roads", ROADS, "--shards", "auto", "--out", one],
+        ["index", "--roads", ROADS, "--shards", "auto", "--out", item],
         ["index", "--roads", ROADS, "--out", tmp_path / "porto.gpkg"],
         ["simulate", tmp_path / "porto.gpkg", "-o", tmp_path / "masks", "-n", "2", "--noise", "clean", "--size", "700"],
     ):
         subprocess.run([sys.executable, "-m", "roadgeo", *map(str, command), "--quiet"], check=True)
-    assert "map_01.shards" in run("maps.py", one, "--count", 2, cwd=tmp_path)
-    assert run("maps.py", one, "--count", 2, cwd=tmp_path) == ""  # it is there already
+    assert "map_01.shards" in run("maps.py", item, "--count", 2, cwd=tmp_path)
+    assert run("maps.py", item, "--count", 2, cwd=tmp_path) == ""  # it is there already
     maps = sorted(tmp_path.glob("map_*.shards"))
-    told = run("measure.py", *maps, "--masks", tmp_path / "masks", "--counts", 1, 2, "--out", "measured", cwd=tmp_path)
-    assert told
+    reported = run(
+        "measure.py", *maps, "--masks", tmp_path / "masks", "--counts", 1, 2, "--out", "measured", cwd=tmp_path
+    )
+    assert reported
     with (tmp_path / "measured" / "table_quick.csv").open(newline="") as file:
         rows = list(csv.DictReader(file))
     assert [int(row["masks"]) for row in rows] == [2, 2]
     assert [int(row["wrong"]) for row in rows] == [0, 0]
     assert int(rows[1]["intersections"]) == 2 * int(rows[0]["intersections"]) > 500
     mask = next((tmp_path / "masks" / "clean").glob("*.png"))
-    assert roadgeo.locate(mask, [open_reference(path) for path in maps]).reference == open_reference(one).name
+    assert roadgeo.locate(mask, [open_reference(path) for path in maps]).reference == open_reference(item).name
 
 
 def test_copies_of_roads_lie_each_on_ground_of_its_own(tmp_path: Path) -> None:

@@ -138,13 +138,23 @@ def test_the_model_that_ships_is_small_and_has_a_card() -> None:
 def test_the_model_says_what_other_tools_ask() -> None:
     onnx = pytest.importorskip("onnx")
     model = onnx.load_from_string(gzip.decompress(MODEL.read_bytes()))
-    told = {p.key: json.loads(p.value) for p in model.metadata_props}
-    assert told["model_type"] == "Segmentor"
-    assert told["class_names"] == {"0": "not_road", "1": "road"}
-    assert told["resolution"] == 100
+    document = {p.key: json.loads(p.value) for p in model.metadata_props}
+    assert document["model_type"] == "Segmentor"
+    assert document["class_names"] == {"0": "not_road", "1": "road"}
+    assert document["resolution"] == 100
     (image,), (road,) = model.graph.input, model.graph.output
-    assert [d.dim_value for d in road.type.tensor_type.shape.dim] == [1, 1, told["tile_size"], told["tile_size"]]
-    assert [d.dim_value for d in image.type.tensor_type.shape.dim] == [1, 3, told["tile_size"], told["tile_size"]]
+    assert [d.dim_value for d in road.type.tensor_type.shape.dim] == [
+        1,
+        1,
+        document["tile_size"],
+        document["tile_size"],
+    ]
+    assert [d.dim_value for d in image.type.tensor_type.shape.dim] == [
+        1,
+        3,
+        document["tile_size"],
+        document["tile_size"],
+    ]
     assert {node.domain for node in model.graph.node} <= {"", "ai.onnx"}
     assert {o.domain: o.version for o in model.opset_import}[""] == 17
 

@@ -38,11 +38,11 @@ def test_rows_are_counted_by_threshold_band_and_kind(trust):
         trust.Row("porto", 1, "elsewhere", "mild", 3.7, 2.5, False, 0.1),
         trust.Row("porto", 1, "mirrored", "torn", 2.1, np.inf, False, 0.1),
     ]
-    told = {row[0]: row[1:] for row in trust.threshold_table(rows, 3.5, 2.0)}
-    assert told["2"][:2] == ["-", "-"]
-    assert told["2"][2].startswith("2 of 2")
-    assert [cell.split(":")[0] for cell in told["3.5"]] == ["1 of 3", "1 of 3", "1 of 2"]
-    assert [cell.split(":")[0] for cell in told["5"]] == ["1 of 3", "0 of 3", "0 of 2"]
+    reported = {row[0]: row[1:] for row in trust.threshold_table(rows, 3.5, 2.0)}
+    assert reported["2"][:2] == ["-", "-"]
+    assert reported["2"][2].startswith("2 of 2")
+    assert [cell.split(":")[0] for cell in reported["3.5"]] == ["1 of 3", "1 of 3", "1 of 2"]
+    assert [cell.split(":")[0] for cell in reported["5"]] == ["1 of 3", "0 of 3", "0 of 2"]
     bands = {row[0]: row[1:] for row in trust.band_table(rows, 3.5, 2.0)}
     assert bands["3.5 to 5"][0] == "2"
     assert bands["3.5 to 5"][1].startswith("2 of 2")

@@ -26,7 +26,7 @@ PORTO, SALT_LAKE_CITY, AUCKLAND, TIFLIS = (-8.6, 41.15), (-111.9, 40.76), (174.7
 )
 def test_an_area_is_found_by_its_name_or_its_bounds(name, place):
     box = find_area(name)
-    assert [one for one in (PORTO, SALT_LAKE_CITY, AUCKLAND, TIFLIS) if lies_in(box, *one)] == [place]
+    assert [item for item in (PORTO, SALT_LAKE_CITY, AUCKLAND, TIFLIS) if lies_in(box, *item)] == [place]
 
 
 @pytest.mark.parametrize(
@@ -50,7 +50,7 @@ def test_what_is_no_area_is_refused(name, said):
 
 
 @pytest.mark.parametrize(
-    ("one", "other", "they_do"),
+    ("first", "other", "they_do"),
     [
         ((0, 0, 2, 2), (1, 1, 3, 3), True),
         ((0, 0, 2, 2), (2, 2, 3, 3), True),
@@ -63,8 +63,8 @@ def test_what_is_no_area_is_refused(name, said):
         ((-180, -90, 180, 90), (170, 0, -170, 2), True),
     ],
 )
-def test_boxes_share_ground_across_the_antimeridian_too(one, other, they_do):
-    assert overlap(one, other) == overlap(other, one) == they_do
+def test_boxes_share_ground_across_the_antimeridian_too(first, other, they_do):
+    assert overlap(first, other) == overlap(other, first) == they_do
 
 
 def test_without_projs_database_names_are_refused_and_bounds_are_not(tmp_path, monkeypatch):

@@ -63,10 +63,10 @@ def test_near_the_nadir_a_lens_is_assumed():
 @given(scale=st.floats(-50, 50).filter(lambda s: abs(s) > 1e-3), tilt=tilts, azimuth=turns)
 def test_a_homography_and_its_multiples_are_the_same(scale, tilt, azimuth):
     matrix = camera((100, 50), SIZE, 1.2, tilt, azimuth, 30.0, 1500.0)
-    one, other = pose(matrix, SIZE), pose(scale * matrix, SIZE)
-    assert one.gsd_m == pytest.approx(other.gsd_m)
-    assert one.tilt_deg == pytest.approx(other.tilt_deg, abs=1e-3)
-    assert angle_between(one.rotation_deg, other.rotation_deg) < 1e-6
+    first, other = pose(matrix, SIZE), pose(scale * matrix, SIZE)
+    assert first.gsd_m == pytest.approx(other.gsd_m)
+    assert first.tilt_deg == pytest.approx(other.tilt_deg, abs=1e-3)
+    assert angle_between(first.rotation_deg, other.rotation_deg) < 1e-6
     assert judge(scale * matrix, SIZE, OPTIONS) is judge(matrix, SIZE, OPTIONS) is None
 
 

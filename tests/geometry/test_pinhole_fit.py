@@ -29,8 +29,8 @@ def pinhole(tilt=0.3, heading=1.0, focal=0.1):
 def test_it_stands_and_points_like_the_twin(tilt: float, heading: float, focal: float) -> None:
     p = np.stack([pinhole(tilt, heading, focal), pinhole(0.0)])
     positions, rotations = _place(p, LOG_FOCAL)
-    for one, position, rotation in zip(p, positions, rotations, strict=True):
-        expected = naive.place_pinholes(one, LOG_FOCAL)
+    for item, position, rotation in zip(p, positions, rotations, strict=True):
+        expected = naive.place_pinholes(item, LOG_FOCAL)
         assert position == pytest.approx(expected[0], abs=1e-8)
         assert rotation == pytest.approx(expected[1], abs=1e-12)
 
@@ -52,7 +52,7 @@ def test_it_is_fitted_like_the_twin(tilt: float, sigma: float) -> None:
     starts = np.stack([pinhole(tilt + away, 1.0 + away, 2 * away) for away in (0.2, 0.1, -0.2)] + [pinhole(1.5)])
     p, covariance = fit_pinhole(starts, corners, 50)
     seen = [(naive.pinhole_residuals(s, corners), s) for s in starts]
-    _, best = min(((np.sum(r**2), s) for r, s in seen if r is not None), key=lambda one: one[0])
+    _, best = min(((np.sum(r**2), s) for r, s in seen if r is not None), key=lambda item: item[0])
     expected, spread = naive.fit_pinhole(best, corners, 700.0)
     assert np.sum(naive.pinhole_residuals(p, corners) ** 2) == pytest.approx(
         np.sum(naive.pinhole_residuals(expected, corners) ** 2), rel=1e-5, abs=1e-9

@@ -48,9 +48,11 @@ def test_a_missing_grid_is_named_with_what_it_is_worth(
         assert 1.0 < found.sigma_m < 6.0
         assert found.grids == (grid,)
         assert found.better_m < found.sigma_m
-    told = found.told("longitude and latitude")
-    assert told.startswith(f"longitude and latitude are good to {found.sigma_m:g} m only: PROJ lacks the grid {grid}")
-    assert told.endswith(f"get it by `pyproj sync --file {grid}`, or set PROJ_NETWORK=ON")
+    reported = found.told("longitude and latitude")
+    assert reported.startswith(
+        f"longitude and latitude are good to {found.sigma_m:g} m only: PROJ lacks the grid {grid}"
+    )
+    assert reported.endswith(f"get it by `pyproj sync --file {grid}`, or set PROJ_NETWORK=ON")
 
 
 def test_what_nobody_knows_is_said() -> None:

@@ -199,7 +199,7 @@ def test_roads_like_the_twin(k1, known, free):
     n = meet_roads(p, plane, points, limits, town.roads, factor, met)
     inverse = np.zeros((free, free)) if known else np.linalg.inv(root @ root.T)
     expected = naive.meet_roads(p, plane, points, limits, inverse, town.roads.segments)
-    assert n == sum(one[1] is not None for one in expected) > 5
+    assert n == sum(value[1] is not None for value in expected) > 5
     for i, (searched, row, *numbers) in enumerate(expected):
         assert met.searched[i] == searched
         assert np.isnan(met.residuals[i]) == (row is None)

@@ -26,9 +26,9 @@ def kept(tmp_path_factory: pytest.TempPathFactory) -> bytes:
     """The machine code of the toys."""
     with pytest.MonkeyPatch.context() as patch:
         folder = fresh(patch, tmp_path_factory.mktemp("code"))
-        told: list[tuple[int, int]] = []
-        compilation.load([MODULE], lambda done, of: told.append((done, of)))
-        assert told == [(n, 4) for n in range(5)]
+        reported: list[tuple[int, int]] = []
+        compilation.load([MODULE], lambda done, of: reported.append((done, of)))
+        assert reported == [(n, 4) for n in range(5)]
         (file,) = folder.iterdir()
         assert file.name == "toy_kernels.o"
         return file.read_bytes()
@@ -38,8 +38,8 @@ def fresh(patch: pytest.MonkeyPatch, folder: Path) -> Path:
     """Be a process that has not loaded anything, with an empty cache."""
     patch.setattr(compilation, "kernel_folder", lambda: folder)
     patch.setattr(compilation, "_left_to_numba", set())
-    for one in compilation.entries(MODULE):
-        patch.setattr(one, "_run", None)
+    for entry in compilation.entries(MODULE):
+        patch.setattr(entry, "_run", None)
     return folder
 
 

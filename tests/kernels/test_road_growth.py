@@ -51,7 +51,7 @@ def seen(network, p, n=500, false=0.0, seed=0):
 def corner_gap(p, q):
     """Greatest distance in metres between where two maps put the frame's corners."""
     corners = np.array([[x, y, 1.0] for x in (-0.8, 0.8) for y in (-0.8, 0.8)])
-    a, b = (corners @ np.append(one, 1.0).reshape(3, 3).T for one in (p, q))
+    a, b = (corners @ np.append(item, 1.0).reshape(3, 3).T for item in (p, q))
     return np.hypot(*(a[:, :2] / a[:, 2:] - b[:, :2] / b[:, 2:]).T).max() * UNIT
 
 

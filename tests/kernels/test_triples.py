@@ -116,8 +116,8 @@ lengths = st.floats(0.1, 10)
 
 
 @given(angles, st.floats(0.2, 2.9), lengths, lengths, angles)
-def test_vertex_angle_like_the_twin(phi, wide, one, two, tangent):
-    e1 = one * np.array([np.cos(phi), np.sin(phi)])
+def test_vertex_angle_like_the_twin(phi, wide, first, two, tangent):
+    e1 = first * np.array([np.cos(phi), np.sin(phi)])
     e2 = two * np.array([np.cos(phi + wide), np.sin(phi + wide)])
     found = vertex_angle(*e1, *e2, tangent)
     assert 0 <= found < 2 * UNITS + 1e-9
@@ -389,8 +389,8 @@ class TestGather:
         return [array[:n] for array in out]
 
     def test_hits_that_agree_make_a_proposal(self):
-        one, other = [1.0, 0, 0, 1], [1.1, 0, 0, 1.1]
-        ids, affine, placed = self.run([(7, 0, 70, 1, 71), (7, 1, 71, 2, 72)], [one, other])
+        first, other = [1.0, 0, 0, 1], [1.1, 0, 0, 1.1]
+        ids, affine, placed = self.run([(7, 0, 70, 1, 71), (7, 1, 71, 2, 72)], [first, other])
         assert ids.tolist() == [[7, 70, 71, 72, -1]]
         assert affine[0] == pytest.approx([1.05, 0, 0, 1.05])
         assert placed.tolist() == [3]

@@ -75,7 +75,9 @@ REASONS = {
 
 
 def public_kernels() -> list[str]:
-    modules = [importlib.import_module(f"roadgeo.kernels.{one.name}") for one in pkgutil.iter_modules(kernels.__path__)]
+    modules = [
+        importlib.import_module(f"roadgeo.kernels.{module.name}") for module in pkgutil.iter_modules(kernels.__path__)
+    ]
     found = {
         name
         for module in modules
@@ -86,7 +88,7 @@ def public_kernels() -> list[str]:
 
 
 def twins() -> dict[str, object]:
-    modules = [importlib.import_module(f"naive.{one.name}") for one in pkgutil.iter_modules(naive.__path__)]
+    modules = [importlib.import_module(f"naive.{module.name}") for module in pkgutil.iter_modules(naive.__path__)]
     return {name: value for module in modules for name, value in inspect.getmembers(module, inspect.isfunction)}
 
 

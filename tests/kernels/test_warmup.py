@@ -25,11 +25,11 @@ assert "numba" not in sys.modules
 
 
 def test_all_kernels_of_the_search_are_kept_as_machine_code() -> None:
-    told = []
-    warm_up(lambda text, share=None: told.append(share))
+    values = []
+    warm_up(lambda text, share=None: values.append(share))
     assert compiled()
-    assert told == [] or (told[0] == 0.0 and told[-1] == 1.0)
-    kept = [one for module in modules_of_the_search() for one in entries(module)]
+    assert values == [] or (values[0] == 0.0 and values[-1] == 1.0)
+    kept = [entry for module in modules_of_the_search() for entry in entries(module)]
     assert len(kept) > 25
 
 

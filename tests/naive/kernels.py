@@ -438,26 +438,26 @@ def adjust(p, free, plane, points, pairs, held, limits, segments):
                 own = own_sigma(reach, limits.sigma_m, limits.map_sigma_m, limits.mask_sigma)
                 both.append((pair, target, pairs.weight / (own**2 + (far / (2 * limits.sigma_m)) ** 2)))
         if iteration < 6:
-            both += [(*one, held.weight * 0.5**iteration) for one in zip(held.query, held.reference, strict=True)]
-        for one in both:
-            more, side = add_point(p, half_side, *one, free)
+            both += [(*item, held.weight * 0.5**iteration) for item in zip(held.query, held.reference, strict=True)]
+        for entry in both:
+            more, side = add_point(p, half_side, *entry, free)
             normal, right = normal + more, right + side
         used = []
         if iteration > 0:
             found = meet_roads(p, plane, points, limits, np.linalg.inv(before), segments)
             for cell in range(limits.n_cells):
-                here = [one for one, c in zip(found, points.cells, strict=True) if c == cell and one[0]]
-                shares[cell] = np.mean([one[1] is not None for one in here]) if here else 1.0
+                here = [result for result, c in zip(found, points.cells, strict=True) if c == cell and result[0]]
+                shares[cell] = np.mean([item[1] is not None for item in here]) if here else 1.0
             used = [
-                one[1:]
-                for one, cell in zip(found, points.cells, strict=True)
-                if one[1] is not None and shares[cell] >= limits.least_share
+                result[1:]
+                for result, cell in zip(found, points.cells, strict=True)
+                if result[1] is not None and shares[cell] >= limits.least_share
             ]
             for row, residual, sigma, own in used:
                 weight = points.weight / own**2 / (1 + (residual / sigma) ** 2)
                 normal, right = normal + weight * np.outer(row, row), right + weight * row * residual / plane.unit
             if used:
-                r, s, own = np.array([one[1:] for one in used]).T
+                r, s, own = np.array([item[1:] for item in used]).T
                 cauchy = 1 / (1 + (r / s) ** 2)
                 slope = (1 - (r / s) ** 2) * cauchy**2  # of the influence r * cauchy
                 rms = np.sqrt(np.mean((cauchy * r / own) ** 2) * cauchy.mean()) / max(slope.mean(), 0.1 * cauchy.mean())
@@ -494,7 +494,7 @@ def vertex_codes(xy, tangents, branches, i, j, k, limit):
         unit = int(vertex_angle(xy[j] - xy[i], xy[k] - xy[i], t)) % (2 * UNITS)
         ways = sides_of(t, branches[i])
         seen.append((unit % UNITS, ways if unit < UNITS else ways[::-1]))
-    pairs = [tuple(sorted(pair, key=lambda one: one[0])) for pair in combinations(seen, 2)]
+    pairs = [tuple(sorted(pair, key=lambda item: item[0])) for pair in combinations(seen, 2)]
 
     def openness(pair):
         between = pair[1][0] - pair[0][0]
@@ -530,16 +530,16 @@ def fill_table(xy, tangents, branches, neighbours, min_shape, limit):
 def alike(code, other, tolerance):
     """Whether two pairs of (unit, sides), unordered, agree: within a tolerance, and no side missing in both."""
 
-    def ways(one, turned):
-        return {(way + turned) % 2 for way in (0, 1) if one[1][way]}
+    def ways(first, turned):
+        return {(way + turned) % 2 for way in (0, 1) if first[1][way]}
 
     for order in permutations(other):
         ours, theirs, near = set(), set(), True
-        for n, (one, two) in enumerate(zip(code, order, strict=True)):
-            gap = (one[0] - two[0] + UNITS // 2) % UNITS - UNITS // 2
+        for n, (first, two) in enumerate(zip(code, order, strict=True)):
+            gap = (first[0] - two[0] + UNITS // 2) % UNITS - UNITS // 2
             near &= abs(gap) <= tolerance
-            ours |= {(n, way) for way in ways(one, 0)}
-            theirs |= {(n, way) for way in ways(two, int(one[0] - gap != two[0]))}
+            ours |= {(n, way) for way in ways(first, 0)}
+            theirs |= {(n, way) for way in ways(two, int(first[0] - gap != two[0]))}
         if near and (ours <= theirs or theirs <= ours):
             return True
     return False

@@ -111,4 +111,4 @@ def beyond_chance(points, roads, turn, bearings=64):
 
 def ratio(met, hit_rate, rate):
     """Return the log-likelihood ratio of points that meet roads or not."""
-    return sum(math.log(hit_rate / rate) if one else math.log((1 - hit_rate) / (1 - rate)) for one in met)
+    return sum(math.log(hit_rate / rate) if place else math.log((1 - hit_rate) / (1 - rate)) for place in met)

@@ -66,10 +66,10 @@ def halfway(lines, n):
     )
 
 
-def are_twins(one, other, distance):
+def are_twins(first, other, distance):
     """Whether two polylines are near at equal shares of their lengths."""
     shares = np.arange(1, 12) / 12
-    a, b = (np.array([LineString(x).interpolate(s, normalized=True).coords[0] for s in shares]) for x in (one, other))
+    a, b = (np.array([LineString(x).interpolate(s, normalized=True).coords[0] for s in shares]) for x in (first, other))
     return bool((np.hypot(*(a - b).T) <= distance).all())
 
 

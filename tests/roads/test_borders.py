@@ -34,7 +34,7 @@ def sheet(
     if caption:
         cv2.putText(paper, "Plate 12: North End, Scale 1:5000", (70, height - 40), 0, 0.9, 255, 2)
     matrix = cv2.getRotationMatrix2D((width / 2, height / 2), turn_deg, 1.0)
-    paper, shown = (cv2.warpAffine(one, matrix, (width, height)) for one in (paper, shown))
+    paper, shown = (cv2.warpAffine(item, matrix, (width, height)) for item in (paper, shown))
     if margin:
         paper = cv2.copyMakeBorder(paper, *[margin] * 4, cv2.BORDER_CONSTANT, value=255)
         shown = cv2.copyMakeBorder(shown, *[margin] * 4, cv2.BORDER_CONSTANT, value=0)
@@ -60,7 +60,7 @@ def test_only_the_map_is_left(what):
 
 
 def test_a_larger_sheet_is_cropped_as_well():
-    roads, shown = (np.kron(one, np.ones((4, 4), bool)) for one in sheet(city(), turn_deg=0.5))
+    roads, shown = (np.kron(item, np.ones((4, 4), bool)) for item in sheet(city(), turn_deg=0.5))
     on_map = find_border(roads, 4 * WIDTH)
     assert on_map is not None
     assert on_map.shape == roads.shape

@@ -27,7 +27,7 @@ def test_thresholds_lie_among_the_values(data: st.DataObject) -> None:
         return
     low, high = float(rows.min()), float(rows.max())
     assert 1 <= len(found) <= 3
-    assert all(np.isfinite(one) and min(low, np.nextafter(low, -np.inf)) <= one <= high for one in found)
+    assert all(np.isfinite(result) and min(low, np.nextafter(low, -np.inf)) <= result <= high for result in found)
 
 
 def test_values_that_differ_by_rounding_are_refused() -> None:

@@ -35,10 +35,10 @@ class Block:
     def commands(self):
         """Yield (command, exit status) of each line; a comment "# status 3" says that it is not 0."""
         for line in self.text.replace("\\\n", " ").splitlines():
-            told = re.search(r"#.*\bstatus (\d+)", line)
+            reported = re.search(r"#.*\bstatus (\d+)", line)
             command = re.sub(r"\s+#.*$|^#.*$", "", line).strip()
             if command:
-                yield command, int(told[1]) if told else 0
+                yield command, int(reported[1]) if reported else 0
 
 
 def blocks(text):
@@ -237,10 +237,10 @@ def unknown_names(text):
         if words[:1] == ["roadgeo"] and len(words) > 1 and not words[1].isupper():
             command, rest = context(words[1:])
             has = options_of(command) if command else set()
-            wrong += [f"{code}: {one}" for one in OPTION.findall(" ".join(rest)) if one not in has]
+            wrong += [f"{code}: {item}" for item in OPTION.findall(" ".join(rest)) if item not in has]
             wrong += [] if command else [code]
         elif words and words[0].startswith("-"):
-            wrong += [one for one in OPTION.findall(code) if one not in known]
+            wrong += [item for item in OPTION.findall(code) if item not in known]
     return wrong
 
 
@@ -270,7 +270,7 @@ def missing_files(text, folder):
     return sorted(
         name
         for name in named
-        if not (ROOT / name).exists() and not any(f"/{one}".endswith(f"/{name}") for one in there)
+        if not (ROOT / name).exists() and not any(f"/{item}".endswith(f"/{name}") for item in there)
     )
 
 

@@ -70,7 +70,7 @@ def main(count: int, effort: str = "quick") -> dict[str, Any]:
     masks = draw_masks(folder, 50)
     options = LocateOptions(effort=effort)
     became: Counter[str] = Counter()
-    told: dict[str, list[float]] = {"resident_mb": [], "median_ms": [], "open_files": []}
+    reported: dict[str, list[float]] = {"resident_mb": [], "median_ms": [], "open_files": []}
     for tenth in range(10):
         spent = []
         for k in range(tenth * count // 10, (tenth + 1) * count // 10):
@@ -82,11 +82,11 @@ def main(count: int, effort: str = "quick") -> dict[str, Any]:
             except MaskError:
                 became["damaged"] += 1
             spent.append(time.process_time() - started)
-        told["resident_mb"].append(round(resident_mb(), 1))
-        told["median_ms"].append(round(1000 * statistics.median(spent), 2))
-        told["open_files"].append(sum(1 for _ in Path("/dev/fd").iterdir()))
-        print(tenth + 1, {name: values[-1] for name, values in told.items()}, file=sys.stderr)
-    return {"locates": count, **told, "became": dict(became)}
+        reported["resident_mb"].append(round(resident_mb(), 1))
+        reported["median_ms"].append(round(1000 * statistics.median(spent), 2))
+        reported["open_files"].append(sum(1 for _ in Path("/dev/fd").iterdir()))
+        print(tenth + 1, {name: values[-1] for name, values in reported.items()}, file=sys.stderr)
+    return {"locates": count, **reported, "became": dict(became)}
 
 
 if __name__ == "__main__":

@@ -67,8 +67,8 @@ class Watch:
 class Judge:
     """Counts what a reader is given, and keeps what it did wrong: one file for each place where it does."""
 
-    def __init__(self, one: Callable[[bytes], None], folder: Path, results: Path, most: int) -> None:
-        self._one, self._watch, self._temporary, self._most = one, Watch(folder), folder / "tmp", most
+    def __init__(self, item: Callable[[bytes], None], folder: Path, results: Path, most: int) -> None:
+        self._one, self._watch, self._temporary, self._most = item, Watch(folder), folder / "tmp", most
         self._findings, self._counter = results / "findings", results / "executions"
         self._findings.mkdir(parents=True, exist_ok=True)
         self.count = int(self._counter.read_text()) if self._counter.exists() else 0
@@ -99,12 +99,12 @@ class Judge:
         assert not left, f"left {left} behind"
 
     def _keep(self, content: bytes, error: Exception) -> None:
-        told = "".join(traceback.format_exception(error))
-        places = [line for line in told.splitlines() if line.startswith("  File")]
+        reported = "".join(traceback.format_exception(error))
+        places = [line for line in reported.splitlines() if line.startswith("  File")]
         name = type(error).__name__ + "-" + hashlib.sha256("".join(places).encode()).hexdigest()[:8]
         if not (self._findings / name).exists():
             (self._findings / name).write_bytes(content)
-            (self._findings / f"{name}.txt").write_text(told)
+            (self._findings / f"{name}.txt").write_text(reported)
 
     def _write_down(self) -> None:
         written = self._counter.with_suffix(".new")
@@ -147,14 +147,14 @@ def main() -> None:
     tempfile.tempdir = os.environ["TMPDIR"] = os.environ["CPL_TMPDIR"] = str(folder / "tmp")
     results = (given.folder / given.reader).resolve()
     with drivers_registered_once():
-        one = feed(READERS[given.reader], folder)
+        item = feed(READERS[given.reader], folder)
         with atheris.instrument_imports(**_INSTRUMENTED):
             for path in seeds(given.reader):  # what is compiled or imported at first use takes longer than 5 seconds
                 try:
-                    one(path.read_bytes())
+                    item(path.read_bytes())
                 except Exception as error:
                     print(f"{path}: {error!r}", file=sys.stderr)
-        judge = Judge(one, folder, results, given.runs)
+        judge = Judge(item, folder, results, given.runs)
         if judge.count >= given.runs:
             judge.end()
         atheris.Setup(_libfuzzer(given.reader, results), judge)

@@ -73,4 +73,4 @@ def listening(count: int = 0, lose: int = 0, patience_s: int = 120) -> Iterator[
 
 def of_kind(heard: list[dict[str, Any]], kind: str) -> list[dict[str, Any]]:
     """Return the messages of a type."""
-    return [one for one in heard if one["mavpackettype"] == kind]
+    return [item for item in heard if item["mavpackettype"] == kind]

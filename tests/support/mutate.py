@@ -89,10 +89,10 @@ def mutants(source: str) -> Iterator[tuple[str, ast.Module]]:
 
 def codes(code: types.CodeType) -> Iterator[tuple[str, types.CodeType]]:
     """Yield the code of functions by their qualified names."""
-    for one in code.co_consts:
-        if isinstance(one, types.CodeType):
-            yield one.co_qualname, one
-            yield from codes(one)
+    for co_const in code.co_consts:
+        if isinstance(co_const, types.CodeType):
+            yield co_const.co_qualname, co_const
+            yield from codes(co_const)
 
 
 def install(module: types.ModuleType, tree: ast.Module) -> None:
@@ -131,8 +131,8 @@ class Loop:
         for module, where, tree in self.jobs:
             survived = self.passes(session, module, tree)
             self.found.append((f"{module.__name__}:{where}", survived))
-            told = f"{len(self.found)} {'survived' if survived else 'killed'} {module.__name__}:{where}\n"
-            os.write(2, told.encode())
+            reported = f"{len(self.found)} {'survived' if survived else 'killed'} {module.__name__}:{where}\n"
+            os.write(2, reported.encode())
         return True
 
     def passes(self, session: pytest.Session, module: types.ModuleType | None, tree: ast.Module | None) -> bool:

@@ -28,6 +28,6 @@ def validate(path: Path) -> str:
     """What is wrong with a GeoPackage, warnings included; "" where nothing is."""
     command = [find_python(), "-m", VALIDATOR, "-k", "--extra", "--warning-as-error", str(path)]
     done = subprocess.run(command, capture_output=True, text=True, env={"PATH": os.environ["PATH"]})
-    told = "".join(f"{line}\n" for line in (done.stdout + done.stderr).splitlines())
-    assert bool(done.returncode) == bool(told)
-    return told
+    output = "".join(f"{line}\n" for line in (done.stdout + done.stderr).splitlines())
+    assert bool(done.returncode) == bool(output)
+    return output

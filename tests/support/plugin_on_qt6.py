@@ -69,7 +69,7 @@ class File(Definition):
 
 class Source(Definition):
     def __init__(self, name, description="", types=(), **settings):
-        assert all(isinstance(one, Processing.SourceType) for one in types), types
+        assert all(isinstance(item, Processing.SourceType) for item in types), types
         super().__init__(name, description, **settings)
 
 
@@ -306,7 +306,7 @@ def unknown_names(folder):
         for node in ast.walk(tree):
             if isinstance(node, ast.ImportFrom) and (node.module or "").startswith("qgis.PyQt."):
                 module = importlib.import_module(node.module.replace("qgis.PyQt", "PyQt6"))
-                known |= {one.asname or one.name: getattr(module, one.name, None) for one in node.names}
+                known |= {name.asname or name.name: getattr(module, name.name, None) for name in node.names}
         wrong += [f"{path.name}: {name}" for name, found in known.items() if found is None]
         for node in ast.walk(tree):
             words, inner = [], node
@@ -337,25 +337,33 @@ def main():
     plugin.initGui()
     (provider,) = REGISTRY.providers
     assert not provider.icon().isNull()
-    told = {}
+    reported = {}
     for algorithm in provider.algorithms:
         made = algorithm.createInstance()
         made.initAlgorithm()
         assert not made.icon().isNull()
         assert made.canExecute() == (True, "")
         assert made.shortHelpString()
-        told[made.name()] = [made.helpUrl(), len(made.parameters), len(made.outputs)]
-        folded = [one for one in made.parameters.values() if one.flags() & Definition.Flag.FlagAdvanced]
-        told[made.name()].append(len(folded))
-        told[made.name()].append({name: type(one).__name__ for name, one in made.parameters.items()})
-    locate = next(one for one in provider.algorithms if one.name() == "locatemask").createInstance()
+        reported[made.name()] = [made.helpUrl(), len(made.parameters), len(made.outputs)]
+        folded = [
+            parameter for parameter in made.parameters.values() if parameter.flags() & Definition.Flag.FlagAdvanced
+        ]
+        reported[made.name()].append(len(folded))
+        reported[made.name()].append({name: type(parameter).__name__ for name, parameter in made.parameters.items()})
+    locate = next(item for item in provider.algorithms if item.name() == "locatemask").createInstance()
     locate.initAlgorithm()
     context, feedback = Context(), Feedback()
     results = locate.processAlgorithm({"MASK": mask, "OUTPUT_FOLDER": found, "REPORT": True}, context, feedback)
     locate.postProcessAlgorithm(context, feedback)
     application.processEvents()
     plugin.unload()
-    answer = {"algorithms": told, "results": results, "layers": context.layers, "pages": browser.pages, "told": heard}
+    answer = {
+        "algorithms": reported,
+        "results": results,
+        "layers": context.layers,
+        "pages": browser.pages,
+        "told": heard,
+    }
     print(json.dumps({**answer, "qt": sip.SIP_VERSION_STR, "said": feedback.said}))
 
 

@@ -18,8 +18,12 @@ PROMISED = Path(__file__).parents[1] / "data" / "public.json"
 
 def parameters(function):
     """Names of its parameters; those without a default end in an exclamation mark."""
-    own = [one for one in inspect.signature(function).parameters.values() if one.name not in {"self", "cls"}]
-    return [one.name + "!" * (one.default is one.empty and one.kind < one.VAR_POSITIONAL) for one in own]
+    own = [
+        parameter
+        for parameter in inspect.signature(function).parameters.values()
+        if parameter.name not in {"self", "cls"}
+    ]
+    return [item.name + "!" * (item.default is item.empty and item.kind < item.VAR_POSITIONAL) for item in own]
 
 
 def offered_by(value):
@@ -30,8 +34,8 @@ def offered_by(value):
         return []
     own = {name: each for name, each in inspect.getmembers(value) if not name.startswith("_")}
     routines = {name: parameters(each) for name, each in own.items() if inspect.isroutine(each)}
-    methods = [f"{name}({one})" for name, taken in routines.items() for one in ("", *taken)]
-    fields = [one.name for one in dataclasses.fields(value)] if dataclasses.is_dataclass(value) else []
+    methods = [f"{name}({first})" for name, taken in routines.items() for first in ("", *taken)]
+    fields = [field.name for field in dataclasses.fields(value)] if dataclasses.is_dataclass(value) else []
     others = [name for name, each in own.items() if not inspect.isroutine(each) and name not in fields]
     return sorted({*fields, *others, *methods})
 

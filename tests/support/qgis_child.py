@@ -188,12 +188,12 @@ def main():
             os._exit(0)  # QGIS 3.22 may crash as it takes itself apart
         warnings.clear()
         try:
-            told = {"answers": [globals()[name](**arguments) for name, arguments in wanted], "warnings": warnings}
+            reported = {"answers": [globals()[name](**arguments) for name, arguments in wanted], "warnings": warnings}
         except Exception:
-            told = {"error": traceback.format_exc()}
+            reported = {"error": traceback.format_exc()}
         QgsProject.instance().clear()
         sys.stderr.flush()
-        pipe.send_bytes(json.dumps(told).encode())
+        pipe.send_bytes(json.dumps(reported).encode())
 
 
 main()

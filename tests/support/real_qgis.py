@@ -58,10 +58,10 @@ class Qgis:
     def _start(self, errors: Path) -> Connection:
         """Start the process that answers; it ends with our end of the pipe."""
         ours, theirs = Pipe()
-        with theirs, errors.open("wb") as told:
+        with theirs, errors.open("wb") as reported:
             command = [self.python, str(CHILD), str(theirs.fileno())]
             settings = {"env": self.environ, "cwd": self.folder, "pass_fds": [theirs.fileno()]}
-            self._child = subprocess.Popen(command, stdout=subprocess.DEVNULL, stderr=told, **settings)
+            self._child = subprocess.Popen(command, stdout=subprocess.DEVNULL, stderr=reported, **settings)
         assert ours.poll(PATIENCE_S), "QGIS does not start"
         try:
             ours.recv_bytes()

@@ -10,7 +10,7 @@ import cv2
 
 from roadgeo.evaluation.demo import PHOTO, demo_masks
 
-MASKS = [one.path for one in demo_masks() if one.path.stem in ("drone", "elsewhere", "map_sheet")]
+MASKS = [demo_mask.path for demo_mask in demo_masks() if demo_mask.path.stem in ("drone", "elsewhere", "map_sheet")]
 #: The number of processors, for as many threads does the network take, and then a command.
 CODE = """
 import os, sys
@@ -33,16 +33,16 @@ def answers(porto: Path, out: Path, masks: list[Path], *more: str, threads: int 
         timeout=600,
     )
     assert done.returncode == 0, done.stderr
-    told = [json.loads(line) for line in done.stdout.splitlines()]
-    assert len(told) == len(masks)
-    for one in told:
-        del one["seconds"], one["command"]
-    return {one["query"]: one for one in told}
+    output = [json.loads(line) for line in done.stdout.splitlines()]
+    assert len(output) == len(masks)
+    for entry in output:
+        del entry["seconds"], entry["command"]
+    return {item["query"]: item for item in output}
 
 
 def test_order_processes_and_threads_change_nothing(porto: Path, tmp_path: Path) -> None:
     once = answers(porto, tmp_path / "a", MASKS)
-    assert {one["status"] for one in once.values()} == {"located", "not_located"}
+    assert {item["status"] for item in once.values()} == {"located", "not_located"}
     assert answers(porto, tmp_path / "b", MASKS[::-1], "--jobs", "3", threads=4) == once
 
 

@@ -32,7 +32,7 @@ def rows(data_dir: Path) -> list[dict[str, str]]:
 def maps(data_dir: Path, rows: list[dict[str, str]], tmp_path_factory: pytest.TempPathFactory) -> dict[str, Reference]:
     folder = tmp_path_factory.mktemp("maps")
     files = dict.fromkeys(row["roads"] for row in rows)
-    return {one: build_reference(data_dir / one, path=folder / f"{Path(one).stem}.gpkg") for one in files}
+    return {file: build_reference(data_dir / file, path=folder / f"{Path(file).stem}.gpkg") for file in files}
 
 
 def told(row: dict[str, str], what: str) -> LocateOptions:

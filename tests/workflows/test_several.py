@@ -36,7 +36,7 @@ def searched(query, town):
     """
 
     def found(
-        name: str, *places: tuple[float, float], tried: int = 100, likelihood: float | None = None, **told
+        name: str, *places: tuple[float, float], tried: int = 100, likelihood: float | None = None, **reported
     ) -> Found:
         index = replace(town, meta={**town.meta, "name": name, "attribution": "© all"})
         nobody = np.full(len(query.scene.intersections), -1)
@@ -49,8 +49,8 @@ def searched(query, town):
         ]  # fmt: skip
         if fits:
             fits[0] = replace(fits[0], log10_likelihood=fits[0].log10_odds if likelihood is None else likelihood)
-        told = {"stopped": "exhausted", "match_s": 1.0, "refine_s": 0.5, **told}
-        return Found(index, tuple(fits), n_tried=tried, n_searched=len(index), **told)
+        reported = {"stopped": "exhausted", "match_s": 1.0, "refine_s": 0.5, **reported}
+        return Found(index, tuple(fits), n_tried=tried, n_searched=len(index), **reported)
 
     return found
 
@@ -102,8 +102,8 @@ def test_places_of_different_scales_are_compared_by_what_they_explain_of_the_sam
     """Laid five times as large, a mask has five times as much road that may agree by chance."""
     here, large = searched("a", (20.0, 0.0), likelihood=100.0), searched("b", (-8.0, 30_000.0), likelihood=180.0)
     here, large = (
-        replace(one, fits=tuple(replace(fit, statement_px=px) for fit in one.fits))
-        for one, px in ((here, 600.0), (large, 120.0))
+        replace(item, fits=tuple(replace(fit, statement_px=px) for fit in item.fits))
+        for item, px in ((here, 600.0), (large, 120.0))
     )
     best = judge(query, large, here)
     assert (best.status, best.reference, best.log10_odds) == ("located", "a", 20.0)
@@ -189,7 +189,7 @@ NEAR, CAMERA = (-71.06, 42.36, 500.0), CameraOptions()
 
 
 @pytest.mark.parametrize(
-    ("near", "camera", "told"),
+    ("near", "camera", "reported"),
     [
         (None, {}, "; more roads in view or another map may help"),
         (NEAR, {}, "; searched within 500 m of -71.06,42.36: more roads in view or a wider search may help"),
@@ -201,29 +201,29 @@ NEAR, CAMERA = (-71.06, 42.36, 500.0), CameraOptions()
     ],
 )
 @pytest.mark.parametrize("stopped", ["exhausted", "time"])
-def test_a_refusal_names_the_limits_that_were_given(query, searched, near, camera, told, stopped):
+def test_a_refusal_names_the_limits_that_were_given(query, searched, near, camera, reported, stopped):
     match = replace(LocateOptions().match, camera=replace(CAMERA, **camera))
     reason = judge(query, searched("a", stopped=stopped), near=near, match=match).reason
     if stopped == "time":
         assert reason.startswith("stopped at the time limit of 60 s")
-        assert (told.partition(": ")[0] if near or camera else "none fits") in reason
+        assert (reported.partition(": ")[0] if near or camera else "none fits") in reason
     else:
-        assert told in reason
+        assert reported in reason
         assert reason.endswith(" may help")
 
 
 def test_a_refusal_shows_the_best_place_that_there_was(query, searched):
     best = judge(query, searched("a", (1.5, 300.0), (0.5, 5000.0)))
     assert (best.status, best.center) == ("not_located", None)
-    assert [one.log10_odds for one in best.alternatives] == [1.5, 0.5]
+    assert [alternative.log10_odds for alternative in best.alternatives] == [1.5, 0.5]
 
 
 @pytest.mark.parametrize(
-    ("odds", "told"), [(-3.0, "no likelier than"), (0.7, "only 5.0 times"), (3.2, "only 2,000 times")]
+    ("odds", "reported"), [(-3.0, "no likelier than"), (0.7, "only 5.0 times"), (3.2, "only 2,000 times")]
 )
-def test_how_much_likelier_a_place_is_is_said_without_logarithms(query, searched, odds, told):
+def test_how_much_likelier_a_place_is_is_said_without_logarithms(query, searched, odds, reported):
     reason = judge(query, searched("a", (odds, 0.0))).reason
-    assert told in reason
+    assert reported in reason
     assert "3,000 times are asked for" in reason
 
 

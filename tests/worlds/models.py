@@ -43,7 +43,9 @@ def brightness_model(
     stored = []
     for head in heads:  # all but the last see dark roads
         sign = np.float32(1 if head == heads[-1] else -1)
-        stored += [numpy_helper.from_array(sign * one, f"{name}_{head}") for name, one in (("w", weight), ("b", bias))]
+        stored += [
+            numpy_helper.from_array(sign * item, f"{name}_{head}") for name, item in (("w", weight), ("b", bias))
+        ]
     image = helper.make_tensor_value_info("image", TensorProto.FLOAT, [1, 3, size, size])
     graph = helper.make_graph(nodes, "brightness", [image], outputs, stored)
     return save(graph, path, props, raw_props)

@@ -6,16 +6,16 @@ from worlds.fenway import elements
 
 
 def _node(n, where=0.0, **more):
-    told = "".join(f' {key}="{value}"' for key, value in more.items())
-    return f'<node id="{n["id"]}" lat="{n["lat"] + where}" lon="{n["lon"] + where}"{told}/>'
+    reported = "".join(f' {key}="{value}"' for key, value in more.items())
+    return f'<node id="{n["id"]}" lat="{n["lat"] + where}" lon="{n["lon"] + where}"{reported}/>'
 
 
 def _way(way, nodes=None, **more):
-    told = "".join(f' {key}="{value}"' for key, value in more.items())
+    reported = "".join(f' {key}="{value}"' for key, value in more.items())
     place = {} if nodes is None else {k: f' lat="{nodes[k]["lat"]}" lon="{nodes[k]["lon"]}"' for k in way["nodes"]}
     refs = "".join(f'<nd ref="{k}"{place.get(k, "")}/>' for k in way["nodes"])
     tags = "".join(f'<tag k="{k}" v="{v}"/>' for k, v in way["tags"].items() if k in ("highway", "tunnel"))
-    return f'<way id="{way["id"]}"{told}>{refs}{tags}</way>'
+    return f'<way id="{way["id"]}"{reported}>{refs}{tags}</way>'
 
 
 def _xml(*rows):

@@ -32,29 +32,29 @@ _FLAGS = [{"values": ["is_tunnel"], "between": None}]
 
 #: Columns of each schema: of the streets, and of what else lies there.
 SCHEMAS = {
-    "osm": ({"highway": KINDS, "tunnel": ["yes" if one else None for one in TUNNEL]}, {"highway": [None] * 3}),
+    "osm": ({"highway": KINDS, "tunnel": ["yes" if first else None for first in TUNNEL]}, {"highway": [None] * 3}),
     "gdal": (
         {
             "highway": KINDS,
             "railway": [None] * 17,
             "waterway": [None] * 17,
-            "other_tags": ['"lanes"=>"2","tunnel"=>"yes"' if one else '"lanes"=>"2"' for one in TUNNEL],
+            "other_tags": ['"lanes"=>"2","tunnel"=>"yes"' if first else '"lanes"=>"2"' for first in TUNNEL],
         },
         {"highway": [None] * 3, "railway": ["rail", None, None], "waterway": [None, "stream", None]},
     ),
     "geofabrik": (
-        {"osm_id": ["7"] * 17, "fclass": KINDS, "tunnel": ["T" if one else "F" for one in TUNNEL]},
+        {"osm_id": ["7"] * 17, "fclass": KINDS, "tunnel": ["T" if first else "F" for first in TUNNEL]},
         {"fclass": ["rail", "stream", "canal"]},
     ),
     "bbbike": (
-        {"osm_id": [7] * 17, "type": KINDS, "tunnel": [int(one) for one in TUNNEL]},
+        {"osm_id": [7] * 17, "type": KINDS, "tunnel": [int(first) for first in TUNNEL]},
         {"type": ["rail", "river", "stream"]},
     ),
     "overture": (
         {
             "class": KINDS,
             "subtype": ["road"] * 17,
-            "road_flags": [json.dumps(_FLAGS) if one else None for one in TUNNEL],
+            "road_flags": [json.dumps(_FLAGS) if first else None for first in TUNNEL],
             "names": [json.dumps({"primary": f"Rua {n}"}) for n in range(17)],
         },
         {"class": ["river", "unknown", None], "subtype": ["water", "rail", "water"]},
@@ -64,7 +64,7 @@ SCHEMAS = {
         {
             "road_function": _mapped(_OS, "Restricted Local Access Road"),
             "road_classification": _mapped({"primary": "A Road", "secondary": "B Road"}, "Unclassified"),
-            "road_structure": ["Road In Tunnel" if one else None for one in TUNNEL],
+            "road_structure": ["Road In Tunnel" if first else None for first in TUNNEL],
         },
         None,
     ),
@@ -72,7 +72,7 @@ SCHEMAS = {
         {
             "nature": _mapped(_IGN, "Route à 1 chaussée"),
             "importance": _mapped(_IGN_RANK, "5"),
-            "position_par_rapport_au_sol": ["-1" if one else "0" for one in TUNNEL],
+            "position_par_rapport_au_sol": ["-1" if first else "0" for first in TUNNEL],
         },
         {"nature": ["Bac ou liaison maritime", "Voie ferrée principale", "Mur"]},
     ),
@@ -80,7 +80,7 @@ SCHEMAS = {
         {
             "typeVeg": _mapped(_NVDB, "Enkel bilveg"),
             "vegkategori": _mapped({"primary": "R", "secondary": "F", "footway": "K"}, "K"),
-            "medium": ["U" if one else "T" for one in TUNNEL],
+            "medium": ["U" if first else "T" for first in TUNNEL],
         },
         {"typeVeg": ["Bilferje", "Passasjerferje", "Bilferje"]},
     ),
