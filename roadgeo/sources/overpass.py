@@ -226,7 +226,7 @@ def _asking(url: str, options: FetchOptions, say: Say, question: str) -> Iterato
                 f"{host} cannot be reached or broke off; is there a network connection? Without one give --roads FILE: "
                 "extracts are at download.geofabrik.de and extract.bbbike.org"
             ) from error
-        except (ValueError, LookupError, TypeError, AttributeError) as error:
+        except (ValueError, LookupError, TypeError, AttributeError, RecursionError) as error:
             shutil.rmtree(folder, ignore_errors=True)
             raise RoadSourceError(f"{host} gave an answer that cannot be read: {str(error)[:80]}") from error
         finally:
@@ -251,7 +251,7 @@ def _are_whole(folder: Path) -> bool:
     """Whether no answer in a folder was cut short while it was written."""
     try:
         return all(json.loads(file.read_bytes()) is not None for file in folder.glob("*.json"))
-    except (OSError, ValueError):
+    except (OSError, ValueError, RecursionError):
         return False
 
 

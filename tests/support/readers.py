@@ -223,7 +223,7 @@ def serve(path: Path) -> None:
     assert answer.startswith((b"HTTP/1.1 ", b"")), answer[:80]
 
 
-_OPTIONS = FetchOptions("http://127.0.0.1:9/api", "http://127.0.0.1:9", cache=False, retries=0)
+_OPTIONS = FetchOptions("http://127.0.0.1:9/api", "http://127.0.0.1:9", cache=False)
 
 
 def read_overpass(path: Path) -> None:
