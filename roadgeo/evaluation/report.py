@@ -164,7 +164,7 @@ def _lost(scores: Sequence[Score]) -> str:
     """Name the masks that were not located rightly, wrong ones first, and why not."""
     lost = [entry for outcome in _OUTCOMES[1:] for entry in scores if _outcome(entry) == outcome]
     if not lost:
-        return "<p>None.</p>"
+        return "<p>All are right.</p>"
     rows = []
     for entry in lost[:_MOST_LOST]:
         numbers = ["-" if math.isnan(value) else f"{value:.1f}" for value in (entry.center_m, entry.log10_odds)]
