@@ -328,7 +328,7 @@ _SHARED = {
     "resampling": row("--resampling", ("nearest", "bilinear", "cubic", "lanczos"), RESULTS,
         "How values between pixels are found; nearest for classes.", default="cubic", show_default=True, rare=True),
     "compression": row("--compression", ("deflate", "zstd", "jpeg", "webp"), RESULTS,
-        "Of what is drawn. jpeg and webp make photographs of 8 bits five times smaller, with some loss.",
+        "Of what is drawn. jpeg and webp, for photographs only, make them five times smaller, with some loss.",
         default="deflate", show_default=True, rare=True),
     "segment": row("--segment", ("auto", "always", "never"), IMAGE, _SEGMENT, default="auto", rare=True),
     "segmenters": row("--segmenter segmenters", "NAME|MODEL.onnx", IMAGE,

@@ -4,8 +4,8 @@ from __future__ import annotations
 
 import json
 from contextlib import ExitStack
-from functools import lru_cache
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 
@@ -14,7 +14,7 @@ from roadgeo._arrays import AnyArray
 from roadgeo.geometry.mask import RoadMask
 from roadgeo.geometry.warping import warp
 from roadgeo.outputs.names import bare_name
-from roadgeo.outputs.orthophoto import warp_image
+from roadgeo.outputs.orthophoto import COMPRESSION, warp_image
 from roadgeo.outputs.subject import Subject
 from roadgeo.storage.qml import draw_palette
 
@@ -91,24 +91,15 @@ def _write_mask(path: Path, subject: Subject) -> None:
         plain.update_tags(**_tags(subject))
         # Reduced in memory: left to the COG driver, they are written, compressed and read again on the way.
         plain.build_overviews(_reductions(max(grid.width, grid.height)), Resampling.nearest)
-        rasterio.shutil.copy(plain, optimized.name, driver="COG", compress=_compression(), level=1, blocksize=_BLOCK)
+        rasterio.shutil.copy(plain, optimized.name, driver="COG", blocksize=_BLOCK, **_compression(subject))
         path.write_bytes(optimized.read())  # written by Python: a full disk raises an OSError
 
 
-@lru_cache(maxsize=1)
-def _compression() -> str:
-    """Return how masks are compressed: ZSTD takes half the time of DEFLATE, and QGIS reads it; some GDALs lack it."""
-    import rasterio
-    from rasterio.errors import RasterioError
-
-    try:
-        with rasterio.MemoryFile(ext="tif") as file, file.open(
-            driver="GTiff", width=1, height=1, count=1, dtype="uint8", compress="ZSTD", crs="EPSG:4326",
-            transform=rasterio.Affine(2.0, 0.0, 0.0, 0.0, -2.0, 0.0),
-        ):  # fmt: skip
-            return "ZSTD"
-    except RasterioError:
-        return "DEFLATE"
+def _compression(subject: Subject) -> dict[str, Any]:
+    """Return how a mask is compressed: as asked for, or by DEFLATE where that would lose something."""
+    name = subject.image.compression
+    asked = COMPRESSION[name if name in ("deflate", "zstd") else "deflate"]
+    return {key: value for key, value in asked.items() if key != "predictor"}
 
 
 def _reductions(side: int) -> list[int]:

@@ -31,6 +31,7 @@ from roadgeo.storage.orientation import UPRIGHT, read_orientation
 from roadgeo.storage.rasters import open_raster, raster_size, read_palette, writing_raster
 
 __all__ = [
+    "COMPRESSION",
     "CompressionName",
     "ImageOptions",
     "Target",
@@ -56,7 +57,7 @@ _TILED_BYTES = 1 << 28  # larger pictures that can only be read from the top dow
 _MAX_SOURCE = 8192  # sides of a block's source beyond which it is read coarser
 _OVERVIEW_SIDE = 512  # the smallest overview has no longer side
 #: How results are compressed. Deflate is read everywhere; above level 1 it saves 2 % of a photograph in twice the time.
-_COMPRESSION: dict[str, dict[str, Any]] = {
+COMPRESSION: dict[str, dict[str, Any]] = {
     "deflate": {"compress": "DEFLATE", "predictor": "YES", "level": 1},
     "zstd": {"compress": "ZSTD", "predictor": "YES", "level": 1},
     "jpeg": {"compress": "JPEG", "quality": 90},
@@ -388,7 +389,7 @@ def _optimize(drawn: Path, target: str | os.PathLike[str], options: ImageOptions
             num_threads="ALL_CPUS",
             bigtiff="IF_SAFER",
             overview_resampling="nearest" if nearest else "average",
-            **_COMPRESSION[options.compression],
+            **COMPRESSION[options.compression],
         )
 
 

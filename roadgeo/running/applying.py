@@ -13,7 +13,10 @@ import numpy as np
 
 from roadgeo._arrays import FloatArray
 from roadgeo.errors import CrsError, MaskError, NotLocatedError, OutputError
+from roadgeo.geometry.frame import Frame
+from roadgeo.geometry.homography import Homography
 from roadgeo.geometry.mask import RoadMask
+from roadgeo.geometry.pinhole import polygon_area
 from roadgeo.geometry.transformation import LONLAT, exactness
 from roadgeo.location import SCHEMA, Camera, Location, Place
 from roadgeo.outputs.orthophoto import ImageOptions
@@ -27,6 +30,9 @@ from roadgeo.storage.rasters import raster_size
 __all__ = ["apply_location", "read_location"]
 
 _MAX_BYTES = 64 << 20
+
+#: How far the corners by the homography may lie from the footprint, in lengths of its side; and pixel sizes, metres.
+_TOLERANCE, _GSD_M = 1e-5, (1e-4, 1e4)
 
 
 def read_location(path: str | os.PathLike[str]) -> Location:
@@ -68,8 +74,8 @@ def _from_document(document: dict[str, Any]) -> Location:
         raise ValueError(f"a frame of {width} x {height} pixels")
     camera = document.get("camera")
     homography = _array(document["homography"], (3, 3))
-    if abs(np.linalg.det(homography)) < 1e-300:
-        raise ValueError("a homography that cannot be inverted")
+    footprint = _array(document["footprint"], (4, 2))
+    _require_one_place(homography, footprint, (width, height))
     crs, place = _crs(str(document["crs"])), _place(document)
     sigma, covariance = document.get("corner_sigma_m"), document.get("corner_covariance_m2")
     return Location(
@@ -81,7 +87,7 @@ def _from_document(document: dict[str, Any]) -> Location:
         crs,
         (width, height),
         homography,
-        _array(document["footprint"], (4, 2)),
+        footprint,
         _array(document["footprint_lonlat"], (4, 2)),
         place,
         gsd_m=float(document["gsd_m"]),
@@ -94,6 +100,18 @@ def _from_document(document: dict[str, Any]) -> Location:
         camera=None if camera is None else _camera(camera),
         mirrored=bool(document.get("mirrored")),
     )
+
+
+def _require_one_place(homography: FloatArray, footprint: FloatArray, size: tuple[int, int]) -> None:
+    """Raise where a homography does not take the frame to its footprint, or pixels have no size of this Earth."""
+    with np.errstate(all="ignore"):
+        corners = Homography(homography)(Frame(*size).corners)
+        side = float(np.sqrt(polygon_area(footprint)))
+        apart = float(np.abs(corners - footprint).max())
+    if not apart <= _TOLERANCE * side:
+        raise ValueError("the homography does not lead to the footprint")
+    if not _GSD_M[0] <= side / np.sqrt(size[0] * size[1]) <= _GSD_M[1]:
+        raise ValueError(f"a frame of {side:g} m")
 
 
 def _crs(told: str) -> str:

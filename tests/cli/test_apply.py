@@ -13,6 +13,7 @@ from roadgeo.errors import MaskError
 from roadgeo.evaluation.demo import PHOTO, demo_masks
 from roadgeo.running.applying import read_location
 
+CORNERS = np.array([[0.0, 0.0], [1280.0, 0.0], [1280.0, 960.0], [0.0, 960.0]])
 DRONE = next(mask.path for mask in demo_masks() if mask.path.stem == "drone")
 
 
@@ -79,7 +80,14 @@ def test_what_is_no_location_is_refused_in_a_line(
 ) -> None:
     monkeypatch.chdir(tmp_path)
     document = json.loads((located / "drone_location.json").read_text())
-    changes = ({"homography": [[1, 2], [3, 4]]}, {"size": [10**9, 5]}, {"camera": {"x": 1}})
+    changes = (
+        {"homography": [[1, 2], [3, 4]]},
+        {"size": [10**9, 5]},
+        {"camera": {"x": 1}},
+        *({"homography": np.diag([scale, scale, 1.0]).tolist()} for scale in (1e-12, 1.0, 1e300)),
+        {"homography": (1e-12 * np.eye(3)).tolist(), "footprint": [[0, 0], [1e-9, 0], [1e-9, 1e-9], [0, 1e-9]]},
+        {"homography": np.diag([1e-9, 1e-9, 1.0]).tolist(), "footprint": (1e-9 * CORNERS).tolist()},
+    )
     for wrong in ("{", "[]", '{"schema": "other/1"}', *(json.dumps({**document, **change}) for change in changes)):
         Path("a.json").write_text(wrong)
         assert main(["apply", "a.json", str(PHOTO)]) == 1
