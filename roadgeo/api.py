@@ -87,7 +87,7 @@ class Answer(Location):
         from roadgeo.outputs.location_files import OutputOptions, write_location
         from roadgeo.outputs.paths import output_paths
         from roadgeo.running.pictures import as_file
-        from roadgeo.storage.atomic import writing
+        from roadgeo.storage.files import writing
 
         with writing(out_dir):
             Path(out_dir).mkdir(parents=True, exist_ok=True)

@@ -19,7 +19,7 @@ from maps import APART_DEG, transformation
 from pyproj import CRS
 
 from roadgeo.geometry.projection import LocalPlane, to_lonlat
-from roadgeo.storage.atomic import publish, staging
+from roadgeo.storage.files import publish, staging
 
 
 def copy(lines: np.ndarray, crs: str, k: int) -> np.ndarray:

@@ -94,7 +94,7 @@ def evaluate_command(
     from roadgeo.cli.compilation import compile_once
     from roadgeo.evaluation.trials import ReferenceLocator
     from roadgeo.reference.library import resolve_whole
-    from roadgeo.storage.atomic import writing
+    from roadgeo.storage.files import writing
 
     _refuse_idle("--map" if as_map else "" if queries is None else "--queries")
     path = resolve_whole(reference)

@@ -17,7 +17,7 @@ def make_folder(folder: str | os.PathLike[str]) -> None:
         They cannot.
     """
     from roadgeo.errors import OutputError
-    from roadgeo.storage.atomic import writing
+    from roadgeo.storage.files import writing
 
     with writing(folder):
         Path(folder).mkdir(parents=True, exist_ok=True)

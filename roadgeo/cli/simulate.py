@@ -40,8 +40,7 @@ def simulate_command(reference: str, out_dir: Path, roads: Path | None, quiet: b
     from roadgeo.evaluation.trials import read_landscape
     from roadgeo.evaluation.truth import write_truth
     from roadgeo.reference.library import resolve_whole
-    from roadgeo.storage.atomic import writing
-    from roadgeo.storage.files import write_bytes
+    from roadgeo.storage.files import write_bytes, writing
 
     sets = query_sets(options)
     landscape = read_landscape(resolve_whole(reference), roads)

@@ -25,7 +25,7 @@ from roadgeo.running.options import ReadOptions
 from roadgeo.running.photographs import load_model
 from roadgeo.running.tasks import SUFFIXES, find_masks, in_natural_order
 from roadgeo.sources.masks import read_mask
-from roadgeo.storage.atomic import writing
+from roadgeo.storage.files import writing
 
 __all__ = ["VIDEOS", "FrameOptions", "read_frames", "read_stills"]
 

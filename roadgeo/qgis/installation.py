@@ -21,8 +21,7 @@ import roadgeo
 from roadgeo.errors import OutputError
 from roadgeo.outputs.registry import ALSO
 from roadgeo.qgis.plugin.runner import REMEMBERED
-from roadgeo.storage.atomic import writing
-from roadgeo.storage.files import write_bytes
+from roadgeo.storage.files import write_bytes, writing
 
 __all__ = ["NAME", "find_profiles", "install_plugin", "write_package"]
 

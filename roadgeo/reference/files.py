@@ -37,7 +37,7 @@ from roadgeo.reference.network_file import (
 )
 from roadgeo.roads.intersections import Intersections
 from roadgeo.roads.network import RoadNetwork
-from roadgeo.storage.atomic import publish, staging, sync_file
+from roadgeo.storage.files import publish, staging, sync_file
 from roadgeo.storage.geopackage import open_read_only, require_tables
 
 __all__ = [

@@ -26,6 +26,7 @@ every later roadgeo, and holds the roads, the intersections and the options that
 
 from __future__ import annotations
 
+import errno
 import json
 import math
 import mmap
@@ -41,9 +42,9 @@ import numpy as np
 
 from roadgeo import __version__
 from roadgeo._arrays import AnyArray
-from roadgeo.errors import IndexFormatError
+from roadgeo.errors import IndexFormatError, RoadgeoError
 from roadgeo.reference.plain_values import MAX_PICKLE, dump_plain, load_plain, require_plain
-from roadgeo.storage.atomic import publish, staging
+from roadgeo.storage.files import publish, staging
 
 __all__ = [
     "FORMAT_VERSION",
@@ -282,6 +283,8 @@ def _map(path: str | os.PathLike[str]) -> mmap.mmap:
                 _refuse(path, f"it is not an index, or truncated: shorter than {_PREAMBLE.size} bytes")
             return mmap.mmap(file.fileno(), 0, access=mmap.ACCESS_READ)
     except OSError as error:
+        if error.errno == errno.ENOMEM:  # the file is as good as it was
+            raise RoadgeoError(f"{os.fspath(path)}: too little memory to open it; end other programs") from error
         _refuse(path, (error.strerror or str(error)).lower(), error)
 
 

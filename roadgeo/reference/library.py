@@ -15,7 +15,7 @@ from roadgeo.reference.files import ReferencePaths, reference_paths
 from roadgeo.reference.network_file import not_a_reference
 from roadgeo.reference.remote import fetch_manifest, is_remote
 from roadgeo.reference.shards import ENDING, manifest_path
-from roadgeo.storage.atomic import writing
+from roadgeo.storage.files import writing
 
 __all__ = [
     "library_dir",

@@ -18,8 +18,7 @@ from pathlib import Path
 from typing import Any
 
 from roadgeo.errors import IndexFormatError, how_to_install
-from roadgeo.storage.atomic import publish, staging, writing
-from roadgeo.storage.files import write_text
+from roadgeo.storage.files import publish, staging, write_text, writing
 from roadgeo.storage.folders import cache_dir
 
 __all__ = ["fetch_manifest", "fetch_shard", "is_remote"]

@@ -37,7 +37,7 @@ from roadgeo.reference.files import check_reference, identities, reference_diges
 from roadgeo.reference.network_file import stored_digest
 from roadgeo.reference.remote import fetch_shard
 from roadgeo.reference.spool import Bounds
-from roadgeo.storage.atomic import publish, staging
+from roadgeo.storage.files import publish, staging
 
 __all__ = [
     "ENDING",

@@ -43,9 +43,8 @@ from roadgeo.sources.lines import RoadLines
 from roadgeo.sources.overpass import box_area
 from roadgeo.sources.roads import Box, as_text, choose_lines, join_roads, with_crs
 from roadgeo.sources.streams import list_sources, stream_lines, tell_source
-from roadgeo.storage.atomic import writing
 from roadgeo.storage.crs import known_crs
-from roadgeo.storage.files import write_bytes
+from roadgeo.storage.files import write_bytes, writing
 
 if TYPE_CHECKING:
     from roadgeo.running.cluster import Cluster

@@ -1,70 +1,204 @@
-"""Writing files so that a reader sees the old one or the whole new one, never a part."""
+"""Files that appear whole or not at all: written in a staging folder beside the target, synced, then renamed over it.
+
+Readers that hold the previous file open keep reading it; a writer killed at any moment leaves the previous file as it
+was, and at worst a staging folder that the next writer in the same place removes. The folder has a random name, is made
+anew and is the user's alone, and a link at the target is replaced: nobody leads a writer elsewhere.
+"""
 
 from __future__ import annotations
 
 import contextlib
+import errno
 import os
 import re
-import time
+import shutil
 from collections.abc import Iterator
-from contextlib import contextmanager
 from functools import lru_cache
 from pathlib import Path
+from typing import BinaryIO
 
 from roadgeo.errors import OutputError
-from roadgeo.storage.atomic import sync_file, writing
 
-__all__ = ["replacing", "write_bytes", "write_text"]
+try:
+    import fcntl
+except ImportError:  # Windows: there an open file cannot be deleted, which serves as the lock
+    fcntl = None  # type: ignore[assignment]
 
-#: Names of unfinished files, of whatever process, on whatever machine that shares the disk.
-_LEFTOVER = re.compile(r"\..+\.\d+\.part(\.\w+)?")
-_LEFT_S = 3600.0
+__all__ = ["publish", "replacing", "staging", "sync_file", "write_bytes", "write_text", "writing"]
+
+_PREFIX, _SUFFIX, _LOCK = ".roadgeo-", ".tmp", "lock"
+_STAGED = r"\.roadgeo-[0-9a-f]{12}\.tmp[/\\\\]"
+
+_REMEDIES = {
+    errno.ENOSPC: "free some space or choose another disk",
+    errno.EDQUOT: "free some space or choose another disk",
+    errno.EFBIG: "raise the file size limit or choose another disk",
+    errno.EACCES: "choose a folder you may write to",
+    errno.EPERM: "choose a folder you may write to",
+    errno.EROFS: "choose a folder you may write to",
+    errno.ENOENT: "create the folder first",
+    errno.ENOTDIR: "choose a folder, not a file",
+    errno.EISDIR: "choose a file name, not a folder",
+}
 
 
-@contextmanager
-def replacing(path: str | os.PathLike[str], sync: bool = True) -> Iterator[Path]:
-    """Yield a temporary name beside `path`; on success the file there takes the name `path`, else it is deleted.
+@contextlib.contextmanager
+def writing(target: str | os.PathLike[str]) -> Iterator[None]:
+    """Turn an `OSError` of the block into an `OutputError` that names `target`, the cause and the remedy."""
+    try:
+        yield
+    except OSError as error:
+        remedy = _REMEDIES.get(error.errno or 0, "check the disk and the permissions")
+        cause = error.strerror or str(error)
+        raise OutputError(f"cannot write {os.fspath(target)}: {cause.lower()}; {remedy}") from error
 
-    The temporary name keeps the suffix, so that drivers that go by it work. With `sync` the content is on the disk
-    first: after a power cut the name stands for the old content or the new, not for an empty file.
+
+@contextlib.contextmanager
+def staging(target: str | os.PathLike[str]) -> Iterator[Path]:
+    """Give a folder on the target's disk for unfinished files; it is gone at the end, whatever happens.
+
+    Leftovers of writers that died are removed on the way.
+
+    Parameters
+    ----------
+    target : path
+        The file to be written. Its folder must exist.
 
     Raises
     ------
     OutputError
-        The folder is missing or not writable, or the disk is full.
+        When the disk is full, the folder is missing or not writable.
+    """
+    with writing(target):
+        _remove_leftovers(Path(target).parent)
+        with _locked_folder(Path(target).parent) as folder:
+            yield folder
+
+
+@contextlib.contextmanager
+def replacing(path: str | os.PathLike[str], sync: bool = True) -> Iterator[Path]:
+    """Yield a file of the same name in a staging folder; on success it takes the place of `path`.
+
+    With `sync` the content is on the disk first: after a power cut the name stands for the old content or the new, not
+    for an empty file. Leftovers are removed once for each folder, for many files may be written to it.
+
+    Raises
+    ------
+    OutputError
+        As of `staging`.
     """
     target = Path(path)
-    _remove_leftovers(target.parent)
-    temporary = target.with_name(f".{target.stem}.{os.getpid()}.part{target.suffix}")
     try:
         with writing(target):
-            try:
-                yield temporary
+            _remove_leftovers_once(target.parent)
+            with _locked_folder(target.parent) as folder:
+                yield folder / target.name
                 if sync:
-                    sync_file(temporary)
-                temporary.replace(target)
-            finally:
-                temporary.unlink(missing_ok=True)
+                    sync_file(folder / target.name)
+                (folder / target.name).replace(target)
     except OutputError as error:
-        raise OutputError(str(error).replace(str(temporary), str(target))) from error
-
-
-@lru_cache(maxsize=64)
-def _remove_leftovers(folder: Path) -> None:
-    """Remove the unfinished files of writers that were killed an hour ago or earlier; once for each folder."""
-    oldest = time.time() - _LEFT_S
-    for path in folder.glob(".*.part*"):
-        with contextlib.suppress(OSError):
-            if _LEFTOVER.fullmatch(path.name) and path.stat().st_mtime < oldest:
-                path.unlink()
+        raise OutputError(re.sub(_STAGED, "", str(error))) from error
 
 
 def write_bytes(path: str | os.PathLike[str], content: bytes) -> None:
     """Write a whole file in one step (see `replacing`)."""
-    with replacing(path) as temporary:
-        temporary.write_bytes(content)
+    with replacing(path) as staged:
+        staged.write_bytes(content)
 
 
 def write_text(path: str | os.PathLike[str], content: str) -> None:
     """Write a whole UTF-8 text file with line feeds in one step (see `replacing`)."""
     write_bytes(path, content.encode())
+
+
+def publish(staged: Path, target: str | os.PathLike[str], *, replace: bool = True) -> None:
+    """Sync a finished file of a staging folder to disk and rename it over `target`.
+
+    Raises
+    ------
+    FileExistsError
+        There is a target and `replace` is False.
+    """
+    sync_file(staged)
+    if replace:
+        staged.replace(target)
+    else:
+        _rename_to_new(staged, Path(target))
+    _sync_folder(Path(target).parent)
+
+
+def _rename_to_new(staged: Path, target: Path) -> None:
+    """Rename a file to a name that must be free; a hard link tests that and takes it in one step."""
+    try:
+        os.link(staged, target)
+    except FileExistsError:
+        raise
+    except OSError:  # no hard links on this disk: look first, and hope that nobody comes between
+        if target.exists():
+            raise
+        staged.replace(target)
+
+
+def sync_file(path: Path) -> None:
+    """Wait until a file's content is on the disk."""
+    with path.open("rb+") as file:
+        os.fsync(file.fileno())
+
+
+def _sync_folder(folder: Path) -> None:
+    """Make a rename in `folder` survive a power cut, where the platform can."""
+    if os.name == "posix":
+        descriptor = os.open(folder, os.O_RDONLY)
+        try:
+            os.fsync(descriptor)
+        finally:
+            os.close(descriptor)
+
+
+@contextlib.contextmanager
+def _locked_folder(parent: Path) -> Iterator[Path]:
+    """Create a staging folder and lock it, so that other writers see that it is in use; remove it in the end."""
+    folder, lock = _make_folder(parent)
+    try:
+        yield folder
+    finally:
+        lock.close()
+        shutil.rmtree(folder, ignore_errors=True)
+
+
+def _make_folder(parent: Path) -> tuple[Path, BinaryIO]:
+    while True:
+        folder = parent / f"{_PREFIX}{os.urandom(6).hex()}{_SUFFIX}"
+        folder.mkdir(mode=0o700)
+        try:
+            lock = (folder / _LOCK).open("xb")
+        except FileNotFoundError:  # another writer took the empty folder for a leftover
+            continue
+        if fcntl is not None:
+            fcntl.flock(lock, fcntl.LOCK_EX)
+        if (folder / _LOCK).exists():
+            return folder, lock
+        lock.close()
+
+
+def _remove_leftovers(parent: Path) -> None:
+    """Remove staging folders of dead writers: their lock is free."""
+    for folder in parent.glob(f"{_PREFIX}*{_SUFFIX}"):
+        with contextlib.suppress(OSError):  # in use, or being removed by somebody else
+            if not (folder / _LOCK).exists():
+                folder.rmdir()  # only ever empty: the lock is the first file and the last
+                continue
+            if fcntl is None:
+                (folder / _LOCK).unlink()
+                shutil.rmtree(folder, ignore_errors=True)
+                continue
+            with open(folder / _LOCK, "rb+", opener=_follow_no_link) as lock:
+                fcntl.flock(lock, fcntl.LOCK_EX | fcntl.LOCK_NB)
+                shutil.rmtree(folder, ignore_errors=True)
+
+
+_remove_leftovers_once = lru_cache(maxsize=64)(_remove_leftovers)
+
+
+def _follow_no_link(path: str, flags: int) -> int:
+    return os.open(path, flags | getattr(os, "O_NOFOLLOW", 0))

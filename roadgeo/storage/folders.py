@@ -57,7 +57,8 @@ def private_temporary_dir() -> Path:
 def is_private(folder: Path) -> bool:
     """Whether a folder is this user's, and only they may write to it: its files may be executed.
 
-    Its parent may be a group's, but not everybody's, unless only owners may rename what lies there.
+    Its parent is theirs or the system's: its owner may put another folder in the place of this one. A group may write
+    there, but not everybody, unless only owners may rename what lies there.
     """
     if not hasattr(os, "getuid"):  # Windows: the folders of a user are their own
         return folder.is_dir()
@@ -66,7 +67,8 @@ def is_private(folder: Path) -> bool:
     except OSError:
         return False
     mine = stat.S_ISDIR(found.st_mode) and found.st_uid == os.getuid() and not found.st_mode & 0o022
-    return mine and (not around.st_mode & 0o002 or bool(around.st_mode & stat.S_ISVTX))
+    safe = around.st_uid in (0, os.getuid())
+    return mine and safe and (not around.st_mode & 0o002 or bool(around.st_mode & stat.S_ISVTX))
 
 
 def writable(folder: Path) -> bool:

@@ -1,5 +1,6 @@
 """The index file: round trip, and every way in which one can be damaged or hostile."""
 
+import errno
 import io
 import json
 import os
@@ -17,7 +18,7 @@ from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
 from hypothesis.extra import numpy as hnp
 
-from roadgeo.errors import IndexFormatError, OutputError
+from roadgeo.errors import IndexFormatError, OutputError, RoadgeoError
 from roadgeo.reference import index_file, plain_values
 from roadgeo.reference.index_file import FORMAT_VERSION, check_index, read_index, read_manifest, write_index
 
@@ -166,6 +167,18 @@ def test_missing_file_and_folder_are_refused(tmp_path: Path) -> None:
     with pytest.raises(IndexFormatError, match="not a file"):
         read_manifest(tmp_path)
     assert "no such file" in check_index(tmp_path / "none.index")[0]
+
+
+def test_too_little_memory_is_no_fault_of_the_file(path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """It said: build it again."""
+
+    def refuse(*_: object, **__: object) -> None:
+        raise OSError(errno.ENOMEM, os.strerror(errno.ENOMEM))
+
+    monkeypatch.setattr(index_file.mmap, "mmap", refuse)
+    with pytest.raises(RoadgeoError, match="too little memory to open it; end other programs") as raised:
+        read_index(path)
+    assert not isinstance(raised.value, IndexFormatError)
 
 
 def test_other_versions_are_named(path: Path) -> None:

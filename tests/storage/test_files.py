@@ -1,10 +1,131 @@
+import errno
 import os
+import signal
+import subprocess
+import sys
+import time
+from contextlib import nullcontext
 from pathlib import Path
 
 import pytest
 
 from roadgeo.errors import OutputError
-from roadgeo.storage.files import replacing, write_text
+from roadgeo.storage.files import publish, replacing, staging, write_text, writing
+
+
+def test_a_file_appears_when_published(tmp_path: Path) -> None:
+    target = tmp_path / "a.txt"
+    target.write_text("old")
+    with staging(target) as folder:
+        (folder / "a.txt").write_text("new")
+        assert target.read_text() == "old"
+        publish(folder / "a.txt", target)
+    assert target.read_text() == "new"
+    assert list(tmp_path.iterdir()) == [target]
+
+
+def test_a_file_that_must_not_replace_another(tmp_path: Path) -> None:
+    write_twice(tmp_path, "exists")
+
+
+def write_twice(tmp_path: Path, message: str) -> None:
+    target = tmp_path / "a.txt"
+    for content in ("first", "second"):
+        with pytest.raises(OutputError, match=message) if target.exists() else nullcontext():  # noqa: SIM117
+            with staging(target) as folder:
+                (folder / "a.txt").write_text(content)
+                publish(folder / "a.txt", target, replace=False)
+    assert target.read_text() == "first"
+    assert list(tmp_path.iterdir()) == [target]
+
+
+def test_a_disk_without_hard_links(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    def refuse(*_: object) -> None:
+        raise PermissionError(errno.EPERM, "no hard links")
+
+    monkeypatch.setattr(os, "link", refuse)
+    write_twice(tmp_path, "may write to")
+
+
+@pytest.mark.parametrize("error", [ValueError, KeyboardInterrupt, OSError])
+def test_nothing_is_left_when_writing_fails(tmp_path: Path, error: type[BaseException]) -> None:
+    def fail() -> None:
+        with staging(tmp_path / "a.txt") as folder:
+            (folder / "a.txt").write_text("half")
+            raise error
+
+    with pytest.raises(OutputError if error is OSError else error):
+        fail()
+    assert list(tmp_path.iterdir()) == []
+
+
+@pytest.mark.parametrize(
+    ("number", "remedy"),
+    [(errno.ENOSPC, "free some space"), (errno.EROFS, "may write to"), (errno.EIO, "check the disk")],
+)
+def test_errors_name_file_cause_and_remedy(number: int, remedy: str) -> None:
+    with pytest.raises(OutputError, match=rf"cannot write some\.gpkg: .*{remedy}"), writing("some.gpkg"):
+        raise OSError(number, os.strerror(number))
+
+
+def test_a_missing_folder_and_a_file_as_folder_are_named(tmp_path: Path) -> None:
+    with pytest.raises(OutputError, match="create the folder"), staging(tmp_path / "none" / "a.txt"):
+        pass
+    (tmp_path / "file").touch()
+    with pytest.raises(OutputError, match="not a file"), staging(tmp_path / "file" / "a.txt"):
+        pass
+
+
+def hold_staging(target: Path) -> subprocess.Popen[bytes]:
+    """Start another process that stays in the middle of writing `target`."""
+    code = (
+        "import sys, time; from roadgeo.storage.files import staging\n"
+        "with staging(sys.argv[1]) as folder:\n"
+        "    (folder / 'half').write_text('x'); print('ready', flush=True); time.sleep(60)\n"
+    )
+    process = subprocess.Popen([sys.executable, "-c", code, str(target)], stdout=subprocess.PIPE)
+    assert process.stdout is not None
+    assert process.stdout.readline() == b"ready\n"
+    return process
+
+
+def test_a_living_writer_is_left_alone_and_a_dead_one_cleared_away(tmp_path: Path) -> None:
+    with hold_staging(tmp_path / "other.txt") as process:
+        (folder,) = tmp_path.iterdir()
+        with staging(tmp_path / "a.txt"):
+            assert (folder / "half").exists()
+        process.send_signal(signal.SIGKILL)
+    assert folder.exists()
+    (tmp_path / ".roadgeo-abc.tmp").mkdir()  # killed between making the folder and its lock
+    with staging(tmp_path / "a.txt"):
+        assert not folder.exists()
+    assert list(tmp_path.iterdir()) == []
+
+
+def test_foreign_files_of_similar_names_stay(tmp_path: Path) -> None:
+    (tmp_path / ".roadgeo-notes.tmp").mkdir()
+    (tmp_path / ".roadgeo-notes.tmp" / "mine.txt").touch()
+    (tmp_path / "x.tmp").touch()
+    with staging(tmp_path / "a.txt"):
+        pass
+    assert {path.name for path in tmp_path.iterdir()} == {".roadgeo-notes.tmp", "x.tmp"}
+
+
+def test_many_writers_in_one_folder(tmp_path: Path) -> None:
+    code = (
+        "import sys; from pathlib import Path; from roadgeo.storage.files import staging, publish\n"
+        "target = Path(sys.argv[1])\n"
+        "for i in range(60):\n"
+        "    with staging(target) as folder:\n"
+        "        (folder / 'a').write_text('whole'); publish(folder / 'a', target)\n"
+    )
+    writers = [subprocess.Popen([sys.executable, "-c", code, str(tmp_path / f"{i % 2}.txt")]) for i in range(3)]
+    while any(writer.poll() is None for writer in writers):
+        for target in tmp_path.glob("*.txt"):
+            assert target.read_text() == "whole"
+        time.sleep(0.002)
+    assert [writer.returncode for writer in writers] == [0, 0, 0]
+    assert sorted(path.name for path in tmp_path.iterdir()) == ["0.txt", "1.txt"]
 
 
 def test_the_old_file_stands_until_the_new_one_is_whole(tmp_path: Path) -> None:
@@ -31,11 +152,30 @@ def test_a_missing_folder_is_named(tmp_path: Path) -> None:
         write_text(tmp_path / "nowhere" / "a.json", "")
 
 
-def test_unfinished_files_of_writers_that_were_killed_are_removed(tmp_path: Path) -> None:
-    old, fresh, other = (tmp_path / name for name in (".a.12.part.gpkg", ".a.13.part.gpkg", ".a.part.gpkg"))
-    for path in (old, fresh, other):
-        path.touch()
-    for path in (old, other):
-        os.utime(path, (0, 0))
-    write_text(tmp_path / "a.json", "{}")
-    assert sorted(path.name for path in tmp_path.iterdir()) == [".a.13.part.gpkg", ".a.part.gpkg", "a.json"]
+@pytest.mark.skipif(not hasattr(os, "symlink"), reason="no links here")
+def test_planted_links_are_not_followed(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Neither at the target, nor where the unfinished file will be, nor in the place of a lock."""
+    victim, folder = tmp_path / "victim", tmp_path / "out"
+    victim.write_text("precious")
+    folder.mkdir()
+    (folder / "a.json").symlink_to(victim)
+    (folder / f".a.{os.getpid()}.part.json").symlink_to(victim)
+    (folder / f".roadgeo-{'00' * 6}.tmp").symlink_to(tmp_path, target_is_directory=True)
+    (folder / f".roadgeo-{'11' * 6}.tmp").mkdir()
+    (folder / f".roadgeo-{'11' * 6}.tmp" / "lock").symlink_to(victim)
+    names = iter((bytes(6), b"\2" * 6, b"\3" * 6))
+    monkeypatch.setattr(os, "urandom", lambda _: next(names))
+    with pytest.raises(OutputError, match="exists"):
+        write_text(folder / "a.json", "{}")
+    write_text(folder / "a.json", "{}")
+    with staging(folder / "b.json"):
+        pass
+    assert victim.read_text() == "precious"
+    assert (folder / "a.json").read_text() == "{}"
+    assert not (folder / "a.json").is_symlink()
+
+
+def test_errors_name_the_file_not_where_it_was_staged(tmp_path: Path) -> None:
+    with pytest.raises(OutputError) as raised, replacing(tmp_path / "a.json") as staged:
+        raise OutputError(f"cannot write {staged}: no room")
+    assert str(raised.value) == f"cannot write {tmp_path / 'a.json'}: no room"

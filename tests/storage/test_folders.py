@@ -6,7 +6,7 @@ from pathlib import Path
 
 import pytest
 
-from roadgeo.storage.folders import cache_dir, private_temporary_dir, writable
+from roadgeo.storage.folders import cache_dir, is_private, private_temporary_dir, writable
 
 HOME = Path("/home/somebody")
 SETTINGS = ("ROADGEO_CACHE", "XDG_CACHE_HOME", "LOCALAPPDATA")
@@ -86,3 +86,12 @@ def test_a_folder_is_made_to_see_whether_it_can_be_written_to(tmp_path: Path) ->
     assert not list((tmp_path / "a/b").iterdir())
     (tmp_path / "file").touch()
     assert not writable(tmp_path / "file/c")
+
+
+@pytest.mark.skipif(not hasattr(os, "getuid") or os.getuid() != 0, reason="only root gives folders away")
+def test_a_folder_whose_parent_is_somebody_elses_is_not_private(tmp_path: Path) -> None:
+    """They may put another in its place."""
+    (tmp_path / "theirs" / "mine").mkdir(mode=0o700, parents=True)
+    assert is_private(tmp_path / "theirs" / "mine")
+    os.chown(tmp_path / "theirs", 4321, -1)
+    assert not is_private(tmp_path / "theirs" / "mine")
