@@ -5,17 +5,23 @@ from __future__ import annotations
 import math
 from collections.abc import Sequence
 from functools import lru_cache
-from typing import Any
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
 from roadgeo._arrays import AnyArray, FloatArray
+from roadgeo.errors import RoadSourceError
 from roadgeo.geometry.areas import Box
 from roadgeo.geometry.projection import from_lonlat, to_lonlat, transformer
 from roadgeo.matching.index import ReferenceIndex
 from roadgeo.outputs.drawing.svg import join_segments
 from roadgeo.reference.reference import AnyReference
 from roadgeo.reference.shards import ShardedReference
+from roadgeo.storage.vectors import read_layer
+
+if TYPE_CHECKING:
+    from shapely import STRtree
 
 __all__ = ["MAX_ZOOM", "Tiles"]
 
@@ -25,6 +31,8 @@ _EXTENT = 4096
 _WORLD_M = 2 * 20037508.342789244
 #: Shards that one tile is made of, and segments that it holds: those of a whole country are a grey field anyway.
 _MOST_SHARDS, _MOST_SEGMENTS = 16, 60_000
+#: Streets of a map whose names are shown.
+_MOST_STREETS = 200_000
 #: Steps of a tile's side to which its roads are laid where it shows more than a town.
 _COARSE = 512
 
@@ -62,7 +70,10 @@ class Tiles:
         (box_west, box_south), (box_east, box_north) = box.tolist()
         indexes = _indexes(reference, (box_west, box_south, box_east, box_north), zoom)
         ends = np.concatenate([np.empty((0, 2, 2)), *(_web(index, _segments(index, box)) for index in indexes)])
-        return _encode(_draw((ends - (west, north)) * (_EXTENT / side, -_EXTENT / side), zoom))
+        to_tile = _EXTENT / side * np.array([1.0, -1.0])
+        streets = [] if zoom < MAX_ZOOM else [street for index in indexes for street in _named(index.path, corners)]
+        named = [((line - (west, north)) * to_tile, name) for line, name in streets]
+        return _encode(_draw((ends - (west, north)) * to_tile, zoom), named)
 
 
 def _indexes(reference: AnyReference, box: Box, zoom: int) -> list[ReferenceIndex]:
@@ -125,15 +136,47 @@ def _draw(ends: FloatArray, zoom: int) -> list[FloatArray]:
     return join_segments(drawn)
 
 
-def _encode(lines: list[FloatArray]) -> bytes:
+def _named(path: str, box: FloatArray) -> list[tuple[FloatArray, str]]:
+    """Return the lines (V, 2) of the streets that a box touches, in the CRS of web maps, each with its name."""
+    import shapely
+
+    tree, names = _streets(path)
+    found = tree.query(shapely.box(*box.ravel()))
+    lines = shapely.clip_by_rect(tree.geometries[found], *box.ravel())
+    parts, owner = shapely.get_parts(lines, return_index=True)
+    pairs = zip(parts, names[found][owner], strict=True)
+    return [(shapely.get_coordinates(line), str(name)) for line, name in pairs if not shapely.is_empty(line)]
+
+
+@lru_cache(maxsize=_MOST_SHARDS)
+def _streets(path: str) -> tuple[STRtree, AnyArray]:
+    """Read the streets of a map that have a name, from the file beside its index; none where that is not there."""
+    import shapely
+
+    try:
+        layer = read_layer(Path(path), "roads", ["name"], most=_MOST_STREETS)
+    except RoadSourceError:  # shards from elsewhere come without
+        return shapely.STRtree([]), np.empty(0, object)
+    shapes = np.empty(0, object) if layer.shapes is None else layer.shapes
+    names = layer.columns.get("name", np.empty(len(shapes), object))
+    has_name = np.array([bool(name) for name in names], bool)
+    lines = shapely.from_wkb(shapes[has_name])
+    to_web = transformer(str(layer.crs), "EPSG:3857").transform
+    return shapely.STRtree(shapely.transform(lines, to_web, interleaved=False)), names[has_name]
+
+
+def _encode(lines: list[FloatArray], named: list[tuple[FloatArray, str]]) -> bytes:
     import shapely
     from mapbox_vector_tile import encode
 
     if not lines:
         return b""
     roads = shapely.multilinestrings([shapely.linestrings(line) for line in lines])
-    layer = {"name": "roads", "features": [{"geometry": roads, "properties": {}}]}
-    tile: bytes = encode(layer, default_options={"extents": _EXTENT, "y_coord_down": True})
+    streets = [{"geometry": shapely.linestrings(line), "properties": {"name": name}} for line, name in named]
+    layers = [{"name": "roads", "features": [{"geometry": roads, "properties": {}}]}]
+    if streets:
+        layers.append({"name": "streets", "features": streets})
+    tile: bytes = encode(layers, default_options={"extents": _EXTENT, "y_coord_down": True})
     return tile
 
 

@@ -1,9 +1,14 @@
 """The page in Chromium: pictures are dropped and located, refusals are helped, by mouse, by keys and on a phone."""
 
+import errno
+import http.client
 import json
+import os
+import re
 import threading
 from contextlib import contextmanager
 from dataclasses import replace
+from http.server import BaseHTTPRequestHandler, ThreadingHTTPServer
 from pathlib import Path
 
 import cv2
@@ -65,6 +70,7 @@ def served(town, tmp_path_factory):
     query = simulate_query(Landscape.from_network(network), SimulationOptions(VIEW, NOISE_MODELS["clean"]), 0)
     mask = tmp_path_factory.mktemp("page") / "mask.png"
     cv2.imwrite(str(mask), query.mask)
+    index = replace(index, meta={**index.meta, "attribution": '© <a href="https://maps.example">Mappers</a>'})
     workers = Direct([Reference(index, network)], tmp_path_factory.mktemp("images"))
     lonlat = to_lonlat(index.plane.crs, np.array([query.truth.center]))[0]
     with serving(workers) as server:
@@ -72,8 +78,8 @@ def served(town, tmp_path_factory):
 
 
 @contextmanager
-def serving(workers, **options):
-    server = Server(workers, workers.references, ServeOptions(port=0, workers=2, waiting=4, **options))
+def serving(workers, references=None, **options):
+    server = Server(workers, references or workers.references, ServeOptions(port=0, workers=2, waiting=4, **options))
     thread = threading.Thread(target=server.serve_forever, daemon=True)
     thread.start()
     try:
@@ -157,7 +163,7 @@ def wait_for(page, word):
 def look_at(page, lonlat, zoom=15):
     """Move the map; the page's own module tells which it is."""
     page.evaluate(
-        "([center, zoom]) => import('/page/map.mjs').then((map) => { map.theMap().jumpTo({ center, zoom }); })",
+        "([center, zoom]) => import('./page/map.mjs').then((map) => { map.theMap().jumpTo({ center, zoom }); })",
         [[float(value) for value in lonlat], zoom],
     )
 
@@ -165,7 +171,7 @@ def look_at(page, lonlat, zoom=15):
 def on_map(page, lonlat):
     """Where a place is in the window."""
     return page.evaluate(
-        """(place) => import('/page/map.mjs').then((map) => {
+        """(place) => import('./page/map.mjs').then((map) => {
             const { x, y } = map.theMap().project(place);
             return [x, y];
         })""",
@@ -196,7 +202,7 @@ def test_what_is_dropped_is_located_and_shown(page, served):
     assert told == pytest.approx([lonlat[1], lonlat[0]], abs=1e-4)
     expect(page.locator("#said")).to_contain_text("mask.png: Located.")
     # On the map: the picture, its outline, the roads.
-    shown = """import('/page/map.mjs').then(async (module) => {
+    shown = """import('./page/map.mjs').then(async (module) => {
         const map = module.theMap();
         while (!map.loaded()) await new Promise((done) => setTimeout(done, 50));
         const drawn = (layer) => map.queryRenderedFeatures({ layers: [layer] }).length > 0;
@@ -268,23 +274,6 @@ def test_a_refusal_is_helped_by_a_circle(page, served, hard):
     assert 50 < workers.asked[-1].hints["near"][2] < 1000
 
 
-def test_a_refusal_is_helped_by_a_box(page, served, hard):
-    _, workers, mask, lonlat = served
-    give(page, mask, "hard.png")
-    wait_for(page, "Not located")
-    look_at(page, lonlat)
-    page.click("#draw-box")
-    x, y = on_map(page, lonlat)
-    page.mouse.move(x - 80, y + 80)
-    page.mouse.down()
-    page.mouse.move(x + 80, y - 80, steps=3)
-    page.mouse.up()
-    wait_for(page, "Located")
-    west, south, east, north = workers.asked[-1].hints["within"]
-    assert west < lonlat[0] < east
-    assert south < lonlat[1] < north
-
-
 def test_one_of_two_places_is_chosen(page, served, hard):
     _, workers, mask, lonlat = served
     give(page, mask, "twins.png")
@@ -296,32 +285,49 @@ def test_one_of_two_places_is_chosen(page, served, hard):
     assert workers.asked[-1].hints["near"][2] < 450
 
 
-def test_two_points_tell_where_it_is_and_how_large_a_pixel(page, served, hard):
+def test_points_tell_where_it_is_how_large_a_pixel_and_where_up_is(page, served, hard):
     _, workers, mask, lonlat = served
     give(page, mask, "hard.png")
     wait_for(page, "Not located")
     look_at(page, lonlat)
     page.click("#pick")
-    box, pixels = page.locator("#photo").bounding_box(), np.array([(250.0, 300.0), (700.0, 500.0)])
+    pixels = np.array([(250.0, 300.0), (700.0, 500.0), (400.0, 700.0)])
     place = locate(str(mask), workers.references)
-    first, second = to_lonlat(place.crs, place.pixel_to_map(pixels))
-    (x, y), (u, v) = (box["x"], box["y"]) + pixels / 900 * (box["width"], box["height"])
-    page.mouse.click(x, y)
-    expect(page.locator("#asks")).to_contain_text("on the map")
-    page.mouse.click(*on_map(page, first))
-    # The other is carried over.
-    page.mouse.click(u, v)
-    expect(page.locator("#points .pin")).to_have_count(2)
-    page.mouse.move(u, v)
-    page.mouse.down()
-    page.mouse.move(u + 200, v, steps=3)
-    page.mouse.move(*on_map(page, second), steps=3)
-    page.mouse.up()
+    places = to_lonlat(place.crs, place.pixel_to_map(pixels))
+    searches = len(workers.asked)
+    for k in range(2):
+        click_on_picture(page, pixels[k])
+        expect(page.locator("#asks")).to_contain_text("on the map")
+        page.mouse.click(*on_map(page, places[k]))
     wait_for(page, "Located")
     hints = workers.asked[-1].hints
     assert hints["near"][:2] == pytest.approx(tuple(lonlat), abs=2e-4)
     assert hints["gsd_m"][0] < 1.0 < hints["gsd_m"][1]
+    assert turn(hints["heading_deg"][0], place.rotation_deg) < 1.0
+    assert hints["heading_deg"][1] == 15.0
     expect(page.locator("#map .pin.mapped")).to_have_count(2)
+    # A third makes it surer.
+    page.click("#help summary")
+    page.click("#pick")
+    look_at(page, lonlat)
+    click_on_picture(page, pixels[2])
+    page.mouse.click(*on_map(page, places[2]))
+    expect(page.locator("#map .pin.mapped")).to_have_count(3)
+    wait_for(page, "Located")
+    assert len(workers.asked) == searches + 2
+    assert turn(workers.asked[-1].hints["heading_deg"][0], place.rotation_deg) < 1.0
+    assert workers.asked[-1].hints["heading_deg"][1] == 10.0
+
+
+def turn(a, b):
+    """The angle between two headings, degrees."""
+    return abs((a - b + 180) % 360 - 180)
+
+
+def click_on_picture(page, pixel):
+    page.locator("#photo").scroll_into_view_if_needed()
+    box = page.locator("#photo").bounding_box()
+    page.mouse.click(*((box["x"], box["y"]) + pixel / 900 * (box["width"], box["height"])))
 
 
 def test_what_is_known_of_the_camera_is_asked_with(page, served, hard):
@@ -334,6 +340,7 @@ def test_what_is_known_of_the_camera_is_asked_with(page, served, hard):
     for field, value in {
         "lens": "36",
         "tilt": "20",
+        "heading": str(round(locate(str(mask), workers.references).rotation_deg)),
         "near-lat": lonlat[1],
         "near-lon": lonlat[0],
         "near-km": 3,
@@ -343,6 +350,8 @@ def test_what_is_known_of_the_camera_is_asked_with(page, served, hard):
     wait_for(page, "Located")
     hints = workers.asked[-1].hints
     assert (hints["focal_px"], hints["max_tilt_deg"], hints["near"][2]) == (900.0, 20.0, 3000.0)
+    assert hints["heading_deg"] == (round(locate(str(mask), workers.references).rotation_deg), 10.0)
+    expect(page.locator("#heading-off")).to_have_value("10")
     assert hints["gsd_m"] == pytest.approx((0.8, 1.25))
 
 
@@ -502,6 +511,133 @@ def test_it_serves_on_a_phone(phone, served, hard):
     assert phone.locator("#map").bounding_box()["height"] > 400
 
 
+def require_tidy(page, width):
+    """Nothing is wider than the window, and no HTML is shown as text."""
+    assert page.evaluate("document.documentElement.scrollWidth") <= width
+    for part in ("#panel", "#work", "#answer"):
+        assert page.eval_on_selector(part, "(one) => one.scrollWidth - one.clientWidth") <= 1, part
+    assert not re.search(r"</?[a-z]+[^<]*>", page.inner_text("body"))
+
+
+@pytest.mark.parametrize(("width", "height"), [(390, 844), (1280, 800)])
+def test_every_state_fits_its_window(served, chromium, hard, width, height):
+    _, workers, mask, _ = served
+    workers.goes_on.set()
+    far = replace(workers.references[0].index, meta={**workers.references[0].index.meta, "name": "a long name " * 6})
+    black = cv2.imencode(".png", np.zeros((50, 50), np.uint8))[1].tobytes()
+    with (
+        serving(workers, [*workers.references, Reference(far)]) as server,
+        opened(chromium, server, width=width, height=height, phone=width < 700) as page,
+    ):
+        require_tidy(page, width)
+        workers.goes_on.clear()
+        give(page, mask, "a name without a single gap in it, that goes on and on ".replace(" ", "_") * 2 + ".png")
+        wait_for(page, "Working")
+        require_tidy(page, width)
+        workers.goes_on.set()
+        wait_for(page, "Located")
+        for summary in ("#help summary", "#files-of summary"):
+            page.click(summary)
+        expect(page.locator("#files-of a").first).to_be_visible()
+        require_tidy(page, width)
+        page.click("#larger")
+        require_tidy(page, width)
+        page.click("#larger")
+        for name, word in {"hard.png": "Not located", "twins.png": "Two places"}.items():
+            give(page, mask, name)
+            wait_for(page, word)
+            require_tidy(page, width)
+        page.set_input_files("#files", {"name": "black.png", "mimeType": "image/png", "buffer": black})
+        wait_for(page, "Failed")
+        require_tidy(page, width)
+
+
+def test_of_several_maps_the_first_is_shown_and_each_may_be_chosen(served, chromium):
+    workers = served[1]
+    index = workers.references[0].index
+    x, y = index.meta["origin"]
+    far = replace(index, meta={**index.meta, "name": "Far town", "origin": (x, y + 900_000.0)})
+    zoom = "import('./page/map.mjs').then(({ theMap }) => [theMap().getZoom(), theMap().getCenter().lat])"
+    with serving(workers, [Reference(index), Reference(far)]) as server, opened(chromium, server) as page:
+        expect(page.locator("#maps option")).to_have_text([index.name, "Far town"])
+        first = page.evaluate(zoom)
+        page.select_option("#maps", "Far town")
+        page.wait_for_timeout(200)
+        second = page.evaluate(zoom)
+    assert first[0] > 11
+    assert second[0] == pytest.approx(first[0], abs=0.3)
+    assert second[1] > first[1] + 5
+
+
+def test_an_answer_without_its_view_tells_the_place(served, chromium, monkeypatch):
+    def full(*_):
+        raise OSError(errno.ENOSPC, os.strerror(errno.ENOSPC))
+
+    server, workers, mask, _ = served
+    workers.goes_on.set()
+    monkeypatch.setattr("roadgeo.serving.view.write_view", full)
+    page = chromium.new_page()
+    page.goto(f"http://127.0.0.1:{server.server_port}/")
+    give(page, mask)
+    wait_for(page, "Located")
+    expect(page.locator("#facts")).to_contain_text("Middle")
+    page.close()
+
+
+@contextmanager
+def below_a_path(port):
+    """A proxy that serves the server at `port` below /maps/; its own port."""
+
+    class Handler(BaseHTTPRequestHandler):
+        def do_GET(self):
+            body = self.rfile.read(int(self.headers.get("Content-Length", 0)))
+            connection = http.client.HTTPConnection("127.0.0.1", port, timeout=60)
+            path = self.path.removeprefix("/maps") if self.path.startswith("/maps/") else "/outside"
+            kept = {name: value for name, value in self.headers.items() if name.lower() != "content-length"}
+            connection.request(self.command, path, body or None, kept)
+            answer = connection.getresponse()
+            content = answer.read()
+            connection.close()
+            self.send_response(answer.status)
+            for name, value in answer.getheaders():
+                if name.lower() not in ("transfer-encoding", "connection", "content-length"):
+                    self.send_header(name, value)
+            self.send_header("Content-Length", str(len(content)))
+            self.end_headers()
+            self.wfile.write(content)
+
+        do_POST = do_DELETE = do_GET  # noqa: N815 (names of the library)
+
+        def log_message(self, *_):
+            pass
+
+    proxy = ThreadingHTTPServer(("127.0.0.1", 0), Handler)
+    threading.Thread(target=proxy.serve_forever, daemon=True).start()
+    try:
+        yield proxy.server_port
+    finally:
+        proxy.shutdown()
+        proxy.server_close()
+
+
+def test_it_may_lie_below_a_path(served, chromium):
+    server, workers, mask, _ = served
+    workers.goes_on.set()
+    refused = []
+    with below_a_path(server.server_port) as port:
+        page = chromium.new_page()
+        page.on("response", lambda answer: refused.append(answer.url) if answer.status >= 400 else None)
+        page.goto(f"http://127.0.0.1:{port}/maps/")
+        give(page, mask)
+        wait_for(page, "Located")
+        page.click("#files-of summary")
+        with page.expect_download() as download:
+            page.locator("#files-of a").first.click()
+        assert download.value.suggested_filename == "mask_footprint.tif"
+        page.close()
+    assert refused == []
+
+
 def test_a_token_is_asked_for_once(served, chromium):
     workers = served[1]
     with serving(workers, token="open sesame") as server:
@@ -537,12 +673,12 @@ def test_a_browser_that_draws_no_map_tells_places(served, chromium):
 
 def test_a_basemap_is_asked_where_the_user_said(served, chromium):
     workers, asked = served[1], []
-    with serving(workers, basemap="http://127.0.0.1:9/{z}/{x}/{y}.png", basemap_attribution="<b>Me</b>") as server:
+    with serving(workers, basemap="http://127.0.0.1:9/{z}/{x}/{y}.png", basemap_attribution="<b>Me</b> & co") as server:
         context = chromium.new_context()
         page = context.new_page()
         page.on("request", lambda request: asked.append(request.url))
         page.goto(f"http://127.0.0.1:{server.server_port}/")
-        expect(page.locator(".maplibregl-ctrl-attrib")).to_contain_text("<b>Me</b>")
+        expect(page.locator(".maplibregl-ctrl-attrib")).to_contain_text("Me & co")
         page.wait_for_timeout(500)
         context.close()
     elsewhere = [url for url in asked if f":{server.server_port}/" not in url and url.startswith("http")]

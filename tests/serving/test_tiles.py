@@ -1,13 +1,15 @@
 """Roads as vector tiles: what the map has, where it has it."""
 
 import math
+import re
+from dataclasses import replace
 
 import numpy as np
 import pytest
 from mapbox_vector_tile import decode
 
 from roadgeo.geometry.projection import to_lonlat
-from roadgeo.reference.reference import Reference
+from roadgeo.reference.reference import Reference, open_reference
 from roadgeo.serving.tiles import MAX_ZOOM, Tiles
 
 WORLD_M = 2 * 20037508.342789244
@@ -53,6 +55,30 @@ def test_all_roads_lie_in_some_tile(tiles):
         column, row = tile_of(lon, lat, zoom)
         found = to_lonlat("EPSG:3857", points_of(made.tile(0, zoom, column, row), zoom, column, row))
         assert np.hypot(*((found - (lon, lat)) * 111195).T).min() < 3.0
+
+
+def test_near_by_streets_have_names(town, tmp_path):
+    network, index = town
+    names = np.array([f"Street {k}" if k % 2 else "" for k in range(network.graph.n_edges)], object)
+    Reference(index, replace(network, names=names)).save(tmp_path / "town.gpkg")
+    reference = open_reference(tmp_path / "town.gpkg")
+    lon, lat = to_lonlat(index.plane.crs, index.plane.to_crs(index.xy[:1]))[0]
+    column, row = tile_of(lon, lat, MAX_ZOOM)
+    layers = decode(Tiles([reference]).tile(0, MAX_ZOOM, column, row), default_options={"y_coord_down": True})
+    features = layers["streets"]["features"]
+    assert all(re.fullmatch(r"Street \d+", feature["properties"]["name"]) for feature in features)
+    # A street lies where the road of that number does.
+    feature = features[0]
+    number = int(feature["properties"]["name"].split()[1])
+    known = to_lonlat(
+        index.plane.crs, index.plane.to_crs(network.graph.coords[slice(*network.graph.offsets[number : number + 2])])
+    )
+    side = WORLD_M / 2**MAX_ZOOM
+    corner = np.array([column * side - WORLD_M / 2, WORLD_M / 2 - row * side])
+    place = to_lonlat("EPSG:3857", np.array(feature["geometry"]["coordinates"]) / 4096 * side * (1, -1) + corner)
+    assert (place >= known.min(axis=0) - 1e-4).all()
+    assert (place <= known.max(axis=0) + 1e-4).all()
+    assert "streets" not in decode(Tiles([reference]).tile(0, 14, column // 2, row // 2))
 
 
 def test_where_nothing_is_there_is_nothing(tiles):

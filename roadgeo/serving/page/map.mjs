@@ -1,7 +1,8 @@
 // The map: the reference's roads, and what an answer looks like on them.
-import * as maplibre from "/page/maplibre-gl.mjs";
+import * as maplibre from "./maplibre-gl.mjs";
 
 const EARTH_M = 6371000, RAD = Math.PI / 180;
+const HERE = new URL(".", document.baseURI).href;  // the page may lie below a path
 const EMPTY = { type: "FeatureCollection", features: [] };
 const feature = (type, coordinates, properties = {}) => ({ type: "Feature", properties, geometry: { type, coordinates } });
 const collection = (features) => ({ type: "FeatureCollection", features });
@@ -20,37 +21,39 @@ export function offset(from, [east, north]) {
   return [from[0] + east / (RAD * EARTH_M * Math.cos(from[1] * RAD)), from[1] + north / (RAD * EARTH_M)];
 }
 
-/** Make the map of what the server searches; false where the browser cannot draw it. */
-export function makeMap(told) {
-  const sources = {}, roads = [];
-  if (told.basemap) {
-    sources.basemap = { type: "raster", tiles: [told.basemap], tileSize: 256, attribution: escapeHtml(told.basemap_attribution) };
+/** Make the map of what the server searches, opened on the first; false where the browser cannot draw it. */
+export function makeMap({ references, basemap, basemap_attribution, max_zoom }) {
+  const sources = {}, roads = [], names = [];
+  if (basemap) {
+    sources.basemap = { type: "raster", tiles: [basemap], tileSize: 256, attribution: plain(basemap_attribution) };
     roads.push({ id: "basemap", type: "raster", source: "basemap" });
   }
-  told.references.forEach((one, i) => {
-    sources[`roads-${i}`] = {
-      type: "vector", tiles: [`${location.origin}/tiles/${i}/{z}/{x}/{y}.mvt`], maxzoom: told.max_zoom, bounds: one.bounds,
-      attribution: escapeHtml(one.attribution),
-    };
+  references.forEach(({ bounds, attribution }, i) => {
+    const tiles = [`${HERE}tiles/${i}/{z}/{x}/{y}.mvt`];
+    sources[`roads-${i}`] = { type: "vector", tiles, maxzoom: max_zoom, bounds, attribution: plain(attribution) };
     const width = (a, b, c) => ["interpolate", ["exponential", 1.5], ["zoom"], 8, a, 13, b, 18, c];
     const line = { type: "line", source: `roads-${i}`, "source-layer": "roads", layout: { "line-cap": "round", "line-join": "round" } };
     roads.push({ ...line, id: `case-${i}`, minzoom: 12, paint: { "line-color": "#ffffff", "line-width": width(1, 3.4, 22) } });
+    names.push({
+      id: `names-${i}`, type: "symbol", source: `roads-${i}`, "source-layer": "streets", minzoom: 15.5,
+      layout: { "symbol-placement": "line", "text-field": ["get", "name"], "text-size": 12, "text-font": ["sans-serif"] },
+      paint: { "text-color": "#20262e", "text-halo-color": "#ffffff", "text-halo-width": 1.6 },
+    });
     roads.push({ ...line, id: `road-${i}`, paint: { "line-color": "#8c949e", "line-width": width(0.5, 1.4, 14) } });
   });
   const data = { type: "geojson", data: EMPTY };
   Object.assign(sources, { area: data, outline: data });
-  const bounds = told.references.reduce((all, { bounds: [w, s, e, n] }) => all.extend([w, s]).extend([e, n]), new maplibre.LngLatBounds());
   const common = { attributionControl: false, fadeDuration: 0, maxPitch: 0, dragRotate: false, maxZoom: 21 };
   try {
     map = new maplibre.Map({
-      ...common, container: "map", bounds, fitBoundsOptions: { padding: padding() },
+      ...common, container: "map", bounds: references[0].bounds, fitBoundsOptions: { padding: padding() },
       style: {
         version: 8, sources, layers: [
           { id: "ground", type: "background", paint: { "background-color": "#f3f1ec" } }, ...roads,
           { id: "area", type: "fill", source: "area", paint: { "fill-color": "#1a5fa5", "fill-opacity": 0.12 } },
           { id: "area-edge", type: "line", source: "area", paint: { "line-color": "#1a5fa5", "line-width": 2, "line-dasharray": [2, 1] } },
           { id: "outline-case", type: "line", source: "outline", paint: { "line-color": "#ffffff", "line-width": 6 } },
-          { id: "outline", type: "line", source: "outline", paint: { "line-color": "#1a5fa5", "line-width": 3 } },
+          { id: "outline", type: "line", source: "outline", paint: { "line-color": "#1a5fa5", "line-width": 3 } }, ...names,
         ],
       },
     });
@@ -103,10 +106,10 @@ function padding() {
   return { top: 50, bottom: 50, right: 50, left: beside ? document.getElementById("panel").offsetWidth + 60 : 50 };
 }
 
-function escapeHtml(text) {
-  const holder = document.createElement("p");
-  holder.textContent = text || "";
-  return holder.innerHTML;
+/** The words of a licence, which may be written in HTML, as HTML that is nothing but text. */
+function plain(text) {
+  const words = new DOMParser().parseFromString(text || "", "text/html").body.textContent;
+  return new Option(words).innerHTML;
 }
 
 const ready = (one) => new Promise((done) => (one.isStyleLoaded() ? done() : one.once("load", done)));
@@ -127,7 +130,7 @@ export async function showAnswer(base, view, found) {
   set(over, "ends", (place?.matches ?? []).map((one) => feature("Point", one.map, { residual: one.residual_m })));
   if (!place) return;
   if (place.warped) {
-    over.addSource("photo", { type: "image", url: `${location.origin}${base}/warped.webp`, coordinates: place.warped });
+    over.addSource("photo", { type: "image", url: `${HERE}${base}/warped.webp`, coordinates: place.warped });
     over.addLayer({ id: "photo", type: "raster", source: "photo", paint: { "raster-opacity": 1, "raster-fade-duration": 0 } }, "roads-case");
   }
   setOpacity(opacity);
@@ -140,6 +143,7 @@ function set(one, source, features) {
   one.getSource(source).setData(collection(features));
 }
 
+/** Show all of a box, such as the bounds of a reference. */
 export function fit(box) {
   map.fitBounds(box, { padding: padding(), maxZoom: 18, duration: matchMedia("(prefers-reduced-motion: reduce)").matches ? 0 : 700 });
 }
@@ -184,64 +188,41 @@ export function middle() {
   return [lng, lat];
 }
 
-/** The place under a point of the window; null where that is not on the map. */
-export function placeAt(x, y) {
-  const box = map.getContainer().getBoundingClientRect();
-  const over = document.elementFromPoint(x, y);
-  if (!over || !map.getContainer().contains(over)) return null;
-  const { lng, lat } = map.unproject([x - box.left, y - box.top]);
-  return [lng, lat];
-}
-
-/** Show where it is said to lie: near [lon, lat, metres], or within [w, s, e, n]. */
-export function showArea(near, within) {
+/** Show where it is said to lie: near [lon, lat, metres]; null for nowhere. */
+export function showArea(near) {
   if (!map) return;
-  let ring = [];
-  if (near) ring = Array.from({ length: 65 }, (_, i) => offset(near, [near[2] * Math.cos(i * Math.PI / 32), near[2] * Math.sin(i * Math.PI / 32)]));
-  if (within) {
-    const [w, s, e, n] = within;
-    ring = [[w, s], [e, s], [e, n], [w, n], [w, s]];
-  }
-  ready(map).then(() => set(map, "area", ring.length ? [feature("Polygon", [ring])] : []));
+  const ring = near && Array.from({ length: 65 }, (_, i) => offset(near, [near[2] * Math.cos(i * Math.PI / 32), near[2] * Math.sin(i * Math.PI / 32)]));
+  ready(map).then(() => set(map, "area", ring ? [feature("Polygon", [ring])] : []));
 }
 
 let stop = null;
-/** Have a circle or a box drawn: `done` gets near or within; drawing anew or `stopDrawing` ends it. */
-export function draw(kind, done) {
+/** Have a circle drawn, from its middle outwards: `done` gets it; drawing anew or `stopDrawing` ends it. */
+export function drawCircle(done) {
   stopDrawing();
   const box = map.getContainer(), canvas = map.getCanvasContainer();
   box.classList.add("draws");
   map.dragPan.disable();
   map.boxZoom.disable();
   let from = null, start = null;
-  const at = (event) => {
-    const edge = box.getBoundingClientRect(), { lng, lat } = map.unproject([event.clientX - edge.left, event.clientY - edge.top]);
+  const at = ({ clientX, clientY }) => {
+    const edge = box.getBoundingClientRect(), { lng, lat } = map.unproject([clientX - edge.left, clientY - edge.top]);
     return [lng, lat];
   };
-  const made = (to) => {
-    if (kind === "circle") return [[...from, Math.max(Math.hypot(...metres(from, to)), 1)], null];
-    return [null, [Math.min(from[0], to[0]), Math.min(from[1], to[1]), Math.max(from[0], to[0]), Math.max(from[1], to[1])]];
-  };
+  const circle = (event) => [...from, Math.max(Math.hypot(...metres(from, at(event))), 1)];
   const down = (event) => {
     if (event.button) return;
     event.preventDefault();
     canvas.setPointerCapture(event.pointerId);
-    from = at(event);
-    start = [event.clientX, event.clientY];
+    [from, start] = [at(event), event];
   };
-  const move = (event) => from && showArea(...made(at(event)));
+  const move = (event) => from && showArea(circle(event));
   const up = (event) => {
     if (!from) return;
-    let to = at(event);
-    if (Math.hypot(event.clientX - start[0], event.clientY - start[1]) < 6) {  // a click: a fifth of what is seen
-      const { lng, lat } = map.unproject([start[0] + innerWidth / 10, start[1] - innerHeight / 10]);
-      const edge = map.unproject([start[0], start[1]]);
-      to = [from[0] + lng - edge.lng, from[1] + lat - edge.lat];
-    }
-    const [near, within] = made(to);
+    const { clientX, clientY } = start, isClick = Math.hypot(event.clientX - clientX, event.clientY - clientY) < 6;
+    const near = circle(isClick ? { clientX: clientX + innerWidth / 10, clientY } : event);  // a click: a fifth of what is seen
     stopDrawing();
-    showArea(near, within);
-    done(near, within);
+    showArea(near);
+    done(near);
   };
   canvas.style.touchAction = "none";
   const heard = { pointerdown: down, pointermove: move, pointerup: up };

@@ -1,12 +1,12 @@
 // The page: takes pictures, shows how far they are and where they lie, and asks for help where they were refused.
-import * as view from "/page/map.mjs";
-import { hintsOf } from "/page/points.mjs";
+import * as view from "./map.mjs";
+import { hintsOf } from "./points.mjs";
 
 const $ = (id) => document.getElementById(id);
 const WORDS = { located: "Located", ambiguous: "Two places", not_located: "Not located", failed: "Failed", running: "Working", dismissed: "Cancelled" };
 const KEPT = "roadgeo.session";
 const answers = [];  // latest first: { id, base, name, status, message, progress, document, view, hints }
-let current = null, kept = 20, maxBytes = Infinity, hasMap = false;
+let current = null, kept = 20, maxBytes = Infinity, hasMap = false, maps = [];
 
 const make = (tag, properties = {}, ...children) => {
   const one = Object.assign(document.createElement(tag), properties);
@@ -17,9 +17,9 @@ const make = (tag, properties = {}, ...children) => {
 // --- the server -------------------------------------------------------------------------------------------------------
 
 class Problem extends Error {
-  constructor(status, detail, again) {
+  constructor(status, detail) {
     super(detail);
-    Object.assign(this, { status, again });
+    this.status = status;
   }
 }
 
@@ -30,9 +30,9 @@ async function ask(path, options) {
   } catch {
     throw new Problem(0, "The server does not answer. Is roadgeo serve still running?");
   }
-  const told = await answer.json().catch(() => ({}));
-  if (!answer.ok) throw new Problem(answer.status, told.detail ?? `The server answered ${answer.status}.`, Number(answer.headers.get("Retry-After")));
-  return told;
+  const content = await answer.json().catch(() => ({}));
+  if (!answer.ok) throw new Problem(answer.status, content.detail ?? `The server answered ${answer.status}.`);
+  return content;
 }
 
 /** Ask until there is a free place. */
@@ -41,9 +41,9 @@ async function askUntilFree(path, options, entry) {
     try {
       return await ask(path, options);
     } catch (problem) {
-      if (problem.status !== 503 || !problem.again || entry.status === "dismissed") throw problem;
-      update(entry, { message: "waiting for a free place" });
-      await new Promise((done) => setTimeout(done, 1000 * problem.again));
+      if (problem.status !== 503 || entry.status === "dismissed") throw problem;
+      update(entry, { message: `waiting: ${problem.message}` });
+      await new Promise((done) => setTimeout(done, 1000));
     }
   }
 }
@@ -61,7 +61,7 @@ async function takeFiles(files) {
     }
     const body = new FormData();
     body.append("image", entry.file, entry.name);
-    await start(entry, "/locate", { method: "POST", body, headers: { Prefer: "respond-async" } });
+    await start(entry, "locate", { method: "POST", body, headers: { Prefer: "respond-async" } });
   }
 }
 
@@ -78,7 +78,7 @@ function add(entry) {
 async function start(entry, path, options) {
   try {
     const job = await askUntilFree(path, options, entry);
-    Object.assign(entry, { id: job.jobID, base: `/jobs/${job.jobID}`, file: null });
+    Object.assign(entry, { id: job.jobID, base: `jobs/${job.jobID}`, file: null });
     if (entry.status === "dismissed") {
       await ask(entry.base, { method: "DELETE" });
       return;
@@ -112,7 +112,8 @@ async function finish(entry, told) {
     return;
   }
   try {
-    const [{ location }, seen] = await Promise.all([ask(`${entry.base}/results`), ask(`${entry.base}/view.json`)]);
+    const { location } = await ask(`${entry.base}/results`);
+    const seen = await ask(`${entry.base}/view.json`).catch(() => null);  // there was no room for it on the server's disk
     update(entry, { document: location, view: seen, status: location.status, message: location.reason });
   } catch (problem) {
     update(entry, { status: "failed", message: problem.message });
@@ -140,7 +141,7 @@ function keep() {
 async function recall() {
   const told = JSON.parse(sessionStorage.getItem(KEPT) ?? "[]");
   for (const { id, name, hints } of told.slice(0, kept)) {
-    const base = `/jobs/${id}`;
+    const base = `jobs/${id}`;
     try {
       const job = await ask(base);
       const entry = { id, base, name, hints, status: "running", message: job.message, progress: job.progress, since: Date.now() };
@@ -176,16 +177,18 @@ function show(entry) {
   $("reason").textContent = over ? sentence(entry.message) : "";
   showProgress(entry);
   showPicture(entry);
-  $("facts").replaceChildren(...(placed && sure ? facts(found, seen) : []).flatMap(([name, value]) => [make("dt", { textContent: name }), make("dd", {}, value)]));
+  $("facts").replaceChildren(...(sure ? facts(found, seen?.place?.matches ?? []) : []).flatMap(([name, value]) => [make("dt", { textContent: name }), make("dd", {}, value)]));
   $("layers").hidden = !placed;
   $("layers").querySelector(".slide").firstChild.textContent = seen?.is_photograph === false ? "Mask " : "Photograph ";
-  $("help").hidden = !over || !entry.base || status === "failed" && !seen;
+  $("help").hidden = !over || !entry.base || !seen;
   $("help").open = over && (status === "not_located" || status === "ambiguous");
   $("files-of").hidden = !over || !found;
   $("files-of").open = false;
   if (hasMap) {
+    const map = maps.findIndex(({ name }) => name === found?.reference);
+    if (map >= 0) $("maps").selectedIndex = map;
     view.showAnswer(entry.base, seen, found).then(() => entry === current && showPlaces(entry));
-    view.showArea(...(sure ? [null, null] : [entry.hints.near ?? null, entry.hints.within ?? null]));
+    view.showArea(sure ? null : entry.hints.near);
   }
   setSwipe(placed && $("show-swipe").checked);
   $("places").hidden = status !== "ambiguous" || !placed;
@@ -233,7 +236,7 @@ const degrees = ({ lat, lon }) => `${lat.toFixed(6)}, ${lon.toFixed(6)}`;
 const length = (m) => (m < 1 ? `${(m * 100).toPrecision(2)} cm` : m < 10 ? `${m.toFixed(1)} m` : m < 1000 ? `${m.toFixed(0)} m` : `${(m / 1000).toFixed(1)} km`);
 const WINDS = ["north", "north-east", "east", "south-east", "south", "south-west", "west", "north-west"];
 
-function facts(found, { place: { matches } }) {
+function facts(found, matches) {
   const copy = make("button", { type: "button", className: "link", textContent: degrees(found.center), title: "Copy" });
   copy.setAttribute("aria-label", `Middle ${degrees(found.center)}: copy`);
   copy.onclick = () => navigator.clipboard?.writeText(degrees(found.center)).then(() => { $("said").textContent = "Copied"; });
@@ -270,7 +273,7 @@ function showPlaces(entry) {
   const places = [found.center, ...found.alternatives.map((one) => one.center)].slice(0, 6);
   $("places").querySelector("ol").replaceChildren(...places.map((place, i) => {
     const letter = "ABCDEF"[i], lonlat = [place.lon, place.lat];
-    const take = () => again(entry, { ...entry.hints, within: undefined, near: [...lonlat, radius(lonlat, places, side)] });
+    const take = () => again(entry, { ...entry.hints, near: [...lonlat, radius(lonlat, places, side)] });
     view.addMarker(lonlat, letter, `Place ${letter}: it is this one`, "place").getElement().addEventListener("click", take);
     const there = make("button", { type: "button", onclick: take }, make("b", { textContent: letter }), `It is this one: ${degrees(place)}`);
     return make("li", {}, there);
@@ -304,16 +307,16 @@ function complain(text) {
 let pairs = [], waiting = null, picking = false;  // { pixel, lonlat }; a pixel that waits for its place
 
 function resetHelp(entry) {
-  const { near, within, gsd, maxTilt, northUp } = entry.hints;
+  const { near, gsd, heading, maxTilt } = entry.hints;
   const put = (id, value) => { $(id).value = value ?? ""; };
   setNear(near);
-  setWithin(within);
+  put("heading", heading && round(heading[0]));
+  put("heading-off", heading?.[1]);
   put("gsd-low", gsd && round(gsd[0]));
   put("gsd-high", gsd && round(gsd[1]));
   put("tilt", maxTilt);
   put("height");
   put("lens");
-  $("north").checked = Boolean(northUp);
   pairs = entry.pairs ?? [];
   setPicking(false);
   stopDrawing();
@@ -324,21 +327,13 @@ function setNear(near) {
   [["near-lon", near?.[0]], ["near-lat", near?.[1]], ["near-km", near && near[2] / 1000]].forEach(([id, value]) => { $(id).value = value === undefined ? "" : Number(value.toPrecision(8)); });
 }
 
-let box = null;
-function setWithin(within) {
-  box = within ?? null;
-  $("within").hidden = !box;
-  if (box) $("within").firstElementChild.textContent = `Box ${box.map((side) => side.toFixed(3)).join(", ")}`;
-}
-
 /** What is known, from the form. */
 function readHints(size) {
   const number = (id) => ($(id).value === "" ? undefined : Number($(id).value));
   const hints = {}, [lat, lon, km] = ["near-lat", "near-lon", "near-km"].map(number);
-  const told = [lat, lon, km].filter((one) => one !== undefined).length;
-  if (told && told < 3) throw new Error("Of a place give latitude, longitude and how far around.");
-  if (told) hints.near = [lon, lat, km * 1000];
-  if (box) hints.within = box;
+  const given = [lat, lon, km].filter((value) => value !== undefined).length;
+  if (given && given < 3) throw new Error("Give the latitude, the longitude and how far around.");
+  if (given) hints.near = [lon, lat, km * 1000];
   const [low, high, height, lens] = ["gsd-low", "gsd-high", "height", "lens"].map(number);
   if (low !== undefined || high !== undefined) hints.gsd = [low ?? high / 1.25, high ?? low * 1.25];
   else if (height !== undefined && lens !== undefined) {
@@ -347,18 +342,17 @@ function readHints(size) {
     hints.gsd = [round(height / focal / 1.25), round(height / focal * 1.25)];
   } else if (height !== undefined || lens !== undefined) throw new Error("Give both the height and the lens.");
   if (hints.gsd && !(hints.gsd[0] > 0 && hints.gsd[0] <= hints.gsd[1])) throw new Error("Pixel size: the first must not exceed the second.");
+  if (number("heading") !== undefined) hints.heading = [number("heading"), number("heading-off") ?? 10];
   if (number("tilt") !== undefined) hints.maxTilt = number("tilt");
-  if ($("north").checked) hints.northUp = true;
   return hints;
 }
 
 function again(entry, hints) {
-  const known = Object.fromEntries(Object.entries(hints).filter(([, value]) => value !== undefined));
-  const query = Object.entries(known).map(([name, value]) => `${name}=${Array.isArray(value) ? value.join(",") : value}`).join("&");
-  const next = add({ name: entry.name, hints: known, message: "searching again", pairs, view: entry.view && { ...entry.view, place: null, of: entry.base } });
+  const query = Object.entries(hints).map(([name, value]) => `${name}=${value}`).join("&");
+  const next = add({ name: entry.name, hints, message: "searching again", pairs, view: entry.view && { ...entry.view, place: null, of: entry.base } });
   choose(next);
   scrollUp();
-  return start(next, `${entry.base}/again?${query}`, { method: "POST" });
+  return start(next, `${entry.view.of ?? entry.base}/again?${query}`, { method: "POST" });  // of a failed one nothing is kept
 }
 
 function scrollUp() {
@@ -371,33 +365,30 @@ function searchAgain() {
   const entry = current;
   try {
     const hints = readHints(entry.view.size);
-    const told = hintsOf(pairs, entry.view.size);
-    if (told) Object.assign(hints, told, { within: undefined });
-    return again(entry, hints);
+    return again(entry, { ...hints, ...hintsOf(pairs, entry.view.size) });
   } catch (error) {
     $("hint-trouble").textContent = error.message;
     return null;
   }
 }
 
-function startDrawing(kind, button) {
-  const on = button.getAttribute("aria-pressed") === "true";
+function startDrawing() {
+  const button = $("draw-circle"), on = button.getAttribute("aria-pressed") === "true";
   stopDrawing();
   if (on || !hasMap) return;
   setPicking(false);
   button.setAttribute("aria-pressed", "true");
-  tell(kind === "circle" ? "Press in the middle, and draw the circle outwards" : "Press in a corner, and draw the box");
+  tell("Press in the middle, and draw the circle outwards");
   if (innerWidth <= 760) scrollTo({ top: 0 });
-  view.draw(kind, (near, within) => {
+  view.drawCircle((near) => {
     stopDrawing();
-    setNear(near ?? undefined);
-    setWithin(within);
+    setNear(near);
     searchAgain();
   });
 }
 
 function stopDrawing() {
-  for (const id of ["draw-circle", "draw-box"]) $(id).setAttribute("aria-pressed", "false");
+  $("draw-circle").setAttribute("aria-pressed", "false");
   if (hasMap) view.stopDrawing();
   tell("");
 }
@@ -455,7 +446,6 @@ function showPairs() {
     const pin = make("button", { type: "button", className: "pin", textContent: i + 1 });
     pin.setAttribute("aria-label", `Point ${i + 1} in the picture`);
     Object.assign(pin.style, { left: `${100 * column / width}%`, top: `${100 * row / height}%` });
-    if (i >= pairs.length) pin.addEventListener("pointerdown", dragToMap);
     return pin;
   }));
   $("pairs").replaceChildren(...pairs.map(({ lonlat: [lon, lat] }) => make("li", { textContent: degrees({ lat, lon }) })));
@@ -485,26 +475,6 @@ function aimByKeys(event) {
   $("aim").hidden = true;
   pickPixel(current.view.size.map((side, k) => side * aim[k]));
   view.theMap().getCanvas().focus();
-}
-
-/** Carry a point from the picture over to the map. */
-function dragToMap(event) {
-  event.preventDefault();
-  event.stopPropagation();
-  const ghost = event.target.cloneNode(true);
-  ghost.classList.add("ghost");
-  const move = ({ clientX, clientY }) => Object.assign(ghost.style, { left: `${clientX}px`, top: `${clientY}px` });
-  const drop = ({ clientX, clientY }) => {
-    removeEventListener("pointermove", move);
-    removeEventListener("pointerup", drop);
-    ghost.remove();
-    const lonlat = view.placeAt(clientX, clientY);
-    if (lonlat && waiting) setPlace(lonlat);
-  };
-  document.body.append(ghost);
-  move(event);
-  addEventListener("pointermove", move);
-  addEventListener("pointerup", drop);
 }
 
 // --- the swipe --------------------------------------------------------------------------------------------------------
@@ -557,12 +527,8 @@ function listen() {
   $("show-roads").onchange = () => view.showLayers(["roads", "roads-case"], $("show-roads").checked);
   $("show-matches").onchange = () => view.showLayers(["matches", "ends"], $("show-matches").checked);
   $("files-of").ontoggle = () => $("files-of").open && current?.document && showFiles(current);
-  $("draw-circle").onclick = () => startDrawing("circle", $("draw-circle"));
-  $("draw-box").onclick = () => startDrawing("box", $("draw-box"));
-  $("within").lastElementChild.onclick = () => {
-    setWithin(null);
-    view.showArea(null, null);
-  };
+  $("draw-circle").onclick = startDrawing;
+  $("maps").onchange = () => view.fit(maps[$("maps").selectedIndex].bounds);
   $("near-middle").onclick = () => {
     if (hasMap) setNear([...view.middle(), 1000 * (Number($("near-km").value) || 3)]);
     showTyped();
@@ -603,7 +569,7 @@ function listen() {
 
 function showTyped() {
   const [lat, lon, km] = ["near-lat", "near-lon", "near-km"].map((id) => ($(id).value === "" ? NaN : Number($(id).value)));
-  view.showArea([lat, lon, km].every(Number.isFinite) && km > 0 ? [lon, lat, km * 1000] : null, null);
+  view.showArea([lat, lon, km].every(Number.isFinite) && km > 0 ? [lon, lat, km * 1000] : null);
 }
 
 function askToken() {
@@ -612,7 +578,7 @@ function askToken() {
   $("token").onsubmit = async (event) => {
     event.preventDefault();
     try {
-      await ask("/session", { method: "POST", body: $("token-text").value });
+      await ask("session", { method: "POST", body: $("token-text").value });
       location.reload();
     } catch (problem) {
       $("token").querySelector(".bad").textContent = sentence(problem.message);
@@ -621,21 +587,24 @@ function askToken() {
 }
 
 async function begin() {
-  let told;
+  let server;
   try {
-    told = await ask("/references");
+    server = await ask("references");
   } catch (problem) {
     if (problem.status === 401) askToken();
     else complain(problem.message);
     $("work").hidden = problem.status === 401;
     return;
   }
-  kept = told.kept;
-  maxBytes = told.max_bytes;
+  kept = server.kept;
+  maxBytes = server.max_bytes;
+  maps = server.references;
   $("work").hidden = false;
-  hasMap = view.makeMap(told);
+  hasMap = view.makeMap(server);
+  $("maps").replaceChildren(...maps.map(({ name }) => new Option(name)));
+  $("maps").hidden = !hasMap || maps.length < 2;
   if (!hasMap) complain("This browser cannot draw the map (it has no WebGL). Places are told all the same.");
-  $("credit").textContent = `Searching ${told.references.map((one) => one.name).join(", ")}. Nothing leaves this server${told.basemap ? " but what the basemap shows" : ""}.`;
+  $("credit").textContent = `Searching ${maps.map(({ name }) => name).join(", ")}. Nothing leaves this server${server.basemap ? " but what the basemap shows" : ""}.`;
   listen();
   await recall();
 }

@@ -1,9 +1,10 @@
-// Points in the picture and the same on the map: where the picture then lies, how large its pixels are.
-import { metres, offset } from "/page/map.mjs";
+// Points in the picture and the same on the map: where the picture then lies, how large its pixels are, where up is.
+import { metres, offset } from "./map.mjs";
 
 /**
  * The similarity that leads pixels (column, row) to places, fitted to pairs of both by least squares.
- * Returns the middle [lon, lat], metres per pixel, and the root mean square misfit in metres; null where it cannot be told.
+ * Returns the middle [lon, lat], metres per pixel, where up points (degrees clockwise from north), and the root mean
+ * square misfit in metres; null where the points coincide.
  */
 export function fitPoints(pairs, [width, height]) {
   if (pairs.length < 2) return null;
@@ -24,13 +25,17 @@ export function fitPoints(pairs, [width, height]) {
   const lay = ([x, y]) => [b[0] + c * (x - a[0]) - s * (y - a[1]), b[1] + s * (x - a[0]) + c * (y - a[1])];
   const off = Math.sqrt(from.reduce((sum, one, i) => sum + Math.hypot(lay(one)[0] - to[i][0], lay(one)[1] - to[i][1]) ** 2, 0) / n);
   const gsd = Math.hypot(c, s);
-  return gsd > 0 ? { middle: offset(home, lay([width / 2, -height / 2])), gsd, off } : null;
+  return gsd > 0 ? { middle: offset(home, lay([width / 2, -height / 2])), gsd, heading: Math.atan2(-s, c) * 180 / Math.PI, off } : null;
 }
 
-/** What the search is told of points: near where the middle lies, how large pixels are; two points are taken less exactly. */
+/** The hints that points give; two are taken less exactly, for a tilted picture is no similarity. */
 export function hintsOf(pairs, size) {
   const fit = fitPoints(pairs, size);
   if (!fit) return null;
-  const diagonal = fit.gsd * Math.hypot(...size), loose = pairs.length > 2 ? 1.25 : 1.35;
-  return { near: [...fit.middle, Math.max(0.25 * diagonal, 4 * fit.off)], gsd: [fit.gsd / loose, fit.gsd * loose] };
+  const diagonal = fit.gsd * Math.hypot(...size), [loose, turn] = pairs.length > 2 ? [1.25, 10] : [1.35, 15];
+  return {
+    near: [...fit.middle, Math.max(0.25 * diagonal, 4 * fit.off)],
+    gsd: [fit.gsd / loose, fit.gsd * loose],
+    heading: [fit.heading, turn],
+  };
 }
