@@ -26,6 +26,7 @@ if TYPE_CHECKING:
     from roadgeo.matching.options import LocateOptions
     from roadgeo.outputs.schemas import read_schema
     from roadgeo.reference.reference import BuildOptions, Reference, open_reference
+    from roadgeo.reference.shards import ShardedReference
     from roadgeo.workflows import explain
 
 __all__ = [
@@ -36,6 +37,7 @@ __all__ = [
     "Reference",
     "RoadMask",
     "RoadgeoError",
+    "ShardedReference",
     "__version__",
     "build_reference",
     "explain",
@@ -56,6 +58,7 @@ _HOMES = {
     "Reference": "reference.reference",
     "RoadMask": "geometry.mask",
     "RoadgeoError": "errors",
+    "ShardedReference": "reference.shards",
     "build_reference": "api",
     "explain": "workflows",
     "index": "api",

@@ -14,7 +14,7 @@ from typing import TYPE_CHECKING, Any, Literal, TypeAlias
 import numpy as np
 
 from roadgeo._arrays import AnyArray
-from roadgeo.errors import MaskError, NotLocatedError, PluginError, name_extra
+from roadgeo.errors import MaskError, NotLocatedError, PluginError, name_package
 from roadgeo.geometry.areas import Box
 from roadgeo.geometry.mask import RoadMask
 from roadgeo.location import Location
@@ -194,7 +194,7 @@ def build_reference(
     OutputError
         It cannot be written.
     MissingPackageError
-        A package of the extra `maps` is not installed.
+        A package is not installed, as on an onboard computer.
     """
     from roadgeo.sources.roads import choose_roads
     from roadgeo.workflows import build_reference as build
@@ -204,7 +204,7 @@ def build_reference(
         chosen = choose_roads(roads, kinds, tunnels, attribution, crs=crs)
         return build(chosen, name or (where.stem if where else ""), options, path=where)
     except ModuleNotFoundError as error:
-        raise name_extra(error) or error from error
+        raise name_package(error) or error from error
 
 
 def index(

@@ -24,27 +24,17 @@ __all__ = [
     "RoadSourceError",
     "RoadgeoError",
     "how_to_install",
-    "name_extra",
+    "name_package",
 ]
 
-#: Packages that come with an extra, and which: the core locates masks on references that were built elsewhere.
-_EXTRAS = {
-    "geopandas": "maps",
-    "mapbox_vector_tile": "serve",
-    "networkx": "maps",
-    "onnxruntime": "segment",
-    "osmium": "maps",
-    "osmnx": "maps",
-    "pandas": "maps",
-    "pyarrow": "maps",
+#: Packages by the extra, or else the package, to install for them. Onboard computers may lack those without an extra.
+_BRINGS = {
+    **dict.fromkeys(("mapbox_vector_tile", "python_multipart", "starlette", "uvicorn"), "serve"),
+    **dict.fromkeys(("geopandas", "pandas", "pyogrio"), "geopandas"),
     "pymavlink": "mavlink",
-    "pyogrio": "maps",
-    "python_multipart": "serve",
-    "requests": "maps",
-    "scipy": "track",
-    "shapely": "maps",
-    "starlette": "serve",
-    "uvicorn": "serve",
+    **{
+        name: name for name in ("networkx", "onnxruntime", "osmium", "osmnx", "pyarrow", "requests", "scipy", "shapely")
+    },
 }
 
 
@@ -89,7 +79,7 @@ class NotLocatedError(RoadgeoError):
 
 
 class MissingPackageError(RoadgeoError):
-    """A package of an extra is not installed."""
+    """A package is not installed."""
 
 
 class OutputError(RoadgeoError):
@@ -100,17 +90,16 @@ class PluginError(RoadgeoError):
     """A plugin is missing, cannot be loaded, or does not do what is asked of its kind."""
 
 
-def name_extra(error: ModuleNotFoundError) -> MissingPackageError | None:
-    """Return the error that names the extra of a package that is not installed; None if it is of no extra."""
+def name_package(error: ModuleNotFoundError) -> MissingPackageError | None:
+    """Return the error that names how to install a package that is missing; None if roadgeo does not use it."""
     package = (error.name or "").partition(".")[0]
-    if package not in _EXTRAS:
+    if package not in _BRINGS:
         return None
-    extra = _EXTRAS[package]
-    return MissingPackageError(f"this needs {package}, which is not installed (extra {extra}): {how_to_install(extra)}")
+    return MissingPackageError(f"this needs {package}, which is not installed: {how_to_install(_BRINGS[package])}")
 
 
-def how_to_install(extra: str) -> str:
-    """Return the command that adds what an extra of this package needs, to the Python that runs now.
+def how_to_install(name: str) -> str:
+    """Return the command that adds a package, or what an extra of roadgeo needs, to the Python that runs now.
 
     It does not name roadgeo itself, whose source, a checkout or a file, is not known any more.
     """
@@ -121,7 +110,8 @@ def how_to_install(extra: str) -> str:
     except PackageNotFoundError:  # run from its source
         asked = []
     found = (re.fullmatch(r"([\w.-]+(?:\[[\w,-]+\])?)[^;]*;\s*extra == ['\"]([\w-]+)['\"]", one) for one in asked)
-    packages = " ".join(_quoted(one[1]) for one in found if one and one[2] == extra) or f"'roadgeo[{extra}]'"
+    brought = " ".join(_quoted(one[1]) for one in found if one and one[2] == name)
+    packages = brought or (name if name in _BRINGS else f"'roadgeo[{name}]'")
     parts = Path(sys.prefix).parts
     if "pipx" in parts:
         return f"pipx inject roadgeo {packages}"

@@ -12,7 +12,7 @@ import numpy as np
 
 from roadgeo import __version__
 from roadgeo._arrays import FloatArray
-from roadgeo.errors import NotLocatedError, name_extra
+from roadgeo.errors import NotLocatedError, name_package
 from roadgeo.geometry.frame import Frame
 from roadgeo.geometry.homography import Homography
 from roadgeo.geometry.lens import Lens
@@ -444,7 +444,7 @@ class Location:
         try:
             import geopandas as gpd
         except ModuleNotFoundError as error:
-            raise name_extra(error) or error from error
+            raise name_package(error) or error from error
 
         frame = gpd.GeoDataFrame.from_features([self.__geo_interface__], crs="EPSG:4326")
         return frame if self.crs is None else frame.to_crs(self.crs)

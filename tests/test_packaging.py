@@ -9,14 +9,21 @@ from pathlib import Path
 import pytest
 
 import roadgeo
-from roadgeo.errors import how_to_install, name_extra
+from roadgeo.errors import how_to_install, name_package
 from roadgeo.evaluation.demo import ROADS, demo_masks
 
 ROOT = Path(__file__).parents[1]
 PROJECT = tomllib.loads((ROOT / "pyproject.toml").read_text("utf-8"))["project"]
 
+#: Packages that an onboard computer has.
+ON_BOARD = {line for line in (ROOT / "onboard.txt").read_text("utf-8").splitlines() if not line.startswith("#")}
+
 #: Packages that conda-forge calls otherwise.
 ON_CONDA = {"opencv-python-headless": "py-opencv", "osmium": "pyosmium"}
+
+
+def _name_of(requirement: str) -> str:
+    return re.match(r"[\w-]+", requirement)[0]
 
 
 def test_the_citation_is_of_this_version() -> None:
@@ -33,24 +40,29 @@ def test_the_conda_recipe_is_of_this_version_and_needs_the_same() -> None:
     needed = recipe.split("  run:\n")[1].split("\n\n")[0]
     listed = re.findall(r"- ([\w-]+) (>=[\d.]+)", needed)
     extras = PROJECT["optional-dependencies"]
-    every = {*PROJECT["dependencies"], *extras["maps"], *extras["track"], *extras["serve"]}
+    every = {*PROJECT["dependencies"], *extras["serve"]}
     asked = [re.fullmatch(r"([\w-]+)(>=[\d.]+)", item).groups() for item in every]
     expected = {(ON_CONDA.get(name, name), version) for name, version in asked}
     assert set(listed) == {("python", PROJECT["requires-python"]), *expected}
 
 
-def test_a_missing_package_is_named_with_the_extra_that_brings_it() -> None:
+def test_a_missing_package_is_named_with_what_brings_it() -> None:
     extras = PROJECT["optional-dependencies"]
-    brought = {"geopandas": ("geopandas", "pandas", "pyogrio"), "protobuf": ()}
-    for extra in ("maps", "track", "serve", "segment", "mavlink"):
-        for package in (re.match(r"[\w-]+", item)[0] for item in extras[extra]):
-            for name in brought.get(package, (package.replace("-", "_"),)):
-                reported = str(name_extra(ModuleNotFoundError(name=f"{name}.part")))
-                named = re.fullmatch(
-                    rf"this needs {name}, which is not installed \(extra (\w+)\): .* install .+", reported
-                )
-                assert any(item.startswith(package) for item in extras[named[1]])
-    assert name_extra(ModuleNotFoundError(name="another")) is None
+    left_out = [name for name in map(_name_of, PROJECT["dependencies"]) if name not in ON_BOARD | {"protobuf"}]
+    for brings, package in [
+        *((package, package) for package in left_out),
+        *((extra, _name_of(item)) for extra in ("serve", "mavlink") for item in extras[extra]),
+    ]:
+        module = package.replace("-", "_")
+        reported = str(name_package(ModuleNotFoundError(name=f"{module}.part")))
+        assert reported == f"this needs {module}, which is not installed: {how_to_install(brings)}"
+        assert package in reported
+    assert name_package(ModuleNotFoundError(name="another")) is None
+
+
+def test_an_onboard_computer_needs_what_is_pinned() -> None:
+    pinned = {line.split("==")[0] for line in (ROOT / "constraints.txt").read_text("utf-8").splitlines()}
+    assert pinned > ON_BOARD
 
 
 def test_the_constraints_pin_every_package_within_its_bounds() -> None:
@@ -67,9 +79,10 @@ def test_the_constraints_pin_every_package_within_its_bounds() -> None:
         assert min(versions) >= tuple(map(int, least.split("."))), name
 
 
-WITHOUT_EXTRAS = """
+ON_BOARD_ALONE = """
 import sys
-for name in ("scipy", "geopandas", "pandas", "pyogrio", "pyarrow", "shapely", "osmnx", "networkx", "osmium",
+for name in ("onnxruntime", "requests",
+             "scipy", "geopandas", "pandas", "pyogrio", "pyarrow", "shapely", "osmnx", "networkx", "osmium",
              "starlette", "uvicorn", "mapbox_vector_tile", "python_multipart", "dask"):
     sys.modules[name] = None
 from roadgeo.cli import main
@@ -78,14 +91,14 @@ sys.exit(main(sys.argv[1:]))
 
 
 @pytest.mark.slow
-def test_the_core_locates_and_names_the_extra_that_is_missing(tmp_path: Path) -> None:
-    """As on board of a drone: a reference that was built elsewhere, and no extra."""
+def test_an_onboard_computer_locates_and_names_what_is_missing(tmp_path: Path) -> None:
+    """A reference that was built elsewhere is all it needs."""
     reference = tmp_path / "porto.gpkg"
     roadgeo.build_reference(ROADS, path=reference)
     drone = next(mask.path for mask in demo_masks() if mask.path.stem == "drone")
 
     def run(*arguments: object) -> subprocess.CompletedProcess[str]:
-        command = [sys.executable, "-c", WITHOUT_EXTRAS, *map(str, arguments)]
+        command = [sys.executable, "-c", ON_BOARD_ALONE, *map(str, arguments)]
         return subprocess.run(command, capture_output=True, text=True, check=False, cwd=tmp_path)
 
     for arguments in (
@@ -96,13 +109,13 @@ def test_the_core_locates_and_names_the_extra_that_is_missing(tmp_path: Path) ->
     ):
         done = run(*arguments)
         assert done.returncode == 0, done.stderr
-    for extra, arguments in (
-        ("maps", ["index", "--roads", ROADS, "--out", "a.gpkg"]),
-        ("serve", ["serve", "-r", reference]),
+    for package, arguments in (
+        ("shapely", ["index", "--roads", ROADS, "--out", "a.gpkg"]),
+        ("uvicorn", ["serve", "-r", reference]),
     ):
         done = run(*arguments)
         assert done.returncode == 1
-        assert f"which is not installed (extra {extra}): " in done.stderr.splitlines()[-1], done.stderr
+        assert f"{package}, which is not installed: " in done.stderr.splitlines()[-1], done.stderr
 
 
 def test_placeholder_addresses_stand_in_one_place() -> None:
@@ -127,6 +140,6 @@ def test_what_is_missing_is_installed_where_roadgeo_is(
     """Nobody need know where roadgeo itself came from: there may be no such package anywhere."""
     monkeypatch.setattr(sys, "prefix", prefix)
     monkeypatch.setattr(sys, "executable", "/x/python")
-    assert how_to_install("segment").startswith(begins)
+    assert how_to_install("onnxruntime").startswith(begins)
     monkeypatch.setattr(sys, "executable", "/my programs/python")
-    assert "pipx" in prefix or '"/my programs/python"' in how_to_install("segment")
+    assert "pipx" in prefix or '"/my programs/python"' in how_to_install("onnxruntime")

@@ -1,4 +1,4 @@
-"""Measure the whole line, photograph to place, on held-out photographs; needs roadgeo with its extra `segment`.
+"""Measure the whole line, photograph to place, on held-out photographs.
 
     python locate.py DATA --roads roads_from_labels.parquet --work measured [--model runs/fold0.onnx]
 

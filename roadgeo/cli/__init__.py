@@ -20,7 +20,7 @@ import click
 
 from roadgeo import __version__
 from roadgeo.cli.printing import echo
-from roadgeo.errors import RoadgeoError, name_extra
+from roadgeo.errors import RoadgeoError, name_package
 from roadgeo.storage.gdal import forget_missing_proj_data, skip_drivers
 
 __all__ = ["COMMANDS", "ERROR", "INTERRUPTED", "NOT_LOCATED", "Group", "cli", "main"]
@@ -179,7 +179,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
     except RoadgeoError as error:
         return _fail(str(error), ERROR)
     except ModuleNotFoundError as error:
-        missing = name_extra(error)
+        missing = name_package(error)
         if missing is None:
             raise
         return _fail(str(missing), ERROR)

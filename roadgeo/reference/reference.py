@@ -187,7 +187,7 @@ def _read_options(kind: type[_Options], stored: Any, stage: str) -> _Options:
 
 
 def open_reference(path: str | Path, say: Say = say_nothing) -> AnyReference:
-    """Open a reference: REF.gpkg with its REF.index, or REF.shards; those may lie elsewhere, at a URL.
+    """Open a reference: REF.gpkg with its REF.index, REF.shards, also at a URL, or one of the library by its name.
 
     A missing index, or one of an earlier format, is built from the GeoPackage. Of shards only the manifest is read;
     each is opened when it is first searched.
@@ -200,14 +200,12 @@ def open_reference(path: str | Path, say: Say = say_nothing) -> AnyReference:
     IndexFormatError
         If there is no such reference, or it is damaged, hostile, stale or of another version.
     """
-    from roadgeo.reference.files import reference_paths
-    from roadgeo.reference.remote import fetch_manifest, is_remote
+    from roadgeo.reference.library import resolve_reference
     from roadgeo.reference.shards import manifest_path, open_shards
 
-    path = fetch_manifest(str(path)) if is_remote(path) else path
-    paths = reference_paths(path)
-    manifest = None if paths.geopackage.is_file() or paths.index.is_file() else manifest_path(path)
-    return open_whole(path, say) if manifest is None else open_shards(manifest)
+    found = resolve_reference(path)
+    manifest = manifest_path(found) if found.is_dir() else None
+    return open_whole(found, say) if manifest is None else open_shards(manifest)
 
 
 def open_whole(path: str | Path, say: Say = say_nothing) -> Reference:

@@ -18,7 +18,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from roadgeo._progress import Say, say_nothing
-from roadgeo.errors import IndexFormatError, ModelError, OutputError, PluginError, RoadgeoError, name_extra
+from roadgeo.errors import IndexFormatError, ModelError, OutputError, PluginError, RoadgeoError, name_package
 from roadgeo.outputs.registry import JSON, REPORT
 from roadgeo.running.options import BatchOptions, ReadOptions
 from roadgeo.running.probability_files import is_ours, keep_probability, probability_path
@@ -233,7 +233,7 @@ class Locating:
         except Exception as error:  # whatever libraries raise: cv2.error, errors of GDAL, of plugins ...
             if os.environ.get("ROADGEO_TRACEBACK"):
                 raise
-            missing = name_extra(error) if isinstance(error, ModuleNotFoundError) else None
+            missing = name_package(error) if isinstance(error, ModuleNotFoundError) else None
             if missing is not None:
                 return self.failed(task, "INVALID", f"{task.query}: {missing}")
             what = " ".join(f"{type(error).__name__}: {error}".split())

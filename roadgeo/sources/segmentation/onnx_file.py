@@ -123,7 +123,7 @@ def open_onnx(path: str | os.PathLike[str], threads: int = 1) -> OnnxModel:
         onnxruntime is missing; the file is missing, too large, no ONNX, or holds what is listed above.
     """
     if importlib.util.find_spec("onnxruntime") is None:
-        raise ModelError(f"to find the roads in a photograph onnxruntime is needed: {how_to_install('segment')}")
+        raise ModelError(f"to find the roads in a photograph onnxruntime is needed: {how_to_install('onnxruntime')}")
     name, file = os.fspath(path), Path(path)
     if not file.is_file():
         raise ModelError(f"{name}: no such model file; check the path")
