@@ -1,5 +1,7 @@
 """Small worlds whose truth is known, through what `import roadgeo` offers: what must be found, and what must not."""
 
+import functools
+
 import cv2
 import numpy as np
 import pytest
@@ -122,28 +124,32 @@ def self_box(street):
     return bool((np.abs(street.mean(axis=0) - 1800.0) < 700.0).all())
 
 
+@functools.cache
+def map_of(seed, kept):
+    return roadgeo.build_reference(roads_of(lattice(seed, kept)))
+
+
 class TestLattices:
     """Equal blocks: chance nearby is other blocks, and whole blocks are the same everywhere."""
 
     def test_a_lattice_without_gaps_has_no_place(self):
         streets = lattice(1, 1.0)
         mask = draw(streets, view((1600.0, 1500.0), (700, 700), heading_deg=15.0), (700, 700))
-        assert refused(roadgeo.locate(mask, roadgeo.build_reference(roads_of(streets))))
+        assert refused(roadgeo.locate(mask, map_of(1, 1.0)))
 
     @pytest.mark.parametrize(("kept", "wear"), [(0.8, {}), (0.9, {}), (0.85, {"missing": 0.1, "false": 0.03})])
     def test_gaps_tell_where_it_is(self, kept, wear):
         streets = lattice(5, kept)
         truth = view((1600.0, 1500.0), (1200, 1200), heading_deg=15.0)
-        found = roadgeo.locate(draw(streets, truth, (1200, 1200), **wear), roadgeo.build_reference(roads_of(streets)))
+        found = roadgeo.locate(draw(streets, truth, (1200, 1200), **wear), map_of(5, kept))
         assert found.status == "located", found.reason
         assert miss(found, truth, (1200, 1200))[0] < 5.0
 
     @pytest.mark.parametrize(("kept", "size"), [(0.8, (1100, 1100)), (0.9, (600, 600)), (0.97, (1100, 1100))])
     def test_a_lattice_with_other_gaps_is_another_one(self, kept, size):
         """As a mask of Portland fitted a piece of Chicago's lattice, with 10^6."""
-        reference = roadgeo.build_reference(roads_of(lattice(5, kept)))
         mask = draw(lattice(6, kept), view((1600.0, 1500.0), size, heading_deg=15.0), size)
-        assert refused(roadgeo.locate(mask, reference))
+        assert refused(roadgeo.locate(mask, map_of(5, kept)))
 
 
 @pytest.mark.parametrize("gsd", [4.0, 8.0])

@@ -80,22 +80,6 @@ def test_json_lines_stand_in_input_order_and_alone_on_standard_output(
     assert not (tmp_path / "out" / "a_footprint.tif").exists()
 
 
-def test_processes_give_the_same_results(porto: Path, tmp_path: Path, capfd: pytest.CaptureFixture[str]) -> None:
-    masks = [str(mask.path) for mask in MASKS.values()]
-    results = []
-    for jobs in ("1", "2"):
-        assert main(["locate", *masks, "-r", str(porto), "--json", "-o", f"out{jobs}", "--jobs", jobs, "-q"]) == 3
-        out, err = capfd.readouterr()
-        assert err == ""
-        results.append([json.loads(line) for line in out.splitlines()])
-    alone, together = ([{**result, "seconds": None, "command": None} for result in found] for found in results)
-    assert alone == together
-    assert [item["status"] == "located" for item in alone] == [mask.in_map for mask in MASKS.values()]
-    for found, mask in zip(alone, MASKS.values(), strict=True):
-        if mask.in_map:
-            assert center_error(found, mask) < 2
-
-
 def test_what_was_cut_short_goes_on_where_it_was(
     porto: Path, tmp_path: Path, capfd: pytest.CaptureFixture[str]
 ) -> None:
@@ -410,16 +394,6 @@ def test_usage_is_one_line_and_status_2(arguments: list[str], capfd: pytest.Capt
 
 
 # --- the whole --------------------------------------------------------------------------------------------------------
-
-
-def test_the_demonstration_shows_what_it_promises(tmp_path: Path, capfd: pytest.CaptureFixture[str]) -> None:
-    assert main(["demo"]) == 0
-    out = capfd.readouterr().out
-    assert out.count("found at") == 4
-    assert out.count("refused, as it should be") == 1
-    assert (tmp_path / "roadgeo_demo" / "drone_overlay.png").exists()
-    with rasterio.open(tmp_path / "roadgeo_demo" / "drone_footprint.tif") as raster:
-        assert raster.crs.to_epsg() == 32629
 
 
 def test_locate_needs_no_heavy_library(porto: Path, tmp_path: Path) -> None:

@@ -4,7 +4,6 @@ import itertools
 import math
 from dataclasses import replace
 
-import cv2
 import numpy as np
 import pytest
 from hypothesis import given
@@ -14,14 +13,11 @@ from scipy.stats import rankdata
 from worlds.lattices import beside, contest
 from worlds.scenes import Sight, camera, look, random_network, scene_of, shaken
 
-import roadgeo
 from roadgeo.geometry.homography import Homography
 from roadgeo.matching import evidence
 from roadgeo.matching.evidence import Evidence, log10_lead
 from roadgeo.matching.index import build_index
-from roadgeo.matching.options import LocateOptions
 from roadgeo.matching.shifts import Shift, move_about
-from roadgeo.reference.reference import Reference
 
 SIZE = (900, 700)
 TRUTH = camera((2000, 1900), SIZE, 1.0, 20.0, 50.0, 130.0)
@@ -273,26 +269,3 @@ def test_one_piece_outweighs_no_others():
 
 def test_a_long_lead_is_counted_without_end():
     assert 1000.0 < log10_lead(np.ones(10_000)) < 10_000 * math.log10(2.0)
-
-
-def drawn(network, matrix, size):
-    """Draw what a camera sees, with all its roads."""
-    graph = look(network, matrix, size, Sight(sigma_m=0.5), 1)
-    mask = np.zeros(size[::-1], np.uint8)
-    for k in range(len(graph.edges)):
-        line = graph.coords[graph.offsets[k] : graph.offsets[k + 1]] * (1, -1)
-        cv2.polylines(mask, [np.round(line).astype(np.int32)], False, 255, 9)
-    return mask
-
-
-@pytest.mark.slow
-@pytest.mark.parametrize(("share", "located"), [(0.42, False), (0.75, True)])
-def test_a_piece_that_fits_is_no_place_where_most_of_the_frame_does_not(town, share, located):
-    """As in Porto Alegre, where a quarter is like its mirror image: turned over, a mask of it was located at 10^8."""
-    truth, size = camera((1900.0, 2000.0), (1300, 1300), 1.0, heading_deg=40.0), (1300, 1300)
-    mask, stranger = drawn(town[0], truth, size), drawn(random_network(2, 4000.0), truth, size)
-    kept = int(share * size[0])
-    mask[:, kept:] = stranger[:, kept:]
-    found = roadgeo.locate(mask, Reference(town[1]), LocateOptions(effort="quick"))
-    assert found.located == located
-    assert located or found.log10_odds <= 0.0

@@ -8,7 +8,6 @@ from worlds.scenes import Sight, camera, look, scene_of
 
 from roadgeo.geometry.camera import CameraOptions, pose, sampling
 from roadgeo.geometry.homography import Homography
-from roadgeo.location import Reason
 from roadgeo.matching import rivals
 from roadgeo.matching.estimator import MatchOptions, TripleEstimator
 from roadgeo.matching.events import Ledger
@@ -19,8 +18,6 @@ from roadgeo.matching.rivals import Rivals, log10_gap, similar_places
 from roadgeo.matching.search import Search
 from roadgeo.matching.shifts import Shift, move_about
 from roadgeo.matching.triples import larger
-from roadgeo.reference.reference import Reference
-from roadgeo.workflows import locate
 
 NEEDED = LocateOptions().min_log10_odds
 
@@ -94,20 +91,6 @@ def test_a_rival_that_explains_more_takes_over(broken):
 def test_where_all_blocks_are_equal_nothing_leads(even):
     assert stand(even, even[0]).log10_lead < 0.5
     assert stand(even, even[0], beside(even[0], even[2])).log10_lead < 0.5
-
-
-@pytest.mark.slow
-def test_an_even_lattice_is_never_located_and_a_broken_one_at_its_place(broken, even):
-    for world, located in ((broken, True), (even, False)):
-        truth, index, evidence = world
-        answer = locate(drawn(index, truth, evidence.scene.size), Reference(index))
-        assert answer.located == located
-        if located:
-            there = index.plane.to_crs(Homography(truth)(evidence.scene.corners))
-            assert np.hypot(*(answer.footprint - there).T).max() < 10.0
-        else:
-            assert answer.reason_code in {Reason.TWO_PLACES, Reason.NOTHING_STANDS_OUT}
-            assert answer.log10_odds < 1.0
 
 
 def drawn(index, matrix, size):

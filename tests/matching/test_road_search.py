@@ -115,15 +115,6 @@ def test_finds_a_broken_mask_that_triples_do_not(town, seed):
     assert full.best.by_roads
 
 
-@pytest.mark.slow
-@pytest.mark.parametrize("seed", [2, 3])
-def test_another_town_is_refused(town, seed):
-    stranger = scene_of(look(random_network(seed, 2000.0), camera((1000, 1000)), sight=BROKEN))
-    result = search(TripleEstimator(stranger, town[1], MatchOptions()), SearchOptions(time_limit_s=60.0))
-    assert result.score < 2.5
-    assert result.stopped == "exhausted"
-
-
 def test_near_restricts_where_votes_are_cast(town, broken):
     index = town[1]
     everything = RoadSearch(broken, index, CameraOptions())
