@@ -64,11 +64,15 @@ def owners(parts: Sequence[str], workers: Sequence[str]) -> dict[str, list[str]]
 
 
 class _Answer(NamedTuple):
-    """The result of the search of parts; of places that may be reported, or be rivals, log10 odds and the part."""
+    """The result of the search of parts; of places that may be reported, or be rivals, log10 odds and the part.
+
+    `seconds`: time that it took, without the time in which it waited for the worker.
+    """
 
     location: Location
     places: Sequence[tuple[float, str]]
     parts: Sequence[str]
+    seconds: float
 
 
 def run_divided(tasks: Sequence[Task], locating: Locating, cluster: Cluster) -> Iterator[Outcome]:
@@ -121,13 +125,13 @@ def _locate(
         Workers died of it, one after another, or the scheduler went away.
     """
     query = read_query(mask)
-    deadline = perf_counter() + options.search.time_limit_s - query.seconds.vectorize
+    left_s = options.search.time_limit_s - query.seconds.vectorize
     workers = sorted(client.nthreads()) or [""]
 
     def search(worker: str, parts: Sequence[str], options: LocateOptions) -> Future[_Answer]:
         here = sum(sizes[name] for name in parts)
         against = 2.0 * math.log10(larger(sum(sizes.values())) / larger(here))  # as in `Rivals`, for the whole map
-        limits = replace(options.search, time_limit_s=max(deadline - perf_counter(), 0.0))
+        limits = replace(options.search, time_limit_s=max(left_s, 0.0))
         pool = client.get_executor(pure=False, workers=[worker], allow_other_workers=True)
         future: Future[_Answer] = pool.submit(do_prepared, made, query, parts, replace(options, search=limits), against)
         return future
@@ -139,8 +143,10 @@ def _locate(
     least_work = replace(options.search, work_limit_s=min(options.search.work_limit_s, _FIRST_LOOK_S))
     try:
         answers = search_all(replace(options, effort="quick", search=least_work))
+        left_s -= max(answer.seconds for answer in answers)
         if not any(answer.location.located for answer in answers):
             answers = search_all(options)
+            left_s -= max(answer.seconds for answer in answers)
         best = max(answers, key=_rank)
         if best.location.status == "not_located":
             return _refused_by_all(best.location, [answer.location for answer in answers], references)
@@ -163,7 +169,7 @@ def _rank(answer: _Answer) -> tuple[bool, float]:
 
 def _refused_by_all(refusal: Location, others: Sequence[Location], references: Sequence[AnyReference]) -> Location:
     """Return the refusal of the worker that came nearest as one of all maps."""
-    owed = dict.fromkeys(one for location in others for one in location.attribution.split("; ") if one)
+    owed = dict.fromkeys(name for location in others for name in location.attribution.split("; ") if name)
     refusal = replace(refusal, attribution="; ".join(owed))
     names = ", ".join(dict.fromkeys(reference.name for reference in references))
     if names == refusal.reference:
@@ -194,14 +200,14 @@ class _Searcher:
 
     def __call__(self, query: Query, names: Sequence[str], options: LocateOptions, against: float) -> _Answer:
         """Search parts together; all places are less likely by `against` (log10), for the rest of the map."""
-        parts = [self.parts[name] for name in names]
+        started, parts = perf_counter(), [self.parts[name] for name in names]
         found = search_references(query, parts, options, options.search.time_limit_s)
-        found = [_less_likely(one, against) for one in found]
+        found = [_less_likely(result, against) for result in found]
         least = options.min_log10_odds - options.min_margin
         by_path = {_path(part): name for name, part in zip(names, parts, strict=True)}
-        fits = [fit for one in found for fit in one.fits if fit.log10_odds >= least]
+        fits = [fit for result in found for fit in result.fits if fit.log10_odds >= least]
         places = [(fit.log10_odds, by_path[_path(fit.index)]) for fit in fits]
-        return _Answer(decide(query, found, options), places, names)
+        return _Answer(decide(query, found, options), places, names, perf_counter() - started)
 
 
 def _less_likely(found: Found, against: float) -> Found:
